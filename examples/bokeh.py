@@ -1,10 +1,9 @@
-"""Night lights through six lenses: what a point of light becomes out of focus.
+"""Night lights through six lenses: the shape of a point of light out of focus.
 
 Usage: python examples/bokeh.py --out bokeh.png
 
-A street at night: lamps and windows up to 60 m away, a post in focus at 2 m, fairy lights hung in front of it. The same
-picture and depth go through a perfect lens, one of seven blades, a traced double Gauss, an anamorphic lens, one whose
-barrel cuts cat's eyes, and one with a heart in its opening.
+The scene is a street at night: lamps and windows up to 60 m away, a post in focus at 2 m, fairy lights in front of it.
+The lenses: ideal, seven blades, a traced double Gauss, anamorphic, cat's eyes, and a heart-shaped opening.
 """
 
 import argparse
@@ -27,7 +26,7 @@ def main() -> None:
     """Draw the sheet."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--out", type=Path, default=Path("bokeh.png"), help="picture to write")
-    parser.add_argument("--height", type=int, default=480, help="of each picture, in pixels")
+    parser.add_argument("--height", type=int, default=480, help="height of each picture in pixels")
     arguments = parser.parse_args()
     image, depth = street(arguments.height, arguments.height * 3 // 4)
     camera = Camera(focal_length_mm=50.0, f_number=1.2, focus_m=FOCUS_M, sensor_width_mm=12.0)
@@ -40,7 +39,7 @@ def main() -> None:
 
 
 def lenses() -> dict[str, BlurTable]:
-    """Six of them, by what they are called."""
+    """Caption -> blur table of each lens."""
     traced = BlurTable.load("double_gauss_50mm_f2")
     return {
         "perfect": BlurTable.disc(),

@@ -2,8 +2,8 @@
 
     python examples/defocus_dataset.py --images photos --depths depth --out data --workers 2 --copies 4
 
-Depth maps have their image's name, but for the suffix. Stopped, it goes on where it was when it is started again in the
-same way. Needs Ray: pip install 'torchdof[ray]'.
+A depth map has the name of its image, with any suffix. After an interruption, the same command continues where it
+stopped. Needs Ray: pip install 'torchdof[ray]'.
 """
 
 import argparse
@@ -20,23 +20,25 @@ def main() -> None:
     """Make the data set."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--images", type=Path, required=True, help="folder of all-in-focus images")
-    parser.add_argument("--depths", type=Path, help="folder of their depth maps; left out: the images' own Z channels")
+    parser.add_argument("--depths", type=Path, help="folder of their depth maps; default: the images' own Z channels")
     parser.add_argument("--out", type=Path, required=True, help="folder of the data set")
     parser.add_argument("--depth-kind", default="z", help="z, disparity, inverse, or relative, as estimators give it")
     parser.add_argument("--near-m", type=float, help="distance of the nearest value of relative depth")
     parser.add_argument("--far-m", type=float, help="distance of the farthest value of relative depth")
     parser.add_argument("--depth-scale", type=float, help="factor of the depth values, such as 0.001 for millimetres")
-    parser.add_argument("--depth-offset", type=float, default=0.0, help="added to the depth values first")
-    parser.add_argument("--fill-depth", help="nearest or far: where pixels without depth take theirs from")
+    parser.add_argument("--depth-offset", type=float, default=0.0, help="added to the depth values before scaling")
+    parser.add_argument("--fill-depth", help="nearest or far: how to fill pixels without depth")
     parser.add_argument("--focus-m", type=float, nargs=2, default=(0.5, 5.0), metavar=("NEAR", "FAR"))
     parser.add_argument("--f-number", type=float, nargs=2, default=(1.4, 8.0), metavar=("FROM", "TO"))
     parser.add_argument("--focal-length-mm", type=float, default=50.0)
     parser.add_argument("--sensor-width-mm", type=float, default=36.0)
-    parser.add_argument("--table", action="append", help="a lens, such as sato_j15; repeated, one is drawn each time")
+    parser.add_argument(
+        "--table", action="append", help="a lens, such as sato_j15; if repeated, one is chosen at random"
+    )
     parser.add_argument("--tolerance", default="final", help="draft, preview or final")
     parser.add_argument("--format", choices=("webdataset", "parquet"), default="webdataset")
     parser.add_argument("--per-shard", type=int, default=64, help="samples in a shard")
-    parser.add_argument("--copies", type=int, default=1, help="how often each image is blurred")
+    parser.add_argument("--copies", type=int, default=1, help="number of blurred versions of each image")
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()

@@ -2,8 +2,8 @@
 
 Usage: python examples/demo.py --data examples/data/motorcycle --out out
 
-Leaves ``near.png``, ``middle.png`` and ``far.png`` and beside each a sheet: the sharp photograph, the map of the circle
-of confusion (orange in front of the focus, black in focus, blue behind it) and the result.
+Writes ``near.png``, ``middle.png`` and ``far.png``, and for each a sheet with the sharp photograph, the map of the
+circle of confusion (orange in front of the focus, black in focus, blue behind it) and the result.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from torchdof.io.images import read_image, write_image
 from torchdof.io.sheet import write_sheet
 
 FOCUS_M = {"near": 2.3, "middle": 3.1, "far": 4.6}
-APERTURE_RADIUS_M = 0.04  # wider than lenses are made, so that a picture of 741 pixels shows it
+APERTURE_RADIUS_M = 0.04  # larger than in most lenses, so that the blur is visible in a picture 741 pixels wide
 
 
 def main() -> None:
@@ -47,7 +47,7 @@ def main() -> None:
         for name, focus_m in FOCUS_M.items():
             progress.update(task, description=f"focus {name}")
             camera = torchdof.Camera.from_fov(fov_x_deg, APERTURE_RADIUS_M, focus_m)
-            dof = torchdof.DepthOfField(camera, depth_edges="repair")  # stereo ends now and then a pixel off
+            dof = torchdof.DepthOfField(camera, depth_edges="repair")  # stereo edges may be a pixel off
             start = time.perf_counter()
             with torch.no_grad():
                 blurred = dof(picture.pixels, depth)

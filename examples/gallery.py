@@ -1,4 +1,4 @@
-"""The pictures of the documentation, from the data in this repository.
+"""Draws the pictures of the documentation from the data in this repository.
 
 Usage: python examples/gallery.py --out docs/pictures
 
@@ -32,7 +32,7 @@ ROOT = Path(__file__).parents[1]
 MOTORCYCLE, SCENES = ROOT / "examples/data/motorcycle", ROOT / "tests/data/scenes"
 KNOWN = json.loads((MOTORCYCLE / "camera.json").read_text())
 FOV_X_DEG = math.degrees(2 * math.atan(741 / 2 / KNOWN["focal_length_px"]))
-APERTURE_RADIUS_M = 0.04  # wider than lenses are made, so that a picture of 741 pixels shows it
+APERTURE_RADIUS_M = 0.04  # larger than in most lenses, so that the blur is visible in a picture 741 pixels wide
 TABLES = ("sato_j15", "double_gauss_50mm_f2", "wide_22mm_f4")
 
 
@@ -43,9 +43,9 @@ def motorcycle() -> tuple[Tensor, Tensor]:
 
 
 def focused(focus_m: float, aperture_radius_m: float = APERTURE_RADIUS_M) -> Tensor:
-    """The photograph as a lens takes it that is focused there."""
+    """The photograph through a lens focused at ``focus_m``."""
     camera = torchdof.Camera.from_fov(FOV_X_DEG, aperture_radius_m, focus_m)
-    return torchdof.depth_of_field(*motorcycle(), camera, depth_edges="repair")  # stereo ends now and then a pixel off
+    return torchdof.depth_of_field(*motorcycle(), camera, depth_edges="repair")  # stereo edges may be a pixel off
 
 
 def photograph(path: Path, pixels: Tensor) -> None:
@@ -106,13 +106,13 @@ def draw_apertures(path: Path) -> None:
 
 
 def draw_show_focus(path: Path) -> None:
-    """What ``torchdof render --show-focus`` draws."""
+    """The picture of ``torchdof render --show-focus``."""
     image, depth = motorcycle()
     photograph(path, tint_focus(image, torchdof.Camera.from_fov(FOV_X_DEG, 0.02, 2.8).coc_px(depth, image.shape[-1])))
 
 
 def draw_inspect(path: Path) -> None:
-    """What ``torchdof inspect`` draws."""
+    """The picture of ``torchdof inspect``."""
     image, depth = motorcycle()
     report = inspect_depth(image, depth, torchdof.Camera.from_fov(FOV_X_DEG, 0.02, 2.8))
     write_sheet(path, {caption.partition(":")[0]: half(panel) for caption, panel in panels(image, report).items()})
@@ -138,7 +138,7 @@ def draw_bokeh(path: Path) -> None:
 
 
 def draw_field(path: Path) -> None:
-    """The left half of a street at night, through the middle of a traced lens all over and through all its field."""
+    """The left half of a street at night, with the kernels of the middle of the frame, and with those of the field."""
     from torchdof.fit import trace_table
     from torchdof.fit.lens import Lens
     from torchdof.fit.lens.lens import RGB_UM
@@ -170,7 +170,7 @@ def draw_lights(path: Path, tables: dict[str, torchdof.BlurTable]) -> None:
 
 
 def draw_layers(path: Path) -> None:
-    """What lies behind the focus, in it and in front of it, each blurred by itself, on grey."""
+    """Surfaces behind the focus, in focus and in front of it, each blurred alone, on grey."""
     image, depth = motorcycle()
     camera = torchdof.Camera.from_fov(FOV_X_DEG, APERTURE_RADIUS_M, 2.5)
     coc_px, dof = camera.coc_px(depth, image.shape[-1]), torchdof.DepthOfField(camera)
@@ -205,7 +205,7 @@ def draw_edges(path: Path) -> None:
 
 
 def draw_fit(path: Path) -> None:
-    """A dot in focus, the same dot out of focus, and what ``torchdof fit --plots`` draws of the two."""
+    """A dot in focus, the same dot out of focus, and the plot of ``torchdof fit --plots`` for both."""
     simulator = runpy.run_path(str(ROOT / "tests/fit/simulator.py"))
     camera = torchdof.Camera(focal_length_mm=50.0, f_number=2.8, focus_m=1.0)
     radius = float(camera.coc_px(torch.full((1, 1, 1, 1), 0.7), 640).abs())

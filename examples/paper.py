@@ -2,13 +2,12 @@
 
 Usage: python examples/paper.py --out out
 
-First the shipped table ``sato_j15``: its curve, its blur texture, a blurred quad. The paper publishes Table 1 but not
-the samples it was fitted to, so that fit is of samples of the table's own curve: it shows that the fit inverts eq. (1),
-and nothing about a camera.
-
-Then the real test, the paper's own experiment with a lens prescription in the place of the camera: a white dot on black
-paper, in focus at 0.20 m, photographed there and at 0.50 m with noise; read back from the files, fitted both ways (the
-paper's ratio and the forward model), each compared with the truth, made a table, rendered.
+1. The shipped table ``sato_j15``: its curve, its blur texture, a blurred quad. The paper publishes Table 1, but not the
+   samples to which it was fitted. So this fit uses samples of the table's own curve: it tests that the fit inverts
+   eq. (1), and does not test a camera.
+2. The paper's experiment, with a lens prescription instead of the camera. A white dot on black paper is in focus at
+   0.20 m, and photographed there and at 0.50 m, with noise. The files are read and fitted twice, by the paper's ratio
+   and by the forward model. Both fits are compared with the traced spot; the second one is made a table and rendered.
 """
 
 import argparse
@@ -25,14 +24,14 @@ from torchdof.fit.plots import picture_of_fit, picture_of_quad, picture_of_table
 from torchdof.io.images import Picture, write_image
 from torchdof.optics.psf import pixel_kernels
 
-FOCUS_M, PAPER_M = 0.20, 0.50  # where the dot is in focus, and where it is photographed out of focus
+FOCUS_M, PAPER_M = 0.20, 0.50  # distances of the dot in focus and out of focus
 WIDTH, HEIGHT, SENSOR_MM = 480, 360, 9.0  # the middle of a 36 mm sensor of 1920 pixels
 DOT_RADIUS_MM, F_NUMBER = 1.5, 16.0
 NOISE, WHITE = 0.003, 0.8
 
 
 def main() -> None:
-    """Draw everything."""
+    """Draw all figures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the pictures")
     parser.add_argument("--lens", default="double_gauss_50mm", help="prescription: a file or the name of a shipped one")
@@ -43,7 +42,7 @@ def main() -> None:
 
 
 def draw_table_1(out: Path) -> None:
-    """Figures 2 to 4 from the numbers of Table 1; the paper's own samples are not published."""
+    """Figures 2 to 4 from the numbers of Table 1."""
     table = torchdof.BlurTable.load("sato_j15")
     sigma, r_c = (float(table.node_params[k][0, 0]) for k in ("sigma", "r_c"))
     strength = 0.0 if table.strength is None else float(table.strength[0])
@@ -76,13 +75,13 @@ def draw_experiment(out: Path, lens: Lens) -> None:
 
     ratio = fit_pair(pair.sharp, pair.blurred, model="ratio")
     picture_of_fit(ratio, title="the paper's ratio, eq. (1)").savefig(out / "traced_fig2_ratio.png")
-    say("the paper's ratio, which measures the dot and the kernel together", ratio)
+    show("the paper's ratio, which measures the dot and the kernel together", ratio)
     print(f"  from {blur_strength(pair.sharp, pair.blurred)[0].size} samples along 36 spokes")
 
     result = fit_captures(captures, command="examples/paper.py")
     (forward,) = result.fits
     picture_of_fit(forward).savefig(out / "traced_fig2_forward.png")
-    say("the forward model, which measures the kernel", forward)
+    show("the forward model, which measures the kernel", forward)
 
     compare(spot, ratio, forward)
 
@@ -108,7 +107,7 @@ def draw_experiment(out: Path, lens: Lens) -> None:
 
 
 def compare(spot: Spot, ratio: BlurFit, forward: BlurFit) -> None:
-    """Both fits against the spot that took the photograph: the size of the blur, and a natural image through it."""
+    """Prints the errors of both fits against the traced spot: size of the blur, and PSNR of a blurred natural image."""
     true = kernel_of(spot)
     print("against the truth, the traced spot:")
     for what, fit in (("ratio", ratio), ("forward", forward)):
@@ -120,13 +119,13 @@ def compare(spot: Spot, ratio: BlurFit, forward: BlurFit) -> None:
 
 
 def rms_radius(kernel: np.ndarray) -> float:
-    """Root of the mean squared distance from the centre, px."""
+    """Root mean square distance from the centre, px."""
     away = np.arange(kernel.shape[0]) - kernel.shape[0] // 2
     return float(np.sqrt((kernel * (away[:, None] ** 2 + away**2)).sum() / kernel.sum()))
 
 
 def photograph(folder: Path, lens: Lens) -> Spot:
-    """Two photographs of the dot with their capture.toml; returns the traced spot at the paper's second place."""
+    """Writes two photographs of the dot and their capture.toml; returns the traced spot at ``PAPER_M``."""
     folder.mkdir(parents=True, exist_ok=True)
     sensor = focus_sensor(lens, FOCUS_M)
     focal = lens.paraxial().focal_length
@@ -153,14 +152,14 @@ def photograph(folder: Path, lens: Lens) -> Spot:
 
 
 def blur(picture: np.ndarray, spot: Spot) -> np.ndarray:
-    """The picture as the lens spreads it: rays collected by the pixels of a square that holds the spot."""
+    """The picture convolved with the traced spot."""
     from scipy.signal import fftconvolve
 
     return np.asarray(fftconvolve(picture, kernel_of(spot), mode="same"))
 
 
 def kernel_of(spot: Spot) -> np.ndarray:
-    """The share of a spot's rays that each pixel of a square collects."""
+    """Share of a spot's rays in each pixel of a square that contains the spot."""
     scale = WIDTH / SENSOR_MM
     half = int(np.ceil(spot.radius * scale)) + 1
     edges = np.arange(-half, half + 2) - 0.5
@@ -183,7 +182,7 @@ def quad(width: int, height: int, side: float) -> torch.Tensor:
     return picture
 
 
-def say(what: str, fit: BlurFit) -> None:
+def show(what: str, fit: BlurFit) -> None:
     """Print a fit."""
     print(f"{what}:\n{fit.summary()}")
 

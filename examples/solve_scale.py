@@ -2,14 +2,14 @@
 
 Usage: python examples/solve_scale.py --scene tests/data/scenes/room --out out
 
-The sharp image and its depth are known, the depth as an estimator gives it: 8 bits of disparity, without scale and
-shift. One picture taken with a real aperture shows how far each pixel is blurred. All four numbers move together, from
-a guess, until the rendering is the picture.
+Given are the sharp image, its relative disparity in 8 bits (as an estimator gives it, without scale and shift), and one
+picture taken through a lens. The four numbers start from a guess and are optimised together until the rendering matches
+the picture.
 
-What a picture can tell: the radius of the circle of confusion is ``K (1/focus - shift - scale * disparity)``, with K of
-aperture and focal length. That is a straight line over disparity, of two numbers; so two of the four stay free, and
-metres come from what is known beside the picture, as the f-number and the focus from its EXIF data (``--known f_number
-focus_m``). Without these, what is found renders the same picture, in metres of its own.
+One picture does not determine all four. The radius of the circle of confusion is ``K (1/focus - shift - scale *
+disparity)``, with K from aperture and focal length. This is a straight line over disparity, which has two parameters.
+The other two numbers must be known for a result in metres, for example f-number and focus from EXIF (``--known f_number
+focus_m``). Otherwise the solution renders the same picture, but its metres are wrong by an unknown scale and shift.
 """
 
 import argparse
@@ -27,7 +27,8 @@ from torchdof.io.sheet import write_sheet
 from torchdof.reference.metrics import display, psnr
 from torchdof.reference.scenes import Scene, read_scenes
 
-STAGES = ((4, 60, 0.08), (2, 40, 0.04), (1, 25, 0.02))  # coarser by, steps, rate: far from the truth, detail misleads
+# Downsampling factor, steps, learning rate. Coarse stages come first: far from the solution, detail misleads.
+STAGES = ((4, 60, 0.08), (2, 40, 0.04), (1, 25, 0.02))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,15 +48,15 @@ class Found:
 def solve(
     image: Tensor, blurred: Tensor, disparity: Tensor, camera: torchdof.Camera, guess: Found, known: Collection[str]
 ) -> Found:
-    """Moves the numbers of a guess until the rendering is the picture.
+    """Optimises the numbers of a guess until the rendering matches the picture.
 
     Args:
         image: ``[1, 3, H, W]``, all in focus, linear light.
         blurred: ``[1, 3, H, W]``, the picture.
         disparity: ``[1, 1, H, W]``, from 0 to 1, larger is nearer.
         camera: Focal length and sensor of the picture.
-        guess: Where to begin.
-        known: Names of numbers of the guess that are known and stand still.
+        guess: Starting values.
+        known: Names of the numbers that are kept fixed.
     """
     logs = {name: torch.tensor(value).log() for name, value in dataclasses.asdict(guess).items()}
     moving = [logs[name].requires_grad_() for name in logs if name not in known]
@@ -63,7 +64,7 @@ def solve(
         task = progress.add_task("solving", total=sum(steps for _, steps, _ in STAGES))
         for factor, steps, rate in STAGES:
             small, goal, map_ = (F.avg_pool2d(x, factor) for x in (image, blurred, disparity))
-            goal, margin = display(goal), max(2, 24 // factor)  # what lies outside the frame blurs into its border
+            goal, margin = display(goal), max(2, 24 // factor)  # the unknown outside of the frame blurs into its border
             dof = torchdof.DepthOfField(camera, tolerance=2 / 255, check=False)
             optimizer = torch.optim.Adam(moving, lr=rate)
             schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
@@ -81,13 +82,13 @@ def solve(
 
 
 def as_estimated(depth: Tensor) -> tuple[Tensor, float, float]:
-    """Disparity as an estimator gives it, 0 to 1 in 8 bits, and the scale and shift that were lost."""
+    """Disparity as an estimator gives it, 0 to 1 in 8 bits, and its true scale and shift."""
     low, high = (1 / depth).aminmax()
     return (255 * (1 / depth - low) / (high - low)).round() / 255, float(high - low), float(low)
 
 
 def run(scene: Scene, known: Collection[str], out: Path) -> None:
-    """Solves one scene, prints what was found beside what is true, and writes pictures."""
+    """Solves one scene, prints guess, solution and truth, and writes pictures."""
     disparity, scale, shift = as_estimated(scene.depth)
     true = Found(scale, shift, float(scene.camera.focus_m), float(scene.camera.f_number))
     guess = Found(0.6 * scale, 1.3 * shift, 0.8 * true.focus_m, 1.5 * true.f_number)
@@ -121,7 +122,7 @@ def main() -> None:
     parser.add_argument("--known", nargs="*", default=[], choices=[f.name for f in dataclasses.fields(Found)])
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the pictures")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)  # on pictures this small, threads wait for each other longer than they work
+    torch.set_num_threads(1)  # faster for pictures this small
     arguments.out.mkdir(parents=True, exist_ok=True)
     for scene in read_scenes(arguments.scene):
         run(scene, arguments.known, arguments.out)

@@ -16,7 +16,7 @@ settings.register_profile("many", parent=settings.get_profile("local"), max_exam
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE") or ("ci" if os.environ.get("CI") else "local"))
 
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # a core for each worker, and for what it starts
+if "PYTEST_XDIST_WORKER" in os.environ:  # one core for each worker and its subprocesses
     os.environ["OMP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
 
@@ -28,13 +28,13 @@ def _same_random_numbers() -> None:
 
 @pytest.fixture(scope="session")
 def simulator() -> ModuleType:
-    """A camera that photographs dots: `fit/simulator.py`."""
+    """The module `tests/fit/simulator.py`: a simulated camera that photographs dots."""
     return importlib.import_module("tests.fit.simulator")
 
 
 @pytest.fixture(scope="session")
 def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of all workers of this run."""
+    """A folder shared by all workers of this run."""
     own = tmp_path_factory.getbasetemp()
     folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "shared"
     folder.mkdir(exist_ok=True)
@@ -67,6 +67,5 @@ def plain(shared_folder: Path) -> Any:
 
 @pytest.fixture(scope="session")
 def exported_by_command(shared_folder: Path) -> tuple[Path, str]:
-    """A file of blur radii as ``torchdof export`` writes it, without occlusion, and what that printed."""
-    path, told = exported.command_once(shared_folder)
-    return path, told
+    """A file with blur radii as input, written by ``torchdof export``, and the output of the command."""
+    return exported.command_once(shared_folder)

@@ -1,4 +1,4 @@
-"""Modules with their exported files, written once in a run of the tests: tracing takes longer than everything else."""
+"""Modules and their exported files, written once in a test run, because tracing takes long."""
 
 import dataclasses
 import pickle
@@ -20,11 +20,11 @@ from torchdof.render.plan import Plan
 
 CAMERA = torchdof.Camera.from_fov(50.0, 0.05, 2.0)
 SMALL = torchdof.Camera(sensor_width_mm=4.0)  # 4 px at infinity in the hard cases' small frames
-GIVEN: dict[str, Any] = {"depth_edges": "as given"}  # as a file takes it
+GIVEN: dict[str, Any] = {"depth_edges": "as given"}  # the default of an exported file
 MODULES: dict[str, Callable[[], torchdof.DepthOfField]] = {
-    # with occlusion, at resolutions down to a sixteenth: the one such file that a run of the tests writes
+    # with occlusion, at resolutions down to a sixteenth; slow to trace
     "layered": lambda: torchdof.DepthOfField(SMALL, **GIVEN, tolerance=64 / 255, max_coc_px=16.0, check=False),
-    # without occlusion, which is traced in a few seconds
+    # without occlusion; traced in a few seconds
     "plain": lambda: torchdof.DepthOfField(
         CAMERA, **GIVEN, tolerance=16 / 255, max_coc_px=2.5, occlusion=False, check=False
     ),
@@ -40,7 +40,7 @@ MODULES: dict[str, Callable[[], torchdof.DepthOfField]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Exported:
-    """A module, its file and how they compare."""
+    """A module, its file, and the result of comparing them."""
 
     dof: torchdof.DepthOfField
     path: Path
@@ -52,34 +52,34 @@ class Exported:
         return Plan.all(self.dof.options.max_coc_px, self.dof.options.tolerance, rays=True)
 
     def render(self, *tensors: Tensor) -> Tensor:
-        """What onnxruntime makes of the file."""
+        """The picture of the file in onnxruntime."""
         runner = session(self.path)
         feed = {v.name: t.numpy() for v, t in zip(runner.get_inputs(), tensors, strict=True)}
         return torch.from_numpy(np.asarray(runner.run(None, feed)[0]))
 
     def eager(self, *tensors: Tensor) -> Tensor:
-        """What PyTorch makes of the module, with the layers of the file."""
+        """The picture of the module in PyTorch, with the layers of the file."""
         with torch.no_grad():
             return self.dof(*tensors, plan=self.plan)
 
 
 def export_once(name: str, folder: Path) -> Exported:
-    """The module of that name and its file in a folder; whichever process asks first writes it."""
-    dof, path, told = MODULES[name](), folder / f"{name}.onnx", folder / f"{name}.verification"
+    """The module of that name and its file in a folder; the first process to call this writes it."""
+    dof, path, verification = MODULES[name](), folder / f"{name}.onnx", folder / f"{name}.verification"
     with FileLock(folder / f"{name}.lock"):
-        if not told.exists():
-            told.write_bytes(pickle.dumps(to_onnx(dof, path)))
-    return Exported(dof, path, pickle.loads(told.read_bytes()))
+        if not verification.exists():
+            verification.write_bytes(pickle.dumps(to_onnx(dof, path)))
+    return Exported(dof, path, pickle.loads(verification.read_bytes()))
 
 
 def command_once(folder: Path) -> tuple[Path, str]:
-    """A file of blur radii that repairs edges, alone in its folder, and what ``torchdof export`` printed of it."""
-    path, told = folder / "command" / "dof.onnx", folder / "command.json"
+    """A file with blur radii as input and repair of edges, and the output of ``torchdof export``."""
+    path, output = folder / "command" / "dof.onnx", folder / "command.json"
     with FileLock(folder / "command.lock"):
-        if not told.exists():
+        if not output.exists():
             path.parent.mkdir()
             options = ["--inputs", "coc_px", "--max-coc", "2", "--no-occlusion", "--depth-edges", "auto", "--json"]
             result = CliRunner().invoke(app, ["export", "-o", str(path), *options], catch_exceptions=False)
             assert result.exit_code == 0, result.output
-            told.write_text(result.stdout)
-    return path, told.read_text()
+            output.write_text(result.stdout)
+    return path, output.read_text()

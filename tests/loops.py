@@ -1,4 +1,4 @@
-"""Slow and obvious: plain loops in float64 that the tests compare everything else with."""
+"""Slow and obvious reference implementations: plain loops in float64."""
 
 import math
 from collections.abc import Callable
@@ -12,11 +12,11 @@ from torch import Tensor
 
 from torchdof import BlurTable
 
-IN_FOCUS = 2e-4  # on the blur axis; what lies nearer to focus is as it is
+IN_FOCUS = 2e-4  # on the blur axis; smaller blurs count as in focus
 
 
 def scatter(light: Tensor, kernel_of: Callable[[int, int, int], Tensor]) -> Tensor:
-    """Every pixel's light times its own kernel, added up; what falls outside the frame is lost.
+    """Sum of every pixel's light times its own kernel; light outside the frame is lost.
 
     `kernel_of(item, row, column)` is `[1 or C, k, k]`, `light` is `[B, C, H, W]`.
     """
@@ -37,9 +37,9 @@ def scatter(light: Tensor, kernel_of: Callable[[int, int, int], Tensor]) -> Tens
 
 
 def kernel_between(coc: float, nodes: list[float] | None, table: BlurTable, width: int) -> Tensor:
-    """Kernel of one pixel: its own (nodes None), or those of the two layers next to it, mixed linearly.
+    """Kernel of one pixel: its own (nodes None), or the linear mixture of the two neighbouring layers.
 
-    The nodes are places of layers on the blur axis: signed, radius^2 / (radius + 1/2) less what is in focus.
+    The nodes are places of layers on the blur axis: `sign (radius^2 / (radius + 1/2) - IN_FOCUS)`.
     """
 
     def at(signed: float) -> Tensor:
@@ -72,7 +72,7 @@ def mix(first: Tensor, second: Tensor, share: float) -> Tensor:
 def accumulate(
     image: Tensor, coc: Tensor, table: BlurTable, nodes: list[float] | None = None, normalize: bool = True
 ) -> Tensor:
-    """The paper's renderer: every pixel's billboard accumulates; divided by the sum of the weights if asked for."""
+    """The paper's renderer: the sum of every pixel's billboard, with `normalize` divided by the sum of the weights."""
 
     def kernel_of(item: int, row: int, column: int) -> Tensor:
         return kernel_between(float(coc[item, 0, row, column]), nodes, table, image.shape[-1])
@@ -87,7 +87,7 @@ def normalised_convolution(image: Tensor, kernel: Tensor) -> Tensor:
 
 
 def disc_by_columns(radius: float, size: int) -> Tensor:
-    """Disc integrated over the pixels: each pixel cut into columns, the disc's chord clipped to each."""
+    """Disc integrated over the pixels: each pixel is cut into columns, and the disc's chord clipped to each."""
     columns = 40_000 // size
     half = size // 2
     edge = torch.arange(size + 1, dtype=torch.float64) - half - 0.5
@@ -102,7 +102,7 @@ def disc_by_columns(radius: float, size: int) -> Tensor:
 
 
 def interpolated(profile: Callable[[Tensor], Tensor], reach: float, size: int, samples: int = 200) -> Tensor:
-    """Kernel of so many pixels of an isotropic profile of so large a reach, sampled finely."""
+    """Kernel `[size, size]` of an isotropic profile with radius `reach` in pixels, finely sampled."""
     places = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples * 2 * reach - reach
     return seen_by_pixels(profile(torch.hypot(places[:, None], places[None, :])), places, size)
 
@@ -110,8 +110,8 @@ def interpolated(profile: Callable[[Tensor], Tensor], reach: float, size: int, s
 def seen_by_pixels(light: Tensor, places: Tensor, size: int) -> Tensor:
     """Kernel `[size, size]` of a PSF's light `[n, n]` at places `[n]` along each axis, by the interpolator of pixels.
 
-    That is the cubic spline through a single 1 among 0s, at most twice the hat of linear interpolation in effect; what
-    is negative is taken from the four neighbours in proportion to their light.
+    The interpolator is the cubic spline through a single 1 among 0s. The result is limited to twice that of linear
+    interpolation, and negative values are raised to 0 with light of the four neighbours, in proportion to their own.
     """
     knots = np.arange(-60, 61)
     cardinal = CubicSpline(knots, (knots == 0).astype(float), bc_type="natural")
@@ -136,7 +136,7 @@ _FREQUENCY = torch.fft.fftfreq(PERIOD, dtype=torch.float64)
 
 
 def _powers_and_targets(spectrum: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """Of pixels of photographs, at each frequency: power, and this times the PSF's spectrum and its square."""
+    """For the pixels of photographs, at each frequency: power, power times the PSF's spectrum, and times its square."""
     zero = torch.zeros(PERIOD, PERIOD, dtype=torch.float64)
     sums = [zero, zero, zero]
     for down in range(-3, 4):
@@ -151,7 +151,7 @@ def _powers_and_targets(spectrum: Callable[[Tensor], Tensor]) -> tuple[Tensor, T
 
 
 def expected_error(kernel: Tensor, spectrum: Callable[[Tensor], Tensor]) -> float:
-    """Squared error of a kernel on pixels of photographs, of power 1 / f^2, against a PSF of this spectrum."""
+    """Expected squared error of a kernel on photographs (power 1 / f^2) against a PSF with this spectrum."""
     power, meant, squares = _powers_and_targets(spectrum)
     half = kernel.shape[-1] // 2
     axis = torch.arange(-half, half + 1, dtype=torch.float64)
@@ -161,7 +161,7 @@ def expected_error(kernel: Tensor, spectrum: Callable[[Tensor], Tensor]) -> floa
 
 
 def best_kernel(spectrum: Callable[[Tensor], Tensor], half: int) -> Tensor:
-    """The kernel of least expected error that is nowhere negative and sums to 1, by non-negative least squares."""
+    """The non-negative kernel with sum 1 and least expected error, by non-negative least squares."""
     power, meant, _ = _powers_and_targets(spectrum)
     orbits: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for y in range(-half, half + 1):
@@ -191,6 +191,6 @@ def natural_scene(size: int, seed: int) -> Tensor:
 
 
 def spread(values: Tensor, kernel: Tensor) -> Tensor:
-    """Values `[1, 1, H, W]` convolved with a kernel, continued beyond the frame as they are at it."""
+    """Values `[1, 1, H, W]` convolved with a kernel; border pixels are repeated outside the frame."""
     half = kernel.shape[-1] // 2
     return functional.conv2d(functional.pad(values, (half,) * 4, mode="replicate"), kernel[None, None])

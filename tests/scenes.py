@@ -1,4 +1,4 @@
-"""Scenes that tests share: hostile ones, each with its truth, and random ones, each by its seed."""
+"""Scenes shared by tests: hostile cases with known truth, and random scenes by seed."""
 
 import dataclasses
 import math
@@ -34,27 +34,39 @@ def texture(dtype: torch.dtype = torch.float32, channels: int = 3) -> Tensor:
 
 
 def whole(value: float, height: int = HEIGHT, width: int = WIDTH) -> Tensor:
-    """A map of one value."""
+    """A constant map."""
     return torch.full((1, 1, height, width), value)
 
 
 def slope(first: float, last: float, height: int = HEIGHT, width: int = WIDTH) -> Tensor:
-    """A map that changes evenly from the left to the right."""
+    """A map that is linear from left to right."""
     return torch.linspace(first, last, width).expand(1, 1, height, width).clone()
 
 
 def halves(left: float, right: float) -> Tensor:
-    """A map of two planes."""
+    """A map of two planes, left and right."""
     values = whole(left)
     values[..., WIDTH // 2 :] = right
     return values
 
 
+RED, BLUE = torch.tensor([0.7, 0.2, 0.1]), torch.tensor([0.1, 0.3, 0.8])
+
+
+def mixed_edge(share: float, near_px: float = -12.0, far_px: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Red in front of blue. Column 31 is mixed: coverage `share` of red, and the depth of the larger part."""
+    red = (torch.arange(64) < 31).float()
+    red[31] = share
+    image = (red * RED[:, None] + (1 - red) * BLUE[:, None])[None, :, None].expand(1, 3, 48, 64)
+    coc = torch.where(red >= 0.5, near_px, far_px).expand(1, 1, 48, 64)
+    return image, coc
+
+
 def disc(image: Tensor, coc_px: Tensor, table: BlurTable | None = None) -> Tensor:
-    """Closed form of a plane: the image, continued over its border, convolved with a kernel, in float64."""
+    """Closed form for a plane: the image, continued outside its border, convolved with a kernel, in float64."""
     image, radius = image.double(), coc_px.flatten()[:1].double()
     if table is None:
-        half = max(image.shape[-2:]) - 1  # from one pixel of the frame to another
+        half = max(image.shape[-2:]) - 1  # the largest distance between two pixels of the frame
         kernel = BlurTable.disc().kernels(radius, image.shape[-1], window=2 * half + 1)[0]
     else:
         kernel = table.kernels(radius, image.shape[-1])[0]
@@ -64,19 +76,19 @@ def disc(image: Tensor, coc_px: Tensor, table: BlurTable | None = None) -> Tenso
 
 
 def mean(image: Tensor, _: Tensor) -> Tensor:
-    """Closed form of an endless blur: means over as much as lies within the frame's longer side."""
+    """Closed form for a blur far larger than the frame: means over a square of twice its longer side."""
     half = max(image.shape[-2:]) - 1
     wide = continued(image, None, threshold(image), (half,) * 4, half)
     return functional.avg_pool2d(wide, 2 * half + 1, stride=1)
 
 
 def itself(image: Tensor, _: Tensor) -> Tensor:
-    """The picture of what is in focus, or of even light."""
+    """Closed form in focus, and for constant light: the image."""
     return image
 
 
 def darkest(image: Tensor, _: Tensor) -> Tensor:
-    """The picture of the light around a highlight."""
+    """Closed form outside the disc of a highlight: the light around it."""
     return torch.full_like(image, float(image.min()))
 
 
@@ -86,18 +98,18 @@ def _brightest(truth: Tensor) -> Tensor:
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A hostile scene of 32 x 24 pixels, its truth, and how far from it a pixel may be, relative to that pixel.
+    """A hostile scene of 32 x 24 pixels with its truth and limits of the error.
 
     Args:
-        name: What is hostile.
-        maps: Circles of confusion in pixels, or depths in metres where there are cameras: each is a picture.
-        truth: A closed form of image and circle of confusion; None is the same rendering in float64.
-        light: The image of a type.
-        cameras: For each of the maps, or one for all.
-        float32, float16: Limits of the error.
-        per: What the error is relative to, from the truth.
-        where: Pixels that are looked at.
-        options: Of the rendering.
+        name: Description of the difficulty.
+        maps: Circles of confusion in pixels, or depths in metres if there are cameras; one picture each.
+        truth: Closed form as a function of image and circle of confusion; None is the same rendering in float64.
+        light: The image as a function of the dtype.
+        cameras: One for each map, or one for all.
+        float32, float16: Largest relative error.
+        per: Divisor of the error, as a function of the truth.
+        where: Mask of the pixels that are checked.
+        options: Options of the rendering.
     """
 
     name: str
@@ -123,7 +135,7 @@ class Case:
             yield self.light(dtype), values, camera
 
     def error(self, dtype: torch.dtype, **way: Any) -> float:
-        """The largest difference from the truth in any of the pictures; infinite where one is not finite."""
+        """The largest error in any of the pictures; infinite if a picture is not finite."""
         errors = []
         for image, values, camera in self.pairs(dtype):
             out = rendered(image, values, camera, **{**self.options, **way}).double()
@@ -137,24 +149,24 @@ class Case:
         return float(max(errors))
 
     def limit(self, dtype: torch.dtype) -> float:
-        """How large the error may be."""
+        """Largest allowed error."""
         return self.float32 if dtype == torch.float32 else self.float16
 
 
 def rendered(image: Tensor, values: Tensor, camera: Camera | None, **options: Any) -> Tensor:
-    """The picture by circle of confusion, or by depth where there is a camera."""
+    """The picture; without a camera ``values`` are circles of confusion, else depths."""
     if camera is None:
         return blur_by_coc(image, values, **options)
     return DepthOfField(camera, **options)(image, values)
 
 
 def even(value: float, channels: int = 3) -> Light:
-    """One light everywhere, or the brightest that the type has."""
+    """Constant light, clamped to the largest number of the dtype."""
     return lambda dtype: torch.full((1, channels, HEIGHT, WIDTH), min(value, torch.finfo(dtype).max), dtype=dtype)
 
 
 def highlight(value: float, around: float = 1e-4, dtype: torch.dtype | None = None, side: int = 1) -> Light:
-    """A square of light at the middle."""
+    """A square of light in the middle of the frame."""
 
     def light(given: torch.dtype) -> Tensor:
         image = torch.full((1, 1, HEIGHT, WIDTH), around, dtype=dtype or given)
@@ -166,7 +178,7 @@ def highlight(value: float, around: float = 1e-4, dtype: torch.dtype | None = No
 
 
 def beyond(radius: float) -> Tensor:
-    """Pixels farther from the middle."""
+    """Mask of the pixels farther than ``radius`` from the middle."""
     y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
     return torch.hypot((y - HEIGHT // 2).double(), (x - WIDTH // 2).double()) > radius
 
@@ -177,7 +189,7 @@ def noise(seed: int) -> Tensor:
 
 
 def _near_a_node(offset: int) -> Tensor:
-    """Two planes; the nearer one sits on a layer's node, or some units in the last place off it."""
+    """Two planes; the nearer one is ``offset`` units in the last place from a layer's node."""
     node = torch.tensor([c for c in Plan.of_scene(torch.tensor([[[[0.0, 9.0]]]]), 1 / 255).coc_px if 2 < c < 6][0])
     for _ in range(abs(offset)):
         node = torch.nextafter(node, torch.tensor(math.copysign(math.inf, offset)))
@@ -226,8 +238,8 @@ CASES = [
     Case("a plane exactly on a layer's node", [_near_a_node(0)]),
     Case("one unit in the last place to either side of a node", [_near_a_node(-1), _near_a_node(1)],
          lambda image, _: blur_by_coc(image, _near_a_node(0).double())),
-    Case("in focus by a hair", [whole(c * _FOCUS_ENDS) for c in (0.9999, -0.9999)], itself, **_EXACT),
-    Case("out of focus by a hair", [whole(c * _FOCUS_ENDS) for c in (1.0001, -1.0001)], disc),
+    Case("just in focus", [whole(c * _FOCUS_ENDS) for c in (0.9999, -0.9999)], itself, **_EXACT),
+    Case("just out of focus", [whole(c * _FOCUS_ENDS) for c in (1.0001, -1.0001)], disc),
     Case("coc 0, 1e-7 and 0.009 px", [whole(c) for c in (0.0, 1e-7, -1e-7, 0.009, -0.009)], itself, **_EXACT),
     Case("coc 0.6 to 23 px", [whole(c) for c in (0.625, 1.0, -1.5, 3.375, -8.75, 12.75, 23.0)], disc),
     Case("coc larger than the frame", [whole(c) for c in (45.0, -45.0, 1e5, -1e5)], mean),
@@ -278,25 +290,25 @@ SHARP_PX = 0.5
 
 @dataclasses.dataclass
 class Scene:
-    """Arguments of :func:`torchdof.blur_by_coc` in float64, by a seed that reproduces them."""
+    """Arguments of :func:`torchdof.blur_by_coc` in float64."""
 
     image: Tensor
     coc_px: Tensor
     options: dict[str, Any]
 
     def blurred(self, dtype: torch.dtype = torch.float32, step_px: float | Tensor = 0.0, **options: Any) -> Tensor:
-        """The picture in that type, with a step added to the circle of confusion."""
+        """The picture rendered in ``dtype``, with ``step_px`` added to the circle of confusion."""
         given = {**self.options, **options}
         given = {k: v.to(dtype) if isinstance(v, Tensor) else v for k, v in given.items()}
         return blur_by_coc(self.image.to(dtype), (self.coc_px + step_px).to(dtype), **given)
 
     def turned(self, turn: Callable[[Tensor], Tensor]) -> "Scene":
-        """The scene with the frame held otherwise."""
+        """The scene with a flip or transpose ``turn`` applied to all maps."""
         options = {k: turn(v).contiguous() if isinstance(v, Tensor) else v for k, v in self.options.items()}
         return Scene(turn(self.image).contiguous(), turn(self.coc_px).contiguous(), options)
 
     def exposed(self, times: float) -> "Scene":
-        """The scene in brighter light."""
+        """The scene with light multiplied by ``times``."""
         options = dict(self.options)
         if "background" in options:
             options["background"] = options["background"] * times
@@ -304,7 +316,7 @@ class Scene:
 
 
 def _beside_the_edge_of_focus(coc_px: Tensor) -> Tensor:
-    """What is in focus passes through, and what is blurred by a hair more does not: no scene is on that edge."""
+    """Moves radii away from ``SHARP_PX``, where the picture is discontinuous."""
     return torch.where((coc_px.abs() - SHARP_PX).abs() < 0.002, coc_px + 0.01, coc_px).contiguous()
 
 
@@ -319,13 +331,13 @@ def random_scene(
     """Images of noise, blocks, gradients and edges; coc of planes, discs, slopes, checkerboards, steps and noise.
 
     Args:
-        seed: Of the random numbers.
-        ways: With what is hidden filled in (``"filled"``), before a known ``"background"``, or ``"accumulated"``
-            without occlusion: one of these.
+        seed: Seed of the random numbers.
+        ways: Ways of rendering to choose from: ``"filled"`` (hidden surfaces are estimated), ``"background"`` (known),
+            ``"accumulated"`` (without occlusion).
         lamps: Whether there may be highlights.
-        multiple: Of which the sides of the frame are.
-        side: The longest.
-        kinds: Of maps.
+        multiple: The sides of the frame are multiples of this.
+        side: Longest side in pixels.
+        kinds: Kinds of coc maps to choose from.
     """
     draw, generator = random.Random(seed), torch.Generator().manual_seed(seed)
 
@@ -353,7 +365,7 @@ def random_scene(
         planes = (2.0 * uniform(draw.randint(2, 4)) - 1.0) * radius
         which = torch.randint(len(planes), (1, 1, height // 8 + 1, width // 8 + 1), generator=generator)
         coc_px = blocks(planes[which], 8)
-    elif kind == "quarters":  # on the very edge of many decisions
+    elif kind == "quarters":  # multiples of a quarter pixel lie exactly on many thresholds
         steps = torch.randint(-4, 5, (1, 1, height // 8 + 1, width // 8 + 1), generator=generator)
         coc_px = blocks((steps * radius).round().double() / 4, 8)
     elif kind == "discs":
@@ -392,7 +404,7 @@ def random_scene(
 
 
 def made(kind: str, height: int, width: int, radius: float, **options: Any) -> Scene:
-    """Random light, brighter on a grid of pixels if ``lamps`` are given, and a smooth map or one of three planes."""
+    """Random light, multiplied by ``lamps`` on a grid of pixels, and a smooth coc map or one of three planes."""
     torch.manual_seed(3)
     items, lamps = options.pop("items", 1), options.pop("lamps", 1.0)
     image = torch.rand(items, 3, height, width)
@@ -406,7 +418,7 @@ def made(kind: str, height: int, width: int, radius: float, **options: Any) -> S
 
 
 def assert_same_picture(plain: Tensor, compiled: Tensor, image: Tensor) -> None:
-    """Within 1e-5 of the light nearby."""
+    """Asserts that pictures differ by at most 1e-5 of the light nearby."""
     assert plain.dtype == compiled.dtype and plain.shape == compiled.shape
     assert torch.equal(torch.isfinite(plain), torch.isfinite(compiled))
     plain, compiled, image = (torch.nan_to_num(t.float(), 0.0, 0.0, 0.0) for t in (plain, compiled, image))

@@ -1,4 +1,4 @@
-"""Depth of field among Kornia's augmentations, and torchvision's."""
+"""``RandomDepthOfField`` as one of Kornia's augmentations and as a transform of torchvision."""
 
 import functools
 import io
@@ -27,7 +27,7 @@ def random_dof(**changes: Any) -> RandomDepthOfField:
     return RandomDepthOfField(**{"camera": CAMERA, "p": 1.0, **changes})
 
 
-def test_it_is_the_rendering_of_what_was_drawn() -> None:
+def test_it_renders_with_the_parameters_that_were_drawn() -> None:
     image, depth = sample()
     aug = random_dof(transfer="linear", tolerance="preview", p=0.5)
     torch.manual_seed(2)
@@ -47,7 +47,7 @@ def test_it_is_the_rendering_of_what_was_drawn() -> None:
     assert torch.equal(out[~chosen], image[~chosen])
 
 
-def test_images_that_are_left_out_are_not_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_that_were_not_chosen_are_not_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     rendered = []
 
     def noted(image: Tensor, *arguments: Any, **options: Any) -> Tensor:
@@ -71,7 +71,7 @@ def test_encoded_images_are_blurred_in_linear_light() -> None:
     assert torch.equal(out, encode(linear, "srgb", False, False))
 
 
-def test_it_is_repeated_by_its_parameters() -> None:
+def test_the_same_parameters_repeat_the_picture() -> None:
     image, depth = sample()
     aug = random_dof(p=0.7, table=[BlurTable.disc(), BlurTable.gaussian()])
     first = aug(image, depth)
@@ -98,7 +98,7 @@ def test_a_batch_can_share_its_draw() -> None:
         assert len(set(aug._params[name].tolist())) == 1
 
 
-def test_several_lenses_blur_each_their_own_images() -> None:
+def test_each_image_is_blurred_by_the_lens_that_was_drawn_for_it() -> None:
     image, depth = sample()
     tables = [BlurTable.disc(), BlurTable.gaussian()]
     aug = random_dof(table=tables)
@@ -118,7 +118,7 @@ def test_depth_may_lack_its_channel_or_be_shared(shape: tuple[int, ...]) -> None
     assert torch.equal(aug(image, depth.reshape(shape), params=aug._params), expected)
 
 
-def test_one_image_is_kept_or_becomes_a_batch_and_a_dict_is_taken() -> None:
+def test_one_image_keeps_its_shape_or_becomes_a_batch_and_a_dict_is_accepted() -> None:
     image, depth = sample(1)
     aug = random_dof(keepdim=True)
     out = aug(image[0], depth[0])
@@ -144,7 +144,7 @@ def test_gradients_reach_image_and_depth() -> None:
     assert image.grad is not None and depth.grad is not None and bool(depth.grad.any())
 
 
-# In Kornia's containers
+# Kornia's containers
 
 
 def test_image_depth_and_masks_stay_aligned() -> None:
@@ -161,7 +161,7 @@ def test_image_depth_and_masks_stay_aligned() -> None:
     out, moved, moved_labels = pipeline(image, depth, labels)
     assert out.shape == (4, 3, 12, 16) and moved.shape == moved_labels.shape == (4, 1, 12, 16)
     assert torch.equal(moved_labels, (moved > 2).float())
-    assert set(moved.unique().tolist()) <= {0.0, *depth.unique().tolist()}  # no depth is made up
+    assert set(moved.unique().tolist()) <= {0.0, *depth.unique().tolist()}  # depth is not interpolated
     drawn, steps = pipeline._params or [], list[Any](pipeline.children())
     sharp, same = K.AugmentationSequential(*steps[:3], data_keys=["input", "mask"])(image, depth, params=drawn[:3])
     assert torch.equal(same, moved)
@@ -208,7 +208,7 @@ def test_pixels_that_a_rotation_leaves_without_depth_stay_sharp() -> None:
     assert float(out[..., 0, 0].abs().max()) == 0.0
 
 
-# In torchvision's, and in a DataLoader
+# torchvision's Compose, and a DataLoader
 
 
 def test_torchvision_composes_dicts_of_its_tensors() -> None:
@@ -240,7 +240,7 @@ class Blurred(Dataset[Tensor]):
 
 
 @pytest.mark.filterwarnings("ignore:This DataLoader will create 4 worker processes:UserWarning")  # with fewer cores
-def test_four_workers_of_a_data_loader_blur_each_image_by_a_draw_of_its_own() -> None:
+def test_four_workers_of_a_data_loader_draw_different_parameters_for_each_image() -> None:
     torch.manual_seed(5)
     loader = DataLoader(Blurred(), batch_size=4, num_workers=4)
     images = torch.cat(list(loader))
@@ -260,7 +260,7 @@ def test_it_is_pickled_with_its_lenses() -> None:
     assert torch.equal(copy(image, depth, params=aug._params), expected)
 
 
-# Refused
+# Error messages
 
 IMAGE, DEPTH = sample()
 partial: Any = functools.partial
@@ -290,6 +290,6 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
 
 
 @pytest.mark.parametrize(("call", "message"), REFUSED)
-def test_what_makes_no_picture_is_refused_by_name(call: Callable[[], Any], message: str) -> None:
+def test_errors_name_the_argument(call: Callable[[], Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         call()

@@ -1,4 +1,4 @@
-"""Images, batches and clips: every rank is rendered as the batch of its items would be."""
+"""Single images and clips are rendered like a batch of their items."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ def clips() -> tuple[Tensor, Tensor]:
     return torch.rand(2, 3, 3, 9, 12), 0.6 + 3 * torch.rand(2, 3, 1, 9, 12)
 
 
-def test_one_image_is_rendered_as_a_batch_of_one() -> None:
+def test_a_single_image_is_rendered_like_a_batch_of_one() -> None:
     images, depths = clips()
     out = DOF(images[0, 1], depths[0, 1], focus_m=0.8)
     assert out.shape == (3, 9, 12)
@@ -51,12 +51,12 @@ def test_maps_may_be_shared_by_clips_or_frames(axes: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("axes", [(), (1,), (2, 1)])
-def test_a_part_of_a_frame_lies_in_memory_as_what_follows_reads_it(axes: tuple[int, ...]) -> None:
+def test_a_crop_of_a_frame_is_made_contiguous(axes: tuple[int, ...]) -> None:
     part = torch.rand(*axes, 3, 9, 12)[..., 2:7, 3:9]
     assert flattened(axes, "image", part, "C").is_contiguous()
 
 
-def test_background_and_attention_have_the_rank_of_the_image() -> None:
+def test_background_and_attention_of_a_single_image_have_its_rank() -> None:
     images, depths = clips()
     hidden: dict[str, Any] = {"background": images[0, 1], "background_depth": torch.full((1, 9, 12), 9.0)}
     out = DOF(images[0, 0], depths[0, 0], **hidden)
@@ -94,7 +94,7 @@ def test_gradients_reach_a_column_of_focus() -> None:
         ((3, 12), (1, 12), None, r"image must be \[B, C, H, W\]"),
     ],
 )
-def test_what_does_not_fit_is_refused(
+def test_mismatched_shapes_are_refused(
     image: tuple[int, ...], depth: tuple[int, ...], focus_m: Any, message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):

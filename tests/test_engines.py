@@ -1,7 +1,7 @@
-"""Two engines and an exported file make one picture: what each makes of hostile scenes and of random ones.
+"""Both engines and an exported file render the same picture, on hostile and on random scenes.
 
-Most pictures are the plain engine's, in float64, or a closed form's. `pytest -s tests/test_engines.py -k error` prints
-the errors that are measured.
+The reference is a closed form, or the plain engine in float64. `pytest -s tests/test_engines.py -k error` prints the
+measured errors.
 """
 
 import functools
@@ -48,7 +48,7 @@ BY_COLOUR = BlurTable("gaussian", [1.0], {"sigma": torch.tensor([[0.4], [0.5], [
 
 
 def _lens() -> BlurTable:
-    """A lens whose spots are random, and others across the field."""
+    """A lens with random spots that change across the field."""
     coc, radius, dice = torch.tensor([-0.9, -0.3, 0.2, 0.7]), torch.tensor([0.0, 1.5, 3.5]), torch.Generator()
     light, box = torch.rand(3, 4, 3, 16, 8, generator=dice), torch.rand(4, 3, 3, generator=dice) + 0.5
     spots = Field(coc, radius, box * coc.abs()[:, None, None], light)
@@ -74,7 +74,7 @@ def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
     return str(request.param)
 
 
-# Hostile scenes: each within its limit of the truth
+# Hostile scenes
 
 
 @EVERY_ENGINE
@@ -87,15 +87,18 @@ def test_the_error_of_a_hostile_scene_is_within_its_limit(case: Case, dtype: tor
 
 
 class File:
-    """An exported file beside the module that has its layers."""
+    """An exported file, and its module with the same layers."""
 
     def __init__(self, exported: Any) -> None:
         self.camera, self.session, self.portable = exported.dof.camera, session(exported.path), Portable(exported.dof)
 
     def render(self, image: Tensor, values: Tensor, camera: Camera | None) -> tuple[Tensor, Tensor]:
-        """The picture of the file and that of the module in float64; of a map of the coc by the depth that has it."""
+        """Pictures of the file and of the module in float64.
+
+        Without a camera ``values`` are circles of confusion, which are converted to depth because the file takes that.
+        """
         if camera is None:
-            reach = 1.05 * float(values.max().clamp_min(1.0))  # of infinity
+            reach = 1.05 * float(values.max().clamp_min(1.0))  # coc at infinity
             wide = self.camera.replace(f_number=1.0).coc_px(torch.full((1, 1, 1, 1), torch.inf), image.shape[-1])
             values = float(self.camera.focus_m) / (1.0 - values.double() / reach)
             camera = self.camera.replace(f_number=float(wide) / reach)
@@ -117,13 +120,13 @@ def file(layered: Any) -> File:
 def test_the_error_of_a_file_is_within_1e_5(file: File, case: Case) -> None:
     for image, values, camera in case.pairs():
         got, truth = file.render(image, values, camera)
-        # of each pixel; next to light that cancels (negative values) of the brightest
+        # relative to each pixel, or to the brightest one if negative light can cancel
         scale = truth.abs() if float(image.min()) >= 0 else truth.abs().max()
         apart = (got.double() - truth).abs() / scale.clamp_min(torch.finfo(torch.float32).tiny)
         assert float(torch.where(got == truth, 0.0, apart).max()) <= 1e-5
 
 
-# Where light or depth is none
+# Invalid light and depth
 
 
 def _hole(values: Tensor, bad: float) -> Tensor:
@@ -136,7 +139,7 @@ HOLE = _hole(torch.zeros(1, 1, HEIGHT, WIDTH), 1.0)[0, 0] > 0
 
 
 def assert_untouched_by_a_hole(render: Callable[[Tensor, Tensor], Tensor], bad: float) -> None:
-    """A bad depth passes sharp; whatever is in the hole, nobody sees it."""
+    """A pixel with a bad depth stays sharp, and its light does not reach other pixels."""
     image, other, depth = texture(), _hole(texture(), 1e6), _hole(slope(1.2, 6.0), bad)
     out = render(image, depth)
     assert torch.equal(out[..., HOLE], image[..., HOLE]) and torch.isfinite(out).all()
@@ -147,18 +150,18 @@ def assert_untouched_by_a_hole(render: Callable[[Tensor, Tensor], Tensor], bad: 
 @EVERY_ENGINE
 @EVERY_WAY
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, -math.inf])
-def test_a_bad_depth_passes_sharp_and_touches_nothing_else(engine: str, way: dict[str, Any], bad: float) -> None:
+def test_a_bad_depth_stays_sharp_and_does_not_affect_others(engine: str, way: dict[str, Any], bad: float) -> None:
     assert_untouched_by_a_hole(DepthOfField(CAMERA, check=False, **way), bad)
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, -math.inf])
-def test_a_bad_depth_passes_a_file_sharp_and_touches_nothing_else(file: File, bad: float) -> None:
+def test_a_bad_depth_in_a_file_stays_sharp_and_does_not_affect_others(file: File, bad: float) -> None:
     assert_untouched_by_a_hole(lambda image, depth: file.render(image, depth, CAMERA)[0], bad)
 
 
 @EVERY_ENGINE
 @EVERY_WAY
-def test_light_around_bad_depth_keeps_its_sum(engine: str, way: dict[str, Any]) -> None:
+def test_constant_light_stays_constant_around_bad_depth(engine: str, way: dict[str, Any]) -> None:
     dof = DepthOfField(CAMERA, check=False, **way)
     image, flat, depth = texture(), torch.ones(1, 1, HEIGHT, WIDTH), slope(1.2, 6.0)
     assert torch.equal(dof(image, whole(math.nan)), image)
@@ -175,12 +178,12 @@ def test_bad_light_stays_within_its_disc(engine: str, way: dict[str, Any], bad: 
     image[0, 1, 12, 16], coc[0, 0, 12, 16] = bad, coc_px
     touched = ~torch.isfinite(blur_by_coc(image, coc, check=False, **way)).all(1)[0]
     y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
-    assert int(touched.sum()) > 0  # it is not hidden either
+    assert int(touched.sum()) > 0
     assert not touched[torch.hypot(y - 12.0, x - 16.0) > max(abs(coc_px), 1.0) + 1].any()
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf], ids=str)
-def test_bad_light_stays_where_it_is_in_a_file(file: File, bad: float) -> None:
+def test_bad_light_in_a_file_stays_in_its_pixel(file: File, bad: float) -> None:
     image = texture()
     image[0, 1, 12, 20] = bad
     out, truth = file.render(image, slope(1.2, 6.0), CAMERA)
@@ -197,16 +200,16 @@ def test_bad_light_stays_where_it_is_in_a_file(file: File, bad: float) -> None:
 @EVERY_WAY
 @pytest.mark.parametrize("light", [1e10, 2e19, 1e30, 3e38])
 @pytest.mark.parametrize("post", [False, True], ids=["step", "post one pixel wide"])
-def test_light_beside_a_step_is_as_in_float64(engine: str, way: dict[str, Any], light: float, post: bool) -> None:
+def test_bright_light_at_a_step_agrees_with_float64(engine: str, way: dict[str, Any], light: float, post: bool) -> None:
     coc, image = halves(-6.0, 5.0), texture()
-    if post:  # none of its pixels is surely unmixed
+    if post:  # every pixel of it may be mixed
         coc = whole(5.0)
         coc[..., 14] = -4.0
     image[..., 12, 8:24] = 1.0
     image = (image * light).clamp(max=light)
     out, truth = blur_by_coc(image, coc, **way), blur_by_coc(image.double(), coc, **way)
     assert_close(out.double() / light, truth / light, rtol=1e-4, atol=1e-6)
-    # a part of a split pixel may be darker than its surface, not darker than nothing
+    # the parts of a split pixel are limited for negative light too
     image = image / light
     assert_close(blur_by_coc(-image, coc, **way), -blur_by_coc(image, coc, **way), rtol=0.0, atol=5e-4)
     mixed = torch.where(coc > 0, -1.0, -3.0).expand(1, 3, -1, -1).clone()
@@ -223,7 +226,7 @@ def test_bright_layers_and_backgrounds_do_not_overflow(engine: str, light: float
     out, wide = (dof(i, depth, background=i * light, background_depth=far) for i in (image, image.double()))
     assert_close(out.double() / light, wide / light, rtol=1e-4, atol=1e-6)
     rgba = torch.rand(1, 2, 4, HEIGHT, WIDTH)
-    rgba[:, :, -1] = torch.tensor([1e-6, 1.0])[:, None, None]  # light over a tiny coverage is brighter still
+    rgba[:, :, -1] = torch.tensor([1e-6, 1.0])[:, None, None]  # a tiny coverage, by which light is divided
     rgba[:, :, :-1] *= light
     out, wide = (dof.layers(t, torch.tensor([1.2, 9.0])) for t in (rgba, rgba.double()))
     assert_close(out[:, :-1].double() / light, wide[:, :-1] / light, rtol=1e-4, atol=1e-6)
@@ -234,14 +237,14 @@ def test_bright_layers_and_backgrounds_do_not_overflow(engine: str, light: float
 @EVERY_WAY
 @pytest.mark.parametrize("value", [6.5e4, 1e6])
 @pytest.mark.parametrize("coc_px", [-6.0, 2.5, 11.0])
-def test_a_highlight_leaves_the_dark_outside_its_disc(
+def test_a_highlight_does_not_change_pixels_outside_its_disc(
     engine: str, way: dict[str, Any], value: float, coc_px: float
 ) -> None:
     lit, around = torch.full((1, 1, 40, 48), 1e-4), torch.full((1, 1, 40, 48), 3.0)
     around[..., 18:23, 22:27], lit[..., 20, 24] = coc_px, value
     y, x = torch.meshgrid(torch.arange(40), torch.arange(48), indexing="ij")
-    # a layer at half resolution has more support: the pixels of its grid, and the interpolation between them;
-    # and mixed pixels within 2 of it, which are as blurred, see it when they are split
+    # a layer at half resolution reaches farther (its grid and the interpolation); the matting of mixed pixels looks
+    # 2 pixels around
     reach = abs(coc_px) + 1 + (8 if abs(coc_px) >= 8 else 0) + (2 * 2**0.5 if way["occlusion"] else 0)
     out = blur_by_coc(lit, around, **way)[..., torch.hypot(y - 20.0, x - 24.0) > reach]
     assert_close(out, torch.full_like(out, 1e-4), rtol=2e-6, atol=0.0)
@@ -249,7 +252,7 @@ def test_a_highlight_leaves_the_dark_outside_its_disc(
 
 @EVERY_ENGINE
 @pytest.mark.parametrize("name", ["image", "squeezed cat's eyes", "spots across the field"])
-def test_light_of_1e30_is_as_in_float64_through_any_lens(engine: str, name: str) -> None:
+def test_light_of_1e30_agrees_with_float64_for_any_lens(engine: str, name: str) -> None:
     image, coc_px = torch.full((1, 3, HEIGHT, WIDTH), 0.1), halves(-4.0, 3.0)
     image[..., 12, 16] = 1e30
     truth = blur_by_coc(image.double(), coc_px.double(), table=LENSES[name])
@@ -262,7 +265,7 @@ def test_light_of_1e30_is_as_in_float64_through_any_lens(engine: str, name: str)
 
 @pytest.fixture
 def by_both(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Holds the picture of the compiled engine to within 1e-5 of the light nearby of the plain one's."""
+    """Compares the pictures of both engines, to 1e-5 of the light nearby, and checks that each engine was used."""
     served = []
 
     def render(*arguments: Any, native_render: Any = native.render, **options: Any) -> Tensor:
@@ -284,7 +287,7 @@ def by_both(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return compared
 
 
-SMOOTH = ("planes", "smooth", "noise", "slope")  # others are on the edge of decisions, where rounding decides
+SMOOTH = ("planes", "smooth", "noise", "slope")  # other kinds lie on thresholds, where rounding decides
 
 
 @pytest.mark.parametrize("seed", range(60))
@@ -295,7 +298,7 @@ def test_engines_agree_on_random_scenes(seed: int, by_both: Any) -> None:
         scene.options["table"] = BY_COLOUR
     if "occlusion" in scene.options:
         scene.options["normalize"] = seed % 3 > 0
-    if seed % 7 == 0:  # of several items, and other numbers of channels
+    if seed % 7 == 0:  # several items, and other numbers of channels
         scene.image, scene.coc_px = (t.repeat(2, 1 + (seed % 5) * (t.shape[1] == 1 and t is scene.image), 1, 1)
                                      for t in (scene.image, scene.coc_px))  # fmt: skip
         scene.options = {k: v for k, v in scene.options.items() if not isinstance(v, Tensor) and v is not BY_COLOUR}
@@ -309,7 +312,7 @@ def test_engines_agree_on_random_scenes(seed: int, by_both: Any) -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("way", ["accumulated", "background"])
-def test_engines_agree_on_the_very_edge_of_decisions(way: str, seed: int, by_both: Any) -> None:
+def test_engines_agree_exactly_on_thresholds(way: str, seed: int, by_both: Any) -> None:
     scene = random_scene(seed, [way], lamps=way == "accumulated", side=90, kinds=["quarters"])
     by_both(scene.blurred, scene.image, in_focus=bool((scene.coc_px.abs() <= 1.0).all()))
 
@@ -359,7 +362,7 @@ def test_engines_agree_on_scenes_of_every_kind(name: str, by_both: Any) -> None:
 
 @pytest.mark.parametrize("name", ["triangle", "blades", "image"])
 @pytest.mark.parametrize("occlusion", [True, False])
-def test_engines_and_fold_agree_on_lopsided_kernels(name: str, occlusion: bool) -> None:
+def test_engines_and_fold_agree_on_asymmetric_kernels(name: str, occlusion: bool) -> None:
     scene = made("planes", 40, 50, 6.0, table=LENSES[name], occlusion=occlusion, tolerance=0)
     assert_same_picture(scene.blurred(method="fold"), scene.blurred(), scene.image)
 
@@ -378,7 +381,7 @@ def test_engines_agree_on_stacks(seed: int, by_both: Any) -> None:
     by_both(lambda: dof.layers(rgba, depth), torch.zeros_like(rgba[:, 0]))
 
 
-# Threads, batches, strides, types and contexts make no difference
+# Threads, batches, dtypes and contexts
 
 
 def _threads(scene: Scene, way: dict[str, Any], out: Tensor) -> None:
@@ -422,14 +425,14 @@ CHECKS = [_threads, _items, _again, _types]
 @EVERY_ENGINE
 @EVERY_WAY
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__.strip("_"))
-def test_the_picture_is_the_same_whatever_the_circumstances(engine: str, way: dict[str, Any], check: Any) -> None:
+def test_the_picture_does_not_depend_on(engine: str, way: dict[str, Any], check: Any) -> None:
     scene = made("smooth", 18, 22, 3.0, items=2, lamps=100.0)
     scene.coc_px[0] *= 0.1
     check(scene, way, scene.blurred(**way))
 
 
 def posts(soft: bool = False) -> Tensor:
-    """Posts three pixels wide before a wall; soft, as resampling leaves them, ramps swallow part of what is thin."""
+    """Depth of posts three pixels wide in front of a wall; ``soft`` averages it as resampling does."""
     depth = whole(2.5)
     depth[..., 12:15] = depth[..., 4:16, 24:27] = 1.2
     return 1.0 / functional.avg_pool2d(1.0 / depth, 3, 1, 1, count_include_pad=False) if soft else depth
@@ -457,7 +460,7 @@ ENTRIES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 
 @EVERY_ENGINE
 @pytest.mark.parametrize("name", ENTRIES)
-def test_autocast_changes_no_number(name: str, engine: str) -> None:
+def test_autocast_does_not_change(name: str, engine: str) -> None:
     plain = ENTRIES[name](texture(), slope(1.2, 6.0))
     with torch.autocast("cpu", torch.bfloat16):
         assert torch.equal(ENTRIES[name](texture(), slope(1.2, 6.0)), plain)
@@ -467,25 +470,25 @@ def test_autocast_changes_no_number(name: str, engine: str) -> None:
 @pytest.mark.parametrize("size", [(64, 64), (150, 200), (65, 129)])
 @pytest.mark.parametrize("reach", [3.0, 14.0, 40.0])
 def test_tiles_leave_no_seam(occlusion: bool, size: tuple[int, int], reach: float) -> None:
-    # while gradients are recorded the plain engine renders the frame whole, otherwise the compiled one renders tiles
+    # with gradients the plain engine renders the whole frame; without, the compiled engine renders tiles
     image, coc = 3 * torch.rand(1, 3, *size) ** 3, slope(-reach, reach, *size)
     coc[..., size[0] // 3 : size[0] // 2, :] = -0.8 * reach
     plan = Plan.of_scene(coc, 1 / 255)
     tiled = blur_by_coc(image, coc, plan=plan, occlusion=occlusion)
     plain = blur_by_coc(image.clone().requires_grad_(), coc, plan=plan, occlusion=occlusion).detach()
-    assert_close(tiled, plain, rtol=1e-5, atol=1e-5)  # as engines agree anywhere
+    assert_close(tiled, plain, rtol=1e-5, atol=1e-5)
     beside = [torch.tensor([min(n % 64, 64 - n % 64) <= 4 and 4 < n < side - 4 for n in range(side)]) for side in size]
-    where = beside[0][:, None] | beside[1]  # a tile has 64 pixels a side
+    where = beside[0][:, None] | beside[1]  # tiles have 64 x 64 pixels
     assert_close(tiled[..., where], plain[..., where], rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("method", ["layered", "fold"])
-def test_a_user_s_own_tiles_with_a_halo_leave_no_seam(method: Any) -> None:
+def test_tiles_rendered_separately_with_a_halo_leave_no_seam(method: Any) -> None:
     image, coc = 3 * torch.rand(1, 3, 40, 200) ** 3, slope(-6.0, 6.0, 40, 200)
     coc[..., 13:20, :] = -4.8
     options: dict[str, Any] = {"plan": Plan.of_scene(coc, 1 / 255), "occlusion": False, "method": method}
     picture = blur_by_coc(image, coc, **options)
-    halo = 8 + 4 * 8  # beyond the frame light is a mean along the border, four times as wide as the place is far
+    halo = 8 + 4 * 8  # outside the frame, light is a mean along the border, four times as wide as the distance
     for left in range(0, 200, 40):
         start, stop = max(0, left - halo), min(200, left + 40 + halo)
         tile = blur_by_coc(image[..., start:stop], coc[..., start:stop], **options)[..., left - start :][..., :40]
@@ -500,14 +503,14 @@ def test_a_user_s_own_tiles_with_a_halo_leave_no_seam(method: Any) -> None:
 @pytest.mark.parametrize(
     ("planned", "shown"), [(0.0, 6.0), (0.0, -6.0), (-2.0, -3.0), (3.0, 20.0), (4.0, -4.0), (5.0, 0.0)]
 )
-def test_a_plan_of_a_plane_serves_another_plane(engine: str, planned: float, shown: float, occlusion: bool) -> None:
+def test_a_plan_of_one_plane_renders_another(engine: str, planned: float, shown: float, occlusion: bool) -> None:
     plan, plane = Plan.of_scene(whole(planned), 1 / 255), whole(shown)
     out, truth = (blur_by_coc(texture(), plane, occlusion=occlusion, plan=p) for p in (plan, None))
     assert float((out - truth).square().mean().sqrt()) < 1 / 255  # layers of 20 px are coarser
 
 
 @EVERY_ENGINE
-def test_a_plan_of_the_first_frame_serves_a_pull_of_focus(engine: str) -> None:
+def test_a_plan_of_the_first_frame_renders_a_focus_pull(engine: str) -> None:
     image, depth = texture(), slope(1.2, 6.0)
     plan = DOF.plan(image, whole(2.0))  # all in focus
     for focus_m in (2.0, 1.9, 1.4, 1.25, 3.0, 9.0, math.inf):
@@ -520,7 +523,7 @@ def test_a_plan_of_the_first_frame_serves_a_pull_of_focus(engine: str) -> None:
 
 @pytest.fixture
 def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """The kind of each item that the compiled engine renders."""
+    """List of the items that the compiled engine renders, by kind."""
     kinds: list[str] = []
 
     def render(surfaces: Any, kind: Any, native_render: Any = native.render, **options: Any) -> Tensor:
@@ -542,8 +545,8 @@ def test_the_environment_chooses_the_engine(
     assert counted == served * ["image"] and out.data_ptr() != scene.image.data_ptr() and not out.requires_grad
 
 
-@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # by PyTorch, for tangents
-def test_the_plain_engine_serves_all_else(counted: list[str]) -> None:
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # raised inside PyTorch for tangents
+def test_the_plain_engine_renders_calls_that_the_compiled_one_does_not_support(counted: list[str]) -> None:
     scene = made("smooth", 30, 40, 3.0)
     image, coc = scene.image, scene.coc_px
     assert blur_by_coc(image.clone().requires_grad_(), coc).requires_grad
@@ -556,6 +559,6 @@ def test_the_plain_engine_serves_all_else(counted: list[str]) -> None:
     blur_by_coc(image, coc.double())
     blur_by_coc(image, coc, method="fold")
     wide = image[..., :2, :].repeat(1, 1, 1, 18)
-    blur_by_coc(wide, torch.full((1, 1, 2, 720), 400.0))  # a Fourier transform's kernel
+    blur_by_coc(wide, torch.full((1, 1, 2, 720), 400.0))  # a kernel convolved by FFT
     assert torch.equal(blur_by_coc(image, 0.0 * coc), image)
     assert counted == []

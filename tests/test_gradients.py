@@ -1,4 +1,4 @@
-"""Derivatives of the picture: those of finite differences, finite where a scene is hostile, and leading downhill."""
+"""Gradients of the picture: equal to finite differences, finite on hostile scenes, and usable for optimisation."""
 
 import math
 from collections.abc import Callable
@@ -34,9 +34,9 @@ def case() -> dict[str, Tensor]:
 
 @pytest.mark.parametrize("way", SUMS.values(), ids=SUMS)
 @pytest.mark.parametrize("name", [*NUMBERS, "coc_px"])
-def test_gradients_are_those_of_finite_differences(name: str, way: dict[str, Any]) -> None:
+def test_gradients_equal_finite_differences(name: str, way: dict[str, Any]) -> None:
     given = case()
-    if name == "coc_px":  # an even slope would lie on the kinks of "nearer than half way"
+    if name == "coc_px":  # noise, because an even slope would lie exactly on kinks
         coc = torch.linspace(-2.83, 3.17, 12, dtype=torch.float64) + 0.2 * torch.rand(12, dtype=torch.float64)
         leaf = coc.reshape(1, 1, 3, 4).requires_grad_()
         assert torch.autograd.gradcheck(lambda x: blur_by_coc(given["image"], x, tolerance=1 / 60, **way), leaf)
@@ -46,7 +46,7 @@ def test_gradients_are_those_of_finite_differences(name: str, way: dict[str, Any
 
 
 @pytest.mark.parametrize("which", ["a measured table", "leaves of the camera", "a plan", "a plan, sum"])
-def test_gradients_go_through(which: str) -> None:
+def test_gradients_flow_through(which: str) -> None:
     image, depth, focus, f_number = case().values()
     if which == "leaves of the camera":
 
@@ -68,12 +68,12 @@ def test_the_picture_is_the_same_with_gradients_and_their_adjoint_is_that_of_the
     plain, seen, other = dof(image, *others), torch.rand_like(image), torch.rand_like(image)
     out = dof(image.requires_grad_(), *others)
     assert_close(out, plain, rtol=0.0, atol=0.0)
-    if not way["occlusion"]:  # with it the picture is not linear in the image: mixed pixels are told by what they show
+    if not way["occlusion"]:  # with occlusion the picture is not linear in the image, because matting depends on it
         (back,) = torch.autograd.grad(out, image, seen)
         assert_close((back * other).sum(), (seen * dof(other, *others)).sum(), rtol=1e-11, atol=0.0)
 
 
-# Where they must be finite
+# Finite gradients
 
 
 def _nodes() -> Tensor:
@@ -141,13 +141,13 @@ def test_gradients_are_finite_at_hostile_light_and_of_its_type(
     assert [grad.dtype for grad in grads] == [dtype, torch.float32] and all(torch.isfinite(g).all() for g in grads)
 
 
-# By transforms
+# Forward mode and torch.func
 
 
-@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # by PyTorch, for tangents
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # raised inside PyTorch for tangents
 @pytest.mark.parametrize("way", [{"occlusion": True}, {"method": "fold", "occlusion": False}], ids=["over", "paper"])
 @pytest.mark.parametrize("which", [*NUMBERS, "rotation", "squeeze"])
-def test_derivatives_forwards_and_by_transforms_are_those_of_autograd(way: dict[str, Any], which: str) -> None:
+def test_forward_mode_and_torch_func_agree_with_autograd(way: dict[str, Any], which: str) -> None:
     numbers = {name: torch.tensor(value, dtype=torch.float64) for name, value in (("rotation", 25.0), ("squeeze", 1.3))}
     inputs = case() | numbers
     seen, step = torch.rand_like(inputs["image"]), torch.rand_like(inputs[which])
@@ -161,14 +161,14 @@ def test_derivatives_forwards_and_by_transforms_are_those_of_autograd(way: dict[
     (gradient,) = torch.autograd.grad(shown(leaf), leaf)
     assert gradient.abs().max() > 0
     assert_close(torch.func.grad(shown)(inputs[which]), gradient, rtol=1e-12, atol=0.0)
-    (again,) = torch.autograd.grad(shown(leaf), leaf)  # what transforms left in caches is not theirs
+    (again,) = torch.autograd.grad(shown(leaf), leaf)  # torch.func leaves no wrapped tensors in caches
     assert torch.equal(again, gradient)
     with torch.no_grad():
         tangent = torch.func.jvp(shown, (inputs[which],), (step,))[1]
     assert_close(tangent, (gradient * step).sum(), rtol=1e-9, atol=1e-12)
 
 
-def test_transforms_leave_kernels_in_the_cache_that_serve_without_them() -> None:
+def test_kernels_cached_inside_torch_func_are_usable_outside() -> None:
     image, depth = torch.rand(1, 3, 20, 30), torch.linspace(0.7, 6.3, 600).reshape(1, 1, 20, 30)
     dof = DepthOfField(Camera(f_number=1.337, sensor_width_mm=3.0), BlurTable.polygon(7, rotation_deg=12.34))
     torch.func.grad(lambda image: dof(image, depth).sum())(image)
@@ -178,7 +178,7 @@ def test_transforms_leave_kernels_in_the_cache_that_serve_without_them() -> None
     assert_close(twin(image, depth), plain, rtol=0.0, atol=0.0)
 
 
-# Depth from defocus: what made this blur?
+# Depth from defocus
 
 RAMP = slope(0, 1)
 DESCENTS: dict[str, tuple[list[float], list[float], Callable[[Tensor], dict[str, Tensor]], int, float, float]] = {
@@ -204,14 +204,14 @@ def descend(start: Tensor, picture_of: Callable[[Tensor], Tensor], target: Tenso
 
 
 def detailed(height: int = 24, width: int = 32) -> Tensor:
-    """Light with detail of every size, so that any blur shows."""
+    """Light with detail of every size, so that any blur changes it."""
     coarse = functional.interpolate(torch.rand(1, 1, height // 4, width // 4), (height, width))
     return 0.1 + torch.rand(1, 1, height, width) * coarse
 
 
 @pytest.mark.hard
 @pytest.mark.parametrize("name", DESCENTS)
-def test_descent_finds(name: str) -> None:
+def test_gradient_descent_finds(name: str) -> None:
     truth, start, scene_of, steps, rate, limit = DESCENTS[name]
     image, dof = detailed(), DepthOfField(CAMERA)
     target = dof(image, **scene_of(torch.tensor(truth, requires_grad=True))).detach()
@@ -220,12 +220,9 @@ def test_descent_finds(name: str) -> None:
 
 
 @pytest.mark.hard
-def test_descent_finds_a_depth_for_every_pixel() -> None:
-    image, dof, truth = (
-        detailed(16, 24),
-        DepthOfField(CAMERA.replace(focus_m=1.0)),
-        0.25 + 0.35 * torch.rand(1, 1, 3, 4),
-    )
+def test_gradient_descent_finds_a_depth_for_every_pixel() -> None:
+    image, dof = detailed(16, 24), DepthOfField(CAMERA.replace(focus_m=1.0))
+    truth = 0.25 + 0.35 * torch.rand(1, 1, 3, 4)
 
     def picture_of(grid: Tensor) -> Tensor:
         fine = functional.interpolate(grid.clamp(0.05, 0.95), (16, 24), mode="bilinear", align_corners=True)

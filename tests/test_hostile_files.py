@@ -1,4 +1,4 @@
-"""Tables, manifests, prescriptions, states and graphs as files that lie or want to run; changed ones: tests/fuzz."""
+"""Malicious tables, manifests, prescriptions, states and graphs; tests/fuzz changes arbitrary bytes."""
 
 import json
 import pickle
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.hard
 
 
 class Bomb:
-    """Makes a file when it is unpickled."""
+    """Creates a file if it is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -31,7 +31,7 @@ class Bomb:
 
 
 @pytest.mark.parametrize("suffix", [".json", ".toml", ".txt", ".npy", ".npz", ".png", ".exr", ".onnx"])
-def test_a_pickle_under_any_name_is_not_run(tmp_path: Path, suffix: str) -> None:
+def test_a_pickle_with_any_suffix_is_not_executed(tmp_path: Path, suffix: str) -> None:
     bomb = pickle.dumps(Bomb(tmp_path / "ran"))
     path = tmp_path / f"bomb{suffix}"
     path.write_bytes(bomb)
@@ -41,7 +41,7 @@ def test_a_pickle_under_any_name_is_not_run(tmp_path: Path, suffix: str) -> None
     assert not (tmp_path / "ran").exists()
 
 
-def test_a_state_is_loaded_as_weights_only(tmp_path: Path) -> None:
+def test_a_state_can_be_loaded_with_weights_only(tmp_path: Path) -> None:
     dof = DepthOfField(Camera(focus_m=1.5), BlurTable.load("sato_j15"))
     torch.save(dof.state_dict(), tmp_path / "dof.pt")
     other = DepthOfField(Camera())
@@ -49,11 +49,11 @@ def test_a_state_is_loaded_as_weights_only(tmp_path: Path) -> None:
     assert other.camera.focus_m == 1.5 and other.options.table.to_dict() == dof.options.table.to_dict()
 
 
-# What `torchdof export --show` shows
+# Metadata shown by `torchdof export --show`
 
 
 def model_with(path: Path, facts: dict[str, str], external: str | None = None) -> None:
-    """An ONNX file with these metadata and, if named, a tensor that lies in another file."""
+    """Writes an ONNX file with metadata and optionally a tensor stored in another file."""
     node = onnx.helper.make_node("Identity", ["image"], ["out"])
     values = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1]) for name in ("image", "out")]
     graph = onnx.helper.make_graph([node], "g", values[:1], values[1:])
@@ -72,7 +72,7 @@ def model_with(path: Path, facts: dict[str, str], external: str | None = None) -
     ["\x1b[2J\x1b]0;title\x07", "line\nbreak\rback", "\u202edrow", "\x00\x08\x7f\x9b", "x" * 20_000],
     ids=["escape", "lines", "direction", "control", "long"],
 )
-def test_shown_metadata_cannot_steer_a_terminal_or_fill_it(tmp_path: Path, text: str) -> None:
+def test_shown_metadata_have_no_control_characters_and_are_short(tmp_path: Path, text: str) -> None:
     facts = {"torchdof.table": json.dumps({"name": text, text: 1}), f"torchdof.{text}": json.dumps(text)}
     model_with(tmp_path / "x.onnx", facts)
     result = CliRunner().invoke(app, ["export", "--show", str(tmp_path / "x.onnx")])
@@ -93,7 +93,7 @@ def test_shown_metadata_cannot_steer_a_terminal_or_fill_it(tmp_path: Path, text:
     ],
     ids=lambda text: text[:12],
 )
-def test_metadata_that_no_export_writes_are_data_and_refused_by_name(
+def test_foreign_metadata_are_not_executed_and_refused_by_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, value: str, message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -103,13 +103,13 @@ def test_metadata_that_no_export_writes_are_data_and_refused_by_name(
     assert [path.name for path in tmp_path.iterdir()] == ["x.onnx"]
 
 
-def test_endless_metadata_are_refused(tmp_path: Path) -> None:
+def test_too_many_metadata_are_refused(tmp_path: Path) -> None:
     model_with(tmp_path / "x.onnx", {f"torchdof.k{i}": "1" for i in range(1000)})
     with pytest.raises(ValueError, match="are more than torchdof.export writes"):
         describe(tmp_path / "x.onnx")
 
 
-def test_describing_a_file_opens_no_other(tmp_path: Path) -> None:
+def test_describe_opens_no_other_file(tmp_path: Path) -> None:
     (tmp_path / "secret").write_bytes(b"1234")
     model_with(tmp_path / "x.onnx", {}, external="secret")
     (tmp_path / "secret").unlink()

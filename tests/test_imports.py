@@ -1,4 +1,4 @@
-"""Who imports whom: rooms import only rooms on lower floors, and what is not asked for is not loaded."""
+"""Imports: a folder imports only folders below it, and heavy packages are loaded only when they are used."""
 
 import ast
 import subprocess
@@ -13,8 +13,8 @@ import torchdof
 ROOT = Path(__file__).parents[1]
 FOLDERS = {"torchdof": "torchdof", "torchdof.fit": "fit", "torchdof.export": "export"}
 
-# Room -> what it may import, from the lowest floor up.
-ROOMS = {
+# Folder or module of torchdof -> those that it may import; the lowest first.
+ALLOWED = {
     "native": set(),
     "pixels": set(),
     "tensors": set(),
@@ -37,11 +37,11 @@ ROOMS = {
         *("fit", "export", "bench"),
     },
 }
-MOST_FLOORS = 10
+MAX_LEVELS = 10  # of folders, and of files below torchdof.module
 
 
 def modules() -> dict[str, Path]:
-    """Dotted name -> file, of everything that is shipped."""
+    """Dotted name -> file, of every module that is shipped."""
     found = {}
     for package, folder in FOLDERS.items():
         for path in sorted((ROOT / folder).rglob("*.py")):
@@ -54,12 +54,12 @@ FILES = modules()
 HOMES = {name: f"torchdof.{home}" for name, home in torchdof._HOMES.items()}
 
 
-def room_of(module: str) -> str:
+def folder_of(module: str) -> str:
     return (module.split(".") + [""])[1]
 
 
 def imports(module: str, for_types: bool = False) -> Iterator[str]:
-    """Modules of ours that a module imports, anywhere in its file, also or not for the type checker alone."""
+    """Modules of torchdof that a module imports, anywhere in its file; under ``TYPE_CHECKING`` only if `for_types`."""
     path = FILES[module]
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     tree = ast.parse(path.read_text(encoding="utf-8"))
@@ -88,60 +88,60 @@ def imports(module: str, for_types: bool = False) -> Iterator[str]:
 GRAPH = {module: set(imports(module)) - {module} for module in FILES}
 
 
-def floors(graph: dict[str, set[str]]) -> list[set[str]]:
-    """What imports nothing, what imports only that, and so on upwards; the last is all that is in a circle."""
+def levels(graph: dict[str, set[str]]) -> list[set[str]]:
+    """Modules by level: level 0 imports nothing, level n only lower ones. The last set has those in import cycles."""
     left, found = dict(graph), list[set[str]]()
-    while floor := {name for name, targets in left.items() if not targets & set(left)}:
-        found.append(floor)
-        left = {name: targets for name, targets in left.items() if name not in floor}
+    while level := {name for name, targets in left.items() if not targets & set(left)}:
+        found.append(level)
+        left = {name: targets for name, targets in left.items() if name not in level}
     return [*found, set(left)]
 
 
-def test_rooms_hold_every_file_and_only_what_is_below_them_on_ten_floors() -> None:
+def test_every_file_has_a_folder_and_folders_have_at_most_ten_levels() -> None:
     below: set[str] = set()
-    for room, allowed in ROOMS.items():
-        assert allowed <= below, room
-        below.add(room)
-    *found, circle = floors(ROOMS)
-    assert circle == set() and len(found) <= MOST_FLOORS
-    assert {room_of(module) for module in FILES} - {"", "__main__"} <= set(ROOMS)
+    for folder, allowed in ALLOWED.items():
+        assert allowed <= below, folder
+        below.add(folder)
+    *found, cyclic = levels(ALLOWED)
+    assert cyclic == set() and len(found) <= MAX_LEVELS
+    assert {folder_of(module) for module in FILES} - {"", "__main__"} <= set(ALLOWED)
 
 
-def test_files_of_the_engine_have_ten_floors_at_most() -> None:
-    """The module, and all that it stands on: a file is one floor above the highest that it imports."""
-    *found, _ = floors(GRAPH)
-    (floor,) = (number for number, files in enumerate(found, 1) if "torchdof.module" in files)
-    assert floor <= MOST_FLOORS
+def test_the_module_imports_at_most_ten_levels_of_files() -> None:
+    """A file is one level above the highest file that it imports."""
+    *found, _ = levels(GRAPH)
+    (level,) = (number for number, files in enumerate(found, 1) if "torchdof.module" in files)
+    assert level <= MAX_LEVELS
 
 
-@pytest.mark.parametrize("room", ["optics", "options", "render", "depth", "module", "export"])
-def test_files_are_in_no_circle_even_to_the_type_checker(room: str) -> None:
+@pytest.mark.parametrize("folder", ["optics", "options", "render", "depth", "module", "export"])
+def test_imports_for_the_type_checker_are_not_cyclic(folder: str) -> None:
     graph = {module: set(imports(module, for_types=True)) - {module, "torchdof"} for module in FILES}
-    assert [module for module in floors(graph)[-1] if room_of(module) == room] == []
+    assert [module for module in levels(graph)[-1] if folder_of(module) == folder] == []
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_a_room_imports_only_rooms_below_it(room: str) -> None:
+@pytest.mark.parametrize("folder", ALLOWED)
+def test_a_folder_imports_only_folders_below_it(folder: str) -> None:
     wrong = [
         f"{module} imports {target}"
         for module, targets in GRAPH.items()
-        if room_of(module) == room
+        if folder_of(module) == folder
         for target in sorted(targets)
-        if room_of(target) not in {room, *ROOMS[room]}
+        if folder_of(target) not in {folder, *ALLOWED[folder]}
     ]
     assert wrong == []
 
 
-def test_no_file_imports_itself_through_others() -> None:
-    assert sorted(floors(GRAPH)[-1]) == []
+def test_imports_are_not_cyclic() -> None:
+    assert sorted(levels(GRAPH)[-1]) == []
 
 
-@pytest.mark.parametrize(("wing", "other"), [("photo", "lens"), ("lens", "photo")])
-def test_the_wings_of_fit_do_not_know_each_other(wing: str, other: str) -> None:
+@pytest.mark.parametrize(("half", "other"), [("photo", "lens"), ("lens", "photo")])
+def test_fit_photo_and_fit_lens_do_not_import_each_other(half: str, other: str) -> None:
     wrong = [
         f"{module} imports {target}"
         for module, targets in GRAPH.items()
-        if module.startswith(f"torchdof.fit.{wing}")
+        if module.startswith(f"torchdof.fit.{half}")
         for target in targets
         if target.startswith(f"torchdof.fit.{other}")
     ]
@@ -149,15 +149,15 @@ def test_the_wings_of_fit_do_not_know_each_other(wing: str, other: str) -> None:
 
 
 @pytest.mark.parametrize("module", ["problems", "result", "solve", "validation"])
-def test_what_both_wings_stand_on_knows_neither(module: str) -> None:
+def test_modules_that_both_halves_of_fit_use_import_neither(module: str) -> None:
     targets = GRAPH[f"torchdof.fit.{module}"]
     assert not [target for target in targets if target.startswith(("torchdof.fit.photo", "torchdof.fit.lens"))]
 
 
 def loaded(code: str, *names: str) -> list[str]:
-    """Which of some packages are loaded once code has run in a fresh process."""
-    told = f"import sys\n{code}\nprint([name for name in {names!r} if name in sys.modules])"
-    run = subprocess.run([sys.executable, "-W", "error", "-c", told], capture_output=True, text=True, check=True)
+    """Which of the packages `names` are loaded after `code` has run in a new process."""
+    script = f"import sys\n{code}\nprint([name for name in {names!r} if name in sys.modules])"
+    run = subprocess.run([sys.executable, "-W", "error", "-c", script], capture_output=True, text=True, check=True)
     return list(ast.literal_eval(run.stdout.splitlines()[-1]))
 
 
@@ -180,7 +180,7 @@ def test_public_names_load_nothing_heavy() -> None:
     assert loaded(PUBLIC, *HEAVY) == []
 
 
-def test_rooms_below_the_engine_do_not_load_the_compiler() -> None:
+def test_folders_below_render_do_not_load_the_compiler() -> None:
     code = (
         "import torchdof.options, torchdof.depth, torchdof.io.images, torchdof.reference.metrics, torchdof.fit.result"
     )

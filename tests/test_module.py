@@ -44,7 +44,7 @@ def scene(height: int = 12, width: int = 17, reach: float = 4.0, seed: int = 1) 
 
 
 def encoded(light: Tensor) -> Tensor:
-    """As a display shows it: the sRGB curve of what lies in [0, 1]."""
+    """Light clamped to [0, 1] and sRGB-encoded."""
     light = light.double().clamp(0, 1)
     return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * light.clamp_min(1e-9) ** (1 / 2.4) - 0.055)
 
@@ -60,7 +60,7 @@ def rms(first: Tensor, second: Tensor) -> float:
 @pytest.mark.parametrize("name", TABLES)
 def test_a_plane_is_the_convolution_with_the_kernel_of_its_table(name: str, way: dict[str, Any]) -> None:
     image = 10 * torch.rand(1, 3, 14, 19) ** 4
-    for coc in (0.501, -0.7, -2.6, 3.999, *([12.75] if name == "disc" else [])):  # others reach beyond the frame
+    for coc in (0.501, -0.7, -2.6, 3.999, *([12.75] if name == "disc" else [])):  # others have larger kernels
         values = constant_map(coc, image)
         out = blur_by_coc(image, values, table=TABLES[name], **way)
         assert_close(out.double(), disc(image, values, TABLES[name]), rtol=1e-5, atol=1e-6)
@@ -106,7 +106,7 @@ def test_in_focus_plane_is_returned_bit_exact(way: dict[str, Any], dtype: torch.
 
 
 @EVERY_WAY
-def test_what_is_blurred_less_than_a_hundredth_of_a_pixel_is_returned_bit_exact(way: dict[str, Any]) -> None:
+def test_blur_below_a_hundredth_of_a_pixel_is_returned_bit_exact(way: dict[str, Any]) -> None:
     image = torch.rand(1, 3, 7, 9)
     coc = 0.02 * torch.rand(1, 1, 7, 9) - 0.01
     assert torch.equal(blur_by_coc(image, coc, **way), image)
@@ -118,12 +118,12 @@ def test_sharp_pixels_far_from_any_blur_are_untouched() -> None:
     assert_close(blur_by_coc(image, coc)[..., :20], image[..., :20], rtol=1e-6, atol=0.0)
 
 
-def test_a_sharp_foreground_is_not_bled_upon_by_a_blurred_background() -> None:
+def test_a_blurred_background_does_not_bleed_onto_a_sharp_foreground() -> None:
     image, coc = torch.zeros(1, 1, 9, 30), torch.zeros(1, 1, 9, 30)
     image[..., 15:], coc[..., 15:] = 1.0, 5.0
     kept = blur_by_coc(image, coc)
     assert_close(kept[..., :15], image[..., :15], rtol=0.0, atol=1e-6)
-    assert float(blur_by_coc(image, coc, occlusion=False)[..., 14].max()) > 0.05  # as the paper's own algorithm does
+    assert float(blur_by_coc(image, coc, occlusion=False)[..., 14].max()) > 0.05  # the paper's algorithm does bleed
 
 
 def test_a_blurred_foreground_spreads_over_a_sharp_background() -> None:
@@ -168,7 +168,7 @@ def test_the_plain_sum_keeps_all_light_at_any_depths() -> None:
 
 
 def wider(image: Tensor, coc: Tensor, beyond: int) -> tuple[Tensor, Tensor]:
-    """An image and its coc with so many pixels on each side."""
+    """An image and its coc, continued by ``beyond`` pixels on each side."""
     light = continued(image, None, None, (beyond,) * 4, beyond, blur_axis(coc))
     return light, functional.pad(coc, (beyond,) * 4, mode="replicate")
 
@@ -181,7 +181,7 @@ def test_accumulating_billboards_equals_a_plain_loop_over_pixels(name: str, meth
     nodes = list(Plan.of_scene(coc, 1 / 255).nodes)
     options: dict[str, Any] = {"occlusion": False, "normalize": normalize, "method": method}
     out = blur_by_coc(image, coc, table=TABLES[name], **options)
-    beyond = 8 if normalize else 0  # the plain sum is of what was seen
+    beyond = 8 if normalize else 0  # the plain sum does not continue the image
     summed = loops.accumulate(*wider(image, coc, beyond), TABLES[name], nodes, normalize)
     assert_close(out, functional.pad(summed, (-beyond,) * 4), rtol=1e-10, atol=1e-12)
 
@@ -226,7 +226,7 @@ def test_channels_may_be_blurred_by_kernels_of_their_own() -> None:
         together = blur_by_coc(image, coc, table=TABLES["colours"], **way)
         for c, scale in enumerate((1.0, 1.1, 1.25)):
             alone = BlurTable("disc", [1.0], {"radius": [scale]})
-            # with occlusion, all channels together tell where mixed pixels are split
+            # only without occlusion: the matting of mixed pixels uses all channels together
             one = blur_by_coc(image[:, c : c + 1], coc, table=alone, **way)
             assert_close(together[:, c : c + 1], one, rtol=1e-5, atol=1e-6)
 
@@ -235,7 +235,7 @@ def test_channels_may_be_blurred_by_kernels_of_their_own() -> None:
 
 
 @EVERY_WAY
-def test_items_with_cameras_of_their_own_equal_each_alone(way: dict[str, Any]) -> None:
+def test_a_batch_with_a_camera_for_each_item_equals_each_item_alone(way: dict[str, Any]) -> None:
     image = torch.rand(3, 2, 9, 12)
     depth = 0.6 + 4 * torch.rand(3, 1, 9, 12)
     focus, stops = torch.tensor([0.7, 1.5, math.inf]), torch.tensor([1.2, 1.8, 4.0])
@@ -257,7 +257,7 @@ def test_focus_and_aperture_of_the_call_override_those_of_the_camera() -> None:
     assert dof.camera.focus_m == 1.0
 
 
-def test_the_functional_form_is_the_module() -> None:
+def test_the_functional_form_equals_the_module() -> None:
     image, depth = torch.rand(1, 3, 9, 12), 0.6 + 4 * torch.rand(1, 1, 9, 12)
     camera, table = Camera(sensor_width_mm=1.0), BlurTable.gaussian()
     expected = DepthOfField(camera, table, method="fold", occlusion=False)(image, depth, 1.2, 1.7)
@@ -267,7 +267,7 @@ def test_the_functional_form_is_the_module() -> None:
     assert torch.equal(blur_by_coc(image, coc, table=table, method="fold", occlusion=False), expected)
 
 
-def test_a_plan_made_once_serves_a_whole_shot() -> None:
+def test_a_plan_can_be_used_for_other_frames() -> None:
     image, depth = torch.rand(1, 3, 9, 12), 0.6 + 4 * torch.rand(1, 1, 9, 12)
     dof = DepthOfField(Camera(focus_m=1.0, sensor_width_mm=1.0))
     plan = dof.plan(image, depth)
@@ -349,16 +349,10 @@ def test_a_module_can_be_moved_copied_and_put_in_a_sequence() -> None:
     assert list(model.parameters()) == []
 
 
-def test_repr_tells_camera_table_and_options() -> None:
+def test_repr_shows_camera_table_and_options() -> None:
     text = repr(DepthOfField(Camera(35.0, 1.4, 0.8), BlurTable.load("sato_j15"), method="fold"))
     assert text.startswith("DepthOfField(")
-    for part in (
-        "35 mm, f/1.4, focus 0.8 m",
-        "'sato_j15', ring",
-        "tolerance=0.0039",
-        "method='fold'",
-        "occlusion=True",
-    ):
+    for part in ("35 mm, f/1.4, focus 0.8 m", "'sato_j15', ring", "tolerance=0.0039", "method='fold'", "occlusion=T"):
         assert part in text
 
 
@@ -382,8 +376,8 @@ def compiled_case() -> tuple[Camera, Tensor, Tensor]:
         pytest.param("inductor", WAYS["over"], marks=pytest.mark.hard),
     ],
 )
-@pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning")  # from within inductor
-def test_compiled_without_a_break_equals_eager(backend: str, way: dict[str, Any]) -> None:
+@pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning")  # raised inside inductor
+def test_the_module_compiles_without_graph_breaks_and_equals_eager(backend: str, way: dict[str, Any]) -> None:
     torch.compiler.reset()
     camera, image, depth = compiled_case()
     dof = DepthOfField(camera, **COMPILED, **way)
@@ -408,17 +402,14 @@ def test_modules_with_other_options_and_cameras_compile_one_after_the_other() ->
         assert_close(fast, dof(image, depth, focus_m=focus_m, plan=plan), rtol=1e-5, atol=1e-6)
 
 
-# Refused
+# Errors
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"image": torch.rand(3, 4, 5)}, r"depth must be \[1, H, W\] beside an image \[C, H, W\], got \[1, 1, 4, 5\]"),
-        (
-            {"image": torch.zeros(1, 3, 4, 5, dtype=torch.uint8)},
-            "image must be floating point.*torch.uint8; decode",
-        ),
+        ({"image": torch.zeros(1, 3, 4, 5, dtype=torch.uint8)}, "image must be floating point.*torch.uint8; decode"),
         ({"image": [[1.0]]}, "image must be a tensor .*got list"),
         ({"image": torch.rand(1, 3, 0, 5)}, "image must have at least one pixel"),
         ({"depth": torch.ones(1, 4, 5)}, r"depth must be \[1, 1, 4, 5\].*did you forget the channel dimension"),
@@ -479,14 +470,14 @@ def test_a_wrong_coc_or_table_is_refused(coc: Tensor, options: dict[str, Any], m
 
 
 @pytest.mark.parametrize("wrong", [3, "plan", (0.0, 1.0)])
-def test_what_is_no_plan_is_refused(wrong: Any) -> None:
+def test_a_value_that_is_not_a_plan_is_refused(wrong: Any) -> None:
     image, depth, camera = torch.rand(1, 3, 6, 7), torch.full((1, 1, 6, 7), 3.0), Camera(focus_m=1.0)
     for call in (
         lambda: DepthOfField(camera)(image, depth, plan=wrong),
         lambda: depth_of_field(image, depth, camera, plan=wrong),
         lambda: blur_by_coc(image, depth, plan=wrong),
     ):
-        with pytest.raises(ValueError, match=r"plan must be a Plan, as.* got "):
+        with pytest.raises(ValueError, match=r"plan must be a Plan from.* got "):
             call()
 
 

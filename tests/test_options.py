@@ -1,4 +1,4 @@
-"""The options of a rendering are those of the dataclass, wherever they are written."""
+"""Signatures, help and type hints have the options of the dataclass ``Options``."""
 
 import dataclasses
 import inspect
@@ -11,17 +11,17 @@ from torchdof.options import OptionArguments, Options
 OPTIONS = {field.name: field.default for field in dataclasses.fields(Options)}
 
 
-def test_type_checkers_know_every_option() -> None:
+def test_type_hints_have_every_option() -> None:
     assert ["table", *OptionArguments.__annotations__] == list(OPTIONS)
 
 
 @pytest.mark.parametrize("function", [DepthOfField, depth_of_field, blur_by_coc])
-def test_signature_and_help_tell_every_option_with_its_default(function: object) -> None:
+def test_signature_and_help_have_every_option_with_its_default(function: object) -> None:
     parameters = inspect.signature(function).parameters  # type: ignore[arg-type]
     assert {name: parameters[name].default for name in OPTIONS} == {**OPTIONS, "table": None}
     assert all(f"{name}: " in (function.__doc__ or "") for name in OPTIONS)
 
 
-def test_an_argument_that_is_no_option_is_refused_with_those_there_are() -> None:
+def test_an_unknown_option_is_refused_with_a_list_of_options() -> None:
     with pytest.raises(TypeError, match="there is no option 'blades'; options are table, tolerance"):
         DepthOfField(Camera(), blades=5)  # type: ignore[call-arg]

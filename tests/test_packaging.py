@@ -1,4 +1,4 @@
-"""What an installation promises: the command, its data, and examples in docstrings that run."""
+"""An installation has the command and its data, and the examples in docstrings run."""
 
 import doctest
 import importlib
@@ -44,7 +44,7 @@ def test_command_is_installed() -> None:
     assert callable(entry.load())
 
 
-def test_version_tells_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_version_shows_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
     printed = CliRunner().invoke(app, ["--version"]).output
     assert printed.startswith(f"torchdof {importlib.metadata.version('torchdof')}, engine torch (")

@@ -19,16 +19,16 @@ from torchdof.reference.scenes import Scene, read_scenes
 
 SCENES = {scene.name: scene for scene in read_scenes(Path(__file__).parent / "data" / "scenes")}
 GAIN_DB = {"planes/0": 3.5, "room/1": 4.0, "highlights/0": 3.0}
-"""How much nearer the truth than Ikoma's formula: floors a little below what was measured (5.0, 4.4 and 3.5 dB)."""
+"""Least gain in PSNR over Ikoma's formula, a little below the measured gains of 5.0, 4.4 and 3.5 dB."""
 MEASURED_DB = {
     "highlights/0": (20.331, 32.847),
     "planes/0": (31.386, 30.223),
     "portrait/0": (24.966, 23.353),
     "room/1": (40.618, 47.056),
 }
-"""PSNR of the whole crop and inside its margin, at a tolerance of 1/255.
+"""Recorded PSNR of the whole crop and inside its margin, at a tolerance of 1/255.
 
-Accuracy is not to be lost unseen, nor gained: who changes what a rendering decides records what it is worth here.
+A change of the renderer that changes the accuracy must record the new values here.
 """
 WITHIN_DB = 0.002
 
@@ -42,7 +42,7 @@ def rendered(scene: Scene, tolerance: float = 1 / 255) -> torch.Tensor:
 
 
 def differences_db(name: str) -> tuple[float, float]:
-    """How much nearer the truth a crop is than what was recorded, as a whole and inside its margin."""
+    """PSNR of a crop minus the recorded PSNR, for the whole crop and inside its margin."""
     picture = rendered(SCENES[name])
     whole, inner = MEASURED_DB[name]
     return psnr(picture, SCENES[name], inner=False) - whole, psnr(picture, SCENES[name]) - inner
@@ -50,13 +50,13 @@ def differences_db(name: str) -> tuple[float, float]:
 
 @pytest.mark.parametrize("engine", ["torch", "auto"])
 @pytest.mark.parametrize("name", MEASURED_DB)
-def test_pictures_are_as_near_the_truth_as_recorded(monkeypatch: pytest.MonkeyPatch, name: str, engine: str) -> None:
+def test_psnr_equals_the_recorded_values(monkeypatch: pytest.MonkeyPatch, name: str, engine: str) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", engine)
     assert differences_db(name) == pytest.approx((0.0, 0.0), abs=WITHIN_DB)
 
 
 @pytest.mark.parametrize("name", GAIN_DB)
-def test_layered_rendering_is_nearer_the_truth_than_plain_layers(name: str) -> None:
+def test_psnr_is_higher_than_with_ikomas_formula(name: str) -> None:
     scene = SCENES[name]
     assert psnr(rendered(scene), scene) > psnr(ikoma(scene), scene) + GAIN_DB[name]
 
@@ -68,7 +68,7 @@ def test_rms_error_against_exact_layers_stays_below_the_tolerance(name: str, tol
     assert 0 < float(error.square().mean().sqrt()) < tolerance
 
 
-# Every number by which the plain engine decides is held, most by these crops
+# Each constant of the plain engine is covered by a test: doubling it changes the PSNR of a crop, or fails another test
 
 SPEED_OR_ROUNDING = {
     "attention._ALIGN",
@@ -102,7 +102,7 @@ SPEED_OR_ROUNDING = {
     "scatter._COLUMN_BYTES",
     "traced._KEPT",
 }
-"""What does not decide how a picture looks: budgets, safety, finer steps, and numbers that only have to be small."""
+"""Constants without influence on the picture beyond rounding: budgets, safety, numbers that only have to be small."""
 HELD_BESIDE_IT = {
     "attention._FADE",
     "disocclusion._CERTAIN",
@@ -123,7 +123,7 @@ HELD_BESIDE_IT = {
     "plan._LEAST_CUT",
     "surfaces._HAIR",
 }
-"""What no crop needs, but a test of its own module does: seen to fail with twice the number."""
+"""Constants that do not change the crops, but are covered by a test of their own module."""
 
 
 # modules of the plain engine
@@ -131,7 +131,7 @@ FOLDERS = ("torchdof.render.", "torchdof.optics.placed_kernels")
 
 
 def numbers() -> list[str]:
-    """Numbers that the plain engine is made with, as ``module.NAME``; repair has none to do where depth is exact."""
+    """Constants of the plain engine as ``module.NAME``, without ``edges``, which does nothing to exact depth."""
     found = []
     files = [*sorted(Path(torchdof.render.__file__).parent.glob("*.py")), Path(placed_kernels.__file__)]
     for path in files:
@@ -151,23 +151,23 @@ def value_of(name: str) -> Any:
     return getattr(importlib.import_module(f"torchdof.{folder}.{module}"), constant)
 
 
-def test_what_is_held_elsewhere_exists() -> None:
+def test_listed_constants_exist() -> None:
     assert set(numbers()) > SPEED_OR_ROUNDING | HELD_BESIDE_IT
 
 
 @pytest.mark.sweep
 @pytest.mark.parametrize("name", sorted(set(numbers()) - SPEED_OR_ROUNDING - HELD_BESIDE_IT))
-def test_twice_a_number_is_another_picture(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_doubling_a_constant_changes_the_picture(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
     monkeypatch.setattr(kernel_bank, "_templates", KernelCache(2**28))
     kernel_bank._bank.cache_clear()
     value, constant = value_of(name), name.split(".")[1]
     twice = tuple(2 * part for part in value) if isinstance(value, tuple) else 2 * value
     for module in [m for key, m in sys.modules.items() if key.startswith(FOLDERS)]:
-        if getattr(module, constant, None) is value:  # where it is made, and where it was imported to
+        if getattr(module, constant, None) is value:  # the module that defines it, and those that import it
             monkeypatch.setattr(module, constant, twice)
     try:
         moved = max(abs(db) for crop in MEASURED_DB for db in differences_db(crop))
-    except (ValueError, IndexError, RuntimeError):  # such a number is not even possible
+    except (ValueError, IndexError, RuntimeError):  # the doubled value is invalid
         return
     assert moved > WITHIN_DB

@@ -1,4 +1,4 @@
-"""How closely results are compared: one table, by the type of the values. Absolute ones are for values around 1."""
+"""Tolerances of comparisons by dtype. The absolute ones are for values around 1."""
 
 from typing import Any
 
@@ -10,4 +10,4 @@ TOLERANCES: dict[torch.dtype, dict[str, Any]] = {
     torch.bfloat16: {"rtol": 2**-8, "atol": 1e-6},
     torch.float16: {"rtol": 2**-11, "atol": 1e-6},
 }
-"""The two narrow types hold results of float32 arithmetic: half a unit in the last place, rounded once."""
+"""Half precision holds rounded results of float32 arithmetic: half a unit in the last place."""

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 __all__ = ["BlurTable", "Camera", "DepthOfField", "blur_by_coc", "depth_of_field"]
 
-# Imported when first asked for, so that the command line can say what it is asked without PyTorch.
+# Imported on first use, so that ``torchdof --help`` does not import PyTorch.
 _HOMES = {
     "BlurTable": "optics.blur_table",
     "Camera": "optics.camera",

@@ -1,4 +1,4 @@
-"""Single images and clips as the batches that are rendered, and back: ``[C, H, W]`` and ``[B, T, C, H, W]``."""
+"""Converts single images ``[C, H, W]`` and clips ``[B, T, C, H, W]`` to batches ``[B, C, H, W]``, and back."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,9 +13,9 @@ __all__ = ["flattened", "leading_axes", "numbers", "restored"]
 
 
 def leading_axes(image: Any) -> tuple[int, ...]:
-    """The axes of an image before its channels: ``()`` of one image, ``(B,)`` of a batch, ``(B, T)`` of clips.
+    """The axes of an image before its channels: ``()`` for one image, ``(B,)`` for a batch, ``(B, T)`` for clips.
 
-    What is no image counts as a batch: the checks of a batch say what is wrong with it.
+    Any other value counts as a batch; the checks of a batch then refuse it.
 
     Example:
         >>> leading_axes(torch.rand(2, 5, 3, 8, 12))
@@ -27,14 +27,12 @@ def leading_axes(image: Any) -> tuple[int, ...]:
 
 
 def flattened(axes: tuple[int, ...], name: str, value: Any, what: str = "1") -> Any:
-    """A tensor of images or maps as a batch, its leading axes made one; one that is shared by all stays one item.
-
-    Parts of a larger frame are copied here, once, for a rendering looks at them often.
+    """A tensor of images or maps as a contiguous batch ``[B, ..., H, W]``; a single map for all images stays one item.
 
     Args:
         axes: :func:`leading_axes` of the image.
-        name: Of the argument.
-        value: A tensor of the image's rank; what is none is returned as it is.
+        name: Name of the argument.
+        value: A tensor of the image's rank; any other value is returned unchanged.
         what: Its channels, for the message.
 
     Raises:
@@ -44,7 +42,7 @@ def flattened(axes: tuple[int, ...], name: str, value: Any, what: str = "1") -> 
         >>> flattened((2, 5), "depth", torch.ones(2, 1, 1, 8, 12)).shape
         torch.Size([10, 1, 8, 12])
     """
-    if not isinstance(value, Tensor) or value.layout != torch.strided:  # refused by whoever checks the batch
+    if not isinstance(value, Tensor) or value.layout != torch.strided:  # the checks of the batch refuse it
         return value
     _not_mapped(name, value)
     if len(axes) == 1:
@@ -62,16 +60,15 @@ def flattened(axes: tuple[int, ...], name: str, value: Any, what: str = "1") -> 
 
 
 def numbers(axes: tuple[int, ...], name: str, value: Any) -> Any:
-    """A number of the camera as it takes them: a float, or a tensor with one value for each image.
+    """A number of the camera: a float, or a tensor with one value for each image of the batch.
 
     Args:
         axes: :func:`leading_axes` of the image.
-        name: Of the argument.
-        value: A number, a list, or a tensor ``[B]``, ``[B, 1]``, or ``[B, T]`` of clips; None stays None.
+        name: Name of the argument.
+        value: A number, a list, or a tensor ``[B]``, ``[B, 1]``, or ``[B, T]`` for clips; None stays None.
 
     Raises:
-        ValueError: If a list holds something else than numbers, a tensor has another shape, or one comes from
-            ``torch.vmap``.
+        ValueError: If a list does not hold numbers, a tensor has another shape, or it comes from ``torch.vmap``.
 
     Example:
         >>> numbers((2,), "focus_m", [1.0, 2.5]).tolist(), numbers((2, 3), "focus_m", torch.ones(2)).shape
@@ -95,7 +92,7 @@ def numbers(axes: tuple[int, ...], name: str, value: Any) -> Any:
 
 
 def restored(axes: tuple[int, ...], batch: Tensor) -> Tensor:
-    """What was made of a batch with the leading axes that the image came with.
+    """A rendered batch with the leading axes of the input image.
 
     Example:
         >>> restored((2, 5), torch.ones(10, 3, 8, 12)).shape, restored((), torch.ones(1, 3, 8, 12)).shape
@@ -107,7 +104,7 @@ def restored(axes: tuple[int, ...], batch: Tensor) -> Tensor:
 
 
 def _not_mapped(name: str, value: Tensor) -> None:
-    """Refuse a tensor that stands for one item of ``torch.vmap``: its numbers decide what is computed."""
+    """Refuse a tensor inside ``torch.vmap``, because planning layers reads its values."""
     if not is_traced() and torch._C._functorch.is_batchedtensor(value):
         raise ValueError(
             f"{name} comes from torch.vmap, which cannot follow this rendering: layers are planned from the numbers of "

@@ -1,4 +1,4 @@
-"""Depth of field as a module and as functions: configuration, checks, then one call of the pipeline."""
+"""Depth of field as a module and as functions: they check their arguments and call the pipeline."""
 
 import contextlib
 import os
@@ -58,7 +58,7 @@ class DepthOfField(nn.Module):
 
     @property
     def options(self) -> Options:
-        """The options of the next rendering; each is an attribute of the module too, and may be set."""
+        """The options of the next rendering; each is also an attribute of the module, which may be set."""
         values: Any = {name: getattr(self, name) for name in OPTION_NAMES}
         return Options.of(**values)
 
@@ -78,32 +78,32 @@ class DepthOfField(nn.Module):
         background_depth: Tensor | None = None,
         attention: Attention | None = None,
     ) -> Tensor:
-        """Render.
+        """Render a batch of images.
 
-        One image ``[C, H, W]`` and clips ``[B, T, C, H, W]`` are taken as well; all maps then have the image's rank,
-        such as a depth of ``[1, H, W]`` or ``[B, T, 1, H, W]``.
+        A single image ``[C, H, W]`` and clips ``[B, T, C, H, W]`` are accepted too. All maps then have the image's
+        rank: a depth is ``[1, H, W]`` or ``[B, T, 1, H, W]``.
 
         Args:
             image: ``[B, C, H, W]``, linear light, floating point.
             depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres along the optical axis, > 0, ``inf`` allowed. A map of
                 another size with the same aspect ratio is resampled, guided by the image
-                (:func:`torchdof.depth.at_size_of`); a compiled or exported graph takes the image's size only.
+                (:func:`torchdof.depth.at_size_of`); a compiled or exported graph takes only the image's size.
             focus_m: Focus distance in metres for this call: a number, or one for each image as a list, ``[B]`` or
-                ``[B, 1]`` (of clips ``[B]`` or ``[B, T]``); None takes the camera's.
-            f_number: F-number for this call, in the same forms; None takes the camera's.
-            plan: Layers to render with, from :meth:`plan`; None plans for this image. Where the image is blurred more
-                than the plan reaches, layers are added; compiled code takes a plan as it is.
-            background: What is seen where the nearer surfaces of the image are taken away, ``[B, C, H, W]``, where it
-                is known; it takes the place of the guess that fills what a blurred foreground uncovers.
-            background_depth: Its depth in metres, ``[B, 1, H, W]`` or ``[1, 1, H, W]``; nowhere nearer than the image's
-                own, or it counts as that.
-            attention: Where the viewer looks: ``(x, y, radius)`` in pixels, or a map ``[B, 1, H, W]`` of 0 to 1. There
-                the tolerance is kept; elsewhere a draft's is enough.
+                ``[B, 1]`` (for clips ``[B]`` or ``[B, T]``); None uses the camera's.
+            f_number: F-number for this call, in the same forms; None uses the camera's.
+            plan: Layers to render with, from :meth:`plan`; None plans for this image. Layers are added if the image has
+                larger radii than the plan; compiled code uses a plan unchanged.
+            background: Image ``[B, C, H, W]`` of the scene behind the nearer surfaces, if it is known. It replaces the
+                estimate that fills the areas uncovered by a blurred foreground.
+            background_depth: Its depth in metres, ``[B, 1, H, W]`` or ``[1, 1, H, W]``; values nearer than ``depth``
+                are replaced by it.
+            attention: Where the viewer looks: ``(x, y, radius)`` in pixels, or a map ``[B, 1, H, W]`` in [0, 1]. There
+                the tolerance applies; elsewhere that of ``"draft"``.
 
         Returns:
             The image's shape and dtype. Differentiable with respect to image, depth, focus and f-number.
-            While gradients with respect to the circle of confusion are recorded, the layers stand still (they do not
-            follow the scene), so that the picture is a continuous, piecewise linear function of it.
+            While gradients with respect to the circle of confusion are recorded, the layers are fixed instead of
+            following the scene, so that the picture is a continuous, piecewise linear function of it.
 
         Raises:
             ValueError: If shapes, types or values are not as described, or a tensor comes from ``torch.vmap``.
@@ -128,11 +128,11 @@ class DepthOfField(nn.Module):
         focus_m: float | Tensor | None = None,
         f_number: float | Tensor | None = None,
     ) -> Tensor:
-        """Render a stack of layers, such as a multi-plane image, in which nothing is hidden.
+        """Render a stack of complete layers, such as a multi-plane image.
 
         Args:
-            rgba: ``[B, N, C + 1, H, W]``: light premultiplied with coverage, then coverage in [0, 1], of N layers in
-                any order. Where nothing covers a pixel the picture stays transparent.
+            rgba: ``[B, N, C + 1, H, W]``: N layers in any order; light premultiplied by coverage, then coverage in
+                [0, 1]. Pixels that no layer covers stay transparent.
             depth_m: Their depths in metres, ``[N]``, ``[B, N]`` or a map ``[B, N, 1, H, W]``, > 0, ``inf`` allowed.
             focus_m: As in :meth:`forward`.
             f_number: As in :meth:`forward`.
@@ -167,18 +167,18 @@ class DepthOfField(nn.Module):
         focus_m: Number | None = None,
         f_number: Number | None = None,
     ) -> Tensor:
-        """Signed circle of confusion of the call :meth:`forward` with the same arguments: ``[B, 1, H, W]``, pixels.
+        """Signed circle of confusion that :meth:`forward` uses for the same arguments: ``[B, 1, H, W]``, pixels.
 
-        Of one image it is ``[1, H, W]``, of clips ``[B, T, 1, H, W]``.
+        For one image it is ``[1, H, W]``, for clips ``[B, T, 1, H, W]``.
 
         Raises:
-            ValueError: As :meth:`forward`; so does a lens that blurs beyond what numbers hold.
+            ValueError: As :meth:`forward`; also if the circle of confusion is not finite.
         """
         axes = leading_axes(image)
         lens = (numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number))
         image, depth = flattened(axes, "image", image, "C"), flattened(axes, "depth", depth)
         coc = self.coc_as_given(image, depth, *lens)
-        validation.image_and_map(image, "coc_px", coc, "in pixels")  # as many items as the image, whatever the lens has
+        validation.image_and_map(image, "coc_px", coc, "in pixels")  # a lens of another batch size changes its shape
         return restored(axes, edges.mended(image, coc, self.options.depth_edges))
 
     def coc_as_given(
@@ -189,14 +189,14 @@ class DepthOfField(nn.Module):
         f_number: float | Tensor | None,
         name: str = "depth",
     ) -> Tensor:
-        """The circle of confusion of a depth whose edges are as they are given.
+        """The circle of confusion of a depth map without repair of its edges.
 
         Args:
             image: ``[B, C, H, W]``.
-            depth: ``[B or 1, 1, H, W]``, of the image's size or one that may be resampled to it.
-            focus_m: A number or ``[B]``; None takes the camera's.
+            depth: ``[B or 1, 1, H, W]``, of the image's size, or of a size that can be resampled to it.
+            focus_m: A number or ``[B]``; None uses the camera's.
             f_number: The same.
-            name: Of the depth, in messages.
+            name: Name of the depth in messages.
         """
         check = self.options.check
         if not is_traced() and validation.is_resizable(image, depth):
@@ -206,7 +206,7 @@ class DepthOfField(nn.Module):
         validation.image_and_depth(image, depth, values=check, name=name)
         changes = {"focus_m": focus_m, "f_number": f_number}
         camera = self.camera.replace(**{k: v for k, v in changes.items() if v is not None})
-        # as a tensor: an exported graph would take Python's arithmetic with the width to be in float32
+        # a tensor, because an exported graph would do Python's arithmetic with the width in float32
         width: Any = torch.scalar_tensor(image.shape[-1], dtype=torch.float64)
         coc = camera.coc_px(depth, width)
         if not check:
@@ -221,12 +221,11 @@ class DepthOfField(nn.Module):
         focus_m: Number | None = None,
         f_number: Number | None = None,
     ) -> Plan:
-        """The layers this scene needs; one plan can serve a whole shot. Arguments as in :meth:`forward`.
+        """The layers for a scene; one plan can be used for a whole shot. Arguments as in :meth:`forward`.
 
-        Plan for the frame that is blurred most: what other frames need beyond it is added anew in each.
+        Plan for the frame with the largest blur: a frame with larger radii adds layers in every call.
 
-        ``print`` tells which layers there are, of which radius, at which resolution, and which share of the pixels
-        each carries.
+        ``print`` shows the layers: radius, resolution, and the share of the pixels in each.
 
         Example:
             >>> dof = DepthOfField(Camera(focus_m=1.0, f_number=1.0))
@@ -246,10 +245,10 @@ class DepthOfField(nn.Module):
         return {"camera": camera, **options.arguments(), "table": options.table.to_dict()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`get_extra_state` gave, all of it or nothing.
+        """Restore the result of :meth:`get_extra_state`; an error changes nothing.
 
         Raises:
-            ValueError: Naming the field that is missing, unknown or makes no sense.
+            ValueError: If a field is missing, unknown or invalid; the message names it.
         """
         self.camera, self.options = read_state(state)
 
@@ -313,12 +312,12 @@ def blur_by_coc(
     attention: Attention | None = None,
     **options: Unpack[OptionArguments],
 ) -> Tensor:
-    """Depth of field for pipelines that hold a map of the circle of confusion already.
+    """Depth of field from a map of the circle of confusion.
 
     Args:
         image: ``[B, C, H, W]``, linear light; also ``[C, H, W]`` or ``[B, T, C, H, W]``, all maps then of that rank.
-        coc_px: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, signed radius in pixels: negative in front of the focus plane,
-            NaN where it is unknown and ``check=False``.
+        coc_px: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, signed radius in pixels: negative in front of the focus plane.
+            With ``check=False`` it may be NaN where it is unknown.
         table: Blur measured from a lens; None takes the ideal disc.
         plan: Layers to render with; None plans for this image.
         background: As in :meth:`DepthOfField.forward`.
@@ -360,9 +359,9 @@ def blur(
     attention: Attention | None = None,
     ops: Ops = EAGER,
 ) -> Tensor:
-    """Check the arguments of a rendering, then render: what all of the names above come to.
+    """Check the arguments of a rendering and call the pipeline; all functions above end here.
 
-    Arguments are those of :func:`blur_by_coc`, of four axes, and the operations that the pipeline is made of.
+    Arguments as in :func:`blur_by_coc`, with four axes, and the operations ``ops`` (an exported graph has its own).
     """
     channels = options.table.channels
     validation.image_and_coc(image, coc_px, channels, values=options.check)
@@ -379,7 +378,7 @@ def blur(
 
 
 def _engine(light: Tensor) -> contextlib.AbstractContextManager[Any]:
-    """What the pipeline runs in: with autocast off, for it would convolve in half precision."""
+    """Context of the pipeline: autocast is off, because it would convolve in half precision."""
     if not is_traced():
         _has_rendered.set()
     device = light.device.type
@@ -390,7 +389,7 @@ _has_rendered = threading.Event()
 
 
 def _after_fork() -> None:
-    """In a forked child: PyTorch's threads (OpenMP) do not outlive a fork, and waiting for them would last for ever."""
+    """In a forked child, use one thread: OpenMP's threads do not survive a fork, and waiting for them would hang."""
     if _has_rendered.is_set() and torch.get_num_threads() > 1:
         torch.set_num_threads(1)
 
@@ -400,16 +399,16 @@ if hasattr(os, "register_at_fork"):
 
 
 def _check_plan(plan: Plan | None) -> None:
-    """Refuse what is not a plan."""
+    """Refuse a value that is not a plan."""
     if plan is not None and not isinstance(plan, Plan):
         raise ValueError(
-            f"plan must be a Plan, as DepthOfField.plan(image, depth) gives, or None, got {validation.show(plan)}; "
+            f"plan must be a Plan from DepthOfField.plan(image, depth) or None, got {validation.show(plan)}; "
             "leave it out to plan for this image"
         )
 
 
 def _check_attention(attention: Attention | None, plan: Plan | None, options: Options) -> None:
-    """Refuse attention where it cannot be paid: beside a plan, which holds one tolerance, and where code is traced."""
+    """Refuse attention beside a plan, which has one tolerance, and in traced code."""
     if attention is None:
         return
     if plan is not None:

@@ -1,4 +1,4 @@
-"""The options of a rendering, spelled once: names, types, defaults, meaning, and what is wrong with them."""
+"""The options of a rendering, defined once: names, types, defaults, meaning, checks."""
 
 import dataclasses
 import inspect
@@ -24,39 +24,40 @@ __all__ = [
 
 Method = Literal["layered", "fold"]
 DepthEdges = Literal["auto", "repair", "as given"]
-"""What is done to depth edges before rendering: repaired where the map proves inexact, or all of them, or nothing."""
+"""Repair of depth edges before rendering: if the map is inexact, always, or never."""
 
 Tolerance = float | Literal["draft", "preview", "final"]
 """RMS difference, display-encoded, from the same rendering with exact kernels, dense layers and full resolution."""
 
-_DISC = BlurTable.disc()  # one for all: what was computed of a table is kept with it
-_LATER_NUMBERS = {"focus_range_m": None, "tilt_deg": 0.0, "swing_deg": 0.0}  # of the camera; older states lack them
+_DISC = BlurTable.disc()  # shared, because a table caches its hash
+_LATER_NUMBERS = {"focus_range_m": None, "tilt_deg": 0.0, "swing_deg": 0.0}  # defaults for states of older versions
 _Spelled = TypeVar("_Spelled")
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """How a picture is rendered.
+    """Options of a rendering.
 
     Args:
         table: Blur measured from a lens; None takes the ideal disc.
         tolerance: Accepted RMS difference, display-encoded, from the same rendering with exact kernels, dense layers
-            and full resolution. 0 asks for that rendering itself, whose kernels are interpolated between layers half a
-            pixel apart: where depth is noise, 1 to 2.5/255 RMS from a scatter of each pixel's own kernel. ``"draft"``
-            is 8/255, ``"preview"`` 4/255 and ``"final"`` 1/255.
-        occlusion: True composites layers far to near, so that blurred foregrounds cover what is behind and sharp ones
-            are not bled upon. False is the paper's own algorithm: every pixel's light accumulates.
-        normalize: With ``occlusion=False`` only: False leaves the plain sum that the paper accumulates.
-        method: ``"layered"`` spreads layers by convolution (fast); ``"fold"`` by the paper's literal scatter.
-        max_coc_px: Largest radius that a static plan (compiled, exported) covers; larger ones are rendered with it.
-        check: Look for NaN and non-positive depths and non-finite light before rendering, and refuse them. False skips
-            that (and its cost); a pixel with a bad depth then passes through sharp and touches nothing else.
-        depth_edges: ``"auto"`` moves and sharpens the edges of the depth to where the image has them, unless they prove
-            exact in this frame; ``"repair"`` asks each edge; ``"as given"`` takes the map as it is. See
+            and full resolution. 0 gives that rendering itself. Its kernels are interpolated between layers half a pixel
+            apart; if depth is noise, this differs by 1 to 2.5/255 RMS from a scatter of each pixel's own kernel.
+            ``"draft"`` is 8/255, ``"preview"`` 4/255 and ``"final"`` 1/255.
+        occlusion: True composites layers far to near: blurred foregrounds cover the surfaces behind them, and blurred
+            backgrounds do not bleed onto sharp foregrounds. False is the algorithm of the paper: the light of all
+            pixels is added.
+        normalize: Only with ``occlusion=False``: False leaves the plain sum of the paper.
+        method: ``"layered"`` convolves layers (fast); ``"fold"`` is the literal scatter of the paper.
+        max_coc_px: Largest radius in a static plan (compiled, exported); larger ones are rendered with this radius.
+        check: Refuse NaN and non-positive depths and non-finite light before rendering. False skips these checks and
+            their cost; a pixel with an invalid depth is then returned sharp and does not affect others.
+        depth_edges: ``"auto"`` sharpens the edges of the depth and moves them to the edges of the image, unless the
+            depth of this frame is found exact; ``"repair"`` examines each edge; ``"as given"`` changes nothing. See
             :func:`torchdof.depth.repair_edges`.
 
     Raises:
-        ValueError: Naming the option that makes no sense.
+        ValueError: If an option is invalid; the message names it.
 
     Example:
         >>> Options().tolerance == 1 / 255
@@ -91,11 +92,11 @@ class Options:
 
     @classmethod
     def of(cls, table: BlurTable | None = None, **arguments: Unpack["OptionArguments"]) -> "Options":
-        """The options that a caller's arguments mean: no table is the disc, a tolerance's name its number.
+        """Options from a caller's arguments: ``table=None`` means the disc, a named tolerance its number.
 
         Raises:
-            ValueError: Naming the option that makes no sense.
-            TypeError: Naming an argument that is no option.
+            ValueError: If an option is invalid; the message names it.
+            TypeError: If an argument is not an option; the message names it.
 
         Example:
             >>> Options.of(table=None, tolerance="preview") == Options(tolerance=4 / 255)
@@ -114,14 +115,13 @@ class Options:
         return {name: getattr(self, name) for name in OPTION_NAMES}
 
 
-OPTION_NAMES = tuple(field.name for field in dataclasses.fields(Options))  # a compiler cannot ask for fields
+OPTION_NAMES = tuple(field.name for field in dataclasses.fields(Options))  # torch.compile cannot trace fields()
 
 
 class OptionArguments(TypedDict, total=False):
-    """The same names for type checkers: what a caller may write beside the table; a tolerance may be a name too.
+    """The options besides ``table`` for type checkers, which can only read them from a ``TypedDict``.
 
-    They can read these off nothing but a class of this kind, so the names stand here once more, without their meaning
-    and their defaults; a test holds the two together.
+    A test compares the names with :class:`Options`.
     """
 
     tolerance: Tolerance
@@ -134,9 +134,10 @@ class OptionArguments(TypedDict, total=False):
 
 
 def spells_options(function: _Spelled) -> _Spelled:
-    """Have ``help`` and editors show each option where a function or class takes ``**options``.
+    """Decorator that makes ``help`` and editors show each option of a function or class with ``**options``.
 
-    The signature gets the names and defaults of :class:`Options`, the docstring's line ``**options`` their meaning.
+    It adds the names and defaults of :class:`Options` to the signature, and replaces the line ``**options`` of the
+    docstring by their descriptions.
     """
     called: Any = function.__init__ if inspect.isclass(function) else function
     signature = inspect.signature(called)
@@ -164,17 +165,14 @@ def spells_options(function: _Spelled) -> _Spelled:
 
 
 def read_state(state: Any) -> tuple[Camera, Options]:
-    """What a module's state describes.
-
-    Returns:
-        The camera, and the options with the table.
+    """Camera and options (with the table) from the state of a module.
 
     Raises:
-        ValueError: Naming the field that is missing, unknown or makes no sense.
+        ValueError: If a field is missing, unknown or invalid; the message names it.
     """
     names = ["camera", *(field.name for field in dataclasses.fields(Options))]
     if not isinstance(state, Mapping):
-        raise ValueError(f"the state of a DepthOfField must be a dict, as state_dict() gives, got {show(state)}")
+        raise ValueError(f"the state of a DepthOfField must be a dict from state_dict(), got {show(state)}")
     _fields("the state of a DepthOfField", state, names)
     camera = state["camera"]
     if not isinstance(camera, Mapping):

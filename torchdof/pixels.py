@@ -1,6 +1,6 @@
 """Single pixels of maps ``[B, C, H, W]`` by their flat index: ``(item * H + row) * W + column``.
 
-Depth edges, hidden surfaces and highlights concern few pixels; these are looked at as lists ``[P]``.
+Depth edges, hidden surfaces and highlights concern few pixels, which are processed as lists ``[P]``.
 """
 
 import torch
@@ -23,7 +23,7 @@ def places(pixels: Tensor, height: int, width: int) -> tuple[Tensor, Tensor, Ten
 
 def pick(values: Tensor, pixels: Tensor) -> Tensor:
     """Values ``[B, C, H, W]`` at pixels of any shape ``[...]``: ``[C, ...]``."""
-    # of one channel nothing is moved first: a graph copies what it transposes
+    # one channel needs no transpose, which would be a copy in an exported graph
     flat = values.reshape(1, -1) if values.shape[1] == 1 else values.transpose(0, 1).flatten(1)
     picked = flat.index_select(1, pixels.flatten())
     return picked.unflatten(1, pixels.shape)
@@ -37,7 +37,7 @@ def put(values: Tensor, pixels: Tensor, new: Tensor) -> Tensor:
 
 
 def around(pixels: Tensor, like: Tensor, reach: int) -> Tensor:
-    """The pixels up to ``reach`` around each, row by row, those beyond the border on it: ``[(2 reach + 1)^2, P]``."""
+    """Pixels of the square up to ``reach`` around each, row by row, clamped to the frame: ``[(2 reach + 1)^2, P]``."""
     height, width = like.shape[-2:]
     item, row, column = places(pixels, height, width)
     offsets = torch.arange(-reach, reach + 1, device=pixels.device)[:, None]
@@ -47,12 +47,14 @@ def around(pixels: Tensor, like: Tensor, reach: int) -> Tensor:
 
 
 def corners(item: Tensor, row: Tensor, column: Tensor, height: int, width: int) -> tuple[list[Tensor], Tensor, Tensor]:
-    """The four pixels around places, for linear interpolation, and how far down and right of the first the places lie.
+    """Indices and weights for bilinear interpolation at places ``[P]``, clamped to the frame.
 
-    Values go on beyond the border as they are at it. An axis of one pixel has no next one, and gives it no weight.
+    Returns:
+        The four pixels around each place (top left, top right, bottom left, bottom right), and the weights of the lower
+        row and of the right column. On an axis of one pixel the weight is 0.
     """
     row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)
     top, left = row.floor().clamp(max=max(0, height - 2)), column.floor().clamp(max=max(0, width - 2))
     first = (item * height + top.long()) * width + left.long()
-    below, beside = min(1, height - 1) * width, min(1, width - 1)
-    return [first, first + beside, first + below, first + (below + beside)], row - top, column - left
+    down, right = min(1, height - 1) * width, min(1, width - 1)  # index steps; 0 on an axis of one pixel
+    return [first, first + right, first + down, first + (down + right)], row - top, column - left

@@ -1,4 +1,4 @@
-"""What a tensor is: traced, differentiated or in memory."""
+"""Properties of a tensor: traced, differentiated, in memory."""
 
 from typing import Any
 
@@ -9,11 +9,11 @@ from torch.autograd import forward_ad
 __all__ = ["floating", "has_storage", "is_differentiated", "is_fake", "is_in_memory", "is_traced"]
 
 _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
-"""Types of number that PyTorch computes with; of smaller ones it only stores."""
+"""Floating-point dtypes with arithmetic; PyTorch only stores smaller ones."""
 
 
 def is_traced() -> bool:
-    """Whether this code is being compiled or exported: tensors then have no numbers that could be looked at."""
+    """Whether this code is being compiled or exported, so that the values of tensors cannot be read."""
     return torch.compiler.is_compiling() or torch.compiler.is_exporting()
 
 
@@ -23,7 +23,7 @@ def is_fake() -> bool:
 
 
 def is_differentiated(values: Tensor) -> bool:
-    """Whether derivatives are taken with respect to some numbers: backwards, forwards, or by torch.func."""
+    """Whether derivatives are taken with respect to a tensor: in reverse mode, in forward mode, or by torch.func."""
     if is_traced():
         return torch.is_grad_enabled() and values.requires_grad
     while True:
@@ -35,17 +35,14 @@ def is_differentiated(values: Tensor) -> bool:
 
 
 def is_in_memory(values: Tensor) -> bool:
-    """Whether the compiled engine can read some numbers, and nobody asks for more than numbers.
-
-    It cannot under ``FakeTensorMode``, where a new tensor has no memory.
-    """
+    """Whether the compiled engine can use a tensor: dense CPU memory, no gradients, no ``FakeTensorMode``."""
     if values.device.type != "cpu" or torch._C._functorch.is_functorch_wrapped_tensor(values):
         return False
     return not is_fake() and has_storage(values) and not is_differentiated(values)
 
 
 def has_storage(values: Tensor) -> bool:
-    """Whether a tensor's numbers lie in memory: not those of a fake, masked or other wrapper, or of a freed storage."""
+    """Whether a tensor has memory of its own; fake, masked and other wrappers have none, nor has a freed storage."""
     try:
         storage = values.untyped_storage()
         last = values.storage_offset() + sum(
@@ -53,10 +50,10 @@ def has_storage(values: Tensor) -> bool:
         )
         whole = storage.device == values.device and storage.nbytes() >= (last + 1) * values.element_size()
         return values.numel() == 0 or (whole and storage.data_ptr() != 0)
-    except (RuntimeError, NotImplementedError):  # a wrapper's storage may not be asked
+    except (RuntimeError, NotImplementedError):  # wrappers refuse access to their storage
         return False
 
 
 def floating(value: Any) -> bool:
-    """Whether something is a tensor of floating-point numbers that can be computed with: not of 8 bits or fewer."""
+    """Whether a value is a tensor of floating-point numbers of at least 16 bits."""
     return isinstance(value, Tensor) and value.dtype in _FLOATS

@@ -1,4 +1,4 @@
-"""Tensors and numbers at the public boundary: taken as they are, or refused, saying what was expected and what came."""
+"""Checks of arguments at the public boundary; errors state the expected value, the given value and the remedy."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -36,9 +36,9 @@ __all__ = [
 
 
 NAMED_TOLERANCES = {"draft": 8 / 255, "preview": 4 / 255, "final": 1 / 255}
-"""For looking around, for judging a picture, and one that differs by less than a display shows."""
+"""RMS tolerances. The last difference is smaller than a step of an 8-bit display."""
 
-_MOST_STRETCH = 0.03  # of a depth map: estimators work at multiples of 14 or 64 pixels
+_MOST_STRETCH = 0.03  # largest change of a depth map's aspect ratio; estimators work at multiples of 14 or 64 px
 
 WHOLE_NUMBERS = (
     *(torch.uint8, torch.uint16, torch.uint32, torch.uint64),
@@ -52,15 +52,15 @@ def number(
     """A number in the open interval ``(low, high)``.
 
     Args:
-        name: Of the argument.
-        value: What came.
-        low: Below what is allowed.
-        high: Above what is allowed.
-        unit: For the message, such as ``"metres"``.
-        infinite: Whether an infinite number counts as one.
+        name: Name of the argument.
+        value: Value of the argument.
+        low: Lower bound, excluded.
+        high: Upper bound, excluded.
+        unit: Unit for the message, such as ``"metres"``.
+        infinite: Whether infinity is allowed.
 
     Raises:
-        ValueError: If it is not a number (a truth value is none), NaN, or outside.
+        ValueError: If the value is not a number (a bool is not), is NaN, or is out of range.
 
     Example:
         >>> number("f_number", 2, low=0)
@@ -78,7 +78,7 @@ def number(
 
 
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
-    """What :func:`torch.broadcast_shapes` computes, which imports sympy, half a second, when it is first called.
+    """As :func:`torch.broadcast_shapes`, whose first call imports sympy and takes half a second.
 
     Raises:
         RuntimeError: If the shapes do not fit each other.
@@ -90,7 +90,7 @@ def whole(name: str, value: Any, low: int, high: int) -> int:
     """A whole number from ``low`` to ``high``.
 
     Raises:
-        ValueError: If it is none, or outside.
+        ValueError: If the value is not a whole number, or is out of range.
     """
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
         raise ValueError(f"{name} must be a whole number from {low} to {high}, got {show(value)}")
@@ -98,17 +98,17 @@ def whole(name: str, value: Any, low: int, high: int) -> int:
 
 
 def ends(values: Tensor) -> tuple[float, float]:
-    """Least and largest of some numbers; both NaN if one of them is NaN. One look at each value."""
+    """Smallest and largest value; both are NaN if any value is."""
     if values.dtype == torch.float32 and is_in_memory(values) and native.chosen():
         return native.ends(values)
-    # not as half precision, of which autocast knows only one kind at a time
+    # in float32 at least: autocast supports only one half-precision dtype at a time
     exact = torch.float64 if values.dtype == torch.float64 else torch.float32
     low, high = torch.stack([end.to(exact) for end in torch.aminmax(values.detach())]).tolist()
     return low, high
 
 
 def pixels_wide(width: Any) -> None:
-    """Refuse a width in pixels that is none; the symbols and tensors of a traced program pass.
+    """Refuse a width that is not a positive number of pixels; symbols and tensors of a traced program pass.
 
     Raises:
         ValueError: If it is not a positive finite number, or a tensor of one.
@@ -123,15 +123,15 @@ def pixels_wide(width: Any) -> None:
 
 
 def real_tensor(name: str, value: Any, what: str) -> Tensor:
-    """A dense tensor of floating-point numbers that are there.
+    """A dense floating-point tensor that holds data.
 
     Args:
-        name: Of the argument.
-        value: What came.
-        what: What is expected, such as ``"[B, 1, H, W] in metres"``.
+        name: Name of the argument.
+        value: Value of the argument.
+        what: Expected shape and unit for the message, such as ``"[B, 1, H, W] in metres"``.
 
     Raises:
-        ValueError: If it is something else: another kind of object or number, sparse, or without data ("meta").
+        ValueError: If the value is not a tensor, has another dtype, is sparse, or has no data ("meta").
     """
     if not isinstance(value, Tensor):
         raise ValueError(f"{name} must be a tensor {what}, got {show(value)}")
@@ -156,10 +156,10 @@ def real_tensor(name: str, value: Any, what: str) -> Tensor:
 
 
 def tolerance_of(value: Any) -> float:
-    """The number behind a tolerance.
+    """A tolerance as a number.
 
     Raises:
-        ValueError: If it is neither a name nor a number from 0 to below 1.
+        ValueError: If the value is neither a name nor a number in [0, 1).
 
     Example:
         >>> tolerance_of("preview") == 4 / 255
@@ -174,17 +174,23 @@ def tolerance_of(value: Any) -> float:
 
 
 def depth_edges(value: Any) -> None:
-    """Refuse what names no treatment of depth edges.
+    """Refuse a value that is not "auto", "repair" or "as given".
 
     Raises:
-        ValueError: If it is none of "auto", "repair" and "as given".
+        ValueError: If it is another value.
     """
     if not isinstance(value, str) or value not in ("auto", "repair", "as given"):
         raise ValueError(f"depth_edges must be 'auto', 'repair' or 'as given', got {show(value)}")
 
 
 def image_and_depth(image: Tensor, depth: Tensor, values: bool, name: str = "depth") -> None:
-    """Refuse an image and a depth map, which the caller knows by a name, that do not belong together.
+    """Refuse an image and a depth map that do not fit each other.
+
+    Args:
+        image: ``[B, C, H, W]``.
+        depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres.
+        values: Whether to check the values too.
+        name: Name of the depth in messages.
 
     Raises:
         ValueError: If shapes or types are wrong, or, with ``values``, a depth is NaN or not positive.
@@ -200,7 +206,7 @@ def image_and_depth(image: Tensor, depth: Tensor, values: bool, name: str = "dep
 
 
 def is_resizable(image: Any, depth: Any) -> bool:
-    """Whether a depth map has another size than an image and may show the same."""
+    """Whether a depth map has another size than an image, but nearly the same aspect ratio."""
     maps = all(isinstance(t, Tensor) and t.ndim == 4 and t.is_floating_point() and t.numel() for t in (image, depth))
     if not maps or image.shape[-2:] == depth.shape[-2:] or image.device != depth.device:
         return False
@@ -208,7 +214,7 @@ def is_resizable(image: Any, depth: Any) -> bool:
 
 
 def stretch(image: Tensor, depth: Tensor) -> float:
-    """By which part a depth map is stretched along one axis to the shape of an image; 0 for less than a pixel.
+    """Relative stretch of a depth map along one axis to the aspect ratio of an image; 0 for less than a pixel.
 
     Example:
         >>> round(stretch(torch.rand(1, 3, 1080, 1920), torch.rand(1, 1, 294, 518)), 4)  # multiples of 14
@@ -220,7 +226,7 @@ def stretch(image: Tensor, depth: Tensor) -> float:
 
 
 def same_aspect(image: Tensor, depth: Tensor) -> None:
-    """Refuse a depth map that cannot show what an image ``[..., H, W]`` of another size shows.
+    """Refuse a depth map whose aspect ratio differs from that of an image ``[..., H, W]``.
 
     Raises:
         ValueError: If the aspect ratios differ by more than 3 %.
@@ -228,9 +234,9 @@ def same_aspect(image: Tensor, depth: Tensor) -> None:
     if 0 in depth.shape or stretch(image, depth) > _MOST_STRETCH:
         (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
         if 0 not in depth.shape and stretch(image, depth.transpose(-1, -2)) <= _MOST_STRETCH:
-            hint = "turned by 90 degrees it fits: one of the two lies on its side"
+            hint = "turned by 90 degrees it fits: rotate one of the two"
         else:
-            hint = "crop one of the two, so that both show the same"
+            hint = "crop one of the two, so that both show the same area"
         raise ValueError(
             f"depth is {columns} x {rows} pixels and the image {width} x {height}: a depth map may have another size, "
             f"but must have the same aspect ratio, to within 3 %; {hint}"
@@ -238,13 +244,13 @@ def same_aspect(image: Tensor, depth: Tensor) -> None:
 
 
 def image_and_coc(image: Tensor, coc_px: Tensor, channels: int, values: bool) -> None:
-    """Refuse an image and a map of the circle of confusion that do not belong together.
+    """Refuse an image and a map of the circle of confusion that do not fit each other.
 
     Args:
         image: ``[B, C, H, W]``.
         coc_px: Its signed circle of confusion, in pixels.
-        channels: How many kernels the table has at a node: 1, or one for each channel of the image.
-        values: Whether to look at the numbers too; a traced program has none to look at.
+        channels: Number of kernels of the table at a node: 1, or one for each channel of the image.
+        values: Whether to check the values too (never in a traced program).
 
     Raises:
         ValueError: If shapes or types are wrong, the table has other channels than the image, or, with ``values``, a
@@ -259,17 +265,17 @@ def image_and_coc(image: Tensor, coc_px: Tensor, channels: int, values: bool) ->
 
 
 def background(image: Tensor, hidden: Tensor | None, name: str, where: Tensor | None, unit: str) -> None:
-    """Refuse a background that does not belong to an image.
+    """Refuse a background that does not fit an image.
 
     Args:
         image: ``[B, C, H, W]``.
-        hidden: What lies behind it, of the same shape; None if nothing is known.
-        name: Of the map that tells where it lies.
-        where: That map.
-        unit: Of its numbers.
+        hidden: The background, of the same shape, or None.
+        name: Name of the background's map, for messages.
+        where: Depth or circle of confusion of the background, or None.
+        unit: Unit of that map, for messages.
 
     Raises:
-        ValueError: If one of both is missing, or shapes or types are wrong.
+        ValueError: If only one of both is given, or shapes or types are wrong.
     """
     if hidden is None and where is None:
         return
@@ -281,7 +287,7 @@ def background(image: Tensor, hidden: Tensor | None, name: str, where: Tensor | 
         image.dtype,
         image.device,
     ):
-        raise ValueError(f"background must be as the image is, {show(image)}, got {show(hidden)}")
+        raise ValueError(f"background must be like the image, {show(image)}, got {show(hidden)}")
     _map(name, unit, where, image)
     if not is_traced():
         real_tensor("background", hidden, "[B, C, H, W]")
@@ -289,10 +295,10 @@ def background(image: Tensor, hidden: Tensor | None, name: str, where: Tensor | 
 
 
 def finite_background(hidden: Tensor | None, coc_px: Tensor | None) -> None:
-    """Refuse a background, or a circle of confusion of it, that is not finite.
+    """Refuse a background, or its circle of confusion, with values that are not finite.
 
     Raises:
-        ValueError: Counting the values.
+        ValueError: With the number of such values.
     """
     for name, values in (("background_coc_px", coc_px), ("background", hidden)):
         if values is not None and not is_traced():
@@ -300,10 +306,10 @@ def finite_background(hidden: Tensor | None, coc_px: Tensor | None) -> None:
 
 
 def stack(rgba: Tensor, depth_m: Tensor, values: bool) -> Tensor:
-    """Refuse a stack of layers and depths that do not belong together.
+    """Refuse a stack of layers and depths that do not fit each other.
 
     Returns:
-        The depths as ``[B, N, 1, H, W]``, each axis but N of its size or 1.
+        The depths as ``[B or 1, N, 1, H or 1, W or 1]``.
 
     Raises:
         ValueError: If shapes or types are wrong, or, with ``values``, a coverage is outside [0, 1] or light is not
@@ -339,26 +345,26 @@ def stack(rgba: Tensor, depth_m: Tensor, values: bool) -> Tensor:
 
 
 def coc_of_lens(coc_px: Tensor, depth: Tensor, lens: Mapping[str, Any]) -> None:
-    """Refuse a circle of confusion, computed from a lens and a depth > 0, that is beyond what numbers hold.
+    """Refuse a circle of confusion that overflowed.
 
     Args:
-        coc_px: What came out.
-        depth: In metres.
-        lens: What the caller stated of the lens: name and number or tensor.
+        coc_px: The circle of confusion in pixels.
+        depth: The depth in metres from which it was computed.
+        lens: Numbers of the camera by name, floats or tensors.
 
     Raises:
-        ValueError: Naming the nearest depth and all numbers of the lens.
+        ValueError: With the nearest depth and all numbers of the lens.
     """
     if not is_traced() and not all(map(math.isfinite, ends(coc_px))):
         stated = ", ".join(f"{name} {_number(value)}" for name, value in lens.items())
         raise ValueError(
-            f"depth and lens must blur by some number of pixels, got a blur beyond any: this lens ({stated}) "
-            f"blurs a depth of {float(depth.detach().min()):.3g} m so much; check both"
+            f"depth and lens must give a finite blur radius, got an infinite one: check this lens ({stated}) "
+            f"and the depth, which starts at {float(depth.detach().min()):.3g} m"
         )
 
 
 def _number(value: Any) -> str:
-    """A number of a lens, or those of its batch."""
+    """A number of a lens, or all numbers of a batch, as text."""
     numbers = value.detach().flatten().tolist() if isinstance(value, Tensor) else [value]
     return " ".join(f"{x:.6g}" for x in numbers)
 
@@ -369,25 +375,25 @@ def _finite(name: str, values: Tensor) -> None:
         bad = values.numel() - int(torch.isfinite(values).sum())
         raise ValueError(
             f"{name} must be finite, got {bad} of {values.numel()} values that are NaN or infinite; "
-            "mend them, or pass check=False"
+            "repair them, or pass check=False"
         )
 
 
 def image_and_map(image: Tensor, name: str, value: Tensor, unit: str) -> None:
-    """Refuse an image and a map of one number a pixel whose kinds, sizes or devices do not fit.
+    """Refuse an image and a one-channel map whose types, sizes or devices do not fit.
 
     Raises:
-        ValueError: Naming the one that is wrong.
+        ValueError: If one of them is wrong; the message names it.
     """
     _image(image)
     _map(name, unit, value, image)
-    if not is_traced():  # there a tensor has no data yet
+    if not is_traced():
         real_tensor("image", image, "[B, C, H, W]")
         real_tensor(name, value, f"[B, 1, H, W] {unit}")
 
 
 def _image(image: Tensor) -> None:
-    """Refuse what is no image ``[B, C, H, W]`` of floating-point light."""
+    """Refuse a value that is not an image ``[B, C, H, W]`` in floating point."""
     if not isinstance(image, Tensor):
         raise ValueError(f"image must be a tensor [B, C, H, W] in linear light, got {type(image).__name__}")
     if not floating(image):
@@ -401,7 +407,7 @@ def _image(image: Tensor) -> None:
 
 
 def _map(name: str, unit: str, value: Tensor, image: Tensor) -> None:
-    """Refuse what is no map of one number for each pixel of an image, on its device."""
+    """Refuse a value that is not a map ``[B or 1, 1, H, W]`` for an image, on its device."""
     batch, _, height, width = image.shape
     expected = f"{name} must be [{batch}, 1, {height}, {width}] or [1, 1, {height}, {width}] {unit}"
     if not floating(value):
@@ -417,11 +423,11 @@ def _map(name: str, unit: str, value: Tensor, image: Tensor) -> None:
 
 
 def show(value: Any) -> str:
-    """A value for a message: short, and never an error of its own."""
+    """A short text for a value in a message; never raises."""
     if isinstance(value, Tensor):
         return f"a {value.dtype} tensor of shape {list(value.shape)}"
     try:
         text = repr(value)
-    except Exception:  # an integer of more digits than Python prints, or a foreign object's own trouble
+    except Exception:  # an integer with more digits than Python prints, or an error in the object's own repr
         text = ""
     return text if 0 < len(text) <= 60 else f"{type(value).__name__} {text[:40]}...".replace(" ...", "")

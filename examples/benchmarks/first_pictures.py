@@ -1,11 +1,12 @@
-"""What first pictures cost: by new cameras, in fresh processes, as commands and in sequences.
+"""Times of first pictures: with new cameras, in fresh processes, as commands and in sequences.
 
     python examples/benchmarks/first_pictures.py SCENES [--parts cameras pull] [--out results]
     python examples/benchmarks/first_pictures.py SCENES --python OTHER/.venv/bin/python
 
-SCENES is a folder of scenes as for ``torchdof bench --truth``; other pictures are made here, cameras drawn by seeded
-numbers. With ``--python`` another installation takes turns with this one. Each turn of a part is a process of its own,
-which makes sure that this installation keeps its tolerance. The columns are those of ``torchdof bench``.
+SCENES is a folder of scenes as for ``torchdof bench --truth``; other pictures are made here, and cameras are drawn from
+seeded random numbers. With ``--python``, another installation is measured in alternation with this one. Each run of a
+part is a process of its own, which also checks that this installation keeps its tolerance. The columns are those of
+``torchdof bench``.
 """
 
 import argparse
@@ -39,24 +40,34 @@ from torchdof.bench.measurement import BenchScene, Seconds, error, measure, peak
 
 PARTS = "cameras fresh-39 fresh-60 command large pull small augmentation lamps noise demo gegl".split()
 COMMANDS = ("command", "large", "demo")
-ALONE = ("fresh-39", "fresh-60", "lamps", "noise")  # one picture a process, so that its memory shows
-COUNT = 4  # cameras a turn
+ALONE = ("fresh-39", "fresh-60", "lamps", "noise")  # one picture for each process, to measure its memory
+COUNT = 4  # cameras for each run
+CONVOLUTION = "17 x 17 convolution"  # the default reference run of torchdof.bench.measurement
 DATA = ROOT / "examples" / "data" / "motorcycle"
 
 
 class Figure(NamedTuple):
-    """What is measured, what renders, the scene by new cameras, the goal, and the reference run, None for unit Y."""
+    """One row of the table.
+
+    Args:
+        name: Name of the row.
+        blur: Function of image and coc in pixels that renders.
+        scenes: The scene with new cameras.
+        goal: Goal for a column, as text.
+        reference: Name of the reference run that is timed beside it.
+        beside: The reference run; None is a depthwise 17 x 17 convolution.
+    """
 
     name: str
     blur: Callable[..., Any]
     scenes: list[BenchScene]
     goal: str = ""
-    reference: str = "Y"
+    reference: str = CONVOLUTION
     beside: Callable[[], Any] | None = None
 
 
 def figures(part: str, folder: Path, turn: int) -> Iterator[Figure]:
-    """The figures of a part, in order; its name is one of :data:`PARTS`."""
+    """The figures of a part in :data:`PARTS`, in order; ``turn`` seeds the cameras."""
     if part in ("cameras", "gegl"):
         gegl = runpy.run_path(str(Path(__file__).parent / "tools" / "gegl.py"))
         for _, settings in itertools.groupby(read_scenes(folder), lambda scene: scene.name.rpartition("/")[0]):
@@ -109,7 +120,7 @@ def figures(part: str, folder: Path, turn: int) -> Iterator[Figure]:
         )
         camera = Camera.from_fov(math.degrees(2 * math.atan(128 / known["focal_length_px"])), 0.04, 3.0)
         aug = RandomDepthOfField((2.2, 5.0), (1.4, 8.0), camera, transfer="linear", p=1.0, tolerance="preview")
-        batch = BenchScene("crops", *crops.split((3, 1), 1))  # metres in the place of the coc
+        batch = BenchScene("crops", *crops.split((3, 1), 1))  # depth in metres takes the place of the coc
         aug(batch.image, batch.coc_px)
         beside = functools.partial(RandomBoxBlur((11, 11), p=1.0), batch.image)
         name, goal = "RandomDepthOfField, preview, 16 images, one thread", "16000 / cpu_ms at least 110"
@@ -144,7 +155,7 @@ def figures(part: str, folder: Path, turn: int) -> Iterator[Figure]:
 
 
 def spent(*command: object, folder: str | None = None) -> Seconds:
-    """What a command took."""
+    """Wall and processor time of a Python command."""
     wall, before = time.perf_counter(), os.times()
     subprocess.run([sys.executable, *map(str, command)], check=True, cwd=folder, stdout=subprocess.DEVNULL)
     after = os.times()
@@ -153,12 +164,12 @@ def spent(*command: object, folder: str | None = None) -> Seconds:
 
 
 def import_torch() -> tuple[None, Seconds]:
-    """What importing torch takes."""
+    """Time of importing torch."""
     return None, spent("-c", "import torch")
 
 
 def rendered(image: Tensor, coc_px: Tensor) -> tuple[Tensor, Seconds]:
-    """The picture of ``torchdof render``, and what the command took."""
+    """The picture of ``torchdof render``, and the time of the command."""
     with tempfile.TemporaryDirectory() as folder:
         write_image(f"{folder}/photo.jpg", Picture(image, transfer="srgb", sample="8"))
         write_image(f"{folder}/coc.exr", Picture(coc_px, ("Y",)), sample="float")
@@ -168,14 +179,14 @@ def rendered(image: Tensor, coc_px: Tensor) -> tuple[Tensor, Seconds]:
 
 
 def beyond_files(image: Tensor, coc_px: Tensor) -> tuple[Tensor, Seconds]:
-    """The same less what the command takes where all is in focus, and only files are read and written."""
+    """The same, minus the time of a command with everything in focus, which only reads and writes files."""
     picture, seconds = rendered(image, coc_px)
     files = rendered(image, torch.zeros_like(coc_px))[1]
     return picture, Seconds(seconds.wall - files.wall, seconds.cpu - files.cpu)
 
 
 def demonstrated(image: Tensor, _: Tensor) -> tuple[Tensor, Seconds]:
-    """What ``make demo`` runs, of the installation's own repository if it has one, and what it took."""
+    """The time of ``examples/demo.py``, from the repository of the measured installation if it has one."""
     own = Path(torchdof.__file__).parents[1] / "examples" / "demo.py"
     with tempfile.TemporaryDirectory() as out:
         return image, spent(own if own.exists() else ROOT / "examples" / "demo.py", "--data", DATA, "--out", out)
@@ -208,8 +219,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("scenes", type=Path, help="folder of scenes, as torchdof bench --truth takes it")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, metavar="PART", help=", ".join(PARTS))
-    parser.add_argument("--python", help="interpreter of another installation of torchdof, which takes turns")
-    parser.add_argument("--repeat", type=int, default=3, help="turns; by default %(default)s")
+    parser.add_argument("--python", help="interpreter of another installation of torchdof, run in alternation")
+    parser.add_argument("--repeat", type=int, default=3, help="number of runs; by default %(default)s")
     parser.add_argument("--out", type=Path, help="folder for first_pictures.csv and .md")
     parser.add_argument("--turn", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -228,7 +239,7 @@ def main() -> None:
     if arguments.out is not None:
         arguments.out.mkdir(parents=True, exist_ok=True)
     table = summary(rows, ["figure", "by", "goal", "beside"], statistics.median)
-    remark = f"{arguments.repeat} turns, each by other cameras, of " + ", ".join(f"{n}: {pythons[n]}" for n in names)
+    remark = f"{arguments.repeat} runs, each with other cameras, of " + ", ".join(f"{n}: {pythons[n]}" for n in names)
     publish("First pictures", {"First pictures": table}, [remark], arguments.out and arguments.out / "first_pictures")
 
 

@@ -1,4 +1,4 @@
-"""The node: an image and its depth in, the photograph of a real lens out."""
+"""The ComfyUI node: an image and its depth in, the photograph of a real lens out."""
 
 import importlib.resources
 from typing import Any
@@ -20,7 +20,7 @@ _SHAPES = {"as the lens": None, **{f"{count} blades": count for count in range(5
 
 
 def _lenses() -> list[str]:
-    """Lenses by name: the ideal ones, then the tables that come with torchdof."""
+    """Names of lenses: the ideal ones, then the tables that come with torchdof."""
     folder = importlib.resources.files("torchdof.optics") / "tables"
     return ["disc", "gaussian", *sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".json"))]
 
@@ -41,7 +41,7 @@ class DepthOfFieldNode:
 
     @classmethod
     def INPUT_TYPES(cls) -> dict[str, dict[str, tuple[Any, ...]]]:  # noqa: N802 (ComfyUI's name)
-        """What the node takes, as ComfyUI asks for it."""
+        """Inputs of the node, in ComfyUI's format."""
         return {
             "required": {
                 "image": ("IMAGE", {"tooltip": "All in focus."}),
@@ -54,7 +54,7 @@ class DepthOfFieldNode:
                     1.0, 0.05, 1000.0, 0.05, "Distance of the nearest value in metres, if not in metres."
                 ),
                 "far_m": _number(10.0, 0.1, 1e5, 0.1, "Distance of the farthest value in metres, if not in metres."),
-                "focus": ([_POINT, _DISTANCE], {"tooltip": "Focus on what is seen at a point, or at a distance."}),
+                "focus": ([_POINT, _DISTANCE], {"tooltip": "Focus on the surface at a point, or at a distance."}),
                 "focus_x": _number(0.5, 0.0, 1.0, 0.001, "The point: 0 is left, 1 is right."),
                 "focus_y": _number(0.5, 0.0, 1.0, 0.001, "The point: 0 is the top, 1 the bottom."),
                 "focus_m": _number(2.0, 0.1, 1e5, 0.01, "The distance in metres."),
@@ -93,11 +93,11 @@ class DepthOfFieldNode:
 
         Args:
             image: ``[B, H, W, 3 or 4]`` as ComfyUI passes images: encoded for display, in [0, 1].
-            depth: ``[B or 1, h, w, C]``; its channels are averaged. The extremes of all images of a batch are one
-                scale, so that clips do not pulse.
-            depth_kind: What its values are.
+            depth: ``[B or 1, h, w, C]``; its channels are averaged. All images of a batch share the range of values, so
+                that the focus of a clip does not pulse.
+            depth_kind: Kind of the values.
             near_m: Distance of the nearest value in metres.
-            far_m: Distance of the farthest.
+            far_m: Distance of the farthest value in metres.
             focus: "point" or "metres".
             focus_x: The point, from 0 (left) to 1.
             focus_y: The point, from 0 (top) to 1.
@@ -115,7 +115,7 @@ class DepthOfFieldNode:
             Two images ``[B, H, W, 3 or 4]`` and ``[B, H, W, 3]``.
 
         Raises:
-            ValueError: If an input is not as described, or nothing lies in focus by these numbers.
+            ValueError: If an input is not as described, or the focus point has no depth.
         """
         encoded, values = image.movedim(-1, 1), depth.movedim(-1, 1).mean(1, keepdim=True)  # [B, C, H, W]
         has_alpha = encoded.shape[1] == 4

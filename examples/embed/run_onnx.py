@@ -3,9 +3,9 @@
 Usage: python examples/embed/run_onnx.py dof.onnx photo.png depth.npz out.png --focus-m 2.3 --f-number 0.6 \
            --disparity-scale 192.03 --disparity-offset 31.086
 
-The image is decoded to linear light for the graph and encoded as sRGB again. Depth is an array in metres (``.npy``, or
-the only one in an ``.npz``), or disparity, when its scale (baseline in metres times focal length in pixels) is given.
-Pixels without depth (0, NaN or infinite disparity) pass through sharp.
+The image is decoded to linear light, and the result encoded as sRGB. Depth is an array in metres (``.npy``, or the only
+one in an ``.npz``), or disparity if its scale (baseline in metres times focal length in pixels) is given. Pixels
+without depth (0, NaN or infinite disparity) stay sharp.
 """
 
 import argparse
@@ -62,7 +62,7 @@ def read_image(path: str) -> np.ndarray:
 
 
 def read_depth(path: str, scale: float | None, offset: float) -> np.ndarray:
-    """Metres, ``[1, 1, H, W]`` float32; NaN where there is none."""
+    """Metres, ``[1, 1, H, W]`` float32; NaN without depth."""
     loaded = np.load(path)
     values = np.asarray(loaded[loaded.files[0]] if hasattr(loaded, "files") else loaded, dtype=np.float32)
     if scale is not None:
@@ -71,7 +71,7 @@ def read_depth(path: str, scale: float | None, offset: float) -> np.ndarray:
 
 
 def write_image(path: str, light: np.ndarray) -> None:
-    """Linear light ``[1, 3, H, W]`` to an 8-bit sRGB file, or to a float file where the type is one."""
+    """Writes linear light ``[1, 3, H, W]`` to an 8-bit sRGB file, or to a float file (.exr, .hdr, .pfm)."""
     values = light[0].transpose(1, 2, 0)
     if not path.endswith((".exr", ".hdr", ".pfm")):
         values = np.clip(values, 0.0, 1.0)

@@ -3,9 +3,9 @@ r"""A shot on an OpenCue farm: chunks of frames, each ``torchdof render --frames
     python examples/farm/cue_job.py --image /shot/beauty.####.exr --depth /shot/depth.####.exr \
         --out /shot/dof.####.exr --frames 1-48 --show film --shot ab0010 -- --focus-m 1:2.0,48:5.5 --f-number 2
 
-What stands behind ``--`` are options of ``torchdof render``. Needs pip install opencue-pyoutline opencue-pycue, and
-torchdof on the farm's machines. A chunk that is run again renders only the frames that are missing. ``--print`` shows
-the job and sends nothing.
+Arguments after ``--`` are options of ``torchdof render``. Needs pip install opencue-pyoutline opencue-pycue, and
+torchdof on the machines of the farm. A chunk that runs again renders only the missing frames. ``--print`` shows the job
+without sending it.
 """
 
 import argparse
@@ -34,14 +34,14 @@ def job(
 
     Args:
         image: All-in-focus frames, such as ``/shot/beauty.####.exr``.
-        depth: Their depth; None takes the images' Z channel.
+        depth: Their depth; None uses the images' Z channel.
         out: Frames to write.
         frames: First and last, such as ``1-48``.
         options: Further options of ``torchdof render``.
         chunk: Frames of one task.
         cores: Cores of one task.
-        show: OpenCue's show.
-        shot: Its shot.
+        show: Show in OpenCue.
+        shot: Shot in OpenCue.
     """
     command = [
         "env",
@@ -71,15 +71,15 @@ def main() -> None:
     """Send the job, or print it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--image", required=True, help="all-in-focus frames, such as shot.####.exr")
-    parser.add_argument("--depth", help="their depth; left out: the images' Z channel")
+    parser.add_argument("--depth", help="their depth; default: the images' Z channel")
     parser.add_argument("--out", required=True, help="frames to write")
     parser.add_argument("--frames", required=True, help="first and last, such as 1-48")
     parser.add_argument("--chunk", type=int, default=8, help="frames of one task")
     parser.add_argument("--cores", type=int, default=2, help="cores of one task")
     parser.add_argument("--show", default="testing")
     parser.add_argument("--shot", default="default")
-    parser.add_argument("--print", action="store_true", dest="shown", help="show the job, send nothing")
-    parser.add_argument("options", nargs="*", help="options of torchdof render, behind --")
+    parser.add_argument("--print", action="store_true", dest="shown", help="show the job without sending it")
+    parser.add_argument("options", nargs="*", help="options of torchdof render, after --")
     a = parser.parse_args()
     launcher = job(a.image, a.depth, a.out, a.frames, a.options, a.chunk, a.cores, a.show, a.shot)
     if a.shown:

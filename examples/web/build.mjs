@@ -1,8 +1,8 @@
-// Puts the page together: node build.mjs [--out FOLDER] [--model FILE.onnx]
+// Builds the page: node build.mjs [--out FOLDER] [--model FILE.onnx]
 //
-// The page's own files and the modules of ../embed/javascript are copied as they are, beside them the two files of
-// onnxruntime-web that a browser loads. Python writes the exported file and the pair to begin with; --model takes a file
-// that is there already. PYTHON names an interpreter that has torchdof; else the repository's own is taken.
+// Copies the files of the page, the modules of ../embed/javascript and two files of onnxruntime-web. Python writes the
+// exported file and the sample; --model uses an existing file. PYTHON names an interpreter with torchdof; the default is
+// that of the repository.
 
 import { execFileSync } from 'node:child_process'
 import { cpSync, existsSync, mkdirSync, rmSync } from 'node:fs'

@@ -1,7 +1,7 @@
 // Seconds from a click to the picture at 960 x 540, in headless Chromium: node measure.mjs [DIST] [CHROMIUM]
 //
-// The sample is enlarged and cropped to that size. Besides time on the clock, the processor time of all of Chromium is
-// printed, which other programs disturb less (Linux). Needs playwright-core, here or in TORCHDOF_NODE_FOLDER.
+// The sample is enlarged and cropped to that size. Also prints the processor time of all processes of Chromium (Linux),
+// on which other programs have less influence. Needs playwright-core, here or in TORCHDOF_NODE_FOLDER.
 
 import { execFileSync, spawn } from 'node:child_process'
 import { readFileSync } from 'node:fs'
@@ -19,7 +19,7 @@ const address = await new Promise((resolve) => server.stdout.once('data', (text)
 const browser = await chromium.launch({ executablePath, args: ['--no-sandbox'] })
 const page = await browser.newPage({ viewport: { width: 1280, height: 860 } })
 
-/** Processor time in seconds of this process's children and theirs. */
+/** Processor time in seconds of this process's descendants. */
 function processorTime() {
   const lines = execFileSync('ps', ['-eo', 'pid=,ppid='], { encoding: 'utf8' }).trim().split('\n')
   const parents = new Map(lines.map((line) => line.trim().split(/\s+/).map(Number)))

@@ -1,6 +1,6 @@
 // Serves a folder on this machine: node serve.mjs FOLDER PORT
 //
-// Any server of static files will do. This one also sends the two headers without which browsers give a page one thread.
+// Any server of static files works. This one also sends the two headers that a page needs for more than one thread.
 
 import { createReadStream, statSync } from 'node:fs'
 import { createServer } from 'node:http'

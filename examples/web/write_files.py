@@ -1,8 +1,8 @@
-"""What the page needs from Python: the exported file, what is to be known of it, and a pair to begin with.
+"""Writes the files that the web page needs: the exported file, its camera as JSON, and a sample.
 
 Usage: python examples/web/write_files.py --out examples/web/dist [--model dof.onnx]
 
-Leaves ``dof.onnx``, ``dof.json``, and in ``sample/`` the photograph and its depth in millimetres, 16 bits.
+Writes ``dof.onnx``, ``dof.json``, and in ``sample/`` a photograph and its depth in millimetres, 16 bits.
 """
 
 import argparse
@@ -19,9 +19,9 @@ from torchdof.depth.reading import read_depth
 from torchdof.export import describe, to_onnx
 from torchdof.io.images import read_image
 
-FOV_X_DEG = 40.0  # of a 50 mm lens on full frame
+FOV_X_DEG = 40.0  # horizontal field of view of a 50 mm lens on full frame
 MAX_COC_PX = 32.0
-TOLERANCE = 4 / 255  # a preview's: the page is looked at, and a browser is slow
+TOLERANCE = 4 / 255  # that of "preview", because a browser is slow
 DATA = Path(__file__).parents[1] / "data" / "motorcycle"
 
 
@@ -29,7 +29,7 @@ def main() -> None:
     """Write the files."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--out", type=Path, required=True, help="folder of the page")
-    parser.add_argument("--model", type=Path, help="an exported file to take instead of writing one")
+    parser.add_argument("--model", type=Path, help="an exported file to use instead of writing one")
     arguments = parser.parse_args()
 
     model = arguments.out / "dof.onnx"

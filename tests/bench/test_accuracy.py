@@ -1,4 +1,4 @@
-"""Accuracy against the truth, with exact depth and with worse, beside other tools."""
+"""``torchdof bench --truth``: accuracy with exact and with degraded depth, beside other tools."""
 
 import csv
 import shutil
@@ -23,7 +23,7 @@ def run(*arguments: object) -> Result:
     return CliRunner().invoke(app, ["bench", *map(str, arguments)])
 
 
-def test_ikoma_renders_two_planes_focused_on_the_near_one() -> None:
+def test_ikoma_renders_two_planes_with_the_near_one_in_focus() -> None:
     planes = [Plane(2.0, waves(1, (0.6, 0.3, 0.2)), posts(40, 15)), Plane(6.0, waves(2))]
     camera = camera_of(200.0, 96, aperture_radius_m=0.1, focus_m=2.0)
     scene = plane_scene(planes, camera, (60, 96), samples=512)
@@ -38,7 +38,7 @@ def test_ikoma_leaves_a_scene_in_focus_alone() -> None:
     torch.testing.assert_close(out, image, rtol=1e-6, atol=1e-6)
 
 
-def test_bench_scores_renderers_peers_and_references_and_draws_the_worst_places(tmp_path: Path) -> None:
+def test_bench_scores_renderers_peers_and_references_and_draws_the_worst_windows(tmp_path: Path) -> None:
     scenes, out, peer = tmp_path / "scenes", tmp_path / "out", tmp_path / "peer.py"
     shutil.copytree(DATA / "room", scenes / "room")
     peer.write_text(TOY)
@@ -61,7 +61,7 @@ def test_bench_scores_renderers_peers_and_references_and_draws_the_worst_places(
     assert read_image(out / "accuracy.png").pixels.shape[-1] == (len(names) + 2) * (128 + 8) + 8
 
 
-def test_the_worst_place_is_where_the_error_is() -> None:
+def test_the_worst_window_has_the_largest_error() -> None:
     (scene,) = read_scenes(DATA / "planes")
     picture = scene.truth.clone()
     picture[..., 25:29, 31:35] += 0.1

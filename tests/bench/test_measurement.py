@@ -1,4 +1,4 @@
-"""What is measured: new cameras, the same again, a reference run beside; and what is told of them."""
+"""Measurements of ``torchdof bench``: a new camera, the same camera again, a reference beside; and the report."""
 
 import functools
 import itertools
@@ -20,7 +20,7 @@ from torchdof.reference import metrics
 SCENE = shipped(36, 64)
 
 
-def test_a_row_holds_the_first_picture_the_same_again_and_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_row_has_the_times_of_the_first_picture_the_second_and_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
     ticks = itertools.chain([0.0, 4.0, 10.0, 11.0, 20.0, 22.0], itertools.repeat(0.0))
     monkeypatch.setattr(time, "perf_counter", lambda: next(ticks))
     calls: list[Tensor] = []
@@ -35,19 +35,19 @@ def test_a_row_holds_the_first_picture_the_same_again_and_the_reference(monkeypa
     assert "again_ms" not in measure(lambda image, _: (image, 1.0), SCENE, beside=lambda: (None, 1.0), again=False)[1]
 
 
-def test_ratios_are_of_processor_time_and_a_tool_may_time_itself() -> None:
+def test_ratios_are_of_cpu_time_and_a_tool_may_time_itself() -> None:
     taken = iter([Seconds(9.0, 6.0), Seconds(1.0, 2.0), 5.0])
     _, row = measure(lambda image, _: (image, next(taken)), SCENE, beside=lambda: (None, next(taken)))
     assert (row["cpu_ms"], row["over_again"], row["beside_ms"]) == (6000.0, 3.0, 5000.0)
-    assert math.isnan(row["over_beside"])  # the last told the clock alone
+    assert math.isnan(row["over_beside"])  # the reference gives wall time only
 
 
-def test_errors_are_those_of_what_is_displayed() -> None:
-    wanted = (SCENE.image + 0.01).clamp(0.0, 1.0)
-    row = error(SCENE.image, wanted)
-    shown, right = metrics.display(SCENE.image), metrics.display(wanted)
-    assert row["rms_255"] == pytest.approx(255 * float((shown - right).square().mean().sqrt()), abs=1e-4)
-    assert (row["psnr_db"], row["ssim"]) == (metrics.psnr(shown, right), metrics.ssim(shown, right))
+def test_errors_are_of_display_values() -> None:
+    expected = (SCENE.image + 0.01).clamp(0.0, 1.0)
+    row = error(SCENE.image, expected)
+    got, truth = metrics.display(SCENE.image), metrics.display(expected)
+    assert row["rms_255"] == pytest.approx(255 * float((got - truth).square().mean().sqrt()), abs=1e-4)
+    assert (row["psnr_db"], row["ssim"]) == (metrics.psnr(got, truth), metrics.ssim(got, truth))
 
 
 def test_a_picture_that_is_not_finite_is_not_timed() -> None:
@@ -55,14 +55,17 @@ def test_a_picture_that_is_not_finite_is_not_timed() -> None:
         measure(lambda image, _: image / 0.0, SCENE)
 
 
-@pytest.mark.skipif(math.isnan(memory.peak_mb()), reason="this system does not tell the memory of a process")
-def test_peak_memory_is_that_of_the_picture_alone() -> None:
+@pytest.mark.skipif(math.isnan(memory.peak_mb()), reason="this system does not report the memory of a process")
+def test_peak_memory_is_of_one_call_and_includes_freed_memory() -> None:
+    def allocate(mib: int) -> float:
+        return float(torch.ones(mib * 2**18).sum())
+
     for mib in (64, 8):
-        _, grown_mb = peak_of(functools.partial(torch.ones, mib * 2**18))
-        assert grown_mb == pytest.approx(mib, rel=0.25, abs=4.0)
+        total, grown_mb = peak_of(functools.partial(allocate, mib))
+        assert total == mib * 2**18 and grown_mb == pytest.approx(mib, rel=0.25, abs=4.0)
 
 
-def test_another_camera_is_one_of_a_thin_lens() -> None:
+def test_a_new_camera_is_a_thin_lens_with_another_focus() -> None:
     depth = torch.linspace(1.0, 5.0, 64).expand(1, 1, 36, 64)
     given = Camera(50.0, 2.0, focus_m=2.0, focus_breathing=False).coc_px(depth, 64)
     scene = BenchScene("x", SCENE.image, given)
@@ -72,7 +75,7 @@ def test_another_camera_is_one_of_a_thin_lens() -> None:
     torch.testing.assert_close(scene.seen(share, float(focused.abs().max())).coc_px, focused, rtol=1e-4, atol=1e-5)
 
 
-def test_cameras_are_new_ones_and_the_same_for_each_seed() -> None:
+def test_cameras_differ_from_each_other_and_a_seed_repeats_them() -> None:
     cameras, widest = SCENE.cameras(8, 0.5, "a"), float(SCENE.coc_px.abs().max())
     radii = [float(camera.coc_px.abs().max()) for camera in cameras]
     assert len({*radii, widest}) == 9 and all(0.5 * widest <= radius <= widest for radius in radii)
@@ -83,20 +86,20 @@ def test_cameras_are_new_ones_and_the_same_for_each_seed() -> None:
     assert not SCENE.seen(0.0, 0.0).seen(0.4, 0.0).coc_px.any()
 
 
-def test_the_focus_of_a_pull_moves_from_near_to_far() -> None:
+def test_a_focus_pull_moves_from_near_to_far() -> None:
     nearest, *_, farthest = SCENE.pull(5)
     assert float(nearest.coc_px.mean()) > 0 > float(farthest.coc_px.mean())
     assert len({float(frame.coc_px.mean()) for frame in SCENE.pull(5)}) == 5
 
 
-def test_a_scene_of_another_size_is_as_blurred_for_its_width() -> None:
+def test_resizing_a_scene_scales_its_blur_radii_with_the_width() -> None:
     small = SCENE.resized(0.5)
     assert small.image.shape[-2:] == (18, 32)
     assert float(small.coc_px.abs().max()) == pytest.approx(0.5 * float(SCENE.coc_px.abs().max()), rel=0.05)
     assert set(small.coc_px.flatten().tolist()) <= set((0.5 * SCENE.coc_px).flatten().tolist())
 
 
-def test_the_built_in_scene_is_blurred_alike_before_and_behind_the_focus() -> None:
+def test_the_built_in_scene_is_blurred_equally_in_front_of_and_behind_the_focus() -> None:
     scene = shipped()
     assert scene.image.shape == (1, 3, 540, 960)
     assert float(scene.coc_px.min()) == pytest.approx(-16, abs=0.5)
@@ -104,7 +107,7 @@ def test_the_built_in_scene_is_blurred_alike_before_and_behind_the_focus() -> No
     assert 0 < (scene.coc_px.abs() < 0.5).float().mean() < 0.1
 
 
-def test_a_summary_joins_what_was_measured_of_one_thing() -> None:
+def test_a_summary_averages_rows_with_the_same_key() -> None:
     rows = [{"a": a, "new_ms": value, "other": "z"} for a, value in (("x", 1.0), ("y", 5.0), ("x", 4.0))]
     assert summary([*rows, {"a": "y", "psnr_db": 30.0}], ["a"], statistics.fmean) == [
         {"a": "x", "new_ms": 2.5, "spread_ms": 1.5},
@@ -112,7 +115,7 @@ def test_a_summary_joins_what_was_measured_of_one_thing() -> None:
     ]
 
 
-def test_a_report_is_written_whole_or_not_at_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_report_is_written_completely_or_not_at_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tables = {"Means": [{"a": "x", "b": 1234.56, "c": True}], "All": [{"a": "x", "d": math.nan}, {"a": "y", "e": 0.25}]}
     written = functools.partial(publish, "Title", tables, ["remark"], tmp_path / "name")
 
@@ -136,7 +139,7 @@ def test_a_report_is_written_whole_or_not_at_all(tmp_path: Path, capsys: pytest.
     assert (tmp_path / "name.csv").read_text() == "a,d,e\nx,nan,\ny,,0.25\n"
 
 
-def test_a_scene_that_fits_nothing_is_refused() -> None:
+def test_a_scene_of_bad_size_is_refused() -> None:
     for image, coc_px, message in (
         (torch.ones(1, 3, 20, 20), torch.ones(1, 1, 20, 24), "depth is 24 x 20 pixels but the image is 20 x 20"),
         (torch.ones(1, 3, 8, 20), torch.ones(1, 1, 8, 20), "from 16 pixels a side on"),

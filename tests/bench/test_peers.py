@@ -1,4 +1,4 @@
-"""Other tools blur by the circle of confusion that they are given."""
+"""The adapters in ``examples/benchmarks/tools`` make each tool blur by the given circle of confusion."""
 
 import math
 from pathlib import Path
@@ -15,11 +15,11 @@ TOOLS = Path(__file__).parents[2] / "examples" / "benchmarks" / "tools"
 SIDE = 65
 
 
-def wrong(blur: Any, radius_px: float) -> str:
-    """What is wrong with three dots, in focus, behind it and in front of it; empty if nothing is.
+def fault(blur: Any, radius_px: float) -> str:
+    """First fault in the pictures of three dots, in focus, behind and in front of it; "" if all are right.
 
-    Each keeps its light within 3 %, its place within 0.75 px, and has the width (by second moments) of a disc of the
-    radius within 5 %, or within 1 px in focus.
+    A right dot keeps its light within 3 % and its place within 0.75 px. The disc with the dot's second moments has
+    `radius_px` within 5 %, in focus 0 within 1 px.
     """
     place, radii = torch.arange(SIDE, dtype=torch.float64) - SIDE // 2, torch.tensor([0.0, radius_px, -radius_px])
     image = torch.zeros(1, 3, SIDE, 3 * SIDE)
@@ -32,7 +32,7 @@ def wrong(blur: Any, radius_px: float) -> str:
         light = float(dot.sum())
         y, x = (float((dot.sum(axis) * place).sum()) / light for axis in (1, 0))
         square = float((dot * ((place[:, None] - y) ** 2 + (place - x) ** 2)).sum()) / light
-        disc_px = math.sqrt(max(2.0 * (square - 1.0 / 6.0), 0.0))  # a pixel itself has 1 / 6
+        disc_px = math.sqrt(max(2.0 * (square - 1.0 / 6.0), 0.0))  # a pixel's own second moment is 1 / 6
         if abs(light / 8.0 - 1.0) > 0.03:
             return f"{radius:g} px: {light / 8.0:.3f} of its light"
         if max(abs(x), abs(y)) > 0.75:
@@ -50,11 +50,11 @@ def test_a_renderer_blurs_by_the_circle_of_confusion_that_it_is_given(name: str)
             blur = read_peer(TOOLS / f"{name}.py")[1]
         except ValueError as error:
             pytest.skip(str(error))
-    assert wrong(blur, 6.0) == wrong(blur, 11.3) == ""
+    assert fault(blur, 6.0) == fault(blur, 11.3) == ""
 
 
 @pytest.mark.parametrize(
-    "blur, told",
+    "blur, expected",
     [
         (lambda image, coc: image, "6 px: as by a disc of 0.00 px"),
         (lambda image, coc: layered_fft(image, coc.clamp_min(0)), "-6 px: as by a disc of 0.00 px"),
@@ -63,5 +63,5 @@ def test_a_renderer_blurs_by_the_circle_of_confusion_that_it_is_given(name: str)
         (lambda image, coc: layered_fft(image, coc)[..., 1:], "[1, 3, 65, 194], not finite numbers [1, 3, 65, 195]"),
     ],
 )
-def test_a_renderer_that_does_something_else_is_found(blur: Any, told: str) -> None:
-    assert wrong(blur, 6.0) == told
+def test_the_check_finds_each_kind_of_fault(blur: Any, expected: str) -> None:
+    assert fault(blur, 6.0) == expected

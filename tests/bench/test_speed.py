@@ -1,4 +1,4 @@
-"""Speed against error: of one's own scene, by the command."""
+"""``torchdof bench``: speed against error, of the built-in scene or the user's."""
 
 import csv
 import functools
@@ -31,8 +31,8 @@ def run(*arguments: object) -> Result:
 
 
 @pytest.fixture
-def here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What would start a process runs here."""
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs the "fresh process" rows in this process, which is faster."""
     monkeypatch.setattr(speed, "_in_a_fresh_process", lambda blur, *picture: timed(blur, *picture))
 
 
@@ -45,7 +45,9 @@ def files(tmp_path: Path) -> tuple[Path, Path]:
     return image, depth
 
 
-def test_times_are_of_other_cameras_and_errors_of_the_scene_s_own(here: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_times_are_of_new_cameras_and_errors_of_the_scene_s_own(
+    in_this_process: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene = shipped(48, 160).seen(0.0, 13.0)  # blurred enough for coarse layers to show
     rendered: list[Tensor] = []
     monkeypatch.setattr(speed, "blur_by_coc", lambda *a, **options: rendered.append(a[1]) or blur_by_coc(*a, **options))  # type: ignore[func-returns-value]
@@ -56,21 +58,22 @@ def test_times_are_of_other_cameras_and_errors_of_the_scene_s_own(here: None, mo
     for name, row in rows.items():
         if "/255" in name and "," not in name and name.split("/")[0] in ("8", "4", "1"):
             options: dict[str, Any] = {"occlusion": "without" not in name}
-            out, wanted = (
+            out, exact = (
                 metrics.display(blur_by_coc(scene.image, scene.coc_px, tolerance=tolerance, **options))
                 for tolerance in (row["tolerance"], 0.0)
             )
-            assert row["rms_255"] == pytest.approx(255 * float((out - wanted).square().mean().sqrt()), abs=1e-4)
+            assert row["rms_255"] == pytest.approx(255 * float((out - exact).square().mean().sqrt()), abs=1e-4)
             assert row["rms_255"] > 0.1 or row["tolerance"] < 4 / 255
     seen = [coc for coc in rendered if coc.shape == scene.coc_px.shape and not torch.equal(coc, scene.coc_px)]
     times = [sum(torch.equal(coc, other) for other in seen) for coc in seen]
-    # each camera twice, new and again, a fresh process's once; a focus pull's with and without occlusion
+    # cameras are rendered twice, as new and again; those of a fresh process once; those of a focus pull twice with
+    # and twice without occlusion
     assert {*times} == {1, 2, 4}
     pulls = [frame.coc_px for frame in scene.pull(2)]
     assert {count for count, coc in zip(times, seen, strict=True) if any(torch.equal(coc, p) for p in pulls)} == {4}
 
 
-def test_a_fresh_process_has_rendered_nothing_and_tells_its_own_time() -> None:
+def test_a_fresh_process_renders_the_same_picture_and_reports_its_own_time() -> None:
     scene = shipped(36, 64)
     blur = functools.partial(blur_by_coc, tolerance=4 / 255)
     (picture, seconds), waited = timed(lambda: [speed._in_a_fresh_process(blur, scene.image, scene.coc_px)])[0][0], 0.0
@@ -78,8 +81,8 @@ def test_a_fresh_process_has_rendered_nothing_and_tells_its_own_time() -> None:
     assert seconds.wall > 0 and seconds.cpu > waited
 
 
-def test_a_tolerance_that_is_not_kept_is_told(
-    here: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_the_report_names_a_tolerance_that_was_not_kept(
+    in_this_process: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def wrong(*arguments: Any, **options: Any) -> Tensor:
         return blur_by_coc(*arguments, **options) + 0.2 * (options.get("tolerance") == 4 / 255)
@@ -92,7 +95,7 @@ def test_a_tolerance_that_is_not_kept_is_told(
     assert "tolerance was not kept by: 4/255; 4/255 without occlusion." in " ".join(capsys.readouterr().out.split())
 
 
-def test_a_scan_changes_the_radius_or_the_frame_alone(here: None) -> None:
+def test_a_scan_changes_only_the_radius_or_only_the_frame(in_this_process: None) -> None:
     scene = shipped(64, 128)
     found = {facts["setting"]: camera for facts, _, camera, _ in speed.works(scene, True, 1, scan=True)}
     for radius in (4, 8, 16, 32, 64):
@@ -101,8 +104,8 @@ def test_a_scan_changes_the_radius_or_the_frame_alone(here: None) -> None:
     assert [found[f"{share} of the frame 1/255"].image.shape[-1] for share in (0.25, 0.5)] == [32, 64]
 
 
-def test_bench_measures_ones_own_scene_and_makes_its_folder(
-    here: None, files: tuple[Path, Path], tmp_path: Path
+def test_bench_measures_the_users_scene_and_makes_the_output_folder(
+    in_this_process: None, files: tuple[Path, Path], tmp_path: Path
 ) -> None:
     out = tmp_path / "new" / "out"
     result = run(*files, "--repeat", 1, "--out", out, "--f-number", 1.4, "--sensor-width-mm", 6)
@@ -117,7 +120,7 @@ def test_bench_measures_ones_own_scene_and_makes_its_folder(
     assert "Every tolerance was kept." in text and "| 8/255 |" in text
     picture = read_image(out / "speed.png").pixels
     assert picture.shape[-1] > 500 and float(picture.std()) > 0.05
-    # the figures are those of this image, this depth and this camera
+    # the rows are of this image, this depth and this camera
     image = read_image(files[0]).pixels
     depth = torch.linspace(1.0, 4.0, 64).expand(1, 1, 36, 64)
     camera = Camera(50.0, 1.4, float(depth.median()), 6.0)
@@ -126,7 +129,7 @@ def test_bench_measures_ones_own_scene_and_makes_its_folder(
     assert math.isinf(float(rows["exact"]["psnr_db"]))
 
 
-def test_json_holds_the_rows_that_are_printed(files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_json_has_the_printed_rows(files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     row = {"setting": "exact", "new_ms": 0.5, "psnr_db": math.inf, "rms_255": math.nan, "kept": True}
     monkeypatch.setattr(speed, "compare", lambda *_: [row])
     facts = json.loads(run(*files, "--json", "--focus-m", 2).stdout)
@@ -134,9 +137,7 @@ def test_json_holds_the_rows_that_are_printed(files: tuple[Path, Path], monkeypa
     assert facts["settings"] == [row | {"psnr_db": "inf", "rms_255": "nan"}]
 
 
-def test_bench_measures_the_lens_and_focus_that_it_is_told(
-    files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bench_measures_the_given_lens_and_focus(files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     measured: list[BenchScene] = []
     row = {"setting": "exact", "kept": True}
     monkeypatch.setattr(speed, "compare", lambda scene, *_: measured.append(scene) or [row])  # type: ignore[func-returns-value]
@@ -157,7 +158,7 @@ def test_bench_measures_the_lens_and_focus_that_it_is_told(
     assert float(given.coc_px.max()) == pytest.approx(8.0)
 
 
-def test_alpha_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_alpha_is_not_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     measured: list[BenchScene] = []
     monkeypatch.setattr(
         speed,
@@ -205,7 +206,7 @@ def test_bad_arguments_are_refused_in_a_sentence(
     assert result.output.count("\n") == 1
 
 
-def test_an_exported_file_has_its_row(exported_by_command: tuple[Path, str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_exported_file_is_a_row(exported_by_command: tuple[Path, str], monkeypatch: pytest.MonkeyPatch) -> None:
     def copied(dof: DepthOfField, path: str, inputs: str, channels: int, width: int | None) -> None:
         assert dof.options.max_coc_px == 2.0 and not dof.options.occlusion and (inputs, channels) == ("coc_px", 3)
         shutil.copyfile(exported_by_command[0], path)
@@ -213,20 +214,20 @@ def test_an_exported_file_has_its_row(exported_by_command: tuple[Path, str], mon
     monkeypatch.setattr("torchdof.export.to_onnx", copied)
     scene = shipped(64, 96)
     picture = speed._prepared("onnxruntime", scene, occlusion=False)(scene.image, scene.coc_px)
-    wanted = blur_by_coc(scene.image, scene.coc_px, occlusion=False, tolerance=0.0)
-    error = (metrics.display(picture) - metrics.display(wanted)).square().mean().sqrt()
+    exact = blur_by_coc(scene.image, scene.coc_px, occlusion=False, tolerance=0.0)
+    error = (metrics.display(picture) - metrics.display(exact)).square().mean().sqrt()
     assert 0 < 255 * float(error) < 1, "the file's tolerance is that of the row"
 
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning")  # from within inductor
 @pytest.mark.parametrize("backend", ["eager", pytest.param("inductor", marks=pytest.mark.sweep)])
-def test_a_compiled_module_has_its_row(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_compiled_module_is_a_row(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
     scene = shipped(64, 96)
     works = {facts["setting"]: blur for facts, blur, _, _ in speed.works(scene, False, 1, ["compiled"])}
     picture = works["compiled 1/255 without occlusion"](scene.image, scene.coc_px)
-    wanted = blur_by_coc(scene.image, scene.coc_px, occlusion=False, tolerance=0.0)
-    assert error(picture, wanted)["rms_255"] < 0.3
+    exact = blur_by_coc(scene.image, scene.coc_px, occlusion=False, tolerance=0.0)
+    assert error(picture, exact)["rms_255"] < 0.3
 
 
 def test_bench_needs_a_compiler_to_compile(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -236,7 +237,7 @@ def test_bench_needs_a_compiler_to_compile(monkeypatch: pytest.MonkeyPatch) -> N
     assert result.exit_code == 2 and "install g++ or leave --compile out" in result.output
 
 
-def test_without_matplotlib_it_says_so_before_it_measures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_matplotlib_is_reported_before_measuring(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "matplotlib" else find(name, *a))
     result = run("--out", tmp_path)

@@ -1,4 +1,4 @@
-"""A small scene in files, which most tests of the command line work on."""
+"""Files of a small scene for the tests of the command line."""
 
 import shlex
 from collections.abc import Callable
@@ -43,7 +43,7 @@ def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, image: torch.Tensor, 
 
 @pytest.fixture
 def run() -> Callable[..., str]:
-    """Runs a command; gives its standard output, or its standard error where it should fail."""
+    """Runs a command and gives its standard output; with `code` other than 0, its standard error."""
 
     def run(line: str, *arguments: object, code: int = 0) -> str:
         result = CliRunner().invoke(app, [*shlex.split(line), *map(str, arguments)], catch_exceptions=False)

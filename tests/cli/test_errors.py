@@ -1,4 +1,4 @@
-"""Whatever is wrong with the input is one sentence on standard error and exit code 2, and nothing is written."""
+"""Bad input gives exit code 2 and one sentence on standard error, and no file is written."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -56,7 +56,7 @@ image.exr depth.npy --focus-m 2 --fov-deg 40 --aperture-radius-m 1e45 | --fov-de
 image.exr depth.npy --focus-m 2 --fov-deg 40 --aperture-radius-m -1 | --aperture-radius-m must be positive
 image.exr depth.npy --focus-m 2 --aperture-radius-m 1 | --aperture-radius-m goes with --fov-deg
 image.exr depth.npy --focus-m 2 --fill-depth x        | --fill-depth expects nearest, far or metres, got 'x'
-image.exr depth.npy --focus-m 2 --fill-depth 1e-45 --depth-unknown 6 | blurs a depth of 1.4e-45 m
+image.exr depth.npy --focus-m 2 --fill-depth 1e-45 --depth-unknown 6 | which starts at 1.4e-45 m
 image.exr depth.npy --focus-m 2 --depth-kind disparity | disparity needs a scale (--depth-scale)
 image.exr depth.npy --focus-m 2 --depth-kind distance | --depth-kind distance needs --fov-deg
 image.exr depth.npy --focus-m 2 --depth-kind coc      | --depth-kind coc is the blur itself and takes no camera
@@ -133,25 +133,25 @@ def files(scene: Path) -> Path:
     return scene
 
 
-def refused(run: Callable[..., str], line: str, says: str, folder: Path) -> None:
+def assert_refused(run: Callable[..., str], line: str, expected: str, folder: Path) -> None:
     before = {path: path.read_bytes() for path in folder.rglob("*")}
     message = run(line, code=2)
-    assert message.startswith("error: ") and says in message and message.count("\n") == 1, message
+    assert message.startswith("error: ") and expected in message and message.count("\n") == 1, message
     assert {path: path.read_bytes() for path in folder.rglob("*")} == before
 
 
-@pytest.mark.parametrize(("line", "says"), rows(_RENDER))
-def test_what_render_refuses(files: Path, run: Callable[..., str], line: str, says: str) -> None:
-    refused(run, f"render -o out.exr {line}", says, files)
+@pytest.mark.parametrize(("line", "expected"), rows(_RENDER))
+def test_errors_of_render(files: Path, run: Callable[..., str], line: str, expected: str) -> None:
+    assert_refused(run, f"render -o out.exr {line}", expected, files)
 
 
-@pytest.mark.parametrize(("line", "says"), rows(_OTHERS))
-def test_what_the_other_commands_refuse(files: Path, run: Callable[..., str], line: str, says: str) -> None:
-    refused(run, line, says, files)
+@pytest.mark.parametrize(("line", "expected"), rows(_OTHERS))
+def test_errors_of_the_other_commands(files: Path, run: Callable[..., str], line: str, expected: str) -> None:
+    assert_refused(run, line, expected, files)
 
 
 @pytest.mark.parametrize(
-    ("line", "says"),
+    ("line", "expected"),
     [
         ("render image.exr", "Missing option '--out' / '-o'"),
         ("render image.exr depth.npy -o out.exr --f-number wide", "'wide' is not a valid float"),
@@ -162,12 +162,12 @@ def test_what_the_other_commands_refuse(files: Path, run: Callable[..., str], li
         ("nonsense", "No such command 'nonsense'"),
     ],
 )
-def test_wrong_usage_names_what_is_wrong(run: Callable[..., str], line: str, says: str) -> None:
+def test_wrong_usage_names_the_option_or_command(run: Callable[..., str], line: str, expected: str) -> None:
     message = run(line, code=2)
-    assert says in message and "Traceback" not in message
+    assert expected in message and "Traceback" not in message
 
 
-def test_library_names_are_told_as_options(files: Path, run: Callable[..., str]) -> None:
+def test_messages_name_options_rather_than_arguments_of_the_library(files: Path, run: Callable[..., str]) -> None:
     for lens in ("--f-number 1e-42", "--fov-deg 40 --aperture-radius-m 1e45", "--sensor-width-mm 1e-300"):
         message = run(f"render image.exr depth.npy -o out.exr --focus-m 2 {lens}", code=2)
         assert not any(word in message for word in ("coc_px", "check=False", "f_number", "focus_m", "_mm", "_deg"))

@@ -12,8 +12,8 @@ from torchdof.export import describe
 
 
 def test_a_file_is_written_and_its_verification_printed(exported_by_command: tuple[Path, str]) -> None:
-    path, told = exported_by_command
-    printed = json.loads(told)
+    path, output = exported_by_command
+    printed = json.loads(output)
     assert printed["out"] == str(path) and "disc" in printed["title"]
     assert "bad depths" in {case["name"] for case in printed["cases"]}
     assert max(case["max_error"] for case in printed["cases"]) < 1e-5
@@ -23,21 +23,23 @@ def test_a_file_is_written_and_its_verification_printed(exported_by_command: tup
     assert [file.name for file in path.parent.iterdir()] == ["dof.onnx"]
 
 
-def test_blades_are_those_of_the_module(scene: Path, run: Callable[..., str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_options_of_the_aperture_reach_the_module(
+    scene: Path, run: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     modules: list[DepthOfField] = []
 
-    def kept(dof: DepthOfField, *_: Any, **__: Any) -> None:
+    def record(dof: DepthOfField, *_: Any, **__: Any) -> None:
         modules.append(dof)
-        raise ValueError("that was it")
+        raise ValueError("not exported")
 
-    monkeypatch.setattr("torchdof.export.conversion.to_onnx", kept)
+    monkeypatch.setattr("torchdof.export.conversion.to_onnx", record)
     run("export -o dof.onnx --blades 5 --rotation 10 --squeeze 2", code=2)
     aperture = modules[0].options.table.aperture
     assert aperture is not None and (aperture.blades, aperture.rotation_deg, aperture.squeeze) == (5, 10.0, 2.0)
 
 
 def test_show_prints_units_camera_table_and_options(plain: Any, run: Callable[..., str]) -> None:
-    told = run("export --show", plain.path)
+    output = run("export --show", plain.path)
     for part in ("metres along the optical axis", "focal_length_mm: ", "family: disc", "max_coc_px: 2.5", "opset: 20"):
-        assert part in told
+        assert part in output
     assert json.loads(run("export --json --show", plain.path)) == json.loads(json.dumps(describe(plain.path)))

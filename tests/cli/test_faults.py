@@ -1,4 +1,4 @@
-"""A sequence that is interrupted, a disk that fills up, memory that runs out, and what is seen while it takes long."""
+"""Interrupted sequences, frames that cannot be read or written, too little memory, and the progress bar."""
 
 import functools
 import io
@@ -30,34 +30,34 @@ def copies(folder: Path, count: int) -> None:
         os.link(folder / "shot.0001.exr", folder / f"shot.{n:04d}.exr")
 
 
-def heed_interrupts() -> None:
-    """Tests that run in the background of a shell are told to ignore them, and so would be what they start."""
+def handle_interrupts() -> None:
+    """Undoes the shell's "ignore SIGINT" for background jobs, which a child process would inherit."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_sequence_keeps_what_is_whole_and_resumes(scene: Path, number: signal.Signals) -> None:
+def test_an_interrupted_sequence_keeps_its_complete_frames_and_resumes(scene: Path, number: signal.Signals) -> None:
     count = 400
     copies(scene, count)
     command = [sys.executable, "-m", "torchdof", *SEQUENCE.split()]
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=heed_interrupts
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=handle_interrupts
     ) as process:
         deadline = time.monotonic() + 60
         while len(list(scene.glob("out.*"))) < 5 and time.monotonic() < deadline and process.poll() is None:
             time.sleep(0.002)
         process.send_signal(number)
-        told, said = process.communicate(timeout=60)
-    assert process.returncode == (1 if number == signal.SIGINT else 128 + number), said
-    assert b"Traceback" not in said
+        output, errors = process.communicate(timeout=60)
+    assert process.returncode == (1 if number == signal.SIGINT else 128 + number), errors
+    assert b"Traceback" not in errors
     done = sorted(scene.glob("out.*.exr"))
     assert 5 <= len(done) < count
-    assert not list(scene.glob(".*")), "a part was left behind"
-    assert [line.split(b":")[0].decode() for line in told.splitlines()] == [path.name for path in done]
+    assert not list(scene.glob(".*")), "a partial file was left"
+    assert [line.split(b":")[0].decode() for line in output.splitlines()] == [path.name for path in done]
     assert all(read_image(path).pixels.shape == (1, 3, 16, 24) for path in done)
     before = {path: path.stat().st_mtime_ns for path in done}
     for path in sorted(scene.glob("shot.*"))[len(done) + 3 :]:
-        path.unlink()  # three more are enough to see that it goes on
+        path.unlink()  # three more frames are enough
     again = subprocess.run([*command, "--resume"], capture_output=True, text=True, timeout=120)
     assert again.returncode == 0, again.stderr
     assert again.stdout.startswith(f"{len(done)} of {len(done) + 3} frames are there already")
@@ -66,7 +66,7 @@ def test_an_interrupted_sequence_keeps_what_is_whole_and_resumes(scene: Path, nu
 
 
 @pytest.mark.parametrize("broken", ["shot.0003.exr", "out.0003.exr"])
-def test_a_frame_that_cannot_be_read_or_written_ends_a_sequence_by_its_name(
+def test_a_frame_that_cannot_be_read_or_written_stops_the_sequence_and_is_named(
     scene: Path, run: Callable[..., str], broken: str
 ) -> None:
     copies(scene, 5)
@@ -83,25 +83,25 @@ def test_a_frame_that_cannot_be_read_or_written_ends_a_sequence_by_its_name(
 def test_the_next_frame_is_read_and_the_last_written_while_one_is_rendered(
     scene: Path, run: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    meeting = threading.Barrier(3)
+    barrier = threading.Barrier(3)  # passes only if all three steps run at the same time
 
     def waiting(self: frame.Renderer, step: Callable[..., Any], out: str, *arguments: Any) -> Any:
         if out in repr(arguments):
-            meeting.wait(20)
+            barrier.wait(20)
         return step(self, *arguments)
 
     for name, out in (("read", "out.0003"), ("render", "out.0002"), ("write", "out.0001")):
-        own = getattr(frame.Renderer, name)
-        monkeypatch.setattr(frame.Renderer, name, functools.partialmethod(waiting, own, out))
+        original = getattr(frame.Renderer, name)
+        monkeypatch.setattr(frame.Renderer, name, functools.partialmethod(waiting, original, out))
     assert [line[:12] for line in run(SEQUENCE).splitlines()] == [f"out.000{n}.exr" for n in (1, 2, 3)]
 
 
 @pytest.mark.parametrize("frames", ["0-300000000", "1-99999999999999999", "7", "9" * 5000])
-def test_a_range_of_frames_is_not_counted_out(scene: Path, run: Callable[..., str], frames: str) -> None:
+def test_a_huge_range_of_frames_is_refused_at_once(scene: Path, run: Callable[..., str], frames: str) -> None:
     start = time.monotonic()
-    said = run(f"{SEQUENCE} --frames", frames, code=2)
-    assert "there is no such file" in said or "--frames expects first-last" in said
-    assert time.monotonic() - start < 5.0 and len(said) < 200
+    message = run(f"{SEQUENCE} --frames", frames, code=2)
+    assert "there is no such file" in message or "--frames expects first-last" in message
+    assert time.monotonic() - start < 5.0 and len(message) < 200
 
 
 @pytest.mark.parametrize(
@@ -115,18 +115,18 @@ def test_a_range_of_frames_is_not_counted_out(scene: Path, run: Callable[..., st
     ],
     ids=str,
 )
-def test_too_little_memory_is_one_sentence(
+def test_too_little_memory_gives_one_sentence(
     scene: Path, run: Callable[..., str], error: Exception, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object, **__: object) -> None:
         raise error
 
     monkeypatch.setattr(frame, "blur_by_coc", fail)
-    said = run("render image.exr depth.npy -o out.exr --focus-m 2", code=2)
-    assert said.startswith("error: there is too little memory for this image") and said.count("\n") == 1
+    message = run("render image.exr depth.npy -o out.exr --focus-m 2", code=2)
+    assert message.startswith("error: there is too little memory for this image") and message.count("\n") == 1
 
 
-SMALL = """
+LIMITED = """
 import resource, sys
 import torch, torchdof.cli.main, torchdof.cli.frame, OpenImageIO
 torch.set_num_threads(1)
@@ -139,27 +139,27 @@ torchdof.cli.main.app(sys.argv[1:])
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits memory")
 @pytest.mark.parametrize("engine", ["torch", "native"])
-def test_memory_that_runs_out_while_rendering_is_one_sentence(
+def test_a_real_lack_of_memory_while_rendering_gives_one_sentence(
     scene: Path, engine: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", engine)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     write_image("big.exr", Picture(torch.rand(1, 3, 1000, 1500), sample="half"))
     np.save("big.npy", np.linspace(1, 9, 1_500_000, dtype=np.float32).reshape(1000, 1500))
-    call = [sys.executable, "-c", SMALL, "render", "big.exr", "big.npy", "-o", "out.exr", "--focus-m", "2"]
-    told = subprocess.run([*call, "--f-number", "1.4"], capture_output=True, text=True, timeout=120)
-    assert told.returncode == 2 and len(told.stderr.strip().splitlines()) == 1, told.stderr
-    assert "memory" in told.stderr and not (scene / "out.exr").exists()
+    call = [sys.executable, "-c", LIMITED, "render", "big.exr", "big.npy", "-o", "out.exr", "--focus-m", "2"]
+    process = subprocess.run([*call, "--f-number", "1.4"], capture_output=True, text=True, timeout=120)
+    assert process.returncode == 2 and len(process.stderr.strip().splitlines()) == 1, process.stderr
+    assert "memory" in process.stderr and not (scene / "out.exr").exists()
 
 
 class Terminal(io.StringIO):
-    """Standard error that somebody looks at."""
+    """Standard error as a terminal."""
 
     def isatty(self) -> bool:
         return True
 
 
-def test_a_bar_is_shown_of_what_takes_long_and_what_is_printed_to_a_file_stays_there(
+def test_a_long_step_shows_a_bar_on_the_terminal_and_results_still_go_to_the_file(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     terminal, file = Terminal(), io.StringIO()
@@ -183,14 +183,14 @@ def test_a_bar_is_shown_of_what_takes_long_and_what_is_printed_to_a_file_stays_t
     assert file.getvalue() == '{"out": "a.png"}\n' and "a.png" not in terminal.getvalue()
 
 
-def test_a_large_image_is_measured_by_a_strip_where_somebody_looks(
+def test_a_large_image_shows_an_estimate_of_its_time_only_on_a_terminal(
     scene: Path, run: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told: list[str] = []
+    shown: list[str] = []
     monkeypatch.setattr(frame, "_LARGE_PX", 100)
-    monkeypatch.setattr(printed.Bar, "update", lambda self, what: told.append(what))
+    monkeypatch.setattr(printed.Bar, "update", lambda self, text: shown.append(text))
     run("render image.exr depth.npy -o out.exr --focus-m 2")
-    assert told == []
+    assert shown == []
     monkeypatch.setattr(printed, "_is_terminal", lambda: True)
     run("render image.exr depth.npy -o out.exr --focus-m 2")
-    assert len(told) == 1 and re.fullmatch(r"rendering out.exr, about \d+ s", told[0])
+    assert len(shown) == 1 and re.fullmatch(r"rendering out.exr, about \d+ s", shown[0])

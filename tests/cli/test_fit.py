@@ -1,4 +1,4 @@
-"""`torchdof fit` as a user runs it."""
+"""``torchdof fit``: captures or a lens in, a table and pictures out."""
 
 import functools
 import json
@@ -30,17 +30,17 @@ def folder(simulator: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 def test_a_folder_becomes_a_table_with_pictures(run: Run, folder: Path, tmp_path: Path) -> None:
-    told = run("fit", folder, "-o", tmp_path / "mine.json", "--plots", tmp_path / "pictures")
+    output = run("fit", folder, "-o", tmp_path / "mine.json", "--plots", tmp_path / "pictures")
     table = BlurTable.load(tmp_path / "mine.json")
     assert table.family == "disc" and len(table.coc) == 3 and table.name == "my lens"
     assert table.provenance["command"].startswith("torchdof fit ")
-    assert all(words in told for words in ("±", "family: disc", "x noise")) and "warning" not in told
+    assert all(words in output for words in ("±", "family: disc", "x noise")) and "warning" not in output
     assert sorted(f.name for f in (tmp_path / "pictures").iterdir()) == [
         "mine_1000mm.png", "mine_400mm.png", "mine_800mm.png", "mine_table.png", "mine_texture.png",
     ]  # fmt: skip
 
 
-def test_pictures_whose_transfer_nobody_stated_are_said(run: Run, folder: Path, tmp_path: Path) -> None:
+def test_pictures_without_a_stated_transfer_give_a_warning(run: Run, folder: Path, tmp_path: Path) -> None:
     shutil.copytree(folder, tmp_path / "lens")
     manifest = tmp_path / "lens" / "capture.toml"
     manifest.write_text(manifest.read_text().replace('transfer = "srgb"', ""))
@@ -53,9 +53,7 @@ def test_pictures_whose_transfer_nobody_stated_are_said(run: Run, folder: Path, 
     assert "the encoding of 0500mm.png" in facts["warnings"][0]
 
 
-def test_what_was_said_of_a_grid_is_not_said_of_each_of_its_dots(
-    run: Run, simulator: ModuleType, tmp_path: Path
-) -> None:
+def test_a_warning_about_a_grid_of_dots_is_printed_once(run: Run, simulator: ModuleType, tmp_path: Path) -> None:
     camera = simulator.Simulator(level=0.7, snr_db=46, dot_radius=7.0, black=0.02)
     grid = [(-60, 0), (60, 0)]
     folder = simulator.write_captures(tmp_path / "lens", camera, 0.5, [0.8], kernel, grid=grid, width=240, height=120)
@@ -76,25 +74,25 @@ def test_a_polygon_becomes_a_table_with_its_blades(run: Run, simulator: ModuleTy
 
     folder = simulator.write_captures(tmp_path / "lens", camera, 0.5, [0.8], hexagon, width=110, height=90)
     out = tmp_path / "mine.json"
-    told = run("fit", folder, "-o", out, "--family", "polygon", "--plots", tmp_path)
+    output = run("fit", folder, "-o", out, "--family", "polygon", "--plots", tmp_path)
     table = BlurTable.load(out)
     assert table.family == "disc" and table.aperture is not None and table.aperture.blades == 6
-    assert "6 blades" in told and (tmp_path / "mine_800mm.png").is_file()
+    assert "6 blades" in output and (tmp_path / "mine_800mm.png").is_file()
 
 
 def test_a_lens_becomes_a_table(run: Run, tmp_path: Path) -> None:
     arguments = ("--lens", "double_gauss_50mm", "--f-number", "4", "--nodes", "5", "-o", tmp_path / "lens.json")
-    told = run("fit", *arguments)
+    output = run("fit", *arguments)
     facts = json.loads(run("fit", *arguments, "--json"))
     assert facts["out"] == str(tmp_path / "lens.json") and facts["f_number"] == 4.0 and facts["family"] == "radial"
     assert BlurTable.load(tmp_path / "lens.json").unit == "mm"
-    told = " ".join(told.split())
-    assert "50.3582 mm, f/4, focus 2.0 m; 5 distances from" in told and "family: radial, residual" in told
+    output = " ".join(output.split())
+    assert "50.3582 mm, f/4, focus 2.0 m; 5 distances from" in output and "family: radial, residual" in output
 
 
 def test_the_target_is_written_and_nothing_else(run: Run, tmp_path: Path) -> None:
-    told = run("fit", "--target", tmp_path / "target.pdf", "--paper", "letter")
-    assert (tmp_path / "target.pdf").read_bytes().startswith(b"%PDF") and "print it at 100 %" in told
+    output = run("fit", "--target", tmp_path / "target.pdf", "--paper", "letter")
+    assert (tmp_path / "target.pdf").read_bytes().startswith(b"%PDF") and "print it at 100 %" in output
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
@@ -109,13 +107,13 @@ def test_photographs_of_the_target_become_a_table_and_a_sheet(
         return blur_by_coc(image, coc_px, table=table)
 
     monkeypatch.setattr("torchdof.cli.fitted.blur_by_coc", recorded)
-    told = run("fit", tmp_path / "phone", "-o", tmp_path / "phone.json", "--family", "disc")
-    told = " ".join(told.split())
-    assert "in focus" in told and "better: 1 distances out of focus: five to nine" in told
+    output = run("fit", tmp_path / "phone", "-o", tmp_path / "phone.json", "--family", "disc")
+    output = " ".join(output.split())
+    assert "in focus" in output and "better: 1 distances out of focus: five to nine" in output
     table = BlurTable.load(tmp_path / "phone.json")
     assert table.unit == "mm" and table.provenance["sharp"] == "img_0000.jpg"
     assert (tmp_path / "phone.png").stat().st_size > 20_000
-    # lights through all circles of confusion, and the photograph in focus at the largest one
+    # the first call renders lights at every CoC, the second the photograph in focus at the largest CoC
     (_, lights), (photograph, coc_px) = rendered
     assert lights.min() == 0 and coc_px.unique().tolist() == [lights.max()]
     assert photograph.shape[-1] > 60 and photograph.max() > 0.7 and photograph[..., :5].max() < 0.1
@@ -124,17 +122,17 @@ def test_photographs_of_the_target_become_a_table_and_a_sheet(
 def test_a_lens_is_traced_in_its_colours_and_across_its_field(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    few = functools.partial(trace.trace_table, field_nodes=2, field_rays=2000)
-    monkeypatch.setattr(trace, "trace_table", few)
+    with_few_rays = functools.partial(trace.trace_table, field_nodes=2, field_rays=2000)
+    monkeypatch.setattr(trace, "trace_table", with_few_rays)
     (tmp_path / "single.txt").write_text("50 5 1.5168/64.17 20\n0 1 0 8\n-50 0 1 20\n")
     file = tmp_path / "lens.json"
     options = ("--lens", tmp_path / "single.txt", "--f-number", "8", "--nodes", "5", "-o", file)
     run("fit", *options, "--wavelengths", "rgb")
     assert BlurTable.load(file).channels == 3
-    told = run("fit", *options, "--field", "0,6,12")
-    assert "across the field: [0.0, 6.0, 12.0] mm" in told
+    output = run("fit", *options, "--field", "0,6,12")
+    assert "across the field: [0.0, 6.0, 12.0] mm" in output
     drawn = run("tables", file, "-o", tmp_path / "table.png")
     assert "distances to 12" in drawn and (tmp_path / "table.png").is_file()
     field = BlurTable.load(file).field
     assert field is not None and field.radius.tolist() == [0.0, 6.0, 12.0]
-    assert 1.02 * field.box[0, 0, 1] < field.box[0, 2, 1]  # a single lens is worse off its axis
+    assert 1.02 * field.box[0, 0, 1] < field.box[0, 2, 1]  # a single lens blurs more off its axis

@@ -1,4 +1,4 @@
-"""``torchdof inspect`` from the outside."""
+"""``torchdof inspect``: facts about image, depth and lens, as text, as JSON and as a picture."""
 
 import json
 from collections.abc import Callable
@@ -17,7 +17,7 @@ LENS = "--focus-m 2 --f-number 1.4 --sensor-width-mm 4"
 
 @pytest.fixture
 def photo(scene: Path) -> Path:
-    """A folder with photo.png of 40 x 24 pixels, and near.npy: 2 m left, 6 m right, as the picture has it."""
+    """A folder with photo.png of 40 x 24 pixels, and near.npy: 2 m left, 6 m right, with the picture's edge."""
     image, depth = torch.full((1, 3, 24, 40), 0.1), np.full((24, 40), 2.0)
     image[..., 20:], depth[:, 20:] = 0.6, 6.0
     write_image("photo.png", Picture(image, sample="8", transfer="srgb"))
@@ -41,14 +41,16 @@ def photo(scene: Path) -> Path:
         ("holed.npy --focus-m 2 --fill-depth nearest", ["holes 0", "filled        96 holes (10.0 %), nearest"]),
     ],
 )
-def test_what_is_told(photo: Path, run: Callable[..., str], arguments: str, words: list[str]) -> None:
-    told = run(f"inspect photo.png {arguments}")
-    assert all(part in told for part in words), told
+def test_the_text_states_lens_depth_and_blur(
+    photo: Path, run: Callable[..., str], arguments: str, words: list[str]
+) -> None:
+    output = run(f"inspect photo.png {arguments}")
+    assert all(part in output for part in words), output
     sheet = read_image("photo.inspect.png").pixels
     assert sheet.shape[-1] > 3 * 40 and sheet.shape[-2] > 24
 
 
-def test_json_says_for_programs_what_is_printed(photo: Path, run: Callable[..., str]) -> None:
+def test_json_has_the_printed_facts(photo: Path, run: Callable[..., str]) -> None:
     facts = json.loads(run(f"inspect photo.png near.npy -o look.png {LENS} --json"))
     assert facts["camera"]["focus_m"] == 2.0 and facts["picture"] == "look.png" and Path("look.png").is_file()
     assert facts["depth_m"] == {"nearest": 2.0, "1 %": 2.0, "median": 4.0, "99 %": 6.0, "farthest": 6.0}
@@ -57,9 +59,9 @@ def test_json_says_for_programs_what_is_printed(photo: Path, run: Callable[..., 
     assert sum(part["share"] for part in facts["histogram"]) == pytest.approx(1.0)
 
 
-def test_mistakes_are_said_and_strictness_makes_them_errors(photo: Path, run: Callable[..., str]) -> None:
+def test_likely_mistakes_are_warnings_or_with_strict_errors(photo: Path, run: Callable[..., str]) -> None:
     line = "inspect photo.png millimetres.npy --focus-m 3 --f-number 1.4 --sensor-width-mm 4"
-    told = CliRunner().invoke(app, line.split())
-    assert told.exit_code == 0 and "picture " in told.stdout and "--depth-scale 0.001" in told.stderr
-    assert told.stderr.startswith("warning: millimetres.npy: nothing is in focus")
+    result = CliRunner().invoke(app, line.split())
+    assert result.exit_code == 0 and "picture " in result.stdout and "--depth-scale 0.001" in result.stderr
+    assert result.stderr.startswith("warning: millimetres.npy: nothing is in focus")
     assert run(f"{line} --strict", code=2).startswith("error: millimetres.npy: nothing is in focus")

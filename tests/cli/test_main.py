@@ -1,4 +1,4 @@
-"""Which commands there are, what their options mean, and what is said of one that cannot run."""
+"""The list of commands, the names and meanings of their options, and errors before a command starts."""
 
 import os
 import subprocess
@@ -15,17 +15,17 @@ from torchdof.cli.main import COMMANDS, app
 PARSED = {name: command for name in COMMANDS if (command := app.get_command(click.Context(app), name))}
 
 
-def test_help_lists_every_command_with_what_it_does(run: Callable[..., str]) -> None:
+def test_help_lists_every_command_with_its_purpose(run: Callable[..., str]) -> None:
     listed = " ".join(run("--help").split())
     assert list(PARSED) == list(COMMANDS) and len(COMMANDS) == 6
     assert all(f"{name} {command.short_help}" in listed for name, command in PARSED.items())
 
 
-def test_help_of_a_command_teaches_by_examples_and_puts_the_basic_options_first(run: Callable[..., str]) -> None:
-    told = " ".join(run("render --help").split())
+def test_help_of_a_command_has_examples_and_puts_the_basic_options_first(run: Callable[..., str]) -> None:
+    text = " ".join(run("render --help").split())
     for example in ("torchdof render shot.exr -o out.exr", "--focus-m 1:2,48:5.5", "--depth-kind disparity"):
-        assert example in told
-    basic, groups = told.partition("Options: ")[2].partition("Focus and lens: ")[::2]
+        assert example in text
+    basic, groups = text.partition("Options: ")[2].partition("Focus and lens: ")[::2]
     assert all(f"{option} " in basic for option in ("--out", "--focus-m", "--f-number", "--depth-scale", "--tolerance"))
     assert groups.index("--tilt ") < groups.index("Depth map: ") < groups.index("--near-m ") < groups.index("Blur: ")
 
@@ -60,12 +60,12 @@ fit: captures out family accuracy_db dots colours target paper square_mm root le
 
 
 @pytest.mark.parametrize("line", NAMES.replace("\n    ", " ").strip().splitlines(), ids=lambda line: line.split(":")[0])
-def test_names_that_scripts_use_stay(line: str) -> None:
+def test_names_of_options_that_scripts_use_still_exist(line: str) -> None:
     command, _, names = line.partition(": ")
     assert set(names.split()) <= {parameter.name for parameter in PARSED[command].params}
 
 
-def test_defaults_are_those_of_the_library() -> None:
+def test_defaults_equal_those_of_the_library() -> None:
     from torchdof.export.conversion import OPSET
     from torchdof.fit.photo.target import SQUARE_MM
 
@@ -73,7 +73,7 @@ def test_defaults_are_those_of_the_library() -> None:
     assert (defaults["export"]["opset"], defaults["fit"]["square_mm"]) == (OPSET, SQUARE_MM)
 
 
-def test_a_package_that_is_missing_is_named_with_the_extra_that_brings_it(
+def test_a_missing_package_is_named_with_the_extra_that_installs_it(
     monkeypatch: pytest.MonkeyPatch, run: Callable[..., str]
 ) -> None:
     def missing(self: Export) -> None:
@@ -84,22 +84,22 @@ def test_a_package_that_is_missing_is_named_with_the_extra_that_brings_it(
     assert "this command needs scipy; install it with: pip install 'torchdof[fit]'" in run("export", code=2)
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="reads what GNU's OpenMP says of itself")
+@pytest.mark.skipif(sys.platform != "linux", reason="reads the settings that GNU OpenMP prints")
 @pytest.mark.parametrize(
-    ("said", "spins"),
+    ("variables", "spins"),
     [({}, "0"), ({"GOMP_SPINCOUNT": "77"}, "77"), ({"OMP_WAIT_POLICY": "active"}, "30000000000")],
     ids=["nothing", "spins", "policy"],
 )
-def test_threads_that_wait_do_not_spin_unless_the_user_says_so(said: dict[str, str], spins: str) -> None:
+def test_waiting_threads_do_not_spin_unless_the_environment_asks_for_it(variables: dict[str, str], spins: str) -> None:
     names = {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME"}
     environment = {name: value for name, value in os.environ.items() if name not in names}
-    environment |= {"OMP_DISPLAY_ENV": "verbose", **said}
+    environment |= {"OMP_DISPLAY_ENV": "verbose", **variables}
     command = [sys.executable, "-m", "torchdof", "--version"]
-    told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stderr
-    assert f"GOMP_SPINCOUNT = '{spins}'" in told
+    settings = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stderr
+    assert f"GOMP_SPINCOUNT = '{spins}'" in settings
 
 
-def test_python_dash_m_is_the_command(scene: Path) -> None:
+def test_python_dash_m_torchdof_runs_the_command(scene: Path) -> None:
     command = [sys.executable, "-m", "torchdof", "render", "image.exr", "none.npy", "-o", "out.exr", "--focus-m", "2"]
-    told = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (told.returncode, told.stderr) == (2, "error: none.npy: there is no such file\n")
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (process.returncode, process.stderr) == (2, "error: none.npy: there is no such file\n")

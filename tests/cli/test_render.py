@@ -1,4 +1,4 @@
-"""``torchdof render`` from the outside: files in, files out, one line that says what was done."""
+"""``torchdof render``: files in, files out, and one line that summarizes each picture."""
 
 import json
 import math
@@ -71,7 +71,7 @@ PENTAGON = torchdof.BlurTable.polygon(5, 15.0, 0.2, squeeze=1.5, vignetting=0.3)
         (f"--focus-m 2 {LENS} --aperture slit.png", CAMERA, {"table": torchdof.BlurTable.from_aperture(SLIT)}),
     ],
 )
-def test_render_is_the_function_on_files(
+def test_render_equals_the_function_on_tensors(
     image: Tensor,
     depth: Tensor,
     run: Run,
@@ -83,11 +83,11 @@ def test_render_is_the_function_on_files(
     write_image("slit.png", Picture(SLIT.expand(1, 3, 8, 8), sample="8", transfer="srgb"))
     passed: dict[str, Any] = {}
 
-    def kept(*tensors: Tensor, **others: Any) -> Tensor:
+    def record(*tensors: Tensor, **others: Any) -> Tensor:
         passed.update(others)
         return torchdof.blur_by_coc(*tensors, **others)
 
-    monkeypatch.setattr("torchdof.cli.frame.blur_by_coc", kept)
+    monkeypatch.setattr("torchdof.cli.frame.blur_by_coc", record)
     line = run(f"render image.exr depth.npy -o out.exr --device cpu {options}")
     expected = torchdof.depth_of_field(image, depth, camera, **arguments)
     torch.testing.assert_close(pixels("out.exr"), expected, rtol=0, atol=1e-6)
@@ -106,8 +106,8 @@ def test_lights_expand_the_clipped_lamps_of_a_photograph_and_alpha_is_blurred_pr
     night[:, :3, 8, 18], night[:, 3] = 1.0, 1.0
     night[..., 21:] = 0.0
     write_image("night.png", Picture(night, ("R", "G", "B", "A"), sample="8", transfer="srgb"))
-    told = run(f"render night.png depth.npy -o out.exr --focus-m 2 --lights 3 --bits float {LENS}")
-    assert "lights up to 3 stops above white" in told
+    line = run(f"render night.png depth.npy -o out.exr --focus-m 2 --lights 3 --bits float {LENS}")
+    assert "lights up to 3 stops above white" in line
     light = pixels("night.png")
     light = torch.cat([expand_highlights(light[:, :3], 3.0), light[:, 3:]], 1)
     torch.testing.assert_close(pixels("out.exr"), torchdof.depth_of_field(light, depth, CAMERA), rtol=0, atol=1e-5)
@@ -115,7 +115,7 @@ def test_lights_expand_the_clipped_lamps_of_a_photograph_and_alpha_is_blurred_pr
     assert bool(((pixels("out.exr")[:, 3] > 0.01) & (pixels("out.exr")[:, 3] < 0.99)).any())
 
 
-def test_the_line_tells_what_was_done(run: Run) -> None:
+def test_the_line_states_camera_blur_and_table(run: Run) -> None:
     told = run(f"{ONE} {LENS}")
     assert run(f"{ONE} --resume") == "out.exr: is there already\n"
     assert told.startswith(
@@ -127,7 +127,7 @@ def test_the_line_tells_what_was_done(run: Run) -> None:
     assert "5 blades, curvature 0.2, turned by 15, squeeze 1.5, vignetting 0.3; no occlusion" in told
 
 
-def test_camera_comes_from_the_file_when_nobody_states_it_and_that_is_said(image: Tensor, run: Run) -> None:
+def test_the_camera_is_read_from_the_file_and_the_line_names_the_source(image: Tensor, run: Run) -> None:
     tags = {"Exif:FocalLength": 85.0, "FNumber": 1.8, "Exif:SubjectDistance": 3.0, "Exif:FocalLengthIn35mmFilm": 85.0}
     write_image("photo.exr", Picture(image, metadata={name: ("float", value) for name, value in tags.items()}))
     line = run("render photo.exr depth.npy -o out.exr")
@@ -138,7 +138,7 @@ def test_camera_comes_from_the_file_when_nobody_states_it_and_that_is_said(image
     assert "[focal length assumed, f-number assumed, sensor width assumed]" in run(ONE)
 
 
-def test_kinds_of_depth_are_the_same_metres(image: Tensor, depth: Tensor, run: Run) -> None:
+def test_every_kind_of_depth_converts_to_the_same_metres(image: Tensor, depth: Tensor, run: Run) -> None:
     both = torch.cat([image, depth], dim=1)[0].permute(1, 2, 0).contiguous().numpy()
     store("zed.exr", both, "float", ("R", "G", "B", "Z"))
     near = depth[0, 0].numpy() == 2.0
@@ -155,7 +155,7 @@ def test_kinds_of_depth_are_the_same_metres(image: Tensor, depth: Tensor, run: R
     camera = "--focus-m 2 --fov-deg 40 --aperture-radius-m 0.2"
     run(f"render image.exr depth.npy -o expected.exr {camera}")
     relative = "relative.png --depth-kind relative --near-m 2 --far-m 6"
-    for said in (
+    for arguments in (
         relative,
         f"{relative} --value-range 10,200",
         "depth.npy --depth-kind relative --near-m 2 --far-m 6 --relative-kind depth",
@@ -164,16 +164,16 @@ def test_kinds_of_depth_are_the_same_metres(image: Tensor, depth: Tensor, run: R
         "millimetres.npy --depth-scale 0.001 --depth-offset 7",
         "inverse.npy --depth-kind inverse",
         "two.npz --depth-channel other",
-        "zed.exr",  # the image, which has a channel of depth
+        "zed.exr",  # an image with a depth channel
     ):
-        line = run(f"render {'image.exr' if said != 'zed.exr' else ''} {said} -o out.exr {camera}")
+        line = run(f"render {'image.exr' if arguments != 'zed.exr' else ''} {arguments} -o out.exr {camera}")
         torch.testing.assert_close(pixels("out.exr"), pixels("expected.exr"), rtol=0, atol=1e-4)
-        assert ("2 px of depth filled (nearest)" in line) == ("disparity.png" in said)
+        assert ("2 px of depth filled (nearest)" in line) == ("disparity.png" in arguments)
     run(f"render image.exr {relative} -o out.exr {camera} --relative-kind depth")
     assert not torch.allclose(pixels("out.exr"), pixels("expected.exr"), atol=1e-2)
 
 
-def test_ready_circles_of_confusion_need_no_camera(image: Tensor, run: Run) -> None:
+def test_a_map_of_circles_of_confusion_needs_no_camera(image: Tensor, run: Run) -> None:
     coc_px = torch.linspace(-3, 3, 24).expand(1, 1, 16, 24)
     np.save("coc.npy", coc_px.numpy())
     line = run("render image.exr coc.npy -o out.exr --depth-kind coc")
@@ -181,19 +181,21 @@ def test_ready_circles_of_confusion_need_no_camera(image: Tensor, run: Run) -> N
     assert "focus" not in line and "blur radius up to 3.0 px" in line
 
 
-def test_mistakes_are_one_warning_a_sequence_and_errors_where_strict(scene: Path, depth: Tensor, run: Run) -> None:
+def test_likely_mistakes_are_one_warning_per_sequence_or_with_strict_an_error(
+    scene: Path, depth: Tensor, run: Run
+) -> None:
     relative = f"{SEQUENCE} --focus-m 2 {LENS} --depth-kind relative --near-m 2 --far-m 6 --relative-kind depth"
-    told = CliRunner().invoke(app, relative.split())
-    assert told.exit_code == 0 and told.stderr.count("warning: ") == 1 and "--value-range LOW,HIGH" in told.stderr
+    result = CliRunner().invoke(app, relative.split())
+    assert result.exit_code == 0 and result.stderr.count("warning: ") == 1 and "--value-range LOW,HIGH" in result.stderr
     assert CliRunner().invoke(app, [*relative.split(), "--value-range", "2,6"]).stderr == ""
     for n in range(1, 4):
         np.save(f"depth.{n:04d}.npy", depth.numpy() * 1000)
         (scene / f"out.{n:04d}.exr").unlink()
     millimetres = f"{SEQUENCE} --focus-m 3 {LENS}"
-    told = CliRunner().invoke(app, millimetres.split())
-    assert told.exit_code == 0 and len(list(scene.glob("out.*"))) == 3
-    assert told.stderr.startswith("warning: depth.0001.npy: nothing is in focus") and told.stderr.count("\n") == 1
-    assert "is it millimetres (--depth-scale 0.001)" in told.stderr
+    result = CliRunner().invoke(app, millimetres.split())
+    assert result.exit_code == 0 and len(list(scene.glob("out.*"))) == 3
+    assert result.stderr.startswith("warning: depth.0001.npy: nothing is in focus") and result.stderr.count("\n") == 1
+    assert "is it millimetres (--depth-scale 0.001)" in result.stderr
     for path in scene.glob("out.*"):
         path.unlink()
     assert run(f"{millimetres} --strict", code=2).startswith("error: depth.0001.npy: nothing is in focus")
@@ -205,11 +207,11 @@ def test_mistakes_are_one_warning_a_sequence_and_errors_where_strict(scene: Path
 def test_warnings_of_depth_can_be_silenced(depth: Tensor) -> None:
     np.save("depth.npy", depth.numpy() * 1000)
     command = [sys.executable, "-W", "ignore", "-m", "torchdof", *f"{ONE} {LENS}".split()]
-    told = subprocess.run(command, capture_output=True, text=True)
-    assert told.returncode == 0 and told.stderr == ""
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 0 and result.stderr == ""
 
 
-@pytest.mark.parametrize("place", ["everywhere alike", "across the field"])
+@pytest.mark.parametrize("place", ["same everywhere", "across the field"])
 def test_table_of_three_colours_blurs_alpha_like_green(image: Tensor, run: Run, place: str) -> None:
     table = torchdof.BlurTable("gaussian", coc=[1.0], params={"sigma": [[0.2], [0.5], [0.9]]})
     if place == "across the field":
@@ -225,7 +227,7 @@ def test_table_of_three_colours_blurs_alpha_like_green(image: Tensor, run: Run, 
     assert not torch.allclose(out[:, 0], out[:, 1], atol=1e-3)
 
 
-def test_show_focus_draws_outlines_by_zone_and_keeps_all_other_colours(run: Run) -> None:
+def test_show_focus_colours_the_outlines_of_each_zone_and_keeps_other_pixels(run: Run) -> None:
     colours = torch.tensor([0.3, 0.1, 0.2])[:, None, None].expand(1, 3, 16, 24).clone()
     colours[..., 8:, :] *= 0.2  # an outline across all three zones
     write_image("photo.exr", Picture(colours, sample="float"))
@@ -244,7 +246,7 @@ def test_show_focus_draws_outlines_by_zone_and_keeps_all_other_colours(run: Run)
     assert torch.equal(tinted[0, 0, :, :6], tinted[0, 2, :, :6])
 
 
-def test_json_says_for_programs_what_the_line_says(depth: Tensor, run: Run) -> None:
+def test_json_has_the_facts_of_the_line(depth: Tensor, run: Run) -> None:
     run(f"{SEQUENCE} --focus-m 2 --frames 1-1 {LENS}")
     printed = run(f"{SEQUENCE} --focus-m inf {LENS} --resume --json --attention 18,8,4")
     there, *frames = [json.loads(line) for line in printed.splitlines()]
@@ -253,20 +255,21 @@ def test_json_says_for_programs_what_the_line_says(depth: Tensor, run: Run) -> N
     radius = float(CAMERA.replace(focus_m=math.inf).coc_px(depth, 24).abs().max())
     camera: dict[str, Any] = {"focus_m": "inf", "f_number": 1.4, "focal_length_mm": 50.0, "sensor_width_mm": 4.0}
     camera |= {"focus_range_m": None, "tilt_deg": 0.0, "swing_deg": 0.0}
-    told: dict[str, Any] = {
+    expected: dict[str, Any] = {
         "out": "out.0002.exr",
         "camera": camera,
         "assumed": [],
         "largest_coc_px": pytest.approx(radius),
     }
-    told |= {"width": 24, "height": 16, "filled_px": 0, "show_focus": False, "table": "disc", "aperture": None}
-    told |= {"method": "layered", "occlusion": True, "tolerance": 1 / 255, "attention": [18.0, 8.0, 4.0], "lights": 0.0}
+    expected |= {"width": 24, "height": 16, "filled_px": 0, "show_focus": False, "table": "disc", "aperture": None}
+    expected |= {"method": "layered", "occlusion": True, "tolerance": 1 / 255, "attention": [18.0, 8.0, 4.0]}
+    expected |= {"lights": 0.0}
     same = {name: frames[0][name] for name in ("seconds", "device")}
-    assert frames[0] == told | same
+    assert frames[0] == expected | same
     assert frames[0]["seconds"] > 0
 
 
-def test_metadata_bits_and_transfer_of_the_result_are_as_asked(image: Tensor, run: Run) -> None:
+def test_metadata_are_copied_and_bits_and_transfer_follow_the_options(image: Tensor, run: Run) -> None:
     write_image("photo.jpg", Picture(image, metadata={"Make": ("string", "Maker"), "FNumber": ("float", 2.0)}))
     run("render photo.jpg depth.npy -o out.jpg --focus-m 2")
     metadata = read_image("out.jpg").metadata
@@ -280,16 +283,16 @@ def test_metadata_bits_and_transfer_of_the_result_are_as_asked(image: Tensor, ru
     torch.testing.assert_close(pixels("again.exr"), image, rtol=0, atol=1e-5)
 
 
-def test_sequence_follows_the_focus_of_its_keyframes(image: Tensor, depth: Tensor, run: Run) -> None:
+def test_a_sequence_interpolates_the_focus_between_keyframes(image: Tensor, depth: Tensor, run: Run) -> None:
     lines = run(f"{SEQUENCE} --focus-m 1:2,3:6 {LENS}").splitlines()
-    told = [re.search(r"out.(\d+).exr: focus ([\d.]+) m", line).groups() for line in lines]  # type: ignore[union-attr]
-    assert told == [("0001", "2"), ("0002", "3"), ("0003", "6")]
+    focus = [re.search(r"out.(\d+).exr: focus ([\d.]+) m", line).groups() for line in lines]  # type: ignore[union-attr]
+    assert focus == [("0001", "2"), ("0002", "3"), ("0003", "6")]
     for n, focus_m in ((1, 2.0), (2, 3.0), (3, 6.0)):
         expected = torchdof.depth_of_field(image * n, depth, CAMERA.replace(focus_m=focus_m))
         torch.testing.assert_close(pixels(f"out.{n:04d}.exr"), expected, rtol=0, atol=1e-5)
 
 
-def test_steady_depth_flickers_less_and_parts_are_those_of_the_whole(
+def test_steady_depth_flickers_less_and_resumed_or_partial_runs_give_the_same_frames(
     scene: Path, image: Tensor, depth: Tensor, run: Run
 ) -> None:
     generator = torch.Generator().manual_seed(2)
@@ -314,7 +317,9 @@ def test_steady_depth_flickers_less_and_parts_are_those_of_the_whole(
 
 
 @pytest.mark.parametrize("name", ["take #1/x.exr", "50%done/x.exr", "IMG #1.exr", "a##b.exr", "%d.exr", "x %03d.exr"])
-def test_a_file_by_that_very_name_is_no_pattern(scene: Path, image: Tensor, run: Run, name: str) -> None:
+def test_an_existing_file_whose_name_looks_like_a_pattern_is_a_single_image(
+    scene: Path, image: Tensor, run: Run, name: str
+) -> None:
     path = scene / name
     path.parent.mkdir(exist_ok=True)
     write_image(path, Picture(image))
@@ -323,7 +328,7 @@ def test_a_file_by_that_very_name_is_no_pattern(scene: Path, image: Tensor, run:
     assert pixels(str(out)).shape == image.shape
 
 
-def test_places_of_numbers_are_looked_for_in_names_of_files_alone(scene: Path, run: Run) -> None:
+def test_frame_numbers_are_only_in_file_names_never_in_folder_names(scene: Path, run: Run) -> None:
     (scene / "take #1").mkdir()
     for n in (1, 2, 3):
         os.replace(f"shot.{n:04d}.exr", f"take #1/shot.{n:04d}.exr")
@@ -341,8 +346,8 @@ def test_a_link_to_itself_is_refused_in_one_sentence(scene: Path, run: Run, link
     assert (scene / link).is_symlink()
 
 
-def test_a_phones_photograph_is_rendered_as_it_is_seen(run: Run, image: Tensor, depth: Tensor) -> None:
-    """Held upright, a phone stores lines from the bottom to the top (orientation 6); estimators' depth is upright."""
+def test_a_photograph_is_rotated_by_its_orientation_tag(run: Run, image: Tensor, depth: Tensor) -> None:
+    """An upright phone stores a landscape image with orientation 6; depth estimators see the rotated, upright image."""
     spec = oiio.ImageSpec(24, 16, 3, "uint8")
     spec.attribute("Orientation", 6)
     stored = (255 * image[0].permute(1, 2, 0)).byte().contiguous().numpy()
@@ -356,15 +361,17 @@ def test_a_phones_photograph_is_rendered_as_it_is_seen(run: Run, image: Tensor, 
     assert out.pixels.shape == (1, 3, 24, 16) and out.metadata["Orientation"][1] == 1
     seen = read_image("phone.png").pixels
     torch.testing.assert_close(out.pixels[..., 16:, :], seen[..., 16:, :], rtol=0.0, atol=0.01)  # in focus
-    said = run(f"render phone.png depth.npy -o out.png --focus-m 2 {LENS}", code=2)
-    assert "turned by 90 degrees it fits" in said
+    message = run(f"render phone.png depth.npy -o out.png --focus-m 2 {LENS}", code=2)
+    assert "turned by 90 degrees it fits" in message
 
 
-def test_depth_of_nearly_the_shape_is_stretched_and_said_so(run: Run, image: Tensor, depth: Tensor) -> None:
+def test_depth_of_nearly_the_same_shape_is_stretched_and_the_line_states_it(
+    run: Run, image: Tensor, depth: Tensor
+) -> None:
     write_image("large.exr", Picture(torch.nn.functional.interpolate(image, (64, 96)), sample="float"))
     np.save("near.npy", torch.nn.functional.interpolate(depth, (132, 194), mode="nearest").numpy())
-    said = run(f"render large.exr near.npy -o out.exr --focus-m 2 {LENS}")
-    assert "depth stretched by 2.1%" in said and "96 x 64" in said
+    line = run(f"render large.exr near.npy -o out.exr --focus-m 2 {LENS}")
+    assert "depth stretched by 2.1%" in line and "96 x 64" in line
 
 
 def test_the_folder_of_the_output_is_made(run: Run) -> None:

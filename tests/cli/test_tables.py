@@ -1,4 +1,4 @@
-"""``torchdof tables`` from the outside."""
+"""``torchdof tables``: the list of tables and pictures of their kernels."""
 
 import json
 from collections.abc import Callable
@@ -15,10 +15,12 @@ def test_every_table_that_ships_is_listed(run: Callable[..., str]) -> None:
     assert [line.split()[0] for line in lines[2:]] == sorted(path.stem for path in folder.glob("*.json"))
 
 
-def test_the_picture_shows_kernels_in_front_above_and_behind_below(scene: Path, run: Callable[..., str]) -> None:
+def test_the_picture_shows_kernels_of_the_foreground_above_those_of_the_background(
+    scene: Path, run: Callable[..., str]
+) -> None:
     BlurTable.gaussian().save("mine.json")
-    told = run("tables disc mine.json --blades 3 --rotation 90 -o kernels.png")
-    assert "3 blades, turned by 90" in told and "-24, -12" in told
+    output = run("tables disc mine.json --blades 3 --rotation 90 -o kernels.png")
+    assert "3 blades, turned by 90" in output and "-24, -12" in output
     picture = read_image("kernels.png").pixels[0, 0]
     assert picture.shape == (6 * 120 + 34 + 8, 2 * 230 + 3 * 8)
     for row, behind in ((0, False), (5, True)):
@@ -27,18 +29,18 @@ def test_the_picture_shows_kernels_in_front_above_and_behind_below(scene: Path, 
         assert (left > right) != behind  # the triangle's corner points left behind focus
 
 
-def test_tables_that_depend_on_the_place_show_kernels_from_the_middle_to_the_corner(
+def test_tables_that_vary_across_the_field_show_kernels_from_the_centre_to_the_corner(
     scene: Path, run: Callable[..., str]
 ) -> None:
-    told = run("tables disc --vignetting 0.6 -o kernels.png")
-    assert "vignetting 0.6" in told
+    output = run("tables disc --vignetting 0.6 -o kernels.png")
+    assert "vignetting 0.6" in output
     picture = read_image("kernels.png").pixels[0, 0]
     rows = picture[34 + 5 * 120 + 2 : 34 + 6 * 120, 8 : 8 + 4 * 118]
     lit = [float((part > 0.1).sum()) for part in rows.split(118, 1)]
     assert lit[0] > 1.1 * lit[1] > 1.2 * lit[2] > 1.2 * lit[3]
 
 
-def test_json_tells_programs_the_same(run: Callable[..., str]) -> None:
+def test_json_has_the_printed_facts(run: Callable[..., str]) -> None:
     facts = json.loads(run("tables double_gauss_50mm_f2 --json"))
     name = "double_gauss_50mm_f2"
     assert [facts[key] for key in ("table", "family", "nodes", "unit")] == [name, "radial", 41, "mm"]

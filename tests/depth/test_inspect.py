@@ -1,4 +1,4 @@
-"""What a report says of a depth map is what was put into the map."""
+"""Reports on depth maps with known edges, holes and ranges."""
 
 import math
 from collections.abc import Callable
@@ -26,7 +26,7 @@ def two_surfaces(height: int = 40, width: int = 64) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("turn", [lambda t: t, lambda t: t.mT.contiguous()], ids=["along rows", "along columns"])
-def test_steps_where_the_image_has_them_are_exact(turn: Callable[[Tensor], Tensor]) -> None:
+def test_steps_at_edges_of_the_image_are_exact(turn: Callable[[Tensor], Tensor]) -> None:
     image, depth = two_surfaces()
     report = inspect_depth(turn(image), turn(depth), CAMERA)
     assert report.counts == (6 * 40, 0, 0, 0) and report.doubtful == 0.0
@@ -43,7 +43,7 @@ def test_steps_where_the_image_has_them_are_exact(turn: Callable[[Tensor], Tenso
         (lambda z: torch.roll(z, -1, -1), "beside"),
     ],
 )
-def test_damaged_edges_are_doubted_where_rendering_repairs_them(damage: Callable[[Tensor], Tensor], kind: str) -> None:
+def test_the_report_marks_the_edges_that_rendering_repairs(damage: Callable[[Tensor], Tensor], kind: str) -> None:
     image, depth = two_surfaces()
     depth = damage(depth)
     report = inspect_depth(image, depth, CAMERA)
@@ -53,24 +53,24 @@ def test_damaged_edges_are_doubted_where_rendering_repairs_them(damage: Callable
     assert torch.equal((report.edges == 2) | (report.edges == 3), DepthOfField(CAMERA).coc_px(image, depth) != coc_px)
 
 
-def test_an_edge_that_the_image_does_not_show_stays() -> None:
+def test_a_depth_edge_without_an_edge_in_the_image_is_kept() -> None:
     _, depth = two_surfaces()
     assert inspect_depth(torch.full((1, 1, 40, 64), 0.4), depth, CAMERA).doubtful == 0.0
 
 
-def test_a_slope_is_no_edge() -> None:
+def test_a_slope_is_not_an_edge() -> None:
     depth = 1 / torch.linspace(1.0, 0.125, 60).expand(1, 1, 20, 60)
     camera = Camera.from_fov(fov_x_deg=40.0, aperture_radius_m=0.1, focus_m=2.0)
     assert sum(inspect_depth(torch.rand(1, 3, 20, 60), depth, camera).counts) == 0
 
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.name)
-def test_exact_depth_is_told_from_damaged(scene: Scene) -> None:
+def test_exact_depth_is_distinguished_from_damaged_depth(scene: Scene) -> None:
     exact, soft, shifted = (
         inspect_depth(scene.image, degrade(scene.depth, kind), scene.camera).doubtful
         for kind in ("exact", "half-res", "shift 1px")
     )
-    assert exact == 0.0 < shifted and soft > 0.05  # where edges are in doubt, not how far they are off
+    assert exact == 0.0 < shifted and soft > 0.05
 
 
 def test_ranges_holes_and_shares_are_those_of_the_map() -> None:
@@ -98,7 +98,7 @@ def test_maps_of_any_size_are_inspected(size: tuple[int, int]) -> None:
         assert panel.shape == (1, 3, *size) and bool(panel.isfinite().all())
 
 
-def test_a_map_of_holes_alone_is_told() -> None:
+def test_a_map_without_any_depth_is_reported() -> None:
     report = inspect_depth(torch.rand(1, 3, 8, 8), torch.zeros(1, 1, 8, 8), Camera())
     assert report.holes == 64 and "holes 64 (100.0 %)" in str(report)
     assert all(bool(panel.isfinite().all()) for panel in panels(torch.rand(1, 3, 8, 8), report).values())

@@ -83,12 +83,12 @@ CROSS = torch.tensor([[[[1.0, INF, 1.0], [2.0, NAN, 3.0], [1.0, 1.0, 1.0]]]])
         (row(1.0, NAN, NAN, NAN, 4.0), "far", [1.0, 4.0, 4.0, 4.0, 4.0]),
         (row(1.0, NAN, NAN, NAN, 4.0), 9.0, [1.0, 9.0, 9.0, 9.0, 4.0]),
         (row(1.0, NAN, NAN, NAN, 4.0), INF, [1.0, INF, INF, INF, 4.0]),
-        (row(-5.0, NAN, -2.0), "far", [-5.0, -2.0, -2.0]),  # of a map of circles of confusion
-        (CROSS, "far", [1.0, INF, 1.0, 2.0, INF, 3.0, 1.0, 1.0, 1.0]),  # up and down, too
-        (CORNER, "far", [2.0] * 6),  # the nearest where a row and a column have none
+        (row(-5.0, NAN, -2.0), "far", [-5.0, -2.0, -2.0]),  # circles of confusion
+        (CROSS, "far", [1.0, INF, 1.0, 2.0, INF, 3.0, 1.0, 1.0, 1.0]),  # searches columns too
+        (CORNER, "far", [2.0] * 6),  # the nearest, where row and column have no depth
     ],
 )
-def test_holes_are_filled_as_asked(depth: torch.Tensor, fill: Any, expected: list[float]) -> None:
+def test_holes_are_filled_by_the_given_rule(depth: torch.Tensor, fill: Any, expected: list[float]) -> None:
     assert fill_holes(depth, fill).flatten().tolist() == expected
 
 
@@ -109,12 +109,9 @@ def test_nearest_is_as_near_as_the_nearest_of_all_pixels(height: int, width: int
 
 
 @pytest.mark.parametrize(
-    ("call", "says"),
+    ("call", "message"),
     [
-        (
-            lambda: depth_from_values(row(1.0), cast(Any, "metres")),
-            "must be one of z, distance, disparity, inverse, coc",
-        ),
+        (lambda: depth_from_values(row(1.0), cast(Any, "metres")), "must be one of z, distance, disparity, inverse"),
         (lambda: depth_from_values(row(1.0), "disparity"), "disparity needs a scale"),
         (lambda: depth_from_values(row(1.0), "distance"), "needs the horizontal field of view"),
         (lambda: depth_from_values(row(1.0), "distance", fov_x_deg=180.0), r"must be in \(0, 180\) degrees"),
@@ -129,12 +126,12 @@ def test_nearest_is_as_near_as_the_nearest_of_all_pixels(height: int, width: int
         (lambda: fill_holes(row(1.0, NAN), True), "fill"),
     ],
 )
-def test_what_makes_no_depth_is_refused(call: Any, says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_invalid_arguments_are_refused(call: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         call()
 
 
-def test_holes_are_counted_and_refused_unless_a_fill_is_asked_for(tmp_path: Path) -> None:
+def test_holes_are_refused_without_a_fill(tmp_path: Path) -> None:
     np.save(tmp_path / "d.npy", np.array([[1.0, 0.0], [np.nan, 2.0]]))
     with pytest.raises(ValueError, match=r"d\.npy: 2 pixels \(50\.0 %\) have no depth"):
         read_depth(tmp_path / "d.npy")

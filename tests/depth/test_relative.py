@@ -1,4 +1,4 @@
-"""Relative depth: extremes land on near and far, the law between them holds, points give scale and offset."""
+"""Relative depth to metres: between two distances, and from points of known distance."""
 
 import math
 from typing import Any
@@ -23,7 +23,7 @@ def row(*values: float) -> torch.Tensor:
     [("disparity", [8.0, 1 / (0.25 / 2 + 0.75 / 8), 2.0]), ("inverse", [8.0, 1 / (0.25 / 2 + 0.75 / 8), 2.0]),
      ("depth", [2.0, 3.5, 8.0])],
 )  # fmt: skip
-def test_extremes_lie_at_near_and_far_and_the_law_holds_between(kind: Any, expected: list[float]) -> None:
+def test_extremes_are_at_near_and_far_and_values_between_follow_the_formula(kind: Any, expected: list[float]) -> None:
     depth = from_relative(row(-3.0, -2.0, 1.0), 2.0, 8.0, kind)
     torch.testing.assert_close(depth, row(*expected))
 
@@ -39,14 +39,14 @@ def test_scale_and_shift_of_the_values_do_not_matter(kind: Any, factor: float) -
 @pytest.mark.parametrize(
     "dtype", [torch.uint8, torch.uint16, torch.int16, torch.int32, torch.int64, torch.uint32, torch.int8]
 )
-def test_whole_numbers_are_taken_as_they_come(dtype: torch.dtype) -> None:
+def test_integer_dtypes_give_the_depth_of_their_values(dtype: torch.dtype) -> None:
     values = torch.tensor([[[[0, 30, 127]]]])
     depth = from_relative(values.to(dtype), 1.0, 4.0)
     assert depth.dtype == torch.float32
     torch.testing.assert_close(depth, from_relative(values.double(), 1.0, 4.0).float())
 
 
-def test_large_whole_numbers_that_lie_close_together_are_told_apart() -> None:
+def test_neighbouring_large_integers_give_different_depths() -> None:
     values = torch.tensor([[[[2**30, 2**30 + 1, 2**30 + 2]]]], dtype=torch.int32)
     assert from_relative(values, 1.0, 3.0, "depth").flatten().tolist() == [1.0, 2.0, 3.0]
 
@@ -69,7 +69,7 @@ def test_each_item_of_a_batch_has_its_own_extremes() -> None:
     assert from_relative(values, 1.0, 2.0).flatten().tolist() == [2.0, 1.0, 2.0, 1.0]
 
 
-def test_a_stated_range_scales_all_frames_alike_and_bounds_them() -> None:
+def test_value_range_sets_the_scale_and_clamps_values() -> None:
     depth = from_relative(row(-5.0, 0.0, 50.0, 100.0, 120.0), 1.0, 3.0, "depth", value_range=(0.0, 100.0))
     assert depth.flatten().tolist() == [1.0, 1.0, 2.0, 3.0, 3.0]
     assert from_relative(row(50.0), 1.0, 3.0, "depth", value_range=(0.0, 100.0)).item() == 2.0
@@ -89,14 +89,14 @@ def test_gradients_are_those_of_the_formula(kind: Any) -> None:
     assert torch.autograd.gradcheck(lambda v: from_relative(v, 1.0, 5.0, kind), values)
 
 
-def test_it_compiles_whole() -> None:
+def test_from_relative_compiles_without_graph_breaks() -> None:
     values = torch.rand(1, 1, 3, 4)
     compiled = torch.compile(lambda v: from_relative(v, 1.0, 5.0), fullgraph=True, backend="eager")
     torch.testing.assert_close(compiled(values), from_relative(values, 1.0, 5.0))
 
 
 @pytest.mark.parametrize(
-    ("values", "arguments", "says"),
+    ("values", "arguments", "message"),
     [
         (row(1.0, 2.0), (5.0, 1.0), "near_m must be nearer than far_m, got near_m=5 and far_m=1"),
         (row(1.0, 2.0), (1.0, 1.0), "near_m must be nearer than far_m"),
@@ -106,7 +106,7 @@ def test_it_compiles_whole() -> None:
         (row(1.0, 2.0), (1.0, 2.0, "metric"), "must be one of disparity, inverse, depth, got 'metric'"),
         (row(3.0, 3.0), (1.0, 2.0), r"two different values .* one value everywhere; give value_range"),
         (row(3.0), (1.0, 2.0), "two different values"),
-        (row(NAN, INF), (1.0, 2.0), "two different values to tell near from far, got no value"),
+        (row(NAN, INF), (1.0, 2.0), "two different values to distinguish near from far, got no value"),
         (torch.ones(3, 4), (1.0, 2.0), r"must be \[B, 1, H, W\], got \[3, 4\]; add the missing dimensions"),
         (torch.ones(1, 3, 4, 4), (1.0, 2.0), r"must be \[B, 1, H, W\], got \[1, 3, 4, 4\]"),
         (np.ones((3, 4)), (1.0, 2.0), "got ndarray; convert an array with torch.from_numpy"),
@@ -114,13 +114,13 @@ def test_it_compiles_whole() -> None:
         (torch.ones(1, 1, 0, 4), (1.0, 2.0), "at least one pixel"),
     ],
 )
-def test_what_makes_no_depth_is_refused(values: Any, arguments: Any, says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_invalid_arguments_are_refused(values: Any, arguments: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         from_relative(values, *arguments)
 
 
 @pytest.mark.parametrize("value_range", [(1.0, 1.0), (2.0, 1.0), (0.0, NAN), (1.0,), "0,1"])
-def test_a_range_that_is_none_is_refused(value_range: Any) -> None:
+def test_an_invalid_value_range_is_refused(value_range: Any) -> None:
     with pytest.raises(ValueError, match="value_range"):
         from_relative(row(1.0, 2.0), 1.0, 2.0, value_range=value_range)
 
@@ -137,7 +137,7 @@ def test_two_points_give_scale_and_offset_exactly(kind: Any) -> None:
     assert scale.residual < 1e-5
 
 
-def test_of_many_points_near_ones_do_not_outweigh_far_ones() -> None:
+def test_near_points_do_not_outweigh_far_ones() -> None:
     generator = torch.Generator().manual_seed(3)
     values = torch.rand(1, 1, 40, 60, generator=generator)
     depth = 1 / (0.98 * values + 0.02)  # 1 to 50 m
@@ -157,7 +157,7 @@ def test_a_point_at_infinity_fixes_the_offset() -> None:
 
 
 @pytest.mark.parametrize(
-    ("points", "kind", "says"),
+    ("points", "kind", "message"),
     [
         ([(0.5, 0.5, 1.0)], "disparity", "at least two points of different values, got 1"),
         ([(0.5, 0.5, 1.0), (0.6, 0.5, 2.0)], "disparity", "at least two points of different values, got 2"),
@@ -169,6 +169,6 @@ def test_a_point_at_infinity_fixes_the_offset() -> None:
         ([(0.5, 0.5, 1.0), (2.5, 0.5, 4.0)], "z", "must be one of disparity, inverse, depth"),
     ],
 )
-def test_points_that_give_no_scale_are_refused(points: Any, kind: Any, says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_points_without_a_solution_are_refused(points: Any, kind: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         solve_scale(row(1.0, 2.0, 4.0), points, kind, patch=1)

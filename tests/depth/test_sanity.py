@@ -1,4 +1,4 @@
-"""Unit mistakes are said, with the likely cause and the option that mends it; sensible extremes pass in silence."""
+"""Warnings name unit mistakes and the option that corrects them; unusual but sensible input gives no warning."""
 
 import math
 import warnings
@@ -35,12 +35,12 @@ def object_before(depth: torch.Tensor, background_m: float) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("scene", list(read_scenes(SCENES)), ids=lambda scene: scene.name)
-def test_scenes_with_truth_raise_no_doubt(scene: object) -> None:
+def test_test_scenes_give_no_warning(scene: object) -> None:
     check(scene.depth, scene.camera, strict=True)  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("focus_m", [2.3, 3.1, 4.6])
-def test_the_demo_raises_no_doubt(metres: torch.Tensor, focus_m: float) -> None:
+def test_the_demo_gives_no_warning(metres: torch.Tensor, focus_m: float) -> None:
     check(metres, Camera.from_fov(40.8, 0.04, focus_m), strict=True)
     check(metres, Camera(focus_m=focus_m), strict=True)
 
@@ -67,7 +67,7 @@ def test_sensible_extremes_raise_no_doubt(depth: torch.Tensor, camera: Camera) -
 
 
 @pytest.mark.parametrize(
-    ("factor", "focus_m", "says"),
+    ("factor", "focus_m", "message"),
     [
         (1000.0, 3.0, r"nearer than all depth \(2110 to 5017 m\); is it millimetres \(--depth-scale 0.001\)"),
         (100.0, 3.0, r"is it centimetres \(--depth-scale 0.01\)"),
@@ -81,29 +81,29 @@ def test_sensible_extremes_raise_no_doubt(depth: torch.Tensor, camera: Camera) -
         (0.199, 3.0, r"relative depth from 0 to 1, --depth-kind relative --near-m METRES --far-m METRES"),
     ],
 )
-def test_unit_mistakes_are_named_with_what_mends_them(
-    metres: torch.Tensor, factor: float, focus_m: float, says: str
+def test_unit_mistakes_are_named_with_their_remedy(
+    metres: torch.Tensor, factor: float, focus_m: float, message: str
 ) -> None:
-    with pytest.warns(DepthWarning, match=says):
+    with pytest.warns(DepthWarning, match=message):
         check(metres * factor, Camera(focus_m=focus_m))
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises(ValueError, match=message):
         check(metres * factor, Camera(focus_m=focus_m), strict=True)
 
 
-def test_units_are_told_on_maps_so_small_that_nothing_is_blurred_by_a_pixel() -> None:
+def test_unit_mistakes_are_found_in_maps_too_small_for_a_blur_of_a_pixel() -> None:
     small = field(1.0, 6.0)[..., :48, :64]
-    for factor, says in ((1000.0, "millimetres"), (100.0, "centimetres"), (0.001, "1000 times too small")):
-        with pytest.warns(DepthWarning, match=says):
+    for factor, message in ((1000.0, "millimetres"), (100.0, "centimetres"), (0.001, "1000 times too small")):
+        with pytest.warns(DepthWarning, match=message):
             check(small * factor, Camera(focus_m=2.0))
     check(small, Camera(focus_m=2.0), strict=True)
 
 
-def test_whole_millimetres_are_told_whatever_the_focus(metres: torch.Tensor) -> None:
+def test_whole_millimetres_are_found_with_focus_at_infinity(metres: torch.Tensor) -> None:
     with pytest.warns(DepthWarning, match="millimetres"):
         check((metres * 1000).round(), Camera(focus_m=INF))
 
 
-def test_eight_bits_are_no_metres(metres: torch.Tensor) -> None:
+def test_relative_depth_of_8_bits_gives_a_warning(metres: torch.Tensor) -> None:
     relative = (255 * (1 / metres - 1 / metres.max()) / (1 / metres.min() - 1 / metres.max())).round().clamp(min=1)
     with pytest.warns(DepthWarning, match="files of 8 bits hold.*--depth-kind relative"):
         check(relative, Camera(focus_m=3.0))
@@ -111,13 +111,13 @@ def test_eight_bits_are_no_metres(metres: torch.Tensor) -> None:
         check(relative, Camera(focus_m=0.4))
 
 
-def test_disparity_without_its_scale_is_told(metres: torch.Tensor) -> None:
+def test_disparity_without_its_scale_gives_a_warning(metres: torch.Tensor) -> None:
     (mistake,) = depth_mistakes(metres / 192.03, Camera(focus_m=3.0), "inverse")
     assert "the baseline in metres times the focal length in pixels (--depth-scale, not given)" in mistake.message
     assert "--depth-kind relative" in mistake.message
 
 
-def test_a_scale_that_was_given_in_vain_is_to_be_left_out(metres: torch.Tensor) -> None:
+def test_the_advice_for_a_superfluous_scale_is_to_leave_it_out(metres: torch.Tensor) -> None:
     (mistake,) = depth_mistakes(metres / 1000, Camera(focus_m=3.0), "z", 0.001)
     assert "leave --depth-scale out" in mistake.message
 
@@ -125,30 +125,30 @@ def test_a_scale_that_was_given_in_vain_is_to_be_left_out(metres: torch.Tensor) 
 @pytest.mark.parametrize(
     ("depth", "camera"),
     [
-        (field(0.002, 0.005), Camera.from_fov(40.0, 0.01, 0.003)),  # all in millimetres but the opening
-        (field(2.0, 5.0), Camera.from_fov(40.0, 12.0, 3.0)),  # the opening alone
+        (field(0.002, 0.005), Camera.from_fov(40.0, 0.01, 0.003)),  # depth and focus scaled down, the opening not
+        (field(2.0, 5.0), Camera.from_fov(40.0, 12.0, 3.0)),  # the opening in millimetres
         (field(2.0, 5.0), Camera(50.0, 0.01, 3.0)),
         (field(2.0, 5.0), Camera(50.0, 1.8, 3.0, sensor_width_mm=0.036)),
     ],
 )
-def test_blur_that_no_lens_makes_is_told(depth: torch.Tensor, camera: Camera) -> None:
+def test_an_impossible_blur_gives_a_warning(depth: torch.Tensor, camera: Camera) -> None:
     sensor = f"on a sensor of {camera.sensor_width_mm:g} mm"
     with pytest.warns(DepthWarning, match=f"more than a lens makes.*{sensor}.*which is in another unit"):
         check(depth, camera)
 
 
-def test_a_focal_length_in_metres_is_told() -> None:
+def test_a_focal_length_in_metres_gives_a_warning() -> None:
     with pytest.warns(DepthWarning, match="focal length of 0.05 mm on a sensor of 36 mm .* take millimetres"):
         check(field(2.0, 5.0), Camera(0.05, 1.8, 3.0))
 
 
-def test_a_gap_of_depth_around_the_focus_is_told() -> None:
+def test_a_focus_in_a_gap_of_depth_gives_a_warning() -> None:
     depth = object_before(torch.full((1, 1, 120, 160), 1.0), 9.0)
     with pytest.warns(DepthWarning, match=r"no pixel lies near the focus at 3 m, all \(1 to 9 m\)"):
         check(depth, Camera(85.0, 1.4, 3.0))
 
 
-def test_of_a_batch_the_item_that_is_wrong_is_found(metres: torch.Tensor) -> None:
+def test_a_mistake_in_one_item_of_a_batch_is_found(metres: torch.Tensor) -> None:
     both = torch.cat([metres, metres * 1000])
     with pytest.warns(DepthWarning, match="millimetres"):
         check(both, Camera(focus_m=3.0))
@@ -161,13 +161,13 @@ def test_the_warning_can_be_filtered(metres: torch.Tensor) -> None:
         check(metres * 1000, Camera(focus_m=3.0))
 
 
-def test_depths_given_for_circles_of_confusion_are_told() -> None:
+def test_depths_in_place_of_circles_of_confusion_give_a_warning() -> None:
     assert coc_mistakes(torch.linspace(-30, 30, 96).expand(1, 1, 8, 96)) == []
     (mistake,) = coc_mistakes(torch.linspace(800, 5000, 96).expand(1, 1, 8, 96))
     assert "--depth-kind" in mistake.message
 
 
-def test_what_is_no_depth_is_refused() -> None:
+def test_a_tensor_that_is_not_a_depth_map_is_refused() -> None:
     with pytest.raises(ValueError, match=r"depth must be \[B, 1, H, W\] in metres, got \[8, 8\]"):
         check(torch.ones(8, 8), Camera())
     with pytest.raises(ValueError, match="floating-point"):

@@ -1,4 +1,4 @@
-"""Depth along time: flicker sinks, what moves does not smear, and parts of a shot come out as the whole."""
+"""Temporal filter of depth: less flicker, no smearing of moving objects, the same result for parts of a shot."""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,7 +19,7 @@ Shot = list[tuple[Tensor, Tensor]]
 
 
 def texture(seed: int, mean: tuple[float, float, float]) -> Callable[[Tensor, Tensor], Tensor]:
-    """An endless picture of light and dark spots of 4 to 40 pixels, at places x, y."""
+    """A function of places x, y that gives light with spots of 4 to 40 pixels."""
     generator = torch.Generator().manual_seed(seed)
     size, light = 400, torch.ones(1, 3, 400, 400)
     for spot, contrast in ((4, 0.4), (10, 0.6), (40, 0.6)):
@@ -38,14 +38,14 @@ WALL, BARS, BALL = texture(0, (0.4, 0.35, 0.3)), texture(1, (0.2, 0.5, 0.3)), te
 
 
 def shot(frames: int, pan_px: float = 0.0, ball_px: float = 0.0, cut: int = 10**6, toward: float = 0.0) -> Shot:
-    """Bars at 3 m before a slanted wall at 8 m, and a ball at 1.5 m: images and exact depths.
+    """Bars at 3 m in front of a slanted wall at 8 m, and a ball at 1.5 m: images and exact depths.
 
     Args:
-        frames: How many.
-        pan_px: Motion of wall and bars a frame.
-        ball_px: Motion of the ball a frame.
-        cut: Frame at which wall and bars change places.
-        toward: Share of their distance by which wall and bars come nearer in each frame.
+        frames: Number of frames.
+        pan_px: Motion of wall and bars for each frame.
+        ball_px: Motion of the ball for each frame.
+        cut: Frame at which wall and bars are exchanged.
+        toward: Share of its distance by which wall and bars approach in each frame.
     """
     made = []
     for t in range(frames):
@@ -67,7 +67,7 @@ def shot(frames: int, pan_px: float = 0.0, ball_px: float = 0.0, cut: int = 10**
 
 
 def as_estimated(depth: Tensor, frame: int, noise: float = 0.01, blocks: bool = False) -> Tensor:
-    """Depth with noise, its edges a pixel off: all by the same, or each block of 8 by its own."""
+    """Depth with noise, and edges displaced by up to a pixel: the whole frame at once, or each block of 8 x 8."""
     generator = torch.Generator().manual_seed(1000 + frame)
     size = (HEIGHT // 8, WIDTH // 8) if blocks else (1, 1)
     jitter = torch.randint(-1, 2, (1, 2, *size), generator=generator).float()
@@ -91,7 +91,7 @@ def steps(pictures: list[Tensor]) -> float:
 
 
 def flicker(pictures: list[Tensor], exact: list[Tensor]) -> float:
-    """RMS of the difference of neighbouring frames beyond that of exact depth."""
+    """RMS of the difference of neighbouring frames, minus that of exact depth (in squares)."""
     return max(steps(pictures) ** 2 - steps(exact) ** 2, 0.0) ** 0.5
 
 
@@ -107,14 +107,14 @@ def rendered(frames: Shot, depths: list[Tensor]) -> list[Tensor]:
     ]
 
 
-@pytest.mark.parametrize("blocks", [False, True], ids=["edges jitter alike", "edges jitter each on its own"])
-def test_flicker_of_24_frames_sinks_below_a_third(blocks: bool) -> None:
+@pytest.mark.parametrize("blocks", [False, True], ids=["the whole frame jitters", "each block jitters"])
+def test_flicker_of_24_frames_falls_below_a_third(blocks: bool) -> None:
     exact = shot(24)
     given = [(image, as_estimated(depth, t, blocks=blocks)) for t, (image, depth) in enumerate(exact)]
     truth = rendered(exact, [depth for _, depth in exact])
     before = flicker(rendered(given, [depth for _, depth in given]), truth)
     after = flicker(rendered(given, steadied(given)), truth)
-    print(f"flicker {before:.5f} -> {after:.5f}: {after / before:.3f} of what it was")
+    print(f"flicker {before:.5f} -> {after:.5f}: {after / before:.3f} remains")
     assert after < before / 3
 
 
@@ -128,7 +128,7 @@ def test_flicker_of_24_frames_sinks_below_a_third(blocks: bool) -> None:
         pytest.param({"toward": 0.01}, id="toward the camera"),
     ],
 )
-def test_what_moves_does_not_smear(motion: dict[str, Any]) -> None:
+def test_moving_objects_do_not_smear(motion: dict[str, Any]) -> None:
     exact = shot(12, **motion)
     depths = [depth for _, depth in exact]
     given = [(image, as_estimated(depth, t)) for t, (image, depth) in enumerate(exact)]
@@ -139,7 +139,7 @@ def test_what_moves_does_not_smear(motion: dict[str, Any]) -> None:
     assert of_exact < 0.25 * before
 
 
-def test_noise_sinks_where_the_camera_pans() -> None:
+def test_noise_falls_while_the_camera_pans() -> None:
     exact = shot(8, pan_px=2.4)
     given = [(i, z * (1 + 0.01 * torch.randn(z.shape, generator=torch.Generator().manual_seed(t))))
              for t, (i, z) in enumerate(exact)]  # fmt: skip
@@ -147,20 +147,20 @@ def test_noise_sinks_where_the_camera_pans() -> None:
     assert error(steadied(given), depths) < 0.75 * error([z for _, z in given], depths)
 
 
-def test_exact_depth_of_a_still_shot_comes_back() -> None:
+def test_exact_depth_of_a_still_shot_is_unchanged() -> None:
     frames = shot(4)
     for (_, depth), steady in zip(frames, steadied(frames), strict=True):
         torch.testing.assert_close(steady, depth)
 
 
-def test_a_cut_forgets_what_was_before() -> None:
+def test_a_cut_starts_anew() -> None:
     before, after = shot(5), shot(1, cut=0)[0]
     last = steadied([*before, after])[-1]
     other = (last / after[1] - 1).abs() > 0.02
     assert float(other.float().mean()) < 0.002
 
 
-def test_a_surface_that_comes_without_a_trace_in_the_image_passes() -> None:
+def test_an_area_of_new_depth_is_used_even_if_the_image_does_not_change() -> None:
     image, depth = torch.full((1, 3, HEIGHT, WIDTH), 0.2), torch.full((1, 1, HEIGHT, WIDTH), 4.0)
     moved = depth.clone()
     moved[..., 20:40, 30:60] = 1.0
@@ -174,7 +174,7 @@ def test_exposure_does_not_matter() -> None:
         assert float(((one / other - 1).abs() > 1e-3).float().mean()) < 1e-3
 
 
-def test_holes_take_what_was_there_and_infinity_stays() -> None:
+def test_holes_take_the_stored_depth_and_infinity_stays() -> None:
     image, depth = shot(1)[0]
     depth[..., :10] = torch.inf
     holed = depth.clone()
@@ -186,7 +186,7 @@ def test_holes_take_what_was_there_and_infinity_stays() -> None:
     torch.testing.assert_close(steady(image, holed), depth)
 
 
-def test_items_of_a_batch_do_not_know_each_other() -> None:
+def test_items_of_a_batch_are_independent() -> None:
     one, other = ([(i, as_estimated(z, t)) for t, (i, z) in enumerate(shot(4, pan_px=p))] for p in (0.0, 1.5))
     both = [(torch.cat([a[0], b[0]]), torch.cat([a[1], b[1]])) for a, b in zip(one, other, strict=True)]
     alone = steadied(other)
@@ -201,7 +201,7 @@ def test_dtype_of_depth_is_kept(dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 2), (33, 49)])
-def test_frames_of_any_size_and_of_another_than_before(size: tuple[int, int]) -> None:
+def test_a_frame_of_another_size_starts_anew(size: tuple[int, int]) -> None:
     steady = Steady()
     steady(torch.rand(1, 3, 20, 20), torch.ones(1, 1, 20, 20))
     for _ in range(3):
@@ -209,12 +209,12 @@ def test_frames_of_any_size_and_of_another_than_before(size: tuple[int, int]) ->
         torch.testing.assert_close(depth, torch.full((1, 1, *size), 2.0))
 
 
-def test_what_does_not_belong_together_is_refused() -> None:
+def test_image_and_depth_of_different_size_are_refused() -> None:
     with pytest.raises(ValueError, match=r"depth must be \[1, 1, 8, 8\]"):
         Steady()(torch.rand(1, 3, 8, 8), torch.ones(1, 1, 4, 4))
 
 
-def test_motion_of_a_pan_is_found_to_a_fraction_of_a_pixel() -> None:
+def test_motion_of_a_pan_is_found_with_subpixel_precision() -> None:
     (before, _), (now, _) = shot(2, pan_px=2.4)
     flow = motion_between(now, before, torch.ones_like(now[:, :1], dtype=torch.bool))
     assert flow[0, 0].median().item() == pytest.approx(2.4, abs=0.25)
@@ -222,7 +222,7 @@ def test_motion_of_a_pan_is_found_to_a_fraction_of_a_pixel() -> None:
 
 
 @pytest.mark.parametrize("parts", [[range(40, 60)], [range(0, 3), range(3, 50)], [[47], [48], [90], [12]]])
-def test_parts_of_a_shot_are_those_of_the_whole(parts: list[Any]) -> None:
+def test_parts_of_a_shot_equal_the_whole(parts: list[Any]) -> None:
     image = torch.rand(1, 3, 16, 20)
     depths = [2.0 + 0.02 * torch.rand(1, 1, 16, 20) for _ in range(100)]
     reads = []

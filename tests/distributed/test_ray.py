@@ -18,7 +18,7 @@ from torchdof.io.images import Picture, write_image
 
 ROOT = Path(__file__).parents[2]
 _RAY = importlib.util.find_spec("ray")
-HAS_RAY = _RAY is not None and _RAY.origin is not None  # a folder of that name beside the checkout has no origin
+HAS_RAY = _RAY is not None and _RAY.origin is not None  # a plain folder named "ray" has no origin
 NEEDS_RAY = pytest.mark.skipif(not HAS_RAY, reason="Ray is not installed: pip install 'torchdof[ray]'")
 
 
@@ -35,7 +35,7 @@ def photos(tmp_path: Path) -> Path:
 
 @NEEDS_RAY
 @pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="two workers need two cores")
-def test_killed_and_resumed_it_ends_with_the_same_shards(photos: Path) -> None:
+def test_a_killed_and_resumed_job_makes_the_same_shards(photos: Path) -> None:
     command = [sys.executable, str(ROOT / "examples" / "defocus_dataset.py"), "--workers", "2", "--per-shard", "2"]
     command += ["--images", str(photos / "images"), "--depths", str(photos / "depths"), "--out", str(photos / "out")]
     home = {**os.environ, "HOME": str(photos), "PYTHONPATH": str(ROOT), "RAY_DISABLE_IMPORT_WARNING": "1"}
@@ -47,17 +47,17 @@ def test_killed_and_resumed_it_ends_with_the_same_shards(photos: Path) -> None:
         time.sleep(0.02)
     os.killpg(first.pid, signal.SIGKILL)
     first.wait()
-    time.sleep(2)  # workers of the dead cluster end; what they still write is whole
+    time.sleep(2)  # workers of the dead cluster may still finish a shard
     done = {path.name: path.stat().st_mtime_ns for path in shards.glob("shard-*.tar")}
     assert 2 <= len(done) < 12
     cut = sorted(done)[0]
-    os.truncate(shards / cut, 1000)  # what a disk may do to a file
+    os.truncate(shards / cut, 1000)  # a damaged shard is made again
     del done[cut]
-    told = subprocess.run(command, env=home, capture_output=True, text=True, timeout=240, check=True).stdout
-    print(told)
-    assert f"{len(done)} of 12 shards are there already" in told
-    assert told.count(" is complete") == 12 - len(done)
-    assert "left out: " in told and "05.png" in told and "images/s" in told
+    output = subprocess.run(command, env=home, capture_output=True, text=True, timeout=240, check=True).stdout
+    print(output)
+    assert f"{len(done)} of 12 shards are there already" in output
+    assert output.count(" is complete") == 12 - len(done)
+    assert "left out: " in output and "05.png" in output and "images/s" in output
     assert all((shards / name).stat().st_mtime_ns == made for name, made in done.items())
     assert "| samples | 23 |" in (shards / "README.md").read_text()
     assert (shards / "broken.txt").read_text().count("05.png") >= 1
@@ -75,6 +75,6 @@ def test_killed_and_resumed_it_ends_with_the_same_shards(photos: Path) -> None:
 
 
 @pytest.mark.skipif(HAS_RAY, reason="Ray is installed")
-def test_without_ray_it_says_how_to_install_it(photos: Path) -> None:
+def test_without_ray_the_error_states_how_to_install_it(photos: Path) -> None:
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'torchdof\[ray\]'"):
         make_dataset(pairs_in(photos / "images", photos / "depths"), photos / "out")

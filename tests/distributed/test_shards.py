@@ -1,4 +1,4 @@
-"""Shards of a data set: what is in them, what is left out, and that they do not depend on who makes them when."""
+"""Shards of a data set: their contents, omitted inputs, and independence of the worker and of the time."""
 
 import io
 import json
@@ -39,7 +39,7 @@ def batch(rows: list[dict[str, Any]]) -> dict[str, np.ndarray]:
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
-def made(out: Path, rows: list[dict[str, Any]], **changes: Any) -> dict[str, np.ndarray]:
+def make_shards(out: Path, rows: list[dict[str, Any]], **changes: Any) -> dict[str, np.ndarray]:
     out.mkdir(exist_ok=True)
     return RenderShards(out, RandomDepthOfField(**BLUR), **changes)(batch(rows))
 
@@ -54,13 +54,13 @@ def picture(data: bytes, tmp_path: Path, suffix: str = ".png") -> Tensor:
     return read_image(tmp_path / f"read{suffix}").pixels
 
 
-def test_a_shard_holds_each_sample_with_its_parameters(pairs: list[Pair], tmp_path: Path) -> None:
-    told = made(tmp_path / "out", shard_rows(pairs, per_shard=5), picture=".exr")
+def test_a_shard_has_each_sample_with_its_parameters(pairs: list[Pair], tmp_path: Path) -> None:
+    report = make_shards(tmp_path / "out", shard_rows(pairs, per_shard=5), picture=".exr")
     files = members(tmp_path / "out" / "shard-000000.tar")
     assert {*files} == {
         f"{k:08d}.{name}" for k in range(5) for name in ("blurred.exr", "sharp.exr", "depth.npy", "json")
     }
-    assert told["error"].tolist() == [""] * 5
+    assert report["error"].tolist() == [""] * 5
     for k, pair in enumerate(pairs):
         key = f"{k:08d}"
         facts = json.loads(files[f"{key}.json"])
@@ -68,26 +68,28 @@ def test_a_shard_holds_each_sample_with_its_parameters(pairs: list[Pair], tmp_pa
         assert facts["image"] == pair.image and torch.equal(depth, torch.from_numpy(np.load(str(pair.depth))).float())
         camera = Camera(facts["focal_length_mm"], facts["f_number"], facts["focus_m"], facts["sensor_width_mm"])
         sharp = read_image(pair.image).pixels
-        right = depth_of_field(sharp, depth[None, None], camera, tolerance=facts["tolerance"], check=False)
+        expected = depth_of_field(sharp, depth[None, None], camera, tolerance=facts["tolerance"], check=False)
         torch.testing.assert_close(
-            picture(files[f"{key}.blurred.exr"], tmp_path, ".exr"), right.half().float(), rtol=2e-3, atol=1e-6
+            picture(files[f"{key}.blurred.exr"], tmp_path, ".exr"), expected.half().float(), rtol=2e-3, atol=1e-6
         )
     assert len({json.loads(files[f"{k:08d}.json"])["focus_m"] for k in range(5)}) == 5
 
 
-def test_what_is_in_a_shard_depends_on_its_row_and_the_seed_alone(pairs: list[Pair], tmp_path: Path) -> None:
+def test_a_shard_depends_only_on_its_row_and_the_seed(pairs: list[Pair], tmp_path: Path) -> None:
     rows = shard_rows(pairs, per_shard=2, copies=5)
     assert len(rows) == 13
-    made(tmp_path / "alone", rows)
-    made(tmp_path / "other", rows, seed=1)
+    make_shards(tmp_path / "alone", rows)
+    make_shards(tmp_path / "other", rows, seed=1)
     (tmp_path / "threads").mkdir()
     render = RenderShards(tmp_path / "threads", RandomDepthOfField(**BLUR))
     torch.manual_seed(99)
     before, interval = torch.get_rng_state(), sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)  # as often in each other's way as can be
+    sys.setswitchinterval(1e-6)  # threads switch as often as possible, to show any shared state
     try:
         with ThreadPoolExecutor(8) as pool:
-            assert all((told["error"] == "").all() for told in pool.map(lambda row: render(batch([row])), rows[::-1]))
+            assert all(
+                (report["error"] == "").all() for report in pool.map(lambda row: render(batch([row])), rows[::-1])
+            )
     finally:
         sys.setswitchinterval(interval)
     assert torch.equal(torch.get_rng_state(), before)
@@ -97,7 +99,7 @@ def test_what_is_in_a_shard_depends_on_its_row_and_the_seed_alone(pairs: list[Pa
     assert len({json.loads(facts)["focus_m"] for facts in drawn}) == 2
 
 
-def test_broken_inputs_are_left_out_and_listed(
+def test_broken_inputs_are_omitted_and_listed(
     pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Path(pairs[1].image).write_bytes(b"no picture")
@@ -107,13 +109,13 @@ def test_broken_inputs_are_left_out_and_listed(
         if torch.equal(image, read_image(pairs[4].image).pixels):
             torch.empty(2**50)  # torch's allocator raises RuntimeError
         if torch.equal(image, read_image(pairs[2].image).pixels):
-            raise MemoryError  # as numpy and the compiled engine do
+            raise MemoryError  # numpy and the compiled engine raise this
         return depth_of_field(image, *arguments, **options)
 
     monkeypatch.setattr(torchdof.distributed.shards, "depth_of_field", allocate)
-    told = made(tmp_path / "out", shard_rows(pairs, per_shard=5), depth={"unknown": 0.0})
+    report = make_shards(tmp_path / "out", shard_rows(pairs, per_shard=5), depth={"unknown": 0.0})
     for k, error in {1: "cannot be read", 2: "MemoryError", 3: "have no depth", 4: "allocate"}.items():
-        assert error in told["error"][k]
+        assert error in report["error"][k]
     names = {name.split(".")[0] for name in members(tmp_path / "out" / "shard-000000.tar")}
     assert names == {"00000000"}
     summary = summary_of(tmp_path / "out")
@@ -121,13 +123,13 @@ def test_broken_inputs_are_left_out_and_listed(
     assert [image for image, _ in summary.broken] == [pairs[k].image for k in (1, 2, 3, 4)]
 
 
-def test_names_that_are_no_utf_8_are_told_by_their_bytes(pairs: list[Pair], tmp_path: Path) -> None:
+def test_names_that_are_not_utf_8_are_listed_with_escaped_bytes(pairs: list[Pair], tmp_path: Path) -> None:
     folder = tmp_path / os.fsdecode(b"caf\xe9")
     (tmp_path / "images").rename(folder)
     (folder / "1.png").write_bytes(b"no picture")
-    told = made(tmp_path / "out", shard_rows(pairs_in(folder, tmp_path / "depths")))
-    assert told["image"][0] == f"{tmp_path}/caf\\xe9/0.png"
-    assert [error == "" for error in told["error"]] == [True, False, True, True, True] and told["error"][1].encode()
+    report = make_shards(tmp_path / "out", shard_rows(pairs_in(folder, tmp_path / "depths")))
+    assert report["image"][0] == f"{tmp_path}/caf\\xe9/0.png"
+    assert [error == "" for error in report["error"]] == [True, False, True, True, True] and report["error"][1].encode()
     assert summary_of(tmp_path / "out").broken[0][0].endswith("caf\\xe9/1.png")
 
 
@@ -146,18 +148,18 @@ def test_a_damaged_shard_is_made_again_and_a_complete_one_is_not(
     damage: Callable[[Path], object], suffix: str, pairs: list[Pair], tmp_path: Path
 ) -> None:
     out, rows = tmp_path / "out", shard_rows(pairs, per_shard=3)
-    first = made(out, rows)
+    first = make_shards(out, rows)
     whole, times = sorted(out.glob("*.tar"))[0], [path.stat().st_mtime_ns for path in sorted(out.iterdir())]
     before = whole.read_bytes()
     damage(whole.with_suffix(suffix))
     assert (summary_of(out).shards, summary_of(out).samples) == (1, 2)
-    again = made(out, rows)
+    again = make_shards(out, rows)
     assert again["key"].tolist() == first["key"].tolist() and again["shard"].tolist() == [0, 0, 0, 1, 1]
     assert again["error"].tolist() == [""] * 5 and whole.read_bytes() == before and summary_of(out).samples == 5
     assert [path.stat().st_mtime_ns for path in sorted(out.iterdir())][2:] == times[2:]
 
 
-def test_a_shard_is_written_whole_or_not_at_all(
+def test_a_shard_is_written_completely_or_not_at_all(
     pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stopped(path: Path, records: Any) -> None:
@@ -166,27 +168,27 @@ def test_a_shard_is_written_whole_or_not_at_all(
 
     monkeypatch.setattr(torchdof.distributed.shards, "_write_tar", stopped)
     with pytest.raises(KeyboardInterrupt):
-        made(tmp_path / "out", shard_rows(pairs))
+        make_shards(tmp_path / "out", shard_rows(pairs))
     assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_cameras_may_be_given(pairs: list[Pair], tmp_path: Path) -> None:
     given = [Pair(pairs[0].image, pairs[0].depth, focus_m=1.25, f_number=2.0), Pair(pairs[1].image, pairs[1].depth)]
-    made(tmp_path / "out", shard_rows(given), keep=["blurred"])
+    make_shards(tmp_path / "out", shard_rows(given), keep=["blurred"])
     files = members(tmp_path / "out" / "shard-000000.tar")
     first, second = (json.loads(files[f"0000000{k}.json"]) for k in range(2))
     assert (first["focus_m"], first["f_number"]) == (1.25, 2.0) and second["focus_m"] != 1.25
     assert [*files][:2] == ["00000000.blurred.png", "00000000.json"]
 
 
-def test_depth_without_a_scale_lies_between_two_distances(pairs: list[Pair], tmp_path: Path) -> None:
-    made(tmp_path / "out", shard_rows(pairs), depth={"kind": "relative", "near_m": 1.0, "far_m": 8.0})
+def test_relative_depth_is_scaled_between_near_m_and_far_m(pairs: list[Pair], tmp_path: Path) -> None:
+    make_shards(tmp_path / "out", shard_rows(pairs), depth={"kind": "relative", "near_m": 1.0, "far_m": 8.0})
     depth = np.load(io.BytesIO(members(tmp_path / "out" / "shard-000000.tar")["00000000.depth.npy"]))
     values = torch.from_numpy(np.load(str(pairs[0].depth)))[None, None].float()
     np.testing.assert_allclose(depth, from_relative(values, 1.0, 8.0)[0, 0].numpy(), rtol=1e-5)
 
 
-def test_a_lens_is_drawn_and_named(pairs: list[Pair], tmp_path: Path) -> None:
+def test_a_lens_is_chosen_at_random_and_named(pairs: list[Pair], tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     blur = RandomDepthOfField(**{**BLUR, "table": [BlurTable.disc(), BlurTable.gaussian()]})
     RenderShards(tmp_path / "out", blur)(batch(shard_rows(pairs, copies=3)))
@@ -194,11 +196,11 @@ def test_a_lens_is_drawn_and_named(pairs: list[Pair], tmp_path: Path) -> None:
     assert {json.loads(data)["table"] for name, data in files.items() if name.endswith("json")} == {"disc", "gaussian"}
 
 
-def test_parquet_holds_the_same(pairs: list[Pair], tmp_path: Path) -> None:
+def test_parquet_has_the_same_data(pairs: list[Pair], tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
     rows = shard_rows(pairs)
-    made(tmp_path / "tar", rows)
-    made(tmp_path / "parquet", rows, format="parquet")
+    make_shards(tmp_path / "tar", rows)
+    make_shards(tmp_path / "parquet", rows, format="parquet")
     files = members(tmp_path / "tar" / "shard-000000.tar")
     for row in parquet.read_table(tmp_path / "parquet" / "shard-000000.parquet").to_pylist():
         key = row.pop("key")
@@ -207,10 +209,10 @@ def test_parquet_holds_the_same(pairs: list[Pair], tmp_path: Path) -> None:
         assert row == json.loads(files[f"{key}.json"])
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # it leaves its files to be closed
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # webdataset does not close its files
 def test_webdataset_reads_the_shards(pairs: list[Pair], tmp_path: Path) -> None:
     webdataset = pytest.importorskip("webdataset", reason="webdataset is not installed")
-    made(tmp_path / "out", shard_rows(pairs, per_shard=5))
+    make_shards(tmp_path / "out", shard_rows(pairs, per_shard=5))
     read = list(
         webdataset.WebDataset(str(tmp_path / "out" / "shard-000000.tar"), shardshuffle=False).decode("torchrgb")
     )
@@ -238,14 +240,14 @@ def test_webdataset_reads_the_shards(pairs: list[Pair], tmp_path: Path) -> None:
         (lambda f: shard_rows([]), ValueError, "pairs must be at least one"),
     ],
 )
-def test_wrong_arguments_are_refused_by_name(
+def test_errors_name_the_argument(
     call: Callable[[Path], object], error: type[Exception], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(error, match=message):
         call(tmp_path)
 
 
-def test_a_format_whose_package_is_missing_is_refused_before_anything_is_rendered(
+def test_a_missing_package_of_a_format_is_reported_before_rendering(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)

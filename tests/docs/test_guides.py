@@ -1,4 +1,4 @@
-"""What the documentation tells to type works: blocks of code are run, options and links exist, pictures are true."""
+"""The documentation is true: its code runs, its options, links and files exist, its pictures match their scripts."""
 
 import importlib.metadata
 import re
@@ -29,13 +29,13 @@ RUN = [ROOT / "README.md", ROOT / "docs" / "speed.md", *sorted((ROOT / "docs" / 
 RUN += [
     ROOT / "docs" / f"{name}.md" for name in ("index", "datasets", "depth", "embedding", "measuring", "phone", "shapes")
 ]
-"""Pages whose blocks are run from top to bottom, but for those below a comment that says why not."""
+"""Pages whose blocks are run from top to bottom; a comment ``<!-- not run: why -->`` excludes a block."""
 
 _BLOCK = re.compile(r"(?P<skip><!-- not run: [^\n]+ -->\n)?^```(?P<kind>sh|python)\n(?P<text>.*?)^```$", re.M | re.S)
 _COMMAND = re.compile(r"(?:^|`)\s*((?:python -m )?torchdof (?:[a-z]+)(?: [^`\n\\]*(?:\\\n[^`\n\\]*)*)?)", re.M)
 _LINK = re.compile(r"""\]\((?P<link>[^)\s]+)\)|src="(?P<source>[^"]+)\"""")
 _PATH = re.compile(r"(?:`| )((?:examples|tests|docs|fit|export|torchdof|optics|render|depth)/[a-z_/]+(?:\.[a-z]+|/))")
-_ALIKE_DB = 40.0  # of a JPEG with what it was made from, and then some
+_ALIKE_DB = 40.0  # PSNR between a stored JPEG and a newly drawn picture; JPEG compression alone costs less
 
 
 def _names(pages: list[Path]) -> list[str]:
@@ -49,7 +49,7 @@ def commands_of(text: str) -> list[list[str]]:
 
 
 def run_command(words: list[str]) -> None:
-    """Runs torchdof; of what would install or test things, asks whether it is there."""
+    """Runs a torchdof command; of ``make`` it checks only that the targets exist."""
     if words[0] == "torchdof":
         result = CliRunner().invoke(app, words[1:], catch_exceptions=False)
         assert result.exit_code == 0, result.output
@@ -61,7 +61,7 @@ def run_command(words: list[str]) -> None:
 
 
 def given(folder: Path) -> dict[str, Any]:
-    """What pages speak of as the reader's own: names of Python, and files in a folder."""
+    """The Python names that the pages use without defining them; writes the reader's own files into a folder."""
     image = torch.rand(1, 3, 480, 640, generator=torch.Generator().manual_seed(0))
     x, y = torch.meshgrid(torch.arange(640.0), torch.arange(480.0), indexing="xy")
     values = (0.65 - 0.0012 * x + 0.00083 * y).clamp_min(0.1)[None, None]  # a plane, about as far as the pages say
@@ -81,28 +81,30 @@ def given(folder: Path) -> dict[str, Any]:
 
 
 def captures_of_measuring(folder: Path, simulator: ModuleType) -> None:
-    """The photographs that the manifest of docs/measuring.md names, by the camera that it states."""
+    """Writes the photographs named in the manifest of docs/measuring.md, simulated with the camera stated there."""
     text = _text_block("measuring.md", "toml")
-    said = tomllib.loads(text)
-    camera = torchdof.Camera(*(said[name] for name in ("focal_length_mm", "f_number", "focus_m", "sensor_width_mm")))
+    manifest = tomllib.loads(text)
+    numbers = ("focal_length_mm", "f_number", "focus_m", "sensor_width_mm")
+    camera = torchdof.Camera(*(manifest[name] for name in numbers))
     width, lens = 640, folder / "my-lens"
 
     def kernel(distance_m: float) -> tuple[str, dict[str, float]]:
         return "disc", {"radius": float(camera.coc_px(torch.full((1, 1, 1, 1), distance_m), width).abs())}
 
     dot = simulator.Simulator(level=0.7, snr_db=46, dot_radius=9.0, black=0.02)
+    shots = manifest["shot"]
     simulator.write_captures(
-        lens, dot, said["focus_m"], [shot["distance_m"] for shot in said["shot"]], kernel, width, height=240
+        lens, dot, manifest["focus_m"], [shot["distance_m"] for shot in shots], kernel, width, height=240
     )
     for path in lens.glob("*.png"):
-        write_image(path.with_suffix(".tif"), Picture(read_image(path).pixels), said["transfer"], "16")
+        write_image(path.with_suffix(".tif"), Picture(read_image(path).pixels), manifest["transfer"], "16")
         path.unlink()
-    assert {path.name for path in lens.glob("*.tif")} == {said["sharp"], *(shot["file"] for shot in said["shot"])}
+    assert {path.name for path in lens.glob("*.tif")} == {manifest["sharp"], *(shot["file"] for shot in shots)}
     (lens / "capture.toml").write_text(text)
 
 
 def photographs_of_a_phone(folder: Path, simulator: ModuleType) -> None:
-    """Two of the target, one of them in focus."""
+    """Writes two photographs of the target, one of them in focus."""
     simulator.write_photographs(folder / "photographs", 0.2, [0.45], width=500, tone=0.0, noise=0.003, jpeg=97)
 
 
@@ -152,7 +154,7 @@ def test_the_prescription_that_measuring_shows_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", _names(PAGES))
-def test_commands_that_a_page_mentions_have_the_options_it_gives_them(name: str) -> None:
+def test_commands_of_a_page_use_existing_options(name: str) -> None:
     commands = {command: app.get_command(click.Context(app), command) for command in main.COMMANDS}
     parsed = {name: command for name, command in commands.items() if command is not None}
     for match in _COMMAND.finditer((ROOT / name).read_text()):
@@ -164,7 +166,7 @@ def test_commands_that_a_page_mentions_have_the_options_it_gives_them(name: str)
 
 
 @pytest.mark.parametrize("name", _names([*PAGES, ROOT / "CHANGELOG.md"]))
-def test_links_to_files_lead_somewhere(name: str) -> None:
+def test_links_to_files_exist(name: str) -> None:
     for match in _LINK.finditer((ROOT / name).read_text()):
         link = (match["link"] or match["source"]).partition("#")[0]
         if link and not link.startswith(("http:", "https:")):
@@ -172,7 +174,7 @@ def test_links_to_files_lead_somewhere(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", _names(PAGES))
-def test_files_that_a_page_names_are_there(name: str) -> None:
+def test_files_named_by_a_page_exist(name: str) -> None:
     for path in _PATH.findall((ROOT / name).read_text()):
         assert (ROOT / path).exists() or (ROOT / "torchdof" / path).exists(), path
 
@@ -185,9 +187,9 @@ def test_readme_is_short_and_names_extras_that_exist() -> None:
     assert named and named <= set(extras)
 
 
-def test_rooms_that_contributing_names_exist() -> None:
-    rooms = (ROOT / "CONTRIBUTING.md").read_text().partition("## Rooms")[2].partition("\n## ")[0]
-    paths = re.findall(r"`([a-z/_]+(?:/|\.py))`", rooms)
+def test_folders_that_contributing_lists_exist() -> None:
+    listed = (ROOT / "CONTRIBUTING.md").read_text().partition("## Folders")[2].partition("\n## ")[0]
+    paths = re.findall(r"`([a-z/_]+(?:/|\.py))`", listed)
     assert paths
     for path in paths:
         assert (
@@ -211,7 +213,7 @@ def test_every_picture_of_the_documentation_has_a_script() -> None:
     "name",
     [pytest.param(n, marks=[] if n in _QUICK else pytest.mark.sweep) for n in _GALLERY if n.endswith(".jpg")],
 )
-def test_a_picture_of_the_documentation_is_what_its_script_draws(name: str, tmp_path: Path) -> None:
+def test_a_picture_of_the_documentation_matches_its_script(name: str, tmp_path: Path) -> None:
     _GALLERY[name](tmp_path / name)
     drawn, shown = (display(read_image(folder / name).pixels) for folder in (tmp_path, ROOT / "docs" / "pictures"))
     assert psnr(drawn, shown) > _ALIKE_DB

@@ -1,4 +1,4 @@
-// What the modules of examples/embed/javascript make of small inputs: node modules.mjs FOLDER, results as JSON.
+// Runs the modules of examples/embed/javascript on small inputs: node modules.mjs FOLDER prints the results as JSON.
 import { readFileSync } from 'node:fs'
 import { join, resolve } from 'node:path'
 import { pathToFileURL } from 'node:url'

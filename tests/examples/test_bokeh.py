@@ -1,4 +1,4 @@
-"""The example that shows night lights through six lenses, run as a user runs it."""
+"""``examples/bokeh.py``: night lights through six lenses."""
 
 import subprocess
 import sys

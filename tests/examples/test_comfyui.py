@@ -1,4 +1,4 @@
-"""The node for ComfyUI: loaded as ComfyUI loads it, checked by its rules, and run by them."""
+"""The node for ComfyUI, loaded, checked and run in ComfyUI's way, without ComfyUI."""
 
 import importlib.util
 import inspect
@@ -38,7 +38,7 @@ def node(package: ModuleType) -> Any:
 
 
 def defaults(node: Any) -> dict[str, Any]:
-    """What the page fills in: the first of a list, else the default."""
+    """The values that ComfyUI's page starts with: the first of a list, or the input's default."""
     given = {}
     for name, (kind, *extra) in node.INPUT_TYPES()["required"].items():
         if isinstance(kind, list):
@@ -68,7 +68,7 @@ def test_the_folder_is_a_custom_node(package: ModuleType, node: Any) -> None:
     assert (FOLDER / "requirements.txt").read_text().split() == ["torchdof"]
 
 
-def test_inputs_are_as_comfyui_checks_them(node: Any) -> None:
+def test_inputs_follow_comfyuis_rules(node: Any) -> None:
     inputs = node.INPUT_TYPES()
     assert set(inputs) <= {"required", "optional", "hidden"}
     for kind, *extra in inputs["required"].values():
@@ -82,7 +82,7 @@ def test_inputs_are_as_comfyui_checks_them(node: Any) -> None:
     assert arguments == ["self", *inputs["required"]]
 
 
-def test_it_renders_what_torchdof_renders(node: Any) -> None:
+def test_it_renders_the_same_picture_as_torchdof(node: Any) -> None:
     image, depth = scene()
     out, _ = render(node, image, depth, focus="metres", focus_m=1.5, sensor_width_mm=4.0)
     light = decode(image.movedim(-1, 1), "srgb", False, False)
@@ -93,7 +93,7 @@ def test_it_renders_what_torchdof_renders(node: Any) -> None:
     torch.testing.assert_close(out, expected.movedim(1, -1), rtol=1e-5, atol=1e-5)
 
 
-def test_focus_is_where_the_point_is(node: Any) -> None:
+def test_the_point_of_focus_is_sharp(node: Any) -> None:
     image, depth = torch.rand(1, 18, 24, 3), torch.full((1, 18, 24, 3), 2.0)
     depth[:, :, 12:] = 5.0
     changes = {"depth_kind": "metres", "focus": "point", "focus_y": 1.0, "sensor_width_mm": 4.0}
@@ -113,7 +113,7 @@ def test_white_is_near_or_far(node: Any) -> None:
 
 
 @pytest.mark.parametrize("lens", ["gaussian", "sato_j15"])
-def test_every_lens_of_the_list_can_be_had(node: Any, lens: str) -> None:
+def test_every_lens_of_the_list_can_be_loaded(node: Any, lens: str) -> None:
     lenses = node.INPUT_TYPES()["required"]["lens"][0]
     assert lens in lenses
     for name in lenses[2:]:
@@ -136,7 +136,7 @@ def test_points_out_of_focus_have_the_shape(node: Any) -> None:
     assert float((spots["blades"] - spots["blades"].flip(0)).abs().max()) > 0.03
 
 
-def test_a_small_depth_one_depth_and_alpha_are_taken(node: Any) -> None:
+def test_a_smaller_depth_map_a_shared_one_and_alpha_are_accepted(node: Any) -> None:
     image = torch.rand(2, 18, 24, 4)
     out, focus = render(node, image, torch.rand(1, 9, 12, 3), sensor_width_mm=4.0)
     assert out.shape == (2, 18, 24, 4) and focus.shape == (2, 18, 24, 3)

@@ -1,4 +1,4 @@
-"""The demo's pictures, of stereo depth: how many pixels stick out of what is blurred."""
+"""``examples/demo.py`` on stereo depth: how many pixels of blurred regions differ from their surroundings."""
 
 import json
 import math
@@ -16,11 +16,11 @@ from torchdof.reference.metrics import display
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT / "examples" / "data" / "motorcycle"
-MOST = {"near": 680, "middle": 1070, "far": 390}
-"""Pixels that may differ from the median of their 3 x 3 by more than 8/255 where the blur is wider than 2 px."""
+MAX_OUTLIERS = {"near": 680, "middle": 1070, "far": 390}
+"""Largest number of pixels with a blur radius above 2 px that differ from the median of their 3 x 3 by over 8/255."""
 
 
-def test_few_pixels_stick_out_of_what_is_blurred(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_few_pixels_differ_from_their_blurred_surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["demo.py", "--data", str(DATA), "--out", str(tmp_path)])
     demo = runpy.run_path(str(ROOT / "examples" / "demo.py"), run_name="__main__")
     known = json.loads((DATA / "camera.json").read_text())
@@ -33,4 +33,4 @@ def test_few_pixels_stick_out_of_what_is_blurred(tmp_path: Path, monkeypatch: py
         median = around.median(1).values.view_as(shown)
         coc_px = Camera.from_fov(fov_x_deg, demo["APERTURE_RADIUS_M"], focus_m).coc_px(depth, width)
         outliers = int((((shown - median).abs() > 8 / 255) & (coc_px.abs() > 2)).sum())
-        assert outliers <= MOST[name], f"{name}: {outliers}"
+        assert outliers <= MAX_OUTLIERS[name], f"{name}: {outliers}"

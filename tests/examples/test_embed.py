@@ -1,4 +1,4 @@
-"""The samples of `examples/embed` give the pixels of the file that they run."""
+"""The samples of ``examples/embed`` give the pixels that onnxruntime in Python gives for the same file."""
 
 import importlib.util
 import json
@@ -26,7 +26,7 @@ DISPARITY = json.loads((DATA / "camera.json").read_text())["depth"]
 
 
 def header_folder() -> Path | None:
-    """Where onnxruntime's C++ API is: the PyPI and npm packages bring the library only."""
+    """The folder with onnxruntime's C++ headers, which the PyPI and npm packages do not include."""
     folders = [Path(os.environ["TORCHDOF_ONNXRUNTIME"], "include")] if "TORCHDOF_ONNXRUNTIME" in os.environ else []
     folders += [Path(root, "include", "onnxruntime") for root in ("/usr", "/usr/local")]
     return next((folder for folder in folders if (folder / "onnxruntime_cxx_api.h").is_file()), None)
@@ -62,12 +62,12 @@ def linear(encoded: np.ndarray) -> np.ndarray:
 
 
 def area_means(old: int, new: int) -> np.ndarray:
-    """``[new, old]``: the share of each old pixel in the mean of a new one."""
+    """``[new, old]``: weight of each old pixel in the mean that is a new pixel."""
     return np.kron(np.eye(new), np.ones(old)).reshape(new, old, new).sum(2) / old
 
 
 def rendered(exported: Any, light: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
-    """What the file makes of ``[H, W, 3]`` light and ``[H, W, 1]`` metres in Python's onnxruntime."""
+    """The file's output for ``[H, W, 3]`` light and ``[H, W, 1]`` metres, by onnxruntime in Python."""
     image, depth = (torch.tensor(x.transpose(2, 0, 1)[None], dtype=torch.float32) for x in (light, depth_m))
     out = exported.render(image, depth, torch.tensor([FOCUS_M]), torch.tensor([F_NUMBER]))
     return out[0].numpy().transpose(1, 2, 0)
@@ -82,11 +82,11 @@ def test_python_needs_no_torch(plain: Any, tmp_path: Path) -> None:
     call = [sys.executable, str(EMBED / "run_onnx.py"), str(plain.path)]
     call += [str(DATA / "motorcycle_left.png"), str(DATA / "motorcycle_disp.npz"), str(tmp_path / "out.png")]
     call += ["--focus-m", str(FOCUS_M), "--f-number", str(F_NUMBER)]
-    told = run(
+    output = run(
         [*call, "--disparity-scale", str(DISPARITY["scale"]), "--disparity-offset", str(DISPARITY["offset"])],
         environment,
     )
-    assert "741 x 500" in told and "'disc'" in told
+    assert "741 x 500" in output and "'disc'" in output
     sharp, blurred = (pixels(path)[..., :3] for path in (DATA / "motorcycle_left.png", tmp_path / "out.png"))
     assert sharp.shape == blurred.shape
     assert 0.002 < np.abs(sharp - blurred).mean() < 0.2
@@ -153,9 +153,7 @@ def test_cpp_gives_the_pixels_of_the_file(plain: Any, tmp_path: Path) -> None:
     spec = importlib.util.find_spec("onnxruntime")
     assert spec is not None and spec.origin is not None
     (library,) = Path(spec.origin).parent.glob("capi/libonnxruntime.so.*")
-    release = (
-        tmp_path / "onnxruntime"
-    )  # as a release is laid out, of the headers that are here and the library from PyPI
+    release = tmp_path / "onnxruntime"  # the folders of a release: headers of this machine, library from PyPI
     (release / "lib").mkdir(parents=True)
     (release / "include").symlink_to(str(header_folder()))
     for name in ("libonnxruntime.so", "libonnxruntime.so.1"):

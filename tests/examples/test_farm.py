@@ -1,4 +1,4 @@
-"""The templates for render farms: they call options that there are, and their own validators take them."""
+"""The templates for render farms: their options exist, and the farms' own validators accept them."""
 
 import importlib.util
 import os
@@ -26,7 +26,7 @@ def options_of_render() -> set[str]:
     return {option for parameter in command_of("render", Render).params for option in parameter.opts}
 
 
-def test_the_openjd_template_calls_options_that_there_are() -> None:
+def test_the_openjd_template_uses_existing_options() -> None:
     text = (FARM / "openjd.yaml").read_text()
     called = set(re.findall(r"^ +- (--[a-z-]+)$", text, flags=re.MULTILINE))
     assert {"--frames", "--resume", "--out", "--focus-m"} <= called <= options_of_render()
@@ -35,24 +35,24 @@ def test_the_openjd_template_calls_options_that_there_are() -> None:
 
 
 @installed("openjd")
-def test_openjd_takes_its_template() -> None:
+def test_openjd_accepts_its_template() -> None:
     tool = str(Path(sys.executable).with_name("openjd"))
     template = str(FARM / "openjd.yaml")
-    told = subprocess.run([tool, "check", template], capture_output=True, text=True, check=True).stdout
-    assert "passes validation checks" in told
+    output = subprocess.run([tool, "check", template], capture_output=True, text=True, check=True).stdout
+    assert "passes validation checks" in output
     parameters = [word for value in SHOT for word in ("-p", value)]
-    told = subprocess.run([tool, "summary", template, *parameters], capture_output=True, text=True, check=True).stdout
-    assert "Total tasks: 48" in told
+    output = subprocess.run([tool, "summary", template, *parameters], capture_output=True, text=True, check=True).stdout
+    assert "Total tasks: 48" in output
 
 
 @installed("outline", "opencue")
-def test_opencue_takes_its_job(tmp_path: Path) -> None:
+def test_opencue_accepts_its_job(tmp_path: Path) -> None:
     command = [sys.executable, str(FARM / "cue_job.py"), "--image", "/s/b.####.exr", "--out", "/s/o.####.exr"]
     command += ["--frames", "1-48", "--chunk", "5", "--print", "--", "--focus-m", "2"]
-    told = subprocess.run(
+    output = subprocess.run(
         command, capture_output=True, text=True, check=True, env={**os.environ, "HOME": str(tmp_path)}
     ).stdout
-    layer = ElementTree.fromstring(told[told.index("<spec>") :]).find("./job/layers/layer")
+    layer = ElementTree.fromstring(output[output.index("<spec>") :]).find("./job/layers/layer")
     assert layer is not None
     assert (layer.findtext("range"), layer.findtext("chunk")) == ("1-48", "5")
     words = str(layer.findtext("cmd")).split()

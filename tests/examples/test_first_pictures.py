@@ -1,4 +1,4 @@
-"""The list of first pictures: each part can be chosen, and another installation takes turns."""
+"""``first_pictures.py``, which times first renderings: its parts, its checks, and two installations in turns."""
 
 import csv
 import json
@@ -16,7 +16,7 @@ from torchdof.bench.measurement import BenchScene, Seconds
 SCENES = Path(__file__).parents[1] / "data" / "scenes"
 
 
-def drawn(part: str, turn: int = 0) -> list[first_pictures.Figure]:
+def figures(part: str, turn: int = 0) -> list[first_pictures.Figure]:
     return list(first_pictures.figures(part, SCENES / "planes", turn))
 
 
@@ -33,54 +33,54 @@ def drawn(part: str, turn: int = 0) -> list[first_pictures.Figure]:
         ("noise", [(480, 640)], [(59, 60)]),
     ],
 )
-def test_a_part_renders_what_it_says(
+def test_a_part_renders_its_stated_sizes_and_blur_radii(
     part: str, sizes: list[tuple[int, int]], radii_px: list[tuple[float, float]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch, "set_num_threads", lambda _: None)
-    first, second = drawn(part), drawn(part, turn=1)
+    first, second = figures(part), figures(part, turn=1)
     for figure, size, (low, high) in zip(first, sizes, radii_px, strict=True):
         for scene in figure.scenes:
             widest = float(scene.coc_px.abs().max())
             assert scene.image.shape[-2:] == size == scene.coc_px.shape[-2:]
             assert low - 0.01 <= widest <= high + 0.01, "another blur"
-    cocs = [scene.coc_px for figures in (first, second) for figure in figures for scene in figure.scenes]
+    cocs = [scene.coc_px for turn in (first, second) for figure in turn for scene in figure.scenes]
     same = [torch.equal(a, b) for i, a in enumerate(cocs) for b in cocs[:i] if a.shape == b.shape]
     assert not any(same) or part == "lamps", "a camera was rendered before"
 
 
-def test_a_figure_is_of_a_new_camera_the_same_again_and_a_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_figure_times_a_new_camera_the_same_camera_again_and_a_reference(monkeypatch: pytest.MonkeyPatch) -> None:
     ticks = iter([Seconds(6.0, 4.0), Seconds(3.0, 1.0), Seconds(1.0, 8.0)] * 2)
 
-    def told(*_: Tensor) -> tuple[Tensor, Seconds]:
+    def timed(*_: Tensor) -> tuple[Tensor, Seconds]:
         return torch.ones(1, 3, 16, 16), next(ticks)
 
     scene = BenchScene("x", torch.ones(1, 3, 16, 16), torch.ones(1, 1, 16, 16))
-    figure = first_pictures.Figure("figure", told, [scene] * 2, beside=told)
+    figure = first_pictures.Figure("figure", timed, [scene] * 2, beside=timed)
     monkeypatch.setattr(first_pictures, "figures", lambda *_: [figure])
     rows = first_pictures.turn_of("cameras", SCENES, 0)
     assert rows == 2 * [rows[0]]
     assert (rows[0]["new_ms"], rows[0]["cpu_ms"], rows[0]["over_again"], rows[0]["over_beside"]) == (6e3, 4e3, 4.0, 0.5)
 
 
-def test_an_installation_that_is_wrong_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
-    right = first_pictures.blur_by_coc
+def test_an_installation_whose_pictures_are_wrong_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    original = first_pictures.blur_by_coc
     monkeypatch.setattr(first_pictures, "figures", lambda *_: [])
     monkeypatch.setattr(
-        first_pictures, "blur_by_coc", lambda *a, tolerance: right(*a, tolerance=tolerance) + 4 * tolerance
+        first_pictures, "blur_by_coc", lambda *a, tolerance: original(*a, tolerance=tolerance) + 4 * tolerance
     )
     with pytest.raises(RuntimeError, match="does not keep its tolerance"):
         first_pictures.turn_of("cameras", SCENES, 0)
 
 
-def test_the_command_renders_what_blur_by_coc_does() -> None:
+def test_the_command_renders_the_same_picture_as_blur_by_coc() -> None:
     scene = first_pictures.shipped(48, 64).seen(0.0, 5.0)
     picture, seconds = first_pictures.rendered(scene.image, scene.coc_px)
-    wanted = first_pictures.blur_by_coc(scene.image, scene.coc_px)
-    assert first_pictures.error(picture, wanted)["psnr_db"] > 30  # JPEG in and out
+    expected = first_pictures.blur_by_coc(scene.image, scene.coc_px)
+    assert first_pictures.error(picture, expected)["psnr_db"] > 30  # JPEG in and out
     assert seconds.wall > 0.1 and seconds.cpu > 0.1
 
 
-def test_installations_take_turns_and_stand_side_by_side(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_installations_take_turns_and_have_adjacent_rows(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     calls = []
 
     class Done:
@@ -117,9 +117,7 @@ def test_installations_take_turns_and_stand_side_by_side(monkeypatch: pytest.Mon
     )
 
 
-def test_a_part_that_is_not_there_is_refused(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unknown_part_is_refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(sys, "argv", ["x", str(SCENES), "--parts", "nothing"])
     with pytest.raises(SystemExit):
         first_pictures.main()

@@ -1,4 +1,4 @@
-"""The example that finds the scale of relative depth in a picture out of focus, with fewer steps at full size."""
+"""``examples/solve_scale.py``, which finds the scale of relative depth from defocus; with fewer steps at full size."""
 
 import re
 import runpy
@@ -16,7 +16,7 @@ def example() -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("known", "metres"), [(["f_number", "focus_m"], True), ([], False)])
-def test_gradient_descent_finds_the_blur_and_with_the_lens_known_metres(
+def test_gradient_descent_finds_the_blur_and_with_a_known_lens_the_metres(
     example: dict[str, Any],
     tmp_path: Path,
     known: list[str],

@@ -1,4 +1,4 @@
-"""The page of `examples/web`, built and used in headless Chromium; skipped where that is not installed."""
+"""The page of ``examples/web``, built and used in headless Chromium; skipped where that is not installed."""
 
 import json
 import os
@@ -31,7 +31,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def used(plain: Any, shared_folder: Path) -> tuple[Path, Mapping[str, Any]]:
-    """The folder with the page and what was saved from it, and what was seen while it was used."""
+    """The folder with the page and its saved pictures, and the observations of ``web.mjs``."""
     folder = shared_folder / "page"
     environment = os.environ | {"TORCHDOF_NODE_FOLDER": str(NODE_FOLDER), "PYTHON": sys.executable}
     with FileLock(shared_folder / "page.lock"):
@@ -91,17 +91,17 @@ def test_a_click_sharpens_where_it_falls_and_blurs_elsewhere(used: Any) -> None:
         assert np.abs(other - sharp)[window].mean() > 0.008
 
 
-def test_nothing_is_fetched_from_elsewhere_and_nothing_is_complained_of(used: Any) -> None:
+def test_nothing_is_fetched_from_other_hosts_and_the_console_stays_empty(used: Any) -> None:
     _, seen = used
     assert seen["elsewhere"] == [] and seen["console"] == []
 
 
-def test_a_file_is_saved_under_a_telling_name(used: Any) -> None:
+def test_a_saved_files_name_has_the_f_number_and_the_focus(used: Any) -> None:
     folder, seen = used
     assert seen["nearName"] == f"motorcycle_f0.7_{seen['nearFocus'].removesuffix(' m')}m.png"
 
 
-def test_half_the_size_is_shown_while_a_control_moves_and_the_full_size_then(used: Any) -> None:
+def test_half_the_size_is_rendered_while_a_control_moves_and_the_full_size_at_rest(used: Any) -> None:
     _, seen = used
     halves = [message["half"] for message in seen["dragAsked"] if message["type"] == "render"]
     assert halves[0] is True and halves[-1] is False
@@ -116,7 +116,7 @@ def test_everything_works_with_the_keyboard_and_has_a_name(used: Any) -> None:
     assert seen["unnamed"] == []
 
 
-def test_bad_files_are_answered_with_what_to_do(used: Any) -> None:
+def test_messages_about_bad_files_state_the_remedy(used: Any) -> None:
     problems = used[1]["problems"]
     assert "notes.jpg: this browser cannot open it" in problems["photo"] and "JPEG or PNG" in problems["photo"]
     assert "in colour" in problems["depth"] and "shades of grey" in problems["depth"]
@@ -125,7 +125,7 @@ def test_bad_files_are_answered_with_what_to_do(used: Any) -> None:
     assert "90 × 60" in problems["frame"] and "40 × 60" in problems["frame"]
 
 
-def test_relative_depth_lies_between_the_distances_given_and_can_be_turned(used: Any) -> None:
+def test_relative_depth_lies_between_the_given_distances_and_can_be_inverted(used: Any) -> None:
     _, seen = used
     assert seen["ownKind"] == "disparity"
     assert float(seen["ownNear"].removesuffix(" m")) < 1.1 and float(seen["ownTurned"].removesuffix(" m")) > 7.5

@@ -1,4 +1,4 @@
-// Uses the page in headless Chromium as people do: node web.mjs DIST OUT CHROMIUM
+// Clicks, drags and types in the page, in headless Chromium: node web.mjs DIST OUT CHROMIUM
 // Leaves OUT/results.json, the saved PNG files and screenshots. DIST is the page, as examples/web/build.mjs writes it.
 import { spawn } from 'node:child_process'
 import { writeFileSync } from 'node:fs'
@@ -69,7 +69,7 @@ try {
   results.farFocus = await text('#focus-value')
   await save('far.png')
 
-  // By keyboard: the lens, the point of focus, the divider, what is shown.
+  // By keyboard: the lens, the point of focus, the divider, the view.
   await asked()
   await page.focus('#aperture')
   const before = await text('#aperture-value')
@@ -94,14 +94,14 @@ try {
   await page.check('[name=view][value=picture]', { force: true })
   await done()
 
-  // Names for whoever cannot see the controls.
+  // Accessible names, for screen readers.
   results.unnamed = await page.evaluate(() =>
     [...document.querySelectorAll('button, input, select, [role=slider], canvas[role=img]')]
       .filter((e) => !(e.getAttribute('aria-label') || e.innerText?.trim() || [...(e.labels ?? [])].some((l) => l.innerText.trim())))
       .map((e) => e.outerHTML),
   )
 
-  // Files that are none, or do not fit. The pair that was there is kept until it is replaced.
+  // Files that are no images, or whose sizes differ. The earlier pair stays until it is replaced.
   const png = (name) => page.evaluate(async (colours) => {
     const canvas = document.createElement('canvas')
     canvas.width = colours.width
@@ -122,7 +122,7 @@ try {
   results.problems.flat = await problemOf('#depth-file', 'flat_depth.png', 'image/png', await picture(60, 40, ['#777', '#777']))
   results.problems.damaged = await problemOf('#depth-file', 'cut_depth.png', 'image/png', (await picture(60, 40, ['#000', '#fff'])).subarray(0, 60))
 
-  // One's own pair, dropped together: lighter is nearer.
+  // The user's own pair, dropped together: lighter is nearer.
   const photo = await picture(90, 60, ['#fff', '#000', '#fff', '#000', '#fff', '#000', '#fff'])
   const depth = await picture(90, 60, ['#fff', '#000'], 'image/jpeg')
   const transfer = await page.evaluateHandle(([photo, depth]) => {

@@ -1,4 +1,4 @@
-"""One exported file renders what the module renders, at sizes and scenes other than the traced one."""
+"""An exported file renders the module's pictures, at other sizes and of other scenes than the traced ones."""
 
 import math
 from collections.abc import Iterator
@@ -17,26 +17,26 @@ CAMERA = torchdof.Camera.from_fov(50.0, 0.05, 2.0)
 SIMPLE: dict[str, Any] = {"occlusion": False, "tolerance": 0.2, "max_coc_px": 1.5, "check": False}
 
 
-def test_file_is_small_and_every_case_agrees_to_1e_5(layered: Any) -> None:
+def test_the_file_is_small_and_every_case_agrees_within_1e_5(layered: Any) -> None:
     assert layered.path.stat().st_size < 200_000
     assert len(layered.verification.cases) >= 14
     assert 0 < layered.verification.max_error < 1e-5
 
 
-def test_all_in_focus_is_returned_bit_for_bit(layered: Any) -> None:
+def test_an_image_in_focus_is_returned_bit_for_bit(layered: Any) -> None:
     image = torch.rand(1, 3, 50, 40)
     out = layered.render(image, torch.full((1, 1, 50, 40), 2.0), torch.tensor([2.0]), torch.tensor([0.5]))
     assert torch.equal(out, image)
 
 
-def test_a_file_may_take_the_circle_of_confusion_and_a_single_channel(tmp_path: Path) -> None:
+def test_a_file_can_have_the_input_coc_px_and_a_single_channel(tmp_path: Path) -> None:
     table = torchdof.BlurTable.load("double_gauss_50mm_f2")
     dof = torchdof.DepthOfField(CAMERA, table, **SIMPLE)
     with pytest.raises(ValueError, match="state it as width=1920"):
         to_onnx(dof, tmp_path / "dof.onnx", inputs="coc_px", channels=1)
-    told: list[str] = []
-    to_onnx(dof, tmp_path / "dof.onnx", inputs="coc_px", channels=1, width=1920, opset=21, progress=told.append)
-    assert told[:3] == ["tracing", "translating", "slimming"] and told[3:][0] == "verifying: one pixel"
+    steps: list[str] = []
+    to_onnx(dof, tmp_path / "dof.onnx", inputs="coc_px", channels=1, width=1920, opset=21, progress=steps.append)
+    assert steps[:4] == ["tracing", "translating", "slimming", "verifying: one pixel"]
     facts = describe(tmp_path / "dof.onnx")
     assert list(facts["inputs"]) == ["image", "coc_px"] and facts["width"] == 1920 and facts["opset"] == 21
     model = onnx.load(tmp_path / "dof.onnx")
@@ -65,7 +65,7 @@ def graphs(graph: onnx.GraphProto) -> Iterator[onnx.GraphProto]:
                 yield from graphs(attribute.g)
 
 
-def test_the_graph_holds_standard_operators_and_loops_that_skip_what_tiles_do_not_hold(layered: Any) -> None:
+def test_the_graph_has_only_standard_operators_and_loops_that_skip_layers_without_pixels(layered: Any) -> None:
     model = onnx.load(layered.path)
     assert {entry.domain for entry in model.opset_import} == {""}
     nodes = [node for graph in graphs(model.graph) for node in graph.node]
@@ -77,13 +77,13 @@ def test_the_graph_holds_standard_operators_and_loops_that_skip_what_tiles_do_no
     assert not {node.op_type for node in nodes} & {"Scan", "CastLike"} and not {node.domain for node in nodes} - {""}
 
 
-def test_what_a_frame_in_focus_does_not_need_is_inside_a_branch(layered: Any) -> None:
+def test_operators_that_a_frame_in_focus_does_not_need_are_inside_a_branch(layered: Any) -> None:
     graph = onnx.load(layered.path).graph
     assert len(graph.node) < 0.1 * sum(len(inner.node) for inner in graphs(graph))
     assert not {node.op_type for node in graph.node} & {"Conv", "Loop", "NonZero", "TopK", "ScatterElements"}
 
 
-def test_weights_lie_beside_their_convolutions(layered: Any) -> None:
+def test_weights_are_constants_in_the_same_graph_as_their_convolution(layered: Any) -> None:
     for graph in graphs(onnx.load(layered.path).graph):
         made = {name: node for node in graph.node for name in node.output}
         for node in graph.node:
@@ -94,7 +94,7 @@ def test_weights_lie_beside_their_convolutions(layered: Any) -> None:
                 assert len(node.input) == 2
 
 
-def test_nothing_is_copied_to_fill_a_convolution_and_ramps_are_one_operator(layered: Any) -> None:
+def test_inputs_of_convolutions_are_not_copied_and_ramps_are_one_operator(layered: Any) -> None:
     before, ramps = set(), 0
     for graph in graphs(onnx.load(layered.path).graph):
         makers = {output: node.op_type for node in graph.node for output in node.output}
@@ -124,7 +124,7 @@ SIMPLY = torchdof.DepthOfField(CAMERA, **SIMPLE)
         (torchdof.DepthOfField(CAMERA.replace(focus_range_m=(1.0, 2.0)), **SIMPLE), {}, "change focus_range_m"),
     ],
 )
-def test_what_makes_no_file_is_refused_and_nothing_is_written(
+def test_bad_arguments_are_refused_and_no_file_is_written(
     dof: Any, change: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -133,7 +133,7 @@ def test_what_makes_no_file_is_refused_and_nothing_is_written(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_file_that_differs_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_differs_from_the_module_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "dof.onnx").write_text("older")
     monkeypatch.setattr("torchdof.export.verification.TOLERANCE", -1.0)
     with pytest.raises(ValueError, match="differs from the module"):
@@ -143,7 +143,7 @@ def test_a_file_that_differs_is_not_written(tmp_path: Path, monkeypatch: pytest.
 
 
 @pytest.mark.sweep
-def test_a_file_holds_the_kernels_of_a_lopsided_opening(tmp_path: Path) -> None:
+def test_a_file_has_the_kernels_of_an_asymmetric_aperture(tmp_path: Path) -> None:
     table = torchdof.BlurTable.polygon(3, 20.0, squeeze=1.6)
     verification = to_onnx(torchdof.DepthOfField(CAMERA, table, **SIMPLE), tmp_path / "dof.onnx", inputs="coc_px")
     assert verification.passed

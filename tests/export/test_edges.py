@@ -1,4 +1,4 @@
-"""A file that repairs depth edges: the same maps and the same pictures as the plain engine's."""
+"""Exported files repair depth edges and render the pictures of the PyTorch engine."""
 
 import importlib.util
 from pathlib import Path
@@ -22,7 +22,7 @@ KINDS = ("half-res", "near -1px", "exact")
 
 @pytest.fixture(scope="module")
 def tensors() -> tuple[Tensor, Tensor]:
-    """Posts and lamps before a wall in focus, and their coc down to -2 px: soft, a pixel too thin, and exact."""
+    """Posts and lamps in front of a wall in focus, CoC from -2 px: edges soft, foreground 1 px too thin, exact."""
     planes = [
         Plane(6.0, waves(1, mean=(0.5, 0.4, 0.3))),
         Plane(1.2, waves(3, mean=(0.35, 0.1, 0.1)), posts(67.0, 9.0, -0.4, 11.0)),
@@ -38,7 +38,7 @@ def tensors() -> tuple[Tensor, Tensor]:
 
 
 def rendered(image: Tensor, coc: Tensor, treatment: DepthEdges) -> Tensor:
-    """By the plain engine, with the layers of the file."""
+    """The picture of the PyTorch engine with the layers of the file."""
     plan = Plan.all(2.0, 1 / 255, rays=True)
     with torch.no_grad():
         return blur_by_coc(image, coc, plan=plan, max_coc_px=2.0, occlusion=False, check=False, depth_edges=treatment)
@@ -48,7 +48,7 @@ def error(got: np.ndarray, expected: Tensor, image: Tensor) -> float:
     return float(((torch.from_numpy(np.array(got)) - expected).abs() / local_range(image, 4)).max())
 
 
-def test_a_file_repairs_what_the_module_repairs(
+def test_a_file_repairs_the_same_edges_as_the_module(
     exported_by_command: tuple[Path, str], tensors: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
@@ -60,7 +60,7 @@ def test_a_file_repairs_what_the_module_repairs(
     assert error(got, expected, image) <= TOLERANCE
 
 
-def test_a_file_learns_from_the_part_of_a_frame_that_the_module_learns_from(
+def test_a_file_estimates_the_step_from_the_same_part_of_a_frame_as_the_module(
     exported_by_command: tuple[Path, str], tensors: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")

@@ -1,4 +1,4 @@
-"""What a file takes and how it says no: one item for a whole batch, cameras that cannot be, wrong sizes."""
+"""Inputs of exported files: one depth map for a whole batch, impossible cameras, wrong shapes, fixed sizes."""
 
 import math
 from pathlib import Path
@@ -24,16 +24,12 @@ def test_one_depth_and_one_lens_serve_a_whole_batch(plain: Any) -> None:
     ("focus_m", "f_number"),
     [(0.0, 2.0), (-1.0, 2.0), (math.nan, 2.0), (1.0, 0.0), (1.0, -2.0), (1.0, math.nan), (1.0, math.inf)],
 )
-def test_a_camera_that_cannot_be_gives_nan_everywhere_and_only_for_its_item(
-    plain: Any, focus_m: float, f_number: float
-) -> None:
+def test_an_impossible_camera_gives_nan_for_its_item_only(plain: Any, focus_m: float, f_number: float) -> None:
     images, depth = torch.rand(2, 3, 12, 17), 1.0 + 4.0 * torch.rand(2, 1, 12, 17)
     out = plain.render(images, depth, torch.tensor([focus_m, 1.0]), torch.tensor([f_number, 0.3]))
     assert torch.isnan(out[0]).all() and torch.isfinite(out[1]).all()
-    # a plane in focus is no exception
-    assert torch.isnan(plain.render(images[:1], torch.ones(1, 1, 12, 17), *out.new_tensor([[focus_m], [f_number]])))[
-        0
-    ].all()
+    in_focus = plain.render(images[:1], torch.ones(1, 1, 12, 17), *out.new_tensor([[focus_m], [f_number]]))
+    assert torch.isnan(in_focus).all(), "also where the plane is in focus"
 
 
 @pytest.mark.parametrize(
@@ -61,14 +57,14 @@ def test_sizes_can_be_fixed_by_the_runtimes_tool(plain: Any, tmp_path: Path) -> 
     assert torch.equal(torch.from_numpy(out), plain.render(*tensors))
 
 
-def test_loading_says_nothing(layered: Any, capfd: pytest.CaptureFixture[str]) -> None:
+def test_loading_prints_no_warning(layered: Any, capfd: pytest.CaptureFixture[str]) -> None:
     onnxruntime.InferenceSession(layered.path, providers=["CPUExecutionProvider"])
     assert not capfd.readouterr().err
 
 
 @pytest.mark.parametrize("kind", ["ONNXModule", "ONNXSequential"])
 def test_kornia_runs_a_file(plain: Any, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)  # where it keeps files of its own
+    monkeypatch.chdir(tmp_path)  # Kornia writes its cache into the working folder
     onnx_classes = pytest.importorskip("kornia.onnx")
     tensors = torch.rand(1, 3, 20, 31), 1.0 + 4.0 * torch.rand(1, 1, 20, 31), *LENS
     runner = getattr(onnx_classes, kind)(str(plain.path))

@@ -1,4 +1,4 @@
-"""A stand-in depth network and a module in one file render what both do in turn."""
+"""``chain``: a depth network and a depth-of-field file joined in one file give the pictures of both in turn."""
 
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ network (float[N,3,{size}] pixels) => (float[N,{size}] map) {{
 
 
 def network(size: str = "28,42") -> onnx.ModelProto:
-    """Brighter is larger; at a fixed size that is not the image's, or at any."""
+    """A stand-in for a depth network: brighter pixels have larger values; `size` is fixed or "h,w" for any."""
     return onnx.parser.parse_model(NETWORK.format(size=size))
 
 
@@ -92,7 +92,7 @@ def test_the_chain_loads_in_kornia(plain: Any, tmp_path: Path) -> None:
         ({"depth_model": "none.onnx"}, "there is no file"),
     ],
 )
-def test_what_does_not_fit_is_refused_and_leaves_nothing(
+def test_bad_arguments_are_refused_and_no_file_is_written(
     plain: Any, change: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""A file traced at 64 x 64 renders a frame of 1080p in bounded memory."""
+"""A file that was traced at 64 x 64 renders 1080p in bounded memory."""
 
 import json
 import subprocess
@@ -33,8 +33,8 @@ np.save(sys.argv[3], out)
 """
 
 
-def test_1080p_is_rendered_right_with_less_than_0_7_gb(layered: Any, tmp_path: Path) -> None:
-    """In a process as those who deploy have it: onnxruntime and numpy, no PyTorch."""
+def test_1080p_is_rendered_correctly_with_less_than_0_7_gb(layered: Any, tmp_path: Path) -> None:
+    """Runs in a process with onnxruntime and numpy but without PyTorch, as in a deployment."""
     assert layered.dof.max_coc_px == 16.0
     camera, (height, width) = layered.dof.camera, SIZE
     fraction = np.zeros((1, 1, *SIZE), np.float32)  # of the largest radius
@@ -50,10 +50,10 @@ def test_1080p_is_rendered_right_with_less_than_0_7_gb(layered: Any, tmp_path: P
     call = [sys.executable, "-c", RENDER, str(layered.path), str(tmp_path / "feed.npz"), str(tmp_path / "out.npy")]
     done = subprocess.run(call, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
-    told = json.loads(done.stdout.splitlines()[-1])
-    print(f"peak memory {told['peak_gb']:.2f} GB")
-    assert not told["torch"]
-    assert 0.3 < told["peak_gb"] < LIMIT_GB
+    report = json.loads(done.stdout.splitlines()[-1])
+    print(f"peak memory {report['peak_gb']:.2f} GB")
+    assert not report["torch"]
+    assert 0.3 < report["peak_gb"] < LIMIT_GB
 
     data = {name: torch.from_numpy(value) for name, value in feed.items()}
     out, image = torch.from_numpy(np.load(tmp_path / "out.npy")), data["image"]
@@ -61,10 +61,10 @@ def test_1080p_is_rendered_right_with_less_than_0_7_gb(layered: Any, tmp_path: P
     assert torch.equal(out[..., :900], image[..., :900]), "the left half is in focus"
     coc = layered.dof.coc_px(image, data["depth"], data["focus_m"], data["f_number"])
     assert 15.0 < coc.max() <= 16.0
-    rows, columns = slice(400, 640), slice(1280, 1600)  # of the blurred half, on the coarse layers' grid
+    rows, columns = slice(400, 640), slice(1280, 1600)  # in the blurred half, at multiples of the coarse layers' pixels
     part = [tensor[..., rows, columns].contiguous() for tensor in (image, coc)]
     with torch.no_grad():
         expected = blur_by_coc(*part, plan=layered.plan, **layered.dof.options.arguments())
-    inner = (..., slice(80, -80), slice(80, -80))  # where the part's border is out of reach
+    inner = (..., slice(80, -80), slice(80, -80))  # pixels that the border of the part does not influence
     assert (expected - part[0])[inner].abs().max() > 0.3
     torch.testing.assert_close(out[..., rows, columns][inner], expected[inner], atol=1e-5, rtol=0)

@@ -1,4 +1,4 @@
-"""The same file gives the same pixels in OpenVINO and in onnxruntime-web (WebAssembly under Node)."""
+"""A file gives the same pixels in OpenVINO and in onnxruntime-web (WebAssembly in Node) as the module."""
 
 import base64
 import importlib.metadata

@@ -1,4 +1,4 @@
-"""Eager, exported and, in the sweep, compiled render the same picture: of ray-traced scenes, lamps, other sizes."""
+"""Eager, exported and (in the sweep) compiled modules render the same pictures of scenes, lamps and other sizes."""
 
 import dataclasses
 from pathlib import Path
@@ -21,7 +21,7 @@ SIZE = (72, 100)
 
 
 def inputs(name: str, max_coc_px: float) -> tuple[Tensor, ...]:
-    """A part of a scene, with the aperture at which its largest circle of confusion is a file's largest."""
+    """Image, depth and focus of a part of a scene, and the largest CoC that its file can render, in px."""
     scene = {scene.name: scene for scene in read_scenes(DATA)}[name]
     image, depth = (t[..., : SIZE[0], : SIZE[1]].contiguous() for t in (scene.image[:, :3], scene.depth))
     camera = scene.camera.replace(focus_m=float(depth.median()), f_number=1.0)
@@ -32,7 +32,10 @@ SCENES = ["highlights/0", "planes/0", "room/1"]
 
 
 def compared(exported: Any, name: str) -> tuple[tuple[Tensor, ...], Tensor, Tensor]:
-    """What a scene is rendered from, its eager picture, and what errors are told in parts of."""
+    """Inputs of a scene, its eager picture, and the local range of light that errors are divided by.
+
+    The f-number is the one at which the scene's largest circle of confusion is the file's largest.
+    """
     image, depth, focus, reach = inputs(name, exported.dof.options.max_coc_px)
     camera = exported.dof.camera.replace(focus_m=float(focus), f_number=1.0)
     f_number = camera.coc_px(depth, SIZE[1]).abs().amax().reshape(1) / reach
@@ -50,7 +53,7 @@ def test_eager_and_exported_agree(module: str, name: str, request: pytest.Fixtur
     assert float(((exported.render(*tensors) - eager).abs() / unit).max()) <= TOLERANCE
 
 
-def test_items_of_another_size_have_a_focus_and_an_aperture_each(layered: Any) -> None:
+def test_items_of_a_batch_of_another_size_have_their_own_focus_and_aperture(layered: Any) -> None:
     generator = torch.Generator().manual_seed(3)
     image = torch.rand(2, 3, 45, 71, generator=generator)
     depth = torch.nn.functional.interpolate(torch.rand(2, 1, 5, 7, generator=generator) * 4 + 1, (45, 71))
@@ -61,7 +64,7 @@ def test_items_of_another_size_have_a_focus_and_an_aperture_each(layered: Any) -
 
 
 def street(exported: Any, lamps: int) -> tuple[Tensor, ...]:
-    """Lamps behind a post, and in front of it, that are blurred up to the largest radius of a file."""
+    """Lamps behind and in front of a post, blurred by up to the largest radius of a file."""
     depth = torch.full((1, 1, 90, 120), 6.0) + 0.1 * torch.rand(1, 1, 90, 120)
     depth[..., 50:58], depth[..., 70:, :] = 0.8, 1.2
     image = 0.1 * torch.rand(1, 3, 90, 120)
@@ -77,13 +80,13 @@ def test_lamps_are_splatted_ray_by_ray(module: str, lamps: int, request: pytest.
     tensors = street(exported, lamps)
     eager = exported.eager(*tensors)
     with torch.no_grad():
-        softer = exported.dof(*tensors, plan=dataclasses.replace(exported.plan, rays=False))
-    assert float((eager - softer).abs().max()) > 0.05, "no rays"
+        without_rays = exported.dof(*tensors, plan=dataclasses.replace(exported.plan, rays=False))
+    assert float((eager - without_rays).abs().max()) > 0.05, "no lamp is splatted ray by ray"
     assert float(((exported.render(*tensors) - eager).abs() / local_range(tensors[0], 16)).max()) <= TOLERANCE
 
 
 @pytest.mark.parametrize("shape", ["disc", "polygon", "sato_j15"])
-def test_kernels_of_a_file_are_those_of_its_table(shape: str) -> None:
+def test_kernels_of_a_file_equal_those_of_its_table(shape: str) -> None:
     made = {"disc": BlurTable.disc, "polygon": lambda: BlurTable.polygon(blades=5, rotation_deg=10.0)}
     table = made[shape]() if shape in made else BlurTable.load(shape)
     plan = Plan.all(3.0, 1 / 255, rays=True)
@@ -91,7 +94,7 @@ def test_kernels_of_a_file_are_those_of_its_table(shape: str) -> None:
     values_at: Any = ray_splats.values_at
     for coc_px in (-2.75, 0.5, 3.0):
         expected = table.kernels(torch.tensor([coc_px]), 1).float()[0, :, None]
-        half = expected.shape[-1] // 2 + 2  # what lies beyond a kernel is 0
+        half = expected.shape[-1] // 2 + 2  # 2 px of zeros around the kernel
         node = np.array([len(halves) // 2 + round(coc_px * per_px)])
         arrays = [t.numpy() for t in (values, origins, halves, is_round)]
         got = torch.from_numpy(values_at(*arrays, node, np.arange(-half, half + 1)))
@@ -103,7 +106,7 @@ def test_kernels_of_a_file_are_those_of_its_table(shape: str) -> None:
 @pytest.mark.parametrize("module", ["layered", "fold", "fold_with_occlusion"])
 def test_eager_compiled_and_exported_agree(module: str, request: pytest.FixtureRequest) -> None:
     exported = request.getfixturevalue(module)
-    # what is compiled is the traced graph; the code that inductor writes for it is the module's tests' matter
+    # aot_eager checks the traced graph; tests/test_module.py checks inductor's code
     compiled = torch.compile(exported.dof, fullgraph=True, backend="aot_eager")
     for name in SCENES:
         tensors, eager, unit = compared(exported, name)

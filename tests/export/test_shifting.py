@@ -1,4 +1,4 @@
-"""Interpolation by shifted maps: what lies on a plane is found again at every pixel."""
+"""Interpolation by shifted maps is exact for a plane: a map that is linear in the pixel coordinates."""
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ from torchdof.export.shifting import samples
 
 
 def plane(rows: int, columns: int, step: float) -> Tensor:
-    """Place of each sample from the middle, in pixels, down and right: ``[1, 2, rows, columns]``."""
+    """Distance of each sample from the centre, in pixels, down and right: ``[1, 2, rows, columns]``."""
     y, x = ((torch.arange(n, dtype=torch.float64) - (n - 1) / 2) * step for n in (rows, columns))
     return torch.stack(torch.meshgrid(y, x, indexing="ij"))[None]
 

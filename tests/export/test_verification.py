@@ -1,4 +1,4 @@
-"""A file is refused when it is not whole, not portable, or not of this module."""
+"""``verify`` refuses files that are damaged, not portable, or exported from another module."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -57,11 +57,11 @@ def test_another_module_is_refused(plain: Any, change: dict[str, Any], message: 
 
 
 @pytest.mark.parametrize("of_rays", [False, True], ids=["of a layer", "of rays"])
-def test_a_changed_kernel_is_found(of_rays: bool, plain: Any, model: onnx.ModelProto, tmp_path: Path) -> None:
+def test_a_changed_kernel_is_detected(of_rays: bool, plain: Any, model: onnx.ModelProto, tmp_path: Path) -> None:
     tensors = [t for t in _tensors(model.graph) if t.data_type == onnx.TensorProto.FLOAT]
     kernel = max((t for t in tensors if len(t.dims) == (2 if of_rays else 4)), key=lambda t: int(np.prod(t.dims)))
     values = onnx.numpy_helper.to_array(kernel).copy()
-    if of_rays:  # of all radii together
+    if of_rays:  # one tensor has the kernels of all radii
         values *= 1.01
     else:
         values.flat[values.size // 2] *= 1.01
@@ -77,7 +77,7 @@ def test_weights_in_another_file_are_refused(plain: Any, model: onnx.ModelProto,
         verify(tmp_path / "other.onnx", plain.dof)
 
 
-def test_operators_of_others_are_refused(plain: Any, model: onnx.ModelProto, tmp_path: Path) -> None:
+def test_operators_of_other_domains_are_refused(plain: Any, model: onnx.ModelProto, tmp_path: Path) -> None:
     model.opset_import.append(onnx.helper.make_opsetid("com.microsoft", 1))
     with pytest.raises(ValueError, match="needs operators of com.microsoft"):
         verify(save(model, tmp_path), plain.dof)
@@ -99,7 +99,7 @@ def test_damaged_and_foreign_files_are_named(plain: Any, tmp_path: Path) -> None
         verify(tmp_path / "none.onnx", plain.dof)
 
 
-def test_metadata_tell_what_a_file_is(plain: Any, model: onnx.ModelProto, tmp_path: Path) -> None:
+def test_metadata_describe_inputs_camera_table_and_options(plain: Any, model: onnx.ModelProto, tmp_path: Path) -> None:
     facts = describe(plain.path)
     assert model.producer_name == "torchdof" and model.producer_version == facts["version"]
     assert "metres" in facts["inputs"]["depth"] and "linear light" in facts["output"]["out"]

@@ -1,8 +1,12 @@
-"""A phone calibrated end to end, from the target to a rendered picture: `python tests/fit/phone.py --out out/phone`.
+"""Calibrates a simulated phone, from the printed target to a rendered picture.
 
-A simulated phone takes photographs of the printed target (Bayer pattern, 1 % noise, an S-curve, JPEG 90, a turned page
-on a grey desk); `torchdof fit` makes a table of them without being told anything, and `torchdof render` a picture with
-it. The same picture through the true lens says what all that lost. Every command is printed with its time.
+Run ``python tests/fit/phone.py --out out/phone``. It prints each command with its time:
+
+1. The phone photographs the target: Bayer pattern, 1 % noise, an S-curve, JPEG 90, a rotated page on a grey desk.
+2. ``torchdof fit`` makes a table from the photographs, with no other input.
+3. ``torchdof render`` renders a scene with the table.
+
+The result is the PSNR of that picture against the picture of the true lens.
 """
 
 import argparse
@@ -25,9 +29,9 @@ DISTANCES_M = [0.24, 0.27, 0.30, 0.35, 0.40, 0.50, 0.65, 0.80]
 
 def run(*words):
     """Run a command of torchdof, and print it with its time."""
-    began = time.perf_counter()
+    start = time.perf_counter()
     result = CliRunner().invoke(app, [str(w) for w in words])
-    print(f"{time.perf_counter() - began:6.1f} s  torchdof {' '.join(str(w) for w in words)}", flush=True)
+    print(f"{time.perf_counter() - start:6.1f} s  torchdof {' '.join(str(w) for w in words)}", flush=True)
     if result.exit_code:
         raise SystemExit(result.output)
     return result.output
@@ -46,14 +50,14 @@ def scene(width):
 
 
 def measure(folder, distances=tuple(DISTANCES_M), width=1000, tone=0.5, family="auto"):
-    """Calibrate and render in `folder`; returns the PSNR against the true lens, dB, and of the untouched scene."""
+    """Calibrates and renders in `folder`; PSNR in dB against the true lens, of the picture and of the sharp scene."""
     import simulator
 
     folder.mkdir(parents=True, exist_ok=True)
     run("fit", "--target", folder / "target.pdf")
-    began = time.perf_counter()
+    start = time.perf_counter()
     simulator.write_photographs(folder / "photographs", FOCUS_M, list(distances), width=width, tone=tone)
-    print(f"{time.perf_counter() - began:6.1f} s  {1 + len(distances)} photographs of {width} px simulated")
+    print(f"{time.perf_counter() - start:6.1f} s  {1 + len(distances)} photographs of {width} px simulated")
     print(run("fit", folder / "photographs", "-o", folder / "phone.json", "--family", family))
     image, depth = scene(width)
     write_image(folder / "scene.exr", Picture(image), sample="float")
@@ -70,14 +74,14 @@ def measure(folder, distances=tuple(DISTANCES_M), width=1000, tone=0.5, family="
 
 
 def main():
-    """Calibrate a phone and say how well."""
+    """Calibrates a phone and prints the PSNR of a picture."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True, help="folder for target, photographs, table and picture")
     parser.add_argument("--width", type=int, default=1000, help="of the photographs, px")
-    parser.add_argument("--tone", type=float, default=0.5, help="strength of the S-curve that nobody tells of")
+    parser.add_argument("--tone", type=float, default=0.5, help="strength of the S-curve, unknown to the fit")
     arguments = parser.parse_args()
     found, untouched = measure(arguments.out, width=arguments.width, tone=arguments.tone)
-    print(f"rendered against the true lens: {found:.1f} dB, untouched {untouched:.1f} dB")
+    print(f"PSNR against the true lens: rendered {found:.1f} dB, sharp scene {untouched:.1f} dB")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,15 @@
-"""Accuracy of the fits under everything that goes wrong, as a table: `python tests/fit/report.py --draws 60`.
+"""Prints a table of the accuracy of the fits under camera faults: ``python tests/fit/report.py --draws 60``.
 
-Each row is one condition: how far the fitted size of the blur is from the truth on average, and from draw to draw, the
-error that the fit states, how often the truth lies within it (68 % is right), the residual over the noise, and what was
-said.
+Each row is one condition, with these columns:
+
+| column | meaning |
+| --- | --- |
+| bias, % | mean error of the fitted blur radius |
+| spread, % | its standard deviation over the draws |
+| stated, % | mean standard error that the fit states |
+| within, % | share of draws whose error is below the stated one; 68 % is right |
+| x noise | residual over the noise |
+| warnings | kinds of warnings and errors, with their number |
 """
 
 import argparse
@@ -12,7 +19,7 @@ from functools import partial
 
 import numpy as np
 import torch
-from simulator import Simulator, heard
+from simulator import Simulator, result_and_warnings
 
 from torchdof.fit import FitError, fit_pair
 from torchdof.optics.psf import LENGTHS, pixel_kernels
@@ -52,7 +59,7 @@ FAULTY = {
 
 
 def size_of(family, params):
-    """Radius of the uniform disc with the second moment of a PSF, px: drawn so large that its pixels do not matter."""
+    """Radius in px of the uniform disc with the second moment of a PSF, measured on an eightfold enlarged kernel."""
     drawn = {k: torch.tensor((8.0 if k in LENGTHS else 1.0) * v, dtype=torch.float64) for k, v in params.items()}
     kernel = pixel_kernels(family, drawn).numpy()
     away = np.arange(kernel.shape[-1]) - kernel.shape[-1] // 2
@@ -60,48 +67,51 @@ def size_of(family, params):
 
 
 def measure(camera, family, draws):
-    """Errors and stated errors of the size over the truth, residuals over noise `[draws, 3]`; and what was said."""
-    true, found, said = size_of(family, FAMILIES[family]), [], Counter()
+    """Relative errors, stated relative errors, residuals over noise `[draws, 3]`; and counts of warnings by kind."""
+    true, found, kinds = size_of(family, FAMILIES[family]), [], Counter()
     for seed in range(draws):
-        # a dot that always lay at one place among a mosaic's pixels would be off alike in every draw
+        # the error depends on the dot's place among a mosaic's pixels, so that each draw gets another place
         camera = replace(camera, place=tuple(np.random.default_rng(900 + seed).uniform(-1, 1, 2)))
-        # breathing is for the fit to find; a paper twice as far away is known
+        # the fit must find breathing itself; a target at twice the distance is a known magnification
         known = camera.magnification if camera.magnification < 0.9 else 1.0
         pair = camera.pair(family, FAMILIES[family], seed)
-        fit, problems = heard(partial(fit_pair, *pair, family, magnification=known))
+        fit, problems = result_and_warnings(partial(fit_pair, *pair, family, magnification=known))
         refused = isinstance(fit, FitError)
-        said.update({problem.kind for problem in [*problems, *([fit] if refused else [])]})
+        kinds.update({problem.kind for problem in [*problems, *([fit] if refused else [])]})
         if not refused:
             found.append((fit.radius / true - 1, fit.radius_stderr / true, fit.residual_over_noise))
-    return np.array(found).reshape(-1, 3), said
+    return np.array(found).reshape(-1, 3), kinds
 
 
-def print_row(what, found, said):
-    """One line of the table."""
+def print_row(condition, found, kinds):
+    """Prints one line of the table."""
     if len(found):
-        off, stated, noise = found.T
-        numbers = (100 * off.mean(), 100 * off.std(), 100 * stated.mean(), 100 * np.mean(np.abs(off) < stated))
-        text = "{:34s} | {:+6.2f} | {:5.2f} | {:5.2f} | {:3.0f} | {:4.2f}".format(what, *numbers, noise.mean())
+        error, stated, noise = found.T
+        numbers = (100 * error.mean(), 100 * error.std(), 100 * stated.mean(), 100 * np.mean(np.abs(error) < stated))
+        text = "{:34s} | {:+6.2f} | {:5.2f} | {:5.2f} | {:3.0f} | {:4.2f}".format(condition, *numbers, noise.mean())
     else:
-        text = what + 5 * " | "
-    print("|", text, "|", ", ".join(f"{name} {count}" for name, count in sorted(said.items())), "|", flush=True)
+        text = condition + 5 * " | "
+    print("|", text, "|", ", ".join(f"{name} {count}" for name, count in sorted(kinds.items())), "|", flush=True)
 
 
 def main():
-    """Print everything."""
+    """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
-        "--draws", type=int, default=4, help="captures a condition, 60 for coverage; with a fault a tenth, 4 at least"
+        "--draws",
+        type=int,
+        default=4,
+        help="captures per condition, 60 for the column within; faulty conditions get a tenth, at least 4",
     )
-    parser.add_argument("--families", default=",".join(FAMILIES), help="of the blur, separated by commas")
+    parser.add_argument("--families", default=",".join(FAMILIES), help="families of the blur, separated by commas")
     arguments = parser.parse_args()
-    print("| condition | off, % | spread, % | stated, % | within, % | x noise | said, of the draws |")
+    print("| condition | bias, % | spread, % | stated, % | within, % | x noise | warnings |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for family in arguments.families.split(","):
         few = max(arguments.draws // 10, 4)
-        for what, harm in (GOOD | FAULTY).items():
-            camera, draws = Simulator(**{"size": 91, **harm}), arguments.draws if what in GOOD else few
-            print_row(f"{family}, {what}", *measure(camera, family, draws))
+        for condition, harm in (GOOD | FAULTY).items():
+            camera, draws = Simulator(**{"size": 91, **harm}), arguments.draws if condition in GOOD else few
+            print_row(f"{family}, {condition}", *measure(camera, family, draws))
 
 
 if __name__ == "__main__":

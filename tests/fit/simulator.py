@@ -1,7 +1,7 @@
-"""A camera that photographs a white dot, sharp and defocused, with everything that goes wrong in a real one.
+"""A simulated camera that photographs a white dot, sharp and defocused, with the faults of real cameras.
 
-The dot is drawn with anti-aliased edges; the blur is the renderer's own: its kernel applied to the sharp picture's
-pixels. Both pictures are in linear light.
+The dot has anti-aliased edges. The blur is a kernel of the renderer, convolved with the sharp picture's pixels. Both
+pictures are in linear light.
 """
 
 from __future__ import annotations
@@ -23,18 +23,22 @@ from torchdof.optics.psf import pixel_kernels
 
 
 def draw_dot(size: int, radius: float, centre: tuple[float, float] = (0.0, 0.0), oversample: int = 16) -> np.ndarray:
-    """A white disc of `radius` px at `centre` (x, y) px from the picture's centre, each pixel its covered share."""
+    """Coverage `[size, size]` of a disc of `radius` px at `centre` (x, y) px from the picture's centre."""
     axis = (np.arange(size * oversample) + 0.5) / oversample - size / 2
     inside = (axis[None, :] - centre[0]) ** 2 + (axis[:, None] - centre[1]) ** 2 <= radius**2
     return inside.reshape(size, oversample, size, oversample).mean((1, 3))
 
 
 def shape(kind: str, radius: float, size: int = 41, fine: int = 8, turn_deg: float = 11.0) -> np.ndarray:
-    """A blur that no round family has `[size, size]`, drawn as light falls: sums to 1, its centre of mass where it is.
+    """Kernel `[size, size]` of a blur that no round family can fit; it sums to 1 and is not centred on its mass.
 
-    "hexagon" and "heptagon" are inscribed in a circle of `radius` px, a corner `turn_deg` clockwise from the right; the
-    "cat's eye" is a disc of which another, 0.7 radii aside, lets only a part through; "coma" is a disc whose rays go
-    wrong by the square of their height; "mirror" is a disc without its middle, and "rim" one with a brighter edge.
+    | kind | kernel, with y down |
+    | --- | --- |
+    | "hexagon", "heptagon" | inscribed in a circle of `radius` px, a corner `turn_deg` clockwise from the right |
+    | "cat's eye" | the intersection of two discs, 0.7 radii apart |
+    | "coma" | a disc whose rays are displaced by the square of their height in the pupil |
+    | "mirror" | a disc with a central hole of 0.45 radii |
+    | "rim" | a disc whose edge is brighter than its centre |
     """
     axis = (np.arange(size * fine) + 0.5) / fine - size / 2
     x, y = np.meshgrid(axis, axis)
@@ -60,7 +64,7 @@ def shape(kind: str, radius: float, size: int = 41, fine: int = 8, turn_deg: flo
 
 
 def through(kernel: np.ndarray, camera: Simulator, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Sharp and defocused picture of a dot through a kernel `[k, k]`."""
+    """Sharp and defocused picture of a dot, the blur a kernel `[k, k]`."""
     rng = np.random.default_rng(seed)
     still = camera.level * draw_dot(camera.size, camera.dot_radius)
     moved = camera.level * draw_dot(camera.size, camera.dot_radius * camera.magnification, camera.shift)
@@ -68,7 +72,7 @@ def through(kernel: np.ndarray, camera: Simulator, seed: int = 0) -> tuple[np.nd
 
 
 def blur(picture: np.ndarray, family: str, params: dict) -> np.ndarray:
-    """The picture convolved with a kernel of `torchdof.optics.psf`, or with a `shape`."""
+    """The picture convolved with a kernel of `torchdof.optics.psf`, or with the `shape` "hexagon"."""
     if family == "hexagon":
         return fftconvolve(picture, shape(family, **params), mode="same")
     kernel = pixel_kernels(family, {k: torch.as_tensor(v, dtype=torch.float64) for k, v in params.items()}).numpy()
@@ -77,29 +81,29 @@ def blur(picture: np.ndarray, family: str, params: dict) -> np.ndarray:
 
 @dataclass
 class Simulator:
-    """What the camera does to the light; every default is harmless."""
+    """A camera and its faults; the defaults have noise only."""
 
-    size: int = 101  # of the square window, px
-    dot_radius: float = 12.0  # of the sharp dot, px
-    snr_db: float | None = 40.0  # 20 log10(1 / read noise), None for none; 1 is the sharp dot's level
-    full_well: float | None = None  # electrons at 1, for shot noise
-    level: float = 1.0  # of the sharp dot; below 1 keeps encoded pictures from clipping
-    exposure: float = 1.0  # light in the defocused picture over the sharp one
+    size: int = 101  # side of the square window, px
+    dot_radius: float = 12.0  # radius of the sharp dot, px
+    snr_db: float | None = 40.0  # 20 log10(1 / sigma of the read noise); None: no noise. The sharp dot has level 1
+    full_well: float | None = None  # electrons at level 1, for shot noise
+    level: float = 1.0  # level of the sharp dot; below 1 encoded pictures do not clip
+    exposure: float = 1.0  # light of the defocused picture over that of the sharp one
     black: float = 0.0  # level added to both pictures
-    offset: float = 0.0  # level added to the defocused picture alone (stray light)
-    place: tuple[float, float] = (0.0, 0.0)  # of the dot (x, y) in px from the middle, in both pictures
-    shift: tuple[float, float] = (0.0, 0.0)  # of the defocused dot (x, y) in px
-    magnification: float = 1.0  # size of the defocused picture's dot over the sharp one's
-    bits: int | None = None  # quantisation, which cuts blacks off as well
+    offset: float = 0.0  # level added to the defocused picture only (stray light)
+    place: tuple[float, float] = (0.0, 0.0)  # position (x, y) of the dot in both pictures, px from the centre
+    shift: tuple[float, float] = (0.0, 0.0)  # displacement (x, y) of the defocused dot, px
+    magnification: float = 1.0  # size of the dot in the defocused picture over that in the sharp one
+    bits: int | None = None  # bits of the quantization, which also clips to 0..1
     clip: float | None = None  # level above which the picture is clipped
     srgb: bool = False  # leave both pictures sRGB encoded
-    jpeg: int | None = None  # quality that the sRGB-encoded pictures are stored at and decoded from
-    edge_sigma: float = 0.0  # softness in px of both pictures
-    misfocus: float = 0.0  # blur (a Gaussian's sigma in px) of the sharp picture alone
-    texture: float = 0.0  # contrast of the paper's and the dot's grain, a few px large, the same in both pictures
-    uneven: float = 0.0  # how much brighter the light is at the window's right edge than at its left
-    tone: float = 0.0  # strength of an S-curve over the encoded levels that nobody undoes, 0 to 1
-    bayer: bool = False  # record one colour a pixel and demosaic it bilinearly, as the mean of the colours
+    jpeg: int | None = None  # quality of the JPEG through which the sRGB-encoded pictures go
+    edge_sigma: float = 0.0  # sigma in px of a Gaussian blur of both pictures
+    misfocus: float = 0.0  # sigma in px of a Gaussian blur of the sharp picture only
+    texture: float = 0.0  # contrast of a grain of a few px, the same in both pictures
+    uneven: float = 0.0  # relative increase of the light from the window's left edge to its right edge
+    tone: float = 0.0  # strength from 0 to 1 of an S-curve over the encoded levels, which is not undone
+    bayer: bool = False  # sample with an RGGB mosaic, demosaic bilinearly, take the mean of the colours
 
     def pair(self, family: str, params: dict, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Sharp and defocused picture `[size, size]` of one dot."""
@@ -121,7 +125,7 @@ class Simulator:
         return self.record(still, rng), self.record(defocused, rng)
 
     def record(self, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """What the file holds of a picture in linear light, decoded to linear light unless `srgb`."""
+        """The recorded picture of `light`, in linear light, or sRGB encoded if `srgb`."""
         picture = np.maximum(light, 0.0) + self.black
         picture = picture * (1 + self.uneven * np.linspace(-0.5, 0.5, picture.shape[1]))
         if self.full_well is not None:
@@ -129,7 +133,7 @@ class Simulator:
         if self.snr_db is not None:
             picture = picture + rng.normal(0.0, 10 ** (-self.snr_db / 20), picture.shape)
         if self.bayer:
-            picture = demosaiced(picture, "RGGB").mean(0)  # of a grey scene
+            picture = demosaiced(picture, "RGGB").mean(0)  # the scene is grey: all colours have the same light
         if self.clip is not None:
             picture = np.minimum(picture, self.clip)
         if self.tone:
@@ -164,8 +168,8 @@ def _through_jpeg(picture: np.ndarray, quality: int) -> np.ndarray:
     return np.asarray(Image.open(stored), dtype=np.float64) / 255
 
 
-def heard(call) -> tuple:
-    """What a call returns, or the `FitError` it raises; and every `FitWarning` on the way. Others are errors."""
+def result_and_warnings(call) -> tuple:
+    """The result of a call, or its `FitError`, and a list of its `FitWarning`s; other warnings are errors."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("error")
         warnings.simplefilter("always", FitWarning)
@@ -179,10 +183,14 @@ def heard(call) -> tuple:
 def write_captures(
     folder, camera, focus_m, distances, kernel, width=400, height=240, camera_fields="", grid=(), **harm
 ):
-    """A folder of 16-bit sRGB PNGs with its capture.toml: the dot in the frame's centre, and wherever `grid` says.
+    """Writes a folder of 16-bit sRGB PNGs with their capture.toml, and returns it.
 
-    `kernel(distance)` gives (family, params), `kernel(distance, x, y)` that of the dot at a place in the sharp picture;
-    `camera` is a `Simulator` whose window is ignored.
+    Args:
+        camera: A `Simulator`; its `size` is not used.
+        kernel: ``kernel(distance)`` gives (family, params) of the blur; ``kernel(distance, x, y)`` also depends on the
+            dot's position in the sharp picture.
+        grid: Positions (x, y) of the dots in px from the frame's centre; by default one dot in the centre.
+        harm: Changes of `camera`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     places, across = grid or [(0.0, 0.0)], len(inspect.signature(kernel).parameters) == 3
@@ -210,9 +218,9 @@ def write_captures(
 
 
 def write_photographs(folder, focus_m, distances, width=800, tone=0.5, noise=0.01, kernel="disc", jpeg=90, exif=True):
-    """A phone's JPEGs of the printed target on a grey desk, focused at `focus_m`; returns radius in px by distance.
+    """Writes JPEGs of the printed target on a grey desk, focused at `focus_m`; returns {distance: blur radius in px}.
 
-    26 mm equivalent at f/1.8; `tone` is the strength of an S-curve that nobody undoes.
+    The phone has a lens of 26 mm equivalent focal length at f/1.8; `tone` is the strength of its S-curve.
     """
     import OpenImageIO as oiio
 
@@ -228,7 +236,7 @@ def write_photographs(folder, focus_m, distances, width=800, tone=0.5, noise=0.0
         x, y = np.meshgrid(axis_x - x0, axis_y - y0)
         x, y = (x * np.cos(turn) + y * np.sin(turn)) / scale, (y * np.cos(turn) - x * np.sin(turn)) / scale
         light = np.where((np.abs(x) < 105) & (np.abs(y + 17) < 148), 0.8, 0.3 + 0.05 * np.sin(x / 30))
-        # an edge between samples lights them by the share that it leaves of them
+        # anti-aliased: each sample gets its distance from the edge in samples, clipped to 0..1
         inside = np.minimum(*(np.clip((50 - np.abs(v)) * scale * fine + 0.5, 0, 1) for v in (x, y)))
         light += inside * (0.035 - light)
         light += np.clip((2.5 - np.hypot(x, y)) * scale * fine + 0.5, 0, 1) * (0.8 - light)
@@ -253,9 +261,10 @@ def write_photographs(folder, focus_m, distances, width=800, tone=0.5, noise=0.0
 
 
 def place_of_target(i: int, width: int) -> tuple[float, float]:
-    """Where the target's middle lies in photograph `i` of `write_photographs`, px from the frame's centre.
+    """Position (x, y) of the target's centre in photograph `i` of `write_photographs`, px from the frame's centre.
 
-    No hand holds a dot at the same place among the pixels, whose pattern would then err alike in all pictures.
+    It differs between photographs, as with a hand-held phone: at one position among the pixels of the Bayer pattern
+    all photographs would have the same error.
     """
     x, y = np.random.default_rng(900 + i).uniform(-3, 3, 2)
     return 0.02 * width + x, -0.015 * width + y

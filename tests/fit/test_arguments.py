@@ -1,4 +1,4 @@
-"""Any argument of the fits, however wrong, gives a result or a named error; any manifest and prescription as well."""
+"""Any argument of the fits gives a result or a named error."""
 
 import inspect
 import math
@@ -57,10 +57,10 @@ def dot(size: int = 31, sigma: float = 3.0) -> Any:
 
 
 def options_of(function: Callable[..., Any]) -> dict[str, Any]:
-    """Its arguments that may be left out; names of files are only told, and notes only kept."""
+    """Optional arguments of a function with their defaults; without those of fields, and without mere labels."""
     given = inspect.signature(function).parameters
-    told = ("files", "name", "notes", "field", "field_nodes", "field_rays")
-    return {name: one.default for name, one in given.items() if one.default is not one.empty and name not in told}
+    omitted = ("files", "name", "notes", "field", "field_nodes", "field_rays")
+    return {name: one.default for name, one in given.items() if one.default is not one.empty and name not in omitted}
 
 
 SHARP, BLURRED = dot(), dot(sigma=4.0)
@@ -94,12 +94,12 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
 }  # fmt: skip
 
 
-TOLD = "must|need|at least|no such|no lens|negative|flat|no dot|give |takes|NaN|converge|pass|edge|expected|lies at|"
-TOLD += "goes with|stand|can be read|nothing in common"
+EXPECTED = "must|need|at least|no such|no lens|negative|flat|no dot|give |takes|NaN|converge|pass|edge|expected|"
+EXPECTED += "lies at|goes with|stand|can be read|nothing in common"
 
 
-def honest(call: Callable[[], Any]) -> None:
-    """Runs a call that may refuse by name, in one sentence."""
+def check_error(call: Callable[[], Any]) -> None:
+    """Runs a call; an error of it must be one sentence with the expected value."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FitWarning)
         try:
@@ -107,7 +107,7 @@ def honest(call: Callable[[], Any]) -> None:
         except (ValueError, FileNotFoundError) as error:
             message = str(error)
             assert 20 < len(message) < 1000
-            assert re.search(TOLD, message), message
+            assert re.search(EXPECTED, message), message
 
 
 @pytest.mark.parametrize("name", CALLS)
@@ -120,4 +120,4 @@ def test_any_argument_gives_a_result_or_a_named_error(name: str, data: st.DataOb
     arguments = {**good, **{k: data.draw(ANYTHING, label=k) for k in wrong}}
     if name == "trace_table" and "lens" not in wrong:
         arguments["lens"] = LENS
-    honest(lambda: function(**arguments))
+    check_error(lambda: function(**arguments))

@@ -1,4 +1,4 @@
-"""The paper's figures."""
+"""Pictures of fits, tables and textures, as in the paper's figures 2 to 4."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def test_figures_3_and_4_are_the_blur_texture_and_both_quads(tmp_path):
         BlurTable("gaussian", [0.2], {"sigma": torch.tensor([[0.05], [0.1], [0.07]])}),
     ],
 )
-def test_a_table_shows_every_parameter_by_lines_through_its_nodes(table, tmp_path):
+def test_the_picture_of_a_table_has_a_line_through_the_nodes_of_every_parameter(table, tmp_path):
     panels = drawn(picture_of_table(table), tmp_path)
     assert len(panels) == len(table.node_params)
     if "sigma" in table.node_params:

@@ -1,4 +1,4 @@
-"""Inputs made from others, by a seeded random generator: bytes and the structure that a checksum would protect."""
+"""Mutations of files by a seeded random generator: of bytes, and of tokens, packed arrays and PNG chunks."""
 
 import base64
 import binascii
@@ -18,7 +18,7 @@ _TOKEN = re.compile(rb'-?\d[\d.eE+-]*|"[^"]*"|[a-z_]+')
 
 
 def mutated(content: bytes, others: list[bytes], suffix: str, rng: random.Random) -> bytes:
-    """A changed input: a few changes of bytes or, in what has a structure, of its tokens and chunks."""
+    """`content` after 1 to 6 random changes of bytes or, in formats with a structure, of tokens and numbers."""
     made = content
     for _ in range(rng.choice((1, 1, 1, 2, 3, 6))):
         kinds = [_bytes, _bytes, _number, _cut, _splice, _repeat]
@@ -36,7 +36,9 @@ def mutated(content: bytes, others: list[bytes], suffix: str, rng: random.Random
 
 def _bytes(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
     made = bytearray(content or b"\0")
-    limit = len(made) if rng.random() < 0.5 else min(len(made), 400)  # mostly headers, where sizes and offsets are
+    limit = (
+        len(made) if rng.random() < 0.5 else min(len(made), 400)
+    )  # half of the changes hit headers, with sizes and offsets
     for _change in range(rng.choice((1, 1, 2, 4))):
         place = rng.randrange(limit)
         made[place] = rng.choice((0, 255, 1 << rng.randrange(8) ^ made[place], rng.randrange(256)))
@@ -75,7 +77,7 @@ def _token(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
 
 
 def _packed(content: bytes, others: list[bytes], rng: random.Random) -> bytes:
-    """Other numbers in what is deflated and told as text."""
+    """Changes the bytes of a deflated, base64-encoded array."""
     found = _PACKED.search(content)
     try:
         numbers = zlib.decompress(base64.b64decode(found.group(1), validate=True)) if found else b""
@@ -96,7 +98,7 @@ def _float(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
 
 
 def _with_checksums(content: bytes) -> bytes:
-    """A PNG whose chunks have the checksums of what they hold now."""
+    """The PNG with the checksums of its changed chunks corrected, so that readers get past them."""
     made, place = bytearray(content), 8
     while place + 12 <= len(made):
         end = place + 12 + int.from_bytes(made[place : place + 4], "big")

@@ -1,7 +1,8 @@
-"""Fuzzes every reader and the engines for a time: `make fuzz`, or `python -m tests.fuzz.run --seconds 3600`.
+"""Fuzzes the readers and both engines: ``make fuzz``, or ``python -m tests.fuzz.run --seconds 3600``.
 
-Inputs are made by seeded mutation, one target after the other, in a process of its own that is started anew when it
-dies, hangs or grows. What it finds is written to a folder and listed; copied to `found/TARGET/` it is a test.
+Targets take turns on inputs from seeded mutation. They run in a worker process, which is started again when it dies,
+hangs or exceeds its memory. Findings are written to ``--findings`` and printed; a file that is copied to
+``found/TARGET/`` becomes a test.
 """
 
 import argparse
@@ -24,12 +25,12 @@ from tests.fuzz import targets
 from tests.fuzz.mutate import mutated
 from tests.fuzz.targets import TARGETS
 
-_LONGEST_S = 120.0  # for one input, on a busy machine
-_MEMORY = 6 * 2**30
+_TIMEOUT_S = 120.0  # for one input; a busy machine needs seconds for some
+_MEMORY = 6 * 2**30  # address space of the worker in bytes
 
 
 def work(pipe: Connection, folder: str) -> None:
-    """Takes names of targets with paths, answers with what is wrong; what is printed goes to a file."""
+    """Receives (target, path) through the pipe and sends the finding, or None. Output is captured in a file."""
     torch.set_num_threads(1)
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -50,20 +51,20 @@ def work(pipe: Connection, folder: str) -> None:
 
 
 class Worker:
-    """The process in which targets run; it is started when it is needed."""
+    """The process in which targets run; started on demand."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.running: tuple[SpawnProcess, Connection] | None = None
 
     def run(self, name: str, path: Path) -> str | None:
-        """What is wrong with how a target takes a file."""
+        """The finding of a target on a file, or None."""
         process, pipe = self.running or self._start()
         try:
             pipe.send((name, str(path)))
-            if not pipe.poll(_LONGEST_S):
+            if not pipe.poll(_TIMEOUT_S):
                 self.stop()
-                return f"takes longer than {_LONGEST_S:g} s"
+                return f"takes longer than {_TIMEOUT_S:g} s"
             answer: str | None = pipe.recv()
             return answer
         except (EOFError, OSError):
@@ -89,7 +90,7 @@ class Worker:
 
 
 def main() -> None:
-    """Fuzzes for the time given; exit code 1 if something was found."""
+    """Fuzzes for ``--seconds``; exit code 1 if there is a finding."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=3600.0)
     parser.add_argument("--seed", type=int, default=0)
@@ -125,7 +126,7 @@ def main() -> None:
         worker.stop()
     for name, count in tried.items():
         kinds = sum(target == name for target, _ in found)
-        print(f"{name:>10}: {count:8} inputs, {kinds} kinds of trouble")
+        print(f"{name:>10}: {count:8} inputs, {kinds} kinds of findings")
     sys.exit(1 if found else 0)
 
 

@@ -1,7 +1,7 @@
-"""What is fuzzed: every reader of a file, and both engines' rendering and repair; each with whole inputs to start from.
+"""Targets of the fuzzer: every reader of files, and rendering and edge repair by both engines, each with valid inputs.
 
-A target takes a file and may refuse it with its own errors, in one sentence that names the file. Anything else is a
-finding: another exception, a crash, a line that a library prints, a picture that is not finite, too long or too large.
+A target reads a file and may refuse it by an error of ``REFUSED``, one sentence that names the file. Everything else
+is a finding: another exception, a crash, a line on the terminal, a picture that is not finite, too much time or memory.
 """
 
 import dataclasses
@@ -34,12 +34,12 @@ REFUSED = (ValueError, OSError, FitError)
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """One thing that is fuzzed.
+    """A target of the fuzzer.
 
     Args:
-        suffix: Of its files.
-        seeds: Writes whole files into a folder.
-        run: Takes a file; what it raises besides ``REFUSED`` is a finding.
+        suffix: Suffix of its files.
+        seeds: Writes valid files into a folder.
+        run: Reads a file; an exception other than ``REFUSED`` is a finding.
         named: Whether a refusal must name the file.
     """
 
@@ -148,7 +148,7 @@ def _read_array(path: Path) -> None:
         except REFUSED as error:
             assert path.name in str(error), f"not named: {error}"
         else:
-            assert bool((depth > 0).all()), "a depth that is none"
+            assert bool((depth > 0).all()), "a depth of 0 or less"
 
 
 def _table_seeds(folder: Path) -> None:
@@ -167,20 +167,22 @@ def _read_table(path: Path) -> None:
         try:
             kernels = table.kernels(torch.tensor([-5.0, -0.6, 0.0, 1.0, 9.0]), width, size=9)
         except ValueError as error:
-            assert "at most" in str(error), f"read, and then: {error}"
+            assert "at most" in str(error), f"read, but: {error}"
         else:
-            assert torch.isfinite(kernels).all() and float(kernels.min()) >= 0, "kernels that are none"
+            assert torch.isfinite(kernels).all() and float(kernels.min()) >= 0, (
+                "kernels that are not finite or negative"
+            )
 
 
 def _field_seeds(folder: Path) -> None:
-    """Tables with small fields: what is changed in the files of large ones is mostly the light of one spot."""
+    """Tables with small fields; in files of large ones nearly every mutation would hit the light of one spot."""
     coc, radius = torch.tensor([-0.4, 0.1, 0.5]), torch.tensor([0.0, 9.0, 20.0])
     box = torch.tensor([0.01, 0.5, 0.4]) * (0.1 + coc.abs())[:, None, None].expand(3, 3, 3)
     for colours, unit in ((1, "mm"), (3, "mm"), (3, "fraction")):
         light = torch.rand(colours, 3, 3, 6, 4, generator=torch.Generator().manual_seed(colours))
-        in_unit = {"unit": "mm", "sensor_width_mm": 36.0} if unit == "mm" else {"unit": unit}
+        units = {"unit": "mm", "sensor_width_mm": 36.0} if unit == "mm" else {"unit": unit}
         sigma = {"sigma": torch.full((colours, 2), 0.2)}
-        lens = BlurTable("gaussian", [-0.4, 0.5], sigma, field=Field(coc, radius, box, light), **in_unit)
+        lens = BlurTable("gaussian", [-0.4, 0.5], sigma, field=Field(coc, radius, box, light), **units)
         lens.save(folder / f"{unit}{colours}.json")
 
 
@@ -193,7 +195,7 @@ def _read_field(path: Path) -> None:
     coc = torch.linspace(-3, 4, 16).expand(1, 1, 12, 16)
     pictures = _by_both_engines(lambda: blur_by_coc(image, coc, table=table, tolerance="preview"))
     for picture in pictures:
-        assert torch.isfinite(picture).all(), "read, and then: light that is not finite"
+        assert torch.isfinite(picture).all(), "read, but the picture is not finite"
         assert float(picture.max()) <= 60.0 and float(picture.min()) >= -1e-3, "brighter than its light"
     apart = float((pictures[0] - pictures[1]).abs().max())
     assert apart <= 1e-3 * 50.0, f"the engines differ by {apart:.2g}"
@@ -248,10 +250,10 @@ def _read_lens(path: Path) -> None:
         sensor_mm = focus_sensor(lens, 2.0)
         spot = point_spread(lens, 1.0, sensor_mm, field_mm=1.0, rays=200)
     except ValueError as error:
-        assert any(word in str(error) for word in ("lens", "focus", "object")), f"read, and then: {error}"
+        assert any(word in str(error) for word in ("lens", "focus", "object")), f"read, but: {error}"
     else:
         for numbers in (sensor_mm, spot.x, spot.y, spot.weight, spot.centre, spot.pupil_mm2):
-            assert np.isfinite(numbers).all(), "rays that are no numbers"
+            assert np.isfinite(numbers).all(), "rays that are not finite"
 
 
 def _onnx_seeds(folder: Path) -> None:
@@ -277,7 +279,7 @@ def _scene_seeds(folder: Path) -> None:
 
 
 def scene_of(content: bytes) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
-    """Image, coc and options that the bytes of a file stand for: sizes and options, then numbers as they come."""
+    """Image, CoC and options from bytes: five for sizes and options, then float32 for the pixels, repeated."""
     head = content[:5].ljust(5, b"\0")
     height, width, channels = 1 + head[0] % 24, 1 + head[1] % 32, 1 + head[2] % 4
     flags, scale = head[3], (1.0, 30.0, 300.0, 1e-3)[head[4] % 4]
@@ -288,7 +290,7 @@ def scene_of(content: bytes) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]
     numbers = np.resize(numbers, needed)
     image = torch.from_numpy(numbers[: height * width * channels].reshape(1, channels, height, width).copy())
     coc = torch.from_numpy(numbers[height * width * channels :].reshape(1, 1, height, width).copy()) * scale
-    if flags & 16:  # planes rather than noise
+    if flags & 16:  # planes instead of noise
         coc = torch.round(coc / 8) * 8
     if flags & 32:
         image = image.abs()
@@ -317,10 +319,10 @@ def _render(path: Path) -> None:
     plain, compiled = pictures
     good = torch.isfinite(image).all(1, keepdim=True) & torch.isfinite(coc)
     light = torch.where(good, image, 0.0).abs().amax().double()
-    if not options["normalize"] and light > 1e37:  # a plain sum may be beyond what its type holds
+    if not options["normalize"] and light > 1e37:  # without normalization a sum may overflow float32
         return
     for name, picture in (("plain", plain), ("compiled", compiled)):
-        assert bool(torch.isfinite(picture[good.expand_as(picture)]).all()), f"{name}: light that is not finite"
+        assert bool(torch.isfinite(picture[good.expand_as(picture)]).all()), f"{name}: the picture is not finite"
         largest = torch.where(good, picture, 0.0).abs().amax().double()
         assert not options["normalize"] or largest <= 1.5 * light, f"{name}: brighter than its light"
     apart = torch.where(good, plain.double() - compiled.double(), 0.0).abs().amax()
@@ -334,14 +336,14 @@ def _repair(path: Path) -> None:
     step = torch.tensor(span / 8 if options["check"] else 2.0)
     if options["normalize"]:
         step = step.expand_as(nearness)
-    mended = _by_both_engines(lambda: edges.repair(image, nearness, step, options["occlusion"]))
+    repaired = _by_both_engines(lambda: edges.repair(image, nearness, step, options["occlusion"]))
     known = torch.isfinite(nearness)
-    for name, one in zip(("plain", "compiled"), mended, strict=True):
-        assert torch.equal(torch.isfinite(one), known), f"{name}: what is known, and what is not, changes"
-        assert torch.equal(one.nan_to_num()[~known], nearness.nan_to_num()[~known]), f"{name}: what is unknown changes"
+    for name, one in zip(("plain", "compiled"), repaired, strict=True):
+        assert torch.equal(torch.isfinite(one), known), f"{name}: finite where the map is not, or the reverse"
+        assert torch.equal(one.nan_to_num()[~known], nearness.nan_to_num()[~known]), f"{name}: unknown values change"
         assert float(one[known].abs().amax() if known.any() else 0.0) <= 10.0 * span, f"{name}: far beyond the map"
     usual = float(image.nan_to_num(0.0, 0.0, 0.0).abs().amax()) < 1e6 and span < 1e6
-    plain, compiled = mended
+    plain, compiled = repaired
     same = torch.isclose(plain, compiled, rtol=1e-3, atol=1e-3 * span, equal_nan=True).float().mean()
     assert not usual or float(same) > 0.9, f"the engines agree on {float(same):.2f} of the pixels"
 
@@ -350,7 +352,7 @@ TARGETS: dict[str, Target] = {
     **{s[1:]: Target(s, _image_seeds(s), _read_picture) for s in (".png", ".exr", ".tif", ".jpg", ".hdr", ".pfm")},
     **{suffix[1:]: Target(suffix, _array_seeds(suffix), _read_array) for suffix in (".npy", ".npz")},
     "table": Target(".json", _table_seeds, _read_table),
-    "manifest": Target(".toml", _manifest_seeds, _read_manifest, named=False),  # a picture that is not there is named
+    "manifest": Target(".toml", _manifest_seeds, _read_manifest, named=False),  # errors name missing pictures
     "field": Target(".json", _field_seeds, _read_field),
     "lens": Target(".txt", _lens_seeds, _read_lens),
     "zmx": Target(".zmx", _zmx_seeds, _read_lens),
@@ -361,7 +363,7 @@ TARGETS: dict[str, Target] = {
 
 
 def finding(target: Target, path: Path) -> str | None:
-    """What is wrong with how a target takes a file; None if nothing is."""
+    """Description of a target's fault on a file, or None."""
     try:
         target.run(path)
     except REFUSED as error:
@@ -375,7 +377,7 @@ def finding(target: Target, path: Path) -> str | None:
 
 
 def seeds(target: Target, folder: Path) -> Iterator[bytes]:
-    """The whole inputs of a target."""
+    """The valid inputs of a target."""
     target.seeds(folder)
     for path in sorted(folder.iterdir()):
         yield path.read_bytes()

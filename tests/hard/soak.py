@@ -1,7 +1,7 @@
-"""Renders for long in one process and tells whether it grows: `make soak`, or `python tests/hard/soak.py --help`.
+"""Checks that memory does not grow over many renderings: ``make soak``, or ``python tests/hard/soak.py --help``.
 
-Random sizes, cameras, tables and options; then several threads with a module each, and workers that are forked and
-spawned, while other libraries run threads of their own: OpenMP in PyTorch, TBB in OpenVINO.
+Sizes, cameras, tables and options are random. Afterwards threads with a module each, forked and spawned workers must
+render the same pictures, while PyTorch (OpenMP) and OpenVINO (TBB) run threads of their own.
 """
 
 import argparse
@@ -25,7 +25,7 @@ CACHES = [kernel_bank._templates, placed_kernels._shares, psf._quadrants]
 
 
 def lens_with_a_field() -> BlurTable:
-    """A lens whose spots grow towards the corners and lean outwards."""
+    """A lens whose spots grow towards the corners and extend outwards."""
     box = torch.tensor([0.1, 0.5, 0.4]) * torch.linspace(1.0, 1.5, 3)[:, None].expand(2, 3, 1)
     light = torch.linspace(1.0, 2.0, 8)[:, None].expand(1, 2, 3, 8, 6)
     spots = Field(torch.tensor([-0.5, 0.5]), torch.tensor([0.0, 10.0, 20.0]), box, light)
@@ -43,7 +43,7 @@ TABLES = [
 
 
 def resident_mb() -> float:
-    """Memory that this process holds, without the kernels that it keeps on purpose, which are bounded."""
+    """Resident memory of this process without the kernel caches, which are bounded."""
     gc.collect()
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     return (pages * os.sysconf("SC_PAGE_SIZE") - sum(cache.bytes for cache in CACHES)) / 2**20
@@ -70,37 +70,37 @@ def rendering(seed: int) -> torch.Tensor:
 
 
 def same(pictures: list[torch.Tensor], truth: list[torch.Tensor]) -> bool:
-    """Whether pictures are those, but for rounding: PyTorch's sums depend on its number of threads."""
+    """Whether pictures agree up to rounding; PyTorch's sums depend on its number of threads."""
     return len(pictures) == len(truth) and all(map(torch.allclose, pictures, truth))
 
 
-def grown(count: int, say: bool = False) -> tuple[float, float]:
-    """Memory in MB after a fifth of so many renderings, and after all of them: the larger of the last two fifths."""
+def memory_growth(count: int, verbose: bool = False) -> tuple[float, float]:
+    """Memory in MB after the first fifth of `count` renderings, and the larger one after the last two fifths."""
     sizes = []
     for seed in range(count):
         assert torch.isfinite(rendering(seed)).all(), f"seed {seed}"
         if (seed + 1) % (count // 5) == 0:
             sizes.append(resident_mb())
-            if say:
+            if verbose:
                 print(f"{seed + 1:6} renderings, {sizes[-1]:.1f} MB", flush=True)
     return sizes[0], max(sizes[-2:])
 
 
 def in_threads(seeds: range, threads: int) -> list[torch.Tensor]:
-    """Pictures by several threads at once."""
+    """Pictures rendered by several threads at once."""
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(rendering, seeds))
 
 
 def in_workers(seeds: range, kind: str) -> list[torch.Tensor]:
-    """Pictures by processes that are forked from this one, which has rendered before, or spawned."""
+    """Pictures rendered by processes that are spawned, or forked from this one, which has rendered before."""
     context = multiprocessing.get_context(kind)
     with ProcessPoolExecutor(2, context) as pool:
         return list(pool.map(rendering, seeds, timeout=300))
 
 
 class Busy:
-    """Other libraries' threads at work: OpenMP's in PyTorch, TBB's in OpenVINO."""
+    """Keeps threads of other libraries busy: OpenMP in PyTorch, TBB in OpenVINO."""
 
     def __enter__(self) -> "Busy":
         import openvino
@@ -130,13 +130,13 @@ class Busy:
 
 
 def main() -> None:
-    """Soaks, and ends with an error if memory grew by 3 % or a picture differs."""
+    """Renders; exit code 1 if memory grew by more than 3 % or a picture differs."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--renderings", type=int, default=1000)
     parser.add_argument("--pictures", type=int, default=64, help="For threads and workers.")
     arguments = parser.parse_args()
     start = time.monotonic()
-    before, after = grown(arguments.renderings, say=True)
+    before, after = memory_growth(arguments.renderings, verbose=True)
     print(f"{before:.1f} to {after:.1f} MB: {after / before - 1:+.2%}")
     seeds = range(arguments.pictures)
     truth = [rendering(seed) for seed in seeds]

@@ -1,4 +1,4 @@
-"""What every public entry refuses by name: types that only store, plans and lenses that there are not."""
+"""Errors of every public entry: storage-only types, impossible plans, lenses whose blur overflows."""
 
 import functools
 import math
@@ -45,7 +45,7 @@ STORED = [torch.float8_e4m3fn, torch.float8_e5m2, torch.float8_e4m3fnuz, torch.f
 
 @pytest.mark.parametrize("dtype", [*STORED, torch.float4_e2m1fn_x2], ids=str)
 @pytest.mark.parametrize("name", TAKES_TENSORS)
-def test_types_that_only_store_are_refused_by_name(name: str, dtype: torch.dtype) -> None:
+def test_storage_only_types_are_refused_by_name(name: str, dtype: torch.dtype) -> None:
     stored = torch.full((1, 1, 4, 5), 56, dtype=torch.uint8).view(dtype)
     with pytest.raises(ValueError, match=rf"{name.strip()}\b.* got .*float(8|4)"):
         TAKES_TENSORS[name](stored)
@@ -54,12 +54,12 @@ def test_types_that_only_store_are_refused_by_name(name: str, dtype: torch.dtype
 # Plans
 
 
-def test_a_plan_that_reaches_stays_as_it_is() -> None:
+def test_a_plan_with_enough_layers_is_unchanged_and_a_short_one_is_extended() -> None:
     plan = DOF.plan(texture(), slope(1.2, 6.0))
     coc = DOF.coc_px(texture(), slope(1.2, 6.0))
     assert plan.reaching(coc) is plan and plan.reaching(0.5 * coc) is plan
     every = Plan.all(2.0, 1 / 255)
-    assert every.reaching(coc) is every  # that of a graph, which cannot look at its scene
+    assert every.reaching(coc) is every  # plan of a traced graph, which does not depend on its scene
     wider = plan.reaching(3.0 * coc)
     assert set(plan.nodes) < set(wider.nodes)
     gaps = [high - low for low, high in zip(wider.nodes, wider.nodes[1:], strict=False)]
@@ -82,7 +82,7 @@ def test_a_plan_without_a_tolerance_is_refused(tolerance: Any) -> None:
         Plan((0.0, 1.0), tolerance)
 
 
-# Lenses that there are not
+# Lenses whose blur overflows
 
 
 @pytest.mark.parametrize(
@@ -93,10 +93,12 @@ def test_a_plan_without_a_tolerance_is_refused(tolerance: Any) -> None:
         (Camera(focal_length_mm=1e200, focus_m=1e250), 3.0, r"focal_length_mm 1e\+200"),
         (Camera(focus_m=1e-45, focus_breathing=False), 3.0, "focus_m 1e-45"),
         (Camera(focus_m=torch.tensor([1e-45]), focus_breathing=False), 3.0, "focus_m 1.4013e-45"),
-        (Camera(), 1e-45, "a depth of 1.4e-45 m"),
+        (Camera(), 1e-45, "which starts at 1.4e-45 m"),
     ],
 )
-def test_a_blur_beyond_numbers_names_the_lens_and_the_depth(camera: Camera, depth: float, named: str) -> None:
+def test_an_infinite_blur_radius_is_refused_with_the_lens_and_the_depth(
+    camera: Camera, depth: float, named: str
+) -> None:
     image, depths, dof = texture(), whole(depth), DepthOfField(camera)
     calls: list[Callable[[], Any]] = [
         functools.partial(dof, image, depths),
@@ -108,6 +110,6 @@ def test_a_blur_beyond_numbers_names_the_lens_and_the_depth(camera: Camera, dept
                           background_depth=depths),
     ]  # fmt: skip
     for call in calls:
-        with pytest.raises(ValueError, match=f"this lens .*{named}") as refused:
+        with pytest.raises(ValueError, match=f"this lens .*{named}") as caught:
             call()
-        assert "coc_px" not in str(refused.value) and "check=False" not in str(refused.value)
+        assert "coc_px" not in str(caught.value) and "check=False" not in str(caught.value)

@@ -1,4 +1,4 @@
-"""Numbers that are finite but absurd, in lenses, openings, fields and depth maps, are refused by name or do no harm."""
+"""Finite but absurd numbers in lenses, apertures, fields and depth maps are refused by name or do no harm."""
 
 import base64
 import functools
@@ -48,16 +48,14 @@ def field_table(**change: Any) -> BlurTable:
 
 @pytest.mark.parametrize("engine", ["torch", "native"])
 @pytest.mark.parametrize("box", [1e-300, 1e-3, 1e3])
-def test_fields_at_the_ends_of_what_is_taken_make_pictures(
-    box: float, engine: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fields_of_extreme_but_allowed_sizes_render(box: float, engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", engine)
     table = field_table(box=torch.full((3, 3, 3), box, dtype=torch.float64))
     out = blur_by_coc(torch.rand(1, 3, 9, 12), torch.linspace(-3, 4, 12).expand(1, 1, 9, 12), table=table)
     assert 0.0 <= float(out.min()) <= float(out.max()) <= 1.0 + 1e-5
 
 
-def test_a_field_that_inflates_without_end_is_refused() -> None:
+def test_a_zip_bomb_in_a_field_is_refused() -> None:
     data = field_table().field.to_dict()  # type: ignore[union-attr]
     bomb = base64.b64encode(zlib.compress(bytes(10**7), 9)).decode()
     with pytest.raises(ValueError, match="must hold 432 bytes"):
@@ -115,20 +113,20 @@ def test_absurd_numbers_are_refused(call: Callable[[], Any], message: str) -> No
 
 
 @pytest.mark.parametrize("words", ["A2=1e308", "A2=1e300 A4=-1e300", "k=1e300", "A16=1e308"])
-def test_surfaces_beyond_any_lens_are_refused_without_a_warning(words: str, tmp_path: Path) -> None:
+def test_absurd_surfaces_are_refused_without_a_warning(words: str, tmp_path: Path) -> None:
     (tmp_path / "lens.txt").write_text(SINGLET.format(words, 15))
     with pytest.raises(ValueError, match="lens.txt: line 1: (A16|A2|conic constant) must"):
         Lens.read(tmp_path / "lens.txt")
 
 
-def test_a_stack_of_lenses_that_bends_light_beyond_measure_is_refused_without_a_warning(tmp_path: Path) -> None:
+def test_an_absurdly_strong_lens_is_refused_without_a_warning(tmp_path: Path) -> None:
     (tmp_path / "lens.txt").write_text("0.001 1e7 4.9 20\n-0.001 1e7 1 20\n" * 30 + "-50 3 1 20\n0 0 0 15")
     with pytest.raises(ValueError, match="lens 'lens' bends light beyond measure"):
         focus_sensor(Lens.read(tmp_path / "lens.txt"), 2.0)
 
 
 def step(near: float, far: float) -> Tensor:
-    """A map of nearness in which a square stands out, displaced by a pixel against that of the image."""
+    """Nearness `far` with a square of nearness `near`, one pixel right of the image's square."""
     nearness = torch.full((1, 1, 24, 32), far)
     nearness[..., 6:18, 9:21] = near
     return nearness
@@ -156,12 +154,12 @@ def test_repairs_of_maps_and_light_of_any_size_stay_finite(
     nearness, light = case
     image = torch.full((1, 3, 24, 32), 0.1 * light)
     image[..., 6:18, 8:20] = light
-    mended = repair(image, nearness, torch.tensor(1.0), auto)
+    repaired = repair(image, nearness, torch.tensor(1.0), auto)
     known = torch.isfinite(nearness)
-    assert torch.equal(torch.isfinite(mended), known)
-    assert float(mended[known].abs().max()) <= 1.001 * float(nearness[known].abs().max())
-    beyond = nearness.abs() > 1e15
-    assert torch.equal(mended[beyond], nearness[beyond])
+    assert torch.equal(torch.isfinite(repaired), known)
+    assert float(repaired[known].abs().max()) <= 1.001 * float(nearness[known].abs().max())
+    too_large = nearness.abs() > 1e15
+    assert torch.equal(repaired[too_large], nearness[too_large])
 
 
 @pytest.mark.parametrize("focus", ["0", "-1", "nan", "0.02"])
@@ -171,19 +169,19 @@ def test_the_command_line_refuses_a_focus_within_the_lens(focus: str, tmp_path: 
     assert done.exit_code == 2 and "--focus-m must be a number of metres" in done.output
 
 
-def test_a_root_holds_photographs_without_a_description_as_well(tmp_path: Path) -> None:
+def test_root_also_limits_photographs_without_a_description(tmp_path: Path) -> None:
     (tmp_path / "photographs").mkdir()
     (tmp_path / "elsewhere").mkdir()
     for number in range(2):
         write_image(tmp_path / "elsewhere" / f"{number}.png", Picture(torch.rand(1, 3, 40, 40)))
         os.symlink(tmp_path / "elsewhere" / f"{number}.png", tmp_path / "photographs" / f"{number}.png")
     call = ["fit", str(tmp_path / "photographs"), "-o", str(tmp_path / "table.json"), "--root"]
-    said: Callable[[Path], str] = lambda root: CliRunner().invoke(app, [*call, str(root)]).output  # noqa: E731
-    assert "lies outside of" in said(tmp_path / "photographs")
-    assert "show the target" in said(tmp_path)
+    output: Callable[[Path], str] = lambda root: CliRunner().invoke(app, [*call, str(root)]).output  # noqa: E731
+    assert "lies outside of" in output(tmp_path / "photographs")
+    assert "show the target" in output(tmp_path)
 
 
-def test_a_plot_that_cannot_be_finished_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plot_that_cannot_be_written_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full_disk(_: Figure, path: Path) -> None:
         Path(path).write_bytes(b"half of a picture")
         raise OSError("No space left on device")

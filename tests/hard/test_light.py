@@ -1,4 +1,4 @@
-"""What is refused, and what must not overflow, beside the scenes of `tests/test_engines.py`."""
+"""Bad numbers are refused, and very bright light does not overflow; ``tests/test_engines.py`` has more scenes."""
 
 import math
 from typing import Any
@@ -25,16 +25,16 @@ def test_bad_numbers_are_refused_and_counted(name: str, bad: float) -> None:
         "coc_px": lambda: blur_by_coc(image, depth),
         "rgba": lambda: DepthOfField(CAMERA).layers(rgba, torch.tensor([1.0, 4.0])),
     }
-    said = {"depth": "depth must be > 0 .*got 2 of 768 pixels"}.get(name, f"{name} must be finite, got 2 of ")
+    message = {"depth": "depth must be > 0 .*got 2 of 768 pixels"}.get(name, f"{name} must be finite, got 2 of ")
     if bad != math.inf if name == "depth" else not math.isfinite(bad):
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             calls[name]()
     elif name != "rgba":
         calls[name]()
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_a_bad_coc_passes_sharp_when_it_is_not_checked(bad: float) -> None:
+def test_an_unchecked_bad_coc_leaves_its_pixel_sharp(bad: float) -> None:
     image, coc = texture(), whole(4.0)
     coc[0, 0, 5, 5] = bad
     out = blur_by_coc(image, coc, check=False)
@@ -61,14 +61,14 @@ def test_the_ring_of_the_paper_keeps_a_highlight_inside_its_support() -> None:
 
 
 @EVERY_WAY
-def test_gradients_of_light_of_any_size_are_those_of_small_light(way: dict[str, Any]) -> None:
+def test_gradients_do_not_depend_on_the_scale_of_the_light(way: dict[str, Any]) -> None:
     small, bright = ((texture() * k).requires_grad_() for k in (2.0**20, 2.0**90))
     grads = [torch.autograd.grad(blur_by_coc(x, halves(-6.0, 5.0), **way).mean(), x)[0] for x in (small, bright)]
     assert_close(grads[0], grads[1], rtol=1e-4, atol=1e-9)
 
 
 @EVERY_WAY
-def test_the_plain_average_of_many_renderings_of_noise_is_the_rendering_of_its_mean(way: dict[str, Any]) -> None:
+def test_the_mean_of_renderings_of_noise_is_the_rendering_of_the_mean(way: dict[str, Any]) -> None:
     flat, coc = torch.full((1, 1, 20, 24), 0.5), torch.full((1, 1, 20, 24), 3.3)
     noise = [torch.randn_like(flat) for _ in range(8)]
     total = sum(blur_by_coc(flat + n, coc, **way).double() for n in [*noise, *(-n for n in noise)])
@@ -76,8 +76,8 @@ def test_the_plain_average_of_many_renderings_of_noise_is_the_rendering_of_its_m
 
 
 @pytest.mark.parametrize("reach", [2.0, 9.0, 30.0])
-def test_coverage_lies_between_none_and_all(reach: float) -> None:
-    # light 1 on top of light 0: the picture is the coverage of what is in front
+def test_coverage_lies_in_0_to_1(reach: float) -> None:
+    # a foreground of light 1 over a background of light 0: the picture is the foreground's coverage
     image, coc = torch.zeros(1, 1, 40, 50), torch.full((1, 1, 40, 50), reach)
     front = torch.rand(1, 1, 40, 50) < 0.2
     image[front], coc[front] = 1.0, -reach

@@ -1,4 +1,4 @@
-"""Long use of one process: it does not grow, and threads and workers make the same pictures."""
+"""Many renderings in one process: memory does not grow; threads and worker processes render the same pictures."""
 
 import subprocess
 import sys
@@ -11,16 +11,16 @@ from tests.hard import soak
 SOAK = Path(__file__).with_name("soak.py")
 
 
-def soaked(*arguments: str) -> list[str]:
+def run_soak(*arguments: str) -> list[str]:
     run = subprocess.run([sys.executable, str(SOAK), *arguments], capture_output=True, text=True, timeout=3000)
     assert run.returncode == 0, run.stdout + run.stderr
     return run.stdout.splitlines()
 
 
 @pytest.mark.sweep
-def test_a_thousand_renderings_leave_memory_as_it_was_and_workers_make_the_same_pictures() -> None:
-    said = soaked("--renderings", "1000")
-    assert [line.partition(":")[0] for line in said if line.endswith("are the same")] == [
+def test_memory_does_not_grow_over_a_thousand_renderings_and_workers_render_the_same_pictures() -> None:
+    lines = run_soak("--renderings", "1000")
+    assert [line.partition(":")[0] for line in lines if line.endswith("are the same")] == [
         "8 threads",
         "spawned workers",
         "forked workers",
@@ -34,11 +34,11 @@ from torchdof import blur_by_coc
 signal.alarm(100)
 torch.set_num_threads(2)
 image, coc_px = torch.rand(1, 3, 200, 300), torch.linspace(-9.0, 9.0, 300).expand(1, 1, 200, 300)
-wanted = blur_by_coc(image, coc_px)
+expected = blur_by_coc(image, coc_px)
 child = os.fork()
 signal.alarm(100)
 if child == 0:
-    os._exit(0 if torch.allclose(blur_by_coc(image, coc_px), wanted) else 3)
+    os._exit(0 if torch.allclose(blur_by_coc(image, coc_px), expected) else 3)
 print(os.waitpid(child, 0)[1], torch.get_num_threads())
 """
 
@@ -46,13 +46,13 @@ print(os.waitpid(child, 0)[1], torch.get_num_threads())
 @pytest.mark.hard
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no fork")
 @pytest.mark.parametrize("engine", ["torch", "native"])
-def test_a_forked_worker_renders_after_its_parent_has_by_many_threads(engine: str) -> None:
+def test_a_forked_worker_renders_after_its_parent_has_rendered_with_two_threads(engine: str) -> None:
     run = subprocess.run([sys.executable, "-c", FORKED, engine], capture_output=True, text=True, timeout=200)
     assert run.stdout == "0 2\n", run.stdout + run.stderr
 
 
 @pytest.mark.hard
-def test_eight_threads_with_a_module_each_make_the_same_pictures() -> None:
+def test_eight_threads_with_a_module_each_render_the_same_pictures() -> None:
     truth = [soak.rendering(seed) for seed in range(12)]
     assert soak.same(soak.in_threads(range(12), 8), truth)
 
@@ -76,7 +76,7 @@ print(early, rss())
 
 @pytest.mark.hard
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_500_frames_in_one_process_do_not_grow() -> None:
+def test_memory_does_not_grow_over_500_frames() -> None:
     done = subprocess.run([sys.executable, "-c", MANY], capture_output=True, text=True, timeout=400)
     assert done.returncode == 0, done.stderr
     early, late = (int(x) for x in done.stdout.split())

@@ -1,4 +1,4 @@
-"""Tensors without memory of their own are refused by name before the compiled engine could read it."""
+"""Tensors without memory are refused by name; the compiled engine would read invalid addresses."""
 
 import subprocess
 import sys
@@ -13,7 +13,7 @@ from torchdof.tensors import has_storage
 
 
 class Wrapper(Tensor):
-    """A tensor whose numbers are another one's."""
+    """A wrapper subclass: it has a shape but no memory."""
 
     @staticmethod
     def __new__(cls) -> "Wrapper":
@@ -43,7 +43,7 @@ def fake() -> Tensor:
 
 
 @pytest.mark.parametrize("make", [freed, cut, fake, Wrapper])
-def test_what_has_no_memory_is_refused_by_name(make: type[Wrapper]) -> None:
+def test_tensors_without_memory_are_refused_by_name(make: type[Wrapper]) -> None:
     image = torch.rand(1, 3, 40, 50)
     with pytest.raises(ValueError, match=r"coc_px must be a tensor .* that holds data"):
         blur_by_coc(image, make())
@@ -53,7 +53,7 @@ def test_what_has_no_memory_is_refused_by_name(make: type[Wrapper]) -> None:
         blur_by_coc(make(), torch.ones(1, 1, 40, 50))
 
 
-def test_a_fake_mode_around_real_tensors_does_not_end_the_process() -> None:
+def test_a_fake_mode_with_real_tensors_does_not_crash() -> None:
     script = (
         "import torch, torchdof\nfrom torch._subclasses.fake_tensor import FakeTensorMode\n"
         "image, coc = torch.rand(1, 3, 300, 300), 9 * torch.rand(1, 1, 300, 300)\n"
@@ -64,7 +64,7 @@ def test_a_fake_mode_around_real_tensors_does_not_end_the_process() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_views_have_their_memory_and_empty_tensors_need_none() -> None:
+def test_views_and_empty_tensors_have_storage() -> None:
     values = torch.ones(4, 5, 6)
     assert all(map(has_storage, (values[2:, ::2], values.permute(2, 0, 1), values[:1].expand(9, 5, 6), values[:0])))
 
@@ -76,7 +76,7 @@ def test_torch_jit_trace_is_refused() -> None:
         torch.jit.trace(blur_by_coc, (image, coc_px))
 
 
-def test_a_default_of_float64_leaves_gradients_of_float32_alone() -> None:
+def test_gradients_stay_float32_if_the_default_type_is_float64() -> None:
     image, coc_px = torch.rand(1, 3, 60, 60).requires_grad_(), 9 * torch.rand(1, 1, 60, 60)
     torch.set_default_dtype(torch.float64)
     try:

@@ -1,4 +1,4 @@
-"""A file is written whole or not at all: on full disks, by several at once, and whatever ends the process."""
+"""A file is written whole or not at all: on full disks, with concurrent writers, and when the process ends."""
 
 import os
 import signal
@@ -23,7 +23,7 @@ PICTURE = Picture(torch.linspace(0, 1, 3 * 8 * 9).reshape(1, 3, 8, 9))
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
 @pytest.mark.parametrize("step", ["fsync", "replace"])
-def test_what_fails_leaves_the_old_file_and_nothing_else(
+def test_a_failed_write_leaves_the_old_file_and_no_other(
     error: type[BaseException], step: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: Any) -> None:
@@ -62,7 +62,7 @@ KINDS = (".png 8", ".png 16", ".exr half", ".exr float", ".tif float", ".hdr flo
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits the size of files")
-def test_a_disk_that_is_full_from_the_start_or_at_the_last_byte_is_noticed(tmp_path: Path) -> None:
+def test_a_full_disk_is_an_error_and_leaves_the_old_file(tmp_path: Path) -> None:
     folders = [f"x{kind}" for kind in KINDS]
     for name in folders:
         (tmp_path / name).mkdir()
@@ -70,14 +70,14 @@ def test_a_disk_that_is_full_from_the_start_or_at_the_last_byte_is_noticed(tmp_p
     call = [sys.executable, "-c", CUT, *folders]
     run = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     for name in folders:
-        said = [line.removeprefix(name) for line in run.stdout.splitlines() if line.startswith(name)]
-        assert len(said) == 4 and all(line.startswith(" refused:") for line in said), run.stdout + run.stderr
+        results = [line.removeprefix(name) for line in run.stdout.splitlines() if line.startswith(name)]
+        assert len(results) == 4 and all(line.startswith(" refused:") for line in results), run.stdout + run.stderr
         file = name.split()[0]
         assert sorted(p.name for p in (tmp_path / name).iterdir()) == [f"whole{file}", file]
         assert (tmp_path / name / file).read_text() == "old"
 
 
-def test_writers_of_one_name_at_once_leave_one_whole_file(tmp_path: Path) -> None:
+def test_concurrent_writers_of_one_file_leave_it_whole(tmp_path: Path) -> None:
     script = """
 import sys, torch
 from torchdof.io.images import Picture, write_image
@@ -93,7 +93,7 @@ for _ in range(20):
 WRITING = """
 import signal, sys, time
 from torchdof.io.atomic import whole_file
-signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup it is ignored, and stays so
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup would have set it to be ignored
 with whole_file(sys.argv[1]) as outer, whole_file(sys.argv[1] + ".json") as inner:
     outer.write_bytes(b"half")
     inner.write_bytes(b"half")
@@ -103,7 +103,7 @@ with whole_file(sys.argv[1]) as outer, whole_file(sys.argv[1] + ".json") as inne
 
 
 def writing(path: Path) -> subprocess.Popen[str]:
-    """A process that is in the middle of two files."""
+    """A process that is writing two files."""
     run = subprocess.Popen([sys.executable, "-c", WRITING, str(path)], stdout=subprocess.PIPE, text=True)
     assert run.stdout is not None and run.stdout.readline() == "writing\n"
     return run
@@ -111,7 +111,7 @@ def writing(path: Path) -> subprocess.Popen[str]:
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_termination_while_files_are_written_leaves_nothing_of_them(tmp_path: Path, number: int) -> None:
+def test_termination_during_a_write_removes_the_temporary_files(tmp_path: Path, number: int) -> None:
     (tmp_path / "x.exr").write_text("old")
     with writing(tmp_path / "x.exr") as run:
         run.send_signal(number)
@@ -120,12 +120,12 @@ def test_termination_while_files_are_written_leaves_nothing_of_them(tmp_path: Pa
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
-def test_what_a_killed_process_left_is_removed_by_the_first_that_writes_there_a_day_later(tmp_path: Path) -> None:
+def test_temporary_files_of_a_killed_process_are_removed_by_a_write_a_day_later(tmp_path: Path) -> None:
     with writing(tmp_path / "x.exr") as run:
         run.kill()
     left = {*tmp_path.iterdir()}
     other = tmp_path / ".y.exr-like.part"
-    other.write_text("of somebody else")
+    other.write_text("of another program")
     for path in (*left, other):
         os.utime(path, (time.time() - 90_000,) * 2)
     with writing(tmp_path / "z.exr") as living:
@@ -134,7 +134,7 @@ def test_what_a_killed_process_left_is_removed_by_the_first_that_writes_there_a_
         living.kill()
 
 
-def test_a_handler_of_the_caller_is_left_alone(tmp_path: Path) -> None:
+def test_a_signal_handler_of_the_caller_is_kept(tmp_path: Path) -> None:
     def handler(*_: Any) -> None: ...
 
     before = signal.signal(signal.SIGTERM, handler)
@@ -147,7 +147,7 @@ def test_a_handler_of_the_caller_is_left_alone(tmp_path: Path) -> None:
         signal.signal(signal.SIGTERM, before)
 
 
-def test_a_folder_is_searched_for_leftovers_once(tmp_path: Path) -> None:
+def test_a_folder_is_searched_for_abandoned_files_once(tmp_path: Path) -> None:
     for _ in range(2):
         write_text(tmp_path / "x.txt", "x")
         (tmp_path / f".{'0' * 32}.part").touch()

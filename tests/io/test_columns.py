@@ -1,4 +1,4 @@
-"""Tables for people: whole on any terminal."""
+"""Printed tables are folded to the width of the terminal."""
 
 import io
 import re
@@ -23,18 +23,18 @@ def printed(width: int) -> list[str]:
 
 
 @pytest.mark.parametrize("width", [40, 80, 200])
-def test_columns_that_have_no_room_are_folded_and_none_is_cut(width: int) -> None:
+def test_columns_that_do_not_fit_are_folded_and_not_cut(width: int) -> None:
     lines = printed(width)
     assert max(map(len, lines)) <= width
     cells = [cell.strip() for line in lines for cell in re.split("  +", line)]
     for name, values in COLUMNS.items():
         assert name in cells and all(value in cells for value in values)
-    # the first column stands before each part, and the title above the first alone
+    # each part starts with the first column; the title is above the first part only
     assert cells.count("distance m") == sum("──" in line for line in lines) == {40: 6, 80: 2, 200: 1}[width]
     assert sum("colours" in line for line in lines) == 1
 
 
-def test_a_benchmark_s_table_is_whole_at_80_columns(
+def test_the_table_of_a_benchmark_fits_80_columns(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")

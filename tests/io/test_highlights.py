@@ -1,4 +1,4 @@
-"""Clipped lamps get light above white; everything else stays as it was."""
+"""Clipped lamps get light above white; other pixels are unchanged."""
 
 import math
 from pathlib import Path
@@ -23,7 +23,7 @@ def night(level: float = 1.0, side: int = 3, colour: tuple[float, float, float] 
     return light
 
 
-def test_what_is_not_near_clipped_keeps_its_bits() -> None:
+def test_unclipped_pixels_are_bit_exact() -> None:
     light = torch.rand(2, 3, 60, 80)
     risen = expand_highlights(light)
     is_dark = light <= 0.87
@@ -45,14 +45,14 @@ def test_a_clipped_lamp_has_the_hue_of_its_rim() -> None:
     torch.testing.assert_close(risen / risen[0], torch.tensor([1.0, 0.6, 0.3]), rtol=0, atol=0.02)
 
 
-def test_one_clipped_channel_is_what_the_others_are_worth_in_the_colour_of_the_rim() -> None:
+def test_one_clipped_channel_follows_from_the_others_and_the_hue_of_the_rim() -> None:
     light = night(colour=(1.0, 0.2, 0.2))
     light[..., 40:43, 80:83] = torch.tensor([1.0, 0.5, 0.5]).reshape(1, 3, 1, 1)
     red, green, _ = expand_highlights(light)[0, :, 41, 81].tolist()
     assert red == pytest.approx(2.5, rel=0.05) and green == 0.5
 
 
-def test_light_is_monotone_and_continuous_in_the_level_of_a_lamp_and_in_stops() -> None:
+def test_light_is_monotone_and_continuous_in_the_level_of_a_lamp_and_in_the_stops() -> None:
     levels = torch.linspace(0.8, 1.0, 401)
     risen = torch.stack([expand_highlights(night(float(level)))[0, :, 41, 81] for level in levels])
     steps = risen.diff(dim=0)
@@ -62,13 +62,13 @@ def test_light_is_monotone_and_continuous_in_the_level_of_a_lamp_and_in_stops() 
     assert bool((by_stops.diff() > 0).all()) and float(by_stops[1]) < 1.001
 
 
-def test_gradients_are_those_of_differences() -> None:
+def test_gradients_equal_finite_differences() -> None:
     light = 0.9 * torch.rand(1, 3, 6, 7, dtype=torch.float64) + 0.02
     assert torch.autograd.gradcheck(expand_highlights, (light.requires_grad_(),))
 
 
 @pytest.mark.parametrize(
-    ("light", "stops", "says"),
+    ("light", "stops", "message"),
     [
         (torch.ones(3, 4, 4), 3.0, r"light must be \[B, C, H, W\]"),
         (torch.ones(1, 3, 0, 4), 3.0, "at least one pixel"),
@@ -78,13 +78,13 @@ def test_gradients_are_those_of_differences() -> None:
         (torch.ones(1, 3, 4, 4), math.nan, "stops must be a finite number"),
     ],
 )
-def test_wrong_input_is_refused(light: Tensor, stops: float, says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_wrong_input_is_refused(light: Tensor, stops: float, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         expand_highlights(light, stops)
 
 
 @pytest.mark.parametrize(("name", "gain_db"), [("highlights", 0.5), ("room", -0.02), ("planes", -0.02)])
-def test_lamps_come_nearer_to_the_truth_and_other_scenes_lose_nothing(name: str, gain_db: float) -> None:
+def test_psnr_rises_with_lamps_and_does_not_fall_without(name: str, gain_db: float) -> None:
     for scene in read_scenes(SCENES / name):
         clipped, truth = scene.image.clamp(max=1.0), display(scene.truth)
         before, after = (

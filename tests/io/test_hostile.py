@@ -1,6 +1,6 @@
-"""Files that lie, are damaged, too large, or of a kind that is not read: refused by name, in one line, without harm.
+"""Damaged, malicious, too large and unsupported files are refused with their name, in one line, without side effects.
 
-Files with any bytes changed: tests/fuzz.
+tests/fuzz changes arbitrary bytes of files.
 """
 
 import os
@@ -41,7 +41,7 @@ def with_bytes(content: bytes) -> Made:
 
 
 def with_values(values: np.ndarray, *names: str, kind: str = "float", tags: dict[int, int] | None = None) -> Made:
-    """A file by OpenImageIO alone, in a TIFF some tags of which are changed afterwards."""
+    """Writes a file with OpenImageIO alone, then changes ``tags`` of a TIFF."""
 
     def make(path: Path) -> None:
         spec = oiio.ImageSpec(values.shape[1], values.shape[0], values.shape[2], kind)
@@ -94,7 +94,7 @@ def large_map(path: Path) -> None:
 
 
 class Bomb:
-    """Makes a file when it is unpickled."""
+    """Creates a file if it is unpickled."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (Path.touch, (Path("ran"),))
@@ -109,7 +109,7 @@ def holed() -> np.ndarray:
 GREY, COLOUR, TEXT = np.ones((2, 3, 1), np.float32), np.ones((2, 3, 3), np.float32), b"hello world, this is no image\n"
 NOT_RGB = r"colours are not stored as RGB or grey \(photometric interpretation"
 
-# name, how it is made, what reading it as an image is refused with, and as a map (None: not tried)
+# name, function that makes the file, error of read_image, error of read_values (None: not tried)
 FILES: list[tuple[str, Made | None, str | None, str | None]] = [
     ("none.png", None, "there is no such file", "there is no such file"),
     ("none.npy", None, "is not an image that can be read", "there is no such file"),
@@ -139,7 +139,7 @@ FILES: list[tuple[str, Made | None, str | None, str | None]] = [
     ("inks.tif", with_values(COLOUR, kind="uint8", tags={262: 5}), f"{NOT_RGB} 5", f"{NOT_RGB} 5"),
     ("mosaic.tif", with_values(GREY, kind="uint16", tags={262: 32803}), f"{NOT_RGB} 32803", f"{NOT_RGB} 32803"),
     ("negative.tif", with_values(GREY, kind="uint16", tags={262: 0}), f"{NOT_RGB} 0", f"{NOT_RGB} 0"),
-    ("signed.tif", with_values(GREY, kind="int16"), "numbers of type int16, of which it is not known what is wh", None),
+    ("signed.tif", with_values(GREY, kind="int16"), "numbers of type int16, for which white is not defined", None),
     ("colour.png", with_values(np.eye(3, dtype=np.float32)[None], kind="uint8"), None, "which of the channels R, G, B"),
     ("object.npy", with_array(np.array([[{"a": 1}]], object)), None, "cannot be read as an array"),
     ("bomb.npy", with_array(np.array([[Bomb()]], object)), None, "cannot be read as an array"),
@@ -156,7 +156,7 @@ FILES: list[tuple[str, Made | None, str | None, str | None]] = [
 
 
 @pytest.mark.parametrize(("name", "make", "image", "values"), FILES, ids=[file[0] for file in FILES])
-def test_a_file_that_is_not_what_it_should_be_is_refused_by_name_in_one_line(
+def test_invalid_files_are_refused_by_name_in_one_line(
     name: str, make: Made | None, image: str | None, values: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -195,20 +195,20 @@ def test_a_target_that_cannot_be_written_is_named(name: str, sample: Any, messag
     ("name", "how"),
     [("a.heic", "convert it to JPEG or 16-bit TIFF"), ("a.AVIF", "convert it"), ("a.dng", "develop it to linear")],
 )
-def test_a_type_without_a_reader_is_refused_with_how_to_convert_it(
+def test_a_format_without_a_reader_is_refused_with_its_conversion(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, how: str
 ) -> None:
     monkeypatch.setattr(foreign, "readable", lambda: ())
     with pytest.raises(ValueError, match=rf"{name}: {Path(name).suffix.lower()} is not read here: {how}"):
         read_image(name)
-    # OpenImageIO goes by what is in a file: a JPEG stands for what its reader of such a type would give
+    # OpenImageIO looks at the content, so that a renamed JPEG replaces a file of this format
     write_image(tmp_path / "a.jpg", Picture(torch.full((1, 3, 8, 8), 0.2159)))
     (tmp_path / "a.jpg").rename(tmp_path / name)
     monkeypatch.setattr(foreign, "readable", lambda: (Path(name).suffix.lower(),))
     assert float(read_image(tmp_path / name).pixels.mean()) == pytest.approx(0.2159, abs=0.002)
 
 
-def test_names_that_are_no_utf_8_are_read_and_written(tmp_path: Path) -> None:
+def test_files_with_names_that_are_not_utf_8_are_read_and_written(tmp_path: Path) -> None:
     folder = tmp_path / os.fsdecode(b"caf\xe9")
     folder.mkdir()
     for suffix, sample in KINDS.items():
@@ -257,7 +257,7 @@ for suffix in sys.argv[1:]:
 """
 
 
-def test_no_library_prints_a_line_of_its_own_about_a_damaged_picture(tmp_path: Path) -> None:
+def test_libraries_print_nothing_about_a_damaged_picture(tmp_path: Path) -> None:
     for suffix in KINDS:
         write_image(tmp_path / f"whole{suffix}", tiny())
     call = [sys.executable, "-c", SILENT, *KINDS]
@@ -266,7 +266,7 @@ def test_no_library_prints_a_line_of_its_own_about_a_damaged_picture(tmp_path: P
 
 
 def with_attributes(path: Path, count: int) -> None:
-    """An EXR with so many attributes in its header."""
+    """Writes an EXR with ``count`` more attributes in its header."""
     write_image(path, tiny())
     content, end = path.read_bytes(), 8
     while content[end]:
@@ -274,11 +274,11 @@ def with_attributes(path: Path, count: int) -> None:
         type_end = content.index(b"\0", name_end + 1)
         end = type_end + 5 + int.from_bytes(content[type_end + 1 : type_end + 5], "little")
     more = b"".join(b"a%d\0int\0" % i + struct.pack("<Ii", 4, i) for i in range(count))
-    (pixels_at,) = struct.unpack("<Q", content[end + 1 : end + 9])  # of its only block of lines
+    (pixels_at,) = struct.unpack("<Q", content[end + 1 : end + 9])  # offset of the only block of lines
     path.write_bytes(content[:end] + more + b"\0" + struct.pack("<Q", pixels_at + len(more)) + content[end + 9 :])
 
 
-def test_attributes_are_kept_and_endless_ones_refused_at_once(tmp_path: Path) -> None:
+def test_attributes_are_kept_and_too_many_are_refused_at_once(tmp_path: Path) -> None:
     with_attributes(tmp_path / "some.exr", 500)
     assert read_image(tmp_path / "some.exr").metadata["a499"][1] == 499
     for count in (MOST_ATTRIBUTES, 100_000):
@@ -286,10 +286,10 @@ def test_attributes_are_kept_and_endless_ones_refused_at_once(tmp_path: Path) ->
         start = time.perf_counter()
         with pytest.raises(ValueError, match=rf"x\.exr: its headers hold more than {MOST_ATTRIBUTES} attributes"):
             read_image(tmp_path / "x.exr")
-        assert time.perf_counter() - start < 2.0  # its library takes minutes
+        assert time.perf_counter() - start < 2.0  # OpenEXR takes minutes
 
 
-def test_endless_texts_of_a_png_cost_no_time(tmp_path: Path) -> None:
+def test_huge_texts_in_a_png_cost_no_time(tmp_path: Path) -> None:
     write_image(tmp_path / "x.png", tiny())
     content = (tmp_path / "x.png").read_bytes()
     bomb = chunk(b"zTXt", b"k\0\0" + zlib.compress(bytes(2**27), 9))
@@ -349,7 +349,7 @@ def read(name):
 """
 
 
-def told(code: str, folder: Path, names: list[str]) -> list[str]:
+def output_of(code: str, folder: Path, names: list[str]) -> list[str]:
     run = subprocess.run(
         [sys.executable, "-c", READ + code, *names], cwd=folder, capture_output=True, text=True, timeout=300
     )
@@ -362,14 +362,14 @@ def test_huge_sizes_in_a_header_are_refused_without_the_memory(tmp_path: Path) -
     for name, make in HUGE.items():
         make(tmp_path / name)
     code = "limit(6000)\nfor name in sys.argv[1:]:\n    read(name)\nprint(memory.peak_mb())"
-    *lines, megabytes = told(code, tmp_path, [*HUGE])
+    *lines, megabytes = output_of(code, tmp_path, [*HUGE])
     assert len(lines) == 7 and all(re.match(r"(huge\.\w+) refused: .*\1", line) for line in lines), lines
     assert float(megabytes) < 1500
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits memory")
 @pytest.mark.parametrize("known", [True, False], ids=["known", "unknown"])
-def test_a_picture_that_memory_cannot_hold_is_refused(known: bool, tmp_path: Path) -> None:
+def test_a_picture_that_does_not_fit_into_memory_is_refused(known: bool, tmp_path: Path) -> None:
     side = 4096
     zeros = np.zeros((side, side), np.float32)
     np.save(tmp_path / "x.npy", zeros)
@@ -379,16 +379,16 @@ def test_a_picture_that_memory_cannot_hold_is_refused(known: bool, tmp_path: Pat
     (tmp_path / "x.png").write_bytes(png(side, zlib.compress(bytes(side * (3 * side + 1)))))
     names = sorted(path.name for path in tmp_path.iterdir())
     code = "decode.free_bytes = lambda: float('inf')\n" * (not known)
-    lines = told(code + "limit(24)\nfor name in sys.argv[1:]:\n    read(name)", tmp_path, names)
+    lines = output_of(code + "limit(24)\nfor name in sys.argv[1:]:\n    read(name)", tmp_path, names)
     assert len(lines) == 10
-    why = "GiB of memory are free|more than there is memory for|allocate" + "|cannot be had" * (not known)
+    why = "GiB of memory are free|more than there is memory for|allocate" + "|does not fit into memory" * (not known)
     assert all(re.match(rf"(x\.\w+) refused: \1: .*({why})", line) for line in lines), lines
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="measures memory")
-def test_reading_takes_the_stored_picture_and_its_light_and_no_more(tmp_path: Path) -> None:
+def test_reading_needs_memory_for_the_stored_picture_and_its_light_only(tmp_path: Path) -> None:
     side = 3000
     (tmp_path / "x.png").write_bytes(png(side, zlib.compress(bytes(side * (3 * side + 1)))))
     code = "before = memory.peak_mb()\nread_image('x.png')\nprint(memory.peak_mb() - before)"
-    (megabytes,) = told(code, tmp_path, [])
+    (megabytes,) = output_of(code, tmp_path, [])
     assert float(megabytes) * 1e6 / side**2 < 1.3 * (3 + 3 * 4)

@@ -1,4 +1,4 @@
-"""Images round trip through every type of file with known values; what their channels, parts and tags mean."""
+"""Reading and writing images of every format: values, channels, parts and tags."""
 
 import dataclasses
 from pathlib import Path
@@ -28,7 +28,7 @@ def spec_with(
 
 
 def store(path: Path, array: np.ndarray, sample: str, names: tuple[str, ...] | None = None, **attributes: Any) -> Path:
-    """Writes stored numbers by OpenImageIO alone."""
+    """Writes stored numbers with OpenImageIO alone."""
     array = np.atleast_3d(array)
     return store_parts(path, [(spec_with(array, sample, names, **attributes), array)])
 
@@ -50,7 +50,7 @@ def spec_of(path: Path) -> oiio.ImageSpec:
 
 
 def stored(path: Path) -> np.ndarray:
-    """Reads stored numbers by OpenImageIO alone, in their own type."""
+    """Reads stored numbers with OpenImageIO alone, in their own type."""
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), config)
@@ -61,7 +61,7 @@ def stored(path: Path) -> np.ndarray:
 
 
 def ramp(channels: int = 3, height: int = 4, width: int = 6) -> torch.Tensor:
-    """Every value different, in [0, 1], no symmetry: a flip or a swap of channels shows."""
+    """Different values in [0, 1] without symmetry, so that tests detect flips and swapped channels."""
     return torch.linspace(0, 1, channels * height * width).reshape(1, channels, height, width)
 
 
@@ -106,8 +106,8 @@ def test_light_round_trips_within_the_precision_of_the_type(
 
 
 @pytest.mark.parametrize(("suffix", "sample"), [(".exr", "float"), (".tif", "16")])
-def test_pictures_of_more_than_a_million_numbers_are_whole(tmp_path: Path, suffix: str, sample: Any) -> None:
-    pixels = ramp(4, 700, 600)  # read and written some lines at a time
+def test_large_pictures_processed_in_strips_are_exact(tmp_path: Path, suffix: str, sample: Any) -> None:
+    pixels = ramp(4, 700, 600)  # more than a million numbers
     pixels[:, 3] = 1.0
     write_image(tmp_path / f"x{suffix}", Picture(pixels, channels=("R", "G", "B", "A")), sample=sample)
     back = read_image(tmp_path / f"x{suffix}").pixels
@@ -129,7 +129,7 @@ def test_every_integer_value_survives_reading_and_writing_bit_exact(tmp_path: Pa
     [
         (".png", "uint8", GREY),
         (".tif", "uint16", GREY),
-        (".tif", "float", 0.5),  # though its tag says sRGB
+        (".tif", "float", 0.5),  # although its tag is sRGB
         (".tif", "double", 0.5),
         (".exr", "half", 0.5),
         (".jpg", "uint8", GREY),
@@ -146,7 +146,7 @@ def test_integers_are_srgb_and_floats_are_linear_unless_stated(
         )
 
 
-def test_transfer_of_the_result_follows_the_input_within_integers_and_the_type_across(tmp_path: Path) -> None:
+def test_transfer_is_kept_from_integers_to_integers_and_else_is_the_default(tmp_path: Path) -> None:
     picture = Picture(torch.full((1, 3, 2, 2), 0.5), sample="16", transfer="linear")
     for name, changes, first in (
         ("a.png", {}, 32768),
@@ -157,7 +157,7 @@ def test_transfer_of_the_result_follows_the_input_within_integers_and_the_type_a
         assert stored(tmp_path / name)[0, 0, 0] == first
 
 
-def test_light_is_float32_whatever_the_default_is(tmp_path: Path) -> None:
+def test_light_is_float32_with_any_default_dtype(tmp_path: Path) -> None:
     path = store(tmp_path / "x.png", np.full((2, 2, 3), 128, np.uint8), "uint8")
     torch.set_default_dtype(torch.float64)
     try:
@@ -178,7 +178,7 @@ def test_straight_alpha_is_premultiplied_in_linear_light(tmp_path: Path, suffix:
     np.testing.assert_allclose(stored(tmp_path / f"b{suffix}"), stored(path), atol=1e-6)
 
 
-def test_exr_alpha_is_premultiplied_already_and_light_without_coverage_survives(tmp_path: Path) -> None:
+def test_exr_alpha_is_premultiplied_and_light_with_alpha_0_is_kept(tmp_path: Path) -> None:
     rgba = np.zeros((1, 2, 4), np.float32)
     rgba[0, 0], rgba[0, 1] = (0.3, 0.2, 0.1, 0.5), (2.0, 1.0, 0.5, 0.0)
     path = store(tmp_path / "a.exr", rgba, "float", ("R", "G", "B", "A"))
@@ -188,7 +188,7 @@ def test_exr_alpha_is_premultiplied_already_and_light_without_coverage_survives(
     assert np.array_equal(stored(tmp_path / "b.exr"), rgba)
 
 
-def test_alpha_is_refused_where_the_type_cannot_hold_it_unless_it_is_opaque(tmp_path: Path) -> None:
+def test_alpha_below_1_is_refused_by_formats_without_alpha(tmp_path: Path) -> None:
     picture = Picture(torch.full((1, 4, 2, 2), 0.5), channels=("R", "G", "B", "A"))
     with pytest.raises(ValueError, match=r"x\.jpg: a \.jpg file cannot hold the alpha channel; write \.exr"):
         write_image(tmp_path / "x.jpg", picture)
@@ -206,7 +206,7 @@ def test_half_values_beyond_the_range_of_half_stay_finite(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("depth_name", ["Z", "z", "depth", "Depth.Z", "ViewLayer.Depth.Z", None])
-def test_a_depth_channel_beside_colour_is_found_and_normals_are_none(tmp_path: Path, depth_name: str | None) -> None:
+def test_a_depth_channel_is_found_beside_colour_and_normals(tmp_path: Path, depth_name: str | None) -> None:
     values = np.zeros((2, 3, 8), np.float32)
     names = ("R", "G", "B", "A", depth_name or "u", "Normal.X", "Normal.Y", "Normal.Z")
     values[..., 3], values[..., 4], values[..., 7] = 1.0, 1234.5, -1.0
@@ -243,7 +243,7 @@ def test_layers_are_chosen_by_name_and_plain_channels_come_first(tmp_path: Path)
 
 
 def part(channels: tuple[str, ...], name: str = "", side: int = 32, sample: str = "float") -> Any:
-    """A part of an EXR file whose values are all different; parts share the full frame."""
+    """A part of an EXR file with different values; all parts have the same full frame."""
     count = side * side * len(channels)
     values = np.linspace(0.1, 1, count, dtype=np.float32).reshape(side, side, len(channels))
     spec = spec_with(values, sample, channels, **({"oiio__subimagename": name} if name else {}))
@@ -251,7 +251,7 @@ def part(channels: tuple[str, ...], name: str = "", side: int = 32, sample: str 
     return spec, values
 
 
-def test_of_several_parts_the_first_with_colour_is_read_and_depth_of_its_size(tmp_path: Path) -> None:
+def test_the_first_part_with_colour_is_read_and_depth_of_the_same_size(tmp_path: Path) -> None:
     colour, depth, small = part(RGB, "beauty", sample="half"), part(("Z",), "z"), part(("Z",), "s", 16)
     picture = read_image(store_parts(tmp_path / "x.exr", [depth, colour]))
     assert picture.sample == "half"
@@ -268,7 +268,7 @@ WINDOWS = [(-3, -5, 0, 0, 8, 8), (100_000, 100_000, 0, 0, 8, 8), (50, 50, 0, 0, 
 
 
 @pytest.mark.parametrize("make", ["tiles", "levels", *WINDOWS], ids=str)
-def test_an_exr_of_any_make_is_read_and_written_again(tmp_path: Path, make: Any) -> None:
+def test_tiled_mipmapped_and_windowed_exr_files_survive_read_and_write(tmp_path: Path, make: Any) -> None:
     spec, values = part(("R", "G", "B", "Z"))
     if make == "tiles":
         spec.tile_width = spec.tile_height = 16
@@ -290,7 +290,7 @@ def test_an_exr_of_any_make_is_read_and_written_again(tmp_path: Path, make: Any)
     assert torch.equal(copy.pixels, picture.pixels) and copy.window == picture.window
 
 
-# What is kept
+# Metadata
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".exr"])
@@ -303,7 +303,7 @@ def test_metadata_of_the_input_is_kept(tmp_path: Path, suffix: str) -> None:
         assert back.getattribute(name.replace("__", ":")) == (value if isinstance(value, str) else pytest.approx(value))
 
 
-def test_lossy_compression_of_an_exr_is_not_repeated(tmp_path: Path) -> None:
+def test_lossy_compression_of_an_exr_is_replaced_by_zip(tmp_path: Path) -> None:
     source = store(tmp_path / "a.exr", np.zeros((4, 4, 3), np.float32), "half", compression="dwaa:45")
     write_image(tmp_path / "b.exr", read_image(source))
     assert spec_of(tmp_path / "b.exr").get_string_attribute("compression") == "zip"
@@ -312,7 +312,7 @@ def test_lossy_compression_of_an_exr_is_not_repeated(tmp_path: Path) -> None:
 # Maps
 
 
-def test_pfm_rows_run_from_the_bottom_and_its_scale_is_not_applied(tmp_path: Path) -> None:
+def test_pfm_rows_start_at_the_bottom_and_the_scale_is_not_applied(tmp_path: Path) -> None:
     values = np.arange(6, dtype="<f4").reshape(2, 3)
     for head, stored_values in ((b"Pf\n3 2\n-0.003922\n", values), (b"Pf\n3 2\n1.0\n", values.astype(">f4"))):
         (tmp_path / "x.pfm").write_bytes(head + stored_values.tobytes())
@@ -327,7 +327,7 @@ def test_pfm_rows_run_from_the_bottom_and_its_scale_is_not_applied(tmp_path: Pat
     ("suffix", "kind", "largest"),
     [(".png", np.uint16, 65535), (".tif", np.uint16, 65535), (".png", np.uint8, 255), (".tif", np.int16, -1)],
 )
-def test_integer_maps_give_their_integers(tmp_path: Path, suffix: str, kind: Any, largest: int) -> None:
+def test_integer_maps_are_not_scaled(tmp_path: Path, suffix: str, kind: Any, largest: int) -> None:
     values = np.array([[0, 1, largest], [7, 100, 200]]).astype(kind)
     assert read_values(store(tmp_path / f"x{suffix}", values, values.dtype.name))[0, 0].tolist() == values.tolist()
 

@@ -41,12 +41,12 @@ def test_camera_facts_are_those_of_the_tags(tags: dict[str, Any], facts: dict[st
     assert found == pytest.approx(facts)
 
 
-def test_the_film_of_the_equivalent_focal_length_lies_along_the_longer_side() -> None:
+def test_the_36_mm_of_an_equivalent_focal_length_are_the_longer_side() -> None:
     tags = {FOCAL: (None, 4.2), FILM: (None, 27)}
     assert camera_facts(tags, 3000, 4000)["sensor_width_mm"] == pytest.approx(5.6 * 3 / 4)
 
 
-# EXIF 2.32, 4.6.4 A: where the pixel at row r and column c of a stored H x W picture is seen
+# EXIF 2.32, 4.6.4 A: upright place of the pixel at row r and column c of a stored h x w picture
 SEEN: dict[int, Any] = {
     1: lambda r, c, h, w: (r, c),
     2: lambda r, c, h, w: (r, w - 1 - c),
@@ -61,7 +61,7 @@ SEEN: dict[int, Any] = {
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".jpg"])
 @pytest.mark.parametrize("orientation", SEEN)
-def test_a_picture_is_read_as_it_is_seen_and_written_upright(orientation: int, suffix: str, tmp_path: Path) -> None:
+def test_a_picture_is_upright_after_reading_and_writing(orientation: int, suffix: str, tmp_path: Path) -> None:
     height, width = 16, 24
     stored = np.zeros((height, width, 3), np.uint8)
     stored[0:8, 8:16] = 255

@@ -22,7 +22,7 @@ def test_pattern_names_frames(pattern: str, frame: int, name: str) -> None:
 
 
 @pytest.mark.parametrize("pattern", ["a.exr", "a.##.##.exr", "shot.##/a.exr"])
-def test_pattern_needs_one_place_for_the_number(pattern: str) -> None:
+def test_a_pattern_without_exactly_one_placeholder_is_refused(pattern: str) -> None:
     with pytest.raises(ValueError, match="expected one place for the frame number"):
         FramePattern(pattern)
 
@@ -50,12 +50,12 @@ FRAMES = ["", "a", "1-", "5-1", "1,2", "1.5"]
 
 
 @pytest.mark.parametrize(("read", "text"), [*((parse_focus, t) for t in FOCUS), *((parse_frames, t) for t in FRAMES)])
-def test_other_texts_are_refused(read: Callable[[str], object], text: str) -> None:
+def test_invalid_ranges_and_keyframes_are_refused(read: Callable[[str], object], text: str) -> None:
     with pytest.raises(ValueError, match=r"--frames|--focus-m expects metres \(2.0\) or keyframes"):
         read(text)
 
 
-def test_focus_between_keyframes_is_linear_in_dioptres_and_held_outside() -> None:
+def test_focus_is_linear_in_dioptres_between_keyframes_and_constant_outside() -> None:
     keys = parse_focus("20:4.0,10:2.0")
     assert [focus_at_frame(keys, n) for n in (0, 10, 20, 99)] == [2.0, 2.0, 4.0, 4.0]
     assert focus_at_frame(keys, 15) == pytest.approx(1 / 0.375)

@@ -1,4 +1,4 @@
-"""Which engine renders: ``TORCHDOF_ENGINE``."""
+"""Choice of the engine by ``TORCHDOF_ENGINE``."""
 
 import pytest
 import torch
@@ -6,14 +6,16 @@ import torch
 from torchdof import blur_by_coc, native
 
 
-def test_the_compiled_engine_is_chosen_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TORCHDOF_ENGINE", "native")
-    assert native.describe() in ("native (avx2)", "native (baseline)")
-    monkeypatch.delenv("TORCHDOF_ENGINE")
-    assert native.describe().startswith("native (")
+@pytest.mark.parametrize(("value", "engine"), [("native", "native"), (None, "native"), ("torch", "torch")])
+def test_the_compiled_engine_is_the_default(value: str | None, engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("TORCHDOF_ENGINE", raising=False)
+    if value is not None:
+        monkeypatch.setenv("TORCHDOF_ENGINE", value)
+    assert native.describe().startswith(f"{engine} (")
+    assert engine == "torch" or native.describe() in ("native (avx2)", "native (baseline)")
 
 
-def test_an_engine_of_another_version_is_not_used_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_engine_of_another_version_is_not_used_and_gives_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("TORCHDOF_ENGINE", raising=False)
     monkeypatch.setattr(native, "_REVISION", -1)
     native._library.cache_clear()
@@ -26,11 +28,6 @@ def test_an_engine_of_another_version_is_not_used_and_says_so(monkeypatch: pytes
             native.chosen()
     finally:
         native._library.cache_clear()
-
-
-def test_the_plain_engine_can_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
-    assert native.describe().startswith("torch (")
 
 
 def test_an_unknown_engine_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""The circle of confusion by the compiled engine: to the bit what PyTorch computes."""
+"""The circle of confusion by the compiled engine equals PyTorch's bit for bit."""
 
 import math
 
@@ -26,7 +26,7 @@ DEPTH = torch.cat(
     ],
     ids=str,
 )
-def test_both_engines_see_the_same_circle_of_confusion(camera: Camera, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_engines_compute_the_same_circle_of_confusion(camera: Camera, monkeypatch: pytest.MonkeyPatch) -> None:
     depth = DEPTH.reshape(1, 1, 30, 67)
     compiled = camera.coc_px(depth, 640)
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")

@@ -1,4 +1,4 @@
-"""What is asked of whole frames before they are rendered: their ends, looked for by the engine's own threads."""
+"""Minimum and maximum of whole frames, computed by the compiled engine with its own threads."""
 
 import math
 from typing import Any
@@ -13,7 +13,7 @@ SIZES = (1, 7, 8, 9, 2**16 - 1, 2**16, 2**16 + 1, 3 * 2**16 + 5)
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_ends_are_the_least_and_the_largest_number(size: int) -> None:
+def test_ends_are_minimum_and_maximum(size: int) -> None:
     values = torch.randn(size, generator=torch.Generator().manual_seed(size))
     assert native.ends(values) == (float(values.min()), float(values.max()))
     assert native.ends(values.repeat(2, 1).T) == (float(values.min()), float(values.max()))
@@ -21,7 +21,7 @@ def test_ends_are_the_least_and_the_largest_number(size: int) -> None:
 
 @pytest.mark.parametrize("place", [0, 0.5, 1])
 @pytest.mark.parametrize("size", SIZES)
-def test_one_nan_is_seen_and_so_is_one_infinity(size: int, place: float) -> None:
+def test_a_single_nan_or_infinity_is_found(size: int, place: float) -> None:
     values = torch.zeros(size)
     values[int(place * (size - 1))] = -math.inf
     assert native.ends(values)[0] == -math.inf
@@ -39,7 +39,7 @@ def test_both_engines_find_the_same_ends(engine: str, dtype: torch.dtype, monkey
 
 
 class LargeReads(TorchDispatchMode):
-    """PyTorch's operators that look at as many numbers as its threads share, by name."""
+    """Records PyTorch's operators that read tensors large enough for several threads."""
 
     names: list[str]
 
@@ -52,8 +52,8 @@ class LargeReads(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("occlusion", [True, False])
-def test_pytorch_looks_at_no_whole_frame(occlusion: bool) -> None:
-    """Its threads would spin beside the engine's."""
+def test_no_operator_of_pytorch_reads_a_whole_frame(occlusion: bool) -> None:
+    """PyTorch's threads would spin afterwards and compete with those of the engine."""
     image, coc = torch.rand(1, 3, 256, 256), torch.linspace(-6.0, 9.0, 256).expand(1, 1, 256, -1).contiguous()
     reads = LargeReads()
     reads.names = []

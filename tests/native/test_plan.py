@@ -1,4 +1,4 @@
-"""The layers of a frame, planned by the compiled engine: those of the plain one."""
+"""The compiled engine plans the same layers as the plain one."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The compiled engine in a process: threads, forks, interrupts, instructions; and its convolution."""
+"""The compiled engine in a process: threads, interrupts, instruction sets; and its convolution."""
 
 import subprocess
 import sys
@@ -30,7 +30,7 @@ def scenes() -> list[Scene]:
     ]
 
 
-def test_any_number_of_threads_gives_the_same_bits_and_all_instructions_the_same_picture() -> None:
+def test_bits_do_not_depend_on_threads_and_pictures_not_on_the_instruction_set() -> None:
     best, before = native.describe(), torch.get_num_threads()
     for scene in scenes():
         wanted = scene.blurred()
@@ -46,7 +46,7 @@ def test_any_number_of_threads_gives_the_same_bits_and_all_instructions_the_same
     assert native.describe() == best
 
 
-def test_threads_of_python_may_render_at_once() -> None:
+def test_python_threads_may_render_concurrently() -> None:
     given = [*scenes(), *scenes()]
     wanted = [scene.blurred() for scene in given]
     with ThreadPoolExecutor(4) as pool:
@@ -55,7 +55,7 @@ def test_threads_of_python_may_render_at_once() -> None:
 
 
 def answer_of(script: str) -> str:
-    """What a fresh process prints."""
+    """Output of a script in a new process."""
     run = subprocess.run([sys.executable, "-P", "-c", script], capture_output=True, text=True, timeout=120, check=False)
     assert run.returncode == 0, run.stderr
     return run.stdout.strip()
@@ -63,7 +63,7 @@ def answer_of(script: str) -> str:
 
 INTERRUPTED = """
 import os, signal, sys, threading, time, torch
-signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts in the background is told to ignore it
+signal.signal(signal.SIGINT, signal.default_int_handler)  # shells start background jobs with SIGINT ignored
 os.environ["TORCHDOF_ENGINE"] = "native"
 import torchdof
 from torchdof.render.plan import Plan
@@ -82,7 +82,7 @@ try:
     print("not interrupted")
 except KeyboardInterrupt:
     late = time.monotonic() - sent[0]
-    small = torchdof.blur_by_coc(image[..., :40, :40], coc_px[..., :40, :40])  # the engine goes on to serve
+    small = torchdof.blur_by_coc(image[..., :40, :40], coc_px[..., :40, :40])  # the engine still works
     print("in time" if late < 1.0 and bool(small.isfinite().all()) else f"after {late} s")
 """
 
@@ -112,8 +112,8 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a process of Windows cannot send itself Ctrl-C")
-def test_ctrl_c_is_raised_once_the_engine_has_stopped() -> None:
-    """What the engine reads and writes is freed when its caller returns."""
+def test_ctrl_c_is_raised_after_the_engine_has_stopped() -> None:
+    """Otherwise the engine would use memory that its caller has freed."""
     assert answer_of(INTERRUPTED_TWICE) == "after the engine"
 
 

@@ -84,7 +84,7 @@ def test_parameters_are_linear_between_nodes_and_lengths_grow_beyond(
 
 
 @given(st.floats(-20.0, 20.0), st.floats(-1e-6, 1e-6))
-def test_parameters_never_jump(coc: float, step: float) -> None:
+def test_parameters_are_continuous_in_the_coc(coc: float, step: float) -> None:
     first, second = at(TWO_SIDES, coc, width=1), at(TWO_SIDES, coc + step, width=1)
     for name in first:
         assert abs(first[name][0] - second[name][0]) <= abs(step) + 1e-12  # no parameter is steeper than the coc
@@ -120,7 +120,7 @@ def test_kernels_are_one_pixel_in_focus_and_move_light_with_the_square_of_the_co
     assert 5e-5 < float(moved[1]) < 2e-4 and float(moved[3] / moved[1]) == pytest.approx(4.0, rel=0.03)
 
 
-def test_a_blur_that_a_table_has_in_focus_fades_in_with_the_square_of_the_coc() -> None:
+def test_a_blur_in_focus_fades_in_with_the_square_of_the_coc() -> None:
     table = BlurTable("gaussian", [0.0, 1.0], {"sigma": [0.8, 0.8]})
     kernels = table.kernels(torch.tensor([0.0, 0.1, 0.2, 0.5], dtype=torch.float64), 100, size=9)
     moved = 1.0 - kernels[:, 0, 4, 4]
@@ -128,11 +128,11 @@ def test_a_blur_that_a_table_has_in_focus_fades_in_with_the_square_of_the_coc() 
     assert_close(kernels[3, 0], psf.gaussian(0.8, size=9))
 
 
-def test_a_small_blur_in_focus_is_all_there_at_a_small_coc() -> None:
+def test_a_small_blur_in_focus_is_complete_at_a_small_coc() -> None:
     table = BlurTable("gaussian", [0.0, 1.0], {"sigma": [[0.05, 0.05], [0.8, 0.8]]})
     kernels = table.kernels(torch.tensor([0.07], dtype=torch.float64), 100, size=9)[0]
     assert_close(kernels[0], psf.gaussian(0.05, size=9))
-    assert float(kernels[1, 4, 4]) > 0.9  # each colour by its own
+    assert float(kernels[1, 4, 4]) > 0.9  # each colour fades in by its own blur
 
 
 @pytest.mark.parametrize("name", ["disc", "gaussian", "sato_j15"])
@@ -225,7 +225,7 @@ ROUND_TRIPS = [
 
 
 @pytest.mark.parametrize("table", ROUND_TRIPS, ids=repr)
-def test_a_saved_table_is_read_back_whole(table: BlurTable, tmp_path: Path) -> None:
+def test_a_table_survives_save_and_load(table: BlurTable, tmp_path: Path) -> None:
     path = tmp_path / "lens.json"
     table.save(path)
     assert [p.name for p in tmp_path.iterdir()] == ["lens.json"] and stat.S_IMODE(path.stat().st_mode) == 0o644
@@ -234,20 +234,6 @@ def test_a_saved_table_is_read_back_whole(table: BlurTable, tmp_path: Path) -> N
     assert back.to_dict() == table.to_dict() and repr(back) == repr(table)
     coc = torch.tensor([-30.0, -0.7, 0.0, 12.0])
     assert_close(back.kernels(coc, 64, size=15), table.kernels(coc, 64, size=15), rtol=0.0, atol=0.0)
-
-
-def test_a_table_that_cannot_be_written_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "lens.json"
-    BlurTable.disc().save(path)
-
-    def full(*_: Any) -> None:
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr("os.replace", full)
-    with pytest.raises(OSError, match="No space left"):
-        BlurTable.gaussian().save(path)
-    monkeypatch.undo()
-    assert BlurTable.load(path).family == "disc" and [p.name for p in tmp_path.iterdir()] == ["lens.json"]
 
 
 NOT_FINITE = [1.0, math.nan, 2.0]
@@ -340,33 +326,16 @@ def test_bad_values_of_a_profile_are_refused(family: str, params: dict[str, Any]
         "\x00\xff",
     ],
 )
-def test_a_file_that_is_no_table_is_refused_with_its_name(content: str, tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_table_is_refused_with_its_name(content: str, tmp_path: Path) -> None:
     path = tmp_path / "lens.json"
     path.write_bytes(content.encode("latin-1"))
     with pytest.raises(ValueError, match="lens.json: "):
         BlurTable.load(path)
 
 
-def test_a_name_that_is_not_shipped_lists_those_that_are() -> None:
+def test_an_unknown_name_lists_the_shipped_tables() -> None:
     with pytest.raises(FileNotFoundError, match=r"no blur table 'sato': .*sato_j15"):
         BlurTable.load("sato")
-
-
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
-    max_leaves=6,
-)
-
-
-@given(st.sampled_from(sorted(example())), JSON)
-def test_any_value_in_any_field_gives_a_table_or_a_named_error(field: str, value: Any) -> None:
-    try:
-        table = BlurTable.from_dict({**example(), field: value})
-    except ValueError as error:
-        assert str(error)
-    else:
-        assert torch.isfinite(table.kernels(torch.tensor([-3.0, 4.0]), 36, size=5)).all()
 
 
 def test_kernels_sum_to_one_at_any_coc() -> None:
@@ -376,29 +345,22 @@ def test_kernels_sum_to_one_at_any_coc() -> None:
         assert_close(sums, torch.ones_like(sums), rtol=0.0, atol=1e-12)
 
 
-# Tables that make no kernels
-
 SOFT = {"radius": [0.01], "sigma": [0.003], "b": [1.0]}
 
 
 @pytest.mark.parametrize(
     ("family", "coc", "params", "message"),
     [
-        (
-            "softm",
-            [0.01],
-            {**SOFT, "m": [1000.0]},
-            "params.m must be <= 100, got 1000",
-        ),
+        ("softm", [0.01], {**SOFT, "m": [1000.0]}, "params.m must be <= 100, got 1000"),
         ("softm", [0.01], {**SOFT, "m": [1e300]}, "params.m must be <= 100, got 1e"),
-        ("gaussian", [0.01], {"sigma": [1e9]}, "params must be lengths in the unit of coc, got such as reach to"),
+        ("gaussian", [0.01], {"sigma": [1e9]}, "params must be lengths in the unit of coc, got a kernel that reaches"),
         ("disc", [-0.01, 1e-320], {"radius": [0.01, 0.02]}, "coc must reach somewhere from 1e-09 to .* got 9.9"),
-        ("disc", [-0.01, 1e-7], {"radius": [0.01, 0.02]}, "params must be lengths .* reach to 0.02 where coc is 1e-07"),
+        ("disc", [-0.01, 1e-7], {"radius": [0.01, 0.02]}, "params must be lengths .* to 0.02 where coc is 1e-07"),
         ("disc", [1e-300], {"radius": [1e-300]}, "coc must reach somewhere from 1e-09 to"),
         ("disc", [1e90], {"radius": [1e90]}, r"coc must reach somewhere from 1e-09 to 1e\+06 \(fraction\), got 1e"),
     ],
 )
-def test_tables_without_kernels_are_refused_on_load(
+def test_tables_without_valid_kernels_are_refused(
     tmp_path: Path, family: str, coc: list[float], params: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
@@ -410,7 +372,7 @@ def test_tables_without_kernels_are_refused_on_load(
         BlurTable.load(path)
 
 
-def test_a_table_of_endless_nodes_is_refused() -> None:
+def test_a_table_of_too_many_nodes_is_refused() -> None:
     coc = torch.arange(1, 5001, dtype=torch.float64) / 5000
     with pytest.raises(ValueError, match="coc must be at most 4096 nodes, got 5000"):
         BlurTable("disc", coc, {"radius": coc}, unit="fraction")
@@ -426,7 +388,7 @@ def test_steep_tilts_have_kernels_at_any_blur(m: float, sigma: float, coc: float
     assert torch.allclose(kernels.sum((-2, -1)), torch.ones(1, dtype=torch.float64))
 
 
-def test_a_number_that_requires_a_gradient_is_a_number() -> None:
+def test_a_parameter_that_requires_a_gradient_is_used_as_a_number() -> None:
     sigma = torch.tensor(0.5, requires_grad=True)
     table, same = BlurTable.gaussian(sigma), BlurTable.gaussian(0.5)  # type: ignore[arg-type]
     coc = torch.tensor([3.0], dtype=torch.float64)

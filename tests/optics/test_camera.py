@@ -21,7 +21,7 @@ def depth_of(*metres: float, dtype: torch.dtype = torch.float64) -> Tensor:
 
 
 def coc_in_millimetres(focal_mm: float, f_number: float, focus_m: float, z_m: float) -> float:
-    """Textbook: where the image of z falls behind the lens, and the cone's radius on the sensor."""
+    """Textbook formula: image distance of z behind the lens, and radius of its cone of light on the sensor."""
     focal = focal_mm / 1000.0
     sensor = focal if math.isinf(focus_m) else focus_m * focal / (focus_m - focal)
     image = focal if math.isinf(z_m) else z_m * focal / (z_m - focal)
@@ -154,7 +154,7 @@ def test_gradients_at_infinite_depth_and_focus_are_zero_and_not_nan() -> None:
     assert float(slope[..., 1]) == 0.0
 
 
-def test_a_depth_that_is_none_has_no_coc_and_no_part_in_gradients() -> None:
+def test_an_invalid_depth_has_a_nan_coc_and_finite_gradients() -> None:
     depth = depth_of(1.0, 0.0, -2.0, math.nan, 4.0).requires_grad_()
     focus = torch.tensor([2.0], dtype=torch.float64, requires_grad=True)
     coc = Camera(focus_m=focus).coc_px(depth, 100)
@@ -221,12 +221,12 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
 
 
 @pytest.mark.parametrize(("call", "message"), REFUSED)
-def test_what_makes_no_camera_and_no_focus_is_refused(call: Callable[[], Any], message: str) -> None:
+def test_invalid_arguments_are_refused_by_name(call: Callable[[], Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         call()
 
 
-def test_repr_tells_the_camera() -> None:
+def test_repr_shows_the_numbers_of_the_camera() -> None:
     assert repr(Camera(35.0, 1.4, 0.8, 23.5)) == "Camera(35 mm, f/1.4, focus 0.8 m, sensor 23.5 mm)"
     assert "fixed field of view" in repr(Camera.from_fov(40.0, 0.01, 2.0))
     assert "focus [1, 2] m" in repr(Camera(focus_m=torch.tensor([1.0, 2.0])))
@@ -253,7 +253,7 @@ def test_a_range_is_in_focus_from_end_to_end_and_blur_grows_from_its_ends() -> N
     assert float(camera.coc_px(depth_of(float(far)), 1920)) == pytest.approx(1.0, rel=1e-9)
 
 
-def test_a_range_of_no_length_is_one_distance_and_may_reach_to_infinity() -> None:
+def test_an_empty_range_is_one_distance_and_a_range_may_end_at_infinity() -> None:
     depth = depth_of(0.7, 2.0, 9.0, math.inf)
     one, none = Camera(focus_m=2.0), Camera(focus_range_m=(2.0, 2.0))
     assert_close(none.coc_px(depth, 100), one.coc_px(depth, 100), rtol=1e-12, atol=0)
@@ -262,20 +262,20 @@ def test_a_range_of_no_length_is_one_distance_and_may_reach_to_infinity() -> Non
 
 def test_a_focus_distance_beside_a_range_is_refused() -> None:
     camera = Camera(focus_range_m=(1.0, 2.0))
-    with pytest.raises(ValueError, match="focus_m is told by the camera's focus_range_m"):
+    with pytest.raises(ValueError, match="focus_m is given by the camera's focus_range_m"):
         camera.replace(focus_m=3.0)
     assert camera.replace(focus_range_m=None, focus_m=3.0).focus_m == 3.0
     assert camera.replace(f_number=2.0).focus_range_m == (1.0, 2.0)
 
 
 def plane_in_focus(camera: Camera, x: float, y: float, size: tuple[int, int]) -> float:
-    """Depth in focus at a pixel, from where a plane through the lens equation's hinge meets the pixel's ray."""
+    """Depth in focus at a pixel: where its ray meets the plane of focus through the hinge."""
     height, width = size
     focal = float(camera.focal_length_mm) / 1000.0
     tilt, swing = math.radians(float(camera.tilt_deg)), math.radians(float(camera.swing_deg))
     normal = (math.sin(swing) * math.cos(tilt), math.sin(tilt))
     slope_x, slope_y = ((v - n / 2) / float(camera.focal_px(width)) for v, n in ((x, width), (y, height)))
-    # all points (X, Y, Z) with Z / s + (n_x X + n_y Y) / f = 1; at Z = 0 that is the hinge, f / sin(tilt) away
+    # the plane Z / s + (n_x X + n_y Y) / f = 1; at Z = 0 it contains the hinge, f / sin(tilt) from the lens
     return 1.0 / (1.0 / float(camera.focus_m) + (normal[0] * slope_x + normal[1] * slope_y) / focal)
 
 
@@ -325,7 +325,7 @@ def test_coc_is_differentiable_in_the_range_and_the_angles() -> None:
     assert torch.autograd.gradcheck(coc, (depth, *values))
 
 
-def test_a_tilted_lens_is_focused_on_what_is_pointed_at() -> None:
+def test_focus_at_works_with_a_tilted_lens() -> None:
     camera = Camera(focal_length_mm=80.0, tilt_deg=3.0, swing_deg=-1.0)
     depth = torch.linspace(1.0, 5.0, 60 * 80, dtype=torch.float64).reshape(1, 1, 60, 80)
     focused = camera.focus_at(depth, 70.5, 50.5, patch=1)

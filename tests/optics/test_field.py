@@ -1,4 +1,4 @@
-"""Spots of a lens over coc and distance from the middle of the frame."""
+"""The field of a lens: spots over coc and distance from the middle of the frame."""
 
 from typing import Any
 
@@ -47,7 +47,7 @@ def test_spots_are_linear_between_nodes_and_grow_beyond_the_last_coc() -> None:
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-def test_a_field_is_kept_in_a_tables_file(channels: int, tmp_path: Any) -> None:
+def test_a_field_survives_save_and_load(channels: int, tmp_path: Any) -> None:
     lens = table(channels)
     lens.save(tmp_path / "lens.json")
     loaded = BlurTable.load(tmp_path / "lens.json")
@@ -98,7 +98,7 @@ def test_bad_files_are_refused_by_name(change: dict[str, Any], message: str) -> 
         Field.from_dict({**field().to_dict(), **change})
 
 
-def test_what_goes_with_no_field_is_refused_by_name() -> None:
+def test_arguments_that_exclude_a_field_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match="one spot all over the frame"):
         lens_views_by_coc(torch.rand(1, 3, 8, 8), torch.ones(1, 1, 8, 8), table=table())
     with pytest.raises(ValueError, match="has its own opening"):

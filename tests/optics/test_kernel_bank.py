@@ -1,4 +1,4 @@
-"""Kernels from templates: those of the PSF itself, in both engines, at any size."""
+"""Kernels from templates equal those of the PSF, in both engines, at any size."""
 
 import threading
 
@@ -46,21 +46,21 @@ def moments(kernel: torch.Tensor) -> torch.Tensor:
 
 @ALL
 def test_small_kernels_are_those_of_the_psf(table: BlurTable) -> None:
-    coc = SMALL / (1.0 if table.family in ("disc", "softm", "radial") else 3.0)  # others reach farther
+    coc = SMALL / (1.0 if table.family in ("disc", "softm", "radial") else 3.0)  # other families have tails
     kernels, expected = bank_of(table).kernels(coc, 400), of_psf(table, coc)
     assert kernels.shape == expected.shape
-    # between two nodes of a table of many the profile is a mean of theirs
+    # between two nodes the bank interpolates the profile, the table the parameters
     torch.testing.assert_close(kernels, expected, rtol=0.0, atol=1e-6 if len(table.coc) < 3 else 1e-3)
 
 
 @ALL
-def test_large_kernels_hold_their_light_where_the_psf_has_it(table: BlurTable) -> None:
+def test_large_kernels_have_the_moments_of_the_psf(table: BlurTable) -> None:
     kernels, expected = bank_of(table).kernels(LARGE, 400), of_psf(table, LARGE)
     torch.testing.assert_close(kernels.sum((-2, -1)), torch.ones(len(LARGE), table.channels, dtype=torch.float64))
     assert bool((kernels >= 0).all())
     torch.testing.assert_close(moments(kernels), moments(expected), rtol=2e-3, atol=5e-3)
     error = (kernels - expected).square().sum((-2, -1)).sqrt() / expected.square().sum((-2, -1)).sqrt()
-    assert float(error.max()) < (0.15 if table is TABLES["lens"] else 0.04)  # cells of the PSF are pixels, here smaller
+    assert float(error.max()) < (0.15 if table is TABLES["lens"] else 0.04)  # a template has smaller cells than a pixel
 
 
 @ALL
@@ -90,7 +90,6 @@ def test_kernels_change_continuously_with_the_radius(table: BlurTable) -> None:
 
 
 def test_cells_of_a_template_leave_no_ripples_in_a_large_kernel() -> None:
-    """A large Gaussian is a Gaussian at every pixel: the cells of its template do not show."""
     coc = torch.tensor([10.3, 12.2, 27.0], dtype=torch.float64)
     for radius, kernel in zip(coc, bank_of(TABLES["gaussian"]).kernels(coc, 400)[:, 0], strict=True):
         step = torch.arange(kernel.shape[-1], dtype=torch.float64) - kernel.shape[-1] // 2
@@ -100,7 +99,7 @@ def test_cells_of_a_template_leave_no_ripples_in_a_large_kernel() -> None:
         torch.testing.assert_close(kernel[middle], expected[middle], rtol=6e-3, atol=0.0)
 
 
-def test_a_kernel_far_larger_than_the_frame_is_even_light() -> None:
+def test_a_kernel_far_larger_than_the_frame_is_constant() -> None:
     (kernel,) = bank_of(TABLES["disc"]).kernels(torch.tensor([5000.0], dtype=torch.float64), 400, longest=[30])
     assert kernel.shape == (1, 59, 59)
     torch.testing.assert_close(kernel, torch.full_like(kernel, 1.0 / (torch.pi * 5000.0**2)), rtol=2e-3, atol=0.0)
@@ -118,7 +117,7 @@ def test_gradients_to_the_coc_are_those_of_the_kernel() -> None:
     assert torch.autograd.gradcheck(seen, coc, eps=1e-7, atol=1e-5)
 
 
-def test_threads_that_make_the_first_kernels_of_a_table_make_the_same() -> None:
+def test_threads_that_compute_the_same_template_at_once_agree() -> None:
     table, made = BlurTable.polygon(7, 3.21, curvature=0.123), []
     work = [threading.Thread(target=lambda: made.append(bank_of(table).kernels(LARGE, 400))) for _ in range(8)]
     for thread in work:

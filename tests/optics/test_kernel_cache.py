@@ -6,7 +6,7 @@ from torch import Tensor
 from torchdof.optics.kernel_cache import KernelCache
 
 
-def test_what_was_made_is_kept_and_the_longest_unused_goes_first() -> None:
+def test_results_are_kept_and_the_least_recently_used_is_dropped_first() -> None:
     cache, made = KernelCache(25_000), []
 
     def kernel(name: str) -> Tensor:
@@ -22,7 +22,7 @@ def test_what_was_made_is_kept_and_the_longest_unused_goes_first() -> None:
     assert cache.bytes <= 25_000
 
 
-def test_what_alone_is_too_large_is_made_each_time_and_drops_nothing() -> None:
+def test_a_result_above_the_limit_is_not_kept_and_drops_nothing() -> None:
     cache = KernelCache(10_000)
     small = cache.get("small", lambda: torch.zeros(100))
     first, second = (cache.get("large", lambda: torch.zeros(10_000)) for _ in range(2))
@@ -30,7 +30,7 @@ def test_what_alone_is_too_large_is_made_each_time_and_drops_nothing() -> None:
     assert cache.get("small", lambda: torch.ones(100)) is small
 
 
-def test_a_view_counts_with_all_that_it_keeps_alive() -> None:
+def test_a_view_counts_with_its_whole_storage() -> None:
     cache = KernelCache(10_000)
     cache.get("view", lambda: torch.zeros(10_000)[:10])
     assert cache.bytes == 0

@@ -41,7 +41,7 @@ EXAMPLES: list[tuple[str, dict[str, Any]]] = [
 
 
 def distance(first: Tensor, second: Tensor) -> float:
-    """Light that sits elsewhere: the sum of the absolute differences of two kernels, whatever their sizes."""
+    """Sum of the absolute differences of two kernels, which may differ in size."""
     size = max(first.shape[-1], second.shape[-1])
     first, second = (functional.pad(k, ((size - k.shape[-1]) // 2,) * 4) for k in (first, second))
     return float((first - second).abs().sum())
@@ -53,7 +53,7 @@ def second_moment(kernel: Tensor) -> float:
 
 
 def mass_by_radius(family: str, params: dict[str, Any], cells: int = 400_000) -> tuple[Tensor, Tensor]:
-    """Radii and the light in the thin ring at each, by the midpoint rule."""
+    """Radii, and the light in the thin ring at each radius, by the midpoint rule."""
     reach = 1.5 * psf.support(family, params) + 1e-9
     r = (torch.arange(cells, dtype=torch.float64) + 0.5) / cells * reach
     return r, psf.profile(family, r, params) * r
@@ -73,7 +73,7 @@ def test_every_kernel_is_non_negative_sums_to_one_and_is_symmetric(family: str, 
 @pytest.mark.parametrize(
     ("family", "params"), [*EXAMPLES, *(("disc", {"radius": r}) for r in (0.2, 0.5, 0.7, 1.0, 2.2, 5.5, 9.99, 20.3))]
 )
-def test_kernel_is_the_finely_sampled_psf_seen_by_the_interpolator(family: str, params: dict[str, Any]) -> None:
+def test_kernel_is_the_finely_sampled_psf_weighted_by_the_interpolator(family: str, params: dict[str, Any]) -> None:
     kernel = psf.pixel_kernels(family, params)
     assert kernel.shape[-1] // 2 == math.ceil(psf.support(family, params))
 
@@ -82,14 +82,14 @@ def test_kernel_is_the_finely_sampled_psf_seen_by_the_interpolator(family: str, 
 
     reach = psf.support(family, params)
     moved = distance(kernel, loops.interpolated(profile, reach, kernel.shape[-1]))
-    assert moved < (3e-3 if reach < 8 else 1.5e-2)  # cells are wider where the PSF is large
+    assert moved < (3e-3 if reach < 8 else 1.5e-2)  # a large PSF has larger cells
 
 
 @pytest.mark.parametrize(
     ("family", "length"),
     [*(("disc", r) for r in (0.2, 0.5, 0.75, 1.0, 1.25, 1.8, 2.5, 4.0)), *(("gaussian", s) for s in (0.2, 0.5, 0.9))],
 )
-def test_no_kernel_without_negative_values_does_much_better_on_photographs(family: str, length: float) -> None:
+def test_kernels_are_close_to_the_best_non_negative_ones_on_photographs(family: str, length: float) -> None:
     kernel = psf.pixel_kernels(family, {psf.FAMILIES[family][0]: length})
 
     def spectrum(u: Tensor) -> Tensor:
@@ -104,8 +104,8 @@ def test_no_kernel_without_negative_values_does_much_better_on_photographs(famil
 
 
 @pytest.mark.parametrize("radius", [0.3, 0.5, 1.0, 2.0, 4.0])
-def test_pixels_blurred_are_nearer_to_the_blurred_scene_than_with_a_psf_integrated_once_more(radius: float) -> None:
-    scene = loops.natural_scene(size=320, seed=3)  # of 4 x 4 samples a pixel
+def test_kernels_are_more_exact_than_a_psf_integrated_over_the_pixel(radius: float) -> None:
+    scene = loops.natural_scene(size=320, seed=3)  # 4 x 4 samples a pixel
     truth = functional.avg_pool2d(
         loops.spread(scene, loops.disc_by_columns(4 * radius, 2 * math.ceil(4 * radius) + 1)), 4
     )
@@ -148,7 +148,7 @@ def test_a_small_disc_moves_light_by_the_square_of_its_radius(radius: float) -> 
 
 
 @pytest.mark.parametrize("radius", [300.0, 500.0])
-def test_kernels_reach_hundreds_of_pixels(radius: float) -> None:
+def test_kernels_of_hundreds_of_pixels_have_the_right_level_and_moment(radius: float) -> None:
     kernel = psf.disc(radius)
     inside = kernel[kernel.shape[-1] // 2, kernel.shape[-1] // 2]
     assert float(inside) == pytest.approx(1 / (math.pi * radius**2), rel=1e-5)
@@ -166,7 +166,7 @@ def test_kernels_reach_hundreds_of_pixels(radius: float) -> None:
     ],
 )
 def test_kernels_change_continuously_with_their_size(family: str, make: Any) -> None:
-    # every quarter of a pixel, so just below and above where the kernel takes one more pixel or coarser slices
+    # every quarter pixel, which includes the radii where the kernel grows by a pixel or its slices get coarser
     for radius in [*(0.25 * i for i in range(1, 56)), 64.5]:
         step = 1e-4
         below, above = (psf.pixel_kernels(family, make(r)) for r in (radius - step, radius + step))
@@ -214,7 +214,7 @@ def test_gradients_are_finite_where_kernels_are_not_smooth(family: str, length: 
     ],
     ids=["without a soft rim", "without a tilt", "without a hole", "flat"],
 )
-def test_families_hold_simpler_ones(one: Tensor, other: Tensor, apart: float) -> None:
+def test_families_contain_simpler_ones_as_special_cases(one: Tensor, other: Tensor, apart: float) -> None:
     assert distance(one, other) < apart
     assert psf.softm(3.3, 0.4, size=9)[4, 8] > psf.disc(3.3, size=9)[4, 8]
 
@@ -243,7 +243,7 @@ def test_ring_profile_is_equation_one_of_the_paper() -> None:
 
 
 @pytest.mark.parametrize(("family", "params"), [*EXAMPLES, ("disc", {"radius": 4.2})])
-def test_support_holds_all_light_but_a_hundred_thousandth(family: str, params: dict[str, Any]) -> None:
+def test_less_than_1e_5_of_the_light_is_outside_the_support(family: str, params: dict[str, Any]) -> None:
     r, mass = mass_by_radius(family, params)
     assert float(mass[r > psf.support(family, params)].sum() / mass.sum()) < 1e-5
 
@@ -307,8 +307,8 @@ def test_the_window_of_a_large_kernel_is_the_middle_of_the_whole(
 
 
 @pytest.mark.parametrize(("family", "params"), LARGE.items())
-def test_a_window_computes_no_more_than_itself(family: str, params: dict[str, Any]) -> None:
-    """A kernel of 1e8 pixels a side; its window holds its share of the light, and is flat but for a ring's hole."""
+def test_the_window_of_a_huge_kernel_is_computed_alone(family: str, params: dict[str, Any]) -> None:
+    """A kernel of 1e8 pixels a side does not fit into memory; its window is nearly constant."""
     huge = {k: v * 1e6 if k in psf.LENGTHS else v for k, v in params.items()}
     part, smaller = psf.pixel_kernels(family, huge, window=9), psf.pixel_kernels(family, params, window=1)
     assert part.shape == (9, 9)

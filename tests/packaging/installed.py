@@ -1,6 +1,6 @@
-"""Tries the torchdof that is installed, outside the repository: ``python installed.py native`` (or ``torch``).
+"""Checks the installed torchdof, outside the repository: ``python installed.py native`` (or ``torch``).
 
-The argument is the engine that should be in use.
+The argument is the expected engine.
 """
 
 import os
@@ -22,7 +22,7 @@ torch.save(torchdof.DepthOfField(camera)(image, depth) - image, sys.argv[1])
 
 
 def rendered(engine: str) -> torch.Tensor:
-    """What depth of field changed in a picture, by that engine, in a process of its own."""
+    """Difference of the picture of an engine and the image, computed in a new process."""
     path = Path(f"difference_{engine}.pt")
     environment = {**os.environ, "TORCHDOF_ENGINE": engine}
     subprocess.run([sys.executable, "-W", "error", "-c", PICTURE, str(path)], env=environment, check=True)
@@ -32,7 +32,7 @@ def rendered(engine: str) -> torch.Tensor:
 
 
 def main(engine: str) -> None:
-    """Checks the files, the command and a picture; prints what the command says of itself."""
+    """Checks the files, the command and a picture, and prints the version."""
     files = resources.files("torchdof")
     for name in ("py.typed", "fit/__init__.py", "export/__init__.py", "native/__init__.py"):
         assert files.joinpath(name).is_file(), f"{name} is not installed"
@@ -40,7 +40,7 @@ def main(engine: str) -> None:
     for suffix in ("/sato_j15.json", "/double_gauss_50mm.txt"):
         assert any(name.endswith(suffix) for name in names), f"{suffix[1:]} is not installed"
     sources = [name for name in names if name.endswith((".cpp", ".h", ".o"))]
-    assert not sources, f"what is compiled is installed: {sources}"
+    assert not sources, f"sources are installed: {sources}"
     assert any(Path(name).stem == "_engine" for name in names) == (engine == "native")
 
     command = Path(sysconfig.get_path("scripts")) / "torchdof"

@@ -34,7 +34,7 @@ def shown_psnr(image: torch.Tensor, scene: Scene, mask: torch.Tensor | None = No
     return metrics.psnr(metrics.display(image), metrics.display(scene.truth), mask)
 
 
-def test_what_is_in_focus_is_returned_bit_exact() -> None:
+def test_an_image_in_focus_is_returned_bit_exact() -> None:
     image, depth = torch.rand(2, 3, 20, 30), torch.full((1, 1, 20, 30), 2.0)
     image[0, :, 7, 9] = 300.0
     out, known = lens_views(image, depth, CAMERA, views=16)
@@ -73,7 +73,7 @@ def test_channels_are_blurred_by_their_own_kernels() -> None:
     both = lens_views_by_coc(image, coc, table=table, views=64).image
     for channel, radius in enumerate((5.0, 2.5)):
         alone = lens_views_by_coc(image[:, channel : channel + 1], torch.full_like(coc, radius), views=64).image
-        # light is split at a multiple of the mean, which is that of all channels or of one
+        # not equal: light is split at a multiple of the mean, here of both channels and there of one
         assert metrics.psnr(both[:, channel : channel + 1], alone) > 60
 
 
@@ -94,17 +94,17 @@ def test_a_highlight_is_a_disc_of_the_right_radius_and_energy(depth_m: float) ->
     assert float(disc[0, 0][r < radius - 1.5].std()) < 0.2 * level
 
 
-def test_with_hidden_surfaces_known_it_agrees_with_the_exact_truth(bars: Scene) -> None:
+def test_given_the_hidden_surfaces_it_agrees_with_the_exact_truth(bars: Scene) -> None:
     alone = lens_views(bars.image, bars.depth, bars.camera, mixed_edges=False)
-    told = lens_views(bars.image, bars.depth, bars.camera, surfaces=bars.surfaces)
+    given = lens_views(bars.image, bars.depth, bars.camera, surfaces=bars.surfaces)
     assert shown_psnr(bars.image, bars, bars.inner) < 32
-    assert shown_psnr(told.image, bars, bars.inner) > 45
-    assert shown_psnr(told.image, bars, bars.inner) > shown_psnr(alone.image, bars, bars.inner) + 3
-    assert bool((told.known[bars.inner] == 1).all())
+    assert shown_psnr(given.image, bars, bars.inner) > 45
+    assert shown_psnr(given.image, bars, bars.inner) > shown_psnr(alone.image, bars, bars.inner) + 3
+    assert bool((given.known[bars.inner] == 1).all())
     assert 0.3 < float((alone.known[bars.inner] == 1).float().mean()) < 0.95
 
 
-def test_a_stack_of_whole_surfaces_alone_renders_the_scene(bars: Scene) -> None:
+def test_a_stack_of_complete_surfaces_renders_the_scene(bars: Scene) -> None:
     far = bars.surfaces[0]
     out = lens_views(far[0][:, :3], far[1], bars.camera, surfaces=bars.surfaces[1:]).image
     assert shown_psnr(out, bars, bars.inner) > 42
@@ -112,7 +112,7 @@ def test_a_stack_of_whole_surfaces_alone_renders_the_scene(bars: Scene) -> None:
 
 @pytest.fixture(scope="module")
 def seen(crops: dict[str, Scene]) -> Callable[[str, int], torch.Tensor]:
-    """The picture of a scene by so many views, rendered once."""
+    """``seen(name, views)`` is the picture of a scene; each is rendered once."""
 
     @functools.cache
     def picture(name: str, views: int) -> torch.Tensor:
@@ -131,21 +131,21 @@ def test_256_views_are_within_half_a_decibel_of_1024(
     assert abs(many - few) < 0.5
 
 
-def test_more_views_come_nearer_to_the_limit(seen: Callable[[str, int], torch.Tensor]) -> None:
+def test_the_error_falls_with_the_number_of_views(seen: Callable[[str, int], torch.Tensor]) -> None:
     limit = seen("room/1", 1024)
     errors = [metrics.psnr(seen("room/1", views), limit) for views in (4, 16, 64, 256)]
     assert errors == sorted(errors)
     assert errors[-1] > errors[0] + 12
 
 
-def test_ray_traced_room_is_met_where_nothing_hidden_is_uncovered(crops: dict[str, Scene]) -> None:
+def test_it_matches_the_ray_traced_room_where_no_hidden_surface_appears(crops: dict[str, Scene]) -> None:
     scene = crops["room/1"]
     out, known = lens_views(scene.image, scene.depth, scene.camera, mixed_edges=False)
     assert shown_psnr(scene.image, scene, scene.inner) < 28
     assert shown_psnr(out, scene, scene.inner & (known == 1)) > 45
 
 
-def test_a_steep_surface_does_not_tear() -> None:
+def test_a_steep_surface_has_no_gaps() -> None:
     coc = torch.linspace(0.0, 40.0, 60).expand(1, 1, 50, 60)  # grows by 0.7 px a pixel
     out, known = lens_views_by_coc(torch.ones(1, 1, 50, 60), coc, views=64)
     torch.testing.assert_close(out, torch.ones_like(out))

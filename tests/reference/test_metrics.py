@@ -85,6 +85,6 @@ def test_flip_is_zero_for_equal_images_and_largest_where_they_differ() -> None:
         (lambda: metrics.psnr(IMAGE, IMAGE, IMAGE[:, :1] > 1), "mask is empty"),
     ],
 )
-def test_bad_input_is_refused_by_name(call: Callable[[], object], message: str) -> None:
+def test_errors_name_the_argument(call: Callable[[], object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         call()

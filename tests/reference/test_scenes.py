@@ -20,7 +20,7 @@ def jinc(x: torch.Tensor) -> torch.Tensor:
     return torch.stack([(torch.cos(v * t) * chord).sum() / chord.sum() for v in x])
 
 
-def test_truth_of_one_plane_is_the_waves_damped_by_disc_and_pixel() -> None:
+def test_the_truth_of_one_plane_is_its_sine_wave_damped_by_disc_and_pixel() -> None:
     k = torch.tensor([0.6], dtype=torch.float64)
     scene = plane_scene([Plane(2.0, lambda x, y: (1 + torch.sin(k * x))[None])], CAMERA, (4, 60), samples=4096)
     coc = float(scene.coc_px[0, 0, 0, 0])
@@ -33,13 +33,13 @@ def test_truth_of_one_plane_is_the_waves_damped_by_disc_and_pixel() -> None:
     torch.testing.assert_close(scene.truth[0, 0, 0], blurred.float(), rtol=0, atol=2e-3)
 
 
-def test_surfaces_composited_near_over_far_are_the_sharp_image() -> None:
+def test_compositing_the_surfaces_gives_the_sharp_image() -> None:
     planes = [Plane(1.0, waves(1), posts(20, 5)), Plane(3.0, waves(2)), Plane(2.0, waves(3), posts(31, 11, -0.2))]
     scene = plane_scene(planes, CAMERA, (20, 30), samples=256)
     out = torch.zeros(1, 3, 20, 30)
     for rgba, _ in scene.surfaces:
         out = rgba[:, :3] + (1 - rgba[:, 3:]) * out
-    # hard edges of two planes within one pixel are counted once by the scene and multiplied here
+    # where edges of two planes share a pixel, the scene samples both, while alpha compositing multiplies coverages
     assert metrics.psnr(out, scene.image) > 40
     assert sorted(set(scene.depth.flatten().tolist())) == [1.0, 2.0, 3.0]
 
@@ -83,19 +83,19 @@ def test_a_bad_scene_names_file_and_field(tmp_path: Path, change: dict[str, obje
     assert str(tmp_path) in str(error.value)
 
 
-def test_camera_of_a_frame_and_of_its_crop_blur_alike() -> None:
+def test_a_frame_and_its_crop_have_the_same_circles_of_confusion() -> None:
     depth = torch.full((1, 1, 1, 1), 3.0)
     whole, crop = (camera_of(500.0, w, 0.01, 1.0).coc_px(depth, w) for w in (640, 64))
     torch.testing.assert_close(whole, crop, rtol=1e-6, atol=0)
     assert isinstance(camera_of(500.0, 64, 0.01, 1.0), Camera)
 
 
-def test_a_strand_covers_as_much_as_its_width_and_depth_misses_parts_of_it() -> None:
+def test_a_thin_strand_covers_its_width_in_light_and_only_some_pixels_in_depth() -> None:
     width_px, angle = 0.5, 0.4
     away = 100.0 * math.cos(angle), 100.0 * math.sin(angle)
     wire = strands([(30.0 - away[0], 20.0 - away[1], 30.0 + away[0], 20.0 + away[1])], [width_px])
     planes = [Plane(4.0, lambda x, y: torch.zeros(1, *x.shape)), Plane(1.0, lambda x, y: torch.ones(1, *x.shape), wire)]
     scene = plane_scene(planes, CAMERA, (40, 60), samples=512)
-    columns = scene.image[0, 0].sum(0)  # of a slanted strand the cut is longer than its width
+    columns = scene.image[0, 0].sum(0)  # along a column a slanted strand measures width / cos(angle)
     torch.testing.assert_close(columns, torch.full((60,), width_px / math.cos(angle)), rtol=0.02, atol=0)
     assert 10 < int((scene.depth[0, 0] == 1.0).any(0).sum()) < 50

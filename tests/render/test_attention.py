@@ -11,14 +11,14 @@ from torchdof.validation import NAMED_TOLERANCES
 
 
 def scene(height: int = 192, width: int = 320) -> tuple[Tensor, Tensor]:
-    """A slope behind posts: light and signed coc."""
+    """Light and signed coc of a slope behind posts."""
     y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in (height, width)), indexing="ij")
     near = posts(80.0, 12.0)(x, y)
     light = torch.where(near, waves(2)(x, y), waves(1)(x, y)).float()[None]
     return light, torch.where(near, -5.0, 8.0 * y / height - 1.0).float()[None, None]
 
 
-def test_the_tolerance_holds_where_the_viewer_looks_and_loosens_outside() -> None:
+def test_the_tolerance_applies_where_the_viewer_looks_and_draft_elsewhere() -> None:
     image, coc = scene()
     final, draft = (torchdof.blur_by_coc(image, coc, tolerance=t) for t in ("final", "draft"))
     attended = torchdof.blur_by_coc(image, coc, tolerance="final", attention=(60.0, 96.0, 24.0))
@@ -29,7 +29,7 @@ def test_the_tolerance_holds_where_the_viewer_looks_and_loosens_outside() -> Non
     assert float(outside[weight == 0].max()) == 0.0
 
 
-def test_a_map_tells_where_the_viewer_looks_as_well() -> None:
+def test_attention_may_be_a_map() -> None:
     image, coc = scene()
     circle = weight_map((60.0, 96.0, 24.0), image)
     assert torch.equal(
@@ -37,7 +37,7 @@ def test_a_map_tells_where_the_viewer_looks_as_well() -> None:
     )
 
 
-def test_looking_everywhere_or_nowhere_is_one_rendering() -> None:
+def test_attention_everywhere_or_nowhere_equals_one_tolerance() -> None:
     image, coc = scene(96, 160)
     everywhere = torch.ones(1, 1, 96, 160)
     assert torch.equal(torchdof.blur_by_coc(image, coc, attention=everywhere), torchdof.blur_by_coc(image, coc))
@@ -53,7 +53,7 @@ def test_the_circle_fades_out_over_a_quarter_of_its_radius() -> None:
     assert weight[20] == 1 and weight[28] == 1 and weight[29] == pytest.approx(0.5) and weight[30] == 0
 
 
-def test_the_box_holds_all_that_reaches_what_is_looked_at() -> None:
+def test_the_box_contains_all_pixels_whose_blur_reaches_the_attended_area() -> None:
     weight = torch.zeros(1, 1, 400, 600)
     weight[..., 200:210, 300:301] = 0.1
     box = box_around(weight, 50.0)
@@ -64,7 +64,7 @@ def test_the_box_holds_all_that_reaches_what_is_looked_at() -> None:
     assert box_around(0 * weight, 50.0) is None
 
 
-def test_batches_backgrounds_and_gradients_go_with_attention() -> None:
+def test_attention_supports_batches_backgrounds_and_gradients() -> None:
     image, coc = scene(96, 160)
     both, cocs = torch.cat([image, image.flip(3)]), torch.cat([coc, coc.flip(3)]).requires_grad_()
     behind = torch.full_like(both, 0.3), torch.full_like(cocs, 9.0)
@@ -74,25 +74,25 @@ def test_batches_backgrounds_and_gradients_go_with_attention() -> None:
     assert cocs.grad is not None and bool(torch.isfinite(cocs.grad).all()) and float(cocs.grad.abs().max()) > 0
 
 
-SAYS = r"attention must be .*radius.*, got "
+MESSAGE = r"attention must be .*radius.*, got "
 BAD = [(1, 2), (1, 2, 0), (1, 2, -3), (1, 2, "x"), "centre", torch.ones(2, 3), (1, 2, True)]
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("options", "message"),
     [
-        *(({"attention": value}, SAYS) for value in BAD),
+        *(({"attention": value}, MESSAGE) for value in BAD),
         ({"attention": torch.full((1, 1, 32, 40), 1.5)}, "from 0 to 1"),
         ({"attention": (3, 3, 3), "plan": torchdof.render.plan.Plan((0.0, 1.0), 1 / 255)}, "leave plan out"),
     ],
 )
-def test_what_is_no_place_is_refused(options: dict[str, Any], says: str) -> None:
+def test_invalid_attention_is_refused(options: dict[str, Any], message: str) -> None:
     image, coc = scene(32, 40)
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises(ValueError, match=message):
         torchdof.blur_by_coc(image, coc, **options)
 
 
-def test_names_stand_for_tolerances() -> None:
+def test_named_tolerances_equal_their_numbers() -> None:
     image, coc = scene(96, 160)
     for name, value in NAMED_TOLERANCES.items():
         named = torchdof.blur_by_coc(image, coc, tolerance=name)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Light beyond the frame: the border's own, smoothed along it, and nothing that depends on how the frame is held."""
+"""Light outside the frame: that of the border, smoothed along it, equivariant under flips and turns."""
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ from torchdof import blur_by_coc
 from torchdof.render.border import continued
 
 
-def test_light_goes_on_as_half_the_nearest_pixel_and_half_a_mean_along_the_border() -> None:
+def test_continued_light_is_half_the_nearest_pixel_and_half_a_mean_along_the_border() -> None:
     light = torch.rand(2, 3, 20, 40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     out = continued(light, None, None, (0, 0, 0, 9), 9)
     assert out.shape == (2, 3, 29, 40)
@@ -21,14 +21,14 @@ def test_light_goes_on_as_half_the_nearest_pixel_and_half_a_mean_along_the_borde
     assert_close(out[..., 19 + 3, :], (out[..., 19 + 2, :] + out[..., 19 + 4, :]) / 2)
 
 
-def test_what_a_surface_does_not_cover_is_not_in_its_mean() -> None:
+def test_pixels_that_a_surface_does_not_cover_are_not_in_its_mean() -> None:
     light, weight = torch.full((1, 1, 6, 30), 0.5), torch.ones(1, 1, 6, 30)
     light[..., 10:], weight[..., 10:] = 0.0, 0.0
     out = continued(light, weight, None, (0, 0, 8, 8), 8)
     assert_close(out[..., :10], torch.full_like(out[..., :10], 0.5))
 
 
-def test_an_emitter_on_the_border_is_not_drawn_outwards() -> None:
+def test_a_highlight_on_the_border_is_not_continued() -> None:
     light, limit = torch.full((1, 3, 8, 50), 0.1), torch.full((1, 1, 8, 50), 0.8)
     light[..., -1, 20] = 300.0
     out = continued(light, None, limit, (4, 4, 4, 4), 4)
@@ -42,7 +42,7 @@ def turned(values: Tensor, turns: int, flip: bool) -> Tensor:
 
 @pytest.mark.parametrize("flip", [False, True])
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
-def test_light_goes_on_alike_however_the_frame_is_held(turns: int, flip: bool) -> None:
+def test_continuation_commutes_with_flips_and_turns(turns: int, flip: bool) -> None:
     light = torch.rand(1, 2, 13, 21, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     weight = torch.rand(1, 1, 13, 21, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     out = continued(light, weight, None, (6, 6, 6, 6), 6)
@@ -51,8 +51,8 @@ def test_light_goes_on_alike_however_the_frame_is_held(turns: int, flip: bool) -
 
 
 @pytest.mark.parametrize("engine", ["native", "torch"])
-def test_a_texture_is_not_drawn_outwards(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stripes that meet the border average out beyond it; the one pixel at it would leave them."""
+def test_a_texture_is_averaged_outside_the_frame(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Repeating the border's pixels would extend the stripes instead."""
     monkeypatch.setenv("TORCHDOF_ENGINE", engine)
     stripes = torch.tensor([0.2, 0.8, 0.8, 0.2]).repeat(24)
     image = stripes.expand(1, 3, 96, 96).clone()
@@ -63,10 +63,10 @@ def test_a_texture_is_not_drawn_outwards(engine: str, monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize("occlusion", [True, False])
 @pytest.mark.parametrize("engine", ["native", "torch"])
-def test_a_subject_that_the_border_cuts_leaves_its_background_alone(
+def test_a_subject_cut_by_the_border_gives_no_light_to_its_background(
     engine: str, occlusion: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A subject in focus before an even background, blurred by 21 px: beside it the background keeps its light."""
+    """A subject in focus in front of a constant background, which is blurred by 21 px."""
     monkeypatch.setenv("TORCHDOF_ENGINE", engine)
     image, coc = torch.full((1, 3, 120, 200), 60 / 255), torch.full((1, 1, 120, 200), 21.0)
     image[..., 50:, 80:130], coc[..., 50:, 80:130] = 220 / 255, 0.0
@@ -83,7 +83,7 @@ def test_a_slope_along_the_border_is_one_surface() -> None:
     assert_close(continued(light, None, None, ends, 8, slope), continued(light, None, None, ends, 8))
 
 
-def test_what_is_nearer_is_in_no_mean_and_what_is_farther_is() -> None:
+def test_the_mean_along_the_border_excludes_nearer_and_includes_farther_surfaces() -> None:
     light, x = torch.zeros(1, 1, 4, 40), torch.zeros(1, 1, 4, 40)
     light[..., 20:], x[..., 20:] = 1.0, 20.0  # bright and far
     out = continued(light, None, None, (0, 0, 0, 4), 4, x)

@@ -1,4 +1,4 @@
-"""Disocclusion: what is filled in behind blurred surfaces, and behind all layers."""
+"""Disocclusion: filled surfaces behind blurred ones, and the background behind all layers."""
 
 import pytest
 import torch
@@ -6,6 +6,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 from torch.testing import assert_close
 
+from tests.scenes import BLUE, mixed_edge
 from torchdof.render.composite import over
 from torchdof.render.convolution import convolve
 from torchdof.render.disocclusion import behind_pixels, fill_hidden, surfaces_of_image
@@ -13,30 +14,19 @@ from torchdof.render.highlights import threshold
 from torchdof.render.plan import Blur
 from torchdof.render.surfaces import HIDDEN_WEIGHT, Surface, framed
 
-RED, BLUE = torch.tensor([0.7, 0.2, 0.1]), torch.tensor([0.1, 0.3, 0.8])
-
-
-def edge(weight: float, near_px: float = -12.0, far_px: float = 0.0) -> tuple[Tensor, Tensor]:
-    """Red in front of blue; column 31 is red by a share but has the depth of red if that is at least a half."""
-    red = (torch.arange(64) < 31).float()
-    red[31] = weight
-    image = (red * RED[:, None] + (1 - red) * BLUE[:, None])[None, :, None].expand(1, 3, 48, 64)
-    coc = torch.where(red >= 0.5, near_px, far_px).expand(1, 1, 48, 64)
-    return image, coc
-
 
 def surfaces(image: Tensor, coc: Tensor, levels: int) -> tuple[Surface, Surface, Tensor]:
-    """What each pixel shows and hides, and what is behind both."""
+    """The visible and the hidden surface of each pixel, and the background behind both."""
     (own, other), behind = surfaces_of_image(image, coc, None, threshold(image), levels)
     return own, other, behind_pixels(behind, (image.shape[-2], image.shape[-1]))
 
 
-def test_what_is_hidden_is_what_is_seen_around_as_far_as_the_blur_reaches() -> None:
-    image, coc = edge(1.0, near_px=-12.0)
+def test_hidden_surfaces_have_the_colour_and_depth_of_their_surroundings_within_the_blur() -> None:
+    image, coc = mixed_edge(1.0, near_px=-12.0)
     (own, _, _), (other, other_coc, weight), behind = surfaces(image, coc, levels=5)
     assert weight is not None
     reached = (weight[0, 0, 24] > 0).nonzero()[:, 0]
-    assert 12 <= 32 - int(reached.min()) <= 32 and int(reached.max()) == 31  # nothing is behind the wall
+    assert 12 <= 32 - int(reached.min()) <= 32 and int(reached.max()) == 31  # the wall hides nothing
     assert torch.equal(own, image)
     assert torch.allclose(other[0, :, 24, 20:31], BLUE[:, None].expand(3, 11), atol=1e-5)
     assert float(other_coc[0, 0, 24, 20:31].abs().max()) < 1e-5
@@ -44,16 +34,16 @@ def test_what_is_hidden_is_what_is_seen_around_as_far_as_the_blur_reaches() -> N
 
 
 @pytest.mark.parametrize(("near_px", "share"), [(-0.5, 0.0), (-0.507, 0.49), (-0.5225, 1.0), (-3.0, 1.0)])
-def test_what_is_hidden_fades_in_with_the_blur_that_reaches_it(near_px: float, share: float) -> None:
-    """From half a pixel on the finest level is looked at; a sample counts in full from a hundredth of a vote on."""
-    image, coc = edge(1.0, near_px=near_px, far_px=2.0)
+def test_hidden_surfaces_fade_in_with_the_blur_in_front_of_them(near_px: float, share: float) -> None:
+    """The finest level is used above a blur of half a pixel; a sample has full weight above a hundredth of a vote."""
+    image, coc = mixed_edge(1.0, near_px=near_px, far_px=2.0)
     _, (_, _, weight), _ = surfaces(image, coc, levels=5)
     assert weight is not None
     assert float(weight[0, 0, 24, 31]) == pytest.approx(share * HIDDEN_WEIGHT, rel=0.02, abs=1e-6)
 
 
-def test_a_highlight_beside_what_is_hidden_is_not_hidden_there_too() -> None:
-    image, coc = edge(1.0, near_px=-12.0)
+def test_a_highlight_is_not_copied_into_the_hidden_surface_beside_it() -> None:
+    image, coc = mixed_edge(1.0, near_px=-12.0)
     image = image.clone()
     image[..., 20:28, 32:36] = 500.0
     _, (other, _, weight), behind = surfaces(image, coc, levels=5)
@@ -64,18 +54,18 @@ def test_a_highlight_beside_what_is_hidden_is_not_hidden_there_too() -> None:
     assert float(behind[0, :, 24, 20:28].max()) <= most
 
 
-def test_behind_two_blurred_surfaces_lies_the_farthest_around() -> None:
+def test_the_background_behind_two_blurred_surfaces_is_the_farthest_one_around() -> None:
     green = torch.tensor([0.1, 0.6, 0.1])
-    image, coc = edge(1.0, near_px=-18.0)
+    image, coc = mixed_edge(1.0, near_px=-18.0)
     image, coc = image.clone(), coc.clone()
     image[..., 20:28], coc[..., 20:28] = green[:, None, None], -12.0  # red in front of green, and a blue wall
     image[..., 28:], coc[..., 28:] = BLUE[:, None, None], 0.0
     _, (_, _, weight), behind = surfaces(image, coc, levels=6)
     assert weight is not None and float(weight[0, 0, 24, 16]) > 0
-    assert torch.allclose(behind[0, :, 24, 16], BLUE, atol=0.02), "the wall, not the surface in between"
+    assert torch.allclose(behind[0, :, 24, 16], BLUE, atol=0.02)  # the wall, not the surface in between
 
 
-def test_one_level_more_changes_nothing_where_no_blur_looks_so_far() -> None:
+def test_a_level_beyond_the_largest_blur_changes_nothing() -> None:
     made = torch.Generator().manual_seed(1)
     image, coc = torch.rand(1, 3, 51, 66, generator=made), 16.0 * torch.rand(1, 1, 7, 9, generator=made) - 8.0
     coc = functional.interpolate(coc, scale_factor=8.0)[..., :51, :66]
@@ -83,8 +73,8 @@ def test_one_level_more_changes_nothing_where_no_blur_looks_so_far() -> None:
     torch.testing.assert_close(fewer, more, rtol=0, atol=1e-6)
 
 
-def test_what_is_hidden_takes_the_place_of_a_surface_that_is_hardly_mixed_in_smoothly() -> None:
-    image, coc = edge(1.0, near_px=-12.0)
+def test_a_hidden_surface_replaces_a_second_surface_of_small_coverage_smoothly() -> None:
+    image, coc = mixed_edge(1.0, near_px=-12.0)
     most = threshold(image)
     weights = torch.linspace(0.0, 1.2 * HIDDEN_WEIGHT, 40)
     light, found = [], []
@@ -95,17 +85,17 @@ def test_what_is_hidden_takes_the_place_of_a_surface_that_is_hardly_mixed_in_smo
         found.append(float(weight[0, 0, 24, 30]))
     assert found[0] == pytest.approx(HIDDEN_WEIGHT) and found[-1] == pytest.approx(float(weights[-1]))
     steps = torch.stack(light).diff(dim=0).abs().max() / HIDDEN_WEIGHT, torch.tensor(found).diff().abs().max()
-    assert float(steps[0]) < 0.1 and float(steps[1]) < 0.1 * HIDDEN_WEIGHT, "no step, in 40 of them"
+    assert float(steps[0]) < 0.1 and float(steps[1]) < 0.1 * HIDDEN_WEIGHT
 
 
 @pytest.mark.parametrize("size", [(20, 30), (150, 170), (128, 64)])
-def test_a_hole_between_all_layers_shows_what_is_behind_them(size: tuple[int, int]) -> None:
+def test_a_hole_in_all_layers_shows_the_background(size: tuple[int, int]) -> None:
     cells = torch.rand(1, 3, size[0] // 4 + 3, size[1] // 4 + 2, generator=torch.Generator().manual_seed(2))
-    behind = functional.interpolate(cells, scale_factor=4.0, mode="bilinear")  # of one centre with the image
+    behind = functional.interpolate(cells, scale_factor=4.0, mode="bilinear")  # same centre as the image
     top, left = ((length - part) // 2 for length, part in zip(behind.shape[-2:], size, strict=True))
     behind = behind[..., top : top + size[0], left : left + size[1]]
     coc = torch.zeros(1, 1, *size)
-    blurs = [Blur(torch.ones(1, 1, 1), 1), Blur(torch.zeros(1, 1, 1), 1)]  # light of the farther layer goes elsewhere
+    blurs = [Blur(torch.ones(1, 1, 1), 1), Blur(torch.zeros(1, 1, 1), 1)]  # the farther layer leaves a hole
     for cover in (0.0, 0.75, 1.0):
         light = torch.full((1, 3, *size), 0.2)
         surfaces = [

@@ -1,4 +1,4 @@
-"""Kernels at a coarser resolution: averaged, spread and interpolated they come nearest to the kernel they stand for."""
+"""Kernels at a coarser resolution: averaging, convolution and interpolation together approximate the full kernel."""
 
 import pytest
 import torch
@@ -14,7 +14,7 @@ TABLES = {"disc": BlurTable.disc(), "gaussian": BlurTable.gaussian()}
 
 
 def shrink(table: BlurTable, coc_px: float, width: float, scale: int) -> float:
-    """The factor for a coc and a width in coarse pixels."""
+    """Scale of the kernel for a coc and an image width in coarse pixels."""
     return downsampling.shrink(bank_of(table), coc_px * scale, width * scale, scale)
 
 
@@ -27,7 +27,7 @@ def photograph(size: int = 256) -> Tensor:
 
 
 def spread(image: Tensor, table: BlurTable, coc_px: float) -> Tensor:
-    """Spread with the kernel of a coc, around the ends."""
+    """Circular convolution with the kernel of a coc."""
     kernel = table.kernels(torch.tensor([coc_px], dtype=torch.float64), 256)[0, 0]
     half, size = kernel.shape[-1] // 2, image.shape[-1]
     area = functional.pad(kernel, (0, size - 2 * half - 1) * 2).roll((-half, -half), (0, 1))
@@ -35,7 +35,7 @@ def spread(image: Tensor, table: BlurTable, coc_px: float) -> Tensor:
 
 
 def error(table: BlurTable, coc_px: float, scale: int, factor: float) -> float:
-    """RMS difference of the coarse chain from the kernel itself."""
+    """RMS difference between the coarse chain and the full kernel."""
     image = photograph()
     fine = upsampled(spread(downsampled(image, scale), table, coc_px / scale * factor), scale)
     inner = (..., slice(64, -64), slice(64, -64))  # interpolation does not wrap around
@@ -45,15 +45,15 @@ def error(table: BlurTable, coc_px: float, scale: int, factor: float) -> float:
 @pytest.mark.parametrize("scale", [2, 4])
 @pytest.mark.parametrize("coc_px", [1.8, 2.3, 3.6, 4.6, 7.1])
 @pytest.mark.parametrize("name", TABLES)
-def test_no_other_size_is_much_nearer_to_the_kernel(name: str, coc_px: float, scale: int) -> None:
+def test_the_scale_of_the_coarse_kernel_is_near_the_best(name: str, coc_px: float, scale: int) -> None:
     table, meant = TABLES[name], coc_px * scale
     best = min(error(table, meant, scale, 0.5 + 0.02 * step) for step in range(27))
     assert error(table, meant, scale, shrink(table, coc_px, 256 / scale, scale)) < 1.1 * best
-    assert error(table, meant, scale, 1.0) > 1.05 * best or coc_px > 3.0, "as it is would do"
+    assert error(table, meant, scale, 1.0) > 1.05 * best or coc_px > 3.0, "the test cannot detect a wrong scale"
 
 
 def test_a_wide_gaussian_keeps_its_second_moment() -> None:
-    # what averaging 2 x 2 pixels and linear interpolation add to the variance, in coarse pixels
+    # variance added by averaging 2 x 2 pixels and by linear interpolation, in squared coarse pixels
     others = 1 / 4 - 1 / 48
     table = TABLES["gaussian"]
     kernel = table.kernels(torch.tensor([6.0], dtype=torch.float64), 128)[0, 0]
@@ -63,7 +63,7 @@ def test_a_wide_gaussian_keeps_its_second_moment() -> None:
 
 
 @pytest.mark.parametrize("coc_px", [-3.0, 0.3, 11.0, 400.0])
-def test_a_size_is_a_share(coc_px: float) -> None:
+def test_the_scale_is_in_half_to_one_and_equal_on_both_sides_of_focus(coc_px: float) -> None:
     assert 0.5 <= shrink(TABLES["disc"], coc_px, 500.0, 2) <= 1.0
     mirrored = shrink(TABLES["disc"], -coc_px, 500.0, 2)
     assert shrink(TABLES["disc"], coc_px, 500.0, 2) == pytest.approx(mirrored, rel=1e-12)

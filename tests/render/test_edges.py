@@ -1,4 +1,4 @@
-"""Edges of a depth map: exact ones stay, others go to where the image has them, in both engines alike."""
+"""Repair of depth edges: exact ones stay, others move to the edges of the image; both engines agree."""
 
 import math
 from collections.abc import Callable
@@ -21,7 +21,7 @@ compiled = pytest.mark.skipif(not native.chosen(), reason="the compiled engine i
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """Bars and a fence of different colours before a wall; the depth is exact."""
+    """Bars and a fence of different colours in front of a wall, with exact depth."""
     planes = [
         Plane(6.0, waves(1, mean=(0.5, 0.4, 0.3))),
         Plane(2.5, waves(2, mean=(0.1, 0.2, 0.35)), posts(41.0, 14.0, 0.15)),
@@ -43,7 +43,7 @@ def test_exact_edges_stay_bit_for_bit(scene: Scene, kind: str) -> None:
 
 
 def compressed(depth: Tensor, quantum: float) -> Tensor:
-    """As a JPEG of 1 / depth is, all of whose coefficients are rounded alike; its blocks are of 8 x 8 pixels."""
+    """Depth after JPEG compression of 1 / depth, with one quantum for all coefficients of its 8 x 8 blocks."""
     near = 1 / depth
     low, high = near.aminmax()
     places = torch.arange(8.0)
@@ -57,7 +57,7 @@ def compressed(depth: Tensor, quantum: float) -> Tensor:
 
 @pytest.mark.parametrize("quantum", [20.0, 40.0])
 @pytest.mark.parametrize("engine", ["torch", pytest.param("native", marks=compiled)])
-def test_what_compression_leaves_beside_steps_is_no_ramp(
+def test_compression_artefacts_beside_steps_are_not_ramps(
     scene: Scene, quantum: float, engine: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", engine)
@@ -69,10 +69,10 @@ def test_what_compression_leaves_beside_steps_is_no_ramp(
 
 
 @pytest.mark.parametrize("engine", ["torch", pytest.param("native", marks=compiled)])
-def test_means_over_edges_are_ramps_though_they_are_narrow(
+def test_narrow_ramps_of_averaged_depth_are_repaired(
     scene: Scene, engine: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As depth is that was made smaller with its image, or rendered with smooth edges."""
+    """Such depth was downsampled with its image, or rendered with anti-aliasing."""
     monkeypatch.setenv("TORCHDOF_ENGINE", engine)
     image = functional.avg_pool2d(scene.image, 2)
     depth = 1 / functional.avg_pool2d(1 / scene.depth, 2)
@@ -97,20 +97,20 @@ def test_means_over_edges_are_ramps_though_they_are_narrow(
     ],
 )
 @pytest.mark.parametrize("how", ["auto", "repair"])
-def test_edges_go_to_where_the_image_has_them(scene: Scene, kind: str, left: float, how: DepthEdges) -> None:
+def test_edges_move_to_those_of_the_image(scene: Scene, kind: str, left: float, how: DepthEdges) -> None:
     depth = degrade(scene.depth, kind)
     assert wrong(repair_edges(scene.image, depth, how), scene.depth) < left * wrong(depth, scene.depth)
 
 
 @pytest.mark.parametrize("kind", sorted(set(KINDS) - {"exact"}))
-def test_a_depth_map_that_the_image_knows_nothing_of_is_left_alone(scene: Scene, kind: str) -> None:
+def test_depth_with_an_unrelated_image_is_unchanged(scene: Scene, kind: str) -> None:
     depth = degrade(scene.depth, kind)
     assert torch.equal(repair_edges(torch.rand_like(scene.image), depth, "auto"), depth)
 
 
-def test_noise_is_no_edge_and_edges_in_noise_are(scene: Scene) -> None:
+def test_noise_is_not_an_edge_and_edges_in_noise_are_repaired(scene: Scene) -> None:
     exact, thin = (-8.0 * scene.camera.coc_px(degrade(scene.depth, kind), 192) for kind in ("exact", "near -1px"))
-    noise = 0.3 * torch.randn(exact.shape)  # a step high within five pixels
+    noise = 0.3 * torch.randn(exact.shape)  # its range within five pixels is as large as a step
     assert torch.equal(edges.repair(scene.image, exact + noise, 1.0, True), exact + noise)
     left = (edges.repair(scene.image, thin + noise, 1.0, True) - exact).abs() > 10.0
     assert float(left.float().mean()) < 0.25 * float(((thin - exact).abs() > 10.0).float().mean())
@@ -118,7 +118,7 @@ def test_noise_is_no_edge_and_edges_in_noise_are(scene: Scene) -> None:
 
 @pytest.mark.parametrize("steepness", [0.02, 0.3, 1.0])
 @pytest.mark.parametrize("how", ["auto", "repair"])
-def test_a_slope_stays_a_slope(steepness: float, how: DepthEdges) -> None:
+def test_a_slope_is_unchanged(steepness: float, how: DepthEdges) -> None:
     x, y = torch.meshgrid(torch.arange(96.0), torch.arange(64.0), indexing="xy")
     coc = (steepness * (x + 0.3 * y))[None, None]
     image = waves(5)(x.double(), y.double()).float()[None]
@@ -134,12 +134,12 @@ def test_a_thin_structure_keeps_its_depth(scene: Scene) -> None:
     thin = plane_scene(planes, scene.camera, (96, 160), samples=16)
     bars = thin.depth < 3
     given = degrade(thin.depth, "half-res")
-    mended = repair_edges(thin.image, given, "auto")
-    assert float((1 / given)[bars].mean()) < 0.48  # 1 / 1.5 m, spread over what is behind
-    assert 0.55 < float((1 / mended)[bars].mean()) < 0.7
+    repaired = repair_edges(thin.image, given, "auto")
+    assert float((1 / given)[bars].mean()) < 0.48  # exact: 1 / 1.5 m
+    assert 0.55 < float((1 / repaired)[bars].mean()) < 0.7
 
 
-def test_a_lamp_whose_depth_was_averaged_away_gets_it_back() -> None:
+def test_the_averaged_depth_of_a_lamp_is_restored() -> None:
     rows, columns = torch.meshgrid(torch.arange(96.0), torch.arange(128.0), indexing="ij")
     image, depth = 0.2 + 0.02 * torch.rand(1, 3, 96, 128), torch.full((1, 1, 96, 128), 8.0)
     for row in range(12, 96, 24):
@@ -152,14 +152,14 @@ def test_a_lamp_whose_depth_was_averaged_away_gets_it_back() -> None:
     assert 0.4 < float((1 / repair_edges(image, given, "auto"))[lamps].mean()) < 0.6
 
 
-def test_the_pixels_of_a_lamp_get_one_depth_though_some_are_brighter() -> None:
+def test_pixels_of_a_lamp_of_uneven_brightness_get_one_depth() -> None:
     generator = torch.Generator().manual_seed(0)
     image, depth = 0.2 + 0.02 * torch.rand(1, 3, 96, 128, generator=generator), torch.full((1, 1, 96, 128), 8.0)
     lamps = [(..., slice(row, row + 3), slice(row // 3 + 4, row // 3 + 7)) for row in range(12, 90, 16)]
     for lamp in lamps:
         image[lamp], depth[lamp] = 50.0 + 150.0 * torch.rand(1, 3, 3, 3, generator=generator), 2.0
-    mended = 1 / repair_edges(image, degrade(depth, "half-res"), "auto")
-    assert max(float(mended[lamp].max() - mended[lamp].min()) for lamp in lamps) < 0.005
+    repaired = 1 / repair_edges(image, degrade(depth, "half-res"), "auto")
+    assert max(float(repaired[lamp].max() - repaired[lamp].min()) for lamp in lamps) < 0.005
 
 
 @pytest.mark.parametrize("times", [2.0**-10, 2.0**20])
@@ -181,9 +181,9 @@ TURNS: dict[str, Callable[[Tensor], Tensor]] = {
 @pytest.mark.parametrize(
     ("engine", "times"),
     [("torch", (1, 1)), pytest.param("native", (3, 3), marks=compiled)]
-    + [pytest.param("native", (7, 6), marks=compiled)],  # of a frame that large a sample is looked at alone
+    + [pytest.param("native", (7, 6), marks=compiled)],  # a frame large enough to be sampled
 )
-def test_a_turned_map_is_repaired_as_it_is_unturned(
+def test_repair_commutes_with_flips_and_turns(
     scene: Scene,
     kind: str,
     turn: Callable[[Tensor], Tensor],
@@ -191,9 +191,9 @@ def test_a_turned_map_is_repaired_as_it_is_unturned(
     times: tuple[int, int],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Its sizes are odd; a sample that is not turned with it meets other damage and noise."""
+    """Sizes are odd and damage and noise uneven, so that a sample that is not turned with the frame is detected."""
     monkeypatch.setenv("TORCHDOF_ENGINE", engine)
-    monkeypatch.setattr(edges, "_SAMPLED", 2**12)  # else the plain engine looks at all of a small frame
+    monkeypatch.setattr(edges, "_SAMPLED", 2**12)  # makes the plain engine sample a small frame
     image = scene.image.repeat(1, 1, *times)[..., :-1, :-3]
     exact, damaged = (
         scene.camera.coc_px(degrade(scene.depth, k), 192).repeat(1, 1, *times)[..., :-1, :-3] for k in ("exact", kind)
@@ -201,14 +201,14 @@ def test_a_turned_map_is_repaired_as_it_is_unturned(
     height, width = exact.shape[-2:]
     coc = torch.where(torch.arange(width) + torch.arange(height)[:, None] < 0.9 * width, damaged, exact)
     coc = coc + 0.01 * torch.randn(height, 1, generator=torch.Generator().manual_seed(0))
-    mended = edges.repair(image, -coc, edges.STEP_PX, True)
-    assert not torch.equal(mended, -coc)
+    repaired = edges.repair(image, -coc, edges.STEP_PX, True)
+    assert not torch.equal(repaired, -coc)
     turned = edges.repair(turn(image).contiguous(), turn(-coc).contiguous(), edges.STEP_PX, True)
-    torch.testing.assert_close(turned, turn(mended), rtol=0, atol=1e-3)
+    torch.testing.assert_close(turned, turn(repaired), rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize("engine", ["torch", pytest.param("native", marks=compiled)])
-def test_noise_from_row_to_row_counts_as_noise_from_column_to_column(
+def test_noise_along_rows_and_along_columns_is_not_an_edge(
     scene: Scene, engine: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", engine)
@@ -218,15 +218,15 @@ def test_noise_from_row_to_row_counts_as_noise_from_column_to_column(
 
 
 @pytest.mark.parametrize("marked", [0.0, -3.0])
-def test_values_of_pixels_without_depth_stay_and_touch_nothing(scene: Scene, marked: float) -> None:
+def test_markers_of_holes_are_kept_and_act_like_nan(scene: Scene, marked: float) -> None:
     depth, holes = degrade(scene.depth, "near -1px"), torch.zeros_like(scene.depth, dtype=torch.bool)
     holes[..., 40:60, :30] = True
-    mended, same = (repair_edges(scene.image, torch.where(holes, value, depth)) for value in (torch.nan, marked))
-    assert bool(mended.isnan()[holes].all()) and bool((same[holes] == marked).all())
-    assert torch.equal(mended[~holes], same[~holes])
+    repaired, same = (repair_edges(scene.image, torch.where(holes, value, depth)) for value in (torch.nan, marked))
+    assert bool((same[holes] == marked).all())
+    assert torch.equal(repaired[~holes], same[~holes])
 
 
-def test_a_hole_within_a_surface_changes_nothing_else(scene: Scene) -> None:
+def test_a_hole_within_a_surface_changes_no_other_pixel(scene: Scene) -> None:
     depth, holes = torch.full((1, 1, 128, 192), 4.0), torch.zeros(1, 1, 128, 192, dtype=torch.bool)
     depth[..., 101:], holes[..., 40:60, 20:60] = 2.0, True
     image = scene.image * torch.where(torch.arange(192) < 100, 0.3, 1.0)
@@ -235,36 +235,35 @@ def test_a_hole_within_a_surface_changes_nothing_else(scene: Scene) -> None:
     assert torch.equal(repair_edges(image, torch.where(holes, torch.nan, depth))[~holes], whole[~holes])
 
 
-def test_pixels_without_depth_stay_and_touch_nothing(scene: Scene) -> None:
+def test_holes_stay_and_hardly_affect_other_pixels(scene: Scene) -> None:
     depth = degrade(scene.depth, "near -1px")
     holes = torch.zeros_like(depth, dtype=torch.bool)
     holes[..., 40:60, :30] = True
-    mended = repair_edges(scene.image, torch.where(holes, torch.nan, depth))
-    assert bool(mended.isnan()[holes].all())
-    assert not bool(mended.isnan()[~holes].any())
+    repaired = repair_edges(scene.image, torch.where(holes, torch.nan, depth))
+    assert torch.equal(repaired.isnan(), holes)
     whole = repair_edges(scene.image, depth)
-    # what is learnt from the frame is learnt from fewer pixels: one whose surfaces are equally likely may change sides
-    assert float((mended / whole - 1)[..., 60:, :].abs().gt(1e-5).float().mean()) < 2e-4
+    # statistics of the frame come from fewer pixels, so a pixel with equally likely surfaces may change
+    assert float((repaired / whole - 1)[..., 60:, :].abs().gt(1e-5).float().mean()) < 2e-4
 
 
-def test_a_lamp_gets_no_more_nearness_than_it_lost() -> None:
+def test_a_lamp_does_not_come_nearer_than_it_was() -> None:
     rows, columns = torch.meshgrid(torch.arange(96.0), torch.arange(128.0), indexing="ij")
     image, inverse = 0.2 + 0.02 * torch.rand(1, 3, 96, 128), torch.full((1, 1, 96, 128), 0.125)
     for row in range(12, 96, 24):
         for column in range(12, 128, 26):
             apart = (rows - row) ** 2 + (columns - column) ** 2
             image[..., apart < 5] = 200.0
-            inverse[..., apart < 14] = 0.5  # the map's lamps are larger than the image's: nothing is lost
+            inverse[..., apart < 14] = 0.5  # larger in the map than in the image, so that no depth was lost
     given = degraded._blurred(1 / inverse, 1.5)
     assert float((1 / repair_edges(image, given, "auto")).max()) < 0.6
 
 
 @pytest.mark.parametrize("kind", ["half-res", "near -1px"])
 @pytest.mark.parametrize("engine", ["torch", pytest.param("native", marks=compiled)])
-def test_what_differs_by_less_than_half_a_step_has_no_edge(
+def test_differences_below_half_a_step_are_not_edges(
     scene: Scene, kind: str, engine: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)  # the renderer does not ask for a repair then
+    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
     nearness = 1.0 / degrade(scene.depth, kind)
     image = scene.image.clone()
     image[..., 60:62, 90:92] = 500.0
@@ -275,8 +274,8 @@ def test_what_differs_by_less_than_half_a_step_has_no_edge(
 
 
 @pytest.mark.parametrize("moved", [1e-4, -1e-4])
-def test_a_hair_decides_no_direction(moved: float) -> None:
-    """Where four blocks meet, the near surface lies as much beside a pixel as below it."""
+def test_the_direction_of_an_edge_does_not_depend_on_rounding(moved: float) -> None:
+    """Where four blocks meet, the near surface is equally beside and below a pixel."""
     blocks = 3.0 * torch.randint(0, 4, (1, 1, 6, 8)).repeat_interleave(8, -1).repeat_interleave(8, -2) + 0.1
     found, again = (edges._find(n, n.isfinite(), torch.tensor(1.0)) for n in (blocks, blocks + moved))
     assert bool(found.is_edge.any())
@@ -287,20 +286,19 @@ def test_infinite_depth_is_a_surface(scene: Scene) -> None:
     depth = torch.where(scene.depth == 6.0, math.inf, scene.depth)
     assert torch.equal(repair_edges(scene.image, depth, "auto"), depth)
     given = degrade(depth, "near -1px")
-    mended = repair_edges(scene.image, given, "auto")
-    assert float((mended.isinf() != depth.isinf()).float().mean()) < 0.3 * float(
-        (given.isinf() != depth.isinf()).float().mean()
-    )
+    repaired = repair_edges(scene.image, given, "auto")
+    errors = [(d.isinf() != depth.isinf()).float().mean() for d in (repaired, given)]
+    assert float(errors[0]) < 0.3 * float(errors[1])
 
 
-def test_gradients_flow_to_what_is_not_repaired(scene: Scene) -> None:
+def test_gradients_flow_to_pixels_that_are_not_repaired(scene: Scene) -> None:
     depth = degrade(scene.depth, "near -1px").requires_grad_()
-    mended = repair_edges(scene.image, depth)
-    (gradient,) = torch.autograd.grad(mended.sum(), depth)
-    assert torch.equal(gradient, (mended == depth).float())
+    repaired = repair_edges(scene.image, depth)
+    (gradient,) = torch.autograd.grad(repaired.sum(), depth)
+    assert torch.equal(gradient, (repaired == depth).float())
 
 
-def test_an_item_of_a_batch_is_repaired_as_it_is_alone(scene: Scene) -> None:
+def test_items_of_a_batch_are_repaired_independently(scene: Scene) -> None:
     images = torch.cat([scene.image, torch.rand_like(scene.image)])
     depth = degrade(scene.depth, "half-res")
     together = repair_edges(images, depth, "auto")
@@ -308,21 +306,21 @@ def test_an_item_of_a_batch_is_repaired_as_it_is_alone(scene: Scene) -> None:
     assert torch.equal(together[1:], depth)
 
 
-def test_the_renderer_repairs_as_its_option_says(scene: Scene) -> None:
+def test_the_renderer_repairs_by_its_option_depth_edges(scene: Scene) -> None:
     depth = degrade(scene.depth, "half-res")
     coc = scene.camera.coc_px(depth, 192)
-    mended = -edges.repair(scene.image, -coc, torch.tensor(1.0), True)
+    repaired = -edges.repair(scene.image, -coc, torch.tensor(1.0), True)
     as_given = DepthOfField(scene.camera, depth_edges="as given")
     assert torch.equal(as_given.coc_px(scene.image, depth), coc)
-    assert torch.equal(DepthOfField(scene.camera).coc_px(scene.image, depth), mended)
-    expected = blur_by_coc(scene.image, mended, depth_edges="as given")
+    assert torch.equal(DepthOfField(scene.camera).coc_px(scene.image, depth), repaired)
+    expected = blur_by_coc(scene.image, repaired, depth_edges="as given")
     assert torch.equal(DepthOfField(scene.camera)(scene.image, depth), expected)
     assert torch.equal(blur_by_coc(scene.image, coc), expected)
     assert not torch.equal(as_given(scene.image, depth), expected)
 
 
 @pytest.mark.parametrize("value", ["Auto", None, True, 1])
-def test_another_treatment_is_refused(scene: Scene, value: DepthEdges) -> None:
+def test_an_invalid_option_is_refused(scene: Scene, value: DepthEdges) -> None:
     refused = "must be 'auto', 'repair' or 'as given', got"
     for call in (
         lambda: repair_edges(scene.image, scene.depth, value),
@@ -341,14 +339,14 @@ def test_engines_agree(scene: Scene, kind: str, auto: bool) -> None:
     plain = edges._repair(scene.image, nearness, torch.tensor(1.0), auto)
     fast = native.repair_edges(scene.image[0], nearness[0, 0], torch.tensor(1.0), auto)
     same = torch.isclose(fast, plain[0, 0], rtol=1e-3, atol=1e-3, equal_nan=True)
-    assert float(same.float().mean()) > 0.999  # where both surfaces are equally likely, rounding may decide
+    assert float(same.float().mean()) > 0.999  # rounding may decide if both surfaces are equally likely
     coc = native.repair_edges(scene.image[0], -nearness[0, 0], torch.tensor(1.0), auto, of_coc=True)
     torch.testing.assert_close(coc, -fast, rtol=0, atol=0, equal_nan=True)
 
 
 @compiled
 @pytest.mark.parametrize(("kind", "is_exact"), [("exact", True), ("shift 1px", False), ("half-res", False)])
-def test_engines_agree_on_frames_of_which_a_part_decides(scene: Scene, kind: str, is_exact: bool) -> None:
+def test_engines_agree_on_frames_that_are_sampled(scene: Scene, kind: str, is_exact: bool) -> None:
     image = scene.image.repeat(1, 1, 6, 5)
     nearness = -scene.camera.coc_px(degrade(scene.depth, kind), 192).repeat(1, 1, 6, 5)
     assert nearness[0, 0].numel() > 4 * edges._SAMPLED
@@ -361,7 +359,7 @@ def test_engines_agree_on_frames_of_which_a_part_decides(scene: Scene, kind: str
 @compiled
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 3), (65, 130)])
 def test_engines_agree_on_frames_of_any_size(size: tuple[int, int]) -> None:
-    blocks = 9 * torch.rand(1, 1, 1 + size[0] // 5, 1 + size[1] // 5)  # values beside each other are no noise
+    blocks = 9 * torch.rand(1, 1, 1 + size[0] // 5, 1 + size[1] // 5)  # blocks, because noise would not be repaired
     nearness = blocks.repeat_interleave(5, -2).repeat_interleave(5, -1)[..., : size[0], : size[1]].contiguous()
     image = torch.rand(1, 2, *size)
     plain = edges._repair(image, nearness, torch.full_like(nearness, 0.5), False)
@@ -385,12 +383,12 @@ def test_any_number_of_threads_gives_the_same_bits(scene: Scene) -> None:
     assert torch.equal(results[0], results[2])
 
 
-def test_a_compiled_graph_holds_it_as_one_operator(scene: Scene) -> None:
+def test_repair_compiles_without_graph_breaks(scene: Scene) -> None:
     coc = scene.camera.coc_px(degrade(scene.depth, "half-res"), 192)
 
     @torch.compile(backend="eager", fullgraph=True)
-    def mend(image: Tensor, nearness: Tensor) -> Tensor:
+    def repaired(image: Tensor, nearness: Tensor) -> Tensor:
         return edges.repair(image, nearness, 1.0, True)
 
-    function: Callable[[Tensor, Tensor], Tensor] = mend
+    function: Callable[[Tensor, Tensor], Tensor] = repaired
     torch.testing.assert_close(function(scene.image, -coc), edges._repair(scene.image, -coc, torch.tensor(1.0), True))

@@ -26,14 +26,14 @@ def number(value: float) -> Tensor:
 
 
 def passed(table: BlurTable, coc_px: float, y: float, x: float, size: tuple[int, int] = (100, 100)) -> Tensor:
-    """Kernel ``[C, k, k]`` of a place in half diagonals."""
+    """Kernel ``[C, k, k]`` at a place given in half diagonals from the middle of the frame."""
     shares = layer_shares(table, coc_px, 1, size)
     kernel = table.kernels(number(coc_px)[None], size[1])
     return placed(kernel, [(shares, number(1.0))], number(y)[None], number(x)[None])[0]
 
 
 def cats_eye(coc_px: float, y: float, x: float, half: int, front: float, rear: float) -> Tensor:
-    """Share of each pixel that lies in the disc and in those of the rims, by 15 x 15 points."""
+    """Kernel of a cat's eye: intersection of the disc and the rims, sampled at 15 x 15 points a pixel."""
     fine = 15
     place = (torch.arange((2 * half + 1) * fine, dtype=torch.float64) + 0.5) / fine - half - 0.5
     down, across = place[:, None], place[None, :]
@@ -46,7 +46,7 @@ def cats_eye(coc_px: float, y: float, x: float, half: int, front: float, rear: f
 
 @pytest.mark.parametrize("coc_px", [-15.0, 15.0])
 @pytest.mark.parametrize(("y", "x", "vignetting"), [(0.6, 0.8, 0.4), (-0.5, 0.1, (0.7, 0.0)), (0.6, -0.8, (0.1, 0.4))])
-def test_the_kernel_of_a_place_is_what_disc_and_rim_leave_open(
+def test_the_kernel_of_a_place_is_the_intersection_of_disc_and_rims(
     coc_px: float, y: float, x: float, vignetting: Any
 ) -> None:
     aperture = Aperture(vignetting=vignetting)
@@ -54,7 +54,7 @@ def test_the_kernel_of_a_place_is_what_disc_and_rim_leave_open(
     cut = passed(BlurTable.disc().with_aperture(aperture), coc_px, y, x)
     expected = cats_eye(coc_px, y, x, kernel.shape[-1] // 2, *aperture.rims)
     assert float(cut.sum()) == pytest.approx(1.0, abs=1e-12)
-    assert (cut[0] - expected).abs().sum() < 0.04  # of the light, within a pixel of the rim's border
+    assert (cut[0] - expected).abs().sum() < 0.04  # share of the light; errors are at the border of a rim
     assert (kernel[0] - expected).abs().sum() > 0.25
     # behind focus the front rim cuts off the side away from the middle of the frame, the rear rim the other
     front, rear = aperture.rims
@@ -65,7 +65,7 @@ def test_the_kernel_of_a_place_is_what_disc_and_rim_leave_open(
     )
 
 
-def test_in_the_middle_of_the_frame_and_near_focus_nothing_is_cut() -> None:
+def test_kernels_are_not_cut_in_the_middle_of_the_frame_or_near_focus() -> None:
     for coc in (-9.0, 0.02, 3.0):
         kernel = BlurTable.gaussian().kernels(number(coc)[None], 100)[0]
         assert_close(passed(BlurTable.gaussian().with_aperture(CUT), coc, 0.0, 0.0), kernel, rtol=1e-12, atol=0)
@@ -73,7 +73,7 @@ def test_in_the_middle_of_the_frame_and_near_focus_nothing_is_cut() -> None:
     assert_close(passed(TABLE, 0.3, 0.6, 0.8), kernel, rtol=1e-12, atol=0)
 
 
-def test_blur_across_the_frame_is_each_pixels_own_within_a_hundredth() -> None:
+def test_each_pixel_is_blurred_by_the_kernel_of_its_place_within_a_hundredth() -> None:
     height, width, coc_px = 120, 200, 5.0
     image = torch.rand(1, 1, height, width, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     coc = torch.full_like(image, coc_px)
@@ -88,7 +88,7 @@ def test_blur_across_the_frame_is_each_pixels_own_within_a_hundredth() -> None:
         assert float(picture[0, 0, row, column]) == pytest.approx(expected, abs=0.01)
 
 
-def test_even_light_stays_even_and_coarse_layers_agree_with_fine_ones() -> None:
+def test_constant_light_stays_constant_and_coarse_layers_agree_with_fine_ones() -> None:
     coc = torch.linspace(-12.0, 14.0, 90).expand(1, 1, 60, 90).contiguous()
     even = blur_by_coc(torch.full((1, 3, 60, 90), 0.3), coc, table=TABLE)
     assert_close(even, torch.full_like(even, 0.3), rtol=0, atol=1e-5)
@@ -111,7 +111,7 @@ def test_a_picture_with_cats_eyes_has_gradients() -> None:
 
 
 def lopsided(channels: int = 1) -> BlurTable:
-    """A lens whose spots trail outwards, more so off the axis, and are wider across than along."""
+    """A lens with coma: off the axis, spots trail outwards and are wider across than along."""
     coc, radius = torch.tensor([-0.5, -0.2, 0.0, 0.3, 0.6]), torch.tensor([0.0, 8.0, 18.0])
     size = (coc[:, None].abs() + 0.01) * (1.0 - 0.02 * radius)
     box = torch.stack([0.02 * radius * size, size, (1.0 + 0.03 * radius) * size], -1)
@@ -123,7 +123,7 @@ def lopsided(channels: int = 1) -> BlurTable:
 
 
 @pytest.mark.parametrize(("y", "x", "coc_px"), [(0.0, 9.0, 6.0), (-6.0, 8.0, 6.0), (5.0, -5.0, 6.0), (-6.0, 8.0, 1.0)])
-def test_a_spot_lies_outwards_of_its_place_and_is_turned_with_it(y: float, x: float, coc_px: float) -> None:
+def test_a_spot_has_the_moments_of_its_field_turned_by_the_azimuth(y: float, x: float, coc_px: float) -> None:
     table, width = lopsided(), 360
     per_mm = width / 36.0
     half_diagonal = 0.5 * math.hypot(width, 240) / per_mm
@@ -150,7 +150,7 @@ def test_a_spot_lies_outwards_of_its_place_and_is_turned_with_it(y: float, x: fl
     assert float((kernel * (u - mean) ** 2).sum()) == pytest.approx(float(spread[1]), rel=0.02)
 
 
-def test_in_focus_a_field_leaves_a_point_a_point() -> None:
+def test_kernels_of_a_field_are_one_pixel_in_focus() -> None:
     table = lopsided()
     for coc_px in (0.0, 0.02):
         shares = layer_shares(table, coc_px, 1, (240, 360))
@@ -160,7 +160,7 @@ def test_in_focus_a_field_leaves_a_point_a_point() -> None:
 
 
 @pytest.mark.parametrize("colours", [1, 3])
-def test_fold_scatters_each_pixel_with_the_kernel_of_its_own_place(colours: int) -> None:
+def test_fold_scatters_each_pixel_with_the_kernel_of_its_place(colours: int) -> None:
     height, width, coc_px, table = 48, 72, -3.3, lopsided(colours)
     image = torch.zeros(1, 3, height, width, dtype=torch.float64)
     row, column = 13, 55
@@ -182,7 +182,7 @@ def test_fold_scatters_each_pixel_with_the_kernel_of_its_own_place(colours: int)
     [(BlurTable.disc().with_aperture(Aperture(vignetting=0.8)), True), (lopsided(3), False)],
     ids=["cat's eyes", "a field of three colours"],
 )
-def test_layers_are_the_literal_scatter_but_for_what_blocks_share(
+def test_layers_agree_with_the_literal_scatter_within_the_error_of_blocks(
     table: BlurTable, occlusion: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image = torch.rand(1, 3, 16, 24, generator=torch.Generator().manual_seed(3))
@@ -199,7 +199,7 @@ def test_layers_are_the_literal_scatter_but_for_what_blocks_share(
             assert psnr(plain, literal) < 32.0
 
 
-def test_no_seam_shows_between_blocks() -> None:
+def test_there_is_no_seam_between_blocks() -> None:
     y, x = torch.meshgrid(torch.arange(240.0), torch.arange(720.0), indexing="ij")
     image = ((x + 0.3 * y) % 61.0 - 12.5).clamp(0.0, 1.0)[None, None] * 0.8 + 0.1  # slanted bars
     aperture = Aperture(vignetting=0.8)
@@ -212,11 +212,11 @@ def test_no_seam_shows_between_blocks() -> None:
 
 
 @pytest.mark.parametrize("table", [TABLE, lopsided()], ids=["cat's eyes", "a field"])
-def test_a_highlight_has_the_kernel_of_its_own_radius_and_place(table: BlurTable) -> None:
+def test_a_highlight_has_the_kernel_of_its_radius_and_place(table: BlurTable) -> None:
     height, width, row, column, coc_px = 100, 160, 24, 131, 7.0
     image = torch.full((1, 1, height, width), 0.1, dtype=torch.float64)
     coc = torch.full_like(image, coc_px)
-    coc[..., :20] = 3.0  # of two layers, that there are rays
+    coc[..., :20] = 3.0  # rays need at least two layers
     dark = blur_by_coc(image, coc, table=table, tolerance=0)
     image[..., row, column] = 200.0
     spot = (blur_by_coc(image, coc, table=table, tolerance=0) - dark)[0, 0] / 199.9
@@ -226,10 +226,10 @@ def test_a_highlight_has_the_kernel_of_its_own_radius_and_place(table: BlurTable
     expected = placed(own, [(shares, number(1.0))], number(y)[None], number(x)[None])[0, 0]
     half = len(expected) // 2
     spot = spot[row - half : row + half + 1, column - half : column + half + 1]
-    assert float((spot - expected).abs().sum()) < 0.01  # of the light
+    assert float((spot - expected).abs().sum()) < 0.01  # share of the light
 
 
-def test_where_the_viewer_looks_and_elsewhere_the_frame_keeps_its_tolerance() -> None:
+def test_attention_is_ignored_if_kernels_depend_on_the_place() -> None:
     image, coc = torch.rand(1, 3, 40, 60), torch.full((1, 1, 40, 60), 2.0)
     looked_at = blur_by_coc(image, coc, table=TABLE, attention=(4.0, 4.0, 2.0))
     assert torch.equal(looked_at, blur_by_coc(image, coc, table=TABLE))

@@ -1,4 +1,4 @@
-"""Highlights: crisp discs of the right radius and energy, with the shadows of what stands in their rays' way."""
+"""Highlights: crisp discs of the right radius and energy, with shadows of the surfaces that their rays hit."""
 
 import math
 from typing import Any
@@ -17,9 +17,9 @@ LAMP = 3000.0
 
 
 def street(coc_px: float = 14.0, post_px: float | None = None) -> tuple[Tensor, Tensor, tuple[int, int]]:
-    """A lamp of one pixel in front of a dim wall, and a nearer post beside it: image, coc, the lamp's place."""
+    """Image and coc of a lamp of one pixel on a dim wall with a nearer post beside it; and the place of the lamp."""
     image, coc = torch.full((1, 3, 96, 96), 0.05), torch.full((1, 1, 96, 96), coc_px)
-    coc[..., :2, :2] = 0.0  # more than one surface
+    coc[..., :2, :2] = 0.0  # a second surface
     place = (48, 50)
     if post_px is not None:
         coc[..., :, 41:45] = post_px
@@ -42,12 +42,12 @@ def test_a_highlight_is_a_disc_of_its_radius_and_energy(coc_px: float, tolerance
 
 
 @pytest.mark.parametrize(("coc_px", "post_px"), [(14.0, -6.0), (14.0, 4.0), (-9.0, -15.0), (22.0, 0.0)])
-def test_a_post_in_front_draws_its_shadow_where_its_rays_pass(coc_px: float, post_px: float) -> None:
+def test_a_post_in_front_stops_the_rays_that_hit_it(coc_px: float, post_px: float) -> None:
     image, coc, (row, column) = street(coc_px, post_px)
     got = blur_by_coc(image, coc, tolerance=0.0)[0, 0]
     kernel = BlurTable.disc().kernels(torch.tensor([coc_px]), 96)[0, 0]
     half = kernel.shape[-1] // 2
-    for dx in range(-half, half + 1):  # along the row of the lamp, ray by ray
+    for dx in range(-half, half + 1):  # rays along the row of the lamp
         passes_at = column + dx * (1 - post_px / coc_px)
         lands = float(got[row, column + dx])
         if 41.5 <= passes_at <= 43.5:
@@ -57,7 +57,7 @@ def test_a_post_in_front_draws_its_shadow_where_its_rays_pass(coc_px: float, pos
 
 
 @pytest.mark.parametrize(("stretch", "half"), [(1.0, 9), (8.0, 40)])
-def test_a_ray_meets_every_nearer_surface_in_its_way(stretch: float, half: int) -> None:
+def test_a_ray_is_stopped_by_every_nearer_surface_it_hits(stretch: float, half: int) -> None:
     made = torch.Generator().manual_seed(1)
     height, width = 90, 131
     coc_px = torch.full((1, 1, height, width), 9.0, dtype=torch.float64)
@@ -65,14 +65,14 @@ def test_a_ray_meets_every_nearer_surface_in_its_way(stretch: float, half: int) 
     for top, left, near in ((10, 110, -6.0), (60, 70, 3.1), (20, 66, 5.0)):
         coc_px[..., top : top + 12, left : left + 12] = near
     source = torch.randint(height * width, (40,), generator=made)
-    source[0] = 45 * width + 8  # far from all that is as far away as it is
+    source[0] = 45 * width + 8  # far from all surfaces of its own depth
     row, column = source // width, source % width
     coc = stretch * torch.tensor([9.0, 4.5, -1.5, 1.1], dtype=torch.float64).repeat(10)
     coc_px = stretch * coc_px
     step = torch.arange(-half, half + 1)
-    covers = torch.rand(coc_px.shape, dtype=torch.float64, generator=made)  # of the own surface and of a second one
+    covers = torch.rand(coc_px.shape, dtype=torch.float64, generator=made)  # coverage of the first surface
     other_px = stretch * 3.0 + torch.zeros_like(coc_px)
-    others = torch.where(covers < 0.3, 0.9 - covers, HIDDEN_WEIGHT)  # what is hidden covers nothing
+    others = torch.where(covers < 0.3, 0.9 - covers, HIDDEN_WEIGHT)  # a hidden surface stops no rays
     nothing = torch.zeros_like(coc_px)
     shown = [Surface(nothing, coc_px, covers), Surface(nothing, other_px, others)]
     hiding = highlights._Occluders(highlights._obstacles(shown))
@@ -110,7 +110,7 @@ def test_light_below_the_threshold_stays_in_the_layers() -> None:
     assert left.light is image
 
 
-def test_what_is_extracted_and_what_is_left_sum_to_the_light() -> None:
+def test_extracted_and_remaining_light_sum_to_the_image() -> None:
     image, coc, (row, column) = street()
     left, rays = highlights.extract(Surface(image, coc), highlights.threshold(image))
     assert rays is not None
@@ -120,7 +120,7 @@ def test_what_is_extracted_and_what_is_left_sum_to_the_light() -> None:
 
 
 @pytest.mark.parametrize(("coc_px", "share"), [(0.9, 0.0), (1.25, 0.25), (-1.75, 0.75), (2.5, 1.0)])
-def test_rays_begin_with_a_blur_of_one_pixel_and_take_all_from_two_on(coc_px: float, share: float) -> None:
+def test_extraction_fades_in_from_a_blur_of_one_to_two_pixels(coc_px: float, share: float) -> None:
     image = torch.full((1, 1, 40, 40), 0.1)
     image[..., 20, 20] = 100.0
     limit = highlights.threshold(image)
@@ -132,17 +132,17 @@ def test_rays_begin_with_a_blur_of_one_pixel_and_take_all_from_two_on(coc_px: fl
 @pytest.mark.parametrize(
     ("cover", "nearer_px", "beside_light", "sent"),
     [
-        (0.4, 3.0, 0.1, 1.0),  # of nearer surfaces by as much as they are in the way of rays,
+        (0.4, 3.0, 0.1, 1.0),  # depends on the distance to the nearer surface
         (0.4, 1.5, 0.1, 0.7),
         (0.4, 1.0, 0.1, 0.4),
         (0.4, -3.0, 0.1, 0.4),
-        (0.4, 3.0, 1.2, 0.7),  # if they are no highlights,
+        (0.4, 3.0, 1.2, 0.7),  # on the light of the nearer surface, which must not be a highlight
         (0.4, 3.0, 1.6, 0.4),
-        (0.053, 3.0, 0.1, 0.5265),  # and by as much as layers count of what goes on behind them
+        (0.053, 3.0, 0.1, 0.5265),  # on the coverage, as in layers
         (0.003, 3.0, 0.1, 0.003),
     ],
 )
-def test_highlights_behind_a_part_of_a_nearer_surface_send_the_light_of_a_whole_pixel(
+def test_highlights_partly_covered_by_a_nearer_surface_send_the_light_of_a_whole_pixel(
     cover: float, nearer_px: float, beside_light: float, sent: float
 ) -> None:
     image = torch.full((1, 1, 40, 40), 0.1)
@@ -160,14 +160,14 @@ def test_highlights_behind_a_part_of_a_nearer_surface_send_the_light_of_a_whole_
     [
         (0, 0.5, 1.0),
         (1, 0.5, 1.0),
-        (2, 0.5, 0.82),  # 1.5 - 10 * 2 / 25 of what it would send more
+        (2, 0.5, 0.82),  # the additional light is multiplied by 1.5 - 10 * 2 / 25
         (4, 0.5, 0.4),
-        (25, 0.05, 1.0),  # near enough to one of the surfaces
+        (25, 0.05, 1.0),  # pixels near one of the surfaces are not between them
         (25, 0.95, 1.0),
         (3, 0.125, 0.94),  # counts half
     ],
 )
-def test_highlights_send_the_light_of_a_whole_pixel_only_where_depth_steps(
+def test_highlights_send_the_light_of_a_whole_pixel_only_at_steps_of_depth(
     between: int, share: float, sent: float
 ) -> None:
     image = torch.full((1, 1, 40, 40), 0.1)
@@ -183,7 +183,7 @@ def test_highlights_send_the_light_of_a_whole_pixel_only_where_depth_steps(
     assert float(rays.light) == pytest.approx(sent * (100.0 - 0.8), rel=1e-4)
 
 
-def test_where_a_surface_is_not_it_has_no_rays() -> None:
+def test_a_surface_without_coverage_has_no_rays() -> None:
     image, coc, _ = street()
     surface = Surface(image, coc, torch.zeros_like(coc))
     left, rays = highlights.extract(surface, highlights.threshold(image))
@@ -191,7 +191,7 @@ def test_where_a_surface_is_not_it_has_no_rays() -> None:
     assert left.light is image
 
 
-def test_many_bright_pixels_are_left_to_the_layers_but_for_the_brightest() -> None:
+def test_the_number_of_rays_is_limited_to_the_brightest_pixels() -> None:
     generator = torch.Generator().manual_seed(2)
     image = torch.rand(1, 1, 128, 128, generator=generator)
     image = torch.where(torch.rand(image.shape, generator=generator) < 0.05, 100.0 * (1.0 + image), 0.01 * image)
@@ -204,7 +204,7 @@ def test_many_bright_pixels_are_left_to_the_layers_but_for_the_brightest() -> No
 
 
 @pytest.mark.parametrize("range_of_light", [0.0, 1.0])
-def test_bright_pixels_that_become_too_many_fade_into_the_layers(range_of_light: float) -> None:
+def test_rays_above_the_limit_fade_into_the_layers(range_of_light: float) -> None:
     generator = torch.Generator().manual_seed(2)
     image = torch.full((1, 1, 64, 64), 0.01)
     image[..., ::5, ::5] = 1.0 + range_of_light * torch.rand(1, 1, 13, 13, generator=generator)
@@ -225,7 +225,7 @@ def test_the_threshold_of_a_flipped_image_is_the_flipped_threshold(height: int, 
         torch.testing.assert_close(highlights.threshold(turned(image)), turned(limit), rtol=1e-6, atol=0.0)
 
 
-def test_light_that_is_not_known_makes_nothing_a_highlight() -> None:
+def test_unknown_light_does_not_lower_the_threshold() -> None:
     image = torch.zeros(1, 1, 64, 64)
     image[..., 30:33, 30:33] = 1.0
     valid = (image > 0).float()
@@ -233,7 +233,7 @@ def test_light_that_is_not_known_makes_nothing_a_highlight() -> None:
 
 
 def test_rays_are_differentiable_in_light_and_coc() -> None:
-    image, coc, (row, column) = street(6.13, -2.9)  # rays meet no pixel's centre
+    image, coc, (row, column) = street(6.13, -2.9)  # no ray hits the centre of a pixel
     generator = torch.Generator().manual_seed(3)
     target = torch.rand(1, 3, 96, 96, generator=generator)
     light, blur = image.double().requires_grad_(), coc.double().requires_grad_()
@@ -244,14 +244,14 @@ def test_rays_are_differentiable_in_light_and_coc() -> None:
         for m, sign in zip(moved, (1, -1), strict=True):
             m[0, 0, row, column] += sign * step
         inputs = [(m, coc.double()) if tensor is image else (image.double(), m) for m in moved]
-        # gradients ask for layers that stand still
+        # requires_grad_ selects the fixed layers of gradients
         values = [(blur_by_coc(a, b.requires_grad_()) * target).sum().detach() for a, b in inputs]
         slope = float(values[0] - values[1]) / (2 * step)
         assert float(gradient[0, 0, row, column]) == pytest.approx(slope, rel=1e-3)
 
 
 @pytest.mark.parametrize("normalize", [True, False])
-def test_lamps_keep_the_tolerance_where_nothing_hides_anything(normalize: bool) -> None:
+def test_lamps_keep_the_tolerance_without_occlusion(normalize: bool) -> None:
     image = torch.full((1, 3, 200, 240), 0.02)
     for row, column in ((30, 40), (100, 120), (150, 60), (3, 180), (120, 238)):  # the last two beside the border
         image[..., row : row + 2, column : column + 2] = 200.0
@@ -261,6 +261,6 @@ def test_lamps_keep_the_tolerance_where_nothing_hides_anything(normalize: bool) 
     out, exact = (metrics.display(blur_by_coc(image, coc_px, tolerance=t, **options)) for t in (1 / 255, 0))
     error = (out - exact).abs().amax(1)
     assert float(exact.amax()) > 0.5, "the scene tests nothing"
-    # dense layers lie half a pixel apart, which softens the rims of discs by itself
+    # dense layers are half a pixel apart, which already softens the rims of discs
     assert float(torch.quantile(error, 0.999)) < 8.5 / 255
     assert float(error.square().mean().sqrt()) < 1 / 255

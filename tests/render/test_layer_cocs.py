@@ -1,4 +1,4 @@
-"""Where the layers of a scene are laid: close together where it meets the frame's border, and smoothly."""
+"""Radii of the layers of a scene: dense at the radii of the frame's border, and continuous in the scene."""
 
 import pytest
 import torch
@@ -10,13 +10,13 @@ from torchdof.render.plan import Plan
 
 
 def coc_at(x: torch.Tensor) -> torch.Tensor:
-    """Coc of places on the blur axis."""
+    """Circles of confusion at places on the blur axis."""
     return torch.tensor([from_blur_axis(place) for place in x.flatten().tolist()]).reshape(x.shape)
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1 / 255, 4 / 255])
 def test_layers_move_smoothly_with_the_ends_of_a_scene(tolerance: float) -> None:
-    """Where the number of layers changes, the one more lies on another."""
+    """Where the number of layers changes, the new layer coincides with another one."""
     before: list[float] = []
     for far in torch.linspace(1.0, 9.0, 4001, dtype=torch.float64).tolist():
         plan = Plan.of_scene(torch.tensor([-2.2, far], dtype=torch.float64).reshape(1, 1, 1, 2), tolerance)
@@ -29,8 +29,8 @@ def test_layers_move_smoothly_with_the_ends_of_a_scene(tolerance: float) -> None
 
 
 @pytest.mark.parametrize("times", [1, 3], ids=["12 px", "36 px"])
-def test_layers_lie_close_where_a_slope_leaves_the_frame(times: int) -> None:
-    """What is beyond the frame is as blurred as the border: layers far from these blurs would show."""
+def test_layers_are_dense_at_the_radii_of_the_border(times: int) -> None:
+    """Surfaces continued outside the frame have the blur of the border; distant layers would be visible there."""
     height, width = 240, 320
     y = torch.linspace(0, 1, height)[:, None].expand(height, width)
     coc = torch.where(torch.arange(width) < 20, -13.0, -12.0 * y**2)[None, None] * times  # a post is nearer yet
@@ -40,7 +40,7 @@ def test_layers_lie_close_where_a_slope_leaves_the_frame(times: int) -> None:
     assert float(error[..., -12:, :].abs().max()) < 4 / 255
 
 
-def test_places_at_the_border_are_those_of_many_pixels() -> None:
+def test_border_nodes_are_blurs_of_many_border_pixels() -> None:
     x = torch.zeros(1, 1, 100, 100)
     x[..., -1, :] = 6.0  # a quarter of the border
     x[..., 0, :10] = -9.0  # too few
@@ -50,7 +50,7 @@ def test_places_at_the_border_are_those_of_many_pixels() -> None:
 
 
 @pytest.mark.parametrize("x", [-300.0, -20.5, -3.3, 0.0, 7.0, 20.0, 1e4])
-def test_finest_distances_count_there_and_back(x: float) -> None:
+def test_from_finest_inverts_in_finest(x: float) -> None:
     steps = float(layer_cocs._in_finest(torch.tensor(x).double()))
     assert layer_cocs._from_finest(steps) == pytest.approx(x)
 
@@ -67,6 +67,6 @@ def test_finest_distances_count_there_and_back(x: float) -> None:
         (40.0, 1.0, 4.014),
     ],
 )
-def test_layers_lie_as_far_apart_as_measured(x: float, times: float, expected: float) -> None:
-    """Near focus and far from it, at tolerances of so many times 1/255: the numbers behind speed and error."""
+def test_spacing_of_layers_equals_the_recorded_values(x: float, times: float, expected: float) -> None:
+    """Near focus and far from it, at a tolerance of ``times``/255; speed and error depend on these numbers."""
     assert layer_cocs.spacing(x, times / 255) == pytest.approx(expected, abs=1e-3)

@@ -25,12 +25,12 @@ def test_blur_axis_is_the_square_of_the_coc_near_focus_and_the_coc_far_from_it()
 
 
 @given(st.floats(-3.0, 3.0))
-def test_the_blur_axis_has_no_jump(coc: float) -> None:
+def test_the_blur_axis_is_continuous_and_increasing(coc: float) -> None:
     place, beside = blur_axis(torch.tensor([coc, coc + 1e-4], dtype=torch.float64)).tolist()
     assert 0.0 <= beside - place <= 1.2e-4  # nowhere steeper than 9 / 8
 
 
-def test_what_is_in_focus_is_less_blur_than_moves_two_ten_thousandths_of_the_light() -> None:
+def test_kernels_that_count_as_in_focus_move_less_than_2e_4_of_the_light() -> None:
     edge = from_blur_axis(1e-12)
     assert edge == pytest.approx(0.01, rel=0.02)
     for table in (BlurTable.disc(), BlurTable.gaussian(), BlurTable.load("sato_j15")):
@@ -39,13 +39,13 @@ def test_what_is_in_focus_is_less_blur_than_moves_two_ten_thousandths_of_the_lig
 
 
 @given(st.floats(-100.0, 100.0))
-def test_blur_axis_and_back_is_the_coc_of_what_is_blurred_and_zero_of_what_is_not(coc: float) -> None:
+def test_from_blur_axis_inverts_blur_axis_and_gives_0_in_focus(coc: float) -> None:
     there = float(blur_axis(torch.tensor(coc, dtype=torch.float64)))
     back = from_blur_axis(there)
     assert back == pytest.approx(coc if there != 0 else 0.0, abs=1e-11)
 
 
-def test_a_pixel_is_shared_linearly_by_the_layers_next_to_it() -> None:
+def test_weights_are_linear_between_neighbouring_layers() -> None:
     assert_close(weights(torch.tensor([*NODES, -9.0, 9.0])), torch.eye(len(NODES))[:, [0, 1, 2, 3, 4, 0, -1]])
     pixels = weights(torch.tensor([-0.75, 0.8, 1.625])).T
     assert_close(
@@ -54,13 +54,13 @@ def test_a_pixel_is_shared_linearly_by_the_layers_next_to_it() -> None:
 
 
 @given(st.floats(-1e6, 1e6))
-def test_the_shares_of_a_pixel_are_in_0_to_1_and_sum_to_1(x: float) -> None:
+def test_weights_of_a_pixel_are_in_0_to_1_and_sum_to_1(x: float) -> None:
     parts = weights(torch.tensor(x, dtype=torch.float64))
     assert (parts >= 0).all() and (parts <= 1).all() and int((parts > 0).sum()) <= 2
     assert_close(float(parts.sum()), 1.0, rtol=0.0, atol=1e-15)
 
 
-def test_an_eased_ramp_goes_from_0_to_1_and_leaves_0_slowly() -> None:
+def test_an_eased_ramp_rises_smoothly_from_0_to_1() -> None:
     ramp = torch.linspace(0.0, 1.0, 2001, dtype=torch.float64)
     steps = eased(ramp).diff()
     assert float(eased(ramp)[0]) == 0.0 and float(eased(ramp)[-1]) == 1.0
@@ -68,9 +68,9 @@ def test_an_eased_ramp_goes_from_0_to_1_and_leaves_0_slowly() -> None:
     assert float((eased(ramp) - ramp).abs().max()) < 0.08
 
 
-def test_shares_are_differentiable_between_nodes() -> None:
+def test_weights_are_differentiable_between_nodes() -> None:
     x = torch.tensor([-3.0, -0.2, 0.3, 1.0, 5.0], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(weights, x)
     behind = weights_at_or_behind(x.reshape(1, 1, -1), ramps(NODES, x)[:, [0, -1]])
     (gradient,) = torch.autograd.grad(behind.sum(), x)
-    assert (gradient == 0).all()  # all or nothing, whatever x
+    assert (gradient == 0).all()  # the first and the last cumulative weight are constants

@@ -4,21 +4,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.scenes import BLUE, RED, mixed_edge
 from torchdof import blur_by_coc
 from torchdof.reference.scenes import Plane, camera_of, plane_scene, waves
 from torchdof.render.highlights import threshold
 from torchdof.render.matting import attribute_emitters, matte
-
-RED, BLUE = torch.tensor([0.7, 0.2, 0.1]), torch.tensor([0.1, 0.3, 0.8])
-
-
-def edge(share: float, near_px: float = -12.0, far_px: float = 0.0) -> tuple[Tensor, Tensor]:
-    """Red in front of blue; column 31 is red by a share but has the depth of red if that is at least a half."""
-    red = (torch.arange(64) < 31).float()
-    red[31] = share
-    image = (red * RED[:, None] + (1 - red) * BLUE[:, None])[None, :, None].expand(1, 3, 48, 64)
-    coc = torch.where(red >= 0.5, near_px, far_px).expand(1, 1, 48, 64)
-    return image, coc
 
 
 def random_scene() -> tuple[Tensor, Tensor]:
@@ -31,7 +21,7 @@ def random_scene() -> tuple[Tensor, Tensor]:
 
 @pytest.mark.parametrize("share", [0.2, 0.4, 0.6, 0.8])
 def test_a_mixed_pixel_is_split_between_its_two_surfaces(share: float) -> None:
-    image, coc = edge(share)
+    image, coc = mixed_edge(share)
     own, other, other_coc, found = (t[0, ..., 24, 31] for t in matte(image, coc))
     mine, theirs = (RED, BLUE) if share >= 0.5 else (BLUE, RED)
     assert float(found) == pytest.approx(1 - max(share, 1 - share), abs=0.03)
@@ -39,24 +29,24 @@ def test_a_mixed_pixel_is_split_between_its_two_surfaces(share: float) -> None:
     assert float(other_coc) == (0.0 if share >= 0.5 else -12.0)
 
 
-def test_surfaces_that_look_alike_are_hardly_told_apart() -> None:
-    """A contrast of 1/255 of the light around is trusted by half; of 1e-7, which is rounding, not at all."""
+def test_a_split_is_trusted_in_proportion_to_the_contrast_of_the_surfaces() -> None:
+    """By half at a contrast of 1/255 of the light around; not at all at 1e-7, which is rounding."""
     for contrast, trusted in ((0.1, 1.0), (1 / 255, 0.5), (1e-7, 0.0)):
-        image, coc = edge(0.6)
+        image, coc = mixed_edge(0.6)
         image, coc = torch.where(coc < 0, 1.0, 1.0 - contrast).double(), coc.double()
         image[..., 31] = 1.0 - 0.4 * contrast
         weight = matte(image, coc).other_weight[0, 0, 24, 31]
         assert float(weight) == pytest.approx(0.4 * trusted, abs=0.01)
 
 
-def test_no_light_is_lost_in_a_split() -> None:
+def test_a_split_conserves_light() -> None:
     image, coc = random_scene()
     own, other, _, share = matte(image, coc)
     assert torch.allclose((1 - share) * own + share * other, image, atol=1e-5)
 
 
 def strands_before_a_lamp() -> tuple[Tensor, Tensor, Tensor]:
-    """Dark strands of a pixel, every third column, in focus before a lamp; depth finds two thirds of each."""
+    """Dark strands one pixel wide, every third column, in focus before a lamp; depth has two thirds of each."""
     rows, columns = torch.meshgrid(torch.arange(64), torch.arange(80), indexing="ij")
     is_strand = columns % 3 == 0
     lamp = ((rows - 30) ** 2 + (columns - 40) ** 2 <= 16) * 50.0
@@ -65,7 +55,7 @@ def strands_before_a_lamp() -> tuple[Tensor, Tensor, Tensor]:
     return light, coc, is_strand & (lamp > 0) & (rows % 3 > 0)
 
 
-def test_a_lamp_seen_through_strands_is_given_back_to_its_surface() -> None:
+def test_light_of_a_lamp_seen_through_strands_is_assigned_to_the_lamp() -> None:
     light, coc, shone_through = strands_before_a_lamp()
     own, other, other_coc, weight = attribute_emitters(light, coc, threshold(light), None, matte(light, coc))
     inner = shone_through
@@ -75,10 +65,10 @@ def test_a_lamp_seen_through_strands_is_given_back_to_its_surface() -> None:
     assert float(own[..., inner].max()) < 1.0 and float(other[..., inner].min()) > 45.0
     torch.testing.assert_close((1 - weight) * own + weight * other, light, rtol=1e-5, atol=1e-5)
     sharp = blur_by_coc(light, coc)[0, 0]
-    assert float(sharp.max()) < 8.0, "no pixel of the lamp, 20 or more, stays in focus"
+    assert float(sharp.max()) < 8.0, "the lamp, 20 or more, must not stay in focus"
 
 
-def test_the_rim_of_a_lamp_is_not_given_to_hair_that_is_dim_beside_it() -> None:
+def test_the_rim_of_a_lamp_is_not_assigned_to_dim_hair_beside_it() -> None:
     rows, columns = torch.meshgrid(torch.arange(64), torch.arange(80), indexing="ij")
     across = (columns - 40).abs() <= 2
     is_rim, is_hair = across & ((rows == 29) | (rows == 34)), columns == 40
@@ -88,11 +78,11 @@ def test_the_rim_of_a_lamp_is_not_given_to_hair_that_is_dim_beside_it() -> None:
     found = matte(light, coc)
     beside_hair = is_rim & ((columns - 40).abs() == 1)
     assert float(found.other_weight[0, 0][beside_hair].min()) > 0.03
-    assert float(found.other[..., beside_hair].min()) > 2.0, "the hair, 0.02, gets some of the lamp"
+    assert float(found.other[..., beside_hair].min()) > 2.0, "the matte alone makes the hair, 0.02, too bright"
     own, other, _, weight = attribute_emitters(light, coc, threshold(light), None, found)
     assert float(weight[0, 0][beside_hair].max()) < 1e-6
     torch.testing.assert_close((1 - weight) * own + weight * other, light, rtol=1e-5, atol=1e-5)
-    # hair that shines as much itself keeps what it gets of the lamp
+    # hair that is as bright as the lamp keeps its part
     beside_hair = (rows >= 29) & (rows < 35) & ((columns - 40).abs() == 1)
     light[..., 28:36, 40] = 50.0
     found = matte(light, coc)
@@ -128,14 +118,14 @@ def test_lamps_in_focus_leave_no_halo_on_the_blurred_wall_behind_them() -> None:
     made = blur_by_coc(scene.image, scene.coc_px)[0]
     y, x = torch.meshgrid(torch.arange(64) + 0.5, torch.arange(96) + 0.5, indexing="ij")
     around = (distance(x, y) > 1.5) & (distance(x, y) < 8.0)
-    assert float((made - scene.truth[0])[:, around].abs().max()) < 0.02, "not 0.18, as by mean colours alone"
+    assert float((made - scene.truth[0])[:, around].abs().max()) < 0.02  # 0.18 with mean colours alone
 
 
-def test_split_light_is_no_brighter_and_no_darker_than_the_image() -> None:
+def test_split_light_stays_within_the_range_of_the_image() -> None:
     made = torch.Generator().manual_seed(3)
     for _ in range(20):
         image = 0.2 + 0.6 * torch.rand(1, 3, 40, 40, generator=made)
         coc = 20.0 * torch.rand(1, 1, 40, 40, generator=made).round(decimals=0)
         for light in matte(image, coc)[:2]:
-            light = light[(light != 0).all(1, keepdim=True).expand_as(light)]  # 0 where there is no second surface
+            light = light[(light != 0).all(1, keepdim=True).expand_as(light)]  # pixels with a second surface
             assert float(light.min()) >= 0.2 - 1e-5 and float(light.max()) <= 0.8 + 1e-5

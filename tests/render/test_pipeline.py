@@ -1,4 +1,4 @@
-"""What is hidden, where the caller knows it: a background, or a stack of layers."""
+"""Known hidden surfaces: a background, or a stack of layers."""
 
 import math
 from typing import Any
@@ -20,7 +20,7 @@ DEPTHS = (6.0, 2.0, 1.2)
 
 @pytest.fixture(scope="module", params=[1.2, 2.0, 6.0], ids=lambda focus: f"focus at {focus} m")
 def fence(request: pytest.FixtureRequest) -> Scene:
-    """A wall behind two rows of posts; blurs of up to 20 px."""
+    """A wall behind two rows of posts, with blurs of up to 20 px."""
     shapes = [None, posts(90, 30), posts(140, 25, -0.2)]
     planes = [Plane(z, waves(i), shape) for i, (z, shape) in enumerate(zip(DEPTHS, shapes, strict=True))]
     return plane_scene(planes, CAMERA.replace(focus_m=request.param), (160, 220), samples=128)
@@ -32,7 +32,7 @@ def psnr(scene: Scene, out: Tensor) -> float:
 
 
 def behind(scene: Scene) -> tuple[Tensor, Tensor]:
-    """What each pixel shows without its nearest surface, and its depth."""
+    """Image and depth of the scene without the nearest surface of each pixel."""
     far, middle = scene.surfaces[0][0], scene.surfaces[1][0]
     under_posts = middle[:, :3] + (1.0 - middle[:, 3:]) * far[:, :3]
     near = scene.depth < 1.5
@@ -40,15 +40,15 @@ def behind(scene: Scene) -> tuple[Tensor, Tensor]:
     return torch.where(near, under_posts, far[:, :3]), depth
 
 
-def test_a_known_background_brings_3_db(fence: Scene) -> None:
+def test_a_known_background_adds_3_db(fence: Scene) -> None:
     dof = DepthOfField(fence.camera, tolerance=0)
     light, depth = behind(fence)
     alone = psnr(fence, dof(fence.image, fence.depth))
-    told = psnr(fence, dof(fence.image, fence.depth, background=light, background_depth=depth))
-    assert told > alone + 3.0
+    known = psnr(fence, dof(fence.image, fence.depth, background=light, background_depth=depth))
+    assert known > alone + 3.0
 
 
-def test_a_stack_that_hides_nothing_renders_the_truth(fence: Scene) -> None:
+def test_a_stack_of_complete_layers_renders_the_truth(fence: Scene) -> None:
     stack = torch.stack([rgba for rgba, _ in fence.surfaces], 1)
     out = DepthOfField(fence.camera, tolerance=0).layers(stack, torch.tensor(DEPTHS))
     assert psnr(fence, out[:, :3]) > 49.0
@@ -64,7 +64,7 @@ def test_the_order_of_a_stack_and_the_form_of_its_depths_do_not_matter(fence: Sc
     torch.testing.assert_close(dof.layers(stack, maps), expected)
 
 
-def test_an_opaque_layer_alone_is_a_plane_of_that_depth() -> None:
+def test_a_single_opaque_layer_equals_a_plane_of_its_depth() -> None:
     image = torch.rand(1, 3, 24, 32, generator=torch.Generator().manual_seed(0))
     dof = DepthOfField(CAMERA.replace(focus_m=1.0))
     rgba = torch.cat([image, torch.ones(1, 1, 24, 32)], 1)[:, None]
@@ -73,7 +73,7 @@ def test_an_opaque_layer_alone_is_a_plane_of_that_depth() -> None:
     torch.testing.assert_close(out[:, 3], torch.ones(1, 24, 32))
 
 
-def test_what_nothing_covers_stays_transparent_and_what_is_covered_keeps_its_light() -> None:
+def test_pixels_without_coverage_stay_transparent_and_light_is_conserved() -> None:
     rgba = torch.zeros(1, 1, 4, 61, 61)
     rgba[..., 24:37, 24:37] = torch.tensor([0.8, 0.4, 0.2, 1.0])[:, None, None]
     dof = DepthOfField(CAMERA.replace(focus_m=1.0))
@@ -85,7 +85,7 @@ def test_what_nothing_covers_stays_transparent_and_what_is_covered_keeps_its_lig
     assert float(out[..., : 24 - math.ceil(radius) - 1, :].abs().max()) == 0.0
 
 
-def test_layers_at_one_depth_cover_each_other_as_over_does() -> None:
+def test_layers_in_focus_are_composited_by_over() -> None:
     generator = torch.Generator().manual_seed(1)
     cover = torch.rand(1, 2, 1, 12, 16, generator=generator)
     rgba = torch.cat([torch.rand(1, 2, 3, 12, 16, generator=generator) * cover, cover], 2)
@@ -94,24 +94,25 @@ def test_layers_at_one_depth_cover_each_other_as_over_does() -> None:
 
 
 @pytest.mark.parametrize(("apart_px", "weight"), [(0.5, 0.0), (0.75, 0.25), (1.5, 1.0), (-3.0, 0.0)])
-def test_a_known_background_counts_from_half_a_pixel_behind_the_image_on(apart_px: float, weight: float) -> None:
+def test_the_weight_of_a_background_rises_from_half_a_pixel_behind_the_image(apart_px: float, weight: float) -> None:
     image, coc = torch.full((1, 1, 6, 8), 0.5), torch.full((1, 1, 6, 8), 2.0)
     *_, background = _before_background(Surface(image, coc), image, coc + apart_px, (-9.0, 9.0), Options())
     torch.testing.assert_close(background.weight, torch.full_like(coc, weight))
 
 
 @pytest.mark.parametrize("method", ["layered", "fold"])
-def test_a_background_that_is_nowhere_behind_changes_little(method: str) -> None:
+def test_a_background_at_the_depth_of_the_image_changes_little(method: str) -> None:
     generator = torch.Generator().manual_seed(2)
     image = torch.rand(1, 3, 24, 32, generator=generator)
     coc = torch.full((1, 1, 24, 32), 3.3)
-    coc[..., 16:] = 3.75  # less than what counts as two surfaces
-    alone = blur_by_coc(image, coc, method=method)  # type: ignore[arg-type]
-    told = blur_by_coc(image, coc, method=method, background=image, background_coc_px=coc)  # type: ignore[arg-type]
-    torch.testing.assert_close(told, alone, rtol=0, atol=1e-5)
+    coc[..., 16:] = 3.75  # a smaller step than between two surfaces
+    options: dict[str, Any] = {"method": method}
+    alone = blur_by_coc(image, coc, **options)
+    with_background = blur_by_coc(image, coc, background=image, background_coc_px=coc, **options)
+    torch.testing.assert_close(with_background, alone, rtol=0, atol=1e-5)
 
 
-def test_gradients_reach_background_and_stack() -> None:
+def test_gradients_reach_the_background() -> None:
     generator = torch.Generator().manual_seed(3)
     image, back = (torch.rand(1, 1, 6, 10, generator=generator, dtype=torch.float64) for _ in range(2))
     coc = torch.full((1, 1, 6, 10), 0.3, dtype=torch.float64)
@@ -128,21 +129,21 @@ def test_gradients_reach_background_and_stack() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "says"),
+    ("given", "message"),
     [
         ({"background": torch.rand(1, 3, 8, 8)}, "depth"),
         ({"background_depth": torch.ones(1, 1, 8, 8)}, "background"),
-        ({"background": torch.rand(1, 3, 8, 9), "background_depth": torch.ones(1, 1, 8, 9)}, "as the image is"),
+        ({"background": torch.rand(1, 3, 8, 9), "background_depth": torch.ones(1, 1, 8, 9)}, "like the image"),
         ({"background": torch.rand(1, 3, 8, 8), "background_depth": -torch.ones(1, 1, 8, 8)}, "depth must be > 0"),
     ],
 )
-def test_a_background_that_does_not_fit_is_refused(given: dict[str, Tensor], says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_a_background_that_does_not_fit_is_refused(given: dict[str, Tensor], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         DepthOfField(CAMERA)(torch.rand(1, 3, 8, 8), torch.ones(1, 1, 8, 8), **given)
 
 
 @pytest.mark.parametrize(
-    ("rgba", "depth", "options", "says"),
+    ("rgba", "depth", "options", "message"),
     [
         (torch.rand(1, 4, 8, 8), torch.ones(1), {}, r"rgba must be \[B, N, C \+ 1, H, W\]"),
         (torch.rand(1, 2, 4, 8, 8), torch.ones(3), {}, r"depth_m must be \[2\]"),
@@ -152,8 +153,10 @@ def test_a_background_that_does_not_fit_is_refused(given: dict[str, Tensor], say
         (torch.rand(1, 2, 4, 8, 8), torch.ones(2), {"occlusion": False}, "occlusion=True"),
     ],
 )
-def test_a_stack_that_does_not_fit_is_refused(rgba: Tensor, depth: Tensor, options: dict[str, Any], says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_a_stack_that_does_not_fit_is_refused(
+    rgba: Tensor, depth: Tensor, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
         DepthOfField(CAMERA, **options).layers(rgba, depth)
 
 

@@ -20,7 +20,7 @@ def coc_map(*values: float) -> torch.Tensor:
 
 
 def largest_gaps(plan: Plan) -> list[tuple[float, float]]:
-    """Each gap between layers with the place of its inner end."""
+    """Each gap between layers, with the place of its end nearer to focus."""
     pairs = zip(plan.nodes, plan.nodes[1:], strict=False)
     return [(high - low, min(abs(low), abs(high))) for low, high in pairs]
 
@@ -47,30 +47,30 @@ def test_layers_increase_and_span_the_scene(coc: list[float], tolerance: float) 
     assert all(low < high for low, high in zip(plan.nodes, plan.nodes[1:], strict=False))
     assert plan.nodes[0] == pytest.approx(min(blur), abs=1e-9) and plan.nodes[-1] == pytest.approx(max(blur), abs=1e-9)
     if min(blur) < 0 < max(blur):
-        assert 0.0 in plan.nodes  # what is in focus passes through one sharp layer
+        assert 0.0 in plan.nodes  # the sharp layer
 
 
 @given(st.floats(0.6, 200.0), TOLERANCE)
-def test_gaps_between_layers_keep_to_the_spacing_of_the_tolerance(reach: float, tolerance: float) -> None:
+def test_gaps_between_layers_are_at_most_the_spacing_of_the_tolerance(reach: float, tolerance: float) -> None:
     for plan in (Plan.of_scene(coc_map(-reach, reach), tolerance), Plan.all(reach, tolerance)):
         for gap, inner in largest_gaps(plan):
             assert gap <= spacing(inner, tolerance) + 0.3 * spacing(inner + gap, tolerance) + 1e-9
 
 
-def test_layers_lie_farther_apart_for_a_looser_tolerance_and_a_larger_blur() -> None:
+def test_layers_are_farther_apart_for_a_looser_tolerance_and_a_larger_blur() -> None:
     counts = [len(Plan.all(60.0, tolerance).nodes) for tolerance in (0.0, 1 / 255, 1 / 60, 1 / 20)]
     assert counts == sorted(counts, reverse=True) and len(set(counts)) > 2
     assert spacing(0.0, 1 / 255) < spacing(10.0, 1 / 255) < spacing(50.0, 1 / 255)
 
 
-def test_the_plan_of_every_scene_reaches_its_radius_on_both_sides() -> None:
+def test_a_static_plan_covers_its_radius_on_both_sides_of_focus() -> None:
     plan = Plan.all(12.0, 1 / 255)
     assert plan.coc_px[0] == pytest.approx(-12.0) and plan.coc_px[-1] == pytest.approx(12.0)
     assert [-x for x in reversed(plan.nodes)] == list(plan.nodes) and 0.0 in plan.nodes
 
 
-def test_layers_of_every_scene_err_no_more_on_a_slope_than_those_of_the_scene_itself() -> None:
-    """They do not know which blurs its border has; so they lie denser."""
+def test_a_static_plan_is_as_exact_on_a_slope_as_the_plan_of_the_scene() -> None:
+    """Its layers are denser, because it cannot place layers at the blurs of the frame's border."""
     y, x = torch.linspace(0.0, 1.0, 160)[:, None], torch.linspace(0.0, 1.0, 240)
     coc = (8.0 + 16.0 * (0.7 * x + 0.3 * y))[None, None]
     image = torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(1))
@@ -81,20 +81,20 @@ def test_layers_of_every_scene_err_no_more_on_a_slope_than_those_of_the_scene_it
     assert every < own < 0.75 / 255
 
 
-def test_layers_farther_than_any_frame_is_wide_are_refused() -> None:
+def test_layers_with_radii_of_1e9_px_or_more_are_refused() -> None:
     assert Plan((-0.9e9, 0.9e9), 1 / 255).nodes
     for node in (1.1e9, math.inf, math.nan):
         with pytest.raises(ValueError, match="strictly increasing numbers below 1e9 px"):
             Plan((0.0, node), 1 / 255)
 
 
-def test_layers_for_gradients_do_not_move_with_the_scene() -> None:
+def test_layers_for_gradients_do_not_depend_on_small_changes_of_the_scene() -> None:
     first, second = (Plan.still(coc_map(-3.0, reach), 1 / 255) for reach in (5.1, 5.1001))
     assert first.nodes == second.nodes
     assert first.nodes[0] <= -2.5 and first.nodes[-1] >= 4.6
 
 
-def test_a_bad_coc_does_not_plan() -> None:
+def test_nan_and_infinite_coc_add_no_layers() -> None:
     assert Plan.of_scene(coc_map(math.nan, 3.0, 3.0), 1 / 255).nodes[-1] == pytest.approx(place_of(3.0))
     reaching = Plan.of_scene(coc_map(-math.inf, math.inf), 1 / 20)
     assert all(math.isfinite(x) for x in reaching.nodes)
@@ -102,20 +102,20 @@ def test_a_bad_coc_does_not_plan() -> None:
 
 @pytest.mark.parametrize("name", ["disc", "sato_j15"])
 @pytest.mark.parametrize("coc", [300.0, -90.0, 40.0, 5.0])
-def test_kernels_wider_than_a_frame_are_cut_to_it_and_keep_their_values(name: str, coc: float) -> None:
+def test_kernels_wider_than_the_frame_are_cut_and_keep_their_values(name: str, coc: float) -> None:
     table = BlurTable.disc() if name == "disc" else BlurTable.load(name)
     size, plan = (20, 31), Plan((place_of(coc),), 1 / 255)
     (blur,) = plan.blurs(table, size, torch.float64, torch.device("cpu"), coarse=True)
     whole = bank_of(table).kernels(torch.tensor([coc], dtype=torch.float64), size[1])[0]
     spare = max(0, whole.shape[-1] // 2 - 30)
     expected = whole[:, spare : whole.shape[-1] - spare, spare : whole.shape[-1] - spare]
-    # by the light of the PSF, where the whole kernel is scaled by its own sum
+    # the cut kernel is scaled by the light of the PSF, the whole one by its own sum
     torch.testing.assert_close(blur.kernel, expected, rtol=1e-3, atol=0.0)
     assert spare > 0 or abs(coc) < 30
 
 
 @pytest.mark.parametrize("tolerance", [1 / 255, 4 / 255])
-def test_highlights_are_traced_wherever_a_coarse_layer_has_a_share_of_them(tolerance: float) -> None:
+def test_highlights_become_rays_at_all_radii_of_coarse_layers(tolerance: float) -> None:
     plan = Plan.of_scene(coc_map(-40.0, 0.0, 30.0).expand(1, 1, 100, 3), tolerance)
     blurs = plan.blurs(BlurTable.disc(), (100, 100), torch.float32, torch.device("cpu"), coarse=True)
     for k, (_, coc) in enumerate(zip(blurs, plan.coc_px, strict=True)):
@@ -124,18 +124,14 @@ def test_highlights_are_traced_wherever_a_coarse_layer_has_a_share_of_them(toler
     assert any(abs(c) < plan.crisp_px for c in plan.coc_px if c) and any(blur.scale > 1 for blur in blurs)
 
 
-def test_the_larger_a_blur_the_coarser_its_layer() -> None:
+def test_layers_of_larger_blur_have_lower_resolution() -> None:
     plan = Plan.of_scene(coc_map(0.0, 100.0).expand(1, 1, 100, 2), 1 / 255)
     blurs = plan.blurs(BlurTable.disc(), (100, 100), torch.float32, torch.device("cpu"), coarse=True)
-    starts = {
-        scale: min(c for b, c in zip(blurs, plan.coc_px, strict=True) if b.scale == scale) for scale in (2, 4, 8, 16)
-    }
-    assert (
-        7.2 <= starts[2] < 9.0 and 18.0 <= starts[4] < 22.0 and 36.0 <= starts[8] < 44.0 and 72.0 <= starts[16] < 85.0
-    )
+    for scale, low, high in ((2, 7.2, 9.0), (4, 18.0, 22.0), (8, 36.0, 44.0), (16, 72.0, 85.0)):
+        assert low <= min(c for b, c in zip(blurs, plan.coc_px, strict=True) if b.scale == scale) < high
 
 
-def test_a_plan_prints_its_layers_their_resolution_and_their_share_of_the_pixels() -> None:
+def test_a_printed_plan_shows_resolution_and_share_of_the_pixels_of_each_layer() -> None:
     dof = torchdof.DepthOfField(torchdof.Camera(focus_m=2.0, f_number=1.0, sensor_width_mm=6.0), tolerance="preview")
     image = torch.rand(1, 3, 128, 256)
     depth = torch.where(torch.arange(256) < 128, 1.2, 2.0).expand(1, 1, 128, 256)
@@ -149,14 +145,14 @@ def test_a_plan_prints_its_layers_their_resolution_and_their_share_of_the_pixels
     assert "%" not in str(Plan(plan.nodes, plan.tolerance))
 
 
-def test_depths_that_are_not_numbers_count_as_in_focus_when_a_plan_is_told() -> None:
+def test_nan_coc_counts_as_in_focus_in_the_shares_of_a_plan() -> None:
     coc = torch.zeros(2, 1, 40, 50)
     coc[..., :10], coc[0, 0, 0, 0] = -6.0, torch.nan
     pixels = Plan((-5.5, 0.0), 1 / 255).of_pixels(coc).pixels
     assert pixels is not None and pixels[0] == pytest.approx(799 / 4000)
 
 
-def test_kernels_of_highlights_lie_between_those_of_whole_thirty_seconds_of_a_pixel() -> None:
+def test_kernels_of_highlights_are_interpolated_between_multiples_of_1_32_px() -> None:
     table, coc = BlurTable.disc(), torch.tensor([3.0, 3.0078125, -7.26], dtype=torch.float64)
     kernels = kernels_for(table, coc, 100, 100)
     low, high = (
@@ -172,12 +168,12 @@ def test_kernels_of_highlights_lie_between_those_of_whole_thirty_seconds_of_a_pi
     torch.testing.assert_close(kernels_for(table, moving, 100, 100), table.kernels(moving, 100))
 
 
-def test_kernels_are_those_of_the_table_not_of_the_object() -> None:
+def test_kernels_depend_on_the_numbers_of_the_table_only() -> None:
     plan, size = Plan((-5.5, 0.0, 7.5), 1 / 255), (50, 60)
 
     def kernels(table: BlurTable) -> list[torch.Tensor]:
         return [b.kernel for b in plan.blurs(table, size, torch.float64, torch.device("cpu"), coarse=True)]
 
     first, again, other = kernels(BlurTable.disc()), kernels(BlurTable.disc()), kernels(BlurTable.gaussian())
-    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True)), "the same numbers are the same lens"
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
     assert first[0].shape != other[0].shape

@@ -1,4 +1,4 @@
-"""What holds for any scene: pictures are continuous, stay within the range of the light and turn with the image."""
+"""Properties of any scene: pictures are continuous, stay in the range of the light, and commute with flips."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ STEP_PX = 1e-4
 
 
 def seeds(count: int) -> Any:
-    """Some in every run, 500 in `make sweep`."""
+    """``count`` seeds in every run, 500 in `make sweep`."""
     chunks = [pytest.param(range(count), id=f"{count} scenes")]
     chunks += [pytest.param(range(i, i + 50), id=f"from {i}", marks=pytest.mark.sweep) for i in range(0, 500, 50)]
     return pytest.mark.parametrize("seeds", chunks)
@@ -25,7 +25,7 @@ def seeds(count: int) -> Any:
 
 @pytest.fixture(params=ENGINES, ids=["native float32", "torch float32", "torch float64"])
 def dtype(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> torch.dtype:
-    """The type of the numbers; the engine that takes them is in the environment."""
+    """The dtype; the fixture also selects the engine."""
     engine, dtype = request.param
     monkeypatch.setenv("TORCHDOF_ENGINE", engine)
     assert isinstance(dtype, torch.dtype)
@@ -46,10 +46,10 @@ def rms(difference: Tensor) -> float:
     ],
     ids=["as given 0", "0", "1/255"],
 )
-def test_a_hair_of_depth_changes_the_picture_by_a_hair(
+def test_the_picture_is_continuous_in_depth(
     seeds: range, depth_edges: str, tolerance: float, most_rms: float, most: float, dtype: torch.dtype
 ) -> None:
-    """Also where edges are repaired: decisions fade in, or are off what scenes often hold."""
+    """Also with repaired edges: decisions fade in, or their thresholds avoid frequent values."""
     for seed in seeds:
         scene = random_scene(seed)
         scene.options["depth_edges"] = depth_edges
@@ -73,11 +73,11 @@ def test_ordinary_light_stays_within_its_range(seeds: range, tolerance: float, d
 
 
 @seeds(12)
-def test_exposure_decides_nothing(seeds: range, dtype: torch.dtype) -> None:
+def test_the_picture_scales_with_the_exposure(seeds: range, dtype: torch.dtype) -> None:
     for seed in seeds:
         scene = random_scene(seed)
         if dtype == torch.float64:
-            scene.options["depth_edges"] = "as given"  # they are repaired in float32
+            scene.options["depth_edges"] = "as given"  # the repair works in float32
         picture = scene.blurred(dtype, tolerance=1 / 255)
         for times in (1e-6, 1e6):
             difference = scene.exposed(times).blurred(dtype, tolerance=1 / 255) / times - picture
@@ -88,10 +88,10 @@ def test_exposure_decides_nothing(seeds: range, dtype: torch.dtype) -> None:
 @seeds(12)
 @pytest.mark.parametrize(("tolerance", "multiple"), [(0.0, 1), (1 / 255, 16)], ids=["0", "1/255"])
 @pytest.mark.parametrize("depth_edges", ["as given", pytest.param("auto", marks=pytest.mark.sweep)])
-def test_a_turned_scene_is_the_turned_picture(
+def test_rendering_commutes_with_flips_and_turns(
     seeds: range, depth_edges: str, tolerance: float, multiple: int, dtype: torch.dtype
 ) -> None:
-    """Coarse layers are averaged over blocks from the first pixel on: there the sides are multiples of these."""
+    """Coarse layers average blocks that start at the first pixel, so the sides are multiples of the blocks."""
     turns = [lambda t: t.flip(-1), lambda t: t.flip(-2), lambda t: t.mT, lambda t: t.rot90(1, (-2, -1))]
     for seed in seeds:
         scene = random_scene(seed, multiple=multiple)
@@ -104,7 +104,7 @@ def test_a_turned_scene_is_the_turned_picture(
 
 @seeds(12)
 def test_a_flip_of_a_frame_of_any_size_stays_within_the_tolerance(seeds: range) -> None:
-    """There the blocks of coarse layers are others."""
+    """A flip changes the blocks of coarse layers."""
     for seed in seeds:
         scene = random_scene(seed)
         scene.options["depth_edges"] = "as given"
@@ -114,7 +114,7 @@ def test_a_flip_of_a_frame_of_any_size_stays_within_the_tolerance(seeds: range) 
 
 
 @pytest.mark.parametrize("size", [16, 40, 56])
-def test_the_tolerance_holds_where_blurs_are_as_large_as_the_frame(size: int) -> None:
+def test_the_tolerance_holds_for_blurs_as_large_as_the_frame(size: int) -> None:
     for seed in range(6):
         generator = torch.Generator().manual_seed(seed)
         image = 0.05 + 0.9 * torch.rand(1, 3, size, size, generator=generator)

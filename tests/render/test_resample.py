@@ -1,4 +1,4 @@
-"""Depth maps of another size than their image."""
+"""Resampling depth maps to the size of their image."""
 
 import pytest
 import torch
@@ -9,14 +9,14 @@ from torchdof.depth import at_size_of
 
 
 def scene(height: int = 64, width: int = 96) -> tuple[torch.Tensor, torch.Tensor]:
-    """A dark square before a bright wall, with some noise."""
+    """A dark square in front of a bright wall, with some noise."""
     image, depth = 0.8 + 0.05 * torch.rand(1, 3, height, width), torch.full((1, 1, height, width), 5.0)
     image[..., 17:47, 23:61] -= 0.7
     depth[..., 17:47, 23:61] = 2.0
     return image, depth
 
 
-def test_a_map_of_the_image_s_size_is_that_map() -> None:
+def test_a_map_of_the_size_of_the_image_is_returned_itself() -> None:
     image, depth = scene()
     assert at_size_of(image, depth) is depth
 
@@ -36,7 +36,7 @@ def test_a_larger_map_is_averaged() -> None:
     torch.testing.assert_close(at_size_of(image, large), depth)
 
 
-def test_pixels_without_depth_touch_no_other() -> None:
+def test_pixels_without_depth_do_not_affect_others() -> None:
     image, depth = scene()
     small = depth[..., 1::2, 1::2].clone()
     small[..., :4, :4] = 0.0
@@ -52,7 +52,7 @@ def test_another_aspect_ratio_is_refused(size: tuple[int, int]) -> None:
         at_size_of(image, torch.ones(1, 1, *size))
 
 
-def test_the_module_takes_a_smaller_map() -> None:
+def test_the_module_resamples_a_smaller_map() -> None:
     image, depth = scene()
     dof = DepthOfField(Camera.from_fov(40.0, 0.05, 5.0))
     small = depth[..., 1::2, 1::2]
@@ -61,8 +61,8 @@ def test_the_module_takes_a_smaller_map() -> None:
         dof(image, depth[..., :20, ::2])
 
 
-def test_a_map_of_nearly_the_shape_is_stretched_with_a_warning() -> None:
-    """Estimators work at multiples of some pixels: 194 x 132 instead of 194 x 129 for 96 x 64."""
+def test_a_map_of_nearly_the_aspect_ratio_is_stretched_with_a_warning() -> None:
+    """Estimators work at multiples of several pixels: here 194 x 132 instead of 194 x 129 for 96 x 64."""
     image, depth = scene()
     dof = DepthOfField(Camera.from_fov(40.0, 0.05, 5.0))
     near = torch.nn.functional.interpolate(depth, (132, 194), mode="nearest")

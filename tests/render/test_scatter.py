@@ -66,9 +66,7 @@ def test_fold_and_convolution_agree(dtype: torch.dtype, limit: float, radius: fl
 
 
 @pytest.mark.parametrize(("dtype", "limit"), [(torch.float32, 1e-5), (torch.float64, 1e-10)])
-def test_a_very_large_kernel_goes_through_fourier_and_agrees_with_a_direct_sum(
-    dtype: torch.dtype, limit: float
-) -> None:
+def test_a_very_large_kernel_is_convolved_by_fft_and_agrees_with_a_direct_sum(dtype: torch.dtype, limit: float) -> None:
     light, kernels = torch.rand(1, 2, 20, 110, dtype=dtype), bank(45.0, 40.0, dtype=dtype)
     direct = functional.conv2d(light, kernels[:, None], padding=kernels.shape[-1] // 2, groups=2)
     assert_close(convolve(light, kernels), direct, rtol=limit, atol=0.0)
@@ -76,7 +74,7 @@ def test_a_very_large_kernel_goes_through_fourier_and_agrees_with_a_direct_sum(
 
 @pytest.mark.parametrize("radius", [2.0, 40.0])
 def test_a_highlight_changes_nothing_outside_its_own_disc(radius: float) -> None:
-    # the rounding of a Fourier transform in float32 would be seen all over the frame
+    # the rounding of an FFT in float32 would affect the whole frame
     dark = torch.full((1, 1, 9, 201), 0.1)
     lit = dark.clone()
     lit[..., 4, 100] = 6.5e4
@@ -87,7 +85,7 @@ def test_a_highlight_changes_nothing_outside_its_own_disc(radius: float) -> None
 
 @BOTH
 @pytest.mark.parametrize("channels", [1, 3, 16, 17])
-def test_channels_are_spread_apart_from_each_other(scatter: Spread, channels: int) -> None:
+def test_channels_are_convolved_independently(scatter: Spread, channels: int) -> None:
     light = torch.rand(1, channels, 7, 6, dtype=torch.float64)
     kernels = bank(*(1.0 + 0.1 * c for c in range(channels)), size=7)
     together = scatter(light, kernels)
@@ -97,14 +95,14 @@ def test_channels_are_spread_apart_from_each_other(scatter: Spread, channels: in
 
 def test_the_adjoint_of_fold_is_unfold() -> None:
     light, seen = torch.rand(2, 2, 3, 9, 7, dtype=torch.float64)
-    kernels = torch.rand(3, 5, 5, dtype=torch.float64)  # no symmetry: a scatter is not yet a gather
+    kernels = torch.rand(3, 5, 5, dtype=torch.float64)  # asymmetric, so that scatter and gather differ
     patches = functional.unfold(seen, (5, 5), padding=2).unflatten(1, (3, 25))
     gathered = (patches * kernels.flatten(1)[None, :, :, None]).sum(2).unflatten(-1, (9, 7))
     assert_close((fold(light, kernels) * seen).sum(), (light * gathered).sum(), rtol=1e-12, atol=0.0)
 
 
 @pytest.mark.parametrize("rows", [1, 2, 5])
-def test_strips_agree_with_the_frame_as_a_whole(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_strips_agree_with_the_whole_frame(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
     light, kernels = torch.rand(1, 2, 13, 6, dtype=torch.float64), bank(1.2, 2.1, size=7)
     weights = torch.rand(1, 3, 13, 6, dtype=torch.float64)
     each = psf.disc(torch.tensor([0.0, 1.0, 3.4]), size=7).unsqueeze(1)
@@ -179,13 +177,13 @@ def test_fold_of_a_frame_1920_wide_at_radius_16_stays_within_2_gb(height: int) -
 
 
 @pytest.mark.parametrize("radius", [2.5, 14.0])
-def test_one_kernel_serves_all_channels(radius: float) -> None:
+def test_a_single_kernel_applies_to_all_channels(radius: float) -> None:
     light, kernel = torch.rand(2, 3, 20, 24), psf.disc(radius).float()[None]
     assert_close(convolve(light, kernel), convolve(light, kernel.repeat(3, 1, 1)), rtol=1e-6, atol=1e-6)
     assert_close(convolve(light, kernel), fold(light, kernel), rtol=1e-5, atol=1e-6)
 
 
-def test_a_large_kernel_uses_the_halo_as_if_the_frame_went_on() -> None:
+def test_a_large_kernel_uses_the_halo() -> None:
     light, kernels = torch.rand(1, 2, 90, 100), torch.stack([psf.disc(12.0), psf.disc(11.8)]).float()
     half = kernels.shape[-1] // 2
     whole = convolve(light, kernels)[..., half:-half, half:-half]
@@ -197,7 +195,7 @@ def test_a_large_kernel_uses_the_halo_as_if_the_frame_went_on() -> None:
 @pytest.mark.parametrize("items", [1, 2, 7])
 @pytest.mark.parametrize("channels", [1, 3, 4, 5, 8, 9])
 @pytest.mark.parametrize("rows", [1, 2, 13])
-def test_the_halo_is_used_whatever_shares_a_convolution(rows: int, channels: int, items: int) -> None:
+def test_the_halo_is_used_for_any_number_of_items_and_channels(rows: int, channels: int, items: int) -> None:
     bank = torch.stack([psf.disc(1.6 + 0.2 * c, size=7) for c in range(channels)])
     light = torch.rand(items, channels, rows + 6, 17, dtype=torch.float64)
     wanted = fold(light, bank)[..., 3:-3, 3:-3]

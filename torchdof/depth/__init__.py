@@ -1,4 +1,4 @@
-"""Whatever depth people have, as metres along the optical axis: kinds of numbers, holes, files, sanity, shots."""
+"""Depth maps of any kind to metres along the optical axis: units, holes, files, reports, warnings, shots."""
 
 from ..render.edges import repair_edges
 from ..render.resample import at_size_of

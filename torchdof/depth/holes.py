@@ -1,4 +1,4 @@
-"""Pixels without depth: counted, refused, or filled from around as asked."""
+"""Pixels without depth: count, refuse or fill them."""
 
 import math
 from typing import Literal
@@ -12,21 +12,21 @@ from .kinds import number_map
 __all__ = ["Fill", "fill_holes", "resolve_holes"]
 
 Fill = Literal["nearest", "far"] | float
-"""What a hole is filled with, as :func:`fill_holes` describes it."""
+"""The rule by which :func:`fill_holes` fills a hole, or a depth in metres."""
 
 
 def fill_holes(depth: Tensor, fill: Fill) -> Tensor:
-    """Gives every pixel without depth (NaN) one.
+    """Fills every pixel without depth (NaN).
 
     Args:
         depth: ``[1, 1, H, W]``.
-        fill: "nearest" takes the nearest pixel that has depth (by jump flooding: now and then one that is a
+        fill: "nearest" takes the nearest pixel with depth (by jump flooding, which occasionally picks one that is a
             fraction of a pixel farther). "far" takes the farthest of the first pixels with depth to the left, right,
-            above and below: what stereo cannot see lies behind. A number is the depth in metres, for example inf for
-            a sky.
+            above and below, because stereo misses the background beside a foreground. A number is the depth in metres,
+            for example inf for a sky.
 
     Returns:
-        ``[1, 1, H, W]`` without NaN; where there was a depth it is unchanged.
+        ``[1, 1, H, W]`` without NaN; known depths are unchanged.
 
     Raises:
         ValueError: If no pixel has a depth to fill from, or the fill is unknown.
@@ -54,7 +54,7 @@ def fill_holes(depth: Tensor, fill: Fill) -> Tensor:
     candidates = torch.stack([_first_along(depth, dim, back) for dim in (-1, -2) for back in (False, True)])
     farthest = torch.where(candidates.isnan(), -torch.inf, candidates).amax(dim=0)
     filled = torch.where(depth.isnan() & (farthest > -torch.inf), farthest, depth)
-    return fill_holes(filled, "nearest")  # what has no depth in its row or column
+    return fill_holes(filled, "nearest")  # holes without any depth in their row and column
 
 
 def resolve_holes(depth: Tensor, name: str, fill: Fill | None) -> tuple[Tensor, int]:
@@ -62,8 +62,8 @@ def resolve_holes(depth: Tensor, name: str, fill: Fill | None) -> tuple[Tensor, 
 
     Args:
         depth: ``[1, 1, H, W]``.
-        name: Of the file, for the message.
-        fill: As for :func:`fill_holes`; None refuses.
+        name: Name of the file, for the message.
+        fill: As for :func:`fill_holes`; None refuses holes.
 
     Returns:
         The depth without holes, and how many there were.
@@ -87,7 +87,10 @@ def resolve_holes(depth: Tensor, name: str, fill: Fill | None) -> tuple[Tensor, 
 
 
 def _first_along(depth: Tensor, dim: int, back: bool) -> Tensor:
-    """The last value that is not NaN at or before each place along a dimension; NaN where there is none."""
+    """The last value that is not NaN at or before each place along a dimension; NaN if all are.
+
+    With ``back`` it searches from the other end.
+    """
     line = depth.flip(dim) if back else depth
     place = torch.arange(line.shape[dim]).reshape([-1 if d == line.ndim + dim else 1 for d in range(line.ndim)])
     last = torch.where(line.isnan(), -1, place).cummax(dim=dim).values
@@ -96,7 +99,7 @@ def _first_along(depth: Tensor, dim: int, back: bool) -> Tensor:
 
 
 def _nearest(depth: Tensor) -> Tensor:
-    """Jump flooding (Rong and Tan 2006), on the holes alone: ``[H, W]`` with NaN to ``[H, W]`` without."""
+    """Fills NaN in ``[H, W]`` with the nearest depth, by jump flooding (Rong and Tan 2006) on the holes alone."""
     height, width = depth.shape
     y, x = torch.nonzero(depth.isnan(), as_tuple=True)
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")

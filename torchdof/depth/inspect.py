@@ -1,4 +1,4 @@
-"""What a depth map holds and what a camera makes of it: ranges, blur, holes, and how exact its edges are."""
+"""Reports on a depth map and a camera: range of depth, blur radius, holes, and how exact the edges are."""
 
 import dataclasses
 import math
@@ -15,24 +15,29 @@ from ..validation import image_and_map
 __all__ = ["EDGES", "DepthReport", "coc_colours", "inspect_depth", "panels", "tint_focus"]
 
 EDGES = ("exact", "ramp", "beside", "unclear")
-"""Pixels at depth edges, by what rendering does: beside a step that stays where it is; on a ramp that becomes a step;
-of one surface with the depth of the other, which gets its own; on a ramp that stays, for the image shows no edge."""
+"""Kinds of pixels at depth edges.
 
-_NEAR, _SHARP, _FAR = (0.90, 0.35, 0.0), (0.0, 0.62, 0.20), (0.0, 0.30, 0.85)
-_FAINT, _CLEAR = 0.2, 0.6  # change of light to the next pixel, of the brighter one: begins to be an outline, and is one
-_DARKEST = 0.05  # of the mean light: what is darker has no outlines of its own
-_BOUNDS_PX = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
+* exact: beside a step; rendering keeps it.
+* ramp: on a soft edge; rendering turns it into a step.
+* beside: on one surface, with the depth of the other; rendering corrects it.
+* unclear: on a ramp that rendering keeps, because the image shows no edge there.
+"""
+
+_NEAR, _SHARP, _FAR = (0.90, 0.35, 0.0), (0.0, 0.62, 0.20), (0.0, 0.30, 0.85)  # RGB of the outlines, linear light
+_FAINT, _CLEAR = 0.2, 0.6  # contrast (max - min) / max of 3 x 3 pixels at which an outline starts, and is complete
+_DARKEST = 0.05  # share of the mean light; darker pixels give no contrast of their own
+_BOUNDS_PX = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)  # bounds of the histogram in px
 
 
 @dataclasses.dataclass(frozen=True)
 class DepthReport:
-    """What :func:`inspect_depth` found.
+    """The result of :func:`inspect_depth`.
 
     Args:
         depth: The map, ``[1, 1, H, W]`` in metres, NaN in holes.
         coc_px: Signed circle of confusion, ``[1, 1, H, W]``, NaN in holes.
-        edges: ``[1, 1, H, W]``, uint8: 0 where there is no edge of depth, else 1 + the place in :data:`EDGES`.
-        counts: How many pixels of each kind of :data:`EDGES` there are.
+        edges: ``[1, 1, H, W]``, uint8: 0 away from depth edges, else 1 + the index in :data:`EDGES`.
+        counts: Number of pixels of each kind in :data:`EDGES`.
     """
 
     depth: Tensor
@@ -52,13 +57,13 @@ class DepthReport:
 
     @property
     def doubtful(self) -> float:
-        """Share of the pixels at edges whose depth rendering repairs; 0 where it takes the map as it is."""
+        """Share of the pixels at edges whose depth rendering repairs; 0 if it uses the map unchanged."""
         return (self.counts[1] + self.counts[2]) / max(1, sum(self.counts))
 
     def histogram(self) -> list[tuple[float, float, float]]:
         """Lower and upper blur radius in pixels (negative: in front of the focus), and the share of the pixels between.
 
-        The bounds double from 1 px on; bins at both ends that hold nothing are left out.
+        The bounds are 1, 2, 4, ... 128 px; empty bins at both ends are left out.
         """
         bounds = [-math.inf, *(-x for x in reversed(_BOUNDS_PX)), *_BOUNDS_PX, math.inf]
         known = self.coc_px[~self.coc_px.isnan()]
@@ -69,7 +74,7 @@ class DepthReport:
         return [(bounds[k], bounds[k + 1], counts[k] / total) for k in range(filled[0], filled[-1] + 1)]
 
     def distances(self) -> dict[str, float]:
-        """Finite depths in metres: the nearest, those that 1, 50 and 99 % are nearer than, the farthest; or none."""
+        """Nearest and farthest finite depth and the 1, 50 and 99 % quantiles, in metres; empty without finite depth."""
         finite = self.depth[self.depth.isfinite()]
         if not finite.numel():
             return {}
@@ -78,7 +83,7 @@ class DepthReport:
         return {"nearest": float(finite.min()), **named, "farthest": float(finite.max())}
 
     def facts(self) -> dict[str, Any]:
-        """What ``str`` tells, for programs: JSON-like data, distances in metres, radii in pixels, shares of 1."""
+        """The numbers of ``str`` as JSON-like data: distances in metres, radii in pixels, shares in [0, 1]."""
         known = self.coc_px[~self.coc_px.isnan()]
         return {
             "depth_m": self.distances(),
@@ -109,7 +114,7 @@ class DepthReport:
         shares = ", ".join(f"{_percent(n, edge_px)} {name}" for n, name in zip(self.counts, EDGES, strict=True))
         lines.append(f"depth edges   {edge_px} pixels: {shares}")
         if edge_px:
-            taken = "are repaired before rendering" if self.doubtful else "are exact and stay as they are"
+            taken = "are repaired before rendering" if self.doubtful else "are exact and stay unchanged"
             lines.append(f"              they {taken} (depth edges auto)")
         return "\n".join(lines)
 
@@ -119,7 +124,7 @@ _SHARE_NAMES = ("1 %", "median", "99 %")
 
 
 def inspect_depth(image: Tensor, depth: Tensor, camera: Camera) -> DepthReport:
-    """Looks at a depth map: ranges, the circle of confusion that a camera makes of it, holes, exactness of edges.
+    """Inspects a depth map: range of depth, circle of confusion for a camera, holes, exactness of edges.
 
     Args:
         image: ``[1, C, H, W]``, linear light.
@@ -127,7 +132,7 @@ def inspect_depth(image: Tensor, depth: Tensor, camera: Camera) -> DepthReport:
         camera: The camera.
 
     Returns:
-        The report; ``print`` tells it.
+        The report, which can be printed.
 
     Raises:
         ValueError: If an argument is not as described.
@@ -152,13 +157,13 @@ def inspect_depth(image: Tensor, depth: Tensor, camera: Camera) -> DepthReport:
 
 
 def coc_colours(coc_px: Tensor) -> Tensor:
-    """A signed map in colour: orange in front of the focus, black in focus, blue behind; linear light.
+    """A map of signed radii in colour: orange in front of the focus, black in focus, blue behind; linear light.
 
     Args:
         coc_px: ``[1, 1, H, W]``, pixels.
 
     Returns:
-        ``[1, 3, H, W]``; the largest radius, at least 1 px, is full colour.
+        ``[1, 3, H, W]``; the largest radius, or 1 px if that is larger, has full colour.
 
     Example:
         >>> coc_colours(torch.tensor([[[[-2.0, 0.0, 2.0]]]]))[0, :, 0].argmax(dim=0).tolist()
@@ -170,11 +175,11 @@ def coc_colours(coc_px: Tensor) -> Tensor:
 
 
 def panels(image: Tensor, report: DepthReport) -> dict[str, Tensor]:
-    """Pictures of a report, each ``[1, 3, H, W]`` in linear light, by what to write above them.
+    """Pictures of a report: caption -> ``[1, 3, H, W]`` in linear light.
 
     Args:
         image: ``[1, C, H, W]``, linear light.
-        report: What was found.
+        report: Result of :func:`inspect_depth` for this image.
     """
     is_hole = report.depth.isnan()
     magenta = report.depth.new_tensor([0.6, 0.0, 0.6])[:, None, None]
@@ -198,10 +203,10 @@ def panels(image: Tensor, report: DepthReport) -> dict[str, Tensor]:
 
 
 def tint_focus(image: Tensor, coc_px: Tensor, has_alpha: bool = False) -> Tensor:
-    """The image with outlines in colour: green in focus (radius of at most 1 px), orange nearer, blue farther.
+    """Colours the outlines in an image: green in focus (radius of at most 1 px), orange nearer, blue farther.
 
-    Everything else keeps its colours. Outlines are where the image's light changes by more than a third from pixel to
-    pixel, and where one of the three zones meets another.
+    Outlines are the borders between these three zones, and places of high contrast: ``(max - min) / max`` of 3 x 3
+    pixels. They fade in from 0.2 to 0.6. Other pixels keep their colours.
 
     Args:
         image: ``[B, C, H, W]`` in linear light, C of 1 or 3, one more with alpha (premultiplied).

@@ -23,13 +23,13 @@ def depth_from_values(
     unknown: float | None = None,
     fov_x_deg: float | None = None,
 ) -> Tensor:
-    """Numbers of a depth map to metres along the optical axis; pixels without depth become NaN.
+    """Converts the numbers of a depth map to metres along the optical axis; pixels without depth become NaN.
 
     =========== ============================================== ==========================================
     kind        result                                         for
     =========== ============================================== ==========================================
     z           ``scale * (value + offset)``                   renderers; millimetre maps (scale 0.001)
-    distance    the same, as length of the ray, turned into z  path tracers, lidar
+    distance    the same, converted from ray length to z       path tracers, lidar
     disparity   ``scale / (value + offset)``                   stereo: scale = baseline [m] * focal [px]
     inverse     ``scale / (value + offset)``                   inverse depth, learned depth
     coc         ``scale * (value + offset)``, signed px        ready circles of confusion
@@ -37,13 +37,12 @@ def depth_from_values(
 
     Args:
         values: ``[B, 1, H, W]``.
-        kind: What the numbers are.
-        scale: Factor, 1 if None; disparity needs one.
-        offset: Added to the value first.
-        unknown: A value that means "not measured", for example 0, -1 or inf. NaN always does, and so does
-            whatever leads to a depth that is zero, negative or NaN (a disparity of inf among them); for coc, NaN
-            and inf.
-        fov_x_deg: Horizontal field of view in degrees, needed for "distance".
+        kind: Kind of the numbers.
+        scale: Factor; None means 1, but is refused for disparity.
+        offset: Added to the value before scaling.
+        unknown: A value that marks pixels without depth, for example 0, -1 or inf. NaN always does, and so does every
+            value whose result is zero, negative or NaN (a disparity of inf, for example); for coc, NaN and inf.
+        fov_x_deg: Horizontal field of view in degrees; required for "distance".
 
     Returns:
         ``[B, 1, H, W]`` float32 in metres (pixels for coc), ``> 0`` or ``inf``, NaN where unknown.
@@ -63,7 +62,7 @@ def depth_from_values(
     if kind == "disparity" and scale is None:
         raise ValueError(
             "disparity needs a scale (--depth-scale): the baseline in metres times the focal length in pixels; "
-            "where nobody knows it, take it for relative depth: from_relative (--depth-kind relative)"
+            "if it is unknown, treat the map as relative depth: from_relative (--depth-kind relative)"
         )
     scale = 1.0 if scale is None else scale
     for factor in (scale, offset):
@@ -72,7 +71,7 @@ def depth_from_values(
             raise ValueError(f"scale (--depth-scale) must be finite and not 0, offset (--depth-offset) finite, {got}")
     if unknown is not None and not math.isnan(unknown if isinstance(unknown, float) else 0.0):
         unknown = number("unknown", unknown, infinite=True)
-    # in double precision, in place: maps have millions of pixels, and NaN stays NaN
+    # in double precision and in place, because maps have millions of pixels
     depth = values.to(torch.float64, copy=True)
     if unknown is not None:
         depth.masked_fill_(depth == unknown, math.nan)
@@ -102,12 +101,11 @@ def _ray_length(like: Tensor, fov_x_deg: float) -> Tensor:
 
 
 def number_map(name: str, values: Tensor) -> None:
-    """Refuse what is no map of numbers; whole numbers, which files hold, are as good as others.
+    """Refuse a value that is not a non-empty tensor of floating-point or whole numbers.
 
     Raises:
         ValueError: If it is not a tensor of real numbers, or empty.
     """
-    # integers are what files hold; of the rest only what arithmetic works on
     if isinstance(values, Tensor) and values.dtype in WHOLE_NUMBERS and values.layout == torch.strided:
         values = values.double()
     real_tensor(name, values, "[B, 1, H, W]")

@@ -1,4 +1,4 @@
-"""Where each pixel was in the frame before: block matching from coarse to fine."""
+"""Optical flow from a frame to the previous one, by block matching from coarse to fine."""
 
 import torch
 import torch.nn.functional as F
@@ -6,24 +6,24 @@ from torch import Tensor
 
 __all__ = ["motion_between", "sample", "shifted"]
 
-_COARSEST_PX, _LEVELS = 24, 5
-_BLOCK = 7
-_GAIN = 0.05  # share of the difference that a fraction must explain: what stands still, stands still
-_NOISE = 1e-4  # squared difference that tells nothing
-_STILL = 1e-3  # share of pixels that may change before motion is looked for
+_COARSEST_PX, _LEVELS = 24, 5  # smallest side of the coarsest level in px, and most levels; more find larger motion
+_BLOCK = 7  # px; side of the compared blocks; larger ones are more robust and less detailed
+_GAIN = 0.05  # least share of the squared difference that a subpixel shift must remove; larger keeps more pixels still
+_NOISE = 1e-4  # squared difference of noise, for the same test
+_STILL = 1e-3  # share of changed pixels up to which there is no search for motion
 
 
 def motion_between(frame: Tensor, before: Tensor, changed: Tensor) -> Tensor:
-    """How far from each pixel of a frame its content lay in the frame before.
+    """Optical flow ``[B, 2, H, W]`` from each pixel of a frame to its content in the previous frame.
 
     Args:
         frame: ``[B, C, H, W]``.
-        before: The frame before, alike.
-        changed: ``[B, 1, H, W]``, bool: pixels that differ where nothing moves. Where these are next to none there is
-            no motion.
+        before: The previous frame, ``[B, C, H, W]``.
+        changed: ``[B, 1, H, W]``, bool: pixels that differ between both frames. With less than 0.1 % of them the flow
+            is 0.
 
     Returns:
-        ``[B, 2, H, W]``, x and y in pixels, to a fraction of a pixel, found at half the resolution.
+        x and y in pixels, with subpixel precision, computed at half the resolution.
     """
     batch, _, height, width = frame.shape
     if float(changed.float().mean()) <= _STILL:
@@ -40,7 +40,7 @@ def motion_between(frame: Tensor, before: Tensor, changed: Tensor) -> Tensor:
 
 
 def sample(image: Tensor, flow: Tensor) -> Tensor:
-    """The image at each pixel's place in the frame before, linear between pixels: ``[B, C, H, W]``."""
+    """The previous image at ``pixel + flow``, bilinear: ``[B, C, H, W]``."""
     height, width = image.shape[-2:]
     y, x = torch.meshgrid(
         torch.arange(height, dtype=flow.dtype, device=flow.device),
@@ -52,7 +52,7 @@ def sample(image: Tensor, flow: Tensor) -> Tensor:
 
 
 def shifted(maps: Tensor, flow: Tensor) -> Tensor:
-    """The maps ``[B, K, H, W]`` at each pixel's place in the frame before, whole pixels: nothing is mixed."""
+    """The maps ``[B, K, H, W]`` of the previous frame at ``pixel + flow``, rounded to the nearest pixel."""
     batch, count, height, width = maps.shape
     y, x = torch.meshgrid(
         torch.arange(height, device=flow.device), torch.arange(width, device=flow.device), indexing="ij"
@@ -68,7 +68,7 @@ def _halved(picture: Tensor) -> Tensor:
 
 
 def _cost(now: Tensor, then: Tensor, flow: Tensor) -> Tensor:
-    """Mean difference of blocks around each pixel and its place in the frame before, ``[B, 1, H, W]``."""
+    """Mean absolute difference of the blocks around each pixel and around ``pixel + flow``, ``[B, 1, H, W]``."""
     return _block_mean((now - shifted(then, flow)).abs())
 
 
@@ -77,7 +77,11 @@ def _block_mean(values: Tensor) -> Tensor:
 
 
 def _matched(now: Tensor, then: Tensor, flow: Tensor, reach: int) -> Tensor:
-    """The best of whole displacements around a guess, the guesses of blocks around, and none."""
+    """Integer flow of least cost.
+
+    1. Choose among the guess ``flow``, no motion, and the guesses of the four neighbouring blocks.
+    2. Search all displacements of up to ``reach`` pixels around the choice.
+    """
     guesses = [flow, torch.zeros_like(flow)]
     for dim in (-2, -1):
         guesses += [flow.roll(step, dims=dim) for step in (-_BLOCK, _BLOCK)]
@@ -94,19 +98,19 @@ def _matched(now: Tensor, then: Tensor, flow: Tensor, reach: int) -> Tensor:
 
 
 def _better(best_cost: Tensor, best: Tensor, cost: Tensor, candidate: Tensor) -> tuple[Tensor, Tensor]:
-    is_better = cost < best_cost - 1e-4  # of equals the first: flat areas follow what is around them
+    is_better = cost < best_cost - 1e-4  # nearly equal costs keep the earlier candidate, so flat areas keep the guess
     return torch.where(is_better, cost, best_cost), torch.where(is_better, candidate, best)
 
 
 def _to_fractions(now: Tensor, then: Tensor, flow: Tensor) -> Tensor:
-    """Displacements to a fraction of a pixel, by the parabola through the squared differences of three."""
+    """Flow with subpixel precision, along each axis from the parabola through three squared differences."""
     middle = _block_mean((now - shifted(then, flow)).square())
     fractions = []
     for step in ((1.0, 0.0), (0.0, 1.0)):
         offset = flow.new_tensor(step).reshape(1, 2, 1, 1)
         before, after = (_block_mean((now - shifted(then, flow + sign * offset)).square()) for sign in (-1, 1))
         bend = (before + after - 2 * middle).clamp(min=1e-6)
-        gain = (before - after).square() / (8 * bend)  # middle less the bottom of the parabola
+        gain = (before - after).square() / (8 * bend)  # middle minus the minimum of the parabola
         fractions.append(
             torch.where(gain > _GAIN * middle.clamp(min=_NOISE), 0.5 * (before - after) / bend, 0.0).clamp(-0.5, 0.5)
         )

@@ -1,4 +1,4 @@
-"""A depth map from a file to metres without holes."""
+"""Reading a depth map from a file, as metres without holes."""
 
 import os
 
@@ -29,7 +29,7 @@ def read_depth(
 
     Raises:
         OSError: If the file cannot be read.
-        ValueError: If it has holes and ``fill`` is None, or something is missing or unclear.
+        ValueError: If the map has holes and ``fill`` is None, or an argument is missing or wrong.
     """
     depth = depth_from_values(
         read_values(path, channel), kind, scale=scale, offset=offset, unknown=unknown, fov_x_deg=fov_x_deg

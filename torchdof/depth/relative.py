@@ -1,4 +1,4 @@
-"""Depth without a scale, as estimators give it, to metres: between two distances, or from points that are known."""
+"""Relative depth, as estimators give it, to metres: from two distances, or from points of known distance."""
 
 import dataclasses
 import math
@@ -40,18 +40,18 @@ def from_relative(
     Args:
         values: ``[B, 1, H, W]``, floating point or whole numbers, of any range. NaN and infinite values are holes.
         near_m: Distance of the nearest value, in metres, > 0.
-        far_m: Distance of the farthest value, in metres, > ``near_m``; ``inf`` allowed but for ``"depth"``.
-        kind: What the numbers are.
-        value_range: The smallest and the largest value that count; what lies outside is taken for the nearer of the
-            two. None takes each item's own extremes: give it for the frames of a shot, or each is scaled on its own.
-        unknown: A value that means "not measured", for example 0.
+        far_m: Distance of the farthest value, in metres, > ``near_m``; ``inf`` is allowed except for ``"depth"``.
+        kind: Kind of the numbers.
+        value_range: ``(smallest, largest)``; other values are clamped to this range. None takes the extremes of each
+            item. Give it for the frames of a shot, so that all have the same scale.
+        unknown: A value that marks pixels without depth, for example 0.
 
     Returns:
         ``[B, 1, H, W]`` in metres, on the device and in the dtype of ``values`` (float32 for whole numbers); NaN in
         holes. Differentiable with respect to ``values``; an infinite depth passes no gradient.
 
     Raises:
-        ValueError: If an argument is not as described, or an item has no two different values to tell near from far.
+        ValueError: If an argument is not as described, or an item does not have two different values.
 
     Reference:
         Ranftl et al., "Towards robust monocular depth estimation", IEEE TPAMI 2022, section 5: disparity up to scale
@@ -76,7 +76,7 @@ def from_relative(
         if not is_traced() and not bool((low < high).all()):
             problem = "no value" if bool((low > high).any()) else "one value everywhere"
             raise ValueError(
-                f"relative depth needs two different values to tell near from far, got {problem}; give "
+                f"relative depth needs two different values to distinguish near from far, got {problem}; give "
                 "value_range=(smallest, largest) (--value-range) if the values mean something beyond this map"
             )
     else:
@@ -94,13 +94,13 @@ def from_relative(
 
 @dataclasses.dataclass(frozen=True)
 class Scale:
-    """How the values of a map become metres, as :func:`torchdof.depth.depth_from_values` takes it.
+    """Conversion of the values of a map to metres: arguments of :func:`torchdof.depth.depth_from_values`.
 
     Args:
         kind: "disparity": ``scale / (value + offset)``; "z": ``scale * (value + offset)``.
         scale: Factor.
-        offset: Added to the value first.
-        residual: RMS relative error of depth at the points it was solved from.
+        offset: Added to the value before scaling.
+        residual: RMS relative error of depth at the points of :func:`solve_scale`.
     """
 
     kind: Literal["disparity", "z"]
@@ -109,7 +109,7 @@ class Scale:
     residual: float
 
     def depth(self, values: Tensor) -> Tensor:
-        """Metres ``[B, 1, H, W]``, float32; values that lie beyond infinity are at infinity, holes stay NaN.
+        """Metres ``[B, 1, H, W]``, float32; a disparity of 0 or less is at infinity, holes stay NaN.
 
         Example:
             >>> Scale("disparity", 2.0, 0.5, 0.0).depth(torch.tensor([[[[0.5, -0.5, -3.0]]]]))
@@ -123,25 +123,25 @@ class Scale:
 def solve_scale(
     values: Tensor, points: Sequence[tuple[float, float, float]], kind: RelativeKind = "disparity", patch: int = 5
 ) -> Scale:
-    """Scale and offset of relative depth from points whose distance is known.
+    """Scale and offset of relative depth from points of known distance.
 
-    Two points give it exactly; of more, the sum of squared relative errors of depth is the least. In ``torchdof
-    render`` the result is ``--depth-kind disparity --depth-scale SCALE --depth-offset OFFSET`` (``--depth-kind z`` for
-    "depth").
+    Two points give an exact solution; more are fitted by least squares of the relative errors of depth. ``torchdof
+    render`` takes the result as ``--depth-kind disparity --depth-scale SCALE --depth-offset OFFSET`` (``--depth-kind
+    z`` for "depth").
 
     Args:
-        values: ``[1, 1, H, W]``, floating point or whole numbers; what is not finite is left out.
-        points: ``(x, y, metres)``, at least two of different values: pixels from the top left edge, and the distance
+        values: ``[1, 1, H, W]``, floating point or whole numbers; values that are not finite are left out.
+        points: ``(x, y, metres)``, at least two with different values: pixels from the top left edge, and the distance
             along the optical axis, > 0; for disparity ``inf`` allowed.
         kind: As for :func:`from_relative`.
-        patch: Side of the square patch around a point, whose median counts.
+        patch: Side in pixels of the square patch around a point, whose median is used.
 
     Returns:
         The scale.
 
     Raises:
-        ValueError: If an argument is not as described, the points have one value only, or they say that the values run
-            the other way.
+        ValueError: If an argument is not as described, all points have the same value, or the values run the other way
+            than ``kind`` does.
 
     Example:
         >>> values = torch.tensor([[[[1.0, 2.0, 4.0]]]])
@@ -162,7 +162,7 @@ def solve_scale(
             f"scale and offset need at least two points of different values, got {len(known)} points of values "
             f"{sorted({value for value, _ in known})}"
         )
-    # (a v + b) / y = 1 with y = 1/z or z: both sides are relative, so that near points do not outweigh far ones.
+    # Solve a v + b = y with y = z for "depth", else 1/z. Each row is divided by y, so that errors are relative.
     value = torch.tensor([v for v, _ in known], dtype=torch.float64)
     metres = torch.tensor([z for _, z in known], dtype=torch.float64)
     weight = 1.0 / metres if kind == "depth" else metres.clamp(max=1e6 * float(metres.min()))
@@ -171,7 +171,7 @@ def solve_scale(
     factor, constant = torch.linalg.lstsq(design, target[:, None], driver="gelsd").solution[:, 0].tolist()
     if not factor > 0:
         other, way = ("disparity", "nearer") if kind == "depth" else ("depth", "farther")
-        raise ValueError(f"the points say that larger values are {way}; that is kind={other!r}, not {kind!r}")
+        raise ValueError(f"at the points, larger values are {way}; that is kind={other!r}, not {kind!r}")
     residual = float((design @ torch.tensor([factor, constant], dtype=torch.float64) - target).square().mean().sqrt())
     if kind == "depth":
         return Scale("z", factor, constant / factor, residual)
@@ -179,7 +179,7 @@ def solve_scale(
 
 
 def _near_and_far(near_m: float, far_m: float, kind: RelativeKind) -> tuple[float, float]:
-    """Refuse distances that are none, or the wrong way round."""
+    """Refuse distances that are not numbers, or in the wrong order."""
     near_m = number("near_m", near_m, low=0, unit="metres")
     far_m = number("far_m", far_m, low=0, unit="metres", infinite=kind != "depth")
     if not near_m < far_m:
@@ -188,7 +188,7 @@ def _near_and_far(near_m: float, far_m: float, kind: RelativeKind) -> tuple[floa
 
 
 def _range(value_range: tuple[float, float]) -> tuple[float, float]:
-    """Refuse what is not two numbers in order."""
+    """Refuse a range that is not two increasing numbers."""
     if not isinstance(value_range, tuple | list) or len(value_range) != 2:
         raise ValueError(f"value_range must be (smallest, largest), got {show(value_range)}")
     low, high = (number("value_range", x) for x in value_range)
@@ -198,7 +198,7 @@ def _range(value_range: tuple[float, float]) -> tuple[float, float]:
 
 
 def _relative_map(values: Tensor) -> None:
-    """Refuse what is not ``[B, 1, H, W]`` of numbers."""
+    """Refuse a value that is not a tensor ``[B, 1, H, W]`` of numbers."""
     if not isinstance(values, Tensor):
         hint = "; convert an array with torch.from_numpy(array)[None, None]"
         raise ValueError(f"relative depth must be a tensor [B, 1, H, W], got {type(values).__name__}{hint}")
@@ -209,7 +209,7 @@ def _relative_map(values: Tensor) -> None:
 
 
 def _point(values: Tensor, point: tuple[float, float, float], kind: RelativeKind, patch: int) -> tuple[float, float]:
-    """Value and metres of a point."""
+    """Median value around a point, and its distance in metres."""
     if not isinstance(point, Sequence) or len(point) != 3:
         raise ValueError(f"a point must be (x, y, metres), got {show(point)}")
     x, y = (number(name, place) for name, place in zip("xy", point, strict=False))

@@ -1,7 +1,7 @@
-"""Does depth fit the camera? A wrong unit renders without complaint; here it is said, with what mends it.
+"""Warnings if depth hardly fits the camera: a wrong unit would otherwise render without an error.
 
-The rendering itself never asks: it may run under a compiler, on a GPU, a million times. ``torchdof render`` and
-``torchdof inspect`` ask for each frame, others call :func:`check` where they read their depth.
+The renderer itself does not check, because the checks read values and would stall a GPU or break a compiled graph.
+``torchdof render`` and ``torchdof inspect`` check each frame; other programs call :func:`check` where they read depth.
 """
 
 import dataclasses
@@ -18,15 +18,15 @@ from .kinds import DepthKind
 
 __all__ = ["DepthWarning", "Mistake", "check", "coc_mistakes", "depth_mistakes"]
 
-_FACTORS = (0.001, 0.01, 1000.0, 100.0)  # millimetres and centimetres; and what was taken for such and is none
+_FACTORS = (0.001, 0.01, 1000.0, 100.0)  # tried to bring depth to the focus: mm or cm as metres, or scaled down twice
 _UNITS = {0.001: "millimetres", 0.01: "centimetres"}
-_SHARP_PX, _SHARP_WIDTHS = 1.0, 1e-3  # what counts as in focus: the larger of both
+_SHARP_PX, _SHARP_WIDTHS = 1.0, 1e-3  # largest radius in focus: in px, and in image widths; the larger of both
 _NUMBERS = ("focal_length_mm", "f_number", "sensor_width_mm")
-_FAR_OFF = 30.0  # times that the focus may be nearer or farther than all depth where the blur tells nothing
-_FAR_M, _HAND_M = 500.0, 0.1
-_LARGE_WIDTHS, _LARGEST_WIDTHS = 1 / 8, 1.0  # a real macro lens reaches half the frame's width
-_WIDEST_F_NUMBER = 0.5  # of an aplanatic lens in air
-_SHORTEST_WIDTHS = 1 / 20  # focal length over the sensor's width: 169 degrees across
+_FAR_OFF = 30.0  # ratio of focus to nearest or farthest depth beyond which a warning is given even without blur
+_FAR_M, _HAND_M = 500.0, 0.1  # m; depth is suspiciously far, or suspiciously near
+_LARGE_WIDTHS, _LARGEST_WIDTHS = 1 / 8, 1.0  # image widths; a large, an impossible radius (macro lenses reach 1/2)
+_WIDEST_F_NUMBER = 0.5  # limit of an aplanatic lens in air
+_SHORTEST_WIDTHS = 1 / 20  # shortest focal length in sensor widths: a field of view of 169 degrees
 
 
 class DepthWarning(UserWarning):
@@ -35,13 +35,13 @@ class DepthWarning(UserWarning):
 
 @dataclasses.dataclass(frozen=True)
 class Mistake:
-    """What looks like one in a depth map or its camera.
+    """A likely mistake in a depth map or its camera.
 
     Args:
-        name: "focus": nothing is in focus, or the focus is far from all depth; "far": everything is so far that nothing
-            is blurred; "bits": whole numbers as files of 8 bits hold; "blur": blur that no lens makes; "lens": a focal
-            length that none has; "range": relative depth of a sequence without the range of its values.
-        message: What is the case, the likely mistake and what mends it.
+        name: "focus": nothing is in focus, or the focus is far from all depth; "far": all depth is far and nothing is
+            blurred; "bits": whole numbers, as in files of 8 bits; "blur": a larger blur than lenses make; "lens": a
+            shorter focal length than lenses have; "range": relative depth of a sequence without ``value_range``.
+        message: The observation, the likely mistake and its remedy.
     """
 
     name: Literal["focus", "far", "bits", "blur", "lens", "range"]
@@ -49,10 +49,10 @@ class Mistake:
 
 
 def check(depth: Tensor, camera: Camera, *, strict: bool = False) -> None:
-    """Warns where a depth map hardly fits the camera: wrong units, a scale that is missing, relative depth as metres.
+    """Warns if a depth map hardly fits the camera: wrong units, a missing scale, relative depth taken for metres.
 
-    Looks at each value, on the device where the depth is, and waits for the result: call it where depth is read, not
-    in a training loop. Sensible extremes pass: macro, astronomy, scenes wholly in focus.
+    It reads all values on their device and waits for the result: call it where depth is read, not in a training loop.
+    Unusual but sensible input gives no warning: macro, astronomy, scenes wholly in focus.
 
     Args:
         depth: ``[B, 1, H, W]``, metres; ``inf`` and holes (NaN, zero, negative) are left out.
@@ -79,16 +79,16 @@ def check(depth: Tensor, camera: Camera, *, strict: bool = False) -> None:
 def depth_mistakes(
     depth: Tensor, camera: Camera, kind: DepthKind | Literal["relative"] = "z", scale: float | None = None
 ) -> list[Mistake]:
-    """What looks wrong with a depth map seen by a camera.
+    """Likely mistakes in a depth map and its camera.
 
     Args:
         depth: ``[B, 1, H, W]``, metres; ``inf`` and holes (NaN, zero, negative) are left out.
         camera: The camera; its numbers floats or ``[B]``.
-        kind: What the numbers were before they became metres, and
-        scale: the factor they were given, for what is advised.
+        kind: Kind of the numbers before their conversion to metres, for the advice in the message.
+        scale: Factor of that conversion, for the same.
 
     Returns:
-        The mistakes, of each name at most one, of the first item that raises it.
+        At most one mistake of each name, from the first item that has it.
 
     Raises:
         ValueError: If an argument is not as described.
@@ -107,7 +107,7 @@ def depth_mistakes(
     found: dict[str, Mistake] = {}
     for item in range(batch):
         *lens, near, far = (float(x[min(item, x.numel() - 1)]) for x in numbers)
-        # straight: mistakes do not ask where in the frame a depth lies
+        # without tilt, because the checks below do not depend on the place in the frame
         single = camera.replace(
             **dict(zip(_NUMBERS, lens, strict=True)), focus_range_m=(near, far), tilt_deg=0.0, swing_deg=0.0
         )
@@ -117,7 +117,7 @@ def depth_mistakes(
 
 
 def coc_mistakes(coc_px: Tensor) -> list[Mistake]:
-    """What looks wrong with a ready map of the circle of confusion, ``[B, 1, H, W]`` in pixels.
+    """Likely mistakes in a map of the circle of confusion, ``[B, 1, H, W]`` in pixels.
 
     Example:
         >>> [mistake.name for mistake in coc_mistakes(torch.full((1, 1, 4, 6), 1500.0))]
@@ -130,7 +130,7 @@ def coc_mistakes(coc_px: Tensor) -> list[Mistake]:
     size = coc_px[coc_px.isfinite()].abs()
     message = (
         f"a blur radius of {_pixels(float(size.max()))} px on an image of {width} px is more than a lens makes; are "
-        "these depths and no circles of confusion? (--depth-kind)"
+        "these depths instead of circles of confusion? (--depth-kind)"
     )
     return [Mistake("blur", message)]
 
@@ -138,7 +138,12 @@ def coc_mistakes(coc_px: Tensor) -> list[Mistake]:
 def _mistakes(
     depth: Tensor, camera: Camera, kind: DepthKind | Literal["relative"], scale: float | None
 ) -> list[Mistake]:
-    """Likely mistakes of one map ``[1, H, W]`` and a camera of plain numbers."""
+    """Likely mistakes of one map ``[1, H, W]`` and a camera of plain numbers.
+
+    1. Find the range of depth, and the smallest and largest blur radius.
+    2. Nothing in focus, or the focus far from all depth: report only that.
+    3. Otherwise check for 8-bit files, far depth, impossible blur, and an impossible focal length.
+    """
     width, focus_m, known = depth.shape[-1], float(camera.focus_m), depth.detach().flatten()
     if not float(known.min()) > 0:
         known = known[known > 0]
@@ -147,7 +152,7 @@ def _mistakes(
     nearest, farthest = (float(end) for end in known.aminmax())
     finite = known if farthest < math.inf or nearest == math.inf else known[known < math.inf]
     near, far = nearest, float(finite.max())
-    # blur grows from the focus to both sides: it is largest at the ends, least where depth is next to the focus
+    # blur grows away from the focus: it is largest at an end of the range, smallest at the depth next to the focus
     ends = camera.focus_range_m or (camera.focus_m, camera.focus_m)
     before = torch.where(known <= float(ends[1]), known, nearest).max()
     behind = torch.where(known >= float(ends[0]), known, farthest).min()
@@ -163,8 +168,8 @@ def _mistakes(
     factor = next((factor for factor in _FACTORS if near * factor <= focus_m <= far * factor), None)
     is_far_off = factor is not None and not near / _FAR_OFF <= focus_m <= far * _FAR_OFF
     if (not is_sharp and not (is_too_blurred and near <= focus_m <= far)) or is_far_off:
-        told = _out_of_focus(near, far, extent, focus_m, of_bits, factor, kind, scale)
-        return [Mistake("focus", told if is_sharp else f"nothing is in focus: {told}")]
+        message = _out_of_focus(near, far, extent, focus_m, of_bits, factor, kind, scale)
+        return [Mistake("focus", message if is_sharp else f"nothing is in focus: {message}")]
     found = []
     if of_bits and far <= 255 and far - near >= 64:
         found.append(
@@ -194,14 +199,14 @@ def _out_of_focus(
     kind: DepthKind | Literal["relative"],
     scale: float | None,
 ) -> str:
-    """What to say where the focus lies beside all depth."""
+    """Message for a focus outside of all depth."""
     if near <= focus_m <= far:
         return f"no pixel lies near the focus at {focus_m:.4g} m, all {extent}; focus on something with --focus-at X,Y"
     side, hints = "nearer" if focus_m < near else "farther", []
     if kind in ("disparity", "inverse"):
         hints.append(
             "disparity needs its scale, the baseline in metres times the focal length in pixels (--depth-scale, "
-            f"{'not given' if scale is None else f'now {scale:g}'}); where nobody knows it, {_RELATIVE}"
+            f"{'not given' if scale is None else f'now {scale:g}'}); if it is unknown, {_RELATIVE}"
         )
     elif kind != "relative" and of_bits and far <= 255:
         hints.append(f"its whole numbers are those of a file of 8 bits; if they are relative depth, {_RELATIVE}")
@@ -212,7 +217,7 @@ def _out_of_focus(
         if factor > 1.0 and far >= _HAND_M and scale is None:
             hints.append(f"or is the focus in {_UNITS[1.0 / factor]} (--focus-m {focus_m / factor:.4g})?")
     if kind in ("z", "distance") and focus_m < near:
-        hints.append("if near is large in it, it is disparity (--depth-kind disparity)")
+        hints.append("if near has large values in it, it is disparity (--depth-kind disparity)")
     if far < _HAND_M:
         hints.append("all of it lies within a hand's breadth")
     hints.append("if the depth is right, focus with --focus-m METRES or --focus-at X,Y")
@@ -224,7 +229,7 @@ def _pixels(count: float) -> str:
 
 
 def _too_blurred(largest: float, width: int, far: float, extent: str, camera: Camera) -> str:
-    """What to say of blur that no lens makes."""
+    """Message for a blur radius that is larger than lenses make."""
     hand = "all depth lies within a hand's breadth" if far < _HAND_M else "the depth"
     return (
         f"a blur radius of {_pixels(largest)} px on an image of {width} px is more than a lens makes: {hand} {extent}, "
@@ -239,7 +244,7 @@ _RELATIVE = "--depth-kind relative --near-m METRES --far-m METRES"
 
 
 def _advice(factor: float, scale: float | None) -> str:
-    """What depth is in that this factor makes metres of, and the option that does."""
+    """The unit of depth that ``factor`` converts to metres, and the option that does so."""
     total = factor * (1.0 if scale is None else scale)
     option = "leave --depth-scale out" if math.isclose(total, 1.0) else f"--depth-scale {total:.4g}"
     if factor > 1.0:
@@ -248,17 +253,17 @@ def _advice(factor: float, scale: float | None) -> str:
 
 
 def _sample(values: Tensor) -> Tensor:
-    """Some 65,536 of the values, or all of fewer."""
+    """About 65,536 of the values, evenly spaced, or all if there are fewer."""
     return values.flatten()[:: max(1, values.numel() // 65536)]
 
 
 def _whole_numbers(values: Tensor) -> bool:
-    """Whether many different values all are whole numbers."""
+    """Whether a sample has at least 16 different values, all of them whole numbers."""
     sample = _sample(values)
     return bool((sample == sample.round()).all()) and sample.unique().numel() >= 16
 
 
 def _share_at(values: Tensor, share: float) -> float:
-    """The value that this share of the values does not exceed; of many values a sample."""
+    """Quantile of a sample of the values: a share ``share`` of them does not exceed it."""
     sample = _sample(values).float()
     return float(sample.sort().values[min(sample.numel() - 1, int(share * sample.numel()))])

@@ -1,4 +1,4 @@
-"""Depth that does not flicker: filtered along time where neither the image nor the depth moved."""
+"""Removing flicker from depth: a temporal filter where neither the image nor the depth moved."""
 
 from collections.abc import Callable
 
@@ -11,30 +11,36 @@ from .motion import motion_between, sample, shifted
 
 __all__ = ["Steady", "SteadyFrames"]
 
-_FORGET = 0.96  # of the votes stay in each frame
-_GAIN = 1 / 8  # least share of a new depth in the mean
-_ALIKE = (0.02, 0.15)  # relative difference of inverse depths that are one surface: at least, at most
-_NOISES = 4.0  # and between these, times the noise of the map
-_CHANGE = (0.02, 0.08)  # difference of images that is no noise: at least, at most
-_CUT = 0.25  # share of pixels that must have been there before
-_MOVED_PX = 5  # depth that differs over a square of this side has moved; jittering edges are thinner
-_MARGIN = (1.5, 1.0)  # factor and votes by which the second surface must win
+# Inverse depths are one surface if they differ by less than _NOISES times the noise of the map, clamped to _ALIKE.
+_FORGET = 0.96  # share of the votes kept from frame to frame; larger: slower changes between the two surfaces
+_GAIN = 1 / 8  # smallest weight of a new depth in the running mean; larger: less smoothing, less lag
+_ALIKE = (0.02, 0.15)  # smallest and largest relative difference of inverse depths of one surface
+_NOISES = 4.0  # multiple of the noise; larger: more depths count as the same surface
+_CHANGE = (0.02, 0.08)  # smallest and largest threshold on the change of the image (square root of light over its mean)
+_CUT = 0.25  # share of unchanged pixels below which a frame starts a new shot
+_MOVED_PX = 5  # px; depth that differs over a square of this side has moved; jittering edges are thinner
+_MARGIN = (1.5, 1.0)  # the second surface takes over with more than 1.5 times the votes of the first, plus 1
 
 
 class Steady:
-    """Steadies the depth of a shot, frame by frame.
+    """Filters the depth of a shot, frame by frame.
 
-    Each pixel remembers two surfaces: the one it shows, as the running mean of its inverse depths, and another that was
-    seen there lately. A new depth that is like the first is averaged into it, so that noise sinks; one that is not is a
-    vote for the second, which takes over when it has clearly more: an edge that jitters by a pixel stands still where
-    it mostly is. Where the image moves, what is remembered moves along, by block matching: noise sinks there too, but
-    edges are taken as they come, since a memory that moves by whole pixels knows them no better. Where the image
-    changed otherwise, or the depth over an area that no jitter of edges explains, the new depth is taken as it is: cuts
-    and motion pass. A depth that changes evenly while the image stands still is followed about eight frames late, until
-    it differs by four times the map's noise (2 % at least), and at once from there.
+    Each pixel stores two surfaces: the current one, as the running mean of its inverse depth, and a second one that was
+    seen there recently. Each has votes.
 
-    What is kept has the size of a few frames, however long the shot. A frame's depth depends on those before it: see
-    :class:`SteadyFrames` where a shot is worked on in parts.
+    * A new depth near the first surface is averaged into it, which reduces noise.
+    * Another depth is a vote for the second surface, which becomes the first when it has clearly more votes. So an edge
+      that jitters by a pixel stays at its most frequent position.
+    * Where the image moves, the stored surfaces are moved along by block matching in whole pixels. Noise is reduced
+      there too; differing depths are used unchanged, so that edges keep their place.
+    * Where the image changes in another way, or the depth changes over a larger area than a jittering edge, the new
+      depth is used unchanged, so that cuts and moving objects are not smeared.
+
+    If the depth drifts while the image stands still, the result lags by about eight frames as long as the difference is
+    below four times the noise of the map (2 % at least); a larger difference is followed at once.
+
+    Memory is that of a few frames, however long the shot. The depth of a frame depends on all earlier frames; to render
+    a shot in parts, use :class:`SteadyFrames`.
 
     Example:
         >>> steady, image = Steady(), torch.rand(1, 3, 12, 16)
@@ -49,7 +55,7 @@ class Steady:
         self._memory: Tensor | None = None
 
     def reset(self) -> None:
-        """Forgets the frames before, as a cut does."""
+        """Forgets all earlier frames, as a cut does."""
         self._before = self._memory = None
 
     @torch.no_grad()
@@ -59,36 +65,36 @@ class Steady:
         Args:
             image: ``[B, C, H, W]``, linear light, at any exposure.
             depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres, ``inf`` allowed; NaN, zero and negative ones are holes,
-                which take what was remembered.
+                which are filled with the stored depth.
 
         Returns:
-            ``[B, 1, H, W]`` in metres in the dtype of ``depth``, without gradient; NaN in holes of which nothing is
-            remembered.
+            ``[B, 1, H, W]`` in metres in the dtype of ``depth``, without gradient; NaN in holes without stored depth. A
+            frame of another size than the previous one starts anew.
 
         Raises:
-            ValueError: If an argument is not as described. Frames of another size than the one before start anew.
+            ValueError: If an argument is not as described.
         """
         image_and_map(image, "depth", depth, "in metres")
         now = image.float()
         inverse = torch.where(depth > 0, 1.0 / depth.float(), torch.nan).expand(image.shape[0], -1, -1, -1)
         if self._before is None or self._memory is None or self._before.shape != now.shape:
-            memory = _forgotten(inverse)
+            memory = _first_memory(inverse)
         else:
-            memory = _remembered(now, self._before, self._memory, inverse)
+            memory = _next_memory(now, self._before, self._memory, inverse)
         self._before, self._memory = now, memory
         steady = 1.0 / memory[:, :1]
         return steady.to(depth.dtype)
 
 
 class SteadyFrames:
-    """Steady depth of the frames of a shot, the same whichever part of it is worked on.
+    """Steady depth of the frames of a shot, independent of the part of the shot that is rendered.
 
-    A filter starts anew every 48 frames, and 16 frames before its depth is used, counted from the shot's first frame:
-    so each frame depends on at most the 63 before it, which are read first where work starts in the middle. Frames are
-    read once where they are asked for in order, and nothing of them is kept but two filters.
+    Every 48 frames of the shot a new :class:`Steady` takes over, which has started 16 frames earlier. So a frame
+    depends on at most the 63 frames before it; rendering that starts in the middle reads them first. In order, each
+    frame is read once, and only two filters are kept in memory.
 
     Args:
-        read: Gives image and depth of a frame, by its place in the shot from 0, as :class:`Steady` takes them.
+        read: Function of the index of a frame, from 0, that returns its image and depth as :class:`Steady` takes them.
 
     Example:
         >>> image = torch.rand(1, 3, 12, 16)
@@ -100,18 +106,18 @@ class SteadyFrames:
         True
     """
 
-    _SPAN, _LEAD = 48, 16
+    _SPAN, _LEAD = 48, 16  # frames; a longer lead makes the switch to a new filter less visible
 
     def __init__(self, read: Callable[[int], tuple[Tensor, Tensor]]) -> None:
         self._read = read
-        self._filters: dict[int, Steady] = {}  # by the place they started at
+        self._filters: dict[int, Steady] = {}  # first frame -> filter
         self._next = 0
 
     def depth(self, place: int) -> Tensor:
-        """Steady depth ``[B, 1, H, W]`` of the frame at a place in the shot, from 0.
+        """Steady depth ``[B, 1, H, W]`` of the frame with index ``place``, from 0.
 
         Raises:
-            ValueError: If what is read is not as :class:`Steady` takes it.
+            ValueError: If the image or depth of a frame is not as :class:`Steady` takes it.
         """
         start = self._start(place)
         if self._next > place or start not in self._filters:
@@ -131,17 +137,23 @@ class SteadyFrames:
         return steady
 
     def _start(self, place: int) -> int:
-        """Where the filter begins that a frame's depth comes from."""
+        """First frame of the filter that gives the depth of frame ``place``."""
         return max(0, place // self._SPAN * self._SPAN - self._LEAD)
 
 
-def _forgotten(inverse: Tensor) -> Tensor:
-    """Memory of this frame alone, ``[B, 4, H, W]``: inverse depth of the first and the second surface, their votes."""
+def _first_memory(inverse: Tensor) -> Tensor:
+    """Memory after a first frame, ``[B, 4, H, W]``: inverse depth of the first and second surface, votes of both."""
     return torch.cat([inverse, inverse, inverse.isfinite().float(), torch.zeros_like(inverse)], dim=1)
 
 
-def _remembered(now: Tensor, before: Tensor, memory: Tensor, inverse: Tensor) -> Tensor:
-    """Memory after one more frame."""
+def _next_memory(now: Tensor, before: Tensor, memory: Tensor, inverse: Tensor) -> Tensor:
+    """Memory ``[B, 4, H, W]`` after one more frame.
+
+    1. Find the motion of the image, and the pixels that it explains; move the memory along.
+    2. Compare the new depth with the first surface, in multiples of the typical difference.
+    3. Find areas whose depth has moved; they start anew.
+    4. Update the means and votes of both surfaces, and swap them where the second one wins.
+    """
     level = before.clamp(min=0).sqrt().mean((1, 2, 3), keepdim=True).clamp(min=1e-12)
     now, before = (frame.clamp(min=0).sqrt() / level for frame in (now, before))
     flow = motion_between(
@@ -173,4 +185,4 @@ def _remembered(now: Tensor, before: Tensor, memory: Tensor, inverse: Tensor) ->
     wins = differs & (second_votes > _MARGIN[0] * votes + _MARGIN[1])
     first, second = torch.where(wins, second, first), torch.where(wins, first, second)
     votes, second_votes = torch.where(wins, second_votes, votes), torch.where(wins, votes, second_votes)
-    return torch.where(is_known, torch.cat([first, second, votes, second_votes], dim=1), _forgotten(inverse))
+    return torch.where(is_known, torch.cat([first, second, votes, second_votes], dim=1), _first_memory(inverse))

@@ -1,1 +1,1 @@
-"""Files in and out: images, their transfer curves and metadata, numbered frames."""
+"""Reading and writing files: images, their transfer curves and metadata, numbered frames."""

@@ -1,7 +1,7 @@
-"""A file is written whole or not at all: under another name in the same folder, renamed once it is complete.
+"""Writes a file whole or not at all: under a temporary name in the same folder, renamed when it is complete.
 
-That name vanishes on any error, Ctrl-C, SIGTERM and SIGHUP included. A process that is killed outright leaves it
-behind; the first that writes to the folder a day later removes it.
+The temporary file is removed on any error, including Ctrl-C, SIGTERM and SIGHUP. A process killed by SIGKILL leaves it
+behind; the next process that writes to the folder removes it if it is older than a day.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ _DAY_S = 86_400.0
 
 @contextlib.contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A name to write to, in the folder of ``path``, that becomes ``path`` at the end, or vanishes on any error.
+    """A temporary file in the folder of ``path``, renamed to ``path`` at the end, or removed on any error.
 
     Raises:
         OSError: If the folder does not exist or may not be written.
@@ -63,9 +63,9 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         part.write_text(text, encoding="utf-8")
 
 
-@functools.cache  # once: a folder of many frames takes long to list
+@functools.cache  # once for each folder, because listing many frames takes long
 def _remove_abandoned(folder: Path) -> None:
-    """Removes what processes that were killed had not finished writing."""
+    """Removes temporary files older than a day, left by killed processes."""
     for part in folder.glob("." + "[0-9a-f]" * 32 + ".part*"):
         with contextlib.suppress(OSError):
             if time.time() - part.stat().st_mtime > _DAY_S:
@@ -74,18 +74,18 @@ def _remove_abandoned(folder: Path) -> None:
 
 @contextlib.contextmanager
 def unwound_on_termination() -> Iterator[None]:
-    """SIGTERM and SIGHUP as ``SystemExit``, which tidies up behind itself, unless somebody handles them."""
+    """Turns SIGTERM and SIGHUP into ``SystemExit``, so that ``finally`` blocks run; keeps existing handlers."""
 
     def leave(number: int, _: FrameType | None) -> NoReturn:
-        raise SystemExit(128 + number)  # as shells tell of a process that a signal ended
+        raise SystemExit(128 + number)  # the exit status that shells use for signals
 
     ends = {getattr(signal, name, signal.SIGTERM) for name in ("SIGTERM", "SIGHUP")}
-    main = threading.current_thread() is threading.main_thread()  # no other hears of signals
-    heard = [number for number in ends if main and signal.getsignal(number) == signal.SIG_DFL]
+    main = threading.current_thread() is threading.main_thread()  # only this thread may set handlers
+    unhandled = [number for number in ends if main and signal.getsignal(number) == signal.SIG_DFL]
     try:
-        for number in heard:
+        for number in unhandled:
             signal.signal(number, leave)
         yield
     finally:
-        for number in heard:
+        for number in unhandled:
             signal.signal(number, signal.SIG_DFL)

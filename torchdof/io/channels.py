@@ -1,4 +1,4 @@
-"""Which channels of a file are colour and which one is depth, by their names."""
+"""Finds the colour channels and the depth channel of a file by their names."""
 
 __all__ = ["colour_channels", "depth_channel"]
 
@@ -6,10 +6,18 @@ Parts = list[tuple[str, tuple[str, ...]]]  # label and channel names of each par
 
 
 def colour_channels(parts: Parts, layer: str | None, layered: bool) -> tuple[int, list[int], tuple[str, ...]]:
-    """Finds R, G, B (or Y), and A beside them: the index of their part, their indices in it, and their plain names.
+    """Finds R, G, B (or grey, Y) and, if present, A.
 
-    Looks in a part or layer by name, or for the first with colour, those without a layer's name first. ``layered`` says
-    whether names may carry a layer before a dot (EXR). Refuses files without colour, or without the layer.
+    Args:
+        parts: Label and channel names of each part of the file.
+        layer: Name of the part or layer; None takes the first with colour, preferring channels without a layer name.
+        layered: Whether names may have a layer before a dot (EXR).
+
+    Returns:
+        Index of the part, indices of the channels in it, and their names without layer.
+
+    Raises:
+        ValueError: If there is no colour, or no such layer with colour.
 
     Example:
         >>> colour_channels([("", ("A", "B", "G", "R", "Z"))], None, True)
@@ -40,7 +48,7 @@ def colour_channels(parts: Parts, layer: str | None, layered: bool) -> tuple[int
 
 
 def depth_channel(parts: Parts) -> tuple[int, int] | None:
-    """The part and place of the depth channel: ``Z``, ``depth``, ``ViewLayer.Depth.Z``, ...; never ``Normal.Z``.
+    """Indices of the part and of the depth channel in it: ``Z``, ``depth``, ``ViewLayer.Depth.Z``; not ``Normal.Z``.
 
     Example:
         >>> depth_channel([("", ("N.X", "N.Y", "N.Z", "ViewLayer.Depth.Z"))])

@@ -1,4 +1,4 @@
-"""Tables for people, as wide as the terminal."""
+"""Tables printed to a terminal, folded to its width."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ if TYPE_CHECKING:
 
 __all__ = ["print_columns"]
 
-_UNBOUNDED = 10_000  # characters of a line
+_UNBOUNDED = 10_000  # characters; line width at which a table is not folded, to measure it
 
 
 def print_columns(
     console: Console, title: str, columns: Mapping[str, Sequence[str]], words: Collection[str] = ()
 ) -> None:
-    """Prints a table; columns that the terminal has no room for are folded below the others, the first before them.
+    """Prints a table; columns that do not fit are printed below in further tables, each starting with the first column.
 
     Args:
-        console: To print on.
-        title: Above the table.
-        columns: Cells below each heading, all as many.
-        words: Headings of columns of words, which are aligned to the left; the others hold numbers.
+        console: Console to print on.
+        title: Line above the table.
+        columns: Heading -> cells, the same number in each column.
+        words: Headings of columns of text, which are aligned left; numbers are aligned right.
 
     Example:
         >>> from rich.console import Console

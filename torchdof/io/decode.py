@@ -1,7 +1,7 @@
-"""What an image file or array holds, as stored: every channel's numbers, before they mean light or depth.
+"""The stored numbers of image files and arrays, before their conversion to light or depth.
 
-What a header promises is held against limits and free memory before anything is decoded. OpenImageIO is imported when a
-file is read, so that ``import torchdof`` stays light.
+The size in a header is compared with limits and with free memory before anything is decoded. OpenImageIO is imported
+when a file is read, so that ``import torchdof`` stays light.
 """
 
 import contextlib
@@ -29,26 +29,26 @@ PixelType = Literal["8", "16", "half", "float"]
 
 MAX_PIXELS = 2**28
 MOST_ATTRIBUTES = 4096
-"""Of all parts of an EXR file together; what renderers write is a few hundred."""
+"""Largest number of attributes in all parts of an EXR file together; renderers write a few hundred."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Part:
     """One part of a file, as stored."""
 
-    label: str  # the part's name, often empty
-    names: tuple[str, ...]  # of the channels
+    label: str  # name of the part, often empty
+    names: tuple[str, ...]  # names of the channels
     values: np.ndarray  # [H, W, C]
-    kinds: tuple[str, ...]  # what each channel was stored as, as OpenImageIO calls it: "uint8", "half", ...
-    is_exr: bool = False  # names may carry a layer before a dot, and whole numbers are no parts of white
-    straight_alpha: bool = False  # colour is not multiplied by alpha yet
+    kinds: tuple[str, ...]  # stored type of each channel in OpenImageIO's names: "uint8", "half", ...
+    is_exr: bool = False  # names may have a layer before a dot, and integers are not scaled to white
+    straight_alpha: bool = False  # colour is not premultiplied by alpha
     metadata: Metadata = dataclasses.field(default_factory=dict)
     window: tuple[int, int, int, int, int, int] | None = None  # x, y, full x, full y, full width, full height
-    orientation: int = 1  # EXIF's, as stored; the values are turned by it
+    orientation: int = 1  # EXIF orientation as stored; the values are upright already
 
 
 def existing(path: str | os.PathLike[str], suffixes: tuple[str, ...], what: str) -> Path:
-    """The path, if there is a file of one of these types at it, which is not empty; ``what`` names what was wanted."""
+    """The path of an existing, non-empty file with one of the suffixes; ``what`` describes it in messages."""
     if not isinstance(path, str | os.PathLike) or "\0" in os.fspath(path):
         raise ValueError(f"expected the path of {what}, got {show(path)}")
     path = Path(path)
@@ -69,7 +69,7 @@ def existing(path: str | os.PathLike[str], suffixes: tuple[str, ...], what: str)
 
 @contextlib.contextmanager
 def named_in_utf8(path: Path) -> Iterator[str]:
-    """A name by which OpenImageIO opens a file: one that is no UTF-8 by a link to it."""
+    """A UTF-8 name of a file, which OpenImageIO needs; other names get a temporary symbolic link."""
     with contextlib.ExitStack() as folders:
         try:
             name = os.fsencode(path).decode()
@@ -81,7 +81,12 @@ def named_in_utf8(path: Path) -> Iterator[str]:
 
 
 def read_parts(path: Path) -> list[Part]:
-    """Every part of an image file: ``OSError`` if it is damaged, ``ValueError`` if it is too large or not read here."""
+    """All parts of an image file.
+
+    Raises:
+        OSError: If it is damaged.
+        ValueError: If it is too large or of an unsupported kind.
+    """
     if path.suffix.lower() == ".pfm":
         return [_read_pfm(path)]
     check_chunks(path)
@@ -90,11 +95,11 @@ def read_parts(path: Path) -> list[Part]:
         with named_in_utf8(path) as name:
             return list(_parts(path, name))
     except UnicodeDecodeError:
-        raise OSError(f"{path}: is damaged (a name in its header is no text)") from None
+        raise OSError(f"{path}: is damaged (a name in its header is not text)") from None
 
 
 def _parts(path: Path, name: str) -> Iterator[Part]:
-    """The parts of a file that OpenImageIO reads; other than EXR files have one."""
+    """The parts of a file that OpenImageIO reads; only EXR files have several."""
     import OpenImageIO as oiio
 
     config = oiio.ImageSpec()
@@ -141,21 +146,21 @@ def _parts(path: Path, name: str) -> Iterator[Part]:
 
 
 def check_chunks(path: Path) -> None:
-    """Refuse a PNG that is cut short or has a wrong checksum: its library would print a line of its own about it."""
+    """Refuse a PNG that is cut short or has a wrong checksum; libpng would print its own message about it."""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         place, name = 8, b"" if content[:8] == b"\x89PNG\r\n\x1a\n" else b"IEND"
         while name != b"IEND":
             length, name = struct.unpack(">I4s", content[place : place + 8].ljust(8, b"\0"))
             end = place + 8 + length
             if end + 4 > len(content):
-                raise OSError(f"{path}: is damaged or cut short (it ends in its part {name!r})")
+                raise OSError(f"{path}: is damaged or cut short (it ends within its chunk {name!r})")
             if zlib.crc32(content[place + 4 : end]) != int.from_bytes(content[end : end + 4], "big"):
-                raise OSError(f"{path}: is damaged or cut short (its part {name!r} has another checksum)")
+                raise OSError(f"{path}: is damaged or cut short (its chunk {name!r} has a wrong checksum)")
             place = end + 4
 
 
 def _check_attributes(path: Path) -> None:
-    """Refuse an EXR whose headers hold more attributes than anybody wrote: its library takes minutes for 1e5.
+    """Refuse an EXR with more than ``MOST_ATTRIBUTES`` attributes; OpenEXR takes minutes for 1e5.
 
     Reference:
         OpenEXR File Layout, openexr.com.
@@ -171,13 +176,13 @@ def _check_attributes(path: Path) -> None:
                     return
             type_end = content.find(b"\0", content.find(b"\0", place) + 1)
             place = type_end + 5 + int.from_bytes(content[type_end + 1 : type_end + 5], "little")
-            if type_end < place - 2**31 or place >= len(content):  # damaged: left to its reader
+            if type_end < place - 2**31 or place >= len(content):  # damaged: the reader will refuse it
                 return
-    raise ValueError(f"{path}: its headers hold more than {MOST_ATTRIBUTES} attributes, and no more are read")
+    raise ValueError(f"{path}: its headers hold more than {MOST_ATTRIBUTES} attributes, which is the limit")
 
 
 def _check_colours(path: Path, spec: Any) -> None:
-    """Refuse a TIFF whose numbers OpenImageIO does not give as light or ink: CIELAB, a raw mosaic, negatives."""
+    """Refuse a TIFF whose colours OpenImageIO does not convert: CIELAB, a raw mosaic, negatives."""
     meaning = spec.get_int_attribute("tiff:PhotometricInterpretation", 2)
     inks = spec.get_string_attribute("tiff:ColorSpace") == "CMYK"
     if not (meaning in (1, 2, 3, 6) or (meaning == 0 and str(spec.format) == "uint8") or (meaning == 5 and inks)):
@@ -188,7 +193,7 @@ def _check_colours(path: Path, spec: Any) -> None:
 
 
 def _read_pfm(path: Path) -> Part:
-    """PFM by hand: OpenImageIO multiplies by the header's scale, which ruins disparities (Middlebury's among them)."""
+    """Reads a PFM file without OpenImageIO, which multiplies by the scale in the header and so changes disparities."""
     with path.open("rb") as file:
         words: list[bytes] = []
         while len(words) < 4 and (line := file.readline(100)):
@@ -204,12 +209,12 @@ def _read_pfm(path: Path) -> Part:
     if len(data) != 4 * count:
         raise OSError(f"{path}: is cut short ({len(data)} of {4 * count} bytes of pixels)")
     values = np.frombuffer(data, dtype="<f4" if scale < 0 else ">f4").astype(np.float32)
-    values = values.reshape(height, width, channels)[::-1]  # stored from the bottom row up
+    values = values.reshape(height, width, channels)[::-1]  # the bottom row is stored first
     return Part("", tuple("Y" if channels == 1 else "RGB"), values, ("float",) * channels)
 
 
 def read_array(path: Path, key: str | None) -> np.ndarray:
-    """The numbers ``[H, W]`` of an ``.npy`` file, or of an ``.npz`` file's only array or that of a name; no pickles."""
+    """The array ``[H, W]`` of an ``.npy`` file, or of an ``.npz`` file: its only array, or ``key``. Refuses pickles."""
     try:
         if path.suffix.lower() == ".npz":
             with zipfile.ZipFile(path) as archive:
@@ -228,8 +233,8 @@ def read_array(path: Path, key: str | None) -> np.ndarray:
         else:
             array = np.load(path, allow_pickle=False, mmap_mode="r")
         if not isinstance(array, np.ndarray):
-            raise ValueError("it is no array")
-    except Exception as error:  # of bytes that are no array, numpy and zipfile raise a dozen kinds
+            raise ValueError("it is not an array")
+    except Exception as error:  # numpy and zipfile raise a dozen kinds of errors for damaged files
         raise ValueError(f"{path}: cannot be read as an array ({first_line(str(error))})") from None
     shape = array.shape
     while array.ndim > 2 and 1 in (array.shape[0], array.shape[-1]):
@@ -241,7 +246,7 @@ def read_array(path: Path, key: str | None) -> np.ndarray:
 
 
 def _check_size(path: Path, width: int, height: int, pixel_bytes: int, others: int = 0) -> int:
-    """The bytes that a picture takes, stored and read, ``others`` being taken already; refused if there are too few."""
+    """Bytes needed to decode a picture; refuses it if they and those of ``others`` exceed the free memory."""
     if width < 1 or height < 1 or width * height > MAX_PIXELS:
         raise ValueError(f"{path}: its header claims {width} x {height} pixels; between 1 and {MAX_PIXELS} are read")
     needed, free = width * height * pixel_bytes, free_bytes()

@@ -1,4 +1,4 @@
-"""Files that OpenImageIO reads only where it was built with more libraries: phones' HEIC, cameras' raw files."""
+"""Formats that OpenImageIO reads only if it was built with further libraries: HEIC and raw files."""
 
 import os
 from pathlib import Path
@@ -17,7 +17,7 @@ SUFFIXES = tuple(suffix for _, suffixes in _READERS.values() for suffix in suffi
 
 
 def readable() -> tuple[str, ...]:
-    """Suffixes of those that OpenImageIO reads here."""
+    """Suffixes among :data:`SUFFIXES` that the installed OpenImageIO reads."""
     import OpenImageIO as oiio
 
     readers = oiio.get_string_attribute("format_list").split(",")
@@ -25,7 +25,7 @@ def readable() -> tuple[str, ...]:
 
 
 def refusal(path: Any) -> str | None:
-    """Why a file of such a type cannot be read here and how to convert it; None for all other types.
+    """Message with the reason and the conversion for a file that cannot be read here; None for other files.
 
     Example:
         >>> refusal("holiday.jpg") is None

@@ -1,4 +1,4 @@
-"""Lamps that a photograph of 8 bits clipped at white get back light above white, so that they blur as lamps do."""
+"""Restores light above white in small lamps of clipped photographs, so that they blur like lamps."""
 
 import math
 
@@ -10,28 +10,26 @@ from ..validation import real_tensor, show
 
 __all__ = ["expand_highlights"]
 
-_NEAR_WHITE = (
-    0.87,
-    0.97,
-)  # linear light: below the first a channel is unclipped, above the second clipped (8-bit codes 240, 252)
-_SHARE = (0.05, 0.2)  # of clipped pixels around one: from a lamp to a sky
-_SURROUNDINGS = 0.04  # of the image's longer side, 31 pixels at least: the window of that share
-_RIM = 0.007  # of the longer side: the window, 5 pixels at least, in which the rim's colour is looked for
-_ELSEWHERE = 1e-3  # weight of the wide window in the hue; it decides where the narrow window holds no rim
-_LITTLE = 1e-4  # weight of white in the hue; it decides where no light is unclipped
+_NEAR_WHITE = (0.87, 0.97)  # linear light; a channel is unclipped below, clipped above (8-bit codes 240 and 252)
+_SHARE = (0.05, 0.2)  # share of clipped pixels in the surroundings: a lamp below, a sky or paper above
+_SURROUNDINGS = 0.04  # side of these surroundings over the longer side of the image, 31 px at least
+_RIM = 0.007  # side of the window for the colour of the rim, the same way, 5 px at least
+_ELSEWHERE = 1e-3  # weight of the surroundings in the hue; matters where the smaller window has no unclipped light
+_LITTLE = 1e-4  # weight of white in the hue; matters where all light is clipped
 
 
 def expand_highlights(light: Tensor, stops: float = 3.0) -> Tensor:
-    """Gives small clipped lamps light above white, in the hue of their rims; large clipped areas stay as they are.
+    """Raises small clipped lamps above white, in the hue of their rims; large clipped areas are unchanged.
 
-    A place where all channels are clipped rises to ``2^stops`` times white, by its brightest channel. Where some
-    channels are clipped, those rise to what the others are worth in the rim's colour, at most that far. Both fade in
-    from 0.87 to 0.97 of white, so that noise at a rim makes no steps, and fade out where 5 to 20 % of the surroundings,
-    4 % of the longer side wide and 31 pixels at least, are clipped: a sky, a sheet of paper.
+    * If all channels of a pixel are clipped, its brightest channel rises to ``2^stops`` times white.
+    * If some are clipped, they rise until the pixel has the hue of the rim, at most to the same limit.
+    * Both fade in from 0.87 to 0.97 of white, so that noise at a rim causes no steps.
+    * Both fade out where 5 to 20 % of the surroundings are clipped: a sky, a sheet of paper. The surroundings are a
+      square of 4 % of the longer side, 31 px at least.
 
     Args:
         light: ``[B, C, H, W]``, linear light of a photograph, 1 is white; without alpha.
-        stops: How far above white at most, 0 or more.
+        stops: Most stops above white, >= 0.
 
     Returns:
         The same shape, nowhere darker; the same bits where no channel is above 0.87, and ``light`` itself at 0 stops.
@@ -60,8 +58,8 @@ def expand_highlights(light: Tensor, stops: float = 3.0) -> Tensor:
     is_lamp = 1.0 - _rise(_mean(any_clipped, max(31.0, _SURROUNDINGS * longer)), *_SHARE)
     hue = _hue_of_rim(light, 1.0 - any_clipped, longer)
 
-    told = (1.0 - clipped) * hue  # weights of the unclipped channels: strength is their least-squares fit to the hue
-    strength = ((told * light).sum(1, keepdim=True) + _LITTLE) / ((told * hue).sum(1, keepdim=True) + _LITTLE)
+    weights = (1.0 - clipped) * hue  # least squares of strength * hue = light over the unclipped channels
+    strength = ((weights * light).sum(1, keepdim=True) + _LITTLE) / ((weights * hue).sum(1, keepdim=True) + _LITTLE)
     strength = strength.clamp_max(most).lerp(torch.full_like(strength, most), clipped.amin(1, keepdim=True))
     risen = light + clipped * is_lamp * (strength * hue - light).clamp_min(0.0)
     return torch.where(clipped > 0, risen, light)
@@ -78,13 +76,13 @@ def _hue_of_rim(light: Tensor, unclipped: Tensor, longer: int) -> Tensor:
 
 
 def _mean(values: Tensor, width: float) -> Tensor:
-    """Mean over a square window about ``width`` pixels wide; pixels outside of the frame do not count."""
+    """Mean over a square window about ``width`` pixels wide, cut off at the frame."""
     side = 2 * int(width / 2) + 1
     rows = functional.avg_pool2d(values, (side, 1), 1, (side // 2, 0), count_include_pad=False)
     return functional.avg_pool2d(rows, (1, side), 1, (0, side // 2), count_include_pad=False)
 
 
 def _rise(values: Tensor, low: float, high: float) -> Tensor:
-    """From 0 at ``low`` to 1 at ``high``, with no corner at either."""
+    """Smoothstep from 0 at ``low`` to 1 at ``high``."""
     share = ((values - low) / (high - low)).clamp(0.0, 1.0)
     return share * share * (3.0 - 2.0 * share)

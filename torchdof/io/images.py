@@ -1,7 +1,7 @@
-"""Images in and out of files, in linear light: EXR, PNG, TIFF, JPEG, WebP, HDR and PFM, through OpenImageIO.
+"""Reads and writes images in linear light: EXR, PNG, TIFF, JPEG, WebP, HDR and PFM, with OpenImageIO.
 
-The transfer curve is stated, never guessed from a tag: files of integers (PNG, JPEG, TIFF of 8 or 16 bits) are taken as
-sRGB and files of floats (EXR, HDR, PFM, TIFF of floats) as linear light, unless the caller says otherwise.
+The transfer curve is never guessed from a tag. Files of integers (PNG, JPEG, TIFF of 8 or 16 bits) are sRGB, and files
+of floats (EXR, HDR, PFM, TIFF of floats) linear light, unless the argument ``transfer`` changes that.
 
 OpenImageIO is imported when a file is read or written, so that ``import torchdof`` stays light.
 """
@@ -26,7 +26,7 @@ from .transfer import Transfer, decode, default_transfer, encode, encode_8_bits
 
 __all__ = ["Picture", "read_image", "read_values", "write_image"]
 
-_SAMPLES: dict[str, tuple[PixelType, ...]] = {  # what each type of file can hold, its default first
+_SAMPLES: dict[str, tuple[PixelType, ...]] = {  # suffix -> sample types, the default first
     ".exr": ("half", "float"),
     ".png": ("8", "16"),
     **dict.fromkeys((".tif", ".tiff"), ("8", "16", "float")),
@@ -44,17 +44,17 @@ _LOSSLESS_EXR = ("none", "rle", "zip", "zips", "piz")
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """An image as the module takes it, with what is needed to write it back.
+    """An image in linear light, with the properties of its file that are needed to write it back.
 
     Args:
-        pixels: ``[1, C, H, W]`` float32 in linear light. Colour is premultiplied by alpha, where there is one.
-        channels: Names of the channels: ``("R", "G", "B")``, ``("Y",)``, either with ``"A"`` at the end.
+        pixels: ``[1, C, H, W]`` float32 in linear light. Colour is premultiplied by alpha, if there is alpha.
+        channels: Names of the channels: ``("R", "G", "B")`` or grey ``("Y",)``, either with ``"A"`` at the end.
         depth: ``[1, 1, H, W]``, the numbers of the file's own depth channel, or None.
         metadata: Name -> (OpenImageIO type, value).
-        sample: What a pixel was stored as: "8", "16", "half" or "float".
-        transfer: How the file was encoded, "linear" or "srgb".
-        window: Where the pixels lie in the full frame (EXR data window): x, y, full x, full y, full width, full height.
-        orientation: The file's EXIF orientation, by which the pixels are turned already.
+        sample: Stored type of a sample: "8", "16", "half" or "float".
+        transfer: Encoding of the file, "linear" or "srgb".
+        window: Place of the pixels in the full frame (EXR data window): x, y, full x, full y, full width, full height.
+        orientation: EXIF orientation of the file; the pixels are upright already.
     """
 
     pixels: Tensor
@@ -81,18 +81,16 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
     """Reads an image into linear light.
 
     Args:
-        path: An EXR, PNG, TIFF, JPEG, WebP, HDR or PFM file; HEIC and raw files where OpenImageIO was built to read
-            them.
-        transfer: "linear" or "srgb"; None takes "srgb" for integers and "linear" for floats, whatever the file's tags
-            say.
+        path: An EXR, PNG, TIFF, JPEG, WebP, HDR or PFM file; HEIC and raw files if OpenImageIO was built to read them.
+        transfer: "linear" or "srgb"; None uses "srgb" for integers and "linear" for floats, and ignores tags.
         layer: Name of the part or layer of an EXR file to read; None takes the first that has colour.
 
     Returns:
-        The picture, with its depth channel where the file has one (any part of an EXR file; names like ``Z``, ``depth``
-        or ``ViewLayer.Depth.Z``). A picture that a camera's orientation tag turns is turned, and the tag is then 1.
+        The picture, upright, with orientation tag 1. Its depth channel is read from any part of an EXR file (names like
+        ``Z``, ``depth`` or ``ViewLayer.Depth.Z``).
 
     Raises:
-        OSError: If the file is missing, empty, truncated, not an image, or memory for it cannot be had.
+        OSError: If the file is missing, empty, truncated, not an image, or does not fit into memory.
         ValueError: If the type, the size or the kind of colours is not supported, a channel is missing, or colours are
             not finite.
 
@@ -130,17 +128,17 @@ def _memory_for(path: Path) -> Iterator[None]:
     try:
         yield
     except (MemoryError, RuntimeError) as error:  # torch's allocator raises the latter
-        raise OSError(f"{path}: memory for it cannot be had ({first_line(str(error))})") from None
+        raise OSError(f"{path}: does not fit into memory ({first_line(str(error))})") from None
 
 
 def _light(
     path: Path, source: Part, indices: list[int], transfer: Transfer | None, has_alpha: bool
 ) -> tuple[Tensor, PixelType, Transfer]:
-    """Stored numbers as light ``[1, C, H, W]``, what they were stored as and how encoded."""
+    """Light ``[1, C, H, W]`` from stored numbers, their type, and their encoding."""
     kinds = [source.kinds[k] for k in indices]
     kind = kinds[0] if len(set(kinds)) == 1 else "float"
     if kind not in _STORED and not source.is_exr:
-        raise ValueError(f"{path}: holds numbers of type {kind}, of which it is not known what is white; store 16 bits")
+        raise ValueError(f"{path}: holds numbers of type {kind}, for which white is not defined; store 16 bits")
     sample = _STORED.get(kind, "float")
     transfer, white = transfer or default_transfer(sample), _WHITE[sample]
     curve = None
@@ -163,7 +161,7 @@ def _light(
         encoded: Transfer = "linear" if curve is not None else transfer
         light[:, :, lines] = decode(pixels, encoded, has_alpha, source.straight_alpha)
         if not unknown and not bool(torch.isfinite(light[:, :, lines]).all()):
-            raise ValueError(f"{path}: its light is beyond what float32 holds; scale it down")
+            raise ValueError(f"{path}: its light is beyond the range of float32; scale it down")
     if unknown:
         raise ValueError(
             f"{path}: {unknown} pixels are not finite (NaN or inf); repair them before blurring spreads them"
@@ -172,7 +170,7 @@ def _light(
 
 
 def _strips(height: int, line: int) -> list[slice]:
-    """Some lines at a time, about a million numbers, so that nothing but a picture itself is as large as a picture."""
+    """Slices of rows with about a million numbers each, which keep temporary arrays small."""
     lines = 1 + 2**20 // line
     return [slice(top, top + lines) for top in range(0, height, lines)]
 
@@ -180,19 +178,19 @@ def _strips(height: int, line: int) -> list[slice]:
 def write_image(
     path: str | os.PathLike[str], picture: Picture, transfer: Transfer | None = None, sample: PixelType | None = None
 ) -> None:
-    """Writes a picture whole or not at all: to a new file in the same folder, renamed once it is complete.
+    """Writes a picture whole or not at all: to a new file in the same folder, renamed when it is complete.
 
     Args:
-        path: Where to; the type follows from the suffix (.exr .png .tif .tiff .jpg .jpeg .webp .hdr .pfm).
-        picture: Pixels in linear light; its metadata goes into the file, as far as the type can hold it.
-        transfer: "linear" or "srgb"; None takes the picture's own where both it and the new file are integers, or both
-            floats, and otherwise "srgb" for integers and "linear" for floats.
-        sample: "8", "16", "half" or "float"; None takes the picture's own where the type can hold it, and otherwise the
-            type's default (8 bits, or half for EXR).
+        path: Output file; its suffix gives the format (.exr .png .tif .tiff .jpg .jpeg .webp .hdr .pfm).
+        picture: Pixels in linear light; metadata that the format supports is written too.
+        transfer: "linear" or "srgb". None keeps the picture's own if both its ``sample`` and the new one are integers,
+            or both floats; otherwise it is "srgb" for integers and "linear" for floats.
+        sample: "8", "16", "half" or "float"; None keeps the picture's own if the format supports it, and otherwise
+            takes the default of the format (8 bits, or half for EXR).
 
     Raises:
-        ValueError: If the type cannot hold what is asked (alpha in a JPEG, 16 bits in an HDR, ...).
-        OSError: If the file cannot be written; what was there before is then untouched.
+        ValueError: If the format does not support the request (alpha in a JPEG, 16 bits in an HDR, ...).
+        OSError: If the file cannot be written; an existing file is then unchanged.
     """
     import OpenImageIO as oiio
 
@@ -257,7 +255,7 @@ def write_image(
     with whole_file(path) as part:
         with part.open("wb") as file:
             if suffix in (".jpg", ".jpeg") and hasattr(os, "posix_fallocate"):
-                os.posix_fallocate(file.fileno(), 0, array.size + 2**20)  # libjpeg ends the process on a full disk
+                os.posix_fallocate(file.fileno(), 0, array.size + 2**20)  # fails here: libjpeg exits on a full disk
         with named_in_utf8(part) as name:
             output = oiio.ImageOutput.create(name)
             if output is None or not output.open(name, spec):
@@ -271,20 +269,20 @@ def write_image(
 
 
 def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Tensor:
-    """Reads the plain numbers of a one-channel map, such as a depth map: no transfer curve, integers as integers.
+    """Reads the numbers of a one-channel map, such as a depth map, without transfer curve or scaling of integers.
 
     Args:
         path: An image of one channel (or of equal ones), an EXR file with a depth channel, or ``.npy`` / ``.npz``.
-        channel: Channel of an image, or array of an ``.npz`` file, by name; None takes the only one or the depth
-            channel.
+        channel: Name of a channel of an image, or of an array in an ``.npz`` file; None takes the only one, or the
+            depth channel.
 
     Returns:
         ``[1, 1, H, W]`` float32; a 16-bit file gives 0 to 65535, an 8-bit file 0 to 255. The scale in the header of
         a PFM file is not applied.
 
     Raises:
-        OSError: If the file is missing, empty, truncated or unreadable, or memory for it cannot be had.
-        ValueError: If the channel is not clear, or the array is not two-dimensional numbers.
+        OSError: If the file is missing, empty, truncated or unreadable, or does not fit into memory.
+        ValueError: If the channel is ambiguous or missing, or the array is not two-dimensional numbers.
     """
     path = existing(path, (*_SUFFIXES, ".npy", ".npz"), "a depth map")
     with _memory_for(path):
@@ -312,13 +310,13 @@ def _map(values: np.ndarray) -> Tensor:
 
 
 def _float32(values: np.ndarray) -> np.ndarray:
-    """Numbers in single precision; those beyond it become infinite."""
+    """Numbers in single precision; larger ones become infinite."""
     with np.errstate(over="ignore", invalid="ignore"):
         return values.astype(np.float32)
 
 
 def _is_whole(name: str) -> bool:
-    """Whether a file's end is there: what fails in the last flush of its buffer is reported by nobody."""
+    """Whether a file is complete; OpenImageIO does not report an error in the last flush of its buffer."""
     import OpenImageIO as oiio
 
     source = oiio.ImageInput.open(name)
@@ -329,6 +327,6 @@ def _is_whole(name: str) -> bool:
     problem = source.geterror()
     source.close()
     with contextlib.suppress(OSError):
-        check_chunks(Path(name))  # OpenImageIO does not read the last one
+        check_chunks(Path(name))  # OpenImageIO does not read the last chunk
         return last is not None and not problem
     return False

@@ -1,4 +1,4 @@
-"""How much memory this process can still take: what a file's header promises is held against it before reading."""
+"""Free memory, with which the size in a file's header is compared before reading."""
 
 import contextlib
 import math
@@ -15,7 +15,7 @@ _CONTAINERS = (  # limit and use of a control group, version 2 and 1
 
 
 def free_bytes() -> float:
-    """Bytes that this process can still take: what the machine, its limits and its container leave; ``inf`` if unknown.
+    """Bytes that this process can still allocate, limited by machine, ulimit and container; ``inf`` if unknown.
 
     Example:
         >>> free_bytes() > 2**20
@@ -25,7 +25,7 @@ def free_bytes() -> float:
     with contextlib.suppress(OSError):
         free += [1024.0 * int(kib) for kib in re.findall(r"MemAvailable:\s*(\d+)", Path("/proc/meminfo").read_text())]
     for limit, used in _CONTAINERS:
-        with contextlib.suppress(OSError, ValueError):  # "max" is no number: there is no limit
+        with contextlib.suppress(OSError, ValueError):  # "max" means no limit
             free.append(float(int(Path(limit).read_text()) - int(Path(used).read_text())))
     with contextlib.suppress(ImportError, OSError):
         import resource

@@ -1,4 +1,4 @@
-"""Metadata of an image file: tags that a copy keeps, orientation, and facts about the camera."""
+"""Metadata of an image file: tags that a copy keeps, orientation, camera settings."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -12,7 +12,7 @@ __all__ = ["Metadata", "camera_facts", "kept_metadata", "upright"]
 Metadata = dict[str, tuple[Any, Any]]
 """Name -> (OpenImageIO type, value)."""
 
-# Facts about how one file was stored, which are wrong for the next.
+# Attributes of the storage of one file, which do not apply to a copy.
 _STORAGE_PREFIXES = ("oiio:", "tiff:", "openexr:", "png:", "pnm:", "jpeg:", "rgbe:", "thumbnail", "Exif:ExifVersion")
 _STORAGE_NAMES: tuple[str, ...] = ("name", "planarconfig", "textureformat", "CompressionQuality")
 _STORAGE_NAMES += ("Exif:FlashPixVersion", "Exif:ColorSpace")
@@ -20,7 +20,7 @@ _MM_PER_UNIT: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF 
 
 
 _FLIPPED: dict[Any, tuple[int, ...]] = {2: (1,), 3: (0, 1), 4: (0,), 5: (), 6: (1,), 7: (0, 1), 8: (0,)}
-"""EXIF orientation (0x0112) -> axes that are flipped, after rows and columns have changed places from 5 on."""
+"""EXIF orientation (0x0112) -> flipped axes. Orientations from 5 up first transpose the image."""
 _OF_AXES = (
     ("Exif:PixelXDimension", "Exif:PixelYDimension"),
     ("Exif:FocalPlaneXResolution", "Exif:FocalPlaneYResolution"),
@@ -28,7 +28,7 @@ _OF_AXES = (
 
 
 def upright(values: "np.ndarray", metadata: Metadata) -> "tuple[np.ndarray, Metadata]":
-    """An image ``[H, W, C]`` turned as its orientation tag says, and its metadata, in which the tag is then 1.
+    """Turns an image ``[H, W, C]`` upright by its orientation tag, and sets the tag to 1.
 
     Example:
         >>> import numpy as np
@@ -52,10 +52,10 @@ def upright(values: "np.ndarray", metadata: Metadata) -> "tuple[np.ndarray, Meta
 
 
 def kept_metadata(attributes: Iterable[Any]) -> Metadata:
-    """What a copy of an image should keep of OpenImageIO's ``extra_attribs``.
+    """Metadata for a copy of an image, from OpenImageIO's ``extra_attribs``.
 
     Returns:
-        Name -> (type, value), without what describes how the file was stored.
+        Name -> (type, value), without attributes of the storage.
     """
     return {
         a.name: (a.type, a.value)
@@ -65,19 +65,19 @@ def kept_metadata(attributes: Iterable[Any]) -> Metadata:
 
 
 def camera_facts(metadata: Mapping[str, tuple[Any, Any]], width: int, height: int) -> dict[str, float]:
-    """What the metadata says about the camera, under the names of ``torchdof.Camera``; only what it says.
+    """Camera settings found in the metadata, under the names of ``torchdof.Camera``.
 
-    The width of the sensor follows from the resolution of the focal plane (EXIF 0xA20E), or from the focal length's
-    equivalent on 35 mm film where that is missing or contradicts it, as in a picture scaled down after it was taken.
-    The 36 mm of that film are the picture's longer side.
+    The sensor width comes from the resolution of the focal plane (EXIF 0xA20E). If that is missing, or differs by more
+    than 25 % (for example after scaling the picture), it comes from the 35 mm equivalent focal length, with 36 mm for
+    the longer side of the picture.
 
     Args:
         metadata: As in ``Picture.metadata``.
         width: Width of the image in pixels.
-        height: Its height.
+        height: Height of the image in pixels.
 
     Returns:
-        Any of ``focal_length_mm``, ``f_number``, ``focus_m``, ``sensor_width_mm``.
+        Those of ``focal_length_mm``, ``f_number``, ``focus_m`` and ``sensor_width_mm`` that are known.
 
     Example:
         >>> tags = {"Exif:FocalLength": 50.0, "FNumber": 1.8, "Exif:FocalLengthIn35mmFilm": 75}

@@ -1,4 +1,4 @@
-"""Numbered frames: file names such as ``shot.####.exr``, and focus that moves between keyframes."""
+"""Numbered frames: file names such as ``shot.####.exr``, and focus keyframes."""
 
 import math
 import re
@@ -12,10 +12,12 @@ _DIGITS = 18
 
 
 class FramePattern:
-    """A file name with a place for the frame's number: ``####`` or ``%04d``, zero-padded to that many digits.
+    """A file name with a placeholder for the frame number: ``####`` or ``%04d``, zero-padded to that many digits.
 
-    The number stands in the last component of the path; folders are called what they are called. ``ValueError`` if
-    there is no place for a number, more than one, or one of more digits than a name can have.
+    Only the last component of the path may have a placeholder; folder names are used literally.
+
+    Raises:
+        ValueError: If there is not exactly one placeholder, or it has more than 18 digits.
 
     Example:
         >>> FramePattern("out/shot.####.exr").name(7)
@@ -26,8 +28,8 @@ class FramePattern:
         self.path = Path(path)
         places = list(_PLACEHOLDER.finditer(self.path.name))
         if len(places) != 1:
-            told = "expected one place for the frame number in the file's name, such as shot.####.exr"
-            raise ValueError(f"{path}: {told}")
+            expected = "expected one place for the frame number in the file's name, such as shot.####.exr"
+            raise ValueError(f"{path}: {expected}")
         place = places[0]
         self._before, self._after = self.path.name[: place.start()], self.path.name[place.end() :]
         text = place.group()
@@ -37,12 +39,12 @@ class FramePattern:
 
     @staticmethod
     def matches(path: str | Path) -> bool:
-        """Whether a path names many files: it has a place for a frame number, and no file is called just that."""
+        """Whether a path has a placeholder, and no file has literally this name."""
         return _PLACEHOLDER.search(Path(path).name) is not None and not Path(path).is_file()
 
     @staticmethod
     def is_padded(path: str | Path) -> bool:
-        """Whether a path has a place for a frame number of several digits: nobody calls a single file that."""
+        """Whether a path has a placeholder of several digits, which is unlikely in the name of a single file."""
         return re.search(r"##|%0?\d+d", Path(path).name) is not None
 
     def name(self, frame: int) -> Path:
@@ -50,7 +52,7 @@ class FramePattern:
         return self.path.with_name(f"{self._before}{frame:0{self._digits}d}{self._after}")
 
     def frames(self) -> list[int]:
-        """The numbers of the frames that are there, in order."""
+        """Numbers of the existing frames, in order."""
         if not self.path.parent.is_dir():
             return []
         wanted = re.compile(re.escape(self._before) + r"(\d+)" + re.escape(self._after))
@@ -75,9 +77,10 @@ def parse_frames(text: str) -> tuple[int, int]:
 
 
 def parse_focus(text: str) -> list[tuple[int, float]]:
-    """Reads a focus distance in metres, ``2.0``, as one keyframe, or keyframes ``frame:metres``, in their order.
+    """Reads a focus distance in metres, ``2.0``, as one keyframe, or keyframes ``frame:metres``, sorted by frame.
 
-    ``ValueError`` if a part cannot be read, is not positive, or a frame is named twice.
+    Raises:
+        ValueError: If a part cannot be read, a distance is not positive, or a frame is given twice.
 
     Example:
         >>> parse_focus("1:2.0,48:inf")
@@ -99,10 +102,10 @@ def parse_focus(text: str) -> list[tuple[int, float]]:
 
 
 def focus_at_frame(keys: list[tuple[int, float]], frame: int) -> float:
-    """Metres in focus at a frame: linear in 1/distance between keyframes, held before the first and after the last.
+    """Focus distance in metres at a frame: linear in 1/distance between keyframes, constant before and after them.
 
-    Blur is proportional to the difference of inverse distances, so a rack of focus that is even in 1/m changes the blur
-    evenly, and can end at infinity.
+    The blur radius is linear in the inverse focus distance, so the blur changes at a constant rate, and the focus can
+    end at infinity.
 
     Example:
         >>> focus_at_frame([(0, 1.0), (10, 2.0)], 5)
@@ -110,7 +113,7 @@ def focus_at_frame(keys: list[tuple[int, float]], frame: int) -> float:
     """
     if not keys:
         raise ValueError("focus needs at least one keyframe (frame, metres), got none")
-    from ..validation import number  # takes PyTorch, without which arguments are read
+    from ..validation import number  # imports PyTorch, which parsing of arguments must not need
 
     number("frame", frame)
     if frame <= keys[0][0]:

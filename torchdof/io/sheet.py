@@ -14,13 +14,13 @@ def write_sheet(path: str | os.PathLike[str], panels: dict[str, Tensor], margin:
     """Writes panels side by side, each with its caption above.
 
     Args:
-        path: Where to, as for :func:`torchdof.io.images.write_image`.
+        path: Output file, as for :func:`torchdof.io.images.write_image`.
         panels: Caption -> ``[1, 3, H, W]`` in linear light, all of one size.
         margin: Pixels between panels.
         caption: Height of the line of captions in pixels.
 
     Raises:
-        ValueError: If the type of file is not known.
+        ValueError: If the format is unknown.
         OSError: If the file cannot be written.
     """
     import OpenImageIO as oiio

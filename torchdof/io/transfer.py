@@ -1,7 +1,7 @@
-"""Transfer curves: what a file stores to linear light and back, with alpha straight or premultiplied.
+"""Transfer curves: file values to linear light and back, with straight or premultiplied alpha.
 
-``kornia.color.rgb_to_linear_rgb`` and its inverse give the same bits in [0, 1]. They are not used because they take
-nothing but three channels, do not mirror negative light, and take a second to import.
+``kornia.color.rgb_to_linear_rgb`` and its inverse give the same bits in [0, 1]. They are not used because they support
+three channels only, do not extend the curve to negative light, and take a second to import.
 """
 
 from typing import Literal
@@ -16,7 +16,7 @@ Transfer = Literal["linear", "srgb"]
 
 
 def default_transfer(sample: str) -> Transfer:
-    """What a file of such samples ("8", "16", "half", "float") is taken for when nobody says: floats are linear."""
+    """Default encoding of samples of a type: "linear" for "half" and "float", "srgb" for "8" and "16"."""
     return "linear" if sample in ("half", "float") else "srgb"
 
 
@@ -44,14 +44,14 @@ def encode(pixels: Tensor, transfer: Transfer, has_alpha: bool, straight: bool) 
 
 
 def encode_8_bits(pixels: Tensor, transfer: Transfer, has_alpha: bool) -> np.ndarray:
-    """What :func:`encode` makes of pixels, rounded to 8 bits, by a table over all numbers of half precision.
+    """The result of :func:`encode` rounded to 8 bits, looked up in a table of all half-precision numbers.
 
-    Half precision moves a number by a fortieth of a step of the 8 bits at most, so that what was read from 8 bits
-    comes back as it was. Alpha becomes straight.
+    Rounding to half precision changes a number by at most a fortieth of an 8-bit step, so that 8-bit images are
+    preserved exactly. Alpha becomes straight.
 
     Args:
         pixels: ``[1, C, H, W]``, linear light, premultiplied.
-        transfer: How colour is encoded.
+        transfer: Encoding of colour.
         has_alpha: Whether the last channel is alpha.
 
     Returns:
@@ -84,12 +84,12 @@ def _divide(colour: Tensor, alpha: Tensor) -> Tensor:
 
 
 def _srgb_to_linear(encoded: Tensor) -> Tensor:
-    """IEC 61966-2-1; negative values by symmetry."""
+    """Inverse sRGB curve of IEC 61966-2-1, odd for negative values."""
     size = encoded.abs()
     return torch.where(size <= 0.04045, size / 12.92, ((size + 0.055) / 1.055) ** 2.4).copysign(encoded)
 
 
 def _linear_to_srgb(linear: Tensor) -> Tensor:
     size = linear.abs()
-    curved = 1.055 * size.clamp_min(0.0031308) ** (1 / 2.4) - 0.055  # of 0 the root's gradient would be infinite
+    curved = 1.055 * size.clamp_min(0.0031308) ** (1 / 2.4) - 0.055  # clamped: the gradient is infinite at 0
     return torch.where(size <= 0.0031308, size * 12.92, curved).copysign(linear)

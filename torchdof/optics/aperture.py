@@ -1,12 +1,12 @@
 """The opening of a lens that is not round: blades, an image of it, an anamorphic squeeze. Exact areas, differentiable.
 
-A lens draws a point out of focus as its opening, drawn as large as the circle of confusion. Coordinates ``u`` of the
-opening are those of the picture: x to the right, y down, and the circle around the opening has radius 1. Behind the
-focus plane a point at ``p`` is drawn at ``p + coc u``, as somebody sees the opening who looks through the lens from
-behind the camera; in front of it, where the coc is negative, it is turned by half.
+A lens draws a point out of focus as an image of its opening, scaled by the circle of confusion. The coordinates ``u``
+of the opening have the axes of the picture, x to the right and y down, and the opening's circumscribed circle has
+radius 1. The light of a point at ``p`` that passes through ``u`` lands at ``p + coc u``. So behind the focus plane the
+opening appears as a viewer behind the camera sees it; in front of it, where the coc is negative, it is point-reflected.
 
-A straight-edged opening's area in a square is exact: its outline is followed, and each edge adds what lies between it
-and the square's left side (Green's theorem). A curved blade is followed by 48 chords that enclose the arc's own area.
+The area of a polygon in each square of a grid is exact: by Green's theorem, each edge adds the area between itself and
+the left side of the square. A curved blade is approximated by 48 chords, scaled to enclose the arc's own area.
 """
 
 import dataclasses
@@ -26,28 +26,28 @@ __all__ = ["Aperture"]
 
 Number = float | Tensor
 
-_CHORDS = 48  # of a curved blade
+_CHORDS = 48  # straight pieces of a curved blade; more follow the arc more closely
 _MOST_BLADES = 64
-_MOST_SIDE = 128  # pixels of an image of an opening, which are averaged down to so many
-_SQUEEZE = (0.1, 10.0)
+_MOST_SIDE = 128  # pixels; a larger image of an opening is averaged down to this
+_SQUEEZE = (0.1, 10.0)  # allowed range of height over width
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Aperture:
-    """What of a round lens lets light through, and how much narrower than high the lens draws it.
+    """The open part of a round lens, and the ratio of height to width of its blur.
 
     Args:
-        blades: Straight or curved blades that leave a regular polygon open, from 3; 0 leaves the lens round.
-        rotation_deg: Turns the opening counter-clockwise, as it shows behind the focus plane. At 0 a corner of a
-            polygon points up. A float, or a tensor ``[]`` that a gradient is taken to.
+        blades: Number of blades, from 3, whose opening is a regular polygon; 0 leaves the lens round.
+        rotation_deg: Turns the opening counter-clockwise, as it appears behind the focus plane. At 0 a corner of a
+            polygon points up. A float, or a tensor ``[]``, which may require a gradient.
         curvature: 0 for straight blades, 1 for blades that leave a circle, in between for arcs.
         squeeze: Height of the blur over its width: 2 for an anamorphic lens of that squeeze. The circle of confusion
-            is the blur's height. A float, or a tensor ``[]`` that a gradient is taken to.
-        mask: Transmission ``[H, W]`` >= 0 of the square around the opening, in place of blades: the longer side spans
-            it. Images of more than 128 pixels are averaged down. It is turned by bilinear interpolation.
-        vignetting: How much of its width a cat's eye in the corner of the frame lacks in height, from 0 (none) to 1
-            (closed): the lens's rims, one in front of the opening and one behind it, move before it towards the corners
-            and cut off half of that each. Or the share of either, ``(front, rear)``
+            is the blur's height. A float, or a tensor ``[]``, which may require a gradient.
+        mask: Transmission ``[H, W]`` >= 0 of the square around the opening, instead of blades; the longer side of the
+            image spans the square. Images of more than 128 pixels are averaged down. Rotation is bilinear.
+        vignetting: Cat's eyes, from 0 (round everywhere) to 1 (closed in the corner of the frame). A cat's eye in the
+            corner is shorter than wide by this share of its width. Two rims of the lens barrel cut it, one in front of
+            the opening and one behind it, each by half of that. A pair ``(front, rear)`` gives each rim its own share
             (:mod:`torchdof.optics.placed_kernels`).
 
     Raises:
@@ -98,13 +98,13 @@ class Aperture:
 
     @property
     def rims(self) -> tuple[float, float]:
-        """How far the front and the rear rim move in the corner of the frame, in diameters of the opening."""
+        """Shift of the front and of the rear rim in the corner of the frame, in diameters of the opening."""
         given = self.vignetting
         return given if isinstance(given, tuple) else (given / 2, given / 2)
 
     @property
     def is_round(self) -> bool:
-        """Whether nothing but the squeeze tells the opening, in the middle of the frame, from a round one."""
+        """Whether the opening is a circle in the middle of the frame, possibly squeezed."""
         return self.blades == 0 and self.mask is None
 
     @property
@@ -119,10 +119,10 @@ class Aperture:
 
     @functools.cached_property
     def finest(self) -> float:
-        """Share of the circle of confusion whose disc is about as fine as the blur: at most 1.
+        """Radius, as a share of the circle of confusion, of the disc with detail about as fine as the blur: at most 1.
 
-        Of a mask it is told by its outline's length over its area, up to twice that of a disc; of a cat's eye by its
-        height halfway to the corner.
+        For a mask it is twice the radius of the disc with the same ratio of area to outline length, at most 1; for a
+        cat's eye, its height over its width halfway to the corner.
         """
         finest = min(1.0, 1.0 / _plain(self.squeeze)) * (1.0 - min(1.0, sum(self.rims)) / 2)
         if self.mask is None:
@@ -133,12 +133,12 @@ class Aperture:
         return finest * min(1.0, 4.0 * float(self.mask.sum() / outline) * pixel)
 
     def shares(self, half: int, step_y: Tensor, step_x: Tensor) -> Tensor:
-        """How much of each cell of a grid is open, without the squeeze: ``[..., 2 half + 1, 2 half + 1]``, float64.
+        """Open share of each cell of a grid, without the squeeze: ``[..., 2 half + 1, 2 half + 1]``, float64.
 
         Args:
-            half: Cells on each side of the middle one, whose centre is the opening's.
-            step_y: Height of the cells ``[...]``; the circle around the opening has radius 1.
-            step_x: Their width ``[...]``.
+            half: Cells on each side of the middle one, which is centred on the opening.
+            step_y: Height of the cells ``[...]``; the circumscribed circle of the opening has radius 1.
+            step_x: Width of the cells ``[...]``.
         """
         batch = broadcast_shapes(step_y.shape, step_x.shape)
         high, wide = (step.to(torch.float64).expand(batch).reshape(-1) for step in (step_y, step_x))
@@ -198,9 +198,9 @@ class Aperture:
         return f"Aperture({', '.join(parts) or 'round'})"
 
     def _outline(self, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Corners ``[V]`` of the outline, x and y, so that it goes round with the light on its left in y-up terms."""
+        """Corners ``[V]`` of the outline, x and y with y down, ordered counter-clockwise as seen with y up."""
         half_angle = math.pi / self.blades
-        along, out = _blade(half_angle, self.curvature)  # of the blade whose outward normal is up
+        along, out = _blade(half_angle, self.curvature)  # the blade whose outward normal points up
         normal = torch.arange(self.blades, dtype=torch.float64, device=device)[:, None] * (2.0 * half_angle)
         turn = torch.deg2rad(torch.as_tensor(self.rotation_deg, dtype=torch.float64, device=device))
         normal = normal + half_angle + math.pi / 2 + turn
@@ -210,7 +210,7 @@ class Aperture:
         return x.flatten(), -y.flatten()
 
     def _turned(self, mask: Tensor) -> Tensor:
-        """A mask as it shows behind the focus plane."""
+        """A mask turned by ``rotation_deg``."""
         turn = self.rotation_deg
         if not isinstance(turn, Tensor) and turn == 0.0:
             return mask
@@ -225,7 +225,7 @@ class Aperture:
 
 
 def _blade(half_angle: float, curvature: float) -> tuple[Tensor, Tensor]:
-    """Points along one blade, the last left out: along it, counter-clockwise, and out from the centre, ``[chords]``."""
+    """Corners of one blade without the last: distances along the blade and out from the centre, each ``[chords]``."""
     chord, apothem = math.sin(half_angle), math.cos(half_angle)
     sagitta = curvature * (1.0 - apothem)
     if sagitta < 1e-9:
@@ -234,7 +234,7 @@ def _blade(half_angle: float, curvature: float) -> tuple[Tensor, Tensor]:
     half_arc = math.asin(min(1.0, chord / radius)) if sagitta <= radius else math.pi - math.asin(chord / radius)
     angle = torch.linspace(-half_arc, half_arc, _CHORDS + 1, dtype=torch.float64)[:-1]
     bulge = 2.0 * radius * torch.sin((half_arc + angle) / 2) * torch.sin((half_arc - angle) / 2)
-    missing = 1.0 / _CHORDS**2  # share of the arc's area that its chords leave out: of a flat arc, and of any other
+    missing = 1.0 / _CHORDS**2  # share of the arc's area outside its chords; the limit of a flat arc
     if half_arc > 5e-3:
         step = 2.0 * half_arc / _CHORDS
         missing = _CHORDS * (step - math.sin(step)) / (2.0 * half_arc - math.sin(2.0 * half_arc))
@@ -242,13 +242,17 @@ def _blade(half_angle: float, curvature: float) -> tuple[Tensor, Tensor]:
 
 
 def _polygon_shares(x: Tensor, y: Tensor, count: int) -> Tensor:
-    """Area of polygons with corners ``[m, V]`` in each of ``count x count`` unit squares from (0, 0) on: ``[m, ...]``.
+    """Area of polygons with corners ``[m, V]`` in unit squares: ``[m, count, count]``, the first square at (0, 0).
 
-    The outline goes round counter-clockwise where y points up.
+    Corners are counter-clockwise as seen with y up.
+
+    1. Cut each edge at the rows of squares.
+    2. For each piece and each vertical grid line, integrate over y the part of ``[0, line]`` left of the piece.
+    3. Sum over the pieces, signed by their direction; neighbouring grid lines differ by the area between them.
     """
     items, next_x, next_y = len(x), x.roll(-1, -1), y.roll(-1, -1)
     row = torch.arange(count, dtype=torch.float64, device=x.device)[:, None]
-    start, end = ((corner[:, None, :] - row).clamp(0.0, 1.0) for corner in (y, next_y))  # [m, rows, V] in the row
+    start, end = ((corner[:, None, :] - row).clamp(0.0, 1.0) for corner in (y, next_y))  # [m, rows, V]
     item, line, edge = (start.detach() != end.detach()).nonzero().unbind(1)
     start, end = start[item, line, edge], end[item, line, edge]
     x, y, next_x, next_y = (corner[item, edge] for corner in (x, y, next_x, next_y))
@@ -256,7 +260,7 @@ def _polygon_shares(x: Tensor, y: Tensor, count: int) -> Tensor:
     ends = torch.stack([x + slope * (part + line - y) for part in (start, end)])
     left, right = ends.amin(0)[:, None], ends.amax(0)[:, None]
     border = torch.arange(count + 1, dtype=torch.float64, device=x.device)
-    # mean over the edge of the smaller of its x and the border's
+    # mean of min(x, border) over the piece
     within = torch.minimum(torch.maximum(border, left), right) - left
     mean = torch.minimum(border, left) + within - within.square() / (2.0 * (right - left) + 1e-12)
     left_of = mean.new_zeros(items * count, count + 1)
@@ -265,7 +269,7 @@ def _polygon_shares(x: Tensor, y: Tensor, count: int) -> Tensor:
 
 
 def _overlaps(count: int, step: Tensor, size: int, longer: int) -> Tensor:
-    """Length that ``count`` cells of steps ``[m]`` share with each pixel of a mask: ``[m, count, size]``."""
+    """Overlap of ``count`` cells of width ``step`` ``[m]`` with each pixel of a mask: ``[m, count, size]``."""
     cell = (torch.arange(count + 1, dtype=torch.float64, device=step.device) - count / 2) * step[:, None]
     pixel = (torch.arange(size + 1, dtype=torch.float64, device=step.device) - size / 2) * (2.0 / longer)
     low = torch.maximum(cell[:, :-1, None], pixel[:-1])
@@ -273,7 +277,7 @@ def _overlaps(count: int, step: Tensor, size: int, longer: int) -> Tensor:
 
 
 def _checked_mask(mask: Any) -> Tensor:
-    """A mask as float64 on the CPU, not larger than it may be."""
+    """A valid mask as float64 on the CPU, averaged down to at most ``_MOST_SIDE`` pixels, with a maximum of 1."""
     values = real_tensor("mask", mask, "[H, W]").detach().to("cpu", torch.float64)
     if values.ndim != 2 or not values.numel():
         raise ValueError(f"mask must be the transmission [H, W] of an opening, got {list(values.shape)}")
@@ -287,7 +291,7 @@ def _checked_mask(mask: Any) -> Tensor:
 
 
 def _check(name: str, value: Any, low: float, high: float) -> None:
-    """Refuse a number that is none, or lies outside its range."""
+    """Refuse a value that is not a number, or is outside ``[low, high]``."""
     if isinstance(value, Tensor):
         good = value.ndim == 0 and value.is_floating_point()
     else:

@@ -21,42 +21,44 @@ __all__ = ["BlurTable"]
 
 UNITS = ("fraction", "mm", "relative")
 _MOST_NODES = 4096
-_COC_RANGE = (1e-9, 1e6)
-_WIDEST = 1e4  # times the circle of confusion; a blur that is not of the focus shows at small ones
-_SMALLEST, _LARGEST = 1e-100, 1e100  # of parameters: their sums and products are numbers too
-_STEEPEST = 100.0  # m of a tilt, whose light would lie in the tail of the edge
-_SEEN_PX = 1.5  # around a spot, in which pixels see some of it
-_RIM_POWER = 4.0  # of the radius, with which a rim grows
-_TRIED_AT_ONCE = 64
-_TRIED_PX = (0.5, 6.0)  # radii of the widest kernel tried
+_COC_RANGE = (1e-9, 1e6)  # allowed |coc| of the outermost nodes, in the table's unit
+_WIDEST = 1e4  # largest radius of a kernel over |coc| of its node; allows a blur that remains in focus
+_SMALLEST, _LARGEST = 1e-100, 1e100  # allowed parameters: their sums and products stay finite in float64
+_STEEPEST = 100.0  # largest exponent m of "softm"; with a steeper tilt the light would lie in the tail of the edge
+_SEEN_PX = 1.5  # px around a spot of a field in which pixels receive some of its light
+_RIM_POWER = 4.0  # exponent m of a bright rim; a larger one makes the rim thinner
+_TRIED_AT_ONCE = 64  # kernels checked together; limits memory
+_TRIED_PX = (0.5, 6.0)  # radii in px to which the widest kernel is scaled for the check
 
 
 class BlurTable:
-    """Kernel parameters at nodes of signed circle of confusion, and the rule between them.
+    """Kernel parameters at nodes of signed circle of confusion, with interpolation between them.
 
-    Between nodes the parameters are linear in the signed coc, on each side of focus by itself; lengths shrink to 0 at a
-    coc of 0 unless a node sits there. Beyond the last node of a side the lengths grow with ``|coc|`` and the pure
-    numbers stay. A side without nodes mirrors the other. A table of one node is thus a lens whose blur keeps its shape
-    and scales with the circle of confusion, as the thin lens has it.
+    Each side of focus is interpolated separately:
+
+    * Between nodes, parameters are linear in the signed coc. Lengths go to 0 at a coc of 0 unless there is a node.
+    * Beyond the last node, lengths grow in proportion to ``|coc|``; pure numbers keep the value of the last node.
+    * A side without nodes uses the nodes of the other side.
+
+    So a table of one node is a thin lens: its blur keeps its shape and scales with the circle of confusion.
 
     Args:
         family: A key of :data:`torchdof.optics.psf.FAMILIES`.
         coc: Signed coc of the nodes ``[N]``, strictly increasing, not only 0; in ``unit``.
         params: Parameters of the family by name: ``[N]``, or ``[channels, N]`` for a lens that blurs its colours
             differently (``values`` of ``radial``: one more axis ``P``). Lengths are in ``unit``.
-        unit: ``"fraction"`` of the image's width, ``"mm"`` on a sensor of ``sensor_width_mm``, or ``"relative"`` for a
-            table of which only the ratio of lengths to coc counts (one node a side).
-        sensor_width_mm: Width of the sensor the millimetres were measured on; with ``unit="mm"`` only.
+        unit: ``"fraction"`` of the image's width, ``"mm"`` on a sensor of ``sensor_width_mm``, or ``"relative"``: only
+            the ratio of lengths to coc matters (one node a side).
+        sensor_width_mm: Width of the sensor on which the millimetres were measured; with ``unit="mm"`` only.
         strength: The fitted strength N at the nodes ``[N]``, kept as measured. It does not enter rendering: kernels
             conserve energy.
         name: Short name.
-        provenance: Where the numbers are from (camera, source, date, command): a JSON-like dict.
+        provenance: Origin of the numbers (camera, source, date, command): a JSON-like dict.
         residual: Relative residual of the fit at each node ``[N]``.
-        aperture: What the lens's opening is where it is not round (:class:`torchdof.optics.aperture.Aperture`): the
-            family is multiplied by it, and turned by half in front of the focus plane.
-        field: What the lens does across the frame, where that was traced or measured
-            (:class:`torchdof.optics.field.Field`): pictures are then made of its spots, and the parameters tell those
-            of the middle of the frame. A table with a field has no aperture of its own.
+        aperture: Opening that is not round (:class:`torchdof.optics.aperture.Aperture`). The profile is multiplied by
+            it, and point-reflected in front of the focus plane. None is a round opening.
+        field: Traced or measured blur across the frame (:class:`torchdof.optics.field.Field`). Rendering then uses its
+            spots; the parameters describe the middle of the frame. A table with a field takes no aperture.
 
     Raises:
         ValueError: If a field is not as described; the message names it.
@@ -165,16 +167,16 @@ class BlurTable:
         """A lens whose aperture blades leave a polygon open, inscribed in the circle of confusion.
 
         Args:
-            blades: How many, from 3.
-            rotation_deg: Turns the polygon counter-clockwise, as it shows behind the focus plane; at 0 a corner points
-                up. A float, or a tensor ``[]`` that a gradient is taken to.
+            blades: Number of blades, from 3.
+            rotation_deg: Turns the polygon counter-clockwise, as it appears behind the focus plane; at 0 a corner
+                points up. A float, or a tensor ``[]``, which may require a gradient.
             curvature: 0 for straight blades to 1 for a circle.
             squeeze: Height of the blur over its width, 2 for a common anamorphic lens; the circle of confusion is the
-                height. A float, or a tensor ``[]`` that a gradient is taken to.
-            rim: How much brighter the blur is at the circle around the opening than in its middle, as that of an
-                over-corrected lens is (spherical aberration); >= -1, and negative where it is darker.
-            vignetting: How much of its width a cat's eye in the corner of the frame lacks in height, 0 to 1, or the
-                shares of the lens's front and rear rim (:class:`torchdof.optics.aperture.Aperture`).
+                height. A float, or a tensor ``[]``, which may require a gradient.
+            rim: Brightness of the edge over that of the middle, minus 1: positive for an over-corrected lens (spherical
+                aberration), 0 for an even disc, -1 for a dark edge.
+            vignetting: Cat's eyes, 0 (round) to 1 (closed in the corner), or a pair for the front and rear rim
+                (:class:`torchdof.optics.aperture.Aperture`).
 
         Raises:
             ValueError: If a number is out of its range.
@@ -196,10 +198,10 @@ class BlurTable:
         rim: float = 0.0,
         vignetting: float | tuple[float, float] = 0.0,
     ) -> "BlurTable":
-        """A lens with any opening: each point out of focus is drawn as this image, as large as its circle of confusion.
+        """A lens with any opening: a point out of focus appears as this image, scaled to its circle of confusion.
 
         Args:
-            image: Transmission ``[H, W]`` >= 0, linear, of the square around the opening as it shows behind the focus
+            image: Transmission ``[H, W]`` >= 0, linear, of the square around the opening as it appears behind the focus
                 plane; the longer side spans the circle of confusion. More than 128 pixels are averaged down.
             rotation_deg: As in :meth:`polygon`.
             squeeze: As in :meth:`polygon`.
@@ -207,7 +209,7 @@ class BlurTable:
             vignetting: As in :meth:`polygon`.
 
         Raises:
-            ValueError: If the image is no transmission, or a number is out of its range.
+            ValueError: If the image is not a transmission, or a number is out of its range.
 
         Example:
             >>> BlurTable.from_aperture(torch.eye(9))
@@ -246,12 +248,12 @@ class BlurTable:
 
     @property
     def is_round(self) -> bool:
-        """Whether the opening is a circle, but for a squeeze: kernels are the same turned by half."""
+        """Whether the opening is a circle, possibly squeezed: kernels then equal their point reflection."""
         return self.aperture is None or self.aperture.is_round
 
     @property
     def depends_on_place(self) -> bool:
-        """Whether kernels are others towards the corners of the frame."""
+        """Whether kernels change across the frame."""
         return self.field is not None or (self.aperture is not None and self.aperture.depends_on_place)
 
     @property
@@ -260,7 +262,7 @@ class BlurTable:
         return self.aperture is not None and self.aperture.is_differentiated
 
     def fingerprint(self) -> str:
-        """Hash of all that kernels depend on: tables with the same numbers share it. Kept once it is made.
+        """Hash of all numbers that kernels depend on; computed once.
 
         Example:
             >>> BlurTable.disc().fingerprint() == BlurTable.disc().fingerprint() != BlurTable.gaussian().fingerprint()
@@ -276,7 +278,7 @@ class BlurTable:
 
     @property
     def channels(self) -> int:
-        """Kernels at a node: 1, or the number of image channels that are blurred differently."""
+        """Number of kernels at a node: 1, or one for each channel of the image."""
         return next(iter(self._params.values())).shape[0]
 
     @property
@@ -289,7 +291,7 @@ class BlurTable:
 
         Args:
             coc_px: Signed coc in pixels, any shape ``[...]``.
-            width: Width in pixels of the image the coc is meant for.
+            width: Width in pixels of the image to which the coc refers.
 
         Returns:
             Parameters by name, lengths in pixels: ``[channels, ...]`` (``values``: ``[channels, ..., P]``), float64.
@@ -309,21 +311,19 @@ class BlurTable:
         return mixed
 
     def kernels(self, coc_px: Tensor, width: float, size: int | None = None, window: int | None = None) -> Tensor:
-        """Kernels at a signed coc: what the PSF does to a picture made of pixels (:mod:`torchdof.optics.psf`).
+        """Kernels of the middle of the frame at a signed coc, for pictures made of pixels (:mod:`torchdof.optics.psf`).
 
-        They are those of the middle of the frame. In front of the focus plane an opening that is not round shows turned
-        by half.
+        In front of the focus plane, kernels of an opening that is not round are point-reflected.
 
-        In focus the kernel is a single pixel, for what is in focus is as sharp in the image as it shall be. Where the
-        table has a blur of its own there, that fades in with the square of the coc, four times as fast as the light
-        does that a disc moves: one that moves half of its light is all there at 0.35 px, one that moves a hundredth at
-        0.05 px.
+        In focus the kernel is a single pixel, because the image is already as sharp there as it should be. A table may
+        have a blur of its own in focus, which moves a share ``M`` of the light to other pixels. It is faded in with the
+        weight ``min(1, 4 coc^2 / M)``: at 0.35 px for ``M`` = 0.5, at 0.05 px for ``M`` = 0.01, it is complete.
 
         Args:
             coc_px: Signed coc in pixels ``[n]``.
             width: Width in pixels of the image.
             size: Odd width of the kernels; None takes the smallest that holds them all.
-            window: Odd width of the middle part that is wanted, which then holds its share of the light; None is all.
+            window: Odd width of the middle part to return, which sums to its share of the light; None returns all.
 
         Returns:
             ``[n, channels, size, size]``, float64, non-negative, each summing to 1. Differentiable in ``coc_px``, and
@@ -351,25 +351,28 @@ class BlurTable:
         return torch.lerp(centre, kernels, fade)
 
     def _from_templates(self, coc_px: Tensor, width: float, size: int | None, window: int | None) -> Tensor:
-        """Kernels of :meth:`kernels` where no gradient to the aperture is taken."""
+        """The kernels of :meth:`kernels` without gradients to the aperture, interpolated from templates."""
         signed = coc_px.to(torch.float64)
         reach = psf.support(self.family, self.params(signed.detach(), width), self.aperture)
         whole = psf.half_width(reach) if size is None and window is not None else psf.width_of(size, reach) // 2
         half = whole if window is None else min(whole, psf.width_of(window, reach) // 2)
         cut = [(whole if size is not None else half) + 1] * len(coc_px) if half < reach else []
         made = bank_of(self).kernels(signed, width, longest=cut)
-        if size is not None:  # all light is in the size that was asked for
+        if size is not None:  # kernels that are cut off to a given size sum to 1 as well
             made = made / made.sum((-2, -1), keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
         spare = half - made.shape[-1] // 2
         return functional.pad(made, (spare,) * 4).to(coc_px.device)
 
     def moved_in_focus(self, width: float) -> Tensor:
-        """Share ``[channels]`` of its light that the table's kernel in focus moves to other pixels."""
+        """Share ``[channels]`` of the light that the table's kernel in focus moves to other pixels."""
         in_focus = psf.pixel_kernels(self.family, self.params(torch.zeros(()), width), aperture=self.aperture).detach()
         return 1.0 - in_focus[:, in_focus.shape[-2] // 2, in_focus.shape[-1] // 2]
 
     def side_nodes(self, sign: int) -> tuple[Tensor, dict[str, Tensor]]:
-        """Nodes of one side of focus, that in front of it for a sign of -1, by growing ``|coc|`` from 0.
+        """Nodes of one side of focus, ordered by ``|coc|`` from 0.
+
+        Args:
+            sign: -1 in front of the focus plane, 1 behind it.
 
         Returns:
             Unsigned coc ``[N]`` and parameters ``[channels, N]``, in the table's unit.
@@ -390,7 +393,7 @@ class BlurTable:
         return max(reach, float(self.field.reach(signed / per_unit).max()) * per_unit + _SEEN_PX)
 
     def finest_px(self, coc_px: float, width: float) -> float:
-        """Radius in pixels, at most ``|coc_px|``, of the disc about as fine as the finest kernel of a signed coc."""
+        """Radius in pixels, at most ``|coc_px|``, of the disc with detail about as fine as the kernel's finest."""
         if self.field is not None:
             per_unit = self.px_per_unit(width)
             return min(abs(coc_px), self.field.finest(coc_px / per_unit) * per_unit)
@@ -448,7 +451,7 @@ class BlurTable:
 
         Raises:
             ValueError: If the content is not a valid table; the message names the file and the field.
-            FileNotFoundError: If there is neither such a file nor such a shipped table.
+            FileNotFoundError: If no file and no shipped table has this name.
 
         Example:
             >>> BlurTable.load("sato_j15").family
@@ -500,7 +503,7 @@ class BlurTable:
         return f"BlurTable({self.name or 'unnamed'!r}, {self.family}, {nodes}{colours}{opening})"
 
     def px_per_unit(self, width: float) -> float:
-        """Pixels of an image of a width in pixels that the table's unit is long; 1 for ``"relative"``.
+        """Length of the table's unit in pixels of an image ``width`` pixels wide; 1 for ``"relative"``.
 
         Example:
             >>> BlurTable("disc", [0.01], {"radius": [0.01]}, unit="fraction").px_per_unit(1920)
@@ -511,7 +514,7 @@ class BlurTable:
         return float(width) if self.sensor_width_mm is None else width / self.sensor_width_mm
 
     def _check_params(self, params: Mapping[str, Any]) -> dict[str, Tensor]:
-        """Parameters by name as ``[channels, N]`` (``values``: ``[channels, N, P]``), or a refusal by name."""
+        """Valid parameters as ``[channels, N]`` (``values``: ``[channels, N, P]``), float64."""
         names = psf.FAMILIES[self.family]
         if not isinstance(params, Mapping) or set(params) != set(names):
             got = ", ".join(map(str, params)) if isinstance(params, Mapping) else type(params).__name__
@@ -563,13 +566,13 @@ class BlurTable:
             largest, reach = float(side.abs().max()), float(field.reach(side).max())
             if reach > _WIDEST * largest:
                 raise ValueError(
-                    "field.box must be lengths in the unit of field.coc, got such as "
-                    f"reach to {reach:g} where coc is {largest:g}"
+                    "field.box must be lengths in the unit of field.coc, got a spot that "
+                    f"reaches to {reach:g} where coc is {largest:g}"
                 )
         return field
 
     def _try_kernels(self) -> None:
-        """Refuse parameters whose kernels, at the nodes, between and beyond them, are no numbers or no lens's."""
+        """Refuse parameters whose kernels at, between or beyond the nodes are not finite or far too wide."""
         low, high = _COC_RANGE
         per_px, widest = self.px_per_unit(1.0), 0.0
         for side in (self.coc[self.coc < 0], self.coc[self.coc > 0]):
@@ -579,8 +582,8 @@ class BlurTable:
             reach = psf.support(self.family, self.params(side * per_px, 1.0)) / per_px if len(side) else 0.0
             if reach > _WIDEST * largest:
                 raise ValueError(
-                    "params must be lengths in the unit of coc, got such as "
-                    f"reach to {reach:g} where coc is {largest:g}"
+                    "params must be lengths in the unit of coc, got a kernel that "
+                    f"reaches to {reach:g} where coc is {largest:g}"
                 )
             widest = max(widest, reach)
         if widest == 0.0:
@@ -593,7 +596,7 @@ class BlurTable:
             lengths = {name: value * factor if name in psf.LENGTHS else value for name, value in some.items()}
             if not bool(torch.isfinite(psf.pixel_kernels(self.family, lengths)).all()):
                 named = ", ".join(f"{name} up to {float(value.max()):g}" for name, value in self._params.items())
-                raise ValueError(f"params of {self.family} make kernels that are no numbers: {named}")
+                raise ValueError(f"params of {self.family} make kernels that are not finite: {named}")
 
     def _per_node(self, name: str, value: Sequence[float] | Tensor | None) -> Tensor | None:
         if value is None:
@@ -604,7 +607,7 @@ class BlurTable:
         return numbers
 
     def _side(self, sign: int) -> tuple[Tensor, dict[str, Tensor]] | None:
-        """Nodes of one side of focus by growing ``|coc|``, starting at 0."""
+        """Nodes of one side of focus, ordered by ``|coc|``, with a node at 0; None if the side has no nodes."""
         chosen = self.coc * sign >= 0
         if not bool((self.coc * sign > 0).any()):
             return None
@@ -636,7 +639,7 @@ class BlurTable:
 
 
 def _numbers(name: str, value: Any) -> Tensor:
-    """Finite numbers as a float64 tensor on the CPU, or a refusal by name."""
+    """Finite numbers as a float64 tensor on the CPU; raises ``ValueError`` with the name if they are not."""
     if isinstance(value, list | tuple):
         value = [each.detach() if isinstance(each, Tensor) else each for each in value]
     try:
@@ -644,7 +647,7 @@ def _numbers(name: str, value: Any) -> Tensor:
         if not (floating(numbers) or numbers.dtype in WHOLE_NUMBERS) or numbers.layout != torch.strided:
             raise TypeError
         if not isinstance(value, Tensor):
-            numbers = torch.as_tensor(value, dtype=torch.float64)  # a list would have come as float32
+            numbers = torch.as_tensor(value, dtype=torch.float64)  # the line above made a list float32
         numbers = numbers.detach().to("cpu", torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         raise ValueError(f"{name} must be numbers, got {str(value)[:60]}") from None

@@ -13,7 +13,8 @@ Sign and axis conventions are stated here once; every other module links to this
   with ``(n_x, n_y) = (sin swing cos tilt, sin tilt)`` and ``(x, y)`` the pixel's place from the image's centre, to the
   right and down. All such planes of one tilt meet ``f / sin tilt`` below the lens (the hinge). The image distance is
   that of the lens when it is straight.
-* A range in focus is sharp from end to end; beyond each, blur is that of a lens focused on this end.
+* ``focus_range_m=(near, far)`` is sharp between both distances. Nearer than ``near`` the blur is that of a lens focused
+  on ``near``; farther than ``far``, that of a lens focused on ``far``.
 
 Reference:
     Potmesil and Chakravarty, "A lens and aperture camera model for synthetic image generation", SIGGRAPH 1981.
@@ -50,8 +51,8 @@ class Camera:
         sensor_width_mm: Width of the part of the sensor that the image shows, in millimetres, > 0.
         focus_breathing: True for a real lens, whose image distance ``s f / (s - f)`` grows (and whose field of view
             narrows) as it focuses nearer. False for the convention of computer graphics, which keeps the field of view.
-        focus_range_m: ``(near, far)``: all between these distances is in focus, and blur grows from there on. It takes
-            the place of ``focus_m``, which becomes the distance halfway in ``1 / z``. None is one distance.
+        focus_range_m: ``(near, far)``: everything between these distances is in focus, and blur grows outside of them.
+            It replaces ``focus_m``, which becomes the distance halfway in ``1 / z``. None focuses on ``focus_m``.
         tilt_deg: Degrees by which the lens points down, in (-90, 90): with a positive tilt the plane in focus comes
             nearer towards the bottom of the image, as along the ground. The sensor stays upright.
         swing_deg: Degrees by which the lens points to the right: focus comes nearer towards the right.
@@ -124,7 +125,7 @@ class Camera:
         else:
             half = math.tan(math.radians(fov_x_deg) / 2)
         if not isinstance(half, Tensor) and half < 1e-300:
-            raise ValueError(f"fov_x_deg must be in (0, 180) degrees, got {_show(fov_x_deg)}, which is none")
+            raise ValueError(f"fov_x_deg must be in (0, 180) degrees, got {_show(fov_x_deg)}, which is too small")
         focal_length_mm = 18.0 / half
         f_number = focal_length_mm / (2000.0 * aperture_radius_m)
         return cls(focal_length_mm, f_number, focus_m, 36.0, focus_breathing=False)
@@ -145,8 +146,8 @@ class Camera:
     def coc_px(self, depth: Tensor, width: int) -> Tensor:
         """Signed radius of the circle of confusion.
 
-        Differences of inverse depths are taken as ``(z - s) / (z s)``, which neither cancels near focus nor loses
-        ``z = inf`` or ``s = inf``: exactly 0 at ``z = s`` and exactly ``(A / 2) F / s`` at infinity.
+        Finite distances give ``1/s - 1/z`` as ``(z - s) / (z s)``, which does not cancel near focus. The result is
+        exactly 0 at ``z = s`` and exactly ``(A / 2) F / s`` at infinity.
 
         Args:
             depth: ``[B, 1, H, W]`` (or ``[1, 1, H, W]``, broadcast over the camera's batch), metres, > 0, ``inf``
@@ -155,7 +156,7 @@ class Camera:
 
         Returns:
             ``[B, 1, H, W]`` in pixels; negative in front of the focus plane, positive behind it, NaN where the depth is
-            not > 0. Differentiable with respect to depth and to every tensor of the camera, without what is NaN.
+            not > 0. Differentiable with respect to depth and to every tensor of the camera; NaN pixels have gradient 0.
 
         Raises:
             ValueError: If the depth is not a floating-point tensor, or its batch does not fit the camera's.
@@ -181,7 +182,7 @@ class Camera:
         return torch.where(known, scale * dioptres, torch.nan)
 
     def _compiled_coc_px(self, depth: Tensor, width: int) -> Tensor | None:
-        """The same by the compiled engine, where plain numbers are asked for; None where they are not."""
+        """The same by the compiled engine; None if that does not support the call (traced, batched, tilted, ...)."""
         if is_traced() or depth.dtype != torch.float32 or not is_in_memory(depth) or not native.chosen():
             return None
         ends = self.focus_range_m or (self.focus_m, self.focus_m)
@@ -192,7 +193,7 @@ class Camera:
         return native.coc_px(depth, scale, nearest, farthest) if tilt == swing == 0.0 else None
 
     def _tilted_dioptres(self, depth: Tensor, width: int) -> Tensor | float:
-        """What a tilted lens adds to the inverse of the focus distance at each pixel ``[B, 1, H, W]``, in 1/m."""
+        """Term that a tilted lens adds to ``1/s`` at each pixel, ``[B, 1, H, W]`` in 1/m; 0 for a straight lens."""
         tilt, swing = self.tilt_deg, self.swing_deg
         if not isinstance(tilt, Tensor) and not isinstance(swing, Tensor) and tilt == swing == 0.0:
             return 0.0
@@ -200,7 +201,7 @@ class Camera:
         rows, columns = (
             torch.arange(n, dtype=depth.dtype, device=depth.device) + 0.5 - n / 2 for n in depth.shape[-2:]
         )
-        pitch = width / depth.shape[-1] / _column(self.focal_px(width), depth)  # of the map, at a distance of 1
+        pitch = width / depth.shape[-1] / _column(self.focal_px(width), depth)  # pixel of the map at a distance of 1
         along = torch.sin(swing) * torch.cos(tilt) * columns + torch.sin(tilt) * rows[:, None]
         return along * pitch / _column(self.focal_length_mm / 1000.0, depth)
 
@@ -213,13 +214,13 @@ class Camera:
         """
         if "focus_m" in changes and changes.get("focus_range_m", self.focus_range_m) is not None:
             raise ValueError(
-                "focus_m is told by the camera's focus_range_m, got focus_m as well; "
-                "change focus_range_m, or take it away with camera.replace(focus_range_m=None)"
+                "focus_m is given by the camera's focus_range_m, got focus_m as well; "
+                "change focus_range_m, or remove it with camera.replace(focus_range_m=None)"
             )
         return dataclasses.replace(self, **changes)
 
     def focus_at(self, depth: Tensor, x: float, y: float, patch: int = 5) -> "Camera":
-        """This camera focused on what is seen at a pixel.
+        """This camera focused on the surface at a pixel.
 
         Args:
             depth: ``[B, 1, H, W]``, metres.
@@ -251,8 +252,8 @@ class Camera:
         """This camera focused on a subject: on the median of its depths, each weighted by the mask.
 
         Args:
-            depth: ``[B, 1, H, W]``, metres; what is not > 0 is left out.
-            focus_mask: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, >= 0: how much each pixel is the subject's.
+            depth: ``[B, 1, H, W]``, metres; values that are not > 0 are left out.
+            focus_mask: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, >= 0: weight of each pixel.
 
         Returns:
             A camera with that ``focus_m``: a float for one item, else ``[B]``.
@@ -275,12 +276,12 @@ class Camera:
         return self._focused(depth, mask, "where focus_mask is above 0")
 
     def focus_in(self, depth: Tensor, box: tuple[float, float, float, float]) -> "Camera":
-        """This camera focused on what fills a box, as autofocus does: the median, weighted towards the box's middle.
+        """This camera focused on the content of a box, as autofocus does: the median, weighted towards the middle.
 
-        Weights fall as a Gaussian whose standard deviation is half the box's half sides.
+        Weights are Gaussian; the standard deviation along each axis is a quarter of the box's side.
 
         Args:
-            depth: ``[B, 1, H, W]``, metres; what is not > 0 is left out.
+            depth: ``[B, 1, H, W]``, metres; values that are not > 0 are left out.
             box: ``(left, top, right, bottom)`` in pixels from the frame's top left corner.
 
         Returns:
@@ -310,7 +311,7 @@ class Camera:
         distance = depth
         far = dataclasses.replace(self, focus_m=math.inf, focus_range_m=None)
         shift = far._tilted_dioptres(depth, int(depth.shape[-1]))
-        if isinstance(shift, Tensor):  # smaller by 1 - f / s where the lens breathes
+        if isinstance(shift, Tensor):  # tilted: solve 1/s + shift (1 - f/s) = 1/z for s; the factor only if it breathes
             breathing = 1.0 - _column(self.focal_length_mm / 1000.0, depth) * shift if self.focus_breathing else 1.0
             distance = breathing / (1.0 / depth - shift)
         medians = []
@@ -384,7 +385,7 @@ def _dioptres_behind(z: Tensor, s: Tensor) -> Tensor:
 
 
 def _weighted_median(values: Tensor, weights: Tensor) -> Tensor:
-    """The value ``[]`` up to which half of the weights of values ``[n]`` lie."""
+    """The smallest of ``values`` ``[n]`` at which the cumulative weight reaches half of the total."""
     values, order = values.sort()
     summed = weights[order].double().cumsum(0)
     return values[int((summed >= 0.5 * summed[-1]).nonzero()[0])]
@@ -419,7 +420,7 @@ def _check_number(name: str, value: Number) -> None:
         raise ValueError(
             f"{name} must be positive{'' if name in _MAY_BE_INFINITE else ' and finite'}, got {show(value)}"
         )
-    # compared, not asked for: in compiled code a number that differs between two cameras is a variable
+    # compares with inf instead of math.isfinite: torch.compile can then treat the number as a variable
     if not good or (
         name not in _MAY_BE_INFINITE and (_largest(value) if isinstance(value, Tensor) else value) == math.inf
     ):
@@ -429,7 +430,7 @@ def _check_number(name: str, value: Number) -> None:
 
 
 def _check_angle(name: str, value: Number) -> None:
-    """Refuse an angle that is none, or turns the lens away."""
+    """Refuse an angle that is not a number, or not in (-90, 90) degrees."""
     shaped = isinstance(value, Tensor) and value.ndim <= 1 and floating(value) and value.numel() > 0
     plain = isinstance(value, int | float) and not isinstance(value, bool)
     if not shaped and not plain:
@@ -439,7 +440,7 @@ def _check_angle(name: str, value: Number) -> None:
 
 
 def _checked_range(value: Any) -> tuple[Number, Number]:
-    """The ends of a range in focus, or a refusal."""
+    """The ends ``(near, far)`` of a focus range; raises ``ValueError`` if it is not one."""
     if not isinstance(value, tuple | list) or len(value) != 2:
         raise ValueError(f"focus_range_m must be (near, far) in metres, got {show(value)}")
     near, far = value
@@ -451,7 +452,7 @@ def _checked_range(value: Any) -> tuple[Number, Number]:
 
 
 def _check_map(name: str, value: Any) -> None:
-    """Refuse what is no map ``[B, 1, H, W]``."""
+    """Refuse a value that is not a map ``[B, 1, H, W]``."""
     real_tensor(name, value, "[B, 1, H, W]" + (" in metres" if name == "depth" else ""))
     if value.ndim != 4 or value.shape[1] != 1 or not value.numel():
         unit = " in metres" if name == "depth" else ""
@@ -459,7 +460,7 @@ def _check_map(name: str, value: Any) -> None:
 
 
 def _column(value: Number, like: Tensor) -> Tensor:
-    """A camera number as ``[B, 1, 1, 1]`` (or a scalar) in the type of ``like``, checked against its batch."""
+    """A camera number as ``[B, 1, 1, 1]`` or a scalar, in the dtype of ``like``; its batch must fit ``like``."""
     if not isinstance(value, Tensor):
         return torch.as_tensor(value, dtype=like.dtype, device=like.device)
     value = value.to(dtype=like.dtype, device=like.device)

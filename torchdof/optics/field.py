@@ -1,13 +1,17 @@
-"""Across the field: where a lens's light falls that comes from off its axis, traced or measured.
+"""Blur across the field: the spots of a lens off its axis, traced or measured.
 
-Off its axis a lens blurs otherwise than on it: its barrel cuts cat's eyes, its focus shifts (field curvature), up and
-down otherwise than across (astigmatism), light trails outwards (coma) and each colour by itself (lateral colour). All
-of it is a spot that turns with the azimuth and is mirrored at the line to the middle of the frame. So half a spot each
-is kept, over the signed circle of confusion and the distance from the middle, in coordinates ``u`` away from the middle
-and ``v`` across. Their origin is where the sharp image shows the point.
+Away from the middle of the frame the blur of a lens changes: its barrel cuts cat's eyes, its focus shifts (field
+curvature) and differs between the radial and the tangential direction (astigmatism), light trails outwards (coma), and
+colours separate (lateral colour).
 
-A spot is a histogram in a box that just holds it. Between nodes boxes and histograms are linear in the signed coc and
-in the distance; beyond the last coc of a side boxes grow with it, and beyond the last distance all stays as it is.
+The *spot*, the image of a point, holds all of that. Because a lens is rotationally symmetric, the spot depends only on
+the signed circle of confusion and on the distance from the middle of the frame; it turns with the azimuth, and is
+symmetric about the line to the middle. So half of each spot is stored, with ``u`` pointing away from the middle and
+``v`` across. The origin is the place of the point in the sharp image.
+
+A spot is a histogram in the smallest box that contains it. Boxes and histograms are interpolated linearly in the signed
+coc and in the distance. Beyond the last coc of a side, boxes grow in proportion to the coc; beyond the last distance
+the last spots are used.
 """
 
 import base64
@@ -27,10 +31,10 @@ from ..validation import real_tensor, show
 
 __all__ = ["Field"]
 
-_STEPS = 65535  # that the brightest cell of a spot counts in a file
-_MOST_CELLS = 2**25  # in a file
-_LIT = 1e-3  # of the brightest cell
-_LEAST_SIDE = 1e-6  # of the largest box: a spot has a size
+_STEPS = 65535  # integer value of the brightest cell of a spot in a file
+_MOST_CELLS = 2**25  # largest number of cells in a file
+_LIT = 1e-3  # share of the brightest cell; darker cells do not count for the reach of a spot
+_LEAST_SIDE = 1e-6  # smallest side of a box, relative to the largest; avoids a division by 0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -38,14 +42,13 @@ class Field:
     """Spots of a lens over the signed circle of confusion and the distance from the middle of the frame.
 
     Args:
-        coc: Signed coc of the nodes ``[K]``, strictly increasing, from in front of the focus plane to behind it; in the
-            table's unit, as all lengths.
+        coc: Signed coc of the nodes ``[K]``, strictly increasing, from in front of the focus plane to behind it. This
+            and all lengths are in the table's unit.
         radius: Distances from the middle of the frame ``[F]``, strictly increasing from 0.
-        box: Each spot's box ``[K, F, 3]``: its middle away from the middle of the frame, half its length along that
-            direction, and half its width.
-        light: Light in the cells of half of each box ``[channels, K, F, U, V]``, or of all channels
-            ``[K, F, U, V]``: U from the end next to the middle of the frame outwards, V from the line to the middle to
-            one side. Each spot is made to sum to 1.
+        box: Box of each spot ``[K, F, 3]``: centre in u, half length in u, half width in v.
+        light: Light in the cells of the half of each box with ``v >= 0``: ``[channels, K, F, U, V]``, or
+            ``[K, F, U, V]`` for all channels. U increases away from the middle of the frame, V away from the symmetry
+            line. Each spot is normalised to a sum of 1.
 
     Raises:
         ValueError: If a field is not as described; the message names it.
@@ -99,7 +102,7 @@ class Field:
 
     @property
     def channels(self) -> int:
-        """Spots at a node: 1, or the number of image channels that are blurred differently."""
+        """Number of spots at a node: 1, or one for each channel of the image."""
         return self.light.shape[0]
 
     def spots(self, coc: float, radius: Tensor) -> tuple[Tensor, Tensor]:
@@ -117,7 +120,7 @@ class Field:
         )
 
     def reach(self, coc: Tensor) -> Tensor:
-        """Distances from the origin that hold all spots of signed coc ``[n]``."""
+        """Radius around the origin that contains all spots of each signed coc ``[n]``."""
         coc = coc.to(torch.float64)
         beyond = torch.maximum(coc / self.coc[-1], coc / self.coc[0]).clamp_min(1.0)
         low, part = _between(self.coc, coc)
@@ -125,7 +128,7 @@ class Field:
 
     @functools.cached_property
     def _reaches(self) -> Tensor:
-        """Distance from the origin that holds all spots of a node ``[K]``: their lit cells."""
+        """Radius around the origin that contains the lit cells of all spots with the coc of each node: ``[K]``."""
         length, width = self.light.shape[-2:]
         u = torch.linspace(-1.0, 1.0, length + 1, dtype=torch.float64) * self.box[..., 1:2] + self.box[..., :1]
         farthest = torch.maximum(u[..., 1:].abs(), u[..., :-1].abs())
@@ -134,7 +137,7 @@ class Field:
         return torch.where(lit, torch.hypot(farthest[..., None], v[..., None, :]), 0.0).amax((0, 2, 3, 4))
 
     def finest(self, coc: float) -> float:
-        """Radius of the disc about as fine as the spot of a signed coc in the middle of the frame."""
+        """Radius of the disc with detail about as fine as the spot of a signed coc in the middle of the frame."""
         box, light = self.spots(coc, self.radius[:1])
         return float(2.0 * deviations(box, light).amin())
 
@@ -148,8 +151,8 @@ class Field:
     def to_dict(self) -> dict[str, Any]:
         """The field as JSON-like data, the inverse of :meth:`from_dict`.
 
-        The light of each spot is in whole steps, 65535 to its brightest cell, as little-endian 16 bit numbers, deflated
-        (RFC 1950) and as base64; ``shape`` tells their axes, ``[channels, K, F, U, V]``.
+        ``light`` holds integers from 0 to 65535 for the brightest cell of each spot: little-endian 16 bit, deflated
+        (RFC 1950), base64. ``shape`` is ``[channels, K, F, U, V]``.
         """
         light = self.light / self.light.amax((-2, -1), keepdim=True)
         steps = (light * _STEPS).round().to(torch.int32).numpy().astype("<u2")
@@ -187,7 +190,7 @@ class Field:
         except (TypeError, ValueError, zlib.error):
             raise ValueError("field.light must be deflated numbers of 16 bit as base64 text") from None
         if len(cells) != count:
-            raise ValueError(f"field.light must hold {count} bytes, as field.shape tells, got {len(cells)}")
+            raise ValueError(f"field.light must hold {count} bytes for field.shape, got {len(cells)}")
         light = np.frombuffer(cells, "<u2").astype(np.float64).reshape(shape)
         return cls(**values, light=torch.from_numpy(light))
 
@@ -196,9 +199,11 @@ class Field:
 
 
 def deviations(box: Tensor, light: Tensor) -> Tensor:
-    """Standard deviations ``[n, 2]`` along u and v of spots' light ``[channels, n, U, V]``, the least of the channels.
+    """Standard deviations ``[n, 2]`` along u and v of spots, the smallest of the channels.
 
-    That along v is taken about the line to the middle of the frame.
+    Args:
+        box: Boxes ``[n, 3]`` of the spots.
+        light: Their light ``[channels, n, U, V]``, each spot with sum 1. Along v the deviation is about ``v = 0``.
     """
     length, width = light.shape[-2:]
     u = (torch.arange(length, dtype=torch.float64, device=light.device) + 0.5) * (2.0 / length) - 1.0
@@ -210,6 +215,6 @@ def deviations(box: Tensor, light: Tensor) -> Tensor:
 
 
 def _between(nodes: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
-    """Node before each place and how far on the way to the next one it lies, 0 to 1."""
+    """Index of the node before each place, and the weight in [0, 1] of the next node."""
     low = (torch.searchsorted(nodes, place.contiguous(), right=True) - 1).clamp(0, len(nodes) - 2)
     return low, ((place - nodes[low]) / (nodes[low + 1] - nodes[low])).clamp(0.0, 1.0)

@@ -1,17 +1,20 @@
-"""Kernels at the cost of two small matrix products, for every picture is a first one, with blurs that no cache holds.
+"""Kernels of any radius from templates, by two small matrix products.
 
-:func:`torchdof.optics.psf.pixel_kernels` integrates a PSF over square *cells*, ``n`` from its centre to its end, and
-then over the interpolator ``phi`` of each pixel. How much light a cell holds does not depend on the size of the PSF.
-So that part, the *template* ``T``, is made once for each node of a table. A kernel of any radius follows from it:
+A cache of finished kernels would not help, because a new camera blurs by new radii. But
+:func:`torchdof.optics.psf.pixel_kernels` works in two steps, of which the first does not depend on the radius. It
+integrates a PSF over square *cells*, ``n`` from the centre to the end of the PSF, and then weights them with the
+interpolator ``phi`` of each pixel. The light in the cells, the *template* ``T``, is computed once for each node of a
+table. A kernel of any radius is then
 
     ``K = A T B'``  with  ``A[m, i] = phi(m - i h)``,  ``B[m, i] = phi(m - i w)``
 
-for cells ``h`` pixels high and ``w`` pixels wide. ``K`` is then limited, made non-negative and scaled to a sum of 1, as
-there. Templates have 16, 32, 64, 128 or 256 cells. The one used has cells of half a pixel to a pixel, and the next
-finer one fades in from three quarters of a pixel on: kernels are continuous functions of the radius. A PSF of more than
-256 pixels is sampled linearly from its template.
+for cells ``h`` pixels high and ``w`` pixels wide. As in ``pixel_kernels``, ``K`` is limited, made non-negative and
+scaled to a sum of 1.
 
-Between two nodes of a table the template is the mean of theirs, and its size that of the interpolated parameters.
+* Templates have 16, 32, 64, 128 or 256 cells. The one in use has cells of half a pixel to a pixel. The next finer one
+  is blended in while cells grow from 0.75 to 1 pixel, so that kernels are continuous functions of the radius. A PSF of
+  more than 256 pixels is sampled linearly from its template.
+* Between two nodes of a table, templates are interpolated linearly, and the radius follows the interpolated parameters.
 
 The compiled engine makes the same kernels from the same templates (``native/src/kernels.cpp``).
 """
@@ -37,21 +40,24 @@ LEAST_CELLS = 16
 """Cells from the centre to the end of a PSF in the coarsest template."""
 
 _LEVELS = 5  # templates of 16, 32, 64, 128 and 256 cells
-_FADES_FROM = 0.75  # px of a cell; from there to 1 px the next finer template fades in
-_SMALLEST = 1e-7  # px; a smaller PSF counts as one of that size, whose kernel is a single pixel
-_BANKS = 32  # tables whose nodes are kept
+_FADES_FROM = 0.75  # px a cell; from here to 1 px the next finer template is blended in
+_SMALLEST = 1e-7  # px; a smaller PSF is rendered with this radius, whose kernel is a single pixel
+_BANKS = 32  # banks kept in memory
 SPOT_MARGIN_PX = 1.0
-"""Pixels around a spot of a field, none of whose light is at the border of its samples."""
+"""Empty margin in pixels around a spot of a field, so that its samples fall to 0 at their border."""
 
 FADE_IN = 4.0
-"""How much faster than a disc's blur the blur of a table in focus fades in, by the square of the coc in pixels."""
+"""Weight of a table's own blur in focus, over ``coc_px^2 / M`` with ``M`` the share of light that this blur moves.
 
-_WIDTHS = 64  # widths of images for which a table's blur in focus is kept
+A larger value makes the blur complete at a smaller circle of confusion.
+"""
+
+_WIDTHS = 64  # image widths for which the blur in focus is kept
 _templates = KernelCache(128 * 2**20)
 
 
 class Lens(Protocol):
-    """What a bank asks of a table: :class:`torchdof.BlurTable`."""
+    """The part of :class:`torchdof.BlurTable` that a bank uses."""
 
     family: str
     unit: str
@@ -65,36 +71,35 @@ class Lens(Protocol):
 
     @property
     def is_round(self) -> bool:
-        """Whether kernels are the same turned by half."""
+        """Whether kernels equal their point reflection."""
 
     def fingerprint(self) -> str:
-        """Hash of all that kernels depend on."""
+        """Hash of all numbers that kernels depend on."""
 
     def px_per_unit(self, width: float) -> float:
-        """Pixels of an image of a width that the table's unit is long."""
+        """Length of the table's unit in pixels of an image ``width`` pixels wide."""
 
     def side_nodes(self, sign: int) -> tuple[Tensor, dict[str, Tensor]]:
         """Unsigned coc and parameters of the nodes of one side of focus."""
 
     def moved_in_focus(self, width: float) -> Tensor:
-        """Share of its light that the kernel in focus moves."""
+        """Share of the light that the kernel in focus moves to other pixels."""
 
 
 class Spots(NamedTuple):
-    """What the kernels of n circles of confusion are made from, with C colours: plain numbers, for n is small.
+    """Recipe for the kernels of n circles of confusion and C colours, as plain numbers because n is small.
 
     Args:
-        templates: Cells of the templates in use, each ``[C, 2 n + 3, 2 n + 3]``, float32.
-        which: Which of these, four for each kernel: those of the nodes below and above, and the same of the next finer
-            level.
-        part: How far each lies from the node below to the one above, 0 to 1.
-        finer: Share of the finer level, 0 to 1.
+        templates: Cells of the templates in use, each ``[C, 2 cells + 3, 2 cells + 3]``, float32.
+        which: Four indices into ``templates`` for each kernel: node below and above, and both of the next finer level.
+        part: Weight of the node above, in [0, 1].
+        finer: Weight of the finer level, in [0, 1].
         reach: Radius of the PSF in pixels, C for each kernel.
-        fade: Share of the kernel, the rest being a single pixel, C for each.
-        flipped: Whether the kernel is turned by half.
-        half: Pixels that the kernel reaches to each side; what reaches farther is cut off.
-        moves: What to add to ``part`` ``[n]`` and ``reach`` ``[n, C]``: zeros that have the gradients to the coc. None
-            where no gradient is taken.
+        fade: Weight of the kernel against a single pixel, in [0, 1], C for each kernel.
+        flipped: Whether the kernel is point-reflected.
+        half: Half width of each kernel in pixels; light beyond it is cut off.
+        moves: Zeros to add to ``part`` ``[n]`` and ``reach`` ``[n, C]``, through which gradients flow to the coc; None
+            without gradients.
     """
 
     templates: list[Tensor]
@@ -109,15 +114,15 @@ class Spots(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """Where a coc lies in a table, and how large its PSF is.
+    """Position of a coc among the nodes of a table, and the radius of its PSF.
 
     Args:
         side: 0 in front of focus, 1 behind it.
-        node: The node below.
-        part: Part of the way to the next one.
+        node: Index of the node below.
+        part: Weight of the next node, in [0, 1].
         reach: Radius of the PSF of each colour, in pixels.
-        part_slope: What the part gains with a pixel of ``|coc|``.
-        reach_slopes: What each reach gains with it.
+        part_slope: Derivative of ``part`` with respect to ``|coc|`` in pixels.
+        reach_slopes: Derivative of each ``reach`` with respect to it.
     """
 
     side: int
@@ -129,12 +134,12 @@ class _Place(NamedTuple):
 
 
 def bank_of(table: Lens) -> "KernelBank":
-    """The bank of a table; tables of the same numbers share it."""
-    return _bank(table.fingerprint(), _Same(table))
+    """The bank of a table; tables with the same fingerprint share it."""
+    return _bank(table.fingerprint(), _Uncompared(table))
 
 
-class _Same:
-    """A table as an argument that does not count for :func:`functools.lru_cache`: its fingerprint does."""
+class _Uncompared:
+    """Passes a table through :func:`functools.lru_cache`, which then compares only the fingerprint beside it."""
 
     def __init__(self, table: Lens) -> None:
         self.table = table
@@ -147,19 +152,19 @@ class _Same:
 
 
 @functools.lru_cache(_BANKS)
-def _bank(fingerprint: str, same: _Same) -> "KernelBank":
-    return KernelBank(same.table)
+def _bank(fingerprint: str, uncompared: _Uncompared) -> "KernelBank":
+    return KernelBank(uncompared.table)
 
 
 class KernelBank:
-    """Kernels of a table from templates that are made when they are first needed.
+    """Kernels of a table from templates that are computed when they are first needed.
 
-    All banks together keep up to 128 MB of templates, those used latest. Thread-safe: two threads that miss a template
-    at once both make it. Kernels are those of the middle of the frame; of a table with a field they are even light as
-    far as its spots reach, of which :mod:`torchdof.optics.placed_kernels` takes shares.
+    All banks together keep up to 128 MB of templates, the most recently used ones. Thread-safe: two threads that miss
+    the same template at once both compute it. Kernels are those of the middle of the frame. For a table with a field
+    they are uniform discs as large as its spots, which :mod:`torchdof.optics.placed_kernels` multiplies by the spots.
 
     Args:
-        table: Its aperture's rotation and squeeze are taken as numbers, without gradients.
+        table: The rotation and squeeze of its aperture are used as numbers, without gradients.
     """
 
     def __init__(self, table: Lens) -> None:
@@ -176,7 +181,7 @@ class KernelBank:
         self._nodes = [nodes for _, nodes in sides]
         self._distances: list[list[float]] = [distances.tolist() for distances, _ in sides]
         self._reaches: list[list[list[float]]] = [each.tolist() for each in reaches]
-        # a node without size has the shape of the next one
+        # a node of size 0 has no shape: use that of the next node
         self._shapes = [
             [j + 1 if j + 1 < each.shape[1] and not bool(each[:, j].any()) else j for j in range(each.shape[1])]
             for each in reaches
@@ -203,14 +208,14 @@ class KernelBank:
     def spots(
         self, coc_px: Tensor | Sequence[float], width: float, scale: Sequence[float] = (), longest: Sequence[int] = ()
     ) -> Spots:
-        """What kernels are made from.
+        """The recipe of kernels: templates, weights, radii.
 
         Args:
             coc_px: Signed coc ``[n]`` in pixels of the image.
             width: Width of the image in pixels.
-            scale: Kernels are for every ``scale``-th pixel, n of them; empty stands for 1.
-            longest: Pixels of these that the longer side of the frame has, n of them: kernels are cut to what reaches
-                from one to another. Empty leaves them whole.
+            scale: Downsampling factor of each kernel's layer, n of them; empty means 1.
+            longest: Longer side of the frame in downsampled pixels, n of them: a half width is limited to one less.
+                Empty leaves the kernels whole.
         """
         cocs = coc_px.detach().to("cpu", torch.float64).tolist() if isinstance(coc_px, Tensor) else list(coc_px)
         scales = list(scale) or [1.0] * len(cocs)
@@ -224,7 +229,7 @@ class KernelBank:
         spots = Spots([], [], [], [], [], [], [], [], None)
         for coc, size, place in zip(cocs, scales, places, strict=True):
             reach, finer, index = [r / size for r in place.reach], 0.0, (0, 0, 0, 0)
-            if self.is_even:  # a spot, as pixels see it; in focus a single one
+            if self.is_even:  # a spot and its margin; a single pixel in focus
                 reach = [0.0 if coc == 0 else r + math.sqrt(2.0) * SPOT_MARGIN_PX for r in reach]
                 half = math.floor(max(reach))
             else:
@@ -264,13 +269,13 @@ class KernelBank:
     ) -> Tensor:
         """Kernels ``[n, C, k, k]``, float64 on the CPU, as :meth:`torchdof.BlurTable.kernels` has them.
 
-        They are as wide as the widest of them, non-negative, and each sums to 1, but for what is cut off. Arguments are
-        those of :meth:`spots`. Differentiable in ``coc_px``.
+        All have the width of the widest. They are non-negative; each sums to 1, minus the light that is cut off.
+        Arguments as in :meth:`spots`. Differentiable in ``coc_px``.
         """
         return self.of_spots(self.spots(coc_px, width, scale, longest))
 
     def of_spots(self, spots: Spots) -> Tensor:
-        """The kernels of :meth:`kernels`, from what :meth:`spots` gives."""
+        """The kernels of :meth:`kernels`, from the result of :meth:`spots`."""
         half = max(spots.half)
         numbers = (spots.part, spots.finer, spots.reach, spots.fade, spots.half)
         parts, finer, reach, fade, halves = (torch.tensor(each, dtype=torch.float64) for each in numbers)
@@ -304,18 +309,18 @@ class KernelBank:
     def _sampled(self, cells: Tensor, reach: Tensor, outside: Tensor, cut: Tensor) -> Tensor:
         """Kernels ``[n, C, k, k]`` from templates ``[n, C, cells, cells]`` and reach ``[n, C]``.
 
-        They are 0 at the pixels ``outside`` ``[n, 1, k, k]``. Those that are ``cut`` have their share of the light.
+        They are 0 at the pixels ``outside`` ``[n, 1, k, k]``. Each sums to 1; those with ``cut`` to the light inside.
         """
         high = reach / (cells.shape[-1] // 2 - 1)
         wide = high / self.squeeze
         kernel = psf.sampled(cells, high, high if self.squeeze == 1.0 else wide, outside.shape[-1] // 2)
         kernel = kernel.masked_fill(outside, 0.0)
-        light = cells.sum((-2, -1)) * high.clamp_min(1.0) * wide.clamp_min(1.0)  # of all pixels
+        light = cells.sum((-2, -1)) * high.clamp_min(1.0) * wide.clamp_min(1.0)  # sum of the uncut kernel
         light = torch.where(cut, light, kernel.sum((-2, -1)))
         return kernel / light[..., None, None]
 
     def variance_px(self, coc_px: float, width: float, scale: float) -> float:
-        """Second moment of a kernel, mean of both axes and of colours, in squares of ``scale`` pixels."""
+        """Second moment of a kernel, mean of both axes and of colours, in squared pixels of a layer (``scale`` px)."""
         place = self._place(coc_px, width)
         low, high = (self._light_and_moment(place.side, place.node + above) for above in (0, 1))
         total = 0.0
@@ -336,10 +341,10 @@ class KernelBank:
         return self._sums[key]
 
     def kept(self, sign: float, find: Callable[["KernelBank", float, float], float]) -> float:
-        """A number that a function finds of the blur on one side of focus, found once.
+        """A number that depends only on the blur on one side of focus, computed by ``find`` once.
 
-        The function takes this bank, a coc of 1 or -1 pixel, and the width in pixels of an image in which that is the
-        coc of the side's last node.
+        ``find(bank, coc_px, width)`` gets a coc of 1 or -1 pixel, and the image width at which that is the coc of the
+        last node of the side.
         """
         sign = 1.0 if self._mirrored and self.table.is_round else sign
         if sign not in self._found:
@@ -355,7 +360,7 @@ class KernelBank:
         return psf.template(self.table.family, params, LEAST_CELLS << level, self.table.aperture).float().contiguous()
 
     def _fade(self, coc_px: float, width: float) -> list[float]:
-        """Share of a kernel of each colour, the rest being a single pixel: below 1 where a blur in focus fades in."""
+        """Weight of the kernel of each colour against a single pixel; below 1 where a blur in focus fades in."""
         if self.table.is_sharp_in_focus or self.is_even:
             return [1.0] * self.colours
         if width not in self._moved:

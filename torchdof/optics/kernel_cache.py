@@ -1,4 +1,4 @@
-"""What is computed once of a lens and kept: bounded by bytes, not by entries, for a kernel takes bytes or megabytes."""
+"""A cache of kernels, limited by bytes instead of entries because a kernel takes from a few bytes to megabytes."""
 
 import functools
 import threading
@@ -13,7 +13,7 @@ from ..tensors import is_fake, is_traced
 
 __all__ = ["KernelCache", "kept"]
 
-_ENTRY_BYTES = 512  # of a key and what belongs to it
+_ENTRY_BYTES = 512  # counted for a key and its dictionary entry, besides the tensors
 
 _CONSTANT_BYTES = 16 * 2**20  # of all functions that are kept
 
@@ -23,10 +23,10 @@ Kept = TypeVar("Kept", Tensor, tuple[Tensor, ...], float)
 
 
 class KernelCache:
-    """Results by what they were made from; beyond a number of bytes the one unused for longest goes. Thread-safe.
+    """A least-recently-used cache. Thread-safe.
 
     Args:
-        limit_bytes: Of all results together; one that alone is larger is not kept.
+        limit_bytes: Largest size of all results together; a single result that is larger is not kept.
 
     Example:
         >>> cache = KernelCache(2**20)
@@ -40,14 +40,14 @@ class KernelCache:
         self._lock = threading.Lock()
 
     def get(self, key: Hashable, make: Callable[[], Kept]) -> Kept:
-        """What is kept under a key, made first where there is nothing.
+        """The result stored under ``key``; calls ``make`` if there is none.
 
-        Two threads that miss at once both make it, and one result is kept.
+        Two threads that miss the same key at once both call ``make``; one result is kept.
         """
         return self.get_all([key], lambda _: [make()])[0]
 
     def get_all(self, keys: Sequence[_Key], make: Callable[[list[_Key]], Sequence[Kept]]) -> list[Kept]:
-        """The same for several keys, no two of them alike; ``make`` makes what is missing of them together."""
+        """The results of several distinct keys; one call of ``make`` computes those of all missing keys."""
         results: dict[_Key, Any] = {}
         with self._lock:
             for key in keys:
@@ -70,7 +70,7 @@ class KernelCache:
 
 
 def _unwrapped(made: Any) -> Any:
-    """What was made, outside of every transform of torch.func: it is wrapped by them, though it depends on no input."""
+    """A result without the wrappers of torch.func, which wraps every tensor, also one that depends on no input."""
     if isinstance(made, tuple):
         return tuple(map(_unwrapped, made))
     while isinstance(made, Tensor) and torch._C._functorch.is_functorch_wrapped_tensor(made):

@@ -1,16 +1,20 @@
-"""Kernels that depend on the place in the frame: a kernel times what the field lets through, turned by the azimuth.
+"""Kernels that depend on the place in the frame: a kernel of the middle times a mask, turned by the azimuth.
 
-A lens is round. So what it does off its axis is told along one line from the middle of the frame, at a few distances
-from it, in coordinates ``u`` away from the middle and ``v`` across (:mod:`torchdof.optics.field`). The kernel of a
-place is the table's own at each pixel times the *share* there: of two distances the mean, turned by the place's
-azimuth, sampled linearly. Then its light is made whole again: how much darker corners are, the sharp image shows
+A lens is rotationally symmetric. So the masks, called *shares* and in [0, 1], are computed only along one line from the
+middle of the frame, at a few distances, in coordinates ``u`` away from the middle and ``v`` across
+(:mod:`torchdof.optics.field`). The kernel ``K_p`` of a place ``p`` is
+
+    ``K_p[m] = K[m] share_p(m) / sum_m K[m] share_p(m)``
+
+with ``K`` the kernel of the middle, and ``share_p`` interpolated between two distances, turned by the azimuth of ``p``
+and sampled bilinearly at the pixels. The division keeps the light: the sharp image shows the darkening of the corners
 already.
 
-* Traced and measured spots: the table's kernel is even light, the share the spot itself, seen by a pixel.
-* Cat's eyes (``vignetting=``): the table's kernel is that of the middle of the frame, with all its blades. A ray
-  through the point ``w`` of the aperture, to a place ``p`` in the frame (from its middle, in half diagonals), passes
-  where ``|w + 2 front p| <= 1`` and ``|w - 2 rear p| <= 1``: a rim in front of the aperture and one behind it cut.
-  The share is the distance in pixels to the nearer rim's edge, plus half a pixel, from 0 to 1.
+* Traced and measured spots: ``K`` is a uniform disc, and the share is the spot itself, averaged over a pixel.
+* Cat's eyes (``vignetting=``): ``K`` has the whole opening. A ray through the point ``w`` of the aperture to a place
+  ``p`` in the frame (from its middle, in half diagonals) passes where ``|w + 2 front p| <= 1`` and
+  ``|w - 2 rear p| <= 1``: it is cut by a rim in front of the aperture and one behind it. The share is the signed
+  distance in pixels to the edge of the nearer rim, plus half a pixel, clamped to [0, 1].
 """
 
 import dataclasses
@@ -29,21 +33,21 @@ from .kernel_cache import KernelCache
 __all__ = ["DISTANCES", "Shares", "layer_shares", "placed", "placed_between", "ray_shares"]
 
 DISTANCES = 17
-"""Distances from the middle of the frame to its corner at which shares are told."""
+"""Number of distances, from the middle of the frame to its corner, at which shares are computed."""
 
-_FINE = 4.0  # samples a pixel
-_MOST = 64  # samples on each side of the origin
-_LEAST_SEEN = 0.5  # px around a sample
-_ASIDE = 1e-6  # half diagonals: the middle of the frame has an azimuth
-_SMALLEST = 1e-6  # px of blur, that a spot has a size
-_LEAST = 1e-6  # of a kernel; where less passes it stays whole
-_LEAST_SIZE = 0.5  # of a spot, which is made smaller by what pixels add to it
-_RAY_STEP = 1.09  # between radii of highlights for which shares are told
+_FINE = 4.0  # samples of a share per pixel
+_MOST = 64  # most samples on each side of the origin
+_LEAST_SEEN = 0.5  # px; smallest width over which a sample averages the spot
+_ASIDE = 1e-6  # half diagonals; offset that gives the middle of the frame an azimuth
+_SMALLEST = 1e-6  # px; smallest scale of a spot, so that boxes have a size in focus
+_LEAST = 1e-6  # share of a kernel's light; where less passes, the kernel is not masked
+_LEAST_SIZE = 0.5  # smallest scale of a spot, which is shrunk by the blur that sampling adds
+_RAY_STEP = 1.09  # ratio of neighbouring radii at which the shares of highlights are computed
 _shares = KernelCache(128 * 2**20)
 
 
 class PlacedLens(Lens, Protocol):
-    """What shares are made of: :class:`torchdof.BlurTable`."""
+    """The part of :class:`torchdof.BlurTable` that shares are computed from."""
 
     def reach_px(self, coc_px: float, width: float) -> float:
         """Radius in pixels that holds the kernels at ``+-coc_px``."""
@@ -51,15 +55,15 @@ class PlacedLens(Lens, Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Shares:
-    """What the field lets through, of one radius.
+    """Masks for the kernels of one signed circle of confusion, at :data:`DISTANCES` distances.
 
     Args:
-        values: ``[1 or C, distances, rows, columns]``: rows along u, from the end next to the middle of the frame, and
-            columns along v from 0; :data:`DISTANCES` of them, evenly from the middle of the frame to its corner.
-        boxes: Where these lie ``[distances, 3]``: their middle in u, half their length in u and their width in v, in
-            pixels of the kernel.
-        coc_px: The radius, signed, in such pixels.
-        squeeze: Height of the blur over its width: of places across, the share is that of so many times as far.
+        values: ``[1 or C, distances, rows, columns]``; rows along increasing u, columns along v from 0. Distances are
+            spaced evenly from the middle of the frame to its corner.
+        boxes: Extent of the values ``[distances, 3]``: centre in u, half length in u and width in v, in pixels of the
+            kernel.
+        coc_px: Signed circle of confusion in pixels of the kernel.
+        squeeze: Height of the blur over its width; horizontal offsets are multiplied by it before the lookup.
     """
 
     values: Tensor
@@ -68,7 +72,7 @@ class Shares:
     squeeze: float | Tensor = 1.0
 
     def to(self, like: Tensor) -> "Shares":
-        """The same in the type and on the device of a tensor."""
+        """The same with the dtype and device of ``like``."""
         return dataclasses.replace(
             self, values=self.values.to(like).contiguous(), boxes=self.boxes.to(like).contiguous()
         )
@@ -78,25 +82,28 @@ def layer_shares(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, 
     """Shares of a layer.
 
     Args:
-        table: One that depends on the place.
+        table: A table with ``depends_on_place``.
         coc_px: Signed coc in pixels of the image.
-        scale: Every so many pixels of the image are one of the layer's.
+        scale: Downsampling factor of the layer.
         size: Height and width of the image.
     """
     key = ("layer", table.fingerprint(), coc_px, scale, size)
-    values, boxes = _shares.get(key, lambda: _made(table, coc_px, scale, size))
+    values, boxes = _shares.get(key, lambda: _computed(table, coc_px, scale, size))
     return Shares(values, boxes, coc_px / scale, _squeeze(table))
 
 
 def ray_shares(table: PlacedLens, coc_px: Sequence[float], size: tuple[int, int]) -> list[Shares]:
-    """Shares for highlights of so many signed coc, by growing coc: those of two fixed radii around each of them."""
+    """Shares for highlights with signed ``coc_px``, ordered by coc.
+
+    They are computed at fixed radii, powers of ``_RAY_STEP``: the two around each highlight.
+    """
     steps = set()
     for coc in coc_px:
         step = math.floor(math.log(max(abs(coc), 1.0)) / math.log(_RAY_STEP))
         steps |= {(coc < 0, step), (coc < 0, step + 1)}
     radii = sorted(math.copysign(_RAY_STEP**step, -1.0 if near else 1.0) for near, step in steps)
     keys = [("ray", table.fingerprint(), radius, 1, size) for radius in radii]
-    made = _shares.get_all(keys, lambda missing: [_made(table, key[2], 1, size) for key in missing])
+    made = _shares.get_all(keys, lambda missing: [_computed(table, key[2], 1, size) for key in missing])
     squeeze = _squeeze(table)
     return [Shares(values, boxes, radius, squeeze) for (values, boxes), radius in zip(made, radii, strict=True)]
 
@@ -105,18 +112,25 @@ def _squeeze(table: PlacedLens) -> float | Tensor:
     return 1.0 if table.aperture is None else table.aperture.squeeze
 
 
-@torch.inference_mode(False)  # what is kept must serve autograd as well
-def _made(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Values and boxes of :class:`Shares`, float64."""
+@torch.inference_mode(False)  # cached tensors must be usable by autograd
+def _computed(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Values and boxes of :class:`Shares`, float64.
+
+    For the spots of a field:
+
+    1. Take boxes and light at each distance, in pixels of the layer, shrunk to 0 in focus.
+    2. Shrink the boxes so that the blur that downsampling and sampling add leaves the right variance.
+    3. Average the cells of each spot over the pixel around each sample, and scale the maximum to 1.
+    """
     half_diagonal = 0.5 * math.hypot(*size)
     distance = torch.linspace(0.0, 1.0, DISTANCES, dtype=torch.float64)
     if table.field is None:
         return _through_rims(table, coc_px / scale, size[1] / scale, distance)
     per_unit = table.px_per_unit(size[1])
     boxes, light = table.field.spots(coc_px / per_unit, distance * half_diagonal / per_unit)
-    # in focus a point stays one; nothing sets in at once
+    # below 1 px the spot shrinks with the coc, so that a point in focus stays a point and blur starts continuously
     boxes = boxes * (per_unit / scale * min(1.0, max(abs(coc_px), _SMALLEST)))
-    # what averaging over blocks, interpolation between them, and the box of a pixel here add
+    # variance added by averaging blocks, interpolating between them, and by the box of a pixel below, in px^2
     added = (1 / 4 - 1 / (12 * scale**2) if scale > 1 else 0.0) + 1 / 12
     cells = boxes[:, 1:] * torch.tensor([2.0, 1.0], dtype=torch.float64) / torch.tensor(light.shape[-2:])
     spread = deviations(boxes, light).square()
@@ -131,7 +145,7 @@ def _made(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int]) -
     sides = torch.linspace(-1.0, 1.0, 2 * width + 1, dtype=torch.float64) * boxes[:, 2:]
     whole = torch.cat([light.flip(-1), light], -1)  # [C, distances, U, 2 V]
     area = cells.prod(-1)[:, None, None]
-    # a sample sees as much of it as makes one pixel with what light gathered in cells and linear interpolation add
+    # width of the average: a pixel, minus the variance that cells and linear interpolation between samples add
     samples = around[:, 1:] / torch.tensor([rows, columns])
     pixel = (1.0 - 2.0 * samples.square() - 3.0 * cells.square()).clamp_min(_LEAST_SEEN**2).sqrt()
     values = _overlaps(along, ends, pixel[:, 0]) @ (whole / area)
@@ -140,14 +154,20 @@ def _made(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int]) -
 
 
 def _overlaps(place: Tensor, ends: Tensor, width: Tensor) -> Tensor:
-    """Length of each cell that so much around a place covers: ``[n, places, cells]``."""
+    """Overlap of intervals with cells: ``[n, places, cells]``.
+
+    Args:
+        place: Centres of the intervals ``[n, places]``.
+        ends: Edges of the cells ``[n, cells + 1]``.
+        width: Width of the intervals ``[n]``.
+    """
     place, half = place[:, :, None], 0.5 * width[:, None, None]
     low = torch.maximum(place - half, ends[:, None, :-1])
     return (torch.minimum(place + half, ends[:, None, 1:]) - low).clamp_min(0.0)
 
 
 def _through_rims(table: PlacedLens, coc_px: float, width: float, distance: Tensor) -> tuple[Tensor, Tensor]:
-    """Distances in pixels from the edges of the aperture's rims, as shares."""
+    """Values and boxes for cat's eyes: signed distances in pixels to the nearer rim, plus half a pixel, unclamped."""
     if table.aperture is None:
         raise AssertionError("a table that depends on the place has a field or rims")
     reach = math.ceil(table.reach_px(coc_px, width)) + 1.0
@@ -160,7 +180,7 @@ def _through_rims(table: PlacedLens, coc_px: float, width: float, distance: Tens
     inside = []
     for shift in (2.0 * front * coc_px, -2.0 * rear * coc_px):
         away = torch.hypot(along[None, :, None] + shift * distance[:, None, None], across)
-        # a rim that is shifted by less than a pixel cuts off less: kernels of the middle stay as they are
+        # a rim shifted by less than a pixel cuts less, so that kernels in the middle of the frame are unchanged
         slack = 4.0 * (abs(coc_px) + 1.0) * (1.0 - abs(shift) * distance).clamp_min(0.0)[:, None, None]
         inside.append(abs(coc_px) + 0.5 + slack - away)
     return torch.minimum(*inside).unsqueeze(0), boxes.contiguous()
@@ -170,13 +190,13 @@ def placed(kernel: Tensor, shares: Sequence[tuple[Shares, Tensor]], y: Tensor, x
     """Kernels of places in the frame.
 
     Args:
-        kernel: The table's own, ``[1 or n, 1 or C, k, k]``.
-        shares: Those of one radius, or of two neighbouring ones, each with its part ``[n]`` or ``[]``.
+        kernel: Kernel of the middle of the frame, ``[1 or n, 1 or C, k, k]``.
+        shares: Shares of one radius, or of two neighbouring ones, each with its weight ``[n]`` or ``[]``.
         y: Places ``[n]``, in half diagonals down from the middle of the frame.
         x: The same to the right.
 
     Returns:
-        ``[n, 1 or C, k, k]``, each with as much light as the table's own.
+        ``[n, 1 or C, k, k]``, each with the same sum as ``kernel``.
     """
     step = torch.arange(kernel.shape[-1], dtype=kernel.dtype, device=kernel.device) - kernel.shape[-1] // 2
     y, x = (t.to(kernel.dtype)[:, None, None] for t in (y, x))
@@ -204,7 +224,15 @@ def placed(kernel: Tensor, shares: Sequence[tuple[Shares, Tensor]], y: Tensor, x
 
 
 def placed_between(kernels: Tensor, shares: Sequence[Shares], coc: Tensor, y: Tensor, x: Tensor) -> Tensor:
-    """Kernels ``[n, 1 or C, k, k]`` of sources ``[n]`` at places, with the shares of the radii around each of them."""
+    """Kernels ``[n, 1 or C, k, k]`` of sources at places, with shares interpolated between the radii around each.
+
+    Args:
+        kernels: Kernels of the middle of the frame, ``[n, 1 or C, k, k]``.
+        shares: Result of :func:`ray_shares`, ordered by coc.
+        coc: Signed coc of the sources ``[n]`` in pixels.
+        y: Places ``[n]``, in half diagonals down from the middle of the frame.
+        x: The same to the right.
+    """
     radii = torch.tensor([each.coc_px for each in shares], dtype=coc.dtype, device=coc.device)
     low = (torch.searchsorted(radii, coc.detach().contiguous(), right=True) - 1).clamp(0, len(radii) - 2)
     parts = ((coc - radii[low]) / (radii[low + 1] - radii[low])).clamp(0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Point spread functions, and kernels: what a PSF does to a picture made of pixels. Differentiable in the parameters.
+"""Point spread functions (PSFs), and kernels: the effect of a PSF on pixels. Differentiable in the parameters.
 
 A pixel is an integral already, ``J = box * scene`` at the pixel's centre, and the blurred picture's is
 ``(psf * J)(j) = (psf * box * scene)(j)``. So a kernel must not integrate the PSF over the pixel's box once more, which
@@ -8,22 +8,22 @@ the samples. The kernel of least error over pictures of a power spectrum ``S(f)`
     ``K^(f) = sum_i P(f + i) psf^(f + i) / sum_i P(f + i)``,
 
 that is ``K[m] = integral psf(x) phi(m - x) dx``, with the interpolator ``phi^(f) = P(f) / sum_i P(f + i)``. Photographs
-have ``S ~ 1 / f^2``; for them the separable cardinal cubic spline is as good a phi. It moves no second moment: a
-Gaussian of 1.3 px gives a kernel of standard deviation 1.3 px. Where phi's lobes make a pixel negative, its four
-neighbours make up for it (:func:`_settled`). Discs then come to within 0.3 dB of the non-negative kernel of least
-error, and for a length that goes to 0 the kernel goes to a single pixel with the length's square.
+have ``S ~ 1 / f^2``; for them the separable cardinal cubic spline is as good a phi. It changes no second moment: a
+Gaussian of 1.3 px gives a kernel of standard deviation 1.3 px. Where the lobes of phi make a pixel negative, its four
+neighbours give up light to raise it to 0 (:func:`_settled`). Kernels of discs are then within 0.3 dB of the
+non-negative kernel of least error. As a length goes to 0, the kernel approaches a single pixel with its square.
 
-The integral is a sum over square cells, 16 from the centre to the end of a small PSF and a pixel wide in a large one;
-Every family is a profile ``f(r)`` over the distance ``r`` from the centre; nothing but its cells knows that it is
-round. A cell's integral is exact for ``gaussian`` and ``disc``. For the others it is taken ring by ring: a cell is cut
-by circles into thin slices, the area of each slice is exact (circle against square), and within a slice ``f`` is
-replaced by its mean over r, which has a closed form for every family.
+The integral is a sum over square cells: 16 from the centre to the end of a small PSF, cells of a pixel in a large one.
+Every family is a profile ``f(r)`` over the distance ``r`` from the centre. The integral over a cell is exact for
+``gaussian`` and ``disc``. For the other families, circles cut the cell into thin slices. The area of each slice is
+exact (circle against square), and within a slice ``f`` is replaced by its mean over r, which has a closed form for
+every family.
 
-An aperture (:mod:`torchdof.optics.aperture`) multiplies the profile. The circle around the opening has the radius
-``radius``, ``2 sigma`` of a ``gaussian`` or ``r_c + 2 sigma`` of a ``ring``, and what of the profile lies outside of
-the opening is cut off. What a ``disc`` puts into a cell is the opening's area there. For the other families each cell
-(a ninth of it, in a kernel of up to 64 cells a side) holds the profile's mean in it times its open area. A squeeze
-makes the cells wider, as seen from a lens that is round.
+An aperture (:mod:`torchdof.optics.aperture`) multiplies the profile, and cuts off the part outside of the opening. The
+circumscribed circle of the opening has the radius ``radius``, ``2 sigma`` for ``gaussian`` and ``r_c + 2 sigma`` for
+``ring``. The light of a ``disc`` in a cell is the area of the opening in it. For the other families it is the mean of
+the profile in the cell times the open area; in kernels of up to 64 cells a side, each cell is split in nine for this. A
+squeeze stretches the cells horizontally instead of shrinking the profile.
 
 Reference:
     Field, "Relations between the statistics of natural images and the response properties of cortical cells", Journal
@@ -73,17 +73,17 @@ LENGTHS = frozenset({"sigma", "r_c", "radius"})
 """Parameters that are lengths; the others are pure numbers."""
 
 _SMALLEST = 1e-7  # px; a length below it is rendered as this, which is a kernel of one pixel to 1e-14
-_TILT_EXPONENT = 460.0  # of e: 1e200
-_CACHED_HALF_WIDTH = 64
-_LARGEST = 2**16 + 1  # px; a kernel that wide takes 34 GB
-_ALWAYS_WHOLE = 256  # px on each side of the centre; a kernel up to there is computed whole, whatever its window
-_AT_ONCE = 2**20  # slices computed together
-_CELLS = 16  # cells from the centre to the end of a PSF that is so many pixels large or smaller
-_PARTS = 3  # of a cell along each axis, where an opening cuts the profile of a kernel that is not large
-_MASS_CELLS = 60  # cells on each side over which the light of a large shaped kernel is summed
-_AROUND = 2  # pixels around a kernel on which its values depend
+_TILT_EXPONENT = 460.0  # largest logarithm of (r / R)^m, e^460 = 1e200; a larger power would overflow
+_CACHED_HALF_WIDTH = 64  # cells; slices of larger quadrants are not cached
+_LARGEST = 2**16 + 1  # px; a kernel of this width takes 34 GB
+_ALWAYS_WHOLE = 256  # px on each side of the centre; smaller kernels are computed whole, whatever the window
+_AT_ONCE = 2**20  # slices computed together; limits memory
+_CELLS = 16  # cells from the centre to the end of a PSF with a radius of at most as many pixels
+_PARTS = 3  # parts of a cell along each axis where an opening cuts the profile; more are more exact
+_MASS_CELLS = 60  # cells on each side over which the light of a large kernel with an opening is summed
+_AROUND = 2  # px around a kernel that its values depend on (the four neighbours of _settled, and theirs)
 _quadrants = KernelCache(64 * 2**20)
-_RINGS = 2**14  # the whole of a larger kernel is summed in so many; agrees with its pixels' sum to 1e-6
+_RINGS = 2**14  # rings over which the light of a large round kernel is summed; agrees with its pixels to 1e-6
 
 Number = float | Tensor
 
@@ -191,20 +191,25 @@ def pixel_kernels(
     window: int | None = None,
     aperture: Aperture | None = None,
 ) -> Tensor:
-    """Kernel of a family by name: what its PSF does to a picture made of pixels.
+    """Kernel of a family by name: the effect of its PSF on pixels.
+
+    1. Choose the widths of the kernel and of the part to compute.
+    2. Scale the lengths to cells and integrate the PSF over each cell.
+    3. Weight the cells with the interpolator of each pixel, and remove negative values.
+    4. Scale the kernel to a sum of 1; without any light it is a single pixel.
 
     Args:
         family: A key of :data:`FAMILIES`.
         params: Its parameters by name; lengths in pixels, floats or ``[...]`` (``values``: ``[..., P]``), which
             broadcast against each other.
-        size: Odd width of the kernel; None takes the smallest that holds the largest kernel asked for.
-        window: Odd width of the middle part that is wanted; None is all. Only that is computed of a large kernel.
+        size: Odd width of the kernel; None takes the smallest that holds the largest kernel.
+        window: Odd width of the middle part to return; None returns all. Of a large kernel only this part is computed.
         aperture: The opening that the profile is multiplied by; None is a round one.
 
     Returns:
-        ``[..., size, size]``, float64, non-negative, each kernel summing to 1, as behind the focus plane. What lies
-        beyond ``size`` is cut off.
-        With a smaller ``window``, that part of it: ``[..., window, window]``, summing to its share of the light.
+        ``[..., size, size]``, float64, non-negative, each kernel summing to 1, for a point behind the focus plane. The
+        PSF is cut off at ``size``.
+        With a smaller ``window``: the middle part ``[..., window, window]``, which sums to its share of the light.
 
     Raises:
         ValueError: If the family, a parameter or the size is not as described.
@@ -216,12 +221,12 @@ def pixel_kernels(
     half = whole if whole <= _ALWAYS_WHOLE else part
     lengths = {k: v.clamp_min(_SMALLEST) if k in ("sigma", "radius") else v for k, v in checked.items()}
     end = reach(family, lengths, aperture)
-    high = wide = (end / _CELLS).clamp(max=1.0)  # of a cell, in pixels
+    high = wide = (end / _CELLS).clamp(max=1.0)  # sides of a cell, in pixels
     if aperture is not None:
         wide = (end / aperture.squeeze / _CELLS).clamp(max=1.0)
     in_cells = {k: v / high if k in LENGTHS else v for k, v in lengths.items()}
-    aspect = None if aperture is None else wide * aperture.squeeze / high  # of a cell, seen from a round lens
-    farthest = math.ceil(min(_support(family, lengths, aperture), half + _AROUND))  # px, which are cells if many
+    aspect = None if aperture is None else wide * aperture.squeeze / high  # width over height of a cell, unsqueezed
+    farthest = math.ceil(min(_support(family, lengths, aperture), half + _AROUND))  # px; a large PSF has 1 px cells
     cells = _sharpened(_cells(family, in_cells, max(_CELLS, farthest) + 1, whole, aperture, aspect))
     kernel = sampled(cells, high, wide, half)
     if half == whole:
@@ -230,15 +235,15 @@ def pixel_kernels(
         total = _mass(family, in_cells, whole, aperture, aspect)[..., None, None]
     centre = torch.zeros_like(kernel)
     centre[..., half, half] = 1.0
-    # too small to hold any light in float64, or all of it beyond size: a single pixel
+    # no light at all: the PSF underflows in float64, or lies beyond size
     kernel = torch.where(total > 0, kernel / torch.where(total > 0, total, 1.0), centre)
     return kernel[..., half - part : half + part + 1, half - part : half + part + 1]
 
 
 def template(family: str, params: Mapping[str, Tensor], cells: int, aperture: Aperture | None = None) -> Tensor:
-    """Light of the cells of a PSF that is so many cells large from its centre to its end, whatever its size in pixels.
+    """Light in the cells of a PSF with a radius of ``cells`` cells, from which :func:`sampled` makes kernels.
 
-    It is without the blur of being integrals, and what :func:`sampled` makes kernels of.
+    The blur of integrating over cells is removed (:func:`_sharpened`).
 
     Args:
         family: A key of :data:`FAMILIES`.
@@ -247,7 +252,7 @@ def template(family: str, params: Mapping[str, Tensor], cells: int, aperture: Ap
         aperture: The opening that the profile is multiplied by; None is a round one.
 
     Returns:
-        ``[C, 2 cells + 3, 2 cells + 3]``, float64, but for a factor.
+        ``[C, 2 cells + 3, 2 cells + 3]``, float64, up to a factor.
     """
     lengths = {k: v.clamp_min(_SMALLEST) if k in ("sigma", "radius") else v for k, v in params.items()}
     cell = reach(family, lengths, aperture) / cells
@@ -256,7 +261,7 @@ def template(family: str, params: Mapping[str, Tensor], cells: int, aperture: Ap
 
 
 def sampled(cells: Tensor, high: Tensor, wide: Tensor, half: int) -> Tensor:
-    """Kernels of PSFs from the light of their cells, but for a factor: ``[..., 2 half + 1, 2 half + 1]``.
+    """Kernels of PSFs from the light in their cells, up to a factor: ``[..., 2 half + 1, 2 half + 1]``.
 
     Args:
         cells: Light of square cells around the centre, ``[..., n, n]``.
@@ -312,7 +317,7 @@ def _support(family: str, checked: Mapping[str, Tensor], aperture: Aperture | No
 
 
 def width_of(size: int | None, reach_px: float) -> int:
-    """Width in pixels of kernels: ``size`` if that is one, else the smallest that holds a PSF of radius ``reach_px``.
+    """Width in pixels of kernels: ``size`` if given, else the smallest that holds a PSF of radius ``reach_px``.
 
     Raises:
         ValueError: If the size is not odd and positive, or the kernel would be too wide.
@@ -334,7 +339,7 @@ def half_width(reach: float) -> int:
 
 
 def _checked(family: str, params: Mapping[str, Number]) -> dict[str, Tensor]:
-    """Parameters of a family as float64 tensors on one device, or a refusal by name."""
+    """Valid parameters of a family as float64 tensors on one device."""
     if not isinstance(family, str) or family not in FAMILIES:
         raise ValueError(f"family must be one of {', '.join(FAMILIES)}, got {show(family)}")
     if not isinstance(params, Mapping) or set(params) != set(FAMILIES[family]):
@@ -358,7 +363,7 @@ def _checked(family: str, params: Mapping[str, Number]) -> dict[str, Tensor]:
 
 
 def _parameter(name: str, value: Number, device: torch.device) -> Tensor:
-    """One parameter as a float64 tensor, or a refusal by name."""
+    """One valid parameter as a float64 tensor."""
     if isinstance(value, Tensor):
         tensor = real_tensor(name, value.double() if value.dtype in WHOLE_NUMBERS else value, "[...]")
         if not tensor.numel():
@@ -373,7 +378,10 @@ def _parameter(name: str, value: Number, device: torch.device) -> Tensor:
 
 
 def reach(family: str, params: Mapping[str, Tensor], aperture: Aperture | None = None) -> Tensor:
-    """Radius beyond which a profile holds next to no light, in the unit of its lengths, without squeeze: ``[...]``."""
+    """Radius at which a profile ends, in the unit of its lengths, without squeeze: ``[...]``.
+
+    Beyond it is less than 4e-6 of the light.
+    """
     if aperture is not None and not aperture.is_round:
         return opening_radius(family, params)
     if family == "gaussian":
@@ -388,12 +396,13 @@ def reach(family: str, params: Mapping[str, Tensor], aperture: Aperture | None =
 def opening_radius(family: str, params: Mapping[str, Tensor]) -> Tensor:
     """Radius of the circle around the opening that a profile is multiplied by, in the unit of its lengths."""
     if family == "gaussian":
-        return 2.0 * params["sigma"]  # the disc of the same second moment
+        return 2.0 * params["sigma"]  # radius of the disc with the same second moment
     return params["r_c"] + 2.0 * params["sigma"] if family == "ring" else params["radius"]
 
 
 def _tilt(r: Tensor, params: Mapping[str, Tensor]) -> Tensor:
-    farthest = torch.exp(_TILT_EXPONENT / params["m"].detach().clamp_min(1.0))  # a larger power would overflow
+    """Factor ``1 + b (r / R)^m`` of ``softm``, >= 0; the power is limited to 1e200."""
+    farthest = torch.exp(_TILT_EXPONENT / params["m"].detach().clamp_min(1.0))
     return (1.0 + params["b"] * torch.minimum(r / params["radius"], farthest) ** params["m"]).clamp_min(0.0)
 
 
@@ -405,9 +414,15 @@ def _cells(
     aperture: Aperture | None = None,
     aspect: Tensor | None = None,
 ) -> Tensor:
-    """Integral of a PSF over each cell, lengths in cells: ``[..., 2 half + 1, 2 half + 1]``, but for a factor.
+    """Integral of a PSF over the cells around its centre: ``[..., 2 half + 1, 2 half + 1]``, up to a factor.
 
-    They are the middle of a PSF that reaches ``whole`` pixels. Cells are ``aspect`` times as wide as high.
+    Args:
+        family: A key of :data:`FAMILIES`.
+        lengths: Checked parameters, lengths in cells.
+        half: Cells on each side of the centre.
+        whole: Half width of the whole kernel in pixels; a smaller one is integrated more finely.
+        aperture: The opening; None is a round one.
+        aspect: Width of a cell over its height; None is 1.
     """
     slices = 16 if whole <= 64 else 8
     if aperture is None or aperture.is_round:
@@ -420,7 +435,7 @@ def _cells(
     fine = count * half + count // 2
     in_parts = {k: v * count if k in LENGTHS else v for k, v in lengths.items()}
     light = _round_cells(family, in_parts, fine, slices // count, aspect)
-    lit = _round_cells("disc", {"radius": reach(family, in_parts)}, fine, slices, aspect)  # where the profile has any
+    lit = _round_cells("disc", {"radius": reach(family, in_parts)}, fine, slices, aspect)  # area inside the profile
     share = aperture.shares(fine, 1.0 / (count * radius), wide / (count * radius))
     parts = torch.where(lit > 0, light / torch.where(lit > 0, lit, 1.0), 0.0) * share
     return parts.unflatten(-1, (-1, count)).unflatten(-3, (-1, count)).mean((-3, -1))
@@ -439,7 +454,7 @@ def _round_cells(family: str, lengths: Mapping[str, Tensor], half: int, slices: 
 
 
 def _sharpened(cells: Tensor) -> Tensor:
-    """Cells without the blur of being integrals: a variance of 1/12 less along each axis."""
+    """Cells without the blur of integrating over a cell: a variance 1/12 smaller along each axis."""
     for axis in (-2, -1):
         around = functional.pad(cells, (0, 0, 1, 1) if axis == -2 else (1, 1))
         size = cells.shape[axis]
@@ -450,12 +465,17 @@ def _sharpened(cells: Tensor) -> Tensor:
 def _interpolated(cells: Tensor, high: Tensor, wide: Tensor, half: int) -> Tensor:
     """Integrals of a PSF with the interpolator of each pixel: ``[..., 2 half + 1, 2 half + 1]``.
 
-    The PSF is given in cells ``[..., n, n]`` of so many pixels ``[...]``. A pixel is at most twice what linear
-    interpolation would give it, which leaves out the interpolator's ripples where the PSF has no light. Cells larger
-    than a pixel are interpolated linearly.
+    A pixel is limited to twice the result of linear interpolation. This removes the ripples of the cubic interpolator
+    where the PSF has no light. Cells larger than a pixel are interpolated linearly.
+
+    Args:
+        cells: Light in the cells of the PSF, ``[..., n, n]``.
+        high: Height of a cell in pixels ``[...]``.
+        wide: Width of a cell in pixels ``[...]``.
+        half: Pixels on each side of the centre.
     """
     n = cells.shape[-1] // 2
-    if bool((high == 1.0).all() and (wide == 1.0).all()):  # an interpolator is 0 at other pixels
+    if bool((high == 1.0).all() and (wide == 1.0).all()):  # cells are pixels: the interpolator is 1 at its own, else 0
         return functional.pad(cells, (half - n,) * 4)
     pixel = torch.arange(-half, half + 1, dtype=torch.float64, device=cells.device)[:, None]
     place = torch.arange(-n, n + 1, dtype=torch.float64, device=cells.device)
@@ -473,9 +493,9 @@ def _interpolated(cells: Tensor, high: Tensor, wide: Tensor, half: int) -> Tenso
 def _ripple(pixel: Tensor, cell: Tensor) -> Tensor:
     """Sum of the interpolator of each pixel ``[pixels, 1]`` over cells of a size ``[..., 1, 1]``, times the size.
 
-    It is 1, and what the spectrum of the interpolator has at one cycle a cell: cells are samples of it.
+    Cells sample the interpolator, so by Poisson summation the sum is 1 plus its spectrum at one cycle per cell.
     """
-    cycles = 1.0 / cell.clamp(1.0 / 16.0, 1.0)  # a pixel; in smaller cells there is no ripple
+    cycles = 1.0 / cell.clamp(1.0 / 16.0, 1.0)  # cycles per pixel; smaller cells have no ripple
     power = torch.sinc(cycles) ** 4
     spectrum = 3.0 * power / (2.0 + torch.cos(2.0 * math.pi * cycles))
     return 1.0 + 2.0 * spectrum * torch.cos(2.0 * math.pi * cycles * pixel)
@@ -498,10 +518,10 @@ def _cardinal_spline(t: Tensor) -> Tensor:
 
 
 def _settled(kernel: Tensor) -> Tensor:
-    """Non-negative values ``[..., n, n]``: what is missing where one is negative is taken from its four neighbours.
+    """Raises negative values ``[..., n, n]`` to 0 with light from their four neighbours.
 
-    Each gives in proportion to what it has. Light then moves by a pixel only, which hardly changes low frequencies,
-    where pictures have most of their power.
+    Each neighbour gives light in proportion to its own. Light moves by one pixel only, which hardly changes the low
+    frequencies, where photographs have most of their power.
     """
     positive, owed = kernel.clamp_min(0.0), (-kernel).clamp_min(0.0)
     around = _neighbours(positive)
@@ -523,11 +543,11 @@ def _gaussian_quadrant(sigma: Tensor, half: int, aspect: Tensor | None = None) -
 
 
 def _gaussian_line(sigma: Tensor, half: int) -> Tensor:
-    """Integral of a Gaussian over each unit step from its centre on: ``[..., half + 1]``."""
+    """Integral of a Gaussian over each unit step outwards from its centre: ``[..., half + 1]``."""
     edges = torch.arange(half + 2, dtype=torch.float64, device=sigma.device) - 0.5
     cumulative = torch.erf(edges / (math.sqrt(2) * sigma.unsqueeze(-1)))
     tail = torch.erfc(edges / (math.sqrt(2) * sigma.unsqueeze(-1)))
-    # erf loses the tail, erfc the centre: each where it is exact
+    # differences of erf round badly in the tail, those of erfc at the centre
     return torch.where(edges[:-1] < 1.0, cumulative[..., 1:] - cumulative[..., :-1], tail[..., :-1] - tail[..., 1:])
 
 
@@ -539,7 +559,7 @@ def _disc_quadrant(radius: Tensor, half: int, aspect: Tensor | None = None) -> T
     across = edge if aspect is None else edge * aspect[..., None]  # [..., half + 2]
     covered = _corner_area(across[..., None, :], edge[:, None], radius).diff(dim=-1).diff(dim=-2).clamp_min(0.0)
     width, breadth = edge.diff(), across.diff()
-    # outside and inside the circle without the rounding of differences
+    # cells wholly outside or inside the circle are exact, without the rounding of differences
     nearest = torch.hypot(edge[:-1, None], across[..., None, :-1])
     farthest = torch.hypot(edge[1:, None], across[..., None, 1:])
     covered = torch.where(farthest <= radius, width[:, None] * breadth[..., None, :], covered)
@@ -547,7 +567,7 @@ def _disc_quadrant(radius: Tensor, half: int, aspect: Tensor | None = None) -> T
 
 
 def _twice(index: Tensor) -> Tensor:
-    """How often a pixel's area in the quadrant counts: one on an axis reaches as far to the other side of it."""
+    """Factor of each cell's area in the quadrant: a cell on an axis extends equally to the other side."""
     twice = torch.where(index == 0, 2.0, 1.0)
     return twice[:, None] * twice[None, :]
 
@@ -577,9 +597,9 @@ def _mass(
     aperture: Aperture | None = None,
     aspect: Tensor | None = None,
 ) -> Tensor:
-    """Sum over the pixels of a kernel with so many of them on each side of its centre, from rings: ``[...]``.
+    """Sum over the pixels of a kernel with ``half`` pixels on each side of its centre: ``[...]``.
 
-    That of a shaped one is summed over coarser cells.
+    Round kernels are summed over rings, those with an opening over coarser cells.
     """
     side = torch.full_like(reach(family, lengths), half + 0.5)
     if aperture is not None and not aperture.is_round:
@@ -614,7 +634,7 @@ def _slice_means(family: str, p: Mapping[str, Tensor], inner: Tensor, outer: Ten
 
 
 def _erfc_integral(x: Tensor) -> Tensor:
-    """``integral of erfc(x) / 2``, without the cancellation that would follow where erfc is nearly 2."""
+    """``integral of erfc(x) / 2``, arranged so that nothing cancels where erfc is nearly 2."""
     a = x.abs()
     tail = 0.5 * (a * torch.erfc(a) - torch.exp(-a * a) / math.sqrt(math.pi))
     return torch.where(x < 0, x + tail, tail)
@@ -639,7 +659,7 @@ def _table_integral(r: Tensor, p: Mapping[str, Tensor]) -> Tensor:
     return (start + left * part + (right - left) * part * part / 2) * radius / last
 
 
-@torch.inference_mode(False)  # what is kept must serve autograd as well
+@torch.inference_mode(False)  # cached tensors must be usable by autograd
 def _cut_quadrant(half: int, slices: int, top: int, bottom: int) -> tuple[Tensor, Tensor, Tensor]:
     """Slices of the square cells of a quadrant's rows."""
     return _slices(half, slices, top, bottom, torch.ones((), dtype=torch.float64))
@@ -668,7 +688,7 @@ def _slices(half: int, slices: int, top: int, bottom: int, aspect: Tensor) -> tu
 def _corner_area(x: Tensor, y: Tensor, r: Tensor) -> Tensor:
     """Area of the quarter disc of radius r that lies within the rectangle from the origin to (x, y)."""
     x, y = torch.minimum(x, r), torch.minimum(y, r)
-    reach = _root(r * r - y * y)  # up to here the rectangle's top is inside the disc
+    reach = _root(r * r - y * y)  # for smaller x the rectangle's top is inside the disc
 
     def under_arc(t: Tensor) -> Tensor:
         inside = t < r
@@ -680,6 +700,6 @@ def _corner_area(x: Tensor, y: Tensor, r: Tensor) -> Tensor:
 
 
 def _root(square: Tensor) -> Tensor:
-    """Square root of the positive, 0 of the rest: with finite gradients."""
+    """Square root of positive numbers, 0 for others, with finite gradients."""
     positive = square > 0
     return torch.where(positive, torch.sqrt(torch.where(positive, square, 1.0)), 0.0)

@@ -1,4 +1,4 @@
-"""Blur tables as JSON files: the schema, the shipped ones, and what is wrong with a file."""
+"""Blur tables as JSON files: the schema, the checks, and the shipped tables."""
 
 import json
 import os
@@ -13,7 +13,7 @@ __all__ = ["fields_of", "find", "read", "shipped", "stamped", "write"]
 
 SCHEMA = "torchdof/blur-table"
 VERSION = 3
-READABLE = (1, 2, 3)  # the first knows no aperture, the second no field
+READABLE = (1, 2, 3)  # versions; 2 added "aperture", 3 added "field"
 _SHIPPED = Path(__file__).parent / "tables"
 _REQUIRED = ("family", "unit", "coc", "params")
 _OPTIONAL = ("name", "sensor_width_mm", "strength", "residual", "provenance", "aperture", "field")
@@ -25,8 +25,8 @@ def find(source: str | os.PathLike[str]) -> Path:
     """The file of a table: a path, or the name of a shipped table such as ``"sato_j15"``.
 
     Raises:
-        ValueError: If it is neither a text nor a path.
-        FileNotFoundError: If there is neither such a file nor such a shipped table.
+        ValueError: If ``source`` is neither a string nor a path.
+        FileNotFoundError: If no file and no shipped table has this name.
     """
     if not isinstance(source, str | os.PathLike):
         raise ValueError(f"source must be the name or the path of a blur table, got {show(source)}")
@@ -51,7 +51,7 @@ def read(path: Path) -> Any:
     """The JSON in a file.
 
     Raises:
-        ValueError: If it is none.
+        ValueError: If the file is not valid JSON.
         RecursionError: If it is nested too deep.
     """
     return json.loads(path.read_text(encoding="utf-8"))

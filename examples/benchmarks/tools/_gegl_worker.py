@@ -1,4 +1,4 @@
-"""Runs GEGL for ``gegl.py``, in an interpreter that has its bindings and perhaps nothing else.
+"""Runs GEGL for ``gegl.py``, in an interpreter that has GEGL's bindings.
 
 Usage: python _gegl_worker.py FOLDER WIDTH HEIGHT RADIUS; prints seconds. Or: python _gegl_worker.py --version
 """

@@ -1,4 +1,4 @@
-"""Blender's Defocus node, float32: discs of a radius per pixel; the radius map is fed to it as it is."""
+"""Blender's Defocus node, float32: a disc with its own radius for each pixel; it gets the radius map unchanged."""
 
 import functools
 import os
@@ -13,7 +13,7 @@ from torch import Tensor
 
 NAME = "Blender Defocus"
 NOTE = (
-    "float32, full precision, on the CPU; |coc| as Z with 'no z-buffer'. Time: the compositor with the node less the "
+    "float32, full precision, on the CPU; |coc| as Z with 'no z-buffer'. Time: the compositor with the node minus the "
     "compositor without it; without process start and file i/o."
 )
 _WORKER = Path(__file__).with_name("_blender_worker.py")
@@ -26,7 +26,7 @@ def available() -> str | None:
 
 @functools.cache
 def version() -> str:
-    """Version of Blender, from 5 on; empty if there is none."""
+    """Version of Blender, 5 or newer; empty if it is not installed."""
     script = "import bpy; bpy.types.Scene.bl_rna.properties['compositing_node_group']; print(bpy.app.version_string)"
     done = subprocess.run([_python(), "-c", script], capture_output=True, text=True)
     return "" if done.returncode else done.stdout.split()[-1]

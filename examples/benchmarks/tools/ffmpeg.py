@@ -1,8 +1,8 @@
-"""FFmpeg's varblur, 16-bit integers: the mean over a square of a size per pixel, from a summed area table.
+"""FFmpeg's varblur, 16-bit integers: the mean over a square with its own size for each pixel, by a summed area table.
 
-The square gets the variance of the disc. In FFmpeg 5 and 6 its side is ``2 + 8 max_r value / 65535`` pixels, at least
-two and even on average, so nothing stays quite sharp and everything moves by half a pixel. Light is scaled so that 16
-is the brightest value that the integers hold; brighter light is clipped.
+The square has the variance of the disc. In FFmpeg 5 and 6 its side is ``2 + 8 max_r value / 65535`` pixels. It is at
+least 2 and even on average, so no pixel stays sharp and the picture shifts by half a pixel. Light is scaled so that the
+largest integer is 16; brighter light is clipped.
 """
 
 import re
@@ -40,7 +40,7 @@ def version() -> str:
 def blur(image: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
     """Blurs ``image`` ``[1, 3, H, W]`` by ``coc_px`` ``[1, 1, H, W]``; returns it and the seconds that FFmpeg took."""
     height, width = image.shape[-2:]
-    # A disc has variance R^2 / 4 along an axis and its pixels 1 / 12; n pixels in a row have (n^2 - 1) / 12.
+    # Variance along an axis: R^2 / 4 for a disc, 1 / 12 for its pixels, (n^2 - 1) / 12 for n pixels in a row.
     side = (3.0 * coc_px.square() + 2.0).sqrt().clamp(2.0, 2.0 + 8.0 * _MAX_R)
     radius = ((side - 2.0) / (8.0 * _MAX_R)).expand(1, 3, -1, -1)
     frame = torch.cat([image / _WHITE, radius], 2)[0, [1, 2, 0]].clamp(0.0, 1.0)  # [3, 2 H, W]: green, blue, red

@@ -1,6 +1,6 @@
-"""GEGL's lens-blur (the engine of GIMP), float32: discs of a radius per pixel.
+"""GEGL's lens-blur (the engine of GIMP), float32: a disc with its own radius for each pixel.
 
-Its disc holds every pixel up to half a pixel beyond the radius it is given, so it is given half a pixel less.
+GEGL's disc extends half a pixel beyond its radius, so the radius is reduced by half a pixel.
 """
 
 import functools

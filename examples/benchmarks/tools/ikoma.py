@@ -1,6 +1,7 @@
-"""The layered formula of Ikoma et al. 2021 by FFT in PyTorch: what torchdof builds on.
+"""The layered formula of Ikoma et al. 2021 by FFT in PyTorch, on which torchdof builds.
 
-Ikoma, Nguyen, Metzler, Peng, Wetzstein, "Depth from defocus with learned optics", ICCP 2021; written from the formula.
+Ikoma, Nguyen, Metzler, Peng, Wetzstein, "Depth from defocus with learned optics", ICCP 2021. Written from the formula,
+not from the authors' code.
 """
 
 import torch

@@ -1,4 +1,4 @@
-"""A loop of kornia's filter2d over 16 radii, each with a disc, and for every pixel the nearest of the 16 results."""
+"""kornia's filter2d with discs of 16 radii; each pixel takes the result with the nearest radius."""
 
 import kornia
 import torch

@@ -3,7 +3,7 @@
 // Usage: run_onnx dof.onnx image.pfm depth.pfm out.pfm FOCUS_M F_NUMBER
 //
 // Images are PFM files of linear light (`oiiotool photo.png --colorconvert srgb linear -o image.pfm` writes one); depth
-// is a PFM file in metres. What to copy is the class DepthOfField; the rest reads and writes files.
+// is a PFM file in metres. Copy the class DepthOfField; the rest reads and writes files.
 
 #include <onnxruntime_cxx_api.h>
 
@@ -20,7 +20,7 @@
 #include <string>
 #include <vector>
 
-// Channels one after the other, rows from the top, as the exported file takes them.
+// Planar channels, rows from the top, as the exported file takes them.
 struct Image {
     std::int64_t channels = 0, height = 0, width = 0;
     std::vector<float> values;
@@ -59,7 +59,7 @@ private:
     Ort::MemoryInfo memory_ = Ort::MemoryInfo::CreateCpu(OrtArenaAllocator, OrtMemTypeDefault);
 };
 
-// A PFM file: a line each for kind, size and byte order (negative: little endian), then rows from the bottom.
+// A PFM file: one line each for kind, size and byte order (negative: little endian), then rows from the bottom up.
 Image read_pfm(const std::filesystem::path& path) {
     std::ifstream file(path, std::ios::binary);
     std::string kind;

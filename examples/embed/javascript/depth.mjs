@@ -1,4 +1,4 @@
-// Depth as people have it to metres along the optical axis, as the exported file takes it.
+// Depth maps of any kind to metres along the optical axis, as the exported file takes them.
 
 import { decodePng, isPng } from './png.mjs'
 
@@ -47,7 +47,7 @@ export function metresOf(map, { kind, scale = 1, nearM, farM }) {
   })
 }
 
-/** The smallest and the largest finite value; [Infinity, -Infinity] if there is none. */
+/** The smallest and the largest finite value; [Infinity, -Infinity] without finite values. */
 export function extremes(values) {
   let low = Infinity
   let high = -Infinity
@@ -61,9 +61,9 @@ export function extremes(values) {
 }
 
 /**
- * Fill holes (NaN) with what lies behind them: the farther of the nearest known pixels to the left and right.
+ * Fill holes (NaN) with the farther of the nearest known pixels to the left and right.
  *
- * Without depth a pixel stays sharp whatever surrounds it, which looks like dirt.
+ * A pixel without depth would stay sharp inside blurred surroundings.
  *
  * @param {Float32Array} metres height * width; changed.
  * @returns {number} the share of pixels that had no depth.
@@ -90,7 +90,7 @@ export function fillHoles(metres, width) {
   return holes / metres.length
 }
 
-/** Depth at another size: the nearest pixel's, since a mean of two surfaces is a place where nothing is. */
+/** Depth at another size, by nearest neighbour: a mean of two surfaces would be a depth where no surface is. */
 export function depthAtSize(metres, width, height, newWidth, newHeight) {
   if (newWidth === width && newHeight === height) return metres
   const resized = new Float32Array(newWidth * newHeight)
@@ -118,7 +118,7 @@ export async function readDepthMap(bytes) {
   throw new Error('a depth map must be a PNG file or a NumPy array (.npy)')
 }
 
-/** A depth map of samples whose colour channels are the same; two and four channels hold alpha, which is not read. */
+/** A depth map from a PNG with equal colour channels; the alpha of two or four channels is ignored. */
 export function greyDepthMap(samples, width, height, channels, fullScale) {
   const values = new Float32Array(width * height)
   for (let i = 0; i < values.length; i++) {
@@ -143,7 +143,7 @@ const NPY_TYPES = {
   '|u1': Uint8Array,
 }
 
-/** A depth map from a NumPy file, whose header is text behind ten or twelve bytes. */
+/** A depth map from a NumPy file, whose header is text after ten or twelve bytes. */
 function depthOfNpy(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength)
   const begin = bytes[6] === 1 ? 10 : 12

@@ -22,11 +22,11 @@ export class DepthOfField {
   }
 
   /**
-   * Blur what is out of focus.
+   * Render depth of field.
    *
    * @param {Float32Array} light Linear light, [3, height, width]: all red values, then green, then blue.
    * @param {Float32Array} depth Metres along the optical axis, [height, width]; NaN, zero and negative stay sharp.
-   * @param {number} focusM Distance in metres of what is to be sharp.
+   * @param {number} focusM Focus distance in metres.
    * @param {number} fNumber Focal length over aperture diameter: smaller blurs more.
    * @returns {Promise<Float32Array>} Linear light, [3, height, width].
    */

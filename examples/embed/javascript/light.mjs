@@ -1,14 +1,14 @@
 // Pixels of a screen (8-bit sRGB) to linear light and back.
 //
-// Blur is a sum of light, and only linear light adds up: pixels are decoded before they are resized or blurred, and
-// encoded once at the end. Images of light are planar, [3, height, width], as the exported file takes them.
+// Only linear light may be averaged: pixels are decoded before they are resized or blurred, and encoded once at the end.
+// Images of light are planar, [3, height, width], as the exported file takes them.
 
 /** sRGB, 0 to 1, to linear light (IEC 61966-2-1). */
 export const decoded = (value) => (value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4)
 
 const LIGHT_OF_CODE = Float32Array.from({ length: 256 }, (_, code) => decoded(code / 255))
 
-// Light at which rounding goes up to the next code, and the code at the beginning of each cell of a fine grid.
+// Thresholds of light between neighbouring 8-bit codes, and the code at the beginning of each cell of a fine grid.
 const NEXT_CODE_AT = Float32Array.from({ length: 255 }, (_, code) => decoded((code + 0.5) / 255))
 const CELLS = 4096
 const CODE_OF_CELL = Uint8Array.from({ length: CELLS + 1 }, (_, cell) => {
@@ -54,7 +54,7 @@ export function linearLight(rgba, width, height, newWidth = width, newHeight = h
   return light
 }
 
-/** For each of `count` new pixels along a line of `length`: the old pixels it covers, and their shares of it. */
+/** For each of `count` new pixels along a line of `length` old ones: the old pixels that it covers, and their weights. */
 function shares(length, count) {
   return Array.from({ length: count }, (_, index) => {
     const begin = (index * length) / count
@@ -69,7 +69,7 @@ function shares(length, count) {
 }
 
 /**
- * Linear light to opaque 8-bit sRGB, rounded to the nearest code; what is brighter than white becomes white, NaN black.
+ * Linear light to opaque 8-bit sRGB, rounded to the nearest code; light above white becomes white, NaN black.
  *
  * @param {Float32Array} light [3, height, width]
  * @returns {Uint8ClampedArray} height * width * 4 bytes, as ImageData takes them.

@@ -1,5 +1,5 @@
-// PNG files, all of whose bits count: browsers decode 16-bit depth maps to 8 bits and apply colour profiles to them.
-// Node 18 and browsers alike; nothing to install.
+// PNG files with all their bits; browsers would reduce 16-bit depth maps to 8 bits and apply colour profiles to them.
+// For Node 18 and browsers, without dependencies.
 
 const SIGNATURE = [137, 80, 78, 71, 13, 10, 26, 10]
 const CHANNELS = { 0: 1, 2: 3, 3: 1, 4: 2, 6: 4 } // by colour type: grey, RGB, palette, grey + alpha, RGB + alpha

@@ -1,11 +1,11 @@
-// Files of people to pictures and depth maps, with errors that people can act on.
+// Opens files as pictures and depth maps; errors state the remedy.
 
 import { extremes, greyDepthMap, readDepthMap } from './depth.mjs'
 import { isPng } from './png.mjs'
 
 const MOST_PIXELS = 16e6 // what phones' browsers draw at once
 
-/** What an opened file is of: 'photo' or 'depth', by its name, then by its content. */
+/** Kind of a file, 'photo' or 'depth', by its name, then by its content. */
 export async function kindOf(file) {
   if (/depth|disp|\.npy$/i.test(file.name)) return 'depth'
   const start = new Uint8Array(await file.slice(0, 33).arrayBuffer())

@@ -1,4 +1,4 @@
-// How large the blur is: DESIGN of the file's thin lens, for what the page says and draws besides the picture.
+// The thin lens of the exported file, for the numbers and the depth view of the page.
 
 /** Signed radius in pixels of the circle of confusion: coc = (A / 2) F (1/s - 1/z), negative in front of the focus. */
 export function cocPx(camera, width, focusM, fNumber, depthM) {
@@ -7,7 +7,7 @@ export function cocPx(camera, width, focusM, fNumber, depthM) {
   return apertureRadiusM * focalPx * (1 / focusM - 1 / depthM)
 }
 
-/** A picture of depth: near is light; what is blurred by less than a pixel of the result is tinted. */
+/** A picture of depth: near is light; pixels with a blur radius below one pixel of the result are tinted. */
 export function depthPicture(metres, width, height, near, far, coc) {
   const image = new ImageData(width, height)
   for (let i = 0; i < metres.length; i++) {
@@ -22,7 +22,7 @@ export function depthPicture(metres, width, height, near, far, coc) {
   return image
 }
 
-/** Distance of what is seen at a point of the picture: the median of a small patch of the depth map. */
+/** Distance of the surface at a point of the picture: the median of a small patch of the depth map. */
 export function distanceAt(metres, width, height, u, v) {
   const column = Math.min(width - 1, Math.floor(u * width))
   const row = Math.min(height - 1, Math.floor(v * height))

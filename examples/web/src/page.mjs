@@ -1,4 +1,4 @@
-// Files and controls to a scene and a lens, and what comes back to the screen.
+// The page: turns files and controls into a scene and a lens, and shows the results.
 
 import { depthAtSize, extremes, fillHoles, metresOf } from './depth.mjs'
 import { kindOf, readDepth, readPhoto } from './files.mjs'
@@ -96,7 +96,7 @@ async function takeSample() {
   }
 }
 
-/** What a map most likely means: floats are metres, 16 bits millimetres unless they fill their range, 8 bits relative. */
+/** Likely kind of a map: floats are metres, 16 bits millimetres unless they fill their range, 8 bits relative. */
 function guessMeaning({ values, fullScale }) {
   const [low, high] = extremes(values)
   const fillsRange = fullScale !== null && low < 0.1 * fullScale && high > 0.9 * fullScale
@@ -105,7 +105,7 @@ function guessMeaning({ values, fullScale }) {
   $('scale').value = fullScale === null ? '1' : '0.001'
 }
 
-/** Photo, depth map and what it means to a scene; says what is missing or does not fit. */
+/** Makes a scene from photo, depth map and its kind; shows a message if one is missing or does not fit. */
 function arrange(point = { u: 0.5, v: 0.5 }) {
   showTiles()
   scene = null
@@ -223,7 +223,7 @@ function setFocus(distanceM, isDone) {
   update(isDone)
 }
 
-/** The controls say something new: show it in half the size now, in full when they have settled. */
+/** After a change of the controls: render at half the size now, at full size when they have settled. */
 function update(isDone) {
   result = null
   $('save').disabled = true

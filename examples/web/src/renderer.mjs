@@ -1,10 +1,10 @@
-// The page's side of the worker: one picture at a time, always the one wanted last, and how long it will take.
+// The page's side of the worker: renders one picture at a time, always the last one requested, and estimates its time.
 
 export class Renderer {
   /**
    * @param handlers.onSharp ({rgba, width, height}): the photograph at the size of the result.
-   * @param handlers.onBegin (expectedMs or null, isHalf, isReady): a picture has been begun, or waits until all is loaded.
-   * @param handlers.onPicture ({rgba, width, height, half, ms}): it is there.
+   * @param handlers.onBegin (expectedMs or null, isHalf, isReady): a picture was started, or waits for loading.
+   * @param handlers.onPicture ({rgba, width, height, half, ms}): the picture is finished.
    * @param handlers.onFailed (message).
    */
   constructor(handlers) {
@@ -15,7 +15,7 @@ export class Renderer {
     this.#start()
   }
 
-  /** What is to be rendered from now on: {photo, depth, width, height}. */
+  /** Set the scene: {photo, depth, width, height}. */
   setScene(scene) {
     this.scene = { ...scene, sceneId: ++this.sceneId }
     this.wanted = null
@@ -23,7 +23,7 @@ export class Renderer {
     else this.worker.postMessage({ type: 'scene', ...this.scene })
   }
 
-  /** Ask for a picture; one that was asked for and not begun is forgotten. */
+  /** Request a picture; replaces an earlier request that has not been started. */
   request(wanted) {
     this.wanted = wanted
     if (!this.running) this.#next()
@@ -80,7 +80,7 @@ export class Renderer {
     return (this.msPerPixel * this.scene.width * this.scene.height) / (half ? 4 : 1)
   }
 
-  /** A picture in progress cannot be stopped, but its worker can: if loading another is quicker than waiting. */
+  /** Stops a picture in progress by ending its worker, if starting another worker is quicker than waiting. */
   #isWorthStartingAgain() {
     const expected = this.running && this.#expectedMs(this.running.half)
     return expected !== null && expected - (performance.now() - this.running.began) > this.loadMs

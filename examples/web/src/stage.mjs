@@ -17,7 +17,7 @@ export class Stage {
     this.#listenForDivider()
   }
 
-  /** Show the photograph as it is, and its size. */
+  /** Show the sharp photograph, and its size. */
   showSharp({ rgba, width, height }) {
     this.frame.style.setProperty('--aspect', width / height)
     for (const canvas of [this.before, this.after]) {
@@ -42,12 +42,12 @@ export class Stage {
     context.drawImage(small, 0, 0, this.after.width, this.after.height)
   }
 
-  /** Whether there is anything to focus and to compare. */
+  /** Whether there is a picture to focus and compare. */
   setActive(isActive) {
     this.frame.classList.toggle('idle', !isActive)
   }
 
-  /** Show a depth map's picture instead, or, given null, the photograph again. */
+  /** Show the picture of a depth map; null shows the photograph again. */
   showDepth(image) {
     this.depthView.hidden = image === null
     if (image === null) return
@@ -56,7 +56,7 @@ export class Stage {
     this.depthView.getContext('2d').putImageData(image, 0, 0)
   }
 
-  /** Put the mark to a point; it is paler where the focus was not set by it. */
+  /** Move the mark to a point; it is paler if the focus was not set there. */
   mark(u, v, isFocus) {
     this.point = { u, v }
     this.reticle.style.setProperty('--x', `${100 * u}%`)
@@ -64,7 +64,7 @@ export class Stage {
     this.reticle.classList.toggle('set-by-distance', !isFocus)
   }
 
-  /** Show the progress of what takes about so long; null: nobody knows. */
+  /** Show the progress of work that takes about this many ms; null means unknown. */
   beginProgress(expectedMs) {
     clearInterval(this.ticking)
     this.progress.hidden = false

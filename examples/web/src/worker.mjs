@@ -1,4 +1,4 @@
-// Renders away from the page, which stays quick meanwhile.
+// Renders in a worker, so that the page stays responsive.
 //
 // Takes {type: 'scene', photo, depth, width, height}, then {type: 'render', half, focusM, fNumber}.
 // Gives {type: 'ready'}, {type: 'sharp', rgba, width, height}, {type: 'picture', half, rgba, width, height} or {type: 'failed', message}.

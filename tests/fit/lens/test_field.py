@@ -1,4 +1,4 @@
-"""Spots across the field, traced, in a table and in a picture."""
+"""Spots across the field: traced directly, from a table, and in rendered pictures."""
 
 import math
 from typing import Any
@@ -21,19 +21,19 @@ from torchdof.reference.scenes import Plane, plane_views, waves
 
 WIDTH, HEIGHT = 960, 640
 F_NUMBER, FOCUS_M, SENSOR_MM = 2.0, 2.0, 36.0
-POINT_PX = 0.7  # standard deviation of a point light
+POINT_PX = 0.7  # sigma of the sharp image of a point light, a Gaussian
 RADII = (0.0, 6.0, 8.0, 13.0, 15.0, 19.0, 21.0)
 
 
 GAUSS = Lens.read("double_gauss_50mm")
 STOPPED = GAUSS.with_f_number(F_NUMBER)
 SENSOR = focus_sensor(STOPPED, FOCUS_M)
-# the thin lens that the traced one stands beside
+# the thin lens with the traced lens's focal length
 CAMERA = Camera(GAUSS.paraxial().focal_length, F_NUMBER, FOCUS_M, SENSOR_MM)
 
 
 def traced_spot(z_m: float, radius_mm: float, azimuth: float, half: int, width: int, rays: int = 160_000) -> np.ndarray:
-    """What pixels ``[2 half + 1, 2 half + 1]`` get of the spot of a point whose sharp image is a small Gaussian."""
+    """Pixels ``[2 half + 1, 2 half + 1]`` of the traced spot of a point whose sharp image is a small Gaussian."""
     height = field_height_mm(STOPPED, z_m, SENSOR, radius_mm, "principal")
     u, v, weight = spot_of_place(STOPPED, z_m, SENSOR, height, rays)
     u, v = u * (width / SENSOR_MM), v * (width / SENSOR_MM)
@@ -69,7 +69,7 @@ def test_rendered_points_are_the_traced_spots(table: BlurTable, z_m: float, leas
         spots.append((slice(row - half, row + half + 1), slice(column - half, column + half + 1), spot))
 
     def decibels(table: BlurTable) -> list[float]:
-        """Of point lights as rendered against traced spots, peak 1, in a square of 1.1 times the blur."""
+        """PSNR of each rendered point light against its traced spot of peak 1, in a square of 1.1 blur radii."""
         picture = blur_by_coc(image, coc_px, table=table)[0, 0].double().numpy()
         errors = [((picture[rows, columns] - spot) ** 2).mean() / spot.max() ** 2 for rows, columns, spot in spots]
         return [-10.0 * math.log10(error) for error in errors]
@@ -79,10 +79,10 @@ def test_rendered_points_are_the_traced_spots(table: BlurTable, z_m: float, leas
 
 
 def rays_of(z_m: float, size: tuple[int, int], samples: int) -> Any:
-    """Rays from places on the sensor back through the lens to a plane, for `plane_views`.
+    """Rays from points of the sensor backwards through the lens to a plane, for `plane_views`.
 
-    A lens is traced backwards by turning it. What a ray sees of the plane is told by where the sharp image, which the
-    lens makes of it through a small stop, shows that point.
+    The turned lens is traced forwards. `plane_views` wants the pixel at which the sharp image shows the point where a
+    ray meets the plane: the image through a small stop, whose distortion is a polynomial fitted to chief rays.
     """
     back, first, pixel = STOPPED.turned(), STOPPED.paraxial(), SENSOR_MM / size[1]
     heights = 0.5 * math.hypot(*size) * pixel * np.linspace(0.1, 1.1, 9)
@@ -94,7 +94,7 @@ def rays_of(z_m: float, size: tuple[int, int], samples: int) -> Any:
 
     def rays(n: int, x: Tensor, y: Tensor) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
         radius, angle = 1.05 * back.surfaces[0].diameter / 2 * math.sqrt((n + 0.5) / samples), n * 2.39996
-        # the picture on the sensor is upside down
+        # the image on the sensor is upside down
         start = (middle - np.stack([x.double().numpy().ravel(), y.double().numpy().ravel()])) * pixel
         aim = radius * np.array([[math.cos(angle)], [math.sin(angle)]])
         run = np.concatenate([aim - start, np.full_like(start[:1], SENSOR)])
@@ -124,10 +124,10 @@ def test_rays_traced_from_pixels_back_through_the_lens_see_the_spot() -> None:
     seen = plane_views([Plane(z_m, light)], rays, (HEIGHT, WIDTH), window, samples)[0, 0].double().numpy()
     straight, turned = (-10.0 * np.log10(((s - spot) ** 2).mean() / spot.max() ** 2) for s in (seen, seen[::-1, ::-1]))
     assert seen.sum() == pytest.approx(1.0, abs=0.01)
-    assert straight > 36.0 and turned < 28.0  # of so many rays; and it does not lie inwards
+    assert straight > 36.0 and turned < 28.0  # 900 rays give 36 dB; the spot does not point inwards
 
 
-def test_a_picture_across_the_field_is_what_rays_through_the_lens_make(table: BlurTable) -> None:
+def test_a_picture_of_a_table_with_a_field_equals_one_of_rays_through_the_lens(table: BlurTable) -> None:
     size, samples, plane = (240, 360), 100, Plane(0.9, waves(11))
 
     def pinhole(_: int, x: Tensor, y: Tensor) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
@@ -148,11 +148,11 @@ def test_a_picture_across_the_field_is_what_rays_through_the_lens_make(table: Bl
     assert decibels(table.replace(field=None)) < 42.0
 
 
-def test_lateral_colour_draws_colours_beside_each_other() -> None:
+def test_lateral_colour_displaces_the_colours_of_a_point() -> None:
     options: dict[str, Any] = {"nodes": 5, "points": 9, "rays": 200, "field": (0, 16.5), "field_nodes": 2}
     table = trace_table(GAUSS, 4.0, 2.0, wavelengths_um=RGB_UM, field_rays=3_000, **options)
     assert table.field is not None
-    stopped, width, column = GAUSS.with_f_number(4.0), 3840, 3680  # 16.5 mm from the middle of 36
+    stopped, width, column = GAUSS.with_f_number(4.0), 3840, 3680  # the column is 16.5 mm from the centre of 36 mm
     sensor = focus_sensor(stopped, 2.0)
     height = field_height_mm(stopped, 2.0, sensor, 16.5, "principal")
     centres = []
@@ -169,7 +169,7 @@ def test_lateral_colour_draws_colours_beside_each_other() -> None:
     assert (across - across[1]).tolist() == pytest.approx([c - centres[1] for c in centres], abs=0.05)
 
 
-def test_on_the_axis_spots_are_round_and_lie_on_it(table: BlurTable) -> None:
+def test_spots_on_the_axis_are_round_and_centred(table: BlurTable) -> None:
     assert table.field is not None and table.channels == 1
     middle, length, width = table.field.box[:, 0].unbind(-1)
     assert float(middle.abs().max()) < 1e-3

@@ -17,7 +17,7 @@ ASPHERE = "40 3 1.5 20 stop k=-0.6 A4=1.2e-06 A10=-3e-13\n-40 2 1 20 A2=0.001\n"
 
 
 @pytest.mark.parametrize("name", FACTS)
-def test_first_order_properties_are_the_designs_and_fit_together(name):
+def test_first_order_properties_equal_the_published_ones_and_are_consistent(name):
     lens = Lens.read(name)
     first, turned = lens.paraxial(), lens.turned().paraxial()
     assert (first.focal_length, first.back_focal) == pytest.approx(FACTS[name], abs=1e-4)
@@ -35,7 +35,7 @@ def test_thick_lens_agrees_with_the_lensmakers_equation(lens_of):
     power = 0.6 * (1 / 60 + 1 / 90 - 0.6 * 8 / (1.6 * 60 * 90))
     assert first.focal_length == pytest.approx(1 / power, rel=1e-12)
     assert first.back_focal == pytest.approx((1 - 0.6 * 8 / (1.6 * 60)) / power, rel=1e-12)
-    # a stop before all glass is its own entrance pupil
+    # a stop in front of all glass is its own entrance pupil
     assert (first.entrance_pupil, first.entrance_pupil_diameter) == pytest.approx((0.0, 18.0))
 
 
@@ -66,7 +66,7 @@ def test_stop_sets_the_f_number_and_scaling_keeps_it(lens_of):
     square = np.linspace(0.0, 9.0, 7) ** 2
     for one, other in zip(lens.surfaces, scaled.surfaces, strict=True):
         np.testing.assert_allclose(other.sag(6.25 * square)[0], 2.5 * one.sag(square)[0], rtol=1e-12)
-    # a polynomial of r^2 is a curvature
+    # A2 r^2 is the paraxial sag of a sphere of curvature 2 A2
     sphere, asphere = (lens_of(f"{front}\n-40 2 1 20\n0 0 0 10\n") for front in ("50 3 1.5 20", "inf 3 1.5 20 A2=0.01"))
     assert asphere.paraxial().focal_length == pytest.approx(sphere.paraxial().focal_length, rel=1e-12)
 
@@ -95,7 +95,7 @@ def test_glasses_have_their_makers_indices(glass, lines, apart, lens_of):
         assert [(n_g - n_f) / (n_f - n_c)] * len(partial) == pytest.approx(partial, rel=1e-9)
 
 
-def test_catalogue_is_that_of_glasses():
+def test_indices_and_dispersions_of_the_catalogue_are_those_of_glasses():
     assert len(catalogue()) > 100
     for name, glass in catalogue().items():
         n_c, n_d, n_f, n_g = map(glass.index, (C_UM, D_UM, F_UM, G_UM))
@@ -169,7 +169,7 @@ def test_wrong_numbers_are_refused(value):
         lens.indices(value)
 
 
-def test_what_is_no_lens_is_refused_by_name(lens_of):
+def test_impossible_lenses_are_refused_by_name(lens_of):
     with pytest.raises(FileNotFoundError, match=r"double_gauss_50mm, telephoto_250mm, wide_22mm"):
         Lens.read("triplet")
     with pytest.raises(ValueError, match="does not converge light"):

@@ -1,4 +1,4 @@
-"""Our rays against those of optiland, an independent ray tracer. Optional: `pip install optiland`."""
+"""Rays and spots against those of optiland, an independent ray tracer (``pip install optiland``)."""
 
 import importlib
 import importlib.util
@@ -15,14 +15,14 @@ from torchdof.fit.lens.rays import trace_rays
 from torchdof.fit.lens.spot import focus_sensor, point_spread
 
 if importlib.util.find_spec("optiland") is None:
-    pytest.skip("optiland is not installed; the rays go without their independent check", allow_module_level=True)
+    pytest.skip("optiland is not installed; rays are not checked independently", allow_module_level=True)
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # its warnings are not ours to fail on
+pytestmark = pytest.mark.filterwarnings("ignore")  # optiland's own warnings
 
 LENSES = ("double_gauss_50mm", "wide_22mm", "telephoto_250mm")
 
 
-# Laikin, Lens Design, 4th ed., p. 63: Tessar, f/4.5, 4 inches, of SCHOTT's glasses; its clear diameters are ours
+# Laikin, Lens Design, 4th ed., p. 63: Tessar, f/4.5, 4 inches, with SCHOTT glasses. Clear diameters are our choice
 TESSAR = """
 1.3329  0.2791 N-SK15 1.1
 -9.9754 0.2054 1      1.1
@@ -34,11 +34,11 @@ TESSAR = """
 -1.5218 0      1      1.1
 """
 LINES_UM = (0.65627, 0.58756, 0.48613)  # C, d, F
-DEPTHS = (2.5, 2.0, 1.5, 1.2, 1.0, 0.7, 0.4, 0.0)  # in dioptres of the focus
+DEPTHS = (2.5, 2.0, 1.5, 1.2, 1.0, 0.7, 0.4, 0.0)  # focus distance over object distance
 
 
-def their_lens(lens: Lens, sensor_mm: float, wavelength_um: float = 0.58756) -> Any:
-    """Glasses of the catalogue by name are theirs; of other media they get our index."""
+def optiland_lens(lens: Lens, sensor_mm: float, wavelength_um: float = 0.58756) -> Any:
+    """The lens in optiland, with optiland's glass of the same name where there is one, else our index."""
     materials = importlib.import_module("optiland.materials")
     optic = importlib.import_module("optiland.optic").Optic()
     optic.surfaces.add(index=0, radius=np.inf, thickness=10.0)
@@ -59,7 +59,7 @@ def their_lens(lens: Lens, sensor_mm: float, wavelength_um: float = 0.58756) -> 
     return optic
 
 
-def their_rays(start: np.ndarray, direction: np.ndarray, wavelength_um: float = 0.58756) -> Any:
+def optiland_rays(start: np.ndarray, direction: np.ndarray, wavelength_um: float = 0.58756) -> Any:
     light, wavelength = np.ones_like(start[0]), np.full_like(start[0], wavelength_um)
     return importlib.import_module("optiland.rays").RealRays(*start, *direction, light, wavelength)
 
@@ -71,25 +71,25 @@ def test_rays_land_within_5e5_mm(name: str, slope: float) -> None:
     sensor = focus_sensor(lens, 2.0, "paraxial")
     rng = np.random.default_rng(0)
     half = lens.paraxial().entrance_pupil_diameter / 2
-    # from a point 1 m before the first vertex to points of the entrance pupil
+    # from a point 1 m in front of the first vertex to points of the entrance pupil
     count = 400
     r, turn = half * np.sqrt(rng.random(count)), 2 * math.pi * rng.random(count)
     pupil = lens.paraxial().entrance_pupil
     source = np.array([[0.0], [-1000.0 * slope], [-1000.0]])
     direction = np.stack([r * np.cos(turn), r * np.sin(turn), np.full(count, pupil)]) - source
     direction /= np.linalg.norm(direction, axis=0)
-    start = source + direction * (999.0 / direction[2])  # 1 mm before the vertex
+    start = source + direction * (999.0 / direction[2])  # 1 mm in front of the vertex
     ours = trace_rays(lens, start, direction)
     assert ours.alive.sum() > count / 4
     x, y = ours.at(lens.vertices[-1] + sensor)
-    theirs = their_rays(start, direction)
-    their_lens(lens, sensor).surfaces.trace(theirs, skip=1)
+    theirs = optiland_rays(start, direction)
+    optiland_lens(lens, sensor).surfaces.trace(theirs, skip=1)
     apart = np.hypot(np.asarray(theirs.x) - x, np.asarray(theirs.y) - y)[ours.alive]
     assert apart.max() < 5e-5
 
 
-def their_rms(lens: Lens, z_m: float, sensor: float, wavelength_um: float) -> float:
-    """RMS radius of the spot on the axis, of rays equally dense over the entrance pupil that pass every aperture."""
+def optiland_rms(lens: Lens, z_m: float, sensor: float, wavelength_um: float) -> float:
+    """RMS radius in mm of the spot on the axis, from rays uniform over the entrance pupil that pass every aperture."""
     first = lens.paraxial()
     height = 1.5 * first.entrance_pupil_diameter / 2 * np.sqrt((np.arange(4000) + 0.5) / 4000)
     reach = 1000.0 * z_m - first.front_principal + first.entrance_pupil  # from the object to the entrance pupil
@@ -98,7 +98,7 @@ def their_rms(lens: Lens, z_m: float, sensor: float, wavelength_um: float) -> fl
     direction /= np.linalg.norm(direction, axis=0)
     start = np.stack([0 * height, height, first.entrance_pupil * along])
     start = start - direction * ((first.entrance_pupil + 5.0) / direction[2])
-    optic, rays = their_lens(lens, sensor, wavelength_um), their_rays(start, direction, wavelength_um)
+    optic, rays = optiland_lens(lens, sensor, wavelength_um), optiland_rays(start, direction, wavelength_um)
     optic.surfaces.trace(rays, skip=1)
     passes = np.isfinite(np.asarray(rays.y))
     for i, surface in enumerate(lens.surfaces):
@@ -117,6 +117,6 @@ def test_rms_spots_of_eight_depths_and_three_lines_agree_within_1_percent(name: 
         for dioptres in DEPTHS:
             z_m = focus_m / dioptres if dioptres else math.inf
             ours = point_spread(lens, z_m, sensor, meridional=True, rays=4000, wavelength_um=wavelength_um).rms
-            theirs = their_rms(lens, z_m, sensor, wavelength_um)
+            theirs = optiland_rms(lens, z_m, sensor, wavelength_um)
             worst = max(worst, abs(ours / theirs - 1.0))
     assert worst < 0.01

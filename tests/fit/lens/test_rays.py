@@ -13,14 +13,14 @@ ALONG = np.array([[0.0], [0.0], [1.0]])
 
 
 def surfaces(*rows: tuple[float, float, float], conic: float = 0.0, polynomial: tuple[float, ...] = ()) -> Lens:
-    """A lens of radius, thickness and index, the stop in front; the last surface may be an asphere."""
+    """A lens from rows (radius, thickness, index) with the stop in front; `conic`, `polynomial`: last surface."""
     shapes = [(0.0, ())] * (len(rows) - 1) + [(conic, polynomial)]
     made = [Surface(r, t, Glass.of_numbers(n), 1e3, *shape) for (r, t, n), shape in zip(rows, shapes, strict=True)]
     return Lens(tuple(made), stop=0)
 
 
 def shaped(radius: float, index: float, conic: float = 0.0, polynomial: tuple[float, ...] = ()) -> Lens:
-    """Glass behind a flat front that ends in a surface."""
+    """A block of glass with a flat front and the given rear surface."""
     return surfaces((math.inf, 30.0, index), (radius, 0.0, 1.0), conic=conic, polynomial=polynomial)
 
 
@@ -33,7 +33,7 @@ def beam(count: int = 500, reach: float = 5.0, tilt: float = 0.1, seed: int = 0)
 
 
 def heights(*height: float, x: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Rays along the axis."""
+    """Rays parallel to the axis at the given heights."""
     y = np.array(height)
     return np.stack([x * y, y, np.full(len(y), -1.0)]), np.repeat(ALONG, len(y), 1)
 
@@ -41,7 +41,7 @@ def heights(*height: float, x: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize(
     ("radius", "conic", "polynomial"), [(30.0, 0.0, ()), (-30.0, 0.0, ()), (-30.0, -0.7, (0.0, 2e-5, -1e-7))]
 )
-def test_rays_meet_the_surface_and_snell_holds_there(radius, conic, polynomial):
+def test_rays_end_on_the_surface_and_obey_snells_law(radius, conic, polynomial):
     lens = shaped(radius, 1.6, conic, polynomial)
     position, direction = beam()
     rays = trace_rays(lens, position, direction)
@@ -52,11 +52,11 @@ def test_rays_meet_the_surface_and_snell_holds_there(radius, conic, polynomial):
     height, slope = surface.sag(square)
     np.testing.assert_allclose(at[2], height, atol=1e-10)
     numeric = (surface.sag(square + step)[0] - surface.sag(square - step)[0]) / 2 / step
-    np.testing.assert_allclose(slope, numeric, atol=1e-8)  # the slope is the sag's own
+    np.testing.assert_allclose(slope, numeric, atol=1e-8)  # the slope is the derivative of the sag
     normal = np.stack([-2 * slope * at[0], -2 * slope * at[1], np.ones_like(slope)])
     u, v = direction[:2] / 1.6  # behind the flat front
     inside = np.stack([u, v, np.sqrt(1 - u * u - v * v)])
-    # the tangential part of index x direction does not change; directions stay unit vectors
+    # Snell's law: index * direction changes only along the normal; directions stay unit vectors
     change = np.cross(1.6 * inside - rays.direction, normal, axis=0)
     assert rays.alive.sum() > 400
     np.testing.assert_allclose(change[:, rays.alive], 0.0, atol=1e-10)
@@ -70,7 +70,7 @@ def test_rays_near_the_axis_follow_first_order_optics(name):
     rays = trace_rays(lens, *heights(height))
     assert rays.at(lens.vertices[-1] + first.back_focal)[1, 0] == pytest.approx(0.0, abs=1e-7 * height)
     assert rays.direction[1, 0] == pytest.approx(-height / first.focal_length, rel=1e-7)
-    # through the middle of the entrance pupil, out through that of the exit pupil
+    # a ray to the centre of the entrance pupil leaves through the centre of the exit pupil
     direction = np.array([[0.0], [2e-5], [1.0]]) / math.hypot(2e-5, 1.0)
     rays = trace_rays(lens, first.entrance_pupil * ALONG - 100.0 * direction, direction, clip=False)
     exit_pupil = lens.vertices[-1] - lens.turned().paraxial().entrance_pupil
@@ -78,7 +78,7 @@ def test_rays_near_the_axis_follow_first_order_optics(name):
 
 
 def test_hyperboloid_focuses_a_beam_in_one_point():
-    # Descartes: glass ends in a hyperboloid of conic constant -n^2; the focus lies at R / (1 - n), for any height
+    # Descartes: a rear surface with conic constant -n^2 focuses a parallel beam at R / (1 - n), at any height
     n, radius = 1.5, -20.0
     rays = trace_rays(shaped(radius, n, -n * n), *heights(*np.linspace(-15.0, 15.0, 31), x=0.3))
     assert rays.alive.all()
@@ -86,7 +86,7 @@ def test_hyperboloid_focuses_a_beam_in_one_point():
     assert np.abs(rays.at(29.0 + radius / (1 - n))[1]).max() > 0.1
 
 
-def test_polynomial_asphere_is_the_conic_whose_series_it_is():
+def test_a_polynomial_asphere_with_a_spheres_series_equals_the_sphere():
     # sag of a sphere: c r^2 / 2 + c^3 r^4 / 8 + c^5 r^6 / 16 + 5 c^7 r^8 / 128 + 7 c^9 r^10 / 256 + ...
     c = -1 / 60.0
     series = tuple(factor * c**power for factor, power in ((1 / 2, 1), (1 / 8, 3), (1 / 16, 5), (5 / 128, 7)))
@@ -111,7 +111,7 @@ WALL = surfaces((math.inf, 1.0, 1.0), (10.0, 5.0, 1.5), (math.inf, 0.0, 1.0))
         (WALL.with_stop(8.0), (3.9, 4.1, 9.99, 1e6), (1, 0, 0, 0)),
         (shaped(-10.0, 1.0), (5.0, 9.9, 10.1, 40.0, 1e6), (1, 1, 0, 0, 0)),
         (shaped(-10.0, 1.0, 0.0, (0.0, 1e-7)), (5.0, 9.9, 10.1, 40.0, 1e6), (1, 1, 0, 0, 0)),
-        # surfaces that cross at a height of 6 mm: beyond, there is no glass between them
+        # the surfaces cross at a height of 6 mm; further out there is no glass between them
         (
             surfaces((math.inf, 1.0, 1.0), (20.0, 2 * (20.0 - math.sqrt(400.0 - 36.0)), 1.5), (-20.0, 0.0, 1.0)),
             (0.0, 5.9, 6.1, 8.0),
@@ -120,19 +120,19 @@ WALL = surfaces((math.inf, 1.0, 1.0), (10.0, 5.0, 1.5), (math.inf, 0.0, 1.0))
     ],
     ids=["reflected", "missed", "missed in air", "stopped", "beyond a sphere", "beyond an asphere", "out of order"],
 )
-def test_rays_that_do_not_pass_end_without_warnings(lens, height, alive):
+def test_blocked_rays_end_without_warnings(lens, height, alive):
     assert trace_rays(lens, *heights(*height)).alive.tolist() == [bool(one) for one in alive]
 
 
-def test_rays_are_not_clipped_where_that_is_asked_for_and_many_are_as_few():
+def test_clip_false_ignores_apertures_and_many_rays_give_the_results_of_few():
     position, direction = heights(*np.linspace(0.0, 12.0, 40_000))
     small = WALL.with_stop(8.0)
     assert trace_rays(small, position[:, 20_000:20_001], direction[:, :1], clip=False).alive[0]
     many = trace_rays(small, position, direction)
     for start in (0, 16_300, 39_900):
         few = trace_rays(small, position[:, start : start + 100], direction[:, :100])
-        for found, wanted in zip(many, few, strict=True):
-            np.testing.assert_array_equal(found[..., start : start + 100], wanted)
+        for found, expected in zip(many, few, strict=True):
+            np.testing.assert_array_equal(found[..., start : start + 100], expected)
 
 
 @pytest.mark.parametrize("shapes", [((3,), (3,)), ((3, 2), (3, 1)), ((2, 5), (2, 5))])

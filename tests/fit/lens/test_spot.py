@@ -16,7 +16,7 @@ def gauss() -> Lens:
 @pytest.mark.parametrize(
     ("reference", "radius"), [("principal", 0.37052), ("pupil", 0.36889), ("vertex", 0.35927), ("sensor", 0.39485)]
 )
-def test_blur_depends_on_what_distances_are_measured_from_and_focus_does_not(gauss, reference, radius):
+def test_the_reference_point_of_distances_changes_the_blur_but_not_the_focus(gauss, reference, radius):
     sensor = focus_sensor(gauss, 2.0, "paraxial", reference)
     spot = point_spread(gauss, 1.0, sensor, reference=reference, meridional=True, rays=20_000)
     assert spot.radius == pytest.approx(radius, abs=2e-5)
@@ -25,14 +25,14 @@ def test_blur_depends_on_what_distances_are_measured_from_and_focus_does_not(gau
     assert point_spread(lens, 2.0, sensor, reference=reference, meridional=True).radius < 1e-3
 
 
-def test_the_same_plane_is_in_focus_from_the_sensor_and_from_h(gauss):
+def test_distances_from_the_sensor_and_from_h_focus_the_same_plane(gauss):
     sensor = focus_sensor(gauss, 2.0, "paraxial", "sensor")
     from_h = 2.0 - (gauss.vertices[-1] + sensor - gauss.paraxial().front_principal) / 1000.0
     assert focus_sensor(gauss, from_h, "paraxial", "principal") == pytest.approx(sensor, abs=1e-9)
 
 
 def over_thin_lens(lens: Lens, f_number: float, focus_m: float, z_m: float) -> float:
-    """Largest blur radius over the thin lens's, less 1; allows for an entrance pupil beside H."""
+    """Blur radius over that of the thin lens, minus 1; the thin lens has its pupil where the entrance pupil is."""
     first, stopped = lens.paraxial(), lens.with_f_number(f_number)
     apart = (first.front_principal - first.entrance_pupil) / 1000.0
     thin = abs(signed_coc_mm(z_m, first.focal_length, f_number, focus_m)) / (1.0 - apart / z_m)
@@ -42,10 +42,10 @@ def over_thin_lens(lens: Lens, f_number: float, focus_m: float, z_m: float) -> f
 
 @pytest.mark.parametrize(("name", "focus_m"), [("double_gauss_50mm", 2.0), ("wide_22mm", 1.0)])
 @pytest.mark.parametrize("z_m", [0.7, 1.5, 5.0, math.inf])
-def test_tiny_aperture_is_the_thin_lens(name, focus_m, z_m):
+def test_a_tiny_aperture_gives_the_thin_lens(name, focus_m, z_m):
     lens = Lens.read(name)
     assert abs(over_thin_lens(lens, 400.0, focus_m, z_m)) < 2e-4
-    # what is left is of third order: a quarter for a stop half as wide
+    # the difference is a third-order aberration: proportional to the square of the stop's diameter
     wide, narrow = (over_thin_lens(lens, f_number, focus_m, z_m) for f_number in (22.0, 44.0))
     assert abs(wide) > 1e-3
     assert wide / narrow == pytest.approx(4.0, rel=0.06)
@@ -55,7 +55,7 @@ def test_best_focus_has_the_least_rms_radius(gauss):
     best = focus_sensor(gauss, 2.0, "best")
     rms = [point_spread(gauss, 2.0, best + shift, meridional=True).rms for shift in (-0.005, 0.0, 0.005)]
     assert rms[1] < min(rms[0], rms[2])
-    assert rms[0] == pytest.approx(rms[2], rel=1e-3)  # a parabola's feet
+    assert rms[0] == pytest.approx(rms[2], rel=1e-3)  # the RMS is a parabola around its minimum
     assert abs(best - focus_sensor(gauss, 2.0, "paraxial")) < 0.02
 
 
@@ -74,18 +74,18 @@ def test_spot_on_axis_is_round_and_agrees_with_the_fan(gauss, z_m):
 
 
 def test_a_near_point_lights_rings_of_the_pupil_by_their_solid_angle(gauss):
-    # 8 cm before H, where the pupil's rim is 12 degrees aside: of light within a cone, 1 - cosine
+    # 8 cm in front of H the pupil's rim is 12 degrees off the axis; a cone has the solid angle 2 pi (1 - cos)
     spot = point_spread(gauss, 0.08, 60.0, meridional=True, rays=4_000)
     pupil = gauss.paraxial().entrance_pupil
     distance = 80.0 - gauss.paraxial().front_principal + pupil
     rim = math.sqrt(spot.pupil_mm2 / math.pi)
-    # the outermost tenth of the fan's rays: rings of equal area from 0.9 of the pupil's on
+    # the outermost tenth of the fan's rays: rings of equal area, from 0.9 of the pupil's area outwards
     cosine = [distance / math.hypot(distance, rim * math.sqrt(share)) for share in (0.9, 1.0)]
     outer = spot.weight[round(0.9 * len(spot.weight)) :].sum()
     assert outer == pytest.approx((cosine[0] - cosine[1]) / (1.0 - cosine[1]), rel=2e-3)
 
 
-def test_vignetting_takes_light_and_roundness_towards_the_corner(gauss):
+def test_vignetting_reduces_light_and_symmetry_towards_the_corner(gauss):
     sensor = focus_sensor(gauss, 2.0)
     spots = [point_spread(gauss, 1.0, sensor, field_mm=f) for f in (0.0, 6.0, 12.0, 18.0)]
     area, asymmetry = [spot.pupil_mm2 for spot in spots], [spot.asymmetry for spot in spots]
@@ -97,8 +97,10 @@ def test_vignetting_takes_light_and_roundness_towards_the_corner(gauss):
 
 
 @pytest.mark.parametrize("z_m", [2.0, math.inf])
-@pytest.mark.parametrize(("field_mm", "distortion"), [(0.1, 1e-4), (3.0, 1e-3), (10.0, 0.008)])  # grows as its square
-def test_field_is_where_a_pinhole_would_image_the_point(gauss, z_m, field_mm, distortion):
+@pytest.mark.parametrize(
+    ("field_mm", "distortion"), [(0.1, 1e-4), (3.0, 1e-3), (10.0, 0.008)]
+)  # distortion grows with the square of field_mm
+def test_field_mm_is_the_height_of_a_pinholes_image(gauss, z_m, field_mm, distortion):
     lens = gauss.with_f_number(16.0)
     centre = point_spread(lens, z_m, focus_sensor(lens, z_m), field_mm=field_mm, rays=5_000).centre
     assert centre == pytest.approx(field_mm, rel=distortion)

@@ -17,8 +17,8 @@ from torchdof.optics import psf
 
 WIDTH = 1920
 PIXEL = 36.0 / WIDTH
-SHARP_PX = 0.34  # from here on a shipped table shows all its blur in focus
-# lens, f-number, focus, nodes, wanted PSNR between nodes where images are blurred
+SHARP_PX = 0.34  # smallest |CoC| in px at which a shipped table is not faded to a point
+# lens, f-number, focus in m, nodes, least PSNR in dB between nodes with |CoC| of at least SHARP_PX
 SHIPPED = {
     "double_gauss_50mm_f2": ("double_gauss_50mm", 2.0, 2.0, 41, 55.0),
     "double_gauss_50mm_f4": ("double_gauss_50mm", 4.0, 2.0, 16, 60.0),
@@ -31,7 +31,10 @@ read = functools.cache(Lens.read)
 
 @functools.cache
 def traced_kernel(lens: Lens, f_number: float, focus_m: float, coc: float) -> np.ndarray:
-    """The spot of a fan turned about the axis, in eighths of a pixel, as pixels see it: no kernel code, no fit."""
+    """Kernel of a traced fan, rotated about the axis on a grid of 1/8 px and integrated over pixels.
+
+    It uses neither the renderer's kernels nor the fit.
+    """
     per_dioptre = signed_coc_mm(math.inf, lens.paraxial().focal_length, f_number, focus_m) * focus_m
     dioptres = 1.0 / focus_m - coc / per_dioptre
     z_m = 1.0 / dioptres if dioptres > 1e-9 else math.inf
@@ -59,7 +62,7 @@ def between(table: BlurTable, share: float = 0.5) -> np.ndarray:
 
 
 def psnr(table: BlurTable, places: Any, lens: Lens, f_number: float, focus_m: float, *, shown: bool) -> np.ndarray:
-    """PSNR at signed coc in mm: of what the table shows, or of its kernels without the fade to focus."""
+    """PSNR at signed CoCs in mm of a table's kernels; with `shown` False without their fade to a point in focus."""
     found = []
     for coc in map(float, places):
         px = coc / PIXEL
@@ -69,9 +72,9 @@ def psnr(table: BlurTable, places: Any, lens: Lens, f_number: float, focus_m: fl
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_shipped_table_matches_traced_spots_and_says_where_it_is_from(name):
-    # the fit saw spots at 1/4, 1/2 and 3/4 of each interval
-    lens, f_number, focus_m, nodes, wanted = SHIPPED[name]
+def test_a_shipped_table_matches_traced_spots_and_states_its_origin(name):
+    # the fit used spots at 1/4, 1/2 and 3/4 of each interval
+    lens, f_number, focus_m, nodes, least = SHIPPED[name]
     table = BlurTable.load(name)
     assert len(table.coc) == nodes
     shares = [0.15, 1 / 3, 0.5, 2 / 3, 0.85]
@@ -80,9 +83,9 @@ def test_shipped_table_matches_traced_spots_and_says_where_it_is_from(name):
     blurred, is_middle = places[blurs], np.repeat(shares, nodes - 1)[blurs] == 0.5
     shown = psnr(table, blurred, read(lens), f_number, focus_m, shown=True)
     plain = psnr(table, places, read(lens), f_number, focus_m, shown=False)
-    assert shown[is_middle].min() >= wanted
+    assert shown[is_middle].min() >= least
     assert shown.min() >= 55.0 and plain.min() >= 50.0
-    # around focus a table is nowhere worse than the thin lens
+    # near focus a table is at least as good as the thin lens
     px = np.array([-1.3, -0.85, -0.7, -0.35, -0.1, 0.1, 0.35, 0.7, 0.85, 1.3])
     near, thin = (psnr(t, px * PIXEL, read(lens), f_number, focus_m, shown=True) for t in (table, DISC))
     assert (near - np.minimum(thin, 55.0)).min() > 0.0 and near[np.abs(px) > SHARP_PX].min() >= 50.0
@@ -93,7 +96,7 @@ def test_shipped_table_matches_traced_spots_and_says_where_it_is_from(name):
     assert len(str(table.to_dict())) < 150_000
 
 
-def test_a_table_takes_as_many_nodes_as_50_db_need(lens_of):
+def test_the_number_of_nodes_is_chosen_for_50_db(lens_of):
     lens = lens_of("50 5 1.5168 20\n0 1 0 18\n-50 0 1 20\n")
     given = {"f_number": 6.0, "nodes": None, "points": 33, "rays": 500}
     coarse, fine = (small(lens, **given, width_px=width) for width in (480, WIDTH))
@@ -114,7 +117,7 @@ def test_fitting_all_nodes_at_once_beats_fitting_each_alone(monkeypatch):
     assert found[6].min() > found[0].min() + 3.0
 
 
-def test_signed_coc_is_the_cameras():
+def test_signed_coc_equals_camera_coc_px():
     depth = torch.tensor([0.7, 1.0, 2.0, 3.0, 100.0, math.inf], dtype=torch.float64).reshape(1, 1, 1, -1)
     expected = Camera(50.3582, 2.8, 2.0, 36.0).coc_px(depth, width=36).flatten().tolist()
     found = [signed_coc_mm(z, 50.3582, 2.8, 2.0) for z in depth.flatten().tolist()]
@@ -126,7 +129,7 @@ def small(lens: Lens, **changes: Any) -> BlurTable:
     return trace_table(lens, **{**given, **changes})
 
 
-def test_shut_down_lens_gives_discs_of_the_thin_lens():
+def test_a_stopped_down_lens_gives_discs_of_the_thin_lens():
     table = small(read("double_gauss_50mm"), f_number=32.0, focus="paraxial")
     far = psf.disc(float(table.coc[-1]) / PIXEL)
     made = table.kernels(table.coc[-1:] / PIXEL, WIDTH)[0, 0]
@@ -141,7 +144,7 @@ def test_nodes_reach_from_the_nearest_distance_to_infinity():
     assert 0.0 in table.coc.tolist() and table.provenance["asymmetry"] == 0.0
     command = table.provenance["command"].removeprefix("torchdof.fit.")
     assert eval(command, {"trace_table": trace_table, "Lens": Lens}).to_dict() == table.to_dict()
-    table = small(lens, focus_m=math.inf, nodes=4)  # there is a near side only
+    table = small(lens, focus_m=math.inf, nodes=4)  # focused at infinity, everything is in front of the focus
     assert len(table.coc) == 4 and float(table.coc.max()) == 0.0
     assert table.provenance["focus_m"] == "inf"
 
@@ -150,9 +153,8 @@ def test_dispersion_gives_one_kernel_a_channel(lens_of):
     lens = lens_of("50 5 1.5168/64.17 20\n0 1 0 8\n-50 0 1 20\n")
     table = small(lens, focus="paraxial", wavelengths_um=RGB_UM)
     assert table.channels == 3
-    # behind the focus a singlet's image lies nearer to the lens, in blue even more: the blur is larger
+    # a singlet focuses blue nearer to the lens: blue is blurred more behind the focus and less in front of it
     assert (table.node_params["radius"][:, -1].diff() > 0).all()
-    # before it the other way round
     assert (table.node_params["radius"][:, 0].diff() < 0).all()
 
 
@@ -162,13 +164,13 @@ def test_off_axis_table_states_its_asymmetry():
     assert len(asymmetry) == 5 and max(asymmetry) > 0.2
 
 
-@pytest.mark.parametrize(("family", "wanted"), [("softm", 55.0), ("disc", 40.0), ("gaussian", 25.0), ("ring", 35.0)])
-def test_named_shapes_follow_a_stopped_down_lens(family, wanted):
+@pytest.mark.parametrize(("family", "least"), [("softm", 55.0), ("disc", 40.0), ("gaussian", 25.0), ("ring", 35.0)])
+def test_parametric_families_fit_a_stopped_down_lens(family, least):
     lens = read("double_gauss_50mm")
     table = small(lens, f_number=4.0, family=family, rays=1_000)
     assert table.family == family
     ends = table.coc.numpy()[[0, -1]]
-    assert psnr(table, ends, lens, 4.0, 2.0, shown=True).min() > wanted
+    assert psnr(table, ends, lens, 4.0, 2.0, shown=True).min() > least
 
 
 @pytest.mark.parametrize(

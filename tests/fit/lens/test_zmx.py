@@ -59,7 +59,7 @@ def numbers(lens: Lens) -> list[list[float]]:
 @pytest.mark.parametrize(
     ("name", "encoding"), [("double_gauss_50mm", "utf-8"), ("wide_22mm", "utf-16"), ("telephoto_250mm", "utf-8")]
 )
-def test_shipped_lens_written_as_zmx_is_read_as_itself(name, encoding, lens_of):
+def test_a_shipped_lens_survives_a_round_trip_through_zmx(name, encoding, lens_of):
     lens = Lens.read(name)
     again = lens_of(as_zmx(lens), "lens.zmx", encoding)
     np.testing.assert_allclose(numbers(again), numbers(lens), rtol=1e-14)
@@ -100,7 +100,7 @@ def test_inches_are_millimetres_times_25_4(lens_of):
         ("DISZ 5", "DISZ -5", "surface 2: thickness must be a number from 0"),
     ],
 )
-def test_what_is_no_such_lens_is_refused(old, new, message, lens_of):
+def test_unsupported_zmx_files_are_refused(old, new, message, lens_of):
     text = HEAD.format("MM") + SINGLET
     assert old in text
     with pytest.raises(ValueError, match=rf"lens\.zmx: {message}"):

@@ -1,4 +1,4 @@
-"""Dots of a grid to one table whose blur depends on the place."""
+"""A grid of dots becomes one table whose blur varies across the field."""
 
 import math
 
@@ -14,15 +14,15 @@ from torchdof.optics.field import deviations
 
 
 def radii(table: BlurTable, coc_px: float, away_px: list[float], width: int) -> list[float]:
-    """Radius in pixels of the disc with the second moment, along u and v, of the spots of places."""
+    """Radius in px of the disc with the spot's second moment, the mean of u and v, at `away_px` from the centre."""
     box, light = table.field.spots(coc_px / table.px_per_unit(width), torch.tensor(away_px) / table.px_per_unit(width))
     return (2.0 * deviations(box, light) * table.px_per_unit(width)).mean(-1).tolist()
 
 
-def test_a_grid_of_dots_tells_how_the_blur_grows_across_the_field(simulator, tmp_path):
+def test_a_grid_of_dots_gives_the_blur_across_the_field(simulator, tmp_path):
     far, focus = 120.0, 0.5
 
-    def radius(distance, away):  # the focus of the corners lies nearer
+    def radius(distance, away):  # curvature of field: the corners focus nearer
         return 20.0 * (1 / (focus * (1.0 - 0.1 * (away / far) ** 2)) - 1 / distance)
 
     def kernel(distance, x, y):
@@ -44,23 +44,23 @@ def test_a_grid_of_dots_tells_how_the_blur_grows_across_the_field(simulator, tmp
 
 
 def eye(x: float, y: float) -> torch.Tensor:
-    """A disc whose side away from the middle is cut off, of a dot at a place."""
+    """Aperture mask of a dot at (x, y): a disc whose side away from the frame's centre is cut off."""
     place = (torch.arange(64) + 0.5) / 32 - 1.0
     down, right = place[:, None], place[None, :]
     outwards = (down * y + right * x) / math.hypot(x, y)
     return ((torch.hypot(down, right) < 1.0) & (outwards < 0.4)).double()
 
 
-def test_openings_of_dots_are_turned_to_one_spot():
+def test_apertures_of_dots_are_rotated_to_a_common_direction():
     places = [(0.0, 0.0), (10.0, 0.0), (-6.0, 8.0), (0.0, -20.0)]
     openings = [torch.ones(64, 64), *(eye(*place) for place in places[1:])]
     arguments = {"coc": [-1.0, 1.0], "params": {"radius": [1.0, 1.0]}, "unit": "mm", "sensor_width_mm": 36.0}
     tables = [BlurTable("disc", **arguments, aperture=BlurTable.from_aperture(o).aperture) for o in openings]
     field = field_of_dots(tables, places, [1.0, 1.0])
     assert field.radius.tolist() == [0.0, 10.0, 20.0] and field.coc.tolist() == [-1.0, 0.0, 1.0]
-    assert float(field.box[1].max()) < 1e-4  # in focus a point is one, as lines through both sides tell
+    assert float(field.box[1].max()) < 1e-4  # interpolated to focus, the spot is a point
     u = (torch.arange(field.light.shape[-2]) + 0.5) / field.light.shape[-2] * 2.0 - 1.0
-    for k, turned in ((0, -1.0), (2, 1.0)):  # in front of the focus openings show turned by half
+    for k, turned in ((0, -1.0), (2, 1.0)):  # in front of the focus the image of the aperture is rotated by 180 degrees
         for f in (1, 2):
             along = field.light[0, k, f].sum(-1)
             cut = (u * turned * float(field.box[k, f, 1])) > 0.45
@@ -74,7 +74,7 @@ def test_openings_of_dots_are_turned_to_one_spot():
     torch.testing.assert_close(mirrored.light[:, 0], field.light[:, 0], rtol=0, atol=2e-3 * float(field.light.max()))
 
 
-def test_dots_at_one_distance_are_refused_and_none():
+def test_dots_at_one_distance_and_an_empty_list_are_refused():
     table = BlurTable("disc", coc=[1.0], params={"radius": [1.0]}, unit="fraction")
     with pytest.raises(FitError, match="at two distances from the middle"):
         field_of_dots([table], [(0.0, 0.0)], [1.0])

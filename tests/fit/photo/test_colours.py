@@ -1,4 +1,4 @@
-"""A kernel a colour from one capture: lateral and longitudinal colour told apart, against a simulated lens."""
+"""One kernel per colour from one capture of a simulated lens with lateral and longitudinal colour."""
 
 import numpy as np
 import pytest
@@ -7,13 +7,13 @@ from torchdof import BlurTable
 from torchdof.fit import Capture, Captures, fit_captures, read_captures
 from torchdof.fit.photo.frame import PATTERNS, demosaiced
 
-PER_DIOPTRE, FOCUS = 24.0, (-0.04, 0.0, 0.05)  # px a dioptre, and how much nearer each colour is focused, 1/m
-SIDE = ((0.5, -0.2), (0.0, 0.0), (-0.3, 0.4))  # px by which each colour lies beside green
+PER_DIOPTRE, FOCUS = 24.0, (-0.04, 0.0, 0.05)  # blur radius in px per dioptre; focus of each colour minus green's, 1/m
+SIDE = ((0.5, -0.2), (0.0, 0.0), (-0.3, 0.4))  # displacement (x, y) of each colour from green, px
 DISTANCES = (0.75, 1.4)
 
 
 def frames(simulator, distance, seed, size=61):
-    """Red, green and blue of a dot `[3, H, W]`, each with its own focus and place."""
+    """Picture of a dot `[3, H, W]`: red, green and blue with their own focus and place."""
     rng, m = np.random.default_rng(seed), 1 / distance
     seen = []
     for focus, (x, y) in zip(FOCUS, SIDE, strict=True):
@@ -35,7 +35,7 @@ def captures(simulator, distances=DISTANCES, record=lambda seen: seen):
 
 
 def check(result, distances, tolerance):
-    """Blur and place of each colour against the truth: radii to a share, places to three times as many px."""
+    """Checks the colours' radii within the relative `tolerance` and their places within ``3 * tolerance`` px."""
     for colour, focus, side in zip(result.colours, FOCUS, SIDE, strict=True):
         true = [abs(PER_DIOPTRE * (1 - 1 / d + focus)) for d in distances]
         assert [f.params["radius"] for f in colour.fits] == pytest.approx(true, rel=tolerance)
@@ -58,7 +58,7 @@ def test_lateral_and_longitudinal_colour_are_told_apart(simulator, tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:.*one distance was measured:torchdof.fit.problems.FitWarning")
-def test_a_mosaic_tells_the_same_as_three_colours(simulator):
+def test_a_mosaic_gives_the_same_blur_as_three_colours(simulator):
     def through_mosaic(seen):
         mosaic = seen[1].copy()
         mosaic[::2, ::2], mosaic[1::2, 1::2] = seen[0, ::2, ::2], seen[2, 1::2, 1::2]
@@ -68,7 +68,7 @@ def test_a_mosaic_tells_the_same_as_three_colours(simulator):
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
-def test_demosaicing_keeps_planes(pattern):
+def test_demosaicing_is_exact_for_linear_gradients(pattern):
     rows, columns = np.indices((8, 10))
     planes = np.stack([0.1 * columns + 0.2, 0.1 * rows + 0.3, 0.05 * (rows + columns)])
     mosaic = np.zeros((8, 10))

@@ -1,4 +1,4 @@
-"""Finding the dot."""
+"""Detection of the dot: centre, radius, noise; rings, dust and grids."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from torchdof.fit.photo.dot import find_dot, find_dots
 
 @pytest.mark.parametrize(("gain", "level"), [(1.0, 0.0), (300.0, 64.0)])
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.3, -0.4), (5.25, 3.5)])
-def test_centre_and_radius_are_found_below_a_pixel_at_any_level(simulator, shift, gain, level):
+def test_centre_and_radius_have_subpixel_accuracy_at_any_level(simulator, shift, gain, level):
     picture = simulator.draw_dot(81, 9.0, shift) + np.random.default_rng(0).normal(0, 0.01, (81, 81))
     dot = find_dot(gain * picture + level)
     assert (dot.x - 40, dot.y - 40) == pytest.approx(shift, abs=0.03)
@@ -16,7 +16,7 @@ def test_centre_and_radius_are_found_below_a_pixel_at_any_level(simulator, shift
     assert dot.noise == pytest.approx(0.01 * gain, rel=0.1) and dot.background == pytest.approx(level, abs=0.01 * gain)
 
 
-def test_a_ring_is_one_dot_dust_is_none_and_a_grid_gives_every_one(simulator):
+def test_a_ring_is_one_dot_dust_is_ignored_and_every_dot_of_a_grid_is_found(simulator):
     ring = simulator.blur(simulator.draw_dot(101, 1.0), "ring", {"sigma": 1.5, "r_c": 14.0})
     assert len(find_dots(ring / ring.max() + np.random.default_rng(0).normal(0, 0.01, ring.shape))) == 1
     dusty = simulator.draw_dot(81, 9.0)

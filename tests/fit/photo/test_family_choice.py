@@ -1,4 +1,4 @@
-"""Accuracy on a natural image, and the choice by need."""
+"""PSNR on natural images and on highlights, and the choice of the cheapest sufficient family."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from torchdof.fit.photo.family_choice import choose, highlight_psnr
 from torchdof.optics.psf import disc, gaussian, ring
 
 
-def test_psnr_is_that_of_an_image_with_the_spectrum():
+def test_natural_psnr_equals_the_psnr_of_an_image_with_that_spectrum():
     # an image drawn with a 1/f amplitude and random phase, blurred both ways and compared
     rng = np.random.default_rng(0)
     n = 256
@@ -27,13 +27,13 @@ def test_psnr_is_that_of_an_image_with_the_spectrum():
     assert natural_psnr(first, second) == pytest.approx(direct, abs=0.3)
 
 
-def test_a_highlight_tells_a_ring_from_a_disc_where_a_photograph_hardly_does():
+def test_a_highlight_distinguishes_a_ring_from_a_disc_better_than_a_photograph():
     round_, rim = disc(8.0, size=33), ring(3.0, 4.0, size=33)
     assert natural_psnr(round_, rim) > 37 and highlight_psnr(round_, rim) < 17
     assert highlight_psnr(round_, disc(8.0, size=41)) > 190
 
 
-def test_choice_is_the_cheapest_that_looks_like_the_likeliest():
+def test_the_choice_is_the_cheapest_family_that_looks_like_the_likeliest():
     kernels = {"gaussian": gaussian(3.0), "disc": disc(6.0), "radial": disc(6.002)}
     arrays = {k: v.numpy() for k, v in kernels.items()}
     family, why, psnr = choose(arrays, {"gaussian": 900.0, "disc": 50.0, "radial": 0.0}, 45)

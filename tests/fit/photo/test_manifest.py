@@ -1,4 +1,4 @@
-"""Folders of photographs: reading, windows, and every refusal with its file and number."""
+"""Folders with a capture.toml: reading, windows around dots, and errors with file and number."""
 
 from pathlib import Path
 
@@ -33,7 +33,7 @@ def picture(folder, name, value, size=(240, 400)):
     write_image(folder / name, Picture(torch.full((1, 3, *size), value)), transfer="srgb", sample="16")
 
 
-def test_a_folder_is_read_linear_and_cut_around_the_dot(folder):
+def test_pictures_are_decoded_to_linear_light_and_cropped_around_the_dot(folder):
     (captures,) = read_captures(folder)
     assert [c.distance_m for c in captures] == [0.4, 1.0] and captures.focus_m == 0.5 and captures.width_px == 400
     first = captures.pairs[0]
@@ -45,7 +45,7 @@ def test_a_folder_is_read_linear_and_cut_around_the_dot(folder):
         assert fit.params["sigma"] == pytest.approx(softness(pair.distance_m)[1]["sigma"], rel=0.02)
 
 
-def test_the_dark_frame_is_subtracted_and_the_transfer_is_what_the_manifest_says(folder):
+def test_the_dark_frame_is_subtracted_and_the_manifests_transfer_is_used(folder):
     picture(folder, "dark.png", 0.02)
     change(folder, "focus_m = 0.5", 'focus_m = 0.5\ndark = "dark.png"')
     assert abs(np.median(read_captures(folder)[0].pairs[0].sharp)) < 2e-3
@@ -54,12 +54,12 @@ def test_the_dark_frame_is_subtracted_and_the_transfer_is_what_the_manifest_says
     assert read_captures(folder)[0].pairs[0].sharp.max() == pytest.approx(0.87, abs=0.03)
 
 
-def test_encoded_pictures_whose_transfer_nobody_stated_are_never_taken_in_silence(folder):
+def test_encoded_pictures_without_a_stated_transfer_give_a_warning(folder):
     change(folder, 'transfer = "srgb"', "")
     with pytest.warns(FitWarning, match="the encoding of 0500mm.png and 2 more is not stated") as caught:
         (captures,) = read_captures(folder)
-    said = caught[0].message
-    assert said.kind == "not linear" and said.number == 3 and said.file.endswith("capture.toml")
+    warning = caught[0].message
+    assert warning.kind == "not linear" and warning.number == 3 and warning.file.endswith("capture.toml")
     assert captures.notes["transfer"] == "by file type"
     for name in ("0400mm", "0500mm", "1000mm"):
         write_image(folder / f"{name}.exr", read_image(folder / f"{name}.png"))
@@ -67,7 +67,7 @@ def test_encoded_pictures_whose_transfer_nobody_stated_are_never_taken_in_silenc
     assert len(read_captures(folder)[0]) == 2  # floats are linear light
 
 
-def test_a_grid_gives_the_centre_dot_or_each(simulator, tmp_path):
+def test_a_grid_gives_the_dot_in_the_centre_or_every_dot(simulator, tmp_path):
     camera = simulator.Simulator(level=0.7, snr_db=46, dot_radius=7.0)
     grid = [(x, y) for x in (-110, 0, 110) for y in (-80, 0, 80)]
     folder = simulator.write_captures(
@@ -136,7 +136,7 @@ def test_wrong_manifests_and_pictures_are_refused_with_the_field(folder, before,
     assert caught.value.kind == kind and caught.value.file.endswith(("capture.toml", ".png"))
 
 
-def test_a_root_holds_the_manifest_and_its_pictures(folder, tmp_path_factory):
+def test_manifest_and_pictures_must_lie_below_root(folder, tmp_path_factory):
     outside = tmp_path_factory.mktemp("outside")
     assert len(read_captures(folder, root=folder)) == len(read_captures(folder, root=folder.parent)) == 1
     with pytest.raises(FitError, match="lies outside of"):
@@ -147,13 +147,13 @@ def test_a_root_holds_the_manifest_and_its_pictures(folder, tmp_path_factory):
     (folder / "link.png").symlink_to(outside / "secret.png")
     for name in ("link.png", f"{outside}/secret.png", f"../{outside.name}/secret.png"):
         change(folder, 'file = "0400mm.png"', f'file = "{name}"')
-        assert "../" in name or len(read_captures(folder)) == 1  # without a root it is read
+        assert "../" in name or len(read_captures(folder)) == 1  # allowed without a root
         with pytest.raises(FitError, match=r"secret\.png' lies outside|link\.png' lies outside"):
             read_captures(folder, root=folder)
         change(folder, f'file = "{name}"', 'file = "0400mm.png"')
 
 
-def test_what_is_missing_is_named(folder, tmp_path):
+def test_missing_files_are_named(folder, tmp_path):
     (folder / "1000mm.png").unlink()
     with pytest.raises(OSError, match="1000mm.png"):
         read_captures(folder)
@@ -175,8 +175,8 @@ def test_captures_from_arrays_are_checked():
             Captures(pairs, focus_m=0.5, width_px=100, **more)
 
 
-def test_a_mosaic_that_a_tag_turns_is_refused(tmp_path: Path) -> None:
-    """Turned, its upper left pixels would have other colours."""
+def test_a_mosaic_with_an_orientation_tag_is_refused(tmp_path: Path) -> None:
+    """Rotation would change the colours of the pattern's upper left pixels."""
     spec = oiio.ImageSpec(8, 6, 1, "uint16")
     spec.attribute("Orientation", 6)
     output = oiio.ImageOutput.create(str(tmp_path / "mosaic.tif"))

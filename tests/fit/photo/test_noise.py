@@ -1,4 +1,4 @@
-"""Noise that goes together in neighbouring pixels: what is estimated of it, and what it does to errors."""
+"""Correlated noise of neighbouring pixels: its estimate and its effect on standard errors."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from torchdof.fit.photo.noise import LAGS, correlate, correlation_of, independen
 from torchdof.fit.photo.pair import prepared_pair
 
 
-def test_independent_noise_is_found_to_be():
+def test_independent_noise_has_no_estimated_correlation():
     noise, everywhere = np.random.default_rng(0).normal(size=(90, 90)), np.ones((90, 90), dtype=bool)
     correlation, fine = noise_beside(noise, 0.0, everywhere)
     assert np.count_nonzero(correlation) == 1 and correlation[LAGS, LAGS] == independent_share(correlation) == 1
@@ -22,12 +22,12 @@ def test_noise_is_measured_beside_the_dot(simulator):
     assert noise_of(dot) == 0
 
 
-def test_the_correlation_of_demosaiced_noise_is_its_filter_s():
+def test_the_correlation_of_demosaiced_noise_is_that_of_its_filter():
     noise = demosaiced(np.random.default_rng(1).normal(size=(160, 160)), "RGGB").mean(0)
     used = np.ones(noise.shape, dtype=bool)
     used[40:80, 40:90] = False
     correlation = correlation_of(np.where(used, noise, 100.0), used)
-    # the pattern's four places have filters of their own; their mean is what a stationary noise would have
+    # each of the pattern's four pixels has its own filter; stationary noise has the mean of their correlations
     parts = []
     for y in (0, 1):
         for x in (0, 1):
@@ -40,24 +40,25 @@ def test_the_correlation_of_demosaiced_noise_is_its_filter_s():
     assert noise_beside(noise, 0.0, used)[1] < 0.3 and independent_share(correlation) < 0.3
 
 
-def test_the_noise_of_a_demosaiced_picture_is_that_of_its_paper(simulator):
+def test_the_noise_of_a_demosaiced_picture_is_that_of_its_background(simulator):
     for seed in range(3):
         sharp, blurred = simulator.Simulator(size=91, bayer=True).pair("disc", {"radius": 6.0}, seed)
         pair = prepared_pair(sharp, blurred, "image")[0]
         dark = pair.distance > pair.dot.reach + 2
-        # 0.65 to 0.75 of it where lags that chance hides were taken for none; and light brings no more
+        # setting insignificant correlations to 0 would give 0.65 to 0.75 of the noise
         assert pair.source.noise / np.sqrt(pair.fine_share) == pytest.approx(blurred[dark].std(), rel=0.1)
-        assert pair.shot_noise < 0.2 * pair.source.noise**2  # 4 where the paper's was told by another measure
+        # there is no shot noise; two different estimators for dot and background would give a ratio of 4
+        assert pair.shot_noise < 0.2 * pair.source.noise**2
 
 
-def test_the_noise_of_a_demosaiced_jpeg_is_not_taken_for_more_than_it_is(simulator):
+def test_the_noise_of_a_demosaiced_jpeg_is_not_overestimated(simulator):
     camera = simulator.Simulator(size=91, bayer=True, jpeg=90, level=0.7, black=0.02)
     fits = [fit_pair(*camera.pair("gaussian", {"sigma": 3.0}, s), "gaussian") for s in range(2)]
-    # 0.28 where the light's fine noise was held to be as small a part of all as the dark's, which JPEG takes away
+    # JPEG removes fine noise from the dark background; assuming the same share on the dot would give 0.28
     assert 0.4 < np.mean([f.residual_over_noise for f in fits]) < 1.1
 
 
-def test_correlate_is_the_covariance_of_filtered_noise():
+def test_correlate_is_symmetric_and_weights_neighbours_by_the_correlation():
     rng = np.random.default_rng(2)
     correlation = np.zeros((2 * LAGS + 1, 2 * LAGS + 1))
     correlation[LAGS - 1 : LAGS + 2, LAGS - 1 : LAGS + 2] = np.outer([0.5, 1, 0.5], [0.5, 1, 0.5])

@@ -1,4 +1,4 @@
-"""Blur that is not round: shapes drawn by an independent simulator, told apart and carried into tables."""
+"""Blur that is not round: shapes of the simulator are recognized and stored in tables."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def kernel_of(fit):
 
 
 def centred(kernel):
-    """A kernel with its centre of mass in the middle: where a blur lies is the displacement's to say."""
+    """A kernel with its centre of mass in the centre; its place is the fit's `shift`, not part of the shape."""
     y, x = center_of_mass(kernel)
     moved = np.maximum(shift(kernel, (kernel.shape[0] // 2 - y, kernel.shape[0] // 2 - x), order=3), 0.0)
     return moved / moved.sum()
@@ -31,7 +31,7 @@ def size_of(kernel):
 
 
 def captured(simulator, kind, radius, seed=0, **camera):
-    """A pair without any warning expected of it, and the true kernel."""
+    """A pair of pictures and their true kernel."""
     kernel = simulator.shape(kind, radius)
     return simulator.through(kernel, simulator.Simulator(**{"size": 65, "dot_radius": 8.0, **camera}), seed), kernel
 
@@ -45,7 +45,7 @@ def captured(simulator, kind, radius, seed=0, **camera):
         ("mirror", "ring", 48, 13),
     ],
 )
-def test_auto_takes_the_family_that_a_shape_needs(simulator, kind, family, natural, look):
+def test_auto_chooses_the_family_that_a_shape_needs(simulator, kind, family, natural, look):
     pair, kernel = captured(simulator, kind, 7.5)
     fit = fit_pair(*pair)
     assert fit.family == family and (fit.aperture is None) == (family == "ring")
@@ -59,13 +59,13 @@ def test_auto_takes_the_family_that_a_shape_needs(simulator, kind, family, natur
         assert abs((fit.params["rotation_deg"] + 90 + 11 + 30) % 60 - 30) < 3
 
 
-def test_a_disc_is_neither_a_polygon_nor_a_picture(simulator):
+def test_a_disc_is_not_fitted_as_a_polygon_or_an_image(simulator):
     for seed in range(2):
         pair = simulator.Simulator(size=61, dot_radius=8.0, bayer=seed == 1).pair("disc", {"radius": 7.0}, seed)
         assert fit_pair(*pair).family == "disc"
 
 
-def test_an_opening_that_is_known_is_fitted_in_its_size_alone(simulator):
+def test_of_a_known_aperture_only_the_size_is_fitted(simulator):
     pair, kernel = captured(simulator, "hexagon", 5.0)
     fit = fit_pair(*pair, "image", aperture=Aperture(6, 19.0))
     assert list(fit.params) == ["radius"] and fit.params["radius"] == pytest.approx(5.0, rel=0.01)
@@ -74,7 +74,7 @@ def test_an_opening_that_is_known_is_fitted_in_its_size_alone(simulator):
         fit_pair(*pair, "disc", aperture=Aperture(6))
 
 
-def test_a_table_holds_the_opening_turned_by_half_in_front_of_the_focus(simulator, tmp_path):
+def test_a_table_rotates_the_aperture_by_180_degrees_in_front_of_the_focus(simulator, tmp_path):
     pairs, kernels = [], []
     for distance, radius in ((0.8, 5.5), (1.4, 5.5)):
         kernel = simulator.shape("coma", radius)

@@ -1,4 +1,4 @@
-"""The forward model on simulated captures: what it recovers, what it says about itself, and what it refuses."""
+"""The forward model on simulated captures: recovered parameters, standard errors, warnings and errors."""
 
 import re
 from dataclasses import replace
@@ -26,7 +26,7 @@ def off(fit, name, true):
     return abs(fit.params[name] / true - 1)
 
 
-# camera, family, its parameters, options of the fit, captures, largest error of one and of their mean
+# camera, family, its parameters, options of the fit, number of captures, largest relative error of one and of the mean
 RECOVERED = [
     *(({}, "gaussian", {"sigma": s}, {}, 3, most, most) for s, most in [(0.5, 0.03), (1.0, 0.01), (2.0, 0.01)]),
     *(({"snr_db": 30}, "gaussian", {"sigma": s}, {}, 3, 0.02, 0.02) for s in (2.0, 4.0, 8.0)),
@@ -41,14 +41,14 @@ RECOVERED = [
         ]
     ),
     ({"snr_db": 53.5}, "ring", RING, {}, 4, 0.05, 0.05),  # 40 dB below the mean square of the whole window
-    # the softness of the sensor does not grow with the dot: 0.13 if it did
+    # the softness of demosaicing does not scale with the dot; scaling it would give an error of 0.13
     ({"size": 61, "dot_radius": 9.0, "bayer": True}, "disc", {"radius": 2.0}, {"magnification": 0.4}, 1, 0.03, 0.03),
     ({"size": 61, "dot_radius": 4.5, "bayer": True}, "disc", {"radius": 2.0}, {"magnification": 2.0}, 1, 0.03, 0.03),
 ]
 
 
 @pytest.mark.parametrize(("camera", "family", "params", "options", "captures", "each", "mean"), RECOVERED)
-def test_a_blur_comes_back(simulator, camera, family, params, options, captures, each, mean):
+def test_the_fit_recovers_the_blur(simulator, camera, family, params, options, captures, each, mean):
     camera = simulator.Simulator(**{"magnification": options.get("magnification", 1.0), **camera})
     fits = [fit_pair(*camera.pair(family, params, seed), family, **options) for seed in range(captures)]
     for name, true in params.items():
@@ -61,23 +61,25 @@ def test_a_blur_comes_back(simulator, camera, family, params, options, captures,
         assert f"{name} = " in fit.summary() and "x the noise" in fit.summary()
 
 
-@pytest.mark.filterwarnings("ignore::torchdof.fit.problems.FitWarning")  # there is no noise to hide behind
+@pytest.mark.filterwarnings("ignore::torchdof.fit.problems.FitWarning")  # without noise every misfit is significant
 @pytest.mark.parametrize(("sigma", "most"), [(0.8, 0.025), (1.3, 0.01), (2.6, 0.003)])
-def test_sigma_is_that_of_the_light_and_not_of_the_pixels_on_which_it_falls(sigma, most):
+def test_sigma_is_that_of_the_light_without_the_width_of_a_pixel(sigma, most):
     fine = 8  # samples a pixel, each way
     axis = (np.arange(51 * fine) + 0.5) / fine - 25.5
     light = np.clip((6.0 - np.hypot(axis[:, None], axis)) * fine + 0.5, 0.0, 1.0)
     pictures = (light, gaussian_filter(light, sigma * fine))
     sharp, blurred = (picture.reshape(51, fine, 51, fine).mean((1, 3)) for picture in pictures)
-    assert off(fit_pair(sharp, blurred, "gaussian"), "sigma", sigma) < most  # 6.7, 2.5, 0.6 % with the pixel in it
-    line = np.diff(norm.cdf(np.arange(-20.5, 21.0), scale=sigma))  # the light of a star that falls on each pixel
+    assert off(fit_pair(sharp, blurred, "gaussian"), "sigma", sigma) < most  # with the pixel's width: 6.7, 2.5, 0.6 %
+    line = np.diff(norm.cdf(np.arange(-20.5, 21.0), scale=sigma))  # a star's light on each pixel
     assert off(fit_pair(None, line[:, None] * line, "gaussian"), "sigma", sigma) < 0.01
 
 
-@pytest.mark.filterwarnings("ignore::torchdof.fit.problems.FitWarning")  # there is no noise to hide behind
-def test_the_radius_is_that_of_the_light_and_not_of_a_kernel_whose_pixels_cannot_be_negative(simulator):
+@pytest.mark.filterwarnings("ignore::torchdof.fit.problems.FitWarning")  # without noise every misfit is significant
+def test_the_radius_is_that_of_the_light_rather_than_of_the_non_negative_kernel(simulator):
     pair = simulator.Simulator(size=41, dot_radius=8.0, snr_db=60).pair("disc", {"radius": 0.9})
-    assert fit_pair(*pair, "disc", fit_magnification=False).radius == pytest.approx(0.9, rel=0.01)  # 1.07 by its kernel
+    assert fit_pair(*pair, "disc", fit_magnification=False).radius == pytest.approx(
+        0.9, rel=0.01
+    )  # of the kernel: 1.07
 
 
 @pytest.mark.parametrize(
@@ -103,18 +105,18 @@ def test_standard_errors_hold_in_repeated_captures(simulator, camera, family, tr
 @pytest.mark.parametrize(
     ("family", "true"), [("gaussian", {"sigma": 3.0}), ("disc", {"radius": 7.0}), ("softm", SOFTM)]
 )
-def test_auto_takes_the_cheapest_family_that_is_enough(simulator, family, true):
+def test_auto_chooses_the_cheapest_sufficient_family(simulator, family, true):
     fit = fit_pair(*simulator.Simulator(snr_db=60, size=81).pair(family, true), accuracy_db=60)
     assert fit.family == family and "60 dB" in fit.why and fit.psnr[family] >= 60
 
 
-def test_auto_does_not_take_a_disc_for_a_ring(simulator):
-    # a photograph through the disc is within 45 dB, and every highlight is another one
+def test_auto_does_not_fit_a_disc_to_a_ring(simulator):
+    # photographs differ by 45 dB only, but highlights look different
     fit = fit_pair(*simulator.Simulator(size=81).pair("ring", {"sigma": 3.0, "r_c": 4.0}))
     assert fit.psnr["disc"] > 44.5 and fit.family == "ring" and "softm second by" in fit.why
 
 
-def test_radial_follows_what_no_other_family_has(simulator):
+def test_radial_fits_a_profile_that_no_other_family_can(simulator):
     true = {"values": np.array([1.0, 0.2, 0.1, 0.1, 0.3, 1.0, 0.9, 0.2, 0.0]), "radius": 12.0}
     fit = fit_pair(*simulator.Simulator(snr_db=60, dot_radius=4.0, size=81).pair("radial", true), accuracy_db=65)
     assert fit.family == "radial" and "no cheaper family" in fit.why and fit.psnr["softm"] < 60
@@ -127,17 +129,17 @@ def test_radial_follows_what_no_other_family_has(simulator):
 
 
 @pytest.mark.parametrize(("name", "asymmetric"), [("0885", False), ("0888", False), ("0422", True)])
-def test_photographed_stars_are_rings_and_the_uneven_one_is_said_to_be(simulator, name, asymmetric):
+def test_photographed_stars_are_rings_and_an_uneven_one_gives_a_warning(simulator, name, asymmetric):
     (file,) = STARS.glob(f"*{name}*.npy")
     star = np.load(file, allow_pickle=False)
-    ring, said = simulator.heard(lambda: fit_pair(None, star, "ring", files=(None, file.name)))
-    kinds = {warning.kind: warning for warning in said}
-    assert "residual" in kinds and all(file.name in str(warning) for warning in said)
+    ring, found = simulator.result_and_warnings(lambda: fit_pair(None, star, "ring", files=(None, file.name)))
+    kinds = {warning.kind: warning for warning in found}
+    assert "residual" in kinds and all(file.name in str(warning) for warning in found)
     if asymmetric:
         assert kinds["asymmetry"].number > 0.2 and "not round: 2" in str(kinds["asymmetry"])
     else:
         assert ring.residual < 0.14 and ring.asymmetry < 0.15
-        assert simulator.heard(lambda: fit_pair(None, star, "gaussian"))[0].residual > 0.25
+        assert simulator.result_and_warnings(lambda: fit_pair(None, star, "gaussian"))[0].residual > 0.25
 
 
 JPEG = {"level": 0.8, "size": 91, "jpeg": 90, "black": 0.02}
@@ -150,7 +152,7 @@ G3, G4, D6, R34 = (
     ("disc", DISC),
     ("ring", {"sigma": 3.0, "r_c": 4.0}),
 )
-# camera, kernel, seed, options of the fit, kinds of what is said (None: linear light is doubted), words, first number
+# camera, kernel, seed, options of the fit, kinds of warnings (None: "not linear" or "residual"), words, first number
 WARNED = [
     *(
         ({"srgb": True, "level": 0.7, **noise}, ("gaussian", {"sigma": s}), 1, {}, None, "linear", None)
@@ -176,30 +178,35 @@ WARNED = [
 
 
 @pytest.mark.parametrize(("camera", "kernel", "seed", "options", "kinds", "words", "number"), WARNED)
-def test_what_is_wrong_with_a_capture_is_said(simulator, camera, kernel, seed, options, kinds, words, number):
+def test_faults_of_a_capture_give_warnings(simulator, camera, kernel, seed, options, kinds, words, number):
     options = {"family": kernel[0], "files": ("a.png", "b.png"), **options}
     pair = simulator.Simulator(**camera).pair(*kernel, seed)
-    fit, said = simulator.heard(lambda: fit_pair(*pair, **options))
-    assert {w.kind for w in said} == kinds or (kinds is None and {"not linear", "residual"} & {w.kind for w in said})
-    assert any(re.search(words, str(w)) for w in said) and {w.file for w in said} <= set(options["files"])
-    assert number is None or said[0].number == pytest.approx(number, rel=0.1)
-    if kinds in ({"saturated"}, {"not in focus"}):  # it does no harm
+    fit, found = simulator.result_and_warnings(lambda: fit_pair(*pair, **options))
+    assert {w.kind for w in found} == kinds or (kinds is None and {"not linear", "residual"} & {w.kind for w in found})
+    assert any(re.search(words, str(w)) for w in found) and {w.file for w in found} <= set(options["files"])
+    assert number is None or found[0].number == pytest.approx(number, rel=0.1)
+    if kinds in ({"saturated"}, {"not in focus"}):  # faults that do not change the fitted blur
         assert off(fit, *next(iter(kernel[1].items()))) < 0.02
-        assert len({w.file for w in said}) == 1 + (kinds == {"saturated"})
+        assert len({w.file for w in found}) == 1 + (kinds == {"saturated"})
     if options["family"] == "auto":
         assert fit.family == "gaussian" and "the cheapest with 30 dB" in fit.why and "softm, the likeliest" in fit.why
 
 
-# faultless captures, or such with faults that hardly matter: a warning would be an error here
+# captures without faults, or with negligible ones: a warning is an error here
 SILENT = [
     ({"snr_db": None}, "gaussian", {"sigma": 3.0}, 0),
     ({"level": 0.7, "full_well": 3000.0, "snr_db": 50}, "gaussian", {"sigma": 3.0}, 0),
     ({"level": 0.7, "bits": 8, "snr_db": 60, "black": 0.02}, "gaussian", {"sigma": 3.0}, 0),
-    # of twelve, the draw in which the highest of a JPEG's few levels had ten pixels
+    # the one of twelve seeds in which ten pixels have the highest level of the JPEG
     ({"level": 0.7, "jpeg": 90, "black": 0.02, "size": 91}, "disc", DISC, 3),
     ({"edge_sigma": 0.9}, "gaussian", {"sigma": 6.0}, 0),
-    ({**JPEG, "magnification": 1.02}, "ring", {"sigma": 3.0, "r_c": 4.0}, 101),  # a lens that breathes: no tone curve
-    # blacks that are not cut off
+    (
+        {**JPEG, "magnification": 1.02},
+        "ring",
+        {"sigma": 3.0, "r_c": 4.0},
+        101,
+    ),  # focus breathing must not look like a tone curve
+    # blacks that are not clipped
     ({"bits": 16, "snr_db": 46, "dot_radius": 9.0, "level": 0.8, "black": 0.01}, "disc", DISC, 0),
     ({"bits": 6, "snr_db": None, "dot_radius": 9.0, "level": 0.8}, "disc", DISC, 0),
     ({"bits": 8, "snr_db": 46, "dot_radius": 9.0, "level": 0.8, "black": 0.012}, "disc", DISC, 0),
@@ -207,7 +214,7 @@ SILENT = [
 
 
 @pytest.mark.parametrize(("camera", "family", "params", "seed"), SILENT)
-def test_a_faultless_capture_is_fitted_in_silence(simulator, camera, family, params, seed):
+def test_a_capture_without_faults_gives_no_warning(simulator, camera, family, params, seed):
     fit = fit_pair(*simulator.Simulator(**camera).pair(family, params, seed), family)
     assert fit.magnification == pytest.approx(camera.get("magnification", 1.0), abs=0.005)
 
@@ -215,19 +222,19 @@ def test_a_faultless_capture_is_fitted_in_silence(simulator, camera, family, par
 @pytest.mark.parametrize("colours", [1, 3])
 @pytest.mark.parametrize(
     "harm",
-    [  # the paper's noise is hidden, with the dot's and without it; the dot's is hidden, and the paper's is not
+    [  # rounding hides the background's noise: with and without the dot's; then the dot's noise only
         {"level": 0.75, "snr_db": 63},
         {"level": 0.8, "snr_db": 60},
         {"level": 0.75, "snr_db": 66, "black": 0.5 / 255},
     ],
 )
-def test_the_rounding_of_a_file_is_no_tone_curve(simulator, harm, colours):
+def test_rounding_to_8_bits_is_not_reported_as_a_tone_curve(simulator, harm, colours):
     camera = simulator.Simulator(bits=8, dot_radius=9.0, **harm)
     fit_pair(*np.mean([camera.pair("disc", DISC, seed) for seed in range(colours)], axis=0), "disc", white=1.0)
 
 
 @pytest.mark.parametrize(("cheap", "freest"), [(2.1, 1.7), (2.5, 1.95), (2.1, 1.0)])
-def test_twice_the_noise_is_never_silent(simulator, cheap, freest):
+def test_a_residual_of_twice_the_noise_gives_a_warning(simulator, cheap, freest):
     pair, _, _ = prepared_pair(*simulator.Simulator().pair("disc", DISC))
     solution = pair.solve("disc")
     chosen = replace(describe(pair, solution, ""), residual=cheap * 0.0015, noise=0.0015)
@@ -235,8 +242,8 @@ def test_twice_the_noise_is_never_silent(simulator, cheap, freest):
         check_fit(pair, solution, chosen, None, replace(chosen, family="radial", residual=freest * 0.0015))
 
 
-def test_round_blur_is_never_said_to_be_uneven_and_a_cat_s_eye_is(simulator):
-    # the chance of the statistic is spread evenly between 0 and 1 where there is only noise
+def test_a_cat_s_eye_gives_a_warning_of_asymmetry_and_round_blur_does_not(simulator):
+    # with noise only, the p-value of the statistic is uniform in 0..1
     chances = []
     for seed in range(24):
         camera = simulator.Simulator(size=45, dot_radius=6.0)
@@ -245,7 +252,7 @@ def test_round_blur_is_never_said_to_be_uneven_and_a_cat_s_eye_is(simulator):
         chances.append(asymmetry_of(pair, pair.solve("disc"))[1])
     assert min(chances) > 1e-3 and 0.25 < np.mean(chances) < 0.75
     eye = simulator.through(simulator.shape("cat's eye", 8.0), simulator.Simulator(size=71, dot_radius=10.0))
-    fit, said = simulator.heard(lambda: fit_pair(*eye, "disc"))
+    fit, said = simulator.result_and_warnings(lambda: fit_pair(*eye, "disc"))
     (uneven,) = (w for w in said if w.kind == "asymmetry")
     assert fit.asymmetry > 0.03 and uneven.number == fit.asymmetry and "family 'disc' cannot" in str(uneven)
 
@@ -270,7 +277,7 @@ REFUSED = [  # arguments of the wrong kind: test_arguments.py
 
 
 @pytest.mark.parametrize(("change", "kind", "match"), REFUSED)
-def test_what_cannot_be_fitted_is_refused_by_name(simulator, change, kind, match):
+def test_impossible_fits_are_refused_by_name(simulator, change, kind, match):
     sharp, blurred = simulator.Simulator().pair("gaussian", {"sigma": 2.0})
     change = change(sharp, blurred) if callable(change) else change
     given = {"sharp": sharp, "blurred": blurred, "family": "gaussian", "files": ("a.png", "b.png"), **change}
@@ -285,14 +292,14 @@ def test_a_window_that_cuts_the_blur_is_refused(simulator):
     assert caught.value.kind in ("window", "flat profile")
 
 
-def test_a_fit_takes_one_thread_and_gives_the_others_back(simulator, monkeypatch):
+def test_a_fit_runs_on_one_thread_and_restores_their_number(simulator, monkeypatch):
     during = []
 
-    def spied(*given):
+    def record(*given):
         during.extend(library["num_threads"] for library in threadpool_info())
         return describe(*given)
 
-    monkeypatch.setattr("torchdof.fit.photo.pair.describe", spied)
+    monkeypatch.setattr("torchdof.fit.photo.pair.describe", record)
     with threadpool_limits(limits=2):
         fit_pair(*simulator.Simulator(size=61).pair("disc", {"radius": 4.0}), "disc")
         after = [library["num_threads"] for library in threadpool_info()]

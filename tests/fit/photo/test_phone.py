@@ -1,4 +1,4 @@
-"""A phone calibrated end to end, small: what `python tests/fit/phone.py` does with nine photographs of 1000 px."""
+"""A small run of ``tests/fit/phone.py``: calibration of a phone from the target to a rendered picture."""
 
 import importlib.util
 import sys
@@ -7,7 +7,9 @@ from pathlib import Path
 from torchdof import BlurTable
 
 
-def test_photographs_with_an_unknown_tone_curve_end_in_the_picture_of_the_true_lens(simulator, tmp_path, monkeypatch):
+def test_a_table_of_photographs_with_an_unknown_tone_curve_renders_the_true_lens_s_picture(
+    simulator, tmp_path, monkeypatch
+):
     path = Path(__file__).parents[1] / "phone.py"
     spec = importlib.util.spec_from_file_location("phone", path)
     phone = importlib.util.module_from_spec(spec)

@@ -1,4 +1,4 @@
-"""Eq. (1) and other smooth profiles on samples over radius; the paper's ratio along spokes, and what it measures."""
+"""Fits of eq. (1) and other smooth profiles to samples over the radius; the paper's ratio along spokes."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def eq_1(r, n=N, r_c=R_C, sigma=SIGMA):
 
 @pytest.mark.parametrize("r_max_mm", [2, 3, 4, 5, 6, 7, 8])
 @pytest.mark.parametrize("count", [21, 200])
-def test_table_1_comes_back_to_a_millionth_from_radii_in_metres(r_max_mm, count):
+def test_table_1_is_recovered_within_1e_6_from_radii_in_metres(r_max_mm, count):
     r = np.linspace(0, r_max_mm * 1e-3, count)
     assert fit_profile(r, eq_1(r)).params == pytest.approx({"N": N, "r_c": R_C, "sigma": SIGMA}, rel=1e-6)
 
@@ -29,7 +29,7 @@ def test_table_1_comes_back_to_a_millionth_from_radii_in_metres(r_max_mm, count)
         ("softm", {"N": 0.7, "radius": 6.0, "sigma": 0.8, "b": 0.5, "m": 3.0}),
     ],
 )
-def test_every_family_comes_back_from_its_own_samples_in_their_unit(family, true, unit):
+def test_every_family_is_recovered_from_its_own_samples_in_any_unit(family, true, unit):
     r = np.linspace(0, 12, 150) * unit
     true = {n: v * unit if n in ("sigma", "r_c", "radius") else v for n, v in true.items()}
     fit = fit_profile(r, evaluate(family, r, true), family)
@@ -45,7 +45,7 @@ def test_standard_errors_hold_in_repeated_samples():
         assert 0.75 < pull.std() < 1.3 and abs(pull.mean()) < 0.45, name
 
 
-def test_standard_errors_grow_with_errors_that_a_spoke_has_in_common():
+def test_standard_errors_include_errors_common_to_a_spoke():
     r, spoke = np.tile(np.linspace(0, 6e-3, 20), 36), np.repeat(np.arange(36), 20)
     strength = eq_1(r) + 0.02 * np.random.default_rng(0).normal(size=36)[spoke]
     assert fit_profile(r, strength, groups=spoke).stderr["N"] > 2 * fit_profile(r, strength).stderr["N"]
@@ -77,7 +77,7 @@ def test_wrong_samples_are_refused_by_name(r, strength, kind, match):
     assert caught.value.kind == kind
 
 
-def test_a_parameter_that_nothing_fixes_is_said():
+def test_an_undetermined_parameter_gives_a_warning():
     r = np.linspace(0, 5e-4, 60)
     with pytest.warns(FitWarning, match="to fix sigma"):
         fit_profile(r, eq_1(r, r_c=0.0) + 0.006 * np.random.default_rng(0).normal(size=60))
@@ -93,18 +93,18 @@ def test_another_family_is_refused(family):
         fit_profile(NINE, 1 - NINE, family)
 
 
-def test_strength_is_sampled_every_pixel_of_36_spokes_and_is_the_pictures_ratio(simulator):
+def test_blur_strength_is_the_ratio_of_the_pictures_along_36_spokes(simulator):
     sharp, _ = simulator.Simulator(snr_db=None).pair("gaussian", {"sigma": 1.0})
     rows, columns = np.indices(sharp.shape) - 50.0
     r, strength, spoke = blur_strength(sharp, 0.05 + sharp * (1 + 0.02 * columns - 0.01 * rows))
     assert len(np.unique(spoke)) == 36 and sorted(np.unique(r)) == list(range(12))
     theta = np.deg2rad(10 * spoke)
-    expected = 1 + r * (0.02 * np.cos(theta) - 0.01 * np.sin(theta))  # bilinear between pixels, as a plane is
+    expected = 1 + r * (0.02 * np.cos(theta) - 0.01 * np.sin(theta))  # bilinear interpolation is exact for a plane
     np.testing.assert_allclose(strength[r < 10], expected[r < 10], atol=1e-9)
 
 
 @pytest.mark.parametrize(("sigma", "least"), [(4.0, 8.0), (8.0, 9.6)])
-def test_ratio_measures_the_dot_with_the_kernel_and_not_the_kernel(simulator, sigma, least):
-    # the paper's own procedure: widths of about 9 to 14 px whatever the kernel's is; kept faithful, not corrected
+def test_the_ratio_model_measures_dot_and_kernel_together(simulator, sigma, least):
+    # the paper's procedure gives widths of about 9 to 14 px whatever the kernel's width; it is not corrected
     fit = fit_pair(*simulator.Simulator(snr_db=None).pair("gaussian", {"sigma": sigma}), "gaussian", model="ratio")
     assert fit.model == "ratio" and fit.params["sigma"] > least

@@ -1,4 +1,4 @@
-"""From captures at several distances to a table, and from the table to the picture."""
+"""Tables from captures at several distances, and the kernels between their nodes."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def cocs(distances):
 
 
 def lens(coc):
-    """What the simulated lens does at a signed coc in px: the blur's edge softens and its rim brightens with it."""
+    """Parameters of the simulated lens's blur at a signed CoC in px: edge softness and rim brightness depend on it."""
     a = abs(coc)
     return {"radius": 1.05 * a, "sigma": 0.3 + 0.04 * a, "b": 0.4 + 0.01 * coc, "m": 3.0 + 0.02 * coc}
 
@@ -52,7 +52,7 @@ def nine(simulator):
     return fit_captures(captured(simulator, DISTANCES), "softm")
 
 
-def test_the_table_is_keyed_by_the_camera_s_signed_coc_and_survives_its_file(nine, tmp_path):
+def test_nodes_are_at_the_camera_s_signed_cocs_and_survive_saving(nine, tmp_path):
     nine.table.save(tmp_path / "a.json")
     table = BlurTable.load(tmp_path / "a.json")
     np.testing.assert_allclose(table.coc.numpy(), np.array(cocs(DISTANCES)) * 36.0 / WIDTH, rtol=1e-9)
@@ -61,36 +61,36 @@ def test_the_table_is_keyed_by_the_camera_s_signed_coc_and_survives_its_file(nin
     torch.testing.assert_close(table.node_params["radius"], nine.table.node_params["radius"])
 
 
-def test_kernels_between_the_nodes_are_the_lens_s(nine):
+def test_kernels_between_the_nodes_equal_the_lens_s(nine):
     reached = psnr_between_nodes(nine.table, [c for c in np.linspace(-8, 9, 50) if abs(c) > 1.2])
     assert reached.min() > 55 and np.median(reached) > 62
 
 
-def test_neighbours_that_inform_each_other_keep_to_one_branch(simulator):
+def test_smoothing_over_neighbouring_distances_keeps_parameters_on_one_branch(simulator):
     places, reached = np.linspace(-5, -1.5, 20), []
-    for informed in (False, True):
-        table = fit_table(captured(simulator, [0.7, 0.8, 0.9], seed=51), "softm", smooth=informed)
-        # the parameters on the lines between the nodes, drawn without the table's templates, which have errors too
+    for smooth in (False, True):
+        table = fit_table(captured(simulator, [0.7, 0.8, 0.9], seed=51), "softm", smooth=smooth)
+        # kernels of the interpolated parameters, without the table's templates, which have errors too
         lines = [table.params(torch.tensor(coc), WIDTH) for coc in places]
         drawn = [psf.softm(**{name: value[0] for name, value in line.items()}) for line in lines]
         reached.append(psnr_to_the_lens(drawn, places).min())
-    rough, smooth = reached
-    assert smooth > 60 and smooth > rough + 5
+    separate, smoothed = reached
+    assert smoothed > 60 and smoothed > separate + 5
 
 
 @pytest.mark.parametrize(
     ("family", "distances", "snr_db", "places", "least"),
     [
         ("softm", [0.7, 1.5], None, cocs([0.7, 1.5]), 80),  # exact at the nodes without noise
-        ("radial", [0.7, 0.8, 1.25, 1.5], 50, [-5.0, -4.0, 3.0, 4.0], 50),  # a free profile needs no family
+        ("radial", [0.7, 0.8, 1.25, 1.5], 50, [-5.0, -4.0, 3.0, 4.0], 50),  # a free profile fits any round lens
     ],
 )
-def test_a_family_that_holds_the_lens_comes_back(simulator, family, distances, snr_db, places, least):
+def test_a_sufficient_family_recovers_the_lens(simulator, family, distances, snr_db, places, least):
     table = fit_table(captured(simulator, distances, snr_db=snr_db), family)
     assert table.family == family and psnr_between_nodes(table, places).min() > least
 
 
-def test_the_scale_is_measured_where_the_camera_is_not_known(simulator):
+def test_the_scale_is_measured_if_the_camera_is_unknown(simulator):
     unknown = captured(simulator, [0.7, 1.5], known=False, family="disc", params=lambda coc: {"radius": abs(coc)})
     result = fit_captures(unknown, "disc")
     assert result.scale == "measured" and result.table.unit == "fraction"
@@ -98,16 +98,16 @@ def test_the_scale_is_measured_where_the_camera_is_not_known(simulator):
     np.testing.assert_allclose(result.table.node_params["radius"][0], result.table.coc.abs(), rtol=1e-2)
 
 
-def test_one_distance_makes_a_table_and_says_so(simulator):
+def test_one_distance_makes_a_table_with_a_warning(simulator):
     with pytest.warns(FitWarning, match="one distance was measured") as caught:
         table = fit_table(captured(simulator, [0.7]), "softm")
-    said = caught[0].message
-    assert (said.kind, said.number, said.file) == ("single distance", 0.7, "0.7.png") and len(table.coc) == 1
+    warning = caught[0].message
+    assert (warning.kind, warning.number, warning.file) == ("single distance", 0.7, "0.7.png") and len(table.coc) == 1
     kernels = table.kernels(torch.tensor([-2.0, 2.0]), WIDTH)
     torch.testing.assert_close(kernels[0], kernels[1])
 
 
-def test_auto_takes_one_family_for_all_tells_its_progress_and_a_gain_against_the_exposures(simulator):
+def test_auto_chooses_one_family_reports_progress_and_warns_of_a_wrong_exposure(simulator):
     steps = []
     with pytest.warns(FitWarning, match="times as bright as the exposures say") as caught:
         result = fit_captures(
@@ -119,20 +119,22 @@ def test_auto_takes_one_family_for_all_tells_its_progress_and_a_gain_against_the
     assert caught[0].message.number == pytest.approx(2.0, rel=0.02)
 
 
-def test_fits_that_only_tell_the_family_say_nothing(simulator):
+def test_trial_fits_of_other_families_do_not_warn(simulator):
     pair = simulator.Simulator(size=71, misfocus=1.4).pair("disc", {"radius": 6.0})
-    _, said = simulator.heard(lambda: fit_captures(Captures((Capture(*pair, 2.0),), focus_m=1.0, width_px=WIDTH)))
-    assert [w.kind for w in said].count("not in focus") == 1
+    captures = Captures((Capture(*pair, 2.0),), focus_m=1.0, width_px=WIDTH)
+    _, found = simulator.result_and_warnings(lambda: fit_captures(captures))
+    assert [w.kind for w in found].count("not in focus") == 1
 
 
 @pytest.mark.filterwarnings("ignore:.*one distance was measured:torchdof.fit.problems.FitWarning")
-def test_standard_errors_count_what_was_guessed_about_the_pictures(simulator):
+def test_standard_errors_include_the_uncertainty_of_the_pictures(simulator):
     camera = simulator.Simulator(size=61, dot_radius=8.0, magnification=0.5)
     sharp, blurred = camera.pair("disc", {"radius": 5.0}, 1)
     guess = camera.pair("disc", {"radius": 5.2}, 1)
-    plain, wary = (
+    plain, uncertain = (
         fit_captures(Captures((Capture(sharp, blurred, 2.0, uncertain=others),), 1.0, WIDTH), "disc", smooth=False)
         for others in ((), (guess,))
     )
-    assert wary.fits[0].radius == plain.fits[0].radius and wary.fits[0].radius_stderr == pytest.approx(0.2, rel=0.1)
-    assert wary.fits[0].stderr["radius"] == pytest.approx(np.sqrt(wary.fits[0].covariance[0, 0]), rel=1e-6)
+    (fit,) = uncertain.fits
+    assert fit.radius == plain.fits[0].radius and fit.radius_stderr == pytest.approx(0.2, rel=0.1)
+    assert fit.stderr["radius"] == pytest.approx(np.sqrt(fit.covariance[0, 0]), rel=1e-6)

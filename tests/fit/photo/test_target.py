@@ -1,4 +1,4 @@
-"""The printed target: the page, finding it on a desk, and what photographs of it tell without any description."""
+"""The printed target: the page, its detection, and distances, focus and tone curve from photographs of it."""
 
 import re
 from dataclasses import replace
@@ -14,13 +14,13 @@ from torchdof.io.images import read_image
 
 
 @pytest.mark.parametrize(("paper", "width", "height"), [("a4", 595.28, 841.89), ("letter", 612.0, 792.0)])
-def test_the_page_is_a_pdf_whose_objects_are_where_it_says(tmp_path, paper, width, height):
+def test_the_page_has_its_square_dot_and_text_at_their_places(tmp_path, paper, width, height):
     write_target(tmp_path / "target.pdf", paper)
     data = (tmp_path / "target.pdf").read_bytes()
     box = re.search(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", data)
     assert (float(box[1]), float(box[2])) == pytest.approx((width, height), abs=0.01)
     content = re.search(rb"stream\n(.*)\nendstream", data, re.S)[1]
-    # in mm: the square, the dot in its middle, and lines of text that lie on the page and below it
+    # in mm: the square, the dot in its centre, and lines of text on the page below the square
     x, y, *sides = map(float, re.search(rb"\n([\d.]+) ([\d.]+) ([\d.]+) ([\d.]+) re f", content).groups())
     assert sides == [SQUARE_MM] * 2
     right, middle = map(float, re.search(rb"1 g ([\d.]+) ([\d.]+) m", content).groups())
@@ -53,7 +53,7 @@ def test_the_target_is_found_on_a_desk_and_measured(simulator, folder):
     assert target.white == pytest.approx(0.8, rel=0.03) and target.elongation < 1.01
     with pytest.raises(FitError, match="no target found"):
         find_target(np.random.default_rng(0).random((200, 300)))
-    with pytest.raises(FitError):  # a black square without a dot is something else
+    with pytest.raises(FitError):  # a black square without a dot is not a target
         hidden = light.copy()
         rows, columns = np.indices(light.shape)
         hidden[np.hypot(rows - target.y, columns - target.x) < 0.2 * target.side_px] = 0.035
@@ -77,8 +77,8 @@ def test_photographs_tell_their_distances_and_the_focus(folder):
 
 
 @pytest.mark.filterwarnings("ignore:.*too few to find a tone curve:torchdof.fit.problems.FitWarning")
-def test_each_colour_of_photographs_has_a_kernel_of_its_own(folder):
-    # the desk is grey: what one colour tells, all do
+def test_each_colour_of_photographs_has_its_own_kernel(folder):
+    # the scene is grey, so that all colours have the same blur
     captures = read_photographs(folder[0], colours="each").captures
     (pair,) = [c for c in captures if c.distance_m > 0.4]
     assert pair.colours is not None and pair.colours[1].shape == (3, *pair.blurred.shape)
@@ -89,7 +89,7 @@ def test_each_colour_of_photographs_has_a_kernel_of_its_own(folder):
     assert [c.fits[0].radius for c in found.colours] == pytest.approx([found.fits[0].radius] * 3, rel=0.01)
 
 
-def test_what_cannot_be_read_says_what_to_do(simulator, tmp_path):
+def test_errors_of_unreadable_folders_state_the_remedy(simulator, tmp_path):
     with pytest.raises(FitError, match="neither a capture.toml nor two photographs"):
         read_photographs(tmp_path)
     simulator.write_photographs(tmp_path, 0.2, [0.3], width=480, tone=0.0, exif=False)
@@ -101,7 +101,7 @@ def test_what_cannot_be_read_says_what_to_do(simulator, tmp_path):
 
 
 def _photographs(simulator, tone, seed=0):
-    """Dots as they would be in large photographs, blurred more and more, with an S-curve that nobody undid."""
+    """Dots of large photographs with five blur radii and an S-curve."""
     rng, found = np.random.default_rng(seed), []
     for radius in (0.0, 8.0, 16.0, 24.0, 32.0):
         side, size = 320.0, 321
@@ -113,19 +113,19 @@ def _photographs(simulator, tone, seed=0):
     return found
 
 
-def test_a_tone_curve_is_found_by_the_light_of_the_dot_and_undone(simulator):
+def test_a_tone_curve_is_found_from_the_total_light_of_the_dot_and_undone(simulator):
     assert tone_curve(_photographs(simulator, 0.0), SQUARE_MM).bend == (0.0, 0.0, 0.0)
     bend = tone_curve(_photographs(simulator, 0.5), SQUARE_MM).bend
     levels = np.linspace(0.05, 0.75, 20)[None]
     curved = simulator.Simulator(tone=0.5, snr_db=None).record(levels, np.random.default_rng(0))
-    # up to a common factor, which no kernel feels
+    # relative to the highest level: a common factor does not change a kernel
     before, after = (v / v[0, -1] - levels / levels[0, -1] for v in (curved, untoned(curved, bend)))
     assert np.abs(after).max() < 0.4 * np.abs(before).max()
 
 
 @pytest.mark.parametrize("tone", [0.0, 0.4])
-def test_a_tone_curve_is_found_by_the_edges_of_the_square(simulator, tmp_path, tone):
-    # of dots as small as these the light tells nothing
+def test_a_tone_curve_is_found_from_the_edges_of_the_square(simulator, tmp_path, tone):
+    # these dots are too small to use their total light
     simulator.write_photographs(tmp_path, 0.2, [0.28, 0.4, 0.6], width=800, tone=tone)
     found = read_photographs(tmp_path)
     if tone == 0.0:
