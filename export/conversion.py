@@ -16,6 +16,7 @@ from onnxscript import opset20
 from torchdof import DepthOfField
 from torchdof.io.atomic import whole_file
 from torchdof.options import DepthEdges
+from torchdof.tensors import TRACEABLE
 
 from . import lists, ray_splats
 from .graph import INPUTS, OUTPUT, Portable, trace
@@ -70,8 +71,8 @@ def to_onnx(
         The comparison with the module; ``print`` shows it as a table.
 
     Raises:
-        ValueError: If an argument is not as described, or the file does not render as the module does; nothing is
-            written then.
+        ValueError: If an argument is not as described, PyTorch is older than 2.13, or the file does not render as the
+            module does; nothing is written then.
 
     Example:
         >>> import tempfile, torchdof
@@ -80,6 +81,11 @@ def to_onnx(
         ...     len(to_onnx(dof, f"{folder}/dof.onnx").cases) > 5
         True
     """
+    if not TRACEABLE:
+        raise ValueError(
+            f"torchdof needs PyTorch 2.13 or newer to write ONNX files, this is {torch.__version__}; what a newer "
+            "one has written can be verified here"
+        )
     if not isinstance(dof, DepthOfField):
         raise ValueError(f"dof must be a torchdof.DepthOfField, got {type(dof).__name__}")
     if isinstance(opset, bool) or not isinstance(opset, int) or opset < OPSET:

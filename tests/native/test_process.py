@@ -56,7 +56,7 @@ def test_threads_of_python_may_render_at_once() -> None:
 
 def answer_of(script: str) -> str:
     """What a fresh process prints."""
-    run = subprocess.run([sys.executable, "-P", "-c", script], capture_output=True, text=True, timeout=120, check=False)
+    run = subprocess.run([sys.executable, "-I", "-c", script], capture_output=True, text=True, timeout=120, check=False)
     assert run.returncode == 0, run.stderr
     return run.stdout.strip()
 
