@@ -81,11 +81,6 @@ def to_onnx(
         ...     len(to_onnx(dof, f"{folder}/dof.onnx").cases) > 5
         True
     """
-    if not TRACEABLE:
-        raise ValueError(
-            f"torchdof needs PyTorch 2.13 or newer to write ONNX files, this is {torch.__version__}; what a newer "
-            "one has written can be verified here"
-        )
     if not isinstance(dof, DepthOfField):
         raise ValueError(f"dof must be a torchdof.DepthOfField, got {type(dof).__name__}")
     if isinstance(opset, bool) or not isinstance(opset, int) or opset < OPSET:
@@ -96,6 +91,11 @@ def to_onnx(
     if not path.parent.is_dir():
         raise ValueError(f"cannot write {path}: there is no folder {path.parent}")
     portable = Portable(dof, inputs, width, depth_edges)
+    if not TRACEABLE:
+        raise ValueError(
+            f"torchdof needs PyTorch 2.13 or newer to write ONNX files, this is {torch.__version__}; what a newer "
+            "one has written can be verified here"
+        )
     progress("tracing")
     with _quiet():
         program = trace(portable, channels)

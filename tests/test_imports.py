@@ -34,7 +34,7 @@ ROOMS = {
     "distributed": {"validation", "io", "depth", "render", "module", "augmentation"},
     "bench": {"validation", "io", "optics", "reference", "module", "export"},
     "cli": {
-        *("validation", "native", "io", "optics", "depth", "options", "render", "module"),
+        *("tensors", "validation", "native", "io", "optics", "depth", "options", "render", "module"),
         *("fit", "export", "bench"),
     },
 }

@@ -4,6 +4,7 @@ python examples/benchmarks/per_pixel.py [--side 256]
 """
 
 import argparse
+import functools
 import statistics
 import time
 from collections.abc import Callable
@@ -25,6 +26,11 @@ def seconds(call: Callable[[], object], times: int = 5) -> float:
     return statistics.median(taken)
 
 
+def gradients(image: torch.Tensor, coc_px: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """Gradients to image and radius."""
+    return torch.autograd.grad(splat(image, coc_px).sum(), (image, coc_px))
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser()
@@ -37,10 +43,9 @@ def main() -> None:
         image = torch.rand(1, 3, side, side)
         coc_px = most_px * (2 * torch.rand(1, 1, side, side) - 1)
         leaves = (image.clone().requires_grad_(), coc_px.clone().requires_grad_())
-        forward = seconds(lambda image=image, coc_px=coc_px: splat(image, coc_px))
-        step = seconds(lambda leaves=leaves: torch.autograd.grad(splat(*leaves).sum(), leaves))
-        with torch.no_grad():
-            layered = seconds(lambda image=image, coc_px=coc_px: blur_by_coc(image, coc_px, occlusion=False))
+        forward = seconds(functools.partial(splat, image, coc_px))
+        step = seconds(functools.partial(gradients, *leaves))
+        layered = seconds(functools.partial(blur_by_coc, image, coc_px, occlusion=False))
         print(f"{most_px:6g} {forward:6.2f} {step:5.2f} {layered:8.2f}")
 
 

@@ -14,6 +14,7 @@ import torch
 from click.testing import CliRunner, Result
 from torch import Tensor
 
+from tests.traced import TRACED
 from torchdof import Camera, DepthOfField, blur_by_coc
 from torchdof.bench import speed
 from torchdof.bench.measurement import BenchScene, error, shipped, timed
@@ -218,6 +219,7 @@ def test_an_exported_file_has_its_row(exported_by_command: tuple[Path, str], mon
     assert 0 < 255 * float(error) < 1, "the file's tolerance is that of the row"
 
 
+@TRACED
 @pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning")  # from within inductor
 @pytest.mark.parametrize("backend", ["eager", pytest.param("inductor", marks=pytest.mark.sweep)])
 def test_a_compiled_module_has_its_row(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -234,6 +236,12 @@ def test_bench_needs_a_compiler_to_compile(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.delenv("CXX", raising=False)
     result = run("--compile")
     assert result.exit_code == 2 and "install g++ or leave --compile out" in result.output
+
+
+def test_bench_compiles_with_a_compiler_that_can_follow_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchdof.tensors.TRACEABLE", False)
+    result = run("--compile")
+    assert result.exit_code == 2 and "torch.compile needs PyTorch 2.13" in result.output
 
 
 def test_without_matplotlib_it_says_so_before_it_measures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
