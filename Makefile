@@ -1,5 +1,6 @@
 # make demo       render a real photograph focused near, middle and far; pictures go to out/
 # make test       run the tests, two at a time
+# make oldest     run the tests on the oldest supported versions (constraints-oldest.txt, Python 3.10), a download of 3 GB
 # make docs       build the site of the documentation into build/site/, links checked
 # make pictures   render the pictures of the documentation anew into docs/pictures/
 # make sweep      run the hard tests at full length: whole frames instead of strips, up to twenty times as many examples
@@ -7,7 +8,7 @@
 # make sanitize   run the compiled engine's tests under AddressSanitizer and ThreadSanitizer; needs GCC
 # make fuzz       changed files to every reader, and scenes to both engines, for an hour (SECONDS=3600); lists what it finds
 # make soak       1,000 renderings in one process, 8 threads, forked and spawned workers: memory and pictures stay the same
-# All need only Python 3.11 and make: the first run makes .venv and installs what constraints.txt pins.
+# All but oldest need only Python 3.11 and make: the first run makes .venv and installs what constraints.txt pins.
 # Where there is a C++ compiler the engine is compiled too.
 
 PYTHON ?= python3.11
@@ -20,13 +21,19 @@ FOR_DEMO := $(VENV)/.installed-for-demo
 export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export PIP_BUILD_CONSTRAINT := $(PIP_CONSTRAINT)
 
-.PHONY: demo test docs pictures sweep install check wheel sanitize fuzz soak clean
+.PHONY: demo test oldest docs pictures sweep install check wheel sanitize fuzz soak clean
 
 demo: $(FOR_DEMO)
 	$(BIN)/python examples/demo.py --data examples/data/motorcycle --out out
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+oldest:
+	test -x build/venv-oldest/bin/python || python3.10 -m venv build/venv-oldest
+	PIP_CONSTRAINT=$(CURDIR)/constraints-oldest.txt PIP_BUILD_CONSTRAINT=$(CURDIR)/constraints-oldest.txt \
+		build/venv-oldest/bin/pip install --quiet --editable '.[test]'
+	build/venv-oldest/bin/python -m pytest -n 2 --dist worksteal
 
 docs: $(INSTALLED)
 	rm -rf build/package

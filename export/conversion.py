@@ -16,6 +16,7 @@ from onnxscript import opset20
 from torchdof import DepthOfField
 from torchdof.io.atomic import whole_file
 from torchdof.options import DepthEdges
+from torchdof.tensors import TRACEABLE
 
 from . import lists, ray_splats
 from .graph import INPUTS, OUTPUT, Portable, trace
@@ -69,7 +70,8 @@ def to_onnx(
         The comparison with the module; ``print`` shows a table.
 
     Raises:
-        ValueError: If an argument is invalid, or the file's result differs from the module's; no file is written then.
+        ValueError: If an argument is invalid, PyTorch is older than 2.13, or the file's result differs from the
+            module's; no file is written then.
 
     Example:
         >>> import tempfile, torchdof
@@ -88,6 +90,11 @@ def to_onnx(
     if not path.parent.is_dir():
         raise ValueError(f"cannot write {path}: there is no folder {path.parent}")
     portable = Portable(dof, inputs, width, depth_edges)
+    if not TRACEABLE:
+        raise ValueError(
+            f"torchdof needs PyTorch 2.13 or newer to write ONNX files, this is {torch.__version__}; what a newer "
+            "one has written can be verified here"
+        )
     progress("tracing")
     with _quiet():
         program = trace(portable, channels)

@@ -9,6 +9,7 @@ import torch
 from hypothesis import HealthCheck, settings
 
 from tests import exported
+from torchdof.tensors import TRACEABLE
 
 settings.register_profile("local", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("ci", parent=settings.get_profile("local"), derandomize=True, print_blob=True)
@@ -42,30 +43,36 @@ def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def layered(shared_folder: Path) -> Any:
+def _exporter() -> None:
+    if not TRACEABLE:
+        pytest.skip("needs PyTorch 2.13 to export")
+
+
+@pytest.fixture(scope="session")
+def layered(shared_folder: Path, _exporter: None) -> Any:
     """An exported module with occlusion, by convolution at resolutions down to a sixteenth."""
     return exported.export_once("layered", shared_folder)
 
 
 @pytest.fixture(scope="session")
-def fold(shared_folder: Path) -> Any:
+def fold(shared_folder: Path, _exporter: None) -> Any:
     """An exported module without occlusion, by the literal scatter."""
     return exported.export_once("fold", shared_folder)
 
 
 @pytest.fixture(scope="session")
-def fold_with_occlusion(shared_folder: Path) -> Any:
+def fold_with_occlusion(shared_folder: Path, _exporter: None) -> Any:
     """The same with occlusion."""
     return exported.export_once("fold with occlusion", shared_folder)
 
 
 @pytest.fixture(scope="session")
-def plain(shared_folder: Path) -> Any:
+def plain(shared_folder: Path, _exporter: None) -> Any:
     """An exported module without occlusion, which is traced in a few seconds."""
     return exported.export_once("plain", shared_folder)
 
 
 @pytest.fixture(scope="session")
-def exported_by_command(shared_folder: Path) -> tuple[Path, str]:
+def exported_by_command(shared_folder: Path, _exporter: None) -> tuple[Path, str]:
     """A file with blur radii as input, written by ``torchdof export``, and the output of the command."""
     return exported.command_once(shared_folder)

@@ -9,14 +9,17 @@ import kornia.augmentation as K
 import pytest
 import torch
 from torch import Tensor
+from torch.testing import assert_close
 from torch.utils.data import DataLoader, Dataset
 
 import torchdof.augmentation
 import torchdof.io.transfer
-from torchdof import BlurTable, Camera, depth_of_field
+from torchdof import BlurTable, Camera, DepthOfField, depth_of_field
 from torchdof.augmentation import DepthAugmentationSequential, RandomDepthOfField
 
 CAMERA = Camera(sensor_width_mm=4.0)
+# Kornia 0.8 does not say of masks how their corners lie
+pytestmark = pytest.mark.filterwarnings("ignore:Default grid_sample and affine_grid behavior:UserWarning")
 
 
 def sample(count: int = 4) -> tuple[Tensor, Tensor]:
@@ -142,6 +145,60 @@ def test_gradients_reach_image_and_depth() -> None:
     depth.requires_grad_()
     random_dof(p=0.5)(image, depth).square().sum().backward()
     assert image.grad is not None and depth.grad is not None and bool(depth.grad.any())
+
+
+# Labels
+
+
+def test_the_label_is_the_blur_of_the_picture_and_what_was_drawn_by_name() -> None:
+    image, depth = sample()
+    torch.manual_seed(2)
+    aug = random_dof(p=0.5, transfer="linear", return_label=True, table=[BlurTable.disc()] * 3, depth_edges="as given")
+    out, label = aug(image, depth)
+    left_out = ~label["blurred"]
+    assert label.keys() == {"coc_px", "focus_m", "f_number", "table", "blurred"} and 0 < int(left_out.sum()) < 4
+    lens = {name: label[name] for name in ("focus_m", "f_number")}
+    expected = DepthOfField(CAMERA).coc_px(image, depth, **lens)
+    assert_close(label["coc_px"][label["blurred"]], expected[label["blurred"]])
+    assert not bool(label["coc_px"][left_out].any()) and torch.equal(out[left_out], image[left_out])
+    assert torch.equal(out, depth_of_field(image, depth, CAMERA, check=False, **lens).where(
+        label["blurred"][:, None, None, None], image
+    ))  # fmt: skip
+    again, same = aug(image, depth, params=aug._params)
+    assert torch.equal(again, out) and all(torch.equal(same[name], label[name]) for name in label)
+
+
+def test_pixels_without_depth_have_no_blur_in_the_label() -> None:
+    image, depth = sample(1)
+    depth[..., :5] = 0.0
+    label = random_dof(return_label=True)(image, depth)[1]
+    assert not bool(label["coc_px"][..., :5].any()) and bool(label["coc_px"][..., 5:].all())
+
+
+def test_a_dict_is_given_the_label_of_one_image_under_its_names() -> None:
+    image, depth = sample(1)
+    given = random_dof(keepdim=True, return_label=True)({"image": image[0], "depth": depth[0], "index": 3})
+    assert given["image"].shape == (3, 18, 24) and given["coc_px"].shape == (1, 18, 24) and given["index"] == 3
+    assert given["focus_m"].shape == given["f_number"].shape == given["table"].shape == () and bool(given["blurred"])
+
+
+def test_the_label_of_a_sequence_is_asked_for_after_it() -> None:
+    image, depth = sample()
+    dof = random_dof(p=0.5)
+    pipeline = DepthAugmentationSequential(K.RandomHorizontalFlip(p=1.0), dof, data_keys=["input", "mask"])
+    _, moved = pipeline(image, depth)
+    drawn: Any = pipeline._params
+    label = dof.label(image.flip(-1), moved, drawn[1].data)
+    both = dof.label(torch.cat([image.flip(-1), moved], 1), params=drawn[1].data)
+    assert label["coc_px"].shape == moved.shape
+    assert all(torch.equal(label[name], both[name]) for name in label)
+
+
+def test_its_text_shows_the_numbers_that_were_given() -> None:
+    text = repr(random_dof(focus_m=(0.5, 5.0), f_number=(1.4, 8.0), table=BlurTable.gaussian(), tolerance="preview"))
+    for part in ("focus_m=(0.5, 5.0)", "f_number=(1.4, 8.0)", "table=BlurTable('gaussian'", "p=1.0", "Camera(50 mm"):
+        assert part in text
+    assert f"tolerance={4 / 255}" in text and "transfer='srgb'" in text
 
 
 # Kornia's containers
@@ -277,11 +334,14 @@ ARGUMENTS: list[tuple[dict[str, Any], str]] = [
     ({"tolerance": 2.0}, "tolerance must be a number"),
     ({"p": 2.0}, "p must be a probability from 0 to 1"),
     ({"p": True}, "p must be a probability from 0 to 1"),
+    ({"return_label": 1}, "return_label must be True or False"),
 ]
 REFUSED: list[tuple[Callable[[], Any], str]] = [
     *((partial(RandomDepthOfField, **arguments), message) for arguments, message in ARGUMENTS),
     (lambda: K.AugmentationSequential(random_dof(), data_keys=["input", "mask"])(IMAGE, DEPTH),
      r"needs a depth: .*DepthAugmentationSequential.*3 channels alone"),
+    (lambda: random_dof().label(IMAGE, DEPTH), "params must be those of 4 images, got none; call it before"),
+    (lambda: random_dof().label(IMAGE, DEPTH, random_dof().forward_parameters((3, 3, 18, 24))), "got those of 3"),
     (lambda: random_dof()({"image": IMAGE}), "a dict must have 'image' and 'depth', got the keys image"),
     (lambda: random_dof()(IMAGE, DEPTH[:3, 0]), r"depth must be \[4, 1, 18, 24\].* got \[1, 3, 18, 24\]"),
     (lambda: random_dof()((IMAGE - 0.5) / 0.2, DEPTH), r"must lie in \[0, 1\].*put normalization behind"),

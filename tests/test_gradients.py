@@ -11,7 +11,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from tests.scenes import CAMERA, WAYS, slope, whole
-from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
+from tests.traced import TRACED
+from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, validation
 from torchdof.render.layer_weights import from_blur_axis
 from torchdof.render.plan import Plan
 
@@ -144,6 +145,7 @@ def test_gradients_are_finite_at_hostile_light_and_of_its_type(
 # Forward mode and torch.func
 
 
+@TRACED
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # raised inside PyTorch for tangents
 @pytest.mark.parametrize("way", [{"occlusion": True}, {"method": "fold", "occlusion": False}], ids=["over", "paper"])
 @pytest.mark.parametrize("which", [*NUMBERS, "rotation", "squeeze"])
@@ -168,6 +170,7 @@ def test_forward_mode_and_torch_func_agree_with_autograd(way: dict[str, Any], wh
     assert_close(tangent, (gradient * step).sum(), rtol=1e-9, atol=1e-12)
 
 
+@TRACED
 def test_kernels_cached_inside_torch_func_are_usable_outside() -> None:
     image, depth = torch.rand(1, 3, 20, 30), torch.linspace(0.7, 6.3, 600).reshape(1, 1, 20, 30)
     dof = DepthOfField(Camera(f_number=1.337, sensor_width_mm=3.0), BlurTable.polygon(7, rotation_deg=12.34))
@@ -176,6 +179,15 @@ def test_kernels_cached_inside_torch_func_are_usable_outside() -> None:
     assert not torch._C._functorch.is_functorch_wrapped_tensor(plain)
     twin = DepthOfField(dof.camera, BlurTable.polygon(7, rotation_deg=12.34))
     assert_close(twin(image, depth), plain, rtol=0.0, atol=0.0)
+
+
+@pytest.mark.parametrize("which", ["image", "depth", "focus_m"])
+def test_torch_func_of_an_old_pytorch_is_refused_by_name(which: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(validation, "TRACEABLE", False)
+    given = {"image": torch.rand(1, 3, 8, 9), "depth": 1 + torch.rand(1, 1, 8, 9), "focus_m": torch.tensor([1.5])}
+    dof = DepthOfField(Camera())
+    with pytest.raises(ValueError, match=r"comes from torch\.func, for which torchdof needs PyTorch 2\.13"):
+        torch.func.grad(lambda value: dof(**{**given, which: value}).sum())(given[which])
 
 
 # Depth from defocus

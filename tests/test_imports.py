@@ -27,13 +27,14 @@ ALLOWED = {
     "depth": {"tensors", "validation", "io", "optics", "render"},
     "reference": {"validation", "io", "optics", "render"},
     "module": {"tensors", "validation", "batch", "optics", "options", "render"},
+    "functional": {"tensors", "validation", "batch", "optics"},
     "fit": {"validation", "io", "optics"},
-    "export": {"pixels", "io", "optics", "options", "render", "reference", "module"},
+    "export": {"pixels", "tensors", "io", "optics", "options", "render", "reference", "module"},
     "augmentation": {"tensors", "validation", "io", "optics", "options", "module"},
     "distributed": {"validation", "io", "depth", "render", "module", "augmentation"},
     "bench": {"validation", "io", "optics", "reference", "module", "export"},
     "cli": {
-        *("validation", "native", "io", "optics", "depth", "options", "render", "module"),
+        *("tensors", "validation", "native", "io", "optics", "depth", "options", "render", "module"),
         *("fit", "export", "bench"),
     },
 }
@@ -178,6 +179,31 @@ PUBLIC = "import torchdof\nfor name in torchdof.__all__: getattr(torchdof, name)
 
 def test_public_names_load_nothing_heavy() -> None:
     assert loaded(PUBLIC, *HEAVY) == []
+
+
+FIRST = """
+import torch
+from torchdof import BlurTable, Camera, DepthOfField
+dof = DepthOfField(Camera(focus_m=1.0, sensor_width_mm=4.0), BlurTable.polygon(6))
+image, depth = torch.rand(2, 3, 24, 32), 1 + torch.rand(2, 1, 24, 32).requires_grad_()
+with torch.no_grad():
+    assert not torch.equal(dof(image, depth, focus_m=[1.0, 1.5]), image)
+"""
+WITH_GRADIENTS = "dof(image, depth).sum().backward()"
+PER_PIXEL = """
+from torchdof.functional import splat
+splat(image, depth).sum().backward()
+"""
+
+
+@pytest.mark.parametrize("engine", ["auto", "torch"])
+@pytest.mark.parametrize("then", ["", WITH_GRADIENTS, PER_PIXEL], ids=["picture", "gradients", "splat"])
+def test_a_first_picture_loads_neither_sympy_nor_the_compiler(
+    then: str, engine: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They take a second, and eager code needs neither."""
+    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+    assert loaded(FIRST + then, "sympy", "torch._dynamo", "torch._inductor", "kornia") == []
 
 
 def test_folders_below_render_do_not_load_the_compiler() -> None:

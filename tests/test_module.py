@@ -13,7 +13,8 @@ from torch.testing import assert_close
 from tests import loops
 from tests.scenes import WAYS, disc
 from tests.tolerances import TOLERANCES
-from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field
+from tests.traced import TRACED
+from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field, tensors
 from torchdof.render.border import continued
 from torchdof.render.layer_weights import blur_axis
 from torchdof.render.plan import Plan
@@ -367,6 +368,7 @@ def compiled_case() -> tuple[Camera, Tensor, Tensor]:
     return camera, torch.rand(1, 3, 10, 14), 1.0 + 2 * torch.rand(1, 1, 10, 14)
 
 
+@TRACED
 @pytest.mark.parametrize(
     ("backend", "way"),
     [
@@ -388,6 +390,7 @@ def test_the_module_compiles_without_graph_breaks_and_equals_eager(backend: str,
     assert rms(fast, dof(image, depth)) <= 2 * COMPILED["tolerance"]
 
 
+@TRACED
 def test_modules_with_other_options_and_cameras_compile_one_after_the_other() -> None:
     torch.compiler.reset()
     camera, image, depth = compiled_case()
@@ -400,6 +403,22 @@ def test_modules_with_other_options_and_cameras_compile_one_after_the_other() ->
         fast = torch.compile(dof, fullgraph=True, backend="eager")(image, depth, focus_m=focus_m)
         plan = Plan.all(reach, tolerance)
         assert_close(fast, dof(image, depth, focus_m=focus_m, plan=plan), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("fullgraph", [True, False])
+def test_the_compiler_of_an_old_pytorch_is_refused_by_name(fullgraph: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tensors, "TRACEABLE", False)
+    torch.compiler.reset()
+    image, depth = torch.rand(1, 3, 8, 9), torch.full((1, 1, 8, 9), 3.0)
+    dof = DepthOfField(Camera(focus_m=1.0))
+    for call in (dof, lambda image, depth: blur_by_coc(image, depth)):
+        with pytest.raises(Exception, match=r"torchdof needs PyTorch 2\.13 or newer to be compiled.*compiler\.disable"):
+            torch.compile(call, fullgraph=fullgraph, backend="eager")(image, depth)
+    torch.compiler.reset()
+    left_out = torch.compiler.disable(dof)
+    around = torch.compile(lambda image, depth: 2.0 * left_out(image, depth), backend="eager")
+    assert_close(around(image, depth), 2.0 * dof(image, depth))
+    torch.compiler.reset()
 
 
 # Errors

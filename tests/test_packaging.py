@@ -9,6 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 import torchdof
+from tests.traced import TRACED
 from torchdof.cli.main import app
 
 ROOT = Path(__file__).parents[1]
@@ -21,7 +22,9 @@ MODULES = sorted(
 )
 
 
-@pytest.mark.parametrize("name", MODULES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[TRACED] if name == "torchdof.export.conversion" else []) for name in MODULES]
+)
 def test_examples_in_docstrings_run(name: str) -> None:
     failed, _ = doctest.testmod(importlib.import_module(name), optionflags=doctest.NORMALIZE_WHITESPACE)
     assert failed == 0

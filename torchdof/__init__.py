@@ -18,7 +18,7 @@ _HOMES = {
     "blur_by_coc": "module",
     "depth_of_field": "module",
 }
-_SUBPACKAGES = ("augmentation", "depth", "distributed", "export", "fit")
+_SUBPACKAGES = ("augmentation", "depth", "distributed", "export", "fit", "functional")
 
 
 def __getattr__(name: str) -> Any:

@@ -7,7 +7,7 @@ channel of the image, in ``DepthAugmentationSequential`` with the depth as a mas
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Unpack
+from typing import Any
 
 import torch
 from kornia.augmentation import AugmentationSequential, IntensityAugmentationBase2D
@@ -16,9 +16,10 @@ from kornia.augmentation.container.ops import AugmentationSequentialOps
 from kornia.augmentation.container.params import ParamItem
 from kornia.constants import DataKey
 from torch import Tensor, nn
+from typing_extensions import Unpack
 
 from .io.transfer import Transfer, decode, encode
-from .module import depth_of_field
+from .module import DepthOfField, depth_of_field
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera
 from .options import OptionArguments, Options, spells_options
@@ -56,6 +57,8 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         same_on_batch: Draw once for the whole batch.
         p: Probability of each image to be blurred.
         keepdim: Return one image ``[C, H, W]`` as such, not as a batch of one.
+        return_label: Return what was drawn beside the images, as :meth:`label` has it: ``(images, label)``, or under
+            these names in a dict. Kornia's containers hand on images alone; ask :meth:`label` after them.
         **options: As in :class:`torchdof.options.Options`.
 
     Raises:
@@ -67,6 +70,9 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         >>> blurred = aug(image, depth)
         >>> torch.equal(blurred, aug(image, depth, params=aug._params))
         True
+        >>> label = aug.label(image, depth)
+        >>> label["coc_px"].shape, label["focus_m"].shape
+        (torch.Size([2, 1, 8, 12]), torch.Size([2]))
     """
 
     def __init__(
@@ -79,6 +85,7 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         same_on_batch: bool = False,
         p: float = 0.5,
         keepdim: bool = False,
+        return_label: bool = False,
         **options: Unpack[OptionArguments],
     ) -> None:
         if isinstance(p, bool) or not isinstance(p, int | float) or not 0.0 <= p <= 1.0:
@@ -95,6 +102,9 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
             raise ValueError("table must be a torchdof.BlurTable, several, or None, got an empty list")
         if transfer not in ("linear", "srgb"):
             raise ValueError(f"transfer must be 'linear' or 'srgb', got {show(transfer)}")
+        if not isinstance(return_label, bool):
+            raise ValueError(f"return_label must be True or False, got {show(return_label)}")
+        self.return_label = return_label
         options.setdefault("check", False)
         self.focus_m, self.f_number = (near_m, far_m), (widest, narrowest)
         self.renderings = [Options.of(table, **options) for table in tables]
@@ -110,6 +120,12 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         """Draws ``focus_m`` [m], ``f_number`` and ``table`` (which of several), each ``[B]``."""
         return self._in_units(super().generate_parameters(batch_shape))
 
+    def forward_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
+        """Draws for every image, blurred or not, and which are; Kornia 0.8 would draw for the blurred ones alone."""
+        chosen = self.__batch_prob_generator__(batch_shape, self.p, self.p_batch, self.same_on_batch)
+        shape = torch.tensor(batch_shape, dtype=torch.long)
+        return {**self.generate_parameters(batch_shape), "batch_prob": chosen, "forward_input_shape": shape}
+
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
         """The parameters of one image by a generator of the caller's, each ``[1]``; the process's stays as it is."""
         ends = {name: low_and_high for low_and_high, name, _, _ in self._ranges}
@@ -124,6 +140,24 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
             "f_number": torch.exp2(drawn["f_number"] / 2).clamp(*self.f_number),
             "table": drawn["table"].long().clamp_max(len(self.renderings) - 1),
         }
+
+    def __repr__(self) -> str:
+        options = self.renderings[0].arguments()
+        del options["table"]
+        tables = [rendering.table for rendering in self.renderings]
+        shown = {
+            **{"focus_m": self.focus_m, "f_number": self.f_number, "camera": self.camera},
+            **{"table": tables if len(tables) > 1 else tables[0], **self.flags},
+            **{"same_on_batch": self.same_on_batch, "p": self.p, "keepdim": self.keepdim},
+            **{"return_label": self.return_label, **options},
+        }
+        return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in shown.items())})"
+
+    def __call__(self, input: Any, *arguments: Any, **kwargs: Any) -> Any:
+        """Kornia's, which converts and keeps images, but where a dict comes or goes: it takes that for an image."""
+        if isinstance(input, Mapping) or self.return_label:
+            return nn.Module.__call__(self, input, *arguments, **kwargs)
+        return super().__call__(input, *arguments, **kwargs)
 
     def forward(  # type: ignore[override]  # the depth comes second, where Kornia has the parameters
         self,
@@ -144,7 +178,8 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
             **kwargs: What Kornia's containers pass on.
 
         Returns:
-            Images of the shape of ``input`` (a batch unless ``keepdim``), in its dtype, or the dict.
+            Images of the shape of ``input`` (a batch unless ``keepdim``), in its dtype, or the dict; with
+            ``return_label`` also the label.
 
         Raises:
             ValueError: If there is no depth, or shapes or values are not as described.
@@ -156,10 +191,12 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
             params = dict(self.forward_parameters(shape) if params is None else params)
             params["depth"] = depth
         try:
-            return super().forward(input, params, **kwargs)
+            images = super().forward(input, params, **kwargs)
+            return (images, self.label(input, depth, params)) if self.return_label else images
         finally:
-            if params is not None:  # depth is an input, not a parameter: nothing keeps it, nothing repeats it
-                params.pop("depth", None)
+            for drawn in (params, self._params):  # depth is an input: nothing keeps it, nothing repeats it
+                if drawn is not None:
+                    drawn.pop("depth", None)
 
     def _forward_dict(
         self, sample: Mapping[str, Any], params: dict[str, Tensor] | None, **kwargs: Any
@@ -169,28 +206,70 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         if name is None or "depth" not in sample:
             raise ValueError(f"a dict must have 'image' and 'depth', got the keys {', '.join(map(str, sample))}")
         image, depth = (_plain(sample[key]) for key in (name, "depth"))
-        blurred = self.forward(image, depth, params, **kwargs).reshape(image.shape)
-        return {**sample, name: _as(sample[name], blurred)}
+        blurred = self.forward(image, depth, params, **kwargs)
+        blurred, label = blurred if self.return_label else (blurred, {})
+        return {**sample, name: _as(sample[name], blurred.reshape(image.shape)), **label}
+
+    def label(
+        self, input: Tensor, depth: Tensor | None = None, params: Mapping[str, Any] | None = None
+    ) -> dict[str, Tensor]:
+        """What the images of a call show, by name, for a network to learn.
+
+        Args:
+            input: The images of the call, before the blur, with or without the depth as their last channel.
+            depth: Its depth, as in :meth:`forward`.
+            params: Its parameters; None takes those of the last call.
+
+        Returns:
+            ``coc_px``: signed radius of the circle of confusion ``[B, 1, H, W]``, in pixels, negative in front of the
+            focus plane, 0 where a pixel stays as it is; ``focus_m`` in metres, ``f_number`` and ``table`` (its number
+            among those given), each ``[B]``, also of images that were left out; ``blurred``, bool ``[B]``, False of
+            these. Of one image ``[C, H, W]`` all are without the axis B.
+
+        Raises:
+            ValueError: As :meth:`forward`; so do parameters that were drawn for another number of images.
+        """
+        shape = _batch_shape(input)
+        image, depth, _ = _image_and_depth(_plain(input).reshape(shape), _plain(depth))
+        drawn, count = self._params if params is None else params, len(image)
+        if not drawn or len(drawn["focus_m"]) != count:
+            got = f"those of {len(drawn['focus_m'])}" if drawn else "none; call it before, or give them"
+            raise ValueError(f"params must be those of {count} images, got {got}")
+        chosen = self._chosen(drawn, count).to(image.device)
+        blurred = torch.zeros(count, dtype=torch.bool, device=image.device).index_fill(0, chosen, True)
+        coc = depth.new_zeros(depth.shape)
+        if len(chosen):
+            options: Any = self.renderings[0].arguments()
+            lens = (drawn[name].to(image.device)[chosen] for name in ("focus_m", "f_number"))
+            light = self._light(image[chosen], self.flags["transfer"])
+            known = DepthOfField(self.camera, **options).coc_px(light, depth[chosen], *lens)
+            coc = coc.index_copy(0, chosen, torch.nan_to_num(known, nan=0.0).to(coc.dtype))
+        numbers = {name: drawn[name].to(image.device) for name in ("focus_m", "f_number", "table")}
+        label = {"coc_px": coc, **numbers, "blurred": blurred}
+        return label if input.ndim == 4 else {name: value[0] for name, value in label.items()}
+
+    def transform_inputs(
+        self,
+        input: Tensor,
+        params: dict[str, Tensor],
+        flags: dict[str, Any],
+        transform: Tensor | None = None,
+        **kwargs: Any,
+    ) -> Tensor:
+        """Kornia's, but for choosing the images, which needs their depth; Kornia 0.8 would hand on some without it."""
+        params, flags = self._process_kwargs_to_params_and_flags(
+            self._params if params is None else params, flags, **kwargs
+        )
+        images = self.transform_tensor(input)
+        self.validate_tensor(images)
+        output = self.apply_transform(images, params, flags, transform)
+        return output.reshape(input.shape) if self.keepdim else output
 
     def apply_transform(
         self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
         """Blurs the images that ``params`` select, ``[B, C, H, W]``."""
-        depth = params.get("depth")
-        image, kept = input, input[:, :0]
-        if depth is None:
-            if input.shape[1] not in (2, 4):
-                raise ValueError(
-                    "RandomDepthOfField needs a depth: give it as the second argument or as the last channel of an "
-                    "image of 2 or 4 channels, or use torchdof.augmentation.DepthAugmentationSequential, whose first "
-                    f"mask is the depth; got an image of {input.shape[1]} channels alone"
-                )
-            image, depth, kept = input[:, :-1], input[:, -1:], input[:, -1:]
-        if depth.ndim in (2, 3):
-            depth = depth.unsqueeze(-3) if depth.ndim == 2 or len(depth) == len(input) else depth
-            depth = depth if depth.ndim == 4 else depth[None]
-        image_and_map(image, "depth", depth, "in metres")
-        depth = depth.expand(len(input), -1, -1, -1)
+        image, depth, kept = _image_and_depth(input, params.get("depth"))
         chosen = self._chosen(params, len(input))
         out = image
         for index in params["table"][chosen].unique().tolist():
@@ -203,7 +282,7 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
 
     def _chosen(self, params: Mapping[str, Tensor], count: int) -> Tensor:
         """Numbers of the items to blur; where all are always blurred, Kornia does not look at the gate."""
-        if self.p == 1.0 and self.p_batch == 1.0:
+        if (self.p == 1.0 and self.p_batch == 1.0) or "batch_prob" not in params:
             return torch.arange(count)
         return torch.atleast_1d(params["batch_prob"] > 0.5).expand(count).nonzero()[:, 0].cpu()
 
@@ -211,18 +290,24 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         self, image: Tensor, depth: Tensor, params: Mapping[str, Tensor], items: Tensor, index: int, transfer: Transfer
     ) -> Tensor:
         """Items of one lens, ``[N, C, H, W]``."""
-        if transfer == "srgb":
-            low, high = (float(value) for value in image.detach().aminmax())
-            if not _DISPLAYED[0] <= low <= high <= _DISPLAYED[1]:
-                raise ValueError(
-                    f"images with transfer='srgb' must lie in [0, 1], got {low:.4g} to {high:.4g}; put normalization "
-                    "behind RandomDepthOfField, or say transfer='linear'"
-                )
-            image = decode(image, "srgb", has_alpha=False, straight=False)
+        image = self._light(image, transfer)
         options: Any = self.renderings[index].arguments()
         focus_m, f_number = (params[name].to(items.device)[items] for name in ("focus_m", "f_number"))
         out = depth_of_field(image, depth, self.camera, focus_m=focus_m, f_number=f_number, **options)
         return encode(out, "srgb", has_alpha=False, straight=False) if transfer == "srgb" else out
+
+    @staticmethod
+    def _light(image: Tensor, transfer: Transfer) -> Tensor:
+        """Linear light of images."""
+        if transfer == "linear":
+            return image
+        low, high = (float(value) for value in image.detach().aminmax())
+        if not _DISPLAYED[0] <= low <= high <= _DISPLAYED[1]:
+            raise ValueError(
+                f"images with transfer='srgb' must lie in [0, 1], got {low:.4g} to {high:.4g}; put normalization "
+                "behind RandomDepthOfField, or say transfer='linear'"
+            )
+        return decode(image, "srgb", has_alpha=False, straight=False)
 
 
 class DepthAugmentationSequential(AugmentationSequential):
@@ -272,6 +357,24 @@ class _DepthOps(AugmentationSequentialOps):
             depth = arg[keys.index(DataKey.MASK)]
             param = ParamItem(param.name, {**param.data, "depth": depth})
         return super().transform(*arg, module=module, param=param, extra_args=extra_args, data_keys=data_keys)
+
+
+def _image_and_depth(input: Tensor, depth: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Images, their depth ``[B, 1, H, W]``, and the channels of the input ``[B, C, H, W]`` that are returned as is."""
+    image, kept = input, input[:, :0]
+    if depth is None:
+        if input.shape[1] not in (2, 4):
+            raise ValueError(
+                "RandomDepthOfField needs a depth: give it as the second argument or as the last channel of an "
+                "image of 2 or 4 channels, or use torchdof.augmentation.DepthAugmentationSequential, whose first "
+                f"mask is the depth; got an image of {input.shape[1]} channels alone"
+            )
+        image, depth, kept = input[:, :-1], input[:, -1:], input[:, -1:]
+    if depth.ndim in (2, 3):
+        depth = depth.unsqueeze(-3) if depth.ndim == 2 or len(depth) == len(input) else depth
+        depth = depth if depth.ndim == 4 else depth[None]
+    image_and_map(image, "depth", depth, "in metres")
+    return image, depth.expand(len(input), -1, -1, -1), kept
 
 
 def _range(name: str, value: Any, most: float) -> tuple[float, float]:

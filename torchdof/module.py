@@ -5,10 +5,11 @@ import os
 import threading
 import warnings
 from collections.abc import Sequence
-from typing import Any, Unpack
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from typing_extensions import Unpack
 
 from . import validation
 from .batch import flattened, leading_axes, numbers, restored
@@ -20,7 +21,7 @@ from .render.attention import Attention
 from .render.ops import EAGER, Ops
 from .render.plan import Plan
 from .render.resample import at_size_of
-from .tensors import is_traced
+from .tensors import is_traced, refuse_old_compiler
 
 __all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]
 
@@ -108,6 +109,7 @@ class DepthOfField(nn.Module):
         Raises:
             ValueError: If shapes, types or values are not as described, or a tensor comes from ``torch.vmap``.
         """
+        refuse_old_compiler()
         options, axes = self.options, leading_axes(image)
         lens = (numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number))
         image, depth = flattened(axes, "image", image, "C"), flattened(axes, "depth", depth)
@@ -297,6 +299,7 @@ def depth_of_field(
         >>> depth_of_field(image, depth, Camera(focus_m=1.0)).shape
         torch.Size([1, 3, 8, 12])
     """
+    refuse_old_compiler()
     return DepthOfField(camera, table, **options)(image, depth, focus_m, f_number, plan, attention=attention)
 
 
@@ -336,6 +339,7 @@ def blur_by_coc(
         >>> blur_by_coc(image, torch.linspace(-2, 2, 12).expand(1, 1, 8, 12)).shape
         torch.Size([1, 3, 8, 12])
     """
+    refuse_old_compiler()
     axes = leading_axes(image)
     rendered = blur(
         flattened(axes, "image", image, "C"),

@@ -4,7 +4,9 @@ import dataclasses
 import inspect
 import textwrap
 from collections.abc import Mapping
-from typing import Any, Literal, TypedDict, TypeVar, Unpack
+from typing import Any, Literal, TypedDict, TypeVar
+
+from typing_extensions import Unpack
 
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera

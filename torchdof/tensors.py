@@ -6,15 +6,55 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-__all__ = ["floating", "has_storage", "is_differentiated", "is_fake", "is_in_memory", "is_traced"]
+__all__ = [
+    "TRACEABLE",
+    "floating",
+    "has_storage",
+    "is_differentiated",
+    "is_exporting",
+    "is_fake",
+    "is_in_memory",
+    "is_traced",
+    "refuse_old_compiler",
+]
+
+TRACEABLE = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 13)
+"""Whether this PyTorch can compile and export the renderer, and transform it with torch.func: older ones cannot."""
 
 _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 """Floating-point dtypes with arithmetic; PyTorch only stores smaller ones."""
 
 
+def is_exporting() -> bool:
+    """Whether this code is being exported; PyTorch before 2.7 cannot tell, nor export it."""
+    return hasattr(torch.compiler, "is_exporting") and torch.compiler.is_exporting()
+
+
 def is_traced() -> bool:
     """Whether this code is being compiled or exported, so that the values of tensors cannot be read."""
-    return torch.compiler.is_compiling() or torch.compiler.is_exporting()
+    return torch.compiler.is_compiling() or is_exporting()
+
+
+def refuse_old_compiler() -> None:
+    """Refuse to be compiled by a PyTorch that is too old for it.
+
+    Raises:
+        RuntimeError: With what to do; wrapped by the compiler in an error of its own.
+    """
+    if not TRACEABLE and is_traced():
+        _refuse_compiler()
+
+
+def _refuse_compiler() -> None:
+    raise RuntimeError(
+        f"torchdof needs PyTorch 2.13 or newer to be compiled, this is {torch.__version__}; leave it out of compiled "
+        "code, with torch.compiler.disable(dof)"
+    )
+
+
+# The compiler then calls it, where it would only stop at an exception. What torch.compiler.assume_constant_result does,
+# without importing the whole compiler for it.
+_refuse_compiler._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 def is_fake() -> bool:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from . import native
-from .tensors import floating, has_storage, is_in_memory, is_traced
+from .tensors import TRACEABLE, floating, has_storage, is_in_memory, is_traced
 
 __all__ = [
     "NAMED_TOLERANCES",
@@ -98,7 +98,16 @@ def whole(name: str, value: Any, low: int, high: int) -> int:
 
 
 def ends(values: Tensor) -> tuple[float, float]:
-    """Smallest and largest value; both are NaN if any value is."""
+    """Smallest and largest value; both are NaN if any value is.
+
+    Raises:
+        ValueError: If they come from ``torch.func`` of a PyTorch older than 2.13, where they cannot be read.
+    """
+    if not TRACEABLE and torch._C._functorch.is_functorch_wrapped_tensor(values):
+        raise ValueError(
+            "the image, the depth or a number of the camera comes from torch.func, for which torchdof needs PyTorch "
+            f"2.13 or newer, this is {torch.__version__}; use torch.autograd instead"
+        )
     if values.dtype == torch.float32 and is_in_memory(values) and native.chosen():
         return native.ends(values)
     # in float32 at least: autocast supports only one half-precision dtype at a time

@@ -2,7 +2,7 @@
 
 import math
 import os
-import tomllib
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -13,6 +13,11 @@ from ..problems import FitError, warn
 from ..validation import a_choice, a_number
 from .captures import CAMERA, RANGES, Captures, check_distances
 from .frame import PATTERNS, Dots, Frame, cut_pairs, read_frame, size_of
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 __all__ = ["MANIFEST", "Captures", "Colours", "inside", "read_captures"]
 

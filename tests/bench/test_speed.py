@@ -14,6 +14,7 @@ import torch
 from click.testing import CliRunner, Result
 from torch import Tensor
 
+from tests.traced import TRACED
 from torchdof import Camera, DepthOfField, blur_by_coc
 from torchdof.bench import speed
 from torchdof.bench.measurement import BenchScene, error, shipped, timed
@@ -219,6 +220,7 @@ def test_an_exported_file_is_a_row(exported_by_command: tuple[Path, str], monkey
     assert 0 < 255 * float(error) < 1, "the file's tolerance is that of the row"
 
 
+@TRACED
 @pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning")  # from within inductor
 @pytest.mark.parametrize("backend", ["eager", pytest.param("inductor", marks=pytest.mark.sweep)])
 def test_a_compiled_module_is_a_row(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -235,6 +237,12 @@ def test_bench_needs_a_compiler_to_compile(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.delenv("CXX", raising=False)
     result = run("--compile")
     assert result.exit_code == 2 and "install g++ or leave --compile out" in result.output
+
+
+def test_bench_refuses_to_compile_with_an_old_pytorch(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchdof.tensors.TRACEABLE", False)
+    result = run("--compile")
+    assert result.exit_code == 2 and "torch.compile needs PyTorch 2.13" in result.output
 
 
 def test_a_missing_matplotlib_is_reported_before_measuring(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests.tolerances import TOLERANCES
+from tests.traced import TRACED
 from torchdof.depth import depth_from_values, from_relative, solve_scale
 from torchdof.depth.relative import RELATIVE_KINDS
 
@@ -89,6 +90,7 @@ def test_gradients_are_those_of_the_formula(kind: Any) -> None:
     assert torch.autograd.gradcheck(lambda v: from_relative(v, 1.0, 5.0, kind), values)
 
 
+@TRACED
 def test_from_relative_compiles_without_graph_breaks() -> None:
     values = torch.rand(1, 1, 3, 4)
     compiled = torch.compile(lambda v: from_relative(v, 1.0, 5.0), fullgraph=True, backend="eager")

@@ -5,7 +5,7 @@ import re
 import runpy
 import shlex
 import shutil
-import tomllib
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -22,6 +22,11 @@ from torchdof.cli.main import app
 from torchdof.fit.lens import Lens
 from torchdof.io.images import Picture, read_image, write_image
 from torchdof.reference.metrics import display, psnr
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]

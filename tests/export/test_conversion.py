@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import torchdof
-from torchdof.export import describe, to_onnx
+from torchdof.export import conversion, describe, to_onnx
 from torchdof.export.verification import session
 
 CAMERA = torchdof.Camera.from_fov(50.0, 0.05, 2.0)
@@ -150,3 +150,12 @@ def test_a_file_has_the_kernels_of_an_asymmetric_aperture(tmp_path: Path) -> Non
     image, coc = torch.rand(1, 3, 30, 40), torch.full((1, 1, 30, 40), 1.5)
     (out,) = session(tmp_path / "dof.onnx").run(None, {"image": image.numpy(), "coc_px": coc.numpy()})
     assert (torch.from_numpy(out) - image).abs().max() > 0.1
+
+
+def test_an_exporter_that_cannot_follow_is_refused_before_it_starts(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(conversion, "TRACEABLE", False)
+    with pytest.raises(ValueError, match=r"needs PyTorch 2\.13 or newer to write ONNX files, this is "):
+        to_onnx(torchdof.DepthOfField(torchdof.Camera()), tmp_path / "dof.onnx")
+    assert list(tmp_path.iterdir()) == []

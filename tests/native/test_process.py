@@ -56,7 +56,7 @@ def test_python_threads_may_render_concurrently() -> None:
 
 def answer_of(script: str) -> str:
     """Output of a script in a new process."""
-    run = subprocess.run([sys.executable, "-P", "-c", script], capture_output=True, text=True, timeout=120, check=False)
+    run = subprocess.run([sys.executable, "-I", "-c", script], capture_output=True, text=True, timeout=120, check=False)
     assert run.returncode == 0, run.stderr
     return run.stdout.strip()
 

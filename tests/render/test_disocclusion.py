@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from tests.scenes import BLUE, mixed_edge
+from tests.traced import TRACED
 from torchdof.render.composite import over
 from torchdof.render.convolution import convolve
 from torchdof.render.disocclusion import behind_pixels, fill_hidden, surfaces_of_image
@@ -107,8 +108,9 @@ def test_a_hole_in_all_layers_shows_the_background(size: tuple[int, int]) -> Non
         torch.testing.assert_close(shown, 0.2 * cover + (1 - cover) * behind, rtol=0, atol=1e-6)
 
 
+@TRACED
 def test_gradients_of_a_compiled_graph_are_those_of_eager_code() -> None:
-    image, coc = edge(0.7, near_px=-4.0, far_px=2.0)
+    image, coc = mixed_edge(0.7, near_px=-4.0, far_px=2.0)
     limit = threshold(image)
 
     def hidden_light(light: Tensor) -> Tensor:

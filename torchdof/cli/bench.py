@@ -100,6 +100,10 @@ class Bench:
             raise FileNotFoundError(
                 "torch.compile needs a C++ compiler, and none was found; install g++ or leave --compile out"
             )
+        from ..tensors import TRACEABLE
+
+        if self.speed.compiled and not TRACEABLE:
+            raise ValueError("torch.compile needs PyTorch 2.13 or newer here; leave --compile out")
         self._measure_speed()
 
     def _compare_with_truth(self, truth: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from ..tensors import is_traced
+from ..tensors import is_traced, refuse_old_compiler
 from ..validation import number, show
 from .kinds import depth_from_values, number_map
 
@@ -61,6 +61,7 @@ def from_relative(
         >>> from_relative(torch.tensor([[[[0, 128, 255]]]], dtype=torch.uint8), near_m=1.0, far_m=5.0)
         tensor([[[[5.0000, 1.6623, 1.0000]]]])
     """
+    refuse_old_compiler()
     if not isinstance(kind, str) or kind not in RELATIVE_KINDS:
         raise ValueError(f"the kind of relative depth must be one of {', '.join(RELATIVE_KINDS)}, got {show(kind)}")
     near_m, far_m = _near_and_far(near_m, far_m, kind)

@@ -11,6 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..tensors import is_exporting
+
 __all__ = ["constants", "is_compiled", "one_operator"]
 
 _KEPT = 4  # lists of constants; a compiled graph asks for each of its own twice
@@ -18,7 +20,7 @@ _KEPT = 4  # lists of constants; a compiled graph asks for each of its own twice
 
 def is_compiled() -> bool:
     """Whether this code is being compiled, and not exported."""
-    return torch.compiler.is_compiling() and not torch.compiler.is_exporting()
+    return torch.compiler.is_compiling() and not is_exporting()
 
 
 def one_operator(
