@@ -194,7 +194,7 @@ WITHOUT_PYTORCH = [
     *([command, "--no-such-option"] for command in ("render", "fit", "export", "bench", "inspect", "tables")),
     ["render", "a.png", "d.png", "-o", "o.png", "--f-number", "wide"],
     ["render", "a.png", "d.png", "-o", "o.png", "--focus-m", "2", "--focus-at", "3,4"],
-    ["render", "a.png", "d.png", "-o", "o.png", "--depth-kind", "relative"],
+    ["render", "a.png", "d.png", "-o", "o.png", "--depth-kind", "z", "--near-m", "1"],
     ["render", "a.png", "d.png", "-o", "o.png", "--tolerance", "best"],
     ["render", "a.####.png", "d.png", "-o", "o.####.png", "--frames", "1-"],
     ["inspect", "a.png", "d.png", "--depth-kind", "coc"],

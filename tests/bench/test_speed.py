@@ -108,7 +108,7 @@ def test_bench_measures_ones_own_scene_and_makes_its_folder(
     result = run(*files, "--repeat", 1, "--out", out, "--f-number", 1.4, "--sensor-width-mm", 6)
     assert result.exit_code == 0, result.output
     assert "image.exr, blur radius -" in result.output
-    assert "focus at the median depth" in " ".join(result.output.split())
+    assert "focus on what is nearest the middle" in " ".join(result.output.split())
     assert sorted(p.name for p in out.iterdir()) == ["speed.csv", "speed.md", "speed.png"]
     with (out / "speed.csv").open() as file:
         rows = {row["setting"]: row for row in csv.DictReader(file)}

@@ -32,7 +32,7 @@ image.exr depth.npy --focus-m 2 -o ./image.exr        | is one of the inputs
 image.exr depth.npy --focus-m 2 -o depth.npy          | depth.npy: is one of the inputs
 image.exr depth.npy --focus-m 2 -o depth.npy/out.exr  | its folder cannot be made
 image.exr depth.npy --focus-m 2 -o out.gif            | cannot write files of type '.gif'
-image.exr depth.npy                                   | where is the focus? give --focus-m METRES or --focus-at X,Y
+shot.####.exr depth.npy -o o.#.exr                    | where is the focus? give --focus-m METRES or --focus-at X,Y
 image.exr depth.npy --focus-m near                    | --focus-m expects metres (2.0) or keyframes
 image.exr depth.npy --focus-m 1:2,5:3                 | --focus-m has keyframes but IMAGE is a single image
 image.exr depth.npy --focus-m 0.01                    | --focus-m must be longer than the focal length
@@ -60,10 +60,9 @@ image.exr depth.npy --focus-m 2 --fill-depth 1e-45 --depth-unknown 6 | blurs a d
 image.exr depth.npy --focus-m 2 --depth-kind disparity | disparity needs a scale (--depth-scale)
 image.exr depth.npy --focus-m 2 --depth-kind distance | --depth-kind distance needs --fov-deg
 image.exr depth.npy --focus-m 2 --depth-kind coc      | --depth-kind coc is the blur itself and takes no camera
-image.exr depth.npy --focus-m 2 --depth-kind relative --near-m 1 | --depth-kind relative needs --near-m and --far-m
 image.exr depth.npy --focus-m 2 --depth-kind relative --near-m 1 --far-m 2 --depth-scale 3 | near and far say it
 image.exr depth.npy --focus-m 2 --depth-kind relative --near-m 5 --far-m 1 | depth.npy: near_m must be nearer than
-image.exr depth.npy --focus-m 2 --near-m 1            | add --depth-kind relative
+image.exr depth.npy --focus-m 2 --near-m 1 --depth-kind z | are for relative depth, and not for --depth-kind z
 image.exr depth.npy --focus-m 2 --value-range 3       | --value-range expects two numbers such as 0,255
 image.exr millimetres.npy --focus-m 3 --f-number 1.4 --strict | millimetres.npy: the focus at 3 m is nearer than all
 image.exr depth.npy --focus-m 2 --table nowhere       | no blur table 'nowhere': neither a file nor one of disc, gauss
@@ -155,7 +154,7 @@ def test_what_the_other_commands_refuse(files: Path, run: Callable[..., str], li
     [
         ("render image.exr", "Missing option '--out' / '-o'"),
         ("render image.exr depth.npy -o out.exr --f-number wide", "'wide' is not a valid float"),
-        ("render image.exr depth.npy -o out.exr --depth-kind odd", "'odd' is not one of 'z', 'distance'"),
+        ("render image.exr depth.npy -o out.exr --depth-kind odd", "'odd' is not one of 'auto', 'z', 'distance'"),
         ("render image.exr depth.npy -o out.exr --f-number", "Option '--f-number' requires an argument"),
         ("render --nonsense", "No such option '--nonsense'"),
         ("bench --repeat 0", "0 is not in the range x>=1"),

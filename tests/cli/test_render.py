@@ -372,3 +372,56 @@ def test_the_folder_of_the_output_is_made(run: Run) -> None:
     assert read_image("new/folder/out.exr").pixels.shape[-1] == 24
     run(f"inspect image.exr depth.npy -o other/sheet.png --focus-m 2 {LENS}")
     assert Path("other/sheet.png").is_file()
+
+
+# The first command
+
+
+def guessed(command: str) -> tuple[str, str]:
+    """What a command prints, and what it notes."""
+    told = CliRunner().invoke(app, command.split(), catch_exceptions=False)
+    assert told.exit_code == 0
+    return told.stdout, told.stderr
+
+
+GREY = "taken for relative depth, larger is nearer (else --relative-kind depth), from 1 to 8 m (--near-m, --far-m)"
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "sample", "noted"),
+    [(20, 250, "uint8", GREY), (3000, 65500, "uint16", GREY), (900, 5000, "uint16", "taken for millimetres")],
+)
+def test_the_first_command_needs_no_option(run: Run, low: int, high: int, sample: str, noted: str) -> None:
+    """A subject in front of a slope: it is sharp, and the rest is blurred by 2 % of the width."""
+    size = (60, 90)
+    image = torch.rand(1, 3, *size, generator=torch.Generator().manual_seed(3))
+    write_image("photo.png", Picture(image, sample="8", transfer="srgb"))
+    far, near = (high, low) if "millimetres" in noted else (low, high)
+    values = np.repeat(np.linspace(far, (far + near) / 2, size[0])[:, None], size[1], 1)
+    values[15:, 30:60] = near
+    store("depth.png", values.astype(sample)[..., None], sample, ("Y",))
+    line, note = guessed("render photo.png depth.png -o out.png")
+    assert note.count("\n") == 1 and note.startswith(f"note: depth.png: {noted}")
+    assert "blur radius up to 1.8 px" in line and "f-number for a blur of 2% of the width" in line
+    assert "focus on what is nearest the middle" in line
+    before, after = pixels("photo.png"), pixels("out.png")
+    torch.testing.assert_close(after[..., 35:, 38:52], before[..., 35:, 38:52], rtol=0, atol=0.01)
+    assert float((after - before)[..., :12, :].abs().mean()) > 0.05
+
+
+def test_metres_are_said_to_be_taken_for_such_unless_the_focus_is_in_metres(depth: Tensor, run: Run) -> None:
+    line, note = guessed("render image.exr depth.npy -o out.exr")
+    assert note.startswith("note: depth.npy: taken for metres") and line.startswith("out.exr: focus 2 m")
+    assert guessed(f"{ONE} {LENS}")[1] == ""
+    holed = depth.clone()
+    holed[..., 3, 4:6] = 0.0
+    np.save("depth.npy", holed.numpy())
+    assert "2 px of depth filled (far)" in guessed("render image.exr depth.npy -o out.exr")[0]
+    assert "no depth" in run(f"{ONE} {LENS}", code=2)
+
+
+def test_a_lens_in_the_file_blurs_a_first_picture_where_that_is_seen(image: Tensor, run: Run) -> None:
+    for f_number, words in ((1.8, "f/1.8,"), (64.0, "f-number for a blur of 2% of the width")):
+        tags = {"Exif:FocalLength": 85.0, "FNumber": f_number, "Exif:FocalLengthIn35mmFilm": 85.0}
+        write_image("photo.exr", Picture(image, metadata={name: ("float", value) for name, value in tags.items()}))
+        assert words in run("render photo.exr depth.npy -o out.exr")

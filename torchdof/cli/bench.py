@@ -55,7 +55,7 @@ class Bench:
 
         torchdof bench photo.png depth.exr --f-number 1.8 --out results
 
-    Camera, depth and blur are told as to torchdof render; without a focus it is at the median depth.
+    Camera, depth and blur are told as to torchdof render, and found as there.
 
     torchdof and simpler renderers against scenes whose depth of field is known, beside GEGL:
 
@@ -151,7 +151,7 @@ class Bench:
         from .frame import coc_of, read_frame
 
         frame = read_frame(image, self.depth, self.scene)
-        coc_px, camera, remarks = coc_of(frame, self.scene, WarnOnce(self.scene.depth_map.strict), median=True)
+        coc_px, camera, remarks = coc_of(frame, WarnOnce(self.scene.depth_map.strict))
         if self.scene.lens.has_focus:
             remarks = ["focus as stated", *remarks]
         words = "blur as given" if camera is None else f"{camera!r}; {', '.join(remarks)}"

@@ -8,7 +8,7 @@ import math
 import os
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -28,8 +28,12 @@ __all__ = ["Accuracy", "Blur", "DepthMap", "Lens", "Opening", "Scene", "Sensor"]
 __all__ += ["edges_option", "json_option", "pick_device", "make_folder_of", "refuse_input"]
 
 _ASSUMED = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
+_NEAR_M, _FAR_PER_NEAR = 1.0, 8.0  # of relative depth
+_BLUR, _SEEN = 0.02, 0.005  # of the picture's width: a blur that is plain to see, and the least that is seen at all
 _SPELLED = {"focus_range_m": "--focus-range", "tilt_deg": "--tilt", "swing_deg": "--swing", "fov_x_deg": "--fov-deg"}
 _IDEAL = ("disc", "gaussian")
+_WHOLE_NUMBERS = (".png", ".jpg", ".jpeg", ".webp")
+_OF_RENDERERS = (".exr", ".tif", ".tiff")  # whose floating point numbers are distances
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +57,8 @@ class Lens(Sensor):
         basic=True,
     )
     focus_at: tuple[float, float] | None = option(
-        "Focus on what is seen at this pixel, counted from the top left; in a sequence, anew in each frame.",
+        "Focus on what is seen at this pixel, counted from the top left; in a sequence, anew in each frame. Default: "
+        "the focus that IMAGE's file states, else the subject nearest the middle.",
         metavar="X,Y",
         read=numbers(2, "--focus-at expects a pixel X,Y such as 320,200"),
         basic=True,
@@ -89,6 +94,11 @@ class Lens(Sensor):
         """Whether the user said where to focus."""
         return (self.focus_m, self.focus_at, self.focus_range) != (None, None, None)
 
+    @property
+    def speaks_of_metres(self) -> bool:
+        """Whether the user said anything of the scene in metres."""
+        return (self.focus_m, self.focus_range, self.aperture_radius_m) != (None, None, None)
+
     def refuse_keyframes(self) -> None:
         """Refuse focus that moves, for a single image."""
         if len(self.focus_m or []) > 1:
@@ -109,27 +119,31 @@ class Lens(Sensor):
         return camera_facts(metadata, width, height) | stated
 
     def camera(
-        self, metadata: Mapping[str, Any], depth: "Tensor", frame: int = 0, median: bool = False
+        self, metadata: Mapping[str, Any], depth: "Tensor", frame: int | None = None, is_to_scale: bool = True
     ) -> "tuple[Camera, list[str]]":
-        """The camera of one frame, and remarks on what the user did not state: the file does, or it is assumed.
+        """The camera of one picture, and remarks on what the user did not state: the file does, or it is assumed.
 
-        With ``median``, the focus is at the median depth where the user said nothing, whatever the file says. Refuses
-        a focus that is stated nowhere, and numbers that make no lens, by the names of the options.
+        A single picture is focused on its subject, and blurred so that it is seen, where nothing says otherwise; a
+        frame of a sequence, which has a number, is not, for both would change from frame to frame. Distances that are
+        not to scale have nothing to do with the file's own. Refuses numbers that make no lens, by the names of the
+        options.
         """
         from ..optics.camera import Camera
 
         height, width = depth.shape[-2:]
         known, remarks, focus_m = self._known(metadata, width, height), list[str](), math.inf
         if self.focus_m is not None:
-            focus_m = focus_at_frame(self.focus_m, frame)
-        elif not self.has_focus and median:
-            focus_m = float(depth[depth > 0].median())
-            remarks.append("focus at the median depth")
-        elif not self.has_focus:
-            if "focus_m" not in known:
-                raise ValueError("where is the focus? give --focus-m METRES or --focus-at X,Y (the file does not say)")
+            focus_m = focus_at_frame(self.focus_m, frame or 0)
+        elif not self.has_focus and is_to_scale and "focus_m" in known:
             focus_m = known["focus_m"]
             remarks.append("focus from the file")
+        elif not self.has_focus and frame is not None:
+            raise ValueError("where is the focus? give --focus-m METRES or --focus-at X,Y (the file does not say)")
+        elif not self.has_focus:
+            from ..depth.guess import subject_m
+
+            focus_m = subject_m(depth)
+            remarks.append("focus on what is nearest the middle")
         if self.fov_deg is None:
             for name in (name for name in _ASSUMED if getattr(self, name) is None):
                 words = "f-number" if name == "f_number" else name.rsplit("_", 1)[0].replace("_", " ")
@@ -146,7 +160,15 @@ class Lens(Sensor):
                     radius_m = 18.0 / math.tan(math.radians(self.fov_deg) / 2) / (2000.0 * (self.f_number or math.nan))
                 camera = Camera.from_fov(self.fov_deg, radius_m, focus_m)
             camera = camera.replace(focus_range_m=self.focus_range, tilt_deg=self.tilt, swing_deg=self.swing)
-        return camera if self.focus_at is None else camera.focus_at(depth, *self.focus_at), remarks
+        camera = camera if self.focus_at is None else camera.focus_at(depth, *self.focus_at)
+        if frame is None and (self == Lens() or not (is_to_scale or self.f_number or self.fov_deg)):
+            largest_px = largest_coc_px(camera, depth)
+            is_known = is_to_scale and "f_number" in known and largest_px >= _SEEN * width
+            if largest_px > 0 and not is_known:
+                camera = camera.replace(f_number=camera.f_number * largest_px / (_BLUR * width))
+                remarks = [remark for remark in remarks if not remark.startswith("f-number")]
+                remarks.append(f"f-number for a blur of {_BLUR:.0%} of the width")
+        return camera, remarks
 
     def stated(self, camera: "Camera") -> dict[str, Any]:
         """The numbers of a camera by the options, or the file, that they are from."""
@@ -173,17 +195,18 @@ class Lens(Sensor):
 class DepthMap:
     """Depth map."""
 
-    depth_kind: Literal["z", "distance", "disparity", "inverse", "relative", "coc"] = option(
+    depth_kind: Literal["auto", "z", "distance", "disparity", "inverse", "relative", "coc"] = option(
         "What the numbers are: z along the optical axis or distance along the ray, in metres after scale * (value + "
         "offset); disparity or inverse depth, in metres after scale / (value + offset); relative, as estimators give "
-        "it, between --near-m and --far-m; or coc, the signed blur radius in pixels (negative is near).",
-        "z",
+        "it, between --near-m and --far-m; or coc, the signed blur radius in pixels (negative is near). auto guesses "
+        "between relative, millimetres and metres, and says which; in sequences, and with --strict, it is z.",
+        "auto",
         basic=True,
     )
     depth_scale: float | None = option("0.001 for maps in millimetres.", basic=True)
     depth_offset: float = option("Added to each value first.", 0.0)
-    near_m: float | None = option("Distance of the nearest value of relative depth.")
-    far_m: float | None = option("Distance of its farthest value (inf allowed).")
+    near_m: float | None = option("Distance of the nearest value of relative depth. Default: 1, or --far-m / 8.")
+    far_m: float | None = option("Distance of its farthest value (inf allowed). Default: 8 times --near-m.")
     relative_kind: Literal["disparity", "inverse", "depth"] | None = option(
         "What relative depth is: disparity or inverse depth, larger is nearer (MiDaS, Depth Anything; the default), or "
         "depth, larger is farther (Marigold)."
@@ -204,18 +227,61 @@ class DepthMap:
     strict: bool = option("Refuse what looks like a wrong unit or scale, instead of warning.", False)
 
     def __post_init__(self) -> None:
-        if self.depth_kind == "relative":
-            if self.near_m is None or self.far_m is None:
-                raise ValueError(
-                    "--depth-kind relative needs --near-m and --far-m, the distances of the nearest and the farthest "
-                    "value in metres (--far-m inf for a sky)"
-                )
-            if self.depth_scale is not None or self.depth_offset != 0.0:
-                raise ValueError("--depth-kind relative has no --depth-scale and --depth-offset: near and far say it")
-        elif any(value is not None for value in (self.near_m, self.far_m, self.relative_kind, self.value_range)):
+        has_scale = self.depth_scale is not None or self.depth_offset != 0.0
+        is_relative = any(
+            value is not None for value in (self.near_m, self.far_m, self.relative_kind, self.value_range)
+        )
+        if self.depth_kind == "auto" and (is_relative or has_scale or self.strict):  # which say what the numbers are
+            object.__setattr__(self, "depth_kind", "relative" if is_relative else "z")
+        if self.depth_kind == "relative" and has_scale:
+            raise ValueError("relative depth has no --depth-scale and --depth-offset: near and far say it")
+        if self.depth_kind != "relative" and is_relative:
             raise ValueError(
-                "--near-m, --far-m, --relative-kind and --value-range are for relative depth: add --depth-kind relative"
+                "--near-m, --far-m, --relative-kind and --value-range are for relative depth, and not for --depth-kind "
+                f"{self.depth_kind}"
             )
+
+    @property
+    def ends_m(self) -> tuple[float, float]:
+        """Distances of the nearest and the farthest value of relative depth."""
+        near_m, far_m = self.near_m, self.far_m
+        if near_m is None:
+            near_m = _NEAR_M if far_m is None or far_m == math.inf else far_m / _FAR_PER_NEAR
+        return near_m, near_m * _FAR_PER_NEAR if far_m is None else far_m
+
+    @property
+    def is_to_scale(self) -> bool:
+        """Whether distances are metres that somebody measured or stated."""
+        return self.depth_kind != "relative" or self.near_m is not None or self.far_m is not None
+
+    def of_sequence(self) -> "DepthMap":
+        """The same for frames of a sequence, where a guess could be another one in each: unsaid is metres."""
+        return replace(self, depth_kind="z") if self.depth_kind == "auto" else self
+
+    def guessed(self, values: "Tensor", path: Path, is_metric: bool) -> "tuple[DepthMap, str]":
+        """The same with a kind in the place of ``auto``, by the values of a map, and what to tell of it.
+
+        Metres are nothing to tell where what the user says of the scene ``is_metric``; otherwise holes are filled too.
+        """
+        from ..depth.guess import guess_kind
+
+        known = values if self.depth_unknown is None else values.masked_fill(values == self.depth_unknown, math.nan)
+        suffix = path.suffix.lower()
+        guess = guess_kind(known, suffix in _WHOLE_NUMBERS, is_metric or suffix in _OF_RENDERERS)
+        if guess.kind == "z" and guess.scale == 1.0 and is_metric:
+            return replace(self, depth_kind="z"), ""
+        fill, unknown = "far" if self.fill_depth is None else self.fill_depth, self.depth_unknown
+        unknown = guess.unknown if unknown is None else unknown
+        said = replace(self, depth_kind=guess.kind, depth_unknown=unknown, fill_depth=fill)
+        if guess.kind == "z":
+            unit = "metres" if guess.scale == 1.0 else "millimetres"
+            told = f"taken for {unit}; if it is not, say so with --depth-kind or --depth-scale"
+            return replace(said, depth_scale=None if guess.scale == 1.0 else guess.scale), told
+        larger, other = ("nearer", "depth") if guess.relative_kind == "disparity" else ("farther", "disparity")
+        near_m, far_m = said.ends_m
+        told = f"taken for relative depth, larger is {larger} (else --relative-kind {other}), from {near_m:g} to "
+        told += f"{far_m:g} m (--near-m, --far-m); if it is not, say so with --depth-kind"
+        return replace(said, relative_kind=guess.relative_kind), told
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -321,6 +387,12 @@ def edges_option(default: str) -> Any:
 def json_option() -> Any:
     """The option of all commands for programs."""
     return option("Print what is printed as JSON, for programs: one object a line.", False, names=("--json",))
+
+
+def largest_coc_px(camera: "Camera", depth: "Tensor") -> float:
+    """The largest blur radius in pixels of what has a depth."""
+    coc_px = camera.coc_px(depth, depth.shape[-1]).abs()
+    return float(coc_px.nan_to_num(0.0).max())
 
 
 @contextlib.contextmanager

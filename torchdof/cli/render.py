@@ -48,6 +48,10 @@ class _Files:
 class Render:
     """Blur IMAGE by its DEPTH as a lens would.
 
+    A photograph and its depth map, of whatever kind: what is taken for granted is printed.
+
+        torchdof render photo.jpg depth.png -o out.jpg
+
     A photograph and its depth in millimetres, focused on what is seen at column 320, row 200:
 
         torchdof render photo.jpg depth.png -o out.jpg --depth-scale 0.001 --focus-at 320,200 --f-number 1.8
@@ -71,13 +75,15 @@ class Render:
 
         torchdof render l.png disp.npz -o out.png --focus-m 2 --depth-kind disparity --depth-scale 192 --fill-depth far
 
-    Depth from an estimator, which knows near from far but no metres:
+    Depth from an estimator, which knows near from far but no metres, between distances that you state:
 
-        torchdof render photo.jpg depth.png -o out.jpg --depth-kind relative --near-m 1.2 --far-m 8 --focus-m 1.5
+        torchdof render photo.jpg depth.png -o out.jpg --near-m 1.2 --far-m 8 --focus-m 1.5 --f-number 1.4
 
     The lens is what you state, else what the file's EXIF data state, else 50 mm at f/2.8 on a sensor of 36 mm; the line
-    that is printed says which. Alpha and metadata are kept. A file is written whole or not at all. What looks
-    like a wrong unit is said on standard error; with --strict it is refused. --json prints one JSON object a frame.
+    that is printed says which. Where you state neither focus nor lens, a single image is focused on what is nearest
+    its middle, and opened until the largest blur radius is 2 % of its width, unless the file's lens blurs enough.
+    Alpha and metadata are kept. A file is written whole or not at all. What looks like a wrong unit is said on standard
+    error; with --strict it is refused. --json prints one JSON object a frame.
     """
 
     image: Path = argument("All-in-focus image (EXR, PNG, TIFF, JPEG, HDR, PFM) or shot.####.exr.", "IMAGE")
@@ -128,14 +134,14 @@ class Render:
             return
         from .frame import Renderer
 
-        renderer = Renderer(self)
+        renderer = Renderer(self, self.scene)
         with Bar(f"rendering {self.out.name}") as bar:
             frame = renderer.read(self.image, self.depth, self.out)
             renderer.write(renderer.render(frame, self.out, bar=bar))
 
     def _render_sequence(self) -> None:
         """Renders the frames of a numbered sequence, in order; with ``--resume`` only those that are missing."""
-        source, target, said = FramePattern(self.image), FramePattern(self.out), self.scene.depth_map
+        source, target, said = FramePattern(self.image), FramePattern(self.out), self.scene.depth_map.of_sequence()
         depths = FramePattern(self.depth) if self.depth is not None and FramePattern.matches(self.depth) else None
         numbers = self._numbers(source, depths)
         todo = [n for n in numbers if not (self.files.resume and target.name(n).is_file())]
@@ -147,7 +153,7 @@ class Render:
         from ..depth.sanity import Mistake
         from .frame import Renderer
 
-        renderer = Renderer(self)
+        renderer = Renderer(self, dataclasses.replace(self.scene, depth_map=said))
         if said.depth_kind == "relative" and said.value_range is None and len(numbers) > 1:
             renderer.warned.warn(self.depth or self.image, [Mistake("range", _EACH_ITS_OWN)])
 

@@ -16,7 +16,7 @@ from ..optics.camera import Camera
 from ..validation import real_tensor
 from .kinds import DepthKind
 
-__all__ = ["DepthWarning", "Mistake", "check", "coc_mistakes", "depth_mistakes"]
+__all__ = ["DepthWarning", "Mistake", "check", "coc_mistakes", "depth_mistakes", "whole_numbers"]
 
 _FACTORS = (0.001, 0.01, 1000.0, 100.0)  # millimetres and centimetres; and what was taken for such and is none
 _UNITS = {0.001: "millimetres", 0.01: "centimetres"}
@@ -155,7 +155,7 @@ def _mistakes(
     blur = camera.coc_px(torch.cat([decisive, _sample(known)]).reshape(1, 1, 1, -1), width).abs().flatten()
     least, largest, blur = float(blur[:2].min()), float(blur[2:4].max()), blur[4:]
     extent = f"({near:.4g} to {far:.4g} m)" if near < far else f"({near:.4g} m)"
-    of_bits = far <= 65535 and _whole_numbers(finite)
+    of_bits = far <= 65535 and whole_numbers(finite)
     sharp_px = max(_SHARP_PX, _SHARP_WIDTHS * width)
     is_wide_open = float(camera.f_number) < _WIDEST_F_NUMBER and largest > _LARGE_WIDTHS * width
     is_too_blurred = is_wide_open or _share_at(blur, 0.99) > _LARGEST_WIDTHS * width
@@ -252,7 +252,7 @@ def _sample(values: Tensor) -> Tensor:
     return values.flatten()[:: max(1, values.numel() // 65536)]
 
 
-def _whole_numbers(values: Tensor) -> bool:
+def whole_numbers(values: Tensor) -> bool:
     """Whether many different values all are whole numbers."""
     sample = _sample(values)
     return bool((sample == sample.round()).all()) and sample.unique().numel() >= 16
