@@ -54,6 +54,17 @@ image.exr depth.npy --focus-m 2 --fov-deg 40 --f-number 2 --aperture-radius-m 1 
 image.exr depth.npy --focus-m 2 --fov-deg 40 --f-number 1e-42 | --f-number 1e-42
 image.exr depth.npy --focus-m 2 --fov-deg 40 --aperture-radius-m 1e45 | --fov-deg 40, --aperture-radius-m 1e+45
 image.exr depth.npy --focus-m 2 --fov-deg 40 --aperture-radius-m -1 | --aperture-radius-m must be positive
+image.exr depth.npy --focus-m 2 --f-number 2 --blur 2% | --f-number and --blur both say how wide the lens opens
+image.exr depth.npy --focus-m 2 --equivalent 85,1.4 --blur 2% | --equivalent and --blur both say how wide the lens op
+image.exr depth.npy --focus-m 2 --equivalent 85,1.4 --fov-deg 40 | say the same; give one of them
+image.exr depth.npy --focus-m 2 --equivalent 85,1.4 --focal-length-mm 50 | --equivalent and --focal-length-mm say the
+image.exr depth.npy --focus-m 2 --equivalent 85       | --equivalent expects a focal length and an f-number such as
+image.exr depth.npy --focus-m 2 --equivalent 85,0     | --equivalent must be positive
+image.exr depth.npy --focus-m 2 --blur 2              | --blur expects a share of the picture's width
+image.exr depth.npy --focus-m 2 --blur 0%             | --blur expects a share of the picture's width
+image.exr depth.npy --focus-m 2 --blur 99%            | --blur expects a share of the picture's width
+image.exr depth.npy --depth-kind coc --blur 2%        | --depth-kind coc is the blur itself and takes no camera
+shot.####.exr depth.npy -o o.#.exr --focus-m 2 --blur 2% | --blur would open the lens anew in each frame
 image.exr depth.npy --focus-m 2 --aperture-radius-m 1 | --aperture-radius-m goes with --fov-deg
 image.exr depth.npy --focus-m 2 --fill-depth x        | --fill-depth expects nearest, far or metres, got 'x'
 image.exr depth.npy --focus-m 2 --fill-depth 1e-45 --depth-unknown 6 | blurs a depth of 1.4e-45 m

@@ -36,7 +36,7 @@ def photo(scene: Path) -> Path:
         (f"near.npy {LENS}", ["####", "depth edges   144 pixels: 100.0 % exact", "picture       photo.inspect.png"]),
         (
             "near.npy",
-            ["[focus on what is nearest the middle, focal length assumed, sensor width assumed, f-number for a blur"],
+            ["[focus on what is nearest the middle, focal length assumed, f-number for a blur of 2% of the width"],
         ),
         ("near.npy --focus-range 1.5,2.2 --tilt 3", ["focus 1.5 to 2.2 m", "tilt 3 degrees"]),
         ("near.npy --depth-kind relative --near-m 1 --far-m 3 --relative-kind depth", ["nearest 1 ", "farthest 3"]),

@@ -26,10 +26,10 @@ from torchdof.optics.field import Field
 pytestmark = pytest.mark.usefixtures("scene")  # its files lie in the working folder
 
 Run = Callable[..., str]
-LENS = "--focal-length-mm 50 --f-number 1.4 --sensor-width-mm 4"  # blurs by 1.8 px
+LENS = "--focal-length-mm 50 --f-number 1.2 --sensor-width-mm 4"  # blurs by 2.1 px
 ONE = "render image.exr depth.npy -o out.exr --focus-m 2"
 SEQUENCE = "render shot.####.exr depth.####.npy -o out.####.exr"
-CAMERA = torchdof.Camera(focal_length_mm=50.0, f_number=1.4, focus_m=2.0, sensor_width_mm=4.0)
+CAMERA = torchdof.Camera(focal_length_mm=50.0, f_number=1.2, focus_m=2.0, sensor_width_mm=4.0)
 RENDERED = torchdof.Camera.from_fov(40.0, 0.2, 2.0)
 SLIT = torch.zeros(8, 8)
 SLIT[1:7, 1:3] = 1.0
@@ -119,7 +119,7 @@ def test_the_line_tells_what_was_done(run: Run) -> None:
     told = run(f"{ONE} {LENS}")
     assert run(f"{ONE} --resume") == "out.exr: is there already\n"
     assert told.startswith(
-        "out.exr: focus 2 m, f/1.4, 50 mm on 4 mm; blur radius up to 1.8 px; disc, layered; 24 x 16;"
+        "out.exr: focus 2 m, f/1.2, 50 mm on 4 mm; blur radius up to 2.1 px; disc, layered; 24 x 16;"
     )
     shape = f"{BLADES} --tilt 3 --swing -1"
     told = run(f"render image.exr depth.npy -o out.exr --focus-range 1.5,1.8 --no-occlusion {shape} {LENS}")
@@ -251,7 +251,7 @@ def test_json_says_for_programs_what_the_line_says(depth: Tensor, run: Run) -> N
     assert there == {"out": "out.0001.exr", "is_there_already": True}
     assert [frame["out"] for frame in frames] == ["out.0002.exr", "out.0003.exr"]
     radius = float(CAMERA.replace(focus_m=math.inf).coc_px(depth, 24).abs().max())
-    camera: dict[str, Any] = {"focus_m": "inf", "f_number": 1.4, "focal_length_mm": 50.0, "sensor_width_mm": 4.0}
+    camera: dict[str, Any] = {"focus_m": "inf", "f_number": 1.2, "focal_length_mm": 50.0, "sensor_width_mm": 4.0}
     camera |= {"focus_range_m": None, "tilt_deg": 0.0, "swing_deg": 0.0}
     told: dict[str, Any] = {
         "out": "out.0002.exr",
@@ -393,19 +393,19 @@ GREY = "taken for relative depth, larger is nearer (else --relative-kind depth),
 )
 def test_the_first_command_needs_no_option(run: Run, low: int, high: int, sample: str, noted: str) -> None:
     """A subject in front of a slope: it is sharp, and the rest is blurred by 2 % of the width."""
-    size = (60, 90)
+    size = (80, 120)
     image = torch.rand(1, 3, *size, generator=torch.Generator().manual_seed(3))
     write_image("photo.png", Picture(image, sample="8", transfer="srgb"))
     far, near = (high, low) if "millimetres" in noted else (low, high)
     values = np.repeat(np.linspace(far, (far + near) / 2, size[0])[:, None], size[1], 1)
-    values[15:, 30:60] = near
+    values[20:, 40:80] = near
     store("depth.png", values.astype(sample)[..., None], sample, ("Y",))
     line, note = guessed("render photo.png depth.png -o out.png")
     assert note.count("\n") == 1 and note.startswith(f"note: depth.png: {noted}")
-    assert "blur radius up to 1.8 px" in line and "f-number for a blur of 2% of the width" in line
+    assert "blur radius up to 2.4 px" in line and "f-number for a blur of 2% of the width" in line
     assert "focus on what is nearest the middle" in line
     before, after = pixels("photo.png"), pixels("out.png")
-    torch.testing.assert_close(after[..., 35:, 38:52], before[..., 35:, 38:52], rtol=0, atol=0.01)
+    torch.testing.assert_close(after[..., 45:, 50:70], before[..., 45:, 50:70], rtol=0, atol=0.01)
     assert float((after - before)[..., :12, :].abs().mean()) > 0.05
 
 
@@ -425,3 +425,51 @@ def test_a_lens_in_the_file_blurs_a_first_picture_where_that_is_seen(image: Tens
         tags = {"Exif:FocalLength": 85.0, "FNumber": f_number, "Exif:FocalLengthIn35mmFilm": 85.0}
         write_image("photo.exr", Picture(image, metadata={name: ("float", value) for name, value in tags.items()}))
         assert words in run("render photo.exr depth.npy -o out.exr")
+
+
+# How much blur
+
+
+def test_blur_is_a_share_of_the_width_for_what_is_blurred_most(depth: Tensor, run: Run) -> None:
+    for focus in ("--focus-m 2", "--focus-m 5", "--focus-at 21,5"):
+        for lens in ("", " --focal-length-mm 85", " --fov-deg 40"):
+            line = run(f"render image.exr depth.npy -o out.exr {focus}{lens} --blur 10%")
+            assert "blur radius up to 2.4 px" in line and "f-number" not in line
+    f_number = float(re.search(r"f/([\d.]+)", run(f"{ONE} --blur 10%")).group(1))  # type: ignore[union-attr]
+    expected = torchdof.Camera(50.0, f_number, 2.0)
+    assert float(expected.coc_px(depth, 24).max()) == pytest.approx(2.4, rel=0.01)
+
+
+@pytest.mark.parametrize(("size", "sensor_mm"), [((16, 24), 36.0), ((24, 16), 24.0)])
+def test_an_equivalent_lens_is_that_of_full_frame_however_the_picture_is_held(
+    run: Run, size: tuple[int, int], sensor_mm: float
+) -> None:
+    tags = {"Exif:FocalLength": 5.7, "FNumber": 1.8, "Exif:FocalLengthIn35mmFilm": 26.0}
+    image, depth = torch.rand(1, 3, *size), torch.full((1, 1, *size), 6.0)
+    depth[..., : size[0] // 2, :] = 1.5
+    write_image("phone.exr", Picture(image, sample="float", metadata={n: ("float", v) for n, v in tags.items()}))
+    np.save("metres.npy", depth.numpy())
+    camera = torchdof.Camera(85.0, 1.4, 1.5, sensor_mm)
+    for said in ("85mm,1.4", "85,1.4", "85mm,f/1.4"):
+        line = run(f"render phone.exr metres.npy -o out.exr --bits float --focus-m 1.5 --equivalent {said}")
+        assert f"f/1.4, 85 mm on {sensor_mm:g} mm" in line and "[" not in line
+    expected = torchdof.depth_of_field(image, depth, camera)
+    torch.testing.assert_close(pixels("out.exr"), expected, rtol=0, atol=1e-6)
+    line = run("render phone.exr metres.npy -o out.exr --depth-kind relative --relative-kind depth --equivalent 85,1.4")
+    assert "focus 1 m, f/1.4" in line and "depth from 1 to 8 m assumed" in line
+
+
+def test_blur_that_is_hardly_seen_says_what_makes_more_of_it(run: Run) -> None:
+    for options, advice in (
+        ("--f-number 8", "a smaller --f-number, or --blur 2% makes more of it"),
+        ("--blur 2%", "a larger --blur makes more of it"),
+        ("--fov-deg 40 --aperture-radius-m 0.001", "a larger --aperture-radius-m, or --blur 2%"),
+        ("--equivalent 35mm,8", "a smaller --equivalent f-number, or --blur 2%"),
+        ("--focus-range 1,9", "nothing is blurred, for all depth is in focus"),
+    ):
+        focus = "" if "range" in options else "--focus-m 2"
+        note = guessed(f"render image.exr depth.npy -o out.exr {focus} {options}")[1]
+        assert note.startswith("note: out.exr: ") and advice in note and note.count("\n") == 1
+    note = guessed(f"{SEQUENCE} --focus-m 2 --f-number 8")[1]
+    assert note.count("\n") == 1 and "a smaller --f-number makes more of it" in note
+    assert guessed(f"{ONE} {LENS}")[1] == ""

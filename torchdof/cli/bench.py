@@ -152,7 +152,7 @@ class Bench:
 
         frame = read_frame(image, self.depth, self.scene)
         coc_px, camera, remarks = coc_of(frame, WarnOnce(self.scene.depth_map.strict))
-        if self.scene.lens.has_focus:
-            remarks = ["focus as stated", *remarks]
+        remarks = ["focus as stated"] * self.scene.lens.has_focus + remarks
+        remarks += [f"depth {frame.guess}"] if frame.guess else []
         words = "blur as given" if camera is None else f"{camera!r}; {', '.join(remarks)}"
         return BenchScene(image.name, frame.picture.light, coc_px, words)

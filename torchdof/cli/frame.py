@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Frame", "Rendered", "Renderer", "coc_of", "facts_of_camera", "read_frame"]
 
+_HARDLY_PX = 2.0  # radius of blur below which people think that nothing happened
 _LARGE_PX = 8_000_000  # pixels from which on people ask how long it takes
 _STRIPS = 16
 
@@ -58,7 +59,10 @@ class Frame:
     @property
     def remarks(self) -> list[str]:
         """What was done to the depth that nobody asked for."""
-        return [f"depth stretched by {self.stretch:.1%}"] if self.stretch else []
+        said, remarks = self.scene.depth_map, [f"depth stretched by {self.stretch:.1%}"] if self.stretch else []
+        if said.depth_kind == "relative" and None in (said.near_m, said.far_m):
+            remarks.append("depth from {:g} to {:g} m assumed".format(*said.ends_m))
+        return remarks
 
 
 def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = False, **encoding: Any) -> Frame:
@@ -110,10 +114,12 @@ def _metres(values: Tensor, name: str, picture: Picture, scene: Scene) -> tuple[
     return (metres if kind == "coc" else at_size_of(pixels, metres)), stretched
 
 
-def coc_of(frame: Frame, warned: WarnOnce, number: int | None = None) -> tuple[Tensor, Camera | None, list[str]]:
+def coc_of(
+    frame: Frame, warned: WarnOnce, number: int = 0, is_still: bool = True
+) -> tuple[Tensor, Camera | None, list[str]]:
     """Signed radius ``[1, 1, H, W]`` in pixels; the camera, None for ``--depth-kind coc``; remarks as it has them.
 
-    The number is that of a frame of a sequence.
+    The number is that of the frame, for focus that moves.
 
     Raises:
         ValueError: If the lens makes no sense, or something looks like a mistake and ``warned`` is strict.
@@ -122,7 +128,7 @@ def coc_of(frame: Frame, warned: WarnOnce, number: int | None = None) -> tuple[T
     if said.depth_kind == "coc":
         warned.warn(frame.name, coc_mistakes(values))
         return values, None, []
-    camera, remarks = lens.camera(frame.picture.metadata, values, number, said.is_to_scale)
+    camera, remarks = lens.camera(frame.picture.metadata, values, number, is_still, said.is_to_scale)
     remarks += frame.remarks
     coc_px = camera.coc_px(values, values.shape[-1])
     coc_of_lens(coc_px, values, lens.stated(camera))
@@ -150,8 +156,9 @@ class Rendered:
 class Renderer:
     """What ``torchdof render`` does with each frame: reads, renders and writes it."""
 
-    def __init__(self, command: "Render", scene: Scene) -> None:
-        self.command, self.scene, self.table = command, scene, command.blur.chosen()
+    def __init__(self, command: "Render", scene: Scene, is_still: bool = True) -> None:
+        self.command, self.scene, self.is_still = command, scene, is_still
+        self.table, self._is_hardly_blurred = command.blur.chosen(), False
         self.device, self.warned = pick_device(command.device), WarnOnce(command.scene.depth_map.strict)
 
     def read(self, image: Path, depth: Path | None, out: Path) -> Frame:
@@ -160,11 +167,11 @@ class Renderer:
         files = self.command.files
         return read_frame(image, depth, self.scene, transfer=files.transfer, layer=files.layer)
 
-    def render(self, frame: Frame, out: Path, number: int | None = None, bar: Bar | None = None) -> Rendered:
+    def render(self, frame: Frame, out: Path, number: int = 0, bar: Bar | None = None) -> Rendered:
         """The picture of a frame; the bar is told how long a large one takes. Raises as :func:`coc_of`."""
         start, picture, command = time.perf_counter(), frame.picture, self.command
         frame = dataclasses.replace(frame, values=frame.values.to(self.device))
-        coc_px, camera, remarks = coc_of(frame, self.warned, number)
+        coc_px, camera, remarks = coc_of(frame, self.warned, number, self.is_still)
         pixels = picture.pixels.to(self.device)
         if command.show_focus:
             pixels = tint_focus(pixels, coc_px, picture.has_alpha)
@@ -181,10 +188,13 @@ class Renderer:
                 if bar is not None and bar.is_seen and coc_px.numel() > _LARGE_PX:
                     bar.update(f"rendering {out.name}, about {_seconds(blur, pixels, coc_px):.0f} s")
                 pixels = blur(pixels, coc_px, attention=command.attention)
-        words, facts = self._told(camera, float(coc_px.abs().max()), frame)
+        largest_px, notes = float(coc_px.abs().max()), [f"{frame.name}: {frame.guess}"] if frame.guess else []
+        if camera is not None and largest_px < _HARDLY_PX and not self._is_hardly_blurred:
+            self._is_hardly_blurred = True
+            notes.append(f"{out}: {command.scene.lens.more_blur(largest_px, self.is_still)}")
+        words, facts = self._told(camera, largest_px, frame)
         facts |= {"assumed": remarks, "width": pixels.shape[-1], "height": pixels.shape[-2]}
         seconds = frame.seconds + time.perf_counter() - start
-        notes = [f"{frame.name}: {frame.guess}"] if frame.guess else []
         return Rendered(out, dataclasses.replace(picture, pixels=pixels), notes, words, facts, seconds)
 
     def write(self, rendered: Rendered) -> None:

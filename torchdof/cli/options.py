@@ -36,6 +36,21 @@ _WHOLE_NUMBERS = (".png", ".jpg", ".jpeg", ".webp")
 _OF_RENDERERS = (".exr", ".tif", ".tiff")  # whose floating point numbers are distances
 
 
+def _share(text: str) -> float:
+    """Reads a share of the width, in per cent."""
+    expected = "--blur expects a share of the picture's width, above 0 and at most 50 %, such as 2%"
+    share = numbers(1, expected)(text.removesuffix("%"))[0] / 100
+    if not (text.endswith("%") and 0 < share <= 0.5):
+        raise ValueError(f"{expected}, got {text!r}")
+    return share
+
+
+def _equivalent(text: str) -> tuple[float, ...]:
+    """Reads a focal length in mm and an f-number."""
+    expected = "--equivalent expects a focal length and an f-number such as 85mm,1.4"
+    return numbers(2, expected)(re.sub(r"mm(?=,)|(?<=,)f/", "", text))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
     """Focus and lens."""
@@ -71,6 +86,20 @@ class Lens(Sensor):
     tilt: float = option("Degrees by which the lens is tilted down: focus comes nearer towards the bottom.", 0.0)
     swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)
     f_number: float | None = option("Smaller is blurrier.", basic=True)
+    blur_share: float | None = option(
+        "Open the lens until what is blurred most, the nearest or the farthest, has a blur radius of this share of the "
+        "picture's width, such as 2%; instead of --f-number.",
+        names=("--blur",),
+        metavar="SHARE%",
+        read=_share,
+        basic=True,
+    )
+    equivalent: tuple[float, float] | None = option(
+        "Full-frame lens that the picture is taken to be from: focal length and f-number, such as 85mm,1.4.",
+        metavar="MM,F",
+        read=_equivalent,
+        basic=True,
+    )
     aperture_radius_m: float | None = option("Radius of the opening, with --fov-deg.")
 
     def __post_init__(self) -> None:
@@ -78,21 +107,46 @@ class Lens(Sensor):
         given = [name for name, place in places.items() if place is not None]
         if len(given) > 1:
             raise ValueError(f"{' and '.join(given)} both say where to focus; give one of them")
-        if self.fov_deg is None:
-            if self.aperture_radius_m is not None:
-                raise ValueError("--aperture-radius-m goes with --fov-deg; a real lens has --f-number instead")
-            return
-        if self.focal_length_mm is not None or self.sensor_width_mm is not None:
-            raise ValueError("--fov-deg and --focal-length-mm with --sensor-width-mm say the same; give one of them")
-        if not 0 < self.fov_deg < 180:
+        lens: dict[str, Any] = {"--fov-deg": self.fov_deg, "--focal-length-mm": self.focal_length_mm}
+        lens |= {"--sensor-width-mm": self.sensor_width_mm, "--equivalent": self.equivalent}
+        for name in ("--fov-deg", "--equivalent"):
+            others = [other for other, value in lens.items() if value is not None and other != name]
+            if lens[name] is not None and others:
+                raise ValueError(f"{name} and {' with '.join(others)} say the same; give one of them")
+        opening = [name for name, value in self._openings.items() if value is not None]
+        if self.fov_deg is None and self.aperture_radius_m is not None:
+            raise ValueError("--aperture-radius-m goes with --fov-deg; a real lens has --f-number instead")
+        if len(opening) > 1:
+            raise ValueError(f"{' and '.join(opening)} both say how wide the lens opens; give one of them")
+        if self.fov_deg is not None and not 0 < self.fov_deg < 180:
             raise ValueError(f"--fov-deg must be a number of degrees > 0 and < 180, got {self.fov_deg:g}")
-        if self.f_number is not None and self.aperture_radius_m is not None:
-            raise ValueError("--f-number and --aperture-radius-m both say how wide the lens opens; give one of them")
+
+    @property
+    def _openings(self) -> dict[str, Any]:
+        """Each option that says how wide the lens opens, and what it says."""
+        names = {"--f-number": "f_number", "--aperture-radius-m": "aperture_radius_m"}
+        names |= {"--equivalent": "equivalent", "--blur": "blur_share"}
+        return {option: getattr(self, name) for option, name in names.items()}
 
     @property
     def has_focus(self) -> bool:
         """Whether the user said where to focus."""
         return (self.focus_m, self.focus_at, self.focus_range) != (None, None, None)
+
+    def refuse_share(self) -> None:
+        """Refuse blur as a share of the width, for a sequence, whose depth changes."""
+        if self.blur_share is not None:
+            raise ValueError("--blur would open the lens anew in each frame of a sequence; give --f-number")
+
+    def more_blur(self, largest_px: float, is_still: bool) -> str:
+        """What to do about blur that is too small to be seen."""
+        if largest_px == 0:
+            return "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
+        wider = "a larger --aperture-radius-m" if self.aperture_radius_m is not None else "a smaller --f-number"
+        wider = "a smaller --equivalent f-number" if self.equivalent is not None else wider
+        wider = "a larger --blur" if self.blur_share is not None else wider
+        more = f", or --blur {_BLUR:.0%}" if is_still and self.blur_share is None else ""
+        return f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; {wider}{more} makes more of it"
 
     @property
     def speaks_of_metres(self) -> bool:
@@ -116,40 +170,44 @@ class Lens(Sensor):
     def _known(self, metadata: Mapping[str, Any], width: int, height: int) -> dict[str, float]:
         """Numbers of the camera that the user or else the file states."""
         stated = {name: value for name in _ASSUMED if (value := getattr(self, name)) is not None}
+        if self.equivalent is not None:
+            lens = (*self.equivalent, 36.0 * width / max(width, height))
+            stated = dict(zip(_ASSUMED, lens, strict=True))
         return camera_facts(metadata, width, height) | stated
 
     def camera(
-        self, metadata: Mapping[str, Any], depth: "Tensor", frame: int | None = None, is_to_scale: bool = True
+        self,
+        metadata: Mapping[str, Any],
+        depth: "Tensor",
+        frame: int = 0,
+        is_still: bool = True,
+        is_to_scale: bool = True,
     ) -> "tuple[Camera, list[str]]":
         """The camera of one picture, and remarks on what the user did not state: the file does, or it is assumed.
 
-        A single picture is focused on its subject, and blurred so that it is seen, where nothing says otherwise; a
-        frame of a sequence, which has a number, is not, for both would change from frame to frame. Distances that are
-        not to scale have nothing to do with the file's own. Refuses numbers that make no lens, by the names of the
-        options.
+        A still is focused on its subject, and blurred so that it is seen, where nothing says otherwise; a frame of a
+        sequence is not, for both would change from frame to frame. Distances that are not to scale have nothing to do
+        with the file's own. Refuses numbers that make no lens, by the names of the options.
         """
         from ..optics.camera import Camera
 
         height, width = depth.shape[-2:]
         known, remarks, focus_m = self._known(metadata, width, height), list[str](), math.inf
         if self.focus_m is not None:
-            focus_m = focus_at_frame(self.focus_m, frame or 0)
+            focus_m = focus_at_frame(self.focus_m, frame)
         elif not self.has_focus and is_to_scale and "focus_m" in known:
             focus_m = known["focus_m"]
             remarks.append("focus from the file")
-        elif not self.has_focus and frame is not None:
+        elif not self.has_focus and not is_still:
             raise ValueError("where is the focus? give --focus-m METRES or --focus-at X,Y (the file does not say)")
         elif not self.has_focus:
             from ..depth.guess import subject_m
 
             focus_m = subject_m(depth)
             remarks.append("focus on what is nearest the middle")
-        if self.fov_deg is None:
-            for name in (name for name in _ASSUMED if getattr(self, name) is None):
-                words = "f-number" if name == "f_number" else name.rsplit("_", 1)[0].replace("_", " ")
-                remarks.append(f"{words} {'from the file' if name in known else 'assumed'}")
-        elif self.aperture_radius_m is None and self.f_number is None:
-            raise ValueError("--fov-deg needs the opening of the lens: either --aperture-radius-m or --f-number")
+        is_open = any(value is not None for value in self._openings.values())
+        if self.fov_deg is not None and not is_open:
+            raise ValueError("--fov-deg needs the opening of the lens: --aperture-radius-m, --f-number or --blur")
         with _by_option(self._names()):
             if self.fov_deg is None:
                 lens: dict[str, Any] = {name: known.get(name, assumed) for name, assumed in _ASSUMED.items()}
@@ -157,18 +215,29 @@ class Lens(Sensor):
             else:
                 radius_m = self.aperture_radius_m
                 if radius_m is None:  # on the equivalent sensor, 36 mm wide
-                    radius_m = 18.0 / math.tan(math.radians(self.fov_deg) / 2) / (2000.0 * (self.f_number or math.nan))
+                    f_number = 1.0 if self.f_number is None else self.f_number or math.nan
+                    radius_m = 18.0 / math.tan(math.radians(self.fov_deg) / 2) / (2000.0 * f_number)
                 camera = Camera.from_fov(self.fov_deg, radius_m, focus_m)
             camera = camera.replace(focus_range_m=self.focus_range, tilt_deg=self.tilt, swing_deg=self.swing)
         camera = camera if self.focus_at is None else camera.focus_at(depth, *self.focus_at)
-        if frame is None and (self == Lens() or not (is_to_scale or self.f_number or self.fov_deg)):
-            largest_px = largest_coc_px(camera, depth)
-            is_known = is_to_scale and "f_number" in known and largest_px >= _SEEN * width
-            if largest_px > 0 and not is_known:
-                camera = camera.replace(f_number=camera.f_number * largest_px / (_BLUR * width))
-                remarks = [remark for remark in remarks if not remark.startswith("f-number")]
-                remarks.append(f"f-number for a blur of {_BLUR:.0%} of the width")
+        largest_px, share = self._largest_coc_px(camera, depth), self.blur_share
+        if is_still and not is_open and (self == Lens() or not is_to_scale):
+            is_seen = is_to_scale and "f_number" in known and largest_px >= _SEEN * width
+            share = None if is_seen else _BLUR
+        if share is not None and largest_px > 0:
+            camera = camera.replace(f_number=camera.f_number * largest_px / (share * width))
+        for name in _ASSUMED if self.fov_deg is None and self.equivalent is None else ():
+            words = "f-number" if name == "f_number" else name.rsplit("_", 1)[0].replace("_", " ")
+            if name == "f_number" and share is not None:
+                remarks += [] if is_open else [f"{words} for a blur of {share:.0%} of the width"]
+            elif getattr(self, name) is None:
+                remarks.append(f"{words} {'from the file' if name in known else 'assumed'}")
         return camera, remarks
+
+    def _largest_coc_px(self, camera: "Camera", depth: "Tensor") -> float:
+        """The largest blur radius in pixels of what has a depth, at all keyframes of the focus."""
+        cameras = [camera.replace(focus_m=metres) for _, metres in self.focus_m or []] or [camera]
+        return max(float(each.coc_px(depth, depth.shape[-1]).abs().nan_to_num(0.0).max()) for each in cameras)
 
     def stated(self, camera: "Camera") -> dict[str, Any]:
         """The numbers of a camera by the options, or the file, that they are from."""
@@ -177,8 +246,8 @@ class Lens(Sensor):
         names = self._names()
         if self.fov_deg is None:
             return {names[name]: getattr(camera, name) for name in CAMERA_NUMBERS}
-        opening = "aperture_radius_m" if self.f_number is None else "f_number"
-        return {"--fov-deg": self.fov_deg, names[opening]: getattr(self, opening), names["focus_m"]: camera.focus_m}
+        opening = next((option, value) for option, value in self._openings.items() if value is not None)
+        return {"--fov-deg": self.fov_deg, **dict([opening]), names["focus_m"]: camera.focus_m}
 
     def _names(self) -> dict[str, str]:
         """What the user knows a number of the camera as: the option that states it, or the file's own."""
@@ -186,9 +255,10 @@ class Lens(Sensor):
         given = {name: getattr(self, name) is not None for name in (*_ASSUMED, "aperture_radius_m")}
         spelled = {name: f"--{name.replace('_', '-')}" for name in given} | {"focus_m": focus}
         given["focus_m"] = self.has_focus
-        return _SPELLED | {
-            name: spelled[name] + ("" if is_given else " (not given)") for name, is_given in given.items()
-        }
+        names = {name: spelled[name] + ("" if is_given else " (not given)") for name, is_given in given.items()}
+        if self.equivalent is not None:
+            names |= dict.fromkeys(_ASSUMED, "--equivalent")
+        return _SPELLED | names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -387,12 +457,6 @@ def edges_option(default: str) -> Any:
 def json_option() -> Any:
     """The option of all commands for programs."""
     return option("Print what is printed as JSON, for programs: one object a line.", False, names=("--json",))
-
-
-def largest_coc_px(camera: "Camera", depth: "Tensor") -> float:
-    """The largest blur radius in pixels of what has a depth."""
-    coc_px = camera.coc_px(depth, depth.shape[-1]).abs()
-    return float(coc_px.nan_to_num(0.0).max())
 
 
 @contextlib.contextmanager

@@ -148,12 +148,13 @@ class Render:
         if len(todo) < len(numbers):
             there = [target.name(n) for n in numbers if n not in set(todo)]
             self._tell_of_those_there(there, f"{len(there)} of {len(numbers)} frames are there already")
+        self.scene.lens.refuse_share()
         if self.files.steady and said.depth_kind == "coc":
             raise ValueError("--steady filters depth in metres; --depth-kind coc has none")
         from ..depth.sanity import Mistake
         from .frame import Renderer
 
-        renderer = Renderer(self, dataclasses.replace(self.scene, depth_map=said))
+        renderer = Renderer(self, dataclasses.replace(self.scene, depth_map=said), is_still=False)
         if said.depth_kind == "relative" and said.value_range is None and len(numbers) > 1:
             renderer.warned.warn(self.depth or self.image, [Mistake("range", _EACH_ITS_OWN)])
 

@@ -39,8 +39,9 @@ class Mistake:
 
     Args:
         name: "focus": nothing is in focus, or the focus is far from all depth; "far": everything is so far that nothing
-            is blurred; "bits": whole numbers as files of 8 bits hold; "blur": blur that no lens makes; "lens": a focal
-            length that none has; "range": relative depth of a sequence without the range of its values.
+            is blurred; "bits": numbers as of relative depth, whole ones of 8 bits or such from 0 to 1; "blur": blur
+            that no lens makes; "lens": a focal length that none has; "range": relative depth of a sequence without the
+            range of its values.
         message: What is the case, the likely mistake and what mends it.
     """
 
@@ -166,12 +167,10 @@ def _mistakes(
         told = _out_of_focus(near, far, extent, focus_m, of_bits, factor, kind, scale)
         return [Mistake("focus", told if is_sharp else f"nothing is in focus: {told}")]
     found = []
-    if of_bits and far <= 255 and far - near >= 64:
-        found.append(
-            Mistake(
-                "bits", f"all depth is whole numbers {extent}, as files of 8 bits hold; if it is relative, {_RELATIVE}"
-            )
-        )
+    is_of_bits, is_of_shares = of_bits and far <= 255 and far - near >= 64, 0.9 < far <= 1.0 and near < 0.05
+    if kind != "relative" and (is_of_bits or is_of_shares):
+        told = f"whole numbers {extent}, as files of 8 bits hold" if is_of_bits else f"between 0 and 1 {extent}"
+        found.append(Mistake("bits", f"all depth is {told}; if it is relative, {_RELATIVE}"))
     elif _share_at(finite, 0.05) > _FAR_M and largest <= sharp_px and (of_bits or focus_m < math.inf):
         unit = _advice(0.001, scale)
         message = f"all depth is far {extent}, and nothing is blurred; is it {unit}? The focus too is in metres"
