@@ -34,7 +34,10 @@ image.exr depth.npy --focus-m 2 -o depth.npy/out.exr  | its folder cannot be mad
 image.exr depth.npy --focus-m 2 -o out.gif            | cannot write files of type '.gif'
 shot.####.exr depth.npy -o o.#.exr                    | where is the focus? give --focus-m METRES or --focus-at X,Y
 image.exr depth.npy --focus-m near                    | --focus-m expects metres (2.0) or keyframes
-image.exr depth.npy --focus-m 1:2,5:3                 | --focus-m has keyframes but IMAGE is a single image
+image.exr depth.npy --focus-m 1:2,5:3                 | out.exr: expected one place for the frame number
+image.exr depth.npy --focus-m 1:2,5:3 -o o.#.exr --sheet s.png | --sheet is of one picture
+shot.####.exr depth.npy --focus-m 2 -o o.#.exr --sheet s.png | --sheet is of one picture
+image.exr depth.npy --focus-m 2 -o o.##.exr           | image.exr: is a single image
 image.exr depth.npy --focus-m 0.01                    | --focus-m must be longer than the focal length
 image.exr depth.npy --focus-at 3                      | --focus-at expects a pixel X,Y such as 320,200, got '3'
 image.exr depth.npy --focus-at 99,5                   | focus point (99.0, 5.0) must lie in the frame of 24 x 16

@@ -473,3 +473,45 @@ def test_blur_that_is_hardly_seen_says_what_makes_more_of_it(run: Run) -> None:
     note = guessed(f"{SEQUENCE} --focus-m 2 --f-number 8")[1]
     assert note.count("\n") == 1 and "a smaller --f-number makes more of it" in note
     assert guessed(f"{ONE} {LENS}")[1] == ""
+
+
+# More than one picture of a still
+
+
+def test_a_sheet_shows_before_depth_and_after(image: Tensor, depth: Tensor, run: Run) -> None:
+    large = {"mode": "bilinear", "size": (160, 240)}
+    image = torch.nn.functional.interpolate(image, **large)  # type: ignore[arg-type]
+    write_image("photo.png", Picture(image, sample="8", transfer="srgb"))
+    np.save("metres.npy", torch.nn.functional.interpolate(depth, (160, 240)).numpy())
+    line = run("render photo.png metres.npy -o out.png --focus-m 2 --blur 2% --sheet look/sheet.png")
+    assert "sheet look/sheet.png" in line
+    sheet = pixels("look/sheet.png")
+    assert sheet.shape[-1] == 3 * 240 + 4 * 8
+    before, middle, after = (sheet[..., 34:194, 8 + k * 248 : 248 + k * 248] for k in range(3))
+    torch.testing.assert_close(before, pixels("photo.png"), rtol=0, atol=0.01)
+    torch.testing.assert_close(after, pixels("out.png"), rtol=0, atol=0.01)
+    assert float(middle[..., :118].min()) > 0.99 and float(middle[..., 122:].max()) < 0.01
+    coc_px = np.tile(np.repeat([-4.0, 4.0], 120), (160, 1))
+    np.save("coc.npy", coc_px)
+    run("render photo.png coc.npy -o out.png --depth-kind coc --sheet sheet.png")
+    colours = pixels("sheet.png")[0, :, 100, 256:496]
+    assert colours[:, :120].argmax(0).eq(0).all() and colours[:, 120:].argmax(0).eq(2).all()
+
+
+def test_a_still_whose_focus_moves_is_a_file_a_frame_with_one_opening(image: Tensor, depth: Tensor, run: Run) -> None:
+    line = f"render image.exr depth.npy -o pull.##.exr --focus-m 2:2,4:6 {LENS}"
+    told = run(line).splitlines()
+    assert [part.partition(" m,")[0] for part in told] == [
+        f"pull.0{n}.exr: focus {m}" for n, m in ((2, 2), (3, 3), (4, 6))
+    ]
+    for n, focus_m in ((2, 2.0), (3, 3.0), (4, 6.0)):
+        expected = torchdof.depth_of_field(image, depth, CAMERA.replace(focus_m=focus_m))
+        torch.testing.assert_close(pixels(f"pull.{n:02d}.exr"), expected, rtol=0, atol=1e-5)
+    Path("pull.03.exr").unlink()
+    assert run(f"{line} --resume").splitlines()[0] == "2 of 3 frames are there already"
+    assert len(run(f"{line} --frames 3-4").splitlines()) == 2
+    told = run("render image.exr depth.npy -o pull.##.exr --focus-m 1:2,3:6 --blur 10%").splitlines()
+    assert len({re.search(r"f/[\d.]+", part).group() for part in told}) == 1  # type: ignore[union-attr]
+    radii = [float(re.search(r"up to ([\d.]+) px", part).group(1)) for part in told]  # type: ignore[union-attr]
+    assert max(radii) == 2.4 and radii[1] < 2.4
+    assert guessed("render image.exr depth.npy -o pull.##.exr --focus-m 1:2,3:6 --f-number 9")[1].count("note:") == 1

@@ -12,12 +12,13 @@ import torch
 from torch import Tensor
 
 from ..depth.holes import resolve_holes
-from ..depth.inspect import tint_focus
+from ..depth.inspect import coc_colours, depth_colours, tint_focus
 from ..depth.kinds import depth_from_values
 from ..depth.relative import from_relative
 from ..depth.sanity import Mistake, coc_mistakes, depth_mistakes
 from ..io.highlights import expand_highlights
 from ..io.images import Picture, read_image, read_values, write_image
+from ..io.sheet import shrunk, write_sheet
 from ..module import blur_by_coc
 from ..optics.blur_table import BlurTable
 from ..optics.camera import CAMERA_NUMBERS, Camera
@@ -35,6 +36,7 @@ __all__ = ["Frame", "Rendered", "Renderer", "coc_of", "facts_of_camera", "read_f
 _HARDLY_PX = 2.0  # radius of blur below which people think that nothing happened
 _LARGE_PX = 8_000_000  # pixels from which on people ask how long it takes
 _STRIPS = 16
+_PANEL_PX = 800  # of the longer side of a panel
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,7 +149,8 @@ class Rendered:
 
     out: Path
     picture: Picture
-    notes: list[str]
+    panels: dict[str, Tensor]  # of a sheet, by their captions
+    notes: dict[str, str]  # what was taken for granted, each told once
     words: list[str]
     facts: dict[str, Any]
     seconds: float
@@ -158,7 +161,7 @@ class Renderer:
 
     def __init__(self, command: "Render", scene: Scene, is_still: bool = True) -> None:
         self.command, self.scene, self.is_still = command, scene, is_still
-        self.table, self._is_hardly_blurred = command.blur.chosen(), False
+        self.table, self._noted = command.blur.chosen(), set[str]()
         self.device, self.warned = pick_device(command.device), WarnOnce(command.scene.depth_map.strict)
 
     def read(self, image: Path, depth: Path | None, out: Path) -> Frame:
@@ -188,26 +191,34 @@ class Renderer:
                 if bar is not None and bar.is_seen and coc_px.numel() > _LARGE_PX:
                     bar.update(f"rendering {out.name}, about {_seconds(blur, pixels, coc_px):.0f} s")
                 pixels = blur(pixels, coc_px, attention=command.attention)
-        largest_px, notes = float(coc_px.abs().max()), [f"{frame.name}: {frame.guess}"] if frame.guess else []
-        if camera is not None and largest_px < _HARDLY_PX and not self._is_hardly_blurred:
-            self._is_hardly_blurred = True
-            notes.append(f"{out}: {command.scene.lens.more_blur(largest_px, self.is_still)}")
+        largest_px, notes = float(coc_px.abs().max()), dict[str, str]()
+        if frame.guess:
+            notes["guess"] = f"{frame.name}: {frame.guess}"
+        if camera is not None and largest_px < _HARDLY_PX:
+            notes["blur"] = f"{out}: {command.scene.lens.more_blur(largest_px, self.is_still)}"
         words, facts = self._told(camera, largest_px, frame)
         facts |= {"assumed": remarks, "width": pixels.shape[-1], "height": pixels.shape[-2]}
         seconds = frame.seconds + time.perf_counter() - start
-        return Rendered(out, dataclasses.replace(picture, pixels=pixels), notes, words, facts, seconds)
+        picture = dataclasses.replace(picture, pixels=pixels)
+        panels = _panels(frame, coc_px, picture) if command.files.sheet else {}
+        return Rendered(out, picture, panels, notes, words, facts, seconds)
 
     def write(self, rendered: Rendered) -> None:
-        """Writes the picture, whole or not at all, and prints one line."""
-        start, files, out = time.perf_counter(), self.command.files, str(rendered.out)
+        """Writes the picture, whole or not at all, and its sheet, and prints one line."""
+        start, files = time.perf_counter(), self.command.files
         make_folder_of(rendered.out)
         write_image(rendered.out, rendered.picture, files.out_transfer, files.bits)
+        if rendered.panels and files.sheet is not None:
+            make_folder_of(files.sheet)
+            write_sheet(files.sheet, rendered.panels)
+            rendered.words.append(f"sheet {files.sheet}")
         seconds = rendered.seconds + time.perf_counter() - start
-        facts = {"out": out, **rendered.facts, "seconds": seconds}
+        facts = {"out": str(rendered.out), **rendered.facts, "seconds": seconds}
         remarks = f" [{', '.join(facts['assumed'])}]" if facts["assumed"] else ""
-        note(*rendered.notes)
+        note(*(line for name, line in rendered.notes.items() if name not in self._noted))
+        self._noted |= set(rendered.notes)
         words = [*rendered.words, f"{facts['width']} x {facts['height']}", f"{seconds:.2f} s on {facts['device']}"]
-        tell(self.command.as_json, facts, f"{out}: {'; '.join(words)}{remarks}")
+        tell(self.command.as_json, facts, f"{rendered.out}: {'; '.join(words)}{remarks}")
 
     def _told(self, camera: Camera | None, largest_px: float, frame: Frame) -> tuple[list[str], dict[str, Any]]:
         """What was done to a frame, for people and for programs."""
@@ -237,6 +248,15 @@ class Renderer:
             words += [f"lights up to {command.lights:g} stops above white"] if command.lights else []
         words += [f"{frame.holes} px of depth filled ({frame.scene.depth_map.fill_depth})"] if frame.holes else []
         return words, facts
+
+
+def _panels(frame: Frame, coc_px: Tensor, after: Picture) -> dict[str, Tensor]:
+    """Pictures of a sheet, each ``[1, 3, H, W]`` in linear light, by their captions."""
+    middle = {"depth: near is bright": depth_colours(frame.values)}
+    if frame.scene.depth_map.depth_kind == "coc":
+        middle = {"blur radius: near orange, far blue": coc_colours(coc_px)}
+    panels = {"before": frame.picture.light, **middle, "after": after.light}
+    return {name: shrunk(panel.cpu(), _PANEL_PX).expand(-1, 3, -1, -1) for name, panel in panels.items()}
 
 
 def _seconds(blur: Callable[..., Tensor], pixels: Tensor, coc_px: Tensor) -> float:

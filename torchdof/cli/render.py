@@ -39,6 +39,7 @@ class _Files:
     )
     bits: Literal["8", "16", "half", "float"] | None = option("What OUT stores. Default: as IMAGE, where the type can.")
     layer: str | None = option("Layer or part of an EXR that is the image.")
+    sheet: Path | None = option("Also write the image, its depth and the result side by side to this file.")
     frames: tuple[int, int] | None = option("Part of a sequence.", metavar="FIRST-LAST", read=parse_frames)
     steady: bool = option("Filter depth of a sequence along time, where neither image nor depth moved.", False)
     resume: bool = option("Render only the frames that OUT lacks.", False)
@@ -63,6 +64,10 @@ class Render:
     A sequence, its focus pulled from 2 m to 5.5 m; --resume goes on after an interruption:
 
         torchdof render shot.####.exr -o out.####.exr --focus-m 1:2,48:5.5 --f-number 2 --resume
+
+    A photograph, its focus pulled from 1 m to 5 m in 24 frames:
+
+        torchdof render photo.jpg depth.png -o pull.##.png --focus-m 1:1,24:5
 
     --steady filters depth that flickers along time, where neither image nor depth moved; a part of a sequence, or the
     rest of it with --resume, comes out as the whole would: up to 63 frames before it are read first.
@@ -120,15 +125,21 @@ class Render:
             raise ValueError(f"--lights must be a finite number of stops from 0 on, got {self.lights:g}")
 
     def run(self) -> None:
-        """Renders one image, or the frames of a sequence."""
-        if FramePattern.matches(self.image):
+        """Renders one image, the frames of a sequence, or a still whose focus moves."""
+        is_sequence, moves = FramePattern.matches(self.image), len(self.scene.lens.focus_m or []) > 1
+        if (is_sequence or moves) and self.files.sheet is not None:
+            raise ValueError("--sheet is of one picture; leave it out where there are more")
+        if is_sequence:
             self._render_sequence()
             return
-        sequences = FramePattern.is_padded(self.out) and not FramePattern.is_padded(self.image)
-        sequences = (sequences and FramePattern.matches(self.out)) or self.files.frames is not None or self.files.steady
-        if sequences or (self.depth is not None and FramePattern.matches(self.depth)):
+        has_frames = FramePattern.is_padded(self.out) and not FramePattern.is_padded(self.image)
+        has_frames = (has_frames and FramePattern.matches(self.out)) or self.files.frames is not None
+        is_of_sequence = self.depth is not None and FramePattern.matches(self.depth)
+        if (has_frames and not moves) or self.files.steady or is_of_sequence:
             raise ValueError(f"{self.image}: is a single image; for a sequence write it as shot.####.exr")
-        self.scene.lens.refuse_keyframes()
+        if moves:
+            self._pull_focus(self.scene.lens.focus_m or [])
+            return
         if self.files.resume and self.out.exists():
             self._tell_of_those_there([self.out], f"{self.out}: is there already")
             return
@@ -139,16 +150,31 @@ class Render:
             frame = renderer.read(self.image, self.depth, self.out)
             renderer.write(renderer.render(frame, self.out, bar=bar))
 
-    def _render_sequence(self) -> None:
-        """Renders the frames of a numbered sequence, in order; with ``--resume`` only those that are missing."""
-        source, target, said = FramePattern(self.image), FramePattern(self.out), self.scene.depth_map.of_sequence()
-        depths = FramePattern(self.depth) if self.depth is not None and FramePattern.matches(self.depth) else None
-        numbers = self._numbers(source, depths)
+    def _pull_focus(self, keys: Sequence[tuple[int, float]]) -> None:
+        """Renders a still once for each frame from the first to the last keyframe of the focus."""
+        target, (first, last) = FramePattern(self.out), self.files.frames or (keys[0][0], keys[-1][0])
+        todo = self._missing(target, range(first, last + 1))
+        from .frame import Renderer
+
+        renderer = Renderer(self, self.scene)
+        frame = renderer.read(self.image, self.depth, self.out)
+        self._render_each(renderer, {n: target.name(n) for n in todo}, lambda _: frame)
+
+    def _missing(self, target: FramePattern, numbers: Sequence[int]) -> list[int]:
+        """The numbers of frames to render: all, or with ``--resume`` those that are not there; the others are told."""
         todo = [n for n in numbers if not (self.files.resume and target.name(n).is_file())]
         if len(todo) < len(numbers):
             there = [target.name(n) for n in numbers if n not in set(todo)]
             self._tell_of_those_there(there, f"{len(there)} of {len(numbers)} frames are there already")
+        return todo
+
+    def _render_sequence(self) -> None:
+        """Renders the frames of a numbered sequence, in order; with ``--resume`` only those that are missing."""
+        source, target, said = FramePattern(self.image), FramePattern(self.out), self.scene.depth_map.of_sequence()
+        depths = FramePattern(self.depth) if self.depth is not None and FramePattern.matches(self.depth) else None
         self.scene.lens.refuse_share()
+        numbers = self._numbers(source, depths)
+        todo = self._missing(target, numbers)
         if self.files.steady and said.depth_kind == "coc":
             raise ValueError("--steady filters depth in metres; --depth-kind coc has none")
         from ..depth.sanity import Mistake

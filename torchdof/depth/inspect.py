@@ -12,13 +12,14 @@ from ..optics.camera import Camera
 from ..render.edges import STEP_PX, judged
 from ..validation import image_and_map
 
-__all__ = ["EDGES", "DepthReport", "coc_colours", "inspect_depth", "panels", "tint_focus"]
+__all__ = ["EDGES", "DepthReport", "coc_colours", "depth_colours", "inspect_depth", "panels", "tint_focus"]
 
 EDGES = ("exact", "ramp", "beside", "unclear")
 """Pixels at depth edges, by what rendering does: beside a step that stays where it is; on a ramp that becomes a step;
 of one surface with the depth of the other, which gets its own; on a ramp that stays, for the image shows no edge."""
 
 _NEAR, _SHARP, _FAR = (0.90, 0.35, 0.0), (0.0, 0.62, 0.20), (0.0, 0.30, 0.85)
+_HOLE = (0.6, 0.0, 0.6)
 _FAINT, _CLEAR = 0.2, 0.6  # change of light to the next pixel, of the brighter one: begins to be an outline, and is one
 _DARKEST = 0.05  # of the mean light: what is darker has no outlines of its own
 _BOUNDS_PX = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
@@ -151,6 +152,26 @@ def inspect_depth(image: Tensor, depth: Tensor, camera: Camera) -> DepthReport:
     return DepthReport(depth, coc_px, kinds, (counts[0], counts[1], counts[2], counts[3]))
 
 
+def depth_colours(depth: Tensor) -> Tensor:
+    """A map of depth as a picture: grey, even in 1 / distance, near bright and far dark; holes (NaN) are magenta.
+
+    Args:
+        depth: ``[1, 1, H, W]``, metres.
+
+    Returns:
+        ``[1, 3, H, W]`` in linear light.
+
+    Example:
+        >>> depth_colours(torch.tensor([[[[1.0, 2.0, torch.inf]]]]))[0, 0, 0, [0, 2]].tolist()
+        [1.0, 0.0]
+    """
+    is_hole = depth.isnan()
+    inverse = torch.where(is_hole, 0.0, 1.0 / depth)
+    low, high = inverse[~is_hole].aminmax() if bool((~is_hole).any()) else (inverse.min(), inverse.max())
+    grey = ((inverse - low) / (high - low).clamp(min=1e-12)).clamp(0, 1) ** 2.2
+    return torch.where(is_hole, depth.new_tensor(_HOLE)[:, None, None], grey)
+
+
 def coc_colours(coc_px: Tensor) -> Tensor:
     """A signed map in colour: orange in front of the focus, black in focus, blue behind; linear light.
 
@@ -177,17 +198,14 @@ def panels(image: Tensor, report: DepthReport) -> dict[str, Tensor]:
         report: What was found.
     """
     is_hole = report.depth.isnan()
-    magenta = report.depth.new_tensor([0.6, 0.0, 0.6])[:, None, None]
-    inverse = torch.where(is_hole, 0.0, 1.0 / report.depth)
-    low, high = inverse[~is_hole].aminmax() if bool((~is_hole).any()) else (inverse.min(), inverse.max())
-    grey = ((inverse - low) / (high - low).clamp(min=1e-12)).clamp(0, 1) ** 2.2
+    magenta = report.depth.new_tensor(_HOLE)[:, None, None]
     coc_px = torch.where(is_hole, 0.0, report.coc_px)
     colours = image.new_tensor([[0, 0, 0], [0.0, 0.7, 0.1], [1.0, 0.05, 0.0], [1.0, 0.0, 0.8], [0.05, 0.1, 0.5]])
     marks = colours[report.edges[:, 0].long()].permute(0, 3, 1, 2)  # [1, H, W, 3] -> [1, 3, H, W]
     level = image.mean(1, keepdim=True) / image.mean().clamp(min=1e-12)
     dim = (0.08 * level).clamp(0, 0.3).expand(-1, 3, -1, -1)
     return {
-        "depth: near is bright, holes magenta": torch.where(is_hole, magenta, grey),
+        "depth: near is bright, holes magenta": depth_colours(report.depth),
         f"blur radius {float(coc_px.min()):+.1f} to {float(coc_px.max()):+.1f} px: near orange, far blue": torch.where(
             is_hole, magenta, coc_colours(coc_px)
         ),

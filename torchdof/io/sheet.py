@@ -3,11 +3,27 @@
 import os
 
 import torch
+import torch.nn.functional as functional
 from torch import Tensor
 
 from .images import Picture, write_image
 
-__all__ = ["write_sheet"]
+__all__ = ["shrunk", "write_sheet"]
+
+
+def shrunk(pixels: Tensor, longest: int) -> Tensor:
+    """Pixels ``[1, C, H, W]`` in linear light, smaller if their longer side is longer than so many.
+
+    Example:
+        >>> shrunk(torch.ones(1, 3, 40, 80), 20).shape
+        torch.Size([1, 3, 10, 20])
+    """
+    height, width = pixels.shape[-2:]
+    share = longest / max(height, width)
+    if share >= 1:
+        return pixels
+    size = (max(1, round(share * height)), max(1, round(share * width)))
+    return functional.interpolate(pixels, size, mode="bilinear", antialias=True)
 
 
 def write_sheet(path: str | os.PathLike[str], panels: dict[str, Tensor], margin: int = 8, caption: int = 34) -> None:
