@@ -16,6 +16,7 @@ image.exr --focus-m 2                                 | image.exr: has no depth 
 image.exr small.npy --focus-m 2                       | small.npy: depth is 3 x 4 pixels and the image 24 x 16
 image.exr small.npy --depth-kind coc                  | small.npy: coc is 3 x 4 pixels but the image is 24 x 16
 image.exr holed.npy --focus-m 2                       | holed.npy: 2 pixels (0.5 %) have no depth
+image.exr holed.npy --depth-kind relative --depth-unknown 0 | have no depth (NaN or marked unknown); say how to fill
 image.exr depth.npy --focus-m 2 --layer b             | image.exr: has no layer 'b'
 image.exr depth.####.npy --focus-m 2                  | image.exr: is a single image
 image.exr depth.npy --focus-m 2 --frames 1-2          | image.exr: is a single image
@@ -25,6 +26,8 @@ shot.####.exr none.####.npy --focus-m 2 -o o.#.exr    | none.0001.npy: there is 
 shot.####.exr depth.npy --focus-m 2 -o o.#.exr --frames 2-5 | shot.0004.exr: there is no such file (2 of 4 frames
 none.####.exr depth.npy --focus-m 2 -o o.#.exr        | none.####.exr: there are no such files
 shot.####.exr depth.npy --focus-m 2 -o shot.####.exr  | shot.0001.exr: is one of the inputs
+shot.0002.exr depth.npy --focus-m 1:2,3:4 -o shot.####.exr | shot.0002.exr: is one of the inputs
+image.exr shot.0003.exr --focus-m 1:2,3:4 -o shot.####.exr | shot.0003.exr: is one of the inputs
 shot.####.exr depth.####.npy -o o.#.exr --depth-kind coc --steady | --steady filters depth in metres
 shot.####.exr depth.npy --focus-m 2 -o o.#.exr --frames 5-2   | --frames must not end before it starts
 shot.%099999999d.exr depth.npy --focus-m 2            | must have at most 18 digits

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from .command import argument, option
-from .options import Blur, Scene, json_option
+from .options import Blur, Scene, check_files, json_option
 from .printed import WarnOnce, json_line
 
 if TYPE_CHECKING:
@@ -92,6 +92,8 @@ class Bench:
         if self.image is None and self.scene != Scene():
             raise ValueError("the built-in scene has its own camera and depth; name an IMAGE for these options")
         self.scene.lens.refuse_keyframes()
+        if self.image is not None:
+            check_files(self.image, self.depth, None)
         needed = {"matplotlib": self.out is not None, "onnxruntime": self.speed.onnx}
         for package, is_needed in needed.items():  # before the time is spent
             if is_needed and importlib.util.find_spec(package) is None:

@@ -7,6 +7,7 @@ heads them in ``--help``. Nothing here imports PyTorch, so that help and wrong a
 import contextlib
 import dataclasses
 import inspect
+import math
 import types
 import typing
 from collections.abc import Callable, Iterator
@@ -32,6 +33,7 @@ def option(
     read: Callable[[str], Any] | None = None,
     group: str = "",
     least: int | None = None,
+    positive: bool = False,
     basic: bool = False,
 ) -> Any:
     """A field that is an option of a command.
@@ -44,9 +46,11 @@ def option(
         read: Makes the value of its text; a ``ValueError`` says what was expected.
         group: The heading in the help that it stands under, if not its class's.
         least: The smallest whole number.
+        positive: Whether it must be greater than 0, and finite.
         basic: Whether it stands first in the help, before the groups.
     """
     facts = {"help": help, "names": names, "metavar": metavar, "read": read, "least": least}
+    facts["positive"] = positive
     facts["group"] = "Options" if basic else group
     return dataclasses.field(**({} if default is ... else {"default": default}), metadata=facts)
 
@@ -135,6 +139,8 @@ def _parameter(field: Any, hint: Any) -> click.Parameter:
         given["type"] = click.Choice(typing.get_args(hint))
     else:
         given["type"] = _TYPES[hint] if facts["least"] is None else click.IntRange(min=facts["least"])
+    if facts["positive"]:
+        given["callback"] = _positive
     if not required and field.default not in (None, ()):
         given["default"] = field.default
     if facts["names"] == ("argument",):
@@ -144,6 +150,13 @@ def _parameter(field: Any, hint: Any) -> click.Parameter:
     else:
         given |= {"multiple": several, "show_default": bool(field.default) and not required}
     return click.Option([field.name, *(facts["names"] or (f"--{field.name.replace('_', '-')}",))], **given)
+
+
+def _positive(_: click.Context, parameter: click.Parameter, value: float | None) -> float | None:
+    """A number that is greater than 0 and finite, or none."""
+    if value is not None and not 0 < value < math.inf:
+        raise ValueError(f"{parameter.opts[0]} must be positive and finite, got {value:g}")
+    return value
 
 
 def _made(kind: type[Any], values: dict[str, Any]) -> Any:

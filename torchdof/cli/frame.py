@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor
@@ -25,7 +25,7 @@ from ..optics.camera import CAMERA_NUMBERS, Camera
 from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect, stretch
-from .options import Scene, make_folder_of, pick_device, refuse_input
+from .options import Scene, make_folder_of, pick_device
 from .printed import Bar, WarnOnce, note, tell
 
 if TYPE_CHECKING:
@@ -86,9 +86,9 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
         fill = scene.depth_map.fill_depth if holes else said.fill_depth
         scene = dataclasses.replace(scene, depth_map=dataclasses.replace(said, fill_depth=fill))
     values, stretched = _metres(values, str(source), picture, scene)
-    fill = scene.depth_map.fill_depth
+    said, fill = scene.depth_map, cast(Any, scene.depth_map.fill_depth)
     if fill is not None or not holes:
-        values, filled = resolve_holes(values, str(source), fill)  # type: ignore[arg-type]
+        values, filled = resolve_holes(values, str(source), fill, said.depth_kind == "relative")
     return Frame(str(source), scene, picture, values, filled, time.perf_counter() - start, stretched, guess)
 
 
@@ -164,9 +164,8 @@ class Renderer:
         self.table, self._noted = command.blur.chosen(), set[str]()
         self.device, self.warned = pick_device(command.device), WarnOnce(command.scene.depth_map.strict)
 
-    def read(self, image: Path, depth: Path | None, out: Path) -> Frame:
-        """As :func:`read_frame`, unless the result would take the place of what is read."""
-        refuse_input(out, image, depth)
+    def read(self, image: Path, depth: Path | None) -> Frame:
+        """As :func:`read_frame`, encoded as the command says."""
         files = self.command.files
         return read_frame(image, depth, self.scene, transfer=files.transfer, layer=files.layer)
 

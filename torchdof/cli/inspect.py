@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from .command import argument, option
-from .options import Scene, json_option, make_folder_of, refuse_input
+from .options import Scene, check_files, json_option, make_folder_of
 from .printed import WarnOnce, note, tell
 
 __all__ = ["Inspect"]
@@ -36,7 +36,7 @@ class Inspect:
         if self.scene.depth_map.depth_kind == "coc":
             raise ValueError("--depth-kind coc is the blur itself: there is no depth to inspect")
         target = Path(f"{self.image.stem}.inspect.png") if self.out is None else self.out
-        refuse_input(target, self.image, self.depth)
+        check_files(self.image, self.depth, target)
         from ..depth.inspect import inspect_depth, panels
         from ..io.sheet import write_sheet
         from .frame import facts_of_camera, read_frame

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..io.metadata import camera_facts
+from ..io.paths import existing_image, existing_map, samples_of
 from ..io.sequence import focus_at_frame, parse_focus
 from .command import numbers, option, word_or_number
 
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from ..optics.camera import Camera
 
 __all__ = ["Accuracy", "Blur", "DepthMap", "Lens", "Opening", "Scene", "Sensor"]
-__all__ += ["edges_option", "json_option", "pick_device", "make_folder_of", "refuse_input"]
+__all__ += ["edges_option", "json_option", "pick_device", "make_folder_of", "check_files"]
 
 _ASSUMED = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
 _NEAR_M, _FAR_PER_NEAR = 1.0, 8.0  # of relative depth
@@ -55,8 +56,8 @@ def _equivalent(text: str) -> tuple[float, ...]:
 class Sensor:
     """Focus and lens."""
 
-    focal_length_mm: float | None = option("Real focal length, not the 35 mm equivalent.")
-    sensor_width_mm: float | None = option("36 for full frame.")
+    focal_length_mm: float | None = option("Real focal length, not the 35 mm equivalent.", positive=True)
+    sensor_width_mm: float | None = option("36 for full frame.", positive=True)
     fov_deg: float | None = option("Horizontal field of view of a rendered image, instead of a lens.")
 
 
@@ -85,7 +86,7 @@ class Lens(Sensor):
     )
     tilt: float = option("Degrees by which the lens is tilted down: focus comes nearer towards the bottom.", 0.0)
     swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)
-    f_number: float | None = option("Smaller is blurrier.", basic=True)
+    f_number: float | None = option("Smaller is blurrier.", positive=True, basic=True)
     blur_share: float | None = option(
         "Open the lens until what is blurred most, the nearest or the farthest, has a blur radius of this share of the "
         "picture's width, such as 2%; instead of --f-number.",
@@ -100,7 +101,7 @@ class Lens(Sensor):
         read=_equivalent,
         basic=True,
     )
-    aperture_radius_m: float | None = option("Radius of the opening, with --fov-deg.")
+    aperture_radius_m: float | None = option("Radius of the opening, with --fov-deg.", positive=True)
 
     def __post_init__(self) -> None:
         places = {"--focus-m": self.focus_m, "--focus-at": self.focus_at, "--focus-range": self.focus_range}
@@ -215,8 +216,7 @@ class Lens(Sensor):
             else:
                 radius_m = self.aperture_radius_m
                 if radius_m is None:  # on the equivalent sensor, 36 mm wide
-                    f_number = 1.0 if self.f_number is None else self.f_number or math.nan
-                    radius_m = 18.0 / math.tan(math.radians(self.fov_deg) / 2) / (2000.0 * f_number)
+                    radius_m = 18.0 / math.tan(math.radians(self.fov_deg) / 2) / (2000.0 * (self.f_number or 1.0))
                 camera = Camera.from_fov(self.fov_deg, radius_m, focus_m)
             camera = camera.replace(focus_range_m=self.focus_range, tilt_deg=self.tilt, swing_deg=self.swing)
         camera = camera if self.focus_at is None else camera.focus_at(depth, *self.focus_at)
@@ -481,10 +481,16 @@ def make_folder_of(path: Path) -> None:
         raise OSError(f"{path}: its folder cannot be made ({error.strerror})") from None
 
 
-def refuse_input(out: Path, *sources: Path | None) -> None:
-    """Refuse to write a file in the place of one that is read."""
-    if any(source is not None and os.path.realpath(source) == os.path.realpath(out) for source in sources):
+def check_files(image: Path, depth: Path | None, out: Path | None) -> None:
+    """Refuse, before anything is read, files that are not there, and to write one in the place of one that is read."""
+    existing_image(image)
+    if depth is not None:
+        existing_map(depth)
+    if out is None:
+        return
+    if any(source is not None and os.path.realpath(source) == os.path.realpath(out) for source in (image, depth)):
         raise ValueError(f"{out}: is one of the inputs; write to another file")
+    samples_of(out)
 
 
 def pick_device(name: str) -> "torch.device":

@@ -12,7 +12,7 @@ import click
 
 from ..io.sequence import FramePattern, parse_frames
 from .command import argument, numbers, option
-from .options import Accuracy, Blur, Scene, edges_option, json_option
+from .options import Accuracy, Blur, Scene, check_files, edges_option, json_option
 from .printed import Bar, json_line
 
 if TYPE_CHECKING:
@@ -140,6 +140,7 @@ class Render:
         if moves:
             self._pull_focus(self.scene.lens.focus_m or [])
             return
+        check_files(self.image, self.depth, self.out)
         if self.files.resume and self.out.exists():
             self._tell_of_those_there([self.out], f"{self.out}: is there already")
             return
@@ -147,17 +148,19 @@ class Render:
 
         renderer = Renderer(self, self.scene)
         with Bar(f"rendering {self.out.name}") as bar:
-            frame = renderer.read(self.image, self.depth, self.out)
+            frame = renderer.read(self.image, self.depth)
             renderer.write(renderer.render(frame, self.out, bar=bar))
 
     def _pull_focus(self, keys: Sequence[tuple[int, float]]) -> None:
         """Renders a still once for each frame from the first to the last keyframe of the focus."""
         target, (first, last) = FramePattern(self.out), self.files.frames or (keys[0][0], keys[-1][0])
+        for n in range(first, last + 1):
+            check_files(self.image, self.depth, target.name(n))
         todo = self._missing(target, range(first, last + 1))
         from .frame import Renderer
 
         renderer = Renderer(self, self.scene)
-        frame = renderer.read(self.image, self.depth, self.out)
+        frame = renderer.read(self.image, self.depth)
         self._render_each(renderer, {n: target.name(n) for n in todo}, lambda _: frame)
 
     def _missing(self, target: FramePattern, numbers: Sequence[int]) -> list[int]:
@@ -174,6 +177,8 @@ class Render:
         depths = FramePattern(self.depth) if self.depth is not None and FramePattern.matches(self.depth) else None
         self.scene.lens.refuse_share()
         numbers = self._numbers(source, depths)
+        for n in numbers:
+            check_files(source.name(n), depths.name(n) if depths else self.depth, target.name(n))
         todo = self._missing(target, numbers)
         if self.files.steady and said.depth_kind == "coc":
             raise ValueError("--steady filters depth in metres; --depth-kind coc has none")
@@ -185,7 +190,7 @@ class Render:
             renderer.warned.warn(self.depth or self.image, [Mistake("range", _EACH_ITS_OWN)])
 
         def read(n: int) -> "Frame":
-            return renderer.read(source.name(n), depths.name(n) if depths else self.depth, target.name(n))
+            return renderer.read(source.name(n), depths.name(n) if depths else self.depth)
 
         whole = [n for n in source.frames() if depths is None or depths.name(n).is_file()]
         steadied = _steadied(read, whole) if self.files.steady else read
