@@ -19,6 +19,7 @@ from torch import Tensor
 
 import torchdof
 from torchdof.cli.main import app
+from torchdof.depth.inspect import tint_focus
 from torchdof.io.highlights import expand_highlights
 from torchdof.io.images import Picture, read_image, write_image
 from torchdof.optics.field import Field
@@ -225,23 +226,30 @@ def test_table_of_three_colours_blurs_alpha_like_green(image: Tensor, run: Run, 
     assert not torch.allclose(out[:, 0], out[:, 1], atol=1e-3)
 
 
-def test_show_focus_draws_outlines_by_zone_and_keeps_all_other_colours(run: Run) -> None:
+def test_show_focus_tints_by_zone_and_keeps_light_and_shade(run: Run) -> None:
     colours = torch.tensor([0.3, 0.1, 0.2])[:, None, None].expand(1, 3, 16, 24).clone()
-    colours[..., 8:, :] *= 0.2  # an outline across all three zones
+    colours[..., 8:, :] *= 0.2
     write_image("photo.exr", Picture(colours, sample="float"))
     write_image("grey.png", Picture(torch.full((1, 1, 16, 24), 0.3), ("Y",)))
     np.save("coc.npy", np.tile(np.repeat([-4.0, 0.0, 4.0], 8), (16, 1)))
     line = run("render photo.exr coc.npy -o tint.exr --depth-kind coc --show-focus")
     tinted = pixels("tint.exr")
-    assert tinted[0, :, 7].argmax(dim=0).tolist() == [0] * 8 + [1] * 8 + [2] * 8
-    for columns in (slice(0, 7), slice(9, 15), slice(17, 24)):  # away from where zones meet
-        for rows in (slice(0, 7), slice(9, 16)):  # and from the outline
-            torch.testing.assert_close(tinted[..., rows, columns], colours[..., rows, columns])
+    assert tinted[0].argmax(dim=0).tolist() == [[0] * 8 + [1] * 8 + [2] * 8] * 16
+    assert bool((tinted.amax(1) < 1.5 * colours.amax(1)).all()), "too strong"
+    lit, dark = tinted[..., :8, :].mean((1, 2)), tinted[..., 8:, :].mean((1, 2))
+    assert bool((lit > 3.5 * dark).all())
     assert "focus shown" in line
     run("render grey.png coc.npy -o tint.png --depth-kind coc --show-focus")
-    tinted = pixels("tint.png")
-    assert tinted[0, :, 0, [7, 8, 15, 16]].argmax(dim=0).tolist() == [0, 1, 1, 2]
-    assert torch.equal(tinted[0, 0, :, :6], tinted[0, 2, :, :6])
+    assert pixels("tint.png")[0, :, 0, [0, 8, 16]].argmax(dim=0).tolist() == [0, 1, 2]
+
+
+def test_the_tint_of_the_focus_turns_without_a_jump_and_leaves_what_is_transparent() -> None:
+    coc_px = torch.linspace(-4.0, 4.0, 1601)[None, None, None]
+    premultiplied = torch.full((1, 4, 1, 1601), 0.4)
+    premultiplied[..., :400] = 0.0
+    tinted = tint_focus(premultiplied, coc_px, has_alpha=True)
+    assert float(tinted[..., 400:].diff(dim=-1).abs().max()) < 0.002
+    assert bool((tinted[..., :400] == 0).all())
 
 
 def test_json_says_for_programs_what_the_line_says(depth: Tensor, run: Run) -> None:

@@ -18,13 +18,15 @@ def test_every_table_that_ships_is_listed(run: Callable[..., str]) -> None:
 def test_the_picture_shows_kernels_in_front_above_and_behind_below(scene: Path, run: Callable[..., str]) -> None:
     BlurTable.gaussian().save("mine.json")
     told = run("tables disc mine.json --blades 3 --rotation 90 -o kernels.png")
-    assert "3 blades, turned by 90" in told and "-24, -12" in told
+    assert "3 blades, turned by 90" in told and "negative is in front of focus" in told
     picture = read_image("kernels.png").pixels[0, 0]
-    assert picture.shape == (6 * 120 + 34 + 8, 2 * 230 + 3 * 8)
+    assert picture.shape == (6 * 200 + 34 + 8, 76 + 2 * 230 + 3 * 8)
     for row, behind in ((0, False), (5, True)):
-        kernel = picture[34 + row * 120 : 34 + (row + 1) * 120, 8:238]
+        kernel = picture[34 + row * 200 : 34 + (row + 1) * 200, 84:314]
         left, right = kernel[:, :115].sum(), kernel[:, 115:].sum()
         assert (left > right) != behind  # the triangle's corner points left behind focus
+        label = picture[34 + row * 200 : 34 + (row + 1) * 200, 8:84]
+        assert bool((label[80:120] < 0.1).any()) and bool((label[:70] > 0.7).all()), "a label beside its row"
 
 
 def test_tables_that_depend_on_the_place_show_kernels_from_the_middle_to_the_corner(
@@ -33,8 +35,8 @@ def test_tables_that_depend_on_the_place_show_kernels_from_the_middle_to_the_cor
     told = run("tables disc --vignetting 0.6 -o kernels.png")
     assert "vignetting 0.6" in told
     picture = read_image("kernels.png").pixels[0, 0]
-    rows = picture[34 + 5 * 120 + 2 : 34 + 6 * 120, 8 : 8 + 4 * 118]
-    lit = [float((part > 0.1).sum()) for part in rows.split(118, 1)]
+    rows = picture[34 + 5 * 200 + 2 : 34 + 6 * 200, 84 : 84 + 4 * 198]
+    lit = [float((part > 0.1).sum()) for part in rows.split(198, 1)]
     assert lit[0] > 1.1 * lit[1] > 1.2 * lit[2] > 1.2 * lit[3]
 
 

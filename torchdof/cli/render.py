@@ -113,7 +113,7 @@ class Render:
         group="Blur",
     )
     show_focus: bool = option(
-        "Don't blur: draw the outlines of what is near orange, in focus green, far blue.", False, group="Blur"
+        "Don't blur: show the image in grey, tinted: near orange, in focus green, far blue.", False, group="Blur"
     )
     device: str = option("auto, cpu, cuda, cuda:1, ...", "auto", group="Blur")
     depth_edges: Literal["auto", "repair", "as-given"] = edges_option("auto")

@@ -5,7 +5,6 @@ import math
 from typing import Any
 
 import torch
-import torch.nn.functional as functional
 from torch import Tensor
 
 from ..optics.camera import Camera
@@ -18,10 +17,9 @@ EDGES = ("exact", "ramp", "beside", "unclear")
 """Pixels at depth edges, by what rendering does: beside a step that stays where it is; on a ramp that becomes a step;
 of one surface with the depth of the other, which gets its own; on a ramp that stays, for the image shows no edge."""
 
-_NEAR, _SHARP, _FAR = (0.90, 0.35, 0.0), (0.0, 0.62, 0.20), (0.0, 0.30, 0.85)
+_NEAR, _SHARP, _FAR = (1.3, 0.6, 0.0), (0.1, 1.3, 0.3), (0.1, 0.5, 1.3)
+_TINT, _FLOOR = 0.4, 0.1  # share of the tint; light that it has in the dark, of the mean
 _HOLE = (0.6, 0.0, 0.6)
-_FAINT, _CLEAR = 0.2, 0.6  # change of light to the next pixel, of the brighter one: begins to be an outline, and is one
-_DARKEST = 0.05  # of the mean light: what is darker has no outlines of its own
 _BOUNDS_PX = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 
 
@@ -216,10 +214,9 @@ def panels(image: Tensor, report: DepthReport) -> dict[str, Tensor]:
 
 
 def tint_focus(image: Tensor, coc_px: Tensor, has_alpha: bool = False) -> Tensor:
-    """The image with outlines in colour: green in focus (radius of at most 1 px), orange nearer, blue farther.
+    """The image in grey, lightly tinted: green in focus (radius of at most 1 px), orange nearer, blue farther.
 
-    Everything else keeps its colours. Outlines are where the image's light changes by more than a third from pixel to
-    pixel, and where one of the three zones meets another.
+    Green turns to the others between 1 and 2 px.
 
     Args:
         image: ``[B, C, H, W]`` in linear light, C of 1 or 3, one more with alpha (premultiplied).
@@ -233,34 +230,19 @@ def tint_focus(image: Tensor, coc_px: Tensor, has_alpha: bool = False) -> Tensor
         ValueError: If shapes or types are not as described.
 
     Example:
-        >>> coc_px = torch.tensor([-3.0, -3.0, 0.2, 5.0, 5.0])[None, None, None]
-        >>> tinted = tint_focus(torch.ones(1, 3, 1, 5), coc_px)
-        >>> tinted[0, :, 0, 1:4].argmax(dim=0)  # red, green and blue are strongest where zones meet
+        >>> coc_px = torch.tensor([-3.0, 0.2, 5.0])[None, None, None]
+        >>> tint_focus(torch.ones(1, 3, 1, 3), coc_px)[0, :, 0].argmax(dim=0)  # red, green and blue are strongest
         tensor([0, 1, 2])
-        >>> tinted[0, :, 0, 0]
-        tensor([1., 1., 1.])
     """
     image_and_map(image, "coc_px", coc_px, "in pixels")
     if image.shape[1] - has_alpha not in (1, 3):
         raise ValueError(f"image must have 1 or 3 channels of colour, got {image.shape[1] - has_alpha}")
     colour, alpha = (image[:, :-1], image[:, -1:]) if has_alpha else (image, image[:, :0])
-    tints = torch.tensor([_NEAR, _SHARP, _FAR], dtype=image.dtype, device=image.device)
-    zone = (coc_px >= -1.0).long() + (coc_px > 1.0).long()
-    tint = tints[zone[:, 0]].permute(0, 3, 1, 2)  # [B, H, W, 3] -> [B, 3, H, W]
+    near, sharp, far = (image.new_tensor(tint)[:, None, None] for tint in (_NEAR, _SHARP, _FAR))
+    tint = torch.lerp(torch.where(coc_px < 0, near, far), sharp, (2.0 - coc_px.abs()).clamp(0.0, 1.0))
     grey = colour.mean(dim=1, keepdim=True)
-    brightest, darkest = _largest_around(grey), -_largest_around(-grey)
-    zones = zone.to(image.dtype)
-    meets_another = _largest_around(zones) + _largest_around(-zones) > 0
-    contrast = (brightest - darkest) / brightest.clamp(min=_DARKEST * grey.mean().clamp(min=1e-12))
-    outline = torch.where(meets_another, 1.0, ((contrast - _FAINT) / (_CLEAR - _FAINT)).clamp(0.0, 1.0))
-    shown = tint / tint.amax(dim=1, keepdim=True) * brightest.clamp(min=grey.mean())
-    tinted = torch.lerp(colour.expand_as(shown), shown, outline.expand_as(shown))
-    return torch.cat([tinted, alpha], dim=1)
-
-
-def _largest_around(values: Tensor) -> Tensor:
-    """Largest of a pixel and its eight neighbours, ``[B, 1, H, W]``."""
-    return functional.max_pool2d(values, 3, stride=1, padding=1)
+    floor = _FLOOR * grey.mean() * (alpha if has_alpha else 1.0)
+    return torch.cat([(1.0 - _TINT) * grey + _TINT * tint * (grey + floor), alpha], dim=1)
 
 
 def _percent(count: int, total: int) -> str:
