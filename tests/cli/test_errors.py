@@ -63,7 +63,7 @@ image.exr depth.npy --focus-m 2 --fov-deg 40 --aperture-radius-m -1 | --aperture
 image.exr depth.npy --focus-m 2 --f-number 2 --blur 2% | --f-number and --blur both say how wide the lens opens
 image.exr depth.npy --focus-m 2 --equivalent 85,1.4 --blur 2% | --equivalent and --blur both say how wide the lens op
 image.exr depth.npy --focus-m 2 --equivalent 85,1.4 --fov-deg 40 | say the same; give one of them
-image.exr depth.npy --focus-m 2 --equivalent 85,1.4 --focal-length-mm 50 | --equivalent and --focal-length-mm say the
+image.exr depth.npy --focus-m 2 --equivalent 85,1.4 --focal-length-mm 50 | --equivalent and --focal-length-mm with
 image.exr depth.npy --focus-m 2 --equivalent 85       | --equivalent expects a focal length and an f-number such as
 image.exr depth.npy --focus-m 2 --equivalent 85,0     | --equivalent must be positive
 image.exr depth.npy --focus-m 2 --blur 2              | --blur expects a share of the picture's width

@@ -52,6 +52,13 @@ def _equivalent(text: str) -> tuple[float, ...]:
     return numbers(2, expected)(re.sub(r"mm(?=,)|(?<=,)f/", "", text))
 
 
+def _give_one(options: Mapping[str, Any], problem: str) -> None:
+    """Refuse two options, by what they say, that contradict each other."""
+    given = [name for name, value in options.items() if value is not None]
+    if len(given) > 1:
+        raise ValueError(f"{' and '.join(given)} {problem}; give one of them")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
     """Focus and lens."""
@@ -105,20 +112,13 @@ class Lens(Sensor):
 
     def __post_init__(self) -> None:
         places = {"--focus-m": self.focus_m, "--focus-at": self.focus_at, "--focus-range": self.focus_range}
-        given = [name for name, place in places.items() if place is not None]
-        if len(given) > 1:
-            raise ValueError(f"{' and '.join(given)} both say where to focus; give one of them")
-        lens: dict[str, Any] = {"--fov-deg": self.fov_deg, "--focal-length-mm": self.focal_length_mm}
-        lens |= {"--sensor-width-mm": self.sensor_width_mm, "--equivalent": self.equivalent}
-        for name in ("--fov-deg", "--equivalent"):
-            others = [other for other, value in lens.items() if value is not None and other != name]
-            if lens[name] is not None and others:
-                raise ValueError(f"{name} and {' with '.join(others)} say the same; give one of them")
-        opening = [name for name, value in self._openings.items() if value is not None]
+        views = {"--fov-deg": self.fov_deg, "--equivalent": self.equivalent}
+        real = self.focal_length_mm if self.focal_length_mm is not None else self.sensor_width_mm
+        _give_one(places, "both say where to focus")
+        _give_one(views | {"--focal-length-mm with --sensor-width-mm": real}, "say the same")
         if self.fov_deg is None and self.aperture_radius_m is not None:
             raise ValueError("--aperture-radius-m goes with --fov-deg; a real lens has --f-number instead")
-        if len(opening) > 1:
-            raise ValueError(f"{' and '.join(opening)} both say how wide the lens opens; give one of them")
+        _give_one(self._openings, "both say how wide the lens opens")
         if self.fov_deg is not None and not 0 < self.fov_deg < 180:
             raise ValueError(f"--fov-deg must be a number of degrees > 0 and < 180, got {self.fov_deg:g}")
 
@@ -133,11 +133,6 @@ class Lens(Sensor):
     def has_focus(self) -> bool:
         """Whether the user said where to focus."""
         return (self.focus_m, self.focus_at, self.focus_range) != (None, None, None)
-
-    def refuse_share(self) -> None:
-        """Refuse blur as a share of the width, for a sequence, whose depth changes."""
-        if self.blur_share is not None:
-            raise ValueError("--blur would open the lens anew in each frame of a sequence; give --f-number")
 
     def more_blur(self, largest_px: float, is_still: bool) -> str:
         """What to do about blur that is too small to be seen."""
@@ -220,11 +215,11 @@ class Lens(Sensor):
                 camera = Camera.from_fov(self.fov_deg, radius_m, focus_m)
             camera = camera.replace(focus_range_m=self.focus_range, tilt_deg=self.tilt, swing_deg=self.swing)
         camera = camera if self.focus_at is None else camera.focus_at(depth, *self.focus_at)
-        largest_px, share = self._largest_coc_px(camera, depth), self.blur_share
+        share = self.blur_share
         if is_still and not is_open and (self == Lens() or not is_to_scale):
-            is_seen = is_to_scale and "f_number" in known and largest_px >= _SEEN * width
-            share = None if is_seen else _BLUR
-        if share is not None and largest_px > 0:
+            is_known = is_to_scale and "f_number" in known
+            share = None if is_known and self._largest_coc_px(camera, depth) >= _SEEN * width else _BLUR
+        if share is not None and (largest_px := self._largest_coc_px(camera, depth)) > 0:
             camera = camera.replace(f_number=camera.f_number * largest_px / (share * width))
         for name in _ASSUMED if self.fov_deg is None and self.equivalent is None else ():
             words = "f-number" if name == "f_number" else name.rsplit("_", 1)[0].replace("_", " ")

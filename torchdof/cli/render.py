@@ -153,33 +153,39 @@ class Render:
 
     def _pull_focus(self, keys: Sequence[tuple[int, float]]) -> None:
         """Renders a still once for each frame from the first to the last keyframe of the focus."""
-        target, (first, last) = FramePattern(self.out), self.files.frames or (keys[0][0], keys[-1][0])
-        for n in range(first, last + 1):
-            check_files(self.image, self.depth, target.name(n))
-        todo = self._missing(target, range(first, last + 1))
+        first, last = self.files.frames or (keys[0][0], keys[-1][0])
+        todo = self._todo(FramePattern(self.out), dict.fromkeys(range(first, last + 1), (self.image, self.depth)))
         from .frame import Renderer
 
         renderer = Renderer(self, self.scene)
         frame = renderer.read(self.image, self.depth)
-        self._render_each(renderer, {n: target.name(n) for n in todo}, lambda _: frame)
+        self._render_each(renderer, todo, lambda _: frame)
 
-    def _missing(self, target: FramePattern, numbers: Sequence[int]) -> list[int]:
-        """The numbers of frames to render: all, or with ``--resume`` those that are not there; the others are told."""
-        todo = [n for n in numbers if not (self.files.resume and target.name(n).is_file())]
-        if len(todo) < len(numbers):
-            there = [target.name(n) for n in numbers if n not in set(todo)]
-            self._tell_of_those_there(there, f"{len(there)} of {len(numbers)} frames are there already")
-        return todo
+    def _todo(self, target: FramePattern, sources: Mapping[int, tuple[Path, Path | None]]) -> dict[int, Path]:
+        """The files of the frames to render: all, or with ``--resume`` those that are not there; the others are told.
+
+        Refuses frames whose image and depth, by their numbers, are not as :func:`check_files` wants them.
+        """
+        files = {n: target.name(n) for n in sources}
+        for n, (image, depth) in sources.items():
+            check_files(image, depth, files[n])
+        there = {n: file for n, file in files.items() if self.files.resume and file.is_file()}
+        if there:
+            self._tell_of_those_there([*there.values()], f"{len(there)} of {len(files)} frames are there already")
+        return {n: file for n, file in files.items() if n not in there}
 
     def _render_sequence(self) -> None:
         """Renders the frames of a numbered sequence, in order; with ``--resume`` only those that are missing."""
         source, target, said = FramePattern(self.image), FramePattern(self.out), self.scene.depth_map.of_sequence()
         depths = FramePattern(self.depth) if self.depth is not None and FramePattern.matches(self.depth) else None
-        self.scene.lens.refuse_share()
+        if self.scene.lens.blur_share is not None:
+            raise ValueError("--blur would open the lens anew in each frame of a sequence; give --f-number")
+
+        def sources(n: int) -> tuple[Path, Path | None]:
+            return source.name(n), depths.name(n) if depths else self.depth
+
         numbers = self._numbers(source, depths)
-        for n in numbers:
-            check_files(source.name(n), depths.name(n) if depths else self.depth, target.name(n))
-        todo = self._missing(target, numbers)
+        todo = self._todo(target, {n: sources(n) for n in numbers})
         if self.files.steady and said.depth_kind == "coc":
             raise ValueError("--steady filters depth in metres; --depth-kind coc has none")
         from ..depth.sanity import Mistake
@@ -190,11 +196,10 @@ class Render:
             renderer.warned.warn(self.depth or self.image, [Mistake("range", _EACH_ITS_OWN)])
 
         def read(n: int) -> "Frame":
-            return renderer.read(source.name(n), depths.name(n) if depths else self.depth)
+            return renderer.read(*sources(n))
 
         whole = [n for n in source.frames() if depths is None or depths.name(n).is_file()]
-        steadied = _steadied(read, whole) if self.files.steady else read
-        self._render_each(renderer, {n: target.name(n) for n in todo}, steadied)
+        self._render_each(renderer, todo, _steadied(read, whole) if self.files.steady else read)
 
     def _numbers(self, source: FramePattern, depths: FramePattern | None) -> Sequence[int]:
         """The numbers of the frames that are asked for, all of which are there."""
