@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 import click
 
 from .command import argument, option
-from .options import Blur, Scene, check_files, json_option
+from .options import Blur, check_files, json_option
 from .printed import WarnOnce, json_line
+from .scene import Scene
 
 if TYPE_CHECKING:
     from ..bench.measurement import BenchScene

@@ -8,15 +8,16 @@ import contextlib
 import dataclasses
 import inspect
 import math
+import re
 import types
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import click
 
-__all__ = ["argument", "command_of", "numbers", "option", "word_or_number"]
+__all__ = ["argument", "by_option", "command_of", "numbers", "option", "word_or_number"]
 
 _TYPES: dict[Any, click.ParamType] = {
     **{str: click.STRING, int: click.INT, float: click.FLOAT, bool: click.BOOL},
@@ -76,6 +77,16 @@ def numbers(count: int | None, expected: str) -> Callable[[str], tuple[float, ..
 def word_or_number(words: tuple[str, ...], expected: str) -> Callable[[str], float | str]:
     """Reads one of some words, or a number; what was expected is the message where it is neither."""
     return lambda text: text if text in words else numbers(1, expected)(text)[0]
+
+
+@contextlib.contextmanager
+def by_option(names: Mapping[str, str]) -> Iterator[None]:
+    """Has a refusal say the option's name where it says its own."""
+    try:
+        yield
+    except ValueError as error:
+        pattern = re.compile(r"\b(" + "|".join(names) + r")\b")
+        raise ValueError(pattern.sub(lambda found: names[found.group()], str(error))) from None
 
 
 class _Command(click.Command):

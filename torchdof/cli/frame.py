@@ -25,8 +25,9 @@ from ..optics.camera import CAMERA_NUMBERS, Camera
 from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect, stretch
-from .options import Scene, make_folder_of, pick_device
+from .options import make_folder_of, pick_device
 from .printed import Bar, WarnOnce, note, tell
+from .scene import Scene
 
 if TYPE_CHECKING:
     from .render import Render

@@ -4,8 +4,9 @@ import dataclasses
 from pathlib import Path
 
 from .command import argument, option
-from .options import Scene, check_files, json_option, make_folder_of
+from .options import check_files, json_option, make_folder_of
 from .printed import WarnOnce, note, tell
+from .scene import Scene
 
 __all__ = ["Inspect"]
 

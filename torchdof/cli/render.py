@@ -12,8 +12,9 @@ import click
 
 from ..io.sequence import FramePattern, parse_frames
 from .command import argument, numbers, option
-from .options import Accuracy, Blur, Scene, check_files, edges_option, json_option
+from .options import Accuracy, Blur, check_files, edges_option, json_option
 from .printed import Bar, json_line
+from .scene import Scene
 
 if TYPE_CHECKING:
     from torch import Tensor
