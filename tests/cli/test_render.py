@@ -392,7 +392,10 @@ def guessed(command: str) -> tuple[str, str]:
     return told.stdout, told.stderr
 
 
-GREY = "taken for relative depth, larger is nearer (else --relative-kind depth), from 1 to 8 m (--near-m, --far-m)"
+GREY = (
+    "taken for relative depth (else --depth-kind), larger is nearer (else --relative-kind depth), from 1 to 8 m (else "
+    "--near-m, --far-m)"
+)
 
 
 @pytest.mark.parametrize(
@@ -523,3 +526,21 @@ def test_a_still_whose_focus_moves_is_a_file_a_frame_with_one_opening(image: Ten
     radii = [float(re.search(r"up to ([\d.]+) px", part).group(1)) for part in told]  # type: ignore[union-attr]
     assert max(radii) == 2.4 and radii[1] < 2.4
     assert guessed("render image.exr depth.npy -o pull.##.exr --focus-m 1:2,3:6 --f-number 9")[1].count("note:") == 1
+
+
+def test_a_picture_of_one_depth_is_said_to_be_all_in_focus(run: Run) -> None:
+    np.save("flat.npy", np.full((16, 24), 3.0))
+    line, note = guessed("render image.exr flat.npy -o out.exr")
+    assert "nothing is blurred" in note and "f-number assumed" in line and "f-number for" not in line
+
+
+def test_a_stray_pixel_does_not_take_the_blur_from_all_others(image: Tensor, depth: Tensor, run: Run) -> None:
+    large = torch.nn.functional.interpolate(depth, (80, 120))
+    write_image("large.exr", Picture(torch.nn.functional.interpolate(image, (80, 120)), sample="float"))
+    openings = []
+    for stray_m in (2.0, 0.1):
+        large[..., 40, 90] = stray_m
+        np.save("large.npy", large.numpy())
+        line = run("render large.exr large.npy -o out.exr --focus-m 2 --blur 4% --depth-edges as-given")
+        openings.append(re.search(r"f/([\d.]+)", line).group(1))  # type: ignore[union-attr]
+    assert openings[0] == openings[1]

@@ -24,6 +24,7 @@ __all__ = ["DepthMap", "Lens", "Scene", "Sensor"]
 _ASSUMED = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
 _NEAR_M, _FAR_PER_NEAR = 1.0, 8.0  # of relative depth
 _BLUR, _SEEN = 0.02, 0.005  # of the picture's width: a blur that is plain to see, and the least that is seen at all
+_STRAY, _SAMPLES = 1000, 2**20  # pixels of which one may be blurred more; pixels that are looked at
 _SPELLED = {"focus_range_m": "--focus-range", "tilt_deg": "--tilt", "swing_deg": "--swing", "fov_x_deg": "--fov-deg"}
 _WHOLE_NUMBERS = (".png", ".jpg", ".jpeg", ".webp")
 _OF_RENDERERS = (".exr", ".tif", ".tiff")  # whose floating point numbers are distances
@@ -211,20 +212,23 @@ class Lens(Sensor):
         if is_still and not is_open and (self == Lens() or not is_to_scale):
             is_known = is_to_scale and "f_number" in known
             share = None if is_known and self._largest_coc_px(camera, depth) >= _SEEN * width else _BLUR
-        if share is not None and (largest_px := self._largest_coc_px(camera, depth)) > 0:
+        largest_px = 0.0 if share is None else self._largest_coc_px(camera, depth)
+        if share is not None and largest_px > 0:
             camera = camera.replace(f_number=camera.f_number * largest_px / (share * width))
         for name in _ASSUMED if self.fov_deg is None and self.equivalent is None else ():
             words = "f-number" if name == "f_number" else name.rsplit("_", 1)[0].replace("_", " ")
-            if name == "f_number" and share is not None:
+            if name == "f_number" and share is not None and largest_px > 0:
                 remarks += [] if is_open else [f"{words} for a blur of {share:.0%} of the width"]
             elif getattr(self, name) is None:
                 remarks.append(f"{words} {'from the file' if name in known else 'assumed'}")
         return camera, remarks
 
     def _largest_coc_px(self, camera: "Camera", depth: "Tensor") -> float:
-        """The largest blur radius in pixels of what has a depth, at all keyframes of the focus."""
+        """The largest blur radius in pixels, but for a thousandth of stray pixels, at all keyframes of the focus."""
         cameras = [camera.replace(focus_m=metres) for _, metres in self.focus_m or []] or [camera]
-        return max(float(each.coc_px(depth, depth.shape[-1]).abs().nan_to_num(0.0).max()) for each in cameras)
+        radii = [each.coc_px(depth, depth.shape[-1]).abs().nan_to_num(0.0).flatten() for each in cameras]
+        sampled = [radius[:: 1 + radius.numel() // _SAMPLES] for radius in radii]
+        return max(float(radius.kthvalue(radius.numel() - radius.numel() // _STRAY).values) for radius in sampled)
 
     def stated(self, camera: "Camera") -> dict[str, Any]:
         """The numbers of a camera by the options, or the file, that they are from."""
@@ -332,12 +336,12 @@ class DepthMap:
         said = replace(self, depth_kind=guess.kind, depth_unknown=unknown, fill_depth=fill)
         if guess.kind == "z":
             unit = "metres" if guess.scale == 1.0 else "millimetres"
-            told = f"taken for {unit}; if it is not, say so with --depth-kind or --depth-scale"
+            told = f"taken for {unit} (else --depth-kind, --depth-scale)"
             return replace(said, depth_scale=None if guess.scale == 1.0 else guess.scale), told
         larger, other = ("nearer", "depth") if guess.relative_kind == "disparity" else ("farther", "disparity")
         near_m, far_m = said.ends_m
-        told = f"taken for relative depth, larger is {larger} (else --relative-kind {other}), from {near_m:g} to "
-        told += f"{far_m:g} m (--near-m, --far-m); if it is not, say so with --depth-kind"
+        told = f"taken for relative depth (else --depth-kind), larger is {larger} (else --relative-kind {other}), "
+        told += f"from {near_m:g} to {far_m:g} m (else --near-m, --far-m)"
         return replace(said, relative_kind=guess.relative_kind), told
 
 
