@@ -66,12 +66,12 @@ class Render:
 
         torchdof render shot.####.exr -o out.####.exr --focus-m 1:2,48:5.5 --f-number 2 --resume
 
+    --steady filters depth that flickers along time, where neither image nor depth moved; a part of a sequence, or the
+    rest of it with --resume, comes out as the whole would: up to 63 frames before it are read first.
+
     A photograph, its focus pulled from 1 m to 5 m in 24 frames:
 
         torchdof render photo.jpg depth.png -o pull.##.png --focus-m 1:1,24:5
-
-    --steady filters depth that flickers along time, where neither image nor depth moved; a part of a sequence, or the
-    rest of it with --resume, comes out as the whole would: up to 63 frames before it are read first.
 
     Seven blades on an anamorphic lens, all from 1.5 to 2.2 m in focus:
 
