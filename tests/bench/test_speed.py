@@ -19,6 +19,7 @@ from torchdof import Camera, DepthOfField, blur_by_coc
 from torchdof.bench import speed
 from torchdof.bench.measurement import BenchScene, error, shipped, timed
 from torchdof.cli.main import app
+from torchdof.depth.guess import subject_m
 from torchdof.io.images import Picture, read_image, write_image
 from torchdof.reference import metrics
 
@@ -112,7 +113,7 @@ def test_bench_measures_the_users_scene_and_makes_the_output_folder(
     result = run(*files, "--repeat", 1, "--out", out, "--f-number", 1.4, "--sensor-width-mm", 6)
     assert result.exit_code == 0, result.output
     assert "image.exr, blur radius -" in result.output
-    assert "focus at the median depth" in " ".join(result.output.split())
+    assert "focus on what is nearest the middle" in " ".join(result.output.split())
     assert sorted(p.name for p in out.iterdir()) == ["speed.csv", "speed.md", "speed.png"]
     with (out / "speed.csv").open() as file:
         rows = {row["setting"]: row for row in csv.DictReader(file)}
@@ -124,7 +125,7 @@ def test_bench_measures_the_users_scene_and_makes_the_output_folder(
     # the rows are of this image, this depth and this camera
     image = read_image(files[0]).pixels
     depth = torch.linspace(1.0, 4.0, 64).expand(1, 1, 36, 64)
-    camera = Camera(50.0, 1.4, float(depth.median()), 6.0)
+    camera = Camera(50.0, 1.4, subject_m(depth), 6.0)
     shown = [metrics.display(DepthOfField(camera, tolerance=t)(image, depth)) for t in (8 / 255, 0.0)]
     assert float(rows["8/255"]["psnr_db"]) == pytest.approx(metrics.psnr(*shown), abs=0.01)
     assert math.isinf(float(rows["exact"]["psnr_db"]))

@@ -16,6 +16,7 @@ image.exr --focus-m 2                                 | image.exr: has no depth 
 image.exr small.npy --focus-m 2                       | small.npy: depth is 3 x 4 pixels and the image 24 x 16
 image.exr small.npy --depth-kind coc                  | small.npy: coc is 3 x 4 pixels but the image is 24 x 16
 image.exr holed.npy --focus-m 2                       | holed.npy: 2 pixels (0.5 %) have no depth
+image.exr holed.npy --depth-kind relative --depth-unknown 0 | have no depth (NaN or marked unknown); say how to fill
 image.exr depth.npy --focus-m 2 --layer b             | image.exr: has no layer 'b'
 image.exr depth.####.npy --focus-m 2                  | image.exr: is a single image
 image.exr depth.npy --focus-m 2 --frames 1-2          | image.exr: is a single image
@@ -25,6 +26,8 @@ shot.####.exr none.####.npy --focus-m 2 -o o.#.exr    | none.0001.npy: there is 
 shot.####.exr depth.npy --focus-m 2 -o o.#.exr --frames 2-5 | shot.0004.exr: there is no such file (2 of 4 frames
 none.####.exr depth.npy --focus-m 2 -o o.#.exr        | none.####.exr: there are no such files
 shot.####.exr depth.npy --focus-m 2 -o shot.####.exr  | shot.0001.exr: is one of the inputs
+shot.0002.exr depth.npy --focus-m 1:2,3:4 -o shot.####.exr | shot.0002.exr: is one of the inputs
+image.exr shot.0003.exr --focus-m 1:2,3:4 -o shot.####.exr | shot.0003.exr: is one of the inputs
 shot.####.exr depth.####.npy -o o.#.exr --depth-kind coc --steady | --steady filters depth in metres
 shot.####.exr depth.npy --focus-m 2 -o o.#.exr --frames 5-2   | --frames must not end before it starts
 shot.%099999999d.exr depth.npy --focus-m 2            | must have at most 18 digits
@@ -32,9 +35,12 @@ image.exr depth.npy --focus-m 2 -o ./image.exr        | is one of the inputs
 image.exr depth.npy --focus-m 2 -o depth.npy          | depth.npy: is one of the inputs
 image.exr depth.npy --focus-m 2 -o depth.npy/out.exr  | its folder cannot be made
 image.exr depth.npy --focus-m 2 -o out.gif            | cannot write files of type '.gif'
-image.exr depth.npy                                   | where is the focus? give --focus-m METRES or --focus-at X,Y
+shot.####.exr depth.npy -o o.#.exr                    | where is the focus? give --focus-m METRES or --focus-at X,Y
 image.exr depth.npy --focus-m near                    | --focus-m expects metres (2.0) or keyframes
-image.exr depth.npy --focus-m 1:2,5:3                 | --focus-m has keyframes but IMAGE is a single image
+image.exr depth.npy --focus-m 1:2,5:3                 | out.exr: expected one place for the frame number
+image.exr depth.npy --focus-m 1:2,5:3 -o o.#.exr --sheet s.png | --sheet is of one picture
+shot.####.exr depth.npy --focus-m 2 -o o.#.exr --sheet s.png | --sheet is of one picture
+image.exr depth.npy --focus-m 2 -o o.##.exr           | image.exr: is a single image
 image.exr depth.npy --focus-m 0.01                    | --focus-m must be longer than the focal length
 image.exr depth.npy --focus-at 3                      | --focus-at expects a pixel X,Y such as 320,200, got '3'
 image.exr depth.npy --focus-at 99,5                   | focus point (99.0, 5.0) must lie in the frame of 24 x 16
@@ -54,16 +60,26 @@ image.exr depth.npy --focus-m 2 --fov-deg 40 --f-number 2 --aperture-radius-m 1 
 image.exr depth.npy --focus-m 2 --fov-deg 40 --f-number 1e-42 | --f-number 1e-42
 image.exr depth.npy --focus-m 2 --fov-deg 40 --aperture-radius-m 1e45 | --fov-deg 40, --aperture-radius-m 1e+45
 image.exr depth.npy --focus-m 2 --fov-deg 40 --aperture-radius-m -1 | --aperture-radius-m must be positive
+image.exr depth.npy --focus-m 2 --f-number 2 --blur 2% | --f-number and --blur both say how wide the lens opens
+image.exr depth.npy --focus-m 2 --equivalent 85,1.4 --blur 2% | --equivalent and --blur both say how wide the lens op
+image.exr depth.npy --focus-m 2 --equivalent 85,1.4 --fov-deg 40 | say the same; give one of them
+image.exr depth.npy --focus-m 2 --equivalent 85,1.4 --focal-length-mm 50 | --equivalent and --focal-length-mm with
+image.exr depth.npy --focus-m 2 --equivalent 85       | --equivalent expects a focal length and an f-number such as
+image.exr depth.npy --focus-m 2 --equivalent 85,0     | --equivalent must be positive
+image.exr depth.npy --focus-m 2 --blur 2              | --blur expects a share of the picture's width
+image.exr depth.npy --focus-m 2 --blur 0%             | --blur expects a share of the picture's width
+image.exr depth.npy --focus-m 2 --blur 99%            | --blur expects a share of the picture's width
+image.exr depth.npy --depth-kind coc --blur 2%        | --depth-kind coc is the blur itself and takes no camera
+shot.####.exr depth.npy -o o.#.exr --focus-m 2 --blur 2% | --blur would open the lens anew in each frame
 image.exr depth.npy --focus-m 2 --aperture-radius-m 1 | --aperture-radius-m goes with --fov-deg
 image.exr depth.npy --focus-m 2 --fill-depth x        | --fill-depth expects nearest, far or metres, got 'x'
 image.exr depth.npy --focus-m 2 --fill-depth 1e-45 --depth-unknown 6 | which starts at 1.4e-45 m
 image.exr depth.npy --focus-m 2 --depth-kind disparity | disparity needs a scale (--depth-scale)
 image.exr depth.npy --focus-m 2 --depth-kind distance | --depth-kind distance needs --fov-deg
 image.exr depth.npy --focus-m 2 --depth-kind coc      | --depth-kind coc is the blur itself and takes no camera
-image.exr depth.npy --focus-m 2 --depth-kind relative --near-m 1 | --depth-kind relative needs --near-m and --far-m
 image.exr depth.npy --focus-m 2 --depth-kind relative --near-m 1 --far-m 2 --depth-scale 3 | near and far say it
 image.exr depth.npy --focus-m 2 --depth-kind relative --near-m 5 --far-m 1 | depth.npy: near_m must be nearer than
-image.exr depth.npy --focus-m 2 --near-m 1            | add --depth-kind relative
+image.exr depth.npy --focus-m 2 --near-m 1 --depth-kind z | are for relative depth, and not for --depth-kind z
 image.exr depth.npy --focus-m 2 --value-range 3       | --value-range expects two numbers such as 0,255
 image.exr millimetres.npy --focus-m 3 --f-number 1.4 --strict | millimetres.npy: the focus at 3 m is nearer than all
 image.exr depth.npy --focus-m 2 --table nowhere       | no blur table 'nowhere': neither a file nor one of disc, gauss
@@ -155,7 +171,7 @@ def test_errors_of_the_other_commands(files: Path, run: Callable[..., str], line
     [
         ("render image.exr", "Missing option '--out' / '-o'"),
         ("render image.exr depth.npy -o out.exr --f-number wide", "'wide' is not a valid float"),
-        ("render image.exr depth.npy -o out.exr --depth-kind odd", "'odd' is not one of 'z', 'distance'"),
+        ("render image.exr depth.npy -o out.exr --depth-kind odd", "'odd' is not one of 'auto', 'z', 'distance'"),
         ("render image.exr depth.npy -o out.exr --f-number", "Option '--f-number' requires an argument"),
         ("render --nonsense", "No such option '--nonsense'"),
         ("bench --repeat 0", "0 is not in the range x>=1"),

@@ -22,7 +22,7 @@ from torchdof.io.images import Picture, read_image, write_image
 
 pytestmark = pytest.mark.hard
 
-SEQUENCE = "render shot.####.exr depth.npy -o out.####.exr --focus-m 2"
+SEQUENCE = "render shot.####.exr depth.npy -o out.####.exr --focus-m 2 --f-number 1.2 --sensor-width-mm 4"
 
 
 def copies(folder: Path, count: int) -> None:
@@ -90,7 +90,7 @@ def test_the_next_frame_is_read_and_the_last_written_while_one_is_rendered(
             barrier.wait(20)
         return step(self, *arguments)
 
-    for name, out in (("read", "out.0003"), ("render", "out.0002"), ("write", "out.0001")):
+    for name, out in (("read", "shot.0003"), ("render", "out.0002"), ("write", "out.0001")):
         original = getattr(frame.Renderer, name)
         monkeypatch.setattr(frame.Renderer, name, functools.partialmethod(waiting, original, out))
     assert [line[:12] for line in run(SEQUENCE).splitlines()] == [f"out.000{n}.exr" for n in (1, 2, 3)]

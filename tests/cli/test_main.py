@@ -45,9 +45,10 @@ def test_an_option_means_the_same_in_all_commands() -> None:
 
 NAMES = """
 render: image depth out focus_m focus_at focus_range tilt swing f_number focal_length_mm sensor_width_mm fov_deg
-    aperture_radius_m depth_kind depth_scale depth_offset near_m far_m relative_kind value_range strict depth_unknown
-    fill_depth depth_channel depth_edges table blades rotation curvature squeeze aperture vignetting tolerance attention
-    lights no_occlusion method show_focus device transfer out_transfer bits layer frames steady resume as_json
+    aperture_radius_m blur_share equivalent depth_kind depth_scale depth_offset near_m far_m relative_kind value_range
+    strict depth_unknown fill_depth depth_channel depth_edges table blades rotation curvature squeeze aperture
+    vignetting tolerance attention lights no_occlusion method show_focus device transfer out_transfer bits layer
+    sheet frames steady resume as_json
 inspect: image depth out focus_m focus_at focus_range tilt swing f_number focal_length_mm sensor_width_mm fov_deg
     aperture_radius_m depth_kind depth_scale depth_offset near_m far_m relative_kind value_range strict depth_unknown
     fill_depth depth_channel as_json

@@ -19,6 +19,7 @@ from torch import Tensor
 
 import torchdof
 from torchdof.cli.main import app
+from torchdof.depth.inspect import tint_focus
 from torchdof.io.highlights import expand_highlights
 from torchdof.io.images import Picture, read_image, write_image
 from torchdof.optics.field import Field
@@ -26,10 +27,10 @@ from torchdof.optics.field import Field
 pytestmark = pytest.mark.usefixtures("scene")  # its files lie in the working folder
 
 Run = Callable[..., str]
-LENS = "--focal-length-mm 50 --f-number 1.4 --sensor-width-mm 4"  # blurs by 1.8 px
+LENS = "--focal-length-mm 50 --f-number 1.2 --sensor-width-mm 4"  # blurs by 2.1 px
 ONE = "render image.exr depth.npy -o out.exr --focus-m 2"
 SEQUENCE = "render shot.####.exr depth.####.npy -o out.####.exr"
-CAMERA = torchdof.Camera(focal_length_mm=50.0, f_number=1.4, focus_m=2.0, sensor_width_mm=4.0)
+CAMERA = torchdof.Camera(focal_length_mm=50.0, f_number=1.2, focus_m=2.0, sensor_width_mm=4.0)
 RENDERED = torchdof.Camera.from_fov(40.0, 0.2, 2.0)
 SLIT = torch.zeros(8, 8)
 SLIT[1:7, 1:3] = 1.0
@@ -119,7 +120,7 @@ def test_the_line_states_camera_blur_and_table(run: Run) -> None:
     told = run(f"{ONE} {LENS}")
     assert run(f"{ONE} --resume") == "out.exr: is there already\n"
     assert told.startswith(
-        "out.exr: focus 2 m, f/1.4, 50 mm on 4 mm; blur radius up to 1.8 px; disc, layered; 24 x 16;"
+        "out.exr: focus 2 m, f/1.2, 50 mm on 4 mm; blur radius up to 2.1 px; disc, layered; 24 x 16;"
     )
     shape = f"{BLADES} --tilt 3 --swing -1"
     told = run(f"render image.exr depth.npy -o out.exr --focus-range 1.5,1.8 --no-occlusion {shape} {LENS}")
@@ -227,23 +228,30 @@ def test_table_of_three_colours_blurs_alpha_like_green(image: Tensor, run: Run, 
     assert not torch.allclose(out[:, 0], out[:, 1], atol=1e-3)
 
 
-def test_show_focus_colours_the_outlines_of_each_zone_and_keeps_other_pixels(run: Run) -> None:
+def test_show_focus_tints_by_zone_and_keeps_light_and_shade(run: Run) -> None:
     colours = torch.tensor([0.3, 0.1, 0.2])[:, None, None].expand(1, 3, 16, 24).clone()
-    colours[..., 8:, :] *= 0.2  # an outline across all three zones
+    colours[..., 8:, :] *= 0.2
     write_image("photo.exr", Picture(colours, sample="float"))
     write_image("grey.png", Picture(torch.full((1, 1, 16, 24), 0.3), ("Y",)))
     np.save("coc.npy", np.tile(np.repeat([-4.0, 0.0, 4.0], 8), (16, 1)))
     line = run("render photo.exr coc.npy -o tint.exr --depth-kind coc --show-focus")
     tinted = pixels("tint.exr")
-    assert tinted[0, :, 7].argmax(dim=0).tolist() == [0] * 8 + [1] * 8 + [2] * 8
-    for columns in (slice(0, 7), slice(9, 15), slice(17, 24)):  # away from where zones meet
-        for rows in (slice(0, 7), slice(9, 16)):  # and from the outline
-            torch.testing.assert_close(tinted[..., rows, columns], colours[..., rows, columns])
+    assert tinted[0].argmax(dim=0).tolist() == [[0] * 8 + [1] * 8 + [2] * 8] * 16
+    assert bool((tinted.amax(1) < 1.5 * colours.amax(1)).all()), "too strong"
+    lit, dark = tinted[..., :8, :].mean((1, 2)), tinted[..., 8:, :].mean((1, 2))
+    assert bool((lit > 3.5 * dark).all())
     assert "focus shown" in line
     run("render grey.png coc.npy -o tint.png --depth-kind coc --show-focus")
-    tinted = pixels("tint.png")
-    assert tinted[0, :, 0, [7, 8, 15, 16]].argmax(dim=0).tolist() == [0, 1, 1, 2]
-    assert torch.equal(tinted[0, 0, :, :6], tinted[0, 2, :, :6])
+    assert pixels("tint.png")[0, :, 0, [0, 8, 16]].argmax(dim=0).tolist() == [0, 1, 2]
+
+
+def test_the_tint_of_the_focus_turns_without_a_jump_and_leaves_what_is_transparent() -> None:
+    coc_px = torch.linspace(-4.0, 4.0, 1601)[None, None, None]
+    premultiplied = torch.full((1, 4, 1, 1601), 0.4)
+    premultiplied[..., :400] = 0.0
+    tinted = tint_focus(premultiplied, coc_px, has_alpha=True)
+    assert float(tinted[..., 400:].diff(dim=-1).abs().max()) < 0.002
+    assert bool((tinted[..., :400] == 0).all())
 
 
 def test_json_has_the_facts_of_the_line(depth: Tensor, run: Run) -> None:
@@ -253,7 +261,7 @@ def test_json_has_the_facts_of_the_line(depth: Tensor, run: Run) -> None:
     assert there == {"out": "out.0001.exr", "is_there_already": True}
     assert [frame["out"] for frame in frames] == ["out.0002.exr", "out.0003.exr"]
     radius = float(CAMERA.replace(focus_m=math.inf).coc_px(depth, 24).abs().max())
-    camera: dict[str, Any] = {"focus_m": "inf", "f_number": 1.4, "focal_length_mm": 50.0, "sensor_width_mm": 4.0}
+    camera: dict[str, Any] = {"focus_m": "inf", "f_number": 1.2, "focal_length_mm": 50.0, "sensor_width_mm": 4.0}
     camera |= {"focus_range_m": None, "tilt_deg": 0.0, "swing_deg": 0.0}
     expected: dict[str, Any] = {
         "out": "out.0002.exr",
@@ -379,3 +387,167 @@ def test_the_folder_of_the_output_is_made(run: Run) -> None:
     assert read_image("new/folder/out.exr").pixels.shape[-1] == 24
     run(f"inspect image.exr depth.npy -o other/sheet.png --focus-m 2 {LENS}")
     assert Path("other/sheet.png").is_file()
+
+
+# The first command
+
+
+def guessed(command: str) -> tuple[str, str]:
+    """What a command prints, and what it notes."""
+    told = CliRunner().invoke(app, command.split(), catch_exceptions=False)
+    assert told.exit_code == 0
+    return told.stdout, told.stderr
+
+
+GREY = (
+    "taken for relative depth (else --depth-kind), larger is nearer (else --relative-kind depth), from 1 to 8 m (else "
+    "--near-m, --far-m)"
+)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "sample", "noted"),
+    [(20, 250, "uint8", GREY), (3000, 65500, "uint16", GREY), (900, 5000, "uint16", "taken for millimetres")],
+)
+def test_the_first_command_needs_no_option(run: Run, low: int, high: int, sample: str, noted: str) -> None:
+    """A subject in front of a slope: it is sharp, and the rest is blurred by 2 % of the width."""
+    size = (80, 120)
+    image = torch.rand(1, 3, *size, generator=torch.Generator().manual_seed(3))
+    write_image("photo.png", Picture(image, sample="8", transfer="srgb"))
+    far, near = (high, low) if "millimetres" in noted else (low, high)
+    values = np.repeat(np.linspace(far, (far + near) / 2, size[0])[:, None], size[1], 1)
+    values[20:, 40:80] = near
+    store("depth.png", values.astype(sample)[..., None], sample, ("Y",))
+    line, note = guessed("render photo.png depth.png -o out.png")
+    assert note.count("\n") == 1 and note.startswith(f"note: depth.png: {noted}")
+    assert "blur radius up to 2.4 px" in line and "f-number for a blur of 2% of the width" in line
+    assert "focus on what is nearest the middle" in line
+    before, after = pixels("photo.png"), pixels("out.png")
+    torch.testing.assert_close(after[..., 45:, 50:70], before[..., 45:, 50:70], rtol=0, atol=0.01)
+    assert float((after - before)[..., :12, :].abs().mean()) > 0.05
+
+
+def test_metres_are_said_to_be_taken_for_such_unless_the_focus_is_in_metres(depth: Tensor, run: Run) -> None:
+    line, note = guessed("render image.exr depth.npy -o out.exr")
+    assert note.startswith("note: depth.npy: taken for metres") and line.startswith("out.exr: focus 2 m")
+    assert guessed(f"{ONE} {LENS}")[1] == ""
+    holed = depth.clone()
+    holed[..., 3, 4:6] = 0.0
+    np.save("depth.npy", holed.numpy())
+    assert "2 px of depth filled (far)" in guessed("render image.exr depth.npy -o out.exr")[0]
+    assert "no depth" in run(f"{ONE} {LENS}", code=2)
+
+
+def test_a_lens_in_the_file_blurs_a_first_picture_where_that_is_seen(image: Tensor, run: Run) -> None:
+    for f_number, words in ((1.8, "f/1.8,"), (64.0, "f-number for a blur of 2% of the width")):
+        tags = {"Exif:FocalLength": 85.0, "FNumber": f_number, "Exif:FocalLengthIn35mmFilm": 85.0}
+        write_image("photo.exr", Picture(image, metadata={name: ("float", value) for name, value in tags.items()}))
+        assert words in run("render photo.exr depth.npy -o out.exr")
+
+
+# How much blur
+
+
+def test_blur_is_a_share_of_the_width_for_what_is_blurred_most(depth: Tensor, run: Run) -> None:
+    for focus in ("--focus-m 2", "--focus-m 5", "--focus-at 21,5"):
+        for lens in ("", " --focal-length-mm 85", " --fov-deg 40"):
+            line = run(f"render image.exr depth.npy -o out.exr {focus}{lens} --blur 10%")
+            assert "blur radius up to 2.4 px" in line and "f-number" not in line
+    f_number = float(re.search(r"f/([\d.]+)", run(f"{ONE} --blur 10%")).group(1))  # type: ignore[union-attr]
+    expected = torchdof.Camera(50.0, f_number, 2.0)
+    assert float(expected.coc_px(depth, 24).max()) == pytest.approx(2.4, rel=0.01)
+
+
+@pytest.mark.parametrize(("size", "sensor_mm"), [((16, 24), 36.0), ((24, 16), 24.0)])
+def test_an_equivalent_lens_is_that_of_full_frame_however_the_picture_is_held(
+    run: Run, size: tuple[int, int], sensor_mm: float
+) -> None:
+    tags = {"Exif:FocalLength": 5.7, "FNumber": 1.8, "Exif:FocalLengthIn35mmFilm": 26.0}
+    image, depth = torch.rand(1, 3, *size), torch.full((1, 1, *size), 6.0)
+    depth[..., : size[0] // 2, :] = 1.5
+    write_image("phone.exr", Picture(image, sample="float", metadata={n: ("float", v) for n, v in tags.items()}))
+    np.save("metres.npy", depth.numpy())
+    camera = torchdof.Camera(85.0, 1.4, 1.5, sensor_mm)
+    for said in ("85mm,1.4", "85,1.4", "85mm,f/1.4"):
+        line = run(f"render phone.exr metres.npy -o out.exr --bits float --focus-m 1.5 --equivalent {said}")
+        assert f"f/1.4, 85 mm on {sensor_mm:g} mm" in line and "[" not in line
+    expected = torchdof.depth_of_field(image, depth, camera)
+    torch.testing.assert_close(pixels("out.exr"), expected, rtol=0, atol=1e-6)
+    line = run("render phone.exr metres.npy -o out.exr --depth-kind relative --relative-kind depth --equivalent 85,1.4")
+    assert "focus 1 m, f/1.4" in line and "depth from 1 to 8 m assumed" in line
+
+
+def test_blur_that_is_hardly_seen_says_what_makes_more_of_it(run: Run) -> None:
+    for options, advice in (
+        ("--f-number 8", "a smaller --f-number, or --blur 2% makes more of it"),
+        ("--blur 2%", "a larger --blur makes more of it"),
+        ("--fov-deg 40 --aperture-radius-m 0.001", "a larger --aperture-radius-m, or --blur 2%"),
+        ("--equivalent 35mm,8", "a smaller --equivalent f-number, or --blur 2%"),
+        ("--focus-range 1,9", "nothing is blurred, for all depth is in focus"),
+    ):
+        focus = "" if "range" in options else "--focus-m 2"
+        note = guessed(f"render image.exr depth.npy -o out.exr {focus} {options}")[1]
+        assert note.startswith("note: out.exr: ") and advice in note and note.count("\n") == 1
+    note = guessed(f"{SEQUENCE} --focus-m 2 --f-number 8")[1]
+    assert note.count("\n") == 1 and "a smaller --f-number makes more of it" in note
+    assert guessed(f"{ONE} {LENS}")[1] == ""
+
+
+# More than one picture of a still
+
+
+def test_a_sheet_shows_before_depth_and_after(image: Tensor, depth: Tensor, run: Run) -> None:
+    large = {"mode": "bilinear", "size": (160, 240)}
+    image = torch.nn.functional.interpolate(image, **large)  # type: ignore[arg-type]
+    write_image("photo.png", Picture(image, sample="8", transfer="srgb"))
+    np.save("metres.npy", torch.nn.functional.interpolate(depth, (160, 240)).numpy())
+    line = run("render photo.png metres.npy -o out.png --focus-m 2 --blur 2% --sheet look/sheet.png")
+    assert "sheet look/sheet.png" in line
+    sheet = pixels("look/sheet.png")
+    assert sheet.shape[-1] == 3 * 240 + 4 * 8
+    before, middle, after = (sheet[..., 34:194, 8 + k * 248 : 248 + k * 248] for k in range(3))
+    torch.testing.assert_close(before, pixels("photo.png"), rtol=0, atol=0.01)
+    torch.testing.assert_close(after, pixels("out.png"), rtol=0, atol=0.01)
+    assert float(middle[..., :118].min()) > 0.99 and float(middle[..., 122:].max()) < 0.01
+    coc_px = np.tile(np.repeat([-4.0, 4.0], 120), (160, 1))
+    np.save("coc.npy", coc_px)
+    run("render photo.png coc.npy -o out.png --depth-kind coc --sheet sheet.png")
+    colours = pixels("sheet.png")[0, :, 100, 256:496]
+    assert colours[:, :120].argmax(0).eq(0).all() and colours[:, 120:].argmax(0).eq(2).all()
+
+
+def test_a_still_whose_focus_moves_is_a_file_a_frame_with_one_opening(image: Tensor, depth: Tensor, run: Run) -> None:
+    line = f"render image.exr depth.npy -o pull.##.exr --focus-m 2:2,4:6 {LENS}"
+    told = run(line).splitlines()
+    assert [part.partition(" m,")[0] for part in told] == [
+        f"pull.0{n}.exr: focus {m}" for n, m in ((2, 2), (3, 3), (4, 6))
+    ]
+    for n, focus_m in ((2, 2.0), (3, 3.0), (4, 6.0)):
+        expected = torchdof.depth_of_field(image, depth, CAMERA.replace(focus_m=focus_m))
+        torch.testing.assert_close(pixels(f"pull.{n:02d}.exr"), expected, rtol=0, atol=1e-5)
+    Path("pull.03.exr").unlink()
+    assert run(f"{line} --resume").splitlines()[0] == "2 of 3 frames are there already"
+    assert len(run(f"{line} --frames 3-4").splitlines()) == 2
+    told = run("render image.exr depth.npy -o pull.##.exr --focus-m 1:2,3:6 --blur 10%").splitlines()
+    assert len({re.search(r"f/[\d.]+", part).group() for part in told}) == 1  # type: ignore[union-attr]
+    radii = [float(re.search(r"up to ([\d.]+) px", part).group(1)) for part in told]  # type: ignore[union-attr]
+    assert max(radii) == 2.4 and radii[1] < 2.4
+    assert guessed("render image.exr depth.npy -o pull.##.exr --focus-m 1:2,3:6 --f-number 9")[1].count("note:") == 1
+
+
+def test_a_picture_of_one_depth_is_said_to_be_all_in_focus(run: Run) -> None:
+    np.save("flat.npy", np.full((16, 24), 3.0))
+    line, note = guessed("render image.exr flat.npy -o out.exr")
+    assert "nothing is blurred" in note and "f-number assumed" in line and "f-number for" not in line
+
+
+def test_a_stray_pixel_does_not_take_the_blur_from_all_others(image: Tensor, depth: Tensor, run: Run) -> None:
+    large = torch.nn.functional.interpolate(depth, (80, 120))
+    write_image("large.exr", Picture(torch.nn.functional.interpolate(image, (80, 120)), sample="float"))
+    openings = []
+    for stray_m in (2.0, 0.1):
+        large[..., 40, 90] = stray_m
+        np.save("large.npy", large.numpy())
+        line = run("render large.exr large.npy -o out.exr --focus-m 2 --blur 4% --depth-edges as-given")
+        openings.append(re.search(r"f/([\d.]+)", line).group(1))  # type: ignore[union-attr]
+    assert openings[0] == openings[1]

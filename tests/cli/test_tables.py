@@ -20,13 +20,15 @@ def test_the_picture_shows_kernels_of_the_foreground_above_those_of_the_backgrou
 ) -> None:
     BlurTable.gaussian().save("mine.json")
     output = run("tables disc mine.json --blades 3 --rotation 90 -o kernels.png")
-    assert "3 blades, turned by 90" in output and "-24, -12" in output
+    assert "3 blades, turned by 90" in output and "negative is in front of focus" in output
     picture = read_image("kernels.png").pixels[0, 0]
-    assert picture.shape == (6 * 120 + 34 + 8, 2 * 230 + 3 * 8)
+    assert picture.shape == (6 * 200 + 34 + 8, 76 + 2 * 230 + 3 * 8)
     for row, behind in ((0, False), (5, True)):
-        kernel = picture[34 + row * 120 : 34 + (row + 1) * 120, 8:238]
+        kernel = picture[34 + row * 200 : 34 + (row + 1) * 200, 84:314]
         left, right = kernel[:, :115].sum(), kernel[:, 115:].sum()
         assert (left > right) != behind  # the triangle's corner points left behind focus
+        label = picture[34 + row * 200 : 34 + (row + 1) * 200, 8:84]
+        assert bool((label[80:120] < 0.1).any()) and bool((label[:70] > 0.7).all()), "a label beside its row"
 
 
 def test_tables_that_vary_across_the_field_show_kernels_from_the_centre_to_the_corner(
@@ -35,8 +37,8 @@ def test_tables_that_vary_across_the_field_show_kernels_from_the_centre_to_the_c
     output = run("tables disc --vignetting 0.6 -o kernels.png")
     assert "vignetting 0.6" in output
     picture = read_image("kernels.png").pixels[0, 0]
-    rows = picture[34 + 5 * 120 + 2 : 34 + 6 * 120, 8 : 8 + 4 * 118]
-    lit = [float((part > 0.1).sum()) for part in rows.split(118, 1)]
+    rows = picture[34 + 5 * 200 + 2 : 34 + 6 * 200, 84 : 84 + 4 * 198]
+    lit = [float((part > 0.1).sum()) for part in rows.split(198, 1)]
     assert lit[0] > 1.1 * lit[1] > 1.2 * lit[2] > 1.2 * lit[3]
 
 

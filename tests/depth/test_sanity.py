@@ -111,6 +111,16 @@ def test_relative_depth_of_8_bits_gives_a_warning(metres: torch.Tensor) -> None:
         check(relative, Camera(focus_m=0.4))
 
 
+def test_values_from_0_to_1_give_a_warning_wherever_the_focus_lies() -> None:
+    shares = torch.linspace(0.0, 1.0, 96).expand(1, 1, 64, 96)
+    for focus_m in (0.2, 0.9):
+        camera = Camera(focal_length_mm=5.0, sensor_width_mm=6.0, focus_m=focus_m)
+        (mistake,) = depth_mistakes(shares, camera)
+        assert mistake.name == "bits" and "between 0 and 1 (" in mistake.message and "relative" in mistake.message
+        assert depth_mistakes(shares, camera, "relative") == []
+        assert depth_mistakes(0.3 + 0.6 * shares, camera) == []  # a close-up
+
+
 def test_disparity_without_its_scale_gives_a_warning(metres: torch.Tensor) -> None:
     (mistake,) = depth_mistakes(metres / 192.03, Camera(focus_m=3.0), "inverse")
     assert "the baseline in metres times the focal length in pixels (--depth-scale, not given)" in mistake.message

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 import click
 
 from .command import argument, option
-from .options import Blur, Scene, json_option
+from .options import Blur, check_files, json_option
 from .printed import WarnOnce, json_line
+from .scene import Scene
 
 if TYPE_CHECKING:
     from ..bench.measurement import BenchScene
@@ -55,7 +56,7 @@ class Bench:
 
         torchdof bench photo.png depth.exr --f-number 1.8 --out results
 
-    Camera, depth and blur are told as to torchdof render; without a focus it is at the median depth.
+    Camera, depth and blur are told as to torchdof render, and found as there.
 
     torchdof and simpler renderers against scenes whose depth of field is known, beside GEGL:
 
@@ -92,6 +93,8 @@ class Bench:
         if self.image is None and self.scene != Scene():
             raise ValueError("the built-in scene has its own camera and depth; name an IMAGE for these options")
         self.scene.lens.refuse_keyframes()
+        if self.image is not None:
+            check_files(self.image, self.depth, None)
         needed = {"matplotlib": self.out is not None, "onnxruntime": self.speed.onnx}
         for package, is_needed in needed.items():  # before the time is spent
             if is_needed and importlib.util.find_spec(package) is None:
@@ -155,8 +158,8 @@ class Bench:
         from .frame import coc_of, read_frame
 
         frame = read_frame(image, self.depth, self.scene)
-        coc_px, camera, remarks = coc_of(frame, self.scene, WarnOnce(self.scene.depth_map.strict), median=True)
-        if self.scene.lens.has_focus:
-            remarks = ["focus as stated", *remarks]
+        coc_px, camera, remarks = coc_of(frame, WarnOnce(self.scene.depth_map.strict))
+        remarks = ["focus as stated"] * self.scene.lens.has_focus + remarks
+        remarks += [f"depth {frame.guess}"] if frame.guess else []
         words = "blur as given" if camera is None else f"{camera!r}; {', '.join(remarks)}"
         return BenchScene(image.name, frame.picture.light, coc_px, words)

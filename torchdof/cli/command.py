@@ -7,15 +7,17 @@ heads them in ``--help``. Nothing here imports PyTorch, so that help and wrong a
 import contextlib
 import dataclasses
 import inspect
+import math
+import re
 import types
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import click
 
-__all__ = ["argument", "command_of", "numbers", "option", "word_or_number"]
+__all__ = ["argument", "by_option", "command_of", "numbers", "option", "word_or_number"]
 
 _TYPES: dict[Any, click.ParamType] = {
     **{str: click.STRING, int: click.INT, float: click.FLOAT, bool: click.BOOL},
@@ -32,6 +34,7 @@ def option(
     read: Callable[[str], Any] | None = None,
     group: str = "",
     least: int | None = None,
+    positive: bool = False,
     basic: bool = False,
 ) -> Any:
     """A field that is an option of a command.
@@ -44,9 +47,11 @@ def option(
         read: Makes the value of its text; a ``ValueError`` says what was expected.
         group: The heading in the help that it stands under, if not its class's.
         least: The smallest whole number.
+        positive: Whether it must be greater than 0, and finite.
         basic: Whether it stands first in the help, before the groups.
     """
     facts = {"help": help, "names": names, "metavar": metavar, "read": read, "least": least}
+    facts["positive"] = positive
     facts["group"] = "Options" if basic else group
     return dataclasses.field(**({} if default is ... else {"default": default}), metadata=facts)
 
@@ -72,6 +77,16 @@ def numbers(count: int | None, expected: str) -> Callable[[str], tuple[float, ..
 def word_or_number(words: tuple[str, ...], expected: str) -> Callable[[str], float | str]:
     """Reads one of some words, or a number; what was expected is the message where it is neither."""
     return lambda text: text if text in words else numbers(1, expected)(text)[0]
+
+
+@contextlib.contextmanager
+def by_option(names: Mapping[str, str]) -> Iterator[None]:
+    """Has a refusal say the option's name where it says its own."""
+    try:
+        yield
+    except ValueError as error:
+        pattern = re.compile(r"\b(" + "|".join(names) + r")\b")
+        raise ValueError(pattern.sub(lambda found: names[found.group()], str(error))) from None
 
 
 class _Command(click.Command):
@@ -135,6 +150,8 @@ def _parameter(field: Any, hint: Any) -> click.Parameter:
         given["type"] = click.Choice(typing.get_args(hint))
     else:
         given["type"] = _TYPES[hint] if facts["least"] is None else click.IntRange(min=facts["least"])
+    if facts["positive"]:
+        given["callback"] = _positive
     if not required and field.default not in (None, ()):
         given["default"] = field.default
     if facts["names"] == ("argument",):
@@ -144,6 +161,13 @@ def _parameter(field: Any, hint: Any) -> click.Parameter:
     else:
         given |= {"multiple": several, "show_default": bool(field.default) and not required}
     return click.Option([field.name, *(facts["names"] or (f"--{field.name.replace('_', '-')}",))], **given)
+
+
+def _positive(_: click.Context, parameter: click.Parameter, value: float | None) -> float | None:
+    """A number that is greater than 0 and finite, or none."""
+    if value is not None and not 0 < value < math.inf:
+        raise ValueError(f"{parameter.opts[0]} must be positive and finite, got {value:g}")
+    return value
 
 
 def _made(kind: type[Any], values: dict[str, Any]) -> Any:

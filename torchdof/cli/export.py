@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .command import option
-from .options import Accuracy, Blur, Sensor, edges_option, json_option
+from .options import Accuracy, Blur, edges_option, json_option
 from .printed import Bar, tell
+from .scene import Sensor
 
 __all__ = ["Export"]
 

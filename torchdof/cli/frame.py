@@ -6,34 +6,38 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor
 
 from ..depth.holes import resolve_holes
-from ..depth.inspect import tint_focus
+from ..depth.inspect import coc_colours, depth_colours, tint_focus
 from ..depth.kinds import depth_from_values
 from ..depth.relative import from_relative
-from ..depth.sanity import coc_mistakes, depth_mistakes
+from ..depth.sanity import Mistake, coc_mistakes, depth_mistakes
 from ..io.highlights import expand_highlights
 from ..io.images import Picture, read_image, read_values, write_image
+from ..io.sheet import shrunk, write_sheet
 from ..module import blur_by_coc
 from ..optics.blur_table import BlurTable
 from ..optics.camera import CAMERA_NUMBERS, Camera
 from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect, stretch
-from .options import Scene, make_folder_of, pick_device, refuse_input
-from .printed import Bar, WarnOnce, tell
+from .options import make_folder_of, pick_device
+from .printed import Bar, WarnOnce, note, tell
+from .scene import Scene
 
 if TYPE_CHECKING:
     from .render import Render
 
 __all__ = ["Frame", "Rendered", "Renderer", "coc_of", "facts_of_camera", "read_frame"]
 
+_HARDLY_PX = 2.0  # radius of blur below which people think that nothing happened
 _LARGE_PX = 8_000_000  # pixels from which on people ask how long it takes
 _STRIPS = 16
+_PANEL_PX = 800  # of the longer side of a panel
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,41 +45,58 @@ class Frame:
     """An image and its depth, as read."""
 
     name: str  # of the file that the depth is from
+    scene: Scene  # as stated, with what was guessed
     picture: Picture
     values: Tensor  # [1, 1, H, W], depth in metres, or signed pixels for coc
     holes: int  # pixels that were filled
     seconds: float
     stretch: float  # by which part the depth was stretched along one axis to the shape of the image
+    guess: str  # what the depth was taken for, where nobody said it
+
+    def mistakes(self, camera: Camera) -> list[Mistake]:
+        """What looks wrong with the depth, seen by a camera."""
+        said = self.scene.depth_map
+        kind: Any = said.depth_kind
+        return depth_mistakes(self.values, camera, kind, said.depth_scale)
 
     @property
     def remarks(self) -> list[str]:
         """What was done to the depth that nobody asked for."""
-        return [f"depth stretched by {self.stretch:.1%}"] if self.stretch else []
+        said, remarks = self.scene.depth_map, [f"depth stretched by {self.stretch:.1%}"] if self.stretch else []
+        if said.depth_kind == "relative" and None in (said.near_m, said.far_m):
+            remarks.append("depth from {:g} to {:g} m assumed".format(*said.ends_m))
+        return remarks
 
 
 def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = False, **encoding: Any) -> Frame:
     """Reads an image, as :func:`torchdof.io.images.read_image` does, and its depth, which may be a channel of it.
 
-    With ``holes``, those that nobody said how to fill stay NaN; otherwise they are a ``ValueError``.
+    Where nobody said what the depth is, it is guessed. With ``holes``, those that nobody said how to fill
+    stay NaN; otherwise they are a ``ValueError``.
     """
-    start, name, fill = time.perf_counter(), str(depth or image), scene.depth_map.fill_depth
+    start, source, guess = time.perf_counter(), depth or image, ""
     picture, filled = read_image(image, **encoding), 0
-    values, stretched = _metres(image, depth, picture, scene)
-    if fill is not None or not holes:
-        values, filled = resolve_holes(values, name, fill)  # type: ignore[arg-type]
-    return Frame(name, picture, values, filled, time.perf_counter() - start, stretched)
-
-
-def _metres(image: Path, depth: Path | None, picture: Picture, scene: Scene) -> tuple[Tensor, float]:
-    """Depth in metres (signed pixels for coc), ``[1, 1, H, W]`` of the image's size, NaN in holes; its stretch."""
-    said, name, pixels = scene.depth_map, str(depth or image), picture.pixels
-    kind = said.depth_kind
-    if depth is not None or said.depth_channel is not None:
-        values = read_values(depth or image, said.depth_channel)
+    if depth is not None or scene.depth_map.depth_channel is not None:
+        values = read_values(source, scene.depth_map.depth_channel)
     elif picture.depth is not None:
         values = picture.depth
     else:
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH")
+    if scene.depth_map.depth_kind == "auto":
+        said, guess = scene.depth_map.guessed(values, source, scene.lens.speaks_of_metres)
+        fill = scene.depth_map.fill_depth if holes else said.fill_depth
+        scene = dataclasses.replace(scene, depth_map=dataclasses.replace(said, fill_depth=fill))
+    values, stretched = _metres(values, str(source), picture, scene)
+    said, fill = scene.depth_map, cast(Any, scene.depth_map.fill_depth)
+    if fill is not None or not holes:
+        values, filled = resolve_holes(values, str(source), fill, said.depth_kind == "relative")
+    return Frame(str(source), scene, picture, values, filled, time.perf_counter() - start, stretched, guess)
+
+
+def _metres(values: Tensor, name: str, picture: Picture, scene: Scene) -> tuple[Tensor, float]:
+    """Depth in metres (signed pixels for coc), ``[1, 1, H, W]`` of the image's size, NaN in holes; its stretch."""
+    said, pixels = scene.depth_map, picture.pixels
+    kind: Any = said.depth_kind
     sizes = [f"{t.shape[-1]} x {t.shape[-2]}" for t in (values, pixels)]
     if kind == "coc" and sizes[0] != sizes[1]:
         raise ValueError(f"{name}: coc is {sizes[0]} pixels but the image is {sizes[1]}; they must be the same")
@@ -83,8 +104,8 @@ def _metres(image: Path, depth: Path | None, picture: Picture, scene: Scene) -> 
         same_aspect(pixels, values)
         stretched = stretch(pixels, values)
         if kind == "relative":
-            ends, relative = (said.near_m or 0.0, said.far_m or 0.0), said.relative_kind or "disparity"
-            values = from_relative(values, *ends, relative, value_range=said.value_range, unknown=said.depth_unknown)
+            options: dict[str, Any] = {"value_range": said.value_range, "unknown": said.depth_unknown}
+            values = from_relative(values, *said.ends_m, said.relative_kind or "disparity", **options)
             return at_size_of(pixels, values), stretched
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
@@ -97,22 +118,24 @@ def _metres(image: Path, depth: Path | None, picture: Picture, scene: Scene) -> 
 
 
 def coc_of(
-    frame: Frame, scene: Scene, warned: WarnOnce, number: int = 0, median: bool = False
+    frame: Frame, warned: WarnOnce, number: int = 0, is_still: bool = True
 ) -> tuple[Tensor, Camera | None, list[str]]:
     """Signed radius ``[1, 1, H, W]`` in pixels; the camera, None for ``--depth-kind coc``; remarks as it has them.
+
+    The number is that of the frame, for focus that moves.
 
     Raises:
         ValueError: If the lens makes no sense, or something looks like a mistake and ``warned`` is strict.
     """
-    said, values = scene.depth_map, frame.values
+    said, lens, values = frame.scene.depth_map, frame.scene.lens, frame.values
     if said.depth_kind == "coc":
         warned.warn(frame.name, coc_mistakes(values))
         return values, None, []
-    camera, remarks = scene.lens.camera(frame.picture.metadata, values, number, median)
+    camera, remarks = lens.camera(frame.picture.metadata, values, number, is_still, said.is_to_scale)
     remarks += frame.remarks
     coc_px = camera.coc_px(values, values.shape[-1])
-    coc_of_lens(coc_px, values, scene.lens.stated(camera))
-    warned.warn(frame.name, depth_mistakes(values, camera, said.depth_kind, said.depth_scale))
+    coc_of_lens(coc_px, values, lens.stated(camera))
+    warned.warn(frame.name, frame.mistakes(camera))
     return coc_px, camera, remarks
 
 
@@ -123,10 +146,12 @@ def facts_of_camera(camera: Camera) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Rendered:
-    """A picture, the file it goes to, its report as words for people and facts for programs, and its seconds."""
+    """A picture, the file it goes to, its report as notes and words for people and facts for programs, its seconds."""
 
     out: Path
     picture: Picture
+    panels: dict[str, Tensor]  # of a sheet, by their captions
+    notes: dict[str, str]  # what was taken for granted, each told once
     words: list[str]
     facts: dict[str, Any]
     seconds: float
@@ -135,21 +160,21 @@ class Rendered:
 class Renderer:
     """What ``torchdof render`` does with each frame: reads, renders and writes it."""
 
-    def __init__(self, command: "Render") -> None:
-        self.command, self.table = command, command.blur.chosen()
+    def __init__(self, command: "Render", scene: Scene, is_still: bool = True) -> None:
+        self.command, self.scene, self.is_still = command, scene, is_still
+        self.table, self._noted = command.blur.chosen(), set[str]()
         self.device, self.warned = pick_device(command.device), WarnOnce(command.scene.depth_map.strict)
 
-    def read(self, image: Path, depth: Path | None, out: Path) -> Frame:
-        """As :func:`read_frame`, unless the result would take the place of what is read."""
-        refuse_input(out, image, depth)
+    def read(self, image: Path, depth: Path | None) -> Frame:
+        """As :func:`read_frame`, encoded as the command says."""
         files = self.command.files
-        return read_frame(image, depth, self.command.scene, transfer=files.transfer, layer=files.layer)
+        return read_frame(image, depth, self.scene, transfer=files.transfer, layer=files.layer)
 
     def render(self, frame: Frame, out: Path, number: int = 0, bar: Bar | None = None) -> Rendered:
         """The picture of a frame; the bar is told how long a large one takes. Raises as :func:`coc_of`."""
         start, picture, command = time.perf_counter(), frame.picture, self.command
         frame = dataclasses.replace(frame, values=frame.values.to(self.device))
-        coc_px, camera, remarks = coc_of(frame, command.scene, self.warned, number)
+        coc_px, camera, remarks = coc_of(frame, self.warned, number, self.is_still)
         pixels = picture.pixels.to(self.device)
         if command.show_focus:
             pixels = tint_focus(pixels, coc_px, picture.has_alpha)
@@ -166,26 +191,39 @@ class Renderer:
                 if bar is not None and bar.is_seen and coc_px.numel() > _LARGE_PX:
                     bar.update(f"rendering {out.name}, about {_seconds(blur, pixels, coc_px):.0f} s")
                 pixels = blur(pixels, coc_px, attention=command.attention)
-        words, facts = self._told(camera, float(coc_px.abs().max()), frame.holes)
+        largest_px, notes = float(coc_px.abs().max()), dict[str, str]()
+        if frame.guess:
+            notes["guess"] = f"{frame.name}: {frame.guess}"
+        if camera is not None and largest_px < _HARDLY_PX:
+            notes["blur"] = f"{out}: {command.scene.lens.more_blur(largest_px, self.is_still)}"
+        words, facts = self._told(camera, largest_px, frame)
         facts |= {"assumed": remarks, "width": pixels.shape[-1], "height": pixels.shape[-2]}
         seconds = frame.seconds + time.perf_counter() - start
-        return Rendered(out, dataclasses.replace(picture, pixels=pixels), words, facts, seconds)
+        picture = dataclasses.replace(picture, pixels=pixels)
+        panels = _panels(frame, coc_px, picture) if command.files.sheet else {}
+        return Rendered(out, picture, panels, notes, words, facts, seconds)
 
     def write(self, rendered: Rendered) -> None:
-        """Writes the picture, whole or not at all, and prints one line."""
-        start, files, out = time.perf_counter(), self.command.files, str(rendered.out)
+        """Writes the picture, whole or not at all, and its sheet, and prints one line."""
+        start, files = time.perf_counter(), self.command.files
         make_folder_of(rendered.out)
         write_image(rendered.out, rendered.picture, files.out_transfer, files.bits)
+        if rendered.panels and files.sheet is not None:
+            make_folder_of(files.sheet)
+            write_sheet(files.sheet, rendered.panels)
+            rendered.words.append(f"sheet {files.sheet}")
         seconds = rendered.seconds + time.perf_counter() - start
-        facts = {"out": out, **rendered.facts, "seconds": seconds}
+        facts = {"out": str(rendered.out), **rendered.facts, "seconds": seconds}
         remarks = f" [{', '.join(facts['assumed'])}]" if facts["assumed"] else ""
+        note(*(line for name, line in rendered.notes.items() if name not in self._noted))
+        self._noted |= set(rendered.notes)
         words = [*rendered.words, f"{facts['width']} x {facts['height']}", f"{seconds:.2f} s on {facts['device']}"]
-        tell(self.command.as_json, facts, f"{out}: {'; '.join(words)}{remarks}")
+        tell(self.command.as_json, facts, f"{rendered.out}: {'; '.join(words)}{remarks}")
 
-    def _told(self, camera: Camera | None, largest_px: float, holes: int) -> tuple[list[str], dict[str, Any]]:
+    def _told(self, camera: Camera | None, largest_px: float, frame: Frame) -> tuple[list[str], dict[str, Any]]:
         """What was done to a frame, for people and for programs."""
         command, table, words = self.command, self.table, list[str]()
-        facts: dict[str, Any] = {"camera": None, "largest_coc_px": largest_px, "filled_px": holes}
+        facts: dict[str, Any] = {"camera": None, "largest_coc_px": largest_px, "filled_px": frame.holes}
         facts |= {"show_focus": command.show_focus, "device": str(self.device)}
         if camera is not None:
             ends, angles = camera.focus_range_m, {"tilt": camera.tilt_deg, "swing": camera.swing_deg}
@@ -208,8 +246,17 @@ class Renderer:
             facts |= {name: getattr(options, name) for name in ("method", "occlusion", "tolerance")}
             facts |= {"attention": command.attention, "lights": command.lights}
             words += [f"lights up to {command.lights:g} stops above white"] if command.lights else []
-        words += [f"{holes} px of depth filled ({command.scene.depth_map.fill_depth})"] if holes else []
+        words += [f"{frame.holes} px of depth filled ({frame.scene.depth_map.fill_depth})"] if frame.holes else []
         return words, facts
+
+
+def _panels(frame: Frame, coc_px: Tensor, after: Picture) -> dict[str, Tensor]:
+    """Pictures of a sheet, each ``[1, 3, H, W]`` in linear light, by their captions."""
+    middle = {"depth: near is bright": depth_colours(frame.values)}
+    if frame.scene.depth_map.depth_kind == "coc":
+        middle = {"blur radius: near orange, far blue": coc_colours(coc_px)}
+    panels = {"before": frame.picture.light, **middle, "after": after.light}
+    return {name: shrunk(panel.cpu(), _PANEL_PX).expand(-1, 3, -1, -1) for name, panel in panels.items()}
 
 
 def _seconds(blur: Callable[..., Tensor], pixels: Tensor, coc_px: Tensor) -> float:

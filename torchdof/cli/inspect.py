@@ -4,8 +4,9 @@ import dataclasses
 from pathlib import Path
 
 from .command import argument, option
-from .options import Scene, json_option, make_folder_of, refuse_input
-from .printed import WarnOnce, tell
+from .options import check_files, json_option, make_folder_of
+from .printed import WarnOnce, note, tell
+from .scene import Scene
 
 __all__ = ["Inspect"]
 
@@ -19,7 +20,7 @@ class Inspect:
 
         torchdof inspect photo.jpg depth.png --depth-scale 0.001 --focus-at 320,200 --f-number 1.8
 
-    The lens is found as for torchdof render; without a focus it is at the median depth.
+    Focus and lens are found as for torchdof render.
     """
 
     image: Path = argument("All-in-focus image, as for torchdof render.", "IMAGE")
@@ -36,18 +37,17 @@ class Inspect:
         if self.scene.depth_map.depth_kind == "coc":
             raise ValueError("--depth-kind coc is the blur itself: there is no depth to inspect")
         target = Path(f"{self.image.stem}.inspect.png") if self.out is None else self.out
-        refuse_input(target, self.image, self.depth)
+        check_files(self.image, self.depth, target)
         from ..depth.inspect import inspect_depth, panels
-        from ..depth.sanity import depth_mistakes
         from ..io.sheet import write_sheet
         from .frame import facts_of_camera, read_frame
 
-        said = self.scene.depth_map
         frame = read_frame(self.image, self.depth, self.scene, holes=True)
+        said = frame.scene.depth_map
         light, metres = frame.picture.light, frame.values
         if not bool((metres > 0).any()):
             raise ValueError(f"{frame.name}: no pixel has a depth; check the kind, scale and offset of the depth map")
-        camera, notes = self.scene.lens.camera(frame.picture.metadata, metres, median=True)
+        camera, notes = frame.scene.lens.camera(frame.picture.metadata, metres, is_to_scale=said.is_to_scale)
         notes += frame.remarks
         report = inspect_depth(light, metres, camera)
         make_folder_of(target)
@@ -62,4 +62,5 @@ class Inspect:
         facts = {"image": str(self.image), "width": width, "height": height, "camera": facts_of_camera(camera)}
         facts |= {"assumed": notes, **report.facts(), "filled_px": frame.holes, "picture": str(target)}
         tell(self.as_json, facts, "\n".join(lines))
-        WarnOnce(said.strict).warn(frame.name, depth_mistakes(metres, camera, said.depth_kind, said.depth_scale))
+        note(*([f"{frame.name}: {frame.guess}"] if frame.guess else []))
+        WarnOnce(said.strict).warn(frame.name, frame.mistakes(camera))

@@ -23,7 +23,7 @@ _EXTRAS = {
     **{"scipy": "fit", "threadpoolctl": "fit", "matplotlib": "plot"},
     **{"onnx": "export", "onnxscript": "export", "onnxruntime": "export"},
 }
-_TOO_LITTLE = "there is too little memory for this image; try a smaller one, or --tolerance draft"
+_TOO_LITTLE = "there is too little memory for this image; a smaller one, or a coarser --tolerance, takes less"
 # PyTorch's own words for it on the CPU are those of what it is built from
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "bad_alloc", "size calculation overflowed", "new thread")
 

@@ -1,236 +1,26 @@
-"""The options that several commands share: focus and lens, depth map, blur; what they mean, and what contradicts.
+"""The options that several commands share, besides those of the scene: the opening, blur, accuracy; files, device.
 
 PyTorch is imported when the first of them is put to use, so that help and contradictions are answered at once.
 """
 
-import contextlib
-import math
 import os
-import re
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ..io.metadata import camera_facts
-from ..io.sequence import focus_at_frame, parse_focus
-from .command import numbers, option, word_or_number
+from ..io.paths import existing_image, existing_map, samples_of
+from .command import by_option, option, word_or_number
 
 if TYPE_CHECKING:
     import torch
-    from torch import Tensor
 
     from ..optics.aperture import Aperture
     from ..optics.blur_table import BlurTable
-    from ..optics.camera import Camera
 
-__all__ = ["Accuracy", "Blur", "DepthMap", "Lens", "Opening", "Scene", "Sensor"]
-__all__ += ["edges_option", "json_option", "pick_device", "make_folder_of", "refuse_input"]
+__all__ = ["Accuracy", "Blur", "Opening"]
+__all__ += ["edges_option", "json_option", "pick_device", "make_folder_of", "check_files"]
 
-_ASSUMED = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
-_SPELLED = {"focus_range_m": "--focus-range", "tilt_deg": "--tilt", "swing_deg": "--swing", "fov_x_deg": "--fov-deg"}
 _IDEAL = ("disc", "gaussian")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sensor:
-    """Focus and lens."""
-
-    focal_length_mm: float | None = option("Real focal length, not the 35 mm equivalent.")
-    sensor_width_mm: float | None = option("36 for full frame.")
-    fov_deg: float | None = option("Horizontal field of view of a rendered image, instead of a lens.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Lens(Sensor):
-    """Focus and lens."""
-
-    focus_m: list[tuple[int, float]] | None = option(
-        "Distance in focus in metres (inf allowed), or keyframes frame:metres such as 1:2.0,48:5.5; between them "
-        "1/distance is linear, so that the blur changes evenly.",
-        metavar="METRES",
-        read=parse_focus,
-        basic=True,
-    )
-    focus_at: tuple[float, float] | None = option(
-        "Focus on what is seen at this pixel, counted from the top left; in a sequence, anew in each frame.",
-        metavar="X,Y",
-        read=numbers(2, "--focus-at expects a pixel X,Y such as 320,200"),
-        basic=True,
-    )
-    focus_range: tuple[float, float] | None = option(
-        "In focus from NEAR to FAR metres, blurred beyond; instead of --focus-m.",
-        metavar="NEAR,FAR",
-        read=numbers(2, "--focus-range expects two numbers such as 1.5,2.2"),
-    )
-    tilt: float = option("Degrees by which the lens is tilted down: focus comes nearer towards the bottom.", 0.0)
-    swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)
-    f_number: float | None = option("Smaller is blurrier.", basic=True)
-    aperture_radius_m: float | None = option("Radius of the opening, with --fov-deg.")
-
-    def __post_init__(self) -> None:
-        places = {"--focus-m": self.focus_m, "--focus-at": self.focus_at, "--focus-range": self.focus_range}
-        given = [name for name, place in places.items() if place is not None]
-        if len(given) > 1:
-            raise ValueError(f"{' and '.join(given)} both say where to focus; give one of them")
-        if self.fov_deg is None:
-            if self.aperture_radius_m is not None:
-                raise ValueError("--aperture-radius-m goes with --fov-deg; a real lens has --f-number instead")
-            return
-        if self.focal_length_mm is not None or self.sensor_width_mm is not None:
-            raise ValueError("--fov-deg and --focal-length-mm with --sensor-width-mm say the same; give one of them")
-        if not 0 < self.fov_deg < 180:
-            raise ValueError(f"--fov-deg must be a number of degrees > 0 and < 180, got {self.fov_deg:g}")
-        if self.f_number is not None and self.aperture_radius_m is not None:
-            raise ValueError("--f-number and --aperture-radius-m both say how wide the lens opens; give one of them")
-
-    @property
-    def has_focus(self) -> bool:
-        """Whether the user said where to focus."""
-        return (self.focus_m, self.focus_at, self.focus_range) != (None, None, None)
-
-    def refuse_keyframes(self) -> None:
-        """Refuse focus that moves, for a single image."""
-        if len(self.focus_m or []) > 1:
-            raise ValueError("--focus-m has keyframes but IMAGE is a single image; give one distance in metres")
-
-    def view_deg(self, metadata: Mapping[str, Any], width: int, height: int) -> float:
-        """Horizontal field of view, stated or by focal length and sensor, which the file may know."""
-        known = self._known(metadata, width, height)
-        if self.fov_deg is not None:
-            return self.fov_deg
-        if not {"focal_length_mm", "sensor_width_mm"} <= set(known):
-            raise ValueError("--depth-kind distance needs --fov-deg, or --focal-length-mm and --sensor-width-mm")
-        return 2 * math.degrees(math.atan2(known["sensor_width_mm"], 2 * known["focal_length_mm"]))
-
-    def _known(self, metadata: Mapping[str, Any], width: int, height: int) -> dict[str, float]:
-        """Numbers of the camera that the user or else the file states."""
-        stated = {name: value for name in _ASSUMED if (value := getattr(self, name)) is not None}
-        return camera_facts(metadata, width, height) | stated
-
-    def camera(
-        self, metadata: Mapping[str, Any], depth: "Tensor", frame: int = 0, median: bool = False
-    ) -> "tuple[Camera, list[str]]":
-        """The camera of one frame, and remarks on what the user did not state: the file does, or it is assumed.
-
-        With ``median``, the focus is at the median depth where the user said nothing, whatever the file says. Refuses
-        a focus that is stated nowhere, and numbers that make no lens, by the names of the options.
-        """
-        from ..optics.camera import Camera
-
-        height, width = depth.shape[-2:]
-        known, remarks, focus_m = self._known(metadata, width, height), list[str](), math.inf
-        if self.focus_m is not None:
-            focus_m = focus_at_frame(self.focus_m, frame)
-        elif not self.has_focus and median:
-            focus_m = float(depth[depth > 0].median())
-            remarks.append("focus at the median depth")
-        elif not self.has_focus:
-            if "focus_m" not in known:
-                raise ValueError("where is the focus? give --focus-m METRES or --focus-at X,Y (the file does not say)")
-            focus_m = known["focus_m"]
-            remarks.append("focus from the file")
-        if self.fov_deg is None:
-            for name in (name for name in _ASSUMED if getattr(self, name) is None):
-                words = "f-number" if name == "f_number" else name.rsplit("_", 1)[0].replace("_", " ")
-                remarks.append(f"{words} {'from the file' if name in known else 'assumed'}")
-        elif self.aperture_radius_m is None and self.f_number is None:
-            raise ValueError("--fov-deg needs the opening of the lens: either --aperture-radius-m or --f-number")
-        with _by_option(self._names()):
-            if self.fov_deg is None:
-                lens: dict[str, Any] = {name: known.get(name, assumed) for name, assumed in _ASSUMED.items()}
-                camera = Camera(**lens, focus_m=focus_m)
-            else:
-                radius_m = self.aperture_radius_m
-                if radius_m is None:  # on the equivalent sensor, 36 mm wide
-                    radius_m = 18.0 / math.tan(math.radians(self.fov_deg) / 2) / (2000.0 * (self.f_number or math.nan))
-                camera = Camera.from_fov(self.fov_deg, radius_m, focus_m)
-            camera = camera.replace(focus_range_m=self.focus_range, tilt_deg=self.tilt, swing_deg=self.swing)
-        return camera if self.focus_at is None else camera.focus_at(depth, *self.focus_at), remarks
-
-    def stated(self, camera: "Camera") -> dict[str, Any]:
-        """The numbers of a camera by the options, or the file, that they are from."""
-        from ..optics.camera import CAMERA_NUMBERS
-
-        names = self._names()
-        if self.fov_deg is None:
-            return {names[name]: getattr(camera, name) for name in CAMERA_NUMBERS}
-        opening = "aperture_radius_m" if self.f_number is None else "f_number"
-        return {"--fov-deg": self.fov_deg, names[opening]: getattr(self, opening), names["focus_m"]: camera.focus_m}
-
-    def _names(self) -> dict[str, str]:
-        """What the user knows a number of the camera as: the option that states it, or the file's own."""
-        focus = "--focus-at" if self.focus_at else "--focus-range" if self.focus_range else "--focus-m"
-        given = {name: getattr(self, name) is not None for name in (*_ASSUMED, "aperture_radius_m")}
-        spelled = {name: f"--{name.replace('_', '-')}" for name in given} | {"focus_m": focus}
-        given["focus_m"] = self.has_focus
-        return _SPELLED | {
-            name: spelled[name] + ("" if is_given else " (not given)") for name, is_given in given.items()
-        }
-
-
-@dataclass(frozen=True, kw_only=True)
-class DepthMap:
-    """Depth map."""
-
-    depth_kind: Literal["z", "distance", "disparity", "inverse", "relative", "coc"] = option(
-        "What the numbers are: z along the optical axis or distance along the ray, in metres after scale * (value + "
-        "offset); disparity or inverse depth, in metres after scale / (value + offset); relative, as estimators give "
-        "it, between --near-m and --far-m; or coc, the signed blur radius in pixels (negative is near).",
-        "z",
-        basic=True,
-    )
-    depth_scale: float | None = option("0.001 for maps in millimetres.", basic=True)
-    depth_offset: float = option("Added to each value first.", 0.0)
-    near_m: float | None = option("Distance of the nearest value of relative depth.")
-    far_m: float | None = option("Distance of its farthest value (inf allowed).")
-    relative_kind: Literal["disparity", "inverse", "depth"] | None = option(
-        "What relative depth is: disparity or inverse depth, larger is nearer (MiDaS, Depth Anything; the default), or "
-        "depth, larger is farther (Marigold)."
-    )
-    value_range: tuple[float, float] | None = option(
-        "Smallest and largest value of relative depth; default: those of each frame.",
-        metavar="LOW,HIGH",
-        read=numbers(2, "--value-range expects two numbers such as 0,255"),
-    )
-    depth_unknown: float | None = option("A value that means 'not measured', such as 0, -1 or inf.")
-    fill_depth: float | str | None = option(
-        "Fill pixels without depth: from the nearest one, from the farthest around (what stereo cannot see lies "
-        "behind), or with a distance (inf for a sky).",
-        metavar="nearest|far|METRES",
-        read=word_or_number(("nearest", "far"), "--fill-depth expects nearest, far or metres"),
-    )
-    depth_channel: str | None = option("Channel (or array of an .npz) that is depth.")
-    strict: bool = option("Refuse what looks like a wrong unit or scale, instead of warning.", False)
-
-    def __post_init__(self) -> None:
-        if self.depth_kind == "relative":
-            if self.near_m is None or self.far_m is None:
-                raise ValueError(
-                    "--depth-kind relative needs --near-m and --far-m, the distances of the nearest and the farthest "
-                    "value in metres (--far-m inf for a sky)"
-                )
-            if self.depth_scale is not None or self.depth_offset != 0.0:
-                raise ValueError("--depth-kind relative has no --depth-scale and --depth-offset: near and far say it")
-        elif any(value is not None for value in (self.near_m, self.far_m, self.relative_kind, self.value_range)):
-            raise ValueError(
-                "--near-m, --far-m, --relative-kind and --value-range are for relative depth: add --depth-kind relative"
-            )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scene:
-    """What is seen, and through what; commands that take an image and its depth are made of it."""
-
-    lens: Lens = Lens()
-    depth_map: DepthMap = DepthMap()
-
-    def __post_init__(self) -> None:
-        lens = self.lens
-        if self.depth_map.depth_kind == "coc" and lens != Lens(fov_deg=lens.fov_deg):
-            raise ValueError(
-                "--depth-kind coc is the blur itself and takes no camera; leave focus and lens options out"
-            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,7 +50,7 @@ class Opening:
 
         mask = None if self.aperture is None else read_image(self.aperture).light[0].mean(0)
         names = {name: f"--{name.removesuffix('_deg')}" for name in ("blades", "rotation_deg", "curvature", "squeeze")}
-        with _by_option(names | {"vignetting": "--vignetting"}):
+        with by_option(names | {"vignetting": "--vignetting"}):
             aperture = Aperture(self.blades, self.rotation, self.curvature, self.squeeze, mask, self.vignetting)
         return None if aperture.is_round and self.squeeze == 1.0 and not aperture.depends_on_place else aperture
 
@@ -323,16 +113,6 @@ def json_option() -> Any:
     return option("Print what is printed as JSON, for programs: one object a line.", False, names=("--json",))
 
 
-@contextlib.contextmanager
-def _by_option(names: Mapping[str, str]) -> Iterator[None]:
-    """Has a refusal say the option's name where it says its own."""
-    try:
-        yield
-    except ValueError as error:
-        pattern = re.compile(r"\b(" + "|".join(names) + r")\b")
-        raise ValueError(pattern.sub(lambda found: names[found.group()], str(error))) from None
-
-
 def make_folder_of(path: Path) -> None:
     """The folder in which a file is to be written, made where it is missing.
 
@@ -345,10 +125,16 @@ def make_folder_of(path: Path) -> None:
         raise OSError(f"{path}: its folder cannot be made ({error.strerror})") from None
 
 
-def refuse_input(out: Path, *sources: Path | None) -> None:
-    """Refuse to write a file in the place of one that is read."""
-    if any(source is not None and os.path.realpath(source) == os.path.realpath(out) for source in sources):
+def check_files(image: Path, depth: Path | None, out: Path | None) -> None:
+    """Refuse, before anything is read, files that are not there, and to write one in the place of one that is read."""
+    existing_image(image)
+    if depth is not None:
+        existing_map(depth)
+    if out is None:
+        return
+    if any(source is not None and os.path.realpath(source) == os.path.realpath(out) for source in (image, depth)):
         raise ValueError(f"{out}: is one of the inputs; write to another file")
+    samples_of(out)
 
 
 def pick_device(name: str) -> "torch.device":

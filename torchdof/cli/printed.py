@@ -14,7 +14,7 @@ import click
 if TYPE_CHECKING:
     from ..depth.sanity import Mistake
 
-__all__ = ["Bar", "WarnOnce", "json_line", "tell"]
+__all__ = ["Bar", "WarnOnce", "json_line", "note", "tell"]
 
 _PATIENCE_S = 3.0
 
@@ -22,6 +22,12 @@ _PATIENCE_S = 3.0
 def tell(as_json: bool, facts: Mapping[str, Any], line: str) -> None:
     """Prints facts as JSON, or the line that says the same to people."""
     click.echo(json_line(facts) if as_json else line)
+
+
+def note(*lines: str) -> None:
+    """Prints what was taken for granted, and what to do about it, on standard error."""
+    for line in lines:
+        click.echo(f"note: {line}", err=True)
 
 
 def json_line(facts: Mapping[str, Any]) -> str:

@@ -12,8 +12,9 @@ import click
 
 from ..io.sequence import FramePattern, parse_frames
 from .command import argument, numbers, option
-from .options import Accuracy, Blur, Scene, edges_option, json_option
+from .options import Accuracy, Blur, check_files, edges_option, json_option
 from .printed import Bar, json_line
+from .scene import Scene
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -39,6 +40,7 @@ class _Files:
     )
     bits: Literal["8", "16", "half", "float"] | None = option("What OUT stores. Default: as IMAGE, where the type can.")
     layer: str | None = option("Layer or part of an EXR that is the image.")
+    sheet: Path | None = option("Also write the image, its depth and the result side by side to this file.")
     frames: tuple[int, int] | None = option("Part of a sequence.", metavar="FIRST-LAST", read=parse_frames)
     steady: bool = option("Filter depth of a sequence along time, where neither image nor depth moved.", False)
     resume: bool = option("Render only the frames that OUT lacks.", False)
@@ -47,6 +49,10 @@ class _Files:
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Render:
     """Blur IMAGE by its DEPTH as a lens would.
+
+    A photograph and its depth map, of whatever kind: what is taken for granted is printed.
+
+        torchdof render photo.jpg depth.png -o out.jpg
 
     A photograph and its depth in millimetres, focused on what is seen at column 320, row 200:
 
@@ -63,6 +69,10 @@ class Render:
     --steady filters depth that flickers along time, where neither image nor depth moved; a part of a sequence, or the
     rest of it with --resume, comes out as the whole would: up to 63 frames before it are read first.
 
+    A photograph, its focus pulled from 1 m to 5 m in 24 frames:
+
+        torchdof render photo.jpg depth.png -o pull.##.png --focus-m 1:1,24:5
+
     Seven blades on an anamorphic lens, all from 1.5 to 2.2 m in focus:
 
         torchdof render shot.exr -o out.exr --focus-range 1.5,2.2 --blades 7 --rotation 15 --squeeze 2
@@ -71,13 +81,15 @@ class Render:
 
         torchdof render l.png disp.npz -o out.png --focus-m 2 --depth-kind disparity --depth-scale 192 --fill-depth far
 
-    Depth from an estimator, which knows near from far but no metres:
+    Depth from an estimator, which knows near from far but no metres, between distances that you state:
 
-        torchdof render photo.jpg depth.png -o out.jpg --depth-kind relative --near-m 1.2 --far-m 8 --focus-m 1.5
+        torchdof render photo.jpg depth.png -o out.jpg --near-m 1.2 --far-m 8 --focus-m 1.5 --f-number 1.4
 
     The lens is what you state, else what the file's EXIF data state, else 50 mm at f/2.8 on a sensor of 36 mm; the line
-    that is printed says which. Alpha and metadata are kept. A file is written whole or not at all. What looks
-    like a wrong unit is said on standard error; with --strict it is refused. --json prints one JSON object a frame.
+    that is printed says which. Where you state neither focus nor lens, a single image is focused on what is nearest
+    its middle, and opened until the largest blur radius is 2 % of its width, unless the file's lens blurs enough.
+    Alpha and metadata are kept. A file is written whole or not at all. What looks like a wrong unit is said on standard
+    error; with --strict it is refused. --json prints one JSON object a frame.
     """
 
     image: Path = argument("All-in-focus image (EXR, PNG, TIFF, JPEG, HDR, PFM) or shot.####.exr.", "IMAGE")
@@ -102,7 +114,7 @@ class Render:
         group="Blur",
     )
     show_focus: bool = option(
-        "Don't blur: draw the outlines of what is near orange, in focus green, far blue.", False, group="Blur"
+        "Don't blur: show the image in grey, tinted: near orange, in focus green, far blue.", False, group="Blur"
     )
     device: str = option("auto, cpu, cuda, cuda:1, ...", "auto", group="Blur")
     depth_edges: Literal["auto", "repair", "as-given"] = edges_option("auto")
@@ -114,49 +126,81 @@ class Render:
             raise ValueError(f"--lights must be a finite number of stops from 0 on, got {self.lights:g}")
 
     def run(self) -> None:
-        """Renders one image, or the frames of a sequence."""
-        if FramePattern.matches(self.image):
+        """Renders one image, the frames of a sequence, or a still whose focus moves."""
+        is_sequence, moves = FramePattern.matches(self.image), len(self.scene.lens.focus_m or []) > 1
+        if (is_sequence or moves) and self.files.sheet is not None:
+            raise ValueError("--sheet is of one picture; leave it out where there are more")
+        if is_sequence:
             self._render_sequence()
             return
-        sequences = FramePattern.is_padded(self.out) and not FramePattern.is_padded(self.image)
-        sequences = (sequences and FramePattern.matches(self.out)) or self.files.frames is not None or self.files.steady
-        if sequences or (self.depth is not None and FramePattern.matches(self.depth)):
+        has_frames = FramePattern.is_padded(self.out) and not FramePattern.is_padded(self.image)
+        has_frames = (has_frames and FramePattern.matches(self.out)) or self.files.frames is not None
+        is_of_sequence = self.depth is not None and FramePattern.matches(self.depth)
+        if (has_frames and not moves) or self.files.steady or is_of_sequence:
             raise ValueError(f"{self.image}: is a single image; for a sequence write it as shot.####.exr")
-        self.scene.lens.refuse_keyframes()
+        if moves:
+            self._pull_focus(self.scene.lens.focus_m or [])
+            return
+        check_files(self.image, self.depth, self.out)
         if self.files.resume and self.out.exists():
             self._tell_of_those_there([self.out], f"{self.out}: is there already")
             return
         from .frame import Renderer
 
-        renderer = Renderer(self)
+        renderer = Renderer(self, self.scene)
         with Bar(f"rendering {self.out.name}") as bar:
-            frame = renderer.read(self.image, self.depth, self.out)
+            frame = renderer.read(self.image, self.depth)
             renderer.write(renderer.render(frame, self.out, bar=bar))
+
+    def _pull_focus(self, keys: Sequence[tuple[int, float]]) -> None:
+        """Renders a still once for each frame from the first to the last keyframe of the focus."""
+        first, last = self.files.frames or (keys[0][0], keys[-1][0])
+        todo = self._todo(FramePattern(self.out), dict.fromkeys(range(first, last + 1), (self.image, self.depth)))
+        from .frame import Renderer
+
+        renderer = Renderer(self, self.scene)
+        frame = renderer.read(self.image, self.depth)
+        self._render_each(renderer, todo, lambda _: frame)
+
+    def _todo(self, target: FramePattern, sources: Mapping[int, tuple[Path, Path | None]]) -> dict[int, Path]:
+        """The files of the frames to render: all, or with ``--resume`` those that are not there; the others are told.
+
+        Refuses frames whose image and depth, by their numbers, are not as :func:`check_files` wants them.
+        """
+        files = {n: target.name(n) for n in sources}
+        for n, (image, depth) in sources.items():
+            check_files(image, depth, files[n])
+        there = {n: file for n, file in files.items() if self.files.resume and file.is_file()}
+        if there:
+            self._tell_of_those_there([*there.values()], f"{len(there)} of {len(files)} frames are there already")
+        return {n: file for n, file in files.items() if n not in there}
 
     def _render_sequence(self) -> None:
         """Renders the frames of a numbered sequence, in order; with ``--resume`` only those that are missing."""
-        source, target, said = FramePattern(self.image), FramePattern(self.out), self.scene.depth_map
+        source, target, said = FramePattern(self.image), FramePattern(self.out), self.scene.depth_map.of_sequence()
         depths = FramePattern(self.depth) if self.depth is not None and FramePattern.matches(self.depth) else None
+        if self.scene.lens.blur_share is not None:
+            raise ValueError("--blur would open the lens anew in each frame of a sequence; give --f-number")
+
+        def sources(n: int) -> tuple[Path, Path | None]:
+            return source.name(n), depths.name(n) if depths else self.depth
+
         numbers = self._numbers(source, depths)
-        todo = [n for n in numbers if not (self.files.resume and target.name(n).is_file())]
-        if len(todo) < len(numbers):
-            there = [target.name(n) for n in numbers if n not in set(todo)]
-            self._tell_of_those_there(there, f"{len(there)} of {len(numbers)} frames are there already")
+        todo = self._todo(target, {n: sources(n) for n in numbers})
         if self.files.steady and said.depth_kind == "coc":
             raise ValueError("--steady filters depth in metres; --depth-kind coc has none")
         from ..depth.sanity import Mistake
         from .frame import Renderer
 
-        renderer = Renderer(self)
+        renderer = Renderer(self, dataclasses.replace(self.scene, depth_map=said), is_still=False)
         if said.depth_kind == "relative" and said.value_range is None and len(numbers) > 1:
             renderer.warned.warn(self.depth or self.image, [Mistake("range", _EACH_ITS_OWN)])
 
         def read(n: int) -> "Frame":
-            return renderer.read(source.name(n), depths.name(n) if depths else self.depth, target.name(n))
+            return renderer.read(*sources(n))
 
         whole = [n for n in source.frames() if depths is None or depths.name(n).is_file()]
-        steadied = _steadied(read, whole) if self.files.steady else read
-        self._render_each(renderer, {n: target.name(n) for n in todo}, steadied)
+        self._render_each(renderer, todo, _steadied(read, whole) if self.files.steady else read)
 
     def _numbers(self, source: FramePattern, depths: FramePattern | None) -> Sequence[int]:
         """The numbers of the frames that are asked for, all of which are there."""

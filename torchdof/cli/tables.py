@@ -20,7 +20,7 @@ __all__ = ["Tables"]
 
 _WIDTH = 1920  # px of the image that kernels are shown for
 _COC_PX = (-24.0, -12.0, -6.0, 6.0, 12.0, 24.0)
-_CELL = (120, 230)  # rows and columns of a kernel's picture, as wide as a caption
+_CELL = (200, 230)  # rows and columns of a kernel's picture, as wide as a caption
 _ZOOM = 2  # picture's pixels a pixel
 _PLACES = (0.0, 0.4, 0.7, 0.95)  # of the way from the middle of the frame to its corner
 
@@ -59,15 +59,15 @@ class Tables:
             facts = _facts(name, table)
             tell(self.as_json, facts, _line(facts))
             if self.out is not None:
-                panels[Path(name).stem] = _column(table)
+                where = ": middle to corner" if table.depends_on_place else ""
+                panels[f"{Path(name).stem}{where}"] = _column(table)
         if self.out is None:
             return
         widest = max(panel.shape[-1] for panel in panels.values())
         panels = {name: functional.pad(panel, (0, widest - panel.shape[-1])) for name, panel in panels.items()}
-        write_sheet(self.out, panels, caption=34)
+        write_sheet(self.out, panels, rows=[f"{coc:+g} px" for coc in _COC_PX])
         if not self.as_json:
-            radii = ", ".join(f"{coc:g}" for coc in _COC_PX)
-            click.echo(f"{self.out}: blur radii from top to bottom {radii} px in an image of {_WIDTH} px")
+            click.echo(f"{self.out}: a row a blur radius in an image of {_WIDTH} px; negative is in front of focus")
 
 
 def _facts(name: str, table: "BlurTable") -> dict[str, Any]:

@@ -57,13 +57,14 @@ def fill_holes(depth: Tensor, fill: Fill) -> Tensor:
     return fill_holes(filled, "nearest")  # holes without any depth in their row and column
 
 
-def resolve_holes(depth: Tensor, name: str, fill: Fill | None) -> tuple[Tensor, int]:
+def resolve_holes(depth: Tensor, name: str, fill: Fill | None, is_relative: bool = False) -> tuple[Tensor, int]:
     """Counts the pixels without depth (NaN), and refuses or fills them.
 
     Args:
         depth: ``[1, 1, H, W]``.
         name: Name of the file, for the message.
         fill: As for :func:`fill_holes`; None refuses holes.
+        is_relative: Whether zero stands for the far end and is filled already.
 
     Returns:
         The depth without holes, and how many there were.
@@ -75,10 +76,11 @@ def resolve_holes(depth: Tensor, name: str, fill: Fill | None) -> tuple[Tensor, 
     if holes == 0:
         return depth, 0
     if fill is None:
+        causes = "NaN or marked unknown" if is_relative else "NaN, zero, negative or marked unknown"
+        far = "; if zero is the far end of relative depth, say that (--depth-kind relative)"
         raise ValueError(
-            f"{name}: {holes} pixels ({100 * holes / depth.numel():.1f} %) have no depth (NaN, zero, negative or "
-            "marked unknown); say how to fill them: fill 'nearest' or 'far' (--fill-depth); if zero is the far end of "
-            "relative depth, say that (--depth-kind relative)"
+            f"{name}: {holes} pixels ({100 * holes / depth.numel():.1f} %) have no depth ({causes}); say how to fill "
+            f"them: fill 'nearest' or 'far' (--fill-depth){'' if is_relative else far}"
         )
     try:
         return fill_holes(depth, fill), holes

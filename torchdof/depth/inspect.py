@@ -5,14 +5,13 @@ import math
 from typing import Any
 
 import torch
-import torch.nn.functional as functional
 from torch import Tensor
 
 from ..optics.camera import Camera
 from ..render.edges import STEP_PX, judged
 from ..validation import image_and_map
 
-__all__ = ["EDGES", "DepthReport", "coc_colours", "inspect_depth", "panels", "tint_focus"]
+__all__ = ["EDGES", "DepthReport", "coc_colours", "depth_colours", "inspect_depth", "panels", "tint_focus"]
 
 EDGES = ("exact", "ramp", "beside", "unclear")
 """Kinds of pixels at depth edges.
@@ -23,9 +22,9 @@ EDGES = ("exact", "ramp", "beside", "unclear")
 * unclear: on a ramp that rendering keeps, because the image shows no edge there.
 """
 
-_NEAR, _SHARP, _FAR = (0.90, 0.35, 0.0), (0.0, 0.62, 0.20), (0.0, 0.30, 0.85)  # RGB of the outlines, linear light
-_FAINT, _CLEAR = 0.2, 0.6  # contrast (max - min) / max of 3 x 3 pixels at which an outline starts, and is complete
-_DARKEST = 0.05  # share of the mean light; darker pixels give no contrast of their own
+_NEAR, _SHARP, _FAR = (1.3, 0.6, 0.0), (0.1, 1.3, 0.3), (0.1, 0.5, 1.3)  # RGB of the tints, linear light
+_TINT, _FLOOR = 0.4, 0.1  # share of the tint in a pixel; its light in dark pixels, as a share of the mean light
+_HOLE = (0.6, 0.0, 0.6)  # RGB of pixels without depth
 _BOUNDS_PX = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)  # bounds of the histogram in px
 
 
@@ -156,6 +155,26 @@ def inspect_depth(image: Tensor, depth: Tensor, camera: Camera) -> DepthReport:
     return DepthReport(depth, coc_px, kinds, (counts[0], counts[1], counts[2], counts[3]))
 
 
+def depth_colours(depth: Tensor) -> Tensor:
+    """A map of depth as a picture: grey, even in 1 / distance, near bright and far dark; holes (NaN) are magenta.
+
+    Args:
+        depth: ``[1, 1, H, W]``, metres.
+
+    Returns:
+        ``[1, 3, H, W]`` in linear light.
+
+    Example:
+        >>> depth_colours(torch.tensor([[[[1.0, 2.0, torch.inf]]]]))[0, 0, 0, [0, 2]].tolist()
+        [1.0, 0.0]
+    """
+    is_hole = depth.isnan()
+    inverse = torch.where(is_hole, 0.0, 1.0 / depth)
+    low, high = inverse[~is_hole].aminmax() if bool((~is_hole).any()) else (inverse.min(), inverse.max())
+    grey = ((inverse - low) / (high - low).clamp(min=1e-12)).clamp(0, 1) ** 2.2
+    return torch.where(is_hole, depth.new_tensor(_HOLE)[:, None, None], grey)
+
+
 def coc_colours(coc_px: Tensor) -> Tensor:
     """A map of signed radii in colour: orange in front of the focus, black in focus, blue behind; linear light.
 
@@ -182,17 +201,14 @@ def panels(image: Tensor, report: DepthReport) -> dict[str, Tensor]:
         report: Result of :func:`inspect_depth` for this image.
     """
     is_hole = report.depth.isnan()
-    magenta = report.depth.new_tensor([0.6, 0.0, 0.6])[:, None, None]
-    inverse = torch.where(is_hole, 0.0, 1.0 / report.depth)
-    low, high = inverse[~is_hole].aminmax() if bool((~is_hole).any()) else (inverse.min(), inverse.max())
-    grey = ((inverse - low) / (high - low).clamp(min=1e-12)).clamp(0, 1) ** 2.2
+    magenta = report.depth.new_tensor(_HOLE)[:, None, None]
     coc_px = torch.where(is_hole, 0.0, report.coc_px)
     colours = image.new_tensor([[0, 0, 0], [0.0, 0.7, 0.1], [1.0, 0.05, 0.0], [1.0, 0.0, 0.8], [0.05, 0.1, 0.5]])
     marks = colours[report.edges[:, 0].long()].permute(0, 3, 1, 2)  # [1, H, W, 3] -> [1, 3, H, W]
     level = image.mean(1, keepdim=True) / image.mean().clamp(min=1e-12)
     dim = (0.08 * level).clamp(0, 0.3).expand(-1, 3, -1, -1)
     return {
-        "depth: near is bright, holes magenta": torch.where(is_hole, magenta, grey),
+        "depth: near is bright, holes magenta": depth_colours(report.depth),
         f"blur radius {float(coc_px.min()):+.1f} to {float(coc_px.max()):+.1f} px: near orange, far blue": torch.where(
             is_hole, magenta, coc_colours(coc_px)
         ),
@@ -203,10 +219,9 @@ def panels(image: Tensor, report: DepthReport) -> dict[str, Tensor]:
 
 
 def tint_focus(image: Tensor, coc_px: Tensor, has_alpha: bool = False) -> Tensor:
-    """Colours the outlines in an image: green in focus (radius of at most 1 px), orange nearer, blue farther.
+    """The image in grey, lightly tinted: green in focus (radius of at most 1 px), orange nearer, blue farther.
 
-    Outlines are the borders between these three zones, and places of high contrast: ``(max - min) / max`` of 3 x 3
-    pixels. They fade in from 0.2 to 0.6. Other pixels keep their colours.
+    The tint changes from green to the other two between 1 and 2 px.
 
     Args:
         image: ``[B, C, H, W]`` in linear light, C of 1 or 3, one more with alpha (premultiplied).
@@ -220,34 +235,19 @@ def tint_focus(image: Tensor, coc_px: Tensor, has_alpha: bool = False) -> Tensor
         ValueError: If shapes or types are not as described.
 
     Example:
-        >>> coc_px = torch.tensor([-3.0, -3.0, 0.2, 5.0, 5.0])[None, None, None]
-        >>> tinted = tint_focus(torch.ones(1, 3, 1, 5), coc_px)
-        >>> tinted[0, :, 0, 1:4].argmax(dim=0)  # red, green and blue are strongest where zones meet
+        >>> coc_px = torch.tensor([-3.0, 0.2, 5.0])[None, None, None]
+        >>> tint_focus(torch.ones(1, 3, 1, 3), coc_px)[0, :, 0].argmax(dim=0)  # red, green and blue are strongest
         tensor([0, 1, 2])
-        >>> tinted[0, :, 0, 0]
-        tensor([1., 1., 1.])
     """
     image_and_map(image, "coc_px", coc_px, "in pixels")
     if image.shape[1] - has_alpha not in (1, 3):
         raise ValueError(f"image must have 1 or 3 channels of colour, got {image.shape[1] - has_alpha}")
     colour, alpha = (image[:, :-1], image[:, -1:]) if has_alpha else (image, image[:, :0])
-    tints = torch.tensor([_NEAR, _SHARP, _FAR], dtype=image.dtype, device=image.device)
-    zone = (coc_px >= -1.0).long() + (coc_px > 1.0).long()
-    tint = tints[zone[:, 0]].permute(0, 3, 1, 2)  # [B, H, W, 3] -> [B, 3, H, W]
+    near, sharp, far = (image.new_tensor(tint)[:, None, None] for tint in (_NEAR, _SHARP, _FAR))
+    tint = torch.lerp(torch.where(coc_px < 0, near, far), sharp, (2.0 - coc_px.abs()).clamp(0.0, 1.0))
     grey = colour.mean(dim=1, keepdim=True)
-    brightest, darkest = _largest_around(grey), -_largest_around(-grey)
-    zones = zone.to(image.dtype)
-    meets_another = _largest_around(zones) + _largest_around(-zones) > 0
-    contrast = (brightest - darkest) / brightest.clamp(min=_DARKEST * grey.mean().clamp(min=1e-12))
-    outline = torch.where(meets_another, 1.0, ((contrast - _FAINT) / (_CLEAR - _FAINT)).clamp(0.0, 1.0))
-    shown = tint / tint.amax(dim=1, keepdim=True) * brightest.clamp(min=grey.mean())
-    tinted = torch.lerp(colour.expand_as(shown), shown, outline.expand_as(shown))
-    return torch.cat([tinted, alpha], dim=1)
-
-
-def _largest_around(values: Tensor) -> Tensor:
-    """Largest of a pixel and its eight neighbours, ``[B, 1, H, W]``."""
-    return functional.max_pool2d(values, 3, stride=1, padding=1)
+    floor = _FLOOR * grey.mean() * (alpha if has_alpha else 1.0)
+    return torch.cat([(1.0 - _TINT) * grey + _TINT * tint * (grey + floor), alpha], dim=1)
 
 
 def _percent(count: int, total: int) -> str:

@@ -16,7 +16,7 @@ from ..optics.camera import Camera
 from ..validation import real_tensor
 from .kinds import DepthKind
 
-__all__ = ["DepthWarning", "Mistake", "check", "coc_mistakes", "depth_mistakes"]
+__all__ = ["DepthWarning", "Mistake", "check", "coc_mistakes", "depth_mistakes", "whole_numbers"]
 
 _FACTORS = (0.001, 0.01, 1000.0, 100.0)  # tried to bring depth to the focus: mm or cm as metres, or scaled down twice
 _UNITS = {0.001: "millimetres", 0.01: "centimetres"}
@@ -39,8 +39,9 @@ class Mistake:
 
     Args:
         name: "focus": nothing is in focus, or the focus is far from all depth; "far": all depth is far and nothing is
-            blurred; "bits": whole numbers, as in files of 8 bits; "blur": a larger blur than lenses make; "lens": a
-            shorter focal length than lenses have; "range": relative depth of a sequence without ``value_range``.
+            blurred; "bits": whole numbers, as in files of 8 bits, or numbers from 0 to 1; "blur": a larger blur than
+            lenses make; "lens": a shorter focal length than lenses have; "range": relative depth of a sequence without
+            ``value_range``.
         message: The observation, the likely mistake and its remedy.
     """
 
@@ -160,7 +161,7 @@ def _mistakes(
     blur = camera.coc_px(torch.cat([decisive, _sample(known)]).reshape(1, 1, 1, -1), width).abs().flatten()
     least, largest, blur = float(blur[:2].min()), float(blur[2:4].max()), blur[4:]
     extent = f"({near:.4g} to {far:.4g} m)" if near < far else f"({near:.4g} m)"
-    of_bits = far <= 65535 and _whole_numbers(finite)
+    of_bits = far <= 65535 and whole_numbers(finite)
     sharp_px = max(_SHARP_PX, _SHARP_WIDTHS * width)
     is_wide_open = float(camera.f_number) < _WIDEST_F_NUMBER and largest > _LARGE_WIDTHS * width
     is_too_blurred = is_wide_open or _share_at(blur, 0.99) > _LARGEST_WIDTHS * width
@@ -171,12 +172,10 @@ def _mistakes(
         message = _out_of_focus(near, far, extent, focus_m, of_bits, factor, kind, scale)
         return [Mistake("focus", message if is_sharp else f"nothing is in focus: {message}")]
     found = []
-    if of_bits and far <= 255 and far - near >= 64:
-        found.append(
-            Mistake(
-                "bits", f"all depth is whole numbers {extent}, as files of 8 bits hold; if it is relative, {_RELATIVE}"
-            )
-        )
+    is_of_bits, is_of_shares = of_bits and far <= 255 and far - near >= 64, 0.9 < far <= 1.0 and near < 0.05
+    if kind != "relative" and (is_of_bits or is_of_shares):
+        told = f"whole numbers {extent}, as files of 8 bits hold" if is_of_bits else f"between 0 and 1 {extent}"
+        found.append(Mistake("bits", f"all depth is {told}; if it is relative, {_RELATIVE}"))
     elif _share_at(finite, 0.05) > _FAR_M and largest <= sharp_px and (of_bits or focus_m < math.inf):
         unit = _advice(0.001, scale)
         message = f"all depth is far {extent}, and nothing is blurred; is it {unit}? The focus too is in metres"
@@ -257,7 +256,7 @@ def _sample(values: Tensor) -> Tensor:
     return values.flatten()[:: max(1, values.numel() // 65536)]
 
 
-def _whole_numbers(values: Tensor) -> bool:
+def whole_numbers(values: Tensor) -> bool:
     """Whether a sample has at least 16 different values, all of them whole numbers."""
     sample = _sample(values)
     return bool((sample == sample.round()).all()) and sample.unique().numel() >= 16

@@ -14,18 +14,15 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from ..validation import show
 from .memory import free_bytes
 from .metadata import Metadata, kept_metadata, upright
 
-__all__ = ["MOST_ATTRIBUTES", "Part", "PixelType", "check_chunks", "existing", "first_line", "named_in_utf8"]
+__all__ = ["MOST_ATTRIBUTES", "Part", "check_chunks", "first_line", "named_in_utf8"]
 __all__ += ["read_array", "read_parts"]
-
-PixelType = Literal["8", "16", "half", "float"]
 
 MAX_PIXELS = 2**28
 MOST_ATTRIBUTES = 4096
@@ -45,26 +42,6 @@ class Part:
     metadata: Metadata = dataclasses.field(default_factory=dict)
     window: tuple[int, int, int, int, int, int] | None = None  # x, y, full x, full y, full width, full height
     orientation: int = 1  # EXIF orientation as stored; the values are upright already
-
-
-def existing(path: str | os.PathLike[str], suffixes: tuple[str, ...], what: str) -> Path:
-    """The path of an existing, non-empty file with one of the suffixes; ``what`` describes it in messages."""
-    if not isinstance(path, str | os.PathLike) or "\0" in os.fspath(path):
-        raise ValueError(f"expected the path of {what}, got {show(path)}")
-    path = Path(path)
-    if os.path.islink(os.path.realpath(path)):
-        raise OSError(f"{path}: is a link that leads back to itself")
-    if path.suffix.lower() not in suffixes:
-        raise ValueError(
-            f"{path}: {path.suffix or 'no suffix'} is not {what} that can be read; use {' '.join(suffixes)}"
-        )
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such file")
-    if not path.is_file():
-        raise IsADirectoryError(f"{path}: is not a file")
-    if path.stat().st_size == 0:
-        raise OSError(f"{path}: the file is empty")
-    return path
 
 
 @contextlib.contextmanager

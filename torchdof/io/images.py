@@ -18,22 +18,14 @@ import torch
 from torch import Tensor
 
 from ..validation import real_tensor
-from . import foreign
 from .atomic import whole_file
 from .channels import colour_channels, depth_channel
-from .decode import Part, PixelType, check_chunks, existing, first_line, named_in_utf8, read_array, read_parts
+from .decode import Part, check_chunks, first_line, named_in_utf8, read_array, read_parts
+from .paths import PixelType, existing_image, existing_map, samples_of
 from .transfer import Transfer, decode, default_transfer, encode, encode_8_bits
 
 __all__ = ["Picture", "read_image", "read_values", "write_image"]
 
-_SAMPLES: dict[str, tuple[PixelType, ...]] = {  # suffix -> sample types, the default first
-    ".exr": ("half", "float"),
-    ".png": ("8", "16"),
-    **dict.fromkeys((".tif", ".tiff"), ("8", "16", "float")),
-    **dict.fromkeys((".jpg", ".jpeg", ".webp"), ("8",)),
-    **dict.fromkeys((".hdr", ".pfm"), ("float",)),
-}
-_SUFFIXES = tuple(_SAMPLES)
 _OIIO_SAMPLE: dict[PixelType, str] = {"8": "uint8", "16": "uint16", "half": "half", "float": "float"}
 _STORED: dict[str, PixelType] = {name: sample for sample, name in _OIIO_SAMPLE.items()} | {"double": "float"}
 _WHITE = {"8": 255.0, "16": 65535.0, "half": 1.0, "float": 1.0}
@@ -101,10 +93,7 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
         ...     round(float(read_image(folder + "/grey.png").pixels.mean()), 3)  # 8 bits, sRGB
         0.216
     """
-    unread = foreign.refusal(path)
-    if unread is not None:
-        raise ValueError(f"{path}: {unread}")
-    path = existing(path, (*_SUFFIXES, *foreign.readable()), "an image")
+    path = existing_image(path)
     if transfer not in (None, "linear", "srgb"):
         raise ValueError(f"transfer must be 'linear' or 'srgb', got {transfer!r}")
     with _memory_for(path):
@@ -196,9 +185,7 @@ def write_image(
 
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix not in _SAMPLES:
-        raise ValueError(f"{path}: cannot write files of type {suffix or 'none'!r}; use one of {' '.join(_SUFFIXES)}")
-    holds = _SAMPLES[suffix]
+    holds = samples_of(path)
     if sample is None:
         floats = picture.sample in ("half", "float")
         sample = picture.sample if picture.sample in holds else "float" if floats and suffix[:4] == ".tif" else holds[0]
@@ -284,7 +271,7 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
         OSError: If the file is missing, empty, truncated or unreadable, or does not fit into memory.
         ValueError: If the channel is ambiguous or missing, or the array is not two-dimensional numbers.
     """
-    path = existing(path, (*_SUFFIXES, ".npy", ".npz"), "a depth map")
+    path = existing_map(path)
     with _memory_for(path):
         if path.suffix.lower() in (".npy", ".npz"):
             return _map(read_array(path, channel))

@@ -1,16 +1,41 @@
 """Pictures side by side in one file, each with a caption."""
 
 import os
+from collections.abc import Sequence
 
 import torch
+import torch.nn.functional as functional
 from torch import Tensor
 
 from .images import Picture, write_image
 
-__all__ = ["write_sheet"]
+__all__ = ["shrunk", "write_sheet"]
+
+_LABEL = 76  # px: width of what is written beside rows
 
 
-def write_sheet(path: str | os.PathLike[str], panels: dict[str, Tensor], margin: int = 8, caption: int = 34) -> None:
+def shrunk(pixels: Tensor, longest: int) -> Tensor:
+    """Pixels ``[1, C, H, W]`` in linear light, smaller if their longer side is longer than so many.
+
+    Example:
+        >>> shrunk(torch.ones(1, 3, 40, 80), 20).shape
+        torch.Size([1, 3, 10, 20])
+    """
+    height, width = pixels.shape[-2:]
+    share = longest / max(height, width)
+    if share >= 1:
+        return pixels
+    size = (max(1, round(share * height)), max(1, round(share * width)))
+    return functional.interpolate(pixels, size, mode="bilinear", antialias=True)
+
+
+def write_sheet(
+    path: str | os.PathLike[str],
+    panels: dict[str, Tensor],
+    margin: int = 8,
+    caption: int = 34,
+    rows: Sequence[str] = (),
+) -> None:
     """Writes panels side by side, each with its caption above.
 
     Args:
@@ -18,6 +43,7 @@ def write_sheet(path: str | os.PathLike[str], panels: dict[str, Tensor], margin:
         panels: Caption -> ``[1, 3, H, W]`` in linear light, all of one size.
         margin: Pixels between panels.
         caption: Height of the line of captions in pixels.
+        rows: What to write to the left of the rows, of equal height, that each panel consists of.
 
     Raises:
         ValueError: If the format is unknown.
@@ -26,14 +52,15 @@ def write_sheet(path: str | os.PathLike[str], panels: dict[str, Tensor], margin:
     import OpenImageIO as oiio
 
     height, width = next(iter(panels.values())).shape[-2:]
-    sheet = torch.full((1, 3, height + caption + margin, len(panels) * (width + margin) + margin), 0.8)
-    for k, panel in enumerate(panels.values()):
-        left = margin + k * (width + margin)
+    start = margin + (_LABEL if rows else 0)
+    sheet = torch.full((1, 3, height + caption + margin, start + len(panels) * (width + margin)), 0.8)
+    lefts = [start + k * (width + margin) for k in range(len(panels))]
+    for left, panel in zip(lefts, panels.values(), strict=True):
         sheet[:, :, caption : caption + height, left : left + width] = panel.cpu()
     buffer = oiio.ImageBuf(sheet[0].permute(1, 2, 0).contiguous().numpy())  # [3, H, W] -> [H, W, 3]
-    for k, text in enumerate(panels):
-        oiio.ImageBufAlgo.render_text(
-            buffer, margin + k * (width + margin), caption - 11, text, 20, "", (0.0, 0.0, 0.0)
-        )
+    texts = [(left, caption - 11, text) for left, text in zip(lefts, panels, strict=True)]
+    texts += [(margin, caption + round((k + 0.5) * height / len(rows)) + 7, text) for k, text in enumerate(rows)]
+    for x, y, text in texts:
+        oiio.ImageBufAlgo.render_text(buffer, x, y, text, 20, "", (0.0, 0.0, 0.0))
     pixels = torch.from_numpy(buffer.get_pixels(oiio.FLOAT)).permute(2, 0, 1)[None]
     write_image(path, Picture(pixels, sample="8", transfer="srgb"))

@@ -1,0 +1,107 @@
+"""Guesses about depth maps: the kind of their numbers, which way they run, and where the subject is."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchdof.depth.guess import Guess, guess_kind, subject_m
+
+ROWS, COLUMNS = 48, 64
+MILLIMETRES = Guess("z", 0.001, 0.0)
+
+
+def ground(top: float, bottom: float) -> Tensor:
+    """A map ``[1, 1, 48, 64]`` that goes evenly from its top row to its bottom row."""
+    return torch.linspace(top, bottom, ROWS)[None, None, :, None].repeat(1, 1, 1, COLUMNS)
+
+
+@pytest.mark.parametrize(
+    ("values", "whole", "expected"),
+    [
+        (ground(0, 255).round(), False, Guess("relative")),
+        (ground(255, 0).round(), False, Guess("relative", relative_kind="depth")),
+        (ground(0, 65535).round(), False, Guess("relative")),
+        (ground(65535, 900).round(), False, Guess("relative", relative_kind="depth")),
+        (ground(7000, 600).round(), False, MILLIMETRES),
+        (ground(600, 7000).round(), False, Guess("relative")),  # the ground would be farther than the sky
+        (ground(8.0, 1.5), False, Guess("z")),
+        (ground(0.3, 12.0), False, Guess("relative")),
+        (ground(0.0, 1.0), False, Guess("relative")),
+        (ground(1.0, 0.0), False, Guess("relative", relative_kind="depth")),
+        (ground(0.9, 0.2), False, Guess("z")),  # a close-up
+        (ground(-0.4, 3.0), False, Guess("relative")),
+        (ground(6.0, 2.0).round(), False, Guess("z")),  # a few whole metres
+        ((ground(2.0, 0.2).round() * 100), True, Guess("relative", relative_kind="depth")),
+        (torch.full((1, 1, 4, 4), 2.0), False, Guess("z")),
+        (torch.full((1, 1, 4, 4), math.nan), False, Guess("z")),
+    ],
+)
+def test_a_map_is_taken_for_what_its_numbers_say(values: Tensor, whole: bool, expected: Guess) -> None:
+    assert guess_kind(values, whole) == expected
+
+
+def test_what_is_said_in_metres_is_not_turned_round() -> None:
+    assert guess_kind(ground(1.0, 9.0)).kind == "relative"
+    assert guess_kind(ground(1.0, 9.0), metric=True) == Guess("z")
+    assert guess_kind(ground(0.0, 1.0), metric=True).kind == "relative"
+
+
+def test_holes_do_not_count() -> None:
+    values = ground(8.0, 1.5)
+    values[..., ::5], values[..., 1::5] = math.nan, math.inf
+    assert guess_kind(values) == Guess("z")
+    values = ground(7000, 600).round()
+    values[..., ROWS // 2 :, ::2] = 0.0
+    assert guess_kind(values) == MILLIMETRES
+
+
+def test_equal_values_lean_to_neither_side() -> None:
+    halves = torch.tensor([2.0, 6.0]).repeat_interleave(32).expand(1, 1, ROWS, COLUMNS)
+    assert guess_kind(halves) == Guess("z")
+
+
+SKY = torch.full((1, 1, ROWS, COLUMNS), math.inf)
+
+
+def subject(size: int, depth_m: float, behind: Tensor) -> Tensor:
+    """A square of a depth in the middle of a map."""
+    depth = behind.clone()
+    depth[..., ROWS // 2 - size : ROWS // 2 + size, COLUMNS // 2 - size : COLUMNS // 2 + size] = depth_m
+    return depth
+
+
+@pytest.mark.parametrize("behind", [ground(9.0, 8.0), SKY], ids=["wall", "sky"])
+def test_the_nearer_surface_in_the_middle_is_the_subject(behind: Tensor) -> None:
+    assert subject_m(subject(6, 2.0, behind)) == pytest.approx(2.0)
+    assert subject_m(subject(1, 2.0, behind)) > 8.0  # a twig is not
+
+
+def test_what_is_nearer_beside_the_middle_is_not_the_subject() -> None:
+    depth = subject(6, 2.0, ground(9.0, 9.0))
+    depth[..., : ROWS // 5, :] = 0.5
+    depth[..., : COLUMNS // 5] = 0.5
+    assert subject_m(depth) == pytest.approx(2.0)
+
+
+def test_noise_stray_pixels_and_holes_move_the_subject_little() -> None:
+    depth = subject(8, 2.0, ground(9.0, 9.0))
+    generator = torch.Generator().manual_seed(0)
+    depth = depth * (1 + 0.01 * torch.randn(depth.shape, generator=generator))
+    depth[..., ROWS // 2, COLUMNS // 2], depth[..., ::7, ::7] = 0.1, math.nan
+    assert subject_m(depth) == pytest.approx(2.0, rel=0.02)
+
+
+def test_a_large_map_is_judged_as_a_small_one() -> None:
+    depth = subject(6, 2.0, ground(9.0, 8.0))
+    large = torch.nn.functional.interpolate(depth, scale_factor=25, mode="nearest")
+    assert subject_m(large) == pytest.approx(subject_m(depth), rel=1e-3)
+    assert guess_kind(torch.nn.functional.interpolate(ground(0.3, 12.0), scale_factor=25)).kind == "relative"
+
+
+def test_a_map_of_one_depth_or_none() -> None:
+    assert subject_m(ground(3.0, 3.0)) == pytest.approx(3.0)
+    assert subject_m(SKY) == math.inf
+    with pytest.raises(ValueError, match="no pixel has a depth"):
+        subject_m(ground(0.0, 0.0))

@@ -1,0 +1,360 @@
+"""What is seen and through what: focus and lens, depth map; what their options mean, guess, and contradict.
+
+PyTorch is imported when the first of them is put to use, so that help and contradictions are answered at once.
+"""
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from ..io.metadata import camera_facts
+from ..io.sequence import focus_at_frame, parse_focus
+from .command import by_option, numbers, option, word_or_number
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ..optics.camera import Camera
+
+__all__ = ["DepthMap", "Lens", "Scene", "Sensor"]
+
+_ASSUMED = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
+_NEAR_M, _FAR_PER_NEAR = 1.0, 8.0  # of relative depth
+_BLUR, _SEEN = 0.02, 0.005  # of the picture's width: a blur that is plain to see, and the least that is seen at all
+_STRAY, _SAMPLES = 1000, 2**20  # pixels of which one may be blurred more; pixels that are looked at
+_SPELLED = {"focus_range_m": "--focus-range", "tilt_deg": "--tilt", "swing_deg": "--swing", "fov_x_deg": "--fov-deg"}
+_WHOLE_NUMBERS = (".png", ".jpg", ".jpeg", ".webp")
+_OF_RENDERERS = (".exr", ".tif", ".tiff")  # whose floating point numbers are distances
+
+
+def _share(text: str) -> float:
+    """Reads a share of the width, in per cent."""
+    expected = "--blur expects a share of the picture's width, above 0 and at most 50 %, such as 2%"
+    share = numbers(1, expected)(text.removesuffix("%"))[0] / 100
+    if not (text.endswith("%") and 0 < share <= 0.5):
+        raise ValueError(f"{expected}, got {text!r}")
+    return share
+
+
+def _equivalent(text: str) -> tuple[float, ...]:
+    """Reads a focal length in mm and an f-number."""
+    expected = "--equivalent expects a focal length and an f-number such as 85mm,1.4"
+    return numbers(2, expected)(re.sub(r"mm(?=,)|(?<=,)f/", "", text))
+
+
+def _give_one(options: Mapping[str, Any], problem: str) -> None:
+    """Refuse two options, by what they say, that contradict each other."""
+    given = [name for name, value in options.items() if value is not None]
+    if len(given) > 1:
+        raise ValueError(f"{' and '.join(given)} {problem}; give one of them")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """Focus and lens."""
+
+    focal_length_mm: float | None = option("Real focal length, not the 35 mm equivalent.", positive=True)
+    sensor_width_mm: float | None = option("36 for full frame.", positive=True)
+    fov_deg: float | None = option("Horizontal field of view of a rendered image, instead of a lens.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lens(Sensor):
+    """Focus and lens."""
+
+    focus_m: list[tuple[int, float]] | None = option(
+        "Distance in focus in metres (inf allowed), or keyframes frame:metres such as 1:2.0,48:5.5; between them "
+        "1/distance is linear, so that the blur changes evenly.",
+        metavar="METRES",
+        read=parse_focus,
+        basic=True,
+    )
+    focus_at: tuple[float, float] | None = option(
+        "Focus on what is seen at this pixel, counted from the top left; in a sequence, anew in each frame. Default: "
+        "the focus that IMAGE's file states, else the subject nearest the middle.",
+        metavar="X,Y",
+        read=numbers(2, "--focus-at expects a pixel X,Y such as 320,200"),
+        basic=True,
+    )
+    focus_range: tuple[float, float] | None = option(
+        "In focus from NEAR to FAR metres, blurred beyond; instead of --focus-m.",
+        metavar="NEAR,FAR",
+        read=numbers(2, "--focus-range expects two numbers such as 1.5,2.2"),
+    )
+    tilt: float = option("Degrees by which the lens is tilted down: focus comes nearer towards the bottom.", 0.0)
+    swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)
+    f_number: float | None = option("Smaller is blurrier.", positive=True, basic=True)
+    blur_share: float | None = option(
+        "Open the lens until what is blurred most, the nearest or the farthest, has a blur radius of this share of the "
+        "picture's width, such as 2%; instead of --f-number.",
+        names=("--blur",),
+        metavar="SHARE%",
+        read=_share,
+        basic=True,
+    )
+    equivalent: tuple[float, float] | None = option(
+        "Full-frame lens that the picture is taken to be from: focal length and f-number, such as 85mm,1.4.",
+        metavar="MM,F",
+        read=_equivalent,
+        basic=True,
+    )
+    aperture_radius_m: float | None = option("Radius of the opening, with --fov-deg.", positive=True)
+
+    def __post_init__(self) -> None:
+        places = {"--focus-m": self.focus_m, "--focus-at": self.focus_at, "--focus-range": self.focus_range}
+        views = {"--fov-deg": self.fov_deg, "--equivalent": self.equivalent}
+        real = self.focal_length_mm if self.focal_length_mm is not None else self.sensor_width_mm
+        _give_one(places, "both say where to focus")
+        _give_one(views | {"--focal-length-mm with --sensor-width-mm": real}, "say the same")
+        if self.fov_deg is None and self.aperture_radius_m is not None:
+            raise ValueError("--aperture-radius-m goes with --fov-deg; a real lens has --f-number instead")
+        _give_one(self._openings, "both say how wide the lens opens")
+        if self.fov_deg is not None and not 0 < self.fov_deg < 180:
+            raise ValueError(f"--fov-deg must be a number of degrees > 0 and < 180, got {self.fov_deg:g}")
+
+    @property
+    def _openings(self) -> dict[str, Any]:
+        """Each option that says how wide the lens opens, and what it says."""
+        names = {"--f-number": "f_number", "--aperture-radius-m": "aperture_radius_m"}
+        names |= {"--equivalent": "equivalent", "--blur": "blur_share"}
+        return {option: getattr(self, name) for option, name in names.items()}
+
+    @property
+    def has_focus(self) -> bool:
+        """Whether the user said where to focus."""
+        return (self.focus_m, self.focus_at, self.focus_range) != (None, None, None)
+
+    def more_blur(self, largest_px: float, is_still: bool) -> str:
+        """What to do about blur that is too small to be seen."""
+        if largest_px == 0:
+            return "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
+        wider = "a larger --aperture-radius-m" if self.aperture_radius_m is not None else "a smaller --f-number"
+        wider = "a smaller --equivalent f-number" if self.equivalent is not None else wider
+        wider = "a larger --blur" if self.blur_share is not None else wider
+        more = f", or --blur {_BLUR:.0%}" if is_still and self.blur_share is None else ""
+        return f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; {wider}{more} makes more of it"
+
+    @property
+    def speaks_of_metres(self) -> bool:
+        """Whether the user said anything of the scene in metres."""
+        return (self.focus_m, self.focus_range, self.aperture_radius_m) != (None, None, None)
+
+    def refuse_keyframes(self) -> None:
+        """Refuse focus that moves, for a single image."""
+        if len(self.focus_m or []) > 1:
+            raise ValueError("--focus-m has keyframes but IMAGE is a single image; give one distance in metres")
+
+    def view_deg(self, metadata: Mapping[str, Any], width: int, height: int) -> float:
+        """Horizontal field of view, stated or by focal length and sensor, which the file may know."""
+        known = self._known(metadata, width, height)
+        if self.fov_deg is not None:
+            return self.fov_deg
+        if not {"focal_length_mm", "sensor_width_mm"} <= set(known):
+            raise ValueError("--depth-kind distance needs --fov-deg, or --focal-length-mm and --sensor-width-mm")
+        return 2 * math.degrees(math.atan2(known["sensor_width_mm"], 2 * known["focal_length_mm"]))
+
+    def _known(self, metadata: Mapping[str, Any], width: int, height: int) -> dict[str, float]:
+        """Numbers of the camera that the user or else the file states."""
+        stated = {name: value for name in _ASSUMED if (value := getattr(self, name)) is not None}
+        if self.equivalent is not None:
+            lens = (*self.equivalent, 36.0 * width / max(width, height))
+            stated = dict(zip(_ASSUMED, lens, strict=True))
+        return camera_facts(metadata, width, height) | stated
+
+    def camera(
+        self,
+        metadata: Mapping[str, Any],
+        depth: "Tensor",
+        frame: int = 0,
+        is_still: bool = True,
+        is_to_scale: bool = True,
+    ) -> "tuple[Camera, list[str]]":
+        """The camera of one picture, and remarks on what the user did not state: the file does, or it is assumed.
+
+        A still is focused on its subject, and blurred so that it is seen, where nothing says otherwise; a frame of a
+        sequence is not, for both would change from frame to frame. Distances that are not to scale have nothing to do
+        with the file's own. Refuses numbers that make no lens, by the names of the options.
+        """
+        from ..optics.camera import Camera
+
+        height, width = depth.shape[-2:]
+        known, remarks, focus_m = self._known(metadata, width, height), list[str](), math.inf
+        if self.focus_m is not None:
+            focus_m = focus_at_frame(self.focus_m, frame)
+        elif not self.has_focus and is_to_scale and "focus_m" in known:
+            focus_m = known["focus_m"]
+            remarks.append("focus from the file")
+        elif not self.has_focus and not is_still:
+            raise ValueError("where is the focus? give --focus-m METRES or --focus-at X,Y (the file does not say)")
+        elif not self.has_focus:
+            from ..depth.guess import subject_m
+
+            focus_m = subject_m(depth)
+            remarks.append("focus on what is nearest the middle")
+        is_open = any(value is not None for value in self._openings.values())
+        if self.fov_deg is not None and not is_open:
+            raise ValueError("--fov-deg needs the opening of the lens: --aperture-radius-m, --f-number or --blur")
+        with by_option(self._names()):
+            if self.fov_deg is None:
+                lens: dict[str, Any] = {name: known.get(name, assumed) for name, assumed in _ASSUMED.items()}
+                camera = Camera(**lens, focus_m=focus_m)
+            else:
+                radius_m = self.aperture_radius_m
+                if radius_m is None:  # on the equivalent sensor, 36 mm wide
+                    radius_m = 18.0 / math.tan(math.radians(self.fov_deg) / 2) / (2000.0 * (self.f_number or 1.0))
+                camera = Camera.from_fov(self.fov_deg, radius_m, focus_m)
+            camera = camera.replace(focus_range_m=self.focus_range, tilt_deg=self.tilt, swing_deg=self.swing)
+        camera = camera if self.focus_at is None else camera.focus_at(depth, *self.focus_at)
+        share = self.blur_share
+        if is_still and not is_open and (self == Lens() or not is_to_scale):
+            is_known = is_to_scale and "f_number" in known
+            share = None if is_known and self._largest_coc_px(camera, depth) >= _SEEN * width else _BLUR
+        largest_px = 0.0 if share is None else self._largest_coc_px(camera, depth)
+        if share is not None and largest_px > 0:
+            camera = camera.replace(f_number=camera.f_number * largest_px / (share * width))
+        for name in _ASSUMED if self.fov_deg is None and self.equivalent is None else ():
+            words = "f-number" if name == "f_number" else name.rsplit("_", 1)[0].replace("_", " ")
+            if name == "f_number" and share is not None and largest_px > 0:
+                remarks += [] if is_open else [f"{words} for a blur of {share:.0%} of the width"]
+            elif getattr(self, name) is None:
+                remarks.append(f"{words} {'from the file' if name in known else 'assumed'}")
+        return camera, remarks
+
+    def _largest_coc_px(self, camera: "Camera", depth: "Tensor") -> float:
+        """The largest blur radius in pixels, but for a thousandth of stray pixels, at all keyframes of the focus."""
+        cameras = [camera.replace(focus_m=metres) for _, metres in self.focus_m or []] or [camera]
+        radii = [each.coc_px(depth, depth.shape[-1]).abs().nan_to_num(0.0).flatten() for each in cameras]
+        sampled = [radius[:: 1 + radius.numel() // _SAMPLES] for radius in radii]
+        return max(float(radius.kthvalue(radius.numel() - radius.numel() // _STRAY).values) for radius in sampled)
+
+    def stated(self, camera: "Camera") -> dict[str, Any]:
+        """The numbers of a camera by the options, or the file, that they are from."""
+        from ..optics.camera import CAMERA_NUMBERS
+
+        names = self._names()
+        if self.fov_deg is None:
+            return {names[name]: getattr(camera, name) for name in CAMERA_NUMBERS}
+        opening = next((option, value) for option, value in self._openings.items() if value is not None)
+        return {"--fov-deg": self.fov_deg, **dict([opening]), names["focus_m"]: camera.focus_m}
+
+    def _names(self) -> dict[str, str]:
+        """What the user knows a number of the camera as: the option that states it, or the file's own."""
+        focus = "--focus-at" if self.focus_at else "--focus-range" if self.focus_range else "--focus-m"
+        given = {name: getattr(self, name) is not None for name in (*_ASSUMED, "aperture_radius_m")}
+        spelled = {name: f"--{name.replace('_', '-')}" for name in given} | {"focus_m": focus}
+        given["focus_m"] = self.has_focus
+        names = {name: spelled[name] + ("" if is_given else " (not given)") for name, is_given in given.items()}
+        if self.equivalent is not None:
+            names |= dict.fromkeys(_ASSUMED, "--equivalent")
+        return _SPELLED | names
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthMap:
+    """Depth map."""
+
+    depth_kind: Literal["auto", "z", "distance", "disparity", "inverse", "relative", "coc"] = option(
+        "What the numbers are: z along the optical axis or distance along the ray, in metres after scale * (value + "
+        "offset); disparity or inverse depth, in metres after scale / (value + offset); relative, as estimators give "
+        "it, between --near-m and --far-m; or coc, the signed blur radius in pixels (negative is near). auto guesses "
+        "between relative, millimetres and metres, and says which; in sequences, and with --strict, it is z.",
+        "auto",
+        basic=True,
+    )
+    depth_scale: float | None = option("0.001 for maps in millimetres.", basic=True)
+    depth_offset: float = option("Added to each value first.", 0.0)
+    near_m: float | None = option("Distance of the nearest value of relative depth. Default: 1, or --far-m / 8.")
+    far_m: float | None = option("Distance of its farthest value (inf allowed). Default: 8 times --near-m.")
+    relative_kind: Literal["disparity", "inverse", "depth"] | None = option(
+        "What relative depth is: disparity or inverse depth, larger is nearer (MiDaS, Depth Anything; the default), or "
+        "depth, larger is farther (Marigold)."
+    )
+    value_range: tuple[float, float] | None = option(
+        "Smallest and largest value of relative depth; default: those of each frame.",
+        metavar="LOW,HIGH",
+        read=numbers(2, "--value-range expects two numbers such as 0,255"),
+    )
+    depth_unknown: float | None = option("A value that means 'not measured', such as 0, -1 or inf.")
+    fill_depth: float | str | None = option(
+        "Fill pixels without depth: from the nearest one, from the farthest around (what stereo cannot see lies "
+        "behind), or with a distance (inf for a sky).",
+        metavar="nearest|far|METRES",
+        read=word_or_number(("nearest", "far"), "--fill-depth expects nearest, far or metres"),
+    )
+    depth_channel: str | None = option("Channel (or array of an .npz) that is depth.")
+    strict: bool = option("Refuse what looks like a wrong unit or scale, instead of warning.", False)
+
+    def __post_init__(self) -> None:
+        has_scale = self.depth_scale is not None or self.depth_offset != 0.0
+        is_relative = any(
+            value is not None for value in (self.near_m, self.far_m, self.relative_kind, self.value_range)
+        )
+        if self.depth_kind == "auto" and (is_relative or has_scale or self.strict):  # which say what the numbers are
+            object.__setattr__(self, "depth_kind", "relative" if is_relative else "z")
+        if self.depth_kind == "relative" and has_scale:
+            raise ValueError("relative depth has no --depth-scale and --depth-offset: near and far say it")
+        if self.depth_kind != "relative" and is_relative:
+            raise ValueError(
+                "--near-m, --far-m, --relative-kind and --value-range are for relative depth, and not for --depth-kind "
+                f"{self.depth_kind}"
+            )
+
+    @property
+    def ends_m(self) -> tuple[float, float]:
+        """Distances of the nearest and the farthest value of relative depth."""
+        near_m, far_m = self.near_m, self.far_m
+        if near_m is None:
+            near_m = _NEAR_M if far_m is None or far_m == math.inf else far_m / _FAR_PER_NEAR
+        return near_m, near_m * _FAR_PER_NEAR if far_m is None else far_m
+
+    @property
+    def is_to_scale(self) -> bool:
+        """Whether distances are metres that somebody measured or stated."""
+        return self.depth_kind != "relative" or self.near_m is not None or self.far_m is not None
+
+    def of_sequence(self) -> "DepthMap":
+        """The same for frames of a sequence, where a guess could be another one in each: unsaid is metres."""
+        return replace(self, depth_kind="z") if self.depth_kind == "auto" else self
+
+    def guessed(self, values: "Tensor", path: Path, is_metric: bool) -> "tuple[DepthMap, str]":
+        """The same with a kind in the place of ``auto``, by the values of a map, and what to tell of it.
+
+        Metres are nothing to tell where what the user says of the scene ``is_metric``; otherwise holes are filled too.
+        """
+        from ..depth.guess import guess_kind
+
+        known = values if self.depth_unknown is None else values.masked_fill(values == self.depth_unknown, math.nan)
+        suffix = path.suffix.lower()
+        guess = guess_kind(known, suffix in _WHOLE_NUMBERS, is_metric or suffix in _OF_RENDERERS)
+        if guess.kind == "z" and guess.scale == 1.0 and is_metric:
+            return replace(self, depth_kind="z"), ""
+        fill, unknown = "far" if self.fill_depth is None else self.fill_depth, self.depth_unknown
+        unknown = guess.unknown if unknown is None else unknown
+        said = replace(self, depth_kind=guess.kind, depth_unknown=unknown, fill_depth=fill)
+        if guess.kind == "z":
+            unit = "metres" if guess.scale == 1.0 else "millimetres"
+            told = f"taken for {unit} (else --depth-kind, --depth-scale)"
+            return replace(said, depth_scale=None if guess.scale == 1.0 else guess.scale), told
+        larger, other = ("nearer", "depth") if guess.relative_kind == "disparity" else ("farther", "disparity")
+        near_m, far_m = said.ends_m
+        told = f"taken for relative depth (else --depth-kind), larger is {larger} (else --relative-kind {other}), "
+        told += f"from {near_m:g} to {far_m:g} m (else --near-m, --far-m)"
+        return replace(said, relative_kind=guess.relative_kind), told
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """What is seen, and through what; commands that take an image and its depth are made of it."""
+
+    lens: Lens = Lens()
+    depth_map: DepthMap = DepthMap()
+
+    def __post_init__(self) -> None:
+        lens = self.lens
+        if self.depth_map.depth_kind == "coc" and lens != Lens(fov_deg=lens.fov_deg):
+            raise ValueError(
+                "--depth-kind coc is the blur itself and takes no camera; leave focus and lens options out"
+            )
