@@ -123,7 +123,9 @@ def _made(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int]) -
     smaller = (1.0 - added / spread.clamp_min(1e-12)).clamp_min(_LEAST_SIZE**2).sqrt()
     boxes = torch.cat([boxes[:, :1], boxes[:, 1:] * smaller], -1)
     around = boxes + torch.tensor([0.0, SPOT_MARGIN_PX, SPOT_MARGIN_PX], dtype=torch.float64)
-    rows, columns = (min(_MOST, math.ceil(_FINE * float(side))) for side in around[:, 1:].amax(0))
+    wanted = (_FINE * around[:, 1:].amax(0)).clamp(max=_MOST)
+    rows, columns = (math.ceil(number) for number in wanted.tolist())
+    around[:, 1:] *= torch.tensor([rows, columns]) / wanted  # a sample's size is a continuous function of the radius
     along = torch.linspace(-1.0, 1.0, 2 * rows + 1, dtype=torch.float64) * around[:, 1:2] + around[:, :1]
     across = torch.linspace(0.0, 1.0, columns + 1, dtype=torch.float64) * around[:, 2:]
     length, width = light.shape[-2:]
@@ -150,10 +152,10 @@ def _through_rims(table: PlacedLens, coc_px: float, width: float, distance: Tens
     """Distances in pixels from the edges of the aperture's rims, as shares."""
     if table.aperture is None:
         raise AssertionError("a table that depends on the place has a field or rims")
-    reach = math.ceil(table.reach_px(coc_px, width)) + 1.0
-    boxes = torch.tensor([0.0, reach, reach * max(1.0, float(table.aperture.squeeze))], dtype=torch.float64)
-    boxes = boxes[[0, 2, 2]].expand(len(distance), 3)
-    count = min(2 * _MOST, math.ceil(float(boxes[0, 1])))
+    # whole pixels, so that samples lie a pixel apart, whatever the squeeze
+    reach = math.ceil((math.ceil(table.reach_px(coc_px, width)) + 1) * max(1.0, float(table.aperture.squeeze)))
+    boxes = torch.tensor([0.0, reach, reach], dtype=torch.float64).expand(len(distance), 3)
+    count = min(2 * _MOST, reach)
     along = torch.linspace(-1.0, 1.0, 2 * count + 1, dtype=torch.float64) * boxes[0, 1]
     across = torch.linspace(0.0, 1.0, count + 1, dtype=torch.float64) * boxes[0, 2]
     front, rear = table.aperture.rims
