@@ -89,7 +89,8 @@ def resolve_holes(depth: Tensor, name: str, fill: Fill | None) -> tuple[Tensor, 
 def _first_along(depth: Tensor, dim: int, back: bool) -> Tensor:
     """The last value that is not NaN at or before each place along a dimension; NaN where there is none."""
     line = depth.flip(dim) if back else depth
-    place = torch.arange(line.shape[dim]).reshape([-1 if d == line.ndim + dim else 1 for d in range(line.ndim)])
+    shape = [-1 if d == line.ndim + dim else 1 for d in range(line.ndim)]
+    place = torch.arange(line.shape[dim], device=line.device).reshape(shape)
     last = torch.where(line.isnan(), -1, place).cummax(dim=dim).values
     values = torch.where(last >= 0, line.gather(dim, last.clamp(min=0)), torch.nan)
     return values.flip(dim) if back else values
@@ -99,7 +100,7 @@ def _nearest(depth: Tensor) -> Tensor:
     """Jump flooding (Rong and Tan 2006), on the holes alone: ``[H, W]`` with NaN to ``[H, W]`` without."""
     height, width = depth.shape
     y, x = torch.nonzero(depth.isnan(), as_tuple=True)
-    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    rows, columns = torch.meshgrid(*(torch.arange(n, device=depth.device) for n in depth.shape), indexing="ij")
     seed = torch.where(depth.isnan(), -1, rows * width + columns)
     step = 1 << max(height, width).bit_length()
     steps = [step]

@@ -163,8 +163,8 @@ def solve_scale(
             f"{sorted({value for value, _ in known})}"
         )
     # (a v + b) / y = 1 with y = 1/z or z: both sides are relative, so that near points do not outweigh far ones.
-    value = torch.tensor([v for v, _ in known], dtype=torch.float64)
-    metres = torch.tensor([z for _, z in known], dtype=torch.float64)
+    value = torch.tensor([v for v, _ in known], dtype=torch.float64, device="cpu")
+    metres = torch.tensor([z for _, z in known], dtype=torch.float64, device="cpu")
     weight = 1.0 / metres if kind == "depth" else metres.clamp(max=1e6 * float(metres.min()))
     target = metres.isfinite().double() if kind != "depth" else torch.ones_like(value)
     design = torch.stack([value * weight, weight], dim=1)
@@ -172,7 +172,7 @@ def solve_scale(
     if not factor > 0:
         other, way = ("disparity", "nearer") if kind == "depth" else ("depth", "farther")
         raise ValueError(f"the points say that larger values are {way}; that is kind={other!r}, not {kind!r}")
-    residual = float((design @ torch.tensor([factor, constant], dtype=torch.float64) - target).square().mean().sqrt())
+    residual = float((design @ design.new_tensor([factor, constant]) - target).square().mean().sqrt())
     if kind == "depth":
         return Scale("z", factor, constant / factor, residual)
     return Scale("disparity", 1.0 / factor, constant / factor, residual)

@@ -642,7 +642,7 @@ def _table_integral(r: Tensor, p: Mapping[str, Tensor]) -> Tensor:
 @torch.inference_mode(False)  # what is kept must serve autograd as well
 def _cut_quadrant(half: int, slices: int, top: int, bottom: int) -> tuple[Tensor, Tensor, Tensor]:
     """Slices of the square cells of a quadrant's rows."""
-    return _slices(half, slices, top, bottom, torch.ones((), dtype=torch.float64))
+    return _slices(half, slices, top, bottom, torch.ones((), dtype=torch.float64, device="cpu"))
 
 
 def _slices(half: int, slices: int, top: int, bottom: int, aspect: Tensor) -> tuple[Tensor, Tensor, Tensor]:

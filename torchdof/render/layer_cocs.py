@@ -74,7 +74,7 @@ def extent(coc_px: Tensor) -> tuple[float, float]:
     if math.isnan(both[0]):
         both = ends(torch.where(coc_px.isnan(), 0.0, coc_px))
     exact = torch.promote_types(coc_px.dtype, torch.float32)
-    low, high = on_axis(torch.tensor(both, dtype=exact), max(coc_px.shape[-2:])).tolist()
+    low, high = on_axis(torch.tensor(both, dtype=exact, device="cpu"), max(coc_px.shape[-2:])).tolist()
     return low, high
 
 

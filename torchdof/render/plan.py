@@ -143,8 +143,8 @@ class Plan:
 
         Nothing tells where the borders of these scenes lie. So coarse layers, where that matters, lie denser.
         """
-        reach = float(blur_axis(torch.tensor(max_coc_px, dtype=torch.float64)))
-        dense_from = float(blur_axis(torch.tensor(_COARSE_FROM_PX[0], dtype=torch.float64)))
+        reach = float(blur_axis(torch.tensor(max_coc_px, dtype=torch.float64, device="cpu")))
+        dense_from = float(blur_axis(torch.tensor(_COARSE_FROM_PX[0], dtype=torch.float64, device="cpu")))
         last = reach - 0.3 * layer_cocs.spacing(reach, layer_cocs.DENSE * tolerance)
         inner = [x for x in layer_cocs.spaced_nodes(-reach, reach, tolerance, dense_from) if abs(x) < last]
         return cls((-reach, *inner, reach), tolerance, rays, grows=False, kernels_per_px=_FEWER_KERNELS_PER_PX)
@@ -289,7 +289,7 @@ def _layer_kernels(
     if table.is_differentiated:  # gradients to the aperture's rotation and squeeze need the PSF itself
         kernels = []
         for k, (coc, scale) in enumerate(zip(coc_px, scales, strict=True)):
-            coarse = torch.tensor([coc * shrink(bank, coc, width, scale) / scale], dtype=torch.float64)
+            coarse = torch.tensor([coc * shrink(bank, coc, width, scale) / scale], dtype=torch.float64, device="cpu")
             window = 2 * longest[k] - 1 if longest else None
             kernels.append(table.kernels(coarse, width / scale, window=window)[0])
         return kernels
