@@ -65,7 +65,7 @@ def test_the_order_of_a_stack_and_the_form_of_its_depths_do_not_matter(fence: Sc
 
 
 @pytest.mark.parametrize("tolerance", ["draft", "final"])
-def test_a_stack_in_a_batch_is_rendered_as_alone(tolerance: str) -> None:
+def test_a_stack_in_a_batch_is_rendered_as_alone(tolerance: Any) -> None:
     dof = DepthOfField(CAMERA, tolerance=tolerance)
     rgba = torch.rand(2, 2, 4, 24, 32, generator=torch.Generator().manual_seed(0))
     depth = torch.tensor([[1.2, 4.0], [0.6, 30.0]])
