@@ -102,7 +102,8 @@ def _parts(path: Path, name: str) -> Iterator[Part]:
     source = oiio.ImageInput.open(name, config)
     if source is None:
         raise OSError(f"{path}: cannot be read ({first_line(oiio.geterror())})")
-    is_exr, specs, promised = source.format_name() == "openexr", [], 0
+    specs: list[Any] = []
+    is_exr, promised = source.format_name() == "openexr", 0
     try:
         while (is_exr or not specs) and source.seek_subimage(len(specs), 0):
             specs.append(spec := source.spec())
