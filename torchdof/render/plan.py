@@ -91,15 +91,16 @@ class Plan:
         """Layers for a frame ``[B, 1, H, W]`` whose error is to be at most a tolerance: the plan of every rendering.
 
         Errors are largest beside edges and the border, and where blurs are as large as the frame these are everywhere:
-        such a frame is planned for less. For a plan that is to be ``still`` it is a whole power of 1/2 of the
-        tolerance, lest layers move with the scene.
+        such a frame is planned for less, though not for the sake of a few pixels. For a plan that is to be ``still`` it
+        is a whole power of 1/2 of the tolerance, lest layers move with the scene.
         """
         if not still and coc_px.dtype == torch.float32 and is_in_memory(coc_px) and native.chosen():
             return cls(*native.plan(coc_px, tolerance))
         coc_px = coc_px.detach()
-        extent = layer_cocs.extent(coc_px)
-        low, high = (from_blur_axis(end) for end in extent)
-        part = min(1.0, min(coc_px.shape[-2:]) / (_SMALL_RADII * max(-low, high, 1.0)))
+        extent, shorter = layer_cocs.extent(coc_px), min(coc_px.shape[-2:])
+        part = min(1.0, shorter / (_SMALL_RADII * max(*(abs(from_blur_axis(end)) for end in extent), 1.0)))
+        if part < 1.0:
+            part = min(1.0, shorter / (_SMALL_RADII * max(layer_cocs.widest(coc_px), 1.0)))
         if still:
             return cls.still(coc_px, tolerance * 2.0 ** math.floor(math.log2(part)))
         return cls._between(*extent, coc_px, tolerance * part)
