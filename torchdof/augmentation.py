@@ -5,6 +5,7 @@ channel of the image, in ``DepthAugmentationSequential`` with the depth as a mas
 ``torchvision.transforms.v2.Compose`` with samples that are dicts.
 """
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -129,9 +130,8 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
         """The parameters of one image by a generator of the caller's, each ``[1]``; the process's stays as it is."""
         ends = {name: low_and_high for low_and_high, name, _, _ in self._ranges}
-        return self._in_units(
-            {name: low + (high - low) * torch.rand(1, generator=generator) for name, (low, high) in ends.items()}
-        )
+        share = functools.partial(torch.rand, 1, generator=generator, device=generator.device)
+        return self._in_units({name: low + (high - low) * share() for name, (low, high) in ends.items()})
 
     def _in_units(self, drawn: dict[str, Tensor]) -> dict[str, Tensor]:
         """Metres, f-numbers and the numbers of tables of what was drawn evenly."""
@@ -283,7 +283,7 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
     def _chosen(self, params: Mapping[str, Tensor], count: int) -> Tensor:
         """Numbers of the items to blur; where all are always blurred, Kornia does not look at the gate."""
         if (self.p == 1.0 and self.p_batch == 1.0) or "batch_prob" not in params:
-            return torch.arange(count)
+            return torch.arange(count, device="cpu")
         return torch.atleast_1d(params["batch_prob"] > 0.5).expand(count).nonzero()[:, 0].cpu()
 
     def _blurred(

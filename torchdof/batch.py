@@ -76,7 +76,7 @@ def numbers(axes: tuple[int, ...], name: str, value: Any) -> Any:
     """
     if isinstance(value, Sequence) and not isinstance(value, str):
         try:
-            value = torch.tensor(value, dtype=torch.float64)
+            value = torch.tensor(value, dtype=torch.float64, device="cpu")
         except (TypeError, ValueError, RuntimeError, OverflowError):
             raise ValueError(f"{name} must be a number, a list of numbers or a tensor [B], got {show(value)}") from None
     if not isinstance(value, Tensor) or value.ndim == 0:

@@ -209,7 +209,7 @@ class DepthOfField(nn.Module):
         changes = {"focus_m": focus_m, "f_number": f_number}
         camera = self.camera.replace(**{k: v for k, v in changes.items() if v is not None})
         # a tensor, because an exported graph would do Python's arithmetic with the width in float32
-        width: Any = torch.scalar_tensor(image.shape[-1], dtype=torch.float64)
+        width: Any = torch.scalar_tensor(image.shape[-1], dtype=torch.float64, device="cpu")
         coc = camera.coc_px(depth, width)
         if not check:
             return torch.where(depth > 0, coc, torch.nan)

@@ -83,7 +83,7 @@ def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
     Raises:
         RuntimeError: If the shapes do not fit each other.
     """
-    return torch.broadcast_tensors(*(torch.zeros(()).expand(tuple(shape)) for shape in shapes))[0].shape
+    return torch.broadcast_tensors(*(torch.zeros((), device="cpu").expand(tuple(shape)) for shape in shapes))[0].shape
 
 
 def whole(name: str, value: Any, low: int, high: int) -> int:
@@ -340,9 +340,10 @@ def stack(rgba: Tensor, depth_m: Tensor, values: bool) -> Tensor:
         )
     if tuple(depth.shape[3:]) not in ((1, 1), (height, width)):
         raise ValueError(f"depth_m must have the layers' size {height} x {width}, got {list(depth_m.shape)}")
-    if values and not is_traced():
+    if not is_traced():
         real_tensor("rgba", rgba, "[B, N, C + 1, H, W]")
         real_tensor("depth_m", depth_m, "in metres")
+    if values and not is_traced():
         cover = rgba[:, :, -1]
         bad = int((~((cover >= 0) & (cover <= 1))).sum())
         if bad:

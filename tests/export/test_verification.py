@@ -102,6 +102,7 @@ def test_damaged_and_foreign_files_are_named(plain: Any, tmp_path: Path) -> None
 def test_metadata_describe_inputs_camera_table_and_options(plain: Any, model: onnx.ModelProto, tmp_path: Path) -> None:
     facts = describe(plain.path)
     assert model.producer_name == "torchdof" and model.producer_version == facts["version"]
+    assert all("give NaN in their item" in facts["inputs"][name] for name in ("focus_m", "f_number"))
     assert "metres" in facts["inputs"]["depth"] and "linear light" in facts["output"]["out"]
     assert facts["camera"]["focal_length_mm"] == plain.dof.camera.focal_length_mm
     assert facts["table"]["family"] == "disc" and len(facts["table"]["sha256"]) == 64

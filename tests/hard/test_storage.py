@@ -64,6 +64,44 @@ def test_a_fake_mode_with_real_tensors_does_not_crash() -> None:
     assert done.returncode == 0, done.stderr
 
 
+ELSEWHERE = """
+import sys, torch
+torch.set_default_device(sys.argv[1])
+from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
+from torchdof.depth import fill_holes, from_relative
+random = torch.Generator("cpu").manual_seed(0)
+image = torch.rand(1, 3, 40, 60, generator=random, device="cpu")
+image[0, :, 20, 30] = 200.0
+coc = torch.linspace(-9, 9, 60, device="cpu").expand(1, 1, 40, 60).clone()
+tables = [BlurTable.load("sato_j15"), BlurTable.polygon(5, 10.0, curvature=0.3, squeeze=0.7, vignetting=0.5)]
+pictures = [blur_by_coc(image, coc, table=table, occlusion=hides) for table in tables for hides in (True, False)]
+depth = from_relative(fill_holes(coc.where(coc < 8, torch.nan), "nearest"), 1.0, 3.0).requires_grad_()
+focused = DepthOfField(Camera(focus_range_m=(1.5, 2.0), tilt_deg=3.0))(image, depth)
+focused.square().sum().backward()
+print([float(t.detach().double().sum()) for t in (*pictures, focused, depth.grad)])
+"""
+
+
+@pytest.mark.parametrize("engine", ["native", "torch"])
+def test_a_default_device_changes_nothing_of_pictures_on_another(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+    on_cpu, on_meta = (
+        subprocess.run([sys.executable, "-c", ELSEWHERE, device], capture_output=True, text=True, check=False)
+        for device in ("cpu", "meta")
+    )
+    assert on_meta.returncode == 0, on_meta.stderr
+    assert on_meta.stdout == on_cpu.stdout != ""
+
+
+def test_a_freed_depth_has_no_coc() -> None:
+    with pytest.raises(ValueError, match=r"depth must be a tensor in metres that holds data, got a freed storage"):
+        Camera(focus_m=2.0).coc_px(freed(), 50)
+    rgba = torch.rand(1, 1, 4, 40, 50)
+    rgba.untyped_storage().resize_(0)
+    with pytest.raises(ValueError, match=r"rgba must be a tensor .* that holds data, got a freed storage"):
+        DepthOfField(Camera(focus_m=2.0), check=False).layers(rgba, torch.tensor([1.0]))
+
+
 def test_views_and_empty_tensors_have_storage() -> None:
     values = torch.ones(4, 5, 6)
     assert all(map(has_storage, (values[2:, ::2], values.permute(2, 0, 1), values[:1].expand(9, 5, 6), values[:0])))

@@ -22,7 +22,7 @@ import pytest
 import torch
 
 from torchdof import BlurTable
-from torchdof.io import foreign
+from torchdof.io import decode, foreign
 from torchdof.io.decode import MOST_ATTRIBUTES
 from torchdof.io.images import Picture, read_image, read_values, write_image
 
@@ -319,6 +319,30 @@ def huge_exr(path: Path) -> None:
         start = content.index(name) + len(name) + 4
         content[start : start + 16] = struct.pack("<iiii", 0, 0, 1_000_000, 1_000_000)
     path.write_bytes(content)
+
+
+def with_parts(path: Path, count: int) -> None:
+    """An EXR of so many parts of 40 x 40 pixels."""
+    specs = [oiio.ImageSpec(40, 40, 3, "half") for _ in range(count)]
+    for number, spec in enumerate(specs):
+        spec.attribute("oiio:subimagename", f"part {number}")
+    output = oiio.ImageOutput.create(str(path))
+    assert output is not None and output.open(str(path), tuple(specs))
+    for number, spec in enumerate(specs):
+        assert number == 0 or output.open(str(path), spec, "AppendSubimage")
+        assert output.write_image(np.zeros((40, 40, 3), np.float16))
+    assert output.close()
+
+
+def test_all_parts_are_held_against_memory_before_the_first_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_parts(tmp_path / "x.exr", 5)  # 144 kB when read, of which 29 kB are one part's
+    assert read_image(tmp_path / "x.exr", layer="part 3").pixels.shape == (1, 3, 40, 40)
+    monkeypatch.setattr(decode, "free_bytes", lambda: 1e5)
+    monkeypatch.setattr(oiio.ImageInput, "read_image", lambda *_: pytest.fail("read"))
+    with pytest.raises(ValueError, match="GiB of memory are free"):
+        read_image(tmp_path / "x.exr")
 
 
 NPY = "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000, 1000000), }".ljust(117).encode() + b"\n"

@@ -122,7 +122,7 @@ def lopsided(channels: int = 1) -> BlurTable:
     return BlurTable("disc", coc, params, unit="mm", sensor_width_mm=36.0, field=Field(coc, radius, box, light))
 
 
-@pytest.mark.parametrize(("y", "x", "coc_px"), [(0.0, 9.0, 6.0), (-6.0, 8.0, 6.0), (5.0, -5.0, 6.0), (-6.0, 8.0, 1.0)])
+@pytest.mark.parametrize(("y", "x", "coc_px"), [(0.0, 9.0, 6.0), (-6.0, 8.0, 6.0), (5.0, -5.0, 6.0), (-6.0, 8.0, 1.5)])
 def test_a_spot_has_the_moments_of_its_field_turned_by_the_azimuth(y: float, x: float, coc_px: float) -> None:
     table, width = lopsided(), 360
     per_mm = width / 36.0
@@ -209,6 +209,27 @@ def test_there_is_no_seam_between_blocks() -> None:
     at_border = (torch.arange(third.shape[-1]) + 2) % BLOCK[1] == 0
     seams, elsewhere = (float(third[..., part].square().mean()) for part in (at_border, ~at_border))
     assert 0.5 * math.sqrt(max(seams - elsewhere, 0.0)) < 1.5 / 255
+
+
+SQUEEZED = BlurTable.polygon(5, 10.0, squeeze=1.5, vignetting=(0.6, 0.2))
+
+
+@pytest.mark.parametrize("engine", ["native", "torch"])
+@pytest.mark.parametrize(
+    ("table", "radii"),
+    [(SQUEEZED, (1.0, 3.0, -4.0)), (lopsided(), (0.6447397, 0.9064583, 1.6714067))],
+    ids=["cat's eyes, squeezed", "a field"],
+)
+def test_where_shares_get_one_more_sample_the_picture_does_not_jump(
+    table: BlurTable, radii: tuple[float, ...], engine: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+    image = torch.rand(1, 1, 48, 360, generator=torch.Generator().manual_seed(3)) + 0.05
+    for radius in radii:
+        below, above = (
+            blur_by_coc(image, torch.full_like(image, radius * share), table=table) for share in (1 - 2e-6, 1 + 2e-6)
+        )
+        assert_close(below, above, rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize("table", [TABLE, lopsided()], ids=["cat's eyes", "a field"])

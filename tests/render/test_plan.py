@@ -81,6 +81,19 @@ def test_a_static_plan_is_as_exact_on_a_slope_as_the_plan_of_the_scene() -> None
     assert every < own < 0.75 / 255
 
 
+@pytest.mark.parametrize("engine", ["native", "torch"])
+def test_a_frame_is_planned_for_less_where_it_is_blurred_much_not_where_a_few_pixels_are(
+    engine: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+    coc = torch.full((1, 1, 480, 640), 3.0)
+    coc[..., 200:202, 300:302] = -1e5
+    assert Plan.of_frame(coc, 1 / 255).tolerance == 1 / 255
+    assert Plan.of_frame(coc, 1 / 255, still=True).tolerance == 1 / 255
+    for blurred in (torch.full_like(coc, 500.0), torch.cat([torch.full_like(coc, 500.0), coc])):
+        assert Plan.of_frame(blurred, 1 / 255).tolerance == pytest.approx(480 / (3 * 500) / 255)
+
+
 def test_layers_with_radii_of_1e9_px_or_more_are_refused() -> None:
     assert Plan((-0.9e9, 0.9e9), 1 / 255).nodes
     for node in (1.1e9, math.inf, math.nan):

@@ -53,7 +53,8 @@ def _told_in_one_sentence() -> Iterator[None]:
             message = _TOO_LITTLE
         else:
             raise
-    click.echo(f"error: {message}", err=True)
+    with contextlib.suppress(OSError):  # who cannot be told still gets the code
+        click.echo(f"error: {message}", err=True)
     raise SystemExit(2)
 
 
@@ -91,11 +92,19 @@ def app() -> None:
     """Depth of field from an image and its depth: the photograph that a real lens would have taken."""
 
 
+def _open_streams() -> None:
+    """Opens what is closed of standard input, output and error as nothing: no file may take its place, and messages."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))  # takes the lowest free number, which is the stream's own
+
+
 def main() -> None:
     """Entry point of ``torchdof`` and of ``python -m torchdof``."""
     # PyTorch's threads (OpenMP's) wait for their next work without a rest, which takes the processor from whoever has
     # some. GNU's library and LLVM's read these when PyTorch is loaded; what the user set is left as it is.
     if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME"} & set(os.environ):
         os.environ |= {"OMP_WAIT_POLICY": "passive", "KMP_BLOCKTIME": "0"}
+    _open_streams()
     with unwound_on_termination():
         app(prog_name="torchdof")

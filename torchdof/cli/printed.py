@@ -1,5 +1,6 @@
 """What commands print: a line for people or JSON for programs, warnings, and a bar while something takes long."""
 
+import contextlib
 import json
 import math
 import os
@@ -79,7 +80,8 @@ class WarnOnce:
 
 
 def _one_line(message: Warning | str, *_: Any, **__: Any) -> None:
-    click.echo(f"warning: {message}", err=True)
+    with contextlib.suppress(OSError):  # a warning that cannot be written costs no picture
+        click.echo(f"warning: {message}", err=True)
 
 
 def _is_terminal() -> bool:

@@ -94,7 +94,8 @@ def _first_along(depth: Tensor, dim: int, back: bool) -> Tensor:
     With ``back`` it searches from the other end.
     """
     line = depth.flip(dim) if back else depth
-    place = torch.arange(line.shape[dim]).reshape([-1 if d == line.ndim + dim else 1 for d in range(line.ndim)])
+    shape = [-1 if d == line.ndim + dim else 1 for d in range(line.ndim)]
+    place = torch.arange(line.shape[dim], device=line.device).reshape(shape)
     last = torch.where(line.isnan(), -1, place).cummax(dim=dim).values
     values = torch.where(last >= 0, line.gather(dim, last.clamp(min=0)), torch.nan)
     return values.flip(dim) if back else values
@@ -104,7 +105,7 @@ def _nearest(depth: Tensor) -> Tensor:
     """Fills NaN in ``[H, W]`` with the nearest depth, by jump flooding (Rong and Tan 2006) on the holes alone."""
     height, width = depth.shape
     y, x = torch.nonzero(depth.isnan(), as_tuple=True)
-    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    rows, columns = torch.meshgrid(*(torch.arange(n, device=depth.device) for n in depth.shape), indexing="ij")
     seed = torch.where(depth.isnan(), -1, rows * width + columns)
     step = 1 << max(height, width).bit_length()
     steps = [step]

@@ -118,7 +118,7 @@ class DepthReport:
         return "\n".join(lines)
 
 
-_SHARES = torch.tensor([0.01, 0.5, 0.99], dtype=torch.float64)
+_SHARES = torch.tensor([0.01, 0.5, 0.99], dtype=torch.float64, device="cpu")
 _SHARE_NAMES = ("1 %", "median", "99 %")
 
 

@@ -95,8 +95,8 @@ def _ray_length(like: Tensor, fov_x_deg: float) -> Tensor:
         raise ValueError(f"the field of view must be in (0, 180) degrees, got {show(fov_x_deg)}")
     height, width = like.shape[-2:]
     focal_px = width / 2 / max(math.tan(math.radians(fov_x_deg) / 2), 1e-300)
-    x = (torch.arange(width, dtype=like.dtype) + 0.5 - width / 2) / focal_px
-    y = (torch.arange(height, dtype=like.dtype) + 0.5 - height / 2) / focal_px
+    x = (torch.arange(width, dtype=like.dtype, device=like.device) + 0.5 - width / 2) / focal_px
+    y = (torch.arange(height, dtype=like.dtype, device=like.device) + 0.5 - height / 2) / focal_px
     return torch.sqrt(1.0 + x[None, :] ** 2 + y[:, None] ** 2)[None, None]
 
 

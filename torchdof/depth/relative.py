@@ -164,8 +164,8 @@ def solve_scale(
             f"{sorted({value for value, _ in known})}"
         )
     # Solve a v + b = y with y = z for "depth", else 1/z. Each row is divided by y, so that errors are relative.
-    value = torch.tensor([v for v, _ in known], dtype=torch.float64)
-    metres = torch.tensor([z for _, z in known], dtype=torch.float64)
+    value = torch.tensor([v for v, _ in known], dtype=torch.float64, device="cpu")
+    metres = torch.tensor([z for _, z in known], dtype=torch.float64, device="cpu")
     weight = 1.0 / metres if kind == "depth" else metres.clamp(max=1e6 * float(metres.min()))
     target = metres.isfinite().double() if kind != "depth" else torch.ones_like(value)
     design = torch.stack([value * weight, weight], dim=1)
@@ -173,7 +173,7 @@ def solve_scale(
     if not factor > 0:
         other, way = ("disparity", "nearer") if kind == "depth" else ("depth", "farther")
         raise ValueError(f"at the points, larger values are {way}; that is kind={other!r}, not {kind!r}")
-    residual = float((design @ torch.tensor([factor, constant], dtype=torch.float64) - target).square().mean().sqrt())
+    residual = float((design @ design.new_tensor([factor, constant]) - target).square().mean().sqrt())
     if kind == "depth":
         return Scale("z", factor, constant / factor, residual)
     return Scale("disparity", 1.0 / factor, constant / factor, residual)

@@ -103,7 +103,7 @@ def depth_mistakes(
         raise ValueError(f"depth must be [B, 1, H, W] in metres, got {list(depth.shape)}")
     in_focus = camera.focus_range_m or (camera.focus_m, camera.focus_m)
     lens = [getattr(camera, name) for name in _NUMBERS]
-    numbers = [torch.as_tensor(value).reshape(-1) for value in (*lens, *in_focus)]
+    numbers = [torch.as_tensor(value, device="cpu").reshape(-1) for value in (*lens, *in_focus)]
     batch = max(depth.shape[0], *(x.numel() for x in numbers))
     found: dict[str, Mistake] = {}
     for item in range(batch):

@@ -84,15 +84,18 @@ def _parts(path: Path, name: str) -> Iterator[Part]:
     source = oiio.ImageInput.open(name, config)
     if source is None:
         raise OSError(f"{path}: cannot be read ({first_line(oiio.geterror())})")
-    is_exr, number, promised = source.format_name() == "openexr", 0, 0
+    specs: list[Any] = []
+    is_exr, promised = source.format_name() == "openexr", 0
     try:
-        while source.seek_subimage(number, 0) and (is_exr or not number):
-            spec = source.spec()
+        while (is_exr or not specs) and source.seek_subimage(len(specs), 0):
+            specs.append(spec := source.spec())
             pixel_bytes = spec.nchannels * (spec.format.size() + 4)
             promised += _check_size(path, spec.width, spec.height, pixel_bytes, promised)
             if spec.deep:
                 raise ValueError(f"{path}: holds deep samples; flatten it to one sample a pixel first")
             _check_colours(path, spec)
+        for number, spec in enumerate(specs):
+            source.seek_subimage(number, 0)
             values = source.read_image(spec.format)
             problem = source.geterror()
             if values is None or problem:
@@ -117,7 +120,6 @@ def _parts(path: Path, name: str) -> Iterator[Part]:
                 window=window if values.shape[:2] == (spec.height, spec.width) else None,
                 orientation=orientation,
             )
-            number += 1
     finally:
         source.close()
 

@@ -179,7 +179,7 @@ class Aperture:
         fields = dict(data)
         if fields.get("mask") is not None:
             try:
-                fields["mask"] = torch.tensor(fields["mask"], dtype=torch.float64)
+                fields["mask"] = torch.tensor(fields["mask"], dtype=torch.float64, device="cpu")
             except (TypeError, ValueError, RuntimeError, OverflowError):
                 raise ValueError(f"mask must be rows of numbers, got {show(fields['mask'])}") from None
         return cls(**fields)
@@ -214,7 +214,7 @@ class Aperture:
         turn = self.rotation_deg
         if not isinstance(turn, Tensor) and turn == 0.0:
             return mask
-        angle = torch.deg2rad(torch.as_tensor(turn, dtype=torch.float64))
+        angle = torch.deg2rad(torch.as_tensor(turn, dtype=torch.float64, device=mask.device))
         cosine, sine = torch.cos(angle), torch.sin(angle)
         height, width = mask.shape
         rows = torch.stack([cosine, -sine * height / width, sine * width / height, cosine])
@@ -229,10 +229,11 @@ def _blade(half_angle: float, curvature: float) -> tuple[Tensor, Tensor]:
     chord, apothem = math.sin(half_angle), math.cos(half_angle)
     sagitta = curvature * (1.0 - apothem)
     if sagitta < 1e-9:
-        return torch.tensor([-chord], dtype=torch.float64), torch.tensor([apothem], dtype=torch.float64)
+        along, out = torch.tensor([[-chord], [apothem]], dtype=torch.float64, device="cpu")
+        return along, out
     radius = (chord**2 + sagitta**2) / (2.0 * sagitta)
     half_arc = math.asin(min(1.0, chord / radius)) if sagitta <= radius else math.pi - math.asin(chord / radius)
-    angle = torch.linspace(-half_arc, half_arc, _CHORDS + 1, dtype=torch.float64)[:-1]
+    angle = torch.linspace(-half_arc, half_arc, _CHORDS + 1, dtype=torch.float64, device="cpu")[:-1]
     bulge = 2.0 * radius * torch.sin((half_arc + angle) / 2) * torch.sin((half_arc - angle) / 2)
     missing = 1.0 / _CHORDS**2  # share of the arc's area outside its chords; the limit of a flat arc
     if half_arc > 5e-3:

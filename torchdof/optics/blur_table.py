@@ -129,7 +129,7 @@ class BlurTable:
         self._sides = {sign: self._side(sign) for sign in (-1, 1)}
         for sign in (-1, 1):
             self._sides[sign] = self._sides[sign] or self._sides[-sign]
-        in_focus = [self._side_params(sign, torch.zeros(1)) for sign in (-1, 1)]
+        in_focus = [self._side_params(sign, torch.zeros(1, device="cpu")) for sign in (-1, 1)]
         self.is_sharp_in_focus = not any(bool(p[name].any()) for p in in_focus for name in psf.LENGTHS & p.keys())
         self._try_kernels()
 
@@ -365,7 +365,8 @@ class BlurTable:
 
     def moved_in_focus(self, width: float) -> Tensor:
         """Share ``[channels]`` of the light that the table's kernel in focus moves to other pixels."""
-        in_focus = psf.pixel_kernels(self.family, self.params(torch.zeros(()), width), aperture=self.aperture).detach()
+        params = self.params(torch.zeros((), device="cpu"), width)
+        in_focus = psf.pixel_kernels(self.family, params, aperture=self.aperture).detach()
         return 1.0 - in_focus[:, in_focus.shape[-2] // 2, in_focus.shape[-1] // 2]
 
     def side_nodes(self, sign: int) -> tuple[Tensor, dict[str, Tensor]]:
@@ -385,7 +386,7 @@ class BlurTable:
     def reach_px(self, coc_px: float, width: float) -> float:
         """Radius in pixels that holds the kernels at ``+-coc_px``."""
         number("coc_px", coc_px, unit="pixels")
-        signed = torch.tensor([-abs(coc_px), abs(coc_px)], dtype=torch.float64)
+        signed = torch.tensor([-abs(coc_px), abs(coc_px)], dtype=torch.float64, device="cpu")
         reach = psf.support(self.family, self.params(signed, width), self.aperture)
         if self.field is None:
             return reach
@@ -418,10 +419,10 @@ class BlurTable:
             >>> round(float(texture.max()), 3)
             0.581
         """
-        signed = torch.tensor(number("coc_px", coc_px, unit="pixels"), dtype=torch.float64)
+        signed = torch.tensor(number("coc_px", coc_px, unit="pixels"), dtype=torch.float64, device="cpu")
         params = self.params(signed, width)
         size = psf.width_of(size, psf.support(self.family, params, self.aperture))
-        axis = torch.arange(size, dtype=torch.float64) - size // 2
+        axis = torch.arange(size, dtype=torch.float64, device="cpu") - size // 2
         opening = self.aperture or Aperture()
         r = torch.hypot(axis[:, None], axis[None, :] * opening.squeeze)
         texture = psf.profile(self.family, r.flatten(), params).unflatten(-1, (size, size))
@@ -643,11 +644,11 @@ def _numbers(name: str, value: Any) -> Tensor:
     if isinstance(value, list | tuple):
         value = [each.detach() if isinstance(each, Tensor) else each for each in value]
     try:
-        numbers = torch.as_tensor(value)
+        numbers = torch.as_tensor(value, device="cpu")
         if not (floating(numbers) or numbers.dtype in WHOLE_NUMBERS) or numbers.layout != torch.strided:
             raise TypeError
         if not isinstance(value, Tensor):
-            numbers = torch.as_tensor(value, dtype=torch.float64)  # the line above made a list float32
+            numbers = torch.as_tensor(value, dtype=torch.float64, device="cpu")  # the line above made a list float32
         numbers = numbers.detach().to("cpu", torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         raise ValueError(f"{name} must be numbers, got {str(value)[:60]}") from None

@@ -166,6 +166,8 @@ class Camera:
             raise ValueError(f"depth must be a floating-point tensor in metres, got {got}; convert it with .float()")
         if depth.layout != torch.strided:
             raise ValueError(f"depth must be a dense tensor in metres, got {depth.layout}; convert it with .to_dense()")
+        if type(depth) is Tensor and depth.device.type == "cpu":  # not a subclass, which may need no memory
+            real_tensor("depth", depth, "in metres")
         compiled = self._compiled_coc_px(depth, width)
         if compiled is not None:
             return compiled
@@ -435,7 +437,7 @@ def _check_angle(name: str, value: Number) -> None:
     plain = isinstance(value, int | float) and not isinstance(value, bool)
     if not shaped and not plain:
         raise ValueError(f"{name} must be degrees, a float or a floating-point tensor [B], got {show(value)}")
-    if not is_traced() and not bool((torch.as_tensor(value).detach().abs() < 90.0).all()):
+    if not is_traced() and not bool((torch.as_tensor(value, device="cpu").detach().abs() < 90.0).all()):
         raise ValueError(f"{name} must be in (-90, 90) degrees, got {_show(value)}")
 
 
@@ -446,7 +448,10 @@ def _checked_range(value: Any) -> tuple[Number, Number]:
     near, far = value
     for end in (near, far):
         _check_number("focus_range_m", end)
-    if not is_traced() and not bool((torch.as_tensor(near).detach() <= torch.as_tensor(far).detach()).all()):
+    if is_traced():
+        return near, far
+    low, high = (torch.as_tensor(end, device="cpu").detach() for end in value)
+    if not bool((low <= high).all()):
         raise ValueError(f"focus_range_m must go from near to far, got ({_show(near)}, {_show(far)})")
     return near, far
 

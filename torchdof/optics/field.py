@@ -110,7 +110,7 @@ class Field:
         beyond = max(1.0, coc / float(self.coc[-1]), coc / float(self.coc[0]))
         low, part = _between(self.radius, radius.to(torch.float64))
         nodes = slice(int(low.min()), int(low.max()) + 2)
-        k, of_next = _between(self.coc, torch.tensor(coc, dtype=torch.float64))
+        k, of_next = _between(self.coc, torch.tensor(coc, dtype=torch.float64, device="cpu"))
         box = torch.lerp(self.box[k, nodes], self.box[k + 1, nodes], of_next) * beyond  # [F, 3]
         light = torch.lerp(self.light[:, k, nodes], self.light[:, k + 1, nodes], of_next)  # [channels, F, U, V]
         low = low - nodes.start
@@ -130,9 +130,10 @@ class Field:
     def _reaches(self) -> Tensor:
         """Radius around the origin that contains the lit cells of all spots with the coc of each node: ``[K]``."""
         length, width = self.light.shape[-2:]
-        u = torch.linspace(-1.0, 1.0, length + 1, dtype=torch.float64) * self.box[..., 1:2] + self.box[..., :1]
+        along = torch.linspace(-1.0, 1.0, length + 1, dtype=torch.float64, device="cpu")
+        u = along * self.box[..., 1:2] + self.box[..., :1]
         farthest = torch.maximum(u[..., 1:].abs(), u[..., :-1].abs())
-        v = torch.linspace(0.0, 1.0, width + 1, dtype=torch.float64)[1:] * self.box[..., 2:]
+        v = torch.linspace(0.0, 1.0, width + 1, dtype=torch.float64, device="cpu")[1:] * self.box[..., 2:]
         lit = self.light > _LIT * self.light.amax((-2, -1), keepdim=True)
         return torch.where(lit, torch.hypot(farthest[..., None], v[..., None, :]), 0.0).amax((0, 2, 3, 4))
 
@@ -177,7 +178,7 @@ class Field:
         values = {}
         for name in known[:4]:
             try:
-                values[name] = torch.tensor(data[name], dtype=torch.float64)
+                values[name] = torch.tensor(data[name], dtype=torch.float64, device="cpu")
             except (TypeError, ValueError, RuntimeError, OverflowError):
                 raise ValueError(f"field.{name} must be rows of numbers, got {show(data[name])}") from None
         shape = [int(n) for n in values.pop("shape").flatten().nan_to_num().clamp(-1, _MOST_CELLS).tolist()]

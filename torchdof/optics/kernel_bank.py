@@ -169,7 +169,9 @@ class KernelBank:
 
     def __init__(self, table: Lens) -> None:
         self.table, self.colours, self.is_even = table, table.channels, table.field is not None
-        self.squeeze = 1.0 if table.aperture is None else float(torch.as_tensor(table.aperture.squeeze).detach())
+        self.squeeze = (
+            1.0 if table.aperture is None else float(torch.as_tensor(table.aperture.squeeze, device="cpu").detach())
+        )
         self.widest = max(1.0, 1.0 / self.squeeze)
         self._lens = table.fingerprint()
         self._moved: dict[float, list[float]] = {}
@@ -201,7 +203,9 @@ class KernelBank:
             slopes = [(r[low + 1] - r[low]) * slope for r in reaches]
             sizes = [r[low] + part * (r[low + 1] - r[low]) for r in reaches]
         if self.table.field is not None:
-            seen = float(self.table.field.reach(torch.tensor([coc_px / per_unit], dtype=torch.float64))[0])
+            seen = float(
+                self.table.field.reach(torch.tensor([coc_px / per_unit], dtype=torch.float64, device="cpu"))[0]
+            )
             sizes, slopes = [seen * min(abs(coc_px), 1.0)] * self.colours, [0.0] * self.colours
         return _Place(side, low, part, [size * per_unit for size in sizes], slope / per_unit, slopes)
 
@@ -260,8 +264,8 @@ class KernelBank:
             distance = coc_px.to("cpu", torch.float64).abs()
             moved = distance - distance.detach()
             slopes = [[slope / size for slope in p.reach_slopes] for p, size in zip(places, scales, strict=True)]
-            part = moved * torch.tensor([p.part_slope for p in places], dtype=torch.float64)
-            moves = (part, moved[:, None] * torch.tensor(slopes, dtype=torch.float64))
+            part = moved * torch.tensor([p.part_slope for p in places], dtype=torch.float64, device="cpu")
+            moves = (part, moved[:, None] * torch.tensor(slopes, dtype=torch.float64, device="cpu"))
         return spots._replace(templates=made, half=halves, moves=moves)
 
     def kernels(
@@ -278,18 +282,18 @@ class KernelBank:
         """The kernels of :meth:`kernels`, from the result of :meth:`spots`."""
         half = max(spots.half)
         numbers = (spots.part, spots.finer, spots.reach, spots.fade, spots.half)
-        parts, finer, reach, fade, halves = (torch.tensor(each, dtype=torch.float64) for each in numbers)
+        parts, finer, reach, fade, halves = (torch.tensor(each, dtype=torch.float64, device="cpu") for each in numbers)
         if spots.moves is not None:
             parts, reach = parts + spots.moves[0], reach + spots.moves[1]
-        step = torch.arange(-half, half + 1, dtype=torch.float64)
+        step = torch.arange(-half, half + 1, dtype=torch.float64, device="cpu")
         outside = (torch.maximum(step.abs(), step.abs()[:, None]) > halves[:, None, None])[:, None]
         if self.is_even:
             disc = (torch.hypot(step[:, None], step) <= reach[:, :, None, None]).to(torch.float64)
             made = disc / disc.sum((-2, -1), keepdim=True)
         else:
-            made = torch.zeros(len(spots.part), self.colours, len(step), len(step), dtype=torch.float64)
+            made = torch.zeros(len(spots.part), self.colours, len(step), len(step), dtype=torch.float64, device="cpu")
             for key in set(spots.which):
-                which = torch.tensor([i for i, other in enumerate(spots.which) if other == key])
+                which = torch.tensor([i for i, other in enumerate(spots.which) if other == key], device="cpu")
                 low, high, fine_low, fine_high = (spots.templates[i].double() for i in key)
                 sizes, part = reach[which], parts[which][:, None, None, None]
                 cut = halves[which, None] < sizes.detach() * self.widest - 1e-9
@@ -299,7 +303,7 @@ class KernelBank:
                     kernel = torch.lerp(kernel, fine, finer[which][:, None, None, None])
                 made = made.index_put((which,), kernel)
         if any(spots.flipped):
-            made = torch.where(torch.tensor(spots.flipped)[:, None, None, None], made.flip(-2, -1), made)
+            made = torch.where(torch.tensor(spots.flipped, device="cpu")[:, None, None, None], made.flip(-2, -1), made)
         if bool((fade == 1.0).all()):
             return made
         centre = torch.zeros_like(made)
@@ -334,7 +338,7 @@ class KernelBank:
         key = (1 if self._mirrored else side, self._shapes[side][node])
         if key not in self._sums:
             template = _templates.get((self._lens, *key, 0), lambda: self._template(*key, 0)).double()
-            step = torch.arange(-LEAST_CELLS - 1.0, LEAST_CELLS + 2.0, dtype=torch.float64) / LEAST_CELLS
+            step = torch.arange(-LEAST_CELLS - 1.0, LEAST_CELLS + 2.0, dtype=torch.float64, device="cpu") / LEAST_CELLS
             square = 0.5 * (step[:, None] ** 2 + step**2 / self.squeeze**2)
             light, moment = template.sum((-2, -1)).tolist(), (template * square).sum((-2, -1)).tolist()
             self._sums[key] = list(zip(light, moment, strict=True))

@@ -123,7 +123,7 @@ def _computed(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int
     3. Average the cells of each spot over the pixel around each sample, and scale the maximum to 1.
     """
     half_diagonal = 0.5 * math.hypot(*size)
-    distance = torch.linspace(0.0, 1.0, DISTANCES, dtype=torch.float64)
+    distance = torch.linspace(0.0, 1.0, DISTANCES, dtype=torch.float64, device="cpu")
     if table.field is None:
         return _through_rims(table, coc_px / scale, size[1] / scale, distance)
     per_unit = table.px_per_unit(size[1])
@@ -132,21 +132,25 @@ def _computed(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int
     boxes = boxes * (per_unit / scale * min(1.0, max(abs(coc_px), _SMALLEST)))
     # variance added by averaging blocks, interpolating between them, and by the box of a pixel below, in px^2
     added = (1 / 4 - 1 / (12 * scale**2) if scale > 1 else 0.0) + 1 / 12
-    cells = boxes[:, 1:] * torch.tensor([2.0, 1.0], dtype=torch.float64) / torch.tensor(light.shape[-2:])
+    rows, columns = light.shape[-2:]
+    cells = boxes[:, 1:] * torch.tensor([2.0 / rows, 1.0 / columns], dtype=torch.float64, device="cpu")
     spread = deviations(boxes, light).square()
     smaller = (1.0 - added / spread.clamp_min(1e-12)).clamp_min(_LEAST_SIZE**2).sqrt()
     boxes = torch.cat([boxes[:, :1], boxes[:, 1:] * smaller], -1)
-    around = boxes + torch.tensor([0.0, SPOT_MARGIN_PX, SPOT_MARGIN_PX], dtype=torch.float64)
-    rows, columns = (min(_MOST, math.ceil(_FINE * float(side))) for side in around[:, 1:].amax(0))
-    along = torch.linspace(-1.0, 1.0, 2 * rows + 1, dtype=torch.float64) * around[:, 1:2] + around[:, :1]
-    across = torch.linspace(0.0, 1.0, columns + 1, dtype=torch.float64) * around[:, 2:]
+    around = boxes + torch.tensor([0.0, SPOT_MARGIN_PX, SPOT_MARGIN_PX], dtype=torch.float64, device="cpu")
+    wanted = (_FINE * around[:, 1:].amax(0)).clamp(max=_MOST)
+    rows, columns = (math.ceil(number) for number in wanted.tolist())
+    counts = torch.tensor([rows, columns], device="cpu")
+    around[:, 1:] *= counts / wanted  # a sample's size is a continuous function of the radius
+    along = torch.linspace(-1.0, 1.0, 2 * rows + 1, dtype=torch.float64, device="cpu") * around[:, 1:2] + around[:, :1]
+    across = torch.linspace(0.0, 1.0, columns + 1, dtype=torch.float64, device="cpu") * around[:, 2:]
     length, width = light.shape[-2:]
-    ends = torch.linspace(-1.0, 1.0, length + 1, dtype=torch.float64) * boxes[:, 1:2] + boxes[:, :1]
-    sides = torch.linspace(-1.0, 1.0, 2 * width + 1, dtype=torch.float64) * boxes[:, 2:]
+    ends = torch.linspace(-1.0, 1.0, length + 1, dtype=torch.float64, device="cpu") * boxes[:, 1:2] + boxes[:, :1]
+    sides = torch.linspace(-1.0, 1.0, 2 * width + 1, dtype=torch.float64, device="cpu") * boxes[:, 2:]
     whole = torch.cat([light.flip(-1), light], -1)  # [C, distances, U, 2 V]
     area = cells.prod(-1)[:, None, None]
     # width of the average: a pixel, minus the variance that cells and linear interpolation between samples add
-    samples = around[:, 1:] / torch.tensor([rows, columns])
+    samples = around[:, 1:] / counts
     pixel = (1.0 - 2.0 * samples.square() - 3.0 * cells.square()).clamp_min(_LEAST_SEEN**2).sqrt()
     values = _overlaps(along, ends, pixel[:, 0]) @ (whole / area)
     values = values @ _overlaps(across, sides, pixel[:, 1]).transpose(-2, -1)
@@ -170,12 +174,12 @@ def _through_rims(table: PlacedLens, coc_px: float, width: float, distance: Tens
     """Values and boxes for cat's eyes: signed distances in pixels to the nearer rim, plus half a pixel, unclamped."""
     if table.aperture is None:
         raise AssertionError("a table that depends on the place has a field or rims")
-    reach = math.ceil(table.reach_px(coc_px, width)) + 1.0
-    boxes = torch.tensor([0.0, reach, reach * max(1.0, float(table.aperture.squeeze))], dtype=torch.float64)
-    boxes = boxes[[0, 2, 2]].expand(len(distance), 3)
-    count = min(2 * _MOST, math.ceil(float(boxes[0, 1])))
-    along = torch.linspace(-1.0, 1.0, 2 * count + 1, dtype=torch.float64) * boxes[0, 1]
-    across = torch.linspace(0.0, 1.0, count + 1, dtype=torch.float64) * boxes[0, 2]
+    # whole pixels, so that samples lie a pixel apart, whatever the squeeze
+    reach = math.ceil((math.ceil(table.reach_px(coc_px, width)) + 1) * max(1.0, float(table.aperture.squeeze)))
+    boxes = torch.tensor([0.0, reach, reach], dtype=torch.float64, device="cpu").expand(len(distance), 3)
+    count = min(2 * _MOST, reach)
+    along = torch.linspace(-1.0, 1.0, 2 * count + 1, dtype=torch.float64, device="cpu") * boxes[0, 1]
+    across = torch.linspace(0.0, 1.0, count + 1, dtype=torch.float64, device="cpu") * boxes[0, 2]
     front, rear = table.aperture.rims
     inside = []
     for shift in (2.0 * front * coc_px, -2.0 * rear * coc_px):

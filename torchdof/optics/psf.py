@@ -662,7 +662,7 @@ def _table_integral(r: Tensor, p: Mapping[str, Tensor]) -> Tensor:
 @torch.inference_mode(False)  # cached tensors must be usable by autograd
 def _cut_quadrant(half: int, slices: int, top: int, bottom: int) -> tuple[Tensor, Tensor, Tensor]:
     """Slices of the square cells of a quadrant's rows."""
-    return _slices(half, slices, top, bottom, torch.ones((), dtype=torch.float64))
+    return _slices(half, slices, top, bottom, torch.ones((), dtype=torch.float64, device="cpu"))
 
 
 def _slices(half: int, slices: int, top: int, bottom: int, aspect: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -82,7 +82,7 @@ def _render(
     """One item ``[C, H, W]``."""
     height, width = surfaces[0][0].shape[-2:]
     aperture = options.table.aperture or Aperture()
-    like = torch.empty(0)
+    like = torch.empty(0, device="cpu")
     render = functools.partial(
         native.render,
         kind=kind,
@@ -109,7 +109,9 @@ def _render(
 
 def _ray_shares(table: BlurTable, size: tuple[int, int], steps: Sequence[int]) -> list[Shares]:
     """What the field lets through of kernels of highlights whose coc is so many steps."""
-    return [s.to(torch.empty(0)) for s in ray_shares(table, [step / KERNELS_PER_PX for step in steps], size)]
+    return [
+        s.to(torch.empty(0, device="cpu")) for s in ray_shares(table, [step / KERNELS_PER_PX for step in steps], size)
+    ]
 
 
 def _psfs(table: BlurTable, width: int, longest: int, steps: Sequence[int]) -> list[Tensor]:

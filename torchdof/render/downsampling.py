@@ -68,10 +68,10 @@ def _correction(bank: KernelBank, one_px: float, width: float) -> float:
     reach = max(bank.spots([one_px], width).reach[0]) * bank.widest
     radius = min(_RADIUS_PX, (_PERIOD / 2 - 2) / reach)
     coc, width = one_px * radius, width * radius
-    frequency = 2 * math.pi * torch.fft.fftfreq(_PERIOD * _SCALE, dtype=torch.float64)
-    centres = (torch.arange(_SCALE, dtype=torch.float64) - (_SCALE - 1) / 2)[:, None]
+    frequency = 2 * math.pi * torch.fft.fftfreq(_PERIOD * _SCALE, dtype=torch.float64, device="cpu")
+    centres = (torch.arange(_SCALE, dtype=torch.float64, device="cpu") - (_SCALE - 1) / 2)[:, None]
     block = torch.cos(centres * frequency).mean(0)
-    offsets = (torch.arange(2 * _SCALE, dtype=torch.float64) - _SCALE + 0.5)[:, None]
+    offsets = (torch.arange(2 * _SCALE, dtype=torch.float64, device="cpu") - _SCALE + 0.5)[:, None]
     linear = ((1 - offsets.abs() / _SCALE) * torch.cos(offsets * frequency)).sum(0) / _SCALE
     block, linear = (part[:, None] * part for part in (block, linear))
     finest = 2 * math.pi / (8 * _PERIOD * _SCALE)
@@ -82,7 +82,7 @@ def _correction(bank: KernelBank, one_px: float, width: float) -> float:
     chain = _aliases(linear**2) * _aliases(block**2 * power)
     others = (1 / 4 - 1 / (12 * _SCALE**2)) / bank.variance_px(coc, width, 1.0)
     least = math.sqrt(max(_LEAST**2, 1 - others))
-    factors = torch.linspace(least, 1.0, _CANDIDATES, dtype=torch.float64)
+    factors = torch.linspace(least, 1.0, _CANDIDATES, dtype=torch.float64, device="cpu")
     coarse = _spectra(bank, [coc * factor for factor in factors.tolist()], width, _PERIOD)
     errors = (coarse.abs() ** 2 * chain - 2 * (coarse.conj() * meant).real).sum((-2, -1))
     # the error of a disc ripples with where its edge lies between pixels: a parabola through it does not

@@ -13,13 +13,14 @@ from torch import Tensor
 from ..validation import ends
 from .layer_weights import blur_axis
 
-__all__ = ["DENSE", "border_nodes", "extent", "finest", "on_axis", "slid", "spaced_nodes", "spacing"]
+__all__ = ["DENSE", "border_nodes", "extent", "finest", "on_axis", "slid", "spaced_nodes", "spacing", "widest"]
 
 DENSE = 0.65
 """Share of the tolerance for which coarse layers are spaced where nothing tells where a scene's borders lie.
 
 Measured on smooth slopes: from 0.8 on their layers are no denser than what a scene itself gets."""
 
+_FEW = 100  # the largest radii of a frame: 1 / _FEW of its pixels may exceed them
 _FINEST = 0.5
 _FINEST_PARTS = 40.0
 _WIDE = _FINEST * _FINEST_PARTS  # from which on the finest distance grows
@@ -31,8 +32,13 @@ _LOOSE = 4.0  # of 255: from there on by its square root, lest a picture consist
 
 def on_axis(coc_px: Tensor, longest: int) -> Tensor:
     """Places on the blur axis, finite, of some pixels of a frame whose longer side has so many."""
-    reach = 4.0 * longest + 4.0  # a kernel far larger than the frame is the same everywhere in it
+    reach = _reach(longest)
     return blur_axis(torch.where(torch.isnan(coc_px), 0.0, coc_px).clamp(-reach, reach))
+
+
+def _reach(longest: int) -> float:
+    """Radius beyond which a kernel is the same everywhere in a frame whose longer side has so many pixels."""
+    return 4.0 * longest + 4.0
 
 
 def finest(x: float) -> float:
@@ -74,8 +80,18 @@ def extent(coc_px: Tensor) -> tuple[float, float]:
     if math.isnan(both[0]):
         both = ends(torch.where(coc_px.isnan(), 0.0, coc_px))
     exact = torch.promote_types(coc_px.dtype, torch.float32)
-    low, high = on_axis(torch.tensor(both, dtype=exact), max(coc_px.shape[-2:])).tolist()
+    low, high = on_axis(torch.tensor(both, dtype=exact, device="cpu"), max(coc_px.shape[-2:])).tolist()
     return low, high
+
+
+def widest(coc_px: Tensor) -> float:
+    """Mean radius in pixels of the hundredth of a map's pixels that is blurred most; the largest of ``[B, 1, H, W]``.
+
+    A few pixels add next to nothing to it.
+    """
+    radii = torch.where(torch.isnan(coc_px), 0.0, coc_px).abs().clamp(max=_reach(max(coc_px.shape[-2:]))).flatten(1)
+    most = radii.topk(-(-radii.shape[1] // _FEW), sorted=False).values
+    return float(most.double().mean(1).amax())
 
 
 def border_nodes(coc_px: Tensor) -> list[float]:

@@ -104,6 +104,8 @@ def _planned(
 
 def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     """Depth of field of checked layers ``[B, N, C + 1, H, W]``; see :meth:`torchdof.DepthOfField.layers`."""
+    if len(rgba) > 1 and not is_differentiated(coc_px):  # each item has its own layers, as it would have alone
+        return torch.cat([blur_stack(*item, options) for item in zip(rgba.split(1), coc_px.split(1), strict=True)])
     wide = torch.float64 if torch.float64 in (rgba.dtype, coc_px.dtype) else torch.float32
     light, coc = rgba.to(wide), coc_px.to(wide)
     order = torch.where(torch.isfinite(coc), coc, torch.inf).argsort(1)  # near to far

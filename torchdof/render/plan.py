@@ -91,15 +91,16 @@ class Plan:
         """Layers for a frame ``[B, 1, H, W]`` whose error is to be at most a tolerance: the plan of every rendering.
 
         Errors are largest beside edges and the border, and where blurs are as large as the frame these are everywhere:
-        such a frame is planned for less. For a plan that is to be ``still`` it is a whole power of 1/2 of the
-        tolerance, lest layers move with the scene.
+        such a frame is planned for less, though not for the sake of a few pixels. For a plan that is to be ``still`` it
+        is a whole power of 1/2 of the tolerance, lest layers move with the scene.
         """
         if not still and coc_px.dtype == torch.float32 and is_in_memory(coc_px) and native.chosen():
             return cls(*native.plan(coc_px, tolerance))
         coc_px = coc_px.detach()
-        extent = layer_cocs.extent(coc_px)
-        low, high = (from_blur_axis(end) for end in extent)
-        part = min(1.0, min(coc_px.shape[-2:]) / (_SMALL_RADII * max(-low, high, 1.0)))
+        extent, shorter = layer_cocs.extent(coc_px), min(coc_px.shape[-2:])
+        part = min(1.0, shorter / (_SMALL_RADII * max(*(abs(from_blur_axis(end)) for end in extent), 1.0)))
+        if part < 1.0:
+            part = min(1.0, shorter / (_SMALL_RADII * max(layer_cocs.widest(coc_px), 1.0)))
         if still:
             return cls.still(coc_px, tolerance * 2.0 ** math.floor(math.log2(part)))
         return cls._between(*extent, coc_px, tolerance * part)
@@ -143,8 +144,8 @@ class Plan:
 
         Nothing tells where the borders of these scenes lie. So coarse layers, where that matters, lie denser.
         """
-        reach = float(blur_axis(torch.tensor(max_coc_px, dtype=torch.float64)))
-        dense_from = float(blur_axis(torch.tensor(_COARSE_FROM_PX[0], dtype=torch.float64)))
+        reach = float(blur_axis(torch.tensor(max_coc_px, dtype=torch.float64, device="cpu")))
+        dense_from = float(blur_axis(torch.tensor(_COARSE_FROM_PX[0], dtype=torch.float64, device="cpu")))
         last = reach - 0.3 * layer_cocs.spacing(reach, layer_cocs.DENSE * tolerance)
         inner = [x for x in layer_cocs.spaced_nodes(-reach, reach, tolerance, dense_from) if abs(x) < last]
         return cls((-reach, *inner, reach), tolerance, rays, grows=False, kernels_per_px=_FEWER_KERNELS_PER_PX)
@@ -289,7 +290,7 @@ def _layer_kernels(
     if table.is_differentiated:  # gradients to the aperture's rotation and squeeze need the PSF itself
         kernels = []
         for k, (coc, scale) in enumerate(zip(coc_px, scales, strict=True)):
-            coarse = torch.tensor([coc * shrink(bank, coc, width, scale) / scale], dtype=torch.float64)
+            coarse = torch.tensor([coc * shrink(bank, coc, width, scale) / scale], dtype=torch.float64, device="cpu")
             window = 2 * longest[k] - 1 if longest else None
             kernels.append(table.kernels(coarse, width / scale, window=window)[0])
         return kernels

@@ -508,10 +508,12 @@ class FieldMask {
       s.next = s.values + count;
     }
   }
-  float share(float dy, float dx) const {
-    const float across = dx * squeeze_, u = dy * down_ + across * right_, v = std::fabs(across * down_ - dy * right_);
-    const float first = samples_[0].at(u, v);
-    return both_ ? (1.0f - part_) * first + part_ * samples_[1].at(u, v) : first;
+  // Shares at dx, dx + 1, ...
+  vec shares_along(float dy, float dx) const {
+    vec across;
+    for (int i = 0; i < LANES; i++) across[i] = (dx + i) * squeeze_;
+    const vec u = dy * down_ + across * right_, v = across * down_ - dy * right_, first = samples_[0].at(u, most(v, -v));
+    return both_ ? (1.0f - part_) * first + part_ * samples_[1].at(u, most(v, -v)) : first;
   }
   // Shares at dy, dy - 1, ... for samples of a single radius.
   vec shares(float dy, float dx) const {
@@ -540,20 +542,8 @@ class FieldMask {
     const float *values, *next;  // samples at the field distances before and after the position
     int columns;
     float near, last_row, last_column, per_u, first_u, per_v;
-    float at(float u, float v) const {
-      // NaN becomes 0
-      const float row = std::min(std::max(0.0f, u * per_u + first_u), last_row), column = std::min(std::max(0.0f, v * per_v), last_column);
-      const int i = std::min((int)row, (int)last_row - 1), j = std::min((int)column, (int)last_column - 1);
-      const float down = row - i, right = column - j;
-      float mean[2];
-      for (int k = 0; k < 2; k++) {
-        const float *p = (k ? next : values) + i * columns + j;
-        const float upper = p[0] + right * (p[1] - p[0]), lower = p[columns] + right * (p[columns + 1] - p[columns]);
-        mean[k] = upper + down * (lower - upper);
-      }
-      return clamp01(mean[0] + near * (mean[1] - mean[0]));
-    }
     vec at(vec u, vec v) const {
+      // NaN becomes 0
       const vec row = least(most(u * per_u + first_u, vec{}), all(last_row)), column = least(most(v * per_v, vec{}), all(last_column));
       const ivec i = convert(least(row, all(last_row - 1.0f))), j = convert(least(column, all(last_column - 1.0f)));
       const vec down = row - convert(i), right = column - convert(j);

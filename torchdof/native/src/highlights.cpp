@@ -434,17 +434,24 @@ std::vector<float> gains_of(const Job &job, const RayKernels &kernels) {
     const Ray &ray = job.rays[r];
     for (int e = 0; e < E; e++) {
       const FieldMask mask = mask_of(job, kernels, ray, e);
+      const int half = std::max(kernels.halves[ray.radius], kernels.halves[ray.radius + 1]);
+      std::vector<float> row(2 * half + 1 + LANES);
       double all_light = 0, left = 0;
-      for (int which = ray.radius; which <= ray.radius + 1; which++) {
-        const int h = kernels.halves[which], side = 2 * h + 1;
-        const float part = which == ray.radius ? 1.0f - ray.part : ray.part, *values = kernels.kernels[which] + (size_t)e * side * side;
-        for (int y = 0; y < side; y++)
-          for (int x = 0; x < side; x++) {
-            const float light = part * values[y * side + x];
-            if (light == 0) continue;
-            all_light += light;
-            left += light * mask.share((float)(y - h), (float)(x - h));
-          }
+      for (int y = -half; y <= half; y++) {
+        std::fill(row.begin(), row.end(), 0.0f);
+        for (int which = ray.radius; which <= ray.radius + 1; which++) {
+          const int h = kernels.halves[which], side = 2 * h + 1;
+          if (std::abs(y) > h) continue;
+          const float part = which == ray.radius ? 1.0f - ray.part : ray.part;
+          const float *values = kernels.kernels[which] + ((size_t)e * side + y + h) * side;
+          for (int x = 0; x < side; x++) row[half - h + x] += part * values[x];
+        }
+        for (int x = 0; x <= 2 * half; x += LANES) {
+          const vec light = load<vec>(row.data() + x);
+          if (!any_positive(light)) continue;
+          const vec passed = light * mask.shares_along((float)y, (float)(x - half));
+          for (int lane = 0; lane < LANES; lane++) all_light += light[lane], left += passed[lane];
+        }
       }
       gains[(size_t)r * E + e] = left > FieldMask::LEAST * all_light ? (float)(all_light / left) : 0.0f;
     }
@@ -527,8 +534,9 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
             std::fill(row, row + PATCH, 0.0f);
             add_taps(ray.radius, 1.0f - ray.part, e, py + i, px, nx, row);
             add_taps(ray.radius + 1, ray.part, e, py + i, px, nx, row);
-            for (int x = 0; x < nx && gain > 0; x++)
-              if (row[x] != 0) row[x] *= gain * masks[e].share((float)(py + i - ray.row), (float)(px + x - ray.column));
+            for (int x = 0; x < nx && gain > 0; x += LANES)
+              if (any_positive(load<vec>(row + x)))
+                store(row + x, load<vec>(row + x) * gain * masks[e].shares_along((float)(py + i - ray.row), (float)(px + x - ray.column)));
             for (int x = 0; x < PATCH; x += LANES) any |= any_positive(load<vec>(row + x));
           }
         }

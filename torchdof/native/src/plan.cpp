@@ -2,6 +2,8 @@
 // render/layer_cocs.py and render/plan.py.
 #include "engine.h"
 
+#include <numeric>
+
 #include "variants.h"
 
 namespace torchdof {
@@ -12,6 +14,7 @@ constexpr double FINEST = 0.5, FINEST_PARTS = 40, WIDE = FINEST * FINEST_PARTS;
 constexpr double SPACING = 0.25, SPACING_POWER = 0.8, LOOSE = 4, NEAR = 0.3;
 constexpr double CROWD = 0.03;     // share of the border's pixels that get a layer at their own position,
 constexpr int LEAST_CROWD = 16;    // and the minimum number of such pixels
+constexpr int FEW = 100;           // the largest radii of a frame: 1 / FEW of its pixels may exceed them
 constexpr double SMALL_RADII = 3;  // a frame smaller than this many of its largest blur radii gets a smaller tolerance
 
 double finest(double x) { return std::max(FINEST, std::fabs(x) / FINEST_PARTS); }
@@ -96,7 +99,18 @@ std::vector<double> plan(const float *coc, int maps, int height, int width, doub
   const float reach = 4.0f * std::max(height, width) + 4.0f;
   auto place = [&](float c) { return axis(std::isnan(c) ? 0.0f : clamp(c, -reach, reach), -INFINITY, INFINITY); };
   const double nearest = place(low), farthest = place(high);
-  const double widest = std::max({-(double)coc_at(nearest), (double)coc_at(farthest), 1.0});  // px
+  double widest = std::max({-(double)coc_at(nearest), (double)coc_at(farthest), 1.0});  // px
+  if (SMALL_RADII * widest > std::min(height, width)) {  // but not for the sake of a few pixels
+    double usual = 1;
+    std::vector<float> radii(area);
+    const auto most = radii.begin() + (area + FEW - 1) / FEW;
+    for (const float *map = coc; map < coc + maps * area; map += area) {
+      for (int64_t i = 0; i < area; i++) radii[i] = std::isnan(map[i]) ? 0.0f : std::min(std::fabs(map[i]), reach);
+      std::nth_element(radii.begin(), most - 1, radii.end(), std::greater<float>());
+      usual = std::max(usual, std::accumulate(radii.begin(), most, 0.0) / (double)(most - radii.begin()));
+    }
+    widest = usual;
+  }
   tolerance *= std::min(1.0, std::min(height, width) / (SMALL_RADII * widest));
   if (farthest <= nearest) return {nearest};
   std::vector<float> border;
