@@ -178,7 +178,7 @@ class _Cuts(onnx_ir.passes.InPlacePass):
                 continue
             along: list[Any] = [first.inputs[3], node.inputs[3]]
             axes = [onnx_ir.convenience.get_const_tensor(value) for value in along]
-            if axes[0] is None or axes[1] is None or whole.shape is None:
+            if whole is None or axes[0] is None or axes[1] is None or whole.shape is None:
                 continue
             rank = len(whole.shape)  # an axis may be counted from the last one
             if {int(a) % rank for a in axes[0].numpy()} & {int(a) % rank for a in axes[1].numpy()}:

@@ -53,11 +53,13 @@ def continued(
         image_x: The same of the image, ``[B / surfaces, 1, H, W]``; None: the image has the one surface.
         surfaces: Number of surfaces.
     """
-    image = limit, image_x
     rows, columns = (
         _beyond(
-            *(None if map_ is None else _both(map_, dim, 1) for map_ in (light, weight, x)),
-            *(None if map_ is None else _both(map_, dim, surfaces) for map_ in image),
+            _both(light, dim),
+            None if weight is None else _both(weight, dim),
+            None if x is None else _both(x, dim),
+            None if limit is None else _both(limit, dim, surfaces),
+            None if image_x is None else _both(image_x, dim, surfaces),
             farthest,
         )
         for dim in (-2, -1)
@@ -76,7 +78,7 @@ def continued(
     return torch.cat([lines[1].flip(-2), lines[0], lines[2]], -2)
 
 
-def _both(values: Tensor, dim: int, times: int) -> Tensor:
+def _both(values: Tensor, dim: int, times: int = 1) -> Tensor:
     """First and last line of maps ``[B, c, H, W]`` along an axis, several times: ``[2, times B, c, n]``."""
     lines = torch.stack([values.select(dim, 0), values.select(dim, -1)])
     return lines if times == 1 else lines.repeat(1, times, 1, 1)

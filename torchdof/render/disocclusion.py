@@ -226,11 +226,12 @@ def fill_hidden(
     cells = _largest(torch.cat([-coc_px, wanted], 1), cell_rows, cell_columns, BEHIND_STEP)
     nearest, is_wanted = -cells[:, :1], cells[:, 1:] > 0
     samples, shares = zip(*_samples(searched, (cell_rows, cell_columns), BEHIND_STEP), strict=True)
-    shown = shown_behind(_in_pairs(torch.stack(samples, 1)), torch.stack(shares), nearest[:, None])
-    farthest = search(searched, *shown, nearest, farthest=True)
+    shown, known = shown_behind(_in_pairs(torch.stack(samples, 1)), torch.stack(shares), nearest[:, None])
+    farthest = search(searched, shown, known, nearest, farthest=True)
     coarse: tuple[Tensor, ...] = ()
     if len(searched) > _FINE_LEVELS:
-        coarse = search(searched[_FINE_LEVELS:], *(part[:, _FINE_LEVELS:] for part in shown), nearest)
+        rest = slice(_FINE_LEVELS, None)
+        coarse = search(searched[rest], shown[:, rest], known[:, rest], nearest)
     looked = torch.cat([*farthest, *coarse], 1)
     looked = ops.choose(lambda: is_wanted.any(), looked * is_wanted, torch.zeros_like(looked))
     behind = torch.where(looked[:, colours + 1 : colours + 2] > 0, looked[:, :colours], pyramid[_FINE_LEVELS - 1][0])
