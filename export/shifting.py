@@ -17,7 +17,7 @@ def samples(values: Tensor, size: tuple[int, int], step: int, half_px: tuple[Ten
         half_px: How many halves of a pixel of the map, 0 or 1, its centre lies below and right of that of the samples.
 
     Returns:
-        Two rows and two columns of samples, ``[B, C, 2, 2, H, W]``, and shares ``[2, 2, H, W]``.
+        Samples ``[B, C, 4, H, W]`` and shares ``[4, H, W]``.
     """
     enlarged = functional.interpolate(values, scale_factor=float(step), mode="nearest")
     first = step // 2  # of the samples before the first pixel
@@ -25,10 +25,10 @@ def samples(values: Tensor, size: tuple[int, int], step: int, half_px: tuple[Ten
     for n, half in zip(size, half_px, strict=True):
         place = 2 * torch.arange(n, device=values.device) + 2 * first + 1
         share = ((place % (2 * step)).to(values.dtype) + half) / (2 * step)
-        shares.append(torch.stack([1.0 - share, share]))
+        shares.append((1.0 - share, share))
     shifted = [
         enlarged.narrow(-2, first + row * step, size[0]).narrow(-1, first + column * step, size[1])
         for row in (0, 1)
         for column in (0, 1)
     ]
-    return torch.stack(shifted, 2).unflatten(2, (2, 2)), shares[0][:, None, :, None] * shares[1][:, None, :]
+    return torch.stack(shifted, 2), torch.stack([y[:, None] * x for y in shares[0] for x in shares[1]])

@@ -57,7 +57,7 @@ def slim(model: onnx_ir.Model) -> onnx_ir.Model:
     )
     for step in flat:
         step(model)
-    fold_constants(model, input_size_limit=2**24, output_size_limit=2**16)
+    fold_constants(model, input_size_limit=2**24, output_size_limit=2**13)
     for step in tidy:
         step(model)
     structure(model)

@@ -76,7 +76,7 @@ def seen(levels: Sequence[Level], coc_px: Tensor, mask: Tensor, ops: Ops) -> See
         values = window(functional.pad(level.values, ends, mode="replicate"), _SIDE // level.step, 1)
         pieces.append(values)
         shown.append(shown_behind(*samples(values, (_SIDE, _SIDE), level.step, (halves[0], halves[1])), coc_px))
-    lights, weights = (torch.stack(parts, 1) for parts in zip(*shown, strict=True))
+    lights, weights = (torch.cat([part[None] for part in parts]) for parts in zip(*shown, strict=True))
     found = torch.cat(search(levels, lights, weights, coc_px), 1)
 
     def hides() -> Tensor:
@@ -87,7 +87,7 @@ def seen(levels: Sequence[Level], coc_px: Tensor, mask: Tensor, ops: Ops) -> See
     rows, columns = ((w + m) // _SIDE for w, m in zip(whole, more, strict=True))
     batch = looking.shape[0]
     tiles = collect(tile, batch * rows * columns)
-    # narrowed, not sliced: so tracing knows the sizes of what is left
+    # narrow() instead of slices: tracing then knows the sizes of the result
     maps = _joined(tiles, (batch, rows, columns)).narrow(-2, top, size[0]).narrow(-1, left, size[1])
     return maps[:, :-1], maps[:, -1:]
 

@@ -71,14 +71,14 @@ def disc(image: Tensor, coc_px: Tensor, table: BlurTable | None = None) -> Tenso
     else:
         kernel = table.kernels(radius, image.shape[-1])[0]
     half = kernel.shape[-1] // 2
-    wide = continued(image, None, threshold(image), (half,) * 4, half)
+    wide = continued([image], None, threshold(image), (half,) * 4, half)[0]
     return functional.conv2d(wide, kernel.expand(image.shape[1], -1, -1)[:, None], groups=image.shape[1])
 
 
 def mean(image: Tensor, _: Tensor) -> Tensor:
     """Closed form for a blur far larger than the frame: means over a square of twice its longer side."""
     half = max(image.shape[-2:]) - 1
-    wide = continued(image, None, threshold(image), (half,) * 4, half)
+    wide = continued([image], None, threshold(image), (half,) * 4, half)[0]
     return functional.avg_pool2d(wide, 2 * half + 1, stride=1)
 
 

@@ -18,7 +18,7 @@ from torchdof import BlurTable, Camera, DepthOfField, depth_of_field
 from torchdof.augmentation import DepthAugmentationSequential, RandomDepthOfField
 
 CAMERA = Camera(sensor_width_mm=4.0)
-# Kornia 0.8 does not say of masks how their corners lie
+# Kornia 0.8 does not pass align_corners for masks
 pytestmark = pytest.mark.filterwarnings("ignore:Default grid_sample and affine_grid behavior:UserWarning")
 
 
@@ -150,7 +150,7 @@ def test_gradients_reach_image_and_depth() -> None:
 # Labels
 
 
-def test_the_label_is_the_blur_of_the_picture_and_what_was_drawn_by_name() -> None:
+def test_the_label_holds_the_blur_and_the_random_parameters_by_name() -> None:
     image, depth = sample()
     torch.manual_seed(2)
     aug = random_dof(p=0.5, transfer="linear", return_label=True, table=[BlurTable.disc()] * 3, depth_edges="as given")

@@ -27,27 +27,27 @@ NAMES = [table.name for table in TABLES]
 
 
 def scene(batch: int = 2, most_px: float = 4.0, height: int = 7, width: int = 9) -> tuple[Tensor, Tensor]:
-    """Light and a signed radius, at random."""
+    """A random image and a random map of signed radii."""
     coc = most_px * (2 * torch.rand(batch, 1, height, width, dtype=WIDE) - 1)
     return torch.rand(batch, 3, height, width, dtype=WIDE), coc
 
 
 @pytest.mark.parametrize("normalize", [True, False])
 @pytest.mark.parametrize("table", TABLES, ids=NAMES)
-def test_it_is_a_plain_loop_over_pixels_with_the_kernel_of_each(table: BlurTable, normalize: bool) -> None:
+def test_scatter_equals_a_plain_loop_with_a_kernel_for_each_pixel(table: BlurTable, normalize: bool) -> None:
     image, coc = scene(1)
     expected = loops.accumulate(image, coc, table, None, normalize)
     assert_close(splat(image, coc, table, normalize=normalize), expected, rtol=0, atol=3e-4)
 
 
 @pytest.mark.parametrize("table", TABLES, ids=NAMES)
-def test_radii_for_which_kernels_are_made_have_these_to_the_last_digit(table: BlurTable) -> None:
+def test_kernels_of_tabulated_radii_are_exact(table: BlurTable) -> None:
     image, coc = scene(1, most_px=1.9)
     coc = (128 * coc).round() / 128
     assert_close(splat(image, coc, table), loops.accumulate(image, coc, table), rtol=1e-11, atol=1e-12)
 
 
-def test_a_wide_blur_in_a_small_frame_is_that_of_the_loop() -> None:
+def test_a_wide_blur_in_a_small_frame_equals_the_loop() -> None:
     image, coc = scene(1, most_px=30.0, height=3, width=6)
     assert_close(splat(image, coc), loops.accumulate(image, coc, BlurTable.disc()), rtol=0, atol=3e-4)
 
@@ -85,17 +85,17 @@ def test_an_image_in_focus_is_returned_bit_exact() -> None:
     assert torch.equal(splat(image, torch.zeros(1, 1, 8, 9), normalize=False), image)
 
 
-def test_a_plane_is_what_the_layered_rendering_makes_of_it() -> None:
+def test_a_plane_equals_its_layered_rendering() -> None:
     image, coc = torch.rand(1, 3, 20, 24), torch.full((1, 1, 20, 24), 2.7)
     layered = blur_by_coc(image, coc, occlusion=False, tolerance=0, depth_edges="as given")
-    inside = (..., slice(3, -3), slice(3, -3))  # beyond the border layers go on as the image does
+    inside = (..., slice(3, -3), slice(3, -3))  # the layered rendering extends the image beyond its border
     assert_close(splat(image, coc)[inside], layered[inside], rtol=0, atol=3e-4)
 
 
 # Batches
 
 
-def test_items_of_a_batch_are_what_they_are_alone_and_a_map_may_be_shared() -> None:
+def test_items_of_a_batch_equal_each_alone_and_may_share_a_map() -> None:
     image, coc = scene(3)
     together = splat(image, coc)
     for item in range(3):
@@ -112,7 +112,7 @@ def test_single_images_and_clips_are_taken() -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
-def test_the_dtype_is_the_images(dtype: torch.dtype) -> None:
+def test_the_result_has_the_dtype_of_the_image(dtype: torch.dtype) -> None:
     image, coc = scene(1)
     out = splat(image.to(dtype), coc.float())
     assert out.dtype == dtype
@@ -149,7 +149,7 @@ def test_torch_func_has_the_same_gradient() -> None:
     assert_close(torch.func.grad(lambda c: splat(image, c).square().sum())(coc), expected)
 
 
-def test_a_step_keeps_memory_of_a_few_images_for_the_way_back() -> None:
+def test_a_training_step_stores_a_few_images_for_the_backward_pass() -> None:
     image = torch.rand(1, 3, 40, 50, requires_grad=True)
     coc = (torch.rand(1, 1, 40, 50) * 8).requires_grad_()
     kept: dict[int, int] = {}
@@ -186,6 +186,6 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
 
 
 @pytest.mark.parametrize(("call", "message"), REFUSED)
-def test_what_has_no_picture_is_refused_by_name(call: Callable[[], Any], message: str) -> None:
+def test_invalid_arguments_are_refused_by_name(call: Callable[[], Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         call()

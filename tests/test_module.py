@@ -87,7 +87,7 @@ def test_a_plane_equals_a_plain_loop_over_its_pixels() -> None:
     image = torch.rand(1, 2, 6, 7, dtype=torch.float64)
     kernels = TABLES["disc"].kernels(torch.tensor([2.3], dtype=torch.float64), 7)[0]
     half = kernels.shape[-1] // 2
-    wide = continued(image, None, None, (half,) * 4, half)
+    wide = continued([image], None, None, (half,) * 4, half)[0]
     expected = functional.pad(loops.normalised_convolution(wide, kernels), (-half,) * 4)
     for way in WAYS.values():
         out = blur_by_coc(image, constant_map(2.3, image, torch.float64), **way)
@@ -170,7 +170,7 @@ def test_the_plain_sum_keeps_all_light_at_any_depths() -> None:
 
 def wider(image: Tensor, coc: Tensor, beyond: int) -> tuple[Tensor, Tensor]:
     """An image and its coc, continued by ``beyond`` pixels on each side."""
-    light = continued(image, None, None, (beyond,) * 4, beyond, blur_axis(coc))
+    light = continued([image], None, None, (beyond,) * 4, beyond, blur_axis(coc))[0]
     return light, functional.pad(coc, (beyond,) * 4, mode="replicate")
 
 

@@ -1,6 +1,6 @@
-"""Random depth of field among Kornia's augmentations: its parameters, containers and rules of repetition.
+"""Random depth of field as a Kornia augmentation, with Kornia's parameters, containers and repeated calls.
 
-``RandomDepthOfField`` sits in Kornia's ``ImageSequential`` and ``AugmentationSequential`` with the depth as the last
+``RandomDepthOfField`` works in Kornia's ``ImageSequential`` and ``AugmentationSequential`` with the depth as the last
 channel of the image, in ``DepthAugmentationSequential`` with the depth as a mask, resampled as masks are, and in
 ``torchvision.transforms.v2.Compose`` with samples that are dicts.
 """
@@ -29,7 +29,7 @@ from .validation import image_and_map, number, show
 
 __all__ = ["DepthAugmentationSequential", "RandomDepthOfField"]
 
-_DISPLAYED = (-0.5, 1.5)  # what resampling may make of values from 0 to 1
+_DISPLAYED = (-0.5, 1.5)  # accepted range of encoded images: from [0, 1], resampling may overshoot this far
 _IMAGE_NAMES = ("image", "input", "img")
 
 
@@ -37,29 +37,30 @@ _IMAGE_NAMES = ("image", "input", "img")
 class RandomDepthOfField(IntensityAugmentationBase2D):
     """Blurs images by their depth with a random focus, f-number and lens.
 
-    Focus is drawn evenly in dioptres (1 / metres) and the f-number evenly in stops, because blur and light go with
-    these; both, and the lens, are kept in ``_params`` and repeated by ``aug(image, depth, params=aug._params)``. Images
-    that ``p`` leaves out are returned as they are, and cost nothing.
+    Focus is drawn uniformly in dioptres (1 / metres), in which blur is linear, and the f-number uniformly in stops,
+    each of which halves the light. Both, and the lens, are kept in ``_params``;
+    ``aug(image, depth, params=aug._params)`` repeats them. Images that ``p`` leaves out are returned unchanged, and
+    cost nothing.
 
     The depth comes in one of three ways: as the second argument, as the last channel of an image of two or four
     channels (which is returned with it, unchanged), or under the key ``"depth"`` of a dict.
 
-    Where the depth is not > 0, as in the corners that a rotation leaves, pixels stay sharp: ``check`` is False unless
-    you say otherwise. A crop narrows the field of view, and so does a camera with a smaller ``sensor_width_mm``: the
-    camera given is that of the image as it arrives here.
+    Where the depth is not > 0, for example in the corners after a rotation, pixels stay sharp, because ``check`` is
+    False by default. A crop narrows the field of view, as a smaller ``sensor_width_mm`` does: ``camera`` must be that
+    of the image as it arrives here.
 
     Args:
         focus_m: Nearest and farthest focus distance in metres, > 0, ``inf`` allowed.
         f_number: Smallest and largest f-number, > 0.
         camera: Focal length, sensor width and focus breathing; its own focus and f-number are not used.
-        table: Blur measured from a lens, or several, of which one is drawn for each image; None takes the ideal disc.
-        transfer: How images are encoded: ``"srgb"``, as files and data sets hold them (in [0, 1]; put normalization
-            behind), or ``"linear"`` light.
+        table: Blur of a lens, or several, of which one is drawn for each image; None takes the ideal disc.
+        transfer: Encoding of the images: ``"srgb"``, as in files and data sets (in [0, 1]; normalise after this
+            step), or ``"linear"`` light.
         same_on_batch: Draw once for the whole batch.
-        p: Probability of each image to be blurred.
+        p: Probability that an image is blurred.
         keepdim: Return one image ``[C, H, W]`` as such, not as a batch of one.
-        return_label: Return what was drawn beside the images, as :meth:`label` has it: ``(images, label)``, or under
-            these names in a dict. Kornia's containers hand on images alone; ask :meth:`label` after them.
+        return_label: Also return the result of :meth:`label`: ``(images, label)``, or its entries in a dict. Kornia's
+            containers pass on images alone; call :meth:`label` after them.
         **options: As in :class:`torchdof.options.Options`.
 
     Raises:
@@ -118,23 +119,23 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         self._param_generator = rg.PlainUniformGenerator(*self._ranges)
 
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
-        """Draws ``focus_m`` [m], ``f_number`` and ``table`` (which of several), each ``[B]``."""
+        """Draw ``focus_m`` in metres, ``f_number`` and ``table`` (index of a table), each ``[B]``."""
         return self._in_units(super().generate_parameters(batch_shape))
 
     def forward_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
-        """Draws for every image, blurred or not, and which are; Kornia 0.8 would draw for the blurred ones alone."""
+        """Draw parameters for every image, and which are blurred; Kornia 0.8 would draw for the blurred ones alone."""
         chosen = self.__batch_prob_generator__(batch_shape, self.p, self.p_batch, self.same_on_batch)
         shape = torch.tensor(batch_shape, dtype=torch.long)
         return {**self.generate_parameters(batch_shape), "batch_prob": chosen, "forward_input_shape": shape}
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """The parameters of one image by a generator of the caller's, each ``[1]``; the process's stays as it is."""
+        """Draw the parameters of one image, each ``[1]``, from ``generator``; the global generator is not used."""
         ends = {name: low_and_high for low_and_high, name, _, _ in self._ranges}
         share = functools.partial(torch.rand, 1, generator=generator, device=generator.device)
         return self._in_units({name: low + (high - low) * share() for name, (low, high) in ends.items()})
 
     def _in_units(self, drawn: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Metres, f-numbers and the numbers of tables of what was drawn evenly."""
+        """Convert the uniformly drawn numbers to metres, f-numbers and indices of tables."""
         return {
             "focus_m": (1.0 / drawn["focus"]).clamp(*self.focus_m),
             "f_number": torch.exp2(drawn["f_number"] / 2).clamp(*self.f_number),
@@ -154,7 +155,7 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in shown.items())})"
 
     def __call__(self, input: Any, *arguments: Any, **kwargs: Any) -> Any:
-        """Kornia's, which converts and keeps images, but where a dict comes or goes: it takes that for an image."""
+        """Kornia's call, which converts images; skipped for dicts and labels, which Kornia would take for images."""
         if isinstance(input, Mapping) or self.return_label:
             return nn.Module.__call__(self, input, *arguments, **kwargs)
         return super().__call__(input, *arguments, **kwargs)
@@ -166,16 +167,15 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         params: dict[str, Tensor] | None = None,
         **kwargs: Any,
     ) -> Any:
-        """Augment.
+        """Blur images.
 
         Args:
-            input: ``[B, C, H, W]`` or ``[C, H, W]``; without a depth beside it, its last channel is the depth. Or a
-                dict with ``"image"`` (or ``"input"``, ``"img"``) and ``"depth"``, which is returned with that image
-                replaced.
+            input: ``[B, C, H, W]`` or ``[C, H, W]``; without ``depth``, its last channel is the depth. Or a dict with
+                ``"image"`` (or ``"input"``, ``"img"``) and ``"depth"``, which is returned with the image replaced.
             depth: Metres, ``[B, 1, H, W]``, ``[B, H, W]`` or ``[1, 1, H, W]``; of one image ``[1, H, W]`` or
                 ``[H, W]``.
             params: Parameters of an earlier call, to repeat it; None draws new ones.
-            **kwargs: What Kornia's containers pass on.
+            **kwargs: Arguments from Kornia's containers.
 
         Returns:
             Images of the shape of ``input`` (a batch unless ``keepdim``), in its dtype, or the dict; with
@@ -194,14 +194,14 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
             images = super().forward(input, params, **kwargs)
             return (images, self.label(input, depth, params)) if self.return_label else images
         finally:
-            for drawn in (params, self._params):  # depth is an input: nothing keeps it, nothing repeats it
+            for drawn in (params, self._params):  # depth is an input, not a parameter that a call keeps
                 if drawn is not None:
                     drawn.pop("depth", None)
 
     def _forward_dict(
         self, sample: Mapping[str, Any], params: dict[str, Tensor] | None, **kwargs: Any
     ) -> dict[str, Any]:
-        """A sample as torchvision's transforms pass it on."""
+        """Blur a sample that is a dict, as in torchvision's transforms."""
         name = next((name for name in _IMAGE_NAMES if name in sample), None)
         if name is None or "depth" not in sample:
             raise ValueError(f"a dict must have 'image' and 'depth', got the keys {', '.join(map(str, sample))}")
@@ -213,21 +213,21 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
     def label(
         self, input: Tensor, depth: Tensor | None = None, params: Mapping[str, Any] | None = None
     ) -> dict[str, Tensor]:
-        """What the images of a call show, by name, for a network to learn.
+        """Blur and drawn parameters of the images of a call, as training labels by name.
 
         Args:
-            input: The images of the call, before the blur, with or without the depth as their last channel.
-            depth: Its depth, as in :meth:`forward`.
-            params: Its parameters; None takes those of the last call.
+            input: Images of the call, before the blur, with or without the depth as their last channel.
+            depth: Depth of the call, as in :meth:`forward`.
+            params: Parameters of the call; None takes those of the last call.
 
         Returns:
             ``coc_px``: signed radius of the circle of confusion ``[B, 1, H, W]``, in pixels, negative in front of the
-            focus plane, 0 where a pixel stays as it is; ``focus_m`` in metres, ``f_number`` and ``table`` (its number
-            among those given), each ``[B]``, also of images that were left out; ``blurred``, bool ``[B]``, False of
-            these. Of one image ``[C, H, W]`` all are without the axis B.
+            focus plane, 0 where a pixel is unchanged; ``focus_m`` in metres, ``f_number`` and ``table`` (index of the
+            table), each ``[B]``, also for images that were not blurred; ``blurred``, bool ``[B]``. For one image
+            ``[C, H, W]`` all are without the axis B.
 
         Raises:
-            ValueError: As :meth:`forward`; so do parameters that were drawn for another number of images.
+            ValueError: As :meth:`forward`; also if the parameters were drawn for another number of images.
         """
         shape = _batch_shape(input)
         image, depth, _ = _image_and_depth(_plain(input).reshape(shape), _plain(depth))
@@ -256,7 +256,7 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         transform: Tensor | None = None,
         **kwargs: Any,
     ) -> Tensor:
-        """Kornia's, but for choosing the images, which needs their depth; Kornia 0.8 would hand on some without it."""
+        """As in Kornia, but pass on all images: :meth:`apply_transform` selects those to blur, with their depth."""
         params, flags = self._process_kwargs_to_params_and_flags(
             self._params if params is None else params, flags, **kwargs
         )
@@ -268,20 +268,20 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
     def apply_transform(
         self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
-        """Blurs the images that ``params`` select, ``[B, C, H, W]``."""
+        """Blur the images ``[B, C, H, W]`` that ``params`` select."""
         image, depth, kept = _image_and_depth(input, params.get("depth"))
         chosen = self._chosen(params, len(input))
         out = image
         for index in params["table"][chosen].unique().tolist():
             items = chosen[params["table"][chosen] == index].to(input.device)
-            alone = len(items) == len(input)  # then nothing is copied
+            alone = len(items) == len(input)  # all images have this lens: copy none
             picked = (image, depth) if alone else (image[items], depth[items])
             rendered = self._blurred(*picked, params, items, int(index), flags["transfer"])
             out = rendered if alone else out.index_copy(0, items, rendered)
         return torch.cat([out, kept], dim=1) if kept.shape[1] else out
 
     def _chosen(self, params: Mapping[str, Tensor], count: int) -> Tensor:
-        """Numbers of the items to blur; where all are always blurred, Kornia does not look at the gate."""
+        """Indices of the items to blur: all if the probability is 1, as in Kornia, else those with an open gate."""
         if (self.p == 1.0 and self.p_batch == 1.0) or "batch_prob" not in params:
             return torch.arange(count, device="cpu")
         return torch.atleast_1d(params["batch_prob"] > 0.5).expand(count).nonzero()[:, 0].cpu()
@@ -289,7 +289,7 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
     def _blurred(
         self, image: Tensor, depth: Tensor, params: Mapping[str, Tensor], items: Tensor, index: int, transfer: Transfer
     ) -> Tensor:
-        """Items of one lens, ``[N, C, H, W]``."""
+        """Blur items ``[N, C, H, W]`` with one lens."""
         image = self._light(image, transfer)
         options: Any = self.renderings[index].arguments()
         focus_m, f_number = (params[name].to(items.device)[items] for name in ("focus_m", "f_number"))
@@ -298,7 +298,7 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
 
     @staticmethod
     def _light(image: Tensor, transfer: Transfer) -> Tensor:
-        """Linear light of images."""
+        """Decode images to linear light."""
         if transfer == "linear":
             return image
         low, high = (float(value) for value in image.detach().aminmax())
@@ -313,13 +313,13 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
 class DepthAugmentationSequential(AugmentationSequential):
     """Kornia's ``AugmentationSequential``, in which the first mask is the depth of the image, in metres.
 
-    Geometric steps move image, depth and masks alike, depth and masks by nearest neighbour, so that no depth between
-    two surfaces is made up; :class:`RandomDepthOfField` gets the depth as it is at its place in the sequence.
+    Geometric steps transform image, depth and masks alike, depth and masks by nearest neighbour, so that no depth
+    between two surfaces appears. :class:`RandomDepthOfField` receives the depth as the steps before left it.
 
     Args:
-        *args: Augmentations; those of depth of field are direct members, not within another container.
-        **kwargs: As Kornia's; ``data_keys`` are ``"input"``, ``"mask"`` for the depth, and whatever else there is. With
-            ``data_keys=None`` a dict is taken, in which the first key that begins with ``"mask"`` is the depth.
+        *args: Augmentations; :class:`RandomDepthOfField` must be a direct member, not inside another container.
+        **kwargs: As Kornia's; ``data_keys`` are ``"input"``, ``"mask"`` for the depth, and any others. With
+            ``data_keys=None`` the input is a dict, in which the first key that begins with ``"mask"`` is the depth.
 
     Raises:
         ValueError: When called, if there is no mask and a member needs the depth.
@@ -341,7 +341,7 @@ class DepthAugmentationSequential(AugmentationSequential):
 
 
 class _DepthOps(AugmentationSequentialOps):
-    """Hands the depth to the steps that need it, where Kornia's hands every tensor on by itself."""
+    """Passes the depth to the steps that need it; Kornia's class passes each tensor separately."""
 
     def transform(
         self,
@@ -360,7 +360,7 @@ class _DepthOps(AugmentationSequentialOps):
 
 
 def _image_and_depth(input: Tensor, depth: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Images, their depth ``[B, 1, H, W]``, and the channels of the input ``[B, C, H, W]`` that are returned as is."""
+    """Split an input ``[B, C, H, W]`` into images, depth ``[B, 1, H, W]`` and channels to return unchanged."""
     image, kept = input, input[:, :0]
     if depth is None:
         if input.shape[1] not in (2, 4):
@@ -378,7 +378,7 @@ def _image_and_depth(input: Tensor, depth: Tensor | None) -> tuple[Tensor, Tenso
 
 
 def _range(name: str, value: Any, most: float) -> tuple[float, float]:
-    """Two numbers > 0, the smaller first."""
+    """Check a pair of numbers > 0, the smaller first."""
     if not isinstance(value, Sequence) or len(value) != 2:
         raise ValueError(f"{name} must be two numbers, the smallest and the largest, got {show(value)}")
     low, high = (number(name, item, low=0.0, infinite=most == math.inf) for item in value)
@@ -388,7 +388,7 @@ def _range(name: str, value: Any, most: float) -> tuple[float, float]:
 
 
 def _batch_shape(image: Any) -> tuple[int, ...]:
-    """``[B, C, H, W]`` of images as Kornia takes them."""
+    """Shape ``[B, C, H, W]`` of one image or a batch."""
     if not floating(image) or image.ndim not in (3, 4):
         raise ValueError(
             f"image must be a floating-point tensor [B, C, H, W] or [C, H, W], got {show(image)}; convert bytes with "
@@ -398,12 +398,12 @@ def _batch_shape(image: Any) -> tuple[int, ...]:
 
 
 def _plain(value: Any) -> Any:
-    """A tensor without a subclass of its own, such as torchvision's."""
+    """Convert a tensor of a subclass, such as torchvision's, to a plain one."""
     return value.as_subclass(Tensor) if isinstance(value, Tensor) else value
 
 
 def _as(like: Any, value: Tensor) -> Tensor:
-    """A tensor of the same subclass, with what torchvision keeps beside the numbers."""
+    """Convert a tensor to the subclass of ``like``, with torchvision's metadata."""
     if type(like) is Tensor:
         return value
     from torchvision.tv_tensors import TVTensor, wrap

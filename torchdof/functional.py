@@ -1,6 +1,6 @@
-"""Blur of single pixels for those who bring the blur themselves: each pixel has the kernel of its own radius.
+"""Blur each pixel with the kernel of its own radius, which the caller computes.
 
-It is the paper's scatter without layers, and what training code calls a PSF layer.
+It is the paper's scatter without layers; training code calls it a PSF layer.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,10 +19,10 @@ from .validation import ends, image_and_coc, image_and_map, show
 
 __all__ = ["splat"]
 
-_PER_PX = 128  # kernels made for each pixel of radius up to _EVEN_PX; more of them change next to nothing
-_EVEN_PX = 2.0  # radius from which on the distance between kernels grows with the radius, to 1/256 of it
-_AT_ONCE = 64  # kernels made together: of like radius, for each is as wide as the widest
-_LEAST = 1e-6  # share of scattered weight below which nothing is known
+_PER_PX = 128  # kernels per px of radius, up to _EVEN_PX; more take longer and hardly change the picture
+_EVEN_PX = 2.0  # px of radius: above, kernels are 1/256 of the radius apart; larger is finer
+_AT_ONCE = 64  # kernels of similar radius made together, each as wide as the widest; more take more memory
+_LEAST = 1e-6  # scattered weight, of 1: pixels with less are unknown and become 0
 _DISC = BlurTable.disc()
 _GAUSSIAN = BlurTable.gaussian(1.0)
 _kernels = KernelCache(128 * 2**20)
@@ -41,25 +41,25 @@ def splat(
     With ``K_q`` the kernel of pixel q and ``I`` its light, the picture at p is
     ``sum_q K_q(p - q) I(q) / sum_q K_q(p - q)``; without ``normalize`` it is the numerator alone.
 
-    Kernels are interpolated linearly between those of radii 1/128 px apart, from 2 px on 1/256 of the radius apart: on
-    average 2e-4 of a kernel's light, or less, lies elsewhere than in :meth:`torchdof.BlurTable.kernels`. Time grows
-    with the number of pixels times the square of the largest blur, memory with the number of pixels alone, also where
-    gradients are recorded. For blurs of more than a few pixels :func:`torchdof.blur_by_coc` is many times faster.
+    Kernels are interpolated linearly between radii 1/128 px apart, above 2 px 1/256 of the radius apart. On average, at
+    most 2e-4 of a kernel's light differs from :meth:`torchdof.BlurTable.kernels`. Time grows with the number of pixels
+    times the square of the largest blur; memory grows with the number of pixels alone, with gradients too. For blurs of
+    more than a few pixels :func:`torchdof.blur_by_coc` is many times faster.
 
     Args:
-        image: ``[B, C, H, W]``, linear light, floating point; also ``[C, H, W]`` or ``[B, T, C, H, W]``, the maps then
-            of that rank.
+        image: ``[B, C, H, W]``, linear light, floating point; also ``[C, H, W]`` or ``[B, T, C, H, W]``, with maps of
+            the same rank.
         coc_px: Signed radius of the circle of confusion ``[B, 1, H, W]`` or ``[1, 1, H, W]``, in pixels; negative in
             front of the focus plane.
-        table: Blur measured from a lens, the same in all of the frame; None takes the ideal disc.
+        table: Blur of a lens, the same across the frame; None takes the ideal disc.
         sigma_px: In place of ``coc_px`` and ``table``: standard deviation of a Gaussian, in pixels, >= 0, of the same
             shapes.
         normalize: Divide by the sum of the kernels that reach a pixel. False gives the plain sum, which is darker at
-            the border, over which some of the light falls.
+            the border, because some light leaves the frame.
 
     Returns:
         The image's shape and dtype. Differentiable with respect to the image and to ``coc_px`` or ``sigma_px``, any
-        number of times, backwards (not by ``torch.func.jvp``).
+        number of times, in reverse mode (not by ``torch.func.jvp``).
 
     Raises:
         ValueError: If an argument is not as described or not finite, both or neither of ``coc_px`` and ``sigma_px``
@@ -114,7 +114,7 @@ def splat(
 
 
 def _splatted(image: Tensor, coc_px: Tensor, table: BlurTable, normalize: bool) -> Tensor:
-    """The same of a batch ``[B, C, H, W]`` that has been checked."""
+    """The same for a checked batch ``[B, C, H, W]``."""
     batch, channels, height, width = image.shape
     wide = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
     light, coc = image.to(wide), coc_px.to(wide).expand(batch, -1, -1, -1)
@@ -122,7 +122,7 @@ def _splatted(image: Tensor, coc_px: Tensor, table: BlurTable, normalize: bool) 
         light = torch.cat([light, torch.ones_like(light[:, : table.channels])], 1)
     light = light.unflatten(1, (-1, table.channels))  # [B, n, 1 or C, H, W]
 
-    # the two kernels around each radius, and how far from the first to the second it lies
+    # the two kernels around each radius, and the fraction of the way from the first to the second
     radius, sign = coc.abs(), torch.where(coc.detach() < 0, -1.0, 1.0)
     low = _place(radius.detach()).floor()
     below, above = _radius(low), _radius(low + 1.0)
@@ -134,7 +134,7 @@ def _splatted(image: Tensor, coc_px: Tensor, table: BlurTable, normalize: bool) 
     steps = [(down, right) for down, right in lit.tolist() if abs(down) < height and abs(right) < width]
     taps = torch.stack([kernels[..., half + down, half + right].t() for down, right in steps])  # [steps, 1 or C, n]
 
-    # one image at a time on the CPU, whose caches then hold it
+    # on the CPU one image at a time, which fits into the caches
     count = 1 if light.device.type == "cpu" else batch
     parts = zip(light.split(count), part.split(count), which.split(count, 1), strict=True)
     out = torch.cat([_Scatter.apply(*each, taps, steps) for each in parts]).flatten(1, 2)
@@ -145,21 +145,21 @@ def _splatted(image: Tensor, coc_px: Tensor, table: BlurTable, normalize: bool) 
 
 
 class _Scatter(torch.autograd.Function):
-    """Light times each pixel's own kernel, moved and added up, one step of all kernels after the other.
+    """Scatter light with each pixel's own kernel: for each offset within the kernels, multiply, shift and add.
 
-    Nothing but what is given is kept for the way back.
+    Only the inputs are saved for the backward pass.
     """
 
     @staticmethod
     def forward(light: Tensor, part: Tensor, which: Tensor, taps: Tensor, steps: list[tuple[int, int]]) -> Tensor:
-        """The scattered light.
+        """Scatter light.
 
         Args:
             light: ``[B, n, 1 or C, H, W]``.
-            part: How far from the first of two kernels to the second, 0 to 1: ``[B, 1, H, W]``.
-            which: The two kernels of each pixel, ``[2, B, 1, H, W]``.
-            taps: Of each step, what the kernels have there, ``[steps, 1 or C, kernels]``.
-            steps: Rows down and columns to the right that light moves.
+            part: Weight of the second of each pixel's two kernels, 0 to 1: ``[B, 1, H, W]``.
+            which: Indices of the two kernels of each pixel, ``[2, B, 1, H, W]``.
+            taps: Values of all kernels at each offset, ``[steps, 1 or C, kernels]``.
+            steps: The offsets: rows down and columns to the right by which light moves.
         """
         out = torch.zeros_like(light)
         for tap, _, source, target in _moves(part, which, taps, steps):
@@ -168,13 +168,13 @@ class _Scatter(torch.autograd.Function):
 
     @staticmethod
     def setup_context(context: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        """Keep what is given."""
+        """Save the inputs."""
         *tensors, context.steps = inputs
         context.save_for_backward(*tensors)
 
     @staticmethod
     def backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients to the light and to the parts: the same steps the other way."""
+        """Gradients of ``light`` and ``part``: the same shifts in the opposite direction."""
         light, part, which, taps = context.saved_tensors
         to_light = torch.zeros_like(light) if context.needs_input_grad[0] else None
         to_part = torch.zeros_like(part) if context.needs_input_grad[1] else None
@@ -189,9 +189,9 @@ class _Scatter(torch.autograd.Function):
 def _moves(
     part: Tensor, which: Tensor, taps: Tensor, steps: list[tuple[int, int]]
 ) -> Iterator[tuple[Tensor, Tensor, tuple[Any, ...], tuple[Any, ...]]]:
-    """Of each step what kernels have there, its slope with ``part``, the pixels light comes from, and where it lands.
+    """For each offset: kernel values, their derivative by ``part``, source pixels and target pixels of the light.
 
-    The first two are ``[B, 1, 1 or C, rows, columns]``, of the pixels it comes from.
+    The first two are ``[B, 1, 1 or C, rows, columns]``, for the source pixels.
     """
     height, width = part.shape[-2:]
     first, second = (each.flatten() for each in which)
@@ -206,9 +206,9 @@ def _moves(
 
 
 def _kernels_at(places: list[int], table: BlurTable, width: int, longest: int) -> Tensor:
-    """Kernels ``[n, 1 or C, k, k]``, float64, of places that are signed as the coc is.
+    """Kernels ``[n, 1 or C, k, k]``, float64, at ``places`` (:func:`_place`) with the sign of the coc.
 
-    They are cut to what reaches from one pixel to another of a frame whose longer side is ``longest`` pixels.
+    They are cut to the offsets within a frame whose longer side is ``longest`` pixels.
     """
 
     def make(keys: Sequence[tuple[Any, ...]]) -> list[Tensor]:
@@ -233,7 +233,7 @@ def _kernels_at(places: list[int], table: BlurTable, width: int, longest: int) -
 
 
 def _place(radius: Tensor) -> Tensor:
-    """Place of a radius in pixels among those that kernels are made for, which lie at the whole numbers."""
+    """Place of a radius in pixels on a scale on which kernels are made for the whole numbers."""
     even = _PER_PX * radius.clamp(max=_EVEN_PX)
     return even + _PER_PX * _EVEN_PX * (radius / _EVEN_PX).clamp_min(1.0).log()
 

@@ -19,14 +19,14 @@ __all__ = [
 ]
 
 TRACEABLE = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 13)
-"""Whether this PyTorch can compile and export the renderer, and transform it with torch.func: older ones cannot."""
+"""Whether this PyTorch, 2.13 or newer, can compile and export the renderer, and transform it with torch.func."""
 
 _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 """Floating-point dtypes with arithmetic; PyTorch only stores smaller ones."""
 
 
 def is_exporting() -> bool:
-    """Whether this code is being exported; PyTorch before 2.7 cannot tell, nor export it."""
+    """Whether this code is being exported; False before PyTorch 2.7, which cannot export it."""
     return hasattr(torch.compiler, "is_exporting") and torch.compiler.is_exporting()
 
 
@@ -36,10 +36,10 @@ def is_traced() -> bool:
 
 
 def refuse_old_compiler() -> None:
-    """Refuse to be compiled by a PyTorch that is too old for it.
+    """Raise an error if a PyTorch that is too old compiles this code.
 
     Raises:
-        RuntimeError: With what to do; wrapped by the compiler in an error of its own.
+        RuntimeError: With the remedy in its message; the compiler wraps it in an error of its own.
     """
     if not TRACEABLE and is_traced():
         _refuse_compiler()
@@ -52,8 +52,8 @@ def _refuse_compiler() -> None:
     )
 
 
-# The compiler then calls it, where it would only stop at an exception. What torch.compiler.assume_constant_result does,
-# without importing the whole compiler for it.
+# With this flag the compiler calls the function, so that its message is seen; at a plain exception it would only stop
+# tracing. It is the flag of torch.compiler.assume_constant_result, set without importing the whole compiler.
 _refuse_compiler._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
@@ -82,7 +82,7 @@ def is_in_memory(values: Tensor) -> bool:
 
 
 def has_storage(values: Tensor) -> bool:
-    """Whether a tensor has memory of its own; fake, masked and other wrappers have none, nor has a freed storage."""
+    """Whether a tensor has memory of its own; False for fake, masked and other wrappers, and for a freed storage."""
     try:
         storage = values.untyped_storage()
         last = values.storage_offset() + sum(

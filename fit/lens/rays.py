@@ -19,7 +19,7 @@ class Rays(NamedTuple):
         direction: Unit vectors ``[3, R]``.
         alive: ``[R]``; False if a ray missed a surface, hit outside a clear diameter, was totally reflected, or met a
             surface before the one in front of it (two surfaces that intersect at their rims). Position and direction of
-            such a ray have no meaning.
+            a ray that is not alive are undefined.
     """
 
     position: Array

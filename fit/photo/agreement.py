@@ -87,7 +87,7 @@ def _readings(captures: Captures, expected: Array, measured: Array, telling: Mas
 
 
 def _stands(captures: Captures, defocus: float) -> str:
-    """The distance with this defocus [1/m], as text; empty if there is none."""
+    """The distance with this defocus [1/m], as text; empty if no distance has it."""
     vergence = 1 / captures.focus_m - defocus
     return f"{1 / vergence:.3g} m" if vergence > 0 else ""
 

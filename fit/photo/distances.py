@@ -134,7 +134,7 @@ def _fit_like(fit: BlurFit, pair: Capture, focus_m: float, sharp: Array, blurred
 
 
 def counted(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
-    """Adds the uncertainty of what was guessed about its pictures to a fit's standard errors."""
+    """Adds the uncertainty of a pair's pictures (``pair.uncertain``) to the standard errors of its fit."""
     if not pair.uncertain:
         return fit
     with without_warnings():

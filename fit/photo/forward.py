@@ -42,7 +42,7 @@ _STEP = {"dx": 1e-4, "dy": 1e-4, "magnification": 1e-5}
 
 @dataclass(frozen=True)
 class Solution:
-    """The kernel and moves that best explain the defocused picture, and what is needed to judge them."""
+    """The kernel and moves that best explain the defocused picture, with their covariance and residuals."""
 
     family: str
     params: dict[str, float | Array]

@@ -34,7 +34,7 @@ def noise_of(picture: Array) -> float:
 
 
 def fine_variance(picture: Array, pixels: Mask) -> float:
-    """Variance of the noise of some pixels `[H, W]`, by second differences; NaN if there are none."""
+    """Variance of the noise of some pixels `[H, W]`, by second differences; NaN without pixels."""
     inside = pixels[1:-1, 1:-1]
     return float(np.mean(_mixed_differences(picture)[inside] ** 2)) if inside.any() else np.nan
 

@@ -67,7 +67,7 @@ def test_an_interrupted_sequence_keeps_its_complete_frames_and_resumes(scene: Pa
 
 @pytest.mark.parametrize("streams", ["2>&-", "<&- >&- 2>&-", "2>/dev/full"])
 def test_a_picture_is_written_where_nobody_can_be_told(scene: Path, streams: str) -> None:
-    line = "-m torchdof render shot.0001.exr depth.npy -o out.exr --focus-m 2000"  # a depth like that is warned of
+    line = "-m torchdof render shot.0001.exr depth.npy -o out.exr --focus-m 2000"  # gives a warning
     run = subprocess.run(["sh", "-c", f"{sys.executable} {line} {streams}"], timeout=120, check=False)
     assert run.returncode == 0
     assert read_image(scene / "out.exr").pixels.shape == (1, 3, 16, 24)

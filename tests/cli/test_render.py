@@ -245,7 +245,7 @@ def test_show_focus_tints_by_zone_and_keeps_light_and_shade(run: Run) -> None:
     assert pixels("tint.png")[0, :, 0, [0, 8, 16]].argmax(dim=0).tolist() == [0, 1, 2]
 
 
-def test_the_tint_of_the_focus_turns_without_a_jump_and_leaves_what_is_transparent() -> None:
+def test_the_focus_tint_is_continuous_and_keeps_transparent_pixels() -> None:
     coc_px = torch.linspace(-4.0, 4.0, 1601)[None, None, None]
     premultiplied = torch.full((1, 4, 1, 1601), 0.4)
     premultiplied[..., :400] = 0.0
@@ -393,7 +393,7 @@ def test_the_folder_of_the_output_is_made(run: Run) -> None:
 
 
 def guessed(command: str) -> tuple[str, str]:
-    """What a command prints, and what it notes."""
+    """Standard output of a command, and its notes on standard error."""
     told = CliRunner().invoke(app, command.split(), catch_exceptions=False)
     assert told.exit_code == 0
     return told.stdout, told.stderr
@@ -410,7 +410,7 @@ GREY = (
     [(20, 250, "uint8", GREY), (3000, 65500, "uint16", GREY), (900, 5000, "uint16", "taken for millimetres")],
 )
 def test_the_first_command_needs_no_option(run: Run, low: int, high: int, sample: str, noted: str) -> None:
-    """A subject in front of a slope: it is sharp, and the rest is blurred by 2 % of the width."""
+    """A subject in front of a slope: the subject is sharp, and the largest blur is 2 % of the width."""
     size = (80, 120)
     image = torch.rand(1, 3, *size, generator=torch.Generator().manual_seed(3))
     write_image("photo.png", Picture(image, sample="8", transfer="srgb"))
@@ -427,7 +427,7 @@ def test_the_first_command_needs_no_option(run: Run, low: int, high: int, sample
     assert float((after - before)[..., :12, :].abs().mean()) > 0.05
 
 
-def test_metres_are_said_to_be_taken_for_such_unless_the_focus_is_in_metres(depth: Tensor, run: Run) -> None:
+def test_a_guess_of_metres_is_noted_unless_the_focus_is_in_metres(depth: Tensor, run: Run) -> None:
     line, note = guessed("render image.exr depth.npy -o out.exr")
     assert note.startswith("note: depth.npy: taken for metres") and line.startswith("out.exr: focus 2 m")
     assert guessed(f"{ONE} {LENS}")[1] == ""
@@ -438,7 +438,7 @@ def test_metres_are_said_to_be_taken_for_such_unless_the_focus_is_in_metres(dept
     assert "no depth" in run(f"{ONE} {LENS}", code=2)
 
 
-def test_a_lens_in_the_file_blurs_a_first_picture_where_that_is_seen(image: Tensor, run: Run) -> None:
+def test_the_lens_of_the_file_is_used_if_its_blur_is_visible(image: Tensor, run: Run) -> None:
     for f_number, words in ((1.8, "f/1.8,"), (64.0, "f-number for a blur of 2% of the width")):
         tags = {"Exif:FocalLength": 85.0, "FNumber": f_number, "Exif:FocalLengthIn35mmFilm": 85.0}
         write_image("photo.exr", Picture(image, metadata={name: ("float", value) for name, value in tags.items()}))
@@ -448,7 +448,7 @@ def test_a_lens_in_the_file_blurs_a_first_picture_where_that_is_seen(image: Tens
 # How much blur
 
 
-def test_blur_is_a_share_of_the_width_for_what_is_blurred_most(depth: Tensor, run: Run) -> None:
+def test_blur_sets_the_largest_radius_as_a_share_of_the_width(depth: Tensor, run: Run) -> None:
     for focus in ("--focus-m 2", "--focus-m 5", "--focus-at 21,5"):
         for lens in ("", " --focal-length-mm 85", " --fov-deg 40"):
             line = run(f"render image.exr depth.npy -o out.exr {focus}{lens} --blur 10%")
@@ -459,7 +459,7 @@ def test_blur_is_a_share_of_the_width_for_what_is_blurred_most(depth: Tensor, ru
 
 
 @pytest.mark.parametrize(("size", "sensor_mm"), [((16, 24), 36.0), ((24, 16), 24.0)])
-def test_an_equivalent_lens_is_that_of_full_frame_however_the_picture_is_held(
+def test_an_equivalent_lens_is_for_full_frame_in_landscape_and_portrait(
     run: Run, size: tuple[int, int], sensor_mm: float
 ) -> None:
     tags = {"Exif:FocalLength": 5.7, "FNumber": 1.8, "Exif:FocalLengthIn35mmFilm": 26.0}
@@ -477,7 +477,7 @@ def test_an_equivalent_lens_is_that_of_full_frame_however_the_picture_is_held(
     assert "focus 1 m, f/1.4" in line and "depth from 1 to 8 m assumed" in line
 
 
-def test_blur_that_is_hardly_seen_says_what_makes_more_of_it(run: Run) -> None:
+def test_a_note_advises_how_to_increase_a_hardly_visible_blur(run: Run) -> None:
     for options, advice in (
         ("--f-number 8", "a smaller --f-number, or --blur 2% makes more of it"),
         ("--blur 2%", "a larger --blur makes more of it"),
@@ -516,7 +516,7 @@ def test_a_sheet_shows_before_depth_and_after(image: Tensor, depth: Tensor, run:
     assert colours[:, :120].argmax(0).eq(0).all() and colours[:, 120:].argmax(0).eq(2).all()
 
 
-def test_a_still_whose_focus_moves_is_a_file_a_frame_with_one_opening(image: Tensor, depth: Tensor, run: Run) -> None:
+def test_a_focus_pull_of_a_still_writes_frames_with_one_aperture(image: Tensor, depth: Tensor, run: Run) -> None:
     line = f"render image.exr depth.npy -o pull.##.exr --focus-m 2:2,4:6 {LENS}"
     told = run(line).splitlines()
     assert [part.partition(" m,")[0] for part in told] == [
@@ -535,13 +535,13 @@ def test_a_still_whose_focus_moves_is_a_file_a_frame_with_one_opening(image: Ten
     assert guessed("render image.exr depth.npy -o pull.##.exr --focus-m 1:2,3:6 --f-number 9")[1].count("note:") == 1
 
 
-def test_a_picture_of_one_depth_is_said_to_be_all_in_focus(run: Run) -> None:
+def test_a_note_states_that_a_picture_of_one_depth_is_all_in_focus(run: Run) -> None:
     np.save("flat.npy", np.full((16, 24), 3.0))
     line, note = guessed("render image.exr flat.npy -o out.exr")
     assert "nothing is blurred" in note and "f-number assumed" in line and "f-number for" not in line
 
 
-def test_a_stray_pixel_does_not_take_the_blur_from_all_others(image: Tensor, depth: Tensor, run: Run) -> None:
+def test_a_stray_pixel_does_not_reduce_the_blur_of_the_others(image: Tensor, depth: Tensor, run: Run) -> None:
     large = torch.nn.functional.interpolate(depth, (80, 120))
     write_image("large.exr", Picture(torch.nn.functional.interpolate(image, (80, 120)), sample="float"))
     openings = []

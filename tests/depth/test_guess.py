@@ -1,4 +1,4 @@
-"""Guesses about depth maps: the kind of their numbers, which way they run, and where the subject is."""
+"""Guesses about depth maps: the kind and direction of their numbers, and the distance of the subject."""
 
 import math
 
@@ -13,7 +13,7 @@ MILLIMETRES = Guess("z", 0.001, 0.0)
 
 
 def ground(top: float, bottom: float) -> Tensor:
-    """A map ``[1, 1, 48, 64]`` that goes evenly from its top row to its bottom row."""
+    """A map ``[1, 1, 48, 64]`` that is linear from its top row to its bottom row."""
     return torch.linspace(top, bottom, ROWS)[None, None, :, None].repeat(1, 1, 1, COLUMNS)
 
 
@@ -38,11 +38,11 @@ def ground(top: float, bottom: float) -> Tensor:
         (torch.full((1, 1, 4, 4), math.nan), False, Guess("z")),
     ],
 )
-def test_a_map_is_taken_for_what_its_numbers_say(values: Tensor, whole: bool, expected: Guess) -> None:
+def test_the_kind_of_a_map_follows_from_its_numbers(values: Tensor, whole: bool, expected: Guess) -> None:
     assert guess_kind(values, whole) == expected
 
 
-def test_what_is_said_in_metres_is_not_turned_round() -> None:
+def test_metric_input_is_not_taken_for_disparity() -> None:
     assert guess_kind(ground(1.0, 9.0)).kind == "relative"
     assert guess_kind(ground(1.0, 9.0), metric=True) == Guess("z")
     assert guess_kind(ground(0.0, 1.0), metric=True).kind == "relative"
@@ -66,7 +66,7 @@ SKY = torch.full((1, 1, ROWS, COLUMNS), math.inf)
 
 
 def subject(size: int, depth_m: float, behind: Tensor) -> Tensor:
-    """A square of a depth in the middle of a map."""
+    """The map ``behind`` with a square of ``depth_m`` in its middle."""
     depth = behind.clone()
     depth[..., ROWS // 2 - size : ROWS // 2 + size, COLUMNS // 2 - size : COLUMNS // 2 + size] = depth_m
     return depth
@@ -75,10 +75,10 @@ def subject(size: int, depth_m: float, behind: Tensor) -> Tensor:
 @pytest.mark.parametrize("behind", [ground(9.0, 8.0), SKY], ids=["wall", "sky"])
 def test_the_nearer_surface_in_the_middle_is_the_subject(behind: Tensor) -> None:
     assert subject_m(subject(6, 2.0, behind)) == pytest.approx(2.0)
-    assert subject_m(subject(1, 2.0, behind)) > 8.0  # a twig is not
+    assert subject_m(subject(1, 2.0, behind)) > 8.0  # a twig is not the subject
 
 
-def test_what_is_nearer_beside_the_middle_is_not_the_subject() -> None:
+def test_a_nearer_surface_beside_the_middle_is_not_the_subject() -> None:
     depth = subject(6, 2.0, ground(9.0, 9.0))
     depth[..., : ROWS // 5, :] = 0.5
     depth[..., : COLUMNS // 5] = 0.5
@@ -100,7 +100,7 @@ def test_a_large_map_is_judged_as_a_small_one() -> None:
     assert guess_kind(torch.nn.functional.interpolate(ground(0.3, 12.0), scale_factor=25)).kind == "relative"
 
 
-def test_a_map_of_one_depth_or_none() -> None:
+def test_a_map_of_one_depth_has_a_subject_and_a_map_without_depth_is_refused() -> None:
     assert subject_m(ground(3.0, 3.0)) == pytest.approx(3.0)
     assert subject_m(SKY) == math.inf
     with pytest.raises(ValueError, match="no pixel has a depth"):

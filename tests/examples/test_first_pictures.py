@@ -5,6 +5,7 @@ import json
 import math
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -90,7 +91,8 @@ def test_installations_take_turns_and_have_adjacent_rows(monkeypatch: pytest.Mon
             row = {"figure": part, "goal": "", "beside": "Y", "new_ms": 10.0 + int(turn) + 5 * (python == "other")}
             self.stdout = "noise\n" + json.dumps([row])
 
-    monkeypatch.setattr(first_pictures.subprocess, "run", lambda call, **_: Done(call))
+    # the module's own name, for Python's platform module calls subprocess.run as well
+    monkeypatch.setattr(first_pictures, "subprocess", SimpleNamespace(run=lambda call, **_: Done(call), PIPE=None))
     arguments = [
         "x",
         str(SCENES),

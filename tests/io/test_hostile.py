@@ -322,7 +322,7 @@ def huge_exr(path: Path) -> None:
 
 
 def with_parts(path: Path, count: int) -> None:
-    """An EXR of so many parts of 40 x 40 pixels."""
+    """Writes an EXR of ``count`` parts of 40 x 40 pixels."""
     specs = [oiio.ImageSpec(40, 40, 3, "half") for _ in range(count)]
     for number, spec in enumerate(specs):
         spec.attribute("oiio:subimagename", f"part {number}")

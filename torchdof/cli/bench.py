@@ -1,4 +1,4 @@
-"""``torchdof bench``: speed against error on a scene; or how close to the truth each renderer comes."""
+"""``torchdof bench``: speed against error on a scene, or accuracy of renderers where the truth is known."""
 
 import dataclasses
 import importlib.util
@@ -50,24 +50,24 @@ class _Accuracy:
 class Bench:
     """Measure speed against error on your own scene, or accuracy where the truth is known.
 
-    Each tolerance against the exact rendering, on the CPU: time of pictures by cameras that were not rendered before,
-    and of the same again; memory; RMS error, PSNR and SSIM. Also a focus pull and fresh processes; with --onnx an
-    exported file, with --compile torch.compile, with --scan how cost grows with blur and frame:
+    Compares each tolerance with the exact rendering on the CPU: time of the first and of a second picture by a camera,
+    memory, RMS error, PSNR and SSIM. Also times a focus pull and fresh processes; with --onnx an exported file, with
+    --compile torch.compile, with --scan several radii and frame sizes:
 
         torchdof bench photo.png depth.exr --f-number 1.8 --out results
 
-    Camera, depth and blur are told as to torchdof render, and found as there.
+    The options for camera, depth and blur, and their defaults, are those of torchdof render.
 
-    torchdof and simpler renderers against scenes whose depth of field is known, beside GEGL:
+    Compare torchdof, simpler renderers and GEGL on scenes whose depth of field is known:
 
         torchdof bench --truth scenes --peer examples/benchmarks/tools/gegl.py --out results
 
-    The same with depth as bad as real depth is:
+    The same with depth that is soft, displaced, coarse or noisy, as real depth is:
 
         torchdof bench --truth scenes --degrade --out results
 
-    The picture that --truth alone writes shows, for each scene, the place where torchdof is farthest from the truth:
-    sharp, truth, each renderer.
+    Without --degrade, a picture shows the region of each scene where the error of torchdof is largest: the sharp image,
+    the truth and each renderer.
     """
 
     image: Path | None = argument(
@@ -84,7 +84,7 @@ class Bench:
     as_json: bool = json_option()
 
     def run(self) -> None:
-        """Measures, prints and writes."""
+        """Checks the options, then measures accuracy or speed."""
         if self.accuracy.truth is not None:
             self._compare_with_truth(self.accuracy.truth)
             return
@@ -96,7 +96,7 @@ class Bench:
         if self.image is not None:
             check_files(self.image, self.depth, None)
         needed = {"matplotlib": self.out is not None, "onnxruntime": self.speed.onnx}
-        for package, is_needed in needed.items():  # before the time is spent
+        for package, is_needed in needed.items():  # check before measuring for minutes
             if is_needed and importlib.util.find_spec(package) is None:
                 raise ModuleNotFoundError(f"no {package}", name=package)
         if self.speed.compiled and not any(map(shutil.which, (os.environ.get("CXX", ""), "g++", "clang++", "c++"))):
@@ -110,7 +110,7 @@ class Bench:
         self._measure_speed()
 
     def _compare_with_truth(self, truth: Path) -> None:
-        """Accuracy on the scenes of a folder."""
+        """Measures accuracy on the scenes in a folder."""
         if self.image is not None or self.speed != _Speed(repeat=self.speed.repeat):
             raise ValueError(
                 "--truth measures the scenes of its folder; leave IMAGE and DEPTH out, and --onnx, --compile and --scan"
@@ -132,7 +132,7 @@ class Bench:
         accuracy.compare(truth, self.out, views, self.accuracy.degrade, list(self.accuracy.peer))
 
     def _measure_speed(self) -> None:
-        """Speed against error on the user's scene, or the one that is built in."""
+        """Measures speed against error on the user's scene or on the built-in one."""
         from rich.console import Console
 
         from ..bench import speed
@@ -153,7 +153,7 @@ class Bench:
         speed.report(rows, scene, self.out, quiet=self.as_json)
 
     def _read(self, image: Path) -> "BenchScene":
-        """The user's image and its blur, without alpha."""
+        """Reads the user's image, without alpha, and its blur radii."""
         from ..bench.measurement import BenchScene
         from .frame import coc_of, read_frame
 

@@ -1,7 +1,7 @@
-"""A command is a dataclass: its fields are its arguments and options, stated once, and Click reads them.
+"""Builds Click commands from dataclasses, whose fields are the arguments and options of the command.
 
-Fields that are dataclasses themselves are groups of options that several commands share; their docstring
-heads them in ``--help``. Nothing here imports PyTorch, so that help and wrong arguments are answered at once.
+A field that is itself a dataclass is a group of options, which several commands can share; its docstring is the heading
+in ``--help``. This module does not import PyTorch, so that help and errors about arguments appear at once.
 """
 
 import contextlib
@@ -37,18 +37,18 @@ def option(
     positive: bool = False,
     basic: bool = False,
 ) -> Any:
-    """A field that is an option of a command.
+    """Declares a dataclass field as an option.
 
     Args:
-        help: What it means.
-        default: What it is where it isn't given; ``...`` asks for it.
-        names: What it is called; the field's name with dashes if nothing is said.
-        metavar: What stands for its value in the help.
-        read: Makes the value of its text; a ``ValueError`` says what was expected.
-        group: The heading in the help that it stands under, if not its class's.
-        least: The smallest whole number.
-        positive: Whether it must be greater than 0, and finite.
-        basic: Whether it stands first in the help, before the groups.
+        help: Text in ``--help``.
+        default: Default value; ``...`` makes the option required.
+        names: Spellings on the command line; empty uses the field's name with dashes.
+        metavar: Placeholder for the value in ``--help``.
+        read: Converts the text to the value, or raises ``ValueError`` with the expected form.
+        group: Heading in ``--help``; empty uses the docstring of the field's class.
+        least: Smallest allowed value of a whole number.
+        positive: Whether the value must be finite and above 0.
+        basic: Whether ``--help`` lists the option before the groups.
     """
     facts = {"help": help, "names": names, "metavar": metavar, "read": read, "least": least}
     facts["positive"] = positive
@@ -57,12 +57,12 @@ def option(
 
 
 def argument(help: str, metavar: str, default: Any = ...) -> Any:
-    """A field that is an argument of a command, at its place; with a default it may be left out."""
+    """Declares a dataclass field as a positional argument, which a default makes optional."""
     return option(help, default, metavar=metavar, names=("argument",))
 
 
 def numbers(count: int | None, expected: str) -> Callable[[str], tuple[float, ...]]:
-    """Reads so many numbers, or any, with commas between them; the message of an error is what was expected."""
+    """A parser of ``count`` numbers (None: any count) separated by commas; its errors start with ``expected``."""
 
     def read(text: str) -> tuple[float, ...]:
         with contextlib.suppress(ValueError):
@@ -75,13 +75,13 @@ def numbers(count: int | None, expected: str) -> Callable[[str], tuple[float, ..
 
 
 def word_or_number(words: tuple[str, ...], expected: str) -> Callable[[str], float | str]:
-    """Reads one of some words, or a number; what was expected is the message where it is neither."""
+    """A parser of one of ``words`` or a number; its errors start with ``expected``."""
     return lambda text: text if text in words else numbers(1, expected)(text)[0]
 
 
 @contextlib.contextmanager
 def by_option(names: Mapping[str, str]) -> Iterator[None]:
-    """Has a refusal say the option's name where it says its own."""
+    """Replaces names of arguments by names of options (argument -> option) in the message of a ``ValueError``."""
     try:
         yield
     except ValueError as error:
@@ -90,9 +90,9 @@ def by_option(names: Mapping[str, str]) -> Iterator[None]:
 
 
 class _Command(click.Command):
-    """A command whose help lists options by their groups."""
+    """A command whose ``--help`` lists options by group."""
 
-    groups: dict[str | None, str]  # of each parameter's name
+    groups: dict[str | None, str]  # name of a parameter -> heading
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         shown: dict[str, list[tuple[str, str]]] = {"Options": []}
@@ -106,7 +106,7 @@ class _Command(click.Command):
 
 
 def command_of(name: str, kind: type[Any]) -> click.Command:
-    """The command whose arguments are the fields of a class, whose docstring says what it does, and ``run`` does it."""
+    """The command that makes a ``kind`` of its arguments and runs it; the docstring of ``kind`` is the help."""
     parameters, told = list(_parameters(kind, "Options")), inspect.getdoc(kind) or ""
     command = _Command(
         name,
@@ -122,13 +122,13 @@ def command_of(name: str, kind: type[Any]) -> click.Command:
 
 
 def _fields(kind: type[Any]) -> list[tuple[Any, Any]]:
-    """The fields of a class and their types."""
+    """Fields of a class, each with its type."""
     hints = typing.get_type_hints(kind)
     return [(field, hints[field.name]) for field in dataclasses.fields(kind)]
 
 
 def _parameters(kind: type[Any], group: str) -> Iterator[tuple[click.Parameter, str]]:
-    """The arguments and options that the fields of a class are, and those of the classes in it, with their groups."""
+    """Arguments and options for the fields of a class and of the groups in it, each with its heading."""
     for field, hint in _fields(kind):
         if dataclasses.is_dataclass(hint):
             yield from _parameters(hint, (hint.__doc__ or "").rstrip("."))  # type: ignore[arg-type]
@@ -137,7 +137,7 @@ def _parameters(kind: type[Any], group: str) -> Iterator[tuple[click.Parameter, 
 
 
 def _parameter(field: Any, hint: Any) -> click.Parameter:
-    """The argument or option that a field is."""
+    """Argument or option for a field."""
     facts, required, read = field.metadata, field.default is dataclasses.MISSING, field.metadata["read"]
     if typing.get_origin(hint) in (types.UnionType, typing.Union):
         hint = typing.get_args(hint)[0]
@@ -164,14 +164,14 @@ def _parameter(field: Any, hint: Any) -> click.Parameter:
 
 
 def _positive(_: click.Context, parameter: click.Parameter, value: float | None) -> float | None:
-    """A number that is greater than 0 and finite, or none."""
+    """Refuses a number that is not positive and finite; None is allowed."""
     if value is not None and not 0 < value < math.inf:
         raise ValueError(f"{parameter.opts[0]} must be positive and finite, got {value:g}")
     return value
 
 
 def _made(kind: type[Any], values: dict[str, Any]) -> Any:
-    """An object of a class, and of the classes in it, from the values of all their fields."""
+    """Creates an object of ``kind`` with its groups; ``values`` has the values of all their fields by name."""
     made = {
         field.name: _made(hint, values) if dataclasses.is_dataclass(hint) else values[field.name]  # type: ignore[arg-type]
         for field, hint in _fields(kind)

@@ -1,4 +1,4 @@
-"""``torchdof export``: a module to a verified ONNX file, and what such a file says about itself."""
+"""``torchdof export``: writes a verified ONNX file, or prints the metadata of one."""
 
 import dataclasses
 import json
@@ -42,7 +42,7 @@ class Export:
 
         torchdof export -o dof.onnx --table double_gauss_50mm_f2 --width 1920 --max-coc 24 --tolerance 0.008
 
-    What a file is:
+    Print the metadata of a file:
 
         torchdof export --show dof.onnx
     """
@@ -58,7 +58,7 @@ class Export:
     as_json: bool = json_option()
 
     def run(self) -> None:
-        """Writes a file, or reads one."""
+        """Writes a file, or prints the metadata of one."""
         if (self.out is None) == (self.show is None):
             raise ValueError("give either -o FILE to write or --show FILE to read")
         if self.show is not None:
@@ -88,7 +88,7 @@ class Export:
 
 
 def _lines(facts: Mapping[str, Any], indent: str = "") -> str:
-    """A file's metadata, a line each."""
+    """Metadata as text, one line for each entry."""
     from torchdof.export.metadata import shown
 
     lines = []

@@ -1,4 +1,4 @@
-"""`torchdof fit`: photographs of a dot, or a lens prescription, to a blur table."""
+"""``torchdof fit``: makes a blur table from photographs of a dot or from a lens prescription."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _WANTED = "--field takes distances in mm from the middle of the frame, rising fr
 
 
 def _wavelengths(text: str) -> tuple[float, ...]:
-    """Micrometres; none stands for red, green and blue."""
+    """Reads wavelengths in micrometres; ``rgb`` gives an empty tuple, which means red, green and blue."""
     return () if text == "rgb" else _micrometres(text)
 
 
 def _radii(text: str) -> tuple[float, ...]:
-    """Distances from the middle of the frame, in mm, rising from 0."""
+    """Reads distances in mm from the middle of the frame, rising from 0."""
     radii_mm = numbers(None, _WANTED)(text)
     if len(radii_mm) < 2 or radii_mm[0] != 0 or not all(low < high < math.inf for low, high in pairwise(radii_mm)):
         raise ValueError(f"{_WANTED}, got {text!r}")
@@ -90,7 +90,7 @@ class Fit:
 
         torchdof fit my-lens/ -o my-lens.json --plots pictures/
 
-    Or print a target, photograph it, and let the pictures tell the rest (see docs/phone.md):
+    Or print a target and photograph it; no capture.toml is needed (see docs/phone.md):
 
         torchdof fit --target target.pdf
 
@@ -100,7 +100,7 @@ class Fit:
 
         torchdof fit --lens double_gauss_50mm --f-number 2 --focus-m 2 -o double-gauss.json
 
-    Or all of its frame, from the middle to the corner, cat's eyes and coma included:
+    Or trace it across the frame, from the middle to the corner, with cat's eyes and coma:
 
         torchdof fit --lens double_gauss_50mm --field 0,4,8,12,16,20,21.6 -o across-the-field.json
     """
@@ -118,7 +118,7 @@ class Fit:
     as_json: bool = json_option()
 
     def run(self) -> None:
-        """Makes the table and says what it is made of; or writes the target."""
+        """Checks the options, then makes the table, or writes the target to print."""
         lens, target, said = self.lens.lens, self.target.target, self.lens
         if target is not None and (self.captures is not None or lens is not None):
             raise ValueError("--target writes the page to print; give it alone, and the photographs afterwards")

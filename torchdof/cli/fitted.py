@@ -1,4 +1,4 @@
-"""How ``torchdof fit`` makes its tables, and what it tells and draws of them."""
+"""Makes the tables of ``torchdof fit``, prints the results and draws them."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Shown", "fit_photographs", "trace_lens"]
 
-_WIDTH = 1920  # px of the image that a table's texture is drawn for
+_WIDTH = 1920  # px; image width for which the texture of a table is drawn
 
 
 def trace_lens(said: Fit, source: str) -> None:
-    """Traces the table of a lens, tells what it is, and writes it."""
+    """Traces the table of a lens, prints a summary, and writes the table."""
     lens, options = Lens.read(source), said.lens
     focal = lens.paraxial().focal_length
     number("--focus-m", options.focus_m, low=focal / 1000, unit="metres", infinite=True)
@@ -66,7 +66,7 @@ def trace_lens(said: Fit, source: str) -> None:
 
 
 def fit_photographs(said: Fit, folder: Path) -> None:
-    """Fits photographs of the target, or the dots of a manifest, tells how well, and writes their tables."""
+    """Fits photographs of the target, or the dots of a manifest, prints the fits, and writes their tables."""
     options, photographs, shown = said.photographs, None, Shown(quiet=said.as_json)
     colours, dots = (None if value == "manifest" else value for value in (options.colours, options.dots))
     with _heard() as doubts:
@@ -91,7 +91,7 @@ def fit_photographs(said: Fit, folder: Path) -> None:
                 accuracy_db=options.accuracy_db,
                 progress=lambda done, total, what, bar=bar: bar.update(what, done, total),  # type: ignore[misc]
                 command=command,
-                scale_of=fitted[0][1] if fitted else None,  # the dot nearest to the centre, whose scale all share
+                scale_of=fitted[0][1] if fitted else None,  # all dots use the scale of the one nearest to the centre
             )
         messages = [*doubts, *heard]
         fitted.append((captures, result))
@@ -112,7 +112,7 @@ def fit_photographs(said: Fit, folder: Path) -> None:
 
 @contextmanager
 def _heard() -> Iterator[list[str]]:
-    """Collects warnings, which are in the list once the block has ended; what is said twice is in it once."""
+    """Collects warnings in a list, which is filled at the end of the block, without duplicates."""
     messages = list[str]()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", FitWarning)
@@ -121,7 +121,7 @@ def _heard() -> Iterator[list[str]]:
 
 
 def _facts_of(captures: Captures, result: TableFit) -> dict[str, Any]:
-    """What :meth:`Shown.fit` tells, for programs."""
+    """The results that :meth:`Shown.fit` prints, as data for JSON."""
     of_fit = ("params", "stderr", "residual", "residual_over_noise", "magnification")
     of_colour = ("name", "focus_shift_dioptres", "lateral_px")
     return {
@@ -139,23 +139,23 @@ def _facts_of(captures: Captures, result: TableFit) -> dict[str, Any]:
 
 
 class Shown:
-    """What is told on standard output, and pictures; quiet, it tells facts for programs alone."""
+    """Prints results and draws pictures; with ``quiet`` it prints JSON only."""
 
     def __init__(self, quiet: bool) -> None:
         self._quiet = quiet
         self._console = Console(soft_wrap=True, quiet=quiet, markup=False, highlight=False)
 
     def say(self, text: str, style: str = "") -> None:
-        """One line for people."""
+        """Prints text for people, unless quiet."""
         self._console.print(text, style=style)
 
     def facts(self, facts: dict[str, Any]) -> None:
-        """One line for programs."""
+        """Prints one line of JSON, if quiet."""
         if self._quiet:
             print(json_line(facts), flush=True)
 
     def photographs(self, photographs: Photographs) -> None:
-        """What was found in photographs of the target, and what to do better, on one screen."""
+        """Prints distance, size, brightness and sharpness of each photograph, and advice for better ones."""
         sharp, pictures = photographs.captures.notes["sharp"], photographs.pictures
         columns = {
             "file": [picture.file for picture in pictures],
@@ -170,7 +170,7 @@ class Shown:
             self.say(f"better: {sentence}", "cyan")
 
     def fit(self, captures: Captures, result: TableFit, messages: Sequence[str]) -> None:
-        """The fits at all distances, why the family was chosen, and warnings."""
+        """Prints the fits at all distances, the reason for the family, and warnings."""
         fits = result.fits
         columns = {
             "distance m": [f"{pair.distance_m:.4g}" for pair in captures],
@@ -192,7 +192,7 @@ class Shown:
             self.say(f"warning: {message}", "yellow")
 
     def _colours(self, captures: Captures, result: TableFit) -> None:
-        """What differs between the colours: the size of their blur, their focus, and where they lie."""
+        """Prints focus distance, radius and lateral displacement of each colour."""
         vergences = [1 / captures.focus_m + colour.focus_shift_dioptres for colour in result.colours]
         focuses = [f"{1 / v:.4g}" if v > 0 else "" if math.isnan(v) else "beyond infinity" for v in vergences]
         columns = {"": [colour.name for colour in result.colours], "focus m": focuses}
@@ -205,12 +205,12 @@ class Shown:
         self.say("the table holds a kernel a colour; lateral colour is no blur, and not in it")
 
     def write(self, table: BlurTable, target: Path) -> None:
-        """Writes a table."""
+        """Writes a table and prints its path."""
         table.save(target)
         self.say(f"{target}: {table!r}")
 
     def sheet(self, photographs: Photographs, result: TableFit, target: Path) -> None:
-        """Draws what was found, fitted and made of it; without matplotlib it says so."""
+        """Draws photographs, fits and a rendering on one sheet; without matplotlib it prints a message."""
         try:
             from torchdof.fit.sheet import sheet_of_photographs
 
@@ -228,7 +228,7 @@ class Shown:
         captures: Captures | None = None,
         result: TableFit | None = None,
     ) -> None:
-        """Draws each distance's fit, a table over depth, and the blur texture of its largest circle of confusion."""
+        """Draws the fit at each distance, the table over depth, and the texture of its largest circle of confusion."""
         from torchdof.fit import plots
 
         if captures is not None and result is not None:
@@ -240,7 +240,7 @@ class Shown:
         self._save(plots.picture_of_texture(table, largest, _WIDTH), folder / f"{stem}_texture.png")
 
     def _save(self, figure: Any, target: Path) -> None:
-        """Writes a figure, whole or not at all."""
+        """Writes a figure, whole or not at all, and prints its path."""
         with whole_file(target) as part:
             figure.savefig(part)
         self.say(str(target))

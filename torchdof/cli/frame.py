@@ -1,4 +1,4 @@
-"""One frame from files to a file: what ``torchdof render`` does with each image, and what other commands do of it."""
+"""Reads, renders and writes one frame for ``torchdof render``; other commands use parts of it."""
 
 import dataclasses
 import functools
@@ -34,34 +34,34 @@ if TYPE_CHECKING:
 
 __all__ = ["Frame", "Rendered", "Renderer", "coc_of", "facts_of_camera", "read_frame"]
 
-_HARDLY_PX = 2.0  # radius of blur below which people think that nothing happened
-_LARGE_PX = 8_000_000  # pixels from which on people ask how long it takes
-_STRIPS = 16
-_PANEL_PX = 800  # of the longer side of a panel
+_HARDLY_PX = 2.0  # px; a note advises more blur if the largest radius is below
+_LARGE_PX = 8_000_000  # pixels of an image; the bar shows the expected time of larger ones
+_STRIPS = 16  # number of strips of an image, of which one is timed
+_PANEL_PX = 800  # px; longer side of a panel on a sheet
 
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
     """An image and its depth, as read."""
 
-    name: str  # of the file that the depth is from
-    scene: Scene  # as stated, with what was guessed
+    name: str  # file with the depth
+    scene: Scene  # the options, with the guess in the place of "auto"
     picture: Picture
-    values: Tensor  # [1, 1, H, W], depth in metres, or signed pixels for coc
-    holes: int  # pixels that were filled
-    seconds: float
-    stretch: float  # by which part the depth was stretched along one axis to the shape of the image
-    guess: str  # what the depth was taken for, where nobody said it
+    values: Tensor  # [1, 1, H, W], depth in metres, or signed radius in pixels for coc
+    holes: int  # number of filled pixels
+    seconds: float  # time of reading
+    stretch: float  # relative stretch of the depth along one axis to the aspect of the image
+    guess: str  # message about the guessed kind of depth, or empty
 
     def mistakes(self, camera: Camera) -> list[Mistake]:
-        """What looks wrong with the depth, seen by a camera."""
+        """Likely mistakes in the depth, given the camera."""
         said = self.scene.depth_map
         kind: Any = said.depth_kind
         return depth_mistakes(self.values, camera, kind, said.depth_scale)
 
     @property
     def remarks(self) -> list[str]:
-        """What was done to the depth that nobody asked for."""
+        """Changes of the depth, and assumptions about it, that no option states."""
         said, remarks = self.scene.depth_map, [f"depth stretched by {self.stretch:.1%}"] if self.stretch else []
         if said.depth_kind == "relative" and None in (said.near_m, said.far_m):
             remarks.append("depth from {:g} to {:g} m assumed".format(*said.ends_m))
@@ -71,8 +71,8 @@ class Frame:
 def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = False, **encoding: Any) -> Frame:
     """Reads an image, as :func:`torchdof.io.images.read_image` does, and its depth, which may be a channel of it.
 
-    Where nobody said what the depth is, it is guessed. With ``holes``, those that nobody said how to fill
-    stay NaN; otherwise they are a ``ValueError``.
+    A depth of the kind "auto" is guessed. Holes are filled as the options state. Without that option they stay NaN
+    if ``holes`` is true; otherwise they are filled as the guess proposes, or raise ``ValueError``.
     """
     start, source, guess = time.perf_counter(), depth or image, ""
     picture, filled = read_image(image, **encoding), 0
@@ -94,7 +94,7 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
 
 
 def _metres(values: Tensor, name: str, picture: Picture, scene: Scene) -> tuple[Tensor, float]:
-    """Depth in metres (signed pixels for coc), ``[1, 1, H, W]`` of the image's size, NaN in holes; its stretch."""
+    """Depth in metres (signed pixels for coc), ``[1, 1, H, W]`` at the image's size, NaN in holes; and its stretch."""
     said, pixels = scene.depth_map, picture.pixels
     kind: Any = said.depth_kind
     sizes = [f"{t.shape[-1]} x {t.shape[-2]}" for t in (values, pixels)]
@@ -120,12 +120,12 @@ def _metres(values: Tensor, name: str, picture: Picture, scene: Scene) -> tuple[
 def coc_of(
     frame: Frame, warned: WarnOnce, number: int = 0, is_still: bool = True
 ) -> tuple[Tensor, Camera | None, list[str]]:
-    """Signed radius ``[1, 1, H, W]`` in pixels; the camera, None for ``--depth-kind coc``; remarks as it has them.
+    """Signed radius ``[1, 1, H, W]`` in pixels, the camera (None for ``--depth-kind coc``), and remarks on both.
 
-    The number is that of the frame, for focus that moves.
+    ``number`` is the frame number, at which the focus is interpolated between keyframes.
 
     Raises:
-        ValueError: If the lens makes no sense, or something looks like a mistake and ``warned`` is strict.
+        ValueError: If the lens is impossible, or a mistake is likely and ``warned`` is strict.
     """
     said, lens, values = frame.scene.depth_map, frame.scene.lens, frame.values
     if said.depth_kind == "coc":
@@ -140,25 +140,25 @@ def coc_of(
 
 
 def facts_of_camera(camera: Camera) -> dict[str, Any]:
-    """Its numbers, for programs."""
+    """The numbers of a camera, as data for JSON."""
     return {name: float(getattr(camera, name)) for name in CAMERA_NUMBERS}
 
 
 @dataclasses.dataclass(frozen=True)
 class Rendered:
-    """A picture, the file it goes to, its report as notes and words for people and facts for programs, its seconds."""
+    """A rendered picture with its report."""
 
-    out: Path
+    out: Path  # file to write
     picture: Picture
-    panels: dict[str, Tensor]  # of a sheet, by their captions
-    notes: dict[str, str]  # what was taken for granted, each told once
-    words: list[str]
-    facts: dict[str, Any]
-    seconds: float
+    panels: dict[str, Tensor]  # caption -> panel of the sheet
+    notes: dict[str, str]  # kind -> note; each kind is printed once
+    words: list[str]  # parts of the printed line
+    facts: dict[str, Any]  # the same as data for JSON
+    seconds: float  # time of reading and rendering
 
 
 class Renderer:
-    """What ``torchdof render`` does with each frame: reads, renders and writes it."""
+    """Reads, renders and writes the frames of ``torchdof render``."""
 
     def __init__(self, command: "Render", scene: Scene, is_still: bool = True) -> None:
         self.command, self.scene, self.is_still = command, scene, is_still
@@ -166,12 +166,12 @@ class Renderer:
         self.device, self.warned = pick_device(command.device), WarnOnce(command.scene.depth_map.strict)
 
     def read(self, image: Path, depth: Path | None) -> Frame:
-        """As :func:`read_frame`, encoded as the command says."""
+        """Reads a frame as :func:`read_frame`, with the transfer curve and layer of the options."""
         files = self.command.files
         return read_frame(image, depth, self.scene, transfer=files.transfer, layer=files.layer)
 
     def render(self, frame: Frame, out: Path, number: int = 0, bar: Bar | None = None) -> Rendered:
-        """The picture of a frame; the bar is told how long a large one takes. Raises as :func:`coc_of`."""
+        """Renders a frame; ``bar`` shows the expected time of a large one. Raises as :func:`coc_of`."""
         start, picture, command = time.perf_counter(), frame.picture, self.command
         frame = dataclasses.replace(frame, values=frame.values.to(self.device))
         coc_px, camera, remarks = coc_of(frame, self.warned, number, self.is_still)
@@ -221,7 +221,7 @@ class Renderer:
         tell(self.command.as_json, facts, f"{rendered.out}: {'; '.join(words)}{remarks}")
 
     def _told(self, camera: Camera | None, largest_px: float, frame: Frame) -> tuple[list[str], dict[str, Any]]:
-        """What was done to a frame, for people and for programs."""
+        """Parts of the printed line about a frame, and the same as data for JSON."""
         command, table, words = self.command, self.table, list[str]()
         facts: dict[str, Any] = {"camera": None, "largest_coc_px": largest_px, "filled_px": frame.holes}
         facts |= {"show_focus": command.show_focus, "device": str(self.device)}
@@ -251,7 +251,7 @@ class Renderer:
 
 
 def _panels(frame: Frame, coc_px: Tensor, after: Picture) -> dict[str, Tensor]:
-    """Pictures of a sheet, each ``[1, 3, H, W]`` in linear light, by their captions."""
+    """Panels of a sheet: caption -> ``[1, 3, H, W]`` in linear light."""
     middle = {"depth: near is bright": depth_colours(frame.values)}
     if frame.scene.depth_map.depth_kind == "coc":
         middle = {"blur radius: near orange, far blue": coc_colours(coc_px)}
@@ -260,7 +260,7 @@ def _panels(frame: Frame, coc_px: Tensor, after: Picture) -> dict[str, Tensor]:
 
 
 def _seconds(blur: Callable[..., Tensor], pixels: Tensor, coc_px: Tensor) -> float:
-    """How long an image is expected to take, by a strip across its middle."""
+    """Expected time of ``blur`` in seconds, extrapolated from a strip across the middle of the image."""
     start, height = time.perf_counter(), pixels.shape[-2]
     strip = (..., slice(height // 2, height // 2 + math.ceil(height / _STRIPS)), slice(None))
     blur(pixels[strip], coc_px[strip])
@@ -268,7 +268,7 @@ def _seconds(blur: Callable[..., Tensor], pixels: Tensor, coc_px: Tensor) -> flo
 
 
 def _with_lights(picture: Picture, pixels: Tensor, stops: float) -> Tensor:
-    """Pixels whose clipped lamps have light again; alpha stays. Refuses scene-linear light, which clips nothing."""
+    """Pixels with the light of clipped lamps restored; alpha is unchanged. Refuses floats, which do not clip."""
     if picture.sample in ("half", "float"):
         raise ValueError(
             f"--lights is for photographs of 8 or 16 bits, which clip at white; this image holds {picture.sample} "
@@ -279,7 +279,7 @@ def _with_lights(picture: Picture, pixels: Tensor, stops: float) -> Tensor:
 
 
 def _with_alpha(table: BlurTable) -> BlurTable:
-    """A table for light with alpha, which is blurred as green is."""
+    """The table with a channel for alpha, which is blurred like green."""
     if table.channels == 1:
         return table
     params = {name: torch.cat([v, v[1:2]]) for name, v in table.node_params.items()}

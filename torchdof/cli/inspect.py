@@ -1,4 +1,4 @@
-"""``torchdof inspect``: what a depth map holds, what a camera makes of it, and whether that makes sense."""
+"""``torchdof inspect``: reports on a depth map, its blur by a camera, and likely mistakes."""
 
 import dataclasses
 from pathlib import Path
@@ -13,14 +13,14 @@ __all__ = ["Inspect"]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Inspect:
-    """Tell what a depth map holds and what a camera makes of it, before anything is rendered.
+    """Report on a depth map and its blur by a camera, before anything is rendered.
 
-    Ranges, the histogram of the blur radius, the share in focus, holes, how many of the map's edges lie where the image
-    has them; and a picture of depth, blur and doubtful edges. Wrong units are said on standard error.
+    Prints ranges, the histogram of the blur radius, the share in focus, holes, and how many edges of the depth match
+    edges of the image. Draws depth, blur and doubtful edges. Warns of wrong units on standard error.
 
         torchdof inspect photo.jpg depth.png --depth-scale 0.001 --focus-at 320,200 --f-number 1.8
 
-    Focus and lens are found as for torchdof render.
+    The defaults of focus and lens are those of torchdof render.
     """
 
     image: Path = argument("All-in-focus image, as for torchdof render.", "IMAGE")
@@ -32,7 +32,7 @@ class Inspect:
     as_json: bool = json_option()
 
     def run(self) -> None:
-        """Prints what was found, and draws it."""
+        """Prints the report, and draws it."""
         self.scene.lens.refuse_keyframes()
         if self.scene.depth_map.depth_kind == "coc":
             raise ValueError("--depth-kind coc is the blur itself: there is no depth to inspect")

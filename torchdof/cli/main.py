@@ -1,4 +1,4 @@
-"""The command line: each command is imported when it is asked for, and what is wrong with the input is one sentence."""
+"""The command line; it imports a command when that is called, and reports wrong input in one sentence."""
 
 import contextlib
 import errno
@@ -17,20 +17,20 @@ from .command import command_of
 __all__ = ["app", "main"]
 
 COMMANDS = ("render", "fit", "export", "bench", "inspect", "tables")
-"""Each is a class in the module of its name."""
+"""Names of the commands; each is a module with a class of the same name, capitalised."""
 
 _EXTRAS = {
     **{"scipy": "fit", "threadpoolctl": "fit", "matplotlib": "plot"},
     **{"onnx": "export", "onnxscript": "export", "onnxruntime": "export"},
 }
 _TOO_LITTLE = "there is too little memory for this image; a smaller one, or a coarser --tolerance, takes less"
-# PyTorch's own words for it on the CPU are those of what it is built from
+# messages of PyTorch's RuntimeError when memory runs out on the CPU; they come from several libraries
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "bad_alloc", "size calculation overflowed", "new thread")
 
 
 @contextlib.contextmanager
 def _told_in_one_sentence() -> Iterator[None]:
-    """Ends with code 2 and the message of errors of the input, files, memory and missing packages; others pass."""
+    """Prints errors of input, files, memory and missing packages, and exits with code 2; other errors pass."""
     try:
         yield
         return
@@ -43,23 +43,23 @@ def _told_in_one_sentence() -> Iterator[None]:
         if isinstance(error, OSError) and error.errno == errno.EPIPE:
             raise
         message = str(error) or type(error).__name__
-    except MemoryError:  # numpy's has a message of its own, about arrays
+    except MemoryError:  # numpy's own message is about arrays
         message = _TOO_LITTLE
     except RuntimeError as error:
-        torch = sys.modules.get("torch")  # whoever ran out of a device's memory has imported it
+        torch = sys.modules.get("torch")  # already imported if a device ran out of memory
         if torch is not None and isinstance(error, torch.OutOfMemoryError):
             message = "the device has too little memory for this image; try --device cpu"
         elif any(words in str(error) for words in _NO_MEMORY):
             message = _TOO_LITTLE
         else:
             raise
-    with contextlib.suppress(OSError):  # who cannot be told still gets the code
+    with contextlib.suppress(OSError):  # the exit code is the same if standard error is closed
         click.echo(f"error: {message}", err=True)
     raise SystemExit(2)
 
 
 class _Commands(click.Group):
-    """The commands."""
+    """The group of all commands."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -77,7 +77,7 @@ class _Commands(click.Group):
 
 def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     if wanted:
-        from .. import native  # takes PyTorch
+        from .. import native  # imports PyTorch
 
         click.echo(f"torchdof {importlib.metadata.version('torchdof')}, engine {native.describe()}")
         ctx.exit()
@@ -93,16 +93,16 @@ def app() -> None:
 
 
 def _open_streams() -> None:
-    """Opens what is closed of standard input, output and error as nothing: no file may take its place, and messages."""
+    """Opens closed standard streams on the null device; otherwise a file could get their number, and their messages."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, mode))  # takes the lowest free number, which is the stream's own
+            setattr(sys, name, open(os.devnull, mode))  # gets the lowest free number, the stream's own
 
 
 def main() -> None:
     """Entry point of ``torchdof`` and of ``python -m torchdof``."""
-    # PyTorch's threads (OpenMP's) wait for their next work without a rest, which takes the processor from whoever has
-    # some. GNU's library and LLVM's read these when PyTorch is loaded; what the user set is left as it is.
+    # The OpenMP threads of PyTorch spin while they wait, which slows other processes. The OpenMP libraries of GNU and
+    # LLVM read these variables when PyTorch is loaded. A variable that the user has set turns this off.
     if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME"} & set(os.environ):
         os.environ |= {"OMP_WAIT_POLICY": "passive", "KMP_BLOCKTIME": "0"}
     _open_streams()

@@ -1,6 +1,6 @@
-"""The options that several commands share, besides those of the scene: the opening, blur, accuracy; files, device.
+"""Options that several commands share, besides those of the scene: aperture, blur, accuracy, files and device.
 
-PyTorch is imported when the first of them is put to use, so that help and contradictions are answered at once.
+PyTorch is imported when an option is first used, so that help and errors about options appear at once.
 """
 
 import os
@@ -44,7 +44,7 @@ class Opening:
             raise ValueError("--rotation turns blades or an image; give --blades or --aperture too")
 
     def opening(self) -> "Aperture | None":
-        """The opening that these options mean; None if they mean a round one."""
+        """The aperture of these options; None if it is round and the same everywhere."""
         from ..io.images import read_image
         from ..optics.aperture import Aperture
 
@@ -55,7 +55,7 @@ class Opening:
         return None if aperture.is_round and self.squeeze == 1.0 and not aperture.depends_on_place else aperture
 
     def table_of(self, name: str) -> "BlurTable":
-        """A table by its name, or by the path of its JSON file, with this opening in place of its own."""
+        """A table by name or by path of a JSON file; an aperture of these options replaces its own."""
         from ..optics.blur_table import BlurTable
         from ..optics.table_file import shipped
 
@@ -75,7 +75,7 @@ class Blur(Opening):
     table: str = option("disc, gaussian, a shipped table such as sato_j15, or a JSON file.", "disc", basic=True)
 
     def chosen(self) -> "BlurTable":
-        """The table that these options mean, as :meth:`table_of`."""
+        """The table of these options, as :meth:`table_of`."""
         return self.table_of(self.table)
 
 
@@ -94,12 +94,12 @@ class Accuracy:
     method: Literal["layered", "fold"] = option("fold is the literal scatter: exact, slow, for small radii.", "layered")
 
     def options(self) -> dict[str, Any]:
-        """The same as arguments of :class:`torchdof.DepthOfField`."""
+        """These options as arguments of :class:`torchdof.DepthOfField`."""
         return {"tolerance": self.tolerance, "occlusion": not self.no_occlusion, "method": self.method}
 
 
 def edges_option(default: str) -> Any:
-    """The option of what is done to depth edges; commands differ in what they do unless told."""
+    """The option ``--depth-edges``, whose default differs between commands."""
     return option(
         "Move and sharpen the edges of the depth to where the image has them: unless they prove exact, each one, or "
         "not at all.",
@@ -109,15 +109,15 @@ def edges_option(default: str) -> Any:
 
 
 def json_option() -> Any:
-    """The option of all commands for programs."""
+    """The option ``--json``, which every command has."""
     return option("Print what is printed as JSON, for programs: one object a line.", False, names=("--json",))
 
 
 def make_folder_of(path: Path) -> None:
-    """The folder in which a file is to be written, made where it is missing.
+    """Creates the folder of ``path`` if it is missing.
 
     Raises:
-        OSError: If it cannot be made.
+        OSError: If the folder cannot be created.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -126,7 +126,7 @@ def make_folder_of(path: Path) -> None:
 
 
 def check_files(image: Path, depth: Path | None, out: Path | None) -> None:
-    """Refuse, before anything is read, files that are not there, and to write one in the place of one that is read."""
+    """Refuse missing inputs, an output that is also an input, and an output of an unsupported type."""
     existing_image(image)
     if depth is not None:
         existing_map(depth)
@@ -138,7 +138,7 @@ def check_files(image: Path, depth: Path | None, out: Path | None) -> None:
 
 
 def pick_device(name: str) -> "torch.device":
-    """A device by name; "auto" is CUDA where there is one, else the CPU."""
+    """A device by name; "auto" is CUDA if available, else the CPU."""
     import torch
 
     if name == "auto":

@@ -1,4 +1,4 @@
-"""What commands print: a line for people or JSON for programs, warnings, and a bar while something takes long."""
+"""Output of commands: a line for people or JSON for programs, notes, warnings, and a progress bar."""
 
 import contextlib
 import json
@@ -17,22 +17,22 @@ if TYPE_CHECKING:
 
 __all__ = ["Bar", "WarnOnce", "json_line", "note", "tell"]
 
-_PATIENCE_S = 3.0
+_PATIENCE_S = 3.0  # s before the bar appears
 
 
 def tell(as_json: bool, facts: Mapping[str, Any], line: str) -> None:
-    """Prints facts as JSON, or the line that says the same to people."""
+    """Prints ``facts`` as JSON, or ``line`` for people."""
     click.echo(json_line(facts) if as_json else line)
 
 
 def note(*lines: str) -> None:
-    """Prints what was taken for granted, and what to do about it, on standard error."""
+    """Prints notes on standard error: assumptions, and options that change them."""
     for line in lines:
-        click.echo(f"note: {line}", err=True)
+        _to_stderr(f"note: {line}")
 
 
 def json_line(facts: Mapping[str, Any]) -> str:
-    """Facts as JSON on one line. JSON has no infinity: numbers that are not finite are the texts inf, -inf and nan.
+    """Facts as one line of JSON; numbers that are not finite become the strings inf, -inf and nan.
 
     Example:
         >>> json_line({"focus_m": float("inf"), "size": (3, 2)})
@@ -52,16 +52,16 @@ def json_line(facts: Mapping[str, Any]) -> str:
 
 
 class WarnOnce:
-    """Warns of likely mistakes, a line each on standard error: what is wrong with a sequence is so in each frame.
+    """Warns of likely mistakes, one line each on standard error; each kind is printed once for all frames.
 
-    With ``strict`` a mistake is a ``ValueError``; else ``PYTHONWARNINGS=ignore`` silences them.
+    With ``strict`` a mistake raises ``ValueError``. ``PYTHONWARNINGS=ignore`` silences warnings.
     """
 
     def __init__(self, strict: bool = False) -> None:
         self._strict, self._names = strict, set[str]()
 
     def warn(self, source: str | os.PathLike[str], mistakes: "Iterable[Mistake]") -> None:
-        """Warns of each mistake of a kind that was not warned of before."""
+        """Warns of the mistakes whose kind has not been printed yet."""
         from ..depth.sanity import DepthWarning
 
         for mistake in mistakes:
@@ -75,13 +75,17 @@ class WarnOnce:
                 warnings.showwarning = _one_line
                 try:
                     warnings.warn(message, DepthWarning, stacklevel=2)
-                except DepthWarning as warning:  # only strictness makes errors of them
+                except DepthWarning as warning:  # by PYTHONWARNINGS=error, but only --strict may stop a command
                     _one_line(warning)
 
 
 def _one_line(message: Warning | str, *_: Any, **__: Any) -> None:
-    with contextlib.suppress(OSError):  # a warning that cannot be written costs no picture
-        click.echo(f"warning: {message}", err=True)
+    _to_stderr(f"warning: {message}")
+
+
+def _to_stderr(line: str) -> None:
+    with contextlib.suppress(OSError):  # a message that cannot be written must not stop the command
+        click.echo(line, err=True)
 
 
 def _is_terminal() -> bool:
@@ -89,9 +93,9 @@ def _is_terminal() -> bool:
 
 
 class Bar:
-    """A bar with an estimate on standard error, from the third second on, where that is a terminal.
+    """A progress bar with the remaining time, shown after three seconds if standard error is a terminal.
 
-    It says what is being done, of how many steps in total; None where nobody knows.
+    ``what`` describes the current step; ``total`` is the number of steps, or None if it is unknown.
     """
 
     def __init__(self, what: str, total: float | None = None) -> None:
@@ -105,14 +109,14 @@ class Bar:
                 *(progress.TextColumn("{task.description}", markup=False), progress.BarColumn(), elapsed, remaining),
                 console=Console(stderr=True),
                 transient=True,
-                redirect_stdout=sys.stdout.isatty(),  # lines go above the bar; to a file they go as ever
+                redirect_stdout=sys.stdout.isatty(),  # prints lines above the bar; a file is unaffected
             )
             self._task = self._progress.add_task(what, total=total)
             self._timer = threading.Timer(_PATIENCE_S, self._progress.start)
             self._timer.daemon = True
 
     def update(self, what: str | None = None, done: float | None = None, total: float | None = None) -> None:
-        """Says what is done now, how many steps are done, and how many there are."""
+        """Changes the description, the number of finished steps, or their total."""
         if self.is_seen:
             self._progress.update(self._task, description=what, completed=done, total=total)
 

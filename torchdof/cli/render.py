@@ -1,4 +1,4 @@
-"""``torchdof render``: its options, and the frames it goes through."""
+"""``torchdof render``: its options, and the order in which it reads, renders and writes frames."""
 
 import dataclasses
 import itertools
@@ -50,11 +50,11 @@ class _Files:
 class Render:
     """Blur IMAGE by its DEPTH as a lens would.
 
-    A photograph and its depth map, of whatever kind: what is taken for granted is printed.
+    A photograph and its depth map of any kind; the assumptions are printed:
 
         torchdof render photo.jpg depth.png -o out.jpg
 
-    A photograph and its depth in millimetres, focused on what is seen at column 320, row 200:
+    A photograph and its depth in millimetres, focused on the pixel at column 320, row 200:
 
         torchdof render photo.jpg depth.png -o out.jpg --depth-scale 0.001 --focus-at 320,200 --f-number 1.8
 
@@ -62,18 +62,18 @@ class Render:
 
         torchdof render shot.exr -o out.exr --fov-deg 40 --aperture-radius-m 0.012 --focus-m 2
 
-    A sequence, its focus pulled from 2 m to 5.5 m; --resume goes on after an interruption:
+    A sequence with a focus pull from 2 m to 5.5 m; --resume continues after an interruption:
 
         torchdof render shot.####.exr -o out.####.exr --focus-m 1:2,48:5.5 --f-number 2 --resume
 
-    --steady filters depth that flickers along time, where neither image nor depth moved; a part of a sequence, or the
-    rest of it with --resume, comes out as the whole would: up to 63 frames before it are read first.
+    --steady filters flickering depth over time, where neither image nor depth moves. With --frames or --resume the
+    result is the same as for the whole sequence, because up to 63 earlier frames are read first.
 
-    A photograph, its focus pulled from 1 m to 5 m in 24 frames:
+    A photograph with a focus pull from 1 m to 5 m in 24 frames:
 
         torchdof render photo.jpg depth.png -o pull.##.png --focus-m 1:1,24:5
 
-    Seven blades on an anamorphic lens, all from 1.5 to 2.2 m in focus:
+    Seven blades on an anamorphic lens, in focus from 1.5 to 2.2 m:
 
         torchdof render shot.exr -o out.exr --focus-range 1.5,2.2 --blades 7 --rotation 15 --squeeze 2
 
@@ -81,15 +81,15 @@ class Render:
 
         torchdof render l.png disp.npz -o out.png --focus-m 2 --depth-kind disparity --depth-scale 192 --fill-depth far
 
-    Depth from an estimator, which knows near from far but no metres, between distances that you state:
+    Relative depth from an estimator, mapped to distances that you state:
 
         torchdof render photo.jpg depth.png -o out.jpg --near-m 1.2 --far-m 8 --focus-m 1.5 --f-number 1.4
 
-    The lens is what you state, else what the file's EXIF data state, else 50 mm at f/2.8 on a sensor of 36 mm; the line
-    that is printed says which. Where you state neither focus nor lens, a single image is focused on what is nearest
-    its middle, and opened until the largest blur radius is 2 % of its width, unless the file's lens blurs enough.
-    Alpha and metadata are kept. A file is written whole or not at all. What looks like a wrong unit is said on standard
-    error; with --strict it is refused. --json prints one JSON object a frame.
+    The lens is the one you state, else the one in the file's EXIF data, else 50 mm at f/2.8 on a sensor of 36 mm; the
+    printed line names the source. If you state neither focus nor lens, a single image is focused on the subject nearest
+    its middle, and the lens is opened until the largest blur radius is 2 % of the width, unless the file's lens blurs
+    enough. Alpha and metadata are kept. A file is written whole or not at all. A likely wrong unit gives a warning on
+    standard error, with --strict an error. --json prints one JSON object per frame.
     """
 
     image: Path = argument("All-in-focus image (EXR, PNG, TIFF, JPEG, HDR, PFM) or shot.####.exr.", "IMAGE")
@@ -126,7 +126,7 @@ class Render:
             raise ValueError(f"--lights must be a finite number of stops from 0 on, got {self.lights:g}")
 
     def run(self) -> None:
-        """Renders one image, the frames of a sequence, or a still whose focus moves."""
+        """Renders one image, the frames of a sequence, or a focus pull in a still image."""
         is_sequence, moves = FramePattern.matches(self.image), len(self.scene.lens.focus_m or []) > 1
         if (is_sequence or moves) and self.files.sheet is not None:
             raise ValueError("--sheet is of one picture; leave it out where there are more")
@@ -153,7 +153,7 @@ class Render:
             renderer.write(renderer.render(frame, self.out, bar=bar))
 
     def _pull_focus(self, keys: Sequence[tuple[int, float]]) -> None:
-        """Renders a still once for each frame from the first to the last keyframe of the focus."""
+        """Renders a still image once for each frame from the first to the last keyframe of the focus."""
         first, last = self.files.frames or (keys[0][0], keys[-1][0])
         todo = self._todo(FramePattern(self.out), dict.fromkeys(range(first, last + 1), (self.image, self.depth)))
         from .frame import Renderer
@@ -163,9 +163,9 @@ class Render:
         self._render_each(renderer, todo, lambda _: frame)
 
     def _todo(self, target: FramePattern, sources: Mapping[int, tuple[Path, Path | None]]) -> dict[int, Path]:
-        """The files of the frames to render: all, or with ``--resume`` those that are not there; the others are told.
+        """Frame number -> file to render; ``--resume`` leaves out existing files and reports them.
 
-        Refuses frames whose image and depth, by their numbers, are not as :func:`check_files` wants them.
+        ``sources`` maps frame numbers to image and depth, which are checked by :func:`check_files`.
         """
         files = {n: target.name(n) for n in sources}
         for n, (image, depth) in sources.items():
@@ -203,7 +203,7 @@ class Render:
         self._render_each(renderer, todo, _steadied(read, whole) if self.files.steady else read)
 
     def _numbers(self, source: FramePattern, depths: FramePattern | None) -> Sequence[int]:
-        """The numbers of the frames that are asked for, all of which are there."""
+        """Numbers of the requested frames; refuses frames without an image or a depth."""
         numbers: Sequence[int] = source.frames()
         if self.files.frames is not None:
             first, last = self.files.frames
@@ -222,7 +222,7 @@ class Render:
         return numbers
 
     def _render_each(self, renderer: "Renderer", files: Mapping[int, Path], read: "Callable[[int], Frame]") -> None:
-        """Renders frames in order; while one is rendered, the next is read and the one before is written."""
+        """Renders frames in order; while one is rendered, the next is read and the previous one is written."""
         with Bar("", len(files)) as bar, ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as writer:
             numbers, coming, written = iter(files), list["Future[Frame]"](), writer.submit(lambda: None)
             try:
@@ -231,8 +231,8 @@ class Render:
                     coming += [reader.submit(read, ahead) for ahead in itertools.islice(numbers, 2 - len(coming))]
                     rendered = renderer.render(coming.pop(0).result(), out, n)
                     written.result()
-                    written = writer.submit(renderer.write, rendered)  # which no interrupt ends half way
-            finally:  # what was rendered is written, whatever happens to the next
+                    written = writer.submit(renderer.write, rendered)  # Ctrl-C does not stop this thread
+            finally:  # a rendered frame is written even if the next one fails
                 written.result()
 
     def _tell_of_those_there(self, files: Sequence[Path], line: str) -> None:
@@ -241,7 +241,7 @@ class Render:
 
 
 def _steadied(read: "Callable[[int], Frame]", numbers: Sequence[int]) -> "Callable[[int], Frame]":
-    """Reads frames with the depth that frames before them steadied, whichever of a sequence are asked for."""
+    """A version of ``read`` with steadied depth; ``numbers`` are all frames of the sequence, in order."""
     from ..depth.steady import SteadyFrames
 
     latest: list[Frame] = []

@@ -1,6 +1,6 @@
-"""What is seen and through what: focus and lens, depth map; what their options mean, guess, and contradict.
+"""Options for focus, lens and depth map: their meaning, their defaults and guesses, and contradictions between them.
 
-PyTorch is imported when the first of them is put to use, so that help and contradictions are answered at once.
+PyTorch is imported when an option is first used, so that help and errors about options appear at once.
 """
 
 import math
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
 __all__ = ["DepthMap", "Lens", "Scene", "Sensor"]
 
 _ASSUMED = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
-_NEAR_M, _FAR_PER_NEAR = 1.0, 8.0  # of relative depth
-_BLUR, _SEEN = 0.02, 0.005  # of the picture's width: a blur that is plain to see, and the least that is seen at all
-_STRAY, _SAMPLES = 1000, 2**20  # pixels of which one may be blurred more; pixels that are looked at
+_NEAR_M, _FAR_PER_NEAR = 1.0, 8.0  # nearest relative depth in m, and farthest over nearest, by default
+_BLUR, _SEEN = 0.02, 0.005  # default largest blur radius, and the smallest that is visible, over the width
+_STRAY, _SAMPLES = 1000, 2**20  # one pixel in _STRAY is ignored as an outlier; most pixels examined
 _SPELLED = {"focus_range_m": "--focus-range", "tilt_deg": "--tilt", "swing_deg": "--swing", "fov_x_deg": "--fov-deg"}
-_WHOLE_NUMBERS = (".png", ".jpg", ".jpeg", ".webp")
-_OF_RENDERERS = (".exr", ".tif", ".tiff")  # whose floating point numbers are distances
+_WHOLE_NUMBERS = (".png", ".jpg", ".jpeg", ".webp")  # types that hold whole numbers only
+_OF_RENDERERS = (".exr", ".tif", ".tiff")  # types whose floats are taken for distances
 
 
 def _share(text: str) -> float:
-    """Reads a share of the width, in per cent."""
+    """Reads a percentage of the width, as a fraction."""
     expected = "--blur expects a share of the picture's width, above 0 and at most 50 %, such as 2%"
     share = numbers(1, expected)(text.removesuffix("%"))[0] / 100
     if not (text.endswith("%") and 0 < share <= 0.5):
@@ -46,7 +46,7 @@ def _equivalent(text: str) -> tuple[float, ...]:
 
 
 def _give_one(options: Mapping[str, Any], problem: str) -> None:
-    """Refuse two options, by what they say, that contradict each other."""
+    """Refuse more than one given option (option -> value or None); ``problem`` is the reason."""
     given = [name for name, value in options.items() if value is not None]
     if len(given) > 1:
         raise ValueError(f"{' and '.join(given)} {problem}; give one of them")
@@ -117,18 +117,18 @@ class Lens(Sensor):
 
     @property
     def _openings(self) -> dict[str, Any]:
-        """Each option that says how wide the lens opens, and what it says."""
+        """Option -> value or None, for the options that set the aperture."""
         names = {"--f-number": "f_number", "--aperture-radius-m": "aperture_radius_m"}
         names |= {"--equivalent": "equivalent", "--blur": "blur_share"}
         return {option: getattr(self, name) for option, name in names.items()}
 
     @property
     def has_focus(self) -> bool:
-        """Whether the user said where to focus."""
+        """Whether an option sets the focus."""
         return (self.focus_m, self.focus_at, self.focus_range) != (None, None, None)
 
     def more_blur(self, largest_px: float, is_still: bool) -> str:
-        """What to do about blur that is too small to be seen."""
+        """Advice for a largest blur radius that is hardly visible."""
         if largest_px == 0:
             return "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
         wider = "a larger --aperture-radius-m" if self.aperture_radius_m is not None else "a smaller --f-number"
@@ -139,16 +139,16 @@ class Lens(Sensor):
 
     @property
     def speaks_of_metres(self) -> bool:
-        """Whether the user said anything of the scene in metres."""
+        """Whether an option states a length in metres."""
         return (self.focus_m, self.focus_range, self.aperture_radius_m) != (None, None, None)
 
     def refuse_keyframes(self) -> None:
-        """Refuse focus that moves, for a single image."""
+        """Refuse keyframes of the focus, for a command that renders a single image."""
         if len(self.focus_m or []) > 1:
             raise ValueError("--focus-m has keyframes but IMAGE is a single image; give one distance in metres")
 
     def view_deg(self, metadata: Mapping[str, Any], width: int, height: int) -> float:
-        """Horizontal field of view, stated or by focal length and sensor, which the file may know."""
+        """Horizontal field of view in degrees, as stated, or from focal length and sensor of options or file."""
         known = self._known(metadata, width, height)
         if self.fov_deg is not None:
             return self.fov_deg
@@ -157,7 +157,7 @@ class Lens(Sensor):
         return 2 * math.degrees(math.atan2(known["sensor_width_mm"], 2 * known["focal_length_mm"]))
 
     def _known(self, metadata: Mapping[str, Any], width: int, height: int) -> dict[str, float]:
-        """Numbers of the camera that the user or else the file states."""
+        """Numbers of the camera from the options, or else from the file."""
         stated = {name: value for name in _ASSUMED if (value := getattr(self, name)) is not None}
         if self.equivalent is not None:
             lens = (*self.equivalent, 36.0 * width / max(width, height))
@@ -172,11 +172,14 @@ class Lens(Sensor):
         is_still: bool = True,
         is_to_scale: bool = True,
     ) -> "tuple[Camera, list[str]]":
-        """The camera of one picture, and remarks on what the user did not state: the file does, or it is assumed.
+        """The camera of one picture, and remarks on the source of the numbers that no option states.
 
-        A still is focused on its subject, and blurred so that it is seen, where nothing says otherwise; a frame of a
-        sequence is not, for both would change from frame to frame. Distances that are not to scale have nothing to do
-        with the file's own. Refuses numbers that make no lens, by the names of the options.
+        1. Take the focus from the options, else from the file, else from the subject of a still.
+        2. Take the lens from the options, else from the file, else from ``_ASSUMED``.
+        3. Open the lens for the blur of ``--blur``, or for a visible blur in a still whose options leave it open.
+
+        In a sequence nothing is guessed, because guesses would differ from frame to frame. Without ``is_to_scale`` the
+        file's focus is ignored. Raises ``ValueError`` with names of options if no lens has these numbers.
         """
         from ..optics.camera import Camera
 
@@ -224,14 +227,14 @@ class Lens(Sensor):
         return camera, remarks
 
     def _largest_coc_px(self, camera: "Camera", depth: "Tensor") -> float:
-        """The largest blur radius in pixels, but for a thousandth of stray pixels, at all keyframes of the focus."""
+        """Largest blur radius in pixels at all keyframes of the focus, without the largest thousandth of the pixels."""
         cameras = [camera.replace(focus_m=metres) for _, metres in self.focus_m or []] or [camera]
         radii = [each.coc_px(depth, depth.shape[-1]).abs().nan_to_num(0.0).flatten() for each in cameras]
         sampled = [radius[:: 1 + radius.numel() // _SAMPLES] for radius in radii]
         return max(float(radius.kthvalue(radius.numel() - radius.numel() // _STRAY).values) for radius in sampled)
 
     def stated(self, camera: "Camera") -> dict[str, Any]:
-        """The numbers of a camera by the options, or the file, that they are from."""
+        """Option -> number of the camera, for messages."""
         from ..optics.camera import CAMERA_NUMBERS
 
         names = self._names()
@@ -241,7 +244,7 @@ class Lens(Sensor):
         return {"--fov-deg": self.fov_deg, **dict([opening]), names["focus_m"]: camera.focus_m}
 
     def _names(self) -> dict[str, str]:
-        """What the user knows a number of the camera as: the option that states it, or the file's own."""
+        """Argument of :class:`Camera` -> its option, marked if that is not given; for messages."""
         focus = "--focus-at" if self.focus_at else "--focus-range" if self.focus_range else "--focus-m"
         given = {name: getattr(self, name) is not None for name in (*_ASSUMED, "aperture_radius_m")}
         spelled = {name: f"--{name.replace('_', '-')}" for name in given} | {"focus_m": focus}
@@ -292,7 +295,7 @@ class DepthMap:
         is_relative = any(
             value is not None for value in (self.near_m, self.far_m, self.relative_kind, self.value_range)
         )
-        if self.depth_kind == "auto" and (is_relative or has_scale or self.strict):  # which say what the numbers are
+        if self.depth_kind == "auto" and (is_relative or has_scale or self.strict):  # these options imply the kind
             object.__setattr__(self, "depth_kind", "relative" if is_relative else "z")
         if self.depth_kind == "relative" and has_scale:
             raise ValueError("relative depth has no --depth-scale and --depth-offset: near and far say it")
@@ -304,7 +307,7 @@ class DepthMap:
 
     @property
     def ends_m(self) -> tuple[float, float]:
-        """Distances of the nearest and the farthest value of relative depth."""
+        """Distances in metres of the nearest and the farthest value of relative depth."""
         near_m, far_m = self.near_m, self.far_m
         if near_m is None:
             near_m = _NEAR_M if far_m is None or far_m == math.inf else far_m / _FAR_PER_NEAR
@@ -312,17 +315,18 @@ class DepthMap:
 
     @property
     def is_to_scale(self) -> bool:
-        """Whether distances are metres that somebody measured or stated."""
+        """Whether distances are in metres, and not only assumed for relative depth."""
         return self.depth_kind != "relative" or self.near_m is not None or self.far_m is not None
 
     def of_sequence(self) -> "DepthMap":
-        """The same for frames of a sequence, where a guess could be another one in each: unsaid is metres."""
+        """The same for a sequence: "auto" becomes "z", because a guess could differ from frame to frame."""
         return replace(self, depth_kind="z") if self.depth_kind == "auto" else self
 
     def guessed(self, values: "Tensor", path: Path, is_metric: bool) -> "tuple[DepthMap, str]":
-        """The same with a kind in the place of ``auto``, by the values of a map, and what to tell of it.
+        """The same with a guessed kind in the place of ``auto``, and a message about the guess.
 
-        Metres are nothing to tell where what the user says of the scene ``is_metric``; otherwise holes are filled too.
+        If other options are in metres (``is_metric``) and so is the guess, the message is empty. Otherwise holes are
+        filled from the far side by default.
         """
         from ..depth.guess import guess_kind
 
@@ -347,7 +351,7 @@ class DepthMap:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """What is seen, and through what; commands that take an image and its depth are made of it."""
+    """Options for focus, lens and depth map, for commands that take an image and its depth."""
 
     lens: Lens = Lens()
     depth_map: DepthMap = DepthMap()

@@ -1,4 +1,4 @@
-"""``torchdof tables``: which blur tables there are, and pictures of their kernels."""
+"""``torchdof tables``: lists blur tables and draws their kernels."""
 
 import dataclasses
 import math
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Tables"]
 
-_WIDTH = 1920  # px of the image that kernels are shown for
-_COC_PX = (-24.0, -12.0, -6.0, 6.0, 12.0, 24.0)
-_CELL = (200, 230)  # rows and columns of a kernel's picture, as wide as a caption
-_ZOOM = 2  # picture's pixels a pixel
-_PLACES = (0.0, 0.4, 0.7, 0.95)  # of the way from the middle of the frame to its corner
+_WIDTH = 1920  # px; image width for which kernels are drawn
+_COC_PX = (-24.0, -12.0, -6.0, 6.0, 12.0, 24.0)  # px; signed blur radii of the rows
+_CELL = (200, 230)  # px; height and width of a kernel's picture, wide enough for its caption
+_ZOOM = 2  # width in the picture of one pixel of a kernel
+_PLACES = (0.0, 0.4, 0.7, 0.95)  # distances from the middle of the frame; its corner is at 1
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,8 +30,8 @@ class Tables:
     """List blur tables, and draw their kernels.
 
     The picture has a column for each table and a row for each signed blur radius, from 24 pixels in front of the focus
-    plane to 24 behind it, in an image of 1920 pixels. Each kernel is as bright as its brightest pixel allows. Of a
-    table whose kernels depend on the place it has four columns, from the middle of a frame of 3:2 to its lower right
+    plane to 24 behind it, in an image 1920 pixels wide. Each kernel is scaled to a largest value of 1 (white). A table
+    whose kernels depend on the place in the frame has four columns, from the middle of a 3:2 frame to its lower right
     corner.
 
         torchdof tables -o tables.png
@@ -71,7 +71,7 @@ class Tables:
 
 
 def _facts(name: str, table: "BlurTable") -> dict[str, Any]:
-    """What there is to say of a table."""
+    """Properties of a table, as data for JSON."""
     return {
         "table": name,
         "family": table.family,
@@ -86,7 +86,7 @@ def _facts(name: str, table: "BlurTable") -> dict[str, Any]:
 
 
 def _line(facts: dict[str, Any]) -> str:
-    """The same in one line."""
+    """Properties of a table as one line of text."""
     parts = [f"{facts['family']}, {facts['nodes']} node{'s' if facts['nodes'] > 1 else ''}"]
     if facts["unit"] != "relative":
         low, high = facts["coc"]
@@ -97,7 +97,7 @@ def _line(facts: dict[str, Any]) -> str:
 
 
 def _column(table: "BlurTable") -> "Tensor":
-    """Kernels of a table below each other, ``[1, 3, rows, columns]`` in linear light; beside each other over places."""
+    """Kernels of a table, ``[1, 3, H, W]`` in linear light: one row per blur radius, one column per place."""
     import torch
     import torch.nn.functional as functional
 

@@ -1,4 +1,4 @@
-"""What a depth map and its picture are likely to mean where nobody says it: the kind of numbers, and the subject."""
+"""Guesses the kind of a depth map's numbers, and the subject of a picture, if the user states neither."""
 
 import dataclasses
 import math
@@ -12,25 +12,25 @@ from .sanity import whole_numbers
 
 __all__ = ["Guess", "guess_kind", "subject_m"]
 
-_ONE_BYTE, _FILLED = 255, 60_000  # whole numbers up to here are shades of grey; from here on, of 16 bits
-_NEXT_TO_ZERO = 0.05  # of values from 0 to 1; nothing is photographed so near in metres
-_CLEAR = 0.35  # correlation from which on a picture's lower part is taken for nearer than its upper one
-_SAMPLES = 65_536
-_BINS, _REACH = 64, 3  # of 1 / distance; a surface is a bin and as many on each side
-_SPREAD = 1 / 6  # standard deviation of what counts as the middle, of each side of the picture
-_STRAY = 0.01  # of the pixels, the nearest and the farthest
-_SUBJECT = 0.2  # of the middle, at least, is the subject
+_ONE_BYTE, _FILLED = 255, 60_000  # whole numbers are grey levels if their largest is <= the first or >= the second
+_NEXT_TO_ZERO = 0.05  # smallest value below which numbers up to 1 are relative: in metres, it would be too near
+_CLEAR = 0.35  # absolute correlation of values and rows above which values clearly grow or shrink downwards
+_SAMPLES = 65_536  # most pixels examined
+_BINS, _REACH = 64, 3  # bins of 1 / distance; bins on each side of its peak that belong to a surface
+_SPREAD = 1 / 6  # standard deviation of the weight of the middle, over each side of the picture
+_STRAY = 0.01  # share of the pixels at each end of the distances that is ignored as outliers
+_SUBJECT = 0.2  # smallest share of the middle that the subject fills
 
 
 @dataclasses.dataclass(frozen=True)
 class Guess:
-    """What the numbers of a map are taken for.
+    """The meaning of the numbers of a depth map.
 
     Args:
-        kind: "z": metres after ``scale``; "relative": near and far, without a unit.
-        scale: Metres a unit, for "z".
+        kind: "z": metres after multiplication by ``scale``; "relative": near and far, without a unit.
+        scale: Metres per unit, for "z".
         unknown: The value that means "not measured", or None.
-        relative_kind: Which way relative depth runs.
+        relative_kind: Kind of relative depth: "disparity" is larger for nearer surfaces, "depth" for farther ones.
     """
 
     kind: Literal["z", "relative"]
@@ -40,18 +40,18 @@ class Guess:
 
 
 def guess_kind(values: Tensor, whole: bool = False, metric: bool = False) -> Guess:
-    """Guesses what the numbers of a depth map are.
+    """Guesses the meaning of the numbers of a depth map.
 
-    Whole numbers up to 255, or up to the end of 16 bits, are shades of grey: relative depth; others are millimetres,
-    zero where nothing was measured. Other numbers are metres, unless they run from 0 to 1 or are negative. Relative
-    depth is disparity, larger is nearer, unless its lower part is clearly smaller than its upper one: the ground is
-    nearer than the sky. By the same sign, what would be a distance is relative disparity where it clearly grows
-    downwards, as an estimator's own numbers do.
+    * Whole numbers are relative depth (grey levels) if the largest is at most 255, or at least 60,000. Otherwise they
+      are millimetres, with 0 for pixels that were not measured.
+    * Other numbers are relative depth if they lie in [0, 1] and come near 0, or if some are negative; else metres.
+    * Relative depth is "disparity" (larger is nearer), unless the values clearly shrink downwards: the ground is nearer
+      than the sky. For the same reason distances that clearly grow downwards are taken for relative disparity.
 
     Args:
-        values: ``[1, 1, H, W]``; what is not finite is left out.
-        whole: Whether the file can hold whole numbers only; otherwise the values tell.
-        metric: Whether what else is known is in metres: numbers that may be distances then are.
+        values: ``[1, 1, H, W]``; NaN and infinite values are ignored.
+        whole: Whether the file type holds whole numbers only; otherwise the values are examined.
+        metric: Whether other input is in metres; distances are then never taken for disparity.
 
     Example:
         >>> guess_kind(torch.linspace(0, 255, 256).round().reshape(1, 1, 16, 16)).kind
@@ -78,13 +78,13 @@ def guess_kind(values: Tensor, whole: bool = False, metric: bool = False) -> Gue
 
 
 def subject_m(depth: Tensor) -> float:
-    """Distance of the subject nearest to the middle of the picture, in metres.
+    """Distance in metres of the subject in the middle of the picture.
 
-    It is the nearest surface that fills at least a fifth of the middle, weighted by a Gaussian of a sixth of each side;
-    of this surface the median counts, so that neither an edge nor a stray pixel does.
+    The subject is the nearest surface that fills at least a fifth of the middle, which is a Gaussian weight with a
+    standard deviation of a sixth of each side. The distance is the median of that surface.
 
     Args:
-        depth: ``[1, 1, H, W]``, metres; NaN, zero and negative ones are left out, ``inf`` counts.
+        depth: ``[1, 1, H, W]``, metres, may be ``inf``; NaN, zero and negative values are ignored.
 
     Raises:
         ValueError: If no pixel has a depth.
@@ -118,7 +118,7 @@ def subject_m(depth: Tensor) -> float:
 
 
 def _growth_downwards(values: Tensor) -> float:
-    """Correlation of the values' ranks with their rows, -1 to 1: positive where the lower part has larger ones."""
+    """Correlation of the ranks of the values with their rows, in [-1, 1]; positive if values grow downwards."""
     step = math.ceil(math.sqrt(values.numel() / _SAMPLES))
     values = values[0, 0, step // 2 :: step, step // 2 :: step]
     known = values.isfinite() & (values != 0)
@@ -126,6 +126,6 @@ def _growth_downwards(values: Tensor) -> float:
     if rows.numel() < 2:
         return 0.0
     _, places, counts = values[known].unique(return_inverse=True, return_counts=True)
-    ranks = (counts.cumsum(0) - 0.5 * counts)[places]  # equal values share one
+    ranks = (counts.cumsum(0) - 0.5 * counts)[places]  # equal values have equal ranks
     rows, ranks = rows - rows.mean(), ranks - ranks.mean()
     return float((rows * ranks).sum() / (rows.norm() * ranks.norm()).clamp(min=1e-12))

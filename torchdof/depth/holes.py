@@ -64,7 +64,7 @@ def resolve_holes(depth: Tensor, name: str, fill: Fill | None, is_relative: bool
         depth: ``[1, 1, H, W]``.
         name: Name of the file, for the message.
         fill: As for :func:`fill_holes`; None refuses holes.
-        is_relative: Whether zero stands for the far end and is filled already.
+        is_relative: Whether the map is relative depth, in which zero is the far end and no hole; for the message.
 
     Returns:
         The depth without holes, and how many there were.

@@ -167,7 +167,12 @@ def _strips(height: int, line: int) -> list[slice]:
 def write_image(
     path: str | os.PathLike[str], picture: Picture, transfer: Transfer | None = None, sample: PixelType | None = None
 ) -> None:
-    """Writes a picture whole or not at all: to a new file in the same folder, renamed when it is complete.
+    """Writes a picture whole or not at all.
+
+    1. Choose the sample type and the transfer curve, and drop alpha or add channels as the format requires.
+    2. Encode the light, in strips of rows.
+    3. Add the window, the metadata and the settings of the compression.
+    4. Write a temporary file, check that it is complete, and rename it.
 
     Args:
         path: Output file; its suffix gives the format (.exr .png .tif .tiff .jpg .jpeg .webp .hdr .pfm).

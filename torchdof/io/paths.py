@@ -1,6 +1,6 @@
-"""Names of files: which types are read and written, and whether there is anything to read.
+"""Types of files that are read and written, and checks of paths.
 
-Nothing here imports PyTorch, so that a command that names no file is answered at once.
+Nothing here imports PyTorch, so that an error about a path appears at once.
 """
 
 import os
@@ -13,7 +13,7 @@ __all__ = ["IMAGES", "PixelType", "existing", "existing_image", "existing_map", 
 
 PixelType = Literal["8", "16", "half", "float"]
 
-_SAMPLES: dict[str, tuple[PixelType, ...]] = {  # what each type of file can hold, its default first
+_SAMPLES: dict[str, tuple[PixelType, ...]] = {  # suffix -> sample types, the default first
     ".exr": ("half", "float"),
     ".png": ("8", "16"),
     **dict.fromkeys((".tif", ".tiff"), ("8", "16", "float")),
@@ -25,10 +25,10 @@ IMAGES = tuple(_SAMPLES)
 
 
 def samples_of(path: Path) -> tuple[PixelType, ...]:
-    """What an image file to be written can hold, by its suffix, its default first.
+    """Sample types that an image file can hold, by its suffix; the default is first.
 
     Raises:
-        ValueError: If no such file can be written.
+        ValueError: If files with this suffix cannot be written.
     """
     suffix = path.suffix.lower()
     if suffix not in _SAMPLES:
@@ -37,7 +37,7 @@ def samples_of(path: Path) -> tuple[PixelType, ...]:
 
 
 def existing_image(path: str | os.PathLike[str]) -> Path:
-    """The path of an image of a type that is read here, as :func:`existing`."""
+    """Checks the path of an image, as :func:`existing`."""
     unread = foreign.refusal(path)
     if unread is not None:
         raise ValueError(f"{path}: {unread}")
@@ -46,19 +46,19 @@ def existing_image(path: str | os.PathLike[str]) -> Path:
 
 
 def existing_map(path: str | os.PathLike[str]) -> Path:
-    """The path of a depth map, as :func:`existing`."""
+    """Checks the path of a depth map, as :func:`existing`."""
     return existing(path, (*IMAGES, ".npy", ".npz"), "a depth map")
 
 
 def existing(path: str | os.PathLike[str], suffixes: tuple[str, ...], what: str) -> Path:
-    """The path, if there is a file of one of these types at it, which is not empty; ``what`` names what was wanted.
+    """Returns ``path`` if it is a file with one of ``suffixes`` that is not empty; ``what`` describes it in messages.
 
     Raises:
-        OSError: If there is none, or an empty one.
-        ValueError: If it is no path, or of another type.
+        OSError: If the file is missing, empty or not a regular file.
+        ValueError: If ``path`` is not a path, or has another suffix.
     """
     if not isinstance(path, str | os.PathLike) or "\0" in os.fspath(path):
-        from ..validation import show  # takes PyTorch
+        from ..validation import show  # imports PyTorch
 
         raise ValueError(f"expected the path of {what}, got {show(path)}")
     path = Path(path)

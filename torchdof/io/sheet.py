@@ -11,11 +11,11 @@ from .images import Picture, write_image
 
 __all__ = ["shrunk", "write_sheet"]
 
-_LABEL = 76  # px: width of what is written beside rows
+_LABEL = 76  # px; width of the column of row labels
 
 
 def shrunk(pixels: Tensor, longest: int) -> Tensor:
-    """Pixels ``[1, C, H, W]`` in linear light, smaller if their longer side is longer than so many.
+    """Pixels ``[1, C, H, W]`` in linear light, scaled down if the longer side exceeds ``longest`` pixels.
 
     Example:
         >>> shrunk(torch.ones(1, 3, 40, 80), 20).shape
@@ -43,7 +43,7 @@ def write_sheet(
         panels: Caption -> ``[1, 3, H, W]`` in linear light, all of one size.
         margin: Pixels between panels.
         caption: Height of the line of captions in pixels.
-        rows: What to write to the left of the rows, of equal height, that each panel consists of.
+        rows: Labels to the left of the panels, one for each of their rows, which have equal height.
 
     Raises:
         ValueError: If the format is unknown.

@@ -13,9 +13,9 @@ from ..tensors import is_fake, is_traced
 
 __all__ = ["KernelCache", "kept"]
 
-_ENTRY_BYTES = 512  # counted for a key and its dictionary entry, besides the tensors
+_ENTRY_BYTES = 512  # bytes counted for a key and its dictionary entry, besides the tensors
 
-_CONSTANT_BYTES = 16 * 2**20  # of all functions that are kept
+_CONSTANT_BYTES = 16 * 2**20  # largest size in bytes of the results of all functions decorated with kept
 
 _Arguments = ParamSpec("_Arguments")
 _Key = TypeVar("_Key", bound=Hashable)
@@ -40,7 +40,7 @@ class KernelCache:
         self._lock = threading.Lock()
 
     def get(self, key: Hashable, make: Callable[[], Kept]) -> Kept:
-        """The result stored under ``key``; calls ``make`` if there is none.
+        """The result stored under ``key``; computed by ``make`` if the key is missing.
 
         Two threads that miss the same key at once both call ``make``; one result is kept.
         """
@@ -70,7 +70,7 @@ class KernelCache:
 
 
 def _unwrapped(made: Any) -> Any:
-    """A result without the wrappers of torch.func, which wraps every tensor, also one that depends on no input."""
+    """Remove the wrappers of torch.func, which wraps every tensor, also one that depends on no input."""
     if isinstance(made, tuple):
         return tuple(map(_unwrapped, made))
     while isinstance(made, Tensor) and torch._C._functorch.is_functorch_wrapped_tensor(made):
@@ -87,11 +87,11 @@ _CONSTANTS = KernelCache(_CONSTANT_BYTES)
 
 
 def kept(make: Callable[_Arguments, tuple[Tensor, ...]]) -> Callable[_Arguments, tuple[Tensor, ...]]:
-    """Keeps the tensors that a function makes of numbers alone: index tables and the like, the same in every frame.
+    """Cache the tensors that a function makes from numbers alone, such as index tables: the same in every frame.
 
     In traced code, and under ``FakeTensorMode``, the function is called each time.
     """
-    whole = torch.inference_mode(False)(make)  # what is kept must serve autograd as well
+    whole = torch.inference_mode(False)(make)  # autograd will use them too, and refuses inference tensors
 
     @functools.wraps(make)
     def called(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> tuple[Tensor, ...]:

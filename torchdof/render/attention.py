@@ -1,4 +1,4 @@
-"""Attention: the tolerance is kept where the viewer looks, and loosened to that of a draft outside.
+"""Attention: the picture keeps its tolerance where the viewer looks, and has that of a draft elsewhere.
 
 Reference:
     Mulder, van Liere, "Fast perception-based depth of field rendering", VRST 2000.
@@ -16,17 +16,17 @@ from ..validation import show
 __all__ = ["Attention", "box_around", "weight_map"]
 
 Attention = tuple[float, float, float] | Tensor
-"""``(x, y, radius)`` in pixels of what the viewer looks at, or a map ``[B, 1, H, W]`` or ``[1, 1, H, W]``, 0 to 1."""
+"""A disc ``(x, y, radius)`` in pixels at which the viewer looks, or a map ``[B or 1, 1, H, W]``, 0 to 1."""
 
-_FADE = 0.25  # of the radius, outside of it
-_ALIGN = 64  # the part is cut where cells of the whole frame begin
+_FADE = 0.25  # width of the fade around the disc, as a fraction of its radius
+_ALIGN = 64  # crops begin and end at multiples of it, in pixels, so that cells match those of the whole frame
 
 
 def weight_map(attention: Any, image: Tensor) -> Tensor:
-    """How far the viewer looks at each pixel: ``[B or 1, 1, H, W]``, 0 to 1.
+    """Weight of the viewer's attention at each pixel: ``[B or 1, 1, H, W]``, 0 to 1.
 
     Raises:
-        ValueError: If it is neither three numbers with a radius > 0 nor a map that belongs to the image.
+        ValueError: If ``attention`` is neither three numbers with a radius > 0 nor a map of the image's size.
     """
     batch, _, height, width = image.shape
     if isinstance(attention, Tensor):
@@ -49,7 +49,7 @@ def weight_map(attention: Any, image: Tensor) -> Tensor:
 
 
 def box_around(weight: Tensor, reach_px: float) -> tuple[slice, slice] | None:
-    """Rows and columns of what a viewer looks at and all that reaches into it; None if that is nothing."""
+    """Rows and columns of the pixels with ``weight > 0``, plus ``reach_px`` on each side; None without such pixels."""
     seen = (weight > 0).flatten(0, 1).any(0)
     if not bool(seen.any()):
         return None

@@ -1,19 +1,21 @@
-"""Light beyond the frame's border, continued from what is seen along it.
+"""Continue light beyond the frame's border from the pixels along it.
 
-Nothing tells what is out there, but the spectrum of images falls with the square of the frequency, and of such an image
-the expectation beyond a straight border is the harmonic continuation: the row at the border, smoothed along it the more
-the farther out. Half of the nearest pixel's light and half of a mean along the border, four times as wide to each side
-as the place is far, come close to it.
+The scene outside the frame is unknown. The power of images falls with the square of the frequency, and for such images
+the expected value beyond a straight border is the harmonic continuation: the border's row, smoothed along the border by
+a width that grows with the distance from it. Half of the nearest pixel's light plus half of a mean along the border is
+a good approximation; the mean extends to each side by four times the distance.
 
-The mean is over the surface that the nearest pixel shows and those behind it: no light of a subject that the border
-cuts goes into its background, while the subject may end beyond the border and show what is behind. Surfaces are told
-apart by the steps of the blur along the border, added up; slopes do not count. The sum is divided into bins, and each
-pixel belongs to the two bins beside its own sum.
+The mean is over the surface of the nearest pixel and the surfaces behind it. So a subject that the border cuts gives no
+light to its background. Beyond the subject itself the background does contribute, because the subject may end there.
+Surfaces are separated by the steps of the blur along the border: the steps are summed, slopes count as 0. The range of
+the sum is divided into bins, and each pixel belongs to the two bins nearest to its own sum.
 
 Reference:
     Field, "Relations between the statistics of natural images and the response properties of cortical cells", Journal
     of the Optical Society of America A 4(12), 1987 (the spectrum).
 """
+
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as functional
@@ -23,74 +25,78 @@ from ..optics.kernel_cache import kept
 
 __all__ = ["continued"]
 
-_WIDTH = 4  # the mean reaches so many times as far to each side as the place lies beyond the border
-_BINS = 16  # number of bins; a larger one separates more surfaces
-_STEP = 0.5  # largest difference of neighbours on one surface, on the blur axis; twice that is a whole step
+_WIDTH = 4  # half width of the mean along the border, over the distance from the border; larger smooths more
+_BINS = 16  # number of bins; more of them separate more surfaces
+_STEP = 0.5  # px on the blur axis: neighbours that differ by less are one surface, by twice that are two
 
 
 def continued(
-    light: Tensor,
+    lights: Sequence[Tensor],
     weight: Tensor | None,
     limit: Tensor | None,
     ends: tuple[int, int, int, int],
     farthest: int,
     x: Tensor | None = None,
     image_x: Tensor | None = None,
-    surfaces: int = 1,
-) -> Tensor:
-    """Adds pixels to light ``[B, C, H, W]`` at the left, right, top and bottom.
+) -> list[Tensor]:
+    """Add continued pixels to the light ``[B, C, H, W]`` of S surfaces at the left, right, top and bottom.
 
-    Beyond a corner the continuations of the two rows that meet there are mixed by how far each goes.
+    In a corner, the vertical continuation of the row and the horizontal one of the column are averaged, each weighted
+    by its own distance from the frame.
 
     Args:
-        light: Of one surface; or of several, one after the other along the batch, B items altogether.
-        weight: Share of each pixel that the surface covers, ``[B, 1, H, W]``: the weight in means. None is 1.
-        limit: Largest light of a pixel that is not a highlight, ``[B / surfaces, 1, H, W]``: highlights are not
-            continued. None: there are no highlights.
-        ends: Pixels to add; in traced code they may be symbols.
-        farthest: Number that none of them exceeds.
-        x: Place of the pixels on the blur axis, ``[B, 1, H, W]``; None: all of them are one surface.
-        image_x: The same of the image, ``[B / surfaces, 1, H, W]``; None: the image has the one surface.
-        surfaces: Number of surfaces.
+        lights: Light of each surface.
+        weight: Share of each pixel that each surface covers, concatenated to ``[S B, 1, H, W]``: the weight in means.
+            None means 1.
+        limit: Largest light of a pixel that is not a highlight, ``[B, 1, H, W]``: highlights are not continued. None:
+            there are no highlights.
+        ends: Pixels to add at each side; in traced code they may be symbols.
+        farthest: Upper limit of ``ends``.
+        x: Place of each surface's pixels on the blur axis, concatenated to ``[S B, 1, H, W]``; None: all pixels of a
+            surface belong together.
+        image_x: The same for the image itself, ``[B, 1, H, W]``; None: it equals ``x``.
     """
+    count = len(lights)
     rows, columns = (
         _beyond(
-            _both(light, dim),
-            None if weight is None else _both(weight, dim),
-            None if x is None else _both(x, dim),
-            None if limit is None else _both(limit, dim, surfaces),
-            None if image_x is None else _both(image_x, dim, surfaces),
+            _both(lights, dim),
+            None if weight is None else _both([weight], dim),
+            None if x is None else _both([x], dim),
+            None if limit is None else _both([limit] * count, dim),
+            None if image_x is None else _both([image_x] * count, dim),
             farthest,
-        )
+        ).unflatten(1, (count, -1))
         for dim in (-2, -1)
-    )  # [2, B, C, farthest, W]: top and bottom; [2, B, C, farthest, H]: left and right
-    # the corners: the row's own continuation and the column's
+    )  # [2, S, B, C, farthest, W]: top and bottom; [2, S, B, C, farthest, H]: left and right
+    # corners: the continuations of the row (outwards) and of the column (sideways)
     outwards = torch.stack([rows[..., 0], rows[..., -1]], 1)[..., None]  # [top or bottom, left or right, ..., 1]
     sideways = torch.stack([columns[..., 0], columns[..., -1]])[..., None, :]
     far, across = _distances(rows, farthest)[:, None], _distances(rows, farthest)
     corners = (outwards * far + sideways * across) / (far + across)
     left, right, top, bottom = ends
-    before, after = columns[0, ..., :left, :], columns[1, ..., :right, :]
-    lines = [torch.cat([before.flip(-2).transpose(-1, -2), light, after.transpose(-1, -2)], -1)]
-    for side, count in ((0, top), (1, bottom)):
-        parts = (corners[side, 0, ..., :left].flip(-1), rows[side], corners[side, 1, ..., :right])
-        lines.append(torch.cat(parts, -1)[..., :count, :])
-    return torch.cat([lines[1].flip(-2), lines[0], lines[2]], -2)
+    wide = []
+    for k, light in enumerate(lights):
+        before, after = columns[0, k, ..., :left, :], columns[1, k, ..., :right, :]
+        lines = [torch.cat([before.flip(-2).transpose(-1, -2), light, after.transpose(-1, -2)], -1)]
+        for side, added in ((0, top), (1, bottom)):
+            parts = (corners[side, 0, k, ..., :left].flip(-1), rows[side, k], corners[side, 1, k, ..., :right])
+            lines.append(torch.cat(parts, -1)[..., :added, :])
+        wide.append(torch.cat([lines[1].flip(-2), lines[0], lines[2]], -2))
+    return wide
 
 
-def _both(values: Tensor, dim: int, times: int = 1) -> Tensor:
-    """First and last line of maps ``[B, c, H, W]`` along an axis, several times: ``[2, times B, c, n]``."""
-    lines = torch.stack([values.select(dim, 0), values.select(dim, -1)])
-    return lines if times == 1 else lines.repeat(1, times, 1, 1)
+def _both(maps: Sequence[Tensor], dim: int) -> Tensor:
+    """First and last line of maps ``[B, c, H, W]`` along ``dim``: ``[2, maps B, c, n]``."""
+    return torch.stack([torch.cat([values.select(dim, end) for values in maps]) for end in (0, -1)])
 
 
 def _distances(like: Tensor, reach: int) -> Tensor:
-    """Pixels from the last one of the frame, 1, 2, ... ``reach``."""
+    """Distances in pixels from the frame's last pixel: 1, 2, ... ``reach``."""
     return torch.arange(1, reach + 1, device=like.device).to(like.dtype)
 
 
 def _bins(x: Tensor, image_x: Tensor) -> Tensor:
-    """Place of each pixel of a line among the bins less the bin, ``[..., 1, bins, n]``, from ``[..., 1, n]``."""
+    """Signed distance of each pixel from each bin, in bins: lines ``[..., 1, n]`` to ``[..., 1, bins, n]``."""
     x, image_x = x.double(), image_x.double()
     surface = functional.pad(_step(image_x.diff()).cumsum(-1), (1, 0))
     low, high = surface.amin(-1, keepdim=True), surface.amax(-1, keepdim=True)
@@ -101,16 +107,16 @@ def _bins(x: Tensor, image_x: Tensor) -> Tensor:
 
 
 def _step(difference: Tensor) -> Tensor:
-    """Differences on the blur axis that are steps from one surface to another; 0 for those of a slope."""
+    """Keep differences on the blur axis that are steps between surfaces; set those of a slope to 0."""
     return difference * (difference.abs() / _STEP - 1.0).clamp(0.0, 1.0)
 
 
 def _beyond(
     line: Tensor, weight: Tensor | None, x: Tensor | None, most: Tensor | None, image_x: Tensor | None, farthest: int
 ) -> Tensor:
-    """Continues lines ``[..., C, n]`` at the border by ``farthest`` pixels, nearest first: ``[..., C, farthest, n]``.
+    """Continue lines ``[..., C, n]`` at the border by ``farthest`` pixels, nearest first: ``[..., C, farthest, n]``.
 
-    The other arguments are lines of the maps that :func:`continued` has, ``[..., 1, n]``.
+    The other arguments are lines ``[..., 1, n]`` of the maps of :func:`continued`.
     """
     if most is not None:
         brightest = line.amax(-2, keepdim=True)
@@ -120,12 +126,12 @@ def _beyond(
     values = torch.cat([line * weight, weight], -2).double()[..., None, :]  # [..., C + 1, 1, n]
     bins = None if x is None else _bins(x, x if image_x is None else image_x)
     values = values if bins is None else values * (1.0 - bins.abs()).clamp_min(0.0)
-    sums = functional.pad(values.cumsum(-1), (1, 0))  # of the pixels before each
-    # means for distances that are powers of two; between them linear
+    sums = functional.pad(values.cumsum(-1), (1, 0))  # over the pixels before each one
+    # means for distances that are powers of two, interpolated linearly between them
     levels = farthest.bit_length() + 1
     start, stop, octave, part = _windows(line.shape[-1], farthest, levels, line.dtype, line.device)
     window = (sums.index_select(-1, stop) - sums.index_select(-1, start)).unflatten(-1, (levels, -1))
-    if bins is not None:  # those of its own surface, and of farther ones
+    if bins is not None:  # sum over the pixel's own surface and farther ones
         window = window * (1.0 - bins).clamp(0.0, 1.0).unsqueeze(-2)
     window = window.sum(-3)  # [..., C + 1, levels, n]
     total = window[..., -1:, :, :]
@@ -138,10 +144,10 @@ def _beyond(
 def _windows(
     length: int, farthest: int, levels: int, dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Where the window of each pixel of a line starts and stops, ``[levels n]``; level l is that of 2^l pixels.
+    """Start and stop of each pixel's window on a line, ``[levels n]`` each; level l is for a distance of 2^l pixels.
 
-    And for each distance up to the farthest the level before it ``[farthest]``, and its share of the way to the next
-    level ``[farthest, 1]``.
+    Also, for each distance up to ``farthest``, the level below it ``[farthest]`` and the fraction of the way to the
+    next level ``[farthest, 1]``.
     """
     at = torch.arange(length, device=device)
     half = torch.tensor([_WIDTH * 2**level for level in range(levels)], device=device)[:, None]

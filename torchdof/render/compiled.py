@@ -1,4 +1,4 @@
-"""Hands pictures to the compiled engine (:mod:`torchdof.native`), where that can make them."""
+"""Render with the compiled engine (:mod:`torchdof.native`) where it supports the arguments."""
 
 import functools
 from collections.abc import Sequence
@@ -29,11 +29,11 @@ def picture(
     cover: Tensor | None = None,
     lens_width: int | None = None,
 ) -> Tensor | None:
-    """The picture ``[B, C, H, W]`` that the plain engine would make, item by item; None where that one serves.
+    """Render the picture ``[B, C, H, W]`` of the plain engine, item by item; None if that engine must render it.
 
-    The compiled engine serves eager inference on the CPU in float32, with layers. Arguments are those of the plain
-    engine's entry, ``torchdof.render.pipeline._render_item``, and the width of the image whose kernels are used, where
-    it is not the picture's own.
+    The compiled engine supports ``method="layered"`` in float32 on the CPU, in eager code without gradients. Arguments
+    are those of ``torchdof.render.pipeline._render_item``; ``lens_width`` is the width in pixels of the image whose
+    kernels are used, if it differs from the picture's.
     """
     if options.table.is_differentiated:
         return None
@@ -53,7 +53,7 @@ def picture(
     if cover is not None:
         low, high = plan.coc_px[0], plan.coc_px[-1]
         coc = coc.clamp(low, high)
-        # what no layer covers is seen through all of them
+        # a black surface behind the layers, for pixels that no layer covers
         nothing, farthest = torch.zeros_like(light[0, 0]), torch.full_like(coc[0, 0, 0], high)
         items = []
         for surfaces in zip(light, coc[:, :, 0], cover[:, :, 0], strict=True):
@@ -67,7 +67,7 @@ def picture(
 
 
 def _is_plain(values: Tensor) -> bool:
-    """Whether numbers alone are asked for, in memory that the compiled engine can read: no gradients, no device."""
+    """Whether the compiled engine can read a tensor: float32 in CPU memory, without gradients."""
     return values.dtype == torch.float32 and is_in_memory(values)
 
 
@@ -79,7 +79,7 @@ def _render(
     surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]],
     kind: native.Kind,
 ) -> Tensor:
-    """One item ``[C, H, W]``."""
+    """Render one item to ``[C, H, W]``."""
     height, width = surfaces[0][0].shape[-2:]
     aperture = options.table.aperture or Aperture()
     like = torch.empty(0, device="cpu")
@@ -100,7 +100,7 @@ def _render(
     )
     if kind != "background":
         try:
-            return render(surfaces)  # the engine looks at one image's light itself; a stack's has room
+            return render(surfaces)  # raises OverflowError if light is too bright; a stack is scaled already
         except OverflowError:
             pass
     scale = float(headroom.factor(*(light[None] for light, _, _ in surfaces[:2])))
@@ -108,14 +108,14 @@ def _render(
 
 
 def _ray_shares(table: BlurTable, size: tuple[int, int], steps: Sequence[int]) -> list[Shares]:
-    """What the field lets through of kernels of highlights whose coc is so many steps."""
+    """Field masks for the kernels of highlights with a coc of ``steps / KERNELS_PER_PX`` pixels."""
     return [
         s.to(torch.empty(0, device="cpu")) for s in ray_shares(table, [step / KERNELS_PER_PX for step in steps], size)
     ]
 
 
 def _psfs(table: BlurTable, width: int, longest: int, steps: Sequence[int]) -> list[Tensor]:
-    """Kernels ``[1 or C, k, k]`` of highlights whose coc is so many steps."""
+    """Kernels ``[1 or C, k, k]`` of highlights with a coc of ``steps / KERNELS_PER_PX`` pixels."""
     coc_px = [step / KERNELS_PER_PX for step in steps]
     return _kernels(table, bank_of(table).spots(coc_px, width, longest=[longest] * len(coc_px)))
 

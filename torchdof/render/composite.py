@@ -1,4 +1,4 @@
-"""Layers, far to near, to one image: each is scattered with its kernel and composited with what is behind it."""
+"""Composite layers to one image, far to near: scatter each with its kernel and lay it over the layers behind it."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -21,13 +21,13 @@ Scatter = Callable[[Tensor, Tensor, int], Tensor]
 """``(light [B, C, H, W], kernels [1 or C, k, k], halo) -> [B, C, H - 2 halo, W - 2 halo]``."""
 
 Picture = tuple[Tensor, Tensor]
-"""Light ``[B, C, h, w]`` and what it is to be weighed with, of one channel or C."""
+"""Light ``[B, C, h, w]`` and its weight ``[B, 1 or C, h, w]``: a sum of weights, a coverage or a transmittance."""
 
 Pictures = Sequence[Picture]
-Lights = Sequence[Tensor]  # named here, for a graph that is compiled reads annotations of inner functions
+Lights = Sequence[Tensor]  # an alias, because torch.compile evaluates the annotations of inner functions
 
-_LEAST = 1e-6  # share of scattered weight below which nothing is known
-_KNOWN = 0.002  # share of scattered weight from which on a layer is known in full
+_LEAST = 1e-6  # scattered weight, of 1: pixels with less are unknown and become 0
+_KNOWN = 0.002  # scattered weight, of 1: layers with less cover gradually less; larger fades more of them
 
 
 def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, ops: Ops = EAGER) -> Tensor:
@@ -36,15 +36,14 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, ops: Ops = EAGER
     With ``m_k`` the weight of layer k, ``M_k`` the weight at or behind it and ``K_k`` its kernel:
     ``colour = K_k * (m_k I) / K_k * M_k``, coverage ``a = K_k * m_k / K_k * M_k``, ``out = colour + (1 - a) out``.
     Dividing by ``K_k * M_k`` keeps a surface that spans several layers closed and lets the background reach under the
-    blurred edge of what is in front. A layer of which next to nothing is known covers next to nothing: without that, a
-    hair more or less in it would change the picture. Where all layers leave a pixel uncovered, what is behind them
-    shows.
+    blurred edge of a foreground. Where ``K_k * M_k`` is near 0 the coverage fades to 0; otherwise the first bit of
+    weight in a layer would change the picture abruptly. Pixels that no layer covers show ``frame.behind``.
 
     Args:
-        frame: The surfaces seen in each pixel.
+        frame: Surfaces of each pixel.
         blurs: Kernel and resolution of each layer.
-        scatter: How a layer is scattered.
-        ops: How layers that nothing lies in are skipped.
+        scatter: Function that scatters a layer.
+        ops: Operations; ``ops.choose`` skips empty layers.
 
     Reference:
         Ikoma, Nguyen, Metzler, Peng, Wetzstein, "Depth from defocus with learned optics", ICCP 2021.
@@ -52,8 +51,8 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, ops: Ops = EAGER
     frame = frame.near_to_far()
     colours, backed = frame.colours, frame.behind is not None
 
-    # Beside light goes the share 1 - a that is left of what is behind, in sums of what is positive: behind bright light
-    # the rounding of a difference would show. Where nothing is behind, a itself: what is divided by it in the end.
+    # The second part of a picture is the transmittance 1 - a, computed as a sum of positive terms: a difference would
+    # round badly behind bright light. If ``frame.behind`` is None, it is the coverage a, which divides the final light.
     def normalised(lights: Lights, weight: Tensor, beyond: Tensor) -> Pictures:
         lacking = (_KNOWN - weight - beyond).clamp_min(0.0)
         beyond = beyond + lacking * lacking * (0.5 / _KNOWN)
@@ -74,9 +73,9 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, ops: Ops = EAGER
 
 
 def accumulate(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, ops: Ops = EAGER) -> Tensor:
-    """The paper's scatter: every pixel's light accumulates, whatever lies in front; after it come its weights.
+    """The paper's scatter: add the light of all layers, ignoring occlusion; channels of weights follow the light.
 
-    It is what :func:`mean` takes. Arguments are those of :func:`over`.
+    Pass the result to :func:`mean`. Arguments are those of :func:`over`.
 
     Reference:
         Sato, Dobashi, Yamamoto, section 3.
@@ -89,9 +88,9 @@ def accumulate(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, ops: Ops =
 
 
 def accumulate_once(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
-    """The same scatter as :func:`accumulate`, as the paper does it: one pass, in which each pixel has its own kernel.
+    """The scatter of :func:`accumulate` as in the paper: one pass, in which each pixel has its own kernel.
 
-    A pixel's kernel is interpolated between those of the layers around its coc, at full resolution.
+    The kernel is interpolated between those of the two layers around the pixel's coc, at full resolution.
 
     Reference:
         Sato, Dobashi, Yamamoto, section 3: (a) read the depth, (b) choose its blur texture, (c) multiply and
@@ -117,11 +116,15 @@ def _composite_layers(
     empty: float = 0.0,
     normalised: Callable[[Lights, Tensor, Tensor], Pictures] | None = None,
 ) -> Tensor:
-    """All layers, far to near: light ``[B, C, h, w]`` and, after it, what it is to be weighed with.
+    """Composite all layers, far to near: light ``[B, C, h, w]`` followed by its weights.
 
-    The weights have one channel, or C where each colour has a kernel of its own, and are ``empty`` where there is no
-    layer. ``composited`` puts what is in front and what is behind it together; ``normalised`` makes each layer's of the
-    light of scattered layers, their weights and the weights behind them.
+    1. Drop empty layers.
+    2. Group neighbours of one resolution whose kernels have similar sizes.
+    3. Scatter each group by one convolution, and convert it to pictures with ``normalised(lights, weights, behind)``.
+    4. Put them in front of the picture at their resolution with ``composited(front, behind)``.
+    5. Upsample coarse results and put them in front of the full picture in the same way.
+
+    Weights have one channel, or C if each colour has its own kernel; without any layer they are ``empty``.
     """
     order = [k for k, occupied in enumerate(frame.occupied()) if occupied][::-1]
     light, colours = frame.surfaces[0].light, frame.colours
@@ -133,8 +136,8 @@ def _composite_layers(
 
     picture = blank(*frame.area)
 
-    # neighbouring layers of one coarser resolution are composited at it: on one side of focus, lest others lie between;
-    # those whose kernels are of like size are scattered by one convolution, as many as fill its channels
+    # A run has one resolution. A coarse one stays on one side of the focus, because finer layers lie between the sides.
+    # A group of a run has at most as many layers as fill the channels of one convolution.
     uniform = each == 1 and blurs[0].shares is None
     most = CHANNELS // (colours + (2 if normalised else 1)) if uniform else 1
     runs: dict[tuple[int, bool], list[list[int]]] = {}
@@ -148,7 +151,7 @@ def _composite_layers(
             groups.append([k])
     for (scale, _), groups in runs.items():
         part = picture
-        if scale > 1:  # one pixel more on each side, to interpolate from
+        if scale > 1:  # one more pixel on each side, for the interpolation
             part = blank(*(n // scale + 2 for n in frame.area))
         for group in groups:
             lights, *weights = _scattered(frame, blurs, scatter, group, normalised is not None)
@@ -173,10 +176,10 @@ def _composite_layers(
 def _scattered(
     frame: Frame, blurs: Sequence[Blur], scatter: Scatter, group: list[int], visibility: bool
 ) -> tuple[Lights, Tensor] | tuple[Lights, Tensor, Tensor]:
-    """Scattered layers of a group, near to far: light of each, weights and, with visibility, the weights behind.
+    """Scatter the layers of a group, near to far: light of each, weights and, with ``visibility``, weights behind.
 
-    Light is ``[B, C, h, w]``; the weights of n layers are ``[B, n, h, w]``, or ``[B, n C, h, w]`` where each colour has
-    a kernel of its own.
+    Light is ``[B, C, h, w]``; the weights of n layers are ``[B, n, h, w]``, or ``[B, n C, h, w]`` if each colour has
+    its own kernel.
     """
     halo, half, each = max(blurs[k].halo for k in group), max(blurs[k].half for k in group), len(blurs[0].kernel)
     shares, scale, kernels = blurs[group[0]].shares, blurs[group[0]].scale, blurs[group[0]].kernel
@@ -185,7 +188,7 @@ def _scattered(
         terms = tuple(term.expand(-1, -1, each, -1, -1) for term in terms)
     widths = [term.shape[2] for term in terms]  # C, and 1 or C
     channels = downsampled(torch.cat([term.flatten(1, 2) for term in terms], 1), scale)
-    if shares is not None and scatter is fold:  # one layer, as where each colour has a kernel
+    if shares is not None and scatter is fold:  # the group is a single layer
         kernels = kernels.repeat(channels.shape[1] // each, 1, 1)
         scattered = fold(channels, kernels, half, None, [shares], frame.size)
     elif shares is not None:
@@ -202,28 +205,28 @@ def _scattered(
 
 
 def _needed(frame: Frame, blurs: Sequence[Blur], layers: list[int]) -> Callable[[], Tensor]:
-    """Asks whether anything within reach of the frame's area lies in layers that follow each other."""
+    """A function that computes whether any pixel within reach of the area lies in these consecutive layers."""
     ends = (frame.nodes[0] - 1.0, *frame.nodes, frame.nodes[-1] + 1.0)
     halo = max(blurs[k].halo for k in layers)
     return functools.partial(frame.any_between, ends[min(layers)], ends[max(layers) + 2], halo)
 
 
 def _each(*weights: Tensor, layers: int) -> list[tuple[Tensor, ...]]:
-    """Weights ``[B, n or n C, h, w]`` of n layers, one by one."""
+    """Split weights ``[B, n or n C, h, w]`` into those of each layer."""
     return [t.split([t.shape[1] // layers] * layers, 1) for t in weights]
 
 
 def _parts(values: Tensor, colours: int) -> Picture:
-    """Light, and the channels after it."""
+    """Split channels into light and its weights."""
     light, weight = values.split([colours, values.shape[1] - colours], 1)
     return light, weight
 
 
 def mean(summed: Tensor, colours: int, normalize: bool = True, highlights: Tensor | None = None) -> Tensor:
-    """Light over the weight that comes after it; 0 where nothing is known.
+    """Divide light by the weight that follows it in the channels; 0 where the weight is 0.
 
-    Not normalised, the plain sum of what was seen, dark at the border and uneven at depth edges. ``highlights`` is
-    light that was extracted from the layers and splatted ray by ray.
+    Without ``normalize``, return the plain sum, which is dark at the border and uneven at depth edges. ``highlights``
+    is light to add, which was extracted from the layers and splatted ray by ray.
     """
     light, weight = summed[:, :colours], summed[:, colours:]
     light = light if highlights is None else light + highlights

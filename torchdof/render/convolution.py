@@ -1,6 +1,6 @@
-"""Scatter of layers by convolution: a scatter with one kernel is one with the kernel turned by half.
+"""Scatter layers by convolution; ``conv2d`` correlates, so it takes kernels turned by 180 degrees.
 
-Light scattered over the frame's border is lost, nothing comes in.
+Light scattered beyond the frame's border is lost, and no light comes from there.
 """
 
 import torch
@@ -15,22 +15,22 @@ CHANNELS = 16
 """Channels of one depthwise convolution: on CPUs fewer take as long, in PyTorch and in onnxruntime."""
 
 DIRECT_TAPS = 21 * 21
-"""Taps up to which sums are taken in float32: longer ones of equal terms drift by more than 1e-6."""
+"""Taps up to which a kernel is applied directly, in float32: longer sums of equal terms drift by more than 1e-6."""
 
-_FOURIER_STEP = 128  # lengths of a Fourier transform: those with large prime factors are slow
+_FOURIER_STEP = 128  # px: lengths of a Fourier transform are multiples, as large prime factors make it slow
 
 
 def convolve(light: Tensor, kernels: Tensor, halo: int = 0, turned: bool = False) -> Tensor:
-    """Scatter with one kernel a channel, by convolution.
+    """Scatter light with one kernel per channel, by convolution.
 
-    Small kernels are applied directly, large ones through a Fourier transform in float64: in float32 a highlight would
-    leave rounding errors all over the frame.
+    Small kernels are applied directly, large ones through a Fourier transform in float64: in float32, the rounding
+    error of one highlight would spread over the whole frame.
 
     Args:
         light: ``[B, C, H, W]``.
         kernels: ``[1 or C, k, k]``, k odd.
         halo: Pixels on each side that scatter into the result ``[B, C, H - 2 halo, W - 2 halo]`` but are not in it.
-        turned: Whether kernels must be turned by half; those of a round lens need not, which spares a graph the step.
+        turned: Whether ``conv2d`` needs the kernels turned; those of a round lens are symmetric, which saves the step.
     """
     half, channels = kernels.shape[-1] // 2, light.shape[1]
     if halo > half:
@@ -40,7 +40,7 @@ def convolve(light: Tensor, kernels: Tensor, halo: int = 0, turned: bool = False
         return light * kernels[:, 0, 0, None, None]
     if (2 * half + 1) ** 2 > DIRECT_TAPS and not is_traced():
         wide = widest_float(light.device)
-        # what would wrap around falls into the halo
+        # the transform's wrap-around falls into the halo, which is cut off
         area = [-(-(n + 2 * (half - halo)) // _FOURIER_STEP) * _FOURIER_STEP for n in light.shape[-2:]]
         spectrum = torch.fft.rfft2(light.to(wide), s=area) * torch.fft.rfft2(kernels.to(wide), s=area)
         rows, columns = (slice(half + halo, half + n - halo) for n in light.shape[-2:])
@@ -55,5 +55,5 @@ def convolve(light: Tensor, kernels: Tensor, halo: int = 0, turned: bool = False
 
 
 def widest_float(device: torch.device) -> torch.dtype:
-    """Type for long sums; not every device has float64."""
+    """Dtype for long sums: float64, or float32 on MPS, which has no float64."""
     return torch.float32 if device.type == "mps" else torch.float64

@@ -1,14 +1,14 @@
-"""Edges of a depth map where the image has them.
+"""Moves the edges of a depth map to the edges of the image.
 
-Depth that is measured or estimated has its edges beside those of the image, or ramps where they should be steps. Both
-draw outlines around everything that is blurred. Here each pixel near an edge is asked which of the two surfaces that
-meet there it shows: by its colour, against the colours that surely belong to one of them; and by the map, trusted as
-far as it has proved right in the rest of the frame. So the map's own habits (a foreground a pixel too thin, edges
-displaced to the right, ramps four pixels wide) are learnt from the frame, and a map whose edges are exact proves so and
-stays as it is.
+Measured or estimated depth has its edges a few pixels beside those of the image, or ramps instead of steps. Both draw
+outlines around blurred objects. This module decides for each pixel near a depth edge which of the two surfaces it
+shows. It compares the pixel's colour with pixels that clearly lie on one surface, and combines this with a prior: the
+share of wrong pixels that the map has at similar places of the same frame. So systematic errors (a foreground a pixel
+too thin, edges displaced to the right, ramps four pixels wide) are learnt from the frame, and a map whose edges prove
+exact stays unchanged.
 
-Everything is computed in a measure of nearness that is linear in 1 / depth: there planes are straight, and what
-resampling and estimators do to an edge is an average.
+All computations use nearness, a measure linear in 1 / depth: planes are linear in it, and resampling and depth
+estimation turn an edge into averages of it.
 """
 
 from typing import NamedTuple
@@ -27,72 +27,72 @@ from .traced import is_compiled, one_operator
 __all__ = ["STEP_PX", "judged", "mended", "repair", "repair_edges"]
 
 STEP_PX = 1.0
-"""Difference in the circle of confusion from which on the edge between two surfaces is worth repair."""
+"""Smallest difference in coc, in pixels, between two surfaces whose edge is repaired."""
 
-_LEAST_STEP_PX = 0.5 * STEP_PX  # beside lamps; in a map whose pixels differ by less a repair changes nothing
-_STEP = 0.1  # part of its nearness by which a surface stands before another one, for :func:`repair_edges`
-_NOISES = 12.0  # standard deviations of a map's noise that a step stands out at least
-_NOISE_SAMPLED = 2**13  # pixels of a frame among which noise is looked for, half along rows and half along columns
-_RINGS = 3  # pixels beside a step that may be on its wrong side
-_REACH = 5  # pixels around one that tell what the two surfaces look like
-_FALLOFF_PX = 2.5
-_ABRUPT = 0.3  # part of a step that lies between two neighbours
-_SURE = (0.0, 0.02, 0.06, 0.2, 1.0)  # weight of a pixel as witness, by ring; beside an edge it may be wrong itself
-_RAMP_REACH = 6  # half the width of the widest ramp that is one, not a slope
-_TIE = 0.017  # part of a step by which directions must differ: off the multiples of 1/25 that means of steps are
+_LEAST_STEP_PX = 0.5 * STEP_PX  # smallest range of coc in a map that is repaired; half a step, as for lamps
+_STEP = 0.1  # step of :func:`repair_edges`, as a fraction of the largest nearness around; larger: fewer edges
+_NOISES = 12.0  # smallest step, in standard deviations of the map's noise; larger: fewer edges in noisy maps
+_NOISE_SAMPLED = 2**13  # pixels per frame for the estimate of noise, half along rows and half along columns
+_RINGS = 3  # pixels on each side of a step that are checked; larger: corrects wider displacements
+_REACH = 5  # half the width of the window of samples around a pixel, in pixels
+_FALLOFF_PX = 2.5  # standard deviation of the Gaussian weights of these samples
+_ABRUPT = 0.3  # smallest jump between neighbours at a step, as a fraction of the step
+_SURE = (0.0, 0.02, 0.06, 0.2, 1.0)  # weight of a sample, by ring: beside a step its depth may be wrong
+_RAMP_REACH = 6  # half the width of the widest ramp, in pixels; anything wider is a slope
+_TIE = 0.017  # lead of one axis that gives an edge its direction, in steps; avoids ties: means are multiples of 1/25
 _DIRECTIONS = 5
-_SHALLOW = 0.03  # slope, of what lies between the surfaces around, from which on it belongs to a ramp
-_LEVELS = 6  # places on a ramp that are calibrated apart
+_SHALLOW = 0.03  # smallest slope of a ramp per pixel, as a fraction of the range of nearness around
+_LEVELS = 6  # levels of a ramp that are calibrated separately
 _PLACES = 2 * _RINGS + _LEVELS
-_TRUSTED = 0.05  # share of wrong pixels that a map is assumed to have
-_ROUNDS = 10
-_SHARPNESS = 1.6  # how much surer colours are than their likelihoods say, which count witnesses on the wrong side
-_MOST = 4.0  # times its own step, a thin structure stands out at most
-_BLUR_REACH = 9
-_CLIMBED = 0.35  # standard deviations of the blur, by pixels of the middle half of its ramps and steps they climb
-_PIXEL = 0.2  # of its variance that comes from looking at pixels
-_BETTER = 0.5  # part of what a shape leaves unexplained that its blur explains, where it is blurred
-_LEAN = 2.0  # by how much likelier the far surface must be, as a logarithm: foreground left behind is seen more
-_PRIOR_COUNT = 30.0  # pixels for which the assumption that a map is exact stands
-_EXACT = 0.025  # share of wrong pixels up to which a map's steps count as exact
-_DOUBTFUL = 0.05  # share of wrong pixels of a kind from which on each of them is asked
-_SOFT = 0.1  # share of ramps among the pixels of edges from which on a map counts as soft, if its ramps are either
-_WIDE = 1.5  # so wide in pixels, or
-_MIXED = 0.5  # to such a part far from both surfaces: compression leaves narrow ones near one of them
-_RELATED = 0.8  # share of clear cases in which colours must agree with a map to be heard on it
-_SAMPLED = 12_000  # pixels: a map is calibrated in the geometric mean of this number and the frame's, in blocks
-_BLOCK = 8
-_NEVER = 1e30
-_LARGEST = 1e15  # nearness, and light, whose squares are numbers too: beyond it the one is none, the other no brighter
-_BRIGHTEST = 1e30
+_TRUSTED = 0.05  # assumed share of wrong pixels beside steps
+_ROUNDS = 10  # iterations of the calibration
+_SHARPNESS = 1.6  # factor on scores, which samples on the wrong side reduce; larger: colour outweighs the map
+_MOST = 4.0  # largest corrected step at a thin structure, as a multiple of the step in the map
+_BLUR_REACH = 9  # half the width of the Gaussian kernel, in pixels
+_CLIMBED = 0.35  # standard deviation of a ramp, as a fraction of (pixels of its middle half) / (steps they climb)
+_PIXEL = 0.2  # variance in px^2 that the area of a pixel adds to a ramp
+_BETTER = 0.5  # fraction of the variance unexplained by a sharp shape that its blur must explain for full confidence
+_LEAN = 2.0  # log-odds by which a far surface must win, with "auto": foreground left behind is the more visible error
+_PRIOR_COUNT = 30.0  # weight of assumptions in the calibration, in pixels; larger: the frame changes them less
+_EXACT = 0.025  # largest share of wrong pixels at which the steps of a map count as exact
+_DOUBTFUL = 0.05  # share of wrong pixels of a kind above which these pixels are decided again
+_SOFT = 0.1  # a map is soft if a larger share of its edge pixels lies on ramps, and if
+_WIDE = 1.5  # ramps are wider than this, in pixels, or
+_MIXED = 0.5  # a larger share of their pixels is in the middle half (compression makes narrow ramps near one surface)
+_RELATED = 0.8  # smallest agreement of colours with the clear pixels of a map at which "auto" uses colours
+_SAMPLED = 12_000  # the calibration uses sqrt(_SAMPLED * pixels of the frame) pixels, in blocks
+_BLOCK = 8  # side of a block, in pixels
+_NEVER = 1e30  # negated, replaces invalid values in maxima
+_LARGEST = 1e15  # largest valid nearness, whose square is finite in float32
+_BRIGHTEST = 1e30  # upper limit for light; products of a few such values overflow float32
 
 
 class _Edges(NamedTuple):
-    """What a map of nearness shows; all ``[B, 1, H, W]``."""
+    """Edges of a map of nearness; all ``[B, 1, H, W]``."""
 
-    near: Tensor  # of the two surfaces that meet around the pixel
-    far: Tensor
-    is_ramp: Tensor  # the map passes from one to the other here
-    ring: Tensor  # how many pixels from a step: 1 is beside it; one more than there are: none is near
+    near: Tensor  # nearness of the nearer of the two surfaces around the pixel
+    far: Tensor  # nearness of the farther one
+    is_ramp: Tensor  # the pixel lies on a ramp between the two
+    ring: Tensor  # distance to a step in pixels, from 1; ``_RINGS + 1`` if no step is within ``_RINGS``
     is_edge: Tensor
-    direction: Tensor  # towards the near surface: up, left, none (it lies diagonally), right or down
+    direction: Tensor  # towards the near surface: 0 up, 1 left, 2 diagonal, 3 right, 4 down
 
 
 def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> Tensor:
     """Moves and sharpens the edges of a depth map to where the image has them.
 
-    Ramps become steps between their two surfaces; pixels that show one surface and have the depth of the other get
-    theirs; structures so thin that a ramp has swallowed part of their depth get it back. Slopes stay slopes, and where
-    the image shows no difference between two surfaces the map is left as it is.
+    Ramps become steps between their two surfaces. Pixels that show one surface and have the depth of the other are
+    corrected. Thin structures that a blurred map has flattened get their full depth. Slopes stay slopes, and an edge
+    between two surfaces of the same colour stays unchanged.
 
     Args:
         image: ``[B, C, H, W]``, linear light, floating point; its scale does not matter.
         depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres, > 0, ``inf`` allowed; NaN, zero and negative values stay.
-        edges: "repair" asks each edge; "auto" leaves a map alone whose edges prove exact, bit for bit; "as given" does
-            nothing.
+        edges: "repair" decides at each edge; "auto" returns a map whose edges prove exact unchanged to the bit; "as
+            given" does nothing.
 
     Returns:
-        ``[B, 1, H, W]``, metres. Gradients flow to the depth where it is unchanged; what was repaired is constant.
+        ``[B, 1, H, W]``, metres. Gradients flow to the depth of unchanged pixels; repaired pixels are constant.
 
     Raises:
         ValueError: If shapes or types are not as described.
@@ -118,16 +118,16 @@ def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> 
 
 
 def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER) -> Tensor:
-    """A map of the coc with its edges where the image has them: the first step of the pipeline.
+    """Repairs the edges of a map of the coc: the first step of the pipeline.
 
     Args:
         image: ``[B, C, H, W]``, linear light.
         coc_px: ``[B or 1, 1, H, W]``, signed.
-        edges: As :func:`repair_edges` has it.
-        ops: How a frame without edges is skipped, and lists of pixels are gone through.
+        edges: As for :func:`repair_edges`.
+        ops: Skips frames without edges, and processes lists of pixels in parts.
 
     Returns:
-        The map, ``[B, 1, H, W]`` where it is repaired. Gradients flow to it where it is unchanged.
+        The map, ``[B, 1, H, W]`` if it is repaired. Gradients flow to unchanged pixels.
     """
     if edges == "as given":
         return coc_px
@@ -141,7 +141,7 @@ def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER) -
 
 
 def _has_steps(coc_px: Tensor) -> Tensor:
-    """Whether two pixels of a map, or of one with NaN, may differ by the least step: a bool ``[]``."""
+    """Whether the range of a map reaches :data:`_LEAST_STEP_PX` or contains NaN: a bool ``[]``."""
     low, high = torch.aminmax(coc_px)
     return ~(high - low < _LEAST_STEP_PX)
 
@@ -149,21 +149,23 @@ def _has_steps(coc_px: Tensor) -> Tensor:
 def repair(
     image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool, of_coc: bool = False, ops: Ops = EAGER
 ) -> Tensor:
-    """Repairs a map of nearness, of any scale and offset; what is not finite, or above 1e15, stays and touches nothing.
+    """Repairs a map of nearness, of any scale and offset.
+
+    Values that are not finite, or above 1e15 in magnitude, stay unchanged and affect no other pixel.
 
     Args:
         image: ``[B, C, H, W]``, linear light.
         nearness: ``[B or 1, 1, H, W]``, linear in 1 / depth, larger is nearer.
-        step: Difference in nearness from which on neighbours are two surfaces, ``[B, 1, H, W]`` or a number.
-        auto: Whether edges that prove exact are left alone.
-        of_coc: Whether the map is of the coc instead, which is larger where it is farther.
-        ops: How lists of pixels are gone through.
+        step: Smallest difference in nearness between two surfaces, ``[B, 1, H, W]`` or a number.
+        auto: Whether edges that prove exact stay unchanged.
+        of_coc: Whether ``nearness`` is a map of the coc instead, which is larger where it is farther.
+        ops: Processes lists of pixels in parts.
 
     Returns:
-        ``[B, 1, H, W]``, constant to autograd; where nothing is repaired, the given values themselves.
+        ``[B, 1, H, W]``, constant to autograd; unchanged pixels keep their values to the bit.
     """
     device = image.device.type
-    if torch.is_autocast_enabled(device):  # it would convolve in half precision
+    if torch.is_autocast_enabled(device):  # which would compute in half precision
         with torch.autocast(device, enabled=False):
             return repair(image, nearness, step, auto, of_coc, ops)
     image, nearness = image.detach(), nearness.detach()
@@ -187,15 +189,15 @@ def repair(
 
 @torch.no_grad()
 def judged(image: Tensor, nearness: Tensor, step: Tensor | float) -> tuple[Tensor, Tensor]:
-    """The pixels at a map's edges, and those whose nearness :func:`repair` changes with ``auto``.
+    """Finds the pixels at a map's edges, and those that :func:`repair` changes with ``auto``.
 
     Args:
-        image: As there.
-        nearness: As there.
-        step: As there.
+        image: As for :func:`repair`.
+        nearness: As for :func:`repair`.
+        step: As for :func:`repair`.
 
     Returns:
-        ``[B, 1, H, W]``, uint8: 0 where there is no edge, 1 beside a step, 2 on a ramp; and bool.
+        ``[B, 1, H, W]`` each: 0 away from edges, 1 beside a step, 2 on a ramp, uint8; and whether a pixel changes.
     """
     given = nearness.float().expand(image.shape[0], -1, -1, -1)
     valid = given.abs() <= _LARGEST
@@ -207,6 +209,16 @@ def judged(image: Tensor, nearness: Tensor, step: Tensor | float) -> tuple[Tenso
 
 @torch.no_grad()
 def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops = EAGER) -> Tensor:
+    """Plain PyTorch version of :func:`repair`.
+
+    1. Find ramps and steps, and the nearness of both surfaces there.
+    2. Score sampled edge pixels by colour, fit the prior of each kind of edge pixel, and detect soft maps.
+    3. Select the pixels to decide: all edge pixels; with ``auto``, those of kinds that are often wrong.
+    4. A selected pixel shows the near surface where ``score + logit(prior) > 0``.
+    5. Correct thin structures that a soft map has flattened.
+    6. Give selected pixels the nearness of their surface, on ramps in proportion to the evidence.
+    7. Correct lamps of a few pixels in soft maps.
+    """
     valid = nearness.abs() <= _LARGEST
     given = torch.where(valid, nearness, 0.0)
     step = torch.maximum(step, _NOISES * _noise(given, valid))
@@ -215,9 +227,9 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops 
     is_near = 2.0 * given > edges.near + edges.far
     witness = given.new_tensor(_SURE)[edges.ring] * (valid & ~edges.is_ramp)
 
-    # how far the map can be trusted, at each kind of place on an edge: from part of the frame
+    # the prior of each kind of edge pixel, from samples
     height, width = given.shape[-2:]
-    area = torch.scalar_tensor(height * width, dtype=torch.float64, device=given.device)  # a graph's changes
+    area = torch.scalar_tensor(height * width, dtype=torch.float64, device=given.device)  # not a constant in graphs
     every = (area / _SAMPLED).sqrt().ceil().long()
     rows, columns = (_from_border(n, given.device) // _BLOCK for n in (height, width))
     sampled = pixels.indices(edges.is_edge & ((rows[:, None] + columns) % every == 0))
@@ -236,22 +248,22 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops 
         is_soft = is_soft & is_related
         is_inexact = is_related & (is_soft | (_mean_of(wrong, ~edges.is_ramp, sampled) > _EXACT))
 
-    # which surface the doubtful pixels show
+    # which surface the selected pixels show
     doubtful = edges.is_edge
     if auto:
         doubtful = doubtful & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
     edge_pixels = pixels.indices(doubtful)
-    if auto and not is_traced() and len(edge_pixels) == 0:  # nor is any lamp lifted: a soft map has doubtful ramps
+    if auto and not is_traced() and len(edge_pixels) == 0:  # lamps change only in soft maps, whose ramps are selected
         return nearness
     score, evidence, near, far = _judge(light, given, witness, edges, edge_pixels, ops)
     shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0])
-    if auto:  # else steps that prove right are asked as well, and would be moved
+    if auto:  # without auto, correct steps are decided as well, and this would move them
         shows_near = shows_near + _LEAN * (score.abs() - 1.0).clamp(0.0, 1.0)
     shows_near = shows_near > 0
 
-    # and what is so thin that a ramp swallowed part of its depth
+    # thin structures
     length = climb.sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
-    # standard deviation of the blur that made ramps of an item's steps
+    # standard deviation, in pixels, of the blur that turned the steps of an item into ramps
     climbed = (climb * is_mixed).sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
     ramp_px = _CLIMBED * is_mixed.sum((1, 2, 3), keepdim=True) / climbed
     sigma = (ramp_px.square() - _PIXEL).clamp_min(0.0).sqrt().clamp(0.2, 3.0)
@@ -271,22 +283,22 @@ def _empty(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
     return torch.empty_like(nearness, memory_format=torch.contiguous_format)
 
 
-# How many pixels need work depends on the data, which compiled graphs do not allow for.
+# The number of pixels to process depends on the data, which compiled graphs do not support.
 @one_operator("torchdof::repair_edges", _empty)
 def _operator(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
     return _repair(image, nearness, step, auto).clone()
 
 
 def _from_border(size: int, device: torch.device) -> Tensor:
-    """Distance to the nearest border: what is chosen by it is the same in a turned frame."""
+    """Distance of each pixel to the nearest border: selects the same pixels in a mirrored frame."""
     places = torch.arange(size, device=device)
     return torch.minimum(places, size - 1 - places)
 
 
 def _noise(nearness: Tensor, valid: Tensor) -> Tensor:
-    """Standard deviation of an item's noise, ``[B, 1, 1, 1]``.
+    """Estimates the standard deviation of each item's noise, ``[B, 1, 1, 1]``.
 
-    From how the middle pixel of all bends its row, or its column if that is more.
+    It is proportional to the median of ``|second difference|``, along rows or columns, whichever is larger.
     """
     every = (2 * nearness.shape[-2] * nearness.shape[-1] + _NOISE_SAMPLED - 1) // _NOISE_SAMPLED
     middles = []
@@ -299,26 +311,26 @@ def _noise(nearness: Tensor, valid: Tensor) -> Tensor:
         middle = (has.flatten(1).sum(1, keepdim=True) - 1).clamp_min(0) // 2
         middles.append(bends.gather(1, middle))
     bend = torch.maximum(*(torch.where(middle < torch.inf, middle, 0.0) for middle in middles))
-    return 0.6053 * bend[..., None, None]  # 1.4826 / sqrt(6), of a Gaussian
+    return 0.6053 * bend[..., None, None]  # 1.4826 / sqrt(6), for Gaussian noise
 
 
 def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
-    """Ramps and steps, and the two surfaces that meet there."""
+    """Finds ramps and steps, and the nearness of the two surfaces that meet there."""
     high, low = torch.where(valid, nearness, -_NEVER), torch.where(valid, -nearness, -_NEVER)
     slope, jump = _slopes(nearness, valid)
     span = _highest(high, _REACH) + _highest(low, _REACH)
-    # a ramp ends, a slope goes on
+    # a ramp is short and has flat places around it; a slope has none
     flattest = -_highest(-_mean(slope, 2), 8)
     is_ramp = (slope > 0.1 * step) & (slope > _SHALLOW * span) & (span > step) & (flattest < 0.3 * slope) & valid
 
-    # the surfaces at both ends of a ramp
+    # the surfaces at both ends of a ramp: extremes spread along it pixel by pixel
     near, far = high, low
     for _ in range(_RAMP_REACH):
         near, far = (torch.where(is_ramp, _highest(end, 1), end) for end in (near, far))
     is_ramp = is_ramp & (near + far > step)
     near, far = torch.where(is_ramp, near, high), torch.where(is_ramp, far, low)
 
-    # those at both sides of a step
+    # the surfaces on both sides of a step; the innermost ring that reaches it counts
     nears, fars = ([_highest(end, ring) for ring in range(1, _RINGS + 1)] for end in (near, far))
     least = torch.maximum(0.6 * (nears[-1] + fars[-1]), step)
     ring = torch.full_like(nearness, _RINGS + 1, dtype=torch.long)
@@ -341,9 +353,9 @@ def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
 
 
 def _kind(level: Tensor, edges: _Edges) -> Tensor:
-    """Which pixels are calibrated together: those of one ring and side of a step, or one level of a ramp, by direction.
+    """Index of the kind of each pixel ``[B, 1, H, W]``; pixels of one kind have one prior.
 
-    Numbers ``[B, 1, H, W]``: of items, then of places, then of directions.
+    A kind is an item, a place and a direction. A place is a ring on one side of a step, or one level of a ramp.
     """
     side = (level > 0.5).long() * _RINGS + edges.ring.clamp(max=_RINGS) - 1
     place = torch.where(edges.is_ramp, 2 * _RINGS + (level * _LEVELS).long().clamp(0, _LEVELS - 1), side)
@@ -354,15 +366,20 @@ def _kind(level: Tensor, edges: _Edges) -> Tensor:
 def _judge(
     light: Tensor, nearness: Tensor, witness: Tensor, edges: _Edges, edge_pixels: Tensor, ops: Ops
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Which of two surfaces pixels ``[P]`` show, by their colour.
+    """Scores by colour which of two surfaces pixels ``[P]`` show.
+
+    1. Take samples of both surfaces from a window around each pixel, weighted by distance and by ``witness``.
+    2. Compute mean and spread of both colours, and how well these separate the surfaces.
+    3. Compute the likelihood of each surface: the share of its samples that resemble the pixel.
+    4. Average scores over neighbours of similar colour.
 
     Returns:
-        ``[P]`` each: the logarithm of how much likelier the near one is; how surely the colours of the two tell, 0 to
-        1; and the nearness of the near and of the far surface there.
+        ``[P]`` each: the log-likelihood ratio, positive for the near surface; the evidence, 0 to 1; and the nearness
+        of the near and of the far surface, as means of the samples that resemble the pixel.
     """
     colour = light.sqrt()
     offsets = torch.arange(-_REACH, _REACH + 1, device=light.device, dtype=light.dtype)
-    apart = offsets[:, None] ** 2 + offsets**2  # a pixel is no witness of its own
+    apart = offsets[:, None] ** 2 + offsets**2  # a pixel is not its own sample
     falloff = torch.where(apart > 0, torch.exp(-apart / (2 * _FALLOFF_PX**2)), 0.0).flatten()[:, None]
 
     def look(part: Tensor) -> Tensor:
@@ -373,7 +390,7 @@ def _judge(
         weight = falloff * pixels.pick(witness, window)[0]
         sides = [weight * ((level > 0.75) & (level < 1.25)), weight * ((level < 0.25) & (level > -0.25))]
 
-        # what the surfaces look like: mean colours, and how far colours stray from these
+        # mean colours of both surfaces, and the variance around them
         sums = [side.sum(0) for side in sides]
         known = (sums[0] > 1e-3) & (sums[1] > 1e-3)
         totals = [total + 1e-9 for total in sums]
@@ -386,9 +403,9 @@ def _judge(
         spread = 0.5 * (spreads[0] + spreads[1]) + noise + 1e-12
         contrast = (means[0] - means[1]).square().sum(0)
         tells = (contrast / (contrast + 0.5 * spread) - 0.1).clamp_min(0.0) / 0.9
-        tells = torch.where(known, tells, 1.0)  # in the middle of a wide ramp the neighbours do
+        tells = torch.where(known, tells, 1.0)  # without samples, in the middle of a wide ramp, neighbours decide
 
-        # likelihood: how many witnesses look alike, and a little how close their mean is
+        # likelihood: the share of similar samples, and to a small part the distance to their mean
         alike = (1.0 + (others - own[:, None]).square().sum(0) / (0.3 * spread)).square().reciprocal()
         close = [(1.0 + (own - m).square().sum(0) / (0.3 * spread)).square().reciprocal() for m in means]
         likelihoods = [
@@ -404,7 +421,7 @@ def _judge(
 
     score, tells, near, far = ops.by_parts(look, edge_pixels).unbind(0)
 
-    # neighbours of like colour decide together
+    # neighbours of similar colour decide together
     scores = pixels.put(torch.full_like(nearness, torch.nan), edge_pixels, score)
     window = pixels.around(edge_pixels, nearness, 1)
     own, others, said = pixels.pick(colour, edge_pixels), pixels.pick(colour, window), pixels.pick(scores, window)[0]
@@ -413,14 +430,14 @@ def _judge(
     said = torch.where(said.isnan(), 0.0, said)
     score = (_SHARPNESS * tells * (alike * said).sum(0) / alike.sum(0).clamp_min(1e-12)).clamp(-6.0, 6.0)
     evidence = (2.0 * tells * said.abs().amax(0) - 1.0).clamp(0.0, 1.0)
-    # from the ends of a wide ramp only one of the surfaces is in sight
+    # at the ends of a wide ramp the window holds only one of the surfaces: use the evidence of its middle
     known = _highest(pixels.put(torch.zeros_like(nearness), edge_pixels, evidence), 3)
     evidence = pixels.pick(known, edge_pixels)[0]
     return score, evidence, near, far
 
 
 def _mean_of(values: Tensor, mask: Tensor, sampled: Tensor) -> Tensor:
-    """Mean over those of an item's sampled pixels that are in a mask, ``[B, 1, 1, 1]``; 0 where there are none."""
+    """Mean over an item's sampled pixels inside a mask, ``[B, 1, 1, 1]``; 0 without such pixels."""
     item, weight = sampled // mask[0].numel(), pixels.pick(mask, sampled)[0].to(values.dtype)
     weighted = weight * pixels.pick(values, sampled)[0]
     sums = [weight.new_zeros(mask.shape[0]).index_add(0, item, w) for w in (weight, weighted)]
@@ -428,10 +445,10 @@ def _mean_of(values: Tensor, mask: Tensor, sampled: Tensor) -> Tensor:
 
 
 def _is_related(level: Tensor, edges: _Edges, sampled: Tensor, score: Tensor) -> Tensor:
-    """Whether what an item's colours say agrees with its map where that is hardly in doubt, ``[B, 1, 1, 1]``.
+    """Whether the colour scores of an item agree with its map at clear pixels, ``[B, 1, 1, 1]``.
 
-    That is as far from steps as they are looked at, and at the ends of ramps. An image that knows nothing of the depth
-    agrees by half.
+    Clear pixels lie in the outermost ring of a step or near the ends of a ramp. An image unrelated to its depth agrees
+    at half of them.
     """
     own = pixels.pick(level, sampled)[0]
     is_ramp, ring = pixels.pick(edges.is_ramp, sampled)[0], pixels.pick(edges.ring, sampled)[0]
@@ -444,13 +461,17 @@ def _is_related(level: Tensor, edges: _Edges, sampled: Tensor, score: Tensor) ->
 
 
 def _calibrate(kind: Tensor, sampled: Tensor, score: Tensor, items: int) -> Tensor:
-    """Share of pixels that show the near surface, by kind: that which explains the scores best, from a wary start."""
+    """Share of pixels that show the near surface, for each kind: the prior, fitted to colour scores.
+
+    Expectation maximisation with an assumed share, which counts as :data:`_PRIOR_COUNT` pixels. The first fit joins all
+    directions; its shares are the assumption of the second fit, one direction at a time.
+    """
     device, dtype = score.device, score.dtype
     steps = torch.tensor([_TRUSTED] * _RINGS + [1.0 - _TRUSTED] * _RINGS, device=device, dtype=dtype)
     ramps = (torch.arange(_LEVELS, device=device, dtype=dtype) + 0.5) / _LEVELS
     assumed = torch.cat([steps, ramps]).repeat(items)
     kinds = pixels.pick(kind, sampled)[0]
-    places = kinds // _DIRECTIONS  # all directions together first
+    places = kinds // _DIRECTIONS
     weight = (0.5 * score.abs()).clamp(max=1.0)
 
     def fit(groups: Tensor, count: int, start: Tensor, assumed: Tensor) -> Tensor:
@@ -465,14 +486,14 @@ def _calibrate(kind: Tensor, sampled: Tensor, score: Tensor, items: int) -> Tens
     together = fit(places, items * _PLACES, torch.where(is_step, 0.5, assumed), assumed).repeat_interleave(_DIRECTIONS)
     shares = fit(kinds, items * _PLACES * _DIRECTIONS, torch.full_like(together, 0.5), together)
     shares = shares.view(items, _PLACES, _DIRECTIONS)
-    # where the pixels beside a step are right those farther away are too
+    # pixels farther from a step are at least as often right as those beside it
     far = [shares[:, :k].amin(1) for k in range(1, _RINGS + 1)]
     near = [shares[:, _RINGS : _RINGS + k].amax(1) for k in range(1, _RINGS + 1)]
     return torch.cat([torch.stack(far + near, 1), shares[:, 2 * _RINGS :]], 1).flatten()
 
 
 def _climb(nearness: Tensor, valid: Tensor, edges: _Edges) -> Tensor:
-    """Part of a step that edge pixels climb, ``[B, 1, H, W]``: summed, it is the length of the steps in pixels."""
+    """Steepness of edge pixels in steps per pixel, ``[B, 1, H, W]``: its sum is the length of all edges in pixels."""
     across, along = _changes(nearness, valid, -1), _changes(nearness, valid, -2)
     beside = [functional.pad(across, ends) for ends in ((1, 0), (0, 1))]
     below = [functional.pad(along, (0, 0, *ends)) for ends in ((1, 0), (0, 1))]
@@ -492,7 +513,11 @@ def _unmix(
     far: Tensor,
     ops: Ops,
 ) -> tuple[Tensor, Tensor]:
-    """The surfaces at a soft map's edges where one is thin: as near and far as its blurred shape explains best."""
+    """Corrects the nearness of thin structures at the edges of soft maps.
+
+    A surface is thin where an opening of 5 x 5 pixels removes its label. The fit ``nearness = a + b blurred(label)``
+    around a pixel gives the far surface ``a`` and the near one ``a + b``.
+    """
     blurred = _blurred(label, sigma)
     gap = near - far
     item = edge_pixels // label[0].numel()
@@ -527,7 +552,10 @@ def _lift_lamps(
     lost_px: Tensor,
     ops: Ops,
 ) -> Tensor:
-    """Lamps of a few pixels, whose nearness a soft map spreads around them, as near as what is spread amounts to."""
+    """Raises the nearness of lamps of a few pixels, which a soft map spreads over their surroundings.
+
+    The fit ``nearness = a + b blurred(cover)``, with the lamp's cover from its light, gives the lamp ``a + b``.
+    """
     brightest = light.amax(1, keepdim=True)
     usual = _mean(brightest.sqrt(), _REACH + 2) ** 2
     span = _highest(nearness, _REACH) + _highest(-nearness, _REACH)
@@ -536,7 +564,7 @@ def _lift_lamps(
     cover = torch.where(brightest > 2.0 * usual, brightest / around.clamp_min(1e-30), 0.0)
     lamp_pixels = pixels.indices(is_lamp)
     behind, difference, fit = _regress(nearness, cover, _blurred(cover, sigma), lamp_pixels, ops)
-    # the pixels of a lamp are one surface
+    # all pixels of a lamp lie on one surface: average their fits
     weight = fit * pixels.pick(cover, lamp_pixels)[0]
     window, none = pixels.around(lamp_pixels, nearness, 2), torch.zeros_like(nearness)
     values = (weight, weight * (behind + difference.clamp_min(0.0)), weight * fit)
@@ -548,16 +576,19 @@ def _lift_lamps(
 
 
 def _is_lost(lost_px: Tensor) -> Tensor:
-    """How far thin structures can have lost nearness, 0 to 1, ``[B]``: none where the map's surfaces are too large."""
+    """Confidence that thin structures are flattened, 0 to 1, ``[B]``; 0 if the map's surfaces are 1 px too wide.
+
+    ``lost_px`` is the mean width by which they are too narrow, in pixels.
+    """
     return (2.4 + 2.5 * lost_px).clamp(0.0, 1.0).flatten()
 
 
 def _regress(
     nearness: Tensor, shape: Tensor, blurred: Tensor, chosen: Tensor, ops: Ops
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Nearness around pixels ``[P]`` as ``a + b blurred``: a, b, and how well that fits, 0 to 1.
+    """Fits ``nearness = a + b blurred`` in windows around pixels ``[P]``: a, b and the quality of the fit, 0 to 1.
 
-    It must explain what the shape does not that is not blurred.
+    The quality is 0 if the sharp ``shape`` explains as much of the variance: then the map is not blurred there.
     """
     offsets = torch.arange(-_REACH, _REACH + 1, device=nearness.device, dtype=nearness.dtype)
     weight = torch.exp(-(offsets[:, None].square() + offsets.square()) / 18.0).flatten()[:, None]
@@ -585,9 +616,10 @@ def _regress(
 
 
 def _slopes(nearness: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """Steepness by pixel where it goes on from one side to the other, 0 elsewhere and beside what is unknown.
+    """Slope and jump of each pixel, ``[B, 1, H, W]`` each; the maximum over both axes.
 
-    The lesser of both sides, in the steeper of the two axes; and by how much the change on one side exceeds that.
+    The slope is the smaller of the changes on both sides if these have one sign, else 0. The jump is the larger change
+    minus the slope. Changes from or to an invalid pixel are 0.
     """
     least, jump = [], []
     for dim in (-1, -2):
@@ -601,7 +633,7 @@ def _slopes(nearness: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _changes(nearness: Tensor, valid: Tensor, dim: int) -> Tensor:
-    """From each pixel to the next one, 0 where one of them is unknown."""
+    """Difference from each pixel to the next along ``dim``; 0 if one of them is invalid."""
     known = valid.narrow(dim, 1, valid.shape[dim] - 1) & valid.narrow(dim, 0, valid.shape[dim] - 1)
     return torch.where(known, nearness.diff(dim=dim), 0.0)
 
@@ -619,16 +651,16 @@ def _mean(values: Tensor, reach: int) -> Tensor:
 
 
 def _blurred(values: Tensor, sigma: Tensor) -> Tensor:
-    """Items ``[B, 1, H, W]``, each under a Gaussian of its own sigma ``[B, 1, 1, 1]``."""
+    """Blurs each item ``[B, 1, H, W]`` with a Gaussian of its own sigma ``[B, 1, 1, 1]`` in pixels."""
     offsets = torch.arange(_BLUR_REACH + 1, device=values.device, dtype=values.dtype)
-    half = torch.exp(-offsets.square() / (2.0 * sigma.square()))  # [B, 1, 1, k], from the centre on, which is 1
+    half = torch.exp(-offsets.square() / (2.0 * sigma.square()))  # [B, 1, 1, k], k = 0 is the centre
     half = half / (2.0 * half.sum(-1, keepdim=True) - 1.0)
     for dim in (-1, -2):
         across = _BLUR_REACH if dim == -1 else 0
         ends = (across, across, _BLUR_REACH - across, _BLUR_REACH - across)
         size, padded = values.shape[dim], functional.pad(values, ends, mode="replicate")
         values = half[..., :1] * values
-        for k in range(1, _BLUR_REACH + 1):  # runtimes have no convolution with a kernel that the data makes
+        for k in range(1, _BLUR_REACH + 1):  # runtimes of graphs have no convolution with a computed kernel
             both = padded.narrow(dim, _BLUR_REACH - k, size) + padded.narrow(dim, _BLUR_REACH + k, size)
             values = values + half[..., k : k + 1] * both
     return values

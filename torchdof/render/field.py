@@ -1,7 +1,8 @@
-"""Scatter of layers whose kernels depend on the place in the frame (:mod:`torchdof.optics.placed_kernels`).
+"""Scatters layers whose kernels depend on the place in the frame (:mod:`torchdof.optics.placed_kernels`).
 
-Kernels are those of where light lands, block by block; highlights take that of where they come from. Pixels of one
-block of its layer's resolution share a kernel: beyond a few blocks it changes by parts of a pixel.
+Each block of the result has one kernel, that of the block's middle: within a few blocks a kernel changes by only a
+fraction of a pixel. So layers use the kernel of the place where light lands; highlights use that of the place where it
+comes from.
 """
 
 import functools
@@ -16,7 +17,7 @@ from ..optics.placed_kernels import Shares, placed
 __all__ = ["BLOCK", "scattered"]
 
 BLOCK = (8, 16)
-"""Rows and columns of a layer whose pixels share a kernel."""
+"""Height and width of a block whose pixels share a kernel, in pixels of the layer; larger: faster, less accurate."""
 
 
 def scattered(
@@ -27,15 +28,18 @@ def scattered(
     scale: int,
     size: tuple[int, int],
 ) -> Tensor:
-    """A layer's light scattered with the kernel of where it lands.
+    """Scatters a layer's light with the kernel of the block in which it lands.
 
     Args:
-        shares: Of the layer.
-        light: ``[B, C, h, w]``; it begins ``half`` pixels before the frame, and one more at coarser resolutions.
-        kernel: The table's own ``[1 or C, k, k]``.
-        half: Pixels on each side that are not in the result ``[B, C, h - 2 half, w - 2 half]``.
-        scale: Every so many pixels of the image are one of the layer's.
+        shares: How the field changes the layer's kernel.
+        light: ``[B, C, h, w]``; begins ``half`` pixels before the frame, or ``half + 1`` at coarser resolutions.
+        kernel: Kernel of the blur table, ``[1 or C, k, k]``.
+        half: Radius of the kernel: pixels on each side of ``light`` that the result lacks.
+        scale: Pixel of the layer in pixels of the image.
         size: Height and width of the image.
+
+    Returns:
+        ``[B, C, h - 2 half, w - 2 half]``.
     """
     high, wide = BLOCK
     (batch, channels), (rows, columns) = light.shape[:2], (n - 2 * half for n in light.shape[2:])
@@ -56,7 +60,7 @@ def scattered(
 
 
 def _places(count: int, block: int, size: int, like: Tensor, scale: int, half_diagonal: float) -> Tensor:
-    """Middles of the blocks along an axis, in half diagonals from the middle of the frame."""
+    """Middles of the blocks along an axis, as distances from the middle of the frame in half diagonals."""
     middle = torch.arange(0, count, block, dtype=like.dtype, device=like.device) + block / 2
-    before = 1 if scale > 1 else 0  # pixels in front of the frame, to interpolate from
+    before = 1 if scale > 1 else 0  # pixels before the frame, for interpolation
     return ((middle - before) * scale - size / 2) / half_diagonal

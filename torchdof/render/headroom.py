@@ -1,6 +1,6 @@
-"""Room above the light: matting and splatting take its powers, and those must not overflow.
+"""Headroom: scales very bright light down so that sums of its powers, in matting and splatting, do not overflow.
 
-Light that is too bright for that is scaled down for the time of a rendering, by a power of two: nothing is rounded.
+The scale is a power of two, which rounds nothing; the rendered picture is scaled back.
 """
 
 import math
@@ -12,15 +12,15 @@ from ..tensors import is_traced
 
 __all__ = ["factor", "has_room"]
 
-_SUMMED = 16  # the power of two of so many terms as no sum of light has
+_SUMMED = 16  # log2 of the largest number of terms in a sum of light; larger: scales down earlier
 
 
 def factor(light: Tensor, behind: Tensor | None = None) -> Tensor:
-    """What to multiply the light of each item with so that it has room: ``[B, 1, 1, 1]``, at most 1.
+    """Scale of the light of each item at which no sum overflows: ``[B, 1, 1, 1]``, at most 1.
 
     Args:
-        light: ``[B, C, H, W]``, of which fourth powers are summed; what is not finite does not count.
-        behind: ``[B, C, H, W]``, of which only the light itself is.
+        light: ``[B, C, H, W]``, whose fourth powers are summed; values that are not finite are ignored.
+        behind: Light behind the image, ``[B, C, H, W]``, which is summed itself.
 
     Example:
         >>> factor(torch.full((1, 3, 4, 5), 1e30)).log2().item()
@@ -33,13 +33,13 @@ def factor(light: Tensor, behind: Tensor | None = None) -> Tensor:
 
 
 def has_room(scale: Tensor) -> bool:
-    """Whether a :func:`factor` changes nothing; traced code, which cannot look at it, always applies it."""
+    """Whether a :func:`factor` is 1 everywhere; False in traced code, which cannot read it and always applies it."""
     return not is_traced() and bool((scale == 1.0).all())
 
 
 def _excess(light: Tensor, power: int) -> Tensor:
-    """How many times each item's light must be halved, ``[B, 1, 1, 1]``: whole numbers."""
-    steps = (math.frexp(torch.finfo(light.dtype).max)[1] - _SUMMED) // power  # in float32 28, or 112
+    """Number of times each item's light must be halved, ``[B, 1, 1, 1]``: whole numbers, as floats."""
+    steps = (math.frexp(torch.finfo(light.dtype).max)[1] - _SUMMED) // power  # float32: 28 if power = 4, 112 if 1
     level = light.detach().abs()
     peak = torch.where(torch.isfinite(level), level, 0.0).amax((1, 2, 3), keepdim=True)
     return (peak / 2.0**steps).clamp_min(1.0).log2().ceil()

@@ -1,14 +1,15 @@
-"""Highlights: light far brighter than what is around it, splatted by rays to the crisp discs that a lens makes of it.
+"""Highlights: light far brighter than its surroundings, splatted ray by ray as the crisp discs that a lens draws.
 
-Layers know how much of the lens a blurred foreground covers, not which part. For other light that is enough; in the
-disc of a highlight everybody sees it, for a post in front of a lamp draws a crisp line through its disc. A ray from a
-pixel at ``p`` with coc ``c`` through the point ``u`` of the lens lands at ``p + c u``, and it passes a nearer surface
-with coc ``c'`` where the image shows the position ``p + (c - c') u``. So the sharp image itself tells which rays pass.
+Layers know which fraction of the lens a blurred foreground covers, but not which part of it. For ordinary light the
+fraction is enough. In the disc of a highlight the part is visible: a post in front of a lamp draws a crisp line through
+the disc. So each ray is tested. With lens coordinates ``u``, a ray from a pixel at ``p`` with coc ``c`` lands at
+``p + c u``. It crosses a nearer surface with coc ``c'`` at the point that the sharp image shows at ``p + (c - c') u``,
+and is blocked if that pixel has coc ``c'``.
 
-Highlights are few. What exceeds the threshold of what is around it is extracted from the layers, and splatted as rays.
-Without occlusion nothing stands in the way: there rays are for what layers would be too coarse for, and their light is
-divided by the same sum of weights as the layers'. Nothing of it sets in at once: what a highlight exceeds, how much it
-is blurred, what stands before it and how many there are fade in.
+Highlights are few: the light above a local threshold is removed from the layers and splatted as rays. Without occlusion
+all rays pass. There rays serve highlights whose layers would be too coarse, and their light is divided by the same sum
+of weights as that of the layers. Everything fades in without a jump: the excess over the threshold, the blur, the
+occluders and the number of highlights.
 """
 
 import math
@@ -29,29 +30,30 @@ from .surfaces import HIDDEN_WEIGHT, Highlights, Surface, going_on
 __all__ = ["COARSE_CELL", "FACTOR", "NEARER_PX", "affordable_taps", "covered_cells", "extract", "splat", "threshold"]
 
 FACTOR = 8.0
-"""Light above so many times what is around it is a highlight's."""
+"""A highlight is brighter than its surroundings by more than this factor."""
 
 COARSE_CELL = 8
-"""Pixels in which nearer surfaces are looked for."""
+"""Side in pixels of the cells in which occluders are counted."""
 
 NEARER_PX = 1.0
-"""Difference in coc from which on a surface is another one, in front: wholly at 1 px more."""
+"""Smallest difference in coc, in pixels, at which a surface blocks a ray; it blocks fully at 1 px more."""
 
-_STEP = 3  # every so many pixels one tells the threshold; odd, as the next, that a flip of an image flips them
-_CELL = 11  # of them over which it is decided
-_LEAST_PX = 1.0  # blur from which on there are rays
-_WHOLE = 4.0  # times the share of a highlight that is splatted is, up to 1, what counts of its rays
-_TAPS_PER_PIXEL = 16  # of the frame: rays beyond this number are left to the layers
-_FREE_CHANGE_PX = 1.6  # mean change of the coc between neighbours, in pixels, above which fewer rays are affordable
-_TAPS = 2**21  # rays splatted together
-_PAIRS = 2**22  # of a source and a bin of nearer surfaces, looked at together
-_PAIR_TAPS = 2**19  # of these, rays looked at together
+_STEP = 3  # the threshold samples every third pixel; odd, as _CELL, so that a mirrored image has mirrored samples
+_CELL = 11  # samples along a side of a cell; larger: a smoother threshold
+_LEAST_PX = 1.0  # smallest blur of a highlight, in pixels
+_WHOLE = 4.0  # a highlight counts with min(1, _WHOLE * share splatted) of its rays against the budget
+_TAPS_PER_PIXEL = 16  # budget of rays per pixel of the frame; the layers keep the light beyond it
+_FREE_CHANGE_PX = 1.6  # mean change of coc between neighbours, in pixels, above which the budget shrinks
+_TAPS = 2**21  # rays that are splatted at once; larger, as in the next two: faster, with more memory
+_PAIRS = 2**22  # pairs of a highlight and a bin of occluders that are tested at once
+_PAIR_TAPS = 2**19  # rays of these pairs that are tested at once
 
 
 def threshold(light: Tensor, valid: Tensor | None = None) -> Tensor:
-    """Largest light ``[B, 1, H, W]`` that is no highlight's, where light ``[B, C, H, W]`` is valid.
+    """Light ``[B, 1, H, W]`` above which a pixel of ``light`` ``[B, C, H, W]`` is a highlight.
 
-    It is :data:`FACTOR` times what four fifths of the pixels of a cell stay below, interpolated between cells.
+    It is :data:`FACTOR` times the 80th percentile of the brightest channel in a cell, interpolated between cells.
+    Pixels where ``valid`` is 0 count as infinitely bright.
     """
     height, width = light.shape[-2:]
     brightest = light.detach().amax(1, keepdim=True)
@@ -67,9 +69,9 @@ def threshold(light: Tensor, valid: Tensor | None = None) -> Tensor:
 
 
 def _cells(size: int, side: int, device: torch.device) -> tuple[int, Tensor]:
-    """Pixels by which cells along an axis begin before it, as they end after it, and the pixels that tell of them.
+    """Pixels by which the first cell begins before an axis of ``size`` pixels, and the indices of all samples.
 
-    Two cells at least. Beyond its ends the axis is mirrored.
+    The cells, at least two, are centred on the axis, which is mirrored beyond its ends.
     """
     count = (size + 2 * side - 1) // side
     count = count + (count + size) % 2
@@ -87,24 +89,29 @@ def extract(
     most_taps: Tensor | float | None = None,
     ops: Ops = EAGER,
 ) -> tuple[Surface, Highlights | None]:
-    """Take the light above a limit out of a surface of an image, to be splatted ray by ray.
+    """Removes the light above a limit from a surface of an image, to be splatted ray by ray.
 
-    A highlight behind part of a nearer surface sends the light of its whole pixel: that surface stands in the way of
-    these rays, and what it takes would be taken twice. Beside a highlight what is behind keeps its share, for it is
-    bright only by what the two mean colours of a mixed pixel do not explain. Nor where depth around has values
-    between the two: it is not exact then, and the farther one may be nearer than the lamp.
+    1. Select pixels brighter than ``limit`` and blurred by more than ``from_px``.
+    2. If their rays exceed ``most_taps``, raise the limit: the brightest stay, with their light above that limit.
+    3. Split the light of each: ``excess = light (1 - limit / peak) fade``; the surface keeps the rest.
+    4. Multiply the excess by the cover of the surface in its pixel.
+
+    A highlight on the farther surface of a mixed pixel sends the light of the whole pixel (cover 1): the nearer surface
+    blocks its rays, and its cover would be subtracted twice. Two cases keep the smaller cover. If the nearer surface is
+    bright too, the light behind it is only the part of the pixel that two mean colours do not explain. If the depth
+    around has values between the two surfaces, it is inexact, and the farther one may be nearer than the lamp.
 
     Args:
-        surface: Of an image.
-        limit: As :func:`threshold` gives it, ``[B, 1, H, W]``.
-        from_px: Blur from which on there are rays; all of the light above the limit is theirs at 1 px more.
+        surface: A surface of an image.
+        limit: Threshold as from :func:`threshold`, ``[B, 1, H, W]``.
+        from_px: Smallest blur of a highlight in pixels; its excess is splatted in full at 1 px more.
         beside: The other surface of each pixel.
-        image_coc_px: Coc of the image, ``[B, 1, H, W]``; without it a highlight sends what its surface has.
-        most_taps: Number of rays that are affordable, as :func:`affordable_taps` gives it; None: 16 a pixel.
-        ops: How a frame without highlights stays as it is.
+        image_coc_px: Coc of the image, ``[B, 1, H, W]``; None: the cover stays that of the surface.
+        most_taps: Largest number of rays, as from :func:`affordable_taps`; None: 16 per pixel.
+        ops: Keeps a frame without highlights as it is.
 
     Returns:
-        The surface with what is left of its light, and the highlights if there are any.
+        The surface with its remaining light, and the highlights, or None without any.
     """
     light, coc_px, weight = surface
     from_px = max(from_px, _LEAST_PX)
@@ -113,7 +120,7 @@ def extract(
     bright = pixels.indices(is_bright if weight is None else is_bright & (weight > 0))
     peak, coc, most = (pixels.pick(t, bright)[0] for t in (brightest, coc_px, limit))
     fades = (coc.abs() - from_px).clamp(max=1.0)
-    # where they are too many, the brightest of them, and only what they are brighter by
+    # the limit at which the rays fit into the budget
     most_taps = _TAPS_PER_PIXEL * math.prod(coc_px.shape) if most_taps is None else most_taps
     least = _least_peak(peak.detach(), coc.detach(), ((1.0 - most / peak) * fades).detach(), most_taps)
     kept = (peak.detach() > least).nonzero()[:, 0]
@@ -122,7 +129,7 @@ def extract(
     bright, peak, fades, coc, most = (t.index_select(0, kept) for t in (bright, peak, fades, coc, most))
     taken_from, ordinary = pixels.pick(light, bright), torch.maximum(most, least) / peak
     excess = taken_from * ((1.0 - ordinary) * fades)
-    # not what the excess leaves: its rounding is brighter than a dark scene
+    # not light - excess, whose rounding error is brighter than a dark scene
     left = pixels.put(light, bright, taken_from * ((1.0 - fades) + fades * ordinary))
     left = ops.choose(lambda: is_bright.any(), left, light)
     if weight is not None:
@@ -133,7 +140,7 @@ def extract(
             beside_peak = pixels.pick(beside.light, bright).amax(0)
             is_dark = (2.0 - beside_peak / most.clamp_min(torch.finfo(most.dtype).tiny)).clamp(0.0, 1.0)
             around = pixels.pick(image_coc_px, pixels.around(bright, image_coc_px, 2))[0]
-            off_middle = (around - (coc - 0.5 * gap)).abs() / gap.clamp_min(NEARER_PX)  # 1/2 on either surface
+            off_middle = (around - (coc - 0.5 * gap)).abs() / gap.clamp_min(NEARER_PX)  # 1/2 at the coc of a surface
             is_step = (1.5 - 10.0 * (3.5 - 8.0 * off_middle).clamp(0.0, 1.0).mean(0)).clamp(0.0, 1.0)
             cover = cover + going_on(cover) * (stopped * is_dark * is_step)
         excess = excess * cover
@@ -142,10 +149,10 @@ def extract(
 
 
 def affordable_taps(coc_px: Tensor) -> Tensor:
-    """Number of rays ``[]`` that are splatted in a frame ``[B, 1, H, W]`` with occlusion: 16 a pixel.
+    """Largest number of rays ``[]`` for a frame with occlusion and coc ``[B, 1, H, W]``: 16 per pixel or fewer.
 
-    A ray looks at each surface that may stand in its way. In a depth map of noise these are many: the number falls in
-    proportion to the mean change of the coc from one pixel to the next.
+    Each ray is tested against each possible occluder, and a noisy depth map has many. So the number is inversely
+    proportional to the mean change of the coc between neighbours, above :data:`_FREE_CHANGE_PX`.
     """
     coc, area = coc_px.detach(), math.prod(coc_px.shape)
     change = (coc.diff(dim=-1).abs().sum() + coc.diff(dim=-2).abs().sum()) / area
@@ -153,19 +160,19 @@ def affordable_taps(coc_px: Tensor) -> Tensor:
 
 
 def _least_peak(peak: Tensor, coc: Tensor, share: Tensor, most_taps: Tensor | float) -> Tensor:
-    """Light ``[1]`` up to which highlights ``[n]`` are left to the layers of a frame, lest there be too many rays.
+    """Raised limit ``[1]`` for the light of highlights ``[n]``, at which the number of rays fits the budget.
 
-    It is the ``L`` at which the rays of those with a peak ``p`` above it, weighted by ``1 - L / (2 p)``, are as many as
-    there may be; 0 where all fit. So it grows smoothly with their number, for equal ones too, and at most twice as many
-    are splatted.
+    It is the L that solves ``sum over peaks p > L of taps (1 - L / (2 p)) = most_taps``, or 0 if all rays fit. The
+    weights make L grow smoothly with the number of highlights, even equal ones; at most twice ``most_taps`` rays are
+    splatted.
     """
     taps = (2.0 * coc.abs() + 1.0) ** 2 * (_WHOLE * share).clamp(max=1.0)
-    values, order = functional.pad(peak.double(), (0, 1)).sort(descending=True)  # and one of no light, the last
+    values, order = functional.pad(peak.double(), (0, 1)).sort(descending=True)  # with a last peak of 0
     count = functional.pad(taps.double(), (0, 1)).index_select(0, order)
     slope = torch.where(values > 0, 0.5 * count / values, 0.0).cumsum(0)
     budget = torch.as_tensor(most_taps, dtype=count.dtype, device=count.device)
-    count = count.cumsum(0) - budget  # how many of them are beyond what there may be
-    at_next = count - functional.pad(values[1:], (0, 1)) * slope  # how many there are at the next peak
+    count = count.cumsum(0) - budget  # rays beyond the budget at L = 0
+    at_next = count - functional.pad(values[1:], (0, 1)) * slope  # rays beyond the budget at L = the next peak
     last = (at_next[:-1] < 0).sum(0, keepdim=True)
     count, slope, value = (t.index_select(0, last) for t in (count, slope, values))
     level = count / torch.where(slope > 0, slope, 1.0)
@@ -180,10 +187,10 @@ def splat(
     kernels_per_px: int = KERNELS_PER_PX,
     ops: Ops = EAGER,
 ) -> Tensor:
-    """Scatter highlights to ``[B, C, H, W]``, each ray to where it lands but for what nearer surfaces take of it.
+    """Splats highlights to ``[B, C, H, W]``: each ray adds its light where it lands, times its transmittance.
 
-    These are the surfaces that an image shows, each pixel's own first; without occlusion all rays pass. Differentiable
-    in the light and coc of the rays and in what is in their way.
+    ``shown`` are the occluders, each pixel's own surface first; without ``occlusion`` all rays pass. Differentiable in
+    the light and coc of ``rays`` and in the coc and cover of ``shown``.
     """
     together = Highlights(*(torch.cat(parts, -1) for parts in zip(*rays, strict=True)))
     coc_px, in_the_way = shown[0].coc_px, _obstacles(shown) if occlusion else []
@@ -202,7 +209,13 @@ def _splatted(
     kernels_per_px: int,
     lens_width: int | None,
 ) -> Tensor:
-    """Highlights to ``[B, C, H, W]``, so many together that their rays stay within bounds."""
+    """Splats highlights to ``[B, C, H, W]`` in chunks of bounded memory.
+
+    1. Sort the highlights by blur, and pad the frame by the radius of the widest kernel.
+    2. Take the next chunk: at most :data:`_TAPS` rays and :data:`_PAIRS` pairs with bins of occluders.
+    3. Make its kernels, for their place in the frame if the table depends on it.
+    4. Multiply kernel, light and transmittance, and add the products where the rays land.
+    """
     batch, _, height, width = coc_px.shape
     longest, lens_width = max(height, width), lens_width or int(width)
     source, light, coc = rays
@@ -217,14 +230,14 @@ def _splatted(
     def half_of(radius: float) -> int:
         return min(math.ceil(table.reach_px(radius, lens_width) + 0.5), longest - 1)
 
-    margin = max([half_of(radii[-1]), *(half_of(each.coc_px) for each in shares)])  # the widest need not be the last
+    margin = max([half_of(radii[-1]), *(half_of(each.coc_px) for each in shares)])  # one of them may be the widest
     across = width + 2 * margin
     area = (height + 2 * margin) * across
     splats = light.new_zeros(len(light), batch * area)
     hiding = _Occluders(obstacles) if obstacles else None
     most = len(radii) if hiding is None else max(1, _PAIRS // hiding.bins)
     start = 0
-    while start < len(radii):  # sources of increasing blur, as many as make a bounded number of taps
+    while start < len(radii):  # bounded by the first radius of the chunk, then by its last
         stop = min(len(radii), start + most, start + max(1, _TAPS // (2 * half_of(radii[start]) + 1) ** 2))
         stop = min(stop, start + max(1, _TAPS // (2 * half_of(radii[stop - 1]) + 1) ** 2))
         part = slice(start, stop)
@@ -249,41 +262,42 @@ def _splatted(
 
 
 def _obstacles(surfaces: Sequence[Surface]) -> list[tuple[Tensor, Tensor]]:
-    """Coc of surfaces and the part of each pixel that they cover, ``[B, 1, H, W]``: none where they are hidden."""
+    """Coc and cover of the occluders, ``[B, 1, H, W]`` each; the cover is 0 where a surface is hidden."""
     covers = [torch.ones_like(s.coc_px) if s.weight is None else s.weight for s in surfaces]
     covers = [covers[0], *((c - HIDDEN_WEIGHT).clamp_min(0.0) for c in covers[1:])]
     return [(s.coc_px, cover) for s, cover in zip(surfaces, covers, strict=True)]
 
 
 class _Occluders:
-    """Surfaces that may stand in the way of rays: their coc and cover, in bins of 1 px of coc."""
+    """Occluders: coc and cover of the surfaces of an image, in bins of 1 px of coc."""
 
     def __init__(self, obstacles: Sequence[tuple[Tensor, Tensor]]) -> None:
         coc_px = obstacles[0][0].detach()
         self.height, self.width = int(coc_px.shape[-2]), int(coc_px.shape[-1])
         self.low = coc_px.amin()
-        shown = [(coc - self.low, cover) for coc, cover in obstacles]  # a place in bins
+        shown = [(coc - self.low, cover) for coc, cover in obstacles]  # coc in bins
         self.bins = int(torch.stack([place.detach().amax() for place, _ in shown]).amax()) + 2
         self.counts = covered_cells([(place.detach(), cover.detach()) for place, cover in shown], self.bins)
         self.places, self.covers = (torch.stack([t.flatten() for t in maps]) for maps in zip(*shown, strict=True))
 
     def hidden(self, item: Tensor, row: Tensor, column: Tensor, coc: Tensor, step: Tensor) -> Tensor:
-        """Share of each ray ``[n, k, k]`` that nearer surfaces take.
+        """Fraction of each ray that is blocked, ``[n, k, k]``.
 
-        A ray passes the surfaces of a bin at a share of its way; between four pixels their cover is interpolated.
+        A ray that lands ``step`` from its pixel crosses a bin of coc ``c'`` at ``(1 - c' / coc) step``. The cover there
+        is interpolated between four pixels.
 
         Args:
-            item: Of each source in the batch, ``[n]``.
-            row: Of each source, ``[n]``.
-            column: Of each source, ``[n]``.
-            coc: Signed coc of each source in pixels, ``[n]``.
-            step: Pixels from the source to where its rays land, along each axis, ``[k]``.
+            item: Index in the batch of each highlight, ``[n]``.
+            row: Row of each highlight, ``[n]``.
+            column: Column of each highlight, ``[n]``.
+            coc: Signed coc of each highlight in pixels, ``[n]``.
+            step: Offsets in pixels at which rays land, along each axis, ``[k]``.
         """
         bins = torch.arange(self.bins, device=coc.device)
         nearer = self.low + bins
         scale = 1.0 - nearer / coc[:, None]  # [n, bins]
         fades = (coc[:, None] - NEARER_PX - nearer).clamp(0.0, 1.0)
-        # pairs of a source and a bin of which some cell within reach shows something
+        # pairs of a highlight and a bin with a non-empty cell within reach
         reach = scale.detach().abs() * step[-1]
         (top, bottom), (left, right) = (
             [(place[:, None] + end).clamp(0, size - 1).long() // COARSE_CELL for end in (-reach, reach + 1.0)]
@@ -308,11 +322,11 @@ class _Occluders:
 
 
 def covered_cells(places: Sequence[tuple[Tensor, Tensor]], bins: int) -> Tensor:
-    """Counts the cells above and left of each cell that show something in a bin: ``[bins, B, rows + 1, columns + 1]``.
+    """Summed-area table of the non-empty cells of each bin: ``[bins, B, rows + 1, columns + 1]``.
 
     Args:
-        places: Place of each pixel among the bins and its cover, ``[B, 1, H, W]``, of each surface. A pixel lies in the
-            bin before its place and in the one after it.
+        places: Coc in bins and cover of each surface, ``[B, 1, H, W]`` each. A pixel belongs to the two bins that its
+            coc lies between.
         bins: Number of bins.
     """
     batch, _, height, width = places[0][0].shape
@@ -320,7 +334,7 @@ def covered_cells(places: Sequence[tuple[Tensor, Tensor]], bins: int) -> Tensor:
     item, row, column = (torch.arange(n, device=places[0][0].device) for n in (batch, height, width))
     cell = (item[:, None, None] * rows + row[:, None] // COARSE_CELL) * columns + column // COARSE_CELL
     shown = places[0][0].new_zeros((bins + 2) * batch * rows * columns)
-    for place, cover in places:  # a pixel without cover is put beyond all bins
+    for place, cover in places:  # a pixel without cover goes to an extra bin
         before = torch.where(cover > 0, place, float(bins)).long()[:, 0]
         for bin_of in (before, before + 1):
             index = (bin_of * (batch * rows * columns) + cell).flatten()

@@ -1,6 +1,6 @@
-"""Where the layers of a scene are put on the blur axis: at its ends and at the coc of its border, and in between.
+"""Choose the places of layers: at both ends of the scene's coc range, at the coc of its border, and between these.
 
-Distances are those of :mod:`torchdof.render.layer_weights`' blur axis.
+Places and distances are on the blur axis of :mod:`torchdof.render.layer_weights`.
 """
 
 import math
@@ -16,33 +16,33 @@ from .layer_weights import blur_axis
 __all__ = ["DENSE", "border_nodes", "extent", "finest", "on_axis", "slid", "spaced_nodes", "spacing", "widest"]
 
 DENSE = 0.65
-"""Share of the tolerance for which coarse layers are spaced where nothing tells where a scene's borders lie.
+"""Factor on the tolerance for the spacing of coarse layers, if the coc of the scene's border is unknown.
 
-Measured on smooth slopes: from 0.8 on their layers are no denser than what a scene itself gets."""
+Measured on smooth slopes: at 0.8 or more, their layers are no denser than in a plan for the scene itself."""
 
-_FEW = 100  # the largest radii of a frame: 1 / _FEW of its pixels may exceed them
-_FINEST = 0.5
-_FINEST_PARTS = 40.0
-_WIDE = _FINEST * _FINEST_PARTS  # from which on the finest distance grows
+_FEW = 100  # the largest radii of a frame are those of 1 / _FEW of its pixels
+_FINEST = 0.5  # px: smallest distance between layers near the focus; larger skips layers
+_FINEST_PARTS = 40.0  # smallest distance elsewhere: the blur divided by this
+_WIDE = _FINEST * _FINEST_PARTS  # px: blur above which the smallest distance grows
 _SPACING = 0.25  # px near focus at a tolerance of 1/255; measured, as the next two: errors stay below the tolerance
-_SPACING_POWER = 0.8  # of the tolerance
-_NEAR = 0.3  # of the spacing: so near to a fixed node there is no other; at twice as far one is where it would be
-_LOOSE = 4.0  # of 255: from there on by its square root, lest a picture consists of two layers
+_SPACING_POWER = 0.8  # exponent of the tolerance in the spacing; larger: fewer layers at tolerances above 1/255
+_NEAR = 0.3  # spacings: a node nearer to a fixed one than this merges with it; from twice this on it does not move
+_LOOSE = 4.0  # of 255: above, the spacing grows with the tolerance's square root, to keep more than two layers
 
 
 def on_axis(coc_px: Tensor, longest: int) -> Tensor:
-    """Places on the blur axis, finite, of some pixels of a frame whose longer side has so many."""
+    """Finite places on the blur axis of a coc in a frame whose longer side has ``longest`` pixels."""
     reach = _reach(longest)
     return blur_axis(torch.where(torch.isnan(coc_px), 0.0, coc_px).clamp(-reach, reach))
 
 
 def _reach(longest: int) -> float:
-    """Radius beyond which a kernel is the same everywhere in a frame whose longer side has so many pixels."""
+    """Radius in pixels above which a kernel is constant within a frame whose longer side has ``longest`` pixels."""
     return 4.0 * longest + 4.0
 
 
 def finest(x: float) -> float:
-    """Least distance between layers at a place that is worth anything: half a pixel, or a fortieth of the blur."""
+    """Smallest useful distance between layers at ``x``: half a pixel, or a fortieth of the blur."""
     return max(_FINEST, abs(x) / _FINEST_PARTS)
 
 
@@ -54,9 +54,9 @@ def spacing(x: float, tolerance: float) -> float:
 
 
 def spaced_nodes(low: float, high: float, tolerance: float, dense_from: float = math.inf) -> tuple[float, ...]:
-    """Nodes outwards from focus by :func:`spacing`, the last on each side at or beyond the given end.
+    """Nodes outwards from focus by :func:`spacing`; the last on each side is at or beyond ``low`` or ``high``.
 
-    From ``dense_from`` on they are spaced as for a share of the tolerance.
+    Beyond ``dense_from`` they are spaced for the tolerance times :data:`DENSE`.
     """
     nodes = [0.0]
     for sign, limit in ((-1, -low), (1, high)):
@@ -68,14 +68,14 @@ def spaced_nodes(low: float, high: float, tolerance: float, dense_from: float = 
 
 
 def slid(node: float, fixed: Sequence[float], tolerance: float) -> float:
-    """A node between fixed ones: moved towards one that comes near, and in the end onto it."""
+    """Move a node that is near a fixed one towards it; a very near one lands on it."""
     near = min(fixed, key=lambda other: abs(node - other))
     gap = abs(node - near) / spacing(node, tolerance)
     return near + (node - near) * min(max((gap - _NEAR) / _NEAR, 0.0), 1.0)
 
 
 def extent(coc_px: Tensor) -> tuple[float, float]:
-    """Nearest and farthest place of the pixels ``[B, 1, H, W]``."""
+    """Nearest and farthest place of ``coc_px [B, 1, H, W]`` on the blur axis."""
     both = ends(coc_px)
     if math.isnan(both[0]):
         both = ends(torch.where(coc_px.isnan(), 0.0, coc_px))
@@ -85,9 +85,9 @@ def extent(coc_px: Tensor) -> tuple[float, float]:
 
 
 def widest(coc_px: Tensor) -> float:
-    """Mean radius in pixels of the hundredth of a map's pixels that is blurred most; the largest of ``[B, 1, H, W]``.
+    """Mean radius in pixels of the most blurred hundredth of a map ``[B, 1, H, W]``; the largest of the batch.
 
-    A few pixels add next to nothing to it.
+    A few pixels hardly change it.
     """
     radii = torch.where(torch.isnan(coc_px), 0.0, coc_px).abs().clamp(max=_reach(max(coc_px.shape[-2:]))).flatten(1)
     most = radii.topk(-(-radii.shape[1] // _FEW), sorted=False).values
@@ -95,19 +95,19 @@ def widest(coc_px: Tensor) -> float:
 
 
 def border_nodes(coc_px: Tensor) -> list[float]:
-    """Places at which much of the frame's border lies.
+    """Places at which many pixels of the frame's border lie.
 
-    Surfaces go on beyond the frame as they are at its border, so what comes from there comes from few blurs: layers far
-    from these show.
+    Surfaces continue beyond the frame with the blur of its border. So large areas there have the same few blurs, and
+    layers far from these cause visible errors.
     """
     border = torch.cat([coc_px[..., 0, :], coc_px[..., -1, :], coc_px[..., 0], coc_px[..., -1]], -1)
     return _crowded(on_axis(border, max(coc_px.shape[-2:])).flatten(), width=1.0, least_share=0.03)
 
 
 def _crowded(x: Tensor, width: float, least_share: float) -> list[float]:
-    """Places at which at least so large a share of all places ``[n]`` lies, and 16, the most crowded first.
+    """Places that hold at least ``least_share`` of all ``x [n]``, and at least 16 of them; the most crowded first.
 
-    What counts as one place is ``width`` finest distances wide, three bins of the histogram.
+    A place is an interval of ``width`` finest distances: three bins of the histogram.
     """
     bins = torch.round(_in_finest(x) * (3.0 / width)).long()
     first = int(bins.min())
@@ -120,19 +120,19 @@ def _crowded(x: Tensor, width: float, least_share: float) -> list[float]:
             break
         place = _from_finest((first + i) * width / 3.0)
         if all(abs(place - other) > 0.6 * finest(place) for other in places):
-            # one that occurs: its pixels then lie in no other layer
+            # the median is a value that occurs, so pixels of that value lie in this layer alone
             places.append(float(x[(bins - first - i).abs() <= 1].median()))
     return places
 
 
 def _in_finest(x: Tensor) -> Tensor:
-    """Places in finest distances from focus."""
+    """Convert places to numbers of finest distances from focus."""
     steps = x.abs().clamp(max=_WIDE) / _FINEST + _FINEST_PARTS * (x.abs() / _WIDE).clamp_min(1.0).log()
     return steps * x.sign()
 
 
 def _from_finest(steps: float) -> float:
-    """The place so many finest distances from focus."""
+    """Place at a number of finest distances from focus: the inverse of :func:`_in_finest`."""
     if abs(steps) <= _FINEST_PARTS:
         return steps * _FINEST
     return math.copysign(_WIDE * math.exp(abs(steps) / _FINEST_PARTS - 1.0), steps)

@@ -1,17 +1,18 @@
-"""Signed circle of confusion to soft layers: how much of each pixel's light each layer carries.
+"""Divide pixels into soft layers by their signed circle of confusion: the weight of each pixel in each layer.
 
 Layers sit at nodes of signed coc, ``nodes[0] < nodes[1] < ...``, so from the nearest to the farthest. A pixel between
 two nodes is divided linearly, which makes the picture continuous and differentiable in depth, focus and aperture. All
-of it follows from one ramp: the weight of a pixel at or behind node k is
+weights follow from one ramp: the weight of a pixel at or behind node k is
 ``clamp((x - nodes[k-1]) / (nodes[k] - nodes[k-1]))``; its weight in layer k is the difference of two ramps.
 
-Where layers occlude each other their light is divided by the weight at or behind them, and there the ramp is eased: the
-share of a pixel a hair behind a node is next to nothing, and what is divided by it would be all that its layer knows.
+Where layers occlude each other, their light is divided by the weight at or behind them. There the ramp is eased, so
+that it leaves 0 slowly: a pixel just behind a node has a tiny weight in the layer behind it, and if no other pixel
+there is known, the division would turn that tiny weight into a full one.
 
-Nodes live on the *blur axis* ``x = sign(coc) * max(coc^2 / (|coc| + 0.5) - 2e-4, 0)``. Far from focus it goes as the
-coc does, near focus as its square, which is how the light goes that a small kernel moves. So a mixture of the sharp
-layer, at x = 0, and the first blurred one stands for the blurs between them. What lies at x = 0 is in focus and passes
-through unchanged: |coc| < 0.01 px, where a disc would move 1e-4 of the light.
+Nodes live on the *blur axis* ``x = sign(coc) * max(coc^2 / (|coc| + 0.5) - 2e-4, 0)``. Far from focus x grows like the
+coc, near focus like its square, as does the light that a small kernel moves. So a mixture of the sharp layer, at x = 0,
+and the first blurred one represents the blurs between them. Pixels at x = 0 are in focus and pass through unchanged:
+|coc| < 0.01 px, where a disc would move 1e-4 of the light.
 """
 
 import math
@@ -22,16 +23,16 @@ from torch import Tensor
 
 __all__ = ["blur_axis", "eased", "from_blur_axis", "ramps", "weights_at_or_behind"]
 
-_SQUARE_PX = 0.5  # coc around which the axis goes over from the square to the coc itself
-_IN_FOCUS = 2e-4  # where focus ends: a coc of 0.01 px
+_SQUARE_PX = 0.5  # px of coc around which x changes from the square of the coc to the coc itself
+_IN_FOCUS = 2e-4  # x below which a pixel is in focus, at a coc of 0.01 px; larger: more pixels pass unchanged
 
 
-_FOOT = 0.15  # share up to which an eased ramp rises by its square
+_FOOT = 0.15  # weight up to which an eased ramp is a parabola; larger: it leaves 0 more slowly
 
 
 def blur_axis(coc_px: Tensor) -> Tensor:
-    """Place on the blur axis of a signed coc, any shape; 0 wherever the pixel is in focus."""
-    # in a form whose operations no compiler fuses: both engines agree to the last bit about which pixels lie at a node
+    """Place on the blur axis of a signed coc, any shape; 0 if the pixel is in focus."""
+    # no compiler fuses these operations, so both engines agree to the last bit which pixels lie at a node
     x = coc_px * coc_px.abs() / (coc_px.abs() + _SQUARE_PX)
     return x - x.clamp(-_IN_FOCUS, _IN_FOCUS)
 
@@ -43,23 +44,23 @@ def from_blur_axis(x: float) -> float:
 
 
 def ramps(nodes: Sequence[float], like: Tensor) -> Tensor:
-    """Where the ramps of layers begin and how wide they are, ``[2, n + 1]``, as the second argument of the next.
+    """Start and width of the layers' ramps, ``[2, n + 1]``, for :func:`weights_at_or_behind`.
 
     Args:
-        nodes: Places of the layers, strictly increasing: near to far. Everything is at or behind the first, nothing
+        nodes: Places of the layers, strictly increasing: near to far. Every pixel is at or behind the first node, none
             behind the last.
-        like: Its dtype and device are taken.
+        like: Tensor with the dtype and device of the result.
     """
     widths = [1.0, *(high - low for low, high in zip(nodes, nodes[1:], strict=False)), 1.0]
     return like.new_tensor([[-math.inf, *nodes[:-1], math.inf], widths])
 
 
 def weights_at_or_behind(x: Tensor, ramps: Tensor) -> Tensor:
-    """How much of each pixel, 0 to 1, lies in layers or behind them, ``M_k`` of the composite: ``[B, n, H, W]``.
+    """Share of each pixel, 0 to 1, that lies in layer k or behind it: ``M_k`` of the composite, ``[B, n, H, W]``.
 
     Args:
         x: Places on the blur axis ``[B, 1, H, W]``; those beyond the outermost nodes belong to these.
-        ramps: Some of those that :func:`ramps` gives, ``[2, n]``.
+        ramps: All or some columns of the result of :func:`ramps`, ``[2, n]``.
     """
     start, width = ramps[..., None, None]
     return ((x - start) / width).clamp(0.0, 1.0)

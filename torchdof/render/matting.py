@@ -1,9 +1,9 @@
-"""Matting of mixed pixels: what part of a pixel on a depth edge belongs to which of the two surfaces there.
+"""Matting of mixed pixels: splits a pixel on a depth edge between the two surfaces that meet there.
 
-A sharp image is anti-aliased, its depth is not. Along every depth edge pixels carry the light of two surfaces and the
-depth of one; blurred with that depth alone, a bright emitter draws a wrong ring and a foreground a fringe. Such pixels
-are split between their surfaces, without touching texture within a surface. Everything is computed at the pixels of
-edges only.
+A sharp image is anti-aliased, its depth map is not. So the pixels along a depth edge have the light of two surfaces and
+the depth of one. Blurred with that depth alone, a bright emitter draws a wrong ring and a foreground a fringe. Matting
+gives each surface its part of the light, and leaves texture within a surface unchanged. It computes only the pixels at
+edges.
 """
 
 import math
@@ -19,25 +19,25 @@ from ..tensors import is_traced
 __all__ = ["NEVER_PX", "Matted", "attribute_emitters", "matte"]
 
 NEVER_PX = 1e9
-"""A coc that no pixel has."""
+"""A coc in pixels that no pixel has: marks the absence of a surface."""
 
-_EDGE_PX = 0.5  # difference in coc of neighbours from which on they may be two surfaces
-_UNCLEAN = 1e-2  # weight of a pixel that may be mixed itself
-_FALLOFF = math.exp(-1 / 4.5)
-_TRUST = 4.0  # how much texture discredits the contrast of the two surfaces
-_ALIKE = 1.0 / 255.0  # contrast, as a share of the brightest light around, that is worth as much as none
-_UNBOUNDED = 1e6  # times the brightest pixel around: so bright is neither part of a pixel
-_EMITTER_REACH = 3  # pixels around a highlight that tell on which surface it lies
-_TOUCHING = 2  # pixels around an emitter into which a soft picture spreads its light
-_DIM = 0.1  # times the light of a highlight's pixel: what is darker is as sure to be none of it
-_MOST_WEIGHT = 0.98  # of a highlight's pixel that an emitter of another surface may have
+_EDGE_PX = 0.5  # smallest difference in coc of neighbours on two surfaces, in pixels; larger: fewer edges
+_UNCLEAN = 1e-2  # weight, against 1, of pixels that may be mixed themselves in the mean colour of a surface
+_FALLOFF = math.exp(-1 / 4.5)  # weight of a neighbour at a distance of 1 px: a Gaussian of sigma 1.5
+_TRUST = 4.0  # weight of variance against contrast; larger: texture stops more splits
+_ALIKE = 1.0 / 255.0  # contrast at which trust is halved, as a fraction of the brightest light around
+_UNBOUNDED = 1e6  # upper limit for either part, as a multiple of the brightest neighbour; avoids 0 * inf
+_EMITTER_REACH = 3  # half the width in pixels of the window in which an emitter's surface is searched
+_TOUCHING = 2  # distance in pixels over which a soft image spreads the light of an emitter in front
+_DIM = 0.1  # darker pixels are equally good samples of a surface without light, as a fraction of the highlight
+_MOST_WEIGHT = 0.98  # largest weight of an emitter on another surface in a highlight's pixel
 
 
 class Matted(NamedTuple):
-    """Surfaces of pixels: light of the own and of the other one ``[B, C, H, W]``, the other's coc and its weight.
+    """The two surfaces of each pixel: its own, whose coc the pixel has, and the other one, across the edge.
 
-    The last two are ``[B, 1, H, W]``; the weight is the part of the pixel that the other surface covers, 0 away from
-    edges.
+    Light is ``[B, C, H, W]``, coc and weight ``[B, 1, H, W]``. The weight is the fraction of the pixel that the other
+    surface covers, 0 away from edges.
     """
 
     own: Tensor
@@ -47,17 +47,19 @@ class Matted(NamedTuple):
 
 
 def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
-    """Matting of pixels at depth edges: the surface they are attributed to, and the one across the edge.
+    """Splits pixels at depth edges between their own surface and the one across the edge.
 
-    With F and B the light of the two surfaces beside the pixel, the weight ``a`` of F in a pixel is the least-squares
-    solution of ``I = a F + (1 - a) B``, kept on the side of 1/2 that the pixel's own depth states (its centre lies on
-    that surface) and drawn towards one surface alone where the contrast of the two is small against their texture. The
-    light of the two parts sums to the pixel's, and neither leaves the image's range.
+    1. Take the nearest and the farthest coc of the 3 x 3 pixels around as those of the two surfaces.
+    2. Take their colours F (near) and B (far), each ``[C]``, as means of neighbours on one surface.
+    3. Fit ``I = a F + (1 - a) B`` to the pixel's light I by least squares: ``a = (I - B) (F - B) / |F - B|^2``.
+    4. Keep a on the side of 1/2 of the pixel's own surface, on which its centre lies. Shrink the other surface's weight
+       where contrast is small against texture.
+    5. Distribute the residual over both parts: they sum to I, and neither leaves the image's range.
 
     Args:
         light: ``[B, C, H, W]``.
         coc_px: ``[B, 1, H, W]``, signed.
-        valid: ``[B, 1, H, W]``, 0 where a pixel is to be left out; None counts all.
+        valid: ``[B, 1, H, W]``, 0 where a pixel is left out; None means all count.
 
     Returns:
         The surfaces; the weight of the other one is in [0, 1/2].
@@ -69,7 +71,7 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
     is_edge = high + low > _EDGE_PX
     edge_pixels = pixels.indices(is_edge if known is None else is_edge & known)
 
-    # the two surfaces are as near and as far as the pixels around; no absolute level of light decides
+    # coc of the two surfaces; light relative to the brightest neighbour, so that its scale does not matter
     own_coc, colour = pixels.pick(coc_px, edge_pixels)[0], pixels.pick(light, edge_pixels)
     window = pixels.around(edge_pixels, coc_px, 1)
     window_light, window_coc = pixels.pick(light, window), pixels.pick(coc_px, window)[0]  # [C, 9, P], [9, P]
@@ -81,41 +83,41 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
         near, far = torch.where(window_known, near, NEVER_PX), torch.where(window_known, far, -NEVER_PX)
     near, far = near.amin(0), far.amax(0)
     is_near = own_coc - near < far - own_coc
-    edge = ((far - near) / _EDGE_PX - 1.0).clamp(0.0, 1.0)  # how surely there are two
+    edge = ((far - near) / _EDGE_PX - 1.0).clamp(0.0, 1.0)  # confidence that there are two surfaces
     edges = pixels.put(torch.zeros_like(coc_px), edge_pixels, edge)
     gap = (far - near).clamp_min(1e-6)
 
-    # their light: means over pixels around that lie on one of them and are hardly mixed themselves
+    # their colours: means over neighbours that lie on one of them, mostly unmixed ones
     weight = (1.0 - pixels.pick(edges, window)[0] + _UNCLEAN) * _falloff(light, 1)
     if valid is not None:
         weight = weight * pixels.pick(valid, window)[0]
     nearness = (far - window_coc) / gap
     near_weight, far_weight = weight * (4 * nearness - 2.8).clamp(0, 1), weight * (1.2 - 4 * nearness).clamp(0, 1)
     back, back_variance = _mean_of(window_light, far_weight)
-    # a thin foreground has no clean pixel: trust the one that differs most from what is behind
+    # a thin foreground has no unmixed pixel: prefer those that differ most from the background
     differs = ((window_light - back[:, None]) ** 2).sum(0)
     differs = (differs + _ALIKE**2) / (differs.amax(0) + _ALIKE**2)
     clean = (0.1 * near_weight.sum(0) / _UNCLEAN - 1.0).clamp(0.0, 1.0)
     front, front_variance = _mean_of(window_light, near_weight * torch.lerp(differs, torch.ones_like(clean), clean))
 
-    # a = (I - B) (F - B) / (F - B)^2, as far as it can be trusted
+    # a = (I - B) (F - B) / |F - B|^2, and the trust in it
     contrast = front - back
     strength = (contrast**2).sum(0)
     fitted = (((colour - back) * contrast).sum(0) / strength.clamp_min(1e-12)).clamp(0.0, 1.0)
     misfit = ((colour - back - fitted * contrast) ** 2).sum(0)
     trust = strength / (strength + _TRUST * (back_variance + front_variance + misfit) + _ALIKE**2)
-    # the pixel's depth must be that of one of the two: in between, a steep surface goes on
+    # a depth between the two belongs to a steep surface, not to an edge
     sided = ((own_coc - near) - (far - own_coc)).abs() / gap
     certainty = edge * trust * (4.0 * sided - 2.0).clamp(0.0, 1.0)
-    weight = torch.where(is_near, 1.0 - fitted, fitted).clamp(max=0.5) * certainty  # of the other surface
+    weight = torch.where(is_near, 1.0 - fitted, fitted).clamp(max=0.5) * certainty  # weight of the other surface
 
-    # what the mean colours do not explain goes to both; no light is lost, and none is brighter or darker than the image
+    # each part gets a share of the residual in proportion to its weight squared, and stays in the image's range
     own_mean, other_mean = torch.where(is_near, front, back), torch.where(is_near, back, front)
     own_weight = 1.0 - weight
     unexplained = colour - own_weight * own_mean - weight * other_mean
     moved = weight * (other_mean + unexplained * weight / (weight**2 + own_weight**2))
     item = pixels.places(edge_pixels, *coc_px.shape[-2:])[0]
-    range_of_image = light.amin((2, 3)), light.amax((2, 3))  # bounded: 0 of something infinite would be no number
+    range_of_image = light.amin((2, 3)), light.amax((2, 3))  # clamped: 0 * inf would be NaN
     least, most = ((extreme[item].t() / brightest).clamp(-_UNBOUNDED, _UNBOUNDED) for extreme in range_of_image)
     moved = torch.minimum(moved.maximum(colour - own_weight * most), colour - own_weight * least)
     moved = torch.minimum(moved.maximum(weight * least), weight * most)
@@ -134,21 +136,25 @@ def attribute_emitters(
 ) -> Matted:
     """Gives the light of highlights to the surface on which their emitter lies.
 
-    An emitter seen through hair or twigs shines into pixels whose depth is that of a strand, and one in front of a
-    wall into pixels around it whose depth is the wall's. A highlight's pixel is such a one where its own surface is dim
-    beside it and farther pixels around, or nearer ones that touch it, are about as bright. Of its light what exceeds
-    the own surface's is then the other's, which may cover more than half of the pixel. In turn the emitter's own pixels
-    keep what another surface would get of them that is dim beside it and nowhere as bright.
+    An emitter seen through hair shines into pixels that have the depth of a strand. An emitter in front of a wall
+    shines into pixels around it that have the depth of the wall. In a highlight's pixel, for emitters in front and then
+    for emitters behind:
+
+    1. Test for an emitter on another surface: its own surface is dim around it, and farther pixels, or nearer ones that
+       touch it, are about as bright as the highlight.
+    2. If so, the other surface gets the light above that of the own one, and may cover more than half of the pixel.
+    3. Conversely, if the emitter lies on the pixel's own surface, reduce the weight of the other surface. It does if
+       the other surface is dim around the pixel and nowhere as bright as the highlight.
 
     Args:
         light: ``[B, C, H, W]``.
         coc_px: ``[B, 1, H, W]``, signed.
-        threshold: Light from which on a pixel is a highlight's, ``[B, 1, H, W]``.
+        threshold: Light above which a pixel is a highlight, ``[B, 1, H, W]``.
         valid: As for :func:`matte`.
-        surfaces: What :func:`matte` returns.
+        surfaces: The result of :func:`matte`.
 
     Returns:
-        The same, changed at those pixels.
+        The surfaces, changed at those pixels.
     """
     brightest = light.amax(1, keepdim=True)
     is_bright = brightest > threshold
@@ -168,10 +174,10 @@ def attribute_emitters(
     nearest = window_coc.amin(0)
 
     def beyond(coc: Tensor, side: float, share: float) -> tuple[Tensor, ...]:
-        """How surely the emitter lies behind (side 1) or before (-1) surfaces of a coc, and not on them.
+        """Confidence that the emitter lies behind (side 1) or in front of (-1) surfaces with coc ``coc``, 0 to 1.
 
-        It does if what is there has more than a share of their peak. And light of these surfaces where they are
-        dimmest, the largest light, and the emitter's coc.
+        It requires pixels there whose peak exceeds ``share`` times that of the surfaces. Also returns the light of the
+        surfaces where they are dimmest, the larger of both peaks, and the emitter's coc.
         """
         away = side * (window_coc - coc)
         there = (counted if side > 0 else touches) * (away - 1.0).clamp(0.0, 1.0)
@@ -190,12 +196,12 @@ def attribute_emitters(
     other, other_coc, weight = other / scale, other_coc[0], weight[0]
     for side, least_share in ((-1.0, 1.0), (1.0, 0.5)):
         sureness, surface, top, emitter_coc = beyond(own_coc, side, least_share)
-        if side < 0:  # what is seen through a surface is not before it
+        if side < 0:  # an emitter seen through a surface is not in front of it
             sureness = sureness * (1.0 - beyond(emitter_coc, 1.0, 0.5)[0])
         floor = surface.amax(0)
         share = ((own_peak - floor) / (top - floor).clamp_min(1e-12)).clamp(1.0 - _MOST_WEIGHT, _MOST_WEIGHT)
         emitter = (seen - (1.0 - share) * surface).clamp_min(0.0)
-        # what was found without it goes on before surfaces, which are mostly the same; behind them it fades out first
+        # in front, the earlier result fades into the new one, mostly the same surface; behind, it fades out first
         kept, given = (1.0 - sureness, sureness) if side < 0 else (1.0 - 2.0 * sureness, 2.0 * sureness - 1.0)
         kept, given = kept.clamp_min(0.0) * weight, given.clamp_min(0.0)
         moved, weight = kept * other + given * emitter, kept + given * share
@@ -203,7 +209,7 @@ def attribute_emitters(
         other = torch.where(weight > 0, moved / known, 0.0)
         other_coc = torch.lerp(other_coc, emitter_coc, given * share / known)
 
-        # and of its own pixels another surface would get some
+        # the other way round: an emitter on the own surface
         bright_other = (other.amax(0) / limit.clamp_min(torch.finfo(light.dtype).tiny) - 1.0).clamp(0.0, 1.0)
         apart = (side * (own_coc - other_coc) - 1.0).clamp(0.0, 1.0)
         weight = weight * (1.0 - apart * bright_other * beyond(other_coc, side, 1.0)[0])
@@ -213,14 +219,14 @@ def attribute_emitters(
 
 
 def _falloff(light: Tensor, reach: int) -> Tensor:
-    """Weights of the pixels of a window around its middle, ``[(2 reach + 1)^2, 1]``."""
+    """Gaussian weights of the pixels of a window, ``[(2 reach + 1)^2, 1]``."""
     steps = range(-reach, reach + 1)
     return light.new_tensor([_FALLOFF ** (dy * dy + dx * dx) for dy in steps for dx in steps])[:, None]
 
 
 def _mean_of(colour: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted mean over n of colours ``[C, n, P]`` and their variance, summed over colours, ``[P]``."""
+    """Weighted mean ``[C, P]`` of colours ``[C, n, P]`` over n, and their variance ``[P]``, summed over channels."""
     total = weight.sum(0).clamp_min(1e-12)
     mean = (colour * weight).sum(1) / total
-    # not as a difference of squares, whose rounding would decide where all colours are alike
+    # not E[x^2] - E[x]^2, whose rounding error dominates where all colours are alike
     return mean, (((colour - mean[:, None]) ** 2 * weight).sum(1) / total).sum(0)

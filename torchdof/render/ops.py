@@ -1,8 +1,8 @@
-"""Operations that an exported graph does otherwise than eager code: an object that is passed down the pipeline.
+"""Operations that an exported graph implements differently from eager code; the pipeline passes them as an object.
 
-Eager code looks at numbers and then chooses its work. A graph cannot: it holds branches and loops instead. Each
-operation is given what eager code does as a function; :data:`EAGER` calls it, a graph may do something else to the same
-result (``export/operations.py``).
+Eager code reads values of tensors and then chooses its work. A graph cannot: it needs explicit branches and loops. Each
+operation takes the eager code as a function. :data:`EAGER` calls this function; the operations of a graph may compute
+the same result in another way (``export/operations.py``).
 """
 
 from collections.abc import Callable, Sequence
@@ -16,14 +16,15 @@ from .surfaces import Frame, Highlights
 
 __all__ = ["EAGER", "Level", "Ops", "Seen"]
 
-_PART = 40_000  # pixels that are looked at together
+_PART = 40_000  # pixels that are processed at once; larger: faster, with more memory
 
 
 class Level(NamedTuple):
-    """Farthest surfaces at every ``step``-th pixel: light, coc and weight ``[B, C + 2, H, W]``.
+    """A level of a pyramid: the farthest surfaces at every ``step``-th pixel.
 
-    ``vote`` is the level's weight against other levels; None means that ``values`` hold it in their weights. A pixel
-    uses the level where its blur exceeds ``least_px`` pixels, and fully above twice that blur.
+    ``values`` are light, coc and weight, ``[B, C + 2, H, W]``. ``vote`` is the weight of the level against others; None
+    means that the weights in ``values`` include it. A pixel uses the level if its blur exceeds ``least_px`` pixels, and
+    fully from twice that blur.
     """
 
     values: Tensor
@@ -33,49 +34,49 @@ class Level(NamedTuple):
 
 
 Seen = tuple[Tensor, Tensor]
-"""What levels show behind a map: light and coc ``[B, C + 1, h, w]``, and the sum of their votes ``[B, 1, h, w]``."""
+"""Light and coc behind a map, ``[B, C + 1, h, w]``, and the sum of the levels' votes, ``[B, 1, h, w]``."""
 
 
 class Ops:
     """The operations of eager code."""
 
     lens_width: int | None = None
-    """Width in pixels of the image whose kernels are used, for a table with lengths; None: the image's own."""
+    """Width in pixels of the image for which a blur table with lengths makes kernels; None means the image at hand."""
 
     kernels: Sequence[Tensor] | None = None
-    """Kernels of all layers, made before; None: they are made for the frame at hand."""
+    """Kernels of all layers, made in advance; None means they are made for the frame at hand."""
 
     def choose(self, needed: Callable[[], Tensor], result: Tensor, given: Tensor) -> Tensor:
-        """``result`` where ``needed()``, a bool ``[]``, is true; else ``given``, which then equals it.
+        """Returns ``result`` if ``needed()``, a bool ``[]``, is true, else ``given``, which equals it in that case.
 
-        A graph computes what only the result needs only then.
+        A graph computes ``result`` only if it is needed.
         """
         return result
 
     def by_parts(self, look: Callable[[Tensor], Tensor], pixels: Tensor) -> Tensor:
-        """``look(pixels)``, ``[n, P]``, of pixels ``[P]``: by parts of the list, to bound the memory."""
+        """Computes ``look(pixels)``, ``[n, P]``, for pixels ``[P]``, in parts of the list to bound the memory."""
         return look(pixels) if is_traced() else torch.cat([look(part) for part in pixels.split(_PART)], 1)
 
     def seen(
         self, look: Callable[[Sequence[Level], Tensor], Seen], levels: Sequence[Level], coc_px: Tensor, mask: Tensor
     ) -> Seen:
-        """``look(levels, coc_px)``: what levels of a pyramid show behind each pixel. A mask of 0 and 1 says where."""
+        """Computes ``look(levels, coc_px)``, light and coc behind each pixel, needed where ``mask`` is 1, not 0."""
         return look(levels, coc_px)
 
     def splat(
         self, splat: Callable[[], Tensor], rays: Highlights, coc_px: Tensor, obstacles: Sequence[tuple[Tensor, Tensor]]
     ) -> Tensor:
-        """Highlights to ``[B, C, H, W]``, given the frame's coc and what may stand in their way: coc and cover."""
+        """Splats highlights to ``[B, C, H, W]``; ``obstacles`` are coc and cover of the occluders."""
         return splat()
 
     def align(self, margin: int, coarsest: int) -> int:
-        """What a frame's sides must be multiples of, given the pixels around it and those of the coarsest layer's."""
+        """Number that divides height and width of a frame; here ``coarsest``, the scale of the coarsest layer."""
         return coarsest
 
     def render(self, frame: Frame, render: Callable[[Frame], Tensor]) -> Tensor:
-        """The picture of a frame, given what renders a frame."""
+        """Renders a frame with the function ``render``."""
         return render(frame)
 
 
 EAGER = Ops()
-"""Those of all code but an exported graph's."""
+"""The operations of eager code, and the default everywhere."""

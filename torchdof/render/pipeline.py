@@ -1,6 +1,6 @@
-"""The chain, step by step: depth edges, a plan, surfaces and highlights, the layers they lie in, and the picture.
+"""Render one image: plan layers, split mixed pixels, fill hidden areas, extract highlights, blur layers, composite.
 
-Every step is given the same operations (:mod:`torchdof.render.ops`): those of eager code, or of an exported graph.
+Each step takes ``ops`` (:mod:`torchdof.render.ops`): one set of operations for eager code, another for exported graphs.
 """
 
 import dataclasses
@@ -27,8 +27,8 @@ from .surfaces import Frame, Surface, framed
 
 __all__ = ["blur", "blur_stack"]
 
-_REACH = 4.0  # blur radii within which what lies around a pixel can change it: its light, and what is filled in behind
-_SAME_PX = 0.5  # a background whose coc differs by less is the surface that the image shows
+_REACH = 4.0  # largest blur radii: margin rendered around an attention area; smaller changes its light and hidden fill
+_SAME_PX = 0.5  # px of coc: a background at most this far behind the image's surface counts as the same surface
 
 
 def blur(
@@ -40,22 +40,22 @@ def blur(
     attention: Attention | None = None,
     ops: Ops = EAGER,
 ) -> Tensor:
-    """Depth of field of checked arguments, as :func:`torchdof.blur_by_coc` has them.
+    """Render depth of field from the checked arguments of :func:`torchdof.blur_by_coc`.
 
     Args:
         image: ``[B, C, H, W]``.
-        coc_px: ``[B or 1, 1, H, W]``, with edges as they are given.
-        plan: Layers; without a plan each item gets its own.
-        options: Of the rendering.
-        behind: Background and its coc.
-        attention: Where the tolerance is kept; elsewhere that of a draft is enough.
-        ops: The operations of all steps.
+        coc_px: ``[B or 1, 1, H, W]``, before the repair of depth edges.
+        plan: Layers; None plans each item separately.
+        options: Options of the rendering.
+        behind: Known background ``[B, C, H, W]`` and its coc ``[B, 1, H, W]``.
+        attention: Area rendered within ``options.tolerance``; the rest is rendered with the tolerance ``"draft"``.
+        ops: Operations of all steps.
     """
     coc_px = edges.mended(image, coc_px, options.depth_edges, ops)
     if attention is None:
         return _planned(image, coc_px, plan, options, behind, ops)
     weight = weight_map(attention, image)
-    if options.table.depends_on_place:  # a part by itself would have another middle: all of it keeps the tolerance
+    if options.table.depends_on_place:  # kernels depend on the distance from the frame's middle, so no part is cut out
         return _planned(image, coc_px, plan, options, behind, ops)
     loose = dataclasses.replace(options, tolerance=max(options.tolerance, NAMED_TOLERANCES["draft"]))
     known = torch.nan_to_num(coc_px.detach(), nan=0.0, posinf=0.0, neginf=0.0)
@@ -76,7 +76,7 @@ def blur(
 def _planned(
     image: Tensor, coc_px: Tensor, plan: Plan | None, options: Options, behind: tuple[Tensor, Tensor] | None, ops: Ops
 ) -> Tensor:
-    """The picture of an image whose edges are mended, with a plan, or one for each item."""
+    """Render an image with repaired depth edges, with the given plan or with one plan for each item."""
     if is_traced() and options.table.depends_on_place:
         raise ValueError(
             "a compiled or exported graph has one kernel a layer; take a table without vignetting or field"
@@ -85,7 +85,8 @@ def _planned(
     maps = [image, coc_px, *(behind or ())]
     maps = [t.to(wide).contiguous().expand(image.shape[0], -1, -1, -1) for t in maps]
     if plan is None and is_traced():
-        # numbers that the graph is made for: those that differ between two modules would be variables in it
+        # Floats rebuilt from hex become constants of the graph. The options' own floats would become inputs of the
+        # graph if they differ between two modules.
         max_coc_px, tolerance = (float.fromhex(float(n).hex()) for n in (options.max_coc_px, options.tolerance))
         plan = Plan.all(max_coc_px, tolerance)
     elif plan is None and any(map(is_differentiated, maps[1::2])):
@@ -94,7 +95,7 @@ def _planned(
         plan = plan.reaching(torch.cat(maps[1::2]))
     if plan is not None:
         return _render_item(plan, options, ops, *maps).to(image.dtype)
-    # each item has its own layers, as it would have alone
+    # one plan for each item, so that the result does not depend on the rest of the batch
     items = []
     for item in zip(*(t.split(1) for t in maps), strict=True):
         cocs = item[1] if behind is None else torch.cat(item[1::2])
@@ -103,14 +104,14 @@ def _planned(
 
 
 def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
-    """Depth of field of checked layers ``[B, N, C + 1, H, W]``; see :meth:`torchdof.DepthOfField.layers`."""
-    if len(rgba) > 1 and not is_differentiated(coc_px):  # each item has its own layers, as it would have alone
+    """Render checked layers ``[B, N, C + 1, H, W]``; see :meth:`torchdof.DepthOfField.layers`."""
+    if len(rgba) > 1 and not is_differentiated(coc_px):  # one plan for each item, independent of the batch
         return torch.cat([blur_stack(*item, options) for item in zip(rgba.split(1), coc_px.split(1), strict=True)])
     wide = torch.float64 if torch.float64 in (rgba.dtype, coc_px.dtype) else torch.float32
     light, coc = rgba.to(wide), coc_px.to(wide)
     order = torch.where(torch.isfinite(coc), coc, torch.inf).argsort(1)  # near to far
     cover = light[:, :, -1:].clamp(0.0, 1.0)
-    scale = headroom.factor(light.flatten(1, 2))  # here, for light over a tiny coverage is brighter still
+    scale = headroom.factor(light.flatten(1, 2))  # before the division, which makes light of tiny coverage huge
     valid = torch.isfinite(coc) & torch.isfinite(light).all(2, keepdim=True) & (cover > 0)
     cover, coc = torch.where(valid, cover, 0.0), torch.where(valid, coc, coc.new_zeros(()))
     light = torch.where(valid, light * scale[:, None] / cover.clamp_min(1e-12), 0.0)
@@ -130,24 +131,33 @@ def _render_item(
     behind_coc: Tensor | None = None,
     cover: Tensor | None = None,
 ) -> Tensor:
-    """The picture ``[B, C, H, W]`` of float maps with a plan: the one entry to both engines.
+    """Render float maps with a plan to ``[B, C, H, W]``: the only entry to both engines.
 
-    An image ``[B, C, H, W]`` and its coc ``[B, 1, H, W]``, with what is seen where its nearer surfaces are taken away,
-    if that is known; or, with how much each covers ``[B, N, 1, H, W]``, a stack of layers ``[B, N, ...]``, near to far.
+    The maps are either an image ``light [B, C, H, W]`` with ``coc [B, 1, H, W]`` and optionally a known background,
+    ``behind_light`` and ``behind_coc``; or, with ``cover [B, N, 1, H, W]``, a stack of layers ``[B, N, ...]``, near to
+    far.
+
+    1. Let the compiled engine render, if it supports the arguments.
+    2. A stack: composite its layers in front of a black surface. All in focus: return the image.
+    3. Set invalid pixels to 0, and scale down light whose powers would overflow.
+    4. Compute the limit above which light belongs to a highlight.
+    5. Split mixed pixels, and fill hidden surfaces or take the known background.
+    6. Take the highlights out of the surfaces and splat them ray by ray.
+    7. Blur and composite the layers, add the highlights, and undo step 3.
     """
     if plan.nodes != (0.0,):
         picture = compiled.picture(plan, options, light, coc, behind_light, behind_coc, cover, ops.lens_width)
         if picture is not None:
             return picture
-    low, high = plan.coc_px[0], plan.coc_px[-1]  # beyond, blurs are alike, and differences of huge ones would cancel
+    low, high = plan.coc_px[0], plan.coc_px[-1]  # clamp coc to these: differences of huge values would round badly
     if cover is not None:
         coc = coc.clamp(low, high)
         stack = [Surface(light[:, i], coc[:, i], cover[:, i]) for i in range(light.shape[1])]
-        # what no layer covers is seen through all of them
+        # a black surface behind the layers, for pixels that no layer covers
         stack.append(Surface(torch.zeros_like(light[:, 0]), torch.full_like(coc[:, 0], high)))
         return _composite(stack, None, plan, options, ops, image=None)
     if plan.nodes == (0.0,):
-        # in focus: nothing changes, but whoever asks for the gradient of the coc is told that it is 0
+        # all in focus: the image is unchanged; with the term 0 * coc, the coc has a gradient of 0 instead of None
         return light + 0.0 * torch.nan_to_num(coc) if is_differentiated(coc) else light.clone()
     image, valid, weight = light, None, None
     if not options.check:
@@ -159,15 +169,15 @@ def _render_item(
     if not has_room:
         light, behind_light = light * scale, None if behind_light is None else behind_light * scale
 
-    # what is a highlight; without occlusion it matters only where a light is too bright for a coarse layer
+    # limit of highlights; without occlusion only those are splatted that a coarse layer would soften
     crisp_px = plan.crisp_px if options.method == "layered" else math.inf
     coarse = plan.rays and crisp_px < max(abs(c) for c in plan.coc_px)
     limit = highlights.threshold(light, weight) if options.occlusion or options.normalize or coarse else None
-    # a plane's one kernel is exact, but for where blocks of the frame share it
+    # a plane has one kernel, which is exact unless it changes across the frame: then blocks of pixels share kernels
     several = len(plan.nodes) > 1 or options.table.depends_on_place
     splatted = several and (options.occlusion or coarse)
 
-    # the surfaces of each pixel, and what is behind all of them
+    # surfaces of each pixel, and the light behind all of them
     surfaces, behind = [Surface(light, coc, weight)], None
     if behind_light is not None and behind_coc is not None and limit is not None:
         surfaces = _before_background(surfaces[0], behind_light, behind_coc, (low, high), options)
@@ -176,24 +186,23 @@ def _render_item(
         levels = min(math.ceil(math.log2(widest)) + 1, 7)
         surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels, ops)
 
-    # the highlights of these, ray by ray
+    # highlights of these surfaces, ray by ray
     splats = None
     if limit is not None and splatted and plan.rays:
-        # without occlusion only those that coarse layers would soften
         from_px = 0.0 if options.occlusion else crisp_px - 1.0
-        # a known background says itself what is behind a mixed pixel
+        # with a known background, mixed pixels need no second surface for their highlights
         beside = surfaces[::-1] if len(surfaces) == 2 else [None] * len(surfaces)
         most = highlights.affordable_taps(coc) if options.occlusion else None
         extracted = [
             highlights.extract(s, limit, from_px, b, coc, most, ops) for s, b in zip(surfaces, beside, strict=True)
         ]
         surfaces, rays = [s for s, _ in extracted], [r for _, r in extracted if r is not None]
-        # what may stand in their way, the image's own surface first; a known background is in nobody's
+        # surfaces that can block rays, the image's own first; a known background is the farthest and blocks none
         shown = surfaces if behind_light is None else surfaces[1::-1]
         if rays:
             splats = highlights.splat(rays, shown, options.table, options.occlusion, plan.kernels_per_px, ops)
 
-    # and all of it in layers, each scattered, far to near
+    # blur and composite the layers, far to near
     own = 0 if behind_light is None else 1
     out = _composite(surfaces, behind, plan, options, ops, own, limit, splats)
     out = out if has_room else out / scale
@@ -204,16 +213,16 @@ def _render_item(
 def _before_background(
     surface: Surface, behind: Tensor, behind_coc: Tensor, reach: tuple[float, float], options: Options
 ) -> list[Surface]:
-    """Surfaces of an image in front of a known background, near to far, with coc within the layers' reach."""
+    """Surfaces of an image in front of a known background, near to far; coc is clamped to ``reach``."""
     light, coc, weight = surface
     valid = None if options.check else torch.isfinite(behind_coc) & torch.isfinite(behind).all(1, keepdim=True)
     behind_coc = behind_coc.clamp(*reach)
     own_light, other_light, other_coc, other_weight = matte(light, coc, weight)
-    # what shows past a nearer surface of a mixed pixel is the background's to tell
+    # of the second surfaces of mixed pixels keep the nearer ones; the known background replaces the farther ones
     own_weight, other_weight = 1.0 - other_weight, torch.where(other_coc < coc, other_weight, 0.0)
     if weight is not None:
         own_weight, other_weight = own_weight * weight, other_weight * weight
-    apart = (behind_coc - coc - _SAME_PX).clamp(0.0, 1.0)  # else the image itself shows it
+    apart = (behind_coc - coc - _SAME_PX).clamp(0.0, 1.0)  # 0: the background is the surface in the image
     behind_weight = apart + (1.0 - apart) * other_weight
     if valid is not None:
         behind, behind_coc, behind_weight = (torch.where(valid, t, 0.0) for t in (behind, behind_coc, behind_weight))
@@ -232,7 +241,7 @@ def _composite(
     limit: Tensor | None = None,
     splats: Tensor | None = None,
 ) -> Tensor:
-    """Surfaces, and the light of highlights, to a picture; ``image`` is the image's own surface, None of layers."""
+    """Composite surfaces and add highlights; ``image`` is the index of the image's own surface, None for a stack."""
     light, layered = surfaces[0].light, options.method == "layered"
     size = (light.shape[-2], light.shape[-1])
     blurs = plan.blurs(options.table, size, light.dtype, light.device, layered, ops.lens_width, ops.kernels)

@@ -1,4 +1,4 @@
-"""What a scene needs: the layers to render it with, for a tolerance, and their kernels."""
+"""Choose the layers that render a scene within a tolerance, and make their kernels."""
 
 import dataclasses
 import math
@@ -19,19 +19,19 @@ from .layer_weights import blur_axis, from_blur_axis, ramps, weights_at_or_behin
 
 __all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for", "layer_spots", "longest_px"]
 
-KERNELS_PER_PX = 32  # of radius, for highlights
-_FEWER_KERNELS_PER_PX = 4  # for those of a graph, which holds them all; costs up to 0.02 dB
-_COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # blurs from which each next half of the resolution will do at 1/255
-_LEAST_CUT = 24  # pixels of a layer: kernels are not cut for smaller frames, that a graph's do not depend on sizes
-_SMALL_RADII = 3.0  # a frame no larger than so many of its largest blurs is planned for less than the tolerance
-_FARTHEST_PX = 1e9  # of a layer; frames are smaller
+KERNELS_PER_PX = 32  # kernels for highlights, per px of radius; more are smoother and take more memory
+_FEWER_KERNELS_PER_PX = 4  # the same in a graph, which holds all kernels as constants; costs up to 0.02 dB
+_COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # px: layers from these radii on have 1/2, 1/4, ... resolution at 1/255
+_LEAST_CUT = 24  # layer pixels: kernels that reach less are never cut, so that in a graph they do not depend on sizes
+_SMALL_RADII = 3.0  # blur radii: frames with a shorter side below this are planned for a smaller tolerance
+_FARTHEST_PX = 1e9  # px: upper limit of nodes; frames are smaller
 
 
 @dataclasses.dataclass(frozen=True)
 class Blur:
     """How one layer is scattered: at every ``scale``-th pixel, with a kernel ``[1 or C, k, k]`` in such pixels.
 
-    Where kernels depend on the place, ``shares`` tell what becomes of the kernel across the frame.
+    ``shares`` are the masks that change the kernel across the frame; None: it is the same everywhere.
     """
 
     kernel: Tensor
@@ -51,19 +51,19 @@ class Blur:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """Layers of a rendering, near to far; ``print`` tells them.
+    """Layers of a rendering, near to far; ``print(plan)`` lists them.
 
     Args:
         nodes: Places of the layers on the blur axis (see :mod:`torchdof.render.layer_weights`), strictly increasing.
-        tolerance: What the plan was made for, in [0, 1).
-        rays: Highlights are splatted (:mod:`torchdof.render.highlights`) where layers would not do.
-        grows: Layers are added where a scene is blurred beyond them; False, as of plans for every scene: what is beyond
-            is blurred as far as the outermost ones.
-        kernels_per_px: Of radius, for these highlights; between them kernels are interpolated.
-        pixels: Share of the scene's pixels that each layer carries, where it was asked for.
+        tolerance: Tolerance that the plan was made for, in [0, 1).
+        rays: Whether highlights are splatted (:mod:`torchdof.render.highlights`) where layers would soften them.
+        grows: Whether layers are added for a scene that is blurred more than the outermost ones. False, as in plans
+            for every scene: larger blurs are clamped to the outermost layers.
+        kernels_per_px: Kernels of highlights per pixel of radius; between them kernels are interpolated.
+        pixels: Share of the scene's pixels in each layer; None unless :meth:`of_pixels` computed it.
 
     Raises:
-        ValueError: If there are no nodes in order, or the tolerance is none.
+        ValueError: If ``nodes`` are not strictly increasing numbers, or ``tolerance`` is not a number in [0, 1).
     """
 
     nodes: tuple[float, ...]
@@ -74,7 +74,7 @@ class Plan:
     pixels: tuple[float, ...] | None = dataclasses.field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        if is_traced():  # its numbers are not to be looked at
+        if is_traced():  # values cannot be read
             return
         nodes = self.nodes
         plain = isinstance(nodes, tuple) and all(isinstance(x, int | float) and abs(x) < _FARTHEST_PX for x in nodes)
@@ -82,17 +82,18 @@ class Plan:
             raise ValueError(
                 f"plan must hold layers as a tuple of strictly increasing numbers below 1e9 px, got {show(nodes)}"
             )
-        if isinstance(self.tolerance, str):  # names are for those who call a rendering
+        if isinstance(self.tolerance, str):  # names such as "draft" are for options
             raise ValueError(f"tolerance of a plan must be a number in [0, 1), such as 1/255, got {self.tolerance!r}")
         tolerance_of(self.tolerance)
 
     @classmethod
     def of_frame(cls, coc_px: Tensor, tolerance: float, still: bool = False) -> "Plan":
-        """Layers for a frame ``[B, 1, H, W]`` whose error is to be at most a tolerance: the plan of every rendering.
+        """Layers for a frame ``[B, 1, H, W]`` whose error must not exceed ``tolerance``: the plan of every rendering.
 
-        Errors are largest beside edges and the border, and where blurs are as large as the frame these are everywhere:
-        such a frame is planned for less, though not for the sake of a few pixels. For a plan that is to be ``still`` it
-        is a whole power of 1/2 of the tolerance, lest layers move with the scene.
+        Errors are largest beside depth edges and the border. In a frame that is small compared with its blur radii,
+        most pixels are near one: the tolerance is multiplied by ``shorter side / (3 * radius)``, with the mean radius
+        of the most blurred hundredth of its pixels. With ``still`` the factor is rounded down to a power of 1/2, so
+        that layers do not move with the scene.
         """
         if not still and coc_px.dtype == torch.float32 and is_in_memory(coc_px) and native.chosen():
             return cls(*native.plan(coc_px, tolerance))
@@ -107,16 +108,16 @@ class Plan:
 
     @classmethod
     def of_scene(cls, coc_px: Tensor, tolerance: float) -> "Plan":
-        """Layers for this scene: they span the coc that occur, with one on each end, and lie close at those of borders.
+        """Layers for one scene ``[B, 1, H, W]``, at both ends of its coc range and dense near the coc of its border.
 
-        A scene ``[B, 1, H, W]`` of one plane gets one layer, and its kernel is exact. NaN is left out.
+        A scene of one plane gets one layer, whose kernel is exact. NaN is ignored.
         """
         coc_px = coc_px.detach()
         return cls._between(*layer_cocs.extent(coc_px), coc_px, tolerance)
 
     @classmethod
     def _between(cls, low: float, high: float, coc_px: Tensor, tolerance: float) -> "Plan":
-        """The same, of a scene whose ends on the blur axis are known."""
+        """The same, for a scene that spans ``low`` to ``high`` on the blur axis."""
         if high <= low:
             return cls((low,), tolerance)
         fixed = [low, high]
@@ -126,7 +127,7 @@ class Plan:
                 for node in (border, border - finest, border + finest):
                     if low < node < high and min(abs(node - other) for other in fixed) > 0.6 * finest:
                         fixed.append(node)
-        # those in between make room for these smoothly: a picture must not jump when a scene moves
+        # nodes between the fixed ones slide smoothly onto them, so that the picture does not jump when a scene moves
         nodes = {*fixed}
         for node in layer_cocs.spaced_nodes(low, high, tolerance):
             if low < node < high:
@@ -135,14 +136,14 @@ class Plan:
 
     @classmethod
     def still(cls, coc_px: Tensor, tolerance: float) -> "Plan":
-        """Layers that reach as far as this scene does but do not move with it: for gradients."""
+        """Layers at places that do not depend on the scene, as many as its coc range needs: for gradients."""
         return cls(layer_cocs.spaced_nodes(*layer_cocs.extent(coc_px.detach()), tolerance), tolerance)
 
     @classmethod
     def all(cls, max_coc_px: float, tolerance: float, rays: bool = False) -> "Plan":
-        """Layers for every scene up to a radius: the plan of a compiled module, or with rays of an exported one.
+        """Layers for every scene up to a radius: the plan of a compiled module or, with ``rays``, of an exported one.
 
-        Nothing tells where the borders of these scenes lie. So coarse layers, where that matters, lie denser.
+        The coc at the borders of these scenes is unknown, so the coarse layers, whose errors it affects, are denser.
         """
         reach = float(blur_axis(torch.tensor(max_coc_px, dtype=torch.float64, device="cpu")))
         dense_from = float(blur_axis(torch.tensor(_COARSE_FROM_PX[0], dtype=torch.float64, device="cpu")))
@@ -151,7 +152,7 @@ class Plan:
         return cls((-reach, *inner, reach), tolerance, rays, grows=False, kernels_per_px=_FEWER_KERNELS_PER_PX)
 
     def reaching(self, coc_px: Tensor) -> "Plan":
-        """This plan, with layers added outwards as far as a scene ``[B, 1, H, W]`` is blurred; itself if it reaches."""
+        """This plan with layers added outwards until they span a scene ``[B, 1, H, W]``; itself if none is missing."""
         nearest, farthest = layer_cocs.extent(coc_px.detach())
         if not self.grows or (self.nodes[0] <= nearest and farthest <= self.nodes[-1]):
             return self
@@ -163,9 +164,9 @@ class Plan:
         return dataclasses.replace(self, nodes=tuple(sorted(nodes)), pixels=None)
 
     def of_pixels(self, coc_px: Tensor) -> "Plan":
-        """The same plan, told which share of a scene's pixels each layer carries: ``[B, 1, H, W]``."""
+        """The same plan with ``pixels``: the share of a scene ``[B, 1, H, W]`` that lies in each layer."""
         x = layer_cocs.on_axis(coc_px.detach(), max(coc_px.shape[-2:])).clamp(self.nodes[0], self.nodes[-1])
-        ends = ramps(self.nodes, x).split(1, 1)  # one at a time, for a frame may be large
+        ends = ramps(self.nodes, x).split(1, 1)  # one at a time, to bound the memory
         behind = [float(weights_at_or_behind(x, end).double().mean()) for end in ends]
         pixels = tuple(behind[k] - behind[k + 1] for k in range(len(self.nodes)))
         return dataclasses.replace(self, pixels=pixels)
@@ -186,7 +187,7 @@ class Plan:
 
     @property
     def crisp_px(self) -> float:
-        """Radius from which on light is blurred at a coarser resolution, all or in part; that softens highlights."""
+        """Radius in pixels above which highlights soften: a coarser resolution has at least a part in their blur."""
         coarse = [abs(coc) for coc in self.coc_px if self._scale(coc) > 1]
         if not coarse:
             return math.inf
@@ -204,10 +205,10 @@ class Plan:
     ) -> list[Blur]:
         """Kernel and resolution of each layer for a frame of ``size`` (height, width).
 
-        Kernels are cut to what reaches from one pixel of the frame to another; those of up to 23 pixels of their layer
-        to each side are left whole. Traced code holds them as constants, so a table that is tied to the width of the
-        image ties it as well. ``lens_width`` is the width of that image, if it is not the frame's own; ``kept`` are
-        the constants, if they are made already (:meth:`constants`).
+        Kernels are cut to the offsets between two pixels of the frame; those that reach at most 23 pixels of their
+        layer stay whole. Traced code holds kernels as constants, so a table with lengths fixes the image width as well.
+        ``lens_width`` is the width of the image whose kernels are used, if it differs from the frame's; ``kept`` are
+        the results of :meth:`constants`, if they exist already.
         """
         width, scales = self.layer_sizes(table, (size[0], lens_width or size[1]), coarse)
         if kept is not None or is_traced():
@@ -222,41 +223,41 @@ class Plan:
         return [Blur(*each) for each in zip(bank, scales, shares, strict=True)]
 
     def constants(self, table: BlurTable, coarse: bool, lens_width: int) -> list[Tensor]:
-        """Kernels that a trace takes as constants, none of them cut to a frame."""
+        """Kernels of the layers as constants of a trace, not cut to a frame."""
         return _layer_kernels(table, self.coc_px, *self.layer_sizes(table, (1, lens_width), coarse))
 
     def shares(
         self, table: BlurTable, scales: Sequence[int], size: tuple[int, int], like: Tensor | None = None
     ) -> list[Shares]:
-        """What the field leaves of each layer's kernel, in the type of a tensor; none of a lens that has no field."""
+        """Field masks of each layer's kernel, in the dtype and device of ``like``; empty for a lens without a field."""
         if not table.depends_on_place:
             return []
         shares = [layer_shares(table, coc, scale, size) for coc, scale in zip(self.coc_px, scales, strict=True)]
         return shares if like is None else [each.to(like) for each in shares]
 
     def layer_sizes(self, table: BlurTable, size: tuple[int, int], coarse: bool) -> tuple[int, tuple[int, ...]]:
-        """Width of the image that kernels depend on, 1 where they depend on none, and the resolution of each layer."""
+        """Image width for the kernels (1 if they do not depend on it) and downsampling factor of each layer."""
         width = 1 if table.unit == "relative" else int(size[1])
         coarse = coarse and len(self.nodes) > 1  # a plane is exact
         return width, tuple(self._scale(table.finest_px(coc, width)) if coarse else 1 for coc in self.coc_px)
 
     def _scale(self, coc_px: float) -> int:
-        """Resolution a layer is convolved at: every ``scale``-th pixel, a power of two."""
-        # rounded: whether a coc is in float32 or float64 does not decide
+        """Downsampling factor of a layer, a power of two."""
+        # rounded, so that float32 and float64 give the same factor
         reach = round(abs(coc_px) * math.sqrt(self.tolerance * 255.0), 4)
         return 2 ** sum(reach >= start for start in _COARSE_FROM_PX)
 
 
 def longest_px(size: tuple[int, int], scales: Sequence[int]) -> list[int]:
-    """Pixels of the longer side of a frame of ``size`` at every ``scale``-th one, to which kernels are cut."""
+    """Longer side of a frame of ``size`` in pixels of each layer: kernels are cut to it."""
     return [max(-(-max(size) // scale), _LEAST_CUT) for scale in scales]
 
 
 def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int, per_px: int = KERNELS_PER_PX) -> Tensor:
-    """Kernels ``[n, 1 or C, k, k]``, float64, of single pixels, such as highlights, of signed coc ``[n]``.
+    """Kernels ``[n, 1 or C, k, k]``, float64, of single pixels, such as highlights, with signed coc ``[n]``.
 
-    Each is interpolated between those of so many radii a pixel where no gradient asks for more. They are cut to what
-    reaches within a frame whose longer side is ``longest`` pixels.
+    Without gradients, each is interpolated between kernels at ``per_px`` radii per pixel. They are cut to the offsets
+    within a frame whose longer side is ``longest`` pixels.
     """
     if table.is_differentiated:
         kernels = table.kernels(coc_px, width)
@@ -275,13 +276,13 @@ def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int, per_
 def layer_spots(
     table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int], longest: Sequence[int] = ()
 ) -> Spots:
-    """What the kernels of layers at every ``scale``-th pixel are made from, cut to frames of so many of these."""
+    """Spots from which the kernels of layers are made, cut to frames of ``longest`` layer pixels."""
     bank = bank_of(table)
     sizes = [coc * shrink(bank, coc, width, scale) for coc, scale in zip(coc_px, scales, strict=True)]
     return bank.spots(sizes, width, scales, longest)
 
 
-@torch.inference_mode(False)  # what is kept must serve autograd as well
+@torch.inference_mode(False)  # kept tensors are used by autograd too, which refuses inference tensors
 def _layer_kernels(
     table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int], longest: Sequence[int] = ()
 ) -> list[Tensor]:
@@ -301,7 +302,7 @@ def _layer_kernels(
 
 
 def _masked(kernel: Tensor, size: tuple[int, int], scale: int) -> Tensor:
-    """A kernel of traced code, which keeps its size: taps that reach beyond a frame of a size are 0."""
+    """Set taps that reach beyond a frame of ``size`` to 0: in traced code a kernel keeps its shape."""
     half = kernel.shape[-1] // 2
     if half < _LEAST_CUT:
         return kernel

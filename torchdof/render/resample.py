@@ -1,4 +1,4 @@
-"""Resampling of depth: a map of another size than its image, at the image's."""
+"""Resamples a depth map to the size of its image."""
 
 import torch
 import torch.nn.functional as functional
@@ -11,17 +11,17 @@ __all__ = ["at_size_of"]
 
 
 def at_size_of(image: Tensor, depth: Tensor) -> Tensor:
-    """A depth map at the size of its image: resampled as 1 / depth, its edges then moved to where the image has them.
+    """Resamples a depth map to the size of its image, as 1 / depth, then moves its edges to those of the image.
 
     Args:
         image: ``[B, C, H, W]``, linear light.
-        depth: ``[B, 1, h, w]`` or ``[1, 1, h, w]``, metres, ``inf`` allowed, of the image's field of view. One whose
-            aspect ratio is off by up to 3 % is stretched. Pixels without depth (NaN, zero or negative) stay without it
-            and touch no other.
+        depth: ``[B, 1, h, w]`` or ``[1, 1, h, w]``, metres, ``inf`` allowed, with the image's field of view. If the
+            aspect ratio differs by up to 3 %, the map is stretched. Pixels without depth (NaN, zero or negative) stay
+            without depth and affect no others.
 
     Returns:
-        ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres; a map that has the image's size as it is. Gradients flow to the
-        depth but where an edge was repaired.
+        ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres; a map of the image's size is returned unchanged. Gradients
+        flow to the depth except at repaired edges.
 
     Raises:
         ValueError: If the shapes are not as described, or the aspect ratios differ by more than 3 %.

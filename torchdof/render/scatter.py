@@ -1,6 +1,6 @@
-"""The paper's scatter, literally: every pixel's light, multiplied into a kernel centred on the pixel, accumulated.
+"""The paper's scatter, literally: multiply each pixel's light by a kernel centred on the pixel, and add up.
 
-Light scattered over the frame's border is lost, nothing comes in.
+Light scattered beyond the frame's border is lost, and no light comes from there.
 """
 
 import math
@@ -16,7 +16,7 @@ from .convolution import DIRECT_TAPS, widest_float
 
 __all__ = ["fold"]
 
-_COLUMN_BYTES = 256 * 2**20
+_COLUMN_BYTES = 256 * 2**20  # bytes of the columns in memory at once; larger: fewer, larger strips
 
 
 def fold(
@@ -27,17 +27,17 @@ def fold(
     shares: Sequence[Shares] | None = None,
     frame: tuple[int, int] = (0, 0),
 ) -> Tensor:
-    """Columns of pixel light times kernel, summed where they fall by ``fold``.
+    """Multiply the light of each pixel by its kernel, and add the products where they land (``torch``'s ``fold``).
 
-    Works on so many rows at once that the columns stay within 256 MB. Sums of large kernels are taken in float64.
+    The products are made for strips of rows that take at most 256 MB. Large kernels are summed in float64.
 
     Args:
         light: ``[B, C, H, W]``.
         kernels: ``[1 or C, k, k]``, k odd; or, with weights, a bank of them ``[n, 1 or C, k, k]``.
         halo: Pixels on each side that scatter into the result ``[B, C, H - 2 halo, W - 2 halo]`` but are not in it.
-        weights: How much of each kernel of the bank a pixel is scattered with, ``[B, n, H, W]``.
-        shares: What becomes of each kernel of the bank across the frame; None: they are alike everywhere.
-        frame: Height and width of the frame, which begins ``halo`` pixels after the light; with ``shares`` only.
+        weights: Weight of each kernel of the bank in the kernel of each pixel, ``[B, n, H, W]``.
+        shares: Masks that change each kernel of the bank across the frame; None: kernels are the same everywhere.
+        frame: Height and width of the frame, which begins ``halo`` pixels after the light; used with ``shares``.
 
     Reference:
         Sato, Dobashi, Yamamoto, section 3, steps (a) to (c). The adjoint is ``unfold``.
@@ -53,7 +53,7 @@ def fold(
     strips = []
     for top in range(0, height, rows):
         strip, weight = (t[:, :, top : top + rows] for t in (light, weights))
-        # every pixel's own kernel
+        # the kernel of each pixel
         if shares is None:
             taps = torch.einsum("bnp,nct->bctp", weight.flatten(2), kernels.flatten(2))
         else:
@@ -78,13 +78,13 @@ def fold(
 def _of_pixels(
     kernel: Tensor, shares: Shares, first: tuple[int, int], count: tuple[int, int], size: tuple[int, int]
 ) -> Tensor:
-    """Each pixel's own kernel, ``[n, 1 or C, k, k]``.
+    """The masked kernel of each pixel of a block, ``[n, 1 or C, k, k]``.
 
     Args:
-        kernel: The table's own ``[1 or C, k, k]``, or several times those of C colours.
-        shares: At the frame's resolution.
-        first: Row and column of the first pixel.
-        count: Rows and columns of them.
+        kernel: Kernel of the table, ``[1 or C, k, k]``; those of C colours may be repeated.
+        shares: Masks at the frame's resolution.
+        first: Row and column of the block's first pixel.
+        count: Rows and columns of the block.
         size: Height and width of the frame.
     """
     half_diagonal = 0.5 * math.hypot(*size)

@@ -1,4 +1,4 @@
-"""Surfaces as the steps of the pipeline hand them on, and the frame that they make, continued over its border."""
+"""Surfaces, as the steps of the pipeline exchange them, and the padded frame from which layers are cut."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -15,18 +15,18 @@ from .layer_weights import blur_axis, eased, ramps, weights_at_or_behind
 __all__ = ["HIDDEN_WEIGHT", "Frame", "Highlights", "Placed", "Surface", "framed", "going_on"]
 
 HIDDEN_WEIGHT = 0.003
-"""Weight of a hidden sample against 1 of a visible one."""
+"""Weight of a hidden sample, which is guessed; a visible one has 1. A larger value mixes more guessed light in."""
 
 _HAIR = 0.06
-"""Share of a surface up to which, in a layer, it does not yet hide what is known behind it."""
+"""Share of a surface at or behind a layer at which it counts there in full; larger: it fades in over more depth."""
 _GOES_ON = 0.1
-"""Share of a pixel, beyond a hidden one's, from which on its farther surface goes on wholly behind the nearer one."""
+"""Visible share of a far surface, above HIDDEN_WEIGHT, at which it continues in full behind the near one."""
 
 
 class Surface(NamedTuple):
-    """What a surface contributes to each pixel: light ``[B, C, H, W]``, signed coc and weight ``[B, 1, H, W]``.
+    """A surface in each pixel: light ``[B, C, H, W]``, signed coc and weight ``[B, 1, H, W]``.
 
-    The weight is the part of the pixel that it covers; None is 1.
+    The weight is the share of the pixel that it covers; None means 1.
     """
 
     light: Tensor
@@ -43,7 +43,7 @@ class Highlights(NamedTuple):
 
 
 class Placed(NamedTuple):
-    """A surface continued over the frame's border; ``x`` is its place on the blur axis."""
+    """A surface continued beyond the frame's border; ``x`` is its place on the blur axis."""
 
     light: Tensor
     x: Tensor
@@ -52,19 +52,19 @@ class Placed(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """Surfaces of a frame, continued over its border; what the layers scatter is cut out of it.
+    """Surfaces of a frame, continued beyond its border; the layers are cut out of it.
 
     Args:
         surfaces: ``[B, ., h + 2 margin, w + 2 margin]`` where ``h, w`` is the area; stacked ones are near to far.
         nodes: Places of the layers on the blur axis, near to far.
-        ramps: Of these, as :func:`torchdof.render.layer_weights.ramps` gives them.
-        behind: Light behind all surfaces, ``[B, C, h, w]``; None: nothing is.
-        margin: Pixels on each side, as many as the widest kernel reaches.
-        area: Height and width, continued to whole blocks of the coarsest layer.
+        ramps: Ramps of the nodes, from :func:`torchdof.render.layer_weights.ramps`.
+        behind: Light behind all surfaces, ``[B, C, h, w]``; None: there is no such light.
+        margin: Pixels added on each side, as many as the widest kernel reaches.
+        area: Height and width of the image, extended to whole blocks of the coarsest layer.
         size: Height and width of the image.
-        occlusion: Layers occlude each other, and the ramps between them are eased.
-        stacked: The surfaces of a pixel, near to far, each cover it by their weight, whatever the others do. False:
-            their weights sum to at most 1.
+        occlusion: Whether layers occlude each other; then the ramps between them are eased.
+        stacked: True: each surface covers a pixel by its weight, independently of the others. False: the weights of a
+            pixel sum to at most 1.
     """
 
     surfaces: Sequence[Placed]
@@ -79,16 +79,16 @@ class Frame:
 
     @property
     def colours(self) -> int:
-        """C."""
+        """Number of colour channels, C."""
         return int(self.surfaces[0].light.shape[1])
 
     def cut(self, values: Tensor, halo: int) -> Tensor:
-        """The part of a map of the frame that reaches so far beyond its area."""
+        """Crop a map of the frame to its area and ``halo`` pixels around it."""
         start = self.margin - halo
         return values[..., start : start + self.area[0] + 2 * halo, start : start + self.area[1] + 2 * halo]
 
     def near_to_far(self) -> "Frame":
-        """The same with the nearer one of two surfaces first, pixel by pixel."""
+        """The same frame with its two surfaces sorted near to far in each pixel."""
         if self.stacked or len(self.surfaces) == 1:
             return self
         own, other = self.surfaces
@@ -99,7 +99,7 @@ class Frame:
         return dataclasses.replace(self, surfaces=[near, far])
 
     def occupied(self) -> list[bool]:
-        """Whether anything lies in each layer; in traced code, which cannot look, anything may."""
+        """Whether any pixel lies in each layer; True for all in traced code, where values cannot be read."""
         count = len(self.nodes)
         if is_traced():
             return [True] * count
@@ -110,15 +110,15 @@ class Frame:
         return [any(counts[max(2 * k - 1, 0) : 2 * k + 2]) for k in range(count)]
 
     def any_between(self, low: float, high: float, halo: int) -> Tensor:
-        """Whether anything, up to so far beyond the area, lies between two places on the blur axis: a bool ``[]``."""
+        """Whether a pixel within ``halo`` of the area lies between two places on the blur axis: a bool ``[]``."""
         middle, half = (low + high) / 2.0, (high - low) / 2.0
         x = torch.cat([s.x for s in self.surfaces], 1)
         return (self.cut(x, halo) - middle).abs().min() < half
 
     def layers(self, first: int, count: int, halo: int) -> tuple[Tensor, Tensor, Tensor]:
-        """What layers that follow each other scatter, with so many pixels beyond the area.
+        """Light and weights of ``count`` layers from ``first`` on, for the area and ``halo`` pixels around it.
 
-        It is their light ``m_k I``, ``[B, n, C, h, w]``, its weight ``m_k`` and the weight behind them ``M_k - m_k``,
+        Returns light ``m_k I``, ``[B, n, C, h, w]``, its weight ``m_k`` and the weight behind it ``M_k - m_k``,
         ``[B, n, 1, h, w]``.
         """
         surfaces = [Placed(*(self.cut(t, halo) for t in s if t is not None)) for s in self.surfaces]
@@ -131,18 +131,21 @@ class Frame:
 
 
 def going_on(cover: Tensor) -> Tensor:
-    """What the farther surface of a mixed pixel, of which it covers so much, may count more: behind the nearer one."""
+    """Extra coverage given to the far surface of a mixed pixel so that it continues behind the near one.
+
+    ``cover`` is the share of the pixel in which it is visible.
+    """
     return (1.0 - cover) * ((cover - HIDDEN_WEIGHT) / _GOES_ON).clamp(0.0, 1.0)
 
 
 def _mixed(surfaces: Sequence[Placed], pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
     """``m_k I``, ``m_k`` and ``M_k - m_k`` of one surface, or of two that share their pixels, near to far.
 
-    Each is a sum over the surfaces. The farther one of a mixed pixel goes on behind the nearer one: in layers behind
-    that one it counts whole. Where the nearer one lies in a layer itself, or behind it, both count by their shares, for
-    else a surface that spans several layers would be open at its edge.
+    Each is a sum over the surfaces. The far surface of a mixed pixel continues behind the near one: it counts in full
+    in layers behind the near surface. In the near surface's own layers and those in front, both count by their shares;
+    otherwise a surface that spans several layers would have gaps at its edge.
 
-    Pairs are how much of each surface lies at or behind layers k, and behind them, ``[B, n, 1, h, w]``.
+    ``pairs`` holds, for each surface, its shares at or behind layer k and behind it, each ``[B, n, 1, h, w]``.
     """
     sums: list[Tensor] = []
     nearer: Tensor | None = None
@@ -159,10 +162,14 @@ def _mixed(surfaces: Sequence[Placed], pairs: Sequence[tuple[Tensor, Tensor]]) -
 
 
 def _stacked(surfaces: Sequence[Placed], pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
-    """The same of surfaces that cover a pixel independently, near to far.
+    """The same for surfaces that cover a pixel independently, near to far.
 
-    A pixel counts for layer k as far as what is at or behind it is known, but for what that has in front. A surface of
-    which only a hair lies there is in front of it.
+    With ``c`` the cover of a surface, ``b`` its share at or behind layer k and ``h = c eased(min(b / _HAIR, 1))``,
+
+        ``M_k = prod(1 - h (1 - b)) (1 - prod(1 - h))``,
+
+    products over the surfaces: the known part of the pixel at or behind layer k, less the parts of the same surfaces
+    in front of it.
     """
     visible = torch.ones_like(surfaces[0].x)
     arriving = unknown = visible
@@ -170,8 +177,8 @@ def _stacked(surfaces: Sequence[Placed], pairs: Sequence[tuple[Tensor, Tensor]])
     for (_, x, weight), (behind, beyond) in zip(surfaces, pairs, strict=True):
         cover = torch.ones_like(x) if weight is None else weight
         here = cover * eased((behind / _HAIR).clamp(max=1.0))
-        passes = 1.0 - here * (1.0 - behind)  # what layers in front leave
-        stops = cover * (behind - beyond) / passes.clamp_min(1e-6)  # of what arrives at the surface in this layer
+        passes = 1.0 - here * (1.0 - behind)  # share not hidden by the surface's part in front of layer k
+        stops = cover * (behind - beyond) / passes.clamp_min(1e-6)  # share of the arriving light stopped in layer k
         stopped.append(arriving * stops)
         arriving, visible = arriving * (1.0 - stops), visible * passes
         unknown = unknown * (1.0 - here)
@@ -192,37 +199,37 @@ def framed(
     limit: Tensor | None = None,
     image: int | None = 0,
 ) -> Frame:
-    """Surfaces of an image as a frame: they go on beyond the border as they are at it (:mod:`torchdof.render.border`).
+    """Continue the surfaces of an image beyond its border to a frame (:mod:`torchdof.render.border`).
 
     Args:
-        surfaces: Near to far if stacked; else one, or the two that share each pixel.
-        nodes: As in :class:`Frame`; surfaces beyond the outermost ones belong to these.
-        behind: Light behind all of them, ``[B, C, H, W]``; None: nothing is.
+        surfaces: Near to far if stacked; else one surface, or the two that share each pixel.
+        nodes: As in :class:`Frame`; surfaces beyond the outermost nodes are clamped to them.
+        behind: Light behind all surfaces, ``[B, C, H, W]``; None: there is no such light.
         margin: As in :class:`Frame`.
-        multiple: What the sides of the area must be multiples of: of the coarsest layer's pixel at least.
+        multiple: The area is extended to multiples of this many pixels, at least a pixel of the coarsest layer.
         occlusion: As in :class:`Frame`.
         stacked: As in :class:`Frame`.
-        lit: Light goes on beyond the border as well; False: nothing comes from there.
-        limit: Largest light that is no highlight's, ``[B, 1, H, W]``; None: all of it goes on.
-        image: Which of the surfaces each pixel of the image has; None: they are layers, each seen everywhere.
+        lit: Whether light is continued beyond the border too; False: it is 0 there.
+        limit: Largest light that is not a highlight, ``[B, 1, H, W]``: light above it is not continued; None: all is.
+        image: Index of the image's own surface; None: the surfaces are layers, each known everywhere.
     """
     size = (surfaces[0].light.shape[-2], surfaces[0].light.shape[-1])
     height, width = ((n + multiple - 1) // multiple * multiple for n in size)
-    beyond = (0, width - size[1], 0, height - size[0])  # right and below, to whole blocks
+    beyond = (0, width - size[1], 0, height - size[0])  # pixels added right and below, to whole blocks
     ends = (margin, margin + beyond[1], margin, margin + beyond[3])
     lights, cocs, weights = zip(*surfaces, strict=True)
     x = blur_axis(torch.cat(cocs)).clamp(nodes[0], nodes[-1])
-    light, cover = torch.cat(lights), None
+    cover = None
     if any(weight is not None for weight in weights):
         cover = torch.cat([torch.ones_like(cocs[0]) if weight is None else weight for weight in weights])
     if lit:
         image_x = None if image is None else x.unflatten(0, (len(surfaces), -1))[image]
-        light = continued(light, cover, limit, ends, margin + multiple - 1, x, image_x, len(surfaces))
+        lights = continued(lights, cover, limit, ends, margin + multiple - 1, x, image_x)
     else:
-        light = functional.pad(light, ends)
+        lights = [functional.pad(light, ends) for light in lights]
     x = functional.pad(x if cover is None else torch.cat([x, cover], 1), ends, mode="replicate")
-    maps = [light, *x.split(1, 1)]
-    placed = [Placed(*parts) for parts in zip(*(t.unflatten(0, (len(surfaces), -1)) for t in maps), strict=True)]
+    maps = [part.unflatten(0, (len(surfaces), -1)) for part in x.split(1, 1)]
+    placed = [Placed(*parts) for parts in zip(lights, *maps, strict=True)]
     if behind is not None:
         behind = functional.pad(behind, beyond, mode="replicate")
     return Frame(placed, nodes, ramps(nodes, placed[0].x), behind, margin, (height, width), size, occlusion, stacked)

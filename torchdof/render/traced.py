@@ -1,6 +1,6 @@
-"""Code that ``torch.compile`` does not trace: functions whose work depends on values, and kernels of a table.
+"""Code that ``torch.compile`` does not trace: functions whose work depends on values, and the kernels of a table.
 
-A compiled graph calls such a function as one operator and holds the kernels as constants.
+A compiled graph calls such a function as one operator, and holds the kernels as constants.
 """
 
 import functools
@@ -15,33 +15,33 @@ from ..tensors import is_exporting
 
 __all__ = ["constants", "is_compiled", "one_operator"]
 
-_KEPT = 4  # lists of constants; a compiled graph asks for each of its own twice
+_KEPT = 4  # cached lists of constants; a compiled graph asks for each of its lists twice
 
 
 def is_compiled() -> bool:
-    """Whether this code is being compiled, and not exported."""
+    """Whether this code is being compiled, but not exported."""
     return torch.compiler.is_compiling() and not is_exporting()
 
 
 def one_operator(
     name: str, empty: Callable[..., Any], differentiable: int = 0
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Makes a function an operator of PyTorch, that a compiled graph calls as a whole.
+    """Make a function an operator of PyTorch, which a compiled graph calls as a whole.
 
     Args:
-        name: Of the operator.
-        empty: Gives empty tensors like the function's results, from the same arguments.
-        differentiable: How many of the first arguments gradients are taken to; backwards, the function runs once more.
+        name: Name of the operator.
+        empty: Function of the same arguments that returns empty tensors like the results.
+        differentiable: Number of leading arguments that get gradients; the backward pass runs the function again.
 
     Returns:
-        A decorator. The function takes tensors, None and numbers, and gives new contiguous tensors.
+        A decorator for functions that take tensors, None and numbers, and return new contiguous tensors.
     """
 
     def decorated(function: Callable[..., Any]) -> Callable[..., Any]:
         operator = torch.library.custom_op(name, function, mutates_args=())
         operator.register_fake(empty)
 
-        def remember(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:  # called with these names
+        def remember(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:  # PyTorch passes these arguments by name
             ctx.others = [None if isinstance(value, Tensor) else value for value in inputs]
             ctx.save_for_backward(*(value if isinstance(value, Tensor) else None for value in inputs))
 
@@ -63,7 +63,7 @@ def one_operator(
 
 
 def constants(make: Callable[..., Sequence[Tensor]], *arguments: Any) -> list[Tensor]:
-    """The tensors of ``make(*arguments)`` as constants of the compiled graph, whose arguments never change."""
+    """The tensors of ``make(*arguments)`` as constants of a compiled graph, in which ``arguments`` never change."""
     shapes = _shapes(make, *arguments)
     parts = _numbers(make, *arguments).split([math.prod(shape) for shape in shapes])
     return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
@@ -82,6 +82,6 @@ def _numbers(make: Callable[..., Sequence[Tensor]], *arguments: Any) -> Tensor:
     return torch.cat([tensor.flatten() for tensor in _made(make, *arguments)])
 
 
-for _constant in (_shapes, _numbers):  # one result each, for a compiled graph holds one of a function
-    # what torch.compiler.assume_constant_result does, without importing the whole compiler for it
+for _constant in (_shapes, _numbers):  # two functions: a compiled graph holds one constant for each
+    # sets the flag of torch.compiler.assume_constant_result, without importing the whole compiler
     _constant._dynamo_marked_constant = True  # type: ignore[union-attr]

@@ -43,9 +43,9 @@ def check(result, distances, tolerance):
         assert np.allclose(colour.lateral_px, places, atol=3 * tolerance)
 
 
-# the mean of discs of three sizes is no disc, and what it leaves looks like a tone curve's
+# the mean of discs of three sizes is not a disc; its residual looks like that of a tone curve
 @pytest.mark.filterwarnings("ignore:the fit.s residual depends on the level:torchdof.fit.problems.FitWarning")
-def test_lateral_and_longitudinal_colour_are_told_apart(simulator, tmp_path):
+def test_lateral_and_longitudinal_colour_are_separated(simulator, tmp_path):
     result = fit_captures(captures(simulator), "disc")
     check(result, DISTANCES, 0.012)
     assert [c.focus_shift_dioptres for c in result.colours] == pytest.approx(FOCUS, abs=0.003)

@@ -60,7 +60,7 @@ def test_the_target_is_found_on_a_desk_and_measured(simulator, folder):
         find_target(hidden)
 
 
-def test_photographs_tell_their_distances_and_the_focus(folder):
+def test_distances_and_focus_are_found_from_the_photographs(folder):
     with pytest.warns(FitWarning, match="3 photographs are too few to find a tone curve") as caught:
         found = read_photographs(folder[0])
     assert caught[0].message.number == 3
