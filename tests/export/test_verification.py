@@ -59,7 +59,8 @@ def test_another_module_is_refused(plain: Any, change: dict[str, Any], message: 
 @pytest.mark.parametrize("of_rays", [False, True], ids=["of a layer", "of rays"])
 def test_a_changed_kernel_is_detected(of_rays: bool, plain: Any, model: onnx.ModelProto, tmp_path: Path) -> None:
     tensors = [t for t in _tensors(model.graph) if t.data_type == onnx.TensorProto.FLOAT]
-    kernel = max((t for t in tensors if len(t.dims) == (2 if of_rays else 4)), key=lambda t: int(np.prod(t.dims)))
+    shaped = [t for t in tensors if (len(t.dims) == 2 and t.dims[0] == 1 if of_rays else len(t.dims) == 4)]
+    kernel = max(shaped, key=lambda t: int(np.prod(t.dims)))
     values = onnx.numpy_helper.to_array(kernel).copy()
     if of_rays:  # one tensor has the kernels of all radii
         values *= 1.01
