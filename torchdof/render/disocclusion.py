@@ -100,7 +100,8 @@ def behind_pixels(behind: Tensor, size: tuple[int, int]) -> Tensor:
         whole = behind.shape[dim] * BEHIND_STEP
         samples, parts = _axis(length, 1, whole, (BEHIND_STEP,), behind.dtype, behind.device)
         part = parts[0, :, None] if dim == -2 else parts[0]
-        behind = torch.lerp(*(behind.index_select(dim, samples[0, i]) for i in range(2)), part)
+        before, after = (behind.index_select(dim, samples[0, i]) for i in range(2))
+        behind = torch.lerp(before, after, part)
     return behind
 
 

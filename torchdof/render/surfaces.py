@@ -217,6 +217,7 @@ def framed(
     height, width = ((n + multiple - 1) // multiple * multiple for n in size)
     beyond = (0, width - size[1], 0, height - size[0])  # pixels added right and below, to whole blocks
     ends = (margin, margin + beyond[1], margin, margin + beyond[3])
+    lights: Sequence[Tensor]
     lights, cocs, weights = zip(*surfaces, strict=True)
     x = blur_axis(torch.cat(cocs)).clamp(nodes[0], nodes[-1])
     cover = None
