@@ -76,7 +76,7 @@ def seen(levels: Sequence[Level], coc_px: Tensor, mask: Tensor, ops: Ops) -> See
         values = window(functional.pad(level.values, ends, mode="replicate"), _SIDE // level.step, 1)
         pieces.append(values)
         shown.append(shown_behind(*samples(values, (_SIDE, _SIDE), level.step, (halves[0], halves[1])), coc_px))
-    lights, weights = (torch.cat([part[None] for part in parts]) for parts in zip(*shown, strict=True))
+    lights, weights = (torch.stack(parts) for parts in zip(*shown, strict=True))
     found = torch.cat(search(levels, lights, weights, coc_px), 1)
 
     def hides() -> Tensor:

@@ -252,9 +252,10 @@ class Renderer:
 
 def _panels(frame: Frame, coc_px: Tensor, after: Picture) -> dict[str, Tensor]:
     """Panels of a sheet: caption -> ``[1, 3, H, W]`` in linear light."""
-    middle = {"depth: near is bright": depth_colours(frame.values)}
     if frame.scene.depth_map.depth_kind == "coc":
         middle = {"blur radius: near orange, far blue": coc_colours(coc_px)}
+    else:
+        middle = {"depth: near is bright": depth_colours(frame.values)}
     panels = {"before": frame.picture.light, **middle, "after": after.light}
     return {name: shrunk(panel.cpu(), _PANEL_PX).expand(-1, 3, -1, -1) for name, panel in panels.items()}
 

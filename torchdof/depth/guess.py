@@ -95,8 +95,7 @@ def subject_m(depth: Tensor) -> float:
         >>> round(subject_m(depth), 6)
         2.0
     """
-    step = math.ceil(math.sqrt(depth.numel() / _SAMPLES))
-    depth = depth[0, 0, step // 2 :: step, step // 2 :: step].double().cpu()
+    depth = _sampled(depth).double().cpu()
     y, x = (torch.linspace(-0.5, 0.5, size + 2, dtype=torch.float64)[1:-1] for size in depth.shape)
     weight = torch.exp(-0.5 * ((y[:, None] / _SPREAD).square() + (x / _SPREAD).square()))
     known = depth > 0
@@ -117,10 +116,15 @@ def subject_m(depth: Tensor) -> float:
     return 1.0 / median if median > 0 else math.inf
 
 
+def _sampled(values: Tensor) -> Tensor:
+    """Every n-th row and column of a map ``[1, 1, H, W]``, so that about ``_SAMPLES`` values remain: ``[h, w]``."""
+    step = math.ceil(math.sqrt(values.numel() / _SAMPLES))
+    return values[0, 0, step // 2 :: step, step // 2 :: step]
+
+
 def _growth_downwards(values: Tensor) -> float:
     """Correlation of the ranks of the values with their rows, in [-1, 1]; positive if values grow downwards."""
-    step = math.ceil(math.sqrt(values.numel() / _SAMPLES))
-    values = values[0, 0, step // 2 :: step, step // 2 :: step]
+    values = _sampled(values)
     known = values.isfinite() & (values != 0)
     rows = torch.arange(values.shape[0], dtype=torch.float64)[:, None].expand(values.shape)[known]
     if rows.numel() < 2:

@@ -86,7 +86,7 @@ def _bytes(made: Tensor | tuple[Tensor, ...] | float) -> int:
 _CONSTANTS = KernelCache(_CONSTANT_BYTES)
 
 
-def kept(make: Callable[_Arguments, tuple[Tensor, ...]]) -> Callable[_Arguments, tuple[Tensor, ...]]:
+def kept(make: Callable[_Arguments, Kept]) -> Callable[_Arguments, Kept]:
     """Cache the tensors that a function makes from numbers alone, such as index tables: the same in every frame.
 
     In traced code, and under ``FakeTensorMode``, the function is called each time.
@@ -94,7 +94,7 @@ def kept(make: Callable[_Arguments, tuple[Tensor, ...]]) -> Callable[_Arguments,
     whole = torch.inference_mode(False)(make)  # autograd will use them too, and refuses inference tensors
 
     @functools.wraps(make)
-    def called(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> tuple[Tensor, ...]:
+    def called(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> Kept:
         if is_traced() or is_fake():
             return make(*args, **kwargs)
         key = (make.__module__, make.__qualname__, args, tuple(sorted(kwargs.items())))

@@ -228,7 +228,7 @@ def fill_hidden(
     cells = _largest(torch.cat([-coc_px, wanted], 1), cell_rows, cell_columns, BEHIND_STEP)
     nearest, is_wanted = -cells[:, :1], cells[:, 1:] > 0
     samples, shares = _samples(searched, (cell_rows, cell_columns), BEHIND_STEP)
-    shown, known = shown_behind(torch.cat([part[None] for part in samples]), shares[:, None, None], nearest)
+    shown, known = shown_behind(torch.stack(samples), shares[:, None, None], nearest)
     farthest = search(searched, shown, known, nearest, farthest=True)
     coarse: tuple[Tensor, ...] = ()
     if len(searched) > _FINE_LEVELS:
@@ -294,7 +294,7 @@ def _seen(levels: Sequence[Level], coc_px: Tensor) -> Seen:
     """Light and coc behind the surfaces of an image, ``[B, C + 1, H, W]``, and the sum of votes ``[B, 1, H, W]``."""
     size = (coc_px.shape[-2], coc_px.shape[-1])
     shown = [shown_behind(values, share, coc_px) for values, share in zip(*_samples(levels, size, 1), strict=True)]
-    lights, weights = (torch.cat([part[None] for part in parts]) for parts in zip(*shown, strict=True))
+    lights, weights = (torch.stack(parts) for parts in zip(*shown, strict=True))
     return search(levels, lights, weights, coc_px)
 
 
@@ -355,7 +355,7 @@ def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tenso
         Light and coc ``[B, C + 1, h, w]``, and the sum of the levels' votes ``[B, 1, h, w]``.
     """
     rules = tuple((level.least_px, level.vote) for level in levels)
-    (numbers,) = _numbers_of(rules, coc_px.dtype, coc_px.device)
+    numbers = _numbers_of(rules, coc_px.dtype, coc_px.device)
     least, slope, most = (numbers[i, :, None, None, None, None] for i in range(3))
     looked = (coc_px.abs() / least - 1.0).clamp(0.0, 1.0)
     votes = looked * torch.minimum(weight * slope, most)
@@ -374,14 +374,12 @@ def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tenso
 
 
 @kept
-def _numbers_of(
-    rules: tuple[tuple[float, float | None], ...], dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, ...]:
+def _numbers_of(rules: tuple[tuple[float, float | None], ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Rows of ``[3, L]``: smallest blur in pixels at which a level is read; votes per weight; most votes."""
     numbers = [
         (least_px, 1.0, math.inf) if vote is None else (least_px, vote / _SURE, vote) for least_px, vote in rules
     ]
-    return (torch.tensor(numbers, dtype=dtype, device=device).t(),)
+    return torch.tensor(numbers, dtype=dtype, device=device).t()
 
 
 def _least_px(level: int) -> float:

@@ -303,8 +303,8 @@ class _Occluders:
             [(place[:, None] + end).clamp(0, size - 1).long() // COARSE_CELL for end in (-reach, reach + 1.0)]
             for place, size in ((row, self.height), (column, self.width))
         )
-        lower, upper = bottom + 1, top
-        corners = ((lower, right + 1, 1), (upper, right + 1, -1), (lower, left, -1), (upper, left, 1))
+        bottom, right = bottom + 1, right + 1
+        corners = ((bottom, right, 1), (top, right, -1), (bottom, left, -1), (top, left, 1))
         count = sum(sign * self.counts[bins, item[:, None], y, x] for y, x, sign in corners)
         pairs = ((count > 0) & (fades.detach() > 0)).nonzero()
         hidden = coc.new_zeros(len(coc), len(step), len(step))

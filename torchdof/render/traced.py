@@ -1,6 +1,6 @@
 """Code that ``torch.compile`` does not trace: functions whose work depends on values, and the kernels of a table.
 
-A compiled graph calls such a function as one operator, and holds the kernels as constants.
+A compiled graph calls each of these functions as one operator, and holds the kernels as constants.
 """
 
 import functools

@@ -174,7 +174,7 @@ class Surfaces {
     for (int k = 0; blocks[i] && k < 2 * channels + 3; k++)
       for (int y = first; y < first + rows; y++) __builtin_prefetch(blocks[i] + k * BLOCK_PIXELS + y * BLOCK);
   }
-  // Returns a block; creates it from the image if there is none.
+  // Returns a block; creates it from the image if it does not exist yet.
   Block make_block(int i);
   // Surface i at n pixels of a row from column x, within one block column: pointers to each channel, coc and weight
   // (null means 1). Returns false if there is no such surface.
