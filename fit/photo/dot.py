@@ -171,7 +171,8 @@ def used_pixels(
     bright = picture > dot.background + 0.15 * dot.peak
     share = float(np.sum(clipped & bright)) / max(int(bright.sum()), 1)
     if refuse and share > _CLIPPED:
-        text = f"{100 * share:.0f} % of the {name} dot's pixels are clipped at {level:.4g}; expose less"
+        text = f"{100 * share:.0f} % of the {name} dot's pixels are clipped at {level:.4g}; expose less, so that at "
+        text += f"least {100 - 100 * _CLIPPED:.0f} % are below it"
         raise FitError(text, "saturated", file=file, number=share)
     if refuse:
         text = f"{count} pixels of the {name} picture are clipped at {level:.4g} and were left out; expose less"
