@@ -14,14 +14,18 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 __all__ = [
     "HALF_LARGEST",
+    "MOST_PLANES",
     "Kind",
+    "PaddedFrame",
+    "blend",
+    "blend_gradient",
     "chosen",
     "coc_px",
     "convolve",
@@ -41,11 +45,14 @@ other, near to far."""
 HALF_LARGEST = 256
 """Largest half width of a kernel, in pixels of its layer; larger kernels need the PyTorch engine."""
 
+MOST_PLANES = 16
+"""Most channels of light and kernels' colours together in :func:`blend`."""
+
 _KINDS: dict[Kind, int] = {"image": 0, "background": 1, "stack": 2}
 _SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
 _SMALL_FRAME = 2**16  # pixels; up to this size the main thread renders itself, which saves 0.1 ms
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
-_REVISION = 5  # of ``src/api.h``
+_REVISION = 6  # of ``src/api.h``
 
 _Floats = ctypes.POINTER(ctypes.c_float)
 
@@ -181,6 +188,22 @@ class _Map(ctypes.Structure):
     ]
 
 
+class _Layers(ctypes.Structure):
+    """``torchdof_layers`` of ``src/api.h``."""
+
+    _fields_ = [  # noqa: RUF012
+        *((name, ctypes.c_int32) for name in ("rows", "columns", "margin", "height", "width", "channels", "surfaces")),
+        *((name, ctypes.POINTER(ctypes.c_void_p)) for name in ("light", "place", "weight")),
+        *((name, ctypes.c_int32) for name in ("occlusion", "backed", "layers")),
+        ("nodes", ctypes.POINTER(ctypes.c_double)),
+        *((name, ctypes.POINTER(ctypes.c_int32)) for name in ("scales", "halves")),
+        ("kernel_colours", ctypes.c_int32),
+        ("kernels", ctypes.c_void_p),
+        ("threads", ctypes.c_int32),
+        ("cancelled", ctypes.POINTER(ctypes.c_int32)),
+    ]
+
+
 def chosen() -> bool:
     """Whether the compiled engine is used.
 
@@ -310,6 +333,105 @@ def render(
 
     _interruptible(run, cancelled, height * width)
     return out
+
+
+class PaddedFrame(NamedTuple):
+    """What :func:`blend` needs besides the surfaces' maps ``[., rows, columns]``, which include a margin.
+
+    Args:
+        margin: Pixels of the maps before the picture.
+        area: Height and width of the picture. They, the margin and the maps' sizes are multiples of all pixel sizes.
+        nodes: Positions of the layers on the blur axis, near to far.
+        layers: Kernel ``[1 or C, k, k]`` and pixel size of each layer.
+        occlusion: Whether layers occlude each other; otherwise their light and weights are added.
+        backed: Whether the transmittance of all layers is computed, not their coverage.
+    """
+
+    margin: int
+    area: tuple[int, int]
+    nodes: Sequence[float]
+    layers: Sequence[tuple[Tensor, int]]
+    occlusion: bool
+    backed: bool
+
+
+def blend(surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: PaddedFrame) -> Tensor:
+    """Blurs and composites the layers of a padded frame, as :func:`torchdof.render.composite.over`, for one image.
+
+    Args:
+        surfaces: Light ``[C, rows, columns]``, position on the blur axis and weight ``[rows, columns]`` (None: 1) of
+            one surface, or of two that share each pixel; float32.
+        frame: Layers and geometry.
+
+    Returns:
+        Light, then coverage or transmittance of each colour of the kernels (or, without occlusion, the sum of weights),
+        ``[planes, height, width]``, float32; the same bits for any number of threads.
+
+    Raises:
+        MemoryError: If there is not enough memory.
+    """
+    return _blended(surfaces, frame, None)[0]
+
+
+def blend_gradient(
+    surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: PaddedFrame, gradient: Tensor
+) -> list[Tensor]:
+    """The gradients of :func:`blend` by its surfaces, from that by its result ``[planes, height, width]``.
+
+    Returns:
+        Gradients by light, position and, if it has one, weight of each surface, in this order.
+
+    Raises:
+        MemoryError: If there is not enough memory.
+    """
+    return _blended(surfaces, frame, gradient)
+
+
+def _blended(
+    surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: PaddedFrame, gradient: Tensor | None
+) -> list[Tensor]:
+    maps = [[None if t is None else t.contiguous() for t in each] for each in zip(*surfaces, strict=True)]
+    kernels, count = [kernel.float() for kernel, _ in frame.layers], len(frame.nodes)
+    colours = max(kernel.shape[0] for kernel in kernels)
+    bank = torch.cat([kernel.expand(colours, -1, -1).flatten() for kernel in kernels])
+    cancelled = ctypes.c_int32(0)
+    channels, rows, columns = surfaces[0][0].shape
+    scene = _Layers(
+        rows,
+        columns,
+        frame.margin,
+        *frame.area,
+        channels,
+        len(surfaces),
+        *map(_pointers, maps),
+        frame.occlusion,
+        frame.backed,
+        count,
+        _array(ctypes.c_double, count)(*frame.nodes),
+        _array(ctypes.c_int32, count)(*(scale for _, scale in frame.layers)),
+        _array(ctypes.c_int32, count)(*(kernel.shape[-1] // 2 for kernel in kernels)),
+        colours,
+        bank.data_ptr(),
+        torch.get_num_threads(),
+        ctypes.pointer(cancelled),
+    )
+    if gradient is None:
+        out = torch.empty(channels + colours, *frame.area, dtype=torch.float32, device="cpu")
+        results = [out]
+    else:
+        gradient = gradient.float().contiguous()
+        sums = [[None if t is None else torch.zeros_like(t) for t in each] for each in maps]
+        results = [t for of_surface in zip(*sums, strict=True) for t in of_surface if t is not None]
+
+    def run() -> None:
+        if gradient is None:
+            _check(_engine().torchdof_blend(ctypes.byref(scene), out.data_ptr()))
+        else:
+            pointers = map(_pointers, sums)
+            _check(_engine().torchdof_blend_gradient(ctypes.byref(scene), gradient.data_ptr(), *pointers))
+
+    _interruptible(run, cancelled, rows * columns)
+    return results
 
 
 def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool = False) -> Tensor:
@@ -535,7 +657,8 @@ def _fits(library: ctypes.CDLL) -> bool:
     except AttributeError:
         return False
     interface.restype = ctypes.c_int64
-    expected: int = _REVISION << 32 | ctypes.sizeof(_Scene) << 16 | ctypes.sizeof(_Map)
+    others = ctypes.sizeof(_Map) + ctypes.sizeof(_Layers)
+    expected: int = _REVISION << 32 | ctypes.sizeof(_Scene) << 16 | others
     return bool(interface() == expected)
 
 
@@ -573,6 +696,9 @@ def _library() -> tuple[ctypes.CDLL | None, str]:
     library.torchdof_convolve.argtypes = [pointer, ctypes.c_int32, ctypes.c_int32, pointer, ctypes.c_int32, pointer]
     library.torchdof_convolve.restype = None
     library.torchdof_repair_edges.argtypes = [ctypes.POINTER(_Map), ctypes.POINTER(ctypes.c_int32)]
+    maps = ctypes.POINTER(pointer)
+    library.torchdof_blend.argtypes = [ctypes.POINTER(_Layers), pointer]
+    library.torchdof_blend_gradient.argtypes = [ctypes.POINTER(_Layers), pointer, maps, maps, maps]
     whole, numbers = ctypes.c_int32, ctypes.POINTER(ctypes.c_double)
     real = ctypes.c_float
     library.torchdof_coc.argtypes = [pointer, ctypes.c_int64, real, real, real, whole, pointer]

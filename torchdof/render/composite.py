@@ -1,5 +1,6 @@
 """Composite layers to one image, far to near: scatter each with its kernel and lay it over the layers behind it."""
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 
@@ -8,12 +9,13 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from . import field
+from .blend import blended
 from .convolution import CHANNELS
 from .downsampling import downsampled, upsampled
 from .ops import EAGER, Ops
 from .plan import Blur
 from .scatter import fold
-from .surfaces import Frame
+from .surfaces import Frame, Placed
 
 __all__ = ["Scatter", "accumulate", "accumulate_once", "mean", "over"]
 
@@ -48,7 +50,6 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, ops: Ops = EAGER
     Reference:
         Ikoma, Nguyen, Metzler, Peng, Wetzstein, "Depth from defocus with learned optics", ICCP 2021.
     """
-    frame = frame.near_to_far()
     colours, backed = frame.colours, frame.behind is not None
 
     # The second part of a picture is the transmittance 1 - a, computed as a sum of positive terms: a difference would
@@ -66,7 +67,7 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, ops: Ops = EAGER
         share = left * share_behind if backed else torch.addcmul(share, left, share_behind)
         return torch.addcmul(light, left, light_behind), share
 
-    picture = _composite_layers(frame, blurs, scatter, composited, ops, 1.0 if backed else 0.0, normalised)
+    picture = _picture(frame, blurs, scatter, composited, ops, 1.0 if backed else 0.0, normalised)
     light, left = _parts(picture, colours)
     out = mean(picture, colours) if frame.behind is None else torch.addcmul(light, left, frame.behind)
     return out[..., : frame.size[0], : frame.size[1]]
@@ -84,7 +85,7 @@ def accumulate(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, ops: Ops =
     def added(front: Picture, behind: Picture) -> Picture:
         return front[0] + behind[0], front[1] + behind[1]
 
-    return _composite_layers(frame, blurs, scatter, added, ops)[..., : frame.size[0], : frame.size[1]]
+    return _picture(frame, blurs, scatter, added, ops)[..., : frame.size[0], : frame.size[1]]
 
 
 def accumulate_once(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
@@ -105,6 +106,25 @@ def accumulate_once(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
     shares = None if blurs[0].shares is None else [b.shares for b in blurs if b.shares is not None]
     summed = fold(light, kernels.repeat(1, min(2, each), 1, 1), halo, weights, shares, frame.size)
     return summed[..., : frame.size[0], : frame.size[1]]
+
+
+def _picture(
+    frame: Frame,
+    blurs: Sequence[Blur],
+    scatter: Scatter,
+    composited: Callable[[Picture, Picture], Picture],
+    ops: Ops,
+    empty: float = 0.0,
+    normalised: Callable[[Lights, Tensor, Tensor], Pictures] | None = None,
+) -> Tensor:
+    """:func:`_composite_layers` of a frame, computed by the compiled engine if it supports the arguments."""
+
+    def plain(surfaces: Sequence[Placed]) -> Tensor:
+        sorted_frame = dataclasses.replace(frame, surfaces=surfaces).near_to_far()
+        return _composite_layers(sorted_frame, blurs, scatter, composited, ops, empty, normalised)
+
+    picture = None if scatter is fold else blended(frame, blurs, empty > 0, plain)
+    return plain(frame.surfaces) if picture is None else picture
 
 
 def _composite_layers(

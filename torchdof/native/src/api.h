@@ -124,6 +124,38 @@ typedef struct {
 // changed: 0 if the map needs no repair; out is then not written.
 TORCHDOF_API int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed);
 
+// A padded frame whose layers are blurred and composited: surfaces of each pixel, all of them with a margin.
+typedef struct {
+  int32_t rows, columns;         // of the maps; multiples of the largest scale, as is the margin
+  int32_t margin;                // pixels of the maps before the picture
+  int32_t height, width;         // of the picture, multiples of the largest scale
+  int32_t channels;              // with kernel_colours at most TORCHDOF_MOST_PLANES
+  int32_t surfaces;              // 1, or 2 that share each pixel
+  const float *const *light;     // for each surface [channels, rows, columns]
+  const float *const *place;     // for each surface [rows, columns]: position on the blur axis
+  const float *const *weight;    // for each surface [rows, columns], or null: it covers its pixels fully
+  int32_t occlusion;             // 0: light and weights of all layers are added
+  int32_t backed;                // 1: there is light behind all surfaces, so the transmittance is computed, not the coverage
+
+  int32_t layers;                // as in torchdof_scene
+  const double *nodes;
+  const int32_t *scales, *halves;
+  int32_t kernel_colours;
+  const float *kernels;
+
+  int32_t threads;
+  const volatile int32_t *cancelled;
+} torchdof_layers;
+#define TORCHDOF_MOST_PLANES 16
+
+// out: [channels + kernel_colours, height, width]: light, and coverage or transmittance, or sum of weights.
+TORCHDOF_API int32_t torchdof_blend(const torchdof_layers *layers, float *out);
+
+// Adds to the gradients of all surfaces, of the shapes in `layers`, from the gradient of `out`. A surface without weight
+// has no gradient of it.
+TORCHDOF_API int32_t torchdof_blend_gradient(const torchdof_layers *layers, const float *gradient, float *const *light,
+                                             float *const *place, float *const *weight);
+
 // Smallest and largest value; both NaN if any value is NaN.
 TORCHDOF_API int32_t torchdof_ends(const float *values, int64_t count, int32_t threads, float *low, float *high);
 
@@ -131,9 +163,9 @@ TORCHDOF_API int32_t torchdof_ends(const float *values, int64_t count, int32_t t
 TORCHDOF_API void torchdof_convolve(const float *in, int32_t height, int32_t width, const float *kernel, int32_t half,
                                     float *out);
 
-// Version of this interface, for the caller to check first: sizes of two structures and, in the upper half,
+// Version of this interface, for the caller to check first: sizes of its structures and, in the upper half,
 // TORCHDOF_REVISION, which increases with every other change of this file.
-#define TORCHDOF_REVISION 5
+#define TORCHDOF_REVISION 6
 TORCHDOF_API int64_t torchdof_interface(void);
 
 // "avx2" or "baseline".

@@ -98,12 +98,21 @@ int32_t torchdof_ends(const float *values, int64_t count, int32_t threads, float
   return torchdof::guarded([&] { torchdof::chosen().ends(values, count, threads, low, high); });
 }
 
+int32_t torchdof_blend(const torchdof_layers *layers, float *out) {
+  return torchdof::guarded([&] { torchdof::chosen().blend(*layers, out); });
+}
+
+int32_t torchdof_blend_gradient(const torchdof_layers *layers, const float *gradient, float *const *light, float *const *place,
+                                float *const *weight) {
+  return torchdof::guarded([&] { torchdof::chosen().blend_gradient(*layers, gradient, light, place, weight); });
+}
+
 void torchdof_convolve(const float *in, int32_t height, int32_t width, const float *kernel, int32_t half, float *out) {
   torchdof::chosen().convolve(in, height, width, kernel, half, out);
 }
 
 int64_t torchdof_interface(void) {
-  return (int64_t)TORCHDOF_REVISION << 32 | (int64_t)sizeof(torchdof_scene) << 16 | (int64_t)sizeof(torchdof_map);
+  return (int64_t)TORCHDOF_REVISION << 32 | (int64_t)sizeof(torchdof_scene) << 16 | (int64_t)(sizeof(torchdof_map) + sizeof(torchdof_layers));
 }
 
 const char *torchdof_instructions(void) { return torchdof::use_avx2 ? "avx2" : "baseline"; }

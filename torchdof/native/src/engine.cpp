@@ -10,15 +10,9 @@ Job::Job(const torchdof_scene &scene)
     : scene(scene), height(scene.height), width(scene.width), channels(scene.channels), colours(scene.kernel_colours) {
   const float *values = scene.kernels;
   for (int k = 0; k < scene.layers; k++) {
-    Layer l;
+    Layer l = make_layer(scene.nodes, scene.layers, k);
     l.scale = scene.scales[k];
     l.half = scene.halves[k];
-    l.node = scene.nodes[k];
-    l.first = k == 0;
-    l.before = (float)(l.first ? l.node : scene.nodes[k - 1]);
-    l.per_before = l.first ? 0.0f : (float)(1.0 / (l.node - scene.nodes[k - 1]));
-    l.at = (float)l.node;
-    l.per_after = k == scene.layers - 1 ? 0.0f : (float)(1.0 / (scene.nodes[k + 1] - l.node));
     const int side = 2 * l.half + 1;
     for (int e = 0; e < colours; e++, values += side * side) l.kernels.push_back(make_kernel(values, l.half, !scene.shares));
     if (scene.shares && l.half) {
@@ -236,6 +230,6 @@ static void convolve_all(const float *in, int height, int width, const float *va
     }
 }
 extern const Variant variant;
-const Variant variant = {begin, repair_edges, find_ends, coc_of_depth, plan, make_kernels, convolve_all};
+const Variant variant = {begin, repair_edges, find_ends, coc_of_depth, plan, make_kernels, convolve_all, blend, blend_gradient};
 }  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

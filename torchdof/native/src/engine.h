@@ -287,6 +287,18 @@ inline V visible_continuation(V continuation, V nearer) {
   return continuation * (1.0f - least(nearer * (1.0f / HIDING_SHARE), V{} + 1.0f));
 }
 
+// Layer k of `count`, without its resolution and kernels.
+inline Layer make_layer(const double *nodes, int count, int k) {
+  Layer l;
+  l.node = nodes[k];
+  l.first = k == 0;
+  l.before = (float)(l.first ? l.node : nodes[k - 1]);
+  l.per_before = l.first ? 0.0f : (float)(1.0 / (l.node - nodes[k - 1]));
+  l.at = (float)l.node;
+  l.per_after = k == count - 1 ? 0.0f : (float)(1.0 / (nodes[k + 1] - l.node));
+  return l;
+}
+
 struct Job {
   explicit Job(const torchdof_scene &scene);
   void begin();
@@ -601,6 +613,10 @@ void make_kernels(const torchdof_spots &spots, int threads, float *const *out);
 bool repair_edges(const torchdof_map &map);
 
 void composite(const Job &job, const RayKernels &ray_kernels, float *out);
+
+// Blurs and composites the layers of a padded frame, and the gradient of that; blend.cpp
+void blend(const torchdof_layers &scene, float *out);
+void blend_gradient(const torchdof_layers &scene, const float *out_gradient, float *const *light, float *const *place, float *const *weight);
 
 }  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

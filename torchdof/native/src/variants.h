@@ -29,6 +29,8 @@ struct Variant {
   std::vector<double> (*plan)(const float *coc, int maps, int height, int width, double &tolerance, int threads);
   void (*make_kernels)(const torchdof_spots &spots, int threads, float *const *out);
   void (*convolve)(const float *in, int height, int width, const float *kernel, int half, float *out);
+  void (*blend)(const torchdof_layers &layers, float *out);
+  void (*blend_gradient)(const torchdof_layers &layers, const float *gradient, float *const *light, float *const *place, float *const *weight);
 };
 
 namespace baseline {

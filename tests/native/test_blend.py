@@ -1,0 +1,126 @@
+"""The compiled engine's layers and their gradients equal the plain engine's."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchdof import BlurTable, blur_by_coc, native
+from torchdof.render.plan import Plan
+
+pytestmark = pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built")
+
+BY_COLOUR = BlurTable("gaussian", [1.0], {"sigma": torch.tensor([[0.4], [0.5], [0.6]])})
+WAYS: dict[str, dict[str, Any]] = {
+    "over": {},
+    "no light behind": {"coc": (3.0, 3.0)},
+    "sum": {"occlusion": False},
+    "plain sum": {"occlusion": False, "normalize": False},
+    "coarse": {"coc": (-40.0, 40.0)},
+    "coarse only": {"coc": (20.0, 40.0)},
+    "coarse sum": {"coc": (-40.0, 40.0), "occlusion": False},
+    "in front of focus": {"coc": (-30.0, -9.0)},
+    "by colour": {"table": BY_COLOUR},
+    "by colour, sum": {"table": BY_COLOUR, "occlusion": False},
+    "triangle": {"table": BlurTable.polygon(3, 20.0, squeeze=1.6)},
+    "holes": {"check": False, "hole": True},
+    "nodes in the map": {"plan": Plan((-9.0, -2.0, 0.0, 3.0, 8.0), 1 / 255)},
+    "two channels": {"channels": 2},
+}
+
+
+def scene(coc: tuple[float, float] = (-12.0, 12.0), channels: int = 3, hole: bool = False) -> tuple[Tensor, Tensor]:
+    """Two images with patches of two slopes, none of their sides a multiple of a block's."""
+    generator = torch.Generator().manual_seed(5)
+    image = 0.05 + torch.rand(2, channels, 70, 101, generator=generator)
+    patch = torch.rand(2, 1, 7, 11, generator=generator).repeat_interleave(10, 2).repeat_interleave(10, 3)
+    slopes = torch.linspace(0.0, 0.6, 101) + torch.linspace(0.0, 0.4, 70)[:, None]
+    part = torch.where(patch[..., :70, :101] > 0.7, 1.0 - slopes, slopes)
+    radius = coc[0] + (coc[1] - coc[0]) * part
+    if hole:
+        radius[..., 20:24, 30:33] = math.nan
+    return image, radius
+
+
+def rendered(way: dict[str, Any], dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor, Tensor]:
+    """A picture, and the gradients of a random sum over it by light and coc."""
+    options = dict(way)
+    made = {name: options.pop(name) for name in ("coc", "channels", "hole") if name in options}
+    image, coc = scene(**made)
+    if "plan" in options:  # some pixels lie exactly at nodes, where ramps have a kink
+        coc[..., 30:40, :] = options["plan"].coc_px[3]
+    image, coc = image.to(dtype).requires_grad_(), coc.to(dtype if dtype == torch.float64 else torch.float32)
+    out = blur_by_coc(image, coc.requires_grad_(), **options)
+    seen = torch.rand(out.shape, generator=torch.Generator().manual_seed(1)) - 0.3
+    return out.detach(), *torch.autograd.grad((out * seen).sum(), (image, coc))
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    """The arguments of every gradient that the compiled engine computes."""
+    found: list[tuple[Any, ...]] = []
+
+    def recorded(*arguments: Any, of: Any = native.blend_gradient) -> list[Tensor]:
+        found.append(arguments)
+        return list(of(*arguments))
+
+    monkeypatch.setattr(native, "blend_gradient", recorded)
+    return found
+
+
+def difference(values: Tensor, other: Tensor) -> float:
+    """Norm of a difference, relative to the second argument's."""
+    return float((values - other).norm() / other.norm())
+
+
+@pytest.mark.parametrize("name", WAYS)
+def test_pictures_and_gradients_equal_the_plain_engines(
+    name: str, calls: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = rendered(WAYS[name])
+    assert len(calls) == 2, "the compiled engine computes the gradient of both items"
+    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
+    plain = rendered(WAYS[name])
+    assert len(calls) == 2
+    for ours, other, most in zip(found, plain, (1e-6, 1e-5, 5e-5), strict=True):
+        assert difference(ours, other) < most
+
+
+@pytest.mark.parametrize("name", ["over", "coarse", "sum", "by colour"])
+def test_gradients_have_the_same_bits_for_any_number_of_threads_and_batch(name: str, calls: list[Any]) -> None:
+    rendered(WAYS[name])
+    arguments, threads = calls[1], torch.get_num_threads()
+    try:
+        results = []
+        for count in (1, 2, 5):
+            torch.set_num_threads(count)
+            results.append(native.blend_gradient(*arguments))
+        native.use_instructions("baseline")
+        baseline = native.blend_gradient(*arguments)
+    finally:
+        torch.set_num_threads(threads)
+        native.use_instructions("avx2")
+    for one, two, five, other in zip(*results, baseline, strict=True):
+        assert torch.equal(one, two) and torch.equal(one, five)
+        assert difference(other, one) < 5e-5
+
+
+def test_float64_is_the_plain_engines_and_differs_by_rounding_alone(calls: list[Any]) -> None:
+    exact = rendered({}, torch.float64)
+    assert not calls
+    for ours, other in zip(rendered({}), exact, strict=True):
+        assert difference(ours.double(), other) < 2e-5
+
+
+def test_the_gradient_of_a_gradient_is_the_plain_engines() -> None:
+    def curvature(dtype: torch.dtype) -> Tensor:
+        image, coc = (t[:1, :, :20, :30].to(dtype).requires_grad_() for t in scene((-4.0, 4.0)))
+        out = blur_by_coc(image, coc)
+        (first,) = torch.autograd.grad(out.square().sum(), coc, create_graph=True)
+        (second,) = torch.autograd.grad(first.square().sum(), image)
+        return second
+
+    exact = curvature(torch.float64)
+    assert float((curvature(torch.float32) - exact).norm()) < 1e-3 * float(exact.norm())

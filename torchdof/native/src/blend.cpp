@@ -1,0 +1,790 @@
+// The layers of a padded frame, blurred and composited as in composite.cpp, and the gradient of that: what training
+// needs between the surfaces of a frame and its picture. All planes are dense, because every pixel has a gradient.
+//
+// With m a layer's share of each pixel, r the share behind it, I light and K the layer's kernel, from far to near:
+//
+//   l = K * (m I),  w = K * m,  v = K * r,   n = w + v' (v' is v, raised where w + v < KNOWN)
+//   picture = l / n + (1 - w / n) picture
+//
+// Backward, the blurred l, w and v are computed again and kept, block by block; their gradients replace them. Each block
+// then composites its layers again, walks back through them from near to far, and the gradients of l, w and v are
+// scattered by the turned kernels to the gradients of m I, m and r, and from these to the surfaces.
+#include "engine.h"
+
+namespace torchdof {
+namespace TORCHDOF_SIMD {
+namespace {
+
+constexpr float KNOWN = 2e-3f;  // blurred weight at which a layer's colour is fully known, as in composite.cpp
+constexpr int STRIPS = BLOCK / STRIP_ROWS;
+static_assert(BLOCK % STRIP_COLUMNS == 0, "strips fill a block");
+
+inline vec load_some(const float *p, int n) {
+  if (n >= LANES) return load<vec>(p);
+  vec v = {};
+  memcpy(&v, p, n * sizeof(float));
+  return v;
+}
+inline void add_some(float *p, vec v, int n) {
+  if (n >= LANES) return store(p, load<vec>(p) + v);
+  for (int i = 0; i < n; i++) p[i] += v[i];
+}
+// Derivative of a ramp clamped to [0, 1], eased or not, by its argument before the clamp.
+inline vec slope_of_ramp(vec v, bool ease) {
+  const auto inside = (v >= vec{}) & (v <= all(1.0f));
+  const vec slope = ease ? (v > all(FOOT) ? all(SLOPE) : v * (SLOPE / FOOT)) : all(1.0f);
+  return inside ? slope : vec{};
+}
+
+// Consecutive layers of one resolution on one side of the focus, on a grid of their pixels: the padded frame, with
+// `guard` pixels around it that stay 0.
+struct Run {
+  int scale, margin;                     // margin: pixels of the grid before the picture
+  int rows, columns, pitch, guard;       // of the grid
+  int block_rows, block_columns;
+  int top, left, bottom, right;          // its canvas in the grid; a coarse one has one more pixel on each side
+  std::vector<int> layers;               // far to near
+  size_t plane;                          // values of a plane of the grid
+  Buffer<float> canvas, slopes;          // light and coverage [planes, plane], and their gradient
+  size_t at(int y, int x) const { return (size_t)(y + guard) * pitch + x + guard; }
+  int blocks() const { return block_rows * block_columns; }
+};
+
+// A layer: which blocks of its run's grid its light reaches, and the blurred terms there.
+struct Blurred {
+  std::vector<int> place;   // of each block in `values`, or -1
+  std::vector<int> reached, needed, around;  // blocks with blurred terms; that these read; that those read
+  std::vector<uint8_t> occupied;  // blocks in which the layer occurs
+  Buffer<float> values;     // [blocks, terms, BLOCK_PIXELS]
+  std::vector<Kernel> kernels, turned;  // for each colour
+};
+
+class Blend {
+ public:
+  explicit Blend(const torchdof_layers &scene)
+      : scene_(scene), C_(scene.channels), E_(scene.kernel_colours), S_(scene.surfaces), over_(scene.occlusion), terms_(C_ + (over_ ? 2 : 1)), values_(C_ + (over_ ? 2 : 1) * E_), planes_(C_ + E_), empty_(scene.backed ? 1.0f : 0.0f) {
+    const float *values = scene.kernels;
+    layers_.resize(scene.layers);
+    blurred_.resize(scene.layers);
+    for (int k = 0; k < scene.layers; k++) {
+      layers_[k] = make_layer(scene.nodes, scene.layers, k);
+      layers_[k].scale = scene.scales[k];
+      layers_[k].half = scene.halves[k];
+      const int side = 2 * scene.halves[k] + 1;
+      for (int e = 0; e < E_; e++, values += side * side) {
+        std::vector<float> turned(values, values + side * side);
+        std::reverse(turned.begin(), turned.end());
+        blurred_[k].kernels.push_back(make_kernel(values, layers_[k].half, true));
+        blurred_[k].turned.push_back(make_kernel(turned.data(), layers_[k].half, true));
+      }
+    }
+  }
+
+  void picture(float *out) {
+    blur_all();
+    each_block(fine(), [&](int block, Events &) {
+      float canvas[MOST * BLOCK_PIXELS];
+      clear(canvas);
+      for (const Run &run : runs_)
+        if (run.scale > 1)
+          join(run, block, canvas, nullptr);
+        else
+          for (int k : run.layers) put(k, block, canvas);
+      write(fine(), block, canvas, out);
+    });
+  }
+
+  void gradient(const float *out_gradient, float *const *light, float *const *place, float *const *weight) {
+    blur_all();
+    const size_t area = (size_t)scene_.height * scene_.width;
+    for (Run &run : runs_)
+      if (run.scale > 1) {
+        run.slopes = Buffer<float>(planes_ * area);
+        memset(run.slopes.data(), 0, planes_ * area * sizeof(float));
+      }
+    each_block(fine(), [&](int block, Events &events) {
+      float slopes[MOST * BLOCK_PIXELS];
+      read(fine(), block, out_gradient, slopes);
+      walk(block, events, slopes);
+    });
+    for (Run &run : runs_) {
+      if (run.scale == 1) continue;
+      each_block(run, [&](int block, Events &events) {
+        float slopes[MOST * BLOCK_PIXELS];
+        gather(run, block, slopes);
+        walk_layers(run, block, events, slopes);
+      });
+    }
+    light_ = light, place_ = place, weight_ = weight;
+    for (const Run &run : runs_) {
+      Buffer<float> planes = grid_planes(run, values_);
+      for (int k : run.layers) scatter_back(run, k, planes.data());
+    }
+  }
+
+ private:
+  static constexpr int MOST = 16;  // most planes of a canvas
+  static constexpr int CELL_PX = 8;
+  using Events = std::vector<float>;
+
+  const Run &fine() const { return *std::find_if(runs_.begin(), runs_.end(), [](const Run &run) { return run.scale == 1; }); }
+
+  template <typename Body>
+  void parallel(int count, const Body &body) const {
+    torchdof::parallel(scene_.threads, count, scene_.cancelled, body);
+  }
+  // Calls body(block, events) for the blocks of a run's canvas; events: memory of the thread.
+  template <typename Body>
+  void each_block(const Run &run, const Body &body) {
+    std::vector<Events> events(std::max(1, scene_.threads));
+    const int r0 = std::max(run.top, 0) / BLOCK, r1 = (run.bottom - 1) / BLOCK, c0 = std::max(run.left, 0) / BLOCK, c1 = (run.right - 1) / BLOCK;
+    const int across = c1 - c0 + 1;
+    parallel((r1 - r0 + 1) * across, [&](int i, int worker) { body((r0 + i / across) * run.block_columns + c0 + i % across, events[worker]); });
+  }
+
+  Buffer<float> grid_planes(const Run &run, int count) const {
+    Buffer<float> planes(count * run.plane);
+    memset(planes.data(), 0, count * run.plane * sizeof(float));
+    return planes;
+  }
+
+  // The layers, blurred, and the canvases of coarse runs.
+  void blur_all() {
+    find_runs();
+    mark_cells();
+    for (Run &run : runs_) {
+      Buffer<float> planes = grid_planes(run, terms_);
+      for (int k : run.layers) {
+        find_blocks(run, k);
+        blur(run, k, planes.data());
+      }
+      if (run.scale == 1) continue;
+      run.canvas = grid_planes(run, planes_);
+      each_block(run, [&](int block, Events &) {
+        float canvas[MOST * BLOCK_PIXELS];
+        clear(canvas);
+        for (int k : run.layers) put(k, block, canvas);
+        const int y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
+        for (int c = 0; c < planes_; c++)
+          for (int y = 0; y < BLOCK; y++) memcpy(run.canvas.data() + c * run.plane + run.at(y0 + y, x0), canvas + c * BLOCK_PIXELS + y * BLOCK, BLOCK * sizeof(float));
+      });
+    }
+  }
+
+  // Far to near. Without full-resolution layers an empty run stands for the picture.
+  void find_runs() {
+    auto add = [&](int scale) {
+      runs_.emplace_back();
+      Run &run = runs_.back();
+      run.scale = scale;
+      run.margin = scene_.margin / scale;
+      run.rows = scene_.rows / scale;
+      run.columns = scene_.columns / scale;
+      const int more = scale > 1;
+      run.top = run.left = run.margin - more;
+      run.bottom = run.margin + scene_.height / scale + more;
+      run.right = run.margin + scene_.width / scale + more;
+      run.guard = 0;
+    };
+    for (int k = scene_.layers - 1; k >= 0; k--) {
+      const bool follows = !runs_.empty() && runs_.back().scale == layers_[k].scale && (layers_[k].scale == 1 || (layers_[runs_.back().layers.back()].node < 0) == (layers_[k].node < 0));
+      if (!follows) add(layers_[k].scale);
+      runs_.back().layers.push_back(k);
+      runs_.back().guard = std::max(runs_.back().guard, layers_[k].half + BLOCK);
+    }
+    if (!has_fine()) add(1);
+    for (Run &run : runs_) {
+      run.block_rows = ceil_div(run.rows, BLOCK);
+      run.block_columns = ceil_div(run.columns, BLOCK);
+      run.pitch = run.block_columns * BLOCK + 2 * run.guard + LANES;
+      run.plane = (size_t)(run.block_rows * BLOCK + 2 * run.guard) * run.pitch;
+    }
+  }
+  bool has_fine() const {
+    return std::any_of(runs_.begin(), runs_.end(), [](const Run &run) { return run.scale == 1; });
+  }
+
+  // Finds the layers that occur in each cell of CELL_PX x CELL_PX pixels of the padded frame.
+  void mark_cells() {
+    words_ = (scene_.layers + 63) / 64;
+    cell_rows_ = ceil_div(scene_.rows, CELL_PX);
+    cell_columns_ = ceil_div(scene_.columns, CELL_PX);
+    cells_.assign((size_t)cell_rows_ * cell_columns_ * words_, 0);
+    std::vector<float> nodes;
+    for (const Layer &l : layers_) nodes.push_back(l.at);
+    const int last = (int)nodes.size() - 1;
+    parallel(cell_rows_, [&](int row, int) {
+      for (int i = 0; i < S_; i++)
+        for (int y = row * CELL_PX; y < std::min((row + 1) * CELL_PX, scene_.rows); y++) {
+          const float *of_row = scene_.place[i] + (size_t)y * scene_.columns;
+          for (int x = 0, k = 0; x < scene_.columns; x++) {
+            while (k < last && of_row[x] >= nodes[k + 1]) k++;
+            while (k > 0 && of_row[x] < nodes[k]) k--;
+            uint64_t *bits = &cells_[((size_t)row * cell_columns_ + x / CELL_PX) * words_];
+            bits[k / 64] |= 1ull << k % 64;
+            const bool beyond = of_row[x] > nodes[k], at = of_row[x] == nodes[k] && nodes[k] != 0;
+            // a pixel at a node has a gradient in the layers beside it, except in focus
+            if (k < last && (beyond || at)) bits[(k + 1) / 64] |= 1ull << (k + 1) % 64;
+            if (k > 0 && at) bits[(k - 1) / 64] |= 1ull << (k - 1) % 64;
+          }
+        }
+    });
+  }
+  // Whether a layer occurs in a range of pixels of a run's grid.
+  bool occurs(const Run &run, int k, int y0, int y1, int x0, int x1) const {
+    const int s = run.scale, r0 = std::max(y0 * s, 0) / CELL_PX, r1 = std::min(y1 * s - 1, scene_.rows - 1) / CELL_PX;
+    const int c0 = std::max(x0 * s, 0) / CELL_PX, c1 = std::min(x1 * s - 1, scene_.columns - 1) / CELL_PX;
+    for (int r = r0; r <= r1; r++)
+      for (int c = c0; c <= c1; c++)
+        if (cells_[((size_t)r * cell_columns_ + c) * words_ + k / 64] >> k % 64 & 1) return true;
+    return false;
+  }
+
+  // Finds the blocks that a layer's light reaches, and those that are read for them, forward and backward.
+  void find_blocks(const Run &run, int k) {
+    Blurred &b = blurred_[k];
+    const int half = layers_[k].half, count = run.blocks();
+    b.place.assign(count, -1);
+    b.occupied.assign(count, 0);
+    std::vector<uint8_t> needed(count, 0), around(count, 0);
+    auto spread = [&](int block, std::vector<uint8_t> &to) {
+      const int y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
+      for (int r = std::max(y0 - half, 0) / BLOCK; r <= std::min((y0 + BLOCK - 1 + half) / BLOCK, run.block_rows - 1); r++)
+        for (int c = std::max(x0 - half, 0) / BLOCK; c <= std::min((x0 + BLOCK - 1 + half) / BLOCK, run.block_columns - 1); c++) to[r * run.block_columns + c] = 1;
+    };
+    for (int i = 0; i < count; i++) {
+      const int y0 = i / run.block_columns * BLOCK, x0 = i % run.block_columns * BLOCK;
+      b.occupied[i] = occurs(run, k, y0, y0 + BLOCK, x0, x0 + BLOCK);
+      const bool outside = y0 >= run.bottom || y0 + BLOCK <= run.top || x0 >= run.right || x0 + BLOCK <= run.left;
+      if (outside || !occurs(run, k, y0 - half, y0 + BLOCK + half, x0 - half, x0 + BLOCK + half)) continue;
+      b.place[i] = (int)b.reached.size();
+      b.reached.push_back(i);
+      spread(i, needed);
+    }
+    for (int i = 0; i < count; i++)
+      if (needed[i]) b.needed.push_back(i), spread(i, around);
+    for (int i = 0; i < count; i++)
+      if (around[i]) b.around.push_back(i);
+    b.values = Buffer<float>((size_t)b.reached.size() * values_ * BLOCK_PIXELS + 1);
+  }
+
+  float *values_of(int k, int block) const {
+    const int place = blurred_[k].place[block];
+    return place < 0 ? nullptr : blurred_[k].values.data() + (size_t)place * values_ * BLOCK_PIXELS;
+  }
+
+  // A pixel's surfaces near to far (a vector of pixels), and a layer's terms of them.
+  struct Pixels {
+    vec weight[2], counted[2], ahead[2], here[2], h[2], t[2], extra = {}, known = {}, share = {};
+    decltype(vec{} < vec{}) swapped;
+  };
+  void weigh(const Layer &l, size_t at, int n, Pixels &p) const {
+    vec place[2], weight[2];
+    for (int j = 0; j < S_; j++) {
+      place[j] = load_some(scene_.place[j] + at, n);
+      weight[j] = scene_.weight[j] ? load_some(scene_.weight[j] + at, n) : all(1.0f);
+    }
+    p.swapped = S_ > 1 ? place[1] < place[0] : place[0] < place[0];
+    for (int j = 0; j < S_; j++) {
+      const vec its_place = S_ > 1 ? (p.swapped ? place[1 - j] : place[j]) : place[j];
+      p.weight[j] = p.counted[j] = S_ > 1 ? (p.swapped ? weight[1 - j] : weight[j]) : weight[j];
+      p.ahead[j] = (its_place - l.before) * l.per_before + (l.first ? 1.0f : 0.0f);
+      p.here[j] = (its_place - l.at) * l.per_after;
+      p.h[j] = ramp(p.ahead[j], over_);
+      p.t[j] = ramp(p.here[j], over_);
+    }
+    if (S_ < 2) return;
+    p.known = (p.weight[1] - HIDDEN_WEIGHT) * (1.0f / CONTINUATION_SHARE);
+    p.share = p.h[0] * (1.0f / HIDING_SHARE);
+    p.extra = (1.0f - p.weight[1]) * clamp01(p.known);
+    p.counted[1] += p.extra * (1.0f - clamp01(p.share));
+  }
+
+  // The terms of a layer in a block of a run's grid: light, share and the share behind it.
+  void terms(const Run &run, int k, int block, float *planes) const {
+    const Layer &l = layers_[k];
+    const bool occupied = blurred_[k].occupied[block];
+    const int s = run.scale, y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
+    const int first = occupied ? 0 : terms_ - 1, columns = std::min(BLOCK * s, scene_.columns - x0 * s);
+    const float part = 1.0f / (s * s);
+    for (int v = 0; v < terms_; v++)
+      for (int y = 0; y < BLOCK; y++) memset(planes + v * run.plane + run.at(y0 + y, x0), 0, BLOCK * sizeof(float));
+    if (!occupied && !over_) return;
+    for (int y = y0 * s; y < std::min((y0 + BLOCK) * s, scene_.rows); y++)
+      for (int x = 0; x < columns; x += LANES) {
+        const int n = std::min(LANES, columns - x);
+        const size_t at = (size_t)y * scene_.columns + x0 * s + x;
+        Pixels p;
+        weigh(l, at, n, p);
+        vec share[2], term[MOST + 2], own = {}, behind = {};
+        for (int j = 0; j < S_; j++) {
+          share[j] = (p.h[j] - p.t[j]) * p.counted[j];
+          own += share[j];
+          behind += p.t[j] * p.counted[j];
+        }
+        for (int c = first; c < C_; c++) {
+          const vec a = load_some(scene_.light[0] + c * map_ + at, n);
+          if (S_ > 1) {
+            const vec b = load_some(scene_.light[1] + c * map_ + at, n);
+            term[c] = a * (p.swapped ? share[1] : share[0]) + b * (p.swapped ? share[0] : share[1]);
+          } else {
+            term[c] = a * share[0];
+          }
+        }
+        term[C_] = own;
+        if (over_) term[C_ + 1] = behind;
+        for (int v = first; v < terms_; v++) {
+          float *its = planes + v * run.plane + run.at(y / s, x0 + x / s);
+          if (s == 1)
+            memcpy(its, &term[v], n * sizeof(float));
+          else if (s >= LANES)
+            its[0] += part * sum(term[v]);
+          else
+            for (int i = 0; i < n; i++) its[i / s] += part * term[v][i];
+        }
+      }
+  }
+
+  // Which rows of a block's window hold anything of a layer, for convolve_strip.
+  void rows_of(const Run &run, int k, int block, std::vector<uint32_t> &rows) const {
+    const int half = layers_[k].half, y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
+    const int c0 = std::max(x0 - half, 0) / BLOCK, c1 = std::min((x0 + BLOCK - 1 + half) / BLOCK, run.block_columns - 1);
+    rows.assign(BLOCK + 2 * half, 0);
+    int last = -1;
+    uint32_t any = 0;
+    for (int i = 0; i < (int)rows.size(); i++) {
+      const int y = y0 - half + i;
+      if (y < 0 || y / BLOCK >= run.block_rows) continue;
+      if (y / BLOCK != last) {
+        last = y / BLOCK, any = 0;
+        for (int c = c0; c <= c1; c++) any |= blurred_[k].occupied[last * run.block_columns + c] ? ~0u : 0u;
+      }
+      rows[i] = any;
+    }
+  }
+
+  // Convolves a block of a plane: out [BLOCK, BLOCK].
+  void convolve(const Run &run, const float *plane, int block, const Kernel &kernel, const uint32_t *rows, float *out) const {
+    const int y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
+    float strip[STRIP];
+    for (int y = 0; y < BLOCK; y += STRIP_ROWS)
+      for (int x = 0; x < BLOCK; x += STRIP_COLUMNS) {
+        convolve_strip(plane + run.at(y0 + y - kernel.half, x0 + x - kernel.half), run.pitch, rows + y, ~0u, kernel, strip);
+        for (int i = 0; i < STRIP_ROWS; i++) memcpy(out + (y + i) * BLOCK + x, strip + i * STRIP_COLUMNS, STRIP_COLUMNS * sizeof(float));
+      }
+  }
+
+  void blur(const Run &run, int k, float *planes) {
+    const Blurred &b = blurred_[k];
+    parallel((int)b.needed.size(), [&](int i, int) { terms(run, k, b.needed[i], planes); });
+    parallel((int)b.reached.size(), [&](int i, int) {
+      std::vector<uint32_t> rows, every(BLOCK + 2 * layers_[k].half, ~0u);
+      rows_of(run, k, b.reached[i], rows);
+      float *to = values_of(k, b.reached[i]);
+      for (int v = 0; v < values_; v++, to += BLOCK_PIXELS) {
+        const int term = v < C_ + E_ ? std::min(v, C_) : C_ + 1;
+        convolve(run, planes + term * run.plane, b.reached[i], b.kernels[E_ == 1 ? 0 : v < C_ ? v : (v - C_) % E_], term <= C_ ? rows.data() : every.data(), to);
+      }
+    });
+  }
+
+  void clear(float *canvas) const {
+    std::fill(canvas, canvas + C_ * BLOCK_PIXELS, 0.0f);
+    std::fill(canvas + C_ * BLOCK_PIXELS, canvas + planes_ * BLOCK_PIXELS, over_ ? empty_ : 0.0f);
+  }
+
+  // Puts light and coverage (or transmittance, if backed) in front of a canvas.
+  struct Front {
+    vec share, left;
+  };
+  // The share of a layer at a pixel, and what it leaves of the picture behind it.
+  Front front(vec share) const { return {share, scene_.backed ? share : most(all(1.0f) - share, vec{})}; }
+  struct Known {
+    vec lacking, beyond, known;
+  };
+  static Known know(vec own, vec behind) {
+    const vec lacking = most(all(KNOWN) - own - behind, vec{}), beyond = behind + lacking * lacking * (0.5f / KNOWN);
+    return {lacking, beyond, own + beyond};
+  }
+  void put(int k, int block, float *canvas) const {
+    const float *values = values_of(k, block);
+    if (!values) return;
+    if (!over_) {
+      for (int i = 0; i < planes_ * BLOCK_PIXELS; i += LANES) store(canvas + i, load<vec>(canvas + i) + load<vec>(values + i));
+      return;
+    }
+    for (int e = 0; e < E_; e++)
+      for (int i = 0; i < BLOCK_PIXELS; i += LANES) {
+        const vec own = load<vec>(values + (C_ + e) * BLOCK_PIXELS + i), behind = load<vec>(values + (C_ + E_ + e) * BLOCK_PIXELS + i);
+        const Known n = know(own, behind);
+        const Front f = front((scene_.backed ? n.beyond : own) / n.known);
+        for (int c = E_ == 1 ? 0 : e; c < (E_ == 1 ? C_ : e + 1); c++) {
+          float *to = canvas + c * BLOCK_PIXELS + i;
+          store(to, load<vec>(values + c * BLOCK_PIXELS + i) / n.known + f.left * load<vec>(to));
+        }
+        float *to = canvas + (C_ + e) * BLOCK_PIXELS + i;
+        store(to, scene_.backed ? f.left * load<vec>(to) : f.share + f.left * load<vec>(to));
+      }
+  }
+
+  // Row and column of a coarse canvas before a pixel of the picture, and the fraction of the way to the next.
+  static void coarse(int at, int scale, int limit, int &before, float &part) {
+    const float place = (at + 0.5f) / scale + 0.5f;
+    before = std::clamp((int)place, 0, limit - 2);
+    part = place - before;
+  }
+
+  // A coarse canvas at a block of the picture, interpolated: [planes, BLOCK, BLOCK]; false if it is empty there.
+  bool widen(const Run &run, int block, float *out) const {
+    const Run &to = fine();
+    const int y0 = block / to.block_columns * BLOCK - to.margin, x0 = block % to.block_columns * BLOCK - to.margin;
+    const int s = run.scale, rows = run.bottom - run.top, columns = run.right - run.left;
+    int column[BLOCK], first;
+    float part[BLOCK];
+    for (int x = 0; x < BLOCK; x++) coarse(x0 + x, s, columns, column[x], part[x]);
+    first = column[0];
+    const int count = column[BLOCK - 1] + 2 - first;
+    {
+      int low, high;
+      float unused;
+      coarse(y0, s, rows, low, unused);
+      coarse(y0 + BLOCK - 1, s, rows, high, unused);
+      bool any = false;
+      for (int r = (run.top + low) / BLOCK; r <= (run.top + high + 1) / BLOCK; r++)
+        for (int c = (run.left + first) / BLOCK; c <= (run.left + first + count - 1) / BLOCK; c++)
+          for (int k : run.layers) any |= blurred_[k].place[r * run.block_columns + c] >= 0;
+      if (!any) return false;
+    }
+    for (int c = 0; c < planes_; c++) {
+      const float *plane = run.canvas.data() + c * run.plane;
+      for (int y = 0; y < BLOCK; y++) {
+        int row;
+        float down, line[BLOCK + 2];
+        coarse(y0 + y, s, rows, row, down);
+        const float *upper = plane + run.at(run.top + row, run.left + first), *lower = upper + run.pitch;
+        for (int i = 0; i < count; i++) line[i] = upper[i] + down * (lower[i] - upper[i]);
+        float *its = out + c * BLOCK_PIXELS + y * BLOCK;
+        for (int x = 0; x < BLOCK; x++) {
+          const float *v = line + column[x] - first;
+          its[x] = v[0] + part[x] * (v[1] - v[0]);
+        }
+      }
+    }
+    return true;
+  }
+  // The gradient of a coarse canvas at a block of its grid, from that of its interpolation: [planes, BLOCK, BLOCK].
+  void gather(const Run &run, int block, float *slopes) const {
+    const int s = run.scale, y0 = block / run.block_columns * BLOCK - run.top, x0 = block % run.block_columns * BLOCK - run.left;
+    const int H = scene_.height, W = scene_.width, rows = run.bottom - run.top, columns = run.right - run.left;
+    auto weight = [&](int at, int i, int limit) {
+      int before;
+      float part;
+      coarse(at, s, limit, before, part);
+      return before == i ? 1.0f - part : before + 1 == i ? part : 0.0f;
+    };
+    // pixels of the picture that a coarse pixel i may have a part in: (i - 1.5) s to (i + 0.5) s
+    auto low = [&](int i) { return std::max((2 * i - 3) * s / 2 - 1, 0); };
+    auto high = [&](int i, int limit) { return std::min((2 * i + 1) * s / 2 + 1, limit); };
+    std::vector<float> line(W);
+    memset(slopes, 0, planes_ * BLOCK_PIXELS * sizeof(float));
+    const int left = low(std::max(x0, 0)), right = high(std::min(x0 + BLOCK, columns) - 1, W);
+    for (int c = 0; c < planes_; c++)
+      for (int y = std::max(0, -y0); y < BLOCK && y0 + y < rows; y++) {
+        std::fill(line.begin(), line.end(), 0.0f);
+        for (int from = low(y0 + y); from < high(y0 + y, H); from++) {
+          const float part = weight(from, y0 + y, rows), *row = run.slopes.data() + ((size_t)c * H + from) * W;
+          if (part != 0)
+            for (int x = left; x < right; x++) line[x] += part * row[x];
+        }
+        for (int x = std::max(0, -x0); x < BLOCK && x0 + x < columns; x++) {
+          float total = 0;
+          for (int from = low(x0 + x); from < high(x0 + x, W); from++) total += weight(from, x0 + x, columns) * line[from];
+          slopes[c * BLOCK_PIXELS + y * BLOCK + x] = total;
+        }
+      }
+  }
+
+  // Puts a coarse canvas in front of a block of the picture; `kept`: where its interpolated values are kept.
+  bool join(const Run &run, int block, float *canvas, float *kept) const {
+    float memory[MOST * BLOCK_PIXELS], *values = kept ? kept : memory;
+    if (!widen(run, block, values)) return false;
+    if (!over_) {
+      for (int i = 0; i < planes_ * BLOCK_PIXELS; i += LANES) store(canvas + i, load<vec>(canvas + i) + load<vec>(values + i));
+      return true;
+    }
+    for (int e = 0; e < E_; e++)
+      for (int i = 0; i < BLOCK_PIXELS; i += LANES) {
+        const Front f = front(load<vec>(values + (C_ + e) * BLOCK_PIXELS + i));
+        for (int c = E_ == 1 ? 0 : e; c < (E_ == 1 ? C_ : e + 1); c++) {
+          float *to = canvas + c * BLOCK_PIXELS + i;
+          store(to, load<vec>(values + c * BLOCK_PIXELS + i) + f.left * load<vec>(to));
+        }
+        float *to = canvas + (C_ + e) * BLOCK_PIXELS + i;
+        store(to, scene_.backed ? f.left * load<vec>(to) : f.share + f.left * load<vec>(to));
+      }
+    return true;
+  }
+
+  // Pixels of a block that lie in a run's canvas, as rows and columns of the block.
+  struct Inside {
+    int top, bottom, left, right;
+  };
+  Inside inside(const Run &run, int block) const {
+    const int y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
+    return {std::max(run.top - y0, 0), std::min(run.bottom - y0, BLOCK), std::max(run.left - x0, 0), std::min(run.right - x0, BLOCK)};
+  }
+  template <typename Body>  // body(plane, position in the block, position in a picture, count) for each row
+  void each_row(const Run &run, int block, const Body &body) const {
+    const Inside in = inside(run, block);
+    const int y0 = block / run.block_columns * BLOCK - run.margin, x0 = block % run.block_columns * BLOCK - run.margin;
+    for (int c = 0; c < planes_; c++)
+      for (int y = in.top; y < in.bottom; y++)
+        body(c * BLOCK_PIXELS + y * BLOCK + in.left, ((size_t)c * scene_.height + y0 + y) * scene_.width + x0 + in.left, in.right - in.left);
+  }
+  void write(const Run &run, int block, const float *canvas, float *out) const {
+    each_row(run, block, [&](size_t from, size_t to, int count) { memcpy(out + to, canvas + from, count * sizeof(float)); });
+  }
+  void read(const Run &run, int block, const float *picture, float *canvas) const {
+    memset(canvas, 0, planes_ * BLOCK_PIXELS * sizeof(float));
+    each_row(run, block, [&](size_t to, size_t from, int count) { memcpy(canvas + to, picture + from, count * sizeof(float)); });
+  }
+
+  // Gradient of what is behind (in place of that of the picture in front of it) and, returned, of a front's share. `add`:
+  // called with each channel's gradient.
+  template <typename Light>
+  vec through(int e, int i, Front f, const float *behind, float *slopes, const Light &light) const {
+    float *coverage = slopes + (C_ + e) * BLOCK_PIXELS + i;
+    const vec of_coverage = load<vec>(coverage);
+    vec left = of_coverage * load<vec>(behind + (C_ + e) * BLOCK_PIXELS + i);
+    for (int c = E_ == 1 ? 0 : e; c < (E_ == 1 ? C_ : e + 1); c++) {
+      float *its = slopes + c * BLOCK_PIXELS + i;
+      const vec slope = load<vec>(its);
+      left += slope * load<vec>(behind + c * BLOCK_PIXELS + i);
+      light(c, slope);
+      store(its, f.left * slope);
+    }
+    store(coverage, f.left * of_coverage);
+    return scene_.backed ? left : of_coverage - (f.share <= all(1.0f) ? left : vec{});
+  }
+
+  // Walks back through a layer: its blurred terms become their gradients.
+  void walk_layer(int k, int block, const float *behind, float *slopes) const {
+    float *values = values_of(k, block);
+    if (!over_) {
+      memcpy(values, slopes, values_ * BLOCK_PIXELS * sizeof(float));
+      return;
+    }
+    for (int e = 0; e < E_; e++)
+      for (int i = 0; i < BLOCK_PIXELS; i += LANES) {
+        float *own = values + (C_ + e) * BLOCK_PIXELS + i, *beyond = values + (C_ + E_ + e) * BLOCK_PIXELS + i;
+        const Known n = know(load<vec>(own), load<vec>(beyond));
+        const vec per = all(1.0f) / n.known, share = (scene_.backed ? n.beyond : load<vec>(own)) * per;
+        vec of_known = {};
+        const vec of_share = through(e, i, front(share), behind, slopes, [&](int c, vec slope) {
+          float *its = values + c * BLOCK_PIXELS + i;
+          const vec of_light = slope * per;
+          of_known -= of_light * load<vec>(its) * per;
+          store(its, of_light);
+        });
+        of_known -= of_share * share * per;
+        const vec of_part = of_share * per, of_beyond = of_known + (scene_.backed ? of_part : vec{}), lacking = n.lacking * (1.0f / KNOWN);
+        store(own, of_known + (scene_.backed ? vec{} : of_part) - of_beyond * lacking);
+        store(beyond, of_beyond * (1.0f - lacking));
+      }
+  }
+
+  // Composites the layers of a coarse block again, and walks back through them.
+  void walk_layers(const Run &run, int block, Events &events, float *slopes) const {
+    const size_t size = planes_ * BLOCK_PIXELS;
+    events.resize(size * (run.layers.size() + 1));
+    float *canvas = events.data();
+    clear(canvas);
+    for (int k : run.layers) {
+      memcpy(canvas + size, canvas, size * sizeof(float));
+      canvas += size;
+      put(k, block, canvas);
+    }
+    for (int i = (int)run.layers.size() - 1; i >= 0; i--)
+      if (values_of(run.layers[i], block)) walk_layer(run.layers[i], block, events.data() + i * size, slopes);
+  }
+
+  // The same for a block of the picture, of layers and coarse canvases.
+  void walk(int block, Events &events, float *slopes) const {
+    const size_t size = planes_ * BLOCK_PIXELS;
+    size_t count = 0;
+    for (const Run &run : runs_) count += run.scale > 1 ? 2 : run.layers.size();
+    events.resize(size * (count + 1));
+    std::vector<const float *> behind;  // the canvas behind each layer or coarse canvas
+    std::vector<float> canvas(size);
+    float *free = events.data();
+    clear(canvas.data());
+    auto keep = [&] {
+      memcpy(free, canvas.data(), size * sizeof(float));
+      behind.push_back(free);
+      free += size;
+    };
+    for (const Run &run : runs_)
+      if (run.scale > 1) {
+        keep();
+        if (join(run, block, canvas.data(), free))
+          free += size;
+        else
+          behind.back() = nullptr;
+      } else {
+        for (int k : run.layers) {
+          keep();
+          put(k, block, canvas.data());
+        }
+      }
+    for (int r = (int)runs_.size() - 1; r >= 0; r--) {
+      const Run &run = runs_[r];
+      if (run.scale > 1) {
+        const float *its = behind.back();
+        behind.pop_back();
+        if (its) walk_join(run, block, its, its + size, slopes);
+      } else {
+        for (int i = (int)run.layers.size() - 1; i >= 0; i--, behind.pop_back())
+          if (values_of(run.layers[i], block)) walk_layer(run.layers[i], block, behind.back(), slopes);
+      }
+    }
+  }
+  void walk_join(const Run &run, int block, const float *behind, const float *values, float *slopes) const {
+    float of_run[MOST * BLOCK_PIXELS];
+    if (over_)
+      for (int e = 0; e < E_; e++)
+        for (int i = 0; i < BLOCK_PIXELS; i += LANES) {
+          const Front f = front(load<vec>(values + (C_ + e) * BLOCK_PIXELS + i));
+          const vec of_share = through(e, i, f, behind, slopes, [&](int c, vec slope) { store(of_run + c * BLOCK_PIXELS + i, slope); });
+          store(of_run + (C_ + e) * BLOCK_PIXELS + i, of_share);
+        }
+    else
+      memcpy(of_run, slopes, planes_ * BLOCK_PIXELS * sizeof(float));
+    write(fine(), block, of_run, run.slopes.data());
+  }
+
+  // Scatters the gradients of a layer's blurred terms to its terms, and on to the surfaces.
+  void scatter_back(const Run &run, int k, float *planes) {
+    const Blurred &b = blurred_[k];
+    parallel((int)b.around.size(), [&](int i, int) {
+      const int block = b.around[i], y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
+      const float *values = values_of(k, block);
+      for (int v = 0; v < values_; v++)
+        for (int y = 0; y < BLOCK; y++) {
+          float *to = planes + v * run.plane + run.at(y0 + y, x0);
+          if (values)
+            memcpy(to, values + v * BLOCK_PIXELS + y * BLOCK, BLOCK * sizeof(float));
+          else
+            memset(to, 0, BLOCK * sizeof(float));
+        }
+    });
+    parallel((int)b.needed.size(), [&](int i, int) {
+      const int block = b.needed[i];
+      if (!b.occupied[block] && (!over_ || !weighed())) return;  // its terms are constant there
+      const std::vector<uint32_t> every(BLOCK + 2 * layers_[k].half, ~0u);
+      float slopes[(MOST + 2) * BLOCK_PIXELS], more[BLOCK_PIXELS];
+      for (int term = b.occupied[block] ? 0 : C_ + 1; term < terms_; term++) {
+        float *to = slopes + term * BLOCK_PIXELS;
+        const int first = term < C_ ? term : term == C_ ? C_ : C_ + E_, count = term < C_ ? 1 : E_;
+        for (int e = 0; e < count; e++) {
+          const Kernel &kernel = b.turned[E_ == 1 ? 0 : term < C_ ? term : e];
+          convolve(run, planes + (first + e) * run.plane, block, kernel, every.data(), e ? more : to);
+          for (int j = 0; e && j < BLOCK_PIXELS; j++) to[j] += more[j];
+        }
+      }
+      to_surfaces(run, k, block, slopes);
+    });
+  }
+  bool weighed() const {
+    for (int j = 0; j < S_; j++)
+      if (scene_.weight[j]) return true;
+    return false;
+  }
+
+  void to_surfaces(const Run &run, int k, int block, const float *slopes) const {
+    const Layer &l = layers_[k];
+    const bool occupied = blurred_[k].occupied[block];
+    const int s = run.scale, y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
+    const int columns = std::min(BLOCK * s, scene_.columns - x0 * s);
+    const float part = 1.0f / (s * s);
+    for (int y = y0 * s; y < std::min((y0 + BLOCK) * s, scene_.rows); y++)
+      for (int x = 0; x < columns; x += LANES) {
+        const int n = std::min(LANES, columns - x);
+        const size_t at = (size_t)y * scene_.columns + x0 * s + x;
+        const float *row = slopes + (y / s - y0) * BLOCK;
+        auto slope = [&](int v) {
+          const float *from = row + v * BLOCK_PIXELS;
+          if (s == 1) return load<vec>(from + x);
+          vec wide;
+          for (int i = 0; i < LANES; i++) wide[i] = from[(x + i) / s];
+          return wide * part;
+        };
+        Pixels p;
+        weigh(l, at, n, p);
+        const vec of_behind = over_ ? slope(C_ + 1) : vec{};
+        vec of_share[2], of_counted[2], of_h[2] = {}, of_t[2] = {};
+        if (occupied) of_share[0] = of_share[1] = slope(C_);
+        for (int c = 0; occupied && c < C_; c++) {
+          const vec of_light = slope(c);
+          for (int j = 0; j < S_; j++) {
+            // surface j as it is stored is the nearer or the farther one
+            const vec light = load_some(scene_.light[j] + c * map_ + at, n);
+            const vec own = S_ > 1 ? (p.swapped ? (p.h[1 - j] - p.t[1 - j]) * p.counted[1 - j] : (p.h[j] - p.t[j]) * p.counted[j]) : (p.h[0] - p.t[0]) * p.counted[0];
+            add_some(light_[j] + c * map_ + at, of_light * own, n);
+            if (S_ == 1) {
+              of_share[0] += of_light * light;
+            } else {
+              of_share[j] += p.swapped ? vec{} : of_light * light;
+              of_share[1 - j] += p.swapped ? of_light * light : vec{};
+            }
+          }
+        }
+        for (int j = 0; j < S_; j++) {
+          of_counted[j] = of_behind * p.t[j];
+          if (!occupied) continue;
+          of_counted[j] += of_share[j] * (p.h[j] - p.t[j]);
+          of_h[j] = of_share[j] * p.counted[j];
+          of_t[j] = (of_behind - of_share[j]) * p.counted[j];
+        }
+        if (S_ > 1) {
+          const vec hidden = 1.0f - clamp01(p.share);
+          const auto known_inside = (p.known >= vec{}) & (p.known <= all(1.0f)), share_inside = (p.share >= vec{}) & (p.share <= all(1.0f));
+          const vec of_extra = (known_inside ? (1.0f - p.weight[1]) * (1.0f / CONTINUATION_SHARE) : vec{}) - clamp01(p.known);
+          of_h[0] -= share_inside ? of_counted[1] * p.extra * (1.0f / HIDING_SHARE) : vec{};
+          of_counted[1] *= 1.0f + of_extra * hidden;
+        }
+        vec of_place[2];
+        for (int j = 0; j < S_; j++)
+          of_place[j] = of_h[j] * slope_of_ramp(p.ahead[j], over_) * l.per_before + of_t[j] * slope_of_ramp(p.here[j], over_) * l.per_after;
+        for (int j = 0; j < S_; j++) {
+          const vec its_place = S_ > 1 ? (p.swapped ? of_place[1 - j] : of_place[j]) : of_place[j];
+          const vec its_weight = S_ > 1 ? (p.swapped ? of_counted[1 - j] : of_counted[j]) : of_counted[j];
+          add_some(place_[j] + at, its_place, n);
+          if (scene_.weight[j]) add_some(weight_[j] + at, its_weight, n);
+        }
+      }
+  }
+
+  const torchdof_layers &scene_;
+  const int C_, E_, S_;
+  const bool over_;
+  const int terms_, values_, planes_;  // of a layer: terms, blurred terms; planes of a canvas
+  const float empty_;
+  const size_t map_ = (size_t)scene_.rows * scene_.columns;
+  std::vector<Layer> layers_;
+  std::vector<Blurred> blurred_;
+  std::vector<Run> runs_;
+  int words_ = 0, cell_rows_ = 0, cell_columns_ = 0;
+  std::vector<uint64_t> cells_;
+  float *const *light_ = nullptr, *const *place_ = nullptr, *const *weight_ = nullptr;
+};
+
+}  // namespace
+
+void blend(const torchdof_layers &scene, float *out) { Blend(scene).picture(out); }
+
+void blend_gradient(const torchdof_layers &scene, const float *out_gradient, float *const *light, float *const *place, float *const *weight) {
+  Blend(scene).gradient(out_gradient, light, place, weight);
+}
+
+}  // namespace TORCHDOF_SIMD
+}  // namespace torchdof

@@ -1,0 +1,82 @@
+"""Blur and composite the layers of a frame with the compiled engine, forward and backward."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .. import native
+from ..tensors import is_in_memory, is_traced
+from .plan import Blur
+from .surfaces import Frame, Placed
+
+__all__ = ["blended"]
+
+
+def blended(
+    frame: Frame, blurs: Sequence[Blur], backed: bool, plain: Callable[[Sequence[Placed]], Tensor]
+) -> Tensor | None:
+    """Composite all layers of a frame, with its gradient: light followed by its weights, ``[B, C + 1 or C, h, w]``.
+
+    The gradient of the gradient comes from the plain engine.
+
+    Args:
+        frame: One surface, or two that share each pixel, in any order.
+        blurs: Kernel and resolution of each layer.
+        backed: Whether the weights are transmittances, not coverages; without occlusion they are sums of weights.
+        plain: The same computation, differentiable, for the surfaces of such a frame.
+
+    Returns:
+        None if the compiled engine cannot compute it: it needs float32 on the CPU, eager code without function
+        transforms, and kernels that are the same everywhere and have no gradient.
+    """
+    if is_traced() or not native.chosen() or frame.stacked:
+        return None
+    given = [[t for t in surface if t is not None] for surface in frame.surfaces]
+    tensors = [t for of_surface in given for t in of_surface]
+    if not all(t.dtype == torch.float32 and is_in_memory(t.detach()) for t in tensors):
+        return None
+    if any(b.shares is not None or b.kernel.requires_grad or b.half > native.HALF_LARGEST for b in blurs):
+        return None
+    if frame.colours + max(len(blur.kernel) for blur in blurs) > native.MOST_PLANES:
+        return None
+    layers = [(blur.kernel, blur.scale) for blur in blurs]
+    padded = native.PaddedFrame(frame.margin, frame.area, frame.nodes, layers, frame.occlusion, backed)
+    result: Tensor = _Blend.apply(padded, list(map(len, given)), plain, *tensors)
+    return result
+
+
+def _surfaces(counts: Sequence[int], tensors: Sequence[Tensor]) -> list[Placed]:
+    """The surfaces of a flat list of tensors, with ``counts`` tensors each."""
+    left = iter(tensors)
+    return [Placed(*(next(left) for _ in range(count))) for count in counts]
+
+
+class _Blend(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, padded: native.PaddedFrame, counts: list[int], plain: Any, *tensors: Tensor) -> Tensor:
+        ctx.padded, ctx.counts, ctx.plain = padded, counts, plain
+        ctx.save_for_backward(*tensors)
+        return torch.stack([native.blend(item, padded) for item in _items(counts, tensors)])
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,), tensors = gradients, ctx.saved_tensors
+        if torch.is_grad_enabled():  # a gradient of this gradient will be asked for
+            wanted = [t for t in tensors if t.requires_grad]
+            picture = ctx.plain(_surfaces(ctx.counts, tensors))
+            found = iter(torch.autograd.grad(picture, wanted, gradient, create_graph=True))
+            return None, None, None, *(next(found) if t.requires_grad else None for t in tensors)
+        items = zip(_items(ctx.counts, tensors), gradient, strict=True)
+        found = zip(*(native.blend_gradient(item, ctx.padded, of_item) for item, of_item in items), strict=True)
+        return None, None, None, *(torch.stack(each).view_as(t) for each, t in zip(found, tensors, strict=True))
+
+
+def _items(counts: Sequence[int], tensors: Sequence[Tensor]) -> list[list[tuple[Tensor, Tensor, Tensor | None]]]:
+    """Light, position and weight of each surface, for each item of a batch."""
+    surfaces = _surfaces(counts, [t.detach() for t in tensors])
+    return [
+        [(s.light[i], s.x[i, 0], None if s.weight is None else s.weight[i, 0]) for s in surfaces]
+        for i in range(len(tensors[0]))
+    ]
