@@ -21,6 +21,7 @@ from torch import Tensor
 
 __all__ = [
     "HALF_LARGEST",
+    "MOST_LEVELS",
     "MOST_PLANES",
     "Kind",
     "PaddedFrame",
@@ -32,6 +33,8 @@ __all__ = [
     "describe",
     "ends",
     "kernels",
+    "look_behind",
+    "look_behind_gradient",
     "plan",
     "render",
     "repair_edges",
@@ -45,6 +48,9 @@ other, near to far."""
 HALF_LARGEST = 256
 """Largest half width of a kernel, in pixels of its layer; larger kernels need the PyTorch engine."""
 
+MOST_LEVELS = 4
+"""Most levels of :func:`look_behind`."""
+
 MOST_PLANES = 16
 """Most channels of light and kernels' colours together in :func:`blend`."""
 
@@ -52,7 +58,7 @@ _KINDS: dict[Kind, int] = {"image": 0, "background": 1, "stack": 2}
 _SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
 _SMALL_FRAME = 2**16  # pixels; up to this size the main thread renders itself, which saves 0.1 ms
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
-_REVISION = 6  # of ``src/api.h``
+_REVISION = 7  # of ``src/api.h``
 
 _Floats = ctypes.POINTER(ctypes.c_float)
 
@@ -201,6 +207,16 @@ class _Layers(ctypes.Structure):
         ("kernels", ctypes.c_void_p),
         ("threads", ctypes.c_int32),
         ("cancelled", ctypes.POINTER(ctypes.c_int32)),
+    ]
+
+
+class _Level(ctypes.Structure):
+    """``torchdof_level`` of ``src/api.h``."""
+
+    _fields_ = [  # noqa: RUF012
+        ("values", ctypes.c_void_p),
+        *((name, ctypes.c_int32) for name in ("rows", "columns", "step")),
+        *((name, ctypes.c_float) for name in ("least_px", "slope", "most")),
     ]
 
 
@@ -434,6 +450,47 @@ def _blended(
     return results
 
 
+Levels = Sequence[tuple[Tensor, tuple[int, float, float, float]]]
+"""Light, coc and weight of each level of a pyramid, ``[C + 2, h, w]``; with the distance of two samples in pixels, the
+smallest blur at which a pixel reads the level, the votes for each weight, and the most votes."""
+
+
+def look_behind(levels: Levels, coc: Tensor) -> Tensor:
+    """Surfaces behind those of an image with coc ``[H, W]``, as ``torchdof.render.disocclusion`` defines them.
+
+    Returns:
+        Light, coc and votes, ``[C + 2, H, W]``, float32; the same bits for any number of threads.
+
+    Raises:
+        MemoryError: If there is not enough memory.
+    """
+    coc, made = coc.contiguous(), [values.contiguous() for values, _ in levels]
+    out = torch.empty(made[0].shape[0], *coc.shape, dtype=torch.float32, device="cpu")
+    arguments = _level_arguments(made, levels, coc)
+    _check(_engine().torchdof_look_behind(*arguments, out.data_ptr()))
+    return out
+
+
+def look_behind_gradient(levels: Levels, coc: Tensor, gradient: Tensor) -> list[Tensor]:
+    """The gradients of :func:`look_behind` by coc and by each level, from that by its result ``[C + 2, H, W]``.
+
+    Raises:
+        MemoryError: If there is not enough memory.
+    """
+    coc, made = coc.contiguous(), [values.contiguous() for values, _ in levels]
+    gradient, of_coc, of_levels = gradient.contiguous(), torch.empty_like(coc), [torch.zeros_like(t) for t in made]
+    arguments = _level_arguments(made, levels, coc)
+    pointers = (gradient.data_ptr(), _pointers(of_levels), of_coc.data_ptr())
+    _check(_engine().torchdof_look_behind_gradient(*arguments, *pointers))
+    return [of_coc, *of_levels]
+
+
+def _level_arguments(made: Sequence[Tensor], levels: Levels, coc: Tensor) -> tuple[Any, ...]:
+    each = [_Level(t.data_ptr(), *t.shape[1:], *rule) for t, (_, rule) in zip(made, levels, strict=True)]
+    count, threads = len(each), torch.get_num_threads()
+    return _array(_Level, count)(*each), count, made[0].shape[0] - 2, coc.data_ptr(), *coc.shape, threads
+
+
 def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool = False) -> Tensor:
     """Repairs the edges of a depth map, as :func:`torchdof.render.edges.repair`, for one image.
 
@@ -657,7 +714,7 @@ def _fits(library: ctypes.CDLL) -> bool:
     except AttributeError:
         return False
     interface.restype = ctypes.c_int64
-    others = ctypes.sizeof(_Map) + ctypes.sizeof(_Layers)
+    others = ctypes.sizeof(_Map) + ctypes.sizeof(_Layers) + ctypes.sizeof(_Level)
     expected: int = _REVISION << 32 | ctypes.sizeof(_Scene) << 16 | others
     return bool(interface() == expected)
 
@@ -700,6 +757,9 @@ def _library() -> tuple[ctypes.CDLL | None, str]:
     library.torchdof_blend.argtypes = [ctypes.POINTER(_Layers), pointer]
     library.torchdof_blend_gradient.argtypes = [ctypes.POINTER(_Layers), pointer, maps, maps, maps]
     whole, numbers = ctypes.c_int32, ctypes.POINTER(ctypes.c_double)
+    of_levels = [ctypes.POINTER(_Level), whole, whole, pointer, whole, whole, whole]
+    library.torchdof_look_behind.argtypes = [*of_levels, pointer]
+    library.torchdof_look_behind_gradient.argtypes = [*of_levels, pointer, maps, pointer]
     real = ctypes.c_float
     library.torchdof_coc.argtypes = [pointer, ctypes.c_int64, real, real, real, whole, pointer]
     library.torchdof_plan.argtypes = [pointer, *[whole] * 3, numbers, whole, numbers, whole, ctypes.POINTER(whole)]

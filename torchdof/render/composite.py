@@ -9,7 +9,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from . import field
-from .blend import blended
+from .compiled_steps import blended
 from .convolution import CHANNELS
 from .downsampling import downsampled, upsampled
 from .ops import EAGER, Ops

@@ -12,6 +12,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ..optics.kernel_cache import kept
+from .compiled_steps import looked_behind
 from .downsampling import downsampled
 from .matting import NEVER_PX, attribute_emitters, matte
 from .ops import EAGER, Level, Ops, Seen
@@ -292,10 +293,17 @@ def _farthest(light: Tensor, coc_px: Tensor, weight: Tensor) -> tuple[Tensor, Te
 
 def _seen(levels: Sequence[Level], coc_px: Tensor) -> Seen:
     """Light and coc behind the surfaces of an image, ``[B, C + 1, H, W]``, and the sum of votes ``[B, 1, H, W]``."""
-    size = (coc_px.shape[-2], coc_px.shape[-1])
-    shown = [shown_behind(values, share, coc_px) for values, share in zip(*_samples(levels, size, 1), strict=True)]
-    lights, weights = (torch.stack(parts) for parts in zip(*shown, strict=True))
-    return search(levels, lights, weights, coc_px)
+
+    def plain(values: Sequence[Tensor], coc_px: Tensor) -> Tensor:
+        given = [level._replace(values=t) for level, t in zip(levels, values, strict=True)]
+        samples = _samples(given, (coc_px.shape[-2], coc_px.shape[-1]), 1)
+        shown = [shown_behind(values, share, coc_px) for values, share in zip(*samples, strict=True)]
+        lights, weights = (torch.stack(parts) for parts in zip(*shown, strict=True))
+        return torch.cat(search(given, lights, weights, coc_px), 1)
+
+    found = looked_behind(levels, [_rule(level) for level in levels], coc_px, plain)
+    found = plain([level.values for level in levels], coc_px) if found is None else found
+    return found[:, :-1], found[:, -1:]
 
 
 def _samples(levels: Sequence[Level], size: tuple[int, int], step: int) -> tuple[list[Tensor], Tensor]:
@@ -354,8 +362,7 @@ def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tenso
     Returns:
         Light and coc ``[B, C + 1, h, w]``, and the sum of the levels' votes ``[B, 1, h, w]``.
     """
-    rules = tuple((level.least_px, level.vote) for level in levels)
-    numbers = _numbers_of(rules, coc_px.dtype, coc_px.device)
+    numbers = _numbers_of(tuple(_rule(level) for level in levels), coc_px.dtype, coc_px.device)
     least, slope, most = (numbers[i, :, None, None, None, None] for i in range(3))
     looked = (coc_px.abs() / least - 1.0).clamp(0.0, 1.0)
     votes = looked * torch.minimum(weight * slope, most)
@@ -373,13 +380,15 @@ def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tenso
     return seen, total
 
 
+def _rule(level: Level) -> tuple[float, float, float]:
+    """Smallest blur in pixels at which a level is read, votes per weight, and most votes."""
+    return (level.least_px, 1.0, math.inf) if level.vote is None else (level.least_px, level.vote / _SURE, level.vote)
+
+
 @kept
-def _numbers_of(rules: tuple[tuple[float, float | None], ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Rows of ``[3, L]``: smallest blur in pixels at which a level is read; votes per weight; most votes."""
-    numbers = [
-        (least_px, 1.0, math.inf) if vote is None else (least_px, vote / _SURE, vote) for least_px, vote in rules
-    ]
-    return torch.tensor(numbers, dtype=dtype, device=device).t()
+def _numbers_of(rules: tuple[tuple[float, float, float], ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Rows of ``[3, L]``: the numbers of :func:`_rule`."""
+    return torch.tensor(rules, dtype=dtype, device=device).t()
 
 
 def _least_px(level: int) -> float:

@@ -11,7 +11,7 @@ from .. import native
 from ..optics.blur_table import BlurTable
 from ..optics.kernel_bank import Spots, bank_of
 from ..optics.placed_kernels import Shares, layer_shares
-from ..tensors import is_differentiated, is_in_memory, is_traced
+from ..tensors import is_in_memory, is_traced
 from ..validation import show, tolerance_of
 from . import layer_cocs, traced
 from .downsampling import shrink
@@ -256,16 +256,14 @@ def longest_px(size: tuple[int, int], scales: Sequence[int]) -> list[int]:
 def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int, per_px: int = KERNELS_PER_PX) -> Tensor:
     """Kernels ``[n, 1 or C, k, k]``, float64, of single pixels, such as highlights, with signed coc ``[n]``.
 
-    Without gradients, each is interpolated between kernels at ``per_px`` radii per pixel. They are cut to the offsets
-    within a frame whose longer side is ``longest`` pixels.
+    Each is interpolated between kernels at ``per_px`` radii per pixel, which gives its gradient too. They are cut to the
+    offsets within a frame whose longer side is ``longest`` pixels.
     """
     if table.is_differentiated:
         kernels = table.kernels(coc_px, width)
-    elif is_differentiated(coc_px):
-        kernels = bank_of(table).kernels(coc_px, width, longest=[longest] * len(coc_px))
     else:
         steps = coc_px.double() * per_px
-        below = steps.floor()
+        below = steps.detach().floor()
         radii, which = torch.unique(torch.stack([below, below + 1.0]), return_inverse=True)
         of_radii = bank_of(table).kernels(radii / per_px, width, longest=[longest] * len(radii)).to(coc_px.device)
         kernels = torch.lerp(of_radii[which[0]], of_radii[which[1]], (steps - below)[:, None, None, None])

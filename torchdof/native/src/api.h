@@ -156,6 +156,25 @@ TORCHDOF_API int32_t torchdof_blend(const torchdof_layers *layers, float *out);
 TORCHDOF_API int32_t torchdof_blend_gradient(const torchdof_layers *layers, const float *gradient, float *const *light,
                                              float *const *place, float *const *weight);
 
+// A level of the pyramid from which hidden surfaces are filled; see render/disocclusion.py.
+typedef struct {
+  const float *values;    // [channels + 2, rows, columns]: light, coc, weight
+  int32_t rows, columns;  // at least 2
+  int32_t step;           // pixels between two samples; of all levels together they cover the same pixels
+  float least_px;         // blur above which a pixel reads the level
+  float slope, most;      // votes for each weight of the samples, and most votes
+} torchdof_level;
+#define TORCHDOF_MOST_LEVELS 4
+
+// The surfaces behind pixels with coc [height, width]. out: light, coc and votes, [channels + 2, height, width].
+TORCHDOF_API int32_t torchdof_look_behind(const torchdof_level *levels, int32_t count, int32_t channels, const float *coc, int32_t height,
+                                          int32_t width, int32_t threads, float *out);
+
+// From the gradient of `out`: adds to the gradients of the levels' values, sets that of coc.
+TORCHDOF_API int32_t torchdof_look_behind_gradient(const torchdof_level *levels, int32_t count, int32_t channels, const float *coc,
+                                                   int32_t height, int32_t width, int32_t threads, const float *gradient,
+                                                   float *const *of_levels, float *of_coc);
+
 // Smallest and largest value; both NaN if any value is NaN.
 TORCHDOF_API int32_t torchdof_ends(const float *values, int64_t count, int32_t threads, float *low, float *high);
 
@@ -165,7 +184,7 @@ TORCHDOF_API void torchdof_convolve(const float *in, int32_t height, int32_t wid
 
 // Version of this interface, for the caller to check first: sizes of its structures and, in the upper half,
 // TORCHDOF_REVISION, which increases with every other change of this file.
-#define TORCHDOF_REVISION 6
+#define TORCHDOF_REVISION 7
 TORCHDOF_API int64_t torchdof_interface(void);
 
 // "avx2" or "baseline".

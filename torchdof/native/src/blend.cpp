@@ -54,7 +54,7 @@ struct Run {
 struct Blurred {
   std::vector<int> place;   // of each block in `values`, or -1
   std::vector<int> reached, needed, around;  // blocks with blurred terms; that these read; that those read
-  std::vector<uint8_t> occupied;  // blocks in which the layer occurs
+  std::vector<uint8_t> occupied, behind;  // blocks in which the layer occurs; in which anything lies behind it
   Buffer<float> values;     // [blocks, terms, BLOCK_PIXELS]
   std::vector<Kernel> kernels, turned;  // for each colour
 };
@@ -204,12 +204,14 @@ class Blend {
     return std::any_of(runs_.begin(), runs_.end(), [](const Run &run) { return run.scale == 1; });
   }
 
-  // Finds the layers that occur in each cell of CELL_PX x CELL_PX pixels of the padded frame.
+  // Finds the layers that occur in each cell of CELL_PX x CELL_PX pixels of the padded frame, and its range of places.
   void mark_cells() {
     words_ = (scene_.layers + 63) / 64;
     cell_rows_ = ceil_div(scene_.rows, CELL_PX);
     cell_columns_ = ceil_div(scene_.columns, CELL_PX);
     cells_.assign((size_t)cell_rows_ * cell_columns_ * words_, 0);
+    lows_.assign((size_t)cell_rows_ * cell_columns_, NEVER);
+    highs_.assign(lows_.size(), -NEVER);
     std::vector<float> nodes;
     for (const Layer &l : layers_) nodes.push_back(l.at);
     const int last = (int)nodes.size() - 1;
@@ -220,7 +222,10 @@ class Blend {
           for (int x = 0, k = 0; x < scene_.columns; x++) {
             while (k < last && of_row[x] >= nodes[k + 1]) k++;
             while (k > 0 && of_row[x] < nodes[k]) k--;
-            uint64_t *bits = &cells_[((size_t)row * cell_columns_ + x / CELL_PX) * words_];
+            const size_t cell = (size_t)row * cell_columns_ + x / CELL_PX;
+            uint64_t *bits = &cells_[cell * words_];
+            lows_[cell] = std::min(lows_[cell], of_row[x]);
+            highs_[cell] = std::max(highs_[cell], of_row[x]);
             bits[k / 64] |= 1ull << k % 64;
             const bool beyond = of_row[x] > nodes[k], at = of_row[x] == nodes[k] && nodes[k] != 0;
             // a pixel at a node has a gradient in the layers beside it, except in focus
@@ -238,6 +243,24 @@ class Blend {
       for (int c = c0; c <= c1; c++)
         if (cells_[((size_t)r * cell_columns_ + c) * words_ + k / 64] >> k % 64 & 1) return true;
     return false;
+  }
+
+  // Where the pixels of a block lie, whichever surface.
+  enum Side { ACROSS, IN_FRONT, BEHIND };
+  Side side_of(const Run &run, int k, int block) const {
+    if (blurred_[k].occupied[block]) return ACROSS;
+    const Layer &l = layers_[k];
+    if (k == scene_.layers - 1) return IN_FRONT;
+    const int s = run.scale, y0 = block / run.block_columns * BLOCK * s, x0 = block % run.block_columns * BLOCK * s;
+    const int r1 = std::min(y0 + BLOCK * s, scene_.rows), c1 = std::min(x0 + BLOCK * s, scene_.columns);
+    bool in_front = true, behind = true;
+    for (int r = y0 / CELL_PX; r * CELL_PX < r1; r++)
+      for (int c = x0 / CELL_PX; c * CELL_PX < c1; c++) {
+        const size_t cell = (size_t)r * cell_columns_ + c;
+        in_front &= highs_[cell] <= l.at;
+        behind &= lows_[cell] >= layers_[k + 1].at;
+      }
+    return in_front ? IN_FRONT : behind ? BEHIND : ACROSS;
   }
 
   // Finds the blocks that a layer's light reaches, and those that are read for them, forward and backward.
@@ -261,8 +284,13 @@ class Blend {
       b.reached.push_back(i);
       spread(i, needed);
     }
+    b.behind.assign(count, 0);
     for (int i = 0; i < count; i++)
-      if (needed[i]) b.needed.push_back(i), spread(i, around);
+      if (needed[i]) {
+        b.needed.push_back(i);
+        spread(i, around);
+        b.behind[i] = side_of(run, k, i) != IN_FRONT;
+      }
     for (int i = 0; i < count; i++)
       if (around[i]) b.around.push_back(i);
     b.values = Buffer<float>((size_t)b.reached.size() * values_ * BLOCK_PIXELS + 1);
@@ -273,27 +301,30 @@ class Blend {
     return place < 0 ? nullptr : blurred_[k].values.data() + (size_t)place * values_ * BLOCK_PIXELS;
   }
 
+  vec weight_at(int j, size_t at, int n) const { return scene_.weight[j] ? load_some(scene_.weight[j] + at, n) : all(1.0f); }
+
   // A pixel's surfaces near to far (a vector of pixels), and a layer's terms of them.
   struct Pixels {
     vec weight[2], counted[2], ahead[2], here[2], h[2], t[2], extra = {}, known = {}, share = {};
     decltype(vec{} < vec{}) swapped;
   };
+  template <int S>
   void weigh(const Layer &l, size_t at, int n, Pixels &p) const {
     vec place[2], weight[2];
-    for (int j = 0; j < S_; j++) {
+    for (int j = 0; j < S; j++) {
       place[j] = load_some(scene_.place[j] + at, n);
-      weight[j] = scene_.weight[j] ? load_some(scene_.weight[j] + at, n) : all(1.0f);
+      weight[j] = weight_at(j, at, n);
     }
-    p.swapped = S_ > 1 ? place[1] < place[0] : place[0] < place[0];
-    for (int j = 0; j < S_; j++) {
-      const vec its_place = S_ > 1 ? (p.swapped ? place[1 - j] : place[j]) : place[j];
-      p.weight[j] = p.counted[j] = S_ > 1 ? (p.swapped ? weight[1 - j] : weight[j]) : weight[j];
+    p.swapped = S > 1 ? place[1] < place[0] : place[0] < place[0];
+    for (int j = 0; j < S; j++) {
+      const vec its_place = S > 1 ? (p.swapped ? place[1 - j] : place[j]) : place[j];
+      p.weight[j] = p.counted[j] = S > 1 ? (p.swapped ? weight[1 - j] : weight[j]) : weight[j];
       p.ahead[j] = (its_place - l.before) * l.per_before + (l.first ? 1.0f : 0.0f);
       p.here[j] = (its_place - l.at) * l.per_after;
       p.h[j] = ramp(p.ahead[j], over_);
       p.t[j] = ramp(p.here[j], over_);
     }
-    if (S_ < 2) return;
+    if (S < 2) return;
     p.known = (p.weight[1] - HIDDEN_WEIGHT) * (1.0f / CONTINUATION_SHARE);
     p.share = p.h[0] * (1.0f / HIDING_SHARE);
     p.extra = (1.0f - p.weight[1]) * clamp01(p.known);
@@ -301,39 +332,45 @@ class Blend {
   }
 
   // The terms of a layer in a block of a run's grid: light, share and the share behind it.
+  template <int S, int CHANNELS>
   void terms(const Run &run, int k, int block, float *planes) const {
+    const int C = CHANNELS ? CHANNELS : C_, count = C + (over_ ? 2 : 1);
     const Layer &l = layers_[k];
     const bool occupied = blurred_[k].occupied[block];
     const int s = run.scale, y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
-    const int first = occupied ? 0 : terms_ - 1, columns = std::min(BLOCK * s, scene_.columns - x0 * s);
+    const int first = occupied ? 0 : count - 1, columns = std::min(BLOCK * s, scene_.columns - x0 * s);
     const float part = 1.0f / (s * s);
-    for (int v = 0; v < terms_; v++)
+    for (int v = 0; v < count; v++)
       for (int y = 0; y < BLOCK; y++) memset(planes + v * run.plane + run.at(y0 + y, x0), 0, BLOCK * sizeof(float));
-    if (!occupied && !over_) return;
+    const Side side = side_of(run, k, block);
+    if (side == IN_FRONT || (!occupied && !over_)) return;
     for (int y = y0 * s; y < std::min((y0 + BLOCK) * s, scene_.rows); y++)
       for (int x = 0; x < columns; x += LANES) {
         const int n = std::min(LANES, columns - x);
         const size_t at = (size_t)y * scene_.columns + x0 * s + x;
         Pixels p;
-        weigh(l, at, n, p);
         vec share[2], term[MOST + 2], own = {}, behind = {};
-        for (int j = 0; j < S_; j++) {
+        if (side == BEHIND)
+          for (int j = 0; j < S; j++) behind += weight_at(j, at, n);
+        else
+          weigh<S>(l, at, n, p);
+        for (int j = 0; side == ACROSS && j < S; j++) {
           share[j] = (p.h[j] - p.t[j]) * p.counted[j];
           own += share[j];
           behind += p.t[j] * p.counted[j];
         }
-        for (int c = first; c < C_; c++) {
+        for (int c = first; c < C; c++) {
           const vec a = load_some(scene_.light[0] + c * map_ + at, n);
-          if (S_ > 1) {
+          if (S > 1) {
             const vec b = load_some(scene_.light[1] + c * map_ + at, n);
             term[c] = a * (p.swapped ? share[1] : share[0]) + b * (p.swapped ? share[0] : share[1]);
           } else {
             term[c] = a * share[0];
           }
         }
-        term[C_] = own;
-        if (over_) term[C_ + 1] = behind;
-        for (int v = first; v < terms_; v++) {
+        term[C] = own;
+        if (over_) term[C + 1] = behind;
+        for (int v = first; v < count; v++) {
           float *its = planes + v * run.plane + run.at(y / s, x0 + x / s);
           if (s == 1)
             memcpy(its, &term[v], n * sizeof(float));
@@ -345,8 +382,8 @@ class Blend {
       }
   }
 
-  // Which rows of a block's window hold anything of a layer, for convolve_strip.
-  void rows_of(const Run &run, int k, int block, std::vector<uint32_t> &rows) const {
+  // Which rows of a block's window hold anything of a layer, or behind it, for convolve_strip.
+  void rows_of(const Run &run, int k, int block, bool behind, std::vector<uint32_t> &rows) const {
     const int half = layers_[k].half, y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
     const int c0 = std::max(x0 - half, 0) / BLOCK, c1 = std::min((x0 + BLOCK - 1 + half) / BLOCK, run.block_columns - 1);
     rows.assign(BLOCK + 2 * half, 0);
@@ -357,7 +394,7 @@ class Blend {
       if (y < 0 || y / BLOCK >= run.block_rows) continue;
       if (y / BLOCK != last) {
         last = y / BLOCK, any = 0;
-        for (int c = c0; c <= c1; c++) any |= blurred_[k].occupied[last * run.block_columns + c] ? ~0u : 0u;
+        for (int c = c0; c <= c1; c++) any |= (behind ? blurred_[k].behind : blurred_[k].occupied)[last * run.block_columns + c] ? ~0u : 0u;
       }
       rows[i] = any;
     }
@@ -374,16 +411,30 @@ class Blend {
       }
   }
 
+  void terms_of(const Run &run, int k, int block, float *planes) const {
+    if (C_ == 3)
+      S_ == 1 ? terms<1, 3>(run, k, block, planes) : terms<2, 3>(run, k, block, planes);
+    else
+      S_ == 1 ? terms<1, 0>(run, k, block, planes) : terms<2, 0>(run, k, block, planes);
+  }
+  void to_surfaces_of(const Run &run, int k, int block, const float *slopes) const {
+    if (C_ == 3)
+      S_ == 1 ? to_surfaces<1, 3>(run, k, block, slopes) : to_surfaces<2, 3>(run, k, block, slopes);
+    else
+      S_ == 1 ? to_surfaces<1, 0>(run, k, block, slopes) : to_surfaces<2, 0>(run, k, block, slopes);
+  }
+
   void blur(const Run &run, int k, float *planes) {
     const Blurred &b = blurred_[k];
-    parallel((int)b.needed.size(), [&](int i, int) { terms(run, k, b.needed[i], planes); });
+    parallel((int)b.needed.size(), [&](int i, int) { terms_of(run, k, b.needed[i], planes); });
     parallel((int)b.reached.size(), [&](int i, int) {
-      std::vector<uint32_t> rows, every(BLOCK + 2 * layers_[k].half, ~0u);
-      rows_of(run, k, b.reached[i], rows);
+      std::vector<uint32_t> rows, rows_behind;
+      rows_of(run, k, b.reached[i], false, rows);
+      rows_of(run, k, b.reached[i], true, rows_behind);
       float *to = values_of(k, b.reached[i]);
       for (int v = 0; v < values_; v++, to += BLOCK_PIXELS) {
         const int term = v < C_ + E_ ? std::min(v, C_) : C_ + 1;
-        convolve(run, planes + term * run.plane, b.reached[i], b.kernels[E_ == 1 ? 0 : v < C_ ? v : (v - C_) % E_], term <= C_ ? rows.data() : every.data(), to);
+        convolve(run, planes + term * run.plane, b.reached[i], b.kernels[E_ == 1 ? 0 : v < C_ ? v : (v - C_) % E_], term <= C_ ? rows.data() : rows_behind.data(), to);
       }
     });
   }
@@ -679,7 +730,7 @@ class Blend {
     });
     parallel((int)b.needed.size(), [&](int i, int) {
       const int block = b.needed[i];
-      if (!b.occupied[block] && (!over_ || !weighed())) return;  // its terms are constant there
+      if (!b.occupied[block] && (!over_ || !weighed() || side_of(run, k, block) == IN_FRONT)) return;  // terms are constant
       const std::vector<uint32_t> every(BLOCK + 2 * layers_[k].half, ~0u);
       float slopes[(MOST + 2) * BLOCK_PIXELS], more[BLOCK_PIXELS];
       for (int term = b.occupied[block] ? 0 : C_ + 1; term < terms_; term++) {
@@ -691,7 +742,7 @@ class Blend {
           for (int j = 0; e && j < BLOCK_PIXELS; j++) to[j] += more[j];
         }
       }
-      to_surfaces(run, k, block, slopes);
+      to_surfaces_of(run, k, block, slopes);
     });
   }
   bool weighed() const {
@@ -700,9 +751,12 @@ class Blend {
     return false;
   }
 
+  template <int S, int CHANNELS>
   void to_surfaces(const Run &run, int k, int block, const float *slopes) const {
+    const int C = CHANNELS ? CHANNELS : C_;
     const Layer &l = layers_[k];
     const bool occupied = blurred_[k].occupied[block];
+    const Side side = side_of(run, k, block);
     const int s = run.scale, y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
     const int columns = std::min(BLOCK * s, scene_.columns - x0 * s);
     const float part = 1.0f / (s * s);
@@ -718,19 +772,24 @@ class Blend {
           for (int i = 0; i < LANES; i++) wide[i] = from[(x + i) / s];
           return wide * part;
         };
+        const vec of_behind = over_ ? slope(C + 1) : vec{};
+        if (side == BEHIND) {
+          for (int j = 0; j < S; j++)
+            if (scene_.weight[j]) add_some(weight_[j] + at, of_behind, n);
+          continue;
+        }
         Pixels p;
-        weigh(l, at, n, p);
-        const vec of_behind = over_ ? slope(C_ + 1) : vec{};
+        weigh<S>(l, at, n, p);
         vec of_share[2], of_counted[2], of_h[2] = {}, of_t[2] = {};
-        if (occupied) of_share[0] = of_share[1] = slope(C_);
-        for (int c = 0; occupied && c < C_; c++) {
+        if (occupied) of_share[0] = of_share[1] = slope(C);
+        for (int c = 0; occupied && c < C; c++) {
           const vec of_light = slope(c);
-          for (int j = 0; j < S_; j++) {
+          for (int j = 0; j < S; j++) {
             // surface j as it is stored is the nearer or the farther one
             const vec light = load_some(scene_.light[j] + c * map_ + at, n);
-            const vec own = S_ > 1 ? (p.swapped ? (p.h[1 - j] - p.t[1 - j]) * p.counted[1 - j] : (p.h[j] - p.t[j]) * p.counted[j]) : (p.h[0] - p.t[0]) * p.counted[0];
+            const vec own = S > 1 ? (p.swapped ? (p.h[1 - j] - p.t[1 - j]) * p.counted[1 - j] : (p.h[j] - p.t[j]) * p.counted[j]) : (p.h[0] - p.t[0]) * p.counted[0];
             add_some(light_[j] + c * map_ + at, of_light * own, n);
-            if (S_ == 1) {
+            if (S == 1) {
               of_share[0] += of_light * light;
             } else {
               of_share[j] += p.swapped ? vec{} : of_light * light;
@@ -738,14 +797,14 @@ class Blend {
             }
           }
         }
-        for (int j = 0; j < S_; j++) {
+        for (int j = 0; j < S; j++) {
           of_counted[j] = of_behind * p.t[j];
           if (!occupied) continue;
           of_counted[j] += of_share[j] * (p.h[j] - p.t[j]);
           of_h[j] = of_share[j] * p.counted[j];
           of_t[j] = (of_behind - of_share[j]) * p.counted[j];
         }
-        if (S_ > 1) {
+        if (S > 1) {
           const vec hidden = 1.0f - clamp01(p.share);
           const auto known_inside = (p.known >= vec{}) & (p.known <= all(1.0f)), share_inside = (p.share >= vec{}) & (p.share <= all(1.0f));
           const vec of_extra = (known_inside ? (1.0f - p.weight[1]) * (1.0f / CONTINUATION_SHARE) : vec{}) - clamp01(p.known);
@@ -753,11 +812,11 @@ class Blend {
           of_counted[1] *= 1.0f + of_extra * hidden;
         }
         vec of_place[2];
-        for (int j = 0; j < S_; j++)
+        for (int j = 0; j < S; j++)
           of_place[j] = of_h[j] * slope_of_ramp(p.ahead[j], over_) * l.per_before + of_t[j] * slope_of_ramp(p.here[j], over_) * l.per_after;
-        for (int j = 0; j < S_; j++) {
-          const vec its_place = S_ > 1 ? (p.swapped ? of_place[1 - j] : of_place[j]) : of_place[j];
-          const vec its_weight = S_ > 1 ? (p.swapped ? of_counted[1 - j] : of_counted[j]) : of_counted[j];
+        for (int j = 0; j < S; j++) {
+          const vec its_place = S > 1 ? (p.swapped ? of_place[1 - j] : of_place[j]) : of_place[j];
+          const vec its_weight = S > 1 ? (p.swapped ? of_counted[1 - j] : of_counted[j]) : of_counted[j];
           add_some(place_[j] + at, its_place, n);
           if (scene_.weight[j]) add_some(weight_[j] + at, its_weight, n);
         }
@@ -775,6 +834,7 @@ class Blend {
   std::vector<Run> runs_;
   int words_ = 0, cell_rows_ = 0, cell_columns_ = 0;
   std::vector<uint64_t> cells_;
+  std::vector<float> lows_, highs_;
   float *const *light_ = nullptr, *const *place_ = nullptr, *const *weight_ = nullptr;
 };
 

@@ -107,12 +107,24 @@ int32_t torchdof_blend_gradient(const torchdof_layers *layers, const float *grad
   return torchdof::guarded([&] { torchdof::chosen().blend_gradient(*layers, gradient, light, place, weight); });
 }
 
+int32_t torchdof_look_behind(const torchdof_level *levels, int32_t count, int32_t channels, const float *coc, int32_t height, int32_t width,
+                             int32_t threads, float *out) {
+  return torchdof::guarded([&] { torchdof::chosen().look_behind(levels, count, channels, coc, height, width, threads, out); });
+}
+
+int32_t torchdof_look_behind_gradient(const torchdof_level *levels, int32_t count, int32_t channels, const float *coc, int32_t height,
+                                      int32_t width, int32_t threads, const float *gradient, float *const *of_levels, float *of_coc) {
+  return torchdof::guarded([&] {
+    torchdof::chosen().look_behind_gradient(levels, count, channels, coc, height, width, threads, gradient, of_levels, of_coc);
+  });
+}
+
 void torchdof_convolve(const float *in, int32_t height, int32_t width, const float *kernel, int32_t half, float *out) {
   torchdof::chosen().convolve(in, height, width, kernel, half, out);
 }
 
 int64_t torchdof_interface(void) {
-  return (int64_t)TORCHDOF_REVISION << 32 | (int64_t)sizeof(torchdof_scene) << 16 | (int64_t)(sizeof(torchdof_map) + sizeof(torchdof_layers));
+  return (int64_t)TORCHDOF_REVISION << 32 | (int64_t)sizeof(torchdof_scene) << 16 | (int64_t)(sizeof(torchdof_map) + sizeof(torchdof_layers) + sizeof(torchdof_level));
 }
 
 const char *torchdof_instructions(void) { return torchdof::use_avx2 ? "avx2" : "baseline"; }

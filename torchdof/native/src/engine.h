@@ -618,5 +618,10 @@ void composite(const Job &job, const RayKernels &ray_kernels, float *out);
 void blend(const torchdof_layers &scene, float *out);
 void blend_gradient(const torchdof_layers &scene, const float *out_gradient, float *const *light, float *const *place, float *const *weight);
 
+// The surfaces behind pixels, read from a pyramid, and the gradient of that; look_behind.cpp
+void look_behind(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads, float *out);
+void look_behind_gradient(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads,
+                          const float *gradient, float *const *of_levels, float *of_coc);
+
 }  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

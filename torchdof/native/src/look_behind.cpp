@@ -1,0 +1,208 @@
+// The surfaces behind each pixel, read from the levels of a pyramid, and the gradient of that: the functions
+// shown_behind and search of render/disocclusion.py, for training. Inference fills hidden surfaces in disocclusion.cpp.
+//
+// Of the four samples j of level l around a pixel with coc c, those behind it count: with their coc d, weight w and
+// bilinear share s, part p_j = s w clamp(d - c - BEHIND_FROM, 0, 1). Their mean m_l has the vote
+// v_l = clamp(|c| / least_l - 1, 0, 1) min(slope_l sum p, most_l). The result is sum v_l m_l / sum v_l, and sum v_l.
+#include "engine.h"
+
+namespace torchdof {
+namespace TORCHDOF_SIMD {
+namespace {
+
+constexpr float BEHIND_FROM = 0.5f;  // difference in coc from which a sample begins to lie behind a pixel
+constexpr float LEAST_WEIGHT = 1e-4f, LEAST_VOTE = 1e-9f;
+constexpr int BAND = 32;  // rows of pixels whose gradients are summed on their own, so that sums keep their order
+constexpr int MOST_LEVELS = TORCHDOF_MOST_LEVELS, MOST_PLANES = TORCHDOF_MOST_PLANES + 2;
+
+// The samples before and after each pixel of an axis, and the weight of the one after.
+struct Axis {
+  std::vector<int> before;
+  std::vector<float> part;
+  Axis(int length, int samples, int step, int whole) {
+    const float last = (float)whole / step - 1.0f;
+    for (int i = 0; i < length; i++) {
+      const float place = std::min(std::max((i - 0.5f * (length - 1) + 0.5f * whole) / step - 0.5f, 0.0f), last);
+      before.push_back(std::min((int)place, samples - 2));
+      part.push_back(place - before.back());
+    }
+  }
+};
+
+struct Behind {
+  const torchdof_level *levels;
+  int count, planes, height, width;  // planes: light, coc, weight
+  std::vector<Axis> rows, columns;
+
+  Behind(const torchdof_level *levels, int count, int channels, int height, int width)
+      : levels(levels), count(count), planes(channels + 2), height(height), width(width) {
+    for (int l = 0; l < count; l++) {
+      rows.emplace_back(height, levels[l].rows, levels[l].step, levels[0].rows * levels[0].step);
+      columns.emplace_back(width, levels[l].columns, levels[l].step, levels[0].columns * levels[0].step);
+    }
+  }
+
+  // What a pixel finds in a level.
+  struct Found {
+    size_t at[4];                   // of the samples
+    float share[4], is_behind[4], part[4];
+    float total, weight, looked;    // sum of the parts; the same, or 0 if tiny
+    float mean[MOST_PLANES];        // light and coc
+    float vote;
+  };
+  // Returns false if nothing lies behind the pixel in this level.
+  bool find(int l, int y, int x, float coc, Found &f) const {
+    const torchdof_level &level = levels[l];
+    const float blur = std::fabs(coc) / level.least_px - 1.0f;
+    f.looked = clamp01(blur);
+    f.vote = 0;
+    if (!(blur >= 0)) return false;
+    const size_t size = (size_t)level.rows * level.columns;
+    const float *const cocs = level.values + (planes - 2) * size, *const weights = cocs + size;
+    const int row = rows[l].before[y], column = columns[l].before[x];
+    const float down = rows[l].part[y], aside = columns[l].part[x];
+    bool any = false;
+    for (int j = 0; j < 4; j++) {
+      f.at[j] = (size_t)(row + j / 2) * level.columns + column + j % 2;
+      f.is_behind[j] = cocs[f.at[j]] - coc - BEHIND_FROM;
+      any |= f.is_behind[j] >= 0;
+    }
+    if (!any) return false;
+    f.total = 0;
+    for (int j = 0; j < 4; j++) {
+      f.share[j] = (j / 2 ? down : 1.0f - down) * (j % 2 ? aside : 1.0f - aside);
+      f.part[j] = f.share[j] * weights[f.at[j]] * clamp01(f.is_behind[j]);
+      f.total += f.part[j];
+    }
+    f.weight = f.total > LEAST_WEIGHT ? f.total : 0.0f;
+    const float per = 1.0f / std::max(f.weight, LEAST_WEIGHT);
+    for (int c = 0; c < planes - 1; c++) {
+      float sum = 0;
+      for (int j = 0; j < 4; j++) sum += f.part[j] * level.values[c * size + f.at[j]];
+      f.mean[c] = sum * per;
+    }
+    f.vote = f.looked * std::min(f.weight * level.slope, level.most);
+    return true;
+  }
+
+  void look(const float *coc, int threads, float *out) const {
+    const size_t area = (size_t)height * width;
+    torchdof::parallel(threads, height, nullptr, [&](int y, int) {
+      for (int x = 0; x < width; x++) {
+        const size_t at = (size_t)y * width + x;
+        float sums[MOST_PLANES] = {}, votes = 0;
+        for (int l = 0; l < count; l++) {
+          Found f;
+          if (!find(l, y, x, coc[at], f)) continue;
+          votes += f.vote;
+          for (int c = 0; c < planes - 1; c++) sums[c] += f.vote * f.mean[c];
+        }
+        const float per = 1.0f / std::max(votes, LEAST_VOTE);
+        for (int c = 0; c < planes - 1; c++) out[c * area + at] = sums[c] * per;
+        out[(planes - 1) * area + at] = votes;
+      }
+    });
+  }
+
+  // Rows of a level that a band of pixels reads.
+  void rows_of(int l, int band, int &first, int &last) const {
+    first = rows[l].before[band * BAND];
+    last = rows[l].before[std::min((band + 1) * BAND, height) - 1] + 1;
+  }
+
+  void gradient(const float *coc, const float *slopes, int threads, float *const *of_levels, float *of_coc) const {
+    const int bands = ceil_div(height, BAND);
+    std::vector<std::vector<float>> sums(bands);  // for each level [planes, rows, columns] of the rows that it reads
+    torchdof::parallel(threads, bands, nullptr, [&](int band, int) {
+      float *to[MOST_LEVELS];
+      size_t start[MOST_LEVELS], size[MOST_LEVELS], total = 0;
+      for (int l = 0; l < count; l++) {
+        int first, last;
+        rows_of(l, band, first, last);
+        start[l] = (size_t)first * levels[l].columns;
+        size[l] = (size_t)(last - first + 1) * levels[l].columns;
+        total += planes * size[l];
+      }
+      sums[band].assign(total, 0.0f);
+      for (int l = 0; l < count; l++) to[l] = l ? to[l - 1] + planes * size[l - 1] : sums[band].data();
+      for (int y = band * BAND; y < std::min((band + 1) * BAND, height); y++)
+        for (int x = 0; x < width; x++) pixel(y, x, coc, slopes, to, start, size, of_coc);
+    });
+    for (int band = 0; band < bands; band++) {
+      const float *from = sums[band].data();
+      for (int l = 0; l < count; l++) {
+        int first, last;
+        rows_of(l, band, first, last);
+        const size_t n = (size_t)(last - first + 1) * levels[l].columns;
+        for (int v = 0; v < planes; v++, from += n) {
+          float *to = of_levels[l] + ((size_t)v * levels[l].rows + first) * levels[l].columns;
+          for (size_t i = 0; i < n; i++) to[i] += from[i];
+        }
+      }
+    }
+  }
+
+  // Adds a pixel's gradients to those of the samples that it reads, and sets that of its coc.
+  void pixel(int y, int x, const float *coc, const float *slopes, float *const *to, const size_t *start, const size_t *size, float *of_coc) const {
+    const size_t area = (size_t)height * width, at = (size_t)y * width + x;
+    Found found[MOST_LEVELS];
+    bool any[MOST_LEVELS];
+    float sums[MOST_PLANES] = {}, votes = 0, slope[MOST_PLANES], along = 0, of_own = 0;
+    for (int l = 0; l < count; l++) {
+      any[l] = find(l, y, x, coc[at], found[l]);
+      votes += found[l].vote;
+      for (int c = 0; any[l] && c < planes - 1; c++) sums[c] += found[l].vote * found[l].mean[c];
+    }
+    const float per = 1.0f / std::max(votes, LEAST_VOTE);
+    for (int c = 0; c < planes - 1; c++) {
+      slope[c] = slopes[c * area + at] * per;
+      along += slope[c] * sums[c] * per;
+    }
+    if (votes < LEAST_VOTE) along = 0;
+    for (int l = 0; l < count; l++) {
+      if (!any[l]) continue;
+      const torchdof_level &level = levels[l];
+      const Found &f = found[l];
+      const size_t whole = (size_t)level.rows * level.columns;
+      float of_vote = slopes[(planes - 1) * area + at] - along, of_parts = 0;
+      for (int c = 0; c < planes - 1; c++) of_vote += slope[c] * f.mean[c];
+      const float counted = f.weight * level.slope, bounded = std::min(counted, level.most);
+      const float blur = std::fabs(coc[at]) / level.least_px - 1.0f;
+      if (blur <= 1) of_own += of_vote * bounded / level.least_px * (coc[at] < 0 ? -1.0f : 1.0f);
+      if (f.weight > 0) {
+        if (counted <= level.most) of_parts = of_vote * f.looked * level.slope * (counted == level.most ? 0.5f : 1.0f);
+        for (int c = 0; c < planes - 1; c++) of_parts -= slope[c] * f.vote * f.mean[c] / f.weight;
+      }
+      const float per_weight = 1.0f / std::max(f.weight, LEAST_WEIGHT);
+      for (int j = 0; j < 4; j++) {
+        const size_t sample = f.at[j] - start[l];
+        float of_part = of_parts;
+        for (int c = 0; c < planes - 1; c++) {
+          const float of_mean = slope[c] * f.vote * per_weight;
+          of_part += of_mean * level.values[c * whole + f.at[j]];
+          to[l][c * size[l] + sample] += of_mean * f.part[j];
+        }
+        to[l][(planes - 1) * size[l] + sample] += of_part * f.share[j] * clamp01(f.is_behind[j]);
+        if (f.is_behind[j] < 0 || f.is_behind[j] > 1) continue;
+        const float of_distance = of_part * f.share[j] * level.values[(planes - 1) * whole + f.at[j]];
+        to[l][(planes - 2) * size[l] + sample] += of_distance;
+        of_own -= of_distance;
+      }
+    }
+    of_coc[at] = of_own;
+  }
+};
+
+}  // namespace
+
+void look_behind(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads, float *out) {
+  Behind(levels, count, channels, height, width).look(coc, threads, out);
+}
+
+void look_behind_gradient(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads,
+                          const float *gradient, float *const *of_levels, float *of_coc) {
+  Behind(levels, count, channels, height, width).gradient(coc, gradient, threads, of_levels, of_coc);
+}
+
+}  // namespace TORCHDOF_SIMD
+}  // namespace torchdof

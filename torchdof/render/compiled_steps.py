@@ -1,0 +1,140 @@
+"""Steps of a differentiated rendering that the compiled engine computes, forward and backward."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .. import native
+from ..tensors import is_in_memory, is_traced
+from .ops import Level
+from .plan import Blur
+from .surfaces import Frame, Placed
+
+__all__ = ["blended", "looked_behind"]
+
+
+def blended(
+    frame: Frame, blurs: Sequence[Blur], backed: bool, plain: Callable[[Sequence[Placed]], Tensor]
+) -> Tensor | None:
+    """Composite all layers of a frame, with its gradient: light followed by its weights, ``[B, C + 1 or C, h, w]``.
+
+    The gradient of the gradient comes from the plain engine.
+
+    Args:
+        frame: One surface, or two that share each pixel, in any order.
+        blurs: Kernel and resolution of each layer.
+        backed: Whether the weights are transmittances, not coverages; without occlusion they are sums of weights.
+        plain: The same computation, differentiable, for the surfaces of such a frame.
+
+    Returns:
+        None if the compiled engine cannot compute it: it needs float32 on the CPU, eager code without function
+        transforms, and kernels that are the same everywhere and have no gradient.
+    """
+    given = [[t for t in surface if t is not None] for surface in frame.surfaces]
+    tensors = [t for of_surface in given for t in of_surface]
+    if frame.stacked or not _supported(tensors):
+        return None
+    if any(b.shares is not None or b.kernel.requires_grad or b.half > native.HALF_LARGEST for b in blurs):
+        return None
+    if frame.colours + max(len(blur.kernel) for blur in blurs) > native.MOST_PLANES:
+        return None
+    layers = [(blur.kernel, blur.scale) for blur in blurs]
+    padded = native.PaddedFrame(frame.margin, frame.area, frame.nodes, layers, frame.occlusion, backed)
+    result: Tensor = _Blend.apply(padded, list(map(len, given)), plain, *tensors)
+    return result
+
+
+def looked_behind(
+    levels: Sequence[Level],
+    rules: Sequence[tuple[float, float, float]],
+    coc_px: Tensor,
+    plain: Callable[[Sequence[Tensor], Tensor], Tensor],
+) -> Tensor | None:
+    """Surfaces behind those of an image, with their gradient: light, coc and votes ``[B, C + 2, H, W]``.
+
+    Args:
+        levels: Levels of a pyramid that are centred on the image.
+        rules: Of each level the smallest blur at which it is read, its votes per weight, and its most votes.
+        coc_px: Signed coc of the image, ``[B, 1, H, W]``.
+        plain: The same computation, differentiable, from the levels' values and the coc.
+
+    Returns:
+        None if the compiled engine cannot compute it, as in :func:`blended`.
+    """
+    values = [level.values for level in levels]
+    if not _supported([coc_px, *values]) or len(levels) > native.MOST_LEVELS or values[0].shape[1] > native.MOST_PLANES:
+        return None
+    steps = [(level.step, *rule) for level, rule in zip(levels, rules, strict=True)]
+    result: Tensor = _LookBehind.apply(steps, plain, coc_px, *values)
+    return result
+
+
+def _supported(tensors: Sequence[Tensor]) -> bool:
+    """Whether the compiled engine is in use and can read tensors that may need gradients."""
+    if is_traced() or not native.chosen():
+        return False
+    return all(t.dtype == torch.float32 and is_in_memory(t.detach()) for t in tensors)
+
+
+def _surfaces(counts: Sequence[int], tensors: Sequence[Tensor]) -> list[Placed]:
+    """The surfaces of a flat list of tensors, with ``counts`` tensors each."""
+    left = iter(tensors)
+    return [Placed(*(next(left) for _ in range(count))) for count in counts]
+
+
+class _Blend(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, padded: native.PaddedFrame, counts: list[int], plain: Any, *tensors: Tensor) -> Tensor:
+        ctx.padded, ctx.counts, ctx.plain = padded, counts, plain
+        ctx.save_for_backward(*tensors)
+        return torch.stack([native.blend(item, padded) for item in _items(counts, tensors)])
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,), tensors = gradients, ctx.saved_tensors
+        if torch.is_grad_enabled():
+            return None, None, None, *_differentiable(ctx.plain(_surfaces(ctx.counts, tensors)), tensors, gradient)
+        items = zip(_items(ctx.counts, tensors), gradient, strict=True)
+        found = zip(*(native.blend_gradient(item, ctx.padded, of_item) for item, of_item in items), strict=True)
+        return None, None, None, *(torch.stack(each).view_as(t) for each, t in zip(found, tensors, strict=True))
+
+
+def _items(counts: Sequence[int], tensors: Sequence[Tensor]) -> list[list[tuple[Tensor, Tensor, Tensor | None]]]:
+    """Light, position and weight of each surface, for each item of a batch."""
+    surfaces = _surfaces(counts, [t.detach() for t in tensors])
+    return [
+        [(s.light[i], s.x[i, 0], None if s.weight is None else s.weight[i, 0]) for s in surfaces]
+        for i in range(len(tensors[0]))
+    ]
+
+
+class _LookBehind(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, steps: list[tuple[int, float, float, float]], plain: Any, *tensors: Tensor) -> Tensor:
+        ctx.steps, ctx.plain = steps, plain
+        ctx.save_for_backward(*tensors)
+        items = zip(*(t.detach() for t in tensors), strict=True)
+        return torch.stack(
+            [native.look_behind(list(zip(levels, steps, strict=True)), coc[0]) for coc, *levels in items]
+        )
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,), tensors = gradients, ctx.saved_tensors
+        if torch.is_grad_enabled():
+            coc, *values = tensors
+            return None, None, *_differentiable(ctx.plain(values, coc), tensors, gradient)
+        found = []
+        for of_item, coc, *levels in zip(gradient, *(t.detach() for t in tensors), strict=True):
+            of_coc, *of_levels = native.look_behind_gradient(list(zip(levels, ctx.steps, strict=True)), coc[0], of_item)
+            found.append([of_coc[None], *of_levels])
+        return None, None, *(torch.stack(each) for each in zip(*found, strict=True))
+
+
+def _differentiable(result: Tensor, inputs: Sequence[Tensor], gradient: Tensor) -> list[Tensor | None]:
+    """The gradients by those inputs that need one, to be differentiated again."""
+    wanted = [t for t in inputs if t.requires_grad]
+    found = iter(torch.autograd.grad(result, wanted, gradient, create_graph=True))
+    return [next(found) if t.requires_grad else None for t in inputs]
