@@ -80,7 +80,8 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     if arguments.row is not None:
-        measure(*ROWS[arguments.row], arguments.repeat)
+        side, batch, occlusion = ROWS[arguments.row]
+        measure(side, batch, occlusion, arguments.repeat)
         return
     print(
         f"{'parts of the photograph':32} {'batch':>5} {'picture':>11} {'step':>11} {'ratio':>6} {'memory':>11}",

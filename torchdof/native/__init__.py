@@ -757,7 +757,7 @@ def _library() -> tuple[ctypes.CDLL | None, str]:
     library.torchdof_blend.argtypes = [ctypes.POINTER(_Layers), pointer]
     library.torchdof_blend_gradient.argtypes = [ctypes.POINTER(_Layers), pointer, maps, maps, maps]
     whole, numbers = ctypes.c_int32, ctypes.POINTER(ctypes.c_double)
-    of_levels = [ctypes.POINTER(_Level), whole, whole, pointer, whole, whole, whole]
+    of_levels: list[Any] = [ctypes.POINTER(_Level), whole, whole, pointer, whole, whole, whole]
     library.torchdof_look_behind.argtypes = [*of_levels, pointer]
     library.torchdof_look_behind_gradient.argtypes = [*of_levels, pointer, maps, pointer]
     real = ctypes.c_float

@@ -256,8 +256,8 @@ def longest_px(size: tuple[int, int], scales: Sequence[int]) -> list[int]:
 def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int, per_px: int = KERNELS_PER_PX) -> Tensor:
     """Kernels ``[n, 1 or C, k, k]``, float64, of single pixels, such as highlights, with signed coc ``[n]``.
 
-    Each is interpolated between kernels at ``per_px`` radii per pixel, which gives its gradient too. They are cut to the
-    offsets within a frame whose longer side is ``longest`` pixels.
+    Each is interpolated between kernels at ``per_px`` radii per pixel, which gives its gradient too. They are cut to
+    the offsets within a frame whose longer side is ``longest`` pixels.
     """
     if table.is_differentiated:
         kernels = table.kernels(coc_px, width)

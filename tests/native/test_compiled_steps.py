@@ -1,4 +1,4 @@
-"""The compiled engine's layers and their gradients equal the plain engine's."""
+"""The steps of a differentiated rendering that the compiled engine computes equal the plain engine's."""
 
 import math
 from typing import Any
@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 
 from torchdof import BlurTable, blur_by_coc, native
+from torchdof.render import disocclusion
+from torchdof.render.ops import Level
 from torchdof.render.plan import Plan
 
 pytestmark = pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built")
@@ -54,7 +56,8 @@ def rendered(way: dict[str, Any], dtype: torch.dtype = torch.float32) -> tuple[T
     image, coc = image.to(dtype).requires_grad_(), coc.to(dtype if dtype == torch.float64 else torch.float32)
     out = blur_by_coc(image, coc.requires_grad_(), **options)
     seen = torch.rand(out.shape, generator=torch.Generator().manual_seed(1)) - 0.3
-    return out.detach(), *torch.autograd.grad((out * seen).sum(), (image, coc))
+    of_light, of_coc = torch.autograd.grad((out * seen).sum(), (image, coc))
+    return out.detach(), of_light, of_coc
 
 
 @pytest.fixture
@@ -83,7 +86,7 @@ def test_pictures_and_gradients_equal_the_plain_engines(
     assert len(calls) == 2, "the compiled engine computes the gradient of both items"
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
     plain = rendered(WAYS[name])
-    assert len(calls) == 2
+    assert len(calls) == 2, "and the plain one computes it alone"
     for ours, other, most in zip(found, plain, (1e-6, 1e-5, 5e-5), strict=True):
         assert difference(ours, other) < most
 
@@ -124,3 +127,38 @@ def test_the_gradient_of_a_gradient_is_the_plain_engines() -> None:
 
     exact = curvature(torch.float64)
     assert float((curvature(torch.float32) - exact).norm()) < 1e-3 * float(exact.norm())
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_surfaces_behind_and_their_gradients_equal_the_plain_engines(
+    channels: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Levels of random samples, some empty; some pixels lie exactly where a level begins to be read."""
+    generator, levels = torch.Generator().manual_seed(3), []
+    coc = 20.0 * torch.rand(2, 1, 70, 101, generator=generator) - 10.0
+    coc[..., 5:9] = 2.0
+    for step, vote in ((2, 0.35), (4, 0.12), (4, None)):
+        values = torch.rand(2, channels + 2, 80 // step, 112 // step, generator=generator)
+        values[:, -2] = 20.0 * values[:, -2] - 8.0
+        values[:, -1] *= torch.rand(values[:, -1].shape, generator=generator) > 0.3
+        levels.append(Level(values, step, vote, step / 4.0))
+    seen = torch.rand(2, channels + 2, 70, 101, generator=generator) - 0.3
+
+    def looked() -> list[Tensor]:
+        leaves = [t.clone().requires_grad_() for t in (coc, *(level.values for level in levels))]
+        given = [level._replace(values=t) for level, t in zip(levels, leaves[1:], strict=True)]
+        out = torch.cat(disocclusion._seen(given, leaves[0]), 1)
+        return [out.detach(), *torch.autograd.grad((out * seen).sum(), leaves)]
+
+    used: list[int] = []
+
+    def recorded(*arguments: Any, of: Any = native.look_behind_gradient) -> list[Tensor]:
+        used.append(1)
+        return list(of(*arguments))
+
+    monkeypatch.setattr(native, "look_behind_gradient", recorded)
+    found = looked()
+    assert len(used) == 2
+    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
+    for ours, plain in zip(found, looked(), strict=True):
+        assert difference(ours, plain) < 1e-4
