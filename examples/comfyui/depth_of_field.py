@@ -1,12 +1,13 @@
 """The ComfyUI node: an image and its depth in, the photograph of a real lens out."""
 
 import importlib.resources
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchdof import BlurTable, Camera, depth_of_field
+from torchdof import BlurTable, Camera, blur_by_coc
 from torchdof.depth import at_size_of, from_relative
 from torchdof.depth.inspect import tint_focus
 from torchdof.io.transfer import decode, encode
@@ -27,6 +28,16 @@ def _lenses() -> list[str]:
 
 def _number(default: float, low: float, high: float, step: float, tooltip: str) -> tuple[str, dict[str, Any]]:
     return "FLOAT", {"default": default, "min": low, "max": high, "step": step, "tooltip": tooltip}
+
+
+def _progress(images: int) -> Callable[[], object]:
+    """A function that moves ComfyUI's progress bar by one image; without ComfyUI it does nothing."""
+    try:
+        from comfy.utils import ProgressBar  # type: ignore[import-not-found]
+    except ImportError:
+        return lambda: None
+    bar = ProgressBar(images)
+    return lambda: bar.update(1)
 
 
 class DepthOfFieldNode:
@@ -133,9 +144,14 @@ class DepthOfFieldNode:
         table = ideal[lens]() if lens in ideal else BlurTable.load(lens)
         if _SHAPES[shape] or squeeze != 1.0:
             table = table.with_aperture(Aperture(_SHAPES[shape] or 0, rotation_deg, squeeze=squeeze))
+        coc_px = camera.coc_px(metres, width).expand(len(light), -1, -1, -1)
+        done, rendered = _progress(len(light)), []
         with torch.no_grad():
-            out = depth_of_field(light, metres, camera, table=table, tolerance=quality)
-        tinted = tint_focus(light, camera.coc_px(metres, width).expand(len(light), -1, -1, -1), has_alpha)[:, :3]
+            for picture, radius in zip(light.split(1), coc_px.split(1), strict=True):
+                rendered.append(blur_by_coc(picture, radius, table=table, tolerance=quality))
+                done()
+        out = torch.cat(rendered)
+        tinted = tint_focus(light, coc_px, has_alpha)[:, :3]
         shown = encode(out.clamp_min(0.0), "srgb", has_alpha, straight=True)
         return shown.clamp(0.0, 1.0).movedim(1, -1), encode(tinted, "srgb", False, False).clamp(0.0, 1.0).movedim(1, -1)
 

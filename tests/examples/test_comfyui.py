@@ -2,6 +2,7 @@
 
 import importlib.util
 import inspect
+import json
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -140,3 +141,38 @@ def test_a_smaller_depth_map_a_shared_one_and_alpha_are_accepted(node: Any) -> N
     image = torch.rand(2, 18, 24, 4)
     out, focus = render(node, image, torch.rand(1, 9, 12, 3), sensor_width_mm=4.0)
     assert out.shape == (2, 18, 24, 4) and focus.shape == (2, 18, 24, 3)
+
+
+def test_the_workflow_is_valid_for_the_node(node: Any) -> None:
+    """What ComfyUI's page checks when it opens a workflow: types, sockets, links and the values of all widgets."""
+    workflow = json.loads((FOLDER / "workflow.json").read_text())
+    nodes = {each["id"]: each for each in workflow["nodes"]}
+    (ours,) = (each for each in nodes.values() if each["type"] == "TorchdofDepthOfField")
+    inputs = node.INPUT_TYPES()["required"]
+    sockets = [name for name, (kind, *_) in inputs.items() if kind == "IMAGE"]
+    assert [each["name"] for each in ours["inputs"]] == sockets
+    assert [each["name"] for each in ours["outputs"]] == list(node.RETURN_NAMES)
+    assert dict(zip(defaults(node), ours["widgets_values"], strict=True)) == defaults(node)
+    for number, source, of_source, target, of_target, kind in workflow["links"]:
+        assert number in nodes[source]["outputs"][of_source]["links"]
+        assert number == nodes[target]["inputs"][of_target]["link"]
+        assert kind == nodes[source]["outputs"][of_source]["type"] == nodes[target]["inputs"][of_target]["type"]
+    assert workflow["last_node_id"] == max(nodes) and workflow["last_link_id"] == max(k for k, *_ in workflow["links"])
+
+
+def test_comfyuis_progress_bar_moves_with_every_image(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    moved: list[int] = []
+
+    class ProgressBar:
+        def __init__(self, total: int) -> None:
+            moved.append(-total)
+
+        def update(self, step: int) -> None:
+            moved.append(step)
+
+    utils = ModuleType("comfy.utils")
+    utils.ProgressBar = ProgressBar  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "comfy", ModuleType("comfy"))
+    monkeypatch.setitem(sys.modules, "comfy.utils", utils)
+    render(node, *scene())
+    assert moved == [-2, 1, 1]
