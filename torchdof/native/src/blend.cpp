@@ -90,7 +90,7 @@ class Blend {
           join(run, block, canvas, nullptr);
         else
           for (int k : run.layers) put(k, block, canvas);
-      write(fine(), block, canvas, out);
+      write(block, canvas, out);
     });
   }
 
@@ -104,7 +104,7 @@ class Blend {
       }
     each_block(fine(), [&](int block, Events &events) {
       float slopes[MOST * BLOCK_PIXELS];
-      read(fine(), block, out_gradient, slopes);
+      read(block, out_gradient, slopes);
       walk(block, events, slopes);
     });
     for (Run &run : runs_) {
@@ -308,6 +308,11 @@ class Blend {
     vec weight[2], counted[2], ahead[2], here[2], h[2], t[2], extra = {}, known = {}, share = {};
     decltype(vec{} < vec{}) swapped;
   };
+  // Surface j of the frame from the nearer and the farther one, or the other way round.
+  template <int S>
+  static vec swap(const Pixels &p, const vec *surfaces, int j) {
+    return S > 1 ? (p.swapped ? surfaces[1 - j] : surfaces[j]) : surfaces[j];
+  }
   template <int S>
   void weigh(const Layer &l, size_t at, int n, Pixels &p) const {
     vec place[2], weight[2];
@@ -317,8 +322,8 @@ class Blend {
     }
     p.swapped = S > 1 ? place[1] < place[0] : place[0] < place[0];
     for (int j = 0; j < S; j++) {
-      const vec its_place = S > 1 ? (p.swapped ? place[1 - j] : place[j]) : place[j];
-      p.weight[j] = p.counted[j] = S > 1 ? (p.swapped ? weight[1 - j] : weight[j]) : weight[j];
+      const vec its_place = swap<S>(p, place, j);
+      p.weight[j] = p.counted[j] = swap<S>(p, weight, j);
       p.ahead[j] = (its_place - l.before) * l.per_before + (l.first ? 1.0f : 0.0f);
       p.here[j] = (its_place - l.at) * l.per_after;
       p.h[j] = ramp(p.ahead[j], over_);
@@ -360,13 +365,8 @@ class Blend {
           behind += p.t[j] * p.counted[j];
         }
         for (int c = first; c < C; c++) {
-          const vec a = load_some(scene_.light[0] + c * map_ + at, n);
-          if (S > 1) {
-            const vec b = load_some(scene_.light[1] + c * map_ + at, n);
-            term[c] = a * (p.swapped ? share[1] : share[0]) + b * (p.swapped ? share[0] : share[1]);
-          } else {
-            term[c] = a * share[0];
-          }
+          term[c] = load_some(scene_.light[0] + c * map_ + at, n) * swap<S>(p, share, 0);
+          if (S > 1) term[c] += load_some(scene_.light[1] + c * map_ + at, n) * swap<S>(p, share, 1);
         }
         term[C] = own;
         if (over_) term[C + 1] = behind;
@@ -444,11 +444,10 @@ class Blend {
     std::fill(canvas + C_ * BLOCK_PIXELS, canvas + planes_ * BLOCK_PIXELS, over_ ? empty_ : 0.0f);
   }
 
-  // Puts light and coverage (or transmittance, if backed) in front of a canvas.
+  // The share of a layer at a pixel, and what it leaves of the picture behind it.
   struct Front {
     vec share, left;
   };
-  // The share of a layer at a pixel, and what it leaves of the picture behind it.
   Front front(vec share) const { return {share, scene_.backed ? share : most(all(1.0f) - share, vec{})}; }
   struct Known {
     vec lacking, beyond, known;
@@ -457,25 +456,39 @@ class Blend {
     const vec lacking = most(all(KNOWN) - own - behind, vec{}), beyond = behind + lacking * lacking * (0.5f / KNOWN);
     return {lacking, beyond, own + beyond};
   }
+  int first_channel(int e) const { return E_ == 1 ? 0 : e; }
+  int last_channel(int e) const { return E_ == 1 ? C_ - 1 : e; }
+
+  // Puts light, multiplied by `gain`, in front of a canvas at pixel i, in the channels of kernel e.
+  void over(int e, int i, Front f, const float *light, vec gain, float *canvas) const {
+    for (int c = first_channel(e); c <= last_channel(e); c++) {
+      float *to = canvas + c * BLOCK_PIXELS + i;
+      store(to, load<vec>(light + c * BLOCK_PIXELS + i) * gain + f.left * load<vec>(to));
+    }
+    float *to = canvas + (C_ + e) * BLOCK_PIXELS + i;
+    store(to, (scene_.backed ? vec{} : f.share) + f.left * load<vec>(to));
+  }
+  void add(const float *values, float *canvas) const {
+    for (int i = 0; i < planes_ * BLOCK_PIXELS; i += LANES) store(canvas + i, load<vec>(canvas + i) + load<vec>(values + i));
+  }
+  // Calls body(e, i) for each vector of pixels of a block and each of the kernel's colours.
+  template <typename Body>
+  void each_pixel(const Body &body) const {
+    for (int e = 0; e < E_; e++)
+      for (int i = 0; i < BLOCK_PIXELS; i += LANES) body(e, i);
+  }
+
+  // Puts a layer in front of a canvas.
   void put(int k, int block, float *canvas) const {
     const float *values = values_of(k, block);
     if (!values) return;
-    if (!over_) {
-      for (int i = 0; i < planes_ * BLOCK_PIXELS; i += LANES) store(canvas + i, load<vec>(canvas + i) + load<vec>(values + i));
-      return;
-    }
-    for (int e = 0; e < E_; e++)
-      for (int i = 0; i < BLOCK_PIXELS; i += LANES) {
-        const vec own = load<vec>(values + (C_ + e) * BLOCK_PIXELS + i), behind = load<vec>(values + (C_ + E_ + e) * BLOCK_PIXELS + i);
-        const Known n = know(own, behind);
-        const Front f = front((scene_.backed ? n.beyond : own) / n.known);
-        for (int c = E_ == 1 ? 0 : e; c < (E_ == 1 ? C_ : e + 1); c++) {
-          float *to = canvas + c * BLOCK_PIXELS + i;
-          store(to, load<vec>(values + c * BLOCK_PIXELS + i) / n.known + f.left * load<vec>(to));
-        }
-        float *to = canvas + (C_ + e) * BLOCK_PIXELS + i;
-        store(to, scene_.backed ? f.left * load<vec>(to) : f.share + f.left * load<vec>(to));
-      }
+    if (!over_) return add(values, canvas);
+    each_pixel([&](int e, int i) {
+      const vec own = load<vec>(values + (C_ + e) * BLOCK_PIXELS + i);
+      const Known n = know(own, load<vec>(values + (C_ + E_ + e) * BLOCK_PIXELS + i));
+      const vec per = all(1.0f) / n.known;
+      over(e, i, front((scene_.backed ? n.beyond : own) * per), values, per, canvas);
+    });
   }
 
   // Row and column of a coarse canvas before a pixel of the picture, and the fraction of the way to the next.
@@ -559,45 +572,29 @@ class Blend {
   bool join(const Run &run, int block, float *canvas, float *kept) const {
     float memory[MOST * BLOCK_PIXELS], *values = kept ? kept : memory;
     if (!widen(run, block, values)) return false;
-    if (!over_) {
-      for (int i = 0; i < planes_ * BLOCK_PIXELS; i += LANES) store(canvas + i, load<vec>(canvas + i) + load<vec>(values + i));
-      return true;
-    }
-    for (int e = 0; e < E_; e++)
-      for (int i = 0; i < BLOCK_PIXELS; i += LANES) {
-        const Front f = front(load<vec>(values + (C_ + e) * BLOCK_PIXELS + i));
-        for (int c = E_ == 1 ? 0 : e; c < (E_ == 1 ? C_ : e + 1); c++) {
-          float *to = canvas + c * BLOCK_PIXELS + i;
-          store(to, load<vec>(values + c * BLOCK_PIXELS + i) + f.left * load<vec>(to));
-        }
-        float *to = canvas + (C_ + e) * BLOCK_PIXELS + i;
-        store(to, scene_.backed ? f.left * load<vec>(to) : f.share + f.left * load<vec>(to));
-      }
+    if (over_)
+      each_pixel([&](int e, int i) { over(e, i, front(load<vec>(values + (C_ + e) * BLOCK_PIXELS + i)), values, all(1.0f), canvas); });
+    else
+      add(values, canvas);
     return true;
   }
 
-  // Pixels of a block that lie in a run's canvas, as rows and columns of the block.
-  struct Inside {
-    int top, bottom, left, right;
-  };
-  Inside inside(const Run &run, int block) const {
+  // Calls body(position in the block, position in a picture, count) for each plane and row of a block of the picture.
+  template <typename Body>
+  void each_row(int block, const Body &body) const {
+    const Run &run = fine();
     const int y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
-    return {std::max(run.top - y0, 0), std::min(run.bottom - y0, BLOCK), std::max(run.left - x0, 0), std::min(run.right - x0, BLOCK)};
-  }
-  template <typename Body>  // body(plane, position in the block, position in a picture, count) for each row
-  void each_row(const Run &run, int block, const Body &body) const {
-    const Inside in = inside(run, block);
-    const int y0 = block / run.block_columns * BLOCK - run.margin, x0 = block % run.block_columns * BLOCK - run.margin;
+    const int left = std::max(run.left - x0, 0), count = std::min(run.right - x0, BLOCK) - left;
     for (int c = 0; c < planes_; c++)
-      for (int y = in.top; y < in.bottom; y++)
-        body(c * BLOCK_PIXELS + y * BLOCK + in.left, ((size_t)c * scene_.height + y0 + y) * scene_.width + x0 + in.left, in.right - in.left);
+      for (int y = std::max(run.top - y0, 0); y < std::min(run.bottom - y0, BLOCK); y++)
+        body(c * BLOCK_PIXELS + y * BLOCK + left, ((size_t)c * scene_.height + y0 + y - run.top) * scene_.width + x0 + left - run.left, count);
   }
-  void write(const Run &run, int block, const float *canvas, float *out) const {
-    each_row(run, block, [&](size_t from, size_t to, int count) { memcpy(out + to, canvas + from, count * sizeof(float)); });
+  void write(int block, const float *canvas, float *out) const {
+    each_row(block, [&](size_t from, size_t to, int count) { memcpy(out + to, canvas + from, count * sizeof(float)); });
   }
-  void read(const Run &run, int block, const float *picture, float *canvas) const {
+  void read(int block, const float *picture, float *canvas) const {
     memset(canvas, 0, planes_ * BLOCK_PIXELS * sizeof(float));
-    each_row(run, block, [&](size_t to, size_t from, int count) { memcpy(canvas + to, picture + from, count * sizeof(float)); });
+    each_row(block, [&](size_t to, size_t from, int count) { memcpy(canvas + to, picture + from, count * sizeof(float)); });
   }
 
   // Gradient of what is behind (in place of that of the picture in front of it) and, returned, of a front's share. `add`:
@@ -607,7 +604,7 @@ class Blend {
     float *coverage = slopes + (C_ + e) * BLOCK_PIXELS + i;
     const vec of_coverage = load<vec>(coverage);
     vec left = of_coverage * load<vec>(behind + (C_ + e) * BLOCK_PIXELS + i);
-    for (int c = E_ == 1 ? 0 : e; c < (E_ == 1 ? C_ : e + 1); c++) {
+    for (int c = first_channel(e); c <= last_channel(e); c++) {
       float *its = slopes + c * BLOCK_PIXELS + i;
       const vec slope = load<vec>(its);
       left += slope * load<vec>(behind + c * BLOCK_PIXELS + i);
@@ -625,23 +622,22 @@ class Blend {
       memcpy(values, slopes, values_ * BLOCK_PIXELS * sizeof(float));
       return;
     }
-    for (int e = 0; e < E_; e++)
-      for (int i = 0; i < BLOCK_PIXELS; i += LANES) {
-        float *own = values + (C_ + e) * BLOCK_PIXELS + i, *beyond = values + (C_ + E_ + e) * BLOCK_PIXELS + i;
-        const Known n = know(load<vec>(own), load<vec>(beyond));
-        const vec per = all(1.0f) / n.known, share = (scene_.backed ? n.beyond : load<vec>(own)) * per;
-        vec of_known = {};
-        const vec of_share = through(e, i, front(share), behind, slopes, [&](int c, vec slope) {
-          float *its = values + c * BLOCK_PIXELS + i;
-          const vec of_light = slope * per;
-          of_known -= of_light * load<vec>(its) * per;
-          store(its, of_light);
-        });
-        of_known -= of_share * share * per;
-        const vec of_part = of_share * per, of_beyond = of_known + (scene_.backed ? of_part : vec{}), lacking = n.lacking * (1.0f / KNOWN);
-        store(own, of_known + (scene_.backed ? vec{} : of_part) - of_beyond * lacking);
-        store(beyond, of_beyond * (1.0f - lacking));
-      }
+    each_pixel([&](int e, int i) {
+      float *own = values + (C_ + e) * BLOCK_PIXELS + i, *beyond = values + (C_ + E_ + e) * BLOCK_PIXELS + i;
+      const Known n = know(load<vec>(own), load<vec>(beyond));
+      const vec per = all(1.0f) / n.known, share = (scene_.backed ? n.beyond : load<vec>(own)) * per;
+      vec of_known = {};
+      const vec of_share = through(e, i, front(share), behind, slopes, [&](int c, vec slope) {
+        float *its = values + c * BLOCK_PIXELS + i;
+        const vec of_light = slope * per;
+        of_known -= of_light * load<vec>(its) * per;
+        store(its, of_light);
+      });
+      of_known -= of_share * share * per;
+      const vec of_part = of_share * per, of_beyond = of_known + (scene_.backed ? of_part : vec{}), lacking = n.lacking * (1.0f / KNOWN);
+      store(own, of_known + (scene_.backed ? vec{} : of_part) - of_beyond * lacking);
+      store(beyond, of_beyond * (1.0f - lacking));
+    });
   }
 
   // Composites the layers of a coarse block again, and walks back through them.
@@ -702,15 +698,13 @@ class Blend {
   void walk_join(const Run &run, int block, const float *behind, const float *values, float *slopes) const {
     float of_run[MOST * BLOCK_PIXELS];
     if (over_)
-      for (int e = 0; e < E_; e++)
-        for (int i = 0; i < BLOCK_PIXELS; i += LANES) {
-          const Front f = front(load<vec>(values + (C_ + e) * BLOCK_PIXELS + i));
-          const vec of_share = through(e, i, f, behind, slopes, [&](int c, vec slope) { store(of_run + c * BLOCK_PIXELS + i, slope); });
-          store(of_run + (C_ + e) * BLOCK_PIXELS + i, of_share);
-        }
+      each_pixel([&](int e, int i) {
+        const Front f = front(load<vec>(values + (C_ + e) * BLOCK_PIXELS + i));
+        store(of_run + (C_ + e) * BLOCK_PIXELS + i, through(e, i, f, behind, slopes, [&](int c, vec slope) { store(of_run + c * BLOCK_PIXELS + i, slope); }));
+      });
     else
       memcpy(of_run, slopes, planes_ * BLOCK_PIXELS * sizeof(float));
-    write(fine(), block, of_run, run.slopes.data());
+    write(block, of_run, run.slopes.data());
   }
 
   // Scatters the gradients of a layer's blurred terms to its terms, and on to the surfaces.
@@ -780,22 +774,19 @@ class Blend {
         }
         Pixels p;
         weigh<S>(l, at, n, p);
-        vec of_share[2], of_counted[2], of_h[2] = {}, of_t[2] = {};
-        if (occupied) of_share[0] = of_share[1] = slope(C);
+        vec share[2], of_share[2], of_counted[2], of_h[2] = {}, of_t[2] = {};
+        for (int j = 0; j < S; j++) {
+          share[j] = (p.h[j] - p.t[j]) * p.counted[j];
+          of_share[j] = occupied ? slope(C) : vec{};
+        }
         for (int c = 0; occupied && c < C; c++) {
           const vec of_light = slope(c);
+          vec more[2];
           for (int j = 0; j < S; j++) {
-            // surface j as it is stored is the nearer or the farther one
-            const vec light = load_some(scene_.light[j] + c * map_ + at, n);
-            const vec own = S > 1 ? (p.swapped ? (p.h[1 - j] - p.t[1 - j]) * p.counted[1 - j] : (p.h[j] - p.t[j]) * p.counted[j]) : (p.h[0] - p.t[0]) * p.counted[0];
-            add_some(light_[j] + c * map_ + at, of_light * own, n);
-            if (S == 1) {
-              of_share[0] += of_light * light;
-            } else {
-              of_share[j] += p.swapped ? vec{} : of_light * light;
-              of_share[1 - j] += p.swapped ? of_light * light : vec{};
-            }
+            more[j] = of_light * load_some(scene_.light[j] + c * map_ + at, n);
+            add_some(light_[j] + c * map_ + at, of_light * swap<S>(p, share, j), n);
           }
+          for (int j = 0; j < S; j++) of_share[j] += swap<S>(p, more, j);
         }
         for (int j = 0; j < S; j++) {
           of_counted[j] = of_behind * p.t[j];
@@ -815,10 +806,8 @@ class Blend {
         for (int j = 0; j < S; j++)
           of_place[j] = of_h[j] * slope_of_ramp(p.ahead[j], over_) * l.per_before + of_t[j] * slope_of_ramp(p.here[j], over_) * l.per_after;
         for (int j = 0; j < S; j++) {
-          const vec its_place = S > 1 ? (p.swapped ? of_place[1 - j] : of_place[j]) : of_place[j];
-          const vec its_weight = S > 1 ? (p.swapped ? of_counted[1 - j] : of_counted[j]) : of_counted[j];
-          add_some(place_[j] + at, its_place, n);
-          if (scene_.weight[j]) add_some(weight_[j] + at, its_weight, n);
+          add_some(place_[j] + at, swap<S>(p, of_place, j), n);
+          if (scene_.weight[j]) add_some(weight_[j] + at, swap<S>(p, of_counted, j), n);
         }
       }
   }
