@@ -198,7 +198,7 @@ def test_bad_light_in_a_file_stays_in_its_pixel(file: File, bad: float) -> None:
 
 @EVERY_ENGINE
 @EVERY_WAY
-@pytest.mark.parametrize("light", [1e10, 2e19, 1e30, 3e38])
+@pytest.mark.parametrize("light", [2e19, 3e38])
 @pytest.mark.parametrize("post", [False, True], ids=["step", "post one pixel wide"])
 def test_bright_light_at_a_step_agrees_with_float64(engine: str, way: dict[str, Any], light: float, post: bool) -> None:
     coc, image = halves(-6.0, 5.0), texture()
@@ -466,22 +466,6 @@ def test_autocast_does_not_change(name: str, engine: str) -> None:
         assert torch.equal(ENTRIES[name](texture(), slope(1.2, 6.0)), plain)
 
 
-@pytest.mark.parametrize("occlusion", [True, False])
-@pytest.mark.parametrize("size", [(64, 64), (150, 200), (65, 129)])
-@pytest.mark.parametrize("reach", [3.0, 14.0, 40.0])
-def test_tiles_leave_no_seam(occlusion: bool, size: tuple[int, int], reach: float) -> None:
-    # with gradients the plain engine renders the whole frame; without, the compiled engine renders tiles
-    image, coc = 3 * torch.rand(1, 3, *size) ** 3, slope(-reach, reach, *size)
-    coc[..., size[0] // 3 : size[0] // 2, :] = -0.8 * reach
-    plan = Plan.of_scene(coc, 1 / 255)
-    tiled = blur_by_coc(image, coc, plan=plan, occlusion=occlusion)
-    plain = blur_by_coc(image.clone().requires_grad_(), coc, plan=plan, occlusion=occlusion).detach()
-    assert_close(tiled, plain, rtol=1e-5, atol=1e-5)
-    beside = [torch.tensor([min(n % 64, 64 - n % 64) <= 4 and 4 < n < side - 4 for n in range(side)]) for side in size]
-    where = beside[0][:, None] | beside[1]  # tiles have 64 x 64 pixels
-    assert_close(tiled[..., where], plain[..., where], rtol=1e-6, atol=1e-6)
-
-
 @pytest.mark.parametrize("method", ["layered", "fold"])
 def test_tiles_rendered_separately_with_a_halo_leave_no_seam(method: Any) -> None:
     image, coc = 3 * torch.rand(1, 3, 40, 200) ** 3, slope(-6.0, 6.0, 40, 200)
@@ -507,15 +491,6 @@ def test_a_plan_of_one_plane_renders_another(engine: str, planned: float, shown:
     plan, plane = Plan.of_scene(whole(planned), 1 / 255), whole(shown)
     out, truth = (blur_by_coc(texture(), plane, occlusion=occlusion, plan=p) for p in (plan, None))
     assert float((out - truth).square().mean().sqrt()) < 1 / 255  # layers of 20 px are coarser
-
-
-@EVERY_ENGINE
-def test_a_plan_of_the_first_frame_renders_a_focus_pull(engine: str) -> None:
-    image, depth = texture(), slope(1.2, 6.0)
-    plan = DOF.plan(image, whole(2.0))  # all in focus
-    for focus_m in (2.0, 1.9, 1.4, 1.25, 3.0, 9.0, math.inf):
-        out, truth = DOF(image, depth, focus_m, plan=plan), DOF(image, depth, focus_m)
-        assert float((out - truth).square().mean().sqrt()) < 1 / 255
 
 
 # Which engine renders

@@ -1,5 +1,6 @@
 import io
 import math
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -67,13 +68,6 @@ def test_a_plane_is_the_convolution_with_the_kernel_of_its_table(name: str, way:
         assert_close(out.double(), disc(image, values, TABLES[name]), rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("coc", [-17.21, 44.44])
-def test_a_strongly_blurred_plane_is_the_convolution_at_any_size(coc: float) -> None:
-    image = 10 * torch.rand(1, 1, 90, 120) ** 4
-    values = constant_map(coc, image)
-    assert_close(blur_by_coc(image, values).double(), disc(image, values), rtol=1e-5, atol=1e-6)
-
-
 def test_a_plane_in_depth_is_convolved_with_the_disc_of_the_thin_lens() -> None:
     camera = Camera(focal_length_mm=85.0, f_number=2.0, focus_m=1.5, sensor_width_mm=4.0)
     image, depth = torch.rand(1, 3, 15, 20), torch.full((1, 1, 15, 20), 6.0)
@@ -104,19 +98,8 @@ def test_in_focus_plane_is_returned_bit_exact(way: dict[str, Any], dtype: torch.
     depth = torch.full((1, 1, 7, 9), 2.0, dtype=dtype)
     out = DepthOfField(Camera(focus_m=2.0), **way)(image, depth)
     assert torch.equal(out, image) and out.data_ptr() != image.data_ptr()
-
-
-@EVERY_WAY
-def test_blur_below_a_hundredth_of_a_pixel_is_returned_bit_exact(way: dict[str, Any]) -> None:
-    image = torch.rand(1, 3, 7, 9)
-    coc = 0.02 * torch.rand(1, 1, 7, 9) - 0.01
-    assert torch.equal(blur_by_coc(image, coc, **way), image)
-
-
-def test_sharp_pixels_far_from_any_blur_are_untouched() -> None:
-    image, coc = torch.rand(1, 3, 9, 40), torch.zeros(1, 1, 9, 40)
-    coc[..., 30:] = 3.2
-    assert_close(blur_by_coc(image, coc)[..., :20], image[..., :20], rtol=1e-6, atol=0.0)
+    below_a_hundredth = 0.02 * torch.rand(1, 1, 7, 9) - 0.01
+    assert torch.equal(blur_by_coc(image, below_a_hundredth, **way), image)
 
 
 def test_a_blurred_background_does_not_bleed_onto_a_sharp_foreground() -> None:
@@ -136,15 +119,6 @@ def test_a_blurred_foreground_spreads_over_a_sharp_background() -> None:
 
 
 # Sums
-
-
-@EVERY_WAY
-@pytest.mark.parametrize(("reach", "value"), [(0.8, 0.37), (0.8, 1e4), (5.0, 0.37), (5.0, 1e4), (30.0, 1e4)], ids=str)
-def test_a_constant_image_stays_constant_at_any_depth(way: dict[str, Any], value: float, reach: float) -> None:
-    image, coc = scene(reach=reach)
-    flat = torch.full_like(image, value)
-    for values in (coc, min(reach, 5.0) * torch.randn(coc.shape)):
-        assert_close(blur_by_coc(flat, values, **way), flat, rtol=1e-6, atol=0.0)
 
 
 @EVERY_WAY
@@ -248,16 +222,6 @@ def test_a_batch_with_a_camera_for_each_item_equals_each_item_alone(way: dict[st
         assert_close(together[one], DepthOfField(camera, **way)(image[one], depth[one]), rtol=1e-6, atol=1e-6)
 
 
-def test_focus_and_aperture_of_the_call_override_those_of_the_camera() -> None:
-    image, depth = torch.rand(2, 3, 9, 12), 0.6 + 4 * torch.rand(2, 1, 9, 12)
-    dof = DepthOfField(Camera(focus_m=1.0, f_number=2.0, sensor_width_mm=1.0))
-    expected = DepthOfField(Camera(focus_m=3.0, f_number=1.0, sensor_width_mm=1.0))(image, depth)
-    assert_close(dof(image, depth, focus_m=3.0, f_number=1.0), expected, rtol=0.0, atol=0.0)
-    tensors = dof(image, depth, focus_m=torch.tensor([3.0, 3.0]), f_number=torch.tensor([1.0, 1.0]))
-    assert_close(tensors, expected, rtol=1e-6, atol=1e-6)
-    assert dof.camera.focus_m == 1.0
-
-
 def test_the_functional_form_equals_the_module() -> None:
     image, depth = torch.rand(1, 3, 9, 12), 0.6 + 4 * torch.rand(1, 1, 9, 12)
     camera, table = Camera(sensor_width_mm=1.0), BlurTable.gaussian()
@@ -266,14 +230,6 @@ def test_the_functional_form_equals_the_module() -> None:
     assert torch.equal(out, expected)
     coc = camera.replace(focus_m=1.2, f_number=1.7).coc_px(depth, 12)
     assert torch.equal(blur_by_coc(image, coc, table=table, method="fold", occlusion=False), expected)
-
-
-def test_a_plan_can_be_used_for_other_frames() -> None:
-    image, depth = torch.rand(1, 3, 9, 12), 0.6 + 4 * torch.rand(1, 1, 9, 12)
-    dof = DepthOfField(Camera(focus_m=1.0, sensor_width_mm=1.0))
-    plan = dof.plan(image, depth)
-    assert_close(dof(image, depth, plan=plan), dof(image, depth), rtol=1e-6, atol=1e-6)
-    assert torch.isfinite(dof(image, depth / 3, plan=plan)).all()
 
 
 # Types, shapes, strides
@@ -423,81 +379,52 @@ def test_the_compiler_of_an_old_pytorch_is_refused_by_name(fullgraph: bool, monk
 
 # Errors
 
+IMAGE, DEPTH, COC = torch.rand(1, 3, 4, 5), torch.ones(1, 1, 4, 5), torch.zeros(1, 1, 4, 5)
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"image": torch.rand(3, 4, 5)}, r"depth must be \[1, H, W\] beside an image \[C, H, W\], got \[1, 1, 4, 5\]"),
-        ({"image": torch.zeros(1, 3, 4, 5, dtype=torch.uint8)}, "image must be floating point.*torch.uint8; decode"),
-        ({"image": [[1.0]]}, "image must be a tensor .*got list"),
-        ({"image": torch.rand(1, 3, 0, 5)}, "image must have at least one pixel"),
-        ({"depth": torch.ones(1, 4, 5)}, r"depth must be \[1, 1, 4, 5\].*did you forget the channel dimension"),
-        ({"depth": torch.ones(1, 1, 5, 4)}, r"depth must be \[1, 1, 4, 5\].* got \[1, 1, 5, 4\]"),
-        ({"depth": torch.ones(2, 1, 4, 5)}, r"depth must be \[1, 1, 4, 5\].* got \[2, 1, 4, 5\]"),
-        ({"depth": torch.ones(1, 3, 4, 5)}, r"depth must be \[1, 1, 4, 5\].* got \[1, 3, 4, 5\]"),
-        ({"depth": torch.ones(1, 1, 4, 5, dtype=torch.int64)}, "depth must be .*floating point, got a torch.int64"),
-        ({"depth": 2.0}, "depth must be .*got float"),
-        ({"depth": torch.ones(1, 1, 4, 5, device="meta")}, "depth must be on the image's device cpu, got meta"),
-        ({"depth": torch.zeros(1, 1, 4, 5)}, "depth must be > 0 .* 20 of 20 pixels .*fill the holes"),
-        ({"depth": torch.full((1, 1, 4, 5), math.nan)}, "depth must be > 0"),
-        ({"image": torch.full((1, 3, 4, 5), math.nan)}, "image must be finite, got 60 of 60"),
-        ({"image": torch.full((1, 3, 4, 5), math.inf)}, "image must be finite"),
-        ({"focus_m": 0.01}, "focus_m must be longer than the focal length"),
-        ({"f_number": -1.0}, "f_number must be positive"),
-        ({"focus_m": torch.tensor([1.0, 2.0])}, r"must be \[1, 1, 4, 5\].* got \[2, 1, 4, 5\]"),
-    ],
-)
-def test_wrong_input_is_refused_in_one_sentence(changes: dict[str, Any], message: str) -> None:
-    arguments: dict[str, Any] = {"image": torch.rand(1, 3, 4, 5), "depth": torch.ones(1, 1, 4, 5), **changes}
+
+def module(**options: Any) -> Callable[[], Any]:
+    return lambda: DepthOfField(**{"camera": Camera(), **options})
+
+
+def called(**arguments: Any) -> Callable[[], Any]:
+    return lambda: DepthOfField(Camera())(**{"image": IMAGE, "depth": DEPTH, **arguments})
+
+
+REFUSED: list[tuple[Callable[[], Any], str]] = [
+    (called(image=IMAGE[0]), r"depth must be \[1, H, W\] beside an image \[C, H, W\], got \[1, 1, 4, 5\]"),
+    (called(image=IMAGE.byte()), "image must be floating point.*torch.uint8; decode"),
+    (called(image=[[1.0]]), "image must be a tensor .*got list"),
+    (called(image=IMAGE[:, :, :0]), "image must have at least one pixel"),
+    (called(image=IMAGE / 0.0), "image must be finite, got 60 of 60"),
+    (called(depth=DEPTH[0]), r"depth must be \[1, 1, 4, 5\].*did you forget the channel dimension"),
+    *((called(depth=torch.ones(size)), r"depth must be \[1, 1, 4, 5\].* got \[{}, {}, {}, {}\]".format(*size))
+      for size in ((1, 1, 5, 4), (2, 1, 4, 5), (1, 3, 4, 5))),
+    (called(depth=DEPTH.long()), "depth must be .*floating point, got a torch.int64"),
+    (called(depth=2.0), "depth must be .*got float"),
+    (called(depth=DEPTH.to("meta")), "depth must be on the image's device cpu, got meta"),
+    (called(depth=0.0 * DEPTH), "depth must be > 0 .* 20 of 20 pixels .*fill the holes"),
+    (called(focus_m=0.01), "focus_m must be longer than the focal length"),
+    (called(f_number=-1.0), "f_number must be positive"),
+    (called(focus_m=torch.tensor([1.0, 2.0])), r"must be \[1, 1, 4, 5\].* got \[2, 1, 4, 5\]"),
+    (module(camera=50.0), "^camera must be a torchdof.Camera, got float"),
+    (module(table="disc"), "^table must be a torchdof.BlurTable, got str; read a file with BlurTable.load"),
+    *((module(tolerance=value), r"^tolerance must be a number in \[0, 1\)") for value in (-0.1, 1.0, math.nan, True)),
+    (module(method="scatter"), "^method must be 'layered' or 'fold', got 'scatter'"),
+    (module(normalize=False), "^normalize=False is the plain sum of occlusion=False"),
+    *((module(max_coc_px=value), "^max_coc_px must be a radius above 0.5 pixels") for value in (0.5, math.inf)),
+    (lambda: blur_by_coc(IMAGE, COC / 0.0), "coc_px must be finite, got 20 of 20"),
+    (lambda: blur_by_coc(IMAGE, COC[0, 0]), r"coc_px must be \[1, 1, 4, 5\].* in pixels"),
+    (lambda: blur_by_coc(IMAGE[:, :1], COC, table=TABLES["colours"]), "the table blurs 3 channels, the image has 1"),
+    (called(plan=3), r"plan must be a Plan from.* got "),
+    (lambda: depth_of_field(IMAGE, DEPTH, Camera(), plan="plan"), r"plan must be a Plan from"),  # type: ignore[arg-type]
+    (lambda: blur_by_coc(IMAGE, COC, plan=(0.0, 1.0)), r"plan must be a Plan from"),  # type: ignore[arg-type]
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "message"), REFUSED)
+def test_a_wrong_argument_is_refused_in_one_sentence(call: Callable[[], Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        DepthOfField(Camera())(**arguments)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"camera": 50.0}, "camera must be a torchdof.Camera, got float"),
-        ({"table": "disc"}, "table must be a torchdof.BlurTable, got str; read a file with BlurTable.load"),
-        ({"tolerance": -0.1}, r"tolerance must be a number in \[0, 1\)"),
-        ({"tolerance": 1.0}, "tolerance must be"),
-        ({"tolerance": math.nan}, "tolerance must be"),
-        ({"tolerance": True}, "tolerance must be"),
-        ({"method": "scatter"}, "method must be 'layered' or 'fold', got 'scatter'"),
-        ({"normalize": False}, "normalize=False is the plain sum of occlusion=False"),
-        ({"max_coc_px": 0.5}, "max_coc_px must be a radius above 0.5 pixels"),
-        ({"max_coc_px": math.inf}, "max_coc_px must be"),
-        ({"max_coc_px": math.nan}, "max_coc_px must be"),
-    ],
-)
-def test_a_wrong_option_is_refused_by_name(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=f"^{message}"):
-        DepthOfField(**{"camera": Camera(), **options})
-
-
-@pytest.mark.parametrize(
-    ("coc", "options", "message"),
-    [
-        (torch.full((1, 1, 4, 5), math.nan), {}, "coc_px must be finite, got 20 of 20"),
-        (torch.full((1, 1, 4, 5), -math.inf), {}, "coc_px must be finite"),
-        (torch.zeros(4, 5), {}, r"coc_px must be \[1, 1, 4, 5\].* in pixels"),
-        (torch.zeros(1, 1, 4, 5), {"table": TABLES["colours"]}, "the table blurs 3 channels, the image has 1"),
-    ],
-)
-def test_a_wrong_coc_or_table_is_refused(coc: Tensor, options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        blur_by_coc(torch.rand(1, 1, 4, 5), coc, **options)
-
-
-@pytest.mark.parametrize("wrong", [3, "plan", (0.0, 1.0)])
-def test_a_value_that_is_not_a_plan_is_refused(wrong: Any) -> None:
-    image, depth, camera = torch.rand(1, 3, 6, 7), torch.full((1, 1, 6, 7), 3.0), Camera(focus_m=1.0)
-    for call in (
-        lambda: DepthOfField(camera)(image, depth, plan=wrong),
-        lambda: depth_of_field(image, depth, camera, plan=wrong),
-        lambda: blur_by_coc(image, depth, plan=wrong),
-    ):
-        with pytest.raises(ValueError, match=r"plan must be a Plan from.* got "):
-            call()
+        call()
 
 
 @pytest.mark.parametrize(
