@@ -10,7 +10,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.scenes import CAMERA, WAYS, slope, whole
+from tests.scenes import CAMERA, WAYS, halves, slope, texture, whole
 from tests.traced import TRACED
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, validation
 from torchdof.render.layer_weights import from_blur_axis
@@ -140,6 +140,13 @@ def test_gradients_are_finite_at_hostile_light_and_of_its_type(
     leaves = [image.requires_grad_(), EVEN.clone().requires_grad_()]
     grads = torch.autograd.grad(blur_by_coc(*leaves, **way).float().square().sum(), leaves)
     assert [grad.dtype for grad in grads] == [dtype, torch.float32] and all(torch.isfinite(g).all() for g in grads)
+
+
+@EVERY_WAY
+def test_gradients_do_not_depend_on_the_scale_of_the_light(way: dict[str, Any]) -> None:
+    small, bright = ((texture() * k).requires_grad_() for k in (2.0**20, 2.0**90))
+    grads = [torch.autograd.grad(blur_by_coc(x, halves(-6.0, 5.0), **way).mean(), x)[0] for x in (small, bright)]
+    assert_close(grads[0], grads[1], rtol=1e-4, atol=1e-9)
 
 
 # Forward mode and torch.func

@@ -149,12 +149,6 @@ def test_fit_photo_and_fit_lens_do_not_import_each_other(half: str, other: str) 
     assert wrong == []
 
 
-@pytest.mark.parametrize("module", ["problems", "result", "solve", "validation"])
-def test_modules_that_both_halves_of_fit_use_import_neither(module: str) -> None:
-    targets = GRAPH[f"torchdof.fit.{module}"]
-    assert not [target for target in targets if target.startswith(("torchdof.fit.photo", "torchdof.fit.lens"))]
-
-
 def loaded(code: str, *names: str) -> list[str]:
     """Which of the packages `names` are loaded after `code` has run in a new process."""
     script = f"import sys\n{code}\nprint([name for name in {names!r} if name in sys.modules])"
@@ -204,13 +198,6 @@ def test_a_first_picture_loads_neither_sympy_nor_the_compiler(
     """They take a second, and eager code needs neither."""
     monkeypatch.setenv("TORCHDOF_ENGINE", engine)
     assert loaded(FIRST + then, "sympy", "torch._dynamo", "torch._inductor", "kornia") == []
-
-
-def test_folders_below_render_do_not_load_the_compiler() -> None:
-    code = (
-        "import torchdof.options, torchdof.depth, torchdof.io.images, torchdof.reference.metrics, torchdof.fit.result"
-    )
-    assert loaded(code, "torch._dynamo", "kornia", "OpenImageIO") == []
 
 
 WITHOUT_PYTORCH = [

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from tests import loops
-from tests.scenes import WAYS, disc
+from tests.scenes import CAMERA, HEIGHT, WAYS, WIDTH, disc, slope, texture
 from tests.tolerances import TOLERANCES
 from tests.traced import TRACED
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field, tensors
@@ -39,10 +39,10 @@ def scene(height: int = 12, width: int = 17, reach: float = 4.0, seed: int = 1) 
     """A random image and a coc of slopes, steps and noise from -reach to reach."""
     generator = torch.Generator().manual_seed(seed)
     image = 4 * torch.rand(1, 3, height, width, generator=generator) ** 4
-    slope = torch.linspace(-1, 1, width).expand(height, width).clone()
-    slope[height // 3 : height // 2] = -0.9
-    slope[-2:] += 0.3 * torch.randn(2, width, generator=generator)
-    return image, reach * slope.clamp(-1, 1)[None, None]
+    coc = torch.linspace(-1, 1, width).expand(height, width).clone()
+    coc[height // 3 : height // 2] = -0.9
+    coc[-2:] += 0.3 * torch.randn(2, width, generator=generator)
+    return image, reach * coc.clamp(-1, 1)[None, None]
 
 
 def encoded(light: Tensor) -> Tensor:
@@ -395,7 +395,6 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (called(image=IMAGE.byte()), "image must be floating point.*torch.uint8; decode"),
     (called(image=[[1.0]]), "image must be a tensor .*got list"),
     (called(image=IMAGE[:, :, :0]), "image must have at least one pixel"),
-    (called(image=IMAGE / 0.0), "image must be finite, got 60 of 60"),
     (called(depth=DEPTH[0]), r"depth must be \[1, 1, 4, 5\].*did you forget the channel dimension"),
     *((called(depth=torch.ones(size)), r"depth must be \[1, 1, 4, 5\].* got \[{}, {}, {}, {}\]".format(*size))
       for size in ((1, 1, 5, 4), (2, 1, 4, 5), (1, 3, 4, 5))),
@@ -409,16 +408,35 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (module(camera=50.0), "^camera must be a torchdof.Camera, got float"),
     (module(table="disc"), "^table must be a torchdof.BlurTable, got str; read a file with BlurTable.load"),
     *((module(tolerance=value), r"^tolerance must be a number in \[0, 1\)") for value in (-0.1, 1.0, math.nan, True)),
+    *((module(depth_edges=value), "must be 'auto', 'repair' or 'as given', got") for value in ("Auto", None, True)),
     (module(method="scatter"), "^method must be 'layered' or 'fold', got 'scatter'"),
     (module(normalize=False), "^normalize=False is the plain sum of occlusion=False"),
     *((module(max_coc_px=value), "^max_coc_px must be a radius above 0.5 pixels") for value in (0.5, math.inf)),
-    (lambda: blur_by_coc(IMAGE, COC / 0.0), "coc_px must be finite, got 20 of 20"),
     (lambda: blur_by_coc(IMAGE, COC[0, 0]), r"coc_px must be \[1, 1, 4, 5\].* in pixels"),
     (lambda: blur_by_coc(IMAGE[:, :1], COC, table=TABLES["colours"]), "the table blurs 3 channels, the image has 1"),
     (called(plan=3), r"plan must be a Plan from.* got "),
     (lambda: depth_of_field(IMAGE, DEPTH, Camera(), plan="plan"), r"plan must be a Plan from"),  # type: ignore[arg-type]
     (lambda: blur_by_coc(IMAGE, COC, plan=(0.0, 1.0)), r"plan must be a Plan from"),  # type: ignore[arg-type]
 ]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["depth", "image", "coc_px", "rgba"])
+@pytest.mark.parametrize("bad", [0.0, -0.0, -1.0, math.nan, math.inf, -math.inf])
+def test_bad_numbers_are_refused_and_counted(name: str, bad: float) -> None:
+    image, depth, rgba = texture(), slope(1.2, 6.0), torch.ones(1, 2, 4, HEIGHT, WIDTH)
+    {"depth": depth, "image": image, "coc_px": depth, "rgba": rgba}[name].flatten()[7:9] = bad
+    calls: dict[str, Any] = {
+        "depth": lambda: DepthOfField(CAMERA)(image, depth),
+        "image": lambda: DepthOfField(CAMERA)(image, depth),
+        "coc_px": lambda: blur_by_coc(image, depth),
+        "rgba": lambda: DepthOfField(CAMERA).layers(rgba, torch.tensor([1.0, 4.0])),
+    }
+    message = {"depth": "depth must be > 0 .*got 2 of 768 pixels"}.get(name, f"{name} must be finite, got 2 of ")
+    if bad != math.inf if name == "depth" else not math.isfinite(bad):
+        with pytest.raises(ValueError, match=message):
+            calls[name]()
+    elif name != "rgba":
+        calls[name]()
 
 
 @pytest.mark.parametrize(("call", "message"), REFUSED)

@@ -9,10 +9,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from torch import Tensor
 
 from examples.benchmarks import first_pictures
-from torchdof.bench.measurement import BenchScene, Seconds
 
 SCENES = Path(__file__).parents[1] / "data" / "scenes"
 
@@ -47,20 +45,6 @@ def test_a_part_renders_its_stated_sizes_and_blur_radii(
     cocs = [scene.coc_px for turn in (first, second) for figure in turn for scene in figure.scenes]
     same = [torch.equal(a, b) for i, a in enumerate(cocs) for b in cocs[:i] if a.shape == b.shape]
     assert not any(same) or part == "lamps", "a camera was rendered before"
-
-
-def test_a_figure_times_a_new_camera_the_same_camera_again_and_a_reference(monkeypatch: pytest.MonkeyPatch) -> None:
-    ticks = iter([Seconds(6.0, 4.0), Seconds(3.0, 1.0), Seconds(1.0, 8.0)] * 2)
-
-    def timed(*_: Tensor) -> tuple[Tensor, Seconds]:
-        return torch.ones(1, 3, 16, 16), next(ticks)
-
-    scene = BenchScene("x", torch.ones(1, 3, 16, 16), torch.ones(1, 1, 16, 16))
-    figure = first_pictures.Figure("figure", timed, [scene] * 2, beside=timed)
-    monkeypatch.setattr(first_pictures, "figures", lambda *_: [figure])
-    rows = first_pictures.turn_of("cameras", SCENES, 0)
-    assert rows == 2 * [rows[0]]
-    assert (rows[0]["new_ms"], rows[0]["cpu_ms"], rows[0]["over_again"], rows[0]["over_beside"]) == (6e3, 4e3, 4.0, 0.5)
 
 
 def test_an_installation_whose_pictures_are_wrong_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -117,10 +101,3 @@ def test_installations_take_turns_and_have_adjacent_rows(monkeypatch: pytest.Mon
         math.isfinite(float(rows[0]["new_ms"]))
         and "| pull | other |" in (tmp_path / "new" / "first_pictures.md").read_text()
     )
-
-
-def test_an_unknown_part_is_refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(sys, "argv", ["x", str(SCENES), "--parts", "nothing"])
-    with pytest.raises(SystemExit):
-        first_pictures.main()
-    assert "invalid choice: 'nothing'" in capsys.readouterr().err

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from torchdof import blur_by_coc, native, validation
+from torchdof import blur_by_coc, native
 
 SIZES = (1, 7, 8, 9, 2**16 - 1, 2**16, 2**16 + 1, 3 * 2**16 + 5)
 
@@ -27,15 +27,6 @@ def test_a_single_nan_or_infinity_is_found(size: int, place: float) -> None:
     assert native.ends(values)[0] == -math.inf
     values[int(place * (size - 1))] = math.nan
     assert all(map(math.isnan, native.ends(values)))
-
-
-@pytest.mark.parametrize("engine", ["native", "torch"])
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
-def test_both_engines_find_the_same_ends(engine: str, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
-    values = torch.linspace(-3.0, 5.0, 100, dtype=dtype, requires_grad=True)
-    assert validation.ends(values) == (-3.0, 5.0)
-    assert all(map(math.isnan, validation.ends(torch.cat([values, torch.tensor([math.nan], dtype=dtype)]))))
 
 
 class LargeReads(TorchDispatchMode):

@@ -9,7 +9,6 @@ import torch
 
 from tests.scenes import Scene, assert_same_picture, made
 from torchdof import native
-from torchdof.render.scatter import fold
 
 
 @pytest.fixture(autouse=True)
@@ -117,7 +116,7 @@ def test_ctrl_c_is_raised_after_the_engine_has_stopped() -> None:
     assert answer_of(INTERRUPTED_TWICE) == "after the engine"
 
 
-@pytest.mark.parametrize("half", [0, 1, 2, 3, 7, 8, 10])
+@pytest.mark.parametrize("half", [0, 1, 2, 3, 7, 8, 10, 20, 64])
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (5, 6), (16, 16), (19, 37)])
 def test_convolution_scatters_an_asymmetric_kernel(height: int, width: int, half: int) -> None:
     light, kernel = torch.rand(height, width), torch.rand(2 * half + 1, 2 * half + 1)
@@ -126,13 +125,4 @@ def test_convolution_scatters_an_asymmetric_kernel(height: int, width: int, half
         for column in range(width):
             wanted[row : row + 2 * half + 1, column : column + 2 * half + 1] += light[row, column] * kernel
     wanted = wanted[half : half + height, half : half + width].float()
-    scattered = native.convolve(light, kernel)
-    torch.testing.assert_close(scattered, wanted, rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(scattered, fold(light[None, None], kernel[None])[0, 0], rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("half", [20, 64])
-def test_convolution_scatters_the_widest_kernels(half: int) -> None:
-    light, kernel = torch.rand(70, 90), torch.rand(2 * half + 1, 2 * half + 1)
-    scattered = native.convolve(light, kernel)
-    torch.testing.assert_close(scattered, fold(light[None, None], kernel[None])[0, 0], rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(native.convolve(light, kernel), wanted, rtol=1e-5, atol=1e-6)

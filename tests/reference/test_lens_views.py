@@ -1,6 +1,4 @@
-import functools
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -104,36 +102,11 @@ def test_given_the_hidden_surfaces_it_agrees_with_the_exact_truth(bars: Scene) -
     assert 0.3 < float((alone.known[bars.inner] == 1).float().mean()) < 0.95
 
 
-def test_a_stack_of_complete_surfaces_renders_the_scene(bars: Scene) -> None:
-    far = bars.surfaces[0]
-    out = lens_views(far[0][:, :3], far[1], bars.camera, surfaces=bars.surfaces[1:]).image
-    assert shown_psnr(out, bars, bars.inner) > 42
-
-
-@pytest.fixture(scope="module")
-def seen(crops: dict[str, Scene]) -> Callable[[str, int], torch.Tensor]:
-    """``seen(name, views)`` is the picture of a scene; each is rendered once."""
-
-    @functools.cache
-    def picture(name: str, views: int) -> torch.Tensor:
-        scene = crops[name]
-        return lens_views(scene.image, scene.depth, scene.camera, views=views).image
-
-    return picture
-
-
-@pytest.mark.parametrize("name", ["planes/0", "room/1", "highlights/0"])
-def test_256_views_are_within_half_a_decibel_of_1024(
-    crops: dict[str, Scene], seen: Callable[[str, int], torch.Tensor], name: str
-) -> None:
-    scene = crops[name]
-    few, many = (shown_psnr(seen(name, views), scene, scene.inner) for views in (256, 1024))
-    assert abs(many - few) < 0.5
-
-
-def test_the_error_falls_with_the_number_of_views(seen: Callable[[str, int], torch.Tensor]) -> None:
-    limit = seen("room/1", 1024)
-    errors = [metrics.psnr(seen("room/1", views), limit) for views in (4, 16, 64, 256)]
+def test_the_error_falls_with_the_number_of_views(crops: dict[str, Scene]) -> None:
+    scene = crops["room/1"]
+    *few, limit = (lens_views(scene.image, scene.depth, scene.camera, views=n).image for n in (4, 16, 64, 256, 1024))
+    errors = [metrics.psnr(picture, limit) for picture in few]
+    assert abs(shown_psnr(few[-1], scene, scene.inner) - shown_psnr(limit, scene, scene.inner)) < 0.5
     assert errors == sorted(errors)
     assert errors[-1] > errors[0] + 12
 
@@ -150,11 +123,8 @@ def test_a_steep_surface_has_no_gaps() -> None:
     out, known = lens_views_by_coc(torch.ones(1, 1, 50, 60), coc, views=64)
     torch.testing.assert_close(out, torch.ones_like(out))
     assert float(known[..., 15:35, 10:18].min()) == 1.0
-
-
-def test_a_blurred_bar_does_not_darken_towards_the_frame() -> None:
-    out = lens_views_by_coc(torch.full((1, 1, 20, 20), 0.7), torch.full((1, 1, 20, 20), -8.0), views=64).image
-    torch.testing.assert_close(out, torch.full_like(out, 0.7))
+    near = lens_views_by_coc(torch.full((1, 1, 20, 20), 0.7), torch.full((1, 1, 20, 20), -8.0), views=64).image
+    torch.testing.assert_close(near, torch.full_like(near, 0.7))  # not darker towards the frame
 
 
 def test_half_precision_and_batches() -> None:
