@@ -1,7 +1,6 @@
 """Warnings name unit mistakes and the option that corrects them; unusual but sensible input gives no warning."""
 
 import math
-import warnings
 from pathlib import Path
 
 import pytest
@@ -163,12 +162,6 @@ def test_a_mistake_in_one_item_of_a_batch_is_found(metres: torch.Tensor) -> None
     with pytest.warns(DepthWarning, match="millimetres"):
         check(both, Camera(focus_m=3.0))
     check(both, Camera(focus_m=torch.tensor([3.0, INF])), strict=True)
-
-
-def test_the_warning_can_be_filtered(metres: torch.Tensor) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DepthWarning)
-        check(metres * 1000, Camera(focus_m=3.0))
 
 
 def test_depths_in_place_of_circles_of_confusion_give_a_warning() -> None:

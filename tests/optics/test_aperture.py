@@ -156,18 +156,6 @@ def test_kernels_differentiate_in_rotation_squeeze_and_coc() -> None:
         assert torch.autograd.gradcheck(kernels, (*given, places), atol=1e-6, fast_mode=True)
 
 
-def test_a_picture_differentiates_in_rotation_and_squeeze() -> None:
-    dice = torch.Generator().manual_seed(1)
-    image = torch.rand(1, 1, 9, 11, generator=dice, dtype=torch.float64)
-    coc = torch.where(torch.arange(11) < 6, -2.3, 3.1).expand(1, 1, 9, 11).double()
-
-    def picture(rotation: Tensor, squeeze: Tensor) -> Tensor:
-        return blur_by_coc(image, coc, table=BlurTable.polygon(3, rotation, squeeze=squeeze), tolerance=0)
-
-    given = tuple(torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (11.0, 1.2))
-    assert torch.autograd.gradcheck(picture, given, atol=1e-6, fast_mode=True)
-
-
 def test_a_table_with_an_aperture_survives_save_and_load(tmp_path: Path) -> None:
     for table in LOPSIDED:
         table.save(tmp_path / "lens.json")

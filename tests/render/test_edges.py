@@ -162,12 +162,6 @@ def test_pixels_of_a_lamp_of_uneven_brightness_get_one_depth() -> None:
     assert max(float(repaired[lamp].max() - repaired[lamp].min()) for lamp in lamps) < 0.005
 
 
-@pytest.mark.parametrize("times", [2.0**-10, 2.0**20])
-def test_the_brightness_of_the_image_changes_nothing(scene: Scene, times: float) -> None:
-    depth = degrade(scene.depth, "half-res")
-    torch.testing.assert_close(repair_edges(scene.image, depth), repair_edges(times * scene.image, depth))
-
-
 TURNS: dict[str, Callable[[Tensor], Tensor]] = {
     "left-right": lambda t: t.flip(-1),
     "top-bottom": lambda t: t.flip(-2),
@@ -222,7 +216,7 @@ def test_markers_of_holes_are_kept_and_act_like_nan(scene: Scene, marked: float)
     depth, holes = degrade(scene.depth, "near -1px"), torch.zeros_like(scene.depth, dtype=torch.bool)
     holes[..., 40:60, :30] = True
     repaired, same = (repair_edges(scene.image, torch.where(holes, value, depth)) for value in (torch.nan, marked))
-    assert bool((same[holes] == marked).all())
+    assert bool((same[holes] == marked).all()) and bool(repaired[holes].isnan().all())
     assert torch.equal(repaired[~holes], same[~holes])
 
 
@@ -233,17 +227,6 @@ def test_a_hole_within_a_surface_changes_no_other_pixel(scene: Scene) -> None:
     whole = repair_edges(image, depth)
     assert bool((whole != depth).any())
     assert torch.equal(repair_edges(image, torch.where(holes, torch.nan, depth))[~holes], whole[~holes])
-
-
-def test_holes_stay_and_hardly_affect_other_pixels(scene: Scene) -> None:
-    depth = degrade(scene.depth, "near -1px")
-    holes = torch.zeros_like(depth, dtype=torch.bool)
-    holes[..., 40:60, :30] = True
-    repaired = repair_edges(scene.image, torch.where(holes, torch.nan, depth))
-    assert torch.equal(repaired.isnan(), holes)
-    whole = repair_edges(scene.image, depth)
-    # statistics of the frame come from fewer pixels, so a pixel with equally likely surfaces may change
-    assert float((repaired / whole - 1)[..., 60:, :].abs().gt(1e-5).float().mean()) < 2e-4
 
 
 def test_a_lamp_does_not_come_nearer_than_it_was() -> None:
@@ -317,17 +300,6 @@ def test_the_renderer_repairs_by_its_option_depth_edges(scene: Scene) -> None:
     assert torch.equal(DepthOfField(scene.camera)(scene.image, depth), expected)
     assert torch.equal(blur_by_coc(scene.image, coc), expected)
     assert not torch.equal(as_given(scene.image, depth), expected)
-
-
-@pytest.mark.parametrize("value", ["Auto", None, True, 1])
-def test_an_invalid_option_is_refused(scene: Scene, value: DepthEdges) -> None:
-    refused = "must be 'auto', 'repair' or 'as given', got"
-    for call in (
-        lambda: repair_edges(scene.image, scene.depth, value),
-        lambda: DepthOfField(scene.camera, depth_edges=value),
-    ):
-        with pytest.raises(ValueError, match=refused):
-            call()
 
 
 @compiled

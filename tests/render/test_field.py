@@ -27,9 +27,15 @@ def number(value: float) -> Tensor:
 
 def passed(table: BlurTable, coc_px: float, y: float, x: float, size: tuple[int, int] = (100, 100)) -> Tensor:
     """Kernel ``[C, k, k]`` at a place given in half diagonals from the middle of the frame."""
-    shares = layer_shares(table, coc_px, 1, size)
-    kernel = table.kernels(number(coc_px)[None], size[1])
+    lens = table if table.field is None else bank_of(table)
+    shares, kernel = layer_shares(table, coc_px, 1, size), lens.kernels(number(coc_px)[None], size[1])
     return placed(kernel, [(shares, number(1.0))], number(y)[None], number(x)[None])[0]
+
+
+def of_pixel(table: BlurTable, coc_px: float, row: int, column: int, size: tuple[int, int]) -> Tensor:
+    """Kernel ``[C, k, k]`` of a pixel."""
+    y, x = ((p + 0.5 - n / 2) / (0.5 * math.hypot(*size)) for p, n in zip((row, column), size, strict=True))
+    return passed(table, coc_px, y, x, size)
 
 
 def cats_eye(coc_px: float, y: float, x: float, half: int, front: float, rear: float) -> Tensor:
@@ -79,10 +85,9 @@ def test_each_pixel_is_blurred_by_the_kernel_of_its_place_within_a_hundredth() -
     coc = torch.full_like(image, coc_px)
     picture = blur_by_coc(image, coc, table=TABLE, occlusion=False)
     kernel = BlurTable.disc().kernels(coc[0, 0, 0, :1], width)[0]
-    half, diagonal = kernel.shape[-1] // 2, 0.5 * math.hypot(height, width)
+    half = kernel.shape[-1] // 2
     for row, column in ((6, 9), (61, 97), (17, 190), (110, 24), (64, 160)):
-        y, x = (number((p + 0.5 - n / 2) / diagonal) for p, n in ((row, height), (column, width)))
-        own = passed(TABLE, coc_px, float(y), float(x), (height, width))[0]
+        own = of_pixel(TABLE, coc_px, row, column, (height, width))[0]
         around = image[0, 0, row - half : row + half + 1, column - half : column + half + 1]
         expected = float((around * own.flip(-2, -1)).sum())
         assert float(picture[0, 0, row, column]) == pytest.approx(expected, abs=0.01)
@@ -127,11 +132,7 @@ def test_a_spot_has_the_moments_of_its_field_turned_by_the_azimuth(y: float, x: 
     table, width = lopsided(), 360
     per_mm = width / 36.0
     half_diagonal = 0.5 * math.hypot(width, 240) / per_mm
-    shares = layer_shares(table, coc_px, 1, (240, width))
-    own = bank_of(table).kernels(number(coc_px)[None], width)
-    kernel = placed(own, [(shares, number(1.0))], number(y / half_diagonal)[None], number(x / half_diagonal)[None])[
-        0, 0
-    ]
+    kernel = passed(table, coc_px, y / half_diagonal, x / half_diagonal, (240, width))[0]
     step = torch.arange(len(kernel), dtype=torch.float64) - len(kernel) // 2
     distance = math.hypot(y, x)
     u, v = (step[:, None] * y + step * x) / distance, (step[:, None] * x - step * y) / distance
@@ -153,9 +154,7 @@ def test_a_spot_has_the_moments_of_its_field_turned_by_the_azimuth(y: float, x: 
 def test_kernels_of_a_field_are_one_pixel_in_focus() -> None:
     table = lopsided()
     for coc_px in (0.0, 0.02):
-        shares = layer_shares(table, coc_px, 1, (240, 360))
-        own = bank_of(table).kernels(number(coc_px)[None], 360)
-        kernel = placed(own, [(shares, number(1.0))], number(0.4)[None], number(0.7)[None])[0, 0]
+        kernel = passed(table, coc_px, 0.4, 0.7, (240, 360))[0]
         assert float(kernel[len(kernel) // 2, len(kernel) // 2]) > 1.0 - 1e-9
 
 
@@ -167,10 +166,7 @@ def test_fold_scatters_each_pixel_with_the_kernel_of_its_place(colours: int) -> 
     image[0, :, row, column] = torch.tensor([1.0, 2.0, 3.0])
     coc = torch.full((1, 1, height, width), coc_px, dtype=torch.float64)
     picture = blur_by_coc(image, coc, table=table, method="fold", occlusion=False, normalize=False)[0]
-    own = bank_of(table).kernels(number(coc_px)[None], width)
-    diagonal = 0.5 * math.hypot(height, width)
-    y, x = (number((p + 0.5 - n / 2) / diagonal)[None] for p, n in ((row, height), (column, width)))
-    kernel = placed(own, [(layer_shares(table, coc_px, 1, (height, width)), number(1.0))], y, x)[0]
+    kernel = of_pixel(table, coc_px, row, column, (height, width))
     half = kernel.shape[-1] // 2
     around = picture[:, row - half : row + half + 1, column - half : column + half + 1]
     assert_close(around, kernel * image[0, :, row, column, None, None], rtol=0, atol=1e-12)
@@ -241,10 +237,7 @@ def test_a_highlight_has_the_kernel_of_its_radius_and_place(table: BlurTable) ->
     dark = blur_by_coc(image, coc, table=table, tolerance=0)
     image[..., row, column] = 200.0
     spot = (blur_by_coc(image, coc, table=table, tolerance=0) - dark)[0, 0] / 199.9
-    half_diagonal = 0.5 * math.hypot(height, width)
-    y, x = ((p + 0.5 - n / 2) / half_diagonal for p, n in ((row, height), (column, width)))
-    shares, own = layer_shares(table, coc_px, 1, (height, width)), bank_of(table).kernels(number(coc_px)[None], width)
-    expected = placed(own, [(shares, number(1.0))], number(y)[None], number(x)[None])[0, 0]
+    expected = of_pixel(table, coc_px, row, column, (height, width))[0]
     half = len(expected) // 2
     spot = spot[row - half : row + half + 1, column - half : column + half + 1]
     assert float((spot - expected).abs().sum()) < 0.01  # share of the light

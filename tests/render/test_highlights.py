@@ -102,14 +102,6 @@ def test_splatting_in_parts_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> 
     torch.testing.assert_close(blur_by_coc(image, coc), whole, rtol=1e-5, atol=1e-5)
 
 
-def test_light_below_the_threshold_stays_in_the_layers() -> None:
-    image = torch.rand(1, 3, 64, 80, generator=torch.Generator().manual_seed(1))
-    coc = torch.linspace(-9, 9, 80).expand(1, 1, 64, 80)
-    left, rays = highlights.extract(Surface(image, coc), highlights.threshold(image))
-    assert rays is None
-    assert left.light is image
-
-
 def test_extracted_and_remaining_light_sum_to_the_image() -> None:
     image, coc, (row, column) = street()
     left, rays = highlights.extract(Surface(image, coc), highlights.threshold(image))
@@ -215,14 +207,6 @@ def test_rays_above_the_limit_fade_into_the_layers(range_of_light: float) -> Non
     steps = torch.tensor(light).diff()
     assert light[0] > 1.3 * light[-1], "the scene tests nothing"
     assert float(steps.abs().max()) < 0.02 * light[0]
-
-
-@pytest.mark.parametrize(("height", "width"), [(66, 99), (31, 70), (2, 35), (1, 1)])
-def test_the_threshold_of_a_flipped_image_is_the_flipped_threshold(height: int, width: int) -> None:
-    image = torch.rand(1, 3, height, width)
-    limit = highlights.threshold(image)
-    for turned in (lambda t: t.flip(-1), lambda t: t.flip(-2), lambda t: t.mT):
-        torch.testing.assert_close(highlights.threshold(turned(image)), turned(limit), rtol=1e-6, atol=0.0)
 
 
 def test_unknown_light_does_not_lower_the_threshold() -> None:

@@ -1,6 +1,7 @@
 """Known hidden surfaces: a background, or a stack of layers."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -137,39 +138,33 @@ def test_gradients_reach_the_background() -> None:
     assert float(slope[..., 4:6].sum()) > 0.05
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"background": torch.rand(1, 3, 8, 8)}, "depth"),
-        ({"background_depth": torch.ones(1, 1, 8, 8)}, "background"),
-        ({"background": torch.rand(1, 3, 8, 9), "background_depth": torch.ones(1, 1, 8, 9)}, "like the image"),
-        ({"background": torch.rand(1, 3, 8, 8), "background_depth": -torch.ones(1, 1, 8, 8)}, "depth must be > 0"),
-    ],
-)
-def test_a_background_that_does_not_fit_is_refused(given: dict[str, Tensor], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        DepthOfField(CAMERA)(torch.rand(1, 3, 8, 8), torch.ones(1, 1, 8, 8), **given)
+IMAGE, DEPTH, RGBA = torch.rand(1, 3, 8, 8), torch.ones(1, 1, 8, 8), torch.rand(1, 2, 4, 8, 8)
+
+
+def over(options: dict[str, Any] | None = None, **given: Tensor) -> Callable[[], Tensor]:
+    return lambda: DepthOfField(CAMERA, **(options or {}))(IMAGE, DEPTH, **given)
+
+
+def stacked(rgba: Tensor, depth_m: Tensor, **options: Any) -> Callable[[], Tensor]:
+    return lambda: DepthOfField(CAMERA, **options).layers(rgba, depth_m)
 
 
 @pytest.mark.parametrize(
-    ("rgba", "depth", "options", "message"),
+    ("call", "message"),
     [
-        (torch.rand(1, 4, 8, 8), torch.ones(1), {}, r"rgba must be \[B, N, C \+ 1, H, W\]"),
-        (torch.rand(1, 2, 4, 8, 8), torch.ones(3), {}, r"depth_m must be \[2\]"),
-        (torch.rand(1, 2, 4, 8, 8), torch.ones(1, 2, 1, 8, 9), {}, "8 x 8"),
-        (torch.rand(1, 2, 4, 8, 8), torch.tensor([1.0, -1.0]), {}, "depth_m must be > 0"),
-        (torch.rand(1, 2, 4, 8, 8) + 1.5, torch.ones(2), {}, "coverage"),
-        (torch.rand(1, 2, 4, 8, 8), torch.ones(2), {"occlusion": False}, "occlusion=True"),
+        (over(background=IMAGE), "depth"),
+        (over(background_depth=DEPTH), "background"),
+        (over(background=torch.rand(1, 3, 8, 9), background_depth=torch.ones(1, 1, 8, 9)), "like the image"),
+        (over(background=IMAGE, background_depth=-DEPTH), "depth must be > 0"),
+        (over({"occlusion": False}, background=IMAGE, background_depth=DEPTH), "occlusion=True"),
+        (stacked(RGBA[0], torch.ones(1)), r"rgba must be \[B, N, C \+ 1, H, W\]"),
+        (stacked(RGBA, torch.ones(3)), r"depth_m must be \[2\]"),
+        (stacked(RGBA, torch.ones(1, 2, 1, 8, 9)), "8 x 8"),
+        (stacked(RGBA, torch.tensor([1.0, -1.0])), "depth_m must be > 0"),
+        (stacked(RGBA + 1.5, torch.ones(2)), "coverage"),
+        (stacked(RGBA, torch.ones(2), occlusion=False), "occlusion=True"),
     ],
 )
-def test_a_stack_that_does_not_fit_is_refused(
-    rgba: Tensor, depth: Tensor, options: dict[str, Any], message: str
-) -> None:
+def test_a_background_or_stack_that_does_not_fit_is_refused(call: Callable[[], Tensor], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        DepthOfField(CAMERA, **options).layers(rgba, depth)
-
-
-def test_a_background_needs_occlusion() -> None:
-    image, depth = torch.rand(1, 3, 8, 8), torch.ones(1, 1, 8, 8)
-    with pytest.raises(ValueError, match="occlusion=True"):
-        DepthOfField(CAMERA, occlusion=False)(image, depth, background=image, background_depth=depth)
+        call()
