@@ -9,6 +9,7 @@ import torch
 from hypothesis import HealthCheck, settings
 
 from tests import exported
+from torchdof import native
 from torchdof.tensors import TRACEABLE
 
 settings.register_profile("local", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -25,6 +26,16 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # one core for each worker and its subp
 @pytest.fixture(autouse=True)
 def _same_random_numbers() -> None:
     torch.manual_seed(0)
+
+
+@pytest.fixture(params=["torch", "native"])
+def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The engine that renders: a test that asks for it runs with each."""
+    monkeypatch.delenv("TORCHDOF_ENGINE", raising=False)
+    if request.param == "native" and not native.chosen():
+        pytest.skip("the compiled engine is not built")
+    monkeypatch.setenv("TORCHDOF_ENGINE", request.param)
+    return str(request.param)
 
 
 @pytest.fixture(scope="session")

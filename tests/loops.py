@@ -5,7 +5,6 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-import torch.nn.functional as functional
 from scipy.interpolate import CubicSpline
 from scipy.optimize import nnls
 from torch import Tensor
@@ -84,21 +83,6 @@ def accumulate(
 def normalised_convolution(image: Tensor, kernel: Tensor) -> Tensor:
     """Image convolved with one kernel `[1 or C, k, k]`, divided by the part of the kernel inside the frame."""
     return scatter(image, lambda *_: kernel) / scatter(torch.ones_like(image), lambda *_: kernel)
-
-
-def disc_by_columns(radius: float, size: int) -> Tensor:
-    """Disc integrated over the pixels: each pixel is cut into columns, and the disc's chord clipped to each."""
-    columns = 40_000 // size
-    half = size // 2
-    edge = torch.arange(size + 1, dtype=torch.float64) - half - 0.5
-    x = edge[:-1, None] + (torch.arange(columns, dtype=torch.float64) + 0.5) / columns  # [size, columns]
-    chord = (radius**2 - x**2).clamp_min(0.0).sqrt()
-    kernel = torch.zeros(size, size, dtype=torch.float64)
-    for row in range(size):
-        top = torch.minimum(torch.maximum(chord, edge[row]), edge[row + 1])
-        bottom = torch.minimum(torch.maximum(-chord, edge[row]), edge[row + 1])
-        kernel[row] = (top - bottom).mean(1)
-    return kernel / kernel.sum()
 
 
 def interpolated(profile: Callable[[Tensor], Tensor], reach: float, size: int, samples: int = 200) -> Tensor:
@@ -180,17 +164,3 @@ def best_kernel(spectrum: Callable[[Tensor], Tensor], half: int) -> Tensor:
         for y, x in pixels:
             kernel[y + half, x + half] = weight
     return kernel / kernel.sum()
-
-
-def natural_scene(size: int, seed: int) -> Tensor:
-    """A random scene `[1, 1, size, size]` whose power falls with the square of the frequency, as photographs' does."""
-    frequency = torch.fft.fftfreq(size, dtype=torch.float64)
-    falls = 1 / torch.hypot(frequency[:, None], frequency).clamp_min(1 / size)
-    noise = torch.randn(size, size, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    return torch.fft.ifft2(torch.fft.fft2(noise) * falls).real[None, None]
-
-
-def spread(values: Tensor, kernel: Tensor) -> Tensor:
-    """Values `[1, 1, H, W]` convolved with a kernel; border pixels are repeated outside the frame."""
-    half = kernel.shape[-1] // 2
-    return functional.conv2d(functional.pad(values, (half,) * 4, mode="replicate"), kernel[None, None])

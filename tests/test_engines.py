@@ -42,7 +42,6 @@ from torchdof.reference.lens_views import lens_views
 from torchdof.reference.metrics import ssim
 from torchdof.render.plan import Plan
 
-EVERY_ENGINE = pytest.mark.parametrize("engine", ["torch", "native"], indirect=True)
 EVERY_WAY = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 BY_COLOUR = BlurTable("gaussian", [1.0], {"sigma": torch.tensor([[0.4], [0.5], [0.6]])}, name="by colour")
 
@@ -67,17 +66,9 @@ LENSES = {
 }
 
 
-@pytest.fixture
-def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The engine that renders."""
-    monkeypatch.setenv("TORCHDOF_ENGINE", request.param)
-    return str(request.param)
-
-
 # Hostile scenes
 
 
-@EVERY_ENGINE
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16], ids=["float32", "float16"])
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_the_error_of_a_hostile_scene_is_within_its_limit(case: Case, dtype: torch.dtype, engine: str) -> None:
@@ -147,7 +138,6 @@ def assert_untouched_by_a_hole(render: Callable[[Tensor, Tensor], Tensor], bad: 
     assert not torch.allclose(out[..., ~HOLE], image[..., ~HOLE])
 
 
-@EVERY_ENGINE
 @EVERY_WAY
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, -math.inf])
 def test_a_bad_depth_stays_sharp_and_does_not_affect_others(engine: str, way: dict[str, Any], bad: float) -> None:
@@ -159,7 +149,6 @@ def test_a_bad_depth_in_a_file_stays_sharp_and_does_not_affect_others(file: File
     assert_untouched_by_a_hole(lambda image, depth: file.render(image, depth, CAMERA)[0], bad)
 
 
-@EVERY_ENGINE
 @EVERY_WAY
 def test_constant_light_stays_constant_around_bad_depth(engine: str, way: dict[str, Any]) -> None:
     dof = DepthOfField(CAMERA, check=False, **way)
@@ -169,7 +158,6 @@ def test_constant_light_stays_constant_around_bad_depth(engine: str, way: dict[s
     assert_close(dof(flat, depth), flat, rtol=1e-6, atol=0.0)
 
 
-@EVERY_ENGINE
 @EVERY_WAY
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf], ids=str)
 @pytest.mark.parametrize("coc_px", [0.0, -3.0, 40.0])
@@ -196,7 +184,6 @@ def test_bad_light_in_a_file_stays_in_its_pixel(file: File, bad: float) -> None:
 # Light of any size
 
 
-@EVERY_ENGINE
 @EVERY_WAY
 @pytest.mark.parametrize("light", [2e19, 3e38])
 @pytest.mark.parametrize("post", [False, True], ids=["step", "post one pixel wide"])
@@ -218,7 +205,6 @@ def test_bright_light_at_a_step_agrees_with_float64(engine: str, way: dict[str, 
     assert -3.0001 <= float(out.min()) and float(out.max()) <= -0.9999
 
 
-@EVERY_ENGINE
 @pytest.mark.parametrize("light", [2e19, 1e30, -1e30])
 def test_bright_layers_and_backgrounds_do_not_overflow(engine: str, light: float) -> None:
     dof, depth = DepthOfField(CAMERA), halves(1.2, 2.5)
@@ -233,7 +219,6 @@ def test_bright_layers_and_backgrounds_do_not_overflow(engine: str, light: float
     assert_close(out[:, -1].double(), wide[:, -1], rtol=1e-5, atol=1e-6)
 
 
-@EVERY_ENGINE
 @EVERY_WAY
 @pytest.mark.parametrize("value", [6.5e4, 1e6])
 @pytest.mark.parametrize("coc_px", [-6.0, 2.5, 11.0])
@@ -250,7 +235,6 @@ def test_a_highlight_does_not_change_pixels_outside_its_disc(
     assert_close(out, torch.full_like(out, 1e-4), rtol=2e-6, atol=0.0)
 
 
-@EVERY_ENGINE
 @pytest.mark.parametrize("name", ["image", "squeezed cat's eyes", "spots across the field"])
 def test_light_of_1e30_agrees_with_float64_for_any_lens(engine: str, name: str) -> None:
     image, coc_px = torch.full((1, 3, HEIGHT, WIDTH), 0.1), halves(-4.0, 3.0)
@@ -422,7 +406,6 @@ def _types(scene: Scene, way: dict[str, Any], out: Tensor) -> None:
 CHECKS = [_threads, _items, _again, _types]
 
 
-@EVERY_ENGINE
 @EVERY_WAY
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__.strip("_"))
 def test_the_picture_does_not_depend_on(engine: str, way: dict[str, Any], check: Any) -> None:
@@ -458,7 +441,6 @@ ENTRIES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 }  # fmt: skip
 
 
-@EVERY_ENGINE
 @pytest.mark.parametrize("name", ENTRIES)
 def test_autocast_does_not_change(name: str, engine: str) -> None:
     plain = ENTRIES[name](texture(), slope(1.2, 6.0))
@@ -482,7 +464,6 @@ def test_tiles_rendered_separately_with_a_halo_leave_no_seam(method: Any) -> Non
 # Plans of other scenes
 
 
-@EVERY_ENGINE
 @pytest.mark.parametrize("occlusion", [True, False])
 @pytest.mark.parametrize(
     ("planned", "shown"), [(0.0, 6.0), (0.0, -6.0), (-2.0, -3.0), (3.0, 20.0), (4.0, -4.0), (5.0, 0.0)]

@@ -190,13 +190,9 @@ splat(image, depth).sum().backward()
 """
 
 
-@pytest.mark.parametrize("engine", ["auto", "torch"])
 @pytest.mark.parametrize("then", ["", WITH_GRADIENTS, PER_PIXEL], ids=["picture", "gradients", "splat"])
-def test_a_first_picture_loads_neither_sympy_nor_the_compiler(
-    then: str, engine: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_first_picture_loads_neither_sympy_nor_the_compiler(then: str, engine: str) -> None:
     """They take a second, and eager code needs neither."""
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
     assert loaded(FIRST + then, "sympy", "torch._dynamo", "torch._inductor", "kornia") == []
 
 

@@ -17,6 +17,7 @@ import onnx
 import OpenImageIO as oiio
 import torch
 
+from tests.files import spec_with, store_parts
 from torchdof import BlurTable, blur_by_coc
 from torchdof.depth import read_depth
 from torchdof.export import describe
@@ -61,10 +62,7 @@ def _image_seeds(suffix: str) -> Callable[[Path], None]:
         if suffix not in (".hdr", ".jpg", ".pfm"):
             write_image(folder / f"alpha{suffix}", _picture(4))
         if suffix == ".exr":
-            _tiled(folder / "tiled.exr", levels="ONE_LEVEL")
-            _tiled(folder / "mipmap.exr", levels="MIPMAP_LEVELS")
-            _parts(folder / "parts.exr")
-            _window(folder / "window.exr")
+            _exr_seeds(folder)
         if suffix == ".jpg":
             tags = {
                 "Exif:FocalLength": ("float", 50.0),
@@ -76,42 +74,23 @@ def _image_seeds(suffix: str) -> Callable[[Path], None]:
     return write
 
 
-def _spec(channels: tuple[str, ...] = ("R", "G", "B", "Z")) -> oiio.ImageSpec:
-    spec = oiio.ImageSpec(16, 16, len(channels), "half")
-    spec.channelnames = channels
-    return spec
+def _part(channels: tuple[str, ...] = ("R", "G", "B", "Z"), **attributes: Any) -> tuple[oiio.ImageSpec, np.ndarray]:
+    values = np.linspace(0.1, 1, 256 * len(channels), dtype=np.float32).reshape(16, 16, len(channels))
+    return spec_with(values, "half", channels, **attributes), values
 
 
-def _store(path: Path, specs: list[oiio.ImageSpec]) -> None:
-    output = oiio.ImageOutput.create(str(path))
-    assert output is not None and output.open(str(path), specs if len(specs) > 1 else specs[0])
-    for number, spec in enumerate(specs):
-        assert not number or output.open(str(path), spec, "AppendSubimage")
-        pixels = np.linspace(0.1, 1, spec.width * spec.height * spec.nchannels, dtype=np.float32)
-        assert output.write_image(pixels.reshape(spec.height, spec.width, spec.nchannels)), output.geterror()
-    output.close()
-
-
-def _tiled(path: Path, levels: str) -> None:
-    spec = _spec()
-    spec.tile_width = spec.tile_height = 16
-    if levels != "ONE_LEVEL":
-        spec.attribute("openexr:levelmode", 1)
-        spec.attribute("textureformat", "Plain Texture")
-    _store(path, [spec])
-
-
-def _parts(path: Path) -> None:
-    colour, depth = _spec(("R", "G", "B")), _spec(("Z",))
-    colour.attribute("name", "beauty")
-    depth.attribute("name", "depth")
-    _store(path, [colour, depth])
-
-
-def _window(path: Path) -> None:
-    spec = _spec()
+def _exr_seeds(folder: Path) -> None:
+    """With tiles, levels, parts and a window."""
+    tiled = _part()
+    levels = _part(openexr__levelmode=1, textureformat="Plain Texture")
+    for spec, _ in (tiled, levels):
+        spec.tile_width = spec.tile_height = 16
+    window = _part()
+    spec = window[0]
     spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height = -3, -5, 0, 0, 8, 8
-    _store(path, [spec])
+    for name, part in {"tiled": tiled, "mipmap": levels, "window": window}.items():
+        store_parts(folder / f"{name}.exr", [part])
+    store_parts(folder / "parts.exr", [_part(("R", "G", "B"), name="beauty"), _part(("Z",), name="depth")])
 
 
 def _read_picture(path: Path) -> None:

@@ -23,7 +23,6 @@ print(os.waitpid(child, 0)[1], torch.get_num_threads())
 
 @pytest.mark.hard
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no fork")
-@pytest.mark.parametrize("engine", ["torch", "native"])
 def test_a_forked_worker_renders_after_its_parent_has_rendered_with_two_threads(engine: str) -> None:
     run = subprocess.run([sys.executable, "-c", FORKED, engine], capture_output=True, text=True, timeout=200)
     assert run.stdout == "0 2\n", run.stdout + run.stderr

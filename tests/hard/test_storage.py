@@ -82,9 +82,7 @@ print([float(t.detach().double().sum()) for t in (*pictures, focused, depth.grad
 """
 
 
-@pytest.mark.parametrize("engine", ["native", "torch"])
-def test_a_default_device_changes_nothing_of_pictures_on_another(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+def test_a_default_device_changes_nothing_of_pictures_on_another(engine: str) -> None:
     on_cpu, on_meta = (
         subprocess.run([sys.executable, "-c", ELSEWHERE, device], capture_output=True, text=True, check=False)
         for device in ("cpu", "meta")

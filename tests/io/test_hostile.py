@@ -21,6 +21,7 @@ import OpenImageIO as oiio
 import pytest
 import torch
 
+from tests.files import spec_with, store, store_parts
 from torchdof import BlurTable
 from torchdof.io import decode, foreign
 from torchdof.io.decode import MOST_ATTRIBUTES
@@ -44,11 +45,7 @@ def with_values(values: np.ndarray, *names: str, kind: str = "float", tags: dict
     """Writes a file with OpenImageIO alone, then changes ``tags`` of a TIFF."""
 
     def make(path: Path) -> None:
-        spec = oiio.ImageSpec(values.shape[1], values.shape[0], values.shape[2], kind)
-        spec.channelnames = names or spec.channelnames
-        output = oiio.ImageOutput.create(str(path))
-        assert output is not None and output.open(str(path), spec)
-        assert output.write_image(values) and output.close()
+        store(path, values, kind, names or None)
         content = bytearray(path.read_bytes())
         for tag, value in (tags or {}).items():
             start = struct.unpack_from("<I", content, 4)[0] + 2
@@ -321,23 +318,12 @@ def huge_exr(path: Path) -> None:
     path.write_bytes(content)
 
 
-def with_parts(path: Path, count: int) -> None:
-    """Writes an EXR of ``count`` parts of 40 x 40 pixels."""
-    specs = [oiio.ImageSpec(40, 40, 3, "half") for _ in range(count)]
-    for number, spec in enumerate(specs):
-        spec.attribute("oiio:subimagename", f"part {number}")
-    output = oiio.ImageOutput.create(str(path))
-    assert output is not None and output.open(str(path), tuple(specs))
-    for number, spec in enumerate(specs):
-        assert number == 0 or output.open(str(path), spec, "AppendSubimage")
-        assert output.write_image(np.zeros((40, 40, 3), np.float16))
-    assert output.close()
-
-
 def test_all_parts_are_held_against_memory_before_the_first_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with_parts(tmp_path / "x.exr", 5)  # 144 kB when read, of which 29 kB are one part's
+    black = np.zeros((40, 40, 3), np.float16)
+    parts = [(spec_with(black, "half", oiio__subimagename=f"part {n}"), black) for n in range(5)]
+    store_parts(tmp_path / "x.exr", parts)  # 144 kB when read, of which 29 kB are one part's
     assert read_image(tmp_path / "x.exr", layer="part 3").pixels.shape == (1, 3, 40, 40)
     monkeypatch.setattr(decode, "free_bytes", lambda: 1e5)
     monkeypatch.setattr(oiio.ImageInput, "read_image", lambda *_: pytest.fail("read"))

@@ -56,11 +56,7 @@ def compressed(depth: Tensor, quantum: float) -> Tensor:
 
 
 @pytest.mark.parametrize("quantum", [20.0, 40.0])
-@pytest.mark.parametrize("engine", ["torch", pytest.param("native", marks=compiled)])
-def test_compression_artefacts_beside_steps_are_not_ramps(
-    scene: Scene, quantum: float, engine: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+def test_compression_artefacts_beside_steps_are_not_ramps(scene: Scene, quantum: float, engine: str) -> None:
     depth = compressed(scene.depth, quantum)
     assert 0.05 < float((1 / depth - 1 / scene.depth).abs().max()) < 0.3
     assert torch.equal(repair_edges(scene.image, depth, "auto"), depth)
@@ -68,12 +64,8 @@ def test_compression_artefacts_beside_steps_are_not_ramps(
     assert wrong(repair_edges(scene.image, soft, "auto"), scene.depth) < 0.5 * wrong(soft, scene.depth)
 
 
-@pytest.mark.parametrize("engine", ["torch", pytest.param("native", marks=compiled)])
-def test_narrow_ramps_of_averaged_depth_are_repaired(
-    scene: Scene, engine: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_narrow_ramps_of_averaged_depth_are_repaired(scene: Scene, engine: str) -> None:
     """Such depth was downsampled with its image, or rendered with anti-aliasing."""
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
     image = functional.avg_pool2d(scene.image, 2)
     depth = 1 / functional.avg_pool2d(1 / scene.depth, 2)
     nearest = -functional.max_pool2d(-scene.depth, 2), functional.max_pool2d(scene.depth, 2)
@@ -172,22 +164,12 @@ TURNS: dict[str, Callable[[Tensor], Tensor]] = {
 
 @pytest.mark.parametrize("turn", TURNS.values(), ids=TURNS)
 @pytest.mark.parametrize("kind", ["near -1px", "half-res"])
-@pytest.mark.parametrize(
-    ("engine", "times"),
-    [("torch", (1, 1)), pytest.param("native", (3, 3), marks=compiled)]
-    + [pytest.param("native", (7, 6), marks=compiled)],  # a frame large enough to be sampled
-)
 def test_repair_commutes_with_flips_and_turns(
-    scene: Scene,
-    kind: str,
-    turn: Callable[[Tensor], Tensor],
-    engine: str,
-    times: tuple[int, int],
-    monkeypatch: pytest.MonkeyPatch,
+    scene: Scene, kind: str, turn: Callable[[Tensor], Tensor], engine: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Sizes are odd and damage and noise uneven, so that a sample that is not turned with the frame is detected."""
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
     monkeypatch.setattr(edges, "_SAMPLED", 2**12)  # makes the plain engine sample a small frame
+    times = (1, 1) if engine == "torch" else (7, 6)  # a frame large enough to be sampled
     image = scene.image.repeat(1, 1, *times)[..., :-1, :-3]
     exact, damaged = (
         scene.camera.coc_px(degrade(scene.depth, k), 192).repeat(1, 1, *times)[..., :-1, :-3] for k in ("exact", kind)
@@ -201,11 +183,7 @@ def test_repair_commutes_with_flips_and_turns(
     torch.testing.assert_close(turned, turn(repaired), rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize("engine", ["torch", pytest.param("native", marks=compiled)])
-def test_noise_along_rows_and_along_columns_is_not_an_edge(
-    scene: Scene, engine: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+def test_noise_along_rows_and_along_columns_is_not_an_edge(scene: Scene, engine: str) -> None:
     for shape in ((1, 1, 128, 1), (1, 1, 1, 192)):
         noise = (2.0 * torch.randn(shape, generator=torch.Generator().manual_seed(0))).expand(scene.depth.shape)
         assert torch.equal(edges.repair(scene.image, noise.contiguous(), edges.STEP_PX, False), noise)
@@ -242,11 +220,7 @@ def test_a_lamp_does_not_come_nearer_than_it_was() -> None:
 
 
 @pytest.mark.parametrize("kind", ["half-res", "near -1px"])
-@pytest.mark.parametrize("engine", ["torch", pytest.param("native", marks=compiled)])
-def test_differences_below_half_a_step_are_not_edges(
-    scene: Scene, kind: str, engine: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+def test_differences_below_half_a_step_are_not_edges(scene: Scene, kind: str, engine: str) -> None:
     nearness = 1.0 / degrade(scene.depth, kind)
     image = scene.image.clone()
     image[..., 60:62, 90:92] = 500.0
