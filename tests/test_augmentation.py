@@ -117,14 +117,6 @@ def test_the_last_channel_is_the_depth_and_is_returned() -> None:
     assert torch.equal(out[:, :3], aug(image, depth, params=aug._params))
 
 
-def test_gradients_reach_image_and_depth() -> None:
-    image, depth = sample()
-    image.requires_grad_()
-    depth.requires_grad_()
-    random_dof(p=0.5)(image, depth).square().sum().backward()
-    assert image.grad is not None and depth.grad is not None and bool(depth.grad.any())
-
-
 # Labels
 
 
@@ -144,13 +136,6 @@ def test_the_label_holds_the_blur_and_the_random_parameters_by_name() -> None:
     ))  # fmt: skip
     again, same = aug(image, depth, params=aug._params)
     assert torch.equal(again, out) and all(torch.equal(same[name], label[name]) for name in label)
-
-
-def test_pixels_without_depth_have_no_blur_in_the_label() -> None:
-    image, depth = sample(1)
-    depth[..., :5] = 0.0
-    label = random_dof(return_label=True)(image, depth)[1]
-    assert not bool(label["coc_px"][..., :5].any()) and bool(label["coc_px"][..., 5:].all())
 
 
 def test_the_label_of_a_sequence_is_asked_for_after_it() -> None:
@@ -189,16 +174,6 @@ def test_image_depth_and_masks_stay_aligned() -> None:
     assert torch.equal(out, dof(sharp, moved, params=drawn[3].data))
     again = pipeline(image, depth, labels, params=drawn)
     assert all(torch.equal(a, b) for a, b in zip(again, (out, moved, moved_labels), strict=True))
-
-
-def test_a_dict_goes_through_the_sequence() -> None:
-    image, depth = sample()
-    pipeline = DepthAugmentationSequential(K.RandomHorizontalFlip(p=1.0), random_dof(), data_keys=None)
-    out = pipeline({"image": image, "mask_depth": depth, "mask_labels": depth.clone(), "name": "a"})
-    assert torch.equal(out["mask_depth"], depth.flip(-1)) and torch.equal(out["mask_labels"], depth.flip(-1))
-    drawn: Any = pipeline._params
-    assert torch.equal(out["image"], random_dof()(image.flip(-1), depth.flip(-1), params=drawn[1].data))
-    assert out["name"] == "a"
 
 
 @pytest.mark.parametrize("container", ["image", "augmentation", "video"])

@@ -10,8 +10,7 @@ from torch.testing import assert_close
 
 from tests import loops
 from tests.tolerances import TOLERANCES
-from tests.traced import TRACED
-from torchdof import BlurTable, blur_by_coc
+from torchdof import BlurTable
 from torchdof.functional import splat
 
 WIDE = torch.float64
@@ -38,18 +37,6 @@ def test_scatter_equals_a_plain_loop_with_a_kernel_for_each_pixel(table: BlurTab
     image, coc = scene(1)
     expected = loops.accumulate(image, coc, table, None, normalize)
     assert_close(splat(image, coc, table, normalize=normalize), expected, rtol=0, atol=3e-4)
-
-
-@pytest.mark.parametrize("table", TABLES, ids=NAMES)
-def test_kernels_of_tabulated_radii_are_exact(table: BlurTable) -> None:
-    image, coc = scene(1, most_px=1.9)
-    coc = (128 * coc).round() / 128
-    assert_close(splat(image, coc, table), loops.accumulate(image, coc, table), rtol=1e-11, atol=1e-12)
-
-
-def test_a_wide_blur_in_a_small_frame_equals_the_loop() -> None:
-    image, coc = scene(1, most_px=30.0, height=3, width=6)
-    assert_close(splat(image, coc), loops.accumulate(image, coc, BlurTable.disc()), rtol=0, atol=3e-4)
 
 
 def gauss_psf(image: Tensor, c_px: Tensor) -> Tensor:
@@ -83,13 +70,6 @@ def test_an_image_in_focus_is_returned_bit_exact() -> None:
     image = torch.rand(2, 3, 8, 9)
     assert torch.equal(splat(image, torch.zeros(1, 1, 8, 9)), image)
     assert torch.equal(splat(image, torch.zeros(1, 1, 8, 9), normalize=False), image)
-
-
-def test_a_plane_equals_its_layered_rendering() -> None:
-    image, coc = torch.rand(1, 3, 20, 24), torch.full((1, 1, 20, 24), 2.7)
-    layered = blur_by_coc(image, coc, occlusion=False, tolerance=0, depth_edges="as given")
-    inside = (..., slice(3, -3), slice(3, -3))  # the layered rendering extends the image beyond its border
-    assert_close(splat(image, coc)[inside], layered[inside], rtol=0, atol=3e-4)
 
 
 # Batches
@@ -138,15 +118,6 @@ def test_gradients_to_sigma_and_gradients_of_these() -> None:
 
     assert torch.autograd.gradcheck(blurred, (image, sigma))
     assert torch.autograd.gradgradcheck(blurred, (image, sigma))
-
-
-@TRACED
-def test_torch_func_has_the_same_gradient() -> None:
-    image, coc = scene(1)
-    wanted = coc.clone().requires_grad_()
-    (expected,) = torch.autograd.grad(splat(image, wanted).square().sum(), wanted)
-    assert bool(expected.any())
-    assert_close(torch.func.grad(lambda c: splat(image, c).square().sum())(coc), expected)
 
 
 def test_a_training_step_stores_a_few_images_for_the_backward_pass() -> None:

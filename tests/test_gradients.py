@@ -1,5 +1,6 @@
 """Gradients of the picture: equal to finite differences, finite on hostile scenes, and usable for optimisation."""
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -13,6 +14,9 @@ from torch.testing import assert_close
 from tests.scenes import CAMERA, WAYS, halves, slope, texture, whole
 from tests.traced import TRACED
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, validation
+from torchdof.depth import from_relative
+from torchdof.depth.relative import RELATIVE_KINDS
+from torchdof.io.highlights import expand_highlights
 from torchdof.render.layer_weights import from_blur_axis
 from torchdof.render.plan import Plan
 
@@ -72,6 +76,16 @@ def test_the_picture_is_the_same_with_gradients_and_their_adjoint_is_that_of_the
     if not way["occlusion"]:  # with occlusion the picture is not linear in the image, because matting depends on it
         (back,) = torch.autograd.grad(out, image, seen)
         assert_close((back * other).sum(), (seen * dof(other, *others)).sum(), rtol=1e-11, atol=0.0)
+
+
+@pytest.mark.parametrize(
+    ("function", "channels"),
+    [(expand_highlights, 3)]
+    + [(functools.partial(from_relative, near_m=1.0, far_m=5.0, kind=kind), 1) for kind in RELATIVE_KINDS],
+)
+def test_gradients_of_maps_equal_finite_differences(function: Callable[[Tensor], Tensor], channels: int) -> None:
+    values = 0.9 * torch.rand(1, channels, 6, 7, dtype=torch.float64) + 0.02
+    assert torch.autograd.gradcheck(function, (values.requires_grad_(),))
 
 
 # Finite gradients

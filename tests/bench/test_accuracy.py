@@ -63,20 +63,6 @@ def test_the_worst_window_has_the_largest_error() -> None:
     assert torch.equal(picture[window], picture[..., 25:29, 31:35])
 
 
-def test_every_kind_of_depth_is_scored_with_every_renderer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(accuracy, "KINDS", {kind: accuracy.KINDS[kind] for kind in ("exact", "near -1px")})
-    peer = tmp_path / "peer.py"
-    peer.write_text(TOY)
-    accuracy.compare(DATA / "planes", tmp_path, [], True, [peer])
-    rows = list(csv.DictReader((tmp_path / "degraded.csv").read_text().splitlines()))
-    value = {(row["depth"], row["renderer"]): float(row["psnr_db"]) for row in rows}
-    assert len(value) == len(rows) == 2 * 4
-    assert value["exact", "torchdof"] == pytest.approx(value["exact", "as given"], abs=0.05)
-    assert value["near -1px", "torchdof"] > value["near -1px", "as given"] + 0.3
-    assert value["exact", "toy 7"] == value["near -1px", "toy 7"]
-    assert "| near -1px | torchdof |" in (tmp_path / "degraded.md").read_text()
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -83,29 +83,6 @@ def test_a_fresh_process_renders_the_same_picture_and_reports_its_own_time() -> 
     assert seconds.wall > 0 and seconds.cpu > waited
 
 
-def test_the_report_names_a_tolerance_that_was_not_kept(
-    in_this_process: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def wrong(*arguments: Any, **options: Any) -> Tensor:
-        return blur_by_coc(*arguments, **options) + 0.2 * (options.get("tolerance") == 4 / 255)
-
-    monkeypatch.setattr(speed, "blur_by_coc", wrong)
-    scene = shipped(36, 64)
-    rows = speed.compare(scene, repeat=1)
-    assert [row["setting"] for row in rows if not row["kept"]] == ["4/255", "4/255 without occlusion"]
-    speed.report(rows, scene, None)
-    assert "tolerance was not kept by: 4/255; 4/255 without occlusion." in " ".join(capsys.readouterr().out.split())
-
-
-def test_a_scan_changes_only_the_radius_or_only_the_frame(in_this_process: None) -> None:
-    scene = shipped(64, 128)
-    found = {facts["setting"]: camera for facts, _, camera, _ in speed.works(scene, True, 1, scan=True)}
-    for radius in (4, 8, 16, 32, 64):
-        camera = found[f"{radius} px 1/255"]
-        assert 0.7 * radius <= float(camera.coc_px.abs().max()) <= radius and camera.image is scene.image
-    assert [found[f"{share} of the frame 1/255"].image.shape[-1] for share in (0.25, 0.5)] == [32, 64]
-
-
 def test_bench_measures_the_users_scene_and_makes_the_output_folder(
     in_this_process: None, files: tuple[Path, Path], tmp_path: Path
 ) -> None:

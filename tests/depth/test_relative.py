@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from tests.tolerances import TOLERANCES
-from tests.traced import TRACED
 from torchdof.depth import depth_from_values, from_relative, solve_scale
 from torchdof.depth.relative import RELATIVE_KINDS
 
@@ -82,19 +81,6 @@ def test_the_farthest_disparity_may_lie_at_infinity_and_passes_no_gradient() -> 
     assert depth[..., :3].flatten().tolist() == [INF, 2.0, 1.0]
     depth[depth.isfinite()].sum().backward()
     assert values.grad is not None and bool(values.grad.isfinite().all())
-
-
-@pytest.mark.parametrize("kind", RELATIVE_KINDS)
-def test_gradients_are_those_of_the_formula(kind: Any) -> None:
-    values = torch.rand(2, 1, 3, 4, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda v: from_relative(v, 1.0, 5.0, kind), values)
-
-
-@TRACED
-def test_from_relative_compiles_without_graph_breaks() -> None:
-    values = torch.rand(1, 1, 3, 4)
-    compiled = torch.compile(lambda v: from_relative(v, 1.0, 5.0), fullgraph=True, backend="eager")
-    torch.testing.assert_close(compiled(values), from_relative(values, 1.0, 5.0))
 
 
 @pytest.mark.parametrize(

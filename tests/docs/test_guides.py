@@ -189,16 +189,6 @@ def test_readme_is_short_and_names_extras_that_exist() -> None:
     assert named and named <= set(extras)
 
 
-def test_folders_that_contributing_lists_exist() -> None:
-    listed = (ROOT / "CONTRIBUTING.md").read_text().partition("## Folders")[2].partition("\n## ")[0]
-    paths = re.findall(r"`([a-z/_]+(?:/|\.py))`", listed)
-    assert paths
-    for path in paths:
-        assert (
-            (ROOT / path).exists() or (ROOT / "torchdof" / path).exists() or (ROOT / "torchdof/render" / path).exists()
-        )
-
-
 _GALLERY = runpy.run_path(str(ROOT / "examples" / "gallery.py"))["GALLERY"]
 _QUICK = ("lenses.jpg", "truth_lamps.jpg", "truth_bars.jpg")
 

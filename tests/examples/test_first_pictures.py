@@ -47,16 +47,6 @@ def test_a_part_renders_its_stated_sizes_and_blur_radii(
     assert not any(same) or part == "lamps", "a camera was rendered before"
 
 
-def test_an_installation_whose_pictures_are_wrong_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
-    original = first_pictures.blur_by_coc
-    monkeypatch.setattr(first_pictures, "figures", lambda *_: [])
-    monkeypatch.setattr(
-        first_pictures, "blur_by_coc", lambda *a, tolerance: original(*a, tolerance=tolerance) + 4 * tolerance
-    )
-    with pytest.raises(RuntimeError, match="does not keep its tolerance"):
-        first_pictures.turn_of("cameras", SCENES, 0)
-
-
 def test_the_command_renders_the_same_picture_as_blur_by_coc() -> None:
     scene = first_pictures.shipped(48, 64).seen(0.0, 5.0)
     picture, seconds = first_pictures.rendered(scene.image, scene.coc_px)

@@ -53,16 +53,6 @@ def test_eager_and_exported_agree(module: str, name: str, request: pytest.Fixtur
     assert float(((exported.render(*tensors) - eager).abs() / unit).max()) <= TOLERANCE
 
 
-def test_items_of_a_batch_of_another_size_have_their_own_focus_and_aperture(layered: Any) -> None:
-    generator = torch.Generator().manual_seed(3)
-    image = torch.rand(2, 3, 45, 71, generator=generator)
-    depth = torch.nn.functional.interpolate(torch.rand(2, 1, 5, 7, generator=generator) * 4 + 1, (45, 71))
-    tensors = image, depth, torch.tensor([1.4, 3.0]), torch.tensor([4.0, 7.0])
-    expected = layered.eager(*tensors)
-    assert (expected - image).abs().max() > 0.1
-    torch.testing.assert_close(layered.render(*tensors), expected, atol=1e-5, rtol=0)
-
-
 def street(exported: Any, lamps: int) -> tuple[Tensor, ...]:
     """Lamps behind and in front of a post, blurred by up to the largest radius of a file."""
     depth = torch.full((1, 1, 90, 120), 6.0) + 0.1 * torch.rand(1, 1, 90, 120)

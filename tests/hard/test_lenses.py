@@ -13,11 +13,9 @@ import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchdof import BlurTable, blur_by_coc
-from torchdof.cli.fitted import Shown
 from torchdof.cli.main import app
 from torchdof.fit import FitError
 from torchdof.fit.lens.glass import Glass
@@ -156,13 +154,6 @@ def test_repairs_of_maps_and_light_of_any_size_stay_finite(case: tuple[Tensor, f
     assert torch.equal(repaired[too_large], nearness[too_large])
 
 
-@pytest.mark.parametrize("focus", ["0", "-1", "nan", "0.02"])
-def test_the_command_line_refuses_a_focus_within_the_lens(focus: str, tmp_path: Path) -> None:
-    arguments = ["fit", "--lens", "wide_22mm", "-o", str(tmp_path / "table.json"), "--focus-m", focus]
-    done = CliRunner().invoke(app, arguments)
-    assert done.exit_code == 2 and "--focus-m must be a number of metres" in done.output
-
-
 def test_root_also_limits_photographs_without_a_description(tmp_path: Path) -> None:
     (tmp_path / "photographs").mkdir()
     (tmp_path / "elsewhere").mkdir()
@@ -173,14 +164,3 @@ def test_root_also_limits_photographs_without_a_description(tmp_path: Path) -> N
     output: Callable[[Path], str] = lambda root: CliRunner().invoke(app, [*call, str(root)]).output  # noqa: E731
     assert "lies outside of" in output(tmp_path / "photographs")
     assert "show the target" in output(tmp_path)
-
-
-def test_a_plot_that_cannot_be_written_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full_disk(_: Figure, path: Path) -> None:
-        Path(path).write_bytes(b"half of a picture")
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr(Figure, "savefig", full_disk)
-    with pytest.raises(OSError, match="No space left"):
-        Shown(quiet=True).draw(BlurTable.disc(), tmp_path, "disc")
-    assert not list(tmp_path.iterdir())

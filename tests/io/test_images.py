@@ -130,15 +130,6 @@ def test_transfer_is_kept_from_integers_to_integers_and_else_is_the_default(tmp_
         assert stored(tmp_path / name)[0, 0, 0] == first
 
 
-def test_light_is_float32_with_any_default_dtype(tmp_path: Path) -> None:
-    path = store(tmp_path / "x.png", np.full((2, 2, 3), 128, np.uint8), "uint8")
-    torch.set_default_dtype(torch.float64)
-    try:
-        assert read_image(path).pixels.dtype == torch.float32
-    finally:
-        torch.set_default_dtype(torch.float32)
-
-
 @pytest.mark.parametrize(("suffix", "sample"), [(".png", "8"), (".png", "16"), (".tif", "8"), (".tif", "float")])
 def test_straight_alpha_is_premultiplied_in_linear_light(tmp_path: Path, suffix: str, sample: Any) -> None:
     rgba = np.zeros((2, 2, 4), np.float32)

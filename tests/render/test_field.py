@@ -79,20 +79,6 @@ def test_kernels_are_not_cut_in_the_middle_of_the_frame_or_near_focus() -> None:
     assert_close(passed(TABLE, 0.3, 0.6, 0.8), kernel, rtol=1e-12, atol=0)
 
 
-def test_each_pixel_is_blurred_by_the_kernel_of_its_place_within_a_hundredth() -> None:
-    height, width, coc_px = 120, 200, 5.0
-    image = torch.rand(1, 1, height, width, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-    coc = torch.full_like(image, coc_px)
-    picture = blur_by_coc(image, coc, table=TABLE, occlusion=False)
-    kernel = BlurTable.disc().kernels(coc[0, 0, 0, :1], width)[0]
-    half = kernel.shape[-1] // 2
-    for row, column in ((6, 9), (61, 97), (17, 190), (110, 24), (64, 160)):
-        own = of_pixel(TABLE, coc_px, row, column, (height, width))[0]
-        around = image[0, 0, row - half : row + half + 1, column - half : column + half + 1]
-        expected = float((around * own.flip(-2, -1)).sum())
-        assert float(picture[0, 0, row, column]) == pytest.approx(expected, abs=0.01)
-
-
 def test_constant_light_stays_constant_and_coarse_layers_agree_with_fine_ones() -> None:
     coc = torch.linspace(-12.0, 14.0, 90).expand(1, 1, 60, 90).contiguous()
     even = blur_by_coc(torch.full((1, 3, 60, 90), 0.3), coc, table=TABLE)

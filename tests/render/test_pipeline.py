@@ -65,24 +65,6 @@ def test_the_order_of_a_stack_and_the_form_of_its_depths_do_not_matter(fence: Sc
     torch.testing.assert_close(dof.layers(stack, maps), expected)
 
 
-@pytest.mark.parametrize("tolerance", ["draft", "final"])
-def test_a_stack_in_a_batch_is_rendered_as_alone(tolerance: Any) -> None:
-    dof = DepthOfField(CAMERA, tolerance=tolerance)
-    rgba = torch.rand(2, 2, 4, 24, 32, generator=torch.Generator().manual_seed(0))
-    depth = torch.tensor([[1.2, 4.0], [0.6, 30.0]])
-    alone = [dof.layers(rgba[i : i + 1], depth[i : i + 1]) for i in range(2)]
-    torch.testing.assert_close(dof.layers(rgba, depth), torch.cat(alone), rtol=0, atol=0)
-
-
-def test_a_single_opaque_layer_equals_a_plane_of_its_depth() -> None:
-    image = torch.rand(1, 3, 24, 32, generator=torch.Generator().manual_seed(0))
-    dof = DepthOfField(CAMERA.replace(focus_m=1.0))
-    rgba = torch.cat([image, torch.ones(1, 1, 24, 32)], 1)[:, None]
-    out = dof.layers(rgba, torch.tensor([2.0]))
-    torch.testing.assert_close(out[:, :3], dof(image, torch.full((1, 1, 24, 32), 2.0)))
-    torch.testing.assert_close(out[:, 3], torch.ones(1, 24, 32))
-
-
 def test_pixels_without_coverage_stay_transparent_and_light_is_conserved() -> None:
     rgba = torch.zeros(1, 1, 4, 61, 61)
     rgba[..., 24:37, 24:37] = torch.tensor([0.8, 0.4, 0.2, 1.0])[:, None, None]
@@ -108,18 +90,6 @@ def test_the_weight_of_a_background_rises_from_half_a_pixel_behind_the_image(apa
     image, coc = torch.full((1, 1, 6, 8), 0.5), torch.full((1, 1, 6, 8), 2.0)
     *_, background = _before_background(Surface(image, coc), image, coc + apart_px, (-9.0, 9.0), Options())
     torch.testing.assert_close(background.weight, torch.full_like(coc, weight))
-
-
-@pytest.mark.parametrize("method", ["layered", "fold"])
-def test_a_background_at_the_depth_of_the_image_changes_little(method: str) -> None:
-    generator = torch.Generator().manual_seed(2)
-    image = torch.rand(1, 3, 24, 32, generator=generator)
-    coc = torch.full((1, 1, 24, 32), 3.3)
-    coc[..., 16:] = 3.75  # a smaller step than between two surfaces
-    options: dict[str, Any] = {"method": method}
-    alone = blur_by_coc(image, coc, **options)
-    with_background = blur_by_coc(image, coc, background=image, background_coc_px=coc, **options)
-    torch.testing.assert_close(with_background, alone, rtol=0, atol=1e-5)
 
 
 def test_gradients_reach_the_background() -> None:
