@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 import torch
-import torch.nn.functional as functional
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -209,44 +208,3 @@ def test_torch_func_of_an_old_pytorch_is_refused_by_name(which: str, monkeypatch
     dof = DepthOfField(Camera())
     with pytest.raises(ValueError, match=r"comes from torch\.func, for which torchdof needs PyTorch 2\.13"):
         torch.func.grad(lambda value: dof(**{**given, which: value}).sum())(given[which])
-
-
-# Depth from defocus
-
-RAMP = slope(0, 1)
-DESCENTS: dict[str, tuple[list[float], list[float], Callable[[Tensor], dict[str, Tensor]], int, float, float]] = {
-    "a plane before focus": ([1 / 1.3], [1 / 1.55], lambda x: {"depth": torch.ones_like(RAMP) / x}, 80, 0.02, 0.005),
-    "a plane behind focus": ([1 / 5.0], [1 / 2.6], lambda x: {"depth": torch.ones_like(RAMP) / x}, 80, 0.02, 0.005),
-    "a slope": ([0.33, 0.17], [0.26, 0.26], lambda x: {"depth": 1 / (x[0] + (x[1] - x[0]) * RAMP)}, 60, 0.03, 0.02),
-    "the focus": ([1.6], [1.35], lambda x: {"depth": 2 + 6 * RAMP, "focus_m": x}, 50, 0.07, 0.01),
-    "the f-number": ([2.0], [3.0], lambda x: {"depth": 2 + 6 * RAMP, "f_number": x}, 50, 0.07, 0.01),
-}  # fmt: skip
-
-
-def descend(start: Tensor, picture_of: Callable[[Tensor], Tensor], target: Tensor, steps: int, rate: float) -> Tensor:
-    """Gradient descent on the squared difference of pictures."""
-    unknown = start.clone().requires_grad_()
-    adam = torch.optim.Adam([unknown], lr=rate, betas=(0.8, 0.9))
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, steps)
-    for _ in range(steps):
-        adam.zero_grad()
-        (picture_of(unknown) - target).square().mean().backward()
-        adam.step()
-        schedule.step()
-    return unknown.detach()
-
-
-def detailed(height: int = 24, width: int = 32) -> Tensor:
-    """Light with detail of every size, so that any blur changes it."""
-    coarse = functional.interpolate(torch.rand(1, 1, height // 4, width // 4), (height, width))
-    return 0.1 + torch.rand(1, 1, height, width) * coarse
-
-
-@pytest.mark.hard
-@pytest.mark.parametrize("name", DESCENTS)
-def test_gradient_descent_finds(name: str) -> None:
-    truth, start, scene_of, steps, rate, limit = DESCENTS[name]
-    image, dof = detailed(), DepthOfField(CAMERA)
-    target = dof(image, **scene_of(torch.tensor(truth, requires_grad=True))).detach()
-    found = descend(torch.tensor(start), lambda x: dof(image, **scene_of(x)), target, steps, rate)
-    assert found.tolist() == pytest.approx(truth, rel=limit)

@@ -5,7 +5,6 @@ import itertools
 import math
 import statistics
 import time
-from pathlib import Path
 
 import pytest
 import torch
@@ -14,7 +13,7 @@ from torch import Tensor
 from torchdof import Camera
 from torchdof.bench import memory
 from torchdof.bench.measurement import BenchScene, Seconds, measure, peak_of, shipped
-from torchdof.bench.report import publish, summary
+from torchdof.bench.report import summary
 
 SCENE = shipped(36, 64)
 
@@ -98,27 +97,3 @@ def test_a_summary_averages_rows_with_the_same_key() -> None:
         {"a": "x", "new_ms": 2.5, "spread_ms": 1.5},
         {"a": "y", "new_ms": 5.0, "psnr_db": 30.0},
     ]
-
-
-def test_a_report_is_written_completely_or_not_at_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    tables = {"Means": [{"a": "x", "b": 1234.56, "c": True}], "All": [{"a": "x", "d": math.nan}, {"a": "y", "e": 0.25}]}
-    written = functools.partial(publish, "Title", tables, ["remark"], tmp_path / "name")
-
-    def full(path: Path) -> None:
-        raise OSError("no space left")
-
-    (tmp_path / "name.md").write_text("before")
-    with pytest.raises(OSError, match="no space"):
-        written(full)
-    assert [path.name for path in tmp_path.iterdir()] == ["name.md"]
-    assert (tmp_path / "name.md").read_text() == "before"
-    capsys.readouterr()
-    written(quiet=True)
-    assert not capsys.readouterr().out
-    text = (tmp_path / "name.md").read_text()
-    assert (
-        "## Means\n\n| a | b | c |\n| --- | --- | --- |\n| x | 1235 | yes |" in text
-        and "| x |  |  |\n| y |  | 0.25 |" in text
-    )
-    assert f" {torch.get_num_threads()} threads; " in text and f"torch {torch.__version__}" in text and "remark" in text
-    assert (tmp_path / "name.csv").read_text() == "a,d,e\nx,nan,\ny,,0.25\n"

@@ -1,11 +1,6 @@
 """``first_pictures.py``, which times first renderings: its parts, its checks, and two installations in turns."""
 
-import csv
-import json
-import math
-import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -53,41 +48,3 @@ def test_the_command_renders_the_same_picture_as_blur_by_coc() -> None:
     expected = first_pictures.blur_by_coc(scene.image, scene.coc_px)
     assert first_pictures.error(picture, expected)["psnr_db"] > 30  # JPEG in and out
     assert seconds.wall > 0.1 and seconds.cpu > 0.1
-
-
-def test_installations_take_turns_and_have_adjacent_rows(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    calls = []
-
-    class Done:
-        def __init__(self, call: list[str]) -> None:
-            python, _, folder, _, part, _, turn = map(str, call)
-            calls.append((python, part, turn))
-            row = {"figure": part, "goal": "", "beside": "Y", "new_ms": 10.0 + int(turn) + 5 * (python == "other")}
-            self.stdout = "noise\n" + json.dumps([row])
-
-    # the module's own name, for Python's platform module calls subprocess.run as well
-    monkeypatch.setattr(first_pictures, "subprocess", SimpleNamespace(run=lambda call, **_: Done(call), PIPE=None))
-    arguments = [
-        "x",
-        str(SCENES),
-        "--parts",
-        "pull",
-        "--python",
-        "other",
-        "--repeat",
-        "2",
-        "--out",
-        str(tmp_path / "new"),
-    ]
-    monkeypatch.setattr(sys, "argv", arguments)
-    first_pictures.main()
-    assert calls == [(python, "pull", turn) for turn in "01" for python in (sys.executable, "other")]
-    rows = list(csv.DictReader((tmp_path / "new" / "first_pictures.csv").read_text().splitlines()))
-    assert [(row["by"], float(row["new_ms"]), float(row["spread_ms"])) for row in rows] == [
-        ("here", 10.5, 0.5),
-        ("other", 15.5, 0.5),
-    ]
-    assert (
-        math.isfinite(float(rows[0]["new_ms"]))
-        and "| pull | other |" in (tmp_path / "new" / "first_pictures.md").read_text()
-    )

@@ -1,7 +1,7 @@
 """Checks that memory does not grow over many renderings: ``make soak``, or ``python tests/hard/soak.py --help``.
 
-Sizes, cameras, tables and options are random. Afterwards threads with a module each, forked and spawned workers must
-render the same pictures, while PyTorch (OpenMP) and OpenVINO (TBB) run threads of their own.
+Sizes, cameras, tables and options are random. Afterwards threads with a module each, spawned and forked workers must
+render the same pictures.
 """
 
 import argparse
@@ -10,7 +10,6 @@ import multiprocessing
 import os
 import random
 import sys
-import threading
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
@@ -99,36 +98,6 @@ def in_workers(seeds: range, kind: str) -> list[torch.Tensor]:
         return list(pool.map(rendering, seeds, timeout=300))
 
 
-class Busy:
-    """Keeps threads of other libraries busy: OpenMP in PyTorch, TBB in OpenVINO."""
-
-    def __enter__(self) -> "Busy":
-        import openvino
-
-        x = openvino.opset13.parameter([64, 64])
-        core = openvino.Core()
-        network = core.compile_model(openvino.Model([openvino.opset13.matmul(x, x, False, False)], [x]), "CPU")
-        self.stop = threading.Event()
-
-        def openmp() -> None:
-            while not self.stop.wait(0.001):
-                torch.rand(300, 300) @ torch.rand(300, 300)
-
-        def tbb() -> None:
-            while not self.stop.wait(0.001):
-                network([torch.rand(64, 64).numpy()])
-
-        self.threads = [threading.Thread(target=work) for work in (openmp, tbb)]
-        for thread in self.threads:
-            thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop.set()
-        for thread in self.threads:
-            thread.join()
-
-
 def main() -> None:
     """Renders; exit code 1 if memory grew by more than 3 % or a picture differs."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -140,9 +109,8 @@ def main() -> None:
     print(f"{before:.1f} to {after:.1f} MB: {after / before - 1:+.2%}")
     seeds = range(arguments.pictures)
     truth = [rendering(seed) for seed in seeds]
-    with Busy():
-        threads, spawned = in_threads(seeds, 8), in_workers(seeds, "spawn")
-    pictures = {"8 threads": threads, "spawned workers": spawned, "forked workers": in_workers(seeds, "fork")}
+    pictures = {"8 threads": in_threads(seeds, 8)}
+    pictures |= {f"{kind}ed workers": in_workers(seeds, kind) for kind in ("spawn", "fork")}
     equal = {name: same(made, truth) for name, made in pictures.items()}
     for name in equal:
         print(f"{name}: {len(truth)} pictures {'are the same' if equal[name] else 'DIFFER'}")

@@ -75,16 +75,6 @@ def test_a_highlight_changes_nothing_outside_its_own_disc(radius: float) -> None
     assert_close(convolve(lit, kernels)[..., apart], convolve(dark, kernels)[..., apart], rtol=1e-6, atol=0.0)
 
 
-@BOTH
-@pytest.mark.parametrize("channels", [1, 3, 16, 17])
-def test_channels_are_convolved_independently(scatter: Spread, channels: int) -> None:
-    light = torch.rand(1, channels, 7, 6, dtype=torch.float64)
-    kernels = bank(*(1.0 + 0.1 * c for c in range(channels)), size=7)
-    together = scatter(light, kernels)
-    for c in range(channels):
-        assert_close(together[:, c : c + 1], scatter(light[:, c : c + 1], kernels[c : c + 1]))
-
-
 def test_the_adjoint_of_fold_is_unfold() -> None:
     light, seen = torch.rand(2, 2, 3, 9, 7, dtype=torch.float64)
     kernels = torch.rand(3, 5, 5, dtype=torch.float64)  # asymmetric, so that scatter and gather differ
