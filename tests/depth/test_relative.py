@@ -36,27 +36,15 @@ def test_scale_and_shift_of_the_values_do_not_matter(kind: Any, factor: float) -
     torch.testing.assert_close(from_relative(factor * (values - 0.3), 1.5, 9.0, kind), expected)
 
 
-@pytest.mark.parametrize(
-    "dtype", [torch.uint8, torch.uint16, torch.int16, torch.int32, torch.int64, torch.uint32, torch.int8]
-)
-def test_integer_dtypes_give_the_depth_of_their_values(dtype: torch.dtype) -> None:
-    values = torch.tensor([[[[0, 30, 127]]]])
-    depth = from_relative(values.to(dtype), 1.0, 4.0)
-    assert depth.dtype == torch.float32
-    torch.testing.assert_close(depth, from_relative(values.double(), 1.0, 4.0).float())
-
-
-def test_neighbouring_large_integers_give_different_depths() -> None:
-    values = torch.tensor([[[[2**30, 2**30 + 1, 2**30 + 2]]]], dtype=torch.int32)
-    assert from_relative(values, 1.0, 3.0, "depth").flatten().tolist() == [1.0, 2.0, 3.0]
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
-def test_floating_types_are_kept(dtype: torch.dtype) -> None:
-    values = torch.rand(2, 1, 4, 5).to(dtype)
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.uint32, *TOLERANCES])
+def test_integers_become_float32_and_floating_types_are_kept(dtype: torch.dtype) -> None:
+    values = torch.tensor([[[[0, 30, 127]]]]).to(dtype)
     depth = from_relative(values, 1.0, 4.0)
-    assert depth.dtype == dtype
-    torch.testing.assert_close(depth, from_relative(values.double(), 1.0, 4.0).to(dtype), **TOLERANCES[dtype])
+    assert depth.dtype == (dtype if dtype.is_floating_point else torch.float32)
+    expected = from_relative(values.double(), 1.0, 4.0).to(depth.dtype)
+    torch.testing.assert_close(depth, expected, **TOLERANCES[depth.dtype])
+    large = torch.tensor([[[[2**30, 2**30 + 1, 2**30 + 2]]]], dtype=torch.int32)
+    assert from_relative(large, 1.0, 3.0, "depth").flatten().tolist() == [1.0, 2.0, 3.0]
 
 
 def test_holes_stay_holes_and_do_not_stretch_the_range() -> None:
@@ -87,16 +75,12 @@ def test_the_farthest_disparity_may_lie_at_infinity_and_passes_no_gradient() -> 
     ("values", "arguments", "message"),
     [
         (row(1.0, 2.0), (5.0, 1.0), "near_m must be nearer than far_m, got near_m=5 and far_m=1"),
-        (row(1.0, 2.0), (1.0, 1.0), "near_m must be nearer than far_m"),
         (row(1.0, 2.0), (0.0, 1.0), "near_m must be a number of metres > 0"),
-        (row(1.0, 2.0), (1.0, NAN), "far_m must be a number"),
         (row(1.0, 2.0), (1.0, INF, "depth"), "far_m must be a number"),
         (row(1.0, 2.0), (1.0, 2.0, "metric"), "must be one of disparity, inverse, depth, got 'metric'"),
         (row(3.0, 3.0), (1.0, 2.0), r"two different values .* one value everywhere; give value_range"),
-        (row(3.0), (1.0, 2.0), "two different values"),
         (row(NAN, INF), (1.0, 2.0), "two different values to distinguish near from far, got no value"),
         (torch.ones(3, 4), (1.0, 2.0), r"must be \[B, 1, H, W\], got \[3, 4\]; add the missing dimensions"),
-        (torch.ones(1, 3, 4, 4), (1.0, 2.0), r"must be \[B, 1, H, W\], got \[1, 3, 4, 4\]"),
         (np.ones((3, 4)), (1.0, 2.0), "got ndarray; convert an array with torch.from_numpy"),
         (torch.ones(1, 1, 3, 4, dtype=torch.bool), (1.0, 2.0), "got torch.bool"),
         (torch.ones(1, 1, 0, 4), (1.0, 2.0), "at least one pixel"),
@@ -107,7 +91,7 @@ def test_invalid_arguments_are_refused(values: Any, arguments: Any, message: str
         from_relative(values, *arguments)
 
 
-@pytest.mark.parametrize("value_range", [(1.0, 1.0), (2.0, 1.0), (0.0, NAN), (1.0,), "0,1"])
+@pytest.mark.parametrize("value_range", [(2.0, 1.0), (0.0, NAN), (1.0,), "0,1"])
 def test_an_invalid_value_range_is_refused(value_range: Any) -> None:
     with pytest.raises(ValueError, match="value_range"):
         from_relative(row(1.0, 2.0), 1.0, 2.0, value_range=value_range)
