@@ -202,8 +202,7 @@ def test_every_picture_of_the_documentation_has_a_script() -> None:
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=[] if n in _QUICK else pytest.mark.sweep) for n in _GALLERY if n.endswith(".jpg")],
+    "name", [pytest.param(n, marks=[] if n in _QUICK else pytest.mark.sweep) for n in _GALLERY if n.endswith(".jpg")]
 )
 def test_a_picture_of_the_documentation_matches_its_script(name: str, tmp_path: Path) -> None:
     _GALLERY[name](tmp_path / name)

@@ -1,13 +1,11 @@
 import math
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 import torch.nn.functional as functional
 
 from torchdof.optics.blur_table import BlurTable
-from torchdof.optics.camera import Camera
 from torchdof.reference import metrics
 from torchdof.reference.lens_views import lens_views, lens_views_by_coc
 from torchdof.reference.scenes import Plane, Scene, camera_of, plane_scene, posts, read_scenes, waves
@@ -115,17 +113,3 @@ def test_a_steep_surface_has_no_gaps() -> None:
     assert float(known[..., 15:35, 10:18].min()) == 1.0
     near = lens_views_by_coc(torch.full((1, 1, 20, 20), 0.7), torch.full((1, 1, 20, 20), -8.0), views=64).image
     torch.testing.assert_close(near, torch.full_like(near, 0.7))  # not darker towards the frame
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"views": 0}, "views must be a whole number of points"),
-        ({"views": 2.5}, "views must be a whole number of points"),
-        ({"surfaces": [(torch.rand(1, 3, 8, 8), torch.ones(1, 1, 8, 8))]}, r"a surface must be \[1, 4, 8, 8\]"),
-        ({"surfaces": [(torch.rand(1, 4, 8, 8), -torch.ones(1, 1, 8, 8))]}, "depth must be > 0"),
-    ],
-)
-def test_bad_arguments_are_refused(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        lens_views(torch.rand(1, 3, 8, 8), torch.ones(1, 1, 8, 8), Camera(), **options)

@@ -64,16 +64,11 @@ def test_flip_is_zero_for_equal_images_and_largest_where_they_differ() -> None:
     ("call", "message"),
     [
         (lambda: metrics.display(3.0), "linear must be a tensor of linear light, got 3.0"),  # type: ignore[arg-type]
-        (lambda: metrics.display(IMAGE.int()), "linear must be a floating-point tensor"),
-        (lambda: metrics.psnr(IMAGE.numpy(), IMAGE), r"image must be a tensor \[B, C, H, W\]"),  # type: ignore[arg-type]
-        (lambda: metrics.psnr(IMAGE, IMAGE.int()), "truth must be a floating-point tensor"),
         (lambda: metrics.psnr(IMAGE[0], IMAGE[0]), r"image must be \[B, C, H, W\] .*got \[3, 8, 8\]"),
         (lambda: metrics.psnr(BAD, IMAGE), "image and truth must be finite, got 1 of 64 pixels"),
         (lambda: metrics.psnr(IMAGE, IMAGE, IMAGE[:, :1]), "mask must be a bool tensor"),
         (lambda: metrics.psnr(IMAGE, IMAGE, IMAGE[0] > 0), r"mask must be \[1 or 1, 1, 8, 8\], got \[3, 8, 8\]"),
-        (lambda: metrics.ssim(IMAGE, BAD), "truth must be finite, got 1 of 192 values"),
         (lambda: metrics.ssim(IMAGE[..., :5], IMAGE[..., :5]), "SSIM needs at least 6 pixels a side"),
-        (lambda: metrics.flip(BAD, IMAGE), "image must be finite"),
         (lambda: metrics.flip(IMAGE.repeat(2, 1, 1, 1), IMAGE.repeat(2, 1, 1, 1)), "one RGB image"),
         *(
             (functools.partial(measure, torch.zeros(1, 3, 9, 8), IMAGE), OTHER_SHAPE)

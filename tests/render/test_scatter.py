@@ -35,10 +35,7 @@ def bank(*radii: float, size: int | None = None, dtype: torch.dtype = torch.floa
 @pytest.mark.parametrize("shape", [(1, 1, 1, 1), (1, 2, 1, 7), (2, 3, 6, 1), (2, 1, 5, 8)])
 @pytest.mark.parametrize("radius", [0.3, 1.2, 3.4, 9.0])
 def test_scatter_equals_a_plain_loop_over_pixels(
-    scatter: Spread,
-    dtype: torch.dtype,
-    shape: tuple[int, ...],
-    radius: float,
+    scatter: Spread, dtype: torch.dtype, shape: tuple[int, ...], radius: float
 ) -> None:
     light = torch.rand(shape, dtype=dtype)
     kernels = bank(*(radius * (1 + 0.1 * c) for c in range(shape[1])), dtype=dtype)
