@@ -26,6 +26,7 @@ from tests.scenes import (
     Scene,
     assert_same_picture,
     halves,
+    lens_with_a_field,
     made,
     random_scene,
     slope,
@@ -37,21 +38,12 @@ from torchdof.depth import repair_edges
 from torchdof.export.graph import Portable
 from torchdof.export.verification import session
 from torchdof.optics.aperture import Aperture
-from torchdof.optics.field import Field
 from torchdof.reference.lens_views import lens_views
 from torchdof.reference.metrics import ssim
 from torchdof.render.plan import Plan
 
 EVERY_WAY = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 BY_COLOUR = BlurTable("gaussian", [1.0], {"sigma": torch.tensor([[0.4], [0.5], [0.6]])}, name="by colour")
-
-
-def _lens() -> BlurTable:
-    """A lens with random spots that change across the field."""
-    coc, radius, dice = torch.tensor([-0.9, -0.3, 0.2, 0.7]), torch.tensor([0.0, 1.5, 3.5]), torch.Generator()
-    light, box = torch.rand(3, 4, 3, 16, 8, generator=dice), torch.rand(4, 3, 3, generator=dice) + 0.5
-    spots = Field(coc, radius, box * coc.abs()[:, None, None], light)
-    return BlurTable("disc", coc, {"radius": coc.abs().expand(3, -1)}, unit="mm", sensor_width_mm=6.0, field=spots)
 
 
 LENSES = {
@@ -62,7 +54,7 @@ LENSES = {
     "cat's eyes": BlurTable.disc().with_aperture(Aperture(vignetting=0.4)),
     "squeezed cat's eyes": BlurTable.polygon(5, 10.0, squeeze=1.5, vignetting=(0.6, 0.2)),
     "cat's eyes by colour": BY_COLOUR.with_aperture(Aperture(vignetting=0.5)),
-    "spots across the field": _lens(),
+    "spots across the field": lens_with_a_field(),
 }
 
 

@@ -1,4 +1,4 @@
-"""The templates for render farms: their options exist, and the farms' own validators accept them."""
+"""The options in a template for render farms exist."""
 
 import re
 from pathlib import Path

@@ -18,6 +18,7 @@ import OpenImageIO as oiio
 import torch
 
 from tests.files import spec_with, store_parts
+from tests.scenes import lens_with_a_field
 from torchdof import BlurTable, blur_by_coc
 from torchdof.depth import read_depth
 from torchdof.export import describe
@@ -27,7 +28,6 @@ from torchdof.fit.lens.spot import focus_sensor, point_spread
 from torchdof.io.images import Picture, read_image, read_values, write_image
 from torchdof.io.metadata import camera_facts
 from torchdof.optics.aperture import Aperture
-from torchdof.optics.field import Field
 from torchdof.render import edges
 
 REFUSED = (ValueError, OSError, FitError)
@@ -155,14 +155,8 @@ def _read_table(path: Path) -> None:
 
 def _field_seeds(folder: Path) -> None:
     """Tables with small fields; in files of large ones nearly every mutation would hit the light of one spot."""
-    coc, radius = torch.tensor([-0.4, 0.1, 0.5]), torch.tensor([0.0, 9.0, 20.0])
-    box = torch.tensor([0.01, 0.5, 0.4]) * (0.1 + coc.abs())[:, None, None].expand(3, 3, 3)
-    for colours, unit in ((1, "mm"), (3, "mm"), (3, "fraction")):
-        light = torch.rand(colours, 3, 3, 6, 4, generator=torch.Generator().manual_seed(colours))
-        units = {"unit": "mm", "sensor_width_mm": 36.0} if unit == "mm" else {"unit": unit}
-        sigma = {"sigma": torch.full((colours, 2), 0.2)}
-        lens = BlurTable("gaussian", [-0.4, 0.5], sigma, field=Field(coc, radius, box, light), **units)
-        lens.save(folder / f"{unit}{colours}.json")
+    for colours in (1, 3):
+        lens_with_a_field(colours).save(folder / f"{colours}.json")
 
 
 def _read_field(path: Path) -> None:

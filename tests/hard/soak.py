@@ -1,4 +1,4 @@
-"""Checks that memory does not grow over many renderings: ``make soak``, or ``python tests/hard/soak.py --help``.
+"""Checks that memory does not grow over many renderings: ``make soak``, or ``python -m tests.hard.soak --help``.
 
 Sizes, cameras, tables and options are random. Afterwards threads with a module each, spawned and forked workers must
 render the same pictures.
@@ -16,19 +16,11 @@ from pathlib import Path
 
 import torch
 
+from tests.scenes import lens_with_a_field
 from torchdof import BlurTable, Camera, DepthOfField
 from torchdof.optics import kernel_bank, placed_kernels, psf
-from torchdof.optics.field import Field
 
 CACHES = [kernel_bank._templates, placed_kernels._shares, psf._quadrants]
-
-
-def lens_with_a_field() -> BlurTable:
-    """A lens whose spots grow towards the corners and extend outwards."""
-    box = torch.tensor([0.1, 0.5, 0.4]) * torch.linspace(1.0, 1.5, 3)[:, None].expand(2, 3, 1)
-    light = torch.linspace(1.0, 2.0, 8)[:, None].expand(1, 2, 3, 8, 6)
-    spots = Field(torch.tensor([-0.5, 0.5]), torch.tensor([0.0, 10.0, 20.0]), box, light)
-    return BlurTable("disc", [-0.5, 0.5], {"radius": [0.5, 0.5]}, unit="mm", sensor_width_mm=36.0, field=spots)
 
 
 TABLES = [
@@ -37,7 +29,7 @@ TABLES = [
     BlurTable.load("sato_j15"),
     BlurTable.load("wide_22mm_f4"),
     BlurTable.polygon(7, 15.0, vignetting=0.4),
-    lens_with_a_field(),
+    lens_with_a_field(colours=1),
 ]
 
 

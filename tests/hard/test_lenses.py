@@ -15,6 +15,7 @@ import torch
 from click.testing import CliRunner
 from torch import Tensor
 
+from tests.scenes import lens_with_a_field
 from torchdof import BlurTable, blur_by_coc
 from torchdof.cli.main import app
 from torchdof.fit import FitError
@@ -33,38 +34,27 @@ HUGE = 10**400
 SINGLET = "50 5 1.5 20 {}\n-50 3 1 20\n0 0 0 {}"
 
 
-def field_table(**change: Any) -> BlurTable:
-    given = {
-        "coc": torch.tensor([-0.4, 0.1, 0.5], dtype=torch.float64),
-        "radius": torch.tensor([0.0, 9.0, 20.0], dtype=torch.float64),
-        "box": torch.tensor([0.0, 0.3, 0.3]).expand(3, 3, 3),
-        "light": torch.rand(3, 3, 6, 4) + 0.1,
-    }
-    field = Field(**{**given, **change})
-    return BlurTable("gaussian", [-0.4, 0.5], {"sigma": [0.2, 0.2]}, unit="mm", sensor_width_mm=36.0, field=field)
-
-
 @pytest.mark.parametrize("box", [1e-300, 1e-3, 1e3])
 def test_fields_of_extreme_but_allowed_sizes_render(box: float, engine: str) -> None:
-    table = field_table(box=torch.full((3, 3, 3), box, dtype=torch.float64))
+    table = lens_with_a_field(box=torch.full((4, 3, 3), box, dtype=torch.float64))
     out = blur_by_coc(torch.rand(1, 3, 9, 12), torch.linspace(-3, 4, 12).expand(1, 1, 9, 12), table=table)
     assert 0.0 <= float(out.min()) <= float(out.max()) <= 1.0 + 1e-5
 
 
 def test_a_zip_bomb_in_a_field_is_refused() -> None:
-    data = field_table().field.to_dict()  # type: ignore[union-attr]
+    data = lens_with_a_field(colours=1).field.to_dict()  # type: ignore[union-attr]
     bomb = base64.b64encode(zlib.compress(bytes(10**7), 9)).decode()
-    with pytest.raises(ValueError, match="must hold 432 bytes"):
+    with pytest.raises(ValueError, match="must hold 1152 bytes"):
         Field.from_dict({**data, "light": bomb})
     with pytest.raises(ValueError, match="five numbers of cells"):
-        Field.from_dict({**data, "light": bomb, "shape": [1, 3, 3, 5000, 5000]})
+        Field.from_dict({**data, "light": bomb, "shape": [1, 4, 3, 5000, 5000]})
 
 
 partial: Any = functools.partial
 
 
 def field_of(**change: Any) -> Callable[[], Any]:
-    return lambda: field_table(**change)
+    return lambda: lens_with_a_field(**change)
 
 
 def doubles(*values: float) -> Tensor:
@@ -75,13 +65,13 @@ def spot(**change: Any) -> Any:
     return point_spread(Lens.read("double_gauss_50mm"), **{"z_m": 1.0, "sensor_mm": 38.0, "rays": 100, **change})
 
 
-ONE, BOX = {"radius": [1.0]}, torch.tensor([1e9, 0.1, 0.1]).expand(3, 3, 3)
+ONE, BOX = {"radius": [1.0]}, torch.tensor([1e9, 0.1, 0.1]).expand(4, 3, 3)
 DIGITS = ("blades", "rotation_deg", "curvature", "squeeze", "vignetting")
 REFUSED: list[tuple[Callable[[], Any], str]] = [
-    (field_of(box=torch.full((3, 3, 3), 1e38)), r"field\.box must be lengths in the unit of field\.coc"),
+    (field_of(box=torch.full((4, 3, 3), 1e38)), r"field\.box must be lengths in the unit of field\.coc"),
     (field_of(box=BOX), r"field\.box must be lengths"),
-    (field_of(coc=doubles(-1e-300, 0.0, 1e-300)), r"field\.coc must reach somewhere"),
-    (field_of(coc=doubles(-1.0, 0.0, 1e300)), r"field\.coc must reach somewhere"),
+    (field_of(coc=doubles(-1e-300, 0.0, 1e-301, 1e-300)), r"field\.coc must reach somewhere"),
+    (field_of(coc=doubles(-1.0, 0.0, 1.0, 1e300)), r"field\.coc must reach somewhere"),
     (field_of(radius=doubles(0.0, 1.0, 1e300)), r"field\.radius must reach somewhere"),
     *((partial(Aperture, **{"blades": 5, name: HUGE}), name) for name in DIGITS),
     (lambda: BlurTable("radial", [1.0], {"values": [[1.0, 1e308, 1.0]], **ONE}), r"params\.values must"),

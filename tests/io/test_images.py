@@ -41,13 +41,9 @@ def ramp(channels: int = 3, height: int = 4, width: int = 6) -> torch.Tensor:
 @pytest.mark.parametrize(
     ("suffix", "sample", "transfer", "channels", "tolerance"),
     [
-        (".exr", "half", "linear", "RGB", 5e-4),
         (".exr", "float", "linear", "RGB", 0.0),
         (".exr", "float", "srgb", "RGB", 1e-6),
-        (".tif", "float", "linear", "RGB", 0.0),
         (".tif", "16", "srgb", "RGB", 2e-5),
-        (".tiff", "8", "srgb", "RGB", 5e-3),
-        (".png", "8", "srgb", "RGB", 5e-3),
         (".png", "16", "srgb", "RGB", 2e-5),
         (".png", "16", "linear", "RGB", 1e-5),
         (".jpg", "8", "srgb", "RGB", 0.1),
@@ -55,11 +51,9 @@ def ramp(channels: int = 3, height: int = 4, width: int = 6) -> torch.Tensor:
         (".pfm", "float", "linear", "RGB", 0.0),
         (".exr", "half", "linear", "Y", 5e-4),
         (".png", "8", "srgb", "Y", 5e-3),
-        (".tif", "8", "srgb", "Y", 5e-3),
         (".jpg", "8", "srgb", "Y", 0.05),
         (".pfm", "float", "linear", "Y", 0.0),
         (".exr", "half", "linear", "YA", 5e-4),
-        (".png", "16", "srgb", "YA", 1e-4),
         (".tif", "16", "srgb", "YA", 1e-4),
         (".tif", "float", "linear", "RGBA", 1e-6),
         (".png", "8", "linear", "RGBA", 5e-3),
@@ -97,16 +91,12 @@ def test_every_integer_value_survives_reading_and_writing_bit_exact(tmp_path: Pa
     assert np.array_equal(stored(tmp_path / f"b{suffix}"), values)
 
 
+FLOATS = [(".tif", "float"), (".tif", "double"), (".exr", "half")]  # although the tag of the first is sRGB
+
+
 @pytest.mark.parametrize(
     ("suffix", "sample", "light"),
-    [
-        (".png", "uint8", GREY),
-        (".tif", "uint16", GREY),
-        (".tif", "float", 0.5),  # although its tag is sRGB
-        (".tif", "double", 0.5),
-        (".exr", "half", 0.5),
-        (".jpg", "uint8", GREY),
-    ],
+    [(".png", "uint8", GREY), (".tif", "uint16", GREY), (".jpg", "uint8", GREY), *((*kind, 0.5) for kind in FLOATS)],
 )
 def test_integers_are_srgb_and_floats_are_linear_unless_stated(
     tmp_path: Path, suffix: str, sample: str, light: float

@@ -219,11 +219,6 @@ def test_a_batch_of_parameters_equals_each_alone() -> None:
             assert_close(together[i, j], psf.ring(float(sigma[i, 0]), float(r_c[0, j]), size=15))
 
 
-def test_a_smaller_size_cuts_the_kernel_and_keeps_its_sum() -> None:
-    whole, cut = psf.gaussian(2.0, size=21), psf.gaussian(2.0, size=5)
-    assert_close(cut, whole[8:13, 8:13] / whole[8:13, 8:13].sum())
-
-
 @pytest.mark.parametrize(
     ("family", "params", "message"),
     [
@@ -238,12 +233,6 @@ def test_a_smaller_size_cuts_the_kernel_and_keeps_its_sum() -> None:
 def test_bad_parameters_are_refused_by_name(family: str, params: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         psf.pixel_kernels(family, params)
-
-
-@pytest.mark.parametrize("size", [0, -1, 4])
-def test_a_size_that_is_not_odd_is_refused(size: int) -> None:
-    with pytest.raises(ValueError, match=f"size must be a positive odd number of pixels, got {size}"):
-        psf.disc(2.0, size=size)
 
 
 LARGE: dict[str, dict[str, Any]] = {
@@ -275,7 +264,11 @@ def test_the_window_of_a_huge_kernel_is_computed_alone(family: str, params: dict
     torch.testing.assert_close(1e12 * part, smaller.expand(9, 9), rtol=3e-2, atol=0.0)
 
 
-def test_a_window_wider_than_the_kernel_is_the_kernel() -> None:
+def test_sizes_and_windows_are_odd_and_a_smaller_size_keeps_the_sum() -> None:
+    whole, cut = psf.gaussian(2.0, size=21), psf.gaussian(2.0, size=5)
+    assert_close(cut, whole[8:13, 8:13] / whole[8:13, 8:13].sum())
     assert torch.equal(psf.disc(3.0), psf.pixel_kernels("disc", {"radius": 3.0}, window=99))
-    with pytest.raises(ValueError, match="positive odd number of pixels, got 4"):
-        psf.pixel_kernels("disc", {"radius": 3.0}, window=4)
+    for size in (0, -1, 4):
+        for name in ("size", "window"):
+            with pytest.raises(ValueError, match=f"size must be a positive odd number of pixels, got {size}"):
+                psf.pixel_kernels("disc", {"radius": 2.0}, **{name: size})

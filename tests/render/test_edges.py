@@ -131,17 +131,21 @@ def test_a_thin_structure_keeps_its_depth(scene: Scene) -> None:
     assert 0.55 < float((1 / repaired)[bars].mean()) < 0.7
 
 
-def test_the_averaged_depth_of_a_lamp_is_restored() -> None:
+def discs(square_px: float) -> Tensor:
+    """Mask of discs on a grid; their squared radius is ``square_px``."""
     rows, columns = torch.meshgrid(torch.arange(96.0), torch.arange(128.0), indexing="ij")
-    image, depth = 0.2 + 0.02 * torch.rand(1, 3, 96, 128), torch.full((1, 1, 96, 128), 8.0)
-    for row in range(12, 96, 24):
-        for column in range(12, 128, 26):
-            lamp = (rows - row) ** 2 + (columns - column) ** 2 < 5
-            image[..., lamp], depth[..., lamp] = 200.0, 2.0
-    given = degrade(depth, "blur 1.5")
-    lamps = depth < 3
-    assert float((1 / given)[lamps].mean()) < 0.33
-    assert 0.4 < float((1 / repair_edges(image, given, "auto"))[lamps].mean()) < 0.6
+    return ((rows % 24 - 12) ** 2 + (columns % 26 - 12) ** 2 < square_px) & (columns < 116)
+
+
+def test_the_averaged_depth_of_a_lamp_is_restored_and_does_not_come_nearer_than_it_was() -> None:
+    lamps = discs(5.0)
+    image = torch.where(lamps, 200.0, 0.2 + 0.02 * torch.rand(1, 3, 96, 128))
+    given = degrade(torch.where(lamps, 2.0, 8.0)[None, None], "blur 1.5")
+    assert float((1 / given)[..., lamps].mean()) < 0.33
+    assert 0.4 < float((1 / repair_edges(image, given, "auto"))[..., lamps].mean()) < 0.6
+    # larger in the map than in the image, so that no depth was lost
+    given = degraded._blurred(torch.where(discs(14.0), 2.0, 8.0)[None, None], 1.5)
+    assert float((1 / repair_edges(image, given, "auto")).max()) < 0.6
 
 
 def test_pixels_of_a_lamp_of_uneven_brightness_get_one_depth() -> None:
@@ -205,18 +209,6 @@ def test_a_hole_within_a_surface_changes_no_other_pixel(scene: Scene) -> None:
     whole = repair_edges(image, depth)
     assert bool((whole != depth).any())
     assert torch.equal(repair_edges(image, torch.where(holes, torch.nan, depth))[~holes], whole[~holes])
-
-
-def test_a_lamp_does_not_come_nearer_than_it_was() -> None:
-    rows, columns = torch.meshgrid(torch.arange(96.0), torch.arange(128.0), indexing="ij")
-    image, inverse = 0.2 + 0.02 * torch.rand(1, 3, 96, 128), torch.full((1, 1, 96, 128), 0.125)
-    for row in range(12, 96, 24):
-        for column in range(12, 128, 26):
-            apart = (rows - row) ** 2 + (columns - column) ** 2
-            image[..., apart < 5] = 200.0
-            inverse[..., apart < 14] = 0.5  # larger in the map than in the image, so that no depth was lost
-    given = degraded._blurred(1 / inverse, 1.5)
-    assert float((1 / repair_edges(image, given, "auto")).max()) < 0.6
 
 
 @pytest.mark.parametrize("kind", ["half-res", "near -1px"])
