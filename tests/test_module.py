@@ -13,7 +13,6 @@ from torch.testing import assert_close
 
 from tests import loops
 from tests.scenes import CAMERA, HEIGHT, WAYS, WIDTH, disc, slope, texture
-from tests.tolerances import TOLERANCES
 from tests.traced import TRACED
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field, tensors
 from torchdof.reference import metrics
@@ -118,9 +117,10 @@ def wider(image: Tensor, coc: Tensor, beyond: int) -> tuple[Tensor, Tensor]:
     return light, functional.pad(coc, (beyond,) * 4, mode="replicate")
 
 
-@pytest.mark.parametrize("normalize", [True, False])
-@pytest.mark.parametrize("method", ["layered", "fold"])
-@pytest.mark.parametrize("name", ["disc", "sato_j15"])
+@pytest.mark.parametrize(
+    ("name", "method", "normalize"),
+    [("disc", "layered", True), ("disc", "fold", False), ("sato_j15", "fold", True), ("sato_j15", "layered", False)],
+)
 def test_accumulating_billboards_equals_a_plain_loop_over_pixels(name: str, method: Any, normalize: bool) -> None:
     image, coc = (x.double() for x in scene(5, 6, reach=1.8))
     nodes = list(Plan.of_scene(coc, 1 / 255).nodes)
@@ -129,17 +129,6 @@ def test_accumulating_billboards_equals_a_plain_loop_over_pixels(name: str, meth
     beyond = 8 if normalize else 0  # the plain sum does not continue the image
     summed = loops.accumulate(*wider(image, coc, beyond), TABLES[name], nodes, normalize)
     assert_close(out, functional.pad(summed, (-beyond,) * 4), rtol=1e-10, atol=1e-12)
-
-
-@pytest.mark.parametrize("occlusion", [True, False])
-def test_fold_and_layered_render_the_same_picture(occlusion: bool) -> None:
-    image, coc = scene(reach=7.0)
-    for dtype in (torch.float32, torch.float64):
-        pair = [
-            blur_by_coc(image.to(dtype), coc.to(dtype), occlusion=occlusion, method=method)
-            for method in ("layered", "fold")
-        ]
-        assert_close(pair[0], pair[1], **TOLERANCES[dtype])
 
 
 @pytest.mark.parametrize("way", list(WAYS.values())[:2], ids=["over", "sum"])
@@ -171,22 +160,6 @@ def test_the_functional_form_equals_the_module() -> None:
 
 
 # Types, shapes, strides
-
-
-@EVERY_WAY
-@pytest.mark.parametrize("dtype", TYPES)
-def test_the_result_has_the_type_of_the_image_and_its_precision(way: dict[str, Any], dtype: torch.dtype) -> None:
-    image, coc = scene(reach=5.0)
-    image = image.to(dtype)
-    out = blur_by_coc(image, coc, **way)
-    assert out.dtype == dtype and out.shape == image.shape
-    limits = dict(TOLERANCES[dtype]) if dtype.itemsize == 2 else TOLERANCES[torch.float32]
-    limits = {**limits, "rtol": limits["rtol"] + 1e-5}
-    exact = blur_by_coc(image.double(), coc.double(), **way)
-    assert_close(out.double(), exact, **limits)
-    if dtype == torch.float32:
-        assert not torch.equal(out.double(), exact)
-        assert_close(blur_by_coc(image, coc.double(), **way), exact.float(), rtol=1e-6, atol=1e-7)
 
 
 @settings(max_examples=25)
@@ -269,7 +242,8 @@ def compiled_case() -> tuple[Camera, Tensor, Tensor]:
         ("eager", WAYS["over"]),
         ("eager", WAYS["sum"]),
         ("eager", WAYS["fold-sum"]),
-        pytest.param("inductor", WAYS["over"], marks=pytest.mark.hard),
+        pytest.param("inductor", WAYS["sum"], marks=pytest.mark.hard),
+        pytest.param("inductor", WAYS["over"], marks=pytest.mark.sweep),  # takes minutes
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning")  # raised inside inductor

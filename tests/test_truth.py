@@ -7,12 +7,9 @@ import torch
 
 from torchdof import DepthOfField
 from torchdof.reference import metrics
-from torchdof.reference.ikoma import ikoma
 from torchdof.reference.scenes import Scene, read_scenes
 
 SCENES = {scene.name: scene for scene in read_scenes(Path(__file__).parent / "data" / "scenes")}
-GAIN_DB = {"planes/0": 3.5, "room/1": 4.0, "highlights/0": 3.0}
-"""Least gain in PSNR over Ikoma's formula, a little below the measured gains of 5.0, 4.4 and 3.5 dB."""
 MEASURED_DB = {
     "highlights/0": (20.331, 32.847),
     "planes/0": (31.386, 30.223),
@@ -40,13 +37,7 @@ def test_psnr_equals_the_recorded_values(name: str, engine: str) -> None:
     assert (psnr(picture, scene, inner=False), psnr(picture, scene)) == pytest.approx(MEASURED_DB[name], abs=WITHIN_DB)
 
 
-@pytest.mark.parametrize("name", GAIN_DB)
-def test_psnr_is_higher_than_with_ikomas_formula(name: str) -> None:
-    scene = SCENES[name]
-    assert psnr(rendered(scene), scene) > psnr(ikoma(scene), scene) + GAIN_DB[name]
-
-
-@pytest.mark.parametrize("name", GAIN_DB)
+@pytest.mark.parametrize("name", ["planes/0", "room/1", "highlights/0"])
 @pytest.mark.parametrize("tolerance", [1 / 255, 4 / 255])
 def test_rms_error_against_exact_layers_stays_below_the_tolerance(name: str, tolerance: float) -> None:
     error = metrics.display(rendered(SCENES[name], tolerance)) - metrics.display(rendered(SCENES[name], 0))
