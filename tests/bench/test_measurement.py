@@ -3,7 +3,6 @@
 import functools
 import itertools
 import math
-import statistics
 import time
 
 import pytest
@@ -13,7 +12,6 @@ from torch import Tensor
 from torchdof import Camera
 from torchdof.bench import memory
 from torchdof.bench.measurement import BenchScene, Seconds, measure, peak_of, shipped
-from torchdof.bench.report import summary
 
 SCENE = shipped(36, 64)
 
@@ -76,24 +74,9 @@ def test_cameras_differ_from_each_other_and_a_seed_repeats_them() -> None:
     assert not SCENE.seen(0.0, 0.0).seen(0.4, 0.0).coc_px.any()
 
 
-def test_resizing_a_scene_scales_its_blur_radii_with_the_width() -> None:
-    small = SCENE.resized(0.5)
-    assert small.image.shape[-2:] == (18, 32)
-    assert float(small.coc_px.abs().max()) == pytest.approx(0.5 * float(SCENE.coc_px.abs().max()), rel=0.05)
-    assert set(small.coc_px.flatten().tolist()) <= set((0.5 * SCENE.coc_px).flatten().tolist())
-
-
 def test_the_built_in_scene_is_blurred_equally_in_front_of_and_behind_the_focus() -> None:
     scene = shipped()
     assert scene.image.shape == (1, 3, 540, 960)
     assert float(scene.coc_px.min()) == pytest.approx(-16, abs=0.5)
     assert float(scene.coc_px.max()) == pytest.approx(16, abs=0.5)
     assert 0 < (scene.coc_px.abs() < 0.5).float().mean() < 0.1
-
-
-def test_a_summary_averages_rows_with_the_same_key() -> None:
-    rows = [{"a": a, "new_ms": value, "other": "z"} for a, value in (("x", 1.0), ("y", 5.0), ("x", 4.0))]
-    assert summary([*rows, {"a": "y", "psnr_db": 30.0}], ["a"], statistics.fmean) == [
-        {"a": "x", "new_ms": 2.5, "spread_ms": 1.5},
-        {"a": "y", "new_ms": 5.0, "psnr_db": 30.0},
-    ]
