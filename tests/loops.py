@@ -79,11 +79,6 @@ def accumulate(
     return total / scatter(torch.ones_like(image), kernel_of) if normalize else total
 
 
-def normalised_convolution(image: Tensor, kernel: Tensor) -> Tensor:
-    """Image convolved with one kernel `[1 or C, k, k]`, divided by the part of the kernel inside the frame."""
-    return scatter(image, lambda *_: kernel) / scatter(torch.ones_like(image), lambda *_: kernel)
-
-
 def interpolated(profile: Callable[[Tensor], Tensor], reach: float, size: int, samples: int = 200) -> Tensor:
     """Kernel `[size, size]` of an isotropic profile with radius `reach` in pixels, finely sampled."""
     places = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples * 2 * reach - reach

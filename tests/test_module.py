@@ -72,17 +72,6 @@ def test_a_plane_in_depth_is_convolved_with_the_disc_of_the_thin_lens() -> None:
     assert_close(DepthOfField(camera)(image, depth).double(), expected, rtol=1e-5, atol=1e-6)
 
 
-def test_a_plane_equals_a_plain_loop_over_its_pixels() -> None:
-    image = torch.rand(1, 2, 6, 7, dtype=torch.float64)
-    kernels = TABLES["disc"].kernels(torch.tensor([2.3], dtype=torch.float64), 7)[0]
-    half = kernels.shape[-1] // 2
-    wide = continued([image], None, None, (half,) * 4, half)[0]
-    expected = functional.pad(loops.normalised_convolution(wide, kernels), (-half,) * 4)
-    for way in WAYS.values():
-        out = blur_by_coc(image, constant_map(2.3, image, torch.float64), **way)
-        assert_close(out, expected, rtol=1e-10, atol=1e-12)
-
-
 # Focus
 
 

@@ -83,6 +83,20 @@ def test_a_fresh_process_renders_the_same_picture_and_reports_its_own_time() -> 
     assert seconds.wall > 0 and seconds.cpu > waited
 
 
+def test_the_report_names_a_tolerance_that_was_not_kept(
+    in_this_process: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def wrong(*arguments: Any, **options: Any) -> Tensor:
+        return blur_by_coc(*arguments, **options) + 0.2 * (options.get("tolerance") == 4 / 255)
+
+    monkeypatch.setattr(speed, "blur_by_coc", wrong)
+    scene = shipped(36, 64)
+    rows = speed.compare(scene, repeat=1)
+    assert [row["setting"] for row in rows if not row["kept"]] == ["4/255", "4/255 without occlusion"]
+    speed.report(rows, scene, None)
+    assert "tolerance was not kept by: 4/255; 4/255 without occlusion." in " ".join(capsys.readouterr().out.split())
+
+
 def test_bench_measures_the_users_scene_and_makes_the_output_folder(
     in_this_process: None, files: tuple[Path, Path], tmp_path: Path
 ) -> None:

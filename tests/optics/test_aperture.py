@@ -58,14 +58,6 @@ def test_areas_of_polygons_are_exact(blades: int, curvature: float) -> None:
         assert_close(float(shares.sum()) * step * 0.8 * step, area_of(blades, curvature), rtol=0, atol=1e-12)
 
 
-def test_an_axis_aligned_square_covers_whole_cells() -> None:
-    step = torch.tensor(math.sqrt(0.5) / 2.5, dtype=torch.float64)  # the square's side is five cells
-    shares = Aperture(4, rotation_deg=45.0).shares(4, step, step)
-    expected = torch.zeros(9, 9, dtype=torch.float64)
-    expected[2:7, 2:7] = 1.0
-    assert_close(shares, expected, rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize("coc_px", [-43.4, 36.0])
 @pytest.mark.parametrize("table", [BlurTable.polygon(5, 11.0), BlurTable.polygon(3, 20.0, squeeze=1.6), LOPSIDED[2]])
 def test_a_point_of_light_shows_the_aperture_upright_behind_focus_and_reflected_in_front(

@@ -192,6 +192,7 @@ NOT_FINITE = [1.0, math.nan, 2.0]
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"schema": "lut"}, "schema must be 'torchdof/blur-table', got 'lut'"),
         ({"version": 4}, "version must be 1 or 2 or 3, got 4; update torchdof"),
         ({"family": None}, "family is missing"),
         ({"lens": "50 mm"}, "lens is not a field of a blur table"),

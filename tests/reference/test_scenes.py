@@ -43,17 +43,6 @@ def test_compositing_the_surfaces_gives_the_sharp_image() -> None:
     assert sorted(set(scene.depth.flatten().tolist())) == [1.0, 2.0, 3.0]
 
 
-@pytest.mark.parametrize(("name", "margin"), [("highlights/0", 24), ("planes/0", 20), ("room/1", 16)])
-def test_shipped_scenes_are_sharp_where_in_focus(name: str, margin: int) -> None:
-    scene = {s.name: s for s in read_scenes(DATA)}[name]
-    assert scene.margin_px == margin
-    assert scene.image.shape == scene.truth.shape == (1, 3, 160, 192)
-    shown, truth = metrics.display(scene.image), metrics.display(scene.truth)
-    sharp = (scene.coc_px.abs() < 0.5) & scene.inner
-    blurred = (scene.coc_px.abs() > 4.0) & scene.inner
-    assert metrics.psnr(shown, truth, sharp) > metrics.psnr(shown, truth, blurred) + 3
-
-
 def test_a_folder_without_scenes_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no scene here"):
         list(read_scenes(tmp_path))
