@@ -2,7 +2,6 @@
 
 import functools
 import pickle
-from collections.abc import Callable
 from typing import Any
 
 import kornia.augmentation as K
@@ -14,6 +13,7 @@ from torch.utils.data import DataLoader, Dataset
 
 import torchdof.augmentation
 import torchdof.io.transfer
+from tests.refused import refuses
 from torchdof import BlurTable, Camera, DepthOfField, depth_of_field
 from torchdof.augmentation import DepthAugmentationSequential, RandomDepthOfField
 
@@ -249,7 +249,7 @@ def test_four_workers_of_a_data_loader_draw_different_parameters_for_each_image(
 
 IMAGE, DEPTH = sample()
 partial: Any = functools.partial
-REFUSED: list[tuple[Callable[[], Any], str]] = [
+test_errors_name_the_argument = refuses(
     (partial(RandomDepthOfField, focus_m=(5.0, 0.5)), "focus_m must be two numbers, the smallest first"),
     (partial(RandomDepthOfField, focus_m=(0.04, 5.0)), "focus_m must be longer than the focal length"),
     (partial(RandomDepthOfField, f_number=(1.4, float("inf"))), "f_number must be a number"),
@@ -265,10 +265,4 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: random_dof()(IMAGE, DEPTH[:3, 0]), r"depth must be \[4, 1, 18, 24\].* got \[1, 3, 18, 24\]"),
     (lambda: random_dof()((IMAGE - 0.5) / 0.2, DEPTH), r"must lie in \[0, 1\].*put normalization behind"),
     (lambda: random_dof()((IMAGE * 255).byte(), DEPTH), r"floating-point tensor.*image.float\(\) / 255"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("call", "message"), REFUSED)
-def test_errors_name_the_argument(call: Callable[[], Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        call()
+)  # fmt: skip

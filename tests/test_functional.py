@@ -1,14 +1,12 @@
 """Scatter of pixels with kernels of their own, against plain loops."""
 
-from collections.abc import Callable
-from typing import Any
-
 import pytest
 import torch
 from torch import Tensor
 from torch.testing import assert_close
 
 from tests import loops
+from tests.refused import refuses
 from tests.tolerances import TOLERANCES
 from torchdof import BlurTable
 from torchdof.functional import splat
@@ -138,7 +136,7 @@ def test_a_training_step_stores_a_few_images_for_the_backward_pass() -> None:
 # Refused
 
 IMAGE, COC = torch.rand(2, 3, 8, 9), torch.rand(2, 1, 8, 9)
-REFUSED: list[tuple[Callable[[], Any], str]] = [
+test_invalid_arguments_are_refused_by_name = refuses(
     (lambda: splat(IMAGE), "takes coc_px, with a table, or sigma_px, of Gaussians; got neither"),
     (lambda: splat(IMAGE, COC, sigma_px=COC), "got both"),
     (lambda: splat(IMAGE, None, BlurTable.disc(), sigma_px=COC), "sigma_px .* takes no table"),
@@ -149,10 +147,4 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: splat(IMAGE, COC, BlurTable.polygon(6, vignetting=0.3)), r"vignetting.*blur_by_coc"),
     (lambda: splat(IMAGE, COC, BlurTable.polygon(6, torch.ones((), requires_grad=True))), "no gradient to the apertu"),
     (lambda: torch.vmap(splat)(IMAGE[:, None], COC[:, None]), "comes from torch.vmap"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("call", "message"), REFUSED)
-def test_invalid_arguments_are_refused_by_name(call: Callable[[], Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        call()
+)  # fmt: skip

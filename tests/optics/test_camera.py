@@ -1,6 +1,5 @@
 import functools
 import math
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -9,6 +8,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
+from tests.refused import refuses
 from torchdof import Camera
 
 Number = float | Tensor
@@ -174,7 +174,7 @@ def test_a_bad_number_is_refused_by_name(name: str, value: Any) -> None:
 
 FRAME, TWO = torch.ones(1, 1, 4, 8), Camera(focus_m=torch.tensor([1.0, 2.0]))
 partial: Any = functools.partial
-REFUSED: list[tuple[Callable[[], Any], str]] = [
+test_invalid_arguments_are_refused_by_name = refuses(
     *((partial(Camera().replace, **{name: math.inf}), f"^{name} must be positive and finite")
       for name in ("focal_length_mm", "f_number", "sensor_width_mm")),
     (lambda: Camera(focus_m=0.05), r"focus_m must be longer than the focal length \(50 mm\), got 0.05 m"),
@@ -194,13 +194,7 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: Camera().focus_on(FRAME, -FRAME), ">= 0"),
     (lambda: Camera().focus_in(FRAME, (50, 50, 60, 60)), "hold pixels of the frame"),
     (lambda: Camera().focus_in(FRAME, (1, 2, 3)), r"must be \(left, top"),  # type: ignore[arg-type]
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("call", "message"), REFUSED)
-def test_invalid_arguments_are_refused_by_name(call: Callable[[], Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        call()
+)  # fmt: skip
 
 
 def test_repr_shows_the_numbers_of_the_camera() -> None:
