@@ -68,14 +68,6 @@ def test_draws_lie_in_their_ranges_and_differ() -> None:
     assert drawn["table"].bincount().tolist() == pytest.approx([167] * 3, abs=50)
 
 
-def test_a_batch_can_share_its_draw() -> None:
-    image, depth = sample()
-    aug = random_dof(same_on_batch=True, p=0.5)
-    aug(image, depth)
-    for name in ("focus_m", "f_number", "table", "batch_prob"):
-        assert len(set(aug._params[name].tolist())) == 1
-
-
 def test_each_image_is_blurred_by_the_lens_that_was_drawn_for_it() -> None:
     image, depth = sample()
     tables = [BlurTable.disc(), BlurTable.gaussian()]
@@ -107,14 +99,6 @@ def test_one_image_keeps_its_shape_or_becomes_a_batch_and_a_dict_is_accepted() -
     given = random_dof(keepdim=True, return_label=True)({"image": image[0], "depth": depth[0], "index": 3})
     assert given["image"].shape == (3, 18, 24) and given["coc_px"].shape == (1, 18, 24) and given["index"] == 3
     assert given["focus_m"].shape == given["f_number"].shape == given["table"].shape == () and bool(given["blurred"])
-
-
-def test_the_last_channel_is_the_depth_and_is_returned() -> None:
-    image, depth = sample()
-    aug = random_dof()
-    out = aug(torch.cat([image, depth], dim=1))
-    assert torch.equal(out[:, 3:], depth)
-    assert torch.equal(out[:, :3], aug(image, depth, params=aug._params))
 
 
 # Labels

@@ -1,14 +1,13 @@
 """Imports: a folder imports only folders below it, and heavy packages are loaded only when they are used."""
 
 import ast
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 import torchdof
+from tests.processes import output_of
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = {"torchdof": "torchdof", "torchdof.fit": "fit", "torchdof.export": "export"}
@@ -143,8 +142,7 @@ def test_fit_photo_and_fit_lens_do_not_import_each_other(half: str, other: str) 
 def loaded(code: str, *names: str) -> list[str]:
     """Which of the packages `names` are loaded after `code` has run in a new process."""
     script = f"import sys\n{code}\nprint([name for name in {names!r} if name in sys.modules])"
-    run = subprocess.run([sys.executable, "-W", "error", "-c", script], capture_output=True, text=True, check=True)
-    return list(ast.literal_eval(run.stdout.splitlines()[-1]))
+    return list(ast.literal_eval(output_of(script, flags=["-W", "error"]).splitlines()[-1]))
 
 
 HEAVY = ("scipy", "onnx", "onnxruntime", "onnxscript", "OpenImageIO", "matplotlib")

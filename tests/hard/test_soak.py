@@ -1,9 +1,10 @@
 """Many renderings in one process: memory does not grow; threads and worker processes render the same pictures."""
 
-import subprocess
 import sys
 
 import pytest
+
+from tests.processes import output_of
 
 FORKED = """
 import os, signal, sys, torch
@@ -24,8 +25,7 @@ print(os.waitpid(child, 0)[1], torch.get_num_threads())
 @pytest.mark.hard
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no fork")
 def test_a_forked_worker_renders_after_its_parent_has_rendered_with_two_threads(engine: str) -> None:
-    run = subprocess.run([sys.executable, "-c", FORKED, engine], capture_output=True, text=True, timeout=200)
-    assert run.stdout == "0 2\n", run.stdout + run.stderr
+    assert output_of(FORKED, engine) == "0 2\n"
 
 
 MANY = """
@@ -48,7 +48,5 @@ print(early, rss())
 @pytest.mark.hard
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_memory_does_not_grow_over_500_frames() -> None:
-    done = subprocess.run([sys.executable, "-c", MANY], capture_output=True, text=True, timeout=400)
-    assert done.returncode == 0, done.stderr
-    early, late = (int(x) for x in done.stdout.split())
+    early, late = (int(x) for x in output_of(MANY).split())
     assert late < 1.05 * early

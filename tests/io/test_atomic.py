@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 
+from tests.processes import output_of
 from torchdof import BlurTable
 from torchdof.io.atomic import whole_file
 from torchdof.io.images import Picture, write_image
@@ -66,11 +67,10 @@ def test_a_full_disk_is_an_error_and_leaves_the_old_file(tmp_path: Path) -> None
     for name in folders:
         (tmp_path / name).mkdir()
         (tmp_path / name / name.split()[0]).write_text("old")
-    call = [sys.executable, "-c", CUT, *folders]
-    run = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    lines = output_of(CUT, *folders, cwd=tmp_path).splitlines()
     for name in folders:
-        results = [line.removeprefix(name) for line in run.stdout.splitlines() if line.startswith(name)]
-        assert len(results) == 4 and all(line.startswith(" refused:") for line in results), run.stdout + run.stderr
+        results = [line.removeprefix(name) for line in lines if line.startswith(name)]
+        assert len(results) == 4 and all(line.startswith(" refused:") for line in results), lines
         file = name.split()[0]
         assert sorted(p.name for p in (tmp_path / name).iterdir()) == [f"whole{file}", file]
         assert (tmp_path / name / file).read_text() == "old"

@@ -22,6 +22,7 @@ import pytest
 import torch
 
 from tests.files import spec_with, store, store_parts
+from tests.processes import output_of
 from torchdof import BlurTable
 from torchdof.io import decode, foreign
 from torchdof.io.decode import MOST_ATTRIBUTES
@@ -348,20 +349,12 @@ def read(name):
 """
 
 
-def output_of(code: str, folder: Path, names: list[str]) -> list[str]:
-    run = subprocess.run(
-        [sys.executable, "-c", READ + code, *names], cwd=folder, capture_output=True, text=True, timeout=300
-    )
-    assert run.returncode == 0, run.stderr[-500:]
-    return run.stdout.splitlines()
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="limits memory")
 def test_huge_sizes_in_a_header_are_refused_without_the_memory(tmp_path: Path) -> None:
     for name, make in HUGE.items():
         make(tmp_path / name)
     code = "limit(6000)\nfor name in sys.argv[1:]:\n    read(name)\nprint(memory.peak_mb())"
-    *lines, megabytes = output_of(code, tmp_path, [*HUGE])
+    *lines, megabytes = output_of(READ + code, *HUGE, cwd=tmp_path).splitlines()
     assert len(lines) == 7 and all(re.match(r"(huge\.\w+) refused: .*\1", line) for line in lines), lines
     assert float(megabytes) < 1500
 
@@ -378,7 +371,8 @@ def test_a_picture_that_does_not_fit_into_memory_is_refused(known: bool, tmp_pat
     (tmp_path / "x.png").write_bytes(png(side, zlib.compress(bytes(side * (3 * side + 1)))))
     names = sorted(path.name for path in tmp_path.iterdir())
     code = "decode.free_bytes = lambda: float('inf')\n" * (not known)
-    lines = output_of(code + "limit(24)\nfor name in sys.argv[1:]:\n    read(name)", tmp_path, names)
+    code += "limit(24)\nfor name in sys.argv[1:]:\n    read(name)"
+    lines = output_of(READ + code, *names, cwd=tmp_path).splitlines()
     assert len(lines) == 10
     why = "GiB of memory are free|more than there is memory for|allocate" + "|does not fit into memory" * (not known)
     assert all(re.match(rf"(x\.\w+) refused: \1: .*({why})", line) for line in lines), lines

@@ -1,12 +1,12 @@
 """The compiled engine in a process: threads, interrupts, instruction sets; and its convolution."""
 
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
 
+from tests.processes import output_of
 from tests.scenes import Scene, assert_same_picture, made
 from torchdof import native
 
@@ -53,13 +53,6 @@ def test_python_threads_may_render_concurrently() -> None:
             assert torch.equal(picture, alone)
 
 
-def answer_of(script: str) -> str:
-    """Output of a script in a new process."""
-    run = subprocess.run([sys.executable, "-I", "-c", script], capture_output=True, text=True, timeout=120, check=False)
-    assert run.returncode == 0, run.stderr
-    return run.stdout.strip()
-
-
 INTERRUPTED = """
 import os, signal, sys, threading, time, torch
 signal.signal(signal.SIGINT, signal.default_int_handler)  # shells start background jobs with SIGINT ignored
@@ -88,7 +81,7 @@ except KeyboardInterrupt:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a process of Windows cannot send itself Ctrl-C")
 def test_ctrl_c_ends_a_long_rendering() -> None:
-    assert answer_of(INTERRUPTED) == "in time"
+    assert output_of(INTERRUPTED, flags=["-I"]) == "in time\n"
 
 
 INTERRUPTED_TWICE = """
@@ -113,7 +106,7 @@ except KeyboardInterrupt:
 @pytest.mark.skipif(sys.platform == "win32", reason="a process of Windows cannot send itself Ctrl-C")
 def test_ctrl_c_is_raised_after_the_engine_has_stopped() -> None:
     """Otherwise the engine would use memory that its caller has freed."""
-    assert answer_of(INTERRUPTED_TWICE) == "after the engine"
+    assert output_of(INTERRUPTED_TWICE, flags=["-I"]) == "after the engine\n"
 
 
 @pytest.mark.parametrize("half", [0, 1, 2, 3, 7, 8, 10, 20, 64])

@@ -224,19 +224,15 @@ def test_a_range_is_in_focus_from_end_to_end_and_blur_grows_from_its_ends() -> N
     assert float(camera.coc_px(depth_of(float(far)), 1920)) == pytest.approx(1.0, rel=1e-9)
 
 
-def test_an_empty_range_is_one_distance_and_a_range_may_end_at_infinity() -> None:
+def test_a_range_may_be_empty_or_end_at_infinity_and_excludes_a_focus_distance() -> None:
     depth = depth_of(0.7, 2.0, 9.0, math.inf)
     one, none = Camera(focus_m=2.0), Camera(focus_range_m=(2.0, 2.0))
     assert_close(none.coc_px(depth, 100), one.coc_px(depth, 100), rtol=1e-12, atol=0)
     assert Camera(focus_range_m=(2.0, math.inf)).coc_px(depth, 100).flatten().tolist()[1:] == [0.0, 0.0, 0.0]
-
-
-def test_a_focus_distance_beside_a_range_is_refused() -> None:
-    camera = Camera(focus_range_m=(1.0, 2.0))
     with pytest.raises(ValueError, match="focus_m is given by the camera's focus_range_m"):
-        camera.replace(focus_m=3.0)
-    assert camera.replace(focus_range_m=None, focus_m=3.0).focus_m == 3.0
-    assert camera.replace(f_number=2.0).focus_range_m == (1.0, 2.0)
+        none.replace(focus_m=3.0)
+    assert none.replace(focus_range_m=None, focus_m=3.0).focus_m == 3.0
+    assert none.replace(f_number=2.0).focus_range_m == (2.0, 2.0)
 
 
 def plane_in_focus(camera: Camera, x: float, y: float, size: tuple[int, int]) -> float:

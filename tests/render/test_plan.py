@@ -77,6 +77,10 @@ def test_nan_and_infinite_coc_add_no_layers() -> None:
     assert Plan.of_scene(coc_map(math.nan, 3.0, 3.0), 1 / 255).nodes[-1] == pytest.approx(place_of(3.0))
     reaching = Plan.of_scene(coc_map(-math.inf, math.inf), 1 / 20)
     assert all(math.isfinite(x) for x in reaching.nodes)
+    coc = torch.zeros(2, 1, 40, 50)
+    coc[..., :10], coc[0, 0, 0, 0] = -6.0, torch.nan
+    pixels = Plan((-5.5, 0.0), 1 / 255).of_pixels(coc).pixels
+    assert pixels is not None and pixels[0] == pytest.approx(799 / 4000), "a NaN counts as in focus"
 
 
 @pytest.mark.parametrize("name", ["disc", "sato_j15"])
@@ -122,13 +126,6 @@ def test_a_printed_plan_shows_resolution_and_share_of_the_pixels_of_each_layer()
     assert plan.pixels is not None and sum(plan.pixels) == pytest.approx(1.0)
     assert torch.equal(dof(image, depth, plan=plan), dof(image, depth))
     assert "%" not in str(Plan(plan.nodes, plan.tolerance))
-
-
-def test_nan_coc_counts_as_in_focus_in_the_shares_of_a_plan() -> None:
-    coc = torch.zeros(2, 1, 40, 50)
-    coc[..., :10], coc[0, 0, 0, 0] = -6.0, torch.nan
-    pixels = Plan((-5.5, 0.0), 1 / 255).of_pixels(coc).pixels
-    assert pixels is not None and pixels[0] == pytest.approx(799 / 4000)
 
 
 def test_kernels_of_highlights_are_interpolated_between_multiples_of_1_32_px() -> None:
