@@ -99,25 +99,18 @@ def test_fold_is_differentiable_in_the_weights_across_strips(monkeypatch: pytest
 
 @BOTH
 @REAL
-@given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 2), st.integers(1, 4), st.floats(0.0, 12.0), st.booleans())
+@given(st.tuples(*(st.integers(1, most) for most in (2, 4, 9, 9))), st.floats(0.0, 12.0), st.booleans())
 def test_scatter_of_any_shape_and_stride_equals_a_direct_sum(
-    scatter: Spread,
-    dtype: torch.dtype,
-    height: int,
-    width: int,
-    batch: int,
-    channels: int,
-    radius: float,
-    strided: bool,
+    scatter: Spread, dtype: torch.dtype, shape: tuple[int, int, int, int], radius: float, strided: bool
 ) -> None:
-    light = torch.rand(batch, channels, height, width, dtype=dtype)
+    light = torch.rand(shape, dtype=dtype)
     if strided:
-        light = light.mT.contiguous(memory_format=torch.channels_last).mT[:, :, :: 2 if height > 1 else 1]
-    kernels = bank(*(radius * (1 + 0.1 * c) for c in range(channels)), dtype=dtype)
+        light = light.mT.contiguous(memory_format=torch.channels_last).mT[:, :, :: 2 if shape[2] > 1 else 1]
+    kernels = bank(*(radius * (1 + 0.1 * c) for c in range(shape[1])), dtype=dtype)
     out = scatter(light, kernels)
     assert out.shape == light.shape
     wide = kernels.double()[:, None]  # symmetric
-    direct = functional.conv2d(light.double().contiguous(), wide, padding=kernels.shape[-1] // 2, groups=channels)
+    direct = functional.conv2d(light.double().contiguous(), wide, padding=kernels.shape[-1] // 2, groups=shape[1])
     assert_close(out, direct.to(dtype), **TOLERANCES[dtype])
 
 
