@@ -8,6 +8,7 @@ from torch.testing import assert_close
 from tests import loops
 from tests.refused import refuses
 from tests.tolerances import TOLERANCES
+from tests.traced import TRACED
 from torchdof import BlurTable
 from torchdof.functional import splat
 
@@ -35,6 +36,11 @@ def test_scatter_equals_a_plain_loop_with_a_kernel_for_each_pixel(table: BlurTab
     image, coc = scene(1)
     expected = loops.accumulate(image, coc, table, None, normalize)
     assert_close(splat(image, coc, table, normalize=normalize), expected, rtol=0, atol=3e-4)
+
+
+def test_a_wide_blur_in_a_small_frame_equals_the_loop() -> None:
+    image, coc = scene(1, most_px=30.0, height=3, width=6)
+    assert_close(splat(image, coc), loops.accumulate(image, coc, BlurTable.disc()), rtol=0, atol=3e-4)
 
 
 def gauss_psf(image: Tensor, c_px: Tensor) -> Tensor:
@@ -110,6 +116,15 @@ def test_gradients_to_sigma_and_gradients_of_these() -> None:
 
     assert torch.autograd.gradcheck(blurred, (image, sigma))
     assert torch.autograd.gradgradcheck(blurred, (image, sigma))
+
+
+@TRACED
+def test_torch_func_has_the_same_gradient() -> None:
+    image, coc = scene(1)
+    wanted = coc.clone().requires_grad_()
+    (expected,) = torch.autograd.grad(splat(image, wanted).square().sum(), wanted)
+    assert bool(expected.any())
+    assert_close(torch.func.grad(lambda c: splat(image, c).square().sum())(coc), expected)
 
 
 def test_a_training_step_stores_a_few_images_for_the_backward_pass() -> None:

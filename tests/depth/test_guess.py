@@ -35,6 +35,7 @@ def ground(top: float, bottom: float) -> Tensor:
         (ground(6.0, 2.0).round(), False, Guess("z")),  # a few whole metres
         ((ground(2.0, 0.2).round() * 100), True, Guess("relative", relative_kind="depth")),
         (torch.full((1, 1, 4, 4), 2.0), False, Guess("z")),
+        (torch.tensor([2.0, 6.0]).repeat_interleave(32).repeat(1, 1, ROWS, 1), False, Guess("z")),  # equal downwards
         (torch.full((1, 1, 4, 4), math.nan), False, Guess("z")),
     ],
 )

@@ -88,6 +88,7 @@ def test_maps_of_any_size_are_inspected(size: tuple[int, int]) -> None:
         assert panel.shape == (1, 3, *size) and bool(panel.isfinite().all())
 
 
-def test_batches_are_refused() -> None:
+def test_a_map_without_depth_is_reported_and_batches_are_refused() -> None:
+    assert "holes 64 (100.0 %)" in str(inspect_depth(torch.rand(1, 3, 8, 8), torch.zeros(1, 1, 8, 8), Camera()))
     with pytest.raises(ValueError, match="one image at a time, got a batch of 2"):
         inspect_depth(torch.rand(2, 3, 8, 8), torch.ones(1, 1, 8, 8), Camera())

@@ -1,4 +1,4 @@
-"""A file is written whole or not at all: on full disks, with concurrent writers, and when the process ends."""
+"""A file is written whole or not at all: on full disks, and when the process ends."""
 
 import os
 import signal

@@ -287,6 +287,17 @@ def test_attributes_are_kept_and_too_many_are_refused_at_once(tmp_path: Path) ->
         assert time.perf_counter() - start < 2.0  # OpenEXR takes minutes
 
 
+def test_huge_texts_in_a_png_cost_no_time(tmp_path: Path) -> None:
+    write_image(tmp_path / "x.png", tiny())
+    content = (tmp_path / "x.png").read_bytes()
+    bomb = chunk(b"zTXt", b"k\0\0" + zlib.compress(bytes(2**27), 9))
+    texts = b"".join(chunk(b"tEXt", b"k%d\0v" % i) for i in range(100_000))
+    (tmp_path / "x.png").write_bytes(content[:33] + bomb + texts + content[33:])
+    start = time.process_time()
+    assert read_image(tmp_path / "x.png").pixels.shape == (1, 3, 8, 9)
+    assert time.process_time() - start < 5.0
+
+
 # Sizes
 
 

@@ -54,6 +54,18 @@ def test_gaps_between_layers_are_at_most_the_spacing_of_the_tolerance(reach: flo
     assert [-x for x in reversed(plan.nodes)] == list(plan.nodes)
 
 
+def test_a_static_plan_is_as_exact_on_a_slope_as_the_plan_of_the_scene() -> None:
+    """Its layers are denser, because it cannot place layers at the blurs of the frame's border."""
+    y, x = torch.linspace(0.0, 1.0, 160)[:, None], torch.linspace(0.0, 1.0, 240)
+    coc = (8.0 + 16.0 * (0.7 * x + 0.3 * y))[None, None]
+    image = torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(1))
+    image = torch.nn.functional.interpolate(image, coc.shape[-2:], mode="bicubic").clamp(0.0, 1.0)
+    exact = torchdof.blur_by_coc(image, coc, tolerance=0)
+    plans = Plan.all(24.0, 1 / 255), Plan.of_scene(coc, 1 / 255)
+    every, own = (float((torchdof.blur_by_coc(image, coc, plan=p) - exact).square().mean().sqrt()) for p in plans)
+    assert every < own < 0.75 / 255
+
+
 def test_a_frame_is_planned_for_less_where_it_is_blurred_much_not_where_a_few_pixels_are(engine: str) -> None:
     coc = torch.full((1, 1, 480, 640), 3.0)
     coc[..., 200:202, 300:302] = -1e5
