@@ -298,8 +298,9 @@ def lens_with_a_field(colours: int = 3, unit: float = 1.0, **change: Any) -> Blu
     box = (torch.rand(4, 3, 3, generator=dice) + 0.5) * coc.abs()[:, None, None]
     given = {"coc": coc, "radius": radius, "box": box, "light": torch.rand(colours, 4, 3, 8, 6, generator=dice) + 0.1}
     field = Field(**{**given, **change})
-    params = {"radius": field.coc.abs().expand(colours, -1)}
-    return BlurTable("disc", field.coc, params, unit="mm", sensor_width_mm=36.0 * unit, field=field)
+    ends = unit * torch.tensor([-0.4, 0.5])
+    params = {"radius": ends.abs().expand(colours, -1)}
+    return BlurTable("disc", ends, params, unit="mm", sensor_width_mm=36.0 * unit, field=field)
 
 
 TABLES = [BlurTable.disc(), BlurTable.gaussian(), BlurTable.load("sato_j15")]
