@@ -44,7 +44,7 @@ def test_freed_tensors_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"depth must be a tensor in metres that holds data, got a freed storage"):
         Camera(focus_m=2.0).coc_px(freed(), 50)
     with pytest.raises(ValueError, match=r"rgba must be a tensor .* that holds data, got a freed storage"):
-        DepthOfField(Camera(focus_m=2.0), check=False).layers(freed()[None], torch.tensor([1.0]))
+        DepthOfField(Camera(focus_m=2.0), check=False).layers(freed().expand(1, 2, 40, 50)[None], torch.tensor([1.0]))
 
 
 @pytest.mark.parametrize("make", [freed, cut, fake, Wrapper])
@@ -60,12 +60,13 @@ def test_tensors_without_memory_are_refused_by_name(make: type[Wrapper]) -> None
 
 ELSEWHERE = """
 import torch
+torch.set_default_device("meta")  # first, as what is cached would hide where it was made
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
 from torchdof.depth import fill_holes, from_relative
 random = torch.Generator("cpu").manual_seed(0)
-image = torch.rand(1, 3, 40, 60, generator=random)
+image = torch.rand(1, 3, 40, 60, generator=random, device="cpu")
 image[0, :, 20, 30] = 200.0
-coc = torch.linspace(-9, 9, 60).expand(1, 1, 40, 60).clone()
+coc = torch.linspace(-9, 9, 60, device="cpu").expand(1, 1, 40, 60).clone()
 def pictures():
     tables = [BlurTable.load("sato_j15"), BlurTable.polygon(5, 10.0, curvature=0.3, squeeze=0.7, vignetting=0.5)]
     made = [blur_by_coc(image, coc, table=table, occlusion=hides) for table in tables for hides in (True, False)]
@@ -73,7 +74,6 @@ def pictures():
     focused = DepthOfField(Camera(focus_range_m=(1.5, 2.0), tilt_deg=3.0))(image, depth)
     focused.square().sum().backward()
     return [float(t.detach().double().sum()) for t in (*made, focused, depth.grad)]
-torch.set_default_device("meta")  # first, as what is cached would hide where it was made
 elsewhere = pictures()
 torch.set_default_device("cpu")
 print(elsewhere == pictures())
