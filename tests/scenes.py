@@ -6,6 +6,7 @@ import random
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import pytest
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
@@ -25,6 +26,7 @@ WAYS: dict[str, dict[str, Any]] = {
     "fold-over": {"method": "fold", "occlusion": True},
     "fold-sum": {"method": "fold", "occlusion": False},
 }
+EVERY_WAY = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 Light = Callable[[torch.dtype], Tensor]
 
 

@@ -18,9 +18,9 @@ from torch.testing import assert_close
 from tests.scenes import (
     CAMERA,
     CASES,
+    EVERY_WAY,
     HEIGHT,
     TABLES,
-    WAYS,
     WIDTH,
     Case,
     Scene,
@@ -42,7 +42,6 @@ from torchdof.reference.lens_views import lens_views
 from torchdof.reference.metrics import ssim
 from torchdof.render.plan import Plan
 
-EVERY_WAY = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 BY_COLOUR = BlurTable("gaussian", [1.0], {"sigma": torch.tensor([[0.4], [0.5], [0.6]])}, name="by colour")
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.scenes import CAMERA, WAYS, halves, slope, texture, whole
+from tests.scenes import CAMERA, EVERY_WAY, WAYS, halves, slope, texture, whole
 from tests.traced import TRACED
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, validation
 from torchdof.depth import from_relative
@@ -19,7 +19,6 @@ from torchdof.io.highlights import expand_highlights
 from torchdof.render.layer_weights import from_blur_axis
 from torchdof.render.plan import Plan
 
-EVERY_WAY = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 SUMS: dict[str, dict[str, Any]] = {**WAYS, "plain sum": {"occlusion": False, "normalize": False}}
 SMALL = Camera(sensor_width_mm=0.6)
 NUMBERS = ("image", "depth", "focus_m", "f_number")

@@ -13,7 +13,7 @@ from torch.testing import assert_close
 
 from tests import loops
 from tests.refused import refuses
-from tests.scenes import CAMERA, HEIGHT, WAYS, WIDTH, disc, slope, texture
+from tests.scenes import CAMERA, EVERY_WAY, HEIGHT, WAYS, WIDTH, disc, slope, texture
 from tests.traced import TRACED
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field, tensors
 from torchdof.reference import metrics
@@ -22,7 +22,6 @@ from torchdof.render.layer_weights import blur_axis
 from torchdof.render.plan import Plan
 
 TYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
-EVERY_WAY = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 TABLES = {
     "disc": BlurTable.disc(),
     "gaussian": BlurTable.gaussian(),
