@@ -145,8 +145,8 @@ def loaded(code: str, *names: str) -> list[str]:
     return list(ast.literal_eval(output_of(script, flags=["-W", "error"]).splitlines()[-1]))
 
 
-HEAVY = ("scipy", "onnx", "onnxruntime", "onnxscript", "OpenImageIO", "matplotlib")
-HEAVY += ("kornia", "click", "rich", "torch._dynamo")
+HEAVY = ["scipy", "onnx", "onnxruntime", "onnxscript", "OpenImageIO", "matplotlib"]
+HEAVY += ["kornia", "click", "rich", "torch._dynamo"]
 PUBLIC = "import torchdof\nfor name in torchdof.__all__: getattr(torchdof, name)"
 
 

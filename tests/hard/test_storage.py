@@ -23,8 +23,8 @@ class Wrapper(Tensor):
         raise NotImplementedError
 
 
-def freed() -> Tensor:
-    values = torch.ones(1, 1, 40, 50)
+def freed(shape: tuple[int, ...] = (1, 1, 40, 50)) -> Tensor:
+    values = torch.ones(shape)
     values.untyped_storage().resize_(0)
     return values
 
@@ -44,7 +44,7 @@ def test_freed_tensors_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"depth must be a tensor in metres that holds data, got a freed storage"):
         Camera(focus_m=2.0).coc_px(freed(), 50)
     with pytest.raises(ValueError, match=r"rgba must be a tensor .* that holds data, got a freed storage"):
-        DepthOfField(Camera(focus_m=2.0), check=False).layers(freed().expand(1, 2, 40, 50)[None], torch.tensor([1.0]))
+        DepthOfField(Camera(focus_m=2.0), check=False).layers(freed((1, 1, 4, 40, 50)), torch.tensor([1.0]))
 
 
 @pytest.mark.parametrize("make", [freed, cut, fake, Wrapper])

@@ -269,6 +269,6 @@ def test_sizes_and_windows_are_odd_and_a_smaller_size_keeps_the_sum() -> None:
     assert_close(cut, whole[8:13, 8:13] / whole[8:13, 8:13].sum())
     assert torch.equal(psf.disc(3.0), psf.pixel_kernels("disc", {"radius": 3.0}, window=99))
     for size in (0, -1, 4):
-        for name in ("size", "window"):
+        for sizes in ({"size": size}, {"window": size}):
             with pytest.raises(ValueError, match=f"size must be a positive odd number of pixels, got {size}"):
-                psf.pixel_kernels("disc", {"radius": 2.0}, **{name: size})
+                psf.pixel_kernels("disc", {"radius": 2.0}, **sizes)  # type: ignore[arg-type]
