@@ -65,15 +65,10 @@ def test_a_picture_is_upright_after_reading_and_writing(orientation: int, suffix
     height, width = 16, 24
     stored = np.zeros((height, width, 3), np.uint8)
     stored[0:8, 8:16] = 255
-    tags: dict[str, Any] = {
-        "Orientation": orientation,
-        FILM: 26,
-        "Make": "A",
-        WIDTH: width,
-        "Exif:PixelYDimension": height,
-    }
+    tags = {"Orientation": orientation, FILM: 26, "Make": "A", WIDTH: width, "Exif:PixelYDimension": height}
     path, copy = tmp_path / f"stored{suffix}", tmp_path / f"copy{suffix}"
-    store(path, stored, "uint8", **{name.replace(":", "__"): value for name, value in tags.items()})
+    attributes: dict[str, Any] = {name.replace(":", "__"): value for name, value in tags.items()}
+    store(path, stored, "uint8", **attributes)
     picture = read_image(path)
     seen = np.zeros((16, 24) if orientation < 5 else (24, 16), bool)
     for r in range(8):
