@@ -23,7 +23,7 @@ def crops() -> dict[str, Scene]:
 def bars() -> Scene:
     near, far = Plane(1.0, waves(1, (0.6, 0.3, 0.2)), posts(40, 9)), Plane(2.0, waves(2))
     planes = [near, far, Plane(1.5, waves(3), posts(61, 20, -0.3, 9))]
-    return plane_scene(planes, CAMERA, (72, 96), samples=1024)
+    return plane_scene(planes, CAMERA, (72, 96), samples=512)
 
 
 def shown_psnr(image: torch.Tensor, scene: Scene, mask: torch.Tensor | None = None) -> float:
