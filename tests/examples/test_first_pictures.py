@@ -18,10 +18,10 @@ def figures(part: str, turn: int = 0) -> list[first_pictures.Figure]:
     ("part", "sizes", "radii_px"),
     [
         ("fresh-39", [(1350, 1080)], [(39, 39)]),
-        ("fresh-60", [(1333, 2000)], [(60, 60)]),
-        ("command", [(1333, 2000)] * 3, [(30, 30), (60, 60), (111, 111)]),
+        pytest.param("fresh-60", [(1333, 2000)], [(60, 60)], marks=pytest.mark.sweep),
+        pytest.param("command", [(1333, 2000)] * 3, [(30, 30), (60, 60), (111, 111)], marks=pytest.mark.sweep),
         ("cameras", [(160, 192)], [(4, 64)]),
-        ("pull", [(1080, 1920)] * 2, [(69, 69)] * 2),
+        pytest.param("pull", [(1080, 1920)] * 2, [(69, 69)] * 2, marks=pytest.mark.sweep),
         ("small", [(256, 256)] * 3, [(2, 8)] * 3),
         ("lamps", [(480, 640)], [(500, 500)]),
         ("noise", [(480, 640)], [(59, 60)]),
