@@ -71,7 +71,7 @@ fuzz: $(INSTALLED)
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz.run --seconds $(SECONDS)
 
 soak: $(INSTALLED)
-	$(BIN)/python tests/hard/soak.py --renderings 1000
+	$(BIN)/python -m tests.hard.soak --renderings 1000
 
 INSTALLS_FROM := pyproject.toml constraints.txt CMakeLists.txt $(wildcard torchdof/native/src/*) build/modules
 

@@ -9,6 +9,7 @@ import torch
 from hypothesis import HealthCheck, settings
 
 from tests import exported
+from torchdof import native
 from torchdof.tensors import TRACEABLE
 
 settings.register_profile("local", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -25,6 +26,16 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # one core for each worker and its subp
 @pytest.fixture(autouse=True)
 def _same_random_numbers() -> None:
     torch.manual_seed(0)
+
+
+@pytest.fixture(params=["torch", "native"])
+def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The engine that renders: a test that asks for it runs with each."""
+    monkeypatch.delenv("TORCHDOF_ENGINE", raising=False)
+    if request.param == "native" and not native.chosen():
+        pytest.skip("the compiled engine is not built")
+    monkeypatch.setenv("TORCHDOF_ENGINE", request.param)
+    return str(request.param)
 
 
 @pytest.fixture(scope="session")
@@ -48,28 +59,17 @@ def _exporter() -> None:
         pytest.skip("needs PyTorch 2.13 to export")
 
 
-@pytest.fixture(scope="session")
-def layered(shared_folder: Path, _exporter: None) -> Any:
-    """An exported module with occlusion, by convolution at resolutions down to a sixteenth."""
-    return exported.export_once("layered", shared_folder)
+def _exported(name: str) -> Any:
+    """A fixture: a module of :data:`tests.exported.MODULES` and its file."""
+
+    @pytest.fixture(scope="session", name=name.replace(" ", "_"))
+    def fixture(shared_folder: Path, _exporter: None) -> Any:
+        return exported.export_once(name, shared_folder)
+
+    return fixture
 
 
-@pytest.fixture(scope="session")
-def fold(shared_folder: Path, _exporter: None) -> Any:
-    """An exported module without occlusion, by the literal scatter."""
-    return exported.export_once("fold", shared_folder)
-
-
-@pytest.fixture(scope="session")
-def fold_with_occlusion(shared_folder: Path, _exporter: None) -> Any:
-    """The same with occlusion."""
-    return exported.export_once("fold with occlusion", shared_folder)
-
-
-@pytest.fixture(scope="session")
-def plain(shared_folder: Path, _exporter: None) -> Any:
-    """An exported module without occlusion, which is traced in a few seconds."""
-    return exported.export_once("plain", shared_folder)
+layered, plain, fold, fold_with_occlusion = map(_exported, exported.MODULES)
 
 
 @pytest.fixture(scope="session")

@@ -5,9 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-import torch.nn.functional as functional
 from scipy.interpolate import CubicSpline
-from scipy.optimize import nnls
 from torch import Tensor
 
 from torchdof import BlurTable
@@ -81,26 +79,6 @@ def accumulate(
     return total / scatter(torch.ones_like(image), kernel_of) if normalize else total
 
 
-def normalised_convolution(image: Tensor, kernel: Tensor) -> Tensor:
-    """Image convolved with one kernel `[1 or C, k, k]`, divided by the part of the kernel inside the frame."""
-    return scatter(image, lambda *_: kernel) / scatter(torch.ones_like(image), lambda *_: kernel)
-
-
-def disc_by_columns(radius: float, size: int) -> Tensor:
-    """Disc integrated over the pixels: each pixel is cut into columns, and the disc's chord clipped to each."""
-    columns = 40_000 // size
-    half = size // 2
-    edge = torch.arange(size + 1, dtype=torch.float64) - half - 0.5
-    x = edge[:-1, None] + (torch.arange(columns, dtype=torch.float64) + 0.5) / columns  # [size, columns]
-    chord = (radius**2 - x**2).clamp_min(0.0).sqrt()
-    kernel = torch.zeros(size, size, dtype=torch.float64)
-    for row in range(size):
-        top = torch.minimum(torch.maximum(chord, edge[row]), edge[row + 1])
-        bottom = torch.minimum(torch.maximum(-chord, edge[row]), edge[row + 1])
-        kernel[row] = (top - bottom).mean(1)
-    return kernel / kernel.sum()
-
-
 def interpolated(profile: Callable[[Tensor], Tensor], reach: float, size: int, samples: int = 200) -> Tensor:
     """Kernel `[size, size]` of an isotropic profile with radius `reach` in pixels, finely sampled."""
     places = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples * 2 * reach - reach
@@ -129,68 +107,3 @@ def seen_by_pixels(light: Tensor, places: Tensor, size: int) -> Tensor:
                 settled[y][x] -= owed * max(kernel[y][x], 0.0) / wealth
     inner = torch.tensor(settled, dtype=torch.float64).clamp_min(0.0)[2:-2, 2:-2]
     return inner / inner.sum()
-
-
-PERIOD = 32  # pixels
-_FREQUENCY = torch.fft.fftfreq(PERIOD, dtype=torch.float64)
-
-
-def _powers_and_targets(spectrum: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """For the pixels of photographs, at each frequency: power, power times the PSF's spectrum, and times its square."""
-    zero = torch.zeros(PERIOD, PERIOD, dtype=torch.float64)
-    sums = [zero, zero, zero]
-    for down in range(-3, 4):
-        for right in range(-3, 4):
-            y, x = (_FREQUENCY + down)[:, None], _FREQUENCY + right
-            size = torch.hypot(y, x)
-            power = (torch.sinc(y) * torch.sinc(x)) ** 2 / size.clamp_min(1 / PERIOD) ** 2
-            psf = spectrum(size)
-            terms = (power, power * psf, power * psf**2)
-            sums = [total + term for total, term in zip(sums, terms, strict=True)]
-    return sums[0], sums[1], sums[2]
-
-
-def expected_error(kernel: Tensor, spectrum: Callable[[Tensor], Tensor]) -> float:
-    """Expected squared error of a kernel on photographs (power 1 / f^2) against a PSF with this spectrum."""
-    power, meant, squares = _powers_and_targets(spectrum)
-    half = kernel.shape[-1] // 2
-    axis = torch.arange(-half, half + 1, dtype=torch.float64)
-    wave = torch.cos(2 * math.pi * _FREQUENCY[:, None] * axis)  # kernels are symmetric
-    made = wave @ kernel @ wave.T
-    return float((power * made**2 - 2 * meant * made + squares).sum())
-
-
-def best_kernel(spectrum: Callable[[Tensor], Tensor], half: int) -> Tensor:
-    """The non-negative kernel with sum 1 and least expected error, by non-negative least squares."""
-    power, meant, _ = _powers_and_targets(spectrum)
-    orbits: dict[tuple[int, int], list[tuple[int, int]]] = {}
-    for y in range(-half, half + 1):
-        for x in range(-half, half + 1):
-            orbits.setdefault((max(abs(y), abs(x)), min(abs(y), abs(x))), []).append((y, x))
-    columns = []
-    for pixels in orbits.values():
-        waves = sum(torch.cos(2 * math.pi * (_FREQUENCY[:, None] * y + _FREQUENCY * x)) for y, x in pixels)
-        columns.append((waves * power.sqrt()).flatten())
-    most = 1e3 * torch.tensor([[float(len(pixels)) for pixels in orbits.values()]], dtype=torch.float64)
-    left = torch.cat([torch.stack(columns, 1), most])
-    right = torch.cat([(meant / power.sqrt()).flatten(), most.new_tensor([1e3])])
-    weights, _ = nnls(left.numpy(), right.numpy())
-    kernel = torch.zeros(2 * half + 1, 2 * half + 1, dtype=torch.float64)
-    for pixels, weight in zip(orbits.values(), weights, strict=True):
-        for y, x in pixels:
-            kernel[y + half, x + half] = weight
-    return kernel / kernel.sum()
-
-
-def natural_scene(size: int, seed: int) -> Tensor:
-    """A random scene `[1, 1, size, size]` whose power falls with the square of the frequency, as photographs' does."""
-    frequency = torch.fft.fftfreq(size, dtype=torch.float64)
-    falls = 1 / torch.hypot(frequency[:, None], frequency).clamp_min(1 / size)
-    noise = torch.randn(size, size, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    return torch.fft.ifft2(torch.fft.fft2(noise) * falls).real[None, None]
-
-
-def spread(values: Tensor, kernel: Tensor) -> Tensor:
-    """Values `[1, 1, H, W]` convolved with a kernel; border pixels are repeated outside the frame."""
-    half = kernel.shape[-1] // 2
-    return functional.conv2d(functional.pad(values, (half,) * 4, mode="replicate"), kernel[None, None])

@@ -6,11 +6,13 @@ import random
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import pytest
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
+from torchdof.optics.field import Field
 from torchdof.render.border import continued
 from torchdof.render.highlights import threshold
 from torchdof.render.layer_weights import from_blur_axis
@@ -24,6 +26,7 @@ WAYS: dict[str, dict[str, Any]] = {
     "fold-over": {"method": "fold", "occlusion": True},
     "fold-sum": {"method": "fold", "occlusion": False},
 }
+EVERY_WAY = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 Light = Callable[[torch.dtype], Tensor]
 
 
@@ -282,6 +285,25 @@ CASES = [
 
 
 # Random scenes
+
+
+def lens_with_a_field(colours: int = 3, unit: float = 1.0, **change: Any) -> BlurTable:
+    """A lens with random spots that change across the field.
+
+    Args:
+        colours: Number of colours.
+        unit: Factor on all lengths; with 1 the sensor is 36 mm wide.
+        change: Other arguments of the :class:`torchdof.optics.field.Field`.
+    """
+    dice = torch.Generator().manual_seed(colours)
+    coc, radius = unit * torch.tensor([-0.4, -0.1, 0.2, 0.5]), unit * torch.tensor([0.0, 9.0, 20.0])
+    box = (torch.rand(4, 3, 3, generator=dice) + 0.5) * coc.abs()[:, None, None]
+    given = {"coc": coc, "radius": radius, "box": box, "light": torch.rand(colours, 4, 3, 8, 6, generator=dice) + 0.1}
+    field = Field(**{**given, **change})
+    ends = unit * torch.tensor([-0.4, 0.5])
+    params = {"radius": ends.abs().expand(colours, -1)}
+    return BlurTable("disc", ends, params, unit="mm", sensor_width_mm=36.0 * unit, field=field)
+
 
 TABLES = [BlurTable.disc(), BlurTable.gaussian(), BlurTable.load("sato_j15")]
 KINDS = ("planes", "planes", "discs", "smooth", "slope", "noise", "checkerboard", "step")

@@ -66,15 +66,6 @@ def test_background_and_attention_of_a_single_image_have_its_rank() -> None:
     assert torch.equal(out, DOF(images[:1, 0], depths[:1, 0], attention=look[None])[0])
 
 
-@pytest.mark.parametrize("focus_m", [[0.8, 2.0], torch.tensor([[0.8], [2.0]], dtype=torch.float64)])
-def test_a_batch_takes_its_focus_as_a_list_or_a_column(focus_m: Any) -> None:
-    images, depths = clips()
-    assert torch.equal(
-        DOF(images[:, 0], depths[:, 0], focus_m=focus_m),
-        DOF(images[:, 0], depths[:, 0], focus_m=torch.tensor([0.8, 2.0], dtype=torch.float64)),
-    )
-
-
 def test_gradients_reach_a_column_of_focus() -> None:
     images, depths = clips()
     focus_m = torch.tensor([[0.8], [2.0]], requires_grad=True)
@@ -86,8 +77,6 @@ def test_gradients_reach_a_column_of_focus() -> None:
     ("image", "depth", "focus_m", "message"),
     [
         ((3, 9, 12), (1, 1, 9, 12), None, r"depth must be \[1, H, W\] beside an image \[C, H, W\]"),
-        ((3, 9, 12), (9, 12), None, r"depth must be \[1, H, W\]"),
-        ((2, 3, 3, 9, 12), (2, 1, 9, 12), None, r"depth must be \[2, 3, 1, H, W\]"),
         ((2, 3, 3, 9, 12), (3, 3, 1, 9, 12), None, r"depth must be \[2, 3, 1, H, W\]"),
         ((2, 3, 3, 9, 12), (2, 3, 1, 9, 12), [1.0, 2.0, 3.0], r"focus_m must be a number, \[2\] or \[2, 3\]"),
         ((2, 3, 9, 12), (2, 1, 9, 12), ["near", 2.0], "focus_m must be a number, a list of numbers"),

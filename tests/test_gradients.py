@@ -1,22 +1,24 @@
 """Gradients of the picture: equal to finite differences, finite on hostile scenes, and usable for optimisation."""
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
-import torch.nn.functional as functional
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.scenes import CAMERA, WAYS, slope, whole
+from tests.scenes import CAMERA, EVERY_WAY, WAYS, halves, slope, texture, whole
 from tests.traced import TRACED
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, validation
+from torchdof.depth import from_relative
+from torchdof.depth.relative import RELATIVE_KINDS
+from torchdof.io.highlights import expand_highlights
 from torchdof.render.layer_weights import from_blur_axis
 from torchdof.render.plan import Plan
 
-EVERY_WAY = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 SUMS: dict[str, dict[str, Any]] = {**WAYS, "plain sum": {"occlusion": False, "normalize": False}}
 SMALL = Camera(sensor_width_mm=0.6)
 NUMBERS = ("image", "depth", "focus_m", "f_number")
@@ -72,6 +74,16 @@ def test_the_picture_is_the_same_with_gradients_and_their_adjoint_is_that_of_the
     if not way["occlusion"]:  # with occlusion the picture is not linear in the image, because matting depends on it
         (back,) = torch.autograd.grad(out, image, seen)
         assert_close((back * other).sum(), (seen * dof(other, *others)).sum(), rtol=1e-11, atol=0.0)
+
+
+@pytest.mark.parametrize(
+    ("function", "channels"),
+    [(expand_highlights, 3)]
+    + [(functools.partial(from_relative, near_m=1.0, far_m=5.0, kind=kind), 1) for kind in RELATIVE_KINDS],
+)
+def test_gradients_of_maps_equal_finite_differences(function: Callable[[Tensor], Tensor], channels: int) -> None:
+    values = 0.9 * torch.rand(1, channels, 6, 7, dtype=torch.float64) + 0.02
+    assert torch.autograd.gradcheck(function, (values.requires_grad_(),))
 
 
 # Finite gradients
@@ -142,6 +154,13 @@ def test_gradients_are_finite_at_hostile_light_and_of_its_type(
     assert [grad.dtype for grad in grads] == [dtype, torch.float32] and all(torch.isfinite(g).all() for g in grads)
 
 
+@EVERY_WAY
+def test_gradients_do_not_depend_on_the_scale_of_the_light(way: dict[str, Any]) -> None:
+    small, bright = ((texture() * k).requires_grad_() for k in (2.0**20, 2.0**90))
+    grads = [torch.autograd.grad(blur_by_coc(x, halves(-6.0, 5.0), **way).mean(), x)[0] for x in (small, bright)]
+    assert_close(grads[0], grads[1], rtol=1e-4, atol=1e-9)
+
+
 # Forward mode and torch.func
 
 
@@ -188,58 +207,3 @@ def test_torch_func_of_an_old_pytorch_is_refused_by_name(which: str, monkeypatch
     dof = DepthOfField(Camera())
     with pytest.raises(ValueError, match=r"comes from torch\.func, for which torchdof needs PyTorch 2\.13"):
         torch.func.grad(lambda value: dof(**{**given, which: value}).sum())(given[which])
-
-
-# Depth from defocus
-
-RAMP = slope(0, 1)
-DESCENTS: dict[str, tuple[list[float], list[float], Callable[[Tensor], dict[str, Tensor]], int, float, float]] = {
-    "a plane before focus": ([1 / 1.3], [1 / 1.55], lambda x: {"depth": torch.ones_like(RAMP) / x}, 80, 0.02, 0.005),
-    "a plane behind focus": ([1 / 5.0], [1 / 2.6], lambda x: {"depth": torch.ones_like(RAMP) / x}, 80, 0.02, 0.005),
-    "a slope": ([0.33, 0.17], [0.26, 0.26], lambda x: {"depth": 1 / (x[0] + (x[1] - x[0]) * RAMP)}, 60, 0.03, 0.02),
-    "the focus": ([1.6], [1.35], lambda x: {"depth": 2 + 6 * RAMP, "focus_m": x}, 50, 0.07, 0.01),
-    "the f-number": ([2.0], [3.0], lambda x: {"depth": 2 + 6 * RAMP, "f_number": x}, 50, 0.07, 0.01),
-}  # fmt: skip
-
-
-def descend(start: Tensor, picture_of: Callable[[Tensor], Tensor], target: Tensor, steps: int, rate: float) -> Tensor:
-    """Gradient descent on the squared difference of pictures."""
-    unknown = start.clone().requires_grad_()
-    adam = torch.optim.Adam([unknown], lr=rate, betas=(0.8, 0.9))
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, steps)
-    for _ in range(steps):
-        adam.zero_grad()
-        (picture_of(unknown) - target).square().mean().backward()
-        adam.step()
-        schedule.step()
-    return unknown.detach()
-
-
-def detailed(height: int = 24, width: int = 32) -> Tensor:
-    """Light with detail of every size, so that any blur changes it."""
-    coarse = functional.interpolate(torch.rand(1, 1, height // 4, width // 4), (height, width))
-    return 0.1 + torch.rand(1, 1, height, width) * coarse
-
-
-@pytest.mark.hard
-@pytest.mark.parametrize("name", DESCENTS)
-def test_gradient_descent_finds(name: str) -> None:
-    truth, start, scene_of, steps, rate, limit = DESCENTS[name]
-    image, dof = detailed(), DepthOfField(CAMERA)
-    target = dof(image, **scene_of(torch.tensor(truth, requires_grad=True))).detach()
-    found = descend(torch.tensor(start), lambda x: dof(image, **scene_of(x)), target, steps, rate)
-    assert found.tolist() == pytest.approx(truth, rel=limit)
-
-
-@pytest.mark.hard
-def test_gradient_descent_finds_a_depth_for_every_pixel() -> None:
-    image, dof = detailed(16, 24), DepthOfField(CAMERA.replace(focus_m=1.0))
-    truth = 0.25 + 0.35 * torch.rand(1, 1, 3, 4)
-
-    def picture_of(grid: Tensor) -> Tensor:
-        fine = functional.interpolate(grid.clamp(0.05, 0.95), (16, 24), mode="bilinear", align_corners=True)
-        return dof(image, 1 / fine)
-
-    target = picture_of(truth.clone().requires_grad_()).detach()
-    found = descend(torch.full_like(truth, 0.42), picture_of, target, steps=90, rate=0.03)
-    assert float((found - truth).abs().mean()) < 0.02

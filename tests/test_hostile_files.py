@@ -1,52 +1,16 @@
 """Malicious tables, manifests, prescriptions, states and graphs; tests/fuzz changes arbitrary bytes."""
 
 import json
-import pickle
 from pathlib import Path
-from typing import Any
 
 import onnx
 import pytest
-import torch
 from click.testing import CliRunner
 
-from torchdof import BlurTable, Camera, DepthOfField
 from torchdof.cli.main import app
 from torchdof.export import describe
-from torchdof.fit import read_captures
-from torchdof.fit.lens.lens import Lens
-from torchdof.io.images import read_values
 
 pytestmark = pytest.mark.hard
-
-
-class Bomb:
-    """Creates a file if it is unpickled."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return (Path.touch, (self.path,))
-
-
-@pytest.mark.parametrize("suffix", [".json", ".toml", ".txt", ".npy", ".npz", ".png", ".exr", ".onnx"])
-def test_a_pickle_with_any_suffix_is_not_executed(tmp_path: Path, suffix: str) -> None:
-    bomb = pickle.dumps(Bomb(tmp_path / "ran"))
-    path = tmp_path / f"bomb{suffix}"
-    path.write_bytes(bomb)
-    readers = {".json": BlurTable.load, ".toml": read_captures, ".txt": Lens.read, ".onnx": describe}
-    with pytest.raises((ValueError, OSError), match="bomb"):
-        readers.get(suffix, read_values)(path)  # type: ignore[operator]
-    assert not (tmp_path / "ran").exists()
-
-
-def test_a_state_can_be_loaded_with_weights_only(tmp_path: Path) -> None:
-    dof = DepthOfField(Camera(focus_m=1.5), BlurTable.load("sato_j15"))
-    torch.save(dof.state_dict(), tmp_path / "dof.pt")
-    other = DepthOfField(Camera())
-    other.load_state_dict(torch.load(tmp_path / "dof.pt", weights_only=True))
-    assert other.camera.focus_m == 1.5 and other.options.table.to_dict() == dof.options.table.to_dict()
 
 
 # Metadata shown by `torchdof export --show`
@@ -86,10 +50,7 @@ def test_shown_metadata_have_no_control_characters_and_are_short(tmp_path: Path,
         ('"' + "x" * 2**20 + '"', "are more than torchdof.export writes"),
         ("[" * 50_000, "are not JSON"),
         ("9" * 10_000, "are not JSON"),
-        ("{'a': 1}", "are not JSON"),
-        ("[1, 2", "are not JSON"),
         ("__import__('pathlib').Path('ran').touch()", "are not JSON"),
-        ("!!python/object:x", "are not JSON"),
     ],
     ids=lambda text: text[:12],
 )

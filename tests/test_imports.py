@@ -1,14 +1,13 @@
 """Imports: a folder imports only folders below it, and heavy packages are loaded only when they are used."""
 
 import ast
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 import torchdof
+from tests.processes import output_of
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = {"torchdof": "torchdof", "torchdof.fit": "fit", "torchdof.export": "export"}
@@ -115,12 +114,6 @@ def test_the_module_imports_at_most_ten_levels_of_files() -> None:
     assert level <= MAX_LEVELS
 
 
-@pytest.mark.parametrize("folder", ["optics", "options", "render", "depth", "module", "export"])
-def test_imports_for_the_type_checker_are_not_cyclic(folder: str) -> None:
-    graph = {module: set(imports(module, for_types=True)) - {module, "torchdof"} for module in FILES}
-    assert [module for module in levels(graph)[-1] if folder_of(module) == folder] == []
-
-
 @pytest.mark.parametrize("folder", ALLOWED)
 def test_a_folder_imports_only_folders_below_it(folder: str) -> None:
     wrong = [
@@ -133,47 +126,27 @@ def test_a_folder_imports_only_folders_below_it(folder: str) -> None:
     assert wrong == []
 
 
-def test_imports_are_not_cyclic() -> None:
+def test_no_imports_are_cyclic_not_even_those_for_the_type_checker_up_to_the_module() -> None:
     assert sorted(levels(GRAPH)[-1]) == []
+    graph = {module: set(imports(module, for_types=True)) - {module, "torchdof"} for module in FILES}
+    below = {"optics", "options", "render", "depth", "module", "export"}
+    assert [module for module in levels(graph)[-1] if folder_of(module) in below] == []
 
 
 @pytest.mark.parametrize(("half", "other"), [("photo", "lens"), ("lens", "photo")])
 def test_fit_photo_and_fit_lens_do_not_import_each_other(half: str, other: str) -> None:
-    wrong = [
-        f"{module} imports {target}"
-        for module, targets in GRAPH.items()
-        if module.startswith(f"torchdof.fit.{half}")
-        for target in targets
-        if target.startswith(f"torchdof.fit.{other}")
-    ]
-    assert wrong == []
-
-
-@pytest.mark.parametrize("module", ["problems", "result", "solve", "validation"])
-def test_modules_that_both_halves_of_fit_use_import_neither(module: str) -> None:
-    targets = GRAPH[f"torchdof.fit.{module}"]
-    assert not [target for target in targets if target.startswith(("torchdof.fit.photo", "torchdof.fit.lens"))]
+    targets = [t for module, imported in GRAPH.items() if module.startswith(f"torchdof.fit.{half}") for t in imported]
+    assert [target for target in targets if target.startswith(f"torchdof.fit.{other}")] == []
 
 
 def loaded(code: str, *names: str) -> list[str]:
     """Which of the packages `names` are loaded after `code` has run in a new process."""
     script = f"import sys\n{code}\nprint([name for name in {names!r} if name in sys.modules])"
-    run = subprocess.run([sys.executable, "-W", "error", "-c", script], capture_output=True, text=True, check=True)
-    return list(ast.literal_eval(run.stdout.splitlines()[-1]))
+    return list(ast.literal_eval(output_of(script, flags=["-W", "error"]).splitlines()[-1]))
 
 
-HEAVY = (
-    "scipy",
-    "onnx",
-    "onnxruntime",
-    "onnxscript",
-    "OpenImageIO",
-    "matplotlib",
-    "kornia",
-    "click",
-    "rich",
-    "torch._dynamo",
-)
+HEAVY = ["scipy", "onnx", "onnxruntime", "onnxscript", "OpenImageIO", "matplotlib"]
+HEAVY += ["kornia", "click", "rich", "torch._dynamo"]
 PUBLIC = "import torchdof\nfor name in torchdof.__all__: getattr(torchdof, name)"
 
 
@@ -189,28 +162,16 @@ image, depth = torch.rand(2, 3, 24, 32), 1 + torch.rand(2, 1, 24, 32).requires_g
 with torch.no_grad():
     assert not torch.equal(dof(image, depth, focus_m=[1.0, 1.5]), image)
 """
-WITH_GRADIENTS = "dof(image, depth).sum().backward()"
-PER_PIXEL = """
+WITH_GRADIENTS = """
 from torchdof.functional import splat
+dof(image, depth).sum().backward()
 splat(image, depth).sum().backward()
 """
 
 
-@pytest.mark.parametrize("engine", ["auto", "torch"])
-@pytest.mark.parametrize("then", ["", WITH_GRADIENTS, PER_PIXEL], ids=["picture", "gradients", "splat"])
-def test_a_first_picture_loads_neither_sympy_nor_the_compiler(
-    then: str, engine: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_first_picture_with_gradients_loads_neither_sympy_nor_the_compiler(engine: str) -> None:
     """They take a second, and eager code needs neither."""
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
-    assert loaded(FIRST + then, "sympy", "torch._dynamo", "torch._inductor", "kornia") == []
-
-
-def test_folders_below_render_do_not_load_the_compiler() -> None:
-    code = (
-        "import torchdof.options, torchdof.depth, torchdof.io.images, torchdof.reference.metrics, torchdof.fit.result"
-    )
-    assert loaded(code, "torch._dynamo", "kornia", "OpenImageIO") == []
+    assert loaded(FIRST + WITH_GRADIENTS, "sympy", "torch._dynamo", "torch._inductor", "kornia") == []
 
 
 WITHOUT_PYTORCH = [

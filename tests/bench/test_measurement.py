@@ -3,19 +3,15 @@
 import functools
 import itertools
 import math
-import statistics
 import time
-from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
 from torchdof import Camera
-from torchdof.bench import measurement, memory
-from torchdof.bench.measurement import BenchScene, Seconds, error, measure, peak_of, shipped
-from torchdof.bench.report import publish, summary
-from torchdof.reference import metrics
+from torchdof.bench import memory
+from torchdof.bench.measurement import BenchScene, Seconds, measure, peak_of, shipped
 
 SCENE = shipped(36, 64)
 
@@ -40,14 +36,6 @@ def test_ratios_are_of_cpu_time_and_a_tool_may_time_itself() -> None:
     _, row = measure(lambda image, _: (image, next(taken)), SCENE, beside=lambda: (None, next(taken)))
     assert (row["cpu_ms"], row["over_again"], row["beside_ms"]) == (6000.0, 3.0, 5000.0)
     assert math.isnan(row["over_beside"])  # the reference gives wall time only
-
-
-def test_errors_are_of_display_values() -> None:
-    expected = (SCENE.image + 0.01).clamp(0.0, 1.0)
-    row = error(SCENE.image, expected)
-    got, truth = metrics.display(SCENE.image), metrics.display(expected)
-    assert row["rms_255"] == pytest.approx(255 * float((got - truth).square().mean().sqrt()), abs=1e-4)
-    assert (row["psnr_db"], row["ssim"]) == (metrics.psnr(got, truth), metrics.ssim(got, truth))
 
 
 def test_a_picture_that_is_not_finite_is_not_timed() -> None:
@@ -86,63 +74,9 @@ def test_cameras_differ_from_each_other_and_a_seed_repeats_them() -> None:
     assert not SCENE.seen(0.0, 0.0).seen(0.4, 0.0).coc_px.any()
 
 
-def test_a_focus_pull_moves_from_near_to_far() -> None:
-    nearest, *_, farthest = SCENE.pull(5)
-    assert float(nearest.coc_px.mean()) > 0 > float(farthest.coc_px.mean())
-    assert len({float(frame.coc_px.mean()) for frame in SCENE.pull(5)}) == 5
-
-
-def test_resizing_a_scene_scales_its_blur_radii_with_the_width() -> None:
-    small = SCENE.resized(0.5)
-    assert small.image.shape[-2:] == (18, 32)
-    assert float(small.coc_px.abs().max()) == pytest.approx(0.5 * float(SCENE.coc_px.abs().max()), rel=0.05)
-    assert set(small.coc_px.flatten().tolist()) <= set((0.5 * SCENE.coc_px).flatten().tolist())
-
-
 def test_the_built_in_scene_is_blurred_equally_in_front_of_and_behind_the_focus() -> None:
     scene = shipped()
     assert scene.image.shape == (1, 3, 540, 960)
     assert float(scene.coc_px.min()) == pytest.approx(-16, abs=0.5)
     assert float(scene.coc_px.max()) == pytest.approx(16, abs=0.5)
     assert 0 < (scene.coc_px.abs() < 0.5).float().mean() < 0.1
-
-
-def test_a_summary_averages_rows_with_the_same_key() -> None:
-    rows = [{"a": a, "new_ms": value, "other": "z"} for a, value in (("x", 1.0), ("y", 5.0), ("x", 4.0))]
-    assert summary([*rows, {"a": "y", "psnr_db": 30.0}], ["a"], statistics.fmean) == [
-        {"a": "x", "new_ms": 2.5, "spread_ms": 1.5},
-        {"a": "y", "new_ms": 5.0, "psnr_db": 30.0},
-    ]
-
-
-def test_a_report_is_written_completely_or_not_at_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    tables = {"Means": [{"a": "x", "b": 1234.56, "c": True}], "All": [{"a": "x", "d": math.nan}, {"a": "y", "e": 0.25}]}
-    written = functools.partial(publish, "Title", tables, ["remark"], tmp_path / "name")
-
-    def full(path: Path) -> None:
-        raise OSError("no space left")
-
-    (tmp_path / "name.md").write_text("before")
-    with pytest.raises(OSError, match="no space"):
-        written(full)
-    assert [path.name for path in tmp_path.iterdir()] == ["name.md"]
-    assert (tmp_path / "name.md").read_text() == "before"
-    capsys.readouterr()
-    written(quiet=True)
-    assert not capsys.readouterr().out
-    text = (tmp_path / "name.md").read_text()
-    assert (
-        "## Means\n\n| a | b | c |\n| --- | --- | --- |\n| x | 1235 | yes |" in text
-        and "| x |  |  |\n| y |  | 0.25 |" in text
-    )
-    assert f" {torch.get_num_threads()} threads; " in text and f"torch {torch.__version__}" in text and "remark" in text
-    assert (tmp_path / "name.csv").read_text() == "a,d,e\nx,nan,\ny,,0.25\n"
-
-
-def test_a_scene_of_bad_size_is_refused() -> None:
-    for image, coc_px, message in (
-        (torch.ones(1, 3, 20, 20), torch.ones(1, 1, 20, 24), "depth is 24 x 20 pixels but the image is 20 x 20"),
-        (torch.ones(1, 3, 8, 20), torch.ones(1, 1, 8, 20), "from 16 pixels a side on"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            measurement.BenchScene("x", image, coc_px)

@@ -9,7 +9,6 @@ import torch
 
 from torchdof import blur_by_coc
 from torchdof.bench.accuracy import read_peer
-from torchdof.reference.ikoma import layered_fft
 
 TOOLS = Path(__file__).parents[2] / "examples" / "benchmarks" / "tools"
 SIDE = 65
@@ -51,17 +50,3 @@ def test_a_renderer_blurs_by_the_circle_of_confusion_that_it_is_given(name: str)
         except ValueError as error:
             pytest.skip(str(error))
     assert fault(blur, 6.0) == fault(blur, 11.3) == ""
-
-
-@pytest.mark.parametrize(
-    "blur, expected",
-    [
-        (lambda image, coc: image, "6 px: as by a disc of 0.00 px"),
-        (lambda image, coc: layered_fft(image, coc.clamp_min(0)), "-6 px: as by a disc of 0.00 px"),
-        (lambda image, coc: 0.9 * layered_fft(image, coc), "0 px: 0.900 of its light"),
-        (lambda image, coc: layered_fft(image, coc).roll(1, -1), "0 px: moved by 1.00, 0.00 px"),
-        (lambda image, coc: layered_fft(image, coc)[..., 1:], "[1, 3, 65, 194], not finite numbers [1, 3, 65, 195]"),
-    ],
-)
-def test_the_check_finds_each_kind_of_fault(blur: Any, expected: str) -> None:
-    assert fault(blur, 6.0) == expected

@@ -1,3 +1,4 @@
+import functools
 import math
 from pathlib import Path
 from typing import Any, cast
@@ -8,6 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.refused import refuses
 from torchdof.depth.holes import fill_holes
 from torchdof.depth.kinds import depth_from_values
 from torchdof.depth.reading import read_depth
@@ -108,27 +110,18 @@ def test_nearest_is_as_near_as_the_nearest_of_all_pixels(height: int, width: int
             assert math.sqrt(got) <= math.sqrt(best) + 0.5
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: depth_from_values(row(1.0), cast(Any, "metres")), "must be one of z, distance, disparity, inverse"),
-        (lambda: depth_from_values(row(1.0), "disparity"), "disparity needs a scale"),
-        (lambda: depth_from_values(row(1.0), "distance"), "needs the horizontal field of view"),
-        (lambda: depth_from_values(row(1.0), "distance", fov_x_deg=180.0), r"must be in \(0, 180\) degrees"),
-        (lambda: depth_from_values(row(1.0), "z", scale=0.0), r"scale \(--depth-scale\) must be finite and not 0"),
-        (lambda: depth_from_values(row(1.0), "z", offset=NAN), r"offset \(--depth-offset\) finite"),
-        (lambda: fill_holes(row(NAN), "nearest"), "no pixel has a depth; check the kind, scale and offset"),
-        (lambda: fill_holes(row(NAN), "far"), "no pixel has a depth; check the kind, scale and offset"),
-        (lambda: fill_holes(row(1.0, NAN), cast(Any, "middle")), "fill"),
-        (lambda: fill_holes(row(1.0, NAN), 0.0), "fill"),
-        (lambda: fill_holes(row(1.0, NAN), -1.0), "fill"),
-        (lambda: fill_holes(row(1.0, NAN), NAN), "fill"),
-        (lambda: fill_holes(row(1.0, NAN), True), "fill"),
-    ],
-)
-def test_invalid_arguments_are_refused(call: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        call()
+test_invalid_arguments_are_refused = refuses(
+    (lambda: depth_from_values(row(1.0), cast(Any, "metres")), "must be one of z, distance, disparity, inverse"),
+    (lambda: depth_from_values(row(1.0), "disparity"), "disparity needs a scale"),
+    (lambda: depth_from_values(row(1.0), "distance"), "needs the horizontal field of view"),
+    (lambda: depth_from_values(row(1.0), "distance", fov_x_deg=180.0), r"must be in \(0, 180\) degrees"),
+    (lambda: depth_from_values(row(1.0), "z", scale=0.0), r"scale \(--depth-scale\) must be finite and not 0"),
+    (lambda: depth_from_values(row(1.0), "z", offset=NAN), r"offset \(--depth-offset\) finite"),
+    *((functools.partial(fill_holes, row(NAN), fill), "no pixel has a depth; check the kind, scale and offset")
+      for fill in cast(Any, ("nearest", "far"))),
+    *((functools.partial(fill_holes, row(1.0, NAN), fill), "fill")
+      for fill in cast(Any, ("middle", 0.0, -1.0, NAN, True))),
+)  # fmt: skip
 
 
 def test_holes_are_refused_without_a_fill(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from tests.tolerances import TOLERANCES
-from tests.traced import TRACED
 from torchdof.depth import depth_from_values, from_relative, solve_scale
 from torchdof.depth.relative import RELATIVE_KINDS
 
@@ -37,27 +36,15 @@ def test_scale_and_shift_of_the_values_do_not_matter(kind: Any, factor: float) -
     torch.testing.assert_close(from_relative(factor * (values - 0.3), 1.5, 9.0, kind), expected)
 
 
-@pytest.mark.parametrize(
-    "dtype", [torch.uint8, torch.uint16, torch.int16, torch.int32, torch.int64, torch.uint32, torch.int8]
-)
-def test_integer_dtypes_give_the_depth_of_their_values(dtype: torch.dtype) -> None:
-    values = torch.tensor([[[[0, 30, 127]]]])
-    depth = from_relative(values.to(dtype), 1.0, 4.0)
-    assert depth.dtype == torch.float32
-    torch.testing.assert_close(depth, from_relative(values.double(), 1.0, 4.0).float())
-
-
-def test_neighbouring_large_integers_give_different_depths() -> None:
-    values = torch.tensor([[[[2**30, 2**30 + 1, 2**30 + 2]]]], dtype=torch.int32)
-    assert from_relative(values, 1.0, 3.0, "depth").flatten().tolist() == [1.0, 2.0, 3.0]
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
-def test_floating_types_are_kept(dtype: torch.dtype) -> None:
-    values = torch.rand(2, 1, 4, 5).to(dtype)
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.uint32, *TOLERANCES])
+def test_integers_become_float32_and_floating_types_are_kept(dtype: torch.dtype) -> None:
+    values = torch.tensor([[[[0, 30, 127]]]]).to(dtype)
     depth = from_relative(values, 1.0, 4.0)
-    assert depth.dtype == dtype
-    torch.testing.assert_close(depth, from_relative(values.double(), 1.0, 4.0).to(dtype), **TOLERANCES[dtype])
+    assert depth.dtype == (dtype if dtype.is_floating_point else torch.float32)
+    expected = from_relative(values.double(), 1.0, 4.0).to(depth.dtype)
+    torch.testing.assert_close(depth, expected, **TOLERANCES[depth.dtype])
+    large = torch.tensor([[[[2**30, 2**30 + 1, 2**30 + 2]]]], dtype=torch.int32)
+    assert from_relative(large, 1.0, 3.0, "depth").flatten().tolist() == [1.0, 2.0, 3.0]
 
 
 def test_holes_stay_holes_and_do_not_stretch_the_range() -> None:
@@ -84,33 +71,16 @@ def test_the_farthest_disparity_may_lie_at_infinity_and_passes_no_gradient() -> 
     assert values.grad is not None and bool(values.grad.isfinite().all())
 
 
-@pytest.mark.parametrize("kind", RELATIVE_KINDS)
-def test_gradients_are_those_of_the_formula(kind: Any) -> None:
-    values = torch.rand(2, 1, 3, 4, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda v: from_relative(v, 1.0, 5.0, kind), values)
-
-
-@TRACED
-def test_from_relative_compiles_without_graph_breaks() -> None:
-    values = torch.rand(1, 1, 3, 4)
-    compiled = torch.compile(lambda v: from_relative(v, 1.0, 5.0), fullgraph=True, backend="eager")
-    torch.testing.assert_close(compiled(values), from_relative(values, 1.0, 5.0))
-
-
 @pytest.mark.parametrize(
     ("values", "arguments", "message"),
     [
         (row(1.0, 2.0), (5.0, 1.0), "near_m must be nearer than far_m, got near_m=5 and far_m=1"),
-        (row(1.0, 2.0), (1.0, 1.0), "near_m must be nearer than far_m"),
         (row(1.0, 2.0), (0.0, 1.0), "near_m must be a number of metres > 0"),
-        (row(1.0, 2.0), (1.0, NAN), "far_m must be a number"),
         (row(1.0, 2.0), (1.0, INF, "depth"), "far_m must be a number"),
         (row(1.0, 2.0), (1.0, 2.0, "metric"), "must be one of disparity, inverse, depth, got 'metric'"),
         (row(3.0, 3.0), (1.0, 2.0), r"two different values .* one value everywhere; give value_range"),
-        (row(3.0), (1.0, 2.0), "two different values"),
         (row(NAN, INF), (1.0, 2.0), "two different values to distinguish near from far, got no value"),
         (torch.ones(3, 4), (1.0, 2.0), r"must be \[B, 1, H, W\], got \[3, 4\]; add the missing dimensions"),
-        (torch.ones(1, 3, 4, 4), (1.0, 2.0), r"must be \[B, 1, H, W\], got \[1, 3, 4, 4\]"),
         (np.ones((3, 4)), (1.0, 2.0), "got ndarray; convert an array with torch.from_numpy"),
         (torch.ones(1, 1, 3, 4, dtype=torch.bool), (1.0, 2.0), "got torch.bool"),
         (torch.ones(1, 1, 0, 4), (1.0, 2.0), "at least one pixel"),
@@ -121,7 +91,7 @@ def test_invalid_arguments_are_refused(values: Any, arguments: Any, message: str
         from_relative(values, *arguments)
 
 
-@pytest.mark.parametrize("value_range", [(1.0, 1.0), (2.0, 1.0), (0.0, NAN), (1.0,), "0,1"])
+@pytest.mark.parametrize("value_range", [(2.0, 1.0), (0.0, NAN), (1.0,), "0,1"])
 def test_an_invalid_value_range_is_refused(value_range: Any) -> None:
     with pytest.raises(ValueError, match="value_range"):
         from_relative(row(1.0, 2.0), 1.0, 2.0, value_range=value_range)
@@ -161,7 +131,6 @@ def test_a_point_at_infinity_fixes_the_offset() -> None:
 @pytest.mark.parametrize(
     ("points", "kind", "message"),
     [
-        ([(0.5, 0.5, 1.0)], "disparity", "at least two points of different values, got 1"),
         ([(0.5, 0.5, 1.0), (0.6, 0.5, 2.0)], "disparity", "at least two points of different values, got 2"),
         ([(0.5, 0.5, 1.0), (2.5, 0.5, 4.0)], "disparity", "that is kind='depth', not 'disparity'"),
         ([(0.5, 0.5, 4.0), (2.5, 0.5, 1.0)], "depth", "that is kind='disparity', not 'depth'"),

@@ -1,7 +1,6 @@
 """Warnings name unit mistakes and the option that corrects them; unusual but sensible input gives no warning."""
 
 import math
-import warnings
 from pathlib import Path
 
 import pytest
@@ -60,6 +59,8 @@ def test_the_demo_gives_no_warning(metres: torch.Tensor, focus_m: float) -> None
         pytest.param(torch.full((1, 1, 8, 8), 3.0), Camera(focus_m=3.0), id="a wall"),
         pytest.param(torch.full((1, 1, 1, 1), 3.0), Camera(focus_m=3.0), id="one pixel"),
         pytest.param(torch.full((1, 1, 8, 8), math.nan), Camera(focus_m=3.0), id="holes alone"),
+        pytest.param(field(1.0, 6.0)[..., :48, :64], Camera(focus_m=2.0), id="a small map"),
+        pytest.param(field(2.0, 5.0).expand(2, -1, -1, -1), Camera(focus_m=torch.tensor([3.0, INF])), id="two lenses"),
     ],
 )
 def test_sensible_extremes_raise_no_doubt(depth: torch.Tensor, camera: Camera) -> None:
@@ -90,90 +91,61 @@ def test_unit_mistakes_are_named_with_their_remedy(
         check(metres * factor, Camera(focus_m=focus_m), strict=True)
 
 
-def test_unit_mistakes_are_found_in_maps_too_small_for_a_blur_of_a_pixel() -> None:
-    small = field(1.0, 6.0)[..., :48, :64]
-    for factor, message in ((1000.0, "millimetres"), (100.0, "centimetres"), (0.001, "1000 times too small")):
-        with pytest.warns(DepthWarning, match=message):
-            check(small * factor, Camera(focus_m=2.0))
-    check(small, Camera(focus_m=2.0), strict=True)
+SMALL = field(1.0, 6.0)[..., :48, :64]  # too small for a blur of a pixel
+SHARES = torch.linspace(0.0, 1.0, 96).expand(1, 1, 64, 96)
 
 
-def test_whole_millimetres_are_found_with_focus_at_infinity(metres: torch.Tensor) -> None:
-    with pytest.warns(DepthWarning, match="millimetres"):
-        check((metres * 1000).round(), Camera(focus_m=INF))
+@pytest.mark.parametrize(
+    ("depth", "camera", "message"),
+    [
+        (1000.0 * SMALL, Camera(focus_m=2.0), "millimetres"),
+        (100.0 * SMALL, Camera(focus_m=2.0), "centimetres"),
+        (0.001 * SMALL, Camera(focus_m=2.0), "1000 times too small"),
+        ((3000.0 * SMALL).round(), Camera(focus_m=INF), "millimetres"),
+        (torch.cat([SMALL, 1000.0 * SMALL]), Camera(focus_m=3.0), "millimetres"),  # in one item of a batch
+        (field(2.0, 5.0), Camera(0.05, 1.8, 3.0), "focal length of 0.05 mm on a sensor of 36 mm .* take millimetres"),
+        (
+            object_before(torch.full((1, 1, 120, 160), 1.0), 9.0),
+            Camera(85.0, 1.4, 3.0),
+            r"no pixel lies near the focus at 3 m, all \(1 to 9 m\)",
+        ),
+        *((depth, camera, "more than a lens makes.*on a sensor of .*which is in another unit")
+          for depth, camera in (
+              (field(0.002, 0.005), Camera.from_fov(40.0, 0.01, 0.003)),  # depth and focus scaled, the opening not
+              (field(2.0, 5.0), Camera.from_fov(40.0, 12.0, 3.0)),  # the opening in millimetres
+              (field(2.0, 5.0), Camera(50.0, 0.01, 3.0)),
+              (field(2.0, 5.0), Camera(50.0, 1.8, 3.0, sensor_width_mm=0.036)))),
+    ],
+)  # fmt: skip
+def test_other_units_and_impossible_lenses_give_a_warning(depth: torch.Tensor, camera: Camera, message: str) -> None:
+    with pytest.warns(DepthWarning, match=message):
+        check(depth, camera)
 
 
 def test_relative_depth_of_8_bits_gives_a_warning(metres: torch.Tensor) -> None:
     relative = (255 * (1 / metres - 1 / metres.max()) / (1 / metres.min() - 1 / metres.max())).round().clamp(min=1)
-    with pytest.warns(DepthWarning, match="files of 8 bits hold.*--depth-kind relative"):
-        check(relative, Camera(focus_m=3.0))
-    with pytest.warns(DepthWarning, match="nothing is in focus.*8 bits.*--depth-kind relative"):
-        check(relative, Camera(focus_m=0.4))
+    for focus_m, message in ((3.0, "files of 8 bits hold"), (0.4, "nothing is in focus.*8 bits")):
+        with pytest.warns(DepthWarning, match=f"{message}.*--depth-kind relative"):
+            check(relative, Camera(focus_m=focus_m))
 
 
-def test_values_from_0_to_1_give_a_warning_wherever_the_focus_lies() -> None:
-    shares = torch.linspace(0.0, 1.0, 96).expand(1, 1, 64, 96)
-    for focus_m in (0.2, 0.9):
-        camera = Camera(focal_length_mm=5.0, sensor_width_mm=6.0, focus_m=focus_m)
-        (mistake,) = depth_mistakes(shares, camera)
-        assert mistake.name == "bits" and "between 0 and 1 (" in mistake.message and "relative" in mistake.message
-        assert depth_mistakes(shares, camera, "relative") == []
-        assert depth_mistakes(0.3 + 0.6 * shares, camera) == []  # a close-up
+@pytest.mark.parametrize("focus_m", [0.2, 0.9])
+def test_values_from_0_to_1_give_a_warning_wherever_the_focus_lies(focus_m: float) -> None:
+    camera = Camera(focal_length_mm=5.0, sensor_width_mm=6.0, focus_m=focus_m)
+    (mistake,) = depth_mistakes(SHARES, camera)
+    assert mistake.name == "bits" and "between 0 and 1 (" in mistake.message and "relative" in mistake.message
+    assert depth_mistakes(SHARES, camera, "relative") == []
+    assert depth_mistakes(0.3 + 0.6 * SHARES, camera) == []  # a close-up
 
 
-def test_disparity_without_its_scale_gives_a_warning(metres: torch.Tensor) -> None:
+def test_the_advice_depends_on_the_kind_and_the_scale(metres: torch.Tensor) -> None:
     (mistake,) = depth_mistakes(metres / 192.03, Camera(focus_m=3.0), "inverse")
     assert "the baseline in metres times the focal length in pixels (--depth-scale, not given)" in mistake.message
     assert "--depth-kind relative" in mistake.message
-
-
-def test_the_advice_for_a_superfluous_scale_is_to_leave_it_out(metres: torch.Tensor) -> None:
     (mistake,) = depth_mistakes(metres / 1000, Camera(focus_m=3.0), "z", 0.001)
     assert "leave --depth-scale out" in mistake.message
-
-
-@pytest.mark.parametrize(
-    ("depth", "camera"),
-    [
-        (field(0.002, 0.005), Camera.from_fov(40.0, 0.01, 0.003)),  # depth and focus scaled down, the opening not
-        (field(2.0, 5.0), Camera.from_fov(40.0, 12.0, 3.0)),  # the opening in millimetres
-        (field(2.0, 5.0), Camera(50.0, 0.01, 3.0)),
-        (field(2.0, 5.0), Camera(50.0, 1.8, 3.0, sensor_width_mm=0.036)),
-    ],
-)
-def test_an_impossible_blur_gives_a_warning(depth: torch.Tensor, camera: Camera) -> None:
-    sensor = f"on a sensor of {camera.sensor_width_mm:g} mm"
-    with pytest.warns(DepthWarning, match=f"more than a lens makes.*{sensor}.*which is in another unit"):
-        check(depth, camera)
-
-
-def test_a_focal_length_in_metres_gives_a_warning() -> None:
-    with pytest.warns(DepthWarning, match="focal length of 0.05 mm on a sensor of 36 mm .* take millimetres"):
-        check(field(2.0, 5.0), Camera(0.05, 1.8, 3.0))
-
-
-def test_a_focus_in_a_gap_of_depth_gives_a_warning() -> None:
-    depth = object_before(torch.full((1, 1, 120, 160), 1.0), 9.0)
-    with pytest.warns(DepthWarning, match=r"no pixel lies near the focus at 3 m, all \(1 to 9 m\)"):
-        check(depth, Camera(85.0, 1.4, 3.0))
-
-
-def test_a_mistake_in_one_item_of_a_batch_is_found(metres: torch.Tensor) -> None:
-    both = torch.cat([metres, metres * 1000])
-    with pytest.warns(DepthWarning, match="millimetres"):
-        check(both, Camera(focus_m=3.0))
-    check(both, Camera(focus_m=torch.tensor([3.0, INF])), strict=True)
-
-
-def test_the_warning_can_be_filtered(metres: torch.Tensor) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DepthWarning)
-        check(metres * 1000, Camera(focus_m=3.0))
-
-
-def test_depths_in_place_of_circles_of_confusion_give_a_warning() -> None:
     assert coc_mistakes(torch.linspace(-30, 30, 96).expand(1, 1, 8, 96)) == []
-    (mistake,) = coc_mistakes(torch.linspace(800, 5000, 96).expand(1, 1, 8, 96))
+    (mistake,) = coc_mistakes(torch.linspace(800, 5000, 96).expand(1, 1, 8, 96))  # depths in place of coc
     assert "--depth-kind" in mistake.message
 
 

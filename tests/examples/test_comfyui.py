@@ -63,13 +63,10 @@ def render(node: Any, image: Tensor, depth: Tensor, **changes: Any) -> tuple[Ten
     return out
 
 
-def test_the_folder_is_a_custom_node(package: ModuleType, node: Any) -> None:
+def test_the_folder_is_a_custom_node_with_inputs_by_comfyuis_rules(package: ModuleType, node: Any) -> None:
     assert set(package.NODE_DISPLAY_NAME_MAPPINGS) == set(package.NODE_CLASS_MAPPINGS)
     assert isinstance(node.CATEGORY, str) and callable(getattr(node, node.FUNCTION))
     assert (FOLDER / "requirements.txt").read_text().split() == ["torchdof"]
-
-
-def test_inputs_follow_comfyuis_rules(node: Any) -> None:
     inputs = node.INPUT_TYPES()
     assert set(inputs) <= {"required", "optional", "hidden"}
     for kind, *extra in inputs["required"].values():
@@ -105,22 +102,14 @@ def test_the_point_of_focus_is_sharp(node: Any) -> None:
     assert not torch.equal(near, far)
 
 
-def test_white_is_near_or_far(node: Any) -> None:
+def test_kinds_of_depth_and_lenses_make_different_pictures(node: Any) -> None:
     image, depth = scene()
     changes = {"focus": "metres", "focus_m": 1.0, "sensor_width_mm": 4.0}
     near, _ = render(node, image, depth, **changes)
-    far, _ = render(node, image, depth, depth_kind="white is far", **changes)
-    assert not torch.allclose(near, far, atol=1e-2)
-
-
-@pytest.mark.parametrize("lens", ["gaussian", "sato_j15"])
-def test_every_lens_of_the_list_can_be_loaded(node: Any, lens: str) -> None:
-    lenses = node.INPUT_TYPES()["required"]["lens"][0]
-    assert lens in lenses
-    for name in lenses[2:]:
+    for other in ({"depth_kind": "white is far"}, {"lens": "gaussian"}, {"lens": "sato_j15"}):
+        assert not torch.allclose(near, render(node, image, depth, **changes, **other)[0], atol=1e-2)
+    for name in node.INPUT_TYPES()["required"]["lens"][0][2:]:
         assert BlurTable.load(name).name
-    image, depth = scene()
-    render(node, image, depth, lens=lens, sensor_width_mm=4.0)
 
 
 def test_points_out_of_focus_have_the_shape(node: Any) -> None:

@@ -1,18 +1,11 @@
 """``first_pictures.py``, which times first renderings: its parts, its checks, and two installations in turns."""
 
-import csv
-import json
-import math
-import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
-from torch import Tensor
 
 from examples.benchmarks import first_pictures
-from torchdof.bench.measurement import BenchScene, Seconds
 
 SCENES = Path(__file__).parents[1] / "data" / "scenes"
 
@@ -25,10 +18,10 @@ def figures(part: str, turn: int = 0) -> list[first_pictures.Figure]:
     ("part", "sizes", "radii_px"),
     [
         ("fresh-39", [(1350, 1080)], [(39, 39)]),
-        ("fresh-60", [(1333, 2000)], [(60, 60)]),
-        ("command", [(1333, 2000)] * 3, [(30, 30), (60, 60), (111, 111)]),
+        pytest.param("fresh-60", [(1333, 2000)], [(60, 60)], marks=pytest.mark.sweep),
+        pytest.param("command", [(1333, 2000)] * 3, [(30, 30), (60, 60), (111, 111)], marks=pytest.mark.sweep),
         ("cameras", [(160, 192)], [(4, 64)]),
-        ("pull", [(1080, 1920)] * 2, [(69, 69)] * 2),
+        pytest.param("pull", [(1080, 1920)] * 2, [(69, 69)] * 2, marks=pytest.mark.sweep),
         ("small", [(256, 256)] * 3, [(2, 8)] * 3),
         ("lamps", [(480, 640)], [(500, 500)]),
         ("noise", [(480, 640)], [(59, 60)]),
@@ -49,78 +42,9 @@ def test_a_part_renders_its_stated_sizes_and_blur_radii(
     assert not any(same) or part == "lamps", "a camera was rendered before"
 
 
-def test_a_figure_times_a_new_camera_the_same_camera_again_and_a_reference(monkeypatch: pytest.MonkeyPatch) -> None:
-    ticks = iter([Seconds(6.0, 4.0), Seconds(3.0, 1.0), Seconds(1.0, 8.0)] * 2)
-
-    def timed(*_: Tensor) -> tuple[Tensor, Seconds]:
-        return torch.ones(1, 3, 16, 16), next(ticks)
-
-    scene = BenchScene("x", torch.ones(1, 3, 16, 16), torch.ones(1, 1, 16, 16))
-    figure = first_pictures.Figure("figure", timed, [scene] * 2, beside=timed)
-    monkeypatch.setattr(first_pictures, "figures", lambda *_: [figure])
-    rows = first_pictures.turn_of("cameras", SCENES, 0)
-    assert rows == 2 * [rows[0]]
-    assert (rows[0]["new_ms"], rows[0]["cpu_ms"], rows[0]["over_again"], rows[0]["over_beside"]) == (6e3, 4e3, 4.0, 0.5)
-
-
-def test_an_installation_whose_pictures_are_wrong_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
-    original = first_pictures.blur_by_coc
-    monkeypatch.setattr(first_pictures, "figures", lambda *_: [])
-    monkeypatch.setattr(
-        first_pictures, "blur_by_coc", lambda *a, tolerance: original(*a, tolerance=tolerance) + 4 * tolerance
-    )
-    with pytest.raises(RuntimeError, match="does not keep its tolerance"):
-        first_pictures.turn_of("cameras", SCENES, 0)
-
-
 def test_the_command_renders_the_same_picture_as_blur_by_coc() -> None:
     scene = first_pictures.shipped(48, 64).seen(0.0, 5.0)
     picture, seconds = first_pictures.rendered(scene.image, scene.coc_px)
     expected = first_pictures.blur_by_coc(scene.image, scene.coc_px)
     assert first_pictures.error(picture, expected)["psnr_db"] > 30  # JPEG in and out
     assert seconds.wall > 0.1 and seconds.cpu > 0.1
-
-
-def test_installations_take_turns_and_have_adjacent_rows(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    calls = []
-
-    class Done:
-        def __init__(self, call: list[str]) -> None:
-            python, _, folder, _, part, _, turn = map(str, call)
-            calls.append((python, part, turn))
-            row = {"figure": part, "goal": "", "beside": "Y", "new_ms": 10.0 + int(turn) + 5 * (python == "other")}
-            self.stdout = "noise\n" + json.dumps([row])
-
-    # the module's own name, for Python's platform module calls subprocess.run as well
-    monkeypatch.setattr(first_pictures, "subprocess", SimpleNamespace(run=lambda call, **_: Done(call), PIPE=None))
-    arguments = [
-        "x",
-        str(SCENES),
-        "--parts",
-        "pull",
-        "--python",
-        "other",
-        "--repeat",
-        "2",
-        "--out",
-        str(tmp_path / "new"),
-    ]
-    monkeypatch.setattr(sys, "argv", arguments)
-    first_pictures.main()
-    assert calls == [(python, "pull", turn) for turn in "01" for python in (sys.executable, "other")]
-    rows = list(csv.DictReader((tmp_path / "new" / "first_pictures.csv").read_text().splitlines()))
-    assert [(row["by"], float(row["new_ms"]), float(row["spread_ms"])) for row in rows] == [
-        ("here", 10.5, 0.5),
-        ("other", 15.5, 0.5),
-    ]
-    assert (
-        math.isfinite(float(rows[0]["new_ms"]))
-        and "| pull | other |" in (tmp_path / "new" / "first_pictures.md").read_text()
-    )
-
-
-def test_an_unknown_part_is_refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(sys, "argv", ["x", str(SCENES), "--parts", "nothing"])
-    with pytest.raises(SystemExit):
-        first_pictures.main()
-    assert "invalid choice: 'nothing'" in capsys.readouterr().err

@@ -91,46 +91,27 @@ def test_a_click_sharpens_where_it_falls_and_blurs_elsewhere(used: Any) -> None:
         assert np.abs(other - sharp)[window].mean() > 0.008
 
 
-def test_nothing_is_fetched_from_other_hosts_and_the_console_stays_empty(used: Any) -> None:
+def test_the_page_works_alone_with_the_keyboard_and_on_a_phone(used: Any) -> None:
     _, seen = used
-    assert seen["elsewhere"] == [] and seen["console"] == []
-
-
-def test_a_saved_files_name_has_the_f_number_and_the_focus(used: Any) -> None:
-    folder, seen = used
+    assert seen["elsewhere"] == [] and seen["console"] == [], "nothing is fetched from other hosts"
     assert seen["nearName"] == f"motorcycle_f0.7_{seen['nearFocus'].removesuffix(' m')}m.png"
-
-
-def test_half_the_size_is_rendered_while_a_control_moves_and_the_full_size_at_rest(used: Any) -> None:
-    _, seen = used
     halves = [message["half"] for message in seen["dragAsked"] if message["type"] == "render"]
-    assert halves[0] is True and halves[-1] is False
+    assert halves[0] is True and halves[-1] is False, "half the size while a control moves, the full size at rest"
     assert [m["half"] for m in seen["nearAsked"] if m["type"] == "render"][-1] is False
-
-
-def test_everything_works_with_the_keyboard_and_has_a_name(used: Any) -> None:
-    _, seen = used
     assert seen["aperture"] == ["f/0.7", "f/1.4"]
     assert seen["keyboardFocus"][0] != seen["keyboardFocus"][1]
     assert seen["divider"] == "80" and seen["depthIsShown"]
     assert seen["unnamed"] == []
+    assert all(seen[f"{name}_overflow"] == 0 for name in ("desktop_light", "phone_light", "phone_dark"))
 
 
-def test_messages_about_bad_files_state_the_remedy(used: Any) -> None:
-    problems = used[1]["problems"]
+def test_relative_depth_and_bad_files_are_explained(used: Any) -> None:
+    _, seen = used
+    assert seen["ownKind"] == "disparity"
+    assert float(seen["ownNear"].removesuffix(" m")) < 1.1 and float(seen["ownTurned"].removesuffix(" m")) > 7.5
+    problems = seen["problems"]
     assert "notes.jpg: this browser cannot open it" in problems["photo"] and "JPEG or PNG" in problems["photo"]
     assert "in colour" in problems["depth"] and "shades of grey" in problems["depth"]
     assert "one value everywhere" in problems["flat"]
     assert "cut_depth.png" in problems["damaged"] and "damaged" in problems["damaged"]
     assert "90 × 60" in problems["frame"] and "40 × 60" in problems["frame"]
-
-
-def test_relative_depth_lies_between_the_given_distances_and_can_be_inverted(used: Any) -> None:
-    _, seen = used
-    assert seen["ownKind"] == "disparity"
-    assert float(seen["ownNear"].removesuffix(" m")) < 1.1 and float(seen["ownTurned"].removesuffix(" m")) > 7.5
-
-
-def test_the_page_fits_a_phone(used: Any) -> None:
-    _, seen = used
-    assert all(seen[f"{name}_overflow"] == 0 for name in ("desktop_light", "phone_light", "phone_dark"))

@@ -75,33 +75,24 @@ def test_the_graph_has_only_standard_operators_and_loops_that_skip_layers_withou
         assert sum(node.op_type == "If" for graph in graphs(body) for node in graph.node) >= least
     assert {"ScatterElements", "NonZero"} <= {node.op_type for node in rays.node}
     assert not {node.op_type for node in nodes} & {"Scan", "CastLike"} and not {node.domain for node in nodes} - {""}
+    # operators that a frame in focus does not need are inside a branch
+    assert len(model.graph.node) < 0.1 * len(nodes)
+    assert not {node.op_type for node in model.graph.node} & {"Conv", "Loop", "NonZero", "TopK", "ScatterElements"}
 
 
-def test_operators_that_a_frame_in_focus_does_not_need_are_inside_a_branch(layered: Any) -> None:
-    graph = onnx.load(layered.path).graph
-    assert len(graph.node) < 0.1 * sum(len(inner.node) for inner in graphs(graph))
-    assert not {node.op_type for node in graph.node} & {"Conv", "Loop", "NonZero", "TopK", "ScatterElements"}
-
-
-def test_weights_are_constants_in_the_same_graph_as_their_convolution(layered: Any) -> None:
-    for graph in graphs(onnx.load(layered.path).graph):
-        made = {name: node for node in graph.node for name in node.output}
-        for node in graph.node:
-            if node.op_type == "Conv":
-                weight = made[node.input[1]]
-                sources = [weight] if weight.op_type != "Gather" else [made[name] for name in weight.input]
-                assert all(source.op_type in ("Constant", "ConstantOfShape") for source in sources)
-                assert len(node.input) == 2
-
-
-def test_inputs_of_convolutions_are_not_copied_and_ramps_are_one_operator(layered: Any) -> None:
+def test_convolutions_take_constant_weights_and_inputs_that_are_not_copied(layered: Any) -> None:
     before, ramps = set(), 0
     for graph in graphs(onnx.load(layered.path).graph):
-        makers = {output: node.op_type for node in graph.node for output in node.output}
-        before |= {makers.get(node.input[0]) for node in graph.node if node.op_type == "Conv"}
+        makers = {name: node for node in graph.node for name in node.output}
         ramps += sum(node.op_type == "HardSigmoid" for node in graph.node)
-    assert before == {"Concat", "Conv"}
-    assert ramps > 10
+        for node in graph.node:
+            if node.op_type == "Conv":
+                maker, weight = makers.get(node.input[0]), makers[node.input[1]]
+                before.add(maker and maker.op_type)
+                sources = [weight] if weight.op_type != "Gather" else [makers[name] for name in weight.input]
+                assert all(source.op_type in ("Constant", "ConstantOfShape") for source in sources)
+                assert len(node.input) == 2
+    assert before == {"Concat", "Conv"} and ramps > 10, "a ramp is one operator"
 
 
 CATS_EYES = torchdof.BlurTable.polygon(5, vignetting=0.4)
@@ -113,10 +104,8 @@ SIMPLY = torchdof.DepthOfField(CAMERA, **SIMPLE)
     [
         (SIMPLY, {"inputs": "disparity"}, "inputs must be one of depth, coc_px"),
         (SIMPLY, {"opset": 17}, "opset must be 20 or newer"),
-        (SIMPLY, {"opset": 20.5}, "opset must be 20 or newer"),
         (SIMPLY, {"width": 640}, "same kernels at any image width"),
         (SIMPLY, {"channels": 0}, "channels must be a whole number"),
-        (SIMPLY, {"channels": "3"}, "channels must be a whole number"),
         (SIMPLY, {"path": "nowhere/dof.onnx"}, "there is no folder"),
         (torch.nn.Identity(), {}, r"dof must be a torchdof\.DepthOfField"),
         (torchdof.DepthOfField(torchdof.Camera(focus_m=torch.tensor([1.0, 2.0]))), {}, "focus_m must be a float"),
@@ -140,16 +129,6 @@ def test_a_file_that_differs_from_the_module_is_not_written(tmp_path: Path, monk
         to_onnx(torchdof.DepthOfField(CAMERA, **SIMPLE), tmp_path / "dof.onnx")
     assert [file.name for file in tmp_path.iterdir()] == ["dof.onnx"]
     assert (tmp_path / "dof.onnx").read_text() == "older"
-
-
-@pytest.mark.sweep
-def test_a_file_has_the_kernels_of_an_asymmetric_aperture(tmp_path: Path) -> None:
-    table = torchdof.BlurTable.polygon(3, 20.0, squeeze=1.6)
-    verification = to_onnx(torchdof.DepthOfField(CAMERA, table, **SIMPLE), tmp_path / "dof.onnx", inputs="coc_px")
-    assert verification.passed
-    image, coc = torch.rand(1, 3, 30, 40), torch.full((1, 1, 30, 40), 1.5)
-    (out,) = session(tmp_path / "dof.onnx").run(None, {"image": image.numpy(), "coc_px": coc.numpy()})
-    assert (torch.from_numpy(out) - image).abs().max() > 0.1
 
 
 def test_an_exporter_that_cannot_follow_is_refused_before_it_starts(

@@ -1,8 +1,8 @@
 """Fuzzes the readers and both engines: ``make fuzz``, or ``python -m tests.fuzz.run --seconds 3600``.
 
-Targets take turns on inputs from seeded mutation. They run in a worker process, which is started again when it dies,
-hangs or exceeds its memory. Findings are written to ``--findings`` and printed; a file that is copied to
-``found/TARGET/`` becomes a test.
+Targets take turns on inputs from seeded mutation. A turn is a process with limited memory, which writes each input to a
+file before it reads it. If it dies, hangs or finds a fault, that file is a finding: it is copied to ``--findings``. A
+file that is copied to ``found/TARGET/`` becomes a test.
 """
 
 import argparse
@@ -15,8 +15,6 @@ import resource
 import sys
 import tempfile
 import time
-from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 import torch
@@ -26,67 +24,47 @@ from tests.fuzz.mutate import mutated
 from tests.fuzz.targets import TARGETS
 
 _TIMEOUT_S = 120.0  # for one input; a busy machine needs seconds for some
-_MEMORY = 6 * 2**30  # address space of the worker in bytes
+_MEMORY = 6 * 2**30  # address space of a turn in bytes
 
 
-def work(pipe: Connection, folder: str) -> None:
-    """Receives (target, path) through the pipe and sends the finding, or None. Output is captured in a file."""
+def turn(name: str, folder: Path, seed: int, seconds: float) -> None:
+    """Reads mutated inputs for some seconds, until one is a finding; its description is written to a file."""
     torch.set_num_threads(1)
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    printed = os.open(Path(folder) / "printed", os.O_RDWR | os.O_CREAT | os.O_TRUNC)
+    printed = os.open(folder / "printed", os.O_RDWR | os.O_CREAT | os.O_TRUNC)
     os.dup2(printed, 1)
     os.dup2(printed, 2)
-    pipe.send(None)
-    while True:
-        name, path = pipe.recv()
-        os.ftruncate(printed, 0)
-        os.lseek(printed, 0, os.SEEK_SET)
-        wrong = targets.finding(TARGETS[name], Path(path))
+    (folder / "seeds").mkdir()
+    target, rng, end = TARGETS[name], random.Random(seed), time.monotonic() + seconds
+    corpus, path = list(targets.seeds(target, folder / "seeds")), input_of(name, folder)
+    while time.monotonic() < end:
+        path.write_bytes(mutated(rng.choice(corpus), corpus, target.suffix, rng))
+        wrong = targets.finding(target, path)
         lines = os.pread(printed, 10_000, 0).decode(errors="replace").splitlines()
         lines = [line for line in lines if line and not line.startswith("libpng ")]
-        if wrong is None and lines:
-            wrong = f"printed: {lines[0][:200]}"
-        pipe.send(wrong)
+        if wrong or lines:
+            (folder / "finding").write_text(wrong or f"printed: {lines[0][:200]}")
+            return
+        os.ftruncate(printed, 0)
 
 
-class Worker:
-    """The process in which targets run; started on demand."""
+def input_of(name: str, folder: Path) -> Path:
+    """File of the inputs of a target."""
+    return folder / ("capture.toml" if name == "manifest" else f"input{TARGETS[name].suffix}")
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.running: tuple[SpawnProcess, Connection] | None = None
 
-    def run(self, name: str, path: Path) -> str | None:
-        """The finding of a target on a file, or None."""
-        process, pipe = self.running or self._start()
-        try:
-            pipe.send((name, str(path)))
-            if not pipe.poll(_TIMEOUT_S):
-                self.stop()
-                return f"takes longer than {_TIMEOUT_S:g} s"
-            answer: str | None = pipe.recv()
-            return answer
-        except (EOFError, OSError):
-            process.join()
-            self.running = None
-            return f"ends the process with {process.exitcode}"
-
-    def _start(self) -> tuple[SpawnProcess, Connection]:
-        pipe, end = multiprocessing.Pipe()
-        process = multiprocessing.get_context("spawn").Process(target=work, args=(end, str(self.folder)))
-        process.start()
-        end.close()
-        pipe.recv()
-        self.running = process, pipe
-        return self.running
-
-    def stop(self) -> None:
-        """End the process."""
-        if self.running is not None:
-            self.running[0].kill()
-            self.running[0].join()
-        self.running = None
+def finding_of_turn(name: str, folder: Path, seed: int, seconds: float) -> str | None:
+    """The finding of a turn, or None."""
+    process = multiprocessing.get_context("spawn").Process(target=turn, args=(name, folder, seed, seconds))
+    process.start()
+    process.join(seconds + _TIMEOUT_S)
+    if process.is_alive():
+        process.kill()
+        return f"takes longer than {_TIMEOUT_S:g} s"
+    if (folder / "finding").exists():
+        return (folder / "finding").read_text()
+    return f"ends the process with {process.exitcode}" if process.exitcode else None
 
 
 def main() -> None:
@@ -97,37 +75,24 @@ def main() -> None:
     parser.add_argument("--target", choices=TARGETS, action="append", help="Repeat it for several; default: all.")
     parser.add_argument("--findings", type=Path, default=Path("build/fuzz"))
     arguments = parser.parse_args()
-    names = arguments.target or list(TARGETS)
+    names, kinds = arguments.target or list(TARGETS), set[tuple[str, str]]()
     arguments.findings.mkdir(parents=True, exist_ok=True)
-    rng, tried, found = random.Random(arguments.seed), dict.fromkeys(names, 0), {}
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        corpus = {}
-        for name in names:
-            (folder / name).mkdir()
-            corpus[name] = list(targets.seeds(TARGETS[name], folder / name))
-        worker, end = Worker(folder), time.monotonic() + arguments.seconds
-        while time.monotonic() < end:
-            for name in names:
-                turn_s = min(5.0, arguments.seconds / len(names) / 2) * (4.0 if name == "engines" else 1.0)
-                target, turn = TARGETS[name], time.monotonic() + turn_s
-                path = folder / ("capture.toml" if name == "manifest" else f"input{target.suffix}")
-                while time.monotonic() < min(turn, end):
-                    content = mutated(rng.choice(corpus[name]), corpus[name], target.suffix, rng)
-                    path.write_bytes(content)
-                    tried[name] += 1
-                    wrong = worker.run(name, path)
-                    kind = (name, re.sub(r"\d+|0x\w+", "0", wrong or "")[:50])
-                    if wrong and kind not in found:
-                        kept = arguments.findings / f"{name}-{hashlib.sha256(content).hexdigest()[:10]}{target.suffix}"
-                        kept.write_bytes(content)
-                        found[kind] = kept
-                        print(f"FOUND {name}: {wrong} ({kept})", flush=True)
-        worker.stop()
-    for name, count in tried.items():
-        kinds = sum(target == name for target, _ in found)
-        print(f"{name:>10}: {count:8} inputs, {kinds} kinds of findings")
-    sys.exit(1 if found else 0)
+    seed, end = arguments.seed, time.monotonic() + arguments.seconds
+    while (left := end - time.monotonic()) > 0:
+        name = names[seed % len(names)]
+        with tempfile.TemporaryDirectory() as folder:
+            wrong = finding_of_turn(name, Path(folder), seed, min(30.0, left))
+            kind = (name, re.sub(r"\d+|0x\w+", "0", wrong or "")[:50])
+            if wrong and kind not in kinds:
+                kinds.add(kind)
+                content = input_of(name, Path(folder)).read_bytes()
+                digest = hashlib.sha256(content).hexdigest()[:10]
+                kept = arguments.findings / f"{name}-{digest}{TARGETS[name].suffix}"
+                kept.write_bytes(content)
+                print(f"FOUND {name}: {wrong} ({kept})", flush=True)
+        seed += 1
+    print(f"{seed - arguments.seed} turns, {len(kinds)} kinds of findings")
+    sys.exit(1 if kinds else 0)
 
 
 if __name__ == "__main__":

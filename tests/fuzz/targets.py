@@ -17,6 +17,8 @@ import onnx
 import OpenImageIO as oiio
 import torch
 
+from tests.files import spec_with, store_parts
+from tests.scenes import lens_with_a_field
 from torchdof import BlurTable, blur_by_coc
 from torchdof.depth import read_depth
 from torchdof.export import describe
@@ -26,7 +28,6 @@ from torchdof.fit.lens.spot import focus_sensor, point_spread
 from torchdof.io.images import Picture, read_image, read_values, write_image
 from torchdof.io.metadata import camera_facts
 from torchdof.optics.aperture import Aperture
-from torchdof.optics.field import Field
 from torchdof.render import edges
 
 REFUSED = (ValueError, OSError, FitError)
@@ -61,10 +62,7 @@ def _image_seeds(suffix: str) -> Callable[[Path], None]:
         if suffix not in (".hdr", ".jpg", ".pfm"):
             write_image(folder / f"alpha{suffix}", _picture(4))
         if suffix == ".exr":
-            _tiled(folder / "tiled.exr", levels="ONE_LEVEL")
-            _tiled(folder / "mipmap.exr", levels="MIPMAP_LEVELS")
-            _parts(folder / "parts.exr")
-            _window(folder / "window.exr")
+            _exr_seeds(folder)
         if suffix == ".jpg":
             tags = {
                 "Exif:FocalLength": ("float", 50.0),
@@ -76,42 +74,23 @@ def _image_seeds(suffix: str) -> Callable[[Path], None]:
     return write
 
 
-def _spec(channels: tuple[str, ...] = ("R", "G", "B", "Z")) -> oiio.ImageSpec:
-    spec = oiio.ImageSpec(16, 16, len(channels), "half")
-    spec.channelnames = channels
-    return spec
+def _part(channels: tuple[str, ...] = ("R", "G", "B", "Z"), **attributes: Any) -> tuple[oiio.ImageSpec, np.ndarray]:
+    values = np.linspace(0.1, 1, 256 * len(channels), dtype=np.float32).reshape(16, 16, len(channels))
+    return spec_with(values, "half", channels, **attributes), values
 
 
-def _store(path: Path, specs: list[oiio.ImageSpec]) -> None:
-    output = oiio.ImageOutput.create(str(path))
-    assert output is not None and output.open(str(path), specs if len(specs) > 1 else specs[0])
-    for number, spec in enumerate(specs):
-        assert not number or output.open(str(path), spec, "AppendSubimage")
-        pixels = np.linspace(0.1, 1, spec.width * spec.height * spec.nchannels, dtype=np.float32)
-        assert output.write_image(pixels.reshape(spec.height, spec.width, spec.nchannels)), output.geterror()
-    output.close()
-
-
-def _tiled(path: Path, levels: str) -> None:
-    spec = _spec()
-    spec.tile_width = spec.tile_height = 16
-    if levels != "ONE_LEVEL":
-        spec.attribute("openexr:levelmode", 1)
-        spec.attribute("textureformat", "Plain Texture")
-    _store(path, [spec])
-
-
-def _parts(path: Path) -> None:
-    colour, depth = _spec(("R", "G", "B")), _spec(("Z",))
-    colour.attribute("name", "beauty")
-    depth.attribute("name", "depth")
-    _store(path, [colour, depth])
-
-
-def _window(path: Path) -> None:
-    spec = _spec()
+def _exr_seeds(folder: Path) -> None:
+    """With tiles, levels, parts and a window."""
+    tiled = _part()
+    levels = _part(openexr__levelmode=1, textureformat="Plain Texture")
+    for spec, _ in (tiled, levels):
+        spec.tile_width = spec.tile_height = 16
+    window = _part()
+    spec = window[0]
     spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height = -3, -5, 0, 0, 8, 8
-    _store(path, [spec])
+    for name, part in {"tiled": tiled, "mipmap": levels, "window": window}.items():
+        store_parts(folder / f"{name}.exr", [part])
+    store_parts(folder / "parts.exr", [_part(("R", "G", "B"), name="beauty"), _part(("Z",), name="depth")])
 
 
 def _read_picture(path: Path) -> None:
@@ -176,14 +155,8 @@ def _read_table(path: Path) -> None:
 
 def _field_seeds(folder: Path) -> None:
     """Tables with small fields; in files of large ones nearly every mutation would hit the light of one spot."""
-    coc, radius = torch.tensor([-0.4, 0.1, 0.5]), torch.tensor([0.0, 9.0, 20.0])
-    box = torch.tensor([0.01, 0.5, 0.4]) * (0.1 + coc.abs())[:, None, None].expand(3, 3, 3)
-    for colours, unit in ((1, "mm"), (3, "mm"), (3, "fraction")):
-        light = torch.rand(colours, 3, 3, 6, 4, generator=torch.Generator().manual_seed(colours))
-        units = {"unit": "mm", "sensor_width_mm": 36.0} if unit == "mm" else {"unit": unit}
-        sigma = {"sigma": torch.full((colours, 2), 0.2)}
-        lens = BlurTable("gaussian", [-0.4, 0.5], sigma, field=Field(coc, radius, box, light), **units)
-        lens.save(folder / f"{unit}{colours}.json")
+    for colours in (1, 3):
+        lens_with_a_field(colours).save(folder / f"{colours}.json")
 
 
 def _read_field(path: Path) -> None:

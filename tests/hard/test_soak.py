@@ -1,31 +1,10 @@
 """Many renderings in one process: memory does not grow; threads and worker processes render the same pictures."""
 
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
-from tests.hard import soak
-
-SOAK = Path(__file__).with_name("soak.py")
-
-
-def run_soak(*arguments: str) -> list[str]:
-    run = subprocess.run([sys.executable, str(SOAK), *arguments], capture_output=True, text=True, timeout=3000)
-    assert run.returncode == 0, run.stdout + run.stderr
-    return run.stdout.splitlines()
-
-
-@pytest.mark.sweep
-def test_memory_does_not_grow_over_a_thousand_renderings_and_workers_render_the_same_pictures() -> None:
-    lines = run_soak("--renderings", "1000")
-    assert [line.partition(":")[0] for line in lines if line.endswith("are the same")] == [
-        "8 threads",
-        "spawned workers",
-        "forked workers",
-    ]
-
+from tests.processes import output_of
 
 FORKED = """
 import os, signal, sys, torch
@@ -45,16 +24,8 @@ print(os.waitpid(child, 0)[1], torch.get_num_threads())
 
 @pytest.mark.hard
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no fork")
-@pytest.mark.parametrize("engine", ["torch", "native"])
 def test_a_forked_worker_renders_after_its_parent_has_rendered_with_two_threads(engine: str) -> None:
-    run = subprocess.run([sys.executable, "-c", FORKED, engine], capture_output=True, text=True, timeout=200)
-    assert run.stdout == "0 2\n", run.stdout + run.stderr
-
-
-@pytest.mark.hard
-def test_eight_threads_with_a_module_each_render_the_same_pictures() -> None:
-    truth = [soak.rendering(seed) for seed in range(12)]
-    assert soak.same(soak.in_threads(range(12), 8), truth)
+    assert output_of(FORKED, engine) == "0 2\n"
 
 
 MANY = """
@@ -77,7 +48,5 @@ print(early, rss())
 @pytest.mark.hard
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_memory_does_not_grow_over_500_frames() -> None:
-    done = subprocess.run([sys.executable, "-c", MANY], capture_output=True, text=True, timeout=400)
-    assert done.returncode == 0, done.stderr
-    early, late = (int(x) for x in done.stdout.split())
+    early, late = (int(x) for x in output_of(MANY).split())
     assert late < 1.05 * early

@@ -1,4 +1,4 @@
-"""A file is written whole or not at all: on full disks, with concurrent writers, and when the process ends."""
+"""A file is written whole or not at all: on full disks, and when the process ends."""
 
 import os
 import signal
@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 import torch
 
+from tests.processes import output_of
 from torchdof import BlurTable
-from torchdof.io import atomic
-from torchdof.io.atomic import whole_file, write_text
-from torchdof.io.images import Picture, read_image, write_image
+from torchdof.io.atomic import whole_file
+from torchdof.io.images import Picture, write_image
 
 pytestmark = pytest.mark.hard
 
@@ -67,27 +67,13 @@ def test_a_full_disk_is_an_error_and_leaves_the_old_file(tmp_path: Path) -> None
     for name in folders:
         (tmp_path / name).mkdir()
         (tmp_path / name / name.split()[0]).write_text("old")
-    call = [sys.executable, "-c", CUT, *folders]
-    run = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    lines = output_of(CUT, *folders, cwd=tmp_path).splitlines()
     for name in folders:
-        results = [line.removeprefix(name) for line in run.stdout.splitlines() if line.startswith(name)]
-        assert len(results) == 4 and all(line.startswith(" refused:") for line in results), run.stdout + run.stderr
+        results = [line.removeprefix(name) for line in lines if line.startswith(name)]
+        assert len(results) == 4 and all(line.startswith(" refused:") for line in results), lines
         file = name.split()[0]
         assert sorted(p.name for p in (tmp_path / name).iterdir()) == [f"whole{file}", file]
         assert (tmp_path / name / file).read_text() == "old"
-
-
-def test_concurrent_writers_of_one_file_leave_it_whole(tmp_path: Path) -> None:
-    script = """
-import sys, torch
-from torchdof.io.images import Picture, write_image
-for _ in range(20):
-    write_image("x.exr", Picture(torch.full((1, 3, 50, 60), float(sys.argv[1]))))
-"""
-    runs = [subprocess.Popen([sys.executable, "-c", script, value], cwd=tmp_path) for value in ("1", "2")]
-    assert [run.wait(timeout=120) for run in runs] == [0, 0]
-    assert read_image(tmp_path / "x.exr").pixels.unique().tolist() in ([1.0], [2.0])
-    assert [p.name for p in tmp_path.iterdir()] == ["x.exr"]
 
 
 WRITING = """
@@ -145,17 +131,6 @@ def test_a_signal_handler_of_the_caller_is_kept(tmp_path: Path) -> None:
             assert signal.getsignal(signal.SIGTERM) == mine
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-def test_a_folder_is_searched_for_abandoned_files_once(tmp_path: Path) -> None:
-    for _ in range(2):
-        write_text(tmp_path / "x.txt", "x")
-        (tmp_path / f".{'0' * 32}.part").touch()
-        os.utime(tmp_path / f".{'0' * 32}.part", (0, 0))
-    assert (tmp_path / f".{'0' * 32}.part").exists()
-    atomic._remove_abandoned.cache_clear()
-    write_text(tmp_path / "x.txt", "x")
-    assert [p.name for p in tmp_path.iterdir()] == ["x.txt"]
 
 
 def test_a_link_is_followed_and_kept(tmp_path: Path) -> None:

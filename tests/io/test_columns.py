@@ -6,7 +6,6 @@ import re
 import pytest
 from rich.console import Console
 
-from torchdof.bench.report import publish
 from torchdof.io.columns import print_columns
 
 COLUMNS = {
@@ -32,14 +31,3 @@ def test_columns_that_do_not_fit_are_folded_and_not_cut(width: int) -> None:
     # each part starts with the first column; the title is above the first part only
     assert cells.count("distance m") == sum("──" in line for line in lines) == {40: 6, 80: 2, 200: 1}[width]
     assert sum("colours" in line for line in lines) == 1
-
-
-def test_the_table_of_a_benchmark_fits_80_columns(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    scenes = [f"scene/{k}" for k in range(9)]
-    publish("Losses", {"losses": [{"depth": "half-res", **dict.fromkeys(scenes, "32.90 / 31.70 / 24.25")}]}, [], None)
-    lines = capsys.readouterr().out.splitlines()
-    assert max(map(len, lines)) <= 80 and sum(line.count("32.90 / 31.70 / 24.25") for line in lines) == len(scenes)
-    assert sum(line.startswith("half-res") for line in lines) == 3

@@ -21,6 +21,8 @@ import OpenImageIO as oiio
 import pytest
 import torch
 
+from tests.files import spec_with, store, store_parts
+from tests.processes import output_of
 from torchdof import BlurTable
 from torchdof.io import decode, foreign
 from torchdof.io.decode import MOST_ATTRIBUTES
@@ -44,11 +46,7 @@ def with_values(values: np.ndarray, *names: str, kind: str = "float", tags: dict
     """Writes a file with OpenImageIO alone, then changes ``tags`` of a TIFF."""
 
     def make(path: Path) -> None:
-        spec = oiio.ImageSpec(values.shape[1], values.shape[0], values.shape[2], kind)
-        spec.channelnames = names or spec.channelnames
-        output = oiio.ImageOutput.create(str(path))
-        assert output is not None and output.open(str(path), spec)
-        assert output.write_image(values) and output.close()
+        store(path, values, kind, names or None)
         content = bytearray(path.read_bytes())
         for tag, value in (tags or {}).items():
             start = struct.unpack_from("<I", content, 4)[0] + 2
@@ -321,23 +319,12 @@ def huge_exr(path: Path) -> None:
     path.write_bytes(content)
 
 
-def with_parts(path: Path, count: int) -> None:
-    """Writes an EXR of ``count`` parts of 40 x 40 pixels."""
-    specs = [oiio.ImageSpec(40, 40, 3, "half") for _ in range(count)]
-    for number, spec in enumerate(specs):
-        spec.attribute("oiio:subimagename", f"part {number}")
-    output = oiio.ImageOutput.create(str(path))
-    assert output is not None and output.open(str(path), tuple(specs))
-    for number, spec in enumerate(specs):
-        assert number == 0 or output.open(str(path), spec, "AppendSubimage")
-        assert output.write_image(np.zeros((40, 40, 3), np.float16))
-    assert output.close()
-
-
 def test_all_parts_are_held_against_memory_before_the_first_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with_parts(tmp_path / "x.exr", 5)  # 144 kB when read, of which 29 kB are one part's
+    black = np.zeros((40, 40, 3), np.float16)
+    parts = [(spec_with(black, "half", oiio__subimagename=f"part {n}"), black) for n in range(5)]
+    store_parts(tmp_path / "x.exr", parts)  # 144 kB when read, of which 29 kB are one part's
     assert read_image(tmp_path / "x.exr", layer="part 3").pixels.shape == (1, 3, 40, 40)
     monkeypatch.setattr(decode, "free_bytes", lambda: 1e5)
     monkeypatch.setattr(oiio.ImageInput, "read_image", lambda *_: pytest.fail("read"))
@@ -373,20 +360,12 @@ def read(name):
 """
 
 
-def output_of(code: str, folder: Path, names: list[str]) -> list[str]:
-    run = subprocess.run(
-        [sys.executable, "-c", READ + code, *names], cwd=folder, capture_output=True, text=True, timeout=300
-    )
-    assert run.returncode == 0, run.stderr[-500:]
-    return run.stdout.splitlines()
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="limits memory")
 def test_huge_sizes_in_a_header_are_refused_without_the_memory(tmp_path: Path) -> None:
     for name, make in HUGE.items():
         make(tmp_path / name)
     code = "limit(6000)\nfor name in sys.argv[1:]:\n    read(name)\nprint(memory.peak_mb())"
-    *lines, megabytes = output_of(code, tmp_path, [*HUGE])
+    *lines, megabytes = output_of(READ + code, *HUGE, cwd=tmp_path).splitlines()
     assert len(lines) == 7 and all(re.match(r"(huge\.\w+) refused: .*\1", line) for line in lines), lines
     assert float(megabytes) < 1500
 
@@ -403,16 +382,8 @@ def test_a_picture_that_does_not_fit_into_memory_is_refused(known: bool, tmp_pat
     (tmp_path / "x.png").write_bytes(png(side, zlib.compress(bytes(side * (3 * side + 1)))))
     names = sorted(path.name for path in tmp_path.iterdir())
     code = "decode.free_bytes = lambda: float('inf')\n" * (not known)
-    lines = output_of(code + "limit(24)\nfor name in sys.argv[1:]:\n    read(name)", tmp_path, names)
+    code += "limit(24)\nfor name in sys.argv[1:]:\n    read(name)"
+    lines = output_of(READ + code, *names, cwd=tmp_path).splitlines()
     assert len(lines) == 10
     why = "GiB of memory are free|more than there is memory for|allocate" + "|does not fit into memory" * (not known)
     assert all(re.match(rf"(x\.\w+) refused: \1: .*({why})", line) for line in lines), lines
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="measures memory")
-def test_reading_needs_memory_for_the_stored_picture_and_its_light_only(tmp_path: Path) -> None:
-    side = 3000
-    (tmp_path / "x.png").write_bytes(png(side, zlib.compress(bytes(side * (3 * side + 1)))))
-    code = "before = memory.peak_mb()\nread_image('x.png')\nprint(memory.peak_mb() - before)"
-    (megabytes,) = output_of(code, tmp_path, [])
-    assert float(megabytes) * 1e6 / side**2 < 1.3 * (3 + 3 * 4)

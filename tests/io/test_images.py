@@ -9,38 +9,11 @@ import OpenImageIO as oiio
 import pytest
 import torch
 
+from tests.files import spec_with, store, store_parts
 from torchdof.io.images import Picture, read_image, read_values, write_image
 
 GREY = 0.21404114  # linear light of an sRGB value of 0.5
 RGB = ("R", "G", "B")
-
-
-def spec_with(
-    array: np.ndarray, sample: str, names: tuple[str, ...] | None = None, **attributes: Any
-) -> oiio.ImageSpec:
-    spec = oiio.ImageSpec(array.shape[1], array.shape[0], array.shape[2], sample)
-    if names is not None:
-        spec.channelnames = names
-        spec.alpha_channel = names.index("A") if "A" in names else -1
-    for name, value in attributes.items():
-        spec.attribute(name.replace("__", ":"), value)
-    return spec
-
-
-def store(path: Path, array: np.ndarray, sample: str, names: tuple[str, ...] | None = None, **attributes: Any) -> Path:
-    """Writes stored numbers with OpenImageIO alone."""
-    array = np.atleast_3d(array)
-    return store_parts(path, [(spec_with(array, sample, names, **attributes), array)])
-
-
-def store_parts(path: Path, parts: list[tuple[oiio.ImageSpec, np.ndarray]]) -> Path:
-    output, specs = oiio.ImageOutput.create(str(path)), tuple(spec for spec, _ in parts)
-    assert output is not None and output.open(str(path), specs if len(parts) > 1 else specs[0])
-    for number, (spec, array) in enumerate(parts):
-        assert not number or output.open(str(path), spec, "AppendSubimage")
-        assert output.write_image(np.ascontiguousarray(array)), output.geterror()
-    assert output.close()
-    return path
 
 
 def spec_of(path: Path) -> oiio.ImageSpec:
@@ -68,13 +41,9 @@ def ramp(channels: int = 3, height: int = 4, width: int = 6) -> torch.Tensor:
 @pytest.mark.parametrize(
     ("suffix", "sample", "transfer", "channels", "tolerance"),
     [
-        (".exr", "half", "linear", "RGB", 5e-4),
         (".exr", "float", "linear", "RGB", 0.0),
         (".exr", "float", "srgb", "RGB", 1e-6),
-        (".tif", "float", "linear", "RGB", 0.0),
         (".tif", "16", "srgb", "RGB", 2e-5),
-        (".tiff", "8", "srgb", "RGB", 5e-3),
-        (".png", "8", "srgb", "RGB", 5e-3),
         (".png", "16", "srgb", "RGB", 2e-5),
         (".png", "16", "linear", "RGB", 1e-5),
         (".jpg", "8", "srgb", "RGB", 0.1),
@@ -82,11 +51,9 @@ def ramp(channels: int = 3, height: int = 4, width: int = 6) -> torch.Tensor:
         (".pfm", "float", "linear", "RGB", 0.0),
         (".exr", "half", "linear", "Y", 5e-4),
         (".png", "8", "srgb", "Y", 5e-3),
-        (".tif", "8", "srgb", "Y", 5e-3),
         (".jpg", "8", "srgb", "Y", 0.05),
         (".pfm", "float", "linear", "Y", 0.0),
         (".exr", "half", "linear", "YA", 5e-4),
-        (".png", "16", "srgb", "YA", 1e-4),
         (".tif", "16", "srgb", "YA", 1e-4),
         (".tif", "float", "linear", "RGBA", 1e-6),
         (".png", "8", "linear", "RGBA", 5e-3),
@@ -124,16 +91,12 @@ def test_every_integer_value_survives_reading_and_writing_bit_exact(tmp_path: Pa
     assert np.array_equal(stored(tmp_path / f"b{suffix}"), values)
 
 
+FLOATS = [(".tif", "float"), (".tif", "double"), (".exr", "half")]  # although the tag of the first is sRGB
+
+
 @pytest.mark.parametrize(
     ("suffix", "sample", "light"),
-    [
-        (".png", "uint8", GREY),
-        (".tif", "uint16", GREY),
-        (".tif", "float", 0.5),  # although its tag is sRGB
-        (".tif", "double", 0.5),
-        (".exr", "half", 0.5),
-        (".jpg", "uint8", GREY),
-    ],
+    [(".png", "uint8", GREY), (".tif", "uint16", GREY), (".jpg", "uint8", GREY), *((*kind, 0.5) for kind in FLOATS)],
 )
 def test_integers_are_srgb_and_floats_are_linear_unless_stated(
     tmp_path: Path, suffix: str, sample: str, light: float
@@ -155,15 +118,6 @@ def test_transfer_is_kept_from_integers_to_integers_and_else_is_the_default(tmp_
     ):
         write_image(tmp_path / name, dataclasses.replace(picture, **changes))  # type: ignore[arg-type]
         assert stored(tmp_path / name)[0, 0, 0] == first
-
-
-def test_light_is_float32_with_any_default_dtype(tmp_path: Path) -> None:
-    path = store(tmp_path / "x.png", np.full((2, 2, 3), 128, np.uint8), "uint8")
-    torch.set_default_dtype(torch.float64)
-    try:
-        assert read_image(path).pixels.dtype == torch.float32
-    finally:
-        torch.set_default_dtype(torch.float32)
 
 
 @pytest.mark.parametrize(("suffix", "sample"), [(".png", "8"), (".png", "16"), (".tif", "8"), (".tif", "float")])
@@ -218,15 +172,6 @@ def test_a_depth_channel_is_found_beside_colour_and_normals(tmp_path: Path, dept
         return
     assert picture.depth is not None and bool((picture.depth == 1234.5).all())
     assert read_values(tmp_path / "x.exr")[0, 0, 0, 0] == 1234.5
-
-
-def test_half_colour_with_float_depth_stays_half(tmp_path: Path) -> None:
-    values = np.full((2, 3, 4), 1.0001, np.float32)
-    spec = spec_with(values, "half", ("R", "G", "B", "Z"))
-    spec.channelformats = (oiio.HALF, oiio.HALF, oiio.HALF, oiio.FLOAT)
-    picture = read_image(store_parts(tmp_path / "x.exr", [(spec, values)]))
-    assert picture.sample == "half"
-    assert picture.depth is not None and picture.depth[0, 0, 0, 0].item() == pytest.approx(1.0001, abs=1e-7)
 
 
 def test_layers_are_chosen_by_name_and_plain_channels_come_first(tmp_path: Path) -> None:
@@ -301,12 +246,9 @@ def test_metadata_of_the_input_is_kept(tmp_path: Path, suffix: str) -> None:
     back = spec_of(tmp_path / f"b{suffix}")
     for name, value in attributes.items():
         assert back.getattribute(name.replace("__", ":")) == (value if isinstance(value, str) else pytest.approx(value))
-
-
-def test_lossy_compression_of_an_exr_is_replaced_by_zip(tmp_path: Path) -> None:
-    source = store(tmp_path / "a.exr", np.zeros((4, 4, 3), np.float32), "half", compression="dwaa:45")
-    write_image(tmp_path / "b.exr", read_image(source))
-    assert spec_of(tmp_path / "b.exr").get_string_attribute("compression") == "zip"
+    if suffix == ".exr":  # all but a lossy compression
+        write_image(tmp_path / "b.exr", read_image(store(source, stored(source), "half", compression="dwaa:45")))
+        assert spec_of(tmp_path / "b.exr").get_string_attribute("compression") == "zip"
 
 
 # Maps

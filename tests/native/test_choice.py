@@ -6,15 +6,6 @@ import torch
 from torchdof import blur_by_coc, native
 
 
-@pytest.mark.parametrize(("value", "engine"), [("native", "native"), (None, "native"), ("torch", "torch")])
-def test_the_compiled_engine_is_the_default(value: str | None, engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("TORCHDOF_ENGINE", raising=False)
-    if value is not None:
-        monkeypatch.setenv("TORCHDOF_ENGINE", value)
-    assert native.describe().startswith(f"{engine} (")
-    assert engine == "torch" or native.describe() in ("native (avx2)", "native (baseline)")
-
-
 def test_an_engine_of_another_version_is_not_used_and_gives_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("TORCHDOF_ENGINE", raising=False)
     monkeypatch.setattr(native, "_REVISION", -1)

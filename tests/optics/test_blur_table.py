@@ -7,9 +7,6 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
-from torch import Tensor
 from torch.testing import assert_close
 
 from torchdof import BlurTable
@@ -73,6 +70,7 @@ IN_MM = BlurTable("disc", [0.1, 0.2], {"radius": [0.1, 0.3]}, unit="mm", sensor_
         (BlurTable.disc(), 10, [3], {"radius": [3]}),
         (BlurTable.disc(), 10_000, [3], {"radius": [3]}),
         (BlurTable.gaussian(0.25), 100, [8], {"sigma": [2]}),
+        (BlurTable.gaussian(), 100, [2], {"sigma": [1]}),  # the second moment of a disc, R^2 / 2, is 2 sigma^2
     ],
     ids=str,
 )
@@ -81,34 +79,6 @@ def test_parameters_are_linear_between_nodes_and_lengths_grow_beyond(
 ) -> None:
     found = at(table, *coc_px, width=width)
     assert {name: found[name] for name in expected} == {name: pytest.approx(v) for name, v in expected.items()}
-
-
-@given(st.floats(-20.0, 20.0), st.floats(-1e-6, 1e-6))
-def test_parameters_are_continuous_in_the_coc(coc: float, step: float) -> None:
-    first, second = at(TWO_SIDES, coc, width=1), at(TWO_SIDES, coc + step, width=1)
-    for name in first:
-        assert abs(first[name][0] - second[name][0]) <= abs(step) + 1e-12  # no parameter is steeper than the coc
-
-
-def test_gaussian_has_the_second_moment_of_the_disc_by_default() -> None:
-    r = torch.linspace(0, 20, 200_001, dtype=torch.float64)
-    moments = []
-    for table in (BlurTable.disc(), BlurTable.gaussian()):
-        params = {name: value[0] for name, value in table.params(torch.tensor(2.0), 100).items()}
-        mass = psf.profile(table.family, r, params) * r
-        moments.append(float((mass * r**2).sum() / mass.sum()))
-    assert moments[0] == pytest.approx(2.0, rel=1e-4) and moments[1] == pytest.approx(moments[0], rel=1e-4)
-
-
-def test_parameters_are_differentiable_in_the_coc() -> None:
-    coc = torch.tensor([-500.0, -110.0, 30.0, 350.0, 900.0], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda c: tuple(TWO_SIDES.params(c, 100).values()), coc)
-
-
-def test_kernels_are_differentiable_in_the_coc() -> None:
-    coc = torch.tensor([-1.3, 0.2, 0.7], dtype=torch.float64, requires_grad=True)
-    for table in (BlurTable.disc(), BlurTable.gaussian(), BlurTable.load("sato_j15")):
-        assert torch.autograd.gradcheck(lambda c, table=table: table.kernels(c, 100, size=5), coc)
 
 
 @pytest.mark.parametrize("name", ["disc", "gaussian", "sato_j15"])
@@ -126,21 +96,10 @@ def test_a_blur_in_focus_fades_in_with_the_square_of_the_coc() -> None:
     moved = 1.0 - kernels[:, 0, 4, 4]
     assert_close(moved[:3], torch.tensor([0.0, 0.04, 0.16], dtype=torch.float64), rtol=1e-8, atol=1e-8)
     assert_close(kernels[3, 0], psf.gaussian(0.8, size=9))
-
-
-def test_a_small_blur_in_focus_is_complete_at_a_small_coc() -> None:
-    table = BlurTable("gaussian", [0.0, 1.0], {"sigma": [[0.05, 0.05], [0.8, 0.8]]})
-    kernels = table.kernels(torch.tensor([0.07], dtype=torch.float64), 100, size=9)[0]
-    assert_close(kernels[0], psf.gaussian(0.05, size=9))
-    assert float(kernels[1, 4, 4]) > 0.9  # each colour fades in by its own blur
-
-
-@pytest.mark.parametrize("name", ["disc", "gaussian", "sato_j15"])
-def test_kernels_change_continuously_through_focus(name: str) -> None:
-    table = {"disc": BlurTable.disc, "gaussian": BlurTable.gaussian}.get(name, lambda: BlurTable.load(name))()
-    coc = torch.arange(-1.6, 1.6, 4e-3, dtype=torch.float64)
-    jumps = table.kernels(coc, 100, size=11).diff(dim=0).abs().sum((-2, -1))
-    assert float(jumps.max()) < 0.03
+    colours = BlurTable("gaussian", [0.0, 1.0], {"sigma": [[0.05, 0.05], [0.8, 0.8]]})
+    small, large = colours.kernels(torch.tensor([0.07], dtype=torch.float64), 100, size=9)[0]
+    assert_close(small, psf.gaussian(0.05, size=9))  # each colour fades in by its own blur
+    assert float(large[4, 4]) > 0.9
 
 
 def test_kernels_are_those_of_the_family_at_the_table_s_parameters() -> None:
@@ -188,30 +147,21 @@ def test_the_shipped_table_is_table_one_of_the_paper() -> None:
     assert float(params["r_c"]) == pytest.approx(4.2853e-4)
     assert float(params["sigma"]) ** 2 == pytest.approx(5.5114e-6, rel=1e-4)
     assert table.provenance["source"] and table.unit == "relative"
-
-
-def test_the_shipped_table_blurs_as_much_as_the_disc_of_its_coc() -> None:
+    # its coc is that of the disc with the same second moment
     r = torch.linspace(0.0, 0.03, 300_001, dtype=torch.float64)
-    table = BlurTable.load("sato_j15")
-    mass = psf.profile("ring", r, {k: float(v) for k, v in table.node_params.items()}) * r
+    mass = psf.profile("ring", r, {k: float(v) for k, v in params.items()}) * r
     assert float((mass * r**2).sum() / mass.sum()) == pytest.approx(float(table.coc) ** 2 / 2, rel=1e-4)
 
 
-def test_blur_texture_is_the_fitted_profile_with_its_strength() -> None:
-    table = BlurTable.load("sato_j15")
-    texture = table.blur_texture(10.0, width=512, size=41)
-    sigma, r_c = at(table, 10.0)["sigma"][0], at(table, 10.0)["r_c"][0]
-    expected = 0.58116 * math.exp(-((math.hypot(3, 4) - r_c) ** 2) / (2 * sigma**2))
-    assert texture.shape == (1, 41, 41)
-    assert float(texture[0, 20 + 3, 20 - 4]) == pytest.approx(expected, rel=1e-12)
-
-
-def test_blur_texture_takes_the_strength_of_the_nearest_node() -> None:
+def test_blur_texture_is_the_profile_with_the_strength_of_the_nearest_node() -> None:
     table = BlurTable.from_dict(example(unit="fraction", sensor_width_mm=None))
     for coc, strength in ((-19.0, 0.5), (-11.0, 0.6), (28.0, 0.7)):
         sigma, r_c = at(table, coc)["sigma"][0], at(table, coc)["r_c"][0]
-        centre = float(table.blur_texture(coc, width=100, size=5)[0, 2, 2])
-        assert centre == pytest.approx(strength * math.exp(-(r_c**2) / (2 * sigma**2)))
+        texture = table.blur_texture(coc, width=100, size=9)
+        assert texture.shape == (1, 9, 9)
+        for dy, dx in ((0, 0), (3, -4)):
+            expected = strength * math.exp(-((math.hypot(dy, dx) - r_c) ** 2) / (2 * sigma**2))
+            assert float(texture[0, 4 + dy, 4 + dx]) == pytest.approx(expected, rel=1e-12)
 
 
 ROUND_TRIPS = [
@@ -242,50 +192,23 @@ NOT_FINITE = [1.0, math.nan, 2.0]
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"schema": None}, "schema must be 'torchdof/blur-table', got None"),
         ({"schema": "lut"}, "schema must be 'torchdof/blur-table', got 'lut'"),
         ({"version": 4}, "version must be 1 or 2 or 3, got 4; update torchdof"),
-        ({"version": None}, "version must be 1 or 2 or 3, got None"),
         ({"family": None}, "family is missing"),
-        ({"unit": None}, "unit is missing"),
-        ({"coc": None}, "coc is missing"),
-        ({"params": None}, "params is missing"),
         ({"lens": "50 mm"}, "lens is not a field of a blur table"),
-        ({"family": 3}, "family must be a str, got int"),
         ({"family": "box"}, "family must be one of gaussian, ring"),
-        ({"unit": ["mm"]}, "unit must be a str, got list"),
         ({"unit": "inch"}, "unit must be one of fraction, mm, relative, got 'inch'"),
-        ({"name": 7}, "name must be a str, got int"),
-        ({"provenance": "me"}, "provenance must be a dict, got str"),
-        ({"params": [1.0]}, "params must be a dict, got list"),
         ({"params": {"sigma": [1.0, 2.0, 3.0]}}, "params of ring must be sigma, r_c, got sigma"),
-        (
-            {"params": {"sigma": [1.0, 2.0, 3.0], "r_c": [1.0]}},
-            r"params.r_c must be \[N\] .* N = 3 nodes",
-        ),
+        ({"params": {"sigma": [1.0, 2.0, 3.0], "r_c": [1.0]}}, r"params.r_c must be \[N\] .* N = 3 nodes"),
         ({"params": {"sigma": NOT_FINITE, "r_c": [0.0] * 3}}, "params.sigma must be finite numbers"),
         ({"params": {"sigma": [1.0] * 3, "r_c": [0.0, -0.1, 0.0]}}, "params.r_c must be >= 0, got -0.1"),
-        ({"params": {"sigma": [1.0] * 3, "r_c": ["a"] * 3}}, "params.r_c must be numbers"),
         ({"params": {"sigma": [[1.0] * 3] * 3, "r_c": [[1.0] * 3] * 2}}, "params.r_c has 2 channels where other"),
         ({"coc": [0.1, -0.1, 0.3]}, "coc must be strictly increasing"),
-        ({"coc": [-0.1, -0.1, 0.3]}, "coc must be strictly increasing"),
-        ({"coc": []}, "coc must be strictly increasing"),
         ({"coc": [0.0]}, "coc must be strictly increasing signed numbers, one a node and not only 0"),
-        ({"coc": NOT_FINITE}, "coc must be finite numbers"),
-        ({"coc": "three"}, "coc must be numbers, got three"),
-        ({"coc": [[-0.2, 0.3]]}, "coc must be strictly increasing"),
-        ({"coc": [True, False]}, "coc must be numbers"),
-        ({"coc": {"a": 1}}, "coc must be numbers"),
         ({"sensor_width_mm": None}, "sensor_width_mm"),
         ({"sensor_width_mm": 0.0}, "sensor_width_mm must be positive, got 0"),
-        ({"sensor_width_mm": math.nan}, "sensor_width_mm must be positive"),
-        ({"sensor_width_mm": "36"}, "sensor_width_mm must be a number, got '36'"),
-        ({"sensor_width_mm": True}, "sensor_width_mm must be a number, got True"),
-        ({"unit": "fraction"}, "sensor_width_mm"),
         ({"unit": "relative", "sensor_width_mm": None}, "unit 'relative' takes one node on each side"),
         ({"strength": [1.0]}, r"strength must hold one number a node \(3\), got shape \[1\]"),
-        ({"strength": "high"}, "strength must be numbers"),
-        ({"residual": NOT_FINITE}, "residual must be finite numbers"),
     ],
 )
 def test_a_bad_field_is_refused_by_name(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
@@ -296,19 +219,6 @@ def test_a_bad_field_is_refused_by_name(changes: dict[str, Any], message: str, t
     path.write_text(json.dumps(data))
     with pytest.raises(ValueError, match=f"lens.json: {message}"):
         BlurTable.load(path)
-
-
-@pytest.mark.parametrize(
-    ("family", "params", "message"),
-    [
-        ("radial", {"values": [[1.0]], "radius": [1.0]}, "params.values must hold at least two values a node, not all"),
-        ("radial", {"values": [[0.0, 0.0]], "radius": [1.0]}, "params.values must hold at least two values a node"),
-        ("softm", {"radius": [1.0], "sigma": [0.0], "b": [-2.0], "m": [2.0]}, "params.b must be >= -1, got -2"),
-    ],
-)
-def test_bad_values_of_a_profile_are_refused(family: str, params: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        BlurTable(family, [1.0], params)
 
 
 @pytest.mark.parametrize(
@@ -338,25 +248,19 @@ def test_an_unknown_name_lists_the_shipped_tables() -> None:
         BlurTable.load("sato")
 
 
-def test_kernels_sum_to_one_at_any_coc() -> None:
-    coc: Tensor = torch.linspace(-12, 12, 9)
-    for table in ROUND_TRIPS:
-        sums = table.kernels(coc, 100).sum((-2, -1))
-        assert_close(sums, torch.ones_like(sums), rtol=0.0, atol=1e-12)
-
-
 SOFT = {"radius": [0.01], "sigma": [0.003], "b": [1.0]}
 
 
 @pytest.mark.parametrize(
     ("family", "coc", "params", "message"),
     [
+        ("radial", [0.01], {"values": [[1.0]], "radius": [0.01]}, "params.values must hold at least two values a node"),
+        ("radial", [0.01], {"values": [[0.0, 0.0]], "radius": [0.01]}, "params.values must hold at least two values"),
+        ("softm", [0.01], {**SOFT, "b": [-2.0], "m": [2.0]}, "params.b must be >= -1, got -2"),
         ("softm", [0.01], {**SOFT, "m": [1000.0]}, "params.m must be <= 100, got 1000"),
-        ("softm", [0.01], {**SOFT, "m": [1e300]}, "params.m must be <= 100, got 1e"),
         ("gaussian", [0.01], {"sigma": [1e9]}, "params must be lengths in the unit of coc, got a kernel that reaches"),
         ("disc", [-0.01, 1e-320], {"radius": [0.01, 0.02]}, "coc must reach somewhere from 1e-09 to .* got 9.9"),
         ("disc", [-0.01, 1e-7], {"radius": [0.01, 0.02]}, "params must be lengths .* to 0.02 where coc is 1e-07"),
-        ("disc", [1e-300], {"radius": [1e-300]}, "coc must reach somewhere from 1e-09 to"),
         ("disc", [1e90], {"radius": [1e90]}, r"coc must reach somewhere from 1e-09 to 1e\+06 \(fraction\), got 1e"),
     ],
 )

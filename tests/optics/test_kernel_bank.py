@@ -1,7 +1,5 @@
 """Kernels from templates equal those of the PSF, in both engines, at any size."""
 
-import threading
-
 import pytest
 import torch
 
@@ -89,39 +87,7 @@ def test_kernels_change_continuously_with_the_radius(table: BlurTable) -> None:
         assert float((torch.nn.functional.pad(one, (spare,) * 4) - other).abs().sum((-2, -1)).max()) < 1e-3
 
 
-def test_cells_of_a_template_leave_no_ripples_in_a_large_kernel() -> None:
-    coc = torch.tensor([10.3, 12.2, 27.0], dtype=torch.float64)
-    for radius, kernel in zip(coc, bank_of(TABLES["gaussian"]).kernels(coc, 400)[:, 0], strict=True):
-        step = torch.arange(kernel.shape[-1], dtype=torch.float64) - kernel.shape[-1] // 2
-        line = torch.exp(-0.5 * (step / (0.5 * radius)) ** 2)
-        expected = line[:, None] * line / (line[:, None] * line).sum()
-        middle = (step.abs()[:, None] < radius) & (step.abs() < radius)
-        torch.testing.assert_close(kernel[middle], expected[middle], rtol=6e-3, atol=0.0)
-
-
 def test_a_kernel_far_larger_than_the_frame_is_constant() -> None:
     (kernel,) = bank_of(TABLES["disc"]).kernels(torch.tensor([5000.0], dtype=torch.float64), 400, longest=[30])
     assert kernel.shape == (1, 59, 59)
     torch.testing.assert_close(kernel, torch.full_like(kernel, 1.0 / (torch.pi * 5000.0**2)), rtol=2e-3, atol=0.0)
-
-
-def test_gradients_to_the_coc_are_those_of_the_kernel() -> None:
-    coc = torch.tensor([-3.3, 0.9, 7.7, 19.0], dtype=torch.float64, requires_grad=True)
-    weight = torch.rand(61, 61, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-
-    def seen(coc: torch.Tensor) -> torch.Tensor:
-        kernels = bank_of(TABLES["sato_j15"]).kernels(coc, 400, longest=[31] * len(coc))
-        side = kernels.shape[-1]
-        return (kernels[:, 0] * weight[:side, :side]).sum((-2, -1))
-
-    assert torch.autograd.gradcheck(seen, coc, eps=1e-7, atol=1e-5)
-
-
-def test_threads_that_compute_the_same_template_at_once_agree() -> None:
-    table, made = BlurTable.polygon(7, 3.21, curvature=0.123), []
-    work = [threading.Thread(target=lambda: made.append(bank_of(table).kernels(LARGE, 400))) for _ in range(8)]
-    for thread in work:
-        thread.start()
-    for thread in work:
-        thread.join()
-    assert len(made) == 8 and all(torch.equal(made[0], other) for other in made)

@@ -1,15 +1,11 @@
-import functools
 import math
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 import torch.nn.functional as functional
 
 from torchdof.optics.blur_table import BlurTable
-from torchdof.optics.camera import Camera
 from torchdof.reference import metrics
 from torchdof.reference.lens_views import lens_views, lens_views_by_coc
 from torchdof.reference.scenes import Plane, Scene, camera_of, plane_scene, posts, read_scenes, waves
@@ -27,7 +23,7 @@ def crops() -> dict[str, Scene]:
 def bars() -> Scene:
     near, far = Plane(1.0, waves(1, (0.6, 0.3, 0.2)), posts(40, 9)), Plane(2.0, waves(2))
     planes = [near, far, Plane(1.5, waves(3), posts(61, 20, -0.3, 9))]
-    return plane_scene(planes, CAMERA, (72, 96), samples=1024)
+    return plane_scene(planes, CAMERA, (72, 96), samples=512)
 
 
 def shown_psnr(image: torch.Tensor, scene: Scene, mask: torch.Tensor | None = None) -> float:
@@ -67,16 +63,6 @@ def test_a_plane_is_the_convolution_with_the_tables_kernel(table: BlurTable, coc
     assert metrics.psnr(inner, blurred) > 58
 
 
-def test_channels_are_blurred_by_their_own_kernels() -> None:
-    table = BlurTable("disc", [1.0], {"radius": [[1.0], [0.5]]})
-    image, coc = torch.rand(1, 2, 40, 40), torch.full((1, 1, 40, 40), 5.0)
-    both = lens_views_by_coc(image, coc, table=table, views=64).image
-    for channel, radius in enumerate((5.0, 2.5)):
-        alone = lens_views_by_coc(image[:, channel : channel + 1], torch.full_like(coc, radius), views=64).image
-        # not equal: light is split at a multiple of the mean, here of both channels and there of one
-        assert metrics.psnr(both[:, channel : channel + 1], alone) > 60
-
-
 @pytest.mark.parametrize("depth_m", [1.0, 8.0])
 def test_a_highlight_is_a_disc_of_the_right_radius_and_energy(depth_m: float) -> None:
     image = torch.full((1, 1, 81, 81), 0.01)
@@ -104,36 +90,11 @@ def test_given_the_hidden_surfaces_it_agrees_with_the_exact_truth(bars: Scene) -
     assert 0.3 < float((alone.known[bars.inner] == 1).float().mean()) < 0.95
 
 
-def test_a_stack_of_complete_surfaces_renders_the_scene(bars: Scene) -> None:
-    far = bars.surfaces[0]
-    out = lens_views(far[0][:, :3], far[1], bars.camera, surfaces=bars.surfaces[1:]).image
-    assert shown_psnr(out, bars, bars.inner) > 42
-
-
-@pytest.fixture(scope="module")
-def seen(crops: dict[str, Scene]) -> Callable[[str, int], torch.Tensor]:
-    """``seen(name, views)`` is the picture of a scene; each is rendered once."""
-
-    @functools.cache
-    def picture(name: str, views: int) -> torch.Tensor:
-        scene = crops[name]
-        return lens_views(scene.image, scene.depth, scene.camera, views=views).image
-
-    return picture
-
-
-@pytest.mark.parametrize("name", ["planes/0", "room/1", "highlights/0"])
-def test_256_views_are_within_half_a_decibel_of_1024(
-    crops: dict[str, Scene], seen: Callable[[str, int], torch.Tensor], name: str
-) -> None:
-    scene = crops[name]
-    few, many = (shown_psnr(seen(name, views), scene, scene.inner) for views in (256, 1024))
-    assert abs(many - few) < 0.5
-
-
-def test_the_error_falls_with_the_number_of_views(seen: Callable[[str, int], torch.Tensor]) -> None:
-    limit = seen("room/1", 1024)
-    errors = [metrics.psnr(seen("room/1", views), limit) for views in (4, 16, 64, 256)]
+def test_the_error_falls_with_the_number_of_views(crops: dict[str, Scene]) -> None:
+    scene = crops["room/1"]
+    *few, limit = (lens_views(scene.image, scene.depth, scene.camera, views=n).image for n in (4, 16, 64, 256, 512))
+    errors = [metrics.psnr(picture, limit) for picture in few]
+    assert abs(shown_psnr(few[-1], scene, scene.inner) - shown_psnr(limit, scene, scene.inner)) < 0.5
     assert errors == sorted(errors)
     assert errors[-1] > errors[0] + 12
 
@@ -150,31 +111,5 @@ def test_a_steep_surface_has_no_gaps() -> None:
     out, known = lens_views_by_coc(torch.ones(1, 1, 50, 60), coc, views=64)
     torch.testing.assert_close(out, torch.ones_like(out))
     assert float(known[..., 15:35, 10:18].min()) == 1.0
-
-
-def test_a_blurred_bar_does_not_darken_towards_the_frame() -> None:
-    out = lens_views_by_coc(torch.full((1, 1, 20, 20), 0.7), torch.full((1, 1, 20, 20), -8.0), views=64).image
-    torch.testing.assert_close(out, torch.full_like(out, 0.7))
-
-
-def test_half_precision_and_batches() -> None:
-    image, depth = torch.rand(2, 3, 16, 24).half(), torch.rand(2, 1, 16, 24) + 1
-    out, known = lens_views(image, depth, CAMERA, views=8)
-    assert out.dtype == torch.float16
-    assert known.shape == (2, 1, 16, 24)
-    for i in range(2):
-        assert torch.equal(lens_views(image[i : i + 1], depth[i : i + 1], CAMERA, views=8).image, out[i : i + 1])
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"views": 0}, "views must be a whole number of points"),
-        ({"views": 2.5}, "views must be a whole number of points"),
-        ({"surfaces": [(torch.rand(1, 3, 8, 8), torch.ones(1, 1, 8, 8))]}, r"a surface must be \[1, 4, 8, 8\]"),
-        ({"surfaces": [(torch.rand(1, 4, 8, 8), -torch.ones(1, 1, 8, 8))]}, "depth must be > 0"),
-    ],
-)
-def test_bad_arguments_are_refused(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        lens_views(torch.rand(1, 3, 8, 8), torch.ones(1, 1, 8, 8), Camera(), **options)
+    near = lens_views_by_coc(torch.full((1, 1, 20, 20), 0.7), torch.full((1, 1, 20, 20), -8.0), views=64).image
+    torch.testing.assert_close(near, torch.full_like(near, 0.7))  # not darker towards the frame

@@ -5,9 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchdof.optics.camera import Camera
 from torchdof.reference import metrics
-from torchdof.reference.scenes import Plane, camera_of, plane_scene, posts, read_scenes, strands, waves
+from torchdof.reference.scenes import Plane, camera_of, plane_scene, posts, read_scenes, waves
 
 DATA = Path(__file__).parents[1] / "data" / "scenes"
 CAMERA = camera_of(200.0, 96, aperture_radius_m=0.02, focus_m=1.0)
@@ -44,22 +43,6 @@ def test_compositing_the_surfaces_gives_the_sharp_image() -> None:
     assert sorted(set(scene.depth.flatten().tolist())) == [1.0, 2.0, 3.0]
 
 
-@pytest.mark.parametrize(("name", "margin"), [("highlights/0", 24), ("planes/0", 20), ("room/1", 16)])
-def test_shipped_scenes_are_sharp_where_in_focus(name: str, margin: int) -> None:
-    scene = {s.name: s for s in read_scenes(DATA)}[name]
-    assert scene.margin_px == margin
-    assert scene.image.shape == scene.truth.shape == (1, 3, 160, 192)
-    shown, truth = metrics.display(scene.image), metrics.display(scene.truth)
-    sharp = (scene.coc_px.abs() < 0.5) & scene.inner
-    blurred = (scene.coc_px.abs() > 4.0) & scene.inner
-    assert metrics.psnr(shown, truth, sharp) > metrics.psnr(shown, truth, blurred) + 3
-
-
-def test_planes_that_leave_the_frame_open_are_refused() -> None:
-    with pytest.raises(ValueError, match="farthest plane must have no shape"):
-        plane_scene([Plane(1.0, waves(1)), Plane(3.0, waves(2), posts(20, 5))], CAMERA, (4, 4))
-
-
 def test_a_folder_without_scenes_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no scene here"):
         list(read_scenes(tmp_path))
@@ -81,21 +64,3 @@ def test_a_bad_scene_names_file_and_field(tmp_path: Path, change: dict[str, obje
     with pytest.raises(ValueError, match=message) as error:
         list(read_scenes(tmp_path))
     assert str(tmp_path) in str(error.value)
-
-
-def test_a_frame_and_its_crop_have_the_same_circles_of_confusion() -> None:
-    depth = torch.full((1, 1, 1, 1), 3.0)
-    whole, crop = (camera_of(500.0, w, 0.01, 1.0).coc_px(depth, w) for w in (640, 64))
-    torch.testing.assert_close(whole, crop, rtol=1e-6, atol=0)
-    assert isinstance(camera_of(500.0, 64, 0.01, 1.0), Camera)
-
-
-def test_a_thin_strand_covers_its_width_in_light_and_only_some_pixels_in_depth() -> None:
-    width_px, angle = 0.5, 0.4
-    away = 100.0 * math.cos(angle), 100.0 * math.sin(angle)
-    wire = strands([(30.0 - away[0], 20.0 - away[1], 30.0 + away[0], 20.0 + away[1])], [width_px])
-    planes = [Plane(4.0, lambda x, y: torch.zeros(1, *x.shape)), Plane(1.0, lambda x, y: torch.ones(1, *x.shape), wire)]
-    scene = plane_scene(planes, CAMERA, (40, 60), samples=512)
-    columns = scene.image[0, 0].sum(0)  # along a column a slanted strand measures width / cos(angle)
-    torch.testing.assert_close(columns, torch.full((60,), width_px / math.cos(angle)), rtol=0.02, atol=0)
-    assert 10 < int((scene.depth[0, 0] == 1.0).any(0).sum()) < 50

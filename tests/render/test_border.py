@@ -50,10 +50,8 @@ def test_continuation_commutes_with_flips_and_turns(turns: int, flip: bool) -> N
     assert_close(other, turned(out, turns, flip))
 
 
-@pytest.mark.parametrize("engine", ["native", "torch"])
-def test_a_texture_is_averaged_outside_the_frame(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_texture_is_averaged_outside_the_frame(engine: str) -> None:
     """Repeating the border's pixels would extend the stripes instead."""
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
     stripes = torch.tensor([0.2, 0.8, 0.8, 0.2]).repeat(24)
     image = stripes.expand(1, 3, 96, 96).clone()
     coc = torch.full((1, 1, 96, 96), 9.0)
@@ -62,12 +60,8 @@ def test_a_texture_is_averaged_outside_the_frame(engine: str, monkeypatch: pytes
 
 
 @pytest.mark.parametrize("occlusion", [True, False])
-@pytest.mark.parametrize("engine", ["native", "torch"])
-def test_a_subject_cut_by_the_border_gives_no_light_to_its_background(
-    engine: str, occlusion: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_subject_cut_by_the_border_gives_no_light_to_its_background(engine: str, occlusion: bool) -> None:
     """A subject in focus in front of a constant background, which is blurred by 21 px."""
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
     image, coc = torch.full((1, 3, 120, 200), 60 / 255), torch.full((1, 1, 120, 200), 21.0)
     image[..., 50:, 80:130], coc[..., 50:, 80:130] = 220 / 255, 0.0
     out = blur_by_coc(image, coc, occlusion=occlusion)

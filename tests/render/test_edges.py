@@ -56,11 +56,7 @@ def compressed(depth: Tensor, quantum: float) -> Tensor:
 
 
 @pytest.mark.parametrize("quantum", [20.0, 40.0])
-@pytest.mark.parametrize("engine", ["torch", pytest.param("native", marks=compiled)])
-def test_compression_artefacts_beside_steps_are_not_ramps(
-    scene: Scene, quantum: float, engine: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+def test_compression_artefacts_beside_steps_are_not_ramps(scene: Scene, quantum: float, engine: str) -> None:
     depth = compressed(scene.depth, quantum)
     assert 0.05 < float((1 / depth - 1 / scene.depth).abs().max()) < 0.3
     assert torch.equal(repair_edges(scene.image, depth, "auto"), depth)
@@ -68,12 +64,8 @@ def test_compression_artefacts_beside_steps_are_not_ramps(
     assert wrong(repair_edges(scene.image, soft, "auto"), scene.depth) < 0.5 * wrong(soft, scene.depth)
 
 
-@pytest.mark.parametrize("engine", ["torch", pytest.param("native", marks=compiled)])
-def test_narrow_ramps_of_averaged_depth_are_repaired(
-    scene: Scene, engine: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_narrow_ramps_of_averaged_depth_are_repaired(scene: Scene, engine: str) -> None:
     """Such depth was downsampled with its image, or rendered with anti-aliasing."""
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
     image = functional.avg_pool2d(scene.image, 2)
     depth = 1 / functional.avg_pool2d(1 / scene.depth, 2)
     nearest = -functional.max_pool2d(-scene.depth, 2), functional.max_pool2d(scene.depth, 2)
@@ -139,17 +131,21 @@ def test_a_thin_structure_keeps_its_depth(scene: Scene) -> None:
     assert 0.55 < float((1 / repaired)[bars].mean()) < 0.7
 
 
-def test_the_averaged_depth_of_a_lamp_is_restored() -> None:
+def discs(square_px: float) -> Tensor:
+    """Mask of discs on a grid; their squared radius is ``square_px``."""
     rows, columns = torch.meshgrid(torch.arange(96.0), torch.arange(128.0), indexing="ij")
-    image, depth = 0.2 + 0.02 * torch.rand(1, 3, 96, 128), torch.full((1, 1, 96, 128), 8.0)
-    for row in range(12, 96, 24):
-        for column in range(12, 128, 26):
-            lamp = (rows - row) ** 2 + (columns - column) ** 2 < 5
-            image[..., lamp], depth[..., lamp] = 200.0, 2.0
-    given = degrade(depth, "blur 1.5")
-    lamps = depth < 3
-    assert float((1 / given)[lamps].mean()) < 0.33
-    assert 0.4 < float((1 / repair_edges(image, given, "auto"))[lamps].mean()) < 0.6
+    return ((rows % 24 - 12) ** 2 + (columns % 26 - 12) ** 2 < square_px) & (columns < 116)
+
+
+def test_the_averaged_depth_of_a_lamp_is_restored_and_does_not_come_nearer_than_it_was() -> None:
+    lamps = discs(5.0)
+    image = torch.where(lamps, 200.0, 0.2 + 0.02 * torch.rand(1, 3, 96, 128))
+    given = degrade(torch.where(lamps, 2.0, 8.0)[None, None], "blur 1.5")
+    assert float((1 / given)[..., lamps].mean()) < 0.33
+    assert 0.4 < float((1 / repair_edges(image, given, "auto"))[..., lamps].mean()) < 0.6
+    # larger in the map than in the image, so that no depth was lost
+    given = degraded._blurred(torch.where(discs(14.0), 2.0, 8.0)[None, None], 1.5)
+    assert float((1 / repair_edges(image, given, "auto")).max()) < 0.6
 
 
 def test_pixels_of_a_lamp_of_uneven_brightness_get_one_depth() -> None:
@@ -162,12 +158,6 @@ def test_pixels_of_a_lamp_of_uneven_brightness_get_one_depth() -> None:
     assert max(float(repaired[lamp].max() - repaired[lamp].min()) for lamp in lamps) < 0.005
 
 
-@pytest.mark.parametrize("times", [2.0**-10, 2.0**20])
-def test_the_brightness_of_the_image_changes_nothing(scene: Scene, times: float) -> None:
-    depth = degrade(scene.depth, "half-res")
-    torch.testing.assert_close(repair_edges(scene.image, depth), repair_edges(times * scene.image, depth))
-
-
 TURNS: dict[str, Callable[[Tensor], Tensor]] = {
     "left-right": lambda t: t.flip(-1),
     "top-bottom": lambda t: t.flip(-2),
@@ -178,22 +168,12 @@ TURNS: dict[str, Callable[[Tensor], Tensor]] = {
 
 @pytest.mark.parametrize("turn", TURNS.values(), ids=TURNS)
 @pytest.mark.parametrize("kind", ["near -1px", "half-res"])
-@pytest.mark.parametrize(
-    ("engine", "times"),
-    [("torch", (1, 1)), pytest.param("native", (3, 3), marks=compiled)]
-    + [pytest.param("native", (7, 6), marks=compiled)],  # a frame large enough to be sampled
-)
 def test_repair_commutes_with_flips_and_turns(
-    scene: Scene,
-    kind: str,
-    turn: Callable[[Tensor], Tensor],
-    engine: str,
-    times: tuple[int, int],
-    monkeypatch: pytest.MonkeyPatch,
+    scene: Scene, kind: str, turn: Callable[[Tensor], Tensor], engine: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Sizes are odd and damage and noise uneven, so that a sample that is not turned with the frame is detected."""
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
     monkeypatch.setattr(edges, "_SAMPLED", 2**12)  # makes the plain engine sample a small frame
+    times = (1, 1) if engine == "torch" else (7, 6)  # a frame large enough to be sampled
     image = scene.image.repeat(1, 1, *times)[..., :-1, :-3]
     exact, damaged = (
         scene.camera.coc_px(degrade(scene.depth, k), 192).repeat(1, 1, *times)[..., :-1, :-3] for k in ("exact", kind)
@@ -207,11 +187,7 @@ def test_repair_commutes_with_flips_and_turns(
     torch.testing.assert_close(turned, turn(repaired), rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize("engine", ["torch", pytest.param("native", marks=compiled)])
-def test_noise_along_rows_and_along_columns_is_not_an_edge(
-    scene: Scene, engine: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+def test_noise_along_rows_and_along_columns_is_not_an_edge(scene: Scene, engine: str) -> None:
     for shape in ((1, 1, 128, 1), (1, 1, 1, 192)):
         noise = (2.0 * torch.randn(shape, generator=torch.Generator().manual_seed(0))).expand(scene.depth.shape)
         assert torch.equal(edges.repair(scene.image, noise.contiguous(), edges.STEP_PX, False), noise)
@@ -222,7 +198,7 @@ def test_markers_of_holes_are_kept_and_act_like_nan(scene: Scene, marked: float)
     depth, holes = degrade(scene.depth, "near -1px"), torch.zeros_like(scene.depth, dtype=torch.bool)
     holes[..., 40:60, :30] = True
     repaired, same = (repair_edges(scene.image, torch.where(holes, value, depth)) for value in (torch.nan, marked))
-    assert bool((same[holes] == marked).all())
+    assert bool((same[holes] == marked).all()) and bool(repaired[holes].isnan().all())
     assert torch.equal(repaired[~holes], same[~holes])
 
 
@@ -235,35 +211,8 @@ def test_a_hole_within_a_surface_changes_no_other_pixel(scene: Scene) -> None:
     assert torch.equal(repair_edges(image, torch.where(holes, torch.nan, depth))[~holes], whole[~holes])
 
 
-def test_holes_stay_and_hardly_affect_other_pixels(scene: Scene) -> None:
-    depth = degrade(scene.depth, "near -1px")
-    holes = torch.zeros_like(depth, dtype=torch.bool)
-    holes[..., 40:60, :30] = True
-    repaired = repair_edges(scene.image, torch.where(holes, torch.nan, depth))
-    assert torch.equal(repaired.isnan(), holes)
-    whole = repair_edges(scene.image, depth)
-    # statistics of the frame come from fewer pixels, so a pixel with equally likely surfaces may change
-    assert float((repaired / whole - 1)[..., 60:, :].abs().gt(1e-5).float().mean()) < 2e-4
-
-
-def test_a_lamp_does_not_come_nearer_than_it_was() -> None:
-    rows, columns = torch.meshgrid(torch.arange(96.0), torch.arange(128.0), indexing="ij")
-    image, inverse = 0.2 + 0.02 * torch.rand(1, 3, 96, 128), torch.full((1, 1, 96, 128), 0.125)
-    for row in range(12, 96, 24):
-        for column in range(12, 128, 26):
-            apart = (rows - row) ** 2 + (columns - column) ** 2
-            image[..., apart < 5] = 200.0
-            inverse[..., apart < 14] = 0.5  # larger in the map than in the image, so that no depth was lost
-    given = degraded._blurred(1 / inverse, 1.5)
-    assert float((1 / repair_edges(image, given, "auto")).max()) < 0.6
-
-
 @pytest.mark.parametrize("kind", ["half-res", "near -1px"])
-@pytest.mark.parametrize("engine", ["torch", pytest.param("native", marks=compiled)])
-def test_differences_below_half_a_step_are_not_edges(
-    scene: Scene, kind: str, engine: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+def test_differences_below_half_a_step_are_not_edges(scene: Scene, kind: str, engine: str) -> None:
     nearness = 1.0 / degrade(scene.depth, kind)
     image = scene.image.clone()
     image[..., 60:62, 90:92] = 500.0
@@ -319,17 +268,6 @@ def test_the_renderer_repairs_by_its_option_depth_edges(scene: Scene) -> None:
     assert not torch.equal(as_given(scene.image, depth), expected)
 
 
-@pytest.mark.parametrize("value", ["Auto", None, True, 1])
-def test_an_invalid_option_is_refused(scene: Scene, value: DepthEdges) -> None:
-    refused = "must be 'auto', 'repair' or 'as given', got"
-    for call in (
-        lambda: repair_edges(scene.image, scene.depth, value),
-        lambda: DepthOfField(scene.camera, depth_edges=value),
-    ):
-        with pytest.raises(ValueError, match=refused):
-            call()
-
-
 @compiled
 @pytest.mark.parametrize("kind", sorted(KINDS))
 @pytest.mark.parametrize("auto", [True, False])
@@ -347,8 +285,8 @@ def test_engines_agree(scene: Scene, kind: str, auto: bool) -> None:
 @compiled
 @pytest.mark.parametrize(("kind", "is_exact"), [("exact", True), ("shift 1px", False), ("half-res", False)])
 def test_engines_agree_on_frames_that_are_sampled(scene: Scene, kind: str, is_exact: bool) -> None:
-    image = scene.image.repeat(1, 1, 6, 5)
-    nearness = -scene.camera.coc_px(degrade(scene.depth, kind), 192).repeat(1, 1, 6, 5)
+    image = scene.image.repeat(1, 1, 3, 3)
+    nearness = -scene.camera.coc_px(degrade(scene.depth, kind), 192).repeat(1, 1, 3, 3)
     assert nearness[0, 0].numel() > 4 * edges._SAMPLED
     plain = edges._repair(image, nearness, torch.tensor(1.0), True)[0, 0]
     fast = native.repair_edges(image[0], nearness[0, 0], torch.tensor(1.0), True)

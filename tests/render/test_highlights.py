@@ -102,14 +102,6 @@ def test_splatting_in_parts_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> 
     torch.testing.assert_close(blur_by_coc(image, coc), whole, rtol=1e-5, atol=1e-5)
 
 
-def test_light_below_the_threshold_stays_in_the_layers() -> None:
-    image = torch.rand(1, 3, 64, 80, generator=torch.Generator().manual_seed(1))
-    coc = torch.linspace(-9, 9, 80).expand(1, 1, 64, 80)
-    left, rays = highlights.extract(Surface(image, coc), highlights.threshold(image))
-    assert rays is None
-    assert left.light is image
-
-
 def test_extracted_and_remaining_light_sum_to_the_image() -> None:
     image, coc, (row, column) = street()
     left, rays = highlights.extract(Surface(image, coc), highlights.threshold(image))
@@ -129,6 +121,17 @@ def test_extraction_fades_in_from_a_blur_of_one_to_two_pixels(coc_px: float, sha
     assert extracted == pytest.approx(share * (100.0 - float(limit[..., 20, 20])), rel=1e-5)
 
 
+def sent_by_a_covered_lamp(cover: float, beside: Surface, image_coc_px: Tensor) -> float:
+    """Light of a lamp of 100 with coc 6 px, sent by a surface with ``cover``, as a share of that above the limit."""
+    image = torch.full((1, 1, 40, 40), 0.1)
+    image[..., 20, 20] = 100.0
+    surface, limit = Surface(image, torch.full_like(image, 6.0), torch.full_like(image, cover)), 0.8
+    beside = beside._replace(weight=torch.full_like(image, 1.0 - cover))
+    _, rays = highlights.extract(surface, highlights.threshold(image), beside=beside, image_coc_px=image_coc_px)
+    assert rays is not None
+    return float(rays.light) / (100.0 - limit)
+
+
 @pytest.mark.parametrize(
     ("cover", "nearer_px", "beside_light", "sent"),
     [
@@ -145,14 +148,8 @@ def test_extraction_fades_in_from_a_blur_of_one_to_two_pixels(coc_px: float, sha
 def test_highlights_partly_covered_by_a_nearer_surface_send_the_light_of_a_whole_pixel(
     cover: float, nearer_px: float, beside_light: float, sent: float
 ) -> None:
-    image = torch.full((1, 1, 40, 40), 0.1)
-    image[..., 20, 20] = 100.0
-    coc, limit = torch.full_like(image, 6.0), highlights.threshold(image)  # 0.8
-    beside = Surface(torch.full_like(image, beside_light), coc - nearer_px, torch.full_like(image, 1.0 - cover))
-    surface = Surface(image, coc, torch.full_like(image, cover))
-    _, rays = highlights.extract(surface, limit, beside=beside, image_coc_px=beside.coc_px)
-    assert rays is not None
-    assert float(rays.light) == pytest.approx(sent * (100.0 - 0.8), rel=1e-5)
+    beside = Surface(torch.full((1, 1, 40, 40), beside_light), torch.full((1, 1, 40, 40), 6.0 - nearer_px))
+    assert sent_by_a_covered_lamp(cover, beside, beside.coc_px) == pytest.approx(sent, rel=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -170,17 +167,10 @@ def test_highlights_partly_covered_by_a_nearer_surface_send_the_light_of_a_whole
 def test_highlights_send_the_light_of_a_whole_pixel_only_at_steps_of_depth(
     between: int, share: float, sent: float
 ) -> None:
-    image = torch.full((1, 1, 40, 40), 0.1)
-    image[..., 20, 20] = 100.0
-    coc, cover = torch.full_like(image, 6.0), torch.full_like(image, 0.4)
-    beside = Surface(torch.full_like(image, 0.1), torch.full_like(image, 2.0), 1.0 - cover)
+    beside = Surface(torch.full((1, 1, 40, 40), 0.1), torch.full((1, 1, 40, 40), 2.0))
     image_coc = beside.coc_px.clone()
     image_coc[..., 18:23, 18:23] += 4.0 * share * (torch.arange(25) < between).view(5, 5)
-    _, rays = highlights.extract(
-        Surface(image, coc, cover), highlights.threshold(image), beside=beside, image_coc_px=image_coc
-    )
-    assert rays is not None
-    assert float(rays.light) == pytest.approx(sent * (100.0 - 0.8), rel=1e-4)
+    assert sent_by_a_covered_lamp(0.4, beside, image_coc) == pytest.approx(sent, rel=1e-4)
 
 
 def test_a_surface_without_coverage_has_no_rays() -> None:
@@ -215,14 +205,6 @@ def test_rays_above_the_limit_fade_into_the_layers(range_of_light: float) -> Non
     steps = torch.tensor(light).diff()
     assert light[0] > 1.3 * light[-1], "the scene tests nothing"
     assert float(steps.abs().max()) < 0.02 * light[0]
-
-
-@pytest.mark.parametrize(("height", "width"), [(66, 99), (31, 70), (2, 35), (1, 1)])
-def test_the_threshold_of_a_flipped_image_is_the_flipped_threshold(height: int, width: int) -> None:
-    image = torch.rand(1, 3, height, width)
-    limit = highlights.threshold(image)
-    for turned in (lambda t: t.flip(-1), lambda t: t.flip(-2), lambda t: t.mT):
-        torch.testing.assert_close(highlights.threshold(turned(image)), turned(limit), rtol=1e-6, atol=0.0)
 
 
 def test_unknown_light_does_not_lower_the_threshold() -> None:

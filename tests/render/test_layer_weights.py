@@ -24,10 +24,11 @@ def test_blur_axis_is_the_square_of_the_coc_near_focus_and_the_coc_far_from_it()
     assert float(blur_axis(torch.tensor(0.05))) == pytest.approx(0.0025 / 0.55 - 2e-4, rel=1e-4)
 
 
-@given(st.floats(-3.0, 3.0))
-def test_the_blur_axis_is_continuous_and_increasing(coc: float) -> None:
+@given(st.floats(-3.0, 3.0) | st.floats(-100.0, 100.0))
+def test_the_blur_axis_is_continuous_and_increasing_and_inverted_by_from_blur_axis(coc: float) -> None:
     place, beside = blur_axis(torch.tensor([coc, coc + 1e-4], dtype=torch.float64)).tolist()
     assert 0.0 <= beside - place <= 1.2e-4  # nowhere steeper than 9 / 8
+    assert from_blur_axis(place) == pytest.approx(coc if place != 0 else 0.0, abs=1e-11)
 
 
 def test_kernels_that_count_as_in_focus_move_less_than_2e_4_of_the_light() -> None:
@@ -36,13 +37,6 @@ def test_kernels_that_count_as_in_focus_move_less_than_2e_4_of_the_light() -> No
     for table in (BlurTable.disc(), BlurTable.gaussian(), BlurTable.load("sato_j15")):
         kernel = table.kernels(torch.tensor([edge], dtype=torch.float64), 500)[0, 0]
         assert 1.0 - float(kernel.max()) < 2e-4
-
-
-@given(st.floats(-100.0, 100.0))
-def test_from_blur_axis_inverts_blur_axis_and_gives_0_in_focus(coc: float) -> None:
-    there = float(blur_axis(torch.tensor(coc, dtype=torch.float64)))
-    back = from_blur_axis(there)
-    assert back == pytest.approx(coc if there != 0 else 0.0, abs=1e-11)
 
 
 def test_weights_are_linear_between_neighbouring_layers() -> None:
@@ -66,11 +60,3 @@ def test_an_eased_ramp_rises_smoothly_from_0_to_1() -> None:
     assert float(eased(ramp)[0]) == 0.0 and float(eased(ramp)[-1]) == 1.0
     assert float(steps[0]) < 1e-2 / 2000 and (steps > 0).all() and float(steps.diff().abs().max()) < 0.02 / 2000
     assert float((eased(ramp) - ramp).abs().max()) < 0.08
-
-
-def test_weights_are_differentiable_between_nodes() -> None:
-    x = torch.tensor([-3.0, -0.2, 0.3, 1.0, 5.0], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(weights, x)
-    behind = weights_at_or_behind(x.reshape(1, 1, -1), ramps(NODES, x)[:, [0, -1]])
-    (gradient,) = torch.autograd.grad(behind.sum(), x)
-    assert (gradient == 0).all()  # the first and the last cumulative weight are constants

@@ -25,11 +25,6 @@ def largest_gaps(plan: Plan) -> list[tuple[float, float]]:
     return [(high - low, min(abs(low), abs(high))) for low, high in pairs]
 
 
-def test_a_plane_gets_one_layer_at_its_own_coc() -> None:
-    assert Plan.of_scene(coc_map(3.37, 3.37), 1 / 255).coc_px == pytest.approx((3.37,))
-    assert Plan.of_scene(coc_map(-3.37), 1 / 255).coc_px == pytest.approx((-3.37,))
-
-
 def place_of(coc_px: float) -> float:
     return float(blur_axis(torch.tensor(coc_px, dtype=torch.float64)))
 
@@ -55,18 +50,9 @@ def test_gaps_between_layers_are_at_most_the_spacing_of_the_tolerance(reach: flo
     for plan in (Plan.of_scene(coc_map(-reach, reach), tolerance), Plan.all(reach, tolerance)):
         for gap, inner in largest_gaps(plan):
             assert gap <= spacing(inner, tolerance) + 0.3 * spacing(inner + gap, tolerance) + 1e-9
-
-
-def test_layers_are_farther_apart_for_a_looser_tolerance_and_a_larger_blur() -> None:
-    counts = [len(Plan.all(60.0, tolerance).nodes) for tolerance in (0.0, 1 / 255, 1 / 60, 1 / 20)]
-    assert counts == sorted(counts, reverse=True) and len(set(counts)) > 2
-    assert spacing(0.0, 1 / 255) < spacing(10.0, 1 / 255) < spacing(50.0, 1 / 255)
-
-
-def test_a_static_plan_covers_its_radius_on_both_sides_of_focus() -> None:
-    plan = Plan.all(12.0, 1 / 255)
-    assert plan.coc_px[0] == pytest.approx(-12.0) and plan.coc_px[-1] == pytest.approx(12.0)
-    assert [-x for x in reversed(plan.nodes)] == list(plan.nodes) and 0.0 in plan.nodes
+    assert plan.coc_px[-1] == pytest.approx(reach)  # of the plan for all scenes
+    assert 0.0 in plan.nodes or tolerance == 0.5
+    assert [-x for x in reversed(plan.nodes)] == list(plan.nodes)
 
 
 def test_a_static_plan_is_as_exact_on_a_slope_as_the_plan_of_the_scene() -> None:
@@ -81,24 +67,13 @@ def test_a_static_plan_is_as_exact_on_a_slope_as_the_plan_of_the_scene() -> None
     assert every < own < 0.75 / 255
 
 
-@pytest.mark.parametrize("engine", ["native", "torch"])
-def test_a_frame_is_planned_for_less_where_it_is_blurred_much_not_where_a_few_pixels_are(
-    engine: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+def test_a_frame_is_planned_for_less_where_it_is_blurred_much_not_where_a_few_pixels_are(engine: str) -> None:
     coc = torch.full((1, 1, 480, 640), 3.0)
     coc[..., 200:202, 300:302] = -1e5
     assert Plan.of_frame(coc, 1 / 255).tolerance == 1 / 255
     assert Plan.of_frame(coc, 1 / 255, still=True).tolerance == 1 / 255
     for blurred in (torch.full_like(coc, 500.0), torch.cat([torch.full_like(coc, 500.0), coc])):
         assert Plan.of_frame(blurred, 1 / 255).tolerance == pytest.approx(480 / (3 * 500) / 255)
-
-
-def test_layers_with_radii_of_1e9_px_or_more_are_refused() -> None:
-    assert Plan((-0.9e9, 0.9e9), 1 / 255).nodes
-    for node in (1.1e9, math.inf, math.nan):
-        with pytest.raises(ValueError, match="strictly increasing numbers below 1e9 px"):
-            Plan((0.0, node), 1 / 255)
 
 
 def test_layers_for_gradients_do_not_depend_on_small_changes_of_the_scene() -> None:
@@ -111,6 +86,10 @@ def test_nan_and_infinite_coc_add_no_layers() -> None:
     assert Plan.of_scene(coc_map(math.nan, 3.0, 3.0), 1 / 255).nodes[-1] == pytest.approx(place_of(3.0))
     reaching = Plan.of_scene(coc_map(-math.inf, math.inf), 1 / 20)
     assert all(math.isfinite(x) for x in reaching.nodes)
+    coc = torch.zeros(2, 1, 40, 50)
+    coc[..., :10], coc[0, 0, 0, 0] = -6.0, torch.nan
+    pixels = Plan((-5.5, 0.0), 1 / 255).of_pixels(coc).pixels
+    assert pixels is not None and pixels[0] == pytest.approx(799 / 4000), "a NaN counts as in focus"
 
 
 @pytest.mark.parametrize("name", ["disc", "sato_j15"])
@@ -158,13 +137,6 @@ def test_a_printed_plan_shows_resolution_and_share_of_the_pixels_of_each_layer()
     assert "%" not in str(Plan(plan.nodes, plan.tolerance))
 
 
-def test_nan_coc_counts_as_in_focus_in_the_shares_of_a_plan() -> None:
-    coc = torch.zeros(2, 1, 40, 50)
-    coc[..., :10], coc[0, 0, 0, 0] = -6.0, torch.nan
-    pixels = Plan((-5.5, 0.0), 1 / 255).of_pixels(coc).pixels
-    assert pixels is not None and pixels[0] == pytest.approx(799 / 4000)
-
-
 def test_kernels_of_highlights_are_interpolated_between_multiples_of_1_32_px() -> None:
     table, coc = BlurTable.disc(), torch.tensor([3.0, 3.0078125, -7.26], dtype=torch.float64)
     kernels = kernels_for(table, coc, 100, 100)
@@ -179,14 +151,3 @@ def test_kernels_of_highlights_are_interpolated_between_multiples_of_1_32_px() -
     assert kernels_for(table, coc, 100, 4).shape[-1] == 7
     moving = coc.double().requires_grad_()
     torch.testing.assert_close(kernels_for(table, moving, 100, 100), table.kernels(moving, 100))
-
-
-def test_kernels_depend_on_the_numbers_of_the_table_only() -> None:
-    plan, size = Plan((-5.5, 0.0, 7.5), 1 / 255), (50, 60)
-
-    def kernels(table: BlurTable) -> list[torch.Tensor]:
-        return [b.kernel for b in plan.blurs(table, size, torch.float64, torch.device("cpu"), coarse=True)]
-
-    first, again, other = kernels(BlurTable.disc()), kernels(BlurTable.disc()), kernels(BlurTable.gaussian())
-    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
-    assert first[0].shape != other[0].shape

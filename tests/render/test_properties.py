@@ -39,11 +39,7 @@ def rms(difference: Tensor) -> float:
 @seeds(12)
 @pytest.mark.parametrize(
     ("depth_edges", "tolerance", "most_rms", "most"),
-    [
-        ("as given", 0.0, 0.05 / 255, 5e-3),
-        ("auto", 0.0, 0.05 / 255, 5e-3),
-        ("auto", 1 / 255, 0.25 / 255, torch.inf),
-    ],
+    [("as given", 0.0, 0.05 / 255, 5e-3), ("auto", 0.0, 0.05 / 255, 5e-3), ("auto", 1 / 255, 0.25 / 255, torch.inf)],
     ids=["as given 0", "0", "1/255"],
 )
 def test_the_picture_is_continuous_in_depth(

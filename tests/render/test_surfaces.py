@@ -27,15 +27,16 @@ def mixed(share: float, nearer: float) -> list[float]:
     return [float(t) for t in _mixed(surfaces, [(one * nearer, none), (one, none)])]
 
 
-def test_the_farther_surface_of_a_mixed_pixel_continues_behind_the_nearer_one() -> None:
-    assert mixed(0.4, nearer=0.0) == pytest.approx([1.0, 1.0, 0.0])
-
-
-@pytest.mark.parametrize("nearer", [0.06, 0.5, 1.0])
-def test_both_surfaces_have_their_coverage_as_weight_if_the_nearer_one_is_in_the_layer(nearer: float) -> None:
-    assert mixed(0.4, nearer) == pytest.approx([0.4, 0.4 + 0.6 * nearer, 0.0])
-
-
-def test_hidden_surfaces_keep_their_small_weight_and_small_coverage_approaches_it() -> None:
-    assert mixed(HIDDEN_WEIGHT, nearer=0.0) == pytest.approx([HIDDEN_WEIGHT, HIDDEN_WEIGHT, 0.0], abs=1e-6)
-    assert mixed(HIDDEN_WEIGHT + 0.05, nearer=0.0)[1] == pytest.approx(0.053 + 0.947 * 0.5, abs=1e-6)
+@pytest.mark.parametrize(
+    ("share", "nearer", "expected"),
+    [
+        (0.4, 0.0, [1.0, 1.0, 0.0]),  # the farther surface continues behind the nearer one
+        *((0.4, nearer, [0.4, 0.4 + 0.6 * nearer, 0.0]) for nearer in (0.06, 0.5, 1.0)),  # both in the layer
+        (HIDDEN_WEIGHT, 0.0, [HIDDEN_WEIGHT, HIDDEN_WEIGHT, 0.0]),  # hidden surfaces keep their small weight
+        (HIDDEN_WEIGHT + 0.05, 0.0, [0.053 + 0.947 * 0.5, 0.053 + 0.947 * 0.5, 0.0]),  # small coverage approaches it
+    ],
+)
+def test_surfaces_of_a_mixed_pixel_have_their_coverage_and_the_farther_one_continues_behind_the_nearer_one(
+    share: float, nearer: float, expected: list[float]
+) -> None:
+    assert mixed(share, nearer) == pytest.approx(expected, abs=1e-6)

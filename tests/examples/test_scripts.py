@@ -1,0 +1,110 @@
+"""The scripts of ``examples`` run and print or draw the right things."""
+
+import json
+import math
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch.nn.functional as functional
+
+from torchdof.depth.reading import read_depth
+from torchdof.io.images import read_image
+from torchdof.optics.camera import Camera
+from torchdof.reference.metrics import display
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "examples"
+DATA = EXAMPLES / "data" / "motorcycle"
+
+
+def printed_by(script: str, *arguments: object) -> str:
+    """What a script prints in a process of its own."""
+    call = [sys.executable, str(EXAMPLES / script), *map(str, arguments)]
+    run = subprocess.run(call, capture_output=True, text=True, timeout=110)
+    assert run.returncode == 0, run.stderr
+    return run.stdout
+
+
+def test_the_sheet_of_bokeh_shows_six_lenses(tmp_path: Path) -> None:
+    printed_by("bokeh.py", "--out", tmp_path / "bokeh.png", "--height", 96)
+    picture = read_image(tmp_path / "bokeh.png").pixels
+    assert picture.shape == (1, 3, 96 + 34 + 8, 6 * (72 + 8) + 8)
+    panels = [picture[..., 34:130, 8 + 80 * k : 80 + 80 * k] for k in range(6)]
+    for k, panel in enumerate(panels):
+        assert panel.std() > 0.03
+        assert all(float((panel - other).abs().mean()) > 2e-3 for other in panels[:k])
+
+
+def test_per_pixel_prints_a_row_for_each_radius() -> None:
+    rows = [line.split() for line in printed_by("benchmarks/per_pixel.py", "--side", 12).splitlines()]
+    assert rows[0] == ["radius", "splat", "step", "layered"] and [row[0] for row in rows[1:]] == ["4", "8", "16"]
+
+
+MAX_OUTLIERS = {"near": 680, "middle": 1070, "far": 390}
+"""Largest number of pixels with a blur radius above 2 px that differ from the median of their 3 x 3 by over 8/255."""
+
+
+def test_few_pixels_differ_from_their_blurred_surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["demo.py", "--data", str(DATA), "--out", str(tmp_path)])
+    demo = runpy.run_path(str(EXAMPLES / "demo.py"), run_name="__main__")
+    known = json.loads((DATA / "camera.json").read_text())
+    depth = read_depth(DATA / "motorcycle_disp.npz", **known["depth"])
+    width = depth.shape[-1]
+    fov_x_deg = math.degrees(2 * math.atan(width / 2 / known["focal_length_px"]))
+    for name, focus_m in demo["FOCUS_M"].items():
+        shown = display(read_image(tmp_path / f"{name}.png").pixels).mean(1, keepdim=True)
+        around = functional.unfold(functional.pad(shown, (1,) * 4, mode="replicate"), 3)
+        median = around.median(1).values.view_as(shown)
+        coc_px = Camera.from_fov(fov_x_deg, demo["APERTURE_RADIUS_M"], focus_m).coc_px(depth, width)
+        outliers = int((((shown - median).abs() > 8 / 255) & (coc_px.abs() > 2)).sum())
+        assert outliers <= MAX_OUTLIERS[name], f"{name}: {outliers}"
+
+
+@pytest.mark.filterwarnings("ignore:.*one distance was measured")  # as in the paper
+def test_the_paper_s_experiment_reaches_its_figure_4(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", [str(EXAMPLES / "paper.py"), "--out", str(tmp_path)])
+    runpy.run_path(str(EXAMPLES / "paper.py"), run_name="__main__")
+    printed = capsys.readouterr().out
+    for name in ("sato_fig2", "sato_fig3", "sato_fig4", "traced_fig2_ratio", "traced_fig3", "traced_fig4"):
+        picture = np.asarray(oiio.ImageBuf(str(tmp_path / f"{name}.png")).get_pixels())
+        assert picture.std() > 0.02, name
+    # a thin lens gives 0.318 mm on a sensor of 9 mm and 480 px, 17.0 px; the traced lens is slightly larger
+    assert 16.9 < float(re.findall(r"radius = ([\d.]+)", printed)[0]) < 17.3
+    assert "sigma = 0.0023476 m" in printed
+    assert "samples of its own curve" in printed
+    off = {
+        n: float(re.findall(rf"{n} +rms radius [\d.]+ px, ([+-][\d.]+) %", printed)[0]) for n in ("ratio", "forward")
+    }
+    assert abs(off["forward"]) < 2 < abs(off["ratio"])
+    assert float(re.findall(r"spot itself: ([\d.]+) dB", printed)[0]) > 45
+
+
+def test_gradient_descent_finds_the_blur_and_with_a_known_lens_the_metres(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With fewer steps at full size."""
+    example: dict[str, Any] = runpy.run_path(str(EXAMPLES / "solve_scale.py"))
+    main = example["main"]
+    *coarse, (factor, steps, rate) = example["STAGES"]
+    monkeypatch.setitem(main.__globals__, "STAGES", (*coarse, (factor, 4, rate)))
+    scene = ROOT / "tests" / "data" / "scenes" / "room"
+    monkeypatch.setattr(
+        "sys.argv", ["solve_scale.py", "--scene", str(scene), "--out", str(tmp_path), "--known", "f_number", "focus_m"]
+    )
+    main()
+    printed = capsys.readouterr().out
+    rows = {line.split()[0]: [float(x) for x in line.split()[1:]] for line in re.findall(r"  \w+ +[\d. ]+", printed)}
+    (*_, radius_px, depth_percent, close_db), guess = rows["found"], rows["guess"]
+    assert radius_px < 0.15 < 1.0 < guess[4]
+    assert close_db > rows["true"][6] - 0.3
+    assert depth_percent < 4
+    assert (tmp_path / "room_1_scale.png").is_file()

@@ -1,0 +1,37 @@
+"""Pictures written with OpenImageIO alone."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+
+
+def spec_with(
+    array: np.ndarray, sample: str, names: tuple[str, ...] | None = None, **attributes: Any
+) -> oiio.ImageSpec:
+    """A specification of a picture; `__` in the name of an attribute stands for `:`."""
+    spec = oiio.ImageSpec(array.shape[1], array.shape[0], array.shape[2], sample)
+    if names is not None:
+        spec.channelnames = names
+        spec.alpha_channel = names.index("A") if "A" in names else -1
+    for name, value in attributes.items():
+        spec.attribute(name.replace("__", ":"), value)
+    return spec
+
+
+def store(path: Path, array: np.ndarray, sample: str, names: tuple[str, ...] | None = None, **attributes: Any) -> Path:
+    """Writes stored numbers with OpenImageIO alone."""
+    array = np.atleast_3d(array)
+    return store_parts(path, [(spec_with(array, sample, names, **attributes), array)])
+
+
+def store_parts(path: Path, parts: list[tuple[oiio.ImageSpec, np.ndarray]]) -> Path:
+    """Writes the parts of an EXR, or one picture of any type."""
+    output, specs = oiio.ImageOutput.create(str(path)), tuple(spec for spec, _ in parts)
+    assert output is not None and output.open(str(path), specs if len(parts) > 1 else specs[0])
+    for number, (spec, array) in enumerate(parts):
+        assert not number or output.open(str(path), spec, "AppendSubimage")
+        assert output.write_image(np.ascontiguousarray(array)), output.geterror()
+    assert output.close()
+    return path

@@ -1,0 +1,113 @@
+"""The compiled engine finds the same ends, circles of confusion and layers as the plain one, with its own threads."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from torchdof import Camera, blur_by_coc, native
+from torchdof.render.plan import Plan
+
+pytestmark = pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built")
+
+
+DEPTH = torch.cat(
+    [torch.linspace(-1.0, 9.0, 2003), torch.tensor([0.0, 2.0, math.inf, -math.inf, math.nan, 1e-30, 3e38])]
+)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        Camera(focus_m=2.0, f_number=1.4),
+        Camera(focus_m=math.inf),
+        Camera(focus_range_m=(1.5, 2.2)),
+        Camera(focus_range_m=(1.5, math.inf)),
+        Camera.from_fov(fov_x_deg=40.0, aperture_radius_m=0.012, focus_m=2.0),
+        Camera(focus_m=torch.tensor(2.0)),
+    ],
+    ids=str,
+)
+def test_both_engines_compute_the_same_circle_of_confusion(camera: Camera, monkeypatch: pytest.MonkeyPatch) -> None:
+    depth = DEPTH.reshape(1, 1, 30, 67)
+    compiled = camera.coc_px(depth, 640)
+    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
+    plain = camera.coc_px(depth, 640)
+    assert torch.equal(compiled.isnan(), plain.isnan())
+    assert torch.equal(compiled.nan_to_num(7.0), plain.nan_to_num(7.0))
+
+
+def maps() -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(2)
+    noise = torch.rand(1, 1, 97, 131, generator=generator)
+    slope = torch.linspace(-20.0, 50.0, 160).expand(2, 1, 90, 160).clone()
+    halves = torch.where(torch.rand(1, 1, 48, 64, generator=generator) < 0.5, -7.3, 12.5)
+    holes = 500.0 * noise**3
+    holes[0, 0, :2] = math.nan
+    beyond = 3.0 * noise
+    beyond[..., 5, 5] = -math.inf
+    return {
+        "noise": 20.0 * noise - 10.0,
+        "slope": slope,
+        "two planes": halves,
+        "one plane": torch.full((1, 1, 16, 20), -3.25),
+        "in focus": torch.zeros(1, 1, 16, 20),
+        "holes": holes,
+        "beyond the frame": beyond,
+    }
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 0.5 / 255, 1 / 255, 8 / 255, 0.3])
+@pytest.mark.parametrize("coc", maps().values(), ids=maps())
+def test_both_engines_plan_the_same_layers(coc: Tensor, tolerance: float) -> None:
+    compiled, plain = Plan.of_frame(coc, tolerance), Plan.of_frame(coc.double(), tolerance)
+    assert compiled.tolerance == pytest.approx(plain.tolerance, rel=1e-6)
+    assert len(compiled.nodes) == len(plain.nodes)
+    assert compiled.nodes == pytest.approx(plain.nodes, rel=1e-5, abs=1e-5)
+
+
+SIZES = (1, 7, 8, 9, 2**16 - 1, 2**16, 2**16 + 1, 3 * 2**16 + 5)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_ends_are_minimum_and_maximum(size: int) -> None:
+    values = torch.randn(size, generator=torch.Generator().manual_seed(size))
+    assert native.ends(values) == (float(values.min()), float(values.max()))
+    assert native.ends(values.repeat(2, 1).T) == (float(values.min()), float(values.max()))
+
+
+@pytest.mark.parametrize("place", [0, 0.5, 1])
+@pytest.mark.parametrize("size", SIZES)
+def test_a_single_nan_or_infinity_is_found(size: int, place: float) -> None:
+    values = torch.zeros(size)
+    values[int(place * (size - 1))] = -math.inf
+    assert native.ends(values)[0] == -math.inf
+    values[int(place * (size - 1))] = math.nan
+    assert all(map(math.isnan, native.ends(values)))
+
+
+class LargeReads(TorchDispatchMode):
+    """Records PyTorch's operators that read tensors large enough for several threads."""
+
+    names: list[str]
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        reads = not func.is_view and func is not torch.ops.aten.empty_like.default
+        if reads and any(isinstance(a, torch.Tensor) and a.numel() >= 2**15 for a in args):
+            self.names.append(str(func))
+        return result
+
+
+@pytest.mark.parametrize("occlusion", [True, False])
+def test_no_operator_of_pytorch_reads_a_whole_frame(occlusion: bool) -> None:
+    """PyTorch's threads would spin afterwards and compete with those of the engine."""
+    image, coc = torch.rand(1, 3, 256, 256), torch.linspace(-6.0, 9.0, 256).expand(1, 1, 256, -1).contiguous()
+    reads = LargeReads()
+    reads.names = []
+    with torch.inference_mode(), reads:
+        blur_by_coc(image, coc, occlusion=occlusion)
+    assert reads.names == []
