@@ -17,14 +17,12 @@ from .scene import Scene
 if TYPE_CHECKING:
     from ..bench.measurement import BenchScene
 
-__all__ = ["Bench"]
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Speed:
     """Speed."""
 
-    repeat: int = option("Cameras that each setting is timed with.", 5, least=1, basic=True)
+    repeat: int = option("Cameras that each setting is timed with.", 5, type=click.IntRange(min=1), basic=True)
     onnx: bool = option("Also export and time the file in onnxruntime; takes minutes.", False)
     compiled: bool = option("Also time torch.compile; takes minutes.", False, names=("--compile",))
     scan: bool = option("Also show how cost grows with radius and frame size.", False)
@@ -38,7 +36,9 @@ class _Accuracy:
         "Folder with scenes: meta.json, sharp.exr, depth.exr and truth_K.exr, at any depth below it."
     )
     views: tuple[int, ...] = option(
-        "Points on the lens for the reference renderer; repeat it to see how it converges.", (), least=1
+        "Points on the lens for the reference renderer; repeat it to see how it converges.",
+        (),
+        type=click.IntRange(min=1),
     )
     degrade: bool = option(
         "Instead, what depth costs that is soft, displaced, too coarse or noisy; writes degraded.csv and .md.", False
@@ -138,7 +138,7 @@ class Bench:
         from ..bench import speed
         from ..bench.measurement import shipped
 
-        table, console = self.blur.chosen(), Console(stderr=True)
+        table, console = self.blur.table_of(self.blur.table), Console(stderr=True)
         if (self.speed.onnx or self.speed.compiled) and table.depends_on_place:
             raise ValueError("compiled and exported graphs have one kernel a layer; leave --onnx and --compile out")
         scene = dataclasses.replace(shipped() if self.image is None else self._read(self.image), table=table)

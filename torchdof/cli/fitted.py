@@ -27,8 +27,6 @@ from torchdof.validation import number
 if TYPE_CHECKING:
     from torchdof.cli.fit import Fit
 
-__all__ = ["Shown", "fit_photographs", "trace_lens"]
-
 _WIDTH = 1920  # px; image width for which the texture of a table is drawn
 
 

@@ -15,8 +15,6 @@ import click
 if TYPE_CHECKING:
     from ..depth.sanity import Mistake
 
-__all__ = ["Bar", "WarnOnce", "json_line", "note", "tell"]
-
 _PATIENCE_S = 3.0  # s before the bar appears
 
 

@@ -12,16 +12,21 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ..io.metadata import camera_facts
 from ..io.sequence import focus_at_frame, parse_focus
-from .command import by_option, numbers, option, word_or_number
+from .command import by_option, numbers, option, positive, word_or_number
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from ..optics.camera import Camera
 
-__all__ = ["DepthMap", "Lens", "Scene", "Sensor"]
-
 _ASSUMED = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
+_WORDS = {"focal_length_mm": "focal length", "f_number": "f-number", "sensor_width_mm": "sensor width"}
+_WIDER = {  # option that sets the aperture -> how to open the lens wider
+    "--f-number": "a smaller --f-number",
+    "--aperture-radius-m": "a larger --aperture-radius-m",
+    "--equivalent": "a smaller --equivalent f-number",
+    "--blur": "a larger --blur",
+}
 _NEAR_M, _FAR_PER_NEAR = 1.0, 8.0  # nearest relative depth in m, and farthest over nearest, by default
 _BLUR, _SEEN = 0.02, 0.005  # default largest blur radius, and the smallest that is visible, over the width
 _STRAY, _SAMPLES = 1000, 2**20  # one pixel in _STRAY is ignored as an outlier; most pixels examined
@@ -56,8 +61,8 @@ def _give_one(options: Mapping[str, Any], problem: str) -> None:
 class Sensor:
     """Focus and lens."""
 
-    focal_length_mm: float | None = option("Real focal length, not the 35 mm equivalent.", positive=True)
-    sensor_width_mm: float | None = option("36 for full frame.", positive=True)
+    focal_length_mm: float | None = option("Real focal length, not the 35 mm equivalent.", callback=positive)
+    sensor_width_mm: float | None = option("36 for full frame.", callback=positive)
     fov_deg: float | None = option("Horizontal field of view of a rendered image, instead of a lens.")
 
 
@@ -86,7 +91,7 @@ class Lens(Sensor):
     )
     tilt: float = option("Degrees by which the lens is tilted down: focus comes nearer towards the bottom.", 0.0)
     swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)
-    f_number: float | None = option("Smaller is blurrier.", positive=True, basic=True)
+    f_number: float | None = option("Smaller is blurrier.", callback=positive, basic=True)
     blur_share: float | None = option(
         "Open the lens until what is blurred most, the nearest or the farthest, has a blur radius of this share of the "
         "picture's width, such as 2%; instead of --f-number.",
@@ -101,7 +106,7 @@ class Lens(Sensor):
         read=_equivalent,
         basic=True,
     )
-    aperture_radius_m: float | None = option("Radius of the opening, with --fov-deg.", positive=True)
+    aperture_radius_m: float | None = option("Radius of the opening, with --fov-deg.", callback=positive)
 
     def __post_init__(self) -> None:
         places = {"--focus-m": self.focus_m, "--focus-at": self.focus_at, "--focus-range": self.focus_range}
@@ -111,16 +116,15 @@ class Lens(Sensor):
         _give_one(views | {"--focal-length-mm with --sensor-width-mm": real}, "say the same")
         if self.fov_deg is None and self.aperture_radius_m is not None:
             raise ValueError("--aperture-radius-m goes with --fov-deg; a real lens has --f-number instead")
-        _give_one(self._openings, "both say how wide the lens opens")
+        _give_one(self._opening, "both say how wide the lens opens")
         if self.fov_deg is not None and not 0 < self.fov_deg < 180:
             raise ValueError(f"--fov-deg must be a number of degrees > 0 and < 180, got {self.fov_deg:g}")
 
     @property
-    def _openings(self) -> dict[str, Any]:
-        """Option -> value or None, for the options that set the aperture."""
-        names = {"--f-number": "f_number", "--aperture-radius-m": "aperture_radius_m"}
-        names |= {"--equivalent": "equivalent", "--blur": "blur_share"}
-        return {option: getattr(self, name) for option, name in names.items()}
+    def _opening(self) -> dict[str, Any]:
+        """Option -> value, for the option that sets the aperture; empty if none does."""
+        values = (self.f_number, self.aperture_radius_m, self.equivalent, self.blur_share)
+        return {option: value for option, value in zip(_WIDER, values, strict=True) if value is not None}
 
     @property
     def has_focus(self) -> bool:
@@ -131,9 +135,7 @@ class Lens(Sensor):
         """Advice for a largest blur radius that is hardly visible."""
         if largest_px == 0:
             return "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
-        wider = "a larger --aperture-radius-m" if self.aperture_radius_m is not None else "a smaller --f-number"
-        wider = "a smaller --equivalent f-number" if self.equivalent is not None else wider
-        wider = "a larger --blur" if self.blur_share is not None else wider
+        wider = _WIDER[next(iter(self._opening), "--f-number")]
         more = f", or --blur {_BLUR:.0%}" if is_still and self.blur_share is None else ""
         return f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; {wider}{more} makes more of it"
 
@@ -149,20 +151,19 @@ class Lens(Sensor):
 
     def view_deg(self, metadata: Mapping[str, Any], width: int, height: int) -> float:
         """Horizontal field of view in degrees, as stated, or from focal length and sensor of options or file."""
-        known = self._known(metadata, width, height)
+        known = camera_facts(metadata, width, height) | self._stated(width, height)
         if self.fov_deg is not None:
             return self.fov_deg
         if not {"focal_length_mm", "sensor_width_mm"} <= set(known):
             raise ValueError("--depth-kind distance needs --fov-deg, or --focal-length-mm and --sensor-width-mm")
         return 2 * math.degrees(math.atan2(known["sensor_width_mm"], 2 * known["focal_length_mm"]))
 
-    def _known(self, metadata: Mapping[str, Any], width: int, height: int) -> dict[str, float]:
-        """Numbers of the camera from the options, or else from the file."""
-        stated = {name: value for name in _ASSUMED if (value := getattr(self, name)) is not None}
+    def _stated(self, width: int, height: int) -> dict[str, float]:
+        """Numbers of the lens that the options state, for an image of a size in pixels."""
         if self.equivalent is not None:
             lens = (*self.equivalent, 36.0 * width / max(width, height))
-            stated = dict(zip(_ASSUMED, lens, strict=True))
-        return camera_facts(metadata, width, height) | stated
+            return dict(zip(_ASSUMED, lens, strict=True))
+        return {name: value for name in _ASSUMED if (value := getattr(self, name)) is not None}
 
     def camera(
         self,
@@ -184,11 +185,12 @@ class Lens(Sensor):
         from ..optics.camera import Camera
 
         height, width = depth.shape[-2:]
-        known, remarks, focus_m = self._known(metadata, width, height), list[str](), math.inf
+        stated, in_file = self._stated(width, height), camera_facts(metadata, width, height)
+        remarks, focus_m = list[str](), math.inf
         if self.focus_m is not None:
             focus_m = focus_at_frame(self.focus_m, frame)
-        elif not self.has_focus and is_to_scale and "focus_m" in known:
-            focus_m = known["focus_m"]
+        elif not self.has_focus and is_to_scale and "focus_m" in in_file:
+            focus_m = in_file["focus_m"]
             remarks.append("focus from the file")
         elif not self.has_focus and not is_still:
             raise ValueError("where is the focus? give --focus-m METRES or --focus-at X,Y (the file does not say)")
@@ -197,33 +199,27 @@ class Lens(Sensor):
 
             focus_m = subject_m(depth)
             remarks.append("focus on what is nearest the middle")
-        is_open = any(value is not None for value in self._openings.values())
-        if self.fov_deg is not None and not is_open:
+        if self.fov_deg is not None and not self._opening:
             raise ValueError("--fov-deg needs the opening of the lens: --aperture-radius-m, --f-number or --blur")
+        lens: dict[str, Any] = {name: (_ASSUMED | in_file | stated)[name] for name in _ASSUMED}
+        sources = {name: "from the file" if name in in_file else "assumed" for name in _ASSUMED if name not in stated}
         with by_option(self._names()):
             if self.fov_deg is None:
-                lens: dict[str, Any] = {name: known.get(name, assumed) for name, assumed in _ASSUMED.items()}
                 camera = Camera(**lens, focus_m=focus_m)
             else:
-                radius_m = self.aperture_radius_m
-                if radius_m is None:  # on the equivalent sensor, 36 mm wide
-                    radius_m = 18.0 / math.tan(math.radians(self.fov_deg) / 2) / (2000.0 * (self.f_number or 1.0))
-                camera = Camera.from_fov(self.fov_deg, radius_m, focus_m)
+                camera = Camera.from_fov(self.fov_deg, self.aperture_radius_m or 0.01, focus_m)
+                camera = camera if self.f_number is None else camera.replace(f_number=self.f_number)
             camera = camera.replace(focus_range_m=self.focus_range, tilt_deg=self.tilt, swing_deg=self.swing)
         camera = camera if self.focus_at is None else camera.focus_at(depth, *self.focus_at)
-        share = self.blur_share
-        if is_still and not is_open and (self == Lens() or not is_to_scale):
-            is_known = is_to_scale and "f_number" in known
-            share = None if is_known and self._largest_coc_px(camera, depth) >= _SEEN * width else _BLUR
-        largest_px = 0.0 if share is None else self._largest_coc_px(camera, depth)
+        share, is_open = self.blur_share, is_still and not self._opening and (self == Lens() or not is_to_scale)
+        largest_px = self._largest_coc_px(camera, depth) if share is not None or is_open else 0.0
+        if is_open and not (is_to_scale and "f_number" in in_file and largest_px >= _SEEN * width):
+            share = _BLUR
         if share is not None and largest_px > 0:
             camera = camera.replace(f_number=camera.f_number * largest_px / (share * width))
-        for name in _ASSUMED if self.fov_deg is None and self.equivalent is None else ():
-            words = "f-number" if name == "f_number" else name.rsplit("_", 1)[0].replace("_", " ")
-            if name == "f_number" and share is not None and largest_px > 0:
-                remarks += [] if is_open else [f"{words} for a blur of {share:.0%} of the width"]
-            elif getattr(self, name) is None:
-                remarks.append(f"{words} {'from the file' if name in known else 'assumed'}")
+            sources["f_number"] = f"for a blur of {share:.0%} of the width" if is_open else ""
+        if self.fov_deg is None:
+            remarks += [f"{_WORDS[name]} {source}" for name, source in sources.items() if source]
         return camera, remarks
 
     def _largest_coc_px(self, camera: "Camera", depth: "Tensor") -> float:
@@ -240,19 +236,15 @@ class Lens(Sensor):
         names = self._names()
         if self.fov_deg is None:
             return {names[name]: getattr(camera, name) for name in CAMERA_NUMBERS}
-        opening = next((option, value) for option, value in self._openings.items() if value is not None)
-        return {"--fov-deg": self.fov_deg, **dict([opening]), names["focus_m"]: camera.focus_m}
+        return {"--fov-deg": self.fov_deg, **self._opening, names["focus_m"]: camera.focus_m}
 
     def _names(self) -> dict[str, str]:
         """Argument of :class:`Camera` -> its option, marked if that is not given; for messages."""
+        names = {name: f"--{name.replace('_', '-')}" for name in (*_ASSUMED, "aperture_radius_m")}
+        names = {name: option + ("" if getattr(self, name) else " (not given)") for name, option in names.items()}
         focus = "--focus-at" if self.focus_at else "--focus-range" if self.focus_range else "--focus-m"
-        given = {name: getattr(self, name) is not None for name in (*_ASSUMED, "aperture_radius_m")}
-        spelled = {name: f"--{name.replace('_', '-')}" for name in given} | {"focus_m": focus}
-        given["focus_m"] = self.has_focus
-        names = {name: spelled[name] + ("" if is_given else " (not given)") for name, is_given in given.items()}
-        if self.equivalent is not None:
-            names |= dict.fromkeys(_ASSUMED, "--equivalent")
-        return _SPELLED | names
+        names["focus_m"] = focus + ("" if self.has_focus else " (not given)")
+        return _SPELLED | names | (dict.fromkeys(_ASSUMED, "--equivalent") if self.equivalent else {})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -318,10 +310,6 @@ class DepthMap:
         """Whether distances are in metres, and not only assumed for relative depth."""
         return self.depth_kind != "relative" or self.near_m is not None or self.far_m is not None
 
-    def of_sequence(self) -> "DepthMap":
-        """The same for a sequence: "auto" becomes "z", because a guess could differ from frame to frame."""
-        return replace(self, depth_kind="z") if self.depth_kind == "auto" else self
-
     def guessed(self, values: "Tensor", path: Path, is_metric: bool) -> "tuple[DepthMap, str]":
         """The same with a guessed kind in the place of ``auto``, and a message about the guess.
 
@@ -362,3 +350,8 @@ class Scene:
             raise ValueError(
                 "--depth-kind coc is the blur itself and takes no camera; leave focus and lens options out"
             )
+
+    def of_sequence(self) -> "Scene":
+        """The same for a sequence: "auto" becomes "z", because a guess could differ from frame to frame."""
+        is_guessed = self.depth_map.depth_kind == "auto"
+        return replace(self, depth_map=replace(self.depth_map, depth_kind="z")) if is_guessed else self
