@@ -26,7 +26,7 @@ from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect, stretch
 from .options import make_folder_of
-from .printed import Bar, WarnOnce, note, tell
+from .printed import Bar, Once, tell
 from .scene import Scene
 
 if TYPE_CHECKING:
@@ -104,24 +104,22 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
     return Frame(str(source), scene, picture, values, filled, remarks, guess, time.perf_counter() - start)
 
 
-def coc_of(
-    frame: Frame, warned: WarnOnce, number: int = 0, is_still: bool = True
-) -> tuple[Tensor, Camera | None, list[str]]:
+def coc_of(frame: Frame, once: Once, number: int = 0, is_still: bool = True) -> tuple[Tensor, Camera | None, list[str]]:
     """Signed radius ``[1, 1, H, W]`` in pixels, the camera (None for ``--depth-kind coc``), and remarks on both.
 
     ``number`` is the frame number, at which the focus is interpolated between keyframes.
 
     Raises:
-        ValueError: If the lens is impossible, or a mistake is likely and ``warned`` is strict.
+        ValueError: If the lens is impossible, or a mistake is likely and ``once`` is strict.
     """
     said, lens, values = frame.scene.depth_map, frame.scene.lens, frame.values
     if said.depth_kind == "coc":
-        warned.warn(frame.name, coc_mistakes(values))
+        once.warn(frame.name, coc_mistakes(values))
         return values, None, []
     camera, remarks = lens.camera(frame.picture.metadata, values, number, is_still, said.is_to_scale)
     coc_px = camera.coc_px(values, values.shape[-1])
     coc_of_lens(coc_px, values, lens.stated(camera))
-    warned.warn(frame.name, frame.mistakes(camera))
+    once.warn(frame.name, frame.mistakes(camera))
     return coc_px, camera, remarks + frame.remarks
 
 
@@ -148,8 +146,8 @@ class Renderer:
 
     def __init__(self, command: "Render", scene: Scene, is_still: bool) -> None:
         self.command, self.scene, self.is_still = command, scene, is_still
-        self.table, self._noted = command.blur.table_of(command.blur.table), set[str]()
-        self.device, self.warned = _device(command.device), WarnOnce(command.scene.depth_map.strict)
+        self.table, self.device = command.blur.table_of(command.blur.table), _device(command.device)
+        self.once = Once(scene.depth_map.strict)
 
     def read(self, image: Path, depth: Path | None) -> Frame:
         """Reads a frame as :func:`read_frame`, with the transfer curve and layer of the options."""
@@ -160,7 +158,7 @@ class Renderer:
         """Renders a frame; ``bar`` shows the expected time of a large one. Raises as :func:`coc_of`."""
         start, picture, command = time.perf_counter(), frame.picture, self.command
         frame = dataclasses.replace(frame, values=frame.values.to(self.device))
-        coc_px, camera, remarks = coc_of(frame, self.warned, number, self.is_still)
+        coc_px, camera, remarks = coc_of(frame, self.once, number, self.is_still)
         pixels = picture.pixels.to(self.device)
         if command.show_focus:
             pixels = tint_focus(pixels, coc_px, picture.has_alpha)
@@ -188,11 +186,10 @@ class Renderer:
             make_folder_of(files.sheet)
             write_sheet(files.sheet, _panels(rendered))
         largest_px = float(rendered.coc_px.abs().max())
-        notes = {"guess": f"{frame.name}: {frame.guess}"} if frame.guess else {}
+        if frame.guess:
+            self.once.note("guess", f"{frame.name}: {frame.guess}")
         if rendered.camera is not None and largest_px < _HARDLY_PX:
-            notes["blur"] = f"{out}: {frame.scene.lens.more_blur(largest_px, self.is_still)}"
-        note(*(line for name, line in notes.items() if name not in self._noted))
-        self._noted |= set(notes)
+            self.once.note("little blur", f"{out}: {frame.scene.lens.more_blur(largest_px, self.is_still)}")
         words, facts = self._told(rendered.camera, largest_px, frame)
         height, width = rendered.picture.pixels.shape[-2:]
         seconds = rendered.seconds + time.perf_counter() - start

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from .command import argument, option
 from .options import check_files, json_option, make_folder_of
-from .printed import WarnOnce, note, tell
+from .printed import Once, tell
 from .scene import Scene
 
 
@@ -60,5 +60,7 @@ class Inspect:
         facts = {"image": str(self.image), "width": width, "height": height, "camera": facts_of_camera(camera)}
         facts |= {"assumed": notes, **report.facts(), "filled_px": frame.filled, "picture": str(target)}
         tell(self.as_json, facts, "\n".join(lines))
-        note(*([f"{frame.name}: {frame.guess}"] if frame.guess else []))
-        WarnOnce(said.strict).warn(frame.name, frame.mistakes(camera))
+        once = Once(said.strict)
+        if frame.guess:
+            once.note("guess", f"{frame.name}: {frame.guess}")
+        once.warn(frame.name, frame.mistakes(camera))

@@ -168,7 +168,7 @@ class Render:
 
         renderer, said = Renderer(self, scene, is_still=images is None), scene.depth_map
         if images and said.depth_kind == "relative" and said.value_range is None and len(numbers) > 1:
-            renderer.warned.warn(self.depth or self.image, [Mistake("range", _EACH_ITS_OWN)])
+            renderer.once.warn(self.depth or self.image, [Mistake("range", _EACH_ITS_OWN)])
         read_files = functools.lru_cache(maxsize=1)(renderer.read)  # a focus pull reads one image many times
 
         def read(n: int) -> "Frame":
