@@ -42,15 +42,9 @@ def show(value: Any) -> str:
 def number(
     name: str, value: Any, low: float = -math.inf, high: float = math.inf, unit: str = "", infinite: bool = False
 ) -> float:
-    """A number in the open interval ``(low, high)``, which is neither a bool nor NaN.
+    """A number in the open interval ``(low, high)``, neither a bool nor NaN; ``infinite`` allows infinity.
 
-    Args:
-        name: Name of the argument.
-        value: Value of the argument.
-        low: Lower bound, excluded.
-        high: Upper bound, excluded.
-        unit: Unit for the message, such as ``"metres"``.
-        infinite: Whether infinity is allowed.
+    ``name`` is that of the argument in the message, ``unit`` the unit there, such as ``"metres"``.
 
     Example:
         >>> number("f_number", 2, low=0)
@@ -145,10 +139,7 @@ def ends(values: Tensor) -> tuple[float, float]:
 def real_tensor(name: str, value: Any, what: str) -> Tensor:
     """A dense floating-point tensor that holds data.
 
-    Args:
-        name: Name of the argument.
-        value: Value of the argument.
-        what: Expected shape and unit for the message, such as ``"[B, 1, H, W] in metres"``.
+    ``what`` is the expected shape and unit for the message, such as ``"[B, 1, H, W] in metres"``.
     """
     if not isinstance(value, Tensor):
         raise ValueError(f"{name} must be a tensor {what}, got {show(value)}")
@@ -258,15 +249,9 @@ def coc_of_lens(coc_px: Tensor, depth: Tensor, lens: Mapping[str, Any]) -> None:
 def background(
     image: Tensor, hidden: Tensor | None, name: str, where: Tensor | None, unit: str, values: bool = False
 ) -> None:
-    """Refuse a background that is not like the image, or whose map does not fit.
+    """Refuse a background that is not like the image, or whose depth or circle of confusion ``where`` does not fit.
 
-    Args:
-        image: ``[B, C, H, W]``.
-        hidden: The background, of the same shape, or None.
-        name: Name of the background's map, for messages.
-        where: Depth or circle of confusion of the background, or None.
-        unit: Unit of that map, for messages.
-        values: Whether both must be finite.
+    ``name`` and ``unit`` are those of ``where``. With ``values`` both must be finite.
     """
     if hidden is None and where is None:
         return

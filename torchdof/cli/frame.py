@@ -21,7 +21,7 @@ from ..io.images import Picture, read_image, read_values, write_image
 from ..io.sheet import shrunk, write_sheet
 from ..module import blur_by_coc
 from ..optics.blur_table import BlurTable
-from ..optics.camera import CAMERA_NUMBERS, Camera
+from ..optics.camera import Camera
 from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect, stretch
@@ -125,7 +125,7 @@ def coc_of(frame: Frame, once: Once, number: int = 0, is_still: bool = True) -> 
 
 def facts_of_camera(camera: Camera) -> dict[str, Any]:
     """The numbers of a camera, as data for JSON."""
-    return {name: float(getattr(camera, name)) for name in CAMERA_NUMBERS}
+    return {name: value for name, value in vars(camera).items() if name != "focus_breathing"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,12 +202,11 @@ class Renderer:
     def _told(self, camera: Camera | None, largest_px: float, frame: Frame) -> tuple[list[str], dict[str, Any]]:
         """Parts of the printed line about a frame, and the same as data for JSON."""
         command, table, words = self.command, self.table, list[str]()
-        facts: dict[str, Any] = {"camera": None, "largest_coc_px": largest_px, "filled_px": frame.filled}
+        facts: dict[str, Any] = {"camera": camera and facts_of_camera(camera)}
+        facts |= {"largest_coc_px": largest_px, "filled_px": frame.filled}
         facts |= {"show_focus": command.show_focus, "device": str(self.device)}
         if camera is not None:
             ends, angles = camera.focus_range_m, {"tilt": camera.tilt_deg, "swing": camera.swing_deg}
-            facts["camera"] = facts_of_camera(camera) | {f"{name}_deg": float(a) for name, a in angles.items()}
-            facts["camera"]["focus_range_m"] = None if ends is None else [float(end) for end in ends]
             focus = " to ".join(f"{end:.4g}" for end in ends or (camera.focus_m,))
             lens = f"{camera.focal_length_mm:.4g} mm on {camera.sensor_width_mm:.4g} mm"
             words.append(f"focus {focus} m, f/{camera.f_number:.3g}, {lens}")
