@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .command import option
+from .lens import Sensor
 from .options import Accuracy, Blur, json_option
 from .printed import Bar, tell
-from .scene import Sensor
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
