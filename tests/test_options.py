@@ -16,10 +16,10 @@ def test_type_hints_have_every_option() -> None:
 
 
 @pytest.mark.parametrize("function", [DepthOfField, depth_of_field, blur_by_coc])
-def test_signature_and_help_have_every_option_with_its_default(function: object) -> None:
+def test_the_signature_has_every_option_with_its_default_and_help_names_their_class(function: object) -> None:
     parameters = inspect.signature(function).parameters  # type: ignore[arg-type]
     assert {name: parameters[name].default for name in OPTIONS} == {**OPTIONS, "table": None}
-    assert all(f"{name}: " in (function.__doc__ or "") for name in OPTIONS)
+    assert "**options: As in :class:`torchdof.options.Options`" in (function.__doc__ or "")
 
 
 def test_an_unknown_option_is_refused_with_a_list_of_options() -> None:

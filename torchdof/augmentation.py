@@ -25,7 +25,7 @@ from .optics.blur_table import BlurTable
 from .optics.camera import Camera
 from .options import OptionArguments, Options, spells_options
 from .tensors import floating
-from .validation import image_and_map, number, show
+from .validation import choice, image_and_map, number, show
 
 __all__ = ["DepthAugmentationSequential", "RandomDepthOfField"]
 
@@ -102,8 +102,7 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         tables = [table] if table is None or isinstance(table, BlurTable) else [*table]
         if not tables:
             raise ValueError("table must be a torchdof.BlurTable, several, or None, got an empty list")
-        if transfer not in ("linear", "srgb"):
-            raise ValueError(f"transfer must be 'linear' or 'srgb', got {show(transfer)}")
+        choice("transfer", transfer, ("linear", "srgb"))
         if not isinstance(return_label, bool):
             raise ValueError(f"return_label must be True or False, got {show(return_label)}")
         self.return_label = return_label

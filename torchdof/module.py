@@ -370,9 +370,7 @@ def blur(
     channels = options.table.channels
     validation.image_and_coc(image, coc_px, channels, values=options.check)
     _check_plan(plan)
-    validation.background(image, background, "background_coc_px", background_coc_px, "in pixels")
-    if options.check:
-        validation.finite_background(background, background_coc_px)
+    validation.background(image, background, "background_coc_px", background_coc_px, "in pixels", options.check)
     hidden = None if background is None or background_coc_px is None else (background, background_coc_px)
     if hidden is not None and not options.occlusion:
         raise ValueError("without occlusion nothing is hidden: a background needs occlusion=True")

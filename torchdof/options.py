@@ -2,16 +2,14 @@
 
 import dataclasses
 import inspect
-import textwrap
 from collections.abc import Mapping
-from typing import Any, Literal, TypedDict, TypeVar
+from typing import Any, Literal, TypedDict, TypeVar, get_args
 
 from typing_extensions import Unpack
 
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera
-from .validation import depth_edges as check_depth_edges
-from .validation import show, tolerance_of
+from .validation import choice, show, tolerance_of
 
 __all__ = [
     "OPTION_NAMES",
@@ -83,14 +81,13 @@ class Options:
         for name in ("occlusion", "normalize", "check"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name} must be True or False, got {show(getattr(self, name))}")
-        if not isinstance(self.method, str) or self.method not in ("layered", "fold"):
-            raise ValueError(f"method must be 'layered' or 'fold', got {show(self.method)}")
+        choice("method", self.method, get_args(Method))
+        choice("depth_edges", self.depth_edges, get_args(DepthEdges))
         if self.occlusion and not self.normalize:
             raise ValueError("normalize=False is the plain sum of occlusion=False; set occlusion=False as well")
         reach = self.max_coc_px
         if isinstance(reach, bool) or not isinstance(reach, int | float) or not 0.5 < reach < 1e300:
             raise ValueError(f"max_coc_px must be a radius above 0.5 pixels, got {show(reach)}")
-        check_depth_edges(self.depth_edges)
 
     @classmethod
     def of(cls, table: BlurTable | None = None, **arguments: Unpack["OptionArguments"]) -> "Options":
@@ -136,33 +133,16 @@ class OptionArguments(TypedDict, total=False):
 
 
 def spells_options(function: _Spelled) -> _Spelled:
-    """Decorator that makes ``help`` and editors show each option of a function or class with ``**options``.
-
-    It adds the names and defaults of :class:`Options` to the signature, and replaces the line ``**options`` of the
-    docstring by their descriptions.
-    """
+    """Decorator that shows, in the signature of a function with ``**options``, each option with its default."""
     called: Any = function.__init__ if inspect.isclass(function) else function
     signature = inspect.signature(called)
-    own_parameters = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-    own_names = {p.name for p in own_parameters}
-    kinds = OptionArguments.__annotations__
+    own = [parameter for parameter in signature.parameters.values() if parameter.kind is not parameter.VAR_KEYWORD]
+    options = {field.name: field.default for field in dataclasses.fields(Options)}
     spelled = [
-        inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=kinds[f.name])
-        for f in dataclasses.fields(Options)
-        if f.name in kinds
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=options[name], annotation=kind)
+        for name, kind in OptionArguments.__annotations__.items()
     ]
-    called.__signature__ = signature.replace(parameters=[*own_parameters, *spelled])
-    if function.__doc__ and Options.__doc__:
-        meanings = inspect.cleandoc(Options.__doc__).partition("Args:\n")[2].partition("\n\n")[0]
-        lines = [line for line in textwrap.dedent(meanings).splitlines() if line.partition(":")[0] not in own_names]
-        shown = []
-        for line in function.__doc__.splitlines():
-            if line.lstrip().startswith("**options:"):
-                indent = line[: len(line) - len(line.lstrip())]
-                shown += [indent + meaning for meaning in lines]
-            else:
-                shown.append(line)
-        function.__doc__ = "\n".join(shown)
+    called.__signature__ = signature.replace(parameters=[*own, *spelled])
     return function
 
 

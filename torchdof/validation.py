@@ -1,4 +1,8 @@
-"""Checks of arguments at the public boundary; errors state the expected value, the given value and the remedy."""
+"""Checks of arguments at the public boundary.
+
+A failed check raises ``ValueError``, whose message states the expected value, the given value and the remedy. Values of
+tensors are never read in a traced program.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,57 +14,37 @@ from torch import Tensor
 from . import native
 from .tensors import TRACEABLE, floating, has_storage, is_in_memory, is_traced
 
-__all__ = [
-    "NAMED_TOLERANCES",
-    "WHOLE_NUMBERS",
-    "background",
-    "broadcast_shapes",
-    "coc_of_lens",
-    "depth_edges",
-    "ends",
-    "finite_background",
-    "is_resizable",
-    "image_and_coc",
-    "image_and_depth",
-    "image_and_map",
-    "number",
-    "pixels_wide",
-    "real_tensor",
-    "same_aspect",
-    "show",
-    "stack",
-    "stretch",
-    "tolerance_of",
-    "whole",
-]
-
-
 NAMED_TOLERANCES = {"draft": 8 / 255, "preview": 4 / 255, "final": 1 / 255}
 """RMS tolerances. The last difference is smaller than a step of an 8-bit display."""
-
-_MOST_STRETCH = 0.03  # largest change of a depth map's aspect ratio; estimators work at multiples of 14 or 64 px
 
 WHOLE_NUMBERS = (
     *(torch.uint8, torch.uint16, torch.uint32, torch.uint64),
     *(torch.int8, torch.int16, torch.int32, torch.int64),
 )
 
+_MOST_STRETCH = 0.03  # largest change of a depth map's aspect ratio; estimators work at multiples of 14 or 64 px
+
+
+# Numbers and words
+
+
+def show(value: Any) -> str:
+    """A short text for a value in a message; never raises."""
+    if isinstance(value, Tensor):
+        return f"a {value.dtype} tensor of shape {list(value.shape)}"
+    try:
+        text = repr(value)
+    except Exception:  # an integer with more digits than Python prints, or an error in the object's own repr
+        text = ""
+    return text if 0 < len(text) <= 60 else f"{type(value).__name__} {text[:40]}...".replace(" ...", "")
+
 
 def number(
     name: str, value: Any, low: float = -math.inf, high: float = math.inf, unit: str = "", infinite: bool = False
 ) -> float:
-    """A number in the open interval ``(low, high)``.
+    """A number in the open interval ``(low, high)``, neither a bool nor NaN; ``infinite`` allows infinity.
 
-    Args:
-        name: Name of the argument.
-        value: Value of the argument.
-        low: Lower bound, excluded.
-        high: Upper bound, excluded.
-        unit: Unit for the message, such as ``"metres"``.
-        infinite: Whether infinity is allowed.
-
-    Raises:
-        ValueError: If the value is not a number (a bool is not), is NaN, or is out of range.
+    ``name`` is that of the argument in the message, ``unit`` the unit there, such as ``"metres"``.
 
     Example:
         >>> number("f_number", 2, low=0)
@@ -77,6 +61,53 @@ def number(
     raise ValueError(f"{name} must be {wanted}{' (inf allowed)' if infinite else ''}, got {show(value)}")
 
 
+def whole(name: str, value: Any, low: int, high: int) -> int:
+    """A whole number from ``low`` to ``high``; a bool is not one."""
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        raise ValueError(f"{name} must be a whole number from {low} to {high}, got {show(value)}")
+    return value
+
+
+def choice(name: str, value: Any, choices: Sequence[str]) -> None:
+    """Refuse a value that is not one of two or more words.
+
+    Example:
+        >>> choice("method", "layered", ("layered", "fold"))
+    """
+    if not isinstance(value, str) or value not in choices:
+        *others, last = map(repr, choices)
+        raise ValueError(f"{name} must be {', '.join(others)} or {last}, got {show(value)}")
+
+
+def tolerance_of(value: Any) -> float:
+    """A tolerance, a name or a number in [0, 1), as a number.
+
+    Example:
+        >>> tolerance_of("preview") == 4 / 255
+        True
+    """
+    if isinstance(value, str) and value in NAMED_TOLERANCES:
+        return NAMED_TOLERANCES[value]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1:
+        names = ", ".join(repr(name) for name in NAMED_TOLERANCES)
+        raise ValueError(f"tolerance must be a number in [0, 1), such as 1/255, or one of {names}, got {show(value)}")
+    return value
+
+
+def pixels_wide(width: Any) -> None:
+    """Refuse a width that is not a positive number of pixels; symbols and tensors of a traced program pass."""
+    if is_traced() or isinstance(width, torch.SymInt):
+        return
+    if isinstance(width, Tensor):
+        if width.ndim or width.is_complex() or width.layout != torch.strided or width.device.type == "meta":
+            raise ValueError(f"width must be one number of pixels, got {show(width)}")
+        width = width.item()
+    number("width", width, low=0, unit="pixels")
+
+
+# Tensors
+
+
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
     """As :func:`torch.broadcast_shapes`, whose first call imports sympy and takes half a second.
 
@@ -84,17 +115,6 @@ def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
         RuntimeError: If the shapes do not fit each other.
     """
     return torch.broadcast_tensors(*(torch.zeros((), device="cpu").expand(tuple(shape)) for shape in shapes))[0].shape
-
-
-def whole(name: str, value: Any, low: int, high: int) -> int:
-    """A whole number from ``low`` to ``high``.
-
-    Raises:
-        ValueError: If the value is not a whole number, or is out of range.
-    """
-    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        raise ValueError(f"{name} must be a whole number from {low} to {high}, got {show(value)}")
-    return value
 
 
 def ends(values: Tensor) -> tuple[float, float]:
@@ -116,31 +136,10 @@ def ends(values: Tensor) -> tuple[float, float]:
     return low, high
 
 
-def pixels_wide(width: Any) -> None:
-    """Refuse a width that is not a positive number of pixels; symbols and tensors of a traced program pass.
-
-    Raises:
-        ValueError: If it is not a positive finite number, or a tensor of one.
-    """
-    if is_traced() or isinstance(width, torch.SymInt):
-        return
-    if isinstance(width, Tensor):
-        if width.ndim or width.is_complex() or width.layout != torch.strided or width.device.type == "meta":
-            raise ValueError(f"width must be one number of pixels, got {show(width)}")
-        width = width.item()
-    number("width", width, low=0, unit="pixels")
-
-
 def real_tensor(name: str, value: Any, what: str) -> Tensor:
     """A dense floating-point tensor that holds data.
 
-    Args:
-        name: Name of the argument.
-        value: Value of the argument.
-        what: Expected shape and unit for the message, such as ``"[B, 1, H, W] in metres"``.
-
-    Raises:
-        ValueError: If the value is not a tensor, has another dtype, is sparse, or has no data ("meta").
+    ``what`` is the expected shape and unit for the message, such as ``"[B, 1, H, W] in metres"``.
     """
     if not isinstance(value, Tensor):
         raise ValueError(f"{name} must be a tensor {what}, got {show(value)}")
@@ -164,221 +163,6 @@ def real_tensor(name: str, value: Any, what: str) -> Tensor:
     return value
 
 
-def tolerance_of(value: Any) -> float:
-    """A tolerance as a number.
-
-    Raises:
-        ValueError: If the value is neither a name nor a number in [0, 1).
-
-    Example:
-        >>> tolerance_of("preview") == 4 / 255
-        True
-    """
-    if isinstance(value, str) and value in NAMED_TOLERANCES:
-        return NAMED_TOLERANCES[value]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1:
-        names = ", ".join(repr(name) for name in NAMED_TOLERANCES)
-        raise ValueError(f"tolerance must be a number in [0, 1), such as 1/255, or one of {names}, got {show(value)}")
-    return value
-
-
-def depth_edges(value: Any) -> None:
-    """Refuse a value that is not "auto", "repair" or "as given".
-
-    Raises:
-        ValueError: If it is another value.
-    """
-    if not isinstance(value, str) or value not in ("auto", "repair", "as given"):
-        raise ValueError(f"depth_edges must be 'auto', 'repair' or 'as given', got {show(value)}")
-
-
-def image_and_depth(image: Tensor, depth: Tensor, values: bool, name: str = "depth") -> None:
-    """Refuse an image and a depth map that do not fit each other.
-
-    Args:
-        image: ``[B, C, H, W]``.
-        depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres.
-        values: Whether to check the values too.
-        name: Name of the depth in messages.
-
-    Raises:
-        ValueError: If shapes or types are wrong, or, with ``values``, a depth is NaN or not positive.
-    """
-    image_and_map(image, name, depth, "in metres")
-    if values and not is_traced():
-        if not ends(depth)[0] > 0:
-            bad = int((~(depth > 0)).sum())
-            raise ValueError(
-                f"{name} must be > 0 (inf allowed), got {bad} of {depth.numel()} pixels that are NaN, zero or "
-                "negative; fill the holes, or pass check=False to let these pixels through sharp"
-            )
-
-
-def is_resizable(image: Any, depth: Any) -> bool:
-    """Whether a depth map has another size than an image, but nearly the same aspect ratio."""
-    maps = all(isinstance(t, Tensor) and t.ndim == 4 and t.is_floating_point() and t.numel() for t in (image, depth))
-    if not maps or image.shape[-2:] == depth.shape[-2:] or image.device != depth.device:
-        return False
-    return depth.shape[0] in (1, image.shape[0]) and depth.shape[1] == 1 and stretch(image, depth) <= _MOST_STRETCH
-
-
-def stretch(image: Tensor, depth: Tensor) -> float:
-    """Relative stretch of a depth map along one axis to the aspect ratio of an image; 0 for less than a pixel.
-
-    Example:
-        >>> round(stretch(torch.rand(1, 3, 1080, 1920), torch.rand(1, 1, 294, 518)), 4)  # multiples of 14
-        0.009
-    """
-    (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
-    across, down = height * columns, width * rows
-    return abs(across - down) / min(across, down) if abs(across - down) >= max(width, columns) else 0.0
-
-
-def same_aspect(image: Tensor, depth: Tensor) -> None:
-    """Refuse a depth map whose aspect ratio differs from that of an image ``[..., H, W]``.
-
-    Raises:
-        ValueError: If the aspect ratios differ by more than 3 %.
-    """
-    if 0 in depth.shape or stretch(image, depth) > _MOST_STRETCH:
-        (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
-        if 0 not in depth.shape and stretch(image, depth.transpose(-1, -2)) <= _MOST_STRETCH:
-            hint = "turned by 90 degrees it fits: rotate one of the two"
-        else:
-            hint = "crop one of the two, so that both show the same area"
-        raise ValueError(
-            f"depth is {columns} x {rows} pixels and the image {width} x {height}: a depth map may have another size, "
-            f"but must have the same aspect ratio, to within 3 %; {hint}"
-        )
-
-
-def image_and_coc(image: Tensor, coc_px: Tensor, channels: int, values: bool) -> None:
-    """Refuse an image and a map of the circle of confusion that do not fit each other.
-
-    Args:
-        image: ``[B, C, H, W]``.
-        coc_px: Its signed circle of confusion, in pixels.
-        channels: Number of kernels of the table at a node: 1, or one for each channel of the image.
-        values: Whether to check the values too (never in a traced program).
-
-    Raises:
-        ValueError: If shapes or types are wrong, the table has other channels than the image, or, with ``values``, a
-            coc or a pixel is not finite.
-    """
-    image_and_map(image, "coc_px", coc_px, "in pixels")
-    if channels not in (1, image.shape[1]):
-        raise ValueError(f"the table blurs {channels} channels, the image has {image.shape[1]}")
-    if values and not is_traced():
-        _finite("coc_px", coc_px)
-        _finite("image", image)
-
-
-def background(image: Tensor, hidden: Tensor | None, name: str, where: Tensor | None, unit: str) -> None:
-    """Refuse a background that does not fit an image.
-
-    Args:
-        image: ``[B, C, H, W]``.
-        hidden: The background, of the same shape, or None.
-        name: Name of the background's map, for messages.
-        where: Depth or circle of confusion of the background, or None.
-        unit: Unit of that map, for messages.
-
-    Raises:
-        ValueError: If only one of both is given, or shapes or types are wrong.
-    """
-    if hidden is None and where is None:
-        return
-    if hidden is None or where is None:
-        missing = "background" if hidden is None else "background_depth (or background_coc_px)"
-        raise ValueError(f"a background needs its depth, and a depth its background: {missing} is missing")
-    if not isinstance(hidden, Tensor) or (hidden.shape, hidden.dtype, hidden.device) != (
-        image.shape,
-        image.dtype,
-        image.device,
-    ):
-        raise ValueError(f"background must be like the image, {show(image)}, got {show(hidden)}")
-    _map(name, unit, where, image)
-    if not is_traced():
-        real_tensor("background", hidden, "[B, C, H, W]")
-        real_tensor(name, where, f"[B, 1, H, W] {unit}")
-
-
-def finite_background(hidden: Tensor | None, coc_px: Tensor | None) -> None:
-    """Refuse a background, or its circle of confusion, with values that are not finite.
-
-    Raises:
-        ValueError: With the number of such values.
-    """
-    for name, values in (("background_coc_px", coc_px), ("background", hidden)):
-        if values is not None and not is_traced():
-            _finite(name, values)
-
-
-def stack(rgba: Tensor, depth_m: Tensor, values: bool) -> Tensor:
-    """Refuse a stack of layers and depths that do not fit each other.
-
-    Returns:
-        The depths as ``[B or 1, N, 1, H or 1, W or 1]``.
-
-    Raises:
-        ValueError: If shapes or types are wrong, or, with ``values``, a coverage is outside [0, 1] or light is not
-            finite.
-    """
-    for name, value in (("rgba", rgba), ("depth_m", depth_m)):
-        if not floating(value):
-            got = f"a {value.dtype} tensor" if isinstance(value, Tensor) else type(value).__name__
-            raise ValueError(f"{name} must be a floating-point tensor, got {got}")
-    if rgba.ndim != 5 or rgba.shape[2] < 2 or 0 in rgba.shape:
-        raise ValueError(f"rgba must be [B, N, C + 1, H, W], premultiplied, got {list(rgba.shape)}")
-    batch, count, _, height, width = rgba.shape
-    depth = depth_m
-    if depth.ndim in (1, 2) and depth.shape[-1] == count:
-        depth = depth.reshape(-1, count, 1, 1, 1)
-    if depth.ndim != 5 or depth.shape[0] not in (1, batch) or depth.shape[1:3] != (count, 1):
-        raise ValueError(
-            f"depth_m must be [{count}], [{batch}, {count}] or [B, {count}, 1, H, W], got {[*depth_m.shape]}"
-        )
-    if tuple(depth.shape[3:]) not in ((1, 1), (height, width)):
-        raise ValueError(f"depth_m must have the layers' size {height} x {width}, got {list(depth_m.shape)}")
-    if not is_traced():
-        real_tensor("rgba", rgba, "[B, N, C + 1, H, W]")
-        real_tensor("depth_m", depth_m, "in metres")
-    if values and not is_traced():
-        cover = rgba[:, :, -1]
-        bad = int((~((cover >= 0) & (cover <= 1))).sum())
-        if bad:
-            raise ValueError(
-                f"the last channel of rgba is coverage, in [0, 1]; {bad} of {cover.numel()} values are not"
-            )
-        _finite("rgba", rgba)
-    return depth
-
-
-def coc_of_lens(coc_px: Tensor, depth: Tensor, lens: Mapping[str, Any]) -> None:
-    """Refuse a circle of confusion that overflowed.
-
-    Args:
-        coc_px: The circle of confusion in pixels.
-        depth: The depth in metres from which it was computed.
-        lens: Numbers of the camera by name, floats or tensors.
-
-    Raises:
-        ValueError: With the nearest depth and all numbers of the lens.
-    """
-    if not is_traced() and not all(map(math.isfinite, ends(coc_px))):
-        stated = ", ".join(f"{name} {_number(value)}" for name, value in lens.items())
-        raise ValueError(
-            f"depth and lens must give a finite blur radius, got an infinite one: check this lens ({stated}) "
-            f"and the depth, which starts at {float(depth.detach().min()):.3g} m"
-        )
-
-
-def _number(value: Any) -> str:
-    """A number of a lens, or all numbers of a batch, as text."""
-    numbers = value.detach().flatten().tolist() if isinstance(value, Tensor) else [value]
-    return " ".join(f"{x:.6g}" for x in numbers)
-
-
 def _finite(name: str, values: Tensor) -> None:
     """Refuse numbers that are NaN or infinite."""
     if not all(map(math.isfinite, ends(values))):
@@ -389,21 +173,11 @@ def _finite(name: str, values: Tensor) -> None:
         )
 
 
+# An image [B, C, H, W] and what belongs to it
+
+
 def image_and_map(image: Tensor, name: str, value: Tensor, unit: str) -> None:
-    """Refuse an image and a one-channel map whose types, sizes or devices do not fit.
-
-    Raises:
-        ValueError: If one of them is wrong; the message names it.
-    """
-    _image(image)
-    _map(name, unit, value, image)
-    if not is_traced():
-        real_tensor("image", image, "[B, C, H, W]")
-        real_tensor(name, value, f"[B, 1, H, W] {unit}")
-
-
-def _image(image: Tensor) -> None:
-    """Refuse a value that is not an image ``[B, C, H, W]`` in floating point."""
+    """Refuse an image and a one-channel map, in a unit, whose types, sizes or devices do not fit."""
     if not isinstance(image, Tensor):
         raise ValueError(f"image must be a tensor [B, C, H, W] in linear light, got {type(image).__name__}")
     if not floating(image):
@@ -414,6 +188,10 @@ def _image(image: Tensor) -> None:
         raise ValueError(f"image must be [B, C, H, W] in linear light, got {list(image.shape)}{hint}")
     if 0 in image.shape:
         raise ValueError(f"image must have at least one pixel, channel and item, got {list(image.shape)}")
+    _map(name, unit, value, image)
+    if not is_traced():
+        real_tensor("image", image, "[B, C, H, W]")
+        real_tensor(name, value, f"[B, 1, H, W] {unit}")
 
 
 def _map(name: str, unit: str, value: Tensor, image: Tensor) -> None:
@@ -432,12 +210,137 @@ def _map(name: str, unit: str, value: Tensor, image: Tensor) -> None:
         raise ValueError(f"{name} must be on the image's device {image.device}, got {value.device}")
 
 
-def show(value: Any) -> str:
-    """A short text for a value in a message; never raises."""
-    if isinstance(value, Tensor):
-        return f"a {value.dtype} tensor of shape {list(value.shape)}"
-    try:
-        text = repr(value)
-    except Exception:  # an integer with more digits than Python prints, or an error in the object's own repr
-        text = ""
-    return text if 0 < len(text) <= 60 else f"{type(value).__name__} {text[:40]}...".replace(" ...", "")
+def image_and_depth(image: Tensor, depth: Tensor, values: bool, name: str = "depth") -> None:
+    """Refuse an image and a depth map in metres that do not fit, or, with ``values``, depth that is not positive."""
+    image_and_map(image, name, depth, "in metres")
+    if values and not is_traced() and not ends(depth)[0] > 0:
+        bad = int((~(depth > 0)).sum())
+        raise ValueError(
+            f"{name} must be > 0 (inf allowed), got {bad} of {depth.numel()} pixels that are NaN, zero or "
+            "negative; fill the holes, or pass check=False to let these pixels through sharp"
+        )
+
+
+def image_and_coc(image: Tensor, coc_px: Tensor, channels: int, values: bool) -> None:
+    """Refuse an image and a signed circle of confusion in pixels that do not fit.
+
+    ``channels`` is the number of kernels of the table at a node: 1, or one for each channel of the image. With
+    ``values`` both must be finite.
+    """
+    image_and_map(image, "coc_px", coc_px, "in pixels")
+    if channels not in (1, image.shape[1]):
+        raise ValueError(f"the table blurs {channels} channels, the image has {image.shape[1]}")
+    if values and not is_traced():
+        _finite("coc_px", coc_px)
+        _finite("image", image)
+
+
+def coc_of_lens(coc_px: Tensor, depth: Tensor, lens: Mapping[str, Any]) -> None:
+    """Refuse a circle of confusion that overflowed; the message has the numbers of the lens, floats or tensors."""
+    if not is_traced() and not all(map(math.isfinite, ends(coc_px))):
+        given = {n: value.flatten().tolist() if isinstance(value, Tensor) else [value] for n, value in lens.items()}
+        stated = ", ".join(" ".join([name, *(f"{x:.6g}" for x in numbers)]) for name, numbers in given.items())
+        raise ValueError(
+            f"depth and lens must give a finite blur radius, got an infinite one: check this lens ({stated}) "
+            f"and the depth, which starts at {float(depth.detach().min()):.3g} m"
+        )
+
+
+def background(
+    image: Tensor, hidden: Tensor | None, name: str, where: Tensor | None, unit: str, values: bool = False
+) -> None:
+    """Refuse a background that is not like the image, or whose depth or circle of confusion ``where`` does not fit.
+
+    ``name`` and ``unit`` are those of ``where``. With ``values`` both must be finite.
+    """
+    if hidden is None and where is None:
+        return
+    if hidden is None or where is None:
+        missing = "background" if hidden is None else "background_depth (or background_coc_px)"
+        raise ValueError(f"a background needs its depth, and a depth its background: {missing} is missing")
+    like = (image.shape, image.dtype, image.device)
+    if not isinstance(hidden, Tensor) or (hidden.shape, hidden.dtype, hidden.device) != like:
+        raise ValueError(f"background must be like the image, {show(image)}, got {show(hidden)}")
+    _map(name, unit, where, image)
+    if not is_traced():
+        real_tensor("background", hidden, "[B, C, H, W]")
+        real_tensor(name, where, f"[B, 1, H, W] {unit}")
+        if values:
+            _finite(name, where)
+            _finite("background", hidden)
+
+
+def stretch(image: Tensor, depth: Tensor) -> float:
+    """Relative stretch of a depth map along one axis to the aspect ratio of an image; 0 for less than a pixel.
+
+    Example:
+        >>> round(stretch(torch.rand(1, 3, 1080, 1920), torch.rand(1, 1, 294, 518)), 4)  # multiples of 14
+        0.009
+    """
+    (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
+    across, down = height * columns, width * rows
+    return abs(across - down) / min(across, down) if abs(across - down) >= max(width, columns) else 0.0
+
+
+def is_resizable(image: Any, depth: Any) -> bool:
+    """Whether a depth map has another size than an image, but nearly the same aspect ratio."""
+    maps = all(isinstance(t, Tensor) and t.ndim == 4 and t.is_floating_point() and t.numel() for t in (image, depth))
+    if not maps or image.shape[-2:] == depth.shape[-2:] or image.device != depth.device:
+        return False
+    return depth.shape[0] in (1, image.shape[0]) and depth.shape[1] == 1 and stretch(image, depth) <= _MOST_STRETCH
+
+
+def same_aspect(image: Tensor, depth: Tensor) -> None:
+    """Refuse a depth map whose aspect ratio differs by more than 3 % from that of an image ``[..., H, W]``."""
+    if 0 in depth.shape or stretch(image, depth) > _MOST_STRETCH:
+        (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
+        if 0 not in depth.shape and stretch(image, depth.transpose(-1, -2)) <= _MOST_STRETCH:
+            hint = "turned by 90 degrees it fits: rotate one of the two"
+        else:
+            hint = "crop one of the two, so that both show the same area"
+        raise ValueError(
+            f"depth is {columns} x {rows} pixels and the image {width} x {height}: a depth map may have another size, "
+            f"but must have the same aspect ratio, to within 3 %; {hint}"
+        )
+
+
+# Layers
+
+
+def stack(rgba: Tensor, depth_m: Tensor, values: bool) -> Tensor:
+    """Refuse a stack of layers and depths that do not fit.
+
+    With ``values`` coverage must lie in [0, 1] and light must be finite.
+
+    Returns:
+        The depths as ``[B or 1, N, 1, H or 1, W or 1]``.
+    """
+    for name, value in (("rgba", rgba), ("depth_m", depth_m)):
+        if not floating(value):
+            got = f"a {value.dtype} tensor" if isinstance(value, Tensor) else type(value).__name__
+            raise ValueError(f"{name} must be a floating-point tensor, got {got}")
+    if rgba.ndim != 5 or rgba.shape[2] < 2 or 0 in rgba.shape:
+        raise ValueError(f"rgba must be [B, N, C + 1, H, W], premultiplied, got {list(rgba.shape)}")
+    batch, count, _, height, width = rgba.shape
+    depth = depth_m
+    if depth.ndim in (1, 2) and depth.shape[-1] == count:
+        depth = depth.reshape(-1, count, 1, 1, 1)
+    if depth.ndim != 5 or depth.shape[0] not in (1, batch) or depth.shape[1:3] != (count, 1):
+        raise ValueError(
+            f"depth_m must be [{count}], [{batch}, {count}] or [B, {count}, 1, H, W], got {[*depth_m.shape]}"
+        )
+    if tuple(depth.shape[3:]) not in ((1, 1), (height, width)):
+        raise ValueError(f"depth_m must have the layers' size {height} x {width}, got {list(depth_m.shape)}")
+    if is_traced():
+        return depth
+    real_tensor("rgba", rgba, "[B, N, C + 1, H, W]")
+    real_tensor("depth_m", depth_m, "in metres")
+    if values:
+        cover = rgba[:, :, -1]
+        bad = int((~((cover >= 0) & (cover <= 1))).sum())
+        if bad:
+            raise ValueError(
+                f"the last channel of rgba is coverage, in [0, 1]; {bad} of {cover.numel()} values are not"
+            )
+        _finite("rgba", rgba)
+    return depth

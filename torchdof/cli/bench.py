@@ -5,26 +5,20 @@ import importlib.util
 import os
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from .command import argument, option
 from .options import Blur, check_files, json_option
-from .printed import WarnOnce, json_line
+from .printed import Once, json_line
 from .scene import Scene
-
-if TYPE_CHECKING:
-    from ..bench.measurement import BenchScene
-
-__all__ = ["Bench"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Speed:
     """Speed."""
 
-    repeat: int = option("Cameras that each setting is timed with.", 5, least=1, basic=True)
+    repeat: int = option("Cameras that each setting is timed with.", 5, type=click.IntRange(min=1), basic=True)
     onnx: bool = option("Also export and time the file in onnxruntime; takes minutes.", False)
     compiled: bool = option("Also time torch.compile; takes minutes.", False, names=("--compile",))
     scan: bool = option("Also show how cost grows with radius and frame size.", False)
@@ -38,7 +32,9 @@ class _Accuracy:
         "Folder with scenes: meta.json, sharp.exr, depth.exr and truth_K.exr, at any depth below it."
     )
     views: tuple[int, ...] = option(
-        "Points on the lens for the reference renderer; repeat it to see how it converges.", (), least=1
+        "Points on the lens for the reference renderer; repeat it to see how it converges.",
+        (),
+        type=click.IntRange(min=1),
     )
     degrade: bool = option(
         "Instead, what depth costs that is soft, displaced, too coarse or noisy; writes degraded.csv and .md.", False
@@ -84,33 +80,15 @@ class Bench:
     as_json: bool = json_option()
 
     def run(self) -> None:
-        """Checks the options, then measures accuracy or speed."""
+        """Measures accuracy or speed."""
         if self.accuracy.truth is not None:
-            self._compare_with_truth(self.accuracy.truth)
-            return
-        if self.accuracy != _Accuracy():
-            raise ValueError("--views, --degrade and --peer compare with a truth; name its folder with --truth")
-        if self.image is None and self.scene != Scene():
-            raise ValueError("the built-in scene has its own camera and depth; name an IMAGE for these options")
-        self.scene.lens.refuse_keyframes()
-        if self.image is not None:
-            check_files(self.image, self.depth, None)
-        needed = {"matplotlib": self.out is not None, "onnxruntime": self.speed.onnx}
-        for package, is_needed in needed.items():  # check before measuring for minutes
-            if is_needed and importlib.util.find_spec(package) is None:
-                raise ModuleNotFoundError(f"no {package}", name=package)
-        if self.speed.compiled and not any(map(shutil.which, (os.environ.get("CXX", ""), "g++", "clang++", "c++"))):
-            raise FileNotFoundError(
-                "torch.compile needs a C++ compiler, and none was found; install g++ or leave --compile out"
-            )
-        from ..tensors import TRACEABLE
+            self._measure_accuracy(self.accuracy.truth)
+        else:
+            self._measure_speed()
 
-        if self.speed.compiled and not TRACEABLE:
-            raise ValueError("torch.compile needs PyTorch 2.13 or newer here; leave --compile out")
-        self._measure_speed()
-
-    def _compare_with_truth(self, truth: Path) -> None:
-        """Measures accuracy on the scenes in a folder."""
+    def _measure_accuracy(self, truth: Path) -> None:
+        """Checks the options, and measures accuracy on the scenes in a folder."""
+        degrade, views = self.accuracy.degrade, self.accuracy.views
         if self.image is not None or self.speed != _Speed(repeat=self.speed.repeat):
             raise ValueError(
                 "--truth measures the scenes of its folder; leave IMAGE and DEPTH out, and --onnx, --compile and --scan"
@@ -119,47 +97,58 @@ class Bench:
             raise ValueError(
                 "the scenes of --truth have their own lens and depth; leave options of these and of blur out"
             )
-        if self.as_json:
-            raise ValueError("--truth writes its numbers as CSV to the folder --out; leave --json out")
-        if self.out is None:
-            raise ValueError("--truth writes tables and pictures; give a folder with --out")
-        if self.accuracy.degrade and self.accuracy.views:
+        if self.as_json or self.out is None:
+            raise ValueError("--truth writes tables and pictures; give a folder with --out, and leave --json out")
+        if degrade and views:
             raise ValueError("--degrade compares without the reference; leave --views out")
         from ..bench import accuracy
 
         self.out.mkdir(parents=True, exist_ok=True)
-        views = [] if self.accuracy.degrade else list(self.accuracy.views) or [256]
-        accuracy.compare(truth, self.out, views, self.accuracy.degrade, list(self.accuracy.peer))
+        accuracy.compare(truth, self.out, [] if degrade else views or [256], degrade, self.accuracy.peer)
 
     def _measure_speed(self) -> None:
-        """Measures speed against error on the user's scene or on the built-in one."""
+        """Checks the options, and measures speed against error on the user's scene or on the built-in one."""
+        said, lens = self.speed, self.scene.lens
+        if self.accuracy != _Accuracy():
+            raise ValueError("--views, --degrade and --peer compare with a truth; name its folder with --truth")
+        if self.image is None and self.scene != Scene():
+            raise ValueError("the built-in scene has its own camera and depth; name an IMAGE for these options")
+        lens.refuse_keyframes()
+        if self.image is not None:
+            check_files(self.image, self.depth, None)
+        for package, is_needed in {"matplotlib": self.out is not None, "onnxruntime": said.onnx}.items():
+            if is_needed and importlib.util.find_spec(package) is None:  # check before measuring for minutes
+                raise ModuleNotFoundError(f"no {package}", name=package)
+        if said.compiled and not any(map(shutil.which, (os.environ.get("CXX", ""), "g++", "clang++", "c++"))):
+            raise FileNotFoundError(
+                "torch.compile needs a C++ compiler, and none was found; install g++ or leave --compile out"
+            )
         from rich.console import Console
 
         from ..bench import speed
-        from ..bench.measurement import shipped
+        from ..bench.measurement import BenchScene, shipped
+        from ..tensors import TRACEABLE
+        from .frame import coc_of, read_frame
 
-        table, console = self.blur.chosen(), Console(stderr=True)
-        if (self.speed.onnx or self.speed.compiled) and table.depends_on_place:
+        if said.compiled and not TRACEABLE:
+            raise ValueError("torch.compile needs PyTorch 2.13 or newer here; leave --compile out")
+        table = self.blur.table_of(self.blur.table)
+        if (said.onnx or said.compiled) and table.depends_on_place:
             raise ValueError("compiled and exported graphs have one kernel a layer; leave --onnx and --compile out")
-        scene = dataclasses.replace(shipped() if self.image is None else self._read(self.image), table=table)
-        chosen: dict[speed.Runtime, bool] = {"onnxruntime": self.speed.onnx, "compiled": self.speed.compiled}
+        if self.image is None:
+            scene = dataclasses.replace(shipped(), table=table)
+        else:
+            frame = read_frame(self.image, self.depth, self.scene)
+            coc_px, camera, remarks = coc_of(frame, Once(self.scene.depth_map.strict))
+            remarks = ["focus as stated"] * lens.has_focus + remarks + [f"depth {frame.guess}"] * bool(frame.guess)
+            words = "blur as given" if camera is None else f"{camera!r}; {', '.join(remarks)}"
+            scene = BenchScene(self.image.name, frame.picture.light, coc_px, words, table)
         if self.out is not None:
             self.out.mkdir(parents=True, exist_ok=True)
+        chosen: dict[speed.Runtime, bool] = {"onnxruntime": said.onnx, "compiled": said.compiled}
         runtimes = [runtime for runtime, is_chosen in chosen.items() if is_chosen]
-        rows = speed.compare(scene, self.speed.repeat, console, runtimes, self.speed.scan)
+        rows = speed.compare(scene, said.repeat, Console(stderr=True), runtimes, said.scan)
         if self.as_json:
             facts = {"scene": scene.name, "remark": scene.remark, "table": repr(scene.table)}
             click.echo(json_line({**facts, "settings": rows}))
         speed.report(rows, scene, self.out, quiet=self.as_json)
-
-    def _read(self, image: Path) -> "BenchScene":
-        """Reads the user's image, without alpha, and its blur radii."""
-        from ..bench.measurement import BenchScene
-        from .frame import coc_of, read_frame
-
-        frame = read_frame(image, self.depth, self.scene)
-        coc_px, camera, remarks = coc_of(frame, WarnOnce(self.scene.depth_map.strict))
-        remarks = ["focus as stated"] * self.scene.lens.has_focus + remarks
-        remarks += [f"depth {frame.guess}"] if frame.guess else []
-        words = "blur as given" if camera is None else f"{camera!r}; {', '.join(remarks)}"
-        return BenchScene(image.name, frame.picture.light, coc_px, words)

@@ -9,20 +9,13 @@ import dataclasses
 import inspect
 import math
 import re
-import types
 import typing
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 from typing import Any, Literal
 
 import click
 
-__all__ = ["argument", "by_option", "command_of", "numbers", "option", "word_or_number"]
-
-_TYPES: dict[Any, click.ParamType] = {
-    **{str: click.STRING, int: click.INT, float: click.FLOAT, bool: click.BOOL},
-    Path: click.Path(path_type=Path),
-}
+_BASIC = "Options"  # heading of the options that --help lists first
 
 
 def option(
@@ -30,12 +23,10 @@ def option(
     default: Any = None,
     *,
     names: tuple[str, ...] = (),
-    metavar: str | None = None,
     read: Callable[[str], Any] | None = None,
     group: str = "",
-    least: int | None = None,
-    positive: bool = False,
     basic: bool = False,
+    **details: Any,
 ) -> Any:
     """Declares a dataclass field as an option.
 
@@ -43,16 +34,15 @@ def option(
         help: Text in ``--help``.
         default: Default value; ``...`` makes the option required.
         names: Spellings on the command line; empty uses the field's name with dashes.
-        metavar: Placeholder for the value in ``--help``.
         read: Converts the text to the value, or raises ``ValueError`` with the expected form.
         group: Heading in ``--help``; empty uses the docstring of the field's class.
-        least: Smallest allowed value of a whole number.
-        positive: Whether the value must be finite and above 0.
         basic: Whether ``--help`` lists the option before the groups.
+        **details: Further arguments of :class:`click.Option`; its ``type`` is otherwise that of the field.
     """
-    facts = {"help": help, "names": names, "metavar": metavar, "read": read, "least": least}
-    facts["positive"] = positive
-    facts["group"] = "Options" if basic else group
+    details["help"] = help
+    if read is not None:
+        details |= {"type": str, "callback": lambda _, __, text: None if text is None else read(text)}
+    facts = {"names": names, "group": _BASIC if basic else group, "details": details}
     return dataclasses.field(**({} if default is ... else {"default": default}), metadata=facts)
 
 
@@ -79,6 +69,13 @@ def word_or_number(words: tuple[str, ...], expected: str) -> Callable[[str], flo
     return lambda text: text if text in words else numbers(1, expected)(text)[0]
 
 
+def positive(_: click.Context, parameter: click.Parameter, value: float | None) -> float | None:
+    """Callback of an option: refuses a number that is not positive and finite; None is allowed."""
+    if value is not None and not 0 < value < math.inf:
+        raise ValueError(f"{parameter.opts[0]} must be positive and finite, got {value:g}")
+    return value
+
+
 @contextlib.contextmanager
 def by_option(names: Mapping[str, str]) -> Iterator[None]:
     """Replaces names of arguments by names of options (argument -> option) in the message of a ``ValueError``."""
@@ -95,11 +92,11 @@ class _Command(click.Command):
     groups: dict[str | None, str]  # name of a parameter -> heading
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        shown: dict[str, list[tuple[str, str]]] = {"Options": []}
+        shown: dict[str, list[tuple[str, str]]] = {_BASIC: []}
         for parameter in self.get_params(ctx):
             row = parameter.get_help_record(ctx)
             if row is not None and not isinstance(parameter, click.Argument):
-                shown.setdefault(self.groups.get(parameter.name, "Options"), []).append(row)
+                shown.setdefault(self.groups.get(parameter.name, _BASIC), []).append(row)
         for group, rows in shown.items():
             with formatter.section(group):
                 formatter.write_dl(rows, col_max=28)
@@ -107,7 +104,7 @@ class _Command(click.Command):
 
 def command_of(name: str, kind: type[Any]) -> click.Command:
     """The command that makes a ``kind`` of its arguments and runs it; the docstring of ``kind`` is the help."""
-    parameters, told = list(_parameters(kind, "Options")), inspect.getdoc(kind) or ""
+    parameters, told = list(_parameters(kind, _BASIC)), inspect.getdoc(kind) or ""
     command = _Command(
         name,
         params=[parameter for parameter, _ in parameters],
@@ -121,15 +118,11 @@ def command_of(name: str, kind: type[Any]) -> click.Command:
     return command
 
 
-def _fields(kind: type[Any]) -> list[tuple[Any, Any]]:
-    """Fields of a class, each with its type."""
-    hints = typing.get_type_hints(kind)
-    return [(field, hints[field.name]) for field in dataclasses.fields(kind)]
-
-
 def _parameters(kind: type[Any], group: str) -> Iterator[tuple[click.Parameter, str]]:
     """Arguments and options for the fields of a class and of the groups in it, each with its heading."""
-    for field, hint in _fields(kind):
+    hints = typing.get_type_hints(kind)
+    for field in dataclasses.fields(kind):
+        hint = hints[field.name]
         if dataclasses.is_dataclass(hint):
             yield from _parameters(hint, (hint.__doc__ or "").rstrip("."))  # type: ignore[arg-type]
         else:
@@ -137,43 +130,27 @@ def _parameters(kind: type[Any], group: str) -> Iterator[tuple[click.Parameter, 
 
 
 def _parameter(field: Any, hint: Any) -> click.Parameter:
-    """Argument or option for a field."""
-    facts, required, read = field.metadata, field.default is dataclasses.MISSING, field.metadata["read"]
-    if typing.get_origin(hint) in (types.UnionType, typing.Union):
+    """Argument or option for a field of type ``hint``; a tuple without a ``read`` of its own takes several values."""
+    details, names = dict(field.metadata["details"]), field.metadata["names"]
+    required = field.default is dataclasses.MISSING
+    several = typing.get_origin(hint) is tuple and "callback" not in details
+    if typing.get_args(hint) and typing.get_origin(hint) is not Literal:  # X | None, tuple[X, ...]
         hint = typing.get_args(hint)[0]
-    several = typing.get_origin(hint) is tuple and read is None
-    hint = typing.get_args(hint)[0] if several else hint
-    given: dict[str, Any] = {"help": facts["help"], "metavar": facts["metavar"], "required": required}
-    if read is not None:
-        given |= {"type": click.STRING, "callback": lambda _, __, text: None if text is None else read(text)}
-    elif typing.get_origin(hint) is Literal:
-        given["type"] = click.Choice(typing.get_args(hint))
-    else:
-        given["type"] = _TYPES[hint] if facts["least"] is None else click.IntRange(min=facts["least"])
-    if facts["positive"]:
-        given["callback"] = _positive
+    details.setdefault("type", click.Choice(typing.get_args(hint)) if typing.get_origin(hint) is Literal else hint)
     if not required and field.default not in (None, ()):
-        given["default"] = field.default
-    if facts["names"] == ("argument",):
-        return click.Argument([field.name], nargs=-1 if several else 1, **given)
+        details["default"] = field.default
+    if names == ("argument",):
+        return click.Argument([field.name], nargs=-1 if several else 1, required=required, **details)
     if hint is bool:
-        given["is_flag"] = True
+        details["is_flag"] = True
     else:
-        given |= {"multiple": several, "show_default": bool(field.default) and not required}
-    return click.Option([field.name, *(facts["names"] or (f"--{field.name.replace('_', '-')}",))], **given)
-
-
-def _positive(_: click.Context, parameter: click.Parameter, value: float | None) -> float | None:
-    """Refuses a number that is not positive and finite; None is allowed."""
-    if value is not None and not 0 < value < math.inf:
-        raise ValueError(f"{parameter.opts[0]} must be positive and finite, got {value:g}")
-    return value
+        details |= {"multiple": several, "show_default": bool(field.default) and not required}
+    spelled = names or (f"--{field.name.replace('_', '-')}",)
+    return click.Option([field.name, *spelled], required=required, **details)
 
 
 def _made(kind: type[Any], values: dict[str, Any]) -> Any:
     """Creates an object of ``kind`` with its groups; ``values`` has the values of all their fields by name."""
-    made = {
-        field.name: _made(hint, values) if dataclasses.is_dataclass(hint) else values[field.name]  # type: ignore[arg-type]
-        for field, hint in _fields(kind)
-    }
-    return kind(**made)
+    hints: dict[str, Any] = {field.name: typing.get_type_hints(kind)[field.name] for field in dataclasses.fields(kind)}
+    groups: dict[str, Any] = {name: hint for name, hint in hints.items() if dataclasses.is_dataclass(hint)}
+    return kind(**{name: _made(groups[name], values) if name in groups else values[name] for name in hints})

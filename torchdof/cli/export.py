@@ -7,11 +7,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .command import option
-from .options import Accuracy, Blur, edges_option, json_option
+from .lens import Sensor
+from .options import Accuracy, Blur, json_option
 from .printed import Bar, tell
-from .scene import Sensor
-
-__all__ = ["Export"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -53,7 +51,6 @@ class Export:
     blur: Blur
     max_coc: float = option("Largest radius in pixels that the file holds.", 32.0, basic=True)
     accuracy: Accuracy
-    depth_edges: Literal["auto", "repair", "as-given"] = edges_option("as-given")
     graph: _Graph
     as_json: bool = json_option()
 
@@ -80,10 +77,11 @@ class Export:
             camera = Camera(**{name: value for name, value in stated.items() if value is not None})
         else:
             camera = Camera.from_fov(self.sensor.fov_deg, 0.01, 2.0)  # aperture and focus are inputs of the graph
-        dof = DepthOfField(camera, self.blur.chosen(), **self.accuracy.options(), max_coc_px=self.max_coc, check=False)
-        graph = {**dataclasses.asdict(self.graph), "depth_edges": self.depth_edges.replace("-", " ")}
+        options = {"depth_edges": "as given", **self.accuracy.arguments(), "max_coc_px": self.max_coc, "check": False}
+        dof = DepthOfField(camera, self.blur.table_of(self.blur.table), **options)
         with Bar("tracing") as bar:
-            report = to_onnx(dof, out, **graph, progress=bar.update)
+            graph = dataclasses.asdict(self.graph)
+            report = to_onnx(dof, out, **graph, depth_edges=dof.options.depth_edges, progress=bar.update)
         tell(self.as_json, {"out": str(out), **dataclasses.asdict(report)}, f"{report}\nwrote {out}")
 
 

@@ -13,9 +13,6 @@ import click
 from torchdof.cli.command import argument, numbers, option
 from torchdof.cli.options import json_option
 
-__all__ = ["Fit"]
-
-
 _micrometres = numbers(None, "--wavelengths takes rgb, or micrometres like 0.65,0.55,0.45")
 _WANTED = "--field takes distances in mm from the middle of the frame, rising from 0, like 0,7,14,21.6"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,8 +26,7 @@ from torchdof.validation import number
 
 if TYPE_CHECKING:
     from torchdof.cli.fit import Fit
-
-__all__ = ["Shown", "fit_photographs", "trace_lens"]
+    from torchdof.fit.result import BlurFit
 
 _WIDTH = 1920  # px; image width for which the texture of a table is drawn
 
@@ -105,7 +104,8 @@ def fit_photographs(said: Fit, folder: Path) -> None:
             facts["advice"] = list(photographs.advice)
         shown.facts(facts)
         if said.plots is not None and photographs is None:
-            shown.draw(result.table, said.plots, table_file.stem, captures, result)
+            fits = zip((pair.distance_m for pair in captures), result.fits, strict=True)
+            shown.draw(result.table, said.plots, table_file.stem, fits)
     if across:
         shown.write(table_of_dots(fitted), said.out)
 
@@ -220,20 +220,12 @@ class Shown:
         else:
             self._save(sheet, target)
 
-    def draw(
-        self,
-        table: BlurTable,
-        folder: Path,
-        stem: str,
-        captures: Captures | None = None,
-        result: TableFit | None = None,
-    ) -> None:
-        """Draws the fit at each distance, the table over depth, and the texture of its largest circle of confusion."""
+    def draw(self, table: BlurTable, folder: Path, stem: str, fits: Iterable[tuple[float, BlurFit]] = ()) -> None:
+        """Draws the fit at each distance in m, the table over depth, and the texture of its largest coc."""
         from torchdof.fit import plots
 
-        if captures is not None and result is not None:
-            for pair, fit in zip(captures, result.fits, strict=True):
-                self._save(plots.picture_of_fit(fit), folder / f"{stem}_{pair.distance_m * 1000:.0f}mm.png")
+        for distance_m, fit in fits:
+            self._save(plots.picture_of_fit(fit), folder / f"{stem}_{distance_m * 1000:.0f}mm.png")
         self._save(plots.picture_of_table(table), folder / f"{stem}_table.png")
         scales = {"fraction": float(_WIDTH), "mm": _WIDTH / (table.sensor_width_mm or 36.0), "relative": 16.0}
         largest = float(table.coc[table.coc.abs().argmax()]) * scales[table.unit]

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -21,18 +21,16 @@ from ..io.images import Picture, read_image, read_values, write_image
 from ..io.sheet import shrunk, write_sheet
 from ..module import blur_by_coc
 from ..optics.blur_table import BlurTable
-from ..optics.camera import CAMERA_NUMBERS, Camera
+from ..optics.camera import Camera
 from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect, stretch
-from .options import make_folder_of, pick_device
-from .printed import Bar, WarnOnce, note, tell
+from .options import make_folder_of
+from .printed import Bar, Once, tell
 from .scene import Scene
 
 if TYPE_CHECKING:
     from .render import Render
-
-__all__ = ["Frame", "Rendered", "Renderer", "coc_of", "facts_of_camera", "read_frame"]
 
 _HARDLY_PX = 2.0  # px; a note advises more blur if the largest radius is below
 _LARGE_PX = 8_000_000  # pixels of an image; the bar shows the expected time of larger ones
@@ -48,24 +46,15 @@ class Frame:
     scene: Scene  # the options, with the guess in the place of "auto"
     picture: Picture
     values: Tensor  # [1, 1, H, W], depth in metres, or signed radius in pixels for coc
-    holes: int  # number of filled pixels
-    seconds: float  # time of reading
-    stretch: float  # relative stretch of the depth along one axis to the aspect of the image
+    filled: int  # number of filled holes, in pixels
+    remarks: list[str]  # changes of the depth, and assumptions about it, that no option states
     guess: str  # message about the guessed kind of depth, or empty
+    seconds: float  # time of reading
 
     def mistakes(self, camera: Camera) -> list[Mistake]:
         """Likely mistakes in the depth, given the camera."""
-        said = self.scene.depth_map
-        kind: Any = said.depth_kind
-        return depth_mistakes(self.values, camera, kind, said.depth_scale)
-
-    @property
-    def remarks(self) -> list[str]:
-        """Changes of the depth, and assumptions about it, that no option states."""
-        said, remarks = self.scene.depth_map, [f"depth stretched by {self.stretch:.1%}"] if self.stretch else []
-        if said.depth_kind == "relative" and None in (said.near_m, said.far_m):
-            remarks.append("depth from {:g} to {:g} m assumed".format(*said.ends_m))
-        return remarks
+        kind: Any = self.scene.depth_map.depth_kind
+        return depth_mistakes(self.values, camera, kind, self.scene.depth_map.depth_scale)
 
 
 def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = False, **encoding: Any) -> Frame:
@@ -75,115 +64,108 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
     if ``holes`` is true; otherwise they are filled as the guess proposes, or raise ``ValueError``.
     """
     start, source, guess = time.perf_counter(), depth or image, ""
-    picture, filled = read_image(image, **encoding), 0
-    if depth is not None or scene.depth_map.depth_channel is not None:
-        values = read_values(source, scene.depth_map.depth_channel)
+    picture, said = read_image(image, **encoding), scene.depth_map
+    height, width = picture.pixels.shape[-2:]
+    if depth is not None or said.depth_channel is not None:
+        values = read_values(source, said.depth_channel)
     elif picture.depth is not None:
         values = picture.depth
     else:
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH")
-    if scene.depth_map.depth_kind == "auto":
-        said, guess = scene.depth_map.guessed(values, source, scene.lens.speaks_of_metres)
-        fill = scene.depth_map.fill_depth if holes else said.fill_depth
-        scene = dataclasses.replace(scene, depth_map=dataclasses.replace(said, fill_depth=fill))
-    values, stretched = _metres(values, str(source), picture, scene)
-    said, fill = scene.depth_map, cast(Any, scene.depth_map.fill_depth)
-    if fill is not None or not holes:
-        values, filled = resolve_holes(values, str(source), fill, said.depth_kind == "relative")
-    return Frame(str(source), scene, picture, values, filled, time.perf_counter() - start, stretched, guess)
-
-
-def _metres(values: Tensor, name: str, picture: Picture, scene: Scene) -> tuple[Tensor, float]:
-    """Depth in metres (signed pixels for coc), ``[1, 1, H, W]`` at the image's size, NaN in holes; and its stretch."""
-    said, pixels = scene.depth_map, picture.pixels
+    fill: Any = said.fill_depth
+    if said.depth_kind == "auto":
+        said, guess = said.guessed(values, source, scene.lens.speaks_of_metres)
+        fill = fill if holes else said.fill_depth
     kind: Any = said.depth_kind
-    sizes = [f"{t.shape[-1]} x {t.shape[-2]}" for t in (values, pixels)]
-    if kind == "coc" and sizes[0] != sizes[1]:
-        raise ValueError(f"{name}: coc is {sizes[0]} pixels but the image is {sizes[1]}; they must be the same")
-    try:
-        same_aspect(pixels, values)
-        stretched = stretch(pixels, values)
-        if kind == "relative":
-            options: dict[str, Any] = {"value_range": said.value_range, "unknown": said.depth_unknown}
-            values = from_relative(values, *said.ends_m, said.relative_kind or "disparity", **options)
-            return at_size_of(pixels, values), stretched
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from None
-    height, width = pixels.shape[-2:]
+    if kind == "coc" and values.shape[-2:] != (height, width):
+        rows, columns = values.shape[-2:]
+        told = f"coc is {columns} x {rows} pixels but the image is {width} x {height}; they must be the same"
+        raise ValueError(f"{source}: {told}")
     view_deg = scene.lens.view_deg(picture.metadata, width, height) if kind == "distance" else None
-    metres = depth_from_values(
-        values, kind, scale=said.depth_scale, offset=said.depth_offset, unknown=said.depth_unknown, fov_x_deg=view_deg
-    )
-    return (metres if kind == "coc" else at_size_of(pixels, metres)), stretched
+    unknown, filled = said.depth_unknown, 0
+    try:
+        same_aspect(picture.pixels, values)
+        stretched = stretch(picture.pixels, values)
+        if kind == "relative":
+            of_relative: Any = said.relative_kind or "disparity"
+            values = from_relative(values, *said.ends_m, of_relative, value_range=said.value_range, unknown=unknown)
+        else:
+            scaled: dict[str, Any] = {"scale": said.depth_scale, "offset": said.depth_offset}
+            values = depth_from_values(values, kind, **scaled, unknown=unknown, fov_x_deg=view_deg)
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from None
+    values = values if kind == "coc" else at_size_of(picture.pixels, values)
+    if fill is not None or not holes:
+        values, filled = resolve_holes(values, str(source), fill, kind == "relative")
+    remarks = [f"depth stretched by {stretched:.1%}"] if stretched else []
+    if kind == "relative" and None in (said.near_m, said.far_m):
+        remarks.append("depth from {:g} to {:g} m assumed".format(*said.ends_m))
+    scene = dataclasses.replace(scene, depth_map=dataclasses.replace(said, fill_depth=fill))
+    return Frame(str(source), scene, picture, values, filled, remarks, guess, time.perf_counter() - start)
 
 
-def coc_of(
-    frame: Frame, warned: WarnOnce, number: int = 0, is_still: bool = True
-) -> tuple[Tensor, Camera | None, list[str]]:
+def coc_of(frame: Frame, once: Once, number: int = 0, is_still: bool = True) -> tuple[Tensor, Camera | None, list[str]]:
     """Signed radius ``[1, 1, H, W]`` in pixels, the camera (None for ``--depth-kind coc``), and remarks on both.
 
     ``number`` is the frame number, at which the focus is interpolated between keyframes.
 
     Raises:
-        ValueError: If the lens is impossible, or a mistake is likely and ``warned`` is strict.
+        ValueError: If the lens is impossible, or a mistake is likely and ``once`` is strict.
     """
     said, lens, values = frame.scene.depth_map, frame.scene.lens, frame.values
     if said.depth_kind == "coc":
-        warned.warn(frame.name, coc_mistakes(values))
+        once.warn(frame.name, coc_mistakes(values))
         return values, None, []
     camera, remarks = lens.camera(frame.picture.metadata, values, number, is_still, said.is_to_scale)
-    remarks += frame.remarks
     coc_px = camera.coc_px(values, values.shape[-1])
     coc_of_lens(coc_px, values, lens.stated(camera))
-    warned.warn(frame.name, frame.mistakes(camera))
-    return coc_px, camera, remarks
+    once.warn(frame.name, frame.mistakes(camera))
+    return coc_px, camera, remarks + frame.remarks
 
 
 def facts_of_camera(camera: Camera) -> dict[str, Any]:
     """The numbers of a camera, as data for JSON."""
-    return {name: float(getattr(camera, name)) for name in CAMERA_NUMBERS}
+    return {name: value for name, value in vars(camera).items() if name != "focus_breathing"}
 
 
 @dataclasses.dataclass(frozen=True)
 class Rendered:
-    """A rendered picture with its report."""
+    """A rendered picture, and what its report needs."""
 
     out: Path  # file to write
+    frame: Frame
     picture: Picture
-    panels: dict[str, Tensor]  # caption -> panel of the sheet
-    notes: dict[str, str]  # kind -> note; each kind is printed once
-    words: list[str]  # parts of the printed line
-    facts: dict[str, Any]  # the same as data for JSON
+    coc_px: Tensor
+    camera: Camera | None
+    remarks: list[str]
     seconds: float  # time of reading and rendering
 
 
 class Renderer:
     """Reads, renders and writes the frames of ``torchdof render``."""
 
-    def __init__(self, command: "Render", scene: Scene, is_still: bool = True) -> None:
+    def __init__(self, command: "Render", scene: Scene, is_still: bool) -> None:
         self.command, self.scene, self.is_still = command, scene, is_still
-        self.table, self._noted = command.blur.chosen(), set[str]()
-        self.device, self.warned = pick_device(command.device), WarnOnce(command.scene.depth_map.strict)
+        self.table, self.device = command.blur.table_of(command.blur.table), _device(command.device)
+        self.once = Once(scene.depth_map.strict)
 
     def read(self, image: Path, depth: Path | None) -> Frame:
         """Reads a frame as :func:`read_frame`, with the transfer curve and layer of the options."""
         files = self.command.files
         return read_frame(image, depth, self.scene, transfer=files.transfer, layer=files.layer)
 
-    def render(self, frame: Frame, out: Path, number: int = 0, bar: Bar | None = None) -> Rendered:
+    def render(self, frame: Frame, out: Path, number: int, bar: Bar | None = None) -> Rendered:
         """Renders a frame; ``bar`` shows the expected time of a large one. Raises as :func:`coc_of`."""
         start, picture, command = time.perf_counter(), frame.picture, self.command
         frame = dataclasses.replace(frame, values=frame.values.to(self.device))
-        coc_px, camera, remarks = coc_of(frame, self.warned, number, self.is_still)
+        coc_px, camera, remarks = coc_of(frame, self.once, number, self.is_still)
         pixels = picture.pixels.to(self.device)
         if command.show_focus:
             pixels = tint_focus(pixels, coc_px, picture.has_alpha)
             picture = dataclasses.replace(picture, channels=("R", "G", "B", "A")[: pixels.shape[1]])
         else:
             table = _with_alpha(self.table) if picture.has_alpha else self.table
-            options: dict[str, Any] = command.accuracy.options() | {
-                "depth_edges": command.depth_edges.replace("-", " ")
-            }
+            options = command.accuracy.arguments()
             blur: Callable[..., Tensor] = functools.partial(blur_by_coc, table=table, **options)
             with torch.no_grad():
                 if command.lights:
@@ -191,44 +173,40 @@ class Renderer:
                 if bar is not None and bar.is_seen and coc_px.numel() > _LARGE_PX:
                     bar.update(f"rendering {out.name}, about {_seconds(blur, pixels, coc_px):.0f} s")
                 pixels = blur(pixels, coc_px, attention=command.attention)
-        largest_px, notes = float(coc_px.abs().max()), dict[str, str]()
-        if frame.guess:
-            notes["guess"] = f"{frame.name}: {frame.guess}"
-        if camera is not None and largest_px < _HARDLY_PX:
-            notes["blur"] = f"{out}: {command.scene.lens.more_blur(largest_px, self.is_still)}"
-        words, facts = self._told(camera, largest_px, frame)
-        facts |= {"assumed": remarks, "width": pixels.shape[-1], "height": pixels.shape[-2]}
-        seconds = frame.seconds + time.perf_counter() - start
         picture = dataclasses.replace(picture, pixels=pixels)
-        panels = _panels(frame, coc_px, picture) if command.files.sheet else {}
-        return Rendered(out, picture, panels, notes, words, facts, seconds)
+        seconds = frame.seconds + time.perf_counter() - start
+        return Rendered(out, frame, picture, coc_px, camera, remarks, seconds)
 
     def write(self, rendered: Rendered) -> None:
-        """Writes the picture, whole or not at all, and its sheet, and prints one line."""
-        start, files = time.perf_counter(), self.command.files
-        make_folder_of(rendered.out)
-        write_image(rendered.out, rendered.picture, files.out_transfer, files.bits)
-        if rendered.panels and files.sheet is not None:
+        """Writes the picture, whole or not at all, and its sheet, and prints notes and one line."""
+        start, files, out, frame = time.perf_counter(), self.command.files, rendered.out, rendered.frame
+        make_folder_of(out)
+        write_image(out, rendered.picture, files.out_transfer, files.bits)
+        if files.sheet is not None:
             make_folder_of(files.sheet)
-            write_sheet(files.sheet, rendered.panels)
-            rendered.words.append(f"sheet {files.sheet}")
+            write_sheet(files.sheet, _panels(rendered))
+        largest_px = float(rendered.coc_px.abs().max())
+        if frame.guess:
+            self.once.note("guess", f"{frame.name}: {frame.guess}")
+        if rendered.camera is not None and largest_px < _HARDLY_PX:
+            self.once.note("little blur", f"{out}: {frame.scene.lens.more_blur(largest_px, self.is_still)}")
+        words, facts = self._told(rendered.camera, largest_px, frame)
+        height, width = rendered.picture.pixels.shape[-2:]
         seconds = rendered.seconds + time.perf_counter() - start
-        facts = {"out": str(rendered.out), **rendered.facts, "seconds": seconds}
-        remarks = f" [{', '.join(facts['assumed'])}]" if facts["assumed"] else ""
-        note(*(line for name, line in rendered.notes.items() if name not in self._noted))
-        self._noted |= set(rendered.notes)
-        words = [*rendered.words, f"{facts['width']} x {facts['height']}", f"{seconds:.2f} s on {facts['device']}"]
-        tell(self.command.as_json, facts, f"{rendered.out}: {'; '.join(words)}{remarks}")
+        words += [] if files.sheet is None else [f"sheet {files.sheet}"]
+        words += [f"{width} x {height}", f"{seconds:.2f} s on {self.device}"]
+        remarks = f" [{', '.join(rendered.remarks)}]" if rendered.remarks else ""
+        facts = {"out": str(out), **facts, "assumed": rendered.remarks, "width": width, "height": height}
+        tell(self.command.as_json, facts | {"seconds": seconds}, f"{out}: {'; '.join(words)}{remarks}")
 
     def _told(self, camera: Camera | None, largest_px: float, frame: Frame) -> tuple[list[str], dict[str, Any]]:
         """Parts of the printed line about a frame, and the same as data for JSON."""
         command, table, words = self.command, self.table, list[str]()
-        facts: dict[str, Any] = {"camera": None, "largest_coc_px": largest_px, "filled_px": frame.holes}
+        facts: dict[str, Any] = {"camera": camera and facts_of_camera(camera)}
+        facts |= {"largest_coc_px": largest_px, "filled_px": frame.filled}
         facts |= {"show_focus": command.show_focus, "device": str(self.device)}
         if camera is not None:
             ends, angles = camera.focus_range_m, {"tilt": camera.tilt_deg, "swing": camera.swing_deg}
-            facts["camera"] = facts_of_camera(camera) | {f"{name}_deg": float(a) for name, a in angles.items()}
-            facts["camera"]["focus_range_m"] = None if ends is None else [float(end) for end in ends]
             focus = " to ".join(f"{end:.4g}" for end in ends or (camera.focus_m,))
             lens = f"{camera.focal_length_mm:.4g} mm on {camera.sensor_width_mm:.4g} mm"
             words.append(f"focus {focus} m, f/{camera.f_number:.3g}, {lens}")
@@ -238,25 +216,38 @@ class Renderer:
             words.append("focus shown: near orange, sharp green, far blue")
         else:
             name, aperture = table.name or table.family, table.aperture
-            options = Options.of(**command.accuracy.options())
+            options = Options.of(**command.accuracy.arguments())
             words.append(f"{name}, {options.method}")
             words += [] if aperture is None else [repr(aperture).removeprefix("Aperture(").removesuffix(")")]
             words += [] if options.occlusion else ["no occlusion"]
+            words += [f"lights up to {command.lights:g} stops above white"] if command.lights else []
             facts |= {"table": name, "aperture": None if aperture is None else aperture.to_dict()}
             facts |= {name: getattr(options, name) for name in ("method", "occlusion", "tolerance")}
             facts |= {"attention": command.attention, "lights": command.lights}
-            words += [f"lights up to {command.lights:g} stops above white"] if command.lights else []
-        words += [f"{frame.holes} px of depth filled ({frame.scene.depth_map.fill_depth})"] if frame.holes else []
+        words += [f"{frame.filled} px of depth filled ({frame.scene.depth_map.fill_depth})"] if frame.filled else []
         return words, facts
 
 
-def _panels(frame: Frame, coc_px: Tensor, after: Picture) -> dict[str, Tensor]:
+def _device(name: str) -> torch.device:
+    """A device by name; "auto" is CUDA if available, else the CPU."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device).sum().item()
+    except (RuntimeError, AssertionError, NotImplementedError):
+        raise ValueError(f"--device {name}: there is no such device here; use cpu") from None
+    return device
+
+
+def _panels(rendered: Rendered) -> dict[str, Tensor]:
     """Panels of a sheet: caption -> ``[1, 3, H, W]`` in linear light."""
-    if frame.scene.depth_map.depth_kind == "coc":
-        middle = {"blur radius: near orange, far blue": coc_colours(coc_px)}
+    frame = rendered.frame
+    if rendered.camera is None:
+        middle = {"blur radius: near orange, far blue": coc_colours(rendered.coc_px)}
     else:
         middle = {"depth: near is bright": depth_colours(frame.values)}
-    panels = {"before": frame.picture.light, **middle, "after": after.light}
+    panels = {"before": frame.picture.light, **middle, "after": rendered.picture.light}
     return {name: shrunk(panel.cpu(), _PANEL_PX).expand(-1, 3, -1, -1) for name, panel in panels.items()}
 
 

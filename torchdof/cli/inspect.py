@@ -5,10 +5,8 @@ from pathlib import Path
 
 from .command import argument, option
 from .options import check_files, json_option, make_folder_of
-from .printed import WarnOnce, note, tell
+from .printed import Once, tell
 from .scene import Scene
-
-__all__ = ["Inspect"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -55,12 +53,14 @@ class Inspect:
         height, width = metres.shape[-2:]
         lines = [f"image         {width} x {height} px, {', '.join(frame.picture.channels)}"]
         lines += [f"camera        {camera!r}" + (f" [{', '.join(notes)}]" if notes else ""), str(report)]
-        if frame.holes:
-            share = 100 * frame.holes / metres.numel()
-            lines.append(f"filled        {frame.holes} holes ({share:.1f} %), {said.fill_depth}")
+        if frame.filled:
+            share = 100 * frame.filled / metres.numel()
+            lines.append(f"filled        {frame.filled} holes ({share:.1f} %), {said.fill_depth}")
         lines.append(f"picture       {target}")
         facts = {"image": str(self.image), "width": width, "height": height, "camera": facts_of_camera(camera)}
-        facts |= {"assumed": notes, **report.facts(), "filled_px": frame.holes, "picture": str(target)}
+        facts |= {"assumed": notes, **report.facts(), "filled_px": frame.filled, "picture": str(target)}
         tell(self.as_json, facts, "\n".join(lines))
-        note(*([f"{frame.name}: {frame.guess}"] if frame.guess else []))
-        WarnOnce(said.strict).warn(frame.name, frame.mistakes(camera))
+        once = Once(said.strict)
+        if frame.guess:
+            once.note("guess", f"{frame.name}: {frame.guess}")
+        once.warn(frame.name, frame.mistakes(camera))

@@ -14,8 +14,6 @@ import click
 from ..io.atomic import unwound_on_termination
 from .command import command_of
 
-__all__ = ["app", "main"]
-
 COMMANDS = ("render", "fit", "export", "bench", "inspect", "tables")
 """Names of the commands; each is a module with a class of the same name, capitalised."""
 

@@ -1,4 +1,4 @@
-"""Options that several commands share, besides those of the scene: aperture, blur, accuracy, files and device.
+"""Options that several commands share, besides those of the scene: aperture, blur, accuracy and files.
 
 PyTorch is imported when an option is first used, so that help and errors about options appear at once.
 """
@@ -12,13 +12,7 @@ from ..io.paths import existing_image, existing_map, samples_of
 from .command import by_option, option, word_or_number
 
 if TYPE_CHECKING:
-    import torch
-
-    from ..optics.aperture import Aperture
     from ..optics.blur_table import BlurTable
-
-__all__ = ["Accuracy", "Blur", "Opening"]
-__all__ += ["edges_option", "json_option", "pick_device", "make_folder_of", "check_files"]
 
 _IDEAL = ("disc", "gaussian")
 
@@ -37,35 +31,29 @@ class Opening:
     def __post_init__(self) -> None:
         if self.aperture is not None and (self.blades or self.curvature):
             raise ValueError("--aperture is the whole opening; leave --blades and --curvature out")
-        is_round = self.blades == 0 and self.aperture is None
-        if is_round and self.curvature:
+        if self.curvature and not self.blades:
             raise ValueError("--curvature is that of blades; give --blades too")
-        if is_round and self.rotation:
+        if self.rotation and not self.blades and self.aperture is None:
             raise ValueError("--rotation turns blades or an image; give --blades or --aperture too")
 
-    def opening(self) -> "Aperture | None":
-        """The aperture of these options; None if it is round and the same everywhere."""
+    def table_of(self, name: str) -> "BlurTable":
+        """A table by name or by path of a JSON file; an aperture of these options replaces its own."""
         from ..io.images import read_image
         from ..optics.aperture import Aperture
+        from ..optics.blur_table import BlurTable
+        from ..optics.table_file import shipped
 
         mask = None if self.aperture is None else read_image(self.aperture).light[0].mean(0)
         names = {name: f"--{name.removesuffix('_deg')}" for name in ("blades", "rotation_deg", "curvature", "squeeze")}
         with by_option(names | {"vignetting": "--vignetting"}):
-            aperture = Aperture(self.blades, self.rotation, self.curvature, self.squeeze, mask, self.vignetting)
-        return None if aperture.is_round and self.squeeze == 1.0 and not aperture.depends_on_place else aperture
-
-    def table_of(self, name: str) -> "BlurTable":
-        """A table by name or by path of a JSON file; an aperture of these options replaces its own."""
-        from ..optics.blur_table import BlurTable
-        from ..optics.table_file import shipped
-
-        opening = self.opening()
+            opening = Aperture(self.blades, self.rotation, self.curvature, self.squeeze, mask, self.vignetting)
         try:
             table = getattr(BlurTable, name)() if name in _IDEAL else BlurTable.load(name)
         except FileNotFoundError:
-            names = ", ".join([*_IDEAL, *shipped()])
-            raise FileNotFoundError(f"no blur table {name!r}: neither a file nor one of {names}") from None
-        return table if opening is None else table.with_aperture(opening)
+            known = ", ".join([*_IDEAL, *shipped()])
+            raise FileNotFoundError(f"no blur table {name!r}: neither a file nor one of {known}") from None
+        is_plain = opening.is_round and self.squeeze == 1.0 and not opening.depends_on_place
+        return table if is_plain else table.with_aperture(opening)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,10 +61,6 @@ class Blur(Opening):
     """Blur."""
 
     table: str = option("disc, gaussian, a shipped table such as sato_j15, or a JSON file.", "disc", basic=True)
-
-    def chosen(self) -> "BlurTable":
-        """The table of these options, as :meth:`table_of`."""
-        return self.table_of(self.table)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,20 +76,16 @@ class Accuracy:
     )
     no_occlusion: bool = option("One pass that ignores what hides what.", False)
     method: Literal["layered", "fold"] = option("fold is the literal scatter: exact, slow, for small radii.", "layered")
-
-    def options(self) -> dict[str, Any]:
-        """These options as arguments of :class:`torchdof.DepthOfField`."""
-        return {"tolerance": self.tolerance, "occlusion": not self.no_occlusion, "method": self.method}
-
-
-def edges_option(default: str) -> Any:
-    """The option ``--depth-edges``, whose default differs between commands."""
-    return option(
+    depth_edges: Literal["auto", "repair", "as-given"] | None = option(
         "Move and sharpen the edges of the depth to where the image has them: unless they prove exact, each one, or "
-        "not at all.",
-        default,
+        "not at all. Default: auto; in exported files as-given.",
         group="Depth map",
     )
+
+    def arguments(self) -> dict[str, Any]:
+        """These options as arguments of :class:`torchdof.DepthOfField`."""
+        edges = {} if self.depth_edges is None else {"depth_edges": self.depth_edges.replace("-", " ")}
+        return {"tolerance": self.tolerance, "occlusion": not self.no_occlusion, "method": self.method, **edges}
 
 
 def json_option() -> Any:
@@ -135,17 +115,3 @@ def check_files(image: Path, depth: Path | None, out: Path | None) -> None:
     if any(source is not None and os.path.realpath(source) == os.path.realpath(out) for source in (image, depth)):
         raise ValueError(f"{out}: is one of the inputs; write to another file")
     samples_of(out)
-
-
-def pick_device(name: str) -> "torch.device":
-    """A device by name; "auto" is CUDA if available, else the CPU."""
-    import torch
-
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-        torch.empty(1, device=device).sum().item()
-    except (RuntimeError, AssertionError, NotImplementedError):
-        raise ValueError(f"--device {name}: there is no such device here; use cpu") from None
-    return device

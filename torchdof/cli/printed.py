@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import math
 import os
 import sys
 import threading
@@ -15,20 +14,13 @@ import click
 if TYPE_CHECKING:
     from ..depth.sanity import Mistake
 
-__all__ = ["Bar", "WarnOnce", "json_line", "note", "tell"]
-
 _PATIENCE_S = 3.0  # s before the bar appears
+_NOT_FINITE = {"Infinity": "inf", "-Infinity": "-inf", "NaN": "nan"}
 
 
 def tell(as_json: bool, facts: Mapping[str, Any], line: str) -> None:
     """Prints ``facts`` as JSON, or ``line`` for people."""
     click.echo(json_line(facts) if as_json else line)
-
-
-def note(*lines: str) -> None:
-    """Prints notes on standard error: assumptions, and options that change them."""
-    for line in lines:
-        _to_stderr(f"note: {line}")
 
 
 def json_line(facts: Mapping[str, Any]) -> str:
@@ -38,49 +30,41 @@ def json_line(facts: Mapping[str, Any]) -> str:
         >>> json_line({"focus_m": float("inf"), "size": (3, 2)})
         '{"focus_m": "inf", "size": [3, 2]}'
     """
-
-    def finite(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {str(name): finite(part) for name, part in value.items()}
-        if hasattr(value, "tolist"):  # numpy's numbers and arrays
-            return finite(value.tolist())
-        if isinstance(value, list | tuple):
-            return [finite(part) for part in value]
-        return str(value) if isinstance(value, float) and not math.isfinite(value) else value
-
-    return json.dumps(finite(facts), allow_nan=False)
+    text = json.dumps(facts, default=lambda value: value.tolist())  # numpy's numbers and arrays
+    return json.dumps(json.loads(text, parse_constant=_NOT_FINITE.__getitem__))
 
 
-class WarnOnce:
-    """Warns of likely mistakes, one line each on standard error; each kind is printed once for all frames.
+class Once:
+    """Notes and warnings of likely mistakes, one line each on standard error; each kind is printed once for all frames.
 
     With ``strict`` a mistake raises ``ValueError``. ``PYTHONWARNINGS=ignore`` silences warnings.
     """
 
     def __init__(self, strict: bool = False) -> None:
-        self._strict, self._names = strict, set[str]()
+        self._strict, self._kinds = strict, set[str]()
+
+    def note(self, kind: str, line: str) -> None:
+        """Prints a note: an assumption, or advice, with the options that change it."""
+        if kind not in self._kinds:
+            _to_stderr(f"note: {line}")
+        self._kinds.add(kind)
 
     def warn(self, source: str | os.PathLike[str], mistakes: "Iterable[Mistake]") -> None:
-        """Warns of the mistakes whose kind has not been printed yet."""
+        """Warns of likely mistakes in a file."""
         from ..depth.sanity import DepthWarning
 
         for mistake in mistakes:
             message = f"{source}: {mistake.message}"
             if self._strict:
                 raise ValueError(f"{message} (--strict)")
-            if mistake.name in self._names:
-                continue
-            self._names.add(mistake.name)
-            with warnings.catch_warnings():
-                warnings.showwarning = _one_line
-                try:
-                    warnings.warn(message, DepthWarning, stacklevel=2)
-                except DepthWarning as warning:  # by PYTHONWARNINGS=error, but only --strict may stop a command
-                    _one_line(warning)
-
-
-def _one_line(message: Warning | str, *_: Any, **__: Any) -> None:
-    _to_stderr(f"warning: {message}")
+            if mistake.name not in self._kinds:
+                with warnings.catch_warnings():
+                    warnings.showwarning = lambda warning, *_, **__: _to_stderr(f"warning: {warning}")
+                    try:
+                        warnings.warn(message, DepthWarning, stacklevel=2)
+                    except DepthWarning as warning:  # by PYTHONWARNINGS=error, but only --strict may stop a command
+                        _to_stderr(f"warning: {warning}")
+            self._kinds.add(mistake.name)
 
 
 def _to_stderr(line: str) -> None:

@@ -1,6 +1,7 @@
 """``torchdof render``: its options, and the order in which it reads, renders and writes frames."""
 
 import dataclasses
+import functools
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +13,7 @@ import click
 
 from ..io.sequence import FramePattern, parse_frames
 from .command import argument, numbers, option
-from .options import Accuracy, Blur, check_files, edges_option, json_option
+from .options import Accuracy, Blur, check_files, json_option
 from .printed import Bar, json_line
 from .scene import Scene
 
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from .frame import Frame, Renderer
-
-__all__ = ["Render"]
 
 _EACH_ITS_OWN = (
     "each frame's relative depth is scaled by its own extremes, so that distances pulse; give the values that near and "
@@ -117,7 +116,6 @@ class Render:
         "Don't blur: show the image in grey, tinted: near orange, in focus green, far blue.", False, group="Blur"
     )
     device: str = option("auto, cpu, cuda, cuda:1, ...", "auto", group="Blur")
-    depth_edges: Literal["auto", "repair", "as-given"] = edges_option("auto")
     files: _Files
     as_json: bool = json_option()
 
@@ -126,90 +124,70 @@ class Render:
             raise ValueError(f"--lights must be a finite number of stops from 0 on, got {self.lights:g}")
 
     def run(self) -> None:
-        """Renders one image, the frames of a sequence, or a focus pull in a still image."""
-        is_sequence, moves = FramePattern.matches(self.image), len(self.scene.lens.focus_m or []) > 1
-        if (is_sequence or moves) and self.files.sheet is not None:
-            raise ValueError("--sheet is of one picture; leave it out where there are more")
-        if is_sequence:
-            self._render_sequence()
-            return
-        has_frames = FramePattern.is_padded(self.out) and not FramePattern.is_padded(self.image)
-        has_frames = (has_frames and FramePattern.matches(self.out)) or self.files.frames is not None
-        is_of_sequence = self.depth is not None and FramePattern.matches(self.depth)
-        if (has_frames and not moves) or self.files.steady or is_of_sequence:
-            raise ValueError(f"{self.image}: is a single image; for a sequence write it as shot.####.exr")
-        if moves:
-            self._pull_focus(self.scene.lens.focus_m or [])
-            return
-        check_files(self.image, self.depth, self.out)
-        if self.files.resume and self.out.exists():
-            self._tell_of_those_there([self.out], f"{self.out}: is there already")
-            return
-        from .frame import Renderer
+        """Renders one image, the frames of a sequence, or a focus pull in a still image.
 
-        renderer = Renderer(self, self.scene)
-        with Bar(f"rendering {self.out.name}") as bar:
-            frame = renderer.read(self.image, self.depth)
-            renderer.write(renderer.render(frame, self.out, bar=bar))
-
-    def _pull_focus(self, keys: Sequence[tuple[int, float]]) -> None:
-        """Renders a still image once for each frame from the first to the last keyframe of the focus."""
-        first, last = self.files.frames or (keys[0][0], keys[-1][0])
-        todo = self._todo(FramePattern(self.out), dict.fromkeys(range(first, last + 1), (self.image, self.depth)))
-        from .frame import Renderer
-
-        renderer = Renderer(self, self.scene)
-        frame = renderer.read(self.image, self.depth)
-        self._render_each(renderer, todo, lambda _: frame)
-
-    def _todo(self, target: FramePattern, sources: Mapping[int, tuple[Path, Path | None]]) -> dict[int, Path]:
-        """Frame number -> file to render; ``--resume`` leaves out existing files and reports them.
-
-        ``sources`` maps frame numbers to image and depth, which are checked by :func:`check_files`.
+        1. List the frames, and check all their files; with ``--resume`` leave out those that are there.
+        2. Render them in order.
         """
-        files = {n: target.name(n) for n in sources}
-        for n, (image, depth) in sources.items():
-            check_files(image, depth, files[n])
-        there = {n: file for n, file in files.items() if self.files.resume and file.is_file()}
-        if there:
-            self._tell_of_those_there([*there.values()], f"{len(there)} of {len(files)} frames are there already")
-        return {n: file for n, file in files.items() if n not in there}
-
-    def _render_sequence(self) -> None:
-        """Renders the frames of a numbered sequence, in order; with ``--resume`` only those that are missing."""
-        source, target, said = FramePattern(self.image), FramePattern(self.out), self.scene.depth_map.of_sequence()
-        depths = FramePattern(self.depth) if self.depth is not None and FramePattern.matches(self.depth) else None
-        if self.scene.lens.blur_share is not None:
+        images, depths, files = _pattern(self.image), _pattern(self.depth), self.files
+        keys = (self.scene.lens.focus_m or []) if images is None else []
+        is_single = images is None and len(keys) < 2
+        scene = self.scene if images is None else self.scene.of_sequence()
+        if files.sheet is not None and not is_single:
+            raise ValueError("--sheet is of one picture; leave it out where there are more")
+        has_number = FramePattern.is_padded(self.out) and not FramePattern.is_padded(self.image) and _pattern(self.out)
+        if (images is None and (files.steady or depths)) or (is_single and (files.frames or has_number)):
+            raise ValueError(f"{self.image}: is a single image; for a sequence write it as shot.####.exr")
+        if images and scene.lens.blur_share is not None:
             raise ValueError("--blur would open the lens anew in each frame of a sequence; give --f-number")
+        if files.steady and scene.depth_map.depth_kind == "coc":
+            raise ValueError("--steady filters depth in metres; --depth-kind coc has none")
 
         def sources(n: int) -> tuple[Path, Path | None]:
-            return source.name(n), depths.name(n) if depths else self.depth
+            return images.name(n) if images else self.image, depths.name(n) if depths else self.depth
 
-        numbers = self._numbers(source, depths)
-        todo = self._todo(target, {n: sources(n) for n in numbers})
-        if self.files.steady and said.depth_kind == "coc":
-            raise ValueError("--steady filters depth in metres; --depth-kind coc has none")
+        if images is not None:
+            numbers = self._numbers(images, depths)
+        else:
+            first, last = (0, 0) if is_single else files.frames or (keys[0][0], keys[-1][0])
+            numbers = range(first, last + 1)
+        target = FramePattern(self.out).name if not is_single else lambda _: self.out
+        outputs = {n: target(n) for n in numbers}
+        for n, out in outputs.items():
+            check_files(*sources(n), out)
+        done = {out for out in outputs.values() if files.resume and out.is_file()}
+        if done:
+            share = f"{self.out}: is" if is_single else f"{len(done)} of {len(outputs)} frames are"
+            lines = [json_line({"out": str(out), "is_there_already": True}) for out in sorted(done)]
+            click.echo("\n".join(lines) if self.as_json else f"{share} there already")
+        todo = {n: out for n, out in outputs.items() if out not in done}
+        if not todo:
+            return
         from ..depth.sanity import Mistake
         from .frame import Renderer
 
-        renderer = Renderer(self, dataclasses.replace(self.scene, depth_map=said), is_still=False)
-        if said.depth_kind == "relative" and said.value_range is None and len(numbers) > 1:
-            renderer.warned.warn(self.depth or self.image, [Mistake("range", _EACH_ITS_OWN)])
+        renderer, said = Renderer(self, scene, is_still=images is None), scene.depth_map
+        if images and said.depth_kind == "relative" and said.value_range is None and len(numbers) > 1:
+            renderer.once.warn(self.depth or self.image, [Mistake("range", _EACH_ITS_OWN)])
+        read_files = functools.lru_cache(maxsize=1)(renderer.read)  # a focus pull reads one image many times
 
         def read(n: int) -> "Frame":
-            return renderer.read(*sources(n))
+            return read_files(*sources(n))
 
-        whole = [n for n in source.frames() if depths is None or depths.name(n).is_file()]
-        self._render_each(renderer, todo, _steadied(read, whole) if self.files.steady else read)
+        if images and files.steady:
+            whole = [n for n in images.frames() if depths is None or depths.name(n).is_file()]
+            self._render_each(renderer, todo, _steadied(read, whole))
+        else:
+            self._render_each(renderer, todo, read)
 
-    def _numbers(self, source: FramePattern, depths: FramePattern | None) -> Sequence[int]:
-        """Numbers of the requested frames; refuses frames without an image or a depth."""
-        numbers: Sequence[int] = source.frames()
+    def _numbers(self, images: FramePattern, depths: FramePattern | None) -> Sequence[int]:
+        """Numbers of the requested frames of a sequence; refuses frames without an image or a depth."""
+        numbers: Sequence[int] = images.frames()
         if self.files.frames is not None:
             first, last = self.files.frames
             wanted, existing = range(first, last + 1), {n for n in numbers if first <= n <= last}
             if len(existing) < len(wanted):
-                missing = source.name(next(n for n in wanted if n not in existing))
+                missing = images.name(next(n for n in wanted if n not in existing))
                 absent = f"{len(wanted) - len(existing)} of {len(wanted)} frames missing"
                 raise FileNotFoundError(f"{missing}: there is no such file ({absent})")
             numbers = wanted
@@ -223,21 +201,28 @@ class Render:
 
     def _render_each(self, renderer: "Renderer", files: Mapping[int, Path], read: "Callable[[int], Frame]") -> None:
         """Renders frames in order; while one is rendered, the next is read and the previous one is written."""
-        with Bar("", len(files)) as bar, ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as writer:
+        several = len(files) > 1
+        with (
+            Bar(f"rendering {self.out.name}", len(files) if several else None) as bar,
+            ThreadPoolExecutor(1) as reader,
+            ThreadPoolExecutor(1) as writer,
+        ):
             numbers, coming, written = iter(files), list["Future[Frame]"](), writer.submit(lambda: None)
             try:
                 for k, (n, out) in enumerate(files.items()):
-                    bar.update(f"frame {k + 1} of {len(files)}", k)
+                    if several:
+                        bar.update(f"frame {k + 1} of {len(files)}", k)
                     coming += [reader.submit(read, ahead) for ahead in itertools.islice(numbers, 2 - len(coming))]
-                    rendered = renderer.render(coming.pop(0).result(), out, n)
+                    rendered = renderer.render(coming.pop(0).result(), out, n, None if several else bar)
                     written.result()
                     written = writer.submit(renderer.write, rendered)  # Ctrl-C does not stop this thread
             finally:  # a rendered frame is written even if the next one fails
                 written.result()
 
-    def _tell_of_those_there(self, files: Sequence[Path], line: str) -> None:
-        lines = [json_line({"out": str(file), "is_there_already": True}) for file in files]
-        click.echo("\n".join(lines) if self.as_json else line)
+
+def _pattern(path: Path | None) -> FramePattern | None:
+    """The pattern of a numbered sequence; None for the path of a single file."""
+    return FramePattern(path) if path is not None and FramePattern.matches(path) else None
 
 
 def _steadied(read: "Callable[[int], Frame]", numbers: Sequence[int]) -> "Callable[[int], Frame]":

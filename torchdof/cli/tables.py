@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     from ..optics.blur_table import BlurTable
 
-__all__ = ["Tables"]
-
 _WIDTH = 1920  # px; image width for which kernels are drawn
 _COC_PX = (-24.0, -12.0, -6.0, 6.0, 12.0, 24.0)  # px; signed blur radii of the rows
 _CELL = (200, 230)  # px; height and width of a kernel's picture, wide enough for its caption

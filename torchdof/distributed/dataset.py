@@ -13,8 +13,6 @@ from ..io.atomic import write_text
 from ..validation import whole
 from .shards import SUFFIXES, Format, Pair, RenderShards, name_of, samples_of, shard_rows
 
-__all__ = ["Summary", "make_dataset", "pairs_in", "summary_of"]
-
 _IMAGES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".hdr", ".pfm")
 _DEPTHS = (".npy", ".npz", ".exr", ".png", ".tif", ".tiff", ".pfm")
 _CARD = """# Defocus data set

@@ -30,9 +30,7 @@ from ..io.images import Picture, read_image, read_values, write_image
 from ..io.transfer import Transfer
 from ..module import depth_of_field
 from ..render.resample import at_size_of
-from ..validation import number, show, whole
-
-__all__ = ["SUFFIXES", "Format", "Pair", "RenderShards", "name_of", "samples_of", "shard_rows"]
+from ..validation import choice, number, show, whole
 
 Format = Literal["webdataset", "parquet"]
 
@@ -160,14 +158,12 @@ class RenderShards:
         self.seed = whole("seed", seed, 0, 2**62)
         if not self.out.is_dir():
             raise FileNotFoundError(f"{out}: there is no such folder; make it first")
-        if format not in SUFFIXES:
-            raise ValueError(f"format must be 'webdataset' or 'parquet', got {show(format)}")
+        choice("format", format, tuple(SUFFIXES))
+        choice("picture", picture, (".png", ".exr"))
         if importlib.util.find_spec(_WRITERS[format]) is None:
             raise ModuleNotFoundError(f"{format} needs {_WRITERS[format]}: pip install 'torchdof[ray]'")
         if not keep or isinstance(keep, str) or not set(keep) <= set(_KEPT):
             raise ValueError(f"keep must be some of {', '.join(_KEPT)}, got {show(keep)}")
-        if picture not in (".png", ".exr"):
-            raise ValueError(f"picture must be '.png' or '.exr', got {show(picture)}")
         if not isinstance(self.blur, RandomDepthOfField):
             raise ValueError(f"blur must be a RandomDepthOfField, got {show(blur)}")
         self._read_depth = _read_relative if self.depth.get("kind") == "relative" else read_depth

@@ -106,7 +106,7 @@ def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> 
         True
     """
     validation.image_and_depth(image, depth, values=False)
-    validation.depth_edges(edges)
+    validation.choice("depth_edges", edges, ("auto", "repair", "as given"))
     if edges == "as given":
         return depth
     depth = depth.expand(image.shape[0], -1, -1, -1)

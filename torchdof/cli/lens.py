@@ -1,0 +1,243 @@
+"""Options for focus and lens: their meaning, their defaults, contradictions between them, and the camera they make.
+
+PyTorch is imported when an option is first used, so that help and errors about options appear at once.
+"""
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from ..io.metadata import camera_facts
+from ..io.sequence import focus_at_frame, parse_focus
+from .command import by_option, numbers, option, positive
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ..optics.camera import Camera
+
+_ASSUMED = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
+_WORDS = {"focal_length_mm": "focal length", "f_number": "f-number", "sensor_width_mm": "sensor width"}
+_WIDER = {  # option that sets the aperture -> how to open the lens wider
+    "--f-number": "a smaller --f-number",
+    "--aperture-radius-m": "a larger --aperture-radius-m",
+    "--equivalent": "a smaller --equivalent f-number",
+    "--blur": "a larger --blur",
+}
+_BLUR, _SEEN = 0.02, 0.005  # default largest blur radius, and the smallest that is visible, over the width
+_STRAY, _SAMPLES = 1000, 2**20  # one pixel in _STRAY is ignored as an outlier; most pixels examined
+_SPELLED = {"focus_range_m": "--focus-range", "tilt_deg": "--tilt", "swing_deg": "--swing", "fov_x_deg": "--fov-deg"}
+
+
+def _share(text: str) -> float:
+    """Reads a percentage of the width, as a fraction."""
+    expected = "--blur expects a share of the picture's width, above 0 and at most 50 %, such as 2%"
+    share = numbers(1, expected)(text.removesuffix("%"))[0] / 100
+    if not (text.endswith("%") and 0 < share <= 0.5):
+        raise ValueError(f"{expected}, got {text!r}")
+    return share
+
+
+def _equivalent(text: str) -> tuple[float, ...]:
+    """Reads a focal length in mm and an f-number."""
+    expected = "--equivalent expects a focal length and an f-number such as 85mm,1.4"
+    return numbers(2, expected)(re.sub(r"mm(?=,)|(?<=,)f/", "", text))
+
+
+def _give_one(options: Mapping[str, Any], problem: str) -> None:
+    """Refuse more than one given option (option -> value or None); ``problem`` is the reason."""
+    given = [name for name, value in options.items() if value is not None]
+    if len(given) > 1:
+        raise ValueError(f"{' and '.join(given)} {problem}; give one of them")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """Focus and lens."""
+
+    focal_length_mm: float | None = option("Real focal length, not the 35 mm equivalent.", callback=positive)
+    sensor_width_mm: float | None = option("36 for full frame.", callback=positive)
+    fov_deg: float | None = option("Horizontal field of view of a rendered image, instead of a lens.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lens(Sensor):
+    """Focus and lens."""
+
+    focus_m: list[tuple[int, float]] | None = option(
+        "Distance in focus in metres (inf allowed), or keyframes frame:metres such as 1:2.0,48:5.5; between them "
+        "1/distance is linear, so that the blur changes evenly.",
+        metavar="METRES",
+        read=parse_focus,
+        basic=True,
+    )
+    focus_at: tuple[float, float] | None = option(
+        "Focus on what is seen at this pixel, counted from the top left; in a sequence, anew in each frame. Default: "
+        "the focus that IMAGE's file states, else the subject nearest the middle.",
+        metavar="X,Y",
+        read=numbers(2, "--focus-at expects a pixel X,Y such as 320,200"),
+        basic=True,
+    )
+    focus_range: tuple[float, float] | None = option(
+        "In focus from NEAR to FAR metres, blurred beyond; instead of --focus-m.",
+        metavar="NEAR,FAR",
+        read=numbers(2, "--focus-range expects two numbers such as 1.5,2.2"),
+    )
+    tilt: float = option("Degrees by which the lens is tilted down: focus comes nearer towards the bottom.", 0.0)
+    swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)
+    f_number: float | None = option("Smaller is blurrier.", callback=positive, basic=True)
+    blur_share: float | None = option(
+        "Open the lens until what is blurred most, the nearest or the farthest, has a blur radius of this share of the "
+        "picture's width, such as 2%; instead of --f-number.",
+        names=("--blur",),
+        metavar="SHARE%",
+        read=_share,
+        basic=True,
+    )
+    equivalent: tuple[float, float] | None = option(
+        "Full-frame lens that the picture is taken to be from: focal length and f-number, such as 85mm,1.4.",
+        metavar="MM,F",
+        read=_equivalent,
+        basic=True,
+    )
+    aperture_radius_m: float | None = option("Radius of the opening, with --fov-deg.", callback=positive)
+
+    def __post_init__(self) -> None:
+        places = {"--focus-m": self.focus_m, "--focus-at": self.focus_at, "--focus-range": self.focus_range}
+        views = {"--fov-deg": self.fov_deg, "--equivalent": self.equivalent}
+        real = self.focal_length_mm if self.focal_length_mm is not None else self.sensor_width_mm
+        _give_one(places, "both say where to focus")
+        _give_one(views | {"--focal-length-mm with --sensor-width-mm": real}, "say the same")
+        if self.fov_deg is None and self.aperture_radius_m is not None:
+            raise ValueError("--aperture-radius-m goes with --fov-deg; a real lens has --f-number instead")
+        _give_one(self._opening, "both say how wide the lens opens")
+        if self.fov_deg is not None and not 0 < self.fov_deg < 180:
+            raise ValueError(f"--fov-deg must be a number of degrees > 0 and < 180, got {self.fov_deg:g}")
+
+    @property
+    def _opening(self) -> dict[str, Any]:
+        """Option -> value, for the option that sets the aperture; empty if none does."""
+        values = (self.f_number, self.aperture_radius_m, self.equivalent, self.blur_share)
+        return {option: value for option, value in zip(_WIDER, values, strict=True) if value is not None}
+
+    @property
+    def has_focus(self) -> bool:
+        """Whether an option sets the focus."""
+        return (self.focus_m, self.focus_at, self.focus_range) != (None, None, None)
+
+    def more_blur(self, largest_px: float, is_still: bool) -> str:
+        """Advice for a largest blur radius that is hardly visible."""
+        if largest_px == 0:
+            return "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
+        wider = _WIDER[next(iter(self._opening), "--f-number")]
+        more = f", or --blur {_BLUR:.0%}" if is_still and self.blur_share is None else ""
+        return f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; {wider}{more} makes more of it"
+
+    @property
+    def speaks_of_metres(self) -> bool:
+        """Whether an option states a length in metres."""
+        return (self.focus_m, self.focus_range, self.aperture_radius_m) != (None, None, None)
+
+    def refuse_keyframes(self) -> None:
+        """Refuse keyframes of the focus, for a command that renders a single image."""
+        if len(self.focus_m or []) > 1:
+            raise ValueError("--focus-m has keyframes but IMAGE is a single image; give one distance in metres")
+
+    def view_deg(self, metadata: Mapping[str, Any], width: int, height: int) -> float:
+        """Horizontal field of view in degrees, as stated, or from focal length and sensor of options or file."""
+        known = camera_facts(metadata, width, height) | self._stated(width, height)
+        if self.fov_deg is not None:
+            return self.fov_deg
+        if not {"focal_length_mm", "sensor_width_mm"} <= set(known):
+            raise ValueError("--depth-kind distance needs --fov-deg, or --focal-length-mm and --sensor-width-mm")
+        return 2 * math.degrees(math.atan2(known["sensor_width_mm"], 2 * known["focal_length_mm"]))
+
+    def _stated(self, width: int, height: int) -> dict[str, float]:
+        """Numbers of the lens that the options state, for an image of a size in pixels."""
+        if self.equivalent is not None:
+            lens = (*self.equivalent, 36.0 * width / max(width, height))
+            return dict(zip(_ASSUMED, lens, strict=True))
+        return {name: value for name in _ASSUMED if (value := getattr(self, name)) is not None}
+
+    def camera(
+        self,
+        metadata: Mapping[str, Any],
+        depth: "Tensor",
+        frame: int = 0,
+        is_still: bool = True,
+        is_to_scale: bool = True,
+    ) -> "tuple[Camera, list[str]]":
+        """The camera of one picture, and remarks on the source of the numbers that no option states.
+
+        1. Take the focus from the options, else from the file, else from the subject of a still.
+        2. Take the lens from the options, else from the file, else from ``_ASSUMED``.
+        3. Open the lens for the blur of ``--blur``, or for a visible blur in a still whose options leave it open.
+
+        In a sequence nothing is guessed, because guesses would differ from frame to frame. Without ``is_to_scale`` the
+        file's focus is ignored. Raises ``ValueError`` with names of options if no lens has these numbers.
+        """
+        from ..optics.camera import Camera
+
+        height, width = depth.shape[-2:]
+        stated, in_file = self._stated(width, height), camera_facts(metadata, width, height)
+        remarks, focus_m = list[str](), math.inf
+        if self.focus_m is not None:
+            focus_m = focus_at_frame(self.focus_m, frame)
+        elif not self.has_focus and is_to_scale and "focus_m" in in_file:
+            focus_m = in_file["focus_m"]
+            remarks.append("focus from the file")
+        elif not self.has_focus and not is_still:
+            raise ValueError("where is the focus? give --focus-m METRES or --focus-at X,Y (the file does not say)")
+        elif not self.has_focus:
+            from ..depth.guess import subject_m
+
+            focus_m = subject_m(depth)
+            remarks.append("focus on what is nearest the middle")
+        if self.fov_deg is not None and not self._opening:
+            raise ValueError("--fov-deg needs the opening of the lens: --aperture-radius-m, --f-number or --blur")
+        lens: dict[str, Any] = {name: (_ASSUMED | in_file | stated)[name] for name in _ASSUMED}
+        sources = {name: "from the file" if name in in_file else "assumed" for name in _ASSUMED if name not in stated}
+        with by_option(self._names()):
+            if self.fov_deg is None:
+                camera = Camera(**lens, focus_m=focus_m)
+            else:
+                camera = Camera.from_fov(self.fov_deg, self.aperture_radius_m or 0.01, focus_m)
+                camera = camera if self.f_number is None else camera.replace(f_number=self.f_number)
+            camera = camera.replace(focus_range_m=self.focus_range, tilt_deg=self.tilt, swing_deg=self.swing)
+        camera = camera if self.focus_at is None else camera.focus_at(depth, *self.focus_at)
+        share, is_open = self.blur_share, is_still and not self._opening and (self == Lens() or not is_to_scale)
+        largest_px = self._largest_coc_px(camera, depth) if share is not None or is_open else 0.0
+        if is_open and not (is_to_scale and "f_number" in in_file and largest_px >= _SEEN * width):
+            share = _BLUR
+        if share is not None and largest_px > 0:
+            camera = camera.replace(f_number=camera.f_number * largest_px / (share * width))
+            sources["f_number"] = f"for a blur of {share:.0%} of the width" if is_open else ""
+        if self.fov_deg is None:
+            remarks += [f"{_WORDS[name]} {source}" for name, source in sources.items() if source]
+        return camera, remarks
+
+    def _largest_coc_px(self, camera: "Camera", depth: "Tensor") -> float:
+        """Largest blur radius in pixels at all keyframes of the focus, without the largest thousandth of the pixels."""
+        cameras = [camera.replace(focus_m=metres) for _, metres in self.focus_m or []] or [camera]
+        radii = [each.coc_px(depth, depth.shape[-1]).abs().nan_to_num(0.0).flatten() for each in cameras]
+        sampled = [radius[:: 1 + radius.numel() // _SAMPLES] for radius in radii]
+        return max(float(radius.kthvalue(radius.numel() - radius.numel() // _STRAY).values) for radius in sampled)
+
+    def stated(self, camera: "Camera") -> dict[str, Any]:
+        """Option -> number of the camera, for messages."""
+        from ..optics.camera import CAMERA_NUMBERS
+
+        names = self._names()
+        if self.fov_deg is None:
+            return {names[name]: getattr(camera, name) for name in CAMERA_NUMBERS}
+        return {"--fov-deg": self.fov_deg, **self._opening, names["focus_m"]: camera.focus_m}
+
+    def _names(self) -> dict[str, str]:
+        """Argument of :class:`Camera` -> its option, marked if that is not given; for messages."""
+        names = {name: f"--{name.replace('_', '-')}" for name in (*_ASSUMED, "aperture_radius_m")}
+        names = {name: option + ("" if getattr(self, name) else " (not given)") for name, option in names.items()}
+        focus = "--focus-at" if self.focus_at else "--focus-range" if self.focus_range else "--focus-m"
+        names["focus_m"] = focus + ("" if self.has_focus else " (not given)")
+        return _SPELLED | names | (dict.fromkeys(_ASSUMED, "--equivalent") if self.equivalent else {})
