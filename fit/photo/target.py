@@ -43,13 +43,6 @@ def write_target(path: str | os.PathLike[str], paper: Paper = "a4") -> None:
     Raises:
         FitError: wrong suffix or paper.
         OSError: the file cannot be written.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_target(folder + "/target.pdf", "letter")
-        ...     Path(folder, "target.pdf").read_bytes()[:8]
-        b'%PDF-1.4'
     """
     target = Path(path)
     if target.suffix.lower() != ".pdf":
