@@ -95,14 +95,10 @@ def demosaiced(mosaic: Array, pattern: str) -> Array:
 
     Bilinear interpolation is linear, equal in the sharp and the blurred picture, and adds no false colour.
     """
-    colours = []
-    for colour, kernel in (("R", _SQUARE), ("G", _CROSS), ("B", _SQUARE)):
-        sampled = np.zeros_like(mosaic)
-        for i, name in enumerate(pattern):
-            if name == colour:
-                sampled[i // 2 :: 2, i % 2 :: 2] = mosaic[i // 2 :: 2, i % 2 :: 2]
-        colours.append(convolve(sampled, kernel, mode="mirror"))
-    return np.stack(colours)
+    height, width = mosaic.shape
+    names = np.tile(np.array(list(pattern)).reshape(2, 2), (height // 2 + 1, width // 2 + 1))[:height, :width]
+    kernels = {"R": _SQUARE, "G": _CROSS, "B": _SQUARE}
+    return np.stack([convolve(np.where(names == c, mosaic, 0.0), k, mode="mirror") for c, k in kernels.items()])
 
 
 def size_of(picture: Array) -> str:

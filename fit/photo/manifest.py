@@ -165,8 +165,8 @@ def _manifest(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     if not isinstance(shots, list) or not shots or not all(isinstance(s, dict) for s in shots):
         raise refused("give at least one [[shot]] with file and distance_m")
     for table, names in ((fields, _FIELDS), *((shot, _OF_A_SHOT) for shot in shots)):
-        for name in set(table) - set(names):
-            raise refused(f"{name!r} is not a field; known are {', '.join(names)}")
+        if unknown := [name for name in table if name not in names]:
+            raise refused(f"{unknown[0]!r} is not a field; known are {', '.join(names)}")
     return fields, shots
 
 

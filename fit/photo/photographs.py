@@ -109,8 +109,7 @@ def read_photographs(
         facts = facts or camera_facts(picture.metadata, width, height)
         whole = picture.sample in ("8", "16")
         integers = integers and whole
-        half, y, x = int(0.06 * target.side_px) + 4, round(target.y), round(target.x)
-        slope = gaussian_gradient_magnitude(light[y - half : y + half + 1, x - half : x + half + 1], 0.7).max()
+        slope = gaussian_gradient_magnitude(target.window(light, int(0.06 * target.side_px) + 4), 0.7).max()
         sharpness = float(slope / (target.white - target.black))
         pictures.append(Photograph(path.name, light, target, 0.0, sharpness, whole and target.white > 0.98))
     if len(pictures) < 2:
@@ -172,19 +171,15 @@ def _pair(
     """Windows of the dot in two photographs; also, from `taken`, for tone curves a standard error away."""
     half = int(WINDOW * min(sharp.target.side_px, blurred.target.side_px))
 
-    def cut(light: Array, target: Target) -> Array:
-        x, y = round(target.x), round(target.y)
-        return light[..., y - half : y + half + 1, x - half : x + half + 1]
-
     def colours_of(picture: Photograph) -> Array:
-        seen = read_image(folder / picture.file).pixels[0, :3].double().numpy()
-        return np.stack([c if tone is None else untoned(c, tone.bend) for c in cut(seen, picture.target)])
+        seen = picture.target.window(read_image(folder / picture.file).pixels[0, :3].double().numpy(), half)
+        return np.stack([c if tone is None else untoned(c, tone.bend) for c in seen])
 
-    raw = [cut(taken[picture.file], picture.target) for picture in (sharp, blurred)]
+    raw = [picture.target.window(taken[picture.file], half) for picture in (sharp, blurred)]
     others = [] if tone is None else [np.add(tone.bend, step) for step in tone.errors]
     return Capture(
-        cut(sharp.light, sharp.target),
-        cut(blurred.light, blurred.target),
+        sharp.target.window(sharp.light, half),
+        blurred.target.window(blurred.light, half),
         blurred.distance_m,
         files=(str(folder / sharp.file), str(folder / blurred.file)),
         white=1.0 if sharp.clipped else None,

@@ -57,8 +57,8 @@ def tone_curve(pictures: Sequence[tuple[Array, Target]], square_mm: float) -> To
     """The tone curve for which dots and edges are as expected; zero if noise would explain them as well."""
     dots = []
     for light, target in pictures:
-        half, y, x = int(WINDOW * target.side_px), round(target.y), round(target.x)
-        window = light[y - half : y + half + 1, x - half : x + half + 1]
+        half = int(WINDOW * target.side_px)
+        window = target.window(light, half)
         distance = np.hypot(*(np.indices(window.shape) - half))
         inside, around = distance < 0.12 * target.side_px, (distance > 0.2 * target.side_px) & (distance < half)
         area = math.pi * (DOT_MM / 2 * target.side_px / square_mm) ** 2
