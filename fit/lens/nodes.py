@@ -201,7 +201,9 @@ def _fit_shape(family: str, tracer: Tracer, coc: float, before: Array | None) ->
 
     def seen(values: Array) -> Array:
         params = dict(zip(names, values, strict=True))
-        if family == "disc":  # its edge would lie between the radii
+        if family == "gaussian":  # it may reach beyond the radii
+            return np.asarray(weight * np.exp(-2.0 * (np.pi * params["sigma"] * frequency) ** 2))
+        if family == "disc":  # its edge lies between the radii
             phase = 2.0 * np.pi * params["radius"] * frequency
             return np.asarray(weight * 2.0 * j1(phase) / phase)
         light = profile(family, torch.from_numpy(radii), params).numpy() * radii
