@@ -1,8 +1,8 @@
-"""The paper's figures for any fit and table, drawn with matplotlib."""
+"""The paper's figures for any fit and table, and a sheet that documents a calibration, drawn with matplotlib."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,8 +19,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from .photo.photographs import Photographs
+    from .photo.table import TableFit
 
-DATA, MODEL = "#7a7a7a", "#c2410c"
+_DATA, _MODEL = "#7a7a7a", "#c2410c"
 
 
 def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
@@ -34,19 +36,21 @@ def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
     """
     if not fit.samples.shape[1]:
         raise FitError("this fit carries no samples to draw")
-    figure, axes = new_figure(5.4, 3.6)
+    figure, axes = _new_figure(5.4, 3.6)
     forward = fit.model == "forward"
-    axes.plot(*fit.samples, ".", color=DATA, markersize=2.5 if forward else 4, label="pixels" if forward else "samples")
+    axes.plot(
+        *fit.samples, ".", color=_DATA, markersize=2.5 if forward else 4, label="pixels" if forward else "samples"
+    )
     if forward:
-        r, level = model_line(fit)
-        axes.plot(r, level, color=MODEL, label="forward model", zorder=3)
+        r, level = _model_line(fit)
+        axes.plot(r, level, color=_MODEL, label="forward model", zorder=3)
         if fit.aperture is None:  # kernels that are not round have no profile
             line = np.linspace(0, fit.samples[0].max(), 400)
             shape = evaluate(fit.family, line, fit.kernel_params())
             scaled = shape / shape.max() * level.max()
             axes.plot(line, scaled, "--", color="#1d4ed8", label="kernel f(r), scaled", zorder=2)
     else:
-        axes.plot(*fit.curve, color=MODEL, label=f"fitted {fit.family}", zorder=3)
+        axes.plot(*fit.curve, color=_MODEL, label=f"fitted {fit.family}", zorder=3)
     axes.set(xlabel=f"r [{unit}]", ylabel="level above background" if forward else "blur strength", ylim=(0, None))
     values = ", ".join(f"{k} = {v:.4g} ± {fit.stderr[k]:.1g}" for k, v in fit.params.items() if not np.ndim(v))
     axes.set_title(title or f"{fit.family}: {values}", fontsize=9)
@@ -54,7 +58,7 @@ def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
     return figure
 
 
-def model_line(fit: BlurFit) -> tuple[Array, Array]:
+def _model_line(fit: BlurFit) -> tuple[Array, Array]:
     """Radii, and the mean level of a forward fit's model at these radii, in steps of half a unit."""
     bins = np.floor(fit.curve[0] * 2 + 0.5).astype(int)
     count = np.bincount(bins)
@@ -65,7 +69,7 @@ def model_line(fit: BlurFit) -> tuple[Array, Array]:
 def picture_of_texture(table: BlurTable, coc_px: float, width: int, title: str = "") -> Figure:
     """The blur texture at a signed circle of confusion, for an image `width` px wide (the paper's Fig. 3)."""
     texture = table.blur_texture(coc_px, width).detach().numpy()
-    figure, axes = new_figure(4.2, 3.6)
+    figure, axes = _new_figure(4.2, 3.6)
     half = texture.shape[-1] / 2
     colours = np.moveaxis(texture, 0, -1) / texture.max() if texture.shape[0] == 3 else texture[0]
     shown = axes.imshow(colours, cmap="gray", vmin=0, extent=(-half, half, half, -half))
@@ -78,13 +82,13 @@ def picture_of_texture(table: BlurTable, coc_px: float, width: int, title: str =
 
 def picture_of_quad(sharp: Array, blurred: Array, title: str = "") -> Figure:
     """A quad in focus and out of focus `[H, W]`, linear light, and their middle rows (the paper's Fig. 4)."""
-    figure, (left, right, below) = new_figure(9.6, 3.4, 3)
+    figure, (left, right, below) = _new_figure(9.6, 3.4, 3)
     white = float(sharp.max())
-    show(left, sharp, "in focus", white=white)
-    show(right, blurred, "out of focus", white=white)
+    _show(left, sharp, "in focus", white=white)
+    _show(right, blurred, "out of focus", white=white)
     row = sharp.shape[0] // 2
-    below.plot(sharp[row], color=DATA, label="in focus")
-    below.plot(blurred[row], color=MODEL, label="out of focus")
+    below.plot(sharp[row], color=_DATA, label="in focus")
+    below.plot(blurred[row], color=_MODEL, label="out of focus")
     below.set(xlabel="px", ylabel="linear light, middle row")
     below.legend(frameon=False, fontsize=8)
     figure.suptitle(title, fontsize=10)
@@ -94,7 +98,7 @@ def picture_of_quad(sharp: Array, blurred: Array, title: str = "") -> Figure:
 def picture_of_table(table: BlurTable, title: str = "") -> Figure:
     """A table over depth: every parameter at its nodes, and the table's interpolation between them."""
     names = list(table.node_params)
-    figure, axes = new_figure(3.2 * len(names), 3.2, len(names))
+    figure, axes = _new_figure(3.2 * len(names), 3.2, len(names))
     reach = float(table.coc.abs().max())
     width = 1 if table.sensor_width_mm is None else int(table.sensor_width_mm) or 1
     scale = 1.0 if table.unit != "mm" else width / float(table.sensor_width_mm or 1.0)
@@ -113,7 +117,7 @@ def picture_of_table(table: BlurTable, title: str = "") -> Figure:
         else:
             per = scale if name in LENGTHS else 1.0
             for channel in range(nodes.shape[0]):
-                colour = MODEL if nodes.shape[0] == 1 else ("#dc2626", "#16a34a", "#2563eb")[channel % 3]
+                colour = _MODEL if nodes.shape[0] == 1 else ("#dc2626", "#16a34a", "#2563eb")[channel % 3]
                 ax.plot(line, between[name][channel] / per, color=colour, linewidth=1)
                 ax.plot(table.coc, nodes[channel], "o", color=colour, markersize=3)
             ax.set(ylabel=name + (f" [{unit}]" if name in LENGTHS else ""))
@@ -122,19 +126,92 @@ def picture_of_table(table: BlurTable, title: str = "") -> Figure:
     return figure
 
 
-def show(
+def sheet_of_photographs(
+    photographs: Photographs, result: TableFit, render: Callable[[torch.Tensor, torch.Tensor, BlurTable], torch.Tensor]
+) -> Figure:
+    """One figure that documents a calibration from photographs: targets, data, model, and a rendered example.
+
+    One row for each distance: the target found, the window around its dot, the window's pixels over the distance from
+    the centre with the model, the residual, and the kernel. Below, rendered with the table: lights from near to far,
+    and the window of the photograph in focus, blurred as at the most blurred distance.
+
+    Args:
+        photographs: from `read_photographs`.
+        result: from `fit_captures` of the photographs' captures.
+        render: `render(image, coc_px, table)`, with the arguments of `torchdof.blur_by_coc`.
+    """
+    captures = photographs.captures
+    rows = len(captures)
+    figure, axes = _new_figure(12.5, 2.1 * rows + 2.6, 5, rows + 1)
+    by_distance = {p.distance_m: p for p in photographs.pictures}
+    for i, (pair, fit, coc) in enumerate(zip(captures, result.fits, result.coc_px, strict=True)):
+        found, window, profile, residual, kernel = axes[i]
+        picture = by_distance[pair.distance_m]
+        step = max(1, picture.light.shape[1] // 300)
+        height, width = (n // step for n in picture.light.shape)
+        small = picture.light[: height * step, : width * step].reshape(height, step, width, step).mean((1, 3))
+        target, half = picture.target, picture.target.side_px / 2
+        around = [(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]
+        corners = [((target.x + i * half) / step, (target.y + j * half) / step) for i, j in around]
+        _show(found, small, f"{picture.file}, {pair.distance_m:.3f} m", box=corners)
+        _show(window, pair.blurred, "")
+        profile.plot(*fit.samples, ".", color=_DATA, markersize=1.5)
+        profile.plot(*_model_line(fit), color=_MODEL)
+        profile.set_title(f"{fit.family}, radius {fit.radius:.2f} ± {fit.radius_stderr:.2f} px", fontsize=8)
+        residual.plot(fit.samples[0], fit.samples[1] - fit.curve[1], ".", color=_DATA, markersize=1.5)
+        residual.axhline(0, color=_MODEL, linewidth=1)
+        residual.set_title(f"residual {fit.residual_over_noise:.2f} x noise", fontsize=8)
+        shape = result.table.kernels(torch.tensor([coc], dtype=torch.float64), captures.width_px)[0, 0]
+        _show(kernel, shape.detach().numpy(), f"kernel at coc {coc:+.2f} px")
+    for unused in axes[rows]:
+        unused.remove()
+    grid = axes[rows, 0].get_gridspec()
+    (sharp,) = (p for p in photographs.pictures if p.file == captures.notes["sharp"])
+    half = int(min(sharp.target.side_px / 4, 120))
+    x, y = round(sharp.target.x), round(sharp.target.y)
+    window = sharp.light[max(y - half, 0) : y + half, max(x - half, 0) : x + half]
+    most, blurrest = max(zip(result.coc_px, captures, strict=True), key=lambda node: abs(node[0]))
+    ends = min(0.0, *result.coc_px), max(0.0, *result.coc_px)
+    scene = 0.15 + 0.1 * (np.arange(720) // 12 % 2) * np.ones((90, 1))  # small lights on stripes
+    scene[44:46, 18::36] = 25.0
+    lights = _rendered(render, scene, result.table, captures.width_px, *ends)
+    photograph = _rendered(render, window, result.table, captures.width_px, most, most)
+    text = "lights and edges from one end of the measured distances through the focus to the other, with this table"
+    _show(figure.add_subplot(grid[rows, :3]), lights, text)
+    _show(figure.add_subplot(grid[rows, 3]), window, f"{sharp.file}, in focus")
+    _show(figure.add_subplot(grid[rows, 4]), photograph, f"with this table, as at {blurrest.distance_m:.3f} m")
+    return figure
+
+
+def _rendered(
+    render: Callable[[torch.Tensor, torch.Tensor, BlurTable], torch.Tensor],
+    scene: Array,
+    table: BlurTable,
+    width_px: int,
+    left: float,
+    right: float,
+) -> Array:
+    """Renders a part `[H, W]` of a frame `width_px` wide, with a circle of confusion from `left` to `right` px."""
+    coc = torch.linspace(left, right, scene.shape[1], dtype=torch.float32).expand(1, 1, *scene.shape)
+    if table.unit == "mm" and table.sensor_width_mm is not None:  # the part has its own share of the sensor
+        table = table.replace(sensor_width_mm=table.sensor_width_mm * scene.shape[1] / width_px)
+    shown = render(torch.from_numpy(scene).float()[None, None], coc, table)
+    return np.clip(shown[0, 0].numpy().astype(np.float64), 0, 1)
+
+
+def _show(
     axes: Axes, picture: Array, title: str, *, white: float | None = None, box: Sequence[tuple[float, float]] = ()
 ) -> None:
     """Draws a picture `[H, W]` in linear light, encoded for display, and a line through the corners of a box."""
     white = max(float(picture.max()) if white is None else white, 1e-12)
     axes.imshow(np.clip(picture / white, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
     if box:
-        axes.plot(*zip(*box, strict=True), color=MODEL, linewidth=1)
+        axes.plot(*zip(*box, strict=True), color=_MODEL, linewidth=1)
     axes.set_title(title, fontsize=8)
     axes.set_axis_off()
 
 
-def new_figure(width: float, height: float, columns: int = 1, rows: int = 1) -> tuple[Figure, Any]:
+def _new_figure(width: float, height: float, columns: int = 1, rows: int = 1) -> tuple[Figure, Any]:
     """A figure with a size in inches, and its axes in columns and rows."""
     # not pyplot, which would choose a display and keep every figure in memory
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -23,7 +23,6 @@ class BlurFit:
         params: the family's parameters (see `torchdof.optics.psf.FAMILIES`), lengths in the caller's unit (pixels for
             `fit_pair`). Floats, except the array "values" [P] of `radial`. A profile fit (`fit_profile`, model "ratio")
             also has the strength "N".
-            has the strength "N" too.
         stderr: one standard error for each parameter, calibrated against repeated simulated captures.
         radius: of the uniform disc with the same second moment as the PSF (forward model), px; NaN for a profile.
         radius_stderr: its standard error. The radius is well determined even if single parameters are correlated.
@@ -85,20 +84,12 @@ class BlurFit:
         """A few lines of text: each parameter with its error, the residual against the noise, why the family."""
         lines = [f"{self.family} ({self.model})"]
         for name, value in self.params.items():
-            error = self.stderr[name]
-            if isinstance(value, np.ndarray):
-                lines.append(f"  {name}: {value.size} numbers, largest {np.max(value):.4g}")
-            else:
-                lines.append(f"  {name} = {value:.6g} +- {error:.2g}")
-        ratio = self.residual_over_noise
-        lines.append(
-            f"  residual {100 * self.residual:.2f} %" + ("" if math.isnan(ratio) else f", {ratio:.2f} x the noise")
-        )
+            many = f"  {name}: {np.size(value)} numbers, largest {np.max(value):.4g}"
+            lines.append(many if np.ndim(value) else f"  {name} = {value:.6g} +- {self.stderr[name]:.2g}")
+        ratio, (x, y) = self.residual_over_noise, self.shift
+        noise = "" if math.isnan(ratio) else f", {ratio:.2f} x the noise"
+        lines.append(f"  residual {100 * self.residual:.2f} %{noise}")
         if self.model == "forward":
-            lines.append(
-                f"  gain {self.gain:.4g}, shift ({self.shift[0]:+.2f}, {self.shift[1]:+.2f}) px, "
-                f"magnification {self.magnification:.4f}"
-            )
-        if self.why:
-            lines.append(f"  {self.why}")
-        return "\n".join(lines)
+            moved = f"shift ({x:+.2f}, {y:+.2f}) px, magnification {self.magnification:.4f}"
+            lines.append(f"  gain {self.gain:.4g}, {moved}")
+        return "\n".join([*lines, *([f"  {self.why}"] if self.why else [])])

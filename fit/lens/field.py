@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -81,14 +82,12 @@ def spot_of_place(
     wavelength_um: float | None = None,
     reference: Reference = "principal",
 ) -> tuple[Array, Array, Array]:
-    """Positions of a point's light relative to its sharp image: away from the axis, across, and weight.
+    """Positions in mm ``[R]`` of a point's light relative to its sharp image: away from the axis, across; and weight.
 
-    The sharp image is that of the d line through a small stop. Arguments are those of
-    :func:`torchdof.fit.lens.spot.point_spread`; lengths in mm ``[R]``.
+    The sharp image is that of the d line through a small stop. Arguments are those of `point_spread`.
     """
-    spot = point_spread(
-        lens, z_m, sensor_mm, field_mm=field_mm, rays=rays, wavelength_um=wavelength_um, reference=reference
-    )
+    given: dict[str, Any] = {"field_mm": field_mm, "rays": rays, "wavelength_um": wavelength_um, "reference": reference}
+    spot = point_spread(lens, z_m, sensor_mm, **given)
     aside = spot.centre - chief_ray_mm(lens, z_m, sensor_mm, field_mm, reference)
     return aside - spot.y, spot.x, spot.weight
 

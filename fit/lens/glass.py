@@ -26,26 +26,13 @@ _CATALOGUE = Path(__file__).parent / "glasses" / "schott.txt"
 
 @dataclass(frozen=True)
 class Glass:
-    """A glass, or another medium.
+    """A glass, or another medium."""
 
-    Args:
-        name: As in a prescription.
-        coefficients: ``B1, B2, B3, C1, C2, C3`` of Sellmeier's formula, with C in square micrometres; or ``a, b, c`` of
-            Cauchy's.
-
-    Raises:
-        ValueError: If these are not 3 or 6 finite numbers that give an index from 1 to 5 between 0.4 and 0.7 um.
-
-    Example:
-        >>> round(Glass.named("N-BK7").index(0.58756), 5)
-        1.5168
-    """
-
-    name: str
-    coefficients: tuple[float, ...]
+    name: str  # as in a prescription
+    coefficients: tuple[float, ...]  # B1, B2, B3, C1, C2, C3 of Sellmeier's formula, C in um^2; or a, b, c of Cauchy's
 
     def __post_init__(self) -> None:
-        """Validates the coefficients."""
+        """Raises a `ValueError` unless the coefficients are finite and the index from 1 to 5 between 0.4 and 0.7 um."""
         given = self.coefficients
         plain = isinstance(given, tuple) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in given)
         if not plain or len(given) not in (3, 6) or not all(abs(value) <= _LARGEST for value in given):
@@ -57,11 +44,7 @@ class Glass:
 
     @classmethod
     def named(cls, name: str) -> Glass:
-        """A glass of the catalogue.
-
-        Raises:
-            ValueError: If the name is unknown; the message contains the alternatives.
-        """
+        """A glass of the catalogue; an unknown name gives a `ValueError` with the alternatives."""
         if not isinstance(name, str) or name.upper() not in catalogue():
             raise ValueError(
                 f"no glass {show(name)} in the catalogue of SCHOTT; define it by a line "
@@ -80,9 +63,8 @@ class Glass:
             SCHOTT, "TIE-29: Refractive index and dispersion", 2016 (the line of normal glasses).
         """
         name = "/".join(f"{value:.9g}" for value in (index, *dispersion))
-        abbe, partial = (
-            (*dispersion, max(0.3, 0.6438 - 0.001682 * dispersion[0]))[:2] if dispersion else (math.inf, 0.5)
-        )
+        abbe = dispersion[0] if dispersion else math.inf
+        partial = dispersion[1] if len(dispersion) > 1 else max(0.3, 0.6438 - 0.001682 * min(abbe, 1e3))
         if not (abbe >= 1 and 0 < partial < 1):
             raise ValueError(f"the Abbe number must be at least 1 and P_gF between 0 and 1, got {name}")
         d, f, c, g = (np.array([1.0, line**-2, line**-4]) for line in (D_UM, F_UM, C_UM, G_UM))

@@ -1,4 +1,4 @@
-"""Lenses: a list of surfaces, and their first-order optics.
+"""Lenses: a list of surfaces, their first-order optics, and real rays through them.
 
 Light travels to the right, along +z; z = 0 at the first surface's vertex. A positive radius is convex towards the
 object. Lengths are in millimetres. :mod:`torchdof.fit.lens.prescription` describes the file format.
@@ -15,7 +15,7 @@ import numpy as np
 
 from torchdof.validation import number, show, whole
 
-from ..result import Array
+from ..result import Array, Mask
 from . import prescription, zmx
 from .glass import AIR, C_UM, D_UM, F_UM
 from .surface import Surface
@@ -25,6 +25,8 @@ RGB_UM = (C_UM, 0.54607, F_UM)
 
 _SHIPPED = Path(__file__).parent / "lenses"
 _LARGEST = 1e12  # mm; limit of focal lengths and other first-order properties
+_CHUNK = 1 << 14  # rays that fit into the processor's cache together
+_SLACK_MM = 1e-9  # rounding may put a surface this far behind the previous one
 _MARKED = 1.03  # the f-number of a lens is rounded: f/2.03 is marked f/2
 
 
@@ -33,38 +35,34 @@ class Paraxial(NamedTuple):
 
     For the front focal point and the exit pupil, take the rear focal point and the entrance pupil of
     :meth:`Lens.turned`.
-
-    Attributes:
-        focal_length: f.
-        back_focal: rear focal point, from the last vertex (the back focal distance).
-        front_principal: front principal plane H, from the first vertex. A thin lens's object distances start here.
-        rear_principal: rear principal plane H', from the last vertex. A thin lens's image distances start here.
-        entrance_pupil: the stop's image in object space, from the first vertex.
-        entrance_pupil_diameter: its diameter A.
-        f_number: f / A.
     """
 
-    focal_length: float
-    back_focal: float
-    front_principal: float
-    rear_principal: float
-    entrance_pupil: float
-    entrance_pupil_diameter: float
-    f_number: float
+    focal_length: float  # f
+    back_focal: float  # rear focal point, from the last vertex
+    front_principal: float  # principal plane H, from the first vertex; a thin lens's object distances start here
+    rear_principal: float  # principal plane H', from the last vertex; a thin lens's image distances start here
+    entrance_pupil: float  # the stop's image in object space, from the first vertex
+    entrance_pupil_diameter: float  # A
+    f_number: float  # f / A
+
+
+class Rays(NamedTuple):
+    """Rays at a plane or surface; those that are not alive have no meaningful position and direction."""
+
+    position: Array  # [3, R] in mm: x, y, z with z = 0 at the first vertex
+    direction: Array  # unit vectors [3, R]
+    # [R]; False if a ray missed a surface, hit outside a clear diameter, was totally reflected, or met a surface before
+    # the one in front of it (two surfaces that intersect at their rims)
+    alive: Mask
+
+    def at(self, z: float) -> Array:
+        """Intersection of the rays, or their backward extensions, with the plane at z: x and y ``[2, R]`` in mm."""
+        return self.position[:2] + (z - self.position[2]) / self.direction[2] * self.direction[:2]
 
 
 @dataclass(frozen=True, eq=False)
 class Lens:
     """Surfaces on one axis, one of them the aperture stop, in air.
-
-    Args:
-        surfaces: Front to rear; the medium behind the last one has index 1.
-        stop: Index of the surface that is the aperture stop.
-        name: Short name.
-        source: Origin of the numbers.
-
-    Raises:
-        ValueError: If an argument is invalid.
 
     Reference:
         Kolb, Mitchell, Hanrahan, "A realistic camera model for computer graphics", SIGGRAPH 1995, section 3.1.
@@ -75,13 +73,13 @@ class Lens:
         (50.3582, 36.1059)
     """
 
-    surfaces: tuple[Surface, ...]
-    stop: int
+    surfaces: tuple[Surface, ...]  # front to rear; the medium behind the last one has index 1
+    stop: int  # index of the surface that is the aperture stop
     name: str = ""
-    source: str = ""
+    source: str = ""  # origin of the numbers
 
     def __post_init__(self) -> None:
-        """Validates the surfaces and the stop."""
+        """Raises a `ValueError` for invalid surfaces or an invalid stop."""
         if not isinstance(self.surfaces, tuple) or not all(isinstance(one, Surface) for one in self.surfaces):
             raise ValueError(f"surfaces must be a tuple of Surface, got {show(self.surfaces)}")
         whole("stop", self.stop, 0, len(self.surfaces) - 1)
@@ -90,10 +88,9 @@ class Lens:
 
     @classmethod
     def read(cls, source: str | os.PathLike[str]) -> Lens:
-        """Reads a prescription or a Zemax file (.zmx), or an included prescription by name.
+        """Reads a prescription or a Zemax file (.zmx) by its path, or an included prescription by its name.
 
-        Args:
-            source: Path of a file, or a name: ``"double_gauss_50mm"``, ``"wide_22mm"``, ``"telephoto_250mm"``.
+        The names are ``"double_gauss_50mm"``, ``"wide_22mm"`` and ``"telephoto_250mm"``.
 
         Raises:
             ValueError: If the content is not a prescription; the message contains file, line and column.
@@ -130,11 +127,7 @@ class Lens:
         return np.array([1.0, *(surface.glass.index(wavelength_um) for surface in self.surfaces)])
 
     def paraxial(self, wavelength_um: float | None = None) -> Paraxial:
-        """First-order properties, by ray transfer matrices.
-
-        Raises:
-            ValueError: If the lens does not converge light.
-        """
+        """First-order properties, by ray transfer matrices; a `ValueError` if the lens does not converge light."""
         n, matrix, to_stop, gap = self.indices(wavelength_um), np.eye(2), np.eye(2), 0.0
         with np.errstate(over="ignore", invalid="ignore"):
             for i, surface in enumerate(self.surfaces):
@@ -184,13 +177,7 @@ class Lens:
         return replace(self, surfaces=tuple(scaled))
 
     def turned(self) -> Lens:
-        """The lens with front and rear exchanged.
-
-        Example:
-            >>> lens = Lens.read("double_gauss_50mm")
-            >>> bool(abs(lens.turned().paraxial().focal_length - lens.paraxial().focal_length) < 1e-9)
-            True
-        """
+        """The lens with front and rear exchanged."""
         ahead = [(AIR, 0.0), *((one.glass, one.thickness) for one in self.surfaces[:-1])]
         turned = [
             replace(one.bent(-1.0), glass=glass, thickness=gap)
@@ -201,3 +188,47 @@ class Lens:
     def lines(self) -> list[str]:
         """The surfaces as lines of a prescription file."""
         return prescription.lines(self.surfaces, self.stop)
+
+
+def trace_rays(
+    lens: Lens, position: Array, direction: Array, wavelength_um: float | None = None, clip: bool = True
+) -> Rays:
+    """Traces rays to the last surface; they have the direction behind it.
+
+    Args:
+        lens: The prescription.
+        position: A point on each ray ``[3, R]`` in mm, z = 0 at the first vertex; in front of the lens.
+        direction: Unit vectors ``[3, R]`` with a positive z.
+        wavelength_um: None is the d line.
+        clip: Whether clear diameters, including the stop's, block rays.
+
+    Reference:
+        Kolb, Mitchell, Hanrahan 1995, section 3.1 (the loop over surfaces), Snell's law in vector form.
+    """
+    position, direction = (np.asarray(v, dtype=np.float64) for v in (position, direction))
+    if position.ndim != 2 or position.shape[0] != 3 or direction.shape != position.shape:
+        raise ValueError(
+            f"position and direction must both be [3, R], got {list(position.shape)} and {list(direction.shape)}"
+        )
+    if (count := position.shape[1]) > _CHUNK:
+        chunks = (slice(start, start + _CHUNK) for start in range(0, count, _CHUNK))
+        parts = [trace_rays(lens, position[:, one], direction[:, one], wavelength_um, clip) for one in chunks]
+        return Rays(*(np.concatenate(part, -1) for part in zip(*parts, strict=True)))
+    index, along = lens.indices(wavelength_um), np.array([[0.0], [0.0], [1.0]])
+    alive = np.ones(position.shape[1], dtype=bool)
+    for i, (surface, vertex) in enumerate(zip(lens.surfaces, lens.vertices, strict=True)):
+        run, normal, met = surface.meet(position - vertex * along, direction)
+        position = position + run * direction
+        alive &= met
+        if i > 0:  # where two surfaces intersect there is no lens
+            alive &= run >= -_SLACK_MM
+        if clip:
+            alive &= position[0] ** 2 + position[1] ** 2 <= (surface.diameter / 2) ** 2
+        ratio = index[i] / index[i + 1]
+        cosine = (direction * normal).sum(0)
+        inside = 1.0 - ratio * ratio * (1.0 - cosine * cosine)
+        alive &= inside >= 0  # else totally reflected
+        direction = ratio * direction + (np.sqrt(np.maximum(inside, 0.0)) - ratio * cosine) * normal
+        if not alive.all():  # continue blocked rays along the axis, where their numbers stay small
+            position, direction = np.where(alive, position, vertex * along), np.where(alive, direction, along)
+    return Rays(position, direction, alive)

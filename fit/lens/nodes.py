@@ -165,13 +165,11 @@ def fit_radial(tracer: Tracer, places: Sequence[float]) -> tuple[dict[str, Array
 
 def fit_shapes(tracer: Tracer, places: Sequence[float], family: str) -> tuple[dict[str, Array], Array]:
     """A named shape at each node, starting from its neighbour's, from both ends to the focus."""
-    names = FAMILIES[family]
-    params, residual, before = np.zeros((len(names), len(places))), np.zeros(len(places)), None
+    names, before = FAMILIES[family], None
+    params, residual = np.zeros((len(names), len(places))), np.zeros(len(places))
     for i in _to_focus(places):
-        r, light, transfer = tracer.traced(places[i])
-        outermost, rms = float(r.max()), math.sqrt(float(light @ (r * r)))
         before = None if i == len(places) - 1 else before  # the other side begins here
-        before, error = _fit_shape(family, tracer, outermost, transfer, rms / outermost, before)
+        before, outermost, error = _fit_shape(family, tracer, places[i], before)
         params[:, i] = before * [outermost * tracer.pixel if name in LENGTHS else 1.0 for name in names]
         residual[i] = tracer.relative(error)
     return dict(zip(names, params, strict=True)), residual
@@ -183,41 +181,41 @@ def _to_focus(places: Sequence[float]) -> list[int]:
     return [*range(focus), *range(len(places) - 1, focus - 1, -1)]
 
 
-def _fit_shape(
-    family: str, tracer: Tracer, outermost: float, spot_transfer: Array, rms: float, before: Array | None
-) -> tuple[Array, float]:
-    """Parameters of the shape whose transfer function is nearest to a spot's, and the weighted squared error.
+def _fit_shape(family: str, tracer: Tracer, coc: float, before: Array | None) -> tuple[Array, float, float]:
+    """Parameters of the shape whose transfer function is nearest to a spot's; the neighbour's are a weak prior.
 
-    Lengths are relative to the spot's outermost ray. The neighbour's parameters are a start and a weak prior.
+    Returns:
+        The parameters, with lengths relative to the spot's outermost ray; that ray's distance in pixels; and the
+        weighted squared error.
     """
-    names, weight, frequency = FAMILIES[family], tracer.weight, tracer.frequency * outermost
+    (r, light, transfer), names, weight = tracer.traced(coc), FAMILIES[family], tracer.weight
+    outermost = float(r.max())
+    rms, frequency = math.sqrt(float(light @ (r * r))) / outermost, tracer.frequency * outermost
     low, high = np.array([_RANGES[name] for name in names]).T
     if family == "softm":  # a second branch has a small radius, a wide edge and a large tilt
         low[0] = 0.5
     sigma = {"gaussian": 0.5**0.5, "ring": 0.5}.get(family, 0.05) * rms
     geometry = {"radius": 2.0**0.5 * rms, "sigma": sigma, "r_c": 0.7 * rms, "b": 0.0, "m": 2.0}
-    r = (np.arange(_STEPS) + 0.5) * (_REACH / _STEPS)
-    waves = j0(2.0 * np.pi * np.outer(frequency, r))
+    radii = (np.arange(_STEPS) + 0.5) * (_REACH / _STEPS)
+    waves = j0(2.0 * np.pi * np.outer(frequency, radii))
 
     def seen(values: Array) -> Array:
         params = dict(zip(names, values, strict=True))
-        if family == "gaussian":
-            transfer = np.exp(-2.0 * (np.pi * params["sigma"] * frequency) ** 2)
-        elif family == "disc":
+        if family == "gaussian":  # it may reach beyond the radii
+            return np.asarray(weight * np.exp(-2.0 * (np.pi * params["sigma"] * frequency) ** 2))
+        if family == "disc":  # its edge lies between the radii
             phase = 2.0 * np.pi * params["radius"] * frequency
-            transfer = 2.0 * j1(phase) / phase
-        else:
-            light = profile(family, torch.from_numpy(r), params).numpy() * r
-            transfer = waves @ (light / light.sum())
-        return np.asarray(weight * transfer)
+            return np.asarray(weight * 2.0 * j1(phase) / phase)
+        light = profile(family, torch.from_numpy(radii), params).numpy() * radii
+        return np.asarray(weight * (waves @ (light / light.sum())))
 
     start, keep = np.array([geometry[name] for name in names]), 0.0 if before is None else _KEEP
-    near = start if before is None else before
+    near, wanted = start if before is None else before, weight * transfer
     best = best_of(
         lambda values: np.concatenate([seen(values), keep * values]),
-        np.concatenate([weight * spot_transfer, keep * near]),
+        np.concatenate([wanted, keep * near]),
         [near, start] if keep else [start],
         (low, high),
         tolerance=1e-8,
     )
-    return best, float(((seen(best) - weight * spot_transfer) ** 2).sum())
+    return best, outermost, float(((seen(best) - wanted) ** 2).sum())

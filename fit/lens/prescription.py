@@ -29,15 +29,10 @@ _SHAPE = ("k", *(f"A{power}" for power in range(2, 18, 2)))
 
 
 def parse(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
-    r"""Reads the text of a prescription: the surfaces, the index of the stop, and the source.
+    """Reads the text of a prescription: the surfaces, the index of the stop, and the source.
 
     Raises:
         ValueError: If it is not a prescription; the message contains line and column.
-
-    Example:
-        >>> surfaces, stop, _ = parse(b"50 5 1.5/64 20 \n 0 1 0 18 \n -50 0 1 20")
-        >>> [surface.glass.name for surface in surfaces], stop
-        (['1.5/64', '1.5/64', '1'], 1)
     """
     surfaces: list[Surface] = []
     defined: dict[str, Glass] = {}
@@ -49,10 +44,10 @@ def parse(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
         words = text.split()
         try:
             if words[:1] == ["glass"]:
-                name, *numbers = words[1:] or [""]
-                if len(numbers) != 6 or not name[0].isalpha():
+                if len(words) != 8 or not words[1][0].isalpha():
                     raise ValueError(f"expected glass NAME B1 B2 B3 C1 C2 C3, got {' '.join(words[1:])!r}")
-                defined[name] = Glass(name, tuple(_number(f"glass {name}", text) for text in numbers))
+                numbers = tuple(_number(f"glass {words[1]}", text) for text in words[2:])
+                defined[words[1]] = Glass(words[1], numbers)
             elif words:
                 surface, is_stop = _surface(words, surfaces[-1].glass if surfaces else AIR, defined)
                 if is_stop and stop is not None:

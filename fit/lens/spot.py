@@ -13,6 +13,7 @@ four differ by up to 7 cm, and the blur of an object at 1 m by 10 %.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -22,8 +23,7 @@ from torchdof.validation import number, whole
 
 from ..result import Array
 from ..validation import a_choice
-from .lens import Lens
-from .rays import Rays, trace_rays
+from .lens import Lens, Rays, trace_rays
 
 Reference = Literal["principal", "pupil", "vertex", "sensor"]
 Focus = Literal["best", "paraxial"]
@@ -35,24 +35,14 @@ _FARTHEST_M, _WIDEST_MM = 1e12, 1e9
 
 @dataclass(frozen=True, eq=False)
 class Spot:
-    """Positions of the light of one object point on the sensor. A geometric spot, without diffraction.
+    """Positions of the light of one object point on the sensor, in mm. A geometric spot, without diffraction."""
 
-    Attributes:
-        x: Hits relative to the centroid ``[R]``, in mm; the object lies in the direction +y of the field (its image at
-            -y).
-        y: See x.
-        weight: Share of the light of each hit ``[R]``; sums to 1.
-        centre: The centroid's distance from the axis in mm, along the image's field direction.
-        pupil_mm2: Unvignetted area of the entrance pupil, to about 1 %. Off axis over on axis: vignetting.
-        meridional: True for a spot on the axis traced as one fan along y, which represents its rotation about the axis.
-    """
-
-    x: Array
-    y: Array
-    weight: Array
-    centre: float
-    pupil_mm2: float
-    meridional: bool = False
+    x: Array  # hits relative to the centroid [R]
+    y: Array  # the same; the object lies in the direction +y of the field, its image at -y
+    weight: Array  # share of the light of each hit [R]; sums to 1
+    centre: float  # the centroid's distance from the axis, along the image's field direction
+    pupil_mm2: float  # unvignetted area of the entrance pupil, to about 1 %; off axis over on axis: vignetting
+    meridional: bool = False  # a spot on the axis, traced as one fan along y that represents its rotation
 
     @property
     def r(self) -> Array:
@@ -87,29 +77,38 @@ class Spot:
 
 
 def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best", reference: Reference = "principal") -> float:
-    """Distance of the sensor behind the last vertex, in mm, for an object at ``focus_m`` in focus.
+    """Distance of the sensor behind the last vertex, in mm, for an object at ``focus_m`` (``inf`` allowed) in focus.
 
-    Args:
-        lens: The prescription; the best focus depends on its stop.
-        focus_m: Object distance in metres; ``inf`` allowed.
-        kind: ``"paraxial"``: where rays close to the axis meet; ``"best"``: where the spot on the axis has the smallest
-            root mean square radius, like the focus of a photographer or an autofocus.
-        reference: Reference point of the distance, see the module.
+    The kind ``"paraxial"`` is where rays close to the axis meet; ``"best"`` is where the spot on the axis has the
+    smallest root mean square radius, like the focus of a photographer or an autofocus, and depends on the stop.
 
     Raises:
         ValueError: If the object is too near for focusing, or an argument is invalid.
-
-    Example:
-        >>> lens = Lens.read("double_gauss_50mm")
-        >>> round(focus_sensor(lens, float("inf"), kind="paraxial"), 4)
-        36.1059
     """
     a_choice("focus", kind, get_args(Focus))
     first = lens.paraxial()
     sensor = first.back_focal
-    for _ in range(100 if reference == "sensor" else 1):
-        object_mm = vertex_distance_mm(lens, focus_m, reference, sensor)
-        before, sensor = sensor, _image_mm(lens, object_mm, kind)
+    for _ in range(100 if reference == "sensor" else 1):  # the sensor's own place changes such a distance
+        object_mm, before = vertex_distance_mm(lens, focus_m, reference, sensor), sensor
+        distance = object_mm + first.front_principal
+        if distance <= first.focal_length:
+            raise ValueError(
+                f"the focus must be farther than the focal length ({first.focal_length:.4g} mm) from the front "
+                f"principal plane, got {distance:.4g} mm"
+            )
+        sensor = first.rear_principal + 1.0 / (1.0 / first.focal_length - 1.0 / distance)
+        if kind == "best":
+            aim, _, high = _rays_of_point(lens, object_mm, sensor)
+            traced, weight = aim(_fan(high[1], _FAN))
+            weight, height = weight * traced.alive, traced.at(lens.vertices[-1] + sensor)[1]
+            slope = traced.direction[1] / traced.direction[2]
+            # the mean squared radius is a parabola over the sensor's position
+            steepness = float(weight @ (slope * slope))
+            if steepness == 0.0:
+                raise ValueError(
+                    f"no ray of a fan through lens {lens.name!r} comes to a focus; are its openings too narrow?"
+                )
+            sensor -= float(weight @ (height * slope)) / steepness
         if abs(sensor - before) < 1e-12 * first.focal_length:
             break
     return sensor
@@ -138,7 +137,7 @@ def point_spread(
         field_mm: Image height in mm in a pinhole camera with its hole in the front principal plane and its sensor at
             the distance from H'; the real image is there too, up to distortion.
         rays: Number of rays aimed at the lens; vignetting blocks some.
-        wavelength_um: Wavelength in micrometres; None is the d line.
+        wavelength_um: None is the d line.
         reference: Reference point of ``z_m``, see the module.
         meridional: On the axis only: trace a fan that represents its rotation; as accurate with 2,000 rays.
 
@@ -155,11 +154,10 @@ def point_spread(
     number("field_mm", field_mm, low=-_WIDEST_MM, high=_WIDEST_MM, unit="millimetres")
     if meridional and field_mm:
         raise ValueError(f"meridional is for points on the axis, got field_mm = {field_mm}")
-    source = _Source(lens, vertex_distance_mm(lens, z_m, reference, sensor_mm), sensor_mm, field_mm, wavelength_um)
-    low, high = source.pupil_box()
-    side = max(4, round(math.sqrt(rays)))
+    object_mm, side = vertex_distance_mm(lens, z_m, reference, sensor_mm), max(4, round(math.sqrt(rays)))
+    aim, low, high = _rays_of_point(lens, object_mm, sensor_mm, field_mm, wavelength_um)
     points = _fan(high[1], rays) if meridional else _grid(low, high, (np.arange(side) + 0.5) / side)
-    traced, weight = source.aim(points)
+    traced, weight = aim(points)
     alive = traced.alive
     if not alive.any():
         raise ValueError(f"no ray from z = {z_m} m at field {field_mm} mm passes lens {lens.name!r}")
@@ -187,30 +185,6 @@ def vertex_distance_mm(lens: Lens, z_m: float, reference: Reference, sensor_mm: 
     return 1000.0 * z_m - behind_vertex
 
 
-def _image_mm(lens: Lens, object_mm: float, kind: Focus) -> float:
-    """Distance behind the last vertex, in mm, at which an object on the axis is in focus."""
-    first = lens.paraxial()
-    distance = object_mm + first.front_principal
-    if distance <= first.focal_length:
-        raise ValueError(
-            f"the focus must be farther than the focal length ({first.focal_length:.4g} mm) from the front principal "
-            f"plane, got {distance:.4g} mm"
-        )
-    paraxial = first.rear_principal + 1.0 / (1.0 / first.focal_length - 1.0 / distance)
-    if kind == "paraxial":
-        return paraxial
-    source = _Source(lens, object_mm, paraxial)
-    traced, weight = source.aim(_fan(source.pupil_box()[1][1], _FAN))
-    weight = weight * traced.alive
-    height = traced.at(lens.vertices[-1] + paraxial)[1]
-    slope = traced.direction[1] / traced.direction[2]
-    # the mean squared radius is a parabola over the sensor's position
-    steepness = float(weight @ (slope * slope))
-    if steepness == 0.0:
-        raise ValueError(f"no ray of a fan through lens {lens.name!r} comes to a focus; are its openings too narrow?")
-    return paraxial - float(weight @ (height * slope)) / steepness
-
-
 def _fan(reach: float, rays: int) -> Array:
     """Points ``[2, N]`` of the pupil along y, each representing a ring of equal area."""
     return np.stack([np.zeros(rays), reach * np.sqrt((np.arange(rays) + 0.5) / rays)])
@@ -221,42 +195,39 @@ def _grid(low: Array, high: Array, steps: Array) -> Array:
     return np.stack(np.meshgrid(*(low + (high - low) * steps[:, None]).T)).reshape(2, -1)
 
 
-class _Source:
-    """An object point that emits rays of one wavelength."""
+def _rays_of_point(
+    lens: Lens, object_mm: float, sensor_mm: float, field_mm: float = 0.0, wavelength_um: float | None = None
+) -> tuple[Callable[[Array], tuple[Rays, Array]], Array, Array]:
+    """Rays of one wavelength that an object point emits.
 
-    def __init__(
-        self, lens: Lens, object_mm: float, sensor_mm: float, field_mm: float = 0.0, wavelength_um: float | None = None
-    ) -> None:
-        self.lens, self.wavelength_um, first = lens, wavelength_um, lens.paraxial()
-        self.pupil = first.entrance_pupil
-        self.distance = object_mm + self.pupil  # from the entrance pupil
-        self.tangent = field_mm / (sensor_mm - first.rear_principal)  # of the point's direction, seen from H
-        self.slope = self.tangent * (1.0 + (first.front_principal - self.pupil) / self.distance)  # from the pupil
+    Returns:
+        A function that traces rays through points ``[2, R]`` of the entrance pupil's plane, and gives the solid angle
+        of each; and the bounding box, low and high ``[2]``, in that plane of the rays that pass the lens.
+    """
+    first = lens.paraxial()
+    pupil, front = first.entrance_pupil, lens.surfaces[0].diameter
+    distance = object_mm + pupil  # from the entrance pupil
+    tangent = field_mm / (sensor_mm - first.rear_principal)  # of the point's direction, seen from H
+    slope = tangent * (1.0 + (first.front_principal - pupil) / distance)  # from the pupil
 
-    def aim(self, points: Array) -> tuple[Rays, Array]:
-        """Rays through points ``[2, R]`` of the entrance pupil's plane, and the solid angle of each."""
-        slopes = points / self.distance - np.array([[0.0], [self.slope]])
+    def aim(points: Array) -> tuple[Rays, Array]:
+        slopes = points / distance - np.array([[0.0], [slope]])
         run = np.concatenate([slopes, np.ones_like(slopes[:1])])
         length = np.sqrt((run * run).sum(0))
         # start in the plane of the first vertex: the pupil's plane may lie inside the lens
-        start = np.concatenate([points - self.pupil * slopes, np.zeros_like(slopes[:1])])
-        return trace_rays(self.lens, start, run / length, self.wavelength_um), length**-3
+        start = np.concatenate([points - pupil * slopes, np.zeros_like(slopes[:1])])
+        return trace_rays(lens, start, run / length, wavelength_um), length**-3
 
-    def pupil_box(self) -> tuple[Array, Array]:
-        """Bounding box ``(low, high)`` of the rays that pass, in the entrance pupil's plane."""
-        # every passing ray crosses the first surface's clear diameter
-        front = self.lens.surfaces[0].diameter
-        reach = front / 2 + abs(self.pupil) * (abs(self.tangent) + front / self.distance)
-        low, high = np.array([-reach, -reach]), np.array([reach, reach])
-        for _ in range(8):
-            points = _grid(low, high, np.linspace(0.0, 1.0, _PROBES + 1))
-            passed = points[:, self.aim(points)[0].alive]
-            if not passed.size:
-                raise ValueError(
-                    f"no ray of the object point passes lens {self.lens.name!r}; is it in the field of view?"
-                )
-            cell, before = (high - low) / _PROBES, np.prod(high - low)
-            low, high = np.maximum(passed.min(1) - cell, low), np.minimum(passed.max(1) + cell, high)
-            if np.prod(high - low) > 0.95 * before:
-                break
-        return low, high
+    # every passing ray crosses the first surface's clear diameter
+    reach = front / 2 + abs(pupil) * (abs(tangent) + front / distance)
+    low, high = np.array([-reach, -reach]), np.array([reach, reach])
+    for _ in range(8):
+        points = _grid(low, high, np.linspace(0.0, 1.0, _PROBES + 1))
+        passed = points[:, aim(points)[0].alive]
+        if not passed.size:
+            raise ValueError(f"no ray of the object point passes lens {lens.name!r}; is it in the field of view?")
+        cell, before = (high - low) / _PROBES, np.prod(high - low)
+        low, high = np.maximum(passed.min(1) - cell, low), np.minimum(passed.max(1) + cell, high)
+        if np.prod(high - low) > 0.95 * before:
+            break
+    return aim, low, high

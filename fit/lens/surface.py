@@ -27,30 +27,17 @@ _CLOSE_MM = 1e-10
 
 @dataclass(frozen=True)
 class Surface:
-    """A sphere or even asphere, and the medium behind it.
+    """A sphere or even asphere, and the medium behind it; lengths in mm."""
 
-    Args:
-        radius: Radius of curvature at the vertex in mm, ``inf`` for a flat surface; positive if convex towards the
-            object.
-        thickness: Distance to the next surface in mm, >= 0; unused for the last one.
-        glass: The medium behind it.
-        diameter: Clear diameter in mm.
-        conic: Conic constant k.
-        polynomial: ``A_2, A_4, ...``, with lengths in millimetres.
-
-    Raises:
-        ValueError: If a number is outside its range; the message begins with its name.
-    """
-
-    radius: float
-    thickness: float
-    glass: Glass
-    diameter: float
-    conic: float = 0.0
-    polynomial: tuple[float, ...] = ()
+    radius: float  # of curvature at the vertex, inf for a flat surface; positive if convex towards the object
+    thickness: float  # distance to the next surface, >= 0; unused for the last one
+    glass: Glass  # the medium behind it
+    diameter: float  # clear diameter
+    conic: float = 0.0  # conic constant k
+    polynomial: tuple[float, ...] = ()  # A_2, A_4, ...
 
     def __post_init__(self) -> None:
-        """Validates the shape."""
+        """Raises a `ValueError` for a number outside its range; the message begins with its name."""
         if not isinstance(self.glass, Glass) or not isinstance(self.polynomial, tuple):
             raise ValueError(f"glass must be a Glass and polynomial a tuple of numbers, got {show(self)}")
         _check("diameter", self.diameter, _SMALLEST_MM, _LARGEST_MM)

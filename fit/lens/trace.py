@@ -8,8 +8,10 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import torch
 
 from torchdof.optics.blur_table import BlurTable
+from torchdof.optics.camera import Camera
 from torchdof.optics.psf import FAMILIES
 from torchdof.validation import number, show, whole
 
@@ -55,7 +57,7 @@ def trace_table(
 
     Args:
         lens: The prescription.
-        f_number: Marked f-number, see :meth:`Lens.with_f_number`.
+        f_number: Marked f-number; up to 3 % below that of the open stop means fully open.
         focus_m: Focus distance in metres from ``reference``; ``inf`` allowed.
         nodes: Number of nodes, at least 5, or 3 for a focus at infinity; None uses as many as needed.
         nearest_m: Nearest object distance in metres; None is a third of the focus distance (the blur is then twice that
@@ -101,7 +103,8 @@ def trace_table(
     if not 0 < number("nearest_m", nearest_m, unit="metres") < focus_m:
         raise ValueError(f"nearest_m must be nearer than the focus at {focus_m} m, got {nearest_m}")
     rays = (50_000 if field_mm else 2_000) if rays is None else rays
-    near, far = (signed_coc_mm(z, focal, f_number, focus_m) for z in (nearest_m, math.inf))
+    ends = torch.tensor([nearest_m, math.inf], dtype=torch.float64)[None, None, None]
+    near, far = Camera(focal, f_number, focus_m, 1.0).coc_px(ends, width=1).flatten().tolist()  # with pixels of 1 mm
 
     def distance(coc: float) -> float:
         dioptres = 1.0 / focus_m - coc / near * (1.0 / focus_m - 1.0 / nearest_m)
@@ -155,7 +158,7 @@ def trace_table(
 
 
 def _check(given: dict[str, Any]) -> None:
-    """Raises an error for invalid arguments of :func:`trace_table`."""
+    """Raises an error for invalid arguments of `trace_table`; `focus_sensor` and `point_spread` check the rest."""
     lens, focus_m, wavelengths, field = (given[key] for key in ("lens", "focus_m", "wavelengths_um", "field"))
     if not isinstance(lens, Lens):
         raise ValueError(f"lens must be a Lens, got {show(lens)}; read one with Lens.read()")
@@ -164,11 +167,10 @@ def _check(given: dict[str, Any]) -> None:
     number("field_mm", given["field_mm"], -1e6, 1e6)
     number("sensor_width_mm", given["sensor_width_mm"], 0, 1e9)
     number("width_px", given["width_px"], 0, 1e9, unit="pixels")
-    least_nodes = 5 if math.isfinite(focus_m) else 3
-    counts = ("nodes", least_nodes, 1000), ("points", 3, 1000), ("field_nodes", 2, 100), ("field_rays", 1000, 10**7)
-    for name, least, most in counts:
-        if name != "nodes" or given[name] is not None:
-            whole(name, given[name], least, most)
+    if given["nodes"] is not None:
+        whole("nodes", given["nodes"], 5 if math.isfinite(focus_m) else 3, 1000)
+    for name, least, most in (("points", 3, 1000), ("field_nodes", 2, 100), ("field_rays", 1000, 10**7)):
+        whole(name, given[name], least, most)
     if not isinstance(given["name"], str | None):
         raise ValueError(f"name must be a text, got {show(given['name'])}")
     if wavelengths is not None:
@@ -181,23 +183,10 @@ def _check(given: dict[str, Any]) -> None:
     if field is not None:
         if given["field_mm"]:
             raise ValueError("field_mm averages one place, field traces several: give one of them")
-        if not isinstance(field, list | tuple) or len(field) < 2 or field[0] != 0:
-            raise ValueError(
-                f"field must be distances in mm from the middle of the frame, from 0 on, got {show(field)}"
-            )
-        if not all(low < number("field", high, 0, 1e6, unit="mm") for low, high in pairwise(field)):
-            raise ValueError(f"field must be increasing distances in mm, got {show(field)}")
-
-
-def signed_coc_mm(z_m: float, focal_length_mm: float, f_number: float, focus_m: float) -> float:
-    """Signed radius of the thin lens's circle of confusion in mm on the sensor, as :class:`torchdof.Camera` gives it.
-
-    Example:
-        >>> round(signed_coc_mm(1.0, 50.3582, 2.03015, 2.0), 4)
-        -0.3204
-    """
-    aperture_mm, focal_m = focal_length_mm / f_number, focal_length_mm / 1000.0
-    return aperture_mm / 2.0 * focal_m / (1.0 - focal_m / focus_m) * (1.0 / focus_m - 1.0 / z_m)
+        listed = isinstance(field, list | tuple) and len(field) > 1 and field[0] == 0
+        if not listed or not all(low < number("field", high, 0, 1e6, unit="mm") for low, high in pairwise(field)):
+            text = "field must be increasing distances in mm from the middle of the frame, from 0 on"
+            raise ValueError(f"{text}, got {show(field)}")
 
 
 def _rounded(values: Array, digits: int = 6) -> Any:

@@ -17,18 +17,10 @@ _APERTURES = {"SQAP", "ELAP", "OBSC", "SQOB", "ELOB", "SPID", "UDAD", "UDOB"}
 
 
 def parse(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
-    r"""Reads the content of a .zmx file, UTF-16 or plain: surfaces, the index of the stop, and the source.
+    """Reads the content of a .zmx file, UTF-16 or plain: surfaces, the index of the stop, and the source.
 
     Raises:
         ValueError: If it is not a sequential lens that can be traced; the message names the surface.
-
-    Example:
-        >>> surface = "SURF {}\n TYPE STANDARD\n CURV {}\n DISZ {}\n DIAM 9\n"
-        >>> glass = " GLAS N-BK7 0 0 1.5168 64.17\n STOP\n"
-        >>> text = surface.format(0, 0, "INFINITY") + surface.format(1, 0.02, 5) + glass
-        >>> surfaces, stop, _ = parse((text + surface.format(2, -0.02, 95) + surface.format(3, 0, 0)).encode())
-        >>> [(one.radius, one.thickness) for one in surfaces], stop
-        ([(50.0, 5.0), (-50.0, 0.0)], 0)
     """
     text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     listed: list[dict[str, list[str]]] = []

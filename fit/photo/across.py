@@ -77,8 +77,18 @@ def field_of_dots(tables: Sequence[BlurTable], places: Sequence[tuple[float, flo
         reach, seen = torch.tensor([spot[0] for spot in spots]).double(), torch.stack([spot[1] for spot in spots])
         boxes.append(torch.lerp(reach[low], reach[low + 1], part))
         light.append(torch.lerp(seen[low], seen[low + 1], part[:, None, None, None]))
-    sizes, cells = torch.stack(boxes), torch.stack(light)  # [K, F], [K, F, C, U, V]
-    coc, sizes, cells = _both_sides(tables[0].coc, sizes, cells)
+    coc, sizes, cells = tables[0].coc, torch.stack(boxes), torch.stack(light)  # [K], [K, F], [K, F, C, U, V]
+    if not bool((coc < 0).any() and (coc > 0).any()):  # the other side of focus has these spots rotated by half a turn
+        coc, sizes, cells = torch.cat([coc, -coc]), torch.cat([sizes, sizes]), torch.cat([cells, cells.flip(-2)])
+        rising_coc = coc.argsort()
+        coc, sizes, cells = coc[rising_coc], sizes[rising_coc], cells[rising_coc]
+    upper = int((coc > 0).nonzero()[0])
+    # in focus, interpolate the signed size: if it is not 0, that position has its focus at another depth
+    part = coc[upper - 1] / (coc[upper - 1] - coc[upper])
+    size = torch.lerp(-sizes[upper - 1], sizes[upper], part).abs()
+    between = torch.lerp(cells[upper - 1], cells[upper], part)
+    parts = ((coc, coc.new_zeros(1)), (sizes, size[None]), (cells, between[None]))
+    coc, sizes, cells = (torch.cat([of[:upper], new, of[upper:]]) for of, new in parts)
     box = torch.stack([torch.zeros_like(sizes), sizes, sizes], -1)
     return Field(coc, torch.from_numpy(radius), box, cells.permute(2, 0, 1, 3, 4))
 
@@ -109,21 +119,3 @@ def _spot(
                 taken = functional.grid_sample(kernel, grid[None], align_corners=False)[0]
                 total += taken / (len(angles) * taken.sum((-2, -1), keepdim=True))
     return reach, total / (2 * len(group))
-
-
-def _both_sides(coc: Tensor, sizes: Tensor, light: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Adds the focus and, if one side of it has no nodes, the other side's spots rotated by half a turn."""
-    if not bool((coc < 0).any() and (coc > 0).any()):
-        coc, sizes, light = (
-            torch.cat(pair) for pair in ((coc, -coc.flip(0)), (sizes, sizes.flip(0)), (light, light.flip(0, -2)))
-        )
-        order = coc.argsort()
-        coc, sizes, light = coc[order], sizes[order], light[order]
-    upper = int((coc > 0).nonzero()[0])
-    # interpolate the signed size: if it is not 0 in focus, that position has its focus at another depth
-    part = coc[upper - 1] / (coc[upper - 1] - coc[upper])
-    size = torch.lerp(-sizes[upper - 1], sizes[upper], part).abs()
-    between = torch.lerp(light[upper - 1], light[upper], part)
-    parts = ((coc, coc.new_zeros(1)), (sizes, size[None]), (light, between[None]))
-    coc, sizes, light = (torch.cat([of[:upper], new, of[upper:]]) for of, new in parts)
-    return coc, sizes, light

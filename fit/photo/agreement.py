@@ -66,8 +66,20 @@ def _readings(captures: Captures, expected: Array, measured: Array, telling: Mas
     distance, defocus = captures.distances_m, captures.defocus
     per_dioptre = float(np.median(expected / np.abs(defocus)))
     if captures.promised_px is not None:
-        factor = _common_factor(expected, measured)
-        yield _misfit(factor * expected, measured, telling), _scale_causes(captures, factor)
+        factor = _common_factor(expected, measured)  # of all blurs
+        focal, stops, sensor = (float(getattr(captures, name)) for name in CAMERA)
+        units = [name for unit, name in _UNITS.items() if abs(math.log(factor / unit)) < _EXPLAINED]
+        causes = [f"the distances are in {name}, not in metres" for name in units]
+        if factor > 1:
+            text = f"the pictures are a crop of frames about {round(captures.width_px * factor)} px wide (state "
+            text += "full_width_px, or cut them by crop = [left, top, width, height] instead of in an editor)"
+            causes.append(text)
+        causes += [
+            f"the f-number is {stops / factor:.2g}, not {stops:g}",
+            f"the sensor is {sensor / factor:.3g} mm wide, not {sensor:g}",
+            f"the focal length is {focal * math.sqrt(factor):.3g} mm, not {focal:g}",
+        ]
+        yield _misfit(factor * expected, measured, telling), ", or ".join(causes)
     for i, k in combinations(range(len(distance)), 2):
         exchanged = expected.copy()
         exchanged[[i, k]] = expected[[k, i]]
@@ -90,24 +102,6 @@ def _stands(captures: Captures, defocus: float) -> str:
     """The distance with this defocus [1/m], as text; empty if no distance has it."""
     vergence = 1 / captures.focus_m - defocus
     return f"{1 / vergence:.3g} m" if vergence > 0 else ""
-
-
-def _scale_causes(captures: Captures, factor: float) -> str:
-    """Numbers that could be wrong if all blurs are `factor` times the expected ones."""
-    focal, stops, sensor = (float(getattr(captures, name)) for name in CAMERA)
-    units = [name for unit, name in _UNITS.items() if abs(math.log(factor / unit)) < _EXPLAINED]
-    causes = [f"the distances are in {name}, not in metres" for name in units]
-    if factor > 1:
-        causes.append(
-            f"the pictures are a crop of frames about {round(captures.width_px * factor)} px wide (state "
-            "full_width_px, or cut them by crop = [left, top, width, height] instead of in an editor)"
-        )
-    causes += [
-        f"the f-number is {stops / factor:.2g}, not {stops:g}",
-        f"the sensor is {sensor / factor:.3g} mm wide, not {sensor:g}",
-        f"the focal length is {focal * math.sqrt(factor):.3g} mm, not {focal:g}",
-    ]
-    return ", or ".join(causes)
 
 
 def _common_factor(expected: Array, measured: Array) -> float:

@@ -1,18 +1,16 @@
 """Checks of a capture and its fit: levels, focus, residual, roundness, window, bounds."""
 
 import numpy as np
-import torch
 from scipy.ndimage import gaussian_filter
-
-from torchdof.io.transfer import decode, encode
 
 from ..problems import FitError, warn
 from ..result import Array, BlurFit
 from .diagnostics import CHANCE, UNEVEN, asymmetry_of, size_of_blur, unexplained, unfitted_part
 from .dot import Dot, inner_pixels
-from .forward import Forward, Solution
+from .forward import Solution
 from .noise import fine_variance, independent_share, noise_of, rounding_of
 from .source import UNFOCUSED_PX, Edge, soft_edge
+from .tone import untoned
 
 EXPLAINED = 1.15
 """Largest misfit of an ideal dot, over the noise, with which it explains a sharp picture."""
@@ -26,6 +24,7 @@ _SOFTENED = 0.02  # relative error of the kernel's size, from a soft sharp pictu
 _ENCODED = 0.7  # exponent of the edge's levels below which the picture counts as sRGB encoded
 _STEEP, _CERTAIN = 0.03, 4.0  # least steepness of an S-curve: share of the dot's level, and in standard errors
 _TOGETHER = 1.9  # second differences for each independent one: neighbours share pixels
+_DECODE = "is the image linear? Decode it first"
 # a tone curve in the residual: its strength, and chi squared (two parameters), above which to warn
 _BENT, _BENT_CHI = 0.075, 30.0  # after the fit, which leaves 0.075 of a curve of 20 %
 _STEEP_TOO, _BENT_CHI_TOO = 0.008, 18.0  # the same if the sharp dot's edge is steeper than this
@@ -41,7 +40,6 @@ _OUTSIDE_REFUSED, _OUTSIDE_WARNED = 0.05, 0.005  # share of the blur's light out
 
 def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None) -> bool:
     """Whether noise and edge of a sharp picture's dot are those of linear light; warns if not."""
-    text, number = "", 0.0
     inside = inner_pixels(still, dot)
     if inside is not None:
         bright = fine_variance(still, inside)
@@ -49,32 +47,29 @@ def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None) -> boo
         # noise in light can only grow with the level; allow 4 standard errors of its estimate
         most = (1 + 4 / np.sqrt(int(inside.sum() / _TOGETHER))) * np.sqrt(bright + rounding)
         if dot.noise > max(most, 1e-4 * dot.peak):
-            number = dot.noise / max(float(np.sqrt(bright)), 1e-9 * dot.peak)
+            ratio = dot.noise / max(float(np.sqrt(bright)), 1e-9 * dot.peak)
             text = (
-                f"the dark paper has {number:.1f} times the noise of the white dot, as in a picture that is left sRGB "
-                "encoded; is the image linear? Decode it first"
+                f"the dark paper has {ratio:.1f} times the noise of the white dot, as in a picture that is left sRGB "
             )
-    if not text and edge.steepness > max(_STEEP, _CERTAIN * edge.steepness_error):
-        number = edge.steepness
+            warn(f"{text}encoded; {_DECODE}", "not linear", file=file, number=ratio)
+            return False
+    if edge.steepness > max(_STEEP, _CERTAIN * edge.steepness_error):
         text = (
-            f"the dot's edge is steeper than pixels can be, by {100 * number:.0f} % of its level: a tone curve "
+            f"the dot's edge is steeper than pixels can be, by {100 * edge.steepness:.0f} % of its level: a tone curve "
             "(an S-curve, a picture style) or sharpening was applied. The kernel comes out too small; develop without "
             "them"
         )
-    if not text and edge.misfit >= EXPLAINED:
-        bent = soft_edge(still, dot, fit_exponent=True)
-        if bent.exponent < _ENCODED and bent.rms < 0.75 * edge.rms:
-            number = bent.exponent
-            text = (
-                f"the dot's edge is that of light to the power {number:.2f}, as in a picture that is left sRGB "
-                "encoded (about 0.45); is the image linear? Decode it first"
-            )
-    if text:
-        warn(text, "not linear", file=file, number=number)
-    return not text
+        warn(text, "not linear", file=file, number=edge.steepness)
+        return False
+    bent = soft_edge(still, dot, fit_exponent=True) if edge.misfit >= EXPLAINED else edge
+    if bent.exponent < _ENCODED and bent.rms < 0.75 * edge.rms:
+        text = f"the dot's edge is that of light to the power {bent.exponent:.2f}, as in a picture that is left sRGB "
+        warn(f"{text}encoded (about 0.45); {_DECODE}", "not linear", file=file, number=bent.exponent)
+        return False
+    return True
 
 
-def check_levels(pair: Forward, solution: Solution, held: Solution, edge: Edge, file: str | None) -> None:
+def check_levels(solution: Solution, held: Solution, edge: Edge, file: str | None) -> None:
     """Warns if a tone curve would explain the residual of a fit.
 
     No kernel makes all pixels of one level brighter and all of another darker; a tone curve does, even one so weak that
@@ -87,16 +82,16 @@ def check_levels(pair: Forward, solution: Solution, held: Solution, edge: Edge, 
 
     `edge` is that of the sharp dot.
     """
-    curves = _curves(pair, solution, edge.level)
-    found, spread = unexplained(pair, solution, curves)
-    seen = unfitted_part(pair, solution, curves)
+    curves = _curves(solution, edge.level)
+    found, spread = unexplained(solution, curves)
+    seen = unfitted_part(solution, curves)
     bend = np.linalg.lstsq(seen.T @ seen, found, rcond=None)[0]
     chi_squared = float(found @ np.linalg.pinv(spread) @ found)
     steep = edge.steepness / max(edge.steepness_error, np.finfo(float).tiny)
     agrees = edge.steepness > _STEEP_TOO and steep > 1 and chi_squared + steep**2 > _BENT_CHI_TOO
     resized = abs(solution.moves["magnification"] / held.moves["magnification"] - 1) > _RESIZED
     bent = float(np.linalg.norm(bend)) > _BENT and (chi_squared > _BENT_CHI or agrees)
-    if bent or (not resized and _curved(pair, held, edge.level, steep)):
+    if bent or (not resized and _curved(held, edge.level, steep)):
         text = (
             "the fit's residual depends on the level, "
             + ("" if bent else "at the expected size of the dot, ")
@@ -107,28 +102,26 @@ def check_levels(pair: Forward, solution: Solution, held: Solution, edge: Edge, 
         warn(text, "not linear", file=file, number=float(bend[1]))
 
 
-def _curved(pair: Forward, held: Solution, level: float, steep: float) -> bool:
+def _curved(held: Solution, level: float, steep: float) -> bool:
     """Whether an S-curve explains the residual at the expected magnification, and better than another magnification.
 
     `steep`, the excess of the sharp dot's edge in standard errors, counts in favour of the curve.
     """
-    larger = held.gain * pair.move_columns(held.moves, ("magnification",), pair.kernel(held))[0]
-    basis = np.stack([_curves(pair, held, level)[:, 1], larger], axis=1)
-    found, spread = unexplained(pair, held, basis)
+    larger = held.gain * held.pair.move_columns(held.moves, ("magnification",), held.kernel)[0]
+    basis = np.stack([_curves(held, level)[:, 1], larger], axis=1)
+    found, spread = unexplained(held, basis)
     contrast, size = np.sign(found) * found**2 / np.maximum(np.diag(spread), np.finfo(float).tiny)
-    strength = found[0] / np.sum(unfitted_part(pair, held, basis)[:, 0] ** 2)
+    strength = found[0] / np.sum(unfitted_part(held, basis)[:, 0] ** 2)
     clearer = contrast + steep * abs(steep) - abs(size) > _CLEARER
     return bool(strength > _CURVED and contrast > _CURVED_CHI and clearer)
 
 
-def _curves(pair: Forward, solution: Solution, level: float) -> Array:
+def _curves(solution: Solution, level: float) -> Array:
     """Effects of weak tone curves on a fit's pixels `[pixels used, 2]`: brightening, and an S-curve's contrast."""
-    light = (solution.model[pair.used] - solution.background) / (solution.gain * level)  # 0 is the paper
-    encoded = encode(torch.from_numpy(np.clip(light, 0.0, 1.0))[None, None, None], "srgb", False, False)
-    step = 1e-3  # of the encoded level
-    steeper = (decode(encoded + step, "srgb", False, False) - decode(encoded - step, "srgb", False, False)) / (2 * step)
-    e, slope = encoded.flatten().numpy(), solution.gain * level * steeper.flatten().numpy()
-    return np.stack([slope * e * (1 - e), -slope * e * (1 - e) * (1 - 2 * e)], axis=1)
+    light = ((solution.fitted - solution.background) / (solution.gain * level))[None]  # 0 is the paper
+    step = 1e-3
+    weak = np.concatenate([untoned(light, (-step, 0, 0)), untoned(light, (0, -1.5 * step, 0))])
+    return np.asarray(solution.gain * level * (weak - untoned(light, (0, 0, 0))) / step).T
 
 
 def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | None) -> None:
@@ -144,29 +137,31 @@ def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | Non
     if share < _SOFTENED:
         return
     text = f"the sharp picture is soft: its dot's edge has a width of {edge.softness:.1f} px"
-    if edge.softness > UNFOCUSED_PX and deconvolved:
+    small = f"the kernel is too small by {100 * share:.0f} %"
+    if edge.softness <= UNFOCUSED_PX:
+        text += f"; if the printed dot's edge is sharp, {small}"
+    elif not deconvolved:
+        text += f", as out of focus; {small}: focus again"
+    else:
         text += (
             ", as out of focus; the dot was fitted as it would be in focus. If its printed edge is that soft, the "
             f"kernel is too large by {100 * share:.0f} %. Better focus again"
         )
-    elif edge.softness > UNFOCUSED_PX:
-        text += f", as out of focus; the kernel is too small by {100 * share:.0f} %: focus again"
-    else:
-        text += f"; if the printed dot's edge is sharp, the kernel is too small by {100 * share:.0f} %"
     warn(text, "not in focus", file=file, number=edge.softness)
 
 
-def check_fit(pair: Forward, solution: Solution, fit: BlurFit, file: str | None, freest: BlurFit) -> None:
+def check_fit(solution: Solution, fit: BlurFit, file: str | None, freest: BlurFit) -> None:
     """Raises or warns about problems of a fit to the picture `file`.
 
     `fit` describes the solution and will be returned; `freest` is the fit with the freest kernel.
     """
     if not fit.gain > 0:
         raise FitError("the blurred picture has nothing in common with the sharp one", file=file, number=fit.gain)
+    pair = solution.pair
     # share of the light that the kernel spreads outside the window
     source = pair.moved_source(solution.moves)
     total = float(source[0, 0].real)
-    held = float(pair.convolve(source, pair.kernel(solution)[None], whole=True)[0].sum())
+    held = float(pair.convolve(source, solution.kernel[None], whole=True)[0].sum())
     outside = 1 - held / total if total > 0 else 1.0
     size = f"{pair.data.shape[1]}x{pair.data.shape[0]} px"
     if outside > _OUTSIDE_REFUSED:
@@ -175,28 +170,7 @@ def check_fit(pair: Forward, solution: Solution, fit: BlurFit, file: str | None,
     if outside > _OUTSIDE_WARNED:
         text = f"{100 * outside:.1f} % of the blur's light falls outside the window of {size}; cut a larger one"
         warn(text, "window", file=file, number=outside)
-    _check_residual(fit, freest, file)
-    change = fit.magnification / pair.magnification
-    if abs(np.log(change)) > _MAGNIFIED:
-        text = (
-            f"the blurred dot is {change:.3f} times the size it should have; are the distances right, and is the image "
-            "linear, not sRGB encoded?"
-        )
-        warn(text, "magnification", file=file, number=change)
-    _check_spots(pair, solution, file)
-    if fit.asymmetry > UNEVEN and asymmetry_of(pair, solution)[1] < CHANCE:
-        text = (
-            f"the blur is not round: {100 * fit.asymmetry:.0f} % of it depends on the angle in a way that family "
-            f"{fit.family!r} cannot; is the lens decentred, the dot off the axis, or the stop a polygon? Families "
-            "'auto' and 'image' take any shape"
-        )
-        warn(text, "asymmetry", file=file, number=fit.asymmetry)
-    if solution.family != "radial":
-        _check_parameters(pair, solution, file)
-
-
-def _check_residual(fit: BlurFit, freest: BlurFit, file: str | None) -> None:
-    """Warns if the freest fit's residual is far above the noise, or if the chosen family adds much to it."""
+    # the freest residual is far above the noise, or the chosen family adds much to it
     ratio = freest.residual_over_noise
     far_above = (freest.residual > _MATTERS and ratio > FAR_ABOVE) or (freest.residual > _SEEN and ratio > 2.0)
     # if that is reported already, only what the family adds
@@ -215,15 +189,33 @@ def _check_residual(fit: BlurFit, freest: BlurFit, file: str | None) -> None:
         )
         text += f" Family {freest.family!r} may be too simple" if freest.family != "radial" else ""
         warn(text, "residual", file=file, number=ratio)
+    change = fit.magnification / pair.magnification
+    if abs(np.log(change)) > _MAGNIFIED:
+        text = (
+            f"the blurred dot is {change:.3f} times the size it should have; are the distances right, and is the image "
+            "linear, not sRGB encoded?"
+        )
+        warn(text, "magnification", file=file, number=change)
+    _check_spots(solution, file)
+    if fit.asymmetry > UNEVEN and asymmetry_of(solution)[1] < CHANCE:
+        text = (
+            f"the blur is not round: {100 * fit.asymmetry:.0f} % of it depends on the angle in a way that family "
+            f"{fit.family!r} cannot; is the lens decentred, the dot off the axis, or the stop a polygon? Families "
+            "'auto' and 'image' take any shape"
+        )
+        warn(text, "asymmetry", file=file, number=fit.asymmetry)
+    if solution.family != "radial":
+        _check_parameters(solution, file)
 
 
-def _check_spots(pair: Forward, solution: Solution, file: str | None) -> None:
+def _check_spots(solution: Solution, file: str | None) -> None:
     """Warns about light beyond the dot's blur; the residual is not sensitive to small amounts."""
+    pair = solution.pair
     beyond = (pair.distance > pair.dot.reach + 4) & pair.used
     if not beyond.any():
         return
-    residual = np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0)
-    remaining = np.where(beyond, gaussian_filter(residual, 2.0, mode="constant"), -np.inf)
+    smoothed = gaussian_filter(pair.picture(solution.residual, 0.0), 2.0, mode="constant")
+    remaining = np.where(beyond, smoothed, -np.inf)
     y, x = np.unravel_index(int(np.argmax(remaining)), remaining.shape)
     height, peak = float(remaining[y, x]), pair.dot.peak
     # smoothing by sigma = 2 px leaves 0.14 of white noise, and more of correlated noise
@@ -239,9 +231,9 @@ def _check_spots(pair: Forward, solution: Solution, file: str | None) -> None:
         warn(text, "residual", file=file, number=height / peak)
 
 
-def _check_parameters(pair: Forward, solution: Solution, file: str | None) -> None:
+def _check_parameters(solution: Solution, file: str | None) -> None:
     """Warns about parameters on their bounds, and about a blur whose size the pictures do not determine."""
-    low, high = pair.bounds(solution.names)
+    low, high = solution.pair.bounds(solution.names)
     for name, least, most in zip(solution.names, low, high, strict=True):
         value = float({**solution.moves, **solution.params}[name])
         at_least, at_most = value <= least + 1e-6 * abs(least), value >= most * (1 - 1e-6)
@@ -253,7 +245,7 @@ def _check_parameters(pair: Forward, solution: Solution, file: str | None) -> No
         # circular blades
         if (at_least and not length and name != "b" or at_most) and name not in ("m", "curvature"):
             warn(f"{name} ended on its bound {value:.4g}; it is only a limit", "boundary", file=file, number=value)
-    size, error = size_of_blur(pair, solution)
+    size, error = size_of_blur(solution)
     if not error < 0.5 * size:
         text = f"the blur's rms radius of {size:.3g} +- {error:.2g} px is not determined: too little blur, or too noisy"
         warn(text, "flat profile", file=file, number=error / size if size else np.inf)

@@ -5,7 +5,7 @@ from scipy.special import chdtrc
 
 from ..result import Array, BlurFit
 from ..solve import information_criterion
-from .forward import OPENINGS, SHAPES, Forward, Solution, without_level
+from .forward import OPENINGS, SHAPES, Solution, without_level
 from .noise import fine_variance, independent_share, noise_of
 from .radial import size_of_profile
 
@@ -19,15 +19,15 @@ _HARMONICS, _RINGS = 8, 4
 _LIT = 0.01  # share of the peak above which a pixel of a free kernel counts as a parameter
 
 
-def rms_left(pair: Forward, solution: Solution) -> float:
+def rms_left(solution: Solution) -> float:
     """Root mean square of the residual over the lit pixels."""
-    return float(np.sqrt(np.mean((pair.data[pair.lit] - solution.model[pair.lit]) ** 2)))
+    return float(np.sqrt(np.mean(solution.residual[solution.pair.lit[solution.pair.used]] ** 2)))
 
 
-def noise_near(pair: Forward, solution: Solution) -> float:
+def noise_near(solution: Solution) -> float:
     """Standard deviation of a pixel's noise where the light is, from the fine (pixel to pixel) part of the residual."""
-    residual = np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0)
-    seen = np.nan_to_num(fine_variance(residual, pair.lit))
+    pair = solution.pair
+    seen = np.nan_to_num(fine_variance(pair.picture(solution.residual, 0.0), pair.lit))
     lit = pair.data[pair.lit] - solution.background
     dark, light = noise_of(pair.data) ** 2, pair.shot_noise * float(np.mean(np.maximum(lit, 0.0)))
     known = dark / pair.fine_share + light / (pair.fine_share_of_light or pair.fine_share)
@@ -35,26 +35,26 @@ def noise_near(pair: Forward, solution: Solution) -> float:
     return float(np.sqrt(known + max(seen - dark - light, 0.0)))
 
 
-def unexplained(pair: Forward, solution: Solution, basis: Array) -> tuple[Array, Array]:
+def unexplained(solution: Solution, basis: Array) -> tuple[Array, Array]:
     """Products of patterns `[pixels used, n]` with a fit's residual `[n]`, and their covariance under noise alone.
 
     The parts of the patterns that the fit's parameters can imitate are removed.
     """
-    basis = unfitted_part(pair, solution, basis)
-    residual = pair.values - solution.model[pair.used]
+    basis = unfitted_part(solution, basis)
     # a smooth deviation must not count as noise: use the level beside the dot and inside it. Noise cannot exceed the
     # residual: in a JPEG, dark areas have less noise than the level in the light suggests
-    variance = min(noise_near(pair, solution), rms_left(pair, solution)) ** 2
-    return basis.T @ residual, variance * basis.T @ pair.correlated_noise(basis, pair.noise_correlation)
+    variance = min(noise_near(solution), rms_left(solution)) ** 2
+    correlated = solution.pair.correlated_noise(basis, solution.pair.noise_correlation)
+    return basis.T @ solution.residual, variance * basis.T @ correlated
 
 
-def unfitted_part(pair: Forward, solution: Solution, basis: Array) -> Array:
+def unfitted_part(solution: Solution, basis: Array) -> Array:
     """Patterns without the parts that the fit's parameters can imitate, which are not in its residual."""
     known, _ = np.linalg.qr(solution.slopes[:, np.abs(solution.slopes).max(axis=0) > 0])
-    return without_level(basis - known @ (known.T @ basis), solution.model[pair.used])
+    return without_level(basis - known @ (known.T @ basis), solution.fitted)
 
 
-def asymmetry_of(pair: Forward, solution: Solution) -> tuple[float, float]:
+def asymmetry_of(solution: Solution) -> tuple[float, float]:
     """How much of the blur depends on the angle, and the probability of that by noise alone.
 
     The residual is expanded in the first eight harmonics of the angle on four rings. With noise of known covariance,
@@ -63,31 +63,29 @@ def asymmetry_of(pair: Forward, solution: Solution) -> tuple[float, float]:
     Returns:
         Norm of the angle-dependent part, without noise's contribution, over the norm of the light; and the probability.
     """
+    pair = solution.pair
     x, y = pair.dot.x + solution.moves["dx"], pair.dot.y + solution.moves["dy"]
     rows, columns = pair.pixels
     reach = max(pair.dot.reach, 2.0)
     angle, place = np.arctan2(rows - y, columns - x), np.hypot(columns - x, rows - y) / reach * _RINGS
     near = (place <= _RINGS) & pair.used
-    templates = []
-    for ring in range(1, _RINGS + 1):
-        hat = np.clip(1 - np.abs(place - ring + 0.5), 0, None) * near
-        for order in range(1, _HARMONICS + 1):
-            templates += [hat * np.cos(order * angle), hat * np.sin(order * angle)]
-    basis = unfitted_part(pair, solution, np.stack([t[pair.used] for t in templates], axis=1))
+    hats = [(np.clip(1 - np.abs(place - ring + 0.5), 0, None) * near)[pair.used] for ring in range(1, _RINGS + 1)]
+    waves = [wave(n * angle[pair.used]) for n in range(1, _HARMONICS + 1) for wave in (np.cos, np.sin)]
+    basis = unfitted_part(solution, np.stack([hat * wave for hat in hats for wave in waves], axis=1))
     left, values, _ = np.linalg.svd(basis, full_matrices=False)
     left = left[:, values > 1e-6 * values.max()]
-    found, spread = unexplained(pair, solution, left)
+    found, spread = unexplained(solution, left)
     chance = float(chdtrc(found.size, found @ np.linalg.solve(spread, found))) if np.trace(spread) > 0 else 0.0
     light = float(np.sum((pair.data[near] - solution.background) ** 2))
     share = np.sqrt(max(float(found @ found) - float(np.trace(spread)), 0.0) / light) if light > 0 else np.inf
     return float(share), chance
 
 
-def size_of_blur(pair: Forward, solution: Solution) -> tuple[float, float]:
+def size_of_blur(solution: Solution) -> tuple[float, float]:
     """The PSF's rms radius and its standard error, px; better determined than single, correlated parameters."""
     if solution.family == "radial":
         return size_of_profile(solution)
-    shape = list(solution.params)
+    pair, shape = solution.pair, list(solution.params)
     steps = [1e-3 * max(abs(float(solution.params[n])), 0.1) for n in shape]
     varied = {n: np.full(len(shape) + 1, float(solution.params[n])) for n in shape}
     for i, n in enumerate(shape):
@@ -101,7 +99,7 @@ def size_of_blur(pair: Forward, solution: Solution) -> tuple[float, float]:
         if solution.family == "image":  # its shape is free: only the picture's second moment determines its size
             squared, light = pair.distance[pair.lit] ** 2, pair.data[pair.lit] - solution.background
             away = squared - float(light @ squared / light.sum())
-            noise = noise_near(pair, solution) / np.sqrt(independent_share(pair.noise_correlation))
+            noise = noise_near(solution) / np.sqrt(independent_share(pair.noise_correlation))
             of_moment = float(noise * np.linalg.norm(away) / abs(light.sum()) / (2 * max(rms, 1e-9)))
         return rms, float(np.sqrt(variance + of_moment**2))
     # single parameters are undetermined, but their combination may determine the size
@@ -113,8 +111,9 @@ def size_of_blur(pair: Forward, solution: Solution) -> tuple[float, float]:
     return rms, float(np.sqrt(solution.squares / pair.values.size) * np.linalg.norm(along[seen] / values[seen]))
 
 
-def bic_of(pair: Forward, solution: Solution) -> float:
+def bic_of(solution: Solution) -> float:
     """Bayesian information criterion of a solution."""
+    pair = solution.pair
     floor = pair.values.size * (1e-6 * pair.unit) ** 2
     free = len(SHAPES[solution.family])
     if solution.family == "radial":
@@ -122,21 +121,21 @@ def bic_of(pair: Forward, solution: Solution) -> float:
     elif solution.family == "polygon":
         free += 1  # the number of blades
     elif solution.family == "image":
-        kernel = pair.kernel(solution)
-        free = int(np.sum(kernel > _LIT * kernel.max()))
+        free = int(np.sum(solution.kernel > _LIT * solution.kernel.max()))
     # correlated neighbours are not independent samples
     count = pair.values.size * independent_share(pair.noise_correlation)
     squares = (solution.squares + floor) * count / pair.values.size
     return information_criterion(squares, max(round(count), 1), free + len(pair.fit_moves) + 2)
 
 
-def describe(pair: Forward, solution: Solution, why: str) -> BlurFit:
+def describe(solution: Solution, why: str) -> BlurFit:
     """The solution as a `BlurFit`: errors by name, residual and noise of the lit pixels, samples for plotting."""
+    pair = solution.pair
     x, y = pair.dot.x + solution.moves["dx"], pair.dot.y + solution.moves["dy"]
     size = float(np.sqrt(np.mean((pair.data[pair.lit] - solution.background) ** 2)))
     through = (solution.gain * pair.source.noise) ** 2 / pair.fine_share
-    noise = np.sqrt(noise_near(pair, solution) ** 2 + through * float(np.sum(pair.kernel(solution) ** 2)))
-    rms, rms_error = size_of_blur(pair, solution)
+    noise = np.sqrt(noise_near(solution) ** 2 + through * float(np.sum(solution.kernel**2)))
+    rms, rms_error = size_of_blur(solution)
     spread = np.sqrt(np.diag(solution.covariance))
     stderr: dict[str, float | Array] = {
         n: float(s) for n, s in zip(solution.names, spread, strict=True) if n in solution.params
@@ -147,18 +146,18 @@ def describe(pair: Forward, solution: Solution, why: str) -> BlurFit:
     near = (distance <= 1.2 * pair.dot.reach) & pair.used
     order = np.argsort(distance[near])
     samples, curve = (
-        np.stack([distance[near], (levels[near] - solution.background) / (solution.gain or 1.0)])[:, order]
-        for levels in (pair.data, solution.model)
+        np.stack([distance[near], (levels - solution.background) / (solution.gain or 1.0)])[:, order]
+        for levels in (pair.data[near], solution.fitted[near[pair.used]])
     )
     return BlurFit(
         family=solution.family,
         params=dict(solution.params),
         stderr={"values": spread, "radius": 0.0} if solution.family == "radial" else stderr,
-        residual=rms_left(pair, solution) / size,
+        residual=rms_left(solution) / size,
         noise=float(noise) / size,
         covariance=solution.covariance,
         names=solution.names,
-        bic=bic_of(pair, solution),
+        bic=bic_of(solution),
         count=pair.values.size,
         model="forward",
         gain=solution.gain,
@@ -166,7 +165,7 @@ def describe(pair: Forward, solution: Solution, why: str) -> BlurFit:
         shift=(x - pair.source.x, y - pair.source.y),
         centre=(x, y),
         magnification=solution.moves["magnification"],
-        asymmetry=asymmetry_of(pair, solution)[0],
+        asymmetry=asymmetry_of(solution)[0],
         radius=float(np.sqrt(2) * rms),
         radius_stderr=float(np.sqrt(2) * rms_error),
         why=why,

@@ -86,25 +86,25 @@ def _refine_aligned(captures: Captures, family: str, fits: dict[int, BlurFit]) -
     one rule.
     """
     place = captures.defocus
+
+    def end(fit: BlurFit) -> float:
+        """Radius in px that contains all but a thousandth of a free profile's light."""
+        values, radius = np.asarray(fit.params["values"]), float(fit.params["radius"])
+        r = np.linspace(0, radius, 1001)
+        light = np.cumsum(np.interp(r, np.linspace(0, radius, values.size), values) * r)
+        return float(r[np.searchsorted(light, 0.999 * light[-1])]) + radius / (values.size - 1)
+
     for sign in (-1, 1):
         side = [i for i in fits if place[i] * sign > 0]
         if len(side) < 2:
             continue
-        x, ends = np.abs(place[side]), np.array([_end(fits[i]) for i in side])
+        x, ends = np.abs(place[side]), np.array([end(fits[i]) for i in side])
         # near focus a profile may end anywhere: the outer nodes define the line, raised so that it contains theirs
         slope, start = np.polyfit(x, ends, 1, w=x)
         lift = max(float(np.max((ends - slope * x - start)[x > 0.25 * x.max()])), 0.0)
-        for i, defocus, end in zip(side, x, ends, strict=True):
-            reach = max(float(slope * defocus + start + lift), float(end), 1.0)
+        for i, defocus, own in zip(side, x, ends, strict=True):
+            reach = max(float(slope * defocus + start + lift), float(own), 1.0)
             fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=fits[i], reach=reach)
-
-
-def _end(fit: BlurFit) -> float:
-    """Radius in px that contains all but a thousandth of a free profile's light."""
-    values, radius = np.asarray(fit.params["values"]), float(fit.params["radius"])
-    r = np.linspace(0, radius, 1001)
-    light = np.cumsum(np.interp(r, np.linspace(0, radius, values.size), values) * r)
-    return float(r[np.searchsorted(light, 0.999 * light[-1])]) + radius / (values.size - 1)
 
 
 def fit_openings(
@@ -159,19 +159,13 @@ def counted(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
 
 @dataclass(frozen=True)
 class Colour:
-    """One colour of a capture.
+    """One colour of a capture."""
 
-    Attributes:
-        name: "red", "green" or "blue".
-        fits: one for each distance, like those of the mean of the colours.
-        focus_shift_dioptres: 1/distance of its focus minus that of green's, 1/m (longitudinal colour). NaN if fewer
-            than two distances are blurred enough.
-        lateral_px: (x, y) offsets of its dot from green's, px: in focus, then at each distance (lateral colour).
-    """
-
-    name: str
-    fits: tuple[BlurFit, ...]
+    name: str  # "red", "green" or "blue"
+    fits: tuple[BlurFit, ...]  # one for each distance, like those of the mean of the colours
+    # longitudinal colour: 1/distance of its focus minus that of green, 1/m; NaN unless two distances are blurred enough
     focus_shift_dioptres: float
+    # lateral colour: (x, y) offsets of its dot from green's, px: in focus, then at each distance
     lateral_px: tuple[tuple[float, float], ...]
 
 
@@ -190,11 +184,15 @@ def fit_colours(captures: Captures, fits: Sequence[BlurFit]) -> tuple[Colour, ..
         with without_warnings():  # the mean's fit has already warned
             for colour, *pictures in zip(found, *pair.colours, strict=True):
                 colour.append(_fit_like(mean, pair, captures.focus_m, *pictures, **known))
+    green = found[_GREEN]
     shifts = [_focus_shift(captures.defocus, colour) for colour in found]
-    return tuple(
-        Colour(name, tuple(colour), shift - shifts[_GREEN], _beside(colour, found[_GREEN]))
-        for name, colour, shift in zip(_COLOURS, found, shifts, strict=True)
-    )
+    colours = []
+    for name, colour, shift in zip(_COLOURS, found, shifts, strict=True):
+        moved = np.array([np.subtract(f.centre, g.centre) for f, g in zip(colour, green, strict=True)])
+        shifted = np.array([np.subtract(f.shift, g.shift) for f, g in zip(colour, green, strict=True)])
+        lateral = tuple((float(x), float(y)) for x, y in [(moved - shifted).mean(axis=0), *moved])
+        colours.append(Colour(name, tuple(colour), shift - shifts[_GREEN], lateral))
+    return tuple(colours)
 
 
 def _focus_shift(defocus: Array, fits: Sequence[BlurFit]) -> float:
@@ -207,10 +205,3 @@ def _focus_shift(defocus: Array, fits: Sequence[BlurFit]) -> float:
     slope, start = np.polyfit(defocus[telling], radius[telling], 1, w=1 / error[telling])
     # radius = slope * (1/focus - shift - 1/distance), with the colour's own focus 1/focus - shift
     return float(start / slope)
-
-
-def _beside(fits: Sequence[BlurFit], green: Sequence[BlurFit]) -> tuple[tuple[float, float], ...]:
-    """(x, y) offsets of dots from green's: in the sharp picture, then at each distance."""
-    moved = np.array([np.subtract(f.centre, g.centre) for f, g in zip(fits, green, strict=True)])
-    shifted = np.array([np.subtract(f.shift, g.shift) for f, g in zip(fits, green, strict=True)])
-    return tuple((float(x), float(y)) for x, y in [(moved - shifted).mean(axis=0), *moved])

@@ -9,7 +9,7 @@ from scipy.ndimage import uniform_filter
 from ..problems import FitError, warn
 from ..result import Array, Mask
 from ..validation import a_picture
-from .noise import fine_variance, noise_of
+from .noise import fine_variance, near_border, noise_of
 
 _THRESHOLD = 0.15  # of the peak; low enough to keep an uneven ring in one piece
 _SMALLEST_PX = 9
@@ -64,11 +64,9 @@ def find_dots(picture: Array, *, file: str | None = None, smallest: float = _OTH
     """
     height, width = a_picture("a picture of a dot", picture, _SMALLEST_PX, file).shape
     noise = noise_of(picture)
-    frame = max(1, min(height, width) // 20)
-    edge = np.ones(picture.shape, dtype=bool)
-    edge[frame:-frame, frame:-frame] = False
+    levels = picture[near_border(picture.shape, max(1, min(height, width) // 20))]
     # a mean without outliers: the median is biased if blacks are cut off at 0, which removes half of the noise
-    levels, background = picture[edge], float(np.median(picture[edge]))
+    background = float(np.median(levels))
     if noise > 0 and (kept := np.abs(levels - background) <= 5 * noise).any():
         background = float(levels[kept].mean())
     smooth = ndimage.gaussian_filter(picture - background, 1.0, mode="nearest")
@@ -189,11 +187,10 @@ def _plateau(picture: Array, dot: Dot) -> float | None:
     top = float(picture.max())
     above = picture[picture > dot.background + 0.5 * dot.peak]
     at_top = int(np.sum(above == top))
-    if at_top < 5 or at_top < 0.02 * above.size:
-        return None
     levels, counts = np.unique(above, return_counts=True)
-    if levels.size > 1 and counts[-1] <= counts[-2]:
-        return None  # the tail of the noise in a file with few levels
+    tail = levels.size > 1 and counts[-1] <= counts[-2]  # of the noise in a file with few levels
+    if tail or at_top < max(5, 0.02 * above.size):
+        return None
     spacing = float(np.median(np.diff(levels))) if levels.size > 1 else 0.0
     return top if dot.noise > 0.6 * spacing and dot.noise > 1e-12 * abs(top) else None
 

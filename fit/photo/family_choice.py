@@ -108,21 +108,17 @@ def choose(
     lowest = bic[by_likelihood[0]]
     likeliest = min((f for f in kernels if bic[f] <= lowest + _EVIDENCE), key=COST.index)
     second = next(f for f in by_likelihood if f != likeliest)
-    natural = {f: natural_psnr(kernels[f], kernels[likeliest]) for f in kernels}
-    look = {f: highlight_psnr(kernels[f], kernels[likeliest]) for f in kernels}
+    best = kernels[likeliest]
+    reached = {f: f"{natural_psnr(k, best):.1f} and {highlight_psnr(k, best):.1f} dB" for f, k in kernels.items()}
     wanted = f"{accuracy_db:g} dB on a natural image and {accuracy_db - _LOOK_BELOW:g} dB on a highlight"
-    enough = [f for f in kernels if natural[f] >= accuracy_db and look[f] >= accuracy_db - _LOOK_BELOW]
+    enough = [f for f in kernels if looks_alike(kernels[f], best, accuracy_db)]
     family = min([*enough, likeliest], key=COST.index)
-    others = ", ".join(
-        f"{f} {natural[f]:.1f} and {look[f]:.1f} dB, BIC {bic[f] - bic[likeliest]:+.0f}"
-        for f in by_likelihood
-        if f not in (family, likeliest)
-    )
+    rest = [f for f in by_likelihood if f not in (family, likeliest)]
+    others = ", ".join(f"{f} {reached[f]}, BIC {bic[f] - bic[likeliest]:+.0f}" for f in rest)
     if family == likeliest:
         head = "the lowest BIC" if bic[family] == lowest else f"the simplest within {_EVIDENCE:g} of the lowest BIC"
         margin = bic[second] - bic[likeliest]
         why = f"{head} ({second} second by {margin:.0f}), and no cheaper family has {wanted}"
     else:
-        reached = f"{natural[family]:.1f} and {look[family]:.1f} dB"
-        why = f"the cheapest with {wanted} ({reached}) against {likeliest}, the likeliest"
+        why = f"the cheapest with {wanted} ({reached[family]}) against {likeliest}, the likeliest"
     return family, f"{why} ({others})", {f: natural_psnr(kernels[f], kernels["radial"]) for f in kernels}

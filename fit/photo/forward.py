@@ -5,8 +5,11 @@ displacement and magnification do not bias the kernel. Gain and background are l
 the other parameters (variable projection): the kernel's parameters, displacement and magnification.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -38,22 +41,6 @@ _STARTS = {  # lengths relative to the increase of the dot's standard deviation 
 _LEAST, _MOST = {"b": -1.0, "rotation_deg": -np.inf}, {"curvature": 1.0}
 _DRAWN_PX = 16.0
 _STEP = {"dx": 1e-4, "dy": 1e-4, "magnification": 1e-5}
-
-
-@dataclass(frozen=True)
-class Solution:
-    """The kernel and moves that best explain the defocused picture, with their covariance and residuals."""
-
-    family: str
-    params: dict[str, float | Array]
-    moves: dict[str, float]
-    gain: float
-    background: float
-    model: Array  # of the defocused picture [H, W], NaN in unused pixels
-    names: tuple[str, ...]  # of the covariance's parameters
-    covariance: Array
-    squares: float  # sum of squared residuals
-    slopes: Array  # derivatives of the model [pixels used, parameters]
 
 
 @dataclass
@@ -138,11 +125,6 @@ class Forward:
         half = min(int(np.ceil(support(family, tensors))) + 1, most)
         return pixel_kernels(family, tensors, 2 * half + 1).numpy()
 
-    def kernel(self, solution: Solution) -> Array:
-        """Kernel `[k, k]` of a solution."""
-        params = {k: np.asarray(v, dtype=np.float64)[None] for k, v in solution.params.items()}
-        return np.asarray(self.kernels(solution.family, params)[0])
-
     def opening_with(self, params: Mapping[str, float]) -> Aperture:
         """The lens's opening with these of its parameters."""
         if self.opening is None:
@@ -183,19 +165,15 @@ class Forward:
         )
         params = {n: float(v) for n, v in zip(names, numbers, strict=True)}
         fitted, gain, background = self.project(self._shaped(family, names, numbers))
-        residual, slopes, moves = self.values - fitted, self._jacobian(family, names, numbers), self.moves(params)
-        kernel = self.kernels(family, {n: np.array([params[n]]) for n in shape})[0]
+        residual, slopes = self.values - fitted, self._jacobian(family, names, numbers)
+        kernel, penalty = (
+            self.kernels(family, {n: np.array([params[n]]) for n in shape})[0],
+            np.diag((self.unit * pull) ** 2),
+        )
+        covariance = self.covariance(slopes, residual, kernel, gain, penalty, of_prior=True)
+        moves = self.moves(params)
         return Solution(
-            family=family,
-            params={n: params[n] for n in shape},
-            moves=moves,
-            gain=gain,
-            background=background,
-            model=self.picture(fitted, np.nan),
-            names=names,
-            covariance=self.covariance(slopes, residual, kernel, gain, np.diag((self.unit * pull) ** 2), of_prior=True),
-            squares=float(residual @ residual),
-            slopes=slopes,
+            self, family, {n: params[n] for n in shape}, moves, gain, background, fitted, names, covariance, slopes
         )
 
     def moves(self, params: Mapping[str, float]) -> dict[str, float]:
@@ -285,18 +263,11 @@ class Forward:
 
     def bounds(self, names: tuple[str, ...]) -> tuple[list[float], list[float]]:
         """Lower and upper bounds of the named parameters."""
-        width = float(self.half)
         wander = max(2.0, 0.3 * self.dot.radius)
         table = {
-            "sigma": (0.05, width),
-            "r_c": (0.0, width),
-            "radius": (0.1, width),
-            "b": (-0.98, 8.0),
-            "m": (0.5, 12.0),
-            "rotation_deg": (-400.0, 400.0),
-            "curvature": (0.0, 1.0),
-            "dx": (-wander, wander),
-            "dy": (-wander, wander),
+            **{"sigma": (0.05, self.half), "r_c": (0.0, self.half), "radius": (0.1, self.half), "m": (0.5, 12.0)},
+            **{"b": (-0.98, 8.0), "rotation_deg": (-400.0, 400.0), "curvature": (0.0, 1.0)},
+            **dict.fromkeys(("dx", "dy"), (-wander, wander)),
             "magnification": (0.7 * self.magnification, 1.4 * self.magnification),
         }
         return [table[n][0] for n in names], [table[n][1] for n in names]
@@ -320,3 +291,35 @@ def without_level(columns: Array, shaped: Array) -> Array:
     basis = np.stack([np.ones_like(shaped), shaped - shaped.mean()], axis=1)
     basis = basis / np.maximum(np.linalg.norm(basis, axis=0), np.finfo(float).tiny)
     return np.asarray(columns - basis @ (basis.T @ columns))
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The kernel and moves that best explain a pair of pictures, with their covariance and residuals."""
+
+    pair: Forward
+    family: str
+    params: dict[str, float | Array]
+    moves: dict[str, float]
+    gain: float
+    background: float
+    fitted: Array  # the model of the defocused picture [pixels used]
+    names: tuple[str, ...]  # of the covariance's parameters
+    covariance: Array
+    slopes: Array  # derivatives of the model [pixels used, parameters]
+
+    @cached_property
+    def kernel(self) -> Array:
+        """The kernel `[k, k]`."""
+        params = {k: np.asarray(v, dtype=np.float64)[None] for k, v in self.params.items()}
+        return np.asarray(self.pair.kernels(self.family, params)[0])
+
+    @cached_property
+    def residual(self) -> Array:
+        """Data minus model `[pixels used]`."""
+        return np.asarray(self.pair.values - self.fitted)
+
+    @cached_property
+    def squares(self) -> float:
+        """Sum of squared residuals."""
+        return float(self.residual @ self.residual)

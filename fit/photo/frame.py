@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -56,22 +57,21 @@ def read_frame(
         has NaN.
         OSError: the file is missing or damaged.
     """
+    refused = partial(FitError, kind="manifest", file=str(path))
     picture = read_image(path, transfer=transfer)
     pixels = picture.pixels[0].numpy().astype(np.float64)
     pixels = pixels[[i for i, name in enumerate(picture.channels) if name != "A"]]
     if bayer is not None:
         if len(pixels) != 1:
-            text = f"bayer = {bayer!r} is for pictures with one colour a pixel, got {len(pixels)} colours"
-            raise FitError(text, "manifest", file=str(path))
+            raise refused(f"bayer = {bayer!r} is for pictures with one colour a pixel, got {len(pixels)} colours")
         if picture.orientation != 1:
             text = f"bayer = {bayer!r} is for pictures as the sensor is read, got one of EXIF orientation "
-            raise FitError(f"{text}{picture.orientation}; remove the tag", "manifest", file=str(path))
+            raise refused(f"{text}{picture.orientation}; remove the tag")
         pixels = demosaiced(pixels[0], bayer)
     height, width = pixels.shape[1:]
     left, top, columns, rows = crop or (0, 0, width, height)
     if left + columns > width or top + rows > height:
-        text = f"crop {[left, top, columns, rows]} extends beyond the picture of {width}x{height}"
-        raise FitError(text, "manifest", file=str(path))
+        raise refused(f"crop {[left, top, columns, rows]} extends beyond the picture of {width}x{height}")
     pixels = pixels[:, top : top + rows, left : left + columns]
     if bad := int(np.sum(~np.isfinite(pixels))):
         raise FitError(f"{bad} values are NaN or infinite", "not finite", file=str(path), number=float(bad))
@@ -79,24 +79,15 @@ def read_frame(
     high = pixels >= 1.0 - 1e-6
     if dark is not None:
         if dark.colours.shape != pixels.shape:
-            text = f"the dark frame is {size_of(dark.light)}, the picture {size_of(pixels[0])}"
-            raise FitError(text, "manifest", file=str(path))
+            raise refused(f"the dark frame is {size_of(dark.light)}, the picture {size_of(pixels[0])}")
         pixels = pixels - dark.colours
     light = pixels.mean(axis=0)
     if white is not None:
         pixels[high] = white
         light[high.any(axis=0)] = white  # one clipped colour clips the mean
+    encoded, middle = white is not None and picture.transfer == "srgb", ((width - 1) / 2 - left, (height - 1) / 2 - top)
     facts = camera_facts(picture.metadata, width, height)
-    return Frame(
-        file=path,
-        light=light,
-        colours=pixels,
-        white=white,
-        encoded=white is not None and picture.transfer == "srgb",
-        width_px=width,
-        middle=((width - 1) / 2 - left, (height - 1) / 2 - top),
-        facts=facts,
-    )
+    return Frame(path, light, pixels, white, encoded, width, middle, facts)
 
 
 def demosaiced(mosaic: Array, pattern: str) -> Array:
@@ -104,14 +95,10 @@ def demosaiced(mosaic: Array, pattern: str) -> Array:
 
     Bilinear interpolation is linear, equal in the sharp and the blurred picture, and adds no false colour.
     """
-    colours = []
-    for colour, kernel in (("R", _SQUARE), ("G", _CROSS), ("B", _SQUARE)):
-        sampled = np.zeros_like(mosaic)
-        for i, name in enumerate(pattern):
-            if name == colour:
-                sampled[i // 2 :: 2, i % 2 :: 2] = mosaic[i // 2 :: 2, i % 2 :: 2]
-        colours.append(convolve(sampled, kernel, mode="mirror"))
-    return np.stack(colours)
+    height, width = mosaic.shape
+    names = np.tile(np.array(list(pattern)).reshape(2, 2), (height // 2 + 1, width // 2 + 1))[:height, :width]
+    kernels = {"R": _SQUARE, "G": _CROSS, "B": _SQUARE}
+    return np.stack([convolve(np.where(names == c, mosaic, 0.0), k, mode="mirror") for c, k in kernels.items()])
 
 
 def size_of(picture: Array) -> str:
@@ -148,15 +135,14 @@ def cut_pairs(
         cut = [(..., slice(y - half, y + half + 1), slice(x - half, x + half + 1)) for x, y in places]
         sharp, blurred = (frame.light[window].copy() for frame, window in zip(frames, cut, strict=True))
         for frame, window in ((still, sharp), (moved, blurred)):
-            count = len(find_dots(window, file=str(frame.file)))
-            if count > 1:
+            if (count := len(find_dots(window, file=str(frame.file)))) > 1:
                 text = f"{count} dots in a window of {2 * half + 1} px: print the dots farther apart than their blur"
                 raise FitError(text, "several dots", file=str(frame.file), number=float(count))
         pairs.append(
             Capture(
-                sharp=sharp,
-                blurred=blurred,
-                distance_m=distance_m,
+                sharp,
+                blurred,
+                distance_m,
                 files=(str(still.file), str(moved.file)),
                 white=still.white,
                 exposure=exposure,

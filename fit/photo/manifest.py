@@ -4,6 +4,7 @@ import math
 import os
 import sys
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -84,17 +85,17 @@ def read_captures(
     path = Path(folder)
     path = path / MANIFEST if path.is_dir() or path.suffix != ".toml" else path
     where, base = str(path), path.parent
+    refused = partial(FitError, kind="manifest", file=where)
     if root is not None:
         inside(path, root, where)
     fields, shots = _manifest(path)
     fields |= {name: value for name, value in (("dots", dots), ("colours", colours)) if value}
     known = {name: _field(fields, name, where) for name in _FIELDS[1:]}
     shots = [{name: _field(shot, name, where) for name in _OF_A_SHOT} for shot in shots]
-    focus, distances = known["focus_m"], [shot["distance_m"] for shot in shots]
-    check_distances(distances, focus, where)
-    names = [known["sharp"], *(shot["file"] for shot in shots), *([known["dark"]] if known["dark"] else [])]
+    focus, files = known["focus_m"], [shot["file"] for shot in shots]
+    check_distances([shot["distance_m"] for shot in shots], focus, where)
     if root is not None:
-        for name in names:
+        for name in filter(None, [known["sharp"], *files, known["dark"]]):
             inside(base / name, root, where)
 
     def read(name: str, dark: Frame | None) -> Frame:
@@ -104,8 +105,8 @@ def read_captures(
     first = read(known["sharp"], dark)
     each = known["colours"] == "each"
     if each and first.colours.shape[0] != 3:
-        text = f"colours = 'each' needs pictures of three colours, or bayer = 'RGGB', got {first.colours.shape[0]}"
-        raise FitError(text, "manifest", file=where)
+        text = "colours = 'each' needs pictures of three colours, or bayer = 'RGGB', got"
+        raise refused(f"{text} {first.colours.shape[0]}")
     columns, encoded = [], [first.file.name] if first.encoded else []
     for shot in shots:
         moved = read(shot["file"], dark)
@@ -121,28 +122,22 @@ def read_captures(
             "them. Then say transfer = 'linear', or 'srgb' if that is all that was done"
         )
         warn(text, "not linear", file=where, number=float(len(encoded)))
-    full_width = known["full_width_px"]
-    if full_width is not None and full_width < first.width_px:
-        got = f"got {full_width:g} for pictures of {first.width_px}"
-        raise FitError(f"full_width_px must be at least the pictures' own width, {got}", "manifest", file=where)
+    width = first.width_px if known["full_width_px"] is None else round(known["full_width_px"])
+    if width < first.width_px:
+        got = f"got {known['full_width_px']:g} for pictures of {first.width_px}"
+        raise refused(f"full_width_px must be at least the pictures' own width, {got}")
     camera = {name: first.facts.get(name) if known[name] is None else known[name] for name in CAMERA}
     notes = {
         "manifest": path.name,
         "transfer": known["transfer"] or "by file type",
-        "pictures": [shot["file"] for shot in shots],
+        "pictures": files,
         "dots": known["dots"] or "one",
     }
     if from_exif := [name for name in CAMERA if known[name] is None and camera[name] is not None]:
         notes["from_exif"] = from_exif
+    name = known["name"] or base.resolve().name
     return [
-        Captures(
-            pairs=pairs,
-            focus_m=focus,
-            width_px=first.width_px if full_width is None else round(full_width),
-            **camera,
-            name=known["name"] or base.resolve().name,
-            notes=notes | {"position_px": list(pairs[0].position_px)},
-        )
+        Captures(pairs, focus, width, **camera, name=name, notes=notes | {"position_px": list(pairs[0].position_px)})
         for pairs in zip(*columns, strict=False)
     ]
 
@@ -159,20 +154,19 @@ def inside(file: Path, root: str | os.PathLike[str], where: str) -> None:
 
 def _manifest(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The fields of a manifest and those of its shots, with known names only."""
-    where = str(path)
+    refused = partial(FitError, kind="manifest", file=str(path))
     if not path.is_file():
-        raise FitError("there is no such manifest; write a capture.toml beside the pictures", "manifest", file=where)
+        raise refused("there is no such manifest; write a capture.toml beside the pictures")
     try:
         fields = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise FitError(f"is not TOML: {error}", "manifest", file=where) from error
+        raise refused(f"is not TOML: {error}") from error
     shots = fields.get("shot")
     if not isinstance(shots, list) or not shots or not all(isinstance(s, dict) for s in shots):
-        raise FitError("give at least one [[shot]] with file and distance_m", "manifest", file=where)
+        raise refused("give at least one [[shot]] with file and distance_m")
     for table, names in ((fields, _FIELDS), *((shot, _OF_A_SHOT) for shot in shots)):
-        for name in table:
-            if name not in names:
-                raise FitError(f"{name!r} is not a field; known are {', '.join(names)}", "manifest", file=where)
+        if unknown := [name for name in table if name not in names]:
+            raise refused(f"{unknown[0]!r} is not a field; known are {', '.join(names)}")
     return fields, shots
 
 

@@ -22,15 +22,19 @@ def noise_of(picture: Array) -> float:
     """Standard deviation of a pixel's noise, from second differences, which vanish in a smooth picture."""
     differences = _mixed_differences(picture)
     # near the border, away from the dot's edges
-    frame = max(3, min(picture.shape) // 5)
-    edge = np.ones(differences.shape, dtype=bool)
-    edge[frame:-frame, frame:-frame] = False
-    sizes = np.abs(differences[edge])
+    sizes = np.abs(differences[near_border(differences.shape, max(3, min(picture.shape) // 5))])
     # pixels of a mosaic differ in noise, so use the mean square, without outliers. If most pixels are interpolated (one
     # colour of a mosaic), the others carry the noise
     usual = 1.4826 * float(np.median(sizes))
     usual = usual if usual > 1e-9 * float(np.abs(picture).max()) else float(np.percentile(sizes, 90))
     return float(np.sqrt(np.mean(sizes[sizes <= 5 * usual] ** 2)))
+
+
+def near_border(shape: tuple[int, ...], width: int) -> Mask:
+    """Pixels `[H, W]` of a frame of this width along a picture's border."""
+    frame = np.ones(shape, dtype=bool)
+    frame[width:-width, width:-width] = False
+    return frame
 
 
 def fine_variance(picture: Array, pixels: Mask) -> float:

@@ -35,93 +35,88 @@ _LIT = 0.06  # share of the peak of a first estimate, smoothed by a pixel, below
 _WORSE = 3  # number of successively worse strengths of smoothing after which weaker ones are not tried
 
 
-def solve_opening(pair: Forward, round_one: Solution) -> tuple[Forward, Solution, str] | None:
+def solve_opening(round_one: Solution) -> tuple[Solution, str] | None:
     """The opening that explains the residual of the free round profile, or None if none does.
 
     Returns:
-        The pair with its opening, the solution of family "polygon" or "image", and the reason for it.
+        The solution of family "polygon" or "image", and the reason for it.
     """
-    known, what, why = (pair, round_one), "round", ""
-    blades, shown, _ = _harmonic(pair, round_one)
+    known, what, why = round_one, "round", ""
+    blades, shown, _ = _harmonic(round_one)
     if shown > _SHOWN:
-        polygon = solve_polygon(pair, round_one)
-        gained = bic_of(pair, round_one) - bic_of(*polygon)
+        polygon = solve_polygon(round_one)
+        gained = bic_of(round_one) - bic_of(polygon)
         if gained > _BETTER:
             known, what = polygon, f"round, nor a polygon of {blades} blades"
             why = f"a polygon of {blades} blades, its BIC lower by {gained:.0f} than that of any round profile"
-    share, chance = asymmetry_of(*known)
-    if (share > UNEVEN and chance < CHANCE) or rms_left(*known) > _UNEXPLAINED * noise_near(*known):
-        kernel, gained = _deconvolved(*known)
+    share, chance = asymmetry_of(known)
+    if (share > UNEVEN and chance < CHANCE) or rms_left(known) > _UNEXPLAINED * noise_near(known):
+        kernel, gained = _deconvolved(known)
         if gained > _FORETOLD:
-            known = solve_image(*known, kernel)
+            known = solve_image(known, kernel)
             why = (
                 f"the blur is not {what}: a picture of it predicts withheld pixels better "
                 f"(log likelihood higher by {gained / 2:.0f})"
             )
-    return (*known, why) if why else None
+    return (known, why) if why else None
 
 
-def solve_polygon(pair: Forward, round_one: Solution) -> tuple[Forward, Solution]:
+def solve_polygon(round_one: Solution) -> Solution:
     """Fits the regular polygon whose harmonic is the most significant one in a round profile's residual."""
-    blades, _, corner = _harmonic(pair, round_one)
-    size = np.sqrt(2) * size_of_blur(pair, round_one)[0]
+    blades, _, corner = _harmonic(round_one)
+    size = np.sqrt(2) * size_of_blur(round_one)[0]
     start = {
         "radius": size * math.sqrt(3 / (2 + math.cos(2 * math.pi / blades))),
         "rotation_deg": (-90.0 - corner) % (360.0 / blades),
         "curvature": 0.1,
     }
-    return _solved(pair, round_one, Aperture(blades), "polygon", start)
+    return _solved(round_one, Aperture(blades), "polygon", start)
 
 
-def solve_image(pair: Forward, before: Solution, kernel: Array | None = None) -> tuple[Forward, Solution]:
+def solve_image(before: Solution, kernel: Array | None = None) -> Solution:
     """Fits the opening as a picture, from a kernel if given; the moves start from those of `before`."""
-    kernel = _deconvolved(pair, before)[0] if kernel is None else kernel
+    kernel = _deconvolved(before)[0] if kernel is None else kernel
     y, x = center_of_mass(kernel)
     rows, columns = np.nonzero(kernel > 0.01 * kernel.max())
     half = float(np.ceil(np.hypot(rows - y, columns - x).max())) + 1.0  # half the side of the opening's square, px
     side = int(min(_MOST_SIDE, round(2 * half * _FINEST)))
     places = ((np.arange(side) + 0.5) / side * 2 - 1) * half
     fine = map_coordinates(kernel, np.meshgrid(places + y, places + x, indexing="ij"), order=3, mode="constant")
-    opening = Aperture(mask=torch.from_numpy(np.maximum(fine, 0.0)))
-    return _solved(pair, before, opening, "image", {"radius": half})
+    return _solved(before, Aperture(mask=torch.from_numpy(np.maximum(fine, 0.0))), "image", {"radius": half})
 
 
-def _solved(
-    pair: Forward, before: Solution, opening: Aperture, family: str, start: dict[str, float]
-) -> tuple[Forward, Solution]:
-    """The pair with an opening, and its solution; the magnification starts from that of `before`."""
-    shaped = replace(
-        pair, opening=opening, start={family: start}, prior={}, held_magnification=before.moves["magnification"]
-    )
-    return shaped, shaped.solve(family)
+def _solved(before: Solution, opening: Aperture, family: str, start: dict[str, float]) -> Solution:
+    """The solution with an opening; the magnification starts from that of `before`."""
+    held = before.moves["magnification"]
+    shaped = replace(before.pair, opening=opening, start={family: start}, prior={}, held_magnification=held)
+    return shaped.solve(family)
 
 
-def _harmonic(pair: Forward, round_one: Solution) -> tuple[int, float, float]:
-    """Number of blades of the polygon that is most significant in a round profile's residual.
+def _harmonic(round_one: Solution) -> tuple[int, float, float]:
+    """The polygon that is most significant in a round profile's residual.
 
     A polygon is a circle with an angle-dependent radius. The difference from the circle lies on a ring and has one
     period for each blade.
 
     Returns:
-        The number, chi squared of its two amplitudes, and the angle of a corner in degrees from the right, clockwise on
-        the screen.
+        Its number of blades, chi squared of the two amplitudes, and the angle of a corner in degrees from the right,
+        clockwise on the screen.
     """
-    size = np.sqrt(2) * size_of_blur(pair, round_one)[0]
+    pair, size = round_one.pair, np.sqrt(2) * size_of_blur(round_one)[0]
     half = min(int(np.ceil(1.3 * size)) + 3, pair.half)
     axis = np.arange(2 * half + 1) - half
     angle, r = np.arctan2(axis[:, None], axis), np.hypot(axis[:, None], axis)
     ring = np.exp(-0.5 * ((r - size) / (0.7 + 0.05 * size)) ** 2)
     waves = [ring * wave(n * angle) for n in _BLADES for wave in (np.cos, np.sin)]
     basis = pair.convolve(pair.moved_source(round_one.moves), np.stack(waves)).T
-    found, spread = unexplained(pair, round_one, basis)
-    scores, angles = [], []
+    found, spread = unexplained(round_one, basis)
+    candidates = []
     for i, n in enumerate(_BLADES):
         own = slice(2 * i, 2 * i + 2)
-        amplitudes = np.linalg.pinv(basis[:, own].T @ basis[:, own]) @ found[own]
-        scores.append(float(found[own] @ np.linalg.pinv(spread[own, own]) @ found[own]))
-        angles.append(math.degrees(math.atan2(amplitudes[1], amplitudes[0])) / n)
-    best = int(np.argmax(scores))
-    return _BLADES[best], scores[best], angles[best]
+        cosine, sine = np.linalg.pinv(basis[:, own].T @ basis[:, own]) @ found[own]
+        score = float(found[own] @ np.linalg.pinv(spread[own, own]) @ found[own])
+        candidates.append((n, score, math.degrees(math.atan2(sine, cosine)) / n))
+    return max(candidates, key=lambda candidate: candidate[1])
 
 
 def turned(opening: Aperture) -> Aperture:
@@ -156,21 +151,21 @@ def common_opening(fits: Sequence[BlurFit], nearer: Sequence[bool]) -> Aperture:
     return Aperture(mask=torch.from_numpy(np.round(mean / mean.max(), 4)))
 
 
-def _deconvolved(pair: Forward, shape: Solution) -> tuple[Array, float]:
+def _deconvolved(shape: Solution) -> tuple[Array, float]:
     """Deconvolves a pair of pictures, starting from a solution, which gives the moves and the kernel's reach.
 
     Returns:
         The kernel `[k, k]`, k odd, non-negative, summing to 1; and twice the increase of the log likelihood of withheld
         pixels over the solution.
     """
+    pair = shape.pair
     source = pair.moved_source(shape.moves)
-    half = min(int(np.ceil(float(shape.params["radius"]))) + 2, pair.half - 1)
     # withhold a fifth of the pixels, and take the smoothing that predicts them best
     kept_back = np.random.default_rng(0).random(pair.values.size) < _KEPT_BACK
     judged = kept_back & pair.lit[pair.used]
     tried: list[tuple[float, float, Array]] = []
-    kernel = pair.kernel(shape)
-    margin = half - kernel.shape[0] // 2
+    kernel = shape.kernel
+    margin = min(int(np.ceil(float(shape.params["radius"]))) + 2, pair.half - 1) - kernel.shape[0] // 2
     kernel = np.pad(kernel, margin) if margin >= 0 else np.ascontiguousarray(kernel[-margin:margin, -margin:margin])
     for smoothness in _SMOOTHNESS:
         kernel, model = _descend(pair, source, kernel, smoothness, ~kept_back)
@@ -180,7 +175,7 @@ def _deconvolved(pair: Forward, shape: Solution) -> tuple[Array, float]:
     squares, smoothness, kernel = min(tried, key=lambda t: t[0])
     smooth = gaussian_filter(kernel, 1.0)
     lit = binary_dilation(smooth > _LIT * smooth.max())
-    before = float(np.sum((pair.values - shape.model[pair.used])[judged] ** 2))
+    before = float(np.sum(shape.residual[judged] ** 2))
     kernel, _ = _descend(pair, source, kernel * lit, smoothness, np.ones_like(kept_back), lit)
     count = judged.sum() * independent_share(pair.noise_correlation)
     return kernel, float(count * np.log(before / squares))

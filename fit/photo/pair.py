@@ -21,8 +21,8 @@ from .family_choice import COST, choose, looks_alike
 from .forward import ALL_MOVES, OPENINGS, SHAPES, Forward, Solution
 from .noise import independent_share
 from .opening import solve_image, solve_opening, solve_polygon
-from .profile_fit import fit_ratio
-from .radial import solve_radial, solve_round
+from .profile_fit import blur_strength, fit_profile
+from .radial import solve_radial
 from .source import Edge, ideal_dot, picture_of_dot, point_source, soft_edge
 
 Model = Literal["forward", "ratio"]
@@ -137,8 +137,11 @@ def fit_pair(
             f"sharp and blurred must have the same shape, got {list(still.shape)} and {list(data.shape)}; "
             "cut the same window from both"
         )
-    if model == "ratio":
-        return fit_ratio(still, data, "ring" if family == "auto" else family)
+    if model == "ratio":  # errors common to a spoke enter the standard errors
+        if still is None:
+            raise FitError("model='ratio' divides by the sharp picture, got sharp=None; use model='forward'")
+        r, strength, spokes = blur_strength(still, data)
+        return replace(fit_profile(r, strength, "ring" if family == "auto" else family, groups=spokes), model="ratio")
     with one_thread():
         pair, edge, linear = prepared_pair(still, data, source, magnification, white, files, softness)
         if start is not None:
@@ -150,7 +153,14 @@ def fit_pair(
         pair.opening = aperture
         free_profile = family in ("auto", "radial", *OPENINGS) and aperture is None
         # a free profile gives an unbiased magnification, unlike a wrong family
-        expected = freest = solution = solve_round(pair, knots, reach) if free_profile else pair.solve(family)
+        if free_profile:
+            soft = pair.solve("softm")
+            # a free profile ends slightly outside a fitted soft disc, or at `reach`
+            end = float(soft.params["radius"]) + 3.5 * float(soft.params["sigma"]) + 1.0 if reach is None else reach
+            solution = solve_radial(pair, soft.moves, min(end, pair.half - 1.0), knots)
+        else:
+            solution = pair.solve(family)
+        expected = freest = solution
         if held is None:
             unheld = replace(pair, fit_moves=ALL_MOVES)
             radius = float(solution.params["radius"]) if free_profile else 0.0
@@ -160,32 +170,32 @@ def fit_pair(
             floor = max(free.squares / pair.values.size, (1e-4 * pair.unit) ** 2)
             gained = (solution.squares - free.squares) / floor * independent_share(pair.noise_correlation)
             if gained > _SIGNIFICANT:
-                pair.fit_moves, freest, solution = ALL_MOVES, free, free
+                pair, freest, solution = unheld, free, free
         why, psnr = "", dict[str, float]()
         if free_profile:
             pair.held_magnification = freest.moves["magnification"]
             opened = None
             if family == "auto":
-                solution, why, psnr = _choose(pair, freest, accuracy_db)
-                opened = solve_opening(pair, freest)
-                if opened is not None and looks_alike(pair.kernel(solution), opened[0].kernel(opened[1]), accuracy_db):
+                solution, why, psnr = _choose(freest, accuracy_db)
+                opened = solve_opening(freest)
+                if opened is not None and looks_alike(solution.kernel, opened[0].kernel, accuracy_db):
                     opened = None
             elif family != "radial":
-                opened = (*(solve_polygon if family == "polygon" else solve_image)(pair, freest), "")
+                opened = (solve_polygon if family == "polygon" else solve_image)(freest), ""
             if opened is not None:
-                pair, solution, why = opened
+                solution, why = opened
                 freest = expected = solution
-        fit = describe(pair, solution, why)
+        fit = describe(solution, why)
         # a family chosen for its cost is not to blame if the freest kernel explains the rest
-        judged = fit if freest is solution else describe(pair, freest, "")
-        check_fit(pair, solution, fit, files[1], judged)
+        judged = fit if freest is solution else describe(freest, "")
+        check_fit(solution, fit, files[1], judged)
         if edge is not None:
             # a residual far above the noise has been reported already. A picture of a kernel is smoothed, which makes
             # the residual depend on the level
             most = EXPLAINED if freest.family in OPENINGS else FAR_ABOVE
             large = min(fit.radius, edge.radius * fit.magnification) > _EXACT_PX
             if linear and large and judged.residual_over_noise < most:
-                check_levels(pair, freest, expected, edge, files[1])
+                check_levels(freest, expected, edge, files[1])
             check_focus(edge, fit.radius, pair.source.ideal, files[0])
     return replace(fit, psnr=psnr)
 
@@ -248,14 +258,15 @@ def prepared_pair(
     return pair, edge, linear
 
 
-def _choose(pair: Forward, radial: Solution, accuracy_db: float) -> tuple[Solution, str, dict[str, float]]:
+def _choose(radial: Solution, accuracy_db: float) -> tuple[Solution, str, dict[str, float]]:
     """Fits every family at the free profile's magnification and chooses one, which is then fitted with it."""
-    fit_moves, pair.fit_moves = pair.fit_moves, ("dx", "dy")
-    solutions = {"radial": radial} | {f: pair.solve(f) for f in COST[:-1]}
-    kernels = {f: pair.kernel(s) for f, s in solutions.items()}
-    family, why, psnr = choose(kernels, {f: bic_of(pair, s) for f, s in solutions.items()}, accuracy_db)
-    pair.fit_moves = fit_moves
-    if family != "radial" and fit_moves == ALL_MOVES:
+    pair, held = radial.pair, replace(radial.pair, fit_moves=("dx", "dy"))
+    solutions = {"radial": replace(radial, pair=held)} | {f: held.solve(f) for f in COST[:-1]}
+    kernels, bic = {f: s.kernel for f, s in solutions.items()}, {f: bic_of(s) for f, s in solutions.items()}
+    family, why, psnr = choose(kernels, bic, accuracy_db)
+    if family == "radial":
+        return radial, why, psnr
+    if pair.fit_moves == ALL_MOVES:
         pair.start[family] = {k: float(v) for k, v in solutions[family].params.items()}
-        solutions[family] = pair.solve(family)
+        return pair.solve(family), why, psnr
     return solutions[family], why, psnr

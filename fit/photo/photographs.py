@@ -43,19 +43,12 @@ class Photograph:
 
 @dataclass(frozen=True)
 class Photographs:
-    """A folder of photographs, ready for fitting.
+    """A folder of photographs, ready for fitting."""
 
-    Attributes:
-        captures: for `fit_captures`.
-        pictures: every photograph of the target, by distance.
-        tone: three parameters of the tone curve that was undone, see :func:`untoned`.
-        advice: improvements, a sentence each.
-    """
-
-    captures: Captures
-    pictures: tuple[Photograph, ...]
-    tone: tuple[float, float, float]
-    advice: tuple[str, ...]
+    captures: Captures  # for `fit_captures`
+    pictures: tuple[Photograph, ...]  # every photograph of the target, by distance
+    tone: tuple[float, float, float]  # parameters of the tone curve that was undone, see `untoned`
+    advice: tuple[str, ...]  # improvements, a sentence each
 
 
 def read_photographs(
@@ -89,15 +82,13 @@ def read_photographs(
     for path in files:
         if root is not None:
             inside(path, root, where)
-        unread = foreign.refusal(path)
-        if unread is not None:
+        if unread := foreign.refusal(path):
             raise FitError(unread, file=str(path))
     if len(files) < 2:
         text = (
-            f"there is neither a {MANIFEST} nor two photographs (.jpg .png .tif .exr) of the target that "
-            "torchdof fit --target target.pdf makes"
+            f"there is neither a {MANIFEST} nor two photographs (.jpg .png .tif .exr) of the target that torchdof fit"
         )
-        raise FitError(text, "manifest", file=where)
+        raise FitError(f"{text} --target target.pdf makes", "manifest", file=where)
     pictures: list[Photograph] = []
     advice: list[str] = []
     facts, integers = dict[str, float](), True
@@ -118,15 +109,12 @@ def read_photographs(
         facts = facts or camera_facts(picture.metadata, width, height)
         whole = picture.sample in ("8", "16")
         integers = integers and whole
-        clipped = whole and target.white > 0.98
-        half, y, x = int(0.06 * target.side_px) + 4, round(target.y), round(target.x)
-        slope = gaussian_gradient_magnitude(light[y - half : y + half + 1, x - half : x + half + 1], 0.7).max()
+        slope = gaussian_gradient_magnitude(target.window(light, int(0.06 * target.side_px) + 4), 0.7).max()
         sharpness = float(slope / (target.white - target.black))
-        pictures.append(Photograph(path.name, light, target, 0.0, sharpness, clipped))
+        pictures.append(Photograph(path.name, light, target, 0.0, sharpness, whole and target.white > 0.98))
     if len(pictures) < 2:
         raise FitError("; ".join(["fewer than two photographs show the target", *advice]), file=where)
-    missing = [name for name in CAMERA if name not in facts]
-    if missing:
+    if missing := [name for name in CAMERA if name not in facts]:
         text = f"EXIF has no {', '.join(missing)}: share the originals, or describe them in a {MANIFEST}"
         raise FitError(text, "manifest", file=where)
     tone, taken = None, {p.file: p.light for p in pictures}
@@ -183,19 +171,15 @@ def _pair(
     """Windows of the dot in two photographs; also, from `taken`, for tone curves a standard error away."""
     half = int(WINDOW * min(sharp.target.side_px, blurred.target.side_px))
 
-    def cut(light: Array, target: Target) -> Array:
-        x, y = round(target.x), round(target.y)
-        return light[..., y - half : y + half + 1, x - half : x + half + 1]
-
     def colours_of(picture: Photograph) -> Array:
-        seen = read_image(folder / picture.file).pixels[0, :3].double().numpy()
-        return np.stack([c if tone is None else untoned(c, tone.bend) for c in cut(seen, picture.target)])
+        seen = picture.target.window(read_image(folder / picture.file).pixels[0, :3].double().numpy(), half)
+        return np.stack([c if tone is None else untoned(c, tone.bend) for c in seen])
 
-    raw = [cut(taken[picture.file], picture.target) for picture in (sharp, blurred)]
+    raw = [picture.target.window(taken[picture.file], half) for picture in (sharp, blurred)]
     others = [] if tone is None else [np.add(tone.bend, step) for step in tone.errors]
     return Capture(
-        cut(sharp.light, sharp.target),
-        cut(blurred.light, blurred.target),
+        sharp.target.window(sharp.light, half),
+        blurred.target.window(blurred.light, half),
         blurred.distance_m,
         files=(str(folder / sharp.file), str(folder / blurred.file)),
         white=1.0 if sharp.clipped else None,

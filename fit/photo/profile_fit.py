@@ -1,7 +1,5 @@
 """The paper's procedure: blur strength along spokes around a dot, and a fit of eq. (1) or another profile."""
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
@@ -84,18 +82,31 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
     # noise from second differences of samples sorted by r
     noise = float(np.sqrt(np.mean((y[2:] - 2 * y[1:-1] + y[:-2]) ** 2) / 6.0))
     _refuse_flat(x, y, noise)
-    together = None if groups is None else np.asarray(labels[order])
-    fitted, covariance, curve = _fitted(x, y, family, together)
-    squares = float(np.sum((y - curve) ** 2))
+
+    def model(p: Array) -> Array:
+        return evaluate(family, x, dict(zip(names, p, strict=True)))
+
+    starts = [*_STARTS[family], *([[1.0, float(x[np.argmax(y)]), 0.3]] if family == "ring" else [])]
+    fitted = best_of(model, y, starts, ([_BOUNDS[n][0] for n in names], [_BOUNDS[n][1] for n in names]))
+    residual = y - model(fitted)
+    squares = float(residual @ residual)
+    jacobian = approx_fprime(fitted, model, 1e-5 * np.maximum(np.abs(fitted), 1e-2))
+    covariance = inverse(jacobian.T @ jacobian)
+    if groups is None:
+        covariance = covariance * squares / max(y.size - len(names), 1)
+    else:  # a sandwich estimator for correlated errors
+        _, label = np.unique(labels[order], return_inverse=True)
+        count = int(label.max()) + 1
+        scores = np.stack([np.bincount(label, column, count) for column in (jacobian * residual[:, None]).T], axis=1)
+        covariance = covariance @ (scores.T @ scores) @ covariance * count / max(count - 1, 1)
     scale = np.array([unit if n in LENGTHS else peak if n == "N" else 1.0 for n in names])
     covariance = covariance * np.outer(scale, scale)
     params: dict[str, float | Array] = dict(zip(names, (fitted * scale).tolist(), strict=True))
-    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     line = np.linspace(0.0, unit, 257)
     fit = BlurFit(
         family=family,
         params=params,
-        stderr=dict(zip(names, spread.tolist(), strict=True)),
+        stderr=dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True)),
         residual=float(np.sqrt(squares / np.sum(y**2))),
         noise=float(noise * np.sqrt(y.size / np.sum(y**2))),
         covariance=covariance,
@@ -159,10 +170,10 @@ def _checked(r: ArrayLike, strength: ArrayLike, least: int) -> tuple[Array, Arra
 
 def _refuse_flat(x: Array, y: Array, noise: float) -> None:
     """Raises an error if a parabola over r explains the samples no better than a constant."""
-    level = y - y.mean()
     bent = np.stack([np.ones_like(x), x, x * x], axis=1)
     residual = y - bent @ np.linalg.lstsq(bent, y, rcond=None)[0]
-    explained, unexplained = float(level @ level - residual @ residual), float(residual @ residual)
+    unexplained = float(residual @ residual)
+    explained = float(np.sum((y - y.mean()) ** 2)) - unexplained
     variation = float(np.sqrt(max(explained, 0.0) / y.size))
     # F test of a parabola against a constant
     if variation < 1e-8 or explained / 2 < _BENT * unexplained / (y.size - 3):
@@ -171,27 +182,6 @@ def _refuse_flat(x: Array, y: Array, noise: float) -> None:
             "farther out, or move the paper farther from focus"
         )
         raise FitError(text, "flat profile", number=variation / noise if noise > 0 else 0.0)
-
-
-def _fitted(x: Array, y: Array, family: str, groups: Array | None) -> tuple[Array, Array, Array]:
-    """Parameters, their covariance (with groups a sandwich estimator for correlated errors) and the fitted curve."""
-    names = _NAMES[family]
-
-    def model(p: Array) -> Array:
-        return evaluate(family, x, dict(zip(names, p, strict=True)))
-
-    starts = [*_STARTS[family], *([[1.0, float(x[np.argmax(y)]), 0.3]] if family == "ring" else [])]
-    params = best_of(model, y, starts, ([_BOUNDS[n][0] for n in names], [_BOUNDS[n][1] for n in names]))
-    curve = model(params)
-    jacobian = approx_fprime(params, model, 1e-5 * np.maximum(np.abs(params), 1e-2))
-    residual = y - curve
-    bread = inverse(jacobian.T @ jacobian)
-    if groups is None:
-        return params, bread * float(residual @ residual) / max(y.size - len(names), 1), curve
-    _, label = np.unique(groups, return_inverse=True)
-    count = int(label.max()) + 1
-    scores = np.stack([np.bincount(label, column, count) for column in (jacobian * residual[:, None]).T], axis=1)
-    return params, bread @ (scores.T @ scores) @ bread * count / max(count - 1, 1), curve
 
 
 def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, Indices]:
@@ -232,11 +222,3 @@ def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, I
     used = below > 0.2 * dot.peak
     spokes, rays = np.nonzero(used)
     return r[rays], above[used] / below[used], spokes
-
-
-def fit_ratio(sharp: Array | None, blurred: Array, family: str) -> BlurFit:
-    """The paper's procedure: fits a profile to the blur strength; standard errors allow for those common to a spoke."""
-    if sharp is None:
-        raise FitError("model='ratio' divides by the sharp picture, got sharp=None; use model='forward'")
-    r, strength, spokes = blur_strength(sharp, blurred)
-    return replace(fit_profile(r, strength, family, groups=spokes), model="ratio")

@@ -16,14 +16,6 @@ _SMOOTHNESS = 10.0 ** np.arange(-8.0, 0.0)
 _LIMIT = {"dx": 0.5, "dy": 0.5, "magnification": 0.02}  # largest step of an iteration
 
 
-def solve_round(pair: Forward, knots: int | None = None, reach: float | None = None) -> Solution:
-    """A free profile that ends slightly outside a fitted soft disc, or at `reach` px."""
-    soft = pair.solve("softm")
-    if reach is None:
-        reach = float(soft.params["radius"]) + 3.5 * float(soft.params["sigma"]) + 1.0
-    return solve_radial(pair, soft.moves, min(reach, pair.half - 1.0), knots)
-
-
 def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: int | None = None) -> Solution:
     """Fits values of the profile at equal steps of r, and refines the moves.
 
@@ -61,15 +53,15 @@ def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: i
     covariance = np.zeros((count, count))
     covariance[np.ix_(free, free)] = np.where(np.isfinite(known), known, 0.0)
     return Solution(
+        pair=pair,
         family="radial",
         params={"values": weights / float(mass @ weights), "radius": radius},
         moves=moves,
         gain=gain,
         background=background,
-        model=pair.picture(fitted, np.nan),
+        fitted=fitted,
         names=tuple(f"values[{i}]" for i in range(count)),
         covariance=covariance / gain**2,
-        squares=float(residual @ residual),
         slopes=np.stack(pair.move_columns(moves, ("dx", "dy"), kernel), axis=1),
     )
 

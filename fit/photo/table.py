@@ -4,6 +4,7 @@ import datetime
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -110,20 +111,14 @@ def fit_captures(
         a single distance, and of the problems listed at `fit_pair`.
     """
     if not isinstance(captures, Captures):
-        raise FitError(
-            "captures must be a Captures(pairs, focus_m=..., width_px=...), which knows the focus and the frame's "
-            f"width; got {show(captures)}"
-        )
+        text = "captures must be a Captures(pairs, focus_m=..., width_px=...), which knows the focus and the frame's "
+        raise FitError(f"{text}width; got {show(captures)}")
     a_choice("family", family, ("auto", *SHAPES))
-    pairs = captures.pairs
-    twice = family == "auto" or family in OPENINGS
-    total, done = len(pairs) * (2 if twice else 1), 0
+    pairs, twice, done = captures.pairs, family == "auto" or family in OPENINGS, count(1)
 
     def report(pair: Capture) -> None:
-        nonlocal done
-        done += 1
         if progress:
-            progress(done, total, f"{pair.distance_m:g} m")
+            progress(next(done), len(pairs) * (2 if twice else 1), f"{pair.distance_m:g} m")
 
     def kept(pair: Capture, fit: BlurFit) -> None:
         off = 1.0 if pair.exposure is None or not fit.gain > 0 else fit.gain / pair.exposure

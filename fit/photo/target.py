@@ -6,7 +6,7 @@ level of white in any light.
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -43,13 +43,6 @@ def write_target(path: str | os.PathLike[str], paper: Paper = "a4") -> None:
     Raises:
         FitError: wrong suffix or paper.
         OSError: the file cannot be written.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_target(folder + "/target.pdf", "letter")
-        ...     Path(folder, "target.pdf").read_bytes()[:8]
-        b'%PDF-1.4'
     """
     target = Path(path)
     if target.suffix.lower() != ".pdf":
@@ -71,6 +64,11 @@ class Target:
     white: float  # level of the paper around the square
     black: float  # level of the square
 
+    def window(self, light: Array, half: int) -> Array:
+        """Part of a picture `[..., H, W]` around the centre, `half` px on each side."""
+        x, y = round(self.x), round(self.y)
+        return light[..., y - half : y + half + 1, x - half : x + half + 1]
+
 
 def find_target(light: Array, *, file: str | None = None) -> Target:
     """Finds the black square on white paper in a picture `[H, W]` in linear light.
@@ -82,27 +80,21 @@ def find_target(light: Array, *, file: str | None = None) -> Target:
     rows, columns = (n // step for n in light.shape)
     small = light[: rows * step, : columns * step].reshape(rows, step, columns, step).mean((1, 3))
     low, high = np.percentile(small, (1, 97))
-    best: tuple[float, Target] | None = None
-    for share in _LEVELS:
-        for candidate in _squares(small, small < low + share * (high - low)):
-            contrast = (candidate.white - candidate.black) / max(candidate.white + candidate.black, 1e-12)
-            if best is None or contrast > best[0]:
-                best = contrast, candidate
-    if best is None:
+    found = [target for share in _LEVELS for target in _squares(small, small < low + share * (high - low))]
+    if not found:
         text = (
             "no target found: a black square with a white dot in its middle, white paper around it, all in the frame; "
             "is it evenly lit, square on and not too small?"
         )
         raise FitError(text, "no dot", file=file)
-    rough = best[1]
+    rough = max(found, key=lambda t: (t.white - t.black) / max(t.white + t.black, 1e-12))  # of the highest contrast
     x, y = ((v + 0.5) * step - 0.5 for v in (rough.x, rough.y))
     return _refined(light, replace(rough, x=x, y=y, side_px=rough.side_px * step))
 
 
-def _squares(small: Array, dark: Mask) -> Sequence[Target]:
+def _squares(small: Array, dark: Mask) -> Iterator[Target]:
     """Dark areas that are square, have a bright centre and bright surroundings."""
     labels, count = ndimage.label(dark)
-    found = []
     for i, box in enumerate(ndimage.find_objects(labels)[:count], start=1):
         (top, bottom), (left, right) = ((s.start, s.stop) for s in box)
         height, width = bottom - top, right - left
@@ -126,8 +118,7 @@ def _squares(small: Array, dark: Mask) -> Sequence[Target]:
             continue
         white, black = float(np.median(ring)), float(np.median(inside))
         if white > 2.5 * black and float(middle.max()) - black > max(0.05 * (white - black), 4 * float(inside.std())):
-            found.append(replace(target, white=white, black=black))
-    return found
+            yield replace(target, white=white, black=black)
 
 
 def _square_distance(shape: tuple[int, ...], target: Target) -> Array:

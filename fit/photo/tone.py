@@ -55,7 +55,16 @@ def untoned(light: Array, bend: Sequence[float] | Array) -> Array:
 
 def tone_curve(pictures: Sequence[tuple[Array, Target]], square_mm: float) -> Tone:
     """The tone curve for which dots and edges are as expected; zero if noise would explain them as well."""
-    dots = [_dot(light, target, square_mm) for light, target in pictures]
+    dots = []
+    for light, target in pictures:
+        half = int(WINDOW * target.side_px)
+        window = target.window(light, half)
+        distance = np.hypot(*(np.indices(window.shape) - half))
+        inside, around = distance < 0.12 * target.side_px, (distance > 0.2 * target.side_px) & (distance < half)
+        area = math.pi * (DOT_MM / 2 * target.side_px / square_mm) ** 2
+        # the noise of a demosaiced pixel is correlated with about nine neighbours
+        noise = 3 * float(window[around].std()) * math.sqrt(inside.sum()) / (target.white * area)
+        dots.append((window, inside, around, target.white, area, math.hypot(noise, _PRINTED)))
     edges = [pair for light, target in pictures for pair in _edges(light, target)]
 
     def misfit(values: Array) -> Array:
@@ -77,19 +86,6 @@ def tone_curve(pictures: Sequence[tuple[Array, Target]], square_mm: float) -> To
     bend = solution.x[:3] if clear else np.zeros(3)
     values, directions = np.linalg.eigh(spread + np.outer(solution.x[:3] - bend, solution.x[:3] - bend))
     return Tone((float(bend[0]), float(bend[1]), float(bend[2])), (directions * np.sqrt(np.maximum(values, 0.0))).T)
-
-
-def _dot(light: Array, target: Target, square_mm: float) -> tuple[Array, Array, Array, float, float, float]:
-    """The dot's window, masks of the dot and of the ink around it, white, and the dot's area and its error."""
-    half = int(WINDOW * target.side_px)
-    y, x = round(target.y), round(target.x)
-    window = light[y - half : y + half + 1, x - half : x + half + 1]
-    distance = np.hypot(*(np.indices(window.shape) - half))
-    inside, around = distance < 0.12 * target.side_px, (distance > 0.2 * target.side_px) & (distance < half)
-    area = math.pi * (DOT_MM / 2 * target.side_px / square_mm) ** 2
-    # the noise of a demosaiced pixel is correlated with about nine neighbours
-    noise = 3 * float(window[around].std()) * math.sqrt(inside.sum()) / (target.white * area)
-    return window, inside, around, target.white, area, math.hypot(noise, _PRINTED)
 
 
 def _edges(light: Array, target: Target) -> list[tuple[Array, Array]]:

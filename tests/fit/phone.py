@@ -10,7 +10,6 @@ The result is the PSNR of that picture against the picture of the true lens.
 """
 
 import argparse
-import sys
 import time
 from pathlib import Path
 
@@ -49,10 +48,8 @@ def scene(width):
     return (image * tint)[None], (0.2 + 0.6 * place).expand(1, 1, height, width).clone()
 
 
-def measure(folder, distances=tuple(DISTANCES_M), width=1000, tone=0.5, family="auto"):
+def measure(folder, simulator, distances=tuple(DISTANCES_M), width=1000, tone=0.5, family="auto"):
     """Calibrates and renders in `folder`; PSNR in dB against the true lens, of the picture and of the sharp scene."""
-    import simulator
-
     folder.mkdir(parents=True, exist_ok=True)
     run("fit", "--target", folder / "target.pdf")
     start = time.perf_counter()
@@ -80,10 +77,11 @@ def main():
     parser.add_argument("--width", type=int, default=1000, help="of the photographs, px")
     parser.add_argument("--tone", type=float, default=0.5, help="strength of the S-curve, unknown to the fit")
     arguments = parser.parse_args()
-    found, untouched = measure(arguments.out, width=arguments.width, tone=arguments.tone)
+    import simulator  # beside this file
+
+    found, untouched = measure(arguments.out, simulator, width=arguments.width, tone=arguments.tone)
     print(f"PSNR against the true lens: rendered {found:.1f} dB, sharp scene {untouched:.1f} dB")
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).parent))
     main()

@@ -34,17 +34,16 @@ def shape(kind: str, radius: float, size: int = 41, fine: int = 8, turn_deg: flo
 
     | kind | kernel, with y down |
     | --- | --- |
-    | "hexagon", "heptagon" | inscribed in a circle of `radius` px, a corner `turn_deg` clockwise from the right |
+    | "hexagon" | inscribed in a circle of `radius` px, a corner `turn_deg` clockwise from the right |
     | "cat's eye" | the intersection of two discs, 0.7 radii apart |
     | "coma" | a disc whose rays are displaced by the square of their height in the pupil |
     | "mirror" | a disc with a central hole of 0.45 radii |
-    | "rim" | a disc whose edge is brighter than its centre |
     """
     axis = (np.arange(size * fine) + 0.5) / fine - size / 2
     x, y = np.meshgrid(axis, axis)
     r = np.hypot(x, y) / radius
-    if kind in ("hexagon", "heptagon"):
-        wedge = 2 * np.pi / {"hexagon": 6, "heptagon": 7}[kind]
+    if kind == "hexagon":
+        wedge = np.pi / 3
         from_corner = (np.arctan2(y, x) - np.deg2rad(turn_deg)) % wedge
         light = r * np.cos(from_corner - wedge / 2) < np.cos(wedge / 2)
     elif kind == "coma":
@@ -54,11 +53,8 @@ def shape(kind: str, radius: float, size: int = 41, fine: int = 8, turn_deg: flo
         edges = np.arange(size * fine + 1) / fine - size / 2
         light = np.histogram2d(there[1], there[0], bins=(edges, edges))[0]
     else:
-        light = {
-            "cat's eye": (r < 1) & (np.hypot(x - 0.7 * radius, y) < radius),
-            "mirror": (r < 1) & (r > 0.45),
-            "rim": (r < 1) * (1 + 2.0 * r**6),
-        }[kind]
+        cut = {"cat's eye": np.hypot(x - 0.7 * radius, y) < radius, "mirror": r > 0.45}[kind]
+        light = (r < 1) & cut
     kernel = np.asarray(light, dtype=np.float64).reshape(size, fine, size, fine).mean((1, 3))
     return kernel / kernel.sum()
 

@@ -212,7 +212,7 @@ class Shown:
     def sheet(self, photographs: Photographs, result: TableFit, target: Path) -> None:
         """Draws photographs, fits and a rendering on one sheet; without matplotlib it prints a message."""
         try:
-            from torchdof.fit.sheet import sheet_of_photographs
+            from torchdof.fit.plots import sheet_of_photographs
 
             sheet = sheet_of_photographs(photographs, result, lambda *scene: blur_by_coc(*scene[:2], table=scene[2]))
         except ModuleNotFoundError as error:

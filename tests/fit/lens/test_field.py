@@ -12,8 +12,7 @@ from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
 from torchdof.fit import trace_table
 from torchdof.fit.lens import Lens
 from torchdof.fit.lens.field import chief_ray_mm, field_height_mm, spot_of_place
-from torchdof.fit.lens.lens import RGB_UM
-from torchdof.fit.lens.rays import trace_rays
+from torchdof.fit.lens.lens import RGB_UM, trace_rays
 from torchdof.fit.lens.spot import focus_sensor, vertex_distance_mm
 from torchdof.optics.aperture import Aperture
 from torchdof.reference.metrics import display, psnr

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from torchdof.fit.lens.glass import catalogue
-from torchdof.fit.lens.lens import Lens
-from torchdof.fit.lens.rays import trace_rays
+from torchdof.fit.lens.lens import Lens, trace_rays
 from torchdof.fit.lens.spot import focus_sensor, point_spread
 
 if importlib.util.find_spec("optiland") is None:

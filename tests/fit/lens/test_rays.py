@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from torchdof.fit.lens.glass import Glass
-from torchdof.fit.lens.lens import Lens
-from torchdof.fit.lens.rays import trace_rays
+from torchdof.fit.lens.lens import Lens, trace_rays
 from torchdof.fit.lens.surface import Surface
 
 LENSES = ("double_gauss_50mm", "wide_22mm", "telephoto_250mm")

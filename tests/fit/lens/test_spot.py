@@ -5,7 +5,6 @@ import pytest
 
 from torchdof.fit.lens.lens import Lens
 from torchdof.fit.lens.spot import focus_sensor, point_spread
-from torchdof.fit.lens.trace import signed_coc_mm
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +33,9 @@ def test_distances_from_the_sensor_and_from_h_focus_the_same_plane(gauss):
 def over_thin_lens(lens: Lens, f_number: float, focus_m: float, z_m: float) -> float:
     """Blur radius over that of the thin lens, minus 1; the thin lens has its pupil where the entrance pupil is."""
     first, stopped = lens.paraxial(), lens.with_f_number(f_number)
-    apart = (first.front_principal - first.entrance_pupil) / 1000.0
-    thin = abs(signed_coc_mm(z_m, first.focal_length, f_number, focus_m)) / (1.0 - apart / z_m)
+    apart, focal_m = (first.front_principal - first.entrance_pupil) / 1000.0, first.focal_length / 1000.0
+    blur = first.entrance_pupil_diameter / 2 * focal_m / (1 - focal_m / focus_m) * abs(1 / focus_m - 1 / z_m)
+    thin = blur * first.f_number / f_number / (1.0 - apart / z_m)
     sensor = focus_sensor(stopped, focus_m, "paraxial")
     return point_spread(stopped, z_m, sensor, meridional=True, rays=20_000).radius / thin - 1.0
 

