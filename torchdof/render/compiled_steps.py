@@ -8,15 +8,13 @@ from torch import Tensor
 
 from .. import native
 from ..tensors import is_in_memory, is_traced
-from .ops import Level
-from .plan import Blur
 from .surfaces import Frame, Placed
 
 __all__ = ["blended", "looked_behind"]
 
 
 def blended(
-    frame: Frame, blurs: Sequence[Blur], backed: bool, plain: Callable[[Sequence[Placed]], Tensor]
+    frame: Frame, layers: Sequence[tuple[Tensor, int]], backed: bool, plain: Callable[[Sequence[Placed]], Tensor]
 ) -> Tensor | None:
     """Composite all layers of a frame, with its gradient: light followed by its weights, ``[B, C + 1 or C, h, w]``.
 
@@ -24,50 +22,48 @@ def blended(
 
     Args:
         frame: One surface, or two that share each pixel, in any order.
-        blurs: Kernel and resolution of each layer.
+        layers: Kernel ``[1 or C, k, k]`` of each layer, and the distance of its pixels in pixels of the frame.
         backed: Whether the weights are transmittances, not coverages; without occlusion they are sums of weights.
         plain: The same computation, differentiable, for the surfaces of such a frame.
 
     Returns:
         None if the compiled engine cannot compute it: it needs float32 on the CPU, eager code without function
-        transforms, and kernels that are the same everywhere and have no gradient.
+        transforms, and kernels without gradient.
     """
     given = [[t for t in surface if t is not None] for surface in frame.surfaces]
     tensors = [t for of_surface in given for t in of_surface]
     if frame.stacked or not _supported(tensors):
         return None
-    if any(b.shares is not None or b.kernel.requires_grad or b.half > native.HALF_LARGEST for b in blurs):
+    if any(kernel.requires_grad or kernel.shape[-1] // 2 > native.HALF_LARGEST for kernel, _ in layers):
         return None
-    if frame.colours + max(len(blur.kernel) for blur in blurs) > native.MOST_PLANES:
+    if frame.colours + max(len(kernel) for kernel, _ in layers) > native.MOST_PLANES:
         return None
-    layers = [(blur.kernel, blur.scale) for blur in blurs]
     padded = native.PaddedFrame(frame.margin, frame.area, frame.nodes, layers, frame.occlusion, backed)
     result: Tensor = _Blend.apply(padded, list(map(len, given)), plain, *tensors)
     return result
 
 
 def looked_behind(
-    levels: Sequence[Level],
-    rules: Sequence[tuple[float, float, float]],
+    values: Sequence[Tensor],
+    rules: Sequence[tuple[int, float, float, float]],
     coc_px: Tensor,
     plain: Callable[[Sequence[Tensor], Tensor], Tensor],
 ) -> Tensor | None:
     """Surfaces behind those of an image, with their gradient: light, coc and votes ``[B, C + 2, H, W]``.
 
     Args:
-        levels: Levels of a pyramid that are centred on the image.
-        rules: Of each level the smallest blur at which it is read, its votes per weight, and its most votes.
+        values: Light, coc and weight of each level of a pyramid that is centred on the image, ``[B, C + 2, h, w]``.
+        rules: Of each level the distance of two samples in pixels, the smallest blur at which it is read, its votes per
+            weight, and its most votes.
         coc_px: Signed coc of the image, ``[B, 1, H, W]``.
         plain: The same computation, differentiable, from the levels' values and the coc.
 
     Returns:
         None if the compiled engine cannot compute it, as in :func:`blended`.
     """
-    values = [level.values for level in levels]
-    if not _supported([coc_px, *values]) or len(levels) > native.MOST_LEVELS or values[0].shape[1] > native.MOST_PLANES:
+    if not _supported([coc_px, *values]) or len(values) > native.MOST_LEVELS or values[0].shape[1] > native.MOST_PLANES:
         return None
-    steps = [(level.step, *rule) for level, rule in zip(levels, rules, strict=True)]
-    result: Tensor = _LookBehind.apply(steps, plain, coc_px, *values)
+    result: Tensor = _LookBehind.apply(list(rules), plain, coc_px, *values)
     return result
 
 

@@ -123,7 +123,9 @@ def _picture(
         sorted_frame = dataclasses.replace(frame, surfaces=surfaces).near_to_far()
         return _composite_layers(sorted_frame, blurs, scatter, composited, ops, empty, normalised)
 
-    picture = None if scatter is fold else blended(frame, blurs, empty > 0, plain)
+    picture = None
+    if scatter is not fold and blurs[0].shares is None:
+        picture = blended(frame, [(blur.kernel, blur.scale) for blur in blurs], empty > 0, plain)
     return plain(frame.surfaces) if picture is None else picture
 
 

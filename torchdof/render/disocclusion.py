@@ -301,8 +301,9 @@ def _seen(levels: Sequence[Level], coc_px: Tensor) -> Seen:
         lights, weights = (torch.stack(parts) for parts in zip(*shown, strict=True))
         return torch.cat(search(given, lights, weights, coc_px), 1)
 
-    found = looked_behind(levels, [_rule(level) for level in levels], coc_px, plain)
-    found = plain([level.values for level in levels], coc_px) if found is None else found
+    values = [level.values for level in levels]
+    found = looked_behind(values, [(level.step, *_rule(level)) for level in levels], coc_px, plain)
+    found = plain(values, coc_px) if found is None else found
     return found[:, :-1], found[:, -1:]
 
 
