@@ -210,6 +210,9 @@ def test_a_compiled_module_is_a_row(backend: str, monkeypatch: pytest.MonkeyPatc
 
 
 def test_bench_does_not_start_without_its_tools(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as old:
+        old.setattr("torchdof.tensors.TRACEABLE", False)
+        assert "torch.compile needs PyTorch 2.13" in run("--compile").output
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "matplotlib" else find(name, *a))
     monkeypatch.setenv("PATH", "")
@@ -221,5 +224,3 @@ def test_bench_does_not_start_without_its_tools(tmp_path: Path, monkeypatch: pyt
         result = run(*arguments)
         assert result.exit_code == 2 and message in result.output
     assert not list(tmp_path.iterdir())
-    monkeypatch.setattr("torchdof.tensors.TRACEABLE", False)
-    assert "torch.compile needs PyTorch 2.13" in run("--compile").output

@@ -47,6 +47,7 @@ def turn(name: str, folder: Path, seed: int, seconds: float) -> None:
             (folder / "finding").write_text(wrong or f"printed: {lines[0][:200]}")
             return
         os.ftruncate(printed, 0)
+        os.lseek(printed, 0, os.SEEK_SET)
 
 
 def input_of(name: str, folder: Path) -> Path:
