@@ -104,3 +104,13 @@ def test_gradients_stay_float32_if_the_default_type_is_float64() -> None:
     finally:
         torch.set_default_dtype(torch.float32)
     assert image.grad is not None and image.grad.dtype == torch.float32
+
+
+def test_a_fake_mode_with_real_tensors_does_not_crash() -> None:
+    script = (
+        "import torch, torchdof\nfrom torch._subclasses.fake_tensor import FakeTensorMode\n"
+        "image, coc = torch.rand(1, 3, 300, 300), 9 * torch.rand(1, 1, 300, 300)\n"
+        "try:\n    with FakeTensorMode(allow_non_fake_inputs=True): torchdof.blur_by_coc(image, coc)\n"
+        "except Exception as error: print(type(error).__name__)\n"
+    )
+    output_of(script)

@@ -14,7 +14,7 @@ import torch
 from tests.processes import output_of
 from torchdof import BlurTable
 from torchdof.io.atomic import whole_file
-from torchdof.io.images import Picture, write_image
+from torchdof.io.images import Picture, read_image, write_image
 
 pytestmark = pytest.mark.hard
 
@@ -150,3 +150,16 @@ def test_a_folder_without_permission_is_named(tmp_path: Path) -> None:
             write_image(tmp_path / "x.exr", PICTURE)
     finally:
         tmp_path.chmod(0o700)
+
+
+def test_concurrent_writers_of_one_file_leave_it_whole(tmp_path: Path) -> None:
+    script = """
+import sys, torch
+from torchdof.io.images import Picture, write_image
+for _ in range(20):
+    write_image("x.exr", Picture(torch.full((1, 3, 50, 60), float(sys.argv[1]))))
+"""
+    runs = [subprocess.Popen([sys.executable, "-c", script, value], cwd=tmp_path) for value in ("1", "2")]
+    assert [run.wait(timeout=120) for run in runs] == [0, 0]
+    assert read_image(tmp_path / "x.exr").pixels.unique().tolist() in ([1.0], [2.0])
+    assert [p.name for p in tmp_path.iterdir()] == ["x.exr"]
