@@ -74,11 +74,16 @@ def is_differentiated(values: Tensor) -> bool:
         values = torch._C._functorch.get_unwrapped(values)
 
 
-def is_in_memory(values: Tensor) -> bool:
-    """Whether the compiled engine can use a tensor: dense CPU memory, no gradients, no ``FakeTensorMode``."""
+def is_in_memory(values: Tensor, backward: bool = False) -> bool:
+    """Whether the compiled engine can use a tensor: dense CPU memory, no gradients, no ``FakeTensorMode``.
+
+    ``backward`` allows gradients in reverse mode, which some of its steps have.
+    """
     if values.device.type != "cpu" or torch._C._functorch.is_functorch_wrapped_tensor(values):
         return False
-    return not is_fake() and has_storage(values) and not is_differentiated(values)
+    if is_fake() or not has_storage(values):
+        return False
+    return forward_ad.unpack_dual(values).tangent is None if backward else not is_differentiated(values)
 
 
 def has_storage(values: Tensor) -> bool:

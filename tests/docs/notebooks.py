@@ -21,7 +21,7 @@ def code_cells(notebook: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def run(notebook: dict[str, Any]) -> Iterator[list[dict[str, Any]]]:
-    """Outputs of each cell with code in the notebook's own format: what it prints, and the picture of its last line."""
+    """Outputs of each cell with code, as notebooks store them: the printed text, and the picture of its last line."""
     names: dict[str, Any] = {"__name__": "__main__"}
     for cell in code_cells(notebook):
         body = ast.parse("".join(cell["source"])).body

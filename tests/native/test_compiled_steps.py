@@ -11,6 +11,7 @@ from torchdof import BlurTable, blur_by_coc, native
 from torchdof.render import disocclusion
 from torchdof.render.ops import Level
 from torchdof.render.plan import Plan
+from torchdof.tensors import TRACEABLE
 
 pytestmark = pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built")
 
@@ -127,6 +128,23 @@ def test_the_gradient_of_a_gradient_is_the_plain_engines() -> None:
 
     exact = curvature(torch.float64)
     assert float((curvature(torch.float32) - exact).norm()) < 1e-3 * float(exact.norm())
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # raised inside PyTorch for tangents
+def test_forward_mode_and_torch_func_agree_with_reverse_mode() -> None:
+    image, coc = (t[:1, :, :20, :30] for t in scene((-4.0, 4.0)))
+    step, seen = torch.rand_like(image), torch.rand_like(image)
+
+    def total(light: Tensor) -> Tensor:
+        return (blur_by_coc(light, coc) * seen).sum()
+
+    (slope,) = torch.autograd.grad(total(leaf := image.clone().requires_grad_()), leaf)
+    with torch.autograd.forward_ad.dual_level():
+        out = total(torch.autograd.forward_ad.make_dual(image, step))
+        along = torch.autograd.forward_ad.unpack_dual(out).tangent
+    torch.testing.assert_close(along, (slope * step).sum())
+    if TRACEABLE:  # older PyTorch is refused by name
+        torch.testing.assert_close(torch.func.grad(total)(image), slope, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("channels", [1, 3])

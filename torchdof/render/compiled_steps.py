@@ -24,7 +24,7 @@ def blended(
         frame: One surface, or two that share each pixel, in any order.
         layers: Kernel ``[1 or C, k, k]`` of each layer, and the distance of its pixels in pixels of the frame.
         backed: Whether the weights are transmittances, not coverages; without occlusion they are sums of weights.
-        plain: The same computation, differentiable, for the surfaces of such a frame.
+        plain: The same computation by PyTorch, from the frame's surfaces.
 
     Returns:
         None if the compiled engine cannot compute it: it needs float32 on the CPU, eager code without function
@@ -56,7 +56,7 @@ def looked_behind(
         rules: Of each level the distance of two samples in pixels, the smallest blur at which it is read, its votes per
             weight, and its most votes.
         coc_px: Signed coc of the image, ``[B, 1, H, W]``.
-        plain: The same computation, differentiable, from the levels' values and the coc.
+        plain: The same computation by PyTorch, from the levels' values and the coc.
 
     Returns:
         None if the compiled engine cannot compute it, as in :func:`blended`.
@@ -71,7 +71,7 @@ def _supported(tensors: Sequence[Tensor]) -> bool:
     """Whether the compiled engine is in use and can read tensors that may need gradients."""
     if is_traced() or not native.chosen():
         return False
-    return all(t.dtype == torch.float32 and is_in_memory(t.detach()) for t in tensors)
+    return all(t.dtype == torch.float32 and is_in_memory(t, backward=True) for t in tensors)
 
 
 def _surfaces(counts: Sequence[int], tensors: Sequence[Tensor]) -> list[Placed]:

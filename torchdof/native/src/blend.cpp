@@ -444,7 +444,7 @@ class Blend {
     std::fill(canvas + C_ * BLOCK_PIXELS, canvas + planes_ * BLOCK_PIXELS, over_ ? empty_ : 0.0f);
   }
 
-  // The share of a layer at a pixel, and what it leaves of the picture behind it.
+  // A layer's share of a pixel, and its transmittance for the picture behind.
   struct Front {
     vec share, left;
   };
@@ -597,8 +597,9 @@ class Blend {
     each_row(block, [&](size_t to, size_t from, int count) { memcpy(canvas + to, picture + from, count * sizeof(float)); });
   }
 
-  // Gradient of what is behind (in place of that of the picture in front of it) and, returned, of a front's share. `add`:
-  // called with each channel's gradient.
+  // One step back through the composite at pixel i, for kernel e. Multiplies the gradients by the transmittance, so that
+  // they become those of the picture behind. Calls light(c, slope) with the gradient of the front's light in each
+  // channel; returns the gradient of the front's share.
   template <typename Light>
   vec through(int e, int i, Front f, const float *behind, float *slopes, const Light &light) const {
     float *coverage = slopes + (C_ + e) * BLOCK_PIXELS + i;
