@@ -88,7 +88,8 @@ def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best", reference: Re
     a_choice("focus", kind, get_args(Focus))
     first = lens.paraxial()
     sensor = first.back_focal
-    for _ in range(100 if reference == "sensor" else 1):  # the sensor's own place changes such a distance
+    a_choice("reference", reference, get_args(Reference))
+    for _ in range(100 if reference == "sensor" else 1):  # a distance from the sensor changes with the sensor's place
         object_mm, before = vertex_distance_mm(lens, focus_m, reference, sensor), sensor
         distance = object_mm + first.front_principal
         if distance <= first.focal_length:

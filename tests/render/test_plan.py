@@ -149,5 +149,8 @@ def test_kernels_of_highlights_are_interpolated_between_multiples_of_1_32_px() -
     torch.testing.assert_close(kernels[1], torch.lerp(low[0], high[0], 0.25))
     torch.testing.assert_close(kernels[2], torch.lerp(low[1], high[1], 0.68))
     assert kernels_for(table, coc, 100, 4).shape[-1] == 7
-    moving = coc.double().requires_grad_()
-    torch.testing.assert_close(kernels_for(table, moving, 100, 100), table.kernels(moving, 100))
+    moving = coc.clone().requires_grad_()
+    differentiable, seen = kernels_for(table, moving, 100, 100), torch.rand_like(kernels)
+    torch.testing.assert_close(differentiable, kernels, rtol=0.0, atol=0.0)
+    (slope,) = torch.autograd.grad((differentiable * seen).sum(), moving)
+    torch.testing.assert_close(slope[1], 32.0 * ((high[0] - low[0]) * seen[1]).sum())
