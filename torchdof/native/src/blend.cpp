@@ -16,8 +16,7 @@ namespace TORCHDOF_SIMD {
 namespace {
 
 constexpr float KNOWN = 2e-3f;  // blurred weight at which a layer's colour is fully known, as in composite.cpp
-constexpr int STRIPS = BLOCK / STRIP_ROWS;
-static_assert(BLOCK % STRIP_COLUMNS == 0, "strips fill a block");
+static_assert(BLOCK % STRIP_COLUMNS == 0 && BLOCK % STRIP_ROWS == 0, "strips fill a block");
 
 inline vec load_some(const float *p, int n) {
   if (n >= LANES) return load<vec>(p);
@@ -52,7 +51,7 @@ struct Run {
 
 // A layer: which blocks of its run's grid its light reaches, and the blurred terms there.
 struct Blurred {
-  std::vector<int> place;   // of each block in `values`, or -1
+  std::vector<int> index;   // of each block in `values`, or -1
   std::vector<int> reached, needed, around;  // blocks with blurred terms; that these read; that those read
   std::vector<uint8_t> occupied, behind;  // blocks in which the layer occurs; in which anything lies behind it
   Buffer<float> values;     // [blocks, terms, BLOCK_PIXELS]
@@ -123,7 +122,7 @@ class Blend {
   }
 
  private:
-  static constexpr int MOST = 16;  // most planes of a canvas
+  static constexpr int MOST = TORCHDOF_MOST_PLANES;
   static constexpr int CELL_PX = 8;
   using Events = std::vector<float>;
 
@@ -245,7 +244,7 @@ class Blend {
     return false;
   }
 
-  // Where the pixels of a block lie, whichever surface.
+  // Where all surfaces of a block's pixels lie, relative to a layer.
   enum Side { ACROSS, IN_FRONT, BEHIND };
   Side side_of(const Run &run, int k, int block) const {
     if (blurred_[k].occupied[block]) return ACROSS;
@@ -267,7 +266,7 @@ class Blend {
   void find_blocks(const Run &run, int k) {
     Blurred &b = blurred_[k];
     const int half = layers_[k].half, count = run.blocks();
-    b.place.assign(count, -1);
+    b.index.assign(count, -1);
     b.occupied.assign(count, 0);
     std::vector<uint8_t> needed(count, 0), around(count, 0);
     auto spread = [&](int block, std::vector<uint8_t> &to) {
@@ -280,7 +279,7 @@ class Blend {
       b.occupied[i] = occurs(run, k, y0, y0 + BLOCK, x0, x0 + BLOCK);
       const bool outside = y0 >= run.bottom || y0 + BLOCK <= run.top || x0 >= run.right || x0 + BLOCK <= run.left;
       if (outside || !occurs(run, k, y0 - half, y0 + BLOCK + half, x0 - half, x0 + BLOCK + half)) continue;
-      b.place[i] = (int)b.reached.size();
+      b.index[i] = (int)b.reached.size();
       b.reached.push_back(i);
       spread(i, needed);
     }
@@ -297,16 +296,19 @@ class Blend {
   }
 
   float *values_of(int k, int block) const {
-    const int place = blurred_[k].place[block];
-    return place < 0 ? nullptr : blurred_[k].values.data() + (size_t)place * values_ * BLOCK_PIXELS;
+    const int index = blurred_[k].index[block];
+    return index < 0 ? nullptr : blurred_[k].values.data() + (size_t)index * values_ * BLOCK_PIXELS;
   }
 
   vec weight_at(int j, size_t at, int n) const { return scene_.weight[j] ? load_some(scene_.weight[j] + at, n) : all(1.0f); }
 
-  // A pixel's surfaces near to far (a vector of pixels), and a layer's terms of them.
+  // The surfaces of some pixels, near to far, in a layer.
   struct Pixels {
-    vec weight[2], counted[2], ahead[2], here[2], h[2], t[2], extra = {}, known = {}, share = {};
-    decltype(vec{} < vec{}) swapped;
+    vec weight[2], counted[2];  // given; with the continuation of the farther surface
+    vec ahead[2], here[2];      // arguments of the ramps
+    vec h[2], t[2];             // share at or behind the layer; share behind it
+    vec extra = {}, known = {}, share = {};  // terms of the continuation
+    decltype(vec{} < vec{}) swapped;         // the frame's second surface is the nearer one
   };
   // Surface j of the frame from the nearer and the farther one, or the other way round.
   template <int S>
@@ -516,7 +518,7 @@ class Blend {
       bool any = false;
       for (int r = (run.top + low) / BLOCK; r <= (run.top + high + 1) / BLOCK; r++)
         for (int c = (run.left + first) / BLOCK; c <= (run.left + first + count - 1) / BLOCK; c++)
-          for (int k : run.layers) any |= blurred_[k].place[r * run.block_columns + c] >= 0;
+          for (int k : run.layers) any |= blurred_[k].index[r * run.block_columns + c] >= 0;
       if (!any) return false;
     }
     for (int c = 0; c < planes_; c++) {
