@@ -15,7 +15,7 @@ from .downsampling import downsampled, upsampled
 from .ops import EAGER, Ops
 from .plan import Blur
 from .scatter import fold
-from .surfaces import Frame, Placed
+from .surfaces import Frame
 
 __all__ = ["Scatter", "accumulate", "accumulate_once", "mean", "over"]
 
@@ -67,7 +67,11 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, ops: Ops = EAGER
         share = left * share_behind if backed else torch.addcmul(share, left, share_behind)
         return torch.addcmul(light, left, light_behind), share
 
-    picture = _picture(frame, blurs, scatter, composited, ops, 1.0 if backed else 0.0, normalised)
+    def plain(frame: Frame) -> Tensor:
+        empty = 1.0 if backed else 0.0
+        return _composite_layers(frame.near_to_far(), blurs, scatter, composited, ops, empty, normalised)
+
+    picture = _picture(frame, blurs, scatter, backed, plain)
     light, left = _parts(picture, colours)
     out = mean(picture, colours) if frame.behind is None else torch.addcmul(light, left, frame.behind)
     return out[..., : frame.size[0], : frame.size[1]]
@@ -85,7 +89,10 @@ def accumulate(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, ops: Ops =
     def added(front: Picture, behind: Picture) -> Picture:
         return front[0] + behind[0], front[1] + behind[1]
 
-    return _picture(frame, blurs, scatter, added, ops)[..., : frame.size[0], : frame.size[1]]
+    def plain(frame: Frame) -> Tensor:
+        return _composite_layers(frame, blurs, scatter, added, ops)
+
+    return _picture(frame, blurs, scatter, False, plain)[..., : frame.size[0], : frame.size[1]]
 
 
 def accumulate_once(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
@@ -109,24 +116,17 @@ def accumulate_once(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
 
 
 def _picture(
-    frame: Frame,
-    blurs: Sequence[Blur],
-    scatter: Scatter,
-    composited: Callable[[Picture, Picture], Picture],
-    ops: Ops,
-    empty: float = 0.0,
-    normalised: Callable[[Lights, Tensor, Tensor], Pictures] | None = None,
+    frame: Frame, blurs: Sequence[Blur], scatter: Scatter, backed: bool, plain: Callable[[Frame], Tensor]
 ) -> Tensor:
-    """:func:`_composite_layers` of a frame, computed by the compiled engine if it supports the arguments."""
+    """All layers of a frame, composited by the compiled engine if it supports the arguments, else by ``plain(frame)``.
 
-    def plain(surfaces: Sequence[Placed]) -> Tensor:
-        sorted_frame = dataclasses.replace(frame, surfaces=surfaces).near_to_far()
-        return _composite_layers(sorted_frame, blurs, scatter, composited, ops, empty, normalised)
-
+    ``backed`` is as for :func:`torchdof.render.compiled_steps.blended`.
+    """
     picture = None
     if scatter is not fold and blurs[0].shares is None:
-        picture = blended(frame, [(blur.kernel, blur.scale) for blur in blurs], empty > 0, plain)
-    return plain(frame.surfaces) if picture is None else picture
+        layers = [(blur.kernel, blur.scale) for blur in blurs]
+        picture = blended(frame, layers, backed, lambda surfaces: plain(dataclasses.replace(frame, surfaces=surfaces)))
+    return plain(frame) if picture is None else picture
 
 
 def _composite_layers(
