@@ -60,7 +60,7 @@ def test_tensors_without_memory_are_refused_by_name(make: type[Wrapper]) -> None
 
 ELSEWHERE = """
 import torch
-torch.set_default_device("meta")  # first, as what is cached would hide where it was made
+torch.set_default_device("meta")  # before the imports, so that nothing is cached on another device
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
 from torchdof.depth import fill_holes, from_relative
 random = torch.Generator("cpu").manual_seed(0)

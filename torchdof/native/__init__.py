@@ -60,6 +60,7 @@ _SMALL_FRAME = 2**16  # pixels; up to this size the main thread renders itself, 
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
 _REVISION = 7  # of ``src/api.h``
 
+Rules = Sequence[tuple[int, float, float, float]]
 _Floats = ctypes.POINTER(ctypes.c_float)
 
 
@@ -144,6 +145,17 @@ class _Spots(ctypes.Structure):
     ]
 
 
+_OF_LAYERS: list[Any] = [
+    ("layers", ctypes.c_int32),
+    ("nodes", ctypes.POINTER(ctypes.c_double)),
+    ("scales", ctypes.POINTER(ctypes.c_int32)),
+    ("halves", ctypes.POINTER(ctypes.c_int32)),
+    ("kernel_colours", ctypes.c_int32),
+    ("kernels", ctypes.c_void_p),
+]
+"""Fields of the structures that have layers."""
+
+
 class _Scene(ctypes.Structure):
     """``torchdof_scene`` of ``src/api.h``."""
 
@@ -161,12 +173,7 @@ class _Scene(ctypes.Structure):
         ("masked", ctypes.c_int32),
         ("highlights", ctypes.c_int32),
         ("crisp_px", ctypes.c_float),
-        ("layers", ctypes.c_int32),
-        ("nodes", ctypes.POINTER(ctypes.c_double)),
-        ("scales", ctypes.POINTER(ctypes.c_int32)),
-        ("halves", ctypes.POINTER(ctypes.c_int32)),
-        ("kernel_colours", ctypes.c_int32),
-        ("kernels", ctypes.c_void_p),
+        *_OF_LAYERS,
         ("shares", ctypes.POINTER(_Shares)),
         ("distances", ctypes.c_int32),
         ("squeeze", ctypes.c_float),
@@ -200,11 +207,8 @@ class _Layers(ctypes.Structure):
     _fields_ = [  # noqa: RUF012
         *((name, ctypes.c_int32) for name in ("rows", "columns", "margin", "height", "width", "channels", "surfaces")),
         *((name, ctypes.POINTER(ctypes.c_void_p)) for name in ("light", "place", "weight")),
-        *((name, ctypes.c_int32) for name in ("occlusion", "backed", "layers")),
-        ("nodes", ctypes.POINTER(ctypes.c_double)),
-        *((name, ctypes.POINTER(ctypes.c_int32)) for name in ("scales", "halves")),
-        ("kernel_colours", ctypes.c_int32),
-        ("kernels", ctypes.c_void_p),
+        *((name, ctypes.c_int32) for name in ("occlusion", "backed")),
+        *_OF_LAYERS,
         ("threads", ctypes.c_int32),
         ("cancelled", ctypes.POINTER(ctypes.c_int32)),
     ]
@@ -300,9 +304,7 @@ def render(
     lights = [light.float().contiguous() for light, _, _ in surfaces]
     cocs = [coc.float().contiguous() for _, coc, _ in surfaces]
     weights = [None if weight is None else weight.float().contiguous() for _, _, weight in surfaces]
-    kernels = [kernel.float() for kernel, _ in layers]
-    colours = max(kernel.shape[0] for kernel in kernels)
-    bank = torch.cat([kernel.expand(colours, -1, -1).flatten() for kernel in kernels])
+    of_layers, _kernels = _of_layers(nodes, layers)
     cancelled = ctypes.c_int32(0)
     channels, height, width = lights[0].shape
     scene = _Scene(
@@ -319,12 +321,7 @@ def render(
         masked,
         highlights,
         crisp_px,
-        len(nodes),
-        _array(ctypes.c_double, len(nodes))(*nodes),
-        _array(ctypes.c_int32, len(nodes))(*(scale for _, scale in layers)),
-        _array(ctypes.c_int32, len(nodes))(*(kernel.shape[-1] // 2 for kernel in kernels)),
-        colours,
-        bank.data_ptr(),
+        *of_layers,
         _shares(shares) if shares else None,
         shares[0].values.shape[1] if shares else 0,
         squeeze,
@@ -386,7 +383,10 @@ def blend(surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: Padde
     Raises:
         MemoryError: If there is not enough memory.
     """
-    return _blended(surfaces, frame, None)[0]
+    scene, _memory = _layers_of(surfaces, frame)
+    out = torch.empty(scene.channels + scene.kernel_colours, *frame.area, dtype=torch.float32, device="cpu")
+    _blended(scene, lambda: _engine().torchdof_blend(ctypes.byref(scene), out.data_ptr()))
+    return out
 
 
 def blend_gradient(
@@ -400,63 +400,57 @@ def blend_gradient(
     Raises:
         MemoryError: If there is not enough memory.
     """
-    return _blended(surfaces, frame, gradient)
+    (scene, _memory), gradient = _layers_of(surfaces, frame), gradient.contiguous()
+    sums = [
+        [None if t is None else torch.zeros_like(t, memory_format=torch.contiguous_format) for t in each]
+        for each in zip(*surfaces, strict=True)
+    ]
+    arguments = (ctypes.byref(scene), gradient.data_ptr(), *map(_pointers, sums))
+    _blended(scene, lambda: _engine().torchdof_blend_gradient(*arguments))
+    return [t for of_surface in zip(*sums, strict=True) for t in of_surface if t is not None]
 
 
-def _blended(
-    surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: PaddedFrame, gradient: Tensor | None
-) -> list[Tensor]:
+def _layers_of(
+    surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: PaddedFrame
+) -> tuple[_Layers, list[Any]]:
+    """The structure for :func:`blend`, and the memory to which it points."""
     maps = [[None if t is None else t.contiguous() for t in each] for each in zip(*surfaces, strict=True)]
-    kernels, count = [kernel.float() for kernel, _ in frame.layers], len(frame.nodes)
+    of_layers, kernels = _of_layers(frame.nodes, frame.layers)
+    channels, rows, columns = surfaces[0][0].shape
+    cancelled = ctypes.c_int32(0)
+    size = (rows, columns, frame.margin, *frame.area, channels, len(surfaces))
+    how = (frame.occlusion, frame.backed, *of_layers, torch.get_num_threads(), ctypes.pointer(cancelled))
+    return _Layers(*size, *map(_pointers, maps), *how), [maps, kernels]
+
+
+def _blended(scene: _Layers, run: Callable[[], int]) -> None:
+    _interruptible(lambda: _check(run()), scene.cancelled.contents, scene.rows * scene.columns)
+
+
+def _of_layers(nodes: Sequence[float], layers: Sequence[tuple[Tensor, int]]) -> tuple[list[Any], Tensor]:
+    """Values of :data:`_OF_LAYERS`, and the memory of the kernels, which must outlive them."""
+    kernels, count = [kernel.float() for kernel, _ in layers], len(nodes)
     colours = max(kernel.shape[0] for kernel in kernels)
     bank = torch.cat([kernel.expand(colours, -1, -1).flatten() for kernel in kernels])
-    cancelled = ctypes.c_int32(0)
-    channels, rows, columns = surfaces[0][0].shape
-    scene = _Layers(
-        rows,
-        columns,
-        frame.margin,
-        *frame.area,
-        channels,
-        len(surfaces),
-        *map(_pointers, maps),
-        frame.occlusion,
-        frame.backed,
+    made = [
         count,
-        _array(ctypes.c_double, count)(*frame.nodes),
-        _array(ctypes.c_int32, count)(*(scale for _, scale in frame.layers)),
+        _array(ctypes.c_double, count)(*nodes),
+        _array(ctypes.c_int32, count)(*(scale for _, scale in layers)),
         _array(ctypes.c_int32, count)(*(kernel.shape[-1] // 2 for kernel in kernels)),
         colours,
         bank.data_ptr(),
-        torch.get_num_threads(),
-        ctypes.pointer(cancelled),
-    )
-    if gradient is None:
-        out = torch.empty(channels + colours, *frame.area, dtype=torch.float32, device="cpu")
-        results = [out]
-    else:
-        gradient = gradient.float().contiguous()
-        sums = [[None if t is None else torch.zeros_like(t) for t in each] for each in maps]
-        results = [t for of_surface in zip(*sums, strict=True) for t in of_surface if t is not None]
-
-    def run() -> None:
-        if gradient is None:
-            _check(_engine().torchdof_blend(ctypes.byref(scene), out.data_ptr()))
-        else:
-            pointers = map(_pointers, sums)
-            _check(_engine().torchdof_blend_gradient(ctypes.byref(scene), gradient.data_ptr(), *pointers))
-
-    _interruptible(run, cancelled, rows * columns)
-    return results
+    ]
+    return made, bank
 
 
-Levels = Sequence[tuple[Tensor, tuple[int, float, float, float]]]
-"""Light, coc and weight of each level of a pyramid, ``[C + 2, h, w]``; with the distance of two samples in pixels, the
-smallest blur at which a pixel reads the level, the votes for each weight, and the most votes."""
-
-
-def look_behind(levels: Levels, coc: Tensor) -> Tensor:
+def look_behind(levels: Sequence[Tensor], rules: Rules, coc: Tensor) -> Tensor:
     """Surfaces behind those of an image with coc ``[H, W]``, as ``torchdof.render.disocclusion`` defines them.
+
+    Args:
+        levels: Light, coc and weight of each level of a pyramid, ``[C + 2, h, w]``, float32.
+        rules: Of each level the distance of two samples in pixels, the smallest blur at which a pixel reads it, the
+            votes for each weight, and the most votes.
+        coc: Signed coc of the image.
 
     Returns:
         Light, coc and votes, ``[C + 2, H, W]``, float32; the same bits for any number of threads.
@@ -464,31 +458,29 @@ def look_behind(levels: Levels, coc: Tensor) -> Tensor:
     Raises:
         MemoryError: If there is not enough memory.
     """
-    coc, made = coc.contiguous(), [values.contiguous() for values, _ in levels]
-    out = torch.empty(made[0].shape[0], *coc.shape, dtype=torch.float32, device="cpu")
-    arguments = _level_arguments(made, levels, coc)
-    _check(_engine().torchdof_look_behind(*arguments, out.data_ptr()))
+    coc, levels = coc.contiguous(), [values.contiguous() for values in levels]
+    out = torch.empty(levels[0].shape[0], *coc.shape, dtype=torch.float32, device="cpu")
+    _check(_engine().torchdof_look_behind(*_level_arguments(levels, rules, coc), out.data_ptr()))
     return out
 
 
-def look_behind_gradient(levels: Levels, coc: Tensor, gradient: Tensor) -> list[Tensor]:
+def look_behind_gradient(levels: Sequence[Tensor], rules: Rules, coc: Tensor, gradient: Tensor) -> list[Tensor]:
     """The gradients of :func:`look_behind` by coc and by each level, from that by its result ``[C + 2, H, W]``.
 
     Raises:
         MemoryError: If there is not enough memory.
     """
-    coc, made = coc.contiguous(), [values.contiguous() for values, _ in levels]
-    gradient, of_coc, of_levels = gradient.contiguous(), torch.empty_like(coc), [torch.zeros_like(t) for t in made]
-    arguments = _level_arguments(made, levels, coc)
+    coc, levels, gradient = coc.contiguous(), [values.contiguous() for values in levels], gradient.contiguous()
+    of_coc, of_levels = torch.empty_like(coc), [torch.zeros_like(values) for values in levels]
     pointers = (gradient.data_ptr(), _pointers(of_levels), of_coc.data_ptr())
-    _check(_engine().torchdof_look_behind_gradient(*arguments, *pointers))
+    _check(_engine().torchdof_look_behind_gradient(*_level_arguments(levels, rules, coc), *pointers))
     return [of_coc, *of_levels]
 
 
-def _level_arguments(made: Sequence[Tensor], levels: Levels, coc: Tensor) -> tuple[Any, ...]:
-    each = [_Level(t.data_ptr(), *t.shape[1:], *rule) for t, (_, rule) in zip(made, levels, strict=True)]
+def _level_arguments(levels: Sequence[Tensor], rules: Rules, coc: Tensor) -> tuple[Any, ...]:
+    each = [_Level(values.data_ptr(), *values.shape[1:], *rule) for values, rule in zip(levels, rules, strict=True)]
     count, threads = len(each), torch.get_num_threads()
-    return _array(_Level, count)(*each), count, made[0].shape[0] - 2, coc.data_ptr(), *coc.shape, threads
+    return _array(_Level, count)(*each), count, levels[0].shape[0] - 2, coc.data_ptr(), *coc.shape, threads
 
 
 def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool = False) -> Tensor:

@@ -45,7 +45,7 @@ def blended(
 
 def looked_behind(
     values: Sequence[Tensor],
-    rules: Sequence[tuple[int, float, float, float]],
+    rules: native.Rules,
     coc_px: Tensor,
     plain: Callable[[Sequence[Tensor], Tensor], Tensor],
 ) -> Tensor | None:
@@ -63,7 +63,7 @@ def looked_behind(
     """
     if not _supported([coc_px, *values]) or len(values) > native.MOST_LEVELS or values[0].shape[1] > native.MOST_PLANES:
         return None
-    result: Tensor = _LookBehind.apply(list(rules), plain, coc_px, *values)
+    result: Tensor = _LookBehind.apply(rules, plain, coc_px, *values)
     return result
 
 
@@ -108,13 +108,11 @@ def _items(counts: Sequence[int], tensors: Sequence[Tensor]) -> list[list[tuple[
 
 class _LookBehind(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, steps: list[tuple[int, float, float, float]], plain: Any, *tensors: Tensor) -> Tensor:
-        ctx.steps, ctx.plain = steps, plain
+    def forward(ctx: Any, rules: native.Rules, plain: Any, *tensors: Tensor) -> Tensor:
+        ctx.rules, ctx.plain = rules, plain
         ctx.save_for_backward(*tensors)
         items = zip(*(t.detach() for t in tensors), strict=True)
-        return torch.stack(
-            [native.look_behind(list(zip(levels, steps, strict=True)), coc[0]) for coc, *levels in items]
-        )
+        return torch.stack([native.look_behind(levels, rules, coc[0]) for coc, *levels in items])
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
@@ -122,11 +120,13 @@ class _LookBehind(torch.autograd.Function):
         if torch.is_grad_enabled():
             coc, *values = tensors
             return None, None, *_differentiable(ctx.plain(values, coc), tensors, gradient)
-        found = []
-        for of_item, coc, *levels in zip(gradient, *(t.detach() for t in tensors), strict=True):
-            of_coc, *of_levels = native.look_behind_gradient(list(zip(levels, ctx.steps, strict=True)), coc[0], of_item)
-            found.append([of_coc[None], *of_levels])
-        return None, None, *(torch.stack(each) for each in zip(*found, strict=True))
+        items = zip(gradient, *(t.detach() for t in tensors), strict=True)
+        found = [native.look_behind_gradient(levels, ctx.rules, coc[0], of_item) for of_item, coc, *levels in items]
+        return (
+            None,
+            None,
+            *(torch.stack(each).view_as(t) for each, t in zip(zip(*found, strict=True), tensors, strict=True)),
+        )
 
 
 def _differentiable(result: Tensor, inputs: Sequence[Tensor], gradient: Tensor) -> list[Tensor | None]:

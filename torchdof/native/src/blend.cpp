@@ -15,7 +15,6 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr float KNOWN = 2e-3f;  // blurred weight at which a layer's colour is fully known, as in composite.cpp
 static_assert(BLOCK % STRIP_COLUMNS == 0 && BLOCK % STRIP_ROWS == 0, "strips fill a block");
 
 inline vec load_some(const float *p, int n) {
@@ -81,14 +80,10 @@ class Blend {
 
   void picture(float *out) {
     blur_all();
+    const std::vector<Step> steps = steps_of_picture();
     each_block(fine(), [&](int block, Events &) {
       float canvas[MOST * BLOCK_PIXELS];
-      clear(canvas);
-      for (const Run &run : runs_)
-        if (run.scale > 1)
-          join(run, block, canvas, nullptr);
-        else
-          for (int k : run.layers) put(k, block, canvas);
+      composite(steps, block, canvas);
       write(block, canvas, out);
     });
   }
@@ -101,17 +96,19 @@ class Blend {
         run.slopes = Buffer<float>(planes_ * area);
         memset(run.slopes.data(), 0, planes_ * area * sizeof(float));
       }
+    const std::vector<Step> of_picture = steps_of_picture();
     each_block(fine(), [&](int block, Events &events) {
       float slopes[MOST * BLOCK_PIXELS];
       read(block, out_gradient, slopes);
-      walk(block, events, slopes);
+      walk(of_picture, block, events, slopes);
     });
     for (Run &run : runs_) {
       if (run.scale == 1) continue;
+      const std::vector<Step> steps = steps_of(run);
       each_block(run, [&](int block, Events &events) {
         float slopes[MOST * BLOCK_PIXELS];
         gather(run, block, slopes);
-        walk_layers(run, block, events, slopes);
+        walk(steps, block, events, slopes);
       });
     }
     light_ = light, place_ = place, weight_ = weight;
@@ -123,8 +120,12 @@ class Blend {
 
  private:
   static constexpr int MOST = TORCHDOF_MOST_PLANES;
-  static constexpr int CELL_PX = 8;
   using Events = std::vector<float>;
+  // A step of a composite, far to near: a layer, or the canvas of a coarse run (then `run` is not null).
+  struct Step {
+    const Run *run;
+    int layer;
+  };
 
   const Run &fine() const { return *std::find_if(runs_.begin(), runs_.end(), [](const Run &run) { return run.scale == 1; }); }
 
@@ -159,10 +160,10 @@ class Blend {
       }
       if (run.scale == 1) continue;
       run.canvas = grid_planes(run, planes_);
+      const std::vector<Step> steps = steps_of(run);
       each_block(run, [&](int block, Events &) {
         float canvas[MOST * BLOCK_PIXELS];
-        clear(canvas);
-        for (int k : run.layers) put(k, block, canvas);
+        composite(steps, block, canvas);
         const int y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
         for (int c = 0; c < planes_; c++)
           for (int y = 0; y < BLOCK; y++) memcpy(run.canvas.data() + c * run.plane + run.at(y0 + y, x0), canvas + c * BLOCK_PIXELS + y * BLOCK, BLOCK * sizeof(float));
@@ -203,11 +204,11 @@ class Blend {
     return std::any_of(runs_.begin(), runs_.end(), [](const Run &run) { return run.scale == 1; });
   }
 
-  // Finds the layers that occur in each cell of CELL_PX x CELL_PX pixels of the padded frame, and its range of places.
+  // Finds the layers that occur in each cell of CELL x CELL pixels of the padded frame, and its range of places.
   void mark_cells() {
     words_ = (scene_.layers + 63) / 64;
-    cell_rows_ = ceil_div(scene_.rows, CELL_PX);
-    cell_columns_ = ceil_div(scene_.columns, CELL_PX);
+    cell_rows_ = ceil_div(scene_.rows, CELL);
+    cell_columns_ = ceil_div(scene_.columns, CELL);
     cells_.assign((size_t)cell_rows_ * cell_columns_ * words_, 0);
     lows_.assign((size_t)cell_rows_ * cell_columns_, NEVER);
     highs_.assign(lows_.size(), -NEVER);
@@ -216,12 +217,12 @@ class Blend {
     const int last = (int)nodes.size() - 1;
     parallel(cell_rows_, [&](int row, int) {
       for (int i = 0; i < S_; i++)
-        for (int y = row * CELL_PX; y < std::min((row + 1) * CELL_PX, scene_.rows); y++) {
+        for (int y = row * CELL; y < std::min((row + 1) * CELL, scene_.rows); y++) {
           const float *of_row = scene_.place[i] + (size_t)y * scene_.columns;
           for (int x = 0, k = 0; x < scene_.columns; x++) {
             while (k < last && of_row[x] >= nodes[k + 1]) k++;
             while (k > 0 && of_row[x] < nodes[k]) k--;
-            const size_t cell = (size_t)row * cell_columns_ + x / CELL_PX;
+            const size_t cell = (size_t)row * cell_columns_ + x / CELL;
             uint64_t *bits = &cells_[cell * words_];
             lows_[cell] = std::min(lows_[cell], of_row[x]);
             highs_[cell] = std::max(highs_[cell], of_row[x]);
@@ -236,8 +237,8 @@ class Blend {
   }
   // Whether a layer occurs in a range of pixels of a run's grid.
   bool occurs(const Run &run, int k, int y0, int y1, int x0, int x1) const {
-    const int s = run.scale, r0 = std::max(y0 * s, 0) / CELL_PX, r1 = std::min(y1 * s - 1, scene_.rows - 1) / CELL_PX;
-    const int c0 = std::max(x0 * s, 0) / CELL_PX, c1 = std::min(x1 * s - 1, scene_.columns - 1) / CELL_PX;
+    const int s = run.scale, r0 = std::max(y0 * s, 0) / CELL, r1 = std::min(y1 * s - 1, scene_.rows - 1) / CELL;
+    const int c0 = std::max(x0 * s, 0) / CELL, c1 = std::min(x1 * s - 1, scene_.columns - 1) / CELL;
     for (int r = r0; r <= r1; r++)
       for (int c = c0; c <= c1; c++)
         if (cells_[((size_t)r * cell_columns_ + c) * words_ + k / 64] >> k % 64 & 1) return true;
@@ -253,8 +254,8 @@ class Blend {
     const int s = run.scale, y0 = block / run.block_columns * BLOCK * s, x0 = block % run.block_columns * BLOCK * s;
     const int r1 = std::min(y0 + BLOCK * s, scene_.rows), c1 = std::min(x0 + BLOCK * s, scene_.columns);
     bool in_front = true, behind = true;
-    for (int r = y0 / CELL_PX; r * CELL_PX < r1; r++)
-      for (int c = x0 / CELL_PX; c * CELL_PX < c1; c++) {
+    for (int r = y0 / CELL; r * CELL < r1; r++)
+      for (int c = x0 / CELL; c * CELL < c1; c++) {
         const size_t cell = (size_t)r * cell_columns_ + c;
         in_front &= highs_[cell] <= l.at;
         behind &= lows_[cell] >= layers_[k + 1].at;
@@ -480,17 +481,43 @@ class Blend {
       for (int i = 0; i < BLOCK_PIXELS; i += LANES) body(e, i);
   }
 
-  // Puts a layer in front of a canvas.
-  void put(int k, int block, float *canvas) const {
+  std::vector<Step> steps_of(const Run &run) const {
+    std::vector<Step> steps;
+    for (int k : run.layers) steps.push_back({nullptr, k});
+    return steps;
+  }
+  std::vector<Step> steps_of_picture() const {
+    std::vector<Step> steps;
+    for (const Run &run : runs_) {
+      const std::vector<Step> more = run.scale > 1 ? std::vector<Step>{{&run, -1}} : steps_of(run);
+      steps.insert(steps.end(), more.begin(), more.end());
+    }
+    return steps;
+  }
+  // Puts a step in front of a canvas; returns false if it is empty there. `kept`: takes a coarse canvas, interpolated.
+  bool put(const Step &step, int block, float *canvas, float *kept) const {
+    return step.run ? join(*step.run, block, canvas, kept) : put_layer(step.layer, block, canvas);
+  }
+  void composite(const std::vector<Step> &steps, int block, float *canvas) const {
+    float kept[MOST * BLOCK_PIXELS];
+    clear(canvas);
+    for (const Step &step : steps) put(step, block, canvas, kept);
+  }
+
+  bool put_layer(int k, int block, float *canvas) const {
     const float *values = values_of(k, block);
-    if (!values) return;
-    if (!over_) return add(values, canvas);
+    if (!values) return false;
+    if (!over_) {
+      add(values, canvas);
+      return true;
+    }
     each_pixel([&](int e, int i) {
       const vec own = load<vec>(values + (C_ + e) * BLOCK_PIXELS + i);
       const Known n = know(own, load<vec>(values + (C_ + E_ + e) * BLOCK_PIXELS + i));
       const vec per = all(1.0f) / n.known;
       over(e, i, front((scene_.backed ? n.beyond : own) * per), values, per, canvas);
     });
+    return true;
   }
 
   // Row and column of a coarse canvas before a pixel of the picture, and the fraction of the way to the next.
@@ -570,9 +597,7 @@ class Blend {
       }
   }
 
-  // Puts a coarse canvas in front of a block of the picture; `kept`: where its interpolated values are kept.
-  bool join(const Run &run, int block, float *canvas, float *kept) const {
-    float memory[MOST * BLOCK_PIXELS], *values = kept ? kept : memory;
+  bool join(const Run &run, int block, float *canvas, float *values) const {
     if (!widen(run, block, values)) return false;
     if (over_)
       each_pixel([&](int e, int i) { over(e, i, front(load<vec>(values + (C_ + e) * BLOCK_PIXELS + i)), values, all(1.0f), canvas); });
@@ -643,59 +668,25 @@ class Blend {
     });
   }
 
-  // Composites the layers of a coarse block again, and walks back through them.
-  void walk_layers(const Run &run, int block, Events &events, float *slopes) const {
+  // Composites a block again, and walks back through the steps: `slopes` is its gradient.
+  void walk(const std::vector<Step> &steps, int block, Events &events, float *slopes) const {
     const size_t size = planes_ * BLOCK_PIXELS;
-    events.resize(size * (run.layers.size() + 1));
+    events.resize(size * (2 * steps.size() + 1));
+    std::vector<const float *> behind;  // the canvas behind each step, and after it the step's own; null if it is empty
     float *canvas = events.data();
     clear(canvas);
-    for (int k : run.layers) {
-      memcpy(canvas + size, canvas, size * sizeof(float));
-      canvas += size;
-      put(k, block, canvas);
+    for (const Step &step : steps) {
+      float *kept = canvas + size, *next = step.run ? kept + size : kept;
+      memcpy(next, canvas, size * sizeof(float));
+      behind.push_back(put(step, block, next, kept) ? canvas : nullptr);
+      canvas = next;
     }
-    for (int i = (int)run.layers.size() - 1; i >= 0; i--)
-      if (values_of(run.layers[i], block)) walk_layer(run.layers[i], block, events.data() + i * size, slopes);
-  }
-
-  // The same for a block of the picture, of layers and coarse canvases.
-  void walk(int block, Events &events, float *slopes) const {
-    const size_t size = planes_ * BLOCK_PIXELS;
-    size_t count = 0;
-    for (const Run &run : runs_) count += run.scale > 1 ? 2 : run.layers.size();
-    events.resize(size * (count + 1));
-    std::vector<const float *> behind;  // the canvas behind each layer or coarse canvas
-    std::vector<float> canvas(size);
-    float *free = events.data();
-    clear(canvas.data());
-    auto keep = [&] {
-      memcpy(free, canvas.data(), size * sizeof(float));
-      behind.push_back(free);
-      free += size;
-    };
-    for (const Run &run : runs_)
-      if (run.scale > 1) {
-        keep();
-        if (join(run, block, canvas.data(), free))
-          free += size;
-        else
-          behind.back() = nullptr;
-      } else {
-        for (int k : run.layers) {
-          keep();
-          put(k, block, canvas.data());
-        }
-      }
-    for (int r = (int)runs_.size() - 1; r >= 0; r--) {
-      const Run &run = runs_[r];
-      if (run.scale > 1) {
-        const float *its = behind.back();
-        behind.pop_back();
-        if (its) walk_join(run, block, its, its + size, slopes);
-      } else {
-        for (int i = (int)run.layers.size() - 1; i >= 0; i--, behind.pop_back())
-          if (values_of(run.layers[i], block)) walk_layer(run.layers[i], block, behind.back(), slopes);
-      }
+    for (int i = (int)steps.size() - 1; i >= 0; i--) {
+      if (!behind[i]) continue;
+      if (steps[i].run)
+        walk_join(*steps[i].run, block, behind[i], behind[i] + size, slopes);
+      else
+        walk_layer(steps[i].layer, block, behind[i], slopes);
     }
   }
   void walk_join(const Run &run, int block, const float *behind, const float *values, float *slopes) const {

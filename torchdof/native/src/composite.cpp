@@ -12,7 +12,6 @@ namespace TORCHDOF_SIMD {
 namespace {
 
 constexpr float LEAST = 1e-6f;    // blurred weight below which the light of a pixel is unknown
-constexpr float KNOWN = 2e-3f;    // blurred weight at which a layer's colour is fully known; below, 1 / weight is damped
 constexpr float COVERED = 1e-6f;  // uncovered part that is rounding error alone
 constexpr int BEHIND_STEP = 4;    // pixels between samples of the light behind all surfaces
 constexpr int TILE_PIXELS = TILE * TILE;

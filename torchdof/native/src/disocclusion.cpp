@@ -6,7 +6,6 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr float BEHIND_PX = 1.0f;  // difference in coc at which a surface counts as another one behind
 constexpr float FALL = 0.35f;      // weight of a level relative to the next finer one; larger takes light from farther away
 constexpr int CELL_LEVEL = 3;      // level in whose pixels it is decided where a surface may be hidden
 constexpr int FINE_LEVELS = 2;     // levels read by each pixel; coarser ones are read once for each cell of STEP pixels
@@ -14,7 +13,6 @@ constexpr int STEP = 1 << FINE_LEVELS;
 constexpr float SURE = 0.1f;      // weight of a level's sample at which its vote is full
 // votes at which a hidden sample has its full weight, and at which a farther one replaces the nearer
 constexpr float CERTAIN = 0.01f;
-constexpr float LEAST_SEEN = 1e-4f;  // weight of a sample up to which it counts as empty
 constexpr float MIXED = 0.05f;  // smallest share of a second surface used in the pyramid
 
 // One level of a pyramid of the farthest surfaces. A sample has `stride` values: light of each channel, coc, weight,

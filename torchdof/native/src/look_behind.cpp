@@ -2,7 +2,7 @@
 // shown_behind and search of render/disocclusion.py, for training. Inference fills hidden surfaces in disocclusion.cpp.
 //
 // Of the four samples j of level l around a pixel with coc c, those behind it count: with their coc d, weight w and
-// bilinear share s, part p_j = s w clamp(d - c - BEHIND_FROM, 0, 1). Their mean m_l has the vote
+// bilinear share s, part p_j = s w clamp(d - c - BEHIND_PX + 1/2, 0, 1). Their mean m_l has the vote
 // v_l = clamp(|c| / least_l - 1, 0, 1) min(slope_l sum p, most_l). The result is sum v_l m_l / sum v_l, and sum v_l.
 #include "engine.h"
 
@@ -10,8 +10,7 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr float BEHIND_FROM = 0.5f;  // difference in coc from which a sample begins to lie behind a pixel
-constexpr float LEAST_WEIGHT = 1e-4f, LEAST_VOTE = 1e-9f;
+constexpr float LEAST_VOTE = 1e-9f;  // smallest divisor
 constexpr int BAND = 32;  // rows of pixels whose gradients are summed on their own, so that sums keep their order
 constexpr int MOST_LEVELS = TORCHDOF_MOST_LEVELS, MOST_PLANES = TORCHDOF_MOST_PLANES + 2;
 
@@ -45,8 +44,8 @@ struct Behind {
   // What a pixel finds in a level.
   struct Found {
     size_t at[4];                   // of the samples
-    float share[4], is_behind[4], part[4];
-    float total, weight, looked;    // sum of the parts; the same, or 0 if tiny
+    float share[4], is_behind[4], part[4];  // is_behind: not clamped
+    float weight, looked;           // sum of the parts, or 0 if tiny; clamped blur
     float mean[MOST_PLANES];        // light and coc
     float vote;
   };
@@ -64,18 +63,18 @@ struct Behind {
     bool any = false;
     for (int j = 0; j < 4; j++) {
       f.at[j] = (size_t)(row + j / 2) * level.columns + column + j % 2;
-      f.is_behind[j] = cocs[f.at[j]] - coc - BEHIND_FROM;
+      f.is_behind[j] = cocs[f.at[j]] - coc - (BEHIND_PX - 0.5f);
       any |= f.is_behind[j] >= 0;
     }
     if (!any) return false;
-    f.total = 0;
+    float total = 0;
     for (int j = 0; j < 4; j++) {
       f.share[j] = (j / 2 ? down : 1.0f - down) * (j % 2 ? aside : 1.0f - aside);
       f.part[j] = f.share[j] * weights[f.at[j]] * clamp01(f.is_behind[j]);
-      f.total += f.part[j];
+      total += f.part[j];
     }
-    f.weight = f.total > LEAST_WEIGHT ? f.total : 0.0f;
-    const float per = 1.0f / std::max(f.weight, LEAST_WEIGHT);
+    f.weight = total > LEAST_SEEN ? total : 0.0f;
+    const float per = 1.0f / std::max(f.weight, LEAST_SEEN);
     for (int c = 0; c < planes - 1; c++) {
       float sum = 0;
       for (int j = 0; j < 4; j++) sum += f.part[j] * level.values[c * size + f.at[j]];
@@ -173,7 +172,7 @@ struct Behind {
         if (counted <= level.most) of_parts = of_vote * f.looked * level.slope * (counted == level.most ? 0.5f : 1.0f);
         for (int c = 0; c < planes - 1; c++) of_parts -= slope[c] * f.vote * f.mean[c] / f.weight;
       }
-      const float per_weight = 1.0f / std::max(f.weight, LEAST_WEIGHT);
+      const float per_weight = 1.0f / std::max(f.weight, LEAST_SEEN);
       for (int j = 0; j < 4; j++) {
         const size_t sample = f.at[j] - start[l];
         float of_part = of_parts;
