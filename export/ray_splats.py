@@ -114,7 +114,7 @@ def hidden_of(
     zero = op.Constant(value_int=0)
     one = op.Constant(value_int=1)
     bin = op.Range(zero, op.Squeeze(op.Shape(cells, start=0, end=1)), one)
-    nearer = nearest + op.Cast(bin, to=1)
+    nearer = op.Gather(nearest, item) + op.Cast(bin, to=1)
     scale = 1.0 - nearer / coc
     fade = op.Clip(coc - NEARER_PX - nearer, 0.0, 1.0)
     reach = op.Abs(scale) * op.ReduceMax(step, keepdims=0)

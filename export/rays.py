@@ -99,9 +99,9 @@ def splat(rays: Highlights, coc_px: Tensor, obstacles: Sequence[tuple[Tensor, Te
     lists = [light, coc, item, row, column, first, node, part, half]
     blank = coc_px.new_zeros(rays.light.shape[0], batch, down, across)
     sizes = [torch.scalar_tensor(n, dtype=torch.int64) for n in (height, width, across)]
-    nearest = coc_px.min()
+    nearest = coc_px.amin((1, 2, 3))
     if obstacles:
-        places = [(coc - nearest, cover) for coc, cover in obstacles]
+        places = [(coc - nearest[:, None, None, None], cover) for coc, cover in obstacles]
         maps = [torch.stack([t.flatten() for t in part], 1) for part in zip(*places, strict=True)]
         maps.append(covered_cells(places, bins))
     else:  # no bins with surfaces

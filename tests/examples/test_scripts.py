@@ -47,6 +47,11 @@ def test_per_pixel_prints_a_row_for_each_radius() -> None:
     assert rows[0] == ["radius", "splat", "step", "layered"] and [row[0] for row in rows[1:]] == ["4", "8", "16"]
 
 
+def test_operations_prints_a_row_for_each_scene() -> None:
+    rows = printed_by("benchmarks/operations.py", ROOT / "tests" / "data" / "scenes").splitlines()
+    assert len(rows) >= 2 and all(0 < int(row.split()[-5]) < 20_000 for row in rows)
+
+
 MAX_OUTLIERS = {"near": 680, "middle": 1070, "far": 390}
 """Largest number of pixels with a blur radius above 2 px that differ from the median of their 3 x 3 by over 8/255."""
 

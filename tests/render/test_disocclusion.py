@@ -18,7 +18,7 @@ from torchdof.render.surfaces import HIDDEN_WEIGHT, Surface, framed
 
 def surfaces(image: Tensor, coc: Tensor, levels: int) -> tuple[Surface, Surface, Tensor]:
     """The visible and the hidden surface of each pixel, and the background behind both."""
-    (own, other), behind = surfaces_of_image(image, coc, None, threshold(image), levels)
+    (own, other), behind = surfaces_of_image(image, coc, None, threshold(image), [levels])
     return own, other, behind_pixels(behind, (image.shape[-2], image.shape[-1]))
 
 
@@ -81,7 +81,7 @@ def test_a_hidden_surface_replaces_a_second_surface_of_small_coverage_smoothly()
     light, found = [], []
     for mixed in weights.tolist():
         own_weight = torch.full_like(coc, mixed)
-        other, _, weight, _ = fill_hidden(image, coc, torch.zeros_like(image), coc, own_weight, None, most, 5)
+        other, _, weight, _ = fill_hidden(image, coc, torch.zeros_like(image), coc, own_weight, None, most, [5])
         light.append((other * weight)[0, :, 24, 30])
         found.append(float(weight[0, 0, 24, 30]))
     assert found[0] == pytest.approx(HIDDEN_WEIGHT) and found[-1] == pytest.approx(float(weights[-1]))
@@ -103,7 +103,7 @@ def test_a_hole_in_all_layers_shows_the_background(size: tuple[int, int]) -> Non
             Surface(light, coc, torch.full_like(coc, cover)),
             Surface(light, coc + 9.0, torch.full_like(coc, 1 - cover)),
         ]
-        frame = framed(surfaces, behind_pixels(cells, size), (0.0, 1.0), 0, 1, occlusion=True, stacked=False)
+        frame = framed(surfaces, behind_pixels(cells, size), [(0.0, 1.0)], 0, 1, occlusion=True, stacked=False)
         shown = over(frame, blurs, convolve)
         torch.testing.assert_close(shown, 0.2 * cover + (1 - cover) * behind, rtol=0, atol=1e-6)
 
@@ -114,7 +114,7 @@ def test_gradients_of_a_compiled_graph_are_those_of_eager_code() -> None:
     limit = threshold(image)
 
     def hidden_light(light: Tensor) -> Tensor:
-        (own, other), behind = surfaces_of_image(light, coc, None, limit, 3)
+        (own, other), behind = surfaces_of_image(light, coc, None, limit, [3])
         return torch.cat([own.light, other.light], 1).square().sum() + behind.square().sum()
 
     gradients = []

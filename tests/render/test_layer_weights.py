@@ -13,7 +13,7 @@ NODES = (-4.0, -1.5, 0.0, 0.5, 2.0)
 
 def weights(x: Tensor) -> Tensor:
     """Weight of each pixel in each layer: `[layers, ...]`."""
-    behind = weights_at_or_behind(x.reshape(1, 1, -1), ramps(NODES, x)).reshape(-1, *x.shape)
+    behind = weights_at_or_behind(x.reshape(1, 1, -1), ramps([NODES], x)).reshape(-1, *x.shape)
     return behind[:-1] - behind[1:]
 
 

@@ -66,15 +66,6 @@ def test_the_order_of_a_stack_and_the_form_of_its_depths_do_not_matter(fence: Sc
     torch.testing.assert_close(dof.layers(stack, maps), expected)
 
 
-@pytest.mark.parametrize("tolerance", ["draft", "final"])
-def test_a_stack_in_a_batch_is_rendered_as_alone(tolerance: Any) -> None:
-    dof = DepthOfField(CAMERA, tolerance=tolerance)
-    rgba = torch.rand(2, 2, 4, 24, 32, generator=torch.Generator().manual_seed(0))
-    depth = torch.tensor([[1.2, 4.0], [0.6, 30.0]])
-    alone = [dof.layers(rgba[i : i + 1], depth[i : i + 1]) for i in range(2)]
-    torch.testing.assert_close(dof.layers(rgba, depth), torch.cat(alone), rtol=0, atol=0)
-
-
 def test_pixels_without_coverage_stay_transparent_and_light_is_conserved() -> None:
     rgba = torch.zeros(1, 1, 4, 61, 61)
     rgba[..., 24:37, 24:37] = torch.tensor([0.8, 0.4, 0.2, 1.0])[:, None, None]

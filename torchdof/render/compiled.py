@@ -9,12 +9,12 @@ from torch import Tensor
 from .. import native
 from ..optics.aperture import Aperture
 from ..optics.blur_table import BlurTable
-from ..optics.kernel_bank import Spots, bank_of
+from ..optics.kernel_bank import bank_of
 from ..optics.placed_kernels import Shares, ray_shares
 from ..options import Options
 from ..tensors import is_in_memory, is_traced
 from . import headroom
-from .plan import KERNELS_PER_PX, Plan, layer_spots, longest_px
+from .plan import KERNELS_PER_PX, Plan, kernels_of, layer_spots, longest_px
 
 __all__ = ["picture"]
 
@@ -48,7 +48,7 @@ def picture(
     spots = layer_spots(options.table, plan.coc_px, kernels_width, scales, longest_px((height, width), scales))
     if max(spots.half) > native.HALF_LARGEST:
         return None
-    layers = list(zip(_kernels(options.table, spots), scales, strict=True))
+    layers = list(zip(kernels_of(options.table, spots, torch.float32), scales, strict=True))
     render = functools.partial(_render, plan, options, layers, lens_width)
     if cover is not None:
         low, high = plan.coc_px[0], plan.coc_px[-1]
@@ -117,9 +117,5 @@ def _ray_shares(table: BlurTable, size: tuple[int, int], steps: Sequence[int]) -
 def _psfs(table: BlurTable, width: int, longest: int, steps: Sequence[int]) -> list[Tensor]:
     """Kernels ``[1 or C, k, k]`` of highlights with a coc of ``steps / KERNELS_PER_PX`` pixels."""
     coc_px = [step / KERNELS_PER_PX for step in steps]
-    return _kernels(table, bank_of(table).spots(coc_px, width, longest=[longest] * len(coc_px)))
-
-
-def _kernels(table: BlurTable, spots: Spots) -> list[Tensor]:
-    bank = bank_of(table)
-    return native.kernels(spots, squeeze=bank.squeeze, is_round=table.is_round, is_even=bank.is_even)
+    spots = bank_of(table).spots(coc_px, width, longest=[longest] * len(coc_px))
+    return kernels_of(table, spots, torch.float32)

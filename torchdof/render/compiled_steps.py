@@ -32,13 +32,13 @@ def blended(
     """
     given = [[t for t in surface if t is not None] for surface in frame.surfaces]
     tensors = [t for of_surface in given for t in of_surface]
-    if frame.stacked or not _supported(tensors):
+    if frame.stacked or len(frame.nodes) > 1 or not _supported(tensors):
         return None
     if any(kernel.requires_grad or kernel.shape[-1] // 2 > native.HALF_LARGEST for kernel, _ in layers):
         return None
     if frame.colours + max(len(kernel) for kernel, _ in layers) > native.MOST_PLANES:
         return None
-    padded = native.PaddedFrame(frame.margin, frame.area, frame.nodes, layers, frame.occlusion, backed)
+    padded = native.PaddedFrame(frame.margin, frame.area, frame.nodes[0], layers, frame.occlusion, backed)
     result: Tensor = _Blend.apply(padded, list(map(len, given)), plain, *tensors)
     return result
 

@@ -150,7 +150,7 @@ def _composite_layers(
     """
     order = [k for k, occupied in enumerate(frame.occupied()) if occupied][::-1]
     light, colours = frame.surfaces[0].light, frame.colours
-    each = blurs[0].kernel.shape[0]
+    each = blurs[0].kernel.shape[-3]
 
     def blank(height: int, width: int) -> Tensor:
         none = light.new_zeros(light.shape[0], colours, height, width)
@@ -164,7 +164,7 @@ def _composite_layers(
     most = CHANNELS // (colours + (2 if normalised else 1)) if uniform else 1
     runs: dict[tuple[int, bool], list[list[int]]] = {}
     for k in order:
-        groups = runs.setdefault((blurs[k].scale, blurs[k].scale > 1 and frame.nodes[k] < 0), [])
+        groups = runs.setdefault((blurs[k].scale, blurs[k].scale > 1 and min(row[k] for row in frame.nodes) < 0), [])
         group = groups[-1] if groups else []
         widths = [blurs[j].kernel.shape[-1] for j in [*group, k]]
         if group and group[-1] == k + 1 and len(group) < most and max(widths) ** 2 <= 2 * min(widths) ** 2:
@@ -203,7 +203,7 @@ def _scattered(
     Light is ``[B, C, h, w]``; the weights of n layers are ``[B, n, h, w]``, or ``[B, n C, h, w]`` if each colour has
     its own kernel.
     """
-    halo, half, each = max(blurs[k].halo for k in group), max(blurs[k].half for k in group), len(blurs[0].kernel)
+    halo, half, each = max(blurs[k].halo for k in group), max(blurs[k].half for k in group), blurs[0].kernel.shape[-3]
     shares, scale, kernels = blurs[group[0]].shares, blurs[group[0]].scale, blurs[group[0]].kernel
     terms = frame.layers(min(group), len(group), halo)[: 2 + visibility]
     if each > 1:
@@ -217,10 +217,12 @@ def _scattered(
         scattered = field.scattered(shares, channels, kernels, half, scale, frame.size)
     else:
         if len(group) > 1:
-            padded = torch.cat([functional.pad(blurs[k].kernel, (half - blurs[k].half,) * 4) for k in sorted(group)])
-            kernels = torch.cat([padded.repeat_interleave(width, 0) for width in widths])
+            padded = torch.cat(
+                [functional.pad(blurs[k].kernel, (half - blurs[k].half,) * 4) for k in sorted(group)], -3
+            )
+            kernels = torch.cat([padded.repeat_interleave(width, -3) for width in widths], -3)
         elif each > 1:
-            kernels = kernels.repeat(len(terms), 1, 1)
+            kernels = torch.cat([kernels] * len(terms), -3)
         scattered = scatter(channels, kernels, half)
     parts = scattered.split([widths[0]] * len(group) + [width * len(group) for width in widths[1:]], 1)
     return parts[: len(group)], *parts[len(group) :]
@@ -228,7 +230,8 @@ def _scattered(
 
 def _needed(frame: Frame, blurs: Sequence[Blur], layers: list[int]) -> Callable[[], Tensor]:
     """A function that computes whether any pixel within reach of the area lies in these consecutive layers."""
-    ends = (frame.nodes[0] - 1.0, *frame.nodes, frame.nodes[-1] + 1.0)
+    nodes = frame.nodes[0]  # graphs have the same layers for all items
+    ends = (nodes[0] - 1.0, *nodes, nodes[-1] + 1.0)
     halo = max(blurs[k].halo for k in layers)
     return functools.partial(frame.any_between, ends[min(layers)], ends[max(layers) + 2], halo)
 

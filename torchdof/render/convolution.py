@@ -28,7 +28,7 @@ def convolve(light: Tensor, kernels: Tensor, halo: int = 0, turned: bool = False
 
     Args:
         light: ``[B, C, H, W]``.
-        kernels: ``[1 or C, k, k]``, k odd.
+        kernels: ``[1 or C, k, k]``, k odd; or one set for each item, ``[B, 1 or C, k, k]``.
         halo: Pixels on each side that scatter into the result ``[B, C, H - 2 halo, W - 2 halo]`` but are not in it.
         turned: Whether ``conv2d`` needs the kernels turned; those of a round lens are symmetric, which saves the step.
     """
@@ -37,7 +37,7 @@ def convolve(light: Tensor, kernels: Tensor, halo: int = 0, turned: bool = False
         spare = halo - half
         light, halo = light[..., spare : light.shape[-2] - spare, spare : light.shape[-1] - spare], half
     if half == 0:
-        return light * kernels[:, 0, 0, None, None]
+        return light * kernels
     if (2 * half + 1) ** 2 > DIRECT_TAPS and not is_traced():
         wide = widest_float(light.device)
         # the transform's wrap-around falls into the halo, which is cut off
@@ -45,11 +45,15 @@ def convolve(light: Tensor, kernels: Tensor, halo: int = 0, turned: bool = False
         spectrum = torch.fft.rfft2(light.to(wide), s=area) * torch.fft.rfft2(kernels.to(wide), s=area)
         rows, columns = (slice(half + halo, half + n - halo) for n in light.shape[-2:])
         return torch.fft.irfft2(spectrum, s=area)[..., rows, columns].to(light.dtype)
+    kernels = kernels.flip(-2, -1) if turned else kernels
+    if kernels.dim() == 4:  # one group for each channel of each item
+        kernels = kernels.expand(-1, channels, -1, -1).reshape(-1, 1, *kernels.shape[-2:])
+        spread = functional.conv2d(light.flatten(0, 1), kernels, padding=half - halo, groups=len(kernels))
+        return spread.unflatten(0, (len(light), channels))
     spare = -channels % CHANNELS
     if spare and light.device.type == "cpu":
         light = functional.pad(light, (0, 0, 0, 0, 0, spare))
         kernels = functional.pad(kernels, (0, 0, 0, 0, 0, spare)) if kernels.shape[0] > 1 else kernels
-    kernels = kernels.flip(-2, -1) if turned else kernels
     weights = kernels.expand(light.shape[1], -1, -1).unsqueeze(1)
     return functional.conv2d(light, weights, padding=half - halo, groups=light.shape[1])[:, :channels]
 

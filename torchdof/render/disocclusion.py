@@ -41,14 +41,14 @@ BEHIND_STEP = 2**_FINE_LEVELS
 
 
 def surfaces_of_image(
-    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int, ops: Ops = EAGER
+    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: Sequence[int], ops: Ops = EAGER
 ) -> tuple[list[Surface], Tensor]:
     """Splits an image into each pixel's own surface and a second one, mixed or hidden; and the light behind both.
 
     Arguments, and the light behind both, are those of :func:`fill_hidden`.
     """
     if is_compiled():
-        maps = _operator(light, coc_px, valid, threshold, levels)
+        maps = _operator(light, coc_px, valid, threshold, list(levels))
     else:
         maps = _matted_and_filled(light, coc_px, valid, threshold, levels, ops)
     own_light, own_weight, other_light, other_coc, other_weight, behind = maps
@@ -56,7 +56,7 @@ def surfaces_of_image(
 
 
 def _matted_and_filled(
-    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int, ops: Ops
+    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: Sequence[int], ops: Ops
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     matted = matte(light, coc_px, valid)
     own, other, other_coc, weight = attribute_emitters(light, coc_px, threshold, valid, matted)
@@ -68,17 +68,17 @@ def _matted_and_filled(
 
 
 def _empty(
-    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int
+    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: Sequence[int]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     colour, single = light.new_empty(light.shape), coc_px.new_empty(coc_px.shape)
-    behind = light.new_empty(*light.shape[:2], *(behind_size(n, levels) for n in light.shape[-2:]))
+    behind = light.new_empty(*light.shape[:2], *(behind_size(n, max(levels)) for n in light.shape[-2:]))
     return colour, single, torch.empty_like(colour), torch.empty_like(single), torch.empty_like(single), behind
 
 
 # The number of pixels to process depends on the data, which compiled graphs do not support.
 @one_operator("torchdof::surfaces", _empty, differentiable=2)
 def _operator(
-    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int
+    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: Sequence[int]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     maps = (t.contiguous() for t in _matted_and_filled(light, coc_px, valid, threshold, levels, EAGER))
     own, own_weight, other, other_coc, other_weight, behind = maps
@@ -173,7 +173,7 @@ def fill_hidden(
     other_weight: Tensor,
     valid: Tensor | None,
     threshold: Tensor,
-    levels: int,
+    levels: Sequence[int],
     ops: Ops = EAGER,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Fills in light and coc of hidden surfaces, from the farthest surfaces around them.
@@ -195,7 +195,8 @@ def fill_hidden(
         other_weight: Its weight, ``[B, 1, H, W]``, 0 where a pixel is not mixed.
         valid: ``[B, 1, H, W]``, 0 where a pixel is left out; None means all count.
         threshold: Light above which a pixel is a highlight, ``[B, 1, H, W]``; highlights are not filled in elsewhere.
-        levels: Levels of the pyramid, at least 2; the widest search is ``2 ** levels`` pixels.
+        levels: Levels of the pyramid, at least 2, of all items or of each: ``[1]`` or ``[B]``. The widest search is
+            ``2 ** levels`` pixels.
         ops: Reads the levels.
 
     Returns:
@@ -203,7 +204,9 @@ def fill_hidden(
         :data:`BEHIND_STEP`-th pixel, ``[B, C, h, w]``, for an area slightly larger than the image.
     """
     (height, width), colours = coc_px.shape[-2:], light.shape[1]
-    whole = tuple(_continued(n, 2**levels) for n in (height, width))  # pixels of a level, centred on the image
+    sizes = [[_continued(n, 2**own) for own in levels] for n in (height, width)]
+    whole = [max(of_items) for of_items in sizes]  # pixels of a level, centred on the image
+    several = len({*levels}) > 1
 
     # the farther surface of each pixel, dimmed to the threshold
     is_mixed = (other_weight > 0.05) & (other_coc_px > coc_px)
@@ -214,9 +217,14 @@ def fill_hidden(
     far_weight = torch.where(is_mixed, other_weight, 1.0 - other_weight)
     if valid is not None:
         far_coc, far_weight = torch.where(valid > 0, far_coc, -NEVER_PX), far_weight * valid
-    pyramid = [_first_level(far_light, far_coc, far_weight, whole[0] // 2, whole[1] // 2)]
-    for _ in range(1, levels):
-        pyramid.append(_farthest(*pyramid[-1]))
+    pyramid: list[tuple[Tensor, Tensor, Tensor]] = []
+    for level in range(1, max(levels) + 1):
+        values = (
+            _farthest(*pyramid[-1])
+            if pyramid
+            else _first_level(far_light, far_coc, far_weight, *(n // 2 for n in whole))
+        )
+        pyramid.append(_repeated(values, sizes, level) if several else values)
     # cells without valid pixels get the mean light of the others
     light, coc, weight = pyramid[_FINE_LEVELS - 1]
     mean = (light * weight).sum((-2, -1), keepdim=True) / weight.sum((-2, -1), keepdim=True).clamp_min(1e-12)
@@ -249,6 +257,25 @@ def fill_hidden(
     part = hidden / weight.clamp_min(1e-12)
     light, coc_px = torch.lerp(other_light, seen[:, :-1], part), torch.lerp(other_coc_px, seen[:, -1:], part)
     return light, coc_px, weight, behind
+
+
+def _repeated(
+    values: tuple[Tensor, Tensor, Tensor], sizes: Sequence[Sequence[int]], level: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """A level in which each item has the samples that it has alone: of a smaller pyramid, with its border repeated.
+
+    ``sizes`` are the rows and columns of pixels that the pyramid of each item covers, ``[2][B]``; all have one centre.
+    """
+    nearest = []
+    for of_items in sizes:
+        count = max(of_items) >> level
+        own = torch.tensor([[count - (n >> level), count + (n >> level) - 2] for n in of_items]) // 2
+        place = torch.arange(count).expand(len(own), -1)
+        nearest.append(torch.minimum(torch.maximum(place, own[:, :1]), own[:, 1:]).to(values[0].device))
+    rows, columns = nearest
+    item = torch.arange(len(rows), device=rows.device)[:, None, None]
+    light, coc, weight = (t.movedim(1, -1)[item, rows[:, :, None], columns[:, None]].movedim(-1, 1) for t in values)
+    return light, coc, weight
 
 
 def _first_level(

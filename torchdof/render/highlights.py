@@ -83,10 +83,11 @@ def _cells(size: int, side: int, device: torch.device) -> tuple[int, Tensor]:
 def extract(
     surface: Surface,
     limit: Tensor,
-    from_px: float = _LEAST_PX,
+    from_px: float | Tensor = _LEAST_PX,
     beside: Surface | None = None,
     image_coc_px: Tensor | None = None,
-    most_taps: Tensor | float | None = None,
+    most_taps: Tensor | None = None,
+    apart: bool = False,
     ops: Ops = EAGER,
 ) -> tuple[Surface, Highlights | None]:
     """Removes the light above a limit from a surface of an image, to be splatted ray by ray.
@@ -104,29 +105,45 @@ def extract(
     Args:
         surface: A surface of an image.
         limit: Threshold as from :func:`threshold`, ``[B, 1, H, W]``.
-        from_px: Smallest blur of a highlight in pixels; its excess is splatted in full at 1 px more.
+        from_px: Smallest blur of a highlight in pixels, of all items or ``[B, 1, 1, 1]``; its excess is splatted in
+            full at 1 px more.
         beside: The other surface of each pixel.
         image_coc_px: Coc of the image, ``[B, 1, H, W]``; None: the cover stays that of the surface.
-        most_taps: Largest number of rays, as from :func:`affordable_taps`; None: 16 per pixel.
+        most_taps: Largest number of rays of each item ``[B]``, as from :func:`affordable_taps`; None: 16 per pixel.
+        apart: Whether each item keeps to its own number of rays. Otherwise all share the sum of them.
         ops: Keeps a frame without highlights as it is.
 
     Returns:
         The surface with its remaining light, and the highlights, or None without any.
     """
     light, coc_px, weight = surface
-    from_px = max(from_px, _LEAST_PX)
+    area = math.prod(coc_px.shape[1:])
+    from_px = from_px.clamp_min(_LEAST_PX) if isinstance(from_px, Tensor) else max(from_px, _LEAST_PX)
     brightest = light.amax(1, keepdim=True)
     is_bright = (brightest > limit) & (coc_px.detach().abs() > from_px)
     bright = pixels.indices(is_bright if weight is None else is_bright & (weight > 0))
+    if not is_traced() and len(bright) == 0:
+        return surface, None
     peak, coc, most = (pixels.pick(t, bright)[0] for t in (brightest, coc_px, limit))
+    item = bright // area if apart else None
+    if isinstance(from_px, Tensor):
+        from_px = from_px.flatten() if item is None else from_px.flatten().index_select(0, item)
     fades = (coc.abs() - from_px).clamp(max=1.0)
     # the limit at which the rays fit into the budget
-    most_taps = _TAPS_PER_PIXEL * math.prod(coc_px.shape) if most_taps is None else most_taps
-    least = _least_peak(peak.detach(), coc.detach(), ((1.0 - most / peak) * fades).detach(), most_taps)
+    share = ((1.0 - most / peak) * fades).detach()
+    if item is None:
+        budget = _TAPS_PER_PIXEL * math.prod(coc_px.shape) if most_taps is None else most_taps.sum(0)
+        least = _least_peak(peak.detach(), coc.detach(), share, budget)
+    else:
+        own = item == torch.arange(len(coc_px), device=item.device)[:, None]
+        budget = _TAPS_PER_PIXEL * area if most_taps is None else most_taps[:, None]
+        peaks, cocs, shares = (torch.where(own, t.detach(), 0.0) for t in (peak, coc, share))  # 0: of other items
+        least = _least_peak(peaks, cocs, shares, budget)[:, 0].index_select(0, item)
     kept = (peak.detach() > least).nonzero()[:, 0]
     if not is_traced() and len(kept) == 0:
         return surface, None
     bright, peak, fades, coc, most = (t.index_select(0, kept) for t in (bright, peak, fades, coc, most))
+    least = least if item is None else least.index_select(0, kept)
     taken_from, ordinary = pixels.pick(light, bright), torch.maximum(most, least) / peak
     excess = taken_from * ((1.0 - ordinary) * fades)
     # not light - excess, whose rounding error is brighter than a dark scene
@@ -149,32 +166,32 @@ def extract(
 
 
 def affordable_taps(coc_px: Tensor) -> Tensor:
-    """Largest number of rays ``[]`` for a frame with occlusion and coc ``[B, 1, H, W]``: 16 per pixel or fewer.
+    """Largest number of rays ``[B]`` of each frame with occlusion and coc ``[B, 1, H, W]``: 16 per pixel or fewer.
 
     Each ray is tested against each possible occluder, and a noisy depth map has many. So the number is inversely
     proportional to the mean change of the coc between neighbours, above :data:`_FREE_CHANGE_PX`.
     """
-    coc, area = coc_px.detach(), math.prod(coc_px.shape)
-    change = (coc.diff(dim=-1).abs().sum() + coc.diff(dim=-2).abs().sum()) / area
+    coc, area = coc_px.detach(), math.prod(coc_px.shape[1:])
+    change = (coc.diff(dim=-1).abs().sum((1, 2, 3)) + coc.diff(dim=-2).abs().sum((1, 2, 3))) / area
     return _TAPS_PER_PIXEL * area / (change / _FREE_CHANGE_PX).clamp_min(1.0)
 
 
 def _least_peak(peak: Tensor, coc: Tensor, share: Tensor, most_taps: Tensor | float) -> Tensor:
-    """Raised limit ``[1]`` for the light of highlights ``[n]``, at which the number of rays fits the budget.
+    """Raised limit ``[..., 1]`` for the light of highlights ``[..., n]``, at which the number of rays fits the budget.
 
     It is the L that solves ``sum over peaks p > L of taps (1 - L / (2 p)) = most_taps``, or 0 if all rays fit. The
     weights make L grow smoothly with the number of highlights, even equal ones; at most twice ``most_taps`` rays are
-    splatted.
+    splatted. Highlights with a peak of 0 count as none.
     """
     taps = (2.0 * coc.abs() + 1.0) ** 2 * (_WHOLE * share).clamp(max=1.0)
-    values, order = functional.pad(peak.double(), (0, 1)).sort(descending=True)  # with a last peak of 0
-    count = functional.pad(taps.double(), (0, 1)).index_select(0, order)
-    slope = torch.where(values > 0, 0.5 * count / values, 0.0).cumsum(0)
+    values, order = functional.pad(peak.double(), (0, 1)).sort(-1, descending=True)  # with a last peak of 0
+    count = functional.pad(taps.double(), (0, 1)).gather(-1, order)
+    slope = torch.where(values > 0, 0.5 * count / values, 0.0).cumsum(-1)
     budget = torch.as_tensor(most_taps, dtype=count.dtype, device=count.device)
-    count = count.cumsum(0) - budget  # rays beyond the budget at L = 0
-    at_next = count - functional.pad(values[1:], (0, 1)) * slope  # rays beyond the budget at L = the next peak
-    last = (at_next[:-1] < 0).sum(0, keepdim=True)
-    count, slope, value = (t.index_select(0, last) for t in (count, slope, values))
+    count = count.cumsum(-1) - budget  # rays beyond the budget at L = 0
+    at_next = count - functional.pad(values[..., 1:], (0, 1)) * slope  # rays beyond the budget at L = the next peak
+    last = ((at_next < 0) & (values > 0)).sum(-1, keepdim=True)
+    count, slope, value = (t.gather(-1, last) for t in (count, slope, values))
     level = count / torch.where(slope > 0, slope, 1.0)
     return torch.minimum(level.clamp_min(0.0), value).to(peak.dtype)
 
@@ -242,7 +259,6 @@ def _splatted(
         stop = min(stop, start + max(1, _TAPS // (2 * half_of(radii[stop - 1]) + 1) ** 2))
         part = slice(start, stop)
         kernels = kernels_for(table, coc[part], lens_width, longest, kernels_per_px)  # [n, 1 or C, k, k]
-        kernels = kernels.to(light.dtype)
         if shares:
             half_diagonal = 0.5 * math.hypot(height, width)
             y, x = ((row[part] + 0.5 - height / 2) / half_diagonal, (column[part] + 0.5 - width / 2) / half_diagonal)
@@ -274,8 +290,8 @@ class _Occluders:
     def __init__(self, obstacles: Sequence[tuple[Tensor, Tensor]]) -> None:
         coc_px = obstacles[0][0].detach()
         self.height, self.width = int(coc_px.shape[-2]), int(coc_px.shape[-1])
-        self.low = coc_px.amin()
-        shown = [(coc - self.low, cover) for coc, cover in obstacles]  # coc in bins
+        self.low = coc_px.amin((1, 2, 3))
+        shown = [(coc - self.low[:, None, None, None], cover) for coc, cover in obstacles]  # coc in bins
         self.bins = int(torch.stack([place.detach().amax() for place, _ in shown]).amax()) + 2
         self.counts = covered_cells([(place.detach(), cover.detach()) for place, cover in shown], self.bins)
         self.places, self.covers = (torch.stack([t.flatten() for t in maps]) for maps in zip(*shown, strict=True))
@@ -294,7 +310,7 @@ class _Occluders:
             step: Offsets in pixels at which rays land, along each axis, ``[k]``.
         """
         bins = torch.arange(self.bins, device=coc.device)
-        nearer = self.low + bins
+        nearer = self.low.index_select(0, item)[:, None] + bins
         scale = 1.0 - nearer / coc[:, None]  # [n, bins]
         fades = (coc[:, None] - NEARER_PX - nearer).clamp(0.0, 1.0)
         # pairs of a highlight and a bin with a non-empty cell within reach

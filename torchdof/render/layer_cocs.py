@@ -5,15 +5,30 @@ Places and distances are on the blur axis of :mod:`torchdof.render.layer_weights
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
+import numpy as np
 import torch
-import torch.nn.functional as functional
 from torch import Tensor
 
 from ..validation import ends
+from .convolution import widest_float
 from .layer_weights import blur_axis
 
-__all__ = ["DENSE", "border_nodes", "extent", "finest", "on_axis", "slid", "spaced_nodes", "spacing", "widest"]
+__all__ = [
+    "DENSE",
+    "Spread",
+    "border_nodes",
+    "extent",
+    "finest",
+    "on_axis",
+    "slid",
+    "spaced_nodes",
+    "spacing",
+    "spreads",
+    "together",
+    "widest",
+]
 
 DENSE = 0.65
 """Factor on the tolerance for the spacing of coarse layers, if the coc of the scene's border is unknown.
@@ -84,34 +99,61 @@ def extent(coc_px: Tensor) -> tuple[float, float]:
     return low, high
 
 
-def widest(coc_px: Tensor) -> float:
-    """Mean radius in pixels of the most blurred hundredth of a map ``[B, 1, H, W]``; the largest of the batch.
+class Spread(NamedTuple):
+    """What layers of a map are planned from, in host memory."""
+
+    low: float
+    """Nearest place on the blur axis."""
+    high: float
+    """Farthest place."""
+    border: np.ndarray
+    """Places of the pixels at the frame's border, ``[n]``."""
+
+
+def spreads(coc_px: Tensor) -> list[Spread]:
+    """The spread of each item of ``coc_px [B, 1, H, W]``; values on another device are copied to the host once."""
+    known = torch.nan_to_num(coc_px.detach(), nan=0.0, posinf=torch.inf, neginf=-torch.inf)
+    known = known.to(torch.promote_types(known.dtype, torch.float32))
+    both = torch.stack(torch.aminmax(known.flatten(1), dim=1), 1)
+    lines = [known[..., 0, :], known[..., -1, :], known[..., 0], known[..., -1]]
+    x = on_axis(torch.cat([both, *(line.flatten(1) for line in lines)], 1), max(coc_px.shape[-2:]))
+    exact = np.float64 if x.dtype == torch.float64 else np.float32
+    return [Spread(low, high, np.array(border, exact)) for low, high, *border in x.tolist()]
+
+
+def together(spreads: Sequence[Spread]) -> Spread:
+    """The spread of several maps of one scene."""
+    lows, highs, borders = zip(*spreads, strict=True)
+    return Spread(min(lows), max(highs), np.concatenate(borders))
+
+
+def widest(coc_px: Tensor) -> list[float]:
+    """Mean radius in pixels of the most blurred hundredth of each map of ``[B, 1, H, W]``.
 
     A few pixels hardly change it.
     """
     radii = torch.where(torch.isnan(coc_px), 0.0, coc_px).abs().clamp(max=_reach(max(coc_px.shape[-2:]))).flatten(1)
     most = radii.topk(-(-radii.shape[1] // _FEW), sorted=False).values
-    return float(most.double().mean(1).amax())
+    return most.to(widest_float(most.device)).mean(1).tolist()
 
 
-def border_nodes(coc_px: Tensor) -> list[float]:
-    """Places at which many pixels of the frame's border lie.
+def border_nodes(border: np.ndarray) -> list[float]:
+    """Places at which many pixels of the frame's border lie, of their places ``[n]``.
 
     Surfaces continue beyond the frame with the blur of its border. So large areas there have the same few blurs, and
     layers far from these cause visible errors.
     """
-    border = torch.cat([coc_px[..., 0, :], coc_px[..., -1, :], coc_px[..., 0], coc_px[..., -1]], -1)
-    return _crowded(on_axis(border, max(coc_px.shape[-2:])).flatten(), width=1.0, least_share=0.03)
+    return _crowded(border, width=1.0, least_share=0.03)
 
 
-def _crowded(x: Tensor, width: float, least_share: float) -> list[float]:
+def _crowded(x: np.ndarray, width: float, least_share: float) -> list[float]:
     """Places that hold at least ``least_share`` of all ``x [n]``, and at least 16 of them; the most crowded first.
 
     A place is an interval of ``width`` finest distances: three bins of the histogram.
     """
-    bins = torch.round(_in_finest(x) * (3.0 / width)).long()
+    bins = np.rint(_in_finest(x) * (3.0 / width)).astype(int)
     first = int(bins.min())
-    counts = functional.pad(torch.bincount(bins - first), (1, 1))
+    counts = np.pad(np.bincount(bins - first), 1)
     crowds = (counts[:-2] + counts[1:-1] + counts[2:]).tolist()
     places: list[float] = []
     least = max(least_share * len(x), 16)
@@ -120,15 +162,17 @@ def _crowded(x: Tensor, width: float, least_share: float) -> list[float]:
             break
         place = _from_finest((first + i) * width / 3.0)
         if all(abs(place - other) > 0.6 * finest(place) for other in places):
-            # the median is a value that occurs, so pixels of that value lie in this layer alone
-            places.append(float(x[(bins - first - i).abs() <= 1].median()))
+            # the lower median is a value that occurs, so pixels of that value lie in this layer alone
+            crowd = np.sort(x[np.abs(bins - first - i) <= 1])
+            places.append(float(crowd[(len(crowd) - 1) // 2]))
     return places
 
 
-def _in_finest(x: Tensor) -> Tensor:
+def _in_finest(x: np.ndarray) -> np.ndarray:
     """Convert places to numbers of finest distances from focus."""
-    steps = x.abs().clamp(max=_WIDE) / _FINEST + _FINEST_PARTS * (x.abs() / _WIDE).clamp_min(1.0).log()
-    return steps * x.sign()
+    distance = np.abs(x)
+    steps = np.minimum(distance, _WIDE) / _FINEST + _FINEST_PARTS * np.log(np.maximum(distance / _WIDE, 1.0))
+    return np.copysign(steps, x)
 
 
 def _from_finest(steps: float) -> float:

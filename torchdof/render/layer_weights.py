@@ -43,16 +43,25 @@ def from_blur_axis(x: float) -> float:
     return 0.0 if x == 0 else math.copysign(beyond + math.sqrt(beyond * (beyond + 2.0 * _SQUARE_PX)), x)
 
 
-def ramps(nodes: Sequence[float], like: Tensor) -> Tensor:
-    """Start and width of the layers' ramps, ``[2, n + 1]``, for :func:`weights_at_or_behind`.
+def ramps(nodes: Sequence[Sequence[float]], like: Tensor) -> Tensor:
+    """Start and width of the layers' ramps, ``[P, 2, n + 1]``, for :func:`weights_at_or_behind`.
 
     Args:
-        nodes: Places of the layers, strictly increasing: near to far. Every pixel is at or behind the first node, none
-            behind the last.
+        nodes: Places of the layers, near to far: one row for all items of a batch, or one for each item. Every pixel
+            is at or behind the first node, none behind the last. An unused layer, which no pixel lies in, has the
+            place of the next used one, or infinity behind the last used one.
         like: Tensor with the dtype and device of the result.
     """
-    widths = [1.0, *(high - low for low, high in zip(nodes, nodes[1:], strict=False)), 1.0]
-    return like.new_tensor([[-math.inf, *nodes[:-1], math.inf], widths])
+    rows = []
+    for places in nodes:
+        ramp = (-math.inf, 1.0)
+        row = [ramp]
+        for low, high in zip(places, places[1:], strict=False):
+            if high > low:  # else the layer before is unused
+                ramp = (low, high - low) if high < math.inf else (math.inf, 1.0)
+            row.append(ramp)
+        rows.append([*zip(*row, (math.inf, 1.0), strict=True)])
+    return like.new_tensor(rows)
 
 
 def weights_at_or_behind(x: Tensor, ramps: Tensor) -> Tensor:
@@ -60,9 +69,9 @@ def weights_at_or_behind(x: Tensor, ramps: Tensor) -> Tensor:
 
     Args:
         x: Places on the blur axis ``[B, 1, H, W]``; those beyond the outermost nodes belong to these.
-        ramps: All or some columns of the result of :func:`ramps`, ``[2, n]``.
+        ramps: All or some columns of the result of :func:`ramps`, ``[P, 2, n]``.
     """
-    start, width = ramps[..., None, None]
+    start, width = ramps[..., None, None].unbind(1)
     return ((x - start) / width).clamp(0.0, 1.0)
 
 

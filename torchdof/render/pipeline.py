@@ -6,13 +6,16 @@ Each step takes ``ops`` (:mod:`torchdof.render.ops`): one set of operations for 
 import dataclasses
 import functools
 import math
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from .. import native
 from ..options import Options
-from ..tensors import is_differentiated, is_traced
+from ..tensors import is_differentiated, is_in_memory, is_traced
 from ..validation import NAMED_TOLERANCES
 from . import compiled, composite, edges, headroom, highlights
 from .attention import Attention, box_around, weight_map
@@ -21,13 +24,14 @@ from .disocclusion import behind_pixels, surfaces_of_image
 from .layer_weights import blur_axis
 from .matting import matte
 from .ops import EAGER, Ops
-from .plan import Plan
+from .plan import Plan, layers_together
 from .scatter import fold
 from .surfaces import Frame, Surface, framed
 
 __all__ = ["blur", "blur_stack"]
 
 _REACH = 4.0  # largest blur radii: margin rendered around an attention area; smaller changes its light and hidden fill
+_TOGETHER = 2**21  # pixels of items rendered together; larger: fewer, larger operations, and more memory
 _SAME_PX = 0.5  # px of coc: a background at most this far behind the image's surface counts as the same surface
 
 
@@ -94,19 +98,57 @@ def _planned(
     elif plan is not None and not is_traced():
         plan = plan.reaching(torch.cat(maps[1::2]))
     if plan is not None:
-        return _render_item(plan, options, ops, *maps).to(image.dtype)
+        return _render_items([plan], options, ops, *maps).to(image.dtype)
     # one plan for each item, so that the result does not depend on the rest of the batch
-    items = []
-    for item in zip(*(t.split(1) for t in maps), strict=True):
-        cocs = item[1] if behind is None else torch.cat(item[1::2])
-        items.append(_render_item(Plan.of_frame(cocs, options.tolerance), options, ops, *item))
-    return (items[0] if len(items) == 1 else torch.cat(items)).to(image.dtype)
+    scenes = [torch.cat(cocs) for cocs in zip(*(t.split(1) for t in maps[1::2]), strict=True)]
+
+    def render(plans: Sequence[Plan], *maps: Tensor) -> Tensor:
+        return _render_items(plans, options, ops, *maps)
+
+    return _each_planned(render, scenes, options, maps).to(image.dtype)
+
+
+def _each_planned(
+    render: Callable[..., Tensor], scenes: Sequence[Tensor], options: Options, maps: Sequence[Tensor]
+) -> Tensor:
+    """Render items, each with its own plan, as many together as have layers that can be joined.
+
+    Args:
+        render: ``render(plans, *maps)`` renders some items, with one plan or one for each of them.
+        scenes: Coc of all maps of each item, ``[N, 1, H, W]``.
+        options: Options of the rendering.
+        maps: Maps of all items, ``[B, ...]``.
+    """
+    uniform = options.method == "layered" and not options.table.depends_on_place
+    if len(scenes) == 1 or not uniform or (native.chosen() and all(is_in_memory(t, backward=True) for t in maps)):
+        # the compiled engine renders item by item
+        plans = [Plan.of_frame(scene, options.tolerance) for scene in scenes]
+        items = [render([plan], *item) for plan, *item in zip(plans, *(t.split(1) for t in maps), strict=True)]
+        return items[0] if len(items) == 1 else torch.cat(items)
+    plans = Plan.of_items(scenes, options.tolerance)
+    most = max(1, _TOGETHER // math.prod(scenes[0].shape[-2:]))
+    joined = [i for i, plan in enumerate(plans) if len(plan.nodes) > 1]  # a plane has one layer, whose kernel is exact
+    groups = [joined[i : i + most] for i in range(0, len(joined), most)]
+    groups += [[i] for i in range(len(plans)) if i not in joined]
+    items = [maps[0]] * len(plans)
+    for group in groups:
+        parts = maps if len(group) == len(plans) else [torch.cat([t[i : i + 1] for i in group]) for t in maps]
+        rendered = render([plans[i] for i in group], *parts)
+        if len(group) == len(plans):
+            return rendered
+        for i, item in zip(group, rendered.split(1), strict=True):
+            items[i] = item
+    return torch.cat(items)
+
+
+def _levels(plan: Plan) -> int:
+    """Levels of the pyramid from which hidden surfaces are filled."""
+    widest = max(2.0, *map(abs, plan.coc_px))
+    return min(math.ceil(math.log2(widest)) + 1, 7)
 
 
 def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     """Render checked layers ``[B, N, C + 1, H, W]``; see :meth:`torchdof.DepthOfField.layers`."""
-    if len(rgba) > 1 and not is_differentiated(coc_px):  # one plan for each item, independent of the batch
-        return torch.cat([blur_stack(*item, options) for item in zip(rgba.split(1), coc_px.split(1), strict=True)])
     wide = torch.float64 if torch.float64 in (rgba.dtype, coc_px.dtype) else torch.float32
     light, coc = rgba.to(wide), coc_px.to(wide)
     order = torch.where(torch.isfinite(coc), coc, torch.inf).argsort(1)  # near to far
@@ -115,14 +157,21 @@ def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     valid = torch.isfinite(coc) & torch.isfinite(light).all(2, keepdim=True) & (cover > 0)
     cover, coc = torch.where(valid, cover, 0.0), torch.where(valid, coc, coc.new_zeros(()))
     light = torch.where(valid, light * scale[:, None] / cover.clamp_min(1e-12), 0.0)
-    plan = Plan.of_frame(coc.flatten(0, 1), options.tolerance, still=is_differentiated(coc))
-    plan = Plan(plan.nodes, plan.tolerance, rays=False)
     light, coc, cover = (t.gather(1, order.expand_as(t)) for t in (light, coc, cover))
-    return (_render_item(plan, options, EAGER, light, coc, cover=cover) / scale).to(rgba.dtype)
+
+    def render(plans: Sequence[Plan], light: Tensor, coc: Tensor, cover: Tensor) -> Tensor:
+        plans = [dataclasses.replace(plan, rays=False) for plan in plans]
+        return _render_items(plans, options, EAGER, light, coc, cover=cover)
+
+    if is_differentiated(coc):
+        rendered = render([Plan.of_frame(coc.flatten(0, 1), options.tolerance, still=True)], light, coc, cover)
+    else:
+        rendered = _each_planned(render, [*coc], options, [light, coc, cover])
+    return (rendered / scale).to(rgba.dtype)
 
 
-def _render_item(
-    plan: Plan,
+def _render_items(
+    plans: Sequence[Plan],
     options: Options,
     ops: Ops,
     light: Tensor,
@@ -131,7 +180,9 @@ def _render_item(
     behind_coc: Tensor | None = None,
     cover: Tensor | None = None,
 ) -> Tensor:
-    """Render float maps with a plan to ``[B, C, H, W]``: the only entry to both engines.
+    """Render float maps to ``[B, C, H, W]``, with one plan or with one for each item: the only entry to both engines.
+
+    Several plans have more than one layer each, and their table does not depend on the place in the frame.
 
     The maps are either an image ``light [B, C, H, W]`` with ``coc [B, 1, H, W]`` and optionally a known background,
     ``behind_light`` and ``behind_coc``; or, with ``cover [B, N, 1, H, W]``, a stack of layers ``[B, N, ...]``, near to
@@ -145,17 +196,18 @@ def _render_item(
     6. Take the highlights out of the surfaces and splat them ray by ray.
     7. Blur and composite the layers, add the highlights, and undo step 3.
     """
-    if plan.nodes != (0.0,):
+    plan = plans[0]
+    if len(plans) == 1 and plan.nodes != (0.0,):
         picture = compiled.picture(plan, options, light, coc, behind_light, behind_coc, cover, ops.lens_width)
         if picture is not None:
             return picture
-    low, high = plan.coc_px[0], plan.coc_px[-1]  # clamp coc to these: differences of huge values would round badly
+    reach = _of_plans([(plan.coc_px[0], plan.coc_px[-1]) for plan in plans], coc)
     if cover is not None:
-        coc = coc.clamp(low, high)
+        coc = coc.clamp(*(end if isinstance(end, float) else end.unsqueeze(1) for end in reach))
         stack = [Surface(light[:, i], coc[:, i], cover[:, i]) for i in range(light.shape[1])]
         # a black surface behind the layers, for pixels that no layer covers
-        stack.append(Surface(torch.zeros_like(light[:, 0]), torch.full_like(coc[:, 0], high)))
-        return _composite(stack, None, plan, options, ops, image=None)
+        stack.append(Surface(torch.zeros_like(light[:, 0]), torch.zeros_like(coc[:, 0]) + reach[1]))
+        return _composite(stack, None, plans, options, ops, image=None)
     if plan.nodes == (0.0,):
         # all in focus: the image is unchanged; with the term 0 * coc, the coc has a gradient of 0 instead of None
         return light + 0.0 * torch.nan_to_num(coc) if is_differentiated(coc) else light.clone()
@@ -163,15 +215,15 @@ def _render_item(
     if not options.check:
         valid = torch.isfinite(coc) & torch.isfinite(light).all(1, keepdim=True)
         coc, light, weight = torch.where(valid, coc, 0.0), torch.where(valid, light, 0.0), valid.to(light.dtype)
-    coc = coc.clamp(low, high)
+    coc = coc.clamp(*reach)  # differences of huge values would round badly
     scale = headroom.factor(light, behind_light)
     has_room = headroom.has_room(scale)
     if not has_room:
         light, behind_light = light * scale, None if behind_light is None else behind_light * scale
 
     # limit of highlights; without occlusion only those are splatted that a coarse layer would soften
-    crisp_px = plan.crisp_px if options.method == "layered" else math.inf
-    coarse = plan.rays and crisp_px < max(abs(c) for c in plan.coc_px)
+    crisp_px = [plan.crisp_px if options.method == "layered" else math.inf for plan in plans]
+    coarse = any(plan.rays and px < max(map(abs, plan.coc_px)) for plan, px in zip(plans, crisp_px, strict=True))
     limit = highlights.threshold(light, weight) if options.occlusion or options.normalize or coarse else None
     # a plane has one kernel, which is exact unless it changes across the frame: then blocks of pixels share kernels
     several = len(plan.nodes) > 1 or options.table.depends_on_place
@@ -180,21 +232,20 @@ def _render_item(
     # surfaces of each pixel, and the light behind all of them
     surfaces, behind = [Surface(light, coc, weight)], None
     if behind_light is not None and behind_coc is not None and limit is not None:
-        surfaces = _before_background(surfaces[0], behind_light, behind_coc, (low, high), options)
+        surfaces = _before_background(surfaces[0], behind_light, behind_coc, reach, options)
     elif options.occlusion and limit is not None and splatted:
-        widest = max(2.0, *(abs(c) for c in plan.coc_px))
-        levels = min(math.ceil(math.log2(widest)) + 1, 7)
-        surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels, ops)
+        surfaces, behind = surfaces_of_image(light, coc, weight, limit, [*map(_levels, plans)], ops)
 
     # highlights of these surfaces, ray by ray
     splats = None
     if limit is not None and splatted and plan.rays:
-        from_px = 0.0 if options.occlusion else crisp_px - 1.0
+        (from_px,) = [0.0] if options.occlusion else _of_plans([(px - 1.0,) for px in crisp_px], coc)
         # with a known background, mixed pixels need no second surface for their highlights
         beside = surfaces[::-1] if len(surfaces) == 2 else [None] * len(surfaces)
         most = highlights.affordable_taps(coc) if options.occlusion else None
         extracted = [
-            highlights.extract(s, limit, from_px, b, coc, most, ops) for s, b in zip(surfaces, beside, strict=True)
+            highlights.extract(s, limit, from_px, b, coc, most, len(plans) > 1, ops)
+            for s, b in zip(surfaces, beside, strict=True)
         ]
         surfaces, rays = [s for s, _ in extracted], [r for _, r in extracted if r is not None]
         # surfaces that can block rays, the image's own first; a known background is the farthest and blocks none
@@ -204,14 +255,19 @@ def _render_item(
 
     # blur and composite the layers, far to near
     own = 0 if behind_light is None else 1
-    out = _composite(surfaces, behind, plan, options, ops, own, limit, splats)
+    out = _composite(surfaces, behind, plans, options, ops, own, limit, splats)
     out = out if has_room else out / scale
     out = out if valid is None else torch.where(valid, out, image)
     return ops.choose(lambda: blur_axis(coc).abs().max() > 0, out, image)
 
 
+def _of_plans(values: Sequence[Sequence[float]], like: Tensor) -> Sequence[Any]:
+    """The values of the only plan, or tensors ``[B, 1, 1, 1]`` of those of all plans."""
+    return values[0] if len(values) == 1 else like.new_tensor(values)[..., None, None, None].unbind(1)
+
+
 def _before_background(
-    surface: Surface, behind: Tensor, behind_coc: Tensor, reach: tuple[float, float], options: Options
+    surface: Surface, behind: Tensor, behind_coc: Tensor, reach: Sequence[Any], options: Options
 ) -> list[Surface]:
     """Surfaces of an image in front of a known background, near to far; coc is clamped to ``reach``."""
     light, coc, weight = surface
@@ -234,7 +290,7 @@ def _before_background(
 def _composite(
     surfaces: list[Surface],
     behind: Tensor | None,
-    plan: Plan,
+    plans: Sequence[Plan],
     options: Options,
     ops: Ops,
     image: int | None,
@@ -244,12 +300,14 @@ def _composite(
     """Composite surfaces and add highlights; ``image`` is the index of the image's own surface, None for a stack."""
     light, layered = surfaces[0].light, options.method == "layered"
     size = (light.shape[-2], light.shape[-1])
-    blurs = plan.blurs(options.table, size, light.dtype, light.device, layered, ops.lens_width, ops.kernels)
+    nodes, blurs = layers_together(
+        plans, options.table, size, light.dtype, light.device, layered, ops.lens_width, ops.kernels
+    )
     coarsest = max(blur.scale for blur in blurs)
     margin = -(-max(blur.halo for blur in blurs) // coarsest) * coarsest
     behind = None if behind is None else behind_pixels(behind, size)
     lit, multiple = options.occlusion or options.normalize, ops.align(margin, coarsest)
-    frame = framed(surfaces, behind, plan.nodes, margin, multiple, options.occlusion, image != 0, lit, limit, image)
+    frame = framed(surfaces, behind, nodes, margin, multiple, options.occlusion, image != 0, lit, limit, image)
     scatter = functools.partial(convolve, turned=not options.table.is_round) if layered else fold
 
     def scattered(frame: Frame) -> Tensor:

@@ -4,7 +4,9 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
+import torch.nn.functional as functional
 from torch import Tensor
 
 from .. import native
@@ -17,7 +19,16 @@ from . import layer_cocs, traced
 from .downsampling import shrink
 from .layer_weights import blur_axis, from_blur_axis, ramps, weights_at_or_behind
 
-__all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for", "layer_spots", "longest_px"]
+__all__ = [
+    "KERNELS_PER_PX",
+    "Blur",
+    "Plan",
+    "kernels_for",
+    "kernels_of",
+    "layer_spots",
+    "layers_together",
+    "longest_px",
+]
 
 KERNELS_PER_PX = 32  # kernels for highlights, per px of radius; more are smoother and take more memory
 _FEWER_KERNELS_PER_PX = 4  # the same in a graph, which holds all kernels as constants; costs up to 0.02 dB
@@ -31,7 +42,8 @@ _FARTHEST_PX = 1e9  # px: upper limit of nodes; frames are smaller
 class Blur:
     """How one layer is scattered: at every ``scale``-th pixel, with a kernel ``[1 or C, k, k]`` in such pixels.
 
-    ``shares`` are the masks that change the kernel across the frame; None: it is the same everywhere.
+    The kernel is ``[B, 1 or C, k, k]`` if each item of a batch has its own. ``shares`` are the masks that change the
+    kernel across the frame; None: it is the same everywhere.
     """
 
     kernel: Tensor
@@ -97,14 +109,31 @@ class Plan:
         """
         if not still and coc_px.dtype == torch.float32 and is_in_memory(coc_px) and native.chosen():
             return cls(*native.plan(coc_px, tolerance))
-        coc_px = coc_px.detach()
-        extent, shorter = layer_cocs.extent(coc_px), min(coc_px.shape[-2:])
-        part = min(1.0, shorter / (_SMALL_RADII * max(*(abs(from_blur_axis(end)) for end in extent), 1.0)))
-        if part < 1.0:
-            part = min(1.0, shorter / (_SMALL_RADII * max(layer_cocs.widest(coc_px), 1.0)))
-        if still:
-            return cls.still(coc_px, tolerance * 2.0 ** math.floor(math.log2(part)))
-        return cls._between(*extent, coc_px, tolerance * part)
+        return cls.of_items([coc_px], tolerance, still)[0]
+
+    @classmethod
+    def of_items(cls, scenes: Sequence[Tensor], tolerance: float, still: bool = False) -> list["Plan"]:
+        """The plan of :meth:`of_frame` for each scene ``[N, 1, H, W]``, all of one shape.
+
+        Values are copied to the host once for all scenes, and once more if a frame is small beside its blur radii.
+        """
+        coc_px = torch.cat([scene.detach() for scene in scenes])
+        count, shorter = len(scenes[0]), min(coc_px.shape[-2:])
+        spreads = layer_cocs.spreads(coc_px)
+        spreads = [layer_cocs.together(spreads[i : i + count]) for i in range(0, len(coc_px), count)]
+        radii = [max(abs(from_blur_axis(spread.low)), abs(from_blur_axis(spread.high))) for spread in spreads]
+        if shorter < _SMALL_RADII * max(radii):  # otherwise the mean radius is not needed
+            widest = layer_cocs.widest(coc_px)
+            radii = [max(widest[i : i + count]) for i in range(0, len(coc_px), count)]
+        plans = []
+        for (low, high, border), radius in zip(spreads, radii, strict=True):
+            part = min(1.0, shorter / (_SMALL_RADII * max(radius, 1.0)))
+            if still:
+                loose = tolerance * 2.0 ** math.floor(math.log2(part))
+                plans.append(cls(layer_cocs.spaced_nodes(low, high, loose), loose))
+            else:
+                plans.append(cls._between(low, high, border, tolerance * part))
+        return plans
 
     @classmethod
     def of_scene(cls, coc_px: Tensor, tolerance: float) -> "Plan":
@@ -112,19 +141,18 @@ class Plan:
 
         A scene of one plane gets one layer, whose kernel is exact. NaN is ignored.
         """
-        coc_px = coc_px.detach()
-        return cls._between(*layer_cocs.extent(coc_px), coc_px, tolerance)
+        return cls._between(*layer_cocs.together(layer_cocs.spreads(coc_px)), tolerance)
 
     @classmethod
-    def _between(cls, low: float, high: float, coc_px: Tensor, tolerance: float) -> "Plan":
-        """The same, for a scene that spans ``low`` to ``high`` on the blur axis."""
+    def _between(cls, low: float, high: float, border: np.ndarray, tolerance: float) -> "Plan":
+        """The same, for a scene that spans ``low`` to ``high`` on the blur axis, with the places of its border."""
         if high <= low:
             return cls((low,), tolerance)
         fixed = [low, high]
-        for border in layer_cocs.border_nodes(coc_px):
-            finest = layer_cocs.finest(border)
-            if layer_cocs.spacing(border, tolerance) > 2.5 * finest:
-                for node in (border, border - finest, border + finest):
+        for crowded in layer_cocs.border_nodes(border):
+            finest = layer_cocs.finest(crowded)
+            if layer_cocs.spacing(crowded, tolerance) > 2.5 * finest:
+                for node in (crowded, crowded - finest, crowded + finest):
                     if low < node < high and min(abs(node - other) for other in fixed) > 0.6 * finest:
                         fixed.append(node)
         # nodes between the fixed ones slide smoothly onto them, so that the picture does not jump when a scene moves
@@ -133,11 +161,6 @@ class Plan:
             if low < node < high:
                 nodes.add(node if node == 0.0 else layer_cocs.slid(node, fixed, tolerance))
         return cls(tuple(sorted(nodes)), tolerance)
-
-    @classmethod
-    def still(cls, coc_px: Tensor, tolerance: float) -> "Plan":
-        """Layers at places that do not depend on the scene, as many as its coc range needs: for gradients."""
-        return cls(layer_cocs.spaced_nodes(*layer_cocs.extent(coc_px.detach()), tolerance), tolerance)
 
     @classmethod
     def all(cls, max_coc_px: float, tolerance: float, rays: bool = False) -> "Plan":
@@ -153,7 +176,7 @@ class Plan:
 
     def reaching(self, coc_px: Tensor) -> "Plan":
         """This plan with layers added outwards until they span a scene ``[B, 1, H, W]``; itself if none is missing."""
-        nearest, farthest = layer_cocs.extent(coc_px.detach())
+        nearest, farthest = layer_cocs.extent(coc_px)
         if not self.grows or (self.nodes[0] <= nearest and farthest <= self.nodes[-1]):
             return self
         nodes, scene = list(self.nodes), Plan.of_scene(coc_px, self.tolerance)
@@ -166,7 +189,7 @@ class Plan:
     def of_pixels(self, coc_px: Tensor) -> "Plan":
         """The same plan with ``pixels``: the share of a scene ``[B, 1, H, W]`` that lies in each layer."""
         x = layer_cocs.on_axis(coc_px.detach(), max(coc_px.shape[-2:])).clamp(self.nodes[0], self.nodes[-1])
-        ends = ramps(self.nodes, x).split(1, 1)  # one at a time, to bound the memory
+        ends = ramps([self.nodes], x).split(1, -1)  # one at a time, to bound the memory
         behind = [float(weights_at_or_behind(x, end).double().mean()) for end in ends]
         pixels = tuple(behind[k] - behind[k + 1] for k in range(len(self.nodes)))
         return dataclasses.replace(self, pixels=pixels)
@@ -215,7 +238,7 @@ class Plan:
             whole = traced.constants(_layer_kernels, table, self.coc_px, width, scales) if kept is None else kept
             bank = [_masked(k.to(device, dtype), size, s) for k, s in zip(whole, scales, strict=True)]
         else:
-            made = _layer_kernels(table, self.coc_px, width, scales, longest_px(size, scales))
+            made = _layer_kernels(table, self.coc_px, width, scales, longest_px(size, scales), dtype)
             bank = [kernel.to(device, dtype) for kernel in made]
         if not table.depends_on_place:
             return [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
@@ -248,27 +271,113 @@ class Plan:
         return 2 ** sum(reach >= start for start in _COARSE_FROM_PX)
 
 
+def layers_together(
+    plans: Sequence[Plan],
+    table: BlurTable,
+    size: tuple[int, int],
+    dtype: torch.dtype,
+    device: torch.device,
+    coarse: bool,
+    lens_width: int | None = None,
+    kept: Sequence[Tensor] | None = None,
+) -> tuple[list[tuple[float, ...]], list[Blur]]:
+    """Places and blurs of the layers of one plan for a whole batch, or of one plan for each item.
+
+    Layers of several items are joined if they lie on the same side of the focus and have the same resolution. An item
+    with fewer of them than another has unused layers, see :func:`torchdof.render.layer_weights.ramps`.
+
+    Args:
+        plans: One plan, or one for each item; then ``table`` does not depend on the place in the frame.
+        table: As for :meth:`Plan.blurs`, like all others.
+        size: Height and width of the frame.
+        dtype: Type of the kernels.
+        device: Device of the kernels.
+        coarse: Whether layers may have a coarser resolution.
+        lens_width: Width of the image whose kernels are used.
+        kept: Kernels that exist already, of a single plan.
+
+    Returns:
+        Places on the blur axis, ``[P][n]``, and the blur of each of the n layers.
+    """
+    if len(plans) == 1:
+        return [plans[0].nodes], plans[0].blurs(table, size, dtype, device, coarse, lens_width, kept)
+    sizes = [plan.layer_sizes(table, (size[0], lens_width or size[1]), coarse) for plan in plans]
+    scales = [scale for _, of_plan in sizes for scale in of_plan]
+    coc_px = [coc for plan in plans for coc in plan.coc_px]
+    kernels = iter(_layer_kernels(table, coc_px, sizes[0][0], scales, longest_px(size, scales), dtype))
+    # place and kernel of the layers of each plan, by a key that grows from near to far: signed resolution
+    layers: list[dict[int, list[tuple[float, Tensor]]]] = [{} for _ in plans]
+    for of_plan, plan, (_, own_scales) in zip(layers, plans, sizes, strict=True):
+        for node, scale in zip(plan.nodes, own_scales, strict=True):
+            key = 0 if node == 0.0 else int(math.copysign(scale, node))
+            of_plan.setdefault(key, []).append((node, next(kernels)))
+    rows: list[list[float | None]] = [[] for _ in plans]
+    blurs = []
+    for key in sorted({key for of_plan in layers for key in of_plan}):
+        most = max(len(of_plan.get(key, [])) for of_plan in layers)
+        for k in range(most):  # aligned at the focus, where kernels are small
+            column = []
+            for of_plan in layers:
+                own = of_plan.get(key, [])
+                i = k - (most - len(own)) if key < 0 else k
+                column.append(own[i] if 0 <= i < len(own) else None)
+            for row, each in zip(rows, column, strict=True):
+                row.append(None if each is None else each[0])
+            joined = _stacked([None if each is None else each[1] for each in column])
+            blurs.append(Blur(joined.to(device, dtype), max(abs(key), 1)))
+    nodes = []
+    for row in rows:
+        places = [math.inf]
+        for place in reversed(row):  # an unused layer has the place of the next used one
+            places.append(places[-1] if place is None else place)
+        nodes.append(tuple(places[:0:-1]))
+    return nodes, blurs
+
+
+def _stacked(kernels: Sequence[Tensor | None]) -> Tensor:
+    """Kernels ``[1 or C, k, k]`` of one layer, padded to one size: ``[B, 1 or C, k, k]``; 0 where there is none."""
+    largest = max((kernel for kernel in kernels if kernel is not None), key=lambda kernel: kernel.shape[-1])
+    half = largest.shape[-1] // 2
+    empty = torch.zeros_like(largest)
+    padded = [empty if k is None else functional.pad(k, (half - k.shape[-1] // 2,) * 4) for k in kernels]
+    return torch.stack(padded)
+
+
 def longest_px(size: tuple[int, int], scales: Sequence[int]) -> list[int]:
     """Longer side of a frame of ``size`` in pixels of each layer: kernels are cut to it."""
     return [max(-(-max(size) // scale), _LEAST_CUT) for scale in scales]
 
 
 def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int, per_px: int = KERNELS_PER_PX) -> Tensor:
-    """Kernels ``[n, 1 or C, k, k]``, float64, of single pixels, such as highlights, with signed coc ``[n]``.
+    """Kernels ``[n, 1 or C, k, k]`` of single pixels, such as highlights, with signed coc ``[n]``, in its dtype.
 
     Each is interpolated between kernels at ``per_px`` radii per pixel, which gives its gradient too. They are cut to
     the offsets within a frame whose longer side is ``longest`` pixels.
     """
     if table.is_differentiated:
-        kernels = table.kernels(coc_px, width)
+        kernels = table.kernels(coc_px, width).to(coc_px)
     else:
         steps = coc_px.double() * per_px
         below = steps.detach().floor()
         radii, which = torch.unique(torch.stack([below, below + 1.0]), return_inverse=True)
-        of_radii = bank_of(table).kernels(radii / per_px, width, longest=[longest] * len(radii)).to(coc_px.device)
-        kernels = torch.lerp(of_radii[which[0]], of_radii[which[1]], (steps - below)[:, None, None, None])
+        spots = bank_of(table).spots((radii / per_px).tolist(), width, longest=[longest] * len(radii))
+        spots = spots._replace(half=[max(spots.half)] * len(radii))
+        of_radii = torch.stack(kernels_of(table, spots, coc_px.dtype)).to(coc_px)
+        part = (steps - below).to(coc_px.dtype)[:, None, None, None]
+        kernels = torch.lerp(of_radii[which[0]], of_radii[which[1]], part)
     spare = max(0, kernels.shape[-1] // 2 - (longest - 1))
-    return kernels[..., spare : kernels.shape[-1] - spare, spare : kernels.shape[-1] - spare].to(coc_px.device)
+    return kernels[..., spare : kernels.shape[-1] - spare, spare : kernels.shape[-1] - spare]
+
+
+def kernels_of(table: BlurTable, spots: Spots, dtype: torch.dtype = torch.float64) -> list[Tensor]:
+    """Kernels ``[1 or C, k, k]`` on the CPU from their spots; by the compiled engine if float32 suffices."""
+    bank = bank_of(table)
+    usable = is_in_memory(torch.empty(0, device="cpu"))  # new tensors have no memory in torch.func and fake modes
+    if dtype == torch.float32 and spots.moves is None and usable and native.chosen():
+        return native.kernels(spots, squeeze=bank.squeeze, is_round=table.is_round, is_even=bank.is_even)
+    made = bank.of_spots(spots)
+    spare = [made.shape[-1] // 2 - half for half in spots.half]
+    return [k[:, n : k.shape[-1] - n, n : k.shape[-1] - n] for k, n in zip(made, spare, strict=True)]
 
 
 def layer_spots(
@@ -282,9 +391,14 @@ def layer_spots(
 
 @torch.inference_mode(False)  # kept tensors are used by autograd too, which refuses inference tensors
 def _layer_kernels(
-    table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int], longest: Sequence[int] = ()
+    table: BlurTable,
+    coc_px: Sequence[float],
+    width: int,
+    scales: Sequence[int],
+    longest: Sequence[int] = (),
+    dtype: torch.dtype = torch.float64,
 ) -> list[Tensor]:
-    """Kernels ``[1 or C, k, k]`` of the same layers, float64."""
+    """Kernels ``[1 or C, k, k]`` of the same layers, at least as exact as ``dtype``."""
     bank = bank_of(table)
     if table.is_differentiated:  # gradients to the aperture's rotation and squeeze need the PSF itself
         kernels = []
@@ -293,10 +407,7 @@ def _layer_kernels(
             window = 2 * longest[k] - 1 if longest else None
             kernels.append(table.kernels(coarse, width / scale, window=window)[0])
         return kernels
-    spots = layer_spots(table, coc_px, width, scales, longest)
-    made = bank.of_spots(spots)
-    spare = [made.shape[-1] // 2 - half for half in spots.half]
-    return [k[:, n : k.shape[-1] - n, n : k.shape[-1] - n] for k, n in zip(made, spare, strict=True)]
+    return kernels_of(table, layer_spots(table, coc_px, width, scales, longest), dtype)
 
 
 def _masked(kernel: Tensor, size: tuple[int, int], scale: int) -> Tensor:

@@ -1,7 +1,9 @@
 """Surfaces, as the steps of the pipeline exchange them, and the padded frame from which layers are cut."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -56,7 +58,8 @@ class Frame:
 
     Args:
         surfaces: ``[B, ., h + 2 margin, w + 2 margin]`` where ``h, w`` is the area; stacked ones are near to far.
-        nodes: Places of the layers on the blur axis, near to far.
+        nodes: Places of the layers on the blur axis, near to far: one row for the whole batch or one for each item, as
+            for :func:`torchdof.render.layer_weights.ramps`.
         ramps: Ramps of the nodes, from :func:`torchdof.render.layer_weights.ramps`.
         behind: Light behind all surfaces, ``[B, C, h, w]``; None: there is no such light.
         margin: Pixels added on each side, as many as the widest kernel reaches.
@@ -68,7 +71,7 @@ class Frame:
     """
 
     surfaces: Sequence[Placed]
-    nodes: Sequence[float]
+    nodes: Sequence[Sequence[float]]
     ramps: Tensor
     behind: Tensor | None
     margin: int
@@ -100,14 +103,26 @@ class Frame:
 
     def occupied(self) -> list[bool]:
         """Whether any pixel lies in each layer; True for all in traced code, where values cannot be read."""
-        count = len(self.nodes)
+        layers = len(self.nodes[0])
         if is_traced():
-            return [True] * count
-        x = torch.stack([s.x for s in self.surfaces])
+            return [True] * layers
+        x = torch.stack([s.x for s in self.surfaces], 1).reshape(len(self.nodes), -1)
         axis = x.new_tensor(self.nodes)
-        nearer = (torch.bucketize(x, axis, right=True) - 1).clamp(0, count - 1)  # the node at or before
-        counts = torch.bincount((2 * nearer + (x > axis[nearer])).flatten(), minlength=2 * count).tolist()
-        return [any(counts[max(2 * k - 1, 0) : 2 * k + 2]) for k in range(count)]
+        # pixels at each node and behind it; an unused layer has the place of the next used one
+        at = (torch.searchsorted(axis, x, right=True) - 1).clamp_min(0)
+        is_behind = x > axis.gather(1, at)
+        index = 2 * at + is_behind + 2 * layers * torch.arange(len(axis), device=x.device)[:, None]
+        counts = torch.bincount(index.flatten(), minlength=2 * layers * len(axis)).tolist()
+        occupied = [False] * layers
+        for row, places in enumerate(self.nodes):
+            of_row = counts[2 * layers * row :][: 2 * layers]
+            used = [k for k, (x, y) in enumerate(pairwise([*places, math.inf])) if x < y]
+            behind_before = 0
+            for k in used:
+                at, behind = of_row[2 * k : 2 * k + 2]
+                occupied[k] = occupied[k] or at + behind + behind_before > 0
+                behind_before = behind
+        return occupied
 
     def any_between(self, low: float, high: float, halo: int) -> Tensor:
         """Whether a pixel within ``halo`` of the area lies between two places on the blur axis: a bool ``[]``."""
@@ -122,10 +137,9 @@ class Frame:
         ``[B, n, 1, h, w]``.
         """
         surfaces = [Placed(*(self.cut(t, halo) for t in s if t is not None)) for s in self.surfaces]
-        weights = [weights_at_or_behind(s.x, self.ramps[:, first : first + count + 1]) for s in surfaces]
-        if self.occlusion:
-            weights = [eased(weight) for weight in weights]
-        pairs = [(weight[:, :-1, None], weight[:, 1:, None]) for weight in weights]
+        weights = weights_at_or_behind(torch.stack([s.x for s in surfaces]), self.ramps[..., first : first + count + 1])
+        weights = eased(weights) if self.occlusion else weights
+        pairs = [(weight[:, :-1, None], weight[:, 1:, None]) for weight in weights.unbind(0)]
         surfaces = [Placed(*(t.unsqueeze(1) for t in s if t is not None)) for s in surfaces]
         return (_stacked if self.stacked else _mixed)(surfaces, pairs)
 
@@ -190,7 +204,7 @@ def _stacked(surfaces: Sequence[Placed], pairs: Sequence[tuple[Tensor, Tensor]])
 def framed(
     surfaces: Sequence[Surface],
     behind: Tensor | None,
-    nodes: Sequence[float],
+    nodes: Sequence[Sequence[float]],
     margin: int,
     multiple: int,
     occlusion: bool,
@@ -216,19 +230,25 @@ def framed(
     size = (surfaces[0].light.shape[-2], surfaces[0].light.shape[-1])
     height, width = ((n + multiple - 1) // multiple * multiple for n in size)
     beyond = (0, width - size[1], 0, height - size[0])  # pixels added right and below, to whole blocks
-    ends = (margin, margin + beyond[1], margin, margin + beyond[3])
+    around = (margin, margin + beyond[1], margin, margin + beyond[3])
     lights: Sequence[Tensor]
     lights, cocs, weights = zip(*surfaces, strict=True)
-    x = blur_axis(torch.cat(cocs)).clamp(nodes[0], nodes[-1])
+    x = blur_axis(torch.cat(cocs))
+    if len(nodes) == 1:
+        x = x.clamp(nodes[0][0], nodes[0][-1])
+    else:
+        ends = [(row[0], max(place for place in row if place < math.inf)) for row in nodes]
+        low, high = x.new_tensor(ends).repeat(len(surfaces), 1)[..., None, None, None].unbind(1)
+        x = x.clamp(low, high)
     cover = None
     if any(weight is not None for weight in weights):
         cover = torch.cat([torch.ones_like(cocs[0]) if weight is None else weight for weight in weights])
     if lit:
         image_x = None if image is None else x.unflatten(0, (len(surfaces), -1))[image]
-        lights = continued(lights, cover, limit, ends, margin + multiple - 1, x, image_x)
+        lights = continued(lights, cover, limit, around, margin + multiple - 1, x, image_x)
     else:
-        lights = [functional.pad(light, ends) for light in lights]
-    x = functional.pad(x if cover is None else torch.cat([x, cover], 1), ends, mode="replicate")
+        lights = [functional.pad(light, around) for light in lights]
+    x = functional.pad(x if cover is None else torch.cat([x, cover], 1), around, mode="replicate")
     maps = [part.unflatten(0, (len(surfaces), -1)) for part in x.split(1, 1)]
     placed = [Placed(*parts) for parts in zip(lights, *maps, strict=True)]
     if behind is not None:

@@ -1,0 +1,57 @@
+"""What decides the time of the plain engine on a GPU: its operations, and how often it waits for values.
+
+python examples/benchmarks/operations.py SCENES [--occlusion off]
+
+SCENES is a folder of scenes (:func:`torchdof.reference.scenes.read_scenes`). Every row is a scene, or a batch of four
+scenes of one size. A GPU starts each operation separately, and waits for all of them wherever values are read.
+"""
+
+import argparse
+import os
+from typing import Any
+
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from torchdof import blur_by_coc
+from torchdof.reference.scenes import read_scenes
+
+READS = ("_local_scalar_dense", "nonzero", "equal", "_unique2")
+
+
+class Counted(TorchDispatchMode):
+    """Counts operations other than views, and those that read values."""
+
+    operations = reads = 0
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.operations += not function.is_view
+        self.reads += function.overloadpacket.__name__ in READS
+        return function(*args, **(kwargs or {}))
+
+
+def main() -> None:
+    """Print a row for each scene and batch."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes")
+    parser.add_argument("--occlusion", choices=["on", "off"], default="on")
+    arguments = parser.parse_args()
+    os.environ["TORCHDOF_ENGINE"] = "torch"
+    sizes: dict[tuple[int, ...], list[tuple[str, torch.Tensor, torch.Tensor]]] = {}
+    for scene in read_scenes(arguments.scenes):
+        sizes.setdefault(tuple(scene.image.shape), []).append((scene.name, scene.image, scene.coc_px))
+    for scenes in sizes.values():
+        rows = [*scenes]
+        for start in range(0, len(scenes) - 3, 4):
+            names, images, cocs = zip(*scenes[start : start + 4], strict=True)
+            rows.append((f"{names[0]} to {names[-1]}", torch.cat(images), torch.cat(cocs)))
+        for name, image, coc_px in rows:
+            with torch.no_grad():
+                blur_by_coc(image, coc_px, occlusion=arguments.occlusion == "on")  # some tensors are made once
+                with Counted() as counted:
+                    blur_by_coc(image, coc_px, occlusion=arguments.occlusion == "on")
+            print(f"{name:28} {counted.operations:6} operations, {counted.reads:3} times values", flush=True)
+
+
+if __name__ == "__main__":
+    main()
