@@ -196,7 +196,7 @@ def test_likely_mistakes_are_one_warning_per_sequence_or_with_strict_an_error(
         (scene / f"out.{n:04d}.exr").unlink()
     millimetres = f"{SEQUENCE} --focus-m 3 {LENS}"
     result = CliRunner().invoke(app, millimetres.split())
-    assert result.exit_code == 0 and len(list(scene.glob("out.*"))) == 3
+    assert result.exit_code == 0 and len(list(scene.glob("out.*.exr"))) == 3
     assert result.stderr.startswith("warning: depth.0001.npy: nothing is in focus") and result.stderr.count("\n") == 1
     assert "is it millimetres (--depth-scale 0.001)" in result.stderr
     for path in scene.glob("out.*"):
@@ -257,8 +257,9 @@ def test_the_focus_tint_is_continuous_and_keeps_transparent_pixels() -> None:
 
 
 def test_json_has_the_facts_of_the_line(depth: Tensor, run: Run) -> None:
-    run(f"{SEQUENCE} --focus-m 2 --frames 1-1 {LENS}")
-    printed = run(f"{SEQUENCE} --focus-m inf {LENS} --resume --json --attention 18,8,4")
+    line = f"{SEQUENCE} --focus-m inf {LENS} --attention 18,8,4"
+    run(f"{line} --frames 1-1")
+    printed = run(f"{line} --resume --json")
     there, *frames = [json.loads(line) for line in printed.splitlines()]
     assert there == {"out": "out.0001.exr", "is_there_already": True}
     assert [frame["out"] for frame in frames] == ["out.0002.exr", "out.0003.exr"]
@@ -386,7 +387,7 @@ def test_frame_numbers_are_only_in_file_names_never_in_folder_names(scene: Path,
     for n in (1, 2, 3):
         os.replace(f"shot.{n:04d}.exr", f"take #1/shot.{n:04d}.exr")
     run("render --focus-m 2 --frames 2-3", "take #1/shot.####.exr", "depth.npy", "-o", "take #1/out.%03d.exr")
-    assert sorted(p.name for p in (scene / "take #1").glob("out*")) == ["out.002.exr", "out.003.exr"]
+    assert sorted(p.name for p in (scene / "take #1").glob("out*.exr")) == ["out.002.exr", "out.003.exr"]
     run("render image.exr depth.npy --focus-m 2", "-o", "take #2.exr")
     assert (scene / "take #2.exr").is_file()
 

@@ -185,9 +185,7 @@ class Render:
         if files.resume and len(existing) > len(done):
             again = f"{len(existing) - len(done)} of {len(outputs)} frames are rendered again"
             renderer.once.note("again", f"{self.out}: {again}: {reason}")
-        if files.resume or not is_single or record.path.is_file():
-            make_folder_of(self.out)
-            record.write()
+        is_recorded = files.resume or not is_single or record.path.is_file()
         if images and said.depth_kind == "relative" and said.value_range is None and len(numbers) > 1:
             renderer.once.warn(self.depth or self.image, [Mistake("range", _EACH_ITS_OWN)])
         read_files = functools.lru_cache(maxsize=1)(renderer.read)  # a focus pull reads one image many times
@@ -195,7 +193,8 @@ class Render:
         def read(n: int) -> "Frame":
             return read_files(*sources(n))
 
-        self._render_each(renderer, todo, _steadied(read, whole) if images and files.steady else read)
+        frames = _steadied(read, whole) if images and files.steady else read
+        self._render_each(renderer, todo, frames, record if is_recorded else None)
 
     def _options(self) -> dict[str, Any]:
         """The options that change frames."""
@@ -221,8 +220,13 @@ class Render:
             raise FileNotFoundError(f"{without[0]}: there is no such file ({told})")
         return numbers
 
-    def _render_each(self, renderer: "Renderer", files: Mapping[int, Path], read: "Callable[[int], Frame]") -> None:
-        """Renders frames in order; while one is rendered, the next is read and the previous one is written."""
+    def _render_each(
+        self, renderer: "Renderer", files: Mapping[int, Path], read: "Callable[[int], Frame]", record: Record | None
+    ) -> None:
+        """Renders frames in order; while one is rendered, the next is read and the previous one is written.
+
+        The record is written before the first frame, but after it is rendered: an error in it leaves no file.
+        """
         several = len(files) > 1
         with (
             Bar(f"rendering {self.out.name}", len(files) if several else None) as bar,
@@ -237,6 +241,9 @@ class Render:
                     coming += [reader.submit(read, ahead) for ahead in itertools.islice(numbers, 2 - len(coming))]
                     rendered = renderer.render(coming.pop(0).result(), out, n, None if several else bar)
                     written.result()
+                    if k == 0 and record is not None:
+                        make_folder_of(out)
+                        record.write()
                     written = writer.submit(renderer.write, rendered)  # Ctrl-C does not stop this thread
             finally:  # a rendered frame is written even if the next one fails
                 written.result()
