@@ -61,7 +61,7 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
     if large:
         frames.append(("960 x 540", (1, 540, 960), _steps))
     for name, (batch, height, width), shape in frames:
-        image = torch.rand((batch, channels, height, width), generator=random)
+        image = torch.rand((batch, channels, height, width), generator=random, dtype=torch.float32)
         if name.startswith("highlight"):
             image = 0.1 * image
             image[:, :, height // 3, width // 4] = 6.5e4
@@ -74,13 +74,13 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
             coc = functional.avg_pool2d(coc, (1, 5), stride=1, padding=(0, 2), count_include_pad=False)
         elif float(coc.min()) < float(coc.max()):
             # vary the coc: at the exact mean of both neighbours, rounding would decide to which surface a pixel belongs
-            coc = coc * (1.0 + 0.03 * torch.rand(coc.shape, generator=random))
+            coc = coc * (1.0 + 0.03 * torch.rand(coc.shape, generator=random, dtype=coc.dtype))
         if portable.inputs == "coc_px":
             if name == "bad depths":
                 coc[:, :, ::7, 3::11] = math.nan
             yield Case(name, (image, coc))
             continue
-        focus = torch.linspace(1.2, 3.1, batch)
+        focus = torch.linspace(1.2, 3.1, batch, dtype=torch.float32)
         camera, f_number = _lens(portable.dof.camera, focus, 1.05 * coc.abs().amax().clamp_min(1.0), width)
         depth = _depth(camera, coc, width)
         if name.startswith("infinitely far"):
@@ -95,7 +95,7 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
 
 def _ramp(low: float, high: float) -> Callable[[int, int, int], Tensor]:
     def ramp(batch: int, height: int, width: int) -> Tensor:
-        line = torch.linspace(low, high, height * width)
+        line = torch.linspace(low, high, height * width, dtype=torch.float32)
         return line.reshape(1, 1, height, width).repeat(batch, 1, 1, 1)
 
     return ramp
@@ -103,7 +103,7 @@ def _ramp(low: float, high: float) -> Callable[[int, int, int], Tensor]:
 
 def _steps(batch: int, height: int, width: int) -> Tensor:
     """A wall behind the focus, in focus on the left, with a post in front of it."""
-    coc = torch.linspace(0.0, 1.0, width).expand(batch, 1, height, width).clone()
+    coc = torch.linspace(0.0, 1.0, width, dtype=torch.float32).expand(batch, 1, height, width).clone()
     coc[..., width // 3 : width // 2] = -0.7
     return coc
 
@@ -111,7 +111,7 @@ def _steps(batch: int, height: int, width: int) -> Tensor:
 def _lens(camera: Camera, focus: Tensor, reach: Tensor, width: int) -> tuple[Camera, Tensor]:
     """The camera with f-numbers at which infinity has a coc of ``reach`` pixels, and these f-numbers."""
     wide = camera.replace(focus_m=focus, f_number=torch.ones_like(focus))
-    f_number = wide.coc_px(torch.full((len(focus), 1, 1, 1), math.inf), width).flatten() / reach
+    f_number = wide.coc_px(focus.new_full((len(focus), 1, 1, 1), math.inf), width).flatten() / reach
     return wide.replace(f_number=f_number), f_number
 
 

@@ -120,11 +120,11 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
     Raises:
         ValueError: If the channels do not fit the table.
     """
-    table, size = portable.dof.options.table, (2, 64, 64)
+    table = portable.dof.options.table
     if table.channels not in (1, channels):
         raise ValueError(f"the table blurs {table.channels} channels, the image has {channels}")
-    image, map_ = torch.rand(size[0], channels, *size[1:]), torch.rand(size[0], 1, *size[1:]) + 1.0
-    example = (image, map_, *(torch.full(size[:1], value) for value in (1.5, 2.8)[: len(INPUTS[portable.inputs]) - 2]))
+    sizes = [(2, channels, 64, 64), (2, 1, 64, 64), (2,), (2,)][: len(INPUTS[portable.inputs])]
+    example = tuple(torch.ones(size, dtype=torch.float32) for size in sizes)  # the graph does not depend on the values
     traced = copy.copy(portable)
     traced.ops = GraphOps(portable.plan, table, portable.dof.options.method == "layered", portable.width)
     free = torch.export.Dim.AUTO

@@ -50,7 +50,7 @@ def kernels_of(table: BlurTable, plan: Plan, lens_width: int) -> Kernels:
     """Kernels for the highlights of a plan, for an image of ``lens_width`` pixels."""
     farthest = max(abs(c) for c in plan.coc_px)
     count = int(farthest * plan.kernels_per_px) + 2
-    values, size, places = [torch.zeros(table.channels, 1)], 1, []
+    values, size, places = [torch.zeros(table.channels, 1, dtype=torch.float32)], 1, []
     seen: dict[bytes, tuple[int, int]] = {}
     for step in range(-count, count + 1):
         kernel = table.kernels(torch.tensor([step / plan.kernels_per_px], dtype=torch.float64), lens_width)[0].float()

@@ -44,7 +44,7 @@ def test_an_interrupted_sequence_keeps_its_complete_frames_and_resumes(scene: Pa
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=handle_interrupts
     ) as process:
         deadline = time.monotonic() + 60
-        while len(list(scene.glob("out.*"))) < 5 and time.monotonic() < deadline and process.poll() is None:
+        while len(list(scene.glob("out.*.exr"))) < 5 and time.monotonic() < deadline and process.poll() is None:
             time.sleep(0.002)
         process.send_signal(number)
         output, errors = process.communicate(timeout=60)
@@ -84,7 +84,7 @@ def test_a_frame_that_cannot_be_read_or_written_stops_the_sequence_and_is_named(
         Path(broken).mkdir()
     message = run(SEQUENCE, code=2)
     assert message.startswith(f"error: {broken}: ") and message.count("\n") == 1
-    done = sorted(path.name for path in scene.glob("out.*") if path.is_file())
+    done = sorted(path.name for path in scene.glob("out.*.exr") if path.is_file())
     assert done[:2] == ["out.0001.exr", "out.0002.exr"] and "out.0005.exr" not in done and not list(scene.glob(".*"))
 
 

@@ -29,6 +29,8 @@ pytestmark = pytest.mark.usefixtures("scene")  # its files lie in the working fo
 Run = Callable[..., str]
 LENS = "--focal-length-mm 50 --f-number 1.2 --sensor-width-mm 4"  # blurs by 2.1 px
 ONE = "render image.exr depth.npy -o out.exr --focus-m 2"
+OLDER = "older than their files or options"
+PULL = "--focus-m 1:2,3:6 --sensor-width-mm 4 --table lens.json"
 SEQUENCE = "render shot.####.exr depth.####.npy -o out.####.exr"
 CAMERA = torchdof.Camera(focal_length_mm=50.0, f_number=1.2, focus_m=2.0, sensor_width_mm=4.0)
 RENDERED = torchdof.Camera.from_fov(40.0, 0.2, 2.0)
@@ -117,8 +119,8 @@ def test_lights_expand_the_clipped_lamps_of_a_photograph_and_alpha_is_blurred_pr
 
 
 def test_the_line_states_camera_blur_and_table(run: Run) -> None:
-    told = run(f"{ONE} {LENS}")
-    assert run(f"{ONE} --resume") == "out.exr: is there already\n"
+    told = run(f"{ONE} {LENS} --resume")
+    assert run(f"{ONE} {LENS} --resume") == "out.exr: is there already\n"
     assert told.startswith(
         "out.exr: focus 2 m, f/1.2, 50 mm on 4 mm; blur radius up to 2.1 px; disc, layered; 24 x 16;"
     )
@@ -194,7 +196,7 @@ def test_likely_mistakes_are_one_warning_per_sequence_or_with_strict_an_error(
         (scene / f"out.{n:04d}.exr").unlink()
     millimetres = f"{SEQUENCE} --focus-m 3 {LENS}"
     result = CliRunner().invoke(app, millimetres.split())
-    assert result.exit_code == 0 and len(list(scene.glob("out.*"))) == 3
+    assert result.exit_code == 0 and len(list(scene.glob("out.*.exr"))) == 3
     assert result.stderr.startswith("warning: depth.0001.npy: nothing is in focus") and result.stderr.count("\n") == 1
     assert "is it millimetres (--depth-scale 0.001)" in result.stderr
     for path in scene.glob("out.*"):
@@ -255,8 +257,9 @@ def test_the_focus_tint_is_continuous_and_keeps_transparent_pixels() -> None:
 
 
 def test_json_has_the_facts_of_the_line(depth: Tensor, run: Run) -> None:
-    run(f"{SEQUENCE} --focus-m 2 --frames 1-1 {LENS}")
-    printed = run(f"{SEQUENCE} --focus-m inf {LENS} --resume --json --attention 18,8,4")
+    line = f"{SEQUENCE} --focus-m inf {LENS} --attention 18,8,4"
+    run(f"{line} --frames 1-1")
+    printed = run(f"{line} --resume --json")
     there, *frames = [json.loads(line) for line in printed.splitlines()]
     assert there == {"out": "out.0001.exr", "is_there_already": True}
     assert [frame["out"] for frame in frames] == ["out.0002.exr", "out.0003.exr"]
@@ -321,6 +324,49 @@ def test_steady_depth_flickers_less_and_resumed_or_partial_runs_give_the_same_fr
     assert torch.equal(rendered("part", "--steady --frames 7-9", 7, 9), steady[6:9])
 
 
+@pytest.mark.parametrize(
+    ("change", "options", "again", "reason"),
+    [
+        (lambda: None, "--f-number 4", 3, "--f-number changed"),
+        (lambda: None, "--no-occlusion --bits float", 3, "--no-occlusion, --bits changed"),
+        (lambda: np.save("depth.0002.npy", np.full((16, 24), 5.0)), "", 1, OLDER),
+        (lambda: write_image("shot.0003.exr", Picture(torch.ones(1, 3, 16, 24))), "", 1, OLDER),
+        (lambda: np.save("depth.0002.npy", np.full((16, 24), 5.0)), "--steady", 2, OLDER),
+        (lambda: torchdof.BlurTable.gaussian().save("lens.json"), "", 3, OLDER),
+        (
+            lambda: Path("out.####.exr.json").unlink(),
+            "",
+            3,
+            "out.####.exr.json, which has the options of existing frames, is missing",
+        ),
+        (
+            lambda: Path("out.####.exr.json").write_text("[1"),
+            "",
+            3,
+            "out.####.exr.json, which has the options of existing frames, is missing",
+        ),
+        (lambda: guessed(f"{SEQUENCE} --f-number 4 {PULL} --frames 1"), "", 3, "--f-number changed"),
+        (lambda: guessed(f"{SEQUENCE} --f-number 4 {PULL} --frames 1"), "--f-number 4", 2, OLDER),
+    ],
+)
+def test_resume_renders_frames_again_whose_options_or_files_changed(
+    change: Callable[[], object], options: str, again: int, reason: str
+) -> None:
+    torchdof.BlurTable.disc().save("lens.json")
+    line = f"{SEQUENCE} {PULL} {options if options == '--steady' else ''}"
+    guessed(line)
+    kept = "3 of 3 frames are there already\n"
+    assert guessed(f"{line} --resume") == (kept, "")
+    change()
+    line = f"{SEQUENCE} {PULL} {options}"
+    told, noted = guessed(f"{line} --resume")
+    assert told.count("; blur radius") == again and f"{again} of 3 frames" in noted and reason in noted
+    assert guessed(f"{line} --resume") == (kept, "")
+    guessed(line.replace("-o out.", "-o new."))
+    for n in (1, 2, 3):
+        assert torch.equal(pixels(f"out.{n:04d}.exr"), pixels(f"new.{n:04d}.exr"))
+
+
 # Names
 
 
@@ -341,7 +387,7 @@ def test_frame_numbers_are_only_in_file_names_never_in_folder_names(scene: Path,
     for n in (1, 2, 3):
         os.replace(f"shot.{n:04d}.exr", f"take #1/shot.{n:04d}.exr")
     run("render --focus-m 2 --frames 2-3", "take #1/shot.####.exr", "depth.npy", "-o", "take #1/out.%03d.exr")
-    assert sorted(p.name for p in (scene / "take #1").glob("out*")) == ["out.002.exr", "out.003.exr"]
+    assert sorted(p.name for p in (scene / "take #1").glob("out*.exr")) == ["out.002.exr", "out.003.exr"]
     run("render image.exr depth.npy --focus-m 2", "-o", "take #2.exr")
     assert (scene / "take #2.exr").is_file()
 

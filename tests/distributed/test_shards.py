@@ -159,6 +159,26 @@ def test_a_damaged_shard_is_made_again_and_a_complete_one_is_not(
     assert [path.stat().st_mtime_ns for path in sorted(out.iterdir())][2:] == times[2:]
 
 
+def test_a_shard_is_made_again_if_its_settings_or_files_have_changed(pairs: list[Pair], tmp_path: Path) -> None:
+    rows = shard_rows(pairs, per_shard=3)
+    Path(pairs[4].image).unlink()
+
+    def remade(**changes: Any) -> list[int]:
+        before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.tar")}
+        make_shards(tmp_path / "out", rows, **changes)
+        after = {path.name: path.stat().st_mtime_ns for path in sorted((tmp_path / "out").glob("*.tar"))}
+        return [k for k, name in enumerate(after) if after[name] != before.get(name)]
+
+    assert (remade(), remade()) == ([0, 1], [])
+    assert (remade(seed=1), remade(seed=1)) == ([0, 1], [])
+    np.save(str(pairs[0].depth), np.full((12, 16), 2.0))
+    assert (remade(seed=1), remade(seed=1)) == ([0], [])
+    write_image(pairs[4].image, Picture(torch.rand(1, 3, 12, 16)))  # it was missing
+    assert remade(seed=1) == [1] and summary_of(tmp_path / "out").broken == []
+    rows = shard_rows(pairs[::-1], per_shard=3)
+    assert (remade(seed=1), remade(seed=1)) == ([0, 1], [])
+
+
 def test_a_shard_is_written_completely_or_not_at_all(
     pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,10 +1,12 @@
 """Checks that memory does not grow over many renderings: ``make soak``, or ``python -m tests.hard.soak --help``.
 
-Sizes, cameras, tables and options are random. Afterwards threads with a module each, spawned and forked workers must
-render the same pictures.
+Sizes, cameras, tables and options are random, and every second rendering computes gradients. Afterwards threads with a
+module each and spawned workers must render the same pictures with the same gradients, and forked workers, in which
+PyTorch refuses gradients after those of the parent, the same pictures.
 """
 
 import argparse
+import ctypes
 import gc
 import multiprocessing
 import os
@@ -34,14 +36,18 @@ TABLES = [
 
 
 def resident_mb() -> float:
-    """Resident memory of this process without the kernel caches, which are bounded."""
+    """Resident memory of this process without the kernel caches, which are bounded, and without freed memory.
+
+    The C library keeps freed memory for a while, after frames with gradients more than 1 GB.
+    """
     gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     return (pages * os.sysconf("SC_PAGE_SIZE") - sum(cache.bytes for cache in CACHES)) / 2**20
 
 
-def rendering(seed: int) -> torch.Tensor:
-    """A picture of random size, camera, table and options."""
+def rendering(seed: int, gradients: bool = False) -> torch.Tensor:
+    """A picture of random size, camera, table and options; with ``gradients`` those of image and depth, after it."""
     rng, draw = random.Random(seed), torch.Generator().manual_seed(seed)
     height, width = rng.randint(1, 200), rng.randint(1, 260)
     image = torch.rand(rng.choice((1, 1, 2)), 3, height, width, generator=draw)
@@ -56,8 +62,18 @@ def rendering(seed: int) -> torch.Tensor:
         check=rng.random() < 0.7,
         depth_edges=rng.choice(("auto", "repair", "as given")),
     )
-    with torch.inference_mode():
-        return dof(image, depth)
+    if not gradients:
+        with torch.inference_mode():
+            return dof(image, depth).flatten()
+    inputs = [image.requires_grad_(), depth.requires_grad_()]
+    out = dof(*inputs)
+    found = torch.autograd.grad(out.square().sum(), inputs)
+    return torch.cat([t.detach().flatten() for t in (out, *found)])
+
+
+def every_second_with_gradients(seed: int) -> torch.Tensor:
+    """The rendering of a seed, with gradients if it is odd."""
+    return rendering(seed, seed % 2 == 1)
 
 
 def main() -> None:
@@ -68,20 +84,21 @@ def main() -> None:
     arguments = parser.parse_args()
     start, sizes = time.monotonic(), []
     for seed in range(arguments.renderings):
-        assert torch.isfinite(rendering(seed)).all(), f"seed {seed}"
+        assert torch.isfinite(every_second_with_gradients(seed)).all(), f"seed {seed}"
         if (seed + 1) % (arguments.renderings // 5) == 0:
             sizes.append(resident_mb())
             print(f"{seed + 1:6} renderings, {sizes[-1]:.1f} MB", flush=True)
     growth = max(sizes[-2:]) / sizes[0] - 1
     print(f"{growth:+.2%}")
-    truth = list(map(rendering, range(arguments.pictures)))
     pools: dict[str, Executor] = {"8 threads": ThreadPoolExecutor(8)}
     for kind in ("spawn", "fork"):  # forked workers come from this process, which has rendered before
         pools[f"workers by {kind}"] = ProcessPoolExecutor(2, multiprocessing.get_context(kind))
     equal = True
     for name, pool in pools.items():
+        render = rendering if "fork" in name else every_second_with_gradients
+        truth = list(map(render, range(arguments.pictures)))
         with pool:
-            pictures = list(pool.map(rendering, range(arguments.pictures), timeout=300))
+            pictures = list(pool.map(render, range(arguments.pictures), timeout=300))
         same = all(map(torch.allclose, pictures, truth))  # up to rounding: sums depend on PyTorch's number of threads
         print(f"{name}: {len(truth)} pictures {'are the same' if same else 'DIFFER'}")
         equal = equal and same

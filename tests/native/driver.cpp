@@ -1,4 +1,5 @@
-// Renders random scenes, and repairs the edges of their depth, through the C interface, for the sanitizers: `make sanitize`.
+// Renders random scenes, repairs the edges of their depth, and computes the steps of a rendering that have a gradient,
+// through the C interface, for the sanitizers: `make sanitize`.
 //
 // Each scene is rendered by one thread first. Then several callers at once, each with threads of its own, must get the
 // same bits, and one that is cancelled must come back. What a picture should look like is for the tests in Python.
@@ -234,33 +235,163 @@ void check(unsigned seed) {
   for (std::thread &caller : callers) caller.join();
 }
 
-// Depth edges of a scene, steps and ramps: by any number of threads the same.
+// What `compute` gives must be finite, and the same for any number of threads. `what` names it.
+template <typename Compute>
+void check_threads(const Compute &compute, const char *what, int scene) {
+  const std::vector<float> alone = compute(1);
+  if (!std::all_of(alone.begin(), alone.end(), [](float value) { return std::isfinite(value); })) {
+    std::fprintf(stderr, "driver: %s\n", what);
+    fail("it is not finite", scene);
+  }
+  std::vector<std::thread> callers;
+  for (int threads : {2, 5})
+    callers.emplace_back([&, threads] {
+      if (same_bits(alone, compute(threads))) return;
+      std::fprintf(stderr, "driver: %s\n", what);
+      fail("it depends on the number of threads", scene);
+    });
+  for (std::thread &caller : callers) caller.join();
+}
+
+// Depth edges of a scene, steps and ramps.
 void check_edges(unsigned seed) {
   const Scene made(seed);
   const torchdof_scene &scene = made.scene;
   const size_t pixels = size_t(scene.height) * scene.width;
   std::vector<float> nearness = made.coc[0];
   for (size_t i = 0; seed % 2 && i + 2 < pixels; i++) nearness[i] = (made.coc[0][i] + made.coc[0][i + 1] + made.coc[0][i + 2]) / 3;
-  std::vector<float> steps(pixels, 0.5f), alone(pixels);
-  const auto repair = [&](int threads, std::vector<float> &out) {
+  const std::vector<float> steps(pixels, 0.5f);
+  const auto repair = [&](int threads) {
+    std::vector<float> out(pixels);
     const int32_t never = 0;
     const torchdof_map map = {scene.height, scene.width, scene.channels, made.light[0].data(), nearness.data(),
                               int(seed) % 2, seed % 3 ? nullptr : steps.data(), 1.0f, int(seed) % 5 == 0, threads, &never, out.data()};
     int32_t changed = 0;
     if (torchdof_repair_edges(&map, &changed) != TORCHDOF_OK) fail("its edges cannot be repaired", int(seed));
     if (!changed) out = nearness;
+    for (size_t i = 0; i < pixels; i++) {
+      if (std::isfinite(nearness[i])) continue;
+      if (std::memcmp(&out[i], &nearness[i], sizeof(float))) fail("a value that is not finite is changed", int(seed));
+      out[i] = 0.0f;
+    }
+    return out;
   };
-  repair(1, alone);
-  for (size_t i = 0; i < pixels; i++)
-    if (std::isfinite(nearness[i]) && !std::isfinite(alone[i])) fail("a repaired edge is no number", int(seed));
-  std::vector<std::thread> callers;
-  for (int threads : {2, 5})
-    callers.emplace_back([&, threads] {
-      std::vector<float> out(pixels);
-      repair(threads, out);
-      if (!same_bits(alone, out)) fail("the number of threads changes its edges", int(seed));
-    });
-  for (std::thread &caller : callers) caller.join();
+  check_threads(repair, "repaired edges", int(seed));
+}
+
+std::vector<float> noise(std::mt19937 &random, size_t count, double low, double high) {
+  std::uniform_real_distribution<> number(low, high);
+  std::vector<float> values(count);
+  for (float &value : values) value = float(number(random));
+  return values;
+}
+
+void append(std::vector<float> &all, const std::vector<float> &more) { all.insert(all.end(), more.begin(), more.end()); }
+
+// One surface or two, blended with the layers of a scene, and the gradient of that.
+void check_blend(unsigned seed) {
+  const Scene made(seed);
+  std::mt19937 random(seed);
+  const auto integer = [&](int low, int high) { return std::uniform_int_distribution<int>(low, high)(random); };
+  const int largest = *std::max_element(made.scales.begin(), made.scales.end());
+  torchdof_layers frame{};
+  frame.margin = largest * integer(1, 3);
+  frame.height = largest * integer(1, 80 / largest);
+  frame.width = largest * integer(1, 120 / largest);
+  frame.rows = frame.height + 2 * frame.margin;
+  frame.columns = frame.width + 2 * frame.margin;
+  frame.channels = made.scene.channels;
+  frame.surfaces = integer(1, 2);
+  frame.occlusion = integer(0, 3) > 0;
+  frame.backed = integer(0, 1);
+  frame.layers = made.scene.layers;
+  frame.nodes = made.scene.nodes;
+  frame.scales = made.scene.scales;
+  frame.halves = made.scene.halves;
+  frame.kernel_colours = made.scene.kernel_colours;
+  frame.kernels = made.scene.kernels;
+  const size_t pixels = size_t(frame.rows) * frame.columns;
+  std::vector<float> light[2], place[2], weight[2];
+  const float *light_at[2], *place_at[2], *weight_at[2];
+  for (int s = 0; s < frame.surfaces; s++) {
+    const double ends[] = {made.nodes[integer(0, frame.layers - 1)], made.nodes[integer(0, frame.layers - 1)]};
+    light[s] = noise(random, pixels * frame.channels, 0.0, 1.0);
+    place[s] = noise(random, pixels, std::min(ends[0], ends[1]), std::max(ends[0], ends[1]));
+    for (int r = integer(0, 20); r > 0; r--) place[s][integer(0, int(pixels) - 1)] = float(ends[r % 2]);
+    weight[s] = noise(random, integer(0, 1) ? pixels : 0, 0.0, 1.0);
+    light_at[s] = light[s].data();
+    place_at[s] = place[s].data();
+    weight_at[s] = weight[s].empty() ? nullptr : weight[s].data();
+  }
+  frame.light = light_at;
+  frame.place = place_at;
+  frame.weight = weight_at;
+  const size_t planes = frame.channels + frame.kernel_colours;
+  const std::vector<float> slopes = noise(random, planes * frame.height * frame.width, -1.0, 1.0);
+  const auto blend = [&](int threads) {
+    const int32_t never = 0, cancelled = 1;
+    torchdof_layers its_frame = frame;
+    its_frame.threads = threads;
+    its_frame.cancelled = &cancelled;
+    std::vector<float> all(slopes.size());
+    const int result = torchdof_blend(&its_frame, all.data());
+    if (result != TORCHDOF_CANCELLED && result != TORCHDOF_OK) fail("cancelling its layers is an error", int(seed));
+    its_frame.cancelled = &never;
+    if (torchdof_blend(&its_frame, all.data()) != TORCHDOF_OK) fail("its layers cannot be blended", int(seed));
+    std::vector<float> of_light[2], of_place[2], of_weight[2];
+    float *of_light_at[2], *of_place_at[2], *of_weight_at[2];
+    for (int s = 0; s < frame.surfaces; s++) {
+      of_light[s].assign(light[s].size(), 0.0f);
+      of_place[s].assign(place[s].size(), 0.0f);
+      of_weight[s].assign(weight[s].size(), 0.0f);
+      of_light_at[s] = of_light[s].data();
+      of_place_at[s] = of_place[s].data();
+      of_weight_at[s] = weight[s].empty() ? nullptr : of_weight[s].data();
+    }
+    if (torchdof_blend_gradient(&its_frame, slopes.data(), of_light_at, of_place_at, of_weight_at) != TORCHDOF_OK)
+      fail("its layers have no gradient", int(seed));
+    for (int s = 0; s < frame.surfaces; s++)
+      for (const std::vector<float> *part : {&of_light[s], &of_place[s], &of_weight[s]}) append(all, *part);
+    return all;
+  };
+  check_threads(blend, "blended layers", int(seed));
+}
+
+// Surfaces behind pixels, read from one to four levels of a pyramid, and the gradient of that.
+void check_look_behind(unsigned seed) {
+  std::mt19937 random(seed);
+  const auto integer = [&](int low, int high) { return std::uniform_int_distribution<int>(low, high)(random); };
+  const int channels = integer(1, TORCHDOF_MOST_PLANES), count = integer(1, TORCHDOF_MOST_LEVELS);
+  const int rows = (2 << count) * integer(1, 5), columns = (2 << count) * integer(1, 7);  // pixels of all levels
+  const int height = integer(1, rows), width = integer(1, columns);
+  const size_t pixels = size_t(height) * width;
+  std::vector<std::vector<float>> values;
+  std::vector<torchdof_level> levels;
+  for (int l = 0; l < count; l++) {
+    const int step = 2 << l;
+    const size_t size = size_t(rows / step) * (columns / step);
+    values.push_back(noise(random, size * channels, 0.0, 1.0));
+    append(values[l], noise(random, size, -20.0, 20.0));
+    append(values[l], noise(random, size, 0.0, 1.0));
+    levels.push_back({values[l].data(), rows / step, columns / step, step, 0.5f * step, 4.0f, 2.0f});
+  }
+  const std::vector<float> coc = noise(random, pixels, -20.0, 20.0), slopes = noise(random, (channels + 2) * pixels, -1.0, 1.0);
+  const auto look = [&](int threads) {
+    std::vector<float> all(slopes.size()), of_coc(pixels);
+    std::vector<std::vector<float>> of_levels;
+    std::vector<float *> of_levels_at;
+    for (const std::vector<float> &of_level : values) of_levels.emplace_back(of_level.size(), 0.0f);
+    for (std::vector<float> &of_level : of_levels) of_levels_at.push_back(of_level.data());
+    if (torchdof_look_behind(levels.data(), count, channels, coc.data(), height, width, threads, all.data()) != TORCHDOF_OK)
+      fail("surfaces behind cannot be found", int(seed));
+    if (torchdof_look_behind_gradient(levels.data(), count, channels, coc.data(), height, width, threads, slopes.data(),
+                                      of_levels_at.data(), of_coc.data()) != TORCHDOF_OK)
+      fail("surfaces behind have no gradient", int(seed));
+    append(all, of_coc);
+    for (const std::vector<float> &of_level : of_levels) append(all, of_level);
+    return all;
+  };
+  check_threads(look, "surfaces behind", int(seed));
 }
 
 }  // namespace
@@ -272,6 +403,8 @@ int main(int count, char **arguments) {
     for (int seed = 0; seed < scenes; seed++) {
       check(unsigned(seed));
       check_edges(unsigned(seed));
+      check_blend(unsigned(seed));
+      check_look_behind(unsigned(seed));
     }
     std::printf("driver: %d scenes, %s\n", scenes, instructions);
   }

@@ -129,9 +129,23 @@ def _parameters(kind: type[Any], group: str) -> Iterator[tuple[click.Parameter, 
             yield _parameter(field, hint), field.metadata["group"] or group
 
 
+def options_of(command: Any) -> dict[str, Any]:
+    """Values of a command's arguments and options, also those of its groups, by their first spelling."""
+    values: dict[str, Any] = {}
+    for field in dataclasses.fields(command):
+        value = getattr(command, field.name)
+        values |= options_of(value) if dataclasses.is_dataclass(value) else {_spellings(field)[0]: value}
+    return values
+
+
+def _spellings(field: Any) -> tuple[str, ...]:
+    names: tuple[str, ...] = field.metadata["names"]
+    return (field.name.upper(),) if names == ("argument",) else names or (f"--{field.name.replace('_', '-')}",)
+
+
 def _parameter(field: Any, hint: Any) -> click.Parameter:
     """Argument or option for a field of type ``hint``; a tuple without a ``read`` of its own takes several values."""
-    details, names = dict(field.metadata["details"]), field.metadata["names"]
+    details = dict(field.metadata["details"])
     required = field.default is dataclasses.MISSING
     several = typing.get_origin(hint) is tuple and "callback" not in details
     if typing.get_args(hint) and typing.get_origin(hint) is not Literal:  # X | None, tuple[X, ...]
@@ -139,14 +153,13 @@ def _parameter(field: Any, hint: Any) -> click.Parameter:
     details.setdefault("type", click.Choice(typing.get_args(hint)) if typing.get_origin(hint) is Literal else hint)
     if not required and field.default not in (None, ()):
         details["default"] = field.default
-    if names == ("argument",):
+    if field.metadata["names"] == ("argument",):
         return click.Argument([field.name], nargs=-1 if several else 1, required=required, **details)
     if hint is bool:
         details["is_flag"] = True
     else:
         details |= {"multiple": several, "show_default": bool(field.default) and not required}
-    spelled = names or (f"--{field.name.replace('_', '-')}",)
-    return click.Option([field.name, *spelled], required=required, **details)
+    return click.Option([field.name, *_spellings(field)], required=required, **details)
 
 
 def _made(kind: type[Any], values: dict[str, Any]) -> Any:

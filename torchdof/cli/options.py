@@ -62,6 +62,10 @@ class Blur(Opening):
 
     table: str = option("disc, gaussian, a shipped table such as sato_j15, or a JSON file.", "disc", basic=True)
 
+    def files(self) -> list[Path]:
+        """The table and the picture of the opening, if they are files."""
+        return [Path(name) for name in (self.table, self.aperture) if name is not None and Path(name).is_file()]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Accuracy:

@@ -2,19 +2,21 @@
 
 import dataclasses
 import functools
+import importlib.metadata
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from ..io.sequence import FramePattern, parse_frames
-from .command import argument, numbers, option
-from .options import Accuracy, Blur, check_files, json_option
+from .command import argument, numbers, option, options_of
+from .options import Accuracy, Blur, check_files, json_option, make_folder_of
 from .printed import Bar, json_line
+from .resume import Record
 from .scene import Scene
 
 if TYPE_CHECKING:
@@ -27,6 +29,7 @@ _EACH_ITS_OWN = (
     "far have in all frames: --value-range LOW,HIGH"
 )
 Encoding = Literal["linear", "srgb"]
+_NOT_OF_FRAMES = ("--out", "--sheet", "--frames", "--resume", "--strict", "--device", "--json")  # do not change them
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -42,7 +45,9 @@ class _Files:
     sheet: Path | None = option("Also write the image, its depth and the result side by side to this file.")
     frames: tuple[int, int] | None = option("Part of a sequence.", metavar="FIRST-LAST", read=parse_frames)
     steady: bool = option("Filter depth of a sequence along time, where neither image nor depth moved.", False)
-    resume: bool = option("Render only the frames that OUT lacks.", False)
+    resume: bool = option(
+        "Render only the frames that OUT lacks, or that are older than their files or than other options.", False
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,7 +66,8 @@ class Render:
 
         torchdof render shot.exr -o out.exr --fov-deg 40 --aperture-radius-m 0.012 --focus-m 2
 
-    A sequence with a focus pull from 2 m to 5.5 m; --resume continues after an interruption:
+    A sequence with a focus pull from 2 m to 5.5 m; --resume continues after an interruption. OUT.json has the options,
+    so that --resume renders frames again if the options, their files or a table have changed since:
 
         torchdof render shot.####.exr -o out.####.exr --focus-m 1:2,48:5.5 --f-number 2 --resume
 
@@ -126,8 +132,9 @@ class Render:
     def run(self) -> None:
         """Renders one image, the frames of a sequence, or a focus pull in a still image.
 
-        1. List the frames, and check all their files; with ``--resume`` leave out those that are there.
-        2. Render them in order.
+        1. List the frames, and check all their files.
+        2. With ``--resume`` leave out those that are there, and neither their options nor their files have changed.
+        3. Record the options, and render the frames in order.
         """
         images, depths, files = _pattern(self.image), _pattern(self.depth), self.files
         keys = (self.scene.lens.focus_m or []) if images is None else []
@@ -155,7 +162,15 @@ class Render:
         outputs = {n: target(n) for n in numbers}
         for n, out in outputs.items():
             check_files(*sources(n), out)
-        done = {out for out in outputs.values() if files.resume and out.is_file()}
+        whole = list(numbers)  # frames of the sequence, each of which may depend on those before it
+        if images and files.steady:
+            whole = [n for n in images.frames() if depths is None or depths.name(n).is_file()]
+        record, existing = Record(self.out, self._options()), [out for out in outputs.values() if out.is_file()]
+        reason, done = record.difference(), set[Path]()
+        if files.resume and not reason:
+            tables = self.blur.files()
+            done = record.kept(outputs, {n: [*sources(n), *tables] for n in whole}, files.steady)
+            reason = "they are older than their files or options"
         if done:
             share = f"{self.out}: is" if is_single else f"{len(done)} of {len(outputs)} frames are"
             lines = [json_line({"out": str(out), "is_there_already": True}) for out in sorted(done)]
@@ -167,6 +182,10 @@ class Render:
         from .frame import Renderer
 
         renderer, said = Renderer(self, scene, is_still=images is None), scene.depth_map
+        if files.resume and len(existing) > len(done):
+            again = f"{len(existing) - len(done)} of {len(outputs)} frames are rendered again"
+            renderer.once.note("again", f"{self.out}: {again}: {reason}")
+        is_recorded = files.resume or not is_single or record.path.is_file()
         if images and said.depth_kind == "relative" and said.value_range is None and len(numbers) > 1:
             renderer.once.warn(self.depth or self.image, [Mistake("range", _EACH_ITS_OWN)])
         read_files = functools.lru_cache(maxsize=1)(renderer.read)  # a focus pull reads one image many times
@@ -174,11 +193,13 @@ class Render:
         def read(n: int) -> "Frame":
             return read_files(*sources(n))
 
-        if images and files.steady:
-            whole = [n for n in images.frames() if depths is None or depths.name(n).is_file()]
-            self._render_each(renderer, todo, _steadied(read, whole))
-        else:
-            self._render_each(renderer, todo, read)
+        frames = _steadied(read, whole) if images and files.steady else read
+        self._render_each(renderer, todo, frames, record if is_recorded else None)
+
+    def _options(self) -> dict[str, Any]:
+        """The options that change frames."""
+        options = {name: value for name, value in options_of(self).items() if name not in _NOT_OF_FRAMES}
+        return options | {"files": self.blur.files(), "torchdof": importlib.metadata.version("torchdof")}
 
     def _numbers(self, images: FramePattern, depths: FramePattern | None) -> Sequence[int]:
         """Numbers of the requested frames of a sequence; refuses frames without an image or a depth."""
@@ -199,8 +220,13 @@ class Render:
             raise FileNotFoundError(f"{without[0]}: there is no such file ({told})")
         return numbers
 
-    def _render_each(self, renderer: "Renderer", files: Mapping[int, Path], read: "Callable[[int], Frame]") -> None:
-        """Renders frames in order; while one is rendered, the next is read and the previous one is written."""
+    def _render_each(
+        self, renderer: "Renderer", files: Mapping[int, Path], read: "Callable[[int], Frame]", record: Record | None
+    ) -> None:
+        """Renders frames in order; while one is rendered, the next is read and the previous one is written.
+
+        The record is written before the first frame, but after it is rendered: an error in it leaves no file.
+        """
         several = len(files) > 1
         with (
             Bar(f"rendering {self.out.name}", len(files) if several else None) as bar,
@@ -215,6 +241,9 @@ class Render:
                     coming += [reader.submit(read, ahead) for ahead in itertools.islice(numbers, 2 - len(coming))]
                     rendered = renderer.render(coming.pop(0).result(), out, n, None if several else bar)
                     written.result()
+                    if k == 0 and record is not None:
+                        make_folder_of(out)
+                        record.write()
                     written = writer.submit(renderer.write, rendered)  # Ctrl-C does not stop this thread
             finally:  # a rendered frame is written even if the next one fails
                 written.result()

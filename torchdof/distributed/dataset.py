@@ -87,7 +87,8 @@ def make_dataset(
 ) -> Summary:
     """Makes the missing shards of a data set, on the Ray cluster in use or on this machine.
 
-    After an interruption, a call with the same arguments continues with the shards that are not complete.
+    After an interruption, a call with the same arguments continues with the shards that are not complete, or whose
+    input files have changed since.
 
     Args:
         pairs: Images and depths.
@@ -121,8 +122,11 @@ def make_dataset(
     settings = {"images": len(pairs), "copies": copies, "per_shard": per_shard, "sha256_of_samples": digest}
     settings = json.loads(json.dumps(settings | made.settings()))  # tuples become lists
     _same_as_before(out / "plan.json", settings)
-    missing = [row for row in rows if samples_of(out / name_of(row["shard"], format)) is None]
+    missing = [row for row in rows if made.samples_of(**row) is None]
+    again = sum(samples_of(out / name_of(row["shard"], format)) is not None for row in missing)
     say(f"{len(rows) - len(missing)} of {len(rows)} shards are there already")
+    if again:
+        say(f"{again} of {len(rows)} shards are made again: their input files have changed")
     if missing:
         if not ray.is_initialized():
             ray.init(include_dashboard=False)

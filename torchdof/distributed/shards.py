@@ -1,9 +1,10 @@
 """Makes one shard of a data set: reads images, blurs them with random or given cameras, writes all samples or none.
 
-A shard's file name is its number, and its contents depend only on its row and the seed. A run that was interrupted can
-therefore continue with the missing shards, and gives the same files as an uninterrupted one.
+A shard's file name is its number, and its contents depend only on its row, its input files and the settings. A run that
+was interrupted can therefore continue with the missing shards, and gives the same files as an uninterrupted one.
 """
 
+import contextlib
 import dataclasses
 import hashlib
 import importlib.metadata
@@ -92,11 +93,12 @@ def name_of(shard: int, format: Format) -> str:
     return f"shard-{int(shard):06d}{SUFFIXES[format]}"
 
 
-def samples_of(shard: Path) -> list[dict[str, Any]] | None:
-    """Notes about the samples of a shard; None if the shard is missing or incomplete."""
+def samples_of(shard: Path, source: str | None = None) -> list[dict[str, Any]] | None:
+    """Notes about the samples of a shard; None if it is missing, incomplete, or of another ``source`` than given."""
     try:
         notes = json.loads(shard.with_suffix(".json").read_bytes())
-        return list(notes["samples"]) if notes["bytes"] == shard.stat().st_size else None
+        is_complete = notes["bytes"] == shard.stat().st_size and source in (None, notes.get("source"))
+        return list(notes["samples"]) if is_complete else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
@@ -104,8 +106,9 @@ def samples_of(shard: Path) -> list[dict[str, Any]] | None:
 class RenderShards:
     """Makes shards: a callable for ``ray.data.Dataset.map_batches``; works without Ray.
 
-    Each row of a batch is a shard of :func:`shard_rows`. Complete shards are not made again. An input that cannot be
-    read or rendered is skipped and listed with its error in ``shard-NNNNNN.json`` beside the shard.
+    Each row of a batch is a shard of :func:`shard_rows`. Complete shards are not made again, unless the settings, the
+    row, or size or time of an input file have changed. An input that cannot be read or rendered is skipped and listed
+    with its error in ``shard-NNNNNN.json`` beside the shard.
 
     A WebDataset shard has for each key ``KEY.blurred.png``, ``KEY.sharp.png``, ``KEY.depth.npy`` (metres, float32) and
     ``KEY.json`` with all parameters. A Parquet shard has the same as columns; pictures are the bytes of their files.
@@ -187,10 +190,13 @@ class RenderShards:
         """
         rows: list[dict[str, Any]] = []
         for shard, samples in zip(batch["shard"], batch["samples"], strict=True):
-            path = self.out / name_of(shard, self.format)
-            noted = samples_of(path) or self._make(path, json.loads(str(samples)))
+            noted = self.samples_of(shard, samples) or self._make(shard, samples)
             rows += [{"shard": int(shard), **row} for row in noted]
         return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+    def samples_of(self, shard: int, samples: str) -> list[dict[str, Any]] | None:
+        """Notes about the samples of a shard; None if it has to be made."""
+        return samples_of(self.out / name_of(shard, self.format), self._source(samples))
 
     def settings(self) -> dict[str, Any]:
         """Everything except the rows that determines the shards, as JSON values."""
@@ -203,10 +209,17 @@ class RenderShards:
             "options": _plain(self.blur.renderings[0].arguments()),
         }
 
-    def _make(self, path: Path, samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    def _source(self, samples: str) -> str:
+        """Digest of all that determines a shard: settings, samples, and size and time of their files."""
+        files = {sample[name] for sample in json.loads(str(samples)) for name in ("image", "depth") if sample[name]}
+        facts = [self.settings(), str(samples), [_size_and_time(file) for file in sorted(files)]]
+        return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
+
+    def _make(self, shard: int, samples: str) -> list[dict[str, Any]]:
         """Renders and writes one shard; returns the notes about its samples."""
+        path, source = self.out / name_of(shard, self.format), self._source(samples)
         records, rows = [], []
-        for sample in samples:
+        for sample in json.loads(str(samples)):
             start, error = time.process_time(), ""
             try:
                 records.append(self._record(**sample))
@@ -216,7 +229,7 @@ class RenderShards:
             rows.append({**row, "seconds": round(time.process_time() - start, 4)})
         with whole_file(path) as part:
             (_write_tar if self.format == "webdataset" else _write_parquet)(part, records)
-            notes = {"bytes": part.stat().st_size, "samples": rows}
+            notes = {"bytes": part.stat().st_size, "source": source, "samples": rows}
             write_text(path.with_suffix(".json"), json.dumps(notes, indent=1))  # before the shard
         return rows
 
@@ -261,6 +274,14 @@ def _read_relative(
     values = read_values(path, channel)
     metres = from_relative(values, near_m, far_m, relative_kind, value_range=value_range, unknown=unknown)
     return resolve_holes(metres, path, fill)[0]
+
+
+def _size_and_time(file: str) -> tuple[int, int] | None:
+    """Size in bytes and time of the last change in ns; None if the file is missing."""
+    with contextlib.suppress(OSError):
+        facts = os.stat(file)
+        return facts.st_size, facts.st_mtime_ns
+    return None
 
 
 def _text(name: str) -> str:
