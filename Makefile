@@ -8,10 +8,12 @@
 # make sanitize   run the compiled engine's tests under AddressSanitizer and ThreadSanitizer; needs GCC
 # make fuzz       changed files to every reader, and scenes to both engines, for an hour (SECONDS=3600); lists what it finds
 # make soak       1,000 renderings in one process, 8 threads, forked and spawned workers: memory and pictures stay the same
-# All but oldest need only Python 3.11 and make: the first run makes .venv and installs what constraints.txt pins.
+# All but oldest need only make and Python 3.11 or newer: the first run makes .venv and installs what constraints.txt
+# pins. PYTHON=/path/to/python chooses the Python.
 # Where there is a C++ compiler the engine is compiled too.
 
-PYTHON ?= python3.11
+PYTHON ?= $(shell for p in python3.11 python3 python3.12 python3.13 python3.14 python3.11; do \
+	$$p -c 'import ensurepip, sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && break; done; echo $$p)
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
