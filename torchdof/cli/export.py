@@ -61,8 +61,8 @@ class Export:
         if self.show is not None:
             from torchdof.export.metadata import describe
 
-            described = describe(self.show)
-            tell(self.as_json, described, _lines(described))
+            metadata = describe(self.show)
+            tell(self.as_json, metadata, _lines(metadata))
         elif self.out is not None:
             self._write(self.out)
 

@@ -14,11 +14,11 @@ from .command import by_option, option, word_or_number
 if TYPE_CHECKING:
     from ..optics.blur_table import BlurTable
 
-_IDEAL = ("disc", "gaussian")
+_IDEAL_TABLES = ("disc", "gaussian")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Opening:
+class ApertureOptions:
     """Blur."""
 
     blades: int = option("Aperture blades, from 3; 0 is a round lens.", 0)
@@ -46,18 +46,18 @@ class Opening:
         mask = None if self.aperture is None else read_image(self.aperture).light[0].mean(0)
         names = {name: f"--{name.removesuffix('_deg')}" for name in ("blades", "rotation_deg", "curvature", "squeeze")}
         with by_option(names | {"vignetting": "--vignetting"}):
-            opening = Aperture(self.blades, self.rotation, self.curvature, self.squeeze, mask, self.vignetting)
+            aperture = Aperture(self.blades, self.rotation, self.curvature, self.squeeze, mask, self.vignetting)
         try:
-            table = getattr(BlurTable, name)() if name in _IDEAL else BlurTable.load(name)
+            table = getattr(BlurTable, name)() if name in _IDEAL_TABLES else BlurTable.load(name)
         except FileNotFoundError:
-            known = ", ".join([*_IDEAL, *shipped()])
+            known = ", ".join([*_IDEAL_TABLES, *shipped()])
             raise FileNotFoundError(f"no blur table {name!r}: neither a file nor one of {known}") from None
-        is_plain = opening.is_round and self.squeeze == 1.0 and not opening.depends_on_place
-        return table if is_plain else table.with_aperture(opening)
+        is_default = aperture.is_round and self.squeeze == 1.0 and not aperture.depends_on_place
+        return table if is_default else table.with_aperture(aperture)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Blur(Opening):
+class Blur(ApertureOptions):
     """Blur."""
 
     table: str = option("disc, gaussian, a shipped table such as sato_j15, or a JSON file.", "disc", basic=True)
