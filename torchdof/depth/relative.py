@@ -82,12 +82,12 @@ def from_relative(
             )
     else:
         low, high = (value.new_tensor(x) for x in _range(value_range))
-    share = (torch.where(is_known, value, low) - low) / (high - low)
-    share = share.clamp(0.0, 1.0)
+    fraction = (torch.where(is_known, value, low) - low) / (high - low)
+    fraction = fraction.clamp(0.0, 1.0)
     if kind == "depth":
-        depth = near_m + (far_m - near_m) * share
+        depth = near_m + (far_m - near_m) * fraction
     else:
-        inverse = share / near_m + (1.0 - share) / far_m
+        inverse = fraction / near_m + (1.0 - fraction) / far_m
         depth = 1.0 / torch.where(inverse > 0, inverse, 1.0)
         depth = torch.where(inverse > 0, depth, torch.inf)
     return torch.where(is_known, depth, torch.nan).to(dtype)
@@ -117,8 +117,8 @@ class Scale:
             tensor([[[[2., inf, inf]]]])
         """
         depth = depth_from_values(values, self.kind, scale=self.scale, offset=self.offset)
-        beyond = (values.double() + self.offset) * math.copysign(1.0, self.scale) <= 0
-        return torch.where(beyond, torch.inf, depth) if self.kind == "disparity" else depth
+        is_infinite = (values.double() + self.offset) * math.copysign(1.0, self.scale) <= 0
+        return torch.where(is_infinite, torch.inf, depth) if self.kind == "disparity" else depth
 
 
 def solve_scale(
@@ -213,7 +213,7 @@ def _point(values: Tensor, point: tuple[float, float, float], kind: RelativeKind
     """Median value around a point, and its distance in metres."""
     if not isinstance(point, Sequence) or len(point) != 3:
         raise ValueError(f"a point must be (x, y, metres), got {show(point)}")
-    x, y = (number(name, place) for name, place in zip("xy", point, strict=False))
+    x, y = (number(name, coordinate) for name, coordinate in zip("xy", point, strict=False))
     metres = number("the distance of a point", point[2], low=0, unit="metres", infinite=kind != "depth")
     height, width = values.shape[-2:]
     if not (0 <= x < width and 0 <= y < height):
