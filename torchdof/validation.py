@@ -22,7 +22,7 @@ WHOLE_NUMBERS = (
     *(torch.int8, torch.int16, torch.int32, torch.int64),
 )
 
-_MOST_STRETCH = 0.03  # largest change of a depth map's aspect ratio; estimators work at multiples of 14 or 64 px
+_MAX_STRETCH = 0.03  # largest change of a depth map's aspect ratio; estimators work at multiples of 14 or 64 px
 
 
 # Numbers and words
@@ -50,15 +50,15 @@ def number(
         >>> number("f_number", 2, low=0)
         2.0
     """
-    plain = isinstance(value, int | float) and not isinstance(value, bool)
-    if plain and (low < value < high or (infinite and abs(value) == math.inf and low <= value <= high)):
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if is_number and (low < value < high or (infinite and abs(value) == math.inf and low <= value <= high)):
         try:
             return float(value)
         except OverflowError:
             pass
     bounds = [f"> {low:g}"] * (low > -math.inf) + [f"< {high:g}"] * (high < math.inf)
-    wanted = " ".join(["a number", *([f"of {unit}"] * bool(unit)), " and ".join(bounds)]).rstrip()
-    raise ValueError(f"{name} must be {wanted}{' (inf allowed)' if infinite else ''}, got {show(value)}")
+    expected = " ".join(["a number", *([f"of {unit}"] * bool(unit)), " and ".join(bounds)]).rstrip()
+    raise ValueError(f"{name} must be {expected}{' (inf allowed)' if infinite else ''}, got {show(value)}")
 
 
 def whole(name: str, value: Any, low: int, high: int) -> int:
@@ -131,8 +131,8 @@ def ends(values: Tensor) -> tuple[float, float]:
     if values.dtype == torch.float32 and is_in_memory(values) and native.chosen():
         return native.ends(values)
     # in float32 at least: autocast supports only one half-precision dtype at a time
-    exact = torch.float64 if values.dtype == torch.float64 else torch.float32
-    low, high = torch.stack([end.to(exact) for end in torch.aminmax(values.detach())]).tolist()
+    dtype = torch.float64 if values.dtype == torch.float64 else torch.float32
+    low, high = torch.stack([end.to(dtype) for end in torch.aminmax(values.detach())]).tolist()
     return low, high
 
 
@@ -287,14 +287,14 @@ def is_resizable(image: Any, depth: Any) -> bool:
     maps = all(isinstance(t, Tensor) and t.ndim == 4 and t.is_floating_point() and t.numel() for t in (image, depth))
     if not maps or image.shape[-2:] == depth.shape[-2:] or image.device != depth.device:
         return False
-    return depth.shape[0] in (1, image.shape[0]) and depth.shape[1] == 1 and stretch(image, depth) <= _MOST_STRETCH
+    return depth.shape[0] in (1, image.shape[0]) and depth.shape[1] == 1 and stretch(image, depth) <= _MAX_STRETCH
 
 
 def same_aspect(image: Tensor, depth: Tensor) -> None:
     """Refuse a depth map whose aspect ratio differs by more than 3 % from that of an image ``[..., H, W]``."""
-    if 0 in depth.shape or stretch(image, depth) > _MOST_STRETCH:
+    if 0 in depth.shape or stretch(image, depth) > _MAX_STRETCH:
         (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
-        if 0 not in depth.shape and stretch(image, depth.transpose(-1, -2)) <= _MOST_STRETCH:
+        if 0 not in depth.shape and stretch(image, depth.transpose(-1, -2)) <= _MAX_STRETCH:
             hint = "turned by 90 degrees it fits: rotate one of the two"
         else:
             hint = "crop one of the two, so that both show the same area"
