@@ -5,7 +5,7 @@ from scipy.ndimage import gaussian_filter
 
 from ..problems import FitError, warn
 from ..result import Array, BlurFit
-from .diagnostics import ASYMMETRY_LIMIT, SIGNIFICANCE, asymmetry_of, size_of_blur, unexplained, unfitted_part
+from .diagnostics import ASYMMETRIC, P_VALUE, asymmetry_of, size_of_blur, unexplained, unfitted_part
 from .dot import Dot, inner_pixels
 from .forward import Solution
 from .noise import fine_variance, independent_share, noise_of, rounding_of
@@ -32,8 +32,7 @@ _MIN_CONTRAST, _MIN_CONTRAST_CHI = 0.03, 11.0  # at the expected magnification: 
 _MIN_RESIZING = 0.015  # change of magnification that no weak tone curve causes, which changes it by 0.002 to 0.006
 _CHI_MARGIN = 4.0  # chi squared by which a curve must explain more than a change of magnification does
 # the fit
-# Share of the light that a residual must have to be reported: at FAR_ABOVE times the noise, and at twice the noise.
-_MIN_RESIDUAL, _MIN_LARGE_RESIDUAL = 0.005, 1e-3
+_MIN_RESIDUAL, _MIN_AT_TWICE = 0.005, 1e-3  # residual, as a share of the light: at FAR_ABOVE, at twice the noise
 _SPOT_SIGMAS, _MIN_SPOT = 8.0, 0.003  # of a spot beyond the blur: standard deviations, share of the dot's level
 _MAGNIFICATION_LOG = 0.08  # log factor between fitted and expected magnification
 _REFUSED_OUTSIDE, _WARNED_OUTSIDE = 0.05, 0.005  # share of the blur's light outside the window
@@ -49,10 +48,8 @@ def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None) -> boo
         largest_noise = (1 + 4 / np.sqrt(int(inside.sum() / _SHARED_DIFFERENCES))) * np.sqrt(bright + rounding)
         if dot.noise > max(largest_noise, 1e-4 * dot.peak):
             ratio = dot.noise / max(float(np.sqrt(bright)), 1e-9 * dot.peak)
-            text = (
-                f"the dark paper has {ratio:.1f} times the noise of the white dot, as in a picture that is left sRGB "
-            )
-            warn(f"{text}encoded; {_DECODE_ADVICE}", "not linear", file=file, number=ratio)
+            text = f"the dark paper has {ratio:.1f} times the noise of the white dot, as in a picture that is left "
+            warn(f"{text}sRGB encoded; {_DECODE_ADVICE}", "not linear", file=file, number=ratio)
             return False
     if edge.steepness > max(_MIN_STEEPNESS, _MIN_SIGMAS * edge.steepness_error):
         text = (
@@ -177,10 +174,10 @@ def check_fit(solution: Solution, fit: BlurFit, file: str | None, freest: BlurFi
     # the freest residual is far above the noise, or the chosen family adds much to it
     ratio = freest.residual_over_noise
     residual = freest.residual
-    far_above = (residual > _MIN_RESIDUAL and ratio > FAR_ABOVE) or (residual > _MIN_LARGE_RESIDUAL and ratio > 2.0)
+    far_above = (residual > _MIN_RESIDUAL and ratio > FAR_ABOVE) or (residual > _MIN_AT_TWICE and ratio > 2.0)
     # if that is reported already, only what the family adds
     warned_ratio = max(2.0, 1.3 * ratio) if far_above else 2.0
-    if fit is not freest and fit.residual > _MIN_LARGE_RESIDUAL and fit.residual_over_noise > warned_ratio:
+    if fit is not freest and fit.residual > _MIN_AT_TWICE and fit.residual_over_noise > warned_ratio:
         text = (
             f"family {fit.family!r} leaves {fit.residual_over_noise:.1f} times the noise ({100 * fit.residual:.1f} % "
             f"of the light), the free profile {ratio:.1f} times; it was chosen because the "
@@ -202,7 +199,7 @@ def check_fit(solution: Solution, fit: BlurFit, file: str | None, freest: BlurFi
         )
         warn(text, "magnification", file=file, number=change)
     _check_spots(solution, file)
-    if fit.asymmetry > ASYMMETRY_LIMIT and asymmetry_of(solution)[1] < SIGNIFICANCE:
+    if fit.asymmetry > ASYMMETRIC and asymmetry_of(solution)[1] < P_VALUE:
         text = (
             f"the blur is not round: {100 * fit.asymmetry:.0f} % of it depends on the angle in a way that family "
             f"{fit.family!r} cannot; is the lens decentred, the dot off the axis, or the stop a polygon? Families "

@@ -9,10 +9,10 @@ from .forward import OPENINGS, SHAPES, Solution, without_level
 from .noise import fine_variance, independent_share, noise_of
 from .radial import size_of_profile
 
-ASYMMETRY_LIMIT = 0.02
+ASYMMETRIC = 0.02
 """Share of a blur's light that depends on the angle, above which it is not round."""
 
-SIGNIFICANCE = 1e-6
+P_VALUE = 1e-6
 """Probability of a deviation by noise alone, below which it is significant."""
 
 _HARMONICS, _RINGS = 8, 4

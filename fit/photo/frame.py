@@ -57,22 +57,21 @@ def read_frame(
         has NaN.
         OSError: the file is missing or damaged.
     """
-    manifest_error = partial(FitError, kind="manifest", file=str(path))
+    invalid = partial(FitError, kind="manifest", file=str(path))
     picture = read_image(path, transfer=transfer)
     pixels = picture.pixels[0].numpy().astype(np.float64)
     pixels = pixels[[i for i, name in enumerate(picture.channels) if name != "A"]]
     if bayer is not None:
         if len(pixels) != 1:
-            text = f"bayer = {bayer!r} is for pictures with one colour a pixel, got {len(pixels)} colours"
-            raise manifest_error(text)
+            raise invalid(f"bayer = {bayer!r} is for pictures with one colour a pixel, got {len(pixels)} colours")
         if picture.orientation != 1:
             text = f"bayer = {bayer!r} is for pictures as the sensor is read, got one of EXIF orientation "
-            raise manifest_error(f"{text}{picture.orientation}; remove the tag")
+            raise invalid(f"{text}{picture.orientation}; remove the tag")
         pixels = demosaiced(pixels[0], bayer)
     height, width = pixels.shape[1:]
     left, top, columns, rows = crop or (0, 0, width, height)
     if left + columns > width or top + rows > height:
-        raise manifest_error(f"crop {[left, top, columns, rows]} extends beyond the picture of {width}x{height}")
+        raise invalid(f"crop {[left, top, columns, rows]} extends beyond the picture of {width}x{height}")
     pixels = pixels[:, top : top + rows, left : left + columns]
     if bad := int(np.sum(~np.isfinite(pixels))):
         raise FitError(f"{bad} values are NaN or infinite", "not finite", file=str(path), number=float(bad))
@@ -80,7 +79,7 @@ def read_frame(
     is_clipped = pixels >= 1.0 - 1e-6
     if dark is not None:
         if dark.colours.shape != pixels.shape:
-            raise manifest_error(f"the dark frame is {size_of(dark.light)}, the picture {size_of(pixels[0])}")
+            raise invalid(f"the dark frame is {size_of(dark.light)}, the picture {size_of(pixels[0])}")
         pixels = pixels - dark.colours
     light = pixels.mean(axis=0)
     if white is not None:

@@ -85,7 +85,7 @@ def read_captures(
     path = Path(folder)
     path = path / MANIFEST if path.is_dir() or path.suffix != ".toml" else path
     manifest_name, folder_path = str(path), path.parent
-    manifest_error = partial(FitError, kind="manifest", file=manifest_name)
+    invalid = partial(FitError, kind="manifest", file=manifest_name)
     if root is not None:
         inside(path, root, manifest_name)
     fields, shots = _manifest(path)
@@ -106,7 +106,7 @@ def read_captures(
     by_colour = manifest["colours"] == "each"
     if by_colour and sharp_frame.colours.shape[0] != 3:
         text = "colours = 'each' needs pictures of three colours, or bayer = 'RGGB', got"
-        raise manifest_error(f"{text} {sharp_frame.colours.shape[0]}")
+        raise invalid(f"{text} {sharp_frame.colours.shape[0]}")
     columns, encoded = [], [sharp_frame.file.name] if sharp_frame.encoded else []
     for shot in shots:
         blurred_frame = read(shot["file"], dark)
@@ -127,7 +127,7 @@ def read_captures(
     width = sharp_frame.width_px if manifest["full_width_px"] is None else round(manifest["full_width_px"])
     if width < sharp_frame.width_px:
         got = f"got {manifest['full_width_px']:g} for pictures of {sharp_frame.width_px}"
-        raise manifest_error(f"full_width_px must be at least the pictures' own width, {got}")
+        raise invalid(f"full_width_px must be at least the pictures' own width, {got}")
     camera = {name: sharp_frame.facts.get(name) if manifest[name] is None else manifest[name] for name in CAMERA}
     notes = {
         "manifest": path.name,
@@ -156,19 +156,19 @@ def inside(file: Path, root: str | os.PathLike[str], where: str) -> None:
 
 def _manifest(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The fields of a manifest and those of its shots, with known names only."""
-    manifest_error = partial(FitError, kind="manifest", file=str(path))
+    invalid = partial(FitError, kind="manifest", file=str(path))
     if not path.is_file():
-        raise manifest_error("there is no such manifest; write a capture.toml beside the pictures")
+        raise invalid("there is no such manifest; write a capture.toml beside the pictures")
     try:
         fields = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise manifest_error(f"is not TOML: {error}") from error
+        raise invalid(f"is not TOML: {error}") from error
     shots = fields.get("shot")
     if not isinstance(shots, list) or not shots or not all(isinstance(s, dict) for s in shots):
-        raise manifest_error("give at least one [[shot]] with file and distance_m")
+        raise invalid("give at least one [[shot]] with file and distance_m")
     for table, names in ((fields, _FIELDS), *((shot, _SHOT_FIELDS) for shot in shots)):
         if unknown := [name for name in table if name not in names]:
-            raise manifest_error(f"{unknown[0]!r} is not a field; known are {', '.join(names)}")
+            raise invalid(f"{unknown[0]!r} is not a field; known are {', '.join(names)}")
     return fields, shots
 
 

@@ -17,16 +17,7 @@ from scipy.ndimage import binary_dilation, center_of_mass, gaussian_filter, lapl
 from torchdof.optics.aperture import Aperture
 
 from ..result import Array, BlurFit, Mask
-from .diagnostics import (
-    ASYMMETRY_LIMIT,
-    SIGNIFICANCE,
-    asymmetry_of,
-    bic_of,
-    noise_near,
-    residual_rms,
-    size_of_blur,
-    unexplained,
-)
+from .diagnostics import ASYMMETRIC, P_VALUE, asymmetry_of, bic_of, noise_near, residual_rms, size_of_blur, unexplained
 from .forward import Forward, Solution
 from .noise import independent_share
 
@@ -59,7 +50,7 @@ def solve_opening(round_fit: Solution) -> tuple[Solution, str] | None:
             best, excluded = polygon, f"round, nor a polygon of {blades} blades"
             why = f"a polygon of {blades} blades, its BIC lower by {gain:.0f} than that of any round profile"
     asymmetry, probability = asymmetry_of(best)
-    is_asymmetric = asymmetry > ASYMMETRY_LIMIT and probability < SIGNIFICANCE
+    is_asymmetric = asymmetry > ASYMMETRIC and probability < P_VALUE
     if is_asymmetric or residual_rms(best) > _MAX_RATIO * noise_near(best):
         kernel, gain = _deconvolved(best)
         if gain > _MIN_LIKELIHOOD_GAIN:

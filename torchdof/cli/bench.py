@@ -37,7 +37,7 @@ class _Accuracy:
         type=click.IntRange(min=1),
     )
     degrade: bool = option(
-        "Instead, what depth costs that is soft, displaced, too coarse or noisy; writes degraded.csv and .md.", False
+        "Instead, measure the cost of soft, displaced, coarse or noisy depth; writes degraded.csv and .md.", False
     )
     peer: tuple[Path, ...] = option("A Python file with another renderer, blur(image, coc_px); may be repeated.", ())
 

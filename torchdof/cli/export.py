@@ -46,7 +46,7 @@ class Export:
     """
 
     out: Path | None = option("The file to write.", names=("--out", "-o"))
-    show: Path | None = option("Write nothing; print what this file says about itself.", metavar="FILE")
+    show: Path | None = option("Write nothing; print the metadata of this file.", metavar="FILE")
     sensor: Sensor
     blur: Blur
     max_coc: float = option("Largest radius in pixels that the file holds.", 32.0, basic=True)

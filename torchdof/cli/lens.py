@@ -74,7 +74,7 @@ class Lens(Sensor):
         basic=True,
     )
     focus_at: tuple[float, float] | None = option(
-        "Focus on what is seen at this pixel, counted from the top left; in a sequence, anew in each frame. Default: "
+        "Focus on the surface at this pixel, counted from the top left; in a sequence, anew in each frame. Default: "
         "the focus that IMAGE's file states, else the subject nearest the middle.",
         metavar="X,Y",
         read=numbers(2, "--focus-at expects a pixel X,Y such as 320,200"),
@@ -89,8 +89,8 @@ class Lens(Sensor):
     swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)
     f_number: float | None = option("Smaller is blurrier.", callback=positive, basic=True)
     blur_share: float | None = option(
-        "Open the lens until what is blurred most, the nearest or the farthest, has a blur radius of this share of the "
-        "picture's width, such as 2%; instead of --f-number.",
+        "Open the lens until the largest blur radius, at the nearest or farthest depth, is this share of the picture's "
+        "width, such as 2%; instead of --f-number.",
         names=("--blur",),
         metavar="SHARE%",
         read=_width_fraction,

@@ -74,11 +74,11 @@ class Accuracy:
         read=word_or_number(("draft", "preview", "final"), "--tolerance expects draft, preview, final or a number"),
         basic=True,
     )
-    no_occlusion: bool = option("One pass that ignores what hides what.", False)
+    no_occlusion: bool = option("One pass that ignores occlusion.", False)
     method: Literal["layered", "fold"] = option("fold is the literal scatter: exact, slow, for small radii.", "layered")
     depth_edges: Literal["auto", "repair", "as-given"] | None = option(
-        "Move and sharpen the edges of the depth to where the image has them: unless they prove exact, each one, or "
-        "not at all. Default: auto; in exported files as-given.",
+        "Sharpen the edges of the depth and move them to those of the image: auto unless they prove exact, repair each "
+        "one, as-given never. Default: auto; in exported files as-given.",
         group="Depth map",
     )
 
@@ -90,7 +90,7 @@ class Accuracy:
 
 def json_option() -> Any:
     """The option ``--json``, which every command has."""
-    return option("Print what is printed as JSON, for programs: one object a line.", False, names=("--json",))
+    return option("Print results as JSON, for programs: one object a line.", False, names=("--json",))
 
 
 def make_folder_of(path: Path) -> None:

@@ -46,8 +46,8 @@ class DepthMap:
     )
     depth_unknown: float | None = option("A value that means 'not measured', such as 0, -1 or inf.")
     fill_depth: float | str | None = option(
-        "Fill pixels without depth: from the nearest one, from the farthest around (what stereo cannot see lies "
-        "behind), or with a distance (inf for a sky).",
+        "Fill pixels without depth: from the nearest one, from the farthest around (stereo misses the background), or "
+        "with a distance (inf for a sky).",
         metavar="nearest|far|METRES",
         read=word_or_number(("nearest", "far"), "--fill-depth expects nearest, far or metres"),
     )

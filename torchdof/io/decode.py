@@ -23,9 +23,7 @@ from .metadata import Metadata, kept_metadata, upright
 
 __all__ = ["MAX_ATTRIBUTES", "Part", "check_png", "first_line", "read_array", "read_parts", "utf8_name"]
 
-MAX_PIXELS = 2**28
-"""Largest number of pixels of an image or array; a larger limit allows damaged headers to claim more memory."""
-
+MAX_PIXELS = 2**28  # of an image or array; a larger limit allows damaged headers to claim more memory
 MAX_ATTRIBUTES = 4096
 """Largest number of attributes in all parts of an EXR file together; renderers write a few hundred."""
 
