@@ -93,11 +93,11 @@ def run(scene: Scene, known: Collection[str], out: Path) -> None:
     true = Numbers(scale, shift, float(scene.camera.focus_m), float(scene.camera.f_number))
     guess = Numbers(0.6 * scale, 1.3 * shift, 0.8 * true.focus_m, 1.5 * true.f_number)
     guess = dataclasses.replace(guess, **{name: getattr(true, name) for name in known})
-    found = solve(scene.image, scene.truth, disparity, scene.camera, guess, known)
+    solution = solve(scene.image, scene.truth, disparity, scene.camera, guess, known)
     print(f"{scene.name}: {'nothing' if not known else ', '.join(known)} known")
     print("            scale   shift   focus m   f-number   mean error of the blur radius, px   of depth, %   PSNR, dB")
     pictures = {"all in focus": scene.image, "the picture": scene.truth}
-    for name, numbers in (("guess", guess), ("found", found), ("true", true)):
+    for name, numbers in (("guess", guess), ("found", solution), ("true", true)):
         camera = scene.camera.replace(focus_m=numbers.focus_m, f_number=numbers.f_number)
         depth = numbers.depth(disparity)
         radius_error = (camera.coc_px(depth, depth.shape[-1]) - scene.coc_px).abs().mean()

@@ -115,17 +115,17 @@ def _branch(graph: onnx_ir.Graph, choice: onnx_ir.Node, index: int, owners: _Own
     last = onnx_ir.node("Identity", [result])  # a branch can only return its own values
     graph.insert_before(choice, [last])
     choice.replace_input_with(index, last.outputs[0])
-    moved, open_nodes = {last}, [last]
+    branch_nodes, open_nodes = {last}, [last]
     while open_nodes:
         for value in _used_values(open_nodes.pop()):
             node = value.producer()
-            if node is None or node.graph is not graph or node in moved:
+            if node is None or node.graph is not graph or node in branch_nodes:
                 continue
             users = {_enclosing(graph, use.node, owners) for output in node.outputs for use in output.uses()}
-            if users <= moved and not any(output.is_graph_output() for output in node.outputs):
-                moved.add(node)
+            if users <= branch_nodes and not any(output.is_graph_output() for output in node.outputs):
+                branch_nodes.add(node)
                 open_nodes.append(node)
-    nodes = [node for node in graph if node in moved]
+    nodes = [node for node in graph if node in branch_nodes]
     for node in nodes:
         graph.remove(node)
     _type(last.outputs[0], result.dtype, result.shape)

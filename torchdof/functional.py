@@ -213,7 +213,7 @@ def _kernels_at(positions: list[int], table: BlurTable, width: int, longest: int
     """
 
     def make(keys: Sequence[tuple[Any, ...]]) -> list[Tensor]:
-        made: dict[int, Tensor] = {}
+        kernels: dict[int, Tensor] = {}
         by_radius = sorted((key[-1] for key in keys), key=abs)
         for start in range(0, len(by_radius), _KERNELS_AT_ONCE):
             chunk = torch.tensor(by_radius[start : start + _KERNELS_AT_ONCE])
@@ -221,14 +221,14 @@ def _kernels_at(positions: list[int], table: BlurTable, width: int, longest: int
             batch = bank_of(table).kernels(coc, width, longest=[longest] * len(coc))
             margin = max(0, batch.shape[-1] // 2 - (longest - 1))
             inside = slice(margin, batch.shape[-1] - margin)
-            made |= {k: kernel[:, inside, inside].clone() for k, kernel in zip(chunk.tolist(), batch, strict=True)}
-        return [made[key[-1]] for key in keys]
+            kernels |= {k: kernel[:, inside, inside].clone() for k, kernel in zip(chunk.tolist(), batch, strict=True)}
+        return [kernels[key[-1]] for key in keys]
 
     # the kernels of a table without lengths are the same for images of any width
     key_prefix = (table.fingerprint(), 1 if table.unit == "relative" else width, longest)
-    made = _kernels.get_all([(*key_prefix, position) for position in positions], make)
-    half = max(kernel.shape[-1] for kernel in made) // 2
-    return torch.stack([functional.pad(kernel, (half - kernel.shape[-1] // 2,) * 4) for kernel in made])
+    kernels = _kernels.get_all([(*key_prefix, position) for position in positions], make)
+    half = max(kernel.shape[-1] for kernel in kernels) // 2
+    return torch.stack([functional.pad(kernel, (half - kernel.shape[-1] // 2,) * 4) for kernel in kernels])
 
 
 def _position_of(radius: Tensor) -> Tensor:

@@ -156,10 +156,10 @@ def figures(part: str, folder: Path, turn: int) -> Iterator[Figure]:
 
 def spent(*command: object, folder: str | None = None) -> Seconds:
     """Wall and processor time of a Python command."""
-    wall, before = time.perf_counter(), os.times()
+    wall, start = time.perf_counter(), os.times()
     subprocess.run([sys.executable, *map(str, command)], check=True, cwd=folder, stdout=subprocess.DEVNULL)
-    after = os.times()
-    cpu = after.children_user + after.children_system - before.children_user - before.children_system
+    end = os.times()
+    cpu = end.children_user + end.children_system - start.children_user - start.children_system
     return Seconds(time.perf_counter() - wall, cpu)
 
 

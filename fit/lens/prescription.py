@@ -65,7 +65,7 @@ def parse(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
     return tuple(surfaces), stop, source
 
 
-def _surface(words: list[str], before: Glass, defined: dict[str, Glass]) -> tuple[Surface, bool]:
+def _surface(words: list[str], medium: Glass, defined: dict[str, Glass]) -> tuple[Surface, bool]:
     """The surface on a line, behind a medium, and whether it is the stop."""
     if len(words) < 4:
         raise ValueError(f"expected the columns {_COLUMNS}, got {len(words)}: {' '.join(words)!r}")
@@ -77,11 +77,11 @@ def _surface(words: list[str], before: Glass, defined: dict[str, Glass]) -> tupl
             shape[name] = _number(name, text)
         elif word != "stop":
             raise ValueError(f"behind the columns expected stop, k=NUMBER or A2=NUMBER to A16=NUMBER, got {word!r}")
-    glass = before if radius == 0.0 and words[2] == "0" else _glass(words[2], defined)
+    glass = medium if radius == 0.0 and words[2] == "0" else _glass(words[2], defined)
     if radius == 0.0:
-        if glass.index() != before.index():
+        if glass.index() != medium.index():
             raise ValueError("index: the stop does not change the index, write 0")
-        radius, glass, is_stop = math.inf, before, True
+        radius, glass, is_stop = math.inf, medium, True
     conic, *polynomial = shape.values()
     return Surface(radius, thickness, glass, diameter, conic, tuple(polynomial) * any(polynomial)), is_stop
 

@@ -47,8 +47,8 @@ class Surface:
             raise ValueError(f"radius must be inf, or {_MIN_MM:g} to {_MAX_MM:g} mm long, got {self.radius}")
         _check("conic constant", self.conic, -_MAX_CONIC, _MAX_CONIC)
         for i, coefficient in enumerate(self.polynomial):
-            most = _MAX_DEPTH_MM / (self.diameter / 2.0) ** (2 * i + 2)  # limits the depth of the surface's rim
-            _check(f"A{2 * i + 2}", coefficient, -most, most)
+            limit = _MAX_DEPTH_MM / (self.diameter / 2.0) ** (2 * i + 2)  # limits the depth of the surface's rim
+            _check(f"A{2 * i + 2}", coefficient, -limit, limit)
 
     def bent(self, factor: float) -> Surface:
         """The surface with all lengths of its shape multiplied by a factor; -1 exchanges its sides."""

@@ -61,7 +61,7 @@ def parse(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
     return tuple(surfaces), stops[0], f"Zemax file{f': {name}' if name else ''}"
 
 
-def _surface(record: dict[str, list[str]], unit: float, before: Glass) -> Surface | float:
+def _surface(record: dict[str, list[str]], unit: float, medium: Glass) -> Surface | float:
     """A surface behind a medium; for a flat one in air, which is not part of the lens, only its thickness in mm."""
 
     def number(word: str, index: int = 0) -> float:
@@ -79,7 +79,7 @@ def _surface(record: dict[str, list[str]], unit: float, before: Glass) -> Surfac
     curvature, thickness, glass = number("CURV") / unit, number("DISZ") * unit, _glass(record.get("GLAS", []))
     powers = range(1, 9) if kind == "EVENASPH" else ()
     polynomial = tuple(number(f"PARM {i}", 1) * unit ** (1 - 2 * i) for i in powers)
-    if before == glass == AIR and not (curvature or any(polynomial) or "STOP" in record):
+    if medium == glass == AIR and not (curvature or any(polynomial) or "STOP" in record):
         return thickness
     diameter = 2.0 * unit * (number("CLAP", 1) if "CLAP" in record else number("DIAM"))
     if not diameter:

@@ -46,19 +46,19 @@ def table_of_dots(dots: Sequence[tuple[Captures, TableFit]]) -> BlurTable:
             raise FitError(f"the dot at {position} px must be fitted at the distances and colours of the first one")
     centres = [other.pairs[0].position_px for other, _ in dots]
     unit_per_px = float(first.coc[-1]) / first_fit.coc_px[-1]
-    places = [(x * unit_per_px, y * unit_per_px) for x, y in centres]
-    field = field_of_dots([fit.table for _, fit in dots], places, captures.focus_m / captures.distances_m)
-    dot_positions = {"dots_px": [list(place) for place in centres]}
+    positions = [(x * unit_per_px, y * unit_per_px) for x, y in centres]
+    field = field_of_dots([fit.table for _, fit in dots], positions, captures.focus_m / captures.distances_m)
+    dot_positions = {"dots_px": [list(centre) for centre in centres]}
     return first.replace(aperture=None, field=field, provenance=first.provenance | dot_positions)
 
 
-def field_of_dots(tables: Sequence[BlurTable], places: Sequence[tuple[float, float]], scales: Array) -> Field:
+def field_of_dots(tables: Sequence[BlurTable], points: Sequence[tuple[float, float]], scales: Array) -> Field:
     """Spots over blur and distance from the centre, from tables with the same nodes at single positions (x, y).
 
     Positions are those in the sharp picture, relative to the centre of the frame, in the tables' unit. At each node the
     picture is smaller by the factor `scales`, the focus distance over the object distance.
     """
-    radii = np.hypot(*np.array(places, dtype=np.float64).T)
+    radii = np.hypot(*np.array(points, dtype=np.float64).T)
     order = np.argsort(radii)
     groups = np.split(order, np.flatnonzero(np.diff(radii[order]) > _RING_WIDTH * radii.max()) + 1)  # by distance
     rings = groups if radii[groups[0]].mean() > _RING_WIDTH * radii.max() else groups[1:]
@@ -70,7 +70,7 @@ def field_of_dots(tables: Sequence[BlurTable], places: Sequence[tuple[float, flo
     radius = all_radii[np.concatenate([[True], np.diff(all_radii) > 1e-3 * all_radii[-1]])]
     boxes, light = [], []
     for k in range(len(tables[0].coc)):
-        spots = [_spot(tables, places, groups[0], k, azimuths=32), *(_spot(tables, places, ring, k) for ring in rings)]
+        spots = [_spot(tables, points, groups[0], k, azimuths=32), *(_spot(tables, points, ring, k) for ring in rings)]
         nodes = ring_radii * scales[k]
         low = np.clip(np.searchsorted(nodes, radius, side="right") - 1, 0, len(nodes) - 2)
         weight = torch.from_numpy(np.clip((radius - nodes[low]) / (nodes[low + 1] - nodes[low]), 0.0, 1.0))
@@ -94,7 +94,7 @@ def field_of_dots(tables: Sequence[BlurTable], places: Sequence[tuple[float, flo
 
 
 def _spot(
-    tables: Sequence[BlurTable], places: Sequence[tuple[float, float]], group: np.ndarray, node: int, azimuths: int = 0
+    tables: Sequence[BlurTable], points: Sequence[tuple[float, float]], group: np.ndarray, node: int, azimuths: int = 0
 ) -> tuple[float, Tensor]:
     """Half side of the box, and the light ``[C, U, V]``, of dots at one distance from the centre, at a node.
 
@@ -109,13 +109,13 @@ def _spot(
     width = _KERNEL_HALF / reach / unit
     for i in group:
         kernel = tables[i].kernels(torch.tensor([coc * width], dtype=torch.float64), width)
-        x, y = places[i]
+        x, y = points[i]
         angles = np.linspace(0.0, 2.0 * math.pi, azimuths, endpoint=False) if azimuths else [math.atan2(y, x)]
         for angle in angles:
             sine, cosine = math.sin(angle), math.cos(angle)
             for side in (1.0, -1.0):
-                points = torch.stack([u * cosine - side * v * sine, u * sine + side * v * cosine], -1)
-                grid = points * (2.0 * _KERNEL_HALF / kernel.shape[-1])
+                grid_points = torch.stack([u * cosine - side * v * sine, u * sine + side * v * cosine], -1)
+                grid = grid_points * (2.0 * _KERNEL_HALF / kernel.shape[-1])
                 sampled = functional.grid_sample(kernel, grid[None], align_corners=False)[0]
                 total += sampled / (len(angles) * sampled.sum((-2, -1), keepdim=True))
     return reach, total / (2 * len(group))

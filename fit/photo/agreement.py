@@ -113,8 +113,8 @@ def _common_factor(expected: Array, measured: Array) -> float:
 
 def _misfit(expected: Array, measured: Array, is_large: Mask) -> float:
     """Largest |log(measured / expected)|, after subtracting half a pixel for aberrations."""
-    apart = np.maximum(np.abs(measured - expected) - 0.5, 0.0)
-    factor = np.log1p(apart / np.maximum(np.minimum(measured, expected), 1e-9))
+    difference = np.maximum(np.abs(measured - expected) - 0.5, 0.0)
+    factor = np.log1p(difference / np.maximum(np.minimum(measured, expected), 1e-9))
     return float(np.max(np.where(is_large, factor, 0.0)))
 
 

@@ -38,12 +38,12 @@ _MAGNIFICATION_LOG = 0.08  # log factor between fitted and expected magnificatio
 _REFUSED_OUTSIDE, _WARNED_OUTSIDE = 0.05, 0.005  # share of the blur's light outside the window
 
 
-def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None) -> bool:
+def check_linearity(picture: Array, dot: Dot, edge: Edge, file: str | None) -> bool:
     """Whether noise and edge of a sharp picture's dot are those of linear light; warns if not."""
-    inside = inner_pixels(still, dot)
+    inside = inner_pixels(picture, dot)
     if inside is not None:
-        bright = fine_variance(still, inside)
-        rounding = rounding_of(still[still > dot.background + 0.5 * dot.peak])
+        bright = fine_variance(picture, inside)
+        rounding = rounding_of(picture[picture > dot.background + 0.5 * dot.peak])
         # noise in light can only grow with the level; allow 4 standard errors of its estimate
         largest_noise = (1 + 4 / np.sqrt(int(inside.sum() / _SHARED_DIFFERENCES))) * np.sqrt(bright + rounding)
         if dot.noise > max(largest_noise, 1e-4 * dot.peak):
@@ -59,7 +59,7 @@ def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None) -> boo
         )
         warn(text, "not linear", file=file, number=edge.steepness)
         return False
-    encoded_edge = soft_edge(still, dot, fit_exponent=True) if edge.misfit >= EXPLAINED else edge
+    encoded_edge = soft_edge(picture, dot, fit_exponent=True) if edge.misfit >= EXPLAINED else edge
     if encoded_edge.exponent < _MAX_EXPONENT and encoded_edge.rms < 0.75 * edge.rms:
         power = encoded_edge.exponent
         text = f"the dot's edge is that of light to the power {power:.2f}, as in a picture that is left sRGB "

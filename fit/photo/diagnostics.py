@@ -50,8 +50,8 @@ def unexplained(solution: Solution, basis: Array) -> tuple[Array, Array]:
 
 def unfitted_part(solution: Solution, basis: Array) -> Array:
     """Patterns without the parts that the fit's parameters can imitate, which are not in its residual."""
-    known, _ = np.linalg.qr(solution.slopes[:, np.abs(solution.slopes).max(axis=0) > 0])
-    return without_level(basis - known @ (known.T @ basis), solution.fitted)
+    imitable, _ = np.linalg.qr(solution.slopes[:, np.abs(solution.slopes).max(axis=0) > 0])
+    return without_level(basis - imitable @ (imitable.T @ basis), solution.fitted)
 
 
 def asymmetry_of(solution: Solution) -> tuple[float, float]:
@@ -143,11 +143,11 @@ def describe(solution: Solution, why: str) -> BlurFit:
     opening = {n: float(v) for n, v in solution.params.items()} if solution.family in OPENINGS else None
     rows, columns = pair.pixels
     distance = np.hypot(columns - x, rows - y)
-    near = (distance <= 1.2 * pair.dot.reach) & pair.used
-    order = np.argsort(distance[near])
+    is_near = (distance <= 1.2 * pair.dot.reach) & pair.used
+    order = np.argsort(distance[is_near])
     samples, curve = (
-        np.stack([distance[near], (levels - solution.background) / (solution.gain or 1.0)])[:, order]
-        for levels in (pair.data[near], solution.fitted[near[pair.used]])
+        np.stack([distance[is_near], (levels - solution.background) / (solution.gain or 1.0)])[:, order]
+        for levels in (pair.data[is_near], solution.fitted[is_near[pair.used]])
     )
     return BlurFit(
         family=solution.family,

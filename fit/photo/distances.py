@@ -139,13 +139,13 @@ def with_uncertainty(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
     if not pair.uncertain:
         return fit
     with without_warnings():
-        plain, *others = (
+        refit, *others = (
             _fit_like(fit, pair, focus_m, *pictures) for pictures in ((pair.sharp, pair.blurred), *pair.uncertain)
         )
     zero = np.zeros(1)
     names = ("values",) if fit.family == "radial" else fit.names
     changes = np.stack(
-        [np.hstack([np.subtract(o.params.get(n, zero), plain.params.get(n, zero)) for n in names]) for o in others]
+        [np.hstack([np.subtract(o.params.get(n, zero), refit.params.get(n, zero)) for n in names]) for o in others]
     )  # [others, parameters]
     covariance = fit.covariance + changes.T @ changes
     spread = np.sqrt(np.diag(covariance))
@@ -154,7 +154,7 @@ def with_uncertainty(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
         fit,
         stderr=fit.stderr | {n: error for n, error in errors.items() if n in fit.params},
         covariance=covariance,
-        radius_stderr=float(np.hypot(fit.radius_stderr, np.linalg.norm([o.radius - plain.radius for o in others]))),
+        radius_stderr=float(np.hypot(fit.radius_stderr, np.linalg.norm([o.radius - refit.radius for o in others]))),
     )
 
 
@@ -180,7 +180,7 @@ def fit_colours(captures: Captures, fits: Sequence[BlurFit]) -> tuple[Colour, ..
     for pair, mean in zip(captures, fits, strict=True):
         if pair.colours is None:
             raise AssertionError("only captures with colours are fitted by colour")
-        softness = min(soft_edge(still, find_dot(still, file=pair.files[0])).softness for still in pair.colours[0])
+        softness = min(soft_edge(sharp, find_dot(sharp, file=pair.files[0])).softness for sharp in pair.colours[0])
         fixed: dict[str, Any] = {"magnification": mean.magnification, "fit_magnification": False, "softness": softness}
         with without_warnings():  # the mean's fit has already warned
             for colour, *pictures in zip(fits_by_colour, *pair.colours, strict=True):

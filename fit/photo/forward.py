@@ -178,8 +178,8 @@ class Forward:
 
     def moves(self, params: Mapping[str, float]) -> dict[str, float]:
         """The fitted moves, completed by the fixed ones."""
-        held = self.magnification if self.held_magnification is None else self.held_magnification
-        return {n: params.get(n, held if n == "magnification" else 0.0) for n in ALL_MOVES}
+        magnification = self.magnification if self.held_magnification is None else self.held_magnification
+        return {n: params.get(n, magnification if n == "magnification" else 0.0) for n in ALL_MOVES}
 
     def covariance(
         self, slopes: Array, residual: Array, kernel: Array, gain: float, penalty: Array, is_prior: bool = False
@@ -256,9 +256,9 @@ class Forward:
         unmoved = self._drawn(self.moves(params))
         columns = []
         for n in names:
-            moved = self.moves(params)
-            moved[n] += _STEP[n]
-            change = rfft2((self._drawn(moved) - unmoved) / _STEP[n], self.grid)
+            changed = self.moves(params)
+            changed[n] += _STEP[n]
+            change = rfft2((self._drawn(changed) - unmoved) / _STEP[n], self.grid)
             columns.append(self.convolve(change, kernel[None])[0])
         return columns
 

@@ -59,7 +59,7 @@ def rounding_of(levels: Array) -> float:
     return 3 * float(steps.min()) ** 2 / 4 if steps.size else 0.0
 
 
-def correlation_of(values: Array, used: Mask) -> Array:
+def correlation_of(values: Array, is_used: Mask) -> Array:
     """Correlation of the noise (mean 0) of a picture's used pixels with their neighbours.
 
     It is `[2 LAGS + 1, 2 LAGS + 1]`, 1 in the centre, and 0 at lags without significant correlation. Its spectrum is
@@ -68,13 +68,13 @@ def correlation_of(values: Array, used: Mask) -> Array:
     size = 2 * LAGS + 1
     white = np.zeros((size, size))
     white[LAGS, LAGS] = 1.0
-    power = float(np.mean(values[used] ** 2)) if used.any() else 0.0
-    if used.sum() < _MIN_PIXELS or power <= 0:
+    power = float(np.mean(values[is_used] ** 2)) if is_used.any() else 0.0
+    if is_used.sum() < _MIN_PIXELS or power <= 0:
         return white
     # clip outliers (dust, an edge that is not fitted well) at five standard deviations
-    clipped = np.where(used, np.clip(values, -5 * np.sqrt(power), 5 * np.sqrt(power)), 0.0)
+    clipped = np.where(is_used, np.clip(values, -5 * np.sqrt(power), 5 * np.sqrt(power)), 0.0)
     lags = tuple(slice(n - 1 - LAGS, n + LAGS) for n in values.shape)
-    sums, pairs = (correlated(p, p, method="fft")[lags] for p in (clipped, used.astype(np.float64)))
+    sums, pairs = (correlated(p, p, method="fft")[lags] for p in (clipped, is_used.astype(np.float64)))
     pairs = np.maximum(np.round(pairs), 1.0)
     correlation = sums / pairs
     correlation = correlation / max(float(correlation[LAGS, LAGS]), np.finfo(float).tiny)

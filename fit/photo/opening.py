@@ -74,22 +74,22 @@ def solve_polygon(round_fit: Solution) -> Solution:
     return _solved(round_fit, Aperture(blades), "polygon", start)
 
 
-def solve_image(before: Solution, kernel: Array | None = None) -> Solution:
+def solve_image(previous: Solution, kernel: Array | None = None) -> Solution:
     """Fits the opening as a picture, from a kernel if given; the moves start from those of `before`."""
-    kernel = _deconvolved(before)[0] if kernel is None else kernel
+    kernel = _deconvolved(previous)[0] if kernel is None else kernel
     y, x = center_of_mass(kernel)
     rows, columns = np.nonzero(kernel > 0.01 * kernel.max())
     half_px = float(np.ceil(np.hypot(rows - y, columns - x).max())) + 1.0  # half the side of the opening's square, px
     side = int(min(_MAX_SIDE, round(2 * half_px * _SAMPLES_PER_PX)))
     positions = ((np.arange(side) + 0.5) / side * 2 - 1) * half_px
     mask = map_coordinates(kernel, np.meshgrid(positions + y, positions + x, indexing="ij"), order=3, mode="constant")
-    return _solved(before, Aperture(mask=torch.from_numpy(np.maximum(mask, 0.0))), "image", {"radius": half_px})
+    return _solved(previous, Aperture(mask=torch.from_numpy(np.maximum(mask, 0.0))), "image", {"radius": half_px})
 
 
-def _solved(before: Solution, opening: Aperture, family: str, start: dict[str, float]) -> Solution:
+def _solved(previous: Solution, opening: Aperture, family: str, start: dict[str, float]) -> Solution:
     """The solution with an opening; the magnification starts from that of `before`."""
-    magnification = before.moves["magnification"]
-    pair = replace(before.pair, opening=opening, start={family: start}, prior={}, held_magnification=magnification)
+    magnification = previous.moves["magnification"]
+    pair = replace(previous.pair, opening=opening, start={family: start}, prior={}, held_magnification=magnification)
     return pair.solve(family)
 
 

@@ -175,8 +175,8 @@ def _pair(
     half = int(WINDOW * min(sharp.target.side_px, blurred.target.side_px))
 
     def colours_of(picture: Photograph) -> Array:
-        seen = picture.target.window(read_image(folder / picture.file).pixels[0, :3].double().numpy(), half)
-        return np.stack([c if tone is None else untoned(c, tone.bend) for c in seen])
+        window = picture.target.window(read_image(folder / picture.file).pixels[0, :3].double().numpy(), half)
+        return np.stack([c if tone is None else untoned(c, tone.bend) for c in window])
 
     windows = [picture.target.window(original[picture.file], half) for picture in (sharp, blurred)]
     other_curves = [] if tone is None else [np.add(tone.bend, step) for step in tone.errors]

@@ -139,7 +139,7 @@ def evaluate(family: str, r: Array, params: dict[str, float | Array]) -> Array:
     return strength * profile(family, torch.from_numpy(np.ascontiguousarray(r)), shape).numpy()
 
 
-def _checked(r: ArrayLike, strength: ArrayLike, least: int) -> tuple[Array, Array]:
+def _checked(r: ArrayLike, strength: ArrayLike, fewest: int) -> tuple[Array, Array]:
     """Radii and strengths `[n]` as float64 with at least `least` different radii, or an error."""
     try:
         if np.iscomplexobj(r) or np.iscomplexobj(strength):
@@ -161,8 +161,8 @@ def _checked(r: ArrayLike, strength: ArrayLike, least: int) -> tuple[Array, Arra
     if radii.size and radii.min() < 0:
         raise FitError(f"r must be >= 0, got {radii.min():g}", number=float(radii.min()))
     distinct = np.unique(radii).size
-    if distinct < least:
-        raise FitError(f"the family takes at least {least} different radii, got {distinct}", number=float(distinct))
+    if distinct < fewest:
+        raise FitError(f"the family takes at least {fewest} different radii, got {distinct}", number=float(distinct))
     if values.max() <= 0:
         raise FitError("strength must be positive somewhere; is the dot darker than its paper?", number=values.max())
     return radii, values
@@ -211,13 +211,13 @@ def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, I
         >>> round(float(r.max())), round(float(strength.mean()), 3), len(set(spoke.tolist()))
         (5, 0.5, 36)
     """
-    still, moved = a_picture("sharp", sharp, _MIN_SIDE_PX), a_picture("blurred", blurred, _MIN_SIDE_PX)
-    dot, blurred_dot = find_dot(still), find_dot(moved)
+    focused, defocused = a_picture("sharp", sharp, _MIN_SIDE_PX), a_picture("blurred", blurred, _MIN_SIDE_PX)
+    dot, blurred_dot = find_dot(focused), find_dot(defocused)
     # the outermost pixel of the dot is half paper
     r = np.arange(0.0, max(dot.radius - 1.0, 1.0) + 1e-9)
     theta = np.deg2rad(np.arange(0, 360, _STEP_DEG))[:, None]
     positions = [dot.y + r * np.sin(theta), dot.x + r * np.cos(theta)]
-    sharp_level, blurred_level = (map_coordinates(p, positions, order=1, mode="nearest") for p in (still, moved))
+    sharp_level, blurred_level = (map_coordinates(p, positions, order=1, mode="nearest") for p in (focused, defocused))
     sharp_level, blurred_level = sharp_level - dot.background, blurred_level - blurred_dot.background
     is_lit = sharp_level > 0.2 * dot.peak
     spokes, rays = np.nonzero(is_lit)

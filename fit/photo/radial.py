@@ -91,8 +91,8 @@ def size_of_profile(solution: Solution) -> tuple[float, float]:
     """Rms radius of a free profile and its standard error, px; the second moment is linear in the values."""
     values, radius = np.asarray(solution.params["values"]), float(solution.params["radius"])
     r = np.linspace(0, radius, 64 * values.size + 1)
-    place = r / radius * (values.size - 1)
-    hats = np.clip(1 - np.abs(place[None, :] - np.arange(values.size)[:, None]), 0, None)
+    position = r / radius * (values.size - 1)
+    hats = np.clip(1 - np.abs(position[None, :] - np.arange(values.size)[:, None]), 0, None)
     light, moment = hats @ r, hats @ r**3
     rms = float(np.sqrt(moment @ values / (light @ values)))
     # derivative of a quotient: the total light depends on the values too

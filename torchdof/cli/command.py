@@ -83,7 +83,7 @@ def by_option(names: Mapping[str, str]) -> Iterator[None]:
         yield
     except ValueError as error:
         pattern = re.compile(r"\b(" + "|".join(names) + r")\b")
-        raise ValueError(pattern.sub(lambda found: names[found.group()], str(error))) from None
+        raise ValueError(pattern.sub(lambda match: names[match.group()], str(error))) from None
 
 
 class _Command(click.Command):

@@ -235,6 +235,6 @@ class FitPrinter:
 
     def _save(self, figure: Any, target: Path) -> None:
         """Writes a figure, whole or not at all, and prints its path."""
-        with atomic_file(target) as part:
-            figure.savefig(part)
+        with atomic_file(target) as temporary:
+            figure.savefig(temporary)
         self.say(str(target))

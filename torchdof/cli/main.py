@@ -73,8 +73,8 @@ class _Commands(click.Group):
             return super().invoke(ctx)
 
 
-def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
-    if wanted:
+def _print_version(ctx: click.Context, _: click.Parameter, is_given: bool) -> None:
+    if is_given:
         from .. import native  # imports PyTorch
 
         click.echo(f"torchdof {importlib.metadata.version('torchdof')}, engine {native.describe()}")

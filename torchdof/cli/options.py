@@ -50,8 +50,8 @@ class ApertureOptions:
         try:
             table = getattr(BlurTable, name)() if name in _IDEAL_TABLES else BlurTable.load(name)
         except FileNotFoundError:
-            known = ", ".join([*_IDEAL_TABLES, *shipped()])
-            raise FileNotFoundError(f"no blur table {name!r}: neither a file nor one of {known}") from None
+            names_known = ", ".join([*_IDEAL_TABLES, *shipped()])
+            raise FileNotFoundError(f"no blur table {name!r}: neither a file nor one of {names_known}") from None
         is_default = aperture.is_round and self.squeeze == 1.0 and not aperture.depends_on_place
         return table if is_default else table.with_aperture(aperture)
 

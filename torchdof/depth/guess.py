@@ -41,7 +41,7 @@ class Guess:
     relative_kind: RelativeKind = "disparity"
 
 
-def guess_kind(values: Tensor, whole: bool = False, metric: bool = False) -> Guess:
+def guess_kind(values: Tensor, integers: bool = False, metric: bool = False) -> Guess:
     """Guesses the meaning of the numbers of a depth map.
 
     * Whole numbers are relative depth (grey levels) if the largest is at most 255, or at least 60,000. Otherwise they
@@ -52,7 +52,7 @@ def guess_kind(values: Tensor, whole: bool = False, metric: bool = False) -> Gue
 
     Args:
         values: ``[1, 1, H, W]``; NaN and infinite values are ignored.
-        whole: Whether the file type holds whole numbers only; otherwise the values are examined.
+        integers: Whether the file type holds whole numbers only; otherwise the values are examined.
         metric: Whether other input is in metres; distances are then never taken for disparity.
 
     Example:
@@ -63,12 +63,12 @@ def guess_kind(values: Tensor, whole: bool = False, metric: bool = False) -> Gue
         >>> guess_kind(torch.linspace(2.5, 8.0, 256).reshape(1, 1, 16, 16).flip(2)).scale
         1.0
     """
-    known = values[values.isfinite()]
-    low, high = (float(end) for end in known.aminmax()) if known.numel() else (0.0, 0.0)
+    finite = values[values.isfinite()]
+    low, high = (float(end) for end in finite.aminmax()) if finite.numel() else (0.0, 0.0)
     if low == high:
         return Guess("z")
     downwards = _growth_downwards(values)
-    if whole or whole_numbers(known):
+    if integers or whole_numbers(finite):
         is_relative = high <= _MAX_8_BIT or high >= _MIN_16_BIT
         metric_guess = Guess("z", 0.001, 0.0)
     else:
@@ -100,11 +100,11 @@ def subject_m(depth: Tensor) -> float:
     depth = _sampled(depth).double().cpu()
     y, x = (torch.linspace(-0.5, 0.5, size + 2, dtype=torch.float64)[1:-1] for size in depth.shape)
     weight = torch.exp(-0.5 * ((y[:, None] / _MIDDLE_SIGMA).square() + (x / _MIDDLE_SIGMA).square()))
-    known = depth > 0
-    if not bool(known.any()):
+    is_known = depth > 0
+    if not bool(is_known.any()):
         raise ValueError("no pixel has a depth; check the kind, scale and offset of the depth map")
-    dioptres, order = (1.0 / depth[known]).sort()
-    weight = weight[known][order]
+    dioptres, order = (1.0 / depth[is_known]).sort()
+    weight = weight[is_known][order]
     low, high = (float(dioptres[int(share * (dioptres.numel() - 1))]) for share in (_OUTLIERS, 1.0 - _OUTLIERS))
     bins = ((dioptres - low) / max(high - low, 1e-9) * _BINS).clamp(0, _BINS - 1).long()
     shares = torch.zeros(_BINS, dtype=torch.float64).index_add_(0, bins, weight / weight.sum())

@@ -65,11 +65,11 @@ class DepthReport:
         The bounds are 1, 2, 4, ... 128 px; empty bins at both ends are left out.
         """
         bounds = [-math.inf, *(-x for x in reversed(_BOUNDS_PX)), *_BOUNDS_PX, math.inf]
-        known = self.coc_px[~self.coc_px.isnan()]
-        edges = torch.tensor(bounds[1:-1], dtype=known.dtype, device=known.device)
-        counts = torch.bincount(torch.bucketize(known, edges), minlength=len(bounds) - 1).tolist()
+        coc_px = self.coc_px[~self.coc_px.isnan()]
+        edges = torch.tensor(bounds[1:-1], dtype=coc_px.dtype, device=coc_px.device)
+        counts = torch.bincount(torch.bucketize(coc_px, edges), minlength=len(bounds) - 1).tolist()
         filled = [k for k, count in enumerate(counts) if count] or [len(_BOUNDS_PX)]
-        total = max(1, known.numel())
+        total = max(1, coc_px.numel())
         return [(bounds[k], bounds[k + 1], counts[k] / total) for k in range(filled[0], filled[-1] + 1)]
 
     def distances(self) -> dict[str, float]:
@@ -83,12 +83,12 @@ class DepthReport:
 
     def facts(self) -> dict[str, Any]:
         """The numbers of ``str`` as JSON-like data: distances in metres, radii in pixels, shares in [0, 1]."""
-        known = self.coc_px[~self.coc_px.isnan()]
+        coc_px = self.coc_px[~self.coc_px.isnan()]
         return {
             "depth_m": self.distances(),
             "at_infinity_px": int(self.depth.isinf().sum()),
             "holes_px": self.holes,
-            "coc_px": [float(known.min()), float(known.max())] if known.numel() else [],
+            "coc_px": [float(coc_px.min()), float(coc_px.max())] if coc_px.numel() else [],
             "in_focus": self.sharp,
             "histogram": [{"from_px": low, "to_px": high, "share": share} for low, high, share in self.histogram()],
             "depth_edges": dict(zip(EDGES, self.counts, strict=True)),
@@ -101,9 +101,9 @@ class DepthReport:
             lines.append("depth, m      " + "  ".join(f"{name} {metres:.4g}" for name, metres in distances.items()))
         infinite = int(self.depth.isinf().sum())
         lines.append(f"at infinity   {_percent(infinite, total)}   holes {self.holes} ({_percent(self.holes, total)})")
-        known = self.coc_px[~self.coc_px.isnan()]
-        if known.numel():
-            lines.append(f"blur radius   {float(known.min()):+.1f} to {float(known.max()):+.1f} px, negative is near")
+        coc_px = self.coc_px[~self.coc_px.isnan()]
+        if coc_px.numel():
+            lines.append(f"blur radius   {float(coc_px.min()):+.1f} to {float(coc_px.max()):+.1f} px, negative is near")
             lines.append(f"in focus      {100 * self.sharp:.1f} % of the pixels (radius of at most 1 px)")
             longest = max(share for _, _, share in self.histogram())
             for low, high, share in self.histogram():

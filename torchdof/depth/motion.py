@@ -13,22 +13,22 @@ _NOISE = 1e-4  # squared difference of noise, for the same test
 _STILL_SHARE = 1e-3  # share of changed pixels below which motion is not searched
 
 
-def motion_between(frame: Tensor, before: Tensor, changed: Tensor) -> Tensor:
+def motion_between(current_frame: Tensor, previous_frame: Tensor, is_changed: Tensor) -> Tensor:
     """Optical flow ``[B, 2, H, W]`` from each pixel of a frame to its content in the previous frame.
 
     Args:
-        frame: ``[B, C, H, W]``.
-        before: The previous frame, ``[B, C, H, W]``.
-        changed: ``[B, 1, H, W]``, bool: pixels that differ between both frames. With less than 0.1 % of them the flow
-            is 0.
+        current_frame: ``[B, C, H, W]``.
+        previous_frame: The previous frame, ``[B, C, H, W]``.
+        is_changed: ``[B, 1, H, W]``, bool: pixels that differ between both frames. If they are less than 0.1 %, the
+            flow is 0.
 
     Returns:
         x and y in pixels, with subpixel precision, computed at half the resolution.
     """
-    batch, _, height, width = frame.shape
-    if float(changed.float().mean()) <= _STILL_SHARE:
-        return frame.new_zeros(batch, 2, height, width)
-    levels = [(_halved(frame.mean(1, keepdim=True)), _halved(before.mean(1, keepdim=True)))]
+    batch, _, height, width = current_frame.shape
+    if float(is_changed.float().mean()) <= _STILL_SHARE:
+        return current_frame.new_zeros(batch, 2, height, width)
+    levels = [(_halved(current_frame.mean(1, keepdim=True)), _halved(previous_frame.mean(1, keepdim=True)))]
     while min(levels[-1][0].shape[-2:]) >= 2 * _COARSEST_PX and len(levels) < _LEVELS:
         levels.append((_halved(levels[-1][0]), _halved(levels[-1][1])))
     flow = levels[-1][0].new_zeros(batch, 2, *levels[-1][0].shape[-2:])

@@ -157,22 +157,22 @@ def solve_scale(
         raise ValueError(f"values must be one map [1, 1, H, W], got {list(values.shape)}; solve each on its own")
     if isinstance(patch, bool) or not isinstance(patch, int) or patch < 1:
         raise ValueError(f"patch must be a whole number of pixels, at least 1, got {show(patch)}")
-    known = [_point(values, point, kind, patch) for point in points]
-    if len({value for value, _ in known}) < 2:
+    samples = [_point(values, point, kind, patch) for point in points]
+    if len({value for value, _ in samples}) < 2:
         raise ValueError(
-            f"scale and offset need at least two points of different values, got {len(known)} points of values "
-            f"{sorted({value for value, _ in known})}"
+            f"scale and offset need at least two points of different values, got {len(samples)} points of values "
+            f"{sorted({value for value, _ in samples})}"
         )
     # Solve a v + b = y with y = z for "depth", else 1/z. Each row is divided by y, so that errors are relative.
-    value = torch.tensor([v for v, _ in known], dtype=torch.float64, device="cpu")
-    metres = torch.tensor([z for _, z in known], dtype=torch.float64, device="cpu")
+    value = torch.tensor([v for v, _ in samples], dtype=torch.float64, device="cpu")
+    metres = torch.tensor([z for _, z in samples], dtype=torch.float64, device="cpu")
     weight = 1.0 / metres if kind == "depth" else metres.clamp(max=1e6 * float(metres.min()))
     target = metres.isfinite().double() if kind != "depth" else torch.ones_like(value)
     design = torch.stack([value * weight, weight], dim=1)
     factor, constant = torch.linalg.lstsq(design, target[:, None], driver="gelsd").solution[:, 0].tolist()
     if not factor > 0:
-        other, way = ("disparity", "nearer") if kind == "depth" else ("depth", "farther")
-        raise ValueError(f"at the points, larger values are {way}; that is kind={other!r}, not {kind!r}")
+        other, direction = ("disparity", "nearer") if kind == "depth" else ("depth", "farther")
+        raise ValueError(f"at the points, larger values are {direction}; that is kind={other!r}, not {kind!r}")
     residual = float((design @ design.new_tensor([factor, constant]) - target).square().mean().sqrt())
     if kind == "depth":
         return Scale("z", factor, constant / factor, residual)

@@ -118,9 +118,9 @@ def focus_at_frame(keys: list[tuple[int, float]], frame: int) -> float:
     number("frame", frame)
     if frame <= keys[0][0]:
         return keys[0][1]
-    for (before, near), (after, far) in zip(keys, keys[1:], strict=False):
-        if frame <= after:
-            fraction = (frame - before) / (after - before)
+    for (first_frame, near), (last_frame, far) in zip(keys, keys[1:], strict=False):
+        if frame <= last_frame:
+            fraction = (frame - first_frame) / (last_frame - first_frame)
             dioptres = (1.0 - fraction) / near + fraction / far
-            return far if frame == after else 1.0 / dioptres if dioptres > 0 else math.inf
+            return far if frame == last_frame else 1.0 / dioptres if dioptres > 0 else math.inf
     return keys[-1][1]

@@ -243,8 +243,8 @@ class BlurTable:
             TypeError: If a name is unknown.
         """
         names = ("unit", "sensor_width_mm", "strength", "name", "provenance", "residual", "aperture", "field")
-        kept = {"family": self.family, "coc": self.coc, "params": self._params}
-        return BlurTable(**{**kept, **{name: getattr(self, name) for name in names}, **changes})
+        fields = {"family": self.family, "coc": self.coc, "params": self._params}
+        return BlurTable(**{**fields, **{name: getattr(self, name) for name in names}, **changes})
 
     @property
     def is_round(self) -> bool:
@@ -658,5 +658,5 @@ def _numbers(name: str, value: Any) -> Tensor:
 
 
 def _short(numbers: Tensor) -> str:
-    shown = ", ".join(f"{x:g}" for x in numbers.flatten()[:6].tolist())
-    return f"[{shown}{', ...' if numbers.numel() > 6 else ''}] of shape {list(numbers.shape)}"
+    text = ", ".join(f"{x:g}" for x in numbers.flatten()[:6].tolist())
+    return f"[{text}{', ...' if numbers.numel() > 6 else ''}] of shape {list(numbers.shape)}"

@@ -172,8 +172,8 @@ class Camera:
         if compiled is not None:
             return compiled
         z = depth if depth.dtype in (torch.float32, torch.float64) else depth.float()
-        known = z > 0
-        z = torch.where(known, z, 1.0)
+        is_valid = z > 0
+        z = torch.where(is_valid, z, 1.0)
         scale = _as_map(self.aperture_radius_m * self.focal_px(width), z)
         shift = self._tilted_dioptres(z, width)
         if self.focus_range_m is None:
@@ -181,7 +181,7 @@ class Camera:
         else:
             near, far = (_dioptres_behind(z, _as_map(end, z)) + shift for end in self.focus_range_m)
             dioptres = near.clamp(max=0.0) + far.clamp_min(0.0)
-        return torch.where(known, scale * dioptres, torch.nan)
+        return torch.where(is_valid, scale * dioptres, torch.nan)
 
     def _compiled_coc_px(self, depth: Tensor, width: int) -> Tensor | None:
         """The same by the compiled engine; None if that does not support the call (traced, batched, tilted, ...)."""
@@ -308,7 +308,7 @@ class Camera:
             weights.append(torch.where(inside, torch.exp(-0.5 * offset.square()), 0.0))
         return self._focused(depth, (weights[0][:, None] * weights[1])[None, None], f"in the box {show(box)}")
 
-    def _focused(self, depth: Tensor, weight: Tensor, where: str) -> "Camera":
+    def _focused(self, depth: Tensor, weight: Tensor, location: str) -> "Camera":
         """This camera with the weighted median of the distances that would bring each pixel into focus."""
         distance = depth
         at_infinity = dataclasses.replace(self, focus_m=math.inf, focus_range_m=None)
@@ -318,12 +318,12 @@ class Camera:
             distance = breathing / (1.0 / depth - shift)
         medians = []
         for values, item_weight, valid in zip(distance, weight.expand(depth.shape), depth > 0, strict=True):
-            used = valid & (item_weight > 0)
-            if not bool(used.any()):
-                raise ValueError(f"depth must be > 0 where the focus lies, got no valid depth {where}")
-            medians.append(_weighted_median(values[used], item_weight[used]))
+            is_used = valid & (item_weight > 0)
+            if not bool(is_used.any()):
+                raise ValueError(f"depth must be > 0 where the focus lies, got no valid depth {location}")
+            medians.append(_weighted_median(values[is_used], item_weight[is_used]))
         if not all(float(median) > 0 for median in medians):
-            raise ValueError(f"no focus brings the depth {where} onto the tilted plane; tilt less")
+            raise ValueError(f"no focus brings the depth {location} onto the tilted plane; tilt less")
         focus_m = float(medians[0]) if len(medians) == 1 else torch.stack(medians)
         return self.replace(focus_m=focus_m)
 

@@ -289,9 +289,9 @@ class KernelBank:
         outside = (torch.maximum(step.abs(), step.abs()[:, None]) > halves[:, None, None])[:, None]
         if self.is_even:
             disc = (torch.hypot(step[:, None], step) <= reach[:, :, None, None]).to(torch.float64)
-            made = disc / disc.sum((-2, -1), keepdim=True)
+            out = disc / disc.sum((-2, -1), keepdim=True)
         else:
-            made = torch.zeros(len(spots.part), self.colours, len(step), len(step), dtype=torch.float64, device="cpu")
+            out = torch.zeros(len(spots.part), self.colours, len(step), len(step), dtype=torch.float64, device="cpu")
             for key in set(spots.which):
                 items = torch.tensor([i for i, other in enumerate(spots.which) if other == key], device="cpu")
                 low, high, fine_low, fine_high = (spots.templates[i].double() for i in key)
@@ -301,14 +301,14 @@ class KernelBank:
                 if bool((finer[items] > 0).any()):
                     fine = self._sampled(torch.lerp(fine_low, fine_high, part), sizes, outside[items], cut)
                     kernel = torch.lerp(kernel, fine, finer[items][:, None, None, None])
-                made = made.index_put((items,), kernel)
+                out = out.index_put((items,), kernel)
         if any(spots.flipped):
-            made = torch.where(torch.tensor(spots.flipped, device="cpu")[:, None, None, None], made.flip(-2, -1), made)
+            out = torch.where(torch.tensor(spots.flipped, device="cpu")[:, None, None, None], out.flip(-2, -1), out)
         if bool((fade == 1.0).all()):
-            return made
-        centre = torch.zeros_like(made)
+            return out
+        centre = torch.zeros_like(out)
         centre[..., half, half] = 1.0
-        return torch.lerp(centre, made, fade[:, :, None, None])
+        return torch.lerp(centre, out, fade[:, :, None, None])
 
     def _sampled(self, cells: Tensor, reach: Tensor, outside: Tensor, cut: Tensor) -> Tensor:
         """Kernels ``[n, C, k, k]`` from templates ``[n, C, cells, cells]`` and reach ``[n, C]``.
@@ -371,4 +371,4 @@ class KernelBank:
             if len(self._moved) >= _MAX_WIDTHS:
                 self._moved.clear()
             self._moved[width] = self.table.moved_in_focus(width).tolist()
-        return [min(coc_px**2 * FADE_IN / max(moved, 1e-300), 1.0) for moved in self._moved[width]]
+        return [min(coc_px**2 * FADE_IN / max(moved_light, 1e-300), 1.0) for moved_light in self._moved[width]]

@@ -372,8 +372,8 @@ def _parameter(name: str, value: Number, device: torch.device) -> Tensor:
         return tensor.to(device, torch.float64)
     if name == "values":
         raise ValueError(f"values must be a tensor [..., P], got {show(value)}")
-    plain = isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool) and abs(value) < 1e300)
-    if not plain:
+    valid = isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool) and abs(value) < 1e300)
+    if not valid:
         raise ValueError(f"{name} must be a number or a tensor of them, got {show(value)}")
     return torch.tensor(value, dtype=torch.float64, device=device)
 
@@ -580,12 +580,12 @@ def _sliced_quadrant(
     rows = max(1, _SLICES_AT_ONCE // ((half + 1) * slices))
     strips = []
     for top in range(0, half + 1, rows):
-        part = (half, slices, top, min(top + rows, half + 1))
+        rows_part = (half, slices, top, min(top + rows, half + 1))
         if aspect is None:
-            cut = functools.partial(_square_slices, *part)
-            parts = _quadrants.get(part, cut) if half <= _CACHED_HALF_WIDTH else cut()
+            make = functools.partial(_square_slices, *rows_part)
+            parts = _quadrants.get(rows_part, make) if half <= _CACHED_HALF_WIDTH else make()
         else:
-            parts = _slices(*part, aspect)
+            parts = _slices(*rows_part, aspect)
         inner, outer, area = (t.to(lengths[FAMILIES[family][-1]].device) for t in parts)
         strips.append((_slice_means(family, lengths, inner, outer) * area).sum(-1).unflatten(-1, (-1, half + 1)))
     return torch.cat(strips, -2)

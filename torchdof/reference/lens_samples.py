@@ -53,7 +53,7 @@ class LensSamples:
         self._nodes = torch.cat([near[1:].flip(0), far])
         radii = _radii(table, channel, self._nodes, width)
         self._views, self._points = _Points.of(views, radii), _Points.of(views * points_per_view, radii)
-        self._owner = _nearest(self._points.places, self._views.places)
+        self._owner = _nearest(self._points.positions, self._views.positions)
 
     def shift(self, view: int, coc_px: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Shift along x and y of surfaces in this view, in pixels, and the derivatives of both by the coc."""
@@ -78,7 +78,7 @@ class LensSamples:
 class _Points(NamedTuple):
     """Points of the lens, and the shift of each at the tabulated circles of confusion."""
 
-    places: Tensor  # [n, 2] on the unit disc
+    positions: Tensor  # [n, 2] on the unit disc
     directions: Tensor  # [n, 2] unit vectors
     radii: Tensor  # [n, nodes] signed shift in pixels at each tabulated coc
 
