@@ -128,7 +128,6 @@ class _Casts(onnx_ir.passes.InPlacePass):
     """``CastLike`` becomes ``Cast``, or nothing if the type is right already; not every runtime simplifies it."""
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        """Replace in all graphs."""
         number = itertools.count()
         for graph in (model.graph, *model.graph.subgraphs()):
             for node in list(graph):
@@ -156,7 +155,6 @@ class _Parts(onnx_ir.passes.InPlacePass):
     """A slice that is exactly one input of a ``Concat`` becomes that input; onnxruntime would warn of it."""
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        """Replace in the graph, which is still flat."""
         for node in list(model.graph):
             if node.op_type == "Slice" and not node.outputs[0].is_graph_output():
                 part = _part(node)
@@ -170,7 +168,6 @@ class _Cuts(onnx_ir.passes.InPlacePass):
     """Two slices in sequence along different axes become one, because each copies."""
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        """Replace in the graph."""
         for node in list(model.graph):
             source = node.inputs[0] if node.op_type == "Slice" else None
             first = None if source is None else source.producer()
@@ -198,7 +195,6 @@ class _Averages(onnx_ir.passes.InPlacePass):
     """Block means before a convolution become a convolution, which is several times as fast in runtimes."""
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        """Replace in the graph."""
         for node in list(model.graph):
             following = [use.node for use in node.outputs[0].uses()] if node.op_type == "AveragePool" else []
             if [n.op_type for n in following] != ["Pad"]:
@@ -228,7 +224,6 @@ class _Fills(onnx_ir.passes.InPlacePass):
     """
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        """Replace in the graph."""
         graph = model.graph
         for pad in list(graph):
             missing = _spare_channels(pad)
@@ -256,7 +251,6 @@ class _Splits(onnx_ir.passes.InPlacePass):
     """A slice of the first channels and a split become one split, whose last part is not used."""
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        """Replace in the graph."""
         graph = model.graph
         for node in [n for n in graph if n.op_type == "Split" and n.attributes["axis"].as_int() == 1]:
             cut: Any = None if node.inputs[0] is None else node.inputs[0].producer()
@@ -287,16 +281,14 @@ class _Ramps(onnx_ir.passes.InPlacePass):
     """
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        """Replace in the graph."""
         for node in list(model.graph):
             clip: Any = _operand(node.outputs[0], "Sub", 1.0)
             clip = None if clip is None else clip.producer()
-            division: Any = None if clip is None or clip.op_type != "Clip" else clip.inputs[0].producer()
-            bounds = [] if clip is None else [_number(v) for v in clip.inputs[1:]]
-            if division is not None and division.op_type == "Div" and bounds == [0.0, 1.0]:
-                width = _number(division.inputs[1])
+            ratio: Any = None if clip is None or clip.op_type != "Clip" else clip.inputs[0].producer()
+            if ratio is not None and ratio.op_type == "Div" and [_number(v) for v in clip.inputs[1:]] == [0.0, 1.0]:
+                width = _number(ratio.inputs[1])
                 if width is not None:
-                    ramp = onnx_ir.node("HardSigmoid", [division.inputs[0]], {"alpha": -1.0 / width, "beta": 1.0})
+                    ramp = onnx_ir.node("HardSigmoid", [ratio.inputs[0]], {"alpha": -1.0 / width, "beta": 1.0})
                     ramp.outputs[0].type, ramp.outputs[0].shape = node.outputs[0].type, node.outputs[0].shape
                     model.graph.insert_before(node, [ramp])
                     node.outputs[0].replace_all_uses_with(ramp.outputs[0])

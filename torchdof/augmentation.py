@@ -350,7 +350,6 @@ class _DepthOps(AugmentationSequentialOps):
         extra_args: dict[DataKey, dict[str, Any]],
         data_keys: list[Any] | None = None,
     ) -> Any:
-        """Apply one step to all inputs."""
         keys = self.preproc_datakeys(data_keys)
         if isinstance(module, RandomDepthOfField) and DataKey.MASK in keys and isinstance(param.data, dict):
             depth = arg[keys.index(DataKey.MASK)]

@@ -19,9 +19,8 @@ from .validation import ends, image_and_coc, image_and_map, show
 
 __all__ = ["splat"]
 
-# Radii at which kernels are made: 1/128 px apart up to 2 px, and 1/256 of the radius apart above.
 _STEPS_PER_PX = 128  # kernels per px of radius, up to _LINEAR_UP_TO_PX; more take longer and hardly change the picture
-_LINEAR_UP_TO_PX = 2.0  # radius in px from which kernels are spaced in proportion to it; larger is finer
+_LINEAR_UP_TO_PX = 2.0  # radius in px above which kernels are 1/256 of the radius apart; larger is finer
 _KERNELS_AT_ONCE = 64  # kernels of similar radius made together, each as wide as the widest; more take more memory
 _MIN_WEIGHT = 1e-6  # scattered weight, of 1: pixels with less are unknown and become 0
 _DISC = BlurTable.disc()
@@ -169,7 +168,6 @@ class _Scatter(torch.autograd.Function):
 
     @staticmethod
     def setup_context(context: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        """Save the inputs."""
         *tensors, context.steps = inputs
         context.save_for_backward(*tensors)
 

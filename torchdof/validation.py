@@ -25,9 +25,6 @@ WHOLE_NUMBERS = (
 _MAX_STRETCH = 0.03  # largest change of a depth map's aspect ratio; estimators work at multiples of 14 or 64 px
 
 
-# Numbers and words
-
-
 def show(value: Any) -> str:
     """A short text for a value in a message; never raises."""
     if isinstance(value, Tensor):
@@ -105,9 +102,6 @@ def pixels_wide(width: Any) -> None:
     number("width", width, low=0, unit="pixels")
 
 
-# Tensors
-
-
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
     """As :func:`torch.broadcast_shapes`, whose first call imports sympy and takes half a second.
 
@@ -171,9 +165,6 @@ def _finite(name: str, values: Tensor) -> None:
             f"{name} must be finite, got {bad} of {values.numel()} values that are NaN or infinite; "
             "repair them, or pass check=False"
         )
-
-
-# An image [B, C, H, W] and what belongs to it
 
 
 def image_and_map(image: Tensor, name: str, value: Tensor, unit: str) -> None:
@@ -302,9 +293,6 @@ def same_aspect(image: Tensor, depth: Tensor) -> None:
             f"depth is {columns} x {rows} pixels and the image {width} x {height}: a depth map may have another size, "
             f"but must have the same aspect ratio, to within 3 %; {hint}"
         )
-
-
-# Layers
 
 
 def stack(rgba: Tensor, depth_m: Tensor, values: bool) -> Tensor:

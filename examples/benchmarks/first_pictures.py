@@ -188,9 +188,8 @@ def beyond_files(image: Tensor, coc_px: Tensor) -> tuple[Tensor, Seconds]:
 def demonstrated(image: Tensor, _: Tensor) -> tuple[Tensor, Seconds]:
     """The time of ``examples/demo.py``, from the repository of the measured installation if it has one."""
     script = Path(torchdof.__file__).parents[1] / "examples" / "demo.py"
-    script = script if script.exists() else ROOT / "examples" / "demo.py"
     with tempfile.TemporaryDirectory() as out:
-        return image, spent(script, "--data", DATA, "--out", out)
+        return image, spent(script if script.exists() else ROOT / "examples/demo.py", "--data", DATA, "--out", out)
 
 
 def turn_of(part: str, folder: Path, turn: int) -> list[dict[str, Any]]:

@@ -35,9 +35,8 @@ _PRIOR_WEIGHT = 1e-4  # weight of the ray histogram, which determines details of
 _MIN_INTERVAL_PX = 0.01  # pixels of coc; narrower intervals are not divided
 _TARGET_DB = 62.0  # PSNR of a natural image in the middle of an interval; elsewhere it may be a few dB less
 _CONTRAST = 0.22  # standard deviation of natural images over their peak
-# For named shapes: ranges of the parameters; number of samples of the profile, and the radius up to which it is
-# sampled; weight of the neighbour's parameters, which avoids jumps of parameters that the spot does not determine.
-# Lengths are relative to the distance of the outermost ray.
+# Named shapes, lengths relative to the distance of the outermost ray: ranges of the parameters; samples of the profile,
+# and their reach; weight of the neighbour's parameters, which keeps those steady that the spot does not determine.
 _RANGES = {"radius": (0.02, 1.3), "sigma": (0.01, 1.0), "r_c": (0.0, 1.3), "b": (-1.0, 20.0), "m": (0.5, 12.0)}
 _SAMPLES, _SAMPLED_REACH, _NEIGHBOUR_WEIGHT = 400, 2.0, 1e-3
 

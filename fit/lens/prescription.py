@@ -107,9 +107,8 @@ def _number(name: str, text: str) -> float:
 def lines(surfaces: Sequence[Surface], stop: int) -> list[str]:
     """Surfaces as lines of a prescription; the inverse of :func:`parse`."""
     media = [AIR, *(surface.glass for surface in surfaces)]
-    known = catalogue().values()
-    defined = {glass.name: glass for glass in media if len(glass.coefficients) == 6 and glass not in known}
-    text_lines = [" ".join(["glass", name, *map(repr, glass.coefficients)]) for name, glass in defined.items()]
+    named = {glass.name: glass for glass in media if len(glass.coefficients) == 6 and glass not in catalogue().values()}
+    text_lines = [" ".join(["glass", name, *map(repr, glass.coefficients)]) for name, glass in named.items()]
     for i, surface in enumerate(surfaces):
         shape = zip(_SHAPE, (surface.conic, *surface.polynomial), strict=False)
         shape_words = [f"{name}={value:.9g}" for name, value in shape if value]

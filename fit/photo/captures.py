@@ -97,11 +97,9 @@ class Captures:
                 a_number(name, value, *RANGES[name])
 
     def __iter__(self) -> Iterator[Capture]:
-        """Iterate over the pairs."""
         return iter(self.pairs)
 
     def __len__(self) -> int:
-        """Number of pairs."""
         return len(self.pairs)
 
     @property

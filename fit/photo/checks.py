@@ -59,11 +59,10 @@ def check_linearity(picture: Array, dot: Dot, edge: Edge, file: str | None) -> b
         )
         warn(text, "not linear", file=file, number=edge.steepness)
         return False
-    encoded_edge = soft_edge(picture, dot, fit_exponent=True) if edge.misfit >= EXPLAINED else edge
-    if encoded_edge.exponent < _MAX_EXPONENT and encoded_edge.rms < 0.75 * edge.rms:
-        power = encoded_edge.exponent
-        text = f"the dot's edge is that of light to the power {power:.2f}, as in a picture that is left sRGB "
-        warn(f"{text}encoded (about 0.45); {_DECODE_ADVICE}", "not linear", file=file, number=power)
+    encoded = soft_edge(picture, dot, fit_exponent=True) if edge.misfit >= EXPLAINED else edge
+    if encoded.exponent < _MAX_EXPONENT and encoded.rms < 0.75 * edge.rms:
+        text = f"the dot's edge is that of light to the power {encoded.exponent:.2f}, as in a picture that is left "
+        warn(f"{text}sRGB encoded (about 0.45); {_DECODE_ADVICE}", "not linear", file=file, number=encoded.exponent)
         return False
     return True
 

@@ -126,12 +126,11 @@ def fit_openings(
     return fits, opening
 
 
-def _fit_like(fit: BlurFit, pair: Capture, focus_m: float, sharp: Array, blurred: Array, **arguments: Any) -> BlurFit:
+def _fit_like(fit: BlurFit, pair: Capture, focus_m: float, sharp: Array, blurred: Array, **options: Any) -> BlurFit:
     """Fits other pictures of a pair like its own: with the same family and opening, or free profile's end."""
     family, start = (fit.family, fit) if fit.aperture is None else ("image", None)
-    reach = fit.params["radius"] if family == "radial" else None
-    arguments |= {"start": start, "aperture": fit.aperture, "reach": reach}
-    return fit_one(replace(pair, sharp=sharp, blurred=blurred), focus_m, family, **arguments)
+    options |= {"start": start, "aperture": fit.aperture, "reach": fit.params["radius"] if family == "radial" else None}
+    return fit_one(replace(pair, sharp=sharp, blurred=blurred), focus_m, family, **options)
 
 
 def with_uncertainty(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:

@@ -50,8 +50,7 @@ def solve_opening(round_fit: Solution) -> tuple[Solution, str] | None:
             best, excluded = polygon, f"round, nor a polygon of {blades} blades"
             why = f"a polygon of {blades} blades, its BIC lower by {gain:.0f} than that of any round profile"
     asymmetry, probability = asymmetry_of(best)
-    is_asymmetric = asymmetry > ASYMMETRIC and probability < P_VALUE
-    if is_asymmetric or residual_rms(best) > _MAX_RATIO * noise_near(best):
+    if (asymmetry > ASYMMETRIC and probability < P_VALUE) or residual_rms(best) > _MAX_RATIO * noise_near(best):
         kernel, gain = _deconvolved(best)
         if gain > _MIN_LIKELIHOOD_GAIN:
             best = solve_image(best, kernel)

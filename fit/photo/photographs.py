@@ -168,10 +168,7 @@ def read_photographs(
 def _pair(
     folder: Path, sharp: Photograph, blurred: Photograph, original: Mapping[str, Array], tone: Tone | None, each: bool
 ) -> Capture:
-    """Windows of the dot in two photographs; also, from their `original` light, for tone curves a standard error away.
-
-    `each` adds a window for each colour.
-    """
+    """Windows of the dot in two photographs, with colours if `each`; also, from `original` light, for other curves."""
     half = int(WINDOW * min(sharp.target.side_px, blurred.target.side_px))
 
     def colours_of(picture: Photograph) -> Array:

@@ -113,9 +113,8 @@ def compare(
         for occlusion in (True, False):
             dense = functools.partial(blur_by_coc, table=scene.table, occlusion=occlusion, tolerance=0.0)
             exact = functools.cache(lambda camera, dense=dense: dense(camera.image, camera.coc_px))
-            measurements = list(works(scene, occlusion, repeat, runtimes, scan))
-            todo = track(measurements, "", console=console, transient=True, disable=hidden)
-            for columns, blur, camera, is_error in todo:
+            cases = list(works(scene, occlusion, repeat, runtimes, scan))
+            for columns, blur, camera, is_error in track(cases, "", console=console, transient=True, disable=hidden):
                 if is_error:
                     (picture, _), peak_mb = peak_of(functools.partial(timed, blur, camera.image, camera.coc_px))
                     rows.append({**columns, "peak_mb": peak_mb, **error(picture, exact(camera))})

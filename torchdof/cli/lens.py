@@ -27,7 +27,7 @@ _WIDER = {  # option that sets the aperture -> how to open the lens wider
     "--blur": "a larger --blur",
 }
 _DEFAULT_BLUR, _VISIBLE_BLUR = 0.02, 0.005  # largest blur radius over the width: by default; the smallest visible one
-_PIXELS_PER_OUTLIER, _MAX_SAMPLES = 1000, 2**20  # one pixel in so many is an outlier; most pixels examined
+_PER_OUTLIER, _MAX_SAMPLES = 1000, 2**20  # one pixel in so many is an outlier; most pixels examined
 _SPELLED = {"focus_range_m": "--focus-range", "tilt_deg": "--tilt", "swing_deg": "--swing", "fov_x_deg": "--fov-deg"}
 
 
@@ -131,10 +131,9 @@ class Lens(Sensor):
         """Advice for a largest blur radius that is hardly visible."""
         if largest_px == 0:
             return "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
-        remedy = _WIDER[next(iter(self._opening), "--f-number")]
-        or_blur = f", or --blur {_DEFAULT_BLUR:.0%}" if is_still and self.blur_share is None else ""
-        hardly = f"the largest blur radius is {largest_px:.1f} px, which is hardly seen"
-        return f"{hardly}; {remedy}{or_blur} makes more of it"
+        hint = _WIDER[next(iter(self._opening), "--f-number")]
+        other = f", or --blur {_DEFAULT_BLUR:.0%}" if is_still and self.blur_share is None else ""
+        return f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; {hint}{other} makes more of it"
 
     @property
     def speaks_of_metres(self) -> bool:
@@ -224,8 +223,7 @@ class Lens(Sensor):
         cameras = [camera.replace(focus_m=metres) for _, metres in self.focus_m or []] or [camera]
         radii = [at_key.coc_px(depth, depth.shape[-1]).abs().nan_to_num(0.0).flatten() for at_key in cameras]
         sampled = [radius[:: 1 + radius.numel() // _MAX_SAMPLES] for radius in radii]
-        counts = [radius.numel() - radius.numel() // _PIXELS_PER_OUTLIER for radius in sampled]
-        return max(float(radius.kthvalue(count).values) for radius, count in zip(sampled, counts, strict=True))
+        return max(float(radius.kthvalue(radius.numel() - radius.numel() // _PER_OUTLIER).values) for radius in sampled)
 
     def stated(self, camera: "Camera") -> dict[str, Any]:
         """Option -> number of the camera, for messages."""
