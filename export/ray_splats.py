@@ -149,7 +149,7 @@ def blocked_share(
     blocked = covered * op.Unsqueeze(op.GatherND(fade, pair), axes)
     side = op.Shape(step)
     nothing = op.ConstantOfShape(op.Concat(op.Shape(item, start=0, end=1), side, side, axis=0))
-    # ScatterND would not do: runtimes add in parallel in it, and a source has several bins
+    # not ScatterND: runtimes add in parallel there, and would lose some bins of a source that has several
     target = op.Expand(op.Unsqueeze(source, axes), op.Shape(blocked))
     return op.Min(op.ScatterElements(nothing, target, blocked, axis=0, reduction="add"), 1.0)
 

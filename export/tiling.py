@@ -63,7 +63,7 @@ def seen(levels: Sequence[Level], coc_px: Tensor, mask: Tensor, ops: Ops) -> See
     may be something.
     """
     size = (coc_px.shape[-2], coc_px.shape[-1])
-    covered = [levels[0].step * n for n in levels[0].values.shape[-2:]]  # both have one centre
+    covered = [levels[0].step * n for n in levels[0].values.shape[-2:]]  # px; the levels are centred on the image
     missing = [(n + _SIDE - 1) // _SIDE * _SIDE - n for n in covered]  # below and right, to whole tiles
     top, left = ((w - n) // 2 for w, n in zip(covered, size, strict=True))
     halves = [torch.scalar_tensor((w - n) % 2, dtype=coc_px.dtype) for w, n in zip(covered, size, strict=True)]

@@ -174,7 +174,7 @@ def check_fit(solution: Solution, fit: BlurFit, file: str | None, freest: BlurFi
     ratio = freest.residual_over_noise
     residual = freest.residual
     far_above = (residual > _MIN_RESIDUAL and ratio > FAR_ABOVE) or (residual > _MIN_AT_TWICE and ratio > 2.0)
-    # if that is reported already, only what the family adds
+    # a residual far above the noise is reported below; here, only the part that the family adds to it
     warned_ratio = max(2.0, 1.3 * ratio) if far_above else 2.0
     if fit is not freest and fit.residual > _MIN_AT_TWICE and fit.residual_over_noise > warned_ratio:
         text = (

@@ -31,8 +31,8 @@ SourceKind = Literal["auto", "image", "dot"]
 _MIN_WINDOW_PX = 15
 _MIN_DOT_PX = 0.2
 # An ideal dot represents the sharp dot if the rms misfit of its edge, over the dot's level, is small enough.
-_MAX_EDGE_RMS = 2e-3  # for a dot that is magnified
-_MIN_VARIANCE, _MAX_UNEXPLAINED = 0.02, 0.02  # for a dot whose softness would add this variance in px^2; misfit then
+_MAX_EDGE_RMS = 2e-3  # largest misfit of a dot that is magnified
+_MIN_VARIANCE, _MAX_UNEXPLAINED = 0.02, 0.02  # if magnifying its softness adds this variance in px^2: largest misfit
 _MIN_RADIUS_PX = 4.0  # smallest radius of a dot and its blur; below, pixels have an effect like a tone curve
 _MIN_CHI_GAIN = 12.0  # decrease of chi squared for which the magnification is fitted: 3.5 sigma
 

@@ -27,7 +27,7 @@ _WIDER = {  # option that sets the aperture -> how to open the lens wider
     "--blur": "a larger --blur",
 }
 _DEFAULT_BLUR, _VISIBLE_BLUR = 0.02, 0.005  # largest blur radius over the width: by default; the smallest visible one
-_PER_OUTLIER, _MAX_SAMPLES = 1000, 2**20  # one pixel in so many is an outlier; most pixels examined
+_PER_OUTLIER, _MAX_SAMPLES = 1000, 2**20  # one pixel in 1000 is ignored as an outlier; most pixels examined
 _SPELLED = {"focus_range_m": "--focus-range", "tilt_deg": "--tilt", "swing_deg": "--swing", "fov_x_deg": "--fov-deg"}
 
 

@@ -12,7 +12,7 @@ from .sanity import whole_numbers
 
 __all__ = ["Guess", "guess_kind", "subject_m"]
 
-_MAX_8_BIT, _MIN_16_BIT = 255, 60_000  # whole numbers are grey levels if the largest is at most, or at least, this
+_MAX_8_BIT, _MIN_16_BIT = 255, 60_000  # whole numbers are grey levels if their largest is <= the first or >= the second
 _NEAR_ZERO = 0.05  # numbers up to 1 are relative if the smallest is below this: in metres it would be too near
 _CLEAR_CORRELATION = 0.35  # absolute correlation of values and rows above which values clearly grow or shrink downwards
 _MAX_SAMPLES = 65_536  # most pixels examined

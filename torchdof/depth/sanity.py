@@ -24,7 +24,7 @@ _SHARP_PX, _SHARP_WIDTHS = 1.0, 1e-3  # largest radius in focus: in px, and in i
 _NUMBERS = ("focal_length_mm", "f_number", "sensor_width_mm")
 _FAR_OFF_RATIO = 30.0  # ratio of focus to nearest or farthest depth beyond which a warning is given even without blur
 _FAR_M, _NEAR_M = 500.0, 0.1  # m; depth is suspiciously far, or suspiciously near
-_LARGE_WIDTHS, _LARGEST_WIDTHS = 1 / 8, 1.0  # image widths; a large, an impossible radius (macro lenses reach 1/2)
+_LARGE_WIDTHS, _LARGEST_WIDTHS = 1 / 8, 1.0  # image widths: a large radius, an impossible one (macro lenses reach 1/2)
 _WIDEST_F_NUMBER = 0.5  # limit of an aplanatic lens in air
 _SHORTEST_WIDTHS = 1 / 20  # shortest focal length in sensor widths: a field of view of 169 degrees
 

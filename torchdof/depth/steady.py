@@ -133,7 +133,7 @@ class SteadyFrames:
                     steady = filtered if first == start else steady
             self._next += 1
         self._filters = {first: filter_ for first, filter_ in self._filters.items() if first >= start}
-        assert steady is not None  # the loop ran: place was ahead
+        assert steady is not None  # the loop ran at least once: self._next <= place
         return steady
 
     def _start(self, place: int) -> int:
