@@ -22,10 +22,7 @@ from ..validation import a_number
 from .captures import CAMERA, Captures
 
 _MIN_BLUR_PX = 2.0  # radius of a blur that counts; smaller ones are dominated by aberrations
-_WARN_LOG, _REFUSE_LOG = (
-    math.log(1.15),
-    math.log(1.35),
-)  # a thick lens differs by a factor of up to 1.1; an f-stop is 1.41
+_WARN_LOG, _REFUSE_LOG = math.log(1.15), math.log(1.35)  # a thick lens differs by up to 1.1, an f-stop by 1.41
 _EXPLAINED_LOG = math.log(1.12)  # remaining log factor up to which a cause explains the difference
 _UNITS = {3.28: "feet", 39.4: "inches", 100.0: "centimetres", 1000.0: "millimetres"}
 

@@ -188,9 +188,7 @@ def _plateau(picture: Array, dot: Dot) -> float | None:
     above = picture[picture > dot.background + 0.5 * dot.peak]
     at_top = int(np.sum(above == top))
     levels, counts = np.unique(above, return_counts=True)
-    tail = (
-        levels.size > 1 and counts[-1] <= counts[-2]
-    )  # few pixels have the highest level: the tail of the noise in a file with few levels
+    tail = levels.size > 1 and counts[-1] <= counts[-2]  # few pixels at the top level are the tail of the noise
     if tail or at_top < max(5, 0.02 * above.size):
         return None
     spacing = float(np.median(np.diff(levels))) if levels.size > 1 else 0.0

@@ -198,9 +198,7 @@ def write_image(
     if sample not in sample_types:
         raise ValueError(f"{path}: a {suffix} file holds samples of {' or '.join(sample_types)}, not {sample}")
     if transfer is None:
-        both_same = (sample in ("half", "float")) == (
-            picture.sample in ("half", "float")
-        )  # both floats, or both integers
+        both_same = (sample in ("half", "float")) == (picture.sample in ("half", "float"))  # floats, or integers
         transfer = picture.transfer if both_same else default_transfer(sample)
     pixels = real_tensor("pixels", picture.pixels, "[1, C, H, W] in linear light").detach().cpu().float()
     names = picture.channels
