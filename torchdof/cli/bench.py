@@ -10,7 +10,7 @@ import click
 
 from .command import argument, option
 from .options import Blur, check_files, json_option
-from .printed import Once, json_line
+from .output import Notices, json_line
 from .scene import Scene
 
 
@@ -139,7 +139,7 @@ class Bench:
             scene = dataclasses.replace(shipped(), table=table)
         else:
             frame = read_frame(self.image, self.depth, self.scene)
-            coc_px, camera, remarks = coc_of(frame, Once(self.scene.depth_map.strict))
+            coc_px, camera, remarks = coc_of(frame, Notices(self.scene.depth_map.strict))
             remarks = ["focus as stated"] * lens.has_focus + remarks + [f"depth {frame.guess}"] * bool(frame.guess)
             remark = "blur as given" if camera is None else f"{camera!r}; {', '.join(remarks)}"
             scene = BenchScene(self.image.name, frame.picture.light, coc_px, remark, table)

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from .command import option
 from .lens import Sensor
 from .options import Accuracy, Blur, json_option
-from .printed import Bar, tell
+from .output import Bar, print_result
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -62,7 +62,7 @@ class Export:
             from torchdof.export.metadata import describe
 
             metadata = describe(self.show)
-            tell(self.as_json, metadata, _lines(metadata))
+            print_result(self.as_json, metadata, _lines(metadata))
         elif self.out is not None:
             self._write(self.out)
 
@@ -82,7 +82,7 @@ class Export:
         with Bar("tracing") as bar:
             graph = dataclasses.asdict(self.graph)
             report = to_onnx(dof, out, **graph, depth_edges=dof.options.depth_edges, progress=bar.update)
-        tell(self.as_json, {"out": str(out), **dataclasses.asdict(report)}, f"{report}\nwrote {out}")
+        print_result(self.as_json, {"out": str(out), **dataclasses.asdict(report)}, f"{report}\nwrote {out}")
 
 
 def _lines(facts: Mapping[str, Any], indent: str = "") -> str:

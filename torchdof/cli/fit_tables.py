@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from torchdof import BlurTable, blur_by_coc
-from torchdof.cli.printed import Bar, json_line
+from torchdof.cli.output import Bar, json_line
 from torchdof.fit.lens import trace
 from torchdof.fit.lens.lens import RGB_UM, Lens
 from torchdof.fit.photo.across import table_of_dots

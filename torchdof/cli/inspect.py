@@ -5,7 +5,7 @@ from pathlib import Path
 
 from .command import argument, option
 from .options import check_files, json_option, make_folder_of
-from .printed import Once, tell
+from .output import Notices, print_result
 from .scene import Scene
 
 
@@ -59,8 +59,8 @@ class Inspect:
         lines.append(f"picture       {target}")
         facts = {"image": str(self.image), "width": width, "height": height, "camera": facts_of_camera(camera)}
         facts |= {"assumed": notes, **report.facts(), "filled_px": frame.filled, "picture": str(target)}
-        tell(self.as_json, facts, "\n".join(lines))
-        once = Once(depth_map.strict)
+        print_result(self.as_json, facts, "\n".join(lines))
+        notices = Notices(depth_map.strict)
         if frame.guess:
-            once.note("guess", f"{frame.name}: {frame.guess}")
-        once.warn(frame.name, frame.mistakes(camera))
+            notices.note("guess", f"{frame.name}: {frame.guess}")
+        notices.warn(frame.name, frame.mistakes(camera))

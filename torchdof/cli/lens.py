@@ -127,7 +127,7 @@ class Lens(Sensor):
         """Whether an option sets the focus."""
         return (self.focus_m, self.focus_at, self.focus_range) != (None, None, None)
 
-    def more_blur(self, largest_px: float, is_still: bool) -> str:
+    def blur_advice(self, largest_px: float, is_still: bool) -> str:
         """Advice for a largest blur radius that is hardly visible."""
         if largest_px == 0:
             return "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
@@ -136,7 +136,7 @@ class Lens(Sensor):
         return f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; {hint}{other} makes more of it"
 
     @property
-    def speaks_of_metres(self) -> bool:
+    def states_metres(self) -> bool:
         """Whether an option states a length in metres."""
         return (self.focus_m, self.focus_range, self.aperture_radius_m) != (None, None, None)
 

@@ -14,7 +14,7 @@ import click
 from ..io.sequence import FramePattern, parse_frames
 from .command import argument, numbers, option
 from .options import Accuracy, Blur, check_files, json_option
-from .printed import Bar, json_line
+from .output import Bar, json_line
 from .scene import Scene
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from .frame import Frame, Renderer
 
-_EACH_ITS_OWN = (
+_OWN_EXTREMES = (
     "each frame's relative depth is scaled by its own extremes, so that distances pulse; give the values that near and "
     "far have in all frames: --value-range LOW,HIGH"
 )
@@ -155,28 +155,28 @@ class Render:
         outputs = {n: target(n) for n in numbers}
         for n, out in outputs.items():
             check_files(*sources(n), out)
-        done = {out for out in outputs.values() if files.resume and out.is_file()}
-        if done:
-            share = f"{self.out}: is" if is_single else f"{len(done)} of {len(outputs)} frames are"
-            lines = [json_line({"out": str(out), "is_there_already": True}) for out in sorted(done)]
-            click.echo("\n".join(lines) if self.as_json else f"{share} there already")
-        todo = {n: out for n, out in outputs.items() if out not in done}
+        existing = {out for out in outputs.values() if files.resume and out.is_file()}
+        if existing:
+            count = f"{self.out}: is" if is_single else f"{len(existing)} of {len(outputs)} frames are"
+            lines = [json_line({"out": str(out), "is_there_already": True}) for out in sorted(existing)]
+            click.echo("\n".join(lines) if self.as_json else f"{count} there already")
+        todo = {n: out for n, out in outputs.items() if out not in existing}
         if not todo:
             return
         from ..depth.sanity import Mistake
         from .frame import Renderer
 
-        renderer, said = Renderer(self, scene, is_still=images is None), scene.depth_map
-        if images and said.depth_kind == "relative" and said.value_range is None and len(numbers) > 1:
-            renderer.once.warn(self.depth or self.image, [Mistake("range", _EACH_ITS_OWN)])
+        renderer, depth_map = Renderer(self, scene, is_still=images is None), scene.depth_map
+        if images and depth_map.depth_kind == "relative" and depth_map.value_range is None and len(numbers) > 1:
+            renderer.notices.warn(self.depth or self.image, [Mistake("range", _OWN_EXTREMES)])
         read_files = functools.lru_cache(maxsize=1)(renderer.read)  # a focus pull reads one image many times
 
         def read(n: int) -> "Frame":
             return read_files(*sources(n))
 
         if images and files.steady:
-            whole = [n for n in images.frames() if depths is None or depths.name(n).is_file()]
-            self._render_each(renderer, todo, _steadied(read, whole))
+            all_numbers = [n for n in images.frames() if depths is None or depths.name(n).is_file()]
+            self._render_each(renderer, todo, _steadied(read, all_numbers))
         else:
             self._render_each(renderer, todo, read)
 
@@ -185,18 +185,18 @@ class Render:
         numbers: Sequence[int] = images.frames()
         if self.files.frames is not None:
             first, last = self.files.frames
-            wanted, existing = range(first, last + 1), {n for n in numbers if first <= n <= last}
-            if len(existing) < len(wanted):
-                missing = images.name(next(n for n in wanted if n not in existing))
-                absent = f"{len(wanted) - len(existing)} of {len(wanted)} frames missing"
+            requested, found = range(first, last + 1), {n for n in numbers if first <= n <= last}
+            if len(found) < len(requested):
+                missing = images.name(next(n for n in requested if n not in found))
+                absent = f"{len(requested) - len(found)} of {len(requested)} frames missing"
                 raise FileNotFoundError(f"{missing}: there is no such file ({absent})")
-            numbers = wanted
+            numbers = requested
         if not numbers:
             raise FileNotFoundError(f"{self.image}: there are no such files")
-        without = [path for n in numbers if depths is not None and not (path := depths.name(n)).is_file()]
-        if without:
-            told = f"{len(without)} of {len(numbers)} depths missing"
-            raise FileNotFoundError(f"{without[0]}: there is no such file ({told})")
+        missing_depths = [path for n in numbers if depths is not None and not (path := depths.name(n)).is_file()]
+        if missing_depths:
+            summary = f"{len(missing_depths)} of {len(numbers)} depths missing"
+            raise FileNotFoundError(f"{missing_depths[0]}: there is no such file ({summary})")
         return numbers
 
     def _render_each(self, renderer: "Renderer", files: Mapping[int, Path], read: "Callable[[int], Frame]") -> None:
@@ -207,13 +207,13 @@ class Render:
             ThreadPoolExecutor(1) as reader,
             ThreadPoolExecutor(1) as writer,
         ):
-            numbers, coming, written = iter(files), list["Future[Frame]"](), writer.submit(lambda: None)
+            numbers, reading, written = iter(files), list["Future[Frame]"](), writer.submit(lambda: None)
             try:
                 for k, (n, out) in enumerate(files.items()):
                     if several:
                         bar.update(f"frame {k + 1} of {len(files)}", k)
-                    coming += [reader.submit(read, ahead) for ahead in itertools.islice(numbers, 2 - len(coming))]
-                    rendered = renderer.render(coming.pop(0).result(), out, n, None if several else bar)
+                    reading += [reader.submit(read, ahead) for ahead in itertools.islice(numbers, 2 - len(reading))]
+                    rendered = renderer.render(reading.pop(0).result(), out, n, None if several else bar)
                     written.result()
                     written = writer.submit(renderer.write, rendered)  # Ctrl-C does not stop this thread
             finally:  # a rendered frame is written even if the next one fails
@@ -235,10 +235,10 @@ def _steadied(read: "Callable[[int], Frame]", numbers: Sequence[int]) -> "Callab
         latest[:] = [read(numbers[place])]
         return latest[0].picture.pixels, latest[0].values
 
-    frames, places = SteadyFrames(pixels_and_depth), {n: place for place, n in enumerate(numbers)}
+    frames, index_of = SteadyFrames(pixels_and_depth), {n: place for place, n in enumerate(numbers)}
 
     def steadied(n: int) -> "Frame":
-        values = frames.depth(places[n])
+        values = frames.depth(index_of[n])
         return dataclasses.replace(latest[0], values=values)
 
     return steadied

@@ -9,7 +9,7 @@ import click
 
 from .command import argument, option
 from .options import ApertureOptions, json_option
-from .printed import tell
+from .output import print_result
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -55,7 +55,7 @@ class Tables:
         for name in self.names or ["disc", "gaussian", *shipped()]:
             table = self.opening.table_of(name)
             facts = _facts(name, table)
-            tell(self.as_json, facts, _text_line(facts))
+            print_result(self.as_json, facts, _text_line(facts))
             if self.out is not None:
                 suffix = ": middle to corner" if table.depends_on_place else ""
                 panels[f"{Path(name).stem}{suffix}"] = _column(table)
