@@ -366,7 +366,6 @@ def _cast_constant(graph: onnx_ir.Graph, value: onnx_ir.Value, kind: onnx_ir.Dat
 
 
 def _drop_defaults(model: onnx_ir.Model) -> None:
-    """Removes attributes with default values."""
     for node in model.graph.all_nodes():
         schema = onnx.defs.get_schema(node.op_type, model.opset_imports[""]).attributes
         for name, attribute in list(node.attributes.items()):

@@ -157,8 +157,7 @@ def real_tensor(name: str, value: Any, what: str) -> Tensor:
     return value
 
 
-def _finite(name: str, values: Tensor) -> None:
-    """Refuse numbers that are NaN or infinite."""
+def _check_finite(name: str, values: Tensor) -> None:
     if not all(map(math.isfinite, ends(values))):
         bad = values.numel() - int(torch.isfinite(values).sum())
         raise ValueError(
@@ -222,8 +221,8 @@ def image_and_coc(image: Tensor, coc_px: Tensor, channels: int, values: bool) ->
     if channels not in (1, image.shape[1]):
         raise ValueError(f"the table blurs {channels} channels, the image has {image.shape[1]}")
     if values and not is_traced():
-        _finite("coc_px", coc_px)
-        _finite("image", image)
+        _check_finite("coc_px", coc_px)
+        _check_finite("image", image)
 
 
 def coc_of_lens(coc_px: Tensor, depth: Tensor, lens: Mapping[str, Any]) -> None:
@@ -257,8 +256,8 @@ def background(
         real_tensor("background", hidden, "[B, C, H, W]")
         real_tensor(name, where, f"[B, 1, H, W] {unit}")
         if values:
-            _finite(name, where)
-            _finite("background", hidden)
+            _check_finite(name, where)
+            _check_finite("background", hidden)
 
 
 def stretch(image: Tensor, depth: Tensor) -> float:
@@ -330,5 +329,5 @@ def stack(rgba: Tensor, depth_m: Tensor, values: bool) -> Tensor:
             raise ValueError(
                 f"the last channel of rgba is coverage, in [0, 1]; {bad} of {cover.numel()} values are not"
             )
-        _finite("rgba", rgba)
+        _check_finite("rgba", rgba)
     return depth

@@ -61,7 +61,6 @@ class Forward:
     opening: Aperture | None = None  # of the lens, for the kernels in OPENINGS: blades or an image
 
     def __post_init__(self) -> None:
-        """Computes values shared by all families."""
         self.pixels = np.indices(self.data.shape).astype(np.float64)  # rows and columns [2, H, W]
         self.half = min(self.data.shape) // 2  # half the window, px: limits the kernel
         self.grid = tuple(next_fast_len(n + self.half + 1, real=True) for n in self.data.shape)  # for FFTs

@@ -192,7 +192,6 @@ def _params(fits: Sequence[BlurFit], family: str) -> dict[str, Array]:
 
 
 def _provenance(captures: Captures, fits: Sequence[BlurFit], colours: Sequence[Colour]) -> dict[str, Any]:
-    """Provenance of a table of these fits."""
     ratios = [f.residual_over_noise for f in fits]
     provenance = {
         "source": "photographs of a dot",
