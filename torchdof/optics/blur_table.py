@@ -480,7 +480,7 @@ class BlurTable:
             "aperture": None if self.aperture is None else self.aperture.to_dict(),
             "field": None if self.field is None else self.field.to_dict(),
         }
-        return table_file.stamped({k: v for k, v in fields.items() if v is not None})
+        return table_file.with_schema({k: v for k, v in fields.items() if v is not None})
 
     @classmethod
     def from_dict(cls, data: Any) -> "BlurTable":
