@@ -29,7 +29,7 @@ DOT_MM = 5.0
 """Diameter of the white dot in its centre, mm."""
 
 _THUMBNAIL_PX = 500  # width of the reduced copy in which the square is searched
-_THRESHOLDS = np.linspace(0.1, 0.75, 14)  # thresholds, as fractions between dark and bright
+_THRESHOLDS = np.linspace(0.1, 0.75, 14)  # fractions of the range between dark and bright
 _MIN_SHARE, _MAX_SHARE = 0.004, 0.6  # limits of the square's share of the frame
 
 
