@@ -53,39 +53,40 @@ def lenses() -> dict[str, BlurTable]:
 
 def heart(size: int = 64) -> Tensor:
     """An opening in the shape of a heart, ``[size, size]``."""
-    place = torch.linspace(-1.25, 1.25, size)
-    x, y = place[None, :], -place[:, None] + 0.1
+    axis = torch.linspace(-1.25, 1.25, size)
+    x, y = axis[None, :], -axis[:, None] + 0.1
     return ((x**2 + y**2 - 1.0) ** 3 - x**2 * y**3 <= 0.0).float()
 
 
 def street(height: int, width: int) -> tuple[Tensor, Tensor]:
     """Light ``[1, 3, height, width]`` and depth in metres ``[1, 1, height, width]`` of a street at night."""
-    dice = torch.Generator().manual_seed(7)
+    generator = torch.Generator().manual_seed(7)
     row = (torch.arange(height) + 0.5)[:, None].expand(height, width) / height
     column = (torch.arange(width) + 0.5)[None, :].expand(height, width) / width
     ground = row > 0.6
     depth = torch.where(ground, 0.6 / (row - 0.6).clamp_min(0.6 / FAR_M), FAR_M)
     light = torch.stack([0.02 + 0.03 * row, 0.02 + 0.03 * row, 0.045 + 0.02 * row])
-    light = torch.where(ground, light * (0.8 + 0.4 * torch.rand(height, width, generator=dice)), light)
+    light = torch.where(ground, light * (0.8 + 0.4 * torch.rand(height, width, generator=generator)), light)
 
-    def draw(inside: Tensor, colour: Tensor, metres: float) -> None:
-        nearer = inside & (metres < depth)
-        light[:, nearer] = colour[:, None]
-        depth[nearer] = metres
+    def draw(mask: Tensor, colour: Tensor, metres: float) -> None:
+        is_visible = mask & (metres < depth)
+        light[:, is_visible] = colour[:, None]
+        depth[is_visible] = metres
 
     def dots(count: int, rows: tuple[float, float], metres: tuple[float, float], radius: float, power: float) -> None:
         for _ in range(count):
-            y, x, near, shade = torch.rand(4, generator=dice).tolist()
+            y, x, fraction, colour_index = torch.rand(4, generator=generator).tolist()
             centre = rows[0] + y * (rows[1] - rows[0]), x
-            away = torch.hypot((row - centre[0]) * height, (column - centre[1]) * width)
-            colour = COLOURS[int(shade * len(COLOURS))]
-            draw(away < radius, power * colour, math.exp(math.log(metres[0]) + near * math.log(metres[1] / metres[0])))
+            distance = torch.hypot((row - centre[0]) * height, (column - centre[1]) * width)
+            colour = COLOURS[int(colour_index * len(COLOURS))]
+            depth_m = math.exp(math.log(metres[0]) + fraction * math.log(metres[1] / metres[0]))
+            draw(distance < radius, power * colour, depth_m)
 
     dots(WINDOWS, (0.05, 0.55), (30.0, FAR_M - 1.0), 1.2, 25.0)
     dots(LAMPS, (0.1, 0.6), (6.0, 40.0), 1.5, 60.0)
     post = (column - 0.42).abs() < 0.035
     draw(post, torch.tensor([0.22, 0.16, 0.12]), FOCUS_M)
-    light[:, post] *= 0.6 + 0.8 * torch.rand(int(post.sum()), generator=dice)
+    light[:, post] *= 0.6 + 0.8 * torch.rand(int(post.sum()), generator=generator)
     dots(FAIRY_LIGHTS, (0.1, 0.9), (0.9, 1.2), 1.5, 80.0)
     return light[None], depth[None, None].contiguous()
 

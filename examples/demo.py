@@ -37,10 +37,10 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
 
     picture = read_image(arguments.data / "motorcycle_left.png")
-    known = json.loads((arguments.data / "camera.json").read_text())
-    depth = read_depth(arguments.data / "motorcycle_disp.npz", **known["depth"])
+    calibration = json.loads((arguments.data / "camera.json").read_text())
+    depth = read_depth(arguments.data / "motorcycle_disp.npz", **calibration["depth"])
     height, width = depth.shape[-2:]
-    fov_x_deg = math.degrees(2 * math.atan(width / 2 / known["focal_length_px"]))
+    fov_x_deg = math.degrees(2 * math.atan(width / 2 / calibration["focal_length_px"]))
 
     with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), transient=True) as progress:
         task = progress.add_task("rendering", total=len(FOCUS_M))

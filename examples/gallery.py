@@ -30,15 +30,15 @@ from torchdof.reference.scenes import Scene, read_scenes
 
 ROOT = Path(__file__).parents[1]
 MOTORCYCLE, SCENES = ROOT / "examples/data/motorcycle", ROOT / "tests/data/scenes"
-KNOWN = json.loads((MOTORCYCLE / "camera.json").read_text())
-FOV_X_DEG = math.degrees(2 * math.atan(741 / 2 / KNOWN["focal_length_px"]))
+CALIBRATION = json.loads((MOTORCYCLE / "camera.json").read_text())
+FOV_X_DEG = math.degrees(2 * math.atan(741 / 2 / CALIBRATION["focal_length_px"]))
 APERTURE_RADIUS_M = 0.04  # larger than in most lenses, so that the blur is visible in a picture 741 pixels wide
 TABLES = ("sato_j15", "double_gauss_50mm_f2", "wide_22mm_f4")
 
 
 def motorcycle() -> tuple[Tensor, Tensor]:
     """The photograph, ``[1, 3, 500, 741]`` in linear light, and its depth in metres."""
-    depth = read_depth(MOTORCYCLE / "motorcycle_disp.npz", **KNOWN["depth"])
+    depth = read_depth(MOTORCYCLE / "motorcycle_disp.npz", **CALIBRATION["depth"])
     return read_image(MOTORCYCLE / "motorcycle_left.png").pixels, depth
 
 
@@ -147,14 +147,14 @@ def draw_field(path: Path) -> None:
     lens = Lens.read("double_gauss_50mm").with_f_number(2.0)
     camera = torchdof.Camera(lens.paraxial().focal_length, f_number=2.0, focus_m=2.0, sensor_width_mm=36.0)
     field_mm = (0.0, 2.7, 5.4, 8.1, 10.9, 13.7, 16.5, 19.8, 21.6)
-    across: dict[str, Any] = {"wavelengths_um": RGB_UM, "field": field_mm, "field_nodes": 8, "field_rays": 30_000}
-    table = trace_table(lens, 2.0, 2.0, nodes=9, **across)
+    rays: dict[str, Any] = {"field_nodes": 8, "field_rays": 30_000}
+    table = trace_table(lens, 2.0, 2.0, nodes=9, wavelengths_um=RGB_UM, field=field_mm, **rays)
     image, depth = street(640, 960)
-    shown = {}
+    pictures = {}
     for name, spots in {"as in the middle of the frame": None, "traced across the field": table.field}.items():
         picture = torchdof.DepthOfField(camera, table.replace(field=spots), depth_edges="as given")(image, depth)
-        shown[name] = picture[..., 40:400, :480].clamp(0.0, 1.0)
-    write_sheet(path, shown)
+        pictures[name] = picture[..., 40:400, :480].clamp(0.0, 1.0)
+    write_sheet(path, pictures)
 
 
 def draw_lights(path: Path, tables: dict[str, torchdof.BlurTable]) -> None:
@@ -175,12 +175,12 @@ def draw_layers(path: Path) -> None:
     camera = torchdof.Camera.from_fov(FOV_X_DEG, APERTURE_RADIUS_M, 2.5)
     coc_px, dof = camera.coc_px(depth, image.shape[-1]), torchdof.DepthOfField(camera)
     parts = {"behind the focus": coc_px > 2, "in focus": coc_px.abs() <= 2, "in front of it": coc_px < -2}
-    shown = {}
+    pictures = {}
     for name, part in parts.items():
         rgba = torch.cat([image * part, part.to(image)], dim=1)
         light, cover = dof.layers(rgba[:, None], depth[:, None]).split([3, 1], dim=1)
-        shown[name] = half(light + (1 - cover) * 0.4)
-    write_sheet(path, shown)
+        pictures[name] = half(light + (1 - cover) * 0.4)
+    write_sheet(path, pictures)
 
 
 def draw_truth(path: Path) -> None:
@@ -215,13 +215,13 @@ def draw_fit(path: Path) -> None:
         simulator["write_captures"](lens, dot, 1.0, [0.7], lambda _: ("disc", {"radius": radius}), 640)
         arguments = [str(lens), "-o", str(lens / "lens.json"), "--plots", str(lens / "plots")]
         subprocess.run([sys.executable, "-m", "torchdof", "fit", *arguments], check=True, stdout=subprocess.DEVNULL)
-        shown = {}
+        pictures = {}
         for caption, file in {"in focus, 1 m": "1000mm.png", "out of focus, 0.7 m": "0700mm.png"}.items():
             part = read_image(lens / file).pixels[..., 90:150, 275:365]
-            shown[caption] = functional.interpolate(part, size=(300, 450), mode="nearest")
+            pictures[caption] = functional.interpolate(part, size=(300, 450), mode="nearest")
         (plot,) = (lens / "plots").glob("*700mm.png")
-        shown["fitted"] = functional.interpolate(read_image(plot).pixels[:, :3], (300, 450), mode="area")
-    write_sheet(path, shown)
+        pictures["fitted"] = functional.interpolate(read_image(plot).pixels[:, :3], (300, 450), mode="area")
+    write_sheet(path, pictures)
 
 
 def draw_thin_lens(path: Path) -> None:

@@ -110,18 +110,18 @@ def compare(spot: Spot, ratio: BlurFit, forward: BlurFit) -> None:
     """Prints the errors of both fits against the traced spot: size of the blur, and PSNR of a blurred natural image."""
     true = kernel_of(spot)
     print("against the truth, the traced spot:")
-    for what, fit in (("ratio", ratio), ("forward", forward)):
+    for name, fit in (("ratio", ratio), ("forward", forward)):
         shape = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in fit.kernel_params().items()}
         kernel = pixel_kernels(fit.family, shape).numpy()
-        off = rms_radius(kernel) / rms_radius(true) - 1
-        print(f"  {what:8s} rms radius {rms_radius(kernel):.3f} px, {100 * off:+.1f} %", end="")
+        error = rms_radius(kernel) / rms_radius(true) - 1
+        print(f"  {name:8s} rms radius {rms_radius(kernel):.3f} px, {100 * error:+.1f} %", end="")
         print(f"; {natural_psnr(kernel, true):.1f} dB on a natural image")
 
 
 def rms_radius(kernel: np.ndarray) -> float:
     """Root mean square distance from the centre, px."""
-    away = np.arange(kernel.shape[0]) - kernel.shape[0] // 2
-    return float(np.sqrt((kernel * (away[:, None] ** 2 + away**2)).sum() / kernel.sum()))
+    offset = np.arange(kernel.shape[0]) - kernel.shape[0] // 2
+    return float(np.sqrt((kernel * (offset[:, None] ** 2 + offset**2)).sum() / kernel.sum()))
 
 
 def photograph(folder: Path, lens: Lens) -> Spot:
@@ -167,11 +167,11 @@ def kernel_of(spot: Spot) -> np.ndarray:
     return np.asarray(kernel / kernel.sum())
 
 
-def disc(radius_px: float, fine: int = 8) -> np.ndarray:
+def disc(radius_px: float, samples: int = 8) -> np.ndarray:
     """The white dot in the middle of the frame."""
-    y, x = ((np.arange(n * fine) + 0.5) / fine - n / 2 for n in (HEIGHT, WIDTH))
+    y, x = ((np.arange(n * samples) + 0.5) / samples - n / 2 for n in (HEIGHT, WIDTH))
     inside = np.hypot(y[:, None], x[None, :]) <= radius_px
-    return np.asarray(inside.reshape(HEIGHT, fine, WIDTH, fine).mean((1, 3)))
+    return np.asarray(inside.reshape(HEIGHT, samples, WIDTH, samples).mean((1, 3)))
 
 
 def quad(width: int, height: int, side: float) -> torch.Tensor:
@@ -182,9 +182,9 @@ def quad(width: int, height: int, side: float) -> torch.Tensor:
     return picture
 
 
-def show(what: str, fit: BlurFit) -> None:
+def show(title: str, fit: BlurFit) -> None:
     """Print a fit."""
-    print(f"{what}:\n{fit.summary()}")
+    print(f"{title}:\n{fit.summary()}")
 
 
 if __name__ == "__main__":

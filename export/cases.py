@@ -37,7 +37,7 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
         large: Add a frame of 960 x 540.
     """
     reach = portable.dof.options.max_coc_px
-    random = torch.Generator().manual_seed(4)
+    generator = torch.Generator().manual_seed(4)
     frames = [
         ("one pixel", (1, 1, 1), _ramp(0.3, 0.9)),
         ("one row", (1, 1, 7), _ramp(-1.0, 1.0)),
@@ -61,7 +61,7 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
     if large:
         frames.append(("960 x 540", (1, 540, 960), _steps))
     for name, (batch, height, width), shape in frames:
-        image = torch.rand((batch, channels, height, width), generator=random, dtype=torch.float32)
+        image = torch.rand((batch, channels, height, width), generator=generator, dtype=torch.float32)
         if name.startswith("highlight"):
             image = 0.1 * image
             image[:, :, height // 3, width // 4] = 6.5e4
@@ -74,7 +74,7 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
             coc = functional.avg_pool2d(coc, (1, 5), stride=1, padding=(0, 2), count_include_pad=False)
         elif float(coc.min()) < float(coc.max()):
             # vary the coc: at the exact mean of both neighbours, rounding would decide to which surface a pixel belongs
-            coc = coc * (1.0 + 0.03 * torch.rand(coc.shape, generator=random, dtype=coc.dtype))
+            coc = coc * (1.0 + 0.03 * torch.rand(coc.shape, generator=generator, dtype=coc.dtype))
         if portable.inputs == "coc_px":
             if name == "bad depths":
                 coc[:, :, ::7, 3::11] = math.nan
@@ -110,9 +110,9 @@ def _steps(batch: int, height: int, width: int) -> Tensor:
 
 def _lens(camera: Camera, focus: Tensor, reach: Tensor, width: int) -> tuple[Camera, Tensor]:
     """The camera with f-numbers at which infinity has a coc of ``reach`` pixels, and these f-numbers."""
-    wide = camera.replace(focus_m=focus, f_number=torch.ones_like(focus))
-    f_number = wide.coc_px(focus.new_full((len(focus), 1, 1, 1), math.inf), width).flatten() / reach
-    return wide.replace(f_number=f_number), f_number
+    widest = camera.replace(focus_m=focus, f_number=torch.ones_like(focus))
+    f_number = widest.coc_px(focus.new_full((len(focus), 1, 1, 1), math.inf), width).flatten() / reach
+    return widest.replace(f_number=f_number), f_number
 
 
 def _depth(camera: Camera, coc: Tensor, width: int) -> Tensor:

@@ -14,7 +14,7 @@ import torch
 from onnxscript import opset20
 
 from torchdof import DepthOfField
-from torchdof.io.atomic import whole_file
+from torchdof.io.atomic import atomic_file
 from torchdof.options import DepthEdges
 from torchdof.tensors import TRACEABLE
 
@@ -103,18 +103,18 @@ def to_onnx(
     progress("slimming")
     model = onnx_ir.to_proto(broadcast(slim(graph), portable.inputs))
     label(model, dof, portable, channels, opset)
-    with whole_file(path) as part:
-        onnx.save_model(model, part, format="protobuf")
-        return verify(part, dof, progress=progress)
+    with atomic_file(path) as temporary:
+        onnx.save_model(model, temporary, format="protobuf")
+        return verify(temporary, dof, progress=progress)
 
 
 def _translate(program: torch.export.ExportedProgram, inputs: str, opset: int) -> onnx_ir.Model:
     """The module as an ONNX graph, translated by torch.onnx and not yet simplified."""
     # torch.onnx would trace everything again to decompose operators, most of which it can translate as they are
     vars(program)["run_decompositions"] = lambda _: program
-    frame = {0: "B", 2: "H", 3: "W"}
+    frame_axes = {0: "B", 2: "H", 3: "W"}
     names = INPUTS[inputs]
-    shapes = (frame, frame, *(({0: "B"}, {0: "B"}),) * (len(names) > 2))
+    shapes = (frame_axes, frame_axes, *(({0: "B"}, {0: "B"}),) * (len(names) > 2))
     with _quiet():
         converted = torch.onnx.export(
             program,
@@ -130,9 +130,9 @@ def _translate(program: torch.export.ExportedProgram, inputs: str, opset: int) -
     if converted is None:
         raise RuntimeError("torch.onnx.export gave no program")
     for function in (*ray_splats.FUNCTIONS, *lists.FUNCTIONS):
-        own = onnx_ir.serde.deserialize_function(function.to_function_proto())
-        own.opset_imports[""] = opset
-        converted.model.functions[own.identifier()] = own
+        translated = onnx_ir.serde.deserialize_function(function.to_function_proto())
+        translated.opset_imports[""] = opset
+        converted.model.functions[translated.identifier()] = translated
     return converted.model
 
 
@@ -149,19 +149,19 @@ def _to_device(self: Any, device: str, dtype: int, non_blocking: bool = False, c
     return opset20.Cast(self, to=dtype)
 
 
-def _detached(self: Any) -> Any:
+def _identity(self: Any) -> Any:
     return opset20.Identity(self)
 
 
-def _both(self: Any, other: Any) -> Any:
+def _and(self: Any, other: Any) -> Any:
     return opset20.And(self, other)
 
 
-def _subtracted(self: Any, other: Any) -> Any:
+def _rsub(self: Any, other: Any) -> Any:
     return opset20.Sub(opset20.CastLike(other, self), self)
 
 
-def _put(self: Any, dim: int, index: Any, source: Any) -> Any:
+def _index_copy(self: Any, dim: int, index: Any, source: Any) -> Any:
     if dim != 1:
         raise ValueError(f"values are put along axis 1 of [C, P], got axis {dim}")
     changed = opset20.ScatterND(
@@ -172,18 +172,18 @@ def _put(self: Any, dim: int, index: Any, source: Any) -> Any:
     return opset20.Transpose(changed, perm=[1, 0])
 
 
-def _either(self: Any, other: Any) -> Any:
+def _or(self: Any, other: Any) -> Any:
     return opset20.Or(self, other)
 
 
-def _chosen(condition: Any, self: Any, other: Any) -> Any:
+def _where(condition: Any, self: Any, other: Any) -> Any:
     if self.dtype != onnx_ir.DataType.BOOL:
         return opset20.Where(condition, self, other)
     neither = opset20.And(opset20.Not(condition), other)  # onnxruntime has no Where for bool
     return opset20.Or(opset20.And(condition, self), neither)
 
 
-def _selected(self: Any, dim: int, index: Any) -> Any:
+def _index_select(self: Any, dim: int, index: Any) -> Any:
     if dim != 1:
         return opset20.Gather(self, index, axis=dim)
     index = opset20.Unsqueeze(index, opset20.Constant(value_ints=[0]))  # type: ignore[arg-type]
@@ -194,30 +194,30 @@ def _selected(self: Any, dim: int, index: Any) -> Any:
     return opset20.GatherElements(self, index, axis=dim)  # five times as fast in onnxruntime as Gather
 
 
-def _squared(self: Any) -> Any:
+def _square(self: Any) -> Any:
     return opset20.Mul(self, self)
 
 
-def _hypotenuse(self: Any, other: Any) -> Any:
+def _hypot(self: Any, other: Any) -> Any:
     return opset20.Sqrt(opset20.Add(opset20.Mul(self, self), opset20.Mul(other, other)))
 
 
-def _extremes(self: Any, dim: int | None = None, keepdim: bool = False) -> Any:
+def _aminmax(self: Any, dim: int | None = None, keepdim: bool = False) -> Any:
     return opset20.ReduceMin(self, keepdims=0), opset20.ReduceMax(self, keepdims=0)
 
 
-def _differences(self: Any, n: int = 1, dim: int = -1, prepend: Any = None, append: Any = None) -> Any:
+def _diff(self: Any, n: int = 1, dim: int = -1, prepend: Any = None, append: Any = None) -> Any:
     axis: Any = [dim]
     bounds: Any = [0], [1], [-1], [2**63 - 1]
     before = opset20.Slice(self, bounds[0], bounds[2], axis)
     return opset20.Sub(opset20.Slice(self, bounds[1], bounds[3], axis), before)
 
 
-def _product_added(self: Any, tensor1: Any, tensor2: Any, value: float = 1.0) -> Any:
+def _addcmul(self: Any, tensor1: Any, tensor2: Any, value: float = 1.0) -> Any:
     return opset20.Add(self, opset20.Mul(tensor1, tensor2))
 
 
-def _added(self: Any, dim: int, index: Any, source: Any, alpha: float = 1.0) -> Any:
+def _index_add(self: Any, dim: int, index: Any, source: Any, alpha: float = 1.0) -> Any:
     return opset20.ScatterElements(self, index, source, axis=dim, reduction="add")
 
 
@@ -225,19 +225,19 @@ _TRANSLATIONS: dict[Callable[..., Any], Callable[..., Any]] = {
     torch.ops.aten.remainder.Scalar: _remainder,
     torch.ops.aten.to.dtype: _to_dtype,
     torch.ops.aten.to.device: _to_device,
-    torch.ops.aten.detach_.default: _detached,
-    torch.ops.aten.__and__.Tensor: _both,
-    torch.ops.aten.__or__.Tensor: _either,
-    torch.ops.aten.where.self: _chosen,
-    torch.ops.aten.index_select.default: _selected,
-    torch.ops.aten.square.default: _squared,
-    torch.ops.aten.aminmax.default: _extremes,
-    torch.ops.aten.hypot.default: _hypotenuse,
-    torch.ops.aten.diff.default: _differences,
-    torch.ops.aten.index_add.default: _added,
-    torch.ops.aten.addcmul.default: _product_added,
-    torch.ops.aten.rsub.Scalar: _subtracted,
-    torch.ops.aten.index_copy.default: _put,
+    torch.ops.aten.detach_.default: _identity,
+    torch.ops.aten.__and__.Tensor: _and,
+    torch.ops.aten.__or__.Tensor: _or,
+    torch.ops.aten.where.self: _where,
+    torch.ops.aten.index_select.default: _index_select,
+    torch.ops.aten.square.default: _square,
+    torch.ops.aten.aminmax.default: _aminmax,
+    torch.ops.aten.hypot.default: _hypot,
+    torch.ops.aten.diff.default: _diff,
+    torch.ops.aten.index_add.default: _index_add,
+    torch.ops.aten.addcmul.default: _addcmul,
+    torch.ops.aten.rsub.Scalar: _rsub,
+    torch.ops.aten.index_copy.default: _index_copy,
 }
 """Translations of operators that torch.onnx does not translate itself."""
 

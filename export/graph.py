@@ -76,10 +76,10 @@ class Portable(nn.Module):
             return out
         focus_m, f_number = lens
         camera = self.dof.camera
-        least_m = float(camera.focal_length_mm) / 1000.0 if camera.focus_breathing else 0.0
-        possible = (focus_m > least_m) & (f_number > 0) & (f_number < torch.inf)
-        undefined = torch.where(possible[:, None, None, None], out, torch.nan)
-        return self.ops.choose(lambda: ~possible.all(), undefined, out)
+        nearest_m = float(camera.focal_length_mm) / 1000.0 if camera.focus_breathing else 0.0
+        is_possible = (focus_m > nearest_m) & (f_number > 0) & (f_number < torch.inf)
+        undefined = torch.where(is_possible[:, None, None, None], out, torch.nan)
+        return self.ops.choose(lambda: ~is_possible.all(), undefined, out)
 
     def as_called(self, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
         """Renders like a call of the module: layers chosen for the scene, its own highlights and edge repair."""

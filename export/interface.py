@@ -26,12 +26,12 @@ def broadcast(model: onnx_ir.Model, inputs: str) -> onnx_ir.Model:
     batch, channels, stop = (tape.op("Constant", [], {"value_ints": [n]}) for n in (0, 1, 4))
     two = tape.op("Constant", [], {"value_ints": [2]})
     items, size = tape.op("Slice", [shape, batch, channels]), tape.op("Slice", [shape, two, stop])
-    whole = tape.op("Concat", [items, channels, size], {"axis": 0})
+    full = tape.op("Concat", [items, channels, size], {"axis": 0})
     for value in others:
         is_map = value.name == INPUTS[inputs][1]
-        what = "one_item_or_as_many_as_image" + ("_and_its_height_and_width" if is_map else "")
+        hint = "one_item_or_as_many_as_image" + ("_and_its_height_and_width" if is_map else "")
         uses = list(value.uses())
-        expanded = tape.op("Expand", [value, whole if is_map else items], name=f"{value.name}_must_have_{what}")
+        expanded = tape.op("Expand", [value, full if is_map else items], name=f"{value.name}_must_have_{hint}")
         for use in uses:
             use.node.replace_input_with(use.idx, expanded)
         value.shape = onnx_ir.Shape([ITEMS, *value.shape[1:]])

@@ -12,7 +12,7 @@ import onnx.compose
 import onnx.version_converter
 import onnx_ir
 
-from torchdof.io.atomic import whole_file
+from torchdof.io.atomic import atomic_file
 
 from . import bridge
 from .graph import INPUTS, OUTPUT
@@ -74,8 +74,8 @@ def chain(
     if set(facts["inputs"]) != set(INPUTS["depth"]) or dof.graph.input[0].type.tensor_type.shape.dim[1].dim_value != 3:
         raise ValueError(f"dof_model must take a depth and an image of 3 channels, it takes {facts['inputs']}")
     opset, ir = _opset(dof), dof.ir_version
-    estimator, declared, rank = _prepare(depth_model, opset, ir)
-    size = size or declared
+    estimator, declared_size, rank = _prepare(depth_model, opset, ir)
+    size = size or declared_size
     parts = [
         bridge.encode(opset, ir, size, mean, std),
         estimator,
@@ -88,10 +88,10 @@ def chain(
     facts["chain"] = {"estimate": estimate, "scale": scale, "shift": shift, "size": size}
     facts["chain"] |= {"mean": list(mean), "std": list(std)}
     write_facts(joint, facts)
-    with whole_file(path) as part:
-        onnx.save_model(joint, part, format="protobuf")
-        check_format(joint, str(part))
-        _compare(joint, str(part), parts, size or (42, 56))
+    with atomic_file(path) as temporary:
+        onnx.save_model(joint, temporary, format="protobuf")
+        check_format(joint, str(temporary))
+        _compare(joint, str(temporary), parts, size or (42, 56))
 
 
 def _prepare(depth_model: Model, opset: int, ir: int) -> tuple[onnx.ModelProto, tuple[int, int] | None, int]:
@@ -162,7 +162,7 @@ def _compare(joint: onnx.ModelProto, path: str, parts: Sequence[onnx.ModelProto]
     for name, number in (("focus_m", 1.5), ("f_number", 4.0), ("near_m", 0.7), ("far_m", 30.0)):
         values[name] = np.full(1, number, dtype=np.float32)
     feed = {value.name: values[value.name] for value in joint.graph.input}
-    got = session(path).run([OUTPUT, "depth"], feed)
+    joint_results = session(path).run([OUTPUT, "depth"], feed)
     for part in parts:
         with tempfile.TemporaryDirectory() as folder:
             single = os.path.join(folder, "part.onnx")
@@ -175,7 +175,7 @@ def _compare(joint: onnx.ModelProto, path: str, parts: Sequence[onnx.ModelProto]
             zip([v.name for v in run.get_outputs()], run.run(None, {n: values[n] for n in names}), strict=True)
         )
         values |= {"estimate": next(iter(results.values()))} if part is parts[1] else results
-    for name, result in zip((OUTPUT, "depth"), got, strict=True):
+    for name, result in zip((OUTPUT, "depth"), joint_results, strict=True):
         expected = values[name]
         error = float(np.nanmax(np.abs(result - expected) / np.maximum(np.abs(expected), 1.0)))
         if result.shape != expected.shape or not error <= TOLERANCE:

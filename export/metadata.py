@@ -17,9 +17,9 @@ from .graph import OUTPUT, Portable
 __all__ = ["UNITS", "describe", "facts_of", "label", "load", "shown", "table_hash", "write_facts"]
 
 PREFIX = "torchdof."
-_LONGEST, _MOST = 2**16, 100  # limits: characters of one value, number of values
-_SHOWN = 300  # characters of a text that are printed
-_TIMES_READ = 3  # memory needed to read a file, in file sizes
+_MAX_CHARACTERS, _MAX_VALUES = 2**16, 100  # limits: characters of one value, number of values
+_MAX_PRINTED = 300  # characters of a text that are printed
+_MEMORY_PER_BYTE = 3  # memory needed to read a file, in file sizes
 UNITS = {
     "image": "[B, {channels}, H, W] float32, linear light, >= 0, any range",
     "depth": "[B, 1, H, W] float32, metres along the optical axis, inf allowed; NaN, zero and negative pass sharp",
@@ -75,15 +75,15 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
         ValueError: If the file was not written by them.
         FileNotFoundError: If the file is missing.
     """
-    return facts_of(load(path, whole=False), str(path))
+    return facts_of(load(path, external=False), str(path))
 
 
-def load(path: str | os.PathLike[str], whole: bool = True) -> onnx.ModelProto:
+def load(path: str | os.PathLike[str], external: bool = True) -> onnx.ModelProto:
     """Reads an ONNX file.
 
     Args:
         path: The file.
-        whole: Whether to read tensors stored in other files; in untrusted files these may be any files.
+        external: Whether to read tensors stored in other files; in untrusted files these may be any files.
 
     Raises:
         ValueError: If it is not an ONNX file, or larger than the memory.
@@ -92,10 +92,10 @@ def load(path: str | os.PathLike[str], whole: bool = True) -> onnx.ModelProto:
     if not os.path.isfile(path):
         raise FileNotFoundError(f"there is no file {path}")
     size, free = os.path.getsize(path), free_bytes()
-    if _TIMES_READ * size > free:
+    if _MEMORY_PER_BYTE * size > free:
         raise ValueError(f"{path} takes {size / 2**30:.3g} GiB, more than there is memory for")
     try:
-        model = onnx.load(path, load_external_data=whole)
+        model = onnx.load(path, load_external_data=external)
     except Exception as error:  # protobuf raises several types for invalid bytes
         raise ValueError(f"{path} is not an ONNX file: {shown(str(error))}") from error
     if not model.graph.output:
@@ -109,20 +109,20 @@ def facts_of(model: onnx.ModelProto, name: str) -> dict[str, Any]:
     Raises:
         ValueError: If they were not written by an export.
     """
-    written: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for entry in model.metadata_props:
         key, value = entry.key, entry.value
         if not isinstance(key, str) or not isinstance(value, str):  # other bytes are not decoded
             raise ValueError(f"{name}: its metadata have bytes that are not text")
         if not key.startswith(PREFIX):
             continue
-        if len(value) > _LONGEST or len(written) == _MOST:
+        if len(value) > _MAX_CHARACTERS or len(texts) == _MAX_VALUES:
             raise ValueError(f"{name}: its metadata {shown(key)} are more than torchdof.export writes")
-        written[key.removeprefix(PREFIX)] = value
-    if "options" not in written:
+        texts[key.removeprefix(PREFIX)] = value
+    if "options" not in texts:
         raise ValueError(f"{name} was not written by torchdof.export: it lacks the metadata {PREFIX}options")
     facts = {}
-    for key, value in written.items():
+    for key, value in texts.items():
         try:
             facts[key] = json.loads(value)
         except (ValueError, RecursionError) as error:
@@ -132,8 +132,8 @@ def facts_of(model: onnx.ModelProto, name: str) -> dict[str, Any]:
 
 def shown(text: str) -> str:
     """Untrusted text on one line: control characters escaped, and cut if it is long."""
-    line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text[:_SHOWN])
-    return line if len(text) <= _SHOWN else f"{line}... ({len(text)} characters)"
+    line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text[:_MAX_PRINTED])
+    return line if len(text) <= _MAX_PRINTED else f"{line}... ({len(text)} characters)"
 
 
 def table_hash(table: BlurTable) -> str:

@@ -39,7 +39,7 @@ def collect(tile: Tensor, count: int | torch.SymInt) -> Tensor:
 
 def operator(name: str, inputs: Sequence[Tensor], shape: Sequence[int | torch.SymInt], **attributes: int) -> Tensor:
     """An operator of :data:`DOMAIN` in a graph; its result has the dtype of its last input."""
-    stated: dict[str, Any] = {**attributes}
+    values: dict[str, Any] = {**attributes}
     return torch.onnx.ops.symbolic(
-        f"{DOMAIN}::{name}", inputs, stated, dtype=inputs[-1].dtype, shape=list(shape), version=1
+        f"{DOMAIN}::{name}", inputs, values, dtype=inputs[-1].dtype, shape=list(shape), version=1
     )

@@ -25,19 +25,19 @@ else:
 
 __all__ = ["FUNCTIONS"]
 
-_TAPS = 2**16
+_MAX_TAPS = 2**16
 """Largest number of rays splatted together."""
 
 _script = onnxscript.script(onnxscript.values.Opset(DOMAIN, 1), default_opset=op)
 
 
 @_script
-def stop_of(half: Ints, start: Ints) -> Ints:
+def part_end(half: Ints, start: Ints) -> Ints:
     """End of the part of the sources that begins at ``start``; sources are sorted by width; the taps are limited."""
     side = 2 * op.Gather(half, start) + 1
-    stop = op.Min(start + op.Max(_TAPS / (side * side), 1), op.Size(half))
+    stop = op.Min(start + op.Max(_MAX_TAPS / (side * side), 1), op.Size(half))
     side = 2 * op.Gather(half, stop - 1) + 1
-    return op.Min(start + op.Max(_TAPS / (side * side), 1), stop)
+    return op.Min(start + op.Max(_MAX_TAPS / (side * side), 1), stop)
 
 
 @_script
@@ -45,11 +45,11 @@ def values_at(values: Floats, origins: Ints, halves: Ints, round: Flag, node: In
     """Kernels ``[1 or C, m, k, k]`` at nodes ``[m]``; 0 outside."""
     axes = op.Constant(value_ints=[1, 2])
     down = op.Unsqueeze(step, op.Constant(value_ints=[1]))
-    most = op.Max(op.Abs(step), op.Abs(down))
+    larger = op.Max(op.Abs(step), op.Abs(down))
     half = op.Unsqueeze(op.Gather(halves, node), axes)
-    eighth = most * (most + 1) / 2 + op.Min(op.Abs(step), op.Abs(down))
-    place = op.Unsqueeze(op.Gather(origins, node), axes) + op.Where(round, eighth, down * (2 * half + 1) + step)
-    return op.Gather(values, op.Where(most > half, op.Constant(value_int=0), place), axis=1)
+    eighth_index = larger * (larger + 1) / 2 + op.Min(op.Abs(step), op.Abs(down))
+    index = op.Unsqueeze(op.Gather(origins, node), axes) + op.Where(round, eighth_index, down * (2 * half + 1) + step)
+    return op.Gather(values, op.Where(larger > half, op.Constant(value_int=0), index), axis=1)
 
 
 @_script
@@ -75,12 +75,12 @@ def count_in(cells: Floats, bin: Ints, item: Ints, row: Ints, column: Ints) -> F
     items = op.Squeeze(op.Shape(cells, start=1, end=2))
     rows = op.Squeeze(op.Shape(cells, start=2, end=3))
     columns = op.Squeeze(op.Shape(cells, start=3, end=4))
-    place = (((bin * items) + item) * rows + row) * columns + column
-    return op.Gather(op.Reshape(cells, op.Constant(value_ints=[-1])), place)
+    index = (((bin * items) + item) * rows + row) * columns + column
+    return op.Gather(op.Reshape(cells, op.Constant(value_ints=[-1])), index)
 
 
 @_script
-def hidden_of(
+def blocked_share(
     coc: Floats,
     item: Ints,
     row: Ints,
@@ -123,47 +123,47 @@ def hidden_of(
     left = op.Cast(op.Clip(column - reach, 0.0, last_column), to=7) / COARSE_CELL
     right = op.Cast(op.Clip(column + reach + 1.0, 0.0, last_column), to=7) / COARSE_CELL + 1
     below = count_in(cells, bin, item, bottom, right) - count_in(cells, bin, item, top, right)
-    shown = below - count_in(cells, bin, item, bottom, left) + count_in(cells, bin, item, top, left)
-    pairs = op.NonZero(op.And(shown > 0.0, fade > 0.0))
+    count = below - count_in(cells, bin, item, bottom, left) + count_in(cells, bin, item, top, left)
+    pairs = op.NonZero(op.And(count > 0.0, fade > 0.0))
     pair = op.Transpose(pairs, perm=[1, 0])
     source = op.Gather(pairs, zero)
     pair_bin = op.Unsqueeze(op.Cast(op.Gather(pairs, one), to=1), op.Constant(value_ints=[1, 2, 3]))
 
     # each ray of a pair crosses the bin's surface between four pixels
-    way = op.Unsqueeze(op.GatherND(scale, pair), axis_1) * step
-    rows = op.Clip(op.Gather(row, source) + way, 0.0, last_row)
-    columns = op.Clip(op.Gather(column, source) + way, 0.0, last_column)
+    offset = op.Unsqueeze(op.GatherND(scale, pair), axis_1) * step
+    rows = op.Clip(op.Gather(row, source) + offset, 0.0, last_row)
+    columns = op.Clip(op.Gather(column, source) + offset, 0.0, last_column)
     top = op.Min(op.Floor(rows), op.Max(last_row - 1.0, 0.0))
     left = op.Min(op.Floor(columns), op.Max(last_column - 1.0, 0.0))
-    line = (op.Gather(item, source) * height + op.Cast(top, to=7)) * width
-    first = op.Unsqueeze(line, axis_2) + op.Unsqueeze(op.Cast(left, to=7), axis_1)
-    beside = op.Min(width - 1, one)
-    below_it = op.Min(height - 1, one) * width
+    row_start = (op.Gather(item, source) * height + op.Cast(top, to=7)) * width
+    first = op.Unsqueeze(row_start, axis_2) + op.Unsqueeze(op.Cast(left, to=7), axis_1)
+    to_right = op.Min(width - 1, one)
+    to_below = op.Min(height - 1, one) * width
     right_share = op.Unsqueeze(columns - left, axis_1)
     upper = covered_at(places, covers, first, pair_bin)
-    upper = upper + (covered_at(places, covers, first + beside, pair_bin) - upper) * right_share
-    first = first + below_it
+    upper = upper + (covered_at(places, covers, first + to_right, pair_bin) - upper) * right_share
+    first = first + to_below
     lower = covered_at(places, covers, first, pair_bin)
-    lower = lower + (covered_at(places, covers, first + beside, pair_bin) - lower) * right_share
+    lower = lower + (covered_at(places, covers, first + to_right, pair_bin) - lower) * right_share
     covered = upper + (lower - upper) * op.Unsqueeze(rows - top, axis_2)
-    taken = covered * op.Unsqueeze(op.GatherND(fade, pair), axes)
+    blocked = covered * op.Unsqueeze(op.GatherND(fade, pair), axes)
     side = op.Shape(step)
-    none = op.ConstantOfShape(op.Concat(op.Shape(item, start=0, end=1), side, side, axis=0))
-    # ScatterND would not do: runtimes add in parallel in it, and a source has several bins
-    into = op.Expand(op.Unsqueeze(source, axes), op.Shape(taken))
-    return op.Min(op.ScatterElements(none, into, taken, axis=0, reduction="add"), 1.0)
+    nothing = op.ConstantOfShape(op.Concat(op.Shape(item, start=0, end=1), side, side, axis=0))
+    # not ScatterND: runtimes add in parallel there, and would lose some bins of a source that has several
+    target = op.Expand(op.Unsqueeze(source, axes), op.Shape(blocked))
+    return op.Min(op.ScatterElements(nothing, target, blocked, axis=0, reduction="add"), 1.0)
 
 
 @_script
-def landed(splats: Floats, light: Floats, first: Ints, kernels: Floats, step: Ints, across: Ints) -> Floats:
+def add_light(splats: Floats, light: Floats, first: Ints, kernels: Floats, step: Ints, across: Ints) -> Floats:
     """Adds the light ``[m, C]`` of sources, centred at ``first`` ``[m]``, to splats ``[C, n]``."""
     axes = op.Constant(value_ints=[1, 2])
-    all_of_it = op.Constant(value_ints=[-1])
-    landing = kernels * op.Unsqueeze(op.Transpose(light, perm=[1, 0]), op.Constant(value_ints=[2, 3]))
-    landing = op.Reshape(landing, op.Concat(op.Shape(landing, start=0, end=1), all_of_it, axis=0))
-    away = op.Unsqueeze(step * across, op.Constant(value_ints=[1])) + step
-    place = op.Reshape(op.Unsqueeze(first, axes) + away, all_of_it)
-    return op.ScatterElements(splats, op.Expand(place, op.Shape(landing)), landing, axis=1, reduction="add")
+    rest_axis = op.Constant(value_ints=[-1])
+    scattered = kernels * op.Unsqueeze(op.Transpose(light, perm=[1, 0]), op.Constant(value_ints=[2, 3]))
+    scattered = op.Reshape(scattered, op.Concat(op.Shape(scattered, start=0, end=1), rest_axis, axis=0))
+    offset = op.Unsqueeze(step * across, op.Constant(value_ints=[1])) + step
+    target = op.Reshape(op.Unsqueeze(first, axes) + offset, rest_axis)
+    return op.ScatterElements(splats, op.Expand(target, op.Shape(scattered)), scattered, axis=1, reduction="add")
 
 
 @_script
@@ -193,18 +193,18 @@ def splat(
     """Light ``[C, B, H, W]`` of all sources on a blank frame with a margin, except light blocked by nearer surfaces."""
     splats = op.Reshape(blank, op.Constant(value_ints=[0, -1]))
     start = op.Constant(value_int=0)
-    going = op.Size(half) > 0
-    while going:
-        stop = stop_of(half, start)
+    has_more = op.Size(half) > 0
+    while has_more:
+        stop = part_end(half, start)
         reach = op.Gather(half, stop - 1)
         step = op.Range(-reach, reach + 1, 1)
-        at = op.Range(start, stop, 1)
-        kernels = kernels_at(values, origins, halves, round, op.Gather(node, at), op.Gather(part, at), step)
-        hidden = hidden_of(
-            op.Gather(coc, at),
-            op.Gather(item, at),
-            op.Gather(row, at),
-            op.Gather(column, at),
+        index = op.Range(start, stop, 1)
+        kernels = kernels_at(values, origins, halves, round, op.Gather(node, index), op.Gather(part, index), step)
+        hidden = blocked_share(
+            op.Gather(coc, index),
+            op.Gather(item, index),
+            op.Gather(row, index),
+            op.Gather(column, index),
             step,
             height,
             width,
@@ -214,11 +214,11 @@ def splat(
             nearest,
         )
         kernels = kernels * (1.0 - hidden)
-        splats = landed(splats, op.Gather(light, at), op.Gather(first, at), kernels, step, across)
+        splats = add_light(splats, op.Gather(light, index), op.Gather(first, index), kernels, step, across)
         start = stop
-        going = start < op.Size(half)
+        has_more = start < op.Size(half)
     return op.Reshape(splats, op.Shape(blank))
 
 
-FUNCTIONS = (stop_of, values_at, kernels_at, covered_at, count_in, hidden_of, landed, splat)
+FUNCTIONS = (part_end, values_at, kernels_at, covered_at, count_in, blocked_share, add_light, splat)
 """The functions called in the graph."""

@@ -20,7 +20,7 @@ from .operators import operator
 
 __all__ = ["Kernels", "kernels_of", "splat"]
 
-_NEVER = 1e6  # pixels; larger than any coc
+_BEYOND_PX = 1e6  # pixels; larger than any coc
 
 
 class Kernels(NamedTuple):
@@ -50,8 +50,8 @@ def kernels_of(table: BlurTable, plan: Plan, lens_width: int) -> Kernels:
     """Kernels for the highlights of a plan, for an image of ``lens_width`` pixels."""
     farthest = max(abs(c) for c in plan.coc_px)
     count = int(farthest * plan.kernels_per_px) + 2
-    values, size, places = [torch.zeros(table.channels, 1, dtype=torch.float32)], 1, []
-    seen: dict[bytes, tuple[int, int]] = {}
+    values, size, entries = [torch.zeros(table.channels, 1, dtype=torch.float32)], 1, []
+    stored: dict[bytes, tuple[int, int]] = {}
     for step in range(-count, count + 1):
         kernel = table.kernels(torch.tensor([step / plan.kernels_per_px], dtype=torch.float64), lens_width)[0].float()
         half = kernel.shape[-1] // 2
@@ -61,12 +61,12 @@ def kernels_of(table: BlurTable, plan: Plan, lens_width: int) -> Kernels:
         else:
             numbers, centre = kernel.flatten(1), 2 * half * (half + 1)
         key = numbers.contiguous().numpy().tobytes()
-        if key not in seen:  # most are equal on both sides of the focus plane
-            seen[key] = (size + centre, half)
+        if key not in stored:  # most are equal on both sides of the focus plane
+            stored[key] = (size + centre, half)
             values.append(numbers)
             size += numbers.shape[1]
-        places.append(seen[key])
-    origins, halves = torch.tensor(places).unbind(1)
+        entries.append(stored[key])
+    origins, halves = torch.tensor(entries).unbind(1)
     bins, margin = 2 * int(farthest) + 3, int(halves.max())
     return Kernels(
         torch.cat(values, 1), origins, halves, torch.tensor(table.is_round), plan.kernels_per_px, bins, margin
@@ -85,25 +85,25 @@ def splat(rays: Highlights, coc_px: Tensor, obstacles: Sequence[tuple[Tensor, Te
     batch, _, height, width = coc_px.shape
     *lens, per_px, bins, margin = kernels
     halves = kernels.halves
-    step = rays.coc_px * per_px + float(len(halves) // 2)
-    low = step.floor()
-    node, part = low.long(), step - low
+    position = rays.coc_px * per_px + float(len(halves) // 2)
+    low = position.floor()
+    node, fraction = low.long(), position - low
     half = torch.maximum(halves.index_select(0, node), halves.index_select(0, node + 1))
     half, order = half.sort()  # each part of the sources is processed with its widest kernel
-    node, part, coc, source = (t.index_select(0, order) for t in (node, part, rays.coc_px, rays.pixels))
+    node, fraction, coc, source = (t.index_select(0, order) for t in (node, fraction, rays.coc_px, rays.pixels))
     light = rays.light.index_select(1, order).t()
     item, row, column = pixels.places(source, height, width)
 
-    across, down = width + 2 * margin, height + 2 * margin
-    first = (item * down + row + margin) * across + column + margin
-    lists = [light, coc, item, row, column, first, node, part, half]
-    blank = coc_px.new_zeros(rays.light.shape[0], batch, down, across)
-    sizes = [torch.scalar_tensor(n, dtype=torch.int64) for n in (height, width, across)]
+    padded_width, padded_height = width + 2 * margin, height + 2 * margin
+    first = (item * padded_height + row + margin) * padded_width + column + margin
+    lists = [light, coc, item, row, column, first, node, fraction, half]
+    blank = coc_px.new_zeros(rays.light.shape[0], batch, padded_height, padded_width)
+    sizes = [torch.scalar_tensor(n, dtype=torch.int64) for n in (height, width, padded_width)]
     nearest = coc_px.amin((1, 2, 3))
     if obstacles:
-        places = [(coc - nearest[:, None, None, None], cover) for coc, cover in obstacles]
-        maps = [torch.stack([t.flatten() for t in part], 1) for part in zip(*places, strict=True)]
-        maps.append(covered_cells(places, bins))
+        obstacle_bins = [(coc - nearest[:, None, None, None], cover) for coc, cover in obstacles]
+        maps = [torch.stack([t.flatten() for t in fraction], 1) for fraction in zip(*obstacle_bins, strict=True)]
+        maps.append(covered_cells(obstacle_bins, bins))
     else:  # no bins with surfaces
         maps = [coc_px.new_zeros(1, 1), coc_px.new_zeros(1, 1), coc_px.new_zeros(0, 1, 1, 1)]
     inputs = [blank, *lists, *lens, *sizes, *maps, nearest]

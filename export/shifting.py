@@ -23,8 +23,8 @@ def samples(values: Tensor, size: tuple[int, int], step: int, half_px: tuple[Ten
     first = step // 2  # of the samples before the first pixel
     shares = []
     for n, half in zip(size, half_px, strict=True):
-        place = 2 * torch.arange(n, device=values.device) + 2 * first + 1
-        share = ((place % (2 * step)).to(values.dtype) + half) / (2 * step)
+        position = 2 * torch.arange(n, device=values.device) + 2 * first + 1
+        share = ((position % (2 * step)).to(values.dtype) + half) / (2 * step)
         shares.append((1.0 - share, share))
     shifted = [
         enlarged.narrow(-2, first + row * step, size[0]).narrow(-1, first + column * step, size[1])

@@ -15,8 +15,8 @@ from .structure import structure
 
 __all__ = ["slim"]
 
-_OF_WINDOWS = {"pads": 0, "dilations": 1, "strides": 1}  # defaults of these attributes, for each axis
-_LARGEST_EQUAL = 64  # constants with more equal numbers than this are stored as a shape and a value
+_WINDOW_DEFAULTS = {"pads": 0, "dilations": 1, "strides": 1}  # defaults of these attributes, for each axis
+_MAX_EQUAL = 64  # constants with more equal numbers than this are stored as a shape and a value
 
 
 def slim(model: onnx_ir.Model) -> onnx_ir.Model:
@@ -83,13 +83,13 @@ def _place_weights(model: onnx_ir.Model) -> None:
             if bias is not None and bias.const_value is not None and not bias.const_value.numpy().any():
                 node.resize_inputs(2)
             rows, index = np.unique(weight.const_value.numpy(), axis=0, return_inverse=True)
-            own = _initializer(graph, rows, f"{weight.name}_of_{node.name}")
+            local_weight = _initializer(graph, rows, f"{weight.name}_of_{node.name}")
             if len(rows) < len(index):
-                which = _initializer(graph, index.astype(np.int64), f"{own.name}_channels")
-                gather = onnx_ir.node("Gather", [own, which], {"axis": 0})
+                channel_index = _initializer(graph, index.astype(np.int64), f"{local_weight.name}_channels")
+                gather = onnx_ir.node("Gather", [local_weight, channel_index], {"axis": 0})
                 graph.insert_before(node, [gather])
-                own = gather.outputs[0]
-            node.replace_input_with(1, own)
+                local_weight = gather.outputs[0]
+            node.replace_input_with(1, local_weight)
 
 
 def _as_nodes(graph: onnx_ir.Graph) -> None:
@@ -101,16 +101,16 @@ def _as_nodes(graph: onnx_ir.Graph) -> None:
             del graph.initializers[value.name]
             continue
         tape, array = Tape(), value.const_value.numpy()
-        if array.size > _LARGEST_EQUAL and (array == array.flat[0]).all():
+        if array.size > _MAX_EQUAL and (array == array.flat[0]).all():
             shape = tape.op("Constant", [], {"value_ints": list(array.shape)})
             tape.op("ConstantOfShape", [shape], {"value": onnx_ir.tensor(array.flat[:1])})
             shape.name = f"{value.name}_shape"
         else:
             tape.op("Constant", [], {"value": value.const_value})
-        made = tape.nodes[-1].outputs[0]
-        made.name = value.name
+        constant = tape.nodes[-1].outputs[0]
+        constant.name = value.name
         del graph.initializers[value.name]
-        value.replace_all_uses_with(made)
+        value.replace_all_uses_with(constant)
         if first is not None:
             graph.insert_before(first, list(tape.nodes))
 
@@ -128,7 +128,6 @@ class _Casts(onnx_ir.passes.InPlacePass):
     """``CastLike`` becomes ``Cast``, or nothing if the type is right already; not every runtime simplifies it."""
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        """Replace in all graphs."""
         number = itertools.count()
         for graph in (model.graph, *model.graph.subgraphs()):
             for node in list(graph):
@@ -156,7 +155,6 @@ class _Parts(onnx_ir.passes.InPlacePass):
     """A slice that is exactly one input of a ``Concat`` becomes that input; onnxruntime would warn of it."""
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        """Replace in the graph, which is still flat."""
         for node in list(model.graph):
             if node.op_type == "Slice" and not node.outputs[0].is_graph_output():
                 part = _part(node)
@@ -170,17 +168,16 @@ class _Cuts(onnx_ir.passes.InPlacePass):
     """Two slices in sequence along different axes become one, because each copies."""
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        """Replace in the graph."""
         for node in list(model.graph):
-            whole = node.inputs[0] if node.op_type == "Slice" else None
-            first = None if whole is None else whole.producer()
+            source = node.inputs[0] if node.op_type == "Slice" else None
+            first = None if source is None else source.producer()
             if first is None or first.op_type != "Slice" or len(first.inputs) != len(node.inputs):
                 continue
-            along: list[Any] = [first.inputs[3], node.inputs[3]]
-            axes = [onnx_ir.convenience.get_const_tensor(value) for value in along]
-            if whole is None or axes[0] is None or axes[1] is None or whole.shape is None:
+            axis_values: list[Any] = [first.inputs[3], node.inputs[3]]
+            axes = [onnx_ir.convenience.get_const_tensor(value) for value in axis_values]
+            if source is None or axes[0] is None or axes[1] is None or source.shape is None:
                 continue
-            rank = len(whole.shape)  # an axis may be counted from the last one
+            rank = len(source.shape)  # an axis may be counted from the last one
             if {int(a) % rank for a in axes[0].numpy()} & {int(a) % rank for a in axes[1].numpy()}:
                 continue
             tape = Tape()
@@ -198,7 +195,6 @@ class _Averages(onnx_ir.passes.InPlacePass):
     """Block means before a convolution become a convolution, which is several times as fast in runtimes."""
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        """Replace in the graph."""
         for node in list(model.graph):
             following = [use.node for use in node.outputs[0].uses()] if node.op_type == "AveragePool" else []
             if [n.op_type for n in following] != ["Pad"]:
@@ -228,26 +224,25 @@ class _Fills(onnx_ir.passes.InPlacePass):
     """
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        """Replace in the graph."""
         graph = model.graph
         for pad in list(graph):
-            spare = _spare_channels(pad)
-            parts: Any = pad.inputs[0].producer() if spare and pad.inputs[0] is not None else None
-            if parts is None or parts.op_type != "Concat" or parts.attributes["axis"].as_int() != 1:
+            missing = _spare_channels(pad)
+            concat: Any = pad.inputs[0].producer() if missing and pad.inputs[0] is not None else None
+            if concat is None or concat.op_type != "Concat" or concat.attributes["axis"].as_int() != 1:
                 continue
-            filled, tape = list(parts.inputs), Tape()
-            for part in parts.inputs:
-                repeats, spare = divmod(spare, part.shape[1])
+            filled, tape = list(concat.inputs), Tape()
+            for part in concat.inputs:
+                repeats, missing = divmod(missing, part.shape[1])
                 filled += [part] * repeats
-            if spare:
+            if missing:
                 name = f"{pad.outputs[0].name}_fill"
-                ends = {"start": 0, "stop": spare, "axis": 1}
+                ends = {"start": 0, "stop": missing, "axis": 1}
                 bounds = [_initializer(graph, np.array([n]), f"{name}_{end}") for end, n in ends.items()]
-                filled.append(tape.op("Slice", [parts.inputs[0], *bounds]))
-            whole = tape.op("Concat", filled, {"axis": 1})
-            whole.type, whole.shape = pad.outputs[0].type, pad.outputs[0].shape
+                filled.append(tape.op("Slice", [concat.inputs[0], *bounds]))
+            extended = tape.op("Concat", filled, {"axis": 1})
+            extended.type, extended.shape = pad.outputs[0].type, pad.outputs[0].shape
             graph.insert_before(pad, list(tape.nodes))
-            pad.outputs[0].replace_all_uses_with(whole)
+            pad.outputs[0].replace_all_uses_with(extended)
             graph.remove(pad, safe=True)
         return onnx_ir.passes.PassResult(model, modified=True)
 
@@ -256,21 +251,20 @@ class _Splits(onnx_ir.passes.InPlacePass):
     """A slice of the first channels and a split become one split, whose last part is not used."""
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        """Replace in the graph."""
         graph = model.graph
         for node in [n for n in graph if n.op_type == "Split" and n.attributes["axis"].as_int() == 1]:
             cut: Any = None if node.inputs[0] is None else node.inputs[0].producer()
             if cut is None or cut.op_type != "Slice" or cut.inputs[0].shape is None:
                 continue
-            whole, kept = cut.inputs[0], cut.outputs[0].shape
-            alike = [a == b for a, b in zip(whole.shape, kept, strict=True)]
+            source, kept_shape = cut.inputs[0], cut.outputs[0].shape
+            is_equal = [a == b for a, b in zip(source.shape, kept_shape, strict=True)]
             bounds: list[Any] = [cut.inputs[1], node.inputs[1]]
             first, sizes = (onnx_ir.convenience.get_const_tensor(value) for value in bounds)
-            if first is None or sizes is None or first.numpy().any() or alike != [True, False, True, True]:
+            if first is None or sizes is None or first.numpy().any() or is_equal != [True, False, True, True]:
                 continue
-            parts = np.array([*sizes.numpy(), whole.shape[1] - kept[1]])
-            of_all = _initializer(graph, parts, f"{node.outputs[0].name}_sizes")
-            split = onnx_ir.node("Split", [whole, of_all], {"axis": 1}, num_outputs=len(parts))
+            parts = np.array([*sizes.numpy(), source.shape[1] - kept_shape[1]])
+            all_sizes = _initializer(graph, parts, f"{node.outputs[0].name}_sizes")
+            split = onnx_ir.node("Split", [source, all_sizes], {"axis": 1}, num_outputs=len(parts))
             graph.insert_before(node, [split])
             for old, new in zip(node.outputs, split.outputs, strict=False):
                 new.type, new.shape = old.type, old.shape
@@ -287,35 +281,34 @@ class _Ramps(onnx_ir.passes.InPlacePass):
     """
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        """Replace in the graph."""
         for node in list(model.graph):
             clip: Any = _operand(node.outputs[0], "Sub", 1.0)
             clip = None if clip is None else clip.producer()
-            falls: Any = None if clip is None or clip.op_type != "Clip" else clip.inputs[0].producer()
-            if falls is not None and falls.op_type == "Div" and [_number(v) for v in clip.inputs[1:]] == [0.0, 1.0]:
-                width = _number(falls.inputs[1])
+            ratio: Any = None if clip is None or clip.op_type != "Clip" else clip.inputs[0].producer()
+            if ratio is not None and ratio.op_type == "Div" and [_number(v) for v in clip.inputs[1:]] == [0.0, 1.0]:
+                width = _number(ratio.inputs[1])
                 if width is not None:
-                    line = onnx_ir.node("HardSigmoid", [falls.inputs[0]], {"alpha": -1.0 / width, "beta": 1.0})
-                    line.outputs[0].type, line.outputs[0].shape = node.outputs[0].type, node.outputs[0].shape
-                    model.graph.insert_before(node, [line])
-                    node.outputs[0].replace_all_uses_with(line.outputs[0])
+                    ramp = onnx_ir.node("HardSigmoid", [ratio.inputs[0]], {"alpha": -1.0 / width, "beta": 1.0})
+                    ramp.outputs[0].type, ramp.outputs[0].shape = node.outputs[0].type, node.outputs[0].shape
+                    model.graph.insert_before(node, [ramp])
+                    node.outputs[0].replace_all_uses_with(ramp.outputs[0])
             if node.op_type != "Max" or len(node.inputs) != 2:
                 continue
-            straight, lack, rest = node.inputs[0], _operand(node.inputs[0], "Sub", 1.0), None
-            scaled: Any = None if lack is None else lack.producer()
+            linear, difference, complement = node.inputs[0], _operand(node.inputs[0], "Sub", 1.0), None
+            scaled: Any = None if difference is None else difference.producer()
             slope = None if scaled is None else _number(scaled.inputs[-1])
             if scaled is not None and scaled.op_type == "Mul" and slope is not None:
-                rest = _operand(scaled.inputs[0], "Sub", 1.0)
-            clipped: Any = None if rest is None else rest.producer()
-            if rest is None or straight is None or slope is None or clipped.op_type != "Clip":
+                complement = _operand(scaled.inputs[0], "Sub", 1.0)
+            clipped: Any = None if complement is None else complement.producer()
+            if complement is None or linear is None or slope is None or clipped.op_type != "Clip":
                 continue
             # exactly 1 at 1: the offset is a multiple of the float32 resolution near the slope
             offset = round((1.0 - slope) * 2**23) / 2**23
-            line = onnx_ir.node("HardSigmoid", [clipped.inputs[0]], {"alpha": 1.0 - offset, "beta": offset})
-            line.outputs[0].type, line.outputs[0].shape = straight.type, straight.shape
-            model.graph.insert_before(clipped, [line])
-            straight.replace_all_uses_with(line.outputs[0])
-            for use in list(rest.uses()):
+            ramp = onnx_ir.node("HardSigmoid", [clipped.inputs[0]], {"alpha": 1.0 - offset, "beta": offset})
+            ramp.outputs[0].type, ramp.outputs[0].shape = linear.type, linear.shape
+            model.graph.insert_before(clipped, [ramp])
+            linear.replace_all_uses_with(ramp.outputs[0])
+            for use in list(complement.uses()):
                 if use.node.op_type == "Clip" and use.node.inputs[1] is None:  # the foot
                     use.node.replace_input_with(0, clipped.inputs[0])
                     use.node.replace_input_with(1, clipped.inputs[1])
@@ -325,8 +318,8 @@ class _Ramps(onnx_ir.passes.InPlacePass):
 def _operand(value: onnx_ir.Value | None, operator: str, number: float) -> onnx_ir.Value | None:
     """The second operand of ``value``, if it is this operator with this number as the first operand; else None."""
     node = None if value is None else value.producer()
-    is_it = node is not None and node.op_type == operator and _number(node.inputs[0]) == number
-    return node.inputs[1] if node is not None and is_it else None
+    matches = node is not None and node.op_type == operator and _number(node.inputs[0]) == number
+    return node.inputs[1] if node is not None and matches else None
 
 
 def _number(value: onnx_ir.Value | None) -> float | None:
@@ -344,14 +337,14 @@ def _spare_channels(node: onnx_ir.Node) -> int:
 
 def _part(node: onnx_ir.Node) -> onnx_ir.Value | None:
     """The input of a ``Concat`` that a slice cuts out exactly, else None."""
-    whole, *bounds = node.inputs
+    source_value, *bounds = node.inputs
     numbers = [v.const_value.numpy().tolist() for v in bounds if v is not None and v.const_value is not None]
-    source = None if whole is None else whole.producer()
+    source = None if source_value is None else source_value.producer()
     if source is None or len(numbers) < max(3, len(bounds)) or any(len(n) != 1 for n in numbers):
         return None
     (start,), (end,), (axis,), (step,) = (*numbers, [1])[:4]
     if (start, end) == (0, 2**63 - 1) and step == 1:
-        return whole
+        return source_value
     if source.op_type != "Concat" or step != 1 or source.attributes["axis"].as_int() != axis:
         return None
     first = 0
@@ -373,18 +366,17 @@ def _cast_constant(graph: onnx_ir.Graph, value: onnx_ir.Value, kind: onnx_ir.Dat
 
 
 def _drop_defaults(model: onnx_ir.Model) -> None:
-    """Removes attributes with default values."""
     for node in model.graph.all_nodes():
-        known = onnx.defs.get_schema(node.op_type, model.opset_imports[""]).attributes
+        schema = onnx.defs.get_schema(node.op_type, model.opset_imports[""]).attributes
         for name, attribute in list(node.attributes.items()):
-            default = known[name].default_value
-            is_default = default.type and onnx.helper.get_attribute_value(default) == _plain(attribute)
-            of_window = name in _OF_WINDOWS and set(attribute.as_ints()) == {_OF_WINDOWS[name]}
-            if is_default or of_window or (node.op_type, name) == ("Conv", "kernel_shape"):
+            default = schema[name].default_value
+            is_default = default.type and onnx.helper.get_attribute_value(default) == _onnx_value(attribute)
+            is_window_default = name in _WINDOW_DEFAULTS and set(attribute.as_ints()) == {_WINDOW_DEFAULTS[name]}
+            if is_default or is_window_default or (node.op_type, name) == ("Conv", "kernel_shape"):
                 del node.attributes[name]
 
 
-def _plain(attribute: onnx_ir.Attr) -> Any:
+def _onnx_value(attribute: onnx_ir.Attr) -> Any:
     """Value of an attribute in :mod:`onnx`'s types; None for graphs and tensors."""
     value = attribute.value
     return value.encode() if isinstance(value, str) else value if isinstance(value, int | float) else None
@@ -396,7 +388,7 @@ def _shorten(model: onnx_ir.Model) -> None:
     Types and shapes of intermediate values are also removed, because they would be most of the file; inference finds
     them.
     """
-    kept = {value.name for value in (*model.graph.inputs, *model.graph.outputs)}
+    interface_names = {value.name for value in (*model.graph.inputs, *model.graph.outputs)}
     values: list[onnx_ir.Value] = []
     for graph in (model.graph, *model.graph.subgraphs()):
         values += [*graph.inputs]
@@ -406,9 +398,9 @@ def _shorten(model: onnx_ir.Model) -> None:
             for value in node.outputs:
                 if not value.is_graph_output():
                     value.shape = value.type = None
-    values = sorted((v for v in values if v.name not in kept), key=lambda v: -len(v.uses()))
+    values = sorted((v for v in values if v.name not in interface_names), key=lambda v: -len(v.uses()))
     alphabet = string.ascii_letters
     lengths = ([alphabet] + [alphabet + string.digits] * n for n in range(4))
     names = ("".join(letters) for length in lengths for letters in itertools.product(*length))
-    for value, name in zip(values, (name for name in names if name not in kept), strict=False):
+    for value, name in zip(values, (name for name in names if name not in interface_names), strict=False):
         value.name = name

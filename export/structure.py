@@ -49,43 +49,43 @@ def _loop(graph: onnx_ir.Graph, collect: onnx_ir.Node, owners: _Owners) -> None:
     tile: Any = collect.inputs[0]
     side, margin = (windows[0].attributes[name].as_int() for name in ("side", "margin"))
 
-    before = Tape()
-    shape = before.op("Shape", [frame])
-    sizes = before.op("Slice", [shape, _ints(before, 2), _ints(before, 4)])
-    counts = before.op("Div", [before.op("Sub", [sizes, _ints(before, 2 * margin)]), _ints(before, side)])
-    batch = before.op("Slice", [shape, _ints(before, 0), _ints(before, 1)])
-    grid = before.op("Concat", [batch, counts], {"axis": 0})  # items, rows, columns
-    total = before.op("ReduceProd", [grid], {"keepdims": 0})
-    rows = before.op("Slice", [grid, _ints(before, 1), _ints(before, 2)])
-    columns = before.op("Slice", [grid, _ints(before, 2), _ints(before, 3)])
-    always = before.op("Constant", [], {"value": onnx_ir.tensor(True)})
+    outer = Tape()
+    shape = outer.op("Shape", [frame])
+    sizes = outer.op("Slice", [shape, _ints(outer, 2), _ints(outer, 4)])
+    counts = outer.op("Div", [outer.op("Sub", [sizes, _ints(outer, 2 * margin)]), _ints(outer, side)])
+    batch = outer.op("Slice", [shape, _ints(outer, 0), _ints(outer, 1)])
+    grid = outer.op("Concat", [batch, counts], {"axis": 0})  # items, rows, columns
+    total = outer.op("ReduceProd", [grid], {"keepdims": 0})
+    rows = outer.op("Slice", [grid, _ints(outer, 1), _ints(outer, 2)])
+    columns = outer.op("Slice", [grid, _ints(outer, 2), _ints(outer, 3)])
+    true = outer.op("Constant", [], {"value": onnx_ir.tensor(True)})
 
     step = _value("step", onnx_ir.DataType.INT64, [])
-    going = _value("going", onnx_ir.DataType.BOOL, [])
-    inside = Tape()
-    line = inside.op("Div", [step, columns])
-    place = [inside.op("Div", [line, rows]), inside.op("Mod", [line, rows]), inside.op("Mod", [step, columns])]
-    tile_place = inside.op("Concat", place, {"axis": 0})
+    keep_going = _value("going", onnx_ir.DataType.BOOL, [])
+    inner = Tape()
+    line = inner.op("Div", [step, columns])
+    position = [inner.op("Div", [line, rows]), inner.op("Mod", [line, rows]), inner.op("Mod", [step, columns])]
+    tile_position = inner.op("Concat", position, {"axis": 0})
     for window in windows:
         side, margin = (window.attributes[name].as_int() for name in ("side", "margin"))
-        start = inside.op("Mul", [tile_place, _ints(inside, 1, side, side)])
-        stop = inside.op("Add", [start, _ints(inside, 1, side + 2 * margin, side + 2 * margin)])
-        sliced = inside.op("Slice", [window.inputs[0], start, stop, _ints(inside, 0, 2, 3)])
+        start = inner.op("Mul", [tile_position, _ints(inner, 1, side, side)])
+        stop = inner.op("Add", [start, _ints(inner, 1, side + 2 * margin, side + 2 * margin)])
+        sliced = inner.op("Slice", [window.inputs[0], start, stop, _ints(inner, 0, 2, 3)])
         # runtimes do not know the size of a slice, and use fast convolutions only for known sizes
         size = window.outputs[0].shape
-        cut = inside.op("Reshape", [sliced, _ints(inside, *(size.numpy() if size else ()))])
+        cut = inner.op("Reshape", [sliced, _ints(inner, *(size.numpy() if size else ()))])
         window.outputs[0].replace_all_uses_with(cut)
     for node in body_nodes:
         graph.remove(node)
-    condition = inside.op("Identity", [going])
-    after = Tape()
-    squeezed = after.op("Squeeze", [tile, _ints(after, 0)])
-    nodes = [*inside.nodes, *body_nodes, *after.nodes]
+    condition = inner.op("Identity", [keep_going])
+    last = Tape()
+    squeezed = last.op("Squeeze", [tile, _ints(last, 0)])
+    nodes = [*inner.nodes, *body_nodes, *last.nodes]
     _type(condition, onnx_ir.DataType.BOOL, [])
     _type(squeezed, tile.dtype, tile.shape[1:])
-    body = onnx_ir.Graph([step, going], [condition, squeezed], nodes=nodes, name="tile")
-    loop = onnx_ir.node("Loop", [total, always], {"body": body})
-    graph.insert_before(collect, [*before.nodes, loop])
+    body = onnx_ir.Graph([step, keep_going], [condition, squeezed], nodes=nodes, name="tile")
+    loop = onnx_ir.node("Loop", [total, true], {"body": body})
+    graph.insert_before(collect, [*outer.nodes, loop])
     owners[body] = loop
     _replace(graph, collect, loop)
     for window in windows:
@@ -94,18 +94,18 @@ def _loop(graph: onnx_ir.Graph, collect: onnx_ir.Node, owners: _Owners) -> None:
 
 def _branches(graph: onnx_ir.Graph, owners: _Owners) -> None:
     """Makes an ``If`` of each choice in a graph, outermost first, then of those in its branches and loops."""
-    inside: list[onnx_ir.Graph] = []
+    subgraphs: list[onnx_ir.Graph] = []
     while choices := _ours(graph, CHOICE):
         choice = choices[-1]
         branches = [_branch(graph, choice, index, owners) for index in (1, 2)]
-        taken = onnx_ir.node("If", [choice.inputs[0]], {"then_branch": branches[0], "else_branch": branches[1]})
+        if_node = onnx_ir.node("If", [choice.inputs[0]], {"then_branch": branches[0], "else_branch": branches[1]})
         for branch in branches:
-            owners[branch] = taken
-        graph.insert_before(choice, [taken])
-        _replace(graph, choice, taken)
-        inside += branches
-    inside += [a.as_graph() for n in graph if n.op_type == "Loop" for a in n.attributes.values()]
-    for subgraph in inside:
+            owners[branch] = if_node
+        graph.insert_before(choice, [if_node])
+        _replace(graph, choice, if_node)
+        subgraphs += branches
+    subgraphs += [a.as_graph() for n in graph if n.op_type == "Loop" for a in n.attributes.values()]
+    for subgraph in subgraphs:
         _branches(subgraph, owners)
 
 
@@ -115,17 +115,17 @@ def _branch(graph: onnx_ir.Graph, choice: onnx_ir.Node, index: int, owners: _Own
     last = onnx_ir.node("Identity", [result])  # a branch can only return its own values
     graph.insert_before(choice, [last])
     choice.replace_input_with(index, last.outputs[0])
-    moved, open_nodes = {last}, [last]
+    branch_nodes, open_nodes = {last}, [last]
     while open_nodes:
-        for value in _taken(open_nodes.pop()):
+        for value in _used_values(open_nodes.pop()):
             node = value.producer()
-            if node is None or node.graph is not graph or node in moved:
+            if node is None or node.graph is not graph or node in branch_nodes:
                 continue
-            users = {_in(graph, use.node, owners) for output in node.outputs for use in output.uses()}
-            if users <= moved and not any(output.is_graph_output() for output in node.outputs):
-                moved.add(node)
+            users = {_enclosing(graph, use.node, owners) for output in node.outputs for use in output.uses()}
+            if users <= branch_nodes and not any(output.is_graph_output() for output in node.outputs):
+                branch_nodes.add(node)
                 open_nodes.append(node)
-    nodes = [node for node in graph if node in moved]
+    nodes = [node for node in graph if node in branch_nodes]
     for node in nodes:
         graph.remove(node)
     _type(last.outputs[0], result.dtype, result.shape)
@@ -134,12 +134,12 @@ def _branch(graph: onnx_ir.Graph, choice: onnx_ir.Node, index: int, owners: _Own
     return branch
 
 
-def _taken(node: onnx_ir.Node) -> list[onnx_ir.Value]:
+def _used_values(node: onnx_ir.Node) -> list[onnx_ir.Value]:
     """The inputs of a node and of its subgraphs."""
     values = [value for value in node.inputs if value is not None]
     for attribute in node.attributes.values():
         if _is_graph(attribute):
-            values += [value for inner in attribute.as_graph() for value in _taken(inner)]
+            values += [value for inner in attribute.as_graph() for value in _used_values(inner)]
     return values
 
 
@@ -147,7 +147,7 @@ def _is_graph(attribute: onnx_ir.Attr) -> bool:
     return attribute.type == onnx_ir.AttributeType.GRAPH
 
 
-def _in(graph: onnx_ir.Graph, node: onnx_ir.Node, owners: _Owners) -> onnx_ir.Node:
+def _enclosing(graph: onnx_ir.Graph, node: onnx_ir.Node, owners: _Owners) -> onnx_ir.Node:
     """The node of ``graph`` that is, or contains, ``node``."""
     while node.graph is not graph:
         node = owners[node.graph]

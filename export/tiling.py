@@ -39,21 +39,21 @@ def tile_by_tile(frame: Frame, render: Callable[[Frame], Tensor], ops: Ops) -> T
     Returns:
         The rendered frame, ``[B, C, H, W]``.
     """
-    length, margin = side(frame.margin), frame.margin
-    surfaces = [Placed(*(window(t, length, margin) for t in s if t is not None)) for s in frame.surfaces]
-    behind = None if frame.behind is None else window(frame.behind, length, 0)
-    inner = (..., slice(margin, margin + length), slice(margin, margin + length))
-    size = (length, length)
-    piece = Frame(surfaces, frame.nodes, frame.ramps, behind, margin, size, size, frame.occlusion)
-    rendered, sharp = render(piece), surfaces[0].light[inner]
+    tile_px, margin = side(frame.margin), frame.margin
+    surfaces = [Placed(*(window(t, tile_px, margin) for t in s if t is not None)) for s in frame.surfaces]
+    behind = None if frame.behind is None else window(frame.behind, tile_px, 0)
+    inside = (..., slice(margin, margin + tile_px), slice(margin, margin + tile_px))
+    size = (tile_px, tile_px)
+    tile_frame = Frame(surfaces, frame.nodes, frame.ramps, behind, margin, size, size, frame.occlusion)
+    rendered, sharp = render(tile_frame), surfaces[0].light[inside]
     weights = int(rendered.shape[1]) - frame.colours
     if weights:
         sharp = torch.cat([sharp, torch.ones_like(sharp[:, :weights])], 1)
     tile = ops.choose(lambda: torch.stack([s.x.abs().max() for s in surfaces]).max() > 0, rendered, sharp)
-    rows, columns = (n // length for n in frame.area)
+    rows, columns = (n // tile_px for n in frame.area)
     batch = frame.surfaces[0].light.shape[0]
-    pieces = collect(tile, batch * rows * columns)
-    return _joined(pieces, (batch, rows, columns))[..., : frame.size[0], : frame.size[1]]
+    tiles = collect(tile, batch * rows * columns)
+    return _joined(tiles, (batch, rows, columns))[..., : frame.size[0], : frame.size[1]]
 
 
 def seen(levels: Sequence[Level], coc_px: Tensor, mask: Tensor, ops: Ops) -> Seen:
@@ -63,29 +63,29 @@ def seen(levels: Sequence[Level], coc_px: Tensor, mask: Tensor, ops: Ops) -> See
     may be something.
     """
     size = (coc_px.shape[-2], coc_px.shape[-1])
-    whole = [levels[0].step * n for n in levels[0].values.shape[-2:]]  # both have one centre
-    more = [(n + _SIDE - 1) // _SIDE * _SIDE - n for n in whole]  # below and right, to whole tiles
-    top, left = ((w - n) // 2 for w, n in zip(whole, size, strict=True))
-    halves = [torch.scalar_tensor((w - n) % 2, dtype=coc_px.dtype) for w, n in zip(whole, size, strict=True)]
-    ends = [left, whole[1] + more[1] - size[1] - left, top, whole[0] + more[0] - size[0] - top]
-    looking = functional.pad(torch.cat([coc_px, mask], 1), ends, mode="replicate")
-    coc_px, mask = window(looking, _SIDE, 0).split(1, 1)
-    pieces, shown = [], []
+    covered = [levels[0].step * n for n in levels[0].values.shape[-2:]]  # px; the levels are centred on the image
+    missing = [(n + _SIDE - 1) // _SIDE * _SIDE - n for n in covered]  # below and right, to whole tiles
+    top, left = ((w - n) // 2 for w, n in zip(covered, size, strict=True))
+    halves = [torch.scalar_tensor((w - n) % 2, dtype=coc_px.dtype) for w, n in zip(covered, size, strict=True)]
+    ends = [left, covered[1] + missing[1] - size[1] - left, top, covered[0] + missing[0] - size[0] - top]
+    padded = functional.pad(torch.cat([coc_px, mask], 1), ends, mode="replicate")
+    coc_px, mask = window(padded, _SIDE, 0).split(1, 1)
+    windows, behind = [], []
     for level in levels:
-        ends = [1, 1 + more[1] // level.step, 1, 1 + more[0] // level.step]
+        ends = [1, 1 + missing[1] // level.step, 1, 1 + missing[0] // level.step]
         values = window(functional.pad(level.values, ends, mode="replicate"), _SIDE // level.step, 1)
-        pieces.append(values)
-        shown.append(shown_behind(*samples(values, (_SIDE, _SIDE), level.step, (halves[0], halves[1])), coc_px))
-    lights, weights = (torch.stack(parts) for parts in zip(*shown, strict=True))
-    found = torch.cat(search(levels, lights, weights, coc_px), 1)
+        windows.append(values)
+        behind.append(shown_behind(*samples(values, (_SIDE, _SIDE), level.step, (halves[0], halves[1])), coc_px))
+    lights, weights = (torch.stack(parts) for parts in zip(*behind, strict=True))
+    surfaces = torch.cat(search(levels, lights, weights, coc_px), 1)
 
     def hides() -> Tensor:
-        most = torch.stack([values[:, -2].max() for values in pieces]).max()
-        return (mask.max() > 0) & (most > coc_px.min() + (BEHIND_PX - 0.5))
+        nearest = torch.stack([values[:, -2].max() for values in windows]).max()
+        return (mask.max() > 0) & (nearest > coc_px.min() + (BEHIND_PX - 0.5))
 
-    tile = ops.choose(hides, found, torch.zeros_like(found))
-    rows, columns = ((w + m) // _SIDE for w, m in zip(whole, more, strict=True))
-    batch = looking.shape[0]
+    tile = ops.choose(hides, surfaces, torch.zeros_like(surfaces))
+    rows, columns = ((w + m) // _SIDE for w, m in zip(covered, missing, strict=True))
+    batch = padded.shape[0]
     tiles = collect(tile, batch * rows * columns)
     # narrow() instead of slices: tracing then knows the sizes of the result
     maps = _joined(tiles, (batch, rows, columns)).narrow(-2, top, size[0]).narrow(-1, left, size[1])

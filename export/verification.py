@@ -161,7 +161,7 @@ def _compare(runner: onnxruntime.InferenceSession, portable: Portable, case: Cas
     start = time.perf_counter()
     with torch.no_grad():
         expected = portable(*case.tensors)
-    middle = time.perf_counter()
+    between = time.perf_counter()
     feed = {name: t.numpy() for name, t in zip(INPUTS[portable.inputs], case.tensors, strict=True)}
     got = runner.run([OUTPUT], feed)[0]
     end = time.perf_counter()
@@ -170,14 +170,14 @@ def _compare(runner: onnxruntime.InferenceSession, portable: Portable, case: Cas
     # coarse layers average light over their pixels before blurring it
     blurs = portable.blurs((int(expected.shape[2]), int(expected.shape[3])))
     reach = max(blur.halo + blur.scale - 1 for blur in blurs)
-    unit = local_range(case.tensors[0], min(reach, max(expected.shape[-2:])))
-    error = (torch.from_numpy(got) - expected).abs() / unit.clamp_min(torch.finfo(torch.float32).tiny)
+    light_range = local_range(case.tensors[0], min(reach, max(expected.shape[-2:])))
+    error = (torch.from_numpy(got) - expected).abs() / light_range.clamp_min(torch.finfo(torch.float32).tiny)
     error = torch.where(torch.isfinite(error), error, torch.inf)
     with torch.no_grad():
         called = metrics.display(portable.as_called(*case.tensors).nan_to_num(0.0))
     called_db = metrics.psnr(metrics.display(torch.from_numpy(got).nan_to_num(0.0)), called)
     errors = float(error.max()), float(error.mean()), called_db
-    return CaseComparison(case.name, tuple(got.shape), *errors, middle - start, end - middle)
+    return CaseComparison(case.name, tuple(got.shape), *errors, between - start, end - between)
 
 
 def check_format(model: onnx.ModelProto, path: str) -> None:
@@ -186,8 +186,8 @@ def check_format(model: onnx.ModelProto, path: str) -> None:
     Raises:
         ValueError: With the reason.
     """
-    whole = onnx.load(path, load_external_data=False)  # a loaded model no longer contains where its weights were stored
-    if any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in _tensors(whole.graph)):
+    stored = onnx.load(path, load_external_data=False)  # loading the weights would remove the name of their file
+    if any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in _tensors(stored.graph)):
         raise ValueError(f"{path} keeps weights in another file")
     try:
         onnx.checker.check_model(path, full_check=True)
@@ -226,14 +226,14 @@ def _check_interface(model: onnx.ModelProto, inputs: str) -> int:
     """Checks names, types and free sizes; returns the number of channels."""
     channels = model.graph.output[0].type.tensor_type.shape.dim[1].dim_value
     single, colours = (ITEMS, 1, "H", "W"), ("B", channels, "H", "W")
-    lens = ((ITEMS,), (ITEMS,)) if inputs == "depth" else ()
-    expected = [*zip(INPUTS[inputs], (colours, single, *lens), strict=True), (OUTPUT, colours)]
-    got = []
+    lens_inputs = ((ITEMS,), (ITEMS,)) if inputs == "depth" else ()
+    expected = [*zip(INPUTS[inputs], (colours, single, *lens_inputs), strict=True), (OUTPUT, colours)]
+    actual = []
     for value in (*model.graph.input, *model.graph.output):
         kind = value.type.tensor_type
-        got.append((value.name, tuple(d.dim_param or d.dim_value for d in kind.shape.dim)))
+        actual.append((value.name, tuple(d.dim_param or d.dim_value for d in kind.shape.dim)))
         if kind.elem_type != onnx.TensorProto.FLOAT:
             raise ValueError(f"{value.name} must be float32, got {onnx.TensorProto.DataType.Name(kind.elem_type)}")
-    if got != expected:
-        raise ValueError(f"the graph must take and give {expected}, got {got}")
+    if actual != expected:
+        raise ValueError(f"the graph must take and give {expected}, got {actual}")
     return int(channels)

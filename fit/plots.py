@@ -45,10 +45,10 @@ def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
         r, level = _model_line(fit)
         axes.plot(r, level, color=_MODEL, label="forward model", zorder=3)
         if fit.aperture is None:  # kernels that are not round have no profile
-            line = np.linspace(0, fit.samples[0].max(), 400)
-            shape = evaluate(fit.family, line, fit.kernel_params())
-            scaled = shape / shape.max() * level.max()
-            axes.plot(line, scaled, "--", color="#1d4ed8", label="kernel f(r), scaled", zorder=2)
+            radii = np.linspace(0, fit.samples[0].max(), 400)
+            shape = evaluate(fit.family, radii, fit.kernel_params())
+            scaled_profile = shape / shape.max() * level.max()
+            axes.plot(radii, scaled_profile, "--", color="#1d4ed8", label="kernel f(r), scaled", zorder=2)
     else:
         axes.plot(*fit.curve, color=_MODEL, label=f"fitted {fit.family}", zorder=3)
     axes.set(xlabel=f"r [{unit}]", ylabel="level above background" if forward else "blur strength", ylim=(0, None))
@@ -72,9 +72,9 @@ def picture_of_texture(table: BlurTable, coc_px: float, width: int, title: str =
     figure, axes = _new_figure(4.2, 3.6)
     half = texture.shape[-1] / 2
     colours = np.moveaxis(texture, 0, -1) / texture.max() if texture.shape[0] == 3 else texture[0]
-    shown = axes.imshow(colours, cmap="gray", vmin=0, extent=(-half, half, half, -half))
+    image = axes.imshow(colours, cmap="gray", vmin=0, extent=(-half, half, half, -half))
     if texture.shape[0] != 3:
-        figure.colorbar(shown, ax=axes, label="blur strength")
+        figure.colorbar(image, ax=axes, label="blur strength")
     axes.set(xlabel="px", ylabel="px")
     axes.set_title(title or f"blur texture, coc {coc_px:+.1f} px", fontsize=9)
     return figure
@@ -99,26 +99,26 @@ def picture_of_table(table: BlurTable, title: str = "") -> Figure:
     """A table over depth: every parameter at its nodes, and the table's interpolation between them."""
     names = list(table.node_params)
     figure, axes = _new_figure(3.2 * len(names), 3.2, len(names))
-    reach = float(table.coc.abs().max())
+    largest_coc = float(table.coc.abs().max())
     width = 1 if table.sensor_width_mm is None else int(table.sensor_width_mm) or 1
     scale = 1.0 if table.unit != "mm" else width / float(table.sensor_width_mm or 1.0)
-    line = torch.linspace(-reach, reach, 401, dtype=torch.float64)
-    between = table.params(line * scale, width)
+    coc = torch.linspace(-largest_coc, largest_coc, 401, dtype=torch.float64)
+    interpolated = table.params(coc * scale, width)
     unit = {"mm": "mm", "fraction": "of the width", "relative": "relative"}[table.unit]
     for ax, name in zip(np.atleast_1d(axes), names, strict=True):
         nodes = table.node_params[name]
         if name == "values":
-            picture = between[name][0].T.numpy()
+            picture = interpolated[name][0].T.numpy()
             ax.imshow(
                 picture / np.maximum(picture.max(axis=0), 1e-12), aspect="auto", origin="lower", cmap="magma",
-                extent=(-reach, reach, 0, 1),
+                extent=(-largest_coc, largest_coc, 0, 1),
             )  # fmt: skip
             ax.set(ylabel="r / radius", title="profile, each over its peak")
         else:
-            per = scale if name in LENGTHS else 1.0
+            unit_scale = scale if name in LENGTHS else 1.0
             for channel in range(nodes.shape[0]):
                 colour = _MODEL if nodes.shape[0] == 1 else ("#dc2626", "#16a34a", "#2563eb")[channel % 3]
-                ax.plot(line, between[name][channel] / per, color=colour, linewidth=1)
+                ax.plot(coc, interpolated[name][channel] / unit_scale, color=colour, linewidth=1)
                 ax.plot(table.coc, nodes[channel], "o", color=colour, markersize=3)
             ax.set(ylabel=name + (f" [{unit}]" if name in LENGTHS else ""))
         ax.set(xlabel=f"signed coc [{unit}]")
@@ -145,15 +145,15 @@ def sheet_of_photographs(
     figure, axes = _new_figure(12.5, 2.1 * rows + 2.6, 5, rows + 1)
     by_distance = {p.distance_m: p for p in photographs.pictures}
     for i, (pair, fit, coc) in enumerate(zip(captures, result.fits, result.coc_px, strict=True)):
-        found, window, profile, residual, kernel = axes[i]
+        photograph_axes, window, profile, residual, kernel = axes[i]
         picture = by_distance[pair.distance_m]
         step = max(1, picture.light.shape[1] // 300)
         height, width = (n // step for n in picture.light.shape)
-        small = picture.light[: height * step, : width * step].reshape(height, step, width, step).mean((1, 3))
+        thumbnail = picture.light[: height * step, : width * step].reshape(height, step, width, step).mean((1, 3))
         target, half = picture.target, picture.target.side_px / 2
-        around = [(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]
-        corners = [((target.x + i * half) / step, (target.y + j * half) / step) for i, j in around]
-        _show(found, small, f"{picture.file}, {pair.distance_m:.3f} m", box=corners)
+        signs = [(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]
+        corners = [((target.x + i * half) / step, (target.y + j * half) / step) for i, j in signs]
+        _show(photograph_axes, thumbnail, f"{picture.file}, {pair.distance_m:.3f} m", box=corners)
         _show(window, pair.blurred, "")
         profile.plot(*fit.samples, ".", color=_DATA, markersize=1.5)
         profile.plot(*_model_line(fit), color=_MODEL)
@@ -170,16 +170,16 @@ def sheet_of_photographs(
     half = int(min(sharp.target.side_px / 4, 120))
     x, y = round(sharp.target.x), round(sharp.target.y)
     window = sharp.light[max(y - half, 0) : y + half, max(x - half, 0) : x + half]
-    most, blurrest = max(zip(result.coc_px, captures, strict=True), key=lambda node: abs(node[0]))
+    largest_coc, most_blurred = max(zip(result.coc_px, captures, strict=True), key=lambda node: abs(node[0]))
     ends = min(0.0, *result.coc_px), max(0.0, *result.coc_px)
     scene = 0.15 + 0.1 * (np.arange(720) // 12 % 2) * np.ones((90, 1))  # small lights on stripes
     scene[44:46, 18::36] = 25.0
     lights = _rendered(render, scene, result.table, captures.width_px, *ends)
-    photograph = _rendered(render, window, result.table, captures.width_px, most, most)
-    text = "lights and edges from one end of the measured distances through the focus to the other, with this table"
-    _show(figure.add_subplot(grid[rows, :3]), lights, text)
+    rerendered = _rendered(render, window, result.table, captures.width_px, largest_coc, largest_coc)
+    caption = "lights and edges from one end of the measured distances through the focus to the other, with this table"
+    _show(figure.add_subplot(grid[rows, :3]), lights, caption)
     _show(figure.add_subplot(grid[rows, 3]), window, f"{sharp.file}, in focus")
-    _show(figure.add_subplot(grid[rows, 4]), photograph, f"with this table, as at {blurrest.distance_m:.3f} m")
+    _show(figure.add_subplot(grid[rows, 4]), rerendered, f"with this table, as at {most_blurred.distance_m:.3f} m")
     return figure
 
 
@@ -195,8 +195,8 @@ def _rendered(
     coc = torch.linspace(left, right, scene.shape[1], dtype=torch.float32).expand(1, 1, *scene.shape)
     if table.unit == "mm" and table.sensor_width_mm is not None:  # the part has its own share of the sensor
         table = table.replace(sensor_width_mm=table.sensor_width_mm * scene.shape[1] / width_px)
-    shown = render(torch.from_numpy(scene).float()[None, None], coc, table)
-    return np.clip(shown[0, 0].numpy().astype(np.float64), 0, 1)
+    picture = render(torch.from_numpy(scene).float()[None, None], coc, table)
+    return np.clip(picture[0, 0].numpy().astype(np.float64), 0, 1)
 
 
 def _show(

@@ -84,12 +84,12 @@ class BlurFit:
         """A few lines of text: each parameter with its error, the residual against the noise, why the family."""
         lines = [f"{self.family} ({self.model})"]
         for name, value in self.params.items():
-            many = f"  {name}: {np.size(value)} numbers, largest {np.max(value):.4g}"
-            lines.append(many if np.ndim(value) else f"  {name} = {value:.6g} +- {self.stderr[name]:.2g}")
+            array_text = f"  {name}: {np.size(value)} numbers, largest {np.max(value):.4g}"
+            lines.append(array_text if np.ndim(value) else f"  {name} = {value:.6g} +- {self.stderr[name]:.2g}")
         ratio, (x, y) = self.residual_over_noise, self.shift
         noise = "" if math.isnan(ratio) else f", {ratio:.2f} x the noise"
         lines.append(f"  residual {100 * self.residual:.2f} %{noise}")
         if self.model == "forward":
-            moved = f"shift ({x:+.2f}, {y:+.2f}) px, magnification {self.magnification:.4f}"
-            lines.append(f"  gain {self.gain:.4g}, {moved}")
+            moves_text = f"shift ({x:+.2f}, {y:+.2f}) px, magnification {self.magnification:.4f}"
+            lines.append(f"  gain {self.gain:.4g}, {moves_text}")
         return "\n".join([*lines, *([f"  {self.why}"] if self.why else [])])

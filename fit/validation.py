@@ -17,7 +17,7 @@ _BRIGHTEST, _DARKEST = 1e30, 1e-30  # the fourth powers of levels are summed
 def a_number(name: str, value: Any, low: float, high: float = np.inf, unit: str = "") -> float:
     """A number in the open interval (low, high), or a `FitError`."""
     try:
-        return number(name, _plain(value), low, high, unit)
+        return number(name, _python_number(value), low, high, unit)
     except ValueError as error:
         raise FitError(str(error), number=value if isinstance(value, float) else None) from None
 
@@ -25,7 +25,7 @@ def a_number(name: str, value: Any, low: float, high: float = np.inf, unit: str 
 def a_count(name: str, value: Any, low: int, high: int) -> int:
     """A whole number from low to high, or a `FitError`."""
     try:
-        return whole(name, _plain(value), low, high)
+        return whole(name, _python_number(value), low, high)
     except ValueError as error:
         raise FitError(str(error)) from None
 
@@ -67,5 +67,5 @@ def a_picture(name: str, picture: ArrayLike, smallest: int, file: str | None = N
     return array
 
 
-def _plain(value: Any) -> Any:
+def _python_number(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value

@@ -29,7 +29,7 @@ from .validation import choice, image_and_map, number, show
 
 __all__ = ["DepthAugmentationSequential", "RandomDepthOfField"]
 
-_DISPLAYED = (-0.5, 1.5)  # accepted range of encoded images: from [0, 1], resampling may overshoot this far
+_ENCODED_RANGE = (-0.5, 1.5)  # accepted values of encoded images: [0, 1], and the overshoot of earlier resampling
 _IMAGE_NAMES = ("image", "input", "img")
 
 
@@ -94,11 +94,11 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
             raise ValueError(f"p must be a probability from 0 to 1, got {show(p)}")
         super().__init__(p=p, same_on_batch=same_on_batch, keepdim=keepdim)
         near_m, far_m = _range("focus_m", focus_m, math.inf)
-        widest, narrowest = _range("f_number", f_number, 1e300)
+        smallest_f, largest_f = _range("f_number", f_number, 1e300)
         self.camera = Camera() if camera is None else camera
         if not isinstance(self.camera, Camera):
             raise ValueError(f"camera must be a torchdof.Camera, got {show(camera)}")
-        self.camera.replace(focus_m=near_m, f_number=widest)
+        self.camera.replace(focus_m=near_m, f_number=smallest_f)
         tables = [table] if table is None or isinstance(table, BlurTable) else [*table]
         if not tables:
             raise ValueError("table must be a torchdof.BlurTable, several, or None, got an empty list")
@@ -107,12 +107,12 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
             raise ValueError(f"return_label must be True or False, got {show(return_label)}")
         self.return_label = return_label
         options.setdefault("check", False)
-        self.focus_m, self.f_number = (near_m, far_m), (widest, narrowest)
+        self.focus_m, self.f_number = (near_m, far_m), (smallest_f, largest_f)
         self.renderings = [Options.of(table, **options) for table in tables]
         self.flags = {"transfer": transfer}
         self._ranges = (
             ((1.0 / far_m, 1.0 / near_m), "focus", None, None),  # dioptres
-            ((2 * math.log2(widest), 2 * math.log2(narrowest)), "f_number", None, None),  # stops
+            ((2 * math.log2(smallest_f), 2 * math.log2(largest_f)), "f_number", None, None),  # stops
             ((0.0, float(len(tables))), "table", None, None),
         )
         self._param_generator = rg.PlainUniformGenerator(*self._ranges)
@@ -123,15 +123,15 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
 
     def forward_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
         """Draw parameters for every image, and which are blurred; Kornia 0.8 would draw for the blurred ones alone."""
-        chosen = self.__batch_prob_generator__(batch_shape, self.p, self.p_batch, self.same_on_batch)
+        is_blurred = self.__batch_prob_generator__(batch_shape, self.p, self.p_batch, self.same_on_batch)
         shape = torch.tensor(batch_shape, dtype=torch.long)
-        return {**self.generate_parameters(batch_shape), "batch_prob": chosen, "forward_input_shape": shape}
+        return {**self.generate_parameters(batch_shape), "batch_prob": is_blurred, "forward_input_shape": shape}
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
         """Draw the parameters of one image, each ``[1]``, from ``generator``; the global generator is not used."""
-        ends = {name: low_and_high for low_and_high, name, _, _ in self._ranges}
-        share = functools.partial(torch.rand, 1, generator=generator, device=generator.device)
-        return self._in_units({name: low + (high - low) * share() for name, (low, high) in ends.items()})
+        ranges = {name: low_and_high for low_and_high, name, _, _ in self._ranges}
+        uniform = functools.partial(torch.rand, 1, generator=generator, device=generator.device)
+        return self._in_units({name: low + (high - low) * uniform() for name, (low, high) in ranges.items()})
 
     def _in_units(self, drawn: dict[str, Tensor]) -> dict[str, Tensor]:
         """Convert the uniformly drawn numbers to metres, f-numbers and indices of tables."""
@@ -201,13 +201,13 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         self, sample: Mapping[str, Any], params: dict[str, Tensor] | None, **kwargs: Any
     ) -> dict[str, Any]:
         """Blur a sample that is a dict, as in torchvision's transforms."""
-        name = next((name for name in _IMAGE_NAMES if name in sample), None)
-        if name is None or "depth" not in sample:
+        key = next((name for name in _IMAGE_NAMES if name in sample), None)
+        if key is None or "depth" not in sample:
             raise ValueError(f"a dict must have 'image' and 'depth', got the keys {', '.join(map(str, sample))}")
-        image, depth = (_plain(sample[key]) for key in (name, "depth"))
+        image, depth = (_as_plain_tensor(sample[name]) for name in (key, "depth"))
         blurred = self.forward(image, depth, params, **kwargs)
         blurred, label = blurred if self.return_label else (blurred, {})
-        return {**sample, name: _as(sample[name], blurred.reshape(image.shape)), **label}
+        return {**sample, key: _as_type_of(sample[key], blurred.reshape(image.shape)), **label}
 
     def label(
         self, input: Tensor, depth: Tensor | None = None, params: Mapping[str, Any] | None = None
@@ -229,20 +229,20 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
             ValueError: As :meth:`forward`; also if the parameters were drawn for another number of images.
         """
         shape = _batch_shape(input)
-        image, depth, _ = _image_and_depth(_plain(input).reshape(shape), _plain(depth))
-        drawn, count = self._params if params is None else params, len(image)
-        if not drawn or len(drawn["focus_m"]) != count:
+        image, depth, _ = _image_and_depth(_as_plain_tensor(input).reshape(shape), _as_plain_tensor(depth))
+        drawn, batch = self._params if params is None else params, len(image)
+        if not drawn or len(drawn["focus_m"]) != batch:
             got = f"those of {len(drawn['focus_m'])}" if drawn else "none; call it before, or give them"
-            raise ValueError(f"params must be those of {count} images, got {got}")
-        chosen = self._chosen(drawn, count).to(image.device)
-        blurred = torch.zeros(count, dtype=torch.bool, device=image.device).index_fill(0, chosen, True)
+            raise ValueError(f"params must be those of {batch} images, got {got}")
+        items = self._chosen(drawn, batch).to(image.device)
+        blurred = torch.zeros(batch, dtype=torch.bool, device=image.device).index_fill(0, items, True)
         coc = depth.new_zeros(depth.shape)
-        if len(chosen):
+        if len(items):
             options: Any = self.renderings[0].arguments()
-            lens = (drawn[name].to(image.device)[chosen] for name in ("focus_m", "f_number"))
-            light = self._light(image[chosen], self.flags["transfer"])
-            known = DepthOfField(self.camera, **options).coc_px(light, depth[chosen], *lens)
-            coc = coc.index_copy(0, chosen, torch.nan_to_num(known, nan=0.0).to(coc.dtype))
+            camera_numbers = (drawn[name].to(image.device)[items] for name in ("focus_m", "f_number"))
+            light = self._light(image[items], self.flags["transfer"])
+            blur_px = DepthOfField(self.camera, **options).coc_px(light, depth[items], *camera_numbers)
+            coc = coc.index_copy(0, items, torch.nan_to_num(blur_px, nan=0.0).to(coc.dtype))
         numbers = {name: drawn[name].to(image.device) for name in ("focus_m", "f_number", "table")}
         label = {"coc_px": coc, **numbers, "blurred": blurred}
         return label if input.ndim == 4 else {name: value[0] for name, value in label.items()}
@@ -268,16 +268,16 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
         """Blur the images ``[B, C, H, W]`` that ``params`` select."""
-        image, depth, kept = _image_and_depth(input, params.get("depth"))
-        chosen = self._chosen(params, len(input))
+        image, depth, passed_on = _image_and_depth(input, params.get("depth"))
+        blurred = self._chosen(params, len(input))
         out = image
-        for index in params["table"][chosen].unique().tolist():
-            items = chosen[params["table"][chosen] == index].to(input.device)
-            alone = len(items) == len(input)  # all images have this lens: copy none
-            picked = (image, depth) if alone else (image[items], depth[items])
-            rendered = self._blurred(*picked, params, items, int(index), flags["transfer"])
-            out = rendered if alone else out.index_copy(0, items, rendered)
-        return torch.cat([out, kept], dim=1) if kept.shape[1] else out
+        for index in params["table"][blurred].unique().tolist():
+            items = blurred[params["table"][blurred] == index].to(input.device)
+            all_items = len(items) == len(input)  # all images have this lens: copy none
+            pair = (image, depth) if all_items else (image[items], depth[items])
+            rendered = self._blurred(*pair, params, items, int(index), flags["transfer"])
+            out = rendered if all_items else out.index_copy(0, items, rendered)
+        return torch.cat([out, passed_on], dim=1) if passed_on.shape[1] else out
 
     def _chosen(self, params: Mapping[str, Tensor], count: int) -> Tensor:
         """Indices of the items to blur: all if the probability is 1, as in Kornia, else those with an open gate."""
@@ -301,7 +301,7 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         if transfer == "linear":
             return image
         low, high = (float(value) for value in image.detach().aminmax())
-        if not _DISPLAYED[0] <= low <= high <= _DISPLAYED[1]:
+        if not _ENCODED_RANGE[0] <= low <= high <= _ENCODED_RANGE[1]:
             raise ValueError(
                 f"images with transfer='srgb' must lie in [0, 1], got {low:.4g} to {high:.4g}; put normalization "
                 "behind RandomDepthOfField, or say transfer='linear'"
@@ -350,7 +350,6 @@ class _DepthOps(AugmentationSequentialOps):
         extra_args: dict[DataKey, dict[str, Any]],
         data_keys: list[Any] | None = None,
     ) -> Any:
-        """Apply one step to all inputs."""
         keys = self.preproc_datakeys(data_keys)
         if isinstance(module, RandomDepthOfField) and DataKey.MASK in keys and isinstance(param.data, dict):
             depth = arg[keys.index(DataKey.MASK)]
@@ -360,7 +359,7 @@ class _DepthOps(AugmentationSequentialOps):
 
 def _image_and_depth(input: Tensor, depth: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Split an input ``[B, C, H, W]`` into images, depth ``[B, 1, H, W]`` and channels to return unchanged."""
-    image, kept = input, input[:, :0]
+    image, passed_on = input, input[:, :0]
     if depth is None:
         if input.shape[1] not in (2, 4):
             raise ValueError(
@@ -368,19 +367,19 @@ def _image_and_depth(input: Tensor, depth: Tensor | None) -> tuple[Tensor, Tenso
                 "image of 2 or 4 channels, or use torchdof.augmentation.DepthAugmentationSequential, whose first "
                 f"mask is the depth; got an image of {input.shape[1]} channels alone"
             )
-        image, depth, kept = input[:, :-1], input[:, -1:], input[:, -1:]
+        image, depth, passed_on = input[:, :-1], input[:, -1:], input[:, -1:]
     if depth.ndim in (2, 3):
         depth = depth.unsqueeze(-3) if depth.ndim == 2 or len(depth) == len(input) else depth
         depth = depth if depth.ndim == 4 else depth[None]
     image_and_map(image, "depth", depth, "in metres")
-    return image, depth.expand(len(input), -1, -1, -1), kept
+    return image, depth.expand(len(input), -1, -1, -1), passed_on
 
 
-def _range(name: str, value: Any, most: float) -> tuple[float, float]:
+def _range(name: str, value: Any, largest: float) -> tuple[float, float]:
     """Check a pair of numbers > 0, the smaller first."""
     if not isinstance(value, Sequence) or len(value) != 2:
         raise ValueError(f"{name} must be two numbers, the smallest and the largest, got {show(value)}")
-    low, high = (number(name, item, low=0.0, infinite=most == math.inf) for item in value)
+    low, high = (number(name, item, low=0.0, infinite=largest == math.inf) for item in value)
     if low > high:
         raise ValueError(f"{name} must be two numbers, the smallest first, got {show(value)}")
     return low, high
@@ -396,12 +395,12 @@ def _batch_shape(image: Any) -> tuple[int, ...]:
     return tuple(image.shape) if image.ndim == 4 else (1, *image.shape)
 
 
-def _plain(value: Any) -> Any:
+def _as_plain_tensor(value: Any) -> Any:
     """Convert a tensor of a subclass, such as torchvision's, to a plain one."""
     return value.as_subclass(Tensor) if isinstance(value, Tensor) else value
 
 
-def _as(like: Any, value: Tensor) -> Tensor:
+def _as_type_of(like: Any, value: Tensor) -> Tensor:
     """Convert a tensor to the subclass of ``like``, with torchvision's metadata."""
     if type(like) is Tensor:
         return value

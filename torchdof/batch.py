@@ -44,14 +44,14 @@ def flattened(axes: tuple[int, ...], name: str, value: Any, what: str = "1") -> 
     """
     if not isinstance(value, Tensor) or value.layout != torch.strided:  # the checks of the batch refuse it
         return value
-    _not_mapped(name, value)
+    _refuse_vmap(name, value)
     if len(axes) == 1:
         return value.contiguous()
     fits = value.ndim == len(axes) + 3 and all(n in (1, m) for n, m in zip(value.shape, axes, strict=False))
     if not fits:
-        lead = ", ".join(map(str, axes)) + ", " * bool(axes)
+        leading = ", ".join(map(str, axes)) + ", " * bool(axes)
         raise ValueError(
-            f"{name} must be [{lead}{what}, H, W] beside an image [{lead}C, H, W], got {list(value.shape)}"
+            f"{name} must be [{leading}{what}, H, W] beside an image [{leading}C, H, W], got {list(value.shape)}"
         )
     if not axes:
         return value[None].contiguous()
@@ -81,7 +81,7 @@ def numbers(axes: tuple[int, ...], name: str, value: Any) -> Any:
             raise ValueError(f"{name} must be a number, a list of numbers or a tensor [B], got {show(value)}") from None
     if not isinstance(value, Tensor) or value.ndim == 0:
         return value
-    _not_mapped(name, value)
+    _refuse_vmap(name, value)
     if len(axes) < 2:
         return value[:, 0] if value.ndim == 2 and value.shape[1] == 1 else value
     batch, frames = axes
@@ -103,7 +103,7 @@ def restored(axes: tuple[int, ...], batch: Tensor) -> Tensor:
     return batch if len(axes) == 1 else batch.unflatten(0, axes)
 
 
-def _not_mapped(name: str, value: Tensor) -> None:
+def _refuse_vmap(name: str, value: Tensor) -> None:
     """Refuse a tensor inside ``torch.vmap``, because planning layers reads its values."""
     if not is_traced() and torch._C._functorch.is_batchedtensor(value):
         raise ValueError(

@@ -19,10 +19,10 @@ from .validation import ends, image_and_coc, image_and_map, show
 
 __all__ = ["splat"]
 
-_PER_PX = 128  # kernels per px of radius, up to _EVEN_PX; more take longer and hardly change the picture
-_EVEN_PX = 2.0  # px of radius: above, kernels are 1/256 of the radius apart; larger is finer
-_AT_ONCE = 64  # kernels of similar radius made together, each as wide as the widest; more take more memory
-_LEAST = 1e-6  # scattered weight, of 1: pixels with less are unknown and become 0
+_STEPS_PER_PX = 128  # kernels per px of radius, up to _LINEAR_UP_TO_PX; more take longer and hardly change the picture
+_LINEAR_UP_TO_PX = 2.0  # radius in px above which kernels are 1/256 of the radius apart; larger is finer
+_KERNELS_AT_ONCE = 64  # kernels of similar radius made together, each as wide as the widest; more take more memory
+_MIN_WEIGHT = 1e-6  # scattered weight, of 1: pixels with less are unknown and become 0
 _DISC = BlurTable.disc()
 _GAUSSIAN = BlurTable.gaussian(1.0)
 _kernels = KernelCache(128 * 2**20)
@@ -116,31 +116,31 @@ def splat(
 def _splatted(image: Tensor, coc_px: Tensor, table: BlurTable, normalize: bool) -> Tensor:
     """The same for a checked batch ``[B, C, H, W]``."""
     batch, channels, height, width = image.shape
-    wide = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
-    light, coc = image.to(wide), coc_px.to(wide).expand(batch, -1, -1, -1)
+    dtype = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
+    light, coc = image.to(dtype), coc_px.to(dtype).expand(batch, -1, -1, -1)
     if normalize:  # weights are scattered beside the light, with as many channels as there are kernels
         light = torch.cat([light, torch.ones_like(light[:, : table.channels])], 1)
     light = light.unflatten(1, (-1, table.channels))  # [B, n, 1 or C, H, W]
 
-    # the two kernels around each radius, and the fraction of the way from the first to the second
+    # the kernels at the radii below and above that of each pixel, and the weight of the second
     radius, sign = coc.abs(), torch.where(coc.detach() < 0, -1.0, 1.0)
-    low = _place(radius.detach()).floor()
-    below, above = _radius(low), _radius(low + 1.0)
-    part = (radius - below) / (above - below)
-    places, which = torch.unique((sign * torch.stack([low, low + 1.0])).long(), return_inverse=True)
-    kernels = _kernels_at(places.tolist(), table, width, max(height, width)).to(image.device, wide)
+    low = _position_of(radius.detach()).floor()
+    low_radius, high_radius = _radius_at(low), _radius_at(low + 1.0)
+    fraction = (radius - low_radius) / (high_radius - low_radius)
+    positions, indices = torch.unique((sign * torch.stack([low, low + 1.0])).long(), return_inverse=True)
+    kernels = _kernels_at(positions.tolist(), table, width, max(height, width)).to(image.device, dtype)
     half = kernels.shape[-1] // 2
-    lit = (kernels != 0).flatten(0, 1).any(0).nonzero() - half
-    steps = [(down, right) for down, right in lit.tolist() if abs(down) < height and abs(right) < width]
+    taps_used = (kernels != 0).flatten(0, 1).any(0).nonzero() - half
+    steps = [(down, right) for down, right in taps_used.tolist() if abs(down) < height and abs(right) < width]
     taps = torch.stack([kernels[..., half + down, half + right].t() for down, right in steps])  # [steps, 1 or C, n]
 
     # on the CPU one image at a time, which fits into the caches
     count = 1 if light.device.type == "cpu" else batch
-    parts = zip(light.split(count), part.split(count), which.split(count, 1), strict=True)
-    out = torch.cat([_Scatter.apply(*each, taps, steps) for each in parts]).flatten(1, 2)
+    parts = zip(light.split(count), fraction.split(count), indices.split(count, 1), strict=True)
+    out = torch.cat([_Scatter.apply(*tensors, taps, steps) for tensors in parts]).flatten(1, 2)
     if normalize:
         out, weight = out[:, :channels], out[:, channels:]
-        out = out / torch.where(weight > _LEAST, weight, torch.inf)
+        out = out / torch.where(weight > _MIN_WEIGHT, weight, torch.inf)
     return out.to(image.dtype)
 
 
@@ -151,94 +151,91 @@ class _Scatter(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(light: Tensor, part: Tensor, which: Tensor, taps: Tensor, steps: list[tuple[int, int]]) -> Tensor:
+    def forward(light: Tensor, fraction: Tensor, indices: Tensor, taps: Tensor, steps: list[tuple[int, int]]) -> Tensor:
         """Scatter light.
 
         Args:
             light: ``[B, n, 1 or C, H, W]``.
-            part: Weight of the second of each pixel's two kernels, 0 to 1: ``[B, 1, H, W]``.
-            which: Indices of the two kernels of each pixel, ``[2, B, 1, H, W]``.
+            fraction: Weight of the second of each pixel's two kernels, 0 to 1: ``[B, 1, H, W]``.
+            indices: Indices of the two kernels of each pixel, ``[2, B, 1, H, W]``.
             taps: Values of all kernels at each offset, ``[steps, 1 or C, kernels]``.
             steps: The offsets: rows down and columns to the right by which light moves.
         """
         out = torch.zeros_like(light)
-        for tap, _, source, target in _moves(part, which, taps, steps):
+        for tap, _, source, target in _moves(fraction, indices, taps, steps):
             out[target].addcmul_(light[source], tap)
         return out
 
     @staticmethod
     def setup_context(context: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        """Save the inputs."""
         *tensors, context.steps = inputs
         context.save_for_backward(*tensors)
 
     @staticmethod
     def backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients of ``light`` and ``part``: the same shifts in the opposite direction."""
-        light, part, which, taps = context.saved_tensors
+        """Gradients of ``light`` and ``fraction``: the same shifts in the opposite direction."""
+        light, fraction, indices, taps = context.saved_tensors
         to_light = torch.zeros_like(light) if context.needs_input_grad[0] else None
-        to_part = torch.zeros_like(part) if context.needs_input_grad[1] else None
-        for tap, slope, source, target in _moves(part, which, taps, context.steps):
+        to_fraction = torch.zeros_like(fraction) if context.needs_input_grad[1] else None
+        for tap, slope, source, target in _moves(fraction, indices, taps, context.steps):
             if to_light is not None:
                 to_light[source].addcmul_(gradients[0][target], tap)
-            if to_part is not None:
-                to_part[source] += (gradients[0][target] * light[source] * slope).sum((1, 2)).unsqueeze(1)
-        return to_light, to_part, None, None, None
+            if to_fraction is not None:
+                to_fraction[source] += (gradients[0][target] * light[source] * slope).sum((1, 2)).unsqueeze(1)
+        return to_light, to_fraction, None, None, None
 
 
 def _moves(
-    part: Tensor, which: Tensor, taps: Tensor, steps: list[tuple[int, int]]
+    fraction: Tensor, indices: Tensor, taps: Tensor, steps: list[tuple[int, int]]
 ) -> Iterator[tuple[Tensor, Tensor, tuple[Any, ...], tuple[Any, ...]]]:
-    """For each offset: kernel values, their derivative by ``part``, source pixels and target pixels of the light.
+    """For each offset: kernel values, their derivative by ``fraction``, source pixels and target pixels of the light.
 
     The first two are ``[B, 1, 1 or C, rows, columns]``, for the source pixels.
     """
-    height, width = part.shape[-2:]
-    first, second = (each.flatten() for each in which)
+    height, width = fraction.shape[-2:]
+    first, second = (index.flatten() for index in indices)
     for (down, right), values in zip(steps, taps, strict=True):
-        low, high = (values.index_select(1, each).unflatten(1, part.shape) for each in (first, second))
+        low, high = (values.index_select(1, index).unflatten(1, fraction.shape) for index in (first, second))
         slope = (high - low).permute(1, 2, 0, 3, 4)  # [1 or C, B, 1, H, W] to [B, 1, 1 or C, H, W]
-        tap = torch.addcmul(low.permute(1, 2, 0, 3, 4), slope, part.unsqueeze(2))
+        tap = torch.addcmul(low.permute(1, 2, 0, 3, 4), slope, fraction.unsqueeze(2))
         rows, columns = (slice(max(-n, 0), size - max(n, 0)) for n, size in ((down, height), (right, width)))
         source = (..., rows, columns)
         target = (..., slice(rows.start + down, rows.stop + down), slice(columns.start + right, columns.stop + right))
         yield tap[source], slope[source], source, target
 
 
-def _kernels_at(places: list[int], table: BlurTable, width: int, longest: int) -> Tensor:
-    """Kernels ``[n, 1 or C, k, k]``, float64, at ``places`` (:func:`_place`) with the sign of the coc.
+def _kernels_at(positions: list[int], table: BlurTable, width: int, longest: int) -> Tensor:
+    """Kernels ``[n, 1 or C, k, k]``, float64, at ``positions`` (:func:`_position_of`) with the sign of the coc.
 
     They are cut to the offsets within a frame whose longer side is ``longest`` pixels.
     """
 
     def make(keys: Sequence[tuple[Any, ...]]) -> list[Tensor]:
-        made: dict[int, Tensor] = {}
+        kernels: dict[int, Tensor] = {}
         by_radius = sorted((key[-1] for key in keys), key=abs)
-        for start in range(0, len(by_radius), _AT_ONCE):
-            some = torch.tensor(by_radius[start : start + _AT_ONCE])
-            coc = some.sign() * _radius(some.abs().to(torch.float64))
-            together = bank_of(table).kernels(coc, width, longest=[longest] * len(coc))
-            spare = max(0, together.shape[-1] // 2 - (longest - 1))
-            inside = slice(spare, together.shape[-1] - spare)
-            made |= {
-                place: each[:, inside, inside].clone() for place, each in zip(some.tolist(), together, strict=True)
-            }
-        return [made[key[-1]] for key in keys]
+        for start in range(0, len(by_radius), _KERNELS_AT_ONCE):
+            chunk = torch.tensor(by_radius[start : start + _KERNELS_AT_ONCE])
+            coc = chunk.sign() * _radius_at(chunk.abs().to(torch.float64))
+            batch = bank_of(table).kernels(coc, width, longest=[longest] * len(coc))
+            margin = max(0, batch.shape[-1] // 2 - (longest - 1))
+            inside = slice(margin, batch.shape[-1] - margin)
+            kernels |= {k: kernel[:, inside, inside].clone() for k, kernel in zip(chunk.tolist(), batch, strict=True)}
+        return [kernels[key[-1]] for key in keys]
 
     # the kernels of a table without lengths are the same for images of any width
-    lens = (table.fingerprint(), 1 if table.unit == "relative" else width, longest)
-    made = _kernels.get_all([(*lens, place) for place in places], make)
-    half = max(kernel.shape[-1] for kernel in made) // 2
-    return torch.stack([functional.pad(kernel, (half - kernel.shape[-1] // 2,) * 4) for kernel in made])
+    key_prefix = (table.fingerprint(), 1 if table.unit == "relative" else width, longest)
+    kernels = _kernels.get_all([(*key_prefix, position) for position in positions], make)
+    half = max(kernel.shape[-1] for kernel in kernels) // 2
+    return torch.stack([functional.pad(kernel, (half - kernel.shape[-1] // 2,) * 4) for kernel in kernels])
 
 
-def _place(radius: Tensor) -> Tensor:
-    """Place of a radius in pixels on a scale on which kernels are made for the whole numbers."""
-    even = _PER_PX * radius.clamp(max=_EVEN_PX)
-    return even + _PER_PX * _EVEN_PX * (radius / _EVEN_PX).clamp_min(1.0).log()
+def _position_of(radius: Tensor) -> Tensor:
+    """Position of a radius in pixels on the scale whose whole numbers are the radii of the kernels."""
+    linear = _STEPS_PER_PX * radius.clamp(max=_LINEAR_UP_TO_PX)
+    return linear + _STEPS_PER_PX * _LINEAR_UP_TO_PX * (radius / _LINEAR_UP_TO_PX).clamp_min(1.0).log()
 
 
-def _radius(place: Tensor) -> Tensor:
-    """Radius in pixels at a place: the inverse of :func:`_place`."""
-    even = _PER_PX * _EVEN_PX
-    return place.clamp(max=even) / _PER_PX * ((place - even).clamp_min(0.0) / even).exp()
+def _radius_at(position: Tensor) -> Tensor:
+    """Radius in pixels at a position: the inverse of :func:`_position_of`."""
+    linear = _STEPS_PER_PX * _LINEAR_UP_TO_PX
+    return position.clamp(max=linear) / _STEPS_PER_PX * ((position - linear).clamp_min(0.0) / linear).exp()

@@ -401,7 +401,6 @@ if hasattr(os, "register_at_fork"):
 
 
 def _check_plan(plan: Plan | None) -> None:
-    """Refuse a value that is not a plan."""
     if plan is not None and not isinstance(plan, Plan):
         raise ValueError(
             f"plan must be a Plan from DepthOfField.plan(image, depth) or None, got {validation.show(plan)}; "

@@ -30,8 +30,8 @@ Tolerance = float | Literal["draft", "preview", "final"]
 """RMS difference, display-encoded, from the same rendering with exact kernels, dense layers and full resolution."""
 
 _DISC = BlurTable.disc()  # shared, because a table caches its hash
-_LATER_NUMBERS = {"focus_range_m": None, "tilt_deg": 0.0, "swing_deg": 0.0}  # defaults for states of older versions
-_Spelled = TypeVar("_Spelled")
+_NEWER_NUMBERS = {"focus_range_m": None, "tilt_deg": 0.0, "swing_deg": 0.0}  # defaults for states of older versions
+_Decorated = TypeVar("_Decorated")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,9 +85,9 @@ class Options:
         choice("depth_edges", self.depth_edges, get_args(DepthEdges))
         if self.occlusion and not self.normalize:
             raise ValueError("normalize=False is the plain sum of occlusion=False; set occlusion=False as well")
-        reach = self.max_coc_px
-        if isinstance(reach, bool) or not isinstance(reach, int | float) or not 0.5 < reach < 1e300:
-            raise ValueError(f"max_coc_px must be a radius above 0.5 pixels, got {show(reach)}")
+        radius = self.max_coc_px
+        if isinstance(radius, bool) or not isinstance(radius, int | float) or not 0.5 < radius < 1e300:
+            raise ValueError(f"max_coc_px must be a radius above 0.5 pixels, got {show(radius)}")
 
     @classmethod
     def of(cls, table: BlurTable | None = None, **arguments: Unpack["OptionArguments"]) -> "Options":
@@ -132,17 +132,17 @@ class OptionArguments(TypedDict, total=False):
     depth_edges: DepthEdges
 
 
-def spells_options(function: _Spelled) -> _Spelled:
+def spells_options(function: _Decorated) -> _Decorated:
     """Decorator that shows, in the signature of a function with ``**options``, each option with its default."""
-    called: Any = function.__init__ if inspect.isclass(function) else function
-    signature = inspect.signature(called)
-    own = [parameter for parameter in signature.parameters.values() if parameter.kind is not parameter.VAR_KEYWORD]
+    target: Any = function.__init__ if inspect.isclass(function) else function
+    signature = inspect.signature(target)
+    parameters = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
     options = {field.name: field.default for field in dataclasses.fields(Options)}
-    spelled = [
+    options_shown = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=options[name], annotation=kind)
         for name, kind in OptionArguments.__annotations__.items()
     ]
-    called.__signature__ = signature.replace(parameters=[*own, *spelled])
+    target.__signature__ = signature.replace(parameters=[*parameters, *options_shown])
     return function
 
 
@@ -159,7 +159,7 @@ def read_state(state: Any) -> tuple[Camera, Options]:
     camera = state["camera"]
     if not isinstance(camera, Mapping):
         raise ValueError(f"camera of the state must be a dict, got {show(camera)}")
-    camera = {**_LATER_NUMBERS, **camera}
+    camera = {**_NEWER_NUMBERS, **camera}
     _fields("camera of the state", camera, list(Camera.__dataclass_fields__))
     try:
         restored_camera = Camera(**camera)

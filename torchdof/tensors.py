@@ -90,11 +90,11 @@ def has_storage(values: Tensor) -> bool:
     """Whether a tensor has memory of its own; False for fake, masked and other wrappers, and for a freed storage."""
     try:
         storage = values.untyped_storage()
-        last = values.storage_offset() + sum(
+        last_index = values.storage_offset() + sum(
             (n - 1) * step for n, step in zip(values.shape, values.stride(), strict=True)
         )
-        whole = storage.device == values.device and storage.nbytes() >= (last + 1) * values.element_size()
-        return values.numel() == 0 or (whole and storage.data_ptr() != 0)
+        fits = storage.device == values.device and storage.nbytes() >= (last_index + 1) * values.element_size()
+        return values.numel() == 0 or (fits and storage.data_ptr() != 0)
     except (RuntimeError, NotImplementedError):  # wrappers refuse access to their storage
         return False
 

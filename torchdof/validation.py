@@ -22,10 +22,7 @@ WHOLE_NUMBERS = (
     *(torch.int8, torch.int16, torch.int32, torch.int64),
 )
 
-_MOST_STRETCH = 0.03  # largest change of a depth map's aspect ratio; estimators work at multiples of 14 or 64 px
-
-
-# Numbers and words
+_MAX_STRETCH = 0.03  # largest change of a depth map's aspect ratio; estimators work at multiples of 14 or 64 px
 
 
 def show(value: Any) -> str:
@@ -50,15 +47,15 @@ def number(
         >>> number("f_number", 2, low=0)
         2.0
     """
-    plain = isinstance(value, int | float) and not isinstance(value, bool)
-    if plain and (low < value < high or (infinite and abs(value) == math.inf and low <= value <= high)):
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if is_number and (low < value < high or (infinite and abs(value) == math.inf and low <= value <= high)):
         try:
             return float(value)
         except OverflowError:
             pass
     bounds = [f"> {low:g}"] * (low > -math.inf) + [f"< {high:g}"] * (high < math.inf)
-    wanted = " ".join(["a number", *([f"of {unit}"] * bool(unit)), " and ".join(bounds)]).rstrip()
-    raise ValueError(f"{name} must be {wanted}{' (inf allowed)' if infinite else ''}, got {show(value)}")
+    expected = " ".join(["a number", *([f"of {unit}"] * bool(unit)), " and ".join(bounds)]).rstrip()
+    raise ValueError(f"{name} must be {expected}{' (inf allowed)' if infinite else ''}, got {show(value)}")
 
 
 def whole(name: str, value: Any, low: int, high: int) -> int:
@@ -105,9 +102,6 @@ def pixels_wide(width: Any) -> None:
     number("width", width, low=0, unit="pixels")
 
 
-# Tensors
-
-
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
     """As :func:`torch.broadcast_shapes`, whose first call imports sympy and takes half a second.
 
@@ -131,8 +125,8 @@ def ends(values: Tensor) -> tuple[float, float]:
     if values.dtype == torch.float32 and is_in_memory(values) and native.chosen():
         return native.ends(values)
     # in float32 at least: autocast supports only one half-precision dtype at a time
-    exact = torch.float64 if values.dtype == torch.float64 else torch.float32
-    low, high = torch.stack([end.to(exact) for end in torch.aminmax(values.detach())]).tolist()
+    dtype = torch.float64 if values.dtype == torch.float64 else torch.float32
+    low, high = torch.stack([end.to(dtype) for end in torch.aminmax(values.detach())]).tolist()
     return low, high
 
 
@@ -163,17 +157,13 @@ def real_tensor(name: str, value: Any, what: str) -> Tensor:
     return value
 
 
-def _finite(name: str, values: Tensor) -> None:
-    """Refuse numbers that are NaN or infinite."""
+def _check_finite(name: str, values: Tensor) -> None:
     if not all(map(math.isfinite, ends(values))):
         bad = values.numel() - int(torch.isfinite(values).sum())
         raise ValueError(
             f"{name} must be finite, got {bad} of {values.numel()} values that are NaN or infinite; "
             "repair them, or pass check=False"
         )
-
-
-# An image [B, C, H, W] and what belongs to it
 
 
 def image_and_map(image: Tensor, name: str, value: Tensor, unit: str) -> None:
@@ -231,8 +221,8 @@ def image_and_coc(image: Tensor, coc_px: Tensor, channels: int, values: bool) ->
     if channels not in (1, image.shape[1]):
         raise ValueError(f"the table blurs {channels} channels, the image has {image.shape[1]}")
     if values and not is_traced():
-        _finite("coc_px", coc_px)
-        _finite("image", image)
+        _check_finite("coc_px", coc_px)
+        _check_finite("image", image)
 
 
 def coc_of_lens(coc_px: Tensor, depth: Tensor, lens: Mapping[str, Any]) -> None:
@@ -266,8 +256,8 @@ def background(
         real_tensor("background", hidden, "[B, C, H, W]")
         real_tensor(name, where, f"[B, 1, H, W] {unit}")
         if values:
-            _finite(name, where)
-            _finite("background", hidden)
+            _check_finite(name, where)
+            _check_finite("background", hidden)
 
 
 def stretch(image: Tensor, depth: Tensor) -> float:
@@ -287,14 +277,14 @@ def is_resizable(image: Any, depth: Any) -> bool:
     maps = all(isinstance(t, Tensor) and t.ndim == 4 and t.is_floating_point() and t.numel() for t in (image, depth))
     if not maps or image.shape[-2:] == depth.shape[-2:] or image.device != depth.device:
         return False
-    return depth.shape[0] in (1, image.shape[0]) and depth.shape[1] == 1 and stretch(image, depth) <= _MOST_STRETCH
+    return depth.shape[0] in (1, image.shape[0]) and depth.shape[1] == 1 and stretch(image, depth) <= _MAX_STRETCH
 
 
 def same_aspect(image: Tensor, depth: Tensor) -> None:
     """Refuse a depth map whose aspect ratio differs by more than 3 % from that of an image ``[..., H, W]``."""
-    if 0 in depth.shape or stretch(image, depth) > _MOST_STRETCH:
+    if 0 in depth.shape or stretch(image, depth) > _MAX_STRETCH:
         (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
-        if 0 not in depth.shape and stretch(image, depth.transpose(-1, -2)) <= _MOST_STRETCH:
+        if 0 not in depth.shape and stretch(image, depth.transpose(-1, -2)) <= _MAX_STRETCH:
             hint = "turned by 90 degrees it fits: rotate one of the two"
         else:
             hint = "crop one of the two, so that both show the same area"
@@ -302,9 +292,6 @@ def same_aspect(image: Tensor, depth: Tensor) -> None:
             f"depth is {columns} x {rows} pixels and the image {width} x {height}: a depth map may have another size, "
             f"but must have the same aspect ratio, to within 3 %; {hint}"
         )
-
-
-# Layers
 
 
 def stack(rgba: Tensor, depth_m: Tensor, values: bool) -> Tensor:
@@ -342,5 +329,5 @@ def stack(rgba: Tensor, depth_m: Tensor, values: bool) -> Tensor:
             raise ValueError(
                 f"the last channel of rgba is coverage, in [0, 1]; {bad} of {cover.numel()} values are not"
             )
-        _finite("rgba", rgba)
+        _check_finite("rgba", rgba)
     return depth

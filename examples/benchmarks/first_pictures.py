@@ -71,21 +71,21 @@ def figures(part: str, folder: Path, turn: int) -> Iterator[Figure]:
     if part in ("cameras", "gegl"):
         gegl = runpy.run_path(str(Path(__file__).parent / "tools" / "gegl.py"))
         for _, settings in itertools.groupby(read_scenes(folder), lambda scene: scene.name.rpartition("/")[0]):
-            known = next(settings)
-            scene = BenchScene(known.name, known.image, known.coc_px).seen(0.0, 64.0)
+            first = next(settings)
+            scene = BenchScene(first.name, first.image, first.coc_px).seen(0.0, 64.0)
             blur_by_coc(scene.image, scene.coc_px)
             if part == "cameras":
-                seen = scene.cameras(COUNT, 4 / 64, f"{turn} {scene.name}")
-                yield Figure(f"{scene.name}, 4 to 64 px", blur_by_coc, seen, "over_again at most 1.3")
+                cameras = scene.cameras(COUNT, 4 / 64, f"{turn} {scene.name}")
+                yield Figure(f"{scene.name}, 4 to 64 px", blur_by_coc, cameras, "over_again at most 1.3")
             elif gegl["available"]() is None:
                 frame = scene.resized(1920 / scene.image.shape[-1]).seen(0.0, 32.0)
-                seen = frame.cameras(COUNT, 8 / 32, f"{turn} {scene.name}")
-                beside = functools.partial(next, (gegl["blur"](camera.image, camera.coc_px) for camera in seen))
-                yield Figure(f"{scene.name}, 1080p, 8 to 32 px", blur_by_coc, seen, "", gegl["NAME"], beside)
+                cameras = frame.cameras(COUNT, 8 / 32, f"{turn} {scene.name}")
+                beside = functools.partial(next, (gegl["blur"](camera.image, camera.coc_px) for camera in cameras))
+                yield Figure(f"{scene.name}, 1080p, 8 to 32 px", blur_by_coc, cameras, "", gegl["NAME"], beside)
     elif part in ("fresh-39", "fresh-60"):
         size = (1350, 1080) if part == "fresh-39" else (1333, 2000)
-        seen = shipped(*size).seen(0.0, float(part[-2:])).cameras(1, 1.0, f"{turn}")
-        yield Figure(f"{size[1]} x {size[0]}, {part[-2:]} px, fresh process", blur_by_coc, seen)
+        cameras = shipped(*size).seen(0.0, float(part[-2:])).cameras(1, 1.0, f"{turn}")
+        yield Figure(f"{size[1]} x {size[0]}, {part[-2:]} px, fresh process", blur_by_coc, cameras)
     elif part == "pull":
         frames = shipped(1080, 1920).seen(0.0, 69.0 - 0.1 * turn).pull(24)
         yield Figure("focus pull, 1080p, 69 px: frame 1", blur_by_coc, frames[:1])
@@ -97,8 +97,8 @@ def figures(part: str, folder: Path, turn: int) -> Iterator[Figure]:
             blur = functools.partial(blur_by_coc, occlusion=occlusion)
             blur(photo.image, photo.coc_px)
             name = "256 x 256, 8 px, one thread" + ", without occlusion" * (not occlusion)
-            seen = photo.cameras(5 * COUNT, 2 / 8, f"{turn} {occlusion}")
-            yield Figure(name, blur, seen, f"cpu_ms at most {goal_ms}")
+            cameras = photo.cameras(5 * COUNT, 2 / 8, f"{turn} {occlusion}")
+            yield Figure(name, blur, cameras, f"cpu_ms at most {goal_ms}")
         maps = torch.cat([camera.coc_px for camera in photo.cameras(16 * COUNT, 2 / 8, f"{turn} batch")]).split(8)
         batches = [BenchScene("batch", photo.image.repeat(8, 1, 1, 1), coc_px) for coc_px in maps[:COUNT]]
         beside = functools.partial(next, ([blur_by_coc(photo.image, m) for m in ms.split(1)] for ms in maps[COUNT:]))
@@ -112,13 +112,13 @@ def figures(part: str, folder: Path, turn: int) -> Iterator[Figure]:
 
         torch.set_num_threads(1)
         torch.manual_seed(turn)
-        known = json.loads((DATA / "camera.json").read_text())
-        depth = read_depth(DATA / "motorcycle_disp.npz", **known["depth"])
-        together = torch.cat([read_image(DATA / "motorcycle_left.png").pixels, depth], 1)
+        calibration = json.loads((DATA / "camera.json").read_text())
+        depth = read_depth(DATA / "motorcycle_disp.npz", **calibration["depth"])
+        image_and_depth = torch.cat([read_image(DATA / "motorcycle_left.png").pixels, depth], 1)
         crops = torch.cat(
-            [together[..., y : y + 256, x : x + 256] for y in range(0, 241, 80) for x in range(0, 481, 160)]
+            [image_and_depth[..., y : y + 256, x : x + 256] for y in range(0, 241, 80) for x in range(0, 481, 160)]
         )
-        camera = Camera.from_fov(math.degrees(2 * math.atan(128 / known["focal_length_px"])), 0.04, 3.0)
+        camera = Camera.from_fov(math.degrees(2 * math.atan(128 / calibration["focal_length_px"])), 0.04, 3.0)
         aug = RandomDepthOfField((2.2, 5.0), (1.4, 8.0), camera, transfer="linear", p=1.0, tolerance="preview")
         batch = BenchScene("crops", *crops.split((3, 1), 1))  # depth in metres takes the place of the coc
         aug(batch.image, batch.coc_px)
@@ -126,40 +126,40 @@ def figures(part: str, folder: Path, turn: int) -> Iterator[Figure]:
         name, goal = "RandomDepthOfField, preview, 16 images, one thread", "16000 / cpu_ms at least 110"
         yield Figure(name, aug, [batch] * 2 * COUNT, goal, "kornia RandomBoxBlur, 11 x 11", beside)
     elif part in ("lamps", "noise"):
-        scene, dice = shipped(480, 640), torch.Generator().manual_seed(turn)
-        image, coc_px, name = scene.image, 120 * torch.rand(1, 1, 480, 640, generator=dice) - 60, "noise, 60 px"
+        scene, generator = shipped(480, 640), torch.Generator().manual_seed(turn)
+        image, coc_px, name = scene.image, 120 * torch.rand(1, 1, 480, 640, generator=generator) - 60, "noise, 60 px"
         if part == "lamps":
             image = 0.02 * image
             coc_px = 250 * (torch.linspace(0, 1, 480)[:, None] + torch.linspace(0, 1, 640)).expand(1, 1, 480, 640)
-            image.flatten(2)[..., torch.randperm(480 * 640, generator=dice)[:10_000]] = 300.0
+            image.flatten(2)[..., torch.randperm(480 * 640, generator=generator)[:10_000]] = 300.0
             name = "ten thousand lamps, 500 px"
         ordinary = scene.seen(0.0, 60.0).cameras(1, 1.0, f"{turn}")[0]
 
-        def just_like_it() -> tuple[Tensor, Seconds]:
+        def render_again() -> tuple[Tensor, Seconds]:
             blur_by_coc(ordinary.image, ordinary.coc_px)
             return timed(blur_by_coc, ordinary.image, ordinary.coc_px)
 
-        seen, goal = [BenchScene(part, image, coc_px)], "over_beside at most 6, 1000 MiB"
-        yield Figure(f"{name}, 640 x 480", blur_by_coc, seen, goal, "ordinary, 60 px, again", just_like_it)
+        cameras, goal = [BenchScene(part, image, coc_px)], "over_beside at most 6, 1000 MiB"
+        yield Figure(f"{name}, 640 x 480", blur_by_coc, cameras, goal, "ordinary, 60 px, again", render_again)
     elif part == "command":
         for radius_px in (30, 60, 111):
-            seen = shipped(1333, 2000).seen(0.0, radius_px).cameras(1, 1.0, f"{turn}")
+            cameras = shipped(1333, 2000).seen(0.0, radius_px).cameras(1, 1.0, f"{turn}")
             name, goal = f"torchdof render, 2000 x 1333, {radius_px} px", "over_beside at most 3"
-            yield Figure(name, rendered, seen, goal, "import torch", import_torch)
+            yield Figure(name, rendered, cameras, goal, "import torch", import_torch)
     elif part == "large":
-        seen = shipped(1000, 1500).resized(4.0).seen(0.0, 219.0).cameras(1, 1.0, f"{turn}")
+        cameras = shipped(1000, 1500).resized(4.0).seen(0.0, 219.0).cameras(1, 1.0, f"{turn}")
         name, goal = "torchdof render, 6000 x 4000, 219 px, less files", "cpu_ms at most 6000, 2500 MiB"
-        yield Figure(name, beyond_files, seen, goal, "import torch", import_torch)
+        yield Figure(name, beyond_files, cameras, goal, "import torch", import_torch)
     elif part == "demo":
         yield Figure("make demo", demonstrated, [shipped(64, 96)], "", "import torch", import_torch)
 
 
 def spent(*command: object, folder: str | None = None) -> Seconds:
     """Wall and processor time of a Python command."""
-    wall, before = time.perf_counter(), os.times()
+    wall, start = time.perf_counter(), os.times()
     subprocess.run([sys.executable, *map(str, command)], check=True, cwd=folder, stdout=subprocess.DEVNULL)
-    after = os.times()
-    cpu = after.children_user + after.children_system - before.children_user - before.children_system
+    end = os.times()
+    cpu = end.children_user + end.children_system - start.children_user - start.children_system
     return Seconds(time.perf_counter() - wall, cpu)
 
 
@@ -187,9 +187,9 @@ def beyond_files(image: Tensor, coc_px: Tensor) -> tuple[Tensor, Seconds]:
 
 def demonstrated(image: Tensor, _: Tensor) -> tuple[Tensor, Seconds]:
     """The time of ``examples/demo.py``, from the repository of the measured installation if it has one."""
-    own = Path(torchdof.__file__).parents[1] / "examples" / "demo.py"
+    script = Path(torchdof.__file__).parents[1] / "examples" / "demo.py"
     with tempfile.TemporaryDirectory() as out:
-        return image, spent(own if own.exists() else ROOT / "examples" / "demo.py", "--data", DATA, "--out", out)
+        return image, spent(script if script.exists() else ROOT / "examples/demo.py", "--data", DATA, "--out", out)
 
 
 def turn_of(part: str, folder: Path, turn: int) -> list[dict[str, Any]]:
@@ -205,8 +205,8 @@ def turn_of(part: str, folder: Path, turn: int) -> list[dict[str, Any]]:
             (_, row), peak_mb = peak_of(work) if part in ALONE else (work(), math.nan)
             if part in COMMANDS:
                 peak_mb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
-            facts = {"figure": figure.name, "goal": figure.goal, "beside": figure.reference}
-            rows.append({**facts, **row, "peak_mb": peak_mb})
+            columns = {"figure": figure.name, "goal": figure.goal, "beside": figure.reference}
+            rows.append({**columns, **row, "peak_mb": peak_mb})
     scene = shipped(64, 96).seen(0.0, 6.0)
     picture, exact = (blur_by_coc(scene.image, scene.coc_px, tolerance=t) for t in (1 / 255, 0.0))
     if not error(picture, exact)["rms_255"] <= 1.0:
@@ -234,8 +234,8 @@ def main() -> None:
     names = list(pythons)[: 1 + (arguments.python is not None)]
     for part, turn, name in itertools.product(arguments.parts, range(arguments.repeat), names):
         call = [pythons[name], __file__, arguments.scenes, "--parts", part, "--turn", str(turn)]
-        done = subprocess.run(call, stdout=subprocess.PIPE, text=True, check=True)
-        rows += [{"by": name, **row} for row in json.loads(done.stdout.splitlines()[-1])]
+        process = subprocess.run(call, stdout=subprocess.PIPE, text=True, check=True)
+        rows += [{"by": name, **row} for row in json.loads(process.stdout.splitlines()[-1])]
     if arguments.out is not None:
         arguments.out.mkdir(parents=True, exist_ok=True)
     table = summary(rows, ["figure", "by", "goal", "beside"], statistics.median)

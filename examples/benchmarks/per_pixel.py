@@ -18,12 +18,12 @@ from torchdof.functional import splat
 def seconds(call: Callable[[], object], times: int = 5) -> float:
     """Median of some calls, after one that warms up."""
     call()
-    taken = []
+    durations = []
     for _ in range(times):
         start = time.perf_counter()
         call()
-        taken.append(time.perf_counter() - start)
-    return statistics.median(taken)
+        durations.append(time.perf_counter() - start)
+    return statistics.median(durations)
 
 
 def gradients(image: torch.Tensor, coc_px: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -39,14 +39,14 @@ def main() -> None:
     torch.manual_seed(0)
     torch.set_num_threads(1)
     print("radius  splat  step  layered")
-    for most_px in (4.0, 8.0, 16.0):
+    for largest_px in (4.0, 8.0, 16.0):
         image = torch.rand(1, 3, side, side)
-        coc_px = most_px * (2 * torch.rand(1, 1, side, side) - 1)
+        coc_px = largest_px * (2 * torch.rand(1, 1, side, side) - 1)
         leaves = (image.clone().requires_grad_(), coc_px.clone().requires_grad_())
         forward = seconds(functools.partial(splat, image, coc_px))
         step = seconds(functools.partial(gradients, *leaves))
         layered = seconds(functools.partial(blur_by_coc, image, coc_px, occlusion=False))
-        print(f"{most_px:6g} {forward:6.2f} {step:5.2f} {layered:8.2f}")
+        print(f"{largest_px:6g} {forward:6.2f} {step:5.2f} {layered:8.2f}")
 
 
 if __name__ == "__main__":

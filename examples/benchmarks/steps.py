@@ -30,23 +30,23 @@ WIDEST_PX = 8.0
 
 def parts(side: int, batch: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Light and dioptres of parts of the photograph, ``side`` pixels high and wide."""
-    known = json.loads((DATA / "camera.json").read_text())
+    calibration = json.loads((DATA / "camera.json").read_text())
     image = read_image(DATA / "motorcycle_left.png").pixels
-    dioptres = 1.0 / read_depth(DATA / "motorcycle_disp.npz", **known["depth"])
+    dioptres = 1.0 / read_depth(DATA / "motorcycle_disp.npz", **calibration["depth"])
     height, width = image.shape[-2:]
-    places = [(97 * i % (height - side + 1), 211 * i % (width - side + 1)) for i in range(batch)]
-    cut = [torch.cat([t[..., y : y + side, x : x + side] for y, x in places]) for t in (image, dioptres)]
-    return cut[0].contiguous(), cut[1].contiguous()
+    corners = [(97 * i % (height - side + 1), 211 * i % (width - side + 1)) for i in range(batch)]
+    crops = [torch.cat([t[..., y : y + side, x : x + side] for y, x in corners]) for t in (image, dioptres)]
+    return crops[0].contiguous(), crops[1].contiguous()
 
 
 def measure(side: int, batch: int, occlusion: bool, repeat: int) -> None:
     """Print one row."""
     image, dioptres = parts(side, batch)
     low, high = float(dioptres.min()), float(dioptres.max())
-    places = itertools.cycle(0.05 + 0.9 * torch.rand(97, generator=torch.Generator().manual_seed(0)))
+    focus_positions = itertools.cycle(0.05 + 0.9 * torch.rand(97, generator=torch.Generator().manual_seed(0)))
 
     def coc_px() -> torch.Tensor:
-        return WIDEST_PX * (low + (high - low) * next(places) - dioptres) / (high - low)
+        return WIDEST_PX * (low + (high - low) * next(focus_positions) - dioptres) / (high - low)
 
     def picture() -> None:
         blur_by_coc(image, coc_px(), occlusion=occlusion)
@@ -57,18 +57,18 @@ def measure(side: int, batch: int, occlusion: bool, repeat: int) -> None:
 
     def seconds(call: Callable[[], None]) -> float:
         call()
-        taken = []
+        durations = []
         for _ in range(repeat):
             start = time.perf_counter()
             call()
-            taken.append(time.perf_counter() - start)
-        return statistics.median(taken)
+            durations.append(time.perf_counter() - start)
+        return statistics.median(durations)
 
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    frame, of_step = seconds(picture), seconds(step)
+    frame_s, step_s = seconds(picture), seconds(step)
     mib = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
     name = f"{side} x {side}, {'with' if occlusion else 'without'} occlusion"
-    print(f"{name:32} {batch:5} {1e3 * frame:8.0f} ms {1e3 * of_step:8.0f} ms {of_step / frame:6.1f} {mib:7.0f} MiB")
+    print(f"{name:32} {batch:5} {1e3 * frame_s:8.0f} ms {1e3 * step_s:8.0f} ms {step_s / frame_s:6.1f} {mib:7.0f} MiB")
 
 
 def main() -> None:

@@ -145,15 +145,15 @@ class DepthOfFieldNode:
         if _SHAPES[shape] or squeeze != 1.0:
             table = table.with_aperture(Aperture(_SHAPES[shape] or 0, rotation_deg, squeeze=squeeze))
         coc_px = camera.coc_px(metres, width).expand(len(light), -1, -1, -1)
-        done, rendered = _progress(len(light)), []
+        advance, rendered = _progress(len(light)), []
         with torch.no_grad():
             for picture, radius in zip(light.split(1), coc_px.split(1), strict=True):
                 rendered.append(blur_by_coc(picture, radius, table=table, tolerance=quality))
-                done()
+                advance()
         out = torch.cat(rendered)
         tinted = tint_focus(light, coc_px, has_alpha)[:, :3]
-        shown = encode(out.clamp_min(0.0), "srgb", has_alpha, straight=True)
-        return shown.clamp(0.0, 1.0).movedim(1, -1), encode(tinted, "srgb", False, False).clamp(0.0, 1.0).movedim(1, -1)
+        pictures = encode(out.clamp_min(0.0), "srgb", has_alpha, straight=True), encode(tinted, "srgb", False, False)
+        return pictures[0].clamp(0.0, 1.0).movedim(1, -1), pictures[1].clamp(0.0, 1.0).movedim(1, -1)
 
 
 NODE_CLASS_MAPPINGS = {"TorchdofDepthOfField": DepthOfFieldNode}

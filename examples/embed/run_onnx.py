@@ -31,8 +31,8 @@ def main() -> None:
     arguments = parser.parse_args()
 
     session = onnxruntime.InferenceSession(arguments.model, providers=["CPUExecutionProvider"])
-    facts = session.get_modelmeta().custom_metadata_map
-    print(f"table {json.loads(facts['torchdof.table'])}, options {json.loads(facts['torchdof.options'])}")
+    metadata = session.get_modelmeta().custom_metadata_map
+    print(f"table {json.loads(metadata['torchdof.table'])}, options {json.loads(metadata['torchdof.options'])}")
 
     light = read_image(arguments.image)
     depth = read_depth(arguments.depth, arguments.disparity_scale, arguments.disparity_offset)

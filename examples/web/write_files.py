@@ -42,16 +42,16 @@ def main() -> None:
         print(to_onnx(dof, model))
     else:
         shutil.copyfile(arguments.model, model)
-    facts = describe(model)
-    camera_facts = {name: facts["camera"][name] for name in ("focal_length_mm", "sensor_width_mm")}
-    known = camera_facts | {"max_coc_px": facts["options"]["max_coc_px"]}
-    (arguments.out / "dof.json").write_text(json.dumps(known))
+    metadata = describe(model)
+    lens = {name: metadata["camera"][name] for name in ("focal_length_mm", "sensor_width_mm")}
+    page_settings = lens | {"max_coc_px": metadata["options"]["max_coc_px"]}
+    (arguments.out / "dof.json").write_text(json.dumps(page_settings))
 
     sample = arguments.out / "sample"
     sample.mkdir(exist_ok=True)
     shutil.copyfile(DATA / "motorcycle_left.png", sample / "motorcycle.png")
-    kind = json.loads((DATA / "camera.json").read_text())["depth"]
-    depth_m = read_depth(DATA / "motorcycle_disp.npz", **kind)
+    depth_options = json.loads((DATA / "camera.json").read_text())["depth"]
+    depth_m = read_depth(DATA / "motorcycle_disp.npz", **depth_options)
     depth_m = repair_edges(read_image(DATA / "motorcycle_left.png").pixels, depth_m)
     write_millimetres(sample / "motorcycle_depth.png", depth_m[0, 0].numpy())
 

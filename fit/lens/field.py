@@ -14,10 +14,10 @@ from .lens import Lens
 from .spot import Reference, point_spread
 
 _CELLS = (128, 64)  # of half a spot, along and across the radial direction
-_GROWING = 1.5  # coc grows with this power of the node's index
-_CHIEF = 0.1  # diameter, relative to the stop's, of the small stop that defines a position in the sharp image
+_SPACING_POWER = 1.5  # coc grows with this power of the node's index
+_CHIEF_STOP = 0.1  # diameter, relative to the stop's, of the small stop that defines a position in the sharp image
 _CHIEF_RAYS = 900
-_TRIES = 3  # iterations that correct the lens's distortion
+_DISTORTION_STEPS = 3  # iterations that correct the lens's distortion
 
 
 def trace_field(
@@ -46,10 +46,10 @@ def trace_field(
             ]
             low, high = min(u.min() for u, _, _ in spots), max(u.max() for u, _, _ in spots)
             # a ray's light is split among the cells around it, so rays lie half a cell inside the box
-            middle, length = (low + high) / 2, max(high - low, 1e-9) / 2 * rows / (rows - 1)
-            wide = max(1e-9, *(np.abs(v).max() for _, v, _ in spots)) * 2 * columns / (2 * columns - 1)
-            boxes.append((middle, length, wide))
-            light.append([_gathered((u - middle) / length, np.abs(v) / wide, weight) for u, v, weight in spots])
+            centre, length = (low + high) / 2, max(high - low, 1e-9) / 2 * rows / (rows - 1)
+            width = max(1e-9, *(np.abs(v).max() for _, v, _ in spots)) * 2 * columns / (2 * columns - 1)
+            boxes.append((centre, length, width))
+            light.append([_binned((u - centre) / length, np.abs(v) / width, weight) for u, v, weight in spots])
     nodes = (len(coc_mm), len(radius_mm))
     return Field(
         torch.tensor(list(coc_mm), dtype=torch.float64),
@@ -59,7 +59,7 @@ def trace_field(
     )
 
 
-def _gathered(u: Array, v: Array, weight: Array) -> Array:
+def _binned(u: Array, v: Array, weight: Array) -> Array:
     """Splits the light of rays, at -1 to 1 along and 0 to 1 across, among the four cells around each."""
     rows, columns = _CELLS
     along, across = (u + 1.0) * (rows / 2) - 0.5, v * columns - 0.5
@@ -86,24 +86,24 @@ def spot_of_place(
 
     The sharp image is that of the d line through a small stop. Arguments are those of `point_spread`.
     """
-    given: dict[str, Any] = {"field_mm": field_mm, "rays": rays, "wavelength_um": wavelength_um, "reference": reference}
-    spot = point_spread(lens, z_m, sensor_mm, **given)
-    aside = spot.centre - chief_ray_mm(lens, z_m, sensor_mm, field_mm, reference)
-    return aside - spot.y, spot.x, spot.weight
+    options: dict[str, Any] = {"rays": rays, "wavelength_um": wavelength_um, "reference": reference}
+    spot = point_spread(lens, z_m, sensor_mm, field_mm=field_mm, **options)
+    image_mm = spot.centre - chief_ray_mm(lens, z_m, sensor_mm, field_mm, reference)
+    return image_mm - spot.y, spot.x, spot.weight
 
 
 def chief_ray_mm(lens: Lens, z_m: float, sensor_mm: float, field_mm: float, reference: Reference) -> float:
     """Distance from the axis, in mm, of a point's image through a small stop, in the d line."""
     if field_mm == 0.0:
         return 0.0
-    stopped = lens.with_stop(lens.surfaces[lens.stop].diameter * _CHIEF)
+    stopped = lens.with_stop(lens.surfaces[lens.stop].diameter * _CHIEF_STOP)
     return point_spread(stopped, z_m, sensor_mm, field_mm=field_mm, rays=_CHIEF_RAYS, reference=reference).centre
 
 
 def field_height_mm(lens: Lens, z_m: float, sensor_mm: float, radius_mm: float, reference: Reference) -> float:
     """The ``field_mm`` of a point whose image is at `radius_mm` from the centre; corrects the distortion."""
     height = radius_mm
-    for _ in range(_TRIES if radius_mm else 0):
+    for _ in range(_DISTORTION_STEPS if radius_mm else 0):
         height *= radius_mm / chief_ray_mm(lens, z_m, sensor_mm, height, reference)
     return height
 
@@ -120,6 +120,6 @@ def coc_nodes(near_mm: float, far_mm: float, count: int) -> list[float]:
     sides = [(near_mm, count)]
     if far_mm > 0:
         share = math.sqrt(far_mm) / (math.sqrt(far_mm) + math.sqrt(-near_mm))
-        of_far = min(max(2, round(2 * count * share)), 2 * count - 2)
-        sides = [(near_mm, 2 * count - of_far), (far_mm, of_far)]
-    return sorted([0.0, *(end * (i / of_side) ** _GROWING for end, of_side in sides for i in range(1, of_side + 1))])
+        far_count = min(max(2, round(2 * count * share)), 2 * count - 2)
+        sides = [(near_mm, 2 * count - far_count), (far_mm, far_count)]
+    return sorted([0.0, *(end * (i / n) ** _SPACING_POWER for end, n in sides for i in range(1, n + 1))])

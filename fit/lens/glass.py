@@ -20,7 +20,7 @@ import numpy as np
 from torchdof.validation import number, show
 
 D_UM, F_UM, C_UM, G_UM = 0.58756, 0.48613, 0.65627, 0.43584
-_LARGEST = 1e100  # of a coefficient; products stay finite
+_MAX_COEFFICIENT = 1e100  # of a coefficient; products stay finite
 _CATALOGUE = Path(__file__).parent / "glasses" / "schott.txt"
 
 
@@ -33,11 +33,12 @@ class Glass:
 
     def __post_init__(self) -> None:
         """Raises a `ValueError` unless the coefficients are finite and the index from 1 to 5 between 0.4 and 0.7 um."""
-        given = self.coefficients
-        plain = isinstance(given, tuple) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in given)
-        if not plain or len(given) not in (3, 6) or not all(abs(value) <= _LARGEST for value in given):
+        coefficients = self.coefficients
+        values = coefficients if isinstance(coefficients, tuple) else ()
+        are_numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
+        if not are_numbers or len(values) not in (3, 6) or not all(abs(v) <= _MAX_COEFFICIENT for v in values):
             raise ValueError(
-                f"glass {self.name} must have six finite coefficients B1 B2 B3 C1 C2 C3, got {show(given)}"
+                f"glass {self.name} must have six finite coefficients B1 B2 B3 C1 C2 C3, got {show(coefficients)}"
             )
         for wavelength_um in (0.4, D_UM, 0.7):
             self.index(wavelength_um)
@@ -68,8 +69,8 @@ class Glass:
         if not (abbe >= 1 and 0 < partial < 1):
             raise ValueError(f"the Abbe number must be at least 1 and P_gF between 0 and 1, got {name}")
         d, f, c, g = (np.array([1.0, line**-2, line**-4]) for line in (D_UM, F_UM, C_UM, G_UM))
-        across = (index - 1.0) / abbe
-        terms = np.linalg.solve(np.stack([d, f - c, g - f]), [index, across, partial * across])
+        dispersion_FC = (index - 1.0) / abbe
+        terms = np.linalg.solve(np.stack([d, f - c, g - f]), [index, dispersion_FC, partial * dispersion_FC])
         return cls(name, tuple(terms.tolist()))
 
     def index(self, wavelength_um: float = D_UM) -> float:
@@ -79,11 +80,11 @@ class Glass:
             ValueError: If the index is not from 1 to 5: the wavelength is outside the glass's transmission range.
         """
         square = number("wavelength_um", wavelength_um, low=0.299, high=1.201, unit="micrometres") ** 2
-        given = self.coefficients
-        if len(given) == 3:
-            index = given[0] + given[1] / square + given[2] / square**2
+        values = self.coefficients
+        if len(values) == 3:
+            index = values[0] + values[1] / square + values[2] / square**2
         else:
-            terms = (b * square / ((square - c) or 1e-300) for b, c in zip(given[:3], given[3:], strict=True))
+            terms = (b * square / ((square - c) or 1e-300) for b, c in zip(values[:3], values[3:], strict=True))
             index = max(1.0 + sum(terms), 0.0) ** 0.5
         if not 1.0 <= index < 5.0:
             raise ValueError(f"glass {self.name} has no refractive index from 1 to 5 at {wavelength_um:g} um")
@@ -94,7 +95,7 @@ class Glass:
 def catalogue() -> dict[str, Glass]:
     """The glasses of the catalogue, by upper-case name."""
     lines = (line.partition("#")[0].split() for line in _CATALOGUE.read_text(encoding="utf-8").splitlines())
-    return {name: Glass(name, tuple(map(float, given))) for name, *given in filter(None, lines)}
+    return {name: Glass(name, tuple(map(float, numbers))) for name, *numbers in filter(None, lines)}
 
 
 AIR = Glass("1", (1.0, 0.0, 0.0))

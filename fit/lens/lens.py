@@ -24,10 +24,10 @@ RGB_UM = (C_UM, 0.54607, F_UM)
 """Wavelengths for red, green and blue, in micrometres: the lines C, e and F."""
 
 _SHIPPED = Path(__file__).parent / "lenses"
-_LARGEST = 1e12  # mm; limit of focal lengths and other first-order properties
-_CHUNK = 1 << 14  # rays that fit into the processor's cache together
-_SLACK_MM = 1e-9  # rounding may put a surface this far behind the previous one
-_MARKED = 1.03  # the f-number of a lens is rounded: f/2.03 is marked f/2
+_MAX_MM = 1e12  # mm; limit of focal lengths and other first-order properties
+_RAYS_AT_ONCE = 1 << 14  # rays that fit into the processor's cache together
+_OVERLAP_MM = 1e-9  # rounding may put a surface this far behind the previous one
+_F_NUMBER_ROUNDING = 1.03  # the f-number of a lens is rounded: f/2.03 is marked f/2
 
 
 class Paraxial(NamedTuple):
@@ -80,7 +80,7 @@ class Lens:
 
     def __post_init__(self) -> None:
         """Raises a `ValueError` for invalid surfaces or an invalid stop."""
-        if not isinstance(self.surfaces, tuple) or not all(isinstance(one, Surface) for one in self.surfaces):
+        if not isinstance(self.surfaces, tuple) or not all(isinstance(surface, Surface) for surface in self.surfaces):
             raise ValueError(f"surfaces must be a tuple of Surface, got {show(self.surfaces)}")
         whole("stop", self.stop, 0, len(self.surfaces) - 1)
         if (index := self.surfaces[-1].glass.index()) != 1.0:
@@ -137,21 +137,21 @@ class Lens:
                 power = (n[i + 1] - n[i]) * (1.0 / surface.radius + 2.0 * sum(surface.polynomial[:1]))
                 matrix = np.array([[1.0, 0.0], [-power / n[i + 1], n[i] / n[i + 1]]]) @ matrix
                 gap = surface.thickness
-        if not (np.abs(matrix) < _LARGEST).all():
+        if not (np.abs(matrix) < _MAX_MM).all():
             raise ValueError(f"lens {self.name!r} bends light beyond measure; check its radii and polynomials")
         (a, _), (c, d) = matrix.tolist()
-        if not c < -1.0 / _LARGEST:
+        if not c < -1.0 / _MAX_MM:
             raise ValueError(f"lens {self.name!r} must have a positive focal length: it does not converge light")
-        if abs(to_stop[0, 0]) < 1.0 / _LARGEST:
+        if abs(to_stop[0, 0]) < 1.0 / _MAX_MM:
             raise ValueError(f"lens {self.name!r} must have its entrance pupil somewhere: its stop is seen at infinity")
         focal, pupil = -1.0 / c, self.surfaces[self.stop].diameter / abs(float(to_stop[0, 0]))
-        at = float(to_stop[0, 1] / to_stop[0, 0])
-        return Paraxial(focal, a * focal, (1.0 - d) * focal, (a - 1.0) * focal, at, pupil, focal / pupil)
+        pupil_z = float(to_stop[0, 1] / to_stop[0, 0])
+        return Paraxial(focal, a * focal, (1.0 - d) * focal, (a - 1.0) * focal, pupil_z, pupil, focal / pupil)
 
     def with_stop(self, diameter: float) -> Lens:
         """The lens with its stop opened or closed to a diameter in millimetres."""
-        changed = [replace(s, diameter=diameter) if i == self.stop else s for i, s in enumerate(self.surfaces)]
-        return replace(self, surfaces=tuple(changed))
+        surfaces = [replace(s, diameter=diameter) if i == self.stop else s for i, s in enumerate(self.surfaces)]
+        return replace(self, surfaces=tuple(surfaces))
 
     def with_f_number(self, f_number: float) -> Lens:
         """The lens stopped down so that its paraxial f-number is ``f_number``.
@@ -163,27 +163,27 @@ class Lens:
         """
         number("f_number", f_number, 0, 1e9)
         open_at = self.paraxial().f_number
-        if f_number * _MARKED < open_at:
+        if f_number * _F_NUMBER_ROUNDING < open_at:
             raise ValueError(f"f_number must be at least {open_at:.3g} for lens {self.name!r}, got {f_number:g}")
         return self.with_stop(self.surfaces[self.stop].diameter * min(1.0, open_at / f_number))
 
     def scaled(self, focal_length_mm: float) -> Lens:
         """The lens scaled to another focal length; its f-number is unchanged."""
         factor = number("focal_length_mm", focal_length_mm, 0, 1e9) / self.paraxial().focal_length
-        scaled = [
-            replace(one, thickness=one.thickness * factor, diameter=one.diameter * factor).bent(factor)
-            for one in self.surfaces
+        surfaces = [
+            replace(surface, thickness=surface.thickness * factor, diameter=surface.diameter * factor).bent(factor)
+            for surface in self.surfaces
         ]
-        return replace(self, surfaces=tuple(scaled))
+        return replace(self, surfaces=tuple(surfaces))
 
     def turned(self) -> Lens:
         """The lens with front and rear exchanged."""
-        ahead = [(AIR, 0.0), *((one.glass, one.thickness) for one in self.surfaces[:-1])]
-        turned = [
-            replace(one.bent(-1.0), glass=glass, thickness=gap)
-            for one, (glass, gap) in zip(self.surfaces, ahead, strict=True)
+        media = [(AIR, 0.0), *((surface.glass, surface.thickness) for surface in self.surfaces[:-1])]
+        surfaces = [
+            replace(surface.bent(-1.0), glass=glass, thickness=gap)
+            for surface, (glass, gap) in zip(self.surfaces, media, strict=True)
         ]
-        return replace(self, surfaces=tuple(turned[::-1]), stop=len(turned) - 1 - self.stop)
+        return replace(self, surfaces=tuple(surfaces[::-1]), stop=len(surfaces) - 1 - self.stop)
 
     def lines(self) -> list[str]:
         """The surfaces as lines of a prescription file."""
@@ -210,25 +210,25 @@ def trace_rays(
         raise ValueError(
             f"position and direction must both be [3, R], got {list(position.shape)} and {list(direction.shape)}"
         )
-    if (count := position.shape[1]) > _CHUNK:
-        chunks = (slice(start, start + _CHUNK) for start in range(0, count, _CHUNK))
-        parts = [trace_rays(lens, position[:, one], direction[:, one], wavelength_um, clip) for one in chunks]
+    if (count := position.shape[1]) > _RAYS_AT_ONCE:
+        chunks = (slice(start, start + _RAYS_AT_ONCE) for start in range(0, count, _RAYS_AT_ONCE))
+        parts = [trace_rays(lens, position[:, chunk], direction[:, chunk], wavelength_um, clip) for chunk in chunks]
         return Rays(*(np.concatenate(part, -1) for part in zip(*parts, strict=True)))
-    index, along = lens.indices(wavelength_um), np.array([[0.0], [0.0], [1.0]])
+    index, axis = lens.indices(wavelength_um), np.array([[0.0], [0.0], [1.0]])
     alive = np.ones(position.shape[1], dtype=bool)
     for i, (surface, vertex) in enumerate(zip(lens.surfaces, lens.vertices, strict=True)):
-        run, normal, met = surface.meet(position - vertex * along, direction)
+        run, normal, hits = surface.meet(position - vertex * axis, direction)
         position = position + run * direction
-        alive &= met
+        alive &= hits
         if i > 0:  # where two surfaces intersect there is no lens
-            alive &= run >= -_SLACK_MM
+            alive &= run >= -_OVERLAP_MM
         if clip:
             alive &= position[0] ** 2 + position[1] ** 2 <= (surface.diameter / 2) ** 2
         ratio = index[i] / index[i + 1]
         cosine = (direction * normal).sum(0)
-        inside = 1.0 - ratio * ratio * (1.0 - cosine * cosine)
-        alive &= inside >= 0  # else totally reflected
-        direction = ratio * direction + (np.sqrt(np.maximum(inside, 0.0)) - ratio * cosine) * normal
+        discriminant = 1.0 - ratio * ratio * (1.0 - cosine * cosine)
+        alive &= discriminant >= 0  # else totally reflected
+        direction = ratio * direction + (np.sqrt(np.maximum(discriminant, 0.0)) - ratio * cosine) * normal
         if not alive.all():  # continue blocked rays along the axis, where their numbers stay small
-            position, direction = np.where(alive, position, vertex * along), np.where(alive, direction, along)
+            position, direction = np.where(alive, position, vertex * axis), np.where(alive, direction, axis)
     return Rays(position, direction, alive)

@@ -28,17 +28,17 @@ from ..result import Array
 from ..solve import best_of
 from .spot import Spot
 
-_FINEST = 3.0  # cycles for each pixel; kernels are sampled on the pixel grid, so higher frequencies are aliased
-_BETWEEN = (0.25, 0.5, 0.75)  # fractions of the interval between two nodes, at which spots are traced for the joint fit
+_MAX_FREQUENCY = 3.0  # cycles for each pixel; kernels are sampled on the pixel grid, so higher frequencies are aliased
+_FRACTIONS = (0.25, 0.5, 0.75)  # of the interval between two nodes: where more spots are traced for the joint fit
 _SWEEPS = 6
-_PULL = 1e-4  # weight of a ray histogram where spots do not determine a profile (details far below a pixel)
-_NARROW = 0.01  # pixels of coc; narrower intervals are not divided
-_WANTED_DB = 62.0  # PSNR of a natural image in the middle of an interval; elsewhere it may be a few dB less
+_PRIOR_WEIGHT = 1e-4  # weight of the ray histogram, which determines details of the profile far below a pixel
+_MIN_INTERVAL_PX = 0.01  # pixels of coc; narrower intervals are not divided
+_TARGET_DB = 62.0  # PSNR of a natural image in the middle of an interval; elsewhere it may be a few dB less
 _CONTRAST = 0.22  # standard deviation of natural images over their peak
-# for named shapes: ranges of parameters, lengths relative to the outermost ray; number of the profile's samples, and
-# their reach relative to that ray; weight of the neighbour's parameters, which avoids jumps of irrelevant ones
+# Named shapes, lengths relative to the distance of the outermost ray: ranges of the parameters; samples of the profile,
+# and their reach; weight of the neighbour's parameters, which keeps those steady that the spot does not determine.
 _RANGES = {"radius": (0.02, 1.3), "sigma": (0.01, 1.0), "r_c": (0.0, 1.3), "b": (-1.0, 20.0), "m": (0.5, 12.0)}
-_STEPS, _REACH, _KEEP = 400, 2.0, 1e-3
+_SAMPLES, _SAMPLED_REACH, _NEIGHBOUR_WEIGHT = 400, 2.0, 1e-3
 
 
 class NodeEquations(NamedTuple):
@@ -60,14 +60,14 @@ class Tracer:
 
     def __init__(self, spot: Callable[[float], Spot], points: int, pixel: float) -> None:
         self.spot, self.points, self.pixel = spot, points, pixel
-        self.frequency = np.linspace(1 / 256, _FINEST, 400)
+        self.frequency = np.linspace(1 / 256, _MAX_FREQUENCY, 400)
         # amplitude of natural images times the area of a ring of frequencies; constant beyond Nyquist, because of
         # aliasing
         spectrum = np.minimum(self.frequency, 0.5) ** -0.5
         self.weight = spectrum / np.sqrt(1.0 + (np.pi * self.frequency) ** 2)
-        fine = 12 * (points - 1)
-        self._r = (np.arange(fine) + 0.5) / fine  # radii relative to the profile's
-        self._light = _hats(self._r, points) * (2.0 * np.pi * self._r / fine)[:, None]
+        count = 12 * (points - 1)
+        self._r = (np.arange(count) + 0.5) / count  # radii relative to the profile's
+        self._light = _hats(self._r, points) * (2.0 * np.pi * self._r / count)[:, None]
         self.area = self._light.sum(0)  # integral of each hat
         self.traced, self.alone = functools.cache(self._traced), functools.cache(self._alone)
 
@@ -75,8 +75,8 @@ class Tracer:
         """Radii in pixels, weights and transfer function (a Hankel transform) of the spot."""
         spot = self.spot(coc)
         r, light = np.maximum(spot.r / self.pixel, 1e-9), spot.weight
-        pieces = (slice(i, i + 4096) for i in range(0, len(r), 4096))
-        return r, light, np.sum([j0(2.0 * np.pi * np.outer(self.frequency, r[i])) @ light[i] for i in pieces], axis=0)
+        slices = (slice(i, i + 4096) for i in range(0, len(r), 4096))
+        return r, light, np.sum([j0(2.0 * np.pi * np.outer(self.frequency, r[i])) @ light[i] for i in slices], axis=0)
 
     def _alone(self, coc: float) -> tuple[NodeEquations, Array]:
         """Equations of the spot at a node, with the radius of the outermost ray, and values that fit it."""
@@ -87,15 +87,15 @@ class Tracer:
         """Equations of the spot at a coc, for profiles that end at ``radius`` pixels."""
         r, light, transfer = self.traced(coc)
         basis = j0(2.0 * np.pi * np.outer(self.frequency, self._r * radius)) @ self._light * self.weight[:, None]
-        heavy = 1e4 * self.weight.max() ** 2  # fixes the total light, whatever the frequencies
-        gram = basis.T @ basis + heavy * np.outer(self.area, self.area)
-        pull = basis.T @ (transfer * self.weight) + heavy * self.area
+        light_weight = 1e4 * self.weight.max() ** 2  # fixes the total light, whatever the frequencies
+        gram = basis.T @ basis + light_weight * np.outer(self.area, self.area)
+        pull = basis.T @ (transfer * self.weight) + light_weight * self.area
         histogram = light @ _hats(np.minimum(r / radius, 1.0), self.points) / self.area
-        return NodeEquations(radius, gram, pull, float(((transfer * self.weight) ** 2).sum() + heavy), histogram)
+        return NodeEquations(radius, gram, pull, float(((transfer * self.weight) ** 2).sum() + light_weight), histogram)
 
     def fitted(self, gram: Array, pull: Array, prior: Array) -> Array:
         """Non-negative least squares of a quadratic form, with a prior where it is flat; the light sums to 1."""
-        scale = _PULL**2 * np.trace(gram) / np.sum(self.area) * self.area
+        scale = _PRIOR_WEIGHT**2 * np.trace(gram) / np.sum(self.area) * self.area
         factor = cholesky(gram + np.diag(scale), lower=True)
         values, _ = nnls(factor.T, solve_triangular(factor, pull + scale * prior, lower=True), maxiter=50 * len(pull))
         return values / (self.area @ values)
@@ -119,42 +119,42 @@ def place_nodes(tracer: Tracer, near: float, far: float, nodes: int | None) -> l
         ValueError: If no interval is left to halve.
     """
 
-    def gap(left: float, right: float) -> float:
-        (node, values), (after, next_values) = tracer.alone(left), tracer.alone(right)
-        if max(node.radius, after.radius) <= 0.5 or right - left < _NARROW * tracer.pixel:
+    def interval_error(left: float, right: float) -> float:
+        (node, values), (next_node, next_values) = tracer.alone(left), tracer.alone(right)
+        if max(node.radius, next_node.radius) <= 0.5 or right - left < _MIN_INTERVAL_PX * tracer.pixel:
             return 0.0
-        between = tracer.equations((left + right) / 2, (node.radius + after.radius) / 2)
-        return between.error((values + next_values) / 2)
+        middle_node = tracer.equations((left + right) / 2, (node.radius + next_node.radius) / 2)
+        return middle_node.error((values + next_values) / 2)
 
-    places = [near, near / 2, 0.0, far / 2, far] if far > 0 else [near, near / 2, 0.0]
-    gaps = [gap(*pair) for pair in pairwise(places)]
-    enough = 10.0 ** (-_WANTED_DB / 20.0) / _CONTRAST
-    while len(places) < nodes if nodes is not None else tracer.relative(max(gaps)) > enough:
-        worst = int(np.argmax(gaps))
-        if gaps[worst] == 0.0:
+    cocs = [near, near / 2, 0.0, far / 2, far] if far > 0 else [near, near / 2, 0.0]
+    errors = [interval_error(*pair) for pair in pairwise(cocs)]
+    accepted_error = 10.0 ** (-_TARGET_DB / 20.0) / _CONTRAST
+    while len(cocs) < nodes if nodes is not None else tracer.relative(max(errors)) > accepted_error:
+        worst = int(np.argmax(errors))
+        if errors[worst] == 0.0:
             raise ValueError(
-                f"nodes must be at most {len(places)} for this lens and width_px, got {nodes}: between those the spots "
+                f"nodes must be at most {len(cocs)} for this lens and width_px, got {nodes}: between those the spots "
                 "stay within one pixel, or hardly differ; take fewer nodes or a larger width_px"
             )
-        left, right = places[worst : worst + 2]
+        left, right = cocs[worst : worst + 2]
         middle = (left + right) / 2
-        places.insert(worst + 1, middle)
-        gaps[worst : worst + 1] = [gap(left, middle), gap(middle, right)]
-    return places
+        cocs.insert(worst + 1, middle)
+        errors[worst : worst + 1] = [interval_error(left, middle), interval_error(middle, right)]
+    return cocs
 
 
-def fit_radial(tracer: Tracer, places: Sequence[float]) -> tuple[dict[str, Array], Array]:
+def fit_radial(tracer: Tracer, cocs: Sequence[float]) -> tuple[dict[str, Array], Array]:
     """Values of all nodes together, in sweeps from both ends to the focus and back."""
-    nodes, values = map(list, zip(*(tracer.alone(coc) for coc in places), strict=True))
+    nodes, values = map(list, zip(*(tracer.alone(coc) for coc in cocs), strict=True))
     # for each node: equations that contain its values, their weight in them, and the node with the remaining weight
     spots: list[list[tuple[NodeEquations, float, int]]] = [[(node, 1.0, i)] for i, node in enumerate(nodes)]
-    for i, (left, right) in enumerate(pairwise(zip(places, nodes, strict=True))):
-        for share in _BETWEEN:
+    for i, (left, right) in enumerate(pairwise(zip(cocs, nodes, strict=True))):
+        for share in _FRACTIONS:
             coc = (1 - share) * left[0] + share * right[0]
             equations = tracer.equations(coc, (1 - share) * left[1].radius + share * right[1].radius)
             spots[i].append((equations, 1 - share, i + 1))
             spots[i + 1].append((equations, share, i))
-    for order in (_to_focus(places), _to_focus(places)[::-1]) * (_SWEEPS // 2):
+    for order in (_to_focus(cocs), _to_focus(cocs)[::-1]) * (_SWEEPS // 2):
         for i in order:
             gram = np.sum([share**2 * spot.gram for spot, share, _ in spots[i]], axis=0)
             pulls = [share * (spot.pull - (1 - share) * spot.gram @ values[other]) for spot, share, other in spots[i]]
@@ -163,25 +163,25 @@ def fit_radial(tracer: Tracer, places: Sequence[float]) -> tuple[dict[str, Array
     return {"values": np.stack(values), "radius": np.array([node.radius for node in nodes]) * tracer.pixel}, residual
 
 
-def fit_shapes(tracer: Tracer, places: Sequence[float], family: str) -> tuple[dict[str, Array], Array]:
+def fit_shapes(tracer: Tracer, cocs: Sequence[float], family: str) -> tuple[dict[str, Array], Array]:
     """A named shape at each node, starting from its neighbour's, from both ends to the focus."""
-    names, before = FAMILIES[family], None
-    params, residual = np.zeros((len(names), len(places))), np.zeros(len(places))
-    for i in _to_focus(places):
-        before = None if i == len(places) - 1 else before  # the other side begins here
-        before, outermost, error = _fit_shape(family, tracer, places[i], before)
-        params[:, i] = before * [outermost * tracer.pixel if name in LENGTHS else 1.0 for name in names]
+    names, neighbour = FAMILIES[family], None
+    params, residual = np.zeros((len(names), len(cocs))), np.zeros(len(cocs))
+    for i in _to_focus(cocs):
+        neighbour = None if i == len(cocs) - 1 else neighbour  # the other side begins here
+        neighbour, outermost, error = _fit_shape(family, tracer, cocs[i], neighbour)
+        params[:, i] = neighbour * [outermost * tracer.pixel if name in LENGTHS else 1.0 for name in names]
         residual[i] = tracer.relative(error)
     return dict(zip(names, params, strict=True)), residual
 
 
-def _to_focus(places: Sequence[float]) -> list[int]:
+def _to_focus(cocs: Sequence[float]) -> list[int]:
     """Indices of the nodes from both ends to the focus."""
-    focus = int(np.argmin(np.abs(places)))
-    return [*range(focus), *range(len(places) - 1, focus - 1, -1)]
+    focus = int(np.argmin(np.abs(cocs)))
+    return [*range(focus), *range(len(cocs) - 1, focus - 1, -1)]
 
 
-def _fit_shape(family: str, tracer: Tracer, coc: float, before: Array | None) -> tuple[Array, float, float]:
+def _fit_shape(family: str, tracer: Tracer, coc: float, neighbour: Array | None) -> tuple[Array, float, float]:
     """Parameters of the shape whose transfer function is nearest to a spot's; the neighbour's are a weak prior.
 
     Returns:
@@ -196,10 +196,10 @@ def _fit_shape(family: str, tracer: Tracer, coc: float, before: Array | None) ->
         low[0] = 0.5
     sigma = {"gaussian": 0.5**0.5, "ring": 0.5}.get(family, 0.05) * rms
     geometry = {"radius": 2.0**0.5 * rms, "sigma": sigma, "r_c": 0.7 * rms, "b": 0.0, "m": 2.0}
-    radii = (np.arange(_STEPS) + 0.5) * (_REACH / _STEPS)
-    waves = j0(2.0 * np.pi * np.outer(frequency, radii))
+    radii = (np.arange(_SAMPLES) + 0.5) * (_SAMPLED_REACH / _SAMPLES)
+    bessel = j0(2.0 * np.pi * np.outer(frequency, radii))
 
-    def seen(values: Array) -> Array:
+    def weighted_transfer(values: Array) -> Array:
         params = dict(zip(names, values, strict=True))
         if family == "gaussian":  # it may reach beyond the radii
             return np.asarray(weight * np.exp(-2.0 * (np.pi * params["sigma"] * frequency) ** 2))
@@ -207,15 +207,15 @@ def _fit_shape(family: str, tracer: Tracer, coc: float, before: Array | None) ->
             phase = 2.0 * np.pi * params["radius"] * frequency
             return np.asarray(weight * 2.0 * j1(phase) / phase)
         light = profile(family, torch.from_numpy(radii), params).numpy() * radii
-        return np.asarray(weight * (waves @ (light / light.sum())))
+        return np.asarray(weight * (bessel @ (light / light.sum())))
 
-    start, keep = np.array([geometry[name] for name in names]), 0.0 if before is None else _KEEP
-    near, wanted = start if before is None else before, weight * transfer
+    start, prior_weight = np.array([geometry[name] for name in names]), 0.0 if neighbour is None else _NEIGHBOUR_WEIGHT
+    expected, target = start if neighbour is None else neighbour, weight * transfer
     best = best_of(
-        lambda values: np.concatenate([seen(values), keep * values]),
-        np.concatenate([wanted, keep * near]),
-        [near, start] if keep else [start],
+        lambda values: np.concatenate([weighted_transfer(values), prior_weight * values]),
+        np.concatenate([target, prior_weight * expected]),
+        [expected, start] if prior_weight else [start],
         (low, high),
         tolerance=1e-8,
     )
-    return best, outermost, float(((seen(best) - wanted) ** 2).sum())
+    return best, outermost, float(((weighted_transfer(best) - target) ** 2).sum())

@@ -24,7 +24,7 @@ from .glass import AIR, Glass, catalogue
 from .surface import Surface
 
 _COLUMNS = "radius thickness index diameter"
-_MOST_SURFACES = 1000
+_MAX_SURFACES = 1000
 _SHAPE = ("k", *(f"A{power}" for power in range(2, 18, 2)))
 
 
@@ -37,7 +37,7 @@ def parse(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
     surfaces: list[Surface] = []
     defined: dict[str, Glass] = {}
     stop, source = None, ""
-    for at, line in enumerate(content.decode("utf-8").splitlines(), start=1):
+    for line_number, line in enumerate(content.decode("utf-8").splitlines(), start=1):
         text, _, comment = line.partition("#")
         if comment.strip().startswith("source:"):
             source = comment.split(":", 1)[1].strip()
@@ -52,12 +52,12 @@ def parse(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
                 surface, is_stop = _surface(words, surfaces[-1].glass if surfaces else AIR, defined)
                 if is_stop and stop is not None:
                     raise ValueError("radius: a second stop (radius 0, or stop); write inf for flat")
-                if len(surfaces) == _MOST_SURFACES:
-                    raise ValueError(f"a lens has at most {_MOST_SURFACES} surfaces")
+                if len(surfaces) == _MAX_SURFACES:
+                    raise ValueError(f"a lens has at most {_MAX_SURFACES} surfaces")
                 stop = len(surfaces) if is_stop else stop
                 surfaces.append(surface)
         except ValueError as error:
-            raise ValueError(f"line {at}: {error}") from None
+            raise ValueError(f"line {line_number}: {error}") from None
     if stop is None:
         raise ValueError(
             f"no aperture stop among {len(surfaces)} surfaces; one line must have radius 0, or end in stop"
@@ -65,7 +65,7 @@ def parse(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
     return tuple(surfaces), stop, source
 
 
-def _surface(words: list[str], before: Glass, defined: dict[str, Glass]) -> tuple[Surface, bool]:
+def _surface(words: list[str], medium: Glass, defined: dict[str, Glass]) -> tuple[Surface, bool]:
     """The surface on a line, behind a medium, and whether it is the stop."""
     if len(words) < 4:
         raise ValueError(f"expected the columns {_COLUMNS}, got {len(words)}: {' '.join(words)!r}")
@@ -77,11 +77,11 @@ def _surface(words: list[str], before: Glass, defined: dict[str, Glass]) -> tupl
             shape[name] = _number(name, text)
         elif word != "stop":
             raise ValueError(f"behind the columns expected stop, k=NUMBER or A2=NUMBER to A16=NUMBER, got {word!r}")
-    glass = before if radius == 0.0 and words[2] == "0" else _glass(words[2], defined)
+    glass = medium if radius == 0.0 and words[2] == "0" else _glass(words[2], defined)
     if radius == 0.0:
-        if glass.index() != before.index():
+        if glass.index() != medium.index():
             raise ValueError("index: the stop does not change the index, write 0")
-        radius, glass, is_stop = math.inf, before, True
+        radius, glass, is_stop = math.inf, medium, True
     conic, *polynomial = shape.values()
     return Surface(radius, thickness, glass, diameter, conic, tuple(polynomial) * any(polynomial)), is_stop
 
@@ -107,13 +107,13 @@ def _number(name: str, text: str) -> float:
 def lines(surfaces: Sequence[Surface], stop: int) -> list[str]:
     """Surfaces as lines of a prescription; the inverse of :func:`parse`."""
     media = [AIR, *(surface.glass for surface in surfaces)]
-    own = {glass.name: glass for glass in media if len(glass.coefficients) == 6 and glass not in catalogue().values()}
-    written = [" ".join(["glass", name, *map(repr, glass.coefficients)]) for name, glass in own.items()]
+    named = {glass.name: glass for glass in media if len(glass.coefficients) == 6 and glass not in catalogue().values()}
+    text_lines = [" ".join(["glass", name, *map(repr, glass.coefficients)]) for name, glass in named.items()]
     for i, surface in enumerate(surfaces):
         shape = zip(_SHAPE, (surface.conic, *surface.polynomial), strict=False)
-        words = [f"{name}={value:.9g}" for name, value in shape if value]
-        is_plain = not words and math.isinf(surface.radius) and media[i + 1] == media[i]
+        shape_words = [f"{name}={value:.9g}" for name, value in shape if value]
+        is_plain = not shape_words and math.isinf(surface.radius) and media[i + 1] == media[i]
         curve, index = ("0", "0") if i == stop and is_plain else (f"{surface.radius:.9g}", surface.glass.name)
-        words += ["stop"] * (i == stop and not is_plain)
-        written.append(" ".join([curve, f"{surface.thickness:.9g}", index, f"{surface.diameter:.9g}", *words]))
-    return written
+        shape_words += ["stop"] * (i == stop and not is_plain)
+        text_lines.append(" ".join([curve, f"{surface.thickness:.9g}", index, f"{surface.diameter:.9g}", *shape_words]))
+    return text_lines

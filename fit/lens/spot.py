@@ -28,9 +28,9 @@ from .lens import Lens, Rays, trace_rays
 Reference = Literal["principal", "pupil", "vertex", "sensor"]
 Focus = Literal["best", "paraxial"]
 
-_PROBES = 64  # grid intervals along each side of a box in the pupil
-_FAN = 4096
-_FARTHEST_M, _WIDEST_MM = 1e12, 1e9
+_PUPIL_INTERVALS = 64  # grid intervals along each side of a box in the pupil
+_FAN_RAYS = 4096
+_MAX_DISTANCE_M, _MAX_HEIGHT_MM = 1e12, 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +71,8 @@ class Spot:
         order = np.argsort(self.r)
         light = self.weight[order]
         ring = np.minimum((np.cumsum(light) * 16).astype(int), 15)
-        turn = np.arctan2(self.y, self.x)[order]
-        waves = [np.bincount(ring, light * wave(n * turn), 16) for n in range(1, 5) for wave in (np.cos, np.sin)]
+        angle = np.arctan2(self.y, self.x)[order]
+        waves = [np.bincount(ring, light * wave(n * angle), 16) for n in range(1, 5) for wave in (np.cos, np.sin)]
         return math.sqrt(2.0 * float(np.mean(np.sum(np.square(waves), 0) / np.bincount(ring, light, 16) ** 2)))
 
 
@@ -86,21 +86,21 @@ def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best", reference: Re
         ValueError: If the object is too near for focusing, or an argument is invalid.
     """
     a_choice("focus", kind, get_args(Focus))
-    first = lens.paraxial()
-    sensor = first.back_focal
+    paraxial = lens.paraxial()
+    sensor = paraxial.back_focal
     a_choice("reference", reference, get_args(Reference))
     for _ in range(100 if reference == "sensor" else 1):  # a distance from the sensor changes with the sensor's place
-        object_mm, before = vertex_distance_mm(lens, focus_m, reference, sensor), sensor
-        distance = object_mm + first.front_principal
-        if distance <= first.focal_length:
+        object_mm, previous = vertex_distance_mm(lens, focus_m, reference, sensor), sensor
+        distance = object_mm + paraxial.front_principal
+        if distance <= paraxial.focal_length:
             raise ValueError(
-                f"the focus must be farther than the focal length ({first.focal_length:.4g} mm) from the front "
+                f"the focus must be farther than the focal length ({paraxial.focal_length:.4g} mm) from the front "
                 f"principal plane, got {distance:.4g} mm"
             )
-        sensor = first.rear_principal + 1.0 / (1.0 / first.focal_length - 1.0 / distance)
+        sensor = paraxial.rear_principal + 1.0 / (1.0 / paraxial.focal_length - 1.0 / distance)
         if kind == "best":
             aim, _, high = _rays_of_point(lens, object_mm, sensor)
-            traced, weight = aim(_fan(high[1], _FAN))
+            traced, weight = aim(_fan(high[1], _FAN_RAYS))
             weight, height = weight * traced.alive, traced.at(lens.vertices[-1] + sensor)[1]
             slope = traced.direction[1] / traced.direction[2]
             # the mean squared radius is a parabola over the sensor's position
@@ -110,7 +110,7 @@ def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best", reference: Re
                     f"no ray of a fan through lens {lens.name!r} comes to a focus; are its openings too narrow?"
                 )
             sensor -= float(weight @ (height * slope)) / steepness
-        if abs(sensor - before) < 1e-12 * first.focal_length:
+        if abs(sensor - previous) < 1e-12 * paraxial.focal_length:
             break
     return sensor
 
@@ -152,38 +152,38 @@ def point_spread(
         0.3705
     """
     whole("rays", rays, 16, 10**8)
-    number("field_mm", field_mm, low=-_WIDEST_MM, high=_WIDEST_MM, unit="millimetres")
+    number("field_mm", field_mm, low=-_MAX_HEIGHT_MM, high=_MAX_HEIGHT_MM, unit="millimetres")
     if meridional and field_mm:
         raise ValueError(f"meridional is for points on the axis, got field_mm = {field_mm}")
     object_mm, side = vertex_distance_mm(lens, z_m, reference, sensor_mm), max(4, round(math.sqrt(rays)))
     aim, low, high = _rays_of_point(lens, object_mm, sensor_mm, field_mm, wavelength_um)
     points = _fan(high[1], rays) if meridional else _grid(low, high, (np.arange(side) + 0.5) / side)
     traced, weight = aim(points)
-    alive = traced.alive
-    if not alive.any():
+    passed = traced.alive
+    if not passed.any():
         raise ValueError(f"no ray from z = {z_m} m at field {field_mm} mm passes lens {lens.name!r}")
-    hits, weight = traced.at(lens.vertices[-1] + sensor_mm)[:, alive], weight[alive] / weight[alive].sum()
+    hits, weight = traced.at(lens.vertices[-1] + sensor_mm)[:, passed], weight[passed] / weight[passed].sum()
     if meridional:
-        return Spot(hits[0], hits[1], weight, 0.0, math.pi * float(points[1, alive].max()) ** 2, True)
+        return Spot(hits[0], hits[1], weight, 0.0, math.pi * float(points[1, passed].max()) ** 2, True)
     centre = hits @ weight
     x, y = hits - centre[:, None]
-    return Spot(x, y, weight, -float(centre[1]), float(np.prod(high - low) * alive.mean()))
+    return Spot(x, y, weight, -float(centre[1]), float(np.prod(high - low) * passed.mean()))
 
 
 def vertex_distance_mm(lens: Lens, z_m: float, reference: Reference, sensor_mm: float) -> float:
     """Distance of an object in front of the first vertex, in mm."""
     a_choice("reference", reference, get_args(Reference))
-    first = lens.paraxial()
-    places = first.front_principal, first.entrance_pupil, 0.0, float(lens.vertices[-1]) + sensor_mm
-    behind_vertex = dict(zip(get_args(Reference), places, strict=True))[reference]
-    if _FARTHEST_M < z_m < math.inf:
-        raise ValueError(f"objects must be at most {_FARTHEST_M:g} m away, or at infinity, got {z_m} m")
-    if not 1000.0 * z_m - behind_vertex > max(0.0, -first.entrance_pupil):
+    paraxial = lens.paraxial()
+    reference_z = paraxial.front_principal, paraxial.entrance_pupil, 0.0, float(lens.vertices[-1]) + sensor_mm
+    reference_mm = dict(zip(get_args(Reference), reference_z, strict=True))[reference]
+    if _MAX_DISTANCE_M < z_m < math.inf:
+        raise ValueError(f"objects must be at most {_MAX_DISTANCE_M:g} m away, or at infinity, got {z_m} m")
+    if not 1000.0 * z_m - reference_mm > max(0.0, -paraxial.entrance_pupil):
         raise ValueError(
-            f"objects must lie in front of the lens, more than {max(behind_vertex, 0.0) / 1000:.4g} m from its "
+            f"objects must lie in front of the lens, more than {max(reference_mm, 0.0) / 1000:.4g} m from its "
             f"{reference}, got {z_m} m"
         )
-    return 1000.0 * z_m - behind_vertex
+    return 1000.0 * z_m - reference_mm
 
 
 def _fan(reach: float, rays: int) -> Array:
@@ -205,30 +205,30 @@ def _rays_of_point(
         A function that traces rays through points ``[2, R]`` of the entrance pupil's plane, and gives the solid angle
         of each; and the bounding box, low and high ``[2]``, in that plane of the rays that pass the lens.
     """
-    first = lens.paraxial()
-    pupil, front = first.entrance_pupil, lens.surfaces[0].diameter
+    paraxial = lens.paraxial()
+    pupil, front_diameter = paraxial.entrance_pupil, lens.surfaces[0].diameter
     distance = object_mm + pupil  # from the entrance pupil
-    tangent = field_mm / (sensor_mm - first.rear_principal)  # of the point's direction, seen from H
-    slope = tangent * (1.0 + (first.front_principal - pupil) / distance)  # from the pupil
+    tangent = field_mm / (sensor_mm - paraxial.rear_principal)  # of the point's direction, seen from H
+    slope = tangent * (1.0 + (paraxial.front_principal - pupil) / distance)  # from the pupil
 
     def aim(points: Array) -> tuple[Rays, Array]:
         slopes = points / distance - np.array([[0.0], [slope]])
-        run = np.concatenate([slopes, np.ones_like(slopes[:1])])
-        length = np.sqrt((run * run).sum(0))
+        rays = np.concatenate([slopes, np.ones_like(slopes[:1])])
+        length = np.sqrt((rays * rays).sum(0))
         # start in the plane of the first vertex: the pupil's plane may lie inside the lens
         start = np.concatenate([points - pupil * slopes, np.zeros_like(slopes[:1])])
-        return trace_rays(lens, start, run / length, wavelength_um), length**-3
+        return trace_rays(lens, start, rays / length, wavelength_um), length**-3
 
     # every passing ray crosses the first surface's clear diameter
-    reach = front / 2 + abs(pupil) * (abs(tangent) + front / distance)
+    reach = front_diameter / 2 + abs(pupil) * (abs(tangent) + front_diameter / distance)
     low, high = np.array([-reach, -reach]), np.array([reach, reach])
     for _ in range(8):
-        points = _grid(low, high, np.linspace(0.0, 1.0, _PROBES + 1))
+        points = _grid(low, high, np.linspace(0.0, 1.0, _PUPIL_INTERVALS + 1))
         passed = points[:, aim(points)[0].alive]
         if not passed.size:
             raise ValueError(f"no ray of the object point passes lens {lens.name!r}; is it in the field of view?")
-        cell, before = (high - low) / _PROBES, np.prod(high - low)
+        cell, old_area = (high - low) / _PUPIL_INTERVALS, np.prod(high - low)
         low, high = np.maximum(passed.min(1) - cell, low), np.minimum(passed.max(1) + cell, high)
-        if np.prod(high - low) > 0.95 * before:
+        if np.prod(high - low) > 0.95 * old_area:
             break
     return aim, low, high

@@ -20,9 +20,9 @@ from torchdof.validation import show
 from ..result import Array, Mask
 from .glass import Glass
 
-_SMALLEST_MM, _LARGEST_MM, _MOST_CONIC, _DEEPEST_MM = 1e-3, 1e7, 1e6, 1e15  # beyond these, sums overflow
+_MIN_MM, _MAX_MM, _MAX_CONIC, _MAX_DEPTH_MM = 1e-3, 1e7, 1e6, 1e15  # beyond these, sums overflow
 _STEPS = 50  # of Newton's method; four do for most aspheres
-_CLOSE_MM = 1e-10
+_TOLERANCE_MM = 1e-10
 
 
 @dataclass(frozen=True)
@@ -40,15 +40,15 @@ class Surface:
         """Raises a `ValueError` for a number outside its range; the message begins with its name."""
         if not isinstance(self.glass, Glass) or not isinstance(self.polynomial, tuple):
             raise ValueError(f"glass must be a Glass and polynomial a tuple of numbers, got {show(self)}")
-        _check("diameter", self.diameter, _SMALLEST_MM, _LARGEST_MM)
-        _check("thickness", self.thickness, 0.0, _LARGEST_MM)
+        _check("diameter", self.diameter, _MIN_MM, _MAX_MM)
+        _check("thickness", self.thickness, 0.0, _MAX_MM)
         _check("radius", self.radius, -math.inf, math.inf)
-        if not (_SMALLEST_MM <= abs(self.radius) <= _LARGEST_MM or abs(self.radius) == math.inf):
-            raise ValueError(f"radius must be inf, or {_SMALLEST_MM:g} to {_LARGEST_MM:g} mm long, got {self.radius}")
-        _check("conic constant", self.conic, -_MOST_CONIC, _MOST_CONIC)
+        if not (_MIN_MM <= abs(self.radius) <= _MAX_MM or abs(self.radius) == math.inf):
+            raise ValueError(f"radius must be inf, or {_MIN_MM:g} to {_MAX_MM:g} mm long, got {self.radius}")
+        _check("conic constant", self.conic, -_MAX_CONIC, _MAX_CONIC)
         for i, coefficient in enumerate(self.polynomial):
-            most = _DEEPEST_MM / (self.diameter / 2.0) ** (2 * i + 2)  # limits the depth of the surface's rim
-            _check(f"A{2 * i + 2}", coefficient, -most, most)
+            limit = _MAX_DEPTH_MM / (self.diameter / 2.0) ** (2 * i + 2)  # limits the depth of the surface's rim
+            _check(f"A{2 * i + 2}", coefficient, -limit, limit)
 
     def bent(self, factor: float) -> Surface:
         """The surface with all lengths of its shape multiplied by a factor; -1 exchanges its sides."""
@@ -83,23 +83,23 @@ class Surface:
         run = -z / w
         x, y, z = x + run * u, y + run * v, np.zeros_like(x)
         curvature = 1.0 / self.radius
-        half, away = w - curvature * (x * u + y * v), curvature * (x * x + y * y)
-        discriminant = half * half - curvature * (1.0 + self.conic * w * w) * away
-        met = (discriminant >= 0) & (half > 0)
-        step = np.where(met, away / np.where(met, half + np.sqrt(np.maximum(discriminant, 0.0)), 1.0), 0.0)
+        half_b, offset = w - curvature * (x * u + y * v), curvature * (x * x + y * y)
+        discriminant = half_b * half_b - curvature * (1.0 + self.conic * w * w) * offset
+        hits = (discriminant >= 0) & (half_b > 0)
+        step = np.where(hits, offset / np.where(hits, half_b + np.sqrt(np.maximum(discriminant, 0.0)), 1.0), 0.0)
         for _ in range(_STEPS):
             x, y, z, run = x + step * u, y + step * v, z + step * w, run + step
             height, slope = self.sag(x * x + y * y)
-            off = z - height
-            met &= np.isfinite(off)
-            if not (np.abs(off[met]) > _CLOSE_MM / 10.0).any():
+            error = z - height
+            hits &= np.isfinite(error)
+            if not (np.abs(error[hits]) > _TOLERANCE_MM / 10.0).any():
                 break
-            fall = w - 2.0 * slope * (x * u + y * v)
-            step = np.where(met & (fall > 0), -off / np.where(fall > 0, fall, 1.0), 0.0)
-        met &= np.abs(off) <= _CLOSE_MM  # also False for NaN
-        slope = np.where(met, slope, 0.0)
+            rate = w - 2.0 * slope * (x * u + y * v)
+            step = np.where(hits & (rate > 0), -error / np.where(rate > 0, rate, 1.0), 0.0)
+        hits &= np.abs(error) <= _TOLERANCE_MM  # also False for NaN
+        slope = np.where(hits, slope, 0.0)
         normal = np.stack([-2.0 * slope * x, -2.0 * slope * y, np.ones_like(x)])
-        return run, normal / np.sqrt((normal * normal).sum(0)), met
+        return run, normal / np.sqrt((normal * normal).sum(0)), hits
 
 
 def _check(name: str, value: float, low: float, high: float) -> None:

@@ -93,8 +93,8 @@ def trace_table(
         >>> trace_table(lens, f_number=4.0, focus_m=2.0, nodes=5, points=9, rays=200)
         BlurTable('double_gauss_50mm_f4', radial, 5 nodes)
     """
-    given = dict(locals())
-    _check(given)
+    arguments = dict(locals())
+    _check(arguments)
     stopped = lens.with_f_number(f_number)
     focal = lens.paraxial().focal_length
     sensor = focus_sensor(stopped, focus_m, focus, reference)
@@ -104,7 +104,7 @@ def trace_table(
         raise ValueError(f"nearest_m must be nearer than the focus at {focus_m} m, got {nearest_m}")
     rays = (50_000 if field_mm else 2_000) if rays is None else rays
     ends = torch.tensor([nearest_m, math.inf], dtype=torch.float64)[None, None, None]
-    near, far = Camera(focal, f_number, focus_m, 1.0).coc_px(ends, width=1).flatten().tolist()  # with pixels of 1 mm
+    near, far = Camera(focal, f_number, focus_m, 1.0).coc_px(ends, width=1).flatten().tolist()  # a pixel is 1 mm
 
     def distance(coc: float) -> float:
         dioptres = 1.0 / focus_m - coc / near * (1.0 / focus_m - 1.0 / nearest_m)
@@ -116,63 +116,63 @@ def trace_table(
         return point_spread(stopped, distance(coc), sensor, wavelength_um=wavelength_um, **options)
 
     with one_thread():
-        first, *others = (
+        d_line, *coloured = (
             Tracer(partial(spot, wavelength_um=wavelength), points, sensor_width_mm / width_px)
             for wavelength in (None, *(wavelengths_um or ()))
         )
-        places = place_nodes(first, near, far, nodes)
-        channels = others or [first]
-        fitted = [fit_radial(t, places) if family == "radial" else fit_shapes(t, places, family) for t in channels]
-        across = None
+        cocs = place_nodes(d_line, near, far, nodes)
+        channels = coloured or [d_line]
+        fitted = [fit_radial(t, cocs) if family == "radial" else fit_shapes(t, cocs, family) for t in channels]
+        spots = None
         if field is not None:
-            blurs = coc_nodes(near, far, field_nodes)
-            across = trace_field(stopped, sensor, distance, blurs, field, wavelengths_um, field_rays, reference)
-    del given["lens"]
-    call = ", ".join(f"{key}={value!r}" for key, value in {**given, "nearest_m": nearest_m, "rays": rays}.items())
+            field_cocs = coc_nodes(near, far, field_nodes)
+            spots = trace_field(stopped, sensor, distance, field_cocs, field, wavelengths_um, field_rays, reference)
+    del arguments["lens"]
+    call = ", ".join(f"{key}={value!r}" for key, value in {**arguments, "nearest_m": nearest_m, "rays": rays}.items())
     provenance = {
         "lens": lens.name,
         "source": lens.source,
         "prescription": "; ".join(lens.lines()),
         "focal_length_mm": round(focal, 4),
         "f_number_paraxial": round(stopped.paraxial().f_number, 4),
-        **{key: given[key] for key in ("f_number", "focus", "reference", "field_mm")},
+        **{key: arguments[key] for key in ("f_number", "focus", "reference", "field_mm")},
         "focus_m": focus_m if math.isfinite(focus_m) else "inf",
         "nearest_m": round(nearest_m, 6),
         "wavelengths_um": list(wavelengths_um or ()) or "d line",
-        "asymmetry": [round(channels[-1].spot(coc).asymmetry, 4) for coc in places] if field_mm else 0.0,
+        "asymmetry": [round(channels[-1].spot(coc).asymmetry, 4) for coc in cocs] if field_mm else 0.0,
         "fitted_for": f"{width_px} px on {sensor_width_mm:g} mm; geometric spots, no diffraction",
         "date": datetime.date.today().isoformat(),
         "command": f"torchdof.fit.trace_table(Lens.read({lens.name!r}), {call})",
     }
     return BlurTable(
         family,
-        _rounded(np.array(places), 9),
+        _rounded(np.array(cocs), 9),
         {key: [_rounded(params[key]) for params, _ in fitted] for key in FAMILIES[family]},
         unit="mm",
         sensor_width_mm=sensor_width_mm,
         name=f"{lens.name}_f{f_number:g}" if name is None else name,
         provenance=provenance,
         residual=_rounded(np.sqrt(np.mean([residual**2 for _, residual in fitted], axis=0))),
-        field=across,
+        field=spots,
     )
 
 
-def _check(given: dict[str, Any]) -> None:
+def _check(arguments: dict[str, Any]) -> None:
     """Raises an error for invalid arguments of `trace_table`; `focus_sensor` and `point_spread` check the rest."""
-    lens, focus_m, wavelengths, field = (given[key] for key in ("lens", "focus_m", "wavelengths_um", "field"))
+    lens, focus_m, wavelengths, field = (arguments[key] for key in ("lens", "focus_m", "wavelengths_um", "field"))
     if not isinstance(lens, Lens):
         raise ValueError(f"lens must be a Lens, got {show(lens)}; read one with Lens.read()")
-    a_choice("family", given["family"], tuple(FAMILIES))
+    a_choice("family", arguments["family"], tuple(FAMILIES))
     number("focus_m", focus_m, 0, unit="metres", infinite=True)
-    number("field_mm", given["field_mm"], -1e6, 1e6)
-    number("sensor_width_mm", given["sensor_width_mm"], 0, 1e9)
-    number("width_px", given["width_px"], 0, 1e9, unit="pixels")
-    if given["nodes"] is not None:
-        whole("nodes", given["nodes"], 5 if math.isfinite(focus_m) else 3, 1000)
-    for name, least, most in (("points", 3, 1000), ("field_nodes", 2, 100), ("field_rays", 1000, 10**7)):
-        whole(name, given[name], least, most)
-    if not isinstance(given["name"], str | None):
-        raise ValueError(f"name must be a text, got {show(given['name'])}")
+    number("field_mm", arguments["field_mm"], -1e6, 1e6)
+    number("sensor_width_mm", arguments["sensor_width_mm"], 0, 1e9)
+    number("width_px", arguments["width_px"], 0, 1e9, unit="pixels")
+    if arguments["nodes"] is not None:
+        whole("nodes", arguments["nodes"], 5 if math.isfinite(focus_m) else 3, 1000)
+    for name, low, high in (("points", 3, 1000), ("field_nodes", 2, 100), ("field_rays", 1000, 10**7)):
+        whole(name, arguments[name], low, high)
+    if not isinstance(arguments["name"], str | None):
+        raise ValueError(f"name must be a text, got {show(arguments['name'])}")
     if wavelengths is not None:
         if not isinstance(wavelengths, list | tuple) or not wavelengths:
             raise ValueError(f"wavelengths_um must be a list of wavelengths in micrometres, got {show(wavelengths)}")
@@ -181,10 +181,10 @@ def _check(given: dict[str, Any]) -> None:
         if not lens.dispersive:
             raise ValueError(f"wavelengths_um need a lens with Abbe numbers (index/V); {lens.name!r} has none")
     if field is not None:
-        if given["field_mm"]:
+        if arguments["field_mm"]:
             raise ValueError("field_mm averages one place, field traces several: give one of them")
-        listed = isinstance(field, list | tuple) and len(field) > 1 and field[0] == 0
-        if not listed or not all(low < number("field", high, 0, 1e6, unit="mm") for low, high in pairwise(field)):
+        is_list = isinstance(field, list | tuple) and len(field) > 1 and field[0] == 0
+        if not is_list or not all(low < number("field", high, 0, 1e6, unit="mm") for low, high in pairwise(field)):
             text = "field must be increasing distances in mm from the middle of the frame, from 0 on"
             raise ValueError(f"{text}, got {show(field)}")
 

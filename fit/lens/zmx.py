@@ -23,12 +23,12 @@ def parse(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
         ValueError: If it is not a sequential lens that can be traced; the message names the surface.
     """
     text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
-    listed: list[dict[str, list[str]]] = []
+    records: list[dict[str, list[str]]] = []
     unit, name = 1.0, ""
     for line in text.splitlines():
         word, *fields = line.split() or [""]
         if word == "SURF":
-            listed.append({})
+            records.append({})
         elif word == "MODE" and fields[:1] != ["SEQ"]:
             raise ValueError(f"a sequential lens was expected (MODE SEQ), got {line.strip()!r}")
         elif word == "MNUM" and fields[:1] not in ([], ["0"], ["1"]):
@@ -39,49 +39,49 @@ def parse(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
             unit = _UNITS[fields[0]]
         elif word == "NAME":
             name = " ".join(fields)
-        elif listed:
-            listed[-1][f"PARM {fields[0]}" if word == "PARM" and fields else word] = fields
-    if len(listed) < 3:
-        raise ValueError(f"expected an object, surfaces of a lens and an image (SURF), got {len(listed)} surfaces")
+        elif records:
+            records[-1][f"PARM {fields[0]}" if word == "PARM" and fields else word] = fields
+    if len(records) < 3:
+        raise ValueError(f"expected an object, surfaces of a lens and an image (SURF), got {len(records)} surfaces")
     surfaces: list[Surface] = []
     stops = []
-    for at, given in enumerate(listed[1:-1], start=1):
+    for surface_number, record in enumerate(records[1:-1], start=1):
         try:
-            surface = _surface(given, unit, surfaces[-1].glass if surfaces else AIR)
+            surface = _surface(record, unit, surfaces[-1].glass if surfaces else AIR)
             if isinstance(surface, Surface):
-                stops += [len(surfaces)] * ("STOP" in given)
+                stops += [len(surfaces)] * ("STOP" in record)
                 surfaces.append(surface)
             elif surfaces:
                 surfaces[-1] = replace(surfaces[-1], thickness=surfaces[-1].thickness + surface)
         except ValueError as error:
-            raise ValueError(f"surface {at}: {error}") from None
+            raise ValueError(f"surface {surface_number}: {error}") from None
     if len(stops) != 1:
         raise ValueError(f"expected one stop (STOP) among the surfaces of the lens, got {len(stops)}")
     surfaces[-1] = replace(surfaces[-1], thickness=0.0)
     return tuple(surfaces), stops[0], f"Zemax file{f': {name}' if name else ''}"
 
 
-def _surface(given: dict[str, list[str]], unit: float, before: Glass) -> Surface | float:
+def _surface(record: dict[str, list[str]], unit: float, medium: Glass) -> Surface | float:
     """A surface behind a medium; for a flat one in air, which is not part of the lens, only its thickness in mm."""
 
-    def number(word: str, place: int = 0) -> float:
-        fields = given.get(word, [])
+    def number(word: str, index: int = 0) -> float:
+        fields = record.get(word, [])
         try:
-            return float(fields[place]) if len(fields) > place else 0.0
+            return float(fields[index]) if len(fields) > index else 0.0
         except ValueError:
-            raise ValueError(f"{word} must be a number, got {fields[place]!r}") from None
+            raise ValueError(f"{word} must be a number, got {fields[index]!r}") from None
 
-    kind = (given.get("TYPE") or ["STANDARD"])[0]
+    kind = (record.get("TYPE") or ["STANDARD"])[0]
     if kind not in ("STANDARD", "EVENASPH"):
         raise ValueError(f"TYPE must be STANDARD or EVENASPH, got {kind}")
-    if refused := _APERTURES.intersection(given):
-        raise ValueError(f"only round apertures without obstruction are read, got {min(refused)}")
-    curvature, thickness, glass = number("CURV") / unit, number("DISZ") * unit, _glass(given.get("GLAS", []))
+    if unsupported := _APERTURES.intersection(record):
+        raise ValueError(f"only round apertures without obstruction are read, got {min(unsupported)}")
+    curvature, thickness, glass = number("CURV") / unit, number("DISZ") * unit, _glass(record.get("GLAS", []))
     powers = range(1, 9) if kind == "EVENASPH" else ()
     polynomial = tuple(number(f"PARM {i}", 1) * unit ** (1 - 2 * i) for i in powers)
-    if before == glass == AIR and not (curvature or any(polynomial) or "STOP" in given):
+    if medium == glass == AIR and not (curvature or any(polynomial) or "STOP" in record):
         return thickness
-    diameter = 2.0 * unit * (number("CLAP", 1) if "CLAP" in given else number("DIAM"))
+    diameter = 2.0 * unit * (number("CLAP", 1) if "CLAP" in record else number("DIAM"))
     if not diameter:
         raise ValueError("no clear semi-diameter (DIAM); state it in the file")
     return Surface(1.0 / curvature if curvature else math.inf, thickness, glass, diameter, number("CONI"), polynomial)

@@ -17,8 +17,8 @@ from .captures import Captures
 from .table import TableFit
 
 _CELLS = (96, 48)  # of half a spot, along and across the radial direction
-_FINE = 64  # pixels on each side of the centre when a dot's kernel is drawn
-_SAME = 0.05  # share of the largest distance from the centre within which dots are averaged
+_KERNEL_HALF = 64  # pixels on each side of the centre when a dot's kernel is drawn
+_RING_WIDTH = 0.05  # share of the largest distance from the centre within which dots are averaged
 
 
 def table_of_dots(dots: Sequence[tuple[Captures, TableFit]]) -> BlurTable:
@@ -37,64 +37,64 @@ def table_of_dots(dots: Sequence[tuple[Captures, TableFit]]) -> BlurTable:
     """
     if len(dots) < 2:
         raise FitError(f"dots must be those of a grid, two at least, got {len(dots)}")
-    captures, fitted = dots[0]
-    first = fitted.table
-    for other, its_fit in dots:
-        same = its_fit.table.coc.shape == first.coc.shape and torch.allclose(its_fit.table.coc, first.coc, rtol=1e-6)
-        if not same or its_fit.table.channels != first.channels:
-            where = other.notes.get("position_px")
-            raise FitError(f"the dot at {where} px must be fitted at the distances and colours of the first one")
+    captures, first_fit = dots[0]
+    first = first_fit.table
+    for other, fit in dots:
+        is_like_first = fit.table.coc.shape == first.coc.shape and torch.allclose(fit.table.coc, first.coc, rtol=1e-6)
+        if not is_like_first or fit.table.channels != first.channels:
+            position = other.notes.get("position_px")
+            raise FitError(f"the dot at {position} px must be fitted at the distances and colours of the first one")
     centres = [other.pairs[0].position_px for other, _ in dots]
-    per_px = float(first.coc[-1]) / fitted.coc_px[-1]
-    places = [(x * per_px, y * per_px) for x, y in centres]
-    field = field_of_dots([its_fit.table for _, its_fit in dots], places, captures.focus_m / captures.distances_m)
-    found = {"dots_px": [list(place) for place in centres]}
-    return first.replace(aperture=None, field=field, provenance=first.provenance | found)
+    unit_per_px = float(first.coc[-1]) / first_fit.coc_px[-1]
+    positions = [(x * unit_per_px, y * unit_per_px) for x, y in centres]
+    field = field_of_dots([fit.table for _, fit in dots], positions, captures.focus_m / captures.distances_m)
+    dot_positions = {"dots_px": [list(centre) for centre in centres]}
+    return first.replace(aperture=None, field=field, provenance=first.provenance | dot_positions)
 
 
-def field_of_dots(tables: Sequence[BlurTable], places: Sequence[tuple[float, float]], shrunk: Array) -> Field:
+def field_of_dots(tables: Sequence[BlurTable], points: Sequence[tuple[float, float]], scales: Array) -> Field:
     """Spots over blur and distance from the centre, from tables with the same nodes at single positions (x, y).
 
     Positions are those in the sharp picture, relative to the centre of the frame, in the tables' unit. At each node the
-    picture is smaller by the factor `shrunk`, the focus distance over the object distance.
+    picture is smaller by the factor `scales`, the focus distance over the object distance.
     """
-    away = np.hypot(*np.array(places, dtype=np.float64).T)
-    order = np.argsort(away)
-    groups = np.split(order, np.flatnonzero(np.diff(away[order]) > _SAME * away.max()) + 1)  # dots at similar distances
-    rings = groups if away[groups[0]].mean() > _SAME * away.max() else groups[1:]
-    if not rings or away.max() == 0:
+    radii = np.hypot(*np.array(points, dtype=np.float64).T)
+    order = np.argsort(radii)
+    groups = np.split(order, np.flatnonzero(np.diff(radii[order]) > _RING_WIDTH * radii.max()) + 1)  # by distance
+    rings = groups if radii[groups[0]].mean() > _RING_WIDTH * radii.max() else groups[1:]
+    if not rings or radii.max() == 0:
         raise FitError(f"dots must lie at two distances from the middle of the frame at least, got {len(groups)}")
-    rising = np.array([0.0, *(away[ring].mean() for ring in rings)])
+    ring_radii = np.array([0.0, *(radii[ring].mean() for ring in rings)])
     # distances that dots reach in any picture: from the smallest picture's to the largest picture's
-    both = np.sort(np.concatenate([rising * min(shrunk), rising[1:] * max(shrunk)]))
-    radius = both[np.concatenate([[True], np.diff(both) > 1e-3 * both[-1]])]
+    all_radii = np.sort(np.concatenate([ring_radii * min(scales), ring_radii[1:] * max(scales)]))
+    radius = all_radii[np.concatenate([[True], np.diff(all_radii) > 1e-3 * all_radii[-1]])]
     boxes, light = [], []
     for k in range(len(tables[0].coc)):
-        spots = [_spot(tables, places, groups[0], k, azimuths=32), *(_spot(tables, places, ring, k) for ring in rings)]
-        nodes = rising * shrunk[k]
+        spots = [_spot(tables, points, groups[0], k, azimuths=32), *(_spot(tables, points, ring, k) for ring in rings)]
+        nodes = ring_radii * scales[k]
         low = np.clip(np.searchsorted(nodes, radius, side="right") - 1, 0, len(nodes) - 2)
-        part = torch.from_numpy(np.clip((radius - nodes[low]) / (nodes[low + 1] - nodes[low]), 0.0, 1.0))
-        reach, seen = torch.tensor([spot[0] for spot in spots]).double(), torch.stack([spot[1] for spot in spots])
-        boxes.append(torch.lerp(reach[low], reach[low + 1], part))
-        light.append(torch.lerp(seen[low], seen[low + 1], part[:, None, None, None]))
+        weight = torch.from_numpy(np.clip((radius - nodes[low]) / (nodes[low + 1] - nodes[low]), 0.0, 1.0))
+        half_sides, cells = torch.tensor([spot[0] for spot in spots]).double(), torch.stack([spot[1] for spot in spots])
+        boxes.append(torch.lerp(half_sides[low], half_sides[low + 1], weight))
+        light.append(torch.lerp(cells[low], cells[low + 1], weight[:, None, None, None]))
     coc, sizes, cells = tables[0].coc, torch.stack(boxes), torch.stack(light)  # [K], [K, F], [K, F, C, U, V]
     if not bool((coc < 0).any() and (coc > 0).any()):  # the other side of focus has these spots rotated by half a turn
         coc, sizes, cells = torch.cat([coc, -coc]), torch.cat([sizes, sizes]), torch.cat([cells, cells.flip(-2)])
         rising_coc = coc.argsort()
         coc, sizes, cells = coc[rising_coc], sizes[rising_coc], cells[rising_coc]
-    upper = int((coc > 0).nonzero()[0])
+    first_behind = int((coc > 0).nonzero()[0])
     # in focus, interpolate the signed size: if it is not 0, that position has its focus at another depth
-    part = coc[upper - 1] / (coc[upper - 1] - coc[upper])
-    size = torch.lerp(-sizes[upper - 1], sizes[upper], part).abs()
-    between = torch.lerp(cells[upper - 1], cells[upper], part)
-    parts = ((coc, coc.new_zeros(1)), (sizes, size[None]), (cells, between[None]))
-    coc, sizes, cells = (torch.cat([of[:upper], new, of[upper:]]) for of, new in parts)
+    weight = coc[first_behind - 1] / (coc[first_behind - 1] - coc[first_behind])
+    size = torch.lerp(-sizes[first_behind - 1], sizes[first_behind], weight).abs()
+    focus_cells = torch.lerp(cells[first_behind - 1], cells[first_behind], weight)
+    parts = ((coc, coc.new_zeros(1)), (sizes, size[None]), (cells, focus_cells[None]))
+    coc, sizes, cells = (torch.cat([values[:first_behind], new, values[first_behind:]]) for values, new in parts)
     box = torch.stack([torch.zeros_like(sizes), sizes, sizes], -1)
     return Field(coc, torch.from_numpy(radius), box, cells.permute(2, 0, 1, 3, 4))
 
 
 def _spot(
-    tables: Sequence[BlurTable], places: Sequence[tuple[float, float]], group: np.ndarray, node: int, azimuths: int = 0
+    tables: Sequence[BlurTable], points: Sequence[tuple[float, float]], group: np.ndarray, node: int, azimuths: int = 0
 ) -> tuple[float, Tensor]:
     """Half side of the box, and the light ``[C, U, V]``, of dots at one distance from the centre, at a node.
 
@@ -106,16 +106,16 @@ def _spot(
     along, across = (torch.arange(n, dtype=torch.float64) + 0.5 for n in _CELLS)
     u, v = (along * (2.0 / _CELLS[0]) - 1.0)[:, None], across / _CELLS[1]
     total = torch.zeros(tables[0].channels, *_CELLS, dtype=torch.float64)
-    width = _FINE / reach / unit
+    width = _KERNEL_HALF / reach / unit
     for i in group:
         kernel = tables[i].kernels(torch.tensor([coc * width], dtype=torch.float64), width)
-        x, y = places[i]
+        x, y = points[i]
         angles = np.linspace(0.0, 2.0 * math.pi, azimuths, endpoint=False) if azimuths else [math.atan2(y, x)]
         for angle in angles:
             sine, cosine = math.sin(angle), math.cos(angle)
             for side in (1.0, -1.0):
-                place = torch.stack([u * cosine - side * v * sine, u * sine + side * v * cosine], -1)
-                grid = place * (2.0 * _FINE / kernel.shape[-1])
-                taken = functional.grid_sample(kernel, grid[None], align_corners=False)[0]
-                total += taken / (len(angles) * taken.sum((-2, -1), keepdim=True))
+                grid_points = torch.stack([u * cosine - side * v * sine, u * sine + side * v * cosine], -1)
+                grid = grid_points * (2.0 * _KERNEL_HALF / kernel.shape[-1])
+                sampled = functional.grid_sample(kernel, grid[None], align_corners=False)[0]
+                total += sampled / (len(angles) * sampled.sum((-2, -1), keepdim=True))
     return reach, total / (2 * len(group))

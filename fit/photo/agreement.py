@@ -21,9 +21,9 @@ from ..result import Array, Mask
 from ..validation import a_number
 from .captures import CAMERA, Captures
 
-_TELLING_PX = 2.0  # px; smaller blurs are dominated by aberrations
-_WARNED, _REFUSED = math.log(1.15), math.log(1.35)  # a thick lens differs by up to 1.1, a stop is 1.41
-_EXPLAINED = math.log(1.12)  # remaining log factor up to which a cause explains the difference
+_MIN_BLUR_PX = 2.0  # radius of a blur that counts; smaller ones are dominated by aberrations
+_WARN_LOG, _REFUSE_LOG = math.log(1.15), math.log(1.35)  # a thick lens differs by up to 1.1, an f-stop by 1.41
+_EXPLAINED_LOG = math.log(1.12)  # remaining log factor up to which a cause explains the difference
 _UNITS = {3.28: "feet", 39.4: "inches", 100.0: "centimetres", 1000.0: "millimetres"}
 
 
@@ -33,42 +33,42 @@ def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> N
     Raises:
         FitError: of kind "camera" if they differ by a factor above 1.35; it warns above 1.15.
     """
-    measured, promised = np.asarray(radius_px, dtype=np.float64), captures.promised_px
+    measured, camera_px = np.asarray(radius_px, dtype=np.float64), captures.promised_px
     defocus = np.abs(captures.defocus)
-    expected = defocus * _common_factor(defocus, measured) if promised is None else np.abs(promised)
-    telling = np.maximum(expected, measured) > _TELLING_PX
+    expected = defocus * _common_factor(defocus, measured) if camera_px is None else np.abs(camera_px)
+    is_large = np.maximum(expected, measured) > _MIN_BLUR_PX
     # without a camera the scale is fitted to the distances themselves
-    if int(telling.sum()) < (3 if promised is None else 1):
+    if int(is_large.sum()) < (3 if camera_px is None else 1):
         return
-    off = _misfit(expected, measured, telling)
-    if off < _WARNED:
+    misfit_log = _misfit(expected, measured, is_large)
+    if misfit_log < _WARN_LOG:
         return
-    readings = sorted(_readings(captures, expected, measured, telling))
-    likely = [text for misfit, text in readings if misfit < min(_EXPLAINED, 0.5 * off)]
-    worst = int(np.argmax(np.where(telling, np.abs(np.log(measured / expected)), 0.0)))
-    who = "the other distances" if promised is None else "the camera's numbers"
+    readings = sorted(_causes(captures, expected, measured, is_large))
+    likely = [text for misfit, text in readings if misfit < min(_EXPLAINED_LOG, 0.5 * misfit_log)]
+    worst = int(np.argmax(np.where(is_large, np.abs(np.log(measured / expected)), 0.0)))
+    source = "the other distances" if camera_px is None else "the camera's numbers"
     text = (
-        f"at {captures.distances_m[worst]:g} m the blur has a radius of {measured[worst]:.3g} px, but {who} give "
+        f"at {captures.distances_m[worst]:g} m the blur has a radius of {measured[worst]:.3g} px, but {source} give "
         f"{expected[worst]:.3g} px; "
     )
     cause = "; or ".join(likely[:2])
     text += f"likely {cause}" if cause else "no single number explains it: check them all, and the picture of the fit"
     file, factor = captures.pairs[worst].files[1], float(measured[worst] / expected[worst])
-    if off > _REFUSED:
-        if promised is not None:
+    if misfit_log > _REFUSE_LOG:
+        if camera_px is not None:
             text += ". Leave out focal_length_mm, f_number and sensor_width_mm to have the scale measured instead"
         raise FitError(text, "camera", file=file, number=factor)
     warn(text, "camera", file=file, number=factor)
 
 
-def _readings(captures: Captures, expected: Array, measured: Array, telling: Mask) -> Iterator[tuple[float, str]]:
+def _causes(captures: Captures, expected: Array, measured: Array, is_large: Mask) -> Iterator[tuple[float, str]]:
     """Possible single mistakes: the misfit that remains if each is corrected, and its description."""
     distance, defocus = captures.distances_m, captures.defocus
     per_dioptre = float(np.median(expected / np.abs(defocus)))
     if captures.promised_px is not None:
         factor = _common_factor(expected, measured)  # of all blurs
         focal, stops, sensor = (float(getattr(captures, name)) for name in CAMERA)
-        units = [name for unit, name in _UNITS.items() if abs(math.log(factor / unit)) < _EXPLAINED]
+        units = [name for unit, name in _UNITS.items() if abs(math.log(factor / unit)) < _EXPLAINED_LOG]
         causes = [f"the distances are in {name}, not in metres" for name in units]
         if factor > 1:
             text = f"the pictures are a crop of frames about {round(captures.width_px * factor)} px wide (state "
@@ -79,26 +79,26 @@ def _readings(captures: Captures, expected: Array, measured: Array, telling: Mas
             f"the sensor is {sensor / factor:.3g} mm wide, not {sensor:g}",
             f"the focal length is {focal * math.sqrt(factor):.3g} mm, not {focal:g}",
         ]
-        yield _misfit(factor * expected, measured, telling), ", or ".join(causes)
+        yield _misfit(factor * expected, measured, is_large), ", or ".join(causes)
     for i, k in combinations(range(len(distance)), 2):
         exchanged = expected.copy()
         exchanged[[i, k]] = expected[[k, i]]
         text = f"the pictures at {distance[i]:g} and {distance[k]:g} m are exchanged"
-        yield _misfit(exchanged, measured, telling), text
-    if telling.sum() < 3:
+        yield _misfit(exchanged, measured, is_large), text
+    if is_large.sum() < 3:
         return
-    for i in np.flatnonzero(telling).tolist():
-        stands = _stands(captures, math.copysign(measured[i] / per_dioptre, defocus[i])) or "beyond infinity"
+    for i in np.flatnonzero(is_large).tolist():
+        stands = _distance_at(captures, math.copysign(measured[i] / per_dioptre, defocus[i])) or "beyond infinity"
         text = f"the distance of {distance[i]:g} m is misread: by its blur it stands at {stands}"
-        yield _misfit(expected, measured, telling & (np.arange(len(distance)) != i)), text
-    if (defocus[telling] > 0).any() and (defocus[telling] < 0).any():
-        moved = np.linspace(-1, 1, 401) * float(np.abs(defocus).max())
-        misfit, shift = min((_misfit(per_dioptre * np.abs(defocus - m), measured, telling), m) for m in moved)
-        if stands := _stands(captures, shift):
+        yield _misfit(expected, measured, is_large & (np.arange(len(distance)) != i)), text
+    if (defocus[is_large] > 0).any() and (defocus[is_large] < 0).any():
+        shifts = np.linspace(-1, 1, 401) * float(np.abs(defocus).max())
+        misfit, shift = min((_misfit(per_dioptre * np.abs(defocus - m), measured, is_large), m) for m in shifts)
+        if stands := _distance_at(captures, shift):
             yield misfit, f"the lens was focused at {stands}, not at {captures.focus_m:g} m"
 
 
-def _stands(captures: Captures, defocus: float) -> str:
+def _distance_at(captures: Captures, defocus: float) -> str:
     """The distance with this defocus [1/m], as text; empty if no distance has it."""
     vergence = 1 / captures.focus_m - defocus
     return f"{1 / vergence:.3g} m" if vergence > 0 else ""
@@ -111,11 +111,11 @@ def _common_factor(expected: Array, measured: Array) -> float:
     return float((measured / expected)[order][np.searchsorted(weight, 0.5 * weight[-1])])
 
 
-def _misfit(expected: Array, measured: Array, telling: Mask) -> float:
+def _misfit(expected: Array, measured: Array, is_large: Mask) -> float:
     """Largest |log(measured / expected)|, after subtracting half a pixel for aberrations."""
-    apart = np.maximum(np.abs(measured - expected) - 0.5, 0.0)
-    factor = np.log1p(apart / np.maximum(np.minimum(measured, expected), 1e-9))
-    return float(np.max(np.where(telling, factor, 0.0)))
+    difference = np.maximum(np.abs(measured - expected) - 0.5, 0.0)
+    factor = np.log1p(difference / np.maximum(np.minimum(measured, expected), 1e-9))
+    return float(np.max(np.where(is_large, factor, 0.0)))
 
 
 def check_reach(
@@ -150,14 +150,14 @@ def check_reach(
         >>> factors["coc"] < 1
         True
     """
-    for what, value, kind in (("table", table, BlurTable), ("camera", camera, Camera)):
+    for name, value, kind in (("table", table, BlurTable), ("camera", camera, Camera)):
         if not isinstance(value, kind):
-            raise FitError(f"{what} must be a torchdof.{kind.__name__}, got {show(value)}")
+            raise FitError(f"{name} must be a torchdof.{kind.__name__}, got {show(value)}")
     if any(isinstance(getattr(camera, name), torch.Tensor) for name in Camera.__dataclass_fields__):
         raise FitError("camera must hold plain numbers, got tensors; check one item of a batch at a time")
     a_number("width_px", width_px, 0, unit="pixels")
-    plain = all(isinstance(z, int | float) and not isinstance(z, bool) for z in (near_m, far_m))
-    if not plain or not 0 < near_m <= far_m or near_m > 1e300:
+    are_numbers = all(isinstance(z, int | float) and not isinstance(z, bool) for z in (near_m, far_m))
+    if not are_numbers or not 0 < near_m <= far_m or near_m > 1e300:
         raise FitError(f"depths must be 0 < near_m <= far_m, got {show(near_m)} and {show(far_m)}")
     factors = {"coc": 0.0, "f_number": 1.0, "focus_m": 1.0}
     if table.unit != "relative":
@@ -170,14 +170,14 @@ def check_reach(
         largest = "the other side of focus" if math.isinf(factors["coc"]) else f"{factors['coc']:.2g} times the largest"
         text = f"the scene's blur is {largest} that was measured; beyond it kernels are scaled as a thin lens would"
         warn(text, "outside measured", number=factors["coc"])
-    for name, most in (("f_number", 1.05), ("focus_m", 1.25)):
+    for name, limit in (("f_number", 1.05), ("focus_m", 1.25)):
         measured_at, used_at = table.provenance.get(name), float(getattr(camera, name))
         if not isinstance(measured_at, int | float) or isinstance(measured_at, bool):
             continue
         if not 0 < measured_at < math.inf or math.isinf(used_at):
             continue
         factors[name] = used_at / measured_at
-        if max(factors[name], 1 / factors[name]) > most:
+        if max(factors[name], 1 / factors[name]) > limit:
             text = (
                 f"the table was measured at {name} {measured_at:g} and is used at {used_at:g}; the size of the blur is "
                 "right, its shape is that of the measured one"

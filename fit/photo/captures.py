@@ -97,11 +97,9 @@ class Captures:
                 a_number(name, value, *RANGES[name])
 
     def __iter__(self) -> Iterator[Capture]:
-        """Iterate over the pairs."""
         return iter(self.pairs)
 
     def __len__(self) -> int:
-        """Number of pairs."""
         return len(self.pairs)
 
     @property
@@ -127,11 +125,11 @@ class Captures:
 def check_distances(distances: Sequence[float], focus: float, where: str | None) -> None:
     """Raises an error if distances are not positive and increasing, or one equals the focus."""
     a_number("focus_m", focus, 0, 1e100, "metres")
-    for before, distance in zip([0.0, *distances], distances, strict=False):
+    for previous, distance in zip([0.0, *distances], distances, strict=False):
         a_number("distance_m", distance, -1e100, 1e100, "metres")
-        if not before < distance:
-            listed = ", ".join(f"{d:g}" for d in distances)
-            text = f"distances must be positive and increasing, got {listed} m"
+        if not previous < distance:
+            distances_text = ", ".join(f"{d:g}" for d in distances)
+            text = f"distances must be positive and increasing, got {distances_text} m"
             raise FitError(text, "distance", file=where, number=float(distance))
         if distance == focus:
             text = f"a shot lies at the focus ({focus:g} m) and has no blur"

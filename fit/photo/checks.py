@@ -5,7 +5,7 @@ from scipy.ndimage import gaussian_filter
 
 from ..problems import FitError, warn
 from ..result import Array, BlurFit
-from .diagnostics import CHANCE, UNEVEN, asymmetry_of, size_of_blur, unexplained, unfitted_part
+from .diagnostics import ASYMMETRIC, P_VALUE, asymmetry_of, size_of_blur, unexplained, unfitted_part
 from .dot import Dot, inner_pixels
 from .forward import Solution
 from .noise import fine_variance, independent_share, noise_of, rounding_of
@@ -19,41 +19,39 @@ FAR_ABOVE = 1.6
 """Residual over noise above which a warning is given."""
 
 # a sharp picture
-_SENSOR_BLUR_PX = 0.7  # sigma of the edge that demosaicing, a filter before the sensor or a good lens leave in focus
-_SOFTENED = 0.02  # relative error of the kernel's size, from a soft sharp picture, above which to warn
-_ENCODED = 0.7  # exponent of the edge's levels below which the picture counts as sRGB encoded
-_STEEP, _CERTAIN = 0.03, 4.0  # least steepness of an S-curve: share of the dot's level, and in standard errors
-_TOGETHER = 1.9  # second differences for each independent one: neighbours share pixels
-_DECODE = "is the image linear? Decode it first"
+_FOCUSED_SIGMA_PX = 0.7  # sigma of the edge that demosaicing, a filter before the sensor or a good lens leave in focus
+_MIN_SIZE_ERROR = 0.02  # relative error of the kernel's size, from a soft sharp picture, above which to warn
+_MAX_EXPONENT = 0.7  # exponent of the edge's levels below which the picture counts as sRGB encoded
+_MIN_STEEPNESS, _MIN_SIGMAS = 0.03, 4.0  # steepness of an S-curve: share of the dot's level, and in standard errors
+_SHARED_DIFFERENCES = 1.9  # second differences for each independent one: neighbours share pixels
+_DECODE_ADVICE = "is the image linear? Decode it first"
 # a tone curve in the residual: its strength, and chi squared (two parameters), above which to warn
-_BENT, _BENT_CHI = 0.075, 30.0  # after the fit, which leaves 0.075 of a curve of 20 %
-_STEEP_TOO, _BENT_CHI_TOO = 0.008, 18.0  # the same if the sharp dot's edge is steeper than this
-_CURVED, _CURVED_CHI = 0.03, 11.0  # at the expected magnification: half of what a 20 % curve leaves
-_RESIZED = 0.015  # change of magnification that no weak tone curve causes, which changes it by 0.002 to 0.006
-_CLEARER = 4.0  # chi squared by which a curve must explain more than a change of magnification does
+_MIN_CURVE, _MIN_CHI = 0.075, 30.0  # after the fit, which leaves 0.075 of a curve of 20 %
+_SUPPORTING_EDGE, _SUPPORTED_CHI = 0.008, 18.0  # the same if the sharp dot's edge is steeper than this
+_MIN_CONTRAST, _MIN_CONTRAST_CHI = 0.03, 11.0  # at the expected magnification: half of what a 20 % curve leaves
+_MIN_RESIZING = 0.015  # change of magnification that no weak tone curve causes, which changes it by 0.002 to 0.006
+_CHI_MARGIN = 4.0  # chi squared by which a curve must explain more than a change of magnification does
 # the fit
-_MATTERS, _SEEN = 0.005, 1e-3  # residuals as shares of the light: at FAR_ABOVE, and at twice the noise
-_SPOT, _SPOT_MATTERS = 8.0, 0.003  # of a spot beyond the blur: standard deviations, share of the dot's level
-_MAGNIFIED = 0.08  # log factor between fitted and expected magnification
-_OUTSIDE_REFUSED, _OUTSIDE_WARNED = 0.05, 0.005  # share of the blur's light outside the window
+_MIN_RESIDUAL, _MIN_AT_TWICE = 0.005, 1e-3  # residual, as a share of the light: at FAR_ABOVE, at twice the noise
+_SPOT_SIGMAS, _MIN_SPOT = 8.0, 0.003  # of a spot beyond the blur: standard deviations, share of the dot's level
+_MAGNIFICATION_LOG = 0.08  # log factor between fitted and expected magnification
+_REFUSED_OUTSIDE, _WARNED_OUTSIDE = 0.05, 0.005  # share of the blur's light outside the window
 
 
-def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None) -> bool:
+def check_linearity(picture: Array, dot: Dot, edge: Edge, file: str | None) -> bool:
     """Whether noise and edge of a sharp picture's dot are those of linear light; warns if not."""
-    inside = inner_pixels(still, dot)
+    inside = inner_pixels(picture, dot)
     if inside is not None:
-        bright = fine_variance(still, inside)
-        rounding = rounding_of(still[still > dot.background + 0.5 * dot.peak])
+        bright = fine_variance(picture, inside)
+        rounding = rounding_of(picture[picture > dot.background + 0.5 * dot.peak])
         # noise in light can only grow with the level; allow 4 standard errors of its estimate
-        most = (1 + 4 / np.sqrt(int(inside.sum() / _TOGETHER))) * np.sqrt(bright + rounding)
-        if dot.noise > max(most, 1e-4 * dot.peak):
+        largest_noise = (1 + 4 / np.sqrt(int(inside.sum() / _SHARED_DIFFERENCES))) * np.sqrt(bright + rounding)
+        if dot.noise > max(largest_noise, 1e-4 * dot.peak):
             ratio = dot.noise / max(float(np.sqrt(bright)), 1e-9 * dot.peak)
-            text = (
-                f"the dark paper has {ratio:.1f} times the noise of the white dot, as in a picture that is left sRGB "
-            )
-            warn(f"{text}encoded; {_DECODE}", "not linear", file=file, number=ratio)
+            text = f"the dark paper has {ratio:.1f} times the noise of the white dot, as in a picture that is left "
+            warn(f"{text}sRGB encoded; {_DECODE_ADVICE}", "not linear", file=file, number=ratio)
             return False
-    if edge.steepness > max(_STEEP, _CERTAIN * edge.steepness_error):
+    if edge.steepness > max(_MIN_STEEPNESS, _MIN_SIGMAS * edge.steepness_error):
         text = (
             f"the dot's edge is steeper than pixels can be, by {100 * edge.steepness:.0f} % of its level: a tone curve "
             "(an S-curve, a picture style) or sharpening was applied. The kernel comes out too small; develop without "
@@ -61,15 +59,15 @@ def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None) -> boo
         )
         warn(text, "not linear", file=file, number=edge.steepness)
         return False
-    bent = soft_edge(still, dot, fit_exponent=True) if edge.misfit >= EXPLAINED else edge
-    if bent.exponent < _ENCODED and bent.rms < 0.75 * edge.rms:
-        text = f"the dot's edge is that of light to the power {bent.exponent:.2f}, as in a picture that is left sRGB "
-        warn(f"{text}encoded (about 0.45); {_DECODE}", "not linear", file=file, number=bent.exponent)
+    encoded = soft_edge(picture, dot, fit_exponent=True) if edge.misfit >= EXPLAINED else edge
+    if encoded.exponent < _MAX_EXPONENT and encoded.rms < 0.75 * edge.rms:
+        text = f"the dot's edge is that of light to the power {encoded.exponent:.2f}, as in a picture that is left "
+        warn(f"{text}sRGB encoded (about 0.45); {_DECODE_ADVICE}", "not linear", file=file, number=encoded.exponent)
         return False
     return True
 
 
-def check_levels(solution: Solution, held: Solution, edge: Edge, file: str | None) -> None:
+def check_levels(solution: Solution, expected: Solution, edge: Edge, file: str | None) -> None:
     """Warns if a tone curve would explain the residual of a fit.
 
     No kernel makes all pixels of one level brighter and all of another darker; a tone curve does, even one so weak that
@@ -77,51 +75,53 @@ def check_levels(solution: Solution, held: Solution, edge: Edge, file: str | Non
 
     1. The part of a curve's effect that the fit's parameters cannot imitate, in the residual of `solution`.
     2. In a JPEG this part is less certain; an edge of the sharp dot that is slightly too steep then supports it.
-    3. A fitted magnification imitates most of a curve. So the residual of `held`, the solution with the expected
+    3. A fitted magnification imitates most of a curve. So the residual of `expected`, the solution with the expected
        magnification, is tested as well; there a curve must explain more than a change of magnification does.
 
     `edge` is that of the sharp dot.
     """
     curves = _curves(solution, edge.level)
-    found, spread = unexplained(solution, curves)
-    seen = unfitted_part(solution, curves)
-    bend = np.linalg.lstsq(seen.T @ seen, found, rcond=None)[0]
-    chi_squared = float(found @ np.linalg.pinv(spread) @ found)
-    steep = edge.steepness / max(edge.steepness_error, np.finfo(float).tiny)
-    agrees = edge.steepness > _STEEP_TOO and steep > 1 and chi_squared + steep**2 > _BENT_CHI_TOO
-    resized = abs(solution.moves["magnification"] / held.moves["magnification"] - 1) > _RESIZED
-    bent = float(np.linalg.norm(bend)) > _BENT and (chi_squared > _BENT_CHI or agrees)
-    if bent or (not resized and _curved(held, edge.level, steep)):
+    products, covariance = unexplained(solution, curves)
+    visible = unfitted_part(solution, curves)
+    strengths = np.linalg.lstsq(visible.T @ visible, products, rcond=None)[0]
+    chi_squared = float(products @ np.linalg.pinv(covariance) @ products)
+    steepness = edge.steepness / max(edge.steepness_error, np.finfo(float).tiny)
+    agrees = edge.steepness > _SUPPORTING_EDGE and steepness > 1 and chi_squared + steepness**2 > _SUPPORTED_CHI
+    resized = abs(solution.moves["magnification"] / expected.moves["magnification"] - 1) > _MIN_RESIZING
+    is_bent = float(np.linalg.norm(strengths)) > _MIN_CURVE and (chi_squared > _MIN_CHI or agrees)
+    if is_bent or (not resized and _curved(expected, edge.level, steepness)):
         text = (
             "the fit's residual depends on the level, "
-            + ("" if bent else "at the expected size of the dot, ")
+            + ("" if is_bent else "at the expected size of the dot, ")
             + "as with a tone curve (an S-curve, a picture style): the kernel is then too small by 5 % or more; "
             "develop without it. Colours with different blurs have a similar effect (colours = 'each'), and a "
             f"blur that is not of family {solution.family!r}"
         )
-        warn(text, "not linear", file=file, number=float(bend[1]))
+        warn(text, "not linear", file=file, number=float(strengths[1]))
 
 
-def _curved(held: Solution, level: float, steep: float) -> bool:
+def _curved(expected: Solution, level: float, steepness: float) -> bool:
     """Whether an S-curve explains the residual at the expected magnification, and better than another magnification.
 
-    `steep`, the excess of the sharp dot's edge in standard errors, counts in favour of the curve.
+    `steepness`, the excess of the sharp dot's edge in standard errors, counts in favour of the curve.
     """
-    larger = held.gain * held.pair.move_columns(held.moves, ("magnification",), held.kernel)[0]
-    basis = np.stack([_curves(held, level)[:, 1], larger], axis=1)
-    found, spread = unexplained(held, basis)
-    contrast, size = np.sign(found) * found**2 / np.maximum(np.diag(spread), np.finfo(float).tiny)
-    strength = found[0] / np.sum(unfitted_part(held, basis)[:, 0] ** 2)
-    clearer = contrast + steep * abs(steep) - abs(size) > _CLEARER
-    return bool(strength > _CURVED and contrast > _CURVED_CHI and clearer)
+    slope = expected.pair.move_columns(expected.moves, ("magnification",), expected.kernel)[0]
+    size_change = expected.gain * slope
+    basis = np.stack([_curves(expected, level)[:, 1], size_change], axis=1)
+    products, covariance = unexplained(expected, basis)
+    variance = np.maximum(np.diag(covariance), np.finfo(float).tiny)
+    contrast_chi, size_chi = np.sign(products) * products**2 / variance
+    strength = products[0] / np.sum(unfitted_part(expected, basis)[:, 0] ** 2)
+    explains_more = contrast_chi + steepness * abs(steepness) - abs(size_chi) > _CHI_MARGIN
+    return bool(strength > _MIN_CONTRAST and contrast_chi > _MIN_CONTRAST_CHI and explains_more)
 
 
 def _curves(solution: Solution, level: float) -> Array:
     """Effects of weak tone curves on a fit's pixels `[pixels used, 2]`: brightening, and an S-curve's contrast."""
     light = ((solution.fitted - solution.background) / (solution.gain * level))[None]  # 0 is the paper
     step = 1e-3
-    weak = np.concatenate([untoned(light, (-step, 0, 0)), untoned(light, (0, -1.5 * step, 0))])
-    return np.asarray(solution.gain * level * (weak - untoned(light, (0, 0, 0))) / step).T
+    curved_light = np.concatenate([untoned(light, (-step, 0, 0)), untoned(light, (0, -1.5 * step, 0))])
+    return np.asarray(solution.gain * level * (curved_light - untoned(light, (0, 0, 0))) / step).T
 
 
 def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | None) -> None:
@@ -129,23 +129,23 @@ def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | Non
 
     `deconvolved`: whether the kernel, of this radius, was fitted to the dot as it would be in focus.
     """
-    if edge.softness <= _SENSOR_BLUR_PX or edge.radius <= 2 * edge.softness:
+    if edge.softness <= _FOCUSED_SIGMA_PX or edge.radius <= 2 * edge.softness:
         return
     # the variance along an axis of a disc of radius R is R^2 / 4
-    excess = edge.softness**2 - _SENSOR_BLUR_PX**2
-    share = 1 - 1 / np.sqrt(1 + 4 * excess / max(radius_px, 1e-9) ** 2)
-    if share < _SOFTENED:
+    excess = edge.softness**2 - _FOCUSED_SIGMA_PX**2
+    size_error = 1 - 1 / np.sqrt(1 + 4 * excess / max(radius_px, 1e-9) ** 2)
+    if size_error < _MIN_SIZE_ERROR:
         return
     text = f"the sharp picture is soft: its dot's edge has a width of {edge.softness:.1f} px"
-    small = f"the kernel is too small by {100 * share:.0f} %"
+    effect = f"the kernel is too small by {100 * size_error:.0f} %"
     if edge.softness <= UNFOCUSED_PX:
-        text += f"; if the printed dot's edge is sharp, {small}"
+        text += f"; if the printed dot's edge is sharp, {effect}"
     elif not deconvolved:
-        text += f", as out of focus; {small}: focus again"
+        text += f", as out of focus; {effect}: focus again"
     else:
         text += (
             ", as out of focus; the dot was fitted as it would be in focus. If its printed edge is that soft, the "
-            f"kernel is too large by {100 * share:.0f} %. Better focus again"
+            f"kernel is too large by {100 * size_error:.0f} %. Better focus again"
         )
     warn(text, "not in focus", file=file, number=edge.softness)
 
@@ -161,21 +161,22 @@ def check_fit(solution: Solution, fit: BlurFit, file: str | None, freest: BlurFi
     # share of the light that the kernel spreads outside the window
     source = pair.moved_source(solution.moves)
     total = float(source[0, 0].real)
-    held = float(pair.convolve(source, solution.kernel[None], whole=True)[0].sum())
-    outside = 1 - held / total if total > 0 else 1.0
+    inside = float(pair.convolve(source, solution.kernel[None], all_pixels=True)[0].sum())
+    outside = 1 - inside / total if total > 0 else 1.0
     size = f"{pair.data.shape[1]}x{pair.data.shape[0]} px"
-    if outside > _OUTSIDE_REFUSED:
+    if outside > _REFUSED_OUTSIDE:
         text = f"the window cuts the blur: {100 * outside:.0f} % of its light falls outside {size}; cut a larger one"
         raise FitError(text, "window", file=file, number=outside)
-    if outside > _OUTSIDE_WARNED:
+    if outside > _WARNED_OUTSIDE:
         text = f"{100 * outside:.1f} % of the blur's light falls outside the window of {size}; cut a larger one"
         warn(text, "window", file=file, number=outside)
     # the freest residual is far above the noise, or the chosen family adds much to it
     ratio = freest.residual_over_noise
-    far_above = (freest.residual > _MATTERS and ratio > FAR_ABOVE) or (freest.residual > _SEEN and ratio > 2.0)
-    # if that is reported already, only what the family adds
-    most = max(2.0, 1.3 * ratio) if far_above else 2.0
-    if fit is not freest and fit.residual > _SEEN and fit.residual_over_noise > most:
+    residual = freest.residual
+    far_above = (residual > _MIN_RESIDUAL and ratio > FAR_ABOVE) or (residual > _MIN_AT_TWICE and ratio > 2.0)
+    # a residual far above the noise is reported below; here, only the part that the family adds to it
+    warned_ratio = max(2.0, 1.3 * ratio) if far_above else 2.0
+    if fit is not freest and fit.residual > _MIN_AT_TWICE and fit.residual_over_noise > warned_ratio:
         text = (
             f"family {fit.family!r} leaves {fit.residual_over_noise:.1f} times the noise ({100 * fit.residual:.1f} % "
             f"of the light), the free profile {ratio:.1f} times; it was chosen because the "
@@ -190,14 +191,14 @@ def check_fit(solution: Solution, fit: BlurFit, file: str | None, freest: BlurFi
         text += f" Family {freest.family!r} may be too simple" if freest.family != "radial" else ""
         warn(text, "residual", file=file, number=ratio)
     change = fit.magnification / pair.magnification
-    if abs(np.log(change)) > _MAGNIFIED:
+    if abs(np.log(change)) > _MAGNIFICATION_LOG:
         text = (
             f"the blurred dot is {change:.3f} times the size it should have; are the distances right, and is the image "
             "linear, not sRGB encoded?"
         )
         warn(text, "magnification", file=file, number=change)
     _check_spots(solution, file)
-    if fit.asymmetry > UNEVEN and asymmetry_of(solution)[1] < CHANCE:
+    if fit.asymmetry > ASYMMETRIC and asymmetry_of(solution)[1] < P_VALUE:
         text = (
             f"the blur is not round: {100 * fit.asymmetry:.0f} % of it depends on the angle in a way that family "
             f"{fit.family!r} cannot; is the lens decentred, the dot off the axis, or the stop a polygon? Families "
@@ -215,14 +216,14 @@ def _check_spots(solution: Solution, file: str | None) -> None:
     if not beyond.any():
         return
     smoothed = gaussian_filter(pair.picture(solution.residual, 0.0), 2.0, mode="constant")
-    remaining = np.where(beyond, smoothed, -np.inf)
-    y, x = np.unravel_index(int(np.argmax(remaining)), remaining.shape)
-    height, peak = float(remaining[y, x]), pair.dot.peak
+    smoothed_beyond = np.where(beyond, smoothed, -np.inf)
+    y, x = np.unravel_index(int(np.argmax(smoothed_beyond)), smoothed_beyond.shape)
+    height, peak = float(smoothed_beyond[y, x]), pair.dot.peak
     # smoothing by sigma = 2 px leaves 0.14 of white noise, and more of correlated noise
-    smooth = pair.fine_share * independent_share(pair.noise_correlation)
-    around = remaining[beyond]
-    usual = 1.4826 * float(np.median(np.abs(around - np.median(around))))  # also of a JPEG's blocks
-    if height > max(_SPOT * max(0.14 * noise_of(pair.data) / np.sqrt(smooth), usual), _SPOT_MATTERS * peak):
+    smoothing = pair.fine_share * independent_share(pair.noise_correlation)
+    values = smoothed_beyond[beyond]
+    spread = 1.4826 * float(np.median(np.abs(values - np.median(values))))  # also of a JPEG's blocks
+    if height > max(_SPOT_SIGMAS * max(0.14 * noise_of(pair.data) / np.sqrt(smoothing), spread), _MIN_SPOT * peak):
         text = (
             f"a spot of {100 * height / peak:.1f} % of the dot's level is left at ({x}, {y}), "
             f"{pair.distance[y, x]:.0f} px from the dot and beyond its blur: is there another dot, dust or a "
@@ -234,16 +235,16 @@ def _check_spots(solution: Solution, file: str | None) -> None:
 def _check_parameters(solution: Solution, file: str | None) -> None:
     """Warns about parameters on their bounds, and about a blur whose size the pictures do not determine."""
     low, high = solution.pair.bounds(solution.names)
-    for name, least, most in zip(solution.names, low, high, strict=True):
+    for name, lower, upper in zip(solution.names, low, high, strict=True):
         value = float({**solution.moves, **solution.params}[name])
-        at_least, at_most = value <= least + 1e-6 * abs(least), value >= most * (1 - 1e-6)
-        length = name in ("sigma", "radius", "r_c")
-        if at_most and length:
+        at_least, at_most = value <= lower + 1e-6 * abs(lower), value >= upper * (1 - 1e-6)
+        is_length = name in ("sigma", "radius", "r_c")
+        if at_most and is_length:
             text = f"the blur is wider than the window: {name} ran to {value:.3g} px"
             raise FitError(text, "flat profile", file=file, number=value)
         # exempt: the shape of a blur below a pixel, the exponent of a missing tilt, the curvature of straight or
         # circular blades
-        if (at_least and not length and name != "b" or at_most) and name not in ("m", "curvature"):
+        if (at_least and not is_length and name != "b" or at_most) and name not in ("m", "curvature"):
             warn(f"{name} ended on its bound {value:.4g}; it is only a limit", "boundary", file=file, number=value)
     size, error = size_of_blur(solution)
     if not error < 0.5 * size:

@@ -9,17 +9,17 @@ from .forward import OPENINGS, SHAPES, Solution, without_level
 from .noise import fine_variance, independent_share, noise_of
 from .radial import size_of_profile
 
-UNEVEN = 0.02
+ASYMMETRIC = 0.02
 """Share of a blur's light that depends on the angle, above which it is not round."""
 
-CHANCE = 1e-6
+P_VALUE = 1e-6
 """Probability of a deviation by noise alone, below which it is significant."""
 
 _HARMONICS, _RINGS = 8, 4
-_LIT = 0.01  # share of the peak above which a pixel of a free kernel counts as a parameter
+_LIT_SHARE = 0.01  # share of the peak above which a pixel of a free kernel counts as a parameter
 
 
-def rms_left(solution: Solution) -> float:
+def residual_rms(solution: Solution) -> float:
     """Root mean square of the residual over the lit pixels."""
     return float(np.sqrt(np.mean(solution.residual[solution.pair.lit[solution.pair.used]] ** 2)))
 
@@ -27,12 +27,12 @@ def rms_left(solution: Solution) -> float:
 def noise_near(solution: Solution) -> float:
     """Standard deviation of a pixel's noise where the light is, from the fine (pixel to pixel) part of the residual."""
     pair = solution.pair
-    seen = np.nan_to_num(fine_variance(pair.picture(solution.residual, 0.0), pair.lit))
+    fine = np.nan_to_num(fine_variance(pair.picture(solution.residual, 0.0), pair.lit))
     lit = pair.data[pair.lit] - solution.background
     dark, light = noise_of(pair.data) ** 2, pair.shot_noise * float(np.mean(np.maximum(lit, 0.0)))
-    known = dark / pair.fine_share + light / (pair.fine_share_of_light or pair.fine_share)
+    camera_variance = dark / pair.fine_share + light / (pair.fine_share_of_light or pair.fine_share)
     # additional fine variance is not camera noise and may be uncorrelated
-    return float(np.sqrt(known + max(seen - dark - light, 0.0)))
+    return float(np.sqrt(camera_variance + max(fine - dark - light, 0.0)))
 
 
 def unexplained(solution: Solution, basis: Array) -> tuple[Array, Array]:
@@ -43,15 +43,15 @@ def unexplained(solution: Solution, basis: Array) -> tuple[Array, Array]:
     basis = unfitted_part(solution, basis)
     # a smooth deviation must not count as noise: use the level beside the dot and inside it. Noise cannot exceed the
     # residual: in a JPEG, dark areas have less noise than the level in the light suggests
-    variance = min(noise_near(solution), rms_left(solution)) ** 2
+    variance = min(noise_near(solution), residual_rms(solution)) ** 2
     correlated = solution.pair.correlated_noise(basis, solution.pair.noise_correlation)
     return basis.T @ solution.residual, variance * basis.T @ correlated
 
 
 def unfitted_part(solution: Solution, basis: Array) -> Array:
     """Patterns without the parts that the fit's parameters can imitate, which are not in its residual."""
-    known, _ = np.linalg.qr(solution.slopes[:, np.abs(solution.slopes).max(axis=0) > 0])
-    return without_level(basis - known @ (known.T @ basis), solution.fitted)
+    imitable, _ = np.linalg.qr(solution.slopes[:, np.abs(solution.slopes).max(axis=0) > 0])
+    return without_level(basis - imitable @ (imitable.T @ basis), solution.fitted)
 
 
 def asymmetry_of(solution: Solution) -> tuple[float, float]:
@@ -67,18 +67,18 @@ def asymmetry_of(solution: Solution) -> tuple[float, float]:
     x, y = pair.dot.x + solution.moves["dx"], pair.dot.y + solution.moves["dy"]
     rows, columns = pair.pixels
     reach = max(pair.dot.reach, 2.0)
-    angle, place = np.arctan2(rows - y, columns - x), np.hypot(columns - x, rows - y) / reach * _RINGS
-    near = (place <= _RINGS) & pair.used
-    hats = [(np.clip(1 - np.abs(place - ring + 0.5), 0, None) * near)[pair.used] for ring in range(1, _RINGS + 1)]
+    angle, ring_at = np.arctan2(rows - y, columns - x), np.hypot(columns - x, rows - y) / reach * _RINGS
+    near = (ring_at <= _RINGS) & pair.used
+    hats = [(np.clip(1 - np.abs(ring_at - ring + 0.5), 0, None) * near)[pair.used] for ring in range(1, _RINGS + 1)]
     waves = [wave(n * angle[pair.used]) for n in range(1, _HARMONICS + 1) for wave in (np.cos, np.sin)]
     basis = unfitted_part(solution, np.stack([hat * wave for hat in hats for wave in waves], axis=1))
-    left, values, _ = np.linalg.svd(basis, full_matrices=False)
-    left = left[:, values > 1e-6 * values.max()]
-    found, spread = unexplained(solution, left)
-    chance = float(chdtrc(found.size, found @ np.linalg.solve(spread, found))) if np.trace(spread) > 0 else 0.0
+    directions, values, _ = np.linalg.svd(basis, full_matrices=False)
+    directions = directions[:, values > 1e-6 * values.max()]
+    found, spread = unexplained(solution, directions)
+    probability = float(chdtrc(found.size, found @ np.linalg.solve(spread, found))) if np.trace(spread) > 0 else 0.0
     light = float(np.sum((pair.data[near] - solution.background) ** 2))
     share = np.sqrt(max(float(found @ found) - float(np.trace(spread)), 0.0) / light) if light > 0 else np.inf
-    return float(share), chance
+    return float(share), probability
 
 
 def size_of_blur(solution: Solution) -> tuple[float, float]:
@@ -90,42 +90,42 @@ def size_of_blur(solution: Solution) -> tuple[float, float]:
     varied = {n: np.full(len(shape) + 1, float(solution.params[n])) for n in shape}
     for i, n in enumerate(shape):
         varied[n][i + 1] += steps[i]
-    rms, *changed = pair.rms(solution.family, varied).tolist()
-    slope = (np.array(changed) - rms) / steps
+    rms, *varied_rms = pair.rms(solution.family, varied).tolist()
+    slope = (np.array(varied_rms) - rms) / steps
     index = [solution.names.index(n) for n in shape]
     covariance = solution.covariance[np.ix_(index, index)]
     if np.isfinite(np.diag(covariance)).all():
-        variance, of_moment = max(float(slope @ covariance @ slope), 0.0), 0.0
+        variance, moment_error = max(float(slope @ covariance @ slope), 0.0), 0.0
         if solution.family == "image":  # its shape is free: only the picture's second moment determines its size
             squared, light = pair.distance[pair.lit] ** 2, pair.data[pair.lit] - solution.background
-            away = squared - float(light @ squared / light.sum())
+            centred = squared - float(light @ squared / light.sum())
             noise = noise_near(solution) / np.sqrt(independent_share(pair.noise_correlation))
-            of_moment = float(noise * np.linalg.norm(away) / abs(light.sum()) / (2 * max(rms, 1e-9)))
-        return rms, float(np.sqrt(variance + of_moment**2))
+            moment_error = float(noise * np.linalg.norm(centred) / abs(light.sum()) / (2 * max(rms, 1e-9)))
+        return rms, float(np.sqrt(variance + moment_error**2))
     # single parameters are undetermined, but their combination may determine the size
     _, values, right = np.linalg.svd(solution.slopes[:, index], full_matrices=False)
     seen = values > 1e-6 * values.max()
-    along = right @ slope
-    if not seen.any() or np.abs(along[~seen]).sum() > 0.1 * np.abs(along).sum():
+    projected = right @ slope
+    if not seen.any() or np.abs(projected[~seen]).sum() > 0.1 * np.abs(projected).sum():
         return rms, np.inf
-    return rms, float(np.sqrt(solution.squares / pair.values.size) * np.linalg.norm(along[seen] / values[seen]))
+    return rms, float(np.sqrt(solution.squares / pair.values.size) * np.linalg.norm(projected[seen] / values[seen]))
 
 
 def bic_of(solution: Solution) -> float:
     """Bayesian information criterion of a solution."""
     pair = solution.pair
     floor = pair.values.size * (1e-6 * pair.unit) ** 2
-    free = len(SHAPES[solution.family])
+    parameters = len(SHAPES[solution.family])
     if solution.family == "radial":
-        free = int(np.sum(np.asarray(solution.params["values"]) > 0))
+        parameters = int(np.sum(np.asarray(solution.params["values"]) > 0))
     elif solution.family == "polygon":
-        free += 1  # the number of blades
+        parameters += 1  # the number of blades
     elif solution.family == "image":
-        free = int(np.sum(solution.kernel > _LIT * solution.kernel.max()))
+        parameters = int(np.sum(solution.kernel > _LIT_SHARE * solution.kernel.max()))
     # correlated neighbours are not independent samples
     count = pair.values.size * independent_share(pair.noise_correlation)
     squares = (solution.squares + floor) * count / pair.values.size
-    return information_criterion(squares, max(round(count), 1), free + len(pair.fit_moves) + 2)
+    return information_criterion(squares, max(round(count), 1), parameters + len(pair.fit_moves) + 2)
 
 
 def describe(solution: Solution, why: str) -> BlurFit:
@@ -133,27 +133,27 @@ def describe(solution: Solution, why: str) -> BlurFit:
     pair = solution.pair
     x, y = pair.dot.x + solution.moves["dx"], pair.dot.y + solution.moves["dy"]
     size = float(np.sqrt(np.mean((pair.data[pair.lit] - solution.background) ** 2)))
-    through = (solution.gain * pair.source.noise) ** 2 / pair.fine_share
-    noise = np.sqrt(noise_near(solution) ** 2 + through * float(np.sum(solution.kernel**2)))
+    source_variance = (solution.gain * pair.source.noise) ** 2 / pair.fine_share
+    noise = np.sqrt(noise_near(solution) ** 2 + source_variance * float(np.sum(solution.kernel**2)))
     rms, rms_error = size_of_blur(solution)
-    spread = np.sqrt(np.diag(solution.covariance))
+    errors = np.sqrt(np.diag(solution.covariance))
     stderr: dict[str, float | Array] = {
-        n: float(s) for n, s in zip(solution.names, spread, strict=True) if n in solution.params
+        n: float(s) for n, s in zip(solution.names, errors, strict=True) if n in solution.params
     }
     opening = {n: float(v) for n, v in solution.params.items()} if solution.family in OPENINGS else None
     rows, columns = pair.pixels
     distance = np.hypot(columns - x, rows - y)
-    near = (distance <= 1.2 * pair.dot.reach) & pair.used
-    order = np.argsort(distance[near])
+    is_near = (distance <= 1.2 * pair.dot.reach) & pair.used
+    order = np.argsort(distance[is_near])
     samples, curve = (
-        np.stack([distance[near], (levels - solution.background) / (solution.gain or 1.0)])[:, order]
-        for levels in (pair.data[near], solution.fitted[near[pair.used]])
+        np.stack([distance[is_near], (levels - solution.background) / (solution.gain or 1.0)])[:, order]
+        for levels in (pair.data[is_near], solution.fitted[is_near[pair.used]])
     )
     return BlurFit(
         family=solution.family,
         params=dict(solution.params),
-        stderr={"values": spread, "radius": 0.0} if solution.family == "radial" else stderr,
-        residual=rms_left(solution) / size,
+        stderr={"values": errors, "radius": 0.0} if solution.family == "radial" else stderr,
+        residual=residual_rms(solution) / size,
         noise=float(noise) / size,
         covariance=solution.covariance,
         names=solution.names,

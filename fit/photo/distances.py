@@ -23,33 +23,33 @@ _SWEEPS = 2
 _COLOURS = ("red", "green", "blue")
 _GREEN = 1
 _DEFOCUSED_PX = 1.5  # px; for smaller blurs it is uncertain on which side of focus a colour is
-_KNOWN = 0.02  # relative error with which the thin lens gives the radius
+_RADIUS_ERROR = 0.02  # relative error with which the thin lens gives the radius
 
 
-def fit_one(pair: Capture, focus_m: float, family: str, **known: Any) -> BlurFit:
-    """Fits one pair, with the magnification expected from its distance; `known` are arguments of `fit_pair`."""
+def fit_one(pair: Capture, focus_m: float, family: str, **arguments: Any) -> BlurFit:
+    """Fits one pair, with the magnification expected from its distance; `arguments` are arguments of `fit_pair`."""
     expected = {"magnification": focus_m / pair.distance_m, "knots": _KNOTS if family == "radial" else None}
-    return fit_pair(pair.sharp, pair.blurred, family, white=pair.white, files=pair.files, **{**expected, **known})
+    return fit_pair(pair.sharp, pair.blurred, family, white=pair.white, files=pair.files, **{**expected, **arguments})
 
 
 def fit_distances(
     captures: Captures, family: str, smooth: bool, done: Callable[[Capture, BlurFit], None]
 ) -> list[BlurFit]:
     """Fits all pairs with one family; `smooth` then refits each with information from neighbouring distances."""
-    place, fits = captures.defocus, dict[int, BlurFit]()
+    defocus, fits = captures.defocus, dict[int, BlurFit]()
     for sign in (-1, 1):  # from both ends towards focus, each starting from its neighbour's fit
         start: BlurFit | None = None
-        side = sorted(np.flatnonzero(place * sign > 0).tolist(), key=lambda k: -abs(place[k]))
-        for before, i in zip([None, *side], side, strict=False):
+        side = sorted(np.flatnonzero(defocus * sign > 0).tolist(), key=lambda k: -abs(defocus[k]))
+        for outer, i in zip([None, *side], side, strict=False):
             if start is not None:
-                nearer = abs(place[i] / place[before])
-                start = replace(start, params={n: v * nearer if n in LENGTHS else v for n, v in start.params.items()})
+                scale = abs(defocus[i] / defocus[outer])
+                start = replace(start, params={n: v * scale if n in LENGTHS else v for n, v in start.params.items()})
             start = fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=start)
             done(captures.pairs[i], start)
     if smooth:
         with without_warnings():
             (_refine_aligned if family == "radial" else _refine_together)(captures, family, fits)
-    return [fits[i] for i in range(len(place))]
+    return [fits[i] for i in range(len(defocus))]
 
 
 def _refine_together(captures: Captures, family: str, fits: dict[int, BlurFit]) -> None:
@@ -58,23 +58,23 @@ def _refine_together(captures: Captures, family: str, fits: dict[int, BlurFit]) 
     Correlated parameters (a rim's height and its steepness) thus become consistent over distance. The prior is loose,
     so parameters that the pictures determine do not change.
     """
-    place = captures.defocus
-    for i in _SWEEPS * sorted(fits, key=lambda k: -abs(place[k])):
-        side = sorted((k for k in fits if place[k] * place[i] > 0), key=lambda k: abs(place[k]))
+    defocus = captures.defocus
+    for i in _SWEEPS * sorted(fits, key=lambda k: -abs(defocus[k])):
+        side = sorted((k for k in fits if defocus[k] * defocus[i] > 0), key=lambda k: abs(defocus[k]))
         order = side.index(i)
-        beside = side[max(order - 1, 0) : order] + side[order + 1 : order + 2]
-        if not beside:
+        neighbours = side[max(order - 1, 0) : order] + side[order + 1 : order + 2]
+        if not neighbours:
             continue
         size = max(float(v) for n, v in fits[i].params.items() if n in LENGTHS)
-        loose = {n: {"b": 0.1, "m": 0.3}.get(n, 0.05 * size + 0.05) for n in FAMILIES[family]}
+        deviations = {n: {"b": 0.1, "m": 0.3}.get(n, 0.05 * size + 0.05) for n in FAMILIES[family]}
         prior = {}
-        for n, deviation in loose.items():
-            values = [float(fits[k].params[n]) for k in beside]
-            if len(beside) == 1:
-                scaled = values[0] * (abs(place[i] / place[beside[0]]) if n in LENGTHS else 1.0)
+        for n, deviation in deviations.items():
+            values = [float(fits[k].params[n]) for k in neighbours]
+            if len(neighbours) == 1:
+                scaled = values[0] * (abs(defocus[i] / defocus[neighbours[0]]) if n in LENGTHS else 1.0)
                 prior[n] = (float(scaled), 3 * deviation)
             else:
-                share = (place[i] - place[beside[0]]) / (place[beside[1]] - place[beside[0]])
+                share = (defocus[i] - defocus[neighbours[0]]) / (defocus[neighbours[1]] - defocus[neighbours[0]])
                 prior[n] = (float((1 - share) * values[0] + share * values[1]), deviation)
         fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=fits[i], prior=prior)
 
@@ -85,7 +85,7 @@ def _refine_aligned(captures: Captures, family: str, fits: dict[int, BlurFit]) -
     Between nodes a table mixes values at equal fractions of the radius, so the shapes only match if the radii follow
     one rule.
     """
-    place = captures.defocus
+    defocus = captures.defocus
 
     def end(fit: BlurFit) -> float:
         """Radius in px that contains all but a thousandth of a free profile's light."""
@@ -95,56 +95,56 @@ def _refine_aligned(captures: Captures, family: str, fits: dict[int, BlurFit]) -
         return float(r[np.searchsorted(light, 0.999 * light[-1])]) + radius / (values.size - 1)
 
     for sign in (-1, 1):
-        side = [i for i in fits if place[i] * sign > 0]
+        side = [i for i in fits if defocus[i] * sign > 0]
         if len(side) < 2:
             continue
-        x, ends = np.abs(place[side]), np.array([end(fits[i]) for i in side])
+        x, ends = np.abs(defocus[side]), np.array([end(fits[i]) for i in side])
         # near focus a profile may end anywhere: the outer nodes define the line, raised so that it contains theirs
-        slope, start = np.polyfit(x, ends, 1, w=x)
-        lift = max(float(np.max((ends - slope * x - start)[x > 0.25 * x.max()])), 0.0)
-        for i, defocus, own in zip(side, x, ends, strict=True):
-            reach = max(float(slope * defocus + start + lift), float(own), 1.0)
+        slope, intercept = np.polyfit(x, ends, 1, w=x)
+        lift = max(float(np.max((ends - slope * x - intercept)[x > 0.25 * x.max()])), 0.0)
+        for i, magnitude, end_px in zip(side, x, ends, strict=True):
+            reach = max(float(slope * magnitude + intercept + lift), float(end_px), 1.0)
             fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=fits[i], reach=reach)
 
 
 def fit_openings(
-    captures: Captures, family: str, firsts: list[BlurFit], done: Callable[[Capture, BlurFit], None]
+    captures: Captures, family: str, first_fits: list[BlurFit], done: Callable[[Capture, BlurFit], None]
 ) -> tuple[list[BlurFit], Aperture]:
     """Fits all pairs with kernels that are not round: one opening for all, in different sizes.
 
     The first fits of `family` ("polygon" or "image") determine the opening, returned as seen behind the focus.
     """
-    nearer = [pair.distance_m < captures.focus_m for pair in captures]
-    telling = [i for i, fit in enumerate(firsts) if fit.family == family]
-    opening = common_opening([firsts[i] for i in telling], [nearer[i] for i in telling])
-    shown = turned(opening)
+    is_nearer = [pair.distance_m < captures.focus_m for pair in captures]
+    chosen = [i for i, fit in enumerate(first_fits) if fit.family == family]
+    opening = common_opening([first_fits[i] for i in chosen], [is_nearer[i] for i in chosen])
+    rotated = turned(opening)
     fits = []
-    for pair, near in zip(captures, nearer, strict=True):
-        fit = fit_one(pair, captures.focus_m, "image", aperture=shown if near else opening)
+    for pair, in_front in zip(captures, is_nearer, strict=True):
+        fit = fit_one(pair, captures.focus_m, "image", aperture=rotated if in_front else opening)
         fits.append(replace(fit, family=family))
         done(pair, fits[-1])
     return fits, opening
 
 
-def _fit_like(fit: BlurFit, pair: Capture, focus_m: float, sharp: Array, blurred: Array, **known: Any) -> BlurFit:
+def _fit_like(fit: BlurFit, pair: Capture, focus_m: float, sharp: Array, blurred: Array, **options: Any) -> BlurFit:
     """Fits other pictures of a pair like its own: with the same family and opening, or free profile's end."""
     family, start = (fit.family, fit) if fit.aperture is None else ("image", None)
-    known |= {"start": start, "aperture": fit.aperture, "reach": fit.params["radius"] if family == "radial" else None}
-    return fit_one(replace(pair, sharp=sharp, blurred=blurred), focus_m, family, **known)
+    options |= {"start": start, "aperture": fit.aperture, "reach": fit.params["radius"] if family == "radial" else None}
+    return fit_one(replace(pair, sharp=sharp, blurred=blurred), focus_m, family, **options)
 
 
-def counted(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
+def with_uncertainty(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
     """Adds the uncertainty of a pair's pictures (``pair.uncertain``) to the standard errors of its fit."""
     if not pair.uncertain:
         return fit
     with without_warnings():
-        plain, *others = (
+        refit, *others = (
             _fit_like(fit, pair, focus_m, *pictures) for pictures in ((pair.sharp, pair.blurred), *pair.uncertain)
         )
     zero = np.zeros(1)
     names = ("values",) if fit.family == "radial" else fit.names
     changes = np.stack(
-        [np.hstack([np.subtract(o.params.get(n, zero), plain.params.get(n, zero)) for n in names]) for o in others]
+        [np.hstack([np.subtract(o.params.get(n, zero), refit.params.get(n, zero)) for n in names]) for o in others]
     )  # [others, parameters]
     covariance = fit.covariance + changes.T @ changes
     spread = np.sqrt(np.diag(covariance))
@@ -153,7 +153,7 @@ def counted(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
         fit,
         stderr=fit.stderr | {n: error for n, error in errors.items() if n in fit.params},
         covariance=covariance,
-        radius_stderr=float(np.hypot(fit.radius_stderr, np.linalg.norm([o.radius - plain.radius for o in others]))),
+        radius_stderr=float(np.hypot(fit.radius_stderr, np.linalg.norm([o.radius - refit.radius for o in others]))),
     )
 
 
@@ -175,22 +175,22 @@ def fit_colours(captures: Captures, fits: Sequence[BlurFit]) -> tuple[Colour, ..
     In the sharp picture the colours that are not in focus are slightly blurred themselves. The softness of the sharpest
     colour is used for all, so that each kernel contains all of its colour's blur.
     """
-    found: list[list[BlurFit]] = [[] for _ in _COLOURS]
+    fits_by_colour: list[list[BlurFit]] = [[] for _ in _COLOURS]
     for pair, mean in zip(captures, fits, strict=True):
         if pair.colours is None:
             raise AssertionError("only captures with colours are fitted by colour")
-        softness = min(soft_edge(still, find_dot(still, file=pair.files[0])).softness for still in pair.colours[0])
-        known: dict[str, Any] = {"magnification": mean.magnification, "fit_magnification": False, "softness": softness}
+        softness = min(soft_edge(sharp, find_dot(sharp, file=pair.files[0])).softness for sharp in pair.colours[0])
+        fixed: dict[str, Any] = {"magnification": mean.magnification, "fit_magnification": False, "softness": softness}
         with without_warnings():  # the mean's fit has already warned
-            for colour, *pictures in zip(found, *pair.colours, strict=True):
-                colour.append(_fit_like(mean, pair, captures.focus_m, *pictures, **known))
-    green = found[_GREEN]
-    shifts = [_focus_shift(captures.defocus, colour) for colour in found]
+            for colour, *pictures in zip(fits_by_colour, *pair.colours, strict=True):
+                colour.append(_fit_like(mean, pair, captures.focus_m, *pictures, **fixed))
+    green = fits_by_colour[_GREEN]
+    shifts = [_focus_shift(captures.defocus, colour) for colour in fits_by_colour]
     colours = []
-    for name, colour, shift in zip(_COLOURS, found, shifts, strict=True):
-        moved = np.array([np.subtract(f.centre, g.centre) for f, g in zip(colour, green, strict=True)])
-        shifted = np.array([np.subtract(f.shift, g.shift) for f, g in zip(colour, green, strict=True)])
-        lateral = tuple((float(x), float(y)) for x, y in [(moved - shifted).mean(axis=0), *moved])
+    for name, colour, shift in zip(_COLOURS, fits_by_colour, shifts, strict=True):
+        blurred = np.array([np.subtract(f.centre, g.centre) for f, g in zip(colour, green, strict=True)])
+        shifts_from_green = np.array([np.subtract(f.shift, g.shift) for f, g in zip(colour, green, strict=True)])
+        lateral = tuple((float(x), float(y)) for x, y in [(blurred - shifts_from_green).mean(axis=0), *blurred])
         colours.append(Colour(name, tuple(colour), shift - shifts[_GREEN], lateral))
     return tuple(colours)
 
@@ -198,10 +198,10 @@ def fit_colours(captures: Captures, fits: Sequence[BlurFit]) -> tuple[Colour, ..
 def _focus_shift(defocus: Array, fits: Sequence[BlurFit]) -> float:
     """1/distance of a colour's focus minus the capture's, 1/m: where the line through its signed radii crosses 0."""
     radius: Array = np.array([f.radius for f in fits]) * np.sign(defocus)
-    error = np.hypot([f.radius_stderr for f in fits], _KNOWN * radius)
-    telling = np.abs(radius) > _DEFOCUSED_PX
-    if telling.sum() < 2:
+    error = np.hypot([f.radius_stderr for f in fits], _RADIUS_ERROR * radius)
+    is_blurred = np.abs(radius) > _DEFOCUSED_PX
+    if is_blurred.sum() < 2:
         return math.nan
-    slope, start = np.polyfit(defocus[telling], radius[telling], 1, w=1 / error[telling])
+    slope, intercept = np.polyfit(defocus[is_blurred], radius[is_blurred], 1, w=1 / error[is_blurred])
     # radius = slope * (1/focus - shift - 1/distance), with the colour's own focus 1/focus - shift
-    return float(start / slope)
+    return float(intercept / slope)

@@ -12,11 +12,11 @@ from ..validation import a_picture
 from .noise import fine_variance, near_border, noise_of
 
 _THRESHOLD = 0.15  # of the peak; low enough to keep an uneven ring in one piece
-_SMALLEST_PX = 9
-_OTHER_DOT = 0.08  # share of the brightest dot's light above which another spot is a dot and not dirt
-_CLIPPED = 0.6  # share of clipped pixels of the dot above which it cannot be fitted
-_CUT = 0.1  # share of the paper on its lowest level above which blacks are cut
-_WIDER = 1.5  # noise above the mean over noise below it; 1.9 if a tenth of it is cut off
+_MIN_SIDE_PX = 9
+_MIN_LIGHT = 0.08  # share of the brightest dot's light above which another spot is a dot and not dirt
+_MAX_CLIPPED = 0.6  # share of clipped pixels of the dot above which it cannot be fitted
+_CUT_BLACKS = 0.1  # share of the paper on its lowest level above which blacks are cut
+_NOISE_ASYMMETRY = 1.5  # noise above the mean over noise below it; 1.9 if a tenth of it is cut off
 
 
 @dataclass(frozen=True)
@@ -46,41 +46,41 @@ def find_dot(picture: Array, *, file: str | None = None) -> Dot:
     """
     dots = find_dots(picture, file=file)
     if len(dots) > 1:
-        where = ", ".join(f"({d.x:.0f}, {d.y:.0f})" for d in dots[:6])
+        positions = ", ".join(f"({d.x:.0f}, {d.y:.0f})" for d in dots[:6])
         text = (
-            f"{len(dots)} dots where one was expected, at {where}; cover the others, say crop = [left, top, width, "
+            f"{len(dots)} dots where one was expected, at {positions}; cover the others, say crop = [left, top, width, "
             "height] in capture.toml (cropping in an editor loses the scale), or read a grid with dots='centre'"
         )
         raise FitError(text, "several dots", file=file, number=float(len(dots)))
     return dots[0]
 
 
-def find_dots(picture: Array, *, file: str | None = None, smallest: float = _OTHER_DOT) -> list[Dot]:
+def find_dots(picture: Array, *, file: str | None = None, smallest: float = _MIN_LIGHT) -> list[Dot]:
     """Finds dots in a picture `[H, W]` in linear light, brightest first, down to a share `smallest` of its light.
 
     Raises:
         FitError: of kind "no dot" if nothing exceeds the noise enough; of kind "window" if the brightest dot touches
         the edge of the picture.
     """
-    height, width = a_picture("a picture of a dot", picture, _SMALLEST_PX, file).shape
+    height, width = a_picture("a picture of a dot", picture, _MIN_SIDE_PX, file).shape
     noise = noise_of(picture)
     levels = picture[near_border(picture.shape, max(1, min(height, width) // 20))]
     # a mean without outliers: the median is biased if blacks are cut off at 0, which removes half of the noise
     background = float(np.median(levels))
-    if noise > 0 and (kept := np.abs(levels - background) <= 5 * noise).any():
-        background = float(levels[kept].mean())
+    if noise > 0 and (is_usual := np.abs(levels - background) <= 5 * noise).any():
+        background = float(levels[is_usual].mean())
     smooth = ndimage.gaussian_filter(picture - background, 1.0, mode="nearest")
     peak = float(smooth.max())
     # smoothing by sigma = 1 px leaves 0.28 of white noise; the maximum over many pixels is about 4.5 times that
-    floor = 0.28 * noise
-    if not peak > max(8 * floor, 1e-9 * max(float(np.abs(picture).max()), 1e-300)):
-        ratio = peak / floor if floor > 0 else 0.0
+    smoothed_noise = 0.28 * noise
+    if not peak > max(8 * smoothed_noise, 1e-9 * max(float(np.abs(picture).max()), 1e-300)):
+        ratio = peak / smoothed_noise if smoothed_noise > 0 else 0.0
         text = (
             f"no dot found: the brightest spot is {ratio:.1f} times the noise, at least 8 are needed; is it a white "
             "dot on black paper, well exposed?"
         )
         raise FitError(text, "no dot", file=file, number=ratio)
-    labels, count = ndimage.label(smooth > max(_THRESHOLD * peak, 5 * floor), structure=np.ones((3, 3)))
+    labels, count = ndimage.label(smooth > max(_THRESHOLD * peak, 5 * smoothed_noise), structure=np.ones((3, 3)))
     light = np.asarray(ndimage.sum_labels(smooth, labels, np.arange(1, count + 1)))
     boxes = ndimage.find_objects(labels)
     dots = []
@@ -106,22 +106,22 @@ def find_dots(picture: Array, *, file: str | None = None, smallest: float = _OTH
     return dots
 
 
-def _measured(above: Array, x: float, y: float, noise: float, peak: float) -> tuple[float, float, float, float]:
+def _measured(levels: Array, x: float, y: float, noise: float, peak: float) -> tuple[float, float, float, float]:
     """Centre, radius and reach of a dot near (x, y), by moments in three rounds, each within the last reach.
 
     The reach is the radius at which the mean over a ring falls below the noise and is negligible for the moments.
     """
-    rows, columns = np.indices(above.shape).astype(np.float64)
+    rows, columns = np.indices(levels.shape).astype(np.float64)
     for _ in range(3):
         distance = np.hypot(columns - x, rows - y)
         rings = np.floor(distance + 0.5).astype(np.int64).ravel()  # one px wide
-        count = np.bincount(rings)[: max(3, min(above.shape) // 2 + 1)]  # without rings that the crop cuts
-        mean = np.bincount(rings, weights=above.ravel())[: count.size] / np.maximum(count, 1)
+        count = np.bincount(rings)[: max(3, min(levels.shape) // 2 + 1)]  # without rings that the crop cuts
+        mean = np.bincount(rings, weights=levels.ravel())[: count.size] / np.maximum(count, 1)
         dark = np.abs(mean) < np.maximum(2.5 * noise / np.sqrt(np.maximum(count, 1)), 5e-4 * peak)
         bright = int(np.argmax(mean))
-        quiet = np.flatnonzero(dark[bright:-1] & dark[bright + 1 :])
-        reach = float(bright + quiet[0] + 1 if quiet.size else mean.size)
-        inside = np.where(distance <= reach, above, 0.0)
+        dark_pairs = np.flatnonzero(dark[bright:-1] & dark[bright + 1 :])
+        reach = float(bright + dark_pairs[0] + 1 if dark_pairs.size else mean.size)
+        inside = np.where(distance <= reach, levels, 0.0)
         total = float(inside.sum())
         x, y = float((inside * columns).sum() / total), float((inside * rows).sum() / total)
     moment = float((inside * ((columns - x) ** 2 + (rows - y) ** 2)).sum() / total)
@@ -146,8 +146,8 @@ def fine_share_inside(picture: Array, dot: Dot) -> float | None:
     x, y = (columns - dot.x) / dot.radius, (rows - dot.y) / dot.radius
     light = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     levels = picture[inside]
-    left = levels - light @ np.linalg.lstsq(light, levels, rcond=None)[0]
-    variance = float(left @ left) / (levels.size - light.shape[1])
+    residual = levels - light @ np.linalg.lstsq(light, levels, rcond=None)[0]
+    variance = float(residual @ residual) / (levels.size - light.shape[1])
     return min(fine_variance(picture, inside) / variance, 1.0) if variance > 0 else 1.0
 
 
@@ -168,9 +168,9 @@ def used_pixels(
     clipped |= uniform_filter(picture, 3, mode="nearest") > level - 3 * dot.noise
     bright = picture > dot.background + 0.15 * dot.peak
     share = float(np.sum(clipped & bright)) / max(int(bright.sum()), 1)
-    if refuse and share > _CLIPPED:
+    if refuse and share > _MAX_CLIPPED:
         text = f"{100 * share:.0f} % of the {name} dot's pixels are clipped at {level:.4g}; expose less, so that at "
-        text += f"least {100 - 100 * _CLIPPED:.0f} % are below it"
+        text += f"least {100 - 100 * _MAX_CLIPPED:.0f} % are below it"
         raise FitError(text, "saturated", file=file, number=share)
     if refuse:
         text = f"{count} pixels of the {name} picture are clipped at {level:.4g} and were left out; expose less"
@@ -188,7 +188,7 @@ def _plateau(picture: Array, dot: Dot) -> float | None:
     above = picture[picture > dot.background + 0.5 * dot.peak]
     at_top = int(np.sum(above == top))
     levels, counts = np.unique(above, return_counts=True)
-    tail = levels.size > 1 and counts[-1] <= counts[-2]  # of the noise in a file with few levels
+    tail = levels.size > 1 and counts[-1] <= counts[-2]  # few pixels at the top level are the tail of the noise
     if tail or at_top < max(5, 0.02 * above.size):
         return None
     spacing = float(np.median(np.diff(levels))) if levels.size > 1 else 0.0
@@ -203,11 +203,11 @@ def check_blacks(picture: Array, dot: Dot, file: str | None, name: str) -> None:
     """
     paper = picture[distance_from(dot, picture.shape) > dot.reach + 1]
     levels, counts = np.unique(paper, return_counts=True)
-    if levels.size < 2 or counts[0] < _CUT * paper.size:
+    if levels.size < 2 or counts[0] < _CUT_BLACKS * paper.size:
         return
     mean = float(paper.mean())
     within_a_level = not dot.noise > max(0.6 * (levels[1] - levels[0]), 1e-6 * dot.peak)
-    if within_a_level or float(np.quantile(paper, 0.995)) - mean < _WIDER * (mean - levels[0]):
+    if within_a_level or float(np.quantile(paper, 0.995)) - mean < _NOISE_ASYMMETRY * (mean - levels[0]):
         return
     share = float(counts[0] / paper.size)
     text = (

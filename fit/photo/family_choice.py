@@ -14,9 +14,9 @@ COST = ("gaussian", "disc", "ring", "softm", "radial")
 
 _CONTRAST = 0.22  # standard deviation of a photograph's levels over their peak
 _WIDTH = 256  # px; smallest picture for the comparison
-_EVIDENCE = 2.0  # difference of BIC that is not significant
-_LOOK_BELOW = 20.0  # dB by which a highlight may differ more than a photograph
-_DARK, _DISPLAY = 0.02, 1 / 2.2  # level of a highlight that is compared, and exponent of the display
+_BIC_TIE = 2.0  # difference of BIC that is not significant
+_HIGHLIGHT_ALLOWANCE_DB = 20.0  # dB by which a highlight may differ more than a photograph
+_COMPARED_LEVEL, _DISPLAY_EXPONENT = 0.02, 1 / 2.2  # level of a highlight that is compared, and exponent of the display
 
 
 def natural_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
@@ -46,8 +46,8 @@ def natural_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     power = frequency**-2 / np.sum(frequency**-2)
     difference = np.zeros((width, width))
     for sign, k in ((1, first), (-1, second)):
-        around = np.arange(k.shape[0]) - k.shape[0] // 2
-        difference[np.ix_(around, around)] += sign * k
+        offsets = np.arange(k.shape[0]) - k.shape[0] // 2
+        difference[np.ix_(offsets, offsets)] += sign * k
     return _decibels(_CONTRAST**2 * float((power * np.abs(np.fft.fft2(difference)) ** 2).sum()))
 
 
@@ -69,9 +69,9 @@ def highlight_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     """
     first, second = _square("kernel", kernel), _square("other", other)
     half = max(first.shape[0], second.shape[0]) // 2
-    shown = [np.pad(k, half - k.shape[0] // 2) / float(second.max()) for k in (first, second)]
-    seen = np.maximum(*shown) > _DARK
-    encoded = [np.clip(k[seen], 0, 1) ** _DISPLAY for k in shown]
+    scaled = [np.pad(k, half - k.shape[0] // 2) / float(second.max()) for k in (first, second)]
+    is_compared = np.maximum(*scaled) > _COMPARED_LEVEL
+    encoded = [np.clip(k[is_compared], 0, 1) ** _DISPLAY_EXPONENT for k in scaled]
     return _decibels(float(np.mean((encoded[0] - encoded[1]) ** 2)))
 
 
@@ -88,8 +88,8 @@ def _square(name: str, kernel: ArrayLike) -> Array:
 
 def looks_alike(kernel: Array, other: Array, accuracy_db: float) -> bool:
     """Whether two kernels agree within `accuracy_db` on a photograph, and within 20 dB less on a highlight."""
-    look = highlight_psnr(kernel, other)
-    return natural_psnr(kernel, other) >= accuracy_db and look >= accuracy_db - _LOOK_BELOW
+    highlight = highlight_psnr(kernel, other)
+    return natural_psnr(kernel, other) >= accuracy_db and highlight >= accuracy_db - _HIGHLIGHT_ALLOWANCE_DB
 
 
 def choose(
@@ -106,19 +106,19 @@ def choose(
     """
     by_likelihood = sorted(kernels, key=lambda f: (bic[f], COST.index(f)))
     lowest = bic[by_likelihood[0]]
-    likeliest = min((f for f in kernels if bic[f] <= lowest + _EVIDENCE), key=COST.index)
-    second = next(f for f in by_likelihood if f != likeliest)
+    likeliest = min((f for f in kernels if bic[f] <= lowest + _BIC_TIE), key=COST.index)
+    runner_up = next(f for f in by_likelihood if f != likeliest)
     best = kernels[likeliest]
-    reached = {f: f"{natural_psnr(k, best):.1f} and {highlight_psnr(k, best):.1f} dB" for f, k in kernels.items()}
-    wanted = f"{accuracy_db:g} dB on a natural image and {accuracy_db - _LOOK_BELOW:g} dB on a highlight"
-    enough = [f for f in kernels if looks_alike(kernels[f], best, accuracy_db)]
-    family = min([*enough, likeliest], key=COST.index)
-    rest = [f for f in by_likelihood if f not in (family, likeliest)]
-    others = ", ".join(f"{f} {reached[f]}, BIC {bic[f] - bic[likeliest]:+.0f}" for f in rest)
+    accuracy = {f: f"{natural_psnr(k, best):.1f} and {highlight_psnr(k, best):.1f} dB" for f, k in kernels.items()}
+    required = f"{accuracy_db:g} dB on a natural image and {accuracy_db - _HIGHLIGHT_ALLOWANCE_DB:g} dB on a highlight"
+    sufficient = [f for f in kernels if looks_alike(kernels[f], best, accuracy_db)]
+    family = min([*sufficient, likeliest], key=COST.index)
+    remaining = [f for f in by_likelihood if f not in (family, likeliest)]
+    others = ", ".join(f"{f} {accuracy[f]}, BIC {bic[f] - bic[likeliest]:+.0f}" for f in remaining)
     if family == likeliest:
-        head = "the lowest BIC" if bic[family] == lowest else f"the simplest within {_EVIDENCE:g} of the lowest BIC"
-        margin = bic[second] - bic[likeliest]
-        why = f"{head} ({second} second by {margin:.0f}), and no cheaper family has {wanted}"
+        reason = "the lowest BIC" if bic[family] == lowest else f"the simplest within {_BIC_TIE:g} of the lowest BIC"
+        margin = bic[runner_up] - bic[likeliest]
+        why = f"{reason} ({runner_up} second by {margin:.0f}), and no cheaper family has {required}"
     else:
-        why = f"the cheapest with {wanted} ({reached[family]}) against {likeliest}, the likeliest"
+        why = f"the cheapest with {required} ({accuracy[family]}) against {likeliest}, the likeliest"
     return family, f"{why} ({others})", {f: natural_psnr(kernels[f], kernels["radial"]) for f in kernels}

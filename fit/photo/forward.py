@@ -38,8 +38,8 @@ _STARTS = {  # lengths relative to the increase of the dot's standard deviation 
     "ring": [{"sigma": 0.9, "r_c": 0.2}, {"sigma": 0.6, "r_c": 0.9}, {"sigma": 0.25, "r_c": 1.3}],
     "softm": [{"radius": 2.0, "sigma": 0.15, "b": 0.0, "m": 2.0}, {"radius": 1.7, "sigma": 0.4, "b": 0.5, "m": 3.0}],
 }
-_LEAST, _MOST = {"b": -1.0, "rotation_deg": -np.inf}, {"curvature": 1.0}
-_DRAWN_PX = 16.0
+_LOWER, _UPPER = {"b": -1.0, "rotation_deg": -np.inf}, {"curvature": 1.0}
+_RMS_DRAWN_PX = 16.0
 _STEP = {"dx": 1e-4, "dy": 1e-4, "magnification": 1e-5}
 
 
@@ -61,7 +61,6 @@ class Forward:
     opening: Aperture | None = None  # of the lens, for the kernels in OPENINGS: blades or an image
 
     def __post_init__(self) -> None:
-        """Computes values shared by all families."""
         self.pixels = np.indices(self.data.shape).astype(np.float64)  # rows and columns [2, H, W]
         self.half = min(self.data.shape) // 2  # half the window, px: limits the kernel
         self.grid = tuple(next_fast_len(n + self.half + 1, real=True) for n in self.data.shape)  # for FFTs
@@ -90,7 +89,7 @@ class Forward:
         picture[self.box] = self.source.draw(rows, columns, x, y, moves["magnification"])
         return picture
 
-    def convolve(self, source: Array, kernels: Array, whole: bool = False) -> Array:
+    def convolve(self, source: Array, kernels: Array, all_pixels: bool = False) -> Array:
         """Convolves a transformed source `[h, w]` or `[n, h, w]` with kernels `[n, k, k]`: `[n, pixels used]`."""
         size = kernels.shape[-1]
         padded = np.zeros((*kernels.shape[:-2], *self.grid))
@@ -99,7 +98,7 @@ class Forward:
         wrapped = np.roll(padded, (-(size // 2), -(size // 2)), (-2, -1))
         blurred = irfft2(source * rfft2(wrapped, self.grid), self.grid)
         flat = blurred[..., : self.data.shape[0], : self.data.shape[1]].reshape(*blurred.shape[:-2], -1)
-        return np.asarray(flat if whole else flat[..., self.flat])
+        return np.asarray(flat if all_pixels else flat[..., self.flat])
 
     def correlate(self, source: Array, picture: Array, size: int) -> Array:
         """The adjoint of `convolve` for one kernel `[size, size]`, from the used pixels."""
@@ -108,21 +107,21 @@ class Forward:
 
     def picture(self, values: Array, elsewhere: float) -> Array:
         """Pictures `[..., H, W]` from values of the used pixels `[..., pixels used]`."""
-        full = np.full((*values.shape[:-1], self.flat.size), elsewhere)
-        full[..., self.flat] = values
-        return full.reshape(*values.shape[:-1], *self.data.shape)
+        pictures = np.full((*values.shape[:-1], self.flat.size), elsewhere)
+        pictures[..., self.flat] = values
+        return pictures.reshape(*values.shape[:-1], *self.data.shape)
 
     def kernels(self, family: str, params: Mapping[str, Array], widest: int | None = None) -> Array:
         """Kernels `[n, k, k]` for parameters `[n]`, as wide as needed, at most `widest` px or the window."""
-        most = self.half if widest is None else widest
+        limit = self.half if widest is None else widest
         tensors = {k: torch.from_numpy(np.atleast_1d(v)) for k, v in params.items()}
         if family in OPENINGS:
             radius = tensors["radius"]
-            size = 2 * min(int(np.ceil(float(radius.max()))) + 1, most) + 1
-            each = [self.opening_with({n: float(v[i]) for n, v in tensors.items()}) for i in range(len(radius))]
-            drawn = [pixel_kernels("disc", {"radius": r}, size, None, o) for r, o in zip(radius, each, strict=True)]
-            return torch.stack(drawn).numpy()
-        half = min(int(np.ceil(support(family, tensors))) + 1, most)
+            size = 2 * min(int(np.ceil(float(radius.max()))) + 1, limit) + 1
+            openings = [self.opening_with({n: float(v[i]) for n, v in tensors.items()}) for i in range(len(radius))]
+            shapes = zip(radius, openings, strict=True)
+            return torch.stack([pixel_kernels("disc", {"radius": r}, size, None, o) for r, o in shapes]).numpy()
+        half = min(int(np.ceil(support(family, tensors))) + 1, limit)
         return pixel_kernels(family, tensors, 2 * half + 1).numpy()
 
     def opening_with(self, params: Mapping[str, float]) -> Aperture:
@@ -138,11 +137,11 @@ class Forward:
         They are drawn so large that the effect of the kernels' pixels, which are never negative, is negligible.
         """
         lengths = [np.abs(v).max() for n, v in params.items() if n in LENGTHS]
-        enlarged = max(1.0, _DRAWN_PX / max(lengths))
-        drawn = {n: enlarged * np.asarray(v) if n in LENGTHS else np.asarray(v) for n, v in params.items()}
-        kernels = self.kernels(family, drawn, int(np.ceil(enlarged * self.half)))
-        away = np.arange(kernels.shape[-1]) - kernels.shape[-1] // 2
-        return np.asarray(np.sqrt((kernels * (away[:, None] ** 2 + away**2)).sum((1, 2))) / enlarged)
+        scale = max(1.0, _RMS_DRAWN_PX / max(lengths))
+        scaled = {n: scale * np.asarray(v) if n in LENGTHS else np.asarray(v) for n, v in params.items()}
+        kernels = self.kernels(family, scaled, int(np.ceil(scale * self.half)))
+        offset = np.arange(kernels.shape[-1]) - kernels.shape[-1] // 2
+        return np.asarray(np.sqrt((kernels * (offset[:, None] ** 2 + offset**2)).sum((1, 2))) / scale)
 
     def solve(self, family: str) -> Solution:
         """Fits one family from several starts (or from `start`, and from the moments as well)."""
@@ -152,25 +151,25 @@ class Forward:
         # the prior is added as data with the uncertainty of a pixel
         noise = max(noise_of(self.data), 1e-5 * self.unit) / self.unit
         mean, deviation = np.array([self.prior.get(n, (0.0, np.inf)) for n in names]).T
-        pull = noise / deviation
+        prior_weight = noise / deviation
         numbers = best_of(
-            lambda p: np.concatenate([self.project(self._shaped(family, names, p))[0] / self.unit, pull * p]),
-            np.concatenate([self.values / self.unit, pull * mean]),
+            lambda p: np.concatenate([self.project(self._shaped(family, names, p))[0] / self.unit, prior_weight * p]),
+            np.concatenate([self.values / self.unit, prior_weight * mean]),
             [[start[n] if n in start else unmoved[n] for n in names] for start in self._starts(family)],
             self.bounds(names),
-            jacobian=lambda p: np.concatenate([self._jacobian(family, names, p) / self.unit, np.diag(pull)]),
+            jacobian=lambda p: np.concatenate([self._jacobian(family, names, p) / self.unit, np.diag(prior_weight)]),
             tolerance=1e-7,
             # leave the neighbour's branch only if another one reduces chi squared by 12
-            loyalty=12 / self.values.size if family in self.start else 0.0,
+            first_bias=12 / self.values.size if family in self.start else 0.0,
         )
         params = {n: float(v) for n, v in zip(names, numbers, strict=True)}
         fitted, gain, background = self.project(self._shaped(family, names, numbers))
         residual, slopes = self.values - fitted, self._jacobian(family, names, numbers)
         kernel, penalty = (
             self.kernels(family, {n: np.array([params[n]]) for n in shape})[0],
-            np.diag((self.unit * pull) ** 2),
+            np.diag((self.unit * prior_weight) ** 2),
         )
-        covariance = self.covariance(slopes, residual, kernel, gain, penalty, of_prior=True)
+        covariance = self.covariance(slopes, residual, kernel, gain, penalty, is_prior=True)
         moves = self.moves(params)
         return Solution(
             self, family, {n: params[n] for n in shape}, moves, gain, background, fitted, names, covariance, slopes
@@ -178,11 +177,11 @@ class Forward:
 
     def moves(self, params: Mapping[str, float]) -> dict[str, float]:
         """The fitted moves, completed by the fixed ones."""
-        held = self.magnification if self.held_magnification is None else self.held_magnification
-        return {n: params.get(n, held if n == "magnification" else 0.0) for n in ALL_MOVES}
+        magnification = self.magnification if self.held_magnification is None else self.held_magnification
+        return {n: params.get(n, magnification if n == "magnification" else 0.0) for n in ALL_MOVES}
 
     def covariance(
-        self, slopes: Array, residual: Array, kernel: Array, gain: float, penalty: Array, of_prior: bool = False
+        self, slopes: Array, residual: Array, kernel: Array, gain: float, penalty: Array, is_prior: bool = False
     ) -> Array:
         """Covariance of the parameters under the noise of both pictures (a sandwich estimator).
 
@@ -192,25 +191,26 @@ class Forward:
         would make the errors too small. A smoothing penalty `[p, p]` reduces the errors; that of a prior is a
         measurement with the uncertainty of a pixel and adds its own noise to M.
         """
-        bread = inverse(slopes.T @ slopes + penalty)
-        known = np.isfinite(np.diag(bread))
-        bread = np.where(np.outer(known, known), bread, 0.0)
+        information_inverse = inverse(slopes.T @ slopes + penalty)
+        is_determined = np.isfinite(np.diag(information_inverse))
+        information_inverse = np.where(np.outer(is_determined, is_determined), information_inverse, 0.0)
         full = self.picture(residual, 0.0)
         variance = float(np.sum(full[self.lit] ** 2)) / max(int(self.lit.sum()) - slopes.shape[1] - 2, 1)
         # few pixels determine the correlation badly; the paper has many, if its noise is similar
-        found = correlation_of(full, self.used & (self.distance <= self.dot.reach + 2))
-        correlation = max(self.noise_correlation, found, key=np.sum)
-        through = (gain * self.source.noise) ** 2 / self.fine_share
-        own = max(variance - through * float(np.sum(kernel**2)), 0.1 * variance)
-        meat = own * (slopes.T @ self.correlated_noise(slopes, correlation) + (penalty if of_prior else 0.0))
-        if through > 0:  # (K' J)' (K' J) over the source's pixels with noise
+        residual_correlation = correlation_of(full, self.used & (self.distance <= self.dot.reach + 2))
+        correlation = max(self.noise_correlation, residual_correlation, key=np.sum)
+        source_variance = (gain * self.source.noise) ** 2 / self.fine_share
+        own_variance = max(variance - source_variance * float(np.sum(kernel**2)), 0.1 * variance)
+        prior = penalty if is_prior else 0.0
+        score_cov = own_variance * (slopes.T @ self.correlated_noise(slopes, correlation) + prior)
+        if source_variance > 0:  # (K' J)' (K' J) over the source's pixels with noise
             pictures = rfft2(self.picture(slopes.T, 0.0), self.grid)
-            carrying = (self.distance <= self.source.reach * self.magnification).ravel()
-            spread = np.where(carrying, self.convolve(pictures, kernel[None], whole=True), 0.0)
-            alike = correlate(spread.reshape(-1, *self.data.shape), self.noise_correlation)
-            meat = meat + through * (spread @ alike.reshape(spread.shape).T)
-        covariance = bread @ meat @ bread
-        covariance[~known, ~known] = np.inf
+            has_source_noise = (self.distance <= self.source.reach * self.magnification).ravel()
+            spread = np.where(has_source_noise, self.convolve(pictures, kernel[None], all_pixels=True), 0.0)
+            correlated_spread = correlate(spread.reshape(-1, *self.data.shape), self.noise_correlation)
+            score_cov = score_cov + source_variance * (spread @ correlated_spread.reshape(spread.shape).T)
+        covariance = information_inverse @ score_cov @ information_inverse
+        covariance[~is_determined, ~is_determined] = np.inf
         return np.asarray(covariance)
 
     def correlated_noise(self, columns: Array, correlation: Array) -> Array:
@@ -235,15 +235,15 @@ class Forward:
         """Derivatives of the projected model `[pixels used, parameters]` (Kaufman's approximation)."""
         params = dict(zip(names, p, strict=True))
         shape = SHAPES[family]
-        near = {n: np.repeat(params[n], 2 * len(shape) + 1) for n in shape}
+        varied = {n: np.repeat(params[n], 2 * len(shape) + 1) for n in shape}
         for i, n in enumerate(shape):
             step = 1e-4 * max(abs(params[n]), 0.1)
-            near[n][2 * i + 1] += step
-            near[n][2 * i + 2] = max(near[n][2 * i + 2] - step, _LEAST.get(n, 0.0))
-            near[n] = np.minimum(near[n], _MOST.get(n, np.inf))
-        kernels = self.kernels(family, near)
+            varied[n][2 * i + 1] += step
+            varied[n][2 * i + 2] = max(varied[n][2 * i + 2] - step, _LOWER.get(n, 0.0))
+            varied[n] = np.minimum(varied[n], _UPPER.get(n, np.inf))
+        kernels = self.kernels(family, varied)
         slopes = [
-            (kernels[2 * i + 1] - kernels[2 * i + 2]) / (near[n][2 * i + 1] - near[n][2 * i + 2])
+            (kernels[2 * i + 1] - kernels[2 * i + 2]) / (varied[n][2 * i + 1] - varied[n][2 * i + 2])
             for i, n in enumerate(shape)
         ]
         blurred = self.convolve(self.moved_source(self.moves(params)), np.stack([kernels[0], *slopes]))
@@ -255,35 +255,35 @@ class Forward:
         unmoved = self._drawn(self.moves(params))
         columns = []
         for n in names:
-            moved = self.moves(params)
-            moved[n] += _STEP[n]
-            change = rfft2((self._drawn(moved) - unmoved) / _STEP[n], self.grid)
+            changed = self.moves(params)
+            changed[n] += _STEP[n]
+            change = rfft2((self._drawn(changed) - unmoved) / _STEP[n], self.grid)
             columns.append(self.convolve(change, kernel[None])[0])
         return columns
 
     def bounds(self, names: tuple[str, ...]) -> tuple[list[float], list[float]]:
         """Lower and upper bounds of the named parameters."""
-        wander = max(2.0, 0.3 * self.dot.radius)
+        largest_shift = max(2.0, 0.3 * self.dot.radius)
         table = {
             **{"sigma": (0.05, self.half), "r_c": (0.0, self.half), "radius": (0.1, self.half), "m": (0.5, 12.0)},
             **{"b": (-0.98, 8.0), "rotation_deg": (-400.0, 400.0), "curvature": (0.0, 1.0)},
-            **dict.fromkeys(("dx", "dy"), (-wander, wander)),
+            **dict.fromkeys(("dx", "dy"), (-largest_shift, largest_shift)),
             "magnification": (0.7 * self.magnification, 1.4 * self.magnification),
         }
         return [table[n][0] for n in names], [table[n][1] for n in names]
 
     def _starts(self, family: str) -> list[Mapping[str, float]]:
         """Initial kernel parameters: a given start, and shapes with the second moment that the blur has added."""
-        given = [self.start[family]] if family in self.start else []
+        starts = [self.start[family]] if family in self.start else []
         if self.prior:
             # the prior leads to its own branch; starts from moments would be pulled away from it
-            return [*given, {n: mean for n, (mean, _) in self.prior.items()}]
-        added = (self.dot.radius**2 - (self.magnification * self.source.radius) ** 2) / 4
-        size = min(float(np.sqrt(max(added, 0.15))), self.half / 3)
+            return [*starts, {n: mean for n, (mean, _) in self.prior.items()}]
+        added_variance = (self.dot.radius**2 - (self.magnification * self.source.radius) ** 2) / 4
+        size = min(float(np.sqrt(max(added_variance, 0.15))), self.half / 3)
         if family not in OPENINGS:
-            return [*given, *({n: v * size if n in LENGTHS else v for n, v in s.items()} for s in _STARTS[family])]
+            return [*starts, *({n: v * size if n in LENGTHS else v for n, v in s.items()} for s in _STARTS[family])]
         # the rotation of an opening is only known from a given start
-        return given or [{"radius": np.sqrt(2) * size / float(self.rms(family, {"radius": np.ones(1)})[0])}]
+        return starts or [{"radius": np.sqrt(2) * size / float(self.rms(family, {"radius": np.ones(1)})[0])}]
 
 
 def without_level(columns: Array, shaped: Array) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import convolve
 
 from torchdof.io.images import read_image
-from torchdof.io.metadata import camera_facts
+from torchdof.io.metadata import camera_settings
 from torchdof.io.transfer import Transfer
 
 from ..problems import FitError
@@ -57,36 +57,36 @@ def read_frame(
         has NaN.
         OSError: the file is missing or damaged.
     """
-    refused = partial(FitError, kind="manifest", file=str(path))
+    invalid = partial(FitError, kind="manifest", file=str(path))
     picture = read_image(path, transfer=transfer)
     pixels = picture.pixels[0].numpy().astype(np.float64)
     pixels = pixels[[i for i, name in enumerate(picture.channels) if name != "A"]]
     if bayer is not None:
         if len(pixels) != 1:
-            raise refused(f"bayer = {bayer!r} is for pictures with one colour a pixel, got {len(pixels)} colours")
+            raise invalid(f"bayer = {bayer!r} is for pictures with one colour a pixel, got {len(pixels)} colours")
         if picture.orientation != 1:
             text = f"bayer = {bayer!r} is for pictures as the sensor is read, got one of EXIF orientation "
-            raise refused(f"{text}{picture.orientation}; remove the tag")
+            raise invalid(f"{text}{picture.orientation}; remove the tag")
         pixels = demosaiced(pixels[0], bayer)
     height, width = pixels.shape[1:]
     left, top, columns, rows = crop or (0, 0, width, height)
     if left + columns > width or top + rows > height:
-        raise refused(f"crop {[left, top, columns, rows]} extends beyond the picture of {width}x{height}")
+        raise invalid(f"crop {[left, top, columns, rows]} extends beyond the picture of {width}x{height}")
     pixels = pixels[:, top : top + rows, left : left + columns]
     if bad := int(np.sum(~np.isfinite(pixels))):
         raise FitError(f"{bad} values are NaN or infinite", "not finite", file=str(path), number=float(bad))
     white = 1.0 if picture.sample in ("8", "16") else None
-    high = pixels >= 1.0 - 1e-6
+    is_clipped = pixels >= 1.0 - 1e-6
     if dark is not None:
         if dark.colours.shape != pixels.shape:
-            raise refused(f"the dark frame is {size_of(dark.light)}, the picture {size_of(pixels[0])}")
+            raise invalid(f"the dark frame is {size_of(dark.light)}, the picture {size_of(pixels[0])}")
         pixels = pixels - dark.colours
     light = pixels.mean(axis=0)
     if white is not None:
-        pixels[high] = white
-        light[high.any(axis=0)] = white  # one clipped colour clips the mean
+        pixels[is_clipped] = white
+        light[is_clipped.any(axis=0)] = white  # one clipped colour clips the mean
     encoded, middle = white is not None and picture.transfer == "srgb", ((width - 1) / 2 - left, (height - 1) / 2 - top)
-    facts = camera_facts(picture.metadata, width, height)
+    facts = camera_settings(picture.metadata, width, height)
     return Frame(path, light, pixels, white, encoded, width, middle, facts)
 
 
@@ -107,63 +107,66 @@ def size_of(picture: Array) -> str:
 
 
 def cut_pairs(
-    still: Frame, moved: Frame, focus_m: float, distance_m: float, dots: Dots, exposure: float | None, colours: bool
+    frames: tuple[Frame, Frame], focus_m: float, distance_m: float, dots: Dots, exposure: float | None, colours: bool
 ) -> list[Capture]:
-    """Finds the dot, or the dots of a grid, in two frames and cuts the windows around each.
+    """Finds the dot, or the dots of a grid, in a sharp and a blurred frame, and cuts the windows around each.
 
-    `exposure` is the brightness of `moved` over that of `still`.
+    `exposure` is the brightness of the blurred frame over that of the sharp one.
 
     Raises:
         FitError: no dot, several dots, or one too close to the frame's edge or to others.
     """
-    frames = (still, moved)
+    sharp_frame, blurred_frame = frames
     if dots == "one":
-        matched = [(find_dot(still.light, file=str(still.file)), find_dot(moved.light, file=str(moved.file)))]
+        first, second = (find_dot(frame.light, file=str(frame.file)) for frame in frames)
+        matched = [(first, second)]
     else:
-        matched = _matched(still, moved, focus_m / distance_m)[: 1 if dots == "centre" else None]
+        matched = _matched(sharp_frame, blurred_frame, focus_m / distance_m)[: 1 if dots == "centre" else None]
     pairs = []
-    for first, second in matched:
-        places = [(round(dot.x), round(dot.y)) for dot in (first, second)]
-        height, width = still.light.shape
-        border = [min(x, y, width - 1 - x, height - 1 - y) for x, y in places]
-        needed = max(first.reach, second.reach) + 2
-        half = min(*border, math.ceil(_MARGIN * needed) + 8)
+    for sharp_dot, blurred_dot in matched:
+        centres = [(round(dot.x), round(dot.y)) for dot in (sharp_dot, blurred_dot)]
+        height, width = sharp_frame.light.shape
+        border_px = [min(x, y, width - 1 - x, height - 1 - y) for x, y in centres]
+        needed = max(sharp_dot.reach, blurred_dot.reach) + 2
+        half = min(*border_px, math.ceil(_MARGIN * needed) + 8)
         if half < needed:
             text = f"the frame cuts the blur: it reaches {needed:.0f} px from the dot, the frame ends after {half} px"
-            worse = still if border[0] < first.reach + 2 else moved
-            raise FitError(text, "window", file=str(worse.file), number=needed)
-        cut = [(..., slice(y - half, y + half + 1), slice(x - half, x + half + 1)) for x, y in places]
-        sharp, blurred = (frame.light[window].copy() for frame, window in zip(frames, cut, strict=True))
-        for frame, window in ((still, sharp), (moved, blurred)):
+            cut_frame = sharp_frame if border_px[0] < sharp_dot.reach + 2 else blurred_frame
+            raise FitError(text, "window", file=str(cut_frame.file), number=needed)
+        windows = [(..., slice(y - half, y + half + 1), slice(x - half, x + half + 1)) for x, y in centres]
+        sharp, blurred = (frame.light[window].copy() for frame, window in zip(frames, windows, strict=True))
+        for frame, window in ((sharp_frame, sharp), (blurred_frame, blurred)):
             if (count := len(find_dots(window, file=str(frame.file)))) > 1:
                 text = f"{count} dots in a window of {2 * half + 1} px: print the dots farther apart than their blur"
                 raise FitError(text, "several dots", file=str(frame.file), number=float(count))
+        centre = sharp_frame.middle
+        sharp_colours, blurred_colours = (f.colours[window] for f, window in zip(frames, windows, strict=True))
         pairs.append(
             Capture(
                 sharp,
                 blurred,
                 distance_m,
-                files=(str(still.file), str(moved.file)),
-                white=still.white,
+                files=(str(sharp_frame.file), str(blurred_frame.file)),
+                white=sharp_frame.white,
                 exposure=exposure,
-                position_px=(round(first.x - still.middle[0], 2), round(first.y - still.middle[1], 2)),
-                colours=(still.colours[cut[0]].copy(), moved.colours[cut[1]].copy()) if colours else None,
+                position_px=(round(sharp_dot.x - centre[0], 2), round(sharp_dot.y - centre[1], 2)),
+                colours=(sharp_colours.copy(), blurred_colours.copy()) if colours else None,
             )
         )
     return pairs
 
 
-def _matched(still: Frame, moved: Frame, magnification: float) -> list[tuple[Dot, Dot]]:
+def _matched(sharp: Frame, blurred: Frame, magnification: float) -> list[tuple[Dot, Dot]]:
     """Pairs the dots of a grid in both pictures, from the centre outwards: each moves on its line to the centre."""
-    first, second = (find_dots(frame.light, file=str(frame.file), smallest=0.3) for frame in (still, moved))
-    middle, pairs = still.middle, []
-    for dot in sorted(first, key=lambda d: math.dist((d.x, d.y), middle)):
-        where = [m + magnification * (v - m) for m, v in zip(middle, (dot.x, dot.y), strict=True)]
-        near = min(second, key=lambda d: math.dist((d.x, d.y), where))
-        apart = min((math.dist((d.x, d.y), (dot.x, dot.y)) for d in first if d is not dot), default=math.inf)
-        if math.dist((near.x, near.y), where) < 0.4 * magnification * apart:
-            pairs.append((dot, near))
+    sharp_dots, blurred_dots = (find_dots(f.light, file=str(f.file), smallest=0.3) for f in (sharp, blurred))
+    centre, pairs = sharp.middle, []
+    for dot in sorted(sharp_dots, key=lambda d: math.dist((d.x, d.y), centre)):
+        expected = [m + magnification * (v - m) for m, v in zip(centre, (dot.x, dot.y), strict=True)]
+        nearest = min(blurred_dots, key=lambda d: math.dist((d.x, d.y), expected))
+        spacing = min((math.dist((d.x, d.y), (dot.x, dot.y)) for d in sharp_dots if d is not dot), default=math.inf)
+        if math.dist((nearest.x, nearest.y), expected) < 0.4 * magnification * spacing:
+            pairs.append((dot, nearest))
     if not pairs:
-        text = f"none of the {len(first)} dots of {still.file.name} is found again; are the distances right?"
-        raise FitError(text, "no dot", file=str(moved.file), number=float(len(second)))
+        text = f"none of the {len(sharp_dots)} dots of {sharp.file.name} is found again; are the distances right?"
+        raise FitError(text, "no dot", file=str(blurred.file), number=float(len(blurred_dots)))
     return pairs

@@ -32,8 +32,8 @@ _CHOICES: Mapping[str, tuple[str, ...]] = {
     "bayer": PATTERNS,
 }
 _FIELDS = (*("shot", "crop", "focus_m", "exposure_s", "full_width_px", *CAMERA, "sharp", "dark", "name"), *_CHOICES)
-_OF_A_SHOT = ("file", "distance_m", "exposure_s")
-_NEEDED = ("focus_m", "sharp", "file", "distance_m")
+_SHOT_FIELDS = ("file", "distance_m", "exposure_s")
+_REQUIRED = ("focus_m", "sharp", "file", "distance_m")
 
 
 def read_captures(
@@ -84,58 +84,60 @@ def read_captures(
         raise FitError(f"folder must be the path of a folder or of its {MANIFEST}, got {show(folder)}", "manifest")
     path = Path(folder)
     path = path / MANIFEST if path.is_dir() or path.suffix != ".toml" else path
-    where, base = str(path), path.parent
-    refused = partial(FitError, kind="manifest", file=where)
+    manifest_name, folder_path = str(path), path.parent
+    invalid = partial(FitError, kind="manifest", file=manifest_name)
     if root is not None:
-        inside(path, root, where)
+        inside(path, root, manifest_name)
     fields, shots = _manifest(path)
     fields |= {name: value for name, value in (("dots", dots), ("colours", colours)) if value}
-    known = {name: _field(fields, name, where) for name in _FIELDS[1:]}
-    shots = [{name: _field(shot, name, where) for name in _OF_A_SHOT} for shot in shots]
-    focus, files = known["focus_m"], [shot["file"] for shot in shots]
-    check_distances([shot["distance_m"] for shot in shots], focus, where)
+    manifest = {name: _field(fields, name, manifest_name) for name in _FIELDS[1:]}
+    shots = [{name: _field(shot, name, manifest_name) for name in _SHOT_FIELDS} for shot in shots]
+    focus, files = manifest["focus_m"], [shot["file"] for shot in shots]
+    check_distances([shot["distance_m"] for shot in shots], focus, manifest_name)
     if root is not None:
-        for name in filter(None, [known["sharp"], *files, known["dark"]]):
-            inside(base / name, root, where)
+        for name in filter(None, [manifest["sharp"], *files, manifest["dark"]]):
+            inside(folder_path / name, root, manifest_name)
 
     def read(name: str, dark: Frame | None) -> Frame:
-        return read_frame(base / name, known["transfer"], dark, known["crop"], known["bayer"])
+        return read_frame(folder_path / name, manifest["transfer"], dark, manifest["crop"], manifest["bayer"])
 
-    dark = read(known["dark"], None) if known["dark"] else None
-    first = read(known["sharp"], dark)
-    each = known["colours"] == "each"
-    if each and first.colours.shape[0] != 3:
+    dark = read(manifest["dark"], None) if manifest["dark"] else None
+    sharp_frame = read(manifest["sharp"], dark)
+    by_colour = manifest["colours"] == "each"
+    if by_colour and sharp_frame.colours.shape[0] != 3:
         text = "colours = 'each' needs pictures of three colours, or bayer = 'RGGB', got"
-        raise refused(f"{text} {first.colours.shape[0]}")
-    columns, encoded = [], [first.file.name] if first.encoded else []
+        raise invalid(f"{text} {sharp_frame.colours.shape[0]}")
+    columns, encoded = [], [sharp_frame.file.name] if sharp_frame.encoded else []
     for shot in shots:
-        moved = read(shot["file"], dark)
-        _check_alike(first, moved, where)
-        encoded += [moved.file.name] if moved.encoded else []
-        exposure = shot["exposure_s"] / known["exposure_s"] if shot["exposure_s"] and known["exposure_s"] else None
-        columns.append(cut_pairs(first, moved, focus, shot["distance_m"], known["dots"] or "one", exposure, each))
-    if known["transfer"] is None and encoded:
-        more = f" and {len(encoded) - 1} more" if len(encoded) > 1 else ""
+        blurred_frame = read(shot["file"], dark)
+        _check_alike(sharp_frame, blurred_frame, manifest_name)
+        encoded += [blurred_frame.file.name] if blurred_frame.encoded else []
+        seconds = manifest["exposure_s"]
+        exposure = shot["exposure_s"] / seconds if shot["exposure_s"] and seconds else None
+        frames = (sharp_frame, blurred_frame)
+        columns.append(cut_pairs(frames, focus, shot["distance_m"], manifest["dots"] or "one", exposure, by_colour))
+    if manifest["transfer"] is None and encoded:
+        further = f" and {len(encoded) - 1} more" if len(encoded) > 1 else ""
         text = (
-            f"the encoding of {encoded[0]}{more} is not stated; sRGB is assumed. A camera's own tone curve "
+            f"the encoding of {encoded[0]}{further} is not stated; sRGB is assumed. A camera's own tone curve "
             "or sharpening makes the kernel up to 15 % too small and need not show: develop to linear light without "
             "them. Then say transfer = 'linear', or 'srgb' if that is all that was done"
         )
-        warn(text, "not linear", file=where, number=float(len(encoded)))
-    width = first.width_px if known["full_width_px"] is None else round(known["full_width_px"])
-    if width < first.width_px:
-        got = f"got {known['full_width_px']:g} for pictures of {first.width_px}"
-        raise refused(f"full_width_px must be at least the pictures' own width, {got}")
-    camera = {name: first.facts.get(name) if known[name] is None else known[name] for name in CAMERA}
+        warn(text, "not linear", file=manifest_name, number=float(len(encoded)))
+    width = sharp_frame.width_px if manifest["full_width_px"] is None else round(manifest["full_width_px"])
+    if width < sharp_frame.width_px:
+        got = f"got {manifest['full_width_px']:g} for pictures of {sharp_frame.width_px}"
+        raise invalid(f"full_width_px must be at least the pictures' own width, {got}")
+    camera = {name: sharp_frame.facts.get(name) if manifest[name] is None else manifest[name] for name in CAMERA}
     notes = {
         "manifest": path.name,
-        "transfer": known["transfer"] or "by file type",
+        "transfer": manifest["transfer"] or "by file type",
         "pictures": files,
-        "dots": known["dots"] or "one",
+        "dots": manifest["dots"] or "one",
     }
-    if from_exif := [name for name in CAMERA if known[name] is None and camera[name] is not None]:
+    if from_exif := [name for name in CAMERA if manifest[name] is None and camera[name] is not None]:
         notes["from_exif"] = from_exif
-    name = known["name"] or base.resolve().name
+    name = manifest["name"] or folder_path.resolve().name
     return [
         Captures(pairs, focus, width, **camera, name=name, notes=notes | {"position_px": list(pairs[0].position_px)})
         for pairs in zip(*columns, strict=False)
@@ -154,26 +156,26 @@ def inside(file: Path, root: str | os.PathLike[str], where: str) -> None:
 
 def _manifest(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The fields of a manifest and those of its shots, with known names only."""
-    refused = partial(FitError, kind="manifest", file=str(path))
+    invalid = partial(FitError, kind="manifest", file=str(path))
     if not path.is_file():
-        raise refused("there is no such manifest; write a capture.toml beside the pictures")
+        raise invalid("there is no such manifest; write a capture.toml beside the pictures")
     try:
         fields = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise refused(f"is not TOML: {error}") from error
+        raise invalid(f"is not TOML: {error}") from error
     shots = fields.get("shot")
     if not isinstance(shots, list) or not shots or not all(isinstance(s, dict) for s in shots):
-        raise refused("give at least one [[shot]] with file and distance_m")
-    for table, names in ((fields, _FIELDS), *((shot, _OF_A_SHOT) for shot in shots)):
+        raise invalid("give at least one [[shot]] with file and distance_m")
+    for table, names in ((fields, _FIELDS), *((shot, _SHOT_FIELDS) for shot in shots)):
         if unknown := [name for name in table if name not in names]:
-            raise refused(f"{unknown[0]!r} is not a field; known are {', '.join(names)}")
+            raise invalid(f"{unknown[0]!r} is not a field; known are {', '.join(names)}")
     return fields, shots
 
 
 def _field(fields: Mapping[str, Any], name: str, where: str) -> Any:
     """A valid field of the manifest, or None if it is missing and optional."""
     value = fields.get(name)
-    if value is None and name not in _NEEDED:
+    if value is None and name not in _REQUIRED:
         return None
     try:
         if name in RANGES:
@@ -196,8 +198,8 @@ def _check_alike(first: Frame, second: Frame, where: str) -> None:
     if first.light.shape != second.light.shape:
         text = f"{second.file.name} is {size_of(second.light)}, {first.file.name} is {size_of(first.light)}"
         raise FitError(text, "manifest", file=where)
-    for what, word in (("f_number", "f-number"), ("focal_length_mm", "focal length")):
-        before, after = first.facts.get(what), second.facts.get(what)
+    for key, word in (("f_number", "f-number"), ("focal_length_mm", "focal length")):
+        before, after = first.facts.get(key), second.facts.get(key)
         if before and after and abs(math.log(before / after)) > 0.02:
             text = (
                 f"EXIF says this was taken at {word} {after:g}, and {first.file.name} at {before:g}; aperture and "

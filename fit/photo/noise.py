@@ -13,21 +13,21 @@ from ..result import Array, Mask
 LAGS = 6
 """Largest distance in pixels of correlated noise; demosaicing reaches 2, a JPEG's blocks 7."""
 
-_FEWEST = 300  # pixels below which a correlation is not estimated
-_CLEAR = 4.0  # standard errors above which a correlation is significant
-_LEAST_FINE = 1e-4  # smallest share of fine noise
+_MIN_PIXELS = 300  # pixels below which a correlation is not estimated
+_MIN_SIGMAS = 4.0  # standard errors above which a correlation is significant
+_MIN_FINE_SHARE = 1e-4  # smallest share of fine noise
 
 
 def noise_of(picture: Array) -> float:
     """Standard deviation of a pixel's noise, from second differences, which vanish in a smooth picture."""
     differences = _mixed_differences(picture)
     # near the border, away from the dot's edges
-    sizes = np.abs(differences[near_border(differences.shape, max(3, min(picture.shape) // 5))])
+    magnitudes = np.abs(differences[near_border(differences.shape, max(3, min(picture.shape) // 5))])
     # pixels of a mosaic differ in noise, so use the mean square, without outliers. If most pixels are interpolated (one
     # colour of a mosaic), the others carry the noise
-    usual = 1.4826 * float(np.median(sizes))
-    usual = usual if usual > 1e-9 * float(np.abs(picture).max()) else float(np.percentile(sizes, 90))
-    return float(np.sqrt(np.mean(sizes[sizes <= 5 * usual] ** 2)))
+    typical = 1.4826 * float(np.median(magnitudes))
+    typical = typical if typical > 1e-9 * float(np.abs(picture).max()) else float(np.percentile(magnitudes, 90))
+    return float(np.sqrt(np.mean(magnitudes[magnitudes <= 5 * typical] ** 2)))
 
 
 def near_border(shape: tuple[int, ...], width: int) -> Mask:
@@ -59,7 +59,7 @@ def rounding_of(levels: Array) -> float:
     return 3 * float(steps.min()) ** 2 / 4 if steps.size else 0.0
 
 
-def correlation_of(values: Array, used: Mask) -> Array:
+def correlation_of(values: Array, is_used: Mask) -> Array:
     """Correlation of the noise (mean 0) of a picture's used pixels with their neighbours.
 
     It is `[2 LAGS + 1, 2 LAGS + 1]`, 1 in the centre, and 0 at lags without significant correlation. Its spectrum is
@@ -68,25 +68,26 @@ def correlation_of(values: Array, used: Mask) -> Array:
     size = 2 * LAGS + 1
     white = np.zeros((size, size))
     white[LAGS, LAGS] = 1.0
-    power = float(np.mean(values[used] ** 2)) if used.any() else 0.0
-    if used.sum() < _FEWEST or power <= 0:
+    power = float(np.mean(values[is_used] ** 2)) if is_used.any() else 0.0
+    if is_used.sum() < _MIN_PIXELS or power <= 0:
         return white
     # clip outliers (dust, an edge that is not fitted well) at five standard deviations
-    kept = np.where(used, np.clip(values, -5 * np.sqrt(power), 5 * np.sqrt(power)), 0.0)
-    around = tuple(slice(n - 1 - LAGS, n + LAGS) for n in values.shape)
-    sums, pairs = (correlated(p, p, method="fft")[around] for p in (kept, used.astype(np.float64)))
+    clipped = np.where(is_used, np.clip(values, -5 * np.sqrt(power), 5 * np.sqrt(power)), 0.0)
+    lags = tuple(slice(n - 1 - LAGS, n + LAGS) for n in values.shape)
+    sums, pairs = (correlated(p, p, method="fft")[lags] for p in (clipped, is_used.astype(np.float64)))
     pairs = np.maximum(np.round(pairs), 1.0)
-    found = sums / pairs
-    found = found / max(float(found[LAGS, LAGS]), np.finfo(float).tiny)
+    correlation = sums / pairs
+    correlation = correlation / max(float(correlation[LAGS, LAGS]), np.finfo(float).tiny)
     # correlation makes the estimates at other lags less certain
-    certain = _CLEAR * np.sqrt(np.sum(np.where(np.abs(found) > _CLEAR / np.sqrt(pairs), found, 0.0) ** 2) / pairs)
-    wide = np.pad(np.where(np.abs(found) > certain, found, 0.0), 2 * size)
-    spectrum = np.maximum(np.fft.rfft2(np.fft.ifftshift(wide)).real, 0.0)
-    found = np.fft.fftshift(np.fft.irfft2(spectrum, wide.shape))[2 * size : 3 * size, 2 * size : 3 * size]
-    if not found[LAGS, LAGS] > 0:
+    significant = np.where(np.abs(correlation) > _MIN_SIGMAS / np.sqrt(pairs), correlation, 0.0)
+    threshold = _MIN_SIGMAS * np.sqrt(np.sum(significant**2) / pairs)
+    padded = np.pad(np.where(np.abs(correlation) > threshold, correlation, 0.0), 2 * size)
+    spectrum = np.maximum(np.fft.rfft2(np.fft.ifftshift(padded)).real, 0.0)
+    correlation = np.fft.fftshift(np.fft.irfft2(spectrum, padded.shape))[2 * size : 3 * size, 2 * size : 3 * size]
+    if not correlation[LAGS, LAGS] > 0:
         return white
-    found = found / found[LAGS, LAGS]
-    return np.asarray(np.where(np.abs(found) > 1e-9, found, 0.0))  # removes the transform's rounding
+    correlation = correlation / correlation[LAGS, LAGS]
+    return np.asarray(np.where(np.abs(correlation) > 1e-9, correlation, 0.0))  # removes the transform's rounding
 
 
 def correlate(pictures: Array, correlation: Array) -> Array:
@@ -108,11 +109,11 @@ def noise_beside(picture: Array, background: float, dark: Mask) -> tuple[Array, 
 
     The fine share is the part of the variance that second differences measure: 1 for independent neighbours.
     """
-    beside = picture - background
-    correlation = correlation_of(beside, dark)
-    if dark.sum() < _FEWEST:
+    residual = picture - background
+    correlation = correlation_of(residual, dark)
+    if dark.sum() < _MIN_PIXELS:
         return correlation, 1.0
     # use the paper's own spread: an insignificant part of the correlation would raise the fine share, and a mosaic's
     # noise differs between pixels
-    spread = 1.4826 * float(np.median(np.abs(beside[dark] - np.median(beside[dark]))))
-    return correlation, min(max((noise_of(picture) / spread) ** 2, _LEAST_FINE), 1.0) if spread > 0 else 1.0
+    spread = 1.4826 * float(np.median(np.abs(residual[dark] - np.median(residual[dark]))))
+    return correlation, min(max((noise_of(picture) / spread) ** 2, _MIN_FINE_SHARE), 1.0) if spread > 0 else 1.0

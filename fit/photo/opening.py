@@ -17,82 +17,82 @@ from scipy.ndimage import binary_dilation, center_of_mass, gaussian_filter, lapl
 from torchdof.optics.aperture import Aperture
 
 from ..result import Array, BlurFit, Mask
-from .diagnostics import CHANCE, UNEVEN, asymmetry_of, bic_of, noise_near, rms_left, size_of_blur, unexplained
+from .diagnostics import ASYMMETRIC, P_VALUE, asymmetry_of, bic_of, noise_near, residual_rms, size_of_blur, unexplained
 from .forward import Forward, Solution
 from .noise import independent_share
 
 _BLADES = range(3, 10)
-_SHOWN = 25.0  # chi squared of a polygon's harmonic (two degrees of freedom) above which a polygon is fitted
-_BETTER = 10.0  # required decrease of BIC for a polygon; accounts for the choice among seven numbers of blades
-_FORETOLD = 24.0  # required increase of twice the log likelihood of withheld pixels, for a picture
-_UNEXPLAINED = 2.0  # residual over noise above which a picture is tried
-_FINEST = 8  # samples of an opening's picture for each pixel of the kernel
-_MOST_SIDE = 64
+_MIN_HARMONIC_CHI = 25.0  # chi squared of a polygon's harmonic (two degrees of freedom) above which a polygon is fitted
+_MIN_BIC_GAIN = 10.0  # required decrease of BIC for a polygon; accounts for the choice among seven numbers of blades
+_MIN_LIKELIHOOD_GAIN = 24.0  # required increase of twice the log likelihood of withheld pixels, for a picture
+_MAX_RATIO = 2.0  # residual over noise above which a picture is tried
+_SAMPLES_PER_PX = 8  # samples of an opening's picture for each pixel of the kernel
+_MAX_SIDE = 64
 _SMOOTHNESS = 10.0 ** np.arange(0.0, -6.5, -0.5)
-_STEPS, _STILL = 150, 1e-4  # most steps, and change relative to the peak that ends them
-_KEPT_BACK = 0.2  # share of pixels withheld
-_LIT = 0.06  # share of the peak of a first estimate, smoothed by a pixel, below which the kernel is dark
-_WORSE = 3  # number of successively worse strengths of smoothing after which weaker ones are not tried
+_MAX_STEPS, _MIN_CHANGE = 150, 1e-4  # most steps, and change relative to the peak that ends them
+_WITHHELD = 0.2  # share of pixels withheld
+_LIT_SHARE = 0.06  # share of the peak of a first estimate, smoothed by a pixel, below which the kernel is dark
+_WORSE_IN_A_ROW = 3  # number of successively worse strengths of smoothing after which weaker ones are not tried
 
 
-def solve_opening(round_one: Solution) -> tuple[Solution, str] | None:
+def solve_opening(round_fit: Solution) -> tuple[Solution, str] | None:
     """The opening that explains the residual of the free round profile, or None if none does.
 
     Returns:
         The solution of family "polygon" or "image", and the reason for it.
     """
-    known, what, why = round_one, "round", ""
-    blades, shown, _ = _harmonic(round_one)
-    if shown > _SHOWN:
-        polygon = solve_polygon(round_one)
-        gained = bic_of(round_one) - bic_of(polygon)
-        if gained > _BETTER:
-            known, what = polygon, f"round, nor a polygon of {blades} blades"
-            why = f"a polygon of {blades} blades, its BIC lower by {gained:.0f} than that of any round profile"
-    share, chance = asymmetry_of(known)
-    if (share > UNEVEN and chance < CHANCE) or rms_left(known) > _UNEXPLAINED * noise_near(known):
-        kernel, gained = _deconvolved(known)
-        if gained > _FORETOLD:
-            known = solve_image(known, kernel)
+    best, excluded, why = round_fit, "round", ""
+    blades, harmonic_chi, _ = _harmonic(round_fit)
+    if harmonic_chi > _MIN_HARMONIC_CHI:
+        polygon = solve_polygon(round_fit)
+        gain = bic_of(round_fit) - bic_of(polygon)
+        if gain > _MIN_BIC_GAIN:
+            best, excluded = polygon, f"round, nor a polygon of {blades} blades"
+            why = f"a polygon of {blades} blades, its BIC lower by {gain:.0f} than that of any round profile"
+    asymmetry, probability = asymmetry_of(best)
+    if (asymmetry > ASYMMETRIC and probability < P_VALUE) or residual_rms(best) > _MAX_RATIO * noise_near(best):
+        kernel, gain = _deconvolved(best)
+        if gain > _MIN_LIKELIHOOD_GAIN:
+            best = solve_image(best, kernel)
             why = (
-                f"the blur is not {what}: a picture of it predicts withheld pixels better "
-                f"(log likelihood higher by {gained / 2:.0f})"
+                f"the blur is not {excluded}: a picture of it predicts withheld pixels better "
+                f"(log likelihood higher by {gain / 2:.0f})"
             )
-    return (known, why) if why else None
+    return (best, why) if why else None
 
 
-def solve_polygon(round_one: Solution) -> Solution:
+def solve_polygon(round_fit: Solution) -> Solution:
     """Fits the regular polygon whose harmonic is the most significant one in a round profile's residual."""
-    blades, _, corner = _harmonic(round_one)
-    size = np.sqrt(2) * size_of_blur(round_one)[0]
+    blades, _, corner = _harmonic(round_fit)
+    size = np.sqrt(2) * size_of_blur(round_fit)[0]
     start = {
         "radius": size * math.sqrt(3 / (2 + math.cos(2 * math.pi / blades))),
         "rotation_deg": (-90.0 - corner) % (360.0 / blades),
         "curvature": 0.1,
     }
-    return _solved(round_one, Aperture(blades), "polygon", start)
+    return _solved(round_fit, Aperture(blades), "polygon", start)
 
 
-def solve_image(before: Solution, kernel: Array | None = None) -> Solution:
+def solve_image(previous: Solution, kernel: Array | None = None) -> Solution:
     """Fits the opening as a picture, from a kernel if given; the moves start from those of `before`."""
-    kernel = _deconvolved(before)[0] if kernel is None else kernel
+    kernel = _deconvolved(previous)[0] if kernel is None else kernel
     y, x = center_of_mass(kernel)
     rows, columns = np.nonzero(kernel > 0.01 * kernel.max())
-    half = float(np.ceil(np.hypot(rows - y, columns - x).max())) + 1.0  # half the side of the opening's square, px
-    side = int(min(_MOST_SIDE, round(2 * half * _FINEST)))
-    places = ((np.arange(side) + 0.5) / side * 2 - 1) * half
-    fine = map_coordinates(kernel, np.meshgrid(places + y, places + x, indexing="ij"), order=3, mode="constant")
-    return _solved(before, Aperture(mask=torch.from_numpy(np.maximum(fine, 0.0))), "image", {"radius": half})
+    half_px = float(np.ceil(np.hypot(rows - y, columns - x).max())) + 1.0  # half the side of the opening's square, px
+    side = int(min(_MAX_SIDE, round(2 * half_px * _SAMPLES_PER_PX)))
+    positions = ((np.arange(side) + 0.5) / side * 2 - 1) * half_px
+    mask = map_coordinates(kernel, np.meshgrid(positions + y, positions + x, indexing="ij"), order=3, mode="constant")
+    return _solved(previous, Aperture(mask=torch.from_numpy(np.maximum(mask, 0.0))), "image", {"radius": half_px})
 
 
-def _solved(before: Solution, opening: Aperture, family: str, start: dict[str, float]) -> Solution:
+def _solved(previous: Solution, opening: Aperture, family: str, start: dict[str, float]) -> Solution:
     """The solution with an opening; the magnification starts from that of `before`."""
-    held = before.moves["magnification"]
-    shaped = replace(before.pair, opening=opening, start={family: start}, prior={}, held_magnification=held)
-    return shaped.solve(family)
+    magnification = previous.moves["magnification"]
+    pair = replace(previous.pair, opening=opening, start={family: start}, prior={}, held_magnification=magnification)
+    return pair.solve(family)
 
 
-def _harmonic(round_one: Solution) -> tuple[int, float, float]:
+def _harmonic(round_fit: Solution) -> tuple[int, float, float]:
     """The polygon that is most significant in a round profile's residual.
 
     A polygon is a circle with an angle-dependent radius. The difference from the circle lies on a ring and has one
@@ -102,19 +102,19 @@ def _harmonic(round_one: Solution) -> tuple[int, float, float]:
         Its number of blades, chi squared of the two amplitudes, and the angle of a corner in degrees from the right,
         clockwise on the screen.
     """
-    pair, size = round_one.pair, np.sqrt(2) * size_of_blur(round_one)[0]
+    pair, size = round_fit.pair, np.sqrt(2) * size_of_blur(round_fit)[0]
     half = min(int(np.ceil(1.3 * size)) + 3, pair.half)
     axis = np.arange(2 * half + 1) - half
     angle, r = np.arctan2(axis[:, None], axis), np.hypot(axis[:, None], axis)
     ring = np.exp(-0.5 * ((r - size) / (0.7 + 0.05 * size)) ** 2)
     waves = [ring * wave(n * angle) for n in _BLADES for wave in (np.cos, np.sin)]
-    basis = pair.convolve(pair.moved_source(round_one.moves), np.stack(waves)).T
-    found, spread = unexplained(round_one, basis)
+    basis = pair.convolve(pair.moved_source(round_fit.moves), np.stack(waves)).T
+    products, noise_covariance = unexplained(round_fit, basis)
     candidates = []
     for i, n in enumerate(_BLADES):
-        own = slice(2 * i, 2 * i + 2)
-        cosine, sine = np.linalg.pinv(basis[:, own].T @ basis[:, own]) @ found[own]
-        score = float(found[own] @ np.linalg.pinv(spread[own, own]) @ found[own])
+        columns = slice(2 * i, 2 * i + 2)
+        cosine, sine = np.linalg.pinv(basis[:, columns].T @ basis[:, columns]) @ products[columns]
+        score = float(products[columns] @ np.linalg.pinv(noise_covariance[columns, columns]) @ products[columns])
         candidates.append((n, score, math.degrees(math.atan2(sine, cosine)) / n))
     return max(candidates, key=lambda candidate: candidate[1])
 
@@ -137,17 +137,17 @@ def common_opening(fits: Sequence[BlurFit], nearer: Sequence[bool]) -> Aperture:
         votes = {a.blades: float(weight[[b.blades == a.blades for b in found]].sum()) for a in found}
         blades = max(votes, key=votes.__getitem__)
         weight = weight * [a.blades == blades for a in found]
-        turns = np.exp(1j * np.deg2rad(blades * np.array([float(a.rotation_deg) for a in found])))
-        rotation = math.degrees(float(np.angle(weight @ turns))) / blades
+        phases = np.exp(1j * np.deg2rad(blades * np.array([float(a.rotation_deg) for a in found])))
+        rotation = math.degrees(float(np.angle(weight @ phases))) / blades
         return Aperture(blades, rotation, float(weight @ [a.curvature for a in found] / weight.sum()))
-    halves = [float(f.params["radius"]) / f.radius for f in fits]
-    place = ((np.arange(_MOST_SIDE) + 0.5) / _MOST_SIDE * 2 - 1) * max(halves)
-    mean = np.zeros((_MOST_SIDE, _MOST_SIDE))
-    for mask, half, share in zip(
-        (a.mask.numpy() for a in found if a.mask is not None), halves, weight / weight.sum(), strict=True
+    half_sides = [float(f.params["radius"]) / f.radius for f in fits]
+    positions = ((np.arange(_MAX_SIDE) + 0.5) / _MAX_SIDE * 2 - 1) * max(half_sides)
+    mean = np.zeros((_MAX_SIDE, _MAX_SIDE))
+    for mask, half_side, share in zip(
+        (a.mask.numpy() for a in found if a.mask is not None), half_sides, weight / weight.sum(), strict=True
     ):
-        where = np.meshgrid(*[(place / half + 1) / 2 * mask.shape[0] - 0.5] * 2, indexing="ij")
-        mean += share * map_coordinates(mask / mask.mean(), where, order=1, mode="constant") / half**2
+        coordinates = np.meshgrid(*[(positions / half_side + 1) / 2 * mask.shape[0] - 0.5] * 2, indexing="ij")
+        mean += share * map_coordinates(mask / mask.mean(), coordinates, order=1, mode="constant") / half_side**2
     return Aperture(mask=torch.from_numpy(np.round(mean / mean.max(), 4)))
 
 
@@ -161,28 +161,28 @@ def _deconvolved(shape: Solution) -> tuple[Array, float]:
     pair = shape.pair
     source = pair.moved_source(shape.moves)
     # withhold a fifth of the pixels, and take the smoothing that predicts them best
-    kept_back = np.random.default_rng(0).random(pair.values.size) < _KEPT_BACK
-    judged = kept_back & pair.lit[pair.used]
-    tried: list[tuple[float, float, Array]] = []
+    is_withheld = np.random.default_rng(0).random(pair.values.size) < _WITHHELD
+    is_judged = is_withheld & pair.lit[pair.used]
+    candidates: list[tuple[float, float, Array]] = []
     kernel = shape.kernel
     margin = min(int(np.ceil(float(shape.params["radius"]))) + 2, pair.half - 1) - kernel.shape[0] // 2
     kernel = np.pad(kernel, margin) if margin >= 0 else np.ascontiguousarray(kernel[-margin:margin, -margin:margin])
     for smoothness in _SMOOTHNESS:
-        kernel, model = _descend(pair, source, kernel, smoothness, ~kept_back)
-        tried.append((float(np.sum((pair.values - model)[judged] ** 2)), float(smoothness), kernel))
-        if min(t[0] for t in tried) < min(t[0] for t in tried[-_WORSE:]):
+        kernel, model = _descend(pair, source, kernel, smoothness, ~is_withheld)
+        candidates.append((float(np.sum((pair.values - model)[is_judged] ** 2)), float(smoothness), kernel))
+        if min(t[0] for t in candidates) < min(t[0] for t in candidates[-_WORSE_IN_A_ROW:]):
             break
-    squares, smoothness, kernel = min(tried, key=lambda t: t[0])
-    smooth = gaussian_filter(kernel, 1.0)
-    lit = binary_dilation(smooth > _LIT * smooth.max())
-    before = float(np.sum(shape.residual[judged] ** 2))
-    kernel, _ = _descend(pair, source, kernel * lit, smoothness, np.ones_like(kept_back), lit)
-    count = judged.sum() * independent_share(pair.noise_correlation)
-    return kernel, float(count * np.log(before / squares))
+    squares, smoothness, kernel = min(candidates, key=lambda t: t[0])
+    smoothed = gaussian_filter(kernel, 1.0)
+    is_lit = binary_dilation(smoothed > _LIT_SHARE * smoothed.max())
+    squares_before = float(np.sum(shape.residual[is_judged] ** 2))
+    kernel, _ = _descend(pair, source, kernel * is_lit, smoothness, np.ones_like(is_withheld), is_lit)
+    count = is_judged.sum() * independent_share(pair.noise_correlation)
+    return kernel, float(count * np.log(squares_before / squares))
 
 
 def _descend(
-    pair: Forward, source: Array, start: Array, smoothness: float, fitted: Mask, lit: Mask | None = None
+    pair: Forward, source: Array, start: Array, smoothness: float, is_fitted: Mask, is_lit: Mask | None = None
 ) -> tuple[Array, Array]:
     """The kernel and the model of the used pixels, by accelerated projected gradient descent on the lit kernel pixels.
 
@@ -190,22 +190,22 @@ def _descend(
         Beck and Teboulle, "A fast iterative shrinkage-thresholding algorithm", SIAM J. Imaging Sciences 2(1), 2009.
     """
     level = float(pair.values.mean())
-    shaped = pair.convolve(source, start[None])[0]
-    gain = max(float((shaped - shaped.mean()) @ (pair.values - level)) / float(np.var(shaped) * shaped.size), 1e-12)
+    blurred = pair.convolve(source, start[None])[0]
+    gain = max(float((blurred - blurred.mean()) @ (pair.values - level)) / float(np.var(blurred) * blurred.size), 1e-12)
     largest = float(np.abs(source).max()) ** 2
     penalty = smoothness * largest * 1e-2
     step = 1.0 / (largest + 8 * penalty)
-    weights = ahead = gain * start
-    pace = 1.0
-    for _ in range(_STEPS):
-        error = pair.convolve(source, ahead[None])[0] - pair.values
-        error = np.where(fitted, error - error[fitted].mean(), 0.0)
-        gradient = pair.correlate(source, error, start.shape[0]) - penalty * laplace(ahead, mode="constant")
-        after = np.maximum(ahead - step * gradient, 0.0) * (1.0 if lit is None else lit)
-        faster = (1 + np.sqrt(1 + 4 * pace * pace)) / 2
-        ahead = after + (pace - 1) / faster * (after - weights)
-        moved, weights, pace = float(np.abs(after - weights).max()), after, faster
-        if moved < _STILL * float(after.max()):
+    weights = extrapolated = gain * start
+    momentum = 1.0
+    for _ in range(_MAX_STEPS):
+        error = pair.convolve(source, extrapolated[None])[0] - pair.values
+        error = np.where(is_fitted, error - error[is_fitted].mean(), 0.0)
+        gradient = pair.correlate(source, error, start.shape[0]) - penalty * laplace(extrapolated, mode="constant")
+        next_weights = np.maximum(extrapolated - step * gradient, 0.0) * (1.0 if is_lit is None else is_lit)
+        next_momentum = (1 + np.sqrt(1 + 4 * momentum * momentum)) / 2
+        extrapolated = next_weights + (momentum - 1) / next_momentum * (next_weights - weights)
+        change, weights, momentum = float(np.abs(next_weights - weights).max()), next_weights, next_momentum
+        if change < _MIN_CHANGE * float(next_weights.max()):
             break
     model = pair.convolve(source, weights[None])[0]
-    return weights / float(weights.sum()), model + float((pair.values - model)[fitted].mean())
+    return weights / float(weights.sum()), model + float((pair.values - model)[is_fitted].mean())

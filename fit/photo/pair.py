@@ -28,12 +28,13 @@ from .source import Edge, ideal_dot, picture_of_dot, point_source, soft_edge
 Model = Literal["forward", "ratio"]
 SourceKind = Literal["auto", "image", "dot"]
 
-_SMALLEST_WINDOW = 15
-_SMALLEST_DOT_PX = 0.2
-_AS_GOOD = 2e-3  # rms of an edge over the dot's level, up to which an ideal dot may represent a magnified one
-_GROWN, _ALMOST = 0.02, 0.02  # px^2 of false variance that matters; rms of an edge over the dot's level that does not
-_EXACT_PX = 4.0  # smallest radius of a dot and its blur; below, pixels have an effect like a tone curve
-_SIGNIFICANT = 12.0  # decrease of chi squared for which the magnification is fitted: 3.5 sigma
+_MIN_WINDOW_PX = 15
+_MIN_DOT_PX = 0.2
+# An ideal dot represents the sharp dot if the rms misfit of its edge, over the dot's level, is small enough.
+_MAX_EDGE_RMS = 2e-3  # largest misfit of a dot that is magnified
+_MIN_VARIANCE, _MAX_UNEXPLAINED = 0.02, 0.02  # if magnifying its softness adds this variance in px^2: largest misfit
+_MIN_RADIUS_PX = 4.0  # smallest radius of a dot and its blur; below, pixels have an effect like a tone curve
+_MIN_CHI_GAIN = 12.0  # decrease of chi squared for which the magnification is fitted: 3.5 sigma
 
 
 def fit_pair(
@@ -124,32 +125,32 @@ def fit_pair(
         raise FitError(f"aperture must be an Aperture, and goes with family='image', got {show(aperture)}")
     if start is not None and not isinstance(start, BlurFit):
         raise FitError(f"start must be a BlurFit of a similar pair, got {show(start)}")
-    pairs = prior is None or isinstance(prior, Mapping) and all(isinstance(v, tuple) for v in prior.values())
-    if not pairs or any(len(v) != 2 for v in (prior or {}).values()):
+    is_mapping = prior is None or isinstance(prior, Mapping) and all(isinstance(v, tuple) for v in prior.values())
+    if not is_mapping or any(len(v) != 2 for v in (prior or {}).values()):
         raise FitError(f"prior must map names of parameters to (expected value, deviation), got {show(prior)}")
     for name, (mean, deviation) in (prior or {}).items():
         a_number(f"the expected {name}", mean, -1e100, 1e100)
         a_number(f"the deviation of {name}", deviation, 0)
-    data = a_picture("blurred", blurred, _SMALLEST_WINDOW, files[1])
-    still = None if sharp is None else a_picture("sharp", sharp, _SMALLEST_WINDOW, files[0])
-    if still is not None and still.shape != data.shape:
+    data = a_picture("blurred", blurred, _MIN_WINDOW_PX, files[1])
+    sharp_picture = None if sharp is None else a_picture("sharp", sharp, _MIN_WINDOW_PX, files[0])
+    if sharp_picture is not None and sharp_picture.shape != data.shape:
         raise FitError(
-            f"sharp and blurred must have the same shape, got {list(still.shape)} and {list(data.shape)}; "
+            f"sharp and blurred must have the same shape, got {list(sharp_picture.shape)} and {list(data.shape)}; "
             "cut the same window from both"
         )
     if model == "ratio":  # errors common to a spoke enter the standard errors
-        if still is None:
+        if sharp_picture is None:
             raise FitError("model='ratio' divides by the sharp picture, got sharp=None; use model='forward'")
-        r, strength, spokes = blur_strength(still, data)
+        r, strength, spokes = blur_strength(sharp_picture, data)
         return replace(fit_profile(r, strength, "ring" if family == "auto" else family, groups=spokes), model="ratio")
     with one_thread():
-        pair, edge, linear = prepared_pair(still, data, source, magnification, white, files, softness)
+        pair, edge, linear = prepared_pair(sharp_picture, data, source, magnification, white, files, softness)
         if start is not None:
             pair.start[start.family] = {k: float(v) for k, v in start.params.items() if not isinstance(v, np.ndarray)}
         pair.prior = prior or {}
         # whether the magnification is known before the fit: a point has none
-        held = True if sharp is None else None if fit_magnification is None else not fit_magnification
-        pair.fit_moves = ALL_MOVES if held is False else ("dx", "dy")
+        is_known = True if sharp is None else None if fit_magnification is None else not fit_magnification
+        pair.fit_moves = ALL_MOVES if is_known is False else ("dx", "dy")
         pair.opening = aperture
         free_profile = family in ("auto", "radial", *OPENINGS) and aperture is None
         # a free profile gives an unbiased magnification, unlike a wrong family
@@ -161,47 +162,47 @@ def fit_pair(
         else:
             solution = pair.solve(family)
         expected = freest = solution
-        if held is None:
-            unheld = replace(pair, fit_moves=ALL_MOVES)
+        if is_known is None:
+            free_pair = replace(pair, fit_moves=ALL_MOVES)
             radius = float(solution.params["radius"]) if free_profile else 0.0
-            free = solve_radial(unheld, solution.moves, radius, knots) if free_profile else unheld.solve(family)
+            free = solve_radial(free_pair, solution.moves, radius, knots) if free_profile else free_pair.solve(family)
             # scale of chi squared: the residual or, without noise, the rounding of a spline; correlated noise counts
             # less
-            floor = max(free.squares / pair.values.size, (1e-4 * pair.unit) ** 2)
-            gained = (solution.squares - free.squares) / floor * independent_share(pair.noise_correlation)
-            if gained > _SIGNIFICANT:
-                pair, freest, solution = unheld, free, free
+            scale = max(free.squares / pair.values.size, (1e-4 * pair.unit) ** 2)
+            chi_gain = (solution.squares - free.squares) / scale * independent_share(pair.noise_correlation)
+            if chi_gain > _MIN_CHI_GAIN:
+                pair, freest, solution = free_pair, free, free
         why, psnr = "", dict[str, float]()
         if free_profile:
             pair.held_magnification = freest.moves["magnification"]
-            opened = None
+            opening = None
             if family == "auto":
                 solution, why, psnr = _choose(freest, accuracy_db)
-                opened = solve_opening(freest)
-                if opened is not None and looks_alike(solution.kernel, opened[0].kernel, accuracy_db):
-                    opened = None
+                opening = solve_opening(freest)
+                if opening is not None and looks_alike(solution.kernel, opening[0].kernel, accuracy_db):
+                    opening = None
             elif family != "radial":
-                opened = (solve_polygon if family == "polygon" else solve_image)(freest), ""
-            if opened is not None:
-                solution, why = opened
+                opening = (solve_polygon if family == "polygon" else solve_image)(freest), ""
+            if opening is not None:
+                solution, why = opening
                 freest = expected = solution
         fit = describe(solution, why)
         # a family chosen for its cost is not to blame if the freest kernel explains the rest
-        judged = fit if freest is solution else describe(freest, "")
-        check_fit(solution, fit, files[1], judged)
+        freest_fit = fit if freest is solution else describe(freest, "")
+        check_fit(solution, fit, files[1], freest_fit)
         if edge is not None:
             # a residual far above the noise has been reported already. A picture of a kernel is smoothed, which makes
             # the residual depend on the level
-            most = EXPLAINED if freest.family in OPENINGS else FAR_ABOVE
-            large = min(fit.radius, edge.radius * fit.magnification) > _EXACT_PX
-            if linear and large and judged.residual_over_noise < most:
+            largest_ratio = EXPLAINED if freest.family in OPENINGS else FAR_ABOVE
+            is_large = min(fit.radius, edge.radius * fit.magnification) > _MIN_RADIUS_PX
+            if linear and is_large and freest_fit.residual_over_noise < largest_ratio:
                 check_levels(freest, expected, edge, files[1])
             check_focus(edge, fit.radius, pair.source.ideal, files[0])
     return replace(fit, psnr=psnr)
 
 
 def prepared_pair(
-    still: Array | None,
+    sharp_picture: Array | None,
     data: Array,
     source: SourceKind = "auto",
     magnification: float = 1.0,
@@ -216,17 +217,17 @@ def prepared_pair(
     data_dot = find_dot(data, file=files[1])
     used = used_pixels(data, data_dot, white, files[1], "blurred")
     check_blacks(data, data_dot, files[1], "blurred")
-    if still is None:
+    if sharp_picture is None:
         return Forward(point_source(data.shape, data_dot), data, used, data_dot, magnification), None, False
-    dot = find_dot(still, file=files[0])
-    check_blacks(still, dot, files[0], "sharp")
-    whole = used_pixels(still, dot, white, files[0], "sharp", refuse=False)
-    clipped = int(np.sum(~whole))
-    edge = soft_edge(still, dot, white=float(still[~whole].min()) if clipped else None)
+    dot = find_dot(sharp_picture, file=files[0])
+    check_blacks(sharp_picture, dot, files[0], "sharp")
+    is_unclipped = used_pixels(sharp_picture, dot, white, files[0], "sharp", refuse=False)
+    clipped = int(np.sum(~is_unclipped))
+    edge = soft_edge(sharp_picture, dot, white=float(sharp_picture[~is_unclipped].min()) if clipped else None)
     if softness is not None and softness < edge.softness:
         source, edge = "dot", edge.with_softness(softness)
-    linear = clipped > 0 or softness is not None or check_linearity(still, dot, edge, files[0])
-    if edge.radius * magnification < _SMALLEST_DOT_PX:
+    linear = clipped > 0 or softness is not None or check_linearity(sharp_picture, dot, edge, files[0])
+    if edge.radius * magnification < _MIN_DOT_PX:
         text = (
             f"by the distances the dot, {edge.radius:.1f} px in focus, would have a radius of "
             f"{edge.radius * magnification:.2g} px here, which is too small to see; is the distance misread, or in "
@@ -242,26 +243,26 @@ def prepared_pair(
     # an ideal dot is as good as the dot's own pixels: a spline between the pixels of a hard edge is wrong by a few
     # thousandths once it is magnified, and so is the sensor's softness, which does not grow with the dot
     unexplained = edge.rms * np.sqrt(max(1 - 1 / max(edge.misfit, 1e-9) ** 2, 0.0))
-    magnified = edge.softness**2 * abs(1 - magnification**2) > _GROWN
-    close = edge.misfit < EXPLAINED or (edge.rms < _AS_GOOD and magnification != 1)
-    explained = (close or (magnified and unexplained < _ALMOST)) and edge.radius > 2 * edge.softness
+    softness_matters = edge.softness**2 * abs(1 - magnification**2) > _MIN_VARIANCE
+    edge_fits = edge.misfit < EXPLAINED or (edge.rms < _MAX_EDGE_RMS and magnification != 1)
+    explained = (edge_fits or (softness_matters and unexplained < _MAX_UNEXPLAINED)) and edge.radius > 2 * edge.softness
     ideal = clipped or source == "dot" or (source == "auto" and explained)
     pair = Forward(
-        ideal_dot(edge) if ideal else picture_of_dot(still, dot),
+        ideal_dot(edge) if ideal else picture_of_dot(sharp_picture, dot),
         data,
         used,
         data_dot,
         magnification,
         shot_noise=edge.shot_noise / edge.level,
-        fine_share_of_light=fine_share_inside(still, dot),
+        fine_share_of_light=fine_share_inside(sharp_picture, dot),
     )
     return pair, edge, linear
 
 
 def _choose(radial: Solution, accuracy_db: float) -> tuple[Solution, str, dict[str, float]]:
     """Fits every family at the free profile's magnification and chooses one, which is then fitted with it."""
-    pair, held = radial.pair, replace(radial.pair, fit_moves=("dx", "dy"))
-    solutions = {"radial": replace(radial, pair=held)} | {f: held.solve(f) for f in COST[:-1]}
+    pair, fixed_pair = radial.pair, replace(radial.pair, fit_moves=("dx", "dy"))
+    solutions = {"radial": replace(radial, pair=fixed_pair)} | {f: fixed_pair.solve(f) for f in COST[:-1]}
     kernels, bic = {f: s.kernel for f, s in solutions.items()}, {f: bic_of(s) for f, s in solutions.items()}
     family, why, psnr = choose(kernels, bic, accuracy_db)
     if family == "radial":

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import gaussian_gradient_magnitude
 
-from torchdof.io import foreign
+from torchdof.io import optional_formats
 from torchdof.io.images import read_image
-from torchdof.io.metadata import camera_facts
+from torchdof.io.metadata import camera_settings
 from torchdof.validation import number
 
 from ..problems import FitError, warn
@@ -24,9 +24,9 @@ from .manifest import MANIFEST, Colours, inside
 from .target import DOT_MM, SQUARE_MM, Target, find_target
 from .tone import WINDOW, Tone, tone_curve, untoned
 
-_READ = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
-_SAME_PLACE = 0.03  # relative difference of distance up to which a photograph is at the focus
-_FEWEST = 4  # fewest photographs from which a tone curve can be found
+_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
+_AT_FOCUS = 0.03  # relative difference of distance up to which a photograph is at the focus
+_MIN_FOR_TONE = 4  # fewest photographs from which a tone curve can be found
 
 
 @dataclass(frozen=True)
@@ -77,21 +77,21 @@ def read_photographs(
         FitWarning: of kind "not linear" for integers, if there are too few photographs to find a tone curve.
     """
     number("square_mm", square_mm, low=1e-2, high=1e5, unit="millimetres")
-    where = str(folder)
-    files = sorted(p for p in Path(folder).iterdir() if p.suffix.lower() in (*_READ, *foreign.SUFFIXES))
+    folder_name = str(folder)
+    files = sorted(p for p in Path(folder).iterdir() if p.suffix.lower() in (*_SUFFIXES, *optional_formats.SUFFIXES))
     for path in files:
         if root is not None:
-            inside(path, root, where)
-        if unread := foreign.refusal(path):
-            raise FitError(unread, file=str(path))
+            inside(path, root, folder_name)
+        if refusal := optional_formats.refusal(path):
+            raise FitError(refusal, file=str(path))
     if len(files) < 2:
         text = (
             f"there is neither a {MANIFEST} nor two photographs (.jpg .png .tif .exr) of the target that torchdof fit"
         )
-        raise FitError(f"{text} --target target.pdf makes", "manifest", file=where)
+        raise FitError(f"{text} --target target.pdf makes", "manifest", file=folder_name)
     pictures: list[Photograph] = []
     advice: list[str] = []
-    facts, integers = dict[str, float](), True
+    settings, integers = dict[str, float](), True
     for path in files:
         picture = read_image(path)
         if colours == "each" and len(picture.channels) < 3:
@@ -106,26 +106,26 @@ def read_photographs(
         if pictures and width != pictures[0].light.shape[1]:
             text = f"is {width} px wide, the others {pictures[0].light.shape[1]}: all from one camera"
             raise FitError(text, file=str(path))
-        facts = facts or camera_facts(picture.metadata, width, height)
-        whole = picture.sample in ("8", "16")
-        integers = integers and whole
+        settings = settings or camera_settings(picture.metadata, width, height)
+        is_integer = picture.sample in ("8", "16")
+        integers = integers and is_integer
         slope = gaussian_gradient_magnitude(target.window(light, int(0.06 * target.side_px) + 4), 0.7).max()
         sharpness = float(slope / (target.white - target.black))
-        pictures.append(Photograph(path.name, light, target, 0.0, sharpness, whole and target.white > 0.98))
+        pictures.append(Photograph(path.name, light, target, 0.0, sharpness, is_integer and target.white > 0.98))
     if len(pictures) < 2:
-        raise FitError("; ".join(["fewer than two photographs show the target", *advice]), file=where)
-    if missing := [name for name in CAMERA if name not in facts]:
+        raise FitError("; ".join(["fewer than two photographs show the target", *advice]), file=folder_name)
+    if missing := [name for name in CAMERA if name not in settings]:
         text = f"EXIF has no {', '.join(missing)}: share the originals, or describe them in a {MANIFEST}"
-        raise FitError(text, "manifest", file=where)
-    tone, taken = None, {p.file: p.light for p in pictures}
-    if integers and len(pictures) >= _FEWEST:
+        raise FitError(text, "manifest", file=folder_name)
+    tone, original_light = None, {p.file: p.light for p in pictures}
+    if integers and len(pictures) >= _MIN_FOR_TONE:
         tone = tone_curve([(p.light, p.target) for p in pictures], square_mm)
     elif integers:
         text = (
             f"{len(pictures)} photographs are too few to find a tone curve, which would make the kernel up to "
-            f"15 % too small: take {_FEWEST} or more"
+            f"15 % too small: take {_MIN_FOR_TONE} or more"
         )
-        warn(text, "not linear", file=where, number=float(len(pictures)))
+        warn(text, "not linear", file=folder_name, number=float(len(pictures)))
     bend = (0.0, 0.0, 0.0) if tone is None else tone.bend
     if any(bend):
         pictures = [replace(p, light=untoned(p.light, bend)) for p in pictures]
@@ -135,29 +135,29 @@ def read_photographs(
             f"{bend[0]:+.2f}, {bend[1]:+.2f}, {bend[2]:+.2f}); the stated errors count how exactly it is known, "
             "and blurs of a few px may still be 5 % too small; raw pictures need no such guess"
         )
-    sharp = max(pictures, key=lambda p: p.sharpness)
-    focal_px = facts["focal_length_mm"] * width / facts["sensor_width_mm"]
+    sharpest = max(pictures, key=lambda p: p.sharpness)
+    focal_px = settings["focal_length_mm"] * width / settings["sensor_width_mm"]
     # distance of the focus, from the square's size there and the thin lens: 1/focal length = 1/focus + 1/image distance
-    focus_m = (focal_px * square_mm / sharp.target.side_px + facts["focal_length_mm"]) / 1000
-    image_px = focal_px / (1 - facts["focal_length_mm"] / 1000 / focus_m)
+    focus_m = (focal_px * square_mm / sharpest.target.side_px + settings["focal_length_mm"]) / 1000
+    image_px = focal_px / (1 - settings["focal_length_mm"] / 1000 / focus_m)
     pictures = sorted(
         (replace(p, distance_m=image_px * square_mm / 1000 / p.target.side_px) for p in pictures),
         key=lambda p: p.distance_m,
     )
-    moved = [p for p in pictures if abs(p.distance_m / focus_m - 1) > _SAME_PLACE]
-    advice += _advice(pictures, moved, sharp, focus_m)
-    if not moved:
-        raise FitError("all photographs were taken at one distance: step back, without refocusing", file=where)
+    out_of_focus = [p for p in pictures if abs(p.distance_m / focus_m - 1) > _AT_FOCUS]
+    advice += _advice(pictures, out_of_focus, sharpest, focus_m)
+    if not out_of_focus:
+        raise FitError("all photographs were taken at one distance: step back, without refocusing", file=folder_name)
     captures = Captures(
-        pairs=tuple(_pair(Path(folder), sharp, p, taken, tone, colours == "each") for p in moved),
+        pairs=tuple(_pair(Path(folder), sharpest, p, original_light, tone, colours == "each") for p in out_of_focus),
         focus_m=focus_m,
         width_px=width,
-        **{name: facts[name] for name in CAMERA},
+        **{name: settings[name] for name in CAMERA},
         name=Path(folder).resolve().name,
         notes={
             "target_square_mm": square_mm,
             "pictures": [p.file for p in pictures],
-            "sharp": sharp.file,
+            "sharp": sharpest.file,
             "tone_curve": list(bend),
             "from_exif": list(CAMERA),
         },
@@ -166,17 +166,17 @@ def read_photographs(
 
 
 def _pair(
-    folder: Path, sharp: Photograph, blurred: Photograph, taken: Mapping[str, Array], tone: Tone | None, each: bool
+    folder: Path, sharp: Photograph, blurred: Photograph, original: Mapping[str, Array], tone: Tone | None, each: bool
 ) -> Capture:
-    """Windows of the dot in two photographs; also, from `taken`, for tone curves a standard error away."""
+    """Windows of the dot in two photographs, with colours if `each`; also, from `original` light, for other curves."""
     half = int(WINDOW * min(sharp.target.side_px, blurred.target.side_px))
 
     def colours_of(picture: Photograph) -> Array:
-        seen = picture.target.window(read_image(folder / picture.file).pixels[0, :3].double().numpy(), half)
-        return np.stack([c if tone is None else untoned(c, tone.bend) for c in seen])
+        window = picture.target.window(read_image(folder / picture.file).pixels[0, :3].double().numpy(), half)
+        return np.stack([c if tone is None else untoned(c, tone.bend) for c in window])
 
-    raw = [picture.target.window(taken[picture.file], half) for picture in (sharp, blurred)]
-    others = [] if tone is None else [np.add(tone.bend, step) for step in tone.errors]
+    windows = [picture.target.window(original[picture.file], half) for picture in (sharp, blurred)]
+    other_curves = [] if tone is None else [np.add(tone.bend, step) for step in tone.errors]
     return Capture(
         sharp.target.window(sharp.light, half),
         blurred.target.window(blurred.light, half),
@@ -184,21 +184,21 @@ def _pair(
         files=(str(folder / sharp.file), str(folder / blurred.file)),
         white=1.0 if sharp.clipped else None,
         colours=(colours_of(sharp), colours_of(blurred)) if each else None,
-        uncertain=tuple((untoned(raw[0], bend), untoned(raw[1], bend)) for bend in others),
+        uncertain=tuple((untoned(windows[0], bend), untoned(windows[1], bend)) for bend in other_curves),
     )
 
 
 def _advice(
-    pictures: Sequence[Photograph], moved: Sequence[Photograph], sharp: Photograph, focus_m: float
+    pictures: Sequence[Photograph], out_of_focus: Sequence[Photograph], sharp: Photograph, focus_m: float
 ) -> list[str]:
     """Improvements, a sentence each."""
     advice = []
     dot_px = sharp.target.side_px * DOT_MM / SQUARE_MM / 2
     if dot_px < 6:
         advice.append(f"the sharp dot has a radius of {dot_px:.1f} px, 8 to 20 are best: go nearer")
-    if len(moved) < 4:
-        advice.append(f"{len(moved)} distances out of focus: five to nine make a better table")
-    if all(p.distance_m > focus_m for p in moved):
+    if len(out_of_focus) < 4:
+        advice.append(f"{len(out_of_focus)} distances out of focus: five to nine make a better table")
+    if all(p.distance_m > focus_m for p in out_of_focus):
         advice.append("no picture is nearer than the focus: there the table will be the mirror image of the far side")
     for p in pictures:
         if p.clipped:

@@ -30,9 +30,9 @@ _STARTS = {
     "ring": [[1.0, 0.05, 0.3], [1.0, 0.5, 0.2], [1.0, 0.1, 1.0]],
     "softm": [[1.0, 0.5, 0.1, 0.0, 2.0], [1.0, 0.9, 0.1, 0.0, 4.0], [1.0, 0.3, 0.1, 0.5, 2.0]],
 }
-_BENT = 8.0  # F statistic of a parabola against a constant, below which samples are flat: 1 chance in 1500
-_SMALLEST, _LARGEST = 1e-60, 1e60  # their squares enter the covariance
-_SMALLEST_PX = 5  # noise is estimated from second differences
+_FLAT_F = 8.0  # F statistic of a parabola against a constant, below which samples are flat: 1 chance in 1500
+_MIN_LEVEL, _MAX_LEVEL = 1e-60, 1e60  # their squares enter the covariance
+_MIN_SIDE_PX = 5  # noise is estimated from second differences
 _STEP_DEG = 10
 
 
@@ -102,7 +102,7 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
     scale = np.array([unit if n in LENGTHS else peak if n == "N" else 1.0 for n in names])
     covariance = covariance * np.outer(scale, scale)
     params: dict[str, float | Array] = dict(zip(names, (fitted * scale).tolist(), strict=True))
-    line = np.linspace(0.0, unit, 257)
+    curve_r = np.linspace(0.0, unit, 257)
     fit = BlurFit(
         family=family,
         params=params,
@@ -115,18 +115,18 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
         count=y.size,
         model="profile",
         samples=np.stack([radii, values]),
-        curve=np.stack([line, evaluate(family, line, params)]),
+        curve=np.stack([curve_r, evaluate(family, curve_r, params)]),
     )
     for name in LENGTHS.intersection(names):
         value, error, bound = float(fit.params[name]), float(fit.stderr[name]), _BOUNDS[name][1] * unit
         # compare the error of r_c with sigma if r_c is smaller, because a peak at the centre has r_c near 0
-        whole = max(value, float(fit.params["sigma"]) if name == "r_c" else 0.0)
-        if not error < 0.25 * whole:
+        reference_length = max(value, float(fit.params["sigma"]) if name == "r_c" else 0.0)
+        if not error < 0.25 * reference_length:
             text = (
                 f"the profile is too flat, or too different from the family, to fix {name} = {value:.4g} +- "
                 f"{error:.2g}; sample farther out, or try another family"
             )
-            warn(text, "flat profile", number=error / whole if whole else np.inf)
+            warn(text, "flat profile", number=error / reference_length if reference_length else np.inf)
         if value >= 0.999 * bound:
             warn(f"{name} ended on its bound {bound:.4g}; it is only a limit", "boundary", number=bound)
     return fit
@@ -139,7 +139,7 @@ def evaluate(family: str, r: Array, params: dict[str, float | Array]) -> Array:
     return strength * profile(family, torch.from_numpy(np.ascontiguousarray(r)), shape).numpy()
 
 
-def _checked(r: ArrayLike, strength: ArrayLike, least: int) -> tuple[Array, Array]:
+def _checked(r: ArrayLike, strength: ArrayLike, fewest: int) -> tuple[Array, Array]:
     """Radii and strengths `[n]` as float64 with at least `least` different radii, or an error."""
     try:
         if np.iscomplexobj(r) or np.iscomplexobj(strength):
@@ -155,14 +155,14 @@ def _checked(r: ArrayLike, strength: ArrayLike, least: int) -> tuple[Array, Arra
         raise FitError(text, "not finite", number=float(bad))
     for name, array in (("r", radii), ("strength", values)):
         largest = float(np.abs(array).max(initial=0.0))
-        if not _SMALLEST <= largest <= _LARGEST and largest > 0:
-            text = f"{name} must lie within {_SMALLEST:g} and {_LARGEST:g}, got up to {largest:g}; take another unit"
+        if not _MIN_LEVEL <= largest <= _MAX_LEVEL and largest > 0:
+            text = f"{name} must lie within {_MIN_LEVEL:g} and {_MAX_LEVEL:g}, got up to {largest:g}; take another unit"
             raise FitError(text, number=largest)
     if radii.size and radii.min() < 0:
         raise FitError(f"r must be >= 0, got {radii.min():g}", number=float(radii.min()))
     distinct = np.unique(radii).size
-    if distinct < least:
-        raise FitError(f"the family takes at least {least} different radii, got {distinct}", number=float(distinct))
+    if distinct < fewest:
+        raise FitError(f"the family takes at least {fewest} different radii, got {distinct}", number=float(distinct))
     if values.max() <= 0:
         raise FitError("strength must be positive somewhere; is the dot darker than its paper?", number=values.max())
     return radii, values
@@ -170,13 +170,13 @@ def _checked(r: ArrayLike, strength: ArrayLike, least: int) -> tuple[Array, Arra
 
 def _refuse_flat(x: Array, y: Array, noise: float) -> None:
     """Raises an error if a parabola over r explains the samples no better than a constant."""
-    bent = np.stack([np.ones_like(x), x, x * x], axis=1)
-    residual = y - bent @ np.linalg.lstsq(bent, y, rcond=None)[0]
+    parabola = np.stack([np.ones_like(x), x, x * x], axis=1)
+    residual = y - parabola @ np.linalg.lstsq(parabola, y, rcond=None)[0]
     unexplained = float(residual @ residual)
     explained = float(np.sum((y - y.mean()) ** 2)) - unexplained
     variation = float(np.sqrt(max(explained, 0.0) / y.size))
     # F test of a parabola against a constant
-    if variation < 1e-8 or explained / 2 < _BENT * unexplained / (y.size - 3):
+    if variation < 1e-8 or explained / 2 < _FLAT_F * unexplained / (y.size - 3):
         text = (
             f"the profile is flat: it varies by {variation:.3g} of its peak over r, in a noise of {noise:.3g}; sample "
             "farther out, or move the paper farther from focus"
@@ -211,14 +211,14 @@ def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, I
         >>> round(float(r.max())), round(float(strength.mean()), 3), len(set(spoke.tolist()))
         (5, 0.5, 36)
     """
-    still, moved = a_picture("sharp", sharp, _SMALLEST_PX), a_picture("blurred", blurred, _SMALLEST_PX)
-    dot, soft = find_dot(still), find_dot(moved)
+    focused, defocused = a_picture("sharp", sharp, _MIN_SIDE_PX), a_picture("blurred", blurred, _MIN_SIDE_PX)
+    dot, blurred_dot = find_dot(focused), find_dot(defocused)
     # the outermost pixel of the dot is half paper
     r = np.arange(0.0, max(dot.radius - 1.0, 1.0) + 1e-9)
     theta = np.deg2rad(np.arange(0, 360, _STEP_DEG))[:, None]
-    where = [dot.y + r * np.sin(theta), dot.x + r * np.cos(theta)]
-    below, above = (map_coordinates(p, where, order=1, mode="nearest") for p in (still, moved))
-    below, above = below - dot.background, above - soft.background
-    used = below > 0.2 * dot.peak
-    spokes, rays = np.nonzero(used)
-    return r[rays], above[used] / below[used], spokes
+    positions = [dot.y + r * np.sin(theta), dot.x + r * np.cos(theta)]
+    sharp_level, blurred_level = (map_coordinates(p, positions, order=1, mode="nearest") for p in (focused, defocused))
+    sharp_level, blurred_level = sharp_level - dot.background, blurred_level - blurred_dot.background
+    is_lit = sharp_level > 0.2 * dot.peak
+    spokes, rays = np.nonzero(is_lit)
+    return r[rays], blurred_level[is_lit] / sharp_level[is_lit], spokes

@@ -13,7 +13,7 @@ from .forward import Forward, Solution, without_level
 # without noise, and up to 12 dB better with it
 _CAUTION = 3.0
 _SMOOTHNESS = 10.0 ** np.arange(-8.0, 0.0)
-_LIMIT = {"dx": 0.5, "dy": 0.5, "magnification": 0.02}  # largest step of an iteration
+_MAX_STEP = {"dx": 0.5, "dy": 0.5, "magnification": 0.02}  # largest step of an iteration
 
 
 def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: int | None = None) -> Solution:
@@ -29,14 +29,14 @@ def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: i
     values = torch.eye(count, dtype=torch.float64)
     hats = pixel_kernels("radial", {"values": values, "radius": radius}, 2 * half + 1).numpy()
     h = radius / (count - 1)
-    mass = 2 * np.pi * h * h * np.arange(count, dtype=np.float64)  # integral of each hat over the plane
-    mass[0], mass[-1] = np.pi * h * h / 3, 2 * np.pi * (radius * h / 2 - h * h / 6)
+    hat_light = 2 * np.pi * h * h * np.arange(count, dtype=np.float64)  # integral of each hat over the plane
+    hat_light[0], hat_light[-1] = np.pi * h * h / 3, 2 * np.pi * (radius * h / 2 - h * h / 6)
     moves = dict(moves)
     for _ in range(10):
-        columns = mass[:, None] * pair.convolve(pair.moved_source(moves), hats)  # [knots, pixels]
-        weights, smooth = _non_negative(columns, pair.values)
-        gain = float(mass @ weights)
-        kernel = np.tensordot(mass * weights / gain, hats, 1)
+        columns = hat_light[:, None] * pair.convolve(pair.moved_source(moves), hats)  # [knots, pixels]
+        weights, smoothing = _non_negative(columns, pair.values)
+        gain = float(hat_light @ weights)
+        kernel = np.tensordot(hat_light * weights / gain, hats, 1)
         shaped = columns.T @ weights / gain
         fitted, gain, background = pair.project(shaped)
         residual = pair.values - fitted
@@ -44,18 +44,18 @@ def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: i
         slopes = gain * np.stack(pair.move_columns(moves, pair.fit_moves, kernel), axis=1)
         step = np.linalg.lstsq(without_level(slopes, shaped), residual, rcond=None)[0]
         for name, change in zip(pair.fit_moves, step, strict=True):
-            moves[name] += float(np.clip(change, -_LIMIT[name], _LIMIT[name]))
+            moves[name] += float(np.clip(change, -_MAX_STEP[name], _MAX_STEP[name]))
         if np.all(np.abs(step) < 3e-4):
             break
     free = weights > 0
-    tall = (columns - columns.mean(axis=1, keepdims=True))[free].T
-    known = pair.covariance(tall, residual, kernel, gain, smooth[np.ix_(free, free)])
+    centred = (columns - columns.mean(axis=1, keepdims=True))[free].T
+    free_covariance = pair.covariance(centred, residual, kernel, gain, smoothing[np.ix_(free, free)])
     covariance = np.zeros((count, count))
-    covariance[np.ix_(free, free)] = np.where(np.isfinite(known), known, 0.0)
+    covariance[np.ix_(free, free)] = np.where(np.isfinite(free_covariance), free_covariance, 0.0)
     return Solution(
         pair=pair,
         family="radial",
-        params={"values": weights / float(mass @ weights), "radius": radius},
+        params={"values": weights / float(hat_light @ weights), "radius": radius},
         moves=moves,
         gain=gain,
         background=background,
@@ -71,27 +71,28 @@ def _non_negative(columns: Array, data: Array) -> tuple[Array, Array]:
     centred = columns - columns.mean(axis=1, keepdims=True)
     level = data - data.mean()
     normal, right, total = centred @ centred.T, centred @ level, float(level @ level)
-    rough = np.diff(np.eye(columns.shape[0]), 2, axis=0)
-    penalty = rough.T @ rough * float(np.trace(normal)) / columns.shape[0]
-    tried = []
+    differences = np.diff(np.eye(columns.shape[0]), 2, axis=0)
+    penalty = differences.T @ differences * float(np.trace(normal)) / columns.shape[0]
+    candidates = []
     for strength in _SMOOTHNESS:
         smooth = strength * penalty
         # the Cholesky factor of the normal equations has the same minimum as the tall matrix
         factor = np.linalg.cholesky(normal + smooth + 1e-12 * np.trace(normal) * np.eye(len(normal)))
         weights, _ = nnls(factor.T, np.linalg.solve(factor, right))
         free = weights > 0
-        used = np.trace(np.linalg.solve((normal + smooth)[np.ix_(free, free)], normal[np.ix_(free, free)]))
+        effective = np.trace(np.linalg.solve((normal + smooth)[np.ix_(free, free)], normal[np.ix_(free, free)]))
         squares = max(total - 2 * float(right @ weights) + float(weights @ normal @ weights), 1e-14 * total)
-        tried.append((squares / (data.size - min(_CAUTION * float(used), 0.9 * data.size)) ** 2, weights, smooth))
-    return min(tried, key=lambda t: t[0])[1:]
+        score = squares / (data.size - min(_CAUTION * float(effective), 0.9 * data.size)) ** 2
+        candidates.append((score, weights, smooth))
+    return min(candidates, key=lambda t: t[0])[1:]
 
 
 def size_of_profile(solution: Solution) -> tuple[float, float]:
     """Rms radius of a free profile and its standard error, px; the second moment is linear in the values."""
     values, radius = np.asarray(solution.params["values"]), float(solution.params["radius"])
     r = np.linspace(0, radius, 64 * values.size + 1)
-    place = r / radius * (values.size - 1)
-    hats = np.clip(1 - np.abs(place[None, :] - np.arange(values.size)[:, None]), 0, None)
+    position = r / radius * (values.size - 1)
+    hats = np.clip(1 - np.abs(position[None, :] - np.arange(values.size)[:, None]), 0, None)
     light, moment = hats @ r, hats @ r**3
     rms = float(np.sqrt(moment @ values / (light @ values)))
     # derivative of a quotient: the total light depends on the values too

@@ -18,7 +18,7 @@ UNFOCUSED_PX = 1.0
 """Sigma of an edge, px, above which it is out of focus; every camera gives a sharper edge in focus."""
 
 _FOCUSED_PX = 0.5  # typical for cameras: between a perfect lens and a demosaiced picture
-_FINE = 6  # samples across a pixel near the edge
+_SAMPLES_PER_PX = 6  # samples across a pixel near the edge
 
 
 Draw = Callable[[Array, Array, float, float, float], Array]
@@ -62,9 +62,9 @@ def point_source(shape: tuple[int, ...], dot: Dot) -> Source:
 def _drawn_by_splines(picture: Array, x: float, y: float) -> Draw:
     spline = spline_filter(picture, order=3)
 
-    def draw(rows: Array, columns: Array, there_x: float, there_y: float, magnification: float) -> Array:
-        where = [(rows - there_y) / magnification + y, (columns - there_x) / magnification + x]
-        return np.asarray(map_coordinates(spline, where, order=3, prefilter=False), dtype=np.float64)
+    def draw(rows: Array, columns: Array, centre_x: float, centre_y: float, magnification: float) -> Array:
+        coordinates = [(rows - centre_y) / magnification + y, (columns - centre_x) / magnification + x]
+        return np.asarray(map_coordinates(spline, coordinates, order=3, prefilter=False), dtype=np.float64)
 
     return draw
 
@@ -116,14 +116,14 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
     gains outside; encoding (a power of about 0.45) breaks this balance and can be detected.
     """
     grid = np.indices(picture.shape).astype(np.float64)
-    near = distance_from(dot, picture.shape) <= dot.reach + 3
-    rows, columns, levels = grid[0][near], grid[1][near], (picture[near] - dot.background) / dot.peak
-    top = np.inf if white is None else (white - dot.background) / dot.peak
+    is_near = distance_from(dot, picture.shape) <= dot.reach + 3
+    rows, columns, levels = grid[0][is_near], grid[1][is_near], (picture[is_near] - dot.background) / dot.peak
+    clip_level = np.inf if white is None else (white - dot.background) / dot.peak
 
     def model(p: Array) -> Array:
         dx, dy, radius, softness, level = p[:5]
         coverage = _coverage(rows, columns, dot.x + dx, dot.y + dy, radius, softness)
-        return np.minimum(level * (coverage ** p[5] if fit_exponent else coverage), top)
+        return np.minimum(level * (coverage ** p[5] if fit_exponent else coverage), clip_level)
 
     def jacobian(p: Array) -> Array:
         slopes = []
@@ -143,15 +143,16 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
     rms = float(np.sqrt(residual @ residual / max(levels.size - len(solution), 1)))
     inside = inner_pixels(picture, dot)
     shot_noise = 0.0 if inside is None else max(fine_variance(picture, inside) - dot.noise**2, 0.0)
-    fine = noise_beside(picture, dot.background, ~near)[1]
-    expected = float(np.sqrt(np.mean(dot.noise**2 + shot_noise * np.clip(levels, 0, 1)) / fine)) / dot.peak
+    fine_share = noise_beside(picture, dot.background, ~is_near)[1]
+    expected = float(np.sqrt(np.mean(dot.noise**2 + shot_noise * np.clip(levels, 0, 1)) / fine_share)) / dot.peak
     dx, dy, radius, softness, level = solution[:5].tolist()
     coverage = _coverage(rows, columns, dot.x + dx, dot.y + dy, radius, softness)
-    low, high = ((coverage > least) & (coverage < least + 0.38) for least in (0.02, 0.6))
+    lower, upper = ((coverage > least) & (coverage < least + 0.38) for least in (0.02, 0.6))
     steepness, steepness_error = 0.0, np.inf
-    if min(low.sum(), high.sum()) >= 8:
-        steepness = float(residual[high].mean() - residual[low].mean()) / level
-        steepness_error = float(np.sqrt(sum(residual[side].var(ddof=1) / side.sum() for side in (low, high)))) / level
+    if min(lower.sum(), upper.sum()) >= 8:
+        steepness = float(residual[upper].mean() - residual[lower].mean()) / level
+        variance = sum(residual[half].var(ddof=1) / half.sum() for half in (lower, upper))
+        steepness_error = float(np.sqrt(variance)) / level
     return Edge(
         x=dot.x + dx,
         y=dot.y + dy,
@@ -172,9 +173,9 @@ def _coverage(rows: Array, columns: Array, x: float, y: float, radius: float, so
     distance = np.hypot(columns - x, rows - y)
     level = (distance < radius).astype(np.float64)
     # the fine grid's own step softens the edge
-    sigma = max(softness, 0.3 / _FINE)
+    sigma = max(softness, 0.3 / _SAMPLES_PER_PX)
     band = np.abs(distance - radius) < 0.75 + 5 * sigma
-    step = (np.arange(_FINE) + 0.5) / _FINE - 0.5
+    step = (np.arange(_SAMPLES_PER_PX) + 0.5) / _SAMPLES_PER_PX - 0.5
     fine = np.hypot(
         (columns[band] - x)[:, None, None] + step[None, None, :], (rows[band] - y)[:, None, None] + step[None, :, None]
     )

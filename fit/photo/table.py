@@ -18,12 +18,12 @@ from ..result import Array, BlurFit
 from ..validation import a_choice
 from .agreement import check_agreement
 from .captures import CAMERA, Capture, Captures
-from .distances import Colour, counted, fit_colours, fit_distances, fit_one, fit_openings
+from .distances import Colour, fit_colours, fit_distances, fit_one, fit_openings, with_uncertainty
 from .family_choice import COST
 from .forward import OPENINGS, SHAPES
 
-_EXPOSED = 1.3  # ratio of fitted to stated exposure above which to warn
-_ORDER = (*COST, *OPENINGS)
+_MAX_EXPOSURE_RATIO = 1.3  # ratio of fitted to stated exposure above which to warn
+_BY_COST = (*COST, *OPENINGS)
 
 
 @dataclass(frozen=True)
@@ -114,40 +114,40 @@ def fit_captures(
         text = "captures must be a Captures(pairs, focus_m=..., width_px=...), which knows the focus and the frame's "
         raise FitError(f"{text}width; got {show(captures)}")
     a_choice("family", family, ("auto", *SHAPES))
-    pairs, twice, done = captures.pairs, family == "auto" or family in OPENINGS, count(1)
+    pairs, has_first_fits, done = captures.pairs, family == "auto" or family in OPENINGS, count(1)
 
     def report(pair: Capture) -> None:
         if progress:
-            progress(next(done), len(pairs) * (2 if twice else 1), f"{pair.distance_m:g} m")
+            progress(next(done), len(pairs) * (2 if has_first_fits else 1), f"{pair.distance_m:g} m")
 
-    def kept(pair: Capture, fit: BlurFit) -> None:
-        off = 1.0 if pair.exposure is None or not fit.gain > 0 else fit.gain / pair.exposure
-        if max(off, 1 / off) > _EXPOSED:
-            text = f"the blurred dot is {off:.2f} times as bright as the exposures say; is the image linear, and did "
-            warn(f"{text}the light stay the same?", "exposure", file=pair.files[1], number=off)
+    def check_exposure(pair: Capture, fit: BlurFit) -> None:
+        ratio = 1.0 if pair.exposure is None or not fit.gain > 0 else fit.gain / pair.exposure
+        if max(ratio, 1 / ratio) > _MAX_EXPOSURE_RATIO:
+            text = f"the blurred dot is {ratio:.2f} times as bright as the exposures say; is the image linear, and did "
+            warn(f"{text}the light stay the same?", "exposure", file=pair.files[1], number=ratio)
         report(pair)
 
-    why, firsts, opening = f"family {family!r} was asked for", list[BlurFit](), None
-    if twice:  # each pair alone determines the family or the opening; the final fits warn
+    why, first_fits, opening = f"family {family!r} was asked for", list[BlurFit](), None
+    if has_first_fits:  # each pair alone determines the family or the opening; the final fits warn
         for pair in pairs:
             with without_warnings():
-                firsts.append(fit_one(pair, captures.focus_m, family, accuracy_db=accuracy_db))
+                first_fits.append(fit_one(pair, captures.focus_m, family, accuracy_db=accuracy_db))
             report(pair)
     if family == "auto":
         # the richest family needed at any distance is used for all
-        needs_most = max(range(len(pairs)), key=lambda i: _ORDER.index(firsts[i].family))
-        family = firsts[needs_most].family
-        why = f"{family}, for {pairs[needs_most].distance_m:g} m: {firsts[needs_most].why}"
+        richest = max(range(len(pairs)), key=lambda i: _BY_COST.index(first_fits[i].family))
+        family = first_fits[richest].family
+        why = f"{family}, for {pairs[richest].distance_m:g} m: {first_fits[richest].why}"
     if family in OPENINGS:
-        fits, opening = fit_openings(captures, family, firsts, kept)
+        fits, opening = fit_openings(captures, family, first_fits, check_exposure)
     else:
-        fits = fit_distances(captures, family, smooth, kept)
-    fits = [counted(pair, captures.focus_m, fit) for pair, fit in zip(pairs, fits, strict=True)]
+        fits = fit_distances(captures, family, smooth, check_exposure)
+    fits = [with_uncertainty(pair, captures.focus_m, fit) for pair, fit in zip(pairs, fits, strict=True)]
     radius_px = np.array([f.radius for f in fits])
     check_agreement(captures, radius_px)
-    promised, defocus = captures.promised_px, captures.defocus
-    if promised is not None:
-        coc_px, scale = promised, "camera"
+    camera_px, defocus = captures.promised_px, captures.defocus
+    if camera_px is not None:
+        coc_px, scale = camera_px, "camera"
     elif scale_of is not None:
         coc_px, scale = scale_of.coc_per_dioptre_px * defocus, scale_of.scale
     else:
@@ -155,8 +155,8 @@ def fit_captures(
     params, colours = _params(fits, family), tuple[Colour, ...]()
     if all(pair.colours is not None for pair in pairs):
         colours = fit_colours(captures, fits)
-        each = [_params(colour.fits, family) for colour in colours]
-        params = {n: np.stack([p[n] for p in each]) for n in params}
+        colour_params = [_params(colour.fits, family) for colour in colours]
+        params = {n: np.stack([p[n] for p in colour_params]) for n in params}
     if len(pairs) == 1:
         text = (
             f"one distance was measured ({pairs[0].distance_m:g} m); the thin lens scales it to all others, and the "
@@ -192,9 +192,8 @@ def _params(fits: Sequence[BlurFit], family: str) -> dict[str, Array]:
 
 
 def _provenance(captures: Captures, fits: Sequence[BlurFit], colours: Sequence[Colour]) -> dict[str, Any]:
-    """Provenance of a table of these fits."""
     ratios = [f.residual_over_noise for f in fits]
-    known = {
+    provenance = {
         "source": "photographs of a dot",
         "date": datetime.date.today().isoformat(),
         "focus_m": captures.focus_m,
@@ -206,7 +205,7 @@ def _provenance(captures: Captures, fits: Sequence[BlurFit], colours: Sequence[C
     }
     if colours:
         shifts = [c.focus_shift_dioptres for c in colours]
-        known["colours"] = [c.name for c in colours]
-        known["focus_shift_dioptres"] = [round(s, 5) if math.isfinite(s) else None for s in shifts]
-        known["lateral_px"] = [[[round(v, 3) for v in xy] for xy in c.lateral_px] for c in colours]
-    return known | {name: getattr(captures, name) for name in CAMERA if getattr(captures, name) is not None}
+        provenance["colours"] = [c.name for c in colours]
+        provenance["focus_shift_dioptres"] = [round(s, 5) if math.isfinite(s) else None for s in shifts]
+        provenance["lateral_px"] = [[[round(v, 3) for v in xy] for xy in c.lateral_px] for c in colours]
+    return provenance | {name: getattr(captures, name) for name in CAMERA if getattr(captures, name) is not None}

@@ -14,7 +14,7 @@ from typing import Literal, get_args
 import numpy as np
 from scipy import ndimage
 
-from torchdof.io.atomic import whole_file
+from torchdof.io.atomic import atomic_file
 
 from ..problems import FitError
 from ..result import Array, Mask
@@ -28,9 +28,9 @@ SQUARE_MM = 100.0
 DOT_MM = 5.0
 """Diameter of the white dot in its centre, mm."""
 
-_SEARCHED_PX = 500  # width of the reduced copy in which the square is searched
-_LEVELS = np.linspace(0.1, 0.75, 14)  # thresholds, as fractions between dark and bright
-_SMALLEST, _LARGEST = 0.004, 0.6  # limits of the square's share of the frame
+_THUMBNAIL_PX = 500  # width of the reduced copy in which the square is searched
+_THRESHOLDS = np.linspace(0.1, 0.75, 14)  # fractions of the range between dark and bright
+_MIN_SHARE, _MAX_SHARE = 0.004, 0.6  # limits of the square's share of the frame
 
 
 def write_target(path: str | os.PathLike[str], paper: Paper = "a4") -> None:
@@ -49,7 +49,7 @@ def write_target(path: str | os.PathLike[str], paper: Paper = "a4") -> None:
         raise FitError(f"the target is written as PDF: name it {target.with_suffix('.pdf')}", file=str(path))
     a_choice("paper", paper, get_args(Paper))
     page = Path(__file__).with_name(f"target-{paper}.pdf").read_bytes()
-    with whole_file(target) as temporary:
+    with atomic_file(target) as temporary:
         Path(temporary).write_bytes(page)
 
 
@@ -76,44 +76,46 @@ def find_target(light: Array, *, file: str | None = None) -> Target:
     Raises:
         FitError: of kind "no dot" if there is no dark square with a bright centre and bright paper around it.
     """
-    step = max(1, round(light.shape[1] / _SEARCHED_PX))
+    step = max(1, round(light.shape[1] / _THUMBNAIL_PX))
     rows, columns = (n // step for n in light.shape)
-    small = light[: rows * step, : columns * step].reshape(rows, step, columns, step).mean((1, 3))
-    low, high = np.percentile(small, (1, 97))
-    found = [target for share in _LEVELS for target in _squares(small, small < low + share * (high - low))]
-    if not found:
+    thumbnail = light[: rows * step, : columns * step].reshape(rows, step, columns, step).mean((1, 3))
+    low, high = np.percentile(thumbnail, (1, 97))
+    thresholds = low + _THRESHOLDS * (high - low)
+    candidates = [target for level in thresholds for target in _squares(thumbnail, thumbnail < level)]
+    if not candidates:
         text = (
             "no target found: a black square with a white dot in its middle, white paper around it, all in the frame; "
             "is it evenly lit, square on and not too small?"
         )
         raise FitError(text, "no dot", file=file)
-    rough = max(found, key=lambda t: (t.white - t.black) / max(t.white + t.black, 1e-12))  # of the highest contrast
-    x, y = ((v + 0.5) * step - 0.5 for v in (rough.x, rough.y))
-    return _refined(light, replace(rough, x=x, y=y, side_px=rough.side_px * step))
+    best = max(candidates, key=lambda t: (t.white - t.black) / max(t.white + t.black, 1e-12))  # of the highest contrast
+    x, y = ((v + 0.5) * step - 0.5 for v in (best.x, best.y))
+    return _refined(light, replace(best, x=x, y=y, side_px=best.side_px * step))
 
 
-def _squares(small: Array, dark: Mask) -> Iterator[Target]:
+def _squares(thumbnail: Array, dark: Mask) -> Iterator[Target]:
     """Dark areas that are square, have a bright centre and bright surroundings."""
     labels, count = ndimage.label(dark)
     for i, box in enumerate(ndimage.find_objects(labels)[:count], start=1):
         (top, bottom), (left, right) = ((s.start, s.stop) for s in box)
         height, width = bottom - top, right - left
-        touches = top == 0 or left == 0 or bottom == small.shape[0] or right == small.shape[1]
-        if touches or not _SMALLEST < height * width / small.size < _LARGEST or not 0.75 < height / width < 1.33:
+        touches_border = top == 0 or left == 0 or bottom == thumbnail.shape[0] or right == thumbnail.shape[1]
+        share = height * width / thumbnail.size
+        if touches_border or not _MIN_SHARE < share < _MAX_SHARE or not 0.75 < height / width < 1.33:
             continue
-        filled = ndimage.binary_fill_holes(labels[box] == i)
-        area = float(filled.sum())
-        y, x = np.nonzero(filled)
+        square = ndimage.binary_fill_holes(labels[box] == i)
+        area = float(square.sum())
+        y, x = np.nonzero(square)
         covariance = np.cov(np.stack([x, y]))
         # any parallelogram has the area 12 sqrt(det cov)
         if abs(area / (12 * math.sqrt(max(float(np.linalg.det(covariance)), 1e-9))) - 1) > 0.06:
             continue
         side = math.sqrt(area)
         target = Target(left + float(x.mean()), top + float(y.mean()), side, elongation=1.0, white=0.0, black=0.0)
-        distance = _square_distance(small.shape, target)
-        ring = small[(distance > 1.12) & (distance < 1.2)]
-        inside = small[(distance > 0.4) & (distance < 0.85)]
-        middle = small[distance < 0.03 + 1.5 / side]
+        distance = _square_distance(thumbnail.shape, target)
+        ring = thumbnail[(distance > 1.12) & (distance < 1.2)]
+        inside = thumbnail[(distance > 0.4) & (distance < 0.85)]
+        middle = thumbnail[distance < 0.03 + 1.5 / side]
         if ring.size < 8 or inside.size < 8 or middle.size < 1:
             continue
         white, black = float(np.median(ring)), float(np.median(inside))
@@ -124,8 +126,8 @@ def _squares(small: Array, dark: Mask) -> Iterator[Target]:
 def _square_distance(shape: tuple[int, ...], target: Target) -> Array:
     """Distance from the square's centre in half sides, the larger of both axes: 1 on its edge."""
     rows, columns = np.indices(shape)
-    away = np.maximum(np.abs(rows - target.y), np.abs(columns - target.x))
-    return np.asarray(away / (target.side_px / 2))
+    offset = np.maximum(np.abs(rows - target.y), np.abs(columns - target.x))
+    return np.asarray(offset / (target.side_px / 2))
 
 
 def _refined(light: Array, rough: Target) -> Target:
@@ -135,11 +137,11 @@ def _refined(light: Array, rough: Target) -> Target:
         half = int(0.62 * target.side_px) + 2
         top, left = max(round(target.y) - half, 0), max(round(target.x) - half, 0)
         crop = light[top : round(target.y) + half + 1, left : round(target.x) + half + 1]
-        here = replace(target, x=target.x - left, y=target.y - top)
-        distance = _square_distance(crop.shape, here)
+        local = replace(target, x=target.x - left, y=target.y - top)
+        distance = _square_distance(crop.shape, local)
         paper, ink = (distance > 1.12) & (distance < 1.22), (distance > 0.5) & (distance < 0.85)
         rows, columns = np.indices(crop.shape)
-        plane = np.stack([np.ones(crop.shape), rows - here.y, columns - here.x], axis=-1)
+        plane = np.stack([np.ones(crop.shape), rows - local.y, columns - local.x], axis=-1)
         white = plane @ np.linalg.lstsq(plane[paper], crop[paper], rcond=None)[0]
         black = float(np.median(crop[ink] / white[ink]))
         share = np.clip((1 - crop / white) / (1 - black), -0.2, 1.2)
@@ -147,10 +149,10 @@ def _refined(light: Array, rough: Target) -> Target:
         share[distance > 1.15] = 0.0
         area = float(share.sum())
         x, y = float((share * columns).sum() / area), float((share * rows).sum() / area)
-        wide, high = (
+        width, height = (
             math.sqrt(12 * float((share * (axis - middle) ** 2).sum()) / area)
             for axis, middle in ((columns, x), (rows, y))
         )
         level = float(np.median(white))
-        target = Target(x + left, y + top, math.sqrt(area), max(wide / high, high / wide), level, black * level)
+        target = Target(x + left, y + top, math.sqrt(area), max(width / height, height / width), level, black * level)
     return target

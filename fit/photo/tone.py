@@ -20,13 +20,13 @@ from .target import DOT_MM, Target
 WINDOW = 0.36
 """Half side of the dot's window, relative to the square's side."""
 
-_PRINTED = 0.005  # relative error of the dot's expected light
-_BENT = (0.7, 0.7, 0.2)  # expected size of the three parameters
-_CERTAIN = 9.0  # decrease of chi squared required for a tone curve; noise alone exceeds it in 1 of 30 cases
-_ASIDE, _ALONG = 0.1, 0.35  # reach across and along an edge, relative to the square's side
+_DOT_ERROR = 0.005  # relative error of the dot's expected light
+_EXPECTED_BEND = (0.7, 0.7, 0.2)  # expected size of the three parameters
+_MIN_CHI_GAIN = 9.0  # decrease of chi squared required for a tone curve; noise alone exceeds it in 1 of 30 cases
+_ACROSS, _ALONG = 0.1, 0.35  # reach across and along an edge, relative to the square's side
 _BIN = 0.5  # px
-_EVEN, _PLACES = 0.006, 8  # error of the symmetry of two opposite edges, and number of independent positions
-_BLURRED = 2.3  # px from 10 % to 90 % above which an edge is wide enough
+_SYMMETRY_ERROR, _POSITIONS = 0.006, 8  # error of the symmetry of two opposite edges, at independent positions
+_MIN_EDGE_PX = 2.3  # px from 10 % to 90 % above which an edge is wide enough
 _LEVELS = np.linspace(0.0, 1.0, 1025)
 
 
@@ -47,9 +47,9 @@ def untoned(light: Array, bend: Sequence[float] | Array) -> Array:
     """
     u = 2 * _LEVELS - 1
     slope = np.exp(bend[0] * u + bend[1] * (u**2 - 1 / 3) + bend[2] * (u**3 - 0.6 * u))
-    undone = np.concatenate([[0.0], np.cumsum(slope[1:] + slope[:-1])])
+    inverse_curve = np.concatenate([[0.0], np.cumsum(slope[1:] + slope[:-1])])
     encoded = encode(torch.from_numpy(np.clip(light, 0.0, 1.0))[None, None], "srgb", False, False)[0, 0].numpy()
-    level = torch.from_numpy(np.interp(encoded, _LEVELS, undone / undone[-1]))
+    level = torch.from_numpy(np.interp(encoded, _LEVELS, inverse_curve / inverse_curve[-1]))
     return np.asarray(decode(level[None, None], "srgb", False, False)[0, 0].numpy())
 
 
@@ -60,31 +60,31 @@ def tone_curve(pictures: Sequence[tuple[Array, Target]], square_mm: float) -> To
         half = int(WINDOW * target.side_px)
         window = target.window(light, half)
         distance = np.hypot(*(np.indices(window.shape) - half))
-        inside, around = distance < 0.12 * target.side_px, (distance > 0.2 * target.side_px) & (distance < half)
+        inside, surroundings = distance < 0.12 * target.side_px, (distance > 0.2 * target.side_px) & (distance < half)
         area = math.pi * (DOT_MM / 2 * target.side_px / square_mm) ** 2
         # the noise of a demosaiced pixel is correlated with about nine neighbours
-        noise = 3 * float(window[around].std()) * math.sqrt(inside.sum()) / (target.white * area)
-        dots.append((window, inside, around, target.white, area, math.hypot(noise, _PRINTED)))
+        noise = 3 * float(window[surroundings].std()) * math.sqrt(inside.sum()) / (target.white * area)
+        dots.append((window, inside, surroundings, target.white, area, math.hypot(noise, _DOT_ERROR)))
     edges = [pair for light, target in pictures for pair in _edges(light, target)]
 
     def misfit(values: Array) -> Array:
-        bend, found = values[:3], []
-        for window, inside, around, white, area, error in dots:
+        bend, residuals = values[:3], []
+        for window, inside, surroundings, white, area, error in dots:
             level = untoned(window, bend)
-            black, paper = float(level[around].mean()), float(untoned(np.array([[white]]), bend)[0, 0])
+            black, paper = float(level[surroundings].mean()), float(untoned(np.array([[white]]), bend)[0, 0])
             light = float((level - black)[inside].sum()) / (paper - black) / area
-            found.append((math.log(max(light, 1e-3)) - values[3]) / error)
-        uneven = [_unevenness(*untoned(np.stack(pair), bend)) for pair in edges]
-        return np.concatenate([found, *uneven, bend / _BENT])
+            residuals.append((math.log(max(light, 1e-3)) - values[3]) / error)
+        asymmetries = [_edge_asymmetry(*untoned(np.stack(pair), bend)) for pair in edges]
+        return np.concatenate([residuals, *asymmetries, bend / _EXPECTED_BEND])
 
     solution = least_squares(misfit, np.zeros(4), x_scale=0.1)
-    straight = least_squares(lambda v: misfit(np.array([0.0, 0.0, 0.0, v[0]])), [0.0])
+    uncurved = least_squares(lambda v: misfit(np.array([0.0, 0.0, 0.0, v[0]])), [0.0])
     # unexplained residuals make the curve less certain
-    seen = len(dots) + _PLACES * len(edges)
-    spread = np.linalg.inv(solution.jac.T @ solution.jac)[:3, :3] * max(2 * solution.cost / seen, 1.0)
-    clear = 2 * (straight.cost - solution.cost) > _CERTAIN
-    bend = solution.x[:3] if clear else np.zeros(3)
-    values, directions = np.linalg.eigh(spread + np.outer(solution.x[:3] - bend, solution.x[:3] - bend))
+    data_count = len(dots) + _POSITIONS * len(edges)
+    covariance = np.linalg.inv(solution.jac.T @ solution.jac)[:3, :3] * max(2 * solution.cost / data_count, 1.0)
+    is_significant = 2 * (uncurved.cost - solution.cost) > _MIN_CHI_GAIN
+    bend = solution.x[:3] if is_significant else np.zeros(3)
+    values, directions = np.linalg.eigh(covariance + np.outer(solution.x[:3] - bend, solution.x[:3] - bend))
     return Tone((float(bend[0]), float(bend[1]), float(bend[2])), (directions * np.sqrt(np.maximum(values, 0.0))).T)
 
 
@@ -93,31 +93,31 @@ def _edges(light: Array, target: Target) -> list[tuple[Array, Array]]:
 
     Uneven light bends opposite edges in opposite directions, so their errors cancel.
     """
-    reach, along = int(_ASIDE * target.side_px), int(_ALONG * target.side_px)
+    reach, half_length = int(_ACROSS * target.side_px), int(_ALONG * target.side_px)
     pairs = []
     for picture, x, y in ((light, target.x, target.y), (light.T, target.y, target.x)):
         profiles = []
         for side in (-1, 1):
             left = round(x + side * target.side_px / 2) - reach
-            rows = slice(round(y) - along, round(y) + along + 1)
+            rows = slice(round(y) - half_length, round(y) + half_length + 1)
             strip = picture[rows, max(left, 0) : left + 2 * reach + 1]
-            if left < 0 or strip.shape != (2 * along + 1, 2 * reach + 1):
+            if left < 0 or strip.shape != (2 * half_length + 1, 2 * reach + 1):
                 continue
             strip = strip[:, ::-side]  # from paper to ink
             paper, ink = float(strip[:, : reach // 3].mean()), float(strip[:, -(reach // 3) :].mean())
             if reach < 12 or not paper > 1.5 * ink:
                 continue
-            row = np.arange(len(strip)) - along
-            place = ((strip - ink) / (paper - ink)).sum(1) - 0.5
-            slope, start = np.polyfit(row, place, 1)
-            away = (np.arange(strip.shape[1]) - start - slope * row[:, None]) / math.hypot(1, slope)
-            index = np.floor((away + 0.9 * reach) / _BIN).astype(int)
-            kept = (index >= 0) & (index < int(1.8 * reach / _BIN))
-            count = np.bincount(index[kept])
-            level = np.bincount(index[kept], strip[kept]) / np.maximum(count, 1)
-            end = level.size // 6
-            share = (level - level[-end:].mean()) / (level[:end].mean() - level[-end:].mean())
-            if count.all() and _BIN * float(((share > 0.1) & (share < 0.9)).sum()) > _BLURRED:
+            row = np.arange(len(strip)) - half_length
+            edge_positions = ((strip - ink) / (paper - ink)).sum(1) - 0.5
+            slope, intercept = np.polyfit(row, edge_positions, 1)
+            distance = (np.arange(strip.shape[1]) - intercept - slope * row[:, None]) / math.hypot(1, slope)
+            index = np.floor((distance + 0.9 * reach) / _BIN).astype(int)
+            in_range = (index >= 0) & (index < int(1.8 * reach / _BIN))
+            count = np.bincount(index[in_range])
+            level = np.bincount(index[in_range], strip[in_range]) / np.maximum(count, 1)
+            margin = level.size // 6
+            share = (level - level[-margin:].mean()) / (level[:margin].mean() - level[-margin:].mean())
+            if count.all() and _BIN * float(((share > 0.1) & (share < 0.9)).sum()) > _MIN_EDGE_PX:
                 profiles.append(level)
         if len(profiles) == 2:
             shorter = min(profile.size for profile in profiles)
@@ -125,15 +125,15 @@ def _edges(light: Array, target: Target) -> list[tuple[Array, Array]]:
     return pairs
 
 
-def _unevenness(one: Array, other: Array) -> Array:
+def _edge_asymmetry(one: Array, other: Array) -> Array:
     """Asymmetry of two opposite edges at equal distances from their centres, over its error."""
-    uneven: Array = np.zeros(1)
+    asymmetry: Array = np.zeros(1)
     for level in (one, other):
-        end = level.size // 6
-        paper, ink = float(level[:end].mean()), float(level[-end:].mean())
+        margin = level.size // 6
+        paper, ink = float(level[:margin].mean()), float(level[-margin:].mean())
         share = (level - ink) / (paper - ink)
-        middle = float(share.sum()) - 0.5  # of a symmetric edge, in bins
-        away = np.arange(1.0, level.size // 3)
+        centre = float(share.sum()) - 0.5  # of a symmetric edge, in bins
+        offset = np.arange(1.0, level.size // 3)
         bins = np.arange(level.size)
-        uneven = uneven + np.interp(middle + away, bins, share) + np.interp(middle - away, bins, share) - 1
-    return np.asarray(uneven / (2 * _EVEN * math.sqrt(uneven.size / _PLACES)))
+        asymmetry = asymmetry + np.interp(centre + offset, bins, share) + np.interp(centre - offset, bins, share) - 1
+    return np.asarray(asymmetry / (2 * _SYMMETRY_ERROR * math.sqrt(asymmetry.size / _POSITIONS)))

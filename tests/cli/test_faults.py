@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchdof.cli import frame, printed
+from torchdof.cli import frame, output
 from torchdof.io.images import Picture, read_image, write_image
 
 pytestmark = pytest.mark.hard
@@ -174,18 +174,18 @@ def test_a_long_step_shows_a_bar_on_the_terminal_and_results_still_go_to_the_fil
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr(sys, "stdout", file)
     monkeypatch.setenv("TERM", "xterm")
-    with printed.Bar("frame 1 of 24", 24):
+    with output.Bar("frame 1 of 24", 24):
         pass
     assert terminal.getvalue() == ""
-    monkeypatch.setattr(printed, "_PATIENCE_S", 0.0)
-    with printed.Bar("", 4) as bar:
+    monkeypatch.setattr(output, "_DELAY_S", 0.0)
+    with output.Bar("", 4) as bar:
         for done in range(3):
             time.sleep(0.4)
             bar.update(f"frame {done + 1} of 4", done)
         time.sleep(0.5)
-        printed.tell(True, {"out": "a.png"}, "")
+        output.print_result(True, {"out": "a.png"}, "")
     assert "frame 3 of 4" in terminal.getvalue() and re.search(r"0:00:0[01]\S* \S*0:00:0[0-3]", terminal.getvalue())
-    with printed.Bar("rendering [out].png"):
+    with output.Bar("rendering [out].png"):
         time.sleep(0.5)
     assert "rendering [out].png" in terminal.getvalue()
     assert file.getvalue() == '{"out": "a.png"}\n' and "a.png" not in terminal.getvalue()
@@ -196,9 +196,9 @@ def test_a_large_image_shows_an_estimate_of_its_time_only_on_a_terminal(
 ) -> None:
     shown: list[str] = []
     monkeypatch.setattr(frame, "_LARGE_PX", 100)
-    monkeypatch.setattr(printed.Bar, "update", lambda self, text: shown.append(text))
+    monkeypatch.setattr(output.Bar, "update", lambda self, text: shown.append(text))
     run("render image.exr depth.npy -o out.exr --focus-m 2")
     assert shown == []
-    monkeypatch.setattr(printed, "_is_terminal", lambda: True)
+    monkeypatch.setattr(output, "_is_terminal", lambda: True)
     run("render image.exr depth.npy -o out.exr --focus-m 2")
     assert len(shown) == 1 and re.fullmatch(r"rendering out.exr, about \d+ s", shown[0])

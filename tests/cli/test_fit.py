@@ -106,7 +106,7 @@ def test_photographs_of_the_target_become_a_table_and_a_sheet(
         rendered.append((image, coc_px))
         return blur_by_coc(image, coc_px, table=table)
 
-    monkeypatch.setattr("torchdof.cli.fitted.blur_by_coc", recorded)
+    monkeypatch.setattr("torchdof.cli.fit_tables.blur_by_coc", recorded)
     output = run("fit", tmp_path / "phone", "-o", tmp_path / "phone.json", "--family", "disc")
     output = " ".join(output.split())
     assert "in focus" in output and "better: 1 distances out of focus: five to nine" in output

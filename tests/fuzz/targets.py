@@ -26,7 +26,7 @@ from torchdof.fit import FitError, read_captures
 from torchdof.fit.lens.lens import Lens
 from torchdof.fit.lens.spot import focus_sensor, point_spread
 from torchdof.io.images import Picture, read_image, read_values, write_image
-from torchdof.io.metadata import camera_facts
+from torchdof.io.metadata import camera_settings
 from torchdof.optics.aperture import Aperture
 from torchdof.render import edges
 
@@ -102,7 +102,7 @@ def _read_picture(path: Path) -> None:
         else:
             if isinstance(found, Picture):
                 assert torch.isfinite(found.pixels).all(), "pixels that are not finite"
-                camera_facts(found.metadata, found.pixels.shape[-1], found.pixels.shape[-2])
+                camera_settings(found.metadata, found.pixels.shape[-1], found.pixels.shape[-2])
 
 
 def _array_seeds(suffix: str) -> Callable[[Path], None]:

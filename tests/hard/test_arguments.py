@@ -20,7 +20,7 @@ from torchdof.cli.command import numbers, word_or_number
 from torchdof.depth.holes import fill_holes
 from torchdof.depth.inspect import tint_focus
 from torchdof.depth.kinds import depth_from_values
-from torchdof.io.metadata import camera_facts
+from torchdof.io.metadata import camera_settings
 from torchdof.io.sequence import FramePattern, focus_at_frame, parse_focus, parse_frames
 from torchdof.optics import psf
 
@@ -70,7 +70,7 @@ TAGS = ("Exif:FocalLength", "FNumber", "Exif:SubjectDistance", "Exif:FocalLength
 
 
 def facts(**tags: Any) -> dict[str, float]:
-    return camera_facts({name: (None, value) for name, value in zip(TAGS, tags.values(), strict=True)}, 100, 80)
+    return camera_settings({name: (None, value) for name, value in zip(TAGS, tags.values(), strict=True)}, 100, 80)
 
 
 def kernels_of_fields(**fields: Any) -> None:
@@ -155,7 +155,7 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "fill_holes": (fill_holes, {"depth": VALUES, "fill": "far"}),
     "tint_focus": (tint_focus, {"image": IMAGE, "coc_px": COC}),
     "focus_at_frame": (lambda frame: focus_at_frame([(0, 1.0), (5, 2.0)], frame), {"frame": 3}),
-    "camera_facts": (facts, {name: 2.0 for name in TAGS}),
+    "camera_settings": (facts, {name: 2.0 for name in TAGS}),
 }  # fmt: skip
 
 

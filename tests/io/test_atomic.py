@@ -13,7 +13,7 @@ import torch
 
 from tests.processes import output_of
 from torchdof import BlurTable
-from torchdof.io.atomic import whole_file
+from torchdof.io.atomic import atomic_file
 from torchdof.io.images import Picture, read_image, write_image
 
 pytestmark = pytest.mark.hard
@@ -78,9 +78,9 @@ def test_a_full_disk_is_an_error_and_leaves_the_old_file(tmp_path: Path) -> None
 
 WRITING = """
 import signal, sys, time
-from torchdof.io.atomic import whole_file
+from torchdof.io.atomic import atomic_file
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup would have set it to be ignored
-with whole_file(sys.argv[1]) as outer, whole_file(sys.argv[1] + ".json") as inner:
+with atomic_file(sys.argv[1]) as outer, atomic_file(sys.argv[1] + ".json") as inner:
     outer.write_bytes(b"half")
     inner.write_bytes(b"half")
     print("writing", flush=True)
@@ -136,7 +136,7 @@ def test_a_signal_handler_of_the_caller_is_kept(tmp_path: Path) -> None:
 def test_a_link_is_followed_and_kept(tmp_path: Path) -> None:
     (tmp_path / "real.png").write_text("old")
     (tmp_path / "link.png").symlink_to(tmp_path / "real.png")
-    with whole_file(tmp_path / "link.png") as part:
+    with atomic_file(tmp_path / "link.png") as part:
         part.write_text("new")
     assert (tmp_path / "link.png").is_symlink()
     assert (tmp_path / "real.png").read_text() == "new"

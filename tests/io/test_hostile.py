@@ -24,8 +24,8 @@ import torch
 from tests.files import spec_with, store, store_parts
 from tests.processes import output_of
 from torchdof import BlurTable
-from torchdof.io import decode, foreign
-from torchdof.io.decode import MOST_ATTRIBUTES
+from torchdof.io import decode, optional_formats
+from torchdof.io.decode import MAX_ATTRIBUTES
 from torchdof.io.images import Picture, read_image, read_values, write_image
 
 pytestmark = pytest.mark.hard
@@ -196,13 +196,13 @@ def test_a_target_that_cannot_be_written_is_named(name: str, sample: Any, messag
 def test_a_format_without_a_reader_is_refused_with_its_conversion(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, how: str
 ) -> None:
-    monkeypatch.setattr(foreign, "readable", lambda: ())
+    monkeypatch.setattr(optional_formats, "readable", lambda: ())
     with pytest.raises(ValueError, match=rf"{name}: {Path(name).suffix.lower()} is not read here: {how}"):
         read_image(name)
     # OpenImageIO looks at the content, so that a renamed JPEG replaces a file of this format
     write_image(tmp_path / "a.jpg", Picture(torch.full((1, 3, 8, 8), 0.2159)))
     (tmp_path / "a.jpg").rename(tmp_path / name)
-    monkeypatch.setattr(foreign, "readable", lambda: (Path(name).suffix.lower(),))
+    monkeypatch.setattr(optional_formats, "readable", lambda: (Path(name).suffix.lower(),))
     assert float(read_image(tmp_path / name).pixels.mean()) == pytest.approx(0.2159, abs=0.002)
 
 
@@ -279,10 +279,10 @@ def with_attributes(path: Path, count: int) -> None:
 def test_attributes_are_kept_and_too_many_are_refused_at_once(tmp_path: Path) -> None:
     with_attributes(tmp_path / "some.exr", 500)
     assert read_image(tmp_path / "some.exr").metadata["a499"][1] == 499
-    for count in (MOST_ATTRIBUTES, 100_000):
+    for count in (MAX_ATTRIBUTES, 100_000):
         with_attributes(tmp_path / "x.exr", count)
         start = time.perf_counter()
-        with pytest.raises(ValueError, match=rf"x\.exr: its headers hold more than {MOST_ATTRIBUTES} attributes"):
+        with pytest.raises(ValueError, match=rf"x\.exr: its headers hold more than {MAX_ATTRIBUTES} attributes"):
             read_image(tmp_path / "x.exr")
         assert time.perf_counter() - start < 2.0  # OpenEXR takes minutes
 

@@ -6,7 +6,7 @@ import pytest
 
 from tests.files import store
 from torchdof.io.images import read_image, read_values, write_image
-from torchdof.io.metadata import camera_facts
+from torchdof.io.metadata import camera_settings
 
 FOCAL, FILM, DISTANCE = "Exif:FocalLength", "Exif:FocalLengthIn35mmFilm", "Exif:SubjectDistance"
 PLANE, UNIT, WIDTH = "Exif:FocalPlaneXResolution", "Exif:FocalPlaneResolutionUnit", "Exif:PixelXDimension"
@@ -37,13 +37,13 @@ FULL = {"sensor_width_mm": 36.0}
     ],
 )
 def test_camera_facts_are_those_of_the_tags(tags: dict[str, Any], facts: dict[str, float]) -> None:
-    found = camera_facts({name: (None, value) for name, value in tags.items()}, 6000, 4000)
+    found = camera_settings({name: (None, value) for name, value in tags.items()}, 6000, 4000)
     assert found == pytest.approx(facts)
 
 
 def test_the_36_mm_of_an_equivalent_focal_length_are_the_longer_side() -> None:
     tags = {FOCAL: (None, 4.2), FILM: (None, 27)}
-    assert camera_facts(tags, 3000, 4000)["sensor_width_mm"] == pytest.approx(5.6 * 3 / 4)
+    assert camera_settings(tags, 3000, 4000)["sensor_width_mm"] == pytest.approx(5.6 * 3 / 4)
 
 
 # EXIF 2.32, 4.6.4 A: upright place of the pixel at row r and column c of a stored h x w picture

@@ -39,12 +39,12 @@ def renderers(degraded: bool) -> dict[str, Renderer]:
         >>> list(renderers(degraded=False))
         ['untouched', 'scatter', 'ikoma', 'torchdof', 'torchdof dense']
     """
-    ours: dict[str, Renderer] = {"ikoma": layered_fft, "torchdof": blur_by_coc}
+    common: dict[str, Renderer] = {"ikoma": layered_fft, "torchdof": blur_by_coc}
     if degraded:
-        return {"as given": functools.partial(blur_by_coc, depth_edges="as given"), **ours}
+        return {"as given": functools.partial(blur_by_coc, depth_edges="as given"), **common}
     scatter = functools.partial(blur_by_coc, tolerance=0, occlusion=False)
     dense = functools.partial(blur_by_coc, tolerance=0)
-    return {"untouched": lambda image, _: image, "scatter": scatter, **ours, "torchdof dense": dense}
+    return {"untouched": lambda image, _: image, "scatter": scatter, **common, "torchdof dense": dense}
 
 
 def read_peer(path: Path) -> tuple[str, Renderer]:
@@ -80,27 +80,27 @@ def compare(truth: Path, out: Path, views: Sequence[int], degraded: bool, peers:
         ValueError: If a scene or a peer is invalid.
         OSError: If the folder has no scene, or a file cannot be read or written.
     """
-    compared = renderers(degraded) | dict(map(read_peer, peers))
+    by_name = renderers(degraded) | dict(map(read_peer, peers))
     for count in sorted({*views}):
-        compared[f"reference {count}"] = functools.partial(_lens_views, count)
+        by_name[f"reference {count}"] = functools.partial(_lens_views, count)
     scenes, console, rows = list(read_scenes(truth)), Console(stderr=True), []
-    side = min(_TILE_PX, *(size for scene in scenes for size in scene.image.shape[-2:]))
+    tile_px = min(_TILE_PX, *(size for scene in scenes for size in scene.image.shape[-2:]))
     panels: dict[str, list[Tensor]] = {}
     cases = [(scene, kind) for scene in scenes for kind in (KINDS if degraded else ["exact"])]
     for scene, kind in track(cases, "scenes", console=console, transient=True, disable=not console.is_terminal):
         coc_px, pictures = scene.camera.coc_px(degrade(scene.depth, kind), scene.image.shape[-1]), {}
-        for name, blur in compared.items():
+        for name, blur in by_name.items():
             with torch.inference_mode():
                 picture, row = measure(blur, BenchScene(scene.name, scene.image, coc_px), again=False)
             row |= error(picture, scene.truth)
-            shown = metrics.display(picture), metrics.display(scene.truth)
+            displayed = metrics.display(picture), metrics.display(scene.truth)
             if bool(scene.inner.any()):
-                row["psnr_inner"] = metrics.psnr(*shown, scene.inner)
+                row["psnr_inner"] = metrics.psnr(*displayed, scene.inner)
             if metrics.has_flip() and picture.shape[1] == 3:
-                row["flip"] = metrics.flip(*shown)
+                row["flip"] = metrics.flip(*displayed)
             rows.append({"scene": scene.name, "depth": kind, "renderer": name, **row})
             pictures[name] = picture
-        window = _worst(pictures["torchdof"], scene, side)
+        window = _worst(pictures["torchdof"], scene, tile_px)
         for name, picture in {"sharp": scene.image, "truth": scene.truth, **pictures}.items():
             panels.setdefault(name, []).append(picture[window][:, :3].expand(-1, 3, -1, -1))
     tables: dict[str, Sequence[Row]] = {
@@ -111,7 +111,7 @@ def compare(truth: Path, out: Path, views: Sequence[int], degraded: bool, peers:
     if degraded:
         publish("What inexact depth costs", tables, [remark], out / "degraded")
         return
-    remark += f" accuracy.png: for each scene, the {side} x {side} pixels with torchdof's largest error."
+    remark += f" accuracy.png: for each scene, the {tile_px} x {tile_px} pixels with torchdof's largest error."
     sheet = {name: torch.cat(parts, 2) for name, parts in panels.items()}
     draw = functools.partial(write_sheet, panels=sheet)
     publish("Accuracy against the truth", tables, [remark], out / "accuracy", draw)
@@ -119,6 +119,6 @@ def compare(truth: Path, out: Path, views: Sequence[int], degraded: bool, peers:
 
 def _worst(picture: Tensor, scene: Scene, side: int) -> tuple[Any, ...]:
     """The window with the largest squared error of the displayed picture."""
-    squares = (metrics.display(picture) - metrics.display(scene.truth)).square().mean(1, keepdim=True)
-    top, left = divmod(int((means := functional.avg_pool2d(squares, side, stride=1)).argmax()), means.shape[-1])
+    squared_error = (metrics.display(picture) - metrics.display(scene.truth)).square().mean(1, keepdim=True)
+    top, left = divmod(int((means := functional.avg_pool2d(squared_error, side, stride=1)).argmax()), means.shape[-1])
     return ..., slice(top, top + side), slice(left, left + side)

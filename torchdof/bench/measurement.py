@@ -19,7 +19,7 @@ from . import memory
 
 __all__ = ["BenchScene", "Renderer", "Seconds", "error", "measure", "peak_of", "shipped", "timed"]
 
-_LEAST_PX = 16
+_MIN_SIDE = 16
 _Result = TypeVar("_Result")
 
 
@@ -66,8 +66,8 @@ class BenchScene:
         (h, w), (height, width) = self.coc_px.shape[-2:], self.image.shape[-2:]
         if (h, w) != (height, width):
             raise ValueError(f"{self.name}: depth is {w} x {h} pixels but the image is {width} x {height}")
-        if min(h, w) < _LEAST_PX:
-            raise ValueError(f"{self.name}: is {width} x {height}; speed is measured from {_LEAST_PX} pixels a side on")
+        if min(h, w) < _MIN_SIDE:
+            raise ValueError(f"{self.name}: is {width} x {height}; speed is measured from {_MIN_SIDE} pixels a side on")
 
     def seen(self, focus: float, radius_px: float) -> "BenchScene":
         """The scene by another camera: focused nearer (down to -1) or farther (up to 1), with another largest radius.
@@ -75,22 +75,22 @@ class BenchScene:
         A thin lens's circle of confusion is linear in 1 / distance: another focus adds a constant, here at most half of
         its range, and another opening multiplies it.
         """
-        moved = self.coc_px - 0.5 * focus * (self.coc_px.max() - self.coc_px.min())
-        return dataclasses.replace(self, coc_px=moved * (radius_px / moved.abs().max().clamp_min(1e-9)))
+        shifted = self.coc_px - 0.5 * focus * (self.coc_px.max() - self.coc_px.min())
+        return dataclasses.replace(self, coc_px=shifted * (radius_px / shifted.abs().max().clamp_min(1e-9)))
 
-    def cameras(self, count: int, least: float, seed: str) -> "list[BenchScene]":
-        """The scene by ``count`` random cameras, which depend on the seed; radii are ``least`` to 1 times its own."""
-        dice, widest_px = random.Random(seed), float(self.coc_px.abs().max())
-        return [self.seen(dice.uniform(-0.5, 0.5), widest_px * least ** dice.random()) for _ in range(count)]
+    def cameras(self, count: int, smallest: float, seed: str) -> "list[BenchScene]":
+        """The scene by ``count`` random cameras, whose largest radius is ``smallest`` to 1 times that of the scene."""
+        rng, widest_px = random.Random(seed), float(self.coc_px.abs().max())
+        return [self.seen(rng.uniform(-0.5, 0.5), widest_px * smallest ** rng.random()) for _ in range(count)]
 
     def pull(self, count: int) -> "list[BenchScene]":
         """A sequence of ``count`` pictures whose focus moves through the scene."""
         widest_px = float(self.coc_px.abs().max())
         return [self.seen(2 * k / max(1, count - 1) - 1, widest_px) for k in range(count)]
 
-    def resized(self, share: float) -> "BenchScene":
+    def resized(self, scale: float) -> "BenchScene":
         """The scene in a frame of another size; the blur is scaled with the width."""
-        height, width = (max(_LEAST_PX, round(share * n)) for n in self.image.shape[-2:])
+        height, width = (max(_MIN_SIDE, round(scale * n)) for n in self.image.shape[-2:])
         image = functional.interpolate(self.image, (height, width), mode="area")
         coc_px = functional.interpolate(self.coc_px, (height, width), mode="nearest")  # no radii between two surfaces
         return dataclasses.replace(self, image=image, coc_px=coc_px * (width / self.image.shape[-1]))
@@ -123,23 +123,23 @@ def measure(
         raise RuntimeError(f"{scene.name}: the picture is not finite")
     row = {"new_ms": 1e3 * new.wall, "spread_ms": 0.0, "cpu_ms": 1e3 * new.cpu}
     if again:
-        same = timed(blur, scene.image, scene.coc_px)[1]
-        row |= {"again_ms": 1e3 * same.wall, "over_again": new.cpu / same.cpu}
-    reference = timed(beside)[1]
-    return picture, row | {"beside_ms": 1e3 * reference.wall, "over_beside": new.cpu / reference.cpu}
+        repeat_time = timed(blur, scene.image, scene.coc_px)[1]
+        row |= {"again_ms": 1e3 * repeat_time.wall, "over_again": new.cpu / repeat_time.cpu}
+    reference_time = timed(beside)[1]
+    return picture, row | {"beside_ms": 1e3 * reference_time.wall, "over_beside": new.cpu / reference_time.cpu}
 
 
-def error(picture: Tensor, wanted: Tensor) -> dict[str, float]:
+def error(picture: Tensor, reference: Tensor) -> dict[str, float]:
     """Difference of two pictures as displayed: RMS of 255, PSNR in dB, SSIM."""
-    shown, right = metrics.display(picture), metrics.display(wanted)
-    rms = math.sqrt(float((shown.double() - right.double()).square().mean()))
-    return {"rms_255": 255 * rms, "psnr_db": metrics.psnr(shown, right), "ssim": metrics.ssim(shown, right)}
+    shown, truth = metrics.display(picture), metrics.display(reference)
+    rms = math.sqrt(float((shown.double() - truth.double()).square().mean()))
+    return {"rms_255": 255 * rms, "psnr_db": metrics.psnr(shown, truth), "ssim": metrics.ssim(shown, truth)}
 
 
 def peak_of(work: Callable[[], _Result]) -> tuple[_Result, float]:
     """Result of a call, and the growth of resident memory in MiB; frees unused memory first."""
-    held_mb = memory.reset_peak()
-    return work(), memory.peak_mb() - held_mb
+    start_mb = memory.reset_peak()
+    return work(), memory.peak_mb() - start_mb
 
 
 def shipped(height: int = 540, width: int = 960) -> BenchScene:
@@ -150,8 +150,8 @@ def shipped(height: int = 540, width: int = 960) -> BenchScene:
         torch.Size([1, 3, 54, 96])
     """
     y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in (height, width)), indexing="ij")
-    near = posts(width / 6, width / 40)(x, y)
-    light = torch.where(near, waves(2, (0.6, 0.3, 0.2))(x, y), waves(1)(x, y)).float()[None]
-    nearness = torch.where(near, 1.0 + 0.1 * x / width, 0.1 + 0.9 * y / height).float()[None, None]
+    is_post = posts(width / 6, width / 40)(x, y)
+    light = torch.where(is_post, waves(2, (0.6, 0.3, 0.2))(x, y), waves(1)(x, y)).float()[None]
+    nearness = torch.where(is_post, 1.0 + 0.1 * x / width, 0.1 + 0.9 * y / height).float()[None, None]
     coc_px = (0.6 - nearness) * (width / 60 / 0.5)  # equally blurred at the far end and at the posts
     return BenchScene("slope with posts", light, coc_px, "a thin lens focused at 1.67 m")

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from ..io.atomic import whole_file
+from ..io.atomic import atomic_file
 from ..io.columns import print_columns
 
 __all__ = ["LEGEND", "Row", "publish", "summary"]
@@ -45,13 +45,13 @@ def summary(rows: Sequence[Row], keys: Sequence[str], mean: Callable[[list[float
         for name, value in row.items():
             if isinstance(value, float) and name not in keys:
                 columns.setdefault(name, []).append(value)
-    found: list[dict[str, Any]] = []
+    summaries: list[dict[str, Any]] = []
     for values, columns in groups.items():
-        found.append(dict(zip(keys, values, strict=True)) | {name: mean(of) for name, of in columns.items()})
+        summaries.append(dict(zip(keys, values, strict=True)) | {name: mean(v) for name, v in columns.items()})
         if len(columns.get("new_ms", ())) > 1:
             low, _, high = statistics.quantiles(columns["new_ms"], n=4, method="inclusive")
-            found[-1]["spread_ms"] = high - low
-    return found
+            summaries[-1]["spread_ms"] = high - low
+    return summaries
 
 
 def publish(
@@ -83,25 +83,25 @@ def publish(
     console = Console(quiet=quiet)
     text = [f"# {title}", machine, LEGEND, *remarks]
     for number, (name, rows) in enumerate(tables.items()):
-        head = list(dict.fromkeys(column for row in rows for column in row))
-        body = [[_cell(row.get(column, "")) for column in head] for row in rows]
+        columns = list(dict.fromkeys(column for row in rows for column in row))
+        cells = [[_cell(row.get(column, "")) for column in columns] for row in rows]
         if number == 0:
-            words = [column for column in head if isinstance(rows[0].get(column), str)]
-            print_columns(console, name, dict(zip(head, zip(*body, strict=True), strict=True)), words)
-        lines = ["| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body)]
+            text_columns = [column for column in columns if isinstance(rows[0].get(column), str)]
+            print_columns(console, name, dict(zip(columns, zip(*cells, strict=True), strict=True)), text_columns)
+        lines = ["| " + " | ".join(line) + " |" for line in (columns, ["---"] * len(columns), *cells)]
         text.append(f"## {name}\n\n" + "\n".join(lines))
     console.print(*text[1 : 3 + len(remarks)], sep="\n", markup=False, highlight=False)
     if stem is None:
         return
     numbers = io.StringIO()
-    writer = csv.DictWriter(numbers, head, lineterminator="\n")
+    writer = csv.DictWriter(numbers, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows({name: f"{v:.6g}" if isinstance(v, float) else v for name, v in row.items()} for row in rows)
     with contextlib.ExitStack() as files:
         if picture is not None:
-            picture(files.enter_context(whole_file(stem.with_suffix(".png"))))
+            picture(files.enter_context(atomic_file(stem.with_suffix(".png"))))
         for suffix, content in ((".csv", numbers.getvalue()), (".md", "\n\n".join(text) + "\n")):
-            files.enter_context(whole_file(stem.with_suffix(suffix))).write_text(content, encoding="utf-8")
+            files.enter_context(atomic_file(stem.with_suffix(suffix))).write_text(content, encoding="utf-8")
 
 
 def _cell(value: object) -> str:

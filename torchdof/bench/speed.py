@@ -25,10 +25,10 @@ __all__ = ["Runtime", "compare", "report", "works"]
 
 Runtime = Literal["compiled", "onnxruntime"]
 
-_LEVELS = (8.0, 4.0, 2.0, 1.0, 0.5, 0.0)  # tolerances, in 1/255
+_TOLERANCES = (8.0, 4.0, 2.0, 1.0, 0.5, 0.0)  # tolerances, in 1/255
 _RADII_PX, _SIZES = (4.0, 8.0, 16.0, 32.0, 64.0), (0.25, 0.5)
 _FOLD_PX = 128  # width for the literal scatter, which takes k * k columns for each pixel
-_ROUNDING = 1e-6
+_ROUNDING = 1e-6  # RMS error, of 1, by which rounding may exceed the tolerance
 
 
 def works(
@@ -43,26 +43,26 @@ def works(
     blur = functools.partial(blur_by_coc, table=scene.table, occlusion=occlusion)
     small = scene.resized(min(1.0, _FOLD_PX / scene.image.shape[-1]))
     height, width = scene.image.shape[-2:]
-    looking = functools.partial(blur, attention=(width / 2, height / 2, height / 8))
-    ways: list[tuple[str, float, Renderer, BenchScene]] = [
-        *((f"{n:g}/255" if n else "exact", n, functools.partial(blur, tolerance=n / 255), scene) for n in _LEVELS),
+    with_attention = functools.partial(blur, attention=(width / 2, height / 2, height / 8))
+    settings: list[tuple[str, float, Renderer, BenchScene]] = [
+        *((f"{n:g}/255" if n else "exact", n, functools.partial(blur, tolerance=n / 255), scene) for n in _TOLERANCES),
         *((f"{runtime} 1/255", 1, _prepared(runtime, scene, occlusion), scene) for runtime in runtimes),
         ("focus pull 1/255", 1, blur, scene),
         ("fresh process 1/255", 1, functools.partial(_in_a_fresh_process, blur), scene),
-        ("looked at 1/255, else 8/255", 8, looking, scene),
+        ("looked at 1/255, else 8/255", 8, with_attention, scene),
         ("small frame 1/255", 1, blur, small),
         ("small frame fold 1/255", 1, functools.partial(blur, method="fold"), small),
         *((f"{px:g} px 1/255", 1, blur, scene.seen(0.0, px)) for px in _RADII_PX * scan),
         *((f"{share:g} of the frame 1/255", 1, blur, scene.resized(share)) for share in _SIZES * scan),
     ]
-    for name, level, render, seen in ways:
+    for name, tolerance, render, view in settings:
         setting = name + " without occlusion" * (not occlusion)
-        frame = f"{seen.image.shape[-1]} x {seen.image.shape[-2]}"
-        facts = {"setting": setting, "tolerance": level / 255, "frame": frame}
-        for camera in seen.pull(repeat) if name.startswith("focus pull") else seen.cameras(repeat, 0.7, setting):
-            yield facts, render, camera, False
-        if seen in (scene, small):
-            yield facts, render, seen, True
+        frame = f"{view.image.shape[-1]} x {view.image.shape[-2]}"
+        columns = {"setting": setting, "tolerance": tolerance / 255, "frame": frame}
+        for camera in view.pull(repeat) if name.startswith("focus pull") else view.cameras(repeat, 0.7, setting):
+            yield columns, render, camera, False
+        if view in (scene, small):
+            yield columns, render, view, True
 
 
 def _prepared(runtime: Runtime, scene: BenchScene, occlusion: bool) -> Renderer:
@@ -108,21 +108,21 @@ def compare(
         ValueError: If ``repeat`` is not a positive number.
     """
     whole("--repeat", repeat, 1, 10000)
-    silent, rows = console is None or not console.is_terminal, []
+    hidden, rows = console is None or not console.is_terminal, []
     with torch.no_grad():
         for occlusion in (True, False):
             dense = functools.partial(blur_by_coc, table=scene.table, occlusion=occlusion, tolerance=0.0)
             exact = functools.cache(lambda camera, dense=dense: dense(camera.image, camera.coc_px))
-            todo = list(works(scene, occlusion, repeat, runtimes, scan))
-            for facts, blur, camera, is_own in track(todo, "", console=console, transient=True, disable=silent):
-                if is_own:
+            cases = list(works(scene, occlusion, repeat, runtimes, scan))
+            for columns, blur, camera, is_error in track(cases, "", console=console, transient=True, disable=hidden):
+                if is_error:
                     (picture, _), peak_mb = peak_of(functools.partial(timed, blur, camera.image, camera.coc_px))
-                    rows.append({**facts, "peak_mb": peak_mb, **error(picture, exact(camera))})
+                    rows.append({**columns, "peak_mb": peak_mb, **error(picture, exact(camera))})
                 else:
-                    again = not facts["setting"].startswith("fresh process")
-                    rows.append(facts | measure(blur, camera, again=again)[1])
-    found = summary(rows, ["setting", "tolerance", "frame"], statistics.median)
-    return [{**row, "kept": row.get("rms_255", 0.0) <= 255 * (row["tolerance"] + _ROUNDING)} for row in found]
+                    repeat_camera = not columns["setting"].startswith("fresh process")
+                    rows.append(columns | measure(blur, camera, again=repeat_camera)[1])
+    summaries = summary(rows, ["setting", "tolerance", "frame"], statistics.median)
+    return [{**row, "kept": row.get("rms_255", 0.0) <= 255 * (row["tolerance"] + _ROUNDING)} for row in summaries]
 
 
 def report(rows: Sequence[Row], scene: BenchScene, out: Path | None, quiet: bool = False) -> None:
@@ -134,11 +134,11 @@ def report(rows: Sequence[Row], scene: BenchScene, out: Path | None, quiet: bool
     """
     low, high = float(scene.coc_px.min()), float(scene.coc_px.max())
     title = f"{scene.name}, blur radius {low:.1f} to {high:.1f} px, {scene.table!r}"
-    broken = "; ".join(row["setting"] for row in rows if not row["kept"])
+    exceeded = "; ".join(row["setting"] for row in rows if not row["kept"])
     remarks = [
         f"{scene.remark}. A focus pull is a sequence; a fresh process renders its first picture. kept: the RMS error "
         "against the exact rendering with the same occlusion is within the tolerance.",
-        f"**The tolerance was not kept by: {broken}.**" if broken else "Every tolerance was kept.",
+        f"**The tolerance was not kept by: {exceeded}.**" if exceeded else "Every tolerance was kept.",
     ]
     draw = functools.partial(_plot, rows=rows, title=title)
     publish("Speed against error", {title: rows}, remarks, out and out / "speed", draw, quiet)

@@ -10,7 +10,7 @@ import click
 
 from .command import argument, option
 from .options import Blur, check_files, json_option
-from .printed import Once, json_line
+from .output import Notices, json_line
 from .scene import Scene
 
 
@@ -37,7 +37,7 @@ class _Accuracy:
         type=click.IntRange(min=1),
     )
     degrade: bool = option(
-        "Instead, what depth costs that is soft, displaced, too coarse or noisy; writes degraded.csv and .md.", False
+        "Instead, measure the cost of soft, displaced, coarse or noisy depth; writes degraded.csv and .md.", False
     )
     peer: tuple[Path, ...] = option("A Python file with another renderer, blur(image, coc_px); may be repeated.", ())
 
@@ -108,7 +108,7 @@ class Bench:
 
     def _measure_speed(self) -> None:
         """Checks the options, and measures speed against error on the user's scene or on the built-in one."""
-        said, lens = self.speed, self.scene.lens
+        options, lens = self.speed, self.scene.lens
         if self.accuracy != _Accuracy():
             raise ValueError("--views, --degrade and --peer compare with a truth; name its folder with --truth")
         if self.image is None and self.scene != Scene():
@@ -116,10 +116,10 @@ class Bench:
         lens.refuse_keyframes()
         if self.image is not None:
             check_files(self.image, self.depth, None)
-        for package, is_needed in {"matplotlib": self.out is not None, "onnxruntime": said.onnx}.items():
+        for package, is_needed in {"matplotlib": self.out is not None, "onnxruntime": options.onnx}.items():
             if is_needed and importlib.util.find_spec(package) is None:  # check before measuring for minutes
                 raise ModuleNotFoundError(f"no {package}", name=package)
-        if said.compiled and not any(map(shutil.which, (os.environ.get("CXX", ""), "g++", "clang++", "c++"))):
+        if options.compiled and not any(map(shutil.which, (os.environ.get("CXX", ""), "g++", "clang++", "c++"))):
             raise FileNotFoundError(
                 "torch.compile needs a C++ compiler, and none was found; install g++ or leave --compile out"
             )
@@ -130,24 +130,24 @@ class Bench:
         from ..tensors import TRACEABLE
         from .frame import coc_of, read_frame
 
-        if said.compiled and not TRACEABLE:
+        if options.compiled and not TRACEABLE:
             raise ValueError("torch.compile needs PyTorch 2.13 or newer here; leave --compile out")
         table = self.blur.table_of(self.blur.table)
-        if (said.onnx or said.compiled) and table.depends_on_place:
+        if (options.onnx or options.compiled) and table.depends_on_place:
             raise ValueError("compiled and exported graphs have one kernel a layer; leave --onnx and --compile out")
         if self.image is None:
             scene = dataclasses.replace(shipped(), table=table)
         else:
             frame = read_frame(self.image, self.depth, self.scene)
-            coc_px, camera, remarks = coc_of(frame, Once(self.scene.depth_map.strict))
+            coc_px, camera, remarks = coc_of(frame, Notices(self.scene.depth_map.strict))
             remarks = ["focus as stated"] * lens.has_focus + remarks + [f"depth {frame.guess}"] * bool(frame.guess)
-            words = "blur as given" if camera is None else f"{camera!r}; {', '.join(remarks)}"
-            scene = BenchScene(self.image.name, frame.picture.light, coc_px, words, table)
+            remark = "blur as given" if camera is None else f"{camera!r}; {', '.join(remarks)}"
+            scene = BenchScene(self.image.name, frame.picture.light, coc_px, remark, table)
         if self.out is not None:
             self.out.mkdir(parents=True, exist_ok=True)
-        chosen: dict[speed.Runtime, bool] = {"onnxruntime": said.onnx, "compiled": said.compiled}
+        chosen: dict[speed.Runtime, bool] = {"onnxruntime": options.onnx, "compiled": options.compiled}
         runtimes = [runtime for runtime, is_chosen in chosen.items() if is_chosen]
-        rows = speed.compare(scene, said.repeat, Console(stderr=True), runtimes, said.scan)
+        rows = speed.compare(scene, options.repeat, Console(stderr=True), runtimes, options.scan)
         if self.as_json:
             facts = {"scene": scene.name, "remark": scene.remark, "table": repr(scene.table)}
             click.echo(json_line({**facts, "settings": rows}))

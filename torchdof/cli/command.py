@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import click
 
-_BASIC = "Options"  # heading of the options that --help lists first
+_BASIC_HEADING = "Options"  # heading of the options that --help lists first
 
 
 def option(
@@ -42,8 +42,8 @@ def option(
     details["help"] = help
     if read is not None:
         details |= {"type": str, "callback": lambda _, __, text: None if text is None else read(text)}
-    facts = {"names": names, "group": _BASIC if basic else group, "details": details}
-    return dataclasses.field(**({} if default is ... else {"default": default}), metadata=facts)
+    metadata = {"names": names, "group": _BASIC_HEADING if basic else group, "details": details}
+    return dataclasses.field(**({} if default is ... else {"default": default}), metadata=metadata)
 
 
 def argument(help: str, metavar: str, default: Any = ...) -> Any:
@@ -83,7 +83,7 @@ def by_option(names: Mapping[str, str]) -> Iterator[None]:
         yield
     except ValueError as error:
         pattern = re.compile(r"\b(" + "|".join(names) + r")\b")
-        raise ValueError(pattern.sub(lambda found: names[found.group()], str(error))) from None
+        raise ValueError(pattern.sub(lambda match: names[match.group()], str(error))) from None
 
 
 class _Command(click.Command):
@@ -92,26 +92,26 @@ class _Command(click.Command):
     groups: dict[str | None, str]  # name of a parameter -> heading
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        shown: dict[str, list[tuple[str, str]]] = {_BASIC: []}
+        rows_by_group: dict[str, list[tuple[str, str]]] = {_BASIC_HEADING: []}
         for parameter in self.get_params(ctx):
             row = parameter.get_help_record(ctx)
             if row is not None and not isinstance(parameter, click.Argument):
-                shown.setdefault(self.groups.get(parameter.name, _BASIC), []).append(row)
-        for group, rows in shown.items():
+                rows_by_group.setdefault(self.groups.get(parameter.name, _BASIC_HEADING), []).append(row)
+        for group, rows in rows_by_group.items():
             with formatter.section(group):
                 formatter.write_dl(rows, col_max=28)
 
 
 def command_of(name: str, kind: type[Any]) -> click.Command:
     """The command that makes a ``kind`` of its arguments and runs it; the docstring of ``kind`` is the help."""
-    parameters, told = list(_parameters(kind, _BASIC)), inspect.getdoc(kind) or ""
+    parameters, help_text = list(_parameters(kind, _BASIC_HEADING)), inspect.getdoc(kind) or ""
     command = _Command(
         name,
         params=[parameter for parameter, _ in parameters],
-        help=told,
-        short_help=" ".join(told.partition("\n\n")[0].split()),
+        help=help_text,
+        short_help=" ".join(help_text.partition("\n\n")[0].split()),
         no_args_is_help=any(parameter.required for parameter, _ in parameters),
-        callback=lambda **values: _made(kind, values).run(),
+        callback=lambda **values: _instance(kind, values).run(),
         context_settings={"max_content_width": 120},
     )
     command.groups = {parameter.name: group for parameter, group in parameters}
@@ -147,23 +147,23 @@ def _parameter(field: Any, hint: Any) -> click.Parameter:
     """Argument or option for a field of type ``hint``; a tuple without a ``read`` of its own takes several values."""
     details = dict(field.metadata["details"])
     required = field.default is dataclasses.MISSING
-    several = typing.get_origin(hint) is tuple and "callback" not in details
+    takes_several = typing.get_origin(hint) is tuple and "callback" not in details
     if typing.get_args(hint) and typing.get_origin(hint) is not Literal:  # X | None, tuple[X, ...]
         hint = typing.get_args(hint)[0]
     details.setdefault("type", click.Choice(typing.get_args(hint)) if typing.get_origin(hint) is Literal else hint)
     if not required and field.default not in (None, ()):
         details["default"] = field.default
     if field.metadata["names"] == ("argument",):
-        return click.Argument([field.name], nargs=-1 if several else 1, required=required, **details)
+        return click.Argument([field.name], nargs=-1 if takes_several else 1, required=required, **details)
     if hint is bool:
         details["is_flag"] = True
     else:
-        details |= {"multiple": several, "show_default": bool(field.default) and not required}
+        details |= {"multiple": takes_several, "show_default": bool(field.default) and not required}
     return click.Option([field.name, *_spellings(field)], required=required, **details)
 
 
-def _made(kind: type[Any], values: dict[str, Any]) -> Any:
+def _instance(kind: type[Any], values: dict[str, Any]) -> Any:
     """Creates an object of ``kind`` with its groups; ``values`` has the values of all their fields by name."""
     hints: dict[str, Any] = {field.name: typing.get_type_hints(kind)[field.name] for field in dataclasses.fields(kind)}
     groups: dict[str, Any] = {name: hint for name, hint in hints.items() if dataclasses.is_dataclass(hint)}
-    return kind(**{name: _made(groups[name], values) if name in groups else values[name] for name in hints})
+    return kind(**{name: _instance(groups[name], values) if name in groups else values[name] for name in hints})

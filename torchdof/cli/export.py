@@ -9,7 +9,7 @@ from typing import Any, Literal
 from .command import option
 from .lens import Sensor
 from .options import Accuracy, Blur, json_option
-from .printed import Bar, tell
+from .output import Bar, print_result
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,7 @@ class Export:
     """
 
     out: Path | None = option("The file to write.", names=("--out", "-o"))
-    show: Path | None = option("Write nothing; print what this file says about itself.", metavar="FILE")
+    show: Path | None = option("Write nothing; print the metadata of this file.", metavar="FILE")
     sensor: Sensor
     blur: Blur
     max_coc: float = option("Largest radius in pixels that the file holds.", 32.0, basic=True)
@@ -61,8 +61,8 @@ class Export:
         if self.show is not None:
             from torchdof.export.metadata import describe
 
-            described = describe(self.show)
-            tell(self.as_json, described, _lines(described))
+            metadata = describe(self.show)
+            print_result(self.as_json, metadata, _lines(metadata))
         elif self.out is not None:
             self._write(self.out)
 
@@ -82,7 +82,7 @@ class Export:
         with Bar("tracing") as bar:
             graph = dataclasses.asdict(self.graph)
             report = to_onnx(dof, out, **graph, depth_edges=dof.options.depth_edges, progress=bar.update)
-        tell(self.as_json, {"out": str(out), **dataclasses.asdict(report)}, f"{report}\nwrote {out}")
+        print_result(self.as_json, {"out": str(out), **dataclasses.asdict(report)}, f"{report}\nwrote {out}")
 
 
 def _lines(facts: Mapping[str, Any], indent: str = "") -> str:

@@ -14,7 +14,7 @@ from torchdof.cli.command import argument, numbers, option
 from torchdof.cli.options import json_option
 
 _micrometres = numbers(None, "--wavelengths takes rgb, or micrometres like 0.65,0.55,0.45")
-_WANTED = "--field takes distances in mm from the middle of the frame, rising from 0, like 0,7,14,21.6"
+_FIELD_EXPECTED = "--field takes distances in mm from the middle of the frame, rising from 0, like 0,7,14,21.6"
 
 
 def _wavelengths(text: str) -> tuple[float, ...]:
@@ -24,9 +24,9 @@ def _wavelengths(text: str) -> tuple[float, ...]:
 
 def _radii(text: str) -> tuple[float, ...]:
     """Reads distances in mm from the middle of the frame, rising from 0."""
-    radii_mm = numbers(None, _WANTED)(text)
+    radii_mm = numbers(None, _FIELD_EXPECTED)(text)
     if len(radii_mm) < 2 or radii_mm[0] != 0 or not all(low < high < math.inf for low, high in pairwise(radii_mm)):
-        raise ValueError(f"{_WANTED}, got {text!r}")
+        raise ValueError(f"{_FIELD_EXPECTED}, got {text!r}")
     return radii_mm
 
 
@@ -116,7 +116,7 @@ class Fit:
 
     def run(self) -> None:
         """Checks the options, then makes the table, or writes the target to print."""
-        lens, target, said = self.lens.lens, self.target.target, self.lens
+        lens, target, lens_options = self.lens.lens, self.target.target, self.lens
         if target is not None and (self.captures is not None or lens is not None):
             raise ValueError("--target writes the page to print; give it alone, and the photographs afterwards")
         if target is None and (self.captures is None) == (lens is None):
@@ -125,19 +125,19 @@ class Fit:
             raise ValueError("--root is the folder of photographs; leave it out with --lens")
         if self.out.suffix != ".json":
             raise ValueError(f"{self.out}: the table is written as JSON: name it {self.out.with_suffix('.json')}")
-        if lens is not None and not 0 <= said.field_deg < 90:
-            raise ValueError(f"--field-deg must be 0 to 90 degrees from the axis, got {said.field_deg:g}")
-        if lens is not None and said.field is not None and said.field_deg:
+        if lens is not None and not 0 <= lens_options.field_deg < 90:
+            raise ValueError(f"--field-deg must be 0 to 90 degrees from the axis, got {lens_options.field_deg:g}")
+        if lens is not None and lens_options.field is not None and lens_options.field_deg:
             raise ValueError("--field-deg averages one place, --field traces several; give one of them")
         if target is not None:
             from torchdof.fit.photo.target import write_target
 
             write_target(target, self.target.paper)
             if not self.as_json:
-                told = "print it at 100 %, photograph it as it says, then: torchdof fit FOLDER -o table.json"
-                click.echo(f"{target}: {told}")
+                advice = "print it at 100 %, photograph it as it says, then: torchdof fit FOLDER -o table.json"
+                click.echo(f"{target}: {advice}")
             return
-        from torchdof.cli.fitted import fit_photographs, trace_lens
+        from torchdof.cli.fit_tables import fit_photographs, trace_lens
 
         if self.plots is not None:
             self.plots.mkdir(parents=True, exist_ok=True)

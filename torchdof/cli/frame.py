@@ -26,13 +26,13 @@ from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect, stretch
 from .options import make_folder_of
-from .printed import Bar, Once, tell
+from .output import Bar, Notices, print_result
 from .scene import Scene
 
 if TYPE_CHECKING:
     from .render import Render
 
-_HARDLY_PX = 2.0  # px; a note advises more blur if the largest radius is below
+_VISIBLE_PX = 2.0  # px; a note advises more blur if the largest radius is below
 _LARGE_PX = 8_000_000  # pixels of an image; the bar shows the expected time of larger ones
 _STRIPS = 16  # number of strips of an image, of which one is timed
 _PANEL_PX = 800  # px; longer side of a panel on a sheet
@@ -64,62 +64,66 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
     if ``holes`` is true; otherwise they are filled as the guess proposes, or raise ``ValueError``.
     """
     start, source, guess = time.perf_counter(), depth or image, ""
-    picture, said = read_image(image, **encoding), scene.depth_map
+    picture, depth_map = read_image(image, **encoding), scene.depth_map
     height, width = picture.pixels.shape[-2:]
-    if depth is not None or said.depth_channel is not None:
-        values = read_values(source, said.depth_channel)
+    if depth is not None or depth_map.depth_channel is not None:
+        values = read_values(source, depth_map.depth_channel)
     elif picture.depth is not None:
         values = picture.depth
     else:
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH")
-    fill: Any = said.fill_depth
-    if said.depth_kind == "auto":
-        said, guess = said.guessed(values, source, scene.lens.speaks_of_metres)
-        fill = fill if holes else said.fill_depth
-    kind: Any = said.depth_kind
+    fill: Any = depth_map.fill_depth
+    if depth_map.depth_kind == "auto":
+        depth_map, guess = depth_map.guessed(values, source, scene.lens.states_metres)
+        fill = fill if holes else depth_map.fill_depth
+    kind: Any = depth_map.depth_kind
     if kind == "coc" and values.shape[-2:] != (height, width):
         rows, columns = values.shape[-2:]
-        told = f"coc is {columns} x {rows} pixels but the image is {width} x {height}; they must be the same"
-        raise ValueError(f"{source}: {told}")
+        problem = f"coc is {columns} x {rows} pixels but the image is {width} x {height}; they must be the same"
+        raise ValueError(f"{source}: {problem}")
     view_deg = scene.lens.view_deg(picture.metadata, width, height) if kind == "distance" else None
-    unknown, filled = said.depth_unknown, 0
+    unknown, filled = depth_map.depth_unknown, 0
     try:
         same_aspect(picture.pixels, values)
         stretched = stretch(picture.pixels, values)
         if kind == "relative":
-            of_relative: Any = said.relative_kind or "disparity"
-            values = from_relative(values, *said.ends_m, of_relative, value_range=said.value_range, unknown=unknown)
+            value_kind: Any = depth_map.relative_kind or "disparity"
+            values = from_relative(
+                values, *depth_map.ends_m, value_kind, value_range=depth_map.value_range, unknown=unknown
+            )
         else:
-            scaled: dict[str, Any] = {"scale": said.depth_scale, "offset": said.depth_offset}
-            values = depth_from_values(values, kind, **scaled, unknown=unknown, fov_x_deg=view_deg)
+            conversion: dict[str, Any] = {"scale": depth_map.depth_scale, "offset": depth_map.depth_offset}
+            values = depth_from_values(values, kind, **conversion, unknown=unknown, fov_x_deg=view_deg)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
     values = values if kind == "coc" else at_size_of(picture.pixels, values)
     if fill is not None or not holes:
         values, filled = resolve_holes(values, str(source), fill, kind == "relative")
     remarks = [f"depth stretched by {stretched:.1%}"] if stretched else []
-    if kind == "relative" and None in (said.near_m, said.far_m):
-        remarks.append("depth from {:g} to {:g} m assumed".format(*said.ends_m))
-    scene = dataclasses.replace(scene, depth_map=dataclasses.replace(said, fill_depth=fill))
+    if kind == "relative" and None in (depth_map.near_m, depth_map.far_m):
+        remarks.append("depth from {:g} to {:g} m assumed".format(*depth_map.ends_m))
+    scene = dataclasses.replace(scene, depth_map=dataclasses.replace(depth_map, fill_depth=fill))
     return Frame(str(source), scene, picture, values, filled, remarks, guess, time.perf_counter() - start)
 
 
-def coc_of(frame: Frame, once: Once, number: int = 0, is_still: bool = True) -> tuple[Tensor, Camera | None, list[str]]:
+def coc_of(
+    frame: Frame, notices: Notices, number: int = 0, is_still: bool = True
+) -> tuple[Tensor, Camera | None, list[str]]:
     """Signed radius ``[1, 1, H, W]`` in pixels, the camera (None for ``--depth-kind coc``), and remarks on both.
 
     ``number`` is the frame number, at which the focus is interpolated between keyframes.
 
     Raises:
-        ValueError: If the lens is impossible, or a mistake is likely and ``once`` is strict.
+        ValueError: If the lens is impossible, or a mistake is likely and ``notices`` is strict.
     """
-    said, lens, values = frame.scene.depth_map, frame.scene.lens, frame.values
-    if said.depth_kind == "coc":
-        once.warn(frame.name, coc_mistakes(values))
+    depth_map, lens, values = frame.scene.depth_map, frame.scene.lens, frame.values
+    if depth_map.depth_kind == "coc":
+        notices.warn(frame.name, coc_mistakes(values))
         return values, None, []
-    camera, remarks = lens.camera(frame.picture.metadata, values, number, is_still, said.is_to_scale)
+    camera, remarks = lens.camera(frame.picture.metadata, values, number, is_still, depth_map.is_to_scale)
     coc_px = camera.coc_px(values, values.shape[-1])
     coc_of_lens(coc_px, values, lens.stated(camera))
-    once.warn(frame.name, frame.mistakes(camera))
+    notices.warn(frame.name, frame.mistakes(camera))
     return coc_px, camera, remarks + frame.remarks
 
 
@@ -147,7 +151,7 @@ class Renderer:
     def __init__(self, command: "Render", scene: Scene, is_still: bool) -> None:
         self.command, self.scene, self.is_still = command, scene, is_still
         self.table, self.device = command.blur.table_of(command.blur.table), _device(command.device)
-        self.once = Once(scene.depth_map.strict)
+        self.notices = Notices(scene.depth_map.strict)
 
     def read(self, image: Path, depth: Path | None) -> Frame:
         """Reads a frame as :func:`read_frame`, with the transfer curve and layer of the options."""
@@ -158,7 +162,7 @@ class Renderer:
         """Renders a frame; ``bar`` shows the expected time of a large one. Raises as :func:`coc_of`."""
         start, picture, command = time.perf_counter(), frame.picture, self.command
         frame = dataclasses.replace(frame, values=frame.values.to(self.device))
-        coc_px, camera, remarks = coc_of(frame, self.once, number, self.is_still)
+        coc_px, camera, remarks = coc_of(frame, self.notices, number, self.is_still)
         pixels = picture.pixels.to(self.device)
         if command.show_focus:
             pixels = tint_focus(pixels, coc_px, picture.has_alpha)
@@ -187,19 +191,19 @@ class Renderer:
             write_sheet(files.sheet, _panels(rendered))
         largest_px = float(rendered.coc_px.abs().max())
         if frame.guess:
-            self.once.note("guess", f"{frame.name}: {frame.guess}")
-        if rendered.camera is not None and largest_px < _HARDLY_PX:
-            self.once.note("little blur", f"{out}: {frame.scene.lens.more_blur(largest_px, self.is_still)}")
-        words, facts = self._told(rendered.camera, largest_px, frame)
+            self.notices.note("guess", f"{frame.name}: {frame.guess}")
+        if rendered.camera is not None and largest_px < _VISIBLE_PX:
+            self.notices.note("little blur", f"{out}: {frame.scene.lens.blur_advice(largest_px, self.is_still)}")
+        words, facts = self._summary(rendered.camera, largest_px, frame)
         height, width = rendered.picture.pixels.shape[-2:]
         seconds = rendered.seconds + time.perf_counter() - start
         words += [] if files.sheet is None else [f"sheet {files.sheet}"]
         words += [f"{width} x {height}", f"{seconds:.2f} s on {self.device}"]
         remarks = f" [{', '.join(rendered.remarks)}]" if rendered.remarks else ""
         facts = {"out": str(out), **facts, "assumed": rendered.remarks, "width": width, "height": height}
-        tell(self.command.as_json, facts | {"seconds": seconds}, f"{out}: {'; '.join(words)}{remarks}")
+        print_result(self.command.as_json, facts | {"seconds": seconds}, f"{out}: {'; '.join(words)}{remarks}")
 
-    def _told(self, camera: Camera | None, largest_px: float, frame: Frame) -> tuple[list[str], dict[str, Any]]:
+    def _summary(self, camera: Camera | None, largest_px: float, frame: Frame) -> tuple[list[str], dict[str, Any]]:
         """Parts of the printed line about a frame, and the same as data for JSON."""
         command, table, words = self.command, self.table, list[str]()
         facts: dict[str, Any] = {"camera": camera and facts_of_camera(camera)}

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from .command import argument, option
 from .options import check_files, json_option, make_folder_of
-from .printed import Once, tell
+from .output import Notices, print_result
 from .scene import Scene
 
 
@@ -41,11 +41,11 @@ class Inspect:
         from .frame import facts_of_camera, read_frame
 
         frame = read_frame(self.image, self.depth, self.scene, holes=True)
-        said = frame.scene.depth_map
+        depth_map = frame.scene.depth_map
         light, metres = frame.picture.light, frame.values
         if not bool((metres > 0).any()):
             raise ValueError(f"{frame.name}: no pixel has a depth; check the kind, scale and offset of the depth map")
-        camera, notes = frame.scene.lens.camera(frame.picture.metadata, metres, is_to_scale=said.is_to_scale)
+        camera, notes = frame.scene.lens.camera(frame.picture.metadata, metres, is_to_scale=depth_map.is_to_scale)
         notes += frame.remarks
         report = inspect_depth(light, metres, camera)
         make_folder_of(target)
@@ -55,12 +55,12 @@ class Inspect:
         lines += [f"camera        {camera!r}" + (f" [{', '.join(notes)}]" if notes else ""), str(report)]
         if frame.filled:
             share = 100 * frame.filled / metres.numel()
-            lines.append(f"filled        {frame.filled} holes ({share:.1f} %), {said.fill_depth}")
+            lines.append(f"filled        {frame.filled} holes ({share:.1f} %), {depth_map.fill_depth}")
         lines.append(f"picture       {target}")
         facts = {"image": str(self.image), "width": width, "height": height, "camera": facts_of_camera(camera)}
         facts |= {"assumed": notes, **report.facts(), "filled_px": frame.filled, "picture": str(target)}
-        tell(self.as_json, facts, "\n".join(lines))
-        once = Once(said.strict)
+        print_result(self.as_json, facts, "\n".join(lines))
+        notices = Notices(depth_map.strict)
         if frame.guess:
-            once.note("guess", f"{frame.name}: {frame.guess}")
-        once.warn(frame.name, frame.mistakes(camera))
+            notices.note("guess", f"{frame.name}: {frame.guess}")
+        notices.warn(frame.name, frame.mistakes(camera))

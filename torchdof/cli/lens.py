@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from ..io.metadata import camera_facts
+from ..io.metadata import camera_settings
 from ..io.sequence import focus_at_frame, parse_focus
 from .command import by_option, numbers, option, positive
 
@@ -18,20 +18,20 @@ if TYPE_CHECKING:
 
     from ..optics.camera import Camera
 
-_ASSUMED = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
-_WORDS = {"focal_length_mm": "focal length", "f_number": "f-number", "sensor_width_mm": "sensor width"}
+_DEFAULTS = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
+_LABELS = dict(zip(_DEFAULTS, ("focal length", "f-number", "sensor width"), strict=True))
 _WIDER = {  # option that sets the aperture -> how to open the lens wider
     "--f-number": "a smaller --f-number",
     "--aperture-radius-m": "a larger --aperture-radius-m",
     "--equivalent": "a smaller --equivalent f-number",
     "--blur": "a larger --blur",
 }
-_BLUR, _SEEN = 0.02, 0.005  # default largest blur radius, and the smallest that is visible, over the width
-_STRAY, _SAMPLES = 1000, 2**20  # one pixel in _STRAY is ignored as an outlier; most pixels examined
+_DEFAULT_BLUR, _VISIBLE_BLUR = 0.02, 0.005  # largest blur radius over the width: by default; the smallest visible one
+_PER_OUTLIER, _MAX_SAMPLES = 1000, 2**20  # one pixel in 1000 is ignored as an outlier; most pixels examined
 _SPELLED = {"focus_range_m": "--focus-range", "tilt_deg": "--tilt", "swing_deg": "--swing", "fov_x_deg": "--fov-deg"}
 
 
-def _share(text: str) -> float:
+def _width_fraction(text: str) -> float:
     """Reads a percentage of the width, as a fraction."""
     expected = "--blur expects a share of the picture's width, above 0 and at most 50 %, such as 2%"
     share = numbers(1, expected)(text.removesuffix("%"))[0] / 100
@@ -74,7 +74,7 @@ class Lens(Sensor):
         basic=True,
     )
     focus_at: tuple[float, float] | None = option(
-        "Focus on what is seen at this pixel, counted from the top left; in a sequence, anew in each frame. Default: "
+        "Focus on the surface at this pixel, counted from the top left; in a sequence, anew in each frame. Default: "
         "the focus that IMAGE's file states, else the subject nearest the middle.",
         metavar="X,Y",
         read=numbers(2, "--focus-at expects a pixel X,Y such as 320,200"),
@@ -89,11 +89,11 @@ class Lens(Sensor):
     swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)
     f_number: float | None = option("Smaller is blurrier.", callback=positive, basic=True)
     blur_share: float | None = option(
-        "Open the lens until what is blurred most, the nearest or the farthest, has a blur radius of this share of the "
-        "picture's width, such as 2%; instead of --f-number.",
+        "Open the lens until the largest blur radius, at the nearest or farthest depth, is this share of the picture's "
+        "width, such as 2%; instead of --f-number.",
         names=("--blur",),
         metavar="SHARE%",
-        read=_share,
+        read=_width_fraction,
         basic=True,
     )
     equivalent: tuple[float, float] | None = option(
@@ -105,11 +105,11 @@ class Lens(Sensor):
     aperture_radius_m: float | None = option("Radius of the opening, with --fov-deg.", callback=positive)
 
     def __post_init__(self) -> None:
-        places = {"--focus-m": self.focus_m, "--focus-at": self.focus_at, "--focus-range": self.focus_range}
-        views = {"--fov-deg": self.fov_deg, "--equivalent": self.equivalent}
-        real = self.focal_length_mm if self.focal_length_mm is not None else self.sensor_width_mm
-        _give_one(places, "both say where to focus")
-        _give_one(views | {"--focal-length-mm with --sensor-width-mm": real}, "say the same")
+        focus_options = {"--focus-m": self.focus_m, "--focus-at": self.focus_at, "--focus-range": self.focus_range}
+        lens_options = {"--fov-deg": self.fov_deg, "--equivalent": self.equivalent}
+        real_lens = self.focal_length_mm if self.focal_length_mm is not None else self.sensor_width_mm
+        _give_one(focus_options, "both say where to focus")
+        _give_one(lens_options | {"--focal-length-mm with --sensor-width-mm": real_lens}, "say the same")
         if self.fov_deg is None and self.aperture_radius_m is not None:
             raise ValueError("--aperture-radius-m goes with --fov-deg; a real lens has --f-number instead")
         _give_one(self._opening, "both say how wide the lens opens")
@@ -127,16 +127,16 @@ class Lens(Sensor):
         """Whether an option sets the focus."""
         return (self.focus_m, self.focus_at, self.focus_range) != (None, None, None)
 
-    def more_blur(self, largest_px: float, is_still: bool) -> str:
+    def blur_advice(self, largest_px: float, is_still: bool) -> str:
         """Advice for a largest blur radius that is hardly visible."""
         if largest_px == 0:
             return "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
-        wider = _WIDER[next(iter(self._opening), "--f-number")]
-        more = f", or --blur {_BLUR:.0%}" if is_still and self.blur_share is None else ""
-        return f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; {wider}{more} makes more of it"
+        hint = _WIDER[next(iter(self._opening), "--f-number")]
+        other = f", or --blur {_DEFAULT_BLUR:.0%}" if is_still and self.blur_share is None else ""
+        return f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; {hint}{other} makes more of it"
 
     @property
-    def speaks_of_metres(self) -> bool:
+    def states_metres(self) -> bool:
         """Whether an option states a length in metres."""
         return (self.focus_m, self.focus_range, self.aperture_radius_m) != (None, None, None)
 
@@ -147,19 +147,19 @@ class Lens(Sensor):
 
     def view_deg(self, metadata: Mapping[str, Any], width: int, height: int) -> float:
         """Horizontal field of view in degrees, as stated, or from focal length and sensor of options or file."""
-        known = camera_facts(metadata, width, height) | self._stated(width, height)
+        numbers = camera_settings(metadata, width, height) | self._stated(width, height)
         if self.fov_deg is not None:
             return self.fov_deg
-        if not {"focal_length_mm", "sensor_width_mm"} <= set(known):
+        if not {"focal_length_mm", "sensor_width_mm"} <= set(numbers):
             raise ValueError("--depth-kind distance needs --fov-deg, or --focal-length-mm and --sensor-width-mm")
-        return 2 * math.degrees(math.atan2(known["sensor_width_mm"], 2 * known["focal_length_mm"]))
+        return 2 * math.degrees(math.atan2(numbers["sensor_width_mm"], 2 * numbers["focal_length_mm"]))
 
     def _stated(self, width: int, height: int) -> dict[str, float]:
         """Numbers of the lens that the options state, for an image of a size in pixels."""
         if self.equivalent is not None:
             lens = (*self.equivalent, 36.0 * width / max(width, height))
-            return dict(zip(_ASSUMED, lens, strict=True))
-        return {name: value for name in _ASSUMED if (value := getattr(self, name)) is not None}
+            return dict(zip(_DEFAULTS, lens, strict=True))
+        return {name: value for name in _DEFAULTS if (value := getattr(self, name)) is not None}
 
     def camera(
         self,
@@ -172,7 +172,7 @@ class Lens(Sensor):
         """The camera of one picture, and remarks on the source of the numbers that no option states.
 
         1. Take the focus from the options, else from the file, else from the subject of a still.
-        2. Take the lens from the options, else from the file, else from ``_ASSUMED``.
+        2. Take the lens from the options, else from the file, else from ``_DEFAULTS``.
         3. Open the lens for the blur of ``--blur``, or for a visible blur in a still whose options leave it open.
 
         In a sequence nothing is guessed, because guesses would differ from frame to frame. Without ``is_to_scale`` the
@@ -181,7 +181,7 @@ class Lens(Sensor):
         from ..optics.camera import Camera
 
         height, width = depth.shape[-2:]
-        stated, in_file = self._stated(width, height), camera_facts(metadata, width, height)
+        stated, in_file = self._stated(width, height), camera_settings(metadata, width, height)
         remarks, focus_m = list[str](), math.inf
         if self.focus_m is not None:
             focus_m = focus_at_frame(self.focus_m, frame)
@@ -197,8 +197,8 @@ class Lens(Sensor):
             remarks.append("focus on what is nearest the middle")
         if self.fov_deg is not None and not self._opening:
             raise ValueError("--fov-deg needs the opening of the lens: --aperture-radius-m, --f-number or --blur")
-        lens: dict[str, Any] = {name: (_ASSUMED | in_file | stated)[name] for name in _ASSUMED}
-        sources = {name: "from the file" if name in in_file else "assumed" for name in _ASSUMED if name not in stated}
+        lens: dict[str, Any] = {name: (_DEFAULTS | in_file | stated)[name] for name in _DEFAULTS}
+        sources = {name: "from the file" if name in in_file else "assumed" for name in _DEFAULTS if name not in stated}
         with by_option(self._names()):
             if self.fov_deg is None:
                 camera = Camera(**lens, focus_m=focus_m)
@@ -209,21 +209,21 @@ class Lens(Sensor):
         camera = camera if self.focus_at is None else camera.focus_at(depth, *self.focus_at)
         share, is_open = self.blur_share, is_still and not self._opening and (self == Lens() or not is_to_scale)
         largest_px = self._largest_coc_px(camera, depth) if share is not None or is_open else 0.0
-        if is_open and not (is_to_scale and "f_number" in in_file and largest_px >= _SEEN * width):
-            share = _BLUR
+        if is_open and not (is_to_scale and "f_number" in in_file and largest_px >= _VISIBLE_BLUR * width):
+            share = _DEFAULT_BLUR
         if share is not None and largest_px > 0:
             camera = camera.replace(f_number=camera.f_number * largest_px / (share * width))
             sources["f_number"] = f"for a blur of {share:.0%} of the width" if is_open else ""
         if self.fov_deg is None:
-            remarks += [f"{_WORDS[name]} {source}" for name, source in sources.items() if source]
+            remarks += [f"{_LABELS[name]} {source}" for name, source in sources.items() if source]
         return camera, remarks
 
     def _largest_coc_px(self, camera: "Camera", depth: "Tensor") -> float:
         """Largest blur radius in pixels at all keyframes of the focus, without the largest thousandth of the pixels."""
         cameras = [camera.replace(focus_m=metres) for _, metres in self.focus_m or []] or [camera]
-        radii = [each.coc_px(depth, depth.shape[-1]).abs().nan_to_num(0.0).flatten() for each in cameras]
-        sampled = [radius[:: 1 + radius.numel() // _SAMPLES] for radius in radii]
-        return max(float(radius.kthvalue(radius.numel() - radius.numel() // _STRAY).values) for radius in sampled)
+        radii = [at_key.coc_px(depth, depth.shape[-1]).abs().nan_to_num(0.0).flatten() for at_key in cameras]
+        sampled = [radius[:: 1 + radius.numel() // _MAX_SAMPLES] for radius in radii]
+        return max(float(radius.kthvalue(radius.numel() - radius.numel() // _PER_OUTLIER).values) for radius in sampled)
 
     def stated(self, camera: "Camera") -> dict[str, Any]:
         """Option -> number of the camera, for messages."""
@@ -236,8 +236,8 @@ class Lens(Sensor):
 
     def _names(self) -> dict[str, str]:
         """Argument of :class:`Camera` -> its option, marked if that is not given; for messages."""
-        names = {name: f"--{name.replace('_', '-')}" for name in (*_ASSUMED, "aperture_radius_m")}
+        names = {name: f"--{name.replace('_', '-')}" for name in (*_DEFAULTS, "aperture_radius_m")}
         names = {name: option + ("" if getattr(self, name) else " (not given)") for name, option in names.items()}
         focus = "--focus-at" if self.focus_at else "--focus-range" if self.focus_range else "--focus-m"
         names["focus_m"] = focus + ("" if self.has_focus else " (not given)")
-        return _SPELLED | names | (dict.fromkeys(_ASSUMED, "--equivalent") if self.equivalent else {})
+        return _SPELLED | names | (dict.fromkeys(_DEFAULTS, "--equivalent") if self.equivalent else {})

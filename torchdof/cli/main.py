@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from ..io.atomic import unwound_on_termination
+from ..io.atomic import exit_on_signals
 from .command import command_of
 
 COMMANDS = ("render", "fit", "export", "bench", "inspect", "tables")
@@ -21,13 +21,13 @@ _EXTRAS = {
     **{"scipy": "fit", "threadpoolctl": "fit", "matplotlib": "plot"},
     **{"onnx": "export", "onnxscript": "export", "onnxruntime": "export"},
 }
-_TOO_LITTLE = "there is too little memory for this image; a smaller one, or a coarser --tolerance, takes less"
-# messages of PyTorch's RuntimeError when memory runs out on the CPU; they come from several libraries
+_MEMORY_ADVICE = "there is too little memory for this image; a smaller one, or a coarser --tolerance, takes less"
+# Parts of the messages of PyTorch's RuntimeError when memory runs out on the CPU; they come from several libraries.
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "bad_alloc", "size calculation overflowed", "new thread")
 
 
 @contextlib.contextmanager
-def _told_in_one_sentence() -> Iterator[None]:
+def _errors_in_one_sentence() -> Iterator[None]:
     """Prints errors of input, files, memory and missing packages, and exits with code 2; other errors pass."""
     try:
         yield
@@ -42,13 +42,13 @@ def _told_in_one_sentence() -> Iterator[None]:
             raise
         message = str(error) or type(error).__name__
     except MemoryError:  # numpy's own message is about arrays
-        message = _TOO_LITTLE
+        message = _MEMORY_ADVICE
     except RuntimeError as error:
         torch = sys.modules.get("torch")  # already imported if a device ran out of memory
         if torch is not None and isinstance(error, torch.OutOfMemoryError):
             message = "the device has too little memory for this image; try --device cpu"
         elif any(words in str(error) for words in _NO_MEMORY):
-            message = _TOO_LITTLE
+            message = _MEMORY_ADVICE
         else:
             raise
     with contextlib.suppress(OSError):  # the exit code is the same if standard error is closed
@@ -69,12 +69,12 @@ class _Commands(click.Group):
         return command_of(cmd_name, getattr(module, cmd_name.capitalize()))
 
     def invoke(self, ctx: click.Context) -> object:
-        with _told_in_one_sentence():
+        with _errors_in_one_sentence():
             return super().invoke(ctx)
 
 
-def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
-    if wanted:
+def _print_version(ctx: click.Context, _: click.Parameter, is_given: bool) -> None:
+    if is_given:
         from .. import native  # imports PyTorch
 
         click.echo(f"torchdof {importlib.metadata.version('torchdof')}, engine {native.describe()}")
@@ -104,5 +104,5 @@ def main() -> None:
     if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME"} & set(os.environ):
         os.environ |= {"OMP_WAIT_POLICY": "passive", "KMP_BLOCKTIME": "0"}
     _open_streams()
-    with unwound_on_termination():
+    with exit_on_signals():
         app(prog_name="torchdof")

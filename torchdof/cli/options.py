@@ -14,11 +14,11 @@ from .command import by_option, option, word_or_number
 if TYPE_CHECKING:
     from ..optics.blur_table import BlurTable
 
-_IDEAL = ("disc", "gaussian")
+_IDEAL_TABLES = ("disc", "gaussian")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Opening:
+class ApertureOptions:
     """Blur."""
 
     blades: int = option("Aperture blades, from 3; 0 is a round lens.", 0)
@@ -46,18 +46,18 @@ class Opening:
         mask = None if self.aperture is None else read_image(self.aperture).light[0].mean(0)
         names = {name: f"--{name.removesuffix('_deg')}" for name in ("blades", "rotation_deg", "curvature", "squeeze")}
         with by_option(names | {"vignetting": "--vignetting"}):
-            opening = Aperture(self.blades, self.rotation, self.curvature, self.squeeze, mask, self.vignetting)
+            aperture = Aperture(self.blades, self.rotation, self.curvature, self.squeeze, mask, self.vignetting)
         try:
-            table = getattr(BlurTable, name)() if name in _IDEAL else BlurTable.load(name)
+            table = getattr(BlurTable, name)() if name in _IDEAL_TABLES else BlurTable.load(name)
         except FileNotFoundError:
-            known = ", ".join([*_IDEAL, *shipped()])
-            raise FileNotFoundError(f"no blur table {name!r}: neither a file nor one of {known}") from None
-        is_plain = opening.is_round and self.squeeze == 1.0 and not opening.depends_on_place
-        return table if is_plain else table.with_aperture(opening)
+            names_known = ", ".join([*_IDEAL_TABLES, *shipped()])
+            raise FileNotFoundError(f"no blur table {name!r}: neither a file nor one of {names_known}") from None
+        is_default = aperture.is_round and self.squeeze == 1.0 and not aperture.depends_on_place
+        return table if is_default else table.with_aperture(aperture)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Blur(Opening):
+class Blur(ApertureOptions):
     """Blur."""
 
     table: str = option("disc, gaussian, a shipped table such as sato_j15, or a JSON file.", "disc", basic=True)
@@ -78,11 +78,11 @@ class Accuracy:
         read=word_or_number(("draft", "preview", "final"), "--tolerance expects draft, preview, final or a number"),
         basic=True,
     )
-    no_occlusion: bool = option("One pass that ignores what hides what.", False)
+    no_occlusion: bool = option("One pass that ignores occlusion.", False)
     method: Literal["layered", "fold"] = option("fold is the literal scatter: exact, slow, for small radii.", "layered")
     depth_edges: Literal["auto", "repair", "as-given"] | None = option(
-        "Move and sharpen the edges of the depth to where the image has them: unless they prove exact, each one, or "
-        "not at all. Default: auto; in exported files as-given.",
+        "Sharpen the edges of the depth and move them to those of the image: auto unless they prove exact, repair each "
+        "one, as-given never. Default: auto; in exported files as-given.",
         group="Depth map",
     )
 
@@ -94,7 +94,7 @@ class Accuracy:
 
 def json_option() -> Any:
     """The option ``--json``, which every command has."""
-    return option("Print what is printed as JSON, for programs: one object a line.", False, names=("--json",))
+    return option("Print results as JSON, for programs: one object a line.", False, names=("--json",))
 
 
 def make_folder_of(path: Path) -> None:

@@ -15,7 +15,7 @@ import click
 from ..io.sequence import FramePattern, parse_frames
 from .command import argument, numbers, option, options_of
 from .options import Accuracy, Blur, check_files, json_option, make_folder_of
-from .printed import Bar, json_line
+from .output import Bar, json_line
 from .resume import Record
 from .scene import Scene
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from .frame import Frame, Renderer
 
-_EACH_ITS_OWN = (
+_OWN_EXTREMES = (
     "each frame's relative depth is scaled by its own extremes, so that distances pulse; give the values that near and "
     "far have in all frames: --value-range LOW,HIGH"
 )
@@ -181,13 +181,13 @@ class Render:
         from ..depth.sanity import Mistake
         from .frame import Renderer
 
-        renderer, said = Renderer(self, scene, is_still=images is None), scene.depth_map
+        renderer, depth_map = Renderer(self, scene, is_still=images is None), scene.depth_map
         if files.resume and len(existing) > len(done):
             again = f"{len(existing) - len(done)} of {len(outputs)} frames are rendered again"
-            renderer.once.note("again", f"{self.out}: {again}: {reason}")
+            renderer.notices.note("again", f"{self.out}: {again}: {reason}")
         is_recorded = files.resume or not is_single or record.path.is_file()
-        if images and said.depth_kind == "relative" and said.value_range is None and len(numbers) > 1:
-            renderer.once.warn(self.depth or self.image, [Mistake("range", _EACH_ITS_OWN)])
+        if images and depth_map.depth_kind == "relative" and depth_map.value_range is None and len(numbers) > 1:
+            renderer.notices.warn(self.depth or self.image, [Mistake("range", _OWN_EXTREMES)])
         read_files = functools.lru_cache(maxsize=1)(renderer.read)  # a focus pull reads one image many times
 
         def read(n: int) -> "Frame":
@@ -206,18 +206,18 @@ class Render:
         numbers: Sequence[int] = images.frames()
         if self.files.frames is not None:
             first, last = self.files.frames
-            wanted, existing = range(first, last + 1), {n for n in numbers if first <= n <= last}
-            if len(existing) < len(wanted):
-                missing = images.name(next(n for n in wanted if n not in existing))
-                absent = f"{len(wanted) - len(existing)} of {len(wanted)} frames missing"
+            requested, found = range(first, last + 1), {n for n in numbers if first <= n <= last}
+            if len(found) < len(requested):
+                missing = images.name(next(n for n in requested if n not in found))
+                absent = f"{len(requested) - len(found)} of {len(requested)} frames missing"
                 raise FileNotFoundError(f"{missing}: there is no such file ({absent})")
-            numbers = wanted
+            numbers = requested
         if not numbers:
             raise FileNotFoundError(f"{self.image}: there are no such files")
-        without = [path for n in numbers if depths is not None and not (path := depths.name(n)).is_file()]
-        if without:
-            told = f"{len(without)} of {len(numbers)} depths missing"
-            raise FileNotFoundError(f"{without[0]}: there is no such file ({told})")
+        missing_depths = [path for n in numbers if depths is not None and not (path := depths.name(n)).is_file()]
+        if missing_depths:
+            summary = f"{len(missing_depths)} of {len(numbers)} depths missing"
+            raise FileNotFoundError(f"{missing_depths[0]}: there is no such file ({summary})")
         return numbers
 
     def _render_each(
@@ -233,13 +233,13 @@ class Render:
             ThreadPoolExecutor(1) as reader,
             ThreadPoolExecutor(1) as writer,
         ):
-            numbers, coming, written = iter(files), list["Future[Frame]"](), writer.submit(lambda: None)
+            numbers, reading, written = iter(files), list["Future[Frame]"](), writer.submit(lambda: None)
             try:
                 for k, (n, out) in enumerate(files.items()):
                     if several:
                         bar.update(f"frame {k + 1} of {len(files)}", k)
-                    coming += [reader.submit(read, ahead) for ahead in itertools.islice(numbers, 2 - len(coming))]
-                    rendered = renderer.render(coming.pop(0).result(), out, n, None if several else bar)
+                    reading += [reader.submit(read, ahead) for ahead in itertools.islice(numbers, 2 - len(reading))]
+                    rendered = renderer.render(reading.pop(0).result(), out, n, None if several else bar)
                     written.result()
                     if k == 0 and record is not None:
                         make_folder_of(out)
@@ -264,10 +264,10 @@ def _steadied(read: "Callable[[int], Frame]", numbers: Sequence[int]) -> "Callab
         latest[:] = [read(numbers[place])]
         return latest[0].picture.pixels, latest[0].values
 
-    frames, places = SteadyFrames(pixels_and_depth), {n: place for place, n in enumerate(numbers)}
+    frames, index_of = SteadyFrames(pixels_and_depth), {n: place for place, n in enumerate(numbers)}
 
     def steadied(n: int) -> "Frame":
-        values = frames.depth(places[n])
+        values = frames.depth(index_of[n])
         return dataclasses.replace(latest[0], values=values)
 
     return steadied

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _NEAR_M, _FAR_PER_NEAR = 1.0, 8.0  # nearest relative depth in m, and farthest over nearest, by default
-_WHOLE_NUMBERS = (".png", ".jpg", ".jpeg", ".webp")  # types that hold whole numbers only
-_OF_RENDERERS = (".exr", ".tif", ".tiff")  # types whose floats are taken for distances
+_INTEGER_TYPES = (".png", ".jpg", ".jpeg", ".webp")  # types that hold whole numbers only
+_RENDER_TYPES = (".exr", ".tif", ".tiff")  # types whose floats are taken for distances
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +46,8 @@ class DepthMap:
     )
     depth_unknown: float | None = option("A value that means 'not measured', such as 0, -1 or inf.")
     fill_depth: float | str | None = option(
-        "Fill pixels without depth: from the nearest one, from the farthest around (what stereo cannot see lies "
-        "behind), or with a distance (inf for a sky).",
+        "Fill pixels without depth: from the nearest one, from the farthest around (stereo misses the background), or "
+        "with a distance (inf for a sky).",
         metavar="nearest|far|METRES",
         read=word_or_number(("nearest", "far"), "--fill-depth expects nearest, far or metres"),
     )
@@ -92,21 +92,21 @@ class DepthMap:
 
         known = values if self.depth_unknown is None else values.masked_fill(values == self.depth_unknown, math.nan)
         suffix = path.suffix.lower()
-        guess = guess_kind(known, suffix in _WHOLE_NUMBERS, is_metric or suffix in _OF_RENDERERS)
+        guess = guess_kind(known, suffix in _INTEGER_TYPES, is_metric or suffix in _RENDER_TYPES)
         if guess.kind == "z" and guess.scale == 1.0 and is_metric:
             return replace(self, depth_kind="z"), ""
         fill, unknown = "far" if self.fill_depth is None else self.fill_depth, self.depth_unknown
         unknown = guess.unknown if unknown is None else unknown
-        said = replace(self, depth_kind=guess.kind, depth_unknown=unknown, fill_depth=fill)
+        guessed_map = replace(self, depth_kind=guess.kind, depth_unknown=unknown, fill_depth=fill)
         if guess.kind == "z":
             unit = "metres" if guess.scale == 1.0 else "millimetres"
-            told = f"taken for {unit} (else --depth-kind, --depth-scale)"
-            return replace(said, depth_scale=None if guess.scale == 1.0 else guess.scale), told
+            message = f"taken for {unit} (else --depth-kind, --depth-scale)"
+            return replace(guessed_map, depth_scale=None if guess.scale == 1.0 else guess.scale), message
         larger, other = ("nearer", "depth") if guess.relative_kind == "disparity" else ("farther", "disparity")
-        near_m, far_m = said.ends_m
-        told = f"taken for relative depth (else --depth-kind), larger is {larger} (else --relative-kind {other}), "
-        told += f"from {near_m:g} to {far_m:g} m (else --near-m, --far-m)"
-        return replace(said, relative_kind=guess.relative_kind), told
+        near_m, far_m = guessed_map.ends_m
+        message = f"taken for relative depth (else --depth-kind), larger is {larger} (else --relative-kind {other}), "
+        message += f"from {near_m:g} to {far_m:g} m (else --near-m, --far-m)"
+        return replace(guessed_map, relative_kind=guess.relative_kind), message
 
 
 @dataclass(frozen=True, kw_only=True)

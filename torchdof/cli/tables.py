@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .command import argument, option
-from .options import Opening, json_option
-from .printed import tell
+from .options import ApertureOptions, json_option
+from .output import print_result
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 _WIDTH = 1920  # px; image width for which kernels are drawn
 _COC_PX = (-24.0, -12.0, -6.0, 6.0, 12.0, 24.0)  # px; signed blur radii of the rows
-_CELL = (200, 230)  # px; height and width of a kernel's picture, wide enough for its caption
+_CELL_PX = (200, 230)  # px; height and width of a kernel's picture, wide enough for its caption
 _ZOOM = 2  # width in the picture of one pixel of a kernel
-_PLACES = (0.0, 0.4, 0.7, 0.95)  # distances from the middle of the frame; its corner is at 1
+_POSITIONS = (0.0, 0.4, 0.7, 0.95)  # distances from the middle of the frame; its corner is at 1
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,7 @@ class Tables:
     out: Path | None = option(
         "Picture to write: a column of kernels a table, over the blur radius.", names=("--out", "-o")
     )
-    opening: Opening
+    opening: ApertureOptions
     as_json: bool = json_option()
 
     def run(self) -> None:
@@ -55,10 +55,10 @@ class Tables:
         for name in self.names or ["disc", "gaussian", *shipped()]:
             table = self.opening.table_of(name)
             facts = _facts(name, table)
-            tell(self.as_json, facts, _line(facts))
+            print_result(self.as_json, facts, _text_line(facts))
             if self.out is not None:
-                where = ": middle to corner" if table.depends_on_place else ""
-                panels[f"{Path(name).stem}{where}"] = _column(table)
+                suffix = ": middle to corner" if table.depends_on_place else ""
+                panels[f"{Path(name).stem}{suffix}"] = _column(table)
         if self.out is None:
             return
         widest = max(panel.shape[-1] for panel in panels.values())
@@ -83,7 +83,7 @@ def _facts(name: str, table: "BlurTable") -> dict[str, Any]:
     }
 
 
-def _line(facts: dict[str, Any]) -> str:
+def _text_line(facts: dict[str, Any]) -> str:
     """Properties of a table as one line of text."""
     parts = [f"{facts['family']}, {facts['nodes']} node{'s' if facts['nodes'] > 1 else ''}"]
     if facts["unit"] != "relative":
@@ -102,19 +102,20 @@ def _column(table: "BlurTable") -> "Tensor":
     from ..optics.kernel_bank import bank_of
     from ..optics.placed_kernels import layer_shares, placed
 
-    size, columns = _CELL[0] // _ZOOM // 2 * 2 - 1, []
-    for place in _PLACES if table.depends_on_place else ():
+    size, columns = _CELL_PX[0] // _ZOOM // 2 * 2 - 1, []
+    for position in _POSITIONS if table.depends_on_place else ():
         kernels, frame = [], (round(_WIDTH / 1.5), _WIDTH)
-        y, x = (torch.tensor([place * side / math.hypot(*frame)]) for side in frame)
+        y, x = (torch.tensor([position * side / math.hypot(*frame)]) for side in frame)
         for coc in _COC_PX:
-            own = bank_of(table).kernels(torch.tensor([coc]), _WIDTH, longest=[size // 2 + 1]).float()
-            shares = layer_shares(table, coc, 1, frame).to(own)
-            kernel = placed(own, [(shares, own.new_ones(()))], y, x)[0]
+            central = bank_of(table).kernels(torch.tensor([coc]), _WIDTH, longest=[size // 2 + 1]).float()
+            shares = layer_shares(table, coc, 1, frame).to(central)
+            kernel = placed(central, [(shares, central.new_ones(()))], y, x)[0]
             kernels.append(functional.pad(kernel, ((size - kernel.shape[-1]) // 2,) * 4))
         columns.append(torch.stack(kernels))
     columns = columns or [table.kernels(torch.tensor(_COC_PX), _WIDTH, size=size).float()]  # [n, 1 or C, size, size]
-    shown = torch.cat([k / k.amax((1, 2, 3), keepdim=True) for k in columns], -1)
-    shown = shown[:, :3] if shown.shape[1] >= 3 else shown[:, :1].expand(-1, 3, -1, -1)
-    shown = functional.interpolate(shown, scale_factor=float(_ZOOM), mode="nearest")
-    below, beside = _CELL[0] - shown.shape[-2], max(0, _CELL[1] - shown.shape[-1])
-    return functional.pad(shown, (beside // 2, beside - beside // 2, below, 0)).transpose(0, 1).flatten(1, 2)[None]
+    picture = torch.cat([k / k.amax((1, 2, 3), keepdim=True) for k in columns], -1)
+    picture = picture[:, :3] if picture.shape[1] >= 3 else picture[:, :1].expand(-1, 3, -1, -1)
+    picture = functional.interpolate(picture, scale_factor=float(_ZOOM), mode="nearest")
+    padding_y, padding_x = _CELL_PX[0] - picture.shape[-2], max(0, _CELL_PX[1] - picture.shape[-1])
+    cells = functional.pad(picture, (padding_x // 2, padding_x - padding_x // 2, padding_y, 0))
+    return cells.transpose(0, 1).flatten(1, 2)[None]  # [n, 3, h, w] -> [1, 3, n h, w]

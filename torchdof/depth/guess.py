@@ -12,14 +12,15 @@ from .sanity import whole_numbers
 
 __all__ = ["Guess", "guess_kind", "subject_m"]
 
-_ONE_BYTE, _FILLED = 255, 60_000  # whole numbers are grey levels if their largest is <= the first or >= the second
-_NEXT_TO_ZERO = 0.05  # smallest value below which numbers up to 1 are relative: in metres, it would be too near
-_CLEAR = 0.35  # absolute correlation of values and rows above which values clearly grow or shrink downwards
-_SAMPLES = 65_536  # most pixels examined
-_BINS, _REACH = 64, 3  # bins of 1 / distance; bins on each side of its peak that belong to a surface
-_SPREAD = 1 / 6  # standard deviation of the weight of the middle, over each side of the picture
-_STRAY = 0.01  # share of the pixels at each end of the distances that is ignored as outliers
-_SUBJECT = 0.2  # smallest share of the middle that the subject fills
+_MAX_8_BIT, _MIN_16_BIT = 255, 60_000  # whole numbers are grey levels if their largest is <= the first or >= the second
+_NEAR_ZERO = 0.05  # numbers up to 1 are relative if the smallest is below this: in metres it would be too near
+_CLEAR_CORRELATION = 0.35  # absolute correlation of values and rows above which values clearly grow or shrink downwards
+_MAX_SAMPLES = 65_536  # most pixels examined
+# Subject of a picture: a peak in the histogram of 1 / distance.
+_BINS, _REACH_BINS = 64, 3  # bins of 1 / distance; bins on each side of its peak that belong to a surface
+_MIDDLE_SIGMA = 1 / 6  # standard deviation of the weight of the middle, over each side of the picture
+_OUTLIERS = 0.01  # share of the pixels at each end of the distances that is ignored as outliers
+_SUBJECT_SHARE = 0.2  # smallest share of the middle that the subject fills
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Guess:
     relative_kind: RelativeKind = "disparity"
 
 
-def guess_kind(values: Tensor, whole: bool = False, metric: bool = False) -> Guess:
+def guess_kind(values: Tensor, integers: bool = False, metric: bool = False) -> Guess:
     """Guesses the meaning of the numbers of a depth map.
 
     * Whole numbers are relative depth (grey levels) if the largest is at most 255, or at least 60,000. Otherwise they
@@ -50,7 +51,7 @@ def guess_kind(values: Tensor, whole: bool = False, metric: bool = False) -> Gue
 
     Args:
         values: ``[1, 1, H, W]``; NaN and infinite values are ignored.
-        whole: Whether the file type holds whole numbers only; otherwise the values are examined.
+        integers: Whether the file type holds whole numbers only; otherwise the values are examined.
         metric: Whether other input is in metres; distances are then never taken for disparity.
 
     Example:
@@ -61,20 +62,20 @@ def guess_kind(values: Tensor, whole: bool = False, metric: bool = False) -> Gue
         >>> guess_kind(torch.linspace(2.5, 8.0, 256).reshape(1, 1, 16, 16).flip(2)).scale
         1.0
     """
-    known = values[values.isfinite()]
-    low, high = (float(end) for end in known.aminmax()) if known.numel() else (0.0, 0.0)
+    finite = values[values.isfinite()]
+    low, high = (float(end) for end in finite.aminmax()) if finite.numel() else (0.0, 0.0)
     if low == high:
         return Guess("z")
     downwards = _growth_downwards(values)
-    if whole or whole_numbers(known):
-        is_relative = high <= _ONE_BYTE or high >= _FILLED
-        otherwise = Guess("z", 0.001, 0.0)
+    if integers or whole_numbers(finite):
+        is_relative = high <= _MAX_8_BIT or high >= _MIN_16_BIT
+        metric_guess = Guess("z", 0.001, 0.0)
     else:
-        is_relative = low < 0 or (high <= 1 and low < _NEXT_TO_ZERO)
-        otherwise = Guess("z")
+        is_relative = low < 0 or (high <= 1 and low < _NEAR_ZERO)
+        metric_guess = Guess("z")
     if is_relative:
-        return Guess("relative", relative_kind="depth" if downwards < -_CLEAR else "disparity")
-    return Guess("relative") if downwards > _CLEAR and not metric else otherwise
+        return Guess("relative", relative_kind="depth" if downwards < -_CLEAR_CORRELATION else "disparity")
+    return Guess("relative") if downwards > _CLEAR_CORRELATION and not metric else metric_guess
 
 
 def subject_m(depth: Tensor) -> float:
@@ -97,28 +98,28 @@ def subject_m(depth: Tensor) -> float:
     """
     depth = _sampled(depth).double().cpu()
     y, x = (torch.linspace(-0.5, 0.5, size + 2, dtype=torch.float64)[1:-1] for size in depth.shape)
-    weight = torch.exp(-0.5 * ((y[:, None] / _SPREAD).square() + (x / _SPREAD).square()))
-    known = depth > 0
-    if not bool(known.any()):
+    weight = torch.exp(-0.5 * ((y[:, None] / _MIDDLE_SIGMA).square() + (x / _MIDDLE_SIGMA).square()))
+    is_known = depth > 0
+    if not bool(is_known.any()):
         raise ValueError("no pixel has a depth; check the kind, scale and offset of the depth map")
-    dioptres, order = (1.0 / depth[known]).sort()
-    weight = weight[known][order]
-    low, high = (float(dioptres[int(share * (dioptres.numel() - 1))]) for share in (_STRAY, 1.0 - _STRAY))
+    dioptres, order = (1.0 / depth[is_known]).sort()
+    weight = weight[is_known][order]
+    low, high = (float(dioptres[int(share * (dioptres.numel() - 1))]) for share in (_OUTLIERS, 1.0 - _OUTLIERS))
     bins = ((dioptres - low) / max(high - low, 1e-9) * _BINS).clamp(0, _BINS - 1).long()
     shares = torch.zeros(_BINS, dtype=torch.float64).index_add_(0, bins, weight / weight.sum())
-    around = torch.nn.functional.pad(shares, (_REACH, _REACH)).unfold(0, 2 * _REACH + 1, 1)  # [bins, reach]
-    filled, peak = around.sum(1), around.amax(1) == shares
-    enough = (filled >= min(_SUBJECT, float(filled.max()))) & peak & (shares > 0)
-    nearest = int(enough.nonzero().max()) if bool(enough.any()) else int(filled.argmax())
-    of_surface = (bins - nearest).abs() <= _REACH
-    summed = weight[of_surface].cumsum(0)
-    median = float(dioptres[of_surface][int((summed >= 0.5 * summed[-1]).nonzero()[0])])
+    windows = torch.nn.functional.pad(shares, (_REACH_BINS, _REACH_BINS)).unfold(0, 2 * _REACH_BINS + 1, 1)
+    window_shares, is_peak = windows.sum(1), windows.amax(1) == shares
+    is_subject = (window_shares >= min(_SUBJECT_SHARE, float(window_shares.max()))) & is_peak & (shares > 0)
+    peak_bin = int(is_subject.nonzero().max()) if bool(is_subject.any()) else int(window_shares.argmax())
+    of_surface = (bins - peak_bin).abs() <= _REACH_BINS
+    cumulative = weight[of_surface].cumsum(0)
+    median = float(dioptres[of_surface][int((cumulative >= 0.5 * cumulative[-1]).nonzero()[0])])
     return 1.0 / median if median > 0 else math.inf
 
 
 def _sampled(values: Tensor) -> Tensor:
-    """Every n-th row and column of a map ``[1, 1, H, W]``, so that about ``_SAMPLES`` values remain: ``[h, w]``."""
-    step = math.ceil(math.sqrt(values.numel() / _SAMPLES))
+    """Every n-th row and column of a map ``[1, 1, H, W]``, so that about ``_MAX_SAMPLES`` values remain: ``[h, w]``."""
+    step = math.ceil(math.sqrt(values.numel() / _MAX_SAMPLES))
     return values[0, 0, step // 2 :: step, step // 2 :: step]
 
 
@@ -129,7 +130,7 @@ def _growth_downwards(values: Tensor) -> float:
     rows = torch.arange(values.shape[0], dtype=torch.float64)[:, None].expand(values.shape)[known]
     if rows.numel() < 2:
         return 0.0
-    _, places, counts = values[known].unique(return_inverse=True, return_counts=True)
-    ranks = (counts.cumsum(0) - 0.5 * counts)[places]  # equal values have equal ranks
+    _, rank_index, counts = values[known].unique(return_inverse=True, return_counts=True)
+    ranks = (counts.cumsum(0) - 0.5 * counts)[rank_index]  # equal values have equal ranks
     rows, ranks = rows - rows.mean(), ranks - ranks.mean()
     return float((rows * ranks).sum() / (rows.norm() * ranks.norm()).clamp(min=1e-12))

@@ -77,10 +77,10 @@ def resolve_holes(depth: Tensor, name: str, fill: Fill | None, is_relative: bool
         return depth, 0
     if fill is None:
         causes = "NaN or marked unknown" if is_relative else "NaN, zero, negative or marked unknown"
-        far = "; if zero is the far end of relative depth, say that (--depth-kind relative)"
+        hint = "; if zero is the far end of relative depth, say that (--depth-kind relative)"
         raise ValueError(
             f"{name}: {holes} pixels ({100 * holes / depth.numel():.1f} %) have no depth ({causes}); say how to fill "
-            f"them: fill 'nearest' or 'far' (--fill-depth){'' if is_relative else far}"
+            f"them: fill 'nearest' or 'far' (--fill-depth){'' if is_relative else hint}"
         )
     try:
         return fill_holes(depth, fill), holes
@@ -95,8 +95,8 @@ def _first_along(depth: Tensor, dim: int, back: bool) -> Tensor:
     """
     line = depth.flip(dim) if back else depth
     shape = [-1 if d == line.ndim + dim else 1 for d in range(line.ndim)]
-    place = torch.arange(line.shape[dim], device=line.device).reshape(shape)
-    last = torch.where(line.isnan(), -1, place).cummax(dim=dim).values
+    index = torch.arange(line.shape[dim], device=line.device).reshape(shape)
+    last = torch.where(line.isnan(), -1, index).cummax(dim=dim).values
     values = torch.where(last >= 0, line.gather(dim, last.clamp(min=0)), torch.nan)
     return values.flip(dim) if back else values
 

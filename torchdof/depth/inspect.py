@@ -23,7 +23,7 @@ EDGES = ("exact", "ramp", "beside", "unclear")
 """
 
 _NEAR, _SHARP, _FAR = (1.3, 0.6, 0.0), (0.1, 1.3, 0.3), (0.1, 0.5, 1.3)  # RGB of the tints, linear light
-_TINT, _FLOOR = 0.4, 0.1  # share of the tint in a pixel; its light in dark pixels, as a share of the mean light
+_TINT, _DARK_LIGHT = 0.4, 0.1  # share of the tint in a pixel; its light in dark pixels, as a share of the mean light
 _HOLE = (0.6, 0.0, 0.6)  # RGB of pixels without depth
 _BOUNDS_PX = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)  # bounds of the histogram in px
 
@@ -65,11 +65,11 @@ class DepthReport:
         The bounds are 1, 2, 4, ... 128 px; empty bins at both ends are left out.
         """
         bounds = [-math.inf, *(-x for x in reversed(_BOUNDS_PX)), *_BOUNDS_PX, math.inf]
-        known = self.coc_px[~self.coc_px.isnan()]
-        edges = torch.tensor(bounds[1:-1], dtype=known.dtype, device=known.device)
-        counts = torch.bincount(torch.bucketize(known, edges), minlength=len(bounds) - 1).tolist()
+        coc_px = self.coc_px[~self.coc_px.isnan()]
+        edges = torch.tensor(bounds[1:-1], dtype=coc_px.dtype, device=coc_px.device)
+        counts = torch.bincount(torch.bucketize(coc_px, edges), minlength=len(bounds) - 1).tolist()
         filled = [k for k, count in enumerate(counts) if count] or [len(_BOUNDS_PX)]
-        total = max(1, known.numel())
+        total = max(1, coc_px.numel())
         return [(bounds[k], bounds[k + 1], counts[k] / total) for k in range(filled[0], filled[-1] + 1)]
 
     def distances(self) -> dict[str, float]:
@@ -77,18 +77,18 @@ class DepthReport:
         finite = self.depth[self.depth.isfinite()]
         if not finite.numel():
             return {}
-        spread = torch.quantile(finite.flatten()[:: max(1, finite.numel() // 2**20)].double(), _SHARES).tolist()
-        named = dict(zip(_SHARE_NAMES, spread, strict=True))
-        return {"nearest": float(finite.min()), **named, "farthest": float(finite.max())}
+        quantiles = torch.quantile(finite.flatten()[:: max(1, finite.numel() // 2**20)].double(), _QUANTILES).tolist()
+        by_name = dict(zip(_QUANTILE_NAMES, quantiles, strict=True))
+        return {"nearest": float(finite.min()), **by_name, "farthest": float(finite.max())}
 
     def facts(self) -> dict[str, Any]:
         """The numbers of ``str`` as JSON-like data: distances in metres, radii in pixels, shares in [0, 1]."""
-        known = self.coc_px[~self.coc_px.isnan()]
+        coc_px = self.coc_px[~self.coc_px.isnan()]
         return {
             "depth_m": self.distances(),
             "at_infinity_px": int(self.depth.isinf().sum()),
             "holes_px": self.holes,
-            "coc_px": [float(known.min()), float(known.max())] if known.numel() else [],
+            "coc_px": [float(coc_px.min()), float(coc_px.max())] if coc_px.numel() else [],
             "in_focus": self.sharp,
             "histogram": [{"from_px": low, "to_px": high, "share": share} for low, high, share in self.histogram()],
             "depth_edges": dict(zip(EDGES, self.counts, strict=True)),
@@ -101,9 +101,9 @@ class DepthReport:
             lines.append("depth, m      " + "  ".join(f"{name} {metres:.4g}" for name, metres in distances.items()))
         infinite = int(self.depth.isinf().sum())
         lines.append(f"at infinity   {_percent(infinite, total)}   holes {self.holes} ({_percent(self.holes, total)})")
-        known = self.coc_px[~self.coc_px.isnan()]
-        if known.numel():
-            lines.append(f"blur radius   {float(known.min()):+.1f} to {float(known.max()):+.1f} px, negative is near")
+        coc_px = self.coc_px[~self.coc_px.isnan()]
+        if coc_px.numel():
+            lines.append(f"blur radius   {float(coc_px.min()):+.1f} to {float(coc_px.max()):+.1f} px, negative is near")
             lines.append(f"in focus      {100 * self.sharp:.1f} % of the pixels (radius of at most 1 px)")
             longest = max(share for _, _, share in self.histogram())
             for low, high, share in self.histogram():
@@ -113,13 +113,13 @@ class DepthReport:
         shares = ", ".join(f"{_percent(n, edge_px)} {name}" for n, name in zip(self.counts, EDGES, strict=True))
         lines.append(f"depth edges   {edge_px} pixels: {shares}")
         if edge_px:
-            taken = "are repaired before rendering" if self.doubtful else "are exact and stay unchanged"
-            lines.append(f"              they {taken} (depth edges auto)")
+            treatment = "are repaired before rendering" if self.doubtful else "are exact and stay unchanged"
+            lines.append(f"              they {treatment} (depth edges auto)")
         return "\n".join(lines)
 
 
-_SHARES = torch.tensor([0.01, 0.5, 0.99], dtype=torch.float64, device="cpu")
-_SHARE_NAMES = ("1 %", "median", "99 %")
+_QUANTILES = torch.tensor([0.01, 0.5, 0.99], dtype=torch.float64, device="cpu")
+_QUANTILE_NAMES = ("1 %", "median", "99 %")
 
 
 def inspect_depth(image: Tensor, depth: Tensor, camera: Camera) -> DepthReport:
@@ -148,9 +148,9 @@ def inspect_depth(image: Tensor, depth: Tensor, camera: Camera) -> DepthReport:
         raise ValueError(f"inspect one image at a time, got a batch of {image.shape[0]}")
     depth = torch.where(depth > 0, depth, torch.nan)
     coc_px = camera.coc_px(depth, depth.shape[-1])
-    places, changed = judged(image, -coc_px, STEP_PX)
-    is_ramp = places == 2
-    kinds = torch.where(changed, torch.where(is_ramp, 2, 3), torch.where(is_ramp, 4, places)).byte()
+    states, is_changed = judged(image, -coc_px, STEP_PX)
+    is_ramp = states == 2
+    kinds = torch.where(is_changed, torch.where(is_ramp, 2, 3), torch.where(is_ramp, 4, states)).byte()
     counts = torch.bincount(kinds.flatten(), minlength=len(EDGES) + 1)[1:].tolist()
     return DepthReport(depth, coc_px, kinds, (counts[0], counts[1], counts[2], counts[3]))
 
@@ -205,15 +205,15 @@ def panels(image: Tensor, report: DepthReport) -> dict[str, Tensor]:
     coc_px = torch.where(is_hole, 0.0, report.coc_px)
     colours = image.new_tensor([[0, 0, 0], [0.0, 0.7, 0.1], [1.0, 0.05, 0.0], [1.0, 0.0, 0.8], [0.05, 0.1, 0.5]])
     marks = colours[report.edges[:, 0].long()].permute(0, 3, 1, 2)  # [1, H, W, 3] -> [1, 3, H, W]
-    level = image.mean(1, keepdim=True) / image.mean().clamp(min=1e-12)
-    dim = (0.08 * level).clamp(0, 0.3).expand(-1, 3, -1, -1)
+    brightness = image.mean(1, keepdim=True) / image.mean().clamp(min=1e-12)
+    background = (0.08 * brightness).clamp(0, 0.3).expand(-1, 3, -1, -1)
     return {
         "depth: near is bright, holes magenta": depth_colours(report.depth),
         f"blur radius {float(coc_px.min()):+.1f} to {float(coc_px.max()):+.1f} px: near orange, far blue": torch.where(
             is_hole, magenta, coc_colours(coc_px)
         ),
         "depth edges: exact green, ramps red, beside the image's pink, unclear blue": torch.where(
-            report.edges > 0, marks, dim
+            report.edges > 0, marks, background
         ),
     }
 
@@ -246,7 +246,7 @@ def tint_focus(image: Tensor, coc_px: Tensor, has_alpha: bool = False) -> Tensor
     near, sharp, far = (image.new_tensor(tint)[:, None, None] for tint in (_NEAR, _SHARP, _FAR))
     tint = torch.lerp(torch.where(coc_px < 0, near, far), sharp, (2.0 - coc_px.abs()).clamp(0.0, 1.0))
     grey = colour.mean(dim=1, keepdim=True)
-    floor = _FLOOR * grey.mean() * (alpha if has_alpha else 1.0)
+    floor = _DARK_LIGHT * grey.mean() * (alpha if has_alpha else 1.0)
     return torch.cat([(1.0 - _TINT) * grey + _TINT * tint * (grey + floor), alpha], dim=1)
 
 

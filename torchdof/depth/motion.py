@@ -6,36 +6,36 @@ from torch import Tensor
 
 __all__ = ["motion_between", "sample", "shifted"]
 
-_COARSEST_PX, _LEVELS = 24, 5  # smallest side of the coarsest level in px, and most levels; more find larger motion
+_COARSEST_PX, _LEVELS = 24, 5  # smallest side in px of the coarsest level; most levels. More levels find larger motion
 _BLOCK = 7  # px; side of the compared blocks; larger ones are more robust and less detailed
-_GAIN = 0.05  # least share of the squared difference that a subpixel shift must remove; larger keeps more pixels still
+_GAIN = 0.05  # share of the squared difference that a subpixel shift must remove; larger: fewer subpixel shifts
 _NOISE = 1e-4  # squared difference of noise, for the same test
-_STILL = 1e-3  # share of changed pixels up to which there is no search for motion
+_STILL_SHARE = 1e-3  # share of changed pixels below which motion is not searched
 
 
-def motion_between(frame: Tensor, before: Tensor, changed: Tensor) -> Tensor:
+def motion_between(current_frame: Tensor, previous_frame: Tensor, is_changed: Tensor) -> Tensor:
     """Optical flow ``[B, 2, H, W]`` from each pixel of a frame to its content in the previous frame.
 
     Args:
-        frame: ``[B, C, H, W]``.
-        before: The previous frame, ``[B, C, H, W]``.
-        changed: ``[B, 1, H, W]``, bool: pixels that differ between both frames. With less than 0.1 % of them the flow
-            is 0.
+        current_frame: ``[B, C, H, W]``.
+        previous_frame: The previous frame, ``[B, C, H, W]``.
+        is_changed: ``[B, 1, H, W]``, bool: pixels that differ between both frames. If they are less than 0.1 %, the
+            flow is 0.
 
     Returns:
         x and y in pixels, with subpixel precision, computed at half the resolution.
     """
-    batch, _, height, width = frame.shape
-    if float(changed.float().mean()) <= _STILL:
-        return frame.new_zeros(batch, 2, height, width)
-    levels = [(_halved(frame.mean(1, keepdim=True)), _halved(before.mean(1, keepdim=True)))]
+    batch, _, height, width = current_frame.shape
+    if float(is_changed.float().mean()) <= _STILL_SHARE:
+        return current_frame.new_zeros(batch, 2, height, width)
+    levels = [(_halved(current_frame.mean(1, keepdim=True)), _halved(previous_frame.mean(1, keepdim=True)))]
     while min(levels[-1][0].shape[-2:]) >= 2 * _COARSEST_PX and len(levels) < _LEVELS:
         levels.append((_halved(levels[-1][0]), _halved(levels[-1][1])))
     flow = levels[-1][0].new_zeros(batch, 2, *levels[-1][0].shape[-2:])
-    for depth, (now, then) in enumerate(reversed(levels)):
-        if depth:
-            flow = 2.0 * F.interpolate(flow, size=now.shape[-2:], mode="nearest").round()
-        flow = _matched(now, then, flow, reach=2 if depth == 0 else 1)
+    for level, (current, previous) in enumerate(reversed(levels)):
+        if level:
+            flow = 2.0 * F.interpolate(flow, size=current.shape[-2:], mode="nearest").round()
+        flow = _matched(current, previous, flow, reach=2 if level == 0 else 1)
     return 2.0 * F.interpolate(_to_fractions(*levels[0], flow), size=(height, width), mode="nearest")
 
 
@@ -67,16 +67,16 @@ def _halved(picture: Tensor) -> Tensor:
     return F.avg_pool2d(picture, 2, ceil_mode=True)
 
 
-def _cost(now: Tensor, then: Tensor, flow: Tensor) -> Tensor:
+def _cost(current: Tensor, previous: Tensor, flow: Tensor) -> Tensor:
     """Mean absolute difference of the blocks around each pixel and around ``pixel + flow``, ``[B, 1, H, W]``."""
-    return _block_mean((now - shifted(then, flow)).abs())
+    return _block_mean((current - shifted(previous, flow)).abs())
 
 
 def _block_mean(values: Tensor) -> Tensor:
     return F.avg_pool2d(values, _BLOCK, stride=1, padding=_BLOCK // 2, count_include_pad=False)
 
 
-def _matched(now: Tensor, then: Tensor, flow: Tensor, reach: int) -> Tensor:
+def _matched(current: Tensor, previous: Tensor, flow: Tensor, reach: int) -> Tensor:
     """Integer flow of least cost.
 
     1. Choose among the guess ``flow``, no motion, and the guesses of the four neighbouring blocks.
@@ -85,15 +85,15 @@ def _matched(now: Tensor, then: Tensor, flow: Tensor, reach: int) -> Tensor:
     guesses = [flow, torch.zeros_like(flow)]
     for dim in (-2, -1):
         guesses += [flow.roll(step, dims=dim) for step in (-_BLOCK, _BLOCK)]
-    best_cost, best = _cost(now, then, guesses[0]), guesses[0]
+    best_cost, best = _cost(current, previous, guesses[0]), guesses[0]
     for guess in guesses[1:]:
-        best_cost, best = _better(best_cost, best, _cost(now, then, guess), guess)
+        best_cost, best = _better(best_cost, best, _cost(current, previous, guess), guess)
     start = best
     for dy in range(-reach, reach + 1):
         for dx in range(-reach, reach + 1):
             if dx or dy:
                 step = start + start.new_tensor([dx, dy]).reshape(1, 2, 1, 1)
-                best_cost, best = _better(best_cost, best, _cost(now, then, step), step)
+                best_cost, best = _better(best_cost, best, _cost(current, previous, step), step)
     return best
 
 
@@ -102,15 +102,15 @@ def _better(best_cost: Tensor, best: Tensor, cost: Tensor, candidate: Tensor) ->
     return torch.where(is_better, cost, best_cost), torch.where(is_better, candidate, best)
 
 
-def _to_fractions(now: Tensor, then: Tensor, flow: Tensor) -> Tensor:
+def _to_fractions(current: Tensor, previous: Tensor, flow: Tensor) -> Tensor:
     """Flow with subpixel precision, along each axis from the parabola through three squared differences."""
-    middle = _block_mean((now - shifted(then, flow)).square())
+    middle = _block_mean((current - shifted(previous, flow)).square())
     fractions = []
     for step in ((1.0, 0.0), (0.0, 1.0)):
         offset = flow.new_tensor(step).reshape(1, 2, 1, 1)
-        before, after = (_block_mean((now - shifted(then, flow + sign * offset)).square()) for sign in (-1, 1))
+        before, after = (_block_mean((current - shifted(previous, flow + sign * offset)).square()) for sign in (-1, 1))
         bend = (before + after - 2 * middle).clamp(min=1e-6)
-        gain = (before - after).square() / (8 * bend)  # middle minus the minimum of the parabola
+        gain = (before - after).square() / (8 * bend)  # the middle value minus the minimum of the parabola
         fractions.append(
             torch.where(gain > _GAIN * middle.clamp(min=_NOISE), 0.5 * (before - after) / bend, 0.0).clamp(-0.5, 0.5)
         )

@@ -82,12 +82,12 @@ def from_relative(
             )
     else:
         low, high = (value.new_tensor(x) for x in _range(value_range))
-    share = (torch.where(is_known, value, low) - low) / (high - low)
-    share = share.clamp(0.0, 1.0)
+    fraction = (torch.where(is_known, value, low) - low) / (high - low)
+    fraction = fraction.clamp(0.0, 1.0)
     if kind == "depth":
-        depth = near_m + (far_m - near_m) * share
+        depth = near_m + (far_m - near_m) * fraction
     else:
-        inverse = share / near_m + (1.0 - share) / far_m
+        inverse = fraction / near_m + (1.0 - fraction) / far_m
         depth = 1.0 / torch.where(inverse > 0, inverse, 1.0)
         depth = torch.where(inverse > 0, depth, torch.inf)
     return torch.where(is_known, depth, torch.nan).to(dtype)
@@ -117,8 +117,8 @@ class Scale:
             tensor([[[[2., inf, inf]]]])
         """
         depth = depth_from_values(values, self.kind, scale=self.scale, offset=self.offset)
-        beyond = (values.double() + self.offset) * math.copysign(1.0, self.scale) <= 0
-        return torch.where(beyond, torch.inf, depth) if self.kind == "disparity" else depth
+        is_infinite = (values.double() + self.offset) * math.copysign(1.0, self.scale) <= 0
+        return torch.where(is_infinite, torch.inf, depth) if self.kind == "disparity" else depth
 
 
 def solve_scale(
@@ -157,22 +157,22 @@ def solve_scale(
         raise ValueError(f"values must be one map [1, 1, H, W], got {list(values.shape)}; solve each on its own")
     if isinstance(patch, bool) or not isinstance(patch, int) or patch < 1:
         raise ValueError(f"patch must be a whole number of pixels, at least 1, got {show(patch)}")
-    known = [_point(values, point, kind, patch) for point in points]
-    if len({value for value, _ in known}) < 2:
+    samples = [_point(values, point, kind, patch) for point in points]
+    if len({value for value, _ in samples}) < 2:
         raise ValueError(
-            f"scale and offset need at least two points of different values, got {len(known)} points of values "
-            f"{sorted({value for value, _ in known})}"
+            f"scale and offset need at least two points of different values, got {len(samples)} points of values "
+            f"{sorted({value for value, _ in samples})}"
         )
     # Solve a v + b = y with y = z for "depth", else 1/z. Each row is divided by y, so that errors are relative.
-    value = torch.tensor([v for v, _ in known], dtype=torch.float64, device="cpu")
-    metres = torch.tensor([z for _, z in known], dtype=torch.float64, device="cpu")
+    value = torch.tensor([v for v, _ in samples], dtype=torch.float64, device="cpu")
+    metres = torch.tensor([z for _, z in samples], dtype=torch.float64, device="cpu")
     weight = 1.0 / metres if kind == "depth" else metres.clamp(max=1e6 * float(metres.min()))
     target = metres.isfinite().double() if kind != "depth" else torch.ones_like(value)
     design = torch.stack([value * weight, weight], dim=1)
     factor, constant = torch.linalg.lstsq(design, target[:, None], driver="gelsd").solution[:, 0].tolist()
     if not factor > 0:
-        other, way = ("disparity", "nearer") if kind == "depth" else ("depth", "farther")
-        raise ValueError(f"at the points, larger values are {way}; that is kind={other!r}, not {kind!r}")
+        other, direction = ("disparity", "nearer") if kind == "depth" else ("depth", "farther")
+        raise ValueError(f"at the points, larger values are {direction}; that is kind={other!r}, not {kind!r}")
     residual = float((design @ design.new_tensor([factor, constant]) - target).square().mean().sqrt())
     if kind == "depth":
         return Scale("z", factor, constant / factor, residual)
@@ -213,7 +213,7 @@ def _point(values: Tensor, point: tuple[float, float, float], kind: RelativeKind
     """Median value around a point, and its distance in metres."""
     if not isinstance(point, Sequence) or len(point) != 3:
         raise ValueError(f"a point must be (x, y, metres), got {show(point)}")
-    x, y = (number(name, place) for name, place in zip("xy", point, strict=False))
+    x, y = (number(name, coordinate) for name, coordinate in zip("xy", point, strict=False))
     metres = number("the distance of a point", point[2], low=0, unit="metres", infinite=kind != "depth")
     height, width = values.shape[-2:]
     if not (0 <= x < width and 0 <= y < height):

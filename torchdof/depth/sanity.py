@@ -18,13 +18,13 @@ from .kinds import DepthKind
 
 __all__ = ["DepthWarning", "Mistake", "check", "coc_mistakes", "depth_mistakes", "whole_numbers"]
 
-_FACTORS = (0.001, 0.01, 1000.0, 100.0)  # tried to bring depth to the focus: mm or cm as metres, or scaled down twice
+_FACTORS = (0.001, 0.01, 1000.0, 100.0)  # by which depth may be wrong: mm or cm taken for metres, or scaled twice
 _UNITS = {0.001: "millimetres", 0.01: "centimetres"}
 _SHARP_PX, _SHARP_WIDTHS = 1.0, 1e-3  # largest radius in focus: in px, and in image widths; the larger of both
 _NUMBERS = ("focal_length_mm", "f_number", "sensor_width_mm")
-_FAR_OFF = 30.0  # ratio of focus to nearest or farthest depth beyond which a warning is given even without blur
-_FAR_M, _HAND_M = 500.0, 0.1  # m; depth is suspiciously far, or suspiciously near
-_LARGE_WIDTHS, _LARGEST_WIDTHS = 1 / 8, 1.0  # image widths; a large, an impossible radius (macro lenses reach 1/2)
+_FAR_OFF_RATIO = 30.0  # ratio of focus to nearest or farthest depth beyond which a warning is given even without blur
+_FAR_M, _NEAR_M = 500.0, 0.1  # m; depth is suspiciously far, or suspiciously near
+_LARGE_WIDTHS, _LARGEST_WIDTHS = 1 / 8, 1.0  # image widths: a large radius, an impossible one (macro lenses reach 1/2)
 _WIDEST_F_NUMBER = 0.5  # limit of an aplanatic lens in air
 _SHORTEST_WIDTHS = 1 / 20  # shortest focal length in sensor widths: a field of view of 169 degrees
 
@@ -105,16 +105,16 @@ def depth_mistakes(
     lens = [getattr(camera, name) for name in _NUMBERS]
     numbers = [torch.as_tensor(value, device="cpu").reshape(-1) for value in (*lens, *in_focus)]
     batch = max(depth.shape[0], *(x.numel() for x in numbers))
-    found: dict[str, Mistake] = {}
+    mistakes: dict[str, Mistake] = {}
     for item in range(batch):
         *lens, near, far = (float(x[min(item, x.numel() - 1)]) for x in numbers)
         # without tilt, because the checks below do not depend on the place in the frame
-        single = camera.replace(
+        item_camera = camera.replace(
             **dict(zip(_NUMBERS, lens, strict=True)), focus_range_m=(near, far), tilt_deg=0.0, swing_deg=0.0
         )
-        for mistake in _mistakes(depth[min(item, depth.shape[0] - 1)], single, kind, scale):
-            found.setdefault(mistake.name, mistake)
-    return list(found.values())
+        for mistake in _mistakes(depth[min(item, depth.shape[0] - 1)], item_camera, kind, scale):
+            mistakes.setdefault(mistake.name, mistake)
+    return list(mistakes.values())
 
 
 def coc_mistakes(coc_px: Tensor) -> list[Mistake]:
@@ -126,7 +126,7 @@ def coc_mistakes(coc_px: Tensor) -> list[Mistake]:
     """
     real_tensor("coc_px", coc_px, "[B, 1, H, W] in pixels")
     size, width = _sample(coc_px.abs()), coc_px.shape[-1]
-    if not bool(size.isfinite().any()) or _share_at(size[size.isfinite()], 0.99) <= _LARGEST_WIDTHS * width:
+    if not bool(size.isfinite().any()) or _quantile(size[size.isfinite()], 0.99) <= _LARGEST_WIDTHS * width:
         return []
     size = coc_px[coc_px.isfinite()].abs()
     message = (
@@ -145,47 +145,47 @@ def _mistakes(
     2. Nothing in focus, or the focus far from all depth: report only that.
     3. Otherwise check for 8-bit files, far depth, impossible blur, and an impossible focal length.
     """
-    width, focus_m, known = depth.shape[-1], float(camera.focus_m), depth.detach().flatten()
-    if not float(known.min()) > 0:
-        known = known[known > 0]
-        if not known.numel():
+    width, focus_m, valid = depth.shape[-1], float(camera.focus_m), depth.detach().flatten()
+    if not float(valid.min()) > 0:
+        valid = valid[valid > 0]
+        if not valid.numel():
             return []
-    nearest, farthest = (float(end) for end in known.aminmax())
-    finite = known if farthest < math.inf or nearest == math.inf else known[known < math.inf]
+    nearest, farthest = (float(end) for end in valid.aminmax())
+    finite = valid if farthest < math.inf or nearest == math.inf else valid[valid < math.inf]
     near, far = nearest, float(finite.max())
     # blur grows away from the focus: it is largest at an end of the range, smallest at the depth next to the focus
     ends = camera.focus_range_m or (camera.focus_m, camera.focus_m)
-    before = torch.where(known <= float(ends[1]), known, nearest).max()
-    behind = torch.where(known >= float(ends[0]), known, farthest).min()
-    decisive = torch.stack([before, behind, known.new_tensor(nearest), known.new_tensor(farthest)])
-    blur = camera.coc_px(torch.cat([decisive, _sample(known)]).reshape(1, 1, 1, -1), width).abs().flatten()
-    least, largest, blur = float(blur[:2].min()), float(blur[2:4].max()), blur[4:]
+    in_front = torch.where(valid <= float(ends[1]), valid, nearest).max()
+    behind = torch.where(valid >= float(ends[0]), valid, farthest).min()
+    extremes = torch.stack([in_front, behind, valid.new_tensor(nearest), valid.new_tensor(farthest)])
+    blur = camera.coc_px(torch.cat([extremes, _sample(valid)]).reshape(1, 1, 1, -1), width).abs().flatten()
+    smallest, largest, blur = float(blur[:2].min()), float(blur[2:4].max()), blur[4:]
     extent = f"({near:.4g} to {far:.4g} m)" if near < far else f"({near:.4g} m)"
-    of_bits = far <= 65535 and whole_numbers(finite)
+    is_whole = far <= 65535 and whole_numbers(finite)
     sharp_px = max(_SHARP_PX, _SHARP_WIDTHS * width)
     is_wide_open = float(camera.f_number) < _WIDEST_F_NUMBER and largest > _LARGE_WIDTHS * width
-    is_too_blurred = is_wide_open or _share_at(blur, 0.99) > _LARGEST_WIDTHS * width
-    is_sharp = least <= sharp_px
+    is_too_blurred = is_wide_open or _quantile(blur, 0.99) > _LARGEST_WIDTHS * width
+    is_sharp = smallest <= sharp_px
     factor = next((factor for factor in _FACTORS if near * factor <= focus_m <= far * factor), None)
-    is_far_off = factor is not None and not near / _FAR_OFF <= focus_m <= far * _FAR_OFF
+    is_far_off = factor is not None and not near / _FAR_OFF_RATIO <= focus_m <= far * _FAR_OFF_RATIO
     if (not is_sharp and not (is_too_blurred and near <= focus_m <= far)) or is_far_off:
-        message = _out_of_focus(near, far, extent, focus_m, of_bits, factor, kind, scale)
+        message = _out_of_focus(near, far, extent, focus_m, is_whole, factor, kind, scale)
         return [Mistake("focus", message if is_sharp else f"nothing is in focus: {message}")]
-    found = []
-    is_of_bits, is_of_shares = of_bits and far <= 255 and far - near >= 64, 0.9 < far <= 1.0 and near < 0.05
-    if kind != "relative" and (is_of_bits or is_of_shares):
-        told = f"whole numbers {extent}, as files of 8 bits hold" if is_of_bits else f"between 0 and 1 {extent}"
-        found.append(Mistake("bits", f"all depth is {told}; if it is relative, {_RELATIVE}"))
-    elif _share_at(finite, 0.05) > _FAR_M and largest <= sharp_px and (of_bits or focus_m < math.inf):
+    mistakes = []
+    is_8_bit, is_unit_range = is_whole and far <= 255 and far - near >= 64, 0.9 < far <= 1.0 and near < 0.05
+    if kind != "relative" and (is_8_bit or is_unit_range):
+        description = f"whole numbers {extent}, as files of 8 bits hold" if is_8_bit else f"between 0 and 1 {extent}"
+        mistakes.append(Mistake("bits", f"all depth is {description}; if it is relative, {_RELATIVE}"))
+    elif _quantile(finite, 0.05) > _FAR_M and largest <= sharp_px and (is_whole or focus_m < math.inf):
         unit = _advice(0.001, scale)
         message = f"all depth is far {extent}, and nothing is blurred; is it {unit}? The focus too is in metres"
-        found.append(Mistake("far", message))
+        mistakes.append(Mistake("far", message))
     if is_too_blurred:
-        found.append(Mistake("blur", _too_blurred(largest, width, far, extent, camera)))
+        mistakes.append(Mistake("blur", _too_blurred(largest, width, far, extent, camera)))
     if (focal_mm := float(camera.focal_length_mm)) < _SHORTEST_WIDTHS * (sensor_mm := float(camera.sensor_width_mm)):
         lens = f"a focal length of {focal_mm:.4g} mm on a sensor of {sensor_mm:.4g} mm is shorter than any lens's"
-        found.append(Mistake("lens", f"{lens}; --focal-length-mm and --sensor-width-mm take millimetres"))
-    return found
+        mistakes.append(Mistake("lens", f"{lens}; --focal-length-mm and --sensor-width-mm take millimetres"))
+    return mistakes
 
 
 def _out_of_focus(
@@ -193,7 +193,7 @@ def _out_of_focus(
     far: float,
     extent: str,
     focus_m: float,
-    of_bits: bool,
+    is_whole: bool,
     factor: float | None,
     kind: DepthKind | Literal["relative"],
     scale: float | None,
@@ -207,17 +207,17 @@ def _out_of_focus(
             "disparity needs its scale, the baseline in metres times the focal length in pixels (--depth-scale, "
             f"{'not given' if scale is None else f'now {scale:g}'}); if it is unknown, {_RELATIVE}"
         )
-    elif kind != "relative" and of_bits and far <= 255:
+    elif kind != "relative" and is_whole and far <= 255:
         hints.append(f"its whole numbers are those of a file of 8 bits; if they are relative depth, {_RELATIVE}")
     elif kind != "relative" and 0.9 < far <= 1.0 and focus_m > far:
         hints.append(f"if these are relative depth from 0 to 1, {_RELATIVE}")
     elif kind != "relative" and factor is not None:
         hints.append(f"is it {_advice(factor, scale)}?")
-        if factor > 1.0 and far >= _HAND_M and scale is None:
+        if factor > 1.0 and far >= _NEAR_M and scale is None:
             hints.append(f"or is the focus in {_UNITS[1.0 / factor]} (--focus-m {focus_m / factor:.4g})?")
     if kind in ("z", "distance") and focus_m < near:
         hints.append("if near has large values in it, it is disparity (--depth-kind disparity)")
-    if far < _HAND_M:
+    if far < _NEAR_M:
         hints.append("all of it lies within a hand's breadth")
     hints.append("if the depth is right, focus with --focus-m METRES or --focus-at X,Y")
     return f"the focus at {focus_m:.4g} m is {side} than all depth {extent}; {'; '.join(hints)}"
@@ -229,7 +229,7 @@ def _pixels(count: float) -> str:
 
 def _too_blurred(largest: float, width: int, far: float, extent: str, camera: Camera) -> str:
     """Message for a blur radius that is larger than lenses make."""
-    hand = "all depth lies within a hand's breadth" if far < _HAND_M else "the depth"
+    hand = "all depth lies within a hand's breadth" if far < _NEAR_M else "the depth"
     return (
         f"a blur radius of {_pixels(largest)} px on an image of {width} px is more than a lens makes: {hand} {extent}, "
         f"the focus {float(camera.focus_m):.4g} m, the opening {2 * float(camera.aperture_radius_m):.4g} m across "
@@ -262,7 +262,7 @@ def whole_numbers(values: Tensor) -> bool:
     return bool((sample == sample.round()).all()) and sample.unique().numel() >= 16
 
 
-def _share_at(values: Tensor, share: float) -> float:
+def _quantile(values: Tensor, share: float) -> float:
     """Quantile of a sample of the values: a share ``share`` of them does not exceed it."""
     sample = _sample(values).float()
     return float(sample.sort().values[min(sample.numel() - 1, int(share * sample.numel()))])

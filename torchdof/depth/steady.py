@@ -11,15 +11,15 @@ from .motion import motion_between, sample, shifted
 
 __all__ = ["Steady", "SteadyFrames"]
 
-# Inverse depths are one surface if they differ by less than _NOISES times the noise of the map, clamped to _ALIKE.
-_FORGET = 0.96  # share of the votes kept from frame to frame; larger: slower changes between the two surfaces
+# Inverse depths are one surface if their relative difference is at most _NOISES times the noise, clamped to _TOLERANCE.
+_NOISES = 4.0  # larger: more depths count as the same surface
+_TOLERANCE = (0.02, 0.15)
+_VOTE_DECAY = 0.96  # share of the votes kept from frame to frame; larger: slower changes between the two surfaces
 _GAIN = 1 / 8  # smallest weight of a new depth in the running mean; larger: less smoothing, less lag
-_ALIKE = (0.02, 0.15)  # smallest and largest relative difference of inverse depths of one surface
-_NOISES = 4.0  # multiple of the noise; larger: more depths count as the same surface
 _CHANGE = (0.02, 0.08)  # smallest and largest threshold on the change of the image (square root of light over its mean)
-_CUT = 0.25  # share of unchanged pixels below which a frame starts a new shot
+_CUT_SHARE = 0.25  # share of unchanged pixels below which a frame starts a new shot
 _MOVED_PX = 5  # px; depth that differs over a square of this side has moved; jittering edges are thinner
-_MARGIN = (1.5, 1.0)  # the second surface takes over with more than 1.5 times the votes of the first, plus 1
+_SWAP_MARGIN = (1.5, 1.0)  # the second surface takes over with more than 1.5 times the votes of the first, plus 1
 
 
 class Steady:
@@ -125,15 +125,15 @@ class SteadyFrames:
         steady: Tensor | None = None
         while self._next <= place:
             image, depth = self._read(self._next)
-            for begin in {start, self._start(self._next + self._LEAD)}:
-                if begin == self._next:
-                    self._filters[begin] = Steady()
-                if begin in self._filters:
-                    filtered = self._filters[begin](image, depth)
-                    steady = filtered if begin == start else steady
+            for first in {start, self._start(self._next + self._LEAD)}:
+                if first == self._next:
+                    self._filters[first] = Steady()
+                if first in self._filters:
+                    filtered = self._filters[first](image, depth)
+                    steady = filtered if first == start else steady
             self._next += 1
-        self._filters = {begin: kept for begin, kept in self._filters.items() if begin >= start}
-        assert steady is not None  # the loop ran: place was ahead
+        self._filters = {first: filter_ for first, filter_ in self._filters.items() if first >= start}
+        assert steady is not None  # the loop ran at least once: self._next <= place
         return steady
 
     def _start(self, place: int) -> int:
@@ -146,7 +146,7 @@ def _first_memory(inverse: Tensor) -> Tensor:
     return torch.cat([inverse, inverse, inverse.isfinite().float(), torch.zeros_like(inverse)], dim=1)
 
 
-def _next_memory(now: Tensor, before: Tensor, memory: Tensor, inverse: Tensor) -> Tensor:
+def _next_memory(now: Tensor, previous: Tensor, memory: Tensor, inverse: Tensor) -> Tensor:
     """Memory ``[B, 4, H, W]`` after one more frame.
 
     1. Find the motion of the image, and the pixels that it explains; move the memory along.
@@ -154,35 +154,35 @@ def _next_memory(now: Tensor, before: Tensor, memory: Tensor, inverse: Tensor) -
     3. Find areas whose depth has moved; they start anew.
     4. Update the means and votes of both surfaces, and swap them where the second one wins.
     """
-    level = before.clamp(min=0).sqrt().mean((1, 2, 3), keepdim=True).clamp(min=1e-12)
-    now, before = (frame.clamp(min=0).sqrt() / level for frame in (now, before))
+    level = previous.clamp(min=0).sqrt().mean((1, 2, 3), keepdim=True).clamp(min=1e-12)
+    now, previous = (frame.clamp(min=0).sqrt() / level for frame in (now, previous))
     flow = motion_between(
-        now.clamp(max=3), before.clamp(max=3), (now - before).abs().amax(1, keepdim=True) > _CHANGE[0]
+        now.clamp(max=3), previous.clamp(max=3), (now - previous).abs().amax(1, keepdim=True) > _CHANGE[0]
     )
-    change = F.avg_pool2d((now - sample(before, flow)).abs().mean(1, keepdim=True), 3, 1, 1, count_include_pad=False)
+    change = F.avg_pool2d((now - sample(previous, flow)).abs().mean(1, keepdim=True), 3, 1, 1, count_include_pad=False)
     noise = change.flatten(1).median(dim=1).values.reshape(-1, 1, 1, 1)
     is_kept = change <= (3.0 * noise).clamp(*_CHANGE)
-    is_kept = is_kept & (is_kept.float().mean((1, 2, 3), keepdim=True) >= _CUT)
+    is_kept = is_kept & (is_kept.float().mean((1, 2, 3), keepdim=True) >= _CUT_SHARE)
     first, second, votes, second_votes = shifted(memory, flow).split(1, dim=1)
 
     is_seen, is_known = inverse.isfinite(), is_kept & (votes > 0)
     difference = (inverse - first).abs() / torch.maximum(inverse, first).clamp(min=1e-30)
     both = is_seen & is_known
     typical = torch.where(both, difference, torch.nan).flatten(1).nanmedian(dim=1).values.nan_to_num()
-    alike = (_NOISES * 1.48 * typical).clamp(*_ALIKE).reshape(-1, 1, 1, 1)
-    is_first = both & (difference <= alike)
+    tolerance = (_NOISES * 1.48 * typical).clamp(*_TOLERANCE).reshape(-1, 1, 1, 1)
+    is_first = both & (difference <= tolerance)
     differs = both & ~is_first
-    core = F.avg_pool2d(differs.float(), _MOVED_PX, 1, _MOVED_PX // 2) > 0.99
-    has_moved = differs & (F.max_pool2d(core.float(), _MOVED_PX + 2, 1, _MOVED_PX // 2 + 1) > 0)
+    moved_core = F.avg_pool2d(differs.float(), _MOVED_PX, 1, _MOVED_PX // 2) > 0.99
+    has_moved = differs & (F.max_pool2d(moved_core.float(), _MOVED_PX + 2, 1, _MOVED_PX // 2 + 1) > 0)
     has_moved = has_moved | (differs & (flow.abs().amax(1, keepdim=True) > 0))
     is_known = is_known & ~has_moved
 
-    votes, second_votes = _FORGET * votes + is_first, _FORGET * second_votes
+    votes, second_votes = _VOTE_DECAY * votes + is_first, _VOTE_DECAY * second_votes
     first = torch.where(is_first, first + (inverse - first) * (1.0 / votes.clamp(min=1.0)).clamp(min=_GAIN), first)
-    is_second = differs & (second_votes > 0) & ((inverse - second).abs() <= alike * torch.maximum(inverse, second))
+    is_second = differs & (second_votes > 0) & ((inverse - second).abs() <= tolerance * torch.maximum(inverse, second))
     second_votes = torch.where(differs, torch.where(is_second, second_votes, 0.0) + 1.0, second_votes)
     second = torch.where(is_second, second + (inverse - second) / second_votes, torch.where(differs, inverse, second))
-    wins = differs & (second_votes > _MARGIN[0] * votes + _MARGIN[1])
+    wins = differs & (second_votes > _SWAP_MARGIN[0] * votes + _SWAP_MARGIN[1])
     first, second = torch.where(wins, second, first), torch.where(wins, first, second)
     votes, second_votes = torch.where(wins, second_votes, votes), torch.where(wins, votes, second_votes)
     return torch.where(is_known, torch.cat([first, second, votes, second_votes], dim=1), _first_memory(inverse))

@@ -44,30 +44,30 @@ def pairs_in(images: str | os.PathLike[str], depths: str | os.PathLike[str] | No
         FileNotFoundError: If a folder is missing or has no image.
         ValueError: If an image has no depth file, or several.
     """
-    photographs, maps = _by_stem(images, _IMAGES), {} if depths is None else _by_stem(depths, _DEPTHS)
+    photographs, depth_files = _by_stem(images, _IMAGES), {} if depths is None else _by_stem(depths, _DEPTHS)
     if not photographs:
         raise FileNotFoundError(f"{images}: no images here ({' '.join(_IMAGES)})")
     pairs = []
     for stem, (image, *others) in photographs.items():
-        found = maps.get(stem, [])
+        depths_found = depth_files.get(stem, [])
         if others:
             raise ValueError(f"{image}: there is {others[0].name} of the same name; keep one of them")
-        if depths is not None and len(found) != 1:
-            listed = " and ".join(path.name for path in found) or "none"
-            raise ValueError(f"{image}: needs one depth map {stem}.* in {depths}, found {listed}")
-        pairs.append(Pair(str(image), str(found[0]) if found else None))
+        if depths is not None and len(depths_found) != 1:
+            names = " and ".join(path.name for path in depths_found) or "none"
+            raise ValueError(f"{image}: needs one depth map {stem}.* in {depths}, found {names}")
+        pairs.append(Pair(str(image), str(depths_found[0]) if depths_found else None))
     return pairs
 
 
 def _by_stem(folder: str | os.PathLike[str], suffixes: tuple[str, ...]) -> dict[str, list[Path]]:
-    found: dict[str, list[Path]] = {}
-    for path in sorted(_there(folder).absolute().iterdir()):
+    by_stem: dict[str, list[Path]] = {}
+    for path in sorted(_existing_folder(folder).absolute().iterdir()):
         if path.suffix.lower() in suffixes and not path.name.startswith("."):
-            found.setdefault(path.stem, []).append(path)
-    return found
+            by_stem.setdefault(path.stem, []).append(path)
+    return by_stem
 
 
-def _there(folder: str | os.PathLike[str]) -> Path:
+def _existing_folder(folder: str | os.PathLike[str]) -> Path:
     if not Path(folder).is_dir():
         raise FileNotFoundError(f"{folder}: there is no such folder")
     return Path(folder)
@@ -117,12 +117,12 @@ def make_dataset(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     rows = shard_rows(pairs, per_shard, copies)
-    made = RenderShards(out, blur, format=format, **render)  # validates the arguments before Ray starts
+    renderer = RenderShards(out, blur, format=format, **render)  # validates the arguments before Ray starts
     digest = hashlib.sha256(json.dumps(rows).encode()).hexdigest()
     settings = {"images": len(pairs), "copies": copies, "per_shard": per_shard, "sha256_of_samples": digest}
-    settings = json.loads(json.dumps(settings | made.settings()))  # tuples become lists
-    _same_as_before(out / "plan.json", settings)
-    missing = [row for row in rows if made.samples_of(**row) is None]
+    settings = json.loads(json.dumps(settings | renderer.settings()))  # tuples become lists
+    _check_settings(out / "plan.json", settings)
+    missing = [row for row in rows if renderer.samples_of(**row) is None]
     again = sum(samples_of(out / name_of(row["shard"], format)) is not None for row in missing)
     say(f"{len(rows) - len(missing)} of {len(rows)} shards are there already")
     if again:
@@ -142,14 +142,16 @@ def make_dataset(
             compute=ray.data.ActorPoolStrategy(size=min(workers, len(missing))),
             num_cpus=1,
         )
-        start, count, left = time.perf_counter(), 0, {row["shard"]: len(json.loads(row["samples"])) for row in missing}
+        start, count = time.perf_counter(), 0
+        samples_left = {row["shard"]: len(json.loads(row["samples"])) for row in missing}
         for row in results.iter_rows():
             count += not row["error"]
-            left[row["shard"]] -= 1
-            if not left[row["shard"]]:
+            samples_left[row["shard"]] -= 1
+            if not samples_left[row["shard"]]:
                 say(f"{name_of(row['shard'], format)} is complete")
-        s = time.perf_counter() - start
-        say(f"{count} samples in {s:.1f} s: {count / s:.2f} images/s, {count / s / workers:.2f} a worker")
+        seconds = time.perf_counter() - start
+        rate = count / seconds
+        say(f"{count} samples in {seconds:.1f} s: {rate:.2f} images/s, {rate / workers:.2f} a worker")
     summary = summary_of(out)
     _describe(out, summary, settings)
     for image, problem in summary.broken:
@@ -159,20 +161,20 @@ def make_dataset(
 
 def summary_of(out: str | os.PathLike[str]) -> Summary:
     """Contents of the complete shards of a folder; ``FileNotFoundError`` if the folder is missing."""
-    shards = [path for path in sorted(_there(out).glob("shard-*")) if path.suffix in SUFFIXES.values()]
+    shards = [path for path in sorted(_existing_folder(out).glob("shard-*")) if path.suffix in SUFFIXES.values()]
     noted = [samples for samples in map(samples_of, shards) if samples is not None]
     rows = [row for samples in noted for row in samples]
     broken = [(row["image"], row["error"]) for row in rows if row["error"]]
     return Summary(len(rows) - len(broken), len(noted), broken, sum(row["seconds"] for row in rows))
 
 
-def _same_as_before(path: Path, settings: dict[str, Any]) -> None:
+def _check_settings(path: Path, settings: dict[str, Any]) -> None:
     """Writes the settings of a new folder, or refuses a folder that was begun with other settings."""
     if not path.is_file():
         write_text(path, json.dumps(settings, indent=1))
     try:
-        before = json.loads(path.read_bytes())
-        differing = [name for name, value in settings.items() if before.get(name) != value]
+        recorded = json.loads(path.read_bytes())
+        differing = [name for name, value in settings.items() if recorded.get(name) != value]
     except (ValueError, AttributeError):
         raise ValueError(f"{path}: cannot be read; put it back, or use another folder") from None
     if differing:
@@ -184,9 +186,9 @@ def _same_as_before(path: Path, settings: dict[str, Any]) -> None:
 
 def _describe(out: Path, summary: Summary, settings: dict[str, Any]) -> None:
     """Writes the data set's card and the list of broken inputs."""
-    facts: dict[str, Any] = {"samples": summary.samples, "shards": summary.shards}
-    facts |= {"inputs left out": f"{len(summary.broken)}, listed in broken.txt"}
-    facts |= {"time": f"{summary.seconds / max(1, summary.samples):.3f} s of one core a sample", **settings}
-    lines = [f"| {name} | {fact if isinstance(fact, str) else json.dumps(fact)} |" for name, fact in facts.items()]
+    rows: dict[str, Any] = {"samples": summary.samples, "shards": summary.shards}
+    rows |= {"inputs left out": f"{len(summary.broken)}, listed in broken.txt"}
+    rows |= {"time": f"{summary.seconds / max(1, summary.samples):.3f} s of one core a sample", **settings}
+    lines = [f"| {name} | {fact if isinstance(fact, str) else json.dumps(fact)} |" for name, fact in rows.items()]
     write_text(out / "README.md", "\n".join([_CARD, "| what | how much |", "| --- | --- |", *lines, ""]))
     write_text(out / "broken.txt", "".join(f"{image}\t{problem}\n" for image, problem in summary.broken))

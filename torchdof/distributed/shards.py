@@ -26,7 +26,7 @@ from ..augmentation import RandomDepthOfField
 from ..depth.holes import resolve_holes
 from ..depth.reading import read_depth
 from ..depth.relative import from_relative
-from ..io.atomic import whole_file, write_text
+from ..io.atomic import atomic_file, write_text
 from ..io.images import Picture, read_image, read_values, write_image
 from ..io.transfer import Transfer
 from ..module import depth_of_field
@@ -37,7 +37,7 @@ Format = Literal["webdataset", "parquet"]
 
 SUFFIXES = {"webdataset": ".tar", "parquet": ".parquet"}
 _WRITERS = {"webdataset": "webdataset", "parquet": "pyarrow"}
-_KEPT = ("blurred", "sharp", "depth")
+_FILES = ("blurred", "sharp", "depth")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,7 +149,7 @@ class RenderShards:
         *,
         depth: Mapping[str, Any] | None = None,
         format: Format = "webdataset",
-        keep: Sequence[str] = _KEPT,
+        keep: Sequence[str] = _FILES,
         seed: int = 0,
         transfer: Transfer | None = None,
         picture: Literal[".png", ".exr"] = ".png",
@@ -165,16 +165,16 @@ class RenderShards:
         choice("picture", picture, (".png", ".exr"))
         if importlib.util.find_spec(_WRITERS[format]) is None:
             raise ModuleNotFoundError(f"{format} needs {_WRITERS[format]}: pip install 'torchdof[ray]'")
-        if not keep or isinstance(keep, str) or not set(keep) <= set(_KEPT):
-            raise ValueError(f"keep must be some of {', '.join(_KEPT)}, got {show(keep)}")
+        if not keep or isinstance(keep, str) or not set(keep) <= set(_FILES):
+            raise ValueError(f"keep must be some of {', '.join(_FILES)}, got {show(keep)}")
         if not isinstance(self.blur, RandomDepthOfField):
             raise ValueError(f"blur must be a RandomDepthOfField, got {show(blur)}")
         self._read_depth = _read_relative if self.depth.get("kind") == "relative" else read_depth
-        known = inspect.signature(self._read_depth)
+        signature = inspect.signature(self._read_depth)
         try:
-            known.bind("", **self.depth)
+            signature.bind("", **self.depth)
         except TypeError as error:
-            raise ValueError(f"depth must be some of {', '.join([*known.parameters][1:])}: {error}") from None
+            raise ValueError(f"depth must be some of {', '.join([*signature.parameters][1:])}: {error}") from None
         if threads is not None:
             torch.set_num_threads(whole("threads", threads, 1, 4096))
 
@@ -190,8 +190,8 @@ class RenderShards:
         """
         rows: list[dict[str, Any]] = []
         for shard, samples in zip(batch["shard"], batch["samples"], strict=True):
-            noted = self.samples_of(shard, samples) or self._make(shard, samples)
-            rows += [{"shard": int(shard), **row} for row in noted]
+            notes = self.samples_of(shard, samples) or self._make(shard, samples)
+            rows += [{"shard": int(shard), **row} for row in notes]
         return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
     def samples_of(self, shard: int, samples: str) -> list[dict[str, Any]] | None:
@@ -206,7 +206,7 @@ class RenderShards:
             **{name: getattr(self.blur, name) for name in ("focus_m", "f_number")},
             "camera": repr(self.blur.camera),
             "lenses": {table.fingerprint(): table.name or table.family for table in lenses},
-            "options": _plain(self.blur.renderings[0].arguments()),
+            "options": _json_values(self.blur.renderings[0].arguments()),
         }
 
     def _source(self, samples: str) -> str:
@@ -223,13 +223,13 @@ class RenderShards:
             start, error = time.process_time(), ""
             try:
                 records.append(self._record(**sample))
-            except (OSError, ValueError, MemoryError, RuntimeError) as broken:  # torch's allocator raises RuntimeError
-                error = _text(str(broken) or type(broken).__name__)
+            except (OSError, ValueError, MemoryError, RuntimeError) as failure:  # torch's allocator raises RuntimeError
+                error = _text(str(failure) or type(failure).__name__)
             row = {"key": sample["key"], "image": _text(sample["image"]), "error": error}
             rows.append({**row, "seconds": round(time.process_time() - start, 4)})
-        with whole_file(path) as part:
-            (_write_tar if self.format == "webdataset" else _write_parquet)(part, records)
-            notes = {"bytes": part.stat().st_size, "source": source, "samples": rows}
+        with atomic_file(path) as temporary:
+            (_write_tar if self.format == "webdataset" else _write_parquet)(temporary, records)
+            notes = {"bytes": temporary.stat().st_size, "source": source, "samples": rows}
             write_text(path.with_suffix(".json"), json.dumps(notes, indent=1))  # before the shard
         return rows
 
@@ -239,8 +239,8 @@ class RenderShards:
         """One sample: its key, the contents of its files by name, and its parameters as ``json``."""
         source = read_image(image, self.transfer)
         metres = at_size_of(source.pixels, self._read_depth(depth or image, **self.depth))
-        own = hashlib.sha256(f"{self.seed} {key}".encode()).digest()
-        drawn = self.blur.draw(torch.Generator().manual_seed(int.from_bytes(own[:8], "little") >> 1))
+        digest = hashlib.sha256(f"{self.seed} {key}".encode()).digest()
+        drawn = self.blur.draw(torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1))
         camera = self.blur.camera.replace(
             focus_m=float(drawn["focus_m"]) if focus_m is None else focus_m,
             f_number=float(drawn["f_number"]) if f_number is None else f_number,
@@ -255,15 +255,15 @@ class RenderShards:
         }
         table, (height, width) = options.table, blurred.shape[-2:]
         parameters = {
-            **_plain(vars(camera) | options.arguments()),
+            **_json_values(vars(camera) | options.arguments()),
             **{"table": table.name or table.family, "table_fingerprint": table.fingerprint()},
             "aperture": None if table.aperture is None else repr(table.aperture),
             **{"image": _text(image), "depth": depth and _text(depth), "height": height, "width": width},
             "largest_coc_px": float(camera.coc_px(metres, width).abs().nan_to_num().max()),
             **{"seed": self.seed, "torchdof": importlib.metadata.version("torchdof")},
         }
-        kept = {name: _bytes(name, write) for name, write in files.items() if name.partition(".")[0] in self.keep}
-        return {"key": key, **kept, "json": parameters}
+        contents = {name: _bytes(name, write) for name, write in files.items() if name.partition(".")[0] in self.keep}
+        return {"key": key, **contents, "json": parameters}
 
 
 def _read_relative(
@@ -289,7 +289,7 @@ def _text(name: str) -> str:
     return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
-def _plain(arguments: Mapping[str, Any]) -> dict[str, Any]:
+def _json_values(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Numbers and strings of a camera or of options, as JSON values."""
     numbers = {name: float(value) if isinstance(value, Tensor) else value for name, value in arguments.items()}
     return {name: value for name, value in numbers.items() if name != "table"}

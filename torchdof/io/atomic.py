@@ -16,13 +16,13 @@ from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
-__all__ = ["unwound_on_termination", "whole_file", "write_text"]
+__all__ = ["exit_on_signals", "atomic_file", "write_text"]
 
 _DAY_S = 86_400.0
 
 
 @contextlib.contextmanager
-def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary file in the folder of ``path``, renamed to ``path`` at the end, or removed on any error.
 
     Raises:
@@ -31,7 +31,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     Example:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with whole_file(folder + "/note.txt") as part:
+        ...     with atomic_file(folder + "/note.txt") as part:
         ...         _ = part.write_text("complete")
         ...     Path(folder + "/note.txt").read_text()
         'complete'
@@ -46,45 +46,45 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     if not os.access(target.parent, os.W_OK):
         raise PermissionError(f"{path}: may not write to the folder {target.parent}")
     _remove_abandoned(target.parent)
-    part = target.with_name(f".{uuid.uuid4().hex}.part{target.suffix}")
-    with unwound_on_termination():
+    temporary = target.with_name(f".{uuid.uuid4().hex}.part{target.suffix}")
+    with exit_on_signals():
         try:
-            yield part
-            with part.open("rb+") as file:
+            yield temporary
+            with temporary.open("rb+") as file:
                 os.fsync(file.fileno())
-            os.replace(part, target)
+            os.replace(temporary, target)
         finally:
-            part.unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Writes a text file in UTF-8, whole or not at all."""
-    with whole_file(path) as part:
-        part.write_text(text, encoding="utf-8")
+    with atomic_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 @functools.cache  # once for each folder, because listing many frames takes long
 def _remove_abandoned(folder: Path) -> None:
     """Removes temporary files older than a day, left by killed processes."""
-    for part in folder.glob("." + "[0-9a-f]" * 32 + ".part*"):
+    for temporary in folder.glob("." + "[0-9a-f]" * 32 + ".part*"):
         with contextlib.suppress(OSError):
-            if time.time() - part.stat().st_mtime > _DAY_S:
-                part.unlink()
+            if time.time() - temporary.stat().st_mtime > _DAY_S:
+                temporary.unlink()
 
 
 @contextlib.contextmanager
-def unwound_on_termination() -> Iterator[None]:
-    """Turns SIGTERM and SIGHUP into ``SystemExit``, so that ``finally`` blocks run; keeps existing handlers."""
+def exit_on_signals() -> Iterator[None]:
+    """Turns SIGTERM and SIGHUP into ``SystemExit``, so that ``finally`` blocks run; handlers of the caller stay."""
 
-    def leave(number: int, _: FrameType | None) -> NoReturn:
+    def exit_with_status(number: int, _: FrameType | None) -> NoReturn:
         raise SystemExit(128 + number)  # the exit status that shells use for signals
 
-    ends = {getattr(signal, name, signal.SIGTERM) for name in ("SIGTERM", "SIGHUP")}
-    main = threading.current_thread() is threading.main_thread()  # only this thread may set handlers
-    unhandled = [number for number in ends if main and signal.getsignal(number) == signal.SIG_DFL]
+    signals = {getattr(signal, name, signal.SIGTERM) for name in ("SIGTERM", "SIGHUP")}
+    is_main_thread = threading.current_thread() is threading.main_thread()  # only this thread may set handlers
+    unhandled = [number for number in signals if is_main_thread and signal.getsignal(number) == signal.SIG_DFL]
     try:
         for number in unhandled:
-            signal.signal(number, leave)
+            signal.signal(number, exit_with_status)
         yield
     finally:
         for number in unhandled:

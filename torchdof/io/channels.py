@@ -25,24 +25,25 @@ def colour_channels(parts: Parts, layer: str | None, layered: bool) -> tuple[int
     """
     layers_with_colour = []
     for part, (label, names) in enumerate(parts):
-        prefixes = dict.fromkeys(name.rpartition(".")[0] if layered else "" for name in names)
-        for prefix in prefixes:
-            dot = prefix + "." if prefix else ""
-            for wanted in (("R", "G", "B"), ("Y",)):
-                if all(dot + name in names for name in wanted):
-                    plain = (*wanted, "A") if dot + "A" in names else wanted
-                    layers_with_colour.append((prefix, label, part, [names.index(dot + name) for name in plain], plain))
+        layer_names = dict.fromkeys(name.rpartition(".")[0] if layered else "" for name in names)
+        for layer_name in layer_names:
+            start = layer_name + "." if layer_name else ""
+            for colours in (("R", "G", "B"), ("Y",)):
+                if all(start + name in names for name in colours):
+                    channels = (*colours, "A") if start + "A" in names else colours
+                    indices = [names.index(start + name) for name in channels]
+                    layers_with_colour.append((layer_name, label, part, indices, channels))
                     break
     if layer is None:
         layers_with_colour.sort(key=lambda entry: entry[0] != "")
         chosen = layers_with_colour[:1]
     else:
-        chosen = [f for f in layers_with_colour if layer in (f[0], f[1]) or f[0].startswith(layer + ".")]
+        chosen = [found for found in layers_with_colour if layer in found[:2] or found[0].startswith(layer + ".")]
     if not chosen:
-        every = ", ".join(name for _, names in parts for name in names)
+        all_names = ", ".join(name for _, names in parts for name in names)
         if layer is None:
-            raise ValueError(f"has no colour: expected channels R, G, B or Y, found {every}")
-        layers = ", ".join(dict.fromkeys(f[0] or f[1] or "(unnamed)" for f in layers_with_colour)) or "none"
+            raise ValueError(f"has no colour: expected channels R, G, B or Y, found {all_names}")
+        layers = ", ".join(dict.fromkeys(found[0] or found[1] or "(unnamed)" for found in layers_with_colour)) or "none"
         raise ValueError(f"has no layer {layer!r} with colour; its layers with colour: {layers}")
     return chosen[0][2:]
 
@@ -57,8 +58,8 @@ def depth_channel(parts: Parts) -> tuple[int, int] | None:
     for part, (label, names) in enumerate(parts):
         for index, name in enumerate(names):
             words = name.lower().split(".")
-            of_depth = len(words) > 1 and words[-2] in ("depth", "z", "zdepth") and words[-1] in ("z", "v", "y", "r")
-            whole_part = label.lower() in ("depth", "z", "zdepth") and len(names) == 1
-            if name.lower() == "z" or words[-1] == "depth" or of_depth or whole_part:
+            in_layer = len(words) > 1 and words[-2] in ("depth", "z", "zdepth") and words[-1] in ("z", "v", "y", "r")
+            in_own_part = label.lower() in ("depth", "z", "zdepth") and len(names) == 1
+            if name.lower() == "z" or words[-1] == "depth" or in_layer or in_own_part:
                 return part, index
     return None

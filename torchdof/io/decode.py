@@ -21,11 +21,10 @@ import numpy as np
 from .memory import free_bytes
 from .metadata import Metadata, kept_metadata, upright
 
-__all__ = ["MOST_ATTRIBUTES", "Part", "check_chunks", "first_line", "named_in_utf8"]
-__all__ += ["read_array", "read_parts"]
+__all__ = ["MAX_ATTRIBUTES", "Part", "check_png", "first_line", "read_array", "read_parts", "utf8_name"]
 
-MAX_PIXELS = 2**28
-MOST_ATTRIBUTES = 4096
+MAX_PIXELS = 2**28  # of an image or array; a larger limit allows damaged headers to claim more memory
+MAX_ATTRIBUTES = 4096
 """Largest number of attributes in all parts of an EXR file together; renderers write a few hundred."""
 
 
@@ -45,7 +44,7 @@ class Part:
 
 
 @contextlib.contextmanager
-def named_in_utf8(path: Path) -> Iterator[str]:
+def utf8_name(path: Path) -> Iterator[str]:
     """A UTF-8 name of a file, which OpenImageIO needs; other names get a temporary symbolic link."""
     with contextlib.ExitStack() as folders:
         try:
@@ -66,10 +65,10 @@ def read_parts(path: Path) -> list[Part]:
     """
     if path.suffix.lower() == ".pfm":
         return [_read_pfm(path)]
-    check_chunks(path)
+    check_png(path)
     _check_attributes(path)
     try:
-        with named_in_utf8(path) as name:
+        with utf8_name(path) as name:
             return list(_parts(path, name))
     except UnicodeDecodeError:
         raise OSError(f"{path}: is damaged (a name in its header is not text)") from None
@@ -85,12 +84,12 @@ def _parts(path: Path, name: str) -> Iterator[Part]:
     if source is None:
         raise OSError(f"{path}: cannot be read ({first_line(oiio.geterror())})")
     specs: list[Any] = []
-    is_exr, promised = source.format_name() == "openexr", 0
+    is_exr, total_bytes = source.format_name() == "openexr", 0
     try:
         while (is_exr or not specs) and source.seek_subimage(len(specs), 0):
             specs.append(spec := source.spec())
             pixel_bytes = spec.nchannels * (spec.format.size() + 4)
-            promised += _check_size(path, spec.width, spec.height, pixel_bytes, promised)
+            total_bytes += _check_size(path, spec.width, spec.height, pixel_bytes, total_bytes)
             if spec.deep:
                 raise ValueError(f"{path}: holds deep samples; flatten it to one sample a pixel first")
             _check_colours(path, spec)
@@ -124,22 +123,22 @@ def _parts(path: Path, name: str) -> Iterator[Part]:
         source.close()
 
 
-def check_chunks(path: Path) -> None:
+def check_png(path: Path) -> None:
     """Refuse a PNG that is cut short or has a wrong checksum; libpng would print its own message about it."""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        place, name = 8, b"" if content[:8] == b"\x89PNG\r\n\x1a\n" else b"IEND"
-        while name != b"IEND":
-            length, name = struct.unpack(">I4s", content[place : place + 8].ljust(8, b"\0"))
-            end = place + 8 + length
+        offset, chunk = 8, b"" if content[:8] == b"\x89PNG\r\n\x1a\n" else b"IEND"
+        while chunk != b"IEND":
+            length, chunk = struct.unpack(">I4s", content[offset : offset + 8].ljust(8, b"\0"))
+            end = offset + 8 + length
             if end + 4 > len(content):
-                raise OSError(f"{path}: is damaged or cut short (it ends within its chunk {name!r})")
-            if zlib.crc32(content[place + 4 : end]) != int.from_bytes(content[end : end + 4], "big"):
-                raise OSError(f"{path}: is damaged or cut short (its chunk {name!r} has a wrong checksum)")
-            place = end + 4
+                raise OSError(f"{path}: is damaged or cut short (it ends within its chunk {chunk!r})")
+            if zlib.crc32(content[offset + 4 : end]) != int.from_bytes(content[end : end + 4], "big"):
+                raise OSError(f"{path}: is damaged or cut short (its chunk {chunk!r} has a wrong checksum)")
+            offset = end + 4
 
 
 def _check_attributes(path: Path) -> None:
-    """Refuse an EXR with more than ``MOST_ATTRIBUTES`` attributes; OpenEXR takes minutes for 1e5.
+    """Refuse an EXR with more than ``MAX_ATTRIBUTES`` attributes; OpenEXR takes minutes for 1e5.
 
     Reference:
         OpenEXR File Layout, openexr.com.
@@ -147,32 +146,32 @@ def _check_attributes(path: Path) -> None:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         if content[:4] != b"v/1\x01" or len(content) < 9:
             return
-        several, place = bool(content[5] & 0x10), 8
-        for _ in range(MOST_ATTRIBUTES):
-            if content[place : place + 1] == b"\0":  # the end of a part's header
-                place += 1
-                if not several or content[place : place + 1] == b"\0":
+        has_parts, offset = bool(content[5] & 0x10), 8
+        for _ in range(MAX_ATTRIBUTES):
+            if content[offset : offset + 1] == b"\0":  # the end of a part's header
+                offset += 1
+                if not has_parts or content[offset : offset + 1] == b"\0":
                     return
-            type_end = content.find(b"\0", content.find(b"\0", place) + 1)
-            place = type_end + 5 + int.from_bytes(content[type_end + 1 : type_end + 5], "little")
-            if type_end < place - 2**31 or place >= len(content):  # damaged: the reader will refuse it
+            type_end = content.find(b"\0", content.find(b"\0", offset) + 1)
+            offset = type_end + 5 + int.from_bytes(content[type_end + 1 : type_end + 5], "little")
+            if type_end < offset - 2**31 or offset >= len(content):  # damaged: the reader will refuse it
                 return
-    raise ValueError(f"{path}: its headers hold more than {MOST_ATTRIBUTES} attributes, which is the limit")
+    raise ValueError(f"{path}: its headers hold more than {MAX_ATTRIBUTES} attributes, which is the limit")
 
 
 def _check_colours(path: Path, spec: Any) -> None:
     """Refuse a TIFF whose colours OpenImageIO does not convert: CIELAB, a raw mosaic, negatives."""
-    meaning = spec.get_int_attribute("tiff:PhotometricInterpretation", 2)
-    inks = spec.get_string_attribute("tiff:ColorSpace") == "CMYK"
-    if not (meaning in (1, 2, 3, 6) or (meaning == 0 and str(spec.format) == "uint8") or (meaning == 5 and inks)):
+    code = spec.get_int_attribute("tiff:PhotometricInterpretation", 2)  # 0, 1: grey; 2: RGB; 3: palette; 6: YCbCr
+    is_cmyk = code == 5 and spec.get_string_attribute("tiff:ColorSpace") == "CMYK"
+    if not (code in (1, 2, 3, 6) or (code == 0 and str(spec.format) == "uint8") or is_cmyk):
         raise ValueError(
-            f"{path}: its colours are not stored as RGB or grey (photometric interpretation {meaning}: CIELAB, a raw "
+            f"{path}: its colours are not stored as RGB or grey (photometric interpretation {code}: CIELAB, a raw "
             "mosaic, a negative or the like); convert it to RGB"
         )
 
 
 def _read_pfm(path: Path) -> Part:
-    """Reads a PFM file without OpenImageIO, which multiplies by the scale in the header and so changes disparities."""
+    """Reads a PFM file. OpenImageIO would multiply disparities by the scale in the header."""
     with path.open("rb") as file:
         words: list[bytes] = []
         while len(words) < 4 and (line := file.readline(100)):
@@ -203,11 +202,11 @@ def read_array(path: Path, key: str | None) -> np.ndarray:
                 if 2 * largest > free_bytes():
                     raise ValueError(f"holds {largest} bytes, more than there is memory for")
             with np.load(path, allow_pickle=False) as arrays:
-                listed = ", ".join(arrays.files)
+                names = ", ".join(arrays.files)
                 if key is None and len(arrays.files) != 1:
-                    raise ValueError(f"which of the arrays {listed} is depth? name it (--depth-channel)")
+                    raise ValueError(f"which of the arrays {names} is depth? name it (--depth-channel)")
                 if key is not None and key not in arrays.files:
-                    raise ValueError(f"no array {key!r}; it has {listed}")
+                    raise ValueError(f"no array {key!r}; it has {names}")
                 array = arrays[key or arrays.files[0]]
         else:
             array = np.load(path, allow_pickle=False, mmap_mode="r")

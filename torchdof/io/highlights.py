@@ -10,12 +10,13 @@ from ..validation import real_tensor, show
 
 __all__ = ["expand_highlights"]
 
-_NEAR_WHITE = (0.87, 0.97)  # linear light; a channel is unclipped below, clipped above (8-bit codes 240 and 252)
-_SHARE = (0.05, 0.2)  # share of clipped pixels in the surroundings: a lamp below, a sky or paper above
-_SURROUNDINGS = 0.04  # side of these surroundings over the longer side of the image, 31 px at least
-_RIM = 0.007  # side of the window for the colour of the rim, the same way, 5 px at least
-_ELSEWHERE = 1e-3  # weight of the surroundings in the hue; matters where the smaller window has no unclipped light
-_LITTLE = 1e-4  # weight of white in the hue; matters where all light is clipped
+_CLIPPING = (0.87, 0.97)  # linear light; a channel is unclipped below, clipped above (8-bit codes 240 and 252)
+_CLIPPED_SHARE = (0.05, 0.2)  # share of clipped pixels in the surroundings: a lamp below, a sky or paper above
+# Sides of square windows: as a share of the longer side of the image, and at least so many px.
+_SURROUNDINGS, _SURROUNDINGS_PX = 0.04, 31.0  # window of the share of clipped pixels; a larger one raises larger lamps
+_RIM, _RIM_PX = 0.007, 5.0  # window of the hue; a larger one mixes in more of the objects beside the lamp
+_FAR_HUE = 1e-3  # weight of the surroundings in the hue; matters where the rim has no unclipped light
+_WHITE = 1e-4  # weight of white in the hue; matters where all light is clipped
 
 
 def expand_highlights(light: Tensor, stops: float = 3.0) -> Tensor:
@@ -29,7 +30,7 @@ def expand_highlights(light: Tensor, stops: float = 3.0) -> Tensor:
 
     Args:
         light: ``[B, C, H, W]``, linear light of a photograph, 1 is white; without alpha.
-        stops: Most stops above white, >= 0.
+        stops: Largest rise above white in stops, >= 0; each stop doubles the light.
 
     Returns:
         The same shape, nowhere darker; the same bits where no channel is above 0.87, and ``light`` itself at 0 stops.
@@ -52,37 +53,38 @@ def expand_highlights(light: Tensor, stops: float = 3.0) -> Tensor:
         raise ValueError(f"stops must be a finite number from 0 on, got {show(stops)}")
     if stops == 0:
         return light
-    longer, most = max(light.shape[-2:]), 2.0**stops
-    clipped = _rise(light, *_NEAR_WHITE)  # [B, C, H, W]
+    limit = 2.0**stops
+    clipped = _smoothstep(light, *_CLIPPING)  # [B, C, H, W]
     any_clipped = clipped.amax(1, keepdim=True)
-    is_lamp = 1.0 - _rise(_mean(any_clipped, max(31.0, _SURROUNDINGS * longer)), *_SHARE)
-    hue = _hue_of_rim(light, 1.0 - any_clipped, longer)
+    surroundings_px = max(_SURROUNDINGS_PX, _SURROUNDINGS * max(light.shape[-2:]))
+    is_lamp = 1.0 - _smoothstep(_window_mean(any_clipped, surroundings_px), *_CLIPPED_SHARE)
+    hue = _hue_of_rim(light, 1.0 - any_clipped, surroundings_px)
 
     weights = (1.0 - clipped) * hue  # least squares of strength * hue = light over the unclipped channels
-    strength = ((weights * light).sum(1, keepdim=True) + _LITTLE) / ((weights * hue).sum(1, keepdim=True) + _LITTLE)
-    strength = strength.clamp_max(most).lerp(torch.full_like(strength, most), clipped.amin(1, keepdim=True))
-    risen = light + clipped * is_lamp * (strength * hue - light).clamp_min(0.0)
-    return torch.where(clipped > 0, risen, light)
+    strength = ((weights * light).sum(1, keepdim=True) + _WHITE) / ((weights * hue).sum(1, keepdim=True) + _WHITE)
+    strength = strength.clamp_max(limit).lerp(torch.full_like(strength, limit), clipped.amin(1, keepdim=True))
+    raised = light + clipped * is_lamp * (strength * hue - light).clamp_min(0.0)
+    return torch.where(clipped > 0, raised, light)
 
 
-def _hue_of_rim(light: Tensor, unclipped: Tensor, longer: int) -> Tensor:
+def _hue_of_rim(light: Tensor, unclipped: Tensor, surroundings_px: float) -> Tensor:
     """Colour of the brightest unclipped light around each pixel, its largest channel 1, ``[B, C, H, W]``."""
     weight = unclipped * light.amax(1, keepdim=True).clamp(0.0, 1.0) ** 4
     weighted = torch.cat([light * weight, weight], 1)
-    near, far = _mean(weighted, max(5.0, _RIM * longer)), _mean(weighted, max(31.0, _SURROUNDINGS * longer))
-    sums = near + _ELSEWHERE * far
-    colour = (sums[:, :-1] + _LITTLE * _ELSEWHERE) / (sums[:, -1:] + _LITTLE * _ELSEWHERE)
+    rim = _window_mean(weighted, max(_RIM_PX, _RIM * max(light.shape[-2:])))
+    sums = rim + _FAR_HUE * _window_mean(weighted, surroundings_px)
+    colour = (sums[:, :-1] + _WHITE * _FAR_HUE) / (sums[:, -1:] + _WHITE * _FAR_HUE)
     return colour / colour.amax(1, keepdim=True)
 
 
-def _mean(values: Tensor, width: float) -> Tensor:
+def _window_mean(values: Tensor, width: float) -> Tensor:
     """Mean over a square window about ``width`` pixels wide, cut off at the frame."""
     side = 2 * int(width / 2) + 1
     rows = functional.avg_pool2d(values, (side, 1), 1, (side // 2, 0), count_include_pad=False)
     return functional.avg_pool2d(rows, (1, side), 1, (0, side // 2), count_include_pad=False)
 
 
-def _rise(values: Tensor, low: float, high: float) -> Tensor:
+def _smoothstep(values: Tensor, low: float, high: float) -> Tensor:
     """Smoothstep from 0 at ``low`` to 1 at ``high``."""
     share = ((values - low) / (high - low)).clamp(0.0, 1.0)
     return share * share * (3.0 - 2.0 * share)

@@ -18,19 +18,19 @@ import torch
 from torch import Tensor
 
 from ..validation import real_tensor
-from .atomic import whole_file
+from .atomic import atomic_file
 from .channels import colour_channels, depth_channel
-from .decode import Part, check_chunks, first_line, named_in_utf8, read_array, read_parts
+from .decode import Part, check_png, first_line, read_array, read_parts, utf8_name
 from .paths import PixelType, existing_image, existing_map, samples_of
 from .transfer import Transfer, decode, default_transfer, encode, encode_8_bits
 
 __all__ = ["Picture", "read_image", "read_values", "write_image"]
 
 _OIIO_SAMPLE: dict[PixelType, str] = {"8": "uint8", "16": "uint16", "half": "half", "float": "float"}
-_STORED: dict[str, PixelType] = {name: sample for sample, name in _OIIO_SAMPLE.items()} | {"double": "float"}
+_SAMPLE_TYPES: dict[str, PixelType] = {name: sample for sample, name in _OIIO_SAMPLE.items()} | {"double": "float"}
 _WHITE = {"8": 255.0, "16": 65535.0, "half": 1.0, "float": 1.0}
-_HOLDS_ALPHA = (".exr", ".png", ".tif", ".tiff", ".webp")
-_HOLDS_GREY = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pfm")
+_ALPHA_SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".webp")
+_GREY_SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pfm")
 _LOSSLESS_EXR = ("none", "rle", "zip", "zips", "piz")
 
 
@@ -96,7 +96,7 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
     path = existing_image(path)
     if transfer not in (None, "linear", "srgb"):
         raise ValueError(f"transfer must be 'linear' or 'srgb', got {transfer!r}")
-    with _memory_for(path):
+    with _memory_errors_named(path):
         parts = read_parts(path)
         try:
             part, indices, names = colour_channels([(p.label, p.names) for p in parts], layer, parts[0].is_exr)
@@ -113,7 +113,7 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
 
 
 @contextlib.contextmanager
-def _memory_for(path: Path) -> Iterator[None]:
+def _memory_errors_named(path: Path) -> Iterator[None]:
     try:
         yield
     except (MemoryError, RuntimeError) as error:  # torch's allocator raises the latter
@@ -126,18 +126,18 @@ def _light(
     """Light ``[1, C, H, W]`` from stored numbers, their type, and their encoding."""
     kinds = [source.kinds[k] for k in indices]
     kind = kinds[0] if len(set(kinds)) == 1 else "float"
-    if kind not in _STORED and not source.is_exr:
+    if kind not in _SAMPLE_TYPES and not source.is_exr:
         raise ValueError(f"{path}: holds numbers of type {kind}, for which white is not defined; store 16 bits")
-    sample = _STORED.get(kind, "float")
+    sample = _SAMPLE_TYPES.get(kind, "float")
     transfer, white = transfer or default_transfer(sample), _WHITE[sample]
     curve = None
     if white > 1 and (source.straight_alpha or not has_alpha):
         levels = np.arange(white + 1, dtype=np.float32).reshape(1, 1, 1, -1) / np.float32(white)
         curve = decode(torch.from_numpy(levels), transfer, has_alpha=False, straight=False).flatten().numpy()
     height, width = source.values.shape[:2]
-    light, unknown = torch.from_numpy(np.empty((1, len(indices), height, width), np.float32)), 0
-    for lines in _strips(height, width * len(indices)):
-        stored = source.values[lines][..., indices]
+    light, bad_pixels = torch.from_numpy(np.empty((1, len(indices), height, width), np.float32)), 0
+    for rows in _strips(height, width * len(indices)):
+        stored = source.values[rows][..., indices]
         if curve is not None:
             values = curve[stored]
             if has_alpha:
@@ -145,23 +145,23 @@ def _light(
         else:
             values = _float32(stored)
             values = values / np.float32(white) if white > 1 else values
-            unknown += int((~np.isfinite(values)).any(axis=-1).sum())
+            bad_pixels += int((~np.isfinite(values)).any(axis=-1).sum())
         pixels = torch.from_numpy(values).permute(2, 0, 1)[None]  # [h, W, C] -> [1, C, h, W]
         encoded: Transfer = "linear" if curve is not None else transfer
-        light[:, :, lines] = decode(pixels, encoded, has_alpha, source.straight_alpha)
-        if not unknown and not bool(torch.isfinite(light[:, :, lines]).all()):
+        light[:, :, rows] = decode(pixels, encoded, has_alpha, source.straight_alpha)
+        if not bad_pixels and not bool(torch.isfinite(light[:, :, rows]).all()):
             raise ValueError(f"{path}: its light is beyond the range of float32; scale it down")
-    if unknown:
+    if bad_pixels:
         raise ValueError(
-            f"{path}: {unknown} pixels are not finite (NaN or inf); repair them before blurring spreads them"
+            f"{path}: {bad_pixels} pixels are not finite (NaN or inf); repair them before blurring spreads them"
         )
     return light, sample, transfer
 
 
-def _strips(height: int, line: int) -> list[slice]:
+def _strips(height: int, numbers_per_row: int) -> list[slice]:
     """Slices of rows with about a million numbers each, which keep temporary arrays small."""
-    lines = 1 + 2**20 // line
-    return [slice(top, top + lines) for top in range(0, height, lines)]
+    rows = 1 + 2**20 // numbers_per_row
+    return [slice(top, top + rows) for top in range(0, height, rows)]
 
 
 def write_image(
@@ -190,34 +190,35 @@ def write_image(
 
     path = Path(path)
     suffix = path.suffix.lower()
-    holds = samples_of(path)
+    sample_types = samples_of(path)
     if sample is None:
         floats = picture.sample in ("half", "float")
-        sample = picture.sample if picture.sample in holds else "float" if floats and suffix[:4] == ".tif" else holds[0]
-    if sample not in holds:
-        raise ValueError(f"{path}: a {suffix} file holds samples of {' or '.join(holds)}, not {sample}")
+        default = "float" if floats and suffix[:4] == ".tif" else sample_types[0]
+        sample = picture.sample if picture.sample in sample_types else default
+    if sample not in sample_types:
+        raise ValueError(f"{path}: a {suffix} file holds samples of {' or '.join(sample_types)}, not {sample}")
     if transfer is None:
-        same_nature = (sample in ("half", "float")) == (picture.sample in ("half", "float"))
-        transfer = picture.transfer if same_nature else default_transfer(sample)
+        both_same = (sample in ("half", "float")) == (picture.sample in ("half", "float"))  # floats, or integers
+        transfer = picture.transfer if both_same else default_transfer(sample)
     pixels = real_tensor("pixels", picture.pixels, "[1, C, H, W] in linear light").detach().cpu().float()
     names = picture.channels
     if pixels.ndim != 4 or pixels.shape[0] != 1 or pixels.shape[1] != len(names):
         raise ValueError(f"{path}: pixels must be [1, {len(names)}, H, W] for {names}, got {list(pixels.shape)}")
-    if picture.has_alpha and suffix not in _HOLDS_ALPHA:
+    if picture.has_alpha and suffix not in _ALPHA_SUFFIXES:
         if bool((pixels[:, -1] < 1.0).any()):
             raise ValueError(f"{path}: a {suffix} file cannot hold the alpha channel; write .exr, .png or .tif instead")
         pixels, names = pixels[:, :-1], names[:-1]
-    if names[0] == "Y" and suffix not in _HOLDS_GREY:
+    if names[0] == "Y" and suffix not in _GREY_SUFFIXES:
         pixels, names = pixels.expand(-1, 3, -1, -1), ("R", "G", "B")
     straight = names[-1] == "A" and suffix != ".exr"
     if sample == "8" and (straight or names[-1] != "A"):
         array = encode_8_bits(pixels, transfer, straight)
     else:
         array = np.empty((*pixels.shape[2:], len(names)), np.float32)
-        for lines in _strips(array.shape[0], array.shape[1] * len(names)):
-            encoded = encode(pixels[:, :, lines], transfer, names[-1] == "A", straight)
+        for rows in _strips(array.shape[0], array.shape[1] * len(names)):
+            encoded = encode(pixels[:, :, rows], transfer, names[-1] == "A", straight)
             encoded = encoded.clamp(-65504.0, 65504.0) if sample == "half" else encoded
-            array[lines] = encoded[0].permute(1, 2, 0).numpy()  # [C, h, W] -> [h, W, C]
+            array[rows] = encoded[0].permute(1, 2, 0).numpy()  # [C, h, W] -> [h, W, C]
 
     spec = oiio.ImageSpec(array.shape[1], array.shape[0], array.shape[2], _OIIO_SAMPLE[sample])
     spec.channelnames = names
@@ -244,19 +245,19 @@ def write_image(
     if suffix == ".webp":
         spec.attribute("compression", "webp:95")
 
-    with whole_file(path) as part:
-        with part.open("wb") as file:
+    with atomic_file(path) as temporary:
+        with temporary.open("wb") as file:
             if suffix in (".jpg", ".jpeg") and hasattr(os, "posix_fallocate"):
                 os.posix_fallocate(file.fileno(), 0, array.size + 2**20)  # fails here: libjpeg exits on a full disk
-        with named_in_utf8(part) as name:
+        with utf8_name(temporary) as name:
             output = oiio.ImageOutput.create(name)
             if output is None or not output.open(name, spec):
                 problem = (oiio if output is None else output).geterror()
                 raise OSError(f"{path}: could not be opened for writing ({first_line(problem)})")
-            done = output.write_image(array)
-            done = output.close() and done
+            is_written = output.write_image(array)
+            is_written = output.close() and is_written
             problem = output.geterror()  # a full disk shows only here
-            if not done or problem or not _is_whole(name):
+            if not is_written or problem or not _is_complete(name):
                 raise OSError(f"{path}: could not be written ({first_line(problem)}); is the disk full?")
 
 
@@ -277,23 +278,23 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
         ValueError: If the channel is ambiguous or missing, or the array is not two-dimensional numbers.
     """
     path = existing_map(path)
-    with _memory_for(path):
+    with _memory_errors_named(path):
         if path.suffix.lower() in (".npy", ".npz"):
             return _map(read_array(path, channel))
         parts = read_parts(path)
         planes = [(p.label, name, p.values[..., k]) for p in parts for k, name in enumerate(p.names)]
-        listing = ", ".join(name for _, name, _ in planes)
+        channel_names = ", ".join(name for _, name, _ in planes)
         if channel is not None:
             chosen = [plane for label, name, plane in planes if channel in (name, f"{label}.{name}")]
             if not chosen:
-                raise ValueError(f"{path}: no channel {channel!r}; it has {listing}")
+                raise ValueError(f"{path}: no channel {channel!r}; it has {channel_names}")
             return _map(chosen[0])
         depth_place = depth_channel([(p.label, p.names) for p in parts])
         if depth_place is not None:
             return _map(parts[depth_place[0]].values[..., depth_place[1]])
         if all(np.array_equal(values, planes[0][2]) for _, name, values in planes if name != "A"):
             return _map(planes[0][2])
-    raise ValueError(f"{path}: which of the channels {listing} is depth? name it (--depth-channel)")
+    raise ValueError(f"{path}: which of the channels {channel_names} is depth? name it (--depth-channel)")
 
 
 def _map(values: np.ndarray) -> Tensor:
@@ -307,7 +308,7 @@ def _float32(values: np.ndarray) -> np.ndarray:
         return values.astype(np.float32)
 
 
-def _is_whole(name: str) -> bool:
+def _is_complete(name: str) -> bool:
     """Whether a file is complete; OpenImageIO does not report an error in the last flush of its buffer."""
     import OpenImageIO as oiio
 
@@ -319,6 +320,6 @@ def _is_whole(name: str) -> bool:
     problem = source.geterror()
     source.close()
     with contextlib.suppress(OSError):
-        check_chunks(Path(name))  # OpenImageIO does not read the last chunk
+        check_png(Path(name))  # OpenImageIO does not read the last chunk
         return last is not None and not problem
     return False

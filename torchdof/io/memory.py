@@ -8,7 +8,7 @@ from pathlib import Path
 
 __all__ = ["free_bytes"]
 
-_CONTAINERS = (  # limit and use of a control group, version 2 and 1
+_CGROUP_FILES = (  # limit and use of a control group, version 2 and 1
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
     ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
 )
@@ -21,16 +21,17 @@ def free_bytes() -> float:
         >>> free_bytes() > 2**20
         True
     """
-    free = [math.inf]
+    limits = [math.inf]
     with contextlib.suppress(OSError):
-        free += [1024.0 * int(kib) for kib in re.findall(r"MemAvailable:\s*(\d+)", Path("/proc/meminfo").read_text())]
-    for limit, used in _CONTAINERS:
+        limits += [1024.0 * int(kib) for kib in re.findall(r"MemAvailable:\s*(\d+)", Path("/proc/meminfo").read_text())]
+    for limit, used in _CGROUP_FILES:
         with contextlib.suppress(OSError, ValueError):  # "max" means no limit
-            free.append(float(int(Path(limit).read_text()) - int(Path(used).read_text())))
+            limits.append(float(int(Path(limit).read_text()) - int(Path(used).read_text())))
     with contextlib.suppress(ImportError, OSError):
         import resource
 
-        space, _ = resource.getrlimit(resource.RLIMIT_AS)  # ulimit -v
-        if space != resource.RLIM_INFINITY:
-            free.append(space - int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE"))
-    return min(free)
+        address_space, _ = resource.getrlimit(resource.RLIMIT_AS)  # ulimit -v
+        if address_space != resource.RLIM_INFINITY:
+            used_pages = int(Path("/proc/self/statm").read_text().split()[0])
+            limits.append(address_space - used_pages * os.sysconf("SC_PAGE_SIZE"))
+    return min(limits)

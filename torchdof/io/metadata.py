@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import numpy as np
 
-__all__ = ["Metadata", "camera_facts", "kept_metadata", "upright"]
+__all__ = ["Metadata", "camera_settings", "kept_metadata", "upright"]
 
 Metadata = dict[str, tuple[Any, Any]]
 """Name -> (OpenImageIO type, value)."""
@@ -17,11 +17,9 @@ _STORAGE_PREFIXES = ("oiio:", "tiff:", "openexr:", "png:", "pnm:", "jpeg:", "rgb
 _STORAGE_NAMES: tuple[str, ...] = ("name", "planarconfig", "textureformat", "CompressionQuality")
 _STORAGE_NAMES += ("Exif:FlashPixVersion", "Exif:ColorSpace")
 _MM_PER_UNIT: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
-
-
 _FLIPPED: dict[Any, tuple[int, ...]] = {2: (1,), 3: (0, 1), 4: (0,), 5: (), 6: (1,), 7: (0, 1), 8: (0,)}
 """EXIF orientation (0x0112) -> flipped axes. Orientations from 5 up first transpose the image."""
-_OF_AXES = (  # tags that are swapped when an image is transposed
+_AXIS_TAGS = (  # tags that are swapped when an image is transposed
     ("Exif:PixelXDimension", "Exif:PixelYDimension"),
     ("Exif:FocalPlaneXResolution", "Exif:FocalPlaneYResolution"),
 )
@@ -39,16 +37,16 @@ def upright(values: "np.ndarray", metadata: Metadata) -> "tuple[np.ndarray, Meta
     kind, orientation = metadata.get("Orientation", (None, 1))
     if orientation not in _FLIPPED:
         return values, metadata
-    turned = metadata | {"Orientation": (kind, 1)}
+    upright_metadata = metadata | {"Orientation": (kind, 1)}
     if orientation >= 5:
         values = values.swapaxes(0, 1)
-        for across, down in _OF_AXES:
+        for across, down in _AXIS_TAGS:
             for name, other in ((across, down), (down, across)):
-                turned.pop(name, None)
+                upright_metadata.pop(name, None)
                 if other in metadata:
-                    turned[name] = metadata[other]
+                    upright_metadata[name] = metadata[other]
     rows, columns = (slice(None, None, -1 if axis in _FLIPPED[orientation] else 1) for axis in (0, 1))
-    return values[rows, columns], turned
+    return values[rows, columns], upright_metadata
 
 
 def kept_metadata(attributes: Iterable[Any]) -> Metadata:
@@ -64,7 +62,7 @@ def kept_metadata(attributes: Iterable[Any]) -> Metadata:
     }
 
 
-def camera_facts(metadata: Mapping[str, tuple[Any, Any]], width: int, height: int) -> dict[str, float]:
+def camera_settings(metadata: Mapping[str, tuple[Any, Any]], width: int, height: int) -> dict[str, float]:
     """Camera settings found in the metadata, under the names of ``torchdof.Camera``.
 
     The sensor width comes from the resolution of the focal plane (EXIF 0xA20E). If that is missing, or differs by more
@@ -81,7 +79,7 @@ def camera_facts(metadata: Mapping[str, tuple[Any, Any]], width: int, height: in
 
     Example:
         >>> tags = {"Exif:FocalLength": 50.0, "FNumber": 1.8, "Exif:FocalLengthIn35mmFilm": 75}
-        >>> camera_facts({name: (None, value) for name, value in tags.items()}, 6000, 4000)
+        >>> camera_settings({name: (None, value) for name, value in tags.items()}, 6000, 4000)
         {'focal_length_mm': 50.0, 'f_number': 1.8, 'sensor_width_mm': 24.0}
     """
 
@@ -92,26 +90,26 @@ def camera_facts(metadata: Mapping[str, tuple[Any, Any]], width: int, height: in
                 return float(value)
         return None
 
-    facts: dict[str, float] = {}
+    settings: dict[str, float] = {}
     focal_length_mm = number("Exif:FocalLength", "effectiveFocalLength", "nominalFocalLength")
     if focal_length_mm is not None and math.isfinite(focal_length_mm):
-        facts["focal_length_mm"] = focal_length_mm
+        settings["focal_length_mm"] = focal_length_mm
     f_number = number("FNumber", "Exif:FNumber", "aperture")
     if f_number is not None and math.isfinite(f_number):
-        facts["f_number"] = round(f_number, 6)
+        settings["f_number"] = round(f_number, 6)
     focus_m = number("Exif:SubjectDistance", "focus")
     if focus_m is not None:
-        facts["focus_m"] = math.inf if focus_m > 1e6 else focus_m  # EXIF writes infinity as 2^32 - 1
-    by_film = number("Exif:FocalLengthIn35mmFilm")
-    if by_film is not None and focal_length_mm is not None:
-        width_mm = 36.0 * focal_length_mm / by_film * (width / max(width, height))
+        settings["focus_m"] = math.inf if focus_m > 1e6 else focus_m  # EXIF writes infinity as 2^32 - 1
+    film_mm = number("Exif:FocalLengthIn35mmFilm")
+    if film_mm is not None and focal_length_mm is not None:
+        width_mm = 36.0 * focal_length_mm / film_mm * (width / max(width, height))
         if 0 < width_mm < math.inf:
-            facts["sensor_width_mm"] = width_mm
-    per_unit = number("Exif:FocalPlaneXResolution")
-    if per_unit is not None:
+            settings["sensor_width_mm"] = width_mm
+    px_per_unit = number("Exif:FocalPlaneXResolution")
+    if px_per_unit is not None:
         original_width = number("Exif:PixelXDimension") or width
-        unit = _MM_PER_UNIT.get(number("Exif:FocalPlaneResolutionUnit") or 2, 25.4)
-        by_plane = original_width / per_unit * unit
-        if 0 < by_plane < math.inf and abs(by_plane / facts.get("sensor_width_mm", by_plane) - 1.0) < 0.25:
-            facts["sensor_width_mm"] = by_plane
-    return facts
+        mm_per_unit = _MM_PER_UNIT.get(number("Exif:FocalPlaneResolutionUnit") or 2, 25.4)
+        plane_mm = original_width / px_per_unit * mm_per_unit
+        if 0 < plane_mm < math.inf and abs(plane_mm / settings.get("sensor_width_mm", plane_mm) - 1.0) < 0.25:
+            settings["sensor_width_mm"] = plane_mm
+    return settings

@@ -7,9 +7,9 @@ import os
 from pathlib import Path
 from typing import Literal
 
-from . import foreign
+from . import optional_formats
 
-__all__ = ["IMAGES", "PixelType", "existing", "existing_image", "existing_map", "samples_of"]
+__all__ = ["PixelType", "existing_file", "existing_image", "existing_map", "samples_of"]
 
 PixelType = Literal["8", "16", "half", "float"]
 
@@ -20,8 +20,8 @@ _SAMPLES: dict[str, tuple[PixelType, ...]] = {  # suffix -> sample types, the de
     **dict.fromkeys((".jpg", ".jpeg", ".webp"), ("8",)),
     **dict.fromkeys((".hdr", ".pfm"), ("float",)),
 }
-IMAGES = tuple(_SAMPLES)
-"""Suffixes of images that are read and written everywhere."""
+_SUFFIXES = tuple(_SAMPLES)
+"""Suffixes of images that every installation reads and writes."""
 
 
 def samples_of(path: Path) -> tuple[PixelType, ...]:
@@ -32,25 +32,25 @@ def samples_of(path: Path) -> tuple[PixelType, ...]:
     """
     suffix = path.suffix.lower()
     if suffix not in _SAMPLES:
-        raise ValueError(f"{path}: cannot write files of type {suffix or 'none'!r}; use one of {' '.join(IMAGES)}")
+        raise ValueError(f"{path}: cannot write files of type {suffix or 'none'!r}; use one of {' '.join(_SUFFIXES)}")
     return _SAMPLES[suffix]
 
 
 def existing_image(path: str | os.PathLike[str]) -> Path:
-    """Checks the path of an image, as :func:`existing`."""
-    unread = foreign.refusal(path)
-    if unread is not None:
-        raise ValueError(f"{path}: {unread}")
-    is_known = isinstance(path, str | os.PathLike) and Path(path).suffix.lower() in IMAGES
-    return existing(path, IMAGES if is_known else (*IMAGES, *foreign.readable()), "an image")
+    """Checks the path of an image, as :func:`existing_file`."""
+    refusal = optional_formats.refusal(path)
+    if refusal is not None:
+        raise ValueError(f"{path}: {refusal}")
+    is_known = isinstance(path, str | os.PathLike) and Path(path).suffix.lower() in _SUFFIXES
+    return existing_file(path, _SUFFIXES if is_known else (*_SUFFIXES, *optional_formats.readable()), "an image")
 
 
 def existing_map(path: str | os.PathLike[str]) -> Path:
-    """Checks the path of a depth map, as :func:`existing`."""
-    return existing(path, (*IMAGES, ".npy", ".npz"), "a depth map")
+    """Checks the path of a depth map, as :func:`existing_file`."""
+    return existing_file(path, (*_SUFFIXES, ".npy", ".npz"), "a depth map")
 
 
-def existing(path: str | os.PathLike[str], suffixes: tuple[str, ...], what: str) -> Path:
+def existing_file(path: str | os.PathLike[str], suffixes: tuple[str, ...], what: str) -> Path:
     """Returns ``path`` if it is a file with one of ``suffixes`` that is not empty; ``what`` describes it in messages.
 
     Raises:

@@ -8,7 +8,7 @@ from pathlib import Path
 __all__ = ["FramePattern", "focus_at_frame", "parse_focus", "parse_frames"]
 
 _PLACEHOLDER = re.compile(r"#+|%0?(\d*)d")
-_DIGITS = 18
+_MAX_DIGITS = 18  # of a frame number
 
 
 class FramePattern:
@@ -26,16 +26,16 @@ class FramePattern:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        places = list(_PLACEHOLDER.finditer(self.path.name))
-        if len(places) != 1:
+        placeholders = list(_PLACEHOLDER.finditer(self.path.name))
+        if len(placeholders) != 1:
             expected = "expected one place for the frame number in the file's name, such as shot.####.exr"
             raise ValueError(f"{path}: {expected}")
-        place = places[0]
-        self._before, self._after = self.path.name[: place.start()], self.path.name[place.end() :]
-        text = place.group()
-        self._digits = len(text) if text.startswith("#") else int((place.group(1) or "1")[:9])
-        if self._digits > _DIGITS:
-            raise ValueError(f"{path}: the frame number must have at most {_DIGITS} digits, got {self._digits}")
+        placeholder = placeholders[0]
+        self._before, self._after = self.path.name[: placeholder.start()], self.path.name[placeholder.end() :]
+        text = placeholder.group()
+        self._digits = len(text) if text.startswith("#") else int((placeholder.group(1) or "1")[:9])
+        if self._digits > _MAX_DIGITS:
+            raise ValueError(f"{path}: the frame number must have at most {_MAX_DIGITS} digits, got {self._digits}")
 
     @staticmethod
     def matches(path: str | Path) -> bool:
@@ -55,8 +55,8 @@ class FramePattern:
         """Numbers of the existing frames, in order."""
         if not self.path.parent.is_dir():
             return []
-        wanted = re.compile(re.escape(self._before) + r"(\d+)" + re.escape(self._after))
-        numbers = [int(m.group(1)) for p in self.path.parent.iterdir() if (m := wanted.fullmatch(p.name))]
+        pattern = re.compile(re.escape(self._before) + r"(\d+)" + re.escape(self._after))
+        numbers = [int(m.group(1)) for p in self.path.parent.iterdir() if (m := pattern.fullmatch(p.name))]
         return sorted({n for n in numbers if self.name(n).is_file()})
 
 
@@ -118,9 +118,9 @@ def focus_at_frame(keys: list[tuple[int, float]], frame: int) -> float:
     number("frame", frame)
     if frame <= keys[0][0]:
         return keys[0][1]
-    for (before, near), (after, far) in zip(keys, keys[1:], strict=False):
-        if frame <= after:
-            fraction = (frame - before) / (after - before)
+    for (first_frame, near), (last_frame, far) in zip(keys, keys[1:], strict=False):
+        if frame <= last_frame:
+            fraction = (frame - first_frame) / (last_frame - first_frame)
             dioptres = (1.0 - fraction) / near + fraction / far
-            return far if frame == after else 1.0 / dioptres if dioptres > 0 else math.inf
+            return far if frame == last_frame else 1.0 / dioptres if dioptres > 0 else math.inf
     return keys[-1][1]

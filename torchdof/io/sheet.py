@@ -11,7 +11,7 @@ from .images import Picture, write_image
 
 __all__ = ["shrunk", "write_sheet"]
 
-_LABEL = 76  # px; width of the column of row labels
+_LABEL_PX = 76  # px; width of the column of row labels
 
 
 def shrunk(pixels: Tensor, longest: int) -> Tensor:
@@ -22,10 +22,10 @@ def shrunk(pixels: Tensor, longest: int) -> Tensor:
         torch.Size([1, 3, 10, 20])
     """
     height, width = pixels.shape[-2:]
-    share = longest / max(height, width)
-    if share >= 1:
+    scale = longest / max(height, width)
+    if scale >= 1:
         return pixels
-    size = (max(1, round(share * height)), max(1, round(share * width)))
+    size = (max(1, round(scale * height)), max(1, round(scale * width)))
     return functional.interpolate(pixels, size, mode="bilinear", antialias=True)
 
 
@@ -52,7 +52,7 @@ def write_sheet(
     import OpenImageIO as oiio
 
     height, width = next(iter(panels.values())).shape[-2:]
-    start = margin + (_LABEL if rows else 0)
+    start = margin + (_LABEL_PX if rows else 0)
     sheet = torch.full((1, 3, height + caption + margin, start + len(panels) * (width + margin)), 0.8)
     lefts = [start + k * (width + margin) for k in range(len(panels))]
     for left, panel in zip(lefts, panels.values(), strict=True):

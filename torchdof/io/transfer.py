@@ -64,19 +64,19 @@ def encode_8_bits(pixels: Tensor, transfer: Transfer, has_alpha: bool) -> np.nda
     height, width = pixels.shape[-2:]
     if has_alpha:
         pixels = torch.cat([_divide(pixels[:, :-1], pixels[:, -1:]), pixels[:, -1:]], 1)
-    numbers = np.arange(65536, dtype=np.uint16).view(np.float16)
-    shares = torch.from_numpy(numbers.astype(np.float32)).nan_to_num(0.0)
+    halves = np.arange(65536, dtype=np.uint16).view(np.float16)
+    light = torch.from_numpy(halves.astype(np.float32)).nan_to_num(0.0)
     colour, alpha = (
-        (encode(shares, curve, False, False).clamp(0.0, 1.0) * 255.0).round().byte().numpy()
+        (encode(light, curve, False, False).clamp(0.0, 1.0) * 255.0).round().byte().numpy()
         for curve in (transfer, "linear")
     )
-    planes = pixels[0].half().numpy().view(np.uint16)
-    codes = np.empty((height, width, len(planes)), np.uint8)
-    for k, plane in enumerate(planes):
+    channels = pixels[0].half().numpy().view(np.uint16)
+    encoded = np.empty((height, width, len(channels)), np.uint8)
+    for k, channel in enumerate(channels):
         for top in range(0, height, 64):
-            table = alpha if has_alpha and k == len(planes) - 1 else colour
-            codes[top : top + 64, :, k] = np.take(table, plane[top : top + 64], mode="clip")
-    return codes
+            lookup = alpha if has_alpha and k == len(channels) - 1 else colour
+            encoded[top : top + 64, :, k] = np.take(lookup, channel[top : top + 64], mode="clip")
+    return encoded
 
 
 def _divide(colour: Tensor, alpha: Tensor) -> Tensor:
@@ -85,11 +85,11 @@ def _divide(colour: Tensor, alpha: Tensor) -> Tensor:
 
 def _srgb_to_linear(encoded: Tensor) -> Tensor:
     """Inverse sRGB curve of IEC 61966-2-1, odd for negative values."""
-    size = encoded.abs()
-    return torch.where(size <= 0.04045, size / 12.92, ((size + 0.055) / 1.055) ** 2.4).copysign(encoded)
+    magnitude = encoded.abs()
+    return torch.where(magnitude <= 0.04045, magnitude / 12.92, ((magnitude + 0.055) / 1.055) ** 2.4).copysign(encoded)
 
 
 def _linear_to_srgb(linear: Tensor) -> Tensor:
-    size = linear.abs()
-    curved = 1.055 * size.clamp_min(0.0031308) ** (1 / 2.4) - 0.055  # clamped: the gradient is infinite at 0
-    return torch.where(size <= 0.0031308, size * 12.92, curved).copysign(linear)
+    magnitude = linear.abs()
+    curved = 1.055 * magnitude.clamp_min(0.0031308) ** (1 / 2.4) - 0.055  # clamped: the gradient is infinite at 0
+    return torch.where(magnitude <= 0.0031308, magnitude * 12.92, curved).copysign(linear)

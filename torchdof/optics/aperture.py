@@ -27,8 +27,8 @@ __all__ = ["Aperture"]
 Number = float | Tensor
 
 _CHORDS = 48  # straight pieces of a curved blade; more follow the arc more closely
-_MOST_BLADES = 64
-_MOST_SIDE = 128  # pixels; a larger image of an opening is averaged down to this
+_MAX_BLADES = 64
+_MAX_SIDE_PX = 128  # pixels; a larger image of an opening is averaged down to this
 _SQUEEZE = (0.1, 10.0)  # allowed range of height over width
 
 
@@ -69,7 +69,7 @@ class Aperture:
 
     def __post_init__(self) -> None:
         if self.blades != 0 or isinstance(self.blades, bool):
-            whole("blades", self.blades, 3, _MOST_BLADES)
+            whole("blades", self.blades, 3, _MAX_BLADES)
         _check("rotation_deg", self.rotation_deg, -1e6, 1e6)
         _check("squeeze", self.squeeze, *_SQUEEZE)
         if isinstance(self.curvature, Tensor):
@@ -99,8 +99,8 @@ class Aperture:
     @property
     def rims(self) -> tuple[float, float]:
         """Shift of the front and of the rear rim in the corner of the frame, in diameters of the opening."""
-        given = self.vignetting
-        return given if isinstance(given, tuple) else (given / 2, given / 2)
+        shares = self.vignetting
+        return shares if isinstance(shares, tuple) else (shares / 2, shares / 2)
 
     @property
     def is_round(self) -> bool:
@@ -115,7 +115,7 @@ class Aperture:
     @property
     def widest(self) -> float:
         """Largest half axis of the blur over the circle of confusion."""
-        return max(1.0, 1.0 / _plain(self.squeeze))
+        return max(1.0, 1.0 / _as_float(self.squeeze))
 
     @functools.cached_property
     def finest(self) -> float:
@@ -124,11 +124,11 @@ class Aperture:
         For a mask it is twice the radius of the disc with the same ratio of area to outline length, at most 1; for a
         cat's eye, its height over its width halfway to the corner.
         """
-        finest = min(1.0, 1.0 / _plain(self.squeeze)) * (1.0 - min(1.0, sum(self.rims)) / 2)
+        finest = min(1.0, 1.0 / _as_float(self.squeeze)) * (1.0 - min(1.0, sum(self.rims)) / 2)
         if self.mask is None:
             return finest
-        around = functional.pad(self.mask, (1, 1, 1, 1))
-        outline = (around.diff(dim=0)[:, 1:].square() + around.diff(dim=1)[1:].square()).sqrt().sum()
+        padded = functional.pad(self.mask, (1, 1, 1, 1))
+        outline = (padded.diff(dim=0)[:, 1:].square() + padded.diff(dim=1)[1:].square()).sqrt().sum()
         pixel = 2.0 / max(self.mask.shape)
         return finest * min(1.0, 4.0 * float(self.mask.sum() / outline) * pixel)
 
@@ -141,23 +141,23 @@ class Aperture:
             step_x: Width of the cells ``[...]``.
         """
         batch = broadcast_shapes(step_y.shape, step_x.shape)
-        high, wide = (step.to(torch.float64).expand(batch).reshape(-1) for step in (step_y, step_x))
+        heights, widths = (step.to(torch.float64).expand(batch).reshape(-1) for step in (step_y, step_x))
         count = 2 * half + 1
         if self.mask is not None:
             rows, columns = (
                 _overlaps(count, step, size, max(self.mask.shape))
-                for step, size in zip((high, wide), self.mask.shape, strict=True)
+                for step, size in zip((heights, widths), self.mask.shape, strict=True)
             )
-            open_areas = rows @ self._turned(self.mask).to(high.device) @ columns.transpose(-2, -1)
-            return (open_areas / (high * wide)[:, None, None]).reshape(*batch, count, count)
-        x, y = self._outline(high.device)
-        middle = half + 0.5
-        shares = _polygon_shares(x / wide[:, None] + middle, y / high[:, None] + middle, count)
+            open_areas = rows @ self._turned(self.mask).to(heights.device) @ columns.transpose(-2, -1)
+            return (open_areas / (heights * widths)[:, None, None]).reshape(*batch, count, count)
+        x, y = self._outline(heights.device)
+        centre = half + 0.5
+        shares = _polygon_shares(x / widths[:, None] + centre, y / heights[:, None] + centre, count)
         return shares.reshape(*batch, count, count)
 
     def to_dict(self) -> dict[str, Any]:
         """The aperture as JSON-like data, the inverse of :meth:`from_dict`."""
-        fields: dict[str, Any] = {"rotation_deg": _plain(self.rotation_deg), "squeeze": _plain(self.squeeze)}
+        fields: dict[str, Any] = {"rotation_deg": _as_float(self.rotation_deg), "squeeze": _as_float(self.squeeze)}
         fields["vignetting"] = list(self.rims)
         if self.mask is not None:
             return {**fields, "mask": self.mask.tolist()}
@@ -190,9 +190,9 @@ class Aperture:
             parts.append(f"mask {self.mask.shape[0]} x {self.mask.shape[1]}")
         elif self.blades:
             parts.append(f"{self.blades} blades" + (f", curvature {self.curvature:g}" if self.curvature else ""))
-        for name, value, usual in (("turned by", self.rotation_deg, 0.0), ("squeeze", self.squeeze, 1.0)):
-            if _plain(value) != usual:
-                parts.append(f"{name} {_plain(value):g}")
+        for name, value, default in (("turned by", self.rotation_deg, 0.0), ("squeeze", self.squeeze, 1.0)):
+            if _as_float(value) != default:
+                parts.append(f"{name} {_as_float(value):g}")
         if self.depends_on_place:
             parts.append(f"vignetting {sum(self.rims):g}")
         return f"Aperture({', '.join(parts) or 'round'})"
@@ -200,21 +200,21 @@ class Aperture:
     def _outline(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """Corners ``[V]`` of the outline, x and y with y down, ordered counter-clockwise as seen with y up."""
         half_angle = math.pi / self.blades
-        along, out = _blade(half_angle, self.curvature)  # the blade whose outward normal points up
+        along, outward = _blade(half_angle, self.curvature)  # the blade whose outward normal points up
         normal = torch.arange(self.blades, dtype=torch.float64, device=device)[:, None] * (2.0 * half_angle)
-        turn = torch.deg2rad(torch.as_tensor(self.rotation_deg, dtype=torch.float64, device=device))
-        normal = normal + half_angle + math.pi / 2 + turn
-        along, out = along.to(device), out.to(device)
-        x = out * torch.cos(normal) - along * torch.sin(normal)
-        y = out * torch.sin(normal) + along * torch.cos(normal)
+        rotation = torch.deg2rad(torch.as_tensor(self.rotation_deg, dtype=torch.float64, device=device))
+        normal = normal + half_angle + math.pi / 2 + rotation
+        along, outward = along.to(device), outward.to(device)
+        x = outward * torch.cos(normal) - along * torch.sin(normal)
+        y = outward * torch.sin(normal) + along * torch.cos(normal)
         return x.flatten(), -y.flatten()
 
     def _turned(self, mask: Tensor) -> Tensor:
         """A mask turned by ``rotation_deg``."""
-        turn = self.rotation_deg
-        if not isinstance(turn, Tensor) and turn == 0.0:
+        rotation = self.rotation_deg
+        if not isinstance(rotation, Tensor) and rotation == 0.0:
             return mask
-        angle = torch.deg2rad(torch.as_tensor(turn, dtype=torch.float64, device=mask.device))
+        angle = torch.deg2rad(torch.as_tensor(rotation, dtype=torch.float64, device=mask.device))
         cosine, sine = torch.cos(angle), torch.sin(angle)
         height, width = mask.shape
         rows = torch.stack([cosine, -sine * height / width, sine * width / height, cosine])
@@ -229,17 +229,17 @@ def _blade(half_angle: float, curvature: float) -> tuple[Tensor, Tensor]:
     chord, apothem = math.sin(half_angle), math.cos(half_angle)
     sagitta = curvature * (1.0 - apothem)
     if sagitta < 1e-9:
-        along, out = torch.tensor([[-chord], [apothem]], dtype=torch.float64, device="cpu")
-        return along, out
+        along, outward = torch.tensor([[-chord], [apothem]], dtype=torch.float64, device="cpu")
+        return along, outward
     radius = (chord**2 + sagitta**2) / (2.0 * sagitta)
     half_arc = math.asin(min(1.0, chord / radius)) if sagitta <= radius else math.pi - math.asin(chord / radius)
     angle = torch.linspace(-half_arc, half_arc, _CHORDS + 1, dtype=torch.float64, device="cpu")[:-1]
     bulge = 2.0 * radius * torch.sin((half_arc + angle) / 2) * torch.sin((half_arc - angle) / 2)
-    missing = 1.0 / _CHORDS**2  # share of the arc's area outside its chords; the limit of a flat arc
+    missing_share = 1.0 / _CHORDS**2  # share of the arc's area outside its chords; the limit of a flat arc
     if half_arc > 5e-3:
         step = 2.0 * half_arc / _CHORDS
-        missing = _CHORDS * (step - math.sin(step)) / (2.0 * half_arc - math.sin(2.0 * half_arc))
-    return radius * torch.sin(angle), apothem + bulge / (1.0 - missing)
+        missing_share = _CHORDS * (step - math.sin(step)) / (2.0 * half_arc - math.sin(2.0 * half_arc))
+    return radius * torch.sin(angle), apothem + bulge / (1.0 - missing_share)
 
 
 def _polygon_shares(x: Tensor, y: Tensor, count: int) -> Tensor:
@@ -258,15 +258,15 @@ def _polygon_shares(x: Tensor, y: Tensor, count: int) -> Tensor:
     start, end = start[item, line, edge], end[item, line, edge]
     x, y, next_x, next_y = (corner[item, edge] for corner in (x, y, next_x, next_y))
     slope = (next_x - x) / (next_y - y)
-    ends = torch.stack([x + slope * (part + line - y) for part in (start, end)])
+    ends = torch.stack([x + slope * (height + line - y) for height in (start, end)])
     left, right = ends.amin(0)[:, None], ends.amax(0)[:, None]
-    border = torch.arange(count + 1, dtype=torch.float64, device=x.device)
+    grid_line = torch.arange(count + 1, dtype=torch.float64, device=x.device)
     # mean of min(x, border) over the piece
-    within = torch.minimum(torch.maximum(border, left), right) - left
-    mean = torch.minimum(border, left) + within - within.square() / (2.0 * (right - left) + 1e-12)
-    left_of = mean.new_zeros(items * count, count + 1)
-    left_of = left_of.index_add(0, item * count + line, (start - end)[:, None] * mean)
-    return left_of.diff(dim=-1).clamp_min(0.0).unflatten(0, (-1, count))
+    clipped = torch.minimum(torch.maximum(grid_line, left), right) - left
+    mean = torch.minimum(grid_line, left) + clipped - clipped.square() / (2.0 * (right - left) + 1e-12)
+    areas = mean.new_zeros(items * count, count + 1)
+    areas = areas.index_add(0, item * count + line, (start - end)[:, None] * mean)
+    return areas.diff(dim=-1).clamp_min(0.0).unflatten(0, (-1, count))
 
 
 def _overlaps(count: int, step: Tensor, size: int, longer: int) -> Tensor:
@@ -278,15 +278,15 @@ def _overlaps(count: int, step: Tensor, size: int, longer: int) -> Tensor:
 
 
 def _checked_mask(mask: Any) -> Tensor:
-    """A valid mask as float64 on the CPU, averaged down to at most ``_MOST_SIDE`` pixels, with a maximum of 1."""
+    """A valid mask as float64 on the CPU, averaged down to at most ``_MAX_SIDE_PX`` pixels, with a maximum of 1."""
     values = real_tensor("mask", mask, "[H, W]").detach().to("cpu", torch.float64)
     if values.ndim != 2 or not values.numel():
         raise ValueError(f"mask must be the transmission [H, W] of an opening, got {list(values.shape)}")
     if not bool(torch.isfinite(values).all()) or bool((values < 0).any()) or not bool((values > 0).any()):
         raise ValueError("mask must hold finite transmissions >= 0, not all of them 0")
     longer = max(values.shape)
-    if longer > _MOST_SIDE:
-        height, width = (max(1, round(n * _MOST_SIDE / longer)) for n in values.shape)
+    if longer > _MAX_SIDE_PX:
+        height, width = (max(1, round(n * _MAX_SIDE_PX / longer)) for n in values.shape)
         values = functional.adaptive_avg_pool2d(values[None, None], (height, width))[0, 0]
     return values / values.max()
 
@@ -294,12 +294,12 @@ def _checked_mask(mask: Any) -> Tensor:
 def _check(name: str, value: Any, low: float, high: float) -> None:
     """Refuse a value that is not a number, or is outside ``[low, high]``."""
     if isinstance(value, Tensor):
-        good = value.ndim == 0 and value.is_floating_point()
+        is_number = value.ndim == 0 and value.is_floating_point()
     else:
-        good = isinstance(value, int | float) and not isinstance(value, bool)
-    if not good or not low <= value <= high:
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number or not low <= value <= high:
         raise ValueError(f"{name} must be a number from {low:g} to {high:g}, got {show(value)}")
 
 
-def _plain(value: Number) -> float:
+def _as_float(value: Number) -> float:
     return float(value.detach()) if isinstance(value, Tensor) else float(value)

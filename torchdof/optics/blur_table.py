@@ -20,15 +20,15 @@ from .kernel_bank import FADE_IN, bank_of
 __all__ = ["BlurTable"]
 
 UNITS = ("fraction", "mm", "relative")
-_MOST_NODES = 4096
+_MAX_NODES = 4096
 _COC_RANGE = (1e-9, 1e6)  # allowed |coc| of the outermost nodes, in the table's unit
-_WIDEST = 1e4  # largest radius of a kernel over |coc| of its node; allows a blur that remains in focus
-_SMALLEST, _LARGEST = 1e-100, 1e100  # allowed parameters: their sums and products stay finite in float64
-_STEEPEST = 100.0  # largest exponent m of "softm"; with a steeper tilt the light would lie in the tail of the edge
-_SEEN_PX = 1.5  # px around a spot of a field in which pixels receive some of its light
+_MAX_REACH = 1e4  # largest radius of a kernel over |coc| of its node; allows a blur that remains in focus
+_MIN_PARAMETER, _MAX_PARAMETER = 1e-100, 1e100  # allowed parameters: their sums and products stay finite in float64
+_MAX_EXPONENT = 100.0  # largest exponent m of "softm"; with a steeper tilt the light would lie in the tail of the edge
+_SPOT_EDGE_PX = 1.5  # px around a spot of a field in which pixels receive some of its light
 _RIM_POWER = 4.0  # exponent m of a bright rim; a larger one makes the rim thinner
-_TRIED_AT_ONCE = 64  # kernels checked together; limits memory
-_TRIED_PX = (0.5, 6.0)  # radii in px to which the widest kernel is scaled for the check
+_CHECKED_AT_ONCE = 64  # kernels checked together; limits memory
+_CHECKED_PX = (0.5, 6.0)  # radii in px to which the widest kernel is scaled for the check
 
 
 class BlurTable:
@@ -101,8 +101,8 @@ class BlurTable:
             raise ValueError(
                 f"coc must be strictly increasing signed numbers, one a node and not only 0, got {_short(self.coc)}"
             )
-        if len(self.coc) > _MOST_NODES:
-            raise ValueError(f"coc must be at most {_MOST_NODES} nodes, got {len(self.coc)}")
+        if len(self.coc) > _MAX_NODES:
+            raise ValueError(f"coc must be at most {_MAX_NODES} nodes, got {len(self.coc)}")
         if unit == "relative" and max(int((self.coc > 0).sum()), int((self.coc < 0).sum())) > 1:
             raise ValueError(
                 f"unit 'relative' takes one node on each side of focus at most, got {len(self.coc)}; "
@@ -243,8 +243,8 @@ class BlurTable:
             TypeError: If a name is unknown.
         """
         names = ("unit", "sensor_width_mm", "strength", "name", "provenance", "residual", "aperture", "field")
-        kept = {"family": self.family, "coc": self.coc, "params": self._params}
-        return BlurTable(**{**kept, **{name: getattr(self, name) for name in names}, **changes})
+        fields = {"family": self.family, "coc": self.coc, "params": self._params}
+        return BlurTable(**{**fields, **{name: getattr(self, name) for name in names}, **changes})
 
     @property
     def is_round(self) -> bool:
@@ -269,11 +269,11 @@ class BlurTable:
             True
         """
         if self._fingerprint is None:
-            facts: list[Any] = [self.family, self.unit, self.sensor_width_mm, self.px_per_unit(1.0), self.coc.tolist()]
-            facts += [(name, value.tolist()) for name, value in self._params.items()]
-            facts.append(None if self.aperture is None else self.aperture.to_dict())
-            facts.append(None if self.field is None else self.field.fingerprint())
-            self._fingerprint = hashlib.sha256(repr(facts).encode()).hexdigest()
+            data: list[Any] = [self.family, self.unit, self.sensor_width_mm, self.px_per_unit(1.0), self.coc.tolist()]
+            data += [(name, value.tolist()) for name, value in self._params.items()]
+            data.append(None if self.aperture is None else self.aperture.to_dict())
+            data.append(None if self.field is None else self.field.fingerprint())
+            self._fingerprint = hashlib.sha256(repr(data).encode()).hexdigest()
         return self._fingerprint
 
     @property
@@ -301,14 +301,14 @@ class BlurTable:
         scale = self.px_per_unit(width)
         signed = real_tensor("coc_px", coc_px, "[...] in pixels").to(torch.float64) / scale
         near, far = (self._side_params(sign, signed.abs()) for sign in (-1, 1))
-        mixed = {}
+        interpolated = {}
         for name in self._params:
             behind = signed >= 0
             behind = behind.unsqueeze(-1) if name == "values" else behind
-            mixed[name] = torch.where(behind, far[name], near[name])
+            interpolated[name] = torch.where(behind, far[name], near[name])
             if name in psf.LENGTHS:
-                mixed[name] = mixed[name] * scale
-        return mixed
+                interpolated[name] = interpolated[name] * scale
+        return interpolated
 
     def kernels(self, coc_px: Tensor, width: float, size: int | None = None, window: int | None = None) -> Tensor:
         """Kernels of the middle of the frame at a signed coc, for pictures made of pixels (:mod:`torchdof.optics.psf`).
@@ -344,8 +344,8 @@ class BlurTable:
             kernels = torch.where(behind, kernels, kernels.flip(-2, -1))
         if self.is_sharp_in_focus:
             return kernels
-        times = FADE_IN / self.moved_in_focus(width).clamp_min(torch.finfo(torch.float64).tiny)
-        fade = (coc_px.to(torch.float64).square()[:, None] * times).clamp(max=1.0)[:, :, None, None]
+        steepness = FADE_IN / self.moved_in_focus(width).clamp_min(torch.finfo(torch.float64).tiny)
+        fade = (coc_px.to(torch.float64).square()[:, None] * steepness).clamp(max=1.0)[:, :, None, None]
         centre = torch.zeros_like(kernels)
         centre[..., kernels.shape[-2] // 2, kernels.shape[-1] // 2] = 1.0
         return torch.lerp(centre, kernels, fade)
@@ -354,14 +354,14 @@ class BlurTable:
         """The kernels of :meth:`kernels` without gradients to the aperture, interpolated from templates."""
         signed = coc_px.to(torch.float64)
         reach = psf.support(self.family, self.params(signed.detach(), width), self.aperture)
-        whole = psf.half_width(reach) if size is None and window is not None else psf.width_of(size, reach) // 2
-        half = whole if window is None else min(whole, psf.width_of(window, reach) // 2)
-        cut = [(whole if size is not None else half) + 1] * len(coc_px) if half < reach else []
-        made = bank_of(self).kernels(signed, width, longest=cut)
+        full_half = psf.half_width(reach) if size is None and window is not None else psf.width_of(size, reach) // 2
+        half = full_half if window is None else min(full_half, psf.width_of(window, reach) // 2)
+        longest = [(full_half if size is not None else half) + 1] * len(coc_px) if half < reach else []
+        kernels = bank_of(self).kernels(signed, width, longest=longest)
         if size is not None:  # kernels that are cut off to a given size sum to 1 as well
-            made = made / made.sum((-2, -1), keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
-        spare = half - made.shape[-1] // 2
-        return functional.pad(made, (spare,) * 4).to(coc_px.device)
+            kernels = kernels / kernels.sum((-2, -1), keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
+        padding = half - kernels.shape[-1] // 2
+        return functional.pad(kernels, (padding,) * 4).to(coc_px.device)
 
     def moved_in_focus(self, width: float) -> Tensor:
         """Share ``[channels]`` of the light that the table's kernel in focus moves to other pixels."""
@@ -391,7 +391,7 @@ class BlurTable:
         if self.field is None:
             return reach
         per_unit = self.px_per_unit(width)
-        return max(reach, float(self.field.reach(signed / per_unit).max()) * per_unit + _SEEN_PX)
+        return max(reach, float(self.field.reach(signed / per_unit).max()) * per_unit + _SPOT_EDGE_PX)
 
     def finest_px(self, coc_px: float, width: float) -> float:
         """Radius in pixels, at most ``|coc_px|``, of the disc with detail about as fine as the kernel's finest."""
@@ -480,7 +480,7 @@ class BlurTable:
             "aperture": None if self.aperture is None else self.aperture.to_dict(),
             "field": None if self.field is None else self.field.to_dict(),
         }
-        return table_file.stamped({k: v for k, v in fields.items() if v is not None})
+        return table_file.with_schema({k: v for k, v in fields.items() if v is not None})
 
     @classmethod
     def from_dict(cls, data: Any) -> "BlurTable":
@@ -532,10 +532,10 @@ class BlurTable:
             low = -1.0 if name == "b" else 0.0
             if bool((value < low).any()):
                 raise ValueError(f"params.{name} must be >= {low:g}, got {float(value.min()):g}")
-            high = _STEEPEST if name == "m" else _LARGEST
+            high = _MAX_EXPONENT if name == "m" else _MAX_PARAMETER
             if bool((value > high).any()):
                 raise ValueError(f"params.{name} must be <= {high:g}, got {float(value.max()):g}")
-            if name == "values" and (value.shape[-1] < 2 or bool((value.amax(-1) < _SMALLEST).any())):
+            if name == "values" and (value.shape[-1] < 2 or bool((value.amax(-1) < _MIN_PARAMETER).any())):
                 raise ValueError("params.values must hold at least two values a node, not all of them 0")
             checked[name] = value
         channels = max(v.shape[0] for v in checked.values())
@@ -563,9 +563,9 @@ class BlurTable:
                     f"field.{name} must reach somewhere from {low:g} to {high:g} ({self.unit}), "
                     f"got {' and '.join(f'{end:g}' for end in ends.tolist())}"
                 )
-        for side in (field.coc[field.coc <= 0], field.coc[field.coc >= 0]):
-            largest, reach = float(side.abs().max()), float(field.reach(side).max())
-            if reach > _WIDEST * largest:
+        for cocs in (field.coc[field.coc <= 0], field.coc[field.coc >= 0]):
+            largest, reach = float(cocs.abs().max()), float(field.reach(cocs).max())
+            if reach > _MAX_REACH * largest:
                 raise ValueError(
                     "field.box must be lengths in the unit of field.coc, got a spot that "
                     f"reaches to {reach:g} where coc is {largest:g}"
@@ -575,13 +575,13 @@ class BlurTable:
     def _try_kernels(self) -> None:
         """Refuse parameters whose kernels at, between or beyond the nodes are not finite or far too wide."""
         low, high = _COC_RANGE
-        per_px, widest = self.px_per_unit(1.0), 0.0
-        for side in (self.coc[self.coc < 0], self.coc[self.coc > 0]):
-            largest = float(side.abs().max()) if len(side) else low
+        scale, widest = self.px_per_unit(1.0), 0.0
+        for coc in (self.coc[self.coc < 0], self.coc[self.coc > 0]):
+            largest = float(coc.abs().max()) if len(coc) else low
             if not low <= largest <= high:
                 raise ValueError(f"coc must reach somewhere from {low:g} to {high:g} ({self.unit}), got {largest:g}")
-            reach = psf.support(self.family, self.params(side * per_px, 1.0)) / per_px if len(side) else 0.0
-            if reach > _WIDEST * largest:
+            reach = psf.support(self.family, self.params(coc * scale, 1.0)) / scale if len(coc) else 0.0
+            if reach > _MAX_REACH * largest:
                 raise ValueError(
                     "params must be lengths in the unit of coc, got a kernel that "
                     f"reaches to {reach:g} where coc is {largest:g}"
@@ -589,15 +589,15 @@ class BlurTable:
             widest = max(widest, reach)
         if widest == 0.0:
             return
-        places = torch.cat([self.coc, (self.coc[1:] + self.coc[:-1]) / 2, 2.0 * self.coc[[0, -1]]])
-        tried = self.params(places * per_px, 1.0)
-        for pixels, start in itertools.product(_TRIED_PX, range(0, len(places), _TRIED_AT_ONCE)):
-            some = {name: value[:, start : start + _TRIED_AT_ONCE] for name, value in tried.items()}
-            factor = pixels / widest / per_px
-            lengths = {name: value * factor if name in psf.LENGTHS else value for name, value in some.items()}
+        cocs = torch.cat([self.coc, (self.coc[1:] + self.coc[:-1]) / 2, 2.0 * self.coc[[0, -1]]])
+        params = self.params(cocs * scale, 1.0)
+        for pixels, start in itertools.product(_CHECKED_PX, range(0, len(cocs), _CHECKED_AT_ONCE)):
+            batch = {name: value[:, start : start + _CHECKED_AT_ONCE] for name, value in params.items()}
+            factor = pixels / widest / scale
+            lengths = {name: value * factor if name in psf.LENGTHS else value for name, value in batch.items()}
             if not bool(torch.isfinite(psf.pixel_kernels(self.family, lengths)).all()):
-                named = ", ".join(f"{name} up to {float(value.max()):g}" for name, value in self._params.items())
-                raise ValueError(f"params of {self.family} make kernels that are not finite: {named}")
+                ranges = ", ".join(f"{name} up to {float(value.max()):g}" for name, value in self._params.items())
+                raise ValueError(f"params of {self.family} make kernels that are not finite: {ranges}")
 
     def _per_node(self, name: str, value: Sequence[float] | Tensor | None) -> Tensor | None:
         if value is None:
@@ -609,12 +609,12 @@ class BlurTable:
 
     def _side(self, sign: int) -> tuple[Tensor, dict[str, Tensor]] | None:
         """Nodes of one side of focus, ordered by ``|coc|``, with a node at 0; None if the side has no nodes."""
-        chosen = self.coc * sign >= 0
+        on_side = self.coc * sign >= 0
         if not bool((self.coc * sign > 0).any()):
             return None
-        order = torch.argsort(self.coc[chosen].abs())
-        distances = self.coc[chosen].abs()[order]
-        nodes = {k: v[:, chosen][:, order] for k, v in self._params.items()}
+        order = torch.argsort(self.coc[on_side].abs())
+        distances = self.coc[on_side].abs()[order]
+        nodes = {k: v[:, on_side][:, order] for k, v in self._params.items()}
         if distances[0] > 0:
             distances = torch.cat([distances.new_zeros(1), distances])
             for name, value in nodes.items():
@@ -629,20 +629,20 @@ class BlurTable:
         upper = torch.searchsorted(distances, distance.detach().contiguous()).clamp(1, len(distances) - 1)
         lower = upper - 1
         fraction = ((distance - distances[lower]) / (distances[upper] - distances[lower])).clamp(max=1.0)
-        beyond = (distance / distances[-1]).clamp_min(1.0)
-        mixed = {}
+        growth = (distance / distances[-1]).clamp_min(1.0)
+        interpolated = {}
         for name, value in nodes.items():
             weight = fraction.unsqueeze(-1) if name == "values" else fraction
-            mixed[name] = torch.lerp(value[:, lower], value[:, upper], weight)
+            interpolated[name] = torch.lerp(value[:, lower], value[:, upper], weight)
             if name in psf.LENGTHS:
-                mixed[name] = mixed[name] * beyond
-        return mixed
+                interpolated[name] = interpolated[name] * growth
+        return interpolated
 
 
 def _numbers(name: str, value: Any) -> Tensor:
     """Finite numbers as a float64 tensor on the CPU; raises ``ValueError`` with the name if they are not."""
     if isinstance(value, list | tuple):
-        value = [each.detach() if isinstance(each, Tensor) else each for each in value]
+        value = [item.detach() if isinstance(item, Tensor) else item for item in value]
     try:
         numbers = torch.as_tensor(value, device="cpu")
         if not (floating(numbers) or numbers.dtype in WHOLE_NUMBERS) or numbers.layout != torch.strided:
@@ -658,5 +658,5 @@ def _numbers(name: str, value: Any) -> Tensor:
 
 
 def _short(numbers: Tensor) -> str:
-    shown = ", ".join(f"{x:g}" for x in numbers.flatten()[:6].tolist())
-    return f"[{shown}{', ...' if numbers.numel() > 6 else ''}] of shape {list(numbers.shape)}"
+    text = ", ".join(f"{x:g}" for x in numbers.flatten()[:6].tolist())
+    return f"[{text}{', ...' if numbers.numel() > 6 else ''}] of shape {list(numbers.shape)}"

@@ -172,16 +172,16 @@ class Camera:
         if compiled is not None:
             return compiled
         z = depth if depth.dtype in (torch.float32, torch.float64) else depth.float()
-        known = z > 0
-        z = torch.where(known, z, 1.0)
-        scale = _column(self.aperture_radius_m * self.focal_px(width), z)
+        is_valid = z > 0
+        z = torch.where(is_valid, z, 1.0)
+        scale = _as_map(self.aperture_radius_m * self.focal_px(width), z)
         shift = self._tilted_dioptres(z, width)
         if self.focus_range_m is None:
-            dioptres = _dioptres_behind(z, _column(self.focus_m, z)) + shift
+            dioptres = _dioptres_behind(z, _as_map(self.focus_m, z)) + shift
         else:
-            near, far = (_dioptres_behind(z, _column(end, z)) + shift for end in self.focus_range_m)
+            near, far = (_dioptres_behind(z, _as_map(end, z)) + shift for end in self.focus_range_m)
             dioptres = near.clamp(max=0.0) + far.clamp_min(0.0)
-        return torch.where(known, scale * dioptres, torch.nan)
+        return torch.where(is_valid, scale * dioptres, torch.nan)
 
     def _compiled_coc_px(self, depth: Tensor, width: int) -> Tensor | None:
         """The same by the compiled engine; None if that does not support the call (traced, batched, tilted, ...)."""
@@ -199,13 +199,13 @@ class Camera:
         tilt, swing = self.tilt_deg, self.swing_deg
         if not isinstance(tilt, Tensor) and not isinstance(swing, Tensor) and tilt == swing == 0.0:
             return 0.0
-        tilt, swing = (torch.deg2rad(_column(angle, depth)) for angle in (tilt, swing))
+        tilt, swing = (torch.deg2rad(_as_map(angle, depth)) for angle in (tilt, swing))
         rows, columns = (
             torch.arange(n, dtype=depth.dtype, device=depth.device) + 0.5 - n / 2 for n in depth.shape[-2:]
         )
-        pitch = width / depth.shape[-1] / _column(self.focal_px(width), depth)  # pixel of the map at a distance of 1
+        pitch = width / depth.shape[-1] / _as_map(self.focal_px(width), depth)  # size of a pixel at a distance of 1
         along = torch.sin(swing) * torch.cos(tilt) * columns + torch.sin(tilt) * rows[:, None]
-        return along * pitch / _column(self.focal_length_mm / 1000.0, depth)
+        return along * pitch / _as_map(self.focal_length_mm / 1000.0, depth)
 
     def replace(self, **changes: Any) -> "Camera":
         """The same camera with some numbers changed; names are those of the constructor.
@@ -297,33 +297,33 @@ class Camera:
             raise ValueError(f"box must be (left, top, right, bottom) in pixels, got {show(box)}")
         weights = []
         for low, high, size in ((box[1], box[3], depth.shape[-2]), (box[0], box[2], depth.shape[-1])):
-            place = torch.arange(size, dtype=depth.dtype, device=depth.device) + 0.5
-            within = (place >= low) & (place <= high)
-            if not bool(within.any()):
+            centres = torch.arange(size, dtype=depth.dtype, device=depth.device) + 0.5
+            inside = (centres >= low) & (centres <= high)
+            if not bool(inside.any()):
                 raise ValueError(
                     f"box must be (left, top, right, bottom) and hold pixels of the frame of {depth.shape[-1]} x "
                     f"{depth.shape[-2]}, got {show(box)}"
                 )
-            away = (place - (low + high) / 2) / max((high - low) / 4, 1e-3)
-            weights.append(torch.where(within, torch.exp(-0.5 * away.square()), 0.0))
+            offset = (centres - (low + high) / 2) / max((high - low) / 4, 1e-3)
+            weights.append(torch.where(inside, torch.exp(-0.5 * offset.square()), 0.0))
         return self._focused(depth, (weights[0][:, None] * weights[1])[None, None], f"in the box {show(box)}")
 
-    def _focused(self, depth: Tensor, weight: Tensor, where: str) -> "Camera":
+    def _focused(self, depth: Tensor, weight: Tensor, location: str) -> "Camera":
         """This camera with the weighted median of the distances that would bring each pixel into focus."""
         distance = depth
-        far = dataclasses.replace(self, focus_m=math.inf, focus_range_m=None)
-        shift = far._tilted_dioptres(depth, int(depth.shape[-1]))
+        at_infinity = dataclasses.replace(self, focus_m=math.inf, focus_range_m=None)
+        shift = at_infinity._tilted_dioptres(depth, int(depth.shape[-1]))
         if isinstance(shift, Tensor):  # tilted: solve 1/s + shift (1 - f/s) = 1/z for s; the factor only if it breathes
-            breathing = 1.0 - _column(self.focal_length_mm / 1000.0, depth) * shift if self.focus_breathing else 1.0
+            breathing = 1.0 - _as_map(self.focal_length_mm / 1000.0, depth) * shift if self.focus_breathing else 1.0
             distance = breathing / (1.0 / depth - shift)
         medians = []
-        for values, share, valid in zip(distance, weight.expand(depth.shape), depth > 0, strict=True):
-            counts = valid & (share > 0)
-            if not bool(counts.any()):
-                raise ValueError(f"depth must be > 0 where the focus lies, got no valid depth {where}")
-            medians.append(_weighted_median(values[counts], share[counts]))
+        for values, item_weight, valid in zip(distance, weight.expand(depth.shape), depth > 0, strict=True):
+            is_used = valid & (item_weight > 0)
+            if not bool(is_used.any()):
+                raise ValueError(f"depth must be > 0 where the focus lies, got no valid depth {location}")
+            medians.append(_weighted_median(values[is_used], item_weight[is_used]))
         if not all(float(median) > 0 for median in medians):
-            raise ValueError(f"no focus brings the depth {where} onto the tilted plane; tilt less")
+            raise ValueError(f"no focus brings the depth {location} onto the tilted plane; tilt less")
         focus_m = float(medians[0]) if len(medians) == 1 else torch.stack(medians)
         return self.replace(focus_m=focus_m)
 
@@ -340,8 +340,8 @@ class Camera:
             Metres, a float or ``[B]``.
         """
         _check_number("coc_px", coc_px)
-        far = self.replace(focus_m=math.inf)
-        hyperfocal = far.aperture_radius_m * far.focal_px(width) / coc_px
+        at_infinity = self.replace(focus_m=math.inf)
+        hyperfocal = at_infinity.aperture_radius_m * at_infinity.focal_px(width) / coc_px
         return hyperfocal + self.focal_length_mm / 1000.0 if self.focus_breathing else hyperfocal
 
     def sharp_limits_m(self, coc_px: float, width: int) -> tuple[Number, Number]:
@@ -413,17 +413,17 @@ def _check_number(name: str, value: Number) -> None:
             return
         if value.device.type == "meta":
             raise ValueError(f"{name} must be a float or a tensor [B] that holds data, got one on the meta device")
-        good = bool((value.detach() > 0).all())
+        is_positive = bool((value.detach() > 0).all())
     elif isinstance(value, int | float) and not isinstance(value, bool):
-        good = value > 0 and (isinstance(value, float) or value <= 1e300)
+        is_positive = value > 0 and (isinstance(value, float) or value <= 1e300)
     else:
         raise ValueError(f"{name} must be a float or a floating-point tensor [B], got {type(value).__name__}")
-    if not good and not isinstance(value, Tensor):
+    if not is_positive and not isinstance(value, Tensor):
         raise ValueError(
             f"{name} must be positive{'' if name in _MAY_BE_INFINITE else ' and finite'}, got {show(value)}"
         )
     # compares with inf instead of math.isfinite: torch.compile can then treat the number as a variable
-    if not good or (
+    if not is_positive or (
         name not in _MAY_BE_INFINITE and (_largest(value) if isinstance(value, Tensor) else value) == math.inf
     ):
         raise ValueError(
@@ -433,9 +433,9 @@ def _check_number(name: str, value: Number) -> None:
 
 def _check_angle(name: str, value: Number) -> None:
     """Refuse an angle that is not a number, or not in (-90, 90) degrees."""
-    shaped = isinstance(value, Tensor) and value.ndim <= 1 and floating(value) and value.numel() > 0
-    plain = isinstance(value, int | float) and not isinstance(value, bool)
-    if not shaped and not plain:
+    is_tensor = isinstance(value, Tensor) and value.ndim <= 1 and floating(value) and value.numel() > 0
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_tensor and not is_number:
         raise ValueError(f"{name} must be degrees, a float or a floating-point tensor [B], got {show(value)}")
     if not is_traced() and not bool((torch.as_tensor(value, device="cpu").detach().abs() < 90.0).all()):
         raise ValueError(f"{name} must be in (-90, 90) degrees, got {_show(value)}")
@@ -464,7 +464,7 @@ def _check_map(name: str, value: Any) -> None:
         raise ValueError(f"{name} must be [B, 1, H, W]{unit}, got {list(value.shape)}")
 
 
-def _column(value: Number, like: Tensor) -> Tensor:
+def _as_map(value: Number, like: Tensor) -> Tensor:
     """A camera number as ``[B, 1, 1, 1]`` or a scalar, in the dtype of ``like``; its batch must fit ``like``."""
     if not isinstance(value, Tensor):
         return torch.as_tensor(value, dtype=like.dtype, device=like.device)

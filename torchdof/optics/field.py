@@ -31,10 +31,10 @@ from ..validation import real_tensor, show
 
 __all__ = ["Field"]
 
-_STEPS = 65535  # integer value of the brightest cell of a spot in a file
-_MOST_CELLS = 2**25  # largest number of cells in a file
-_LIT = 1e-3  # share of the brightest cell; darker cells do not count for the reach of a spot
-_LEAST_SIDE = 1e-6  # smallest side of a box, relative to the largest; avoids a division by 0
+_MAX_CODE = 65535  # integer value of the brightest cell of a spot in a file
+_MAX_CELLS = 2**25  # largest number of cells in a file
+_LIT_SHARE = 1e-3  # share of the brightest cell; darker cells do not count for the reach of a spot
+_MIN_SIDE = 1e-6  # smallest side of a box, relative to the largest; avoids a division by 0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class Field:
         if not bool((total > 0).all()):
             raise ValueError("field.light must hold some light at every node")
         object.__setattr__(self, "light", light / total)
-        sides = self.box[..., 1:].clamp_min(_LEAST_SIDE * float(self.box[..., 1:].max()))
+        sides = self.box[..., 1:].clamp_min(_MIN_SIDE * float(self.box[..., 1:].max()))
         object.__setattr__(self, "box", torch.cat([self.box[..., :1], sides], -1))
 
     @property
@@ -107,35 +107,35 @@ class Field:
 
     def spots(self, coc: float, radius: Tensor) -> tuple[Tensor, Tensor]:
         """Boxes ``[n, 3]`` and light ``[channels, n, U, V]`` at a signed coc and distances ``[n]``, float64."""
-        beyond = max(1.0, coc / float(self.coc[-1]), coc / float(self.coc[0]))
-        low, part = _between(self.radius, radius.to(torch.float64))
+        growth = max(1.0, coc / float(self.coc[-1]), coc / float(self.coc[0]))
+        low, weight = _bracket(self.radius, radius.to(torch.float64))
         nodes = slice(int(low.min()), int(low.max()) + 2)
-        k, of_next = _between(self.coc, torch.tensor(coc, dtype=torch.float64, device="cpu"))
-        box = torch.lerp(self.box[k, nodes], self.box[k + 1, nodes], of_next) * beyond  # [F, 3]
-        light = torch.lerp(self.light[:, k, nodes], self.light[:, k + 1, nodes], of_next)  # [channels, F, U, V]
+        node, blend = _bracket(self.coc, torch.tensor(coc, dtype=torch.float64, device="cpu"))
+        box = torch.lerp(self.box[node, nodes], self.box[node + 1, nodes], blend) * growth  # [F, 3]
+        light = torch.lerp(self.light[:, node, nodes], self.light[:, node + 1, nodes], blend)  # [channels, F, U, V]
         low = low - nodes.start
         return (
-            torch.lerp(box[low], box[low + 1], part[:, None]),
-            torch.lerp(light[:, low], light[:, low + 1], part[:, None, None]),
+            torch.lerp(box[low], box[low + 1], weight[:, None]),
+            torch.lerp(light[:, low], light[:, low + 1], weight[:, None, None]),
         )
 
     def reach(self, coc: Tensor) -> Tensor:
         """Radius around the origin that contains all spots of each signed coc ``[n]``."""
         coc = coc.to(torch.float64)
-        beyond = torch.maximum(coc / self.coc[-1], coc / self.coc[0]).clamp_min(1.0)
-        low, part = _between(self.coc, coc)
-        return torch.lerp(self._reaches[low], self._reaches[low + 1], part) * beyond
+        growth = torch.maximum(coc / self.coc[-1], coc / self.coc[0]).clamp_min(1.0)
+        low, weight = _bracket(self.coc, coc)
+        return torch.lerp(self._reaches[low], self._reaches[low + 1], weight) * growth
 
     @functools.cached_property
     def _reaches(self) -> Tensor:
         """Radius around the origin that contains the lit cells of all spots with the coc of each node: ``[K]``."""
         length, width = self.light.shape[-2:]
-        along = torch.linspace(-1.0, 1.0, length + 1, dtype=torch.float64, device="cpu")
-        u = along * self.box[..., 1:2] + self.box[..., :1]
+        edges = torch.linspace(-1.0, 1.0, length + 1, dtype=torch.float64, device="cpu")
+        u = edges * self.box[..., 1:2] + self.box[..., :1]
         farthest = torch.maximum(u[..., 1:].abs(), u[..., :-1].abs())
         v = torch.linspace(0.0, 1.0, width + 1, dtype=torch.float64, device="cpu")[1:] * self.box[..., 2:]
-        lit = self.light > _LIT * self.light.amax((-2, -1), keepdim=True)
-        return torch.where(lit, torch.hypot(farthest[..., None], v[..., None, :]), 0.0).amax((0, 2, 3, 4))
+        is_lit = self.light > _LIT_SHARE * self.light.amax((-2, -1), keepdim=True)
+        return torch.where(is_lit, torch.hypot(farthest[..., None], v[..., None, :]), 0.0).amax((0, 2, 3, 4))
 
     def finest(self, coc: float) -> float:
         """Radius of the disc with detail about as fine as the spot of a signed coc in the middle of the frame."""
@@ -144,10 +144,10 @@ class Field:
 
     def fingerprint(self) -> str:
         """Hash of the numbers."""
-        made = hashlib.sha256()
+        digest = hashlib.sha256()
         for value in (self.coc, self.radius, self.box, self.light):
-            made.update(repr(value.shape).encode() + value.contiguous().numpy().tobytes())
-        return made.hexdigest()
+            digest.update(repr(value.shape).encode() + value.contiguous().numpy().tobytes())
+        return digest.hexdigest()
 
     def to_dict(self) -> dict[str, Any]:
         """The field as JSON-like data, the inverse of :meth:`from_dict`.
@@ -156,13 +156,13 @@ class Field:
         (RFC 1950), base64. ``shape`` is ``[channels, K, F, U, V]``.
         """
         light = self.light / self.light.amax((-2, -1), keepdim=True)
-        steps = (light * _STEPS).round().to(torch.int32).numpy().astype("<u2")
+        codes = (light * _MAX_CODE).round().to(torch.int32).numpy().astype("<u2")
         return {
             "coc": self.coc.tolist(),
             "radius": self.radius.tolist(),
             "box": self.box.tolist(),
             "shape": list(light.shape),
-            "light": base64.b64encode(zlib.compress(steps.tobytes(), 9)).decode("ascii"),
+            "light": base64.b64encode(zlib.compress(codes.tobytes(), 9)).decode("ascii"),
         }
 
     @classmethod
@@ -181,8 +181,8 @@ class Field:
                 values[name] = torch.tensor(data[name], dtype=torch.float64, device="cpu")
             except (TypeError, ValueError, RuntimeError, OverflowError):
                 raise ValueError(f"field.{name} must be rows of numbers, got {show(data[name])}") from None
-        shape = [int(n) for n in values.pop("shape").flatten().nan_to_num().clamp(-1, _MOST_CELLS).tolist()]
-        if len(shape) != 5 or min(shape) < 1 or math.prod(shape) > _MOST_CELLS:
+        shape = [int(n) for n in values.pop("shape").flatten().nan_to_num().clamp(-1, _MAX_CELLS).tolist()]
+        if len(shape) != 5 or min(shape) < 1 or math.prod(shape) > _MAX_CELLS:
             raise ValueError(f"field.shape must be five numbers of cells, got {show(data['shape'])}")
         count = 2 * math.prod(shape)
         try:
@@ -215,7 +215,7 @@ def deviations(box: Tensor, light: Tensor) -> Tensor:
     return spread * box[:, 1:]
 
 
-def _between(nodes: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
+def _bracket(nodes: Tensor, positions: Tensor) -> tuple[Tensor, Tensor]:
     """Index of the node before each place, and the weight in [0, 1] of the next node."""
-    low = (torch.searchsorted(nodes, place.contiguous(), right=True) - 1).clamp(0, len(nodes) - 2)
-    return low, ((place - nodes[low]) / (nodes[low + 1] - nodes[low])).clamp(0.0, 1.0)
+    low = (torch.searchsorted(nodes, positions.contiguous(), right=True) - 1).clamp(0, len(nodes) - 2)
+    return low, ((positions - nodes[low]) / (nodes[low + 1] - nodes[low])).clamp(0.0, 1.0)

@@ -40,9 +40,9 @@ LEAST_CELLS = 16
 """Cells from the centre to the end of a PSF in the coarsest template."""
 
 _LEVELS = 5  # templates of 16, 32, 64, 128 and 256 cells
-_FADES_FROM = 0.75  # px a cell; from here to 1 px the next finer template is blended in
-_SMALLEST = 1e-7  # px; a smaller PSF is rendered with this radius, whose kernel is a single pixel
-_BANKS = 32  # banks kept in memory
+_FADE_START_PX = 0.75  # px a cell; from here to 1 px the next finer template is blended in
+_MIN_REACH_PX = 1e-7  # px; a smaller PSF is rendered with this radius, whose kernel is a single pixel
+_MAX_BANKS = 32  # banks kept in memory
 SPOT_MARGIN_PX = 1.0
 """Empty margin in pixels around a spot of a field, so that its samples fall to 0 at their border."""
 
@@ -52,7 +52,7 @@ FADE_IN = 4.0
 A larger value makes the blur complete at a smaller circle of confusion.
 """
 
-_WIDTHS = 64  # image widths for which the blur in focus is kept
+_MAX_WIDTHS = 64  # image widths for which the blur in focus is kept
 _templates = KernelCache(128 * 2**20)
 
 
@@ -135,10 +135,10 @@ class _Place(NamedTuple):
 
 def bank_of(table: Lens) -> "KernelBank":
     """The bank of a table; tables with the same fingerprint share it."""
-    return _bank(table.fingerprint(), _Uncompared(table))
+    return _bank(table.fingerprint(), _IgnoredByCache(table))
 
 
-class _Uncompared:
+class _IgnoredByCache:
     """Passes a table through :func:`functools.lru_cache`, which then compares only the fingerprint beside it."""
 
     def __init__(self, table: Lens) -> None:
@@ -151,8 +151,8 @@ class _Uncompared:
         return 0
 
 
-@functools.lru_cache(_BANKS)
-def _bank(fingerprint: str, uncompared: _Uncompared) -> "KernelBank":
+@functools.lru_cache(_MAX_BANKS)
+def _bank(fingerprint: str, uncompared: _IgnoredByCache) -> "KernelBank":
     return KernelBank(uncompared.table)
 
 
@@ -182,11 +182,11 @@ class KernelBank:
             reaches = [psf.reach(table.family, nodes, table.aperture) for _, nodes in sides]  # [C, N]
         self._nodes = [nodes for _, nodes in sides]
         self._distances: list[list[float]] = [distances.tolist() for distances, _ in sides]
-        self._reaches: list[list[list[float]]] = [each.tolist() for each in reaches]
+        self._reaches: list[list[list[float]]] = [reach.tolist() for reach in reaches]
         # a node of size 0 has no shape: use that of the next node
         self._shapes = [
-            [j + 1 if j + 1 < each.shape[1] and not bool(each[:, j].any()) else j for j in range(each.shape[1])]
-            for each in reaches
+            [j + 1 if j + 1 < reach.shape[1] and not bool(reach[:, j].any()) else j for j in range(reach.shape[1])]
+            for reach in reaches
         ]
         self._mirrored = self._nodes[0] is self._nodes[1]
 
@@ -194,20 +194,20 @@ class KernelBank:
         per_unit = self.table.px_per_unit(width)
         side, distance = int(coc_px >= 0), abs(coc_px) / per_unit
         nodes, reaches = self._distances[side], self._reaches[side]
-        low = min(max(bisect.bisect_left(nodes, distance) - 1, 0), len(nodes) - 2)
-        part, slope = (distance - nodes[low]) / (nodes[low + 1] - nodes[low]), 1.0 / (nodes[low + 1] - nodes[low])
+        node = min(max(bisect.bisect_left(nodes, distance) - 1, 0), len(nodes) - 2)
+        part, slope = (distance - nodes[node]) / (nodes[node + 1] - nodes[node]), 1.0 / (nodes[node + 1] - nodes[node])
         if part > 1.0:  # beyond the last node lengths grow with the coc
             sizes, slopes = [r[-1] * distance / nodes[-1] for r in reaches], [r[-1] / nodes[-1] for r in reaches]
             part, slope = 1.0, 0.0
         else:
-            slopes = [(r[low + 1] - r[low]) * slope for r in reaches]
-            sizes = [r[low] + part * (r[low + 1] - r[low]) for r in reaches]
+            slopes = [(r[node + 1] - r[node]) * slope for r in reaches]
+            sizes = [r[node] + part * (r[node + 1] - r[node]) for r in reaches]
         if self.table.field is not None:
-            seen = float(
+            spot_reach = float(
                 self.table.field.reach(torch.tensor([coc_px / per_unit], dtype=torch.float64, device="cpu"))[0]
             )
-            sizes, slopes = [seen * min(abs(coc_px), 1.0)] * self.colours, [0.0] * self.colours
-        return _Place(side, low, part, [size * per_unit for size in sizes], slope / per_unit, slopes)
+            sizes, slopes = [spot_reach * min(abs(coc_px), 1.0)] * self.colours, [0.0] * self.colours
+        return _Place(side, node, part, [size * per_unit for size in sizes], slope / per_unit, slopes)
 
     def spots(
         self, coc_px: Tensor | Sequence[float], width: float, scale: Sequence[float] = (), longest: Sequence[int] = ()
@@ -237,18 +237,18 @@ class KernelBank:
                 reach = [0.0 if coc == 0 else r + math.sqrt(2.0) * SPOT_MARGIN_PX for r in reach]
                 half = math.floor(max(reach))
             else:
-                reach = [max(r, _SMALLEST) for r in reach]
+                reach = [max(r, _MIN_REACH_PX) for r in reach]
                 largest = max(reach) * self.widest
                 half = max(0, math.ceil(largest - 1e-9))
                 level = min(max(0, math.ceil(math.log2(largest / LEAST_CELLS))), _LEVELS - 1)
                 if level < _LEVELS - 1:
                     cell = largest / (LEAST_CELLS << level)
-                    finer = min(max((cell - _FADES_FROM) / (1.0 - _FADES_FROM), 0.0), 1.0)
+                    finer = min(max((cell - _FADE_START_PX) / (1.0 - _FADE_START_PX), 0.0), 1.0)
                 ends = [
                     (place.side, place.node + above, level + up) for up in range(1 + (finer > 0)) for above in (0, 1)
                 ]
-                found = [index_of(*end) for end in ends]
-                index = (found[0], found[1], found[-2], found[-1])
+                indices = [index_of(*end) for end in ends]
+                index = (indices[0], indices[1], indices[-2], indices[-1])
             spots.which.append(index)
             spots.part.append(place.part)
             spots.finer.append(finer)
@@ -256,17 +256,17 @@ class KernelBank:
             spots.fade.append(self._fade(coc / size, width / size))
             spots.flipped.append(place.side == 0 and not self.table.is_round)
             spots.half.append(half)
-        wanted = [(self._lens, *key) for key in keys]
-        made = _templates.get_all(wanted, lambda missing: [self._template(*key[1:]) for key in missing])
+        template_keys = [(self._lens, *key) for key in keys]
+        templates = _templates.get_all(template_keys, lambda missing: [self._template(*key[1:]) for key in missing])
         halves = [min(half, n - 1) for half, n in zip(spots.half, longest, strict=True)] if longest else spots.half
         moves = None
         if isinstance(coc_px, Tensor) and is_differentiated(coc_px):
             distance = coc_px.to("cpu", torch.float64).abs()
-            moved = distance - distance.detach()
+            zero = distance - distance.detach()
             slopes = [[slope / size for slope in p.reach_slopes] for p, size in zip(places, scales, strict=True)]
-            part = moved * torch.tensor([p.part_slope for p in places], dtype=torch.float64, device="cpu")
-            moves = (part, moved[:, None] * torch.tensor(slopes, dtype=torch.float64, device="cpu"))
-        return spots._replace(templates=made, half=halves, moves=moves)
+            part = zero * torch.tensor([p.part_slope for p in places], dtype=torch.float64, device="cpu")
+            moves = (part, zero[:, None] * torch.tensor(slopes, dtype=torch.float64, device="cpu"))
+        return spots._replace(templates=templates, half=halves, moves=moves)
 
     def kernels(
         self, coc_px: Tensor | Sequence[float], width: float, scale: Sequence[float] = (), longest: Sequence[int] = ()
@@ -282,44 +282,44 @@ class KernelBank:
         """The kernels of :meth:`kernels`, from the result of :meth:`spots`."""
         half = max(spots.half)
         numbers = (spots.part, spots.finer, spots.reach, spots.fade, spots.half)
-        parts, finer, reach, fade, halves = (torch.tensor(each, dtype=torch.float64, device="cpu") for each in numbers)
+        parts, finer, reach, fade, halves = (torch.tensor(v, dtype=torch.float64, device="cpu") for v in numbers)
         if spots.moves is not None:
             parts, reach = parts + spots.moves[0], reach + spots.moves[1]
         step = torch.arange(-half, half + 1, dtype=torch.float64, device="cpu")
         outside = (torch.maximum(step.abs(), step.abs()[:, None]) > halves[:, None, None])[:, None]
         if self.is_even:
             disc = (torch.hypot(step[:, None], step) <= reach[:, :, None, None]).to(torch.float64)
-            made = disc / disc.sum((-2, -1), keepdim=True)
+            out = disc / disc.sum((-2, -1), keepdim=True)
         else:
-            made = torch.zeros(len(spots.part), self.colours, len(step), len(step), dtype=torch.float64, device="cpu")
+            out = torch.zeros(len(spots.part), self.colours, len(step), len(step), dtype=torch.float64, device="cpu")
             for key in set(spots.which):
-                which = torch.tensor([i for i, other in enumerate(spots.which) if other == key], device="cpu")
+                items = torch.tensor([i for i, other in enumerate(spots.which) if other == key], device="cpu")
                 low, high, fine_low, fine_high = (spots.templates[i].double() for i in key)
-                sizes, part = reach[which], parts[which][:, None, None, None]
-                cut = halves[which, None] < sizes.detach() * self.widest - 1e-9
-                kernel = self._sampled(torch.lerp(low, high, part), sizes, outside[which], cut)
-                if bool((finer[which] > 0).any()):
-                    fine = self._sampled(torch.lerp(fine_low, fine_high, part), sizes, outside[which], cut)
-                    kernel = torch.lerp(kernel, fine, finer[which][:, None, None, None])
-                made = made.index_put((which,), kernel)
+                sizes, part = reach[items], parts[items][:, None, None, None]
+                cut = halves[items, None] < sizes.detach() * self.widest - 1e-9
+                kernel = self._sampled(torch.lerp(low, high, part), sizes, outside[items], cut)
+                if bool((finer[items] > 0).any()):
+                    fine = self._sampled(torch.lerp(fine_low, fine_high, part), sizes, outside[items], cut)
+                    kernel = torch.lerp(kernel, fine, finer[items][:, None, None, None])
+                out = out.index_put((items,), kernel)
         if any(spots.flipped):
-            made = torch.where(torch.tensor(spots.flipped, device="cpu")[:, None, None, None], made.flip(-2, -1), made)
+            out = torch.where(torch.tensor(spots.flipped, device="cpu")[:, None, None, None], out.flip(-2, -1), out)
         if bool((fade == 1.0).all()):
-            return made
-        centre = torch.zeros_like(made)
+            return out
+        centre = torch.zeros_like(out)
         centre[..., half, half] = 1.0
-        return torch.lerp(centre, made, fade[:, :, None, None])
+        return torch.lerp(centre, out, fade[:, :, None, None])
 
     def _sampled(self, cells: Tensor, reach: Tensor, outside: Tensor, cut: Tensor) -> Tensor:
         """Kernels ``[n, C, k, k]`` from templates ``[n, C, cells, cells]`` and reach ``[n, C]``.
 
         They are 0 at the pixels ``outside`` ``[n, 1, k, k]``. Each sums to 1; those with ``cut`` to the light inside.
         """
-        high = reach / (cells.shape[-1] // 2 - 1)
-        wide = high / self.squeeze
-        kernel = psf.sampled(cells, high, high if self.squeeze == 1.0 else wide, outside.shape[-1] // 2)
+        height = reach / (cells.shape[-1] // 2 - 1)
+        width = height / self.squeeze
+        kernel = psf.sampled(cells, height, height if self.squeeze == 1.0 else width, outside.shape[-1] // 2)
         kernel = kernel.masked_fill(outside, 0.0)
-        light = cells.sum((-2, -1)) * high.clamp_min(1.0) * wide.clamp_min(1.0)  # sum of the uncut kernel
+        light = cells.sum((-2, -1)) * height.clamp_min(1.0) * width.clamp_min(1.0)  # sum of the uncut kernel
         light = torch.where(cut, light, kernel.sum((-2, -1)))
         return kernel / light[..., None, None]
 
@@ -352,8 +352,8 @@ class KernelBank:
         """
         sign = 1.0 if self._mirrored and self.table.is_round else sign
         if sign not in self._found:
-            last = float(self._distances[sign > 0][-1]) * self.table.px_per_unit(1.0)
-            self._found[sign] = find(self, sign, 1.0 if self.table.unit == "relative" else 1.0 / last)
+            outermost = float(self._distances[sign > 0][-1]) * self.table.px_per_unit(1.0)
+            self._found[sign] = find(self, sign, 1.0 if self.table.unit == "relative" else 1.0 / outermost)
         return self._found[sign]
 
     @torch.inference_mode(False)
@@ -368,7 +368,7 @@ class KernelBank:
         if self.table.is_sharp_in_focus or self.is_even:
             return [1.0] * self.colours
         if width not in self._moved:
-            if len(self._moved) >= _WIDTHS:
+            if len(self._moved) >= _MAX_WIDTHS:
                 self._moved.clear()
             self._moved[width] = self.table.moved_in_focus(width).tolist()
-        return [min(coc_px**2 * FADE_IN / max(moved, 1e-300), 1.0) for moved in self._moved[width]]
+        return [min(coc_px**2 * FADE_IN / max(moved_light, 1e-300), 1.0) for moved_light in self._moved[width]]

@@ -69,17 +69,17 @@ class KernelCache:
         return [results[key] for key in keys]
 
 
-def _unwrapped(made: Any) -> Any:
+def _unwrapped(result: Any) -> Any:
     """Remove the wrappers of torch.func, which wraps every tensor, also one that depends on no input."""
-    if isinstance(made, tuple):
-        return tuple(map(_unwrapped, made))
-    while isinstance(made, Tensor) and torch._C._functorch.is_functorch_wrapped_tensor(made):
-        made = torch._C._functorch.get_unwrapped(made)
-    return made
+    if isinstance(result, tuple):
+        return tuple(map(_unwrapped, result))
+    while isinstance(result, Tensor) and torch._C._functorch.is_functorch_wrapped_tensor(result):
+        result = torch._C._functorch.get_unwrapped(result)
+    return result
 
 
-def _bytes(made: Tensor | tuple[Tensor, ...] | float) -> int:
-    tensors = made if isinstance(made, tuple) else (made,)
+def _bytes(result: Tensor | tuple[Tensor, ...] | float) -> int:
+    tensors = result if isinstance(result, tuple) else (result,)
     return sum(t.untyped_storage().nbytes() for t in tensors if isinstance(t, Tensor))
 
 
@@ -91,13 +91,13 @@ def kept(make: Callable[_Arguments, Kept]) -> Callable[_Arguments, Kept]:
 
     In traced code, and under ``FakeTensorMode``, the function is called each time.
     """
-    whole = torch.inference_mode(False)(make)  # autograd will use them too, and refuses inference tensors
+    outside_inference = torch.inference_mode(False)(make)  # autograd will use them too, and refuses inference tensors
 
     @functools.wraps(make)
-    def called(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> Kept:
+    def cached(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> Kept:
         if is_traced() or is_fake():
             return make(*args, **kwargs)
         key = (make.__module__, make.__qualname__, args, tuple(sorted(kwargs.items())))
-        return _CONSTANTS.get(key, lambda: whole(*args, **kwargs))
+        return _CONSTANTS.get(key, lambda: outside_inference(*args, **kwargs))
 
-    return called
+    return cached

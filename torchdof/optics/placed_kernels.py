@@ -35,14 +35,14 @@ __all__ = ["DISTANCES", "Shares", "layer_shares", "placed", "placed_between", "r
 DISTANCES = 17
 """Number of distances, from the middle of the frame to its corner, at which shares are computed."""
 
-_FINE = 4.0  # samples of a share per pixel
-_MOST = 64  # most samples on each side of the origin
-_LEAST_SEEN = 0.5  # px; smallest width over which a sample averages the spot
-_ASIDE = 1e-6  # half diagonals; offset that gives the middle of the frame an azimuth
-_SMALLEST = 1e-6  # px; smallest scale of a spot, so that boxes have a size in focus
-_LEAST = 1e-6  # share of a kernel's light; where less passes, the kernel is not masked
-_LEAST_SIZE = 0.5  # smallest scale of a spot, which is shrunk by the blur that sampling adds
-_RAY_STEP = 1.09  # ratio of neighbouring radii at which the shares of highlights are computed
+_SAMPLES_PER_PX = 4.0  # samples of a share per pixel
+_MAX_SAMPLES = 64  # most samples on each side of the origin
+_MIN_AVERAGED_PX = 0.5  # px; smallest width over which a sample averages the spot
+_CENTRE_OFFSET = 1e-6  # half diagonals; offset that gives the middle of the frame an azimuth
+_MIN_SCALE_PX = 1e-6  # px; smallest scale of a spot, so that boxes have a size in focus
+_MIN_LIGHT = 1e-6  # share of a kernel's light; where less passes, the kernel is not masked
+_MIN_SHRINK = 0.5  # smallest scale of a spot, which is shrunk by the blur that sampling adds
+_RADIUS_RATIO = 1.09  # ratio of neighbouring radii at which the shares of highlights are computed
 _shares = KernelCache(128 * 2**20)
 
 
@@ -95,17 +95,17 @@ def layer_shares(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, 
 def ray_shares(table: PlacedLens, coc_px: Sequence[float], size: tuple[int, int]) -> list[Shares]:
     """Shares for highlights with signed ``coc_px``, ordered by coc.
 
-    They are computed at fixed radii, powers of ``_RAY_STEP``: the two around each highlight.
+    They are computed at fixed radii, powers of ``_RADIUS_RATIO``: the two around each highlight.
     """
-    steps = set()
+    exponents = set()
     for coc in coc_px:
-        step = math.floor(math.log(max(abs(coc), 1.0)) / math.log(_RAY_STEP))
-        steps |= {(coc < 0, step), (coc < 0, step + 1)}
-    radii = sorted(math.copysign(_RAY_STEP**step, -1.0 if near else 1.0) for near, step in steps)
+        exponent = math.floor(math.log(max(abs(coc), 1.0)) / math.log(_RADIUS_RATIO))
+        exponents |= {(coc < 0, exponent), (coc < 0, exponent + 1)}
+    radii = sorted(math.copysign(_RADIUS_RATIO**exponent, -1.0 if near else 1.0) for near, exponent in exponents)
     keys = [("ray", table.fingerprint(), radius, 1, size) for radius in radii]
-    made = _shares.get_all(keys, lambda missing: [_computed(table, key[2], 1, size) for key in missing])
+    computed = _shares.get_all(keys, lambda missing: [_computed(table, key[2], 1, size) for key in missing])
     squeeze = _squeeze(table)
-    return [Shares(values, boxes, radius, squeeze) for (values, boxes), radius in zip(made, radii, strict=True)]
+    return [Shares(values, boxes, radius, squeeze) for (values, boxes), radius in zip(computed, radii, strict=True)]
 
 
 def _squeeze(table: PlacedLens) -> float | Tensor:
@@ -129,45 +129,45 @@ def _computed(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int
     per_unit = table.px_per_unit(size[1])
     boxes, light = table.field.spots(coc_px / per_unit, distance * half_diagonal / per_unit)
     # below 1 px the spot shrinks with the coc, so that a point in focus stays a point and blur starts continuously
-    boxes = boxes * (per_unit / scale * min(1.0, max(abs(coc_px), _SMALLEST)))
+    boxes = boxes * (per_unit / scale * min(1.0, max(abs(coc_px), _MIN_SCALE_PX)))
     # variance added by averaging blocks, interpolating between them, and by the box of a pixel below, in px^2
-    added = (1 / 4 - 1 / (12 * scale**2) if scale > 1 else 0.0) + 1 / 12
+    added_variance = (1 / 4 - 1 / (12 * scale**2) if scale > 1 else 0.0) + 1 / 12
     rows, columns = light.shape[-2:]
     cells = boxes[:, 1:] * torch.tensor([2.0 / rows, 1.0 / columns], dtype=torch.float64, device="cpu")
     spread = deviations(boxes, light).square()
-    smaller = (1.0 - added / spread.clamp_min(1e-12)).clamp_min(_LEAST_SIZE**2).sqrt()
-    boxes = torch.cat([boxes[:, :1], boxes[:, 1:] * smaller], -1)
-    around = boxes + torch.tensor([0.0, SPOT_MARGIN_PX, SPOT_MARGIN_PX], dtype=torch.float64, device="cpu")
-    wanted = (_FINE * around[:, 1:].amax(0)).clamp(max=_MOST)
-    rows, columns = (math.ceil(number) for number in wanted.tolist())
+    shrink = (1.0 - added_variance / spread.clamp_min(1e-12)).clamp_min(_MIN_SHRINK**2).sqrt()
+    boxes = torch.cat([boxes[:, :1], boxes[:, 1:] * shrink], -1)
+    extent = boxes + torch.tensor([0.0, SPOT_MARGIN_PX, SPOT_MARGIN_PX], dtype=torch.float64, device="cpu")
+    ideal_counts = (_SAMPLES_PER_PX * extent[:, 1:].amax(0)).clamp(max=_MAX_SAMPLES)
+    rows, columns = (math.ceil(number) for number in ideal_counts.tolist())
     counts = torch.tensor([rows, columns], device="cpu")
-    around[:, 1:] *= counts / wanted  # a sample's size is a continuous function of the radius
-    along = torch.linspace(-1.0, 1.0, 2 * rows + 1, dtype=torch.float64, device="cpu") * around[:, 1:2] + around[:, :1]
-    across = torch.linspace(0.0, 1.0, columns + 1, dtype=torch.float64, device="cpu") * around[:, 2:]
+    extent[:, 1:] *= counts / ideal_counts  # a sample's size is a continuous function of the radius
+    along = torch.linspace(-1.0, 1.0, 2 * rows + 1, dtype=torch.float64, device="cpu") * extent[:, 1:2] + extent[:, :1]
+    across = torch.linspace(0.0, 1.0, columns + 1, dtype=torch.float64, device="cpu") * extent[:, 2:]
     length, width = light.shape[-2:]
-    ends = torch.linspace(-1.0, 1.0, length + 1, dtype=torch.float64, device="cpu") * boxes[:, 1:2] + boxes[:, :1]
-    sides = torch.linspace(-1.0, 1.0, 2 * width + 1, dtype=torch.float64, device="cpu") * boxes[:, 2:]
-    whole = torch.cat([light.flip(-1), light], -1)  # [C, distances, U, 2 V]
+    row_edges = torch.linspace(-1.0, 1.0, length + 1, dtype=torch.float64, device="cpu") * boxes[:, 1:2] + boxes[:, :1]
+    column_edges = torch.linspace(-1.0, 1.0, 2 * width + 1, dtype=torch.float64, device="cpu") * boxes[:, 2:]
+    mirrored = torch.cat([light.flip(-1), light], -1)  # [C, distances, U, 2 V]
     area = cells.prod(-1)[:, None, None]
     # width of the average: a pixel, minus the variance that cells and linear interpolation between samples add
-    samples = around[:, 1:] / counts
-    pixel = (1.0 - 2.0 * samples.square() - 3.0 * cells.square()).clamp_min(_LEAST_SEEN**2).sqrt()
-    values = _overlaps(along, ends, pixel[:, 0]) @ (whole / area)
-    values = values @ _overlaps(across, sides, pixel[:, 1]).transpose(-2, -1)
-    return values / values.amax((0, 2, 3), keepdim=True), around
+    sample_px = extent[:, 1:] / counts
+    averaged_px = (1.0 - 2.0 * sample_px.square() - 3.0 * cells.square()).clamp_min(_MIN_AVERAGED_PX**2).sqrt()
+    values = _overlaps(along, row_edges, averaged_px[:, 0]) @ (mirrored / area)
+    values = values @ _overlaps(across, column_edges, averaged_px[:, 1]).transpose(-2, -1)
+    return values / values.amax((0, 2, 3), keepdim=True), extent
 
 
-def _overlaps(place: Tensor, ends: Tensor, width: Tensor) -> Tensor:
+def _overlaps(centres: Tensor, edges: Tensor, width: Tensor) -> Tensor:
     """Overlap of intervals with cells: ``[n, places, cells]``.
 
     Args:
-        place: Centres of the intervals ``[n, places]``.
-        ends: Edges of the cells ``[n, cells + 1]``.
+        centres: Centres of the intervals ``[n, places]``.
+        edges: Edges of the cells ``[n, cells + 1]``.
         width: Width of the intervals ``[n]``.
     """
-    place, half = place[:, :, None], 0.5 * width[:, None, None]
-    low = torch.maximum(place - half, ends[:, None, :-1])
-    return (torch.minimum(place + half, ends[:, None, 1:]) - low).clamp_min(0.0)
+    centres, half = centres[:, :, None], 0.5 * width[:, None, None]
+    low = torch.maximum(centres - half, edges[:, None, :-1])
+    return (torch.minimum(centres + half, edges[:, None, 1:]) - low).clamp_min(0.0)
 
 
 def _through_rims(table: PlacedLens, coc_px: float, width: float, distance: Tensor) -> tuple[Tensor, Tensor]:
@@ -177,17 +177,17 @@ def _through_rims(table: PlacedLens, coc_px: float, width: float, distance: Tens
     # whole pixels, so that samples lie a pixel apart, whatever the squeeze
     reach = math.ceil((math.ceil(table.reach_px(coc_px, width)) + 1) * max(1.0, float(table.aperture.squeeze)))
     boxes = torch.tensor([0.0, reach, reach], dtype=torch.float64, device="cpu").expand(len(distance), 3)
-    count = min(2 * _MOST, reach)
+    count = min(2 * _MAX_SAMPLES, reach)
     along = torch.linspace(-1.0, 1.0, 2 * count + 1, dtype=torch.float64, device="cpu") * boxes[0, 1]
     across = torch.linspace(0.0, 1.0, count + 1, dtype=torch.float64, device="cpu") * boxes[0, 2]
     front, rear = table.aperture.rims
-    inside = []
+    depths = []
     for shift in (2.0 * front * coc_px, -2.0 * rear * coc_px):
-        away = torch.hypot(along[None, :, None] + shift * distance[:, None, None], across)
+        distance_px = torch.hypot(along[None, :, None] + shift * distance[:, None, None], across)
         # a rim shifted by less than a pixel cuts less, so that kernels in the middle of the frame are unchanged
         slack = 4.0 * (abs(coc_px) + 1.0) * (1.0 - abs(shift) * distance).clamp_min(0.0)[:, None, None]
-        inside.append(abs(coc_px) + 0.5 + slack - away)
-    return torch.minimum(*inside).unsqueeze(0), boxes.contiguous()
+        depths.append(abs(coc_px) + 0.5 + slack - distance_px)
+    return torch.minimum(*depths).unsqueeze(0), boxes.contiguous()
 
 
 def placed(kernel: Tensor, shares: Sequence[tuple[Shares, Tensor]], y: Tensor, x: Tensor) -> Tensor:
@@ -202,29 +202,27 @@ def placed(kernel: Tensor, shares: Sequence[tuple[Shares, Tensor]], y: Tensor, x
     Returns:
         ``[n, 1 or C, k, k]``, each with the same sum as ``kernel``.
     """
-    step = torch.arange(kernel.shape[-1], dtype=kernel.dtype, device=kernel.device) - kernel.shape[-1] // 2
+    offset = torch.arange(kernel.shape[-1], dtype=kernel.dtype, device=kernel.device) - kernel.shape[-1] // 2
     y, x = (t.to(kernel.dtype)[:, None, None] for t in (y, x))
-    x = x + _ASIDE
+    x = x + _CENTRE_OFFSET
     distance = torch.sqrt(y * y + x * x)
     down, right = y / distance, x / distance
-    place = distance.flatten().clamp(max=1.0) * (DISTANCES - 1)
-    low = place.long().clamp(max=DISTANCES - 2)
-    near = place - low
-    across = step * shares[0][0].squeeze
-    u, v = step[:, None] * down + across * right, (across * down - step[:, None] * right).abs()
-    of_place = []
-    for each, _ in shares:
-        of_place.append(torch.lerp(each.boxes[low], each.boxes[low + 1], near[:, None]))  # [n, 3]
-    box = torch.stack([part.reshape(-1, 1) * box for (_, part), box in zip(shares, of_place, strict=True)]).sum(0)
+    position = distance.flatten().clamp(max=1.0) * (DISTANCES - 1)
+    low = position.long().clamp(max=DISTANCES - 2)
+    fraction = position - low
+    across = offset * shares[0][0].squeeze
+    u, v = offset[:, None] * down + across * right, (across * down - offset[:, None] * right).abs()
+    boxes = [torch.lerp(entry.boxes[low], entry.boxes[low + 1], fraction[:, None]) for entry, _ in shares]  # [n, 3]
+    box = torch.stack([weight.reshape(-1, 1) * box for (_, weight), box in zip(shares, boxes, strict=True)]).sum(0)
     grid = torch.stack([2.0 * v / box[:, 2:, None] - 1.0, (u - box[:, :1, None]) / box[:, 1:2, None]], -1)
-    share = kernel.new_zeros(())
-    for each, part in shares:
-        values = torch.lerp(each.values[:, low], each.values[:, low + 1], near[:, None, None]).transpose(0, 1)
-        taken = functional.grid_sample(values, grid, padding_mode="border", align_corners=True).clamp(0.0, 1.0)
-        share = share + part.reshape(-1, 1, 1, 1) * taken
-    cut = kernel * share
-    light, left = (k.sum((-2, -1), keepdim=True) for k in (kernel, cut))
-    return torch.where(left > _LEAST * light, cut * (light / left.clamp_min(1e-30)), kernel)
+    mask = kernel.new_zeros(())
+    for entry, weight in shares:
+        values = torch.lerp(entry.values[:, low], entry.values[:, low + 1], fraction[:, None, None]).transpose(0, 1)
+        mask_part = functional.grid_sample(values, grid, padding_mode="border", align_corners=True).clamp(0.0, 1.0)
+        mask = mask + weight.reshape(-1, 1, 1, 1) * mask_part
+    masked = kernel * mask
+    light, light_left = (k.sum((-2, -1), keepdim=True) for k in (kernel, masked))
+    return torch.where(light_left > _MIN_LIGHT * light, masked * (light / light_left.clamp_min(1e-30)), kernel)
 
 
 def placed_between(kernels: Tensor, shares: Sequence[Shares], coc: Tensor, y: Tensor, x: Tensor) -> Tensor:
@@ -237,12 +235,12 @@ def placed_between(kernels: Tensor, shares: Sequence[Shares], coc: Tensor, y: Te
         y: Places ``[n]``, in half diagonals down from the middle of the frame.
         x: The same to the right.
     """
-    radii = torch.tensor([each.coc_px for each in shares], dtype=coc.dtype, device=coc.device)
+    radii = torch.tensor([entry.coc_px for entry in shares], dtype=coc.dtype, device=coc.device)
     low = (torch.searchsorted(radii, coc.detach().contiguous(), right=True) - 1).clamp(0, len(radii) - 2)
-    parts = ((coc - radii[low]) / (radii[low + 1] - radii[low])).clamp(0.0, 1.0)
-    made = torch.empty_like(kernels.expand(-1, max(kernels.shape[1], shares[0].values.shape[0]), -1, -1))
+    weights = ((coc - radii[low]) / (radii[low + 1] - radii[low])).clamp(0.0, 1.0)
+    result = torch.empty_like(kernels.expand(-1, max(kernels.shape[1], shares[0].values.shape[0]), -1, -1))
     for k in low.unique().tolist():
-        of = (low == k).nonzero()[:, 0]
-        pair = [(shares[k], 1.0 - parts[of]), (shares[k + 1], parts[of])]
-        made = made.index_put((of,), placed(kernels[of], pair, y[of], x[of]))
-    return made
+        items = (low == k).nonzero()[:, 0]
+        pair = [(shares[k], 1.0 - weights[items]), (shares[k + 1], weights[items])]
+        result = result.index_put((items,), placed(kernels[items], pair, y[items], x[items]))
+    return result

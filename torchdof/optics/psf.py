@@ -10,7 +10,7 @@ the samples. The kernel of least error over pictures of a power spectrum ``S(f)`
 that is ``K[m] = integral psf(x) phi(m - x) dx``, with the interpolator ``phi^(f) = P(f) / sum_i P(f + i)``. Photographs
 have ``S ~ 1 / f^2``; for them the separable cardinal cubic spline is as good a phi. It changes no second moment: a
 Gaussian of 1.3 px gives a kernel of standard deviation 1.3 px. Where the lobes of phi make a pixel negative, its four
-neighbours give up light to raise it to 0 (:func:`_settled`). Kernels of discs are then within 0.3 dB of the
+neighbours give up light to raise it to 0 (:func:`_non_negative`). Kernels of discs are then within 0.3 dB of the
 non-negative kernel of least error. As a length goes to 0, the kernel approaches a single pixel with its square.
 
 The integral is a sum over square cells: 16 from the centre to the end of a small PSF, cells of a pixel in a large one.
@@ -72,18 +72,18 @@ FAMILIES: dict[str, tuple[str, ...]] = {
 LENGTHS = frozenset({"sigma", "r_c", "radius"})
 """Parameters that are lengths; the others are pure numbers."""
 
-_SMALLEST = 1e-7  # px; a length below it is rendered as this, which is a kernel of one pixel to 1e-14
+_MIN_LENGTH_PX = 1e-7  # px; a length below it is rendered as this, which is a kernel of one pixel to 1e-14
 _TILT_EXPONENT = 460.0  # largest logarithm of (r / R)^m, e^460 = 1e200; a larger power would overflow
 _CACHED_HALF_WIDTH = 64  # cells; slices of larger quadrants are not cached
-_LARGEST = 2**16 + 1  # px; a kernel of this width takes 34 GB
-_ALWAYS_WHOLE = 256  # px on each side of the centre; smaller kernels are computed whole, whatever the window
-_AT_ONCE = 2**20  # slices computed together; limits memory
-_CELLS = 16  # cells from the centre to the end of a PSF with a radius of at most as many pixels
-_PARTS = 3  # parts of a cell along each axis where an opening cuts the profile; more are more exact
+_MAX_WIDTH_PX = 2**16 + 1  # px; a kernel of this width takes 34 GB
+_FULL_UP_TO_PX = 256  # px on each side of the centre; smaller kernels are computed whole, whatever the window
+_SLICES_AT_ONCE = 2**20  # slices computed together; limits memory
+_CELLS = 16  # least cells from the centre to the end of a PSF; larger PSFs have cells of a pixel
+_CELL_PARTS = 3  # parts of a cell along each axis where an opening cuts the profile; more are more exact
 _MASS_CELLS = 60  # cells on each side over which the light of a large kernel with an opening is summed
-_AROUND = 2  # px around a kernel that its values depend on (the four neighbours of _settled, and theirs)
-_quadrants = KernelCache(64 * 2**20)
+_MARGIN_PX = 2  # px around a kernel that its values depend on (the four neighbours in _non_negative, and theirs)
 _RINGS = 2**14  # rings over which the light of a large round kernel is summed; agrees with its pixels to 1e-6
+_quadrants = KernelCache(64 * 2**20)
 
 Number = float | Tensor
 
@@ -216,28 +216,28 @@ def pixel_kernels(
     """
     checked = _checked(family, params)
     reach_px = _support(family, checked, aperture)
-    whole = half_width(reach_px) if size is None and window is not None else width_of(size, reach_px) // 2
-    part = whole if window is None else min(whole, width_of(window, reach_px) // 2)
-    half = whole if whole <= _ALWAYS_WHOLE else part
-    lengths = {k: v.clamp_min(_SMALLEST) if k in ("sigma", "radius") else v for k, v in checked.items()}
+    full_half = half_width(reach_px) if size is None and window is not None else width_of(size, reach_px) // 2
+    window_half = full_half if window is None else min(full_half, width_of(window, reach_px) // 2)
+    half = full_half if full_half <= _FULL_UP_TO_PX else window_half
+    lengths = {k: v.clamp_min(_MIN_LENGTH_PX) if k in ("sigma", "radius") else v for k, v in checked.items()}
     end = reach(family, lengths, aperture)
-    high = wide = (end / _CELLS).clamp(max=1.0)  # sides of a cell, in pixels
+    height = width = (end / _CELLS).clamp(max=1.0)  # sides of a cell, in pixels
     if aperture is not None:
-        wide = (end / aperture.squeeze / _CELLS).clamp(max=1.0)
-    in_cells = {k: v / high if k in LENGTHS else v for k, v in lengths.items()}
-    aspect = None if aperture is None else wide * aperture.squeeze / high  # width over height of a cell, unsqueezed
-    farthest = math.ceil(min(_support(family, lengths, aperture), half + _AROUND))  # px; a large PSF has 1 px cells
-    cells = _sharpened(_cells(family, in_cells, max(_CELLS, farthest) + 1, whole, aperture, aspect))
-    kernel = sampled(cells, high, wide, half)
-    if half == whole:
+        width = (end / aperture.squeeze / _CELLS).clamp(max=1.0)
+    in_cells = {k: v / height if k in LENGTHS else v for k, v in lengths.items()}
+    aspect = None if aperture is None else width * aperture.squeeze / height  # of a cell, without the squeeze
+    farthest = math.ceil(min(_support(family, lengths, aperture), half + _MARGIN_PX))  # px; large PSFs have 1 px cells
+    cells = _sharpened(_cells(family, in_cells, max(_CELLS, farthest) + 1, full_half, aperture, aspect))
+    kernel = sampled(cells, height, width, half)
+    if half == full_half:
         total = kernel.sum((-2, -1), keepdim=True)
     else:
-        total = _mass(family, in_cells, whole, aperture, aspect)[..., None, None]
+        total = _total_light(family, in_cells, full_half, aperture, aspect)[..., None, None]
     centre = torch.zeros_like(kernel)
     centre[..., half, half] = 1.0
     # no light at all: the PSF underflows in float64, or lies beyond size
     kernel = torch.where(total > 0, kernel / torch.where(total > 0, total, 1.0), centre)
-    return kernel[..., half - part : half + part + 1, half - part : half + part + 1]
+    return kernel[..., half - window_half : half + window_half + 1, half - window_half : half + window_half + 1]
 
 
 def template(family: str, params: Mapping[str, Tensor], cells: int, aperture: Aperture | None = None) -> Tensor:
@@ -254,22 +254,23 @@ def template(family: str, params: Mapping[str, Tensor], cells: int, aperture: Ap
     Returns:
         ``[C, 2 cells + 3, 2 cells + 3]``, float64, up to a factor.
     """
-    lengths = {k: v.clamp_min(_SMALLEST) if k in ("sigma", "radius") else v for k, v in params.items()}
+    lengths = {k: v.clamp_min(_MIN_LENGTH_PX) if k in ("sigma", "radius") else v for k, v in params.items()}
     cell = reach(family, lengths, aperture) / cells
     in_cells = {k: v / cell if k in LENGTHS else v for k, v in lengths.items()}
     return _sharpened(_cells(family, in_cells, cells + 1, cells, aperture))
 
 
-def sampled(cells: Tensor, high: Tensor, wide: Tensor, half: int) -> Tensor:
+def sampled(cells: Tensor, height: Tensor, width: Tensor, half: int) -> Tensor:
     """Kernels of PSFs from the light in their cells, up to a factor: ``[..., 2 half + 1, 2 half + 1]``.
 
     Args:
         cells: Light of square cells around the centre, ``[..., n, n]``.
-        high: Height of a cell in pixels, ``[...]``.
-        wide: Its width.
+        height: Height of a cell in pixels, ``[...]``.
+        width: Its width.
         half: Pixels on each side of the centre.
     """
-    return _settled(_interpolated(cells, high, wide, half + _AROUND))[..., _AROUND:-_AROUND, _AROUND:-_AROUND]
+    kernels = _non_negative(_interpolated(cells, height, width, half + _MARGIN_PX))
+    return kernels[..., _MARGIN_PX:-_MARGIN_PX, _MARGIN_PX:-_MARGIN_PX]
 
 
 def profile(family: str, r: Tensor, params: Mapping[str, Number]) -> Tensor:
@@ -296,14 +297,14 @@ def profile(family: str, r: Tensor, params: Mapping[str, Number]) -> Tensor:
         return (r <= checked["radius"]).to(torch.float64)
     if family == "softm":
         edge = 0.5 * torch.erfc((r - checked["radius"]) / (math.sqrt(2) * checked["sigma"].clamp_min(1e-12)))
-        return edge * _tilt(r, checked)
+        return edge * _tilt_factor(r, checked)
     values, radius = checked["values"], checked["radius"]
-    place = (r / radius).clamp(max=1.0) * (values.shape[-1] - 1)
-    low = place.floor().long().clamp(max=values.shape[-1] - 2)
+    position = (r / radius).clamp(max=1.0) * (values.shape[-1] - 1)
+    low = position.floor().long().clamp(max=values.shape[-1] - 2)
     batch = broadcast_shapes(values.shape[:-1], low.shape[:-1])
     values, low = values.expand(*batch, -1), low.expand(*batch, -1)
-    mixed = torch.lerp(values.gather(-1, low), values.gather(-1, low + 1), place - low)
-    return torch.where(r <= radius, mixed, 0.0)
+    interpolated = torch.lerp(values.gather(-1, low), values.gather(-1, low + 1), position - low)
+    return torch.where(r <= radius, interpolated, 0.0)
 
 
 def support(family: str, params: Mapping[str, Number], aperture: Aperture | None = None) -> float:
@@ -324,12 +325,12 @@ def width_of(size: int | None, reach_px: float) -> int:
     """
     if size is None:
         size = 2 * half_width(reach_px) + 1
-        if size > _LARGEST:
+        if size > _MAX_WIDTH_PX:
             raise ValueError(
-                f"a kernel must be at most {_LARGEST} pixels wide, got parameters that need {size}; state its size"
+                f"a kernel must be at most {_MAX_WIDTH_PX} pixels wide, got parameters that need {size}; state its size"
             )
-    if isinstance(size, bool) or not isinstance(size, int) or not 1 <= size <= _LARGEST or size % 2 == 0:
-        raise ValueError(f"size must be a positive odd number of pixels, got {show(size)} (at most {_LARGEST})")
+    if isinstance(size, bool) or not isinstance(size, int) or not 1 <= size <= _MAX_WIDTH_PX or size % 2 == 0:
+        raise ValueError(f"size must be a positive odd number of pixels, got {show(size)} (at most {_MAX_WIDTH_PX})")
     return size
 
 
@@ -371,8 +372,8 @@ def _parameter(name: str, value: Number, device: torch.device) -> Tensor:
         return tensor.to(device, torch.float64)
     if name == "values":
         raise ValueError(f"values must be a tensor [..., P], got {show(value)}")
-    plain = isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool) and abs(value) < 1e300)
-    if not plain:
+    valid = isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool) and abs(value) < 1e300)
+    if not valid:
         raise ValueError(f"{name} must be a number or a tensor of them, got {show(value)}")
     return torch.tensor(value, dtype=torch.float64, device=device)
 
@@ -400,7 +401,7 @@ def opening_radius(family: str, params: Mapping[str, Tensor]) -> Tensor:
     return params["r_c"] + 2.0 * params["sigma"] if family == "ring" else params["radius"]
 
 
-def _tilt(r: Tensor, params: Mapping[str, Tensor]) -> Tensor:
+def _tilt_factor(r: Tensor, params: Mapping[str, Tensor]) -> Tensor:
     """Factor ``1 + b (r / R)^m`` of ``softm``, >= 0; the power is limited to 1e200."""
     farthest = torch.exp(_TILT_EXPONENT / params["m"].detach().clamp_min(1.0))
     return (1.0 + params["b"] * torch.minimum(r / params["radius"], farthest) ** params["m"]).clamp_min(0.0)
@@ -410,7 +411,7 @@ def _cells(
     family: str,
     lengths: Mapping[str, Tensor],
     half: int,
-    whole: int,
+    full_half: int,
     aperture: Aperture | None = None,
     aspect: Tensor | None = None,
 ) -> Tensor:
@@ -420,25 +421,25 @@ def _cells(
         family: A key of :data:`FAMILIES`.
         lengths: Checked parameters, lengths in cells.
         half: Cells on each side of the centre.
-        whole: Half width of the whole kernel in pixels; a smaller one is integrated more finely.
+        full_half: Half width of the whole kernel in pixels; a smaller one is integrated more finely.
         aperture: The opening; None is a round one.
         aspect: Width of a cell over its height; None is 1.
     """
-    slices = 16 if whole <= 64 else 8
+    slices = 16 if full_half <= 64 else 8
     if aperture is None or aperture.is_round:
         return _round_cells(family, lengths, half, slices, aspect)
     radius = opening_radius(family, lengths)
-    wide = torch.ones_like(radius) if aspect is None else aspect
+    width = torch.ones_like(radius) if aspect is None else aspect
     if family == "disc":
-        return aperture.shares(half, 1.0 / radius, wide / radius)
-    count = _PARTS if half <= _CACHED_HALF_WIDTH else 1
-    fine = count * half + count // 2
-    in_parts = {k: v * count if k in LENGTHS else v for k, v in lengths.items()}
-    light = _round_cells(family, in_parts, fine, slices // count, aspect)
-    lit = _round_cells("disc", {"radius": reach(family, in_parts)}, fine, slices, aspect)  # area inside the profile
-    share = aperture.shares(fine, 1.0 / (count * radius), wide / (count * radius))
-    parts = torch.where(lit > 0, light / torch.where(lit > 0, lit, 1.0), 0.0) * share
-    return parts.unflatten(-1, (-1, count)).unflatten(-3, (-1, count)).mean((-3, -1))
+        return aperture.shares(half, 1.0 / radius, width / radius)
+    parts = _CELL_PARTS if half <= _CACHED_HALF_WIDTH else 1
+    fine_half = parts * half + parts // 2
+    fine_lengths = {k: v * parts if k in LENGTHS else v for k, v in lengths.items()}
+    light = _round_cells(family, fine_lengths, fine_half, slices // parts, aspect)
+    covered = _round_cells("disc", {"radius": reach(family, fine_lengths)}, fine_half, slices, aspect)
+    share = aperture.shares(fine_half, 1.0 / (parts * radius), width / (parts * radius))
+    means = torch.where(covered > 0, light / torch.where(covered > 0, covered, 1.0), 0.0) * share
+    return means.unflatten(-1, (-1, parts)).unflatten(-3, (-1, parts)).mean((-3, -1))
 
 
 def _round_cells(family: str, lengths: Mapping[str, Tensor], half: int, slices: int, aspect: Tensor | None) -> Tensor:
@@ -456,13 +457,13 @@ def _round_cells(family: str, lengths: Mapping[str, Tensor], half: int, slices: 
 def _sharpened(cells: Tensor) -> Tensor:
     """Cells without the blur of integrating over a cell: a variance 1/12 smaller along each axis."""
     for axis in (-2, -1):
-        around = functional.pad(cells, (0, 0, 1, 1) if axis == -2 else (1, 1))
+        padded = functional.pad(cells, (0, 0, 1, 1) if axis == -2 else (1, 1))
         size = cells.shape[axis]
-        cells = (26.0 * cells - around.narrow(axis, 0, size) - around.narrow(axis, 2, size)) / 24.0
+        cells = (26.0 * cells - padded.narrow(axis, 0, size) - padded.narrow(axis, 2, size)) / 24.0
     return cells
 
 
-def _interpolated(cells: Tensor, high: Tensor, wide: Tensor, half: int) -> Tensor:
+def _interpolated(cells: Tensor, height: Tensor, width: Tensor, half: int) -> Tensor:
     """Integrals of a PSF with the interpolator of each pixel: ``[..., 2 half + 1, 2 half + 1]``.
 
     A pixel is limited to twice the result of linear interpolation. This removes the ripples of the cubic interpolator
@@ -470,24 +471,24 @@ def _interpolated(cells: Tensor, high: Tensor, wide: Tensor, half: int) -> Tenso
 
     Args:
         cells: Light in the cells of the PSF, ``[..., n, n]``.
-        high: Height of a cell in pixels ``[...]``.
-        wide: Width of a cell in pixels ``[...]``.
+        height: Height of a cell in pixels ``[...]``.
+        width: Width of a cell in pixels ``[...]``.
         half: Pixels on each side of the centre.
     """
     n = cells.shape[-1] // 2
-    if bool((high == 1.0).all() and (wide == 1.0).all()):  # cells are pixels: the interpolator is 1 at its own, else 0
+    if bool((height == 1.0).all() and (width == 1.0).all()):  # cells are pixels, which need no interpolation
         return functional.pad(cells, (half - n,) * 4)
     pixel = torch.arange(-half, half + 1, dtype=torch.float64, device=cells.device)[:, None]
-    place = torch.arange(-n, n + 1, dtype=torch.float64, device=cells.device)
+    cell_index = torch.arange(-n, n + 1, dtype=torch.float64, device=cells.device)
     splines, lines = [], []
-    for size in (high,) if wide is high else (high, wide):
+    for size in (height,) if width is height else (height, width):
         cell = size[..., None, None]
-        away = (pixel - cell * place).abs()  # [..., pixels, cells]
-        line = (1.0 - away / cell.clamp_min(1.0)).clamp_min(0.0)
-        lines.append(line)
-        splines.append(torch.where(cell > 1.0, line, _cardinal_spline(away) / _ripple(pixel, cell)))
-    at_most = 2.0 * (lines[0] @ cells @ lines[-1].transpose(-2, -1)).clamp_min(0.0)
-    return torch.minimum(splines[0] @ cells @ splines[-1].transpose(-2, -1), at_most)
+        distance = (pixel - cell * cell_index).abs()  # [..., pixels, cells]
+        linear = (1.0 - distance / cell.clamp_min(1.0)).clamp_min(0.0)
+        lines.append(linear)
+        splines.append(torch.where(cell > 1.0, linear, _cardinal_spline(distance) / _ripple(pixel, cell)))
+    limit = 2.0 * (lines[0] @ cells @ lines[-1].transpose(-2, -1)).clamp_min(0.0)
+    return torch.minimum(splines[0] @ cells @ splines[-1].transpose(-2, -1), limit)
 
 
 def _ripple(pixel: Tensor, cell: Tensor) -> Tensor:
@@ -510,22 +511,22 @@ def _cardinal_spline(t: Tensor) -> Tensor:
         Unser, "Splines: a perfect fit for signal and image processing", IEEE Signal Processing Magazine 16(6), 1999.
     """
     knot = t.detach().floor()
-    part, first = t - knot, knot == 0.0
+    fraction, is_first = t - knot, knot == 0.0
     right = (12.0 * math.sqrt(3) - 18.0) * torch.pow(math.sqrt(3) - 2.0, knot)
-    left = torch.where(first, 6.0 - 6.0 * math.sqrt(3), right / (math.sqrt(3) - 2.0))
-    bent = left * ((1.0 - part) ** 3 - (1.0 - part)) + right * (part**3 - part)
-    return torch.where(first, 1.0 - part, 0.0) + bent / 6.0
+    left = torch.where(is_first, 6.0 - 6.0 * math.sqrt(3), right / (math.sqrt(3) - 2.0))
+    curvature_term = left * ((1.0 - fraction) ** 3 - (1.0 - fraction)) + right * (fraction**3 - fraction)
+    return torch.where(is_first, 1.0 - fraction, 0.0) + curvature_term / 6.0
 
 
-def _settled(kernel: Tensor) -> Tensor:
+def _non_negative(kernel: Tensor) -> Tensor:
     """Raises negative values ``[..., n, n]`` to 0 with light from their four neighbours.
 
     Each neighbour gives light in proportion to its own. Light moves by one pixel only, which hardly changes the low
     frequencies, where photographs have most of their power.
     """
-    positive, owed = kernel.clamp_min(0.0), (-kernel).clamp_min(0.0)
-    around = _neighbours(positive)
-    rate = torch.where(around > 0, owed / torch.where(around > 0, around, 1.0), 0.0)
+    positive, deficit = kernel.clamp_min(0.0), (-kernel).clamp_min(0.0)
+    neighbour_light = _neighbours(positive)
+    rate = torch.where(neighbour_light > 0, deficit / torch.where(neighbour_light > 0, neighbour_light, 1.0), 0.0)
     return (positive * (1.0 - _neighbours(rate))).clamp_min(0.0)
 
 
@@ -558,15 +559,15 @@ def _disc_quadrant(radius: Tensor, half: int, aspect: Tensor | None = None) -> T
     edge = torch.cat([index.new_zeros(1), index + 0.5])
     across = edge if aspect is None else edge * aspect[..., None]  # [..., half + 2]
     covered = _corner_area(across[..., None, :], edge[:, None], radius).diff(dim=-1).diff(dim=-2).clamp_min(0.0)
-    width, breadth = edge.diff(), across.diff()
+    heights, widths = edge.diff(), across.diff()
     # cells wholly outside or inside the circle are exact, without the rounding of differences
     nearest = torch.hypot(edge[:-1, None], across[..., None, :-1])
     farthest = torch.hypot(edge[1:, None], across[..., None, 1:])
-    covered = torch.where(farthest <= radius, width[:, None] * breadth[..., None, :], covered)
-    return torch.where(nearest < radius, covered, 0.0) * _twice(index)
+    covered = torch.where(farthest <= radius, heights[:, None] * widths[..., None, :], covered)
+    return torch.where(nearest < radius, covered, 0.0) * _mirror_factor(index)
 
 
-def _twice(index: Tensor) -> Tensor:
+def _mirror_factor(index: Tensor) -> Tensor:
     """Factor of each cell's area in the quadrant: a cell on an axis extends equally to the other side."""
     twice = torch.where(index == 0, 2.0, 1.0)
     return twice[:, None] * twice[None, :]
@@ -576,21 +577,21 @@ def _sliced_quadrant(
     family: str, lengths: Mapping[str, Tensor], half: int, slices: int, aspect: Tensor | None = None
 ) -> Tensor:
     """Integral of any profile over each cell right of and below its centre, cut by circles into thin slices."""
-    rows = max(1, _AT_ONCE // ((half + 1) * slices))
+    rows = max(1, _SLICES_AT_ONCE // ((half + 1) * slices))
     strips = []
     for top in range(0, half + 1, rows):
-        part = (half, slices, top, min(top + rows, half + 1))
+        rows_part = (half, slices, top, min(top + rows, half + 1))
         if aspect is None:
-            cut = functools.partial(_cut_quadrant, *part)
-            parts = _quadrants.get(part, cut) if half <= _CACHED_HALF_WIDTH else cut()
+            make = functools.partial(_square_slices, *rows_part)
+            parts = _quadrants.get(rows_part, make) if half <= _CACHED_HALF_WIDTH else make()
         else:
-            parts = _slices(*part, aspect)
+            parts = _slices(*rows_part, aspect)
         inner, outer, area = (t.to(lengths[FAMILIES[family][-1]].device) for t in parts)
         strips.append((_slice_means(family, lengths, inner, outer) * area).sum(-1).unflatten(-1, (-1, half + 1)))
     return torch.cat(strips, -2)
 
 
-def _mass(
+def _total_light(
     family: str,
     lengths: Mapping[str, Tensor],
     half: int,
@@ -601,21 +602,21 @@ def _mass(
 
     Round kernels are summed over rings, those with an opening over coarser cells.
     """
-    side = torch.full_like(reach(family, lengths), half + 0.5)
+    top = torch.full_like(reach(family, lengths), half + 0.5)
     if aperture is not None and not aperture.is_round:
         pixels = (half + 0.5) / (_MASS_CELLS + 0.5)  # of a coarser cell
         coarse = {k: v / pixels if k in LENGTHS else v for k, v in lengths.items()}
         return _cells(family, coarse, _MASS_CELLS, half, aperture, aspect).sum((-2, -1)) * pixels**2
-    across = side if aspect is None else side * aspect
+    right = top if aspect is None else top * aspect
     if family == "gaussian":
         root = math.sqrt(2) * lengths["sigma"]
-        return 4.0 * torch.erf(side / root) * torch.erf(across / root)
+        return 4.0 * torch.erf(top / root) * torch.erf(right / root)
     if family == "disc":
-        return 4.0 * _corner_area(across, side, lengths["radius"])
+        return 4.0 * _corner_area(right, top, lengths["radius"])
     end = reach(family, lengths)
-    share = torch.linspace(0.0, 1.0, _RINGS + 1, dtype=torch.float64, device=end.device)
-    r = torch.minimum(2.0 * end, torch.hypot(side, across)).detach()[..., None, None] * share  # [..., 1, rings]
-    area = 4.0 * _corner_area(across[..., None, None], side[..., None, None], r).diff(dim=-1)
+    fractions = torch.linspace(0.0, 1.0, _RINGS + 1, dtype=torch.float64, device=end.device)
+    r = torch.minimum(2.0 * end, torch.hypot(top, right)).detach()[..., None, None] * fractions  # [..., 1, rings]
+    area = 4.0 * _corner_area(right[..., None, None], top[..., None, None], r).diff(dim=-1)
     return (_slice_means(family, lengths, r[..., :-1], r[..., 1:]) * area).sum((-2, -1))
 
 
@@ -629,7 +630,7 @@ def _slice_means(family: str, p: Mapping[str, Tensor], inner: Tensor, outer: Ten
     if family == "softm":
         width = math.sqrt(2) * p["sigma"]
         rise = _erfc_integral((outer - p["radius"]) / width) - _erfc_integral((inner - p["radius"]) / width)
-        return (rise * width / thickness).clamp_min(0.0) * _tilt((inner + outer) / 2, p)
+        return (rise * width / thickness).clamp_min(0.0) * _tilt_factor((inner + outer) / 2, p)
     return (_table_integral(outer, p) - _table_integral(inner, p)).clamp_min(0.0) / thickness
 
 
@@ -644,23 +645,23 @@ def _table_integral(r: Tensor, p: Mapping[str, Tensor]) -> Tensor:
     """Integral from 0 to r of the piecewise linear table: ``[..., pixels, slices]``."""
     values, radius = p["values"], p["radius"]
     last = values.shape[-1] - 1
-    where = (r / radius).clamp(max=1.0) * last
-    low = where.detach().floor().long().clamp(max=last - 1)
-    whole = torch.cat(
+    position = (r / radius).clamp(max=1.0) * last
+    low = position.detach().floor().long().clamp(max=last - 1)
+    cumulative = torch.cat(
         [torch.zeros_like(values[..., :1]), torch.cumsum((values[..., 1:] + values[..., :-1]) / 2, -1)], -1
     )
     batch = broadcast_shapes(values.shape[:-1], low.shape[:-2])
     flat = low.expand(*batch, *low.shape[-2:]).flatten(-2)
     start, left, right = (
         v.expand(*batch, -1).gather(-1, i).unflatten(-1, low.shape[-2:])
-        for v, i in ((whole, flat), (values, flat), (values, flat + 1))
+        for v, i in ((cumulative, flat), (values, flat), (values, flat + 1))
     )
-    part = where - low
-    return (start + left * part + (right - left) * part * part / 2) * radius / last
+    fraction = position - low
+    return (start + left * fraction + (right - left) * fraction * fraction / 2) * radius / last
 
 
 @torch.inference_mode(False)  # cached tensors must be usable by autograd
-def _cut_quadrant(half: int, slices: int, top: int, bottom: int) -> tuple[Tensor, Tensor, Tensor]:
+def _square_slices(half: int, slices: int, top: int, bottom: int) -> tuple[Tensor, Tensor, Tensor]:
     """Slices of the square cells of a quadrant's rows."""
     return _slices(half, slices, top, bottom, torch.ones((), dtype=torch.float64, device="cpu"))
 
@@ -681,25 +682,25 @@ def _slices(half: int, slices: int, top: int, bottom: int, aspect: Tensor) -> tu
         - _corner_area(high_x, low_y, r)
         + _corner_area(low_x, low_y, r)
     )
-    covered = covered * _twice(index)[top:bottom].flatten()[:, None]
+    covered = covered * _mirror_factor(index)[top:bottom].flatten()[:, None]
     return r[..., :-1].contiguous(), r[..., 1:].contiguous(), covered.diff(dim=-1).clamp_min(0.0)
 
 
 def _corner_area(x: Tensor, y: Tensor, r: Tensor) -> Tensor:
     """Area of the quarter disc of radius r that lies within the rectangle from the origin to (x, y)."""
     x, y = torch.minimum(x, r), torch.minimum(y, r)
-    reach = _root(r * r - y * y)  # for smaller x the rectangle's top is inside the disc
+    reach = _safe_sqrt(r * r - y * y)  # for smaller x the rectangle's top is inside the disc
 
     def under_arc(t: Tensor) -> Tensor:
         inside = t < r
         angle = torch.where(inside, torch.asin(torch.where(inside, t / r, 0.0)), math.pi / 2)
-        return 0.5 * (t * _root(r * r - t * t) + r * r * angle)
+        return 0.5 * (t * _safe_sqrt(r * r - t * t) + r * r * angle)
 
     beyond = torch.where(x > reach, under_arc(x) - under_arc(torch.minimum(reach, x)), 0.0)
     return torch.where(r > 0, y * torch.minimum(x, reach) + beyond, 0.0)
 
 
-def _root(square: Tensor) -> Tensor:
+def _safe_sqrt(square: Tensor) -> Tensor:
     """Square root of positive numbers, 0 for others, with finite gradients."""
     positive = square > 0
     return torch.where(positive, torch.sqrt(torch.where(positive, square, 1.0)), 0.0)

@@ -9,12 +9,12 @@ from typing import Any
 from ..io.atomic import write_text
 from ..validation import show
 
-__all__ = ["fields_of", "find", "read", "shipped", "stamped", "write"]
+__all__ = ["fields_of", "find", "read", "shipped", "with_schema", "write"]
 
 SCHEMA = "torchdof/blur-table"
 VERSION = 3
-READABLE = (1, 2, 3)  # versions; 2 added "aperture", 3 added "field"
-_SHIPPED = Path(__file__).parent / "tables"
+READABLE = (1, 2, 3)  # versions that are read; 2 added "aperture", 3 added "field"
+_FOLDER = Path(__file__).parent / "tables"
 _REQUIRED = ("family", "unit", "coc", "params")
 _OPTIONAL = ("name", "sensor_width_mm", "strength", "residual", "provenance", "aperture", "field")
 _KNOWN = {*_REQUIRED, *_OPTIONAL, "schema", "version"}
@@ -32,7 +32,7 @@ def find(source: str | os.PathLike[str]) -> Path:
         raise ValueError(f"source must be the name or the path of a blur table, got {show(source)}")
     path = Path(source)
     if not path.suffix and not path.exists():
-        path = _SHIPPED / f"{path}.json"
+        path = _FOLDER / f"{path}.json"
     if not path.is_file():
         names = ", ".join(shipped())
         raise FileNotFoundError(
@@ -44,7 +44,7 @@ def find(source: str | os.PathLike[str]) -> Path:
 
 def shipped() -> list[str]:
     """Names of the tables that come with torchdof, sorted."""
-    return sorted(path.stem for path in _SHIPPED.glob("*.json"))
+    return sorted(path.stem for path in _FOLDER.glob("*.json"))
 
 
 def read(path: Path) -> Any:
@@ -66,7 +66,7 @@ def write(data: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
     write_text(path, json.dumps(data, indent=1) + "\n")
 
 
-def stamped(fields: Mapping[str, Any]) -> dict[str, Any]:
+def with_schema(fields: Mapping[str, Any]) -> dict[str, Any]:
     """A table's fields with the schema and its version in front."""
     return {"schema": SCHEMA, "version": VERSION, **fields}
 

@@ -52,7 +52,7 @@ def _quantised(depth: Tensor, levels: int) -> Tensor:
     return 1 / (steps / levels * (high - low) + low).clamp_min(1e-6)
 
 
-def _grown(depth: Tensor, reach: int) -> Tensor:
+def _dilated(depth: Tensor, reach: int) -> Tensor:
     """The nearest depth within ``reach`` pixels (square window), or the farthest within ``-reach``."""
     side = 2 * abs(reach) + 1
     sign = -1.0 if reach > 0 else 1.0
@@ -62,12 +62,12 @@ def _grown(depth: Tensor, reach: int) -> Tensor:
 def _displaced(depth: Tensor, sigma: float) -> Tensor:
     """Displaces edges by some pixels, with slowly varying direction."""
     height, width = depth.shape[-2:]
-    dice = torch.Generator().manual_seed(0)
-    coarse = torch.randn(1, 2, height // 12 + 1, width // 12 + 1, generator=dice)
+    generator = torch.Generator().manual_seed(0)
+    coarse = torch.randn(1, 2, height // 12 + 1, width // 12 + 1, generator=generator)
     offset = sigma * functional.interpolate(coarse, size=(height, width), mode="bicubic")[0]
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    places = torch.stack([(x + offset[0]) / width * 2 - 1, (y + offset[1]) / height * 2 - 1], -1)[None]
-    return functional.grid_sample(depth, places.to(depth), mode="nearest", padding_mode="border", align_corners=False)
+    grid = torch.stack([(x + offset[0]) / width * 2 - 1, (y + offset[1]) / height * 2 - 1], -1)[None]
+    return functional.grid_sample(depth, grid.to(depth), mode="nearest", padding_mode="border", align_corners=False)
 
 
 def _noisy(depth: Tensor, share: float) -> Tensor:
@@ -79,9 +79,9 @@ KINDS: Mapping[str, Callable[[Tensor], Tensor]] = {
     "half-res": lambda z: _resampled(z, 2),
     "quarter-res": lambda z: _resampled(z, 4),
     "shift 1px": lambda z: torch.roll(z, 1, -1),
-    "near -1px": lambda z: _grown(z, -1),  # foreground colour on background depth
-    "near -2px": lambda z: _grown(z, -2),
-    "near +1px": lambda z: _grown(z, 1),
+    "near -1px": lambda z: _dilated(z, -1),  # foreground colour on background depth
+    "near -2px": lambda z: _dilated(z, -2),
+    "near +1px": lambda z: _dilated(z, 1),
     "displaced": lambda z: _displaced(z, 1.5),
     "blur 1.5": lambda z: _blurred(z, 1.5),  # typical of estimators
     "8 bit": lambda z: _quantised(z, 255),

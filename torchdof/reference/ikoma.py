@@ -33,21 +33,21 @@ def layered_fft(image: Tensor, coc_px: Tensor, spacing_px: float = 0.75) -> Tens
     """
     low, high = float(coc_px.min()), float(coc_px.max())
     nodes = torch.linspace(low, high, 2 + int((high - low) / spacing_px), dtype=torch.float64)
-    place = ((coc_px.double() - low) / max(high - low, 1e-9) * (len(nodes) - 1)).to(image.dtype)
+    layer_index = ((coc_px.double() - low) / max(high - low, 1e-9) * (len(nodes) - 1)).to(image.dtype)
     kernels = BlurTable.disc().kernels(nodes, coc_px.shape[-1])[:, 0].to(image.dtype)
     half = kernels.shape[-1] // 2
-    light, place = (functional.pad(x, (half,) * 4, mode="replicate") for x in (image, place))
+    light, layer_index = (functional.pad(x, (half,) * 4, mode="replicate") for x in (image, layer_index))
     height, width = (n + 2 * half for n in image.shape[-2:])
     size = [-(-(n + 2 * half) // 16) * 16 for n in image.shape[-2:]]  # multiples of 16, which make the FFT fast
-    out, at_or_behind, covered = torch.zeros_like(image), torch.zeros_like(place), torch.zeros_like(image[:, :1])
-    least = 1e-6 if image.dtype == torch.float64 else 1e-3  # smaller values are rounding noise of the FFT
+    out, at_or_behind, covered = torch.zeros_like(image), torch.zeros_like(layer_index), torch.zeros_like(image[:, :1])
+    min_visibility = 1e-6 if image.dtype == torch.float64 else 1e-3  # smaller values are rounding noise of the FFT
     for k in reversed(range(len(nodes))):  # far to near
-        weight = (1.0 - (place - k).abs()).clamp_min(0.0)
+        weight = (1.0 - (layer_index - k).abs()).clamp_min(0.0)
         at_or_behind = at_or_behind + weight
         stack = torch.cat([light * weight, weight, at_or_behind], 1)
         spectrum = torch.fft.rfft2(stack, size) * torch.fft.rfft2(kernels[k], size)
         blurred = torch.fft.irfft2(spectrum, size)[..., 2 * half : height, 2 * half : width]
-        visibility = blurred[:, -1:].clamp_min(least)
+        visibility = blurred[:, -1:].clamp_min(min_visibility)
         transmitted = 1.0 - (blurred[:, -2:-1] / visibility).clamp(0.0, 1.0)
         out = blurred[:, :-2].clamp_min(0.0) / visibility + transmitted * out
         covered = 1.0 - transmitted + transmitted * covered

@@ -12,8 +12,8 @@ from ..optics.blur_table import BlurTable
 
 __all__ = ["LensSamples", "spread_points"]
 
-_STEPS = 4096
-_NODES = 33  # circles of confusion on each side of 0 at which radii are tabulated; linear in between
+_RADIAL_STEPS = 4096  # steps of the radius, and of the share of light, in the tables
+_COC_NODES = 33  # circles of confusion on each side of 0 at which radii are tabulated; linear in between
 
 
 def spread_points(count: int) -> tuple[Tensor, Tensor]:
@@ -49,11 +49,11 @@ class LensSamples:
         self.views, self.points_per_view = views, points_per_view
         low = min(0.0, *(float(c.min()) for c in cocs)) - 1e-3
         high = max(0.0, *(float(c.max()) for c in cocs)) + 1e-3
-        near, far = (torch.linspace(0.0, end, _NODES, dtype=torch.float64) for end in (low, high))
+        near, far = (torch.linspace(0.0, end, _COC_NODES, dtype=torch.float64) for end in (low, high))
         self._nodes = torch.cat([near[1:].flip(0), far])
         radii = _radii(table, channel, self._nodes, width)
         self._views, self._points = _Points.of(views, radii), _Points.of(views * points_per_view, radii)
-        self._owner = _nearest(self._points.places, self._views.places)
+        self._owner = _nearest(self._points.positions, self._views.positions)
 
     def shift(self, view: int, coc_px: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Shift along x and y of surfaces in this view, in pixels, and the derivatives of both by the coc."""
@@ -78,7 +78,7 @@ class LensSamples:
 class _Points(NamedTuple):
     """Points of the lens, and the shift of each at the tabulated circles of confusion."""
 
-    places: Tensor  # [n, 2] on the unit disc
+    positions: Tensor  # [n, 2] on the unit disc
     directions: Tensor  # [n, 2] unit vectors
     radii: Tensor  # [n, nodes] signed shift in pixels at each tabulated coc
 
@@ -87,10 +87,10 @@ class _Points(NamedTuple):
         rho, angle = spread_points(count)
         directions = torch.stack([angle.cos(), angle.sin()], -1)
         # interpolate between the tabulated shares
-        where = rho**2 * (radii.shape[0] - 1)
-        low = where.floor().long().clamp(max=radii.shape[0] - 2)
+        position = rho**2 * (radii.shape[0] - 1)
+        low = position.floor().long().clamp(max=radii.shape[0] - 2)
         return cls(
-            rho[:, None] * directions, directions, torch.lerp(radii[low], radii[low + 1], (where - low)[:, None])
+            rho[:, None] * directions, directions, torch.lerp(radii[low], radii[low + 1], (position - low)[:, None])
         )
 
 
@@ -100,23 +100,23 @@ def _radii(table: BlurTable, channel: int, nodes: Tensor, width: int) -> Tensor:
     for coc in nodes:
         params = {name: value[channel] for name, value in table.params(coc, width).items()}
         reach = psf.support(table.family, params)
-        r = torch.linspace(0.0, reach, _STEPS + 1, dtype=torch.float64)
-        middle = 0.5 * (r[1:] + r[:-1])
+        r = torch.linspace(0.0, reach, _RADIAL_STEPS + 1, dtype=torch.float64)
+        ring_centres = 0.5 * (r[1:] + r[:-1])
         # for radii below a thousandth of a pixel the profile does not matter
-        ring = psf.profile(table.family, middle, params) * middle if reach > 1e-3 else middle
-        inside = torch.cat([ring.new_zeros(1), ring.cumsum(0)])
-        shares = torch.linspace(0.0, float(inside[-1]), _STEPS + 1, dtype=torch.float64)
-        upper = torch.searchsorted(inside, shares).clamp(1, _STEPS)
-        step = (inside[upper] - inside[upper - 1]).clamp_min(torch.finfo(torch.float64).tiny)
-        radius = r[upper - 1] + ((shares - inside[upper - 1]) / step).clamp(0.0, 1.0) * (r[upper] - r[upper - 1])
+        ring_light = psf.profile(table.family, ring_centres, params) * ring_centres if reach > 1e-3 else ring_centres
+        cumulative = torch.cat([ring_light.new_zeros(1), ring_light.cumsum(0)])
+        shares = torch.linspace(0.0, float(cumulative[-1]), _RADIAL_STEPS + 1, dtype=torch.float64)
+        upper = torch.searchsorted(cumulative, shares).clamp(1, _RADIAL_STEPS)
+        step = (cumulative[upper] - cumulative[upper - 1]).clamp_min(torch.finfo(torch.float64).tiny)
+        radius = r[upper - 1] + ((shares - cumulative[upper - 1]) / step).clamp(0.0, 1.0) * (r[upper] - r[upper - 1])
         columns.append(radius * torch.sign(coc))
     return torch.stack(columns, 1)
 
 
 def _nearest(points: Tensor, views: Tensor) -> list[list[int]]:
     """For each view, the points nearest to it."""
-    owner = torch.cat([torch.cdist(part, views).argmin(1) for part in points.split(4096)])
-    owned: list[list[int]] = [[] for _ in range(len(views))]
-    for point, view in enumerate(owner.tolist()):
-        owned[view].append(point)
-    return owned
+    nearest_view = torch.cat([torch.cdist(part, views).argmin(1) for part in points.split(4096)])
+    points_of_view: list[list[int]] = [[] for _ in range(len(views))]
+    for point, view in enumerate(nearest_view.tolist()):
+        points_of_view[view].append(point)
+    return points_of_view

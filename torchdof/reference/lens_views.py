@@ -27,7 +27,7 @@ __all__ = ["LensViews", "lens_views", "lens_views_by_coc"]
 
 _SAME_SURFACE_PX = 1.0  # neighbours whose coc differs by less belong to one surface without gaps
 _SAME_DEPTH_PX = 0.5  # surfaces whose coc differs by less do not hide each other
-_BRIGHT = 8.0  # light above this multiple of the mean is drawn from more points of the lens than there are views
+_BRIGHT_RATIO = 8.0  # light above this multiple of the mean is drawn from more points of the lens than there are views
 
 
 class LensViews(NamedTuple):
@@ -97,13 +97,13 @@ def lens_views(
     """
     validation.image_and_depth(image, depth, values=True)
     width = image.shape[-1]
-    placed = []
+    surfaces_coc = []
     for rgba, behind in surfaces:
         validation.image_and_depth(rgba, behind, values=True)
-        placed.append((rgba, camera.coc_px(behind, width)))
+        surfaces_coc.append((rgba, camera.coc_px(behind, width)))
     coc = camera.coc_px(depth, width)
     validation.coc_of_lens(coc, depth, {name: getattr(camera, name) for name in CAMERA_NUMBERS})
-    return lens_views_by_coc(image, coc, table=table, views=views, surfaces=placed, mixed_edges=mixed_edges)
+    return lens_views_by_coc(image, coc, table=table, views=views, surfaces=surfaces_coc, mixed_edges=mixed_edges)
 
 
 def lens_views_by_coc(
@@ -148,10 +148,10 @@ def lens_views_by_coc(
 
     images, shares = [], []
     for item in range(batch):
-        shown = (image[item : item + 1].float(), coc_px.expand(batch, -1, -1, -1)[item : item + 1].float())
-        stack = [(*shown, torch.ones_like(shown[1]))]
+        item_maps = (image[item : item + 1].float(), coc_px.expand(batch, -1, -1, -1)[item : item + 1].float())
+        stack = [(*item_maps, torch.ones_like(item_maps[1]))]
         if mixed_edges or (mixed_edges is None and not surfaces):
-            stack = _matted(*shown)
+            stack = _matted(*item_maps)
         for rgba, coc in surfaces:
             cover = rgba[item : item + 1, -1:].float().clamp(0.0, 1.0)
             colour = rgba[item : item + 1, :-1].float() / cover.clamp_min(1e-6)
@@ -163,21 +163,21 @@ def lens_views_by_coc(
             parts.append(_average([(light[:, group], coc, cover) for light, coc, cover in stack], lens, height, width))
         known = torch.stack([known_share for _, known_share in parts]).amin(0)
         average = torch.cat([light for light, _ in parts], 1)
-        images.append(torch.where(known > 0, average, shown[0]))
+        images.append(torch.where(known > 0, average, item_maps[0]))
         shares.append(known)
     return LensViews(torch.cat(images).to(image.dtype), torch.cat(shares).to(image.dtype))
 
 
 def _matted(image: Tensor, coc: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
     """Splits mixed pixels: light, coc and cover of the surface in front, and of the one behind it."""
-    own, other, other_coc, other_weight = matte(image, coc)
+    own_light, other_light, other_coc, other_weight = matte(image, coc)
     mixed = other_weight > 1e-3
     in_front, behind = mixed & (other_coc < coc), mixed & (other_coc >= coc)
-    front = torch.where(in_front, other, torch.where(behind, own, image))
+    front = torch.where(in_front, other_light, torch.where(behind, own_light, image))
     cover = torch.where(in_front, other_weight, torch.where(behind, 1.0 - other_weight, 1.0))
     return [
         (front, torch.where(in_front, other_coc, coc), cover),
-        (torch.where(in_front, own, other), torch.where(in_front, coc, other_coc), mixed.to(image.dtype)),
+        (torch.where(in_front, own_light, other_light), torch.where(in_front, coc, other_coc), mixed.to(image.dtype)),
     ]
 
 
@@ -185,24 +185,24 @@ def _average(
     stack: Sequence[tuple[Tensor, Tensor, Tensor]], lens: LensSamples, height: int, width: int
 ) -> tuple[Tensor, Tensor]:
     """Mean of all views ``[1, C, H, W]`` and the share of views that saw a surface ``[1, 1, H, W]``."""
-    limit = _BRIGHT * stack[0][0].mean()
-    plain = [(light.clamp(max=limit), coc, cover) for light, coc, cover in stack]
-    squares = _squares(plain)
+    limit = _BRIGHT_RATIO * stack[0][0].mean()
+    clipped = [(light.clamp(max=limit), coc, cover) for light, coc, cover in stack]
+    squares = _squares(clipped)
     excess = torch.cat(
         [(light.double() - limit).clamp_min(0.0)[0].flatten(1).T[cover.flatten() > 0] for light, _, cover in stack]
     )
-    bright = excess.amax(-1).nonzero()[:, 0]
-    extra = excess[bright] * squares.cover[bright, None]
+    bright_rows = excess.amax(-1).nonzero()[:, 0]
+    bright_light = excess[bright_rows] * squares.cover[bright_rows, None]
 
-    count, channels = height * width, extra.shape[-1]
-    device = extra.device
+    count, channels = height * width, bright_light.shape[-1]
+    device = bright_light.device
     # In float64 the mean of equal views is exact: pixels in focus are returned unchanged.
     total = torch.zeros(count, channels, dtype=torch.float64, device=device)
-    glare, seen = torch.zeros_like(total), torch.zeros(count, dtype=torch.float64, device=device)
-    dice = torch.rand(squares.cover.shape, generator=torch.Generator().manual_seed(0)).to(device)
+    highlights, known_views = torch.zeros_like(total), torch.zeros(count, dtype=torch.float64, device=device)
+    thresholds = torch.rand(squares.cover.shape, generator=torch.Generator().manual_seed(0)).to(device)
     for view in range(lens.views):
         # A square that covers 30 % of its pixel is drawn in 30 % of the views.
-        is_drawn = ((dice + view * 0.7548776662466927) % 1.0) < squares.cover
+        is_drawn = ((thresholds + view * 0.7548776662466927) % 1.0) < squares.cover
         source, target, light = _draw(squares, is_drawn, *lens.shift(view, squares.coc), height, width)
         front = torch.full((count,), torch.inf, device=device)
         front.scatter_reduce_(0, target, squares.coc[source], "amin")
@@ -211,12 +211,12 @@ def _average(
         covered = torch.zeros(count, device=device).index_add_(0, target, torch.ones_like(light[:, 0]))
         drawn = torch.zeros(count, channels, device=device).index_add_(0, target, light)
         total += drawn / covered.clamp_min(1.0)[:, None]
-        seen += covered > 0
-        if bright.numel():
-            _draw_points(glare, front, squares, bright, extra, lens, view, height, width)
+        known_views += covered > 0
+        if bright_rows.numel():
+            _draw_points(highlights, front, squares, bright_rows, bright_light, lens, view, height, width)
     # Unknown views get the mean of the known ones, but no highlights.
-    image = (total / seen.clamp_min(1.0)[:, None] + glare / lens.views).clamp_min(0.0).float()
-    return image.T.reshape(1, channels, height, width), (seen / lens.views).float().reshape(1, 1, height, width)
+    image = (total / known_views.clamp_min(1.0)[:, None] + highlights / lens.views).clamp_min(0.0).float()
+    return image.T.reshape(1, channels, height, width), (known_views / lens.views).float().reshape(1, 1, height, width)
 
 
 def _squares(stack: Sequence[tuple[Tensor, Tensor, Tensor]]) -> _Squares:
@@ -288,10 +288,10 @@ def _draw(
 
 
 def _draw_points(
-    glare: Tensor,
+    highlights: Tensor,
     front: Tensor,
     squares: _Squares,
-    bright: Tensor,
+    bright_rows: Tensor,
     light: Tensor,
     lens: LensSamples,
     view: int,
@@ -302,10 +302,10 @@ def _draw_points(
 
     A highlight of one pixel is one dot in each view; with these additional points its disc is even.
     """
-    coc = squares.coc[bright]
+    coc = squares.coc[bright_rows]
     for dx, dy in lens.points_of(view, coc):
-        column, row = (squares.x[bright] + dx).round(), (squares.y[bright] + dy).round()
+        column, row = (squares.x[bright_rows] + dx).round(), (squares.y[bright_rows] + dy).round()
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         target = (row * width + column).long()[inside]
         visible = coc[inside] <= front[target] + _SAME_DEPTH_PX
-        glare.index_add_(0, target[visible], light[inside][visible] / lens.points_per_view)
+        highlights.index_add_(0, target[visible], light[inside][visible] / lens.points_per_view)

@@ -54,7 +54,7 @@ def psnr(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
         >>> round(psnr(torch.zeros(1, 3, 4, 4), torch.full((1, 3, 4, 4), 0.1)), 6)
         20.0
     """
-    _alike(image, truth)
+    _check_pair(image, truth)
     squared = (image.double() - truth.double()).square().mean(1, keepdim=True)
     if mask is not None:
         batch, _, height, width = image.shape
@@ -90,7 +90,7 @@ def ssim(image: Tensor, truth: Tensor) -> float:
     """
     from kornia.metrics import ssim as kornia_ssim
 
-    _alike(image, truth, finite=True)
+    _check_pair(image, truth, finite=True)
     if min(image.shape[-2:]) < 6:
         raise ValueError(f"SSIM needs at least 6 pixels a side, got {list(image.shape)}")
     return float(kornia_ssim(image.double(), truth.double(), window_size=11).mean())
@@ -123,7 +123,7 @@ def flip_map(image: Tensor, truth: Tensor) -> Tensor:
     Reference:
         Andersson et al., "FLIP: a difference evaluator for alternating images", HPG 2020.
     """
-    _alike(image, truth, finite=True)
+    _check_pair(image, truth, finite=True)
     if image.shape[:2] != (1, 3):
         raise ValueError(f"FLIP compares one RGB image, [1, 3, H, W], got {list(image.shape)}")
     flip_evaluator = importlib.import_module("flip_evaluator")
@@ -132,7 +132,7 @@ def flip_map(image: Tensor, truth: Tensor) -> Tensor:
     return torch.from_numpy(error).reshape(1, 1, *image.shape[-2:])
 
 
-def _alike(image: Tensor, truth: Tensor, finite: bool = False) -> None:
+def _check_pair(image: Tensor, truth: Tensor, finite: bool = False) -> None:
     """Raises an error if two images cannot be compared: other shapes or devices or, if asked, values not finite."""
     for name, value in (("image", image), ("truth", truth)):
         real_tensor(name, value, "[B, C, H, W]")

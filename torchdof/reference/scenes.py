@@ -120,8 +120,8 @@ def _read_scene(meta: Path) -> Iterator[Scene]:
             raise ValueError(f"{meta}: truth {index} is {list(truth.shape)}, the sharp image {list(image.shape)}")
         name = f"{data.get('name', meta.parent.name)}/{entry.get('index', index)}"
         camera = camera_of(focal_px, image.shape[-1], radius, focus)
-        widest = math.ceil(float(camera.coc_px(depth, image.shape[-1]).abs().max()))
-        yield Scene(name, image, depth, camera, truth, max(widest, int(entry.get("margin_px", 0))))
+        largest_coc = math.ceil(float(camera.coc_px(depth, image.shape[-1]).abs().max()))
+        yield Scene(name, image, depth, camera, truth, max(largest_coc, int(entry.get("margin_px", 0))))
 
 
 def _number(meta: Path, data: Any, field: str) -> float:
@@ -239,18 +239,18 @@ def _average(planes: Sequence[Plane], x: Tensor, y: Tensor, rays: Rays, samples:
     """Mean light ``[C, H, W]`` of visible planes, premultiplied light and cover of each plane ``[C + 1, H, W]``."""
     index = torch.arange(samples, dtype=torch.float64)
     # Additive recurrences, so that position in the pixel and point on the lens are independent.
-    places = torch.stack([(index * a + 0.5) % 1.0 - 0.5 for a in (0.7548776662466927, 0.5698402909980532)], -1).tolist()
-    total, carried, wholes = torch.zeros(()), torch.zeros(()), [torch.zeros(()) for _ in planes]
-    for i, (px, py) in enumerate(places):
-        seen = torch.zeros(())
-        met, weight = rays(i, x + px, y + py)
-        for k, (plane, place) in enumerate(zip(planes, met, strict=True)):
-            light = plane.light(*place)
-            is_covered = torch.ones_like(x, dtype=torch.bool) if plane.shape is None else plane.shape(*place)
-            seen = torch.where(is_covered, light, seen)
-            wholes[k] = wholes[k] + weight * torch.cat([light * is_covered, is_covered[None]])
-        total, carried = total + weight * seen, carried + weight
-    return total / carried, [whole / carried for whole in wholes]
+    shifts = torch.stack([(index * a + 0.5) % 1.0 - 0.5 for a in (0.7548776662466927, 0.5698402909980532)], -1).tolist()
+    total, total_weight, plane_sums = torch.zeros(()), torch.zeros(()), [torch.zeros(()) for _ in planes]
+    for i, (px, py) in enumerate(shifts):
+        visible = torch.zeros(())
+        points, weight = rays(i, x + px, y + py)
+        for k, (plane, point) in enumerate(zip(planes, points, strict=True)):
+            light = plane.light(*point)
+            is_covered = torch.ones_like(x, dtype=torch.bool) if plane.shape is None else plane.shape(*point)
+            visible = torch.where(is_covered, light, visible)
+            plane_sums[k] = plane_sums[k] + weight * torch.cat([light * is_covered, is_covered[None]])
+        total, total_weight = total + weight * visible, total_weight + weight
+    return total / total_weight, [plane_sum / total_weight for plane_sum in plane_sums]
 
 
 def waves(seed: int, mean: Sequence[float] = (0.4, 0.4, 0.4), contrast: float = 0.8, shortest_px: float = 6.0) -> Light:
@@ -260,11 +260,11 @@ def waves(seed: int, mean: Sequence[float] = (0.4, 0.4, 0.4), contrast: float = 
         >>> waves(0)(torch.zeros(2, 5), torch.zeros(2, 5)).shape
         torch.Size([3, 2, 5])
     """
-    dice = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
     count = 12
-    length = shortest_px * 8 ** torch.rand(count, generator=dice, dtype=torch.float64)
-    angle, phase = 2 * math.pi * torch.rand(2, count, generator=dice, dtype=torch.float64)
-    weight = torch.rand(len(mean), count, generator=dice, dtype=torch.float64)
+    length = shortest_px * 8 ** torch.rand(count, generator=generator, dtype=torch.float64)
+    angle, phase = 2 * math.pi * torch.rand(2, count, generator=generator, dtype=torch.float64)
+    weight = torch.rand(len(mean), count, generator=generator, dtype=torch.float64)
     weight = contrast * weight / weight.sum(1, keepdim=True)
     kx, ky = 2 * math.pi / length * angle.cos(), 2 * math.pi / length * angle.sin()
 

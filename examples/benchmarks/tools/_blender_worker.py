@@ -45,20 +45,20 @@ def main() -> None:
     image, radius = source("image"), source("radius")
     tree.links.new(image.outputs[0], result.inputs[0])
     seconds()  # warms up
-    empty = seconds()
+    empty_seconds = seconds()
     blur = tree.nodes.new("CompositorNodeDefocus")
     blur.use_zbuffer, blur.z_scale, blur.bokeh = False, 1.0, "CIRCLE"
     blur.blur_max = math.ceil(float(np.fromfile(folder / "radius", np.float32).max())) + 1.0
     tree.links.new(image.outputs[0], blur.inputs[0])
     tree.links.new(radius.outputs[0], blur.inputs[1])
     tree.links.new(blur.outputs[0], result.inputs[0])
-    taken = seconds() - empty
+    blur_seconds = seconds() - empty_seconds
 
     bpy.data.images["Render Result"].save_render(str(folder / "out.exr"))
     out = np.empty(width * height * 4, np.float32)
     bpy.data.images.load(str(folder / "out.exr")).pixels.foreach_get(out)
     out.reshape(height, width, 4)[::-1].tofile(folder / "out")
-    (folder / "seconds").write_text(str(taken))
+    (folder / "seconds").write_text(str(blur_seconds))
 
 
 if __name__ == "__main__":

@@ -24,10 +24,10 @@ def main() -> None:
     frame = Gegl.Rectangle.new(0, 0, width, height)
 
     def buffer(pixels: str, name: str | None = None) -> Gegl.Buffer:
-        filled = Gegl.Buffer.new(pixels, 0, 0, width, height)
+        new_buffer = Gegl.Buffer.new(pixels, 0, 0, width, height)
         if name:
-            filled.set(frame, pixels, (folder / name).read_bytes())
-        return filled
+            new_buffer.set(frame, pixels, (folder / name).read_bytes())
+        return new_buffer
 
     image, radius = buffer("RGB float", "image"), buffer("Y float", "radius")
     for _ in range(2):  # the first one warms up

@@ -8,7 +8,7 @@ from torch import Tensor
 NAME = "kornia, 16 bins"
 NOTE = "float32; 16 radii from 0 to the largest, discs with smooth edges. Time: the whole call."
 _BINS = 16
-_FINE = 8  # samples along a pixel
+_SAMPLES_PER_PX = 8  # samples along a pixel
 
 
 def available() -> None:
@@ -36,7 +36,7 @@ def blur(image: Tensor, coc_px: Tensor) -> Tensor:
 def _disc(radius: float) -> Tensor:
     """A disc's share of each pixel, ``[1, k, k]``."""
     half = int(radius + 0.5)
-    place = (torch.arange((2 * half + 1) * _FINE) + 0.5) / _FINE - half - 0.5
-    inside = (place[:, None] ** 2 + place**2 <= radius**2).float()
-    coverage = torch.nn.functional.avg_pool2d(inside[None], _FINE)
+    samples = (torch.arange((2 * half + 1) * _SAMPLES_PER_PX) + 0.5) / _SAMPLES_PER_PX - half - 0.5
+    inside = (samples[:, None] ** 2 + samples**2 <= radius**2).float()
+    coverage = torch.nn.functional.avg_pool2d(inside[None], _SAMPLES_PER_PX)
     return coverage / coverage.sum()

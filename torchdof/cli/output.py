@@ -14,11 +14,11 @@ import click
 if TYPE_CHECKING:
     from ..depth.sanity import Mistake
 
-_PATIENCE_S = 3.0  # s before the bar appears
+_DELAY_S = 3.0  # s before the bar appears
 _NOT_FINITE = {"Infinity": "inf", "-Infinity": "-inf", "NaN": "nan"}
 
 
-def tell(as_json: bool, facts: Mapping[str, Any], line: str) -> None:
+def print_result(as_json: bool, facts: Mapping[str, Any], line: str) -> None:
     """Prints ``facts`` as JSON, or ``line`` for people."""
     click.echo(json_line(facts) if as_json else line)
 
@@ -34,7 +34,7 @@ def json_line(facts: Mapping[str, Any]) -> str:
     return json.dumps(json.loads(text, parse_constant=_NOT_FINITE.__getitem__))
 
 
-class Once:
+class Notices:
     """Notes and warnings of likely mistakes, one line each on standard error; each kind is printed once for all frames.
 
     With ``strict`` a mistake raises ``ValueError``. ``PYTHONWARNINGS=ignore`` silences warnings.
@@ -96,7 +96,7 @@ class Bar:
                 redirect_stdout=sys.stdout.isatty(),  # prints lines above the bar; a file is unaffected
             )
             self._task = self._progress.add_task(what, total=total)
-            self._timer = threading.Timer(_PATIENCE_S, self._progress.start)
+            self._timer = threading.Timer(_DELAY_S, self._progress.start)
             self._timer.daemon = True
 
     def update(self, what: str | None = None, done: float | None = None, total: float | None = None) -> None:

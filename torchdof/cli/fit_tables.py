@@ -1,4 +1,4 @@
-"""Makes the tables of ``torchdof fit``, prints the results and draws them."""
+"""Makes, prints and draws the tables of ``torchdof fit``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from torchdof import BlurTable, blur_by_coc
-from torchdof.cli.printed import Bar, json_line
+from torchdof.cli.output import Bar, json_line
 from torchdof.fit.lens import trace
 from torchdof.fit.lens.lens import RGB_UM, Lens
 from torchdof.fit.photo.across import table_of_dots
@@ -20,7 +20,7 @@ from torchdof.fit.photo.manifest import MANIFEST, Captures, read_captures
 from torchdof.fit.photo.photographs import Photographs, read_photographs
 from torchdof.fit.photo.table import TableFit, fit_captures
 from torchdof.fit.problems import FitWarning
-from torchdof.io.atomic import whole_file
+from torchdof.io.atomic import atomic_file
 from torchdof.io.columns import print_columns
 from torchdof.validation import number
 
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 _WIDTH = 1920  # px; image width for which the texture of a table is drawn
 
 
-def trace_lens(said: Fit, source: str) -> None:
+def trace_lens(command: Fit, source: str) -> None:
     """Traces the table of a lens, prints a summary, and writes the table."""
-    lens, options = Lens.read(source), said.lens
+    lens, options = Lens.read(source), command.lens
     focal = lens.paraxial().focal_length
     number("--focus-m", options.focus_m, low=focal / 1000, unit="metres", infinite=True)
     image_mm = focal / (1 - focal / 1000 / options.focus_m)
@@ -47,71 +47,73 @@ def trace_lens(said: Fit, source: str) -> None:
             wavelengths_um=RGB_UM if options.wavelengths == () else options.wavelengths,
             field=options.field,
         )
-    shown, facts, coc = Shown(quiet=said.as_json), table.provenance, table.coc.tolist()
-    shown.say(
+    printer, facts, coc = FitPrinter(quiet=command.as_json), table.provenance, table.coc.tolist()
+    printer.say(
         f"{facts['lens']}: {facts['focal_length_mm']:g} mm, f/{facts['f_number']:g}, focus {facts['focus_m']} m; "
         f"{len(coc)} distances from {facts['nearest_m']:.3g} m to infinity, circles of confusion "
         f"from {coc[0]:+.3f} to {coc[-1]:+.3f} mm"
     )
     if table.residual is not None:
-        middle, most = 100 * float(table.residual.median()), 100 * float(table.residual.max())
-        shown.say(f"family: {table.family}, residual {middle:.2f} %, {most:.2f} % at most")
+        median, largest = 100 * float(table.residual.median()), 100 * float(table.residual.max())
+        printer.say(f"family: {table.family}, residual {median:.2f} %, {largest:.2f} % at most")
     if table.field is not None:
-        shown.say(f"across the field: {table.field.radius.tolist()} mm from the middle")
-    shown.write(table, said.out)
-    shown.facts({"out": str(said.out), "family": table.family, **facts})
-    if said.plots is not None:
-        shown.draw(table, said.plots, said.out.stem)
+        printer.say(f"across the field: {table.field.radius.tolist()} mm from the middle")
+    printer.write(table, command.out)
+    printer.facts({"out": str(command.out), "family": table.family, **facts})
+    if command.plots is not None:
+        printer.draw(table, command.plots, command.out.stem)
 
 
-def fit_photographs(said: Fit, folder: Path) -> None:
+def fit_photographs(command: Fit, folder: Path) -> None:
     """Fits photographs of the target, or the dots of a manifest, prints the fits, and writes their tables."""
-    options, photographs, shown = said.photographs, None, Shown(quiet=said.as_json)
+    options, photographs, printer = command.photographs, None, FitPrinter(quiet=command.as_json)
     colours, dots = (None if value == "manifest" else value for value in (options.colours, options.dots))
-    with _heard() as doubts:
+    with _collected_warnings() as reading_warnings:
         if folder.is_dir() and not (folder / MANIFEST).is_file():
-            each: Any = colours or "mean"
-            photographs = read_photographs(folder, square_mm=said.target.square_mm, colours=each, root=options.root)
+            mode: Any = colours or "mean"
+            square_mm = command.target.square_mm
+            photographs = read_photographs(folder, square_mm=square_mm, colours=mode, root=options.root)
             capture_sets = [photographs.captures]
-            shown.photographs(photographs)
+            printer.photographs(photographs)
         else:
             capture_sets = read_captures(str(folder), dots=dots, colours=colours, root=options.root)  # type: ignore[arg-type]
-    across = photographs is None and capture_sets[0].notes["dots"] == "field"
-    command = f"torchdof fit {folder.name} --family {options.family} --accuracy-db {options.accuracy_db:g}"
-    told, fitted = set[str](), list[tuple[Captures, TableFit]]()
+    across_field = photographs is None and capture_sets[0].notes["dots"] == "field"
+    command_line = f"torchdof fit {folder.name} --family {options.family} --accuracy-db {options.accuracy_db:g}"
+    printed, fitted = set[str](), list[tuple[Captures, TableFit]]()
     for i, captures in enumerate(capture_sets):
-        table_file = said.out if len(capture_sets) == 1 else said.out.with_name(f"{said.out.stem}_{i:02d}.json")
+        table_file = command.out
         if len(capture_sets) > 1:
-            shown.say(f"dot {i} at {captures.notes['position_px']} px from the centre")
-        with _heard() as heard, Bar("fitting") as bar:
+            table_file = command.out.with_name(f"{command.out.stem}_{i:02d}.json")
+            printer.say(f"dot {i} at {captures.notes['position_px']} px from the centre")
+        with _collected_warnings() as fit_warnings, Bar("fitting") as bar:
             result = fit_captures(
                 captures,
                 options.family,
                 accuracy_db=options.accuracy_db,
                 progress=lambda done, total, what, bar=bar: bar.update(what, done, total),  # type: ignore[misc]
-                command=command,
+                command=command_line,
                 scale_of=fitted[0][1] if fitted else None,  # all dots use the scale of the one nearest to the centre
             )
-        messages = [*doubts, *heard]
+        messages = [*reading_warnings, *fit_warnings]
         fitted.append((captures, result))
-        shown.fit(captures, result, [message for message in messages if message not in told])
-        told.update(messages)
-        if not across:
-            shown.write(result.table, table_file)
+        printer.fit(captures, result, [message for message in messages if message not in printed])
+        printed.update(messages)
+        if not across_field:
+            printer.write(result.table, table_file)
         facts = {"out": str(table_file), **_facts_of(captures, result), "warnings": messages}
         if photographs is not None:
-            shown.sheet(photographs, result, said.out.with_suffix(".png"))
+            printer.sheet(photographs, result, command.out.with_suffix(".png"))
             facts["advice"] = list(photographs.advice)
-        shown.facts(facts)
-        if said.plots is not None and photographs is None:
+        printer.facts(facts)
+        if command.plots is not None and photographs is None:
             fits = zip((pair.distance_m for pair in captures), result.fits, strict=True)
-            shown.draw(result.table, said.plots, table_file.stem, fits)
-    if across:
-        shown.write(table_of_dots(fitted), said.out)
+            printer.draw(result.table, command.plots, table_file.stem, fits)
+    if across_field:
+        printer.write(table_of_dots(fitted), command.out)
 
 
 @contextmanager
-def _heard() -> Iterator[list[str]]:
+def _collected_warnings() -> Iterator[list[str]]:
     """Collects warnings in a list, which is filled at the end of the block, without duplicates."""
     messages = list[str]()
     with warnings.catch_warnings(record=True) as caught:
@@ -121,7 +123,7 @@ def _heard() -> Iterator[list[str]]:
 
 
 def _facts_of(captures: Captures, result: TableFit) -> dict[str, Any]:
-    """The results that :meth:`Shown.fit` prints, as data for JSON."""
+    """The results that :meth:`FitPrinter.fit` prints, as data for JSON."""
     of_fit = ("params", "stderr", "residual", "residual_over_noise", "magnification")
     of_colour = ("name", "focus_shift_dioptres", "lateral_px")
     return {
@@ -138,7 +140,7 @@ def _facts_of(captures: Captures, result: TableFit) -> dict[str, Any]:
     }
 
 
-class Shown:
+class FitPrinter:
     """Prints results and draws pictures; with ``quiet`` it prints JSON only."""
 
     def __init__(self, quiet: bool) -> None:
@@ -233,6 +235,6 @@ class Shown:
 
     def _save(self, figure: Any, target: Path) -> None:
         """Writes a figure, whole or not at all, and prints its path."""
-        with whole_file(target) as part:
-            figure.savefig(part)
+        with atomic_file(target) as temporary:
+            figure.savefig(temporary)
         self.say(str(target))

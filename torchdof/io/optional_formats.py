@@ -6,10 +6,10 @@ from typing import Any
 
 __all__ = ["SUFFIXES", "readable", "refusal"]
 
-_SHARE = "convert it to JPEG or 16-bit TIFF (heif-convert, sips -s format tiff, or let the phone share it as JPEG)"
+_CONVERT = "convert it to JPEG or 16-bit TIFF (heif-convert, sips -s format tiff, or let the phone share it as JPEG)"
 _DEVELOP = "develop it to linear 16-bit TIFF (dcraw -4 -T, or a converter's linear profile) and copy its EXIF"
 _READERS = {
-    "heif": (_SHARE, (".heic", ".heif", ".avif")),
+    "heif": (_CONVERT, (".heic", ".heif", ".avif")),
     "raw": (_DEVELOP, (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf")),
 }
 
@@ -34,5 +34,5 @@ def refusal(path: Any) -> str | None:
     suffix = Path(path).suffix.lower() if isinstance(path, str | os.PathLike) else ""
     if suffix not in SUFFIXES or suffix in readable():
         return None
-    how = next(how for how, suffixes in _READERS.values() if suffix in suffixes)
-    return f"{suffix} is not read here: {how}"
+    remedy = next(remedy for remedy, suffixes in _READERS.values() if suffix in suffixes)
+    return f"{suffix} is not read here: {remedy}"
