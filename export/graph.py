@@ -12,7 +12,7 @@ from torchdof.module import blur
 from torchdof.optics.camera import Camera
 from torchdof.options import DepthEdges, Options
 from torchdof.render.ops import Ops
-from torchdof.render.plan import Blur, Plan
+from torchdof.render.plan import LayerKernel, Plan
 
 from .operations import GraphOps
 
@@ -92,7 +92,7 @@ class Portable(nn.Module):
         coc_px = self.dof.coc_as_given(image, map_, focus_m, f_number)
         return blur(image, coc_px, options, plan, ops=self.ops)
 
-    def blurs(self, size: tuple[int, int]) -> list[Blur]:
+    def blurs(self, size: tuple[int, int]) -> list[LayerKernel]:
         """Kernels of the graph's layers, for a frame of this height and width."""
         coarse = self.dof.options.method == "layered"
         return self.plan.blurs(self.dof.options.table, size, torch.float32, torch.device("cpu"), coarse, self.width)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchdof.render.disocclusion import BEHIND_PX, search, shown_behind
 from torchdof.render.ops import Level, Ops, Seen
-from torchdof.render.surfaces import Frame, Placed
+from torchdof.render.surfaces import Frame, PaddedSurface
 
 from .operators import collect, window
 from .shifting import samples
@@ -40,7 +40,7 @@ def tile_by_tile(frame: Frame, render: Callable[[Frame], Tensor], ops: Ops) -> T
         The rendered frame, ``[B, C, H, W]``.
     """
     tile_px, margin = side(frame.margin), frame.margin
-    surfaces = [Placed(*(window(t, tile_px, margin) for t in s if t is not None)) for s in frame.surfaces]
+    surfaces = [PaddedSurface(*(window(t, tile_px, margin) for t in s if t is not None)) for s in frame.surfaces]
     behind = None if frame.behind is None else window(frame.behind, tile_px, 0)
     inside = (..., slice(margin, margin + tile_px), slice(margin, margin + tile_px))
     size = (tile_px, tile_px)

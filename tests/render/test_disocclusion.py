@@ -12,8 +12,8 @@ from torchdof.render.composite import over
 from torchdof.render.convolution import convolve
 from torchdof.render.disocclusion import behind_pixels, fill_hidden, surfaces_of_image
 from torchdof.render.highlights import threshold
-from torchdof.render.plan import Blur
-from torchdof.render.surfaces import HIDDEN_WEIGHT, Surface, framed
+from torchdof.render.plan import LayerKernel
+from torchdof.render.surfaces import HIDDEN_WEIGHT, Surface, pad_to_frame
 
 
 def surfaces(image: Tensor, coc: Tensor, levels: int) -> tuple[Surface, Surface, Tensor]:
@@ -96,14 +96,17 @@ def test_a_hole_in_all_layers_shows_the_background(size: tuple[int, int]) -> Non
     top, left = ((length - part) // 2 for length, part in zip(behind.shape[-2:], size, strict=True))
     behind = behind[..., top : top + size[0], left : left + size[1]]
     coc = torch.zeros(1, 1, *size)
-    blurs = [Blur(torch.ones(1, 1, 1), 1), Blur(torch.zeros(1, 1, 1), 1)]  # the farther layer leaves a hole
+    blurs = [
+        LayerKernel(torch.ones(1, 1, 1), 1),
+        LayerKernel(torch.zeros(1, 1, 1), 1),
+    ]  # the farther layer leaves a hole
     for cover in (0.0, 0.75, 1.0):
         light = torch.full((1, 3, *size), 0.2)
         surfaces = [
             Surface(light, coc, torch.full_like(coc, cover)),
             Surface(light, coc + 9.0, torch.full_like(coc, 1 - cover)),
         ]
-        frame = framed(surfaces, behind_pixels(cells, size), [(0.0, 1.0)], 0, 1, occlusion=True, stacked=False)
+        frame = pad_to_frame(surfaces, behind_pixels(cells, size), [(0.0, 1.0)], 0, 1, occlusion=True, stacked=False)
         shown = over(frame, blurs, convolve)
         torch.testing.assert_close(shown, 0.2 * cover + (1 - cover) * behind, rtol=0, atol=1e-6)
 

@@ -3,14 +3,14 @@
 import pytest
 import torch
 
-from torchdof.render.surfaces import HIDDEN_WEIGHT, Placed, _mixed, _stacked
+from torchdof.render.surfaces import HIDDEN_WEIGHT, PaddedSurface, _mixed, _stacked
 
 
 @pytest.mark.parametrize(("share", "known"), [(0.0, 0.0), (0.01, 0.0894), (0.03, 0.2546), (0.06, 0.06), (1.0, 1.0)])
 def test_a_surface_with_a_tiny_share_in_a_layer_counts_as_in_front_of_it(share: float, known: float) -> None:
     """From a share of 6 % the layer counts as known, minus the part in front of it; below, gradually less."""
     one = torch.ones(1, 1, 1, 1)
-    light, weight, behind = _stacked([Placed(one, one, None)], [(one * share, torch.zeros_like(one))])
+    light, weight, behind = _stacked([PaddedSurface(one, one, None)], [(one * share, torch.zeros_like(one))])
     assert float(weight + behind) == pytest.approx(known, abs=1e-4)
     assert float(light) <= float(weight) + 1e-6 and float(weight) <= share + 1e-6
 
@@ -23,7 +23,7 @@ def mixed(share: float, nearer: float) -> list[float]:
         nearer: Share of the nearer surface that is in the layer.
     """
     one, none = torch.ones(1, 1, 1, 1), torch.zeros(1, 1, 1, 1)
-    surfaces = [Placed(none, -one, one - share), Placed(one, one, one * share)]
+    surfaces = [PaddedSurface(none, -one, one - share), PaddedSurface(one, one, one * share)]
     return [float(t) for t in _mixed(surfaces, [(one * nearer, none), (one, none)])]
 
 

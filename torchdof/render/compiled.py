@@ -13,7 +13,7 @@ from ..optics.kernel_bank import bank_of
 from ..optics.placed_kernels import Shares, ray_shares
 from ..options import Options
 from ..tensors import is_in_memory, is_traced
-from . import headroom
+from . import exposure
 from .plan import KERNELS_PER_PX, Plan, kernels_of, layer_spots, longest_px
 
 __all__ = ["picture"]
@@ -103,7 +103,7 @@ def _render(
             return render(surfaces)  # raises OverflowError if light is too bright; a stack is scaled already
         except OverflowError:
             pass
-    scale = float(headroom.factor(*(light[None] for light, _, _ in surfaces[:2])))
+    scale = float(exposure.scale_of(*(light[None] for light, _, _ in surfaces[:2])))
     return render([(light * scale, coc, weight) for light, coc, weight in surfaces]) / scale
 
 

@@ -8,13 +8,13 @@ from torch import Tensor
 
 from .. import native
 from ..tensors import is_in_memory, is_traced
-from .surfaces import Frame, Placed
+from .surfaces import Frame, PaddedSurface
 
 __all__ = ["blended", "looked_behind"]
 
 
 def blended(
-    frame: Frame, layers: Sequence[tuple[Tensor, int]], backed: bool, plain: Callable[[Sequence[Placed]], Tensor]
+    frame: Frame, layers: Sequence[tuple[Tensor, int]], backed: bool, plain: Callable[[Sequence[PaddedSurface]], Tensor]
 ) -> Tensor | None:
     """Composite all layers of a frame, with its gradient: light followed by its weights, ``[B, C + 1 or C, h, w]``.
 
@@ -74,10 +74,10 @@ def _supported(tensors: Sequence[Tensor]) -> bool:
     return all(t.dtype == torch.float32 and is_in_memory(t, backward=True) for t in tensors)
 
 
-def _surfaces(counts: Sequence[int], tensors: Sequence[Tensor]) -> list[Placed]:
+def _surfaces(counts: Sequence[int], tensors: Sequence[Tensor]) -> list[PaddedSurface]:
     """The surfaces of a flat list of tensors, with ``counts`` tensors each."""
     left = iter(tensors)
-    return [Placed(*(next(left) for _ in range(count))) for count in counts]
+    return [PaddedSurface(*(next(left) for _ in range(count))) for count in counts]
 
 
 class _Blend(torch.autograd.Function):

@@ -13,7 +13,7 @@ from .compiled_steps import blended
 from .convolution import CHANNELS
 from .downsampling import downsampled, upsampled
 from .ops import EAGER, Ops
-from .plan import Blur
+from .plan import LayerKernel
 from .scatter import fold
 from .surfaces import Frame
 
@@ -32,7 +32,7 @@ _LEAST = 1e-6  # scattered weight, of 1: pixels with less are unknown and become
 _KNOWN = 0.002  # scattered weight, of 1: layers with less cover gradually less; larger fades more of them
 
 
-def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, ops: Ops = EAGER) -> Tensor:
+def over(frame: Frame, blurs: Sequence[LayerKernel], scatter: Scatter, ops: Ops = EAGER) -> Tensor:
     """Normalised "over" of soft layers.
 
     With ``m_k`` the weight of layer k, ``M_k`` the weight at or behind it and ``K_k`` its kernel:
@@ -77,7 +77,7 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, ops: Ops = EAGER
     return out[..., : frame.size[0], : frame.size[1]]
 
 
-def accumulate(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, ops: Ops = EAGER) -> Tensor:
+def accumulate(frame: Frame, blurs: Sequence[LayerKernel], scatter: Scatter, ops: Ops = EAGER) -> Tensor:
     """The paper's scatter: add the light of all layers, ignoring occlusion; channels of weights follow the light.
 
     Pass the result to :func:`mean`. Arguments are those of :func:`over`.
@@ -95,7 +95,7 @@ def accumulate(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, ops: Ops =
     return _picture(frame, blurs, scatter, False, plain)[..., : frame.size[0], : frame.size[1]]
 
 
-def accumulate_once(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
+def accumulate_once(frame: Frame, blurs: Sequence[LayerKernel]) -> Tensor:
     """The scatter of :func:`accumulate` as in the paper: one pass, in which each pixel has its own kernel.
 
     The kernel is interpolated between those of the two layers around the pixel's coc, at full resolution.
@@ -116,7 +116,7 @@ def accumulate_once(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
 
 
 def _picture(
-    frame: Frame, blurs: Sequence[Blur], scatter: Scatter, backed: bool, plain: Callable[[Frame], Tensor]
+    frame: Frame, blurs: Sequence[LayerKernel], scatter: Scatter, backed: bool, plain: Callable[[Frame], Tensor]
 ) -> Tensor:
     """All layers of a frame, composited by the compiled engine if it supports the arguments, else by ``plain(frame)``.
 
@@ -131,7 +131,7 @@ def _picture(
 
 def _composite_layers(
     frame: Frame,
-    blurs: Sequence[Blur],
+    blurs: Sequence[LayerKernel],
     scatter: Scatter,
     composited: Callable[[Picture, Picture], Picture],
     ops: Ops,
@@ -196,7 +196,7 @@ def _composite_layers(
 
 
 def _scattered(
-    frame: Frame, blurs: Sequence[Blur], scatter: Scatter, group: list[int], visibility: bool
+    frame: Frame, blurs: Sequence[LayerKernel], scatter: Scatter, group: list[int], visibility: bool
 ) -> tuple[Lights, Tensor] | tuple[Lights, Tensor, Tensor]:
     """Scatter the layers of a group, near to far: light of each, weights and, with ``visibility``, weights behind.
 
@@ -228,7 +228,7 @@ def _scattered(
     return parts[: len(group)], *parts[len(group) :]
 
 
-def _needed(frame: Frame, blurs: Sequence[Blur], layers: list[int]) -> Callable[[], Tensor]:
+def _needed(frame: Frame, blurs: Sequence[LayerKernel], layers: list[int]) -> Callable[[], Tensor]:
     """A function that computes whether any pixel within reach of the area lies in these consecutive layers."""
     nodes = frame.nodes[0]  # graphs have the same layers for all items
     ends = (nodes[0] - 1.0, *nodes, nodes[-1] + 1.0)

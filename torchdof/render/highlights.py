@@ -25,7 +25,7 @@ from ..optics.placed_kernels import Shares, placed_between, ray_shares
 from ..tensors import is_traced
 from .ops import EAGER, Ops
 from .plan import KERNELS_PER_PX, kernels_for
-from .surfaces import HIDDEN_WEIGHT, Highlights, Surface, going_on
+from .surfaces import HIDDEN_WEIGHT, Highlights, Surface, continuation_weight
 
 __all__ = ["COARSE_CELL", "FACTOR", "NEARER_PX", "affordable_taps", "covered_cells", "extract", "splat", "threshold"]
 
@@ -159,7 +159,7 @@ def extract(
             around = pixels.pick(image_coc_px, pixels.around(bright, image_coc_px, 2))[0]
             off_middle = (around - (coc - 0.5 * gap)).abs() / gap.clamp_min(NEARER_PX)  # 1/2 at the coc of a surface
             is_step = (1.5 - 10.0 * (3.5 - 8.0 * off_middle).clamp(0.0, 1.0).mean(0)).clamp(0.0, 1.0)
-            cover = cover + going_on(cover) * (stopped * is_dark * is_step)
+            cover = cover + continuation_weight(cover) * (stopped * is_dark * is_step)
         excess = excess * cover
     highlights = Highlights(bright, excess, coc)
     return surface._replace(light=left), highlights

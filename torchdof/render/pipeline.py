@@ -17,7 +17,7 @@ from .. import native
 from ..options import Options
 from ..tensors import is_differentiated, is_in_memory, is_traced
 from ..validation import NAMED_TOLERANCES
-from . import compiled, composite, edges, headroom, highlights
+from . import compiled, composite, edges, exposure, highlights
 from .attention import Attention, box_around, weight_map
 from .convolution import convolve
 from .disocclusion import behind_pixels, surfaces_of_image
@@ -26,7 +26,7 @@ from .matting import matte
 from .ops import EAGER, Ops
 from .plan import Plan, layers_together
 from .scatter import fold
-from .surfaces import Frame, Surface, framed
+from .surfaces import Frame, Surface, pad_to_frame
 
 __all__ = ["blur", "blur_stack"]
 
@@ -153,7 +153,7 @@ def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     light, coc = rgba.to(wide), coc_px.to(wide)
     order = torch.where(torch.isfinite(coc), coc, torch.inf).argsort(1)  # near to far
     cover = light[:, :, -1:].clamp(0.0, 1.0)
-    scale = headroom.factor(light.flatten(1, 2))  # before the division, which makes light of tiny coverage huge
+    scale = exposure.scale_of(light.flatten(1, 2))  # before the division, which makes light of tiny coverage huge
     valid = torch.isfinite(coc) & torch.isfinite(light).all(2, keepdim=True) & (cover > 0)
     cover, coc = torch.where(valid, cover, 0.0), torch.where(valid, coc, coc.new_zeros(()))
     light = torch.where(valid, light * scale[:, None] / cover.clamp_min(1e-12), 0.0)
@@ -216,9 +216,9 @@ def _render_items(
         valid = torch.isfinite(coc) & torch.isfinite(light).all(1, keepdim=True)
         coc, light, weight = torch.where(valid, coc, 0.0), torch.where(valid, light, 0.0), valid.to(light.dtype)
     coc = coc.clamp(*reach)  # differences of huge values would round badly
-    scale = headroom.factor(light, behind_light)
-    has_room = headroom.has_room(scale)
-    if not has_room:
+    scale = exposure.scale_of(light, behind_light)
+    is_unscaled = exposure.is_unscaled(scale)
+    if not is_unscaled:
         light, behind_light = light * scale, None if behind_light is None else behind_light * scale
 
     # limit of highlights; without occlusion only those are splatted that a coarse layer would soften
@@ -256,7 +256,7 @@ def _render_items(
     # blur and composite the layers, far to near
     own = 0 if behind_light is None else 1
     out = _composite(surfaces, behind, plans, options, ops, own, limit, splats)
-    out = out if has_room else out / scale
+    out = out if is_unscaled else out / scale
     out = out if valid is None else torch.where(valid, out, image)
     return ops.choose(lambda: blur_axis(coc).abs().max() > 0, out, image)
 
@@ -307,7 +307,7 @@ def _composite(
     margin = -(-max(blur.halo for blur in blurs) // coarsest) * coarsest
     behind = None if behind is None else behind_pixels(behind, size)
     lit, multiple = options.occlusion or options.normalize, ops.align(margin, coarsest)
-    frame = framed(surfaces, behind, nodes, margin, multiple, options.occlusion, image != 0, lit, limit, image)
+    frame = pad_to_frame(surfaces, behind, nodes, margin, multiple, options.occlusion, image != 0, lit, limit, image)
     scatter = functools.partial(convolve, turned=not options.table.is_round) if layered else fold
 
     def scattered(frame: Frame) -> Tensor:

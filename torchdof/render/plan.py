@@ -21,7 +21,7 @@ from .layer_weights import blur_axis, from_blur_axis, ramps, weights_at_or_behin
 
 __all__ = [
     "KERNELS_PER_PX",
-    "Blur",
+    "LayerKernel",
     "Plan",
     "kernels_for",
     "kernels_of",
@@ -39,7 +39,7 @@ _FARTHEST_PX = 1e9  # px: upper limit of nodes; frames are smaller
 
 
 @dataclasses.dataclass(frozen=True)
-class Blur:
+class LayerKernel:
     """How one layer is scattered: at every ``scale``-th pixel, with a kernel ``[1 or C, k, k]`` in such pixels.
 
     The kernel is ``[B, 1 or C, k, k]`` if each item of a batch has its own. ``shares`` are the masks that change the
@@ -225,7 +225,7 @@ class Plan:
         coarse: bool,
         lens_width: int | None = None,
         kept: Sequence[Tensor] | None = None,
-    ) -> list[Blur]:
+    ) -> list[LayerKernel]:
         """Kernel and resolution of each layer for a frame of ``size`` (height, width).
 
         Kernels are cut to the offsets between two pixels of the frame; those that reach at most 23 pixels of their
@@ -241,9 +241,9 @@ class Plan:
             made = _layer_kernels(table, self.coc_px, width, scales, longest_px(size, scales), dtype)
             bank = [kernel.to(device, dtype) for kernel in made]
         if not table.depends_on_place:
-            return [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
+            return [LayerKernel(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
         shares = self.shares(table, scales, (int(size[0]), int(size[1])))
-        return [Blur(*each) for each in zip(bank, scales, shares, strict=True)]
+        return [LayerKernel(*each) for each in zip(bank, scales, shares, strict=True)]
 
     def constants(self, table: BlurTable, coarse: bool, lens_width: int) -> list[Tensor]:
         """Kernels of the layers as constants of a trace, not cut to a frame."""
@@ -280,7 +280,7 @@ def layers_together(
     coarse: bool,
     lens_width: int | None = None,
     kept: Sequence[Tensor] | None = None,
-) -> tuple[list[tuple[float, ...]], list[Blur]]:
+) -> tuple[list[tuple[float, ...]], list[LayerKernel]]:
     """Places and blurs of the layers of one plan for a whole batch, or of one plan for each item.
 
     Layers of several items are joined if they lie on the same side of the focus and have the same resolution. An item
@@ -324,7 +324,7 @@ def layers_together(
             for row, each in zip(rows, column, strict=True):
                 row.append(None if each is None else each[0])
             joined = _stacked([None if each is None else each[1] for each in column])
-            blurs.append(Blur(joined.to(device, dtype), max(abs(key), 1)))
+            blurs.append(LayerKernel(joined.to(device, dtype), max(abs(key), 1)))
     nodes = []
     for row in rows:
         places = [math.inf]

@@ -14,14 +14,14 @@ from ..tensors import is_traced
 from .border import continued
 from .layer_weights import blur_axis, eased, ramps, weights_at_or_behind
 
-__all__ = ["HIDDEN_WEIGHT", "Frame", "Highlights", "Placed", "Surface", "framed", "going_on"]
+__all__ = ["HIDDEN_WEIGHT", "Frame", "Highlights", "PaddedSurface", "Surface", "pad_to_frame", "continuation_weight"]
 
 HIDDEN_WEIGHT = 0.003
 """Weight of a hidden sample, which is guessed; a visible one has 1. A larger value mixes more guessed light in."""
 
 _HAIR = 0.06
 """Share of a surface at or behind a layer at which it counts there in full; larger: it fades in over more depth."""
-_GOES_ON = 0.1
+_CONTINUES_FROM = 0.1
 """Visible share of a far surface, above HIDDEN_WEIGHT, at which it continues in full behind the near one."""
 
 
@@ -44,7 +44,7 @@ class Highlights(NamedTuple):
     coc_px: Tensor
 
 
-class Placed(NamedTuple):
+class PaddedSurface(NamedTuple):
     """A surface continued beyond the frame's border; ``x`` is its place on the blur axis."""
 
     light: Tensor
@@ -70,7 +70,7 @@ class Frame:
             pixel sum to at most 1.
     """
 
-    surfaces: Sequence[Placed]
+    surfaces: Sequence[PaddedSurface]
     nodes: Sequence[Sequence[float]]
     ramps: Tensor
     behind: Tensor | None
@@ -97,8 +97,8 @@ class Frame:
         own, other = self.surfaces
         is_nearer = other.x < own.x
         pairs = [(a, b) for a, b in zip(own, other, strict=True) if a is not None and b is not None]
-        near = Placed(*(torch.where(is_nearer, b, a) for a, b in pairs))
-        far = Placed(*(torch.where(is_nearer, a, b) for a, b in pairs))
+        near = PaddedSurface(*(torch.where(is_nearer, b, a) for a, b in pairs))
+        far = PaddedSurface(*(torch.where(is_nearer, a, b) for a, b in pairs))
         return dataclasses.replace(self, surfaces=[near, far])
 
     def occupied(self) -> list[bool]:
@@ -136,23 +136,23 @@ class Frame:
         Returns light ``m_k I``, ``[B, n, C, h, w]``, its weight ``m_k`` and the weight behind it ``M_k - m_k``,
         ``[B, n, 1, h, w]``.
         """
-        surfaces = [Placed(*(self.cut(t, halo) for t in s if t is not None)) for s in self.surfaces]
+        surfaces = [PaddedSurface(*(self.cut(t, halo) for t in s if t is not None)) for s in self.surfaces]
         weights = weights_at_or_behind(torch.stack([s.x for s in surfaces]), self.ramps[..., first : first + count + 1])
         weights = eased(weights) if self.occlusion else weights
         pairs = [(weight[:, :-1, None], weight[:, 1:, None]) for weight in weights.unbind(0)]
-        surfaces = [Placed(*(t.unsqueeze(1) for t in s if t is not None)) for s in surfaces]
+        surfaces = [PaddedSurface(*(t.unsqueeze(1) for t in s if t is not None)) for s in surfaces]
         return (_stacked if self.stacked else _mixed)(surfaces, pairs)
 
 
-def going_on(cover: Tensor) -> Tensor:
+def continuation_weight(cover: Tensor) -> Tensor:
     """Extra coverage given to the far surface of a mixed pixel so that it continues behind the near one.
 
     ``cover`` is the share of the pixel in which it is visible.
     """
-    return (1.0 - cover) * ((cover - HIDDEN_WEIGHT) / _GOES_ON).clamp(0.0, 1.0)
+    return (1.0 - cover) * ((cover - HIDDEN_WEIGHT) / _CONTINUES_FROM).clamp(0.0, 1.0)
 
 
-def _mixed(surfaces: Sequence[Placed], pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
+def _mixed(surfaces: Sequence[PaddedSurface], pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
     """``m_k I``, ``m_k`` and ``M_k - m_k`` of one surface, or of two that share their pixels, near to far.
 
     Each is a sum over the surfaces. The far surface of a mixed pixel continues behind the near one: it counts in full
@@ -167,7 +167,7 @@ def _mixed(surfaces: Sequence[Placed], pairs: Sequence[tuple[Tensor, Tensor]]) -
         own = behind - beyond
         if cover is not None:
             if nearer is not None:
-                cover = cover + going_on(cover) * (1.0 - (nearer / _HAIR).clamp(0.0, 1.0))
+                cover = cover + continuation_weight(cover) * (1.0 - (nearer / _HAIR).clamp(0.0, 1.0))
             beyond, own = beyond * cover, own * cover
         terms = [light * own, own, beyond]
         sums = [a + b for a, b in zip(sums, terms, strict=True)] if sums else terms
@@ -175,7 +175,9 @@ def _mixed(surfaces: Sequence[Placed], pairs: Sequence[tuple[Tensor, Tensor]]) -
     return sums[0], sums[1], sums[2]
 
 
-def _stacked(surfaces: Sequence[Placed], pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
+def _stacked(
+    surfaces: Sequence[PaddedSurface], pairs: Sequence[tuple[Tensor, Tensor]]
+) -> tuple[Tensor, Tensor, Tensor]:
     """The same for surfaces that cover a pixel independently, near to far.
 
     With ``c`` the cover of a surface, ``b`` its share at or behind layer k and ``h = c eased(min(b / _HAIR, 1))``,
@@ -201,7 +203,7 @@ def _stacked(surfaces: Sequence[Placed], pairs: Sequence[tuple[Tensor, Tensor]])
     return light, own, visible * (1.0 - unknown) - own
 
 
-def framed(
+def pad_to_frame(
     surfaces: Sequence[Surface],
     behind: Tensor | None,
     nodes: Sequence[Sequence[float]],
@@ -250,7 +252,7 @@ def framed(
         lights = [functional.pad(light, around) for light in lights]
     x = functional.pad(x if cover is None else torch.cat([x, cover], 1), around, mode="replicate")
     maps = [part.unflatten(0, (len(surfaces), -1)) for part in x.split(1, 1)]
-    placed = [Placed(*parts) for parts in zip(lights, *maps, strict=True)]
+    placed = [PaddedSurface(*parts) for parts in zip(lights, *maps, strict=True)]
     if behind is not None:
         behind = functional.pad(behind, beyond, mode="replicate")
     return Frame(placed, nodes, ramps(nodes, placed[0].x), behind, margin, (height, width), size, occlusion, stacked)

@@ -1,4 +1,4 @@
-"""Headroom: scales very bright light down so that sums of its powers, in matting and splatting, do not overflow.
+"""Scale very bright light down, so that sums of its powers in matting and splatting do not overflow.
 
 The scale is a power of two, which rounds nothing; the rendered picture is scaled back.
 """
@@ -10,12 +10,12 @@ from torch import Tensor
 
 from ..tensors import is_traced
 
-__all__ = ["factor", "has_room"]
+__all__ = ["is_unscaled", "scale_of"]
 
 _SUMMED = 16  # log2 of the largest number of terms in a sum of light; larger: scales down earlier
 
 
-def factor(light: Tensor, behind: Tensor | None = None) -> Tensor:
+def scale_of(light: Tensor, behind: Tensor | None = None) -> Tensor:
     """Scale of the light of each item at which no sum overflows: ``[B, 1, 1, 1]``, at most 1.
 
     Args:
@@ -23,7 +23,7 @@ def factor(light: Tensor, behind: Tensor | None = None) -> Tensor:
         behind: Light behind the image, ``[B, C, H, W]``, which is summed itself.
 
     Example:
-        >>> factor(torch.full((1, 3, 4, 5), 1e30)).log2().item()
+        >>> scale_of(torch.full((1, 3, 4, 5), 1e30)).log2().item()
         -72.0
     """
     excess = _excess(light, power=4)
@@ -32,8 +32,8 @@ def factor(light: Tensor, behind: Tensor | None = None) -> Tensor:
     return torch.exp2(-excess)
 
 
-def has_room(scale: Tensor) -> bool:
-    """Whether a :func:`factor` is 1 everywhere; False in traced code, which cannot read it and always applies it."""
+def is_unscaled(scale: Tensor) -> bool:
+    """Whether scales from :func:`scale_of` are 1 everywhere; False in traced code, which cannot read it and always applies it."""
     return not is_traced() and bool((scale == 1.0).all())
 
 
