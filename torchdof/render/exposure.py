@@ -33,7 +33,7 @@ def scale_of(light: Tensor, behind: Tensor | None = None) -> Tensor:
 
 
 def is_unscaled(scale: Tensor) -> bool:
-    """Whether scales from :func:`scale_of` are 1 everywhere; False in traced code, which cannot read it and always applies it."""
+    """Whether all scales are 1; False in traced code, which cannot read them and always applies them."""
     return not is_traced() and bool((scale == 1.0).all())
 
 
