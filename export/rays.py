@@ -102,7 +102,7 @@ def splat(rays: Highlights, coc_px: Tensor, obstacles: Sequence[tuple[Tensor, Te
     nearest = coc_px.amin((1, 2, 3))
     if obstacles:
         obstacle_bins = [(coc - nearest[:, None, None, None], cover) for coc, cover in obstacles]
-        maps = [torch.stack([t.flatten() for t in fraction], 1) for fraction in zip(*obstacle_bins, strict=True)]
+        maps = [torch.stack([t.flatten() for t in part], 1) for part in zip(*obstacle_bins, strict=True)]
         maps.append(covered_cells(obstacle_bins, bins))
     else:  # no bins with surfaces
         maps = [coc_px.new_zeros(1, 1), coc_px.new_zeros(1, 1), coc_px.new_zeros(0, 1, 1, 1)]

@@ -6,25 +6,15 @@ import pytest
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 
+from examples.benchmarks.operations import Counted
 from tests.scenes import TABLES, assert_same_picture, random_scene
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
 from torchdof.render.layer_weights import blur_axis, ramps, weights_at_or_behind
-from torchdof.render.plan import Plan, layers_together
+from torchdof.render.plan import Plan, joined_layers
 
 SIZE = (48, 64)
 RADII = (1.5, 30.0, 4.0, 0.0, 9.0)  # px: different layers, resolutions and pyramids; one item is in focus
-
-
-class Operations(TorchDispatchMode):
-    """Counts the operations that compute, copy or allocate."""
-
-    count = 0
-
-    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        self.count += not function.is_view
-        return function(*args, **(kwargs or {}))
 
 
 def batch(seed: int, radii: tuple[float, ...] = RADII) -> tuple[Tensor, Tensor]:
@@ -90,9 +80,9 @@ def test_a_batch_takes_hardly_more_operations_than_its_most_expensive_item(occlu
 
     def operations(images: Tensor, cocs: Tensor) -> int:
         blur_by_coc(images, cocs, occlusion=occlusion)  # some tensors are made once
-        with Operations() as counted:
+        with Counted() as counted:
             blur_by_coc(images, cocs, occlusion=occlusion)
-        return counted.count
+        return counted.operations
 
     alone = [operations(images[i : i + 1], cocs[i : i + 1]) for i in range(4)]
     assert operations(images, cocs) < 1.5 * max(alone) < 0.7 * sum(alone)
@@ -113,7 +103,7 @@ def test_layers_of_several_plans_are_joined_by_side_and_resolution() -> None:
         Plan.of_scene(torch.tensor(ends).reshape(1, 1, 1, -1).expand(1, 1, 100, -1), 1 / 255)
         for ends in ([-40.0, 3.0], [-1.0, 0.0, 25.0], [5.0, 9.0])
     ]
-    nodes, blurs = layers_together(plans, BlurTable.disc(), SIZE, torch.float64, torch.device("cpu"), True)
+    nodes, blurs = joined_layers(plans, BlurTable.disc(), SIZE, torch.empty(0, dtype=torch.float64))
     assert len(blurs) == len(nodes[0]) < sum(len(plan.nodes) for plan in plans)
     for item, (plan, places) in enumerate(zip(plans, nodes, strict=True)):
         x = blur_axis(torch.linspace(-41.0, 26.0, 300).double()).clamp(plan.nodes[0], plan.nodes[-1])

@@ -206,7 +206,6 @@ def fill_hidden(
     (height, width), colours = coc_px.shape[-2:], light.shape[1]
     sizes = [[_continued(n, 2**own) for own in levels] for n in (height, width)]
     whole = [max(of_items) for of_items in sizes]  # pixels of a level, centred on the image
-    several = len({*levels}) > 1
 
     # the farther surface of each pixel, dimmed to the threshold
     is_mixed = (other_weight > 0.05) & (other_coc_px > coc_px)
@@ -217,14 +216,9 @@ def fill_hidden(
     far_weight = torch.where(is_mixed, other_weight, 1.0 - other_weight)
     if valid is not None:
         far_coc, far_weight = torch.where(valid > 0, far_coc, -NEVER_PX), far_weight * valid
-    pyramid: list[tuple[Tensor, Tensor, Tensor]] = []
-    for level in range(1, max(levels) + 1):
-        values = (
-            _farthest(*pyramid[-1])
-            if pyramid
-            else _first_level(far_light, far_coc, far_weight, *(n // 2 for n in whole))
-        )
-        pyramid.append(_repeated(values, sizes, level) if several else values)
+    pyramid = [_repeated(_first_level(far_light, far_coc, far_weight, whole[0] // 2, whole[1] // 2), sizes, 1)]
+    for level in range(2, max(levels) + 1):
+        pyramid.append(_repeated(_farthest(*pyramid[-1]), sizes, level))
     # cells without valid pixels get the mean light of the others
     light, coc, weight = pyramid[_FINE_LEVELS - 1]
     mean = (light * weight).sum((-2, -1), keepdim=True) / weight.sum((-2, -1), keepdim=True).clamp_min(1e-12)
@@ -266,6 +260,8 @@ def _repeated(
 
     ``sizes`` are the rows and columns of pixels that the pyramid of each item covers, ``[2][B]``; all have one centre.
     """
+    if len(sizes[0]) == 1 or all(len({*of_items}) == 1 for of_items in sizes):  # a graph has symbolic sizes of one
+        return values
     nearest = []
     for of_items in sizes:
         count = max(of_items) >> level

@@ -126,9 +126,8 @@ def extract(
         return surface, None
     peak, coc, most = (pixels.pick(t, bright)[0] for t in (brightest, coc_px, limit))
     item = bright // area if apart else None
-    if isinstance(from_px, Tensor):
-        from_px = from_px.flatten() if item is None else from_px.flatten().index_select(0, item)
-    fades = (coc.abs() - from_px).clamp(max=1.0)
+    start = pixels.pick(from_px.expand_as(coc_px), bright)[0] if isinstance(from_px, Tensor) else from_px
+    fades = (coc.abs() - start).clamp(max=1.0)
     # the limit at which the rays fit into the budget
     share = ((1.0 - most / peak) * fades).detach()
     if item is None:

@@ -138,32 +138,25 @@ def widest(coc_px: Tensor) -> list[float]:
 
 
 def border_nodes(border: np.ndarray) -> list[float]:
-    """Places at which many pixels of the frame's border lie, of their places ``[n]``.
+    """Places at which many pixels of the frame's border lie, of their places ``[n]``; the most crowded first.
 
     Surfaces continue beyond the frame with the blur of its border. So large areas there have the same few blurs, and
-    layers far from these cause visible errors.
+    layers far from these cause visible errors. A place is an interval of the finest distance, three bins of the
+    histogram. It holds at least 3 % of all pixels, and at least 16.
     """
-    return _crowded(border, width=1.0, least_share=0.03)
-
-
-def _crowded(x: np.ndarray, width: float, least_share: float) -> list[float]:
-    """Places that hold at least ``least_share`` of all ``x [n]``, and at least 16 of them; the most crowded first.
-
-    A place is an interval of ``width`` finest distances: three bins of the histogram.
-    """
-    bins = np.rint(_in_finest(x) * (3.0 / width)).astype(int)
+    bins = np.rint(_in_finest(border) * 3.0).astype(int)
     first = int(bins.min())
     counts = np.pad(np.bincount(bins - first), 1)
     crowds = (counts[:-2] + counts[1:-1] + counts[2:]).tolist()
     places: list[float] = []
-    least = max(least_share * len(x), 16)
+    least = max(0.03 * len(border), 16)
     for i, count in sorted(enumerate(crowds), key=lambda item: -item[1]):
         if count < least:
             break
-        place = _from_finest((first + i) * width / 3.0)
+        place = _from_finest((first + i) / 3.0)
         if all(abs(place - other) > 0.6 * finest(place) for other in places):
             # the lower median is a value that occurs, so pixels of that value lie in this layer alone
-            crowd = np.sort(x[np.abs(bins - first - i) <= 1])
+            crowd = np.sort(border[np.abs(bins - first - i) <= 1])
             places.append(float(crowd[(len(crowd) - 1) // 2]))
     return places
 

@@ -24,7 +24,7 @@ from .disocclusion import behind_pixels, surfaces_of_image
 from .layer_weights import blur_axis
 from .matting import matte
 from .ops import EAGER, Ops
-from .plan import Plan, layers_together
+from .plan import Plan, joined_layers
 from .scatter import fold
 from .surfaces import Frame, Surface, pad_to_frame
 
@@ -130,15 +130,13 @@ def _each_planned(
     joined = [i for i, plan in enumerate(plans) if len(plan.nodes) > 1]  # a plane has one layer, whose kernel is exact
     groups = [joined[i : i + most] for i in range(0, len(joined), most)]
     groups += [[i] for i in range(len(plans)) if i not in joined]
-    items = [maps[0]] * len(plans)
+    if len(groups) == 1:
+        return render(plans, *maps)
+    by_index: dict[int, Tensor] = {}
     for group in groups:
-        parts = maps if len(group) == len(plans) else [torch.cat([t[i : i + 1] for i in group]) for t in maps]
-        rendered = render([plans[i] for i in group], *parts)
-        if len(group) == len(plans):
-            return rendered
-        for i, item in zip(group, rendered.split(1), strict=True):
-            items[i] = item
-    return torch.cat(items)
+        rendered = render([plans[i] for i in group], *(torch.cat([t[i : i + 1] for i in group]) for t in maps))
+        by_index |= zip(group, rendered.split(1), strict=True)
+    return torch.cat([by_index[i] for i in range(len(plans))])
 
 
 def _levels(plan: Plan) -> int:
@@ -203,8 +201,7 @@ def _render_items(
             return picture
     reach = _of_plans([(plan.coc_px[0], plan.coc_px[-1]) for plan in plans], coc)
     if cover is not None:
-        coc = coc.clamp(*(end if isinstance(end, float) else end.unsqueeze(1) for end in reach))
-        stack = [Surface(light[:, i], coc[:, i], cover[:, i]) for i in range(light.shape[1])]
+        stack = [Surface(light[:, i], coc[:, i].clamp(*reach), cover[:, i]) for i in range(light.shape[1])]
         # a black surface behind the layers, for pixels that no layer covers
         stack.append(Surface(torch.zeros_like(light[:, 0]), torch.zeros_like(coc[:, 0]) + reach[1]))
         return _composite(stack, None, plans, options, ops, image=None)
@@ -300,9 +297,11 @@ def _composite(
     """Composite surfaces and add highlights; ``image`` is the index of the image's own surface, None for a stack."""
     light, layered = surfaces[0].light, options.method == "layered"
     size = (light.shape[-2], light.shape[-1])
-    nodes, blurs = layers_together(
-        plans, options.table, size, light.dtype, light.device, layered, ops.lens_width, ops.kernels
-    )
+    if len(plans) == 1:
+        nodes, table = [plans[0].nodes], options.table
+        blurs = plans[0].blurs(table, size, light.dtype, light.device, layered, ops.lens_width, ops.kernels)
+    else:
+        nodes, blurs = joined_layers(plans, options.table, size, light)
     coarsest = max(blur.scale for blur in blurs)
     margin = -(-max(blur.halo for blur in blurs) // coarsest) * coarsest
     behind = None if behind is None else behind_pixels(behind, size)

@@ -23,10 +23,10 @@ __all__ = [
     "KERNELS_PER_PX",
     "LayerKernel",
     "Plan",
+    "joined_layers",
     "kernels_for",
     "kernels_of",
     "layer_spots",
-    "layers_together",
     "longest_px",
 ]
 
@@ -271,40 +271,27 @@ class Plan:
         return 2 ** sum(reach >= start for start in _COARSE_FROM_PX)
 
 
-def layers_together(
-    plans: Sequence[Plan],
-    table: BlurTable,
-    size: tuple[int, int],
-    dtype: torch.dtype,
-    device: torch.device,
-    coarse: bool,
-    lens_width: int | None = None,
-    kept: Sequence[Tensor] | None = None,
+def joined_layers(
+    plans: Sequence[Plan], table: BlurTable, size: tuple[int, int], like: Tensor
 ) -> tuple[list[tuple[float, ...]], list[LayerKernel]]:
-    """Places and blurs of the layers of one plan for a whole batch, or of one plan for each item.
+    """Layers of several items, each with its own plan, as layers of the whole batch.
 
-    Layers of several items are joined if they lie on the same side of the focus and have the same resolution. An item
-    with fewer of them than another has unused layers, see :func:`torchdof.render.layer_weights.ramps`.
+    Layers are joined if they lie on the same side of the focus and have the same resolution. An item with fewer of them
+    than another has unused layers, see :func:`torchdof.render.layer_weights.ramps`.
 
     Args:
-        plans: One plan, or one for each item; then ``table`` does not depend on the place in the frame.
-        table: As for :meth:`Plan.blurs`, like all others.
+        plans: The plan of each item.
+        table: Table of the kernels, which does not depend on the place in the frame.
         size: Height and width of the frame.
-        dtype: Type of the kernels.
-        device: Device of the kernels.
-        coarse: Whether layers may have a coarser resolution.
-        lens_width: Width of the image whose kernels are used.
-        kept: Kernels that exist already, of a single plan.
+        like: Tensor with the dtype and device of the kernels.
 
     Returns:
-        Places on the blur axis, ``[P][n]``, and the blur of each of the n layers.
+        Places on the blur axis, ``[B][n]``, and the kernels of each of the n layers.
     """
-    if len(plans) == 1:
-        return [plans[0].nodes], plans[0].blurs(table, size, dtype, device, coarse, lens_width, kept)
-    sizes = [plan.layer_sizes(table, (size[0], lens_width or size[1]), coarse) for plan in plans]
+    sizes = [plan.layer_sizes(table, size, coarse=True) for plan in plans]
     scales = [scale for _, of_plan in sizes for scale in of_plan]
     coc_px = [coc for plan in plans for coc in plan.coc_px]
-    kernels = iter(_layer_kernels(table, coc_px, sizes[0][0], scales, longest_px(size, scales), dtype))
+    kernels = iter(_layer_kernels(table, coc_px, sizes[0][0], scales, longest_px(size, scales), like.dtype))
     # place and kernel of the layers of each plan, by a key that grows from near to far: signed resolution
     layers: list[dict[int, list[tuple[float, Tensor]]]] = [{} for _ in plans]
     for of_plan, plan, (_, own_scales) in zip(layers, plans, sizes, strict=True):
@@ -324,7 +311,7 @@ def layers_together(
             for row, each in zip(rows, column, strict=True):
                 row.append(None if each is None else each[0])
             joined = _stacked([None if each is None else each[1] for each in column])
-            blurs.append(LayerKernel(joined.to(device, dtype), max(abs(key), 1)))
+            blurs.append(LayerKernel(joined.to(like), max(abs(key), 1)))
     nodes = []
     for row in rows:
         places = [math.inf]
@@ -335,7 +322,7 @@ def layers_together(
 
 
 def _stacked(kernels: Sequence[Tensor | None]) -> Tensor:
-    """Kernels ``[1 or C, k, k]`` of one layer, padded to one size: ``[B, 1 or C, k, k]``; 0 where there is none."""
+    """Kernels ``[1 or C, k, k]`` of one layer, padded to one size: ``[B, 1 or C, k, k]``. None becomes zeros."""
     largest = max((kernel for kernel in kernels if kernel is not None), key=lambda kernel: kernel.shape[-1])
     half = largest.shape[-1] // 2
     empty = torch.zeros_like(largest)
@@ -372,9 +359,9 @@ def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int, per_
 def kernels_of(table: BlurTable, spots: Spots, dtype: torch.dtype = torch.float64) -> list[Tensor]:
     """Kernels ``[1 or C, k, k]`` on the CPU from their spots; by the compiled engine if float32 suffices."""
     bank = bank_of(table)
-    usable = is_in_memory(torch.empty(0, device="cpu"))  # new tensors have no memory in torch.func and fake modes
-    if dtype == torch.float32 and spots.moves is None and usable and native.chosen():
-        return native.kernels(spots, squeeze=bank.squeeze, is_round=table.is_round, is_even=bank.is_even)
+    if dtype == torch.float32 and spots.moves is None and native.chosen():
+        if is_in_memory(torch.empty(0, device="cpu")):  # new tensors have no memory in torch.func and fake modes
+            return native.kernels(spots, squeeze=bank.squeeze, is_round=table.is_round, is_even=bank.is_even)
     made = bank.of_spots(spots)
     spare = [made.shape[-1] // 2 - half for half in spots.half]
     return [k[:, n : k.shape[-1] - n, n : k.shape[-1] - n] for k, n in zip(made, spare, strict=True)]

@@ -14,7 +14,7 @@ from ..tensors import is_traced
 from .border import continued
 from .layer_weights import blur_axis, eased, ramps, weights_at_or_behind
 
-__all__ = ["HIDDEN_WEIGHT", "Frame", "Highlights", "PaddedSurface", "Surface", "pad_to_frame", "continuation_weight"]
+__all__ = ["HIDDEN_WEIGHT", "Frame", "Highlights", "PaddedSurface", "Surface", "continuation_weight", "pad_to_frame"]
 
 HIDDEN_WEIGHT = 0.003
 """Weight of a hidden sample, which is guessed; a visible one has 1. A larger value mixes more guessed light in."""
@@ -116,12 +116,11 @@ class Frame:
         occupied = [False] * layers
         for row, places in enumerate(self.nodes):
             of_row = counts[2 * layers * row :][: 2 * layers]
-            used = [k for k, (x, y) in enumerate(pairwise([*places, math.inf])) if x < y]
-            behind_before = 0
-            for k in used:
-                at, behind = of_row[2 * k : 2 * k + 2]
-                occupied[k] = occupied[k] or at + behind + behind_before > 0
-                behind_before = behind
+            in_front = 0  # pixels between the used layer before and this one
+            for k, (place, following) in enumerate(pairwise([*places, math.inf])):
+                if place < following:  # else the layer is unused
+                    occupied[k] |= in_front + of_row[2 * k] + of_row[2 * k + 1] > 0
+                    in_front = of_row[2 * k + 1]
         return occupied
 
     def any_between(self, low: float, high: float, halo: int) -> Tensor:
