@@ -150,7 +150,7 @@ def entries(stop: int, error: BaseException | None) -> Iterator[list[str]]:
 
 @pytest.fixture(autouse=True)
 def _unusual_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """What is set to a usual value at the end, instead of to that before, is noticed."""
+    """Starts from unusual values, so that a call that restores the usual ones instead fails its test."""
     monkeypatch.chdir(tmp_path)
     threads = torch.get_num_threads()
     torch.set_num_threads(3)

@@ -190,7 +190,8 @@ class RenderShards:
         """
         rows: list[dict[str, Any]] = []
         for shard, samples in zip(batch["shard"], batch["samples"], strict=True):
-            notes = self.samples_of(shard, samples) or self._make(shard, samples)
+            path, source = self.out / name_of(shard, self.format), self._source(samples)
+            notes = samples_of(path, source) or self._make(path, source, json.loads(str(samples)))
             rows += [{"shard": int(shard), **row} for row in notes]
         return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
@@ -215,11 +216,10 @@ class RenderShards:
         facts = [self.settings(), str(samples), [_size_and_time(file) for file in sorted(files)]]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
-    def _make(self, shard: int, samples: str) -> list[dict[str, Any]]:
+    def _make(self, path: Path, source: str, samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
         """Renders and writes one shard; returns the notes about its samples."""
-        path, source = self.out / name_of(shard, self.format), self._source(samples)
         records, rows = [], []
-        for sample in json.loads(str(samples)):
+        for sample in samples:
             start, error = time.process_time(), ""
             try:
                 records.append(self._record(**sample))

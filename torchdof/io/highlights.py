@@ -12,7 +12,7 @@ __all__ = ["expand_highlights"]
 
 _CLIPPING = (0.87, 0.97)  # linear light; a channel is unclipped below, clipped above (8-bit codes 240 and 252)
 _CLIPPED_SHARE = (0.05, 0.2)  # share of clipped pixels in the surroundings: a lamp below, a sky or paper above
-# Sides of square windows: as a share of the longer side of the image, and at least so many px.
+# Sides of square windows: a share of the longer side of the image, and the smallest side in px.
 _SURROUNDINGS, _SURROUNDINGS_PX = 0.04, 31.0  # window of the share of clipped pixels; a larger one raises larger lamps
 _RIM, _RIM_PX = 0.007, 5.0  # window of the hue; a larger one mixes in more of the objects beside the lamp
 _FAR_HUE = 1e-3  # weight of the surroundings in the hue; matters where the rim has no unclipped light
