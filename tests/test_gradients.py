@@ -208,3 +208,25 @@ def test_torch_func_of_an_old_pytorch_is_refused_by_name(which: str, monkeypatch
     dof = DepthOfField(Camera())
     with pytest.raises(ValueError, match=r"comes from torch\.func, for which torchdof needs PyTorch 2\.13"):
         torch.func.grad(lambda value: dof(**{**given, which: value}).sum())(given[which])
+
+
+@pytest.mark.parametrize(("occlusion", "frames"), [(True, 150), (False, 40)])
+def test_autograd_keeps_a_bounded_number_of_frames(
+    occlusion: bool, frames: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Layers, what is behind surfaces, and rays are computed again in the backward pass."""
+    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
+    light = 0.05 + torch.rand(1, 3, 96, 128)
+    light[..., 7::20, 9::17] = 40.0
+    coc_px = torch.linspace(-3.0, 14.0, 128).repeat(1, 1, 96, 1)
+    coc_px[..., 50:58] = -11.0
+    kept: dict[int, torch.UntypedStorage] = {}  # by their address, and alive, so that no address is used twice
+
+    def keep(values: Tensor) -> Tensor:
+        kept[values.untyped_storage().data_ptr()] = values.untyped_storage()
+        return values
+
+    with torch.autograd.graph.saved_tensors_hooks(keep, lambda values: values):
+        picture = blur_by_coc(light.requires_grad_(), coc_px.requires_grad_(), occlusion=occlusion)
+    assert sum(storage.nbytes() for storage in kept.values()) < frames * light.nbytes
+    torch.autograd.grad(picture.sum(), (light, coc_px))

@@ -1,10 +1,12 @@
 """Properties of a tensor: traced, differentiated, in memory."""
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.autograd.graph import saved_tensors_hooks
 
 __all__ = [
     "TRACEABLE",
@@ -15,6 +17,7 @@ __all__ = [
     "is_fake",
     "is_in_memory",
     "is_traced",
+    "recomputed",
     "refuse_old_compiler",
 ]
 
@@ -72,6 +75,38 @@ def is_differentiated(values: Tensor) -> bool:
         if not torch._C._functorch.is_functorch_wrapped_tensor(values):
             return False
         values = torch._C._functorch.get_unwrapped(values)
+
+
+def recomputed(compute: Callable[[], Tensor]) -> Tensor:
+    """The result of ``compute()``, which the backward pass computes again instead of keeping all intermediate tensors.
+
+    With several such functions, a step with gradients takes the memory of one of them, and the time of a second forward
+    pass. Traced code and torch.func keep the intermediate tensors. ``torch.utils.checkpoint`` does the same, but
+    imports PyTorch's compiler, which takes seconds.
+    """
+    if is_traced() or not torch.is_grad_enabled() or torch._C._functorch.peek_interpreter_stack() is not None:
+        return compute()
+    saved = 0
+    again: dict[int, Tensor] = {}
+
+    def pack(values: Tensor) -> tuple[int, str]:
+        nonlocal saved
+        saved += 1
+        return saved - 1, values.device.type
+
+    def repack(values: Tensor) -> None:
+        again[len(again)] = values.detach()  # autograd attaches it to the first graph
+
+    def unpack(packed: tuple[int, str]) -> Tensor:
+        index, device = packed
+        if index not in again:
+            again.clear()
+            with torch.enable_grad(), torch.autocast(device, enabled=False), saved_tensors_hooks(repack, unpack):
+                compute()
+        return again.pop(index)
+
+    with saved_tensors_hooks(pack, unpack):
+        return compute()
 
 
 def is_in_memory(values: Tensor, backward: bool = False) -> bool:

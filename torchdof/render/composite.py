@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from ..tensors import recomputed
 from . import field
 from .compiled_steps import blended
 from .convolution import CHANNELS
@@ -156,6 +157,18 @@ def _composite_layers(
         none = light.new_zeros(light.shape[0], colours, height, width)
         return torch.cat([none, light.new_full((light.shape[0], each, height, width), empty)], 1)
 
+    def in_front(part: Tensor, group: list[int]) -> Tensor:
+        """Put a group of layers in front of a picture."""
+        lights, *weights = _scattered(frame, blurs, scatter, group, normalised is not None)
+        if normalised is None:
+            layers: Pictures = list(zip(lights, *_each(weights[0], layers=len(group)), strict=True))
+        else:
+            layers = normalised(lights, *weights)
+        front = _parts(part, colours)
+        for layer in reversed(layers):
+            front = composited(layer, front)
+        return torch.cat(front, 1)
+
     picture = blank(*frame.area)
 
     # A run has one resolution. A coarse one stays on one side of the focus, because finer layers lie between the sides.
@@ -176,15 +189,8 @@ def _composite_layers(
         if scale > 1:  # one more pixel on each side, for the interpolation
             part = blank(*(n // scale + 2 for n in frame.area))
         for group in groups:
-            lights, *weights = _scattered(frame, blurs, scatter, group, normalised is not None)
-            if normalised is None:
-                layers: Pictures = list(zip(lights, *_each(weights[0], layers=len(group)), strict=True))
-            else:
-                layers = normalised(lights, *weights)
-            front = _parts(part, colours)
-            for layer in reversed(layers):
-                front = composited(layer, front)
-            part = ops.choose(_needed(frame, blurs, group), torch.cat(front, 1), part)
+            front = recomputed(functools.partial(in_front, part, group))
+            part = ops.choose(_needed(frame, blurs, group), front, part)
         if scale > 1:
             fine = upsampled(part, scale)
             fine = fine[..., scale : fine.shape[-2] - scale, scale : fine.shape[-1] - scale]

@@ -12,6 +12,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ..optics.kernel_cache import kept
+from ..tensors import recomputed
 from .compiled_steps import looked_behind
 from .downsampling import downsampled
 from .matting import NEVER_PX, attribute_emitters, matte
@@ -326,7 +327,7 @@ def _seen(levels: Sequence[Level], coc_px: Tensor) -> Seen:
 
     values = [level.values for level in levels]
     found = looked_behind(values, [(level.step, *_rule(level)) for level in levels], coc_px, plain)
-    found = plain(values, coc_px) if found is None else found
+    found = recomputed(lambda: plain(values, coc_px)) if found is None else found
     return found[:, :-1], found[:, -1:]
 
 

@@ -323,24 +323,27 @@ def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
     flattest = -_highest(-_mean(slope, 2), 8)
     is_ramp = (slope > 0.1 * step) & (slope > _SHALLOW * span) & (span > step) & (flattest < 0.3 * slope) & valid
 
-    # the surfaces at both ends of a ramp: extremes spread along it pixel by pixel
-    near, far = high, low
+    # the surfaces at both ends of a ramp: extremes spread along it pixel by pixel; both in one tensor, [B, 2, H, W]
+    both = torch.cat([high, low], 1)
+    along = both
     for _ in range(_RAMP_REACH):
-        near, far = (torch.where(is_ramp, _highest(end, 1), end) for end in (near, far))
-    is_ramp = is_ramp & (near + far > step)
-    near, far = torch.where(is_ramp, near, high), torch.where(is_ramp, far, low)
+        along = torch.where(is_ramp, _highest(along, 1), along)
+    is_ramp = is_ramp & (along.sum(1, keepdim=True) > step)
+    along = torch.where(is_ramp, along, both)
 
     # the surfaces on both sides of a step; the innermost ring that reaches it counts
-    nears, fars = ([_highest(end, ring) for ring in range(1, _RINGS + 1)] for end in (near, far))
-    least = torch.maximum(0.6 * (nears[-1] + fars[-1]), step)
-    ring = torch.full_like(nearness, _RINGS + 1, dtype=torch.long)
-    beside, behind = nears[-1], fars[-1]
-    for k in reversed(range(_RINGS)):
-        gap = nears[k] + fars[k]
-        is_step = (gap > least) & (_highest(jump, k + 1) > _ABRUPT * gap)
-        ring = torch.where(is_step, k + 1, ring)
-        beside, behind = torch.where(is_step, nears[k], beside), torch.where(is_step, fars[k], behind)
-    near, far = torch.where(is_ramp, near, beside), -torch.where(is_ramp, far, behind)
+    rings = [torch.cat([along, jump], 1)]
+    for _ in range(_RINGS):
+        rings.append(_highest(rings[-1], 1))
+    least = torch.maximum(0.6 * rings[-1][:, :2].sum(1, keepdim=True), step)
+    ring, beside = torch.full_like(nearness, _RINGS + 1, dtype=torch.long), rings[-1][:, :2]
+    for k in range(_RINGS, 0, -1):
+        ends, largest = rings[k][:, :2], rings[k][:, 2:]
+        gap = ends.sum(1, keepdim=True)
+        is_step = (gap > least) & (largest > _ABRUPT * gap)
+        ring, beside = torch.where(is_step, k, ring), torch.where(is_step, ends, beside)
+    near, far = torch.where(is_ramp, along, beside).split(1, 1)
+    far = -far
     is_edge = (is_ramp | (ring <= _RINGS)) & (near - far > step) & valid
 
     mean = _mean(functional.pad(nearness, (2,) * 4, mode="replicate"), 2)
@@ -474,17 +477,17 @@ def _calibrate(kind: Tensor, sampled: Tensor, score: Tensor, items: int) -> Tens
     places = kinds // _DIRECTIONS
     weight = (0.5 * score.abs()).clamp(max=1.0)
 
-    def fit(groups: Tensor, count: int, start: Tensor, assumed: Tensor) -> Tensor:
-        share, total = start, start.new_zeros(count).index_add(0, groups, weight)
+    def fit(groups: Tensor, start: Tensor, assumed: Tensor) -> Tensor:
+        prior = _PRIOR_COUNT * assumed
+        share, total = start, torch.full_like(prior, _PRIOR_COUNT).index_add(0, groups, weight)
         for _ in range(_ROUNDS):
             near = torch.sigmoid(score + torch.logit(share)[groups])
-            found = start.new_zeros(count).index_add(0, groups, weight * near)
-            share = ((found + _PRIOR_COUNT * assumed) / (total + _PRIOR_COUNT)).clamp(0.005, 0.995)
+            share = (prior.index_add(0, groups, weight * near) / total).clamp(0.005, 0.995)
         return share
 
     is_step = (torch.arange(_PLACES, device=device) < 2 * _RINGS).repeat(items)
-    together = fit(places, items * _PLACES, torch.where(is_step, 0.5, assumed), assumed).repeat_interleave(_DIRECTIONS)
-    shares = fit(kinds, items * _PLACES * _DIRECTIONS, torch.full_like(together, 0.5), together)
+    together = fit(places, torch.where(is_step, 0.5, assumed), assumed).repeat_interleave(_DIRECTIONS)
+    shares = fit(kinds, torch.full_like(together, 0.5), together)
     shares = shares.view(items, _PLACES, _DIRECTIONS)
     # pixels farther from a step are at least as often right as those beside it
     far = [shares[:, :k].amin(1) for k in range(1, _RINGS + 1)]
@@ -640,6 +643,8 @@ def _changes(nearness: Tensor, valid: Tensor, dim: int) -> Tensor:
 
 def _highest(values: Tensor, reach: int) -> Tensor:
     side = 2 * reach + 1
+    if reach == 1:
+        return functional.max_pool2d(values, side, stride=1, padding=reach)
     rows = functional.max_pool2d(values, (1, side), stride=1, padding=(0, reach))
     return functional.max_pool2d(rows, (side, 1), stride=1, padding=(reach, 0))
 

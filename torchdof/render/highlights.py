@@ -12,6 +12,7 @@ of weights as that of the layers. Everything fades in without a jump: the excess
 occluders and the number of highlights.
 """
 
+import functools
 import math
 from collections.abc import Sequence
 
@@ -22,7 +23,7 @@ from torch import Tensor
 from .. import pixels
 from ..optics.blur_table import BlurTable
 from ..optics.placed_kernels import Shares, placed_between, ray_shares
-from ..tensors import is_traced
+from ..tensors import is_traced, recomputed
 from .ops import EAGER, Ops
 from .plan import KERNELS_PER_PX, kernels_for
 from .surfaces import HIDDEN_WEIGHT, Highlights, Surface, continuation_weight
@@ -47,6 +48,7 @@ _FREE_CHANGE_PX = 1.6  # mean change of coc between neighbours, in pixels, above
 _TAPS = 2**21  # rays that are splatted at once; larger, as in the next two: faster, with more memory
 _PAIRS = 2**22  # pairs of a highlight and a bin of occluders that are tested at once
 _PAIR_TAPS = 2**19  # rays of these pairs that are tested at once
+_PAIR_TAPS_GPU = 2**22  # the same on a GPU, which is slow at many small operations
 
 
 def threshold(light: Tensor, valid: Tensor | None = None) -> Tensor:
@@ -237,7 +239,7 @@ def _splatted(
     source, light, coc = rays
     order = torch.argsort(coc.detach().abs())
     item, row, column = pixels.places(source[order], height, width)
-    light, coc = light[:, order], coc[order]
+    light, coc = light.index_select(1, order), coc.index_select(0, order)
     shares: list[Shares] = []
     if table.depends_on_place:
         shares = [s.to(light) for s in ray_shares(table, coc.detach().tolist(), (height, width))]
@@ -293,7 +295,7 @@ class _Occluders:
         shown = [(coc - self.low[:, None, None, None], cover) for coc, cover in obstacles]  # coc in bins
         self.bins = int(torch.stack([place.detach().amax() for place, _ in shown]).amax()) + 2
         self.counts = covered_cells([(place.detach(), cover.detach()) for place, cover in shown], self.bins)
-        self.places, self.covers = (torch.stack([t.flatten() for t in maps]) for maps in zip(*shown, strict=True))
+        self.shown = [torch.stack([t.flatten() for t in maps]) for maps in zip(*shown, strict=True)]
 
     def hidden(self, item: Tensor, row: Tensor, column: Tensor, coc: Tensor, step: Tensor) -> Tensor:
         """Fraction of each ray that is blocked, ``[n, k, k]``.
@@ -323,16 +325,23 @@ class _Occluders:
         count = sum(sign * self.counts[bins, item[:, None], y, x] for y, x, sign in corners)
         pairs = ((count > 0) & (fades.detach() > 0)).nonzero()
         hidden = coc.new_zeros(len(coc), len(step), len(step))
-        for part in pairs.split(max(1, _PAIR_TAPS // len(step) ** 2)):
-            source, bin_of = part.unbind(1)
-            way = scale[source, bin_of][:, None] * step
+
+        def blocked(source: Tensor, bin_of: Tensor) -> Tensor:
+            """Fraction of the rays of highlights ``[P]`` that these bins ``[P]`` block, ``[P, k, k]``."""
+            pair = source * self.bins + bin_of
+            way = scale.flatten().index_select(0, pair)[:, None] * step
             rows, columns = (row[source, None] + way)[:, :, None], (column[source, None] + way)[:, None, :]
             around, down, aside = pixels.corners(item[source, None, None], rows, columns, self.height, self.width)
-            pixel = torch.stack(around)  # [4, pairs, k, k]
-            near = (1.0 - (self.places[:, pixel] - bin_of[:, None, None]).abs()).clamp_min(0.0)
-            covered = (self.covers[:, pixel] * near).sum(0)
+            pixel = torch.stack(around)  # [4, P, k, k]
+            place, cover = (t.index_select(1, pixel.flatten()).unflatten(1, pixel.shape) for t in self.shown)
+            covered = (cover * (1.0 - (place - bin_of[:, None, None]).abs()).clamp_min(0.0)).sum(0)
             above, below = torch.lerp(covered[0::2], covered[1::2], aside)
-            hidden = hidden.index_add(0, source, torch.lerp(above, below, down) * fades[source, bin_of][:, None, None])
+            return torch.lerp(above, below, down) * fades.flatten().index_select(0, pair)[:, None, None]
+
+        most = _PAIR_TAPS if coc.device.type == "cpu" else _PAIR_TAPS_GPU
+        for part in pairs.split(max(1, most // len(step) ** 2)):
+            source, bin_of = part.unbind(1)
+            hidden = hidden.index_add(0, source, recomputed(functools.partial(blocked, source, bin_of)))
         return hidden.clamp(max=1.0)
 
 

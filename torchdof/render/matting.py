@@ -118,7 +118,9 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
     moved = weight * (other_mean + unexplained * weight / (weight**2 + own_weight**2))
     item = pixels.places(edge_pixels, *coc_px.shape[-2:])[0]
     range_of_image = light.amin((2, 3)), light.amax((2, 3))  # clamped: 0 * inf would be NaN
-    least, most = ((extreme[item].t() / brightest).clamp(-_UNBOUNDED, _UNBOUNDED) for extreme in range_of_image)
+    # not extreme[item], whose gradient PyTorch adds up pixel by pixel
+    extremes = (extreme.index_select(0, item).t() / brightest for extreme in range_of_image)
+    least, most = (extreme.clamp(-_UNBOUNDED, _UNBOUNDED) for extreme in extremes)
     moved = torch.minimum(moved.maximum(colour - own_weight * most), colour - own_weight * least)
     moved = torch.minimum(moved.maximum(weight * least), weight * most)
     own = (colour - moved) / own_weight

@@ -239,7 +239,7 @@ class Plan:
             bank = [_masked(k.to(device, dtype), size, s) for k, s in zip(whole, scales, strict=True)]
         else:
             made = _layer_kernels(table, self.coc_px, width, scales, longest_px(size, scales), dtype)
-            bank = [kernel.to(device, dtype) for kernel in made]
+            bank = _moved(made, device, dtype)
         if not table.depends_on_place:
             return [LayerKernel(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
         shares = self.shares(table, scales, (int(size[0]), int(size[1])))
@@ -299,7 +299,7 @@ def joined_layers(
             key = 0 if node == 0.0 else int(math.copysign(scale, node))
             of_plan.setdefault(key, []).append((node, next(kernels)))
     rows: list[list[float | None]] = [[] for _ in plans]
-    blurs = []
+    joined, joined_scales = [], []
     for key in sorted({key for of_plan in layers for key in of_plan}):
         most = max(len(of_plan.get(key, [])) for of_plan in layers)
         for k in range(most):  # aligned at the focus, where kernels are small
@@ -310,15 +310,16 @@ def joined_layers(
                 column.append(own[i] if 0 <= i < len(own) else None)
             for row, each in zip(rows, column, strict=True):
                 row.append(None if each is None else each[0])
-            joined = _stacked([None if each is None else each[1] for each in column])
-            blurs.append(LayerKernel(joined.to(like), max(abs(key), 1)))
+            joined.append(_stacked([None if each is None else each[1] for each in column]))
+            joined_scales.append(max(abs(key), 1))
     nodes = []
     for row in rows:
         places = [math.inf]
         for place in reversed(row):  # an unused layer has the place of the next used one
             places.append(places[-1] if place is None else place)
         nodes.append(tuple(places[:0:-1]))
-    return nodes, blurs
+    moved = _moved(joined, like.device, like.dtype)
+    return nodes, [LayerKernel(kernel, scale) for kernel, scale in zip(moved, joined_scales, strict=True)]
 
 
 def _stacked(kernels: Sequence[Tensor | None]) -> Tensor:
@@ -328,6 +329,15 @@ def _stacked(kernels: Sequence[Tensor | None]) -> Tensor:
     empty = torch.zeros_like(largest)
     padded = [empty if k is None else functional.pad(k, (half - k.shape[-1] // 2,) * 4) for k in kernels]
     return torch.stack(padded)
+
+
+def _moved(kernels: Sequence[Tensor], device: torch.device, dtype: torch.dtype) -> list[Tensor]:
+    """Kernels on a device. A GPU gets all of them in one transfer, as each transfer waits for earlier operations."""
+    if device.type == "cpu":
+        return [kernel.to(device, dtype) for kernel in kernels]
+    moved = torch.cat([kernel.flatten() for kernel in kernels]).to(device, dtype)
+    parts = moved.split([kernel.numel() for kernel in kernels])
+    return [part.view(kernel.shape) for part, kernel in zip(parts, kernels, strict=True)]
 
 
 def longest_px(size: tuple[int, int], scales: Sequence[int]) -> list[int]:
