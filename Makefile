@@ -1,4 +1,4 @@
-# make demo       render a real photograph focused near, middle and far; pictures go to out/
+# make demo       render a photograph focused near, middle and far, and a portrait; pictures go to out/
 # make test       run the tests, two at a time
 # make oldest     run the tests on the oldest supported versions (constraints-oldest.txt, Python 3.10), a download of 3 GB
 # make docs       build the site of the documentation into build/site/, links checked

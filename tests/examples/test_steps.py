@@ -9,7 +9,8 @@ def test_it_prints_the_cost_of_a_step() -> None:
     run = subprocess.run(
         [sys.executable, SCRIPT, "--repeat", "1", "--row", "1"], capture_output=True, text=True, check=True
     )
-    name, numbers = run.stdout[:32].strip(), [word for word in run.stdout[32:].split() if word not in ("ms", "MiB")]
-    batch, picture, step, ratio, _ = numbers
-    assert name == "256 x 256, without occlusion" and batch == "1"
-    assert 0 < float(picture) < float(step) and float(ratio) > 1
+    name, numbers = run.stdout[:38].strip(), [word for word in run.stdout[38:].split() if word not in ("ms", "MiB")]
+    picture, step, ratio, *memory = map(float, numbers)
+    assert name == "1 of 256 x 256, without occlusion"
+    assert 0 < picture < step and ratio > 1
+    assert 0 <= memory[0] <= memory[1] < 1000
