@@ -106,10 +106,8 @@ def floating(value: Any) -> bool:
 
 
 def _after_fork() -> None:
-    """In a forked child, use one thread: OpenMP's threads do not survive a fork, and waiting for them would hang.
-
-    Every parent may have started them: reading a file and the import of the default table already compute.
-    """
+    """In a forked child, use one thread: OpenMP's threads do not survive a fork, and waiting for them would hang."""
+    # whatever the parent has done: importing the default table and reading a file have already started them
     if torch.get_num_threads() > 1:
         torch.set_num_threads(1)
 

@@ -48,14 +48,12 @@ def test_threads_share_a_cache() -> None:
 SMALL = """
 import resource, sys, torch
 from torchdof.optics.kernel_cache import KernelCache
-def resident():
-    return int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize()
-cache, tensors = KernelCache(2**30), int(sys.argv[1])
-cache.get(-1, lambda: tuple(torch.zeros(4) for _ in range(tensors)))
-before = resident()
-for i in range(20_000):
-    cache.get(("lens", i, float(i)), lambda: tuple(torch.zeros(4) for _ in range(tensors)))
-print((resident() - before) / cache.bytes)
+cache, sizes = KernelCache(2**30), []
+for i in range(20_001):
+    cache.get(("lens", i, float(i)), lambda: tuple(torch.zeros(4) for _ in range(int(sys.argv[1]))))
+    if i % 20_000 == 0:
+        sizes.append(resource.getpagesize() * int(open("/proc/self/statm").read().split()[1]))
+print((sizes[1] - sizes[0]) / cache.bytes)
 """
 
 
