@@ -1,8 +1,6 @@
 """Depth of field as a module and as functions: they check their arguments and call the pipeline."""
 
 import contextlib
-import os
-import threading
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -381,23 +379,8 @@ def blur(
 
 def _engine(light: Tensor) -> contextlib.AbstractContextManager[Any]:
     """Context of the pipeline: autocast is off, because it would convolve in half precision."""
-    if not is_traced():
-        _has_rendered.set()
     device = light.device.type
     return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else contextlib.nullcontext()
-
-
-_has_rendered = threading.Event()
-
-
-def _after_fork() -> None:
-    """In a forked child, use one thread: OpenMP's threads do not survive a fork, and waiting for them would hang."""
-    if _has_rendered.is_set() and torch.get_num_threads() > 1:
-        torch.set_num_threads(1)
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)
 
 
 def _check_plan(plan: Plan | None) -> None:

@@ -1,5 +1,6 @@
-"""Properties of a tensor: traced, differentiated, in memory."""
+"""Properties of tensors, functions that keep no intermediate ones, and PyTorch's threads after a fork."""
 
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -137,3 +138,14 @@ def has_storage(values: Tensor) -> bool:
 def floating(value: Any) -> bool:
     """Whether a value is a tensor of floating-point numbers of at least 16 bits."""
     return isinstance(value, Tensor) and value.dtype in _FLOATS
+
+
+def _after_fork() -> None:
+    """In a forked child, use one thread: OpenMP's threads do not survive a fork, and waiting for them would hang."""
+    # whatever the parent has done: importing the default table and reading a file have already started them
+    if torch.get_num_threads() > 1:
+        torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)

@@ -13,7 +13,9 @@ from ..tensors import is_fake, is_traced
 
 __all__ = ["KernelCache", "kept"]
 
-_ENTRY_BYTES = 512  # bytes counted for a key and its dictionary entry, besides the tensors
+_ENTRY_BYTES = 384  # bytes counted for a key and its dictionary entry, besides the tensors
+
+_TENSOR_BYTES = 640  # bytes counted for a tensor besides its values: its object, its storage, their alignment
 
 _CONSTANT_BYTES = 16 * 2**20  # largest size in bytes of the results of all functions decorated with kept
 
@@ -80,7 +82,7 @@ def _unwrapped(result: Any) -> Any:
 
 def _bytes(result: Tensor | tuple[Tensor, ...] | float) -> int:
     tensors = result if isinstance(result, tuple) else (result,)
-    return sum(t.untyped_storage().nbytes() for t in tensors if isinstance(t, Tensor))
+    return sum(_TENSOR_BYTES + t.untyped_storage().nbytes() for t in tensors if isinstance(t, Tensor))
 
 
 _CONSTANTS = KernelCache(_CONSTANT_BYTES)
