@@ -323,26 +323,26 @@ def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
     flattest = -_highest(-_mean(slope, 2), 8)
     is_ramp = (slope > 0.1 * step) & (slope > _SHALLOW * span) & (span > step) & (flattest < 0.3 * slope) & valid
 
-    # the surfaces at both ends of a ramp: extremes spread along it pixel by pixel; both in one tensor, [B, 2, H, W]
-    both = torch.cat([high, low], 1)
-    along = both
+    # the surfaces at both ends of a ramp: extremes spread along it pixel by pixel
+    ends = torch.cat([high, low], 1)  # the nearer surface, and the farther one with the opposite sign
+    spread = ends
     for _ in range(_RAMP_REACH):
-        along = torch.where(is_ramp, _highest(along, 1), along)
-    is_ramp = is_ramp & (along.sum(1, keepdim=True) > step)
-    along = torch.where(is_ramp, along, both)
+        spread = torch.where(is_ramp, _highest(spread, 1), spread)
+    is_ramp = is_ramp & (spread.sum(1, keepdim=True) > step)
+    ends = torch.where(is_ramp, spread, ends)
 
     # the surfaces on both sides of a step; the innermost ring that reaches it counts
-    rings = [torch.cat([along, jump], 1)]
+    rings = [torch.cat([ends, jump], 1)]
     for _ in range(_RINGS):
         rings.append(_highest(rings[-1], 1))
     least = torch.maximum(0.6 * rings[-1][:, :2].sum(1, keepdim=True), step)
-    ring, beside = torch.full_like(nearness, _RINGS + 1, dtype=torch.long), rings[-1][:, :2]
+    ring, sides = torch.full_like(nearness, _RINGS + 1, dtype=torch.long), rings[-1][:, :2]
     for k in range(_RINGS, 0, -1):
-        ends, largest = rings[k][:, :2], rings[k][:, 2:]
-        gap = ends.sum(1, keepdim=True)
-        is_step = (gap > least) & (largest > _ABRUPT * gap)
-        ring, beside = torch.where(is_step, k, ring), torch.where(is_step, ends, beside)
-    near, far = torch.where(is_ramp, along, beside).split(1, 1)
+        of_ring, largest_jump = rings[k].split([2, 1], 1)
+        gap = of_ring.sum(1, keepdim=True)
+        is_step = (gap > least) & (largest_jump > _ABRUPT * gap)
+        ring, sides = torch.where(is_step, k, ring), torch.where(is_step, of_ring, sides)
+    near, far = torch.where(is_ramp, ends, sides).split(1, 1)
     far = -far
     is_edge = (is_ramp | (ring <= _RINGS)) & (near - far > step) & valid
 
