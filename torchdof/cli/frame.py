@@ -25,9 +25,8 @@ from ..optics.camera import Camera
 from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect, stretch
-from .options import make_folder_of
+from .options import Scene, make_folder_of
 from .output import Bar, Notices, print_result
-from .scene import Scene
 
 if TYPE_CHECKING:
     from .render import Render

@@ -14,10 +14,9 @@ import click
 
 from ..io.sequence import FramePattern, parse_frames
 from .command import argument, numbers, option, options_of
-from .options import Accuracy, Blur, check_files, json_option, make_folder_of
+from .options import Accuracy, Blur, Scene, check_files, json_option, make_folder_of
 from .output import Bar, json_line
 from .resume import Record
-from .scene import Scene
 
 if TYPE_CHECKING:
     from torch import Tensor
