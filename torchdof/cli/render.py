@@ -257,16 +257,14 @@ def _steadied(read: "Callable[[int], Frame]", numbers: Sequence[int]) -> "Callab
     """A version of ``read`` with steadied depth; ``numbers`` are all frames of the sequence, in order."""
     from ..depth.steady import SteadyFrames
 
-    latest: list[Frame] = []
-
     def pixels_and_depth(place: int) -> "tuple[Tensor, Tensor]":
-        latest[:] = [read(numbers[place])]
-        return latest[0].picture.pixels, latest[0].values
+        frame = read(numbers[place])
+        return frame.picture.pixels, frame.values
 
     frames, index_of = SteadyFrames(pixels_and_depth), {n: place for place, n in enumerate(numbers)}
 
     def steadied(n: int) -> "Frame":
-        values = frames.depth(index_of[n])
-        return dataclasses.replace(latest[0], values=values)
+        values = frames.depth(index_of[n])  # reads frame n last, so that ``read`` still has it
+        return dataclasses.replace(read(n), values=values)
 
     return steadied
