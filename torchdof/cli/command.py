@@ -1,7 +1,7 @@
 """Builds Click commands from dataclasses, whose fields are the arguments and options of the command.
 
 A field that is itself a dataclass is a group of options, which several commands can share; its docstring is the heading
-in ``--help``. This module does not import PyTorch, so that help and errors about arguments appear at once.
+in ``--help``.
 """
 
 import contextlib

@@ -1,7 +1,4 @@
-"""Options for focus and lens: their meaning, their defaults, contradictions between them, and the camera they make.
-
-PyTorch is imported when an option is first used, so that help and errors about options appear at once.
-"""
+"""Options for focus and lens: their meaning, their defaults, contradictions between them, and the camera they make."""
 
 import math
 import re

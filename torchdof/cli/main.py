@@ -15,10 +15,8 @@ from .command import command_of
 COMMANDS = ("render", "fit", "export", "bench", "inspect", "tables")
 """Names of the commands; each is a module with a class of the same name, capitalised."""
 
-_EXTRAS = {
-    **{"scipy": "fit", "threadpoolctl": "fit", "matplotlib": "plot"},
-    **{"onnx": "export", "onnxscript": "export", "onnxruntime": "export"},
-}
+_EXTRAS = {"scipy": "fit", "threadpoolctl": "fit", "matplotlib": "plot"}
+_EXTRAS |= dict.fromkeys(("onnx", "onnxscript", "onnxruntime"), "export")
 _MEMORY_ADVICE = "there is too little memory for this image; a smaller one, or a coarser --tolerance, takes less"
 # Parts of the messages of PyTorch's RuntimeError when memory runs out on the CPU; they come from several libraries.
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "bad_alloc", "size calculation overflowed", "new thread")

@@ -1,7 +1,4 @@
-"""Options that several commands share: depth map, scene, aperture, blur, accuracy; and checks of the files they name.
-
-PyTorch is imported when an option is first used, so that help and errors about options appear at once.
-"""
+"""Options that several commands share: depth map, scene, aperture, blur, accuracy; checks of the files they name."""
 
 import math
 import os

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import click
 
@@ -164,7 +164,9 @@ class Render:
         whole = list(numbers)  # frames of the sequence, each of which may depend on those before it
         if images and files.steady:
             whole = [n for n in images.frames() if depths is None or depths.name(n).is_file()]
-        record, existing = Record(self.out, self._options()), [out for out in outputs.values() if out.is_file()]
+        options = {name: value for name, value in options_of(self).items() if name not in _NOT_OF_FRAMES}
+        options |= {"files": self.blur.files(), "torchdof": importlib.metadata.version("torchdof")}
+        record, existing = Record(self.out, options), [out for out in outputs.values() if out.is_file()]
         reason, done = record.difference(), set[Path]()
         if files.resume and not reason:
             tables = self.blur.files()
@@ -194,11 +196,6 @@ class Render:
 
         frames = _steadied(read, whole) if images and files.steady else read
         self._render_each(renderer, todo, frames, record if is_recorded else None)
-
-    def _options(self) -> dict[str, Any]:
-        """The options that change frames."""
-        options = {name: value for name, value in options_of(self).items() if name not in _NOT_OF_FRAMES}
-        return options | {"files": self.blur.files(), "torchdof": importlib.metadata.version("torchdof")}
 
     def _numbers(self, images: FramePattern, depths: FramePattern | None) -> Sequence[int]:
         """Numbers of the requested frames of a sequence; refuses frames without an image or a depth."""
