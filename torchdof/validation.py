@@ -39,13 +39,9 @@ def show(value: Any) -> str:
 def number(
     name: str, value: Any, low: float = -math.inf, high: float = math.inf, unit: str = "", infinite: bool = False
 ) -> float:
-    """A number in the open interval ``(low, high)``, neither a bool nor NaN; ``infinite`` allows infinity.
+    """A number in the open interval ``(low, high)``, neither a bool nor NaN, as a float; ``infinite`` allows infinity.
 
     ``name`` is that of the argument in the message, ``unit`` the unit there, such as ``"metres"``.
-
-    Example:
-        >>> number("f_number", 2, low=0)
-        2.0
     """
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if is_number and (low < value < high or (infinite and abs(value) == math.inf and low <= value <= high)):
@@ -66,23 +62,14 @@ def whole(name: str, value: Any, low: int, high: int) -> int:
 
 
 def choice(name: str, value: Any, choices: Sequence[str]) -> None:
-    """Refuse a value that is not one of two or more words.
-
-    Example:
-        >>> choice("method", "layered", ("layered", "fold"))
-    """
+    """Refuse a value that is not one of two or more words."""
     if not isinstance(value, str) or value not in choices:
         *others, last = map(repr, choices)
         raise ValueError(f"{name} must be {', '.join(others)} or {last}, got {show(value)}")
 
 
 def tolerance_of(value: Any) -> float:
-    """A tolerance, a name or a number in [0, 1), as a number.
-
-    Example:
-        >>> tolerance_of("preview") == 4 / 255
-        True
-    """
+    """A tolerance, one of :data:`NAMED_TOLERANCES` or a number in [0, 1), as a number."""
     if isinstance(value, str) and value in NAMED_TOLERANCES:
         return NAMED_TOLERANCES[value]
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1:
@@ -103,11 +90,7 @@ def pixels_wide(width: Any) -> None:
 
 
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
-    """As :func:`torch.broadcast_shapes`, whose first call imports sympy and takes half a second.
-
-    Raises:
-        RuntimeError: If the shapes do not fit each other.
-    """
+    """As :func:`torch.broadcast_shapes`, whose first call imports sympy and takes half a second."""
     return torch.broadcast_tensors(*(torch.zeros((), device="cpu").expand(tuple(shape)) for shape in shapes))[0].shape
 
 
@@ -302,10 +285,8 @@ def stack(rgba: Tensor, depth_m: Tensor, values: bool) -> Tensor:
     Returns:
         The depths as ``[B or 1, N, 1, H or 1, W or 1]``.
     """
-    for name, value in (("rgba", rgba), ("depth_m", depth_m)):
-        if not floating(value):
-            got = f"a {value.dtype} tensor" if isinstance(value, Tensor) else type(value).__name__
-            raise ValueError(f"{name} must be a floating-point tensor, got {got}")
+    real_tensor("rgba", rgba, "[B, N, C + 1, H, W]")
+    real_tensor("depth_m", depth_m, "in metres")
     if rgba.ndim != 5 or rgba.shape[2] < 2 or 0 in rgba.shape:
         raise ValueError(f"rgba must be [B, N, C + 1, H, W], premultiplied, got {list(rgba.shape)}")
     batch, count, _, height, width = rgba.shape
@@ -318,16 +299,11 @@ def stack(rgba: Tensor, depth_m: Tensor, values: bool) -> Tensor:
         )
     if tuple(depth.shape[3:]) not in ((1, 1), (height, width)):
         raise ValueError(f"depth_m must have the layers' size {height} x {width}, got {list(depth_m.shape)}")
-    if is_traced():
-        return depth
-    real_tensor("rgba", rgba, "[B, N, C + 1, H, W]")
-    real_tensor("depth_m", depth_m, "in metres")
-    if values:
-        cover = rgba[:, :, -1]
-        bad = int((~((cover >= 0) & (cover <= 1))).sum())
+    if values and not is_traced():
+        coverage = rgba[:, :, -1]
+        bad = int((~((coverage >= 0) & (coverage <= 1))).sum())
         if bad:
-            raise ValueError(
-                f"the last channel of rgba is coverage, in [0, 1]; {bad} of {cover.numel()} values are not"
-            )
+            message = f"the last channel of rgba is coverage, in [0, 1]; {bad} of {coverage.numel()} values are not"
+            raise ValueError(message)
         _check_finite("rgba", rgba)
     return depth

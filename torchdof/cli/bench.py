@@ -9,9 +9,8 @@ from pathlib import Path
 import click
 
 from .command import argument, option
-from .options import Blur, check_files, json_option
+from .options import Blur, Scene, check_files, json_option
 from .output import Notices, json_line
-from .scene import Scene
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

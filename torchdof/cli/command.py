@@ -1,7 +1,7 @@
 """Builds Click commands from dataclasses, whose fields are the arguments and options of the command.
 
 A field that is itself a dataclass is a group of options, which several commands can share; its docstring is the heading
-in ``--help``. This module does not import PyTorch, so that help and errors about arguments appear at once.
+in ``--help``.
 """
 
 import contextlib
@@ -164,6 +164,6 @@ def _parameter(field: Any, hint: Any) -> click.Parameter:
 
 def _instance(kind: type[Any], values: dict[str, Any]) -> Any:
     """Creates an object of ``kind`` with its groups; ``values`` has the values of all their fields by name."""
-    hints: dict[str, Any] = {field.name: typing.get_type_hints(kind)[field.name] for field in dataclasses.fields(kind)}
+    hints = typing.get_type_hints(kind)
     groups: dict[str, Any] = {name: hint for name, hint in hints.items() if dataclasses.is_dataclass(hint)}
     return kind(**{name: _instance(groups[name], values) if name in groups else values[name] for name in hints})

@@ -144,7 +144,6 @@ class FitPrinter:
     """Prints results and draws pictures; with ``quiet`` it prints JSON only."""
 
     def __init__(self, quiet: bool) -> None:
-        self._quiet = quiet
         self._console = Console(soft_wrap=True, quiet=quiet, markup=False, highlight=False)
 
     def say(self, text: str, style: str = "") -> None:
@@ -153,7 +152,7 @@ class FitPrinter:
 
     def facts(self, facts: dict[str, Any]) -> None:
         """Prints one line of JSON, if quiet."""
-        if self._quiet:
+        if self._console.quiet:
             print(json_line(facts), flush=True)
 
     def photographs(self, photographs: Photographs) -> None:

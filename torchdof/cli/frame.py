@@ -25,9 +25,8 @@ from ..optics.camera import Camera
 from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect, stretch
-from .options import make_folder_of
+from .options import Scene, make_folder_of
 from .output import Bar, Notices, print_result
-from .scene import Scene
 
 if TYPE_CHECKING:
     from .render import Render
@@ -137,12 +136,10 @@ class Rendered:
     """A rendered picture, and what its report needs."""
 
     out: Path  # file to write
-    frame: Frame
+    frame: Frame  # with all remarks, and the time of reading and rendering
     picture: Picture
     coc_px: Tensor
     camera: Camera | None
-    remarks: list[str]
-    seconds: float  # time of reading and rendering
 
 
 class Renderer:
@@ -177,9 +174,9 @@ class Renderer:
                 if bar is not None and bar.is_seen and coc_px.numel() > _LARGE_PX:
                     bar.update(f"rendering {out.name}, about {_seconds(blur, pixels, coc_px):.0f} s")
                 pixels = blur(pixels, coc_px, attention=command.attention)
-        picture = dataclasses.replace(picture, pixels=pixels)
         seconds = frame.seconds + time.perf_counter() - start
-        return Rendered(out, frame, picture, coc_px, camera, remarks, seconds)
+        frame = dataclasses.replace(frame, remarks=remarks, seconds=seconds)
+        return Rendered(out, frame, dataclasses.replace(picture, pixels=pixels), coc_px, camera)
 
     def write(self, rendered: Rendered) -> None:
         """Writes the picture, whole or not at all, and its sheet, and prints notes and one line."""
@@ -196,11 +193,11 @@ class Renderer:
             self.notices.note("little blur", f"{out}: {frame.scene.lens.blur_advice(largest_px, self.is_still)}")
         words, facts = self._summary(rendered.camera, largest_px, frame)
         height, width = rendered.picture.pixels.shape[-2:]
-        seconds = rendered.seconds + time.perf_counter() - start
+        seconds = frame.seconds + time.perf_counter() - start
         words += [] if files.sheet is None else [f"sheet {files.sheet}"]
         words += [f"{width} x {height}", f"{seconds:.2f} s on {self.device}"]
-        remarks = f" [{', '.join(rendered.remarks)}]" if rendered.remarks else ""
-        facts = {"out": str(out), **facts, "assumed": rendered.remarks, "width": width, "height": height}
+        remarks = f" [{', '.join(frame.remarks)}]" if frame.remarks else ""
+        facts = {"out": str(out), **facts, "assumed": frame.remarks, "width": width, "height": height}
         print_result(self.command.as_json, facts | {"seconds": seconds}, f"{out}: {'; '.join(words)}{remarks}")
 
     def _summary(self, camera: Camera | None, largest_px: float, frame: Frame) -> tuple[list[str], dict[str, Any]]:

@@ -4,9 +4,8 @@ import dataclasses
 from pathlib import Path
 
 from .command import argument, option
-from .options import check_files, json_option, make_folder_of
+from .options import Scene, check_files, json_option, make_folder_of
 from .output import Notices, print_result
-from .scene import Scene
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

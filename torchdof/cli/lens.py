@@ -1,7 +1,4 @@
-"""Options for focus and lens: their meaning, their defaults, contradictions between them, and the camera they make.
-
-PyTorch is imported when an option is first used, so that help and errors about options appear at once.
-"""
+"""Options for focus and lens: their meaning, their defaults, contradictions between them, and the camera they make."""
 
 import math
 import re
@@ -147,12 +144,12 @@ class Lens(Sensor):
 
     def view_deg(self, metadata: Mapping[str, Any], width: int, height: int) -> float:
         """Horizontal field of view in degrees, as stated, or from focal length and sensor of options or file."""
-        numbers = camera_settings(metadata, width, height) | self._stated(width, height)
         if self.fov_deg is not None:
             return self.fov_deg
-        if not {"focal_length_mm", "sensor_width_mm"} <= set(numbers):
+        lens = camera_settings(metadata, width, height) | self._stated(width, height)
+        if not {"focal_length_mm", "sensor_width_mm"} <= set(lens):
             raise ValueError("--depth-kind distance needs --fov-deg, or --focal-length-mm and --sensor-width-mm")
-        return 2 * math.degrees(math.atan2(numbers["sensor_width_mm"], 2 * numbers["focal_length_mm"]))
+        return 2 * math.degrees(math.atan2(lens["sensor_width_mm"], 2 * lens["focal_length_mm"]))
 
     def _stated(self, width: int, height: int) -> dict[str, float]:
         """Numbers of the lens that the options state, for an image of a size in pixels."""

@@ -1,12 +1,10 @@
 """The command line; it imports a command when that is called, and reports wrong input in one sentence."""
 
 import contextlib
-import errno
 import importlib
 import importlib.metadata
 import os
 import sys
-from collections.abc import Iterator
 from typing import Any
 
 import click
@@ -17,43 +15,11 @@ from .command import command_of
 COMMANDS = ("render", "fit", "export", "bench", "inspect", "tables")
 """Names of the commands; each is a module with a class of the same name, capitalised."""
 
-_EXTRAS = {
-    **{"scipy": "fit", "threadpoolctl": "fit", "matplotlib": "plot"},
-    **{"onnx": "export", "onnxscript": "export", "onnxruntime": "export"},
-}
+_EXTRAS = {"scipy": "fit", "threadpoolctl": "fit", "matplotlib": "plot"}
+_EXTRAS |= dict.fromkeys(("onnx", "onnxscript", "onnxruntime"), "export")
 _MEMORY_ADVICE = "there is too little memory for this image; a smaller one, or a coarser --tolerance, takes less"
 # Parts of the messages of PyTorch's RuntimeError when memory runs out on the CPU; they come from several libraries.
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "bad_alloc", "size calculation overflowed", "new thread")
-
-
-@contextlib.contextmanager
-def _errors_in_one_sentence() -> Iterator[None]:
-    """Prints errors of input, files, memory and missing packages, and exits with code 2; other errors pass."""
-    try:
-        yield
-        return
-    except ModuleNotFoundError as error:
-        package = (error.name or "").partition(".")[0]
-        if package not in _EXTRAS:
-            raise
-        message = f"this command needs {package}; install it with: pip install 'torchdof[{_EXTRAS[package]}]'"
-    except (OSError, ValueError) as error:
-        if isinstance(error, OSError) and error.errno == errno.EPIPE:
-            raise
-        message = str(error) or type(error).__name__
-    except MemoryError:  # numpy's own message is about arrays
-        message = _MEMORY_ADVICE
-    except RuntimeError as error:
-        torch = sys.modules.get("torch")  # already imported if a device ran out of memory
-        if torch is not None and isinstance(error, torch.OutOfMemoryError):
-            message = "the device has too little memory for this image; try --device cpu"
-        elif any(words in str(error) for words in _NO_MEMORY):
-            message = _MEMORY_ADVICE
-        else:
-            raise
-    with contextlib.suppress(OSError):  # the exit code is the same if standard error is closed
-        click.echo(f"error: {message}", err=True)
-    raise SystemExit(2)
 
 
 class _Commands(click.Group):
@@ -69,8 +35,31 @@ class _Commands(click.Group):
         return command_of(cmd_name, getattr(module, cmd_name.capitalize()))
 
     def invoke(self, ctx: click.Context) -> object:
-        with _errors_in_one_sentence():
+        """Prints errors of input, files, memory and missing packages, and exits with code 2; other errors pass."""
+        try:
             return super().invoke(ctx)
+        except ModuleNotFoundError as error:
+            package = (error.name or "").partition(".")[0]
+            if package not in _EXTRAS:
+                raise
+            message = f"this command needs {package}; install it with: pip install 'torchdof[{_EXTRAS[package]}]'"
+        except BrokenPipeError:
+            raise
+        except (OSError, ValueError) as error:
+            message = str(error) or type(error).__name__
+        except MemoryError:  # numpy's own message is about arrays
+            message = _MEMORY_ADVICE
+        except RuntimeError as error:
+            torch = sys.modules.get("torch")  # already imported if a device ran out of memory
+            if torch is not None and isinstance(error, torch.OutOfMemoryError):
+                message = "the device has too little memory for this image; try --device cpu"
+            elif any(words in str(error) for words in _NO_MEMORY):
+                message = _MEMORY_ADVICE
+            else:
+                raise
+        with contextlib.suppress(OSError):  # the exit code is the same if standard error is closed
+            click.echo(f"error: {message}", err=True)
+        raise SystemExit(2)
 
 
 def _print_version(ctx: click.Context, _: click.Parameter, is_given: bool) -> None:
@@ -90,19 +79,15 @@ def app() -> None:
     """Depth of field from an image and its depth: the photograph that a real lens would have taken."""
 
 
-def _open_streams() -> None:
-    """Opens closed standard streams on the null device; otherwise a file could get their number, and their messages."""
-    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, mode))  # gets the lowest free number, the stream's own
-
-
 def main() -> None:
     """Entry point of ``torchdof`` and of ``python -m torchdof``."""
     # The OpenMP threads of PyTorch spin while they wait, which slows other processes. The OpenMP libraries of GNU and
     # LLVM read these variables when PyTorch is loaded. A variable that the user has set turns this off.
     if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME"} & set(os.environ):
         os.environ |= {"OMP_WAIT_POLICY": "passive", "KMP_BLOCKTIME": "0"}
-    _open_streams()
+    # A closed standard stream is opened on the null device: a file could get its number otherwise, and its messages.
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))  # gets the lowest free number, the stream's own
     with exit_on_signals():
         app(prog_name="torchdof")

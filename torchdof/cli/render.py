@@ -8,16 +8,15 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import click
 
 from ..io.sequence import FramePattern, parse_frames
 from .command import argument, numbers, option, options_of
-from .options import Accuracy, Blur, check_files, json_option, make_folder_of
+from .options import Accuracy, Blur, Scene, check_files, json_option, make_folder_of
 from .output import Bar, json_line
 from .resume import Record
-from .scene import Scene
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -165,7 +164,9 @@ class Render:
         whole = list(numbers)  # frames of the sequence, each of which may depend on those before it
         if images and files.steady:
             whole = [n for n in images.frames() if depths is None or depths.name(n).is_file()]
-        record, existing = Record(self.out, self._options()), [out for out in outputs.values() if out.is_file()]
+        options = {name: value for name, value in options_of(self).items() if name not in _NOT_OF_FRAMES}
+        options |= {"files": self.blur.files(), "torchdof": importlib.metadata.version("torchdof")}
+        record, existing = Record(self.out, options), [out for out in outputs.values() if out.is_file()]
         reason, done = record.difference(), set[Path]()
         if files.resume and not reason:
             tables = self.blur.files()
@@ -195,11 +196,6 @@ class Render:
 
         frames = _steadied(read, whole) if images and files.steady else read
         self._render_each(renderer, todo, frames, record if is_recorded else None)
-
-    def _options(self) -> dict[str, Any]:
-        """The options that change frames."""
-        options = {name: value for name, value in options_of(self).items() if name not in _NOT_OF_FRAMES}
-        return options | {"files": self.blur.files(), "torchdof": importlib.metadata.version("torchdof")}
 
     def _numbers(self, images: FramePattern, depths: FramePattern | None) -> Sequence[int]:
         """Numbers of the requested frames of a sequence; refuses frames without an image or a depth."""
@@ -258,16 +254,14 @@ def _steadied(read: "Callable[[int], Frame]", numbers: Sequence[int]) -> "Callab
     """A version of ``read`` with steadied depth; ``numbers`` are all frames of the sequence, in order."""
     from ..depth.steady import SteadyFrames
 
-    latest: list[Frame] = []
-
     def pixels_and_depth(place: int) -> "tuple[Tensor, Tensor]":
-        latest[:] = [read(numbers[place])]
-        return latest[0].picture.pixels, latest[0].values
+        frame = read(numbers[place])
+        return frame.picture.pixels, frame.values
 
     frames, index_of = SteadyFrames(pixels_and_depth), {n: place for place, n in enumerate(numbers)}
 
     def steadied(n: int) -> "Frame":
-        values = frames.depth(index_of[n])
-        return dataclasses.replace(latest[0], values=values)
+        values = frames.depth(index_of[n])  # reads frame n last, so that ``read`` still has it
+        return dataclasses.replace(read(n), values=values)
 
     return steadied

@@ -11,13 +11,9 @@ from ..io.atomic import write_text
 
 
 class Record:
-    """The options of the last run, in the file ``OUT.json`` beside the frames.
+    """The options of the last run, in the file ``OUT.json`` beside the frames; paths in it are absolute.
 
     The file is written again only if the options differ. So a frame that is older than the file has other options.
-
-    Args:
-        out: Path or pattern of the frames.
-        options: Option -> value of this run. Paths are recorded as absolute ones.
     """
 
     def __init__(self, out: Path, options: Mapping[str, Any]) -> None:
@@ -38,10 +34,8 @@ class Record:
     ) -> set[Path]:
         """The existing frames that are not older than the record and their sources.
 
-        Args:
-            frames: Number -> frame.
-            sources: Number -> files from which the frame is rendered, in the order of the sequence.
-            is_steady: Whether a frame also depends on those before it.
+        ``sources`` are the files from which each frame is rendered, in the order of the sequence; with ``is_steady`` a
+        frame also depends on those before it.
         """
         times: Iterable[int] = (max(map(_changed_ns, filter(None, paths))) for paths in sources.values())
         newest = dict(zip(sources, itertools.accumulate(times, max) if is_steady else times, strict=True))

@@ -49,13 +49,13 @@ def pairs_in(images: str | os.PathLike[str], depths: str | os.PathLike[str] | No
         raise FileNotFoundError(f"{images}: no images here ({' '.join(_IMAGES)})")
     pairs = []
     for stem, (image, *others) in photographs.items():
-        depths_found = depth_files.get(stem, [])
+        maps = depth_files.get(stem, [])
         if others:
             raise ValueError(f"{image}: there is {others[0].name} of the same name; keep one of them")
-        if depths is not None and len(depths_found) != 1:
-            names = " and ".join(path.name for path in depths_found) or "none"
+        if depths is not None and len(maps) != 1:
+            names = " and ".join(path.name for path in maps) or "none"
             raise ValueError(f"{image}: needs one depth map {stem}.* in {depths}, found {names}")
-        pairs.append(Pair(str(image), str(depths_found[0]) if depths_found else None))
+        pairs.append(Pair(str(image), str(maps[0]) if maps else None))
     return pairs
 
 
@@ -153,7 +153,12 @@ def make_dataset(
         rate = count / seconds
         say(f"{count} samples in {seconds:.1f} s: {rate:.2f} images/s, {rate / workers:.2f} a worker")
     summary = summary_of(out)
-    _describe(out, summary, settings)
+    facts: dict[str, Any] = {"samples": summary.samples, "shards": summary.shards}
+    facts |= {"inputs left out": f"{len(summary.broken)}, listed in broken.txt"}
+    facts |= {"time": f"{summary.seconds / max(1, summary.samples):.3f} s of one core a sample", **settings}
+    lines = [f"| {name} | {fact if isinstance(fact, str) else json.dumps(fact)} |" for name, fact in facts.items()]
+    write_text(out / "README.md", "\n".join([_CARD, "| what | how much |", "| --- | --- |", *lines, ""]))
+    write_text(out / "broken.txt", "".join(f"{image}\t{problem}\n" for image, problem in summary.broken))
     for image, problem in summary.broken:
         say(f"left out: {problem}" if problem.startswith(image) else f"left out: {image}: {problem}")
     return summary
@@ -182,13 +187,3 @@ def _check_settings(path: Path, settings: dict[str, Any]) -> None:
             f"{path.parent}: was begun with other settings ({', '.join(differing)}); go on with those in {path.name}, "
             "or use another folder"
         )
-
-
-def _describe(out: Path, summary: Summary, settings: dict[str, Any]) -> None:
-    """Writes the data set's card and the list of broken inputs."""
-    rows: dict[str, Any] = {"samples": summary.samples, "shards": summary.shards}
-    rows |= {"inputs left out": f"{len(summary.broken)}, listed in broken.txt"}
-    rows |= {"time": f"{summary.seconds / max(1, summary.samples):.3f} s of one core a sample", **settings}
-    lines = [f"| {name} | {fact if isinstance(fact, str) else json.dumps(fact)} |" for name, fact in rows.items()]
-    write_text(out / "README.md", "\n".join([_CARD, "| what | how much |", "| --- | --- |", *lines, ""]))
-    write_text(out / "broken.txt", "".join(f"{image}\t{problem}\n" for image, problem in summary.broken))

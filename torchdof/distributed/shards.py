@@ -4,7 +4,6 @@ A shard's file name is its number, and its contents depend only on its row, its 
 was interrupted can therefore continue with the missing shards, and gives the same files as an uninterrupted one.
 """
 
-import contextlib
 import dataclasses
 import hashlib
 import importlib.metadata
@@ -14,7 +13,7 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -213,7 +212,8 @@ class RenderShards:
     def _source(self, samples: str) -> str:
         """Digest of all that determines a shard: settings, samples, and size and time of their files."""
         files = {sample[name] for sample in json.loads(str(samples)) for name in ("image", "depth") if sample[name]}
-        facts = [self.settings(), str(samples), [_size_and_time(file) for file in sorted(files)]]
+        stats = [os.stat(file) if os.path.exists(file) else None for file in sorted(files)]
+        facts = [self.settings(), str(samples), [stat and (stat.st_size, stat.st_mtime_ns) for stat in stats]]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
     def _make(self, path: Path, source: str, samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -253,6 +253,12 @@ class RenderShards:
             f"sharp{self.picture}": lambda path: write_image(path, Picture(source.pixels, source.channels)),
             "depth.npy": lambda path: np.save(path, metres[0, 0].numpy()),
         }
+        contents = {}
+        with tempfile.TemporaryDirectory() as folder:
+            for path, write in ((Path(folder) / name, write) for name, write in files.items()):
+                if path.stem in self.keep:
+                    write(path)
+                    contents[path.name] = path.read_bytes()
         table, (height, width) = options.table, blurred.shape[-2:]
         parameters = {
             **_json_values(vars(camera) | options.arguments()),
@@ -262,7 +268,6 @@ class RenderShards:
             "largest_coc_px": float(camera.coc_px(metres, width).abs().nan_to_num().max()),
             **{"seed": self.seed, "torchdof": importlib.metadata.version("torchdof")},
         }
-        contents = {name: _bytes(name, write) for name, write in files.items() if name.partition(".")[0] in self.keep}
         return {"key": key, **contents, "json": parameters}
 
 
@@ -276,14 +281,6 @@ def _read_relative(
     return resolve_holes(metres, path, fill)[0]
 
 
-def _size_and_time(file: str) -> tuple[int, int] | None:
-    """Size in bytes and time of the last change in ns; None if the file is missing."""
-    with contextlib.suppress(OSError):
-        facts = os.stat(file)
-        return facts.st_size, facts.st_mtime_ns
-    return None
-
-
 def _text(name: str) -> str:
     """A file name that UTF-8 can encode: other bytes become escapes."""
     return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
@@ -293,13 +290,6 @@ def _json_values(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Numbers and strings of a camera or of options, as JSON values."""
     numbers = {name: float(value) if isinstance(value, Tensor) else value for name, value in arguments.items()}
     return {name: value for name, value in numbers.items() if name != "table"}
-
-
-def _bytes(name: str, write: Callable[[Path], object]) -> bytes:
-    """The bytes that ``write`` writes to a file with this name."""
-    with tempfile.TemporaryDirectory() as folder:
-        write(Path(folder) / name)
-        return (Path(folder) / name).read_bytes()
 
 
 def _write_tar(path: Path, records: Sequence[dict[str, Any]]) -> None:
