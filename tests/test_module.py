@@ -1,3 +1,4 @@
+import dataclasses
 import io
 import math
 from collections.abc import Callable
@@ -245,6 +246,17 @@ def test_the_module_compiles_without_graph_breaks_and_equals_eager(backend: str,
     still = dof(image, depth, plan=Plan.all(COMPILED["max_coc_px"], COMPILED["tolerance"]))
     assert_close(fast, still, rtol=1e-5, atol=1e-6)
     assert rms(fast, dof(image, depth)) <= 2 * COMPILED["tolerance"]
+
+
+@TRACED
+def test_a_plan_can_be_compiled_and_renders_without_rays() -> None:
+    torch.compiler.reset()
+    camera, image, depth = compiled_case()
+    image[..., 4, 5] = 50.0
+    dof = DepthOfField(camera)
+    plan = dof.plan(image, depth)
+    fast = torch.compile(dof, fullgraph=True, backend="eager")(image, depth, plan=plan)
+    assert_close(fast, dof(image, depth, plan=dataclasses.replace(plan, rays=False)), rtol=1e-5, atol=1e-6)
 
 
 @TRACED

@@ -27,6 +27,7 @@ from .ops import EAGER, Ops
 from .plan import Plan, joined_layers
 from .scatter import fold
 from .surfaces import Frame, Surface, pad_to_frame
+from .traced import is_compiled
 
 __all__ = ["blur", "blur_stack"]
 
@@ -219,8 +220,9 @@ def _render_items(
         light, behind_light = light * scale, None if behind_light is None else behind_light * scale
 
     # limit of highlights; without occlusion only those are splatted that a coarse layer would soften
+    has_rays = plan.rays and not is_compiled()  # their number depends on the light, which compiled graphs do not support
     crisp_px = [plan.crisp_px if options.method == "layered" else math.inf for plan in plans]
-    coarse = any(plan.rays and px < max(map(abs, plan.coc_px)) for plan, px in zip(plans, crisp_px, strict=True))
+    coarse = has_rays and any(px < max(map(abs, plan.coc_px)) for plan, px in zip(plans, crisp_px, strict=True))
     limit = highlights.threshold(light, weight) if options.occlusion or options.normalize or coarse else None
     # a plane has one kernel, which is exact unless it changes across the frame: then blocks of pixels share kernels
     several = len(plan.nodes) > 1 or options.table.depends_on_place
@@ -235,7 +237,7 @@ def _render_items(
 
     # highlights of these surfaces, ray by ray
     splats = None
-    if limit is not None and splatted and plan.rays:
+    if limit is not None and splatted and has_rays:
         (from_px,) = [0.0] if options.occlusion else _of_plans([(px - 1.0,) for px in crisp_px], coc)
         # with a known background, mixed pixels need no second surface for their highlights
         beside = surfaces[::-1] if len(surfaces) == 2 else [None] * len(surfaces)
