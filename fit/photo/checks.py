@@ -8,7 +8,7 @@ from ..result import Array, BlurFit
 from .diagnostics import ASYMMETRIC, P_VALUE, asymmetry_of, size_of_blur, unexplained, unfitted_part
 from .dot import Dot, inner_pixels
 from .forward import Solution
-from .noise import fine_variance, independent_share, noise_of, rounding_of
+from .noise import fine_variance, independent_share, noise_of
 from .source import UNFOCUSED_PX, Edge, soft_edge
 from .tone import untoned
 
@@ -43,7 +43,11 @@ def check_linearity(picture: Array, dot: Dot, edge: Edge, file: str | None) -> b
     inside = inner_pixels(picture, dot)
     if inside is not None:
         bright = fine_variance(picture, inside)
-        rounding = rounding_of(picture[picture > dot.background + 0.5 * dot.peak])
+        # rounding to a file's levels hides at most a variance of (level / 2)^2; levels that are means of three colours
+        # are three times as close, and equal means may differ in the last digit
+        levels = np.unique(picture[picture > dot.background + 0.5 * dot.peak])
+        steps = [step for step in np.diff(levels).tolist() if step > 1e-6 * np.abs(levels).max()]
+        rounding = 3 * min(steps, default=0.0) ** 2 / 4
         # noise in light can only grow with the level; allow 4 standard errors of its estimate
         largest_noise = (1 + 4 / np.sqrt(int(inside.sum() / _SHARED_DIFFERENCES))) * np.sqrt(bright + rounding)
         if dot.noise > max(largest_noise, 1e-4 * dot.peak):

@@ -126,7 +126,7 @@ def turned(opening: Aperture) -> Aperture:
     return replace(opening, rotation_deg=float(opening.rotation_deg) + 180.0)
 
 
-def common_opening(fits: Sequence[BlurFit], nearer: Sequence[bool]) -> Aperture:
+def common_opening(fits: Sequence[BlurFit], nearer: Mask) -> Aperture:
     """One opening for all distances, as seen behind the focus; larger blurs have more weight.
 
     The fits are all "polygon", or all "image"; in front of the focus an opening is seen rotated by half a turn.
