@@ -31,7 +31,7 @@ _F_NUMBER_ROUNDING = 1.03  # the f-number of a lens is rounded: f/2.03 is marked
 
 
 class Paraxial(NamedTuple):
-    """First-order properties of a lens in air, object at infinity. Millimetres; positions along +z."""
+    """First-order properties of a lens in air in the d line, object at infinity. Millimetres; positions along +z."""
 
     focal_length: float  # f
     back_focal: float  # rear focal point, from the last vertex
@@ -112,19 +112,14 @@ class Lens:
         """Position of each surface's vertex on the axis ``[S]``; the first is 0."""
         return np.cumsum([0.0, *(surface.thickness for surface in self.surfaces[:-1])])
 
-    @property
-    def dispersive(self) -> bool:
-        """Whether any glass has different indices for different colours."""
-        return bool((self.indices(F_UM) != self.indices(C_UM)).any())
-
     def indices(self, wavelength_um: float | None = None) -> Array:
         """Refractive indices before the first surface (air) and behind each surface ``[S + 1]``; None is the d line."""
         wavelength_um = D_UM if wavelength_um is None else wavelength_um
         return np.array([1.0, *(surface.glass.index(wavelength_um) for surface in self.surfaces)])
 
-    def paraxial(self, wavelength_um: float | None = None) -> Paraxial:
+    def paraxial(self) -> Paraxial:
         """First-order properties, by ray transfer matrices; a `ValueError` if the lens does not converge light."""
-        n, matrix, to_stop, gap = self.indices(wavelength_um), np.eye(2), np.eye(2), 0.0
+        n, matrix, to_stop, gap = self.indices(), np.eye(2), np.eye(2), 0.0
         with np.errstate(over="ignore", invalid="ignore"):
             for i, surface in enumerate(self.surfaces):
                 matrix = np.array([[1.0, gap], [0.0, 1.0]]) @ matrix

@@ -164,16 +164,12 @@ class Forward:
         )
         params = {n: float(v) for n, v in zip(names, numbers, strict=True)}
         fitted, gain, background = self.project(self._shaped(family, names, numbers))
-        residual, slopes = self.values - fitted, self._jacobian(family, names, numbers)
-        kernel, penalty = (
-            self.kernels(family, {n: np.array([params[n]]) for n in shape})[0],
-            np.diag((self.unit * prior_weight) ** 2),
-        )
-        covariance = self.covariance(slopes, residual, kernel, gain, penalty, is_prior=True)
+        slopes, penalty = self._jacobian(family, names, numbers), np.diag((self.unit * prior_weight) ** 2)
+        kernel = self.kernels(family, {n: np.array([params[n]]) for n in shape})[0]
+        covariance = self.covariance(slopes, self.values - fitted, kernel, gain, penalty, is_prior=True)
+        kernel_params: dict[str, float | Array] = {n: params[n] for n in shape}
         moves = self.moves(params)
-        return Solution(
-            self, family, {n: params[n] for n in shape}, moves, gain, background, fitted, names, covariance, slopes
-        )
+        return Solution(self, family, kernel_params, moves, gain, background, fitted, names, covariance, slopes)
 
     def moves(self, params: Mapping[str, float]) -> dict[str, float]:
         """The fitted moves, completed by the fixed ones."""
