@@ -213,7 +213,7 @@ def _check_spots(solution: Solution, file: str | None) -> None:
     beyond = (pair.distance > pair.dot.reach + 4) & pair.used
     if not beyond.any():
         return
-    smoothed = gaussian_filter(pair.picture(solution.residual, 0.0), 2.0, mode="constant")
+    smoothed = gaussian_filter(pair.picture(solution.residual), 2.0, mode="constant")
     smoothed_beyond = np.where(beyond, smoothed, -np.inf)
     y, x = np.unravel_index(int(np.argmax(smoothed_beyond)), smoothed_beyond.shape)
     height, peak = float(smoothed_beyond[y, x]), pair.dot.peak

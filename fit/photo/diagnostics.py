@@ -27,7 +27,7 @@ def residual_rms(solution: Solution) -> float:
 def noise_near(solution: Solution) -> float:
     """Standard deviation of a pixel's noise where the light is, from the fine (pixel to pixel) part of the residual."""
     pair = solution.pair
-    fine = np.nan_to_num(fine_variance(pair.picture(solution.residual, 0.0), pair.lit))
+    fine = np.nan_to_num(fine_variance(pair.picture(solution.residual), pair.lit))
     lit = pair.data[pair.lit] - solution.background
     dark, light = noise_of(pair.data) ** 2, pair.shot_noise * float(np.mean(np.maximum(lit, 0.0)))
     camera_variance = dark / pair.fine_share + light / (pair.fine_share_of_light or pair.fine_share)
@@ -55,13 +55,10 @@ def unfitted_part(solution: Solution, basis: Array) -> Array:
 
 
 def asymmetry_of(solution: Solution) -> tuple[float, float]:
-    """How much of the blur depends on the angle, and the probability of that by noise alone.
+    """Norm of the blur's angle-dependent part over that of its light, and the probability of that by noise alone.
 
     The residual is expanded in the first eight harmonics of the angle on four rings. With noise of known covariance,
-    the whitened squared coefficients follow a chi squared distribution.
-
-    Returns:
-        Norm of the angle-dependent part, without noise's contribution, over the norm of the light; and the probability.
+    the whitened squared coefficients follow a chi squared distribution. The norm is without noise's contribution.
     """
     pair = solution.pair
     x, y = pair.dot.x + solution.moves["dx"], pair.dot.y + solution.moves["dy"]

@@ -36,11 +36,7 @@ _WORSE_IN_A_ROW = 3  # number of successively worse strengths of smoothing after
 
 
 def solve_opening(round_fit: Solution) -> tuple[Solution, str] | None:
-    """The opening that explains the residual of the free round profile, or None if none does.
-
-    Returns:
-        The solution of family "polygon" or "image", and the reason for it.
-    """
+    """The opening ("polygon" or "image") that explains a free round profile's residual, and why; None if none does."""
     best, excluded, why = round_fit, "round", ""
     blades, harmonic_chi, _ = _harmonic(round_fit)
     if harmonic_chi > _MIN_HARMONIC_CHI:
@@ -74,7 +70,7 @@ def solve_polygon(round_fit: Solution) -> Solution:
 
 
 def solve_image(previous: Solution, kernel: Array | None = None) -> Solution:
-    """Fits the opening as a picture, from a kernel if given; the moves start from those of `before`."""
+    """Fits the opening as a picture, from a kernel if given; the moves start from those of `previous`."""
     kernel = _deconvolved(previous)[0] if kernel is None else kernel
     y, x = center_of_mass(kernel)
     rows, columns = np.nonzero(kernel > 0.01 * kernel.max())
@@ -86,7 +82,7 @@ def solve_image(previous: Solution, kernel: Array | None = None) -> Solution:
 
 
 def _solved(previous: Solution, opening: Aperture, family: str, start: dict[str, float]) -> Solution:
-    """The solution with an opening; the magnification starts from that of `before`."""
+    """The solution with an opening; the magnification starts from that of `previous`."""
     magnification = previous.moves["magnification"]
     pair = replace(previous.pair, opening=opening, start={family: start}, prior={}, held_magnification=magnification)
     return pair.solve(family)

@@ -81,7 +81,17 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
     x, y = radii[order] / unit, values[order] / peak
     # noise from second differences of samples sorted by r
     noise = float(np.sqrt(np.mean((y[2:] - 2 * y[1:-1] + y[:-2]) ** 2) / 6.0))
-    _refuse_flat(x, y, noise)
+    # F test of a parabola over r against a constant
+    parabola = np.stack([np.ones_like(x), x, x * x], axis=1)
+    unexplained = float(np.sum((y - parabola @ np.linalg.lstsq(parabola, y, rcond=None)[0]) ** 2))
+    explained = float(np.sum((y - y.mean()) ** 2)) - unexplained
+    variation = float(np.sqrt(max(explained, 0.0) / y.size))
+    if variation < 1e-8 or explained / 2 < _FLAT_F * unexplained / (y.size - 3):
+        text = (
+            f"the profile is flat: it varies by {variation:.3g} of its peak over r, in a noise of {noise:.3g}; sample "
+            "farther out, or move the paper farther from focus"
+        )
+        raise FitError(text, "flat profile", number=variation / noise if noise > 0 else 0.0)
 
     def model(p: Array) -> Array:
         return evaluate(family, x, dict(zip(names, p, strict=True)))
@@ -161,22 +171,6 @@ def _checked(r: ArrayLike, strength: ArrayLike, fewest: int) -> tuple[Array, Arr
     if values.max() <= 0:
         raise FitError("strength must be positive somewhere; is the dot darker than its paper?", number=values.max())
     return radii, values
-
-
-def _refuse_flat(x: Array, y: Array, noise: float) -> None:
-    """Raises an error if a parabola over r explains the samples no better than a constant."""
-    parabola = np.stack([np.ones_like(x), x, x * x], axis=1)
-    residual = y - parabola @ np.linalg.lstsq(parabola, y, rcond=None)[0]
-    unexplained = float(residual @ residual)
-    explained = float(np.sum((y - y.mean()) ** 2)) - unexplained
-    variation = float(np.sqrt(max(explained, 0.0) / y.size))
-    # F test of a parabola against a constant
-    if variation < 1e-8 or explained / 2 < _FLAT_F * unexplained / (y.size - 3):
-        text = (
-            f"the profile is flat: it varies by {variation:.3g} of its peak over r, in a noise of {noise:.3g}; sample "
-            "farther out, or move the paper farther from focus"
-        )
-        raise FitError(text, "flat profile", number=variation / noise if noise > 0 else 0.0)
 
 
 def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, Indices]:
