@@ -53,9 +53,8 @@ class Surface:
     def scaled(self, factor: float) -> Surface:
         """The surface with all lengths multiplied by a factor."""
         lengths = {name: getattr(self, name) * factor for name in ("radius", "thickness", "diameter")}
-        return replace(
-            self, **lengths, polynomial=tuple(a / factor ** (2 * i + 1) for i, a in enumerate(self.polynomial))
-        )
+        polynomial = tuple(a / factor ** (2 * i + 1) for i, a in enumerate(self.polynomial))
+        return replace(self, **lengths, polynomial=polynomial)
 
     def sag(self, square: Array) -> tuple[Array, Array]:
         """Height z above the vertex's plane at r^2, and its derivative by r^2; NaN beyond the conic's rim."""

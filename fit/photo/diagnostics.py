@@ -83,14 +83,12 @@ def size_of_blur(solution: Solution) -> tuple[float, float]:
     if solution.family == "radial":
         return size_of_profile(solution)
     pair, shape = solution.pair, list(solution.params)
-    steps = [1e-3 * max(abs(float(solution.params[n])), 0.1) for n in shape]
-    varied = {n: np.full(len(shape) + 1, float(solution.params[n])) for n in shape}
-    for i, n in enumerate(shape):
-        varied[n][i + 1] += steps[i]
-    rms, *varied_rms = pair.rms(solution.family, varied).tolist()
+    values = np.array([float(solution.params[n]) for n in shape])
+    steps = 1e-3 * np.maximum(np.abs(values), 0.1)
+    varied = np.vstack([values, values + np.diag(steps)]).T  # a row for each parameter, changed in one column
+    rms, *varied_rms = pair.rms(solution.family, dict(zip(shape, varied, strict=True))).tolist()
     slope = (np.array(varied_rms) - rms) / steps
-    index = [solution.names.index(n) for n in shape]
-    covariance = solution.covariance[np.ix_(index, index)]
+    covariance = solution.covariance[: len(shape), : len(shape)]
     if np.isfinite(np.diag(covariance)).all():
         variance, moment_error = max(float(slope @ covariance @ slope), 0.0), 0.0
         if solution.family == "image":  # its shape is free: only the picture's second moment determines its size
@@ -100,7 +98,7 @@ def size_of_blur(solution: Solution) -> tuple[float, float]:
             moment_error = float(noise * np.linalg.norm(centred) / abs(light.sum()) / (2 * max(rms, 1e-9)))
         return rms, float(np.sqrt(variance + moment_error**2))
     # single parameters are undetermined, but their combination may determine the size
-    _, values, right = np.linalg.svd(solution.slopes[:, index], full_matrices=False)
+    _, values, right = np.linalg.svd(solution.slopes[:, : len(shape)], full_matrices=False)
     seen = values > 1e-6 * values.max()
     projected = right @ slope
     if not seen.any() or np.abs(projected[~seen]).sum() > 0.1 * np.abs(projected).sum():
@@ -137,7 +135,6 @@ def describe(solution: Solution, why: str) -> BlurFit:
     stderr: dict[str, float | Array] = {
         n: float(s) for n, s in zip(solution.names, errors, strict=True) if n in solution.params
     }
-    opening = {n: float(v) for n, v in solution.params.items()} if solution.family in OPENINGS else None
     rows, columns = pair.pixels
     distance = np.hypot(columns - x, rows - y)
     is_near = (distance <= 1.2 * pair.dot.reach) & pair.used
@@ -166,7 +163,7 @@ def describe(solution: Solution, why: str) -> BlurFit:
         radius=float(np.sqrt(2) * rms),
         radius_stderr=float(np.sqrt(2) * rms_error),
         why=why,
-        aperture=None if opening is None else pair.opening_with(opening),
+        aperture=pair.opening_with(solution.params) if solution.family in OPENINGS else None,
         samples=samples,
         curve=curve,
     )

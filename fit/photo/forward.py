@@ -118,15 +118,15 @@ class Forward:
         if family in OPENINGS:
             radius = tensors["radius"]
             size = 2 * min(int(np.ceil(float(radius.max()))) + 1, limit) + 1
-            openings = [self.opening_with({n: float(v[i]) for n, v in tensors.items()}) for i in range(len(radius))]
+            openings = [self.opening_with({n: v[i] for n, v in tensors.items()}) for i in range(len(radius))]
             shapes = zip(radius, openings, strict=True)
             return torch.stack([pixel_kernels("disc", {"radius": r}, size, None, o) for r, o in shapes]).numpy()
         half = min(int(np.ceil(support(family, tensors))) + 1, limit)
         return pixel_kernels(family, tensors, 2 * half + 1).numpy()
 
-    def opening_with(self, params: Mapping[str, float]) -> Aperture:
+    def opening_with(self, params: Mapping[str, Any]) -> Aperture:
         """The lens's opening with these of its parameters."""
-        changed: dict[str, Any] = {n: params[n] for n in ("rotation_deg", "curvature") if n in params}
+        changed: dict[str, Any] = {n: float(params[n]) for n in ("rotation_deg", "curvature") if n in params}
         return replace(self.opening, **changed)
 
     def rms(self, family: str, params: Mapping[str, Array]) -> Array:

@@ -52,18 +52,10 @@ def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: i
     free_covariance = pair.covariance(centred, residual, kernel, gain, smoothing[np.ix_(free, free)])
     covariance = np.zeros((count, count))
     covariance[np.ix_(free, free)] = np.where(np.isfinite(free_covariance), free_covariance, 0.0)
-    return Solution(
-        pair=pair,
-        family="radial",
-        params={"values": weights / float(hat_light @ weights), "radius": radius},
-        moves=moves,
-        gain=gain,
-        background=background,
-        fitted=fitted,
-        names=tuple(f"values[{i}]" for i in range(count)),
-        covariance=covariance / gain**2,
-        slopes=np.stack(pair.move_columns(moves, ("dx", "dy"), kernel), axis=1),
-    )
+    params: dict[str, float | Array] = {"values": weights / float(hat_light @ weights), "radius": radius}
+    names = tuple(f"values[{i}]" for i in range(count))
+    slopes = np.stack(pair.move_columns(moves, ("dx", "dy"), kernel), axis=1)
+    return Solution(pair, "radial", params, moves, gain, background, fitted, names, covariance / gain**2, slopes)
 
 
 def _non_negative(columns: Array, data: Array) -> tuple[Array, Array]:
