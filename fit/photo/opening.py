@@ -92,11 +92,8 @@ def _harmonic(round_fit: Solution) -> tuple[int, float, float]:
     """The polygon that is most significant in a round profile's residual.
 
     A polygon is a circle with an angle-dependent radius. The difference from the circle lies on a ring and has one
-    period for each blade.
-
-    Returns:
-        Its number of blades, chi squared of the two amplitudes, and the angle of a corner in degrees from the right,
-        clockwise on the screen.
+    period for each blade. Returns the number of blades, chi squared of the two amplitudes, and the angle of a corner in
+    degrees from the right, clockwise on the screen.
     """
     pair, size = round_fit.pair, np.sqrt(2) * size_of_blur(round_fit)[0]
     half = min(int(np.ceil(1.3 * size)) + 3, pair.half)
@@ -150,9 +147,8 @@ def common_opening(fits: Sequence[BlurFit], nearer: Mask) -> Aperture:
 def _deconvolved(shape: Solution) -> tuple[Array, float]:
     """Deconvolves a pair of pictures, starting from a solution, which gives the moves and the kernel's reach.
 
-    Returns:
-        The kernel `[k, k]`, k odd, non-negative, summing to 1; and twice the increase of the log likelihood of withheld
-        pixels over the solution.
+    Returns the kernel `[k, k]`, k odd, non-negative, summing to 1; and twice the increase of the log likelihood of
+    withheld pixels over the solution.
     """
     pair = shape.pair
     source = pair.moved_source(shape.moves)
