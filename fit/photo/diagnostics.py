@@ -7,7 +7,6 @@ from ..result import Array, BlurFit
 from ..solve import information_criterion
 from .forward import OPENINGS, SHAPES, Solution, without_level
 from .noise import fine_variance, independent_share, noise_of
-from .radial import size_of_profile
 
 ASYMMETRIC = 0.02
 """Share of a blur's light that depends on the angle, above which it is not round."""
@@ -80,8 +79,15 @@ def asymmetry_of(solution: Solution) -> tuple[float, float]:
 
 def size_of_blur(solution: Solution) -> tuple[float, float]:
     """The PSF's rms radius and its standard error, px; better determined than single, correlated parameters."""
-    if solution.family == "radial":
-        return size_of_profile(solution)
+    if solution.family == "radial":  # light and second moment are sums over the values, each with a hat function
+        values, radius = np.asarray(solution.params["values"]), float(solution.params["radius"])
+        r = np.linspace(0, radius, 64 * values.size + 1)
+        hats = np.clip(1 - np.abs(r / radius * (values.size - 1) - np.arange(values.size)[:, None]), 0, None)
+        light, moment = hats @ r, hats @ r**3
+        rms = float(np.sqrt(moment @ values / (light @ values)))
+        # derivative of a quotient: the total light depends on the values too
+        slope = (moment - rms**2 * light) / (light @ values) / (2 * rms)
+        return rms, float(np.sqrt(max(slope @ solution.covariance @ slope, 0.0)))
     pair, shape = solution.pair, list(solution.params)
     values = np.array([float(solution.params[n]) for n in shape])
     steps = 1e-3 * np.maximum(np.abs(values), 0.1)
