@@ -36,6 +36,16 @@ def a_choice(name: str, value: Any, choices: Sequence[str]) -> None:
         raise FitError(f"{name} must be one of {', '.join(choices)}, got {show(value)}")
 
 
+def real_numbers(value: ArrayLike) -> Array | None:
+    """An array of real numbers as float64; None if the value is not one."""
+    try:
+        array = np.asarray(value)
+        is_real = array.dtype != bool and np.issubdtype(array.dtype, np.number) and not np.iscomplexobj(array)
+        return array.astype(np.float64) if is_real else None
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        return None
+
+
 def a_picture(name: str, picture: ArrayLike, smallest: int, file: str | None = None) -> Array:
     """A picture `[H, W]` of finite numbers with at least `smallest` pixels on each side.
 
@@ -43,22 +53,17 @@ def a_picture(name: str, picture: ArrayLike, smallest: int, file: str | None = N
         FitError: it is not an array of real numbers, too small, or so bright or dark that squares overflow; of kind
             "not finite" for NaN or infinity among its pixels.
     """
-    try:
-        array = np.asarray(picture)
-        if array.dtype == bool or not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
-            raise TypeError
-        array = array.astype(np.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError):
+    array = real_numbers(picture)
+    if array is None:
         text = f"{name} must be an array of real numbers [H, W] in linear light, got {show(picture)}"
-        raise FitError(text, file=file) from None
+        raise FitError(text, file=file)
     if array.ndim != 2 or min(array.shape) < smallest:
         raise FitError(
             f"{name} must be [H, W] with at least {smallest} pixels on a side, got {list(array.shape)}; "
             "fit the colours of a picture one by one",
             file=file,
         )
-    bad = int(np.sum(~np.isfinite(array)))
-    if bad:
+    if bad := int(np.sum(~np.isfinite(array))):
         raise FitError(f"{bad} pixels of {name} are NaN or infinite", "not finite", file=file, number=float(bad))
     largest = float(np.abs(array).max())
     if largest > _BRIGHTEST or 0 < largest < _DARKEST:

@@ -17,7 +17,7 @@ from torchdof.validation import number, show, whole
 
 from ..result import Array, Mask
 from . import prescription, zmx
-from .glass import AIR, C_UM, D_UM, F_UM
+from .glass import C_UM, D_UM, F_UM
 from .surface import Surface
 
 RGB_UM = (C_UM, 0.54607, F_UM)
@@ -31,11 +31,7 @@ _F_NUMBER_ROUNDING = 1.03  # the f-number of a lens is rounded: f/2.03 is marked
 
 
 class Paraxial(NamedTuple):
-    """First-order properties of a lens in air, object at infinity. Millimetres; positions along +z.
-
-    For the front focal point and the exit pupil, take the rear focal point and the entrance pupil of
-    :meth:`Lens.turned`.
-    """
+    """First-order properties of a lens in air in the d line, object at infinity. Millimetres; positions along +z."""
 
     focal_length: float  # f
     back_focal: float  # rear focal point, from the last vertex
@@ -116,19 +112,14 @@ class Lens:
         """Position of each surface's vertex on the axis ``[S]``; the first is 0."""
         return np.cumsum([0.0, *(surface.thickness for surface in self.surfaces[:-1])])
 
-    @property
-    def dispersive(self) -> bool:
-        """Whether any glass has different indices for different colours."""
-        return bool((self.indices(F_UM) != self.indices(C_UM)).any())
-
     def indices(self, wavelength_um: float | None = None) -> Array:
         """Refractive indices before the first surface (air) and behind each surface ``[S + 1]``; None is the d line."""
         wavelength_um = D_UM if wavelength_um is None else wavelength_um
         return np.array([1.0, *(surface.glass.index(wavelength_um) for surface in self.surfaces)])
 
-    def paraxial(self, wavelength_um: float | None = None) -> Paraxial:
+    def paraxial(self) -> Paraxial:
         """First-order properties, by ray transfer matrices; a `ValueError` if the lens does not converge light."""
-        n, matrix, to_stop, gap = self.indices(wavelength_um), np.eye(2), np.eye(2), 0.0
+        n, matrix, to_stop, gap = self.indices(), np.eye(2), np.eye(2), 0.0
         with np.errstate(over="ignore", invalid="ignore"):
             for i, surface in enumerate(self.surfaces):
                 matrix = np.array([[1.0, gap], [0.0, 1.0]]) @ matrix
@@ -170,20 +161,7 @@ class Lens:
     def scaled(self, focal_length_mm: float) -> Lens:
         """The lens scaled to another focal length; its f-number is unchanged."""
         factor = number("focal_length_mm", focal_length_mm, 0, 1e9) / self.paraxial().focal_length
-        surfaces = [
-            replace(surface, thickness=surface.thickness * factor, diameter=surface.diameter * factor).bent(factor)
-            for surface in self.surfaces
-        ]
-        return replace(self, surfaces=tuple(surfaces))
-
-    def turned(self) -> Lens:
-        """The lens with front and rear exchanged."""
-        media = [(AIR, 0.0), *((surface.glass, surface.thickness) for surface in self.surfaces[:-1])]
-        surfaces = [
-            replace(surface.bent(-1.0), glass=glass, thickness=gap)
-            for surface, (glass, gap) in zip(self.surfaces, media, strict=True)
-        ]
-        return replace(self, surfaces=tuple(surfaces[::-1]), stop=len(surfaces) - 1 - self.stop)
+        return replace(self, surfaces=tuple(surface.scaled(factor) for surface in self.surfaces))
 
     def lines(self) -> list[str]:
         """The surfaces as lines of a prescription file."""

@@ -184,9 +184,8 @@ def _to_focus(cocs: Sequence[float]) -> list[int]:
 def _fit_shape(family: str, tracer: Tracer, coc: float, neighbour: Array | None) -> tuple[Array, float, float]:
     """Parameters of the shape whose transfer function is nearest to a spot's; the neighbour's are a weak prior.
 
-    Returns:
-        The parameters, with lengths relative to the spot's outermost ray; that ray's distance in pixels; and the
-        weighted squared error.
+    Lengths are relative to the distance of the spot's outermost ray. Also returns this distance in px, and the weighted
+    squared error.
     """
     (r, light, transfer), names, weight = tracer.traced(coc), FAMILIES[family], tracer.weight
     outermost = float(r.max())

@@ -88,7 +88,6 @@ def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best", reference: Re
     a_choice("focus", kind, get_args(Focus))
     paraxial = lens.paraxial()
     sensor = paraxial.back_focal
-    a_choice("reference", reference, get_args(Reference))
     for _ in range(100 if reference == "sensor" else 1):  # a distance from the sensor changes with the sensor's place
         object_mm, previous = vertex_distance_mm(lens, focus_m, reference, sensor), sensor
         distance = object_mm + paraxial.front_principal

@@ -50,10 +50,11 @@ class Surface:
             limit = _MAX_DEPTH_MM / (self.diameter / 2.0) ** (2 * i + 2)  # limits the depth of the surface's rim
             _check(f"A{2 * i + 2}", coefficient, -limit, limit)
 
-    def bent(self, factor: float) -> Surface:
-        """The surface with all lengths of its shape multiplied by a factor; -1 exchanges its sides."""
+    def scaled(self, factor: float) -> Surface:
+        """The surface with all lengths multiplied by a factor."""
+        lengths = {name: getattr(self, name) * factor for name in ("radius", "thickness", "diameter")}
         polynomial = tuple(a / factor ** (2 * i + 1) for i, a in enumerate(self.polynomial))
-        return replace(self, radius=self.radius * factor, polynomial=polynomial)
+        return replace(self, **lengths, polynomial=polynomial)
 
     def sag(self, square: Array) -> tuple[Array, Array]:
         """Height z above the vertex's plane at r^2, and its derivative by r^2; NaN beyond the conic's rim."""

@@ -19,6 +19,7 @@ from ..result import Array
 from ..solve import one_thread
 from ..validation import a_choice
 from .field import coc_nodes, trace_field
+from .glass import C_UM, F_UM
 from .lens import Lens
 from .nodes import Tracer, fit_radial, fit_shapes, place_nodes
 from .spot import Focus, Reference, Spot, focus_sensor, point_spread
@@ -178,7 +179,7 @@ def _check(arguments: dict[str, Any]) -> None:
             raise ValueError(f"wavelengths_um must be a list of wavelengths in micrometres, got {show(wavelengths)}")
         for value in wavelengths:
             lens.indices(number("wavelengths_um", value, unit="micrometres"))
-        if not lens.dispersive:
+        if np.array_equal(lens.indices(F_UM), lens.indices(C_UM)):
             raise ValueError(f"wavelengths_um need a lens with Abbe numbers (index/V); {lens.name!r} has none")
     if field is not None:
         if arguments["field_mm"]:

@@ -8,7 +8,7 @@ from ..result import Array, BlurFit
 from .diagnostics import ASYMMETRIC, P_VALUE, asymmetry_of, size_of_blur, unexplained, unfitted_part
 from .dot import Dot, inner_pixels
 from .forward import Solution
-from .noise import fine_variance, independent_share, noise_of, rounding_of
+from .noise import fine_variance, independent_share, noise_of
 from .source import UNFOCUSED_PX, Edge, soft_edge
 from .tone import untoned
 
@@ -43,7 +43,11 @@ def check_linearity(picture: Array, dot: Dot, edge: Edge, file: str | None) -> b
     inside = inner_pixels(picture, dot)
     if inside is not None:
         bright = fine_variance(picture, inside)
-        rounding = rounding_of(picture[picture > dot.background + 0.5 * dot.peak])
+        # rounding to a file's levels hides at most a variance of (level / 2)^2; levels that are means of three colours
+        # are three times as close, and equal means may differ in the last digit
+        levels = np.unique(picture[picture > dot.background + 0.5 * dot.peak])
+        steps = [step for step in np.diff(levels).tolist() if step > 1e-6 * np.abs(levels).max()]
+        rounding = 3 * min(steps, default=0.0) ** 2 / 4
         # noise in light can only grow with the level; allow 4 standard errors of its estimate
         largest_noise = (1 + 4 / np.sqrt(int(inside.sum() / _SHARED_DIFFERENCES))) * np.sqrt(bright + rounding)
         if dot.noise > max(largest_noise, 1e-4 * dot.peak):
@@ -76,7 +80,8 @@ def check_levels(solution: Solution, expected: Solution, edge: Edge, file: str |
     1. The part of a curve's effect that the fit's parameters cannot imitate, in the residual of `solution`.
     2. In a JPEG this part is less certain; an edge of the sharp dot that is slightly too steep then supports it.
     3. A fitted magnification imitates most of a curve. So the residual of `expected`, the solution with the expected
-       magnification, is tested as well; there a curve must explain more than a change of magnification does.
+       magnification, is tested for an S-curve, which must explain more than a change of magnification does. A sharp
+       dot's edge that is too steep counts in favour of the curve.
 
     `edge` is that of the sharp dot.
     """
@@ -85,35 +90,28 @@ def check_levels(solution: Solution, expected: Solution, edge: Edge, file: str |
     visible = unfitted_part(solution, curves)
     strengths = np.linalg.lstsq(visible.T @ visible, products, rcond=None)[0]
     chi_squared = float(products @ np.linalg.pinv(covariance) @ products)
-    steepness = edge.steepness / max(edge.steepness_error, np.finfo(float).tiny)
+    steepness = edge.steepness / max(edge.steepness_error, np.finfo(float).tiny)  # in standard errors
     agrees = edge.steepness > _SUPPORTING_EDGE and steepness > 1 and chi_squared + steepness**2 > _SUPPORTED_CHI
-    resized = abs(solution.moves["magnification"] / expected.moves["magnification"] - 1) > _MIN_RESIZING
     is_bent = float(np.linalg.norm(strengths)) > _MIN_CURVE and (chi_squared > _MIN_CHI or agrees)
-    if is_bent or (not resized and _curved(expected, edge.level, steepness)):
-        text = (
-            "the fit's residual depends on the level, "
-            + ("" if is_bent else "at the expected size of the dot, ")
-            + "as with a tone curve (an S-curve, a picture style): the kernel is then too small by 5 % or more; "
-            "develop without it. Colours with different blurs have a similar effect (colours = 'each'), and a "
-            f"blur that is not of family {solution.family!r}"
-        )
-        warn(text, "not linear", file=file, number=float(strengths[1]))
-
-
-def _curved(expected: Solution, level: float, steepness: float) -> bool:
-    """Whether an S-curve explains the residual at the expected magnification, and better than another magnification.
-
-    `steepness`, the excess of the sharp dot's edge in standard errors, counts in favour of the curve.
-    """
-    slope = expected.pair.move_columns(expected.moves, ("magnification",), expected.kernel)[0]
-    size_change = expected.gain * slope
-    basis = np.stack([_curves(expected, level)[:, 1], size_change], axis=1)
-    products, covariance = unexplained(expected, basis)
-    variance = np.maximum(np.diag(covariance), np.finfo(float).tiny)
-    contrast_chi, size_chi = np.sign(products) * products**2 / variance
-    strength = products[0] / np.sum(unfitted_part(expected, basis)[:, 0] ** 2)
-    explains_more = contrast_chi + steepness * abs(steepness) - abs(size_chi) > _CHI_MARGIN
-    return bool(strength > _MIN_CONTRAST and contrast_chi > _MIN_CONTRAST_CHI and explains_more)
+    if not is_bent:
+        if abs(solution.moves["magnification"] / expected.moves["magnification"] - 1) > _MIN_RESIZING:
+            return
+        resizing = expected.gain * expected.pair.move_columns(expected.moves, ("magnification",), expected.kernel)[0]
+        basis = np.stack([_curves(expected, edge.level)[:, 1], resizing], axis=1)
+        products, covariance = unexplained(expected, basis)
+        variance = np.maximum(np.diag(covariance), np.finfo(float).tiny)
+        contrast_chi, size_chi = np.sign(products) * products**2 / variance
+        strength = products[0] / np.sum(unfitted_part(expected, basis)[:, 0] ** 2)
+        margin = contrast_chi + steepness * abs(steepness) - abs(size_chi)
+        if not (strength > _MIN_CONTRAST and contrast_chi > _MIN_CONTRAST_CHI and margin > _CHI_MARGIN):
+            return
+    condition = "" if is_bent else "at the expected size of the dot, "
+    text = (
+        f"the fit's residual depends on the level, {condition}as with a tone curve (an S-curve, a picture style): the "
+        "kernel is then too small by 5 % or more; develop without it. Colours with different blurs have a similar "
+        f"effect (colours = 'each'), and a blur that is not of family {solution.family!r}"
+    )
+    warn(text, "not linear", file=file, number=float(strengths[1]))
 
 
 def _curves(solution: Solution, level: float) -> Array:
@@ -215,7 +213,7 @@ def _check_spots(solution: Solution, file: str | None) -> None:
     beyond = (pair.distance > pair.dot.reach + 4) & pair.used
     if not beyond.any():
         return
-    smoothed = gaussian_filter(pair.picture(solution.residual, 0.0), 2.0, mode="constant")
+    smoothed = gaussian_filter(pair.picture(solution.residual), 2.0, mode="constant")
     smoothed_beyond = np.where(beyond, smoothed, -np.inf)
     y, x = np.unravel_index(int(np.argmax(smoothed_beyond)), smoothed_beyond.shape)
     height, peak = float(smoothed_beyond[y, x]), pair.dot.peak

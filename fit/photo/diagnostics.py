@@ -7,7 +7,6 @@ from ..result import Array, BlurFit
 from ..solve import information_criterion
 from .forward import OPENINGS, SHAPES, Solution, without_level
 from .noise import fine_variance, independent_share, noise_of
-from .radial import size_of_profile
 
 ASYMMETRIC = 0.02
 """Share of a blur's light that depends on the angle, above which it is not round."""
@@ -27,7 +26,7 @@ def residual_rms(solution: Solution) -> float:
 def noise_near(solution: Solution) -> float:
     """Standard deviation of a pixel's noise where the light is, from the fine (pixel to pixel) part of the residual."""
     pair = solution.pair
-    fine = np.nan_to_num(fine_variance(pair.picture(solution.residual, 0.0), pair.lit))
+    fine = np.nan_to_num(fine_variance(pair.picture(solution.residual), pair.lit))
     lit = pair.data[pair.lit] - solution.background
     dark, light = noise_of(pair.data) ** 2, pair.shot_noise * float(np.mean(np.maximum(lit, 0.0)))
     camera_variance = dark / pair.fine_share + light / (pair.fine_share_of_light or pair.fine_share)
@@ -55,13 +54,10 @@ def unfitted_part(solution: Solution, basis: Array) -> Array:
 
 
 def asymmetry_of(solution: Solution) -> tuple[float, float]:
-    """How much of the blur depends on the angle, and the probability of that by noise alone.
+    """Norm of the blur's angle-dependent part over that of its light, and the probability of that by noise alone.
 
     The residual is expanded in the first eight harmonics of the angle on four rings. With noise of known covariance,
-    the whitened squared coefficients follow a chi squared distribution.
-
-    Returns:
-        Norm of the angle-dependent part, without noise's contribution, over the norm of the light; and the probability.
+    the whitened squared coefficients follow a chi squared distribution. The norm is without noise's contribution.
     """
     pair = solution.pair
     x, y = pair.dot.x + solution.moves["dx"], pair.dot.y + solution.moves["dy"]
@@ -83,17 +79,22 @@ def asymmetry_of(solution: Solution) -> tuple[float, float]:
 
 def size_of_blur(solution: Solution) -> tuple[float, float]:
     """The PSF's rms radius and its standard error, px; better determined than single, correlated parameters."""
-    if solution.family == "radial":
-        return size_of_profile(solution)
+    if solution.family == "radial":  # light and second moment are sums over the values, each with a hat function
+        values, radius = np.asarray(solution.params["values"]), float(solution.params["radius"])
+        r = np.linspace(0, radius, 64 * values.size + 1)
+        hats = np.clip(1 - np.abs(r / radius * (values.size - 1) - np.arange(values.size)[:, None]), 0, None)
+        light, moment = hats @ r, hats @ r**3
+        rms = float(np.sqrt(moment @ values / (light @ values)))
+        # derivative of a quotient: the total light depends on the values too
+        slope = (moment - rms**2 * light) / (light @ values) / (2 * rms)
+        return rms, float(np.sqrt(max(slope @ solution.covariance @ slope, 0.0)))
     pair, shape = solution.pair, list(solution.params)
-    steps = [1e-3 * max(abs(float(solution.params[n])), 0.1) for n in shape]
-    varied = {n: np.full(len(shape) + 1, float(solution.params[n])) for n in shape}
-    for i, n in enumerate(shape):
-        varied[n][i + 1] += steps[i]
-    rms, *varied_rms = pair.rms(solution.family, varied).tolist()
+    values = np.array([float(solution.params[n]) for n in shape])
+    steps = 1e-3 * np.maximum(np.abs(values), 0.1)
+    varied = np.vstack([values, values + np.diag(steps)]).T  # a row for each parameter, changed in one column
+    rms, *varied_rms = pair.rms(solution.family, dict(zip(shape, varied, strict=True))).tolist()
     slope = (np.array(varied_rms) - rms) / steps
-    index = [solution.names.index(n) for n in shape]
-    covariance = solution.covariance[np.ix_(index, index)]
+    covariance = solution.covariance[: len(shape), : len(shape)]
     if np.isfinite(np.diag(covariance)).all():
         variance, moment_error = max(float(slope @ covariance @ slope), 0.0), 0.0
         if solution.family == "image":  # its shape is free: only the picture's second moment determines its size
@@ -103,7 +104,7 @@ def size_of_blur(solution: Solution) -> tuple[float, float]:
             moment_error = float(noise * np.linalg.norm(centred) / abs(light.sum()) / (2 * max(rms, 1e-9)))
         return rms, float(np.sqrt(variance + moment_error**2))
     # single parameters are undetermined, but their combination may determine the size
-    _, values, right = np.linalg.svd(solution.slopes[:, index], full_matrices=False)
+    _, values, right = np.linalg.svd(solution.slopes[:, : len(shape)], full_matrices=False)
     seen = values > 1e-6 * values.max()
     projected = right @ slope
     if not seen.any() or np.abs(projected[~seen]).sum() > 0.1 * np.abs(projected).sum():
@@ -140,7 +141,6 @@ def describe(solution: Solution, why: str) -> BlurFit:
     stderr: dict[str, float | Array] = {
         n: float(s) for n, s in zip(solution.names, errors, strict=True) if n in solution.params
     }
-    opening = {n: float(v) for n, v in solution.params.items()} if solution.family in OPENINGS else None
     rows, columns = pair.pixels
     distance = np.hypot(columns - x, rows - y)
     is_near = (distance <= 1.2 * pair.dot.reach) & pair.used
@@ -169,7 +169,7 @@ def describe(solution: Solution, why: str) -> BlurFit:
         radius=float(np.sqrt(2) * rms),
         radius_stderr=float(np.sqrt(2) * rms_error),
         why=why,
-        aperture=None if opening is None else pair.opening_with(opening),
+        aperture=pair.opening_with(solution.params) if solution.family in OPENINGS else None,
         samples=samples,
         curve=curve,
     )

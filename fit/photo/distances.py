@@ -37,9 +37,10 @@ def fit_distances(
 ) -> list[BlurFit]:
     """Fits all pairs with one family; `smooth` then refits each with information from neighbouring distances."""
     defocus, fits = captures.defocus, dict[int, BlurFit]()
-    for sign in (-1, 1):  # from both ends towards focus, each starting from its neighbour's fit
+    # in front of the focus and behind it, pairs from the far end towards the focus
+    sides = [sorted(np.flatnonzero(defocus * sign > 0).tolist(), key=lambda k: -abs(defocus[k])) for sign in (-1, 1)]
+    for side in sides:  # each pair starts from its neighbour's fit
         start: BlurFit | None = None
-        side = sorted(np.flatnonzero(defocus * sign > 0).tolist(), key=lambda k: -abs(defocus[k]))
         for outer, i in zip([None, *side], side, strict=False):
             if start is not None:
                 scale = abs(defocus[i] / defocus[outer])
@@ -48,63 +49,56 @@ def fit_distances(
             done(captures.pairs[i], start)
     if smooth:
         with without_warnings():
-            (_refine_aligned if family == "radial" else _refine_together)(captures, family, fits)
+            for side in sides:
+                (_refine_aligned if family == "radial" else _refine_together)(captures, family, fits, side)
     return [fits[i] for i in range(len(defocus))]
 
 
-def _refine_together(captures: Captures, family: str, fits: dict[int, BlurFit]) -> None:
-    """Refits every pair with a prior: the line between its neighbours on the same side of focus.
+def _refine_together(captures: Captures, family: str, fits: dict[int, BlurFit], side: list[int]) -> None:
+    """Refits the pairs on one side of the focus, each with a prior: the line between its neighbours.
 
     Correlated parameters (a rim's height and its steepness) thus become consistent over distance. The prior is loose,
     so parameters that the pictures determine do not change.
     """
     defocus = captures.defocus
-    for i in _SWEEPS * sorted(fits, key=lambda k: -abs(defocus[k])):
-        side = sorted((k for k in fits if defocus[k] * defocus[i] > 0), key=lambda k: abs(defocus[k]))
-        order = side.index(i)
+    for order, i in _SWEEPS * list(enumerate(side)):
         neighbours = side[max(order - 1, 0) : order] + side[order + 1 : order + 2]
         if not neighbours:
             continue
         size = max(float(v) for n, v in fits[i].params.items() if n in LENGTHS)
-        deviations = {n: {"b": 0.1, "m": 0.3}.get(n, 0.05 * size + 0.05) for n in FAMILIES[family]}
         prior = {}
-        for n, deviation in deviations.items():
-            values = [float(fits[k].params[n]) for k in neighbours]
+        for n in FAMILIES[family]:
+            deviation = {"b": 0.1, "m": 0.3}.get(n, 0.05 * size + 0.05)
+            first, last = (float(fits[k].params[n]) for k in (neighbours[0], neighbours[-1]))
             if len(neighbours) == 1:
-                scaled = values[0] * (abs(defocus[i] / defocus[neighbours[0]]) if n in LENGTHS else 1.0)
+                scaled = first * (abs(defocus[i] / defocus[neighbours[0]]) if n in LENGTHS else 1.0)
                 prior[n] = (float(scaled), 3 * deviation)
             else:
                 share = (defocus[i] - defocus[neighbours[0]]) / (defocus[neighbours[1]] - defocus[neighbours[0]])
-                prior[n] = (float((1 - share) * values[0] + share * values[1]), deviation)
+                prior[n] = (float((1 - share) * first + share * last), deviation)
         fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=fits[i], prior=prior)
 
 
-def _refine_aligned(captures: Captures, family: str, fits: dict[int, BlurFit]) -> None:
-    """Refits free profiles, with radii that lie on a line over the circle of confusion.
+def _refine_aligned(captures: Captures, family: str, fits: dict[int, BlurFit], side: list[int]) -> None:
+    """Refits the free profiles on one side of the focus, with radii that lie on a line over the circle of confusion.
 
     Between nodes a table mixes values at equal fractions of the radius, so the shapes only match if the radii follow
     one rule.
     """
-    defocus = captures.defocus
-
-    def end(fit: BlurFit) -> float:
-        """Radius in px that contains all but a thousandth of a free profile's light."""
-        values, radius = np.asarray(fit.params["values"]), float(fit.params["radius"])
+    if len(side) < 2:
+        return
+    ends = np.empty(len(side))  # radii in px that contain all but a thousandth of a profile's light
+    for k, i in enumerate(side):
+        values, radius = np.asarray(fits[i].params["values"]), float(fits[i].params["radius"])
         r = np.linspace(0, radius, 1001)
         light = np.cumsum(np.interp(r, np.linspace(0, radius, values.size), values) * r)
-        return float(r[np.searchsorted(light, 0.999 * light[-1])]) + radius / (values.size - 1)
-
-    for sign in (-1, 1):
-        side = [i for i in fits if defocus[i] * sign > 0]
-        if len(side) < 2:
-            continue
-        x, ends = np.abs(defocus[side]), np.array([end(fits[i]) for i in side])
-        # near focus a profile may end anywhere: the outer nodes define the line, raised so that it contains theirs
-        slope, intercept = np.polyfit(x, ends, 1, w=x)
-        lift = max(float(np.max((ends - slope * x - intercept)[x > 0.25 * x.max()])), 0.0)
-        for i, magnitude, end_px in zip(side, x, ends, strict=True):
-            reach = max(float(slope * magnitude + intercept + lift), float(end_px), 1.0)
-            fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=fits[i], reach=reach)
+        ends[k] = r[np.searchsorted(light, 0.999 * light[-1])] + radius / (values.size - 1)
+    # near focus a profile may end anywhere: the outer nodes define the line, raised so that it contains theirs
+    x = np.abs(captures.defocus[side])
+    slope, intercept = np.polyfit(x, ends, 1, w=x)
+    lift = max(float(np.max((ends - slope * x - intercept)[x > 0.25 * x.max()])), 0.0)
+    for i, reach in zip(side, np.maximum(np.maximum(slope * x + intercept + lift, ends), 1.0).tolist(), strict=True):
+        fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=fits[i], reach=reach)
 
 
 def fit_openings(
@@ -114,13 +108,12 @@ def fit_openings(
 
     The first fits of `family` ("polygon" or "image") determine the opening, returned as seen behind the focus.
     """
-    is_nearer = [pair.distance_m < captures.focus_m for pair in captures]
+    is_nearer = captures.defocus < 0
     chosen = [i for i, fit in enumerate(first_fits) if fit.family == family]
-    opening = common_opening([first_fits[i] for i in chosen], [is_nearer[i] for i in chosen])
-    rotated = turned(opening)
+    opening = common_opening([first_fits[i] for i in chosen], is_nearer[chosen])
     fits = []
     for pair, in_front in zip(captures, is_nearer, strict=True):
-        fit = fit_one(pair, captures.focus_m, "image", aperture=rotated if in_front else opening)
+        fit = fit_one(pair, captures.focus_m, "image", aperture=turned(opening) if in_front else opening)
         fits.append(replace(fit, family=family))
         done(pair, fits[-1])
     return fits, opening

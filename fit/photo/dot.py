@@ -39,11 +39,7 @@ def distance_from(dot: Dot, shape: tuple[int, ...]) -> Array:
 
 
 def find_dot(picture: Array, *, file: str | None = None) -> Dot:
-    """Finds the only dot in a picture `[H, W]` in linear light.
-
-    Raises:
-        FitError: as from :func:`find_dots`; of kind "several dots" if there is more than one.
-    """
+    """Finds the only dot in a picture `[H, W]` in linear light; an error of kind "several dots" if there are more."""
     dots = find_dots(picture, file=file)
     if len(dots) > 1:
         positions = ", ".join(f"({d.x:.0f}, {d.y:.0f})" for d in dots[:6])
@@ -184,14 +180,12 @@ def _plateau(picture: Array, dot: Dot) -> float | None:
     A clipped picture has many pixels at exactly its highest level, more than at the next lower one, although its noise
     is larger than the distance of its levels. Without noise a flat top may be real.
     """
-    top = float(picture.max())
-    above = picture[picture > dot.background + 0.5 * dot.peak]
-    at_top = int(np.sum(above == top))
-    levels, counts = np.unique(above, return_counts=True)
+    levels, counts = np.unique(picture[picture > dot.background + 0.5 * dot.peak], return_counts=True)
     tail = levels.size > 1 and counts[-1] <= counts[-2]  # few pixels at the top level are the tail of the noise
-    if tail or at_top < max(5, 0.02 * above.size):
+    if tail or counts[-1] < max(5, 0.02 * counts.sum()):
         return None
     spacing = float(np.median(np.diff(levels))) if levels.size > 1 else 0.0
+    top = float(levels[-1])
     return top if dot.noise > 0.6 * spacing and dot.noise > 1e-12 * abs(top) else None
 
 

@@ -58,7 +58,7 @@ class Forward:
     prior: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # expected parameters, deviations
     shot_noise: float = 0.0  # growth of a pixel's noise variance (by second differences) with its level
     fine_share_of_light: float | None = None  # share of that growth seen in second differences; None: the dark paper's
-    opening: Aperture | None = None  # of the lens, for the kernels in OPENINGS: blades or an image
+    opening: Aperture = Aperture()  # of the lens, for the kernels in OPENINGS: blades or an image
 
     def __post_init__(self) -> None:
         self.pixels = np.indices(self.data.shape).astype(np.float64)  # rows and columns [2, H, W]
@@ -102,12 +102,12 @@ class Forward:
 
     def correlate(self, source: Array, picture: Array, size: int) -> Array:
         """The adjoint of `convolve` for one kernel `[size, size]`, from the used pixels."""
-        spread = irfft2(np.conj(source) * rfft2(self.picture(picture, 0.0), self.grid), self.grid)
+        spread = irfft2(np.conj(source) * rfft2(self.picture(picture), self.grid), self.grid)
         return np.asarray(np.roll(spread, (size // 2, size // 2), (0, 1))[:size, :size])
 
-    def picture(self, values: Array, elsewhere: float) -> Array:
-        """Pictures `[..., H, W]` from values of the used pixels `[..., pixels used]`."""
-        pictures = np.full((*values.shape[:-1], self.flat.size), elsewhere)
+    def picture(self, values: Array) -> Array:
+        """Pictures `[..., H, W]` from values of the used pixels `[..., pixels used]`; 0 elsewhere."""
+        pictures = np.zeros((*values.shape[:-1], self.flat.size))
         pictures[..., self.flat] = values
         return pictures.reshape(*values.shape[:-1], *self.data.shape)
 
@@ -118,17 +118,15 @@ class Forward:
         if family in OPENINGS:
             radius = tensors["radius"]
             size = 2 * min(int(np.ceil(float(radius.max()))) + 1, limit) + 1
-            openings = [self.opening_with({n: float(v[i]) for n, v in tensors.items()}) for i in range(len(radius))]
+            openings = [self.opening_with({n: v[i] for n, v in tensors.items()}) for i in range(len(radius))]
             shapes = zip(radius, openings, strict=True)
             return torch.stack([pixel_kernels("disc", {"radius": r}, size, None, o) for r, o in shapes]).numpy()
         half = min(int(np.ceil(support(family, tensors))) + 1, limit)
         return pixel_kernels(family, tensors, 2 * half + 1).numpy()
 
-    def opening_with(self, params: Mapping[str, float]) -> Aperture:
+    def opening_with(self, params: Mapping[str, Any]) -> Aperture:
         """The lens's opening with these of its parameters."""
-        if self.opening is None:
-            raise AssertionError("kernels that are not round are those of an opening")
-        changed: dict[str, Any] = {n: params[n] for n in ("rotation_deg", "curvature") if n in params}
+        changed: dict[str, Any] = {n: float(params[n]) for n in ("rotation_deg", "curvature") if n in params}
         return replace(self.opening, **changed)
 
     def rms(self, family: str, params: Mapping[str, Array]) -> Array:
@@ -164,16 +162,12 @@ class Forward:
         )
         params = {n: float(v) for n, v in zip(names, numbers, strict=True)}
         fitted, gain, background = self.project(self._shaped(family, names, numbers))
-        residual, slopes = self.values - fitted, self._jacobian(family, names, numbers)
-        kernel, penalty = (
-            self.kernels(family, {n: np.array([params[n]]) for n in shape})[0],
-            np.diag((self.unit * prior_weight) ** 2),
-        )
-        covariance = self.covariance(slopes, residual, kernel, gain, penalty, is_prior=True)
+        slopes, penalty = self._jacobian(family, names, numbers), np.diag((self.unit * prior_weight) ** 2)
+        kernel = self.kernels(family, {n: np.array([params[n]]) for n in shape})[0]
+        covariance = self.covariance(slopes, self.values - fitted, kernel, gain, penalty, is_prior=True)
+        kernel_params: dict[str, float | Array] = {n: params[n] for n in shape}
         moves = self.moves(params)
-        return Solution(
-            self, family, {n: params[n] for n in shape}, moves, gain, background, fitted, names, covariance, slopes
-        )
+        return Solution(self, family, kernel_params, moves, gain, background, fitted, names, covariance, slopes)
 
     def moves(self, params: Mapping[str, float]) -> dict[str, float]:
         """The fitted moves, completed by the fixed ones."""
@@ -194,7 +188,7 @@ class Forward:
         information_inverse = inverse(slopes.T @ slopes + penalty)
         is_determined = np.isfinite(np.diag(information_inverse))
         information_inverse = np.where(np.outer(is_determined, is_determined), information_inverse, 0.0)
-        full = self.picture(residual, 0.0)
+        full = self.picture(residual)
         variance = float(np.sum(full[self.lit] ** 2)) / max(int(self.lit.sum()) - slopes.shape[1] - 2, 1)
         # few pixels determine the correlation badly; the paper has many, if its noise is similar
         residual_correlation = correlation_of(full, self.used & (self.distance <= self.dot.reach + 2))
@@ -204,7 +198,7 @@ class Forward:
         prior = penalty if is_prior else 0.0
         score_cov = own_variance * (slopes.T @ self.correlated_noise(slopes, correlation) + prior)
         if source_variance > 0:  # (K' J)' (K' J) over the source's pixels with noise
-            pictures = rfft2(self.picture(slopes.T, 0.0), self.grid)
+            pictures = rfft2(self.picture(slopes.T), self.grid)
             has_source_noise = (self.distance <= self.source.reach * self.magnification).ravel()
             spread = np.where(has_source_noise, self.convolve(pictures, kernel[None], all_pixels=True), 0.0)
             correlated_spread = correlate(spread.reshape(-1, *self.data.shape), self.noise_correlation)
@@ -215,7 +209,7 @@ class Forward:
 
     def correlated_noise(self, columns: Array, correlation: Array) -> Array:
         """Product of the noise's correlation matrix with columns `[pixels used, p]`."""
-        return np.asarray(correlate(self.picture(columns.T, 0.0), correlation)[:, self.used].T)
+        return np.asarray(correlate(self.picture(columns.T), correlation)[:, self.used].T)
 
     def _shaped(self, family: str, names: tuple[str, ...], p: Array) -> Array:
         """The moved source convolved with the kernel, without gain and background: `[pixels used]`."""

@@ -20,8 +20,6 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-__all__ = ["MANIFEST", "Captures", "Colours", "inside", "read_captures"]
-
 MANIFEST = "capture.toml"
 Colours = Literal["mean", "each"]
 

@@ -49,16 +49,6 @@ def _mixed_differences(picture: Array) -> Array:
     return (rows[2:] - 2 * rows[1:-1] + rows[:-2]) / 6.0
 
 
-def rounding_of(levels: Array) -> float:
-    """Upper limit for the variance of rounding to a file's levels, made or hidden: a level halfway between two.
-
-    Levels that are means of three colours are three times as close.
-    """
-    steps = np.diff(np.unique(levels))
-    steps = steps[steps > 1e-6 * np.abs(levels).max(initial=0.0)]  # equal means may differ in the last digit
-    return 3 * float(steps.min()) ** 2 / 4 if steps.size else 0.0
-
-
 def correlation_of(values: Array, is_used: Mask) -> Array:
     """Correlation of the noise (mean 0) of a picture's used pixels with their neighbours.
 

@@ -36,11 +36,7 @@ _WORSE_IN_A_ROW = 3  # number of successively worse strengths of smoothing after
 
 
 def solve_opening(round_fit: Solution) -> tuple[Solution, str] | None:
-    """The opening that explains the residual of the free round profile, or None if none does.
-
-    Returns:
-        The solution of family "polygon" or "image", and the reason for it.
-    """
+    """The opening ("polygon" or "image") that explains a free round profile's residual, and why; None if none does."""
     best, excluded, why = round_fit, "round", ""
     blades, harmonic_chi, _ = _harmonic(round_fit)
     if harmonic_chi > _MIN_HARMONIC_CHI:
@@ -74,7 +70,7 @@ def solve_polygon(round_fit: Solution) -> Solution:
 
 
 def solve_image(previous: Solution, kernel: Array | None = None) -> Solution:
-    """Fits the opening as a picture, from a kernel if given; the moves start from those of `before`."""
+    """Fits the opening as a picture, from a kernel if given; the moves start from those of `previous`."""
     kernel = _deconvolved(previous)[0] if kernel is None else kernel
     y, x = center_of_mass(kernel)
     rows, columns = np.nonzero(kernel > 0.01 * kernel.max())
@@ -86,7 +82,7 @@ def solve_image(previous: Solution, kernel: Array | None = None) -> Solution:
 
 
 def _solved(previous: Solution, opening: Aperture, family: str, start: dict[str, float]) -> Solution:
-    """The solution with an opening; the magnification starts from that of `before`."""
+    """The solution with an opening; the magnification starts from that of `previous`."""
     magnification = previous.moves["magnification"]
     pair = replace(previous.pair, opening=opening, start={family: start}, prior={}, held_magnification=magnification)
     return pair.solve(family)
@@ -96,11 +92,8 @@ def _harmonic(round_fit: Solution) -> tuple[int, float, float]:
     """The polygon that is most significant in a round profile's residual.
 
     A polygon is a circle with an angle-dependent radius. The difference from the circle lies on a ring and has one
-    period for each blade.
-
-    Returns:
-        Its number of blades, chi squared of the two amplitudes, and the angle of a corner in degrees from the right,
-        clockwise on the screen.
+    period for each blade. Returns the number of blades, chi squared of the two amplitudes, and the angle of a corner in
+    degrees from the right, clockwise on the screen.
     """
     pair, size = round_fit.pair, np.sqrt(2) * size_of_blur(round_fit)[0]
     half = min(int(np.ceil(1.3 * size)) + 3, pair.half)
@@ -126,7 +119,7 @@ def turned(opening: Aperture) -> Aperture:
     return replace(opening, rotation_deg=float(opening.rotation_deg) + 180.0)
 
 
-def common_opening(fits: Sequence[BlurFit], nearer: Sequence[bool]) -> Aperture:
+def common_opening(fits: Sequence[BlurFit], nearer: Mask) -> Aperture:
     """One opening for all distances, as seen behind the focus; larger blurs have more weight.
 
     The fits are all "polygon", or all "image"; in front of the focus an opening is seen rotated by half a turn.
@@ -154,9 +147,8 @@ def common_opening(fits: Sequence[BlurFit], nearer: Sequence[bool]) -> Aperture:
 def _deconvolved(shape: Solution) -> tuple[Array, float]:
     """Deconvolves a pair of pictures, starting from a solution, which gives the moves and the kernel's reach.
 
-    Returns:
-        The kernel `[k, k]`, k odd, non-negative, summing to 1; and twice the increase of the log likelihood of withheld
-        pixels over the solution.
+    Returns the kernel `[k, k]`, k odd, non-negative, summing to 1; and twice the increase of the log likelihood of
+    withheld pixels over the solution.
     """
     pair = shape.pair
     source = pair.moved_source(shape.moves)

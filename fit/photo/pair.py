@@ -151,7 +151,7 @@ def fit_pair(
         # whether the magnification is known before the fit: a point has none
         is_known = True if sharp is None else None if fit_magnification is None else not fit_magnification
         pair.fit_moves = ALL_MOVES if is_known is False else ("dx", "dy")
-        pair.opening = aperture
+        pair.opening = aperture or Aperture()
         free_profile = family in ("auto", "radial", *OPENINGS) and aperture is None
         # a free profile gives an unbiased magnification, unlike a wrong family
         if free_profile:

@@ -85,10 +85,8 @@ def read_photographs(
         if refusal := optional_formats.refusal(path):
             raise FitError(refusal, file=str(path))
     if len(files) < 2:
-        text = (
-            f"there is neither a {MANIFEST} nor two photographs (.jpg .png .tif .exr) of the target that torchdof fit"
-        )
-        raise FitError(f"{text} --target target.pdf makes", "manifest", file=folder_name)
+        text = f"there is neither a {MANIFEST} nor two photographs (.jpg .png .tif .exr) of the target that "
+        raise FitError(f"{text}torchdof fit --target target.pdf makes", "manifest", file=folder_name)
     pictures: list[Photograph] = []
     advice: list[str] = []
     settings, integers = dict[str, float](), True
@@ -205,8 +203,6 @@ def _advice(
             advice.append(f"{p.file}: the paper is clipped; expose a stop less")
         if p.target.white < 0.15:
             advice.append(f"{p.file}: the paper is at {100 * p.target.white:.0f} % of white; expose more")
-        if p.target.elongation > 1.03:
-            advice.append(
-                f"{p.file}: the square is {p.target.elongation:.2f} times as long as wide; look at it square on"
-            )
+        if (ratio := p.target.elongation) > 1.03:
+            advice.append(f"{p.file}: the square is {ratio:.2f} times as long as wide; look at it square on")
     return advice

@@ -12,7 +12,7 @@ from torchdof.validation import show
 from ..problems import FitError, warn
 from ..result import Array, BlurFit, Indices
 from ..solve import best_of, information_criterion, inverse
-from ..validation import a_choice, a_picture
+from ..validation import a_choice, a_picture, real_numbers
 from .dot import find_dot
 
 _NAMES = {"gaussian": ("N", "sigma"), "ring": ("N", "r_c", "sigma"), "softm": ("N", "radius", "sigma", "b", "m")}
@@ -81,7 +81,17 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
     x, y = radii[order] / unit, values[order] / peak
     # noise from second differences of samples sorted by r
     noise = float(np.sqrt(np.mean((y[2:] - 2 * y[1:-1] + y[:-2]) ** 2) / 6.0))
-    _refuse_flat(x, y, noise)
+    # F test of a parabola over r against a constant
+    parabola = np.stack([np.ones_like(x), x, x * x], axis=1)
+    unexplained = float(np.sum((y - parabola @ np.linalg.lstsq(parabola, y, rcond=None)[0]) ** 2))
+    explained = float(np.sum((y - y.mean()) ** 2)) - unexplained
+    variation = float(np.sqrt(max(explained, 0.0) / y.size))
+    if variation < 1e-8 or explained / 2 < _FLAT_F * unexplained / (y.size - 3):
+        text = (
+            f"the profile is flat: it varies by {variation:.3g} of its peak over r, in a noise of {noise:.3g}; sample "
+            "farther out, or move the paper farther from focus"
+        )
+        raise FitError(text, "flat profile", number=variation / noise if noise > 0 else 0.0)
 
     def model(p: Array) -> Array:
         return evaluate(family, x, dict(zip(names, p, strict=True)))
@@ -140,17 +150,13 @@ def evaluate(family: str, r: Array, params: dict[str, float | Array]) -> Array:
 
 
 def _checked(r: ArrayLike, strength: ArrayLike, fewest: int) -> tuple[Array, Array]:
-    """Radii and strengths `[n]` as float64 with at least `least` different radii, or an error."""
-    try:
-        if np.iscomplexobj(r) or np.iscomplexobj(strength):
-            raise TypeError
-        radii, values = np.asarray(r, dtype=np.float64), np.asarray(strength, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise FitError("r and strength must be numbers, one strength for each radius") from None
+    """Radii and strengths `[n]` as float64 with at least `fewest` different radii, or an error."""
+    radii, values = real_numbers(r), real_numbers(strength)
+    if radii is None or values is None:
+        raise FitError("r and strength must be numbers, one strength for each radius")
     if radii.ndim != 1 or radii.shape != values.shape:
         raise FitError(f"r and strength must both be [n], got {list(radii.shape)} and {list(values.shape)}")
-    bad = int(np.sum(~np.isfinite(radii) | ~np.isfinite(values)))
-    if bad:
+    if bad := int(np.sum(~np.isfinite(radii) | ~np.isfinite(values))):
         text = f"{bad} of {radii.size} samples are NaN or infinite; leave them out"
         raise FitError(text, "not finite", number=float(bad))
     for name, array in (("r", radii), ("strength", values)):
@@ -160,28 +166,11 @@ def _checked(r: ArrayLike, strength: ArrayLike, fewest: int) -> tuple[Array, Arr
             raise FitError(text, number=largest)
     if radii.size and radii.min() < 0:
         raise FitError(f"r must be >= 0, got {radii.min():g}", number=float(radii.min()))
-    distinct = np.unique(radii).size
-    if distinct < fewest:
+    if (distinct := np.unique(radii).size) < fewest:
         raise FitError(f"the family takes at least {fewest} different radii, got {distinct}", number=float(distinct))
     if values.max() <= 0:
         raise FitError("strength must be positive somewhere; is the dot darker than its paper?", number=values.max())
     return radii, values
-
-
-def _refuse_flat(x: Array, y: Array, noise: float) -> None:
-    """Raises an error if a parabola over r explains the samples no better than a constant."""
-    parabola = np.stack([np.ones_like(x), x, x * x], axis=1)
-    residual = y - parabola @ np.linalg.lstsq(parabola, y, rcond=None)[0]
-    unexplained = float(residual @ residual)
-    explained = float(np.sum((y - y.mean()) ** 2)) - unexplained
-    variation = float(np.sqrt(max(explained, 0.0) / y.size))
-    # F test of a parabola against a constant
-    if variation < 1e-8 or explained / 2 < _FLAT_F * unexplained / (y.size - 3):
-        text = (
-            f"the profile is flat: it varies by {variation:.3g} of its peak over r, in a noise of {noise:.3g}; sample "
-            "farther out, or move the paper farther from focus"
-        )
-        raise FitError(text, "flat profile", number=variation / noise if noise > 0 else 0.0)
 
 
 def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, Indices]:

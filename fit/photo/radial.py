@@ -52,18 +52,10 @@ def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: i
     free_covariance = pair.covariance(centred, residual, kernel, gain, smoothing[np.ix_(free, free)])
     covariance = np.zeros((count, count))
     covariance[np.ix_(free, free)] = np.where(np.isfinite(free_covariance), free_covariance, 0.0)
-    return Solution(
-        pair=pair,
-        family="radial",
-        params={"values": weights / float(hat_light @ weights), "radius": radius},
-        moves=moves,
-        gain=gain,
-        background=background,
-        fitted=fitted,
-        names=tuple(f"values[{i}]" for i in range(count)),
-        covariance=covariance / gain**2,
-        slopes=np.stack(pair.move_columns(moves, ("dx", "dy"), kernel), axis=1),
-    )
+    params: dict[str, float | Array] = {"values": weights / float(hat_light @ weights), "radius": radius}
+    names = tuple(f"values[{i}]" for i in range(count))
+    slopes = np.stack(pair.move_columns(moves, ("dx", "dy"), kernel), axis=1)
+    return Solution(pair, "radial", params, moves, gain, background, fitted, names, covariance / gain**2, slopes)
 
 
 def _non_negative(columns: Array, data: Array) -> tuple[Array, Array]:
@@ -85,16 +77,3 @@ def _non_negative(columns: Array, data: Array) -> tuple[Array, Array]:
         score = squares / (data.size - min(_CAUTION * float(effective), 0.9 * data.size)) ** 2
         candidates.append((score, weights, smooth))
     return min(candidates, key=lambda t: t[0])[1:]
-
-
-def size_of_profile(solution: Solution) -> tuple[float, float]:
-    """Rms radius of a free profile and its standard error, px; the second moment is linear in the values."""
-    values, radius = np.asarray(solution.params["values"]), float(solution.params["radius"])
-    r = np.linspace(0, radius, 64 * values.size + 1)
-    position = r / radius * (values.size - 1)
-    hats = np.clip(1 - np.abs(position[None, :] - np.arange(values.size)[:, None]), 0, None)
-    light, moment = hats @ r, hats @ r**3
-    rms = float(np.sqrt(moment @ values / (light @ values)))
-    # derivative of a quotient: the total light depends on the values too
-    slope = (moment - rms**2 * light) / (light @ values) / (2 * rms)
-    return rms, float(np.sqrt(max(slope @ solution.covariance @ slope, 0.0)))

@@ -16,7 +16,8 @@ from torchdof.cli.output import Bar, json_line
 from torchdof.fit.lens import trace
 from torchdof.fit.lens.lens import RGB_UM, Lens
 from torchdof.fit.photo.across import table_of_dots
-from torchdof.fit.photo.manifest import MANIFEST, Captures, read_captures
+from torchdof.fit.photo.captures import Captures
+from torchdof.fit.photo.manifest import MANIFEST, read_captures
 from torchdof.fit.photo.photographs import Photographs, read_photographs
 from torchdof.fit.photo.table import TableFit, fit_captures
 from torchdof.fit.problems import FitWarning

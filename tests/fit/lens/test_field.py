@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests import lenses
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
 from torchdof.fit import trace_table
 from torchdof.fit.lens import Lens
@@ -83,7 +84,7 @@ def rays_of(z_m: float, size: tuple[int, int], samples: int) -> Any:
     The turned lens is traced forwards. `plane_views` wants the pixel at which the sharp image shows the point where a
     ray meets the plane: the image through a small stop, whose distortion is a polynomial fitted to chief rays.
     """
-    back, first, pixel = STOPPED.turned(), STOPPED.paraxial(), SENSOR_MM / size[1]
+    back, first, pixel = lenses.turned(STOPPED), STOPPED.paraxial(), SENSOR_MM / size[1]
     heights = 0.5 * math.hypot(*size) * pixel * np.linspace(0.1, 1.1, 9)
     distance = vertex_distance_mm(STOPPED, z_m, "principal", SENSOR)
     shown = [chief_ray_mm(STOPPED, z_m, SENSOR, height, "principal") for height in heights]

@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 
+from tests.lenses import turned
 from torchdof.fit.lens.glass import Glass
 from torchdof.fit.lens.lens import Lens, trace_rays
 from torchdof.fit.lens.surface import Surface
@@ -72,7 +73,7 @@ def test_rays_near_the_axis_follow_first_order_optics(name):
     # a ray to the centre of the entrance pupil leaves through the centre of the exit pupil
     direction = np.array([[0.0], [2e-5], [1.0]]) / math.hypot(2e-5, 1.0)
     rays = trace_rays(lens, first.entrance_pupil * ALONG - 100.0 * direction, direction, clip=False)
-    exit_pupil = lens.vertices[-1] - lens.turned().paraxial().entrance_pupil
+    exit_pupil = lens.vertices[-1] - turned(lens).paraxial().entrance_pupil
     assert rays.at(exit_pupil)[1, 0] == pytest.approx(0.0, abs=1e-10)
 
 
