@@ -12,7 +12,7 @@ from torch.testing import assert_close
 
 from tests.scenes import CAMERA, EVERY_WAY, WAYS, halves, slope, texture, whole
 from tests.traced import TRACED
-from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, validation
+from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, tensors, validation
 from torchdof.depth import from_relative
 from torchdof.depth.relative import RELATIVE_KINDS
 from torchdof.io.highlights import expand_highlights
@@ -230,3 +230,20 @@ def test_autograd_keeps_a_bounded_number_of_frames(
         picture = blur_by_coc(light.requires_grad_(), coc_px.requires_grad_(), occlusion=occlusion)
     assert sum(storage.nbytes() for storage in kept.values()) < frames * light.nbytes
     torch.autograd.grad(picture.sum(), (light, coc_px))
+
+
+def test_a_recomputed_function_has_its_gradients_again_and_to_any_order() -> None:
+    values = torch.rand(5, dtype=torch.float64, requires_grad=True)
+    calls = []
+
+    def function() -> Tensor:
+        calls.append(len(calls))
+        return values.sin().exp() * values * values
+
+    (expected,) = torch.autograd.grad(function().sum(), values)
+    result = tensors.recomputed(function).sum()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        gradients = [torch.autograd.grad(result, values, retain_graph=True)[0] for _ in range(2)]
+    assert all(torch.equal(gradient, expected) for gradient in gradients)
+    assert len(calls) == 4  # twice forward, once in each backward pass
+    assert torch.autograd.gradgradcheck(lambda x: tensors.recomputed(lambda: x.sin().exp() * x * x), values)
