@@ -175,11 +175,14 @@ def attribute_emitters(
     touches = counted * (near_by > _FALLOFF ** (2 * _TOUCHING**2 + 1))
     nearest = window_coc.amin(0)
 
-    def beyond(coc: Tensor, side: float, share: float) -> tuple[Tensor, ...]:
+    brightness = peaks**2
+    dimness = 1.0 / (brightness + (_DIM * own_peak) ** 2).clamp_min(1e-24)
+
+    def beyond(coc: Tensor, side: float, share: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Confidence that the emitter lies behind (side 1) or in front of (-1) surfaces with coc ``coc``, 0 to 1.
 
-        It requires pixels there whose peak exceeds ``share`` times that of the surfaces. Also returns the light of the
-        surfaces where they are dimmest, the larger of both peaks, and the emitter's coc.
+        It requires pixels there whose peak exceeds ``share`` times that of the surfaces. Also returns the weights of
+        the window's pixels beyond the surfaces, and of those on them that are dim, and the larger of both peaks.
         """
         away = side * (window_coc - coc)
         there = (counted if side > 0 else touches) * (away - 1.0).clamp(0.0, 1.0)
@@ -188,16 +191,16 @@ def attribute_emitters(
         emitter_peak, same_peak = (there * peaks).amax(0), (same * peaks).amax(0).clamp_min(1e-12)
         sureness = excess * (10.0 * dim.sum(0)).clamp(max=1.0)
         sureness = sureness * (10.0 * (emitter_peak / same_peak - share)).clamp(0.0, 1.0)
-        dimmest = dim / (peaks**2 + (_DIM * own_peak) ** 2).clamp_min(1e-24)
-        surface = (colour * dimmest).sum(1) / dimmest.sum(0).clamp_min(1e-12)
-        lit = there * near_by * peaks**2
-        emitter_coc = nearest + ((window_coc - nearest) * lit).sum(0) / lit.sum(0).clamp_min(1e-12)
-        return sureness, surface, torch.maximum(emitter_peak, same_peak), emitter_coc
+        return sureness, there, dim, torch.maximum(emitter_peak, same_peak)
 
     _, other, other_coc, weight = (pixels.pick(t, bright) for t in surfaces)
     other, other_coc, weight = other / scale, other_coc[0], weight[0]
     for side, least_share in ((-1.0, 1.0), (1.0, 0.5)):
-        sureness, surface, top, emitter_coc = beyond(own_coc, side, least_share)
+        sureness, there, dim, top = beyond(own_coc, side, least_share)
+        dimmest = dim * dimness
+        surface = (colour * dimmest).sum(1) / dimmest.sum(0).clamp_min(1e-12)  # its light where it is dimmest
+        lit = there * near_by * brightness
+        emitter_coc = nearest + ((window_coc - nearest) * lit).sum(0) / lit.sum(0).clamp_min(1e-12)
         if side < 0:  # an emitter seen through a surface is not in front of it
             sureness = sureness * (1.0 - beyond(emitter_coc, 1.0, 0.5)[0])
         floor = surface.amax(0)
