@@ -219,10 +219,9 @@ def _render_items(
     if not is_unscaled:
         light, behind_light = light * scale, None if behind_light is None else behind_light * scale
 
-    # limit of highlights; without occlusion only those are splatted that a coarse layer would soften
-    has_rays = (
-        plan.rays and not is_compiled()
-    )  # their number depends on the light, which compiled graphs do not support
+    # limit of highlights; without occlusion only those are splatted that a coarse layer would soften. A compiled graph
+    # has no rays: their number depends on the light.
+    has_rays = plan.rays and not is_compiled()
     crisp_px = [plan.crisp_px if options.method == "layered" else math.inf for plan in plans]
     coarse = has_rays and any(px < max(map(abs, plan.coc_px)) for plan, px in zip(plans, crisp_px, strict=True))
     limit = highlights.threshold(light, weight) if options.occlusion or options.normalize or coarse else None
