@@ -234,7 +234,7 @@ def test_autograd_keeps_a_bounded_number_of_frames(
 
 def test_a_recomputed_function_has_its_gradients_again_and_to_any_order() -> None:
     values = torch.rand(5, dtype=torch.float64, requires_grad=True)
-    calls = []
+    calls: list[int] = []
 
     def function() -> Tensor:
         calls.append(len(calls))
