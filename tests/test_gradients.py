@@ -214,7 +214,7 @@ def test_torch_func_of_an_old_pytorch_is_refused_by_name(which: str, monkeypatch
 def test_autograd_keeps_a_bounded_number_of_frames(
     occlusion: bool, frames: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Layers, what is behind surfaces, and rays are computed again in the backward pass."""
+    """Layers, hidden surfaces and rays are computed again in the backward pass."""
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
     light = 0.05 + torch.rand(1, 3, 96, 128)
     light[..., 7::20, 9::17] = 40.0
