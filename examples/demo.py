@@ -46,12 +46,13 @@ def motorcycle(folder: Path, focus_m: float) -> Shot:
     return Shot(read_image(folder / "motorcycle_left.png"), depth, camera)
 
 
-def portrait(folder: Path) -> Shot:
-    """A made photograph with relative depth; lamps that the file stores as white get up to 4 stops more light."""
+def portrait(folder: Path, stops: float) -> Shot:
+    """A made photograph with relative depth; lamps that the file stores as white get up to ``stops`` more light."""
     picture = read_image(folder / "portrait.jpg")
     depth = from_relative(read_values(folder / "depth.png"), near_m=0.744, far_m=14.0)
     camera = torchdof.Camera.from_fov(36.0, aperture_radius_m=0.0173, focus_m=1.14)
-    return Shot(dataclasses.replace(picture, pixels=expand_highlights(picture.pixels, stops=4.0)), depth, camera)
+    light = expand_highlights(picture.pixels, stops) if stops else picture.pixels
+    return Shot(dataclasses.replace(picture, pixels=light), depth, camera)
 
 
 def render(name: str, shot: Shot, out: Path) -> str:
@@ -88,7 +89,7 @@ def main() -> None:
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     shots = {name: motorcycle(arguments.data, focus_m) for name, focus_m in FOCUS_M.items()}
-    shots["portrait"] = portrait(arguments.data.parent / "portrait")
+    shots["portrait"] = portrait(arguments.data.parent / "portrait", stops=4.0)
     with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), transient=True) as progress:
         task = progress.add_task("rendering", total=len(shots))
         for name, shot in shots.items():

@@ -21,10 +21,9 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 import torchdof
-from torchdof.depth import from_relative, inspect_depth, read_depth
+from torchdof.depth import inspect_depth, read_depth
 from torchdof.depth.inspect import coc_colours, panels, tint_focus
-from torchdof.io.highlights import expand_highlights
-from torchdof.io.images import Picture, read_image, read_values, write_image
+from torchdof.io.images import Picture, read_image, write_image
 from torchdof.io.sheet import write_sheet
 from torchdof.reference.degraded import degrade
 from torchdof.reference.scenes import Scene, read_scenes
@@ -32,6 +31,7 @@ from torchdof.reference.scenes import Scene, read_scenes
 ROOT = Path(__file__).parents[1]
 MOTORCYCLE, PORTRAIT = ROOT / "examples/data/motorcycle", ROOT / "examples/data/portrait"
 SCENES = ROOT / "tests/data/scenes"
+DEMO = runpy.run_path(str(ROOT / "examples/demo.py"))
 CALIBRATION = json.loads((MOTORCYCLE / "camera.json").read_text())
 FOV_X_DEG = math.degrees(2 * math.atan(741 / 2 / CALIBRATION["focal_length_px"]))
 APERTURE_RADIUS_M = 0.04  # larger than in most lenses, so that the blur is visible in a picture 741 pixels wide
@@ -86,12 +86,10 @@ def draw_far(path: Path) -> None:
     photograph(path, focused(4.6))
 
 
-def portrait(stops: float) -> Tensor:
-    """A portrait focused on the face; lamps behind it get up to ``stops`` more light before they are blurred."""
-    light = read_image(PORTRAIT / "portrait.jpg").pixels
-    depth = from_relative(read_values(PORTRAIT / "depth.png"), near_m=0.744, far_m=14.0)
-    camera = torchdof.Camera.from_fov(36.0, aperture_radius_m=0.0173, focus_m=1.14)
-    return torchdof.depth_of_field(expand_highlights(light, stops) if stops else light, depth, camera)
+def portrait(stops: float = 0.0) -> Tensor:
+    """The demo's portrait; lamps behind the face get up to ``stops`` more light before they are blurred."""
+    picture, depth, camera = DEMO["portrait"](PORTRAIT, stops)
+    return torchdof.depth_of_field(picture.pixels, depth, camera)
 
 
 def draw_portrait(path: Path) -> None:
@@ -103,7 +101,7 @@ def draw_portrait_lights(path: Path) -> None:
     """A part of the portrait: sharp, with lamps as bright as the file holds them, and with brighter ones."""
     part = (..., slice(150, 390), slice(500, 760))
     sharp = read_image(PORTRAIT / "portrait.jpg").pixels
-    pictures = {"photograph": sharp, "lamps as stored": portrait(0.0), "lamps 4 stops brighter": portrait(4.0)}
+    pictures = {"photograph": sharp, "lamps as stored": portrait(), "lamps 4 stops brighter": portrait(4.0)}
     write_sheet(path, {caption: pixels[part] for caption, pixels in pictures.items()})
 
 

@@ -53,6 +53,15 @@ def halves(left: float, right: float) -> Tensor:
     return values
 
 
+def post_before_lamps(batch: int = 1) -> tuple[Tensor, Tensor]:
+    """Light and coc of a post in front of a slope with lamps; blurs of the items fall from the whole to two fifths."""
+    light = 0.05 + torch.rand(batch, 3, 96, 128, generator=torch.Generator().manual_seed(0))
+    light[..., 7::20, 9::17] = 40.0
+    coc_px = slope(-3.0, 14.0, 96, 128).repeat(batch, 1, 1, 1)
+    coc_px[..., 50:58] = -11.0
+    return light, coc_px * torch.linspace(1.0, 0.4, batch)[:, None, None, None]
+
+
 RED, BLUE = torch.tensor([0.7, 0.2, 0.1]), torch.tensor([0.1, 0.3, 0.8])
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.scenes import CAMERA, EVERY_WAY, WAYS, halves, slope, texture, whole
+from tests.scenes import CAMERA, EVERY_WAY, WAYS, halves, post_before_lamps, slope, texture, whole
 from tests.traced import TRACED
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, tensors, validation
 from torchdof.depth import from_relative
@@ -216,10 +216,7 @@ def test_autograd_keeps_a_bounded_number_of_frames(
 ) -> None:
     """Layers, hidden surfaces and rays are computed again in the backward pass."""
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
-    light = 0.05 + torch.rand(1, 3, 96, 128)
-    light[..., 7::20, 9::17] = 40.0
-    coc_px = torch.linspace(-3.0, 14.0, 128).repeat(1, 1, 96, 1)
-    coc_px[..., 50:58] = -11.0
+    light, coc_px = post_before_lamps()
     kept: dict[int, torch.UntypedStorage] = {}  # by their address, and alive, so that no address is used twice
 
     def keep(values: Tensor) -> Tensor:

@@ -1,6 +1,5 @@
 """Depth of field as a module and as functions: they check their arguments and call the pipeline."""
 
-import contextlib
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -19,7 +18,7 @@ from .render.attention import Attention
 from .render.ops import EAGER, Ops
 from .render.plan import Plan
 from .render.resample import at_size_of
-from .tensors import is_traced, refuse_old_compiler
+from .tensors import is_traced, refuse_old_compiler, without_autocast
 
 __all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]
 
@@ -157,7 +156,7 @@ class DepthOfField(nn.Module):
             raise ValueError("layers hide each other: they need occlusion=True")
         frame = rgba.new_empty(batch, 1, height, width)
         cocs = [self.coc_as_given(frame, layer, focus_m, f_number, name="depth_m") for layer in maps.unbind(1)]
-        with _engine(rgba):
+        with without_autocast(rgba.device.type):
             return pipeline.blur_stack(rgba, torch.stack(cocs, 1), options)
 
     def coc_px(
@@ -373,14 +372,8 @@ def blur(
     if hidden is not None and not options.occlusion:
         raise ValueError("without occlusion nothing is hidden: a background needs occlusion=True")
     _check_attention(attention, plan, options)
-    with _engine(image):
+    with without_autocast(image.device.type):  # it would convolve in half precision
         return pipeline.blur(image, coc_px, plan, options, hidden, attention, ops)
-
-
-def _engine(light: Tensor) -> contextlib.AbstractContextManager[Any]:
-    """Context of the pipeline: autocast is off, because it would convolve in half precision."""
-    device = light.device.type
-    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else contextlib.nullcontext()
 
 
 def _check_plan(plan: Plan | None) -> None:

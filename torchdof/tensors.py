@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
@@ -20,6 +21,7 @@ __all__ = [
     "is_traced",
     "recomputed",
     "refuse_old_compiler",
+    "without_autocast",
 ]
 
 TRACEABLE = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 13)
@@ -78,6 +80,11 @@ def is_differentiated(values: Tensor) -> bool:
         values = torch._C._functorch.get_unwrapped(values)
 
 
+def without_autocast(device: str) -> AbstractContextManager[Any]:
+    """A context in which operations on a type of device keep their dtype, also inside an autocast region."""
+    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
+
+
 def recomputed(compute: Callable[[], Tensor]) -> Tensor:
     """The result of ``compute()``, which the backward pass computes again instead of keeping all intermediate tensors.
 
@@ -102,7 +109,7 @@ def recomputed(compute: Callable[[], Tensor]) -> Tensor:
         index, device = packed
         if index not in again:
             again.clear()
-            with torch.enable_grad(), torch.autocast(device, enabled=False), saved_tensors_hooks(repack, unpack):
+            with torch.enable_grad(), without_autocast(device), saved_tensors_hooks(repack, unpack):
                 compute()
         return again.pop(index)
 

@@ -34,14 +34,16 @@ class Counted(TorchDispatchMode):
         return function(*args, **(kwargs or {}))
 
 
-def gpu_seconds(call: Callable[[], None], times: int = 5) -> float:
-    """Median time of some calls, with all operations that they start on the GPU."""
+def seconds(call: Callable[[], object], times: int = 5, device: str = "cpu") -> float:
+    """Median time of some calls, after one that warms up, with all operations that they start on a GPU."""
+    wait = (lambda: None) if device == "cpu" else torch.cuda.synchronize
+    call()
     durations = []
     for _ in range(times):
-        torch.cuda.synchronize()
+        wait()
         start = time.perf_counter()
         call()
-        torch.cuda.synchronize()
+        wait()
         durations.append(time.perf_counter() - start)
     return statistics.median(durations)
 
@@ -72,7 +74,9 @@ def main() -> None:
                 render()  # some tensors are made once
                 with Counted() as counted:
                     render()
-                took = f", {1000 * gpu_seconds(render):6.1f} ms" if arguments.device != "cpu" else ""
+                took = (
+                    f", {1000 * seconds(render, device=arguments.device):6.1f} ms" if arguments.device != "cpu" else ""
+                )
             print(f"{name:28} {counted.operations:6} operations, {counted.reads:3} times values{took}", flush=True)
 
 

@@ -5,25 +5,12 @@ python examples/benchmarks/per_pixel.py [--side 256]
 
 import argparse
 import functools
-import statistics
-import time
-from collections.abc import Callable
 
 import torch
 
+from examples.benchmarks.operations import seconds
 from torchdof import blur_by_coc
 from torchdof.functional import splat
-
-
-def seconds(call: Callable[[], object], times: int = 5) -> float:
-    """Median of some calls, after one that warms up."""
-    call()
-    durations = []
-    for _ in range(times):
-        start = time.perf_counter()
-        call()
-        durations.append(time.perf_counter() - start)
-    return statistics.median(durations)
 
 
 def gradients(image: torch.Tensor, coc_px: torch.Tensor) -> tuple[torch.Tensor, ...]:

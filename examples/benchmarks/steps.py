@@ -11,17 +11,15 @@ import argparse
 import itertools
 import json
 import resource
-import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
 import torch.nn.functional as functional
 
-from examples.benchmarks.operations import gpu_seconds
+from examples.benchmarks.operations import seconds
 from torchdof import blur_by_coc
 from torchdof.depth.reading import read_depth
 from torchdof.functional import splat
@@ -53,13 +51,6 @@ def parts(height: int, width: int, batch: int) -> tuple[torch.Tensor, torch.Tens
     return crops[0].contiguous(), crops[1].contiguous()
 
 
-def seconds(call: Callable[[], None]) -> float:
-    """Time of a call on the CPU."""
-    start = time.perf_counter()
-    call()
-    return time.perf_counter() - start
-
-
 def measure(size: tuple[int, int, int], renderer: str, device: str, repeat: int) -> None:
     """Print one row."""
     image, dioptres = (t.to(device) for t in parts(*size))
@@ -77,17 +68,18 @@ def measure(size: tuple[int, int, int], renderer: str, device: str, repeat: int)
         light, radius = image.clone().requires_grad_(), coc_px().requires_grad_()
         torch.autograd.grad(render(light, radius).square().mean(), (light, radius))
 
-    def measured(call: Callable[[], None]) -> tuple[float, float]:
-        """Median seconds of some calls, after one that warms up, and the most MiB they take."""
-        call()
+    def most_bytes() -> int:
         if device == "cpu":
-            taken = [seconds(call) for _ in range(repeat)]
-            return statistics.median(taken), (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib) / 1024
-        torch.cuda.reset_peak_memory_stats()
-        before = torch.cuda.memory_allocated()
-        return gpu_seconds(call, repeat), (torch.cuda.max_memory_allocated() - before) / 2**20
+            return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+        return torch.cuda.max_memory_allocated()
 
-    before_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    def measured(call: Callable[[], None]) -> tuple[float, float]:
+        """Median seconds of some calls, and the most MiB taken since the start; on a GPU since the first call."""
+        if device != "cpu":
+            torch.cuda.reset_peak_memory_stats()
+        return seconds(call, repeat, device), (most_bytes() - before) / 2**20
+
+    before = most_bytes()
     (frame_s, frame_mib), (step_s, step_mib) = measured(picture), measured(step)
     height, width, batch = size
     name = f"{batch} of {width} x {height}, {renderer}"

@@ -6,22 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scenes import assert_same_picture, random_scene
+from tests.scenes import assert_same_picture, post_before_lamps, random_scene
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
 from torchdof.functional import splat
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 OCCLUSION = pytest.mark.parametrize("occlusion", [True, False])
-
-
-def scene(batch: int = 3) -> tuple[Tensor, Tensor]:
-    """Light and coc of a post in front of a slope with lamps, other blurs for each item."""
-    generator = torch.Generator().manual_seed(0)
-    light = 0.05 + torch.rand(batch, 3, 96, 128, generator=generator)
-    light[:, :, 7::20, 9::17] = 40.0
-    coc_px = torch.linspace(-3.0, 14.0, 128).repeat(batch, 1, 96, 1)
-    coc_px[..., 50:58] = -11.0
-    return light, coc_px * torch.linspace(0.4, 1.0, batch)[:, None, None, None]
 
 
 def on_gpu(value: Any) -> Any:
@@ -53,7 +43,7 @@ def test_a_random_scene_is_the_same_picture(seed: int) -> None:
     ids=lambda options: next(iter(options), "defaults"),
 )
 def test_a_batch_is_the_same_picture_with_any_option(options: dict[str, Any]) -> None:
-    light, coc_px = scene()
+    light, coc_px = post_before_lamps(3)
     if options.get("check") is False:
         light[1, :, 5:9, 5:9], coc_px[2, :, 20:, 40:] = torch.nan, torch.nan
     expected = blur_by_coc(light, coc_px, **options)
@@ -66,7 +56,7 @@ def test_gradients_are_the_same(occlusion: bool, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
     found = []
     for device in ("cpu", "cuda"):
-        light, coc_px = (t.to(device).requires_grad_() for t in scene(2))
+        light, coc_px = (t.to(device).requires_grad_() for t in post_before_lamps(2))
         weight = torch.linspace(0.0, 1.0, 128, device=device)
         picture = blur_by_coc(light, coc_px, occlusion=occlusion)
         found.append([t.cpu() for t in torch.autograd.grad((picture * weight).sum(), (light, coc_px))])
@@ -76,7 +66,7 @@ def test_gradients_are_the_same(occlusion: bool, monkeypatch: pytest.MonkeyPatch
 
 @OCCLUSION
 def test_deterministic_algorithms_give_the_same_bits(occlusion: bool) -> None:
-    light, coc_px = (t.cuda() for t in scene())
+    light, coc_px = (t.cuda() for t in post_before_lamps(3))
     torch.use_deterministic_algorithms(True)
     try:
         results = []
@@ -91,7 +81,7 @@ def test_deterministic_algorithms_give_the_same_bits(occlusion: bool) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_and_autocast_round_only_the_result(dtype: torch.dtype) -> None:
-    light, coc_px = (t.cuda() for t in scene())
+    light, coc_px = (t.cuda() for t in post_before_lamps(3))
     expected = blur_by_coc(light.to(dtype).float(), coc_px)
     torch.testing.assert_close(blur_by_coc(light.to(dtype), coc_px), expected.to(dtype))
     leaf = light.clone().requires_grad_()
@@ -104,7 +94,7 @@ def test_half_precision_and_autocast_round_only_the_result(dtype: torch.dtype) -
 
 
 def test_a_module_a_stack_and_splat_work_on_the_gpu() -> None:
-    light, coc_px = scene(2)
+    light, coc_px = post_before_lamps(2)
     dof = DepthOfField(Camera(focal_length_mm=50.0, f_number=2.0, focus_m=2.0, sensor_width_mm=6.0))
     depth = torch.linspace(1.0, 6.0, 128).expand(2, 1, 96, 128).contiguous()
     assert_same_picture(dof(light, depth), dof.cuda()(light.cuda(), depth.cuda()).cpu(), light)
@@ -117,7 +107,7 @@ def test_a_module_a_stack_and_splat_work_on_the_gpu() -> None:
 
 
 def test_memory_of_a_step_is_bounded() -> None:
-    light, coc_px = (t.cuda().requires_grad_() for t in scene(4))
+    light, coc_px = (t.cuda().requires_grad_() for t in post_before_lamps(4))
     torch.autograd.grad(blur_by_coc(light, coc_px).sum(), (light, coc_px))
     torch.cuda.reset_peak_memory_stats()
     before = torch.cuda.memory_allocated()

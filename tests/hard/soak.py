@@ -46,9 +46,9 @@ def resident_mb() -> float:
 def growth_kb(renderings: int) -> float:
     """Growth of resident memory in kB for each rendering, after the first two fifths of ``renderings``.
 
-    A leak grows for ever. Caches grow up to a limit, which is made low enough to be reached by then:
-    images have at most 100 x 130 pixels, so that the engine keeps little scratch memory; the caches of kernels get a
-    limit of 1 MB each; oneDNN, which keeps up to 1024 compiled operations, one for each size of image, is switched off.
+    A leak grows for ever. Caches grow up to a limit, which is made low enough to be reached by then: images have at
+    most 100 x 130 pixels, so that the engine keeps little scratch memory; the caches of kernels get a limit of 1 MB
+    each; oneDNN, which keeps up to 1024 compiled operations, one for each size of image, is switched off.
     """
     for cache in gc.get_objects():
         if type(cache) is KernelCache:

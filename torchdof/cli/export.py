@@ -56,15 +56,17 @@ class Export:
 
     def run(self) -> None:
         """Writes a file, or prints the metadata of one."""
-        out = self.out
-        if self.show is not None and out is None:
+        if (self.out is None) == (self.show is None):
+            raise ValueError("give either -o FILE to write or --show FILE to read")
+        if self.show is not None:
             from torchdof.export.metadata import describe
 
             metadata = describe(self.show)
             print_result(self.as_json, metadata, _lines(metadata))
-            return
-        if self.show is not None or out is None:
-            raise ValueError("give either -o FILE to write or --show FILE to read")
+        elif self.out is not None:
+            self._write(self.out)
+
+    def _write(self, out: Path) -> None:
         if out.suffix != ".onnx":
             raise ValueError(f"the file is ONNX: name it {out.with_suffix('.onnx')}")
         from torchdof import Camera, DepthOfField

@@ -4,6 +4,7 @@ A shard's file name is its number, and its contents depend only on its row, its 
 was interrupted can therefore continue with the missing shards, and gives the same files as an uninterrupted one.
 """
 
+import contextlib
 import dataclasses
 import hashlib
 import importlib.metadata
@@ -212,8 +213,7 @@ class RenderShards:
     def _source(self, samples: str) -> str:
         """Digest of all that determines a shard: settings, samples, and size and time of their files."""
         files = {sample[name] for sample in json.loads(str(samples)) for name in ("image", "depth") if sample[name]}
-        stats = [os.stat(file) if os.path.exists(file) else None for file in sorted(files)]
-        facts = [self.settings(), str(samples), [stat and (stat.st_size, stat.st_mtime_ns) for stat in stats]]
+        facts = [self.settings(), str(samples), [_size_and_time(file) for file in sorted(files)]]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
     def _make(self, path: Path, source: str, samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -279,6 +279,14 @@ def _read_relative(
     values = read_values(path, channel)
     metres = from_relative(values, near_m, far_m, relative_kind, value_range=value_range, unknown=unknown)
     return resolve_holes(metres, path, fill)[0]
+
+
+def _size_and_time(file: str) -> tuple[int, int] | None:
+    """Size in bytes and time of the last change in ns; None if the file is missing."""
+    with contextlib.suppress(OSError):
+        facts = os.stat(file)
+        return facts.st_size, facts.st_mtime_ns
+    return None
 
 
 def _text(name: str) -> str:

@@ -89,6 +89,7 @@ def test_glasses_have_their_makers_indices(glass, lines, apart, lens_of):
     known = {line: n for line, n in zip((C_UM, D_UM, 0.54607, F_UM, G_UM), lines, strict=True) if n}
     assert [lens.indices(line)[1] for line in known] == pytest.approx(list(known.values()), abs=apart)
     assert lens.indices()[1] == lens.indices(D_UM)[1]
+    assert (lens.indices(F_UM)[1] != lens.indices(C_UM)[1]) == (glass != "1.5")
     if "/" in glass:
         n_d, abbe, *partial = map(float, glass.split("/"))
         n_c, n_f, n_g = (lens.indices(line)[1] for line in (C_UM, F_UM, G_UM))
