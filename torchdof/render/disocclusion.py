@@ -186,7 +186,7 @@ def fill_hidden(
     4. For each pixel, average the levels that have samples behind it, with larger weights for finer ones. Use only the
        samples behind it, as the foreground's colour must not leak in. The search reaches no farther than the pixel's
        blur: deeper inside, hidden surfaces never show.
-    5. Combine the hidden sample with a second surface that is hardly mixed in.
+    5. Replace second surfaces that are hardly mixed in by the hidden sample.
 
     Args:
         light: Light of each pixel's own surface (:func:`torchdof.render.matting.matte`), ``[B, C, H, W]``.
@@ -228,7 +228,7 @@ def fill_hidden(
 
     # the farthest surface around each cell of 4 x 4 pixels, and one level of cells that replaces all coarse levels
     cell_rows, cell_columns = whole[0] // BEHIND_STEP, whole[1] // BEHIND_STEP
-    wanted = ((coc_px.abs() > 0.5) & (other_weight < HIDDEN_WEIGHT)).to(coc_px.dtype)
+    wanted = ((coc_px.abs() > 0.5) & (2.0 * other_weight < HIDDEN_WEIGHT)).to(coc_px.dtype)
     cells = _largest(torch.cat([-coc_px, wanted], 1), cell_rows, cell_columns, BEHIND_STEP)
     nearest, is_wanted = -cells[:, :1], cells[:, 1:] > 0
     samples, shares = _samples(searched, (cell_rows, cell_columns), BEHIND_STEP)
@@ -246,11 +246,11 @@ def fill_hidden(
         searched = [*searched[:_FINE_LEVELS], of_cells]
     seen, total = ops.seen(_seen, searched, coc_px, wanted)
 
-    # the weight of the hidden sample falls linearly to 0 as that of the mixed surface rises to HIDDEN_WEIGHT
-    hidden = (total / _CERTAIN).clamp(max=1.0) * (HIDDEN_WEIGHT - other_weight).clamp_min(0.0)
-    weight = hidden + (1.0 - hidden / HIDDEN_WEIGHT) * other_weight
-    part = hidden / weight.clamp_min(1e-12)
-    light, coc_px = torch.lerp(other_light, seen[:, :-1], part), torch.lerp(other_coc_px, seen[:, -1:], part)
+    # between mixed and hidden the weight falls to 0, because light and coc jump
+    apart = other_weight * (2.0 / HIDDEN_WEIGHT) - 1.0
+    hidden = (total / _CERTAIN).clamp(max=1.0) * -HIDDEN_WEIGHT * apart
+    weight = torch.where(apart < 0, hidden, other_weight * apart.clamp(max=1.0))
+    light, coc_px = (torch.where(apart < 0, a, b) for a, b in ((seen[:, :-1], other_light), (seen[:, -1:], other_coc_px)))
     return light, coc_px, weight, behind
 
 

@@ -190,9 +190,19 @@ class Filling {
     }
     job_.parallel(cell_rows_, [&](int row, int) { find_cells(row); });
     if (stride_ == F8) fill<1>(); else fill<0>();
+    // until here weights of hidden surfaces are negative, which distinguishes them from those of mixed pixels
+    for (int i = 0; i < (int)s_.blocks.size(); i++) {
+      if (!s_.has_block(i)) continue;
+      float *const weight = s_.block(i).weight;
+      for (int at = 0; at < BLOCK_PIXELS; at++) weight[at] = weight[at] < 0 ? -weight[at] : weight[at] * clamp01(apart(weight[at]));
+    }
   }
 
  private:
+  // 0 where a hidden surface replaces a mixed pixel's other one; -1 if that has weight 0, 1 if it has HIDDEN_WEIGHT
+  template <typename V>
+  static V apart(V weight) { return weight * (2.0f / HIDDEN_WEIGHT) - 1.0f; }
+
   void centre(Level &level) const {
     level.centre_y = 0.5f * (job_.height - 1);
     level.centre_x = 0.5f * (job_.width - 1);
@@ -365,7 +375,7 @@ class Filling {
   bool wanted(int y, int x) const {
     const int which = y / BLOCK * s_.block_columns + x / BLOCK;
     if (!(std::fabs(s_.coc[(size_t)y * job_.width + x]) > 0.5f)) return false;
-    return !s_.has_block(which) || s_.block(which).weight[y % BLOCK * BLOCK + x % BLOCK] < HIDDEN_WEIGHT;
+    return !s_.has_block(which) || s_.block(which).weight[y % BLOCK * BLOCK + x % BLOCK] < 0.5f * HIDDEN_WEIGHT;
   }
 
   // Positions of pixels first, first + step, ... in a level.
@@ -524,7 +534,7 @@ class Filling {
       for (int v = 0; v < VECTORS; v++) {
         const vec here = load<vec>(here_of + v * LANES), size = most(here, -here);
         ivec wanted = size > all(0.5f);
-        if (s_.has_block(which)) wanted &= load<vec>(s_.block(which).weight + within + v * LANES) < all(HIDDEN_WEIGHT);
+        if (s_.has_block(which)) wanted &= load<vec>(s_.block(which).weight + within + v * LANES) < all(0.5f * HIDDEN_WEIGHT);
         if (!any_of(wanted)) continue;
         vec total = {};
         for (int k = 0; k <= C; k++) shown[k] = vec{};
@@ -559,20 +569,16 @@ class Filling {
         }
         wanted &= total > vec{};
         if (!any_of(wanted)) continue;
-        // blend with a second surface that matting gave a small weight: its weight reduces that of the hidden one
+        // replace a second surface that matting gave a small weight
         const Block b = s_.make_block(which);
         const size_t at = within + v * LANES;
-        const vec mixed = load<vec>(b.weight + at), hidden = least(total * (1.0f / CERTAIN), all(1.0f)) * (all(HIDDEN_WEIGHT) - mixed);
-        const vec weight = hidden + (all(1.0f) - hidden * (1.0f / HIDDEN_WEIGHT)) * mixed, part = hidden / most(weight, all(1e-12f));
-        auto blend = [&](float *other, vec hidden_one) {
-          const vec old = load<vec>(other), blended = part < all(1.0f) ? old + part * (hidden_one - old) : hidden_one;
-          store(other, wanted ? blended : old);
-        };
-        for (int c = 0; c < C; c++) blend(b.other + c * BLOCK_PIXELS + at, shown[c]);
-        blend(b.coc + at, shown[C]);
+        const vec mixed = load<vec>(b.weight + at), hidden = least(total * (1.0f / CERTAIN), all(1.0f)) * HIDDEN_WEIGHT * apart(mixed);
+        auto replace = [&](float *other, vec hidden_one) { store(other, wanted ? hidden_one : load<vec>(other)); };
+        for (int c = 0; c < C; c++) replace(b.other + c * BLOCK_PIXELS + at, shown[c]);
+        replace(b.coc + at, shown[C]);
         vec valid = all(1.0f);
         for (int x = 0; s_.valid && x < std::min(LANES, columns - v * LANES); x++) valid[x] = s_.valid[(size_t)(y0 + y) * W + x0 + v * LANES + x];
-        store(b.weight + at, wanted ? weight * valid : mixed);
+        store(b.weight + at, wanted ? hidden * valid : mixed);
       }
     }
   }
