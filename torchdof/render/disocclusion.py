@@ -250,7 +250,9 @@ def fill_hidden(
     apart = other_weight * (2.0 / HIDDEN_WEIGHT) - 1.0
     hidden = (total / _CERTAIN).clamp(max=1.0) * -HIDDEN_WEIGHT * apart
     weight = torch.where(apart < 0, hidden, other_weight * apart.clamp(max=1.0))
-    light, coc_px = (torch.where(apart < 0, a, b) for a, b in ((seen[:, :-1], other_light), (seen[:, -1:], other_coc_px)))
+    light, coc_px = (
+        torch.where(apart < 0, a, b) for a, b in ((seen[:, :-1], other_light), (seen[:, -1:], other_coc_px))
+    )
     return light, coc_px, weight, behind
 
 

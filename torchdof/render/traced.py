@@ -41,25 +41,49 @@ def one_operator(
         operator = torch.library.custom_op(name, function, mutates_args=())
         operator.register_fake(empty)
 
-        def remember(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:  # PyTorch passes these arguments by name
-            ctx.others = [None if isinstance(value, Tensor) else value for value in inputs]
-            ctx.save_for_backward(*(value if isinstance(value, Tensor) else None for value in inputs))
-
-        def backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-            saved = zip(context.saved_tensors, context.others, strict=True)
-            inputs = [other if tensor is None else tensor.detach() for tensor, other in saved]
-            with torch.enable_grad():
-                moving = [value.requires_grad_() for value in inputs[:differentiable]]
-                outputs = function(*moving, *inputs[differentiable:])
-                wanted = [(o, g) for o, g in zip(outputs, gradients, strict=True) if o.requires_grad]
-                back = torch.autograd.grad([o for o, _ in wanted], moving, [g for _, g in wanted], allow_unused=True)
-            return (*back, *[None] * (len(inputs) - differentiable))
-
         if differentiable:
-            operator.register_autograd(backward, setup_context=remember)
+            _differentiate(operator, name, function, differentiable)
         return operator
 
     return decorated
+
+
+def _differentiate(operator: Any, name: str, function: Callable[..., Any], differentiable: int) -> None:
+    """Give an operator a backward pass that is an operator too: the compiler would trace all of it otherwise."""
+
+    def gradients(*arguments: Any) -> list[Tensor]:
+        *inputs, of_outputs = arguments
+        with torch.enable_grad(), _autograd():
+            moving = [value.detach().requires_grad_() for value in inputs[:differentiable]]
+            outputs = function(*moving, *inputs[differentiable:])
+            wanted = [(o, g) for o, g in zip(outputs, of_outputs, strict=True) if o.requires_grad]
+            back = torch.autograd.grad([o for o, _ in wanted], moving, [g for _, g in wanted], allow_unused=True)
+        return [torch.zeros_like(v) if g is None else g.contiguous() for v, g in zip(moving, back, strict=True)]
+
+    schema = (
+        torch.library.infer_schema(function, mutates_args=()).split(") ->")[0] + ", Tensor[] of_outputs) -> Tensor[]"
+    )
+    of_inputs = torch.library.custom_op(f"{name}_gradients", gradients, mutates_args=(), schema=schema)
+    of_inputs.register_fake(lambda *inputs: [value.new_empty(value.shape) for value in inputs[:differentiable]])
+
+    def remember(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:  # PyTorch passes these arguments by name
+        ctx.others = [None if isinstance(value, Tensor) else value for value in inputs]
+        ctx.save_for_backward(*(value if isinstance(value, Tensor) else None for value in inputs))
+
+    def backward(context: Any, *of_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        saved = zip(context.saved_tensors, context.others, strict=True)
+        inputs = [other if tensor is None else tensor for tensor, other in saved]
+        return (*of_inputs(*inputs, list(of_outputs)), *[None] * (len(inputs) - differentiable))
+
+    operator.register_autograd(backward, setup_context=remember)
+
+
+def _autograd() -> Any:
+    """A context in which autograd records operations; PyTorch leaves it out within an operator."""
+    left_out = torch._C._dispatch_tls_local_exclude_set()
+    for key in ("AutogradFunctionality", "AutogradOther", "AutogradNestedTensor", "ADInplaceOrView"):
+        left_out = left_out.remove(getattr(torch._C.DispatchKey, key))
+    return torch._C._ForceDispatchKeyGuard(torch._C._dispatch_tls_local_include_set(), left_out)
 
 
 def constants(make: Callable[..., Sequence[Tensor]], *arguments: Any) -> list[Tensor]:

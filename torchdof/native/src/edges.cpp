@@ -16,7 +16,7 @@ namespace {
 
 constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, DIRECTIONS = 5, KINDS = DIRECTIONS * PLACES, ROUNDS = 10;
 constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TIE = 0.017f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.025f, DOUBTFUL = 0.05f, RELATED = 0.8f, SOFT = 0.1f, WIDE = 1.5f, MIXED = 0.5f, SHARPNESS = 1.6f, MOST = 4.0f, CLIMBED = 0.35f, PIXEL = 0.2f, BETTER = 0.5f, LEAN = 2.0f;
-constexpr float NOISES = 12.0f;
+constexpr float NOISES = 12.0f, LEVELS_OF_A_FILE = 64.0f;
 constexpr int NOISE_SAMPLED = 1 << 13, SAMPLED = 12000, SAMPLE_BLOCK = 8, BLUR_REACH = 9, USUAL_REACH = REACH + 2, LAMP_REACH = 2, SIDE_REACH = 6, LOWEST_REACH = 12;
 constexpr int AREA = 96, FLAT_REACH = 8, ROWS_AHEAD = 8;
 // A pixel's result depends on the pixels within this many of it: without ramps, and with ramps.
@@ -336,25 +336,34 @@ class Repair {
   static float root(float light) { return (light <= FINITE) & (light > 0) ? std::sqrt(std::min(light, BRIGHTEST)) : 0.0f; }
 
   // Standard deviation of the map's noise, from the median second difference along rows or columns, whichever is
-  // larger.
+  // larger; at least that of rounding to multiples of the smallest difference of two neighbours, if the map has more
+  // than LEVELS_OF_A_FILE of them.
   float noise() const {
     const int every = (int)((2 * (int64_t)area_ + NOISE_SAMPLED - 1) / NOISE_SAMPLED);
+    float quantum = INFINITY, span = 0;
     const auto middle_bend = [&](int lines, int size, int to_line, int stride) {
       std::vector<float> bends;
+      float low = INFINITY, high = -INFINITY;
       for (int n = 0; n < lines; n++) {
         if (std::min(n, lines - 1 - n) % every != 0) continue;
         const float *line = map_.nearness + (ptrdiff_t)n * to_line;
         for (int k = 0; k < size - 2; k++, line += stride) {
           const float a = line[0], b = line[stride], c = line[2 * stride];
-          if (std::fabs(a) <= LARGEST && std::fabs(b) <= LARGEST && std::fabs(c) <= LARGEST) bends.push_back(std::fabs((c - b) - (b - a)));
+          if (!(std::fabs(a) <= LARGEST && std::fabs(b) <= LARGEST && std::fabs(c) <= LARGEST)) continue;
+          bends.push_back(std::fabs((c - b) - (b - a)));
+          if (a != b) quantum = std::min(quantum, std::fabs(b - a));
+          low = std::min(low, a);
+          high = std::max(high, a);
         }
       }
       if (bends.empty()) return 0.0f;
+      span = std::max(span, high - low);
       const auto middle = bends.begin() + (bends.size() - 1) / 2;
       std::nth_element(bends.begin(), middle, bends.end());
       return *middle;
     };
-    return 0.6053f * std::max(middle_bend(height_, width_, width_, 1), middle_bend(width_, height_, 1, width_));
+    const float bend = std::max(middle_bend(height_, width_, width_, 1), middle_bend(width_, height_, 1, width_));
+    return std::max(0.6053f * bend, span > LEVELS_OF_A_FILE * quantum ? 0.2887f * quantum : 0.0f);
   }
 
   // Whether the sampled steps are ramps that are wide, or whose values are often far from both surfaces.
