@@ -16,8 +16,8 @@ namespace {
 
 constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, DIRECTIONS = 5, KINDS = DIRECTIONS * PLACES, ROUNDS = 10;
 constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TIE = 0.017f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.025f, DOUBTFUL = 0.05f, RELATED = 0.8f, SOFT = 0.1f, WIDE = 1.5f, MIXED = 0.5f, SHARPNESS = 1.6f, MOST = 4.0f, CLIMBED = 0.35f, PIXEL = 0.2f, BETTER = 0.5f, LEAN = 2.0f;
-constexpr float NOISES = 12.0f, LEVELS_OF_A_FILE = 64.0f;
-constexpr int NOISE_SAMPLED = 1 << 13, SAMPLED = 12000, SAMPLE_BLOCK = 8, BLUR_REACH = 9, USUAL_REACH = REACH + 2, LAMP_REACH = 2, SIDE_REACH = 6, LOWEST_REACH = 12;
+constexpr float NOISES = 12.0f, LEVELS_OF_A_FILE = 64.0f, OVERSHOOT = 0.12f;
+constexpr int NOISE_SAMPLED = 1 << 13, SAMPLED = 12000, SAMPLE_BLOCK = 8, BLUR_REACH = 9, USUAL_REACH = REACH + 2, LAMP_REACH = 2, RINGING_REACH = 3, SIDE_REACH = 6, LOWEST_REACH = 12;
 constexpr int AREA = 96, FLAT_REACH = 8, ROWS_AHEAD = 8;
 // A pixel's result depends on the pixels within this many of it: without ramps, and with ramps.
 constexpr int STEP_HALO = RINGS + REACH, HALO = RINGS + RAMP_REACH + FLAT_REACH + 3;
@@ -312,6 +312,7 @@ class Repair {
     const float sigma = blur(), lost_px = choose(groups);
     if (is_soft) unmix(groups, sigma, lost_px);
     move(groups, is_soft);
+    if (is_soft) remove_ringing();
     if (is_soft) lift_lamps(sigma, lost_px);
     return true;
   }
@@ -1143,6 +1144,47 @@ class Repair {
         const float own = nearness(edge.i), surface = shows_near ? group.judged[k].near : group.judged[k].far;
         map_.out[edge.i] = sign_ * (own + moved * (surface - own));
       });
+    });
+  }
+
+  // Removes rims beside steps that are a little nearer, or farther, than the surface to which they belong: the ringing
+  // of interpolation. Such pixels move to the nearer end of the range between closed opening and opened closing.
+  void remove_ringing() {
+    memcpy(evidence_.data(), map_.out, area_ * sizeof(float));
+    const std::vector<Group> parts = tiles();
+    parallel((int)parts.size(), [&](int g) {
+      const Part &part = parts[g].part, whole = part.grown(4 * RINGING_REACH);
+      const Grid own(part), span(part), up(whole), down(whole), rows(whole);
+      const auto spread = [&](const Grid &values, int steps_left, bool negated) {
+        const Part over = part.grown(steps_left * RINGING_REACH);
+        max_filter<RINGING_REACH>(values, values, rows, over);
+        clamp_to_frame(values, over);
+        if (negated) each_vector(over, [&](int y, int x) { store(values.at(y, x), -load<vec>(values.at(y, x))); });
+      };
+      fetch(evidence_.data(), up, [this](float v) { return std::fabs(v) <= LARGEST ? sign_ * v : -NONE; });
+      fetch(evidence_.data(), down, [this](float v) { return std::fabs(v) <= LARGEST ? -sign_ * v : -NONE; });
+      each_vector(part, [&](int y, int x) { store(own.at(y, x), load<vec>(up.at(y, x))); });
+      for (const Grid *values : {&up, &down}) spread(*values, 3, true);
+      vec widest = all(-NONE);
+      each_vector(part, [&](int y, int x) {
+        const vec here = -load<vec>(up.at(y, x)) - load<vec>(down.at(y, x));
+        store(span.at(y, x), here);
+        widest = most(widest, here);
+      });
+      if (!map_.steps && !(largest(widest) > step(0))) return;
+      for (const Grid *values : {&up, &down}) {  // the closed opening of -up and of up
+        spread(*values, 2, false);
+        spread(*values, 1, true);
+        spread(*values, 0, true);
+      }
+      for (int y = part.y0; y < part.bottom(); y++)
+        for (int x = part.x0; x < part.right(); x++) {
+          const size_t i = (size_t)y * width_ + x;
+          const float gap = *span.at(y, x), ends[2] = {-*up.at(y, x), *down.at(y, x)};
+          if (!(std::fabs(map_.out[i]) <= LARGEST && gap > step(i))) continue;
+          const float moved = clamp(*own.at(y, x), std::min(ends[0], ends[1]), std::max(ends[0], ends[1])) - *own.at(y, x);
+          map_.out[i] = sign_ * (*own.at(y, x) + moved * clamp01(2.0f - std::fabs(moved) / (OVERSHOOT * gap)));
+        }
     });
   }
 
