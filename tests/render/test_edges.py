@@ -64,6 +64,30 @@ def test_compression_artefacts_beside_steps_are_not_ramps(scene: Scene, quantum:
     assert wrong(repair_edges(scene.image, soft, "auto"), scene.depth) < 0.5 * wrong(soft, scene.depth)
 
 
+def test_the_ringing_of_an_enlarged_map_is_removed(scene: Scene, engine: str) -> None:
+    near = 1 / scene.depth
+    low, high = near.aminmax()
+    small = functional.interpolate(near, scale_factor=0.5, mode="area")
+    soft = 1 / functional.interpolate(small, scale_factor=2.0, mode="bicubic")
+
+    def ringing(depth: Tensor) -> float:
+        level = (1 / depth - low) / (high - low)
+        return float(((level < -0.04) | (level > 1.04)).float().mean())
+
+    assert ringing(soft) > 0.03
+    assert ringing(repair_edges(scene.image, soft, "auto")) < 0.5 * ringing(soft)
+
+
+def test_levels_of_a_file_are_not_edges_however_large_the_blur(engine: str) -> None:
+    level_px = 0.53
+    levels = torch.arange(100.0).repeat_interleave(8).expand(1, 1, 32, -1)
+    levels = levels + 2.0 * (torch.rand(levels.shape) < 0.1)  # compression: two levels are more than a step
+    coc_px = level_px * levels
+    image = torch.rand(1, 3, *coc_px.shape[-2:])
+    assert torch.equal(edges.mended(image, coc_px, "repair"), coc_px)
+    assert not edges.judged(image, coc_px, edges.STEP_PX)[0].any()
+
+
 def test_narrow_ramps_of_averaged_depth_are_repaired(scene: Scene, engine: str) -> None:
     """Such depth was downsampled with its image, or rendered with anti-aliasing."""
     image = functional.avg_pool2d(scene.image, 2)
