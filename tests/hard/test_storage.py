@@ -1,11 +1,14 @@
 """Tensors without memory are refused by name; the compiled engine would read invalid addresses."""
 
+import functools
+
 import pytest
 import torch
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from tests.processes import output_of
+from tests.refused import refuses
 from torchdof import Camera, DepthOfField, blur_by_coc
 from torchdof.tensors import has_storage
 
@@ -40,22 +43,19 @@ def fake() -> Tensor:
         return torch.ones(1, 1, 40, 50)
 
 
-def test_freed_tensors_are_refused_by_name() -> None:
-    with pytest.raises(ValueError, match=r"depth must be a tensor in metres that holds data, got a freed storage"):
-        Camera(focus_m=2.0).coc_px(freed(), 50)
-    with pytest.raises(ValueError, match=r"rgba must be a tensor .* that holds data, got a freed storage"):
-        DepthOfField(Camera(focus_m=2.0), check=False).layers(freed((1, 1, 4, 40, 50)), torch.tensor([1.0]))
-
-
-@pytest.mark.parametrize("make", [freed, cut, fake, Wrapper])
-def test_tensors_without_memory_are_refused_by_name(make: type[Wrapper]) -> None:
-    image = torch.rand(1, 3, 40, 50)
-    with pytest.raises(ValueError, match=r"coc_px must be a tensor .* that holds data"):
-        blur_by_coc(image, make())
-    with pytest.raises(ValueError, match=r"depth must be a tensor .* that holds data"):
-        DepthOfField(Camera(focus_m=2.0))(image, make())
-    with pytest.raises(ValueError, match=r"image must be a tensor .* that holds data"):
-        blur_by_coc(make(), torch.ones(1, 1, 40, 50))
+DOF = DepthOfField(Camera(focus_m=2.0), check=False)
+IMAGE, MAP, FREED = torch.rand(1, 3, 40, 50), torch.ones(1, 1, 40, 50), ", got a freed storage"
+test_tensors_without_memory_are_refused_by_name = refuses(
+    (lambda: DOF.camera.coc_px(freed(), 50), f"depth must be a tensor in metres that holds data{FREED}"),
+    (lambda: DOF.layers(freed((1, 1, 4, 40, 50)), torch.ones(1)), f"rgba must be a tensor .* that holds data{FREED}"),
+    *((functools.partial(lambda call, make: call(make()), call, make), f"{name} must be a tensor .* that holds data")
+      for make in (freed, cut, fake, Wrapper)
+      for name, call in {
+          "coc_px": lambda x: blur_by_coc(IMAGE, x),
+          "depth": lambda x: DOF(IMAGE, x),
+          "image": lambda x: blur_by_coc(x, MAP),
+      }.items()),
+)  # fmt: skip
 
 
 ELSEWHERE = """
