@@ -3,7 +3,7 @@
 import os
 import shutil
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -21,7 +21,7 @@ def needs(*packages: str) -> pytest.MarkDecorator:
     return pytest.mark.skipif(shutil.which("node") is None or missing, reason=reason)
 
 
-def run(call: list[object], environment: Mapping[str, str] = ENVIRONMENT) -> str:
+def run(call: Sequence[object], environment: Mapping[str, str] = ENVIRONMENT) -> str:
     """What a program prints, which must not fail."""
     done = subprocess.run(list(map(str, call)), capture_output=True, text=True, env=environment, timeout=240)
     assert done.returncode == 0, done.stderr[-3000:]

@@ -74,6 +74,7 @@ def test_the_farthest_disparity_may_lie_at_infinity_and_passes_no_gradient() -> 
 
 
 relative: Any = functools.partial(functools.partial, from_relative)
+solved: Any = functools.partial(functools.partial, solve_scale)
 TWO = row(1.0, 2.0)
 test_invalid_arguments_are_refused = refuses(
     (relative(TWO, 5.0, 1.0), "near_m must be nearer than far_m, got near_m=5 and far_m=1"),
@@ -88,7 +89,7 @@ test_invalid_arguments_are_refused = refuses(
     (relative(torch.ones(1, 1, 0, 4), 1.0, 2.0), "at least one pixel"),
     *((relative(TWO, 1.0, 2.0, value_range=pair), "value_range")
       for pair in ((2.0, 1.0), (0.0, NAN), (1.0,), "0,1")),
-    *((functools.partial(solve_scale, row(1.0, 2.0, 4.0), points, kind, patch=1), message)
+    *((solved(row(1.0, 2.0, 4.0), points, kind, patch=1), message)
       for points, kind, message in (
           ([(0.5, 0.5, 1.0), (0.6, 0.5, 2.0)], "disparity", "at least two points of different values, got 2"),
           ([(0.5, 0.5, 1.0), (2.5, 0.5, 4.0)], "disparity", "that is kind='depth', not 'disparity'"),
