@@ -1,12 +1,14 @@
 """Modules and their exported files, written once in a test run, because tracing takes long."""
 
 import dataclasses
+import functools
 import pickle
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnxruntime
 import torch
 from click.testing import CliRunner
 from filelock import FileLock
@@ -51,11 +53,15 @@ class Exported:
         """The layers of the file, and its rays."""
         return Plan.all(self.dof.options.max_coc_px, self.dof.options.tolerance, rays=True)
 
+    @functools.cached_property
+    def runner(self) -> onnxruntime.InferenceSession:
+        """The file in onnxruntime, which takes seconds to load a large one."""
+        return session(self.path)
+
     def render(self, *tensors: Tensor) -> Tensor:
         """The picture of the file in onnxruntime."""
-        runner = session(self.path)
-        feed = {v.name: t.numpy() for v, t in zip(runner.get_inputs(), tensors, strict=True)}
-        return torch.from_numpy(np.asarray(runner.run(None, feed)[0]))
+        feed = {v.name: t.numpy() for v, t in zip(self.runner.get_inputs(), tensors, strict=True)}
+        return torch.from_numpy(np.asarray(self.runner.run(None, feed)[0]))
 
     def eager(self, *tensors: Tensor) -> Tensor:
         """The picture of the module in PyTorch, with the layers of the file."""

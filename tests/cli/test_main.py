@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import click
 import pytest
@@ -98,9 +97,3 @@ def test_waiting_threads_do_not_spin_unless_the_environment_asks_for_it(variable
     command = [sys.executable, "-m", "torchdof", "--version"]
     settings = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stderr
     assert f"GOMP_SPINCOUNT = '{spins}'" in settings
-
-
-def test_python_dash_m_torchdof_runs_the_command(scene: Path) -> None:
-    command = [sys.executable, "-m", "torchdof", "render", "image.exr", "none.npy", "-o", "out.exr", "--focus-m", "2"]
-    process = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (process.returncode, process.stderr) == (2, "error: none.npy: there is no such file\n")

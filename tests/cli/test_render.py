@@ -4,20 +4,18 @@ import json
 import math
 import os
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 import torch
 from click.testing import CliRunner
 from torch import Tensor
 
 import torchdof
+from tests.files import store
 from torchdof.cli.main import app
 from torchdof.depth.inspect import tint_focus
 from torchdof.io.highlights import expand_highlights
@@ -36,13 +34,6 @@ CAMERA = torchdof.Camera(focal_length_mm=50.0, f_number=1.2, focus_m=2.0, sensor
 RENDERED = torchdof.Camera.from_fov(40.0, 0.2, 2.0)
 SLIT = torch.zeros(8, 8)
 SLIT[1:7, 1:3] = 1.0
-
-
-def store(path: str, array: np.ndarray, sample: str, names: tuple[str, ...]) -> None:
-    spec = oiio.ImageSpec(array.shape[1], array.shape[0], array.shape[2], sample)
-    spec.channelnames = names
-    output = oiio.ImageOutput.create(path)
-    assert output is not None and output.open(path, spec) and output.write_image(array) and output.close()
 
 
 def pixels(path: str) -> Tensor:
@@ -143,12 +134,12 @@ def test_the_camera_is_read_from_the_file_and_the_line_names_the_source(image: T
 
 def test_every_kind_of_depth_converts_to_the_same_metres(image: Tensor, depth: Tensor, run: Run) -> None:
     both = torch.cat([image, depth], dim=1)[0].permute(1, 2, 0).contiguous().numpy()
-    store("zed.exr", both, "float", ("R", "G", "B", "Z"))
+    store(Path("zed.exr"), both, "float", ("R", "G", "B", "Z"))
     near = depth[0, 0].numpy() == 2.0
-    store("relative.png", np.where(near, 200, 10).astype(np.uint8)[..., None], "uint8", ("Y",))
+    store(Path("relative.png"), np.where(near, 200, 10).astype(np.uint8), "uint8", ("Y",))
     disparity = np.where(near, 300, 100).astype(np.uint16)
     disparity[3, 4] = disparity[9, 20] = 0
-    store("disparity.png", disparity[..., None], "uint16", ("Y",))
+    store(Path("disparity.png"), disparity, "uint16", ("Y",))
     y, x = np.mgrid[:16, :24] + 0.5
     focal_px = 24 / 2 / math.tan(math.radians(20))
     np.save("ray.npy", depth[0, 0].numpy() * np.sqrt(1 + ((x - 12) ** 2 + (y - 8) ** 2) / focal_px**2))
@@ -207,11 +198,10 @@ def test_likely_mistakes_are_one_warning_per_sequence_or_with_strict_an_error(
     assert CliRunner().invoke(app, fitting.split()).stderr == ""
 
 
+@pytest.mark.filterwarnings("ignore::torchdof.depth.DepthWarning")  # as python -W ignore
 def test_warnings_of_depth_can_be_silenced(depth: Tensor) -> None:
     np.save("depth.npy", depth.numpy() * 1000)
-    command = [sys.executable, "-W", "ignore", "-m", "torchdof", *f"{ONE} {LENS}".split()]
-    result = subprocess.run(command, capture_output=True, text=True)
-    assert result.returncode == 0 and result.stderr == ""
+    assert guessed(f"{ONE} {LENS}")[1] == ""
 
 
 @pytest.mark.parametrize("place", ["same everywhere", "across the field"])
@@ -402,11 +392,7 @@ def test_a_link_to_itself_is_refused_in_one_sentence(scene: Path, run: Run, link
 
 def test_a_photograph_is_rotated_by_its_orientation_tag(run: Run, image: Tensor, depth: Tensor) -> None:
     """An upright phone stores a landscape image with orientation 6; depth estimators see the rotated, upright image."""
-    spec = oiio.ImageSpec(24, 16, 3, "uint8")
-    spec.attribute("Orientation", 6)
-    stored = (255 * image[0].permute(1, 2, 0)).byte().contiguous().numpy()
-    output = oiio.ImageOutput.create("phone.png")
-    assert output is not None and output.open("phone.png", spec) and output.write_image(stored) and output.close()
+    store(Path("phone.png"), (255 * image[0].permute(1, 2, 0)).byte().numpy(), "uint8", Orientation=6)
     upright = torch.rot90(depth, -1, (-2, -1))  # 24 rows of 16, 2 m above and 6 m below
     np.save("upright.npy", upright.numpy())
     line = run(f"render phone.png upright.npy -o out.png --focus-at 8,20 {LENS}")
@@ -463,7 +449,7 @@ def test_the_first_command_needs_no_option(run: Run, low: int, high: int, sample
     far, near = (high, low) if "millimetres" in noted else (low, high)
     values = np.repeat(np.linspace(far, (far + near) / 2, size[0])[:, None], size[1], 1)
     values[20:, 40:80] = near
-    store("depth.png", values.astype(sample)[..., None], sample, ("Y",))
+    store(Path("depth.png"), values.astype(sample), sample, ("Y",))
     line, note = guessed("render photo.png depth.png -o out.png")
     assert note.count("\n") == 1 and note.startswith(f"note: depth.png: {noted}")
     assert "blur radius up to 2.4 px" in line and "f-number for a blur of 2% of the width" in line

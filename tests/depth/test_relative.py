@@ -1,5 +1,6 @@
 """Relative depth to metres: between two distances, and from points of known distance."""
 
+import functools
 import math
 from typing import Any
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.refused import refuses
 from tests.tolerances import TOLERANCES
 from torchdof.depth import depth_from_values, from_relative, solve_scale
 from torchdof.depth.relative import RELATIVE_KINDS
@@ -71,30 +73,32 @@ def test_the_farthest_disparity_may_lie_at_infinity_and_passes_no_gradient() -> 
     assert values.grad is not None and bool(values.grad.isfinite().all())
 
 
-@pytest.mark.parametrize(
-    ("values", "arguments", "message"),
-    [
-        (row(1.0, 2.0), (5.0, 1.0), "near_m must be nearer than far_m, got near_m=5 and far_m=1"),
-        (row(1.0, 2.0), (0.0, 1.0), "near_m must be a number of metres > 0"),
-        (row(1.0, 2.0), (1.0, INF, "depth"), "far_m must be a number"),
-        (row(1.0, 2.0), (1.0, 2.0, "metric"), "must be one of disparity, inverse, depth, got 'metric'"),
-        (row(3.0, 3.0), (1.0, 2.0), r"two different values .* one value everywhere; give value_range"),
-        (row(NAN, INF), (1.0, 2.0), "two different values to distinguish near from far, got no value"),
-        (torch.ones(3, 4), (1.0, 2.0), r"must be \[B, 1, H, W\], got \[3, 4\]; add the missing dimensions"),
-        (np.ones((3, 4)), (1.0, 2.0), "got ndarray; convert an array with torch.from_numpy"),
-        (torch.ones(1, 1, 3, 4, dtype=torch.bool), (1.0, 2.0), "got torch.bool"),
-        (torch.ones(1, 1, 0, 4), (1.0, 2.0), "at least one pixel"),
-    ],
-)
-def test_invalid_arguments_are_refused(values: Any, arguments: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        from_relative(values, *arguments)
-
-
-@pytest.mark.parametrize("value_range", [(2.0, 1.0), (0.0, NAN), (1.0,), "0,1"])
-def test_an_invalid_value_range_is_refused(value_range: Any) -> None:
-    with pytest.raises(ValueError, match="value_range"):
-        from_relative(row(1.0, 2.0), 1.0, 2.0, value_range=value_range)
+relative: Any = functools.partial(functools.partial, from_relative)
+solved: Any = functools.partial(functools.partial, solve_scale)
+TWO = row(1.0, 2.0)
+test_invalid_arguments_are_refused = refuses(
+    (relative(TWO, 5.0, 1.0), "near_m must be nearer than far_m, got near_m=5 and far_m=1"),
+    (relative(TWO, 0.0, 1.0), "near_m must be a number of metres > 0"),
+    (relative(TWO, 1.0, INF, "depth"), "far_m must be a number"),
+    (relative(TWO, 1.0, 2.0, "metric"), "must be one of disparity, inverse, depth, got 'metric'"),
+    (relative(row(3.0, 3.0), 1.0, 2.0), r"two different values .* one value everywhere; give value_range"),
+    (relative(row(NAN, INF), 1.0, 2.0), "two different values to distinguish near from far, got no value"),
+    (relative(torch.ones(3, 4), 1.0, 2.0), r"\[B, 1, H, W\], got \[3, 4\]; add the missing dimensions"),
+    (relative(np.ones((3, 4)), 1.0, 2.0), "got ndarray; convert an array with torch.from_numpy"),
+    (relative(torch.ones(1, 1, 3, 4, dtype=torch.bool), 1.0, 2.0), "got torch.bool"),
+    (relative(torch.ones(1, 1, 0, 4), 1.0, 2.0), "at least one pixel"),
+    *((relative(TWO, 1.0, 2.0, value_range=pair), "value_range")
+      for pair in ((2.0, 1.0), (0.0, NAN), (1.0,), "0,1")),
+    *((solved(row(1.0, 2.0, 4.0), points, kind, patch=1), message)
+      for points, kind, message in (
+          ([(0.5, 0.5, 1.0), (0.6, 0.5, 2.0)], "disparity", "at least two points of different values, got 2"),
+          ([(0.5, 0.5, 1.0), (2.5, 0.5, 4.0)], "disparity", "that is kind='depth', not 'disparity'"),
+          ([(0.5, 0.5, 4.0), (2.5, 0.5, 1.0)], "depth", "that is kind='disparity', not 'depth'"),
+          ([(0.5, 0.5, 1.0), (9.5, 0.5, 4.0)], "disparity", "must lie in the map of 3 x 1 pixels"),
+          ([(0.5, 0.5, 0.0), (2.5, 0.5, 4.0)], "disparity", "the distance of a point must be a number of metres > 0"),
+          ([(0.5, 0.5), (2.5, 0.5, 4.0)], "disparity", r"a point must be \(x, y, metres\)"),
+          ([(0.5, 0.5, 1.0), (2.5, 0.5, 4.0)], "z", "must be one of disparity, inverse, depth"))),
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", RELATIVE_KINDS)
@@ -126,20 +130,3 @@ def test_a_point_at_infinity_fixes_the_offset() -> None:
     scale = solve_scale(row(0.5, 1.0, 2.0), [(0.5, 0.5, INF), (2.5, 0.5, 2.0)], patch=1)
     assert scale.offset == pytest.approx(-0.5) and scale.scale == pytest.approx(3.0)
     assert scale.depth(row(0.25, NAN))[0, 0, 0, 0] == INF and bool(scale.depth(row(0.25, NAN))[0, 0, 0, 1].isnan())
-
-
-@pytest.mark.parametrize(
-    ("points", "kind", "message"),
-    [
-        ([(0.5, 0.5, 1.0), (0.6, 0.5, 2.0)], "disparity", "at least two points of different values, got 2"),
-        ([(0.5, 0.5, 1.0), (2.5, 0.5, 4.0)], "disparity", "that is kind='depth', not 'disparity'"),
-        ([(0.5, 0.5, 4.0), (2.5, 0.5, 1.0)], "depth", "that is kind='disparity', not 'depth'"),
-        ([(0.5, 0.5, 1.0), (9.5, 0.5, 4.0)], "disparity", "must lie in the map of 3 x 1 pixels"),
-        ([(0.5, 0.5, 0.0), (2.5, 0.5, 4.0)], "disparity", "the distance of a point must be a number of metres > 0"),
-        ([(0.5, 0.5), (2.5, 0.5, 4.0)], "disparity", r"a point must be \(x, y, metres\)"),
-        ([(0.5, 0.5, 1.0), (2.5, 0.5, 4.0)], "z", "must be one of disparity, inverse, depth"),
-    ],
-)
-def test_points_without_a_solution_are_refused(points: Any, kind: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        solve_scale(row(1.0, 2.0, 4.0), points, kind, patch=1)

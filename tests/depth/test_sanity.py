@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.refused import refuses
 from torchdof import Camera
 from torchdof.depth import DepthWarning, check, from_relative
 from torchdof.depth.reading import read_depth
@@ -38,10 +39,10 @@ def test_test_scenes_give_no_warning(scene: object) -> None:
     check(scene.depth, scene.camera, strict=True)  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("focus_m", [2.3, 3.1, 4.6])
-def test_the_demo_gives_no_warning(metres: torch.Tensor, focus_m: float) -> None:
-    check(metres, Camera.from_fov(40.8, 0.04, focus_m), strict=True)
-    check(metres, Camera(focus_m=focus_m), strict=True)
+def test_the_demo_gives_no_warning(metres: torch.Tensor) -> None:
+    for focus_m in (2.3, 3.1, 4.6):
+        check(metres, Camera.from_fov(40.8, 0.04, focus_m), strict=True)
+        check(metres, Camera(focus_m=focus_m), strict=True)
 
 
 @pytest.mark.parametrize(
@@ -149,8 +150,7 @@ def test_the_advice_depends_on_the_kind_and_the_scale(metres: torch.Tensor) -> N
     assert "--depth-kind" in mistake.message
 
 
-def test_a_tensor_that_is_not_a_depth_map_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"depth must be \[B, 1, H, W\] in metres, got \[8, 8\]"):
-        check(torch.ones(8, 8), Camera())
-    with pytest.raises(ValueError, match="floating-point"):
-        check(torch.ones(1, 1, 8, 8, dtype=torch.int32), Camera())
+test_a_tensor_that_is_not_a_depth_map_is_refused = refuses(
+    (lambda: check(torch.ones(8, 8), Camera()), r"depth must be \[B, 1, H, W\] in metres, got \[8, 8\]"),
+    (lambda: check(torch.ones(1, 1, 8, 8, dtype=torch.int32), Camera()), "floating-point"),
+)

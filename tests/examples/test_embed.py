@@ -6,7 +6,6 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,11 @@ import OpenImageIO as oiio
 import pytest
 import torch
 
+from tests.node import NEEDS_NODE, NODE_FOLDER, ROOT, needs, run
 from torchdof.depth import from_relative
 
-ROOT = Path(__file__).parents[2]
 DATA = ROOT / "examples" / "data" / "motorcycle"
 EMBED = ROOT / "examples" / "embed"
-NODE_FOLDER = Path(os.environ.get("TORCHDOF_NODE_FOLDER", ROOT / "build" / "node"))
 FOCUS_M, F_NUMBER = 2.3, 1.2
 DISPARITY = json.loads((DATA / "camera.json").read_text())["depth"]
 
@@ -30,12 +28,6 @@ def header_folder() -> Path | None:
     folders = [Path(os.environ["TORCHDOF_ONNXRUNTIME"], "include")] if "TORCHDOF_ONNXRUNTIME" in os.environ else []
     folders += [Path(root, "include", "onnxruntime") for root in ("/usr", "/usr/local")]
     return next((folder for folder in folders if (folder / "onnxruntime_cxx_api.h").is_file()), None)
-
-
-def run(call: list[str], environment: Mapping[str, str] | None = None) -> str:
-    done = subprocess.run(call, capture_output=True, text=True, env=environment, timeout=120)
-    assert done.returncode == 0, done.stderr[-2000:]
-    return done.stdout
 
 
 def pixels(path: Path) -> np.ndarray:
@@ -79,35 +71,24 @@ def test_python_needs_no_torch(plain: Any, tmp_path: Path) -> None:
     environment = os.environ | {"PYTHONPATH": str(tmp_path)}
     check = subprocess.run([sys.executable, "-c", "import torch"], env=environment, capture_output=True, text=True)
     assert "torch was imported" in check.stderr
-    call = [sys.executable, str(EMBED / "run_onnx.py"), str(plain.path)]
-    call += [str(DATA / "motorcycle_left.png"), str(DATA / "motorcycle_disp.npz"), str(tmp_path / "out.png")]
-    call += ["--focus-m", str(FOCUS_M), "--f-number", str(F_NUMBER)]
-    output = run(
-        [*call, "--disparity-scale", str(DISPARITY["scale"]), "--disparity-offset", str(DISPARITY["offset"])],
-        environment,
-    )
+    call = [sys.executable, EMBED / "run_onnx.py", plain.path, DATA / "motorcycle_left.png"]
+    call += [DATA / "motorcycle_disp.npz", tmp_path / "out.png", "--focus-m", FOCUS_M, "--f-number", F_NUMBER]
+    call += ["--disparity-scale", DISPARITY["scale"], "--disparity-offset", DISPARITY["offset"]]
+    output = run(call, environment)
     assert "741 x 500" in output and "'disc'" in output
     sharp, blurred = (pixels(path)[..., :3] for path in (DATA / "motorcycle_left.png", tmp_path / "out.png"))
     assert sharp.shape == blurred.shape
     assert 0.002 < np.abs(sharp - blurred).mean() < 0.2
 
 
-@pytest.mark.skipif(shutil.which("node") is None, reason="Node is not installed")
-@pytest.mark.skipif(
-    not (NODE_FOLDER / "node_modules" / "onnxruntime-web").is_dir(),
-    reason="onnxruntime-web is not installed: npm install --prefix build/node onnxruntime-web",
-)
+@needs("onnxruntime-web")
 def test_javascript_gives_the_pixels_of_the_file(plain: Any, tmp_path: Path) -> None:
     shutil.copytree(EMBED / "javascript", tmp_path / "sample")
     (tmp_path / "sample" / "node_modules").symlink_to(NODE_FOLDER / "node_modules")
     photo, depth_mm = crop()
-    call = ["node", str(tmp_path / "sample" / "run_onnx.mjs"), str(plain.path)]
-    call += [
-        str(write(tmp_path / "photo.png", photo)),
-        str(write(tmp_path / "depth.png", depth_mm)),
-        str(tmp_path / "out.png"),
-    ]
-    call += ["--focus-m", str(FOCUS_M), "--f-number", str(F_NUMBER), "--scale", "0.001"]
+    call = ["node", tmp_path / "sample" / "run_onnx.mjs", plain.path, write(tmp_path / "photo.png", photo)]
+    call += [write(tmp_path / "depth.png", depth_mm), tmp_path / "out.png"]
+    call += ["--focus-m", FOCUS_M, "--f-number", F_NUMBER, "--scale", 0.001]
     assert "128 x 96" in run(call)
     value = rendered(plain, linear(photo / 255), np.where(depth_mm > 0, depth_mm / 1000, np.nan)).clip(0, 1)
     codes = np.rint(255 * np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055))
@@ -115,14 +96,14 @@ def test_javascript_gives_the_pixels_of_the_file(plain: Any, tmp_path: Path) -> 
     assert difference.max() <= 1 and (difference > 0).mean() < 1e-3
 
 
-@pytest.mark.skipif(shutil.which("node") is None, reason="Node is not installed")
+@NEEDS_NODE
 def test_javascript_decodes_resizes_and_scales_as_python_does(tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
     rgba = generator.integers(0, 256, (6, 10, 4), np.uint8)
     values = generator.uniform(3, 9, (4, 5))
     (tmp_path / "rgba.bin").write_bytes(rgba.tobytes())
     np.save(tmp_path / "depth.npy", values)
-    got = json.loads(run(["node", str(ROOT / "tests" / "examples" / "modules.mjs"), str(tmp_path)]))
+    got = json.loads(run(["node", ROOT / "tests" / "examples" / "modules.mjs", tmp_path]))
 
     light = linear(rgba[..., :3] / 255).transpose(2, 0, 1)
     np.testing.assert_allclose(np.reshape(got["light"], light.shape), light, atol=1e-6)
@@ -158,9 +139,9 @@ def test_cpp_gives_the_pixels_of_the_file(plain: Any, tmp_path: Path) -> None:
     (release / "include").symlink_to(str(header_folder()))
     for name in ("libonnxruntime.so", "libonnxruntime.so.1"):
         (release / "lib" / name).symlink_to(library)
-    configure = ["cmake", "-S", str(EMBED / "cpp"), "-B", str(tmp_path / "build"), f"-DONNXRUNTIME={release}"]
+    configure = ["cmake", "-S", EMBED / "cpp", "-B", tmp_path / "build", f"-DONNXRUNTIME={release}"]
     run([*configure, "-DCMAKE_CXX_FLAGS=-Wall -Wextra -Werror"])
-    run(["cmake", "--build", str(tmp_path / "build")])
+    run(["cmake", "--build", tmp_path / "build"])
     photo, depth_mm = crop()
     light, depth_m = linear(photo / 255), np.where(depth_mm > 0, depth_mm / 1000, np.nan).astype(np.float32)
     call = [str(tmp_path / "build" / "run_onnx"), str(plain.path), str(write(tmp_path / "image.pfm", light))]

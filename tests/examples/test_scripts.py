@@ -4,6 +4,7 @@ import json
 import math
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -47,9 +48,22 @@ def test_per_pixel_prints_a_row_for_each_radius() -> None:
     assert rows[0] == ["radius", "splat", "step", "layered"] and [row[0] for row in rows[1:]] == ["4", "8", "16"]
 
 
-def test_operations_prints_a_row_for_each_scene() -> None:
-    rows = printed_by("benchmarks/operations.py", ROOT / "tests" / "data" / "scenes").splitlines()
-    assert len(rows) >= 2 and all(0 < int(row.split()[-5]) < 20_000 for row in rows)
+def test_operations_prints_a_row_for_each_scene_and_for_a_batch_of_four(tmp_path: Path) -> None:
+    for name in "abcd":
+        shutil.copytree(ROOT / "tests" / "data" / "scenes" / "planes", tmp_path / name)
+        for path in (tmp_path / name).glob("*.exr"):
+            assert oiio.ImageBufAlgo.cut(oiio.ImageBuf(str(path)), oiio.ROI(0, 64, 0, 48)).write(str(path))
+    rows = printed_by("benchmarks/operations.py", tmp_path).splitlines()
+    assert len(rows) == 5 and all(0 < int(row.split()[-5]) < 20_000 for row in rows)  # the last is of all four at once
+
+
+def test_steps_prints_the_cost_of_a_step() -> None:
+    row = printed_by("benchmarks/steps.py", "--repeat", 1, "--row", 1)
+    numbers = (float(word) for word in row[38:].split() if word not in ("ms", "MiB"))
+    picture, step, ratio, *memory = numbers
+    assert row[:38].strip() == "1 of 256 x 256, without occlusion"
+    assert 0 < picture < step and ratio > 1
+    assert 0 <= memory[0] <= memory[1] < 1000
 
 
 MAX_OUTLIERS = {"near": 680, "middle": 1070, "far": 390}

@@ -1,9 +1,7 @@
 """The page of ``examples/web``, built and used in headless Chromium; skipped where that is not installed."""
 
 import json
-import os
 import shutil
-import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,17 +13,13 @@ import pytest
 import torch
 from filelock import FileLock
 
-ROOT = Path(__file__).parents[2]
-NODE_FOLDER = Path(os.environ.get("TORCHDOF_NODE_FOLDER", ROOT / "build" / "node"))
+from tests.node import ENVIRONMENT, ROOT, needs, run
+
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "google-chrome"))), None)
 
 pytestmark = [
-    pytest.mark.skipif(shutil.which("node") is None, reason="Node is not installed"),
+    needs("onnxruntime-web", "playwright-core"),
     pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed: apt-get install chromium-headless-shell"),
-    pytest.mark.skipif(
-        not all((NODE_FOLDER / "node_modules" / name).is_dir() for name in ("onnxruntime-web", "playwright-core")),
-        reason="packages are missing: npm install --prefix build/node onnxruntime-web playwright-core",
-    ),
 ]
 
 
@@ -33,20 +27,14 @@ pytestmark = [
 def used(plain: Any, shared_folder: Path) -> tuple[Path, Mapping[str, Any]]:
     """The folder with the page and its saved pictures, and the observations of ``web.mjs``."""
     folder = shared_folder / "page"
-    environment = os.environ | {"TORCHDOF_NODE_FOLDER": str(NODE_FOLDER), "PYTHON": sys.executable}
+    environment = {**ENVIRONMENT, "PYTHON": sys.executable}
     with FileLock(shared_folder / "page.lock"):
         if not (folder / "results.json").exists():
             folder.mkdir(exist_ok=True)
-            build = ["node", str(ROOT / "examples" / "web" / "build.mjs"), "--out", str(folder / "dist")]
-            run([*build, "--model", str(plain.path)], environment)
-            use = ["node", str(Path(__file__).with_name("web.mjs"))]
-            run([*use, str(folder / "dist"), str(folder), str(CHROMIUM)], environment)
+            build = ["node", ROOT / "examples" / "web" / "build.mjs", "--out", folder / "dist"]
+            run([*build, "--model", plain.path], environment)
+            run(["node", Path(__file__).with_name("web.mjs"), folder / "dist", folder, CHROMIUM], environment)
     return folder, json.loads((folder / "results.json").read_text())
-
-
-def run(call: list[str], environment: Mapping[str, str]) -> None:
-    done = subprocess.run(call, capture_output=True, text=True, env=environment, timeout=240)
-    assert done.returncode == 0, done.stderr[-3000:]
 
 
 def pixels(path: Path) -> np.ndarray:

@@ -4,6 +4,7 @@ import importlib.util
 from pathlib import Path
 
 import numpy as np
+import onnxruntime
 import pytest
 import torch
 from torch import Tensor
@@ -37,6 +38,11 @@ def tensors() -> tuple[Tensor, Tensor]:
     return image.repeat(len(KINDS), 1, 1, 1), torch.cat(coc).float()
 
 
+@pytest.fixture(scope="module")
+def runner(exported_by_command: tuple[Path, str]) -> onnxruntime.InferenceSession:
+    return session(exported_by_command[0])
+
+
 def rendered(image: Tensor, coc: Tensor, treatment: DepthEdges) -> Tensor:
     """The picture of the PyTorch engine with the layers of the file."""
     plan = Plan.all(2.0, 1 / 255, rays=True)
@@ -49,39 +55,36 @@ def error(got: np.ndarray, expected: Tensor, image: Tensor) -> float:
 
 
 def test_a_file_repairs_the_same_edges_as_the_module(
-    exported_by_command: tuple[Path, str], tensors: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
+    runner: onnxruntime.InferenceSession, tensors: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
-    path, _ = exported_by_command
     image, coc = tensors
     expected, given = (rendered(image, coc, treatment) for treatment in ("auto", "as given"))
     assert [bool(d > 0.05) for d in (expected - given).abs().amax((1, 2, 3))] == [True, True, False]
-    got = session(path).run(None, {"image": image.numpy(), "coc_px": coc.numpy()})[0]
+    got = runner.run(None, {"image": image.numpy(), "coc_px": coc.numpy()})[0]
     assert error(got, expected, image) <= TOLERANCE
 
 
 def test_a_file_estimates_the_step_from_the_same_part_of_a_frame_as_the_module(
-    exported_by_command: tuple[Path, str], tensors: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
+    runner: onnxruntime.InferenceSession, tensors: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
-    path, _ = exported_by_command
     image, (_, thin, exact) = tensors[0][:1].repeat(1, 1, 3, 4), tensors[1].repeat(1, 1, 3, 4)
     assert image[0, 0].numel() > edges._SAMPLED
     is_right = torch.arange(image.shape[-1]) > torch.arange(image.shape[-2])[:, None]
     coc = torch.where(is_right, thin, exact)[None]
     expected = rendered(image, coc, "auto")
     assert float((expected - rendered(image, coc, "as given")).abs().max()) > 0.05
-    got = session(path).run(None, {"image": image.numpy(), "coc_px": coc.numpy()})[0]
+    got = runner.run(None, {"image": image.numpy(), "coc_px": coc.numpy()})[0]
     assert error(got, expected, image) <= TOLERANCE
 
 
 def test_a_file_without_edges_to_repair_is_bit_exact_in_focus(
-    exported_by_command: tuple[Path, str], tensors: tuple[Tensor, Tensor]
+    exported_by_command: tuple[Path, str], runner: onnxruntime.InferenceSession, tensors: tuple[Tensor, Tensor]
 ) -> None:
-    path, _ = exported_by_command
-    assert describe(path)["depth_edges"] == "auto"
+    assert describe(exported_by_command[0])["depth_edges"] == "auto"
     image = tensors[0]
-    got = session(path).run(None, {"image": image.numpy(), "coc_px": np.zeros_like(tensors[1])})[0]
+    got = runner.run(None, {"image": image.numpy(), "coc_px": np.zeros_like(tensors[1])})[0]
     assert np.array_equal(got, image.numpy())
 
 

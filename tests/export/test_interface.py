@@ -36,11 +36,10 @@ def test_an_impossible_camera_gives_nan_for_its_item_only(plain: Any, focus_m: f
     ("name", "shape"), [("depth", (2, 1, 20, 30)), ("depth", (3, 1, 20, 31)), ("focus_m", (3,)), ("f_number", (3,))]
 )
 def test_a_wrong_shape_is_named(plain: Any, name: str, shape: tuple[int, ...]) -> None:
-    runner = onnxruntime.InferenceSession(plain.path, providers=["CPUExecutionProvider"])
     feed = {"image": np.ones((2, 3, 20, 31)), "depth": np.ones((1, 1, 20, 31)), "focus_m": [1.0], "f_number": [2.0]}
     feed[name] = np.ones(shape)
     with pytest.raises(Exception, match=f"{name}_must_have_one_item_or_as_many_as_image"):
-        runner.run(None, {key: np.asarray(value, np.float32) for key, value in feed.items()})
+        plain.runner.run(None, {key: np.asarray(value, np.float32) for key, value in feed.items()})
 
 
 def test_sizes_can_be_fixed_by_the_runtimes_tool(plain: Any, tmp_path: Path) -> None:

@@ -4,9 +4,6 @@ import base64
 import importlib.metadata
 import importlib.util
 import json
-import os
-import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-ROOT = Path(__file__).parents[2]
-NODE_FOLDER = Path(os.environ.get("TORCHDOF_NODE_FOLDER", ROOT / "build" / "node"))
+from tests.node import needs, run
+
 LIMIT = 1e-4
 
 
@@ -50,22 +47,15 @@ def test_openvino_gives_the_same_pixels(layered: Any, record_property: Any) -> N
     compare(layered, tensors, compiled(feed)[0])
 
 
-@pytest.mark.skipif(shutil.which("node") is None, reason="Node is not installed")
-@pytest.mark.skipif(
-    not (NODE_FOLDER / "node_modules" / "onnxruntime-web").is_dir(),
-    reason="onnxruntime-web is not installed: npm install --prefix build/node onnxruntime-web",
-)
+@needs("onnxruntime-web")
 def test_onnxruntime_web_gives_the_same_pixels(layered: Any, tmp_path: Path, record_property: Any) -> None:
     tensors = scene()
     feed = {}
     for name, tensor in zip(("image", "depth", "focus_m", "f_number"), tensors, strict=True):
         feed[name] = {"dims": list(tensor.shape), "data": base64.b64encode(tensor.numpy().tobytes()).decode()}
     (tmp_path / "feed.json").write_text(json.dumps(feed))
-    call = ["node", str(Path(__file__).with_name("web.mjs"))]
-    call += [str(layered.path), str(tmp_path / "feed.json"), str(tmp_path / "out.json")]
-    environment = os.environ | {"TORCHDOF_NODE_FOLDER": str(NODE_FOLDER)}
-    done = subprocess.run(call, capture_output=True, text=True, env=environment, timeout=120)
-    assert done.returncode == 0, done.stderr[-2000:]
+    web = Path(__file__).with_name("web.mjs")
+    run(["node", web, layered.path, tmp_path / "feed.json", tmp_path / "out.json"])
     result = json.loads((tmp_path / "out.json").read_text())
     print("onnxruntime-web", result["version"])
     record_property("onnxruntime-web", result["version"])

@@ -1,6 +1,5 @@
 """``verify`` refuses files that are damaged, not portable, or exported from another module."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +11,12 @@ import pytest
 
 import torchdof
 from torchdof.export import describe, verify
+from torchdof.export.verification import _tensors
 
 
 @pytest.fixture
 def model(plain: Any) -> onnx.ModelProto:
     return onnx.load(plain.path)
-
-
-def _tensors(graph: onnx.GraphProto) -> Iterator[onnx.TensorProto]:
-    yield from graph.initializer
-    for node in graph.node:
-        for attribute in node.attribute:
-            if attribute.HasField("t"):
-                yield attribute.t
-            yield from _tensors(attribute.g)
 
 
 def save(model: onnx.ModelProto, folder: Path) -> Path:

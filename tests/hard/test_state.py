@@ -93,7 +93,7 @@ def fitted() -> None:
 RENDER: dict[str, Callable[[], Any]] = {
     "blur_by_coc": lambda: differentiated(blur_by_coc, COC),
     "DepthOfField": lambda: differentiated(DepthOfField(Camera(focus_m=2.0, sensor_width_mm=6.0)), DEPTH),
-    "fold": lambda: differentiated(lambda image, coc: blur_by_coc(image, coc, method="fold"), COC),
+    "fold": lambda: differentiated(lambda image, coc: blur_by_coc(image, coc, method="fold"), COC / 4),
     "field": lambda: blur_by_coc(COC.new_ones(1, 1, 30, 40), COC, table=BlurTable.polygon(5, vignetting=0.4)),
     "layers": layers,
     "repair_edges": lambda: repair_edges(COC.new_ones(1, 3, 30, 40), from_relative(COC, 1.0, 3.0)),
