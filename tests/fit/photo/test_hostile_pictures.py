@@ -92,14 +92,17 @@ def off(fit: BlurFit, sigma: float) -> float:
     return max(0.0, abs(max(found, 0.3) - max(sigma, 0.3)) - 0.01) / error
 
 
-@pytest.mark.parametrize(
-    ("name", "family"),
-    [
-        (name, family)
-        for name, (_, sigma) in HOSTILE.items()
-        for family in ("gaussian", "auto", *(("ring", "disc", "softm", "radial") if sigma is None else ()))
-    ],
-)
+# a picture that is refused before a family matters needs one family; "auto" walks through all code of the fit
+EXTREME = ("window of 15", "half a pixel", "no blur", "twice the same", "0 dB", "1e", "denormal", "hot pixel")
+EVERY = ("gaussian", "auto", "ring", "disc", "softm", "radial")
+HOSTILE_CASES = [
+    (name, family)
+    for name in HOSTILE
+    for family in (EVERY if "swapped" in name else EVERY[: 1 + any(words in name for words in EXTREME)])
+]
+
+
+@pytest.mark.parametrize(("name", "family"), HOSTILE_CASES)
 def test_a_hostile_pair_gives_a_right_number_a_warning_or_an_error(
     simulator: ModuleType, captured: Camera, name: str, family: str
 ) -> None:
@@ -124,11 +127,11 @@ def test_error_bars_hold_on_hostile_pictures(
     simulator: ModuleType, captured: Camera, sigma: float, camera: dict[str, Any]
 ) -> None:
     pulls = []
-    for seed in range(12):
+    for seed in range(8):
         fit, _ = attempt(simulator, functools.partial(fit_pair, *captured(sigma, seed, **camera), "gaussian"))
         assert fit is not None
         pulls.append((float(fit.params["sigma"]) - sigma) / float(fit.stderr["sigma"]))
-    # 12 errors in units of the right standard error have a mean square above 2.18 in 1 % of all cases
+    # 8 errors in units of the right standard error have a mean square above 2.25 in 2 % of all cases
     assert math.sqrt(float(np.mean(np.square(pulls)))) < 1.5
     assert max(map(abs, pulls)) < 3.5
 

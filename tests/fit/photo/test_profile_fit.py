@@ -39,7 +39,7 @@ def test_every_family_is_recovered_from_its_own_samples_in_any_unit(family, true
 def test_standard_errors_hold_in_repeated_samples():
     r = np.linspace(0, 6e-3, 100)
     rng = np.random.default_rng(3)
-    fits = [fit_profile(r, eq_1(r, r_c=1e-3) + 0.01 * rng.normal(size=r.size)) for _ in range(60)]
+    fits = [fit_profile(r, eq_1(r, r_c=1e-3) + 0.01 * rng.normal(size=r.size)) for _ in range(30)]
     for name, true in (("N", N), ("r_c", 1e-3), ("sigma", SIGMA)):
         pull = np.array([(f.params[name] - true) / f.stderr[name] for f in fits])
         assert 0.75 < pull.std() < 1.3 and abs(pull.mean()) < 0.45, name
