@@ -91,9 +91,18 @@ def test_the_radius_is_that_of_the_light_rather_than_of_the_non_negative_kernel(
         ({"size": 45}, "gaussian", {"sigma": 0.8}, {"source": "image", **HELD}, 24, (0.75, 1.3)),
         ({"size": 71}, "ring", RING, HELD, 12, (0.5, 1.5)),
         # demosaiced: 2.0 to 2.3 times too small where pixels count as independent
-        ({"size": 55, "bayer": True}, "disc", {"radius": 5.0}, HELD, 16, (0.7, 1.4)),
+        ({"size": 61, "bayer": True}, "disc", {"radius": 5.0}, HELD, 16, (0.7, 1.4)),
+        *(
+            (harsh, "gaussian", {"sigma": s}, {}, 8, (0.5, 1.5))
+            for harsh, s in [
+                ({"size": 61, "snr_db": 10.0}, 2.0),
+                ({"size": 21, "dot_radius": 3.0}, 1.0),
+                ({"size": 61, "clip": 0.9, "snr_db": 30.0}, 2.0),
+            ]
+        ),
     ],
 )
+@pytest.mark.filterwarnings("ignore:.*clipped:torchdof.fit.problems.FitWarning")
 def test_standard_errors_hold_in_repeated_captures(simulator, camera, family, true, options, draws, spread):
     camera = simulator.Simulator(**{"dot_radius": 8.0, **camera})
     fits = [fit_pair(*camera.pair(family, true, 100 + seed), family, **options) for seed in range(draws)]
