@@ -100,10 +100,11 @@ def seen_by_pixels(light: Tensor, places: Tensor, size: int) -> Tensor:
     settled = [[max(value, 0.0) for value in row] for row in kernel]
     for row in range(1, 2 * half):
         for column in range(1, 2 * half):
-            owed = -kernel[row][column]
+            if not (owed := -kernel[row][column]) > 0:
+                continue
             givers = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
             wealth = sum(max(kernel[y][x], 0.0) for y, x in givers)
-            for y, x in givers if owed > 0 and wealth > 0 else []:
+            for y, x in givers if wealth > 0 else []:
                 settled[y][x] -= owed * max(kernel[y][x], 0.0) / wealth
     inner = torch.tensor(settled, dtype=torch.float64).clamp_min(0.0)[2:-2, 2:-2]
     return inner / inner.sum()

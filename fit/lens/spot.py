@@ -220,14 +220,16 @@ def _rays_of_point(
 
     # every passing ray crosses the first surface's clear diameter
     reach = front_diameter / 2 + abs(pupil) * (abs(tangent) + front_diameter / distance)
-    low, high = np.array([-reach, -reach]), np.array([reach, reach])
+    low, high, steps = np.array([-reach, -reach]), np.array([reach, reach]), np.linspace(0.0, 1.0, _PUPIL_INTERVALS + 1)
     for _ in range(8):
-        points = _grid(low, high, np.linspace(0.0, 1.0, _PUPIL_INTERVALS + 1))
+        # seen from the axis the passing rays fill a circle, so that those in one plane give its radius
+        points = _grid(low, high, steps) if field_mm else np.stack([0.0 * steps, low[1] + (high - low)[1] * steps])
         passed = points[:, aim(points)[0].alive]
         if not passed.size:
             raise ValueError(f"no ray of the object point passes lens {lens.name!r}; is it in the field of view?")
         cell, old_area = (high - low) / _PUPIL_INTERVALS, np.prod(high - low)
-        low, high = np.maximum(passed.min(1) - cell, low), np.minimum(passed.max(1) + cell, high)
+        first, last = (passed.min(1), passed.max(1)) if field_mm else (passed.min(), passed.max())
+        low, high = np.maximum(first - cell, low), np.minimum(last + cell, high)
         if np.prod(high - low) > 0.95 * old_area:
             break
     return aim, low, high

@@ -1,5 +1,6 @@
 """Chooses the kernel family: the cheapest whose picture a viewer cannot distinguish from the most likely one's."""
 
+import functools
 from collections.abc import Mapping
 
 import numpy as np
@@ -41,14 +42,19 @@ def natural_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     """
     first, second = _square("kernel", kernel), _square("other", other)
     width = max(_WIDTH, first.shape[-1], second.shape[-1])
-    frequency = np.hypot(np.fft.fftfreq(width)[:, None], np.fft.fftfreq(width))
-    frequency[0, 0] = np.inf
-    power = frequency**-2 / np.sum(frequency**-2)
     difference = np.zeros((width, width))
     for sign, k in ((1, first), (-1, second)):
         offsets = np.arange(k.shape[0]) - k.shape[0] // 2
         difference[np.ix_(offsets, offsets)] += sign * k
-    return _decibels(_CONTRAST**2 * float((power * np.abs(np.fft.fft2(difference)) ** 2).sum()))
+    return _decibels(_CONTRAST**2 * float((_natural_power(width) * np.abs(np.fft.fft2(difference)) ** 2).sum()))
+
+
+@functools.cache
+def _natural_power(width: int) -> Array:
+    """Power spectrum `[width, width]` of natural images; it sums to 1."""
+    frequency = np.hypot(np.fft.fftfreq(width)[:, None], np.fft.fftfreq(width))
+    frequency[0, 0] = np.inf
+    return np.asarray(frequency**-2 / np.sum(frequency**-2))
 
 
 def highlight_psnr(kernel: ArrayLike, other: ArrayLike) -> float:

@@ -68,6 +68,7 @@ class Forward:
         x, y = int(round(self.dot.x)), int(round(self.dot.y))
         # part of the picture in which the source is drawn
         self.box = (slice(max(y - margin, 0), y + margin + 1), slice(max(x - margin, 0), x + margin + 1))
+        self._last_moved: tuple[tuple[float, ...], Array, Array] | None = None
         self.flat = self.used.ravel()
         self.values = self.data[self.used]  # [pixels used]
         self.distance = distance_from(self.dot, self.data.shape)  # of each pixel from the blurred dot's centre, px
@@ -80,7 +81,18 @@ class Forward:
 
     def moved_source(self, moves: Mapping[str, float]) -> Array:
         """Fourier transform, on the padded grid, of the displaced and magnified source."""
-        return rfft2(self._drawn(moves), self.grid)
+        return self._moved(moves)[1]
+
+    def _moved(self, moves: Mapping[str, float]) -> tuple[Array, Array]:
+        """The displaced and magnified source, and its Fourier transform; the last one is kept.
+
+        A step of the fit needs them twice: for the model and for its derivatives.
+        """
+        place = tuple(moves[n] for n in ALL_MOVES)
+        if self._last_moved is None or self._last_moved[0] != place:
+            picture = self._drawn(moves)
+            self._last_moved = place, picture, rfft2(picture, self.grid)
+        return self._last_moved[1:]
 
     def _drawn(self, moves: Mapping[str, float]) -> Array:
         rows, columns = self.pixels[(slice(None), *self.box)]
@@ -89,14 +101,20 @@ class Forward:
         picture[self.box] = self.source.draw(rows, columns, x, y, moves["magnification"])
         return picture
 
+    def transformed(self, kernels: Array) -> Array:
+        """Fourier transforms, on the padded grid, of kernels `[n, k, k]` with their centres in pixel (0, 0)."""
+        wrapped = np.zeros((*kernels.shape[:-2], *self.grid))
+        offsets = np.arange(kernels.shape[-1]) - kernels.shape[-1] // 2  # negative ones wrap around
+        wrapped[..., offsets[:, None], offsets] = kernels
+        return rfft2(wrapped, self.grid)
+
     def convolve(self, source: Array, kernels: Array, all_pixels: bool = False) -> Array:
         """Convolves a transformed source `[h, w]` or `[n, h, w]` with kernels `[n, k, k]`: `[n, pixels used]`."""
-        size = kernels.shape[-1]
-        padded = np.zeros((*kernels.shape[:-2], *self.grid))
-        padded[..., :size, :size] = kernels
-        # the kernel's centre goes to pixel (0, 0) of the cyclic grid
-        wrapped = np.roll(padded, (-(size // 2), -(size // 2)), (-2, -1))
-        blurred = irfft2(source * rfft2(wrapped, self.grid), self.grid)
+        return self.product(source, self.transformed(kernels), all_pixels)
+
+    def product(self, source: Array, kernels: Array, all_pixels: bool = False) -> Array:
+        """The same for transformed kernels `[n, h, w]`."""
+        blurred = irfft2(source * kernels, self.grid)
         flat = blurred[..., : self.data.shape[0], : self.data.shape[1]].reshape(*blurred.shape[:-2], -1)
         return np.asarray(flat if all_pixels else flat[..., self.flat])
 
@@ -246,13 +264,13 @@ class Forward:
 
     def move_columns(self, params: Mapping[str, float], names: tuple[str, ...], kernel: Array) -> list[Array]:
         """Derivatives of the blurred source with respect to displacement and magnification."""
-        unmoved = self._drawn(self.moves(params))
-        columns = []
+        unmoved, _ = self._moved(self.moves(params))
+        transformed, columns = self.transformed(kernel), []
         for n in names:
             changed = self.moves(params)
             changed[n] += _STEP[n]
             change = rfft2((self._drawn(changed) - unmoved) / _STEP[n], self.grid)
-            columns.append(self.convolve(change, kernel[None])[0])
+            columns.append(self.product(change, transformed))
         return columns
 
     def bounds(self, names: tuple[str, ...]) -> tuple[list[float], list[float]]:

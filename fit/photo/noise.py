@@ -5,8 +5,8 @@ second differences, which measure only changes from pixel to pixel, underestimat
 """
 
 import numpy as np
-from scipy.ndimage import convolve
 from scipy.signal import correlate as correlated
+from scipy.signal import fftconvolve
 
 from ..result import Array, Mask
 
@@ -86,7 +86,7 @@ def correlate(pictures: Array, correlation: Array) -> Array:
         return pictures
     reach = int(np.abs(np.argwhere(correlation) - LAGS).max())
     middle = slice(LAGS - reach, LAGS + reach + 1)
-    return np.stack([convolve(p, correlation[middle, middle], mode="constant") for p in pictures])
+    return np.asarray(fftconvolve(pictures, correlation[None, middle, middle], mode="same", axes=(1, 2)))
 
 
 def independent_share(correlation: Array) -> float:

@@ -31,9 +31,9 @@ def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: i
     h = radius / (count - 1)
     hat_light = 2 * np.pi * h * h * np.arange(count, dtype=np.float64)  # integral of each hat over the plane
     hat_light[0], hat_light[-1] = np.pi * h * h / 3, 2 * np.pi * (radius * h / 2 - h * h / 6)
-    moves = dict(moves)
+    moves, transformed = dict(moves), pair.transformed(hats)
     for _ in range(10):
-        columns = hat_light[:, None] * pair.convolve(pair.moved_source(moves), hats)  # [knots, pixels]
+        columns = hat_light[:, None] * pair.product(pair.moved_source(moves), transformed)  # [knots, pixels]
         weights, smoothing = _non_negative(columns, pair.values)
         gain = float(hat_light @ weights)
         kernel = np.tensordot(hat_light * weights / gain, hats, 1)

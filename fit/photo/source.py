@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -115,6 +116,12 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
     With `fit_exponent`, levels are a power of the light. A round white dot loses as much light inside its edge as it
     gains outside; encoding (a power of about 0.45) breaks this balance and can be detected.
     """
+    return _soft_edge(np.asarray(picture, dtype=np.float64).tobytes(), picture.shape, dot, white, fit_exponent)
+
+
+@functools.lru_cache(maxsize=16)  # fits of several distances, families and passes have the same sharp pictures
+def _soft_edge(pixels: bytes, shape: tuple[int, ...], dot: Dot, white: float | None, fit_exponent: bool) -> Edge:
+    picture = np.frombuffer(pixels).reshape(shape)
     grid = np.indices(picture.shape).astype(np.float64)
     is_near = distance_from(dot, picture.shape) <= dot.reach + 3
     rows, columns, levels = grid[0][is_near], grid[1][is_near], (picture[is_near] - dot.background) / dot.peak

@@ -49,7 +49,7 @@ def traced_spot(z_m: float, radius_mm: float, azimuth: float, half: int, width: 
 
 @pytest.fixture(scope="module")
 def table() -> BlurTable:
-    return trace_table(GAUSS, 2.0, 2.0, nodes=5, points=17, rays=400, field=RADII, field_nodes=4, field_rays=40_000)
+    return trace_table(GAUSS, 2.0, 2.0, nodes=5, points=17, rays=400, field=RADII, field_nodes=4, field_rays=20_000)
 
 
 @pytest.mark.parametrize(("z_m", "least"), [(0.9, 37.0), (1e9, 34.0)])

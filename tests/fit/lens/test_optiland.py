@@ -1,4 +1,4 @@
-"""Rays and spots against those of optiland, an independent ray tracer (``pip install optiland``)."""
+"""Spots against those of optiland, an independent ray tracer (``pip install optiland``)."""
 
 import importlib
 import importlib.util
@@ -10,16 +10,13 @@ import numpy as np
 import pytest
 
 from torchdof.fit.lens.glass import catalogue
-from torchdof.fit.lens.lens import Lens, trace_rays
+from torchdof.fit.lens.lens import Lens
 from torchdof.fit.lens.spot import focus_sensor, point_spread
 
 if importlib.util.find_spec("optiland") is None:
     pytest.skip("optiland is not installed; rays are not checked independently", allow_module_level=True)
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # optiland's own warnings
-
-LENSES = ("double_gauss_50mm", "wide_22mm", "telephoto_250mm")
-
 
 # Laikin, Lens Design, 4th ed., p. 63: Tessar, f/4.5, 4 inches, with SCHOTT glasses. Clear diameters are our choice
 TESSAR = """
@@ -63,30 +60,6 @@ def optiland_rays(start: np.ndarray, direction: np.ndarray, wavelength_um: float
     return importlib.import_module("optiland.rays").RealRays(*start, *direction, light, wavelength)
 
 
-@pytest.mark.parametrize("name", LENSES)
-@pytest.mark.parametrize("slope", [0.0, 0.1])
-def test_rays_land_within_5e5_mm(name: str, slope: float) -> None:
-    lens = Lens.read(name)
-    sensor = focus_sensor(lens, 2.0, "paraxial")
-    rng = np.random.default_rng(0)
-    half = lens.paraxial().entrance_pupil_diameter / 2
-    # from a point 1 m in front of the first vertex to points of the entrance pupil
-    count = 400
-    r, turn = half * np.sqrt(rng.random(count)), 2 * math.pi * rng.random(count)
-    pupil = lens.paraxial().entrance_pupil
-    source = np.array([[0.0], [-1000.0 * slope], [-1000.0]])
-    direction = np.stack([r * np.cos(turn), r * np.sin(turn), np.full(count, pupil)]) - source
-    direction /= np.linalg.norm(direction, axis=0)
-    start = source + direction * (999.0 / direction[2])  # 1 mm in front of the vertex
-    ours = trace_rays(lens, start, direction)
-    assert ours.alive.sum() > count / 4
-    x, y = ours.at(lens.vertices[-1] + sensor)
-    theirs = optiland_rays(start, direction)
-    optiland_lens(lens, sensor).surfaces.trace(theirs, skip=1)
-    apart = np.hypot(np.asarray(theirs.x) - x, np.asarray(theirs.y) - y)[ours.alive]
-    assert apart.max() < 5e-5
-
-
 def optiland_rms(lens: Lens, z_m: float, sensor: float, wavelength_um: float) -> float:
     """RMS radius in mm of the spot on the axis, from rays uniform over the entrance pupil that pass every aperture."""
     first = lens.paraxial()
@@ -105,7 +78,7 @@ def optiland_rms(lens: Lens, z_m: float, sensor: float, wavelength_um: float) ->
     return float(np.sqrt(np.mean(np.asarray(rays.y)[passes] ** 2)))
 
 
-@pytest.mark.parametrize("name", [*LENSES, "tessar"])
+@pytest.mark.parametrize("name", ["double_gauss_50mm", "wide_22mm", "telephoto_250mm", "tessar"])
 def test_rms_spots_of_eight_depths_and_three_lines_agree_within_1_percent(name: str, tmp_path: Path) -> None:
     (tmp_path / "tessar.txt").write_text(TESSAR)
     lens = Lens.read(tmp_path / "tessar.txt").scaled(100.0) if name == "tessar" else Lens.read(name)

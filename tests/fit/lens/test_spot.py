@@ -24,12 +24,6 @@ def test_the_reference_point_of_distances_changes_the_blur_but_not_the_focus(gau
     assert point_spread(lens, 2.0, sensor, reference=reference, meridional=True).radius < 1e-3
 
 
-def test_distances_from_the_sensor_and_from_h_focus_the_same_plane(gauss):
-    sensor = focus_sensor(gauss, 2.0, "paraxial", "sensor")
-    from_h = 2.0 - (gauss.vertices[-1] + sensor - gauss.paraxial().front_principal) / 1000.0
-    assert focus_sensor(gauss, from_h, "paraxial", "principal") == pytest.approx(sensor, abs=1e-9)
-
-
 def over_thin_lens(lens: Lens, f_number: float, focus_m: float, z_m: float) -> float:
     """Blur radius over that of the thin lens, minus 1; the thin lens has its pupil where the entrance pupil is."""
     first, stopped = lens.paraxial(), lens.with_f_number(f_number)

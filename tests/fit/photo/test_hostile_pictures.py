@@ -1,7 +1,5 @@
 """A fit to bad data gives a number within its error bars, a warning, or an error: never a wrong number silently."""
 
-import functools
-import math
 from collections.abc import Callable
 from types import ModuleType
 from typing import Any
@@ -92,14 +90,17 @@ def off(fit: BlurFit, sigma: float) -> float:
     return max(0.0, abs(max(found, 0.3) - max(sigma, 0.3)) - 0.01) / error
 
 
-@pytest.mark.parametrize(
-    ("name", "family"),
-    [
-        (name, family)
-        for name, (_, sigma) in HOSTILE.items()
-        for family in ("gaussian", "auto", *(("ring", "disc", "softm", "radial") if sigma is None else ()))
-    ],
-)
+# "auto" walks through the code of all families
+EXTREME = ("window of 15", "no blur", "noise 0 dB", "1e200", "denormal", "1e6", "swapped")
+HOSTILE_CASES = [
+    (name, family)
+    for name in HOSTILE
+    for family in ("gaussian", "auto", "radial")
+    if family == "gaussian" or family == "auto" and any(words in name for words in EXTREME) or "swapped" in name
+]
+
+
+@pytest.mark.parametrize(("name", "family"), HOSTILE_CASES)
 def test_a_hostile_pair_gives_a_right_number_a_warning_or_an_error(
     simulator: ModuleType, captured: Camera, name: str, family: str
 ) -> None:
@@ -110,27 +111,6 @@ def test_a_hostile_pair_gives_a_right_number_a_warning_or_an_error(
     assert sigma is not None, f"{fit.params} without a warning"
     if fit.family == "gaussian":
         assert off(fit, sigma) < 4
-
-
-HARSH: list[tuple[float, dict[str, Any]]] = [
-    (2.0, {"snr_db": 10.0}),
-    (1.0, {"size": 21, "dot_radius": 3.0}),
-    (2.0, {"clip": 0.9, "snr_db": 30.0}),
-]
-
-
-@pytest.mark.parametrize(("sigma", "camera"), HARSH)
-def test_error_bars_hold_on_hostile_pictures(
-    simulator: ModuleType, captured: Camera, sigma: float, camera: dict[str, Any]
-) -> None:
-    pulls = []
-    for seed in range(12):
-        fit, _ = attempt(simulator, functools.partial(fit_pair, *captured(sigma, seed, **camera), "gaussian"))
-        assert fit is not None
-        pulls.append((float(fit.params["sigma"]) - sigma) / float(fit.stderr["sigma"]))
-    # 12 errors in units of the right standard error have a mean square above 2.18 in 1 % of all cases
-    assert math.sqrt(float(np.mean(np.square(pulls)))) < 1.5
-    assert max(map(abs, pulls)) < 3.5
 
 
 RADII = np.linspace(0.0, 8.0, 30)

@@ -1,5 +1,6 @@
 """Folders with a capture.toml: reading, windows around dots, and errors with file and number."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,16 @@ def softness(distance):
     return "gaussian", {"sigma": 6.0 * abs(1 / 0.5 - 1 / distance)}
 
 
-@pytest.fixture
-def folder(simulator, tmp_path):
+@pytest.fixture(scope="module")
+def written(simulator, tmp_path_factory):
     camera = simulator.Simulator(level=0.7, snr_db=46, dot_radius=9.0, black=0.02)
-    return simulator.write_captures(tmp_path / "lens", camera, 0.5, [0.4, 1.0], softness)
+    return simulator.write_captures(tmp_path_factory.mktemp("lens"), camera, 0.5, [0.4, 1.0], softness)
+
+
+@pytest.fixture
+def folder(written, tmp_path):
+    """A copy that a test may change."""
+    return Path(shutil.copytree(written, tmp_path / "lens"))
 
 
 def change(folder, before, after):

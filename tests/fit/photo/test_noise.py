@@ -5,7 +5,7 @@ import pytest
 
 from torchdof.fit import fit_pair
 from torchdof.fit.photo.frame import demosaiced
-from torchdof.fit.photo.noise import LAGS, correlate, correlation_of, independent_share, noise_beside, noise_of
+from torchdof.fit.photo.noise import LAGS, correlate, correlation_of, independent_share, noise_beside
 from torchdof.fit.photo.pair import prepared_pair
 
 
@@ -14,12 +14,6 @@ def test_independent_noise_has_no_estimated_correlation():
     correlation, fine = noise_beside(noise, 0.0, everywhere)
     assert np.count_nonzero(correlation) == 1 and correlation[LAGS, LAGS] == independent_share(correlation) == 1
     assert fine == pytest.approx(1.0, abs=0.1)
-
-
-def test_noise_is_measured_beside_the_dot(simulator):
-    dot = simulator.draw_dot(81, 9.0)
-    assert noise_of(dot + np.random.default_rng(0).normal(0, 0.02, (81, 81))) == pytest.approx(0.02, rel=0.1)
-    assert noise_of(dot) == 0
 
 
 def test_the_correlation_of_demosaiced_noise_is_that_of_its_filter():

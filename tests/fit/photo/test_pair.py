@@ -19,6 +19,7 @@ from torchdof.optics.psf import pixel_kernels
 
 STARS = Path(__file__).parents[2] / "data" / "defocused_stars"
 GAUSSIAN, DISC, RING = {"sigma": 4.0}, {"radius": 6.0}, {"sigma": 4.0, "r_c": 1.5}
+HELD = {"fit_magnification": False}
 SOFTM = {"radius": 8.0, "sigma": 1.0, "b": 1.0, "m": 4.0}
 
 
@@ -28,10 +29,10 @@ def off(fit, name, true):
 
 # camera, family, its parameters, options of the fit, number of captures, largest relative error of one and of the mean
 RECOVERED = [
-    *(({}, "gaussian", {"sigma": s}, {}, 3, most, most) for s, most in [(0.5, 0.03), (1.0, 0.01), (2.0, 0.01)]),
-    *(({"snr_db": 30}, "gaussian", {"sigma": s}, {}, 3, 0.02, 0.02) for s in (2.0, 4.0, 8.0)),
+    *(({}, "gaussian", {"sigma": s}, {}, 1, most, most) for s, most in [(0.5, 0.03), (1.0, 0.01), (2.0, 0.01)]),
+    *(({"snr_db": 30, "size": 101}, "gaussian", {"sigma": s}, {}, 1, 0.02, 0.02) for s in (2.0, 8.0)),
     *(
-        ({"snr_db": 46, **harm}, "gaussian", {"sigma": s}, {}, 3, 0.02, 0.005)
+        ({"snr_db": 46, **harm}, "gaussian", {"sigma": s}, {}, 2, 0.02, 0.005)
         for harm, s in [
             ({"exposure": 0.6, "offset": 0.05}, 2.0),
             ({"shift": (1.3, -1.6)}, 4.0),
@@ -40,7 +41,7 @@ RECOVERED = [
             ({"full_well": 20_000.0}, 4.0),
         ]
     ),
-    ({"snr_db": 53.5}, "ring", RING, {}, 4, 0.05, 0.05),  # 40 dB below the mean square of the whole window
+    ({"snr_db": 53.5}, "ring", RING, {}, 1, 0.05, 0.05),
     # the softness of demosaicing does not scale with the dot; scaling it would give an error of 0.13
     ({"size": 61, "dot_radius": 9.0, "bayer": True}, "disc", {"radius": 2.0}, {"magnification": 0.4}, 1, 0.03, 0.03),
     ({"size": 61, "dot_radius": 4.5, "bayer": True}, "disc", {"radius": 2.0}, {"magnification": 2.0}, 1, 0.03, 0.03),
@@ -49,7 +50,7 @@ RECOVERED = [
 
 @pytest.mark.parametrize(("camera", "family", "params", "options", "captures", "each", "mean"), RECOVERED)
 def test_the_fit_recovers_the_blur(simulator, camera, family, params, options, captures, each, mean):
-    camera = simulator.Simulator(**{"magnification": options.get("magnification", 1.0), **camera})
+    camera = simulator.Simulator(**{"size": 75, "magnification": options.get("magnification", 1.0), **camera})
     fits = [fit_pair(*camera.pair(family, params, seed), family, **options) for seed in range(captures)]
     for name, true in params.items():
         found = np.array([fit.params[name] for fit in fits]) / true - 1
@@ -85,14 +86,23 @@ def test_the_radius_is_that_of_the_light_rather_than_of_the_non_negative_kernel(
 @pytest.mark.parametrize(
     ("camera", "family", "true", "options", "draws", "spread"),
     [
-        ({"size": 81}, "gaussian", {"sigma": 3.0}, {"fit_magnification": True}, 40, (0.75, 1.3)),
+        ({"size": 61}, "gaussian", {"sigma": 3.0}, {"fit_magnification": True}, 16, (0.75, 1.3)),
         # the noise of the dot's picture passes through the kernel: 1.3 to 2 times too small without it
-        ({"size": 61}, "gaussian", {"sigma": 0.8}, {"source": "image", "fit_magnification": False}, 40, (0.75, 1.3)),
-        ({"dot_radius": 12.0, "size": 101}, "ring", RING, {}, 16, (0.5, 1.5)),
+        ({"size": 61}, "gaussian", {"sigma": 0.8}, {"source": "image", **HELD}, 40, (0.75, 1.3)),
+        ({"size": 71}, "ring", RING, HELD, 10, (0.5, 1.5)),
         # demosaiced: 2.0 to 2.3 times too small where pixels count as independent
-        ({"size": 61, "bayer": True}, "disc", {"radius": 5.0}, {"fit_magnification": False}, 16, (0.7, 1.4)),
+        ({"size": 61, "bayer": True}, "disc", {"radius": 5.0}, HELD, 12, (0.7, 1.4)),
+        *(
+            (harsh, "gaussian", {"sigma": s}, {}, 8, (0.5, 1.5))
+            for harsh, s in [
+                ({"size": 61, "snr_db": 10.0}, 2.0),
+                ({"size": 21, "dot_radius": 3.0}, 1.0),
+                ({"size": 61, "clip": 0.9, "snr_db": 30.0}, 2.0),
+            ]
+        ),
     ],
-)  # fmt: skip
+)
+@pytest.mark.filterwarnings("ignore:.*clipped:torchdof.fit.problems.FitWarning")
 def test_standard_errors_hold_in_repeated_captures(simulator, camera, family, true, options, draws, spread):
     camera = simulator.Simulator(**{"dot_radius": 8.0, **camera})
     fits = [fit_pair(*camera.pair(family, true, 100 + seed), family, **options) for seed in range(draws)]
@@ -102,11 +112,9 @@ def test_standard_errors_hold_in_repeated_captures(simulator, camera, family, tr
     assert 0.8 < np.mean([fit.residual_over_noise for fit in fits]) < 1.2
 
 
-@pytest.mark.parametrize(
-    ("family", "true"), [("gaussian", {"sigma": 3.0}), ("disc", {"radius": 7.0}), ("softm", SOFTM)]
-)
+@pytest.mark.parametrize(("family", "true"), [("gaussian", {"sigma": 3.0}), ("disc", {"radius": 7.0})])
 def test_auto_chooses_the_cheapest_sufficient_family(simulator, family, true):
-    fit = fit_pair(*simulator.Simulator(snr_db=60, size=81).pair(family, true), accuracy_db=60)
+    fit = fit_pair(*simulator.Simulator(snr_db=60, size=75).pair(family, true), accuracy_db=60)
     assert fit.family == family and "60 dB" in fit.why and fit.psnr[family] >= 60
 
 
@@ -145,7 +153,7 @@ def test_photographed_stars_are_rings_and_an_uneven_one_gives_a_warning(simulato
 JPEG = {"level": 0.8, "size": 91, "jpeg": 90, "black": 0.02}
 CUT_OFF = {"bits": 16, "snr_db": 45, "level": 0.8}
 TONE = {"tone": 0.5, "level": 0.8, "black": 0.03}
-HELD, CHEAP = {"fit_magnification": False}, {"family": "auto", "accuracy_db": 30}
+CHEAP = {"family": "auto", "accuracy_db": 30}
 G3, G4, D6, R34 = (
     ("gaussian", {"sigma": 3.0}),
     ("gaussian", GAUSSIAN),
@@ -156,8 +164,7 @@ G3, G4, D6, R34 = (
 WARNED = [
     *(
         ({"srgb": True, "level": 0.7, **noise}, ("gaussian", {"sigma": s}), 1, {}, None, "linear", None)
-        for noise in ({"snr_db": None}, {"snr_db": 40.0}, {"snr_db": 60.0, "full_well": 5000.0})
-        for s in (1.0, 4.0)
+        for noise, s in (({"snr_db": None}, 1.0), ({"snr_db": 40.0}, 4.0), ({"snr_db": 60.0, "full_well": 5e3}, 1.0))
     ),
     ({"clip": 0.9}, G4, 0, {}, {"saturated"}, "pixels of the .* picture are", None),
     ({"clip": 0.9, "snr_db": None}, G4, 0, {"white": 0.9}, {"saturated"}, "clipped at 0.9", None),
@@ -180,7 +187,7 @@ WARNED = [
 @pytest.mark.parametrize(("camera", "kernel", "seed", "options", "kinds", "words", "number"), WARNED)
 def test_faults_of_a_capture_give_warnings(simulator, camera, kernel, seed, options, kinds, words, number):
     options = {"family": kernel[0], "files": ("a.png", "b.png"), **options}
-    pair = simulator.Simulator(**camera).pair(*kernel, seed)
+    pair = simulator.Simulator(**{"size": 81, **camera}).pair(*kernel, seed)
     fit, found = simulator.result_and_warnings(lambda: fit_pair(*pair, **options))
     assert {w.kind for w in found} == kinds or (kinds is None and {"not linear", "residual"} & {w.kind for w in found})
     assert any(re.search(words, str(w)) for w in found) and {w.file for w in found} <= set(options["files"])
@@ -216,7 +223,7 @@ SILENT = [
 
 @pytest.mark.parametrize(("camera", "kernel", "seeds", "white"), SILENT)
 def test_a_capture_without_faults_gives_no_warning(simulator, camera, kernel, seeds, white):
-    pair = np.mean([simulator.Simulator(**camera).pair(*kernel, seed) for seed in seeds], axis=0)
+    pair = np.mean([simulator.Simulator(**{"size": 81, **camera}).pair(*kernel, seed) for seed in seeds], axis=0)
     fit = fit_pair(*pair, kernel[0], white=white)  # a warning is an error here
     assert fit.magnification == pytest.approx(camera.get("magnification", 1.0), abs=0.005)
 
@@ -233,7 +240,7 @@ def test_a_residual_of_twice_the_noise_gives_a_warning(simulator, cheap, freest)
 def test_a_cat_s_eye_gives_a_warning_of_asymmetry_and_round_blur_does_not(simulator):
     # with noise only, the p-value of the statistic is uniform in 0..1
     chances = []
-    for seed in range(24):
+    for seed in range(12):
         camera = simulator.Simulator(size=45, dot_radius=6.0)
         pair, _, _ = prepared_pair(*camera.pair("disc", {"radius": 8.0}, seed))
         pair.fit_moves = ("dx", "dy")

@@ -49,7 +49,7 @@ def psnr_between_nodes(table, places):
 
 @pytest.fixture(scope="module")
 def nine(simulator):
-    return fit_captures(captured(simulator, DISTANCES), "softm")
+    return fit_captures(captured(simulator, DISTANCES, seed=50), "softm")
 
 
 def test_nodes_are_at_the_camera_s_signed_cocs_and_survive_saving(nine, tmp_path):
@@ -66,10 +66,10 @@ def test_kernels_between_the_nodes_equal_the_lens_s(nine):
     assert reached.min() > 55 and np.median(reached) > 62
 
 
-def test_smoothing_over_neighbouring_distances_keeps_parameters_on_one_branch(simulator):
+def test_smoothing_over_neighbouring_distances_keeps_parameters_on_one_branch(nine, simulator):
     places, reached = np.linspace(-5, -1.5, 20), []
-    for smooth in (False, True):
-        table = fit_table(captured(simulator, [0.7, 0.8, 0.9], seed=51), "softm", smooth=smooth)
+    alone = fit_table(captured(simulator, DISTANCES[1:4], seed=51), "softm", smooth=False)
+    for table in (alone, nine.table):
         # kernels of the interpolated parameters, without the table's templates, which have errors too
         lines = [table.params(torch.tensor(coc), WIDTH) for coc in places]
         drawn = [psf.softm(**{name: value[0] for name, value in line.items()}) for line in lines]
@@ -82,7 +82,7 @@ def test_smoothing_over_neighbouring_distances_keeps_parameters_on_one_branch(si
     ("family", "distances", "snr_db", "places", "least"),
     [
         ("softm", [0.7, 1.5], None, cocs([0.7, 1.5]), 80),  # exact at the nodes without noise
-        ("radial", [0.7, 0.8, 1.25, 1.5], 50, [-5.0, -4.0, 3.0, 4.0], 50),  # a free profile fits any round lens
+        ("radial", [0.7, 0.8], 50, [-5.0, -4.0], 50),  # a free profile fits any round lens
     ],
 )
 def test_a_sufficient_family_recovers_the_lens(simulator, family, distances, snr_db, places, least):
