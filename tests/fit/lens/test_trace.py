@@ -81,7 +81,7 @@ def test_a_shipped_table_matches_traced_spots_and_states_its_origin(name):
     lens, f_number, focus_m, nodes, least = SHIPPED[name]
     table = BlurTable.load(name)
     assert len(table.coc) == nodes
-    shares = [0.15, 0.5]
+    shares = [0.15, 0.5, 0.85]
     places = np.concatenate([between(table, share) for share in shares])
     blurs = np.abs(places) >= SHARP_PX * PIXEL
     blurred, is_middle = places[blurs], np.repeat(shares, nodes - 1)[blurs] == 0.5
@@ -124,6 +124,13 @@ def test_fitting_all_nodes_at_once_beats_fitting_each_alone(monkeypatch):
 def small(lens: Lens, **changes: Any) -> BlurTable:
     given = {"f_number": 8.0, "focus_m": 2.0, "nodes": 5, "points": 17, "rays": 300}
     return trace_table(lens, **{**given, **changes})
+
+
+def test_a_stopped_down_lens_gives_discs_of_the_thin_lens():
+    table = small(read("double_gauss_50mm"), f_number=32.0, focus="paraxial")
+    far = psf.disc(float(table.coc[-1]) / PIXEL)
+    made = table.kernels(table.coc[-1:] / PIXEL, WIDTH)[0, 0]
+    assert natural_psnr(made.numpy(), far.numpy()) > 55.0
 
 
 def test_nodes_reach_from_the_nearest_distance_to_infinity():
