@@ -49,7 +49,7 @@ def natural_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     return _decibels(_CONTRAST**2 * float((_natural_power(width) * np.abs(np.fft.fft2(difference)) ** 2).sum()))
 
 
-@functools.cache
+@functools.lru_cache(maxsize=8)
 def _natural_power(width: int) -> Array:
     """Power spectrum `[width, width]` of natural images; it sums to 1."""
     frequency = np.hypot(np.fft.fftfreq(width)[:, None], np.fft.fftfreq(width))
