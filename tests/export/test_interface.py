@@ -1,4 +1,4 @@
-"""Inputs of exported files: one depth map for a whole batch, impossible cameras, wrong shapes, fixed sizes."""
+"""Inputs of exported files: one depth map for a batch, impossible cameras, wrong shapes, fixed sizes, hard cases."""
 
 import math
 from pathlib import Path
@@ -9,6 +9,11 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+
+from torchdof import Camera, DepthOfField
+from torchdof.export.cases import cases
+from torchdof.export.graph import Portable
+from torchdof.export.verification import TOLERANCE
 
 LENS = torch.tensor([1.0]), torch.tensor([0.3])
 
@@ -69,3 +74,12 @@ def test_kornia_runs_a_file(plain: Any, kind: str, tmp_path: Path, monkeypatch: 
     runner = getattr(onnx_classes, kind)(str(plain.path))
     got = runner(*(tensor.numpy() for tensor in tensors))[0]
     torch.testing.assert_close(torch.from_numpy(got), plain.eager(*tensors), atol=1e-5, rtol=0)
+
+
+def test_the_pictures_of_verified_cases_do_not_depend_on_rounding() -> None:
+    """Else a file of a module with large blurs, such as the default, would differ from it by more than the limit."""
+    portable = Portable(DepthOfField(Camera()), "depth", None, "as given")
+    for case in cases(portable, 3):
+        if case.name in ("depth edges", "bad depths"):
+            single, double = (portable(*(t.to(kind) for t in case.tensors)) for kind in (torch.float32, torch.float64))
+            assert float((single - double).abs().max()) < TOLERANCE
