@@ -246,13 +246,13 @@ def fill_hidden(
         searched = [*searched[:_FINE_LEVELS], of_cells]
     seen, total = ops.seen(_seen, searched, coc_px, wanted)
 
-    # between mixed and hidden the weight falls to 0, because light and coc jump
+    # A hidden sample replaces a mixed one of less than half its largest weight. Light and coc jump there, so that both
+    # weights fall to 0.
     apart = other_weight * (2.0 / HIDDEN_WEIGHT) - 1.0
     hidden = (total / _CERTAIN).clamp(max=1.0) * -HIDDEN_WEIGHT * apart
     weight = torch.where(apart < 0, hidden, other_weight * apart.clamp(max=1.0))
-    light, coc_px = (
-        torch.where(apart < 0, a, b) for a, b in ((seen[:, :-1], other_light), (seen[:, -1:], other_coc_px))
-    )
+    light = torch.where(apart < 0, seen[:, :-1], other_light)
+    coc_px = torch.where(apart < 0, seen[:, -1:], other_coc_px)
     return light, coc_px, weight, behind
 
 

@@ -60,9 +60,8 @@ def _differentiate(operator: Any, name: str, function: Callable[..., Any], diffe
             back = torch.autograd.grad([o for o, _ in wanted], moving, [g for _, g in wanted], allow_unused=True)
         return [torch.zeros_like(v) if g is None else g.contiguous() for v, g in zip(moving, back, strict=True)]
 
-    schema = (
-        torch.library.infer_schema(function, mutates_args=()).split(") ->")[0] + ", Tensor[] of_outputs) -> Tensor[]"
-    )
+    arguments = operator._schema.split(") ->")[0]
+    schema = f"{arguments}, Tensor[] of_outputs) -> Tensor[]"
     of_inputs = torch.library.custom_op(f"{name}_gradients", gradients, mutates_args=(), schema=schema)
     of_inputs.register_fake(lambda *inputs: [value.new_empty(value.shape) for value in inputs[:differentiable]])
 

@@ -1148,7 +1148,7 @@ class Repair {
   }
 
   // Removes rims beside steps that are a little nearer, or farther, than the surface to which they belong: the ringing
-  // of interpolation. Such pixels move to the nearer end of the range between closed opening and opened closing.
+  // of interpolation. Such pixels move to the closer end of the range between the closed opening and the opened closing.
   void remove_ringing() {
     memcpy(evidence_.data(), map_.out, area_ * sizeof(float));
     const std::vector<Group> parts = tiles();
