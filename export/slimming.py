@@ -36,6 +36,7 @@ def slim(model: onnx_ir.Model) -> onnx_ir.Model:
         _Casts(),
     )
     tidy: tuple[onnx_ir.passes.PassBase, ...] = (
+        passes.RemoveUnusedNodesPass(),  # folding leaves sequences of a wrong type, which shape inference refuses
         passes.ShapeInferencePass(),
         _Parts(),
         _Cuts(),

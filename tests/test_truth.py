@@ -11,8 +11,8 @@ from torchdof.reference.scenes import Scene, read_scenes
 
 SCENES = {scene.name: scene for scene in read_scenes(Path(__file__).parent / "data" / "scenes")}
 MEASURED_DB = {
-    "highlights/0": (20.331, 32.847),
-    "planes/0": (31.386, 30.223),
+    "highlights/0": (20.331, 32.851),
+    "planes/0": (31.386, 30.221),
     "portrait/0": (24.966, 23.353),
     "room/1": (40.618, 47.056),
 }

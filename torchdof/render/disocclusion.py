@@ -61,7 +61,7 @@ def _matted_and_filled(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     matted = matte(light, coc_px, valid)
     own, other, other_coc, weight = attribute_emitters(light, coc_px, threshold, valid, matted)
-    own_weight = 1.0 - weight
+    own_weight = 1.0 - _counted(weight)
     other, other_coc, weight, behind = fill_hidden(own, coc_px, other, other_coc, weight, valid, threshold, levels, ops)
     if valid is not None:
         own_weight, weight = own_weight * valid, weight * valid
@@ -246,14 +246,18 @@ def fill_hidden(
         searched = [*searched[:_FINE_LEVELS], of_cells]
     seen, total = ops.seen(_seen, searched, coc_px, wanted)
 
-    # A hidden sample replaces a mixed one of less than half its largest weight. Light and coc jump there, so that both
-    # weights fall to 0.
-    apart = other_weight * (2.0 / HIDDEN_WEIGHT) - 1.0
-    hidden = (total / _CERTAIN).clamp(max=1.0) * -HIDDEN_WEIGHT * apart
-    weight = torch.where(apart < 0, hidden, other_weight * apart.clamp(max=1.0))
-    light = torch.where(apart < 0, seen[:, :-1], other_light)
-    coc_px = torch.where(apart < 0, seen[:, -1:], other_coc_px)
+    # a hidden sample replaces a mixed one that does not count; both weights fall to 0 there, as light and coc jump
+    room = (HIDDEN_WEIGHT - 2.0 * other_weight).clamp_min(0.0)
+    hidden = (total / _CERTAIN).clamp(max=1.0) * room
+    light = torch.where(hidden > 0, seen[:, :-1], other_light)
+    coc_px = torch.where(hidden > 0, seen[:, -1:], other_coc_px)
+    weight = hidden + _counted(other_weight)
     return light, coc_px, weight, behind
+
+
+def _counted(weight: Tensor) -> Tensor:
+    """Weight with which a mixed pixel's other surface counts: 0 up to HIDDEN_WEIGHT / 2, all from HIDDEN_WEIGHT on."""
+    return weight * (weight * (2.0 / HIDDEN_WEIGHT) - 1.0).clamp(0.0, 1.0)
 
 
 def _repeated(

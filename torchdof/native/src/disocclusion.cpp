@@ -193,16 +193,16 @@ class Filling {
     // until here weights of hidden surfaces are negative, which distinguishes them from those of mixed pixels
     for (int i = 0; i < (int)s_.blocks.size(); i++) {
       if (!s_.has_block(i)) continue;
-      float *const weight = s_.block(i).weight;
-      for (int at = 0; at < BLOCK_PIXELS; at++) weight[at] = weight[at] < 0 ? -weight[at] : weight[at] * clamp01(apart(weight[at]));
+      const Block b = s_.block(i);
+      for (int at = 0; at < BLOCK_PIXELS; at++) {
+        const float mixed = b.weight[at], counted = std::max(mixed, 0.0f) * clamp01(mixed * (2.0f / HIDDEN_WEIGHT) - 1.0f);
+        b.weight[at] = mixed < 0 ? -mixed : counted;
+        b.own_weight[at] = b.own_weight[at] > 0 ? 1.0f - counted : 0.0f;
+      }
     }
   }
 
  private:
-  // 0 where a hidden surface replaces a mixed pixel's other one; -1 if that has weight 0, 1 if it has HIDDEN_WEIGHT
-  template <typename V>
-  static V apart(V weight) { return weight * (2.0f / HIDDEN_WEIGHT) - 1.0f; }
-
   void centre(Level &level) const {
     level.centre_y = 0.5f * (job_.height - 1);
     level.centre_x = 0.5f * (job_.width - 1);
@@ -572,7 +572,7 @@ class Filling {
         // replace a second surface that matting gave a small weight
         const Block b = s_.make_block(which);
         const size_t at = within + v * LANES;
-        const vec mixed = load<vec>(b.weight + at), hidden = least(total * (1.0f / CERTAIN), all(1.0f)) * HIDDEN_WEIGHT * apart(mixed);
+        const vec mixed = load<vec>(b.weight + at), hidden = least(total * (1.0f / CERTAIN), all(1.0f)) * (2.0f * mixed - HIDDEN_WEIGHT);
         auto replace = [&](float *other, vec hidden_one) { store(other, wanted ? hidden_one : load<vec>(other)); };
         for (int c = 0; c < C; c++) replace(b.other + c * BLOCK_PIXELS + at, shown[c]);
         replace(b.coc + at, shown[C]);
