@@ -177,7 +177,7 @@ def fit_pair(
             pair.held_magnification = freest.moves["magnification"]
             opening = None
             if family == "auto":
-                solution, why, psnr = _choose(freest, accuracy_db)
+                solution, why, psnr = _choose(freest, accuracy_db, soft)
                 opening = solve_opening(freest)
                 if opening is not None and looks_alike(solution.kernel, opening[0].kernel, accuracy_db):
                     opening = None
@@ -259,10 +259,17 @@ def prepared_pair(
     return pair, edge, linear
 
 
-def _choose(radial: Solution, accuracy_db: float) -> tuple[Solution, str, dict[str, float]]:
-    """Fits every family at the free profile's magnification and chooses one, which is then fitted with it."""
+def _choose(radial: Solution, accuracy_db: float, soft: Solution) -> tuple[Solution, str, dict[str, float]]:
+    """Fits every family at the free profile's magnification and chooses one, which is then fitted with it.
+
+    `soft` is the fit of "softm" that gave the profile's end; it is fitted again only if the moves are others.
+    """
     pair, fixed_pair = radial.pair, replace(radial.pair, fit_moves=("dx", "dy"))
-    solutions = {"radial": replace(radial, pair=fixed_pair)} | {f: fixed_pair.solve(f) for f in COST[:-1]}
+    is_held = soft.pair.fit_moves == fixed_pair.fit_moves and soft.moves["magnification"] == pair.held_magnification
+    kept = {"radial": radial} | ({"softm": soft} if is_held else {})
+    solutions = {
+        f: replace(kept[f], pair=fixed_pair) if f in kept else fixed_pair.solve(f) for f in ("radial", *COST[:-1])
+    }
     kernels, bic = {f: s.kernel for f, s in solutions.items()}, {f: bic_of(s) for f, s in solutions.items()}
     family, why, psnr = choose(kernels, bic, accuracy_db)
     if family == "radial":

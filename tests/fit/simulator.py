@@ -37,6 +37,7 @@ def shape(kind: str, radius: float, size: int = 41, fine: int = 8, turn_deg: flo
     | "hexagon" | inscribed in a circle of `radius` px, a corner `turn_deg` clockwise from the right |
     | "cat's eye" | the intersection of two discs, 0.7 radii apart |
     | "coma" | a disc whose rays are displaced by the square of their height in the pupil |
+    | "mirror" | a disc with a central hole of 0.45 radii |
     """
     axis = (np.arange(size * fine) + 0.5) / fine - size / 2
     x, y = np.meshgrid(axis, axis)
@@ -52,7 +53,8 @@ def shape(kind: str, radius: float, size: int = 41, fine: int = 8, turn_deg: flo
         edges = np.arange(size * fine + 1) / fine - size / 2
         light = np.histogram2d(there[1], there[0], bins=(edges, edges))[0]
     else:
-        light = (r < 1) & (np.hypot(x - 0.7 * radius, y) < radius)
+        cut = {"cat's eye": np.hypot(x - 0.7 * radius, y) < radius, "mirror": r > 0.45}[kind]
+        light = (r < 1) & cut
     kernel = np.asarray(light, dtype=np.float64).reshape(size, fine, size, fine).mean((1, 3))
     return kernel / kernel.sum()
 
