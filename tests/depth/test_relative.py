@@ -73,6 +73,7 @@ def test_the_farthest_disparity_may_lie_at_infinity_and_passes_no_gradient() -> 
     assert values.grad is not None and bool(values.grad.isfinite().all())
 
 
+# each makes a call that `refuses` runs
 relative: Any = functools.partial(functools.partial, from_relative)
 solved: Any = functools.partial(functools.partial, solve_scale)
 TWO = row(1.0, 2.0)

@@ -191,15 +191,15 @@ class Filling {
     job_.parallel(cell_rows_, [&](int row, int) { find_cells(row); });
     if (stride_ == F8) fill<1>(); else fill<0>();
     // until here weights of hidden surfaces are negative, which distinguishes them from those of mixed pixels
-    for (int i = 0; i < (int)s_.blocks.size(); i++) {
-      if (!s_.has_block(i)) continue;
+    job_.parallel((int)s_.blocks.size(), [&](int i, int) {
+      if (!s_.has_block(i)) return;
       const Block b = s_.block(i);
       for (int at = 0; at < BLOCK_PIXELS; at++) {
         const float mixed = b.weight[at], counted = std::max(mixed, 0.0f) * clamp01(mixed * (2.0f / HIDDEN_WEIGHT) - 1.0f);
         b.weight[at] = mixed < 0 ? -mixed : counted;
         b.own_weight[at] = b.own_weight[at] > 0 ? 1.0f - counted : 0.0f;
       }
-    }
+    });
   }
 
  private:

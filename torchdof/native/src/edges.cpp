@@ -1154,7 +1154,7 @@ class Repair {
     const std::vector<Group> parts = tiles();
     parallel((int)parts.size(), [&](int g) {
       const Part &part = parts[g].part, whole = part.grown(4 * RINGING_REACH);
-      const Grid own(part), span(part), up(whole), down(whole), rows(whole);
+      const Grid span(part), up(whole), down(whole), rows(whole);
       const auto spread = [&](const Grid &values, int steps_left, bool negated) {
         const Part over = part.grown(steps_left * RINGING_REACH);
         max_filter<RINGING_REACH>(values, values, rows, over);
@@ -1163,7 +1163,6 @@ class Repair {
       };
       fetch(evidence_.data(), up, [this](float v) { return std::fabs(v) <= LARGEST ? sign_ * v : -NONE; });
       fetch(evidence_.data(), down, [this](float v) { return std::fabs(v) <= LARGEST ? -sign_ * v : -NONE; });
-      each_vector(part, [&](int y, int x) { store(own.at(y, x), load<vec>(up.at(y, x))); });
       for (const Grid *values : {&up, &down}) spread(*values, 3, true);
       vec widest = all(-NONE);
       each_vector(part, [&](int y, int x) {
@@ -1180,10 +1179,10 @@ class Repair {
       for (int y = part.y0; y < part.bottom(); y++)
         for (int x = part.x0; x < part.right(); x++) {
           const size_t i = (size_t)y * width_ + x;
-          const float gap = *span.at(y, x), ends[2] = {-*up.at(y, x), *down.at(y, x)};
-          if (!(std::fabs(map_.out[i]) <= LARGEST && gap > step(i))) continue;
-          const float moved = clamp(*own.at(y, x), std::min(ends[0], ends[1]), std::max(ends[0], ends[1])) - *own.at(y, x);
-          map_.out[i] = sign_ * (*own.at(y, x) + moved * clamp01(2.0f - std::fabs(moved) / (OVERSHOOT * gap)));
+          const float own = sign_ * map_.out[i], gap = *span.at(y, x), ends[2] = {-*up.at(y, x), *down.at(y, x)};
+          if (!(std::fabs(own) <= LARGEST && gap > step(i))) continue;
+          const float moved = clamp(own, std::min(ends[0], ends[1]), std::max(ends[0], ends[1])) - own;
+          map_.out[i] = sign_ * (own + moved * clamp01(2.0f - std::fabs(moved) / (OVERSHOOT * gap)));
         }
     });
   }
