@@ -97,7 +97,6 @@ def _distances(like: Tensor, reach: int) -> Tensor:
 
 def _bins(x: Tensor, image_x: Tensor) -> Tensor:
     """Signed distance of each pixel from each bin, in bins: lines ``[..., 1, n]`` to ``[..., 1, bins, n]``."""
-    x, image_x = x.double(), image_x.double()
     surface = functional.pad(_step(image_x.diff()).cumsum(-1), (1, 0))
     low, high = surface.amin(-1, keepdim=True), surface.amax(-1, keepdim=True)
     per_bin = (_BINS - 1) / (high - low).clamp_min(1.0)
@@ -123,36 +122,50 @@ def _beyond(
         is_bright = brightest > most
         line = line * torch.where(is_bright, most / torch.where(is_bright, brightest, 1.0), 1.0)
     weight = torch.ones_like(line[..., :1, :]) if weight is None else weight
-    values = torch.cat([line * weight, weight], -2).double()[..., None, :]  # [..., C + 1, 1, n]
+    values = torch.cat([line * weight, weight], -2)[..., None, :]  # [..., C + 1, 1, n]
     bins = None if x is None else _bins(x, x if image_x is None else image_x)
     values = values if bins is None else values * (1.0 - bins.abs()).clamp_min(0.0)
-    sums = functional.pad(values.cumsum(-1), (1, 0))  # over the pixels before each one
     # means for distances that are powers of two, interpolated linearly between them
     levels = farthest.bit_length() + 1
-    start, stop, octave, part = _windows(line.shape[-1], farthest, levels, line.dtype, line.device)
-    window = (sums.index_select(-1, stop) - sums.index_select(-1, start)).unflatten(-1, (levels, -1))
+    octave, part = _octaves(farthest, levels, line.dtype, line.device)
+    window = _window_sums(values, levels)
     if bins is not None:  # sum over the pixel's own surface and farther ones
         window = window * (1.0 - bins).clamp(0.0, 1.0).unsqueeze(-2)
     window = window.sum(-3)  # [..., C + 1, levels, n]
     total = window[..., -1:, :, :]
-    means = (window[..., :-1, :, :] / torch.where(total > 0, total, 1.0)).to(line.dtype)
+    means = window[..., :-1, :, :] / torch.where(total > 0, total, 1.0)
     mean = torch.lerp(means.index_select(-2, octave), means.index_select(-2, octave + 1), part)
     return torch.lerp(line[..., None, :], mean, 0.5)
 
 
-@kept
-def _windows(
-    length: int, farthest: int, levels: int, dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Start and stop of each pixel's window on a line, ``[levels n]`` each; level l is for a distance of 2^l pixels.
+def _window_sums(values: Tensor, levels: int) -> Tensor:
+    """Sums over the pixels within ``4 * 2**l`` of each pixel of lines ``[..., n]``, for level l: ``[..., levels, n]``.
 
-    Also, for each distance up to ``farthest``, the level below it ``[farthest]`` and the fraction of the way to the
-    next level ``[farthest, 1]``.
+    Beyond the line there are zeros. The sum over a window is that of two windows of half its width, which both contain
+    the pixel in its middle: with radius r, ``sum_2r(i) = sum_r(i - r) + sum_r(i + r) - value(i)``. Unlike differences
+    of sums from the start of the line, it is exact to single precision.
     """
-    at = torch.arange(length, device=device)
-    half = torch.tensor([_WIDTH * 2**level for level in range(levels)], device=device)[:, None]
-    start, stop = (at - half).clamp_min(0), (at + (half + 1)).clamp_max(length)
+    length, reach = values.shape[-1], _WIDTH * 2 ** (levels - 1)
+    values = functional.pad(values, (reach, reach))
+    size = length + 2 * reach
+    sums = values.narrow(-1, 0, size - 2) + values.narrow(-1, 1, size - 2) + values.narrow(-1, 2, size - 2)
+    radius, windows = 1, []
+    while radius < reach:
+        twice = size - 4 * radius  # pixels with a whole window
+        sums = sums.narrow(-1, 0, twice) + sums.narrow(-1, 2 * radius, twice) - values.narrow(-1, 2 * radius, twice)
+        radius *= 2
+        if radius >= _WIDTH:
+            windows.append(sums.narrow(-1, reach - radius, length))
+    return torch.stack(windows, -2)
+
+
+@kept
+def _octaves(farthest: int, levels: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """For each distance up to ``farthest``, the level below it and the fraction of the way to the next level.
+
+    Level l is for a distance of 2^l pixels. The results are ``[farthest]`` and ``[farthest, 1]``.
+    """
     distance = torch.arange(1, farthest + 1, device=device)
     powers = torch.tensor([2**level for level in range(1, levels)], device=device)
     octave = (distance[:, None] >= powers).sum(1)
-    return start.flatten(), stop.flatten(), octave, (distance / 2**octave - 1.0).to(dtype)[:, None]
+    return octave, (distance / 2**octave - 1.0).to(dtype)[:, None]
