@@ -29,7 +29,7 @@ class Case:
 
 
 def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Case]:
-    """The calls for which a file must give the module's result.
+    """The calls for which a file must give the module's result; a file with a fixed size gets scenes of this size.
 
     Args:
         portable: The exported module.
@@ -45,6 +45,8 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
         ("smaller than the kernels", (1, 5, 7), _ramp(-1.0, 1.0)),
         ("odd, three items", (3, 37, 53), _ramp(-0.6, 0.8)),
         ("portrait", (1, 96, 31), _ramp(-1.0, 0.4)),
+    ]
+    scenes = [
         ("depth edges", (1, 64, 97), _steps),
         ("lamps", (2, 48, 83), _steps),
         ("all in focus", (1, 48, 64), _ramp(0.0, 0.0)),
@@ -54,12 +56,14 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
         ("highlight of 6.5e4", (1, 61, 75), _ramp(-0.7, 0.7)),
         ("infinitely far, 1e30 m", (1, 40, 50), _ramp(-0.5, 1.0)),
         ("bad depths", (2, 41, 50), _ramp(-0.8, 0.8)),
-        ("several tiles", (1, 257, 129), _ramp(-0.5, 0.9)),
     ]
+    frames += [*scenes, ("several tiles", (1, 257, 129), _ramp(-0.5, 0.9))]
     if portable.dof.options.depth_edges != "as given":
         frames.append(("soft depth edges", (2, 75, 140), _steps))
     if large:
         frames.append(("960 x 540", (1, 540, 960), _steps))
+    if portable.size is not None:
+        frames = [(name, (1, *portable.size), shape) for name, _, shape in scenes]
     for name, (batch, height, width), shape in frames:
         image = torch.rand((batch, channels, height, width), generator=generator, dtype=torch.float32)
         if name.startswith("highlight"):

@@ -19,7 +19,7 @@ from torchdof.options import DepthEdges
 from torchdof.tensors import TRACEABLE
 
 from . import lists, ray_splats
-from .graph import INPUTS, OUTPUT, Portable, trace
+from .graph import INPUTS, OUTPUT, Layout, Portable, Size, axes, trace
 from .interface import broadcast
 from .metadata import label
 from .slimming import slim
@@ -38,6 +38,8 @@ def to_onnx(
     channels: int = 3,
     width: int | None = None,
     depth_edges: DepthEdges = "as given",
+    layout: Layout = "tiles",
+    size: Size = None,
     opset: int = OPSET,
     progress: Callable[[str], object] = lambda _: None,
 ) -> Verification:
@@ -49,9 +51,11 @@ def to_onnx(
     is NaN, zero or negative is copied and does not affect others. An impossible camera (focus within the focal length,
     f-number or focus not positive, NaN) gives a picture of NaN.
 
-    The graph has the layers of every radius up to ``dof.max_coc_px``. It renders tile by tile in an ONNX ``Loop`` and
-    skips, with ``If``, tiles in focus and layers without pixels in or near a tile (numbers in docs/embedding.md).
-    Highlights are rendered ray by ray in another ``Loop``.
+    The graph has the layers of every radius up to ``dof.max_coc_px``. With ``layout="tiles"``, for CPUs, it renders
+    tile by tile in an ONNX ``Loop`` and skips, with ``If``, tiles in focus and layers without pixels in or near a tile.
+    Highlights are rendered ray by ray in another ``Loop``. With ``layout="whole"``, for GPUs and browsers, it has no
+    loops, branches, functions or lists of pixels: it computes every layer of the whole frame, and has no rays, so that
+    highlights are soft discs without the outlines of what stands in front of them (numbers in docs/embedding.md).
 
     Args:
         dof: The module. The file contains its camera, table and options, except focus and f-number, which are inputs.
@@ -63,6 +67,9 @@ def to_onnx(
         depth_edges: Repair of the map's edges in the graph, regardless of the option of ``dof``: ``"as given"`` none,
             ``"auto"`` and ``"repair"`` as in :class:`DepthOfField`, for the time of several renderings
             (docs/embedding.md).
+        layout: ``"tiles"`` or ``"whole"``, see above.
+        size: For the layout ``"whole"``, height and width of the only frame that the graph takes, in a batch of one:
+            fewer operations, for runtimes that need fixed sizes.
         opset: ONNX operator set, 20 or newer.
         progress: Called with the name of each step: tracing, translating, slimming, then each verified case.
 
@@ -89,7 +96,7 @@ def to_onnx(
     path = Path(path)
     if not path.parent.is_dir():
         raise ValueError(f"cannot write {path}: there is no folder {path.parent}")
-    portable = Portable(dof, inputs, width, depth_edges)
+    portable = Portable(dof, inputs, width, depth_edges, layout, size)
     if not TRACEABLE:
         raise ValueError(
             f"torchdof needs PyTorch 2.13 or newer to write ONNX files, this is {torch.__version__}; what a newer "
@@ -99,30 +106,28 @@ def to_onnx(
     with _quiet():
         program = trace(portable, channels)
     progress("translating")
-    graph = _translate(program, portable.inputs, opset)
+    graph = _translate(program, portable, opset)
     progress("slimming")
-    model = onnx_ir.to_proto(broadcast(slim(graph), portable.inputs))
+    slimmed = slim(graph, straight=layout == "whole")
+    model = onnx_ir.to_proto(slimmed if size is not None else broadcast(slimmed, portable.inputs))
     label(model, dof, portable, channels, opset)
     with atomic_file(path) as temporary:
         onnx.save_model(model, temporary, format="protobuf")
         return verify(temporary, dof, progress=progress)
 
 
-def _translate(program: torch.export.ExportedProgram, inputs: str, opset: int) -> onnx_ir.Model:
+def _translate(program: torch.export.ExportedProgram, portable: Portable, opset: int) -> onnx_ir.Model:
     """The module as an ONNX graph, translated by torch.onnx and not yet simplified."""
     # torch.onnx would trace everything again to decompose operators, most of which it can translate as they are
     vars(program)["run_decompositions"] = lambda _: program
-    frame_axes = {0: "B", 2: "H", 3: "W"}
-    names = INPUTS[inputs]
-    shapes = (frame_axes, frame_axes, *(({0: "B"}, {0: "B"}),) * (len(names) > 2))
     with _quiet():
         converted = torch.onnx.export(
             program,
             dynamo=True,
             opset_version=opset,
-            input_names=list(names),
+            input_names=list(INPUTS[portable.inputs]),
             output_names=[OUTPUT],
-            dynamic_shapes=shapes,
+            dynamic_shapes=axes(portable, "B", "H", "W"),
             optimize=False,
             verbose=False,
             custom_translation_table=_TRANSLATIONS,

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+from typing import Any, Literal, get_args
 
 import torch
 import torch._dynamo.config
@@ -15,8 +16,17 @@ from torchdof.render.ops import Ops
 from torchdof.render.plan import LayerKernel, Plan
 
 from .operations import GraphOps
+from .whole import WholeOps
 
-__all__ = ["INPUTS", "OUTPUT", "Portable", "trace"]
+__all__ = ["INPUTS", "LAYOUTS", "OUTPUT", "Layout", "Portable", "Size", "axes", "trace"]
+
+Layout = Literal["tiles", "whole"]
+"""Structure of a graph: a loop over tiles, or straight operations on whole frames."""
+
+LAYOUTS = get_args(Layout)
+
+Size = tuple[int, int] | None
+"""Height and width of the only frame that a graph takes, as a batch of one; None: any batch, height and width."""
 
 INPUTS = {"depth": ("image", "depth", "focus_m", "f_number"), "coc_px": ("image", "coc_px")}
 """Names of the graph's inputs, in order, for each kind of map."""
@@ -37,9 +47,12 @@ class Portable(nn.Module):
         inputs: The map that the graph takes: ``"depth"`` or ``"coc_px"``.
         width: Image width for the kernels of a table with lengths in millimetres or fractions of the width.
         depth_edges: Repair of the map's edges in the graph.
+        layout: Structure of the graph. The layout ``"whole"`` renders without rays of highlights.
+        size: Size of the graph's frame, for the layout ``"whole"``.
 
     Raises:
-        ValueError: If the camera has tensors, or the width is missing or superfluous.
+        ValueError: If the camera has tensors, the width is missing or superfluous, or the layout does not support an
+            argument.
     """
 
     def __init__(
@@ -48,6 +61,8 @@ class Portable(nn.Module):
         inputs: str = "depth",
         width: int | None = None,
         depth_edges: DepthEdges = "as given",
+        layout: Layout = "tiles",
+        size: Size = None,
     ) -> None:
         super().__init__()
         if inputs not in INPUTS:
@@ -59,13 +74,16 @@ class Portable(nn.Module):
                     "focus_m and f_number are inputs "
                     "of the graph, so any value does for them"
                 )
+        _check_layout(layout, size, depth_edges)
+        if size is not None and width is None and dof.options.table.unit != "relative":
+            width = size[1]
         check_width(dof.options.table, width)
-        self.inputs, self.width = inputs, width
+        self.inputs, self.width, self.layout, self.size = inputs, width, layout, size
         self.dof = copy.copy(dof)
         self.dof.options = dataclasses.replace(dof.options, check=False, depth_edges=depth_edges)
         self.called = dataclasses.replace(dof.options, check=False)
         self.plan = Plan.all(dof.options.max_coc_px, dof.options.tolerance, rays=True)
-        self.ops = Ops()
+        self.ops = WholeOps(width) if layout == "whole" else Ops()
         self.ops.lens_width = width
         self.eval()
 
@@ -114,8 +132,24 @@ def check_width(table: BlurTable, width: int | None) -> None:
         )
 
 
+def _check_layout(layout: str, size: Size, depth_edges: DepthEdges) -> None:
+    """Raises an error for options that a layout does not support."""
+    if layout not in LAYOUTS:
+        raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
+    if size is not None and layout != "whole":
+        raise ValueError(f'size is for layout="whole"; a graph of tiles takes frames of any size, got size={size!r}')
+    numbers = size if size is not None else (1, 1)
+    if len(numbers) != 2 or any(isinstance(n, bool) or not isinstance(n, int) or n < 1 for n in numbers):
+        raise ValueError(f"size must be the height and width of a frame in pixels, such as (1080, 1920), got {size!r}")
+    if layout == "whole" and depth_edges != "as given":
+        raise ValueError(
+            f'layout="whole" cannot repair depth edges, whose number depends on the map; repair the map before, or use '
+            f'layout="tiles"; got depth_edges={depth_edges!r}'
+        )
+
+
 def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
-    """Traces the module with dynamic batch, height and width.
+    """Traces the module, with dynamic batch, height and width unless it has a size.
 
     Raises:
         ValueError: If the channels do not fit the table.
@@ -123,14 +157,27 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
     table = portable.dof.options.table
     if table.channels not in (1, channels):
         raise ValueError(f"the table blurs {table.channels} channels, the image has {channels}")
-    sizes = [(2, channels, 64, 64), (2, 1, 64, 64), (2,), (2,)][: len(INPUTS[portable.inputs])]
-    example = tuple(torch.ones(size, dtype=torch.float32) for size in sizes)  # the graph does not depend on the values
+    batch, size = (2, (64, 64)) if portable.size is None else (1, portable.size)
+    sizes = [(batch, channels, *size), (batch, 1, *size), (batch,), (batch,)][: len(INPUTS[portable.inputs])]
+    example = tuple(torch.ones(shape, dtype=torch.float32) for shape in sizes)  # values do not matter
     traced = copy.copy(portable)
-    traced.ops = GraphOps(portable.plan, table, portable.dof.options.method == "layered", portable.width)
-    free = torch.export.Dim.AUTO
-    batch, frame = {0: free}, {0: free, 2: free, 3: free}
-    shapes = (frame, frame, *((batch, batch),) * (len(example) > 2))
+    layered = portable.dof.options.method == "layered"
+    if portable.layout == "whole":
+        traced.ops = WholeOps(portable.width, portable.plan.constants(table, layered, portable.width or 1))
+    else:
+        traced.ops = GraphOps(portable.plan, table, layered, portable.width)
     # the cache of fake tensor results costs more time than it saves, because sizes are symbols
     uncached = torch._dynamo.config.patch(fake_tensor_cache_enabled=False)
     with torch.no_grad(), uncached:
-        return torch.export.export(traced, example, dynamic_shapes=shapes, strict=False)
+        return torch.export.export(
+            traced, example, dynamic_shapes=axes(portable, *[torch.export.Dim.AUTO] * 3), strict=False
+        )
+
+
+def axes(portable: Portable, batch: Any, height: Any, width: Any) -> tuple[Any, ...] | None:
+    """Names of each input's free axes, given those of batch, height and width; None if the sizes are fixed."""
+    if portable.size is not None:
+        return None
+    frame = {0: batch, 2: height, 3: width}
+    lens = ({0: batch},) * (len(INPUTS[portable.inputs]) - 2)
+    return (frame, frame, lens) if lens else (frame, frame)  # of forward(image, map_, *lens)

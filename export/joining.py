@@ -73,6 +73,8 @@ def chain(
     facts = facts_of(dof, "dof_model")
     if set(facts["inputs"]) != set(INPUTS["depth"]) or dof.graph.input[0].type.tensor_type.shape.dim[1].dim_value != 3:
         raise ValueError(f"dof_model must take a depth and an image of 3 channels, it takes {facts['inputs']}")
+    if facts["size"] is not None:
+        raise ValueError(f"dof_model takes only frames of {facts['size']}; export it without a size")
     opset, ir = _opset(dof), dof.ir_version
     estimator, declared_size, rank = _prepare(depth_model, opset, ir)
     size = size or declared_size

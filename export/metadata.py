@@ -47,6 +47,8 @@ def label(model: onnx.ModelProto, dof: DepthOfField, portable: Portable, channel
         "options": options,
         "depth_edges": portable.dof.options.depth_edges,
         "width": portable.width,
+        "layout": portable.layout,
+        "size": portable.size,
         "layers": len(portable.plan.nodes),
         "opset": opset,
     }
@@ -69,7 +71,8 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
     Returns:
         ``version``, ``inputs`` and ``output`` (name to shape, type and unit), ``camera`` (the module's; its focus and
         f-number are inputs of the graph), ``table`` (name, family, unit and SHA-256 of its JSON), ``options``,
-        ``depth_edges``, ``width`` (of a table with lengths, or None), ``layers`` and ``opset``.
+        ``depth_edges``, ``width`` (of a table with lengths, or None), ``layout``, ``size`` (height and width of the
+        only frame, or None), ``layers`` and ``opset``.
 
     Raises:
         ValueError: If the file was not written by them.

@@ -19,8 +19,10 @@ _WINDOW_DEFAULTS = {"pads": 0, "dilations": 1, "strides": 1}  # defaults of thes
 _MAX_EQUAL = 64  # constants with more equal numbers than this are stored as a shape and a value
 
 
-def slim(model: onnx_ir.Model) -> onnx_ir.Model:
+def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
     """Makes one graph without repeated constants, stack traces and names of source files, but with loops and branches.
+
+    A ``straight`` graph has none of these; its constants stay initializers, which runtimes for GPUs load once.
 
     1. Inline functions, fold constants, and replace operators and chains of operators by faster or more common ones.
     2. Make loops and branches.
@@ -32,7 +34,8 @@ def slim(model: onnx_ir.Model) -> onnx_ir.Model:
         passes.RemoveUnusedFunctionsPass(),
         passes.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
         passes.DeduplicateInitializersPass(size_limit=2**24),
-        passes.ShapeInferencePass(),
+        # without values of sizes in a straight graph, in which onnx confuses lists of indices with them
+        passes.ShapeInferencePass(data_prop=not straight),
         _Casts(),
     )
     tidy: tuple[onnx_ir.passes.PassBase, ...] = (
@@ -64,10 +67,11 @@ def slim(model: onnx_ir.Model) -> onnx_ir.Model:
     structure(model)
     for step in structured:
         step(model)
-    _place_weights(model)
-    passes.RemoveUnusedNodesPass()(model)
-    for graph in (model.graph, *model.graph.subgraphs()):
-        _as_nodes(graph)
+    if not straight:
+        _place_weights(model)
+        passes.RemoveUnusedNodesPass()(model)
+        for graph in (model.graph, *model.graph.subgraphs()):
+            _as_nodes(graph)
     _drop_defaults(model)
     _shorten(model)
     return model
@@ -181,9 +185,14 @@ class _Cuts(onnx_ir.passes.InPlacePass):
             rank = len(source.shape)  # an axis may be counted from the last one
             if {int(a) % rank for a in axes[0].numpy()} & {int(a) % rank for a in axes[1].numpy()}:
                 continue
-            tape = Tape()
-            pairs = list(zip(first.inputs, node.inputs, strict=True))[1:]
-            bounds = [tape.op("Concat", list(pair), {"axis": 0}) for pair in pairs]
+            tape, bounds = Tape(), []
+            for number, pair in enumerate(list(zip(first.inputs, node.inputs, strict=True))[1:]):
+                constants = [onnx_ir.convenience.get_const_tensor(value) for value in pair if value is not None]
+                if all(constant is not None for constant in constants):
+                    joined = np.concatenate([constant.numpy() for constant in constants if constant is not None])
+                    bounds.append(_initializer(model.graph, joined, f"{node.outputs[0].name}_bound_{number}"))
+                else:
+                    bounds.append(tape.op("Concat", list(pair), {"axis": 0}))
             cut = tape.op("Slice", [first.inputs[0], *bounds])
             cut.type, cut.shape = node.outputs[0].type, node.outputs[0].shape
             model.graph.insert_before(node, list(tape.nodes))

@@ -123,10 +123,11 @@ def verify(
     model = load(path)
     facts = facts_of(model, str(path))
     inputs = "depth" if "depth" in facts["inputs"] else "coc_px"
-    portable = Portable(dof, inputs, facts["width"], facts["depth_edges"])
+    size = None if facts["size"] is None else tuple(facts["size"])
+    portable = Portable(dof, inputs, facts["width"], facts["depth_edges"], facts["layout"], size)
     check_format(model, os.fspath(path))
     _check_origin(facts, dof)
-    channels = _check_interface(model, inputs)
+    channels = _check_interface(model, portable)
     runner = session(path)
     rows = []
     for case in cases(portable, channels, large):
@@ -222,12 +223,14 @@ def _check_origin(facts: dict, dof: DepthOfField) -> None:
             raise ValueError(f"the file's camera has {name}={facts['camera'][name]!r}, the module's {dof.camera!r}")
 
 
-def _check_interface(model: onnx.ModelProto, inputs: str) -> int:
-    """Checks names, types and free sizes; returns the number of channels."""
+def _check_interface(model: onnx.ModelProto, portable: Portable) -> int:
+    """Checks names, types and sizes; returns the number of channels."""
     channels = model.graph.output[0].type.tensor_type.shape.dim[1].dim_value
-    single, colours = (ITEMS, 1, "H", "W"), ("B", channels, "H", "W")
-    lens_inputs = ((ITEMS,), (ITEMS,)) if inputs == "depth" else ()
-    expected = [*zip(INPUTS[inputs], (colours, single, *lens_inputs), strict=True), (OUTPUT, colours)]
+    batch, items, frame = ("B", ITEMS, ("H", "W")) if portable.size is None else (1, 1, portable.size)
+    single, colours = (items, 1, *frame), (batch, channels, *frame)
+    inputs = INPUTS[portable.inputs]
+    lens_inputs = ((items,),) * (len(inputs) - 2)
+    expected = [*zip(inputs, (colours, single, *lens_inputs), strict=True), (OUTPUT, colours)]
     actual = []
     for value in (*model.graph.input, *model.graph.output):
         kind = value.type.tensor_type

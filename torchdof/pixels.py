@@ -6,7 +6,35 @@ Depth edges, hidden surfaces and highlights concern few pixels, which are proces
 import torch
 from torch import Tensor
 
-__all__ = ["around", "corners", "indices", "pick", "places", "put"]
+__all__ = ["Selected", "around", "corners", "indices", "pick", "places", "put"]
+
+
+class Selected:
+    """Pixels of a mask ``[B, 1, H, W]``, as lists of P values."""
+
+    def __init__(self, mask: Tensor) -> None:
+        self._height, self._width = mask.shape[-2:]
+        self._pixels = indices(mask)
+        self._window: Tensor | None = None
+
+    def pick(self, values: Tensor) -> Tensor:
+        """Values ``[B, C, H, W]`` at the pixels: ``[C, P]``."""
+        return pick(values, self._pixels)
+
+    def around(self, values: Tensor) -> Tensor:
+        """Values at the 3 x 3 pixels around each, row by row, the border's ones repeated: ``[C, 9, P]``."""
+        if self._window is None:
+            self._window = around(self._pixels, values, 1)
+        return pick(values, self._window)
+
+    def of_item(self, values: Tensor) -> Tensor:
+        """Values ``[B, C]`` of each pixel's item: ``[C, P]``."""
+        item = places(self._pixels, self._height, self._width)[0]
+        return values.index_select(0, item).t()  # not values[item], whose gradient PyTorch adds up pixel by pixel
+
+    def put(self, values: Tensor, new: Tensor) -> Tensor:
+        """A copy of ``[B, C, H, W]`` with new values ``[C, P]`` (or ``[P]``, for one channel) at the pixels."""
+        return put(values, self._pixels, new)
 
 
 def indices(mask: Tensor) -> Tensor:

@@ -25,6 +25,14 @@ class _Graph:
     width: int | None = option(
         "Image width whose kernels the file holds, for a table in millimetres or fractions of the width."
     )
+    layout: Literal["tiles", "whole"] = option(
+        "tiles: loops that skip work, for CPUs. whole: straight operations on whole frames, for GPUs and browsers; "
+        "without rays of highlights.",
+        "tiles",
+    )
+    size: str | None = option(
+        "Width and height of the only frame, for --layout whole and runtimes that need fixed sizes.", metavar="WxH"
+    )
     opset: int = option("ONNX operator set.", 20)
 
 
@@ -39,6 +47,10 @@ class Export:
     A table in millimetres is tied to an image width:
 
         torchdof export -o dof.onnx --table double_gauss_50mm_f2 --width 1920 --max-coc 24 --tolerance 0.008
+
+    For a GPU, with frames of one size:
+
+        torchdof export -o dof.onnx --layout whole --size 1920x1080 --max-coc 16
 
     Print the metadata of a file:
 
@@ -80,9 +92,19 @@ class Export:
         options = {"depth_edges": "as given", **self.accuracy.arguments(), "max_coc_px": self.max_coc, "check": False}
         dof = DepthOfField(camera, self.blur.table_of(self.blur.table), **options)
         with Bar("tracing") as bar:
-            graph = dataclasses.asdict(self.graph)
+            graph = dataclasses.asdict(self.graph) | {"size": _size(self.graph.size)}
             report = to_onnx(dof, out, **graph, depth_edges=dof.options.depth_edges, progress=bar.update)
         print_result(self.as_json, {"out": str(out), **dataclasses.asdict(report)}, f"{report}\nwrote {out}")
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    """Height and width of ``WIDTHxHEIGHT``."""
+    if text is None:
+        return None
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isdecimal() for part in parts):
+        raise ValueError(f"--size is a width and a height in pixels, such as 1920x1080, got {text!r}")
+    return int(parts[1]), int(parts[0])
 
 
 def _lines(facts: Mapping[str, Any], indent: str = "") -> str:

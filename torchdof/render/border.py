@@ -145,17 +145,16 @@ def _window_sums(values: Tensor, levels: int) -> Tensor:
     the pixel in its middle: with radius r, ``sum_2r(i) = sum_r(i - r) + sum_r(i + r) - value(i)``. Unlike differences
     of sums from the start of the line, it is exact to single precision.
     """
-    length, reach = values.shape[-1], _WIDTH * 2 ** (levels - 1)
+    reach = _WIDTH * 2 ** (levels - 1)
     values = functional.pad(values, (reach, reach))
-    size = length + 2 * reach
-    sums = values.narrow(-1, 0, size - 2) + values.narrow(-1, 1, size - 2) + values.narrow(-1, 2, size - 2)
+    sums = values[..., :-2] + values[..., 1:-1] + values[..., 2:]  # of pixels with a whole window, as below
     radius, windows = 1, []
     while radius < reach:
-        twice = size - 4 * radius  # pixels with a whole window
-        sums = sums.narrow(-1, 0, twice) + sums.narrow(-1, 2 * radius, twice) - values.narrow(-1, 2 * radius, twice)
         radius *= 2
+        sums = sums[..., :-radius] + sums[..., radius:] - values[..., radius:-radius]
         if radius >= _WIDTH:
-            windows.append(sums.narrow(-1, reach - radius, length))
+            beside = reach - radius  # pixels beside the line
+            windows.append(sums[..., beside : -beside or None])
     return torch.stack(windows, -2)
 
 

@@ -11,7 +11,6 @@ from torch import Tensor
 from ..tensors import recomputed
 from . import field
 from .compiled_steps import blended
-from .convolution import CHANNELS
 from .downsampling import downsampled, upsampled
 from .ops import EAGER, Ops
 from .plan import LayerKernel
@@ -174,7 +173,7 @@ def _composite_layers(
     # A run has one resolution. A coarse one stays on one side of the focus, because finer layers lie between the sides.
     # A group of a run has at most as many layers as fill the channels of one convolution.
     uniform = each == 1 and blurs[0].shares is None
-    most = CHANNELS // (colours + (2 if normalised else 1)) if uniform else 1
+    most = ops.channels // (colours + (2 if normalised else 1)) if uniform else 1
     runs: dict[tuple[int, bool], list[list[int]]] = {}
     for k in order:
         groups = runs.setdefault((blurs[k].scale, blurs[k].scale > 1 and min(row[k] for row in frame.nodes) < 0), [])
@@ -193,7 +192,7 @@ def _composite_layers(
             part = ops.choose(_needed(frame, blurs, group), front, part)
         if scale > 1:
             fine = upsampled(part, scale)
-            fine = fine[..., scale : fine.shape[-2] - scale, scale : fine.shape[-1] - scale]
+            fine = fine[..., scale:-scale, scale:-scale]
             needed = _needed(frame, blurs, [k for group in groups for k in group])
             together = torch.cat(composited(_parts(fine, colours), _parts(picture, colours)), 1)
             part = ops.choose(needed, together, picture)

@@ -59,8 +59,10 @@ def surfaces_of_image(
 def _matted_and_filled(
     light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: Sequence[int], ops: Ops
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    matted = matte(light, coc_px, valid)
-    own, other, other_coc, weight = attribute_emitters(light, coc_px, threshold, valid, matted)
+    matted = matte(light, coc_px, valid, ops)
+    if ops.has_rays:
+        matted = attribute_emitters(light, coc_px, threshold, valid, matted)
+    own, other, other_coc, weight = matted
     own_weight = 1.0 - _counted(weight)
     other, other_coc, weight, behind = fill_hidden(own, coc_px, other, other_coc, weight, valid, threshold, levels, ops)
     if valid is not None:
@@ -293,10 +295,10 @@ def _first_level(
         ends += [before, 2 * samples + 2 - size - before]
     values = functional.pad(torch.cat([light, coc_px, weight], 1), ends, mode="replicate")
     planes = [values[..., row::2, column::2] for row in (0, 1) for column in (0, 1)]  # [B, C + 2, h + 1, w + 1]
+    first, last = slice(0, -1), slice(1, None)
+    parts = [(0, first), (1, first), (0, last)]  # of the three pixels around a sample along an axis
     around = [
-        planes[row % 2 * 2 + column % 2].narrow(-2, row // 2, height).narrow(-1, column // 2, width)
-        for row in range(3)
-        for column in range(3)
+        planes[2 * odd_row + odd_column][..., rows, columns] for odd_row, rows in parts for odd_column, columns in parts
     ]  # [B, C + 2, h, w] each; one tensor of all nine would take the memory of eleven images
     coc, weight = (torch.cat([values[:, i, None] for values in around], 1) for i in (-2, -1))  # [B, 9, h, w]
     share = (shares[1][:, None, :, None] * shares[0][:, None, :]).flatten(0, 1)

@@ -63,7 +63,7 @@ def threshold(light: Tensor, valid: Tensor | None = None) -> Tensor:
         brightest = torch.where(valid > 0, brightest, torch.inf)
     side = _STEP * _CELL
     (top, rows), (left, columns) = (_cells(n, side, light.device) for n in (height, width))
-    cells = functional.pixel_unshuffle(brightest[..., rows, :][..., columns], _CELL)
+    cells = functional.pixel_unshuffle(brightest.index_select(-2, rows).index_select(-1, columns), _CELL)
     level = torch.topk(cells, cells.shape[1] // 5, dim=1)[0][:, -1:]
     level = FACTOR * level.clamp(0.0, torch.finfo(light.dtype).max / FACTOR)
     level = functional.interpolate(level, scale_factor=float(side), mode="bilinear", align_corners=False)

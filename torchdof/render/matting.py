@@ -15,6 +15,7 @@ from torch import Tensor
 
 from .. import pixels
 from ..tensors import is_traced
+from .ops import EAGER, Ops
 
 __all__ = ["NEVER_PX", "Matted", "attribute_emitters", "matte"]
 
@@ -46,7 +47,7 @@ class Matted(NamedTuple):
     other_weight: Tensor
 
 
-def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
+def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops = EAGER) -> Matted:
     """Splits pixels at depth edges between their own surface and the one across the edge.
 
     1. Take the nearest and the farthest coc of the 3 x 3 pixels around as those of the two surfaces.
@@ -60,6 +61,7 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
         light: ``[B, C, H, W]``.
         coc_px: ``[B, 1, H, W]``, signed.
         valid: ``[B, 1, H, W]``, 0 where a pixel is left out; None means all count.
+        ops: Selects the pixels at edges.
 
     Returns:
         The surfaces; the weight of the other one is in [0, 1/2].
@@ -69,28 +71,27 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
     high, low = (c if known is None else torch.where(known, c, -NEVER_PX) for c in (coc_px.detach(), -coc_px.detach()))
     high, low = (functional.max_pool2d(c, 3, stride=1, padding=1) for c in (high, low))
     is_edge = high + low > _EDGE_PX
-    edge_pixels = pixels.indices(is_edge if known is None else is_edge & known)
+    selected = ops.select(is_edge if known is None else is_edge & known)
 
     # coc of the two surfaces; light relative to the brightest neighbour, so that its scale does not matter
-    own_coc, colour = pixels.pick(coc_px, edge_pixels)[0], pixels.pick(light, edge_pixels)
-    window = pixels.around(edge_pixels, coc_px, 1)
-    window_light, window_coc = pixels.pick(light, window), pixels.pick(coc_px, window)[0]  # [C, 9, P], [9, P]
+    own_coc, colour = selected.pick(coc_px)[0], selected.pick(light)
+    window_light, window_coc = selected.around(light), selected.around(coc_px)[0]  # [C, 9, P], [9, P]
     brightest = window_light.detach().abs().amax((0, 1)).clamp_min(torch.finfo(light.dtype).tiny)
     colour, window_light = colour / brightest, window_light / brightest
     near = far = window_coc
-    if known is not None:
-        window_known = pixels.pick(known, window)[0]
-        near, far = torch.where(window_known, near, NEVER_PX), torch.where(window_known, far, -NEVER_PX)
+    counted = None if valid is None else selected.around(valid)[0]
+    if counted is not None:
+        near, far = torch.where(counted > 0, near, NEVER_PX), torch.where(counted > 0, far, -NEVER_PX)
     near, far = near.amin(0), far.amax(0)
     is_near = own_coc - near < far - own_coc
     edge = ((far - near) / _EDGE_PX - 1.0).clamp(0.0, 1.0)  # confidence that there are two surfaces
-    edges = pixels.put(torch.zeros_like(coc_px), edge_pixels, edge)
+    edges = selected.put(torch.zeros_like(coc_px), edge)
     gap = (far - near).clamp_min(1e-6)
 
     # their colours: means over neighbours that lie on one of them, mostly unmixed ones
-    weight = (1.0 - pixels.pick(edges, window)[0] + _UNCLEAN) * _falloff(light, 1)
-    if valid is not None:
-        weight = weight * pixels.pick(valid, window)[0]
+    weight = (1.0 - selected.around(edges)[0] + _UNCLEAN) * _falloff(light, 1)
+    if counted is not None:
+        weight = weight * counted
     nearness = (far - window_coc) / gap
     near_weight, far_weight = weight * (4 * nearness - 2.8).clamp(0, 1), weight * (1.2 - 4 * nearness).clamp(0, 1)
     back, back_variance = _mean_of(window_light, far_weight)
@@ -116,20 +117,18 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
     own_weight = 1.0 - weight
     unexplained = colour - own_weight * own_mean - weight * other_mean
     moved = weight * (other_mean + unexplained * weight / (weight**2 + own_weight**2))
-    item = pixels.places(edge_pixels, *coc_px.shape[-2:])[0]
-    range_of_image = light.amin((2, 3)), light.amax((2, 3))  # clamped: 0 * inf would be NaN
-    # not extreme[item], whose gradient PyTorch adds up pixel by pixel
-    extremes = (extreme.index_select(0, item).t() / brightest for extreme in range_of_image)
-    least, most = (extreme.clamp(-_UNBOUNDED, _UNBOUNDED) for extreme in extremes)
+    range_of_image = light.amin((2, 3)), light.amax((2, 3))
+    extremes = (selected.of_item(extreme) / brightest for extreme in range_of_image)
+    least, most = (extreme.clamp(-_UNBOUNDED, _UNBOUNDED) for extreme in extremes)  # 0 * inf would be NaN
     moved = torch.minimum(moved.maximum(colour - own_weight * most), colour - own_weight * least)
     moved = torch.minimum(moved.maximum(weight * least), weight * most)
     own = (colour - moved) / own_weight
     other = torch.where(weight > 0, moved / weight.clamp_min(1e-12), 0.0)
     return Matted(
-        pixels.put(light, edge_pixels, own * brightest),
-        pixels.put(torch.zeros_like(light), edge_pixels, other * brightest),
-        pixels.put(coc_px, edge_pixels, torch.where(is_near, far, near)),
-        pixels.put(torch.zeros_like(coc_px), edge_pixels, weight),
+        selected.put(light, own * brightest),
+        selected.put(torch.zeros_like(light), other * brightest),
+        selected.put(coc_px, torch.where(is_near, far, near)),
+        selected.put(torch.zeros_like(coc_px), weight),
     )
 
 

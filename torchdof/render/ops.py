@@ -11,7 +11,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .. import pixels
 from ..tensors import is_traced
+from .convolution import CHANNELS
 from .surfaces import Frame, Highlights
 
 __all__ = ["EAGER", "Level", "Ops", "Seen"]
@@ -45,6 +47,16 @@ class Ops:
 
     kernels: Sequence[Tensor] | None = None
     """Kernels of all layers, made in advance; None means they are made for the frame at hand."""
+
+    channels: int = CHANNELS
+    """Channels of one convolution, which blurs several layers; larger: fewer operations, and more memory."""
+
+    has_rays: bool = True
+    """Whether highlights are splatted ray by ray, and their light is given to the surfaces of their emitters."""
+
+    def select(self, mask: Tensor) -> pixels.Selected:
+        """Selects the pixels of a mask, to compute only these."""
+        return pixels.Selected(mask)
 
     def choose(self, needed: Callable[[], Tensor], result: Tensor, given: Tensor) -> Tensor:
         """Returns ``result`` if ``needed()``, a bool ``[]``, is true, else ``given``, which equals it in that case.

@@ -221,7 +221,7 @@ def _render_items(
 
     # limit of highlights; without occlusion only those are splatted that a coarse layer would soften. A compiled graph
     # has no rays: their number depends on the light.
-    has_rays = plan.rays and not is_compiled()
+    has_rays = plan.rays and ops.has_rays and not is_compiled()
     crisp_px = [plan.crisp_px if options.method == "layered" else math.inf for plan in plans]
     coarse = has_rays and any(px < max(map(abs, plan.coc_px)) for plan, px in zip(plans, crisp_px, strict=True))
     limit = highlights.threshold(light, weight) if options.occlusion or options.normalize or coarse else None

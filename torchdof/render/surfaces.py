@@ -88,7 +88,9 @@ class Frame:
     def cut(self, values: Tensor, halo: int) -> Tensor:
         """Crop a map of the frame to its area and ``halo`` pixels around it."""
         start = self.margin - halo
-        return values[..., start : start + self.area[0] + 2 * halo, start : start + self.area[1] + 2 * halo]
+        # counted from the end, a number: sizes are symbols in a graph
+        kept = slice(start, -start or None)
+        return values[..., kept, kept]
 
     def near_to_far(self) -> "Frame":
         """The same frame with its two surfaces sorted near to far in each pixel."""
@@ -137,8 +139,8 @@ class Frame:
         """
         surfaces = [PaddedSurface(*(self.cut(t, halo) for t in s if t is not None)) for s in self.surfaces]
         weights = weights_at_or_behind(torch.stack([s.x for s in surfaces]), self.ramps[..., first : first + count + 1])
-        weights = eased(weights) if self.occlusion else weights
-        pairs = [(weight[:, :-1, None], weight[:, 1:, None]) for weight in weights.unbind(0)]
+        weights = (eased(weights) if self.occlusion else weights).unsqueeze(3)
+        pairs = [(weight[:, :-1], weight[:, 1:]) for weight in weights.unbind(0)]
         surfaces = [PaddedSurface(*(t.unsqueeze(1) for t in s if t is not None)) for s in surfaces]
         return (_stacked if self.stacked else _mixed)(surfaces, pairs)
 
