@@ -177,6 +177,12 @@ def _index_copy(self: Any, dim: int, index: Any, source: Any) -> Any:
     return opset20.Transpose(changed, perm=[1, 0])
 
 
+def _all(self: Any, dim: int, keepdim: bool = False) -> Any:
+    # torch.onnx reduces int64, which runtimes on GPUs leave to the CPU
+    least = opset20.ReduceMin(opset20.Cast(self, to=onnx_ir.DataType.FLOAT), [dim], keepdims=keepdim)  # type: ignore[arg-type]
+    return opset20.Cast(least, to=onnx_ir.DataType.BOOL)
+
+
 def _or(self: Any, other: Any) -> Any:
     return opset20.Or(self, other)
 
@@ -231,6 +237,7 @@ _TRANSLATIONS: dict[Callable[..., Any], Callable[..., Any]] = {
     torch.ops.aten.to.dtype: _to_dtype,
     torch.ops.aten.to.device: _to_device,
     torch.ops.aten.detach_.default: _identity,
+    torch.ops.aten.all.dim: _all,
     torch.ops.aten.__and__.Tensor: _and,
     torch.ops.aten.__or__.Tensor: _or,
     torch.ops.aten.where.self: _where,

@@ -62,6 +62,7 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
     for step in flat:
         step(model)
     fold_constants(model, input_size_limit=2**24, output_size_limit=2**13)
+    _expand_weights(model)
     for step in tidy:
         step(model)
     structure(model)
@@ -75,6 +76,27 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
     _drop_defaults(model)
     _shorten(model)
     return model
+
+
+def _expanded(value: onnx_ir.Value | None) -> np.ndarray | None:
+    """A constant that is expanded to several channels and gets further axes, as numbers; None for other values."""
+    node = None if value is None else value.producer()
+    if node is None or node.op_type not in ("Expand", "Unsqueeze"):
+        tensor = None if value is None else onnx_ir.convenience.get_const_tensor(value)
+        return None if tensor is None else tensor.numpy()
+    array, sizes = (_expanded(source) for source in node.inputs)
+    if array is None or sizes is None:
+        return None
+    return np.expand_dims(array, tuple(sizes)) if node.op_type == "Unsqueeze" else array * np.ones(sizes, array.dtype)
+
+
+def _expand_weights(model: onnx_ir.Model) -> None:
+    """Makes constants of weights that convolutions expand: too large to be folded like other numbers."""
+    for node in [node for node in model.graph if node.op_type == "Conv"]:
+        weight = node.inputs[1]
+        array = _expanded(weight)
+        if weight is not None and array is not None and weight.const_value is None:
+            node.replace_input_with(1, _initializer(model.graph, array, f"{weight.name}_expanded"))
 
 
 def _place_weights(model: onnx_ir.Model) -> None:
