@@ -509,6 +509,15 @@ def test_an_equivalent_lens_is_for_full_frame_in_landscape_and_portrait(
     assert "focus 1 m, f/1.4" in line and "depth from 1 to 8 m assumed" in line
 
 
+def test_lens_and_points_are_those_of_the_display_window(image: Tensor, depth: Tensor, run: Run) -> None:
+    """The file holds half the width of the frame, from 4 px left of it; the surface at 6 m starts at 8 px."""
+    write_image("part.exr", Picture(image, sample="float", window=(-4, 3, 0, 0, 48, 40)))
+    run(f"render part.exr depth.npy -o out.exr --focus-at 10,11 --attention 14,11,4 {LENS}")
+    camera = CAMERA.replace(focus_m=6.0, sensor_width_mm=2.0)
+    expected = torchdof.depth_of_field(image, depth, camera, attention=(18.0, 8.0, 4.0))
+    torch.testing.assert_close(pixels("out.exr"), expected, rtol=0, atol=1e-6)
+
+
 def test_a_note_advises_how_to_increase_a_hardly_visible_blur(run: Run) -> None:
     for options, advice in (
         ("--f-number 8", "a smaller --f-number, or --blur 2% makes more of it"),
