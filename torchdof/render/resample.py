@@ -47,7 +47,7 @@ def _resized(image: Tensor, depth: Tensor) -> Tensor:
     """The steps of :func:`at_size_of`, for shapes that are checked."""
     size, given = (image.shape[-2], image.shape[-1]), (depth.shape[-2], depth.shape[-1])
     if max(size[0] / given[0], size[1] / given[1]) > _LARGEST_FACTOR:
-        between = tuple(round(math.sqrt(large * small)) for large, small in zip(size, given, strict=True))
+        between = (round(math.sqrt(size[0] * given[0])), round(math.sqrt(size[1] * given[1])))
         depth = _resized(functional.interpolate(image, between, mode="area"), depth)
         given = between
     known = (depth > 0).to(depth.dtype)
