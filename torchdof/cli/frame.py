@@ -55,7 +55,9 @@ class Frame:
     def mistakes(self, camera: Camera) -> list[Mistake]:
         """Likely mistakes in the depth, given the camera."""
         kind: Any = self.scene.depth_map.depth_kind
-        return depth_mistakes(self.values, camera, kind, self.scene.depth_map.depth_scale)
+        mistakes = depth_mistakes(self.values, camera, kind, self.scene.depth_map.depth_scale)
+        is_stated = self.scene.lens.blur_share is not None  # a large blur that --blur states is no mistake of units
+        return [mistake for mistake in mistakes if not (is_stated and mistake.name == "blur")]
 
 
 def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = False, **encoding: Any) -> Frame:

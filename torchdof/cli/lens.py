@@ -52,7 +52,7 @@ def _width_fraction(text: str) -> float:
 def _equivalent(text: str) -> tuple[float, ...]:
     """Reads a focal length in mm and an f-number."""
     expected = "--equivalent expects a focal length and an f-number such as 85mm,1.4"
-    return numbers(2, expected)(re.sub(r"mm(?=,)|(?<=,)f/", "", text))
+    return numbers(2, expected)(re.sub(r"\s*(mm)?\s*[, ]\s*(f/?)?", ",", text, count=1))
 
 
 def _give_one(options: Mapping[str, Any], problem: str) -> None:
