@@ -104,7 +104,7 @@ class DepthOfFieldNode:
 
         Args:
             image: ``[B, H, W, 3 or 4]`` as ComfyUI passes images: encoded for display, in [0, 1].
-            depth: ``[B or 1, h, w, C]``; its channels are averaged. All images of a batch share the range of values, so
+            depth: ``[B or 1, h, w, C]``; its colours are averaged. All images of a batch share the range of values, so
                 that the focus of a clip does not pulse.
             depth_kind: Kind of the values.
             near_m: Distance of the nearest value in metres.
@@ -128,11 +128,15 @@ class DepthOfFieldNode:
         Raises:
             ValueError: If an input is not as described, or the focus point has no depth.
         """
-        encoded, values = image.movedim(-1, 1), depth.movedim(-1, 1).mean(1, keepdim=True)  # [B, C, H, W]
+        if len(depth) not in (1, len(image)):
+            raise ValueError(f"depth must be one image, or one for each of the {len(image)} images, got {len(depth)}")
+        encoded, values = image.float().movedim(-1, 1), depth.float().movedim(-1, 1)[:, :3].mean(1, keepdim=True)
         has_alpha = encoded.shape[1] == 4
         light = decode(encoded, "srgb", has_alpha, straight=True)
         if depth_kind != _METRES:
             extremes = (float(values.min()), float(values.max()))
+            if not extremes[0] < extremes[1]:
+                raise ValueError(f"depth must have different values, near and far, got {extremes[0]:g} everywhere")
             kind: Any = "disparity" if depth_kind == _NEAR_IS_WHITE else "depth"
             values = from_relative(values, near_m, far_m, kind, value_range=extremes)
         metres = at_size_of(light, values)

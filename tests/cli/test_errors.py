@@ -34,6 +34,9 @@ shot.%099999999d.exr depth.npy --focus-m 2            | must have at most 18 dig
 image.exr depth.npy --focus-m 2 -o ./image.exr        | is one of the inputs
 image.exr depth.npy --focus-m 2 -o depth.npy          | depth.npy: is one of the inputs
 image.exr depth.npy --focus-m 2 -o depth.npy/out.exr  | its folder cannot be made
+image.exr depth.npy --focus-m 2 --sheet image.exr     | image.exr: is one of the inputs
+image.exr depth.npy --focus-m 2 --sheet ./out.exr     | out.exr: would be written twice
+image.exr depth.npy --focus-m 2 --sheet s.gif         | cannot write files of type '.gif'
 image.exr depth.npy --focus-m 2 -o out.gif            | cannot write files of type '.gif'
 shot.####.exr depth.npy -o o.#.exr                    | where is the focus? give --focus-m METRES or --focus-at X,Y
 image.exr depth.npy --focus-m near                    | --focus-m expects metres (2.0) or keyframes

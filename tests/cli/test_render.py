@@ -488,6 +488,7 @@ def test_blur_sets_the_largest_radius_as_a_share_of_the_width(depth: Tensor, run
     f_number = float(re.search(r"f/([\d.]+)", run(f"{ONE} --blur 10%")).group(1))  # type: ignore[union-attr]
     expected = torchdof.Camera(50.0, f_number, 2.0)
     assert float(expected.coc_px(depth, 24).max()) == pytest.approx(2.4, rel=0.01)
+    run(f"{ONE} --blur 40% --strict")  # a large blur that is stated is no mistake
 
 
 @pytest.mark.parametrize(("size", "sensor_mm"), [((16, 24), 36.0), ((24, 16), 24.0)])
@@ -500,13 +501,22 @@ def test_an_equivalent_lens_is_for_full_frame_in_landscape_and_portrait(
     write_image("phone.exr", Picture(image, sample="float", metadata={n: ("float", v) for n, v in tags.items()}))
     np.save("metres.npy", depth.numpy())
     camera = torchdof.Camera(85.0, 1.4, 1.5, sensor_mm)
-    for said in ("85mm,1.4", "85,1.4", "85mm,f/1.4"):
+    for said in ("85mm,1.4", "85,f1.4", "'85mm f/1.4'"):
         line = run(f"render phone.exr metres.npy -o out.exr --bits float --focus-m 1.5 --equivalent {said}")
         assert f"f/1.4, 85 mm on {sensor_mm:g} mm" in line and "[" not in line
     expected = torchdof.depth_of_field(image, depth, camera)
     torch.testing.assert_close(pixels("out.exr"), expected, rtol=0, atol=1e-6)
     line = run("render phone.exr metres.npy -o out.exr --depth-kind relative --relative-kind depth --equivalent 85,1.4")
     assert "focus 1 m, f/1.4" in line and "depth from 1 to 8 m assumed" in line
+
+
+def test_lens_and_points_are_those_of_the_display_window(image: Tensor, depth: Tensor, run: Run) -> None:
+    """The file holds half the width of the frame, from 4 px left of it; the surface at 6 m starts at 8 px."""
+    write_image("part.exr", Picture(image, sample="float", window=(-4, 3, 0, 0, 48, 40)))
+    run(f"render part.exr depth.npy -o out.exr --focus-at 10,11 --attention 14,11,4 {LENS}")
+    camera = CAMERA.replace(focus_m=6.0, sensor_width_mm=2.0)
+    expected = torchdof.depth_of_field(image, depth, camera, attention=(18.0, 8.0, 4.0))
+    torch.testing.assert_close(pixels("out.exr"), expected, rtol=0, atol=1e-6)
 
 
 def test_a_note_advises_how_to_increase_a_hardly_visible_blur(run: Run) -> None:

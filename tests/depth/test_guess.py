@@ -32,6 +32,7 @@ def ground(top: float, bottom: float) -> Tensor:
         (ground(1.0, 0.0), False, Guess("relative", relative_kind="depth")),
         (ground(0.9, 0.2), False, Guess("z")),  # a close-up
         (ground(-0.4, 3.0), False, Guess("relative")),
+        (torch.cat([ground(-1.0, -1.0), ground(8.0, 1.5)], 3), False, Guess("z")),  # -1 was not measured
         (ground(6.0, 2.0).round(), False, Guess("z")),  # a few whole metres
         ((ground(2.0, 0.2).round() * 100), True, Guess("relative", relative_kind="depth")),
         (torch.full((1, 1, 4, 4), 2.0), False, Guess("z")),

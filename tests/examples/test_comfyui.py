@@ -128,8 +128,17 @@ def test_points_out_of_focus_have_the_shape(node: Any) -> None:
 
 def test_a_smaller_depth_map_a_shared_one_and_alpha_are_accepted(node: Any) -> None:
     image = torch.rand(2, 18, 24, 4)
-    out, focus = render(node, image, torch.rand(1, 9, 12, 3), sensor_width_mm=4.0)
+    out, focus = render(node, image.half(), torch.rand(1, 9, 12, 3).half(), sensor_width_mm=4.0)
     assert out.shape == (2, 18, 24, 4) and focus.shape == (2, 18, 24, 3)
+
+
+@pytest.mark.parametrize(
+    ("depth", "message"),
+    [(torch.rand(3, 18, 24, 3), "one for each of the 2 images, got 3"), (torch.ones(1, 18, 24, 3), "got 1 everywhere")],
+)
+def test_depth_that_does_not_fit_is_refused_in_one_sentence(node: Any, depth: Tensor, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        render(node, scene()[0], depth)
 
 
 def test_the_workflow_is_valid_for_the_node(node: Any) -> None:

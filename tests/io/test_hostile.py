@@ -138,7 +138,7 @@ FILES: list[tuple[str, Made | None, str | None, str | None]] = [
     ("mosaic.tif", with_values(GREY, kind="uint16", tags={262: 32803}), f"{NOT_RGB} 32803", f"{NOT_RGB} 32803"),
     ("negative.tif", with_values(GREY, kind="uint16", tags={262: 0}), f"{NOT_RGB} 0", f"{NOT_RGB} 0"),
     ("signed.tif", with_values(GREY, kind="int16"), "numbers of type int16, for which white is not defined", None),
-    ("colour.png", with_values(np.eye(3, dtype=np.float32)[None], kind="uint8"), None, "which of the channels R, G, B"),
+    ("colour.png", with_values(np.eye(3, dtype=np.float32)[None], kind="uint8"), None, "colours of a heat map"),
     ("object.npy", with_array(np.array([[{"a": 1}]], object)), None, "cannot be read as an array"),
     ("bomb.npy", with_array(np.array([[Bomb()]], object)), None, "cannot be read as an array"),
     ("bomb.npz", with_array(np.array([[Bomb()]], object)), None, "cannot be read as an array"),

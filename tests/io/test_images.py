@@ -249,6 +249,7 @@ def test_metadata_of_the_input_is_kept(tmp_path: Path, suffix: str) -> None:
     if suffix == ".exr":  # all but a lossy compression
         write_image(tmp_path / "b.exr", read_image(store(source, stored(source), "half", compression="dwaa:45")))
         assert spec_of(tmp_path / "b.exr").get_string_attribute("compression") == "zip"
+        assert spec_of(tmp_path / "b.exr").getattribute("colorInteropID") is None  # the file does not state primaries
 
 
 # Maps

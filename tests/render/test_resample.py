@@ -21,9 +21,9 @@ def test_a_map_of_the_size_of_the_image_is_returned_itself() -> None:
     assert at_size_of(image, depth) is depth
 
 
-@pytest.mark.parametrize("factor", [2, 3, 4])
+@pytest.mark.parametrize("factor", [2, 4, 6])
 def test_a_smaller_map_gets_the_edges_of_the_image(factor: int) -> None:
-    image, depth = scene(48, 96)
+    image, depth = (functional.interpolate(values, scale_factor=2) for values in scene(48, 96))
     small = 1 / functional.avg_pool2d(1 / depth, factor)
     soft = 1 / functional.interpolate(1 / small, scale_factor=factor, mode="bilinear")
     wrong, before = (((sized / depth - 1).abs() > 0.01).float().mean() for sized in (at_size_of(image, small), soft))

@@ -25,6 +25,7 @@ from ..optics.camera import Camera
 from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect, stretch
+from .lens import Area
 from .options import Scene, make_folder_of
 from .output import Bar, Notices, print_result
 
@@ -44,6 +45,7 @@ class Frame:
     name: str  # file with the depth
     scene: Scene  # the options, with the guess in the place of "auto"
     picture: Picture
+    area: Area  # place of the picture in the frame to which lens and points refer
     values: Tensor  # [1, 1, H, W], depth in metres, or signed radius in pixels for coc
     filled: int  # number of filled holes, in pixels
     remarks: list[str]  # changes of the depth, and assumptions about it, that no option states
@@ -53,7 +55,9 @@ class Frame:
     def mistakes(self, camera: Camera) -> list[Mistake]:
         """Likely mistakes in the depth, given the camera."""
         kind: Any = self.scene.depth_map.depth_kind
-        return depth_mistakes(self.values, camera, kind, self.scene.depth_map.depth_scale)
+        mistakes = depth_mistakes(self.values, camera, kind, self.scene.depth_map.depth_scale)
+        is_stated = self.scene.lens.blur_share is not None  # a large blur that --blur states is no mistake of units
+        return [mistake for mistake in mistakes if not (is_stated and mistake.name == "blur")]
 
 
 def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = False, **encoding: Any) -> Frame:
@@ -65,6 +69,10 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
     start, source, guess = time.perf_counter(), depth or image, ""
     picture, depth_map = read_image(image, **encoding), scene.depth_map
     height, width = picture.pixels.shape[-2:]
+    area = Area(0, 0, width, height)
+    if picture.window is not None and image.suffix.lower() == ".exr":
+        x, y, full_x, full_y, *size = picture.window
+        area = Area(x - full_x, y - full_y, *size)
     if depth is not None or depth_map.depth_channel is not None:
         values = read_values(source, depth_map.depth_channel)
     elif picture.depth is not None:
@@ -80,7 +88,7 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
         rows, columns = values.shape[-2:]
         problem = f"coc is {columns} x {rows} pixels but the image is {width} x {height}; they must be the same"
         raise ValueError(f"{source}: {problem}")
-    view_deg = scene.lens.view_deg(picture.metadata, width, height) if kind == "distance" else None
+    view_deg = scene.lens.view_deg(picture.metadata, width, area) if kind == "distance" else None
     unknown, filled = depth_map.depth_unknown, 0
     try:
         same_aspect(picture.pixels, values)
@@ -102,7 +110,7 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
     if kind == "relative" and None in (depth_map.near_m, depth_map.far_m):
         remarks.append("depth from {:g} to {:g} m assumed".format(*depth_map.ends_m))
     scene = dataclasses.replace(scene, depth_map=dataclasses.replace(depth_map, fill_depth=fill))
-    return Frame(str(source), scene, picture, values, filled, remarks, guess, time.perf_counter() - start)
+    return Frame(str(source), scene, picture, area, values, filled, remarks, guess, time.perf_counter() - start)
 
 
 def coc_of(
@@ -119,7 +127,8 @@ def coc_of(
     if depth_map.depth_kind == "coc":
         notices.warn(frame.name, coc_mistakes(values))
         return values, None, []
-    camera, remarks = lens.camera(frame.picture.metadata, values, number, is_still, depth_map.is_to_scale)
+    metadata, is_to_scale = frame.picture.metadata, depth_map.is_to_scale
+    camera, remarks = lens.camera(metadata, values, number, is_still, is_to_scale, frame.area)
     coc_px = camera.coc_px(values, values.shape[-1])
     coc_of_lens(coc_px, values, lens.stated(camera))
     notices.warn(frame.name, frame.mistakes(camera))
@@ -173,7 +182,10 @@ class Renderer:
                     pixels = _with_lights(picture, pixels, command.lights)
                 if bar is not None and bar.is_seen and coc_px.numel() > _LARGE_PX:
                     bar.update(f"rendering {out.name}, about {_seconds(blur, pixels, coc_px):.0f} s")
-                pixels = blur(pixels, coc_px, attention=command.attention)
+                attention = command.attention
+                if attention is not None:
+                    attention = (attention[0] - frame.area.x, attention[1] - frame.area.y, attention[2])
+                pixels = blur(pixels, coc_px, attention=attention)
         seconds = frame.seconds + time.perf_counter() - start
         frame = dataclasses.replace(frame, remarks=remarks, seconds=seconds)
         return Rendered(out, frame, dataclasses.replace(picture, pixels=pixels), coc_px, camera)

@@ -44,7 +44,9 @@ class Inspect:
         light, metres = frame.picture.light, frame.values
         if not bool((metres > 0).any()):
             raise ValueError(f"{frame.name}: no pixel has a depth; check the kind, scale and offset of the depth map")
-        camera, notes = frame.scene.lens.camera(frame.picture.metadata, metres, is_to_scale=depth_map.is_to_scale)
+        camera, notes = frame.scene.lens.camera(
+            frame.picture.metadata, metres, is_to_scale=depth_map.is_to_scale, area=frame.area
+        )
         notes += frame.remarks
         report = inspect_depth(light, metres, camera)
         make_folder_of(target)

@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..io.metadata import camera_settings
 from ..io.sequence import focus_at_frame, parse_focus
@@ -28,6 +28,18 @@ _PER_OUTLIER, _MAX_SAMPLES = 1000, 2**20  # one pixel in 1000 is ignored as an o
 _SPELLED = {"focus_range_m": "--focus-range", "tilt_deg": "--tilt", "swing_deg": "--swing", "fov_x_deg": "--fov-deg"}
 
 
+class Area(NamedTuple):
+    """Place of an image's first pixel in the full frame, and the size of that frame, in pixels.
+
+    An EXR stores a data window, which may be a part of the frame (its display window) or extend beyond it.
+    """
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+
 def _width_fraction(text: str) -> float:
     """Reads a percentage of the width, as a fraction."""
     expected = "--blur expects a share of the picture's width, above 0 and at most 50 %, such as 2%"
@@ -40,7 +52,7 @@ def _width_fraction(text: str) -> float:
 def _equivalent(text: str) -> tuple[float, ...]:
     """Reads a focal length in mm and an f-number."""
     expected = "--equivalent expects a focal length and an f-number such as 85mm,1.4"
-    return numbers(2, expected)(re.sub(r"mm(?=,)|(?<=,)f/", "", text))
+    return numbers(2, expected)(re.sub(r"\s*(mm)?\s*[, ]\s*(f/?)?", ",", text, count=1))
 
 
 def _give_one(options: Mapping[str, Any], problem: str) -> None:
@@ -71,8 +83,8 @@ class Lens(Sensor):
         basic=True,
     )
     focus_at: tuple[float, float] | None = option(
-        "Focus on the surface at this pixel, counted from the top left; in a sequence, anew in each frame. Default: "
-        "the focus that IMAGE's file states, else the subject nearest the middle.",
+        "Focus on the surface at this pixel, counted from the top left (of an EXR's display window); in a sequence, "
+        "anew in each frame. Default: the focus that IMAGE's file states, else the subject nearest the middle.",
         metavar="X,Y",
         read=numbers(2, "--focus-at expects a pixel X,Y such as 320,200"),
         basic=True,
@@ -142,14 +154,16 @@ class Lens(Sensor):
         if len(self.focus_m or []) > 1:
             raise ValueError("--focus-m has keyframes but IMAGE is a single image; give one distance in metres")
 
-    def view_deg(self, metadata: Mapping[str, Any], width: int, height: int) -> float:
-        """Horizontal field of view in degrees, as stated, or from focal length and sensor of options or file."""
+    def view_deg(self, metadata: Mapping[str, Any], width: int, area: Area) -> float:
+        """Horizontal field of view in degrees of an image, as stated, or from focal length and sensor."""
+        lens = camera_settings(metadata, area.width, area.height) | self._stated(area.width, area.height)
         if self.fov_deg is not None:
-            return self.fov_deg
-        lens = camera_settings(metadata, width, height) | self._stated(width, height)
-        if not {"focal_length_mm", "sensor_width_mm"} <= set(lens):
+            half = math.tan(math.radians(self.fov_deg) / 2)
+        elif {"focal_length_mm", "sensor_width_mm"} <= set(lens):
+            half = lens["sensor_width_mm"] / (2 * lens["focal_length_mm"])
+        else:
             raise ValueError("--depth-kind distance needs --fov-deg, or --focal-length-mm and --sensor-width-mm")
-        return 2 * math.degrees(math.atan2(lens["sensor_width_mm"], 2 * lens["focal_length_mm"]))
+        return 2 * math.degrees(math.atan(half * width / area.width))
 
     def _stated(self, width: int, height: int) -> dict[str, float]:
         """Numbers of the lens that the options state, for an image of a size in pixels."""
@@ -165,11 +179,13 @@ class Lens(Sensor):
         frame: int = 0,
         is_still: bool = True,
         is_to_scale: bool = True,
+        area: Area | None = None,
     ) -> "tuple[Camera, list[str]]":
         """The camera of one picture, and remarks on the source of the numbers that no option states.
 
         1. Take the focus from the options, else from the file, else from the subject of a still.
-        2. Take the lens from the options, else from the file, else from ``_DEFAULTS``.
+        2. Take the lens from the options, else from the file, else from ``_DEFAULTS``. It is that of the full frame:
+           ``area`` is the place of the picture in it, None if the picture is the frame.
         3. Open the lens for the blur of ``--blur``, or for a visible blur in a still whose options leave it open.
 
         In a sequence nothing is guessed, because guesses would differ from frame to frame. Without ``is_to_scale`` the
@@ -178,7 +194,8 @@ class Lens(Sensor):
         from ..optics.camera import Camera
 
         height, width = depth.shape[-2:]
-        stated, in_file = self._stated(width, height), camera_settings(metadata, width, height)
+        area = area or Area(0, 0, width, height)
+        stated, in_file = self._stated(area.width, area.height), camera_settings(metadata, area.width, area.height)
         remarks, focus_m = list[str](), math.inf
         if self.focus_m is not None:
             focus_m = focus_at_frame(self.focus_m, frame)
@@ -203,7 +220,9 @@ class Lens(Sensor):
                 camera = Camera.from_fov(self.fov_deg, self.aperture_radius_m or 0.01, focus_m)
                 camera = camera if self.f_number is None else camera.replace(f_number=self.f_number)
             camera = camera.replace(focus_range_m=self.focus_range, tilt_deg=self.tilt, swing_deg=self.swing)
-        camera = camera if self.focus_at is None else camera.focus_at(depth, *self.focus_at)
+        camera = camera.replace(sensor_width_mm=camera.sensor_width_mm * (width / area.width))
+        if self.focus_at is not None:
+            camera = camera.focus_at(depth, self.focus_at[0] - area.x, self.focus_at[1] - area.y)
         share, is_open = self.blur_share, is_still and not self._opening and (self == Lens() or not is_to_scale)
         largest_px = self._largest_coc_px(camera, depth) if share is not None or is_open else 0.0
         if is_open and not (is_to_scale and "f_number" in in_file and largest_px >= _VISIBLE_BLUR * width):

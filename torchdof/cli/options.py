@@ -220,12 +220,16 @@ def make_folder_of(path: Path) -> None:
         raise OSError(f"{path}: its folder cannot be made ({error.strerror})") from None
 
 
-def check_files(image: Path, depth: Path | None, out: Path | None) -> None:
-    """Refuse missing inputs, an output that is also an input, and an output of an unsupported type."""
+def check_files(image: Path, depth: Path | None, *outputs: Path | None) -> None:
+    """Refuse missing inputs, outputs that are inputs or the same file, and outputs of an unsupported type."""
     existing_image(image)
     if depth is not None:
         existing_map(depth)
-    if out is not None:
-        if os.path.realpath(out) in map(os.path.realpath, filter(None, (image, depth))):
+    inputs, written = [os.path.realpath(path) for path in (image, depth) if path is not None], set[str]()
+    for out in filter(None, outputs):
+        if os.path.realpath(out) in inputs:
             raise ValueError(f"{out}: is one of the inputs; write to another file")
+        if os.path.realpath(out) in written:
+            raise ValueError(f"{out}: would be written twice; give each picture a file of its own")
         samples_of(out)
+        written.add(os.path.realpath(out))

@@ -160,7 +160,7 @@ class Render:
         target = FramePattern(self.out).name if not is_single else lambda _: self.out
         outputs = {n: target(n) for n in numbers}
         for n, out in outputs.items():
-            check_files(*sources(n), out)
+            check_files(*sources(n), out, files.sheet)
         whole = list(numbers)  # frames of the sequence, each of which may depend on those before it
         if images and files.steady:
             whole = [n for n in images.frames() if depths is None or depths.name(n).is_file()]

@@ -46,6 +46,7 @@ def guess_kind(values: Tensor, integers: bool = False, metric: bool = False) -> 
     * Whole numbers are relative depth (grey levels) if the largest is at most 255, or at least 60,000. Otherwise they
       are millimetres, with 0 for pixels that were not measured.
     * Other numbers are relative depth if they lie in [0, 1] and come near 0, or if some are negative; else metres.
+      A single negative number, such as -1, marks pixels without depth.
     * Relative depth is "disparity" (larger is nearer), unless the values clearly shrink downwards: the ground is nearer
       than the sky. For the same reason distances that clearly grow downwards are taken for relative disparity.
 
@@ -62,6 +63,9 @@ def guess_kind(values: Tensor, integers: bool = False, metric: bool = False) -> 
         >>> guess_kind(torch.linspace(2.5, 8.0, 256).reshape(1, 1, 16, 16).flip(2)).scale
         1.0
     """
+    negative = values[values < 0]
+    if negative.numel() > 1 and bool((negative == negative[0]).all()):
+        values = values.masked_fill(values < 0, math.nan)
     finite = values[values.isfinite()]
     low, high = (float(end) for end in finite.aminmax()) if finite.numel() else (0.0, 0.0)
     if low == high:

@@ -234,7 +234,8 @@ def write_image(
                 spec.attribute(name, value)
             else:
                 spec.attribute(name, kind, value)
-    spec.attribute("oiio:ColorSpace", "srgb_rec709_scene" if transfer == "srgb" else "lin_rec709_scene")
+    if transfer == "srgb" or suffix != ".exr":  # not of linear EXR files, whose primaries are those of the input
+        spec.attribute("oiio:ColorSpace", "srgb_rec709_scene" if transfer == "srgb" else "lin_rec709_scene")
     if transfer == "linear" and suffix != ".exr":
         spec.attribute("Exif:ColorSpace", 65535)  # "uncalibrated"; OpenImageIO cannot write a TIFF without any EXIF
     if straight:
@@ -294,7 +295,8 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
             return _map(parts[depth_place[0]].values[..., depth_place[1]])
         if all(np.array_equal(values, planes[0][2]) for _, name, values in planes if name != "A"):
             return _map(planes[0][2])
-    raise ValueError(f"{path}: which of the channels {channel_names} is depth? name it (--depth-channel)")
+    advice = "name it (--depth-channel); the colours of a heat map are no depth: save the map in grey, or as .npy"
+    raise ValueError(f"{path}: which of the channels {channel_names} is depth? {advice}")
 
 
 def _map(values: np.ndarray) -> Tensor:

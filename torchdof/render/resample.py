@@ -1,5 +1,7 @@
 """Resamples a depth map to the size of its image."""
 
+import math
+
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
@@ -9,9 +11,13 @@ from .edges import repair_edges
 
 __all__ = ["at_size_of"]
 
+_LARGEST_FACTOR = 4  # largest enlargement in one step: its ramps are the widest that the repair takes for edges
+
 
 def at_size_of(image: Tensor, depth: Tensor) -> Tensor:
     """Resamples a depth map to the size of its image, as 1 / depth, then moves its edges to those of the image.
+
+    A map that is more than four times smaller is enlarged in several equal steps, each followed by the repair.
 
     Args:
         image: ``[B, C, H, W]``, linear light.
@@ -34,14 +40,24 @@ def at_size_of(image: Tensor, depth: Tensor) -> Tensor:
     if size == given:
         return depth
     validation.same_aspect(image, depth)
+    return _resized(image, depth)
+
+
+def _resized(image: Tensor, depth: Tensor) -> Tensor:
+    """The steps of :func:`at_size_of`, for shapes that are checked."""
+    size, given = (image.shape[-2], image.shape[-1]), (depth.shape[-2], depth.shape[-1])
+    if max(size[0] / given[0], size[1] / given[1]) > _LARGEST_FACTOR:
+        between = (round(math.sqrt(size[0] * given[0])), round(math.sqrt(size[1] * given[1])))
+        depth = _resized(functional.interpolate(image, between, mode="area"), depth)
+        given = between
     known = (depth > 0).to(depth.dtype)
     inverse = torch.where(depth > 0, 1.0 / depth, 0.0)
 
-    def resized(values: Tensor) -> Tensor:
+    def enlarged_or_averaged(values: Tensor) -> Tensor:
         if given[0] > size[0]:
             return functional.interpolate(values, size, mode="area")
         return functional.interpolate(values, size, mode="bilinear", align_corners=False)
 
-    share = resized(known)
-    mean = resized(inverse) / share.clamp_min(torch.finfo(depth.dtype).tiny)
+    share = enlarged_or_averaged(known)
+    mean = enlarged_or_averaged(inverse) / share.clamp_min(torch.finfo(depth.dtype).tiny)
     return repair_edges(image, torch.where(share >= 0.5, 1.0 / mean, torch.nan))
