@@ -123,8 +123,12 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
     table = portable.dof.options.table
     if table.channels not in (1, channels):
         raise ValueError(f"the table blurs {table.channels} channels, the image has {channels}")
-    sizes = [(2, channels, 64, 64), (2, 1, 64, 64), (2,), (2,)][: len(INPUTS[portable.inputs])]
-    example = tuple(torch.ones(size, dtype=torch.float32) for size in sizes)  # the graph does not depend on the values
+    # With a single row or column of tiles, PyTorch would record the number of tiles as the number of items, because
+    # both are the same in the example: take several, of the largest tiles too. They are not computed while tracing.
+    batch_size, size = 5, (600, 850)
+    sizes = [(batch_size, n, *size) for n in (channels, 1)] + [(batch_size,)] * 2
+    # the graph does not depend on the values
+    example = tuple(torch.ones(1).expand(n) for n in sizes[: len(INPUTS[portable.inputs])])
     traced = copy.copy(portable)
     traced.ops = GraphOps(portable.plan, table, portable.dof.options.method == "layered", portable.width)
     free = torch.export.Dim.AUTO
