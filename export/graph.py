@@ -157,9 +157,11 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
     table = portable.dof.options.table
     if table.channels not in (1, channels):
         raise ValueError(f"the table blurs {table.channels} channels, the image has {channels}")
-    batch, size = (2, (64, 64)) if portable.size is None else (1, portable.size)
+    # With a single row or column of tiles, PyTorch would record the number of tiles as the number of items, because
+    # both are the same in the example: take several, of the largest tiles too. They are not computed while tracing.
+    batch, size = (5, (600, 850)) if portable.size is None else (1, portable.size)
     sizes = [(batch, channels, *size), (batch, 1, *size), (batch,), (batch,)][: len(INPUTS[portable.inputs])]
-    example = tuple(torch.ones(shape, dtype=torch.float32) for shape in sizes)  # values do not matter
+    example = tuple(torch.ones(1, dtype=torch.float32).expand(shape) for shape in sizes)  # values do not matter
     traced = copy.copy(portable)
     layered = portable.dof.options.method == "layered"
     if portable.layout == "whole":

@@ -92,7 +92,9 @@ def test_mismatched_shapes_are_refused(
 
 def test_vmap_is_refused_by_name() -> None:
     images, depths = clips()
-    with pytest.raises(ValueError, match=r"image comes from torch\.vmap"):
-        torch.vmap(DOF)(images[:, 0], depths[:, 0])
-    with pytest.raises(ValueError, match=r"focus_m comes from torch\.vmap"):
-        torch.vmap(lambda s: DOF(images[:, 0], depths[:, 0], focus_m=s[None]))(torch.tensor([1.0, 2.0]))
+    for call in (DOF, torch.func.grad(lambda image, depth: DOF(image, depth).sum())):
+        with pytest.raises(ValueError, match=r"image comes from torch\.vmap"):
+            torch.vmap(call)(images[:, :1], depths[:, :1])
+    for shape in ((2,), (2, 1)):
+        with pytest.raises(ValueError, match=r"focus_m comes from torch\.vmap"):
+            torch.vmap(lambda s: DOF(images[:, 0], depths[:, 0], focus_m=s))(torch.ones(shape))

@@ -241,8 +241,9 @@ def test_the_module_compiles_without_graph_breaks_and_equals_eager(backend: str,
     torch.compiler.reset()
     camera, image, depth = compiled_case()
     dof = DepthOfField(camera, **COMPILED, **way)
-    fast = torch.compile(dof, fullgraph=True, backend=backend)(image, depth)
-    assert not torch.equal(fast, image)
+    torch._dynamo.utils.counters.clear()
+    fast = torch.compile(dof, backend=backend)(image, depth)  # fullgraph=True would read the values of constant tensors
+    assert not torch._dynamo.utils.counters["graph_break"] and not torch.equal(fast, image)
     still = dof(image, depth, plan=Plan.all(COMPILED["max_coc_px"], COMPILED["tolerance"]))
     assert_close(fast, still, rtol=1e-5, atol=1e-6)
     assert rms(fast, dof(image, depth)) <= 2 * COMPILED["tolerance"]

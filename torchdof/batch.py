@@ -79,9 +79,11 @@ def numbers(axes: tuple[int, ...], name: str, value: Any) -> Any:
             value = torch.tensor(value, dtype=torch.float64, device="cpu")
         except (TypeError, ValueError, RuntimeError, OverflowError):
             raise ValueError(f"{name} must be a number, a list of numbers or a tensor [B], got {show(value)}") from None
-    if not isinstance(value, Tensor) or value.ndim == 0:
+    if not isinstance(value, Tensor):
         return value
     _refuse_vmap(name, value)
+    if value.ndim == 0:
+        return value
     if len(axes) < 2:
         return value[:, 0] if value.ndim == 2 and value.shape[1] == 1 else value
     batch, frames = axes
@@ -105,8 +107,10 @@ def restored(axes: tuple[int, ...], batch: Tensor) -> Tensor:
 
 def _refuse_vmap(name: str, value: Tensor) -> None:
     """Refuse a tensor inside ``torch.vmap``, because planning layers reads its values."""
-    if not is_traced() and torch._C._functorch.is_batchedtensor(value):
-        raise ValueError(
-            f"{name} comes from torch.vmap, which cannot follow this rendering: layers are planned from the numbers of "
-            "the depth; call it with the whole batch instead, [B, C, H, W] and [B, 1, H, W]"
-        )
+    while not is_traced() and torch._C._functorch.is_functorch_wrapped_tensor(value):
+        if torch._C._functorch.is_batchedtensor(value):
+            raise ValueError(
+                f"{name} comes from torch.vmap, which cannot follow this rendering: layers are planned from the "
+                "numbers of the depth; call it with the whole batch instead, [B, C, H, W] and [B, 1, H, W]"
+            )
+        value = torch._C._functorch.get_unwrapped(value)  # torch.func.grad inside of torch.vmap wraps it once more

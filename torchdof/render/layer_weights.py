@@ -21,7 +21,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["blur_axis", "eased", "from_blur_axis", "ramps", "weights_at_or_behind"]
+__all__ = ["blur_axis", "blur_axis_of_radius", "eased", "from_blur_axis", "ramps", "weights_at_or_behind"]
 
 _SQUARE_PX = 0.5  # px of coc around which x changes from the square of the coc to the coc itself
 _IN_FOCUS = 2e-4  # x below which a pixel is in focus, at a coc of 0.01 px; larger: more pixels pass unchanged
@@ -35,6 +35,12 @@ def blur_axis(coc_px: Tensor) -> Tensor:
     # no compiler fuses these operations, so both engines agree to the last bit which pixels lie at a node
     x = coc_px * coc_px.abs() / (coc_px.abs() + _SQUARE_PX)
     return x - x.clamp(-_IN_FOCUS, _IN_FOCUS)
+
+
+def blur_axis_of_radius(radius_px: float) -> float:
+    """:func:`blur_axis` of one radius >= 0, computed without a tensor, whose value compiled code could not read."""
+    x = radius_px * radius_px / (radius_px + _SQUARE_PX)
+    return x - min(x, _IN_FOCUS)
 
 
 def from_blur_axis(x: float) -> float:

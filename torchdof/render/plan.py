@@ -17,7 +17,7 @@ from ..tensors import is_in_memory, is_traced
 from ..validation import show, tolerance_of
 from . import layer_cocs, traced
 from .downsampling import shrink
-from .layer_weights import blur_axis, from_blur_axis, ramps, weights_at_or_behind
+from .layer_weights import blur_axis_of_radius, from_blur_axis, ramps, weights_at_or_behind
 
 __all__ = [
     "KERNELS_PER_PX",
@@ -168,8 +168,7 @@ class Plan:
 
         The coc at the borders of these scenes is unknown, so the coarse layers, whose errors it affects, are denser.
         """
-        reach = float(blur_axis(torch.tensor(max_coc_px, dtype=torch.float64, device="cpu")))
-        dense_from = float(blur_axis(torch.tensor(_COARSE_FROM_PX[0], dtype=torch.float64, device="cpu")))
+        reach, dense_from = blur_axis_of_radius(max_coc_px), blur_axis_of_radius(_COARSE_FROM_PX[0])
         last = reach - 0.3 * layer_cocs.spacing(reach, layer_cocs.DENSE * tolerance)
         inner = [x for x in layer_cocs.spaced_nodes(-reach, reach, tolerance, dense_from) if abs(x) < last]
         return cls((-reach, *inner, reach), tolerance, rays, grows=False, kernels_per_px=_FEWER_KERNELS_PER_PX)
