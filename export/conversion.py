@@ -179,7 +179,9 @@ def _index_copy(self: Any, dim: int, index: Any, source: Any) -> Any:
 
 def _all(self: Any, dim: int, keepdim: bool = False) -> Any:
     # torch.onnx reduces int64, which runtimes on GPUs leave to the CPU
-    least = opset20.ReduceMin(opset20.Cast(self, to=onnx_ir.DataType.FLOAT), [dim], keepdims=keepdim)  # type: ignore[arg-type]
+    axis: Any = [dim]
+    as_float: Any = opset20.Cast(self, to=onnx_ir.DataType.FLOAT)
+    least: Any = opset20.ReduceMin(as_float, axis, keepdims=keepdim)
     return opset20.Cast(least, to=onnx_ir.DataType.BOOL)
 
 

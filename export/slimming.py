@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import onnx
 import onnx_ir
+from onnx.reference import ReferenceEvaluator
 from onnx_ir.passes import common as passes
 from onnx_ir.tape import Tape
 from onnxscript.optimizer import fold_constants
@@ -62,7 +63,7 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
     for step in flat:
         step(model)
     fold_constants(model, input_size_limit=2**24, output_size_limit=2**13)
-    _expand_weights(model)
+    _fold_weights(model)
     for step in tidy:
         step(model)
     structure(model)
@@ -78,25 +79,26 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
     return model
 
 
-def _expanded(value: onnx_ir.Value | None) -> np.ndarray | None:
-    """A constant that is expanded to several channels and gets further axes, as numbers; None for other values."""
-    node = None if value is None else value.producer()
-    if node is None or node.op_type not in ("Expand", "Unsqueeze"):
-        tensor = None if value is None else onnx_ir.convenience.get_const_tensor(value)
-        return None if tensor is None else tensor.numpy()
-    array, sizes = (_expanded(source) for source in node.inputs)
-    if array is None or sizes is None:
-        return None
-    return np.expand_dims(array, tuple(sizes)) if node.op_type == "Unsqueeze" else array * np.ones(sizes, array.dtype)
-
-
-def _expand_weights(model: onnx_ir.Model) -> None:
-    """Makes constants of weights that convolutions expand: too large to be folded like other numbers."""
+def _fold_weights(model: onnx_ir.Model) -> None:
+    """Makes constants of weights of convolutions that are larger than the other constants which are folded."""
     for node in [node for node in model.graph if node.op_type == "Conv"]:
         weight = node.inputs[1]
-        array = _expanded(weight)
-        if weight is not None and array is not None and weight.const_value is None:
-            node.replace_input_with(1, _initializer(model.graph, array, f"{weight.name}_expanded"))
+        array = None if weight is None or weight.const_value is not None else _folded(weight)
+        if weight is not None and array is not None:
+            node.replace_input_with(1, _initializer(model.graph, array, f"{weight.name}_folded"))
+
+
+def _folded(value: onnx_ir.Value | None) -> np.ndarray | None:
+    """The numbers of a value that does not depend on the graph's inputs, else None."""
+    tensor = None if value is None else onnx_ir.convenience.get_const_tensor(value)
+    node = None if value is None else value.producer()
+    if tensor is not None or node is None:
+        return None if tensor is None else tensor.numpy()
+    feed = {str(source.name): _folded(source) for source in node.inputs if source is not None}
+    if any(array is None for array in feed.values()):
+        return None
+    results: Any = ReferenceEvaluator(onnx_ir.to_proto(node)).run(None, feed)
+    return np.asarray(results[0])
 
 
 def _place_weights(model: onnx_ir.Model) -> None:

@@ -69,7 +69,7 @@ def _exported(name: str) -> Any:
     return fixture
 
 
-layered, plain, fold, fold_with_occlusion = map(_exported, exported.MODULES)
+layered, whole, plain, fold, fold_with_occlusion = map(_exported, exported.MODULES)
 
 
 @pytest.fixture(scope="session")

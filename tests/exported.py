@@ -17,6 +17,7 @@ from torch import Tensor
 import torchdof
 from torchdof.cli.main import app
 from torchdof.export import Verification, to_onnx
+from torchdof.export.graph import Layout, Portable
 from torchdof.export.verification import session
 from torchdof.render.plan import Plan
 
@@ -26,6 +27,8 @@ GIVEN: dict[str, Any] = {"depth_edges": "as given"}  # the default of an exporte
 MODULES: dict[str, Callable[[], torchdof.DepthOfField]] = {
     # with occlusion, at resolutions down to a sixteenth; slow to trace
     "layered": lambda: torchdof.DepthOfField(SMALL, **GIVEN, tolerance=64 / 255, max_coc_px=16.0, check=False),
+    # one straight graph, with occlusion
+    "whole": lambda: torchdof.DepthOfField(CAMERA, **GIVEN, tolerance=64 / 255, max_coc_px=2.5, check=False),
     # without occlusion; traced in a few seconds
     "plain": lambda: torchdof.DepthOfField(
         CAMERA, **GIVEN, tolerance=16 / 255, max_coc_px=2.5, occlusion=False, check=False
@@ -38,6 +41,7 @@ MODULES: dict[str, Callable[[], torchdof.DepthOfField]] = {
         CAMERA, **GIVEN, tolerance=16 / 255, max_coc_px=2.5, method="fold", check=False
     ),
 }
+LAYOUTS: dict[str, Layout] = {"whole": "whole"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +51,7 @@ class Exported:
     dof: torchdof.DepthOfField
     path: Path
     verification: Verification
+    layout: Layout
 
     @property
     def plan(self) -> Plan:
@@ -66,22 +71,25 @@ class Exported:
     def eager(self, *tensors: Tensor) -> Tensor:
         """The picture of the module in PyTorch, with the layers of the file."""
         with torch.no_grad():
+            if self.layout == "whole":
+                return Portable(self.dof, layout="whole")(*tensors)
             return self.dof(*tensors, plan=self.plan)
 
 
 def export_once(name: str, folder: Path) -> Exported:
     """The module of that name and its file in a folder; the first process to call this writes it."""
+    layout = LAYOUTS.get(name, "tiles")
     dof, path, verification = MODULES[name](), folder / f"{name}.onnx", folder / f"{name}.verification"
     with FileLock(folder / f"{name}.lock"):
         if not verification.exists():
             generator = torch.get_rng_state()
             torch.set_default_dtype(torch.float64 if name == "plain" else torch.float32)  # which changes no file
             try:
-                verification.write_bytes(pickle.dumps(to_onnx(dof, path)))
+                verification.write_bytes(pickle.dumps(to_onnx(dof, path, layout=layout)))
             finally:
                 torch.set_default_dtype(torch.float32)
             assert torch.equal(torch.get_rng_state(), generator), "the caller's generator has been advanced"
-    return Exported(dof, path, pickle.loads(verification.read_bytes()))
+    return Exported(dof, path, pickle.loads(verification.read_bytes()), layout)
 
 
 def command_once(folder: Path) -> tuple[Path, str]:

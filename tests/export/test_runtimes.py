@@ -48,16 +48,19 @@ def test_openvino_gives_the_same_pixels(layered: Any, record_property: Any) -> N
 
 
 @needs("onnxruntime-web")
-def test_onnxruntime_web_gives_the_same_pixels(layered: Any, tmp_path: Path, record_property: Any) -> None:
-    tensors = scene()
+@pytest.mark.parametrize("layout", ["layered", "whole"])
+def test_onnxruntime_web_gives_the_same_pixels(
+    layout: str, tmp_path: Path, request: pytest.FixtureRequest, record_property: Any
+) -> None:
+    exported, tensors = request.getfixturevalue(layout), scene()
     feed = {}
     for name, tensor in zip(("image", "depth", "focus_m", "f_number"), tensors, strict=True):
         feed[name] = {"dims": list(tensor.shape), "data": base64.b64encode(tensor.numpy().tobytes()).decode()}
     (tmp_path / "feed.json").write_text(json.dumps(feed))
     web = Path(__file__).with_name("web.mjs")
-    run(["node", web, layered.path, tmp_path / "feed.json", tmp_path / "out.json"])
+    run(["node", web, exported.path, tmp_path / "feed.json", tmp_path / "out.json"])
     result = json.loads((tmp_path / "out.json").read_text())
     print("onnxruntime-web", result["version"])
     record_property("onnxruntime-web", result["version"])
     pixels = np.frombuffer(base64.b64decode(result["data"]), np.float32).reshape(result["dims"])
-    compare(layered, tensors, pixels)
+    compare(exported, tensors, pixels)

@@ -1,0 +1,103 @@
+"""A file with ``layout="whole"`` is one straight graph, and gives the module's picture without rays of highlights."""
+
+from pathlib import Path
+from typing import Any
+
+import onnx
+import onnx.shape_inference
+import pytest
+import torch
+
+import torchdof
+from tests.exported import CAMERA
+from torchdof.export import chain, describe, to_onnx, verify
+from torchdof.export.graph import Portable, trace
+from torchdof.export.whole import WholeOps
+from torchdof.render.matting import matte
+
+CONTROL = {"Loop", "If", "Scan", "NonZero", "SequenceMap"}
+FEW: dict[str, Any] = {"occlusion": False, "tolerance": "draft", "max_coc_px": 1.0, "check": False}
+
+
+def is_map(value: onnx.ValueInfoProto) -> bool:
+    """Whether a value has the height and width of the frame."""
+    return {"H", "W"} <= {dim.dim_param for dim in value.type.tensor_type.shape.dim}
+
+
+def test_the_graph_is_straight_and_computes_maps_in_single_precision(whole: Any) -> None:
+    model = onnx.load(whole.path)
+    graph = model.graph
+    assert {entry.domain for entry in model.opset_import} == {""} and not model.functions
+    assert len(graph.node) < 2200 and whole.path.stat().st_size < 200_000
+    assert not {node.op_type for node in graph.node} & CONTROL
+    assert not any(attribute.HasField("g") for node in graph.node for attribute in node.attribute)
+    weights = {tensor.name for tensor in graph.initializer}
+    convolutions = [node for node in graph.node if node.op_type == "Conv"]
+    assert len(convolutions) > 3 and all(node.input[1] in weights for node in convolutions)
+    maps = list(filter(is_map, onnx.shape_inference.infer_shapes(model, data_prop=True).graph.value_info))
+    kinds = {value.type.tensor_type.elem_type for value in maps}
+    assert len(maps) > 50 and kinds == {onnx.TensorProto.FLOAT, onnx.TensorProto.BOOL}
+
+
+def test_every_case_agrees_and_a_highlight_is_the_only_difference_from_tiles(whole: Any) -> None:
+    assert len(whole.verification.cases) >= 16 and 0 < whole.verification.max_error < 1e-5
+    generator = torch.Generator().manual_seed(0)
+    image, depth = torch.rand(1, 3, 60, 90, generator=generator), torch.full((1, 1, 60, 90), 9.0)
+    depth[..., 20:40, 30:50] = 1.0
+    lens = torch.tensor([2.0]), torch.tensor([0.4])
+    layouts = [Portable(whole.dof, layout=layout) for layout in ("tiles", "whole")]
+    tiles, straight = (portable(image, depth, *lens) for portable in layouts)
+    torch.testing.assert_close(straight, tiles, atol=1e-6, rtol=0)
+    image[..., 50, 80] = 300.0
+    tiles, straight = (portable(image, depth, *lens) for portable in layouts)
+    assert (straight - tiles).abs().max() > 0.1
+    near = (straight - tiles).abs().amax(1) > 1e-3
+    assert not near[:, :40].any() and not near[:, :, :70].any()
+
+
+def test_a_file_can_have_one_size(tmp_path: Path) -> None:
+    dof, path = torchdof.DepthOfField(CAMERA, **FEW), tmp_path / "dof.onnx"
+    report = to_onnx(dof, path, inputs="coc_px", layout="whole", size=(30, 41))
+    assert {row.shape for row in report.cases} == {(1, 3, 30, 41)}
+    facts = describe(path)
+    assert facts["layout"] == "whole" and facts["size"] == [30, 41]
+    dims = [[d.dim_value for d in v.type.tensor_type.shape.dim] for v in onnx.load(path).graph.input]
+    assert dims == [[1, 3, 30, 41], [1, 1, 30, 41]]
+    with pytest.raises(ValueError, match="dof_model must take a depth"):
+        chain(path, path, tmp_path / "chain.onnx", estimate="metric")
+    assert verify(path, dof).passed
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"layout": "rows"}, "layout must be one of tiles, whole, got 'rows'"),
+        ({"size": (40, 50)}, 'size is for layout="whole"'),
+        ({"layout": "whole", "size": (40, 0)}, r"height and width of a frame in pixels, .* got \(40, 0\)"),
+        ({"layout": "whole", "depth_edges": "auto"}, "cannot repair depth edges"),
+    ],
+)
+def test_what_a_layout_does_not_support_is_refused(change: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        to_onnx(torchdof.DepthOfField(CAMERA, **FEW), tmp_path / "dof.onnx", **change)
+    assert not list(tmp_path.iterdir())
+
+
+def test_matting_of_all_pixels_equals_matting_of_a_list() -> None:
+    generator = torch.Generator().manual_seed(0)
+    image, coc = torch.rand(2, 3, 24, 31, generator=generator), torch.zeros(2, 1, 24, 31)
+    coc[..., 8:16, 9:20] = torch.rand(2, 1, 8, 11, generator=generator) - 6.0
+    valid = (torch.rand(2, 1, 24, 31, generator=generator) > 0.1).float()
+    for given in (None, valid):
+        for listed, everywhere in zip(matte(image, coc, given), matte(image, coc, given, WholeOps(None)), strict=True):
+            torch.testing.assert_close(everywhere, listed, atol=1e-6, rtol=0)
+
+
+def test_the_number_of_items_does_not_depend_on_that_of_tiles() -> None:
+    """With one tile in the traced example, PyTorch recorded the number of tiles as the number of items."""
+    portable = Portable(torchdof.DepthOfField(CAMERA, tolerance=64 / 255, max_coc_px=1.0), "coc_px")
+    program = trace(portable, 1)
+    image = next(node for node in program.graph.nodes if node.name == "image").meta["val"]
+    items = image.shape[0].node.expr
+    counts = [n.meta["val"].shape[0] for n in program.graph.nodes if "Collect" in map(str, n.args)]
+    assert len(counts) == 2 and all(str(n.node.expr).count(str(items)) == 1 for n in counts), counts
