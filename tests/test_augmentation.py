@@ -59,6 +59,17 @@ def test_each_image_is_blurred_by_the_lens_that_was_drawn_for_it() -> None:
         assert torch.equal(out[drawn["table"] == k], alone[drawn["table"] == k])
 
 
+def test_a_camera_with_numbers_for_each_image_is_that_of_the_drawn_ones() -> None:
+    image, depth = sample()
+    camera = Camera(sensor_width_mm=torch.tensor([3.0, 4.0, 5.0, 6.0]))
+    aug = random_dof(camera=camera, p=0.5, return_label=True)
+    params = aug.forward_parameters(image.shape) | {"batch_prob": torch.tensor([0.0, 1.0, 0.0, 1.0])}
+    out, label = aug(image, depth, params=params)
+    whole, whole_label = random_dof(camera=camera, return_label=True)(image, depth, params=params)
+    assert_close(out, torch.stack([image[0], whole[1], image[2], whole[3]]))
+    assert_close(label["coc_px"][1::2], whole_label["coc_px"][1::2])
+
+
 @pytest.mark.parametrize("shape", [(4, 18, 24), (1, 1, 18, 24)])
 def test_depth_may_lack_its_channel_or_be_shared(shape: tuple[int, ...]) -> None:
     image, depth = sample()

@@ -241,7 +241,7 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
             options: Any = self.renderings[0].arguments()
             camera_numbers = (drawn[name].to(image.device)[items] for name in ("focus_m", "f_number"))
             light = self._light(image[items], self.flags["transfer"])
-            blur_px = DepthOfField(self.camera, **options).coc_px(light, depth[items], *camera_numbers)
+            blur_px = DepthOfField(self._camera_of(items), **options).coc_px(light, depth[items], *camera_numbers)
             coc = coc.index_copy(0, items, torch.nan_to_num(blur_px, nan=0.0).to(coc.dtype))
         numbers = {name: drawn[name].to(image.device) for name in ("focus_m", "f_number", "table")}
         label = {"coc_px": coc, **numbers, "blurred": blurred}
@@ -292,8 +292,14 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         image = self._light(image, transfer)
         options: Any = self.renderings[index].arguments()
         focus_m, f_number = (params[name].to(items.device)[items] for name in ("focus_m", "f_number"))
-        out = depth_of_field(image, depth, self.camera, focus_m=focus_m, f_number=f_number, **options)
+        out = depth_of_field(image, depth, self._camera_of(items), focus_m=focus_m, f_number=f_number, **options)
         return encode(out, "srgb", has_alpha=False, straight=False) if transfer == "srgb" else out
+
+    def _camera_of(self, items: Tensor) -> Camera:
+        """The camera, with the numbers of these items where it has one for each image."""
+        values = {name: getattr(self.camera, name) for name in Camera.__dataclass_fields__}
+        own = {name: v[items.to(v.device)] for name, v in values.items() if isinstance(v, Tensor) and v.numel() > 1}
+        return self.camera.replace(**own) if own else self.camera
 
     @staticmethod
     def _light(image: Tensor, transfer: Transfer) -> Tensor:

@@ -172,7 +172,7 @@ NO_TARGETS: list[tuple[str, Any, str]] = [
     ("x.hdr", "16", r"a \.hdr file holds samples of float, not 16"),
     ("x.jpg", "half", r"a \.jpg file holds samples of 8, not half"),
     ("x.gif", None, "cannot write files of type '.gif'"),
-    ("x", None, "cannot write files of type 'none'"),
+    ("x", None, "cannot write a file without a type"),
     ("missing/x.png", None, "there is no folder .*missing; make it first"),
     ("folder.png", None, r"folder\.png: is a folder"),
     ("loop.exr", None, r"loop\.exr: is a link that leads back to itself"),

@@ -32,7 +32,8 @@ def samples_of(path: Path) -> tuple[PixelType, ...]:
     """
     suffix = path.suffix.lower()
     if suffix not in _SAMPLES:
-        raise ValueError(f"{path}: cannot write files of type {suffix or 'none'!r}; use one of {' '.join(_SUFFIXES)}")
+        kind = f"files of type {suffix!r}" if suffix else "a file without a type"
+        raise ValueError(f"{path}: cannot write {kind}; use one of {' '.join(_SUFFIXES)}")
     return _SAMPLES[suffix]
 
 
