@@ -130,7 +130,7 @@ def test_a_file_that_differs_from_the_module_is_not_written(
     monkeypatch.setattr("torchdof.export.verification.TOLERANCE", -1.0)
     monkeypatch.setattr(conversion, "trace", lambda *_: None)  # the graph is that of a file, to save its tracing
     monkeypatch.setattr(conversion, "_translate", lambda *_: None)
-    monkeypatch.setattr(conversion, "slim", lambda _: onnx_ir.load(plain.path))
+    monkeypatch.setattr(conversion, "slim", lambda _, straight: onnx_ir.load(plain.path))
     monkeypatch.setattr(conversion, "broadcast", lambda graph, _: graph)
     with pytest.raises(ValueError, match="differs from the module"):
         to_onnx(plain.dof, tmp_path / "dof.onnx")
