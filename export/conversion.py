@@ -55,7 +55,7 @@ def to_onnx(
     tile by tile in an ONNX ``Loop`` and skips, with ``If``, tiles in focus and layers without pixels in or near a tile.
     Highlights are rendered ray by ray in another ``Loop``. With ``layout="whole"``, for GPUs and browsers, it has no
     loops, branches, functions or lists of pixels: it computes every layer of the whole frame, and has no rays, so that
-    highlights are soft discs without the outlines of what stands in front of them (numbers in docs/embedding.md).
+    highlights are soft discs, without crisp outlines of surfaces in front of them (numbers in docs/embedding.md).
 
     Args:
         dof: The module. The file contains its camera, table and options, except focus and f-number, which are inputs.

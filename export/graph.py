@@ -83,7 +83,7 @@ class Portable(nn.Module):
         self.dof.options = dataclasses.replace(dof.options, check=False, depth_edges=depth_edges)
         self.called = dataclasses.replace(dof.options, check=False)
         self.plan = Plan.all(dof.options.max_coc_px, dof.options.tolerance, rays=True)
-        self.ops = WholeOps(width) if layout == "whole" else Ops()
+        self.ops = WholeOps() if layout == "whole" else Ops()
         self.ops.lens_width = width
         self.eval()
 
@@ -165,7 +165,8 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
     traced = copy.copy(portable)
     layered = portable.dof.options.method == "layered"
     if portable.layout == "whole":
-        traced.ops = WholeOps(portable.width, portable.plan.constants(table, layered, portable.width or 1))
+        traced.ops = copy.copy(portable.ops)
+        traced.ops.kernels = portable.plan.constants(table, layered, portable.width or 1)
     else:
         traced.ops = GraphOps(portable.plan, table, layered, portable.width)
     # the cache of fake tensor results costs more time than it saves, because sizes are symbols

@@ -4,8 +4,6 @@ Runtimes on GPUs and in browsers compute loops, branches and lists of pixels on 
 none: it computes every pixel, also where a tiled graph skips work, and it has no rays of highlights.
 """
 
-from collections.abc import Sequence
-
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
@@ -17,18 +15,10 @@ __all__ = ["WholeOps"]
 
 
 class WholeOps(Ops):
-    """Operations on whole maps; the number of computed pixels does not depend on the values.
-
-    Args:
-        lens_width: Image width in pixels for the kernels of a table with lengths.
-        kernels: Kernels of all layers, as constants of the graph; None makes them for the frame at hand.
-    """
+    """Operations on whole maps; the number of computed pixels does not depend on the values."""
 
     channels = 32
     has_rays = False
-
-    def __init__(self, lens_width: int | None, kernels: Sequence[Tensor] | None = None) -> None:
-        self.lens_width, self.kernels = lens_width, kernels
 
     def select(self, mask: Tensor) -> Selected:
         """All pixels; only those of the mask are changed."""

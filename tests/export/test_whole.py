@@ -89,7 +89,7 @@ def test_matting_of_all_pixels_equals_matting_of_a_list() -> None:
     coc[..., 8:16, 9:20] = torch.rand(2, 1, 8, 11, generator=generator) - 6.0
     valid = (torch.rand(2, 1, 24, 31, generator=generator) > 0.1).float()
     for given in (None, valid):
-        for listed, everywhere in zip(matte(image, coc, given), matte(image, coc, given, WholeOps(None)), strict=True):
+        for listed, everywhere in zip(matte(image, coc, given), matte(image, coc, given, WholeOps()), strict=True):
             torch.testing.assert_close(everywhere, listed, atol=1e-6, rtol=0)
 
 

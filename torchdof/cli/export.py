@@ -12,6 +12,14 @@ from .options import Accuracy, Blur, json_option
 from .output import Bar, print_result
 
 
+def _size(text: str) -> tuple[int, int]:
+    """Reads ``WIDTHxHEIGHT`` as height and width."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise ValueError(f"--size is a width and a height in pixels, such as 1920x1080, got {text!r}")
+    return int(height), int(width)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Graph:
     """Graph."""
@@ -30,8 +38,10 @@ class _Graph:
         "without rays of highlights.",
         "tiles",
     )
-    size: str | None = option(
-        "Width and height of the only frame, for --layout whole and runtimes that need fixed sizes.", metavar="WxH"
+    size: tuple[int, int] | None = option(
+        "Width and height of the only frame, for --layout whole and runtimes that need fixed sizes.",
+        metavar="WxH",
+        read=_size,
     )
     opset: int = option("ONNX operator set.", 20)
 
@@ -92,19 +102,9 @@ class Export:
         options = {"depth_edges": "as given", **self.accuracy.arguments(), "max_coc_px": self.max_coc, "check": False}
         dof = DepthOfField(camera, self.blur.table_of(self.blur.table), **options)
         with Bar("tracing") as bar:
-            graph = dataclasses.asdict(self.graph) | {"size": _size(self.graph.size)}
+            graph = dataclasses.asdict(self.graph)
             report = to_onnx(dof, out, **graph, depth_edges=dof.options.depth_edges, progress=bar.update)
         print_result(self.as_json, {"out": str(out), **dataclasses.asdict(report)}, f"{report}\nwrote {out}")
-
-
-def _size(text: str | None) -> tuple[int, int] | None:
-    """Height and width of ``WIDTHxHEIGHT``."""
-    if text is None:
-        return None
-    parts = text.lower().split("x")
-    if len(parts) != 2 or not all(part.isdecimal() for part in parts):
-        raise ValueError(f"--size is a width and a height in pixels, such as 1920x1080, got {text!r}")
-    return int(parts[1]), int(parts[0])
 
 
 def _lines(facts: Mapping[str, Any], indent: str = "") -> str:
