@@ -66,6 +66,35 @@ def test_the_background_behind_two_blurred_surfaces_is_the_farthest_one_around()
     assert torch.allclose(behind[0, :, 24, 16], BLUE, atol=0.02)  # the wall, not the surface in between
 
 
+def sloping(behind_px: float) -> tuple[Tensor, Tensor]:
+    """A red slope of 20 to 10 px in front of the focus, a green surface at ``behind_px``, a blue wall 60 px behind."""
+    image, coc = (torch.empty(1, channels, 48, 96) for channels in (3, 1))
+    coc[..., :40] = torch.linspace(-20.0, -10.0, 40)
+    coc[..., 40:44], coc[..., 44:] = behind_px, 60.0
+    image[..., :40] = torch.tensor([0.7, 0.1, 0.1])[:, None, None]
+    image[..., 40:44], image[..., 44:] = torch.tensor([0.1, 0.6, 0.1])[:, None, None], BLUE[:, None, None]
+    return image, coc
+
+
+def test_the_surface_behind_a_slope_is_no_part_of_the_slope() -> None:
+    """A mean of the slope in front of the focus and of the wall behind it would be in focus: a sharp speck."""
+    image, coc = sloping(60.0)
+    _, (other, other_coc, weight), _ = surfaces(image, coc, levels=6)
+    assert weight is not None
+    hidden = (weight > 0) & (coc < 0)
+    assert int(hidden.sum()) > 500
+    assert float(other_coc[hidden].min()) > 40.0
+    assert float(other[:, :1][hidden].max()) < 0.25, "little of the slope's red"
+
+
+def test_a_surface_between_a_slope_and_a_wall_lies_behind_the_slope() -> None:
+    image, coc = sloping(-1.0)
+    _, (other, other_coc, weight), _ = surfaces(image, coc, levels=6)
+    assert weight is not None and float(weight[0, 0, 24, 38:40].min()) > 0
+    assert torch.allclose(other_coc[0, 0, 24, 39], torch.tensor(-1.0), atol=6.0)
+    assert float(other[0, 1, 24, 39]) > 0.4, "its green"
+
+
 def test_a_level_beyond_the_largest_blur_changes_nothing() -> None:
     made = torch.Generator().manual_seed(1)
     image, coc = torch.rand(1, 3, 51, 66, generator=made), 16.0 * torch.rand(1, 1, 7, 9, generator=made) - 8.0

@@ -32,6 +32,7 @@ __all__ = [
 ]
 
 BEHIND_PX = 1.0  # difference in coc at which a surface is half another one, in pixels; fully at 1/2 px more
+_OWN_SLOPE = 0.25  # part of a pixel's blur by which its own surface may be farther nearby; larger: fewer hidden samples
 _FALL = 0.35  # weight of a level of the pyramid relative to the next finer one; larger: hidden areas are smoother
 _FINE_LEVELS = 2  # levels that each pixel reads; coarser ones are read once per cell of 2**_FINE_LEVELS pixels
 _SURE = 0.1  # weight of the samples of a level at which its vote is full
@@ -86,6 +87,11 @@ def _operator(
     maps = (t.contiguous() for t in _matted_and_filled(light, coc_px, valid, threshold, levels, EAGER))
     own, own_weight, other, other_coc, other_weight, behind = maps
     return own, own_weight, other, other_coc, other_weight, behind
+
+
+def _end_of_surface(coc_px: Tensor) -> Tensor:
+    """Largest coc of a pixel's own surface nearby: it may slope by a part of the pixel's blur."""
+    return coc_px + (_OWN_SLOPE * coc_px.abs() - BEHIND_PX).clamp_min(0.0)
 
 
 def _is_behind(distance_px: Tensor) -> Tensor:
@@ -187,7 +193,8 @@ def fill_hidden(
        surfaces. It shows where the hidden surface is blurred itself and nothing else reaches a pixel.
     4. For each pixel, average the levels that have samples behind it, with larger weights for finer ones. Use only the
        samples behind it, as the foreground's colour must not leak in. The search reaches no farther than the pixel's
-       blur: deeper inside, hidden surfaces never show.
+       blur: deeper inside, hidden surfaces never show. A strongly blurred surface may slope: a slightly farther sample
+       belongs to it. Else the mean of the slope and of a surface beyond the focus could be in focus, a sharp speck.
     5. Replace second surfaces that are hardly mixed in by the hidden sample.
 
     Args:
@@ -376,7 +383,7 @@ def shown_behind(samples: Tensor, shares: Tensor, coc_px: Tensor) -> Seen:
     """
     count = samples.shape[-4] - 2
     coc, weight = samples.narrow(-4, count, 1), samples.narrow(-4, count + 1, 1)
-    part = shares * weight * _is_behind(coc - coc_px.unsqueeze(2))
+    part = shares * weight * _is_behind(coc - _end_of_surface(coc_px).unsqueeze(2))
     total = part.sum(-3)
     total = torch.where(total > 1e-4, total, 0.0)
     return (samples.narrow(-4, 0, count + 1) * part).sum(-3) / total.clamp_min(1e-4), total

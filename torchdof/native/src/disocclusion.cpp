@@ -114,7 +114,7 @@ struct Seen {
   template <int VECTORS>
   void see(const Level &level, Place row, Place column, float here) {
     looked = clamp01(std::fabs(here) / level.least_px - 1.0f);
-    any = looked > 0 ? behind<VECTORS>(level, row, column, here, sample) : 0.0f;
+    any = looked > 0 ? behind<VECTORS>(level, row, column, end_of_surface(here), sample) : 0.0f;
   }
 };
 
@@ -536,6 +536,7 @@ class Filling {
         ivec wanted = size > all(0.5f);
         if (s_.has_block(which)) wanted &= load<vec>(s_.block(which).weight + within + v * LANES) < all(0.5f * HIDDEN_WEIGHT);
         if (!any_of(wanted)) continue;
+        const vec end = end_of_surface(here);
         vec total = {};
         for (int k = 0; k <= C; k++) shown[k] = vec{};
         for (int i = to.first; i < to.count; i++) {
@@ -550,7 +551,7 @@ class Filling {
           for (int x = 0; x < LANES; x++) right[x] = xs[std::min(v * LANES + x, columns - 1)].part;
           const vec left = all(1.0f) - right, shares[4] = {left * (1.0f - row.part), right * (1.0f - row.part), left * row.part, right * row.part};
           for (int k = 0; k < 4; k++) {
-            const vec farther = clamp01(corners[k][C * VECTORS] - here - all(BEHIND_PX - 0.5f));
+            const vec farther = clamp01(corners[k][C * VECTORS] - end - all(BEHIND_PX - 0.5f));
             any += counts[k] = shares[k] * corners[k][(C + 1) * VECTORS] * farther;
           }
           const vec looked = clamp01(size * (1.0f / level.least_px) - all(1.0f));

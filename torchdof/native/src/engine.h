@@ -134,8 +134,12 @@ constexpr int TILE = 64;             // side in pixels of the tiles that are com
 constexpr float NEVER = 1e9f;        // larger than any coc
 constexpr float KNOWN = 2e-3f;           // blurred weight at which a layer's colour is fully known; below, 1 / weight is damped
 constexpr float BEHIND_PX = 1.0f;        // difference in coc at which a surface counts as another one behind
+constexpr float OWN_SLOPE = 0.25f;       // part of a pixel's blur by which its own surface may be farther nearby
 constexpr float LEAST_SEEN = 1e-4f;      // weight of a sample behind up to which it counts as empty
 constexpr float HIDDEN_WEIGHT = 0.003f;  // weight of a filled hidden surface, against 1 for a visible one
+// Largest coc of a pixel's own surface nearby.
+template <typename V>
+inline V end_of_surface(V coc) { return coc + most(most(coc, -coc) * OWN_SLOPE - BEHIND_PX, V{}); }
 
 // The surfaces of BLOCK x BLOCK pixels where a second one exists or the first differs from the image.
 struct Block {

@@ -2,8 +2,8 @@
 // shown_behind and search of render/disocclusion.py, for training. Inference fills hidden surfaces in disocclusion.cpp.
 //
 // Of the four samples j of level l around a pixel with coc c, those behind it count: with their coc d, weight w and
-// bilinear share s, part p_j = s w clamp(d - c - BEHIND_PX + 1/2, 0, 1). Their mean m_l has the vote
-// v_l = clamp(|c| / least_l - 1, 0, 1) min(slope_l sum p, most_l). The result is sum v_l m_l / sum v_l, and sum v_l.
+// bilinear share s, part p_j = s w clamp(d - e - BEHIND_PX + 1/2, 0, 1), e = c + max(OWN_SLOPE |c| - BEHIND_PX, 0). Their mean
+// m_l has the vote v_l = clamp(|c| / least_l - 1, 0, 1) min(slope_l sum p, most_l). The result is sum v_l m_l / sum v_l, and sum v_l.
 #include "engine.h"
 
 namespace torchdof {
@@ -63,7 +63,7 @@ struct Behind {
     bool any = false;
     for (int j = 0; j < 4; j++) {
       f.at[j] = (size_t)(row + j / 2) * level.columns + column + j % 2;
-      f.is_behind[j] = cocs[f.at[j]] - coc - (BEHIND_PX - 0.5f);
+      f.is_behind[j] = cocs[f.at[j]] - end_of_surface(coc) - (BEHIND_PX - 0.5f);
       any |= f.is_behind[j] >= 0;
     }
     if (!any) return false;
@@ -153,6 +153,7 @@ struct Behind {
       for (int c = 0; any[l] && c < planes - 1; c++) sums[c] += found[l].vote * found[l].mean[c];
     }
     const float per = 1.0f / std::max(votes, LEAST_VOTE);
+    const float slope_of_end = OWN_SLOPE * std::fabs(coc[at]) >= BEHIND_PX ? 1.0f + (coc[at] < 0 ? -OWN_SLOPE : OWN_SLOPE) : 1.0f;
     for (int c = 0; c < planes - 1; c++) {
       slope[c] = slopes[c * area + at] * per;
       along += slope[c] * sums[c] * per;
@@ -185,7 +186,7 @@ struct Behind {
         if (f.is_behind[j] < 0 || f.is_behind[j] > 1) continue;
         const float of_distance = of_part * f.share[j] * level.values[(planes - 1) * whole + f.at[j]];
         to[l][(planes - 2) * size[l] + sample] += of_distance;
-        of_own -= of_distance;
+        of_own -= of_distance * slope_of_end;
       }
     }
     of_coc[at] = of_own;
