@@ -55,6 +55,11 @@ test_tensors_without_memory_are_refused_by_name = refuses(
           "depth": lambda x: DOF(IMAGE, x),
           "image": lambda x: blur_by_coc(x, MAP),
       }.items()),
+    (lambda: DOF(IMAGE, freed((1, 1, 20, 25))), f"depth must be a tensor .* that holds data{FREED}"),
+    (lambda: DOF(IMAGE, MAP, f_number=freed((1,))), f"f_number must be a tensor .* that holds data{FREED}"),
+    (lambda: Camera(tilt_deg=freed(())), f"tilt_deg must be a tensor .* that holds data{FREED}"),
+    (lambda: Camera(focus_range_m=(freed(()), 2.0)), f"focus_range_m must be a tensor .* that holds data{FREED}"),
+    (lambda: blur_by_coc(IMAGE, MAP, attention=freed()), f"attention must be a tensor .* that holds data{FREED}"),
 )  # fmt: skip
 
 

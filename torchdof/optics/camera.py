@@ -413,6 +413,7 @@ def _check_number(name: str, value: Number) -> None:
             return
         if value.device.type == "meta":
             raise ValueError(f"{name} must be a float or a tensor [B] that holds data, got one on the meta device")
+        real_tensor(name, value, "[B]")
         is_positive = bool((value.detach() > 0).all())
     elif isinstance(value, int | float) and not isinstance(value, bool):
         is_positive = value > 0 and (isinstance(value, float) or value <= 1e300)
@@ -437,7 +438,11 @@ def _check_angle(name: str, value: Number) -> None:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if not is_tensor and not is_number:
         raise ValueError(f"{name} must be degrees, a float or a floating-point tensor [B], got {show(value)}")
-    if not is_traced() and not bool((torch.as_tensor(value, device="cpu").detach().abs() < 90.0).all()):
+    if is_traced():
+        return
+    if isinstance(value, Tensor):
+        real_tensor(name, value, "[B] in degrees")
+    if not bool((torch.as_tensor(value, device="cpu").detach().abs() < 90.0).all()):
         raise ValueError(f"{name} must be in (-90, 90) degrees, got {_show(value)}")
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..tensors import floating
-from ..validation import show
+from ..validation import real_tensor, show
 
 __all__ = ["Attention", "box_around", "weight_map"]
 
@@ -30,6 +30,8 @@ def weight_map(attention: Any, image: Tensor) -> Tensor:
     """
     batch, _, height, width = image.shape
     if isinstance(attention, Tensor):
+        if floating(attention):
+            real_tensor("attention", attention, "[B, 1, H, W]")
         fits = attention.ndim == 4 and attention.shape[0] in (1, batch) and attention.shape[1:] == (1, height, width)
         if not fits or not floating(attention) or not bool(((attention >= 0) & (attention <= 1)).all()):
             raise ValueError(

@@ -39,6 +39,8 @@ def at_size_of(image: Tensor, depth: Tensor) -> Tensor:
     size, given = (image.shape[-2], image.shape[-1]), (depth.shape[-2], depth.shape[-1])
     if size == given:
         return depth
+    validation.real_tensor("image", image, "[B, C, H, W]")
+    validation.real_tensor("depth", depth, "[B, 1, h, w] in metres")
     validation.same_aspect(image, depth)
     return _resized(image, depth)
 
