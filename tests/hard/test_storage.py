@@ -99,6 +99,16 @@ def test_views_and_empty_tensors_have_storage() -> None:
     assert all(map(has_storage, (values[2:, ::2], values.permute(2, 0, 1), values[:1].expand(9, 5, 6), values[:0])))
 
 
+def test_a_negated_view_renders_as_its_values(engine: str) -> None:
+    """Its memory holds the values with the other sign: ``z.conj().imag`` of a complex ``z`` is such a view."""
+    light, coc = torch.rand(1, 3, 40, 50), torch.linspace(-4.0, 4.0, 50).expand(1, 1, 40, 50).clone()
+    coc[..., 20:25] = 6.0
+    views = [(-values)._neg_view() for values in (light, coc, coc.abs() + 1.0)]
+    for image, radius, depth in [(views[0], coc, coc.abs() + 1.0), (light, views[1], views[2])]:
+        torch.testing.assert_close(blur_by_coc(image, radius), blur_by_coc(light, coc), rtol=0, atol=0)
+        torch.testing.assert_close(DOF(image, depth), DOF(light, coc.abs() + 1.0), rtol=0, atol=0)
+
+
 @pytest.mark.filterwarnings("ignore:.*torch.jit.trace:DeprecationWarning", "ignore::torch.jit.TracerWarning")
 def test_torch_jit_trace_is_refused() -> None:
     image, coc_px = torch.rand(1, 3, 30, 40), torch.full((1, 1, 30, 40), 3.0)

@@ -88,7 +88,8 @@ def _planned(
         )
     wide = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
     maps = [image, coc_px, *(behind or ())]
-    maps = [t.to(wide).contiguous().expand(image.shape[0], -1, -1, -1) for t in maps]
+    maps = [t.to(wide).contiguous() for t in maps]
+    maps = [(t if is_traced() else t.resolve_neg()).expand(image.shape[0], -1, -1, -1) for t in maps]
     if plan is None and is_traced():
         # Floats rebuilt from hex become constants of the graph. The options' own floats would become inputs of the
         # graph if they differ between two modules.
