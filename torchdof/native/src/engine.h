@@ -416,14 +416,25 @@ Border border_of(const Job &job, int farthest);
 // Where surfaces may block the rays of highlights; highlights.cpp
 struct Visibility {
   static constexpr int CLASSES = 62;  // of coc; one bit for each
+  struct Cell {
+    uint64_t classes = 0;     // classes of coc in the cell
+    uint64_t remainders = 0;  // remainders modulo 64 of the bins before its coc
+  };
   float low = 0, class_width = 1;
   std::vector<int> bins;  // bins of 1 px of coc that may contain a surface, or whose previous bin may
   int cell_rows = 0, cell_columns = 0;
-  std::vector<uint64_t> cells;  // classes of coc in each cell that a ray may cross
+  std::vector<Cell> cells;  // those that a ray may cross
   // Classes that may contain a surface of a bin or of the bin before.
   uint64_t classes_of(int bin) const {
     const int first = std::min((int)(std::max(0, bin - 1) / class_width), CLASSES - 1), last = std::min((int)((bin + 1) / class_width), CLASSES - 1);
     return (2ull << last) - (1ull << first);
+  }
+  // Remainders of a bin and of the bin before, as a cell with a surface of the bin has them.
+  static uint64_t remainders_of(int bin) { return 1ull << bin % 64 | 1ull << (bin + 63) % 64; }
+  // Whether a cell may contain a surface of a bin. Classes alone take a distant coc of the same class for it, remainders
+  // alone one that is 64 px away.
+  bool may_show(const Cell &cell, uint64_t classes, uint64_t remainders) const {
+    return (cell.classes & classes) != 0 && (cell.remainders & remainders) != 0;
   }
 };
 Visibility find_visibility(const Job &job, const RayKernels &kernels);

@@ -292,17 +292,22 @@ Visibility find_visibility(const Job &job, const RayKernels &kernels) {
   v.class_width = std::max(1.0f, bins / (float)v.CLASSES);
   v.cell_rows = ceil_div(H, CELL);
   v.cell_columns = ceil_div(W, CELL);
-  v.cells.assign((size_t)v.cell_rows * v.cell_columns, 0);
+  v.cells.resize((size_t)v.cell_rows * v.cell_columns);
   const std::vector<int> passed = passing(job, kernels, low, v.cell_rows, v.cell_columns);
   const Surfaces &surfaces = job.surfaces;
   typedef uint64_t wide __attribute__((vector_size(LANES * 8)));
-  auto bits_of = [&](vec coc, ivec shown) {
+  struct Bits {
+    wide classes = {}, remainders = {};
+  };
+  auto add_bits = [&](Bits &bits, vec coc, ivec shown) {
     const vec place = least(most(coc - low, vec{}), all(high - low));
-    const ivec which = least(convert(place * (1.0f / v.class_width)), ivec{} + (v.CLASSES - 1));
-    return __builtin_convertvector(shown, wide) & ((wide{} + 1) << __builtin_convertvector(which, wide));
+    auto bit = [&](ivec which) { return __builtin_convertvector(shown, wide) & ((wide{} + 1) << __builtin_convertvector(which, wide)); };
+    bits.classes |= bit(least(convert(place * (1.0f / v.class_width)), ivec{} + (v.CLASSES - 1)));
+    // at a bin's border both bins, because rays compute the distance from it with another rounding error
+    for (const float border : {-1 / 16.0f, 1 / 16.0f}) bits.remainders |= bit(convert(most(place + border, vec{})) & 63);
   };
   job.parallel(v.cell_rows, [&](int row, int) {
-    uint64_t *cells = &v.cells[(size_t)row * v.cell_columns];
+    Visibility::Cell *cells = &v.cells[(size_t)row * v.cell_columns];
     std::vector<const float *> light(job.channels);
     for (int x = 0; x < W; x += BLOCK) {
       const int block = row * CELL / BLOCK * surfaces.block_columns + x / BLOCK, n = std::min(BLOCK, W - x);
@@ -312,9 +317,9 @@ Visibility find_visibility(const Job &job, const RayKernels &kernels) {
       // all coc of a block lie within 1 px: its two extremes give its classes
       const float ends[2] = {job.block_low[block], job.block_high[block]};
       const bool flat = !surfaces.full_planes() && ends[1] - ends[0] < 1;
-      wide bits[BLOCK / CELL] = {};
-      for (wide &of_cell : bits)
-        for (float coc : ends) of_cell |= bits_of(all(coc), ivec{} - flat);
+      Bits bits[BLOCK / CELL];
+      for (Bits &of_cell : bits)
+        for (float coc : ends) add_bits(of_cell, all(coc), ivec{} - flat);
       for (int y = row * CELL; y < std::min(H, (row + 1) * CELL) && !(flat && !surfaces.has_block(block)); y++)
         each_shown(surfaces, y, x, light.data(), [&](bool own, const float *coc, const float *weight, float least_weight) {
           if (own && flat) return;
@@ -325,14 +330,17 @@ Visibility find_visibility(const Job &job, const RayKernels &kernels) {
             coc = its_coc, weight = its_weight;
           }
           for (int j = 0; j < BLOCK; j += LANES)
-            bits[j / CELL] |= bits_of(load<vec>(coc + j), weight ? load<vec>(weight + j) > all(least_weight) : ivec{} == 0);
+            add_bits(bits[j / CELL], load<vec>(coc + j), weight ? load<vec>(weight + j) > all(least_weight) : ivec{} == 0);
         });
       for (int j = 0; j < n; j += CELL)
-        for (int i = 0; i < LANES; i++) cells[(x + j) / CELL] |= bits[j / CELL][i];
+        for (int i = 0; i < LANES; i++) {
+          cells[(x + j) / CELL].classes |= bits[j / CELL].classes[i];
+          cells[(x + j) / CELL].remainders |= bits[j / CELL].remainders[i];
+        }
     }
   });
   uint64_t any = 0;
-  for (uint64_t cell : v.cells) any |= cell;
+  for (const Visibility::Cell &cell : v.cells) any |= cell.classes;
   for (int k = 0; k <= bins; k++)
     if (any & v.classes_of(k)) v.bins.push_back(k);
   return v;
@@ -366,12 +374,13 @@ bool cover_row(const Job &job, int y, int block_column, int block_columns, float
   return any_positive(most_cover);
 }
 
-// Adds, for rays that land in a patch of rows x columns pixels at y, x, the share blocked by surfaces at coc `place`.
-void add_blocked(const Job &job, const Ray &ray, float place, float fades, int y, int x, int rows, int columns, const float **light,
+// Adds, for rays that land in a patch of rows x columns pixels at y, x, the share blocked by surfaces of bin k.
+void add_blocked(const Job &job, const Visibility &v, const Ray &ray, int k, int y, int x, int rows, int columns, const float **light,
                  float (*blocked)[PATCH]) {
   constexpr int LONGEST = 256;  // columns of the image processed together
   const int H = job.height, W = job.width;
-  const float along = 1.0f - place / ray.coc;
+  const float place = v.low + k, fades = clamp01(ray.coc - NEARER_PX - place), along = 1.0f - place / ray.coc;
+  const uint64_t classes = v.classes_of(k), remainders = v.remainders_of(k);
   int column[PATCH];
   float across[PATCH];
   for (int i = 0; i < columns; i++) {
@@ -384,13 +393,31 @@ void add_blocked(const Job &job, const Ray &ray, float place, float fades, int y
   float met[2][PATCH] = {};
   int known[2] = {-1, -1};
   bool meets[2];
+  // columns whose rays may cross a surface of the bin in a row of cells; rays far apart pass between most surfaces
+  bool crosses[PATCH];
+  int crossed_row = -1;
+  auto take_cells = [&](int cell_row) {
+    if (crossed_row == cell_row) return;
+    crossed_row = cell_row;
+    const Visibility::Cell *cells = &v.cells[(size_t)cell_row * v.cell_columns];
+    for (int i = 0; i < columns; i++) {
+      const int cell = column[i] / CELL, next = std::min(column[i] + 1, W - 1) / CELL;
+      crosses[i] = v.may_show(cells[cell], classes, remainders) || (next > cell && v.may_show(cells[next], classes, remainders));
+    }
+  };
   auto take_row = [&](int row) {
     if (known[row % 2] == row) return meets[row % 2];
     known[row % 2] = row;
     meets[row % 2] = false;
     float covered[LONGEST], *to = met[row % 2];
+    take_cells(row / CELL);
     for (int start = 0, stop; start < columns; start = stop) {
-      for (stop = start + 1; stop < columns && std::abs(column[stop] - column[start]) < LONGEST - 2 * BLOCK; stop++) {}
+      if (!crosses[start]) {
+        to[start] = 0;
+        stop = start + 1;
+        continue;
+      }
+      for (stop = start + 1; stop < columns && crosses[stop] && std::abs(column[stop] - column[start]) < LONGEST - 2 * BLOCK; stop++) {}
       const int low = std::min(column[start], column[stop - 1]), high = std::min(std::max(column[start], column[stop - 1]) + 1, W - 1);
       const int first = low / BLOCK;
       meets[row % 2] |= cover_row(job, row, first, high / BLOCK - first + 1, place, light, covered);
@@ -499,10 +526,11 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
       auto cell = [](float at, int size) { return (int)clamp(at, 0.0f, size - 1.0f) / CELL; };
       const int r0 = cell(std::floor(std::min(ya, yb)), H), r1 = cell(std::max(ya, yb) + 1, H);
       const int c0 = cell(std::floor(std::min(xa, xb)), W), c1 = cell(std::max(xa, xb) + 1, W);
-      uint64_t classes = 0;
+      const uint64_t classes = v.classes_of(k), remainders = v.remainders_of(k);
       for (int i = r0; i <= r1; i++)
-        for (int j = c0; j <= c1; j++) classes |= v.cells[(size_t)i * v.cell_columns + j];
-      return (classes & v.classes_of(k)) != 0;
+        for (int j = c0; j <= c1; j++)
+          if (v.may_show(v.cells[(size_t)i * v.cell_columns + j], classes, remainders)) return true;
+      return false;
     };
     nearer.clear();
     if (job.scene.occlusion)
@@ -513,9 +541,8 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
     // accumulates the blocked share of the rays that land in a patch; true if all are blocked
     auto block_all = [&](int y, int x, int rows, int columns, float (&blocked)[PATCH][PATCH]) {
       for (int k : nearer) {
-        const float place = v.low + k;
         if (!may_meet(k, y, x, rows, columns)) continue;
-        add_blocked(job, ray, place, clamp01(ray.coc - NEARER_PX - place), y, x, rows, columns, surface_light.data(), blocked);
+        add_blocked(job, v, ray, k, y, x, rows, columns, surface_light.data(), blocked);
         vec least_blocked = all(1.0f);
         for (int i = 0; i < rows; i++)
           for (int j = 0; j < PATCH; j += LANES) least_blocked = least(least_blocked, load<vec>(blocked[i] + j));
