@@ -1,7 +1,6 @@
 """The compiled engine in a process: threads, interrupts, instruction sets; and its convolution."""
 
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -9,7 +8,7 @@ import torch
 
 from tests.processes import output_of
 from tests.scenes import Scene, assert_same_picture, made
-from torchdof import blur_by_coc, native
+from torchdof import native
 
 
 @pytest.fixture(autouse=True)
@@ -44,28 +43,6 @@ def test_bits_do_not_depend_on_threads_and_pictures_not_on_the_instruction_set()
             native.use_instructions("avx2")
             torch.set_num_threads(before)
     assert native.describe() == best
-
-
-def test_lamps_behind_stray_near_pixels_cost_a_few_frames_without_lamps() -> None:
-    """Each ray looks only at those pixels that it may hit: 7 times the frame without lamps, of 30 with all pixels."""
-    generator = torch.Generator().manual_seed(0)
-    coc, dim = torch.full((1, 1, 192, 256), 11.0), torch.full((1, 3, 192, 256), 0.1)
-    stray = torch.randperm(192 * 256, generator=generator)[:400]
-    coc.flatten()[stray] = -300.0 * torch.rand(400, generator=generator)
-    lamps = dim.clone()
-    lamps[..., 4::12, 4::12] = 200.0
-    lamps.flatten(2)[..., stray] = 0.1
-
-    def cost(light: torch.Tensor) -> float:
-        """Processor time in seconds, the smallest of three."""
-        times = []
-        for _ in range(3):
-            start = time.process_time()
-            blur_by_coc(light, coc, depth_edges="as given")
-            times.append(time.process_time() - start)
-        return min(times)
-
-    assert cost(lamps) < 16 * cost(dim)
 
 
 def test_python_threads_may_render_concurrently() -> None:
