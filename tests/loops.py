@@ -1,5 +1,6 @@
 """Slow and obvious reference implementations: plain loops in float64."""
 
+import functools
 import math
 from collections.abc import Callable
 
@@ -25,12 +26,10 @@ def scatter(light: Tensor, kernel_of: Callable[[int, int, int], Tensor]) -> Tens
             for column in range(width):
                 kernel = kernel_of(item, row, column).to(torch.float64)
                 half = kernel.shape[-1] // 2
-                for dy in range(-half, half + 1):
-                    for dx in range(-half, half + 1):
-                        y, x = row + dy, column + dx
-                        if 0 <= y < height and 0 <= x < width:
-                            weight = kernel[:, dy + half, dx + half]
-                            out[item, :, y, x] += light[item, :, row, column].to(torch.float64) * weight
+                top, left = max(row - half, 0), max(column - half, 0)
+                seen = kernel[:, top - row + half : height - row + half, left - column + half : width - column + half]
+                here = out[item, :, top : row + half + 1, left : column + half + 1]
+                here += light[item, :, row, column, None, None].to(torch.float64) * seen
     return out
 
 
@@ -72,6 +71,7 @@ def accumulate(
 ) -> Tensor:
     """The paper's renderer: the sum of every pixel's billboard, with `normalize` divided by the sum of the weights."""
 
+    @functools.cache
     def kernel_of(item: int, row: int, column: int) -> Tensor:
         return kernel_between(float(coc[item, 0, row, column]), nodes, table, image.shape[-1])
 

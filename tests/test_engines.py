@@ -150,8 +150,7 @@ def test_constant_light_stays_constant_around_bad_depth(engine: str, way: dict[s
 
 
 @EVERY_WAY
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf], ids=str)
-@pytest.mark.parametrize("coc_px", [0.0, -3.0, 40.0])
+@pytest.mark.parametrize(("bad", "coc_px"), [(math.nan, 40.0), (math.inf, 0.0), (-math.inf, -3.0), (math.nan, -3.0)])
 def test_bad_light_stays_within_its_disc(engine: str, way: dict[str, Any], bad: float, coc_px: float) -> None:
     image, coc = texture(), slope(-3.0, 5.0)
     image[0, 1, 12, 16], coc[0, 0, 12, 16] = bad, coc_px
@@ -307,9 +306,9 @@ SCENES: dict[str, Callable[[], Scene]] = {
     **{f"few coarse layers, {ends}, {occlusion}": functools.partial(_few_coarse, *ends, occlusion=occlusion)
        for ends in ((-9.0, 11.0), (-24.0, 30.0)) for occlusion in (True, False)},
     **{f"{kind}, {name}, {occlusion}": functools.partial(
-           made, kind, 70, 90, radius, lamps=1000.0, table=table, occlusion=occlusion)
-       for name, table in LENSES.items() for kind, radius in (("smooth", 13.0), ("planes", 5.0))
-       for occlusion in (True, False)},
+           made, kind, 60, 80, radius, lamps=1000.0, table=table, occlusion=occlusion)
+       for i, (name, table) in enumerate(LENSES.items())
+       for kind, radius, occlusion in (("smooth", 13.0, i % 2 > 0), ("planes", 5.0, i % 2 == 0))},
 }  # fmt: skip
 
 

@@ -40,8 +40,7 @@ def assert_like_alone(images: Tensor, cocs: Tensor, **options: Any) -> None:
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name or "unnamed")
 @pytest.mark.parametrize("occlusion", [True, False])
 def test_an_item_of_a_batch_is_rendered_as_alone(table: BlurTable, occlusion: bool) -> None:
-    for seed in range(3):
-        assert_like_alone(*batch(seed), table=table, occlusion=occlusion)
+    assert_like_alone(*batch(2 * TABLES.index(table) + occlusion), table=table, occlusion=occlusion)
 
 
 @pytest.mark.parametrize(

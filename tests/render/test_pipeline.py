@@ -25,7 +25,7 @@ def fence(request: pytest.FixtureRequest) -> Scene:
     """A wall behind two rows of posts, with blurs of up to 20 px."""
     shapes = [None, posts(90, 30), posts(140, 25, -0.2)]
     planes = [Plane(z, waves(i), shape) for i, (z, shape) in enumerate(zip(DEPTHS, shapes, strict=True))]
-    return plane_scene(planes, CAMERA.replace(focus_m=request.param), (160, 220), samples=128)
+    return plane_scene(planes, CAMERA.replace(focus_m=request.param), (110, 150), samples=128)
 
 
 def psnr(scene: Scene, out: Tensor) -> float:
@@ -62,7 +62,7 @@ def test_the_order_of_a_stack_and_the_form_of_its_depths_do_not_matter(fence: Sc
     stack, depth = torch.stack([rgba for rgba, _ in fence.surfaces], 1), torch.tensor(DEPTHS)
     expected = dof.layers(stack, depth)
     torch.testing.assert_close(dof.layers(stack.flip(1), depth.flip(0)[None]), expected)
-    maps = depth.reshape(1, 3, 1, 1, 1).expand(1, 3, 1, 160, 220)
+    maps = depth.reshape(1, 3, 1, 1, 1).expand(1, 3, 1, 110, 150)
     torch.testing.assert_close(dof.layers(stack, maps), expected)
 
 
@@ -104,7 +104,7 @@ def test_gradients_reach_the_background() -> None:
     def picture(light: Tensor) -> Tensor:
         return blur_by_coc(image, coc, background=light, background_coc_px=back_coc)
 
-    assert torch.autograd.gradcheck(picture, (back,), eps=1e-6, atol=1e-7)
+    assert torch.autograd.gradcheck(picture, (back,), eps=1e-6, atol=1e-7, fast_mode=True)
     slope = torch.autograd.grad(picture(back).sum(), back)[0]
     assert float(slope[..., 4:6].sum()) > 0.05
 
