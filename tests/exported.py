@@ -25,8 +25,8 @@ CAMERA = torchdof.Camera.from_fov(50.0, 0.05, 2.0)
 SMALL = torchdof.Camera(sensor_width_mm=4.0)  # 4 px at infinity in the hard cases' small frames
 GIVEN: dict[str, Any] = {"depth_edges": "as given"}  # the default of an exported file
 MODULES: dict[str, Callable[[], torchdof.DepthOfField]] = {
-    # with occlusion, at resolutions down to a sixteenth; slow to trace
-    "layered": lambda: torchdof.DepthOfField(SMALL, **GIVEN, tolerance=64 / 255, max_coc_px=16.0, check=False),
+    # with occlusion, at resolutions down to an eighth; slow to trace
+    "layered": lambda: torchdof.DepthOfField(SMALL, **GIVEN, tolerance=64 / 255, max_coc_px=8.0, check=False),
     # one straight graph, with occlusion
     "whole": lambda: torchdof.DepthOfField(CAMERA, **GIVEN, tolerance=64 / 255, max_coc_px=2.5, check=False),
     # without occlusion; traced in a few seconds
@@ -93,13 +93,13 @@ def export_once(name: str, folder: Path) -> Exported:
 
 
 def command_once(folder: Path) -> tuple[Path, str]:
-    """A file with blur radii as input and repair of edges, and the output of ``torchdof export``."""
+    """A file of one channel with blur radii as input and repair of edges, and the output of ``torchdof export``."""
     path, output = folder / "command" / "dof.onnx", folder / "command.json"
     with FileLock(folder / "command.lock"):
         if not output.exists():
             path.parent.mkdir()
-            options = ["--inputs", "coc_px", "--max-coc", "2", "--no-occlusion", "--depth-edges", "auto", "--json"]
-            result = CliRunner().invoke(app, ["export", "-o", str(path), *options], catch_exceptions=False)
+            options = "--inputs coc_px --channels 1 --max-coc 2 --no-occlusion --depth-edges auto --opset 21 --json"
+            result = CliRunner().invoke(app, ["export", "-o", str(path), *options.split()], catch_exceptions=False)
             assert result.exit_code == 0, result.output
             output.write_text(result.stdout)
     return path, output.read_text()

@@ -26,7 +26,7 @@ def run(*arguments: object) -> Result:
 def test_ikoma_renders_two_planes_with_the_near_one_in_focus() -> None:
     planes = [Plane(2.0, waves(1, (0.6, 0.3, 0.2)), posts(40, 15)), Plane(6.0, waves(2))]
     camera = camera_of(200.0, 96, aperture_radius_m=0.1, focus_m=2.0)
-    scene = plane_scene(planes, camera, (60, 96), samples=512)
+    scene = plane_scene(planes, camera, (60, 96), samples=128)
     out = metrics.display(ikoma(scene))
     assert metrics.psnr(metrics.display(scene.image), metrics.display(scene.truth), scene.inner) < 32
     assert metrics.psnr(out, metrics.display(scene.truth), scene.inner) > 36
@@ -36,19 +36,19 @@ def test_bench_scores_renderers_peers_and_references_and_draws_the_worst_windows
     scenes, out, peer = tmp_path / "scenes", tmp_path / "out", tmp_path / "peer.py"
     shutil.copytree(DATA / "room", scenes / "room")
     peer.write_text(TOY)
-    result = run("--truth", scenes, "--out", out, "--views", 128, "--views", 4, "--peer", peer)
+    result = run("--truth", scenes, "--out", out, "--views", 64, "--views", 4, "--peer", peer)
     assert result.exit_code == 0, result.output
     assert sorted(p.name for p in out.iterdir()) == ["accuracy.csv", "accuracy.md", "accuracy.png"]
     with (out / "accuracy.csv").open() as file:
         rows = {row["renderer"]: row for row in csv.DictReader(file)}
-    names = [*accuracy.renderers(degraded=False), "toy 7", "reference 4", "reference 128"]
+    names = [*accuracy.renderers(degraded=False), "toy 7", "reference 4", "reference 64"]
     assert list(rows) == names
     scene = next(read_scenes(scenes))
     shown, truth = metrics.display(scene.image), metrics.display(scene.truth)
     for name, mask in (("psnr_db", None), ("psnr_inner", scene.inner)):
         assert float(rows["untouched"][name]) == pytest.approx(metrics.psnr(shown, truth, mask), rel=1e-5)
     assert float(rows["torchdof"]["psnr_db"]) > float(rows["untouched"]["psnr_db"]) + 10
-    assert float(rows["reference 128"]["psnr_db"]) > float(rows["reference 4"]["psnr_db"])
+    assert float(rows["reference 64"]["psnr_db"]) > float(rows["reference 4"]["psnr_db"])
     assert rows["toy 7"]["psnr_db"] == rows["untouched"]["psnr_db"] and float(rows["toy 7"]["new_ms"]) == 2500.0
     text = (out / "accuracy.md").read_text()
     assert text.count("| toy 7 |") == 2 and all(name in result.output for name in names)

@@ -1,11 +1,13 @@
 """``torchdof bench``: speed against error, of the built-in scene or the user's."""
 
 import csv
+import dataclasses
 import functools
 import importlib.util
 import json
 import math
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +53,7 @@ def files(tmp_path: Path) -> tuple[Path, Path]:
 def test_times_are_of_new_cameras_and_errors_of_the_scene_s_own(
     in_this_process: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scene = shipped(48, 160).seen(0.0, 13.0)  # blurred enough for coarse layers to show
+    scene = shipped(36, 120).seen(0.0, 13.0)  # blurred enough for coarse layers to show
     rendered: list[Tensor] = []
     monkeypatch.setattr(speed, "blur_by_coc", lambda *a, **options: rendered.append(a[1]) or blur_by_coc(*a, **options))  # type: ignore[func-returns-value]
     rows = {row["setting"]: row for row in speed.compare(scene, repeat=2)}
@@ -90,7 +92,11 @@ def test_the_report_names_a_tolerance_that_was_not_kept(
     def wrong(*arguments: Any, **options: Any) -> Tensor:
         return blur_by_coc(*arguments, **options) + 0.2 * (options.get("tolerance") == 4 / 255)
 
+    def two(*arguments: Any, works: Any = speed.works) -> Iterator[Any]:
+        return (work for work in works(*arguments) if work[0]["setting"].startswith(("8/255", "4/255")))
+
     monkeypatch.setattr(speed, "blur_by_coc", wrong)
+    monkeypatch.setattr(speed, "works", two)
     scene = shipped(36, 64)
     rows = speed.compare(scene, repeat=1)
     assert [row["setting"] for row in rows if not row["kept"]] == ["4/255", "4/255 without occlusion"]
@@ -183,11 +189,12 @@ def test_bad_arguments_are_refused_in_a_sentence(
 
 def test_an_exported_file_is_a_row(exported_by_command: tuple[Path, str], monkeypatch: pytest.MonkeyPatch) -> None:
     def copied(dof: DepthOfField, path: str, inputs: str, channels: int, width: int | None) -> None:
-        assert dof.options.max_coc_px == 2.0 and not dof.options.occlusion and (inputs, channels) == ("coc_px", 3)
+        assert dof.options.max_coc_px == 2.0 and not dof.options.occlusion and (inputs, channels) == ("coc_px", 1)
         shutil.copyfile(exported_by_command[0], path)
 
     monkeypatch.setattr("torchdof.export.to_onnx", copied)
     scene = shipped(64, 96)
+    scene = dataclasses.replace(scene, image=scene.image[:, :1])
     picture = speed._prepared("onnxruntime", scene, occlusion=False)(scene.image, scene.coc_px)
     exact = blur_by_coc(scene.image, scene.coc_px, occlusion=False, tolerance=0.0)
     error = (metrics.display(picture) - metrics.display(exact)).square().mean().sqrt()

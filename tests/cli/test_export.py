@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import onnx
 import pytest
 
 from torchdof import DepthOfField
@@ -19,7 +20,8 @@ def test_a_file_is_written_and_its_verification_printed(exported_by_command: tup
     assert max(case["max_error"] for case in printed["cases"]) < 1e-5
     facts = describe(path)
     assert facts["options"]["max_coc_px"] == 2.0 and not facts["options"]["occlusion"]
-    assert list(facts["inputs"]) == ["image", "coc_px"] and "[B, 3, H, W]" in facts["inputs"]["image"]
+    assert list(facts["inputs"]) == ["image", "coc_px"] and "[B, 1, H, W]" in facts["inputs"]["image"]
+    assert facts["opset"] == 21 and [entry.version for entry in onnx.load(path).opset_import] == [21]
     assert [file.name for file in path.parent.iterdir()] == ["dof.onnx"]
 
 

@@ -1,6 +1,5 @@
 """An exported file renders the module's pictures, at other sizes and of other scenes than the traced ones."""
 
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,9 @@ import pytest
 import torch
 
 import torchdof
-from torchdof.export import conversion, describe, to_onnx
-from torchdof.export.verification import session
+from torchdof.export import conversion, to_onnx
+from torchdof.export.graph import Portable, trace
+from torchdof.export.rays import kernels_of
 
 CAMERA = torchdof.Camera.from_fov(50.0, 0.05, 2.0)
 SIMPLE: dict[str, Any] = {"occlusion": False, "tolerance": "draft", "max_coc_px": 1.0, "check": False}
@@ -30,32 +30,18 @@ def test_an_image_in_focus_is_returned_bit_for_bit(layered: Any) -> None:
     assert torch.equal(out, image)
 
 
-def test_a_file_can_have_the_input_coc_px_and_a_single_channel(tmp_path: Path) -> None:
+def test_the_kernels_of_a_graph_are_those_of_the_stated_width(monkeypatch: pytest.MonkeyPatch) -> None:
     table = torchdof.BlurTable.load("double_gauss_50mm_f2")
-    dof = torchdof.DepthOfField(CAMERA, table, **SIMPLE)
-    with pytest.raises(ValueError, match="state it as width=1920"):
-        to_onnx(dof, tmp_path / "dof.onnx", inputs="coc_px", channels=1)
-    steps: list[str] = []
-    to_onnx(dof, tmp_path / "dof.onnx", inputs="coc_px", channels=1, width=1920, opset=21, progress=steps.append)
-    assert steps[:4] == ["tracing", "translating", "slimming", "verifying: one pixel"]
-    facts = describe(tmp_path / "dof.onnx")
-    assert list(facts["inputs"]) == ["image", "coc_px"] and facts["width"] == 1920 and facts["opset"] == 21
-    model = onnx.load(tmp_path / "dof.onnx")
-    assert [entry.version for entry in model.opset_import if not entry.domain] == [21]
-    coc = torch.linspace(-1.0, 1.0, 1920).expand(1, 1, 20, 1920).contiguous()
-    coc[..., 4, 7] = math.nan
-    image = torch.rand(1, 1, 20, 1920)
-    runner = session(tmp_path / "dof.onnx")
-    out = torch.from_numpy(runner.run(None, {"image": image.numpy(), "coc_px": coc.numpy()})[0])
-    assert torch.equal(out[..., 4, 7], image[..., 4, 7])
-    expected = torchdof.blur_by_coc(
-        image,
-        coc,
-        table=table,
-        plan=torchdof.render.plan.Plan.all(dof.options.max_coc_px, dof.options.tolerance, rays=True),
-        **{k: v for k, v in SIMPLE.items() if k != "max_coc_px"},
-    )
-    torch.testing.assert_close(out, expected, atol=1e-5, rtol=0)
+    portable = Portable(torchdof.DepthOfField(CAMERA, table, **SIMPLE), "coc_px", 1920)
+    traced: list[Portable] = []
+    monkeypatch.setattr(torch.export, "export", lambda module, *_, **__: traced.append(module))
+    trace(portable, 1)
+    ops = traced[0].ops
+    for width in (1920, 1000):
+        expected = [portable.plan.constants(table, True, width)[0], kernels_of(table, portable.plan, width)[0]]
+        made = [ops.kernels[0], ops.rays[0]]
+        assert all(map(torch.equal, made, expected)) == any(map(torch.equal, made, expected)) == (width == 1920)
+    assert ops.lens_width == 1920
 
 
 def graphs(graph: onnx.GraphProto) -> Iterator[onnx.GraphProto]:

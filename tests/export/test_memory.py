@@ -34,7 +34,7 @@ np.save(sys.argv[3], out)
 
 def test_1080p_is_rendered_correctly_with_less_than_0_7_gb(layered: Any, tmp_path: Path) -> None:
     """Runs in a process with onnxruntime and numpy but without PyTorch, as in a deployment."""
-    assert layered.dof.max_coc_px == 16.0
+    assert layered.dof.max_coc_px == 8.0
     camera, (height, width) = layered.dof.camera, SIZE
     fraction = np.zeros((1, 1, *SIZE), np.float32)  # of the largest radius
     fraction[..., width // 2 :] = np.linspace(0.0, 0.95, width - width // 2, dtype=np.float32)
@@ -43,7 +43,7 @@ def test_1080p_is_rendered_correctly_with_less_than_0_7_gb(layered: Any, tmp_pat
         "image": np.random.default_rng(0).random((1, 3, height, width), dtype=np.float32),
         "depth": 2.0 / (1.0 - fraction),
         "focus_m": np.full(1, 2.0, np.float32),
-        "f_number": wide.flatten().numpy().astype(np.float32) / 16.0,  # infinity has the largest radius
+        "f_number": wide.flatten().numpy().astype(np.float32) / 8.0,  # infinity has the largest radius
     }
     np.savez(tmp_path / "feed.npz", **feed)
     printed = output_of(RENDER, layered.path, tmp_path / "feed.npz", tmp_path / "out.npy")
@@ -57,7 +57,7 @@ def test_1080p_is_rendered_correctly_with_less_than_0_7_gb(layered: Any, tmp_pat
     assert out.shape == (1, 3, *SIZE)
     assert torch.equal(out[..., :900], image[..., :900]), "the left half is in focus"
     coc = layered.dof.coc_px(image, data["depth"], data["focus_m"], data["f_number"])
-    assert 15.0 < coc.max() <= 16.0
+    assert 7.5 < coc.max() <= 8.0
     rows, columns = slice(400, 640), slice(1280, 1600)  # in the blurred half, at multiples of the coarse layers' pixels
     part = [tensor[..., rows, columns].contiguous() for tensor in (image, coc)]
     with torch.no_grad():

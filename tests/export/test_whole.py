@@ -1,5 +1,6 @@
 """A file with ``layout="whole"`` is one straight graph, and gives the module's picture without rays of highlights."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,13 @@ import torch
 
 import torchdof
 from tests.exported import CAMERA
+from torchdof import BlurTable
 from torchdof.export import chain, describe, to_onnx, verify
 from torchdof.export.graph import Portable, trace
+from torchdof.export.verification import session
 from torchdof.export.whole import WholeOps
 from torchdof.render.matting import matte
+from torchdof.render.plan import Plan
 
 CONTROL = {"Loop", "If", "Scan", "NonZero", "SequenceMap"}
 FEW: dict[str, Any] = {"occlusion": False, "tolerance": "draft", "max_coc_px": 1.0, "check": False}
@@ -55,17 +59,25 @@ def test_every_case_agrees_and_a_highlight_is_the_only_difference_from_tiles(who
     assert not near[:, :40].any() and not near[:, :, :70].any()
 
 
-def test_a_file_can_have_one_size(tmp_path: Path) -> None:
-    dof, path = torchdof.DepthOfField(CAMERA, **FEW), tmp_path / "dof.onnx"
-    report = to_onnx(dof, path, inputs="coc_px", layout="whole", size=(30, 41))
-    assert {row.shape for row in report.cases} == {(1, 3, 30, 41)}
+def test_a_file_can_have_one_size_and_one_channel(tmp_path: Path) -> None:
+    table, path, steps = BlurTable.load("double_gauss_50mm_f2"), tmp_path / "dof.onnx", list[str]()
+    dof, size = torchdof.DepthOfField(CAMERA, table, **FEW), (20, 1920)
+    report = to_onnx(dof, path, inputs="coc_px", channels=1, layout="whole", size=size, progress=steps.append)
+    assert steps[:4] == ["tracing", "translating", "slimming", "verifying: depth edges"]
+    assert {row.shape for row in report.cases} == {(1, 1, *size)}
     facts = describe(path)
-    assert facts["layout"] == "whole" and facts["size"] == [30, 41]
+    assert (facts["layout"], facts["size"], facts["width"]) == ("whole", [*size], 1920)
     dims = [[d.dim_value for d in v.type.tensor_type.shape.dim] for v in onnx.load(path).graph.input]
-    assert dims == [[1, 3, 30, 41], [1, 1, 30, 41]]
+    assert dims == [[1, 1, *size]] * 2
     with pytest.raises(ValueError, match="dof_model must take a depth"):
         chain(path, path, tmp_path / "chain.onnx", estimate="metric")
     assert verify(path, dof).passed
+    image, coc = torch.rand(1, 1, *size), torch.linspace(-1.0, 1.0, 1920).expand(1, 1, *size).contiguous()
+    coc[..., 4, 7] = math.nan
+    out = torch.from_numpy(session(path).run(None, {"image": image.numpy(), "coc_px": coc.numpy()})[0])
+    assert torch.equal(out[..., 4, 7], image[..., 4, 7])
+    options = {**dof.options.arguments(), "plan": Plan.all(1.0, dof.options.tolerance)}
+    torch.testing.assert_close(out, torchdof.blur_by_coc(image, coc, **options), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize(

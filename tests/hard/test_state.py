@@ -34,7 +34,7 @@ pytestmark = pytest.mark.hard
 
 PACKAGES = tuple(str(Path(str(package.__file__)).parent) for package in (torchdof, torchdof.fit))
 ERRORS = (KeyboardInterrupt, RuntimeError, OSError, ValueError, SystemExit)
-STOPS = 8  # places at which a call is interrupted
+STOPS = 6  # places at which a call is interrupted
 COC = torch.linspace(-9.0, 9.0, 40).expand(1, 1, 30, 40)
 DEPTH = 2.0 + COC / 9.0
 

@@ -70,13 +70,13 @@ torch.set_default_device("meta")  # before the imports, so that nothing is cache
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
 from torchdof.depth import fill_holes, from_relative
 random = torch.Generator("cpu").manual_seed(0)
-image = torch.rand(1, 3, 40, 60, generator=random, device="cpu")
-image[0, :, 20, 30] = 200.0
-coc = torch.linspace(-9, 9, 60, device="cpu").expand(1, 1, 40, 60).clone()
+image = torch.rand(1, 3, 24, 36, generator=random, device="cpu")
+image[0, :, 12, 20] = 200.0
+coc = torch.linspace(-6, 6, 36, device="cpu").expand(1, 1, 24, 36).clone()
 def pictures():
     tables = [BlurTable.load("sato_j15"), BlurTable.polygon(5, 10.0, curvature=0.3, squeeze=0.7, vignetting=0.5)]
     made = [blur_by_coc(image, coc, table=table, occlusion=hides) for table in tables for hides in (True, False)]
-    depth = from_relative(fill_holes(coc.where(coc < 8, torch.nan), "nearest"), 1.0, 3.0).requires_grad_()
+    depth = from_relative(fill_holes(coc.where(coc < 5, torch.nan), "nearest"), 1.0, 3.0).requires_grad_()
     focused = DepthOfField(Camera(focus_range_m=(1.5, 2.0), tilt_deg=3.0))(image, depth)
     focused.square().sum().backward()
     return [float(t.detach().double().sum()) for t in (*made, focused, depth.grad)]

@@ -37,10 +37,10 @@ WAYS: dict[str, dict[str, Any]] = {
 def scene(coc: tuple[float, float] = (-12.0, 12.0), channels: int = 3, hole: bool = False) -> tuple[Tensor, Tensor]:
     """Two images with patches of two slopes, none of their sides a multiple of a block's."""
     generator = torch.Generator().manual_seed(5)
-    image = 0.05 + torch.rand(2, channels, 70, 101, generator=generator)
-    patch = torch.rand(2, 1, 7, 11, generator=generator).repeat_interleave(10, 2).repeat_interleave(10, 3)
-    slopes = torch.linspace(0.0, 0.6, 101) + torch.linspace(0.0, 0.4, 70)[:, None]
-    part = torch.where(patch[..., :70, :101] > 0.7, 1.0 - slopes, slopes)
+    image = 0.05 + torch.rand(2, channels, 54, 75, generator=generator)
+    patch = torch.rand(2, 1, 6, 8, generator=generator).repeat_interleave(10, 2).repeat_interleave(10, 3)
+    slopes = torch.linspace(0.0, 0.6, 75) + torch.linspace(0.0, 0.4, 54)[:, None]
+    part = torch.where(patch[..., :54, :75] > 0.7, 1.0 - slopes, slopes)
     radius = coc[0] + (coc[1] - coc[0]) * part
     if hole:
         radius[..., 20:24, 30:33] = math.nan

@@ -79,9 +79,9 @@ def test_both_engines_make_the_same_kernels(table: BlurTable, longest: int | Non
 
 @ALL
 def test_kernels_change_continuously_with_the_radius(table: BlurTable) -> None:
-    coc = torch.linspace(2.0, 40.0, 77, dtype=torch.float64)
+    coc = torch.cat([torch.arange(2.0, 12.0, 0.5), torch.arange(12.0, 41.0, 3.5)]).double()
     step = torch.tensor(1e-6, dtype=torch.float64)
-    for radius in coc.split(11):
+    for radius in coc.split(5):
         one, other = (bank_of(table).kernels(radius * factor, 400) for factor in (1.0, 1.0 + step))
         spare = (other.shape[-1] - one.shape[-1]) // 2
         assert float((torch.nn.functional.pad(one, (spare,) * 4) - other).abs().sum((-2, -1)).max()) < 1e-3
