@@ -75,7 +75,7 @@ image[0, :, 12, 20] = 200.0
 coc = torch.linspace(-6, 6, 36, device="cpu").expand(1, 1, 24, 36).clone()
 def pictures():
     tables = [BlurTable.load("sato_j15"), BlurTable.polygon(5, 10.0, curvature=0.3, squeeze=0.7, vignetting=0.5)]
-    made = [blur_by_coc(image, coc, table=table, occlusion=hides) for table in tables for hides in (True, False)]
+    made = [blur_by_coc(image, coc, table=table, occlusion=hides) for table, hides in zip(tables, (True, False))]
     depth = from_relative(fill_holes(coc.where(coc < 5, torch.nan), "nearest"), 1.0, 3.0).requires_grad_()
     focused = DepthOfField(Camera(focus_range_m=(1.5, 2.0), tilt_deg=3.0))(image, depth)
     focused.square().sum().backward()
