@@ -54,10 +54,10 @@ def test_eager_and_exported_agree(module: str, name: str, request: pytest.Fixtur
 
 
 def street(exported: Any, lamps: int) -> tuple[Tensor, ...]:
-    """Lamps behind and in front of a post, blurred by up to the largest radius of a file."""
-    depth = torch.full((1, 1, 90, 120), 6.0) + 0.1 * torch.rand(1, 1, 90, 120)
+    """Lamps behind and in front of a post, blurred by up to the largest radius of a file: two items of two tiles."""
+    depth = torch.full((2, 1, 90, 120), 6.0) + 0.1 * torch.rand(2, 1, 90, 120)
     depth[..., 50:58], depth[..., 70:, :] = 0.8, 1.2
-    image = 0.1 * torch.rand(1, 3, 90, 120)
+    image = 0.1 * torch.rand(2, 3, 90, 120)
     image.flatten(2)[..., torch.randperm(90 * 120)[:lamps]] = 40.0 * torch.rand(3, lamps)
     widest = exported.dof.camera.replace(focus_m=2.0, f_number=1.0).coc_px(depth, 120).abs().amax()
     return image, depth, torch.tensor([2.0]), (widest / exported.dof.options.max_coc_px).reshape(1)

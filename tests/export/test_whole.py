@@ -13,7 +13,7 @@ import torchdof
 from tests.exported import CAMERA
 from torchdof import BlurTable
 from torchdof.export import chain, describe, to_onnx, verify
-from torchdof.export.graph import Portable, trace
+from torchdof.export.graph import Portable
 from torchdof.export.verification import session
 from torchdof.export.whole import WholeOps
 from torchdof.render.matting import matte
@@ -103,13 +103,3 @@ def test_matting_of_all_pixels_equals_matting_of_a_list() -> None:
     for given in (None, valid):
         for listed, everywhere in zip(matte(image, coc, given), matte(image, coc, given, WholeOps()), strict=True):
             torch.testing.assert_close(everywhere, listed, atol=1e-6, rtol=0)
-
-
-def test_the_number_of_items_does_not_depend_on_that_of_tiles() -> None:
-    """With one tile in the traced example, PyTorch recorded the number of tiles as the number of items."""
-    portable = Portable(torchdof.DepthOfField(CAMERA, tolerance=64 / 255, max_coc_px=1.0), "coc_px")
-    program = trace(portable, 1)
-    image = next(node for node in program.graph.nodes if node.name == "image").meta["val"]
-    items = image.shape[0].node.expr
-    counts = [n.meta["val"].shape[0] for n in program.graph.nodes if "Collect" in map(str, n.args)]
-    assert len(counts) == 2 and all(str(n.node.expr).count(str(items)) == 1 for n in counts), counts
