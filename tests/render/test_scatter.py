@@ -28,11 +28,6 @@ def bank(*radii: float, size: int | None = None, dtype: torch.dtype = torch.floa
     return psf.softm(radius, radius / 10, b=0.7, m=2.0, size=size).to(dtype)
 
 
-def test_fold_equals_a_plain_loop_over_pixels() -> None:
-    light, kernels = torch.rand(2, 3, 5, 8, dtype=torch.float64), torch.rand(3, 5, 5, dtype=torch.float64)
-    assert_close(fold(light, kernels), loops.scatter(light, lambda *_: kernels), rtol=1e-12, atol=1e-14)
-
-
 def test_fold_with_a_kernel_of_its_own_for_every_pixel_equals_a_plain_loop() -> None:
     light = torch.rand(2, 3, 5, 6, dtype=torch.float64)
     kernels = psf.disc(torch.tensor([0.0, 1.3, 2.4]), size=5).unsqueeze(1)
