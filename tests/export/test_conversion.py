@@ -36,7 +36,7 @@ def test_the_kernels_of_a_graph_are_those_of_the_stated_width(monkeypatch: pytes
     traced: list[Portable] = []
     monkeypatch.setattr(torch.export, "export", lambda module, *_, **__: traced.append(module))
     trace(portable, 1)
-    ops = traced[0].ops
+    ops: Any = traced[0].ops
     for width in (1920, 1000):
         expected = [portable.plan.constants(table, True, width)[0], kernels_of(table, portable.plan, width)[0]]
         made = [ops.kernels[0], ops.rays[0]]
