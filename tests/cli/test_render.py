@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import torch
 from click.testing import CliRunner
@@ -282,6 +283,14 @@ def test_metadata_are_copied_and_bits_and_transfer_follow_the_options(image: Ten
     torch.testing.assert_close(back.pixels, image, rtol=0, atol=1e-5)
     run("render out.png depth.npy -o again.exr --focus-m 2 --transfer linear --bits float")
     torch.testing.assert_close(pixels("again.exr"), image, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(("suffix", "notes"), [(".webp", 1), (".hdr", 1), (".jpg", 0), (".exr", 0)])
+def test_a_note_states_that_a_type_of_file_holds_no_exif(image: Tensor, suffix: str, notes: int) -> None:
+    write_image("photo.png", Picture(image, metadata={"Exif:FocalLength": ("float", 50.0)}, sample="8"))
+    note = guessed(f"render photo.png depth.npy -o out{suffix} --focus-m 2 {LENS}")[1]
+    assert note.count(f"out{suffix}: EXIF data are lost in a {suffix} file; write .jpg, .png or .tif") == notes
+    assert ("Exif:FocalLength" in read_image(f"out{suffix}").metadata) != bool(notes)
 
 
 def test_a_sequence_interpolates_the_focus_between_keyframes(image: Tensor, depth: Tensor, run: Run) -> None:
@@ -575,6 +584,26 @@ def test_a_focus_pull_of_a_still_writes_frames_with_one_aperture(image: Tensor, 
     radii = [float(re.search(r"up to ([\d.]+) px", part).group(1)) for part in told]  # type: ignore[union-attr]
     assert max(radii) == 2.4 and radii[1] < 2.4
     assert guessed("render image.exr depth.npy -o pull.##.exr --focus-m 1:2,3:6 --f-number 9")[1].count("note:") == 1
+
+
+def test_a_focus_pull_is_one_animation_if_the_name_of_a_webp_has_no_number(run: Run, image: Tensor) -> None:
+    photo = torch.cat([image * 0.5, torch.full_like(image[:, :1], 0.5)], 1)
+    for pixels, channels in ((image, ("R", "G", "B")), (photo, ("R", "G", "B", "A"))):
+        write_image("photo.png", Picture(pixels, channels, sample="8", transfer="srgb"))
+        line = f"render photo.png depth.npy --focus-m 2:2,4:6 {LENS}"
+        told = run(f"{line} -o new/rack.webp").splitlines()
+        assert [part.partition(" m,")[0] for part in told] == [f"new/rack.webp: focus {m}" for m in (2, 3, 6)]
+        assert os.listdir("new") == ["rack.webp"]
+        run(f"{line} -o frame.#.webp")
+        source = oiio.ImageInput.open("new/rack.webp")
+        for n in (2, 3, 4):
+            assert source.seek_subimage(n - 2, 0)
+            frame = oiio.ImageBuf(f"frame.{n}.webp").get_pixels(oiio.UINT8)
+            if n == 2 or len(channels) == 3:  # OpenImageIO blends frames with alpha, which their flags forbid
+                np.testing.assert_array_equal(source.read_image("uint8"), frame)
+        assert not source.seek_subimage(3, 0)
+    assert "an animation is one file" in run(f"{line} -o rack.webp --resume", code=2)
+    assert "only a .webp holds all of them" in run(f"{line} -o rack.gif", code=2)
 
 
 def test_a_note_states_that_a_picture_of_one_depth_is_all_in_focus(run: Run) -> None:

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 _VISIBLE_PX = 2.0  # px; a note advises more blur if the largest radius is below
 _LARGE_PX = 8_000_000  # pixels of an image; the bar shows the expected time of larger ones
 _STRIPS = 16  # number of strips of an image, of which one is timed
+_WITHOUT_EXIF = (".webp", ".hdr", ".pfm")  # types in which OpenImageIO writes no EXIF data
 _PANEL_PX = 800  # px; longer side of a panel on a sheet
 
 
@@ -154,8 +155,8 @@ class Rendered:
 class Renderer:
     """Reads, renders and writes the frames of ``torchdof render``."""
 
-    def __init__(self, command: "Render", scene: Scene, is_still: bool) -> None:
-        self.command, self.scene, self.is_still = command, scene, is_still
+    def __init__(self, command: "Render", scene: Scene, is_still: bool, is_animation: bool = False) -> None:
+        self.command, self.scene, self.is_still, self.is_animation = command, scene, is_still, is_animation
         self.table, self.device = command.blur.table_of(command.blur.table), _device(command.device)
         self.notices = Notices(scene.depth_map.strict)
 
@@ -195,6 +196,7 @@ class Renderer:
         start, files, out, frame = time.perf_counter(), self.command.files, rendered.out, rendered.frame
         make_folder_of(out)
         write_image(out, rendered.picture, files.out_transfer, files.bits)
+        out = self.command.out if self.is_animation else out
         if files.sheet is not None:
             make_folder_of(files.sheet)
             write_sheet(files.sheet, _panels(rendered))
@@ -203,6 +205,9 @@ class Renderer:
             self.notices.note("guess", f"{frame.name}: {frame.guess}")
         if rendered.camera is not None and largest_px < _VISIBLE_PX:
             self.notices.note("little blur", f"{out}: {frame.scene.lens.blur_advice(largest_px, self.is_still)}")
+        if out.suffix.lower() in _WITHOUT_EXIF and any(name.startswith("Exif:") for name in frame.picture.metadata):
+            lost = f"EXIF data are lost in a {out.suffix} file; write .jpg, .png or .tif to keep them"
+            self.notices.note("exif", f"{out}: {lost}")
         words, facts = self._summary(rendered.camera, largest_px, frame)
         height, width = rendered.picture.pixels.shape[-2:]
         seconds = frame.seconds + time.perf_counter() - start

@@ -5,6 +5,7 @@ import functools
 import importlib.metadata
 import itertools
 import math
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
+from ..io.animation import write_animation
 from ..io.sequence import FramePattern, parse_frames
 from .command import argument, numbers, option, options_of
 from .options import Accuracy, Blur, Scene, check_files, json_option, make_folder_of
@@ -73,7 +75,7 @@ class Render:
     --steady filters flickering depth over time, where neither image nor depth moves. With --frames or --resume the
     result is the same as for the whole sequence, because up to 63 earlier frames are read first.
 
-    A photograph with a focus pull from 1 m to 5 m in 24 frames:
+    A photograph with a focus pull from 1 m to 5 m in 24 frames; pull.webp would be one animation, 25 frames a second:
 
         torchdof render photo.jpg depth.png -o pull.##.png --focus-m 1:1,24:5
 
@@ -92,11 +94,11 @@ class Render:
     The lens is the one you state, else the one in the file's EXIF data, else 50 mm at f/2.8 on a sensor of 36 mm; the
     printed line names the source. If you state neither focus nor lens, a single image is focused on the subject nearest
     its middle, and the lens is opened until the largest blur radius is 2 % of the width, unless the file's lens blurs
-    enough. Alpha and metadata are kept. A file is written whole or not at all. A likely wrong unit gives a warning on
-    standard error, with --strict an error. --json prints one JSON object per frame.
+    enough. Alpha and metadata are kept (EXIF not in WebP, HDR and PFM). A file is written whole or not at all. A likely
+    wrong unit gives a warning on standard error, with --strict an error. --json prints one JSON object per frame.
     """
 
-    image: Path = argument("All-in-focus image (EXR, PNG, TIFF, JPEG, HDR, PFM) or shot.####.exr.", "IMAGE")
+    image: Path = argument("All-in-focus image (EXR, PNG, TIFF, JPEG, WebP, HDR, PFM) or shot.####.exr.", "IMAGE")
     depth: Path | None = argument(
         "Its depth (the same types, .npy, .npz); not needed if IMAGE has a Z channel.", "[DEPTH]", None
     )
@@ -139,6 +141,11 @@ class Render:
         keys = (self.scene.lens.focus_m or []) if images is None else []
         is_single = images is None and len(keys) < 2
         scene = self.scene if images is None else self.scene.of_sequence()
+        is_animation = images is None and not is_single and not _pattern(self.out)
+        if is_animation and self.out.suffix.lower() != ".webp":
+            raise ValueError(f"{self.out}: frames need a number, such as pull.##.png; only a .webp holds all of them")
+        if is_animation and files.resume:
+            raise ValueError("--resume is of frames; an animation is one file, so leave it out")
         if files.sheet is not None and not is_single:
             raise ValueError("--sheet is of one picture; leave it out where there are more")
         has_number = FramePattern.is_padded(self.out) and not FramePattern.is_padded(self.image) and _pattern(self.out)
@@ -157,7 +164,7 @@ class Render:
         else:
             first, last = (0, 0) if is_single else files.frames or (keys[0][0], keys[-1][0])
             numbers = range(first, last + 1)
-        target = FramePattern(self.out).name if not is_single else lambda _: self.out
+        target = FramePattern(self.out).name if not (is_single or is_animation) else lambda _: self.out
         outputs = {n: target(n) for n in numbers}
         for n, out in outputs.items():
             check_files(*sources(n), out, files.sheet)
@@ -182,7 +189,7 @@ class Render:
         from ..depth.sanity import Mistake
         from .frame import Renderer
 
-        renderer, depth_map = Renderer(self, scene, is_still=images is None), scene.depth_map
+        renderer, depth_map = Renderer(self, scene, images is None, is_animation), scene.depth_map
         if files.resume and len(existing) > len(done):
             again = f"{len(existing) - len(done)} of {len(outputs)} frames are rendered again"
             renderer.notices.note("again", f"{self.out}: {again}: {reason}")
@@ -195,7 +202,13 @@ class Render:
             return read_files(*sources(n))
 
         frames = _steadied(read, whole) if images and files.steady else read
-        self._render_each(renderer, todo, frames, record if is_recorded else None)
+        if not is_animation:
+            return self._render_each(renderer, todo, frames, record if is_recorded else None)
+        with tempfile.TemporaryDirectory() as folder:
+            todo = {n: Path(folder, f"{n}.webp") for n in todo}
+            self._render_each(renderer, todo, frames, None)
+            make_folder_of(self.out)
+            write_animation(self.out, list(todo.values()))
 
     def _numbers(self, images: FramePattern, depths: FramePattern | None) -> Sequence[int]:
         """Numbers of the requested frames of a sequence; refuses frames without an image or a depth."""
