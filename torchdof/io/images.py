@@ -243,6 +243,8 @@ def write_image(
     if suffix in (".jpg", ".jpeg"):
         spec.attribute("compression", "jpeg:95")
         spec.attribute("jpeg:subsampling", "4:4:4")
+    if suffix == ".png":
+        spec.attribute("png:compressionLevel", 4)  # a third of the time of the default, 6, and a twentieth more bytes
     if suffix == ".webp":
         spec.attribute("compression", "webp:95")
 
