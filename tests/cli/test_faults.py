@@ -191,14 +191,15 @@ def test_a_long_step_shows_a_bar_on_the_terminal_and_results_still_go_to_the_fil
     assert file.getvalue() == '{"out": "a.png"}\n' and "a.png" not in terminal.getvalue()
 
 
-def test_a_large_image_shows_an_estimate_of_its_time_only_on_a_terminal(
-    scene: Path, run: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("large_px", "options"), [(100, ""), (1000, "--method fold")])
+def test_a_large_image_or_a_fold_shows_an_estimate_of_its_time_only_on_a_terminal(
+    scene: Path, run: Callable[..., str], monkeypatch: pytest.MonkeyPatch, large_px: int, options: str
 ) -> None:
     shown: list[str] = []
-    monkeypatch.setattr(frame, "_LARGE_PX", 100)
+    monkeypatch.setattr(frame, "_LARGE_PX", large_px)
     monkeypatch.setattr(output.Bar, "update", lambda self, text: shown.append(text))
-    run("render image.exr depth.npy -o out.exr --focus-m 2")
+    run(f"render image.exr depth.npy -o out.exr --focus-m 2 {options}")
     assert shown == []
     monkeypatch.setattr(output, "_is_terminal", lambda: True)
-    run("render image.exr depth.npy -o out.exr --focus-m 2")
+    run(f"render image.exr depth.npy -o out.exr --focus-m 2 {options}")
     assert len(shown) == 1 and re.fullmatch(r"rendering out.exr, about \d+ s", shown[0])

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from .render import Render
 
 _VISIBLE_PX = 2.0  # px; a note advises more blur if the largest radius is below
-_LARGE_PX = 8_000_000  # pixels of an image; the bar shows the expected time of larger ones
+_LARGE_PX = 8_000_000  # pixels of an image; the bar shows the expected time of larger ones, and of --method fold
 _STRIPS = 16  # number of strips of an image, of which one is timed
 _WITHOUT_EXIF = (".webp", ".hdr", ".pfm")  # types in which OpenImageIO writes no EXIF data
 _PANEL_PX = 800  # px; longer side of a panel on a sheet
@@ -166,7 +166,7 @@ class Renderer:
         return read_frame(image, depth, self.scene, transfer=files.transfer, layer=files.layer)
 
     def render(self, frame: Frame, out: Path, number: int, bar: Bar | None = None) -> Rendered:
-        """Renders a frame; ``bar`` shows the expected time of a large one. Raises as :func:`coc_of`."""
+        """Renders a frame; ``bar`` shows the expected time of a long one. Raises as :func:`coc_of`."""
         start, picture, command = time.perf_counter(), frame.picture, self.command
         frame = dataclasses.replace(frame, values=frame.values.to(self.device))
         coc_px, camera, remarks = coc_of(frame, self.notices, number, self.is_still)
@@ -181,7 +181,8 @@ class Renderer:
             with torch.no_grad():
                 if command.lights:
                     pixels = _with_lights(picture, pixels, command.lights)
-                if bar is not None and bar.is_seen and coc_px.numel() > _LARGE_PX:
+                is_long = coc_px.numel() > _LARGE_PX or command.accuracy.method == "fold"
+                if bar is not None and bar.is_seen and is_long:
                     bar.update(f"rendering {out.name}, about {_seconds(blur, pixels, coc_px):.0f} s")
                 attention = command.attention
                 if attention is not None:
