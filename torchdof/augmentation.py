@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from kornia.augmentation import AugmentationSequential, IntensityAugmentationBase2D
 from kornia.augmentation import random_generator as rg
@@ -25,7 +26,7 @@ from .optics.blur_table import BlurTable
 from .optics.camera import Camera
 from .options import OptionArguments, Options, spells_options
 from .tensors import floating
-from .validation import choice, image_and_map, number, show
+from .validation import FROM_NUMPY, choice, image_and_map, number, show
 
 __all__ = ["DepthAugmentationSequential", "RandomDepthOfField"]
 
@@ -155,6 +156,9 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
 
     def __call__(self, input: Any, *arguments: Any, **kwargs: Any) -> Any:
         """Kornia's call, which converts images; skipped for dicts and labels, which Kornia would take for images."""
+        if isinstance(input, list | tuple):
+            kind = type(input).__name__
+            raise ValueError(f"RandomDepthOfField can take a dict, or image and depth as two arguments, got a {kind}")
         if isinstance(input, Mapping) or self.return_label:
             return nn.Module.__call__(self, input, *arguments, **kwargs)
         return super().__call__(input, *arguments, **kwargs)
@@ -394,10 +398,14 @@ def _range(name: str, value: Any, largest: float) -> tuple[float, float]:
 def _batch_shape(image: Any) -> tuple[int, ...]:
     """Shape ``[B, C, H, W]`` of one image or a batch."""
     if not floating(image) or image.ndim not in (3, 4):
-        raise ValueError(
-            f"image must be a floating-point tensor [B, C, H, W] or [C, H, W], got {show(image)}; convert bytes with "
-            "image.float() / 255, or torchvision's ToDtype(torch.float32, scale=True)"
-        )
+        hint = "; convert bytes with image.float() / 255, or torchvision's ToDtype(torch.float32, scale=True)"
+        if floating(image):
+            hint = (
+                "; join the first axes of clips: image.flatten(0, 1), and so for the depth" if image.ndim == 5 else ""
+            )
+        elif not isinstance(image, Tensor):
+            hint = FROM_NUMPY if isinstance(image, np.ndarray) else ""
+        raise ValueError(f"image must be a floating-point tensor [B, C, H, W] or [C, H, W], got {show(image)}{hint}")
     return tuple(image.shape) if image.ndim == 4 else (1, *image.shape)
 
 

@@ -8,6 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,6 +23,9 @@ WHOLE_NUMBERS = (
     *(torch.int8, torch.int16, torch.int32, torch.int64),
 )
 
+FROM_NUMPY = "; use torch.from_numpy(image).movedim(-1, -3) for an array with channels last"
+"""Advice in messages about an image."""
+
 _MAX_STRETCH = 0.03  # largest change of a depth map's aspect ratio; estimators work at multiples of 14 or 64 px
 
 
@@ -29,6 +33,8 @@ def show(value: Any) -> str:
     """A short text for a value in a message; never raises."""
     if isinstance(value, Tensor):
         return f"a {value.dtype} tensor of shape {list(value.shape)}"
+    if isinstance(value, np.ndarray):
+        return f"a {value.dtype} array of shape {list(value.shape)}"
     try:
         text = repr(value)
     except Exception:  # an integer with more digits than Python prints, or an error in the object's own repr
@@ -152,7 +158,8 @@ def _check_finite(name: str, values: Tensor) -> None:
 def image_and_map(image: Tensor, name: str, value: Tensor, unit: str) -> None:
     """Refuse an image and a one-channel map, in a unit, whose types, sizes or devices do not fit."""
     if not isinstance(image, Tensor):
-        raise ValueError(f"image must be a tensor [B, C, H, W] in linear light, got {type(image).__name__}")
+        got = show(image) + FROM_NUMPY if isinstance(image, np.ndarray) else type(image).__name__
+        raise ValueError(f"image must be a tensor [B, C, H, W] in linear light, got {got}")
     if not floating(image):
         hint = "convert it with .float()" if image.is_floating_point() else "decode it first"
         raise ValueError(f"image must be floating point in linear light, of 16 bits or more, got {image.dtype}; {hint}")
@@ -178,7 +185,9 @@ def _map(name: str, unit: str, value: Tensor, image: Tensor) -> None:
         hint = "; did you forget the channel dimension?" if value.ndim == 3 else ""
         raise ValueError(f"{expected}, got {list(value.shape)}{hint}")
     if value.shape[1:] != (1, height, width) or value.shape[0] not in (1, batch):
-        raise ValueError(f"{expected} as the image is {list(image.shape)}, got {list(value.shape)}")
+        is_last = value.shape[-2:] == image.shape[1:3]
+        hint = "; channels come before height and width: image.movedim(-1, -3)" if is_last else ""
+        raise ValueError(f"{expected} as the image is {list(image.shape)}, got {list(value.shape)}{hint}")
     if value.device != image.device:
         raise ValueError(f"{name} must be on the image's device {image.device}, got {value.device}")
 
@@ -188,9 +197,10 @@ def image_and_depth(image: Tensor, depth: Tensor, values: bool, name: str = "dep
     image_and_map(image, name, depth, "in metres")
     if values and not is_traced() and not ends(depth)[0] > 0:
         bad = int((~(depth > 0)).sum())
+        remedy = "check its unit and kind" if bad == depth.numel() else "fill the holes"
         raise ValueError(
             f"{name} must be > 0 (inf allowed), got {bad} of {depth.numel()} pixels that are NaN, zero or "
-            "negative; fill the holes, or pass check=False to let these pixels through sharp"
+            f"negative; {remedy}, or pass check=False to let these pixels through sharp"
         )
 
 

@@ -17,6 +17,11 @@ image.exr small.npy --focus-m 2                       | small.npy: depth is 3 x 
 image.exr small.npy --depth-kind coc                  | small.npy: coc is 3 x 4 pixels but the image is 24 x 16
 image.exr holed.npy --focus-m 2                       | holed.npy: 2 pixels (0.5 %) have no depth
 image.exr holed.npy --depth-kind relative --depth-unknown 0 | have no depth (NaN or marked unknown); say how to fill
+image.exr unknown.npy --focus-m 2                     | unknown.npy: no pixel has a depth; check the kind
+image.exr unknown.npy --depth-kind relative           | unknown.npy: no pixel has a depth; check the map
+image.exr unknown.npy --depth-kind coc                | unknown.npy: no pixel has a depth; check the kind
+image.exr partly.npy --depth-kind coc                 | have no depth (NaN or marked unknown); say how to fill them: fi
+image.exr millimetres.npy --focus-at 3,3 --depth-scale 1e-6 | --focus-at must be longer than the focal length
 image.exr depth.npy --focus-m 2 --layer b             | image.exr: has no layer 'b'
 image.exr depth.####.npy --focus-m 2                  | image.exr: is a single image
 image.exr depth.npy --focus-m 2 --frames 1-2          | image.exr: is a single image
@@ -112,8 +117,8 @@ bench --views 3                                  | name its folder with --truth
 export                                           | give either -o FILE to write or --show FILE to read
 export -o dof.onnx --show dof.onnx               | give either -o FILE
 export -o dof.bin                                | name it dof.onnx
-export -o dof.onnx --table double_gauss_50mm_f2  | state it as width=1920
-export -o dof.onnx --max-coc 0.2                 | max_coc_px must be
+export -o dof.onnx --table double_gauss_50mm_f2  | state it as --width 1920
+export -o dof.onnx --max-coc 0.2                 | --max-coc must be
 export -o dof.onnx --tolerance 2                 | tolerance must be
 export -o dof.onnx --channels 0                  | channels must be
 export -o dof.onnx --opset 11                    | opset must be
@@ -146,6 +151,8 @@ def files(scene: Path) -> Path:
     np.save("small.npy", np.ones((4, 3)))
     np.save("zeros.npy", 0 * depth)
     np.save("millimetres.npy", 1000 * depth)
+    np.save("unknown.npy", np.nan * depth)
+    np.save("partly.npy", np.where(depth < 3, depth, np.nan))
     depth[0, 0, 3, 4:6] = 0
     np.save("holed.npy", depth)
     write_image("a.png", Picture(torch.ones(1, 3, 4, 4)))

@@ -530,10 +530,11 @@ def test_lens_and_points_are_those_of_the_display_window(image: Tensor, depth: T
 
 def test_a_note_advises_how_to_increase_a_hardly_visible_blur(run: Run) -> None:
     for options, advice in (
-        ("--f-number 8", "a smaller --f-number, or --blur 2% makes more of it"),
-        ("--blur 2%", "a larger --blur makes more of it"),
-        ("--fov-deg 40 --aperture-radius-m 0.001", "a larger --aperture-radius-m, or --blur 2%"),
-        ("--equivalent 35mm,8", "a smaller --equivalent f-number, or --blur 2%"),
+        ("--f-number 8", "a smaller --f-number, or --blur 9% makes more of it"),
+        ("--blur 2%", "a larger --blur, such as 9%, makes more of it"),
+        ("", "a smaller --f-number, or --blur 9% makes more of it"),  # the lens is opened for 2 % by default
+        ("--fov-deg 40 --aperture-radius-m 0.001", "a larger --aperture-radius-m, or --blur 9%"),
+        ("--equivalent 35mm,8", "a smaller --equivalent f-number, or --blur 9%"),
         ("--focus-range 1,9", "nothing is blurred, for all depth is in focus"),
     ):
         focus = "" if "range" in options else "--focus-m 2"
@@ -584,6 +585,9 @@ def test_a_focus_pull_of_a_still_writes_frames_with_one_aperture(image: Tensor, 
     radii = [float(re.search(r"up to ([\d.]+) px", part).group(1)) for part in told]  # type: ignore[union-attr]
     assert max(radii) == 2.4 and radii[1] < 2.4
     assert guessed("render image.exr depth.npy -o pull.##.exr --focus-m 1:2,3:6 --f-number 9")[1].count("note:") == 1
+    wide = "render image.exr depth.npy -o pull.##.exr --focus-m 1:2,3:6 --blur 15%"  # between the two depths at frame 2
+    assert "nothing is in focus" not in guessed(wide)[1]
+    assert "nothing is in focus" in guessed(wide.replace("1:2,3:6", "1:20,3:60"))[1]
 
 
 def test_a_focus_pull_is_one_animation_if_the_name_of_a_webp_has_no_number(run: Run, image: Tensor) -> None:
@@ -603,7 +607,7 @@ def test_a_focus_pull_is_one_animation_if_the_name_of_a_webp_has_no_number(run: 
                 np.testing.assert_array_equal(source.read_image("uint8"), frame)
         assert not source.seek_subimage(3, 0)
     assert "an animation is one file" in run(f"{line} -o rack.webp --resume", code=2)
-    assert "only a .webp holds all of them" in run(f"{line} -o rack.gif", code=2)
+    assert "or a .webp, which holds all frames" in run(f"{line} -o rack.gif", code=2)
 
 
 def test_a_note_states_that_a_picture_of_one_depth_is_all_in_focus(run: Run) -> None:

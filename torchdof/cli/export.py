@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from .command import option
+from .command import by_option, option
 from .lens import Sensor
 from .options import Accuracy, Blur, json_option
 from .output import Bar, print_result
@@ -100,8 +100,9 @@ class Export:
         else:
             camera = Camera.from_fov(self.sensor.fov_deg, 0.01, 2.0)  # aperture and focus are inputs of the graph
         options = {"depth_edges": "as given", **self.accuracy.arguments(), "max_coc_px": self.max_coc, "check": False}
-        dof = DepthOfField(camera, self.blur.table_of(self.blur.table), **options)
-        with Bar("tracing") as bar:
+        table = self.blur.table_of(self.blur.table)
+        with Bar("tracing") as bar, by_option({"max_coc_px": "--max-coc", "width=": "--width "}):
+            dof = DepthOfField(camera, table, **options)
             graph = dataclasses.asdict(self.graph)
             report = to_onnx(dof, out, **graph, depth_edges=dof.options.depth_edges, progress=bar.update)
         print_result(self.as_json, {"out": str(out), **dataclasses.asdict(report)}, f"{report}\nwrote {out}")

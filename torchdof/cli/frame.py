@@ -25,14 +25,13 @@ from ..optics.camera import Camera
 from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect, stretch
-from .lens import Area
+from .lens import VISIBLE_PX, Area
 from .options import Scene, make_folder_of
 from .output import Bar, Notices, print_result
 
 if TYPE_CHECKING:
     from .render import Render
 
-_VISIBLE_PX = 2.0  # px; a note advises more blur if the largest radius is below
 _LARGE_PX = 8_000_000  # pixels of an image; the bar shows the expected time of larger ones, and of --method fold
 _STRIPS = 16  # number of strips of an image, of which one is timed
 _WITHOUT_EXIF = (".webp", ".hdr", ".pfm")  # types in which OpenImageIO writes no EXIF data
@@ -57,8 +56,9 @@ class Frame:
         """Likely mistakes in the depth, given the camera."""
         kind: Any = self.scene.depth_map.depth_kind
         mistakes = depth_mistakes(self.values, camera, kind, self.scene.depth_map.depth_scale)
-        is_stated = self.scene.lens.blur_share is not None  # a large blur that --blur states is no mistake of units
-        return [mistake for mistake in mistakes if not (is_stated and mistake.name == "blur")]
+        meant = ["blur"] * (self.scene.lens.blur_share is not None)  # --blur states it, so that no unit is wrong
+        meant += ["gap"] * (len(self.scene.lens.focus_m or []) > 1)  # a focus pull passes between surfaces
+        return [mistake for mistake in mistakes if mistake.name not in meant]
 
 
 def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = False, **encoding: Any) -> Frame:
@@ -106,7 +106,7 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
         raise ValueError(f"{source}: {error}") from None
     values = values if kind == "coc" else at_size_of(picture.pixels, values)
     if fill is not None or not holes:
-        values, filled = resolve_holes(values, str(source), fill, kind == "relative")
+        values, filled = resolve_holes(values, str(source), fill, kind in ("relative", "coc"))
     remarks = [f"depth stretched by {stretched:.1%}"] if stretched else []
     if kind == "relative" and None in (depth_map.near_m, depth_map.far_m):
         remarks.append("depth from {:g} to {:g} m assumed".format(*depth_map.ends_m))
@@ -204,8 +204,9 @@ class Renderer:
         largest_px = float(rendered.coc_px.abs().max())
         if frame.guess:
             self.notices.note("guess", f"{frame.name}: {frame.guess}")
-        if rendered.camera is not None and largest_px < _VISIBLE_PX:
-            self.notices.note("little blur", f"{out}: {frame.scene.lens.blur_advice(largest_px, self.is_still)}")
+        if rendered.camera is not None and largest_px < VISIBLE_PX:
+            advice = frame.scene.lens.blur_advice(largest_px, rendered.coc_px.shape[-1], self.is_still)
+            self.notices.note("little blur", f"{out}: {advice}")
         if out.suffix.lower() in _WITHOUT_EXIF and any(name.startswith("Exif:") for name in frame.picture.metadata):
             lost = f"EXIF data are lost in a {out.suffix} file; write .jpg, .png or .tif to keep them"
             self.notices.note("exif", f"{out}: {lost}")

@@ -23,6 +23,7 @@ _WIDER = {  # option that sets the aperture -> how to open the lens wider
     "--equivalent": "a smaller --equivalent f-number",
     "--blur": "a larger --blur",
 }
+VISIBLE_PX = 2.0  # px; a note advises more blur if the largest radius is below
 _DEFAULT_BLUR, _VISIBLE_BLUR = 0.02, 0.005  # largest blur radius over the width: by default; the smallest visible one
 _PER_OUTLIER, _MAX_SAMPLES = 1000, 2**20  # one pixel in 1000 is ignored as an outlier; most pixels examined
 _SPELLED = {"focus_range_m": "--focus-range", "tilt_deg": "--tilt", "swing_deg": "--swing", "fov_x_deg": "--fov-deg"}
@@ -136,12 +137,13 @@ class Lens(Sensor):
         """Whether an option sets the focus."""
         return (self.focus_m, self.focus_at, self.focus_range) != (None, None, None)
 
-    def blur_advice(self, largest_px: float, is_still: bool) -> str:
-        """Advice for a largest blur radius that is hardly visible."""
+    def blur_advice(self, largest_px: float, width: int, is_still: bool) -> str:
+        """Advice for a largest blur radius that is hardly visible in an image of a width in pixels."""
         if largest_px == 0:
             return "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
         hint = _WIDER[next(iter(self._opening), "--f-number")]
-        other = f", or --blur {_DEFAULT_BLUR:.0%}" if is_still and self.blur_share is None else ""
+        share = f"{min(0.5, max(_DEFAULT_BLUR, math.ceil(100 * VISIBLE_PX / width) / 100)):.0%}"
+        other = "" if not is_still else f", or --blur {share}" if self.blur_share is None else f", such as {share},"
         return f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; {hint}{other} makes more of it"
 
     @property
@@ -162,7 +164,9 @@ class Lens(Sensor):
         elif {"focal_length_mm", "sensor_width_mm"} <= set(lens):
             half = lens["sensor_width_mm"] / (2 * lens["focal_length_mm"])
         else:
-            raise ValueError("--depth-kind distance needs --fov-deg, or --focal-length-mm and --sensor-width-mm")
+            raise ValueError(
+                "--depth-kind distance needs --fov-deg, --equivalent, or --focal-length-mm and --sensor-width-mm"
+            )
         return 2 * math.degrees(math.atan(half * width / area.width))
 
     def _stated(self, width: int, height: int) -> dict[str, float]:
@@ -220,9 +224,9 @@ class Lens(Sensor):
                 camera = Camera.from_fov(self.fov_deg, self.aperture_radius_m or 0.01, focus_m)
                 camera = camera if self.f_number is None else camera.replace(f_number=self.f_number)
             camera = camera.replace(focus_range_m=self.focus_range, tilt_deg=self.tilt, swing_deg=self.swing)
-        camera = camera.replace(sensor_width_mm=camera.sensor_width_mm * (width / area.width))
-        if self.focus_at is not None:
-            camera = camera.focus_at(depth, self.focus_at[0] - area.x, self.focus_at[1] - area.y)
+            camera = camera.replace(sensor_width_mm=camera.sensor_width_mm * (width / area.width))
+            if self.focus_at is not None:
+                camera = camera.focus_at(depth, self.focus_at[0] - area.x, self.focus_at[1] - area.y)
         share, is_open = self.blur_share, is_still and not self._opening and (self == Lens() or not is_to_scale)
         largest_px = self._largest_coc_px(camera, depth) if share is not None or is_open else 0.0
         if is_open and not (is_to_scale and "f_number" in in_file and largest_px >= _VISIBLE_BLUR * width):

@@ -143,7 +143,10 @@ class Render:
         scene = self.scene if images is None else self.scene.of_sequence()
         is_animation = images is None and not is_single and not _pattern(self.out)
         if is_animation and self.out.suffix.lower() != ".webp":
-            raise ValueError(f"{self.out}: frames need a number, such as pull.##.png; only a .webp holds all of them")
+            expected = (
+                "expected one place for the frame number, such as pull.##.png, or a .webp, which holds all frames"
+            )
+            raise ValueError(f"{self.out}: {expected}")
         if is_animation and files.resume:
             raise ValueError("--resume is of frames; an animation is one file, so leave it out")
         if files.sheet is not None and not is_single:

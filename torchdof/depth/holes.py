@@ -57,14 +57,14 @@ def fill_holes(depth: Tensor, fill: Fill) -> Tensor:
     return fill_holes(filled, "nearest")  # holes without any depth in their row and column
 
 
-def resolve_holes(depth: Tensor, name: str, fill: Fill | None, is_relative: bool = False) -> tuple[Tensor, int]:
+def resolve_holes(depth: Tensor, name: str, fill: Fill | None, zero_is_known: bool = False) -> tuple[Tensor, int]:
     """Counts the pixels without depth (NaN), and refuses or fills them.
 
     Args:
         depth: ``[1, 1, H, W]``.
         name: Name of the file, for the message.
         fill: As for :func:`fill_holes`; None refuses holes.
-        is_relative: Whether the map is relative depth, in which zero is the far end and no hole; for the message.
+        zero_is_known: Whether zero and negative numbers were no holes, as in relative depth; for the message.
 
     Returns:
         The depth without holes, and how many there were.
@@ -75,15 +75,15 @@ def resolve_holes(depth: Tensor, name: str, fill: Fill | None, is_relative: bool
     holes = int(depth.isnan().sum())
     if holes == 0:
         return depth, 0
-    if fill is None:
-        causes = "NaN or marked unknown" if is_relative else "NaN, zero, negative or marked unknown"
+    if fill is None and holes < depth.numel():
+        causes = "NaN or marked unknown" if zero_is_known else "NaN, zero, negative or marked unknown"
         hint = "; if zero is the far end of relative depth, say that (--depth-kind relative)"
         raise ValueError(
             f"{name}: {holes} pixels ({100 * holes / depth.numel():.1f} %) have no depth ({causes}); say how to fill "
-            f"them: fill 'nearest' or 'far' (--fill-depth){'' if is_relative else hint}"
+            f"them: fill 'nearest' or 'far' (--fill-depth){'' if zero_is_known else hint}"
         )
     try:
-        return fill_holes(depth, fill), holes
+        return fill_holes(depth, "far" if fill is None else fill), holes
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
 

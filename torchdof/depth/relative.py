@@ -82,10 +82,11 @@ def from_relative(
         low = torch.where(is_known, value, torch.inf).amin((1, 2, 3), keepdim=True)
         high = torch.where(is_known, value, -torch.inf).amax((1, 2, 3), keepdim=True)
         if not is_traced() and not bool((low < high).all()):
-            problem = "no value" if bool((low > high).any()) else "one value everywhere"
+            if bool((low > high).any()):
+                raise ValueError("no pixel has a depth; check the map, and the value that means unknown")
             raise ValueError(
-                f"relative depth needs two different values to distinguish near from far, got {problem}; give "
-                "value_range=(smallest, largest) (--value-range) if the values mean something beyond this map"
+                "relative depth needs two different values to distinguish near from far, got one value everywhere; "
+                "give value_range=(smallest, largest) (--value-range) if the values mean something beyond this map"
             )
     else:
         low, high = (value.new_tensor(x) for x in _range(value_range))

@@ -38,14 +38,14 @@ class Mistake:
     """A likely mistake in a depth map or its camera.
 
     Args:
-        name: "focus": nothing is in focus, or the focus is far from all depth; "far": all depth is far and nothing is
-            blurred; "bits": whole numbers, as in files of 8 bits, or numbers from 0 to 1; "blur": a larger blur than
-            lenses make; "lens": a shorter focal length than lenses have; "range": relative depth of a sequence without
-            ``value_range``.
+        name: "focus": the focus lies outside of all depth; "gap": no pixel lies near it; "far": all depth is far and
+            nothing is blurred; "bits": whole numbers, as in files of 8 bits, or numbers from 0 to 1; "blur": a larger
+            blur than lenses make; "lens": a shorter focal length than lenses have; "range": relative depth of a
+            sequence without ``value_range``.
         message: The observation, the likely mistake and its remedy.
     """
 
-    name: Literal["focus", "far", "bits", "blur", "lens", "range"]
+    name: Literal["focus", "gap", "far", "bits", "blur", "lens", "range"]
     message: str
 
 
@@ -170,7 +170,8 @@ def _mistakes(
     is_far_off = factor is not None and not near / _FAR_OFF_RATIO <= focus_m <= far * _FAR_OFF_RATIO
     if (not is_sharp and not (is_too_blurred and near <= focus_m <= far)) or is_far_off:
         message = _out_of_focus(near, far, extent, focus_m, is_whole, factor, kind, scale)
-        return [Mistake("focus", message if is_sharp else f"nothing is in focus: {message}")]
+        name: Literal["gap", "focus"] = "gap" if near <= focus_m <= far else "focus"
+        return [Mistake(name, message if is_sharp else f"nothing is in focus: {message}")]
     mistakes = []
     is_8_bit, is_unit_range = is_whole and far <= 255 and far - near >= 64, 0.9 < far <= 1.0 and near < 0.05
     if kind != "relative" and (is_8_bit or is_unit_range):
