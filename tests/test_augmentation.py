@@ -236,7 +236,7 @@ test_errors_name_the_argument = refuses(
     (partial(RandomDepthOfField, return_label=1), "return_label must be True or False"),
     (lambda: K.AugmentationSequential(random_dof(), data_keys=["input", "mask"])(IMAGE, DEPTH),
      r"needs a depth: .*DepthAugmentationSequential.*3 channels alone"),
-    (lambda: random_dof()((IMAGE, DEPTH)), "can take a dict, or image and depth as two arguments, got a tuple"),
+    (lambda: random_dof()((IMAGE, DEPTH)), "takes a dict, or image and depth as two arguments, got a tuple"),
     (lambda: random_dof()(IMAGE[None], DEPTH[None]), r"got a torch.float32 .*; join the first axes of clips"),
     (lambda: random_dof()(IMAGE[0].numpy(), DEPTH), r"got a float32 array of shape \[.*; use torch.from_numpy"),
     (lambda: random_dof()(IMAGE.byte(), DEPTH), r"got a torch.uint8 .*; convert bytes with image.float\(\) / 255"),

@@ -158,7 +158,7 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         """Kornia's call, which converts images; skipped for dicts and labels, which Kornia would take for images."""
         if isinstance(input, list | tuple):
             kind = type(input).__name__
-            raise ValueError(f"RandomDepthOfField can take a dict, or image and depth as two arguments, got a {kind}")
+            raise ValueError(f"RandomDepthOfField takes a dict, or image and depth as two arguments, got a {kind}")
         if isinstance(input, Mapping) or self.return_label:
             return nn.Module.__call__(self, input, *arguments, **kwargs)
         return super().__call__(input, *arguments, **kwargs)
