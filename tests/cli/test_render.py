@@ -293,6 +293,15 @@ def test_a_note_states_that_a_type_of_file_holds_no_exif(image: Tensor, suffix: 
     assert ("Exif:FocalLength" in read_image(f"out{suffix}").metadata) != bool(notes)
 
 
+def test_a_note_names_the_layers_of_an_exr_that_are_not_copied(image: Tensor, depth: Tensor) -> None:
+    channels = torch.cat([image, depth, image, image[:, :1]], 1)[0].permute(1, 2, 0).numpy()
+    store(Path("shot.exr"), channels, "float", ("R", "G", "B", "Z", "dif.R", "dif.G", "dif.B", "N.Z"))
+    told = guessed("render shot.exr -o out.exr --focus-m 2")[1]
+    assert "note: out.exr: is without the other layers of the image: N, dif\n" in told
+    for options in ("shot.exr -o out.png", "image.exr depth.npy -o out.exr"):
+        assert "layers" not in guessed(f"render {options} --focus-m 2")[1]
+
+
 def test_a_sequence_interpolates_the_focus_between_keyframes(image: Tensor, depth: Tensor, run: Run) -> None:
     lines = run(f"{SEQUENCE} --focus-m 1:2,3:6 {LENS}").splitlines()
     focus = [re.search(r"out.(\d+).exr: focus ([\d.]+) m", line).groups() for line in lines]  # type: ignore[union-attr]

@@ -210,6 +210,9 @@ class Renderer:
         if out.suffix.lower() in _WITHOUT_EXIF and any(name.startswith("Exif:") for name in frame.picture.metadata):
             lost = f"EXIF data are lost in a {out.suffix} file; write .jpg, .png or .tif to keep them"
             self.notices.note("exif", f"{out}: {lost}")
+        layers = ", ".join(frame.picture.other_layers)
+        if layers and out.suffix.lower() == ".exr":
+            self.notices.note("layers", f"{out}: is without the other layers of the image: {layers}")
         words, facts = self._summary(rendered.camera, largest_px, frame)
         height, width = rendered.picture.pixels.shape[-2:]
         seconds = frame.seconds + time.perf_counter() - start

@@ -47,6 +47,7 @@ class Picture:
         transfer: Encoding of the file, "linear" or "srgb".
         window: Place of the pixels in the full frame (EXR data window): x, y, full x, full y, full width, full height.
         orientation: EXIF orientation of the file; the pixels are upright already.
+        other_layers: Names of the layers of the file that are neither the pixels nor the depth.
     """
 
     pixels: Tensor
@@ -57,6 +58,7 @@ class Picture:
     transfer: Transfer = "linear"
     window: tuple[int, int, int, int, int, int] | None = None
     orientation: int = 1
+    other_layers: tuple[str, ...] = ()
 
     @property
     def has_alpha(self) -> bool:
@@ -104,12 +106,15 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
             raise ValueError(f"{path}: {error}") from None
         source = parts[part]
         pixels, sample, transfer = _light(path, source, indices, transfer, has_alpha=names[-1] == "A")
-        depth = None
-        same_size = [p for p in parts if p.values.shape[:2] == source.values.shape[:2]]
-        depth_place = depth_channel([(p.label, p.names) for p in same_size])
+        depth, places = None, {(part, k) for k in indices}
+        same_size = [n for n, p in enumerate(parts) if p.values.shape[:2] == source.values.shape[:2]]
+        depth_place = depth_channel([(parts[n].label, parts[n].names) for n in same_size])
         if depth_place is not None:
-            depth = _map(same_size[depth_place[0]].values[..., depth_place[1]])
-    return Picture(pixels, names, depth, source.metadata, sample, transfer, source.window, source.orientation)
+            places.add((same_size[depth_place[0]], depth_place[1]))
+            depth = _map(parts[same_size[depth_place[0]]].values[..., depth_place[1]])
+    left = [(p.label, name) for n, p in enumerate(parts) for k, name in enumerate(p.names) if (n, k) not in places]
+    layers = tuple(dict.fromkeys(name.rpartition(".")[0] or label or name for label, name in left))
+    return Picture(pixels, names, depth, source.metadata, sample, transfer, source.window, source.orientation, layers)
 
 
 @contextlib.contextmanager
