@@ -291,6 +291,7 @@ def test_a_note_states_that_a_type_of_file_holds_no_exif(image: Tensor, suffix: 
     note = guessed(f"render photo.png depth.npy -o out{suffix} --focus-m 2 {LENS}")[1]
     assert note.count(f"out{suffix}: EXIF data are lost in a {suffix} file; write .jpg, .png or .tif") == notes
     assert ("Exif:FocalLength" in read_image(f"out{suffix}").metadata) != bool(notes)
+    assert "EXIF" not in guessed(f"render photo.png depth.npy -o rack.webp --focus-m 1:2,2:3 {LENS}")[1]
 
 
 def test_a_note_names_the_layers_of_an_exr_that_are_not_copied(image: Tensor, depth: Tensor) -> None:

@@ -207,7 +207,8 @@ class Renderer:
         if rendered.camera is not None and largest_px < VISIBLE_PX:
             advice = frame.scene.lens.blur_advice(largest_px, rendered.coc_px.shape[-1], self.is_still)
             self.notices.note("little blur", f"{out}: {advice}")
-        if out.suffix.lower() in _WITHOUT_EXIF and any(name.startswith("Exif:") for name in frame.picture.metadata):
+        has_exif = any(name.startswith("Exif:") for name in frame.picture.metadata)
+        if has_exif and out.suffix.lower() in _WITHOUT_EXIF and not self.is_animation:  # no animation holds them
             lost = f"EXIF data are lost in a {out.suffix} file; write .jpg, .png or .tif to keep them"
             self.notices.note("exif", f"{out}: {lost}")
         layers = ", ".join(frame.picture.other_layers)
