@@ -400,9 +400,7 @@ def _batch_shape(image: Any) -> tuple[int, ...]:
     if not floating(image) or image.ndim not in (3, 4):
         hint = "; convert bytes with image.float() / 255, or torchvision's ToDtype(torch.float32, scale=True)"
         if floating(image):
-            hint = (
-                "; join the first axes of clips: image.flatten(0, 1), and so for the depth" if image.ndim == 5 else ""
-            )
+            hint = "; join the first axes of clips, as image.flatten(0, 1) does" if image.ndim == 5 else ""
         elif not isinstance(image, Tensor):
             hint = FROM_NUMPY if isinstance(image, np.ndarray) else ""
         raise ValueError(f"image must be a floating-point tensor [B, C, H, W] or [C, H, W], got {show(image)}{hint}")

@@ -47,11 +47,8 @@ def flattened(axes: tuple[int, ...], name: str, value: Any, what: str = "1") -> 
     _refuse_vmap(name, value)
     if len(axes) == 1:
         return value.contiguous()
-    fits = (
-        value.ndim == len(axes) + 3
-        and (what == "C" or value.shape[-3] == 1)
-        and all(n in (1, m) for n, m in zip(value.shape, axes, strict=False))
-    )
+    fits = value.ndim == len(axes) + 3 and (what == "C" or value.shape[-3] == 1)
+    fits = fits and all(n in (1, m) for n, m in zip(value.shape, axes, strict=False))
     if not fits:
         leading = ", ".join(map(str, axes)) + ", " * bool(axes)
         raise ValueError(

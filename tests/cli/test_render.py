@@ -617,7 +617,7 @@ def test_a_focus_pull_is_one_animation_if_the_name_of_a_webp_has_no_number(run: 
                 np.testing.assert_array_equal(source.read_image("uint8"), frame)
         assert not source.seek_subimage(3, 0)
     assert "an animation is one file" in run(f"{line} -o rack.webp --resume", code=2)
-    assert "or a .webp, which holds all frames" in run(f"{line} -o rack.gif", code=2)
+    assert "such as pull.##.png, or a .webp" in run(f"{line} -o rack.gif", code=2)
 
 
 def test_a_note_states_that_a_picture_of_one_depth_is_all_in_focus(run: Run) -> None:

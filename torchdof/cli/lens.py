@@ -164,9 +164,7 @@ class Lens(Sensor):
         elif {"focal_length_mm", "sensor_width_mm"} <= set(lens):
             half = lens["sensor_width_mm"] / (2 * lens["focal_length_mm"])
         else:
-            raise ValueError(
-                "--depth-kind distance needs --fov-deg, --equivalent, or --focal-length-mm and --sensor-width-mm"
-            )
+            raise ValueError("--depth-kind distance needs --fov-deg, --equivalent, or focal length and sensor width")
         return 2 * math.degrees(math.atan(half * width / area.width))
 
     def _stated(self, width: int, height: int) -> dict[str, float]:

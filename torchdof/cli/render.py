@@ -143,10 +143,7 @@ class Render:
         scene = self.scene if images is None else self.scene.of_sequence()
         is_animation = images is None and not is_single and not _pattern(self.out)
         if is_animation and self.out.suffix.lower() != ".webp":
-            expected = (
-                "expected one place for the frame number, such as pull.##.png, or a .webp, which holds all frames"
-            )
-            raise ValueError(f"{self.out}: {expected}")
+            raise ValueError(f"{self.out}: expected one place for the frame number, such as pull.##.png, or a .webp")
         if is_animation and files.resume:
             raise ValueError("--resume is of frames; an animation is one file, so leave it out")
         if files.sheet is not None and not is_single:
