@@ -114,7 +114,7 @@ def test_broken_inputs_are_omitted_and_listed(
 
     monkeypatch.setattr(torchdof.distributed.shards, "depth_of_field", allocate)
     report = make_shards(tmp_path / "out", shard_rows(pairs, per_shard=5), depth={"unknown": 0.0})
-    for k, error in {1: "cannot be read", 2: "MemoryError", 3: "have no depth", 4: "allocate"}.items():
+    for k, error in {1: "cannot be read", 2: "MemoryError", 3: "no pixel has a depth", 4: "allocate"}.items():
         assert error in report["error"][k]
     names = {name.split(".")[0] for name in members(tmp_path / "out" / "shard-000000.tar")}
     assert names == {"00000000"}
