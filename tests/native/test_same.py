@@ -5,10 +5,12 @@ from typing import Any
 
 import pytest
 import torch
+import torch.nn.functional as functional
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchdof import Camera, blur_by_coc, native
+from torchdof.render.edges import mended
 from torchdof.render.plan import Plan
 
 pytestmark = pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built")
@@ -111,3 +113,14 @@ def test_no_operator_of_pytorch_reads_a_whole_frame(occlusion: bool) -> None:
     with torch.inference_mode(), reads:
         blur_by_coc(image, coc, occlusion=occlusion)
     assert reads.names == []
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_both_engines_repair_an_enlarged_map_alike(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is linear between its samples, so that pixels lie at exact quarters of the step between two surfaces."""
+    generator = torch.Generator().manual_seed(seed)
+    image, coarse = torch.rand(1, 3, 40, 50, generator=generator), torch.rand(1, 1, 3, 4, generator=generator)
+    coc = functional.interpolate(40.0 * coarse - 20.0, (40, 50), mode="bilinear", align_corners=True)
+    compiled = mended(image, coc, "repair")
+    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
+    torch.testing.assert_close(compiled, mended(image, coc, "repair"), rtol=0.0, atol=5e-3)

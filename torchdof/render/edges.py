@@ -403,9 +403,8 @@ def _judge(
         window = pixels.around(part, nearness, _REACH)
         near, far = pixels.pick(edges.near, part)[0], pixels.pick(edges.far, part)[0]
         values, own, others = pixels.pick(nearness, window)[0], pixels.pick(colour, part), pixels.pick(colour, window)
-        level = (values - far) / (near - far).clamp_min(1e-12)
-        weight = falloff * pixels.pick(witness, window)[0]
-        sides = [weight * ((level > 0.75) & (level < 1.25)), weight * ((level < 0.25) & (level > -0.25))]
+        weight, most_off = falloff * pixels.pick(witness, window)[0], 0.25 * (near - far).clamp_min(1e-12)
+        sides = [weight * ((values - end).abs() < most_off) for end in (near, far)]
 
         # mean colours of both surfaces, and the variance around them
         sums = [side.sum(0) for side in sides]
