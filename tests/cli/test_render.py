@@ -610,6 +610,7 @@ def test_a_focus_pull_is_one_animation_if_the_name_of_a_webp_has_no_number(run: 
         assert os.listdir("new") == ["rack.webp"]
         run(f"{line} -o frame.#.webp")
         source = oiio.ImageInput.open("new/rack.webp")
+        assert source is not None
         for n in (2, 3, 4):
             assert source.seek_subimage(n - 2, 0)
             frame = oiio.ImageBuf(f"frame.{n}.webp").get_pixels(oiio.UINT8)
