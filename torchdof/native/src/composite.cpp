@@ -53,8 +53,9 @@ struct WindowBlock {
   int count;
   const uint64_t *layers;  // that occur in it
   bool clear;              // light and share of its terms are 0
-  // State of its normalizer term: out of date, constant, or KEPT, valid until a layer occurs in the block.
+  // State of its normalizer term: out of date, constant, or KEPT, valid behind the same number of the block's layers.
   enum Normalizer { STALE, ZERO, ONE, KEPT } normalizer;
+  int before;  // with KEPT: layers of the block before that for which the term was computed
   uint32_t partial[BLOCK], varying[BLOCK];  // column marks of each row, stored with a KEPT normalizer
 };
 
@@ -668,9 +669,10 @@ class Composite {
     std::fill(&b.partial[first], &b.partial[first] + rows, 0u);
     std::fill(&b.varying[first], &b.varying[first] + rows, 0u);
     for (WindowBlock &w : b.blocks) {
-      bool before = false, behind = false;
+      int before = 0;  // the block's layers before layer k
+      bool behind = false;
       for (int i = 0; i < index_.words; i++) {
-        before |= (w.layers[i] & below(k, i)) != 0;
+        before += __builtin_popcountll(w.layers[i] & below(k, i));
         behind |= (w.layers[i] & ~below(k + 1, i)) != 0;
       }
       const int y0 = std::max(w.top, first), y1 = std::min(w.top + w.rows, first + rows);
@@ -692,8 +694,10 @@ class Composite {
       if (!over_) continue;
       const uint32_t bits = marks(w.column, w.column + BLOCK - 1);
       if ((before && behind) || (behind && (w.count > 1 || w.surfaces[0].weight))) {
-        if (w.normalizer != WindowBlock::KEPT) block_normalizer(layers_[k], w, b);
+        // layers in between may have been left out here, as their kernels do not reach the block
+        if (w.normalizer != WindowBlock::KEPT || w.before != before) block_normalizer(layers_[k], w, b);
         w.normalizer = WindowBlock::KEPT;
+        w.before = before;
         for (int y = y0; y < y1; y++) {
           b.partial[y] |= w.partial[y - w.top];
           b.varying[y] |= w.varying[y - w.top];
