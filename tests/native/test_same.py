@@ -124,3 +124,18 @@ def test_both_engines_repair_an_enlarged_map_alike(seed: int, monkeypatch: pytes
     compiled = mended(image, coc, "repair")
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
     torch.testing.assert_close(compiled, mended(image, coc, "repair"), rtol=0.0, atol=5e-3)
+
+
+@pytest.mark.parametrize(("seed", "height", "width"), [(0, 37, 61), (1, 29, 76), (2, 12, 88), (3, 5, 73), (4, 70, 90)])
+def test_both_engines_blur_patches_farther_than_a_tile_alike(
+    seed: int, height: int, width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside a tile lie blocks that kernels of the layers near the focus do not reach, and wider ones do."""
+    generator = torch.Generator().manual_seed(seed)
+    patches = 90.0 * torch.rand(4, 1, 3, 6, generator=generator) - 45.0
+    coc = functional.interpolate(patches, (height, width))
+    image = torch.rand(4, 1, height, width, generator=generator)
+    compiled = blur_by_coc(image, coc, depth_edges="as given", tolerance=1e-3)
+    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
+    plain = blur_by_coc(image, coc, depth_edges="as given", tolerance=1e-3)
+    torch.testing.assert_close(compiled, plain, rtol=0.0, atol=1e-5)
