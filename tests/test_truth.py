@@ -14,7 +14,7 @@ MEASURED_DB = {
     "highlights/0": (20.331, 32.851),
     "planes/0": (31.386, 30.221),
     "portrait/0": (24.966, 23.353),
-    "room/1": (40.618, 47.056),
+    "room/1": (40.616, 47.053),
 }
 """Recorded PSNR of the whole crop and inside its margin, at a tolerance of 1/255.
 

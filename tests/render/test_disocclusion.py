@@ -67,9 +67,9 @@ def test_the_background_behind_two_blurred_surfaces_is_the_farthest_one_around()
 
 
 def sloping(behind_px: float) -> tuple[Tensor, Tensor]:
-    """A red slope of 20 to 10 px in front of the focus, a green surface at ``behind_px``, a blue wall 60 px behind."""
+    """A red slope of 30 to 20 px in front of the focus, a green surface at ``behind_px``, a blue wall 60 px behind."""
     image, coc = (torch.empty(1, channels, 48, 96) for channels in (3, 1))
-    coc[..., :40] = torch.linspace(-20.0, -10.0, 40)
+    coc[..., :40] = torch.linspace(-30.0, -20.0, 40)
     coc[..., 40:44], coc[..., 44:] = behind_px, 60.0
     image[..., :40] = torch.tensor([0.7, 0.1, 0.1])[:, None, None]
     image[..., 40:44], image[..., 44:] = torch.tensor([0.1, 0.6, 0.1])[:, None, None], BLUE[:, None, None]
