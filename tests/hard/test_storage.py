@@ -100,7 +100,7 @@ def test_views_and_empty_tensors_have_storage() -> None:
 
 
 def test_a_negated_view_renders_as_its_values(engine: str) -> None:
-    """Its memory holds the values with the other sign: ``z.conj().imag`` of a complex ``z`` is such a view."""
+    """The memory of ``z.conj().imag``, with a complex ``z``, holds the numbers with the opposite sign."""
     light, coc = torch.rand(1, 3, 40, 50), torch.linspace(-4.0, 4.0, 50).expand(1, 1, 40, 50).clone()
     coc[..., 20:25] = 6.0
     views = [(-values)._neg_view() for values in (light, coc, coc.abs() + 1.0)]

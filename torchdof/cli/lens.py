@@ -143,7 +143,8 @@ class Lens(Sensor):
             return "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
         hint = _WIDER[next(iter(self._opening), "--f-number")]
         share = f"{min(0.5, max(_DEFAULT_BLUR, math.ceil(100 * VISIBLE_PX / width) / 100)):.0%}"
-        other = "" if not is_still else f", or --blur {share}" if self.blur_share is None else f", such as {share},"
+        other = f", or --blur {share}" if self.blur_share is None else f", such as {share},"
+        other = other if is_still else ""
         return f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; {hint}{other} makes more of it"
 
     @property

@@ -110,7 +110,8 @@ def _smooth_steps(values: Tensor) -> Tensor:
     known = values.detach().nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
     low, high = known.amin((1, 2, 3), keepdim=True), known.amax((1, 2, 3), keepdim=True)
     level = torch.where(high > 1.0, 1.0, 1.0 / 255.0)
-    is_whole = ((known / level - (known / level).round()).abs() < 1e-3).all(-1, True).all(-2, True)
+    levels = known / level
+    is_whole = ((levels - levels.round()).abs() < 1e-3).all(-1, True).all(-2, True)
     is_of_8_bits = is_whole & (high - low > _LEVELS * level) & (low >= 0) & (high <= 255.0 * level)
     if not is_traced() and not bool(is_of_8_bits.any()):
         return values

@@ -137,6 +137,7 @@ constexpr float BEHIND_PX = 1.0f;        // difference in coc at which a surface
 constexpr float OWN_SLOPE = 0.25f;       // part of a pixel's blur by which its own surface may be farther nearby
 constexpr float LEAST_SEEN = 1e-4f;      // weight of a sample behind up to which it counts as empty
 constexpr float HIDDEN_WEIGHT = 0.003f;  // weight of a filled hidden surface, against 1 for a visible one
+
 // Largest coc of a pixel's own surface nearby.
 template <typename V>
 inline V end_of_surface(V coc) { return coc + most(most(coc, -coc) * OWN_SLOPE - BEHIND_PX, V{}); }

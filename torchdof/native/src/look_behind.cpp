@@ -60,10 +60,11 @@ struct Behind {
     const float *const cocs = level.values + (planes - 2) * size, *const weights = cocs + size;
     const int row = rows[l].before[y], column = columns[l].before[x];
     const float down = rows[l].part[y], aside = columns[l].part[x];
+    const float end = end_of_surface(coc);
     bool any = false;
     for (int j = 0; j < 4; j++) {
       f.at[j] = (size_t)(row + j / 2) * level.columns + column + j % 2;
-      f.is_behind[j] = cocs[f.at[j]] - end_of_surface(coc) - (BEHIND_PX - 0.5f);
+      f.is_behind[j] = cocs[f.at[j]] - end - (BEHIND_PX - 0.5f);
       any |= f.is_behind[j] >= 0;
     }
     if (!any) return false;
