@@ -233,6 +233,7 @@ def test_a_truncated_file_is_refused(tmp_path: Path, suffix: str, sample: Any, s
     (tmp_path / f"cut{suffix}").write_bytes(content[: int(len(content) * share)])
     with pytest.raises(OSError, match=r"cut\.\w+: (is damaged or cut short|is cut short|cannot be read)"):
         read_image(tmp_path / f"cut{suffix}")
+    assert decode.is_complete(tmp_path / f"whole{suffix}") and not decode.is_complete(tmp_path / f"cut{suffix}")
 
 
 @pytest.mark.parametrize("suffix", KINDS)

@@ -47,7 +47,7 @@ class _Files:
     frames: tuple[int, int] | None = option("Part of a sequence.", metavar="FIRST-LAST", read=parse_frames)
     steady: bool = option("Filter depth of a sequence along time, where neither image nor depth moved.", False)
     resume: bool = option(
-        "Render only the frames that OUT lacks, or that are older than their files or than other options.", False
+        "Render only frames that OUT lacks, that are cut short, or older than their files or than other options.", False
     )
 
 
@@ -134,7 +134,7 @@ class Render:
         """Renders one image, the frames of a sequence, or a focus pull in a still image.
 
         1. List the frames, and check all their files.
-        2. With ``--resume`` leave out those that are there, and neither their options nor their files have changed.
+        2. With ``--resume`` leave out those that are complete, and neither their options nor their files have changed.
         3. Record the options, and render the frames in order.
         """
         images, depths, files = _pattern(self.image), _pattern(self.depth), self.files
@@ -178,7 +178,7 @@ class Render:
         if files.resume and not reason:
             tables = self.blur.files()
             done = record.kept(outputs, {n: [*sources(n), *tables] for n in whole}, files.steady)
-            reason = "they are older than their files or options"
+            reason = "they are older than their files or options, or they are cut short"
         if done:
             share = f"{self.out}: is" if is_single else f"{len(done)} of {len(outputs)} frames are"
             lines = [json_line({"out": str(out), "is_there_already": True}) for out in sorted(done)]

@@ -21,7 +21,7 @@ import numpy as np
 from .memory import free_bytes
 from .metadata import Metadata, kept_metadata, upright
 
-__all__ = ["MAX_ATTRIBUTES", "Part", "check_png", "first_line", "read_array", "read_parts", "utf8_name"]
+__all__ = ["MAX_ATTRIBUTES", "Part", "first_line", "is_complete", "read_array", "read_parts", "utf8_name"]
 
 MAX_PIXELS = 2**28  # of an image or array; a larger limit allows damaged headers to claim more memory
 MAX_ATTRIBUTES = 4096
@@ -65,7 +65,7 @@ def read_parts(path: Path) -> list[Part]:
     """
     if path.suffix.lower() == ".pfm":
         return [_read_pfm(path)]
-    check_png(path)
+    _check_png(path)
     _check_attributes(path)
     try:
         with utf8_name(path) as name:
@@ -123,7 +123,31 @@ def _parts(path: Path, name: str) -> Iterator[Part]:
         source.close()
 
 
-def check_png(path: Path) -> None:
+def is_complete(path: Path) -> bool:
+    """Whether an image file ends where its header says; reads all of a PNG, but decodes no more than its last row.
+
+    A JPEG, WebP or HDR file has to be decoded up to that row.
+    """
+    import OpenImageIO as oiio
+
+    try:
+        _check_png(path)  # first, because libpng would print a message
+    except (OSError, ValueError):  # an empty file cannot be mapped into memory
+        return False
+    with utf8_name(path) as name:
+        source = oiio.ImageInput.open(name)
+        if source is None:
+            oiio.geterror()
+            return False
+        spec = source.spec()
+        is_png = source.format_name() == "png"  # its checksums are right, and its last row would need all others
+        last = is_png or source.read_scanline(spec.y + spec.height - 1, 0, "float") is not None
+        problem = source.geterror()
+        source.close()
+    return bool(last) and not problem
+
+
+def _check_png(path: Path) -> None:
     """Refuse a PNG that is cut short or has a wrong checksum; libpng would print its own message about it."""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         offset, chunk = 8, b"" if content[:8] == b"\x89PNG\r\n\x1a\n" else b"IEND"
