@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal
 import click
 
 from ..io.animation import write_animation
+from ..io.atomic import check_writable
 from ..io.sequence import FramePattern, parse_frames
 from .command import argument, numbers, option, options_of
 from .options import Accuracy, Blur, Scene, check_files, json_option, make_folder_of
@@ -186,6 +187,8 @@ class Render:
         todo = {n: out for n, out in outputs.items() if out not in done}
         if not todo:
             return
+        for out in filter(None, [*todo.values(), files.sheet]):
+            check_writable(out)
         from ..depth.sanity import Mistake
         from .frame import Renderer
 
