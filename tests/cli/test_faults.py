@@ -51,8 +51,8 @@ def test_an_interrupted_sequence_keeps_its_complete_frames_and_resumes(
             time.sleep(0.002)
         process.send_signal(number)
         output, errors = process.communicate(timeout=60)
-    assert process.returncode == (1 if number == signal.SIGINT else 128 + number), errors
-    assert b"Traceback" not in errors
+    assert process.returncode in (128 + number, -number), errors  # Python may end itself by SIGINT: 130 for the shell
+    assert errors == (b"interrupted\n" if number == signal.SIGINT else b"")
     done = sorted(scene.glob("out.*.exr"))
     assert 5 <= len(done) < count
     assert not list(scene.glob(".*")), "a partial file was left"
