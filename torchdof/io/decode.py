@@ -26,6 +26,8 @@ __all__ = ["MAX_ATTRIBUTES", "Part", "first_line", "is_complete", "read_array", 
 MAX_PIXELS = 2**28  # of an image or array; a larger limit allows damaged headers to claim more memory
 MAX_ATTRIBUTES = 4096
 """Largest number of attributes in all parts of an EXR file together; renderers write a few hundred."""
+MAX_CHANNELS = 1024
+"""Largest number of channels in a part of an EXR file; OpenImageIO has the same limit."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,7 +164,7 @@ def _check_png(path: Path) -> None:
 
 
 def _check_attributes(path: Path) -> None:
-    """Refuse an EXR with more than ``MAX_ATTRIBUTES`` attributes; OpenEXR takes minutes for 1e5.
+    """Refuse an EXR with more than ``MAX_ATTRIBUTES`` attributes or ``MAX_CHANNELS``; OpenEXR takes minutes for 1e5.
 
     Reference:
         OpenEXR File Layout, openexr.com.
@@ -177,10 +179,22 @@ def _check_attributes(path: Path) -> None:
                 if not has_parts or content[offset : offset + 1] == b"\0":
                     return
             type_end = content.find(b"\0", content.find(b"\0", offset) + 1)
-            offset = type_end + 5 + int.from_bytes(content[type_end + 1 : type_end + 5], "little")
+            start, size = type_end + 5, int.from_bytes(content[type_end + 1 : type_end + 5], "little")
+            if content[type_end - 6 : type_end] == b"chlist":
+                _check_channels(path, content[start : start + size])
+            offset = start + size
             if type_end < offset - 2**31 or offset >= len(content):  # damaged: the reader will refuse it
                 return
     raise ValueError(f"{path}: its headers hold more than {MAX_ATTRIBUTES} attributes, which is the limit")
+
+
+def _check_channels(path: Path, channels: bytes) -> None:
+    """Refuse a list of channels, each a name, a zero and 16 bytes, that is longer than ``MAX_CHANNELS``."""
+    count = offset = 0
+    while 0 < (end := channels.find(b"\0", offset)) and end > offset:
+        count, offset = count + 1, end + 17
+    if count > MAX_CHANNELS:
+        raise ValueError(f"{path}: its header has {count} channels in a part; at most {MAX_CHANNELS} are read")
 
 
 def _check_colours(path: Path, spec: Any) -> None:
