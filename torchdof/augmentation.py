@@ -26,7 +26,7 @@ from .optics.blur_table import BlurTable
 from .optics.camera import Camera
 from .options import OptionArguments, Options, spells_options
 from .tensors import floating
-from .validation import FROM_NUMPY, choice, image_and_map, number, show
+from .validation import FROM_NUMPY, choice, image_and_map, number, refuse_nested, show
 
 __all__ = ["DepthAugmentationSequential", "RandomDepthOfField"]
 
@@ -397,6 +397,7 @@ def _range(name: str, value: Any, largest: float) -> tuple[float, float]:
 
 def _batch_shape(image: Any) -> tuple[int, ...]:
     """Shape ``[B, C, H, W]`` of one image or a batch."""
+    refuse_nested("image", image)
     if not floating(image) or image.ndim not in (3, 4):
         hint = "; convert bytes with image.float() / 255, or torchvision's ToDtype(torch.float32, scale=True)"
         if floating(image):

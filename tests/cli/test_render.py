@@ -41,6 +41,12 @@ def pixels(path: str) -> Tensor:
     return read_image(path).pixels
 
 
+def cut(path: str, byte_count: int | None = None) -> None:
+    """Takes bytes from the end of a file; None takes all."""
+    content = Path(path).read_bytes()
+    Path(path).write_bytes(content[: len(content) - (byte_count or len(content))])
+
+
 SHAPED = CAMERA.replace(focus_range_m=(1.5, 1.8), tilt_deg=3.0, swing_deg=-1.0)
 BLADES = "--blades 5 --rotation 15 --curvature 0.2 --squeeze 1.5 --vignetting 0.3"
 PENTAGON = torchdof.BlurTable.polygon(5, 15.0, 0.2, squeeze=1.5, vignetting=0.3)
@@ -354,6 +360,14 @@ def test_steady_depth_flickers_less_and_resumed_or_partial_runs_give_the_same_fr
             3,
             "out.####.exr.json, which has the options of existing frames, is missing",
         ),
+        (
+            lambda: Path("out.####.exr.json").write_text(""),
+            "",
+            3,
+            "out.####.exr.json, which has the options of existing frames, is missing",
+        ),
+        (lambda: cut("out.0002.exr", 1), "", 1, "or they are cut short"),
+        (lambda: cut("out.0002.exr"), "--steady", 1, "or they are cut short"),
         (lambda: guessed(f"{SEQUENCE} --f-number 4 {PULL} --frames 1"), "", 3, "--f-number changed"),
         (lambda: guessed(f"{SEQUENCE} --f-number 4 {PULL} --frames 1"), "--f-number 4", 2, OLDER),
     ],
@@ -438,6 +452,9 @@ def test_the_folder_of_the_output_is_made(run: Run) -> None:
     assert read_image("new/folder/out.exr").pixels.shape[-1] == 24
     run(f"inspect image.exr depth.npy -o other/sheet.png --focus-m 2 {LENS}")
     assert Path("other/sheet.png").is_file()
+    run("tables disc -o third/disc.png")
+    run("fit --lens double_gauss_50mm --f-number 8 --nodes 5 -o fourth/lens.json")
+    assert Path("third/disc.png").is_file() and Path("fourth/lens.json").is_file()
 
 
 # The first command

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from ..io.atomic import check_writable
 from ..io.paths import existing_image, existing_map, samples_of
 from .command import by_option, numbers, option, word_or_number
 from .lens import Lens
@@ -213,7 +214,8 @@ def json_option() -> Any:
 
 
 def make_folder_of(path: Path) -> None:
-    """Creates the folder of ``path`` if it is missing; raises ``OSError`` if it cannot."""
+    """Creates the folder of ``path`` if it is missing; raises ``OSError`` if it cannot, or ``path`` is read-only."""
+    check_writable(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -217,7 +217,10 @@ class RenderShards:
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
     def _make(self, path: Path, source: str, samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Renders and writes one shard; returns the notes about its samples."""
+        """Renders and writes one shard; returns the notes about its samples.
+
+        Between removing the old notes and writing the new ones a shard counts as incomplete, whatever its file holds.
+        """
         records, rows = [], []
         for sample in samples:
             start, error = time.process_time(), ""
@@ -229,8 +232,9 @@ class RenderShards:
             rows.append({**row, "seconds": round(time.process_time() - start, 4)})
         with atomic_file(path) as temporary:
             (_write_tar if self.format == "webdataset" else _write_parquet)(temporary, records)
-            notes = {"bytes": temporary.stat().st_size, "source": source, "samples": rows}
-            write_text(path.with_suffix(".json"), json.dumps(notes, indent=1))  # before the shard
+            path.with_suffix(".json").unlink(missing_ok=True)
+        notes = {"bytes": path.stat().st_size, "source": source, "samples": rows}
+        write_text(path.with_suffix(".json"), json.dumps(notes, indent=1))
         return rows
 
     def _record(
