@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..validation import real_tensor
+from ..validation import real_tensor, show
 from .atomic import atomic_file
 from .channels import colour_channels, depth_channel
 from .decode import Part, check_png, first_line, read_array, read_parts, utf8_name
@@ -194,6 +194,10 @@ def write_image(
     import OpenImageIO as oiio
 
     path = Path(path)
+    if not isinstance(picture, Picture):
+        raise ValueError(
+            f"{path}: expected a Picture, got {show(picture)}; wrap a tensor [1, 3, H, W]: Picture(pixels)"
+        )
     suffix = path.suffix.lower()
     sample_types = samples_of(path)
     if sample is None:
