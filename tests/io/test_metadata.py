@@ -59,14 +59,16 @@ SEEN: dict[int, Any] = {
 }
 
 
-@pytest.mark.parametrize("suffix", [".png", ".tif", ".jpg"])
+@pytest.mark.parametrize(("suffix", "out"), [(".png", ".png"), (".tif", ".tif"), (".jpg", ".jpg"), (".jpg", ".webp")])
 @pytest.mark.parametrize("orientation", SEEN)
-def test_a_picture_is_upright_after_reading_and_writing(orientation: int, suffix: str, tmp_path: Path) -> None:
+def test_a_picture_is_upright_after_reading_and_writing(
+    orientation: int, suffix: str, out: str, tmp_path: Path
+) -> None:
     height, width = 16, 24
     stored = np.zeros((height, width, 3), np.uint8)
     stored[0:8, 8:16] = 255
     tags = {"Orientation": orientation, FILM: 26, "Make": "A", WIDTH: width, "Exif:PixelYDimension": height}
-    path, copy = tmp_path / f"stored{suffix}", tmp_path / f"copy{suffix}"
+    path, copy = tmp_path / f"stored{suffix}", tmp_path / f"copy{out}"
     attributes: dict[str, Any] = {name.replace(":", "__"): value for name, value in tags.items()}
     store(path, stored, "uint8", **attributes)
     picture = read_image(path)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 _LARGE_PX = 8_000_000  # pixels of an image; the bar shows the expected time of larger ones, and of --method fold
 _STRIPS = 16  # number of strips of an image, of which one is timed
-_WITHOUT_EXIF = (".webp", ".hdr", ".pfm")  # types in which OpenImageIO writes no EXIF data
+_WITHOUT_EXIF = (".hdr", ".pfm")  # types in which OpenImageIO writes no EXIF data
 _PANEL_PX = 800  # px; longer side of a panel on a sheet
 
 
@@ -208,7 +208,7 @@ class Renderer:
             advice = frame.scene.lens.blur_advice(largest_px, rendered.coc_px.shape[-1], self.is_still)
             self.notices.note("little blur", f"{out}: {advice}")
         has_exif = any(name.startswith("Exif:") for name in frame.picture.metadata)
-        if has_exif and out.suffix.lower() in _WITHOUT_EXIF and not self.is_animation:  # no animation holds them
+        if has_exif and out.suffix.lower() in _WITHOUT_EXIF:
             lost = f"EXIF data are lost in a {out.suffix} file; write .jpg, .png or .tif to keep them"
             self.notices.note("exif", f"{out}: {lost}")
         layers = ", ".join(frame.picture.other_layers)

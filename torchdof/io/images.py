@@ -23,6 +23,7 @@ from .channels import colour_channels, depth_channel
 from .decode import Part, check_png, first_line, read_array, read_parts, utf8_name
 from .paths import PixelType, existing_image, existing_map, samples_of
 from .transfer import Transfer, decode, default_transfer, encode, encode_8_bits
+from .webp import add_exif
 
 __all__ = ["Picture", "read_image", "read_values", "write_image"]
 
@@ -271,6 +272,8 @@ def write_image(
             problem = output.geterror()  # a full disk shows only here
             if not is_written or problem or not _is_complete(name):
                 raise OSError(f"{path}: could not be written ({first_line(problem)}); is the disk full?")
+            if suffix == ".webp" and picture.metadata:
+                add_exif(temporary, spec)
 
 
 def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Tensor:
