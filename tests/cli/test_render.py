@@ -285,6 +285,17 @@ def test_metadata_are_copied_and_bits_and_transfer_follow_the_options(image: Ten
     torch.testing.assert_close(pixels("again.exr"), image, rtol=0, atol=1e-5)
 
 
+def test_a_phones_lens_without_a_sensor_is_a_wide_one_and_an_impossible_distance_is_not_the_focus(
+    image: Tensor, run: Run
+) -> None:
+    tags = {"Exif:FocalLength": 4.0, "Exif:SubjectDistance": 0.001}
+    write_image("phone.png", Picture(image, metadata={name: ("float", value) for name, value in tags.items()}))
+    line = run("render phone.png depth.npy -o out.png")
+    assert "4 mm on 5.538 mm" in line and "sensor width assumed" in line  # 36 mm / 26 mm * 4 mm
+    assert "focus on what is nearest the middle" in line
+    assert "4 mm on 8 mm" in run("render phone.png depth.npy -o out.png --sensor-width-mm 8 --focus-m 2")
+
+
 @pytest.mark.parametrize(("suffix", "notes"), [(".webp", 0), (".hdr", 1), (".jpg", 0), (".exr", 0)])
 def test_a_note_states_that_a_type_of_file_holds_no_exif(image: Tensor, suffix: str, notes: int) -> None:
     write_image("photo.png", Picture(image, metadata={"Exif:FocalLength": ("float", 50.0)}, sample="8"))

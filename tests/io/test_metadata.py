@@ -22,6 +22,12 @@ FULL = {"sensor_width_mm": 36.0}
         ({DISTANCE: 4294967295.0}, {"focus_m": float("inf")}),
         ({"FNumber": 0.0, FOCAL: 0.0, DISTANCE: 0.0}, {}),
         ({"FNumber": "wide"}, {}),
+        # numbers that no lens has: 0/0, micrometres for millimetres, 4294967295/1
+        ({"FNumber": float("nan"), FOCAL: 4250.0, FILM: 0, DISTANCE: float("nan")}, {}),
+        ({"FNumber": 4294967295.0, FOCAL: 4.0, FILM: 65535, PLANE: 1e-9, UNIT: 2}, {"focal_length_mm": 4.0}),
+        ({"FNumber": 0.001, FOCAL: 1e-6, PLANE: float("nan"), UNIT: 9}, {}),
+        ({"FNumber": 0.0, "Exif:ApertureValue": 2.0}, {"f_number": 2.0}),
+        ({FOCAL: 0.0, FILM: 26}, {"focal_length_mm": 26.0, **FULL}),  # the equivalent lens
         ({PLANE: 6000 / 36 * 25.4, UNIT: 2}, FULL),  # 6000 pixels at 4233.333 pixels an inch are 36 mm
         ({PLANE: 6000 / 3.6, UNIT: 3}, FULL),
         ({PLANE: 6000 / 36, UNIT: 4}, FULL),

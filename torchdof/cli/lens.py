@@ -23,6 +23,7 @@ _WIDER = {  # option that sets the aperture -> how to open the lens wider
     "--equivalent": "a smaller --equivalent f-number",
     "--blur": "a larger --blur",
 }
+_PHONE_MM, _PHONE_EQUIVALENT_MM = 10.0, 26.0  # a lens shorter than this is a phone's, whose main lens is like this one
 VISIBLE_PX = 2.0  # px; a note advises more blur if the largest radius is below
 _DEFAULT_BLUR, _VISIBLE_BLUR = 0.02, 0.005  # largest blur radius over the width: by default; the smallest visible one
 _PER_OUTLIER, _MAX_SAMPLES = 1000, 2**20  # one pixel in 1000 is ignored as an outlier; most pixels examined
@@ -187,7 +188,8 @@ class Lens(Sensor):
         """The camera of one picture, and remarks on the source of the numbers that no option states.
 
         1. Take the focus from the options, else from the file, else from the subject of a still.
-        2. Take the lens from the options, else from the file, else from ``_DEFAULTS``. It is that of the full frame:
+        2. Take the lens from the options, else from the file, else from ``_DEFAULTS``, or a phone's sensor for a
+           focal length of the file that no larger camera has. It is that of the full frame:
            ``area`` is the place of the picture in it, None if the picture is the frame.
         3. Open the lens for the blur of ``--blur``, or for a visible blur in a still whose options leave it open.
 
@@ -199,10 +201,14 @@ class Lens(Sensor):
         height, width = depth.shape[-2:]
         area = area or Area(0, 0, width, height)
         stated, in_file = self._stated(area.width, area.height), camera_settings(metadata, area.width, area.height)
+        lens: dict[str, Any] = {name: (_DEFAULTS | in_file | stated)[name] for name in _DEFAULTS}
+        if in_file.get("focal_length_mm", math.inf) < _PHONE_MM and "sensor_width_mm" not in in_file | stated:
+            full_frame_mm = 36.0 * area.width / max(area.width, area.height)
+            lens["sensor_width_mm"] = full_frame_mm * in_file["focal_length_mm"] / _PHONE_EQUIVALENT_MM
         remarks, focus_m = list[str](), math.inf
         if self.focus_m is not None:
             focus_m = focus_at_frame(self.focus_m, frame)
-        elif not self.has_focus and is_to_scale and "focus_m" in in_file:
+        elif not self.has_focus and is_to_scale and 1000 * in_file.get("focus_m", 0.0) > lens["focal_length_mm"]:
             focus_m = in_file["focus_m"]
             remarks.append("focus from the file")
         elif not self.has_focus and not is_still:
@@ -214,7 +220,6 @@ class Lens(Sensor):
             remarks.append("focus on what is nearest the middle")
         if self.fov_deg is not None and not self._opening:
             raise ValueError("--fov-deg needs the opening of the lens: --aperture-radius-m, --f-number or --blur")
-        lens: dict[str, Any] = {name: (_DEFAULTS | in_file | stated)[name] for name in _DEFAULTS}
         sources = {name: "from the file" if name in in_file else "assumed" for name in _DEFAULTS if name not in stated}
         with by_option(self._names()):
             if self.fov_deg is None:
