@@ -183,6 +183,7 @@ def test_an_error_is_one_sentence_with_names_of_options(
         ("render --nonsense", "No such option '--nonsense'"),
         ("bench --repeat 0", "0 is not in the range x>=1"),
         ("nonsense", "No such command 'nonsense'"),
+        ("image.exr depth.npy -o out.exr", "to blur a picture: torchdof render image.exr DEPTH -o OUT"),
     ],
 )
 def test_wrong_usage_names_the_option_or_command(run: Callable[..., str], line: str, expected: str) -> None:

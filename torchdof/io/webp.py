@@ -37,8 +37,9 @@ def add_exif(path: Path, spec: Any) -> None:
     with tempfile.TemporaryDirectory() as folder:
         pixel = Path(folder, "pixel.png")
         output = oiio.ImageOutput.create(str(pixel))
-        is_written = output.open(str(pixel), tags) and output.write_image(np.zeros((1, 1, 3), np.uint8))
-        if not (output.close() and is_written):
+        if output is None or not (
+            output.open(str(pixel), tags) and output.write_image(np.zeros((1, 1, 3), np.uint8)) and output.close()
+        ):
             raise OSError(f"{pixel}: could not be written; is the disk full?")
         length, _, exif = pixel.read_bytes().partition(b"eXIf")
     chunks = _chunks(path) | {b"EXIF": _chunk(b"EXIF", exif[: int.from_bytes(length[-4:], "big")])}
