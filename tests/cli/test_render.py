@@ -494,6 +494,10 @@ def test_a_guess_of_metres_is_noted_unless_the_focus_is_in_metres(depth: Tensor,
     line, note = guessed("render image.exr depth.npy -o out.exr")
     assert note.startswith("note: depth.npy: taken for metres") and line.startswith("out.exr: focus 2 m")
     assert guessed(f"{ONE} {LENS}")[1] == ""
+    np.save("estimate.npy", np.linspace(2.0, 30.0, 16, dtype=np.float32)[:, None].repeat(24, 1))
+    line, note = guessed("render image.exr estimate.npy -o out.exr --focus-m 2")
+    assert "2 m, " in line and "taken for metres, as the options are in metres, but its numbers grow downwards" in note
+    assert "taken for relative depth" in guessed("render image.exr estimate.npy -o out.exr")[1]
     holed = depth.clone()
     holed[..., 3, 4:6] = 0.0
     np.save("depth.npy", holed.numpy())
