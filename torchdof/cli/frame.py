@@ -79,7 +79,10 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
     elif picture.depth is not None:
         values = picture.depth
     else:
-        raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH")
+        hint = (
+            "" if image.suffix.lower() == ".exr" else ", which a network such as Depth Anything makes of a photograph"
+        )
+        raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH{hint}")
     fill: Any = depth_map.fill_depth
     if depth_map.depth_kind == "auto":
         depth_map, guess = depth_map.guessed(values, source, scene.lens.states_metres)
