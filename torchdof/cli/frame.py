@@ -79,9 +79,7 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
     elif picture.depth is not None:
         values = picture.depth
     else:
-        hint = (
-            "" if image.suffix.lower() == ".exr" else ", which a network such as Depth Anything makes of a photograph"
-        )
+        hint = "" if image.suffix.lower() == ".exr" else ", which a network such as Depth Anything makes of it"
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH{hint}")
     fill: Any = depth_map.fill_depth
     if depth_map.depth_kind == "auto":
