@@ -31,7 +31,7 @@ NOT_CHECKED = (
 
 def public_callables() -> dict[str, Callable[..., Any]]:
     """Public functions and classes with an argument, by name."""
-    found = {}
+    found: dict[str, Callable[..., Any]] = {}
     for name in MODULES:
         module = importlib.import_module(f"torchdof{name}")
         for public in set(module.__all__) - set(NOT_CHECKED):
@@ -67,7 +67,8 @@ def test_a_first_argument_of_a_wrong_type_is_refused_as_such(
     assert not refusals_of(call, max(0, len(required) - 1)), name
 
 
-aug, partial = RandomDepthOfField(p=1.0), functools.partial
+aug = RandomDepthOfField(p=1.0)
+partial: Any = functools.partial  # for wrong types
 test_a_wrong_type_is_named = refuses(
     *((partial(aug, wrong), "image must be a floating-point tensor") for wrong in (None, "photo.png", 3)),
     *((partial(aug, IMAGE, wrong), "depth must be a tensor .* in metres, got") for wrong in ("depth.png", 3, [2.0])),

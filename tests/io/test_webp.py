@@ -38,8 +38,8 @@ def test_the_tags_are_a_chunk_after_the_picture_which_stays_as_it_is(channels: t
     parts = chunks(tagged)
     assert [*parts] == [b"VP8X", *[b"ALPH"] * (len(channels) == 4), b"VP8 ", b"EXIF"]
     assert parts[b"VP8X"] == bytes([0x18 if len(channels) == 4 else 0x08, 0, 0, 0, 22, 0, 0, 14, 0, 0])
-    images = [oiio.ImageBuf(str(path)).get_pixels(oiio.UINT8) for path in (plain, tagged)]
-    np.testing.assert_array_equal(*images)
+    without, with_tags = (oiio.ImageBuf(str(path)).get_pixels(oiio.UINT8) for path in (plain, tagged))
+    np.testing.assert_array_equal(with_tags, without)
     metadata = read_image(tagged).metadata
     assert {name: metadata[name][1] for name in TAGS} == {name: value for name, (_, value) in TAGS.items()}
     assert b"EXIF" not in chunks(plain)
