@@ -17,7 +17,11 @@ from torch import Tensor
 
 import torchdof
 from tests.files import store
+from torchdof.cli.frame import coc_of, read_frame
+from torchdof.cli.lens import Lens
 from torchdof.cli.main import app
+from torchdof.cli.options import DepthMap, Scene
+from torchdof.cli.output import Notices
 from torchdof.depth.inspect import tint_focus
 from torchdof.io.highlights import expand_highlights
 from torchdof.io.images import Picture, read_image, write_image
@@ -552,6 +556,30 @@ def test_lens_and_points_are_those_of_the_display_window(image: Tensor, depth: T
     camera = CAMERA.replace(focus_m=6.0, sensor_width_mm=2.0)
     expected = torchdof.depth_of_field(image, depth, camera, attention=(18.0, 8.0, 4.0))
     torch.testing.assert_close(pixels("out.exr"), expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("left", "top"), [(9, 3), (0, 17), (24, 20), (12, 12)])
+def test_a_part_of_the_frame_has_the_blur_that_it_has_in_the_whole(left: int, top: int) -> None:
+    """A tilted lens and lengths of rays have their centre in the middle of the display window."""
+    rays = 2 + torch.rand(1, 1, 40, 48, generator=torch.Generator().manual_seed(4))
+    rows, columns = slice(top, top + 16), slice(left, left + 24)
+    found = []
+    for area in ((slice(0, 40), slice(0, 48)), (rows, columns)):
+        light = torch.ones(1, 3, 40, 48)[(..., *area)]
+        place = (area[1].start - 7, area[0].start + 4, -7, 4, 48, 40)
+        write_image("part.exr", Picture(light, sample="float", window=place))
+        np.save("part.npy", rays[(0, 0, *area)].numpy())
+        lens = Lens(
+            tilt=0.4, swing=-0.3, focus_at=(left + 8, top + 9), focal_length_mm=30, sensor_width_mm=36, f_number=1
+        )
+        scene = Scene(lens=lens, depth_map=DepthMap(depth_kind="distance"))
+        frame = read_frame(Path("part.exr"), Path("part.npy"), scene)
+        found.append((frame.values, *coc_of(frame, Notices())[:2]))
+    (whole_m, whole_px, camera), (part_m, part_px, part_camera) = found
+    torch.testing.assert_close(part_m, whole_m[..., rows, columns])
+    torch.testing.assert_close(part_px, whole_px[..., rows, columns], rtol=1e-4, atol=1e-5)
+    assert camera is not None and part_camera is not None
+    assert part_camera.focus_m == pytest.approx(camera.focus_m)
 
 
 def test_a_note_advises_how_to_increase_a_hardly_visible_blur(run: Run) -> None:

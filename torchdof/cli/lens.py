@@ -41,6 +41,34 @@ class Area(NamedTuple):
     width: int
     height: int
 
+    def centred(self, values: "Tensor", size: "tuple[int, int]") -> "tuple[Tensor, Any]":
+        """Pads a map so that the optical axis, in the middle of the full frame, is in the middle of the map.
+
+        Args:
+            values: ``[1, 1, h, w]``, a map of the image.
+            size: Height and width of the image in pixels.
+
+        Returns:
+            The padded map, and the index of the given map in it.
+        """
+        from torch.nn.functional import pad
+
+        (height, width), (rows, columns) = size, values.shape[-2:]
+        across = round((self.width - 2 * self.x - width) * columns / width)  # > 0: the axis is right of the middle
+        down = round((self.height - 2 * self.y - height) * rows / height)
+        left, top = max(0, -across), max(0, -down)
+        padded = pad(values, (left, max(0, across), top, max(0, down)))
+        return padded, (..., slice(top, top + rows), slice(left, left + columns))
+
+
+def centred_coc_px(camera: "Camera", depth: "Tensor", area: Area) -> "Tensor":
+    """As ``camera.coc_px``, with the axis of a tilted lens in the middle of the full frame."""
+    if camera.tilt_deg == camera.swing_deg == 0:
+        return camera.coc_px(depth, depth.shape[-1])
+    padded, place = area.centred(depth, (depth.shape[-2], depth.shape[-1]))
+    wide = camera.replace(sensor_width_mm=camera.sensor_width_mm * (padded.shape[-1] / depth.shape[-1]))
+    return wide.coc_px(padded, padded.shape[-1])[place]
+
 
 def _width_fraction(text: str) -> float:
     """Reads a percentage of the width, as a fraction."""
@@ -230,9 +258,9 @@ class Lens(Sensor):
             camera = camera.replace(focus_range_m=self.focus_range, tilt_deg=self.tilt, swing_deg=self.swing)
             camera = camera.replace(sensor_width_mm=camera.sensor_width_mm * (width / area.width))
             if self.focus_at is not None:
-                camera = camera.focus_at(depth, self.focus_at[0] - area.x, self.focus_at[1] - area.y)
+                camera = self._focused(camera, depth, area, self.focus_at)
         share, is_open = self.blur_share, is_still and not self._opening and (self == Lens() or not is_to_scale)
-        largest_px = self._largest_coc_px(camera, depth) if share is not None or is_open else 0.0
+        largest_px = self._largest_coc_px(camera, depth, area) if share is not None or is_open else 0.0
         if is_open and not (is_to_scale and "f_number" in in_file and largest_px >= _VISIBLE_BLUR * width):
             share = _DEFAULT_BLUR
         if share is not None and largest_px > 0:
@@ -242,10 +270,19 @@ class Lens(Sensor):
             remarks += [f"{_LABELS[name]} {source}" for name, source in sources.items() if source]
         return camera, remarks
 
-    def _largest_coc_px(self, camera: "Camera", depth: "Tensor") -> float:
+    def _focused(self, camera: "Camera", depth: "Tensor", area: Area, point: tuple[float, float]) -> "Camera":
+        """The camera focused on a point of the full frame."""
+        x, y = point[0] - area.x, point[1] - area.y
+        if self.tilt == self.swing == 0:
+            return camera.focus_at(depth, x, y)
+        padded, (_, rows, columns) = area.centred(depth, (depth.shape[-2], depth.shape[-1]))
+        wide = camera.replace(sensor_width_mm=camera.sensor_width_mm * (padded.shape[-1] / depth.shape[-1]))
+        return camera.replace(focus_m=wide.focus_at(padded, x + columns.start, y + rows.start).focus_m)
+
+    def _largest_coc_px(self, camera: "Camera", depth: "Tensor", area: Area) -> float:
         """Largest blur radius in pixels at all keyframes of the focus, without the largest thousandth of the pixels."""
         cameras = [camera.replace(focus_m=metres) for _, metres in self.focus_m or []] or [camera]
-        radii = [at_key.coc_px(depth, depth.shape[-1]).abs().nan_to_num(0.0).flatten() for at_key in cameras]
+        radii = [centred_coc_px(at_key, depth, area).abs().nan_to_num(0.0).flatten() for at_key in cameras]
         sampled = [radius[:: 1 + radius.numel() // _MAX_SAMPLES] for radius in radii]
         return max(float(radius.kthvalue(radius.numel() - radius.numel() // _PER_OUTLIER).values) for radius in sampled)
 
