@@ -29,6 +29,8 @@ class _Commands(click.Group):
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if "." in cmd_name and not ctx.resilient_parsing:
+            ctx.fail(f"{cmd_name!r} is not a command; to blur a picture: torchdof render {cmd_name} DEPTH -o OUT")
         if cmd_name not in COMMANDS:
             return None
         module = importlib.import_module(f".{cmd_name}", __package__)

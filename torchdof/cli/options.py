@@ -87,8 +87,9 @@ class DepthMap:
     def guessed(self, values: "Tensor", path: Path, is_metric: bool) -> "tuple[DepthMap, str]":
         """The same with a guessed kind in the place of ``auto``, and a message about the guess.
 
-        If other options are in metres (``is_metric``) and so is the guess, the message is empty. Otherwise holes are
-        filled from the far side by default.
+        If other options are in metres (``is_metric``) and so is the guess, there is a message only for numbers that
+        would be taken for relative depth without these options. Otherwise holes are filled from the far side by
+        default.
         """
         from ..depth.guess import guess_kind
 
@@ -96,7 +97,11 @@ class DepthMap:
         suffix = path.suffix.lower()
         guess = guess_kind(known, suffix in _INTEGER_TYPES, is_metric or suffix in _RENDER_TYPES)
         if guess.kind == "z" and guess.scale == 1.0 and is_metric:
-            return replace(self, depth_kind="z"), ""
+            metres = replace(self, depth_kind="z")
+            if suffix in _RENDER_TYPES or guess_kind(known).kind == "z":
+                return metres, ""
+            looks = "its numbers grow downwards, as in relative depth (--depth-kind relative)"
+            return metres, f"taken for metres, as the options are in metres, but {looks}"
         unknown = guess.unknown if self.depth_unknown is None else self.depth_unknown
         fill = "far" if self.fill_depth is None else self.fill_depth
         guessed_map = replace(self, depth_kind=guess.kind, depth_unknown=unknown, fill_depth=fill)

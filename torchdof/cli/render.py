@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from ..io.animation import write_animation
 from ..io.atomic import check_writable
 from ..io.sequence import FramePattern, parse_frames
+from ..io.webp import write_animation
 from .command import argument, numbers, option, options_of
 from .options import Accuracy, Blur, Scene, check_files, json_option, make_folder_of
 from .output import Bar, json_line
@@ -95,7 +95,7 @@ class Render:
     The lens is the one you state, else the one in the file's EXIF data, else 50 mm at f/2.8 on a sensor of 36 mm; the
     printed line names the source. If you state neither focus nor lens, a single image is focused on the subject nearest
     its middle, and the lens is opened until the largest blur radius is 2 % of the width, unless the file's lens blurs
-    enough. Alpha and metadata are kept (EXIF not in WebP, HDR and PFM). A file is written whole or not at all. A likely
+    enough. Alpha and metadata are kept (EXIF not in HDR and PFM). A file is written whole or not at all. A likely
     wrong unit gives a warning on standard error, with --strict an error. --json prints one JSON object per frame.
     """
 

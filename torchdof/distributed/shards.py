@@ -78,8 +78,8 @@ def shard_rows(pairs: Sequence[Pair], per_shard: int = 64, copies: int = 1) -> l
         >>> [row["shard"] for row in shard_rows([Pair("a.png"), Pair("b.png")], per_shard=3, copies=2)]
         [0, 1]
     """
-    if not pairs:
-        raise ValueError("pairs must be at least one Pair, got none")
+    if not isinstance(pairs, Sequence) or not pairs or not all(isinstance(pair, Pair) for pair in pairs):
+        raise ValueError(f"pairs must be at least one Pair in a list, as pairs_in() returns, got {show(pairs)}")
     whole("per_shard", per_shard, 1, 10**9)
     whole("copies", copies, 1, 10**9)
     repeated = (dataclasses.asdict(pair) for pair in pairs for _ in range(copies))

@@ -17,12 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..validation import real_tensor
+from ..validation import real_tensor, show
 from .atomic import atomic_file
 from .channels import colour_channels, depth_channel
 from .decode import Part, first_line, is_complete, read_array, read_parts, utf8_name
 from .paths import PixelType, existing_image, existing_map, samples_of
 from .transfer import Transfer, decode, default_transfer, encode, encode_8_bits
+from .webp import add_exif
 
 __all__ = ["Picture", "read_image", "read_values", "write_image"]
 
@@ -194,6 +195,10 @@ def write_image(
     import OpenImageIO as oiio
 
     path = Path(path)
+    if not isinstance(picture, Picture):
+        raise ValueError(
+            f"{path}: expected a Picture, got {show(picture)}; wrap a tensor [1, 3, H, W]: Picture(pixels)"
+        )
     suffix = path.suffix.lower()
     sample_types = samples_of(path)
     if sample is None:
@@ -267,6 +272,8 @@ def write_image(
             problem = output.geterror()  # of a full disk, unless it fills up in the last flush of the buffer
             if not is_written or problem or not is_complete(temporary):
                 raise OSError(f"{path}: could not be written ({first_line(problem)}); is the disk full?")
+            if suffix == ".webp" and picture.metadata:
+                add_exif(temporary, spec)
 
 
 def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Tensor:
