@@ -77,16 +77,17 @@ soak: $(INSTALLED)
 
 INSTALLS_FROM := pyproject.toml constraints.txt CMakeLists.txt $(wildcard torchdof/native/src/*) build/modules
 
+# --no-compile: Python compiles a module when it first imports it; most of the 11,000 are never imported.
 $(INSTALLED): $(INSTALLS_FROM)
 	@echo "installing into $(VENV) all that development needs; the first time this takes minutes"
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --editable '.[dev]'
+	$(BIN)/pip install --quiet --no-compile --editable '.[dev]'
 	touch $(FOR_DEMO) $@
 
 $(FOR_DEMO): $(INSTALLS_FROM)
 	@echo "installing into $(VENV); the first time this takes a minute"
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --editable .
+	$(BIN)/pip install --quiet --no-compile --editable .
 	touch $@
 
 # An editable installation knows where each module lies: after one has moved it must be made again.
