@@ -1,4 +1,4 @@
-// Seconds from a click to the picture at 960 x 540, in headless Chromium: node measure.mjs [DIST] [CHROMIUM]
+// Seconds from a click to the picture, in headless Chromium: node measure.mjs [WIDTHxHEIGHT [DIST [CHROMIUM]]]
 //
 // The sample is enlarged and cropped to that size. Also prints the processor time of all processes of Chromium (Linux),
 // on which other programs have less influence. Needs playwright-core, here or in TORCHDOF_NODE_FOLDER.
@@ -10,7 +10,8 @@ import { dirname, join } from 'node:path'
 import { fileURLToPath } from 'node:url'
 
 const here = dirname(fileURLToPath(import.meta.url))
-const [dist = join(here, 'dist'), executablePath = '/usr/bin/chromium-headless-shell'] = process.argv.slice(2)
+const [size = '960x540', dist = join(here, 'dist'), executablePath = '/usr/bin/chromium-headless-shell'] = process.argv.slice(2)
+const [width, height] = size.split('x').map(Number)
 const require = createRequire(join(process.env.TORCHDOF_NODE_FOLDER ?? here, 'package.json'))
 const { chromium } = require('playwright-core')
 
@@ -48,25 +49,26 @@ async function timed(what, act) {
 
 try {
   await timed('opened, the sample rendered', () => page.goto(address))
-  const files = await page.evaluateHandle(async () => {
+  const files = await page.evaluateHandle(async ([width, height]) => {
     const enlarged = async (name, smooth) => {
       const bitmap = await createImageBitmap(await (await fetch(`sample/${name}`)).blob())
       const canvas = document.createElement('canvas')
-      canvas.width = 960
-      canvas.height = 540
+      canvas.width = width
+      canvas.height = height
       const context = canvas.getContext('2d')
       context.imageSmoothingEnabled = smooth
-      context.drawImage(bitmap, 0, 0, bitmap.width, (bitmap.width * 9) / 16, 0, 0, 960, 540)
+      context.drawImage(bitmap, 0, 0, bitmap.width, (bitmap.width * height) / width, 0, 0, width, height)
       return new File([await new Promise((resolve) => canvas.toBlob(resolve))], name)
     }
     const transfer = new DataTransfer()
     transfer.items.add(await enlarged('motorcycle.png', true))
     transfer.items.add(await enlarged('motorcycle_depth.png', false))
     return transfer
-  })
-  await timed('960 x 540 dropped', async () => {
+  }, [width, height])
+  await page.selectOption('#size', String(Math.max(width, height)))
+  await timed(`${width} x ${height} dropped`, async () => {
     await page.dispatchEvent('#frame', 'drop', { dataTransfer: files })
-    await page.waitForFunction(() => document.querySelector('#status').textContent.includes('960'))
+    await page.waitForFunction((width) => document.querySelector('#status').textContent.includes(String(width)), width)
     await page.selectOption('#kind', 'depth')
     await page.fill('#near', '2.1')
     await page.fill('#far', '5')

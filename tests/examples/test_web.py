@@ -79,13 +79,27 @@ def test_a_click_sharpens_where_it_falls_and_blurs_elsewhere(used: Any) -> None:
         assert np.abs(other - sharp)[window].mean() > 0.008
 
 
+def test_a_saved_file_has_the_size_of_the_photograph_or_that_of_the_screen(plain: Any, used: Any) -> None:
+    folder, seen = used
+    picture, focus_m = expected(plain, folder, 0.55, 0.6, 2 ** (-3 / 6))
+    assert seen["shownSize"] == [640, 432] and seen["fullFocus"] == f"{focus_m:.2f} m"
+    full = np.rint(255 * pixels(folder / "full.png")[..., :3])
+    assert full.shape == picture.shape, "in tiles, whose borders are not visible"
+    assert (np.abs(full - picture) > 2).mean() < 1e-4
+    names = [Path(seen[f"{name}Name"]).suffix for name in ("full", "jpeg", "webp")]
+    assert names == [".png", ".jpg", ".webp"]
+    for name, of_file in (("small.jpg", "jpeg"), ("small.webp", "webp")):
+        buffer = oiio.ImageBuf(str(folder / name))
+        assert (buffer.file_format_name, buffer.spec().width, buffer.spec().height) == (of_file, 640, 432)
+
+
 def test_the_page_works_alone_with_the_keyboard_and_on_a_phone(used: Any) -> None:
     _, seen = used
     assert seen["elsewhere"] == [] and seen["console"] == [], "nothing is fetched from other hosts"
     assert seen["nearName"] == f"motorcycle_f0.7_{seen['nearFocus'].removesuffix(' m')}m.png"
-    halves = [message["half"] for message in seen["dragAsked"] if message["type"] == "render"]
-    assert halves[0] is True and halves[-1] is False, "half the size while a control moves, the full size at rest"
-    assert [m["half"] for m in seen["nearAsked"] if m["type"] == "render"][-1] is False
+    sizes = [message["size"] for message in seen["dragAsked"] if message["type"] == "render"]
+    assert sizes[0] == "half" and sizes[-1] == "shown", "half the size while a control moves, the whole at rest"
+    assert [m["size"] for m in seen["nearAsked"] if m["type"] == "render"][-1] == "shown"
     assert seen["aperture"] == ["f/0.7", "f/1.4"]
     assert seen["keyboardFocus"][0] != seen["keyboardFocus"][1]
     assert seen["divider"] == "80" and seen["depthIsShown"]
@@ -102,4 +116,6 @@ def test_relative_depth_and_bad_files_are_explained(used: Any) -> None:
     assert "in colour" in problems["depth"] and "shades of grey" in problems["depth"]
     assert "one value everywhere" in problems["flat"]
     assert "cut_depth.png" in problems["damaged"] and "damaged" in problems["damaged"]
+    assert seen["slowPair"][0] == "slow_depth.png", "it belongs to the photo that was still being read"
+    assert "1.1 %" in seen["slowPair"][1], "maps of nearly the photo's shape are stretched"
     assert "90 × 60" in problems["frame"] and "40 × 60" in problems["frame"]

@@ -1,7 +1,7 @@
 // Clicks, drags and types in the page, in headless Chromium: node web.mjs DIST OUT CHROMIUM
-// Leaves OUT/results.json, the saved PNG files and screenshots. DIST is the page, as examples/web/build.mjs writes it.
+// Leaves OUT/results.json, the saved files and screenshots. DIST is the page, as examples/web/build.mjs writes it.
 import { spawn } from 'node:child_process'
-import { writeFileSync } from 'node:fs'
+import { readFileSync, writeFileSync } from 'node:fs'
 import { createRequire } from 'node:module'
 import { dirname, join } from 'node:path'
 import { fileURLToPath } from 'node:url'
@@ -9,6 +9,9 @@ import { fileURLToPath } from 'node:url'
 const [dist, out, executablePath] = process.argv.slice(2)
 const require = createRequire(join(process.env.TORCHDOF_NODE_FOLDER, 'package.json'))
 const { chromium } = require('playwright-core')
+// tiles of 256 px, so that the sample has several
+const settings = JSON.parse(readFileSync(join(dist, 'dof.json')))
+writeFileSync(join(dist, 'dof.json'), JSON.stringify({ ...settings, tile_px: 256 }))
 const root = join(dirname(fileURLToPath(import.meta.url)), '..', '..')
 const server = spawn('node', [join(root, 'examples', 'web', 'serve.mjs'), dist, '0'])
 const address = await new Promise((resolve) => server.stdout.once('data', (text) => resolve(String(text).trim())))
@@ -20,7 +23,7 @@ await context.addInitScript(() => {
   window.asked = []
   const post = Worker.prototype.postMessage
   Worker.prototype.postMessage = function (message, ...rest) {
-    window.asked.push({ type: message.type, half: message.half })
+    window.asked.push({ type: message.type, size: message.size })
     return post.call(this, message, ...rest)
   }
 })
@@ -69,12 +72,29 @@ try {
   results.farFocus = await text('#focus-value')
   await save('far.png')
 
+  // A smaller picture on the screen; the file has the size of the photograph and is rendered in tiles.
+  await page.selectOption('#size', '640')
+  await done()
+  await clickAt(0.55, 0.6)
+  results.fullFocus = await text('#focus-value')
+  results.shownSize = await page.locator('#after').evaluate((canvas) => [canvas.width, canvas.height])
+  results.fullName = await save('full.png')
+  await page.uncheck('#full')
+  await page.selectOption('#format', 'image/jpeg')
+  results.jpegName = await save('small.jpg')
+  await page.selectOption('#format', 'image/webp')
+  results.webpName = await save('small.webp')
+  await page.selectOption('#format', 'image/png')
+  await page.check('#full')
+  await page.selectOption('#size', '960')
+  await done()
+
   // By keyboard: the lens, the point of focus, the divider, the view.
   await asked()
   await page.focus('#aperture')
   const before = await text('#aperture-value')
   for (let i = 0; i < 6; i++) await page.keyboard.press('ArrowLeft')
-  await page.waitForFunction(() => window.asked.some((message) => message.half === false))
+  await page.waitForFunction(() => window.asked.some((message) => message.size === 'shown'))
   await done()
   results.aperture = [before, await text('#aperture-value')]
   results.dragAsked = await asked()
@@ -140,6 +160,19 @@ try {
   await done()
   await clickAt(0.02, 0.2)
   results.ownTurned = await text('#focus-value')
+  // A depth map that is chosen while the browser still decodes its photograph stays.
+  await page.evaluate(() => {
+    const decode = window.createImageBitmap
+    window.createImageBitmap = async (...given) => {
+      if (given[0].name === 'slow.png') await new Promise((resolve) => setTimeout(resolve, 500))
+      return decode(...given)
+    }
+  })
+  await page.setInputFiles('#photo-file', { name: 'slow.png', mimeType: 'image/png', buffer: photo })
+  await page.setInputFiles('#depth-file', { name: 'slow_depth.png', mimeType: 'image/png', buffer: await picture(91, 60, ['#000', '#fff']) })
+  await page.waitForFunction(() => document.querySelector('[data-slot=photo] small').textContent === 'slow.png')
+  results.slowPair = [await text('[data-slot=depth] small'), await text('#depth-note')]
+  await done()
   results.problems.frame = await problemOf('#depth-file', 'tall_depth.png', 'image/png', await picture(40, 60, ['#000', '#fff']))
 
   await page.click('#sample')

@@ -11,7 +11,8 @@ const $ = (id) => document.getElementById(id)
 const HORIZON_M = 1000 // farther is all the same to a lens
 const NEEDS_DEPTH =
   'Now add its depth map: a grey picture of distances, from an estimator such as Depth Anything, a depth camera or a renderer.'
-const SETTLED_MS = 250 // no change for so long: the full size is worth its time
+const SETTLED_MS = 250 // time without a change of the controls after which the size of the scene is rendered
+const MOST_STRETCH = 0.03 // between the shapes of photo and depth map: estimators round sizes to multiples of 14 or 64
 
 let camera
 let photo = null // {name, rgba, width, height}
@@ -19,7 +20,7 @@ let depthFile = null // {name, map}
 let isSample = false
 let scene = null // {photo, depth: {metres, width, height}, width, height, nearM, farM}
 let focusM = 2
-let result = null // the full-size picture of what the controls say
+let result = null // the picture of what the controls say, at the size of the scene
 let settling
 
 const fNumberOf = (position) => 2 ** (-position / 6) // six steps: one f-stop of half the diameter
@@ -27,17 +28,24 @@ const fNumber = () => fNumberOf(Number($('aperture').value))
 const stage = new Stage($('frame'), focusAt)
 const renderer = new Renderer({
   onSharp: (picture) => stage.showSharp(picture),
-  onBegin: (expectedMs, isHalf, isReady) => {
+  onBegin: (expectedMs, size, isReady) => {
     stage.beginProgress(expectedMs)
     if (!isReady) say('Loading the lens…')
-    if (isHalf || !isReady) return
+    if (size !== 'shown' || !isReady) return
     const about = expectedMs === null ? '' : ` about ${seconds(expectedMs)}`
     say(`Rendering ${scene.width} × ${scene.height}…${about}`)
   },
+  onTile: ({ done, count }) => {
+    say(`Rendering ${photo.width} × ${photo.height} for the file, part ${done + 1} of ${count}…`)
+  },
   onPicture: (picture) => {
     stage.endProgress()
+    if (picture.size === 'full') {
+      download(picture)
+      return
+    }
     stage.showResult(picture)
-    if (picture.half || settling !== null) return
+    if (picture.size === 'half' || settling !== null) return
     result = picture
     $('save').disabled = false
     say(`${picture.width} × ${picture.height} in ${seconds(picture.ms)}. Click what should be sharp.`)
@@ -59,12 +67,14 @@ async function take(files, slot = null) {
   if (!files.length) return
   complain(null)
   try {
+    const earlierDepth = depthFile
     const opened = { photo: null, depth: null }
     for (const file of files) {
       const kind = slot ?? (await kindOf(file))
       opened[kind] = kind === 'photo' ? await readPhoto(file) : await readDepth(file)
     }
-    if (isSample || (opened.photo && photo)) depthFile = null // it belongs to the photo that goes
+    // the depth of the photo that goes; not one that was chosen while the new photo was read
+    if (depthFile === earlierDepth && (isSample || (opened.photo && photo))) depthFile = null
     if (isSample) photo = null
     isSample = false
     photo = opened.photo ?? photo
@@ -126,7 +136,8 @@ function arrange(point = { u: 0.5, v: 0.5 }) {
   }
   const { map } = depthFile
   const [ours, theirs] = [photo.width / photo.height, map.width / map.height]
-  if (Math.abs(Math.log(ours / theirs)) > 0.02) {
+  const stretch = Math.abs(Math.log(ours / theirs))
+  if (stretch > MOST_STRETCH) {
     throw new Error(
       `The photo is ${photo.width} × ${photo.height}, its depth map ${map.width} × ${map.height}: they must show the same ` +
         'frame. Choose the depth map of this photo, not cropped and not turned.',
@@ -149,10 +160,10 @@ function arrange(point = { u: 0.5, v: 0.5 }) {
     nearM,
     farM: Math.min(Math.max(farM, nearM * 1.001), Math.max(HORIZON_M, 2 * nearM)),
   }
-  noteDepth(holes)
+  noteDepth(holes, stretch)
   $('lens').disabled = false
   stage.setActive(true)
-  renderer.setScene({ photo, depth: scene.depth, width: scene.width, height: scene.height })
+  renderer.setScene({ photo, depth: scene.depth, width: scene.width, height: scene.height, file: $('shape').value })
   focusAt(point.u, point.v, true)
 }
 
@@ -166,9 +177,10 @@ function rearrange() {
   }
 }
 
-function noteDepth(holes) {
+function noteDepth(holes, stretch) {
   const notes = [`${metresText(scene.nearM)} to ${metresText(scene.farM)} away.`]
   if (holes > 0.001) notes.push(`${Math.ceil(100 * holes)} % had no depth and was filled from behind.`)
+  if (stretch > 0.002) notes.push(`Its shape differs by ${(100 * stretch).toFixed(1)} %; it is stretched to the photo.`)
   const isStrange = scene.nearM > 300 || scene.farM < 0.03
   if (isStrange) notes.push('That is not what a photo shows: choose another unit or meaning.')
   $('depth-note').textContent = notes.join(' ')
@@ -231,12 +243,23 @@ function update(isDone) {
   describeLens()
   clearTimeout(settling)
   settling = setTimeout(finish, isDone ? 0 : SETTLED_MS)
-  if (!isDone) renderer.request({ focusM, fNumber: fNumber(), half: true })
+  if (!isDone) request('half')
 }
 
 function finish() {
   settling = null
-  if (scene) renderer.request({ focusM, fNumber: fNumber(), half: false })
+  if (scene) request('shown')
+}
+
+function request(size) {
+  const reachPx = Math.min(camera.max_coc_px, largestRadius(photo.width))
+  renderer.request({ size, file: $('shape').value, focusM, fNumber: fNumber(), tilePx: camera.tile_px, reachPx })
+}
+
+/** Largest blur radius of the scene in pixels of a picture of that width. */
+function largestRadius(width) {
+  const radius = (depthM) => Math.abs(cocPx(camera, width, focusM, fNumber(), depthM))
+  return Math.max(radius(scene.nearM), radius(scene.farM))
 }
 
 function describeLens() {
@@ -251,8 +274,7 @@ function describeLens() {
     return `${(10 * opening * Math.cos(angle)).toFixed(2)},${(10 * opening * Math.sin(angle)).toFixed(2)}`
   })
   $('iris').setAttribute('points', corners.join(' '))
-  const radius = (depthM) => cocPx(camera, scene.width, focusM, fNumber(), depthM)
-  const largest = Math.max(Math.abs(radius(scene.nearM)), Math.abs(radius(scene.farM)))
+  const largest = largestRadius($('full').checked ? photo.width : scene.width)
   $('blur-note').textContent =
     largest > camera.max_coc_px
       ? `Blur of up to ${largest.toFixed(0)} pixels in radius; this page renders ${camera.max_coc_px} at most.`
@@ -296,15 +318,31 @@ function complain(message) {
 
 /* Controls ----------------------------------------------------------------------------------------------------- */
 
-async function save() {
-  const { rgba, width, height } = result
-  const file = new Blob([await encodePng(rgba, width, height, 4)], { type: 'image/png' })
+function save() {
+  const isSmaller = result.width < photo.width || result.height < photo.height
+  if (isSmaller && $('full').checked) request('full')
+  else download(result)
+}
+
+async function download({ rgba, width, height }) {
+  const file = await encoded(rgba, width, height, $('format').value)
   const link = document.createElement('a')
   link.href = URL.createObjectURL(file)
-  link.download = `${photo.name.replace(/\.[^.]*$/, '')}_f${fNumber().toFixed(1)}_${focusM.toFixed(2)}m.png`
+  const ending = file.type === 'image/jpeg' ? 'jpg' : file.type.replace('image/', '')
+  link.download = `${photo.name.replace(/\.[^.]*$/, '')}_f${fNumber().toFixed(1)}_${focusM.toFixed(2)}m.${ending}`
   link.click()
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000)
   say(`Saved ${link.download}.`)
+}
+
+/** A file of the type, or a PNG file where the browser cannot write that type. */
+async function encoded(rgba, width, height, type) {
+  if (type === 'image/png') return new Blob([await encodePng(rgba, width, height, 4)], { type })
+  const canvas = document.createElement('canvas')
+  canvas.width = width
+  canvas.height = height
+  canvas.getContext('2d').putImageData(new ImageData(rgba, width, height), 0, 0)
+  return new Promise((resolve) => canvas.toBlob(resolve, type, 0.93))
 }
 
 function listen() {
@@ -316,6 +354,8 @@ function listen() {
   $('aperture').addEventListener('input', () => update(false))
   for (const name of ['focus', 'aperture']) $(name).addEventListener('change', () => scene && update(true))
   for (const name of ['kind', 'scale', 'near', 'far', 'size']) $(name).addEventListener('change', rearrange)
+  $('shape').addEventListener('change', () => scene && update(true))
+  $('full').addEventListener('change', () => scene && describeLens())
   for (const radio of document.querySelectorAll('[name=view]')) radio.addEventListener('change', showView)
   for (const slot of ['photo', 'depth']) {
     $(`${slot}-file`).addEventListener('change', ({ target }) => {
@@ -341,5 +381,7 @@ function listen() {
 }
 
 camera = await (await fetch('dof.json')).json()
+$('shape').append(...camera.shapes.map(({ name, file }) => new Option(name, file)))
+$('shape').closest('.pair').hidden = camera.shapes.length < 2
 listen()
 await takeSample()

@@ -3,8 +3,10 @@
 export class Renderer {
   /**
    * @param handlers.onSharp ({rgba, width, height}): the photograph at the size of the result.
-   * @param handlers.onBegin (expectedMs or null, isHalf, isReady): a picture was started, or waits for loading.
-   * @param handlers.onPicture ({rgba, width, height, half, ms}): the picture is finished.
+   * @param handlers.onBegin (expectedMs or null, size, isReady): a picture was started, or waits for loading. Its size is
+   *   'half' or 'shown', that of the scene, or 'full', that of the photograph, which is rendered in tiles.
+   * @param handlers.onTile ({done, count}): as many tiles of the full size are done.
+   * @param handlers.onPicture ({rgba, width, height, size, ms}): the picture is finished.
    * @param handlers.onFailed (message).
    */
   constructor(handlers) {
@@ -15,7 +17,7 @@ export class Renderer {
     this.#start()
   }
 
-  /** Set the scene: {photo, depth, width, height}. */
+  /** Set the scene: {photo, depth, width, height, file}; the exported file is loaded first. */
   setScene(scene) {
     this.scene = { ...scene, sceneId: ++this.sceneId }
     this.wanted = null
@@ -27,7 +29,7 @@ export class Renderer {
   request(wanted) {
     this.wanted = wanted
     if (!this.running) this.#next()
-    else if (!this.running.half && this.#isWorthStartingAgain()) this.#start()
+    else if (this.running.size !== 'half' && this.#isWorthStartingAgain()) this.#start()
   }
 
   #start() {
@@ -46,7 +48,8 @@ export class Renderer {
   #next() {
     this.running = { ...this.wanted, sceneId: this.sceneId, began: performance.now() }
     this.wanted = null
-    this.handlers.onBegin(this.isReady ? this.#expectedMs(this.running.half) : null, this.running.half, this.isReady)
+    const { size } = this.running
+    this.handlers.onBegin(this.isReady ? this.#expectedMs(size) : null, size, this.isReady)
     this.worker.postMessage({ type: 'render', ...this.running })
   }
 
@@ -57,9 +60,11 @@ export class Renderer {
       if (this.running) this.running.began = performance.now()
     } else if (data.type === 'sharp') {
       this.handlers.onSharp(data)
+    } else if (data.type === 'tile') {
+      this.handlers.onTile(data)
     } else if (data.type === 'picture') {
       const ms = performance.now() - this.running.began
-      this.msPerPixel = ms / (data.width * data.height)
+      if (data.size !== 'full') this.msPerPixel = ms / (data.width * data.height) // tiles overlap
       const isOfThisScene = this.running.sceneId === this.sceneId
       this.running = null
       if (isOfThisScene) this.handlers.onPicture({ ...data, ms })
@@ -75,14 +80,15 @@ export class Renderer {
     this.handlers.onFailed(message)
   }
 
-  #expectedMs(half) {
+  #expectedMs(size) {
     if (this.msPerPixel === null) return null
-    return (this.msPerPixel * this.scene.width * this.scene.height) / (half ? 4 : 1)
+    const { width, height } = size === 'full' ? this.scene.photo : this.scene
+    return (this.msPerPixel * width * height) / (size === 'half' ? 4 : 1)
   }
 
   /** Stops a picture in progress by ending its worker, if starting another worker is quicker than waiting. */
   #isWorthStartingAgain() {
-    const expected = this.running && this.#expectedMs(this.running.half)
+    const expected = this.running && this.#expectedMs(this.running.size)
     return expected !== null && expected - (performance.now() - this.running.began) > this.loadMs
   }
 }

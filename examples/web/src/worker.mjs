@@ -1,7 +1,9 @@
 // Renders in a worker, so that the page stays responsive.
 //
-// Takes {type: 'scene', photo, depth, width, height}, then {type: 'render', half, focusM, fNumber}.
-// Gives {type: 'ready'}, {type: 'sharp', rgba, width, height}, {type: 'picture', half, rgba, width, height} or {type: 'failed', message}.
+// Takes {type: 'scene', photo, depth, width, height, file}, then {type: 'render', size, file, focusM, fNumber, tilePx, reachPx}, where
+// size is 'half' or 'shown', that of the scene, or 'full', that of the photograph.
+// Gives {type: 'ready'}, {type: 'sharp', rgba, width, height}, {type: 'tile', done, count},
+// {type: 'picture', size, rgba, width, height} or {type: 'failed', message}.
 
 import * as ort from './ort.wasm.min.mjs'
 import { depthAtSize } from './depth.mjs'
@@ -11,38 +13,83 @@ import { linearLight, srgbBytes } from './light.mjs'
 ort.env.wasm.wasmPaths = new URL('./', import.meta.url).href
 ort.env.wasm.numThreads = self.crossOriginIsolated ? Math.min(8, navigator.hardwareConcurrency) : 1
 
-let loading = null // the runtime keeps this worker busy for seconds: the photograph is shown first
 let scene
-const sizes = new Map() // half or not -> light and depth at that size
+const loaded = new Map() // file -> promise of its DepthOfField
+const sizes = new Map() // 'half' or 'shown' -> light and depth at that size
 
-async function load() {
-  const response = await fetch(new URL('dof.onnx', import.meta.url))
-  if (!response.ok) throw new Error(`dof.onnx cannot be loaded (${response.status})`)
+function lensOf(file) {
+  if (!loaded.has(file)) loaded.set(file, load(file))
+  return loaded.get(file)
+}
+
+async function load(file) {
+  const response = await fetch(new URL(file, import.meta.url))
+  if (!response.ok) throw new Error(`${file} cannot be loaded (${response.status})`)
   const dof = await DepthOfField.load(ort, new Uint8Array(await response.arrayBuffer()))
   self.postMessage({ type: 'ready' })
   return dof
 }
 
-function atSize(half) {
-  if (!sizes.has(half)) {
+function atSize(size) {
+  if (!sizes.has(size)) {
     const { photo, depth } = scene
-    const width = half ? Math.ceil(scene.width / 2) : scene.width
-    const height = half ? Math.ceil(scene.height / 2) : scene.height
-    sizes.set(half, {
+    const width = size === 'half' ? Math.ceil(scene.width / 2) : scene.width
+    const height = size === 'half' ? Math.ceil(scene.height / 2) : scene.height
+    sizes.set(size, {
       width,
       height,
       light: linearLight(photo.rgba, photo.width, photo.height, width, height),
       depth: depthAtSize(depth.metres, depth.width, depth.height, width, height),
     })
   }
-  return sizes.get(half)
+  return sizes.get(size)
 }
 
-async function render({ half, focusM, fNumber }) {
-  const dof = await loading
-  const { light, depth, width, height } = atSize(half)
+async function render({ size, file, focusM, fNumber }) {
+  const dof = await lensOf(file)
+  const { light, depth, width, height } = atSize(size)
   const rgba = srgbBytes(await dof.render(light, depth, width, height, focusM, fNumber))
-  self.postMessage({ type: 'picture', half, rgba, width, height }, [rgba.buffer])
+  self.postMessage({ type: 'picture', size, rgba, width, height }, [rgba.buffer])
+}
+
+/**
+ * Renders the photograph at its full size in square tiles, because a browser's memory does not hold a whole one.
+ *
+ * Each tile is rendered with a margin that blur and hidden surfaces do not cross. The file computes the blur from the
+ * width of its image, so the f-number is scaled by the tile's share of the whole width.
+ */
+async function renderTiles({ file, focusM, fNumber, tilePx, reachPx }) {
+  const dof = await lensOf(file)
+  const { rgba: photo, width, height } = scene.photo
+  const depth = depthAtSize(scene.depth.metres, scene.depth.width, scene.depth.height, width, height)
+  const margin = 2 * Math.ceil(reachPx) + 32
+  const rgba = new Uint8ClampedArray(4 * width * height)
+  const count = Math.ceil(width / tilePx) * Math.ceil(height / tilePx)
+  let done = 0
+  for (let top = 0; top < height; top += tilePx) {
+    for (let left = 0; left < width; left += tilePx) {
+      self.postMessage({ type: 'tile', done: done++, count })
+      const [x0, x1] = [Math.max(0, left - margin), Math.min(width, left + tilePx + margin)]
+      const [y0, y1] = [Math.max(0, top - margin), Math.min(height, top + tilePx + margin)]
+      const [w, h] = [x1 - x0, y1 - y0]
+      const light = linearLight(part(photo, 4 * width, 4 * x0, 4 * x1, y0, y1), w, h)
+      const out = await dof.render(light, part(depth, width, x0, x1, y0, y1), w, h, focusM, (fNumber * w) / width)
+      const tile = srgbBytes(out)
+      for (let y = top; y < Math.min(height, top + tilePx); y++) {
+        const row = 4 * w * (y - y0)
+        const inner = tile.subarray(row + 4 * (left - x0), row + 4 * (Math.min(width, left + tilePx) - x0))
+        rgba.set(inner, 4 * (width * y + left))
+      }
+    }
+  }
+  self.postMessage({ type: 'picture', size: 'full', rgba, width, height }, [rgba.buffer])
+}
+
+/** Columns x0 to x1 and rows y0 to y1 of an image, a typed array of `across` values a row. */
+function part(values, across, x0, x1, y0, y1) {
+  const cut = new values.constructor((x1 - x0) * (y1 - y0))
+  for (let y = y0; y < y1; y++) cut.set(values.subarray(across * y + x0, across * y + x1), (x1 - x0) * (y - y0))
+  return cut
 }
 
 self.onmessage = async ({ data }) => {
@@ -50,13 +97,12 @@ self.onmessage = async ({ data }) => {
     if (data.type === 'scene') {
       scene = data
       sizes.clear()
-      const { light, width, height } = atSize(false)
+      const { light, width, height } = atSize('shown')
       const rgba = srgbBytes(light)
       self.postMessage({ type: 'sharp', rgba, width, height }, [rgba.buffer])
-      loading ??= load()
-      await loading
+      await lensOf(data.file) // last, because the runtime keeps this worker busy for seconds
     } else {
-      await render(data)
+      await (data.size === 'full' ? renderTiles(data) : render(data))
     }
   } catch (error) {
     self.postMessage({ type: 'failed', message: String(error?.message ?? error) })
