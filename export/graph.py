@@ -82,7 +82,7 @@ class Portable(nn.Module):
         self.dof = copy.copy(dof)
         self.dof.options = dataclasses.replace(dof.options, check=False, depth_edges=depth_edges)
         self.called = dataclasses.replace(dof.options, check=False)
-        self.plan = Plan.all(dof.options.max_coc_px, dof.options.tolerance, rays=True)
+        self.plan = Plan.static(dof.options.max_coc_px, dof.options.tolerance, rays=True)
         self.ops = WholeOps() if layout == "whole" else Ops()
         self.ops.lens_width = width
         self.eval()

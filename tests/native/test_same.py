@@ -65,7 +65,7 @@ def maps() -> dict[str, Tensor]:
 @pytest.mark.parametrize("tolerance", [0.0, 0.5 / 255, 1 / 255, 8 / 255, 0.3])
 @pytest.mark.parametrize("coc", maps().values(), ids=maps())
 def test_both_engines_plan_the_same_layers(coc: Tensor, tolerance: float) -> None:
-    compiled, plain = Plan.of_frame(coc, tolerance), Plan.of_frame(coc.double(), tolerance)
+    compiled, plain = Plan.for_scene(coc, tolerance), Plan.for_scene(coc.double(), tolerance)
     assert compiled.tolerance == pytest.approx(plain.tolerance, rel=1e-6)
     assert len(compiled.nodes) == len(plain.nodes)
     assert compiled.nodes == pytest.approx(plain.nodes, rel=1e-5, abs=1e-5)

@@ -99,7 +99,7 @@ def test_a_stack_in_a_batch_is_rendered_as_alone(tolerance: Any) -> None:
 
 def test_layers_of_several_plans_are_joined_by_side_and_resolution() -> None:
     plans = [
-        Plan.of_scene(torch.tensor(ends).reshape(1, 1, 1, -1).expand(1, 1, 100, -1), 1 / 255)
+        Plan.for_scene(torch.tensor(ends).reshape(1, 1, 1, -1).expand(1, 1, 100, -1), 1 / 255, adapt=False)
         for ends in ([-40.0, 3.0], [-1.0, 0.0, 25.0], [5.0, 9.0])
     ]
     nodes, blurs = joined_layers(plans, BlurTable.disc(), SIZE, torch.empty(0, dtype=torch.float64))

@@ -548,7 +548,7 @@ def coc_px(depth: Tensor, scale: float, nearest_m: float, farthest_m: float) -> 
 
 
 def plan(coc_px: Tensor, tolerance: float) -> tuple[tuple[float, ...], float]:
-    """Positions of the layers for a frame, as ``torchdof.render.plan.Plan.of_frame``.
+    """Positions of the layers for a frame, as ``torchdof.render.plan.Plan.for_scene``.
 
     Args:
         coc_px: Signed coc of the frame, ``[B, 1, H, W]``, float32, in pixels.

@@ -94,11 +94,11 @@ def _planned(
         # Floats rebuilt from hex become constants of the graph. The options' own floats would become inputs of the
         # graph if they differ between two modules.
         max_coc_px, tolerance = (float.fromhex(float(n).hex()) for n in (options.max_coc_px, options.tolerance))
-        plan = Plan.all(max_coc_px, tolerance)
+        plan = Plan.static(max_coc_px, tolerance)
     elif plan is None and any(map(is_differentiated, maps[1::2])):
-        plan = Plan.of_frame(torch.cat(maps[1::2]), options.tolerance, still=True)
+        plan = Plan.for_scene(torch.cat(maps[1::2]), options.tolerance, on_grid=True)
     elif plan is not None and not is_traced():
-        plan = plan.reaching(torch.cat(maps[1::2]))
+        plan = plan.extended_to(torch.cat(maps[1::2]))
     if plan is not None:
         return _render_items([plan], options, ops, *maps).to(image.dtype)
     # one plan for each item, so that the result does not depend on the rest of the batch
@@ -124,10 +124,10 @@ def _each_planned(
     uniform = options.method == "layered" and not options.table.depends_on_place
     if len(scenes) == 1 or not uniform or (native.chosen() and all(is_in_memory(t, backward=True) for t in maps)):
         # the compiled engine renders item by item
-        plans = [Plan.of_frame(scene, options.tolerance) for scene in scenes]
+        plans = [Plan.for_scene(scene, options.tolerance) for scene in scenes]
         items = [render([plan], *item) for plan, *item in zip(plans, *(t.split(1) for t in maps), strict=True)]
         return items[0] if len(items) == 1 else torch.cat(items)
-    plans = Plan.of_items(scenes, options.tolerance)
+    plans = Plan.for_scenes(scenes, options.tolerance)
     most = max(1, _TOGETHER // math.prod(scenes[0].shape[-2:]))
     joined = [i for i, plan in enumerate(plans) if len(plan.nodes) > 1]  # a plane has one layer, whose kernel is exact
     groups = [joined[i : i + most] for i in range(0, len(joined), most)]
@@ -164,7 +164,7 @@ def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
         return _render_items(plans, options, EAGER, light, coc, cover=cover)
 
     if is_differentiated(coc):
-        rendered = render([Plan.of_frame(coc.flatten(0, 1), options.tolerance, still=True)], light, coc, cover)
+        rendered = render([Plan.for_scene(coc.flatten(0, 1), options.tolerance, on_grid=True)], light, coc, cover)
     else:
         rendered = _each_planned(render, [*coc], options, [light, coc, cover])
     return (rendered / scale).to(rgba.dtype)

@@ -72,7 +72,7 @@ class Plan:
         grows: Whether layers are added for a scene that is blurred more than the outermost ones. False, as in plans
             for every scene: larger blurs are clamped to the outermost layers.
         kernels_per_px: Kernels of highlights per pixel of radius; between them kernels are interpolated.
-        pixels: Share of the scene's pixels in each layer; None unless :meth:`of_pixels` computed it.
+        pixels: Share of the scene's pixels in each layer; None unless :meth:`with_pixels` computed it.
 
     Raises:
         ValueError: If ``nodes`` are not strictly increasing numbers, or ``tolerance`` is not a number in [0, 1).
@@ -99,21 +99,29 @@ class Plan:
         tolerance_of(self.tolerance)
 
     @classmethod
-    def of_frame(cls, coc_px: Tensor, tolerance: float, still: bool = False) -> "Plan":
-        """Layers for a frame ``[B, 1, H, W]`` whose error must not exceed ``tolerance``: the plan of every rendering.
+    def for_scene(cls, coc_px: Tensor, tolerance: float, on_grid: bool = False, adapt: bool = True) -> "Plan":
+        """Layers for one scene ``[B, 1, H, W]``, at both ends of its coc range and dense near the coc of its border.
 
-        Errors are largest beside depth edges and the border. In a frame that is small compared with its blur radii,
-        most pixels are near one: the tolerance is multiplied by ``shorter side / (3 * radius)``, with the mean radius
-        of the most blurred hundredth of its pixels. With ``still`` the factor is rounded down to a power of 1/2, so
-        that layers do not move with the scene.
+        A scene of one plane gets one layer, whose kernel is exact. NaN is ignored.
+
+        Args:
+            coc_px: Signed coc in pixels.
+            tolerance: Largest error of the picture, in [0, 1).
+            on_grid: Whether layers lie at places that do not depend on the scene, as gradients need.
+            adapt: Whether the tolerance is reduced for small frames. Errors are largest beside depth edges and the
+                border. In a frame that is small compared with its blur radii, most pixels are near one, so the
+                tolerance is multiplied by ``shorter side / (3 * radius)``, with the mean radius of the most blurred
+                hundredth of its pixels. With ``on_grid`` the factor is rounded down to a power of 1/2.
         """
-        if not still and coc_px.dtype == torch.float32 and is_in_memory(coc_px) and native.chosen():
+        if not adapt:
+            return cls._between(*layer_cocs.together(layer_cocs.spreads(coc_px)), tolerance)
+        if not on_grid and coc_px.dtype == torch.float32 and is_in_memory(coc_px) and native.chosen():
             return cls(*native.plan(coc_px, tolerance))
-        return cls.of_items([coc_px], tolerance, still)[0]
+        return cls.for_scenes([coc_px], tolerance, on_grid)[0]
 
     @classmethod
-    def of_items(cls, scenes: Sequence[Tensor], tolerance: float, still: bool = False) -> list["Plan"]:
-        """The plan of :meth:`of_frame` for each scene ``[N, 1, H, W]``, all of one shape.
+    def for_scenes(cls, scenes: Sequence[Tensor], tolerance: float, on_grid: bool = False) -> list["Plan"]:
+        """The plan of :meth:`for_scene` for each scene ``[N, 1, H, W]``, all of one shape.
 
         Values are copied to the host once for all scenes, and once more if a frame is small beside its blur radii.
         """
@@ -128,7 +136,7 @@ class Plan:
         plans = []
         for (low, high, border), radius in zip(spreads, radii, strict=True):
             part = min(1.0, shorter / (_SMALL_RADII * max(radius, 1.0)))
-            if still:
+            if on_grid:
                 loose = tolerance * 2.0 ** math.floor(math.log2(part))
                 plans.append(cls(layer_cocs.spaced_nodes(low, high, loose), loose))
             else:
@@ -136,16 +144,8 @@ class Plan:
         return plans
 
     @classmethod
-    def of_scene(cls, coc_px: Tensor, tolerance: float) -> "Plan":
-        """Layers for one scene ``[B, 1, H, W]``, at both ends of its coc range and dense near the coc of its border.
-
-        A scene of one plane gets one layer, whose kernel is exact. NaN is ignored.
-        """
-        return cls._between(*layer_cocs.together(layer_cocs.spreads(coc_px)), tolerance)
-
-    @classmethod
     def _between(cls, low: float, high: float, border: np.ndarray, tolerance: float) -> "Plan":
-        """The same, for a scene that spans ``low`` to ``high`` on the blur axis, with the places of its border."""
+        """Layers for a scene that spans ``low`` to ``high`` on the blur axis, with the places of its border."""
         if high <= low:
             return cls((low,), tolerance)
         fixed = [low, high]
@@ -163,7 +163,7 @@ class Plan:
         return cls(tuple(sorted(nodes)), tolerance)
 
     @classmethod
-    def all(cls, max_coc_px: float, tolerance: float, rays: bool = False) -> "Plan":
+    def static(cls, max_coc_px: float, tolerance: float, rays: bool = False) -> "Plan":
         """Layers for every scene up to a radius: the plan of a compiled module or, with ``rays``, of an exported one.
 
         The coc at the borders of these scenes is unknown, so the coarse layers, whose errors it affects, are denser.
@@ -173,19 +173,19 @@ class Plan:
         inner = [x for x in layer_cocs.spaced_nodes(-reach, reach, tolerance, dense_from) if abs(x) < last]
         return cls((-reach, *inner, reach), tolerance, rays, grows=False, kernels_per_px=_FEWER_KERNELS_PER_PX)
 
-    def reaching(self, coc_px: Tensor) -> "Plan":
-        """This plan with layers added outwards until they span a scene ``[B, 1, H, W]``; itself if none is missing."""
+    def extended_to(self, coc_px: Tensor) -> "Plan":
+        """This plan with layers added outwards until they span a scene ``[B, 1, H, W]``."""
         nearest, farthest = layer_cocs.extent(coc_px)
         if not self.grows or (self.nodes[0] <= nearest and farthest <= self.nodes[-1]):
             return self
-        nodes, scene = list(self.nodes), Plan.of_scene(coc_px, self.tolerance)
+        nodes, scene = list(self.nodes), Plan.for_scene(coc_px, self.tolerance, adapt=False)
         for sign, last in ((-1.0, -self.nodes[0]), (1.0, self.nodes[-1])):
             gap = 0.3 * layer_cocs.spacing(last, self.tolerance)
             beyond = [sign * x for x in scene.nodes if sign * x > last]
             nodes += [sign * x for x in beyond if x > last + gap or x == max(beyond)]
         return dataclasses.replace(self, nodes=tuple(sorted(nodes)), pixels=None)
 
-    def of_pixels(self, coc_px: Tensor) -> "Plan":
+    def with_pixels(self, coc_px: Tensor) -> "Plan":
         """The same plan with ``pixels``: the share of a scene ``[B, 1, H, W]`` that lies in each layer."""
         x = layer_cocs.on_axis(coc_px.detach(), max(coc_px.shape[-2:])).clamp(self.nodes[0], self.nodes[-1])
         ends = ramps([self.nodes], x).split(1, -1)  # one at a time, to bound the memory
