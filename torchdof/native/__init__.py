@@ -64,8 +64,8 @@ Rules = Sequence[tuple[int, float, float, float]]
 _Floats = ctypes.POINTER(ctypes.c_float)
 
 
-class FieldShares(Protocol):
-    """Transmittance of the lens's field over kernels of one radius: :class:`torchdof.optics.placed_kernels.Shares`."""
+class FieldMask(Protocol):
+    """Mask of a lens's field for kernels of one radius: :class:`torchdof.optics.placed_kernels.FieldMask`."""
 
     @property
     def values(self) -> Tensor:
@@ -80,8 +80,8 @@ class FieldShares(Protocol):
         """Signed radius in pixels."""
 
 
-class _Shares(ctypes.Structure):
-    """``torchdof_shares`` of ``src/api.h``."""
+class _FieldMask(ctypes.Structure):
+    """``torchdof_field_mask`` of ``src/api.h``."""
 
     _fields_ = [  # noqa: RUF012
         ("values", ctypes.c_void_p),
@@ -174,7 +174,7 @@ class _Scene(ctypes.Structure):
         ("highlights", ctypes.c_int32),
         ("crisp_px", ctypes.c_float),
         *_OF_LAYERS,
-        ("shares", ctypes.POINTER(_Shares)),
+        ("shares", ctypes.POINTER(_FieldMask)),
         ("distances", ctypes.c_int32),
         ("squeeze", ctypes.c_float),
         ("threads", ctypes.c_int32),
@@ -272,8 +272,8 @@ def render(
     masked: bool,
     highlights: bool,
     crisp_px: float,
-    shares: Sequence[FieldShares],
-    ray_shares: Callable[[list[int]], Sequence[FieldShares]],
+    field_masks: Sequence[FieldMask],
+    ray_masks: Callable[[list[int]], Sequence[FieldMask]],
     squeeze: float,
 ) -> Tensor:
     """Renders depth of field for one image, with as many threads as PyTorch uses.
@@ -290,8 +290,8 @@ def render(
         masked: Whether values may be NaN or infinite; such pixels are copied.
         highlights: Whether highlights are rendered ray by ray where layers would soften them.
         crisp_px: Blur in pixels above which layers soften highlights.
-        shares: Transmittance of the field for each layer, float32 and contiguous; empty if the lens has no field.
-        ray_shares: The same for highlights, from their radii in steps of 1/32 pixel; in ascending order of radius.
+        field_masks: Transmittance of the field for each layer, float32 and contiguous; empty if the lens has no field.
+        ray_masks: The same for highlights, from their radii in steps of 1/32 pixel; in ascending order of radius.
         squeeze: Height of the blur divided by its width.
 
     Returns:
@@ -322,8 +322,8 @@ def render(
         highlights,
         crisp_px,
         *of_layers,
-        _shares(shares) if shares else None,
-        shares[0].values.shape[1] if shares else 0,
+        _field_masks(field_masks) if field_masks else None,
+        field_masks[0].values.shape[1] if field_masks else 0,
         squeeze,
         torch.get_num_threads(),
         ctypes.pointer(cancelled),
@@ -338,8 +338,8 @@ def render(
             count = engine.torchdof_radii(job, ctypes.byref(steps))
             rays = [psf.contiguous() for psf in psfs(steps[:count])] if count else []
             halves = _array(ctypes.c_int32, max(1, count))(*(psf.shape[-1] // 2 for psf in rays))
-            spots = ray_shares(steps[:count]) if count and shares else []
-            of_rays = _shares(spots) if spots else None
+            spots = ray_masks(steps[:count]) if count and field_masks else []
+            of_rays = _field_masks(spots) if spots else None
             _check(engine.torchdof_finish(job, _pointers(rays), halves, of_rays, len(spots), out.data_ptr()))
         finally:
             engine.torchdof_free(job)
@@ -674,12 +674,12 @@ def _check(status: int) -> None:
         raise KeyboardInterrupt
 
 
-def _shares(shares: Sequence[FieldShares]) -> Any:
+def _field_masks(masks: Sequence[FieldMask]) -> Any:
     made = []
-    for each in shares:
+    for each in masks:
         colours, _, rows, columns = each.values.shape
-        made.append(_Shares(each.values.data_ptr(), each.boxes.data_ptr(), each.coc_px, colours, rows, columns))
-    return _array(_Shares, len(made))(*made)
+        made.append(_FieldMask(each.values.data_ptr(), each.boxes.data_ptr(), each.coc_px, colours, rows, columns))
+    return _array(_FieldMask, len(made))(*made)
 
 
 def _pointers(tensors: Sequence[Tensor | None]) -> Any:
@@ -736,7 +736,7 @@ def _library() -> tuple[ctypes.CDLL | None, str]:
         pointer,
         ctypes.POINTER(pointer),
         ctypes.POINTER(ctypes.c_int32),
-        ctypes.POINTER(_Shares),
+        ctypes.POINTER(_FieldMask),
         ctypes.c_int32,
         pointer,
     ]

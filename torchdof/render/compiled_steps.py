@@ -8,13 +8,16 @@ from torch import Tensor
 
 from .. import native
 from ..tensors import is_in_memory, is_traced
-from .surfaces import Frame, PaddedSurface
+from .surfaces import PaddedFrame, PaddedSurface
 
 __all__ = ["blended", "looked_behind"]
 
 
 def blended(
-    frame: Frame, layers: Sequence[tuple[Tensor, int]], backed: bool, plain: Callable[[Sequence[PaddedSurface]], Tensor]
+    frame: PaddedFrame,
+    layers: Sequence[tuple[Tensor, int]],
+    backed: bool,
+    plain: Callable[[Sequence[PaddedSurface]], Tensor],
 ) -> Tensor | None:
     """Composite all layers of a frame, with its gradient: light followed by its weights, ``[B, C + 1 or C, h, w]``.
 

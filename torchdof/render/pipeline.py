@@ -26,7 +26,7 @@ from .matting import matte
 from .ops import EAGER, Ops
 from .plan import Plan, joined_layers
 from .scatter import fold
-from .surfaces import Frame, Surface, pad_to_frame
+from .surfaces import PaddedFrame, Surface, pad_to_frame
 from .traced import is_compiled
 
 __all__ = ["blur", "blur_stack"]
@@ -313,7 +313,7 @@ def _composite(
     frame = pad_to_frame(surfaces, behind, nodes, margin, multiple, options.occlusion, image != 0, lit, limit, image)
     scatter = functools.partial(convolve, turned=not options.table.is_round) if layered else fold
 
-    def scattered(frame: Frame) -> Tensor:
+    def scattered(frame: PaddedFrame) -> Tensor:
         if options.occlusion:
             return composite.over(frame, blurs, scatter, ops)
         if layered:

@@ -12,7 +12,7 @@ from torch import Tensor
 from .. import native
 from ..optics.blur_table import BlurTable
 from ..optics.kernel_bank import Spots, bank_of
-from ..optics.placed_kernels import Shares, layer_shares
+from ..optics.placed_kernels import FieldMask, layer_mask
 from ..tensors import is_in_memory, is_traced
 from ..validation import show, tolerance_of
 from . import layer_cocs, traced
@@ -42,13 +42,13 @@ _FARTHEST_PX = 1e9  # px: upper limit of nodes; frames are smaller
 class LayerKernel:
     """How one layer is scattered: at every ``scale``-th pixel, with a kernel ``[1 or C, k, k]`` in such pixels.
 
-    The kernel is ``[B, 1 or C, k, k]`` if each item of a batch has its own. ``shares`` are the masks that change the
-    kernel across the frame; None: it is the same everywhere.
+    The kernel is ``[B, 1 or C, k, k]`` if each item of a batch has its own. ``mask`` changes the kernel
+    across the frame; None means that it is the same everywhere.
     """
 
     kernel: Tensor
     scale: int
-    shares: Shares | None = None
+    mask: FieldMask | None = None
 
     @property
     def half(self) -> int:
@@ -241,21 +241,21 @@ class Plan:
             bank = _moved(made, device, dtype)
         if not table.depends_on_place:
             return [LayerKernel(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
-        shares = self.shares(table, scales, (int(size[0]), int(size[1])))
-        return [LayerKernel(*each) for each in zip(bank, scales, shares, strict=True)]
+        masks = self.field_masks(table, scales, (int(size[0]), int(size[1])))
+        return [LayerKernel(*each) for each in zip(bank, scales, masks, strict=True)]
 
     def constants(self, table: BlurTable, coarse: bool, lens_width: int) -> list[Tensor]:
         """Kernels of the layers as constants of a trace, not cut to a frame."""
         return _layer_kernels(table, self.coc_px, *self.layer_sizes(table, (1, lens_width), coarse))
 
-    def shares(
+    def field_masks(
         self, table: BlurTable, scales: Sequence[int], size: tuple[int, int], like: Tensor | None = None
-    ) -> list[Shares]:
+    ) -> list[FieldMask]:
         """Field masks of each layer's kernel, in the dtype and device of ``like``; empty for a lens without a field."""
         if not table.depends_on_place:
             return []
-        shares = [layer_shares(table, coc, scale, size) for coc, scale in zip(self.coc_px, scales, strict=True)]
-        return shares if like is None else [each.to(like) for each in shares]
+        masks = [layer_mask(table, coc, scale, size) for coc, scale in zip(self.coc_px, scales, strict=True)]
+        return masks if like is None else [each.to(like) for each in masks]
 
     def layer_sizes(self, table: BlurTable, size: tuple[int, int], coarse: bool) -> tuple[int, tuple[int, ...]]:
         """Image width for the kernels (1 if they do not depend on it) and downsampling factor of each layer."""

@@ -14,7 +14,15 @@ from ..tensors import is_traced
 from .border import continued
 from .layer_weights import blur_axis, eased, ramps, weights_at_or_behind
 
-__all__ = ["HIDDEN_WEIGHT", "Frame", "Highlights", "PaddedSurface", "Surface", "continuation_weight", "pad_to_frame"]
+__all__ = [
+    "HIDDEN_WEIGHT",
+    "Highlights",
+    "PaddedFrame",
+    "PaddedSurface",
+    "Surface",
+    "continuation_weight",
+    "pad_to_frame",
+]
 
 HIDDEN_WEIGHT = 0.003
 """Weight of a hidden sample, which is guessed; a visible one has 1. A larger value mixes more guessed light in."""
@@ -53,7 +61,7 @@ class PaddedSurface(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Frame:
+class PaddedFrame:
     """Surfaces of a frame, continued beyond its border; the layers are cut out of it.
 
     Args:
@@ -92,7 +100,7 @@ class Frame:
         kept = slice(start, -start or None)
         return values[..., kept, kept]
 
-    def near_to_far(self) -> "Frame":
+    def near_to_far(self) -> "PaddedFrame":
         """The same frame with its two surfaces sorted near to far in each pixel."""
         if self.stacked or len(self.surfaces) == 1:
             return self
@@ -215,17 +223,17 @@ def pad_to_frame(
     lit: bool = True,
     limit: Tensor | None = None,
     image: int | None = 0,
-) -> Frame:
+) -> PaddedFrame:
     """Continue the surfaces of an image beyond its border to a frame (:mod:`torchdof.render.border`).
 
     Args:
         surfaces: Near to far if stacked; else one surface, or the two that share each pixel.
-        nodes: As in :class:`Frame`; surfaces beyond the outermost nodes are clamped to them.
+        nodes: As in :class:`PaddedFrame`; surfaces beyond the outermost nodes are clamped to them.
         behind: Light behind all surfaces, ``[B, C, H, W]``; None: there is no such light.
-        margin: As in :class:`Frame`.
+        margin: As in :class:`PaddedFrame`.
         multiple: The area is extended to multiples of this many pixels, at least a pixel of the coarsest layer.
-        occlusion: As in :class:`Frame`.
-        stacked: As in :class:`Frame`.
+        occlusion: As in :class:`PaddedFrame`.
+        stacked: As in :class:`PaddedFrame`.
         lit: Whether light is continued beyond the border too; False: it is 0 there.
         limit: Largest light that is not a highlight, ``[B, 1, H, W]``: light above it is not continued; None: all is.
         image: Index of the image's own surface; None: the surfaces are layers, each known everywhere.
@@ -256,4 +264,6 @@ def pad_to_frame(
     placed = [PaddedSurface(*parts) for parts in zip(lights, *maps, strict=True)]
     if behind is not None:
         behind = functional.pad(behind, beyond, mode="replicate")
-    return Frame(placed, nodes, ramps(nodes, placed[0].x), behind, margin, (height, width), size, occlusion, stacked)
+    return PaddedFrame(
+        placed, nodes, ramps(nodes, placed[0].x), behind, margin, (height, width), size, occlusion, stacked
+    )

@@ -34,7 +34,7 @@ typedef struct {
   float radius;            // signed coc in pixels of the layer
   int32_t colours;         // 1 or channels
   int32_t rows, columns;
-} torchdof_shares;
+} torchdof_field_mask;
 
 typedef struct {
   int32_t height, width, channels;
@@ -56,7 +56,7 @@ typedef struct {
   int32_t kernel_colours;  // 1 or channels
   const float *kernels;    // for each layer [kernel_colours, 2 half + 1, 2 half + 1]
 
-  const torchdof_shares *shares;  // for each layer; null: the kernels are the same everywhere in the frame
+  const torchdof_field_mask *shares;  // for each layer; null: the kernels are the same everywhere in the frame
   int32_t distances;              // number of field distances, from the centre of the frame to its corner
   float squeeze;                  // height of the blur divided by its width
 
@@ -102,7 +102,7 @@ TORCHDOF_API int64_t torchdof_radii(const torchdof_job *job, const int32_t **ste
 // kernels[i] is for radius i: [kernel_colours, 2 halves[i] + 1, 2 halves[i] + 1]. shares: in ascending order of radius,
 // and at least two, or null if layers have none. out: [channels, height, width].
 TORCHDOF_API int32_t torchdof_finish(torchdof_job *job, const float *const *kernels, const int32_t *halves,
-                                     const torchdof_shares *shares, int32_t shares_count, float *out);
+                                     const torchdof_field_mask *shares, int32_t shares_count, float *out);
 
 TORCHDOF_API void torchdof_free(torchdof_job *job);
 

@@ -236,7 +236,7 @@ struct Layer {
   double node = 0;
   float before = 0, per_before = 0, at = 0, per_after = 0;  // ends and slopes of the ramps before and after the layer
   bool first = false;
-  const torchdof_shares *shares = nullptr;
+  const torchdof_field_mask *shares = nullptr;
   bool spots = false;           // shares are 0 at and beyond the edge of their samples
   std::vector<Kernel> kernels;  // 1, or one for each colour
 };
@@ -510,7 +510,7 @@ class FieldMask {
   static constexpr float LEAST = 1e-6f;         // share of a kernel's light below which the kernel is left unmasked
 
   // For the samples a, or the mix of a and b with weight `part` of b. y, x: position in half diagonals from the centre.
-  FieldMask(const torchdof_scene &scene, const torchdof_shares &a, const torchdof_shares *b, float part, int colour, float y, float x)
+  FieldMask(const torchdof_scene &scene, const torchdof_field_mask &a, const torchdof_field_mask *b, float part, int colour, float y, float x)
       : squeeze_(scene.squeeze), part_(part), both_(b != nullptr) {
     x += ASIDE;
     const float distance = std::sqrt(y * y + x * x), place = std::min(distance, 1.0f) * (scene.distances - 1);
@@ -518,7 +518,7 @@ class FieldMask {
     const float near = place - low;
     down_ = y / distance;
     right_ = x / distance;
-    const torchdof_shares *const of[2] = {&a, b};
+    const torchdof_field_mask *const of[2] = {&a, b};
     float box[3] = {};
     for (int k = 0; k <= both_; k++) {
       const float *p = of[k]->boxes + 3 * low, weight = both_ ? k ? part : 1.0f - part : 1.0f;
@@ -601,7 +601,7 @@ inline float per_half_diagonal(const torchdof_scene &scene) {
   return 2.0f / std::sqrt((float)scene.height * scene.height + (float)scene.width * scene.width);
 }
 // Whether shares are 0 at the edge of their samples.
-bool ends_dark(const torchdof_shares &shares, int distances);
+bool ends_dark(const torchdof_field_mask &shares, int distances);
 // Multiplies a layer's kernel by the field's transmittance and restores its sum.
 void mask_kernel(const Layer &layer, int colour, const FieldMask &turned, Kernel &cut);
 // Occupancy of rows is recorded as one bit for every MARKED columns; this is the bit of column x.
