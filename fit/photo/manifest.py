@@ -13,7 +13,7 @@ from torchdof.validation import show
 from ..problems import FitError, warn
 from ..validation import a_choice, a_number
 from .captures import CAMERA, RANGES, Captures, check_distances
-from .frame import PATTERNS, Dots, Photograph, cut_pairs, read_photograph, size_of
+from .frame import PATTERNS, CameraPicture, Dots, cut_pairs, read_picture, size_of
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -96,24 +96,24 @@ def read_captures(
         for name in filter(None, [manifest["sharp"], *files, manifest["dark"]]):
             inside(folder_path / name, root, manifest_name)
 
-    def read(name: str, dark: Photograph | None) -> Photograph:
-        return read_photograph(folder_path / name, manifest["transfer"], dark, manifest["crop"], manifest["bayer"])
+    def read(name: str, dark: CameraPicture | None) -> CameraPicture:
+        return read_picture(folder_path / name, manifest["transfer"], dark, manifest["crop"], manifest["bayer"])
 
     dark = read(manifest["dark"], None) if manifest["dark"] else None
-    sharp_photo = read(manifest["sharp"], dark)
+    sharp_picture = read(manifest["sharp"], dark)
     by_colour = manifest["colours"] == "each"
-    if by_colour and sharp_photo.colours.shape[0] != 3:
+    if by_colour and sharp_picture.colours.shape[0] != 3:
         text = "colours = 'each' needs pictures of three colours, or bayer = 'RGGB', got"
-        raise invalid(f"{text} {sharp_photo.colours.shape[0]}")
-    columns, encoded = [], [sharp_photo.file.name] if sharp_photo.encoded else []
+        raise invalid(f"{text} {sharp_picture.colours.shape[0]}")
+    columns, encoded = [], [sharp_picture.file.name] if sharp_picture.encoded else []
     for shot in shots:
-        blurred_photo = read(shot["file"], dark)
-        _check_alike(sharp_photo, blurred_photo, manifest_name)
-        encoded += [blurred_photo.file.name] if blurred_photo.encoded else []
+        blurred_picture = read(shot["file"], dark)
+        _check_alike(sharp_picture, blurred_picture, manifest_name)
+        encoded += [blurred_picture.file.name] if blurred_picture.encoded else []
         seconds = manifest["exposure_s"]
         exposure = shot["exposure_s"] / seconds if shot["exposure_s"] and seconds else None
-        photos = (sharp_photo, blurred_photo)
-        columns.append(cut_pairs(photos, focus, shot["distance_m"], manifest["dots"] or "one", exposure, by_colour))
+        pictures = (sharp_picture, blurred_picture)
+        columns.append(cut_pairs(pictures, focus, shot["distance_m"], manifest["dots"] or "one", exposure, by_colour))
     if manifest["transfer"] is None and encoded:
         further = f" and {len(encoded) - 1} more" if len(encoded) > 1 else ""
         text = (
@@ -122,11 +122,11 @@ def read_captures(
             "them. Then say transfer = 'linear', or 'srgb' if that is all that was done"
         )
         warn(text, "not linear", file=manifest_name, number=float(len(encoded)))
-    width = sharp_photo.width_px if manifest["full_width_px"] is None else round(manifest["full_width_px"])
-    if width < sharp_photo.width_px:
-        got = f"got {manifest['full_width_px']:g} for pictures of {sharp_photo.width_px}"
+    width = sharp_picture.width_px if manifest["full_width_px"] is None else round(manifest["full_width_px"])
+    if width < sharp_picture.width_px:
+        got = f"got {manifest['full_width_px']:g} for pictures of {sharp_picture.width_px}"
         raise invalid(f"full_width_px must be at least the pictures' own width, {got}")
-    camera = {name: sharp_photo.facts.get(name) if manifest[name] is None else manifest[name] for name in CAMERA}
+    camera = {name: sharp_picture.facts.get(name) if manifest[name] is None else manifest[name] for name in CAMERA}
     notes = {
         "manifest": path.name,
         "transfer": manifest["transfer"] or "by file type",
@@ -191,7 +191,7 @@ def _field(fields: Mapping[str, Any], name: str, where: str) -> Any:
     return value
 
 
-def _check_alike(first: Photograph, second: Photograph, where: str) -> None:
+def _check_alike(first: CameraPicture, second: CameraPicture, where: str) -> None:
     """Raises an error for pictures of different size, or if the lens was changed between them."""
     if first.light.shape != second.light.shape:
         text = f"{second.file.name} is {size_of(second.light)}, {first.file.name} is {size_of(first.light)}"
