@@ -110,10 +110,12 @@ class Portable(nn.Module):
         coc_px = self.dof.coc_as_given(image, map_, focus_m, f_number)
         return blur(image, coc_px, options, plan, ops=self.ops)
 
-    def blurs(self, size: tuple[int, int]) -> list[LayerKernel]:
+    def layer_kernels(self, size: tuple[int, int]) -> list[LayerKernel]:
         """Kernels of the graph's layers, for a frame of this height and width."""
         coarse = self.dof.options.method == "layered"
-        return self.plan.blurs(self.dof.options.table, size, torch.float32, torch.device("cpu"), coarse, self.width)
+        return self.plan.layer_kernels(
+            self.dof.options.table, size, torch.float32, torch.device("cpu"), coarse, self.width
+        )
 
 
 def check_width(table: BlurTable, width: int | None) -> None:

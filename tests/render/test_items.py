@@ -112,7 +112,7 @@ def test_layers_of_several_plans_are_joined_by_side_and_resolution() -> None:
         assert [place for place, is_used in zip(places, used, strict=True) if is_used] == list(plan.nodes)
         alone = weights_at_or_behind(x.reshape(1, 1, 1, -1), ramps([plan.nodes], x))[0, :, 0]
         torch.testing.assert_close(of_layer[used], alone[:-1] - alone[1:])
-        own = plan.blurs(BlurTable.disc(), SIZE, torch.float64, torch.device("cpu"), True)
+        own = plan.layer_kernels(BlurTable.disc(), SIZE, torch.float64, torch.device("cpu"), True)
         joined = [blur for blur, is_used in zip(blurs, used, strict=True) if is_used]
         for blur, alone_blur in zip(joined, own, strict=True):
             assert blur.scale == alone_blur.scale

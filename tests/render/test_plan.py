@@ -98,7 +98,7 @@ def test_nan_and_infinite_coc_add_no_layers() -> None:
 def test_kernels_wider_than_the_frame_are_cut_and_keep_their_values(name: str, coc: float) -> None:
     table = BlurTable.disc() if name == "disc" else BlurTable.load(name)
     size, plan = (20, 31), Plan((place_of(coc),), 1 / 255)
-    (blur,) = plan.blurs(table, size, torch.float64, torch.device("cpu"), coarse=True)
+    (blur,) = plan.layer_kernels(table, size, torch.float64, torch.device("cpu"), coarse=True)
     whole = bank_of(table).kernels(torch.tensor([coc], dtype=torch.float64), size[1])[0]
     spare = max(0, whole.shape[-1] // 2 - 30)
     expected = whole[:, spare : whole.shape[-1] - spare, spare : whole.shape[-1] - spare]
@@ -110,7 +110,7 @@ def test_kernels_wider_than_the_frame_are_cut_and_keep_their_values(name: str, c
 @pytest.mark.parametrize("tolerance", [1 / 255, 4 / 255])
 def test_highlights_become_rays_at_all_radii_of_coarse_layers(tolerance: float) -> None:
     plan = Plan.for_scene(coc_map(-40.0, 0.0, 30.0).expand(1, 1, 100, 3), tolerance, adapt=False)
-    blurs = plan.blurs(BlurTable.disc(), (100, 100), torch.float32, torch.device("cpu"), coarse=True)
+    blurs = plan.layer_kernels(BlurTable.disc(), (100, 100), torch.float32, torch.device("cpu"), coarse=True)
     for k, (_, coc) in enumerate(zip(blurs, plan.coc_px, strict=True)):
         beside = [b.scale for b in blurs[max(0, k - 1) : k + 2]]
         assert max(beside) == 1 or abs(coc) >= plan.crisp_px or plan.nodes[k] == 0.0
@@ -119,7 +119,7 @@ def test_highlights_become_rays_at_all_radii_of_coarse_layers(tolerance: float) 
 
 def test_layers_of_larger_blur_have_lower_resolution() -> None:
     plan = Plan.for_scene(coc_map(0.0, 100.0).expand(1, 1, 100, 2), 1 / 255, adapt=False)
-    blurs = plan.blurs(BlurTable.disc(), (100, 100), torch.float32, torch.device("cpu"), coarse=True)
+    blurs = plan.layer_kernels(BlurTable.disc(), (100, 100), torch.float32, torch.device("cpu"), coarse=True)
     for scale, low, high in ((2, 7.2, 9.0), (4, 18.0, 22.0), (8, 36.0, 44.0), (16, 72.0, 85.0)):
         assert low <= min(c for b, c in zip(blurs, plan.coc_px, strict=True) if b.scale == scale) < high
 

@@ -29,11 +29,11 @@ def picture(
     cover: Tensor | None = None,
     lens_width: int | None = None,
 ) -> Tensor | None:
-    """Render the picture ``[B, C, H, W]`` of the plain engine, item by item; None if that engine must render it.
+    """Render ``[B, C, H, W]`` item by item; None if the compiled engine does not support the arguments.
 
-    The compiled engine supports ``method="layered"`` in float32 on the CPU, in eager code without gradients. Arguments
-    are those of ``torchdof.render.pipeline._render_item``; ``lens_width`` is the width in pixels of the image whose
-    kernels are used, if it differs from the picture's.
+    It supports ``method="layered"`` in float32 on the CPU, in eager code without gradients. Arguments are those of
+    ``torchdof.render.pipeline._render_items``; ``lens_width`` is the width in pixels of the image whose kernels are
+    used, if it differs from the picture's.
     """
     if options.table.is_differentiated:
         return None

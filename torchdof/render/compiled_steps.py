@@ -25,7 +25,7 @@ def blended(
 
     Args:
         frame: One surface, or two that share each pixel, in any order.
-        layers: Kernel ``[1 or C, k, k]`` of each layer, and the distance of its pixels in pixels of the frame.
+        layers: Kernel ``[1 or C, k, k]`` and scale of each layer: the distance of its pixels in pixels of the frame.
         backed: Whether the weights are transmittances, not coverages; without occlusion they are sums of weights.
         plain: The same computation by PyTorch, from the frame's surfaces.
 
@@ -52,12 +52,12 @@ def looked_behind(
     coc_px: Tensor,
     plain: Callable[[Sequence[Tensor], Tensor], Tensor],
 ) -> Tensor | None:
-    """Surfaces behind those of an image, with their gradient: light, coc and votes ``[B, C + 2, H, W]``.
+    """Light, coc and votes of the surfaces behind those of an image, ``[B, C + 2, H, W]``, with their gradient.
 
     Args:
         values: Light, coc and weight of each level of a pyramid that is centred on the image, ``[B, C + 2, h, w]``.
-        rules: Of each level the distance of two samples in pixels, the smallest blur at which it is read, its votes per
-            weight, and its most votes.
+        rules: For each level: the distance of two samples in pixels, the smallest blur in pixels at which the level is
+            read, its votes per weight, and its largest number of votes.
         coc_px: Signed coc of the image, ``[B, 1, H, W]``.
         plain: The same computation by PyTorch, from the levels' values and the coc.
 

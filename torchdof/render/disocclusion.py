@@ -426,7 +426,7 @@ def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tenso
 
 
 def _rule(level: Level) -> tuple[float, float, float]:
-    """Smallest blur in pixels at which a level is read, votes per weight, and most votes."""
+    """Smallest blur in pixels at which a level is read, votes per weight, and largest number of votes."""
     return (level.least_px, 1.0, math.inf) if level.vote is None else (level.least_px, level.vote / _SURE, level.vote)
 
 

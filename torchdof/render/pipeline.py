@@ -31,7 +31,7 @@ from .traced import is_compiled
 
 __all__ = ["blur", "blur_stack"]
 
-_REACH = 4.0  # largest blur radii: margin rendered around an attention area; smaller changes its light and hidden fill
+_REACH = 4.0  # margin around an attention area, in largest blur radii; less changes its light and hidden surfaces
 _TOGETHER = 2**21  # pixels of items rendered together; larger: fewer, larger operations, and more memory
 _SAME_PX = 0.5  # px of coc: a background at most this far behind the image's surface counts as the same surface
 
@@ -220,13 +220,13 @@ def _render_items(
     if not is_unscaled:
         light, behind_light = light * scale, None if behind_light is None else behind_light * scale
 
-    # limit of highlights; without occlusion only those are splatted that a coarse layer would soften. A compiled graph
-    # has no rays: their number depends on the light.
+    # Limit of highlights. Without occlusion, only highlights that a coarse layer would soften are splatted. A compiled
+    # graph has no rays, as their number depends on the light.
     has_rays = plan.rays and ops.has_rays and not is_compiled()
     crisp_px = [plan.crisp_px if options.method == "layered" else math.inf for plan in plans]
     coarse = has_rays and any(px < max(map(abs, plan.coc_px)) for plan, px in zip(plans, crisp_px, strict=True))
     limit = highlights.threshold(light, weight) if options.occlusion or options.normalize or coarse else None
-    # a plane has one kernel, which is exact unless it changes across the frame: then blocks of pixels share kernels
+    # One layer needs no rays: its kernel is exact, unless blocks of pixels share kernels that change across the frame.
     several = len(plan.nodes) > 1 or options.table.depends_on_place
     splatted = several and (options.occlusion or coarse)
 
@@ -303,7 +303,7 @@ def _composite(
     size = (light.shape[-2], light.shape[-1])
     if len(plans) == 1:
         nodes, table = [plans[0].nodes], options.table
-        blurs = plans[0].blurs(table, size, light.dtype, light.device, layered, ops.lens_width, ops.kernels)
+        blurs = plans[0].layer_kernels(table, size, light.dtype, light.device, layered, ops.lens_width, ops.kernels)
     else:
         nodes, blurs = joined_layers(plans, options.table, size, light)
     coarsest = max(blur.scale for blur in blurs)

@@ -33,7 +33,7 @@ __all__ = [
 KERNELS_PER_PX = 32  # kernels for highlights, per px of radius; more are smoother and take more memory
 _FEWER_KERNELS_PER_PX = 4  # the same in a graph, which holds all kernels as constants; costs up to 0.02 dB
 _COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # px: layers from these radii on have 1/2, 1/4, ... resolution at 1/255
-_LEAST_CUT = 24  # layer pixels: kernels that reach less are never cut, so that in a graph they do not depend on sizes
+_LEAST_CUT = 24  # layer pixels: smaller kernels are never cut, so that those of a graph do not depend on its sizes
 _SMALL_RADII = 3.0  # blur radii: frames with a shorter side below this are planned for a smaller tolerance
 _FARTHEST_PX = 1e9  # px: upper limit of nodes; frames are smaller
 
@@ -69,8 +69,8 @@ class Plan:
         nodes: Places of the layers on the blur axis (see :mod:`torchdof.render.layer_weights`), strictly increasing.
         tolerance: Tolerance that the plan was made for, in [0, 1).
         rays: Whether highlights are splatted (:mod:`torchdof.render.highlights`) where layers would soften them.
-        grows: Whether layers are added for a scene that is blurred more than the outermost ones. False, as in plans
-            for every scene: larger blurs are clamped to the outermost layers.
+        grows: Whether layers are added for a scene that is blurred more than the outermost ones. False, as in a static
+            plan, clamps larger blurs to the outermost layers.
         kernels_per_px: Kernels of highlights per pixel of radius; between them kernels are interpolated.
         pixels: Share of the scene's pixels in each layer; None unless :meth:`with_pixels` computed it.
 
@@ -215,7 +215,7 @@ class Plan:
             return math.inf
         return max([0.0, *(abs(coc) for coc in self.coc_px if abs(coc) < min(coarse))])
 
-    def blurs(
+    def layer_kernels(
         self,
         table: BlurTable,
         size: tuple[int, int],
@@ -394,7 +394,7 @@ def _layer_kernels(
     longest: Sequence[int] = (),
     dtype: torch.dtype = torch.float64,
 ) -> list[Tensor]:
-    """Kernels ``[1 or C, k, k]`` of the same layers, at least as exact as ``dtype``."""
+    """Kernels ``[1 or C, k, k]`` of the layers of :func:`layer_spots`, at least as exact as ``dtype``."""
     bank = bank_of(table)
     if table.is_differentiated:  # gradients to the aperture's rotation and squeeze need the PSF itself
         kernels = []
