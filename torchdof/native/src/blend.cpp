@@ -1,5 +1,5 @@
-// The layers of a padded frame, blurred and composited as in composite.cpp, and the gradient of that: what training
-// needs between the surfaces of a frame and its picture. All planes are dense, because every pixel has a gradient.
+// Blurs and composites the layers of a padded frame as composite.cpp does, forward and backward, for training. All planes
+// are dense, because every pixel has a gradient.
 //
 // With m a layer's share of each pixel, r the share behind it, I light and K the layer's kernel, from far to near:
 //
@@ -51,8 +51,10 @@ struct Run {
 // A layer: which blocks of its run's grid its light reaches, and the blurred terms there.
 struct Blurred {
   std::vector<int> index;   // of each block in `values`, or -1
-  std::vector<int> reached, needed, around;  // blocks with blurred terms; that these read; that those read
-  std::vector<uint8_t> occupied, behind;  // blocks in which the layer occurs; in which anything lies behind it
+  std::vector<int> reached;  // blocks with blurred terms
+  std::vector<int> needed;   // blocks that are read for these
+  std::vector<int> around;   // blocks that are read for the gradient of `needed`
+  std::vector<uint8_t> occupied, behind;  // blocks in which the layer occurs; in which a surface lies behind it
   Buffer<float> values;     // [blocks, terms, BLOCK_PIXELS]
   std::vector<Kernel> kernels, turned;  // for each colour
 };
@@ -263,7 +265,7 @@ class Blend {
     return in_front ? IN_FRONT : behind ? BEHIND : ACROSS;
   }
 
-  // Finds the blocks that a layer's light reaches, and those that are read for them, forward and backward.
+  // Finds the blocks that a layer's light reaches, and the blocks that are read for them, forward and backward.
   void find_blocks(const Run &run, int k) {
     Blurred &b = blurred_[k];
     const int half = layers_[k].half, count = run.blocks();
@@ -385,7 +387,7 @@ class Blend {
       }
   }
 
-  // Which rows of a block's window hold anything of a layer, or behind it, for convolve_strip.
+  // Rows of a block's window that contain a layer, or surfaces behind it, as column marks for convolve_strip.
   void rows_of(const Run &run, int k, int block, bool behind, std::vector<uint32_t> &rows) const {
     const int half = layers_[k].half, y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
     const int c0 = std::max(x0 - half, 0) / BLOCK, c1 = std::min((x0 + BLOCK - 1 + half) / BLOCK, run.block_columns - 1);
@@ -575,7 +577,7 @@ class Blend {
       coarse(at, s, limit, before, part);
       return before == i ? 1.0f - part : before + 1 == i ? part : 0.0f;
     };
-    // pixels of the picture that a coarse pixel i may have a part in: (i - 1.5) s to (i + 0.5) s
+    // pixels of the picture into which a coarse pixel i is interpolated: (i - 1.5) s to (i + 0.5) s
     auto low = [&](int i) { return std::max((2 * i - 3) * s / 2 - 1, 0); };
     auto high = [&](int i, int limit) { return std::min((2 * i + 1) * s / 2 + 1, limit); };
     std::vector<float> line(W);

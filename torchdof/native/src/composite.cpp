@@ -11,12 +11,11 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr float LEAST = 1e-6f;    // blurred weight below which the light of a pixel is unknown
-constexpr float COVERED = 1e-6f;  // uncovered part that is rounding error alone
+constexpr float LEAST = 1e-6f;    // blurred weight up to which the light of a pixel is unknown
+constexpr float COVERED = 1e-6f;  // an uncovered part up to this is a rounding error
 constexpr int BEHIND_STEP = 4;    // pixels between samples of the light behind all surfaces
 constexpr int TILE_PIXELS = TILE * TILE;
 constexpr int PART = 16;  // side in pixels of the parts of a coarse canvas that are skipped if empty
-
 constexpr float EVEN_SQUARED = 1e-12f;  // square of the difference from 1 up to which a normalizer counts as 1
 
 // Consecutive layers of one resolution, composited together. Under occlusion a coarse run lies on one side of the
@@ -485,7 +484,7 @@ class Composite {
     }
   }
 
-  // The same for surfaces that cover each other: computes the terms of each row of pixels and averages over s x s.
+  // The terms of layer k for surfaces that cover each other: computes each row of pixels and averages over s x s.
   void block_means(int k, int s, int top, int left, int height, int width, size_t shift, Scratch &b) {
     const float each = 1.0f / (s * s);
     const int n = width * s;

@@ -6,14 +6,11 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr float FALL = 0.35f;      // weight of a level relative to the next finer one; larger takes light from farther away
-constexpr int CELL_LEVEL = 3;      // level in whose pixels it is decided where a surface may be hidden
-constexpr int FINE_LEVELS = 2;     // levels read by each pixel; coarser ones are read once for each cell of STEP pixels
-constexpr int STEP = 1 << FINE_LEVELS;
-constexpr float SURE = 0.1f;      // weight of a level's sample at which its vote is full
-// votes at which a hidden sample has its full weight, and at which a farther one replaces the nearer
-constexpr float CERTAIN = 0.01f;
-constexpr float MIXED = 0.05f;  // smallest share of a second surface used in the pyramid
+// Constants of render/disocclusion.py, which gives their meanings and effects.
+constexpr float FALL = 0.35f, SURE = 0.1f, CERTAIN = 0.01f;
+constexpr int FINE_LEVELS = 2, STEP = 1 << FINE_LEVELS;
+constexpr float MIXED = 0.05f;  // share above which a second surface is used in the pyramid
+constexpr int CELL_LEVEL = 3;   // cells that may show hidden surfaces have the size of this level's samples
 
 // One level of a pyramid of the farthest surfaces. A sample has `stride` values: light of each channel, coc, weight,
 // padding.
@@ -29,7 +26,7 @@ struct Level {
   float coc(int y, int x) const { return at(y, x)[channels]; }
 };
 
-// How certainly a surface that is farther by this difference in coc is another one, 0 to 1.
+// Confidence, 0 to 1, that a surface farther by this difference in coc is another surface.
 inline float is_behind(float distance_px) { return clamp01(distance_px - (BEHIND_PX - 0.5f)); }
 
 // Mean of the farthest of four children.
@@ -107,7 +104,7 @@ float behind(const Level &level, Place row, Place column, float here, f8 *seen) 
   return total;
 }
 
-// A level's sample behind a pixel: its weight (any; 0 if empty) and how much the pixel's blur uses the level (looked).
+// A level's sample behind a pixel: its weight (any; 0 if empty), and the weight of the level for the pixel's blur (looked).
 struct Seen {
   float looked, any;
   f8 *sample;
@@ -288,7 +285,7 @@ class Filling {
       if (!any_of(peaks > all(least_limit))) continue;
       for (int i = x; i < std::min(x + LANES, n); i++) {
         const float peak = peaks[i - x], limit = peak > least_limit ? threshold_at(job_, y, x0 + i) : peak;
-        if (peak > limit)  // a hidden surface next to a highlight is not one
+        if (peak > limit)  // a hidden surface next to a highlight is not a highlight
           for (int c = 0; c < C; c++) out[c * pitch + i] *= limit / peak;
       }
     }
@@ -350,7 +347,7 @@ class Filling {
       }
   }
 
-  // Marks cells near which a level used by their pixels has a farther surface; fine_: one of the fine levels has.
+  // Marks cells near which a level used by their pixels has a farther surface; fine_: a fine level has it.
   void find_cells(int row) {
     for (int column = 0; column < cell_columns_; column++) {
       const size_t cell = (size_t)row * cell_columns_ + column;

@@ -78,7 +78,8 @@ class Downsampling {
   }
 
  private:
-  static constexpr float NOWHERE = -2.0f, FARTHEST = 1e6f;  // node of empty blocks, and of blocks that no layer here uses
+  // Values in place of a node: of empty blocks, and of blocks that no layer of this scale uses.
+  static constexpr float NOWHERE = -2.0f, FARTHEST = 1e6f;
 
   // Computes up to `count` blocks in one cell (or one larger block) of a row; returns how many.
   int blocks(int row, int column, int count, Pieces &pieces) {
@@ -468,7 +469,7 @@ Downsampled::Downsampled(const Job &job, int scale, int margin)
 }
 
 void Downsampled::take(const Job &job, const LayerIndex &index, const Border &border) {
-  // blocks within twice the reach of those in which a layer of this scale occurs: its blur, and what lies behind it
+  // blocks that layers of this scale may need: within twice the reach of a block in which one of them occurs
   const int cells = BLOCK / CELL, block_rows = job.surfaces.block_rows, block_columns = job.surfaces.block_columns;
   std::vector<uint64_t> layers(index.words, 0);
   for (int k = 0; k < (int)job.layers.size(); k++)

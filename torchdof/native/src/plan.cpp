@@ -10,12 +10,13 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
+// Constants of render/layer_cocs.py and render/plan.py, which give their meanings, units and effects.
 constexpr double FINEST = 0.5, FINEST_PARTS = 40, WIDE = FINEST * FINEST_PARTS;
 constexpr double SPACING = 0.25, SPACING_POWER = 0.8, LOOSE = 4, NEAR = 0.3;
-constexpr double CROWD = 0.03;     // share of the border's pixels that get a layer at their own position,
-constexpr int LEAST_CROWD = 16;    // and the minimum number of such pixels
-constexpr int FEW = 100;           // the largest radii of a frame: 1 / FEW of its pixels may exceed them
-constexpr double SMALL_RADII = 3;  // a frame smaller than this many of its largest blur radii gets a smaller tolerance
+constexpr int FEW = 100;
+constexpr double SMALL_RADII = 3;
+constexpr double CROWD = 0.03;   // share of the border's pixels from which a position gets a layer of its own
+constexpr int LEAST_CROWD = 16;  // fewest pixels of such a position
 
 double finest(double x) { return std::max(FINEST, std::fabs(x) / FINEST_PARTS); }
 
