@@ -24,7 +24,7 @@ __all__ = [
     "MOST_LEVELS",
     "MOST_PLANES",
     "Kind",
-    "PaddedFrame",
+    "FrameLayers",
     "blend",
     "blend_gradient",
     "chosen",
@@ -64,7 +64,7 @@ Rules = Sequence[tuple[int, float, float, float]]
 _Floats = ctypes.POINTER(ctypes.c_float)
 
 
-class FieldMask(Protocol):
+class KernelMask(Protocol):
     """Mask of a lens's field for kernels of one radius: :class:`torchdof.optics.placed_kernels.FieldMask`."""
 
     @property
@@ -272,11 +272,15 @@ def render(
     masked: bool,
     highlights: bool,
     crisp_px: float,
-    field_masks: Sequence[FieldMask],
-    ray_masks: Callable[[list[int]], Sequence[FieldMask]],
+    field_masks: Sequence[KernelMask],
+    ray_masks: Callable[[list[int]], Sequence[KernelMask]],
     squeeze: float,
 ) -> Tensor:
     """Renders depth of field for one image, with as many threads as PyTorch uses.
+
+    1. Begin: the engine splits pixels, fills hidden areas and finds the radii of the highlights' kernels.
+    2. Make these kernels and their field masks.
+    3. Finish: the engine composites the layers and splats the highlights.
 
     Args:
         surfaces: Light ``[C, H, W]``, signed coc in pixels ``[H, W]`` and weight ``[H, W]`` (None: 1) of each surface,
@@ -291,7 +295,7 @@ def render(
         highlights: Whether highlights are rendered ray by ray where layers would soften them.
         crisp_px: Blur in pixels above which layers soften highlights.
         field_masks: Transmittance of the field for each layer, float32 and contiguous; empty if the lens has no field.
-        ray_masks: The same for highlights, from their radii in steps of 1/32 pixel; in ascending order of radius.
+        ray_masks: Field masks for signed radii of highlights, in steps of 1/32 pixel, in ascending order of radius.
         squeeze: Height of the blur divided by its width.
 
     Returns:
@@ -348,8 +352,8 @@ def render(
     return out
 
 
-class PaddedFrame(NamedTuple):
-    """What :func:`blend` needs besides the surfaces' maps ``[., rows, columns]``, which include a margin.
+class FrameLayers(NamedTuple):
+    """Layers and geometry of a padded frame, for :func:`blend`; maps ``[., rows, columns]`` include a margin.
 
     Args:
         margin: Pixels of the maps before the picture.
@@ -368,7 +372,7 @@ class PaddedFrame(NamedTuple):
     backed: bool
 
 
-def blend(surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: PaddedFrame) -> Tensor:
+def blend(surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: FrameLayers) -> Tensor:
     """Blurs and composites the layers of a padded frame, as :func:`torchdof.render.composite.over`, for one image.
 
     Args:
@@ -390,7 +394,7 @@ def blend(surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: Padde
 
 
 def blend_gradient(
-    surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: PaddedFrame, gradient: Tensor
+    surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: FrameLayers, gradient: Tensor
 ) -> list[Tensor]:
     """The gradients of :func:`blend` by its surfaces, from that by its result ``[planes, height, width]``.
 
@@ -411,7 +415,7 @@ def blend_gradient(
 
 
 def _layers_of(
-    surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: PaddedFrame
+    surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: FrameLayers
 ) -> tuple[_Layers, list[Any]]:
     """The structure for :func:`blend`, and the memory to which it points."""
     maps = [[None if t is None else t.contiguous() for t in each] for each in zip(*surfaces, strict=True)]
@@ -674,7 +678,7 @@ def _check(status: int) -> None:
         raise KeyboardInterrupt
 
 
-def _field_masks(masks: Sequence[FieldMask]) -> Any:
+def _field_masks(masks: Sequence[KernelMask]) -> Any:
     made = []
     for each in masks:
         colours, _, rows, columns = each.values.shape

@@ -41,7 +41,7 @@ def blended(
         return None
     if frame.colours + max(len(kernel) for kernel, _ in layers) > native.MOST_PLANES:
         return None
-    padded = native.PaddedFrame(frame.margin, frame.area, frame.nodes[0], layers, frame.occlusion, backed)
+    padded = native.FrameLayers(frame.margin, frame.area, frame.nodes[0], layers, frame.occlusion, backed)
     result: Tensor = _Blend.apply(padded, list(map(len, given)), plain, *tensors)
     return result
 
@@ -85,7 +85,7 @@ def _surfaces(counts: Sequence[int], tensors: Sequence[Tensor]) -> list[PaddedSu
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, padded: native.PaddedFrame, counts: list[int], plain: Any, *tensors: Tensor) -> Tensor:
+    def forward(ctx: Any, padded: native.FrameLayers, counts: list[int], plain: Any, *tensors: Tensor) -> Tensor:
         ctx.padded, ctx.counts, ctx.plain = padded, counts, plain
         ctx.save_for_backward(*tensors)
         return torch.stack([native.blend(item, padded) for item in _items(counts, tensors)])
