@@ -77,8 +77,8 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
             image = 0.2 * image + 0.6 * (coc < 0) + 0.1
             coc = functional.avg_pool2d(coc, (1, 5), stride=1, padding=(0, 2), count_include_pad=False)
         elif float(coc.min()) < float(coc.max()):
-            # Vary the coc: at the exact mean of both neighbours, rounding would decide which surface a pixel shows.
-            # Vary it by less than the step between surfaces, as light would depend steeply on a coc of noise.
+            # Noise on the coc: at the exact mean of two neighbours, rounding would decide which surface a pixel shows.
+            # The noise is smaller than the step between surfaces; light would depend steeply on larger noise.
             noise = torch.rand(coc.shape, generator=generator, dtype=coc.dtype)
             coc = coc + coc.clamp(-10.0, 10.0) * 0.03 * noise
         if portable.inputs == "coc_px":

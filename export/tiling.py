@@ -57,10 +57,10 @@ def tile_by_tile(frame: PaddedFrame, render: Callable[[PaddedFrame], Tensor], op
 
 
 def seen(levels: Sequence[Level], coc_px: Tensor, mask: Tensor, ops: Ops) -> Seen:
-    """What levels of a pyramid show behind the pixels of an image, as :mod:`torchdof.render.disocclusion` looks for it.
+    """Light and coc behind the pixels of an image, from the levels of :mod:`torchdof.render.disocclusion`.
 
-    It is looked for tile by tile, and only in tiles that have pixels in the mask ``[B, 1, H, W]`` behind which there
-    may be something.
+    They are computed tile by tile, and only in tiles with pixels of the mask ``[B, 1, H, W]`` behind which a surface
+    may lie.
     """
     size = (coc_px.shape[-2], coc_px.shape[-1])
     covered = [levels[0].step * n for n in levels[0].values.shape[-2:]]  # px; the levels are centred on the image

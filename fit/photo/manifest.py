@@ -60,6 +60,11 @@ def read_captures(
     # shot; dots = "centre", "each" or "field" for a grid; colours = "each"; bayer = "RGGB" for a sensor's mosaic; name
     ```
 
+    1. Read the manifest and check its fields and distances.
+    2. Read the sharp picture and each blurred one, minus the dark frame.
+    3. Cut a window around each dot in both pictures.
+    4. Take missing numbers of the camera from EXIF.
+
     Args:
         folder: folder with the manifest and the pictures, or path of the manifest.
         dots: replaces the manifest's "dots".

@@ -65,6 +65,11 @@ def fit_pair(
     bias the kernel. As in rendering, the kernel is the effect of the fitted PSF on a picture made of pixels
     (`torchdof.optics.psf`): a pixel's own blur, 1/12 px^2 of variance, is in both pictures and not in the parameters.
 
+    1. Find both dots, exclude clipped pixels, and choose a representation of the sharp dot.
+    2. Fit a free profile, or the given family; fit the magnification too if the pictures contradict the expected one.
+    3. With "auto", choose the cheapest family that is accurate enough, or an opening if the blur is not round.
+    4. Check the residual, the levels and the focus; doubtful results give warnings.
+
     `model="ratio"` is the paper's: `blurred / sharp` along spokes inside the dot, then eq. (1). It measures the dot
     convolved with the kernel, so its widths depend on the dot. Use it for comparison with the paper.
 
