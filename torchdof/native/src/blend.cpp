@@ -449,17 +449,16 @@ class Blend {
     std::fill(canvas + C_ * BLOCK_PIXELS, canvas + planes_ * BLOCK_PIXELS, over_ ? empty_ : 0.0f);
   }
 
-  // A layer's share of a pixel, and its transmittance for the picture behind.
   struct Front {
-    vec share, left;
+    vec share, transmittance;  // of a layer in a pixel; for the light behind it
   };
   Front front(vec share) const { return {share, scene_.backed ? share : most(all(1.0f) - share, vec{})}; }
-  struct Known {
-    vec lacking, beyond, known;
+  struct Normalizer {
+    vec lacking, behind, sum;  // what the sum lacks to KNOWN; the share behind the layer, raised; their sum
   };
-  static Known know(vec own, vec behind) {
-    const vec lacking = most(all(KNOWN) - own - behind, vec{}), beyond = behind + lacking * lacking * (0.5f / KNOWN);
-    return {lacking, beyond, own + beyond};
+  static Normalizer normalizer_of(vec own, vec behind) {
+    const vec lacking = most(all(KNOWN) - own - behind, vec{}), raised = behind + lacking * lacking * (0.5f / KNOWN);
+    return {lacking, raised, own + raised};
   }
   int first_channel(int e) const { return E_ == 1 ? 0 : e; }
   int last_channel(int e) const { return E_ == 1 ? C_ - 1 : e; }
@@ -468,10 +467,10 @@ class Blend {
   void over(int e, int i, Front f, const float *light, vec gain, float *canvas) const {
     for (int c = first_channel(e); c <= last_channel(e); c++) {
       float *to = canvas + c * BLOCK_PIXELS + i;
-      store(to, load<vec>(light + c * BLOCK_PIXELS + i) * gain + f.left * load<vec>(to));
+      store(to, load<vec>(light + c * BLOCK_PIXELS + i) * gain + f.transmittance * load<vec>(to));
     }
     float *to = canvas + (C_ + e) * BLOCK_PIXELS + i;
-    store(to, (scene_.backed ? vec{} : f.share) + f.left * load<vec>(to));
+    store(to, (scene_.backed ? vec{} : f.share) + f.transmittance * load<vec>(to));
   }
   void add(const float *values, float *canvas) const {
     for (int i = 0; i < planes_ * BLOCK_PIXELS; i += LANES) store(canvas + i, load<vec>(canvas + i) + load<vec>(values + i));
@@ -515,9 +514,9 @@ class Blend {
     }
     each_pixel([&](int e, int i) {
       const vec own = load<vec>(values + (C_ + e) * BLOCK_PIXELS + i);
-      const Known n = know(own, load<vec>(values + (C_ + E_ + e) * BLOCK_PIXELS + i));
-      const vec per = all(1.0f) / n.known;
-      over(e, i, front((scene_.backed ? n.beyond : own) * per), values, per, canvas);
+      const Normalizer n = normalizer_of(own, load<vec>(values + (C_ + E_ + e) * BLOCK_PIXELS + i));
+      const vec per = all(1.0f) / n.sum;
+      over(e, i, front((scene_.backed ? n.behind : own) * per), values, per, canvas);
     });
     return true;
   }
@@ -633,16 +632,16 @@ class Blend {
   vec through(int e, int i, Front f, const float *behind, float *slopes, const Light &light) const {
     float *coverage = slopes + (C_ + e) * BLOCK_PIXELS + i;
     const vec of_coverage = load<vec>(coverage);
-    vec left = of_coverage * load<vec>(behind + (C_ + e) * BLOCK_PIXELS + i);
+    vec of_transmittance = of_coverage * load<vec>(behind + (C_ + e) * BLOCK_PIXELS + i);
     for (int c = first_channel(e); c <= last_channel(e); c++) {
       float *its = slopes + c * BLOCK_PIXELS + i;
       const vec slope = load<vec>(its);
-      left += slope * load<vec>(behind + c * BLOCK_PIXELS + i);
+      of_transmittance += slope * load<vec>(behind + c * BLOCK_PIXELS + i);
       light(c, slope);
-      store(its, f.left * slope);
+      store(its, f.transmittance * slope);
     }
-    store(coverage, f.left * of_coverage);
-    return scene_.backed ? left : of_coverage - (f.share <= all(1.0f) ? left : vec{});
+    store(coverage, f.transmittance * of_coverage);
+    return scene_.backed ? of_transmittance : of_coverage - (f.share <= all(1.0f) ? of_transmittance : vec{});
   }
 
   // Walks back through a layer: its blurred terms become their gradients.
@@ -653,20 +652,20 @@ class Blend {
       return;
     }
     each_pixel([&](int e, int i) {
-      float *own = values + (C_ + e) * BLOCK_PIXELS + i, *beyond = values + (C_ + E_ + e) * BLOCK_PIXELS + i;
-      const Known n = know(load<vec>(own), load<vec>(beyond));
-      const vec per = all(1.0f) / n.known, share = (scene_.backed ? n.beyond : load<vec>(own)) * per;
-      vec of_known = {};
+      float *own = values + (C_ + e) * BLOCK_PIXELS + i, *behind_it = values + (C_ + E_ + e) * BLOCK_PIXELS + i;
+      const Normalizer n = normalizer_of(load<vec>(own), load<vec>(behind_it));
+      const vec per = all(1.0f) / n.sum, share = (scene_.backed ? n.behind : load<vec>(own)) * per;
+      vec of_sum = {};
       const vec of_share = through(e, i, front(share), behind, slopes, [&](int c, vec slope) {
         float *its = values + c * BLOCK_PIXELS + i;
         const vec of_light = slope * per;
-        of_known -= of_light * load<vec>(its) * per;
+        of_sum -= of_light * load<vec>(its) * per;
         store(its, of_light);
       });
-      of_known -= of_share * share * per;
-      const vec of_part = of_share * per, of_beyond = of_known + (scene_.backed ? of_part : vec{}), lacking = n.lacking * (1.0f / KNOWN);
-      store(own, of_known + (scene_.backed ? vec{} : of_part) - of_beyond * lacking);
-      store(beyond, of_beyond * (1.0f - lacking));
+      of_sum -= of_share * share * per;
+      const vec of_part = of_share * per, of_raised = of_sum + (scene_.backed ? of_part : vec{}), lacking = n.lacking * (1.0f / KNOWN);
+      store(own, of_sum + (scene_.backed ? vec{} : of_part) - of_raised * lacking);
+      store(behind_it, of_raised * (1.0f - lacking));
     });
   }
 
