@@ -110,7 +110,7 @@ def test_the_paper_s_experiment_reaches_its_figure_4(
 def test_gradient_descent_finds_the_blur_and_with_a_known_lens_the_metres(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With fewer steps at full size."""
+    """The script runs with fewer steps at full size."""
     example: dict[str, Any] = runpy.run_path(str(EXAMPLES / "solve_scale.py"))
     main = example["main"]
     *coarse, (factor, steps, rate) = example["STAGES"]

@@ -117,7 +117,7 @@ def test_no_operator_of_pytorch_reads_a_whole_frame(occlusion: bool) -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_both_engines_repair_an_enlarged_map_alike(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is linear between its samples, so that pixels lie at exact quarters of the step between two surfaces."""
+    """An enlarged map is linear between its samples: pixels lie at exact quarters of the step between two surfaces."""
     generator = torch.Generator().manual_seed(seed)
     image, coarse = torch.rand(1, 3, 40, 50, generator=generator), torch.rand(1, 1, 3, 4, generator=generator)
     coc = functional.interpolate(40.0 * coarse - 20.0, (40, 50), mode="bilinear", align_corners=True)

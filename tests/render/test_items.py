@@ -63,7 +63,7 @@ def test_an_item_is_rendered_as_alone_with_any_option(options: dict[str, Any]) -
 
 
 def test_highlights_of_an_item_do_not_depend_on_those_of_another() -> None:
-    """Neither their number of rays nor the blurs of their occluders."""
+    """Its number of rays and the blurs of its occluders are those of the item rendered alone."""
     images, cocs = batch(3, (20.0, 17.3, 20.0))
     images = images * 0.01
     images[0, :, ::5, ::5] = 50.0  # more rays than are affordable

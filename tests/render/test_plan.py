@@ -56,7 +56,7 @@ def test_gaps_between_layers_are_at_most_the_spacing_of_the_tolerance(reach: flo
 
 
 def test_a_static_plan_is_as_exact_on_a_slope_as_the_plan_of_the_scene() -> None:
-    """Its layers are denser, because it cannot place layers at the blurs of the frame's border."""
+    """A static plan has denser layers, because it cannot place layers at the blurs of the frame's border."""
     y, x = torch.linspace(0.0, 1.0, 160)[:, None], torch.linspace(0.0, 1.0, 240)
     coc = (8.0 + 16.0 * (0.7 * x + 0.3 * y))[None, None]
     image = torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(1))

@@ -72,7 +72,7 @@ class FieldMask:
     squeeze: float | Tensor = 1.0
 
     def to(self, like: Tensor) -> "FieldMask":
-        """The same with the dtype and device of ``like``."""
+        """These masks with the dtype and device of ``like``."""
         return dataclasses.replace(
             self, values=self.values.to(like).contiguous(), boxes=self.boxes.to(like).contiguous()
         )

@@ -114,7 +114,7 @@ class Plan:
                 hundredth of its pixels. With ``on_grid`` the factor is rounded down to a power of 1/2.
         """
         if not adapt:
-            return cls._between(*layer_cocs.together(layer_cocs.spreads(coc_px)), tolerance)
+            return cls._between(*layer_cocs.joined(layer_cocs.spreads(coc_px)), tolerance)
         if not on_grid and coc_px.dtype == torch.float32 and is_in_memory(coc_px) and native.chosen():
             return cls(*native.plan(coc_px, tolerance))
         return cls.for_scenes([coc_px], tolerance, on_grid)[0]
@@ -128,11 +128,11 @@ class Plan:
         coc_px = torch.cat([scene.detach() for scene in scenes])
         count, shorter = len(scenes[0]), min(coc_px.shape[-2:])
         spreads = layer_cocs.spreads(coc_px)
-        spreads = [layer_cocs.together(spreads[i : i + count]) for i in range(0, len(coc_px), count)]
+        spreads = [layer_cocs.joined(spreads[i : i + count]) for i in range(0, len(coc_px), count)]
         radii = [max(abs(from_blur_axis(spread.low)), abs(from_blur_axis(spread.high))) for spread in spreads]
         if shorter < _SMALL_RADII * max(radii):  # otherwise the mean radius is not needed
-            widest = layer_cocs.widest(coc_px)
-            radii = [max(widest[i : i + count]) for i in range(0, len(coc_px), count)]
+            largest = layer_cocs.largest_radii(coc_px)
+            radii = [max(largest[i : i + count]) for i in range(0, len(coc_px), count)]
         plans = []
         for (low, high, border), radius in zip(spreads, radii, strict=True):
             part = min(1.0, shorter / (_SMALL_RADII * max(radius, 1.0)))
@@ -159,7 +159,7 @@ class Plan:
         nodes = {*fixed}
         for node in layer_cocs.spaced_nodes(low, high, tolerance):
             if low < node < high:
-                nodes.add(node if node == 0.0 else layer_cocs.slid(node, fixed, tolerance))
+                nodes.add(node if node == 0.0 else layer_cocs.moved_to_fixed(node, fixed, tolerance))
         return cls(tuple(sorted(nodes)), tolerance)
 
     @classmethod
@@ -186,7 +186,7 @@ class Plan:
         return dataclasses.replace(self, nodes=tuple(sorted(nodes)), pixels=None)
 
     def with_pixels(self, coc_px: Tensor) -> "Plan":
-        """The same plan with ``pixels``: the share of a scene ``[B, 1, H, W]`` that lies in each layer."""
+        """This plan with ``pixels``: the share of a scene ``[B, 1, H, W]`` that lies in each layer."""
         x = layer_cocs.on_axis(coc_px.detach(), max(coc_px.shape[-2:])).clamp(self.nodes[0], self.nodes[-1])
         ends = ramps([self.nodes], x).split(1, -1)  # one at a time, to bound the memory
         behind = [float(weights_at_or_behind(x, end).double().mean()) for end in ends]

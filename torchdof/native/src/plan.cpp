@@ -15,8 +15,8 @@ constexpr double FINEST = 0.5, FINEST_PARTS = 40, WIDE = FINEST * FINEST_PARTS;
 constexpr double SPACING = 0.25, SPACING_POWER = 0.8, LOOSE = 4, NEAR = 0.3;
 constexpr int FEW = 100;
 constexpr double SMALL_RADII = 3;
-constexpr double CROWD = 0.03;   // a position gets a layer of its own if this share of the border's pixels have it,
-constexpr int LEAST_CROWD = 16;  // and at least this number of pixels
+constexpr double CROWD = 0.03;
+constexpr int LEAST_CROWD = 16;
 
 double finest(double x) { return std::max(FINEST, std::fabs(x) / FINEST_PARTS); }
 
