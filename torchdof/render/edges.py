@@ -208,7 +208,7 @@ def repair(
 
 
 @torch.no_grad()
-def judged(image: Tensor, nearness: Tensor, step: Tensor | float) -> tuple[Tensor, Tensor]:
+def judged(image: Tensor, nearness: Tensor, step: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:
     """Finds the pixels at a map's edges, and those that :func:`repair` changes with ``auto``.
 
     Args:
@@ -217,14 +217,14 @@ def judged(image: Tensor, nearness: Tensor, step: Tensor | float) -> tuple[Tenso
         step: As for :func:`repair`.
 
     Returns:
-        ``[B, 1, H, W]`` each: 0 away from edges, 1 beside a step, 2 on a ramp, uint8; and whether a pixel changes.
+        Whether a pixel is at an edge, whether it is on a ramp there, and whether it changes, ``[B, 1, H, W]`` each.
     """
     given = nearness.float().expand(image.shape[0], -1, -1, -1)
     valid = given.abs() <= _LARGEST
     step = torch.as_tensor(step, dtype=given.dtype, device=given.device)
     edges = _find(torch.where(valid, given, 0.0), valid, torch.maximum(step, _NOISES * _noise(given, valid)))
     repaired = repair(image, nearness, step, auto=True)
-    return edges.is_edge * (1 + edges.is_ramp.byte()), (repaired != nearness) & valid
+    return edges.is_edge, edges.is_edge & edges.is_ramp, (repaired != nearness) & valid
 
 
 @torch.no_grad()
