@@ -29,7 +29,11 @@ class Case:
 
 
 def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Case]:
-    """The calls for which a file must give the module's result; a file with a fixed size gets scenes of this size.
+    """The calls for which a file must give the module's result.
+
+    1. List frames, each with a size and a shape of its coc; a file with a fixed size gets scenes of this size.
+    2. Draw an image, and make the coc of that shape.
+    3. Find a camera and the depth that has this coc, and insert bad and infinite depths.
 
     Args:
         portable: The exported module.

@@ -740,6 +740,8 @@ class Blend {
     return false;
   }
 
+  // Adds the gradients of a layer's terms in a block to those of the surfaces: the derivatives of `terms` and `weigh`,
+  // last operation first.
   template <int S, int CHANNELS>
   void to_surfaces(const Run &run, int k, int block, const float *slopes) const {
     const int C = CHANNELS ? CHANNELS : C_;

@@ -190,8 +190,9 @@ class Composite {
 
   // Finds the node before each pixel of each surface, and the layers that occur in each cell of CELL x CELL pixels.
   //
-  // A block of one surface that lies between two neighbouring nodes is filled at once. Elsewhere each cell compares the
-  // places of its pixels with the nodes between its smallest and its largest place.
+  // 1. Tabulate the node before places at even distances.
+  // 2. Fill a block at once if it shows one surface that lies between two neighbouring nodes.
+  // 3. In other blocks, compare the places of a cell's pixels with the nodes between the smallest and the largest one.
   void index() {
     index_.words = (N_ + 63) / 64;
     index_.rows = ceil_div(H_, CELL);
@@ -904,6 +905,10 @@ class Composite {
   }
 
   // Composites a coarser canvas, interpolated, onto the tile's canvas.
+  //
+  // 1. Return if no layer of the run reaches the tile.
+  // 2. Widen two rows of the canvas to the tile's resolution; each serves several rows of the tile.
+  // 3. Interpolate between them, and put the result in front of the tile's row.
   void join_finer(const Run &run, int y0, int x0, Scratch &b) {
     const int s = run.scale;
     const int r1 = std::min((y0 + TILE) / s + 1, run.rows - 1) / PART, c1 = std::min((x0 + TILE) / s + 1, run.columns - 1) / PART;

@@ -384,6 +384,8 @@ class Filling {
     return at;
   }
 
+  // Steps 3 and 4 of `run`. The levels from FINE_LEVELS up are combined once for each cell of STEP pixels, and read like
+  // one level by the pixels.
   template <int VECTORS>
   void fill() {
     const int levels = job_.levels, H = job_.height, W = job_.width, C = C_, count = stride_ / F8;
@@ -493,6 +495,10 @@ class Filling {
   };
 
   // Fills the second surfaces of a cell: `behind` and `mix` for LANES pixels at once.
+  //
+  // 1. Copy each level's samples so that the four around each of LANES pixels are vectors.
+  // 2. For each vector of pixels and each level, take the mean of the samples behind them, and add it by its votes.
+  // 3. Replace the second surfaces of the pixels that any level voted for.
   template <int CHANNELS>
   void fill_cell(int y0, int x0, CellLevels &to) {
     constexpr int VECTORS = CELL / LANES, ROWS = CELL / 2 + 2;

@@ -875,6 +875,11 @@ class Repair {
   //
   // The reference colours of a surface are those of the window's pixels whose nearness is within a quarter of the gap.
   // A surface's likelihood is the mean of (1 + d / spread)^-2 over them, d being the squared colour difference.
+  //
+  // 1. Sum over each pixel's window the weights and colour differences of the references of both surfaces.
+  // 2. For LANES pixels at once, compute the spread of the references' colours, and the contrast of the surfaces.
+  // 3. Sum the likelihoods over the windows, which need the spread.
+  // 4. The score is the logarithm of the likelihoods' ratio; the reliability grows with the contrast.
   template <int C>
   void judge(Group &group, const float *falloff, bool wants_surfaces) const {
     const int channels = C ? C : channels_, count = 4 + 2 * channels;
