@@ -106,6 +106,9 @@ class Composite {
   Composite(const Job &job, const RayKernels &ray_kernels, float *out)
       : job_(job), s_(job.surfaces), layers_(job.layers), ray_kernels_(ray_kernels), out_(out) {}
 
+  // 1. Group consecutive layers of one scale into runs.
+  // 2. Find the layers of each cell, the light beyond the border, and the surfaces at the scales of coarse runs.
+  // 3. Composite the tiles of coarse runs, then those of the picture.
   void run() {
     H_ = job_.height, W_ = job_.width, C_ = job_.channels, E_ = job_.colours, N_ = (int)layers_.size();
     over_ = job_.scene.occlusion;
