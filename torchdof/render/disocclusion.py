@@ -39,6 +39,7 @@ _OWN_SLOPE = 0.25  # part of a pixel's blur by which its own surface may be fart
 _FALL = 0.35  # weight of a level relative to the next finer one; larger: hidden areas are smoother
 _FINE_LEVELS = 2  # levels that each pixel reads; coarser ones are read once per cell of 2**_FINE_LEVELS pixels
 _SURE = 0.1  # weight of the samples of a level at which its vote is full
+_LEAST_SEEN = 1e-4  # weight of samples up to which they count as empty
 _CERTAIN = 0.01  # votes at which a hidden sample has full weight, or a farther surface replaces a nearer one
 
 BEHIND_STEP = 2**_FINE_LEVELS
@@ -390,8 +391,8 @@ def shown_behind(samples: Tensor, shares: Tensor, coc_px: Tensor) -> Seen:
     coc, weight = samples.narrow(-4, count, 1), samples.narrow(-4, count + 1, 1)
     part = shares * weight * _is_behind(coc - _end_of_surface(coc_px).unsqueeze(2))
     total = part.sum(-3)
-    total = torch.where(total > 1e-4, total, 0.0)
-    return (samples.narrow(-4, 0, count + 1) * part).sum(-3) / total.clamp_min(1e-4), total
+    total = torch.where(total > _LEAST_SEEN, total, 0.0)
+    return (samples.narrow(-4, 0, count + 1) * part).sum(-3) / total.clamp_min(_LEAST_SEEN), total
 
 
 def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tensor, farthest: bool = False) -> Seen:

@@ -127,16 +127,15 @@ class Buffer {
   std::unique_ptr<T, Give> data_;
 };
 
-constexpr int BLOCK = 16;  // side in pixels of the blocks in which second surfaces are stored
+// Sides in pixels
+constexpr int BLOCK = 16;  // of the blocks in which second surfaces are stored
 constexpr int BLOCK_PIXELS = BLOCK * BLOCK;
-constexpr int CELL = 8;              // side in pixels of the cells for which layers and occluders are listed
-constexpr int TILE = 64;             // side in pixels of the tiles that are composited at once
-constexpr float NEVER = 1e9f;        // larger than any coc
-constexpr float KNOWN = 2e-3f;           // blurred weight, of 1; layers with less cover gradually less
-constexpr float BEHIND_PX = 1.0f;        // px of coc at which a sample lies on another surface with confidence 1/2
-constexpr float OWN_SLOPE = 0.25f;       // part of a pixel's blur by which its own surface may be farther nearby
-constexpr float LEAST_SEEN = 1e-4f;      // a hidden sample with at most this weight counts as empty
-constexpr float HIDDEN_WEIGHT = 0.003f;  // weight of a filled hidden surface, against 1 for a visible one
+constexpr int CELL = 8;   // of the cells for which layers and occluders are listed
+constexpr int TILE = 64;  // of the tiles that are composited at once
+
+// Constants of render/composite.py, disocclusion.py and surfaces.py, which give their meanings and effects.
+constexpr float KNOWN = 2e-3f, BEHIND_PX = 1.0f, OWN_SLOPE = 0.25f, LEAST_SEEN = 1e-4f, HIDDEN_WEIGHT = 0.003f;
+constexpr float NEVER = 1e9f;  // larger than any coc
 
 // Largest coc of a pixel's own surface nearby.
 template <typename V>
