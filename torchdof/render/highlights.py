@@ -44,7 +44,7 @@ _CELL = 11  # samples along a side of a cell; larger: a smoother threshold
 _LEAST_PX = 1.0  # smallest blur of a highlight, in pixels
 _WHOLE = 4.0  # a highlight counts with min(1, _WHOLE * share splatted) of its rays against the budget
 _TAPS_PER_PIXEL = 16  # budget of rays per pixel of the frame; the layers keep the light beyond it
-_FREE_CHANGE_PX = 1.6  # mean change of coc between neighbours, in pixels, above which the budget shrinks
+_FREE_CHANGE_PX = 0.4  # mean change of coc between neighbours, in pixels, above which the budget shrinks
 _TAPS = 2**21  # rays that are splatted at once; larger, as in the next two: faster, with more memory
 _PAIRS = 2**22  # pairs of a highlight and a bin of occluders that are tested at once
 _PAIR_TAPS = 2**19  # rays of these pairs that are tested at once
@@ -94,7 +94,7 @@ def extract(
 ) -> tuple[Surface, Highlights | None]:
     """Removes the light above a limit from a surface of an image, to be splatted ray by ray.
 
-    1. Select pixels brighter than ``limit`` and blurred by more than ``from_px``.
+    1. Select visible pixels brighter than ``limit`` and blurred by more than ``from_px``.
     2. If their rays exceed ``most_taps``, raise the limit: the brightest stay, with their light above that limit.
     3. Split the light of each: ``excess = light (1 - limit / peak) fade``; the surface keeps the rest.
     4. Multiply the excess by the cover of the surface in its pixel.
@@ -123,7 +123,7 @@ def extract(
     from_px = from_px.clamp_min(_LEAST_PX) if isinstance(from_px, Tensor) else max(from_px, _LEAST_PX)
     brightest = light.amax(1, keepdim=True)
     is_bright = (brightest > limit) & (coc_px.detach().abs() > from_px)
-    bright = pixels.indices(is_bright if weight is None else is_bright & (weight > 0))
+    bright = pixels.indices(is_bright if weight is None else is_bright & (weight > HIDDEN_WEIGHT))
     if not is_traced() and len(bright) == 0:
         return surface, None
     peak, coc, most = (pixels.pick(t, bright)[0] for t in (brightest, coc_px, limit))

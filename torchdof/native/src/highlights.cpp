@@ -16,7 +16,7 @@ constexpr float NEARER_PX = 1.0f;       // difference in coc at which a nearer s
 constexpr float WHOLE = 4.0f;
 // budget of kernel taps for each pixel of the frame; highlights beyond it stay in layers
 constexpr int TAPS_PER_PIXEL = 16;
-constexpr double FREE_CHANGE_PX = 1.6;  // mean change of coc between neighbours above which the limit shrinks in proportion
+constexpr double FREE_CHANGE_PX = 0.4;  // mean change of coc between neighbours above which the limit shrinks in proportion
 constexpr int STEPS_PER_PX = 32;        // resolution of the radii of ray kernels
 constexpr int PATCH = 16;               // side in pixels of the squares in which rays are processed
 
@@ -148,7 +148,7 @@ double Job::change_of_coc() const {
 
 // Moves light above the threshold from the surfaces to rays.
 //
-// 1. Collect the bright, blurred pixels of each surface.
+// 1. Collect the bright, blurred, visible pixels of each surface.
 // 2. If their kernels have more taps than the budget, raise the limit above which light is moved.
 // 3. Subtract the light from the surface and store it in rays.
 // 4. List the radii for which kernels are needed.
@@ -175,7 +175,7 @@ void Job::extract_highlights() {
           for (int x = 0; x < n; x++) {
             float brightest = light[0][x];
             for (int c = 1; c < channels; c++) brightest = std::max(brightest, light[c][x]);
-            if (!(brightest > least_limit) || (weight && !(weight[x] > 0)) || !(std::fabs(coc[x]) > from_px)) continue;
+            if (!(brightest > least_limit) || (weight && !(weight[x] > HIDDEN_WEIGHT)) || !(std::fabs(coc[x]) > from_px)) continue;
             const float limit = threshold_at(*this, y, x0 + x);
             if (!(brightest > limit)) continue;
             float part = weight ? weight[x] : 1.0f;
