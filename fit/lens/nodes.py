@@ -1,13 +1,12 @@
 """Nodes of a traced table: their positions, and kernels fitted to their spots, smooth over depth.
 
-Spots and profiles are compared in the frequency domain. The transfer function of a spot (its Hankel transform, a sum of
-Bessel functions over the rays) and that of a profile are weighted by the spectrum of natural images (amplitude
-1/frequency) and the area of a pixel. The squared difference is then the squared error in a photograph, up to a
-constant.
+Spots and profiles are compared by their transfer functions, which are Hankel transforms; a spot's is a sum of Bessel
+functions over its rays. Both are weighted by the spectrum of natural images (amplitude 1/frequency) and the area of a
+pixel. The squared difference is then the squared error in a photograph, up to a constant.
 
-The default family ``"radial"`` is linear in its values for a given radius, and the radius is that of the outermost ray.
-So the fit is a convex problem with a single solution. It is solved for all nodes at once, against spots at the nodes
-*and between them*, where the table interpolates.
+The default family ``"radial"`` has the radius of the outermost ray, and is linear in its values. So the fit is a convex
+problem with a single solution. It is solved for all nodes at once, against spots at the nodes *and between them*, where
+the table interpolates.
 """
 
 import functools

@@ -181,7 +181,7 @@ def _checked(r: ArrayLike, strength: ArrayLike, fewest: int) -> tuple[Array, Arr
 def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, Indices]:
     """`I_b(r, theta) / I(r, theta)` from the dot's centre to its edge, at every pixel of r and every 10 degrees.
 
-    As in the paper, the centre is that of the dot in the sharp picture; a displacement of the defocused dot is not
+    As in the paper, both pictures are read from the centre of the sharp dot; a displacement of the defocused dot is not
     corrected. The result is the dot convolved with the kernel, up to the dot's edge: use it for comparison with the
     paper, and the forward model for rendering.
 

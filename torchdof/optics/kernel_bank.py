@@ -1,10 +1,10 @@
 """Kernels of any radius from templates, by two small matrix products.
 
 A cache of finished kernels would not help, because a new camera blurs by new radii. But
-:func:`torchdof.optics.psf.pixel_kernels` works in two steps, of which the first does not depend on the radius. It
-integrates a PSF over square *cells*, ``n`` from the centre to the end of the PSF, and then weights them with the
-interpolator ``phi`` of each pixel. The light in the cells, the *template* ``T``, is computed once for each node of a
-table. A kernel of any radius is then
+:func:`torchdof.optics.psf.pixel_kernels` works in two steps. The first integrates a PSF over square *cells*, ``n`` from
+the centre to the end of the PSF; the second weights them with the interpolator ``phi`` of each pixel. The first does
+not depend on the radius. So the light in the cells, the *template* ``T``, is computed once for each node of a table. A
+kernel of any radius is then
 
     ``K = A T B'``  with  ``A[m, i] = phi(m - i h)``,  ``B[m, i] = phi(m - i w)``
 

@@ -321,8 +321,8 @@ def _noise(nearness: Tensor, valid: Tensor) -> Tensor:
 
     It is proportional to the median of ``|second difference|``, along rows or columns, whichever is larger. A map that
     holds multiples of a number q, such as one from a file with 8 bits, has at least the noise of rounding to them,
-    ``q / sqrt(12)``; q is the smallest difference of two neighbours. A map of a few surfaces has a smallest difference
-    too, but no more than :data:`_LEVELS_OF_A_FILE` of it between its ends: its noise is not that of rounding.
+    ``q / sqrt(12)``; q is the smallest difference of two neighbours. This needs a range of more than
+    :data:`_LEVELS_OF_A_FILE` times q: a map of a few surfaces has a smallest difference too, which is not rounding.
     """
     every = (2 * nearness.shape[-2] * nearness.shape[-1] + _NOISE_SAMPLED - 1) // _NOISE_SAMPLED
     middles, least, ends = [], [], []

@@ -85,8 +85,8 @@ struct Corners {
   }
 };
 
-// Bilinear mean of those of the four samples that lie behind coc `here`. Returns their weight; `seen` is only written
-// if it exceeds LEAST_SEEN.
+// Bilinear mean of the four samples around a position, without those in front of or at coc `here`. Returns the weight
+// of the others; `seen` is only written if it exceeds LEAST_SEEN.
 template <int VECTORS>
 float behind(const Level &level, Place row, Place column, float here, f8 *seen) {
   const int count = VECTORS ? VECTORS : level.stride / F8, C = level.channels;

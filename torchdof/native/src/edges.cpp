@@ -352,8 +352,8 @@ class Repair {
   static float root(float light) { return (light <= FINITE) & (light > 0) ? std::sqrt(std::min(light, BRIGHTEST)) : 0.0f; }
 
   // Standard deviation of the map's noise, from the median second difference along rows or columns, whichever is
-  // larger; at least that of rounding to multiples of the smallest difference of two neighbours, if the map has more
-  // than LEVELS_OF_A_FILE of them.
+  // larger. At least the noise of rounding, if the map has more than LEVELS_OF_A_FILE levels; their distance is the
+  // smallest difference of two neighbours.
   float noise() const {
     const int every = (int)((2 * (int64_t)area_ + NOISE_SAMPLED - 1) / NOISE_SAMPLED);
     float quantum = INFINITY, span = 0;
