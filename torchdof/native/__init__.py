@@ -396,7 +396,7 @@ def blend(surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: Frame
 def blend_gradient(
     surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: FrameLayers, gradient: Tensor
 ) -> list[Tensor]:
-    """The gradients of :func:`blend` by its surfaces, from that by its result ``[planes, height, width]``.
+    """The gradients of :func:`blend` by its surfaces, given the one by its result, ``[planes, height, width]``.
 
     Returns:
         Gradients by light, position and, if it has one, weight of each surface, in this order.
@@ -452,7 +452,7 @@ def look_behind(levels: Sequence[Tensor], rules: Rules, coc: Tensor) -> Tensor:
 
     Args:
         levels: Light, coc and weight of each level of a pyramid, ``[C + 2, h, w]``, float32.
-        rules: Of each level the distance of two samples in pixels, the smallest blur at which a pixel reads it, the
+        rules: For each level the distance of two samples in pixels, the smallest blur at which a pixel reads it, the
             votes for each weight, and the most votes.
         coc: Signed coc of the image.
 
@@ -469,7 +469,7 @@ def look_behind(levels: Sequence[Tensor], rules: Rules, coc: Tensor) -> Tensor:
 
 
 def look_behind_gradient(levels: Sequence[Tensor], rules: Rules, coc: Tensor, gradient: Tensor) -> list[Tensor]:
-    """The gradients of :func:`look_behind` by coc and by each level, from that by its result ``[C + 2, H, W]``.
+    """The gradients of :func:`look_behind` by coc and by each level, given the one by its result, ``[C + 2, H, W]``.
 
     Raises:
         MemoryError: If there is not enough memory.
