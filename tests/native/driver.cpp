@@ -44,7 +44,7 @@ std::vector<float> disc(double radius, int half, int colours) {
 struct Field {
   static constexpr int distances = 5, columns = 4, rows = 2 * columns - 1;
   std::vector<std::vector<float>> values, boxes;
-  std::vector<torchdof_shares> shares;
+  std::vector<torchdof_field_mask> shares;
 
   Field(const std::vector<double> &radii, int colours) {
     for (double radius : radii) {
@@ -186,7 +186,7 @@ int render(torchdof_scene scene, int threads, const int32_t *cancelled, std::vec
   for (double radius = 128.0; radius > 0.5; radius /= 1.3)
     radii.insert(radii.begin() + long(radii.size() / 2), {-radius, radius});
   const Field rays(radii, scene.kernel_colours);
-  const torchdof_shares *shares = scene.shares ? rays.shares.data() : nullptr;
+  const torchdof_field_mask *shares = scene.shares ? rays.shares.data() : nullptr;
   const int32_t shares_count = scene.shares ? int32_t(radii.size()) : 0;
   const int finished = torchdof_finish(job, kernels_at.data(), halves.data(), shares, shares_count, picture.data());
   torchdof_free(job);
