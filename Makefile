@@ -23,7 +23,7 @@ FOR_DEMO := $(VENV)/.installed-for-demo
 export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export PIP_BUILD_CONSTRAINT := $(PIP_CONSTRAINT)
 
-.PHONY: demo test oldest docs pictures sweep install check wheel sanitize fuzz soak clean
+.PHONY: demo test oldest docs pictures sweep install check package wheel sanitize fuzz soak clean
 
 demo: $(FOR_DEMO)
 	$(BIN)/python examples/demo.py --data examples/data/motorcycle --out out
@@ -37,11 +37,7 @@ oldest:
 		build/venv-oldest/bin/pip install --quiet --editable '.[test]'
 	build/venv-oldest/bin/python -m pytest -n 2 --dist worksteal
 
-docs: $(INSTALLED)
-	rm -rf build/package
-	mkdir -p build/package
-	cp -r torchdof build/package/
-	cp -r fit export build/package/torchdof/
+docs: $(INSTALLED) package
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir build/site
 
 pictures: $(INSTALLED)
@@ -52,15 +48,19 @@ sweep: $(INSTALLED)
 
 install: $(INSTALLED)
 
-# Style and types. Types are checked on a copy that is installed, not editable:
-# only there do checkers find fit/ as torchdof.fit and export/ as torchdof.export.
-check: $(INSTALLED)
+check: $(INSTALLED) package
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	rm -rf build/typecheck
-	$(BIN)/pip install --quiet --no-deps --target build/typecheck .
-	MYPYPATH=build/typecheck $(BIN)/mypy -p torchdof
-	MYPYPATH=build/typecheck $(BIN)/mypy tests examples
+	MYPYPATH=build/package $(BIN)/mypy -p torchdof
+	MYPYPATH=build/package $(BIN)/mypy tests examples
+
+# The package with the folders of an installation: only there do checkers of types and of names find fit/ as
+# torchdof.fit and export/ as torchdof.export.
+package:
+	rm -rf build/package
+	mkdir -p build/package
+	cp -r torchdof build/package/
+	cp -r fit export build/package/torchdof/
 
 wheel: $(INSTALLED)
 	tests/packaging/wheel.sh $(BIN)/python
@@ -77,16 +77,17 @@ soak: $(INSTALLED)
 
 INSTALLS_FROM := pyproject.toml constraints.txt CMakeLists.txt $(wildcard torchdof/native/src/*) build/modules
 
+# --no-compile: Python compiles a module when it first imports it; most of the 11,000 are never imported.
 $(INSTALLED): $(INSTALLS_FROM)
 	@echo "installing into $(VENV) all that development needs; the first time this takes minutes"
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --editable '.[dev]'
+	$(BIN)/pip install --quiet --no-compile --editable '.[dev]'
 	touch $(FOR_DEMO) $@
 
 $(FOR_DEMO): $(INSTALLS_FROM)
 	@echo "installing into $(VENV); the first time this takes a minute"
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --editable .
+	$(BIN)/pip install --quiet --no-compile --editable .
 	touch $@
 
 # An editable installation knows where each module lies: after one has moved it must be made again.

@@ -7,11 +7,13 @@ import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import onnx
 import onnx_ir
 import torch
 from onnxscript import opset20
+from torch.onnx._internal.fx.passes import type_promotion
 
 from torchdof import DepthOfField
 from torchdof.io.atomic import atomic_file
@@ -120,7 +122,7 @@ def _translate(program: torch.export.ExportedProgram, portable: Portable, opset:
     """The module as an ONNX graph, translated by torch.onnx and not yet simplified."""
     # torch.onnx would trace everything again to decompose operators, most of which it can translate as they are
     vars(program)["run_decompositions"] = lambda _: program
-    with _quiet():
+    with _quiet(), mock.patch.object(type_promotion, "_TypePromotionInterpreter", _Promotion):
         converted = torch.onnx.export(
             program,
             dynamo=True,
@@ -139,6 +141,17 @@ def _translate(program: torch.export.ExportedProgram, portable: Portable, opset:
         translated.opset_imports[""] = opset
         converted.model.functions[translated.identifier()] = translated
     return converted.model
+
+
+class _TracedValues(torch.fx.Interpreter):
+    """Takes the values of a graph's nodes from its tracing, and computes only those of nodes added since."""
+
+    def run_node(self, n: torch.fx.Node) -> Any:
+        return n.meta["val"] if "val" in n.meta else super().run_node(n)
+
+
+class _Promotion(type_promotion._TypePromotionInterpreter, _TracedValues):
+    """Casts arguments of mixed types, like torch.onnx, which computes every node again: half of a translation."""
 
 
 def _remainder(self: Any, other: Any) -> Any:

@@ -33,7 +33,7 @@ MODULES: dict[str, Callable[[], torchdof.DepthOfField]] = {
     "plain": lambda: torchdof.DepthOfField(
         CAMERA, **GIVEN, tolerance=16 / 255, max_coc_px=2.5, occlusion=False, check=False
     ),
-    # the literal scatter, without occlusion and with it
+    # the literal scatter: without occlusion in one straight graph of one size, and with it
     "fold": lambda: torchdof.DepthOfField(
         CAMERA, **GIVEN, tolerance=32 / 255, max_coc_px=2.5, occlusion=False, method="fold", check=False
     ),
@@ -41,7 +41,8 @@ MODULES: dict[str, Callable[[], torchdof.DepthOfField]] = {
         CAMERA, **GIVEN, tolerance=16 / 255, max_coc_px=2.5, method="fold", check=False
     ),
 }
-LAYOUTS: dict[str, Layout] = {"whole": "whole"}
+LAYOUTS: dict[str, Layout] = {"whole": "whole", "fold": "whole"}
+SIZES = {"fold": (72, 100)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +86,7 @@ def export_once(name: str, folder: Path) -> Exported:
             generator = torch.get_rng_state()
             torch.set_default_dtype(torch.float64 if name == "plain" else torch.float32)  # which changes no file
             try:
-                verification.write_bytes(pickle.dumps(to_onnx(dof, path, layout=layout)))
+                verification.write_bytes(pickle.dumps(to_onnx(dof, path, layout=layout, size=SIZES.get(name))))
             finally:
                 torch.set_default_dtype(torch.float32)
             assert torch.equal(torch.get_rng_state(), generator), "the caller's generator has been advanced"

@@ -26,7 +26,7 @@ from .optics.blur_table import BlurTable
 from .optics.camera import Camera
 from .options import OptionArguments, Options, spells_options
 from .tensors import floating
-from .validation import FROM_NUMPY, choice, image_and_map, number, show
+from .validation import FROM_NUMPY, choice, image_and_map, number, real_tensor, refuse_nested, show
 
 __all__ = ["DepthAugmentationSequential", "RandomDepthOfField"]
 
@@ -100,7 +100,7 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         if not isinstance(self.camera, Camera):
             raise ValueError(f"camera must be a torchdof.Camera, got {show(camera)}")
         self.camera.replace(focus_m=near_m, f_number=smallest_f)
-        tables = [table] if table is None or isinstance(table, BlurTable) else [*table]
+        tables = [*table] if isinstance(table, Sequence) and not isinstance(table, str) else [table]
         if not tables:
             raise ValueError("table must be a torchdof.BlurTable, several, or None, got an empty list")
         choice("transfer", transfer, ("linear", "srgb"))
@@ -130,6 +130,8 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
         """Draw the parameters of one image, each ``[1]``, from ``generator``; the global generator is not used."""
+        if not isinstance(generator, torch.Generator):
+            raise ValueError(f"generator must be a torch.Generator, got {show(generator)}")
         ranges = {name: low_and_high for low_and_high, name, _, _ in self._ranges}
         uniform = functools.partial(torch.rand, 1, generator=generator, device=generator.device)
         return self._in_units({name: low + (high - low) * uniform() for name, (low, high) in ranges.items()})
@@ -189,8 +191,8 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         """
         if isinstance(input, Mapping):
             return self._forward_dict(input, params, **kwargs)
+        shape = _batch_shape(input)
         if depth is not None:
-            shape = _batch_shape(input)
             params = dict(self.forward_parameters(shape) if params is None else params)
             params["depth"] = depth
         try:
@@ -378,6 +380,7 @@ def _image_and_depth(input: Tensor, depth: Tensor | None) -> tuple[Tensor, Tenso
                 f"mask is the depth; got an image of {input.shape[1]} channels alone"
             )
         image, depth, passed_on = input[:, :-1], input[:, -1:], input[:, -1:]
+    real_tensor("depth", depth, "[B, 1, H, W] in metres")
     if depth.ndim in (2, 3):
         depth = depth.unsqueeze(-3) if depth.ndim == 2 or len(depth) == len(input) else depth
         depth = depth if depth.ndim == 4 else depth[None]
@@ -397,6 +400,7 @@ def _range(name: str, value: Any, largest: float) -> tuple[float, float]:
 
 def _batch_shape(image: Any) -> tuple[int, ...]:
     """Shape ``[B, C, H, W]`` of one image or a batch."""
+    refuse_nested("image", image)
     if not floating(image) or image.ndim not in (3, 4):
         hint = "; convert bytes with image.float() / 255, or torchvision's ToDtype(torch.float32, scale=True)"
         if floating(image):

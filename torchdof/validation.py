@@ -42,6 +42,12 @@ def show(value: Any) -> str:
     return text if 0 < len(text) <= 60 else f"{type(value).__name__} {text[:40]}...".replace(" ...", "")
 
 
+def refuse_nested(name: str, value: Any) -> None:
+    """Refuse a nested tensor, whose shape and numbers most operations cannot read; a traced program has none."""
+    if not is_traced() and isinstance(value, Tensor) and value.is_nested:
+        raise ValueError(f"{name} must be a dense tensor, got a nested one; pass its parts one by one, or padded")
+
+
 def number(
     name: str, value: Any, low: float = -math.inf, high: float = math.inf, unit: str = "", infinite: bool = False
 ) -> float:
@@ -126,6 +132,7 @@ def real_tensor(name: str, value: Any, what: str) -> Tensor:
     """
     if not isinstance(value, Tensor):
         raise ValueError(f"{name} must be a tensor {what}, got {show(value)}")
+    refuse_nested(name, value)
     if not floating(value):
         raise ValueError(f"{name} must be a floating-point tensor {what}, got {value.dtype}; convert it with .float()")
     if value.layout != torch.strided:
@@ -160,6 +167,8 @@ def image_and_map(image: Tensor, name: str, value: Tensor, unit: str) -> None:
     if not isinstance(image, Tensor):
         got = show(image) + FROM_NUMPY if isinstance(image, np.ndarray) else type(image).__name__
         raise ValueError(f"image must be a tensor [B, C, H, W] in linear light, got {got}")
+    refuse_nested("image", image)
+    refuse_nested(name, value)
     if not floating(image):
         hint = "convert it with .float()" if image.is_floating_point() else "decode it first"
         raise ValueError(f"image must be floating point in linear light, of 16 bits or more, got {image.dtype}; {hint}")
@@ -241,6 +250,8 @@ def background(
     if hidden is None or where is None:
         missing = "background" if hidden is None else "background_depth (or background_coc_px)"
         raise ValueError(f"a background needs its depth, and a depth its background: {missing} is missing")
+    refuse_nested("background", hidden)
+    refuse_nested(name, where)
     like = (image.shape, image.dtype, image.device)
     if not isinstance(hidden, Tensor) or (hidden.shape, hidden.dtype, hidden.device) != like:
         raise ValueError(f"background must be like the image, {show(image)}, got {show(hidden)}")
@@ -268,7 +279,13 @@ def stretch(image: Tensor, depth: Tensor) -> float:
 def is_resizable(image: Any, depth: Any) -> bool:
     """Whether a depth map has another size than an image, but nearly the same aspect ratio."""
     maps = all(isinstance(t, Tensor) and t.ndim == 4 and t.is_floating_point() and t.numel() for t in (image, depth))
-    if not maps or image.shape[-2:] == depth.shape[-2:] or image.device != depth.device:
+    if (
+        not maps
+        or image.is_nested
+        or depth.is_nested
+        or image.shape[-2:] == depth.shape[-2:]
+        or image.device != depth.device
+    ):
         return False
     return depth.shape[0] in (1, image.shape[0]) and depth.shape[1] == 1 and stretch(image, depth) <= _MAX_STRETCH
 

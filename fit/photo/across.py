@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.field import Field
+from torchdof.validation import show
 
 from ..problems import FitError
 from ..result import Array
@@ -35,8 +36,9 @@ def table_of_dots(dots: Sequence[tuple[Captures, TableFit]]) -> BlurTable:
     Raises:
         FitError: there are no two dots at different distances from the centre, or their fits differ in kind.
     """
-    if len(dots) < 2:
-        raise FitError(f"dots must be those of a grid, two at least, got {len(dots)}")
+    if not isinstance(dots, Sequence) or len(dots) < 2:
+        got = len(dots) if isinstance(dots, Sequence) else show(dots)
+        raise FitError(f"dots must be those of a grid, two at least, got {got}")
     captures, first_fit = dots[0]
     first = first_fit.table
     for other, fit in dots:

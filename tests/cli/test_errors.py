@@ -13,6 +13,7 @@ _RENDER = """
 none.exr depth.npy --focus-m 2                        | none.exr: there is no such file
 image.exr none.npy --focus-m 2                        | none.npy: there is no such file
 image.exr --focus-m 2                                 | image.exr: has no depth channel; name a depth file
+a.png                                                 | IMAGE DEPTH, which a network such as Depth Anything makes of it
 image.exr small.npy --focus-m 2                       | small.npy: depth is 3 x 4 pixels and the image 24 x 16
 image.exr small.npy --depth-kind coc                  | small.npy: coc is 3 x 4 pixels but the image is 24 x 16
 image.exr holed.npy --focus-m 2                       | holed.npy: 2 pixels (0.5 %) have no depth
@@ -183,6 +184,7 @@ def test_an_error_is_one_sentence_with_names_of_options(
         ("render --nonsense", "No such option '--nonsense'"),
         ("bench --repeat 0", "0 is not in the range x>=1"),
         ("nonsense", "No such command 'nonsense'"),
+        ("image.exr depth.npy -o out.exr", "to blur a picture: torchdof render image.exr DEPTH -o OUT"),
     ],
 )
 def test_wrong_usage_names_the_option_or_command(run: Callable[..., str], line: str, expected: str) -> None:

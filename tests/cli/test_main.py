@@ -84,6 +84,17 @@ def test_a_missing_package_is_named_with_the_extra_that_installs_it(
     assert "this command needs scipy; install it with: pip install 'torchdof[fit]'" in run("export", code=2)
 
 
+@pytest.mark.parametrize("place", ["importlib.import_module", "torchdof.bench.speed.compare"])
+def test_ctrl_c_gives_one_word_and_code_130(
+    place: str, run: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(place, stop)
+    assert run("bench", code=130) == "interrupted\n"
+
+
 @pytest.mark.parametrize("variables", [{}, {"GOMP_SPINCOUNT": "77"}, {"OMP_WAIT_POLICY": "active"}], ids=str)
 def test_waiting_threads_do_not_spin_unless_the_environment_asks_for_it(
     variables: dict[str, str], monkeypatch: pytest.MonkeyPatch

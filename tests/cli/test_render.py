@@ -17,7 +17,11 @@ from torch import Tensor
 
 import torchdof
 from tests.files import store
+from torchdof.cli.frame import coc_of, read_frame
+from torchdof.cli.lens import Lens
 from torchdof.cli.main import app
+from torchdof.cli.options import DepthMap, Scene
+from torchdof.cli.output import Notices
 from torchdof.depth.inspect import tint_focus
 from torchdof.io.highlights import expand_highlights
 from torchdof.io.images import Picture, read_image, write_image
@@ -39,6 +43,12 @@ SLIT[1:7, 1:3] = 1.0
 
 def pixels(path: str) -> Tensor:
     return read_image(path).pixels
+
+
+def cut(path: str, byte_count: int | None = None) -> None:
+    """Takes bytes from the end of a file; None takes all."""
+    content = Path(path).read_bytes()
+    Path(path).write_bytes(content[: len(content) - (byte_count or len(content))])
 
 
 SHAPED = CAMERA.replace(focus_range_m=(1.5, 1.8), tilt_deg=3.0, swing_deg=-1.0)
@@ -285,13 +295,25 @@ def test_metadata_are_copied_and_bits_and_transfer_follow_the_options(image: Ten
     torch.testing.assert_close(pixels("again.exr"), image, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize(("suffix", "notes"), [(".webp", 1), (".hdr", 1), (".jpg", 0), (".exr", 0)])
+def test_a_phones_lens_without_a_sensor_is_a_wide_one_and_an_impossible_distance_is_not_the_focus(
+    image: Tensor, run: Run
+) -> None:
+    tags = {"Exif:FocalLength": 4.0, "Exif:SubjectDistance": 0.001}
+    write_image("phone.png", Picture(image, metadata={name: ("float", value) for name, value in tags.items()}))
+    line = run("render phone.png depth.npy -o out.png")
+    assert "4 mm on 5.538 mm" in line and "sensor width assumed" in line  # 36 mm / 26 mm * 4 mm
+    assert "focus on what is nearest the middle" in line
+    assert "4 mm on 8 mm" in run("render phone.png depth.npy -o out.png --sensor-width-mm 8 --focus-m 2")
+
+
+@pytest.mark.parametrize(("suffix", "notes"), [(".webp", 0), (".hdr", 1), (".jpg", 0), (".exr", 0)])
 def test_a_note_states_that_a_type_of_file_holds_no_exif(image: Tensor, suffix: str, notes: int) -> None:
     write_image("photo.png", Picture(image, metadata={"Exif:FocalLength": ("float", 50.0)}, sample="8"))
     note = guessed(f"render photo.png depth.npy -o out{suffix} --focus-m 2 {LENS}")[1]
     assert note.count(f"out{suffix}: EXIF data are lost in a {suffix} file; write .jpg, .png or .tif") == notes
     assert ("Exif:FocalLength" in read_image(f"out{suffix}").metadata) != bool(notes)
     assert "EXIF" not in guessed(f"render photo.png depth.npy -o rack.webp --focus-m 1:2,2:3 {LENS}")[1]
+    assert "Exif:FocalLength" in read_image("rack.webp").metadata
 
 
 def test_a_note_names_the_layers_of_an_exr_that_are_not_copied(image: Tensor, depth: Tensor) -> None:
@@ -354,6 +376,14 @@ def test_steady_depth_flickers_less_and_resumed_or_partial_runs_give_the_same_fr
             3,
             "out.####.exr.json, which has the options of existing frames, is missing",
         ),
+        (
+            lambda: Path("out.####.exr.json").write_text(""),
+            "",
+            3,
+            "out.####.exr.json, which has the options of existing frames, is missing",
+        ),
+        (lambda: cut("out.0002.exr", 1), "", 1, "or they are cut short"),
+        (lambda: cut("out.0002.exr"), "--steady", 1, "or they are cut short"),
         (lambda: guessed(f"{SEQUENCE} --f-number 4 {PULL} --frames 1"), "", 3, "--f-number changed"),
         (lambda: guessed(f"{SEQUENCE} --f-number 4 {PULL} --frames 1"), "--f-number 4", 2, OLDER),
     ],
@@ -438,6 +468,9 @@ def test_the_folder_of_the_output_is_made(run: Run) -> None:
     assert read_image("new/folder/out.exr").pixels.shape[-1] == 24
     run(f"inspect image.exr depth.npy -o other/sheet.png --focus-m 2 {LENS}")
     assert Path("other/sheet.png").is_file()
+    run("tables disc -o third/disc.png")
+    run("fit --lens double_gauss_50mm --f-number 8 --nodes 5 -o fourth/lens.json")
+    assert Path("third/disc.png").is_file() and Path("fourth/lens.json").is_file()
 
 
 # The first command
@@ -482,6 +515,10 @@ def test_a_guess_of_metres_is_noted_unless_the_focus_is_in_metres(depth: Tensor,
     line, note = guessed("render image.exr depth.npy -o out.exr")
     assert note.startswith("note: depth.npy: taken for metres") and line.startswith("out.exr: focus 2 m")
     assert guessed(f"{ONE} {LENS}")[1] == ""
+    np.save("estimate.npy", np.linspace(2.0, 30.0, 16, dtype=np.float32)[:, None].repeat(24, 1))
+    line, note = guessed("render image.exr estimate.npy -o out.exr --focus-m 2")
+    assert "2 m, " in line and "taken for metres, as the options are in metres, but its numbers grow downwards" in note
+    assert "taken for relative depth" in guessed("render image.exr estimate.npy -o out.exr")[1]
     holed = depth.clone()
     holed[..., 3, 4:6] = 0.0
     np.save("depth.npy", holed.numpy())
@@ -536,6 +573,30 @@ def test_lens_and_points_are_those_of_the_display_window(image: Tensor, depth: T
     camera = CAMERA.replace(focus_m=6.0, sensor_width_mm=2.0)
     expected = torchdof.depth_of_field(image, depth, camera, attention=(18.0, 8.0, 4.0))
     torch.testing.assert_close(pixels("out.exr"), expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("left", "top"), [(9, 3), (0, 17), (24, 20), (12, 12)])
+def test_a_part_of_the_frame_has_the_blur_that_it_has_in_the_whole(left: int, top: int) -> None:
+    """A tilted lens and lengths of rays have their centre in the middle of the display window."""
+    rays = 2 + torch.rand(1, 1, 40, 48, generator=torch.Generator().manual_seed(4))
+    rows, columns = slice(top, top + 16), slice(left, left + 24)
+    found = []
+    for area in ((slice(0, 40), slice(0, 48)), (rows, columns)):
+        light = torch.ones(1, 3, 40, 48)[(..., *area)]
+        place = (area[1].start - 7, area[0].start + 4, -7, 4, 48, 40)
+        write_image("part.exr", Picture(light, sample="float", window=place))
+        np.save("part.npy", rays[(0, 0, *area)].numpy())
+        lens = Lens(
+            tilt=0.4, swing=-0.3, focus_at=(left + 8, top + 9), focal_length_mm=30, sensor_width_mm=36, f_number=1
+        )
+        scene = Scene(lens=lens, depth_map=DepthMap(depth_kind="distance"))
+        frame = read_frame(Path("part.exr"), Path("part.npy"), scene)
+        found.append((frame.values, *coc_of(frame, Notices())[:2]))
+    (whole_m, whole_px, camera), (part_m, part_px, part_camera) = found
+    torch.testing.assert_close(part_m, whole_m[..., rows, columns])
+    torch.testing.assert_close(part_px, whole_px[..., rows, columns], rtol=1e-4, atol=1e-5)
+    assert camera is not None and part_camera is not None
+    assert part_camera.focus_m == pytest.approx(camera.focus_m)
 
 
 def test_a_note_advises_how_to_increase_a_hardly_visible_blur(run: Run) -> None:

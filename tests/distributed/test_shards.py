@@ -179,6 +179,29 @@ def test_a_shard_is_made_again_if_its_settings_or_files_have_changed(pairs: list
     assert (remade(seed=1), remade(seed=1)) == ([0, 1], [])
 
 
+@pytest.mark.parametrize("suffix", [".tar", ".json"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_shard_whose_process_ends_between_its_two_files_is_made_again(
+    pairs: list[Pair], tmp_path: Path, suffix: str, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Shards of other settings often have the same size, because it is a multiple of 10 kB."""
+
+    def stopped(source: Any, target: Path) -> None:
+        if target.suffix == suffix:
+            raise SystemExit
+        renamed(source, target)
+
+    renamed, rows = os.replace, shard_rows(pairs[:1])
+    make_shards(tmp_path / "out", rows)
+    with monkeypatch.context() as patch, pytest.raises(SystemExit):
+        patch.setattr(os, "replace", stopped)
+        make_shards(tmp_path / "out", rows, seed=1)
+    make_shards(tmp_path / "out", rows, seed=seed)
+    make_shards(tmp_path / "new", rows, seed=seed)
+    made, expected = (members(tmp_path / name / "shard-000000.tar") for name in ("out", "new"))
+    assert made == expected and summary_of(tmp_path / "out").samples == 1
+
+
 def test_a_shard_is_written_completely_or_not_at_all(
     pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,6 +7,7 @@ import runpy
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,21 +21,26 @@ from torchdof.io.images import read_image
 from torchdof.optics.camera import Camera
 from torchdof.reference.metrics import display
 
+Run = Callable[..., tuple[dict[str, Any], str]]
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
 DATA = EXAMPLES / "data" / "motorcycle"
 
 
-def printed_by(script: str, *arguments: object) -> str:
-    """What a script prints in a process of its own."""
-    call = [sys.executable, str(EXAMPLES / script), *map(str, arguments)]
-    run = subprocess.run(call, capture_output=True, text=True, timeout=110)
-    assert run.returncode == 0, run.stderr
-    return run.stdout
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs a script with arguments as the main module, and returns its globals and what it prints."""
+
+    def run(script: str, *arguments: object) -> tuple[dict[str, Any], str]:
+        monkeypatch.setattr(sys, "argv", [script, *map(str, arguments)])
+        names = runpy.run_path(str(EXAMPLES / script), run_name="__main__")
+        return names, capsys.readouterr().out
+
+    return run
 
 
-def test_the_sheet_of_bokeh_shows_six_lenses(tmp_path: Path) -> None:
-    printed_by("bokeh.py", "--out", tmp_path / "bokeh.png", "--height", 96)
+def test_the_sheet_of_bokeh_shows_six_lenses(tmp_path: Path, run: Run) -> None:
+    run("bokeh.py", "--out", tmp_path / "bokeh.png", "--height", 96)
     picture = read_image(tmp_path / "bokeh.png").pixels
     assert picture.shape == (1, 3, 96 + 34 + 8, 6 * (72 + 8) + 8)
     panels = [picture[..., 34:130, 8 + 80 * k : 80 + 80 * k] for k in range(6)]
@@ -43,22 +49,23 @@ def test_the_sheet_of_bokeh_shows_six_lenses(tmp_path: Path) -> None:
         assert all(float((panel - other).abs().mean()) > 2e-3 for other in panels[:k])
 
 
-def test_per_pixel_prints_a_row_for_each_radius() -> None:
-    rows = [line.split() for line in printed_by("benchmarks/per_pixel.py", "--side", 12).splitlines()]
+def test_per_pixel_prints_a_row_for_each_radius(run: Run) -> None:
+    rows = [line.split() for line in run("benchmarks/per_pixel.py", "--side", 12)[1].splitlines()]
     assert rows[0] == ["radius", "splat", "step", "layered"] and [row[0] for row in rows[1:]] == ["4", "8", "16"]
 
 
-def test_operations_prints_a_row_for_each_scene_and_for_a_batch_of_four(tmp_path: Path) -> None:
+def test_operations_prints_a_row_for_each_scene_and_for_a_batch_of_four(tmp_path: Path, run: Run) -> None:
     for name in "abcd":
         shutil.copytree(ROOT / "tests" / "data" / "scenes" / "planes", tmp_path / name)
         for path in (tmp_path / name).glob("*.exr"):
             assert oiio.ImageBufAlgo.cut(oiio.ImageBuf(str(path)), oiio.ROI(0, 64, 0, 48)).write(str(path))
-    rows = printed_by("benchmarks/operations.py", tmp_path).splitlines()
+    rows = run("benchmarks/operations.py", tmp_path)[1].splitlines()
     assert len(rows) == 5 and all(0 < int(row.split()[-5]) < 20_000 for row in rows)  # the last is of all four at once
 
 
-def test_steps_prints_the_cost_of_a_step() -> None:
-    row = printed_by("benchmarks/steps.py", "--repeat", 1, "--row", 1)
+def test_steps_prints_the_cost_of_a_step() -> None:  # in a process of its own, whose memory it measures
+    call = [sys.executable, str(EXAMPLES / "benchmarks/steps.py"), "--repeat", "1", "--row", "1"]
+    row = subprocess.run(call, capture_output=True, text=True, timeout=110, check=True).stdout
     numbers = (float(word) for word in row[38:].split() if word not in ("ms", "MiB"))
     picture, step, ratio, *memory = numbers
     assert row[:38].strip() == "1 of 256 x 256, without occlusion"
@@ -70,9 +77,8 @@ MAX_OUTLIERS = {"near": 680, "middle": 1070, "far": 390}
 """Largest number of pixels with a blur radius above 2 px that differ from the median of their 3 x 3 by over 8/255."""
 
 
-def test_few_pixels_differ_from_their_blurred_surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["demo.py", "--data", str(DATA), "--out", str(tmp_path)])
-    demo = runpy.run_path(str(EXAMPLES / "demo.py"), run_name="__main__")
+def test_few_pixels_differ_from_their_blurred_surroundings(tmp_path: Path, run: Run) -> None:
+    demo, _ = run("demo.py", "--data", DATA, "--out", tmp_path)
     known = json.loads((DATA / "camera.json").read_text())
     depth = read_depth(DATA / "motorcycle_disp.npz", **known["depth"])
     width = depth.shape[-1]
@@ -87,12 +93,8 @@ def test_few_pixels_differ_from_their_blurred_surroundings(tmp_path: Path, monke
 
 
 @pytest.mark.filterwarnings("ignore:.*one distance was measured")  # as in the paper
-def test_the_paper_s_experiment_reaches_its_figure_4(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("sys.argv", [str(EXAMPLES / "paper.py"), "--out", str(tmp_path)])
-    runpy.run_path(str(EXAMPLES / "paper.py"), run_name="__main__")
-    printed = capsys.readouterr().out
+def test_the_paper_s_experiment_reaches_its_figure_4(tmp_path: Path, run: Run) -> None:
+    _, printed = run("paper.py", "--out", tmp_path)
     for name in ("sato_fig2", "sato_fig3", "sato_fig4", "traced_fig2_ratio", "traced_fig3", "traced_fig4"):
         picture = np.asarray(oiio.ImageBuf(str(tmp_path / f"{name}.png")).get_pixels())
         assert picture.std() > 0.02, name

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.exported import SIZES
 from torchdof import BlurTable
 from torchdof.export import ray_splats
 from torchdof.export.rays import kernels_of
@@ -17,7 +18,7 @@ from torchdof.reference.scenes import read_scenes
 from torchdof.render.plan import Plan
 
 DATA = Path(__file__).parents[1] / "data" / "scenes"
-SIZE = (72, 100)
+SIZE = SIZES["fold"]
 
 
 def inputs(name: str, max_coc_px: float) -> tuple[Tensor, ...]:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from tests.scenes import CAMERA, slope, texture, whole
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field
+from torchdof.augmentation import RandomDepthOfField
 from torchdof.depth import depth_from_values, fill_holes
 from torchdof.io.images import Picture, write_image
 from torchdof.optics import psf
@@ -40,6 +41,21 @@ TAKES_TENSORS: dict[str, Callable[[Tensor], Any]] = {
     "depth   ": lambda x: fill_holes(x, "far"),
     "pixels": lambda x: write_image("never.exr", Picture(x.expand(1, 3, 4, 5))),
 }
+TAKES_NESTED: dict[str, Callable[[Tensor], Any]] = {
+    "image": lambda x: DOF(x, MAP),
+    "image ": lambda x: RandomDepthOfField(p=1.0)(x, MAP),
+    "depth": lambda x: DOF(IMAGE, x),
+    "coc_px": lambda x: blur_by_coc(IMAGE, x),
+    "focus_m": lambda x: DOF(IMAGE, MAP, focus_m=x),
+    "tilt_deg": lambda x: Camera(tilt_deg=x),
+    "background": lambda x: DOF(IMAGE, MAP, background=x, background_depth=MAP),
+    "background_depth": lambda x: DOF(IMAGE, MAP, background=IMAGE, background_depth=x),
+    "attention": lambda x: DOF(IMAGE, MAP, attention=x),
+    "rgba": lambda x: DOF.layers(x, torch.ones(2)),
+    "coc": lambda x: BlurTable("gaussian", x, {"sigma": [1.0]}),
+    "depth ": lambda x: CAMERA.coc_px(x, 10),
+    "pixels": lambda x: write_image("never.exr", Picture(x)),
+}
 STORED = [torch.float8_e4m3fn, torch.float8_e5m2, torch.float8_e4m3fnuz, torch.float8_e5m2fnuz]
 NEWER = [getattr(torch, name) for name in ("float8_e8m0fnu", "float4_e2m1fn_x2") if hasattr(torch, name)]
 
@@ -50,6 +66,15 @@ def test_storage_only_types_are_refused_by_name(name: str, dtype: torch.dtype) -
     stored = torch.full((1, 1, 4, 5), 56, dtype=torch.uint8).view(dtype)
     with pytest.raises(ValueError, match=rf"{name.strip()}\b.* got .*float(8|4)"):
         TAKES_TENSORS[name](stored)
+
+
+@pytest.mark.filterwarnings("ignore:The PyTorch API of nested tensors:UserWarning")
+@pytest.mark.parametrize("layout", [torch.strided, torch.jagged], ids=str)
+@pytest.mark.parametrize("name", TAKES_NESTED)
+def test_nested_tensors_are_refused_by_name(name: str, layout: torch.layout) -> None:
+    nested = torch.nested.nested_tensor([torch.ones(3, 4, 5), torch.ones(3, 6, 5)], layout=layout)
+    with pytest.raises(ValueError, match=rf"{name.strip()} must be a dense tensor, got a nested one"):
+        TAKES_NESTED[name](nested)
 
 
 # Plans

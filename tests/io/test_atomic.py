@@ -11,9 +11,10 @@ from typing import Any
 import pytest
 import torch
 
+from tests.files import as_an_ordinary_user
 from tests.processes import output_of
 from torchdof import BlurTable
-from torchdof.io.atomic import atomic_file
+from torchdof.io.atomic import atomic_file, check_writable
 from torchdof.io.images import Picture, read_image, write_image
 
 pytestmark = pytest.mark.hard
@@ -78,7 +79,7 @@ def test_a_full_disk_is_an_error_and_leaves_the_old_file(tmp_path: Path) -> None
 
 WRITING = """
 import signal, sys, time
-from torchdof.io.atomic import atomic_file
+from torchdof.io.atomic import atomic_file, check_writable
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup would have set it to be ignored
 with atomic_file(sys.argv[1]) as outer, atomic_file(sys.argv[1] + ".json") as inner:
     outer.write_bytes(b"half")
@@ -142,14 +143,22 @@ def test_a_link_is_followed_and_kept(tmp_path: Path) -> None:
     assert (tmp_path / "real.png").read_text() == "new"
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere")
-def test_a_folder_without_permission_is_named(tmp_path: Path) -> None:
+def test_a_folder_or_file_that_is_read_only_is_named_and_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "access", as_an_ordinary_user)
+    (tmp_path / "x.exr").write_text("old")
+    (tmp_path / "x.exr").chmod(0o444)
+    with pytest.raises(PermissionError, match=r"x\.exr: is read-only; make it writable or name another file"):
+        write_image(tmp_path / "x.exr", PICTURE)
     tmp_path.chmod(0o500)
     try:
         with pytest.raises(PermissionError, match="may not write to the folder"):
-            write_image(tmp_path / "x.exr", PICTURE)
+            write_image(tmp_path / "y.exr", PICTURE)
+        for path in (tmp_path / "x.exr", tmp_path / "missing" / "y.exr"):
+            with pytest.raises(PermissionError, match="is read-only|may not write to the folder"):
+                check_writable(path)
     finally:
         tmp_path.chmod(0o700)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("x.exr", "old")]
 
 
 def test_concurrent_writers_of_one_file_leave_it_whole(tmp_path: Path) -> None:

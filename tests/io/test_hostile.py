@@ -233,6 +233,7 @@ def test_a_truncated_file_is_refused(tmp_path: Path, suffix: str, sample: Any, s
     (tmp_path / f"cut{suffix}").write_bytes(content[: int(len(content) * share)])
     with pytest.raises(OSError, match=r"cut\.\w+: (is damaged or cut short|is cut short|cannot be read)"):
         read_image(tmp_path / f"cut{suffix}")
+    assert decode.is_complete(tmp_path / f"whole{suffix}") and not decode.is_complete(tmp_path / f"cut{suffix}")
 
 
 @pytest.mark.parametrize("suffix", KINDS)
@@ -273,6 +274,23 @@ def test_attributes_are_kept_and_too_many_are_refused_at_once(tmp_path: Path) ->
         with pytest.raises(ValueError, match=rf"x\.exr: its headers hold more than {MAX_ATTRIBUTES} attributes"):
             read_image(tmp_path / "x.exr")
         assert time.perf_counter() - start < 2.0  # OpenEXR takes minutes
+
+
+def test_a_hundred_thousand_channels_are_refused_at_once(tmp_path: Path) -> None:
+    write_image(tmp_path / "x.exr", tiny())
+    content = (tmp_path / "x.exr").read_bytes()
+    start = content.index(b"chlist\0") + 7
+    (size,) = struct.unpack_from("<I", content, start)
+    listed = b"".join(b"c%05d\0" % n + content[start + 6 : start + 22] for n in range(100_000)) + content[start + 4 :]
+    more = struct.pack("<I", len(listed) - len(content) + start + 4 + size) + listed
+    (tmp_path / "x.exr").write_bytes(content[:start] + more)
+    for read in (read_image, read_values):
+        begin = time.process_time()
+        with pytest.raises(
+            ValueError, match=r"x\.exr: its header has 100003 channels in a part; at most 1024 are read"
+        ):
+            read(tmp_path / "x.exr")
+        assert time.process_time() - begin < 2.0  # OpenEXR takes minutes
 
 
 def test_huge_texts_in_a_png_cost_no_time(tmp_path: Path) -> None:

@@ -22,6 +22,12 @@ FULL = {"sensor_width_mm": 36.0}
         ({DISTANCE: 4294967295.0}, {"focus_m": float("inf")}),
         ({"FNumber": 0.0, FOCAL: 0.0, DISTANCE: 0.0}, {}),
         ({"FNumber": "wide"}, {}),
+        # numbers that no lens has: 0/0, micrometres for millimetres, 4294967295/1
+        ({"FNumber": float("nan"), FOCAL: 4250.0, FILM: 0, DISTANCE: float("nan")}, {}),
+        ({"FNumber": 4294967295.0, FOCAL: 4.0, FILM: 65535, PLANE: 1e-9, UNIT: 2}, {"focal_length_mm": 4.0}),
+        ({"FNumber": 0.001, FOCAL: 1e-6, PLANE: float("nan"), UNIT: 9}, {}),
+        ({"FNumber": 0.0, "Exif:ApertureValue": 2.0}, {"f_number": 2.0}),
+        ({FOCAL: 0.0, FILM: 26}, {"focal_length_mm": 26.0, **FULL}),  # the equivalent lens
         ({PLANE: 6000 / 36 * 25.4, UNIT: 2}, FULL),  # 6000 pixels at 4233.333 pixels an inch are 36 mm
         ({PLANE: 6000 / 3.6, UNIT: 3}, FULL),
         ({PLANE: 6000 / 36, UNIT: 4}, FULL),
@@ -59,14 +65,16 @@ SEEN: dict[int, Any] = {
 }
 
 
-@pytest.mark.parametrize("suffix", [".png", ".tif", ".jpg"])
+@pytest.mark.parametrize(("suffix", "out"), [(".png", ".png"), (".tif", ".tif"), (".jpg", ".jpg"), (".jpg", ".webp")])
 @pytest.mark.parametrize("orientation", SEEN)
-def test_a_picture_is_upright_after_reading_and_writing(orientation: int, suffix: str, tmp_path: Path) -> None:
+def test_a_picture_is_upright_after_reading_and_writing(
+    orientation: int, suffix: str, out: str, tmp_path: Path
+) -> None:
     height, width = 16, 24
     stored = np.zeros((height, width, 3), np.uint8)
     stored[0:8, 8:16] = 255
     tags = {"Orientation": orientation, FILM: 26, "Make": "A", WIDTH: width, "Exif:PixelYDimension": height}
-    path, copy = tmp_path / f"stored{suffix}", tmp_path / f"copy{suffix}"
+    path, copy = tmp_path / f"stored{suffix}", tmp_path / f"copy{out}"
     attributes: dict[str, Any] = {name.replace(":", "__"): value for name, value in tags.items()}
     store(path, stored, "uint8", **attributes)
     picture = read_image(path)

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import click
 
+from ..io.atomic import check_writable
 from .command import argument, option
-from .options import Blur, Scene, check_files, json_option
+from .options import Blur, Scene, check_files, json_option, make_folder_of
 from .output import Notices, json_line
 
 
@@ -102,7 +103,7 @@ class Bench:
             raise ValueError("--degrade compares without the reference; leave --views out")
         from ..bench import accuracy
 
-        self.out.mkdir(parents=True, exist_ok=True)
+        make_folder_of(self.out / "accuracy.csv")
         accuracy.compare(truth, self.out, [] if degrade else views or [256], degrade, self.accuracy.peer)
 
     def _measure_speed(self) -> None:
@@ -113,6 +114,8 @@ class Bench:
         if self.image is None and self.scene != Scene():
             raise ValueError("the built-in scene has its own camera and depth; name an IMAGE for these options")
         lens.refuse_keyframes()
+        if self.out is not None:
+            check_writable(self.out / "speed.csv")
         if self.image is not None:
             check_files(self.image, self.depth, None)
         for package, is_needed in {"matplotlib": self.out is not None, "onnxruntime": options.onnx}.items():
@@ -143,7 +146,7 @@ class Bench:
             remark = "blur as given" if camera is None else f"{camera!r}; {', '.join(remarks)}"
             scene = BenchScene(self.image.name, frame.picture.light, coc_px, remark, table)
         if self.out is not None:
-            self.out.mkdir(parents=True, exist_ok=True)
+            make_folder_of(self.out / "speed.csv")
         chosen: dict[speed.Runtime, bool] = {"onnxruntime": options.onnx, "compiled": options.compiled}
         runtimes = [runtime for runtime, is_chosen in chosen.items() if is_chosen]
         rows = speed.compare(scene, options.repeat, Console(stderr=True), runtimes, options.scan)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+from ..io.atomic import check_writable
 from .command import by_option, option
 from .lens import Sensor
 from .options import Accuracy, Blur, json_option
@@ -91,6 +92,7 @@ class Export:
     def _write(self, out: Path) -> None:
         if out.suffix != ".onnx":
             raise ValueError(f"the file is ONNX: name it {out.with_suffix('.onnx')}")
+        check_writable(out)
         from torchdof import Camera, DepthOfField
         from torchdof.export.conversion import to_onnx
 

@@ -11,7 +11,8 @@ from typing import Literal
 import click
 
 from torchdof.cli.command import argument, numbers, option
-from torchdof.cli.options import json_option
+from torchdof.cli.options import json_option, make_folder_of
+from torchdof.io.atomic import check_writable
 
 _micrometres = numbers(None, "--wavelengths takes rgb, or micrometres like 0.65,0.55,0.45")
 _FIELD_EXPECTED = "--field takes distances in mm from the middle of the frame, rising from 0, like 0,7,14,21.6"
@@ -137,10 +138,11 @@ class Fit:
                 advice = "print it at 100 %, photograph it as it says, then: torchdof fit FOLDER -o table.json"
                 click.echo(f"{target}: {advice}")
             return
+        check_writable(self.out)
+        if self.plots is not None:
+            make_folder_of(self.plots / "table.png")
         from torchdof.cli.fit_tables import fit_photographs, trace_lens
 
-        if self.plots is not None:
-            self.plots.mkdir(parents=True, exist_ok=True)
         if lens is not None:
             trace_lens(self, lens)
         elif self.captures is not None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from torchdof import BlurTable, blur_by_coc
+from torchdof.cli.options import make_folder_of
 from torchdof.cli.output import Bar, json_line
 from torchdof.fit.lens import trace
 from torchdof.fit.lens.lens import RGB_UM, Lens
@@ -208,6 +209,7 @@ class FitPrinter:
 
     def write(self, table: BlurTable, target: Path) -> None:
         """Writes a table and prints its path."""
+        make_folder_of(target)
         table.save(target)
         self.say(f"{target}: {table!r}")
 

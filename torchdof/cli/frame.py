@@ -25,7 +25,7 @@ from ..optics.camera import Camera
 from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect, stretch
-from .lens import VISIBLE_PX, Area
+from .lens import VISIBLE_PX, Area, centred_coc_px
 from .options import Scene, make_folder_of
 from .output import Bar, Notices, print_result
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 _LARGE_PX = 8_000_000  # pixels of an image; the bar shows the expected time of larger ones, and of --method fold
 _STRIPS = 16  # number of strips of an image, of which one is timed
-_WITHOUT_EXIF = (".webp", ".hdr", ".pfm")  # types in which OpenImageIO writes no EXIF data
+_WITHOUT_EXIF = (".hdr", ".pfm")  # types in which OpenImageIO writes no EXIF data
 _PANEL_PX = 800  # px; longer side of a panel on a sheet
 
 
@@ -79,7 +79,8 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
     elif picture.depth is not None:
         values = picture.depth
     else:
-        raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH")
+        hint = "" if image.suffix.lower() == ".exr" else ", which a network such as Depth Anything makes of it"
+        raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH{hint}")
     fill: Any = depth_map.fill_depth
     if depth_map.depth_kind == "auto":
         depth_map, guess = depth_map.guessed(values, source, scene.lens.states_metres)
@@ -89,8 +90,9 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
         rows, columns = values.shape[-2:]
         problem = f"coc is {columns} x {rows} pixels but the image is {width} x {height}; they must be the same"
         raise ValueError(f"{source}: {problem}")
-    view_deg = scene.lens.view_deg(picture.metadata, width, area) if kind == "distance" else None
-    unknown, filled = depth_map.depth_unknown, 0
+    centred_width = width + abs(area.width - 2 * area.x - width)
+    view_deg = scene.lens.view_deg(picture.metadata, centred_width, area) if kind == "distance" else None
+    unknown, filled, place = depth_map.depth_unknown, 0, (...,)
     try:
         same_aspect(picture.pixels, values)
         stretched = stretch(picture.pixels, values)
@@ -101,7 +103,9 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
             )
         else:
             conversion: dict[str, Any] = {"scale": depth_map.depth_scale, "offset": depth_map.depth_offset}
-            values = depth_from_values(values, kind, **conversion, unknown=unknown, fov_x_deg=view_deg)
+            if kind == "distance":
+                values, place = area.centred(values, (height, width))
+            values = depth_from_values(values, kind, **conversion, unknown=unknown, fov_x_deg=view_deg)[place]
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
     values = values if kind == "coc" else at_size_of(picture.pixels, values)
@@ -130,7 +134,7 @@ def coc_of(
         return values, None, []
     metadata, is_to_scale = frame.picture.metadata, depth_map.is_to_scale
     camera, remarks = lens.camera(metadata, values, number, is_still, is_to_scale, frame.area)
-    coc_px = camera.coc_px(values, values.shape[-1])
+    coc_px = centred_coc_px(camera, values, frame.area)
     coc_of_lens(coc_px, values, lens.stated(camera))
     notices.warn(frame.name, frame.mistakes(camera))
     return coc_px, camera, remarks + frame.remarks
@@ -208,7 +212,7 @@ class Renderer:
             advice = frame.scene.lens.blur_advice(largest_px, rendered.coc_px.shape[-1], self.is_still)
             self.notices.note("little blur", f"{out}: {advice}")
         has_exif = any(name.startswith("Exif:") for name in frame.picture.metadata)
-        if has_exif and out.suffix.lower() in _WITHOUT_EXIF and not self.is_animation:  # no animation holds them
+        if has_exif and out.suffix.lower() in _WITHOUT_EXIF:
             lost = f"EXIF data are lost in a {out.suffix} file; write .jpg, .png or .tif to keep them"
             self.notices.note("exif", f"{out}: {lost}")
         layers = ", ".join(frame.picture.other_layers)

@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+from ..io.atomic import check_writable
 from .command import argument, option
 from .options import Scene, check_files, json_option, make_folder_of
 from .output import Notices, print_result
@@ -35,6 +36,7 @@ class Inspect:
             raise ValueError("--depth-kind coc is the blur itself: there is no depth to inspect")
         target = Path(f"{self.image.stem}.inspect.png") if self.out is None else self.out
         check_files(self.image, self.depth, target)
+        check_writable(target)
         from ..depth.inspect import inspect_depth, panels
         from ..io.sheet import write_sheet
         from .frame import facts_of_camera, read_frame

@@ -23,6 +23,7 @@ _WIDER = {  # option that sets the aperture -> how to open the lens wider
     "--equivalent": "a smaller --equivalent f-number",
     "--blur": "a larger --blur",
 }
+_PHONE_MM, _PHONE_EQUIVALENT_MM = 10.0, 26.0  # a lens shorter than this is a phone's, whose main lens is like this one
 VISIBLE_PX = 2.0  # px; a note advises more blur if the largest radius is below
 _DEFAULT_BLUR, _VISIBLE_BLUR = 0.02, 0.005  # largest blur radius over the width: by default; the smallest visible one
 _PER_OUTLIER, _MAX_SAMPLES = 1000, 2**20  # one pixel in 1000 is ignored as an outlier; most pixels examined
@@ -39,6 +40,34 @@ class Area(NamedTuple):
     y: int
     width: int
     height: int
+
+    def centred(self, values: "Tensor", size: "tuple[int, int]") -> "tuple[Tensor, Any]":
+        """Pads a map so that the optical axis, in the middle of the full frame, is in the middle of the map.
+
+        Args:
+            values: ``[1, 1, h, w]``, a map of the image.
+            size: Height and width of the image in pixels.
+
+        Returns:
+            The padded map, and the index of the given map in it.
+        """
+        from torch.nn.functional import pad
+
+        (height, width), (rows, columns) = size, values.shape[-2:]
+        across = round((self.width - 2 * self.x - width) * columns / width)  # > 0: the axis is right of the middle
+        down = round((self.height - 2 * self.y - height) * rows / height)
+        left, top = max(0, -across), max(0, -down)
+        padded = pad(values, (left, max(0, across), top, max(0, down)))
+        return padded, (..., slice(top, top + rows), slice(left, left + columns))
+
+
+def centred_coc_px(camera: "Camera", depth: "Tensor", area: Area) -> "Tensor":
+    """As ``camera.coc_px``, with the axis of a tilted lens in the middle of the full frame."""
+    if camera.tilt_deg == camera.swing_deg == 0:
+        return camera.coc_px(depth, depth.shape[-1])
+    padded, place = area.centred(depth, (depth.shape[-2], depth.shape[-1]))
+    wide = camera.replace(sensor_width_mm=camera.sensor_width_mm * (padded.shape[-1] / depth.shape[-1]))
+    return wide.coc_px(padded, padded.shape[-1])[place]
 
 
 def _width_fraction(text: str) -> float:
@@ -187,7 +216,8 @@ class Lens(Sensor):
         """The camera of one picture, and remarks on the source of the numbers that no option states.
 
         1. Take the focus from the options, else from the file, else from the subject of a still.
-        2. Take the lens from the options, else from the file, else from ``_DEFAULTS``. It is that of the full frame:
+        2. Take the lens from the options, else from the file, else from ``_DEFAULTS``, or a phone's sensor for a
+           focal length of the file that no larger camera has. It is that of the full frame:
            ``area`` is the place of the picture in it, None if the picture is the frame.
         3. Open the lens for the blur of ``--blur``, or for a visible blur in a still whose options leave it open.
 
@@ -199,10 +229,14 @@ class Lens(Sensor):
         height, width = depth.shape[-2:]
         area = area or Area(0, 0, width, height)
         stated, in_file = self._stated(area.width, area.height), camera_settings(metadata, area.width, area.height)
+        lens: dict[str, Any] = {name: (_DEFAULTS | in_file | stated)[name] for name in _DEFAULTS}
+        if in_file.get("focal_length_mm", math.inf) < _PHONE_MM and "sensor_width_mm" not in in_file | stated:
+            full_frame_mm = 36.0 * area.width / max(area.width, area.height)
+            lens["sensor_width_mm"] = full_frame_mm * in_file["focal_length_mm"] / _PHONE_EQUIVALENT_MM
         remarks, focus_m = list[str](), math.inf
         if self.focus_m is not None:
             focus_m = focus_at_frame(self.focus_m, frame)
-        elif not self.has_focus and is_to_scale and "focus_m" in in_file:
+        elif not self.has_focus and is_to_scale and 1000 * in_file.get("focus_m", 0.0) > lens["focal_length_mm"]:
             focus_m = in_file["focus_m"]
             remarks.append("focus from the file")
         elif not self.has_focus and not is_still:
@@ -214,7 +248,6 @@ class Lens(Sensor):
             remarks.append("focus on what is nearest the middle")
         if self.fov_deg is not None and not self._opening:
             raise ValueError("--fov-deg needs the opening of the lens: --aperture-radius-m, --f-number or --blur")
-        lens: dict[str, Any] = {name: (_DEFAULTS | in_file | stated)[name] for name in _DEFAULTS}
         sources = {name: "from the file" if name in in_file else "assumed" for name in _DEFAULTS if name not in stated}
         with by_option(self._names()):
             if self.fov_deg is None:
@@ -225,9 +258,9 @@ class Lens(Sensor):
             camera = camera.replace(focus_range_m=self.focus_range, tilt_deg=self.tilt, swing_deg=self.swing)
             camera = camera.replace(sensor_width_mm=camera.sensor_width_mm * (width / area.width))
             if self.focus_at is not None:
-                camera = camera.focus_at(depth, self.focus_at[0] - area.x, self.focus_at[1] - area.y)
+                camera = self._focused(camera, depth, area, self.focus_at)
         share, is_open = self.blur_share, is_still and not self._opening and (self == Lens() or not is_to_scale)
-        largest_px = self._largest_coc_px(camera, depth) if share is not None or is_open else 0.0
+        largest_px = self._largest_coc_px(camera, depth, area) if share is not None or is_open else 0.0
         if is_open and not (is_to_scale and "f_number" in in_file and largest_px >= _VISIBLE_BLUR * width):
             share = _DEFAULT_BLUR
         if share is not None and largest_px > 0:
@@ -237,10 +270,19 @@ class Lens(Sensor):
             remarks += [f"{_LABELS[name]} {source}" for name, source in sources.items() if source]
         return camera, remarks
 
-    def _largest_coc_px(self, camera: "Camera", depth: "Tensor") -> float:
+    def _focused(self, camera: "Camera", depth: "Tensor", area: Area, point: tuple[float, float]) -> "Camera":
+        """The camera focused on a point of the full frame."""
+        x, y = point[0] - area.x, point[1] - area.y
+        if self.tilt == self.swing == 0:
+            return camera.focus_at(depth, x, y)
+        padded, (_, rows, columns) = area.centred(depth, (depth.shape[-2], depth.shape[-1]))
+        wide = camera.replace(sensor_width_mm=camera.sensor_width_mm * (padded.shape[-1] / depth.shape[-1]))
+        return camera.replace(focus_m=wide.focus_at(padded, x + columns.start, y + rows.start).focus_m)
+
+    def _largest_coc_px(self, camera: "Camera", depth: "Tensor", area: Area) -> float:
         """Largest blur radius in pixels at all keyframes of the focus, without the largest thousandth of the pixels."""
         cameras = [camera.replace(focus_m=metres) for _, metres in self.focus_m or []] or [camera]
-        radii = [at_key.coc_px(depth, depth.shape[-1]).abs().nan_to_num(0.0).flatten() for at_key in cameras]
+        radii = [centred_coc_px(at_key, depth, area).abs().nan_to_num(0.0).flatten() for at_key in cameras]
         sampled = [radius[:: 1 + radius.numel() // _MAX_SAMPLES] for radius in radii]
         return max(float(radius.kthvalue(radius.numel() - radius.numel() // _PER_OUTLIER).values) for radius in sampled)
 

@@ -5,7 +5,7 @@ import importlib
 import importlib.metadata
 import os
 import sys
-from typing import Any
+from typing import Any, NoReturn
 
 import click
 
@@ -29,15 +29,22 @@ class _Commands(click.Group):
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if "." in cmd_name and not ctx.resilient_parsing:
+            ctx.fail(f"{cmd_name!r} is not a command; to blur a picture: torchdof render {cmd_name} DEPTH -o OUT")
         if cmd_name not in COMMANDS:
             return None
         module = importlib.import_module(f".{cmd_name}", __package__)
         return command_of(cmd_name, getattr(module, cmd_name.capitalize()))
 
     def invoke(self, ctx: click.Context) -> object:
-        """Prints errors of input, files, memory and missing packages, and exits with code 2; other errors pass."""
+        """Prints errors of input, files, memory and missing packages, and exits with code 2; other errors pass.
+
+        Ctrl-C ends the command with code 130, as in other programs, and one word; Click would exit with 1.
+        """
         try:
             return super().invoke(ctx)
+        except KeyboardInterrupt:
+            _end("interrupted", 130)
         except ModuleNotFoundError as error:
             package = (error.name or "").partition(".")[0]
             if package not in _EXTRAS:
@@ -57,9 +64,14 @@ class _Commands(click.Group):
                 message = _MEMORY_ADVICE
             else:
                 raise
-        with contextlib.suppress(OSError):  # the exit code is the same if standard error is closed
-            click.echo(f"error: {message}", err=True)
-        raise SystemExit(2)
+        _end(f"error: {message}", 2)
+
+
+def _end(line: str, code: int) -> NoReturn:
+    """Prints a line and ends the command with an exit code, which is the same if standard error is closed."""
+    with contextlib.suppress(OSError):
+        click.echo(line, err=True)
+    raise SystemExit(code)
 
 
 def _print_version(ctx: click.Context, _: click.Parameter, is_given: bool) -> None:

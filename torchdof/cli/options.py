@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from ..io.atomic import check_writable
 from ..io.paths import existing_image, existing_map, samples_of
 from .command import by_option, numbers, option, word_or_number
 from .lens import Lens
@@ -86,8 +87,9 @@ class DepthMap:
     def guessed(self, values: "Tensor", path: Path, is_metric: bool) -> "tuple[DepthMap, str]":
         """These options with a guessed kind instead of ``auto``, and a message about the guess.
 
-        If other options are in metres (``is_metric``) and so is the guess, the message is empty. Otherwise holes are
-        filled from the far side by default.
+        If other options are in metres (``is_metric``) and so is the guess, there is a message only for numbers that
+        would be taken for relative depth without these options. Otherwise holes are filled from the far side by
+        default.
         """
         from ..depth.guess import guess_kind
 
@@ -95,7 +97,11 @@ class DepthMap:
         suffix = path.suffix.lower()
         guess = guess_kind(known, suffix in _INTEGER_TYPES, is_metric or suffix in _RENDER_TYPES)
         if guess.kind == "z" and guess.scale == 1.0 and is_metric:
-            return replace(self, depth_kind="z"), ""
+            metres = replace(self, depth_kind="z")
+            if suffix in _RENDER_TYPES or guess_kind(known).kind == "z":
+                return metres, ""
+            looks = "its numbers grow downwards, as in relative depth (--depth-kind relative)"
+            return metres, f"taken for metres, as the options are in metres, but {looks}"
         unknown = guess.unknown if self.depth_unknown is None else self.depth_unknown
         fill = "far" if self.fill_depth is None else self.fill_depth
         guessed_map = replace(self, depth_kind=guess.kind, depth_unknown=unknown, fill_depth=fill)
@@ -213,7 +219,8 @@ def json_option() -> Any:
 
 
 def make_folder_of(path: Path) -> None:
-    """Creates the folder of ``path`` if it is missing; raises ``OSError`` if it cannot."""
+    """Creates the folder of ``path`` if it is missing; raises ``OSError`` if it cannot, or ``path`` is read-only."""
+    check_writable(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from ..io.animation import write_animation
+from ..io.atomic import check_writable
 from ..io.sequence import FramePattern, parse_frames
+from ..io.webp import write_animation
 from .command import argument, numbers, option, options_of
 from .options import Accuracy, Blur, Scene, check_files, json_option, make_folder_of
 from .output import Bar, json_line
@@ -47,7 +48,7 @@ class _Files:
     frames: tuple[int, int] | None = option("Part of a sequence.", metavar="FIRST-LAST", read=parse_frames)
     steady: bool = option("Filter depth of a sequence along time, where neither image nor depth moved.", False)
     resume: bool = option(
-        "Render only the frames that OUT lacks, or that are older than their files or than other options.", False
+        "Render only frames that OUT lacks, that are cut short, or older than their files or than other options.", False
     )
 
 
@@ -94,7 +95,7 @@ class Render:
     The lens is the one you state, else the one in the file's EXIF data, else 50 mm at f/2.8 on a sensor of 36 mm; the
     printed line names the source. If you state neither focus nor lens, a single image is focused on the subject nearest
     its middle, and the lens is opened until the largest blur radius is 2 % of the width, unless the file's lens blurs
-    enough. Alpha and metadata are kept (EXIF not in WebP, HDR and PFM). A file is written whole or not at all. A likely
+    enough. Alpha and metadata are kept (EXIF not in HDR and PFM). A file is written whole or not at all. A likely
     wrong unit gives a warning on standard error, with --strict an error. --json prints one JSON object per frame.
     """
 
@@ -134,7 +135,7 @@ class Render:
         """Renders one image, the frames of a sequence, or a focus pull in a still image.
 
         1. List the frames, and check all their files.
-        2. With ``--resume`` leave out those that are there, and neither their options nor their files have changed.
+        2. With ``--resume`` leave out those that are complete, and neither their options nor their files have changed.
         3. Record the options, and render the frames in order.
         """
         images, depths, files = _pattern(self.image), _pattern(self.depth), self.files
@@ -178,7 +179,7 @@ class Render:
         if files.resume and not reason:
             tables = self.blur.files()
             done = record.kept(outputs, {n: [*sources(n), *tables] for n in whole}, files.steady)
-            reason = "they are older than their files or options"
+            reason = "they are older than their files or options, or they are cut short"
         if done:
             share = f"{self.out}: is" if is_single else f"{len(done)} of {len(outputs)} frames are"
             lines = [json_line({"out": str(out), "is_there_already": True}) for out in sorted(done)]
@@ -186,6 +187,8 @@ class Render:
         todo = {n: out for n, out in outputs.items() if out not in done}
         if not todo:
             return
+        for out in filter(None, [*todo.values(), files.sheet]):
+            check_writable(out)
         from ..depth.sanity import Mistake
         from .frame import Renderer
 

@@ -1,4 +1,4 @@
-"""Which existing frames ``torchdof render --resume`` keeps: those of the same options, not older than their files."""
+"""Which existing frames ``torchdof render --resume`` keeps: complete ones of the same options and files."""
 
 import itertools
 import json
@@ -32,15 +32,18 @@ class Record:
     def kept(
         self, frames: Mapping[int, Path], sources: Mapping[int, Sequence[Path | None]], is_steady: bool
     ) -> set[Path]:
-        """The existing frames that are not older than the record and their sources.
+        """The existing frames that are complete, and not older than the record and their sources.
 
         ``sources`` are the files from which each frame is rendered, in the order of the sequence; with ``is_steady`` a
         frame also depends on those before it.
         """
+        from ..io.decode import is_complete  # imports NumPy
+
         times: Iterable[int] = (max(map(_changed_ns, filter(None, paths))) for paths in sources.values())
         newest = dict(zip(sources, itertools.accumulate(times, max) if is_steady else times, strict=True))
         start = _changed_ns(self.path)
-        return {out for n, out in frames.items() if out.is_file() and _changed_ns(out) >= max(start, newest[n])}
+        recent = (out for n, out in frames.items() if out.is_file() and _changed_ns(out) >= max(start, newest[n]))
+        return {out for out in recent if is_complete(out)}
 
     def write(self) -> None:
         """Writes the options, if they differ from those of the last run."""

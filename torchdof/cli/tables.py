@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..io.atomic import check_writable
 from .command import argument, option
-from .options import ApertureOptions, json_option
+from .options import ApertureOptions, json_option, make_folder_of
 from .output import print_result
 
 if TYPE_CHECKING:
@@ -46,6 +47,8 @@ class Tables:
 
     def run(self) -> None:
         """Lists tables, and draws them if a picture is asked for."""
+        if self.out is not None:
+            check_writable(self.out)
         import torch.nn.functional as functional
 
         from ..io.sheet import write_sheet
@@ -63,6 +66,7 @@ class Tables:
             return
         widest = max(panel.shape[-1] for panel in panels.values())
         panels = {name: functional.pad(panel, (0, widest - panel.shape[-1])) for name, panel in panels.items()}
+        make_folder_of(self.out)
         write_sheet(self.out, panels, rows=[f"{coc:+g} px" for coc in _COC_PX])
         if not self.as_json:
             click.echo(f"{self.out}: a row a blur radius in an image of {_WIDTH} px; negative is in front of focus")

@@ -78,8 +78,8 @@ def shard_rows(pairs: Sequence[Pair], per_shard: int = 64, copies: int = 1) -> l
         >>> [row["shard"] for row in shard_rows([Pair("a.png"), Pair("b.png")], per_shard=3, copies=2)]
         [0, 1]
     """
-    if not pairs:
-        raise ValueError("pairs must be at least one Pair, got none")
+    if not isinstance(pairs, Sequence) or not pairs or not all(isinstance(pair, Pair) for pair in pairs):
+        raise ValueError(f"pairs must be at least one Pair in a list, as pairs_in() returns, got {show(pairs)}")
     whole("per_shard", per_shard, 1, 10**9)
     whole("copies", copies, 1, 10**9)
     repeated = (dataclasses.asdict(pair) for pair in pairs for _ in range(copies))
@@ -217,7 +217,10 @@ class RenderShards:
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
     def _make(self, path: Path, source: str, samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Renders and writes one shard; returns the notes about its samples."""
+        """Renders and writes one shard; returns the notes about its samples.
+
+        Between removing the old notes and writing the new ones a shard counts as incomplete, whatever its file holds.
+        """
         records, rows = [], []
         for sample in samples:
             start, error = time.process_time(), ""
@@ -229,8 +232,9 @@ class RenderShards:
             rows.append({**row, "seconds": round(time.process_time() - start, 4)})
         with atomic_file(path) as temporary:
             (_write_tar if self.format == "webdataset" else _write_parquet)(temporary, records)
-            notes = {"bytes": temporary.stat().st_size, "source": source, "samples": rows}
-            write_text(path.with_suffix(".json"), json.dumps(notes, indent=1))  # before the shard
+            path.with_suffix(".json").unlink(missing_ok=True)
+        notes = {"bytes": path.stat().st_size, "source": source, "samples": rows}
+        write_text(path.with_suffix(".json"), json.dumps(notes, indent=1))
         return rows
 
     def _record(

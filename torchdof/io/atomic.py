@@ -16,7 +16,7 @@ from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
-__all__ = ["exit_on_signals", "atomic_file", "write_text"]
+__all__ = ["atomic_file", "check_writable", "exit_on_signals", "write_text"]
 
 _DAY_S = 86_400.0
 
@@ -26,7 +26,7 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary file in the folder of ``path``, renamed to ``path`` at the end, or removed on any error.
 
     Raises:
-        OSError: If the folder does not exist or may not be written.
+        OSError: If the folder does not exist, or it or an existing file is read-only.
 
     Example:
         >>> import tempfile
@@ -43,8 +43,7 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise FileNotFoundError(f"{path}: there is no folder {target.parent}; make it first")
     if target.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; name a file in it")
-    if not os.access(target.parent, os.W_OK):
-        raise PermissionError(f"{path}: may not write to the folder {target.parent}")
+    check_writable(path)
     _remove_abandoned(target.parent)
     temporary = target.with_name(f".{uuid.uuid4().hex}.part{target.suffix}")
     with exit_on_signals():
@@ -55,6 +54,22 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
             os.replace(temporary, target)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Refuses a file that is read-only, or that lies in a read-only folder or in a missing folder within one.
+
+    A rename could replace a read-only file; like other programs, this one does not.
+
+    Raises:
+        PermissionError: If the file may not be written.
+    """
+    target = Path(os.path.realpath(path))
+    if target.is_file() and not os.access(target, os.W_OK):
+        raise PermissionError(f"{path}: is read-only; make it writable or name another file")
+    folder = next(parent for parent in target.parents if parent.exists())
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(f"{path}: may not write to the folder {folder}")
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:

@@ -21,11 +21,13 @@ import numpy as np
 from .memory import free_bytes
 from .metadata import Metadata, kept_metadata, upright
 
-__all__ = ["MAX_ATTRIBUTES", "Part", "check_png", "first_line", "read_array", "read_parts", "utf8_name"]
+__all__ = ["MAX_ATTRIBUTES", "Part", "first_line", "is_complete", "read_array", "read_parts", "utf8_name"]
 
 MAX_PIXELS = 2**28  # of an image or array; a larger limit allows damaged headers to claim more memory
 MAX_ATTRIBUTES = 4096
 """Largest number of attributes in all parts of an EXR file together; renderers write a few hundred."""
+MAX_CHANNELS = 1024
+"""Largest number of channels in a part of an EXR file; OpenImageIO has the same limit."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +67,7 @@ def read_parts(path: Path) -> list[Part]:
     """
     if path.suffix.lower() == ".pfm":
         return [_read_pfm(path)]
-    check_png(path)
+    _check_png(path)
     _check_attributes(path)
     try:
         with utf8_name(path) as name:
@@ -123,7 +125,31 @@ def _parts(path: Path, name: str) -> Iterator[Part]:
         source.close()
 
 
-def check_png(path: Path) -> None:
+def is_complete(path: Path) -> bool:
+    """Whether an image file ends where its header says; reads all of a PNG, but decodes no more than its last row.
+
+    A JPEG, WebP or HDR file has to be decoded up to that row.
+    """
+    import OpenImageIO as oiio
+
+    try:
+        _check_png(path)  # first, because libpng would print a message
+    except (OSError, ValueError):  # an empty file cannot be mapped into memory
+        return False
+    with utf8_name(path) as name:
+        source = oiio.ImageInput.open(name)
+        if source is None:
+            oiio.geterror()
+            return False
+        spec = source.spec()
+        is_png = source.format_name() == "png"  # its checksums are right, and its last row would need all others
+        last = is_png or source.read_scanline(spec.y + spec.height - 1, 0, "float") is not None
+        problem = source.geterror()
+        source.close()
+    return bool(last) and not problem
+
+
+def _check_png(path: Path) -> None:
     """Refuse a PNG that is cut short or has a wrong checksum; libpng would print its own message about it."""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         offset, chunk = 8, b"" if content[:8] == b"\x89PNG\r\n\x1a\n" else b"IEND"
@@ -138,7 +164,7 @@ def check_png(path: Path) -> None:
 
 
 def _check_attributes(path: Path) -> None:
-    """Refuse an EXR with more than ``MAX_ATTRIBUTES`` attributes; OpenEXR takes minutes for 1e5.
+    """Refuse an EXR with more than ``MAX_ATTRIBUTES`` attributes or ``MAX_CHANNELS``; OpenEXR takes minutes for 1e5.
 
     Reference:
         OpenEXR File Layout, openexr.com.
@@ -153,10 +179,22 @@ def _check_attributes(path: Path) -> None:
                 if not has_parts or content[offset : offset + 1] == b"\0":
                     return
             type_end = content.find(b"\0", content.find(b"\0", offset) + 1)
-            offset = type_end + 5 + int.from_bytes(content[type_end + 1 : type_end + 5], "little")
+            start, size = type_end + 5, int.from_bytes(content[type_end + 1 : type_end + 5], "little")
+            if content[type_end - 6 : type_end] == b"chlist":
+                _check_channels(path, content[start : start + size])
+            offset = start + size
             if type_end < offset - 2**31 or offset >= len(content):  # damaged: the reader will refuse it
                 return
     raise ValueError(f"{path}: its headers hold more than {MAX_ATTRIBUTES} attributes, which is the limit")
+
+
+def _check_channels(path: Path, channels: bytes) -> None:
+    """Refuse a list of channels, each a name, a zero and 16 bytes, that is longer than ``MAX_CHANNELS``."""
+    count = offset = 0
+    while 0 < (end := channels.find(b"\0", offset)) and end > offset:
+        count, offset = count + 1, end + 17
+    if count > MAX_CHANNELS:
+        raise ValueError(f"{path}: its header has {count} channels in a part; at most {MAX_CHANNELS} are read")
 
 
 def _check_colours(path: Path, spec: Any) -> None:

@@ -17,12 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..validation import real_tensor
+from ..validation import real_tensor, show
 from .atomic import atomic_file
 from .channels import colour_channels, depth_channel
-from .decode import Part, check_png, first_line, read_array, read_parts, utf8_name
+from .decode import Part, first_line, is_complete, read_array, read_parts, utf8_name
 from .paths import PixelType, existing_image, existing_map, samples_of
 from .transfer import Transfer, decode, default_transfer, encode, encode_8_bits
+from .webp import add_exif
 
 __all__ = ["Picture", "read_image", "read_values", "write_image"]
 
@@ -194,6 +195,10 @@ def write_image(
     import OpenImageIO as oiio
 
     path = Path(path)
+    if not isinstance(picture, Picture):
+        raise ValueError(
+            f"{path}: expected a Picture, got {show(picture)}; wrap a tensor [1, 3, H, W]: Picture(pixels)"
+        )
     suffix = path.suffix.lower()
     sample_types = samples_of(path)
     if sample is None:
@@ -264,9 +269,11 @@ def write_image(
                 raise OSError(f"{path}: could not be opened for writing ({first_line(problem)})")
             is_written = output.write_image(array)
             is_written = output.close() and is_written
-            problem = output.geterror()  # a full disk shows only here
-            if not is_written or problem or not _is_complete(name):
+            problem = output.geterror()  # of a full disk, unless it fills up in the last flush of the buffer
+            if not is_written or problem or not is_complete(temporary):
                 raise OSError(f"{path}: could not be written ({first_line(problem)}); is the disk full?")
+            if suffix == ".webp" and picture.metadata:
+                add_exif(temporary, spec)
 
 
 def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Tensor:
@@ -315,20 +322,3 @@ def _float32(values: np.ndarray) -> np.ndarray:
     """Numbers in single precision; larger ones become infinite."""
     with np.errstate(over="ignore", invalid="ignore"):
         return values.astype(np.float32)
-
-
-def _is_complete(name: str) -> bool:
-    """Whether a file is complete; OpenImageIO does not report an error in the last flush of its buffer."""
-    import OpenImageIO as oiio
-
-    source = oiio.ImageInput.open(name)
-    if source is None:
-        oiio.geterror()
-        return False
-    last = source.read_scanline(source.spec().y + source.spec().height - 1, 0, "float")
-    problem = source.geterror()
-    source.close()
-    with contextlib.suppress(OSError):
-        check_png(Path(name))  # OpenImageIO does not read the last chunk
-        return last is not None and not problem
-    return False

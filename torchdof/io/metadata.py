@@ -19,6 +19,8 @@ _STORAGE_NAMES += ("Exif:FlashPixVersion", "Exif:ColorSpace")
 _MM_PER_UNIT: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
 _FLIPPED: dict[Any, tuple[int, ...]] = {2: (1,), 3: (0, 1), 4: (0,), 5: (), 6: (1,), 7: (0, 1), 8: (0,)}
 """EXIF orientation (0x0112) -> flipped axes. Orientations from 5 up first transpose the image."""
+_FOCAL_MM, _SENSOR_MM, _F_NUMBERS = (0.5, 3000.0), (1.0, 300.0), (0.5, 1000.0)
+"""Smallest and largest number of a lens that is believed: cameras write 0, or micrometres, for what they don't know."""
 _AXIS_TAGS = (  # tags that are swapped when an image is transposed
     ("Exif:PixelXDimension", "Exif:PixelYDimension"),
     ("Exif:FocalPlaneXResolution", "Exif:FocalPlaneYResolution"),
@@ -67,7 +69,7 @@ def camera_settings(metadata: Mapping[str, tuple[Any, Any]], width: int, height:
 
     The sensor width comes from the resolution of the focal plane (EXIF 0xA20E). If that is missing, or differs by more
     than 25 % (for example after scaling the picture), it comes from the 35 mm equivalent focal length, with 36 mm for
-    the longer side of the picture.
+    the longer side of the picture. Numbers that no lens has are ignored.
 
     Args:
         metadata: As in ``Picture.metadata``.
@@ -83,33 +85,39 @@ def camera_settings(metadata: Mapping[str, tuple[Any, Any]], width: int, height:
         {'focal_length_mm': 50.0, 'f_number': 1.8, 'sensor_width_mm': 24.0}
     """
 
-    def number(*names: str) -> float | None:
+    def number(*names: str, low: float = 0.0, high: float = math.inf) -> float | None:
         for name in names:
             value = metadata.get(name, (None, None))[1]
-            if isinstance(value, int | float) and (0 < value < 1e300 or value == math.inf):
+            if isinstance(value, int | float) and 0 < value and low <= value <= high:
                 return float(value)
         return None
 
     settings: dict[str, float] = {}
-    focal_length_mm = number("Exif:FocalLength", "effectiveFocalLength", "nominalFocalLength")
-    if focal_length_mm is not None and math.isfinite(focal_length_mm):
+    names = ("Exif:FocalLength", "effectiveFocalLength", "nominalFocalLength")
+    focal_length_mm = number(*names, low=_FOCAL_MM[0], high=_FOCAL_MM[1])
+    if focal_length_mm is not None:
         settings["focal_length_mm"] = focal_length_mm
-    f_number = number("FNumber", "Exif:FNumber", "aperture")
-    if f_number is not None and math.isfinite(f_number):
+    f_number = number("FNumber", "Exif:FNumber", "aperture", low=_F_NUMBERS[0], high=_F_NUMBERS[1])
+    f_stops = number("Exif:ApertureValue", high=20.0)
+    if f_number is None and f_stops is not None:
+        f_number = 2 ** (f_stops / 2)  # APEX
+    if f_number is not None:
         settings["f_number"] = round(f_number, 6)
     focus_m = number("Exif:SubjectDistance", "focus")
     if focus_m is not None:
         settings["focus_m"] = math.inf if focus_m > 1e6 else focus_m  # EXIF writes infinity as 2^32 - 1
-    film_mm = number("Exif:FocalLengthIn35mmFilm")
-    if film_mm is not None and focal_length_mm is not None:
+    film_mm = number("Exif:FocalLengthIn35mmFilm", low=_FOCAL_MM[0], high=_FOCAL_MM[1])
+    if film_mm is not None:
+        focal_length_mm = settings.setdefault("focal_length_mm", film_mm)  # the equivalent lens, if no other is known
         width_mm = 36.0 * focal_length_mm / film_mm * (width / max(width, height))
-        if 0 < width_mm < math.inf:
+        if _SENSOR_MM[0] <= width_mm <= _SENSOR_MM[1]:
             settings["sensor_width_mm"] = width_mm
     px_per_unit = number("Exif:FocalPlaneXResolution")
     if px_per_unit is not None:
         original_width = number("Exif:PixelXDimension") or width
         mm_per_unit = _MM_PER_UNIT.get(number("Exif:FocalPlaneResolutionUnit") or 2, 25.4)
         plane_mm = original_width / px_per_unit * mm_per_unit
-        if 0 < plane_mm < math.inf and abs(plane_mm / settings.get("sensor_width_mm", plane_mm) - 1.0) < 0.25:
+        is_agreed = abs(plane_mm / settings.get("sensor_width_mm", plane_mm) - 1.0) < 0.25
+        if _SENSOR_MM[0] <= plane_mm <= _SENSOR_MM[1] and is_agreed:
             settings["sensor_width_mm"] = plane_mm
     return settings

@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from ..validation import real_tensor, show
 from .images import Picture, write_image
 
 __all__ = ["shrunk", "write_sheet"]
@@ -21,7 +22,7 @@ def shrunk(pixels: Tensor, longest: int) -> Tensor:
         >>> shrunk(torch.ones(1, 3, 40, 80), 20).shape
         torch.Size([1, 3, 10, 20])
     """
-    height, width = pixels.shape[-2:]
+    height, width = real_tensor("pixels", pixels, "[1, C, H, W] in linear light").shape[-2:]
     scale = longest / max(height, width)
     if scale >= 1:
         return pixels
@@ -51,7 +52,9 @@ def write_sheet(
     """
     import OpenImageIO as oiio
 
-    height, width = next(iter(panels.values())).shape[-2:]
+    if not isinstance(panels, dict) or not panels:
+        raise ValueError(f"panels must be a dict with at least one panel, caption: pixels, got {show(panels)}")
+    height, width = real_tensor("a panel", next(iter(panels.values())), "[1, 3, H, W] in linear light").shape[-2:]
     start = margin + (_LABEL_PX if rows else 0)
     sheet = torch.full((1, 3, height + caption + margin, start + len(panels) * (width + margin)), 0.8)
     lefts = [start + k * (width + margin) for k in range(len(panels))]

@@ -11,7 +11,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ..tensors import floating
-from ..validation import WHOLE_NUMBERS, number, pixels_wide, real_tensor, show
+from ..validation import WHOLE_NUMBERS, number, pixels_wide, real_tensor, refuse_nested, show
 from . import psf, table_file
 from .aperture import Aperture, Number
 from .field import Field
@@ -643,6 +643,7 @@ class BlurTable:
 
 def _numbers(name: str, value: Any) -> Tensor:
     """Finite numbers as a float64 tensor on the CPU; raises ``ValueError`` with the name if they are not."""
+    refuse_nested(name, value)
     if isinstance(value, list | tuple):
         value = [item.detach() if isinstance(item, Tensor) else item for item in value]
     try:

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from .. import native
 from ..tensors import floating, is_in_memory, is_traced
-from ..validation import pixels_wide, real_tensor, show, whole
+from ..validation import pixels_wide, real_tensor, refuse_nested, show, whole
 
 __all__ = ["CAMERA_NUMBERS", "Camera"]
 
@@ -161,6 +161,7 @@ class Camera:
         Raises:
             ValueError: If the depth is not a floating-point tensor, or its batch does not fit the camera's.
         """
+        refuse_nested("depth", depth)
         if not floating(depth):
             got = f"{depth.dtype} tensor" if isinstance(depth, Tensor) else type(depth).__name__
             raise ValueError(f"depth must be a floating-point tensor in metres, got {got}; convert it with .float()")
@@ -406,6 +407,7 @@ def _show(value: Number) -> str:
 
 def _check_number(name: str, value: Number) -> None:
     """Refuse a number of the camera that is not positive, or neither a float nor a tensor ``[B]``."""
+    refuse_nested(name, value)
     if isinstance(value, Tensor):
         if value.ndim > 1 or not floating(value) or value.layout != torch.strided or not value.numel():
             raise ValueError(f"{name} must be a float or a floating-point tensor [B], got {show(value)}")
@@ -434,6 +436,7 @@ def _check_number(name: str, value: Number) -> None:
 
 def _check_angle(name: str, value: Number) -> None:
     """Refuse an angle that is not a number, or not in (-90, 90) degrees."""
+    refuse_nested(name, value)
     is_tensor = isinstance(value, Tensor) and value.ndim <= 1 and floating(value) and value.numel() > 0
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if not is_tensor and not is_number:
