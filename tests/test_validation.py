@@ -23,10 +23,7 @@ MODULES = (  # of the API pages
     *("", ".augmentation", ".depth", ".distributed", ".export", ".fit", ".functional", ".io.highlights", ".io.images"),
     *(".io.sheet", ".optics.aperture", ".reference.lens_views", ".reference.metrics"),
 )
-NOT_CHECKED = (
-    *("DepthAugmentationSequential", "make_dataset"),  # checked by Kornia; needs Ray
-    "at_size_of",  # returns a depth of the image's size before its checks
-)
+NOT_CHECKED = ("DepthAugmentationSequential", "make_dataset")  # checked by Kornia; needs Ray
 
 
 def public_callables() -> dict[str, Callable[..., Any]]:

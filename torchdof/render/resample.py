@@ -36,11 +36,10 @@ def at_size_of(image: Tensor, depth: Tensor) -> Tensor:
         >>> at_size_of(torch.rand(1, 3, 8, 12), torch.full((1, 1, 4, 6), 2.0)).shape
         torch.Size([1, 1, 8, 12])
     """
-    size, given = (image.shape[-2], image.shape[-1]), (depth.shape[-2], depth.shape[-1])
-    if size == given:
-        return depth
     validation.real_tensor("image", image, "[B, C, H, W]")
     validation.real_tensor("depth", depth, "[B, 1, h, w] in metres")
+    if image.shape[-2:] == depth.shape[-2:]:
+        return depth
     validation.same_aspect(image, depth)
     return _resized(image, depth)
 
