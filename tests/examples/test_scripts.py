@@ -29,7 +29,7 @@ DATA = EXAMPLES / "data" / "motorcycle"
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Runs a script with arguments as the main module, and returns its globals and what it prints."""
+    """Runs a script with arguments as the main module, and returns its globals and its output."""
 
     def run(script: str, *arguments: object) -> tuple[dict[str, Any], str]:
         monkeypatch.setattr(sys, "argv", [script, *map(str, arguments)])

@@ -107,7 +107,7 @@ float behind(const Level &level, Place row, Place column, float here, f8 *seen) 
 // A level's sample behind a pixel.
 struct Sample {
   float level_weight;  // of the level, for the pixel's blur, 0 to 1
-  float weight;        // of the samples that lie behind the pixel; 0: there are none
+  float weight;        // of the samples that lie behind the pixel; 0 without them
   f8 *values;
   template <int VECTORS>
   void read(const Level &level, Place row, Place column, float here) {
