@@ -29,7 +29,11 @@ class Case:
 
 
 def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Case]:
-    """The calls for which a file must give the module's result; a file with a fixed size gets scenes of this size.
+    """The calls for which a file must give the module's result.
+
+    1. List frames, each with a size and a shape of its coc; a file with a fixed size gets scenes of this size.
+    2. Draw an image, and make the coc of that shape.
+    3. Find a camera and the depth that has this coc, and insert bad and infinite depths.
 
     Args:
         portable: The exported module.
@@ -77,8 +81,8 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
             image = 0.2 * image + 0.6 * (coc < 0) + 0.1
             coc = functional.avg_pool2d(coc, (1, 5), stride=1, padding=(0, 2), count_include_pad=False)
         elif float(coc.min()) < float(coc.max()):
-            # Vary the coc: at the exact mean of both neighbours, rounding would decide which surface a pixel shows.
-            # Vary it by less than the step between surfaces, as light would depend steeply on a coc of noise.
+            # Noise on the coc: at the exact mean of two neighbours, rounding would decide which surface a pixel shows.
+            # The noise is smaller than the step between surfaces; light would depend steeply on larger noise.
             noise = torch.rand(coc.shape, generator=generator, dtype=coc.dtype)
             coc = coc + coc.clamp(-10.0, 10.0) * 0.03 * noise
         if portable.inputs == "coc_px":

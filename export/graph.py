@@ -85,7 +85,7 @@ class Portable(nn.Module):
         self.dof = copy.copy(dof)
         self.dof.options = dataclasses.replace(dof.options, check=False, depth_edges=depth_edges)
         self.called = dataclasses.replace(dof.options, check=False)
-        self.plan = Plan.all(dof.options.max_coc_px, dof.options.tolerance, rays=True)
+        self.plan = Plan.static(dof.options.max_coc_px, dof.options.tolerance, rays=True)
         self.ops = WholeOps() if layout == "whole" else Ops()
         self.ops.lens_width = width
         self.eval()
@@ -113,10 +113,12 @@ class Portable(nn.Module):
         coc_px = self.dof.coc_as_given(image, map_, focus_m, f_number)
         return blur(image, coc_px, options, plan, ops=self.ops)
 
-    def blurs(self, size: tuple[int, int]) -> list[LayerKernel]:
+    def layer_kernels(self, size: tuple[int, int]) -> list[LayerKernel]:
         """Kernels of the graph's layers, for a frame of this height and width."""
         coarse = self.dof.options.method == "layered"
-        return self.plan.blurs(self.dof.options.table, size, torch.float32, torch.device("cpu"), coarse, self.width)
+        return self.plan.layer_kernels(
+            self.dof.options.table, size, torch.float32, torch.device("cpu"), coarse, self.width
+        )
 
 
 def check_width(table: BlurTable, width: int | None) -> None:

@@ -24,7 +24,7 @@ else:
 
 __all__ = ["FUNCTIONS", "by_parts"]
 
-_PART_SIDE = 32
+_PART_SIDE = 32  # side of the map that holds a part; larger: fewer steps of the loop, more memory
 _PART_SIZE = _PART_SIDE * _PART_SIDE
 
 _script = onnxscript.script(onnxscript.values.Opset(DOMAIN, 1), default_opset=op)

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchdof.optics.blur_table import BlurTable
 from torchdof.render.ops import Level, Ops, Seen
 from torchdof.render.plan import Plan
-from torchdof.render.surfaces import Frame, Highlights
+from torchdof.render.surfaces import Highlights, PaddedFrame
 
 from .lists import by_parts
 from .operators import choose
@@ -66,6 +66,6 @@ class GraphOps(Ops):
         """Whole tiles."""
         return side(margin)
 
-    def render(self, frame: Frame, render: Callable[[Frame], Tensor]) -> Tensor:
+    def render(self, frame: PaddedFrame, render: Callable[[PaddedFrame], Tensor]) -> Tensor:
         """A loop over tiles."""
         return tile_by_tile(frame, render, self)

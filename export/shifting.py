@@ -14,7 +14,7 @@ def samples(values: Tensor, size: tuple[int, int], step: int, half_px: tuple[Ten
         values: Samples ``[B, C, h, w]`` at every ``step``-th pixel of the map, with one more on each side.
         size: Height and width of the map.
         step: A power of two, 2 or more.
-        half_px: How many halves of a pixel of the map, 0 or 1, its centre lies below and right of that of the samples.
+        half_px: Offset of the map's centre from the samples' centre, below and to the right, in half pixels: 0 or 1.
 
     Returns:
         Samples ``[B, C, 4, H, W]`` and shares ``[4, H, W]``.

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchdof.render.disocclusion import BEHIND_PX, search, shown_behind
 from torchdof.render.ops import Level, Ops, Seen
-from torchdof.render.surfaces import Frame, PaddedSurface
+from torchdof.render.surfaces import PaddedFrame, PaddedSurface
 
 from .operators import collect, window
 from .shifting import samples
@@ -27,7 +27,7 @@ def side(margin: int) -> int:
     return next((n for n in (_SIDE, 128) if margin <= n // 2), 256)
 
 
-def tile_by_tile(frame: Frame, render: Callable[[Frame], Tensor], ops: Ops) -> Tensor:
+def tile_by_tile(frame: PaddedFrame, render: Callable[[PaddedFrame], Tensor], ops: Ops) -> Tensor:
     """Renders each tile of a frame as a frame of its own.
 
     Args:
@@ -44,7 +44,7 @@ def tile_by_tile(frame: Frame, render: Callable[[Frame], Tensor], ops: Ops) -> T
     behind = None if frame.behind is None else window(frame.behind, tile_px, 0)
     inside = (..., slice(margin, margin + tile_px), slice(margin, margin + tile_px))
     size = (tile_px, tile_px)
-    tile_frame = Frame(surfaces, frame.nodes, frame.ramps, behind, margin, size, size, frame.occlusion)
+    tile_frame = PaddedFrame(surfaces, frame.nodes, frame.ramps, behind, margin, size, size, frame.occlusion)
     rendered, sharp = render(tile_frame), surfaces[0].light[inside]
     weights = int(rendered.shape[1]) - frame.colours
     if weights:
@@ -57,10 +57,10 @@ def tile_by_tile(frame: Frame, render: Callable[[Frame], Tensor], ops: Ops) -> T
 
 
 def seen(levels: Sequence[Level], coc_px: Tensor, mask: Tensor, ops: Ops) -> Seen:
-    """What levels of a pyramid show behind the pixels of an image, as :mod:`torchdof.render.disocclusion` looks for it.
+    """Light and coc behind the pixels of an image, from the levels of :mod:`torchdof.render.disocclusion`.
 
-    It is looked for tile by tile, and only in tiles that have pixels in the mask ``[B, 1, H, W]`` behind which there
-    may be something.
+    They are computed tile by tile, and only in tiles with pixels of the mask ``[B, 1, H, W]`` behind which a surface
+    may lie.
     """
     size = (coc_px.shape[-2], coc_px.shape[-1])
     covered = [levels[0].step * n for n in levels[0].values.shape[-2:]]  # px; the levels are centred on the image

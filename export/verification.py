@@ -169,8 +169,8 @@ def _compare(runner: onnxruntime.InferenceSession, portable: Portable, case: Cas
     if got.dtype != np.float32 or got.shape != tuple(expected.shape):
         raise ValueError(f"{case.name}: expected float32 {list(expected.shape)}, got {got.dtype} {list(got.shape)}")
     # coarse layers average light over their pixels before blurring it
-    blurs = portable.blurs((int(expected.shape[2]), int(expected.shape[3])))
-    reach = max(blur.halo + blur.scale - 1 for blur in blurs)
+    kernels = portable.layer_kernels((int(expected.shape[2]), int(expected.shape[3])))
+    reach = max(kernel.halo + kernel.scale - 1 for kernel in kernels)
     light_range = local_range(case.tensors[0], min(reach, max(expected.shape[-2:])))
     error = (torch.from_numpy(got) - expected).abs() / light_range.clamp_min(torch.finfo(torch.float32).tiny)
     error = torch.where(torch.isfinite(error), error, torch.inf)

@@ -57,7 +57,7 @@ class Exported:
     @property
     def plan(self) -> Plan:
         """The layers of the file, and its rays."""
-        return Plan.all(self.dof.options.max_coc_px, self.dof.options.tolerance, rays=True)
+        return Plan.static(self.dof.options.max_coc_px, self.dof.options.tolerance, rays=True)
 
     @functools.cached_property
     def runner(self) -> onnxruntime.InferenceSession:

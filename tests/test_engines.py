@@ -292,7 +292,7 @@ def _background(lamps: float, check: bool) -> Scene:
 
 
 def _planned(reach_px: float) -> Scene:
-    plan = Plan.of_scene(made("smooth", 50, 50, reach_px).coc_px, 1 / 255)
+    plan = Plan.for_scene(made("smooth", 50, 50, reach_px).coc_px, 1 / 255, adapt=False)
     return made("planes", 60, 75, 9.0, items=3, lamps=300.0, plan=plan)
 
 
@@ -353,7 +353,7 @@ def _threads(scene: Scene, way: dict[str, Any], out: Tensor) -> None:
 
 
 def _items(scene: Scene, way: dict[str, Any], out: Tensor) -> None:
-    for plan in (None, Plan.of_scene(scene.coc_px, 1 / 255)):
+    for plan in (None, Plan.for_scene(scene.coc_px, 1 / 255, adapt=False)):
         together = scene.blurred(plan=plan, **way)
         for i in range(len(out)):
             alone = blur_by_coc(scene.image[i : i + 1], scene.coc_px[i : i + 1], plan=plan, **way)
@@ -426,7 +426,7 @@ def test_autocast_does_not_change(name: str, engine: str) -> None:
 def test_tiles_rendered_separately_with_a_halo_leave_no_seam(method: Any) -> None:
     image, coc = 3 * torch.rand(1, 3, 40, 200) ** 3, slope(-6.0, 6.0, 40, 200)
     coc[..., 13:20, :] = -4.8
-    options: dict[str, Any] = {"plan": Plan.of_scene(coc, 1 / 255), "occlusion": False, "method": method}
+    options: dict[str, Any] = {"plan": Plan.for_scene(coc, 1 / 255, adapt=False), "occlusion": False, "method": method}
     picture = blur_by_coc(image, coc, **options)
     halo = 8 + 4 * 8  # outside the frame, light is a mean along the border, four times as wide as the distance
     for left in range(0, 200, 40):
@@ -443,7 +443,7 @@ def test_tiles_rendered_separately_with_a_halo_leave_no_seam(method: Any) -> Non
     ("planned", "shown"), [(0.0, 6.0), (0.0, -6.0), (-2.0, -3.0), (3.0, 20.0), (4.0, -4.0), (5.0, 0.0)]
 )
 def test_a_plan_of_one_plane_renders_another(engine: str, planned: float, shown: float, occlusion: bool) -> None:
-    plan, plane = Plan.of_scene(whole(planned), 1 / 255), whole(shown)
+    plan, plane = Plan.for_scene(whole(planned), 1 / 255, adapt=False), whole(shown)
     out, truth = (blur_by_coc(texture(), plane, occlusion=occlusion, plan=p) for p in (plan, None))
     assert float((out - truth).square().mean().sqrt()) < 1 / 255  # layers of 20 px are coarser
 

@@ -56,7 +56,7 @@ def test_gradients_flow_through(which: str) -> None:
 
         assert gradcheck(render, (focus.requires_grad_(), f_number.requires_grad_()))
         return
-    plan = Plan.all(6.0, 1 / 60) if "plan" in which else None
+    plan = Plan.static(6.0, 1 / 60) if "plan" in which else None
     table = BlurTable.load("sato_j15") if "table" in which else BlurTable.disc()
     dof = DepthOfField(SMALL, table, tolerance=1 / 60, occlusion=which == "a plan")
     assert gradcheck(lambda d: dof(image, d, focus, f_number, plan), (depth.requires_grad_(),))
@@ -89,7 +89,7 @@ def test_gradients_of_maps_equal_finite_differences(function: Callable[[Tensor],
 
 def _nodes() -> Tensor:
     coc = torch.tensor([-4.0, 4.0]).expand(1, 1, 100, 2)
-    nodes = torch.tensor(Plan.of_frame(coc, 8 / 255, still=True).coc_px)  # small frames have an 8th of the tolerance
+    nodes = torch.tensor(Plan.for_scene(coc, 8 / 255, on_grid=True).coc_px)  # small frames have an 8th of the tolerance
     assert len(nodes) >= 12
     return nodes.repeat(9)[:108].reshape(1, 1, 9, 12)
 

@@ -113,7 +113,7 @@ def wider(image: Tensor, coc: Tensor, beyond: int) -> tuple[Tensor, Tensor]:
 )
 def test_accumulating_billboards_equals_a_plain_loop_over_pixels(name: str, method: Any, normalize: bool) -> None:
     image, coc = (x.double() for x in scene(5, 6, reach=1.8))
-    nodes = list(Plan.of_scene(coc, 1 / 255).nodes)
+    nodes = list(Plan.for_scene(coc, 1 / 255, adapt=False).nodes)
     options: dict[str, Any] = {"occlusion": False, "normalize": normalize, "method": method}
     out = blur_by_coc(image, coc, table=TABLES[name], **options)
     beyond = 8 if normalize else 0  # the plain sum does not continue the image
@@ -244,7 +244,7 @@ def test_the_module_compiles_without_graph_breaks_and_equals_eager(backend: str,
     torch._dynamo.utils.counters.clear()
     fast = torch.compile(dof, backend=backend)(image, depth)  # fullgraph=True would read the values of constant tensors
     assert not torch._dynamo.utils.counters["graph_break"] and not torch.equal(fast, image)
-    still = dof(image, depth, plan=Plan.all(COMPILED["max_coc_px"], COMPILED["tolerance"]))
+    still = dof(image, depth, plan=Plan.static(COMPILED["max_coc_px"], COMPILED["tolerance"]))
     assert_close(fast, still, rtol=1e-5, atol=1e-6)
     assert rms(fast, dof(image, depth)) <= 2 * COMPILED["tolerance"]
 
@@ -271,7 +271,7 @@ def test_modules_with_other_options_and_cameras_compile_one_after_the_other() ->
         dof = DepthOfField(camera.replace(**numbers), max_coc_px=reach, tolerance=tolerance, occlusion=False)
         focus_m = torch.tensor([2.0])
         fast = torch.compile(dof, fullgraph=True, backend="eager")(image, depth, focus_m=focus_m)
-        plan = Plan.all(reach, tolerance)
+        plan = Plan.static(reach, tolerance)
         assert_close(fast, dof(image, depth, focus_m=focus_m, plan=plan), rtol=1e-5, atol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""What a PyTorch that cannot compile, export or transform the renderer does not run."""
+"""Mark of tests that need a PyTorch which compiles, exports and transforms the renderer."""
 
 import pytest
 

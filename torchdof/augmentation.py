@@ -47,8 +47,8 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
     channels (which is returned with it, unchanged), or under the key ``"depth"`` of a dict.
 
     Where the depth is not > 0, for example in the corners after a rotation, pixels stay sharp, because ``check`` is
-    False by default. A crop narrows the field of view, as a smaller ``sensor_width_mm`` does: ``camera`` must be that
-    of the image as it arrives here.
+    False by default. A crop narrows the field of view, as a smaller ``sensor_width_mm`` does: ``camera`` must describe
+    the cropped image.
 
     Args:
         focus_m: Nearest and farthest focus distance in metres, > 0, ``inf`` allowed.

@@ -1,6 +1,6 @@
 """Blur each pixel with the kernel of its own radius, which the caller computes.
 
-It is the paper's scatter without layers; training code calls it a PSF layer.
+This is the paper's scatter without layers; training code calls it a PSF layer.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,7 +20,7 @@ from .validation import ends, image_and_coc, image_and_map, show
 __all__ = ["splat"]
 
 _STEPS_PER_PX = 128  # kernels per px of radius, up to _LINEAR_UP_TO_PX; more take longer and hardly change the picture
-_LINEAR_UP_TO_PX = 2.0  # radius in px above which kernels are 1/256 of the radius apart; larger is finer
+_LINEAR_UP_TO_PX = 2.0  # px; above this radius kernels are 1/256 of the radius apart; a larger limit: more kernels
 _KERNELS_AT_ONCE = 64  # kernels of similar radius made together, each as wide as the widest; more take more memory
 _MIN_WEIGHT = 1e-6  # scattered weight, of 1: pixels with less are unknown and become 0
 _DISC = BlurTable.disc()
@@ -114,7 +114,7 @@ def splat(
 
 
 def _splatted(image: Tensor, coc_px: Tensor, table: BlurTable, normalize: bool) -> Tensor:
-    """The same for a checked batch ``[B, C, H, W]``."""
+    """Scatter a checked batch ``[B, C, H, W]``."""
     batch, channels, height, width = image.shape
     dtype = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
     light, coc = image.to(dtype), coc_px.to(dtype).expand(batch, -1, -1, -1)

@@ -235,7 +235,7 @@ class DepthOfField(nn.Module):
             ...
         """
         coc = flattened(leading_axes(image), "coc_px", self.coc_px(image, depth, focus_m, f_number))
-        return Plan.of_frame(coc, self.options.tolerance).of_pixels(coc)
+        return Plan.for_scene(coc, self.options.tolerance).with_pixels(coc)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Camera, table and options: the whole configuration travels with ``state_dict``."""

@@ -179,7 +179,7 @@ def rendered(image: Tensor, coc_px: Tensor) -> tuple[Tensor, Seconds]:
 
 
 def beyond_files(image: Tensor, coc_px: Tensor) -> tuple[Tensor, Seconds]:
-    """The same, minus the time of a command with everything in focus, which only reads and writes files."""
+    """Time of a command, minus the time of a command with everything in focus, which only reads and writes files."""
     picture, seconds = rendered(image, coc_px)
     files = rendered(image, torch.zeros_like(coc_px))[1]
     return picture, Seconds(seconds.wall - files.wall, seconds.cpu - files.cpu)

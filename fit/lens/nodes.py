@@ -1,13 +1,12 @@
 """Nodes of a traced table: their positions, and kernels fitted to their spots, smooth over depth.
 
-Spots and profiles are compared in the frequency domain. The transfer function of a spot (its Hankel transform, a sum of
-Bessel functions over the rays) and that of a profile are weighted by the spectrum of natural images (amplitude
-1/frequency) and the area of a pixel. The squared difference is then the squared error in a photograph, up to a
-constant.
+Spots and profiles are compared by their transfer functions, which are Hankel transforms; a spot's is a sum of Bessel
+functions over its rays. Both are weighted by the spectrum of natural images (amplitude 1/frequency) and the area of a
+pixel. The squared difference is then the squared error in a photograph, up to a constant.
 
-The default family ``"radial"`` is linear in its values for a given radius, and the radius is that of the outermost ray.
-So the fit is a convex problem with a single solution. It is solved for all nodes at once, against spots at the nodes
-*and between them*, where the table interpolates.
+The default family ``"radial"`` has the radius of the outermost ray, and is linear in its values. So the fit is a convex
+problem with a single solution. It is solved for all nodes at once, against spots at the nodes *and between them*, where
+the table interpolates.
 """
 
 import functools
@@ -28,17 +27,21 @@ from ..result import Array
 from ..solve import best_of
 from .spot import Spot
 
-_MAX_FREQUENCY = 3.0  # cycles for each pixel; kernels are sampled on the pixel grid, so higher frequencies are aliased
-_FRACTIONS = (0.25, 0.5, 0.75)  # of the interval between two nodes: where more spots are traced for the joint fit
-_SWEEPS = 6
-_PRIOR_WEIGHT = 1e-4  # weight of the ray histogram, which determines details of the profile far below a pixel
+# Places of the nodes
 _MIN_INTERVAL_PX = 0.01  # pixels of coc; narrower intervals are not divided
 _TARGET_DB = 62.0  # PSNR of a natural image in the middle of an interval; elsewhere it may be a few dB less
 _CONTRAST = 0.22  # standard deviation of natural images over their peak
-# Named shapes, lengths relative to the distance of the outermost ray: ranges of the parameters; samples of the profile,
-# and their reach; weight of the neighbour's parameters, which keeps those steady that the spot does not determine.
+
+# Fit of radial profiles
+_MAX_FREQUENCY = 3.0  # cycles for each pixel; kernels are sampled on the pixel grid, so higher frequencies are aliased
+_FRACTIONS = (0.25, 0.5, 0.75)  # of the interval between two nodes: where more spots are traced for the joint fit
+_SWEEPS = 6  # passes over all nodes of the joint fit
+_PRIOR_WEIGHT = 1e-4  # weight of the ray histogram, which determines details of the profile far below a pixel
+
+# Fit of named shapes; lengths are relative to the distance of the outermost ray
 _RANGES = {"radius": (0.02, 1.3), "sigma": (0.01, 1.0), "r_c": (0.0, 1.3), "b": (-1.0, 20.0), "m": (0.5, 12.0)}
-_SAMPLES, _SAMPLED_REACH, _NEIGHBOUR_WEIGHT = 400, 2.0, 1e-3
+_SAMPLES, _SAMPLED_REACH = 400, 2.0  # samples of the profile, and the radius to which they reach
+_NEIGHBOUR_WEIGHT = 1e-3  # weight of the neighbour's values for parameters that the spot does not determine
 
 
 class NodeEquations(NamedTuple):

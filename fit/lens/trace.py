@@ -53,6 +53,11 @@ def trace_table(
     as are needed for 50 dB on a natural image between them. Intervals whose spots stay within one pixel, or that are
     narrower than 1/100 pixel, are not divided.
 
+    1. Stop the lens down and focus it: the position of the sensor.
+    2. Place the nodes of coc, tracing spots in between to find the worst interpolation.
+    3. Fit a profile to the spots, for all nodes together and for each wavelength.
+    4. With ``field``, trace spots off the axis too.
+
     The table is exact for its focus and f-number. For another focus at the same f-number it is accurate if the lens's
     aberrations change little with distance; for another f-number it is not.
 

@@ -18,20 +18,22 @@ EXPLAINED = 1.15
 FAR_ABOVE = 1.6
 """Residual over noise above which a warning is given."""
 
-# a sharp picture
+# A sharp picture
 _FOCUSED_SIGMA_PX = 0.7  # sigma of the edge that demosaicing, a filter before the sensor or a good lens leave in focus
 _MIN_SIZE_ERROR = 0.02  # relative error of the kernel's size, from a soft sharp picture, above which to warn
 _MAX_EXPONENT = 0.7  # exponent of the edge's levels below which the picture counts as sRGB encoded
 _MIN_STEEPNESS, _MIN_SIGMAS = 0.03, 4.0  # steepness of an S-curve: share of the dot's level, and in standard errors
 _SHARED_DIFFERENCES = 1.9  # second differences for each independent one: neighbours share pixels
 _DECODE_ADVICE = "is the image linear? Decode it first"
-# a tone curve in the residual: its strength, and chi squared (two parameters), above which to warn
-_MIN_CURVE, _MIN_CHI = 0.075, 30.0  # after the fit, which leaves 0.075 of a curve of 20 %
-_SUPPORTING_EDGE, _SUPPORTED_CHI = 0.008, 18.0  # the same if the sharp dot's edge is steeper than this
-_MIN_CONTRAST, _MIN_CONTRAST_CHI = 0.03, 11.0  # at the expected magnification: half of what a 20 % curve leaves
-_MIN_RESIZING = 0.015  # change of magnification that no weak tone curve causes, which changes it by 0.002 to 0.006
+
+# A tone curve in the residual: its strength, and chi squared (two parameters), above which to warn
+_MIN_CURVE, _MIN_CHI = 0.075, 30.0  # a curve of 20 % has this strength in the residual
+_SUPPORTING_EDGE, _SUPPORTED_CHI = 0.008, 18.0  # steepness of the sharp dot's edge, and chi squared with its support
+_MIN_CONTRAST, _MIN_CONTRAST_CHI = 0.03, 11.0  # at the expected magnification; a curve of 20 % has twice the strength
+_MIN_RESIZING = 0.015  # change of magnification above which no curve is sought; a weak curve causes 0.002 to 0.006
 _CHI_MARGIN = 4.0  # chi squared by which a curve must explain more than a change of magnification does
-# the fit
+
+# The fit
 _MIN_RESIDUAL, _MIN_AT_TWICE = 0.005, 1e-3  # residual, as a share of the light: at FAR_ABOVE, at twice the noise
 _SPOT_SIGMAS, _MIN_SPOT = 8.0, 0.003  # of a spot beyond the blur: standard deviations, share of the dot's level
 _MAGNIFICATION_LOG = 0.08  # log factor between fitted and expected magnification
@@ -74,8 +76,8 @@ def check_linearity(picture: Array, dot: Dot, edge: Edge, file: str | None) -> b
 def check_levels(solution: Solution, expected: Solution, edge: Edge, file: str | None) -> None:
     """Warns if a tone curve would explain the residual of a fit.
 
-    No kernel makes all pixels of one level brighter and all of another darker; a tone curve does, even one so weak that
-    the residual hardly grows. There are three kinds of evidence:
+    No kernel makes all pixels of one level brighter and all of another level darker. A tone curve does, even a weak one
+    that hardly increases the residual. There are three kinds of evidence:
 
     1. The part of a curve's effect that the fit's parameters cannot imitate, in the residual of `solution`.
     2. In a JPEG this part is less certain; an edge of the sharp dot that is slightly too steep then supports it.

@@ -54,7 +54,7 @@ def unfitted_part(solution: Solution, basis: Array) -> Array:
 
 
 def asymmetry_of(solution: Solution) -> tuple[float, float]:
-    """Norm of the blur's angle-dependent part over that of its light, and the probability of that by noise alone.
+    """Norm of the blur's angle-dependent part, relative to its light's, and the probability that noise alone gives it.
 
     The residual is expanded in the first eight harmonics of the angle on four rings. With noise of known covariance,
     the whitened squared coefficients follow a chi squared distribution. The norm is without noise's contribution.

@@ -19,7 +19,7 @@ from .pair import fit_pair
 from .source import soft_edge
 
 _KNOTS = 33  # values of a free profile, equal for all distances
-_SWEEPS = 2
+_SWEEPS = 2  # passes of refitting with information from neighbours
 _COLOURS = ("red", "green", "blue")
 _GREEN = 1
 _DEFOCUSED_PX = 1.5  # px; for smaller blurs it is uncertain on which side of focus a colour is

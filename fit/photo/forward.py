@@ -38,9 +38,11 @@ _STARTS = {  # lengths relative to the increase of the dot's standard deviation 
     "ring": [{"sigma": 0.9, "r_c": 0.2}, {"sigma": 0.6, "r_c": 0.9}, {"sigma": 0.25, "r_c": 1.3}],
     "softm": [{"radius": 2.0, "sigma": 0.15, "b": 0.0, "m": 2.0}, {"radius": 1.7, "sigma": 0.4, "b": 0.5, "m": 3.0}],
 }
-_LOWER, _UPPER = {"b": -1.0, "rotation_deg": -np.inf}, {"curvature": 1.0}
-_RMS_DRAWN_PX = 16.0
-_STEP = {"dx": 1e-4, "dy": 1e-4, "magnification": 1e-5}
+# Finite differences
+_LOWER, _UPPER = {"b": -1.0, "rotation_deg": -np.inf}, {"curvature": 1.0}  # limits of the kernel's parameters
+_STEP = {"dx": 1e-4, "dy": 1e-4, "magnification": 1e-5}  # steps of the moves
+
+_RMS_DRAWN_PX = 16.0  # px; rms radius at which a PSF is drawn to measure it; larger: more exact, slower
 
 
 @dataclass
@@ -113,7 +115,7 @@ class Forward:
         return self.product(source, self.transformed(kernels), all_pixels)
 
     def product(self, source: Array, kernels: Array, all_pixels: bool = False) -> Array:
-        """The same for transformed kernels `[n, h, w]`."""
+        """Convolves a transformed source with transformed kernels `[n, h, w]`; results as in `convolve`."""
         blurred = irfft2(source * kernels, self.grid)
         flat = blurred[..., : self.data.shape[0], : self.data.shape[1]].reshape(*blurred.shape[:-2], -1)
         return np.asarray(flat if all_pixels else flat[..., self.flat])

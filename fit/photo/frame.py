@@ -30,7 +30,7 @@ _SQUARE = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 4
 
 
 @dataclass(frozen=True)
-class Frame:
+class CameraPicture:
     """A picture in linear light, and facts from its file."""
 
     file: Path
@@ -43,13 +43,13 @@ class Frame:
     facts: Mapping[str, float]  # from EXIF, about the camera
 
 
-def read_frame(
+def read_picture(
     path: Path,
     transfer: Transfer | None,
-    dark: Frame | None = None,
+    dark: CameraPicture | None = None,
     crop: tuple[int, int, int, int] | None = None,
     bayer: str | None = None,
-) -> Frame:
+) -> CameraPicture:
     """Reads a picture; `crop` is left, top, width and height in px, `dark` was taken with the lens cap on.
 
     Raises:
@@ -87,7 +87,7 @@ def read_frame(
         light[is_clipped.any(axis=0)] = white  # one clipped colour clips the mean
     encoded, middle = white is not None and picture.transfer == "srgb", ((width - 1) / 2 - left, (height - 1) / 2 - top)
     facts = camera_settings(picture.metadata, width, height)
-    return Frame(path, light, pixels, white, encoded, width, middle, facts)
+    return CameraPicture(path, light, pixels, white, encoded, width, middle, facts)
 
 
 def demosaiced(mosaic: Array, pattern: str) -> Array:
@@ -107,47 +107,52 @@ def size_of(picture: Array) -> str:
 
 
 def cut_pairs(
-    frames: tuple[Frame, Frame], focus_m: float, distance_m: float, dots: Dots, exposure: float | None, colours: bool
+    pictures: tuple[CameraPicture, CameraPicture],
+    focus_m: float,
+    distance_m: float,
+    dots: Dots,
+    exposure: float | None,
+    colours: bool,
 ) -> list[Capture]:
-    """Finds the dot, or the dots of a grid, in a sharp and a blurred frame, and cuts the windows around each.
+    """Finds the dot, or the dots of a grid, in a sharp and a blurred photograph, and cuts the windows around each.
 
-    `exposure` is the brightness of the blurred frame over that of the sharp one.
+    `exposure` is the brightness of the blurred photograph over that of the sharp one.
 
     Raises:
         FitError: no dot, several dots, or one too close to the frame's edge or to others.
     """
-    sharp_frame, blurred_frame = frames
+    sharp_picture, blurred_picture = pictures
     if dots == "one":
-        first, second = (find_dot(frame.light, file=str(frame.file)) for frame in frames)
+        first, second = (find_dot(picture.light, file=str(picture.file)) for picture in pictures)
         matched = [(first, second)]
     else:
-        matched = _matched(sharp_frame, blurred_frame, focus_m / distance_m)[: 1 if dots == "centre" else None]
+        matched = _matched(sharp_picture, blurred_picture, focus_m / distance_m)[: 1 if dots == "centre" else None]
     pairs = []
     for sharp_dot, blurred_dot in matched:
         centres = [(round(dot.x), round(dot.y)) for dot in (sharp_dot, blurred_dot)]
-        height, width = sharp_frame.light.shape
+        height, width = sharp_picture.light.shape
         border_px = [min(x, y, width - 1 - x, height - 1 - y) for x, y in centres]
         needed = max(sharp_dot.reach, blurred_dot.reach) + 2
         half = min(*border_px, math.ceil(_MARGIN * needed) + 8)
         if half < needed:
             text = f"the frame cuts the blur: it reaches {needed:.0f} px from the dot, the frame ends after {half} px"
-            cut_frame = sharp_frame if border_px[0] < sharp_dot.reach + 2 else blurred_frame
-            raise FitError(text, "window", file=str(cut_frame.file), number=needed)
+            cut_picture = sharp_picture if border_px[0] < sharp_dot.reach + 2 else blurred_picture
+            raise FitError(text, "window", file=str(cut_picture.file), number=needed)
         windows = [(..., slice(y - half, y + half + 1), slice(x - half, x + half + 1)) for x, y in centres]
-        sharp, blurred = (frame.light[window].copy() for frame, window in zip(frames, windows, strict=True))
-        for frame, window in ((sharp_frame, sharp), (blurred_frame, blurred)):
-            if (count := len(find_dots(window, file=str(frame.file)))) > 1:
+        sharp, blurred = (picture.light[window].copy() for picture, window in zip(pictures, windows, strict=True))
+        for picture, window in ((sharp_picture, sharp), (blurred_picture, blurred)):
+            if (count := len(find_dots(window, file=str(picture.file)))) > 1:
                 text = f"{count} dots in a window of {2 * half + 1} px: print the dots farther apart than their blur"
-                raise FitError(text, "several dots", file=str(frame.file), number=float(count))
-        centre = sharp_frame.middle
-        sharp_colours, blurred_colours = (f.colours[window] for f, window in zip(frames, windows, strict=True))
+                raise FitError(text, "several dots", file=str(picture.file), number=float(count))
+        centre = sharp_picture.middle
+        sharp_colours, blurred_colours = (f.colours[window] for f, window in zip(pictures, windows, strict=True))
         pairs.append(
             Capture(
                 sharp,
                 blurred,
                 distance_m,
-                files=(str(sharp_frame.file), str(blurred_frame.file)),
-                white=sharp_frame.white,
+                files=(str(sharp_picture.file), str(blurred_picture.file)),
+                white=sharp_picture.white,
                 exposure=exposure,
                 position_px=(round(sharp_dot.x - centre[0], 2), round(sharp_dot.y - centre[1], 2)),
                 colours=(sharp_colours.copy(), blurred_colours.copy()) if colours else None,
@@ -156,7 +161,7 @@ def cut_pairs(
     return pairs
 
 
-def _matched(sharp: Frame, blurred: Frame, magnification: float) -> list[tuple[Dot, Dot]]:
+def _matched(sharp: CameraPicture, blurred: CameraPicture, magnification: float) -> list[tuple[Dot, Dot]]:
     """Pairs the dots of a grid in both pictures, from the centre outwards: each moves on its line to the centre."""
     sharp_dots, blurred_dots = (find_dots(f.light, file=str(f.file), smallest=0.3) for f in (sharp, blurred))
     centre, pairs = sharp.middle, []

@@ -13,7 +13,7 @@ from torchdof.validation import show
 from ..problems import FitError, warn
 from ..validation import a_choice, a_number
 from .captures import CAMERA, RANGES, Captures, check_distances
-from .frame import PATTERNS, Dots, Frame, cut_pairs, read_frame, size_of
+from .frame import PATTERNS, CameraPicture, Dots, cut_pairs, read_picture, size_of
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -60,6 +60,11 @@ def read_captures(
     # shot; dots = "centre", "each" or "field" for a grid; colours = "each"; bayer = "RGGB" for a sensor's mosaic; name
     ```
 
+    1. Read the manifest and check its fields and distances.
+    2. Read the sharp picture and each blurred one, minus the dark frame.
+    3. Cut a window around each dot in both pictures.
+    4. Take missing numbers of the camera from EXIF.
+
     Args:
         folder: folder with the manifest and the pictures, or path of the manifest.
         dots: replaces the manifest's "dots".
@@ -96,24 +101,24 @@ def read_captures(
         for name in filter(None, [manifest["sharp"], *files, manifest["dark"]]):
             inside(folder_path / name, root, manifest_name)
 
-    def read(name: str, dark: Frame | None) -> Frame:
-        return read_frame(folder_path / name, manifest["transfer"], dark, manifest["crop"], manifest["bayer"])
+    def read(name: str, dark: CameraPicture | None) -> CameraPicture:
+        return read_picture(folder_path / name, manifest["transfer"], dark, manifest["crop"], manifest["bayer"])
 
     dark = read(manifest["dark"], None) if manifest["dark"] else None
-    sharp_frame = read(manifest["sharp"], dark)
+    sharp_picture = read(manifest["sharp"], dark)
     by_colour = manifest["colours"] == "each"
-    if by_colour and sharp_frame.colours.shape[0] != 3:
+    if by_colour and sharp_picture.colours.shape[0] != 3:
         text = "colours = 'each' needs pictures of three colours, or bayer = 'RGGB', got"
-        raise invalid(f"{text} {sharp_frame.colours.shape[0]}")
-    columns, encoded = [], [sharp_frame.file.name] if sharp_frame.encoded else []
+        raise invalid(f"{text} {sharp_picture.colours.shape[0]}")
+    columns, encoded = [], [sharp_picture.file.name] if sharp_picture.encoded else []
     for shot in shots:
-        blurred_frame = read(shot["file"], dark)
-        _check_alike(sharp_frame, blurred_frame, manifest_name)
-        encoded += [blurred_frame.file.name] if blurred_frame.encoded else []
+        blurred_picture = read(shot["file"], dark)
+        _check_alike(sharp_picture, blurred_picture, manifest_name)
+        encoded += [blurred_picture.file.name] if blurred_picture.encoded else []
         seconds = manifest["exposure_s"]
         exposure = shot["exposure_s"] / seconds if shot["exposure_s"] and seconds else None
-        frames = (sharp_frame, blurred_frame)
-        columns.append(cut_pairs(frames, focus, shot["distance_m"], manifest["dots"] or "one", exposure, by_colour))
+        pictures = (sharp_picture, blurred_picture)
+        columns.append(cut_pairs(pictures, focus, shot["distance_m"], manifest["dots"] or "one", exposure, by_colour))
     if manifest["transfer"] is None and encoded:
         further = f" and {len(encoded) - 1} more" if len(encoded) > 1 else ""
         text = (
@@ -122,11 +127,11 @@ def read_captures(
             "them. Then say transfer = 'linear', or 'srgb' if that is all that was done"
         )
         warn(text, "not linear", file=manifest_name, number=float(len(encoded)))
-    width = sharp_frame.width_px if manifest["full_width_px"] is None else round(manifest["full_width_px"])
-    if width < sharp_frame.width_px:
-        got = f"got {manifest['full_width_px']:g} for pictures of {sharp_frame.width_px}"
+    width = sharp_picture.width_px if manifest["full_width_px"] is None else round(manifest["full_width_px"])
+    if width < sharp_picture.width_px:
+        got = f"got {manifest['full_width_px']:g} for pictures of {sharp_picture.width_px}"
         raise invalid(f"full_width_px must be at least the pictures' own width, {got}")
-    camera = {name: sharp_frame.facts.get(name) if manifest[name] is None else manifest[name] for name in CAMERA}
+    camera = {name: sharp_picture.facts.get(name) if manifest[name] is None else manifest[name] for name in CAMERA}
     notes = {
         "manifest": path.name,
         "transfer": manifest["transfer"] or "by file type",
@@ -191,7 +196,7 @@ def _field(fields: Mapping[str, Any], name: str, where: str) -> Any:
     return value
 
 
-def _check_alike(first: Frame, second: Frame, where: str) -> None:
+def _check_alike(first: CameraPicture, second: CameraPicture, where: str) -> None:
     """Raises an error for pictures of different size, or if the lens was changed between them."""
     if first.light.shape != second.light.shape:
         text = f"{second.file.name} is {size_of(second.light)}, {first.file.name} is {size_of(first.light)}"

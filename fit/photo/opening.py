@@ -2,7 +2,7 @@
 
 The picture is the blurred dot deconvolved with the sharp one. Its pixels are free, except that they are non-negative,
 sum to 1, are smooth where the noise leaves them undetermined, and are 0 where a first estimate is almost dark
-(non-negative noise would accumulate there). The strength of smoothing is found by cross-validation: it predicts
+(non-negative noise would accumulate there). Cross-validation gives the strength of smoothing: the one that predicts
 withheld pixels best.
 """
 

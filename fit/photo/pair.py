@@ -32,7 +32,9 @@ _MIN_WINDOW_PX = 15
 _MIN_DOT_PX = 0.2
 # An ideal dot represents the sharp dot if the rms misfit of its edge, over the dot's level, is small enough.
 _MAX_EDGE_RMS = 2e-3  # largest misfit of a dot that is magnified
-_MIN_VARIANCE, _MAX_UNEXPLAINED = 0.02, 0.02  # if magnifying its softness adds this variance in px^2: largest misfit
+_MAX_UNEXPLAINED = 0.02  # the same if magnifying its softness adds more than _MIN_VARIANCE
+_MIN_VARIANCE = 0.02  # px^2
+
 _MIN_RADIUS_PX = 4.0  # smallest radius of a dot and its blur; below, pixels have an effect like a tone curve
 _MIN_CHI_GAIN = 12.0  # decrease of chi squared for which the magnification is fitted: 3.5 sigma
 
@@ -62,6 +64,11 @@ def fit_pair(
     moved and magnified) + background`. Exposure, stray light, displacement and magnification are fitted, so they do not
     bias the kernel. As in rendering, the kernel is the effect of the fitted PSF on a picture made of pixels
     (`torchdof.optics.psf`): a pixel's own blur, 1/12 px^2 of variance, is in both pictures and not in the parameters.
+
+    1. Find both dots, exclude clipped pixels, and choose a representation of the sharp dot.
+    2. Fit a free profile, or the given family; fit the magnification too if the pictures contradict the expected one.
+    3. With "auto", choose the cheapest family that is accurate enough, or an opening if the blur is not round.
+    4. Check the residual, the levels and the focus; doubtful results give warnings.
 
     `model="ratio"` is the paper's: `blurred / sharp` along spokes inside the dot, then eq. (1). It measures the dot
     convolved with the kernel, so its widths depend on the dot. Use it for comparison with the paper.
@@ -187,7 +194,7 @@ def fit_pair(
                 solution, why = opening
                 freest = expected = solution
         fit = describe(solution, why)
-        # a family chosen for its cost is not to blame if the freest kernel explains the rest
+        # warn about the pictures by the freest kernel's residual; a family chosen for its cost adds some
         freest_fit = fit if freest is solution else describe(freest, "")
         check_fit(solution, fit, files[1], freest_fit)
         if edge is not None:
@@ -240,8 +247,8 @@ def prepared_pair(
             "for it"
         )
         warn(text, "saturated", file=files[0], number=float(clipped))
-    # an ideal dot is as good as the dot's own pixels: a spline between the pixels of a hard edge is wrong by a few
-    # thousandths once it is magnified, and so is the sensor's softness, which does not grow with the dot
+    # An ideal dot is as exact as the dot's own pixels. Magnification makes two errors of a few thousandths: in a spline
+    # between the pixels of a hard edge, and in the sensor's softness, which does not grow with the dot.
     unexplained = edge.rms * np.sqrt(max(1 - 1 / max(edge.misfit, 1e-9) ** 2, 0.0))
     softness_matters = edge.softness**2 * abs(1 - magnification**2) > _MIN_VARIANCE
     edge_fits = edge.misfit < EXPLAINED or (edge.rms < _MAX_EDGE_RMS and magnification != 1)

@@ -60,6 +60,11 @@ def read_photographs(
 ) -> Photographs:
     """Reads a folder of photographs of the target, without a description.
 
+    1. Read each photograph and find the target in it; leave out photographs without one.
+    2. Find the tone curve, undo it, and measure the targets again.
+    3. Take the sharpest photograph as the one in focus; compute each distance from the size of the square.
+    4. Pair the sharpest photograph with each one out of focus.
+
     Args:
         folder: folder with the photographs; other files are ignored.
         square_mm: side of the black square as printed, mm.

@@ -39,8 +39,13 @@ _STEP_DEG = 10
 def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, groups: ArrayLike | None = None) -> BlurFit:
     """Fits `f(r) = N exp(-(r - r_c)^2 / (2 sigma^2))`, or another profile times N, to samples of blur strength.
 
-    Radii may have any unit (the paper's are metres on the paper). They are normalised internally, and the lengths among
-    the parameters are returned in the caller's unit.
+    Radii may have any unit (the paper's are metres on the paper); lengths among the parameters are returned in it.
+
+    1. Normalise radii and strengths, and estimate the noise from second differences.
+    2. Test whether the samples vary over r at all (F test of a parabola against a constant).
+    3. Fit by least squares from several starts.
+    4. Compute the covariance; with groups, by a sandwich estimator.
+    5. Warn about lengths that the samples do not determine, or that ended on a bound.
 
     Args:
         r: distance from the dot's centre `[n]`, >= 0.
@@ -176,7 +181,7 @@ def _checked(r: ArrayLike, strength: ArrayLike, fewest: int) -> tuple[Array, Arr
 def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, Indices]:
     """`I_b(r, theta) / I(r, theta)` from the dot's centre to its edge, at every pixel of r and every 10 degrees.
 
-    As in the paper, the centre is that of the dot in the sharp picture; a displacement of the defocused dot is not
+    As in the paper, both pictures are read from the centre of the sharp dot; a displacement of the defocused dot is not
     corrected. The result is the dot convolved with the kernel, up to the dot's edge: use it for comparison with the
     paper, and the forward model for rendering.
 

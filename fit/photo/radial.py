@@ -9,8 +9,8 @@ from torchdof.optics.psf import pixel_kernels
 from ..result import Array
 from .forward import Forward, Solution, without_level
 
-# factor of the effective parameters in cross-validation: 1 (the usual one) sometimes follows the noise; 3 is as good
-# without noise, and up to 12 dB better with it
+# Factor of the effective parameters in cross-validation; larger: smoother profiles. The usual factor 1 sometimes fits
+# the noise; 3 is equally good without noise, and up to 12 dB better with it.
 _CAUTION = 3.0
 _SMOOTHNESS = 10.0 ** np.arange(-8.0, 0.0)
 _MAX_STEP = {"dx": 0.5, "dy": 0.5, "magnification": 0.02}  # largest step of an iteration

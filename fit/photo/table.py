@@ -86,9 +86,12 @@ def fit_captures(
     sensor width are known it is the camera's. Otherwise its scale is measured: the radius of the uniform disc with the
     same second moment as the fitted kernels, by least squares over all distances.
 
-    Each fit starts from that of its outer neighbour, scaled by geometry, from both ends towards focus; it uses another
-    start only if that fits clearly better. Then all are refitted with a loose prior on the line between their
-    neighbours; free profiles get radii on a line instead.
+    1. With a free choice of family, or an opening, fit each pair alone: this determines one family for all.
+    2. Fit all pairs with this family, from both ends towards focus. Each fit starts from that of its outer neighbour,
+       scaled by geometry; it uses another start only if that fits clearly better.
+    3. Refit with a loose prior on the line between the neighbours; free profiles get radii on a line instead.
+    4. Compare the radii with the camera's, and determine the scale of the circle of confusion.
+    5. Fit each colour like the mean, if the captures have colours.
 
     Args:
         captures: pairs at increasing distances.

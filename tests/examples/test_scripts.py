@@ -29,7 +29,7 @@ DATA = EXAMPLES / "data" / "motorcycle"
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Runs a script with arguments as the main module, and returns its globals and what it prints."""
+    """Runs a script with arguments as the main module, and returns its globals and its output."""
 
     def run(script: str, *arguments: object) -> tuple[dict[str, Any], str]:
         monkeypatch.setattr(sys, "argv", [script, *map(str, arguments)])
@@ -112,7 +112,7 @@ def test_the_paper_s_experiment_reaches_its_figure_4(tmp_path: Path, run: Run) -
 def test_gradient_descent_finds_the_blur_and_with_a_known_lens_the_metres(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With fewer steps at full size."""
+    """The script runs with fewer steps at full size."""
     example: dict[str, Any] = runpy.run_path(str(EXAMPLES / "solve_scale.py"))
     main = example["main"]
     *coarse, (factor, steps, rate) = example["STAGES"]

@@ -45,7 +45,7 @@ def runner(exported_by_command: tuple[Path, str]) -> onnxruntime.InferenceSessio
 
 def rendered(image: Tensor, coc: Tensor, treatment: DepthEdges) -> Tensor:
     """The picture of the PyTorch engine with the layers of the file."""
-    plan = Plan.all(2.0, 1 / 255, rays=True)
+    plan = Plan.static(2.0, 1 / 255, rays=True)
     with torch.no_grad():
         return blur_by_coc(image, coc, plan=plan, max_coc_px=2.0, occlusion=False, check=False, depth_edges=treatment)
 

@@ -77,7 +77,7 @@ def test_kornia_runs_a_file(plain: Any, kind: str, tmp_path: Path, monkeypatch: 
 
 
 def test_the_pictures_of_verified_cases_do_not_depend_on_rounding() -> None:
-    """Else a file of a module with large blurs, such as the default, would differ from it by more than the limit."""
+    """If they did, a file with large blurs, such as the default, would differ from its module beyond the limit."""
     portable = Portable(DepthOfField(Camera()), "depth", None, "as given")
     for case in cases(portable, 3):
         if case.name in ("depth edges", "bad depths"):

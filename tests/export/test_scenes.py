@@ -80,7 +80,7 @@ def test_lamps_are_splatted_ray_by_ray(module: str, lamps: int, request: pytest.
 def test_kernels_of_a_file_equal_those_of_its_table(shape: str) -> None:
     made = {"disc": BlurTable.disc, "polygon": lambda: BlurTable.polygon(blades=5, rotation_deg=10.0)}
     table = made[shape]() if shape in made else BlurTable.load(shape)
-    plan = Plan.all(3.0, 1 / 255, rays=True)
+    plan = Plan.static(3.0, 1 / 255, rays=True)
     values, origins, halves, is_round, per_px, *_ = kernels_of(table, plan, 1)
     values_at: Any = ray_splats.values_at
     for coc_px in (-2.75, 0.5, 3.0):

@@ -76,7 +76,7 @@ def test_a_file_can_have_one_size_and_one_channel(tmp_path: Path) -> None:
     coc[..., 4, 7] = math.nan
     out = torch.from_numpy(session(path).run(None, {"image": image.numpy(), "coc_px": coc.numpy()})[0])
     assert torch.equal(out[..., 4, 7], image[..., 4, 7])
-    options = {**dof.options.arguments(), "plan": Plan.all(1.0, dof.options.tolerance)}
+    options = {**dof.options.arguments(), "plan": Plan.static(1.0, dof.options.tolerance)}
     torch.testing.assert_close(out, torchdof.blur_by_coc(image, coc, **options), atol=1e-5, rtol=0)
 
 

@@ -83,10 +83,10 @@ def test_nested_tensors_are_refused_by_name(name: str, layout: torch.layout) -> 
 def test_a_plan_with_enough_layers_is_unchanged_and_a_short_one_is_extended() -> None:
     plan = DOF.plan(texture(), slope(1.2, 6.0))
     coc = DOF.coc_px(texture(), slope(1.2, 6.0))
-    assert plan.reaching(coc) is plan and plan.reaching(0.5 * coc) is plan
-    every = Plan.all(2.0, 1 / 255)
-    assert every.reaching(coc) is every  # plan of a traced graph, which does not depend on its scene
-    wider = plan.reaching(3.0 * coc)
+    assert plan.extended_to(coc) is plan and plan.extended_to(0.5 * coc) is plan
+    every = Plan.static(2.0, 1 / 255)
+    assert every.extended_to(coc) is every  # plan of a traced graph, which does not depend on its scene
+    wider = plan.extended_to(3.0 * coc)
     assert set(plan.nodes) < set(wider.nodes)
     gaps = [high - low for low, high in zip(wider.nodes, wider.nodes[1:], strict=False)]
     assert min(gaps) > 0.05 and max(gaps) < 3.0

@@ -2,7 +2,7 @@
 // through the C interface, for the sanitizers: `make sanitize`.
 //
 // Each scene is rendered by one thread first. Then several callers at once, each with threads of its own, must get the
-// same bits, and one that is cancelled must come back. What a picture should look like is for the tests in Python.
+// same bits, and a cancelled call must return. The tests in Python check the pictures themselves.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -40,11 +40,11 @@ std::vector<float> disc(double radius, int half, int colours) {
   return repeated;
 }
 
-// What a field lets through of kernels of some radii: less towards one end, the more the farther from the middle.
+// Field masks of some radii: the transmittance falls along the kernel, and more so farther from the middle.
 struct Field {
   static constexpr int distances = 5, columns = 4, rows = 2 * columns - 1;
   std::vector<std::vector<float>> values, boxes;
-  std::vector<torchdof_shares> shares;
+  std::vector<torchdof_field_mask> shares;
 
   Field(const std::vector<double> &radii, int colours) {
     for (double radius : radii) {
@@ -101,7 +101,7 @@ struct Scene {
   }
 
  private:
-  // Rectangles of one blur each before a slope, with specks of light, and where they are allowed NaN and infinities.
+  // Rectangles of one blur each in front of a slope, with small lights; with NaN and infinities if `masked` is set.
   template <typename Integer, typename Number>
   void surfaces(const Integer &integer, const Number &number, double largest) {
     const size_t pixels = size_t(scene.height) * scene.width;
@@ -163,7 +163,7 @@ struct Scene {
   }
 };
 
-// What came of it, and the picture if that is TORCHDOF_OK.
+// Returns the status, and writes the picture if it is TORCHDOF_OK.
 int render(torchdof_scene scene, int threads, const int32_t *cancelled, std::vector<float> &picture) {
   scene.threads = threads;
   scene.cancelled = cancelled;
@@ -186,7 +186,7 @@ int render(torchdof_scene scene, int threads, const int32_t *cancelled, std::vec
   for (double radius = 128.0; radius > 0.5; radius /= 1.3)
     radii.insert(radii.begin() + long(radii.size() / 2), {-radius, radius});
   const Field rays(radii, scene.kernel_colours);
-  const torchdof_shares *shares = scene.shares ? rays.shares.data() : nullptr;
+  const torchdof_field_mask *shares = scene.shares ? rays.shares.data() : nullptr;
   const int32_t shares_count = scene.shares ? int32_t(radii.size()) : 0;
   const int finished = torchdof_finish(job, kernels_at.data(), halves.data(), shares, shares_count, picture.data());
   torchdof_free(job);
@@ -235,7 +235,7 @@ void check(unsigned seed) {
   for (std::thread &caller : callers) caller.join();
 }
 
-// What `compute` gives must be finite, and the same for any number of threads. `what` names it.
+// Checks that the result of `compute` is finite, and the same for any number of threads. `what` names it.
 template <typename Compute>
 void check_threads(const Compute &compute, const char *what, int scene) {
   const std::vector<float> alone = compute(1);
@@ -288,7 +288,7 @@ std::vector<float> noise(std::mt19937 &random, size_t count, double low, double 
 
 void append(std::vector<float> &all, const std::vector<float> &more) { all.insert(all.end(), more.begin(), more.end()); }
 
-// One surface or two, blended with the layers of a scene, and the gradient of that.
+// Blends one surface or two with the layers of a scene, and computes the gradient.
 void check_blend(unsigned seed) {
   const Scene made(seed);
   std::mt19937 random(seed);
@@ -357,7 +357,7 @@ void check_blend(unsigned seed) {
   check_threads(blend, "blended layers", int(seed));
 }
 
-// Surfaces behind pixels, read from one to four levels of a pyramid, and the gradient of that.
+// Reads the surfaces behind pixels from one to four levels of a pyramid, and computes the gradient.
 void check_look_behind(unsigned seed) {
   std::mt19937 random(seed);
   const auto integer = [&](int low, int high) { return std::uniform_int_distribution<int>(low, high)(random); };

@@ -62,7 +62,7 @@ from torchdof.render.plan import Plan
 torch.set_num_threads(1)
 image, coc_px = torch.rand(1, 3, 3000, 4000), torch.linspace(-40.0, 40.0, 4000).expand(1, 1, 3000, 4000).contiguous()
 image[..., ::50, ::50] *= 1000.0
-plan = Plan.of_scene(coc_px, 0.1 / 255)
+plan = Plan.for_scene(coc_px, 0.1 / 255, adapt=False)
 torchdof.blur_by_coc(image[..., :40], coc_px[..., :40], plan=plan, tolerance=0.1 / 255)  # its kernels are kept
 sent = []
 def interrupt():

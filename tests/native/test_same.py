@@ -65,7 +65,7 @@ def maps() -> dict[str, Tensor]:
 @pytest.mark.parametrize("tolerance", [0.0, 0.5 / 255, 1 / 255, 8 / 255, 0.3])
 @pytest.mark.parametrize("coc", maps().values(), ids=maps())
 def test_both_engines_plan_the_same_layers(coc: Tensor, tolerance: float) -> None:
-    compiled, plain = Plan.of_frame(coc, tolerance), Plan.of_frame(coc.double(), tolerance)
+    compiled, plain = Plan.for_scene(coc, tolerance), Plan.for_scene(coc.double(), tolerance)
     assert compiled.tolerance == pytest.approx(plain.tolerance, rel=1e-6)
     assert len(compiled.nodes) == len(plain.nodes)
     assert compiled.nodes == pytest.approx(plain.nodes, rel=1e-5, abs=1e-5)
@@ -117,7 +117,7 @@ def test_no_operator_of_pytorch_reads_a_whole_frame(occlusion: bool) -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_both_engines_repair_an_enlarged_map_alike(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is linear between its samples, so that pixels lie at exact quarters of the step between two surfaces."""
+    """An enlarged map is linear between its samples: pixels lie at exact quarters of the step between two surfaces."""
     generator = torch.Generator().manual_seed(seed)
     image, coarse = torch.rand(1, 3, 40, 50, generator=generator), torch.rand(1, 1, 3, 4, generator=generator)
     coc = functional.interpolate(40.0 * coarse - 20.0, (40, 50), mode="bilinear", align_corners=True)

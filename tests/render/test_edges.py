@@ -89,7 +89,7 @@ def test_levels_of_a_file_are_not_edges_however_large_the_blur(engine: str) -> N
 
 
 def test_narrow_ramps_of_averaged_depth_are_repaired(scene: Scene, engine: str) -> None:
-    """Such depth was downsampled with its image, or rendered with anti-aliasing."""
+    """Depth is averaged if it was downsampled with its image, or rendered with anti-aliasing."""
     image = functional.avg_pool2d(scene.image, 2)
     depth = 1 / functional.avg_pool2d(1 / scene.depth, 2)
     nearest = -functional.max_pool2d(-scene.depth, 2), functional.max_pool2d(scene.depth, 2)

@@ -13,7 +13,7 @@ from torchdof.io.transfer import encode
 from torchdof.optics.aperture import Aperture
 from torchdof.optics.field import Field
 from torchdof.optics.kernel_bank import bank_of
-from torchdof.optics.placed_kernels import layer_shares, placed
+from torchdof.optics.placed_kernels import layer_mask, placed
 from torchdof.reference.metrics import psnr
 from torchdof.render.field import BLOCK
 
@@ -28,8 +28,8 @@ def number(value: float) -> Tensor:
 def passed(table: BlurTable, coc_px: float, y: float, x: float, size: tuple[int, int] = (100, 100)) -> Tensor:
     """Kernel ``[C, k, k]`` at a place given in half diagonals from the middle of the frame."""
     lens = table if table.field is None else bank_of(table)
-    shares, kernel = layer_shares(table, coc_px, 1, size), lens.kernels(number(coc_px)[None], size[1])
-    return placed(kernel, [(shares, number(1.0))], number(y)[None], number(x)[None])[0]
+    mask, kernel = layer_mask(table, coc_px, 1, size), lens.kernels(number(coc_px)[None], size[1])
+    return placed(kernel, [(mask, number(1.0))], number(y)[None], number(x)[None])[0]
 
 
 def of_pixel(table: BlurTable, coc_px: float, row: int, column: int, size: tuple[int, int]) -> Tensor:

@@ -63,7 +63,7 @@ def test_an_item_is_rendered_as_alone_with_any_option(options: dict[str, Any]) -
 
 
 def test_highlights_of_an_item_do_not_depend_on_those_of_another() -> None:
-    """Neither their number of rays nor the blurs of their occluders."""
+    """Its number of rays and the blurs of its occluders are those of the item rendered alone."""
     images, cocs = batch(3, (20.0, 17.3, 20.0))
     images = images * 0.01
     images[0, :, ::5, ::5] = 50.0  # more rays than are affordable
@@ -99,7 +99,7 @@ def test_a_stack_in_a_batch_is_rendered_as_alone(tolerance: Any) -> None:
 
 def test_layers_of_several_plans_are_joined_by_side_and_resolution() -> None:
     plans = [
-        Plan.of_scene(torch.tensor(ends).reshape(1, 1, 1, -1).expand(1, 1, 100, -1), 1 / 255)
+        Plan.for_scene(torch.tensor(ends).reshape(1, 1, 1, -1).expand(1, 1, 100, -1), 1 / 255, adapt=False)
         for ends in ([-40.0, 3.0], [-1.0, 0.0, 25.0], [5.0, 9.0])
     ]
     nodes, blurs = joined_layers(plans, BlurTable.disc(), SIZE, torch.empty(0, dtype=torch.float64))
@@ -112,7 +112,7 @@ def test_layers_of_several_plans_are_joined_by_side_and_resolution() -> None:
         assert [place for place, is_used in zip(places, used, strict=True) if is_used] == list(plan.nodes)
         alone = weights_at_or_behind(x.reshape(1, 1, 1, -1), ramps([plan.nodes], x))[0, :, 0]
         torch.testing.assert_close(of_layer[used], alone[:-1] - alone[1:])
-        own = plan.blurs(BlurTable.disc(), SIZE, torch.float64, torch.device("cpu"), True)
+        own = plan.layer_kernels(BlurTable.disc(), SIZE, torch.float64, torch.device("cpu"), True)
         joined = [blur for blur, is_used in zip(blurs, used, strict=True) if is_used]
         for blur, alone_blur in zip(joined, own, strict=True):
             assert blur.scale == alone_blur.scale

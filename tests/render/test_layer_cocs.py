@@ -20,7 +20,9 @@ def test_layers_move_smoothly_with_the_ends_of_a_scene(tolerance: float) -> None
     """Where the number of layers changes, the new layer coincides with another one."""
     before: list[float] = []
     for far in torch.linspace(1.0, 9.0, 4001, dtype=torch.float64).tolist():
-        plan = Plan.of_scene(torch.tensor([-2.2, far], dtype=torch.float64).reshape(1, 1, 1, 2), tolerance)
+        plan = Plan.for_scene(
+            torch.tensor([-2.2, far], dtype=torch.float64).reshape(1, 1, 1, 2), tolerance, adapt=False
+        )
         nodes = list(plan.nodes)
         if before:  # by 2e-3 px
             farthest = max(min(abs(x - y) for y in before) for x in nodes)

@@ -30,7 +30,7 @@ def test_a_mixed_pixel_is_split_between_its_two_surfaces(share: float) -> None:
 
 
 def test_a_split_is_trusted_in_proportion_to_the_contrast_of_the_surfaces() -> None:
-    """By half at a contrast of 1/255 of the light around; not at all at 1e-7, which is rounding."""
+    """The split has half its effect at a contrast of 1/255 of the light around, and none at 1e-7, which is rounding."""
     for contrast, trusted in ((0.1, 1.0), (1 / 255, 0.5), (1e-7, 0.0)):
         image, coc = mixed_edge(0.6)
         image, coc = torch.where(coc < 0, 1.0, 1.0 - contrast).double(), coc.double()

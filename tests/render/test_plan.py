@@ -30,14 +30,14 @@ def place_of(coc_px: float) -> float:
 
 
 def test_a_scene_in_focus_gets_the_one_sharp_layer() -> None:
-    assert Plan.of_scene(coc_map(-0.01, 0.0, 0.004, 0.009), 1 / 255).nodes == (0.0,)
-    assert len(Plan.of_scene(coc_map(-0.01, 0.0, 0.02), 1 / 255).nodes) == 2
+    assert Plan.for_scene(coc_map(-0.01, 0.0, 0.004, 0.009), 1 / 255, adapt=False).nodes == (0.0,)
+    assert len(Plan.for_scene(coc_map(-0.01, 0.0, 0.02), 1 / 255, adapt=False).nodes) == 2
 
 
 @given(st.lists(st.floats(-300.0, 300.0), min_size=1, max_size=5), TOLERANCE)
 def test_layers_increase_and_span_the_scene(coc: list[float], tolerance: float) -> None:
     scene = torch.tensor(coc, dtype=torch.float64).reshape(1, 1, 1, -1).expand(1, 1, 200, -1)
-    plan = Plan.of_scene(scene, tolerance)
+    plan = Plan.for_scene(scene, tolerance, adapt=False)
     blur = blur_axis(scene[0, 0, 0]).tolist()
     assert all(low < high for low, high in zip(plan.nodes, plan.nodes[1:], strict=False))
     assert plan.nodes[0] == pytest.approx(min(blur), abs=1e-9) and plan.nodes[-1] == pytest.approx(max(blur), abs=1e-9)
@@ -47,7 +47,7 @@ def test_layers_increase_and_span_the_scene(coc: list[float], tolerance: float) 
 
 @given(st.floats(0.6, 200.0), TOLERANCE)
 def test_gaps_between_layers_are_at_most_the_spacing_of_the_tolerance(reach: float, tolerance: float) -> None:
-    for plan in (Plan.of_scene(coc_map(-reach, reach), tolerance), Plan.all(reach, tolerance)):
+    for plan in (Plan.for_scene(coc_map(-reach, reach), tolerance, adapt=False), Plan.static(reach, tolerance)):
         for gap, inner in largest_gaps(plan):
             assert gap <= spacing(inner, tolerance) + 0.3 * spacing(inner + gap, tolerance) + 1e-9
     assert plan.coc_px[-1] == pytest.approx(reach)  # of the plan for all scenes
@@ -56,13 +56,13 @@ def test_gaps_between_layers_are_at_most_the_spacing_of_the_tolerance(reach: flo
 
 
 def test_a_static_plan_is_as_exact_on_a_slope_as_the_plan_of_the_scene() -> None:
-    """Its layers are denser, because it cannot place layers at the blurs of the frame's border."""
+    """A static plan has denser layers, because it cannot place layers at the blurs of the frame's border."""
     y, x = torch.linspace(0.0, 1.0, 160)[:, None], torch.linspace(0.0, 1.0, 240)
     coc = (8.0 + 16.0 * (0.7 * x + 0.3 * y))[None, None]
     image = torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(1))
     image = torch.nn.functional.interpolate(image, coc.shape[-2:], mode="bicubic").clamp(0.0, 1.0)
     exact = torchdof.blur_by_coc(image, coc, tolerance=0)
-    plans = Plan.all(24.0, 1 / 255), Plan.of_scene(coc, 1 / 255)
+    plans = Plan.static(24.0, 1 / 255), Plan.for_scene(coc, 1 / 255, adapt=False)
     every, own = (float((torchdof.blur_by_coc(image, coc, plan=p) - exact).square().mean().sqrt()) for p in plans)
     assert every < own < 0.75 / 255
 
@@ -70,26 +70,26 @@ def test_a_static_plan_is_as_exact_on_a_slope_as_the_plan_of_the_scene() -> None
 def test_a_frame_is_planned_for_less_where_it_is_blurred_much_not_where_a_few_pixels_are(engine: str) -> None:
     coc = torch.full((1, 1, 480, 640), 3.0)
     coc[..., 200:202, 300:302] = -1e5
-    assert Plan.of_frame(coc, 1 / 255).tolerance == 1 / 255
-    assert Plan.of_frame(coc, 1 / 255, still=True).tolerance == 1 / 255
+    assert Plan.for_scene(coc, 1 / 255).tolerance == 1 / 255
+    assert Plan.for_scene(coc, 1 / 255, on_grid=True).tolerance == 1 / 255
     for blurred in (torch.full_like(coc, 500.0), torch.cat([torch.full_like(coc, 500.0), coc])):
-        assert Plan.of_frame(blurred, 1 / 255).tolerance == pytest.approx(480 / (3 * 500) / 255)
+        assert Plan.for_scene(blurred, 1 / 255).tolerance == pytest.approx(480 / (3 * 500) / 255)
 
 
 def test_layers_for_gradients_do_not_depend_on_small_changes_of_the_scene() -> None:
     frames = (coc_map(-3.0, reach).repeat(1, 1, 20, 10) for reach in (5.1, 5.1001))
-    first, second = (Plan.of_frame(coc, 1 / 255, still=True) for coc in frames)
+    first, second = (Plan.for_scene(coc, 1 / 255, on_grid=True) for coc in frames)
     assert first.nodes == second.nodes
     assert first.nodes[0] <= -2.5 and first.nodes[-1] >= 4.6
 
 
 def test_nan_and_infinite_coc_add_no_layers() -> None:
-    assert Plan.of_scene(coc_map(math.nan, 3.0, 3.0), 1 / 255).nodes[-1] == pytest.approx(place_of(3.0))
-    reaching = Plan.of_scene(coc_map(-math.inf, math.inf), 1 / 20)
+    assert Plan.for_scene(coc_map(math.nan, 3.0, 3.0), 1 / 255, adapt=False).nodes[-1] == pytest.approx(place_of(3.0))
+    reaching = Plan.for_scene(coc_map(-math.inf, math.inf), 1 / 20, adapt=False)
     assert all(math.isfinite(x) for x in reaching.nodes)
     coc = torch.zeros(2, 1, 40, 50)
     coc[..., :10], coc[0, 0, 0, 0] = -6.0, torch.nan
-    pixels = Plan((-5.5, 0.0), 1 / 255).of_pixels(coc).pixels
+    pixels = Plan((-5.5, 0.0), 1 / 255).with_pixels(coc).pixels
     assert pixels is not None and pixels[0] == pytest.approx(799 / 4000), "a NaN counts as in focus"
 
 
@@ -98,7 +98,7 @@ def test_nan_and_infinite_coc_add_no_layers() -> None:
 def test_kernels_wider_than_the_frame_are_cut_and_keep_their_values(name: str, coc: float) -> None:
     table = BlurTable.disc() if name == "disc" else BlurTable.load(name)
     size, plan = (20, 31), Plan((place_of(coc),), 1 / 255)
-    (blur,) = plan.blurs(table, size, torch.float64, torch.device("cpu"), coarse=True)
+    (blur,) = plan.layer_kernels(table, size, torch.float64, torch.device("cpu"), coarse=True)
     whole = bank_of(table).kernels(torch.tensor([coc], dtype=torch.float64), size[1])[0]
     spare = max(0, whole.shape[-1] // 2 - 30)
     expected = whole[:, spare : whole.shape[-1] - spare, spare : whole.shape[-1] - spare]
@@ -109,8 +109,8 @@ def test_kernels_wider_than_the_frame_are_cut_and_keep_their_values(name: str, c
 
 @pytest.mark.parametrize("tolerance", [1 / 255, 4 / 255])
 def test_highlights_become_rays_at_all_radii_of_coarse_layers(tolerance: float) -> None:
-    plan = Plan.of_scene(coc_map(-40.0, 0.0, 30.0).expand(1, 1, 100, 3), tolerance)
-    blurs = plan.blurs(BlurTable.disc(), (100, 100), torch.float32, torch.device("cpu"), coarse=True)
+    plan = Plan.for_scene(coc_map(-40.0, 0.0, 30.0).expand(1, 1, 100, 3), tolerance, adapt=False)
+    blurs = plan.layer_kernels(BlurTable.disc(), (100, 100), torch.float32, torch.device("cpu"), coarse=True)
     for k, (_, coc) in enumerate(zip(blurs, plan.coc_px, strict=True)):
         beside = [b.scale for b in blurs[max(0, k - 1) : k + 2]]
         assert max(beside) == 1 or abs(coc) >= plan.crisp_px or plan.nodes[k] == 0.0
@@ -118,8 +118,8 @@ def test_highlights_become_rays_at_all_radii_of_coarse_layers(tolerance: float) 
 
 
 def test_layers_of_larger_blur_have_lower_resolution() -> None:
-    plan = Plan.of_scene(coc_map(0.0, 100.0).expand(1, 1, 100, 2), 1 / 255)
-    blurs = plan.blurs(BlurTable.disc(), (100, 100), torch.float32, torch.device("cpu"), coarse=True)
+    plan = Plan.for_scene(coc_map(0.0, 100.0).expand(1, 1, 100, 2), 1 / 255, adapt=False)
+    blurs = plan.layer_kernels(BlurTable.disc(), (100, 100), torch.float32, torch.device("cpu"), coarse=True)
     for scale, low, high in ((2, 7.2, 9.0), (4, 18.0, 22.0), (8, 36.0, 44.0), (16, 72.0, 85.0)):
         assert low <= min(c for b, c in zip(blurs, plan.coc_px, strict=True) if b.scale == scale) < high
 

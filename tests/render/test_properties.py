@@ -50,7 +50,7 @@ def rms(difference: Tensor) -> float:
 def test_the_picture_is_continuous_in_depth(
     seeds: range, depth_edges: str, tolerance: float, most_rms: float, most: float, dtype: torch.dtype
 ) -> None:
-    """Also with repaired edges: decisions fade in, or their thresholds avoid frequent values."""
+    """It is continuous with repaired edges too: decisions fade in, or their thresholds avoid frequent values."""
     for seed in seeds:
         scene = random_scene(seed)
         scene.options["depth_edges"] = depth_edges

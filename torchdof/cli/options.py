@@ -85,7 +85,7 @@ class DepthMap:
         return self.depth_kind != "relative" or self.near_m is not None or self.far_m is not None
 
     def guessed(self, values: "Tensor", path: Path, is_metric: bool) -> "tuple[DepthMap, str]":
-        """The same with a guessed kind in the place of ``auto``, and a message about the guess.
+        """These options with a guessed kind instead of ``auto``, and a message about the guess.
 
         If other options are in metres (``is_metric``) and so is the guess, there is a message only for numbers that
         would be taken for relative depth without these options. Otherwise holes are filled from the far side by
@@ -130,7 +130,7 @@ class Scene:
             )
 
     def of_sequence(self) -> "Scene":
-        """The same for a sequence: "auto" becomes "z", because a guess could differ from frame to frame."""
+        """The options for a sequence: "auto" becomes "z", because a guess could differ from frame to frame."""
         is_guessed = self.depth_map.depth_kind == "auto"
         return replace(self, depth_map=replace(self.depth_map, depth_kind="z")) if is_guessed else self
 

@@ -31,7 +31,7 @@ _OWN_EXTREMES = (
     "far have in all frames: --value-range LOW,HIGH"
 )
 Encoding = Literal["linear", "srgb"]
-_NOT_OF_FRAMES = ("--out", "--sheet", "--frames", "--resume", "--strict", "--device", "--json")  # do not change them
+_NOT_OF_FRAMES = ("--out", "--sheet", "--frames", "--resume", "--strict", "--device", "--json")  # do not change frames
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -115,7 +115,7 @@ class Render:
         group="Blur",
     )
     lights: float = option(
-        "Give small lamps that IMAGE, a photograph, clipped at white up to so many stops more light, such as 3.",
+        "Make small lamps that IMAGE, a photograph, clipped at white brighter by up to this many stops, such as 3.",
         0.0,
         metavar="STOPS",
         group="Blur",

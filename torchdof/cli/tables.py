@@ -104,7 +104,7 @@ def _column(table: "BlurTable") -> "Tensor":
     import torch.nn.functional as functional
 
     from ..optics.kernel_bank import bank_of
-    from ..optics.placed_kernels import layer_shares, placed
+    from ..optics.placed_kernels import layer_mask, placed
 
     size, columns = _CELL_PX[0] // _ZOOM // 2 * 2 - 1, []
     for position in _POSITIONS if table.depends_on_place else ():
@@ -112,8 +112,8 @@ def _column(table: "BlurTable") -> "Tensor":
         y, x = (torch.tensor([position * side / math.hypot(*frame)]) for side in frame)
         for coc in _COC_PX:
             central = bank_of(table).kernels(torch.tensor([coc]), _WIDTH, longest=[size // 2 + 1]).float()
-            shares = layer_shares(table, coc, 1, frame).to(central)
-            kernel = placed(central, [(shares, central.new_ones(()))], y, x)[0]
+            mask = layer_mask(table, coc, 1, frame).to(central)
+            kernel = placed(central, [(mask, central.new_ones(()))], y, x)[0]
             kernels.append(functional.pad(kernel, ((size - kernel.shape[-1]) // 2,) * 4))
         columns.append(torch.stack(kernels))
     columns = columns or [table.kernels(torch.tensor(_COC_PX), _WIDTH, size=size).float()]  # [n, 1 or C, size, size]

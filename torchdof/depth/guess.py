@@ -12,12 +12,16 @@ from .sanity import whole_numbers
 
 __all__ = ["Guess", "guess_kind", "subject_m"]
 
-_MAX_8_BIT, _MIN_16_BIT = 255, 60_000  # whole numbers are grey levels if their largest is <= the first or >= the second
+_MAX_SAMPLES = 65_536  # most pixels examined
+
+# Kind of the numbers. Whole numbers are grey levels if the largest is <= _MAX_8_BIT or >= _MIN_16_BIT.
+_MAX_8_BIT, _MIN_16_BIT = 255, 60_000
 _NEAR_ZERO = 0.05  # numbers up to 1 are relative if the smallest is below this: in metres it would be too near
 _CLEAR_CORRELATION = 0.35  # absolute correlation of values and rows above which values clearly grow or shrink downwards
-_MAX_SAMPLES = 65_536  # most pixels examined
-# Subject of a picture: a peak in the histogram of 1 / distance.
-_BINS, _REACH_BINS = 64, 3  # bins of 1 / distance; bins on each side of its peak that belong to a surface
+
+# Subject of a picture: a peak in the histogram of 1 / distance
+_BINS = 64  # bins of 1 / distance
+_REACH_BINS = 3  # bins on each side of a peak that belong to its surface; more: surfaces merge
 _MIDDLE_SIGMA = 1 / 6  # standard deviation of the weight of the middle, over each side of the picture
 _OUTLIERS = 0.01  # share of the pixels at each end of the distances that is ignored as outliers
 _SUBJECT_SHARE = 0.2  # smallest share of the middle that the subject fills

@@ -64,7 +64,7 @@ def resolve_holes(depth: Tensor, name: str, fill: Fill | None, zero_is_known: bo
         depth: ``[1, 1, H, W]``.
         name: Name of the file, for the message.
         fill: As for :func:`fill_holes`; None refuses holes.
-        zero_is_known: Whether zero and negative numbers were no holes, as in relative depth; for the message.
+        zero_is_known: Whether zero and negative numbers are known depths, as in relative depth; for the message.
 
     Returns:
         The depth without holes, and how many there were.

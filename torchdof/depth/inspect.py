@@ -21,6 +21,7 @@ EDGES = ("exact", "ramp", "beside", "unclear")
 * beside: on one surface, with the depth of the other; rendering corrects it.
 * unclear: on a ramp that rendering keeps, because the image shows no edge there.
 """
+_EXACT, _RAMP, _BESIDE, _UNCLEAR = range(1, 1 + len(EDGES))  # their numbers in :attr:`DepthReport.edges`
 
 _NEAR, _SHARP, _FAR = (1.3, 0.6, 0.0), (0.1, 1.3, 0.3), (0.1, 0.5, 1.3)  # RGB of the tints, linear light
 _TINT, _DARK_LIGHT = 0.4, 0.1  # share of the tint in a pixel; its light in dark pixels, as a share of the mean light
@@ -148,9 +149,9 @@ def inspect_depth(image: Tensor, depth: Tensor, camera: Camera) -> DepthReport:
         raise ValueError(f"inspect one image at a time, got a batch of {image.shape[0]}")
     depth = torch.where(depth > 0, depth, torch.nan)
     coc_px = camera.coc_px(depth, depth.shape[-1])
-    states, is_changed = judged(image, -coc_px, STEP_PX)
-    is_ramp = states == 2
-    kinds = torch.where(is_changed, torch.where(is_ramp, 2, 3), torch.where(is_ramp, 4, states)).byte()
+    is_edge, is_ramp, is_changed = judged(image, -coc_px, STEP_PX)
+    kept, changed = torch.where(is_ramp, _UNCLEAR, _EXACT * is_edge), torch.where(is_ramp, _RAMP, _BESIDE)
+    kinds = torch.where(is_changed, changed, kept).byte()
     counts = torch.bincount(kinds.flatten(), minlength=len(EDGES) + 1)[1:].tolist()
     return DepthReport(depth, coc_px, kinds, (counts[0], counts[1], counts[2], counts[3]))
 

@@ -6,7 +6,8 @@ from torch import Tensor
 
 __all__ = ["motion_between", "sample", "shifted"]
 
-_COARSEST_PX, _LEVELS = 24, 5  # smallest side in px of the coarsest level; most levels. More levels find larger motion
+_COARSEST_PX = 24  # px; smallest side of the coarsest level; smaller: larger motion is found
+_LEVELS = 5  # largest number of levels; more find larger motion
 _BLOCK = 7  # px; side of the compared blocks; larger ones are more robust and less detailed
 _GAIN = 0.05  # share of the squared difference that a subpixel shift must remove; larger: fewer subpixel shifts
 _NOISE = 1e-4  # squared difference of noise, for the same test

@@ -41,6 +41,9 @@ def from_relative(
     depth       depth is linear, larger is farther      Marigold, and other affine-invariant depth
     =========== ======================================= =====================================================
 
+    Maps of 8 bits, of numbers from 0 to 255 or from 0 to 1, have steps on smooth surfaces. In a strong blur each step
+    near the focus would appear as a fine line, so steps become ramps: values change by at most half a level.
+
     Args:
         values: ``[B, 1, H, W]``, floating point or whole numbers, of any range. NaN and infinite values are holes.
         near_m: Distance of the nearest value, in metres, > 0.
@@ -49,9 +52,6 @@ def from_relative(
         value_range: ``(smallest, largest)``; other values are clamped to this range. None takes the extremes of each
             item. Give it for the frames of a shot, so that all have the same scale.
         unknown: A value that marks pixels without depth, for example 0.
-
-    Maps of 8 bits, of numbers from 0 to 255 or from 0 to 1, have steps on smooth surfaces. These are made ramps, by a
-    change of at most half a level; at a strong blur, each step near the focus would else be seen as a fine line.
 
     Returns:
         ``[B, 1, H, W]`` in metres, on the device and in the dtype of ``values`` (float32 for whole numbers); NaN in
@@ -176,8 +176,8 @@ def solve_scale(
         The scale.
 
     Raises:
-        ValueError: If an argument is not as described, all points have the same value, or the values run the other way
-            than ``kind`` does.
+        ValueError: If an argument is not as described, all points have the same value, or the values of ``kind`` would
+            grow in the other direction.
 
     Example:
         >>> values = torch.tensor([[[[1.0, 2.0, 4.0]]]])

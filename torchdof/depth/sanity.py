@@ -18,13 +18,15 @@ from .kinds import DepthKind
 
 __all__ = ["DepthWarning", "Mistake", "check", "coc_mistakes", "depth_mistakes", "whole_numbers"]
 
+_NUMBERS = ("focal_length_mm", "f_number", "sensor_width_mm")
 _FACTORS = (0.001, 0.01, 1000.0, 100.0)  # by which depth may be wrong: mm or cm taken for metres, or scaled twice
 _UNITS = {0.001: "millimetres", 0.01: "centimetres"}
+
+# Limits at which depth or camera are suspicious
 _SHARP_PX, _SHARP_WIDTHS = 1.0, 1e-3  # largest radius in focus: in px, and in image widths; the larger of both
-_NUMBERS = ("focal_length_mm", "f_number", "sensor_width_mm")
-_FAR_OFF_RATIO = 30.0  # ratio of focus to nearest or farthest depth beyond which a warning is given even without blur
-_FAR_M, _NEAR_M = 500.0, 0.1  # m; depth is suspiciously far, or suspiciously near
 _LARGE_WIDTHS, _LARGEST_WIDTHS = 1 / 8, 1.0  # image widths: a large radius, an impossible one (macro lenses reach 1/2)
+_FAR_OFF_RATIO = 30.0  # ratio of focus to nearest or farthest depth beyond which a warning is given even without blur
+_FAR_M, _NEAR_M = 500.0, 0.1  # m; all depth is farther than the first, or nearer than the second
 _WIDEST_F_NUMBER = 0.5  # limit of an aplanatic lens in air
 _SHORTEST_WIDTHS = 1 / 20  # shortest focal length in sensor widths: a field of view of 169 degrees
 

@@ -25,13 +25,13 @@ _SWAP_MARGIN = (1.5, 1.0)  # the second surface takes over with more than 1.5 ti
 class Steady:
     """Filters the depth of a shot, frame by frame.
 
-    Each pixel stores two surfaces: the current one, as the running mean of its inverse depth, and a second one that was
-    seen there recently. Each has votes.
+    Each pixel stores two surfaces, each with votes: the current one, as the running mean of its inverse depth, and
+    another one that appeared there recently.
 
     * A new depth near the first surface is averaged into it, which reduces noise.
     * Another depth is a vote for the second surface, which becomes the first when it has clearly more votes. So an edge
       that jitters by a pixel stays at its most frequent position.
-    * Where the image moves, the stored surfaces are moved along by block matching in whole pixels. Noise is reduced
+    * Where the image moves, the stored surfaces move with it, by block matching in whole pixels. Noise is reduced
       there too; differing depths are used unchanged, so that edges keep their place.
     * Where the image changes in another way, or the depth changes over a larger area than a jittering edge, the new
       depth is used unchanged, so that cuts and moving objects are not smeared.

@@ -87,8 +87,10 @@ def make_dataset(
 ) -> Summary:
     """Makes the missing shards of a data set, on the Ray cluster in use or on this machine.
 
-    After an interruption, a call with the same arguments continues with the shards that are not complete, or whose
-    input files have changed since.
+    1. List the shards, and check that the folder has the same settings.
+    2. Render the shards that are missing or incomplete, or whose input files have changed, with Ray; so a call with the
+       same arguments continues after an interruption.
+    3. Write a summary and the list of broken inputs.
 
     Args:
         pairs: Images and depths.

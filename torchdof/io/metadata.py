@@ -20,7 +20,7 @@ _MM_PER_UNIT: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF 
 _FLIPPED: dict[Any, tuple[int, ...]] = {2: (1,), 3: (0, 1), 4: (0,), 5: (), 6: (1,), 7: (0, 1), 8: (0,)}
 """EXIF orientation (0x0112) -> flipped axes. Orientations from 5 up first transpose the image."""
 _FOCAL_MM, _SENSOR_MM, _F_NUMBERS = (0.5, 3000.0), (1.0, 300.0), (0.5, 1000.0)
-"""Smallest and largest number of a lens that is believed: cameras write 0, or micrometres, for what they don't know."""
+"""Smallest and largest number of a lens that is believed: cameras write 0, or micrometres, for unknown numbers."""
 _AXIS_TAGS = (  # tags that are swapped when an image is transposed
     ("Exif:PixelXDimension", "Exif:PixelYDimension"),
     ("Exif:FocalPlaneXResolution", "Exif:FocalPlaneYResolution"),

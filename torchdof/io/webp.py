@@ -17,7 +17,7 @@ __all__ = ["add_exif", "write_animation"]
 
 _DURATION_MS = 40  # of one picture
 _ANIMATION = 0x02  # flag of a WebP that is an animation
-_FLAGS = {b"ICCP": 0x20, b"ALPH": 0x10, b"EXIF": 0x08}  # flags of a WebP that has such a chunk
+_FLAGS = {b"ICCP": 0x20, b"ALPH": 0x10, b"EXIF": 0x08}  # flags of a WebP with these chunks
 
 
 def add_exif(path: Path, spec: Any) -> None:

@@ -24,7 +24,7 @@ __all__ = [
     "MOST_LEVELS",
     "MOST_PLANES",
     "Kind",
-    "PaddedFrame",
+    "FrameLayers",
     "blend",
     "blend_gradient",
     "chosen",
@@ -64,8 +64,8 @@ Rules = Sequence[tuple[int, float, float, float]]
 _Floats = ctypes.POINTER(ctypes.c_float)
 
 
-class FieldShares(Protocol):
-    """Transmittance of the lens's field over kernels of one radius: :class:`torchdof.optics.placed_kernels.Shares`."""
+class KernelMask(Protocol):
+    """Mask of a lens's field for kernels of one radius: :class:`torchdof.optics.placed_kernels.FieldMask`."""
 
     @property
     def values(self) -> Tensor:
@@ -80,8 +80,8 @@ class FieldShares(Protocol):
         """Signed radius in pixels."""
 
 
-class _Shares(ctypes.Structure):
-    """``torchdof_shares`` of ``src/api.h``."""
+class _FieldMask(ctypes.Structure):
+    """``torchdof_field_mask`` of ``src/api.h``."""
 
     _fields_ = [  # noqa: RUF012
         ("values", ctypes.c_void_p),
@@ -174,7 +174,7 @@ class _Scene(ctypes.Structure):
         ("highlights", ctypes.c_int32),
         ("crisp_px", ctypes.c_float),
         *_OF_LAYERS,
-        ("shares", ctypes.POINTER(_Shares)),
+        ("shares", ctypes.POINTER(_FieldMask)),
         ("distances", ctypes.c_int32),
         ("squeeze", ctypes.c_float),
         ("threads", ctypes.c_int32),
@@ -272,11 +272,15 @@ def render(
     masked: bool,
     highlights: bool,
     crisp_px: float,
-    shares: Sequence[FieldShares],
-    ray_shares: Callable[[list[int]], Sequence[FieldShares]],
+    field_masks: Sequence[KernelMask],
+    ray_masks: Callable[[list[int]], Sequence[KernelMask]],
     squeeze: float,
 ) -> Tensor:
     """Renders depth of field for one image, with as many threads as PyTorch uses.
+
+    1. Begin: the engine splits pixels, fills hidden areas and finds the radii of the highlights' kernels.
+    2. Make these kernels and their field masks.
+    3. Finish: the engine composites the layers and splats the highlights.
 
     Args:
         surfaces: Light ``[C, H, W]``, signed coc in pixels ``[H, W]`` and weight ``[H, W]`` (None: 1) of each surface,
@@ -290,8 +294,8 @@ def render(
         masked: Whether values may be NaN or infinite; such pixels are copied.
         highlights: Whether highlights are rendered ray by ray where layers would soften them.
         crisp_px: Blur in pixels above which layers soften highlights.
-        shares: Transmittance of the field for each layer, float32 and contiguous; empty if the lens has no field.
-        ray_shares: The same for highlights, from their radii in steps of 1/32 pixel; in ascending order of radius.
+        field_masks: Transmittance of the field for each layer, float32 and contiguous; empty if the lens has no field.
+        ray_masks: Field masks for signed radii of highlights, in steps of 1/32 pixel, in ascending order of radius.
         squeeze: Height of the blur divided by its width.
 
     Returns:
@@ -322,8 +326,8 @@ def render(
         highlights,
         crisp_px,
         *of_layers,
-        _shares(shares) if shares else None,
-        shares[0].values.shape[1] if shares else 0,
+        _field_masks(field_masks) if field_masks else None,
+        field_masks[0].values.shape[1] if field_masks else 0,
         squeeze,
         torch.get_num_threads(),
         ctypes.pointer(cancelled),
@@ -338,8 +342,8 @@ def render(
             count = engine.torchdof_radii(job, ctypes.byref(steps))
             rays = [psf.contiguous() for psf in psfs(steps[:count])] if count else []
             halves = _array(ctypes.c_int32, max(1, count))(*(psf.shape[-1] // 2 for psf in rays))
-            spots = ray_shares(steps[:count]) if count and shares else []
-            of_rays = _shares(spots) if spots else None
+            spots = ray_masks(steps[:count]) if count and field_masks else []
+            of_rays = _field_masks(spots) if spots else None
             _check(engine.torchdof_finish(job, _pointers(rays), halves, of_rays, len(spots), out.data_ptr()))
         finally:
             engine.torchdof_free(job)
@@ -348,8 +352,8 @@ def render(
     return out
 
 
-class PaddedFrame(NamedTuple):
-    """What :func:`blend` needs besides the surfaces' maps ``[., rows, columns]``, which include a margin.
+class FrameLayers(NamedTuple):
+    """Layers and geometry of a padded frame, for :func:`blend`; maps ``[., rows, columns]`` include a margin.
 
     Args:
         margin: Pixels of the maps before the picture.
@@ -368,7 +372,7 @@ class PaddedFrame(NamedTuple):
     backed: bool
 
 
-def blend(surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: PaddedFrame) -> Tensor:
+def blend(surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: FrameLayers) -> Tensor:
     """Blurs and composites the layers of a padded frame, as :func:`torchdof.render.composite.over`, for one image.
 
     Args:
@@ -390,9 +394,9 @@ def blend(surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: Padde
 
 
 def blend_gradient(
-    surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: PaddedFrame, gradient: Tensor
+    surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: FrameLayers, gradient: Tensor
 ) -> list[Tensor]:
-    """The gradients of :func:`blend` by its surfaces, from that by its result ``[planes, height, width]``.
+    """The gradients of :func:`blend` by its surfaces, given the one by its result, ``[planes, height, width]``.
 
     Returns:
         Gradients by light, position and, if it has one, weight of each surface, in this order.
@@ -411,7 +415,7 @@ def blend_gradient(
 
 
 def _layers_of(
-    surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: PaddedFrame
+    surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: FrameLayers
 ) -> tuple[_Layers, list[Any]]:
     """The structure for :func:`blend`, and the memory to which it points."""
     maps = [[None if t is None else t.contiguous() for t in each] for each in zip(*surfaces, strict=True)]
@@ -448,7 +452,7 @@ def look_behind(levels: Sequence[Tensor], rules: Rules, coc: Tensor) -> Tensor:
 
     Args:
         levels: Light, coc and weight of each level of a pyramid, ``[C + 2, h, w]``, float32.
-        rules: Of each level the distance of two samples in pixels, the smallest blur at which a pixel reads it, the
+        rules: For each level the distance of two samples in pixels, the smallest blur at which a pixel reads it, the
             votes for each weight, and the most votes.
         coc: Signed coc of the image.
 
@@ -465,7 +469,7 @@ def look_behind(levels: Sequence[Tensor], rules: Rules, coc: Tensor) -> Tensor:
 
 
 def look_behind_gradient(levels: Sequence[Tensor], rules: Rules, coc: Tensor, gradient: Tensor) -> list[Tensor]:
-    """The gradients of :func:`look_behind` by coc and by each level, from that by its result ``[C + 2, H, W]``.
+    """The gradients of :func:`look_behind` by coc and by each level, given the one by its result, ``[C + 2, H, W]``.
 
     Raises:
         MemoryError: If there is not enough memory.
@@ -548,7 +552,7 @@ def coc_px(depth: Tensor, scale: float, nearest_m: float, farthest_m: float) -> 
 
 
 def plan(coc_px: Tensor, tolerance: float) -> tuple[tuple[float, ...], float]:
-    """Positions of the layers for a frame, as ``torchdof.render.plan.Plan.of_frame``.
+    """Positions of the layers for a frame, as ``torchdof.render.plan.Plan.for_scene``.
 
     Args:
         coc_px: Signed coc of the frame, ``[B, 1, H, W]``, float32, in pixels.
@@ -674,12 +678,12 @@ def _check(status: int) -> None:
         raise KeyboardInterrupt
 
 
-def _shares(shares: Sequence[FieldShares]) -> Any:
+def _field_masks(masks: Sequence[KernelMask]) -> Any:
     made = []
-    for each in shares:
+    for each in masks:
         colours, _, rows, columns = each.values.shape
-        made.append(_Shares(each.values.data_ptr(), each.boxes.data_ptr(), each.coc_px, colours, rows, columns))
-    return _array(_Shares, len(made))(*made)
+        made.append(_FieldMask(each.values.data_ptr(), each.boxes.data_ptr(), each.coc_px, colours, rows, columns))
+    return _array(_FieldMask, len(made))(*made)
 
 
 def _pointers(tensors: Sequence[Tensor | None]) -> Any:
@@ -736,7 +740,7 @@ def _library() -> tuple[ctypes.CDLL | None, str]:
         pointer,
         ctypes.POINTER(pointer),
         ctypes.POINTER(ctypes.c_int32),
-        ctypes.POINTER(_Shares),
+        ctypes.POINTER(_FieldMask),
         ctypes.c_int32,
         pointer,
     ]

@@ -20,15 +20,17 @@ from .kernel_bank import FADE_IN, bank_of
 __all__ = ["BlurTable"]
 
 UNITS = ("fraction", "mm", "relative")
-_MAX_NODES = 4096
-_COC_RANGE = (1e-9, 1e6)  # allowed |coc| of the outermost nodes, in the table's unit
-_MAX_REACH = 1e4  # largest radius of a kernel over |coc| of its node; allows a blur that remains in focus
-_MIN_PARAMETER, _MAX_PARAMETER = 1e-100, 1e100  # allowed parameters: their sums and products stay finite in float64
-_MAX_EXPONENT = 100.0  # largest exponent m of "softm"; with a steeper tilt the light would lie in the tail of the edge
-_SPOT_EDGE_PX = 1.5  # px around a spot of a field in which pixels receive some of its light
 _RIM_POWER = 4.0  # exponent m of a bright rim; a larger one makes the rim thinner
+_SPOT_EDGE_PX = 1.5  # px around a spot of a field in which pixels receive some of its light
+
+# Allowed values
+_MAX_NODES = 4096
+_COC_RANGE = (1e-9, 1e6)  # |coc| of the outermost nodes, in the table's unit
+_MAX_REACH = 1e4  # largest radius of a kernel over |coc| of its node; allows a blur that remains in focus
+_MIN_PARAMETER, _MAX_PARAMETER = 1e-100, 1e100  # sums and products of parameters stay finite in float64
+_MAX_EXPONENT = 100.0  # largest exponent m of "softm"; with a steeper tilt the light would lie in the tail of the edge
+_CHECKED_PX = (0.5, 6.0)  # px; radii to which the widest kernel is scaled for the check
 _CHECKED_AT_ONCE = 64  # kernels checked together; limits memory
-_CHECKED_PX = (0.5, 6.0)  # radii in px to which the widest kernel is scaled for the check
 
 
 class BlurTable:

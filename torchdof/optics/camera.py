@@ -185,7 +185,7 @@ class Camera:
         return torch.where(is_valid, scale * dioptres, torch.nan)
 
     def _compiled_coc_px(self, depth: Tensor, width: int) -> Tensor | None:
-        """The same by the compiled engine; None if that does not support the call (traced, batched, tilted, ...)."""
+        """:meth:`coc_px` by the compiled engine; None if it does not support the call (traced, batched, tilted)."""
         if is_traced() or depth.dtype != torch.float32 or not is_in_memory(depth) or not native.chosen():
             return None
         ends = self.focus_range_m or (self.focus_m, self.focus_m)

@@ -4,7 +4,7 @@ Away from the middle of the frame the blur of a lens changes: its barrel cuts ca
 curvature) and differs between the radial and the tangential direction (astigmatism), light trails outwards (coma), and
 colours separate (lateral colour).
 
-The *spot*, the image of a point, holds all of that. Because a lens is rotationally symmetric, the spot depends only on
+The *spot*, the image of a point, has all of these. Because a lens is rotationally symmetric, the spot depends only on
 the signed circle of confusion and on the distance from the middle of the frame; it turns with the azimuth, and is
 symmetric about the line to the middle. So half of each spot is stored, with ``u`` pointing away from the middle and
 ``v`` across. The origin is the place of the point in the sharp image.

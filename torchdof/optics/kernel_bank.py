@@ -1,10 +1,10 @@
 """Kernels of any radius from templates, by two small matrix products.
 
 A cache of finished kernels would not help, because a new camera blurs by new radii. But
-:func:`torchdof.optics.psf.pixel_kernels` works in two steps, of which the first does not depend on the radius. It
-integrates a PSF over square *cells*, ``n`` from the centre to the end of the PSF, and then weights them with the
-interpolator ``phi`` of each pixel. The light in the cells, the *template* ``T``, is computed once for each node of a
-table. A kernel of any radius is then
+:func:`torchdof.optics.psf.pixel_kernels` works in two steps. The first integrates a PSF over square *cells*, ``n`` from
+the centre to the end of the PSF; the second weights them with the interpolator ``phi`` of each pixel. The first does
+not depend on the radius. So the light in the cells, the *template* ``T``, is computed once for each node of a table. A
+kernel of any radius is then
 
     ``K = A T B'``  with  ``A[m, i] = phi(m - i h)``,  ``B[m, i] = phi(m - i w)``
 
@@ -39,10 +39,6 @@ __all__ = ["LEAST_CELLS", "SPOT_MARGIN_PX", "KernelBank", "Spots", "bank_of"]
 LEAST_CELLS = 16
 """Cells from the centre to the end of a PSF in the coarsest template."""
 
-_LEVELS = 5  # templates of 16, 32, 64, 128 and 256 cells
-_FADE_START_PX = 0.75  # px a cell; from here to 1 px the next finer template is blended in
-_MIN_REACH_PX = 1e-7  # px; a smaller PSF is rendered with this radius, whose kernel is a single pixel
-_MAX_BANKS = 32  # banks kept in memory
 SPOT_MARGIN_PX = 1.0
 """Empty margin in pixels around a spot of a field, so that its samples fall to 0 at their border."""
 
@@ -52,6 +48,10 @@ FADE_IN = 4.0
 A larger value makes the blur complete at a smaller circle of confusion.
 """
 
+_LEVELS = 5  # templates of 16, 32, 64, 128 and 256 cells
+_FADE_START_PX = 0.75  # px a cell; from here to 1 px the next finer template is blended in
+_MIN_REACH_PX = 1e-7  # px; a smaller PSF is rendered with this radius, whose kernel is a single pixel
+_MAX_BANKS = 32  # banks kept in memory
 _MAX_WIDTHS = 64  # image widths for which the blur in focus is kept
 _templates = KernelCache(128 * 2**20)
 

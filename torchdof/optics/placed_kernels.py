@@ -1,19 +1,19 @@
 """Kernels that depend on the place in the frame: a kernel of the middle times a mask, turned by the azimuth.
 
-A lens is rotationally symmetric. So the masks, called *shares* and in [0, 1], are computed only along one line from the
-middle of the frame, at a few distances, in coordinates ``u`` away from the middle and ``v`` across
-(:mod:`torchdof.optics.field`). The kernel ``K_p`` of a place ``p`` is
+A lens is rotationally symmetric. So field masks, in [0, 1], are computed only along one line from the middle of the
+frame, at a few distances, in coordinates ``u`` away from the middle and ``v`` across (:mod:`torchdof.optics.field`).
+The kernel ``K_p`` of a place ``p`` is
 
-    ``K_p[m] = K[m] share_p(m) / sum_m K[m] share_p(m)``
+    ``K_p[m] = K[m] mask_p(m) / sum_m K[m] mask_p(m)``
 
-with ``K`` the kernel of the middle, and ``share_p`` interpolated between two distances, turned by the azimuth of ``p``
+with ``K`` the kernel of the middle, and ``mask_p`` interpolated between two distances, turned by the azimuth of ``p``
 and sampled bilinearly at the pixels. The division keeps the light: the sharp image shows the darkening of the corners
 already.
 
-* Traced and measured spots: ``K`` is a uniform disc, and the share is the spot itself, averaged over a pixel.
+* Traced and measured spots: ``K`` is a uniform disc, and the mask is the spot itself, averaged over a pixel.
 * Cat's eyes (``vignetting=``): ``K`` has the whole opening. A ray through the point ``w`` of the aperture to a place
   ``p`` in the frame (from its middle, in half diagonals) passes where ``|w + 2 front p| <= 1`` and
-  ``|w - 2 rear p| <= 1``: it is cut by a rim in front of the aperture and one behind it. The share is the signed
+  ``|w - 2 rear p| <= 1``: it is cut by a rim in front of the aperture and one behind it. The mask is the signed
   distance in pixels to the edge of the nearer rim, plus half a pixel, clamped to [0, 1].
 """
 
@@ -30,32 +30,32 @@ from .field import deviations
 from .kernel_bank import SPOT_MARGIN_PX, Lens
 from .kernel_cache import KernelCache
 
-__all__ = ["DISTANCES", "Shares", "layer_shares", "placed", "placed_between", "ray_shares"]
+__all__ = ["DISTANCES", "FieldMask", "layer_mask", "placed", "placed_between", "ray_masks"]
 
 DISTANCES = 17
-"""Number of distances, from the middle of the frame to its corner, at which shares are computed."""
+"""Number of distances, from the middle of the frame to its corner, at which masks are computed."""
 
-_SAMPLES_PER_PX = 4.0  # samples of a share per pixel
+_SAMPLES_PER_PX = 4.0  # samples of a mask per pixel
 _MAX_SAMPLES = 64  # most samples on each side of the origin
 _MIN_AVERAGED_PX = 0.5  # px; smallest width over which a sample averages the spot
 _CENTRE_OFFSET = 1e-6  # half diagonals; offset that gives the middle of the frame an azimuth
 _MIN_SCALE_PX = 1e-6  # px; smallest scale of a spot, so that boxes have a size in focus
 _MIN_LIGHT = 1e-6  # share of a kernel's light; where less passes, the kernel is not masked
 _MIN_SHRINK = 0.5  # smallest scale of a spot, which is shrunk by the blur that sampling adds
-_RADIUS_RATIO = 1.09  # ratio of neighbouring radii at which the shares of highlights are computed
-_shares = KernelCache(128 * 2**20)
+_RADIUS_RATIO = 1.09  # ratio of neighbouring radii at which the masks of highlights are computed
+_masks = KernelCache(128 * 2**20)
 
 
 class PlacedLens(Lens, Protocol):
-    """The part of :class:`torchdof.BlurTable` that shares are computed from."""
+    """The part of :class:`torchdof.BlurTable` that masks are computed from."""
 
     def reach_px(self, coc_px: float, width: float) -> float:
         """Radius in pixels that holds the kernels at ``+-coc_px``."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Shares:
-    """Masks for the kernels of one signed circle of confusion, at :data:`DISTANCES` distances.
+class FieldMask:
+    """Mask for the kernels of one signed circle of confusion, at :data:`DISTANCES` distances.
 
     Args:
         values: ``[1 or C, distances, rows, columns]``; rows along increasing u, columns along v from 0. Distances are
@@ -71,15 +71,15 @@ class Shares:
     coc_px: float
     squeeze: float | Tensor = 1.0
 
-    def to(self, like: Tensor) -> "Shares":
-        """The same with the dtype and device of ``like``."""
+    def to(self, like: Tensor) -> "FieldMask":
+        """These masks with the dtype and device of ``like``."""
         return dataclasses.replace(
             self, values=self.values.to(like).contiguous(), boxes=self.boxes.to(like).contiguous()
         )
 
 
-def layer_shares(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int]) -> Shares:
-    """Shares of a layer.
+def layer_mask(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int]) -> FieldMask:
+    """Field mask of a layer.
 
     Args:
         table: A table with ``depends_on_place``.
@@ -88,12 +88,12 @@ def layer_shares(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, 
         size: Height and width of the image.
     """
     key = ("layer", table.fingerprint(), coc_px, scale, size)
-    values, boxes = _shares.get(key, lambda: _computed(table, coc_px, scale, size))
-    return Shares(values, boxes, coc_px / scale, _squeeze(table))
+    values, boxes = _masks.get(key, lambda: _computed(table, coc_px, scale, size))
+    return FieldMask(values, boxes, coc_px / scale, _squeeze(table))
 
 
-def ray_shares(table: PlacedLens, coc_px: Sequence[float], size: tuple[int, int]) -> list[Shares]:
-    """Shares for highlights with signed ``coc_px``, ordered by coc.
+def ray_masks(table: PlacedLens, coc_px: Sequence[float], size: tuple[int, int]) -> list[FieldMask]:
+    """Field masks for highlights with signed ``coc_px``, ordered by coc.
 
     They are computed at fixed radii, powers of ``_RADIUS_RATIO``: the two around each highlight.
     """
@@ -103,9 +103,9 @@ def ray_shares(table: PlacedLens, coc_px: Sequence[float], size: tuple[int, int]
         exponents |= {(coc < 0, exponent), (coc < 0, exponent + 1)}
     radii = sorted(math.copysign(_RADIUS_RATIO**exponent, -1.0 if near else 1.0) for near, exponent in exponents)
     keys = [("ray", table.fingerprint(), radius, 1, size) for radius in radii]
-    computed = _shares.get_all(keys, lambda missing: [_computed(table, key[2], 1, size) for key in missing])
+    computed = _masks.get_all(keys, lambda missing: [_computed(table, key[2], 1, size) for key in missing])
     squeeze = _squeeze(table)
-    return [Shares(values, boxes, radius, squeeze) for (values, boxes), radius in zip(computed, radii, strict=True)]
+    return [FieldMask(values, boxes, radius, squeeze) for (values, boxes), radius in zip(computed, radii, strict=True)]
 
 
 def _squeeze(table: PlacedLens) -> float | Tensor:
@@ -114,7 +114,7 @@ def _squeeze(table: PlacedLens) -> float | Tensor:
 
 @torch.inference_mode(False)  # cached tensors must be usable by autograd
 def _computed(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Values and boxes of :class:`Shares`, float64.
+    """Values and boxes of :class:`FieldMask`, float64.
 
     For the spots of a field:
 
@@ -190,12 +190,12 @@ def _through_rims(table: PlacedLens, coc_px: float, width: float, distance: Tens
     return torch.minimum(*depths).unsqueeze(0), boxes.contiguous()
 
 
-def placed(kernel: Tensor, shares: Sequence[tuple[Shares, Tensor]], y: Tensor, x: Tensor) -> Tensor:
+def placed(kernel: Tensor, masks: Sequence[tuple[FieldMask, Tensor]], y: Tensor, x: Tensor) -> Tensor:
     """Kernels of places in the frame.
 
     Args:
         kernel: Kernel of the middle of the frame, ``[1 or n, 1 or C, k, k]``.
-        shares: Shares of one radius, or of two neighbouring ones, each with its weight ``[n]`` or ``[]``.
+        masks: Masks of one radius, or of two neighbouring ones, each with its weight ``[n]`` or ``[]``.
         y: Places ``[n]``, in half diagonals down from the middle of the frame.
         x: The same to the right.
 
@@ -210,13 +210,13 @@ def placed(kernel: Tensor, shares: Sequence[tuple[Shares, Tensor]], y: Tensor, x
     position = distance.flatten().clamp(max=1.0) * (DISTANCES - 1)
     low = position.long().clamp(max=DISTANCES - 2)
     fraction = position - low
-    across = offset * shares[0][0].squeeze
+    across = offset * masks[0][0].squeeze
     u, v = offset[:, None] * down + across * right, (across * down - offset[:, None] * right).abs()
-    boxes = [torch.lerp(entry.boxes[low], entry.boxes[low + 1], fraction[:, None]) for entry, _ in shares]  # [n, 3]
-    box = torch.stack([weight.reshape(-1, 1) * box for (_, weight), box in zip(shares, boxes, strict=True)]).sum(0)
+    boxes = [torch.lerp(entry.boxes[low], entry.boxes[low + 1], fraction[:, None]) for entry, _ in masks]  # [n, 3]
+    box = torch.stack([weight.reshape(-1, 1) * box for (_, weight), box in zip(masks, boxes, strict=True)]).sum(0)
     grid = torch.stack([2.0 * v / box[:, 2:, None] - 1.0, (u - box[:, :1, None]) / box[:, 1:2, None]], -1)
     mask = kernel.new_zeros(())
-    for entry, weight in shares:
+    for entry, weight in masks:
         values = torch.lerp(entry.values[:, low], entry.values[:, low + 1], fraction[:, None, None]).transpose(0, 1)
         mask_part = functional.grid_sample(values, grid, padding_mode="border", align_corners=True).clamp(0.0, 1.0)
         mask = mask + weight.reshape(-1, 1, 1, 1) * mask_part
@@ -225,22 +225,22 @@ def placed(kernel: Tensor, shares: Sequence[tuple[Shares, Tensor]], y: Tensor, x
     return torch.where(light_left > _MIN_LIGHT * light, masked * (light / light_left.clamp_min(1e-30)), kernel)
 
 
-def placed_between(kernels: Tensor, shares: Sequence[Shares], coc: Tensor, y: Tensor, x: Tensor) -> Tensor:
-    """Kernels ``[n, 1 or C, k, k]`` of sources at places, with shares interpolated between the radii around each.
+def placed_between(kernels: Tensor, masks: Sequence[FieldMask], coc: Tensor, y: Tensor, x: Tensor) -> Tensor:
+    """Kernels ``[n, 1 or C, k, k]`` of sources at places, with masks interpolated between the radii around each.
 
     Args:
         kernels: Kernels of the middle of the frame, ``[n, 1 or C, k, k]``.
-        shares: Result of :func:`ray_shares`, ordered by coc.
+        masks: Result of :func:`ray_masks`, ordered by coc.
         coc: Signed coc of the sources ``[n]`` in pixels.
         y: Places ``[n]``, in half diagonals down from the middle of the frame.
         x: The same to the right.
     """
-    radii = torch.tensor([entry.coc_px for entry in shares], dtype=coc.dtype, device=coc.device)
+    radii = torch.tensor([entry.coc_px for entry in masks], dtype=coc.dtype, device=coc.device)
     low = (torch.searchsorted(radii, coc.detach().contiguous(), right=True) - 1).clamp(0, len(radii) - 2)
     weights = ((coc - radii[low]) / (radii[low + 1] - radii[low])).clamp(0.0, 1.0)
-    result = torch.empty_like(kernels.expand(-1, max(kernels.shape[1], shares[0].values.shape[0]), -1, -1))
+    result = torch.empty_like(kernels.expand(-1, max(kernels.shape[1], masks[0].values.shape[0]), -1, -1))
     for k in low.unique().tolist():
         items = (low == k).nonzero()[:, 0]
-        pair = [(shares[k], 1.0 - weights[items]), (shares[k + 1], weights[items])]
+        pair = [(masks[k], 1.0 - weights[items]), (masks[k + 1], weights[items])]
         result = result.index_put((items,), placed(kernels[items], pair, y[items], x[items]))
     return result

@@ -1,9 +1,10 @@
 """Point spread functions (PSFs), and kernels: the effect of a PSF on pixels. Differentiable in the parameters.
 
-A pixel is an integral already, ``J = box * scene`` at the pixel's centre, and the blurred picture's is
+A pixel is an integral already: ``J = box * scene`` at the pixel's centre. The pixel of the blurred picture is
 ``(psf * J)(j) = (psf * box * scene)(j)``. So a kernel must not integrate the PSF over the pixel's box once more, which
-adds a variance of 1/12 px^2 along each axis and leaves a PSF smaller than a pixel without effect. It needs J between
-the samples. The kernel of least error over pictures of a power spectrum ``S(f)``, ``P = |box^|^2 S``, is
+adds a variance of 1/12 px^2 along each axis and leaves a PSF smaller than a pixel without effect. Instead it must
+estimate J between the samples. The kernel of least error over pictures of a power spectrum ``S(f)``,
+``P = |box^|^2 S``, is
 
     ``K^(f) = sum_i P(f + i) psf^(f + i) / sum_i P(f + i)``,
 
@@ -72,17 +73,20 @@ FAMILIES: dict[str, tuple[str, ...]] = {
 LENGTHS = frozenset({"sigma", "r_c", "radius"})
 """Parameters that are lengths; the others are pure numbers."""
 
+# Accuracy; larger: more exact, slower
+_CELLS = 16  # least cells from the centre to the end of a PSF; larger PSFs have cells of a pixel
+_CELL_PARTS = 3  # parts of a cell along each axis where an opening cuts the profile
+_MASS_CELLS = 60  # cells on each side over which the light of a large kernel with an opening is summed
+_RINGS = 2**14  # rings over which the light of a large round kernel is summed; agrees with its pixels to 1e-6
+
+# Limits
 _MIN_LENGTH_PX = 1e-7  # px; a length below it is rendered as this, which is a kernel of one pixel to 1e-14
 _TILT_EXPONENT = 460.0  # largest logarithm of (r / R)^m, e^460 = 1e200; a larger power would overflow
-_CACHED_HALF_WIDTH = 64  # cells; slices of larger quadrants are not cached
 _MAX_WIDTH_PX = 2**16 + 1  # px; a kernel of this width takes 34 GB
 _FULL_UP_TO_PX = 256  # px on each side of the centre; smaller kernels are computed whole, whatever the window
-_SLICES_AT_ONCE = 2**20  # slices computed together; limits memory
-_CELLS = 16  # least cells from the centre to the end of a PSF; larger PSFs have cells of a pixel
-_CELL_PARTS = 3  # parts of a cell along each axis where an opening cuts the profile; more are more exact
-_MASS_CELLS = 60  # cells on each side over which the light of a large kernel with an opening is summed
 _MARGIN_PX = 2  # px around a kernel that its values depend on (the four neighbours in _non_negative, and theirs)
-_RINGS = 2**14  # rings over which the light of a large round kernel is summed; agrees with its pixels to 1e-6
+_SLICES_AT_ONCE = 2**20  # slices computed together; limits memory
+_CACHED_HALF_WIDTH = 64  # cells; slices of larger quadrants are not cached
 _quadrants = KernelCache(64 * 2**20)
 
 Number = float | Tensor
@@ -662,7 +666,7 @@ def _table_integral(r: Tensor, p: Mapping[str, Tensor]) -> Tensor:
 
 @torch.inference_mode(False)  # cached tensors must be usable by autograd
 def _square_slices(half: int, slices: int, top: int, bottom: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Slices of the square cells of a quadrant's rows."""
+    """Slices of the square cells of a quadrant's rows, as in :func:`_slices`."""
     return _slices(half, slices, top, bottom, torch.ones((), dtype=torch.float64, device="cpu"))
 
 

@@ -18,7 +18,7 @@ def ikoma(scene: Scene, spacing_px: float = 0.75) -> Tensor:
 def layered_fft(image: Tensor, coc_px: Tensor, spacing_px: float = 0.75) -> Tensor:
     """The published layered formula: no hidden surfaces, no mixed pixels, exact discs, by FFT.
 
-    The frame is padded with its border; where layers leave a hole, the rest is scaled up.
+    The frame is padded with its border; where layers leave a hole, the light is divided by their coverage.
 
     Args:
         image: ``[1, C, H, W]``, linear light; the computation uses its dtype.

@@ -10,7 +10,7 @@ from .. import native
 from ..optics.aperture import Aperture
 from ..optics.blur_table import BlurTable
 from ..optics.kernel_bank import bank_of
-from ..optics.placed_kernels import Shares, ray_shares
+from ..optics.placed_kernels import FieldMask, ray_masks
 from ..options import Options
 from ..tensors import is_in_memory, is_traced
 from . import exposure
@@ -29,11 +29,11 @@ def picture(
     cover: Tensor | None = None,
     lens_width: int | None = None,
 ) -> Tensor | None:
-    """Render the picture ``[B, C, H, W]`` of the plain engine, item by item; None if that engine must render it.
+    """Render ``[B, C, H, W]`` item by item; None if the compiled engine does not support the arguments.
 
-    The compiled engine supports ``method="layered"`` in float32 on the CPU, in eager code without gradients. Arguments
-    are those of ``torchdof.render.pipeline._render_item``; ``lens_width`` is the width in pixels of the image whose
-    kernels are used, if it differs from the picture's.
+    It supports ``method="layered"`` in float32 on the CPU, in eager code without gradients. Arguments are those of
+    ``torchdof.render.pipeline._render_items``; ``lens_width`` is the width in pixels of the image whose kernels are
+    used, if it differs from the picture's.
     """
     if options.table.is_differentiated:
         return None
@@ -94,8 +94,8 @@ def _render(
         masked=kind != "stack" and not options.check,
         highlights=plan.rays,
         crisp_px=plan.crisp_px,
-        shares=plan.shares(options.table, [scale for _, scale in layers], (int(height), int(width)), like),
-        ray_shares=functools.partial(_ray_shares, options.table, (int(height), int(width))),
+        field_masks=plan.field_masks(options.table, [scale for _, scale in layers], (int(height), int(width)), like),
+        ray_masks=functools.partial(_ray_masks, options.table, (int(height), int(width))),
         squeeze=float(aperture.squeeze),
     )
     if kind != "background":
@@ -107,10 +107,10 @@ def _render(
     return render([(light * scale, coc, weight) for light, coc, weight in surfaces]) / scale
 
 
-def _ray_shares(table: BlurTable, size: tuple[int, int], steps: Sequence[int]) -> list[Shares]:
+def _ray_masks(table: BlurTable, size: tuple[int, int], steps: Sequence[int]) -> list[FieldMask]:
     """Field masks for the kernels of highlights with a coc of ``steps / KERNELS_PER_PX`` pixels."""
     return [
-        s.to(torch.empty(0, device="cpu")) for s in ray_shares(table, [step / KERNELS_PER_PX for step in steps], size)
+        s.to(torch.empty(0, device="cpu")) for s in ray_masks(table, [step / KERNELS_PER_PX for step in steps], size)
     ]
 
 

@@ -8,13 +8,16 @@ from torch import Tensor
 
 from .. import native
 from ..tensors import is_in_memory, is_traced
-from .surfaces import Frame, PaddedSurface
+from .surfaces import PaddedFrame, PaddedSurface
 
 __all__ = ["blended", "looked_behind"]
 
 
 def blended(
-    frame: Frame, layers: Sequence[tuple[Tensor, int]], backed: bool, plain: Callable[[Sequence[PaddedSurface]], Tensor]
+    frame: PaddedFrame,
+    layers: Sequence[tuple[Tensor, int]],
+    backed: bool,
+    plain: Callable[[Sequence[PaddedSurface]], Tensor],
 ) -> Tensor | None:
     """Composite all layers of a frame, with its gradient: light followed by its weights, ``[B, C + 1 or C, h, w]``.
 
@@ -22,7 +25,7 @@ def blended(
 
     Args:
         frame: One surface, or two that share each pixel, in any order.
-        layers: Kernel ``[1 or C, k, k]`` of each layer, and the distance of its pixels in pixels of the frame.
+        layers: Kernel ``[1 or C, k, k]`` and scale of each layer: the distance of its pixels in pixels of the frame.
         backed: Whether the weights are transmittances, not coverages; without occlusion they are sums of weights.
         plain: The same computation by PyTorch, from the frame's surfaces.
 
@@ -38,7 +41,7 @@ def blended(
         return None
     if frame.colours + max(len(kernel) for kernel, _ in layers) > native.MOST_PLANES:
         return None
-    padded = native.PaddedFrame(frame.margin, frame.area, frame.nodes[0], layers, frame.occlusion, backed)
+    padded = native.FrameLayers(frame.margin, frame.area, frame.nodes[0], layers, frame.occlusion, backed)
     result: Tensor = _Blend.apply(padded, list(map(len, given)), plain, *tensors)
     return result
 
@@ -49,12 +52,12 @@ def looked_behind(
     coc_px: Tensor,
     plain: Callable[[Sequence[Tensor], Tensor], Tensor],
 ) -> Tensor | None:
-    """Surfaces behind those of an image, with their gradient: light, coc and votes ``[B, C + 2, H, W]``.
+    """Light, coc and votes of the surfaces behind those of an image, ``[B, C + 2, H, W]``, with their gradient.
 
     Args:
         values: Light, coc and weight of each level of a pyramid that is centred on the image, ``[B, C + 2, h, w]``.
-        rules: Of each level the distance of two samples in pixels, the smallest blur at which it is read, its votes per
-            weight, and its most votes.
+        rules: For each level: the distance of two samples in pixels, the smallest blur in pixels at which the level is
+            read, its votes per weight, and its largest number of votes.
         coc_px: Signed coc of the image, ``[B, 1, H, W]``.
         plain: The same computation by PyTorch, from the levels' values and the coc.
 
@@ -82,7 +85,7 @@ def _surfaces(counts: Sequence[int], tensors: Sequence[Tensor]) -> list[PaddedSu
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, padded: native.PaddedFrame, counts: list[int], plain: Any, *tensors: Tensor) -> Tensor:
+    def forward(ctx: Any, padded: native.FrameLayers, counts: list[int], plain: Any, *tensors: Tensor) -> Tensor:
         ctx.padded, ctx.counts, ctx.plain = padded, counts, plain
         ctx.save_for_backward(*tensors)
         return torch.stack([native.blend(item, padded) for item in _items(counts, tensors)])

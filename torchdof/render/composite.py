@@ -15,7 +15,7 @@ from .downsampling import downsampled, upsampled
 from .ops import EAGER, Ops
 from .plan import LayerKernel
 from .scatter import fold
-from .surfaces import Frame
+from .surfaces import PaddedFrame
 
 __all__ = ["Scatter", "accumulate", "accumulate_once", "mean", "over"]
 
@@ -32,7 +32,7 @@ _LEAST = 1e-6  # scattered weight, of 1: pixels with less are unknown and become
 _KNOWN = 0.002  # scattered weight, of 1: layers with less cover gradually less; larger fades more of them
 
 
-def over(frame: Frame, blurs: Sequence[LayerKernel], scatter: Scatter, ops: Ops = EAGER) -> Tensor:
+def over(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter: Scatter, ops: Ops = EAGER) -> Tensor:
     """Normalised "over" of soft layers.
 
     With ``m_k`` the weight of layer k, ``M_k`` the weight at or behind it and ``K_k`` its kernel:
@@ -67,7 +67,7 @@ def over(frame: Frame, blurs: Sequence[LayerKernel], scatter: Scatter, ops: Ops 
         share = left * share_behind if backed else torch.addcmul(share, left, share_behind)
         return torch.addcmul(light, left, light_behind), share
 
-    def plain(frame: Frame) -> Tensor:
+    def plain(frame: PaddedFrame) -> Tensor:
         empty = 1.0 if backed else 0.0
         return _composite_layers(frame.near_to_far(), blurs, scatter, composited, ops, empty, normalised)
 
@@ -77,7 +77,7 @@ def over(frame: Frame, blurs: Sequence[LayerKernel], scatter: Scatter, ops: Ops 
     return out[..., : frame.size[0], : frame.size[1]]
 
 
-def accumulate(frame: Frame, blurs: Sequence[LayerKernel], scatter: Scatter, ops: Ops = EAGER) -> Tensor:
+def accumulate(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter: Scatter, ops: Ops = EAGER) -> Tensor:
     """The paper's scatter: add the light of all layers, ignoring occlusion; channels of weights follow the light.
 
     Pass the result to :func:`mean`. Arguments are those of :func:`over`.
@@ -89,13 +89,13 @@ def accumulate(frame: Frame, blurs: Sequence[LayerKernel], scatter: Scatter, ops
     def added(front: Picture, behind: Picture) -> Picture:
         return front[0] + behind[0], front[1] + behind[1]
 
-    def plain(frame: Frame) -> Tensor:
+    def plain(frame: PaddedFrame) -> Tensor:
         return _composite_layers(frame, blurs, scatter, added, ops)
 
     return _picture(frame, blurs, scatter, False, plain)[..., : frame.size[0], : frame.size[1]]
 
 
-def accumulate_once(frame: Frame, blurs: Sequence[LayerKernel]) -> Tensor:
+def accumulate_once(frame: PaddedFrame, blurs: Sequence[LayerKernel]) -> Tensor:
     """The scatter of :func:`accumulate` as in the paper: one pass, in which each pixel has its own kernel.
 
     The kernel is interpolated between those of the two layers around the pixel's coc, at full resolution.
@@ -110,27 +110,31 @@ def accumulate_once(frame: Frame, blurs: Sequence[LayerKernel]) -> Tensor:
     light = frame.surfaces[0].light
     each = kernels.shape[1]
     light = torch.cat([light, torch.ones_like(light[:, :each])], 1)
-    shares = None if blurs[0].shares is None else [b.shares for b in blurs if b.shares is not None]
-    summed = fold(light, kernels.repeat(1, min(2, each), 1, 1), halo, weights, shares, frame.size)
+    masks = None if blurs[0].mask is None else [b.mask for b in blurs if b.mask is not None]
+    summed = fold(light, kernels.repeat(1, min(2, each), 1, 1), halo, weights, masks, frame.size)
     return summed[..., : frame.size[0], : frame.size[1]]
 
 
 def _picture(
-    frame: Frame, blurs: Sequence[LayerKernel], scatter: Scatter, backed: bool, plain: Callable[[Frame], Tensor]
+    frame: PaddedFrame,
+    blurs: Sequence[LayerKernel],
+    scatter: Scatter,
+    backed: bool,
+    plain: Callable[[PaddedFrame], Tensor],
 ) -> Tensor:
     """All layers of a frame, composited by the compiled engine if it supports the arguments, else by ``plain(frame)``.
 
     ``backed`` is as for :func:`torchdof.render.compiled_steps.blended`.
     """
     picture = None
-    if scatter is not fold and blurs[0].shares is None:
+    if scatter is not fold and blurs[0].mask is None:
         layers = [(blur.kernel, blur.scale) for blur in blurs]
         picture = blended(frame, layers, backed, lambda surfaces: plain(dataclasses.replace(frame, surfaces=surfaces)))
     return plain(frame) if picture is None else picture
 
 
 def _composite_layers(
-    frame: Frame,
+    frame: PaddedFrame,
     blurs: Sequence[LayerKernel],
     scatter: Scatter,
     composited: Callable[[Picture, Picture], Picture],
@@ -172,7 +176,7 @@ def _composite_layers(
 
     # A run has one resolution. A coarse one stays on one side of the focus, because finer layers lie between the sides.
     # A group of a run has at most as many layers as fill the channels of one convolution.
-    uniform = each == 1 and blurs[0].shares is None
+    uniform = each == 1 and blurs[0].mask is None
     most = ops.channels // (colours + (2 if normalised else 1)) if uniform else 1
     runs: dict[tuple[int, bool], list[list[int]]] = {}
     for k in order:
@@ -201,7 +205,7 @@ def _composite_layers(
 
 
 def _scattered(
-    frame: Frame, blurs: Sequence[LayerKernel], scatter: Scatter, group: list[int], visibility: bool
+    frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter: Scatter, group: list[int], visibility: bool
 ) -> tuple[Lights, Tensor] | tuple[Lights, Tensor, Tensor]:
     """Scatter the layers of a group, near to far: light of each, weights and, with ``visibility``, weights behind.
 
@@ -209,17 +213,17 @@ def _scattered(
     its own kernel.
     """
     halo, half, each = max(blurs[k].halo for k in group), max(blurs[k].half for k in group), blurs[0].kernel.shape[-3]
-    shares, scale, kernels = blurs[group[0]].shares, blurs[group[0]].scale, blurs[group[0]].kernel
+    mask, scale, kernels = blurs[group[0]].mask, blurs[group[0]].scale, blurs[group[0]].kernel
     terms = frame.layers(min(group), len(group), halo)[: 2 + visibility]
     if each > 1:
         terms = tuple(term.expand(-1, -1, each, -1, -1) for term in terms)
     widths = [term.shape[2] for term in terms]  # C, and 1 or C
     channels = downsampled(torch.cat([term.flatten(1, 2) for term in terms], 1), scale)
-    if shares is not None and scatter is fold:  # the group is a single layer
+    if mask is not None and scatter is fold:  # the group is a single layer
         kernels = kernels.repeat(channels.shape[1] // each, 1, 1)
-        scattered = fold(channels, kernels, half, None, [shares], frame.size)
-    elif shares is not None:
-        scattered = field.scattered(shares, channels, kernels, half, scale, frame.size)
+        scattered = fold(channels, kernels, half, None, [mask], frame.size)
+    elif mask is not None:
+        scattered = field.scattered(mask, channels, kernels, half, scale, frame.size)
     else:
         if len(group) > 1:
             padded = torch.cat(
@@ -233,7 +237,7 @@ def _scattered(
     return parts[: len(group)], *parts[len(group) :]
 
 
-def _needed(frame: Frame, blurs: Sequence[LayerKernel], layers: list[int]) -> Callable[[], Tensor]:
+def _needed(frame: PaddedFrame, blurs: Sequence[LayerKernel], layers: list[int]) -> Callable[[], Tensor]:
     """A function that computes whether any pixel within reach of the area lies in these consecutive layers."""
     nodes = frame.nodes[0]  # graphs have the same layers for all items
     ends = (nodes[0] - 1.0, *nodes, nodes[-1] + 1.0)

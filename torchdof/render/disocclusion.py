@@ -1,7 +1,7 @@
 """Disocclusion: fills in the hidden surfaces behind blurred ones, from the farther surfaces around them.
 
-A blurred foreground is partly transparent, and the image holds no pixel of the surface behind it. A hidden sample with
-a very small weight replaces it: it matters only where no visible sample contributes.
+A blurred foreground is partly transparent, and the image holds no pixel of the surface behind it. A hidden sample takes
+the place of this pixel. Its weight is very small, so that it matters only where no visible sample contributes.
 """
 
 import math
@@ -31,11 +31,15 @@ __all__ = [
     "surfaces_of_image",
 ]
 
-BEHIND_PX = 1.0  # difference in coc at which a surface is half another one, in pixels; fully at 1/2 px more
-_OWN_SLOPE = 0.25  # part of a pixel's blur by which its own surface may be farther nearby; larger: fewer hidden samples
-_FALL = 0.35  # weight of a level of the pyramid relative to the next finer one; larger: hidden areas are smoother
+# Another surface, or a slope of the pixel's own one; larger values of both: fewer hidden samples
+BEHIND_PX = 1.0  # px; difference in coc at which a sample lies on another surface with confidence 1/2; 1 at 1/2 px more
+_OWN_SLOPE = 0.25  # part of a pixel's blur by which its own surface may be farther nearby
+
+# Levels of the pyramid
+_FALL = 0.35  # weight of a level relative to the next finer one; larger: hidden areas are smoother
 _FINE_LEVELS = 2  # levels that each pixel reads; coarser ones are read once per cell of 2**_FINE_LEVELS pixels
 _SURE = 0.1  # weight of the samples of a level at which its vote is full
+_LEAST_SEEN = 1e-4  # weight of samples up to which they count as empty
 _CERTAIN = 0.01  # votes at which a hidden sample has full weight, or a farther surface replaces a nearer one
 
 BEHIND_STEP = 2**_FINE_LEVELS
@@ -193,8 +197,8 @@ def fill_hidden(
        surfaces. It shows where the hidden surface is blurred itself and nothing else reaches a pixel.
     4. For each pixel, average the levels that have samples behind it, with larger weights for finer ones. Use only the
        samples behind it, as the foreground's colour must not leak in. The search reaches no farther than the pixel's
-       blur: deeper inside, hidden surfaces never show. A strongly blurred surface may slope: a slightly farther sample
-       belongs to it. Else the mean of the slope and of a surface beyond the focus could be in focus, a sharp speck.
+       blur: deeper inside, hidden surfaces never show. A slightly farther sample counts as part of the same surface if
+       that is strongly blurred: the mean coc of a slope and of a surface beyond the focus could be 0, a sharp speck.
     5. Replace second surfaces that are hardly mixed in by the hidden sample.
 
     Args:
@@ -205,7 +209,7 @@ def fill_hidden(
         other_weight: Its weight, ``[B, 1, H, W]``, 0 where a pixel is not mixed.
         valid: ``[B, 1, H, W]``, 0 where a pixel is left out; None means all count.
         threshold: Light above which a pixel is a highlight, ``[B, 1, H, W]``; highlights are not filled in elsewhere.
-        levels: Levels of the pyramid, at least 2, of all items or of each: ``[1]`` or ``[B]``. The widest search is
+        levels: Levels of the pyramid, at least 2; one number for all items or one for each. The widest search is
             ``2 ** levels`` pixels.
         ops: Reads the levels.
 
@@ -245,8 +249,8 @@ def fill_hidden(
     farthest = search(searched, shown, known, nearest, farthest=True)
     coarse: tuple[Tensor, ...] = ()
     if len(searched) > _FINE_LEVELS:
-        rest = slice(_FINE_LEVELS, None)
-        coarse = search(searched[rest], shown[rest], known[rest], nearest)
+        coarser = slice(_FINE_LEVELS, None)
+        coarse = search(searched[coarser], shown[coarser], known[coarser], nearest)
     looked = torch.cat([*farthest, *coarse], 1)
     looked = ops.choose(lambda: is_wanted.any(), looked * is_wanted, torch.zeros_like(looked))
     behind = torch.where(looked[:, colours + 1 : colours + 2] > 0, looked[:, :colours], pyramid[_FINE_LEVELS - 1][0])
@@ -255,9 +259,10 @@ def fill_hidden(
         searched = [*searched[:_FINE_LEVELS], of_cells]
     seen, total = ops.seen(_seen, searched, coc_px, wanted)
 
-    # a hidden sample replaces a mixed one that does not count; both weights fall to 0 there, as light and coc jump
-    room = (HIDDEN_WEIGHT - 2.0 * other_weight).clamp_min(0.0)
-    hidden = (total / _CERTAIN).clamp(max=1.0) * room
+    # Up to HIDDEN_WEIGHT / 2 a mixed sample does not count, and the hidden one replaces it. Both weights are 0 at the
+    # limit, where light and coc jump from one to the other.
+    free_weight = (HIDDEN_WEIGHT - 2.0 * other_weight).clamp_min(0.0)
+    hidden = (total / _CERTAIN).clamp(max=1.0) * free_weight
     light = torch.where(hidden > 0, seen[:, :-1], other_light)
     coc_px = torch.where(hidden > 0, seen[:, -1:], other_coc_px)
     weight = hidden + _counted(other_weight)
@@ -265,16 +270,17 @@ def fill_hidden(
 
 
 def _counted(weight: Tensor) -> Tensor:
-    """Weight with which a mixed pixel's other surface counts: 0 up to HIDDEN_WEIGHT / 2, all from HIDDEN_WEIGHT on."""
+    """Weight with which a mixed pixel's other surface counts: 0 up to HIDDEN_WEIGHT / 2, unchanged at HIDDEN_WEIGHT."""
     return weight * (weight * (2.0 / HIDDEN_WEIGHT) - 1.0).clamp(0.0, 1.0)
 
 
 def _repeated(
     values: tuple[Tensor, Tensor, Tensor], sizes: Sequence[Sequence[int]], level: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """A level in which each item has the samples that it has alone: of a smaller pyramid, with its border repeated.
+    """Repeat the border of each item's own pyramid, so that an item has the same samples in a batch as alone.
 
-    ``sizes`` are the rows and columns of pixels that the pyramid of each item covers, ``[2][B]``; all have one centre.
+    The pyramid of a batch covers its largest item. ``sizes`` are the rows and columns of pixels that the pyramid of
+    each item covers, ``[2][B]``; all have one centre.
     """
     if len(sizes[0]) == 1 or all(len({*of_items}) == 1 for of_items in sizes):  # a graph has symbolic sizes of one
         return values
@@ -321,7 +327,7 @@ def _first_level(
 
 
 def _farthest(light: Tensor, coc_px: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The next coarser level of the pyramid: the mean of the farthest ones of each four samples."""
+    """The next coarser level of the pyramid: of each four samples, the mean of those on the farthest surface."""
     farthest = functional.interpolate(functional.max_pool2d(coc_px, 2), scale_factor=2.0, mode="nearest")
     counts = weight * (1.0 - _is_behind(farthest - coc_px))
     means = downsampled(torch.cat([light * counts, coc_px * counts, counts], 1), 2)
@@ -385,8 +391,8 @@ def shown_behind(samples: Tensor, shares: Tensor, coc_px: Tensor) -> Seen:
     coc, weight = samples.narrow(-4, count, 1), samples.narrow(-4, count + 1, 1)
     part = shares * weight * _is_behind(coc - _end_of_surface(coc_px).unsqueeze(2))
     total = part.sum(-3)
-    total = torch.where(total > 1e-4, total, 0.0)
-    return (samples.narrow(-4, 0, count + 1) * part).sum(-3) / total.clamp_min(1e-4), total
+    total = torch.where(total > _LEAST_SEEN, total, 0.0)
+    return (samples.narrow(-4, 0, count + 1) * part).sum(-3) / total.clamp_min(_LEAST_SEEN), total
 
 
 def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tensor, farthest: bool = False) -> Seen:
@@ -395,7 +401,7 @@ def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tenso
     Args:
         levels: L levels, fine to coarse.
         shown: Light and coc of each level, ``[L, B, C + 1, h, w]``, from :func:`shown_behind`.
-        weight: Their weights, ``[L, B, 1, h, w]``, from there too.
+        weight: Their weights, ``[L, B, 1, h, w]``, from :func:`shown_behind`.
         coc_px: Coc of the map, ``[B, 1, h, w]``.
         farthest: Whether, of two levels with different surfaces, only the farther surface counts.
 
@@ -421,7 +427,7 @@ def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tenso
 
 
 def _rule(level: Level) -> tuple[float, float, float]:
-    """Smallest blur in pixels at which a level is read, votes per weight, and most votes."""
+    """Smallest blur in pixels at which a level is read, votes per weight, and largest number of votes."""
     return (level.least_px, 1.0, math.inf) if level.vote is None else (level.least_px, level.vote / _SURE, level.vote)
 
 

@@ -6,8 +6,8 @@ made smaller, by the factor
 
     ``sqrt(1 - k v / V)``.
 
-For a Gaussian ``k`` is 1, because variances add. A disc would become too small by that: its visible feature is the
-edge. The best factor minimises the expected squared difference between this chain and the exact kernel, over images
+For a Gaussian ``k`` is 1, because variances add. A disc would become too small with this ``k``: its visible feature is
+its edge. The best factor minimises the expected squared difference between this chain and the exact kernel, over images
 whose power falls with the square of the frequency, as in photographs. For all radii and resolutions in use, a constant
 ``k`` (1/2 for a disc) gives it to within 0.2 % of the radius; :func:`_correction` finds ``k`` once for a lens.
 
@@ -28,7 +28,8 @@ from ..optics.kernel_bank import KernelBank
 __all__ = ["downsampled", "shrink", "upsampled"]
 
 _LEAST = 0.5  # lower limit of the factor, for kernels hardly wider than the averaging itself
-# _correction finds k from:
+
+# The comparison in which _correction finds k
 _CANDIDATES = 9  # number of factors compared
 _SCALE = 4  # downsampling factor
 _RADIUS_PX = 5.0  # coarse pixels: coc of the kernel, smaller if the kernel would not fit into the period
@@ -46,7 +47,7 @@ def upsampled(values: Tensor, scale: int) -> Tensor:
 
 
 def shrink(bank: KernelBank, coc_px: float, width: float, scale: int) -> float:
-    """Factor for the coc of a kernel that is used at every ``scale``-th pixel.
+    """Factor for the coc of a kernel that is used at every ``scale``-th pixel, to undo the blur of averaging.
 
     Args:
         bank: Kernels of the lens.
@@ -59,8 +60,8 @@ def shrink(bank: KernelBank, coc_px: float, width: float, scale: int) -> float:
     """
     if bank.is_even or scale == 1:  # of a lens with a field, the masks are shrunk instead
         return 1.0
-    others = bank.kept(math.copysign(1.0, coc_px), _correction) * (1 / 4 - 1 / (12 * scale**2))
-    return math.sqrt(max(1.0 - others / bank.variance_px(coc_px, width, scale), _LEAST**2))
+    added = bank.kept(math.copysign(1.0, coc_px), _correction) * (1 / 4 - 1 / (12 * scale**2))
+    return math.sqrt(max(1.0 - added / bank.variance_px(coc_px, width, scale), _LEAST**2))
 
 
 @torch.inference_mode()
@@ -81,8 +82,8 @@ def _correction(bank: KernelBank, one_px: float, width: float) -> float:
     # the chain is linear, but it mixes frequencies that are aliases of each other at the coarse resolution
     meant = _aliases(linear * exact * block * power)
     chain = _aliases(linear**2) * _aliases(block**2 * power)
-    others = (1 / 4 - 1 / (12 * _SCALE**2)) / bank.variance_px(coc, width, 1.0)
-    least = math.sqrt(max(_LEAST**2, 1 - others))
+    added = (1 / 4 - 1 / (12 * _SCALE**2)) / bank.variance_px(coc, width, 1.0)
+    least = math.sqrt(max(_LEAST**2, 1 - added))
     factors = torch.linspace(least, 1.0, _CANDIDATES, dtype=torch.float64, device="cpu")
     coarse = _spectra(bank, [coc * factor for factor in factors.tolist()], width, _PERIOD)
     errors = (coarse.abs() ** 2 * chain - 2 * (coarse.conj() * meant).real).sum((-2, -1))
@@ -90,7 +91,7 @@ def _correction(bank: KernelBank, one_px: float, width: float) -> float:
     powers = torch.stack([factors**2, factors, torch.ones_like(factors)], 1)
     bend, slope, _ = torch.linalg.lstsq(powers, errors[:, None]).solution[:, 0].tolist()
     best = min(max(-slope / (2 * bend), least), 1.0) if bend > 0 else least
-    return min((1.0 - best**2) / others, 1.0)
+    return min((1.0 - best**2) / added, 1.0)
 
 
 def _spectra(bank: KernelBank, coc_px: Sequence[float], width: float, length: int) -> Tensor:

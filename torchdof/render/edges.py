@@ -4,8 +4,8 @@ Measured or estimated depth has its edges a few pixels beside those of the image
 outlines around blurred objects. This module decides for each pixel near a depth edge which of the two surfaces it
 shows. It compares the pixel's colour with pixels that clearly lie on one surface, and combines this with a prior: the
 share of wrong pixels that the map has at similar places of the same frame. So systematic errors (a foreground a pixel
-too thin, edges displaced to the right, ramps four pixels wide) are learnt from the frame, and a map whose edges prove
-exact stays unchanged.
+too thin, edges displaced to the right, ramps four pixels wide) are learnt from the frame, and a map with exact edges
+stays unchanged.
 
 All computations use nearness, a measure linear in 1 / depth: planes are linear in it, and resampling and depth
 estimation turn an edge into averages of it.
@@ -29,42 +29,59 @@ __all__ = ["STEP_PX", "judged", "mended", "repair", "repair_edges"]
 STEP_PX = 1.0
 """Smallest difference in coc, in pixels, between two surfaces whose edge is repaired."""
 
+# Edges: which pixels are compared
 _LEAST_STEP_PX = 0.5 * STEP_PX  # smallest range of coc in a map that is repaired; half a step, as for lamps
 _STEP = 0.1  # step of :func:`repair_edges`, as a fraction of the largest nearness around; larger: fewer edges
-_NOISES = 12.0  # smallest step, in standard deviations of the map's noise; larger: fewer edges in noisy maps
-_LEVELS_OF_A_FILE = 64  # fewest levels of a map with the noise of rounding; larger: more edges in coarse maps
-_NOISE_SAMPLED = 2**13  # pixels per frame for the estimate of noise, half along rows and half along columns
-_RINGS = 3  # pixels on each side of a step that are checked; larger: corrects wider displacements
-_REACH = 5  # half the width of the window of samples around a pixel, in pixels
-_FALLOFF_PX = 2.5  # standard deviation of the Gaussian weights of these samples
-_ABRUPT = 0.3  # smallest jump between neighbours at a step, as a fraction of the step
-_SURE = (0.0, 0.02, 0.06, 0.2, 1.0)  # weight of a sample, by ring: beside a step its depth may be wrong
-_RAMP_REACH = 6  # half the width of the widest ramp, in pixels; anything wider is a slope
-_TIE = 0.017  # lead of one axis that gives an edge its direction, in steps; avoids ties: means are multiples of 1/25
-_DIRECTIONS = 5
+_RINGS = 3  # px on each side of a step that are checked; larger: corrects wider displacements
+_ABRUPT = 0.3  # smallest jump between neighbours at a step, as a fraction of the step; larger: fewer steps
+_RAMP_REACH = 6  # px; half the width of the widest ramp, anything wider is a slope
 _SHALLOW = 0.03  # smallest slope of a ramp per pixel, as a fraction of the range of nearness around
-_LEVELS = 6  # levels of a ramp that are calibrated separately
-_PLACES = 2 * _RINGS + _LEVELS
-_TRUSTED = 0.05  # assumed share of wrong pixels beside steps
-_ROUNDS = 10  # iterations of the calibration
+_TIE = 0.017  # steps by which one axis must lead to give an edge its direction; breaks ties of means over 25 pixels
+
+# Noise of a map, below which a step is not an edge
+_NOISES = 12.0  # smallest step, in standard deviations of the noise; larger: fewer edges in noisy maps
+_LEVELS_OF_A_FILE = 64  # fewest levels of a map with the noise of rounding; larger: more edges in coarse maps
+_NOISE_SAMPLED = 2**13  # pixels per frame that are sampled, half along rows and half along columns
+
+# Colour: which of two surfaces a pixel resembles
+_REACH = 5  # px; half the width of the window of samples around a pixel
+_FALLOFF_PX = 2.5  # standard deviation of the Gaussian weights of these samples
+_SURE = (0.0, 0.02, 0.06, 0.2, 1.0)  # weight of a sample, by ring: beside a step its depth may be wrong
 _SHARPNESS = 1.6  # factor on scores, which samples on the wrong side reduce; larger: colour outweighs the map
-_MOST = 4.0  # largest corrected step at a thin structure, as a multiple of the step in the map
-_BLUR_REACH = 9  # half the width of the Gaussian kernel, in pixels
-_CLIMBED = 0.35  # standard deviation of a ramp, as a fraction of (pixels of its middle half) / (steps they climb)
-_PIXEL = 0.2  # variance in px^2 that the area of a pixel adds to a ramp
-_RINGING_REACH = 3  # half the largest width of a rim of ringing, in pixels; larger: wider details are flattened
-_OVERSHOOT = 0.12  # largest height of a rim that is removed in full, in steps; at twice this height it stays
-_BETTER = 0.5  # fraction of the variance unexplained by a sharp shape that its blur must explain for full confidence
-_LEAN = 2.0  # log-odds by which a far surface must win, with "auto": foreground left behind is the more visible error
-_PRIOR_COUNT = 30.0  # weight of assumptions in the calibration, in pixels; larger: the frame changes them less
+
+# Prior: how often each kind of edge pixel shows the near surface
+_DIRECTIONS = 5  # directions of an edge: up, left, diagonal, right, down
+_LEVELS = 6  # levels of a ramp
+_PLACES = 2 * _RINGS + _LEVELS  # kinds of one direction
+_SAMPLED = 12_000  # sqrt(_SAMPLED * pixels of the frame) pixels are sampled, in blocks; larger: more exact, slower
+_BLOCK = 8  # px; side of a block
+_TRUSTED = 0.05  # assumed share of wrong pixels beside steps
+_PRIOR_COUNT = 30.0  # weight of assumptions, in pixels; larger: the frame changes them less
+_ROUNDS = 10  # iterations of the fit
+
+# Decision, with "auto"
+_RELATED = 0.8  # smallest agreement of colours with the clear pixels of a map at which colours are used
 _EXACT = 0.025  # largest share of wrong pixels at which the steps of a map count as exact
 _DOUBTFUL = 0.05  # share of wrong pixels of a kind above which these pixels are decided again
-_SOFT = 0.1  # a map is soft if a larger share of its edge pixels lies on ramps, and if
-_WIDE = 1.5  # ramps are wider than this, in pixels, or
-_MIXED = 0.5  # a larger share of their pixels is in the middle half (compression makes narrow ramps near one surface)
-_RELATED = 0.8  # smallest agreement of colours with the clear pixels of a map at which "auto" uses colours
-_SAMPLED = 12_000  # the calibration uses sqrt(_SAMPLED * pixels of the frame) pixels, in blocks
-_BLOCK = 8  # side of a block, in pixels
+_LEAN = 2.0  # log-odds by which a far surface must win: foreground left behind is the more visible error
+
+# Soft maps: blurred by resampling, or written by a network. More than _SOFT of the edge pixels of a soft map lie on
+# ramps. These are wider than _WIDE, or have more than _MIXED of their pixels in the middle half between both surfaces:
+# compression makes narrow ramps too, whose pixels lie close to one of the surfaces.
+_SOFT = 0.1  # share of edge pixels
+_WIDE = 1.5  # px
+_MIXED = 0.5  # share of a ramp's pixels
+
+# Thin structures and ringing of soft maps
+_MOST = 4.0  # largest corrected step at a thin structure, as a multiple of the step in the map
+_BLUR_REACH = 9  # px; half the width of the Gaussian kernel
+_CLIMBED = 0.35  # standard deviation of a ramp, as a fraction of (pixels of its middle half) / (steps they climb)
+_PIXEL = 0.2  # px^2; variance that the area of a pixel adds to a ramp
+_BETTER = 0.5  # fraction of the variance unexplained by a sharp shape that its blur must explain for full confidence
+_RINGING_REACH = 3  # px; half the largest width of a rim of ringing; larger: wider details are flattened
+_OVERSHOOT = 0.12  # largest height of a rim that is removed in full, in steps; at twice this height it stays
+
+# Numbers
 _NEVER = 1e30  # negated, replaces invalid values in maxima
 _LARGEST = 1e15  # largest valid nearness, whose square is finite in float32
 _BRIGHTEST = 1e30  # upper limit for light; products of a few such values overflow float32
@@ -91,7 +108,7 @@ def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> 
     Args:
         image: ``[B, C, H, W]``, linear light, floating point; its scale does not matter.
         depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres, > 0, ``inf`` allowed; NaN, zero and negative values stay.
-        edges: "repair" decides at each edge; "auto" returns a map whose edges prove exact unchanged to the bit; "as
+        edges: "repair" decides at each edge; "auto" returns a map with exact edges unchanged to the bit; "as
             given" does nothing.
 
     Returns:
@@ -160,8 +177,8 @@ def repair(
         image: ``[B, C, H, W]``, linear light.
         nearness: ``[B or 1, 1, H, W]``, linear in 1 / depth, larger is nearer.
         step: Smallest difference in nearness between two surfaces, ``[B, 1, H, W]`` or a number.
-        auto: Whether edges that prove exact stay unchanged.
-        of_coc: Whether ``nearness`` is a map of the coc instead, which is larger where it is farther.
+        auto: Whether exact edges stay unchanged.
+        of_coc: Whether ``nearness`` is a map of the coc instead, in which a larger value is farther.
         ops: Processes lists of pixels in parts.
 
     Returns:
@@ -191,7 +208,7 @@ def repair(
 
 
 @torch.no_grad()
-def judged(image: Tensor, nearness: Tensor, step: Tensor | float) -> tuple[Tensor, Tensor]:
+def judged(image: Tensor, nearness: Tensor, step: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:
     """Finds the pixels at a map's edges, and those that :func:`repair` changes with ``auto``.
 
     Args:
@@ -200,14 +217,14 @@ def judged(image: Tensor, nearness: Tensor, step: Tensor | float) -> tuple[Tenso
         step: As for :func:`repair`.
 
     Returns:
-        ``[B, 1, H, W]`` each: 0 away from edges, 1 beside a step, 2 on a ramp, uint8; and whether a pixel changes.
+        Whether a pixel is at an edge, whether it is on a ramp there, and whether it changes, ``[B, 1, H, W]`` each.
     """
     given = nearness.float().expand(image.shape[0], -1, -1, -1)
     valid = given.abs() <= _LARGEST
     step = torch.as_tensor(step, dtype=given.dtype, device=given.device)
     edges = _find(torch.where(valid, given, 0.0), valid, torch.maximum(step, _NOISES * _noise(given, valid)))
     repaired = repair(image, nearness, step, auto=True)
-    return edges.is_edge * (1 + edges.is_ramp.byte()), (repaired != nearness) & valid
+    return edges.is_edge, edges.is_edge & edges.is_ramp, (repaired != nearness) & valid
 
 
 @torch.no_grad()
@@ -256,11 +273,11 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops 
     if auto:
         doubtful = doubtful & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
     edge_pixels = pixels.indices(doubtful)
-    if auto and not is_traced() and len(edge_pixels) == 0:  # lamps change only in soft maps, whose ramps are selected
+    if auto and not is_traced() and len(edge_pixels) == 0:  # nor lamps: a soft map has ramps, which are selected
         return nearness
     score, evidence, near, far = _judge(light, given, witness, edges, edge_pixels, ops)
     shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0])
-    if auto:  # without auto, correct steps are decided as well, and this would move them
+    if auto:  # without auto, correct steps are decided too, and the lead would move them
         shows_near = shows_near + _LEAN * (score.abs() - 1.0).clamp(0.0, 1.0)
     shows_near = shows_near > 0
 
@@ -302,9 +319,10 @@ def _from_border(size: int, device: torch.device) -> Tensor:
 def _noise(nearness: Tensor, valid: Tensor) -> Tensor:
     """Estimates the standard deviation of each item's noise, ``[B, 1, 1, 1]``.
 
-    It is proportional to the median of ``|second difference|``, along rows or columns, whichever is larger. In a map
-    that holds multiples of a number q, such as one from a file with 8 bits, it is at least that of rounding to them,
-    q / sqrt(12). The smallest difference of two neighbours is q; a map of a few surfaces has it too, but fewer levels.
+    It is proportional to the median of ``|second difference|``, along rows or columns, whichever is larger. A map that
+    holds multiples of a number q, such as one from a file with 8 bits, has at least the noise of rounding to them,
+    ``q / sqrt(12)``; q is the smallest difference of two neighbours. This needs a range of more than
+    :data:`_LEVELS_OF_A_FILE` times q: a map of a few surfaces has a smallest difference too, which is not rounding.
     """
     every = (2 * nearness.shape[-2] * nearness.shape[-1] + _NOISE_SAMPLED - 1) // _NOISE_SAMPLED
     middles, least, ends = [], [], []
@@ -324,7 +342,7 @@ def _noise(nearness: Tensor, valid: Tensor) -> Tensor:
         )
     bend = torch.maximum(*(torch.where(middle < torch.inf, middle, 0.0) for middle in middles))
     quantum, span = torch.minimum(*least), torch.maximum(*ends)
-    noise = torch.where(span > _LEVELS_OF_A_FILE * quantum, 0.2887 * quantum, 0.0)
+    noise = torch.where(span > _LEVELS_OF_A_FILE * quantum, 0.2887 * quantum, 0.0)  # 1 / sqrt(12)
     return torch.maximum(0.6053 * bend, noise)[..., None, None]  # 1.4826 / sqrt(6), for Gaussian noise
 
 
@@ -345,7 +363,7 @@ def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
     is_ramp = is_ramp & (spread.sum(1, keepdim=True) > step)
     ends = torch.where(is_ramp, spread, ends)
 
-    # the surfaces on both sides of a step; the innermost ring that reaches it counts
+    # the surfaces on both sides of a step: extremes within k pixels; the smallest k that reaches the step counts
     rings = [torch.cat([ends, jump], 1)]
     for _ in range(_RINGS):
         rings.append(_highest(rings[-1], 1))
@@ -386,8 +404,9 @@ def _judge(
     """Scores by colour which of two surfaces pixels ``[P]`` show.
 
     1. Take samples of both surfaces from a window around each pixel, weighted by distance and by ``witness``.
-    2. Compute mean and spread of both colours, and how well these separate the surfaces.
-    3. Compute the likelihood of each surface: the share of its samples that resemble the pixel.
+    2. Compute mean and spread of both colours, and how well these separate the surfaces, in [0, 1].
+    3. Compute the likelihood of each surface: the share of its samples that resemble the pixel. A surface of several
+       colours has no useful mean, so a share of samples decides and the distance to the mean counts little.
     4. Average scores over neighbours of similar colour.
 
     Returns:
@@ -418,10 +437,10 @@ def _judge(
         noise = 2.25e-4 * (means[0] + means[1]).square().sum(0)
         spread = 0.5 * (spreads[0] + spreads[1]) + noise + 1e-12
         contrast = (means[0] - means[1]).square().sum(0)
-        tells = (contrast / (contrast + 0.5 * spread) - 0.1).clamp_min(0.0) / 0.9
-        tells = torch.where(known, tells, 1.0)  # without samples, in the middle of a wide ramp, neighbours decide
+        separation = (contrast / (contrast + 0.5 * spread) - 0.1).clamp_min(0.0) / 0.9
+        separation = torch.where(known, separation, 1.0)  # no samples in the middle of a wide ramp: neighbours decide
 
-        # likelihood: the share of similar samples, and to a small part the distance to their mean
+        # likelihoods
         alike = (1.0 + (others - own[:, None]).square().sum(0) / (0.3 * spread)).square().reciprocal()
         close = [(1.0 + (own - m).square().sum(0) / (0.3 * spread)).square().reciprocal() for m in means]
         likelihoods = [
@@ -433,19 +452,20 @@ def _judge(
         for side, end in zip(sides, (near, far), strict=True):
             share = side * (alike + 1e-3)
             surfaces.append(torch.where(known, (share * values).sum(0) / share.sum(0).clamp_min(1e-12), end))
-        return torch.stack([score.clamp(-8.0, 8.0), tells, *surfaces])
+        return torch.stack([score.clamp(-8.0, 8.0), separation, *surfaces])
 
-    score, tells, near, far = ops.by_parts(look, edge_pixels).unbind(0)
+    score, separation, near, far = ops.by_parts(look, edge_pixels).unbind(0)
 
     # neighbours of similar colour decide together
     scores = pixels.put(torch.full_like(nearness, torch.nan), edge_pixels, score)
     window = pixels.around(edge_pixels, nearness, 1)
-    own, others, said = pixels.pick(colour, edge_pixels), pixels.pick(colour, window), pixels.pick(scores, window)[0]
+    own, others = pixels.pick(colour, edge_pixels), pixels.pick(colour, window)
+    scores = pixels.pick(scores, window)[0]
     alike = 1.0 / (1.0 + (others - own[:, None]).square().sum(0) / (0.0225 * own.square().sum(0) + 1e-12))
-    alike = torch.where(said.isnan(), 0.0, alike)
-    said = torch.where(said.isnan(), 0.0, said)
-    score = (_SHARPNESS * tells * (alike * said).sum(0) / alike.sum(0).clamp_min(1e-12)).clamp(-6.0, 6.0)
-    evidence = (2.0 * tells * said.abs().amax(0) - 1.0).clamp(0.0, 1.0)
+    alike = torch.where(scores.isnan(), 0.0, alike)  # NaN: not an edge pixel
+    scores = torch.where(scores.isnan(), 0.0, scores)
+    score = (_SHARPNESS * separation * (alike * scores).sum(0) / alike.sum(0).clamp_min(1e-12)).clamp(-6.0, 6.0)
+    evidence = (2.0 * separation * scores.abs().amax(0) - 1.0).clamp(0.0, 1.0)
     # at the ends of a wide ramp the window holds only one of the surfaces: use the evidence of its middle
     known = _highest(pixels.put(torch.zeros_like(nearness), edge_pixels, evidence), 3)
     evidence = pixels.pick(known, edge_pixels)[0]
@@ -531,8 +551,9 @@ def _unmix(
 ) -> tuple[Tensor, Tensor]:
     """Corrects the nearness of thin structures at the edges of soft maps.
 
-    A surface is thin where an opening of 5 x 5 pixels removes its label. The fit ``nearness = a + b blurred(label)``
-    around a pixel gives the far surface ``a`` and the near one ``a + b``.
+    Blur gives a thin structure a nearness between its own and that of the surface around it. A surface is thin where a
+    morphological opening of 5 x 5 pixels removes its label (1 on the near surface, 0 on the far one). The fit
+    ``nearness = a + b blurred(label)`` around a pixel gives the far surface ``a`` and the near one ``a + b``.
     """
     blurred = _blurred(label, sigma)
     gap = near - far
@@ -543,15 +564,15 @@ def _unmix(
         thick = _highest(-_highest(-whole, 2), 2) > 0
         thin = pixels.pick(edges.is_edge & is_soft & (shape > 0) & ~thick, edge_pixels)[0]
         chosen = thin.nonzero()[:, 0]
-        at = edge_pixels[chosen]
-        least, difference, fit = _regress(nearness, label, blurred, at, ops)
+        thin_pixels = edge_pixels[chosen]
+        least, difference, fit = _regress(nearness, label, blurred, thin_pixels, ops)
         fit = fit * _is_lost(lost_px if is_near else -lost_px)[item[chosen]]
         if is_near:
             most = far[chosen] + _MOST * gap[chosen]
             gain = fit * (torch.minimum(least + difference, most) - near[chosen]).clamp_min(0.0)
             near = near.index_add(0, chosen, gain.to(near.dtype))
         else:
-            lowest = pixels.pick(-_highest(-nearness, 12), at)[0]
+            lowest = pixels.pick(-_highest(-nearness, 12), thin_pixels)[0]
             bound = torch.maximum(near[chosen] - _MOST * gap[chosen], lowest)
             gain = fit * (torch.maximum(least, bound) - far[chosen]).clamp_max(0.0)
             far = far.index_add(0, chosen, gain.to(far.dtype))
@@ -561,10 +582,10 @@ def _unmix(
 def _without_ringing(nearness: Tensor, valid: Tensor, step: Tensor) -> Tensor:
     """Removes rims beside steps that are a little nearer, or farther, than the surface to which they belong.
 
-    Bicubic and Lanczos interpolation, with which maps are enlarged, overshoot a step by up to a tenth of it on both
-    sides; the rim of a surface near the focus would then be blurred differently from the surface. Opening removes rims
-    of at most twice :data:`_RINGING_REACH` pixels that are nearer, closing those that are farther. Pixels move into the
-    range between the closed opening and the opened closing (the morphological centre), which also leaves noise alone.
+    Maps enlarged by bicubic or Lanczos interpolation overshoot a step by up to a tenth of it on both sides. The rim of
+    a surface near the focus would be blurred differently from the surface. Opening removes rims of at most twice
+    :data:`_RINGING_REACH` pixels that are nearer, closing those that are farther. Pixels move into the range between
+    the closed opening and the opened closing (the morphological centre), which leaves noise unchanged too.
 
     Reference:
         Serra, "Image Analysis and Mathematical Morphology, volume 2", 1988, chapter 8 (the centre).
@@ -592,9 +613,9 @@ def _lift_lamps(
     lost_px: Tensor,
     ops: Ops,
 ) -> Tensor:
-    """Raises the nearness of lamps of a few pixels, which a soft map spreads over their surroundings.
+    """Raises the nearness of lamps of a few pixels, which a soft map averages with their surroundings.
 
-    The fit ``nearness = a + b blurred(cover)``, with the lamp's cover from its light, gives the lamp ``a + b``.
+    The fit ``nearness = a + b blurred(cover)`` gives the lamp ``a + b``; its cover is its light over its brightest.
     """
     brightest = light.amax(1, keepdim=True)
     usual = _mean(brightest.sqrt(), _REACH + 2) ** 2
@@ -616,9 +637,10 @@ def _lift_lamps(
 
 
 def _is_lost(lost_px: Tensor) -> Tensor:
-    """Confidence that thin structures are flattened, 0 to 1, ``[B]``; 0 if the map's surfaces are 1 px too wide.
+    """Confidence that thin structures are flattened, 0 to 1, ``[B]``.
 
-    ``lost_px`` is the mean width by which they are too narrow, in pixels.
+    ``lost_px`` is the mean width in pixels by which the map's surfaces are too narrow. The confidence is 0 if they are
+    1 px too wide: then blur has not thinned them.
     """
     return (2.4 + 2.5 * lost_px).clamp(0.0, 1.0).flatten()
 
@@ -628,7 +650,7 @@ def _regress(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Fits ``nearness = a + b blurred`` in windows around pixels ``[P]``: a, b and the quality of the fit, 0 to 1.
 
-    The quality is 0 if the sharp ``shape`` explains as much of the variance: then the map is not blurred there.
+    The quality is 0 where the sharp ``shape`` explains as much of the variance: there the map is not blurred.
     """
     offsets = torch.arange(-_REACH, _REACH + 1, device=nearness.device, dtype=nearness.dtype)
     weight = torch.exp(-(offsets[:, None].square() + offsets.square()) / 18.0).flatten()[:, None]
@@ -666,8 +688,8 @@ def _slopes(nearness: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         change = _changes(nearness, valid, dim)
         none = torch.zeros_like(nearness.narrow(dim, 0, 1))
         before, after = torch.cat([none, change], dim), torch.cat([change, none], dim)
-        goes_on = before * after > 0
-        least.append(torch.where(goes_on, torch.minimum(before.abs(), after.abs()), 0.0))
+        has_one_sign = before * after > 0
+        least.append(torch.where(has_one_sign, torch.minimum(before.abs(), after.abs()), 0.0))
         jump.append(torch.maximum(before.abs(), after.abs()) - least[-1])
     return torch.maximum(*least), torch.maximum(*jump)
 
@@ -702,7 +724,7 @@ def _blurred(values: Tensor, sigma: Tensor) -> Tensor:
         ends = (across, across, _BLUR_REACH - across, _BLUR_REACH - across)
         size, padded = values.shape[dim], functional.pad(values, ends, mode="replicate")
         values = half[..., :1] * values
-        for k in range(1, _BLUR_REACH + 1):  # runtimes of graphs have no convolution with a computed kernel
+        for k in range(1, _BLUR_REACH + 1):  # runtimes of graphs cannot convolve with a computed kernel
             both = padded.narrow(dim, _BLUR_REACH - k, size) + padded.narrow(dim, _BLUR_REACH + k, size)
             values = values + half[..., k : k + 1] * both
     return values

@@ -19,8 +19,8 @@ def scale_of(light: Tensor, behind: Tensor | None = None) -> Tensor:
     """Scale of the light of each item at which no sum overflows: ``[B, 1, 1, 1]``, at most 1.
 
     Args:
-        light: ``[B, C, H, W]``, whose fourth powers are summed; values that are not finite are ignored.
-        behind: Light behind the image, ``[B, C, H, W]``, which is summed itself.
+        light: ``[B, C, H, W]``; matting sums its fourth powers. Values that are not finite are ignored.
+        behind: Light behind the image, ``[B, C, H, W]``, of which only sums are computed.
 
     Example:
         >>> scale_of(torch.full((1, 3, 4, 5), 1e30)).log2().item()

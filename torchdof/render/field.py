@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..optics.placed_kernels import Shares, placed
+from ..optics.placed_kernels import FieldMask, placed
 
 __all__ = ["BLOCK", "scattered"]
 
@@ -21,7 +21,7 @@ BLOCK = (8, 16)
 
 
 def scattered(
-    shares: Shares,
+    mask: FieldMask,
     light: Tensor,
     kernel: Tensor,
     half: int,
@@ -31,7 +31,7 @@ def scattered(
     """Scatters a layer's light with the kernel of the block in which it lands.
 
     Args:
-        shares: How the field changes the layer's kernel.
+        mask: How the field changes the layer's kernel.
         light: ``[B, C, h, w]``; begins ``half`` pixels before the frame, or ``half + 1`` at coarser resolutions.
         kernel: Kernel of the blur table, ``[1 or C, k, k]``.
         half: Radius of the kernel: pixels on each side of ``light`` that the result lacks.
@@ -44,12 +44,12 @@ def scattered(
     high, wide = BLOCK
     (batch, channels), (rows, columns) = light.shape[:2], (n - 2 * half for n in light.shape[2:])
     light = functional.pad(light, (0, -columns % wide, 0, -rows % high))
-    shares, whole = shares.to(light), light.new_ones(())
+    mask, whole = mask.to(light), light.new_ones(())
     places = functools.partial(_places, scale=scale, half_diagonal=0.5 * math.hypot(*size))
     x = places(columns, wide, size[1], light)
     bands = []
     for band, y in enumerate(places(rows, high, size[0], light)):
-        kernels = placed(kernel[None], [(shares, whole)], y.expand_as(x), x)  # [blocks, 1 or C, k, k]
+        kernels = placed(kernel[None], [(mask, whole)], y.expand_as(x), x)  # [blocks, 1 or C, k, k]
         window = light[:, :, band * high : (band + 1) * high + 2 * half]
         blocks = window.unfold(-1, wide + 2 * half, wide).permute(0, 3, 1, 2, 4)  # [B, blocks, C, rows, columns]
         each = channels // kernels.shape[1]

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from .. import pixels
 from ..optics.blur_table import BlurTable
-from ..optics.placed_kernels import Shares, placed_between, ray_shares
+from ..optics.placed_kernels import FieldMask, placed_between, ray_masks
 from ..tensors import is_traced, recomputed
 from .ops import EAGER, Ops
 from .plan import KERNELS_PER_PX, kernels_for
@@ -240,15 +240,15 @@ def _splatted(
     order = torch.argsort(coc.detach().abs())
     item, row, column = pixels.places(source[order], height, width)
     light, coc = light.index_select(1, order), coc.index_select(0, order)
-    shares: list[Shares] = []
+    masks: list[FieldMask] = []
     if table.depends_on_place:
-        shares = [s.to(light) for s in ray_shares(table, coc.detach().tolist(), (height, width))]
+        masks = [s.to(light) for s in ray_masks(table, coc.detach().tolist(), (height, width))]
     radii = coc.detach().tolist()
 
     def half_of(radius: float) -> int:
         return min(math.ceil(table.reach_px(radius, lens_width) + 0.5), longest - 1)
 
-    margin = max([half_of(radii[-1]), *(half_of(each.coc_px) for each in shares)])  # one of them may be the widest
+    margin = max([half_of(radii[-1]), *(half_of(each.coc_px) for each in masks)])  # one of them may be the widest
     across = width + 2 * margin
     area = (height + 2 * margin) * across
     splats = light.new_zeros(len(light), batch * area)
@@ -260,10 +260,10 @@ def _splatted(
         stop = min(stop, start + max(1, _TAPS // (2 * half_of(radii[stop - 1]) + 1) ** 2))
         part = slice(start, stop)
         kernels = kernels_for(table, coc[part], lens_width, longest, kernels_per_px)  # [n, 1 or C, k, k]
-        if shares:
+        if masks:
             half_diagonal = 0.5 * math.hypot(height, width)
             y, x = ((row[part] + 0.5 - height / 2) / half_diagonal, (column[part] + 0.5 - width / 2) / half_diagonal)
-            kernels = placed_between(kernels, shares, coc[part], y, x)
+            kernels = placed_between(kernels, masks, coc[part], y, x)
         half = kernels.shape[-1] // 2
         step = torch.arange(-half, half + 1, device=light.device)
         landing = kernels * light[:, part].t()[:, :, None, None]

@@ -21,13 +21,13 @@ __all__ = [
     "border_nodes",
     "extent",
     "finest",
+    "joined",
+    "largest_radii",
+    "moved_to_fixed",
     "on_axis",
-    "slid",
     "spaced_nodes",
     "spacing",
     "spreads",
-    "together",
-    "widest",
 ]
 
 DENSE = 0.65
@@ -35,14 +35,20 @@ DENSE = 0.65
 
 Measured on smooth slopes: at 0.8 or more, their layers are no denser than in a plan for the scene itself."""
 
-_FEW = 100  # the largest radii of a frame are those of 1 / _FEW of its pixels
-_FINEST = 0.5  # px: smallest distance between layers near the focus; larger skips layers
-_FINEST_PARTS = 40.0  # smallest distance elsewhere: the blur divided by this
+_FEW = 100  # the radius of a frame is the mean of 1 / _FEW of its pixels, the most blurred ones
+
+# A place gets a layer of its own if many of the border's pixels lie there; larger: fewer layers
+_CROWD = 0.03  # share of the border's pixels
+_LEAST_CROWD = 16  # and pixels, at least
+
+# Spacing of layers: measured so that errors stay below the tolerance; larger: fewer layers
+_SPACING = 0.25  # px near focus at a tolerance of 1/255
+_SPACING_POWER = 0.8  # exponent of the tolerance
+_LOOSE = 4.0  # tolerance times 255 above which the spacing grows with its square root, to keep more than two layers
+_FINEST = 0.5  # px: smallest distance between layers near the focus
+_FINEST_PARTS = 40.0  # elsewhere the smallest distance is the blur divided by this
 _WIDE = _FINEST * _FINEST_PARTS  # px: blur above which the smallest distance grows
-_SPACING = 0.25  # px near focus at a tolerance of 1/255; measured, as the next two: errors stay below the tolerance
-_SPACING_POWER = 0.8  # exponent of the tolerance in the spacing; larger: fewer layers at tolerances above 1/255
-_NEAR = 0.3  # spacings: a node nearer to a fixed one than this merges with it; from twice this on it does not move
-_LOOSE = 4.0  # of 255: above, the spacing grows with the tolerance's square root, to keep more than two layers
+_NEAR = 0.3  # spacings: nearer to a fixed node, a node merges with it; at twice this distance it does not move
 
 
 def on_axis(coc_px: Tensor, longest: int) -> Tensor:
@@ -82,7 +88,7 @@ def spaced_nodes(low: float, high: float, tolerance: float, dense_from: float = 
     return tuple(sorted(nodes))
 
 
-def slid(node: float, fixed: Sequence[float], tolerance: float) -> float:
+def moved_to_fixed(node: float, fixed: Sequence[float], tolerance: float) -> float:
     """Move a node that is near a fixed one towards it; a very near one lands on it."""
     near = min(fixed, key=lambda other: abs(node - other))
     gap = abs(node - near) / spacing(node, tolerance)
@@ -100,7 +106,7 @@ def extent(coc_px: Tensor) -> tuple[float, float]:
 
 
 class Spread(NamedTuple):
-    """What layers of a map are planned from, in host memory."""
+    """Values of a map from which its layers are planned, in host memory."""
 
     low: float
     """Nearest place on the blur axis."""
@@ -121,13 +127,13 @@ def spreads(coc_px: Tensor) -> list[Spread]:
     return [Spread(low, high, np.array(border, exact)) for low, high, *border in x.tolist()]
 
 
-def together(spreads: Sequence[Spread]) -> Spread:
+def joined(spreads: Sequence[Spread]) -> Spread:
     """The spread of several maps of one scene."""
     lows, highs, borders = zip(*spreads, strict=True)
     return Spread(min(lows), max(highs), np.concatenate(borders))
 
 
-def widest(coc_px: Tensor) -> list[float]:
+def largest_radii(coc_px: Tensor) -> list[float]:
     """Mean radius in pixels of the most blurred hundredth of each map of ``[B, 1, H, W]``.
 
     A few pixels hardly change it.
@@ -141,15 +147,15 @@ def border_nodes(border: np.ndarray) -> list[float]:
     """Places at which many pixels of the frame's border lie, of their places ``[n]``; the most crowded first.
 
     Surfaces continue beyond the frame with the blur of its border. So large areas there have the same few blurs, and
-    layers far from these cause visible errors. A place is an interval of the finest distance, three bins of the
-    histogram. It holds at least 3 % of all pixels, and at least 16.
+    layers far from these cause visible errors. A place is an interval of the length of the finest distance: three bins
+    of a histogram.
     """
     bins = np.rint(_in_finest(border) * 3.0).astype(int)
     first = int(bins.min())
     counts = np.pad(np.bincount(bins - first), 1)
     crowds = (counts[:-2] + counts[1:-1] + counts[2:]).tolist()
     places: list[float] = []
-    least = max(0.03 * len(border), 16)
+    least = max(_CROWD * len(border), _LEAST_CROWD)
     for i, count in sorted(enumerate(crowds), key=lambda item: -item[1]):
         if count < least:
             break

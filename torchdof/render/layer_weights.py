@@ -6,13 +6,13 @@ weights follow from one ramp: the weight of a pixel at or behind node k is
 ``clamp((x - nodes[k-1]) / (nodes[k] - nodes[k-1]))``; its weight in layer k is the difference of two ramps.
 
 Where layers occlude each other, their light is divided by the weight at or behind them. There the ramp is eased, so
-that it leaves 0 slowly: a pixel just behind a node has a tiny weight in the layer behind it, and if no other pixel
-there is known, the division would turn that tiny weight into a full one.
+that it leaves 0 slowly: a pixel just behind a node has a tiny weight in the layer behind it. If no other pixel there
+is known, the division would turn this tiny weight into a full one.
 
 Nodes live on the *blur axis* ``x = sign(coc) * max(coc^2 / (|coc| + 0.5) - 2e-4, 0)``. Far from focus x grows like the
 coc, near focus like its square, as does the light that a small kernel moves. So a mixture of the sharp layer, at x = 0,
-and the first blurred one represents the blurs between them. Pixels at x = 0 are in focus and pass through unchanged:
-|coc| < 0.01 px, where a disc would move 1e-4 of the light.
+and the first blurred one represents the blurs between them. Pixels at x = 0, with ``|coc| < 0.01 px``, are in focus
+and pass through unchanged; a disc would move 1e-4 of their light.
 """
 
 import math
@@ -25,8 +25,6 @@ __all__ = ["blur_axis", "blur_axis_of_radius", "eased", "from_blur_axis", "ramps
 
 _SQUARE_PX = 0.5  # px of coc around which x changes from the square of the coc to the coc itself
 _IN_FOCUS = 2e-4  # x below which a pixel is in focus, at a coc of 0.01 px; larger: more pixels pass unchanged
-
-
 _FOOT = 0.15  # weight up to which an eased ramp is a parabola; larger: it leaves 0 more slowly
 
 

@@ -2,8 +2,7 @@
 
 A sharp image is anti-aliased, its depth map is not. So the pixels along a depth edge have the light of two surfaces and
 the depth of one. Blurred with that depth alone, a bright emitter draws a wrong ring and a foreground a fringe. Matting
-gives each surface its part of the light, and leaves texture within a surface unchanged. It computes only the pixels at
-edges.
+gives each surface its part of the light, only at edges, and leaves texture within a surface unchanged.
 """
 
 import math
@@ -22,15 +21,18 @@ __all__ = ["NEVER_PX", "Matted", "attribute_emitters", "matte"]
 NEVER_PX = 1e9
 """A coc in pixels that no pixel has: marks the absence of a surface."""
 
-_EDGE_PX = 0.5  # smallest difference in coc of neighbours on two surfaces, in pixels; larger: fewer edges
-_UNCLEAN = 1e-2  # weight, against 1, of pixels that may be mixed themselves in the mean colour of a surface
+# Mixed pixels
+_EDGE_PX = 0.5  # px; smallest difference in coc of neighbours on two surfaces; larger: fewer edges
 _FALLOFF = math.exp(-1 / 4.5)  # weight of a neighbour at a distance of 1 px: a Gaussian of sigma 1.5
+_UNCLEAN = 1e-2  # weight in a surface's mean colour of pixels that may be mixed; others have 1
 _TRUST = 4.0  # weight of variance against contrast; larger: texture stops more splits
 _ALIKE = 1.0 / 255.0  # contrast at which trust is halved, as a fraction of the brightest light around
 _UNBOUNDED = 1e6  # upper limit for either part, as a multiple of the brightest neighbour; avoids 0 * inf
-_EMITTER_REACH = 3  # half the width in pixels of the window in which an emitter's surface is searched
-_TOUCHING = 2  # distance in pixels over which a soft image spreads the light of an emitter in front
-_DIM = 0.1  # darker pixels are equally good samples of a surface without light, as a fraction of the highlight
+
+# Emitters
+_EMITTER_REACH = 3  # px; half the width of the window in which an emitter's surface is searched
+_TOUCHING = 2  # px; distance over which a soft image spreads the light of an emitter in front
+_DIM = 0.1  # fraction of the highlight below which all pixels are equally good samples of a surface's own light
 _MOST_WEIGHT = 0.98  # largest weight of an emitter on another surface in a highlight's pixel
 
 
@@ -112,7 +114,8 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops =
     certainty = edge * trust * (4.0 * sided - 2.0).clamp(0.0, 1.0)
     weight = torch.where(is_near, 1.0 - fitted, fitted).clamp(max=0.5) * certainty  # weight of the other surface
 
-    # each part gets a share of the residual in proportion to its weight squared, and stays in the image's range
+    # Each part gets a share of the residual in proportion to its weight squared: the smallest change of both colours.
+    # Then limit the parts to the image's range.
     own_mean, other_mean = torch.where(is_near, front, back), torch.where(is_near, back, front)
     own_weight = 1.0 - weight
     unexplained = colour - own_weight * own_mean - weight * other_mean
@@ -180,8 +183,8 @@ def attribute_emitters(
     def beyond(coc: Tensor, side: float, share: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Confidence that the emitter lies behind (side 1) or in front of (-1) surfaces with coc ``coc``, 0 to 1.
 
-        It requires pixels there whose peak exceeds ``share`` times that of the surfaces. Also returns the weights of
-        the window's pixels beyond the surfaces, and of those on them that are dim, and the larger of both peaks.
+        It is above 0 only if pixels there have a peak above ``share`` times that of the surfaces. Also returns the
+        weights of the window's pixels beyond the surfaces, those of dim pixels on them, and the larger of both peaks.
         """
         away = side * (window_coc - coc)
         there = (counted if side > 0 else touches) * (away - 1.0).clamp(0.0, 1.0)
@@ -205,7 +208,8 @@ def attribute_emitters(
         floor = surface.amax(0)
         share = ((own_peak - floor) / (top - floor).clamp_min(1e-12)).clamp(1.0 - _MOST_WEIGHT, _MOST_WEIGHT)
         emitter = (seen - (1.0 - share) * surface).clamp_min(0.0)
-        # in front, the earlier result fades into the new one, mostly the same surface; behind, it fades out first
+        # The earlier result fades into the new one in front, which is mostly the same surface. Behind is another
+        # surface: the earlier result fades out before the new one fades in, so that their coc do not mix.
         kept, given = (1.0 - sureness, sureness) if side < 0 else (1.0 - 2.0 * sureness, 2.0 * sureness - 1.0)
         kept, given = kept.clamp_min(0.0) * weight, given.clamp_min(0.0)
         moved, weight = kept * other + given * emitter, kept + given * share

@@ -14,7 +14,7 @@ from torch import Tensor
 from .. import pixels
 from ..tensors import is_traced
 from .convolution import CHANNELS
-from .surfaces import Frame, Highlights
+from .surfaces import Highlights, PaddedFrame
 
 __all__ = ["EAGER", "Level", "Ops", "Seen"]
 
@@ -85,7 +85,7 @@ class Ops:
         """Number that divides height and width of a frame; here ``coarsest``, the scale of the coarsest layer."""
         return coarsest
 
-    def render(self, frame: Frame, render: Callable[[Frame], Tensor]) -> Tensor:
+    def render(self, frame: PaddedFrame, render: Callable[[PaddedFrame], Tensor]) -> Tensor:
         """Renders a frame with the function ``render``."""
         return render(frame)
 

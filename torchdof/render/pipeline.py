@@ -26,12 +26,12 @@ from .matting import matte
 from .ops import EAGER, Ops
 from .plan import Plan, joined_layers
 from .scatter import fold
-from .surfaces import Frame, Surface, pad_to_frame
+from .surfaces import PaddedFrame, Surface, pad_to_frame
 from .traced import is_compiled
 
 __all__ = ["blur", "blur_stack"]
 
-_REACH = 4.0  # largest blur radii: margin rendered around an attention area; smaller changes its light and hidden fill
+_REACH = 4.0  # margin around an attention area, in largest blur radii; less changes its light and hidden surfaces
 _TOGETHER = 2**21  # pixels of items rendered together; larger: fewer, larger operations, and more memory
 _SAME_PX = 0.5  # px of coc: a background at most this far behind the image's surface counts as the same surface
 
@@ -94,11 +94,11 @@ def _planned(
         # Floats rebuilt from hex become constants of the graph. The options' own floats would become inputs of the
         # graph if they differ between two modules.
         max_coc_px, tolerance = (float.fromhex(float(n).hex()) for n in (options.max_coc_px, options.tolerance))
-        plan = Plan.all(max_coc_px, tolerance)
+        plan = Plan.static(max_coc_px, tolerance)
     elif plan is None and any(map(is_differentiated, maps[1::2])):
-        plan = Plan.of_frame(torch.cat(maps[1::2]), options.tolerance, still=True)
+        plan = Plan.for_scene(torch.cat(maps[1::2]), options.tolerance, on_grid=True)
     elif plan is not None and not is_traced():
-        plan = plan.reaching(torch.cat(maps[1::2]))
+        plan = plan.extended_to(torch.cat(maps[1::2]))
     if plan is not None:
         return _render_items([plan], options, ops, *maps).to(image.dtype)
     # one plan for each item, so that the result does not depend on the rest of the batch
@@ -124,10 +124,10 @@ def _each_planned(
     uniform = options.method == "layered" and not options.table.depends_on_place
     if len(scenes) == 1 or not uniform or (native.chosen() and all(is_in_memory(t, backward=True) for t in maps)):
         # the compiled engine renders item by item
-        plans = [Plan.of_frame(scene, options.tolerance) for scene in scenes]
+        plans = [Plan.for_scene(scene, options.tolerance) for scene in scenes]
         items = [render([plan], *item) for plan, *item in zip(plans, *(t.split(1) for t in maps), strict=True)]
         return items[0] if len(items) == 1 else torch.cat(items)
-    plans = Plan.of_items(scenes, options.tolerance)
+    plans = Plan.for_scenes(scenes, options.tolerance)
     most = max(1, _TOGETHER // math.prod(scenes[0].shape[-2:]))
     joined = [i for i, plan in enumerate(plans) if len(plan.nodes) > 1]  # a plane has one layer, whose kernel is exact
     groups = [joined[i : i + most] for i in range(0, len(joined), most)]
@@ -164,7 +164,7 @@ def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
         return _render_items(plans, options, EAGER, light, coc, cover=cover)
 
     if is_differentiated(coc):
-        rendered = render([Plan.of_frame(coc.flatten(0, 1), options.tolerance, still=True)], light, coc, cover)
+        rendered = render([Plan.for_scene(coc.flatten(0, 1), options.tolerance, on_grid=True)], light, coc, cover)
     else:
         rendered = _each_planned(render, [*coc], options, [light, coc, cover])
     return (rendered / scale).to(rgba.dtype)
@@ -220,13 +220,13 @@ def _render_items(
     if not is_unscaled:
         light, behind_light = light * scale, None if behind_light is None else behind_light * scale
 
-    # limit of highlights; without occlusion only those are splatted that a coarse layer would soften. A compiled graph
-    # has no rays: their number depends on the light.
+    # Limit of highlights. Without occlusion, only highlights that a coarse layer would soften are splatted. A compiled
+    # graph has no rays, as their number depends on the light.
     has_rays = plan.rays and ops.has_rays and not is_compiled()
     crisp_px = [plan.crisp_px if options.method == "layered" else math.inf for plan in plans]
     coarse = has_rays and any(px < max(map(abs, plan.coc_px)) for plan, px in zip(plans, crisp_px, strict=True))
     limit = highlights.threshold(light, weight) if options.occlusion or options.normalize or coarse else None
-    # a plane has one kernel, which is exact unless it changes across the frame: then blocks of pixels share kernels
+    # One layer needs no rays: its kernel is exact, unless blocks of pixels share kernels that change across the frame.
     several = len(plan.nodes) > 1 or options.table.depends_on_place
     splatted = several and (options.occlusion or coarse)
 
@@ -303,7 +303,7 @@ def _composite(
     size = (light.shape[-2], light.shape[-1])
     if len(plans) == 1:
         nodes, table = [plans[0].nodes], options.table
-        blurs = plans[0].blurs(table, size, light.dtype, light.device, layered, ops.lens_width, ops.kernels)
+        blurs = plans[0].layer_kernels(table, size, light.dtype, light.device, layered, ops.lens_width, ops.kernels)
     else:
         nodes, blurs = joined_layers(plans, options.table, size, light)
     coarsest = max(blur.scale for blur in blurs)
@@ -313,7 +313,7 @@ def _composite(
     frame = pad_to_frame(surfaces, behind, nodes, margin, multiple, options.occlusion, image != 0, lit, limit, image)
     scatter = functools.partial(convolve, turned=not options.table.is_round) if layered else fold
 
-    def scattered(frame: Frame) -> Tensor:
+    def scattered(frame: PaddedFrame) -> Tensor:
         if options.occlusion:
             return composite.over(frame, blurs, scatter, ops)
         if layered:

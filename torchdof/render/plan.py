@@ -12,7 +12,7 @@ from torch import Tensor
 from .. import native
 from ..optics.blur_table import BlurTable
 from ..optics.kernel_bank import Spots, bank_of
-from ..optics.placed_kernels import Shares, layer_shares
+from ..optics.placed_kernels import FieldMask, layer_mask
 from ..tensors import is_in_memory, is_traced
 from ..validation import show, tolerance_of
 from . import layer_cocs, traced
@@ -33,7 +33,7 @@ __all__ = [
 KERNELS_PER_PX = 32  # kernels for highlights, per px of radius; more are smoother and take more memory
 _FEWER_KERNELS_PER_PX = 4  # the same in a graph, which holds all kernels as constants; costs up to 0.02 dB
 _COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # px: layers from these radii on have 1/2, 1/4, ... resolution at 1/255
-_LEAST_CUT = 24  # layer pixels: kernels that reach less are never cut, so that in a graph they do not depend on sizes
+_LEAST_CUT = 24  # layer pixels: smaller kernels are never cut, so that those of a graph do not depend on its sizes
 _SMALL_RADII = 3.0  # blur radii: frames with a shorter side below this are planned for a smaller tolerance
 _FARTHEST_PX = 1e9  # px: upper limit of nodes; frames are smaller
 
@@ -42,13 +42,13 @@ _FARTHEST_PX = 1e9  # px: upper limit of nodes; frames are smaller
 class LayerKernel:
     """How one layer is scattered: at every ``scale``-th pixel, with a kernel ``[1 or C, k, k]`` in such pixels.
 
-    The kernel is ``[B, 1 or C, k, k]`` if each item of a batch has its own. ``shares`` are the masks that change the
-    kernel across the frame; None: it is the same everywhere.
+    The kernel is ``[B, 1 or C, k, k]`` if each item of a batch has its own. ``mask`` changes the kernel
+    across the frame; None means that it is the same everywhere.
     """
 
     kernel: Tensor
     scale: int
-    shares: Shares | None = None
+    mask: FieldMask | None = None
 
     @property
     def half(self) -> int:
@@ -69,10 +69,10 @@ class Plan:
         nodes: Places of the layers on the blur axis (see :mod:`torchdof.render.layer_weights`), strictly increasing.
         tolerance: Tolerance that the plan was made for, in [0, 1).
         rays: Whether highlights are splatted (:mod:`torchdof.render.highlights`) where layers would soften them.
-        grows: Whether layers are added for a scene that is blurred more than the outermost ones. False, as in plans
-            for every scene: larger blurs are clamped to the outermost layers.
+        grows: Whether layers are added for a scene that is blurred more than the outermost ones. False, as in a static
+            plan, clamps larger blurs to the outermost layers.
         kernels_per_px: Kernels of highlights per pixel of radius; between them kernels are interpolated.
-        pixels: Share of the scene's pixels in each layer; None unless :meth:`of_pixels` computed it.
+        pixels: Share of the scene's pixels in each layer; None unless :meth:`with_pixels` computed it.
 
     Raises:
         ValueError: If ``nodes`` are not strictly increasing numbers, or ``tolerance`` is not a number in [0, 1).
@@ -99,36 +99,44 @@ class Plan:
         tolerance_of(self.tolerance)
 
     @classmethod
-    def of_frame(cls, coc_px: Tensor, tolerance: float, still: bool = False) -> "Plan":
-        """Layers for a frame ``[B, 1, H, W]`` whose error must not exceed ``tolerance``: the plan of every rendering.
+    def for_scene(cls, coc_px: Tensor, tolerance: float, on_grid: bool = False, adapt: bool = True) -> "Plan":
+        """Layers for one scene ``[B, 1, H, W]``, at both ends of its coc range and dense near the coc of its border.
 
-        Errors are largest beside depth edges and the border. In a frame that is small compared with its blur radii,
-        most pixels are near one: the tolerance is multiplied by ``shorter side / (3 * radius)``, with the mean radius
-        of the most blurred hundredth of its pixels. With ``still`` the factor is rounded down to a power of 1/2, so
-        that layers do not move with the scene.
+        A scene of one plane gets one layer, whose kernel is exact. NaN is ignored.
+
+        Args:
+            coc_px: Signed coc in pixels.
+            tolerance: Largest error of the picture, in [0, 1).
+            on_grid: Whether layers lie at places that do not depend on the scene, as gradients need.
+            adapt: Whether the tolerance is reduced for small frames. Errors are largest beside depth edges and the
+                border. In a frame that is small compared with its blur radii, most pixels are near one, so the
+                tolerance is multiplied by ``shorter side / (3 * radius)``, with the mean radius of the most blurred
+                hundredth of its pixels. With ``on_grid`` the factor is rounded down to a power of 1/2.
         """
-        if not still and coc_px.dtype == torch.float32 and is_in_memory(coc_px) and native.chosen():
+        if not adapt:
+            return cls._between(*layer_cocs.joined(layer_cocs.spreads(coc_px)), tolerance)
+        if not on_grid and coc_px.dtype == torch.float32 and is_in_memory(coc_px) and native.chosen():
             return cls(*native.plan(coc_px, tolerance))
-        return cls.of_items([coc_px], tolerance, still)[0]
+        return cls.for_scenes([coc_px], tolerance, on_grid)[0]
 
     @classmethod
-    def of_items(cls, scenes: Sequence[Tensor], tolerance: float, still: bool = False) -> list["Plan"]:
-        """The plan of :meth:`of_frame` for each scene ``[N, 1, H, W]``, all of one shape.
+    def for_scenes(cls, scenes: Sequence[Tensor], tolerance: float, on_grid: bool = False) -> list["Plan"]:
+        """The plan of :meth:`for_scene` for each scene ``[N, 1, H, W]``, all of one shape.
 
         Values are copied to the host once for all scenes, and once more if a frame is small beside its blur radii.
         """
         coc_px = torch.cat([scene.detach() for scene in scenes])
         count, shorter = len(scenes[0]), min(coc_px.shape[-2:])
         spreads = layer_cocs.spreads(coc_px)
-        spreads = [layer_cocs.together(spreads[i : i + count]) for i in range(0, len(coc_px), count)]
+        spreads = [layer_cocs.joined(spreads[i : i + count]) for i in range(0, len(coc_px), count)]
         radii = [max(abs(from_blur_axis(spread.low)), abs(from_blur_axis(spread.high))) for spread in spreads]
         if shorter < _SMALL_RADII * max(radii):  # otherwise the mean radius is not needed
-            widest = layer_cocs.widest(coc_px)
-            radii = [max(widest[i : i + count]) for i in range(0, len(coc_px), count)]
+            largest = layer_cocs.largest_radii(coc_px)
+            radii = [max(largest[i : i + count]) for i in range(0, len(coc_px), count)]
         plans = []
         for (low, high, border), radius in zip(spreads, radii, strict=True):
             part = min(1.0, shorter / (_SMALL_RADII * max(radius, 1.0)))
-            if still:
+            if on_grid:
                 loose = tolerance * 2.0 ** math.floor(math.log2(part))
                 plans.append(cls(layer_cocs.spaced_nodes(low, high, loose), loose))
             else:
@@ -136,16 +144,8 @@ class Plan:
         return plans
 
     @classmethod
-    def of_scene(cls, coc_px: Tensor, tolerance: float) -> "Plan":
-        """Layers for one scene ``[B, 1, H, W]``, at both ends of its coc range and dense near the coc of its border.
-
-        A scene of one plane gets one layer, whose kernel is exact. NaN is ignored.
-        """
-        return cls._between(*layer_cocs.together(layer_cocs.spreads(coc_px)), tolerance)
-
-    @classmethod
     def _between(cls, low: float, high: float, border: np.ndarray, tolerance: float) -> "Plan":
-        """The same, for a scene that spans ``low`` to ``high`` on the blur axis, with the places of its border."""
+        """Layers for a scene that spans ``low`` to ``high`` on the blur axis, with the places of its border."""
         if high <= low:
             return cls((low,), tolerance)
         fixed = [low, high]
@@ -159,11 +159,11 @@ class Plan:
         nodes = {*fixed}
         for node in layer_cocs.spaced_nodes(low, high, tolerance):
             if low < node < high:
-                nodes.add(node if node == 0.0 else layer_cocs.slid(node, fixed, tolerance))
+                nodes.add(node if node == 0.0 else layer_cocs.moved_to_fixed(node, fixed, tolerance))
         return cls(tuple(sorted(nodes)), tolerance)
 
     @classmethod
-    def all(cls, max_coc_px: float, tolerance: float, rays: bool = False) -> "Plan":
+    def static(cls, max_coc_px: float, tolerance: float, rays: bool = False) -> "Plan":
         """Layers for every scene up to a radius: the plan of a compiled module or, with ``rays``, of an exported one.
 
         The coc at the borders of these scenes is unknown, so the coarse layers, whose errors it affects, are denser.
@@ -173,20 +173,20 @@ class Plan:
         inner = [x for x in layer_cocs.spaced_nodes(-reach, reach, tolerance, dense_from) if abs(x) < last]
         return cls((-reach, *inner, reach), tolerance, rays, grows=False, kernels_per_px=_FEWER_KERNELS_PER_PX)
 
-    def reaching(self, coc_px: Tensor) -> "Plan":
-        """This plan with layers added outwards until they span a scene ``[B, 1, H, W]``; itself if none is missing."""
+    def extended_to(self, coc_px: Tensor) -> "Plan":
+        """This plan with layers added outwards until they span a scene ``[B, 1, H, W]``."""
         nearest, farthest = layer_cocs.extent(coc_px)
         if not self.grows or (self.nodes[0] <= nearest and farthest <= self.nodes[-1]):
             return self
-        nodes, scene = list(self.nodes), Plan.of_scene(coc_px, self.tolerance)
+        nodes, scene = list(self.nodes), Plan.for_scene(coc_px, self.tolerance, adapt=False)
         for sign, last in ((-1.0, -self.nodes[0]), (1.0, self.nodes[-1])):
             gap = 0.3 * layer_cocs.spacing(last, self.tolerance)
             beyond = [sign * x for x in scene.nodes if sign * x > last]
             nodes += [sign * x for x in beyond if x > last + gap or x == max(beyond)]
         return dataclasses.replace(self, nodes=tuple(sorted(nodes)), pixels=None)
 
-    def of_pixels(self, coc_px: Tensor) -> "Plan":
-        """The same plan with ``pixels``: the share of a scene ``[B, 1, H, W]`` that lies in each layer."""
+    def with_pixels(self, coc_px: Tensor) -> "Plan":
+        """This plan with ``pixels``: the share of a scene ``[B, 1, H, W]`` that lies in each layer."""
         x = layer_cocs.on_axis(coc_px.detach(), max(coc_px.shape[-2:])).clamp(self.nodes[0], self.nodes[-1])
         ends = ramps([self.nodes], x).split(1, -1)  # one at a time, to bound the memory
         behind = [float(weights_at_or_behind(x, end).double().mean()) for end in ends]
@@ -215,7 +215,7 @@ class Plan:
             return math.inf
         return max([0.0, *(abs(coc) for coc in self.coc_px if abs(coc) < min(coarse))])
 
-    def blurs(
+    def layer_kernels(
         self,
         table: BlurTable,
         size: tuple[int, int],
@@ -241,21 +241,21 @@ class Plan:
             bank = _moved(made, device, dtype)
         if not table.depends_on_place:
             return [LayerKernel(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
-        shares = self.shares(table, scales, (int(size[0]), int(size[1])))
-        return [LayerKernel(*each) for each in zip(bank, scales, shares, strict=True)]
+        masks = self.field_masks(table, scales, (int(size[0]), int(size[1])))
+        return [LayerKernel(*each) for each in zip(bank, scales, masks, strict=True)]
 
     def constants(self, table: BlurTable, coarse: bool, lens_width: int) -> list[Tensor]:
         """Kernels of the layers as constants of a trace, not cut to a frame."""
         return _layer_kernels(table, self.coc_px, *self.layer_sizes(table, (1, lens_width), coarse))
 
-    def shares(
+    def field_masks(
         self, table: BlurTable, scales: Sequence[int], size: tuple[int, int], like: Tensor | None = None
-    ) -> list[Shares]:
+    ) -> list[FieldMask]:
         """Field masks of each layer's kernel, in the dtype and device of ``like``; empty for a lens without a field."""
         if not table.depends_on_place:
             return []
-        shares = [layer_shares(table, coc, scale, size) for coc, scale in zip(self.coc_px, scales, strict=True)]
-        return shares if like is None else [each.to(like) for each in shares]
+        masks = [layer_mask(table, coc, scale, size) for coc, scale in zip(self.coc_px, scales, strict=True)]
+        return masks if like is None else [each.to(like) for each in masks]
 
     def layer_sizes(self, table: BlurTable, size: tuple[int, int], coarse: bool) -> tuple[int, tuple[int, ...]]:
         """Image width for the kernels (1 if they do not depend on it) and downsampling factor of each layer."""
@@ -394,7 +394,7 @@ def _layer_kernels(
     longest: Sequence[int] = (),
     dtype: torch.dtype = torch.float64,
 ) -> list[Tensor]:
-    """Kernels ``[1 or C, k, k]`` of the same layers, at least as exact as ``dtype``."""
+    """Kernels ``[1 or C, k, k]`` of the layers of :func:`layer_spots`, at least as exact as ``dtype``."""
     bank = bank_of(table)
     if table.is_differentiated:  # gradients to the aperture's rotation and squeeze need the PSF itself
         kernels = []

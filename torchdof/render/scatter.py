@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..optics.placed_kernels import Shares, placed
+from ..optics.placed_kernels import FieldMask, placed
 from ..tensors import is_traced
 from .convolution import DIRECT_TAPS, widest_float
 
@@ -24,7 +24,7 @@ def fold(
     kernels: Tensor,
     halo: int = 0,
     weights: Tensor | None = None,
-    shares: Sequence[Shares] | None = None,
+    masks: Sequence[FieldMask] | None = None,
     frame: tuple[int, int] = (0, 0),
 ) -> Tensor:
     """Multiply the light of each pixel by its kernel, and add the products where they land (``torch``'s ``fold``).
@@ -36,8 +36,8 @@ def fold(
         kernels: ``[1 or C, k, k]``, k odd; or, with weights, a bank of them ``[n, 1 or C, k, k]``.
         halo: Pixels on each side that scatter into the result ``[B, C, H - 2 halo, W - 2 halo]`` but are not in it.
         weights: Weight of each kernel of the bank in the kernel of each pixel, ``[B, n, H, W]``.
-        shares: Masks that change each kernel of the bank across the frame; None: kernels are the same everywhere.
-        frame: Height and width of the frame, which begins ``halo`` pixels after the light; used with ``shares``.
+        masks: Masks that change each kernel of the bank across the frame; None: kernels are the same everywhere.
+        frame: Height and width of the frame, which begins ``halo`` pixels after the light; used with ``masks``.
 
     Reference:
         Sato, Dobashi, Yamamoto, section 3, steps (a) to (c). The adjoint is ``unfold``.
@@ -48,19 +48,19 @@ def fold(
     size, wide = kernels.shape[-1], widest_float(light.device)
     half = size // 2
     if size * size > DIRECT_TAPS and light.dtype != wide and not is_traced():
-        return fold(light.to(wide), kernels.to(wide), halo, weights.to(wide), shares, frame).to(light.dtype)
+        return fold(light.to(wide), kernels.to(wide), halo, weights.to(wide), masks, frame).to(light.dtype)
     rows = max(1, _COLUMN_BYTES // (batch * channels * size * size * width * light.element_size()))
     strips = []
     for top in range(0, height, rows):
         strip, weight = (t[:, :, top : top + rows] for t in (light, weights))
         # the kernel of each pixel
-        if shares is None:
+        if masks is None:
             taps = torch.einsum("bnp,nct->bctp", weight.flatten(2), kernels.flatten(2))
         else:
             taps = light.new_zeros(())
-            for kernel, share, part in zip(kernels, shares, weight.flatten(2).unbind(1), strict=True):
+            for kernel, mask, part in zip(kernels, masks, weight.flatten(2).unbind(1), strict=True):
                 each = _of_pixels(
-                    kernel, share, (top - halo, -halo), (strip.shape[-2], width), frame
+                    kernel, mask, (top - halo, -halo), (strip.shape[-2], width), frame
                 )  # [pixels, C, k, k]
                 taps = taps + torch.einsum("bp,pct->bctp", part, each.flatten(2))
         columns = strip.flatten(2).unsqueeze(2) * taps  # [B, C, k*k, pixels]
@@ -76,13 +76,13 @@ def fold(
 
 
 def _of_pixels(
-    kernel: Tensor, shares: Shares, first: tuple[int, int], count: tuple[int, int], size: tuple[int, int]
+    kernel: Tensor, mask: FieldMask, first: tuple[int, int], count: tuple[int, int], size: tuple[int, int]
 ) -> Tensor:
     """The masked kernel of each pixel of a block, ``[n, 1 or C, k, k]``.
 
     Args:
         kernel: Kernel of the table, ``[1 or C, k, k]``; those of C colours may be repeated.
-        shares: Masks at the frame's resolution.
+        mask: Mask at the frame's resolution.
         first: Row and column of the block's first pixel.
         count: Rows and columns of the block.
         size: Height and width of the frame.
@@ -93,7 +93,5 @@ def _of_pixels(
         for n, start, side in zip(count, first, size, strict=True)
     )
     y, x = (t.flatten() for t in torch.meshgrid(y, x, indexing="ij"))
-    each = kernel[: shares.values.shape[0]] if shares.values.shape[0] > 1 else kernel
-    return placed(each[None], [(shares.to(kernel), kernel.new_ones(()))], y, x).repeat(
-        1, len(kernel) // len(each), 1, 1
-    )
+    each = kernel[: mask.values.shape[0]] if mask.values.shape[0] > 1 else kernel
+    return placed(each[None], [(mask.to(kernel), kernel.new_ones(()))], y, x).repeat(1, len(kernel) // len(each), 1, 1)

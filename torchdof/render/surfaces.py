@@ -14,12 +14,20 @@ from ..tensors import is_traced
 from .border import continued
 from .layer_weights import blur_axis, eased, ramps, weights_at_or_behind
 
-__all__ = ["HIDDEN_WEIGHT", "Frame", "Highlights", "PaddedSurface", "Surface", "continuation_weight", "pad_to_frame"]
+__all__ = [
+    "HIDDEN_WEIGHT",
+    "Highlights",
+    "PaddedFrame",
+    "PaddedSurface",
+    "Surface",
+    "continuation_weight",
+    "pad_to_frame",
+]
 
 HIDDEN_WEIGHT = 0.003
 """Weight of a hidden sample, which is guessed; a visible one has 1. A larger value mixes more guessed light in."""
 
-_HAIR = 0.06
+_HIDING_SHARE = 0.06
 """Share of a surface at or behind a layer at which it counts there in full; larger: it fades in over more depth."""
 _CONTINUES_FROM = 0.1
 """Visible share of a far surface, above HIDDEN_WEIGHT, at which it continues in full behind the near one."""
@@ -53,7 +61,7 @@ class PaddedSurface(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Frame:
+class PaddedFrame:
     """Surfaces of a frame, continued beyond its border; the layers are cut out of it.
 
     Args:
@@ -88,11 +96,11 @@ class Frame:
     def cut(self, values: Tensor, halo: int) -> Tensor:
         """Crop a map of the frame to its area and ``halo`` pixels around it."""
         start = self.margin - halo
-        # counted from the end, a number: sizes are symbols in a graph
+        # the end is counted from the last pixel, because sizes are symbols in a graph
         kept = slice(start, -start or None)
         return values[..., kept, kept]
 
-    def near_to_far(self) -> "Frame":
+    def near_to_far(self) -> "PaddedFrame":
         """The same frame with its two surfaces sorted near to far in each pixel."""
         if self.stacked or len(self.surfaces) == 1:
             return self
@@ -168,7 +176,7 @@ def _mixed(surfaces: Sequence[PaddedSurface], pairs: Sequence[tuple[Tensor, Tens
         own = behind - beyond
         if cover is not None:
             if nearer is not None:
-                cover = cover + continuation_weight(cover) * (1.0 - (nearer / _HAIR).clamp(0.0, 1.0))
+                cover = cover + continuation_weight(cover) * (1.0 - (nearer / _HIDING_SHARE).clamp(0.0, 1.0))
             beyond, own = beyond * cover, own * cover
         terms = [light * own, own, beyond]
         sums = [a + b for a, b in zip(sums, terms, strict=True)] if sums else terms
@@ -179,9 +187,10 @@ def _mixed(surfaces: Sequence[PaddedSurface], pairs: Sequence[tuple[Tensor, Tens
 def _stacked(
     surfaces: Sequence[PaddedSurface], pairs: Sequence[tuple[Tensor, Tensor]]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The same for surfaces that cover a pixel independently, near to far.
+    """``m_k I``, ``m_k`` and ``M_k - m_k`` of surfaces that cover a pixel independently, near to far.
 
-    With ``c`` the cover of a surface, ``b`` its share at or behind layer k and ``h = c eased(min(b / _HAIR, 1))``,
+    With ``c`` the cover of a surface, ``b`` its share at or behind layer k, ``f`` the share :data:`_HIDING_SHARE` and
+    ``h = c eased(min(b / f, 1))``,
 
         ``M_k = prod(1 - h (1 - b)) (1 - prod(1 - h))``,
 
@@ -193,7 +202,7 @@ def _stacked(
     stopped = []
     for (_, x, weight), (behind, beyond) in zip(surfaces, pairs, strict=True):
         cover = torch.ones_like(x) if weight is None else weight
-        here = cover * eased((behind / _HAIR).clamp(max=1.0))
+        here = cover * eased((behind / _HIDING_SHARE).clamp(max=1.0))
         passes = 1.0 - here * (1.0 - behind)  # share not hidden by the surface's part in front of layer k
         stops = cover * (behind - beyond) / passes.clamp_min(1e-6)  # share of the arriving light stopped in layer k
         stopped.append(arriving * stops)
@@ -215,17 +224,17 @@ def pad_to_frame(
     lit: bool = True,
     limit: Tensor | None = None,
     image: int | None = 0,
-) -> Frame:
+) -> PaddedFrame:
     """Continue the surfaces of an image beyond its border to a frame (:mod:`torchdof.render.border`).
 
     Args:
         surfaces: Near to far if stacked; else one surface, or the two that share each pixel.
-        nodes: As in :class:`Frame`; surfaces beyond the outermost nodes are clamped to them.
+        nodes: As in :class:`PaddedFrame`; surfaces beyond the outermost nodes are clamped to them.
         behind: Light behind all surfaces, ``[B, C, H, W]``; None: there is no such light.
-        margin: As in :class:`Frame`.
+        margin: As in :class:`PaddedFrame`.
         multiple: The area is extended to multiples of this many pixels, at least a pixel of the coarsest layer.
-        occlusion: As in :class:`Frame`.
-        stacked: As in :class:`Frame`.
+        occlusion: As in :class:`PaddedFrame`.
+        stacked: As in :class:`PaddedFrame`.
         lit: Whether light is continued beyond the border too; False: it is 0 there.
         limit: Largest light that is not a highlight, ``[B, 1, H, W]``: light above it is not continued; None: all is.
         image: Index of the image's own surface; None: the surfaces are layers, each known everywhere.
@@ -253,7 +262,9 @@ def pad_to_frame(
         lights = [functional.pad(light, around) for light in lights]
     x = functional.pad(x if cover is None else torch.cat([x, cover], 1), around, mode="replicate")
     maps = [part.unflatten(0, (len(surfaces), -1)) for part in x.split(1, 1)]
-    placed = [PaddedSurface(*parts) for parts in zip(lights, *maps, strict=True)]
+    padded = [PaddedSurface(*parts) for parts in zip(lights, *maps, strict=True)]
     if behind is not None:
         behind = functional.pad(behind, beyond, mode="replicate")
-    return Frame(placed, nodes, ramps(nodes, placed[0].x), behind, margin, (height, width), size, occlusion, stacked)
+    return PaddedFrame(
+        padded, nodes, ramps(nodes, padded[0].x), behind, margin, (height, width), size, occlusion, stacked
+    )

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torchdof.fit import Capture, Captures, FitError, FitWarning, fit_pair, read_captures
-from torchdof.fit.photo.frame import read_frame
+from torchdof.fit.photo.frame import read_picture
 from torchdof.io.images import Picture, read_image, write_image
 
 
@@ -190,4 +190,4 @@ def test_a_mosaic_with_an_orientation_tag_is_refused(tmp_path: Path) -> None:
     assert output is not None and output.open(str(tmp_path / "mosaic.tif"), spec)
     assert output.write_image(np.ones((6, 8, 1), np.uint16)) and output.close()
     with pytest.raises(FitError, match="got one of EXIF orientation 6; remove the tag"):
-        read_frame(tmp_path / "mosaic.tif", "linear", bayer="RGGB")
+        read_picture(tmp_path / "mosaic.tif", "linear", bayer="RGGB")

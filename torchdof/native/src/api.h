@@ -34,7 +34,7 @@ typedef struct {
   float radius;            // signed coc in pixels of the layer
   int32_t colours;         // 1 or channels
   int32_t rows, columns;
-} torchdof_shares;
+} torchdof_field_mask;
 
 typedef struct {
   int32_t height, width, channels;
@@ -56,7 +56,7 @@ typedef struct {
   int32_t kernel_colours;  // 1 or channels
   const float *kernels;    // for each layer [kernel_colours, 2 half + 1, 2 half + 1]
 
-  const torchdof_shares *shares;  // for each layer; null: the kernels are the same everywhere in the frame
+  const torchdof_field_mask *shares;  // for each layer; null: kernels do not change across the frame
   int32_t distances;              // number of field distances, from the centre of the frame to its corner
   float squeeze;                  // height of the blur divided by its width
 
@@ -99,10 +99,10 @@ TORCHDOF_API int32_t torchdof_begin(const torchdof_scene *scene, torchdof_job **
 // Signed radii of highlights in steps of 1/32 pixel; returns their number.
 TORCHDOF_API int64_t torchdof_radii(const torchdof_job *job, const int32_t **steps);
 
-// kernels[i] is for radius i: [kernel_colours, 2 halves[i] + 1, 2 halves[i] + 1]. shares: in ascending order of radius,
-// and at least two, or null if layers have none. out: [channels, height, width].
+// kernels[i] is for radius i: [kernel_colours, 2 halves[i] + 1, 2 halves[i] + 1]. shares: field masks, at least two, in
+// ascending order of radius; null if layers have no masks. out: [channels, height, width].
 TORCHDOF_API int32_t torchdof_finish(torchdof_job *job, const float *const *kernels, const int32_t *halves,
-                                     const torchdof_shares *shares, int32_t shares_count, float *out);
+                                     const torchdof_field_mask *shares, int32_t shares_count, float *out);
 
 TORCHDOF_API void torchdof_free(torchdof_job *job);
 
@@ -112,10 +112,10 @@ typedef struct {
   int32_t height, width, channels;
   const float *light;     // [channels, height, width]
   const float *nearness;  // [height, width]
-  int32_t of_coc;
+  int32_t of_coc;         // 1: `nearness` is coc
   const float *steps;     // smallest difference between two surfaces [height, width], or null:
   float step;             // the same for all pixels
-  int32_t automatic;      // 1: leave a map alone whose edges prove exact
+  int32_t automatic;      // 1: leave a map with exact edges unchanged
   int32_t threads;
   const volatile int32_t *cancelled;
   float *out;  // [height, width]
@@ -151,8 +151,8 @@ typedef struct {
 // out: [channels + kernel_colours, height, width]: light, and coverage or transmittance, or sum of weights.
 TORCHDOF_API int32_t torchdof_blend(const torchdof_layers *layers, float *out);
 
-// Adds to the gradients of all surfaces, of the shapes in `layers`, from the gradient of `out`. A surface without weight
-// has no gradient of it.
+// From the gradient of `out`: adds to the gradients of all surfaces, which have the shapes in `layers`. A surface without
+// weight has no gradient of the weight.
 TORCHDOF_API int32_t torchdof_blend_gradient(const torchdof_layers *layers, const float *gradient, float *const *light,
                                              float *const *place, float *const *weight);
 
@@ -160,9 +160,9 @@ TORCHDOF_API int32_t torchdof_blend_gradient(const torchdof_layers *layers, cons
 typedef struct {
   const float *values;    // [channels + 2, rows, columns]: light, coc, weight
   int32_t rows, columns;  // at least 2
-  int32_t step;           // pixels between two samples; of all levels together they cover the same pixels
+  int32_t step;           // pixels between two samples; all levels cover the same pixels
   float least_px;         // blur above which a pixel reads the level
-  float slope, most;      // votes for each weight of the samples, and most votes
+  float slope, most;      // votes for each weight of the samples, and largest number of votes
 } torchdof_level;
 #define TORCHDOF_MOST_LEVELS 4
 

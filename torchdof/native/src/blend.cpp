@@ -1,5 +1,5 @@
-// The layers of a padded frame, blurred and composited as in composite.cpp, and the gradient of that: what training
-// needs between the surfaces of a frame and its picture. All planes are dense, because every pixel has a gradient.
+// Blurs and composites the layers of a padded frame as composite.cpp does, forward and backward, for training. All planes
+// are dense, because every pixel has a gradient.
 //
 // With m a layer's share of each pixel, r the share behind it, I light and K the layer's kernel, from far to near:
 //
@@ -51,8 +51,10 @@ struct Run {
 // A layer: which blocks of its run's grid its light reaches, and the blurred terms there.
 struct Blurred {
   std::vector<int> index;   // of each block in `values`, or -1
-  std::vector<int> reached, needed, around;  // blocks with blurred terms; that these read; that those read
-  std::vector<uint8_t> occupied, behind;  // blocks in which the layer occurs; in which anything lies behind it
+  std::vector<int> reached;  // blocks with blurred terms
+  std::vector<int> needed;   // blocks that are read for these
+  std::vector<int> around;   // blocks that are read for the gradient of `needed`
+  std::vector<uint8_t> occupied, behind;  // blocks in which the layer occurs; in which a surface lies behind it
   Buffer<float> values;     // [blocks, terms, BLOCK_PIXELS]
   std::vector<Kernel> kernels, turned;  // for each colour
 };
@@ -263,7 +265,7 @@ class Blend {
     return in_front ? IN_FRONT : behind ? BEHIND : ACROSS;
   }
 
-  // Finds the blocks that a layer's light reaches, and those that are read for them, forward and backward.
+  // Finds the blocks that a layer's light reaches, and the blocks that are read for them, forward and backward.
   void find_blocks(const Run &run, int k) {
     Blurred &b = blurred_[k];
     const int half = layers_[k].half, count = run.blocks();
@@ -385,7 +387,7 @@ class Blend {
       }
   }
 
-  // Which rows of a block's window hold anything of a layer, or behind it, for convolve_strip.
+  // Rows of a block's window that contain a layer, or surfaces behind it, as column marks for convolve_strip.
   void rows_of(const Run &run, int k, int block, bool behind, std::vector<uint32_t> &rows) const {
     const int half = layers_[k].half, y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
     const int c0 = std::max(x0 - half, 0) / BLOCK, c1 = std::min((x0 + BLOCK - 1 + half) / BLOCK, run.block_columns - 1);
@@ -447,17 +449,16 @@ class Blend {
     std::fill(canvas + C_ * BLOCK_PIXELS, canvas + planes_ * BLOCK_PIXELS, over_ ? empty_ : 0.0f);
   }
 
-  // A layer's share of a pixel, and its transmittance for the picture behind.
   struct Front {
-    vec share, left;
+    vec share, transmittance;  // of a layer in a pixel; for the light behind it
   };
   Front front(vec share) const { return {share, scene_.backed ? share : most(all(1.0f) - share, vec{})}; }
-  struct Known {
-    vec lacking, beyond, known;
+  struct Normalizer {
+    vec lacking, behind, sum;  // what the sum lacks to KNOWN; the share behind the layer, raised; their sum
   };
-  static Known know(vec own, vec behind) {
-    const vec lacking = most(all(KNOWN) - own - behind, vec{}), beyond = behind + lacking * lacking * (0.5f / KNOWN);
-    return {lacking, beyond, own + beyond};
+  static Normalizer normalizer_of(vec own, vec behind) {
+    const vec lacking = most(all(KNOWN) - own - behind, vec{}), raised = behind + lacking * lacking * (0.5f / KNOWN);
+    return {lacking, raised, own + raised};
   }
   int first_channel(int e) const { return E_ == 1 ? 0 : e; }
   int last_channel(int e) const { return E_ == 1 ? C_ - 1 : e; }
@@ -466,10 +467,10 @@ class Blend {
   void over(int e, int i, Front f, const float *light, vec gain, float *canvas) const {
     for (int c = first_channel(e); c <= last_channel(e); c++) {
       float *to = canvas + c * BLOCK_PIXELS + i;
-      store(to, load<vec>(light + c * BLOCK_PIXELS + i) * gain + f.left * load<vec>(to));
+      store(to, load<vec>(light + c * BLOCK_PIXELS + i) * gain + f.transmittance * load<vec>(to));
     }
     float *to = canvas + (C_ + e) * BLOCK_PIXELS + i;
-    store(to, (scene_.backed ? vec{} : f.share) + f.left * load<vec>(to));
+    store(to, (scene_.backed ? vec{} : f.share) + f.transmittance * load<vec>(to));
   }
   void add(const float *values, float *canvas) const {
     for (int i = 0; i < planes_ * BLOCK_PIXELS; i += LANES) store(canvas + i, load<vec>(canvas + i) + load<vec>(values + i));
@@ -513,9 +514,9 @@ class Blend {
     }
     each_pixel([&](int e, int i) {
       const vec own = load<vec>(values + (C_ + e) * BLOCK_PIXELS + i);
-      const Known n = know(own, load<vec>(values + (C_ + E_ + e) * BLOCK_PIXELS + i));
-      const vec per = all(1.0f) / n.known;
-      over(e, i, front((scene_.backed ? n.beyond : own) * per), values, per, canvas);
+      const Normalizer n = normalizer_of(own, load<vec>(values + (C_ + E_ + e) * BLOCK_PIXELS + i));
+      const vec per = all(1.0f) / n.sum;
+      over(e, i, front((scene_.backed ? n.behind : own) * per), values, per, canvas);
     });
     return true;
   }
@@ -575,7 +576,7 @@ class Blend {
       coarse(at, s, limit, before, part);
       return before == i ? 1.0f - part : before + 1 == i ? part : 0.0f;
     };
-    // pixels of the picture that a coarse pixel i may have a part in: (i - 1.5) s to (i + 0.5) s
+    // pixels of the picture into which a coarse pixel i is interpolated: (i - 1.5) s to (i + 0.5) s
     auto low = [&](int i) { return std::max((2 * i - 3) * s / 2 - 1, 0); };
     auto high = [&](int i, int limit) { return std::min((2 * i + 1) * s / 2 + 1, limit); };
     std::vector<float> line(W);
@@ -631,16 +632,16 @@ class Blend {
   vec through(int e, int i, Front f, const float *behind, float *slopes, const Light &light) const {
     float *coverage = slopes + (C_ + e) * BLOCK_PIXELS + i;
     const vec of_coverage = load<vec>(coverage);
-    vec left = of_coverage * load<vec>(behind + (C_ + e) * BLOCK_PIXELS + i);
+    vec of_transmittance = of_coverage * load<vec>(behind + (C_ + e) * BLOCK_PIXELS + i);
     for (int c = first_channel(e); c <= last_channel(e); c++) {
       float *its = slopes + c * BLOCK_PIXELS + i;
       const vec slope = load<vec>(its);
-      left += slope * load<vec>(behind + c * BLOCK_PIXELS + i);
+      of_transmittance += slope * load<vec>(behind + c * BLOCK_PIXELS + i);
       light(c, slope);
-      store(its, f.left * slope);
+      store(its, f.transmittance * slope);
     }
-    store(coverage, f.left * of_coverage);
-    return scene_.backed ? left : of_coverage - (f.share <= all(1.0f) ? left : vec{});
+    store(coverage, f.transmittance * of_coverage);
+    return scene_.backed ? of_transmittance : of_coverage - (f.share <= all(1.0f) ? of_transmittance : vec{});
   }
 
   // Walks back through a layer: its blurred terms become their gradients.
@@ -651,20 +652,20 @@ class Blend {
       return;
     }
     each_pixel([&](int e, int i) {
-      float *own = values + (C_ + e) * BLOCK_PIXELS + i, *beyond = values + (C_ + E_ + e) * BLOCK_PIXELS + i;
-      const Known n = know(load<vec>(own), load<vec>(beyond));
-      const vec per = all(1.0f) / n.known, share = (scene_.backed ? n.beyond : load<vec>(own)) * per;
-      vec of_known = {};
+      float *own = values + (C_ + e) * BLOCK_PIXELS + i, *behind_it = values + (C_ + E_ + e) * BLOCK_PIXELS + i;
+      const Normalizer n = normalizer_of(load<vec>(own), load<vec>(behind_it));
+      const vec per = all(1.0f) / n.sum, share = (scene_.backed ? n.behind : load<vec>(own)) * per;
+      vec of_sum = {};
       const vec of_share = through(e, i, front(share), behind, slopes, [&](int c, vec slope) {
         float *its = values + c * BLOCK_PIXELS + i;
         const vec of_light = slope * per;
-        of_known -= of_light * load<vec>(its) * per;
+        of_sum -= of_light * load<vec>(its) * per;
         store(its, of_light);
       });
-      of_known -= of_share * share * per;
-      const vec of_part = of_share * per, of_beyond = of_known + (scene_.backed ? of_part : vec{}), lacking = n.lacking * (1.0f / KNOWN);
-      store(own, of_known + (scene_.backed ? vec{} : of_part) - of_beyond * lacking);
-      store(beyond, of_beyond * (1.0f - lacking));
+      of_sum -= of_share * share * per;
+      const vec of_part = of_share * per, of_raised = of_sum + (scene_.backed ? of_part : vec{}), lacking = n.lacking * (1.0f / KNOWN);
+      store(own, of_sum + (scene_.backed ? vec{} : of_part) - of_raised * lacking);
+      store(behind_it, of_raised * (1.0f - lacking));
     });
   }
 
@@ -739,6 +740,8 @@ class Blend {
     return false;
   }
 
+  // Adds the gradients of a layer's terms in a block to those of the surfaces: the derivatives of `terms` and `weigh`,
+  // last operation first.
   template <int S, int CHANNELS>
   void to_surfaces(const Run &run, int k, int block, const float *slopes) const {
     const int C = CHANNELS ? CHANNELS : C_;

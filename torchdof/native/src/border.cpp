@@ -4,9 +4,8 @@
 namespace torchdof {
 namespace TORCHDOF_SIMD {
 
-constexpr int WIDTH = 4;  // half width of the mean along the border, times the distance beyond it; larger is smoother
-constexpr int BINS = 16;  // number of bins; a larger one separates more surfaces
-// difference between neighbours on the blur axis above which they start to count as different surfaces; fully at twice it
+// Constants of render/border.py, which gives their meanings and effects.
+constexpr int WIDTH = 4, BINS = 16;
 constexpr double STEP = 0.5;
 
 // The part of a difference on the blur axis that is a step between surfaces; 0 for a slope.

@@ -11,12 +11,11 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr float LEAST = 1e-6f;    // blurred weight below which the light of a pixel is unknown
-constexpr float COVERED = 1e-6f;  // uncovered part that is rounding error alone
+constexpr float LEAST = 1e-6f;    // blurred weight up to which the light of a pixel is unknown
+constexpr float COVERED = 1e-6f;  // an uncovered part up to this is a rounding error
 constexpr int BEHIND_STEP = 4;    // pixels between samples of the light behind all surfaces
 constexpr int TILE_PIXELS = TILE * TILE;
 constexpr int PART = 16;  // side in pixels of the parts of a coarse canvas that are skipped if empty
-
 constexpr float EVEN_SQUARED = 1e-12f;  // square of the difference from 1 up to which a normalizer counts as 1
 
 // Consecutive layers of one resolution, composited together. Under occlusion a coarse run lies on one side of the
@@ -107,6 +106,9 @@ class Composite {
   Composite(const Job &job, const RayKernels &ray_kernels, float *out)
       : job_(job), s_(job.surfaces), layers_(job.layers), ray_kernels_(ray_kernels), out_(out) {}
 
+  // 1. Group consecutive layers of one scale into runs.
+  // 2. Find the layers of each cell, the light beyond the border, and the surfaces at the scales of coarse runs.
+  // 3. Composite the tiles of coarse runs, then those of the picture.
   void run() {
     H_ = job_.height, W_ = job_.width, C_ = job_.channels, E_ = job_.colours, N_ = (int)layers_.size();
     over_ = job_.scene.occlusion;
@@ -191,8 +193,9 @@ class Composite {
 
   // Finds the node before each pixel of each surface, and the layers that occur in each cell of CELL x CELL pixels.
   //
-  // A block of one surface that lies between two neighbouring nodes is filled at once. Elsewhere each cell compares the
-  // places of its pixels with the nodes between its smallest and its largest place.
+  // 1. Tabulate the node before places at even distances.
+  // 2. Fill a block at once if it shows one surface that lies between two neighbouring nodes.
+  // 3. In other blocks, compare the places of a cell's pixels with the nodes between the smallest and the largest one.
   void index() {
     index_.words = (N_ + 63) / 64;
     index_.rows = ceil_div(H_, CELL);
@@ -485,7 +488,7 @@ class Composite {
     }
   }
 
-  // The same for surfaces that cover each other: computes the terms of each row of pixels and averages over s x s.
+  // The terms of layer k for surfaces that cover each other: computes each row of pixels and averages over s x s.
   void block_means(int k, int s, int top, int left, int height, int width, size_t shift, Scratch &b) {
     const float each = 1.0f / (s * s);
     const int n = width * s;
@@ -905,6 +908,10 @@ class Composite {
   }
 
   // Composites a coarser canvas, interpolated, onto the tile's canvas.
+  //
+  // 1. Return if no layer of the run reaches the tile.
+  // 2. Widen two rows of the canvas to the tile's resolution; each serves several rows of the tile.
+  // 3. Interpolate between them, and put the result in front of the tile's row.
   void join_finer(const Run &run, int y0, int x0, Scratch &b) {
     const int s = run.scale;
     const int r1 = std::min((y0 + TILE) / s + 1, run.rows - 1) / PART, c1 = std::min((x0 + TILE) / s + 1, run.columns - 1) / PART;

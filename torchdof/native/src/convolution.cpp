@@ -88,7 +88,7 @@ Kernel make_kernel(const float *values, int half, bool one_sided) {
   return k;
 }
 
-bool ends_dark(const torchdof_shares &shares, int distances) {
+bool ends_dark(const torchdof_field_mask &shares, int distances) {
   const int rows = shares.rows, columns = shares.columns;
   for (int i = 0; i < shares.colours * distances; i++) {
     const float *values = shares.values + (size_t)i * rows * columns;

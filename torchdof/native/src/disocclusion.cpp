@@ -6,14 +6,11 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr float FALL = 0.35f;      // weight of a level relative to the next finer one; larger takes light from farther away
-constexpr int CELL_LEVEL = 3;      // level in whose pixels it is decided where a surface may be hidden
-constexpr int FINE_LEVELS = 2;     // levels read by each pixel; coarser ones are read once for each cell of STEP pixels
-constexpr int STEP = 1 << FINE_LEVELS;
-constexpr float SURE = 0.1f;      // weight of a level's sample at which its vote is full
-// votes at which a hidden sample has its full weight, and at which a farther one replaces the nearer
-constexpr float CERTAIN = 0.01f;
-constexpr float MIXED = 0.05f;  // smallest share of a second surface used in the pyramid
+// Constants of render/disocclusion.py, which gives their meanings and effects.
+constexpr float FALL = 0.35f, SURE = 0.1f, CERTAIN = 0.01f;
+constexpr int FINE_LEVELS = 2, STEP = 1 << FINE_LEVELS;
+constexpr float MIXED = 0.05f;  // share above which a second surface is used in the pyramid
+constexpr int CELL_LEVEL = 3;   // cells that may show hidden surfaces have the size of this level's samples
 
 // One level of a pyramid of the farthest surfaces. A sample has `stride` values: light of each channel, coc, weight,
 // padding.
@@ -29,7 +26,7 @@ struct Level {
   float coc(int y, int x) const { return at(y, x)[channels]; }
 };
 
-// How certainly a surface that is farther by this difference in coc is another one, 0 to 1.
+// Confidence, 0 to 1, that a surface farther by this difference in coc is another surface.
 inline float is_behind(float distance_px) { return clamp01(distance_px - (BEHIND_PX - 0.5f)); }
 
 // Mean of the farthest of four children.
@@ -88,8 +85,8 @@ struct Corners {
   }
 };
 
-// Bilinear mean of those of the four samples that lie behind coc `here`. Returns their weight; `seen` is only written
-// if it exceeds LEAST_SEEN.
+// Bilinear mean of the four samples around a position, without those in front of or at coc `here`. Returns the weight
+// of the others; `seen` is only written if it exceeds LEAST_SEEN.
 template <int VECTORS>
 float behind(const Level &level, Place row, Place column, float here, f8 *seen) {
   const int count = VECTORS ? VECTORS : level.stride / F8, C = level.channels;
@@ -107,40 +104,41 @@ float behind(const Level &level, Place row, Place column, float here, f8 *seen) 
   return total;
 }
 
-// A level's sample behind a pixel: its weight (any; 0 if empty) and how much the pixel's blur uses the level (looked).
-struct Seen {
-  float looked, any;
-  f8 *sample;
+// A level's sample behind a pixel.
+struct Sample {
+  float level_weight;  // of the level, for the pixel's blur, 0 to 1
+  float weight;        // of the samples that lie behind the pixel; 0 without them
+  f8 *values;
   template <int VECTORS>
-  void see(const Level &level, Place row, Place column, float here) {
-    looked = clamp01(std::fabs(here) / level.least_px - 1.0f);
-    any = looked > 0 ? behind<VECTORS>(level, row, column, end_of_surface(here), sample) : 0.0f;
+  void read(const Level &level, Place row, Place column, float here) {
+    level_weight = clamp01(std::fabs(here) / level.least_px - 1.0f);
+    weight = level_weight > 0 ? behind<VECTORS>(level, row, column, end_of_surface(here), values) : 0.0f;
   }
 };
 
 // Combines the samples of several levels: light and coc; returns the sum of their votes. With `farthest`, only the
 // farther of two surfaces counts.
 template <int VECTORS>
-float mix(const Level *const *levels, const Seen *seen, int n, bool farthest, float *out) {
+float mix(const Level *const *levels, const Sample *samples, int n, bool farthest, float *out) {
   const int count = VECTORS ? VECTORS : levels[0]->stride / F8, C = levels[0]->channels;
   float total = 0;
   for (int i = 0; i < F8 * count; i++) out[i] = 0;
   for (int l = 0; l < n; l++) {
     const Level &level = *levels[l];
-    const float any = seen[l].any, looked = seen[l].looked;
-    if (!(any > 0)) continue;
-    float vote = looked * (level.vote > 0 ? level.vote * std::min(any / SURE, 1.0f) : any);
+    const float weight = samples[l].weight, level_weight = samples[l].level_weight;
+    if (!(weight > 0)) continue;
+    float vote = level_weight * (level.vote > 0 ? level.vote * std::min(weight / SURE, 1.0f) : weight);
     if (farthest) {
-      const float apart = ((const float *)seen[l].sample)[C] - out[C];
+      const float apart = ((const float *)samples[l].values)[C] - out[C];
       if (total > 0) vote *= 1.0f - is_behind(-apart);
-      total *= 1.0f - std::min(looked * any / CERTAIN, 1.0f) * is_behind(apart);
+      total *= 1.0f - std::min(level_weight * weight / CERTAIN, 1.0f) * is_behind(apart);
     }
     total += vote;
     if (!(vote > 0)) continue;
     const float part = vote / std::max(total, 1e-9f);
     for (int i = 0; i < count; i++) {
       const f8 o = load<f8>(out + F8 * i);
-      store(out + F8 * i, o + (seen[l].sample[i] - o) * part);
+      store(out + F8 * i, o + (samples[l].values[i] - o) * part);
     }
   }
   return total;
@@ -190,7 +188,8 @@ class Filling {
     }
     job_.parallel(cell_rows_, [&](int row, int) { find_cells(row); });
     if (stride_ == F8) fill<1>(); else fill<0>();
-    // until here weights of hidden surfaces are negative, which distinguishes them from those of mixed pixels
+    // Until here hidden surfaces have negative weights, which distinguishes them from the second surfaces of mixed
+    // pixels. Small weights of the latter fall to 0, so that a hidden surface can take their place without a step.
     job_.parallel((int)s_.blocks.size(), [&](int i, int) {
       if (!s_.has_block(i)) return;
       const Block b = s_.block(i);
@@ -288,7 +287,7 @@ class Filling {
       if (!any_of(peaks > all(least_limit))) continue;
       for (int i = x; i < std::min(x + LANES, n); i++) {
         const float peak = peaks[i - x], limit = peak > least_limit ? threshold_at(job_, y, x0 + i) : peak;
-        if (peak > limit)  // a hidden surface next to a highlight is not one
+        if (peak > limit)  // a hidden surface next to a highlight is not a highlight
           for (int c = 0; c < C; c++) out[c * pitch + i] *= limit / peak;
       }
     }
@@ -350,7 +349,7 @@ class Filling {
       }
   }
 
-  // Marks cells near which a level used by their pixels has a farther surface; fine_: one of the fine levels has.
+  // Marks cells near which a level used by their pixels has a farther surface; fine_: a fine level has it.
   void find_cells(int row) {
     for (int column = 0; column < cell_columns_; column++) {
       const size_t cell = (size_t)row * cell_columns_ + column;
@@ -385,6 +384,8 @@ class Filling {
     return at;
   }
 
+  // Steps 3 and 4 of `run`. The levels from FINE_LEVELS up are combined once for each cell of STEP pixels, and read like
+  // one level by the pixels.
   template <int VECTORS>
   void fill() {
     const int levels = job_.levels, H = job_.height, W = job_.width, C = C_, count = stride_ / F8;
@@ -393,17 +394,17 @@ class Filling {
     job_.behind_height = rows;
     job_.behind_width = columns;
     job_.behind.resize((size_t)C * rows * columns + 8);  // padding: eight values are read from any position
-    Level together;  // coarse levels combined, behind cells of STEP pixels
-    together.height = rows;
-    together.width = columns;
-    together.step = STEP;
-    together.stride = stride_;
-    together.channels = C;
-    centre(together);
-    together.vote = 0;
+    Level combined;  // mean of the coarse levels behind cells of STEP pixels
+    combined.height = rows;
+    combined.width = columns;
+    combined.step = STEP;
+    combined.stride = stride_;
+    combined.channels = C;
+    centre(combined);
+    combined.vote = 0;
     if (coarse) {
-      together.least_px = pyramid_[FINE_LEVELS].least_px;
-      together.values = Buffer<float>((size_t)rows * columns * stride_);
+      combined.least_px = pyramid_[FINE_LEVELS].least_px;
+      combined.values = Buffer<float>((size_t)rows * columns * stride_);
     }
     std::vector<const Level *> every;
     std::vector<std::vector<Place>> ys, xs;  // positions of the cells in each level
@@ -426,58 +427,58 @@ class Filling {
       for (int c = 0; c < C; c++) mean[c] = (float)(sums[c] / std::max(sums[C], 1e-12));
     }
     job_.parallel(rows, [&](int row, int) {
-      std::vector<float> shows(stride_);
-      std::vector<f8> samples((size_t)levels * count);
-      std::vector<Seen> seen(levels);
-      for (int i = 0; i < levels; i++) seen[i].sample = samples.data() + i * count;
+      std::vector<float> mean_behind(stride_);
+      std::vector<f8> values((size_t)levels * count);
+      std::vector<Sample> samples(levels);
+      for (int i = 0; i < levels; i++) samples[i].values = values.data() + i * count;
       for (int column = 0; column < columns; column++) {
         const size_t at = (size_t)row * columns + column;
-        const float *shown = base.at(row, column);
-        if (!(shown[C + 1] > 0)) shown = mean.data();
-        float *const coarsely = coarse ? together.at(row, column) : nullptr;
-        if (coarse) memset(coarsely, 0, stride_ * sizeof(float));
+        const float *light = base.at(row, column);
+        if (!(light[C + 1] > 0)) light = mean.data();
+        float *const coarse_mean = coarse ? combined.at(row, column) : nullptr;
+        if (coarse) memset(coarse_mean, 0, stride_ * sizeof(float));
         const int top = first_y + row * STEP, left = first_x + column * STEP;
         const int y0 = std::clamp(top, 0, H - 1), y1 = std::clamp(top + STEP - 1 + H % 2, 0, H - 1);
         const int x0 = std::clamp(left, 0, W - 1), x1 = std::clamp(left + STEP - 1 + W % 2, 0, W - 1);
-        bool any = false;
+        bool needed = false;
         for (int r = y0 / cell_; r <= y1 / cell_; r++)
-          for (int c = x0 / cell_; c <= x1 / cell_; c++) any |= found_[(size_t)r * cell_columns_ + c];
-        if (any) {
-          any = false;
+          for (int c = x0 / cell_; c <= x1 / cell_; c++) needed |= found_[(size_t)r * cell_columns_ + c];
+        if (needed) {
+          needed = false;
           float near = NEVER;
           for (int y = y0; y <= y1; y++)
             for (int x = x0; x <= x1; x++) {
               near = std::min(near, s_.coc[(size_t)y * W + x]);
-              any = any || wanted(y, x);
+              needed = needed || wanted(y, x);
             }
-          if (any) {
-            for (int i = 0; i < levels; i++) seen[i].see<VECTORS>(pyramid_[i], ys[i][row], xs[i][column], near);
-            if (coarse) coarsely[C + 1] = mix<VECTORS>(every.data() + FINE_LEVELS, seen.data() + FINE_LEVELS, coarse, false, coarsely);
-            if (mix<VECTORS>(every.data(), seen.data(), levels, true, shows.data()) > 0) shown = shows.data();
+          if (needed) {
+            for (int i = 0; i < levels; i++) samples[i].read<VECTORS>(pyramid_[i], ys[i][row], xs[i][column], near);
+            if (coarse) coarse_mean[C + 1] = mix<VECTORS>(every.data() + FINE_LEVELS, samples.data() + FINE_LEVELS, coarse, false, coarse_mean);
+            if (mix<VECTORS>(every.data(), samples.data(), levels, true, mean_behind.data()) > 0) light = mean_behind.data();
           }
         }
-        for (int c = 0; c < C; c++) job_.behind[(size_t)c * rows * columns + at] = shown[c];
+        for (int c = 0; c < C; c++) job_.behind[(size_t)c * rows * columns + at] = light[c];
       }
     });
-    const int fine = std::min(levels, FINE_LEVELS), looks = fine + (coarse > 0);  // levels that pixels read
-    const Level *look[FINE_LEVELS + 1];
-    for (int i = 0; i < looks; i++) look[i] = i < fine ? &pyramid_[i] : &together;
-    for (int i = 0; i < looks; i++) {
-      ys[i] = places(0, 1, H, look[i]->height, &Level::place_y, *look[i]);
-      xs[i] = places(0, 1, W, look[i]->width, &Level::place_x, *look[i]);
+    const int fine = std::min(levels, FINE_LEVELS), reads = fine + (coarse > 0);
+    const Level *read[FINE_LEVELS + 1];  // by pixels: the fine levels, and the coarse ones combined
+    for (int i = 0; i < reads; i++) read[i] = i < fine ? &pyramid_[i] : &combined;
+    for (int i = 0; i < reads; i++) {
+      ys[i] = places(0, 1, H, read[i]->height, &Level::place_y, *read[i]);
+      xs[i] = places(0, 1, W, read[i]->width, &Level::place_x, *read[i]);
     }
     job_.parallel(s_.block_rows, [&](int by, int) {
-      CellLevels to{look, looks, ys.data(), xs.data()};
+      CellLevels to{read, reads, ys.data(), xs.data()};
       for (int y = by * BLOCK; y < std::min(H, (by + 1) * BLOCK); y += CELL)
         for (int x = 0; x < W; x += CELL) {
-          bool found = false, finely = false;
+          bool found = false, found_fine = false;
           for (int r = y / cell_; r < std::min((y + CELL) / cell_, cell_rows_); r++)
             for (int c = x / cell_; c < std::min((x + CELL) / cell_, cell_columns_); c++) {
               found |= found_[(size_t)r * cell_columns_ + c];
-              finely |= fine_[(size_t)r * cell_columns_ + c];
+              found_fine |= fine_[(size_t)r * cell_columns_ + c];
             }
-          to.first = finely ? 0 : fine;
-          if (found && to.first < looks) C == 3 ? fill_cell<3>(y, x, to) : fill_cell<0>(y, x, to);
+          to.first = found_fine ? 0 : fine;
+          if (found && to.first < reads) C == 3 ? fill_cell<3>(y, x, to) : fill_cell<0>(y, x, to);
         }
     });
   }
@@ -494,6 +495,10 @@ class Filling {
   };
 
   // Fills the second surfaces of a cell: `behind` and `mix` for LANES pixels at once.
+  //
+  // 1. Copy each level's samples so that the four around each of LANES pixels are vectors.
+  // 2. For each vector of pixels and each level, take the mean of the samples behind them, and add it by its votes.
+  // 3. Replace the second surfaces of the pixels that any level voted for.
   template <int CHANNELS>
   void fill_cell(int y0, int x0, CellLevels &to) {
     constexpr int VECTORS = CELL / LANES, ROWS = CELL / 2 + 2;
@@ -502,26 +507,26 @@ class Filling {
     const size_t beside = (size_t)planes * VECTORS, below = 2 * beside, of_level = ROWS * below;
     to.samples.resize(to.count * of_level + planes);
     to.lines.resize(ROWS * planes * CELL);
-    vec *const shown = &to.samples[to.count * of_level];
-    int tops[FINE_LEVELS + 1];
+    vec *const mean = &to.samples[to.count * of_level];
+    int first_rows[FINE_LEVELS + 1];
     for (int i = to.first; i < to.count; i++) {
       const Level &level = *to.levels[i];
       const Place *ys = &to.ys[i][y0], *xs = &to.xs[i][x0];
       const int bottom = std::min(ys[rows - 1].before + 1, level.height - 1), left = xs->before;
       const int last = std::min(xs[columns - 1].before + 1, level.width - 1) - left;
-      tops[i] = ys->before;
+      first_rows[i] = ys->before;
       ivec samples[2][VECTORS];
       for (int x = 0; x < CELL; x++) {
         samples[0][x / LANES][x % LANES] = xs[std::min(x, columns - 1)].before - left;
         samples[1][x / LANES][x % LANES] = std::min(xs[std::min(x, columns - 1)].before - left + 1, last);
       }
       float *line = to.lines.data();
-      for (int row = tops[i]; row <= bottom; row++, line += planes * CELL)
+      for (int row = first_rows[i]; row <= bottom; row++, line += planes * CELL)
         for (int x = 0; x <= last; x++)
           for (int k = 0; k < planes; k++) line[k * CELL + x] = level.at(row, left + x)[k];
       vec *out = &to.samples[i * of_level];
       line = to.lines.data();
-      for (int row = tops[i]; row <= bottom; row++, line += planes * CELL)
+      for (int row = first_rows[i]; row <= bottom; row++, line += planes * CELL)
         for (int side = 0; side < 2; side++)
           for (int k = 0; k < planes; k++)
             for (int v = 0; v < VECTORS; v++) *out++ = pick(line + k * CELL, samples[side][v]);
@@ -538,45 +543,45 @@ class Filling {
         if (!any_of(wanted)) continue;
         const vec end = end_of_surface(here);
         vec total = {};
-        for (int k = 0; k <= C; k++) shown[k] = vec{};
+        for (int k = 0; k <= C; k++) mean[k] = vec{};
         for (int i = to.first; i < to.count; i++) {
           const Level &level = *to.levels[i];
           const Place row = to.ys[i][y0 + y], *xs = &to.xs[i][x0];
           const vec *corners[4];
-          corners[0] = &to.samples[i * of_level + (row.before - tops[i]) * below + v];
+          corners[0] = &to.samples[i * of_level + (row.before - first_rows[i]) * below + v];
           corners[1] = corners[0] + beside;
           corners[2] = corners[0] + (level.height > 1 ? below : 0);
           corners[3] = corners[2] + beside;
-          vec right, any = {}, counts[4];
+          vec right, weight = {}, counts[4];
           for (int x = 0; x < LANES; x++) right[x] = xs[std::min(v * LANES + x, columns - 1)].part;
           const vec left = all(1.0f) - right, shares[4] = {left * (1.0f - row.part), right * (1.0f - row.part), left * row.part, right * row.part};
           for (int k = 0; k < 4; k++) {
             const vec farther = clamp01(corners[k][C * VECTORS] - end - all(BEHIND_PX - 0.5f));
-            any += counts[k] = shares[k] * corners[k][(C + 1) * VECTORS] * farther;
+            weight += counts[k] = shares[k] * corners[k][(C + 1) * VECTORS] * farther;
           }
-          const vec looked = clamp01(size * (1.0f / level.least_px) - all(1.0f));
-          const ivec seen = (any > all(LEAST_SEEN)) & (looked > vec{});
-          if (!any_of(seen)) continue;
-          const vec voted = level.vote > 0 ? level.vote * least(any * (1.0f / SURE), all(1.0f)) : any;
-          const vec vote = seen ? looked * voted : vec{};
+          const vec level_weight = clamp01(size * (1.0f / level.least_px) - all(1.0f));
+          const ivec is_seen = (weight > all(LEAST_SEEN)) & (level_weight > vec{});
+          if (!any_of(is_seen)) continue;
+          const vec voted = level.vote > 0 ? level.vote * least(weight * (1.0f / SURE), all(1.0f)) : weight;
+          const vec vote = is_seen ? level_weight * voted : vec{};
           total += vote;
-          const vec part = vote / most(total, all(1e-9f)), each = all(1.0f) / most(any, all(LEAST_SEEN));
+          const vec part = vote / most(total, all(1e-9f)), each = all(1.0f) / most(weight, all(LEAST_SEEN));
           for (vec &count : counts) count *= each;
           for (int k = 0; k <= C; k++) {
             const size_t plane = (size_t)k * VECTORS;
             const vec sample = corners[0][plane] * counts[0] + corners[1][plane] * counts[1] + corners[2][plane] * counts[2] + corners[3][plane] * counts[3];
-            shown[k] += (sample - shown[k]) * part;
+            mean[k] += (sample - mean[k]) * part;
           }
         }
         wanted &= total > vec{};
         if (!any_of(wanted)) continue;
-        // replace a second surface that matting gave a small weight
+        // replaces a second surface to which matting gave a small weight
         const Block b = s_.make_block(which);
         const size_t at = within + v * LANES;
         const vec mixed = load<vec>(b.weight + at), hidden = least(total * (1.0f / CERTAIN), all(1.0f)) * (2.0f * mixed - HIDDEN_WEIGHT);
         auto replace = [&](float *other, vec hidden_one) { store(other, wanted ? hidden_one : load<vec>(other)); };
-        for (int c = 0; c < C; c++) replace(b.other + c * BLOCK_PIXELS + at, shown[c]);
-        replace(b.coc + at, shown[C]);
+        for (int c = 0; c < C; c++) replace(b.other + c * BLOCK_PIXELS + at, mean[c]);
+        replace(b.coc + at, mean[C]);
         vec valid = all(1.0f);
         for (int x = 0; s_.valid && x < std::min(LANES, columns - v * LANES); x++) valid[x] = s_.valid[(size_t)(y0 + y) * W + x0 + v * LANES + x];
         store(b.weight + at, wanted ? hidden * valid : mixed);

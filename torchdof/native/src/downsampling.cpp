@@ -3,6 +3,7 @@
 // A layer's share of a pixel depends linearly on the pixel's position t between two nodes (0 at the first, 1 at the
 // second). The means of weight w and light, and of w t and light t, over the pixels between each two nodes are
 // therefore enough: the layer at the first node takes mean(w) - mean(w t), the one at the second takes mean(w t).
+// In the code, `sums` are without t, and `sums_behind` with t: of the parts that lie behind the first node.
 #include "engine.h"
 
 namespace torchdof {
@@ -78,7 +79,8 @@ class Downsampling {
   }
 
  private:
-  static constexpr float NOWHERE = -2.0f, FARTHEST = 1e6f;  // node of empty blocks, and of blocks that no layer here uses
+  // Values in place of a node: of empty blocks, and of blocks that no layer of this scale uses.
+  static constexpr float NOWHERE = -2.0f, FARTHEST = 1e6f;
 
   // Computes up to `count` blocks in one cell (or one larger block) of a row; returns how many.
   int blocks(int row, int column, int count, Pieces &pieces) {
@@ -118,23 +120,23 @@ class Downsampling {
         for (int x = 1; x < S; x++) to[j] += columns_of[j * S + x];
       }
     };
-    vec far[S][PARTS], one[PARTS], two[PARTS] = {};
+    vec far[S][PARTS], sums[PARTS], sums_behind[PARTS] = {};
     for (int y = 0; y < S; y++)
       for (int p = 0; p < PARTS; p++)
-        two[p] += far[y][p] = behind(job_.layers[k], index_.place(load<vec>(coc + y * s_.width + p * LANES)), over_);
+        sums_behind[p] += far[y][p] = behind(job_.layers[k], index_.place(load<vec>(coc + y * s_.width + p * LANES)), over_);
     std::fill(to_.row(0, row) + column, to_.row(0, row) + column + COUNT, (float)to_.stands_for[k]);
     std::fill(to_.row(1, row) + column, to_.row(1, row) + column + COUNT, 1.0f);
-    put(2, two);
+    put(2, sums_behind);
     for (int c = 0; c < C_; c++) {
-      for (int p = 0; p < PARTS; p++) one[p] = two[p] = vec{};
+      for (int p = 0; p < PARTS; p++) sums[p] = sums_behind[p] = vec{};
       for (int y = 0; y < S; y++)
         for (int p = 0; p < PARTS; p++) {
           const vec v = load<vec>(light_[c] + y * light_step + p * LANES);
-          one[p] += v;
-          two[p] += v * far[y][p];
+          sums[p] += v;
+          sums_behind[p] += v * far[y][p];
         }
-      put(3 + c, one);
-      put(3 + C_ + c, two);
+      put(3 + c, sums);
+      put(3 + C_ + c, sums_behind);
     }
   }
 
@@ -158,12 +160,12 @@ class Downsampling {
           store(coc_[there] + i, load<vec>(coc + x));
         }
     }
-    const bool two = there == 2 && mixed(y0, x0) && continue_farther(S * WIDTH);
+    const bool continues = there == 2 && mixed(y0, x0) && continue_farther(S * WIDTH);
     const size_t light_step = s_.has_block(y0 / BLOCK * s_.block_columns + x0 / BLOCK) ? BLOCK : s_.width;
     cell_nodes_.clear();
     for (int i = 0; i < there; i++)
-      two ? sum_intervals<S, true>(i, light_step, before_[i], after_[i]) : sum_intervals<S, false>(i, light_step, weight_[i], weight_[i]);
-    for (int i = 0; two && i < (int)corrections_.size(); i++) {
+      continues ? sum_intervals<S, true>(i, light_step, before_[i], after_[i]) : sum_intervals<S, false>(i, light_step, weight_[i], weight_[i]);
+    for (int i = 0; continues && i < (int)corrections_.size(); i++) {
       const NormalizerCorrection &of = corrections_[i];
       float *sums = &cell_sums_[cell_sums_of(to_.stands_for[of.node] | Pieces::NORMALIZER_ONLY, COUNT)] + of.pixel % WIDTH / S;
       sums[0] += of.up_to * each_;
@@ -204,7 +206,7 @@ class Downsampling {
       int k = DONE;
       for (int lane = 0; lane < LANES; lane++) k = std::max(k, (int)last[lane]);
       if (k == DONE) return;
-      vec one[PARTS] = {}, two[PARTS] = {};
+      vec sums[PARTS] = {}, sums_behind[PARTS] = {};
       last = ivec{} + DONE;
       for (int y = 0; y < S; y++)
         for (int p = 0; p < PARTS; p++) {
@@ -215,32 +217,32 @@ class Downsampling {
           if (to_.wanted[k]) {
             const vec far = behind(job_.layers[k], place[y][p], over_), second = MIXED ? its ? load<vec>(after + i) : vec{} : first;
             if (MIXED) share[y][p] += far * (second - first);
-            two[p] += part[y][p] = far * second;
+            sums_behind[p] += part[y][p] = far * second;
           }
-          one[p] += share[y][p];
+          sums[p] += share[y][p];
           interval[y][p] = its ? ivec{} + DONE : interval[y][p];
           last = most(last, interval[y][p]);
         }
       if (!to_.needed(k)) continue;
-      const size_t sums = cell_sums_of(to_.stands_for[k], COUNT);
-      auto put = [&](int value, const vec *sum) {  // sums of S neighbours
-        float columns_of[WIDTH], *to = cell_sums_.data() + sums + value * COUNT;
+      const size_t start = cell_sums_of(to_.stands_for[k], COUNT);
+      auto put = [&](int value, const vec *sum) {  // adds sums of S neighbours
+        float columns_of[WIDTH], *to = cell_sums_.data() + start + value * COUNT;
         for (int p = 0; p < PARTS; p++) store(columns_of + p * LANES, sum[p] * each_);
         for (int x = 0; x < WIDTH; x++) to[x / S] += columns_of[x];
       };
-      put(0, one);
+      put(0, sums);
       if (!to_.wanted[k]) continue;
-      put(C + 1, two);
+      put(C + 1, sums_behind);
       for (int c = 0; c < C; c++) {
-        for (int p = 0; p < PARTS; p++) one[p] = two[p] = vec{};
+        for (int p = 0; p < PARTS; p++) sums[p] = sums_behind[p] = vec{};
         for (int y = 0; y < S; y++)
           for (int p = 0; p < PARTS; p++) {
             const vec v = load<vec>(light_of_[surface][c] + y * light_step + p * LANES);
-            one[p] += v * share[y][p];
-            two[p] += v * part[y][p];
+            sums[p] += v * share[y][p];
+            sums_behind[p] += v * part[y][p];
           }
-        put(1 + c, one);
-        put(C + 2 + c, two);
+        put(1 + c, sums);
+        put(C + 2 + c, sums_behind);
       }
     }
   }
@@ -265,12 +267,12 @@ class Downsampling {
   void put_in_planes(int row, int column, float node, const float *values, int step, float factor) {
     to_.row(0, row)[column] = node;
     if (!values) return;
-    const float *one = values, *two = values + (C_ + 1) * step;
-    to_.row(1, row)[column] = one[0] * factor;
-    to_.row(2, row)[column] = two[0] * factor;
+    const float *means = values, *means_behind = values + (C_ + 1) * step;
+    to_.row(1, row)[column] = means[0] * factor;
+    to_.row(2, row)[column] = means_behind[0] * factor;
     for (int c = 0; c < C_; c++) {
-      to_.row(3 + c, row)[column] = one[(1 + c) * step] * factor;
-      to_.row(3 + C_ + c, row)[column] = two[(1 + c) * step] * factor;
+      to_.row(3 + c, row)[column] = means[(1 + c) * step] * factor;
+      to_.row(3 + C_ + c, row)[column] = means_behind[(1 + c) * step] * factor;
     }
   }
 
@@ -364,9 +366,9 @@ class Downsampling {
       there[i] = read_beyond(i, y0, x0, count, columns);
       for (int j = 0; there[i] && j < count; j += LANES) store(far_[i] + j, far_between(i, j));
     }
-    const bool two = there[0] && there[1] && mixed(y0, x0) && continue_farther(count);
+    const bool continues = there[0] && there[1] && mixed(y0, x0) && continue_farther(count);
     for (int i = 0; i < s_.count; i++)
-      if (there[i]) sum_pixels(i, y0, x0, count, columns, two ? before_[i] : weight_[i], two ? after_[i] : weight_[i]);
+      if (there[i]) sum_pixels(i, y0, x0, count, columns, continues ? before_[i] : weight_[i], continues ? after_[i] : weight_[i]);
     // remove contributions of weight 0
     for (int i = 0; i < gathered_.count;) {
       if (gathered_.values[(size_t)i * stride_] != 0) {
@@ -377,7 +379,7 @@ class Downsampling {
       gathered_.nodes[i] = gathered_.nodes[gathered_.count];
       memcpy(&gathered_.values[(size_t)i * stride_], &gathered_.values[(size_t)gathered_.count * stride_], stride_ * sizeof(float));
     }
-    if (!two) return;
+    if (!continues) return;
     for (const NormalizerCorrection &of : corrections_) {
       float *values = gathered_.between(to_.stands_for[of.node] | Pieces::NORMALIZER_ONLY);
       values[0] += line * of.up_to;
@@ -389,7 +391,7 @@ class Downsampling {
   void sum_pixels(int i, int y0, int x0, int count, int columns, const float *before, const float *after) {
     const int H = job_.height, W = job_.width, C = C_, line = to_.scale * to_.scale / count;
     int last = -1;
-    float *one = nullptr;
+    float *sums = nullptr;
     for (int j = 0; j < count; j++) {
       const float first = line * before[j], second = line * after[j];
       if (second == 0) continue;
@@ -397,25 +399,25 @@ class Downsampling {
       if (!to_.needed(k)) continue;
       if (k != last) {
         last = k;
-        one = gathered_.between(to_.stands_for[k]);
+        sums = gathered_.between(to_.stands_for[k]);
       }
       if (!to_.wanted[k]) {
-        one[0] += first;
+        sums[0] += first;
         continue;
       }
       const int y = y0 + j / columns, x = x0 + j % columns, at_y = std::clamp(y, 0, H - 1), at_x = std::clamp(x, 0, W - 1);
       const float far = far_[i][j], part = far * second, w = first + far * (second - first);
       const float *coc, *weight;
       s_.row(i, at_y, at_x, light_.data(), coc, weight);
-      float *parts = one + C + 1;
-      one[0] += w;
-      parts[0] += part;
+      float *sums_behind = sums + C + 1;
+      sums[0] += w;
+      sums_behind[0] += part;
       for (int c = 0; c < C; c++) {
         const float v = line > 1                   ? border_.mean_light(i, c, y, x, line, *light_[c])
                         : y != at_y || x != at_x ? border_.light(i, c, y, x, *light_[c])
                                                  : *light_[c];
-        one[1 + c] += v * w;
-        parts[1 + c] += v * part;
+        sums[1 + c] += v * w;
+        sums_behind[1 + c] += v * part;
       }
     }
   }
@@ -468,7 +470,7 @@ Downsampled::Downsampled(const Job &job, int scale, int margin)
 }
 
 void Downsampled::take(const Job &job, const LayerIndex &index, const Border &border) {
-  // blocks within twice the reach of those in which a layer of this scale occurs: its blur, and what lies behind it
+  // blocks that layers of this scale may need: within twice the reach of a block in which one of them occurs
   const int cells = BLOCK / CELL, block_rows = job.surfaces.block_rows, block_columns = job.surfaces.block_columns;
   std::vector<uint64_t> layers(index.words, 0);
   for (int k = 0; k < (int)job.layers.size(); k++)

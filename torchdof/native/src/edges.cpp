@@ -14,14 +14,29 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, DIRECTIONS = 5, KINDS = DIRECTIONS * PLACES, ROUNDS = 10;
-constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TIE = 0.017f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.025f, DOUBTFUL = 0.05f, RELATED = 0.8f, SOFT = 0.1f, WIDE = 1.5f, MIXED = 0.5f, SHARPNESS = 1.6f, MOST = 4.0f, CLIMBED = 0.35f, PIXEL = 0.2f, BETTER = 0.5f, LEAN = 2.0f;
-constexpr float NOISES = 12.0f, LEVELS_OF_A_FILE = 64.0f, OVERSHOOT = 0.12f;
-constexpr int NOISE_SAMPLED = 1 << 13, SAMPLED = 12000, SAMPLE_BLOCK = 8, BLUR_REACH = 9, USUAL_REACH = REACH + 2, LAMP_REACH = 2, RINGING_REACH = 3, SIDE_REACH = 6, LOWEST_REACH = 12;
-constexpr int AREA = 96, FLAT_REACH = 8, ROWS_AHEAD = 8;
+// Constants in the groups of render/edges.py, which gives their meanings, units and effects.
+constexpr int RINGS = 3, RAMP_REACH = 6, FLAT_REACH = 8;  // edges; FLAT_REACH: pixels within which a ramp becomes flat
+constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TIE = 0.017f;
+constexpr float NOISES = 12.0f, LEVELS_OF_A_FILE = 64.0f;  // noise
+constexpr int NOISE_SAMPLED = 1 << 13;
+constexpr int REACH = 5;  // colour
+constexpr float SHARPNESS = 1.6f;
+constexpr int DIRECTIONS = 5, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, KINDS = DIRECTIONS * PLACES;  // prior
+constexpr int SAMPLED = 12000, SAMPLE_BLOCK = 8, ROUNDS = 10;
+constexpr float TRUSTED = 0.05f, PRIOR_COUNT = 30.0f;
+constexpr float RELATED = 0.8f, EXACT = 0.025f, DOUBTFUL = 0.05f, LEAN = 2.0f;  // decision, in automatic mode
+constexpr float SOFT = 0.1f, WIDE = 1.5f, MIXED = 0.5f;  // soft maps
+constexpr float MOST = 4.0f, CLIMBED = 0.35f, PIXEL = 0.2f, BETTER = 0.5f, OVERSHOOT = 0.12f;  // thin structures, ringing
+constexpr int BLUR_REACH = 9, RINGING_REACH = 3;
+// Half widths in pixels of further windows: the usual light around a lamp, a lamp, both surfaces, the farthest one.
+constexpr int USUAL_REACH = REACH + 2, LAMP_REACH = 2, SIDE_REACH = 6, LOWEST_REACH = 12;
+
+constexpr int AREA = 96;       // side of a tile in pixels
+constexpr int ROWS_AHEAD = 8;  // rows by which values are prefetched
 // A pixel's result depends on the pixels within this many of it: without ramps, and with ramps.
 constexpr int STEP_HALO = RINGS + REACH, HALO = RINGS + RAMP_REACH + FLAT_REACH + 3;
-constexpr float NONE = 1e30f, NO_SCORE = 100.0f;  // NO_SCORE: marks pixels without a score; above all scores
+constexpr float NONE = 1e30f;       // negated, replaces invalid values in maxima
+constexpr float NO_SCORE = 100.0f;  // marks pixels without a score; above all scores
 constexpr int NEIGHBOURS[8][2] = {{-1, -1}, {-1, 0}, {-1, 1}, {0, -1}, {0, 1}, {1, -1}, {1, 0}, {1, 1}};
 constexpr float LARGEST = 1e15f, BRIGHTEST = 1e30f, FINITE = 3.402823466e38f;
 // Vectors of a window of SIDE x SIDE pixels: first WHOLE columns of each row, then the remaining 4 columns.
@@ -31,7 +46,7 @@ static_assert(SIDE - WHOLE <= 4 && WHOLE > REACH + 1);
 // Bits of a pixel's mark. NEAR: it shows the near surface. GIVEN_NEAR: the map gives it the near surface's depth. Bits
 // from UNSURE up: index into SURE.
 constexpr uint8_t EDGE = 1, RAMP = 2, NEAR = 4, GIVEN_NEAR = 8, LISTED = 16, UNSURE = 32;
-// weight as a colour reference: far from steps, RINGS pixels from one, ..., beside one; none
+// weight as a colour reference: far from steps, RINGS pixels from one, ..., beside one; 0 for invalid pixels and ramps
 constexpr float SURE[256 / UNSURE] = {1.0f, 0.2f, 0.06f, 0.02f, 0.0f};
 
 // A rectangle in the coordinates of the frame; may reach beyond the frame.
@@ -188,7 +203,7 @@ inline vec max_3x3(const float *from, int pitch) {
   return high;
 }
 
-// The same for each value of a part.
+// Maximum over 3 x 3 values around each value of a part.
 void max_3x3(const Grid &in, const Grid &out, const Part &part) {
   for (int x = part.x0; x < part.right(); x += LANES) {
     const auto row = [&](int y) {
@@ -281,17 +296,17 @@ class Repair {
     allocate();
     noise_step_ = NOISES * noise();
     const int every = (int)std::ceil(std::sqrt((double)area_ / SAMPLED));
-    const bool spares = map_.automatic && every > 4;  // the sample is a small part of the frame: find only its edges first
+    const bool finds_twice = map_.automatic && every > 4;  // the sample is a small part of the frame: find only its edges first
     const auto is_sampled = [&](int y, int x) { return (block_of(y, height_) + block_of(x, width_)) % every == 0; };
     std::vector<Group> groups, sampled;
     KindMask all_kinds;
     all_kinds.fill(true);
-    if (spares) {
+    if (finds_twice) {
       sampled = find_in(blocks(is_sampled), REACH, false, false, all_kinds);
     } else {
       sampled = groups = find_in(tiles(), 0, false, true, all_kinds);
     }
-    // the margins contain others
+    // blocks and tiles contain edge pixels that are not sampled
     choose_edges(sampled, [&](const Edge &edge) { return is_sampled(edge.i / width_, edge.i % width_); });
     allocate_results(sampled);
     judge(sampled, false);
@@ -303,10 +318,10 @@ class Repair {
       memcpy(map_.out + (size_t)y * width_, map_.nearness + (size_t)y * width_, width_ * sizeof(float));
     });
     const KindMask doubtful = map_.automatic ? doubtful_kinds(is_soft) : all_kinds;
-    if (spares)
+    if (finds_twice)
       groups = find_in(tiles(), 0, is_soft, is_soft, doubtful);
     else
-      choose_edges(groups, [&](const Edge &edge) { return doubtful[side_of(edge)]; });
+      choose_edges(groups, [&](const Edge &edge) { return doubtful[given_kind_of(edge)]; });
     allocate_results(groups);
     judge(groups, true);
     const float sigma = blur(), lost_px = choose(groups);
@@ -328,17 +343,17 @@ class Repair {
 
   float step(size_t i) const { return std::max(map_.steps ? map_.steps[i] : map_.step, noise_step_); }
   float nearness(size_t i) const { return sign_ * map_.nearness[i]; }
-  // Kind of an edge pixel, plus KINDS if the map gives it the near surface.
-  int side_of(const Edge &edge) const { return edge.kind + (marks_[edge.i] & GIVEN_NEAR ? KINDS : 0); }
-  // Share of those pixels that the map gives the wrong surface.
-  float wrong(int side) const { return side >= KINDS ? 1.0f - shares_[side - KINDS] : shares_[side]; }
+  // Kind of an edge pixel, plus KINDS if the map gives it the near surface: an index into a KindMask.
+  int given_kind_of(const Edge &edge) const { return edge.kind + (marks_[edge.i] & GIVEN_NEAR ? KINDS : 0); }
+  // Share of the pixels of a given kind to which the map gives the wrong surface.
+  float wrong(int given_kind) const { return given_kind >= KINDS ? 1.0f - shares_[given_kind - KINDS] : shares_[given_kind]; }
   static float valid(float v) { return std::fabs(v) <= LARGEST ? v : 0.0f; }
   static vec valid(vec v) { return size_of(v) <= all(LARGEST) ? v : vec{}; }
   static float root(float light) { return (light <= FINITE) & (light > 0) ? std::sqrt(std::min(light, BRIGHTEST)) : 0.0f; }
 
   // Standard deviation of the map's noise, from the median second difference along rows or columns, whichever is
-  // larger; at least that of rounding to multiples of the smallest difference of two neighbours, if the map has more
-  // than LEVELS_OF_A_FILE of them.
+  // larger. At least the noise of rounding, if the map has more than LEVELS_OF_A_FILE levels; their distance is the
+  // smallest difference of two neighbours.
   float noise() const {
     const int every = (int)((2 * (int64_t)area_ + NOISE_SAMPLED - 1) / NOISE_SAMPLED);
     float quantum = INFINITY, span = 0;
@@ -408,7 +423,7 @@ class Repair {
     for (const Group &group : sampled)
       for (const Edge &edge : group.edges)
         if (!(marks_[edge.i] & RAMP)) {
-          found += wrong(side_of(edge));
+          found += wrong(given_kind_of(edge));
           steps++;
         }
     return found > EXACT * steps;
@@ -450,7 +465,7 @@ class Repair {
   // The kinds of pixels to decide in automatic mode: steps of kinds that are often wrong, and ramps if the map is soft.
   KindMask doubtful_kinds(bool is_soft) const {
     KindMask selected;
-    for (int side = 0; side < 2 * KINDS; side++) selected[side] = side % KINDS / DIRECTIONS >= 2 * RINGS ? is_soft : wrong(side) > DOUBTFUL;
+    for (int kind = 0; kind < 2 * KINDS; kind++) selected[kind] = kind % KINDS / DIRECTIONS >= 2 * RINGS ? is_soft : wrong(kind) > DOUBTFUL;
     return selected;
   }
 
@@ -578,7 +593,7 @@ class Repair {
     return groups;
   }
 
-  // The same for one part; returns the end of the edges found.
+  // Finds the edges of one part in the thread's buffer; returns their end.
   const Edge *find_in(const Part &own, const Part &part, bool expects_ramps, const KindMask &selected, EdgeSums *found) {
     for (int y = part.y0; y < part.bottom(); y++) {
       const size_t i = (size_t)y * width_ + part.x0;
@@ -636,7 +651,7 @@ class Repair {
     return {y0, x0, std::min(part.bottom(), wide.bottom()) - y0, std::min(part.right(), wide.right()) - x0};
   }
 
-  // The same for the changing part; returns null if ramps require the larger halo.
+  // Finds the edges of the changing part; returns null if ramps require the larger halo.
   //
   // 1. Slopes that continue on both sides of a pixel are ramp candidates; end_ramps keeps the true ramps.
   // 2. Near and far surface within 1, 2 and 3 pixels, by maximum filters.
@@ -684,10 +699,10 @@ class Repair {
       end_ramps(up, down, slope, high, low, rows, ramp, ramps);
       each_vector(beside, [&](int y, int x) {
         const vec near = load<vec>(high.at(y, x)), far = load<vec>(low.at(y, x));
-        const auto is_one = is_ramp(y, x) & (near + far > step_at(y, x));
-        store(ramp.at(y, x), is_one ? all(1.0f) : vec{});
-        store(up.at(y, x), is_one ? near : load<vec>(up.at(y, x)));
-        store(down.at(y, x), is_one ? far : load<vec>(down.at(y, x)));
+        const auto is_kept = is_ramp(y, x) & (near + far > step_at(y, x));
+        store(ramp.at(y, x), is_kept ? all(1.0f) : vec{});
+        store(up.at(y, x), is_kept ? near : load<vec>(up.at(y, x)));
+        store(down.at(y, x), is_kept ? far : load<vec>(down.at(y, x)));
       });
     }
     // near and far surface within r + 1 pixels
@@ -775,7 +790,7 @@ class Repair {
     }
   }
 
-  // slope: the gradient where it has the same sign on both sides, else 0. jump: how much the steeper side exceeds it.
+  // slope: the smaller change to both neighbours if these have one sign, else 0. jump: the larger change minus the slope.
   void slopes(const Grid &raw, const Grid &slope, const Grid &jump, const Part &part) const {
     const auto known = [](vec change) { return size_of(change) <= all(FINITE) ? change : vec{}; };
     each_vector(part, [&](int y, int x) {
@@ -843,7 +858,7 @@ class Repair {
 
   // For each edge: the score of its surfaces by colour and, if wanted, their nearness.
   void judge(std::vector<Group> &groups, bool wants_surfaces) const {
-    // not its own reference
+    // a pixel is not its own reference
     const std::vector<float> falloff = window([](float square) { return square > 0 ? std::exp(-square / 12.5f) : 0.0f; });
     parallel((int)groups.size(), [&](int g) {
       if (groups[g].edges.empty()) return;
@@ -860,6 +875,11 @@ class Repair {
   //
   // The reference colours of a surface are those of the window's pixels whose nearness is within a quarter of the gap.
   // A surface's likelihood is the mean of (1 + d / spread)^-2 over them, d being the squared colour difference.
+  //
+  // 1. Sum over each pixel's window the weights and colour differences of the references of both surfaces.
+  // 2. For LANES pixels at once, compute the spread of the references' colours, and the contrast of the surfaces.
+  // 3. Sum the likelihoods over the windows, which need the spread.
+  // 4. The score is the logarithm of the likelihoods' ratio; the reliability grows with the contrast.
   template <int C>
   void judge(Group &group, const float *falloff, bool wants_surfaces) const {
     const int channels = C ? C : channels_, count = 4 + 2 * channels;
@@ -885,7 +905,7 @@ class Repair {
       const int lane = (int)(k % LANES);
       Window &window = windows[lane];
       const float near = edge.near, far = edge.far;
-      const vec most_off = all(0.25f * std::max(near - far, 1e-12f));
+      const vec most_difference = all(0.25f * std::max(near - far, 1e-12f));
       vec few[C ? 4 + 2 * C : 1];
       float few_sums[C ? 4 + 2 * C + 3 : 1], few_own[C ? C : 1];
       // of both surfaces: weights, squared colour differences, colour differences of each channel
@@ -896,20 +916,20 @@ class Repair {
       for (int c = 0; c < channels; c++) own[c] = colour_at[c * colour.size + REACH * colour.pitch + REACH];
       each_of_window([&](int n, const auto &take) {
         const vec value = take(given_at, given.pitch), weight = load<vec>(falloff + n * LANES) * take(witness_at, given.pitch), off = value - near;
-        const vec w[2] = {size_of(off) < most_off ? weight : none, size_of(value - far) < most_off ? weight : none};
-        vec stray = none;
+        const vec w[2] = {size_of(off) < most_difference ? weight : none, size_of(value - far) < most_difference ? weight : none};
+        vec apart = none;  // squared colour difference
         for (int c = 0; c < channels; c++) {
           const vec d = take(colour_at + c * colour.size, given.pitch) - own[c];
-          stray += d * d;
+          apart += d * d;
           for (int side = 0; side < 2; side++) sums[4 + 2 * c + side] += w[side] * d;
         }
         for (int side = 0; side < 2; side++) {
           sums[side] += w[side];
-          sums[2 + side] += w[side] * stray;
+          sums[2 + side] += w[side] * apart;
           window.weights[side][n] = w[side];
         }
         window.values[n] = off;
-        window.apart[n] = stray;
+        window.apart[n] = apart;
       });
       sum(sums, count, totals);
       for (int n = 0; n < count; n++) of_lanes[n * LANES + lane] = totals[n];
@@ -1056,7 +1076,7 @@ class Repair {
     std::vector<float> each(KINDS);
     for (int k = 0; k < KINDS; k++) each[k] = together[k / DIRECTIONS];
     shares_ = fit(observations, 1, std::vector<float>(KINDS, 0.5f), each);
-    // a pixel farther from the step is not more often wrong than one nearer to it
+    // pixels farther from a step are at least as often right as those beside it
     for (int r = 1; r < RINGS; r++)
       for (int d = 0; d < DIRECTIONS; d++) {
         float *far = &shares_[r * DIRECTIONS + d], *near = &shares_[(RINGS + r) * DIRECTIONS + d];
@@ -1121,7 +1141,8 @@ class Repair {
     return (float)(total / std::max(found_.length, 1e-12));
   }
 
-  // How much nearness thin structures may have lost, 0 to 1: 0 where the map's near surfaces are too wide.
+  // Confidence that thin structures are flattened, 0 to 1, from the mean width in pixels by which surfaces are too
+  // narrow; 0 if they are 1 px too wide.
   static float loss_factor(float lost_px) { return clamp01(2.4f + 2.5f * lost_px); }
 
   // Moves pixels to the nearness of the surface that they show; on ramps in proportion to the evidence.
@@ -1132,7 +1153,7 @@ class Repair {
       // near the end of a wide ramp only one surface is in reach: use the strongest evidence within three pixels
       const Part around = group.bounds.grown(3);
       const Grid evidence(around), strongest(group.bounds), rows(around);
-      if (is_soft || !map_.automatic) {  // else no ramps are selected
+      if (is_soft || !map_.automatic) {  // otherwise no ramps are selected
         take_listed(evidence_.data(), evidence, 0.0f);
         max_filter<3>(evidence, strongest, rows, group.bounds);
       }
@@ -1321,7 +1342,7 @@ class Repair {
     return found;
   }
 
-  // Restores the nearness of lamps a few pixels wide, which a soft map has spread around them.
+  // Raises the nearness of lamps of a few pixels, which a soft map averages with their surroundings.
   void lift_lamps(float sigma, float lost_px) const {
     const std::vector<float> weights = even_window();
     const std::vector<Group> all_parts = tiles();
@@ -1446,7 +1467,7 @@ class Repair {
   const float sign_;  // -1 for a map of coc, where larger is farther
   const int height_, width_, channels_;
   const size_t area_;
-  float noise_step_ = 0.0f;  // least step that stands out of the map's noise
+  float noise_step_ = 0.0f;  // smallest step that is larger than the map's noise
   Buffer<float> score_, evidence_;
   Buffer<uint8_t> marks_;
   Buffer<Judgement> judged_;  // of the edges given memory last

@@ -48,7 +48,12 @@ static void ends_of(const float *values, int width, int rows, float *low, float 
   }
 }
 
-// Takes the inputs; replaces values that are not finite, and clamps coc to the range of the layers.
+// Takes the inputs.
+//
+// 1. Replace values that are not finite by 0, in copies, and mark their pixels.
+// 2. Find the extremes of coc and light in each block and in the frame; refuse light whose powers would overflow.
+// 3. Clamp coc to the range of the layers, if it exceeds that.
+// 4. Copy the blocks with marked pixels, where these get the weight 0.
 void Job::take_scene() {
   surfaces.height = height;
   surfaces.width = width;

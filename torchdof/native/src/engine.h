@@ -127,16 +127,15 @@ class Buffer {
   std::unique_ptr<T, Give> data_;
 };
 
-constexpr int BLOCK = 16;  // side in pixels of the blocks in which second surfaces are stored
+// Sides in pixels
+constexpr int BLOCK = 16;  // of the blocks in which second surfaces are stored
 constexpr int BLOCK_PIXELS = BLOCK * BLOCK;
-constexpr int CELL = 8;              // side in pixels of the cells for which layers and occluders are listed
-constexpr int TILE = 64;             // side in pixels of the tiles that are composited at once
-constexpr float NEVER = 1e9f;        // larger than any coc
-constexpr float KNOWN = 2e-3f;           // blurred weight at which a layer's colour is fully known; below, 1 / weight is damped
-constexpr float BEHIND_PX = 1.0f;        // difference in coc at which a surface counts as another one behind
-constexpr float OWN_SLOPE = 0.25f;       // part of a pixel's blur by which its own surface may be farther nearby
-constexpr float LEAST_SEEN = 1e-4f;      // weight of a sample behind up to which it counts as empty
-constexpr float HIDDEN_WEIGHT = 0.003f;  // weight of a filled hidden surface, against 1 for a visible one
+constexpr int CELL = 8;   // of the cells for which layers and occluders are listed
+constexpr int TILE = 64;  // of the tiles that are composited at once
+
+// Constants of render/composite.py, disocclusion.py and surfaces.py, which give their meanings and effects.
+constexpr float KNOWN = 2e-3f, BEHIND_PX = 1.0f, OWN_SLOPE = 0.25f, LEAST_SEEN = 1e-4f, HIDDEN_WEIGHT = 0.003f;
+constexpr float NEVER = 1e9f;  // larger than any coc
 
 // Largest coc of a pixel's own surface nearby.
 template <typename V>
@@ -236,8 +235,8 @@ struct Layer {
   double node = 0;
   float before = 0, per_before = 0, at = 0, per_after = 0;  // ends and slopes of the ramps before and after the layer
   bool first = false;
-  const torchdof_shares *shares = nullptr;
-  bool spots = false;           // shares are 0 at and beyond the edge of their samples
+  const torchdof_field_mask *shares = nullptr;
+  bool spots = false;           // the field mask is 0 at and beyond the edge of its samples
   std::vector<Kernel> kernels;  // 1, or one for each colour
 };
 
@@ -267,8 +266,8 @@ inline V ramp(V v, bool ease) {
   v = least(most(v, zero), zero + 1.0f);
   return ease ? eased(v) : v;
 }
-// Share of a surface at place `place` that belongs to the layer or to layers behind it; and to layers behind it. Eased
-// under occlusion.
+// Share of a surface at `place` that belongs to the layer or to layers behind it; below, the share that belongs to layers
+// behind it. Both are eased under occlusion.
 template <typename V>
 inline V at_or_behind(const Layer &l, V place, bool ease) {
   return ramp((place - l.before) * l.per_before + (l.first ? 1.0f : 0.0f), ease);
@@ -282,9 +281,9 @@ inline V behind(const Layer &l, V place, bool ease) {
 constexpr float HIDING_SHARE = 0.06f;
 // share of a mixed pixel's farther surface, above HIDDEN_WEIGHT, at which its continuation is full
 constexpr float CONTINUATION_SHARE = 0.1f;
-// The farther surface of a mixed pixel continues behind the nearer one. The first function gives the extra weight for
-// that continuation, from the farther surface's share of the pixel; the second the part of it that is visible in a
-// layer, from the nearer surface's share at or behind the layer.
+// The farther surface of a mixed pixel continues behind the nearer one. `continuation` gives its extra weight, from its
+// share of the pixel. `visible_continuation` gives the part of this weight that counts in a layer, from the nearer
+// surface's share at or behind the layer.
 template <typename V>
 inline V continuation(V share) {
   const V zero = {}, known = (share - HIDDEN_WEIGHT) * (1.0f / CONTINUATION_SHARE);
@@ -432,8 +431,8 @@ struct Visibility {
   }
   // Remainders of a bin and of the bin before, as a cell with a surface of the bin has them.
   static uint64_t remainders_of(int bin) { return 1ull << bin % 64 | 1ull << (bin + 63) % 64; }
-  // Whether a cell may contain a surface of a bin. Classes alone take a distant coc of the same class for it, remainders
-  // alone one that is 64 px away.
+  // Whether a cell may contain a surface of a bin. Classes alone would accept a distant coc of the same class, remainders
+  // alone a coc that is 64 px away.
   bool may_show(const Cell &cell, uint64_t classes, uint64_t remainders) const {
     return (cell.classes & classes) != 0 && (cell.remainders & remainders) != 0;
   }
@@ -482,8 +481,8 @@ class Downsampled {
   int scale, margin, rows, columns, channels, pitch, first_band;  // margin: blocks around the frame
   // for each band of BLOCK rows of pixels: contributions beyond the first of a block, which is in the planes
   std::vector<Pieces> pieces;
-  // For each interval between nodes: whether a layer of this scale blurs it, whether it lies behind such a layer, and
-  // the interval that represents it.
+  // For each interval between nodes: whether a layer of this scale blurs it, whether it lies behind one of them, and the
+  // interval that represents it.
   std::vector<uint8_t> wanted, behind;
   std::vector<uint16_t> stands_for;
   std::vector<uint8_t> near;  // blocks of BLOCK x BLOCK pixels that layers of this scale may reach
@@ -510,7 +509,7 @@ class FieldMask {
   static constexpr float LEAST = 1e-6f;         // share of a kernel's light below which the kernel is left unmasked
 
   // For the samples a, or the mix of a and b with weight `part` of b. y, x: position in half diagonals from the centre.
-  FieldMask(const torchdof_scene &scene, const torchdof_shares &a, const torchdof_shares *b, float part, int colour, float y, float x)
+  FieldMask(const torchdof_scene &scene, const torchdof_field_mask &a, const torchdof_field_mask *b, float part, int colour, float y, float x)
       : squeeze_(scene.squeeze), part_(part), both_(b != nullptr) {
     x += ASIDE;
     const float distance = std::sqrt(y * y + x * x), place = std::min(distance, 1.0f) * (scene.distances - 1);
@@ -518,7 +517,7 @@ class FieldMask {
     const float near = place - low;
     down_ = y / distance;
     right_ = x / distance;
-    const torchdof_shares *const of[2] = {&a, b};
+    const torchdof_field_mask *const of[2] = {&a, b};
     float box[3] = {};
     for (int k = 0; k <= both_; k++) {
       const float *p = of[k]->boxes + 3 * low, weight = both_ ? k ? part : 1.0f - part : 1.0f;
@@ -539,14 +538,14 @@ class FieldMask {
       s.next = s.values + count;
     }
   }
-  // Shares at dx, dx + 1, ...
+  // Transmittance at dx, dx + 1, ...
   vec shares_along(float dy, float dx) const {
     vec across;
     for (int i = 0; i < LANES; i++) across[i] = (dx + i) * squeeze_;
     const vec u = dy * down_ + across * right_, v = across * down_ - dy * right_, first = samples_[0].at(u, most(v, -v));
     return both_ ? (1.0f - part_) * first + part_ * samples_[1].at(u, most(v, -v)) : first;
   }
-  // Shares at dy, dy - 1, ... for samples of a single radius.
+  // Transmittance at dy, dy - 1, ... for samples of a single radius.
   vec shares(float dy, float dx) const {
     const float across = dx * squeeze_;
     vec step;
@@ -600,8 +599,8 @@ class FieldMask {
 inline float per_half_diagonal(const torchdof_scene &scene) {
   return 2.0f / std::sqrt((float)scene.height * scene.height + (float)scene.width * scene.width);
 }
-// Whether shares are 0 at the edge of their samples.
-bool ends_dark(const torchdof_shares &shares, int distances);
+// Whether a field mask is 0 at the edge of its samples.
+bool ends_dark(const torchdof_field_mask &shares, int distances);
 // Multiplies a layer's kernel by the field's transmittance and restores its sum.
 void mask_kernel(const Layer &layer, int colour, const FieldMask &turned, Kernel &cut);
 // Occupancy of rows is recorded as one bit for every MARKED columns; this is the bit of column x.
@@ -633,11 +632,11 @@ bool repair_edges(const torchdof_map &map);
 
 void composite(const Job &job, const RayKernels &ray_kernels, float *out);
 
-// Blurs and composites the layers of a padded frame, and the gradient of that; blend.cpp
+// Blurs and composites the layers of a padded frame, forward and backward; blend.cpp
 void blend(const torchdof_layers &scene, float *out);
 void blend_gradient(const torchdof_layers &scene, const float *out_gradient, float *const *light, float *const *place, float *const *weight);
 
-// The surfaces behind pixels, read from a pyramid, and the gradient of that; look_behind.cpp
+// The surfaces behind pixels, read from a pyramid, forward and backward; look_behind.cpp
 void look_behind(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads, float *out);
 void look_behind_gradient(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads,
                           const float *gradient, float *const *of_levels, float *of_coc);

@@ -7,8 +7,8 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr int AROUND = 2;   // pixels around a kernel that influence its values
-constexpr int FAR = 11;     // distance in pixels beyond which the spline is below 5e-7
+constexpr int AROUND = 2;  // pixels computed around a kernel: its negative values borrow from them
+constexpr int FAR = 11;    // distance in pixels beyond which the spline is below 5e-7
 constexpr double ROOT = 1.7320508075688772, PI = 3.141592653589793;
 
 // The cardinal cubic spline: 1 at 0 and 0 at every other integer. Linear interpolation of PER_PX samples for each
@@ -36,7 +36,8 @@ class Spline {
   std::vector<float> samples_;
 };
 
-// Sum of the spline over samples `cell` apart, times `cell`, at integer distances from one of them.
+// What a constant template would give at a pixel instead of 1: the sum of the spline over samples `cell` pixels apart,
+// times `cell`. Weights are divided by it.
 double ripple(int pixel, double cell) {
   const double cycles = 1 / std::min(std::max(cell, 1.0 / 16), 1.0), turn = PI * cycles, sinc = std::sin(turn) / turn;
   const double spectrum = 3 * sinc * sinc * sinc * sinc / (2 + std::cos(2 * turn));
@@ -139,7 +140,12 @@ class Maker {
     for (const float *const end = to; out < end; out++) *out /= (float)count;
   }
 
-  // A kernel interpolated between the templates of two nodes.
+  // A kernel from the templates of two nodes:
+  //
+  // 1. Interpolate between the templates.
+  // 2. Resample their cells to pixels, by the spline and linearly.
+  // 3. Remove the spline's overshoot, with the linear interpolation as a limit.
+  // 4. Crop the pixels around the kernel, and normalize the sum to 1.
   void level(const int32_t *which, float part, double reach, int colour, int half, float *out) {
     const int count = s_.cells[which[0]] + 1, across_all = 2 * count + 1;
     const size_t area = (size_t)across_all * across_all;
@@ -162,7 +168,6 @@ class Maker {
     product(down, across, light_.data(), false, row_, kernel_.data());
     product(down, across, light_.data(), true, row_, at_most_.data());
     settle(n);
-    // crop the pixels around; normalize
     const int start = folded_ ? 0 : AROUND, side = 2 * half + 1;
     double sum = 0;
     for (int y = 0; y < side; y++)
@@ -180,8 +185,8 @@ class Maker {
     for (int k = 0; k < side * side; k++) out[k] = (float)(out[k] * per_sum);
   }
 
-  // Limits a kernel [n, n] to twice its linear interpolation, and takes the deficit of negative values from their four
-  // neighbours in proportion.
+  // Removes the spline's overshoot from a kernel [n, n]: limits each value to twice the linear interpolation, and raises
+  // negative values to 0. Their four neighbours give the light for this, in proportion to their own.
   void settle(int n) {
     const int pitch = n + 2;
     positive_.assign((size_t)pitch * pitch, 0.0f);

@@ -1,9 +1,14 @@
-// The surfaces behind each pixel, read from the levels of a pyramid, and the gradient of that: the functions
-// shown_behind and search of render/disocclusion.py, for training. Inference fills hidden surfaces in disocclusion.cpp.
+// The surfaces behind each pixel, read from the levels of a pyramid, forward and backward: the functions shown_behind and
+// search of render/disocclusion.py, for training. Inference fills hidden surfaces in disocclusion.cpp.
 //
-// Of the four samples j of level l around a pixel with coc c, those behind it count: with their coc d, weight w and
-// bilinear share s, part p_j = s w clamp(d - e - BEHIND_PX + 1/2, 0, 1), e = c + max(OWN_SLOPE |c| - BEHIND_PX, 0). Their mean
-// m_l has the vote v_l = clamp(|c| / least_l - 1, 0, 1) min(slope_l sum p, most_l). The result is sum v_l m_l / sum v_l, and sum v_l.
+// For a pixel with coc c, and the four samples j of level l around it with coc d, weight w and bilinear weight s:
+//
+//   e = c + max(OWN_SLOPE |c| - BEHIND_PX, 0)           largest coc of the pixel's own surface
+//   p_j = s w clamp(d - e - BEHIND_PX + 1/2, 0, 1)      part of a sample that lies behind it
+//   m_l = sum p_j sample_j / sum p_j                    light and coc of the level
+//   v_l = clamp(|c| / least_l - 1, 0, 1) min(slope_l sum p_j, most_l)   its votes
+//
+// The result is sum v_l m_l / sum v_l, and sum v_l.
 #include "engine.h"
 
 namespace torchdof {
@@ -41,7 +46,7 @@ struct Behind {
     }
   }
 
-  // What a pixel finds in a level.
+  // Values of a pixel in a level.
   struct Found {
     size_t at[4];                   // of the samples
     float share[4], is_behind[4], part[4];  // is_behind: not clamped

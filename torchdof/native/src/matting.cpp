@@ -6,19 +6,14 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr float EDGE_PX = 0.5f;   // difference in coc of neighbours, in pixels, above which they may be two surfaces
-// weight of a neighbour that may be mixed itself; larger lets mixed pixels colour the two surfaces
-constexpr float UNCLEAN = 1e-2f;
-constexpr float TRUST = 4.0f;     // larger trusts the contrast of two textured surfaces less
-constexpr float ALIKE = 1.0f / 255;  // contrast, as a share of the brightest light around, at which trust is halved
-// limit for either part's light, as a multiple of the brightest neighbour; avoids 0 * inf
-constexpr float UNBOUNDED = 1e6f;
-constexpr int EMITTER_REACH = 3;  // pixels around a highlight in which its surface is looked for
-constexpr int TOUCHING = 2;       // pixels around an emitter over which a soft image spreads its light
-constexpr float DIM = 0.1f;         // share of a highlight's light below which all pixels count as equally dark
-constexpr float MOST_WEIGHT = 0.98f;  // largest weight of another surface's emitter in a highlight's pixel
-constexpr float SAME_PX = 0.5f;   // a background whose coc differs by less is the same surface as the image's
+// Constants of render/matting.py, which gives their meanings, units and effects: mixed pixels, emitters.
+constexpr float EDGE_PX = 0.5f, UNCLEAN = 1e-2f, TRUST = 4.0f, ALIKE = 1.0f / 255, UNBOUNDED = 1e6f;
+constexpr int EMITTER_REACH = 3, TOUCHING = 2;
+constexpr float DIM = 0.1f, MOST_WEIGHT = 0.98f;
+constexpr float SAME_PX = 0.5f;  // px of coc: a background at most this far behind the image's surface is the same surface
+enum Side { IN_FRONT = -1, BEHIND = 1 };  // of an emitter, relative to a surface
 
+// Windows around the pixels of a block
 constexpr int REACH = 1;                   // pixels around a mixed pixel that define its two colours
 constexpr int AROUND = 2 * REACH + 1;
 constexpr int TAPS = AROUND * AROUND;
@@ -35,8 +30,8 @@ struct Window {
   std::vector<vec> around;   // of LANES pixels: light around them [channels, TAPS] and the colours of their surfaces
 };
 
-// Computes for each pixel in and around a block how likely it lies at an edge, 0 to 1. False if no pixel of the block
-// does.
+// Computes for each pixel in and around a block the confidence, 0 to 1, that it lies at an edge. False if it is 0 in the
+// whole block.
 bool find_edges(const Job &job, int y0, int x0, Window &w) {
   const int H = job.height, W = job.width;
   const float *coc = job.surfaces.coc, *valid = job.surfaces.valid;
@@ -110,8 +105,8 @@ vec mean(const vec *light, int channels, const vec *weight, vec *mean) {
 
 // Splits the pixels of `beside`, out of LANES pixels of a row.
 // 1. The near and far coc are the extremes of the 3 x 3 neighbours.
-// 2. The colour of each surface is the mean of its unmixed neighbours. If a thin foreground has none, neighbours count
-// by their difference from the background.
+// 2. The colour of each surface is the mean of its unmixed neighbours. If a thin foreground has no such neighbours, they
+//    count by their difference from the background.
 // 3. The share of the near surface is the projection of the pixel's colour onto the line between both colours.
 // 4. The share of the other surface is at most 1/2, and smaller where texture makes the projection unreliable.
 // 5. The residual colour goes to both in proportion to their shares, within the range of the image's light.
@@ -239,11 +234,10 @@ class Around {
       }
   }
 
-  // How certain it is, 0 to 1, that the emitter lies behind (side 1) or in front of (-1) the surface at `coc`. light:
-  // of the highlight's pixel; limit: the highlight threshold; share: minimum light there, relative to the surface's
-  // brightest pixel.
-  float certainty_beyond(float coc, int side, float share, float light, float limit) {
-    if (!((side > 0 ? farthest_ - coc : coc - nearest_touching_) > 1)) return 0.0f;
+  // Confidence, 0 to 1, that the emitter lies on one side of the surface at `coc`. light: of the highlight's pixel;
+  // limit: the highlight threshold; share: minimum light on that side, relative to the surface's brightest pixel.
+  float certainty_beyond(float coc, Side side, float share, float light, float limit) {
+    if (!((side == BEHIND ? farthest_ - coc : coc - nearest_touching_) > 1)) return 0.0f;
     if (!scale)
       for (int i = 0; i < COUNT; i++) scale = std::max(scale, peaks_[i] = peak_of(s_.light + at_[i], s_.area(), s_.channels));
     const float own_peak = light / scale, dim_below = 5.0f / std::max(own_peak, 1e-12f);
@@ -251,7 +245,7 @@ class Around {
     for (int i = 0; i < COUNT; i++) {
       const float counted = s_.valid ? s_.valid[at_[i]] : 1.0f, peak = peaks_[i] / scale, away = side * (coc_[i] - coc);
       const float same = counted * clamp01(2.0f - std::fabs(away));
-      there_[i] = side > 0 || touches(i) ? counted * clamp01(away - 1.0f) : 0.0f;
+      there_[i] = side == BEHIND || touches(i) ? counted * clamp01(away - 1.0f) : 0.0f;
       dim_[i] = same * falloff_[i] * clamp01(2.5f - dim_below * peak);
       dim_sum += dim_[i];
       emitter_peak = std::max(emitter_peak, there_[i] * peak);
@@ -290,8 +284,8 @@ class Around {
   float scale = 0, top = 0;  // scale: largest light around; top: largest light of both surfaces, relative to scale
 };
 
-// Assigns the light of a highlight's pixel to the surface of its emitter, which lies in front of (side -1) or behind (1)
-// the pixel's own. First the emitter's surface gets the light; then a dark surface gives back what matting gave to it.
+// Assigns the light of a highlight's pixel to the surface of its emitter, in front of the pixel's own surface or behind.
+// First the emitter's surface gets the light; then a dark surface returns the light that matting gave to it.
 void attribute_emitter(Job &job, int y, int x, float least_limit, const float *falloff) {
   Surfaces &s = job.surfaces;
   const int channels = job.channels;
@@ -304,8 +298,8 @@ void attribute_emitter(Job &job, int y, int x, float least_limit, const float *f
   const int i = y / BLOCK * s.block_columns + x / BLOCK, within = y % BLOCK * BLOCK + x % BLOCK;
   std::vector<float> surface, emitter;
   bool changed = false;
-  for (const int side : {-1, 1}) {
-    float sureness = around.certainty_beyond(own_coc, side, side < 0 ? 1.0f : 0.5f, light, limit);
+  for (const Side side : {IN_FRONT, BEHIND}) {
+    float sureness = around.certainty_beyond(own_coc, side, side == IN_FRONT ? 1.0f : 0.5f, light, limit);
     if (sureness > 0) {
       const Block block = s.make_block(i);
       const float coc = around.measure_emitter(light, surface), floor = *std::max_element(surface.begin(), surface.end());
@@ -314,9 +308,9 @@ void attribute_emitter(Job &job, int y, int x, float least_limit, const float *f
       for (int c = 0; c < channels; c++)
         emitter[c] = std::max(s.light[c * area + at] / around.scale - (1.0f - share) * surface[c], 0.0f) * around.scale;
       // an emitter seen behind a surface is not in front of it
-      if (side < 0) sureness *= 1.0f - around.certainty_beyond(coc, 1, 0.5f, light, limit);
-      const float given = std::max(side < 0 ? sureness : 2.0f * sureness - 1.0f, 0.0f);
-      const float kept = std::max(side < 0 ? 1.0f - sureness : 1.0f - 2.0f * sureness, 0.0f) * block.weight[within];
+      if (side == IN_FRONT) sureness *= 1.0f - around.certainty_beyond(coc, BEHIND, 0.5f, light, limit);
+      const float given = std::max(side == IN_FRONT ? sureness : 2.0f * sureness - 1.0f, 0.0f);
+      const float kept = std::max(side == IN_FRONT ? 1.0f - sureness : 1.0f - 2.0f * sureness, 0.0f) * block.weight[within];
       const float weight = kept + given * share, per_weight = weight > 0 ? 1.0f / std::max(weight, 1e-12f) : 0.0f;
       for (int c = 0; c < channels; c++) {
         float &other = block.other[c * BLOCK_PIXELS + within];
@@ -434,7 +428,7 @@ void Job::add_background() {
       }
       known &= std::isfinite(behind_coc[at]);
       const float there = clamp(behind_coc[at], low, high), apart = clamp01(there - here - SAME_PX);
-      float behind_weight = apart + (1.0f - apart) * share;  // else the image already shows it
+      float behind_weight = apart + (1.0f - apart) * share;  // apart = 0: the background is the surface in the image
       if (!known) {
         behind_weight = 0;
         for (int c = 0; c < channels; c++) planes[2][c * area + at] = 0.0f;

@@ -10,12 +10,13 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
+// Constants of render/layer_cocs.py and render/plan.py, which give their meanings, units and effects.
 constexpr double FINEST = 0.5, FINEST_PARTS = 40, WIDE = FINEST * FINEST_PARTS;
 constexpr double SPACING = 0.25, SPACING_POWER = 0.8, LOOSE = 4, NEAR = 0.3;
-constexpr double CROWD = 0.03;     // share of the border's pixels that get a layer at their own position,
-constexpr int LEAST_CROWD = 16;    // and the minimum number of such pixels
-constexpr int FEW = 100;           // the largest radii of a frame: 1 / FEW of its pixels may exceed them
-constexpr double SMALL_RADII = 3;  // a frame smaller than this many of its largest blur radii gets a smaller tolerance
+constexpr int FEW = 100;
+constexpr double SMALL_RADII = 3;
+constexpr double CROWD = 0.03;
+constexpr int LEAST_CROWD = 16;
 
 double finest(double x) { return std::max(FINEST, std::fabs(x) / FINEST_PARTS); }
 
@@ -53,7 +54,7 @@ std::vector<double> border_nodes(std::vector<float> places) {
     bool is_new = true;
     for (double other : nodes) is_new &= std::fabs(place - other) > 0.6 * finest(place);
     if (!is_new) continue;
-    std::vector<float> there;  // an actual position, so that its pixels lie in this layer alone
+    std::vector<float> there;  // the median: a pixel's actual position, so that the pixel lies in this layer alone
     for (size_t k = 0; k < bins.size(); k++)
       if (std::abs(bins[k] - first - i) <= 1) there.push_back(places[k]);
     std::nth_element(there.begin(), there.begin() + (there.size() - 1) / 2, there.end());
@@ -100,7 +101,7 @@ std::vector<double> plan(const float *coc, int maps, int height, int width, doub
   auto place = [&](float c) { return axis(std::isnan(c) ? 0.0f : clamp(c, -reach, reach), -INFINITY, INFINITY); };
   const double nearest = place(low), farthest = place(high);
   double widest = std::max({-(double)coc_at(nearest), (double)coc_at(farthest), 1.0});  // px
-  if (SMALL_RADII * widest > std::min(height, width)) {  // but not for the sake of a few pixels
+  if (SMALL_RADII * widest > std::min(height, width)) {  // the mean of the widest pixels, 1 of FEW, so that a single one does not decide
     double usual = 1;
     std::vector<float> radii(area);
     const auto most = radii.begin() + (area + FEW - 1) / FEW;

@@ -10,7 +10,7 @@ namespace torchdof {
 struct RayKernels {
   const float *const *kernels;
   const int32_t *halves;
-  const torchdof_shares *shares;
+  const torchdof_field_mask *shares;
   int32_t shares_count;
 };
 
