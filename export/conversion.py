@@ -5,6 +5,7 @@ import logging
 import os
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -13,7 +14,6 @@ import onnx
 import onnx_ir
 import torch
 from onnxscript import opset20
-from torch.onnx._internal.fx.passes import type_promotion
 
 from torchdof import DepthOfField
 from torchdof.io.atomic import atomic_file
@@ -122,7 +122,7 @@ def _translate(program: torch.export.ExportedProgram, portable: Portable, opset:
     """The module as an ONNX graph, translated by torch.onnx and not yet simplified."""
     # torch.onnx would trace everything again to decompose operators, most of which it can translate as they are
     vars(program)["run_decompositions"] = lambda _: program
-    with _quiet(), mock.patch.object(type_promotion, "_TypePromotionInterpreter", _Promotion):
+    with _quiet(), _values_as_traced():
         converted = torch.onnx.export(
             program,
             dynamo=True,
@@ -143,15 +143,21 @@ def _translate(program: torch.export.ExportedProgram, portable: Portable, opset:
     return converted.model
 
 
-class _TracedValues(torch.fx.Interpreter):
-    """Takes the values of a graph's nodes from its tracing, and computes only those of nodes added since."""
+def _values_as_traced() -> AbstractContextManager[object]:
+    """Lets torch.onnx cast arguments of mixed types without computing every node again, half of a translation's time.
 
-    def run_node(self, n: torch.fx.Node) -> Any:
-        return n.meta["val"] if "val" in n.meta else super().run_node(n)
+    The values of a graph's nodes are those of its tracing; only nodes that are added since are computed.
+    """
+    from torch.onnx._internal.fx.passes import type_promotion  # older versions of PyTorch cannot import it
 
+    class TracedValues(torch.fx.Interpreter):
+        def run_node(self, n: torch.fx.Node) -> Any:
+            return n.meta["val"] if "val" in n.meta else super().run_node(n)
 
-class _Promotion(type_promotion._TypePromotionInterpreter, _TracedValues):
-    """Casts arguments of mixed types, like torch.onnx, which computes every node again: half of a translation."""
+    class Promotion(type_promotion._TypePromotionInterpreter, TracedValues):
+        """Its base class calls ``run_node`` of the class above."""
+
+    return mock.patch.object(type_promotion, "_TypePromotionInterpreter", Promotion)
 
 
 def _remainder(self: Any, other: Any) -> Any:

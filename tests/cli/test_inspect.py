@@ -13,6 +13,9 @@ from torchdof.cli.main import app
 from torchdof.io.images import Picture, read_image, write_image
 
 LENS = "--focus-m 2 --f-number 1.4 --sensor-width-mm 4"
+FACTS = ["image         40 x 24 px, R, G, B", "f/1.4, focus 2 m, sensor 4 mm", "nearest 2 ", "farthest 6"]
+FACTS += ["holes 0 (0.0 %)", "blur radius   +0.0 to +", "in focus      50.0 %", "####"]
+FACTS += ["depth edges   144 pixels: 100.0 % exact", "picture       photo.inspect.png"]
 
 
 @pytest.fixture
@@ -31,12 +34,10 @@ def photo(scene: Path) -> Path:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (f"near.npy {LENS}", ["image         40 x 24 px, R, G, B", "f/1.4, focus 2 m, sensor 4 mm", "nearest 2 "]),
-        (f"near.npy {LENS}", ["farthest 6", "holes 0 (0.0 %)", "blur radius   +0.0 to +", "in focus      50.0 %"]),
-        (f"near.npy {LENS}", ["####", "depth edges   144 pixels: 100.0 % exact", "picture       photo.inspect.png"]),
+        (f"near.npy {LENS}", FACTS),
         (
             "near.npy",
-            ["[focus on what is nearest the middle, focal length assumed, f-number for a blur of 2% of the width"],
+            ["[focus on what is nearest the middle, focal length assumed, f-number for a blur of 2% of the w"],
         ),
         ("near.npy --focus-range 1.5,2.2 --tilt 3", ["focus 1.5 to 2.2 m", "tilt 3 degrees"]),
         ("near.npy --depth-kind relative --near-m 1 --far-m 3 --relative-kind depth", ["nearest 1 ", "farthest 3"]),

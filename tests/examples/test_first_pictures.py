@@ -17,7 +17,7 @@ def figures(part: str, turn: int = 0) -> list[first_pictures.Figure]:
 @pytest.mark.parametrize(
     ("part", "sizes", "radii_px"),
     [
-        ("fresh-39", [(1350, 1080)], [(39, 39)]),
+        pytest.param("fresh-39", [(1350, 1080)], [(39, 39)], marks=pytest.mark.sweep),
         pytest.param("fresh-60", [(1333, 2000)], [(60, 60)], marks=pytest.mark.sweep),
         pytest.param("command", [(1333, 2000)] * 3, [(30, 30), (60, 60), (111, 111)], marks=pytest.mark.sweep),
         ("cameras", [(160, 192)], [(4, 64)]),
