@@ -12,7 +12,7 @@ Kind = Literal[
     "asymmetry",  # the blur is not round; `number`: share of it that depends on the angle
     "boundary",  # a parameter ended on its bound; the bound
     "camera",  # the blur or EXIF contradicts the camera's numbers and distances; fitted over expected
-    "distance",  # distances do not increase, equal the focus, or make the dot vanish; the first bad one, or the size
+    "distance",  # distances do not increase, are huge, equal the focus, or make the dot vanish; the bad one, or size
     "exposure",  # the fitted gain contradicts the stated exposures; fitted over stated
     "flat profile",  # the samples do not determine a shape; a parameter's relative error, or variation over noise
     "magnification",  # the blurred dot does not have the expected size; fitted over expected

@@ -13,7 +13,7 @@ SCENES = {scene.name: scene for scene in read_scenes(Path(__file__).parent / "da
 MEASURED_DB = {
     "highlights/0": (20.331, 32.851),
     "planes/0": (31.386, 30.221),
-    "portrait/0": (24.966, 23.353),
+    "portrait/0": (25.017, 23.406),
     "room/1": (40.616, 47.053),
 }
 """Recorded PSNR of the whole crop and inside its margin, at a tolerance of 1/255.

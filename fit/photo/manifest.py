@@ -21,6 +21,7 @@ else:
     import tomli as tomllib
 
 MANIFEST = "capture.toml"
+_FAR_M = 100.0  # m; a dot on paper is not seen from farther, so larger distances are likely in millimetres
 Colours = Literal["mean", "each"]
 
 _CHOICES: Mapping[str, tuple[str, ...]] = {
@@ -81,7 +82,8 @@ def read_captures(
         OSError: a picture is missing or damaged.
 
     Warns:
-        FitWarning: of kind "not linear" for integers whose transfer is not stated: sRGB is assumed.
+        FitWarning: of kind "not linear" for integers whose transfer is not stated: sRGB is assumed; of kind "distance"
+        if all distances exceed 100 m, as millimetres do.
     """
     if not isinstance(folder, str | os.PathLike):
         raise FitError(f"folder must be the path of a folder or of its {MANIFEST}, got {show(folder)}", "manifest")
@@ -97,6 +99,10 @@ def read_captures(
     shots = [{name: _field(shot, name, manifest_name) for name in _SHOT_FIELDS} for shot in shots]
     focus, files = manifest["focus_m"], [shot["file"] for shot in shots]
     check_distances([shot["distance_m"] for shot in shots], focus, manifest_name)
+    nearest = min(focus, shots[0]["distance_m"])
+    if nearest > _FAR_M:
+        text = f"all distances are at least {nearest:g} m; they are in metres: divide millimetres by 1000"
+        warn(text, "distance", file=manifest_name, number=nearest)
     if root is not None:
         for name in filter(None, [manifest["sharp"], *files, manifest["dark"]]):
             inside(folder_path / name, root, manifest_name)
@@ -199,7 +205,8 @@ def _field(fields: Mapping[str, Any], name: str, where: str) -> Any:
 def _check_alike(first: CameraPicture, second: CameraPicture, where: str) -> None:
     """Raises an error for pictures of different size, or if the lens was changed between them."""
     if first.light.shape != second.light.shape:
-        text = f"{second.file.name} is {size_of(second.light)}, {first.file.name} is {size_of(first.light)}"
+        sizes = f"{second.file.name} is {size_of(second.light)}, {first.file.name} is {size_of(first.light)}"
+        text = f"{sizes}; give pictures of one size, as the camera made them"
         raise FitError(text, "manifest", file=where)
     for key, word in (("f_number", "f-number"), ("focal_length_mm", "focal length")):
         before, after = first.facts.get(key), second.facts.get(key)

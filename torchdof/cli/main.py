@@ -4,7 +4,9 @@ import contextlib
 import importlib
 import importlib.metadata
 import os
+import signal
 import sys
+from types import FrameType
 from typing import Any, NoReturn
 
 import click
@@ -101,5 +103,20 @@ def main() -> None:
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode))  # gets the lowest free number, the stream's own
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
     with exit_on_signals():
         app(prog_name="torchdof")
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Raises ``KeyboardInterrupt``, but ends the process while PyTorch is imported.
+
+    PyTorch imports NumPy from C++ and ignores any error of that, so that the command would go on without NumPy. At that
+    time no file is being written.
+    """
+    if getattr(getattr(sys.modules.get("torch"), "__spec__", None), "_initializing", False):
+        with contextlib.suppress(OSError):
+            os.write(2, b"interrupted\n")
+        os._exit(130)
+    signal.default_int_handler(number, frame)

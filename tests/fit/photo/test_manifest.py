@@ -74,6 +74,14 @@ def test_encoded_pictures_without_a_stated_transfer_give_a_warning(folder):
     assert len(read_captures(folder)[0]) == 2  # floats are linear light
 
 
+def test_distances_in_millimetres_give_a_warning(folder):
+    for metres, millimetres in (("focus_m = 0.5", "500"), ("distance_m = 0.4", "400"), ("distance_m = 1.0", "1000")):
+        change(folder, metres, f"{metres.split()[0]} = {millimetres}")
+    with pytest.warns(FitWarning, match="all distances are at least 400 m; they are in metres: divide millimetres"):
+        (captures,) = read_captures(folder)
+    assert [pair.distance_m for pair in captures] == [400, 1000]
+
+
 def test_a_grid_gives_the_dot_in_the_centre_or_every_dot(simulator, tmp_path):
     camera = simulator.Simulator(level=0.7, snr_db=46, dot_radius=7.0)
     grid = [(x, y) for x in (-110, 0, 110) for y in (-80, 0, 80)]

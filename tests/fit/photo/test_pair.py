@@ -112,6 +112,15 @@ def test_standard_errors_hold_in_repeated_captures(simulator, camera, family, tr
     assert 0.8 < np.mean([fit.residual_over_noise for fit in fits]) < 1.2
 
 
+@pytest.mark.filterwarnings("ignore::torchdof.fit.problems.FitWarning")
+def test_noise_of_the_sharp_picture_alone_counts_in_the_error_and_explains_the_residual(simulator):
+    sharp, blurred = simulator.Simulator(size=31, dot_radius=6.0, snr_db=None).pair("gaussian", {"sigma": 2.0})
+    noise = np.random.default_rng(0).normal(size=(2, 31, 31))
+    fit = fit_pair(sharp + 0.02 * noise[0], blurred + 1e-3 * noise[1], "gaussian", source="image", **HELD)
+    assert fit.stderr["sigma"] > 0.006  # sigma of ten draws has a spread of 0.017; 0.003 without that noise
+    assert fit.residual_over_noise < 1  # 1.7 without it
+
+
 @pytest.mark.parametrize(("family", "true"), [("gaussian", {"sigma": 3.0}), ("disc", {"radius": 7.0})])
 def test_auto_chooses_the_cheapest_sufficient_family(simulator, family, true):
     fit = fit_pair(*simulator.Simulator(snr_db=60, size=75).pair(family, true), accuracy_db=60)
