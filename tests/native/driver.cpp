@@ -44,7 +44,7 @@ std::vector<float> disc(double radius, int half, int colours) {
 struct Field {
   static constexpr int distances = 5, columns = 4, rows = 2 * columns - 1;
   std::vector<std::vector<float>> values, boxes;
-  std::vector<torchdof_field_mask> shares;
+  std::vector<torchdof_field_mask> masks;
 
   Field(const std::vector<double> &radii, int colours) {
     for (double radius : radii) {
@@ -59,7 +59,7 @@ struct Field {
       boxes.push_back(box);
     }
     for (size_t i = 0; i < radii.size(); i++)
-      shares.push_back({values[i].data(), boxes[i].data(), float(radii[i]), colours, rows, columns});
+      masks.push_back({values[i].data(), boxes[i].data(), float(radii[i]), colours, rows, columns});
   }
 };
 
@@ -95,7 +95,7 @@ struct Scene {
     std::vector<double> radii;
     for (size_t i = 0; i < nodes.size(); i++) radii.push_back(nodes[i] / scales[i]);
     field = std::make_unique<Field>(radii, scene.kernel_colours);
-    scene.shares = field->shares.data();
+    scene.field_masks = field->masks.data();
     scene.distances = Field::distances;
     scene.squeeze = float(number(0.5, 2.0));
   }
@@ -186,9 +186,9 @@ int render(torchdof_scene scene, int threads, const int32_t *cancelled, std::vec
   for (double radius = 128.0; radius > 0.5; radius /= 1.3)
     radii.insert(radii.begin() + long(radii.size() / 2), {-radius, radius});
   const Field rays(radii, scene.kernel_colours);
-  const torchdof_field_mask *shares = scene.shares ? rays.shares.data() : nullptr;
-  const int32_t shares_count = scene.shares ? int32_t(radii.size()) : 0;
-  const int finished = torchdof_finish(job, kernels_at.data(), halves.data(), shares, shares_count, picture.data());
+  const torchdof_field_mask *masks = scene.field_masks ? rays.masks.data() : nullptr;
+  const int32_t masks_count = scene.field_masks ? int32_t(radii.size()) : 0;
+  const int finished = torchdof_finish(job, kernels_at.data(), halves.data(), masks, masks_count, picture.data());
   torchdof_free(job);
   return finished;
 }

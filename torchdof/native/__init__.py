@@ -174,7 +174,7 @@ class _Scene(ctypes.Structure):
         ("highlights", ctypes.c_int32),
         ("crisp_px", ctypes.c_float),
         *_OF_LAYERS,
-        ("shares", ctypes.POINTER(_FieldMask)),
+        ("field_masks", ctypes.POINTER(_FieldMask)),
         ("distances", ctypes.c_int32),
         ("squeeze", ctypes.c_float),
         ("threads", ctypes.c_int32),

@@ -56,7 +56,7 @@ typedef struct {
   int32_t kernel_colours;  // 1 or channels
   const float *kernels;    // for each layer [kernel_colours, 2 half + 1, 2 half + 1]
 
-  const torchdof_field_mask *shares;  // for each layer; null: kernels do not change across the frame
+  const torchdof_field_mask *field_masks;  // for each layer; null: kernels do not change across the frame
   int32_t distances;              // number of field distances, from the centre of the frame to its corner
   float squeeze;                  // height of the blur divided by its width
 
@@ -99,10 +99,10 @@ TORCHDOF_API int32_t torchdof_begin(const torchdof_scene *scene, torchdof_job **
 // Signed radii of highlights in steps of 1/32 pixel; returns their number.
 TORCHDOF_API int64_t torchdof_radii(const torchdof_job *job, const int32_t **steps);
 
-// kernels[i] is for radius i: [kernel_colours, 2 halves[i] + 1, 2 halves[i] + 1]. shares: field masks, at least two, in
+// kernels[i] is for radius i: [kernel_colours, 2 halves[i] + 1, 2 halves[i] + 1]. field_masks: field masks, at least two, in
 // ascending order of radius; null if layers have no masks. out: [channels, height, width].
 TORCHDOF_API int32_t torchdof_finish(torchdof_job *job, const float *const *kernels, const int32_t *halves,
-                                     const torchdof_field_mask *shares, int32_t shares_count, float *out);
+                                     const torchdof_field_mask *field_masks, int32_t field_masks_count, float *out);
 
 TORCHDOF_API void torchdof_free(torchdof_job *job);
 

@@ -803,7 +803,7 @@ class Composite {
 
   // A layer's kernels at a position in pixels of the layer. All strips of one block share them, so they are cached.
   const Kernel *kernels_at(Scratch &b, const Layer &l, int row, int column) const {
-    if (!l.shares) return l.kernels.data();
+    if (!l.field_mask) return l.kernels.data();
     const torchdof_scene &scene = job_.scene;
     const int before = l.scale > 1;  // the canvas of a coarser resolution begins one pixel outside the frame
     const int block_row = (row + before) / FieldMask::ROWS, block_column = (column + before) / FieldMask::COLUMNS;
@@ -816,7 +816,7 @@ class Composite {
     const float per = per_half_diagonal(scene);
     const float y = (((block_row + 0.5f) * FieldMask::ROWS - before) * l.scale - 0.5f * H_) * per;
     const float x = (((block_column + 0.5f) * FieldMask::COLUMNS - before) * l.scale - 0.5f * W_) * per;
-    for (int e = 0; e < E_; e++) mask_kernel(l, e, FieldMask(scene, *l.shares, nullptr, 0.0f, e, y, x), masked.kernels[e]);
+    for (int e = 0; e < E_; e++) mask_kernel(l, e, FieldMask(scene, *l.field_mask, nullptr, 0.0f, e, y, x), masked.kernels[e]);
     return masked.kernels.data();
   }
 

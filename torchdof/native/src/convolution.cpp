@@ -88,10 +88,10 @@ Kernel make_kernel(const float *values, int half, bool one_sided) {
   return k;
 }
 
-bool ends_dark(const torchdof_field_mask &shares, int distances) {
-  const int rows = shares.rows, columns = shares.columns;
-  for (int i = 0; i < shares.colours * distances; i++) {
-    const float *values = shares.values + (size_t)i * rows * columns;
+bool ends_dark(const torchdof_field_mask &mask, int distances) {
+  const int rows = mask.rows, columns = mask.columns;
+  for (int i = 0; i < mask.colours * distances; i++) {
+    const float *values = mask.values + (size_t)i * rows * columns;
     for (int row = 0; row < rows; row++) {
       const float *of_row = values + (size_t)row * columns;
       if (of_row[columns - 1] != 0) return false;
@@ -121,7 +121,7 @@ void mask_kernel(const Layer &layer, int colour, const FieldMask &mask, Kernel &
       const int n = std::min(LANES, end - y);
       vec taps = {};
       memcpy(&taps, from + y, n * sizeof(float));
-      taps *= mask.shares((float)(half - y), (float)-d);
+      taps *= mask.transmittance((float)(half - y), (float)-d);
       left += taps;
       memcpy(to + y, &taps, n * sizeof(float));
     }

@@ -67,8 +67,8 @@ int64_t torchdof_radii(const torchdof_job *job, const int32_t **steps) {
 }
 
 int32_t torchdof_finish(torchdof_job *job, const float *const *kernels, const int32_t *halves,
-                        const torchdof_field_mask *shares, int32_t shares_count, float *out) {
-  return torchdof::guarded([&] { job->job->finish({kernels, halves, shares, shares_count}, out); });
+                        const torchdof_field_mask *field_masks, int32_t field_masks_count, float *out) {
+  return torchdof::guarded([&] { job->job->finish({kernels, halves, field_masks, field_masks_count}, out); });
 }
 
 void torchdof_free(torchdof_job *job) { delete job; }

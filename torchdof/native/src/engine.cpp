@@ -14,10 +14,10 @@ Job::Job(const torchdof_scene &scene)
     l.scale = scene.scales[k];
     l.half = scene.halves[k];
     const int side = 2 * l.half + 1;
-    for (int e = 0; e < colours; e++, values += side * side) l.kernels.push_back(make_kernel(values, l.half, !scene.shares));
-    if (scene.shares && l.half) {
-      l.shares = scene.shares + k;
-      l.spots = ends_dark(*l.shares, scene.distances);
+    for (int e = 0; e < colours; e++, values += side * side) l.kernels.push_back(make_kernel(values, l.half, !scene.field_masks));
+    if (scene.field_masks && l.half) {
+      l.field_mask = scene.field_masks + k;
+      l.spots = ends_dark(*l.field_mask, scene.distances);
     }
     layers.push_back(std::move(l));
   }
@@ -185,7 +185,7 @@ void find_ends(const float *values, int64_t count, int threads, float *low, floa
 void Job::begin() {
   take_scene();
   if (scene.kind == TORCHDOF_STACK) return;
-  const bool several = layers.size() > 1 || scene.shares, background = scene.kind == TORCHDOF_BACKGROUND;
+  const bool several = layers.size() > 1 || scene.field_masks, background = scene.kind == TORCHDOF_BACKGROUND;
   const float reach = std::max(std::fabs(coc_at(layers.front().node)), std::fabs(coc_at(layers.back().node)));
   // without occlusion, highlights need rays only where coarse layers would blur their outlines
   const bool limited = several && (scene.occlusion || (scene.highlights && scene.crisp_px < reach));

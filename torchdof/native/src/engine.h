@@ -235,7 +235,7 @@ struct Layer {
   double node = 0;
   float before = 0, per_before = 0, at = 0, per_after = 0;  // ends and slopes of the ramps before and after the layer
   bool first = false;
-  const torchdof_field_mask *shares = nullptr;
+  const torchdof_field_mask *field_mask = nullptr;
   bool spots = false;           // the field mask is 0 at and beyond the edge of its samples
   std::vector<Kernel> kernels;  // 1, or one for each colour
 };
@@ -539,14 +539,14 @@ class FieldMask {
     }
   }
   // Transmittance at dx, dx + 1, ...
-  vec shares_along(float dy, float dx) const {
+  vec transmittance_along(float dy, float dx) const {
     vec across;
     for (int i = 0; i < LANES; i++) across[i] = (dx + i) * squeeze_;
     const vec u = dy * down_ + across * right_, v = across * down_ - dy * right_, first = samples_[0].at(u, most(v, -v));
     return both_ ? (1.0f - part_) * first + part_ * samples_[1].at(u, most(v, -v)) : first;
   }
   // Transmittance at dy, dy - 1, ... for samples of a single radius.
-  vec shares(float dy, float dx) const {
+  vec transmittance(float dy, float dx) const {
     const float across = dx * squeeze_;
     vec step;
     for (int i = 0; i < LANES; i++) step[i] = dy - i;
@@ -600,7 +600,7 @@ inline float per_half_diagonal(const torchdof_scene &scene) {
   return 2.0f / std::sqrt((float)scene.height * scene.height + (float)scene.width * scene.width);
 }
 // Whether a field mask is 0 at the edge of its samples.
-bool ends_dark(const torchdof_field_mask &shares, int distances);
+bool ends_dark(const torchdof_field_mask &mask, int distances);
 // Multiplies a layer's kernel by the field's transmittance and restores its sum.
 void mask_kernel(const Layer &layer, int colour, const FieldMask &turned, Kernel &cut);
 // Occupancy of rows is recorded as one bit for every MARKED columns; this is the bit of column x.

@@ -444,18 +444,18 @@ void add_blocked(const Job &job, const Visibility &v, const Ray &ray, int k, int
 
 // Transmittance of the lens's field for a ray's kernel.
 static FieldMask mask_of(const Job &job, const RayKernels &kernels, const Ray &ray, int colour) {
-  const auto *shares = kernels.shares;
+  const auto *masks = kernels.field_masks;
   int low = 0;
-  while (low < kernels.shares_count - 2 && shares[low + 1].radius <= ray.coc) low++;
-  const float part = clamp01((ray.coc - shares[low].radius) / (shares[low + 1].radius - shares[low].radius));
+  while (low < kernels.field_masks_count - 2 && masks[low + 1].radius <= ray.coc) low++;
+  const float part = clamp01((ray.coc - masks[low].radius) / (masks[low + 1].radius - masks[low].radius));
   const float per = per_half_diagonal(job.scene);
   const float y = (ray.row + 0.5f - 0.5f * job.height) * per, x = (ray.column + 0.5f - 0.5f * job.width) * per;
-  return FieldMask(job.scene, shares[low], &shares[low + 1], part, colour, y, x);
+  return FieldMask(job.scene, masks[low], &masks[low + 1], part, colour, y, x);
 }
 
 std::vector<float> gains_of(const Job &job, const RayKernels &kernels) {
   const int E = job.colours;
-  if (!job.scene.shares) return {};
+  if (!job.scene.field_masks) return {};
   std::vector<float> gains(job.rays.size() * E);
   job.parallel((int)job.rays.size(), [&](int r, int) {
     const Ray &ray = job.rays[r];
@@ -476,7 +476,7 @@ std::vector<float> gains_of(const Job &job, const RayKernels &kernels) {
         for (int x = 0; x <= 2 * half; x += LANES) {
           const vec light = load<vec>(row.data() + x);
           if (!any_positive(light)) continue;
-          const vec passed = light * mask.shares_along((float)y, (float)(x - half));
+          const vec passed = light * mask.transmittance_along((float)y, (float)(x - half));
           for (int lane = 0; lane < LANES; lane++) all_light += light[lane], left += passed[lane];
         }
       }
@@ -563,7 +563,7 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
             add_taps(ray.radius + 1, ray.part, e, py + i, px, nx, row);
             for (int x = 0; x < nx && gain > 0; x += LANES)
               if (any_positive(load<vec>(row + x)))
-                store(row + x, load<vec>(row + x) * gain * masks[e].shares_along((float)(py + i - ray.row), (float)(px + x - ray.column)));
+                store(row + x, load<vec>(row + x) * gain * masks[e].transmittance_along((float)(py + i - ray.row), (float)(px + x - ray.column)));
             for (int x = 0; x < PATCH; x += LANES) any |= any_positive(load<vec>(row + x));
           }
         }

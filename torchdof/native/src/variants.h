@@ -10,8 +10,8 @@ namespace torchdof {
 struct RayKernels {
   const float *const *kernels;
   const int32_t *halves;
-  const torchdof_field_mask *shares;
-  int32_t shares_count;
+  const torchdof_field_mask *field_masks;
+  int32_t field_masks_count;
 };
 
 class AnyJob {
