@@ -63,11 +63,17 @@ class Area(NamedTuple):
 
 def centred_coc_px(camera: "Camera", depth: "Tensor", area: Area) -> "Tensor":
     """As ``camera.coc_px``, with the axis of a tilted lens in the middle of the full frame."""
-    if camera.tilt_deg == camera.swing_deg == 0:
-        return camera.coc_px(depth, depth.shape[-1])
-    padded, place = area.centred(depth, (depth.shape[-2], depth.shape[-1]))
-    wide = camera.replace(sensor_width_mm=camera.sensor_width_mm * (padded.shape[-1] / depth.shape[-1]))
+    wide, padded, place = _centred(camera, depth, area)
     return wide.coc_px(padded, padded.shape[-1])[place]
+
+
+def _centred(camera: "Camera", depth: "Tensor", area: Area) -> "tuple[Camera, Tensor, Any]":
+    """Camera and map of a tilted lens with the optical axis in the middle of the map; the index of ``depth`` in it."""
+    rows, columns = depth.shape[-2:]
+    if camera.tilt_deg == camera.swing_deg == 0:
+        return camera, depth, (..., slice(0, rows), slice(0, columns))
+    padded, place = area.centred(depth, (rows, columns))
+    return camera.replace(sensor_width_mm=camera.sensor_width_mm * (padded.shape[-1] / columns)), padded, place
 
 
 def _width_fraction(text: str) -> float:
@@ -258,7 +264,9 @@ class Lens(Sensor):
             camera = camera.replace(focus_range_m=self.focus_range, tilt_deg=self.tilt, swing_deg=self.swing)
             camera = camera.replace(sensor_width_mm=camera.sensor_width_mm * (width / area.width))
             if self.focus_at is not None:
-                camera = self._focused(camera, depth, area, self.focus_at)
+                wide, padded, (_, rows, columns) = _centred(camera, depth, area)
+                x, y = self.focus_at[0] - area.x + columns.start, self.focus_at[1] - area.y + rows.start
+                camera = camera.replace(focus_m=wide.focus_at(padded, x, y).focus_m)
         share, is_open = self.blur_share, is_still and not self._opening and (self == Lens() or not is_to_scale)
         largest_px = self._largest_coc_px(camera, depth, area) if share is not None or is_open else 0.0
         if is_open and not (is_to_scale and "f_number" in in_file and largest_px >= _VISIBLE_BLUR * width):
@@ -269,15 +277,6 @@ class Lens(Sensor):
         if self.fov_deg is None:
             remarks += [f"{_LABELS[name]} {source}" for name, source in sources.items() if source]
         return camera, remarks
-
-    def _focused(self, camera: "Camera", depth: "Tensor", area: Area, point: tuple[float, float]) -> "Camera":
-        """The camera focused on a point of the full frame."""
-        x, y = point[0] - area.x, point[1] - area.y
-        if self.tilt == self.swing == 0:
-            return camera.focus_at(depth, x, y)
-        padded, (_, rows, columns) = area.centred(depth, (depth.shape[-2], depth.shape[-1]))
-        wide = camera.replace(sensor_width_mm=camera.sensor_width_mm * (padded.shape[-1] / depth.shape[-1]))
-        return camera.replace(focus_m=wide.focus_at(padded, x + columns.start, y + rows.start).focus_m)
 
     def _largest_coc_px(self, camera: "Camera", depth: "Tensor", area: Area) -> float:
         """Largest blur radius in pixels at all keyframes of the focus, without the largest thousandth of the pixels."""
