@@ -146,9 +146,15 @@ def _translate(program: torch.export.ExportedProgram, portable: Portable, opset:
 def _values_as_traced() -> AbstractContextManager[object]:
     """Lets torch.onnx cast arguments of mixed types without computing every node again, half of a translation's time.
 
-    The values of a graph's nodes are those of its tracing; only nodes that are added since are computed.
+    The values of a graph's nodes are those of its tracing; only nodes that are added since are computed. Where PyTorch
+    has no such pass, nothing changes: its own gives the same file.
     """
-    from torch.onnx._internal.fx.passes import type_promotion  # older versions of PyTorch cannot import it
+    try:
+        from torch.onnx._internal.fx.passes import type_promotion
+    except ImportError:
+        return contextlib.nullcontext()
+    if not hasattr(type_promotion, "_TypePromotionInterpreter"):
+        return contextlib.nullcontext()
 
     class TracedValues(torch.fx.Interpreter):
         def run_node(self, n: torch.fx.Node) -> Any:
