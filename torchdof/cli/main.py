@@ -112,8 +112,8 @@ def main() -> None:
 def _interrupt(number: int, frame: FrameType | None) -> None:
     """Raises ``KeyboardInterrupt``, but ends the process while PyTorch is imported.
 
-    PyTorch imports NumPy from C++ and ignores any error of that, so that the command would go on without NumPy. At that
-    time no file is being written.
+    PyTorch imports NumPy from C++ and ignores any error there; after an interrupt the command would continue without
+    NumPy. No file is being written during the import.
     """
     if getattr(getattr(sys.modules.get("torch"), "__spec__", None), "_initializing", False):
         with contextlib.suppress(OSError):
