@@ -307,6 +307,6 @@ def test_pairs_are_found_by_their_names(pairs: list[Pair], tmp_path: Path) -> No
     (tmp_path / "images" / "2.png").unlink()
     with pytest.raises(ValueError, match=r"3.png: .*found 3.npy and 3.npz"):
         pairs_in(tmp_path / "images", tmp_path / "depths")
-    (tmp_path / "images" / "4.jpg").touch()
-    with pytest.raises(ValueError, match="4.jpg: there is 4.png of the same name; keep one of them"):
+    (tmp_path / "images" / "4.webp").touch()
+    with pytest.raises(ValueError, match="4.png: there is 4.webp of the same name; keep one of them"):
         pairs_in(tmp_path / "images")

@@ -9,7 +9,7 @@ from typing import Literal
 
 from . import optional_formats
 
-__all__ = ["PixelType", "existing_file", "existing_image", "existing_map", "samples_of"]
+__all__ = ["IMAGE_SUFFIXES", "PixelType", "existing_file", "existing_image", "existing_map", "samples_of"]
 
 PixelType = Literal["8", "16", "half", "float"]
 
@@ -20,7 +20,7 @@ _SAMPLES: dict[str, tuple[PixelType, ...]] = {  # suffix -> sample types, the de
     **dict.fromkeys((".jpg", ".jpeg", ".webp"), ("8",)),
     **dict.fromkeys((".hdr", ".pfm"), ("float",)),
 }
-_SUFFIXES = tuple(_SAMPLES)
+IMAGE_SUFFIXES = tuple(_SAMPLES)
 """Suffixes of images that every installation reads and writes."""
 
 
@@ -33,7 +33,7 @@ def samples_of(path: Path) -> tuple[PixelType, ...]:
     suffix = path.suffix.lower()
     if suffix not in _SAMPLES:
         kind = f"files of type {suffix!r}" if suffix else "a file without a type"
-        raise ValueError(f"{path}: cannot write {kind}; use one of {' '.join(_SUFFIXES)}")
+        raise ValueError(f"{path}: cannot write {kind}; use one of {' '.join(IMAGE_SUFFIXES)}")
     return _SAMPLES[suffix]
 
 
@@ -42,13 +42,15 @@ def existing_image(path: str | os.PathLike[str]) -> Path:
     refusal = optional_formats.refusal(path)
     if refusal is not None:
         raise ValueError(f"{path}: {refusal}")
-    is_known = isinstance(path, str | os.PathLike) and Path(path).suffix.lower() in _SUFFIXES
-    return existing_file(path, _SUFFIXES if is_known else (*_SUFFIXES, *optional_formats.readable()), "an image")
+    is_known = isinstance(path, str | os.PathLike) and Path(path).suffix.lower() in IMAGE_SUFFIXES
+    return existing_file(
+        path, IMAGE_SUFFIXES if is_known else (*IMAGE_SUFFIXES, *optional_formats.readable()), "an image"
+    )
 
 
 def existing_map(path: str | os.PathLike[str]) -> Path:
     """Checks the path of a depth map, as :func:`existing_file`."""
-    return existing_file(path, (*_SUFFIXES, ".npy", ".npz"), "a depth map")
+    return existing_file(path, (*IMAGE_SUFFIXES, ".npy", ".npz"), "a depth map")
 
 
 def existing_file(path: str | os.PathLike[str], suffixes: tuple[str, ...], what: str) -> Path:
