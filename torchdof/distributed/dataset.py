@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from ..io.atomic import write_text
-from ..io.paths import IMAGE_SUFFIXES
+from ..io.paths import IMAGE_SUFFIXES, MAP_SUFFIXES
 from ..validation import whole
 from .shards import SUFFIXES, Format, Pair, RenderShards, name_of, samples_of, shard_rows
 
-_DEPTHS = (".npy", ".npz", *IMAGE_SUFFIXES)
 _CARD = """# Defocus data set
 
 Sharp photographs, their depth in metres along the optical axis, and the same photographs as a lens with a random focus
@@ -44,7 +43,8 @@ def pairs_in(images: str | os.PathLike[str], depths: str | os.PathLike[str] | No
         FileNotFoundError: If a folder is missing or has no image.
         ValueError: If an image has no depth file, or several.
     """
-    photographs, depth_files = _by_stem(images, IMAGE_SUFFIXES), {} if depths is None else _by_stem(depths, _DEPTHS)
+    photographs = _by_stem(images, IMAGE_SUFFIXES)
+    depth_files = {} if depths is None else _by_stem(depths, MAP_SUFFIXES)
     if not photographs:
         raise FileNotFoundError(f"{images}: no images here ({' '.join(IMAGE_SUFFIXES)})")
     pairs = []

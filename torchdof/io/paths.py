@@ -9,7 +9,15 @@ from typing import Literal
 
 from . import optional_formats
 
-__all__ = ["IMAGE_SUFFIXES", "PixelType", "existing_file", "existing_image", "existing_map", "samples_of"]
+__all__ = [
+    "IMAGE_SUFFIXES",
+    "MAP_SUFFIXES",
+    "PixelType",
+    "existing_file",
+    "existing_image",
+    "existing_map",
+    "samples_of",
+]
 
 PixelType = Literal["8", "16", "half", "float"]
 
@@ -22,6 +30,9 @@ _SAMPLES: dict[str, tuple[PixelType, ...]] = {  # suffix -> sample types, the de
 }
 IMAGE_SUFFIXES = tuple(_SAMPLES)
 """Suffixes of images that every installation reads and writes."""
+
+MAP_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".npz")
+"""Suffixes of depth maps."""
 
 
 def samples_of(path: Path) -> tuple[PixelType, ...]:
@@ -50,7 +61,7 @@ def existing_image(path: str | os.PathLike[str]) -> Path:
 
 def existing_map(path: str | os.PathLike[str]) -> Path:
     """Checks the path of a depth map, as :func:`existing_file`."""
-    return existing_file(path, (*IMAGE_SUFFIXES, ".npy", ".npz"), "a depth map")
+    return existing_file(path, MAP_SUFFIXES, "a depth map")
 
 
 def existing_file(path: str | os.PathLike[str], suffixes: tuple[str, ...], what: str) -> Path:
