@@ -4,9 +4,9 @@ Spots and profiles are compared by their transfer functions, which are Hankel tr
 functions over its rays. Both are weighted by the spectrum of natural images (amplitude 1/frequency) and the area of a
 pixel. The squared difference is then the squared error in a photograph, up to a constant.
 
-The default family ``"radial"`` has the radius of the outermost ray, and is linear in its values. So the fit is a convex
-problem with a single solution. It is solved for all nodes at once, against spots at the nodes *and between them*, where
-the table interpolates.
+A profile has the radius of the outermost ray, and is linear in its values. So the fit is a convex problem with a single
+solution. It is solved for all nodes at once, against spots at the nodes *and between them*, where the table
+interpolates.
 """
 
 import functools
@@ -16,15 +16,11 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import nnls
-from scipy.special import j0, j1
-
-from torchdof.optics.psf import FAMILIES, LENGTHS, profile
+from scipy.special import j0
 
 from ..result import Array
-from ..solve import best_of
 from .spot import Spot
 
 # Places of the nodes
@@ -32,16 +28,11 @@ _MIN_INTERVAL_PX = 0.01  # pixels of coc; narrower intervals are not divided
 _TARGET_DB = 62.0  # PSNR of a natural image in the middle of an interval; elsewhere it may be a few dB less
 _CONTRAST = 0.22  # standard deviation of natural images over their peak
 
-# Fit of radial profiles
+# Fit of the profiles
 _MAX_FREQUENCY = 3.0  # cycles for each pixel; kernels are sampled on the pixel grid, so higher frequencies are aliased
 _FRACTIONS = (0.25, 0.5, 0.75)  # of the interval between two nodes: where more spots are traced for the joint fit
 _SWEEPS = 6  # passes over all nodes of the joint fit
 _PRIOR_WEIGHT = 1e-4  # weight of the ray histogram, which determines details of the profile far below a pixel
-
-# Fit of named shapes; lengths are relative to the distance of the outermost ray
-_RANGES = {"radius": (0.02, 1.3), "sigma": (0.01, 1.0), "r_c": (0.0, 1.3), "b": (-1.0, 20.0), "m": (0.5, 12.0)}
-_SAMPLES, _SAMPLED_REACH = 400, 2.0  # samples of the profile, and the radius to which they reach
-_NEIGHBOUR_WEIGHT = 1e-3  # weight of the neighbour's values for parameters that the spot does not determine
 
 
 class NodeEquations(NamedTuple):
@@ -166,58 +157,7 @@ def fit_radial(tracer: Tracer, cocs: Sequence[float]) -> tuple[dict[str, Array],
     return {"values": np.stack(values), "radius": np.array([node.radius for node in nodes]) * tracer.pixel}, residual
 
 
-def fit_shapes(tracer: Tracer, cocs: Sequence[float], family: str) -> tuple[dict[str, Array], Array]:
-    """A named shape at each node, starting from its neighbour's, from both ends to the focus."""
-    names, neighbour = FAMILIES[family], None
-    params, residual = np.zeros((len(names), len(cocs))), np.zeros(len(cocs))
-    for i in _to_focus(cocs):
-        neighbour = None if i == len(cocs) - 1 else neighbour  # the other side begins here
-        neighbour, outermost, error = _fit_shape(family, tracer, cocs[i], neighbour)
-        params[:, i] = neighbour * [outermost * tracer.pixel if name in LENGTHS else 1.0 for name in names]
-        residual[i] = tracer.relative(error)
-    return dict(zip(names, params, strict=True)), residual
-
-
 def _to_focus(cocs: Sequence[float]) -> list[int]:
     """Indices of the nodes from both ends to the focus."""
     focus = int(np.argmin(np.abs(cocs)))
     return [*range(focus), *range(len(cocs) - 1, focus - 1, -1)]
-
-
-def _fit_shape(family: str, tracer: Tracer, coc: float, neighbour: Array | None) -> tuple[Array, float, float]:
-    """Parameters of the shape whose transfer function is nearest to a spot's; the neighbour's are a weak prior.
-
-    Lengths are relative to the distance of the spot's outermost ray. Also returns this distance in px, and the weighted
-    squared error.
-    """
-    (r, light, transfer), names, weight = tracer.traced(coc), FAMILIES[family], tracer.weight
-    outermost = float(r.max())
-    rms, frequency = math.sqrt(float(light @ (r * r))) / outermost, tracer.frequency * outermost
-    low, high = np.array([_RANGES[name] for name in names]).T
-    if family == "softm":  # a second branch has a small radius, a wide edge and a large tilt
-        low[0] = 0.5
-    sigma = {"gaussian": 0.5**0.5, "ring": 0.5}.get(family, 0.05) * rms
-    geometry = {"radius": 2.0**0.5 * rms, "sigma": sigma, "r_c": 0.7 * rms, "b": 0.0, "m": 2.0}
-    radii = (np.arange(_SAMPLES) + 0.5) * (_SAMPLED_REACH / _SAMPLES)
-    bessel = j0(2.0 * np.pi * np.outer(frequency, radii))
-
-    def weighted_transfer(values: Array) -> Array:
-        params = dict(zip(names, values, strict=True))
-        if family == "gaussian":  # it may reach beyond the radii
-            return np.asarray(weight * np.exp(-2.0 * (np.pi * params["sigma"] * frequency) ** 2))
-        if family == "disc":  # its edge lies between the radii
-            phase = 2.0 * np.pi * params["radius"] * frequency
-            return np.asarray(weight * 2.0 * j1(phase) / phase)
-        light = profile(family, torch.from_numpy(radii), params).numpy() * radii
-        return np.asarray(weight * (bessel @ (light / light.sum())))
-
-    start, prior_weight = np.array([geometry[name] for name in names]), 0.0 if neighbour is None else _NEIGHBOUR_WEIGHT
-    expected, target = start if neighbour is None else neighbour, weight * transfer
-    best = best_of(
-        lambda values: np.concatenate([weighted_transfer(values), prior_weight * values]),
-        np.concatenate([target, prior_weight * expected]),
-        [expected, start] if prior_weight else [start],
-        (low, high),
-        tolerance=1e-8,
-    )
-    return best, outermost, float(((weighted_transfer(best) - target) ** 2).sum())

@@ -160,18 +160,9 @@ def test_off_axis_table_states_its_asymmetry():
     assert len(asymmetry) == 5 and max(asymmetry) > 0.2
 
 
-@pytest.mark.parametrize(("family", "least"), [("softm", 55.0), ("disc", 40.0), ("gaussian", 25.0), ("ring", 35.0)])
-def test_parametric_families_fit_a_stopped_down_lens(family, least):
-    lens = read("double_gauss_50mm")
-    table = small(lens, f_number=4.0, family=family, rays=1_000)
-    assert table.family == family
-    assert psnr(table, table.coc.numpy()[[0, -1]], lens, 4.0, 2.0, shown=True).min() > least
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"family": "square"}, "family must be one of gaussian, ring, disc, softm, radial, got 'square'"),
         ({"nodes": 4}, "nodes must be a whole number from 5"),
         ({"nodes": 40, "width_px": 20}, "nodes must be at most [0-9]+ for this lens and width_px, got 40"),
         ({"points": 2}, "points must be a whole number from 3 to 1000, got 2"),
