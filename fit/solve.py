@@ -1,4 +1,4 @@
-"""Least squares by SciPy from several starts, and statistics of a solution; failures raise errors."""
+"""Least squares by SciPy from several starts; failures raise errors."""
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -86,8 +86,3 @@ def inverse(information: Array) -> Array:
     affected = (np.abs(vectors[:, is_lost]) > 1e-3).any(axis=1)
     result[affected, affected] = np.inf
     return np.asarray(result, dtype=np.float64)
-
-
-def information_criterion(squares: float, count: int, parameters: int) -> float:
-    """Bayesian information criterion of a least-squares fit, up to a constant that depends on the data only."""
-    return count * float(np.log(max(squares, np.finfo(float).tiny) / count)) + parameters * float(np.log(count))

@@ -138,7 +138,7 @@ def place_nodes(tracer: Tracer, near: float, far: float, nodes: int | None) -> l
 
 
 def fit_radial(tracer: Tracer, cocs: Sequence[float]) -> tuple[dict[str, Array], Array]:
-    """Values of all nodes together, in sweeps from both ends to the focus and back."""
+    """Values of all nodes together, in sweeps from the nearest to the farthest and back."""
     nodes, values = map(list, zip(*(tracer.alone(coc) for coc in cocs), strict=True))
     # for each node: equations that contain its values, their weight in them, and the node with the remaining weight
     spots: list[list[tuple[NodeEquations, float, int]]] = [[(node, 1.0, i)] for i, node in enumerate(nodes)]
@@ -148,16 +148,11 @@ def fit_radial(tracer: Tracer, cocs: Sequence[float]) -> tuple[dict[str, Array],
             equations = tracer.equations(coc, (1 - share) * left[1].radius + share * right[1].radius)
             spots[i].append((equations, 1 - share, i + 1))
             spots[i + 1].append((equations, share, i))
-    for order in (_to_focus(cocs), _to_focus(cocs)[::-1]) * (_SWEEPS // 2):
+    there = range(len(cocs))
+    for order in (there, there[::-1]) * (_SWEEPS // 2):
         for i in order:
             gram = np.sum([share**2 * spot.gram for spot, share, _ in spots[i]], axis=0)
             pulls = [share * (spot.pull - (1 - share) * spot.gram @ values[other]) for spot, share, other in spots[i]]
             values[i] = tracer.fitted(gram, np.sum(pulls, axis=0), nodes[i].histogram)
     residual = np.array([tracer.relative(node.error(v)) for node, v in zip(nodes, values, strict=True)])
     return {"values": np.stack(values), "radius": np.array([node.radius for node in nodes]) * tracer.pixel}, residual
-
-
-def _to_focus(cocs: Sequence[float]) -> list[int]:
-    """Indices of the nodes from both ends to the focus."""
-    focus = int(np.argmin(np.abs(cocs)))
-    return [*range(focus), *range(len(cocs) - 1, focus - 1, -1)]

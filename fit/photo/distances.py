@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from torchdof.optics.aperture import Aperture
-from torchdof.optics.psf import FAMILIES, LENGTHS
+from torchdof.optics.psf import LENGTHS
 
 from ..problems import without_warnings
 from ..result import Array, BlurFit
@@ -19,7 +19,6 @@ from .pair import fit_pair
 from .source import soft_edge
 
 _KNOTS = 33  # values of a free profile, equal for all distances
-_SWEEPS = 2  # passes of refitting with information from neighbours
 _COLOURS = ("red", "green", "blue")
 _GREEN = 1
 _DEFOCUSED_PX = 1.5  # px; for smaller blurs it is uncertain on which side of focus a colour is
@@ -32,10 +31,8 @@ def fit_one(pair: Capture, focus_m: float, family: str, **arguments: Any) -> Blu
     return fit_pair(pair.sharp, pair.blurred, family, white=pair.white, files=pair.files, **{**expected, **arguments})
 
 
-def fit_distances(
-    captures: Captures, family: str, smooth: bool, done: Callable[[Capture, BlurFit], None]
-) -> list[BlurFit]:
-    """Fits all pairs with one family; `smooth` then refits each with information from neighbouring distances."""
+def fit_distances(captures: Captures, family: str, done: Callable[[Capture, BlurFit], None]) -> list[BlurFit]:
+    """Fits all pairs with one family, each starting from its outer neighbour, so that correlated parameters agree."""
     defocus, fits = captures.defocus, dict[int, BlurFit]()
     # in front of the focus and behind it, pairs from the far end towards the focus
     sides = [sorted(np.flatnonzero(defocus * sign > 0).tolist(), key=lambda k: -abs(defocus[k])) for sign in (-1, 1)]
@@ -47,58 +44,7 @@ def fit_distances(
                 start = replace(start, params={n: v * scale if n in LENGTHS else v for n, v in start.params.items()})
             start = fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=start)
             done(captures.pairs[i], start)
-    if smooth:
-        with without_warnings():
-            for side in sides:
-                (_refine_aligned if family == "radial" else _refine_together)(captures, family, fits, side)
     return [fits[i] for i in range(len(defocus))]
-
-
-def _refine_together(captures: Captures, family: str, fits: dict[int, BlurFit], side: list[int]) -> None:
-    """Refits the pairs on one side of the focus, each with a prior: the line between its neighbours.
-
-    Correlated parameters (a rim's height and its steepness) thus become consistent over distance. The prior is loose,
-    so parameters that the pictures determine do not change.
-    """
-    defocus = captures.defocus
-    for order, i in _SWEEPS * list(enumerate(side)):
-        neighbours = side[max(order - 1, 0) : order] + side[order + 1 : order + 2]
-        if not neighbours:
-            continue
-        size = max(float(v) for n, v in fits[i].params.items() if n in LENGTHS)
-        prior = {}
-        for n in FAMILIES[family]:
-            deviation = {"b": 0.1, "m": 0.3}.get(n, 0.05 * size + 0.05)
-            first, last = (float(fits[k].params[n]) for k in (neighbours[0], neighbours[-1]))
-            if len(neighbours) == 1:
-                scaled = first * (abs(defocus[i] / defocus[neighbours[0]]) if n in LENGTHS else 1.0)
-                prior[n] = (float(scaled), 3 * deviation)
-            else:
-                share = (defocus[i] - defocus[neighbours[0]]) / (defocus[neighbours[1]] - defocus[neighbours[0]])
-                prior[n] = (float((1 - share) * first + share * last), deviation)
-        fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=fits[i], prior=prior)
-
-
-def _refine_aligned(captures: Captures, family: str, fits: dict[int, BlurFit], side: list[int]) -> None:
-    """Refits the free profiles on one side of the focus, with radii that lie on a line over the circle of confusion.
-
-    Between nodes a table mixes values at equal fractions of the radius, so the shapes only match if the radii follow
-    one rule.
-    """
-    if len(side) < 2:
-        return
-    ends = np.empty(len(side))  # radii in px that contain all but a thousandth of a profile's light
-    for k, i in enumerate(side):
-        values, radius = np.asarray(fits[i].params["values"]), float(fits[i].params["radius"])
-        r = np.linspace(0, radius, 1001)
-        light = np.cumsum(np.interp(r, np.linspace(0, radius, values.size), values) * r)
-        ends[k] = r[np.searchsorted(light, 0.999 * light[-1])] + radius / (values.size - 1)
-    # near focus a profile may end anywhere: the outer nodes define the line, raised so that it contains theirs
-    x = np.abs(captures.defocus[side])
-    slope, intercept = np.polyfit(x, ends, 1, w=x)
-    lift = max(float(np.max((ends - slope * x - intercept)[x > 0.25 * x.max()])), 0.0)
-    for i, reach in zip(side, np.maximum(np.maximum(slope * x + intercept + lift, ends), 1.0).tolist(), strict=True):
-        fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=fits[i], reach=reach)
 
 
 def fit_openings(

@@ -75,7 +75,6 @@ def fit_captures(
     family: str = "auto",
     *,
     accuracy_db: float = 45.0,
-    smooth: bool = True,
     progress: Callable[[int, int, str], None] | None = None,
     command: str = "torchdof.fit.fit_table",
     scale_of: TableFit | None = None,
@@ -89,9 +88,8 @@ def fit_captures(
     1. With a free choice of family, or an opening, fit each pair alone: this determines one family for all.
     2. Fit all pairs with this family, from both ends towards focus. Each fit starts from that of its outer neighbour,
        scaled by geometry; it uses another start only if that fits clearly better.
-    3. Refit with a loose prior on the line between the neighbours; free profiles get radii on a line instead.
-    4. Compare the radii with the camera's, and determine the scale of the circle of confusion.
-    5. Fit each colour like the mean, if the captures have colours.
+    3. Compare the radii with the camera's, and determine the scale of the circle of confusion.
+    4. Fit each colour like the mean, if the captures have colours.
 
     Args:
         captures: pairs at increasing distances.
@@ -99,7 +97,6 @@ def fit_captures(
             the blur is not round at one distance it is not round at any: "polygon" and "image" use one opening for all
             distances, rotated by half a turn in front of the focus, and fit its size at each.
         accuracy_db: accuracy for "auto", see `fit_pair`.
-        smooth: whether neighbouring distances share information.
         progress: called with (number done, total, text) after each fit.
         command: recorded in the table's provenance.
         scale_of: the fit of another dot in the same photographs, whose scale is used if the camera is unknown. With a
@@ -144,7 +141,7 @@ def fit_captures(
     if family in OPENINGS:
         fits, opening = fit_openings(captures, family, first_fits, check_exposure)
     else:
-        fits = fit_distances(captures, family, smooth, check_exposure)
+        fits = fit_distances(captures, family, check_exposure)
     fits = [with_uncertainty(pair, captures.focus_m, fit) for pair, fit in zip(pairs, fits, strict=True)]
     radius_px = np.array([f.radius for f in fits])
     check_agreement(captures, radius_px)

@@ -23,7 +23,7 @@ def test_figure_2_shows_samples_and_curve(simulator, tmp_path):
     forward = fit_pair(*simulator.Simulator(size=61).pair("gaussian", {"sigma": 3.0}), "gaussian")
     (axes,) = drawn(picture_of_fit(forward), tmp_path)
     assert [line.get_label() for line in axes.get_lines()] == ["pixels", "forward model", "kernel f(r), scaled"]
-    bare = BlurFit("gaussian", {"sigma": 1.0}, {"sigma": 0.1}, 0.0, 0.0, np.eye(1), ("sigma",), 0.0, 9, "profile")
+    bare = BlurFit("gaussian", {"sigma": 1.0}, {"sigma": 0.1}, 0.0, 0.0, np.eye(1), ("sigma",), "profile")
     with pytest.raises(FitError, match="no samples"):
         picture_of_fit(bare)
 
