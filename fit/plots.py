@@ -30,9 +30,6 @@ def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
 
     For a forward fit, the samples are the blurred dot's pixels and the curve is their model, together with the kernel's
     own profile; for a profile fit, the samples are blur strengths.
-
-    Raises:
-        FitError: the fit has no samples.
     """
     if not fit.samples.shape[1]:
         raise FitError("this fit carries no samples to draw")
@@ -104,12 +101,8 @@ def sheet_of_photographs(
 
     One row for each distance: the target found, the window around its dot, the window's pixels over the distance from
     the centre with the model, the residual, and the kernel. Below, rendered with the table: lights from near to far,
-    and the window of the photograph in focus, blurred as at the most blurred distance.
-
-    Args:
-        photographs: from `read_photographs`.
-        result: from `fit_captures` of the photographs' captures.
-        render: `render(image, coc_px, table)`, with the arguments of `torchdof.blur_by_coc`.
+    and the window of the photograph in focus, blurred as at the most blurred distance. `render(image, coc_px, table)`
+    has the arguments of `torchdof.blur_by_coc`.
     """
     captures = photographs.captures
     rows = len(captures)

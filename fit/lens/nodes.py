@@ -108,9 +108,6 @@ def place_nodes(tracer: Tracer, near: float, far: float, nodes: int | None) -> l
     """Signed coc of the nodes: repeatedly halves the interval with the worst interpolation in its middle.
 
     If ``nodes`` is None, until the interpolation reaches 50 dB everywhere.
-
-    Raises:
-        ValueError: If no interval is left to halve.
     """
 
     def interval_error(left: float, right: float) -> float:
