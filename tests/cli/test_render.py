@@ -33,6 +33,8 @@ Run = Callable[..., str]
 LENS = "--focal-length-mm 50 --f-number 1.2 --sensor-width-mm 4"  # blurs by 2.1 px
 ONE = "render image.exr depth.npy -o out.exr --focus-m 2"
 OLDER = "older than their files or options"
+RECORD = Path("out.####.exr.json")
+NO_RECORD = f"{RECORD}, which has the options of existing frames, is missing"
 PULL = "--focus-m 1:2,3:6 --sensor-width-mm 4 --table lens.json"
 SEQUENCE = "render shot.####.exr depth.####.npy -o out.####.exr"
 CAMERA = torchdof.Camera(focal_length_mm=50.0, f_number=1.2, focus_m=2.0, sensor_width_mm=4.0)
@@ -364,24 +366,9 @@ def test_steady_depth_flickers_less_and_resumed_or_partial_runs_give_the_same_fr
         (lambda: write_image("shot.0003.exr", Picture(torch.ones(1, 3, 16, 24))), "", 1, OLDER),
         (lambda: np.save("depth.0002.npy", np.full((16, 24), 5.0)), "--steady", 2, OLDER),
         (lambda: torchdof.BlurTable.gaussian().save("lens.json"), "", 3, OLDER),
-        (
-            lambda: Path("out.####.exr.json").unlink(),
-            "",
-            3,
-            "out.####.exr.json, which has the options of existing frames, is missing",
-        ),
-        (
-            lambda: Path("out.####.exr.json").write_text("[1"),
-            "",
-            3,
-            "out.####.exr.json, which has the options of existing frames, is missing",
-        ),
-        (
-            lambda: Path("out.####.exr.json").write_text(""),
-            "",
-            3,
-            "out.####.exr.json, which has the options of existing frames, is missing",
-        ),
+        (lambda: RECORD.unlink(), "", 3, NO_RECORD),
+        (lambda: RECORD.write_text("[1"), "", 3, NO_RECORD),
+        (lambda: RECORD.write_text(""), "", 3, NO_RECORD),
         (lambda: cut("out.0002.exr", 1), "", 1, "or they are cut short"),
         (lambda: cut("out.0002.exr"), "--steady", 1, "or they are cut short"),
         (lambda: guessed(f"{SEQUENCE} --f-number 4 {PULL} --frames 1"), "", 3, "--f-number changed"),
