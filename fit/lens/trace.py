@@ -1,4 +1,4 @@
-"""Makes a blur table of a lens prescription: traces spots at many distances, and fits kernels smooth over depth."""
+"""Makes a blur table of a lens prescription: traces spots at many distances, and fits a profile to each."""
 
 import datetime
 import math
@@ -19,7 +19,7 @@ from ..solve import one_thread
 from .field import coc_nodes, trace_field
 from .glass import C_UM, F_UM
 from .lens import Lens
-from .nodes import Tracer, fit_radial, place_nodes
+from .nodes import Tracer, place_nodes, profiles
 from .spot import Focus, Reference, Spot, focus_sensor, point_spread
 
 
@@ -52,7 +52,7 @@ def trace_table(
 
     1. Stop the lens down and focus it: the position of the sensor.
     2. Place the nodes of coc, tracing spots in between to find the worst interpolation.
-    3. Fit a profile to the spots, for all nodes together and for each wavelength.
+    3. Fit a profile to the spot of each node, for each wavelength.
     4. With ``field``, trace spots off the axis too.
 
     The table is exact for its focus and f-number. For another focus at the same f-number it is accurate if the lens's
@@ -123,7 +123,7 @@ def trace_table(
         )
         cocs = place_nodes(d_line, near, far, nodes)
         channels = coloured or [d_line]
-        fitted = [fit_radial(tracer, cocs) for tracer in channels]
+        fitted = [profiles(tracer, cocs) for tracer in channels]
         spots = None
         if field is not None:
             field_cocs = coc_nodes(near, far, field_nodes)

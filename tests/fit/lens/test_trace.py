@@ -77,7 +77,6 @@ def psnr(table: BlurTable, places: Any, lens: Lens, f_number: float, focus_m: fl
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_shipped_table_matches_traced_spots_and_states_its_origin(name):
-    # the fit used spots at 1/4, 1/2 and 3/4 of each interval
     lens, f_number, focus_m, nodes, least = SHIPPED[name]
     table = BlurTable.load(name)
     assert len(table.coc) == nodes
@@ -108,17 +107,6 @@ def test_the_number_of_nodes_is_chosen_for_50_db(lens_of):
     places = between(fine)
     places = places[np.abs(places) < 2 * PIXEL]
     assert psnr(fine, places, lens, 6.0, 2.0, shown=False).min() >= 50.0
-
-
-def test_fitting_all_nodes_at_once_beats_fitting_each_alone(monkeypatch):
-    lens = read("double_gauss_50mm")
-    found = {}
-    for sweeps in (0, 6):
-        monkeypatch.setattr("torchdof.fit.lens.nodes._SWEEPS", sweeps)
-        table = small(lens, f_number=4.0, nodes=9, points=33)
-        places = between(table)
-        found[sweeps] = psnr(table, places[np.abs(places) > PIXEL], lens, 4.0, 2.0, shown=True)
-    assert found[6].min() > found[0].min() + 3.0
 
 
 def small(lens: Lens, **changes: Any) -> BlurTable:
