@@ -14,7 +14,7 @@ from ..problems import without_warnings
 from ..result import Array, BlurFit
 from .captures import Capture, Captures
 from .dot import find_dot
-from .opening import common_opening, turned
+from .opening import turned
 from .pair import fit_pair
 from .source import soft_edge
 
@@ -52,12 +52,14 @@ def fit_openings(
 ) -> tuple[list[BlurFit], Aperture]:
     """Fits all pairs with kernels that are not round: one opening for all, in different sizes.
 
-    The first fits of `family` ("polygon" or "image") determine the opening, returned as seen behind the focus.
+    The opening is that of the largest blur whose first fit is of `family` ("polygon" or "image"), as seen behind the
+    focus.
     """
-    is_nearer = captures.defocus < 0
-    chosen = [i for i, fit in enumerate(first_fits) if fit.family == family]
-    opening = common_opening([first_fits[i] for i in chosen], is_nearer[chosen])
-    fits = []
+    is_nearer, fits = captures.defocus < 0, list[BlurFit]()
+    openings = [(fit, near) for fit, near in zip(first_fits, is_nearer, strict=True) if fit.family == family]
+    largest, is_turned = max(openings, key=lambda opening: opening[0].radius)
+    opening = largest.aperture or Aperture()
+    opening = turned(opening) if is_turned else opening
     for pair, in_front in zip(captures, is_nearer, strict=True):
         fit = fit_one(pair, captures.focus_m, "image", aperture=turned(opening) if in_front else opening)
         fits.append(replace(fit, family=family))
