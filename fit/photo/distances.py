@@ -1,14 +1,13 @@
-"""Fits all distances of a capture, smoothly over distance, and each colour."""
+"""Fits the pairs of a capture, their uncertainty, and each colour."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from torchdof.optics.aperture import Aperture
-from torchdof.optics.psf import LENGTHS
 
 from ..problems import without_warnings
 from ..result import Array, BlurFit
@@ -25,52 +24,31 @@ _DEFOCUSED_PX = 1.5  # px; for smaller blurs it is uncertain on which side of fo
 _RADIUS_ERROR = 0.02  # relative error with which the thin lens gives the radius
 
 
-def fit_one(pair: Capture, focus_m: float, family: str, **arguments: Any) -> BlurFit:
-    """Fits one pair, with the magnification expected from its distance; `arguments` are arguments of `fit_pair`."""
-    expected = {"magnification": focus_m / pair.distance_m, "knots": _KNOTS if family == "radial" else None}
-    return fit_pair(pair.sharp, pair.blurred, family, white=pair.white, files=pair.files, **{**expected, **arguments})
+def fit_one(pair: Capture, focus_m: float, family: str, opening: Aperture | None = None, **arguments: Any) -> BlurFit:
+    """Fits one pair, with the magnification expected from its distance; `arguments` are arguments of `fit_pair`.
 
-
-def fit_distances(captures: Captures, family: str, done: Callable[[Capture, BlurFit], None]) -> list[BlurFit]:
-    """Fits all pairs with one family, each starting from its outer neighbour, so that correlated parameters agree."""
-    defocus, fits = captures.defocus, dict[int, BlurFit]()
-    # in front of the focus and behind it, pairs from the far end towards the focus
-    sides = [sorted(np.flatnonzero(defocus * sign > 0).tolist(), key=lambda k: -abs(defocus[k])) for sign in (-1, 1)]
-    for side in sides:  # each pair starts from its neighbour's fit
-        start: BlurFit | None = None
-        for outer, i in zip([None, *side], side, strict=False):
-            if start is not None:
-                scale = abs(defocus[i] / defocus[outer])
-                start = replace(start, params={n: v * scale if n in LENGTHS else v for n, v in start.params.items()})
-            start = fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=start)
-            done(captures.pairs[i], start)
-    return [fits[i] for i in range(len(defocus))]
-
-
-def fit_openings(
-    captures: Captures, family: str, first_fits: list[BlurFit], done: Callable[[Capture, BlurFit], None]
-) -> tuple[list[BlurFit], Aperture]:
-    """Fits all pairs with kernels that are not round: one opening for all, in different sizes.
-
-    The opening is that of the largest blur whose first fit is of `family` ("polygon" or "image"), as seen behind the
-    focus.
+    Of an opening, as seen behind the focus, only the size is fitted.
     """
-    is_nearer, fits = captures.defocus < 0, list[BlurFit]()
-    openings = [(fit, near) for fit, near in zip(first_fits, is_nearer, strict=True) if fit.family == family]
-    largest, is_turned = max(openings, key=lambda opening: opening[0].radius)
+    expected = {"magnification": focus_m / pair.distance_m, "knots": _KNOTS if family == "radial" else None}
+    arguments = {"white": pair.white, "files": pair.files, **expected, **arguments}
+    if opening is None:
+        return fit_pair(pair.sharp, pair.blurred, family, **arguments)
+    aperture = turned(opening) if pair.distance_m < focus_m else opening
+    return replace(fit_pair(pair.sharp, pair.blurred, "image", aperture=aperture, **arguments), family=family)
+
+
+def common_opening(captures: Captures, family: str, fits: Sequence[BlurFit]) -> Aperture:
+    """The opening of the largest blur whose fit is of `family` ("polygon" or "image"), as seen behind the focus."""
+    openings = [(fit, pair) for fit, pair in zip(fits, captures, strict=True) if fit.family == family]
+    largest, pair = max(openings, key=lambda opening: opening[0].radius)
     opening = largest.aperture or Aperture()
-    opening = turned(opening) if is_turned else opening
-    for pair, in_front in zip(captures, is_nearer, strict=True):
-        fit = fit_one(pair, captures.focus_m, "image", aperture=turned(opening) if in_front else opening)
-        fits.append(replace(fit, family=family))
-        done(pair, fits[-1])
-    return fits, opening
+    return turned(opening) if pair.distance_m < captures.focus_m else opening
 
 
 def _fit_like(fit: BlurFit, pair: Capture, focus_m: float, sharp: Array, blurred: Array, **options: Any) -> BlurFit:
     """Fits other pictures of a pair like its own: with the same family and opening, or free profile's end."""
-    family, start = (fit.family, fit) if fit.aperture is None else ("image", None)
-    options |= {"start": start, "aperture": fit.aperture, "reach": fit.params["radius"] if family == "radial" else None}
+    family = fit.family if fit.aperture is None else "image"
+    options |= {"aperture": fit.aperture, "reach": fit.params["radius"] if family == "radial" else None}
     return fit_one(replace(pair, sharp=sharp, blurred=blurred), focus_m, family, **options)
 
 
@@ -79,13 +57,11 @@ def with_uncertainty(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
     if not pair.uncertain:
         return fit
     with without_warnings():
-        refit, *others = (
-            _fit_like(fit, pair, focus_m, *pictures) for pictures in ((pair.sharp, pair.blurred), *pair.uncertain)
-        )
+        others = [_fit_like(fit, pair, focus_m, *pictures) for pictures in pair.uncertain]
     zero = np.zeros(1)
     names = ("values",) if fit.family == "radial" else fit.names
     changes = np.stack(
-        [np.hstack([np.subtract(o.params.get(n, zero), refit.params.get(n, zero)) for n in names]) for o in others]
+        [np.hstack([np.subtract(o.params.get(n, zero), fit.params.get(n, zero)) for n in names]) for o in others]
     )  # [others, parameters]
     covariance = fit.covariance + changes.T @ changes
     spread = np.sqrt(np.diag(covariance))
@@ -94,7 +70,7 @@ def with_uncertainty(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
         fit,
         stderr=fit.stderr | {n: error for n, error in errors.items() if n in fit.params},
         covariance=covariance,
-        radius_stderr=float(np.hypot(fit.radius_stderr, np.linalg.norm([o.radius - refit.radius for o in others]))),
+        radius_stderr=float(np.hypot(fit.radius_stderr, np.linalg.norm([o.radius - fit.radius for o in others]))),
     )
 
 

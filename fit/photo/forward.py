@@ -8,7 +8,7 @@ the other parameters (variable projection): the kernel's parameters, displacemen
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -56,7 +56,6 @@ class Forward:
     magnification: float = 1.0  # expected size of the dot in the blurred picture over that in the sharp one
     fit_moves: tuple[str, ...] = ALL_MOVES  # fitted moves
     held_magnification: float | None = None  # initial or fixed value; None is the expected one
-    start: dict[str, Mapping[str, float]] = field(default_factory=dict)  # initial kernel parameters, by family
     shot_noise: float = 0.0  # growth of a pixel's noise variance (by second differences) with its level
     fine_share_of_light: float | None = None  # share of that growth seen in second differences; None: the dark paper's
     opening: Aperture = Aperture()  # of the lens, for the kernels in OPENINGS: blades or an image
@@ -160,20 +159,18 @@ class Forward:
         offset = np.arange(kernels.shape[-1]) - kernels.shape[-1] // 2
         return np.asarray(np.sqrt((kernels * (offset[:, None] ** 2 + offset**2)).sum((1, 2))) / scale)
 
-    def solve(self, family: str) -> Solution:
-        """Fits one family from several starts (or from `start`, and from the moments as well)."""
+    def solve(self, family: str, start: Mapping[str, float] | None = None) -> Solution:
+        """Fits one family, from given kernel parameters or from several shapes."""
         shape = SHAPES[family]
         names = (*shape, *self.fit_moves)
-        unmoved = self.moves({})
+        unmoved, starts = self.moves({}), self._starts(family) if start is None else [start]
         numbers = best_of(
             lambda p: self.project(self._shaped(family, names, p))[0] / self.unit,
             self.values / self.unit,
-            [[start[n] if n in start else unmoved[n] for n in names] for start in self._starts(family)],
+            [[one[n] if n in one else unmoved[n] for n in names] for one in starts],
             self.bounds(names),
             jacobian=lambda p: self._jacobian(family, names, p) / self.unit,
             tolerance=1e-7,
-            # leave the neighbour's branch only if another one reduces chi squared by 12
-            first_bias=12 / self.values.size if family in self.start else 0.0,
         )
         params = {n: float(v) for n, v in zip(names, numbers, strict=True)}
         fitted, gain, background = self.project(self._shaped(family, names, numbers))
@@ -280,14 +277,12 @@ class Forward:
         return [table[n][0] for n in names], [table[n][1] for n in names]
 
     def _starts(self, family: str) -> list[Mapping[str, float]]:
-        """Initial kernel parameters: a given start, and shapes with the second moment that the blur has added."""
-        starts = [self.start[family]] if family in self.start else []
+        """Initial kernel parameters: shapes with the second moment that the blur has added."""
         added_variance = (self.dot.radius**2 - (self.magnification * self.source.radius) ** 2) / 4
         size = min(float(np.sqrt(max(added_variance, 0.15))), self.half / 3)
         if family not in OPENINGS:
-            return [*starts, *({n: v * size if n in LENGTHS else v for n, v in s.items()} for s in _STARTS[family])]
-        # the rotation of an opening is only known from a given start
-        return starts or [{"radius": np.sqrt(2) * size / float(self.rms(family, {"radius": np.ones(1)})[0])}]
+            return [{n: v * size if n in LENGTHS else v for n, v in s.items()} for s in _STARTS[family]]
+        return [{"radius": np.sqrt(2) * size / float(self.rms(family, {"radius": np.ones(1)})[0])}]
 
 
 def without_level(columns: Array, shaped: Array) -> Array:

@@ -84,8 +84,7 @@ def solve_image(previous: Solution, kernel: Array | None = None) -> Solution:
 def _solved(previous: Solution, opening: Aperture, family: str, start: dict[str, float]) -> Solution:
     """The solution with an opening; the magnification starts from that of `previous`."""
     magnification = previous.moves["magnification"]
-    pair = replace(previous.pair, opening=opening, start={family: start}, held_magnification=magnification)
-    return pair.solve(family)
+    return replace(previous.pair, opening=opening, held_magnification=magnification).solve(family, start)
 
 
 def _harmonic(round_fit: Solution) -> tuple[int, float, float]:
