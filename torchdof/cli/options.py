@@ -149,6 +149,8 @@ class ApertureOptions:
     def __post_init__(self) -> None:
         if self.aperture is not None and (self.blades or self.curvature):
             raise ValueError("--aperture is the whole opening; leave --blades and --curvature out")
+        if self.curvature and not self.blades:
+            raise ValueError("--curvature is that of blades; give --blades too")
         if self.rotation and not self.blades and self.aperture is None:
             raise ValueError("--rotation turns blades or an image; give --blades or --aperture too")
 
