@@ -72,8 +72,7 @@ _SOFT = 0.1  # share of edge pixels
 _WIDE = 1.5  # px
 _MIXED = 0.5  # share of a ramp's pixels
 
-# Thin structures and ringing of soft maps
-_MOST = 4.0  # largest corrected step at a thin structure, as a multiple of the step in the map
+# Lamps and ringing of soft maps
 _BLUR_REACH = 9  # px; half the width of the Gaussian kernel
 _CLIMBED = 0.35  # standard deviation of a ramp, as a fraction of (pixels of its middle half) / (steps they climb)
 _PIXEL = 0.2  # px^2; variance that the area of a pixel adds to a ramp
@@ -102,8 +101,7 @@ def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> 
     """Moves and sharpens the edges of a depth map to where the image has them.
 
     Ramps become steps between their two surfaces. Pixels that show one surface and have the depth of the other are
-    corrected. Thin structures that a blurred map has flattened get their full depth. Slopes stay slopes, and an edge
-    between two surfaces of the same colour stays unchanged.
+    corrected. Slopes stay slopes, and an edge between two surfaces of the same colour stays unchanged.
 
     Args:
         image: ``[B, C, H, W]``, linear light, floating point; its scale does not matter.
@@ -235,9 +233,8 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops 
     2. Score sampled edge pixels by colour, fit the prior of each kind of edge pixel, and detect soft maps.
     3. Select the pixels to decide: all edge pixels; with ``auto``, those of kinds that are often wrong.
     4. A selected pixel shows the near surface where ``score + logit(prior) > 0``.
-    5. Correct thin structures that a soft map has flattened.
-    6. Give selected pixels the nearness of their surface, on ramps in proportion to the evidence.
-    7. In soft maps, remove the ringing of interpolation beside steps, and correct lamps of a few pixels.
+    5. Give selected pixels the nearness of their surface, on ramps in proportion to the evidence.
+    6. In soft maps, remove the ringing of interpolation beside steps, and correct lamps of a few pixels.
     """
     valid = nearness.abs() <= _LARGEST
     given = torch.where(valid, nearness, 0.0)
@@ -281,16 +278,13 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops 
         shows_near = shows_near + _LEAN * (score.abs() - 1.0).clamp(0.0, 1.0)
     shows_near = shows_near > 0
 
-    # thin structures
-    length = climb.sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
-    # standard deviation, in pixels, of the blur that turned the steps of an item into ramps
+    # the blur of a soft map: its standard deviation in pixels, and the width that it takes from near surfaces
     climbed = (climb * is_mixed).sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
     ramp_px = _CLIMBED * is_mixed.sum((1, 2, 3), keepdim=True) / climbed
     sigma = (ramp_px.square() - _PIXEL).clamp_min(0.0).sqrt().clamp(0.2, 3.0)
-    label = torch.where(edges.is_edge, is_near, 2.0 * given > _highest(given, 6) - _highest(-given, 6))
-    label = pixels.put(label.to(given.dtype), edge_pixels, shows_near.to(given.dtype))
+    label = pixels.put(is_near.to(given.dtype), edge_pixels, shows_near.to(given.dtype))
+    length = climb.sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
     lost_px = torch.where(edges.is_edge, label - level, 0.0).sum((1, 2, 3), keepdim=True) / length
-    near, far = _unmix(given, edges, label, is_soft, sigma, lost_px, edge_pixels, near, far, ops)
 
     own = pixels.pick(given, edge_pixels)[0]
     is_ramp = pixels.pick(edges.is_ramp, edge_pixels)[0]
@@ -537,48 +531,6 @@ def _climb(nearness: Tensor, valid: Tensor, edges: _Edges) -> Tensor:
     return torch.where(edges.is_edge, steepness / (edges.near - edges.far).clamp_min(1e-12), 0.0)
 
 
-def _unmix(
-    nearness: Tensor,
-    edges: _Edges,
-    label: Tensor,
-    is_soft: Tensor,
-    sigma: Tensor,
-    lost_px: Tensor,
-    edge_pixels: Tensor,
-    near: Tensor,
-    far: Tensor,
-    ops: Ops,
-) -> tuple[Tensor, Tensor]:
-    """Corrects the nearness of thin structures at the edges of soft maps.
-
-    Blur gives a thin structure a nearness between its own and that of the surface around it. A surface is thin where a
-    morphological opening of 5 x 5 pixels removes its label (1 on the near surface, 0 on the far one). The fit
-    ``nearness = a + b blurred(label)`` around a pixel gives the far surface ``a`` and the near one ``a + b``.
-    """
-    blurred = _blurred(label, sigma)
-    gap = near - far
-    item = edge_pixels // label[0].numel()
-    for is_near in (True, False):
-        shape = label if is_near else 1.0 - label
-        whole = torch.where(edges.is_edge, shape, 1.0)
-        thick = _highest(-_highest(-whole, 2), 2) > 0
-        thin = pixels.pick(edges.is_edge & is_soft & (shape > 0) & ~thick, edge_pixels)[0]
-        chosen = thin.nonzero()[:, 0]
-        thin_pixels = edge_pixels[chosen]
-        least, difference, fit = _regress(nearness, label, blurred, thin_pixels, ops)
-        fit = fit * _is_lost(lost_px if is_near else -lost_px)[item[chosen]]
-        if is_near:
-            most = far[chosen] + _MOST * gap[chosen]
-            gain = fit * (torch.minimum(least + difference, most) - near[chosen]).clamp_min(0.0)
-            near = near.index_add(0, chosen, gain.to(near.dtype))
-        else:
-            lowest = pixels.pick(-_highest(-nearness, 12), thin_pixels)[0]
-            bound = torch.maximum(near[chosen] - _MOST * gap[chosen], lowest)
-            gain = fit * (torch.maximum(least, bound) - far[chosen]).clamp_max(0.0)
-            far = far.index_add(0, chosen, gain.to(far.dtype))
-    return near, far
-
-
 def _without_ringing(nearness: Tensor, valid: Tensor, step: Tensor) -> Tensor:
     """Removes rims beside steps that are a little nearer, or farther, than the surface to which they belong.
 
@@ -631,18 +583,11 @@ def _lift_lamps(
     values = (weight, weight * (behind + difference.clamp_min(0.0)), weight * fit)
     total, level, fit = (pixels.pick(pixels.put(none, lamp_pixels, v), window)[0].sum(0) for v in values)
     level, fit = (values / total.clamp_min(1e-9) for values in (level, fit))
-    fit = fit * _is_lost(lost_px)[lamp_pixels // nearness[0].numel()]
+    # a map whose near surfaces are not too thin has lost no lamps: 0 where they are 1 px too wide
+    is_lost = (2.4 + 2.5 * lost_px).clamp(0.0, 1.0).flatten()
+    fit = fit * is_lost[lamp_pixels // nearness[0].numel()]
     own = pixels.pick(repaired, lamp_pixels)[0]
     return pixels.put(repaired, lamp_pixels, own + fit * (level - own).clamp_min(0.0))
-
-
-def _is_lost(lost_px: Tensor) -> Tensor:
-    """Confidence that thin structures are flattened, 0 to 1, ``[B]``.
-
-    ``lost_px`` is the mean width in pixels by which the map's surfaces are too narrow. The confidence is 0 if they are
-    1 px too wide: then blur has not thinned them.
-    """
-    return (2.4 + 2.5 * lost_px).clamp(0.0, 1.0).flatten()
 
 
 def _regress(

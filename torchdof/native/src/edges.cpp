@@ -26,10 +26,10 @@ constexpr int SAMPLED = 12000, SAMPLE_BLOCK = 8, ROUNDS = 10;
 constexpr float TRUSTED = 0.05f, PRIOR_COUNT = 30.0f;
 constexpr float RELATED = 0.8f, EXACT = 0.025f, DOUBTFUL = 0.05f, LEAN = 2.0f;  // decision, in automatic mode
 constexpr float SOFT = 0.1f, WIDE = 1.5f, MIXED = 0.5f;  // soft maps
-constexpr float MOST = 4.0f, CLIMBED = 0.35f, PIXEL = 0.2f, BETTER = 0.5f, OVERSHOOT = 0.12f;  // thin structures, ringing
+constexpr float CLIMBED = 0.35f, PIXEL = 0.2f, BETTER = 0.5f, OVERSHOOT = 0.12f;  // lamps, ringing
 constexpr int BLUR_REACH = 9, RINGING_REACH = 3;
-// Half widths in pixels of further windows: the usual light around a lamp, a lamp, both surfaces, the farthest one.
-constexpr int USUAL_REACH = REACH + 2, LAMP_REACH = 2, SIDE_REACH = 6, LOWEST_REACH = 12;
+// Half widths in pixels of further windows: the usual light around a lamp, and a lamp.
+constexpr int USUAL_REACH = REACH + 2, LAMP_REACH = 2;
 
 constexpr int AREA = 96;       // side of a tile in pixels
 constexpr int ROWS_AHEAD = 8;  // rows by which values are prefetched
@@ -241,17 +241,6 @@ void sums(const Grid &in, const Grid &out, const Grid &rows, const Part &part, f
   each_vector(part, [&](int y, int x) { store(out.at(y, x), symmetric(rows.at(y - REACH_, x), rows.pitch, LAST + 1, RUN) * factor); });
 }
 
-// Maximum over the square of side 2 LOWEST_REACH + 1 around a pixel.
-inline float largest_around(const Grid &in, int y, int x) {
-  vec high = all(-NONE);
-  for (int v = y - LOWEST_REACH; v <= y + LOWEST_REACH; v++) {
-    const float *row = in.at(v, x - LOWEST_REACH);
-    for (int u = 0; u + LANES <= 2 * LOWEST_REACH + 1; u += LANES) high = most(high, load<vec>(row + u));
-    high = most(high, load<vec>(row + 2 * LOWEST_REACH + 1 - LANES));
-  }
-  return largest(high);
-}
-
 // Which surface a pixel shows. score: log-odds of the near surface. reliability: 0 to 1, how well colours separate the
 // two surfaces. near, far: nearness of the surfaces.
 struct Judgement {
@@ -291,7 +280,7 @@ class Repair {
   // 2. Calibrate: for each kind of edge pixel, the share that shows the near surface.
   // 3. In automatic mode stop here if the map is exact or its edges are unrelated to the image's.
   // 4. Find and decide the edges of the whole frame; move pixels that have the depth of the wrong surface.
-  // 5. In a soft map also restore the nearness of thin structures and small lamps that a blur has reduced.
+  // 5. In a soft map also remove ringing, and restore the nearness of small lamps that a blur has reduced.
   bool run() {
     allocate();
     noise_step_ = NOISES * noise();
@@ -325,7 +314,6 @@ class Repair {
     allocate_results(groups);
     judge(groups, true);
     const float sigma = blur(), lost_px = choose(groups);
-    if (is_soft) unmix(groups, sigma, lost_px);
     move(groups, is_soft);
     if (is_soft) remove_ringing();
     if (is_soft) lift_lamps(sigma, lost_px);
@@ -1141,10 +1129,6 @@ class Repair {
     return (float)(total / std::max(found_.length, 1e-12));
   }
 
-  // Confidence that thin structures are flattened, 0 to 1, from the mean width in pixels by which surfaces are too
-  // narrow; 0 if they are 1 px too wide.
-  static float loss_factor(float lost_px) { return clamp01(2.4f + 2.5f * lost_px); }
-
   // Moves pixels to the nearness of the surface that they show; on ramps in proportion to the evidence.
   void move(const std::vector<Group> &groups, bool is_soft) const {
     parallel((int)groups.size(), [&](int g) {
@@ -1251,100 +1235,10 @@ class Repair {
     return {mean_y - b * mean_x[0] + own, b, of_x[0] > 0.004f ? clamp01((explained[0] - 0.5f) / 0.3f) * better : 0.0f};
   }
 
-  // In a soft map's thin structures: replaces the nearness of the surfaces by the fit of the blurred shape.
-  void unmix(const std::vector<Group> &groups, float sigma, float lost_px) const {
-    const std::vector<float> weights = even_window();
-    parallel((int)groups.size(), [&](int g) {
-      if (!groups[g].edges.empty()) unmix(groups[g], weights.data(), sigma, lost_px);
-    });
-  }
-
-  void unmix(const Group &group, const float *weights, float sigma, float lost_px) const {
-    const int reach = blur_reach(sigma);
-    const std::vector<uint8_t> is_thin = thin(group);
-    const Part part = bounds(group, [&](size_t k) { return is_thin[k]; });
-    if (part.height <= 0 || part.width <= 0) return;
-    const Part around = part.grown(REACH), labelled = around.grown(reach), whole = labelled.grown(SIDE_REACH);
-    const Grid up(whole), down(whole), rows(whole), high(labelled), low(labelled), blurred(around), given(around);
-    fetch(map_.nearness, up, [this](float v) { return sign_ * valid(v); });
-    fetch(map_.nearness, given, [this](float v) { return sign_ * valid(v); });
-    for (size_t i = 0; i < up.size; i++) down.at(whole.y0, whole.x0)[i] = -up.at(whole.y0, whole.x0)[i];
-    max_filter<SIDE_REACH>(up, high, rows, labelled);
-    max_filter<SIDE_REACH>(down, low, rows, labelled);
-    each_vector(labelled, [&](int y, int x) {
-      const auto is_near = 2.0f * load<vec>(up.at(y, x)) > load<vec>(high.at(y, x)) - load<vec>(low.at(y, x));
-      store(high.at(y, x), is_near ? all(1.0f) : vec{});
-    });
-    const Part inside = in_frame(labelled);
-    for (int y = inside.y0; y < inside.bottom(); y++) {
-      const uint8_t *marks = marks_.data() + (size_t)y * width_;
-      float *label = high.at(y, 0);
-      for (int x = inside.x0; x < inside.right(); x++) label[x] = marks[x] & EDGE ? (marks[x] & NEAR ? 1.0f : 0.0f) : label[x];
-    }
-    clamp_to_frame(high, labelled);
-    gaussian(high, blurred, rows, around, sigma);
-    each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
-      if (!is_thin[k]) return;
-      Line line = regress(given, high, blurred, weights, y, x);
-      line.fit *= loss_factor(marks_[edge.i] & NEAR ? lost_px : -lost_px);
-      float &near = group.judged[k].near, &far = group.judged[k].far;
-      const float gap = near - far;
-      if (marks_[edge.i] & NEAR)
-        near += line.fit * std::max(std::min(line.least + line.difference, far + MOST * gap) - near, 0.0f);
-      else if (line.fit > 0)
-        far += line.fit * std::min(std::max(line.least, std::max(near - MOST * gap, -largest_around(down, y, x))) - far, 0.0f);
-    });
-  }
-
-  // For each edge pixel: 1 if its surface is thin, that is, no 5 x 5 square nearby lies wholly in it.
-  std::vector<uint8_t> thin(const Group &group) const {
-    const Part around = group.bounds.grown(4);
-    const int pitch = around.width;
-    const size_t size = (size_t)around.height * pitch;
-    std::vector<uint8_t> memory(2 * size + 4 * pitch, 3);
-    uint8_t *shape = memory.data(), *rows = shape + size + 2 * pitch;  // bit 1: near surface, bit 2: far surface
-    const Part inside = in_frame(around);
-    for (int y = inside.y0; y < inside.bottom(); y++) {
-      const uint8_t *marks = marks_.data() + (size_t)y * width_;
-      uint8_t *row = shape + (y - around.y0) * pitch - around.x0;
-      for (int x = inside.x0; x < inside.right(); x++) {
-        const uint8_t edge = marks[x] & EDGE, is_near = marks[x] & NEAR;
-        row[x] = edge ? (is_near ? 1 : 2) : 3;
-      }
-    }
-    for (int y = 0; y < around.height; y++)
-      for (int x = 2; x < pitch - 2; x++) {
-        const uint8_t *p = shape + y * pitch + x;
-        rows[y * pitch + x] = p[-2] & p[-1] & p[0] & p[1] & p[2];
-      }
-    for (int y = 2; y < around.height - 2; y++)
-      for (int x = 2; x < pitch - 2; x++) {
-        const uint8_t *p = rows + y * pitch + x;
-        shape[y * pitch + x] = p[-2 * pitch] & p[-pitch] & p[0] & p[pitch] & p[2 * pitch];
-      }
-    for (int y = around.y0; y < around.bottom(); y++) {  // outside the frame belongs to no surface
-      uint8_t *row = shape + (y - around.y0) * pitch;
-      if (y < 0 || y >= height_) memset(row, 0, pitch);
-      memset(row, 0, inside.x0 - around.x0);
-      memset(row + inside.right() - around.x0, 0, around.right() - inside.right());
-    }
-    for (int y = 2; y < around.height - 2; y++)
-      for (int x = 4; x < pitch - 4; x++) {
-        const uint8_t *p = shape + y * pitch + x;
-        rows[y * pitch + x] = p[-2] | p[-1] | p[0] | p[1] | p[2];
-      }
-    std::vector<uint8_t> found(group.edges.size());
-    each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
-      const uint8_t *p = rows + (y - around.y0) * pitch + x - around.x0;
-      const uint8_t thick = p[-2 * pitch] | p[-pitch] | p[0] | p[pitch] | p[2 * pitch];
-      found[k] = !(thick & (marks_[edge.i] & NEAR ? 1 : 2));
-    });
-    return found;
-  }
-
   // Raises the nearness of lamps of a few pixels, which a soft map averages with their surroundings.
   void lift_lamps(float sigma, float lost_px) const {
     const std::vector<float> weights = even_window();
+    const float is_lost = clamp01(2.4f + 2.5f * lost_px);  // 0 if the map's near surfaces are 1 px too wide: then it has lost no lamps
     const std::vector<Group> all_parts = tiles();
     const int reach = blur_reach(sigma);
     parallel((int)all_parts.size(), [&](int g) {
@@ -1389,7 +1283,7 @@ class Repair {
             for (int n = 0; n < 3; n++) sums[n] += lamps.at(std::min(std::max(v, 0), height_ - 1), std::min(std::max(u, 0), width_ - 1))[n * lamps.size];
         const float per_weight = 1.0f / std::max(sums[0], 1e-9f);
         const float repaired = sign_ * map_.out[lamp.i];
-        map_.out[lamp.i] = sign_ * (repaired + sums[2] * per_weight * loss_factor(lost_px) * std::max(sums[1] * per_weight - repaired, 0.0f));
+        map_.out[lamp.i] = sign_ * (repaired + sums[2] * per_weight * is_lost * std::max(sums[1] * per_weight - repaired, 0.0f));
       });
     });
   }
