@@ -237,32 +237,31 @@ class Blend {
         }
     });
   }
-  // Whether a layer occurs in a range of pixels of a run's grid.
-  bool occurs(const Run &run, int k, int y0, int y1, int x0, int x1) const {
+  // Calls body(cell) for the cells of a range of pixels of a run's grid until it returns true; returns whether it did.
+  template <typename Body>
+  bool any_cell(const Run &run, int y0, int y1, int x0, int x1, const Body &body) const {
     const int s = run.scale, r0 = std::max(y0 * s, 0) / CELL, r1 = std::min(y1 * s - 1, scene_.rows - 1) / CELL;
     const int c0 = std::max(x0 * s, 0) / CELL, c1 = std::min(x1 * s - 1, scene_.columns - 1) / CELL;
     for (int r = r0; r <= r1; r++)
       for (int c = c0; c <= c1; c++)
-        if (cells_[((size_t)r * cell_columns_ + c) * words_ + k / 64] >> k % 64 & 1) return true;
+        if (body((size_t)r * cell_columns_ + c)) return true;
     return false;
   }
-
-  // Where all surfaces of a block's pixels lie, relative to a layer.
+  // Whether a layer occurs in a cell.
+  bool is_in(int k, size_t cell) const { return cells_[cell * words_ + k / 64] >> k % 64 & 1; }
+  // Where all surfaces of a cell's pixels lie, relative to a layer.
   enum Side { ACROSS, IN_FRONT, BEHIND };
-  Side side_of(const Run &run, int k, int block) const {
-    if (blurred_[k].occupied[block]) return ACROSS;
-    const Layer &l = layers_[k];
-    if (k == scene_.layers - 1) return IN_FRONT;
-    const int s = run.scale, y0 = block / run.block_columns * BLOCK * s, x0 = block % run.block_columns * BLOCK * s;
-    const int r1 = std::min(y0 + BLOCK * s, scene_.rows), c1 = std::min(x0 + BLOCK * s, scene_.columns);
-    bool in_front = true, behind = true;
-    for (int r = y0 / CELL; r * CELL < r1; r++)
-      for (int c = x0 / CELL; c * CELL < c1; c++) {
-        const size_t cell = (size_t)r * cell_columns_ + c;
-        in_front &= highs_[cell] <= l.at;
-        behind &= lows_[cell] >= layers_[k + 1].at;
-      }
-    return in_front ? IN_FRONT : behind ? BEHIND : ACROSS;
+  Side side_of(int k, size_t cell) const {
+    if (is_in(k, cell)) return ACROSS;
+    if (k == scene_.layers - 1 || highs_[cell] <= layers_[k].at) return IN_FRONT;
+    return lows_[cell] >= layers_[k + 1].at ? BEHIND : ACROSS;
+  }
+  // Whether a layer occurs in a range of pixels of a run's grid; whether a surface lies in it or behind it.
+  bool occurs(const Run &run, int k, int y0, int y1, int x0, int x1) const {
+    return any_cell(run, y0, y1, x0, x1, [&](size_t cell) { return is_in(k, cell); });
+  }
+  bool reaches_behind(const Run &run, int k, int y0, int y1, int x0, int x1) const {
+    return any_cell(run, y0, y1, x0, x1, [&](size_t cell) { return side_of(k, cell) != IN_FRONT; });
   }
 
   // Finds the blocks that a layer's light reaches, and the blocks that are read for them, forward and backward.
@@ -291,7 +290,8 @@ class Blend {
       if (needed[i]) {
         b.needed.push_back(i);
         spread(i, around);
-        b.behind[i] = side_of(run, k, i) != IN_FRONT;
+        const int y0 = i / run.block_columns * BLOCK, x0 = i % run.block_columns * BLOCK;
+        b.behind[i] = reaches_behind(run, k, y0, y0 + BLOCK, x0, x0 + BLOCK);
       }
     for (int i = 0; i < count; i++)
       if (around[i]) b.around.push_back(i);
@@ -341,76 +341,84 @@ class Blend {
     p.counted[1] += p.extra * (1.0f - clamp01(p.share));
   }
 
+  // Calls body(y, x, n, side) for up to LANES pixels of the padded frame at a time, for those cells of a block of a run's
+  // grid that are not wholly in front of a layer.
+  template <typename Body>
+  void each_cell(const Run &run, int k, int block, const Body &body) const {
+    const int size = BLOCK * run.scale, y0 = block / run.block_columns * size, x0 = block % run.block_columns * size;
+    for (int top = y0; top < std::min(y0 + size, scene_.rows); top += CELL)
+      for (int left = x0; left < std::min(x0 + size, scene_.columns); left += CELL) {
+        const size_t cell = (size_t)(top / CELL) * cell_columns_ + left / CELL;
+        const Side side = side_of(k, cell);
+        if (side == IN_FRONT) continue;
+        const bool occupied = is_in(k, cell);
+        for (int y = top; y < std::min(top + CELL, scene_.rows); y++)
+          for (int x = left; x < std::min(left + CELL, scene_.columns); x += LANES) body(y, x, std::min(LANES, scene_.columns - x), side, occupied);
+      }
+  }
+
   // The terms of a layer in a block of a run's grid: light, share and the share behind it.
   template <int S, int CHANNELS>
   void terms(const Run &run, int k, int block, float *planes) const {
-    const int C = CHANNELS ? CHANNELS : C_, count = C + (over_ ? 2 : 1);
+    const int C = CHANNELS ? CHANNELS : C_, count = C + (over_ ? 2 : 1), s = run.scale;
     const Layer &l = layers_[k];
-    const bool occupied = blurred_[k].occupied[block];
-    const int s = run.scale, y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
-    const int first = occupied ? 0 : count - 1, columns = std::min(BLOCK * s, scene_.columns - x0 * s);
+    const int y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
     const float part = 1.0f / (s * s);
     for (int v = 0; v < count; v++)
       for (int y = 0; y < BLOCK; y++) memset(planes + v * run.plane + run.at(y0 + y, x0), 0, BLOCK * sizeof(float));
-    const Side side = side_of(run, k, block);
-    if (side == IN_FRONT || (!occupied && !over_)) return;
-    for (int y = y0 * s; y < std::min((y0 + BLOCK) * s, scene_.rows); y++)
-      for (int x = 0; x < columns; x += LANES) {
-        const int n = std::min(LANES, columns - x);
-        const size_t at = (size_t)y * scene_.columns + x0 * s + x;
-        Pixels p;
-        vec share[2], term[MOST + 2], own = {}, behind = {};
-        if (side == BEHIND)
-          for (int j = 0; j < S; j++) behind += weight_at(j, at, n);
-        else
-          weigh<S>(l, at, n, p);
-        for (int j = 0; side == ACROSS && j < S; j++) {
-          share[j] = (p.h[j] - p.t[j]) * p.counted[j];
-          own += share[j];
-          behind += p.t[j] * p.counted[j];
-        }
-        for (int c = first; c < C; c++) {
-          term[c] = load_some(scene_.light[0] + c * map_ + at, n) * swap<S>(p, share, 0);
-          if (S > 1) term[c] += load_some(scene_.light[1] + c * map_ + at, n) * swap<S>(p, share, 1);
-        }
-        term[C] = own;
-        if (over_) term[C + 1] = behind;
-        for (int v = first; v < count; v++) {
-          float *its = planes + v * run.plane + run.at(y / s, x0 + x / s);
-          if (s == 1)
-            memcpy(its, &term[v], n * sizeof(float));
-          else if (s >= LANES)
-            its[0] += part * sum(term[v]);
-          else
-            for (int i = 0; i < n; i++) its[i / s] += part * term[v][i];
-        }
+    if (!blurred_[k].occupied[block] && !over_) return;
+    each_cell(run, k, block, [&](int y, int x, int n, Side side, bool occupied) {
+      const size_t at = (size_t)y * scene_.columns + x;
+      Pixels p;
+      vec share[2], term[MOST + 2], own = {}, behind = {};
+      if (side == BEHIND)
+        for (int j = 0; j < S; j++) behind += weight_at(j, at, n);
+      else
+        weigh<S>(l, at, n, p);
+      for (int j = 0; side == ACROSS && j < S; j++) {
+        share[j] = (p.h[j] - p.t[j]) * p.counted[j];
+        own += share[j];
+        behind += p.t[j] * p.counted[j];
       }
+      const int first = occupied ? 0 : count - 1;
+      for (int c = first; c < C; c++) {
+        term[c] = load_some(scene_.light[0] + c * map_ + at, n) * swap<S>(p, share, 0);
+        if (S > 1) term[c] += load_some(scene_.light[1] + c * map_ + at, n) * swap<S>(p, share, 1);
+      }
+      term[C] = own;
+      if (over_) term[C + 1] = behind;
+      for (int v = first; v < count; v++) {
+        float *its = planes + v * run.plane + run.at(y / s, x / s);
+        if (s == 1)
+          n == LANES ? store(its, term[v]) : add_some(its, term[v], n);
+        else if (s >= LANES)
+          its[0] += part * sum(term[v]);
+        else
+          for (int i = 0; i < n; i++) its[i / s] += part * term[v][i];
+      }
+    });
   }
 
   // Rows of a block's window that contain a layer, or surfaces behind it, as column marks for convolve_strip.
   void rows_of(const Run &run, int k, int block, bool behind, std::vector<uint32_t> &rows) const {
-    const int half = layers_[k].half, y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
-    const int c0 = std::max(x0 - half, 0) / BLOCK, c1 = std::min((x0 + BLOCK - 1 + half) / BLOCK, run.block_columns - 1);
+    const int half = layers_[k].half, y0 = block / run.block_columns * BLOCK - half, x0 = block % run.block_columns * BLOCK - half;
     rows.assign(BLOCK + 2 * half, 0);
-    int last = -1;
-    uint32_t any = 0;
-    for (int i = 0; i < (int)rows.size(); i++) {
-      const int y = y0 - half + i;
-      if (y < 0 || y / BLOCK >= run.block_rows) continue;
-      if (y / BLOCK != last) {
-        last = y / BLOCK, any = 0;
-        for (int c = c0; c <= c1; c++) any |= (behind ? blurred_[k].behind : blurred_[k].occupied)[last * run.block_columns + c] ? ~0u : 0u;
-      }
-      rows[i] = any;
+    const int step = std::max(CELL / run.scale, 1);  // rows of a cell
+    for (int i = 0, next; i < (int)rows.size(); i = next) {
+      next = std::min((floor_div(y0 + i, step) + 1) * step - y0, (int)rows.size());
+      const int x1 = x0 + BLOCK + 2 * half;
+      const bool any = behind ? reaches_behind(run, k, y0 + i, y0 + next, x0, x1) : occurs(run, k, y0 + i, y0 + next, x0, x1);
+      std::fill(rows.begin() + i, rows.begin() + next, any ? ~0u : 0u);
     }
   }
 
-  // Convolves a block of a plane: out [BLOCK, BLOCK].
-  void convolve(const Run &run, const float *plane, int block, const Kernel &kernel, const uint32_t *rows, float *out) const {
+  // Convolves a block of a plane: out [BLOCK, BLOCK]. Strips of rows y for which `wanted(y)` is false stay unwritten.
+  template <typename Wanted>
+  void convolve(const Run &run, const float *plane, int block, const Kernel &kernel, const uint32_t *rows, float *out, const Wanted &wanted) const {
     const int y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
     float strip[STRIP];
     for (int y = 0; y < BLOCK; y += STRIP_ROWS)
-      for (int x = 0; x < BLOCK; x += STRIP_COLUMNS) {
+      for (int x = 0; wanted(y) && x < BLOCK; x += STRIP_COLUMNS) {
         convolve_strip(plane + run.at(y0 + y - kernel.half, x0 + x - kernel.half), run.pitch, rows + y, ~0u, kernel, strip);
         for (int i = 0; i < STRIP_ROWS; i++) memcpy(out + (y + i) * BLOCK + x, strip + i * STRIP_COLUMNS, STRIP_COLUMNS * sizeof(float));
       }
@@ -439,7 +447,7 @@ class Blend {
       float *to = values_of(k, b.reached[i]);
       for (int v = 0; v < values_; v++, to += BLOCK_PIXELS) {
         const int term = v < C_ + E_ ? std::min(v, C_) : C_ + 1;
-        convolve(run, planes + term * run.plane, b.reached[i], b.kernels[E_ == 1 ? 0 : v < C_ ? v : (v - C_) % E_], term <= C_ ? rows.data() : rows_behind.data(), to);
+        convolve(run, planes + term * run.plane, b.reached[i], b.kernels[E_ == 1 ? 0 : v < C_ ? v : (v - C_) % E_], term <= C_ ? rows.data() : rows_behind.data(), to, [](int) { return true; });
       }
     });
   }
@@ -719,15 +727,21 @@ class Blend {
     });
     parallel((int)b.needed.size(), [&](int i, int) {
       const int block = b.needed[i];
-      if (!b.occupied[block] && (!over_ || !weighed() || side_of(run, k, block) == IN_FRONT)) return;  // terms are constant
+      if (!b.occupied[block] && (!over_ || !weighed() || !b.behind[block])) return;  // terms are constant
       const std::vector<uint32_t> every(BLOCK + 2 * layers_[k].half, ~0u);
       float slopes[(MOST + 2) * BLOCK_PIXELS], more[BLOCK_PIXELS];
+      const int y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
+      bool wanted[2][BLOCK / STRIP_ROWS];  // strips with pixels in the layer; in it or behind it
+      for (int y = 0; y < BLOCK; y += STRIP_ROWS) {
+        wanted[0][y / STRIP_ROWS] = occurs(run, k, y0 + y, y0 + y + STRIP_ROWS, x0, x0 + BLOCK);
+        wanted[1][y / STRIP_ROWS] = reaches_behind(run, k, y0 + y, y0 + y + STRIP_ROWS, x0, x0 + BLOCK);
+      }
       for (int term = b.occupied[block] ? 0 : C_ + 1; term < terms_; term++) {
         float *to = slopes + term * BLOCK_PIXELS;
         const int first = term < C_ ? term : term == C_ ? C_ : C_ + E_, count = term < C_ ? 1 : E_;
         for (int e = 0; e < count; e++) {
           const Kernel &kernel = b.turned[E_ == 1 ? 0 : term < C_ ? term : e];
-          convolve(run, planes + (first + e) * run.plane, block, kernel, every.data(), e ? more : to);
+          convolve(run, planes + (first + e) * run.plane, block, kernel, every.data(), e ? more : to, [&](int y) { return wanted[term > C_][y / STRIP_ROWS]; });
           for (int j = 0; e && j < BLOCK_PIXELS; j++) to[j] += more[j];
         }
       }
@@ -746,16 +760,11 @@ class Blend {
   void to_surfaces(const Run &run, int k, int block, const float *slopes) const {
     const int C = CHANNELS ? CHANNELS : C_;
     const Layer &l = layers_[k];
-    const bool occupied = blurred_[k].occupied[block];
-    const Side side = side_of(run, k, block);
     const int s = run.scale, y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
-    const int columns = std::min(BLOCK * s, scene_.columns - x0 * s);
     const float part = 1.0f / (s * s);
-    for (int y = y0 * s; y < std::min((y0 + BLOCK) * s, scene_.rows); y++)
-      for (int x = 0; x < columns; x += LANES) {
-        const int n = std::min(LANES, columns - x);
-        const size_t at = (size_t)y * scene_.columns + x0 * s + x;
-        const float *row = slopes + (y / s - y0) * BLOCK;
+    each_cell(run, k, block, [&](int y, int x, int n, Side side, bool occupied) {
+        const size_t at = (size_t)y * scene_.columns + x;
+        const float *row = slopes + (y / s - y0) * BLOCK - x0;
         auto slope = [&](int v) {
           const float *from = row + v * BLOCK_PIXELS;
           if (s == 1) return load<vec>(from + x);
@@ -767,7 +776,7 @@ class Blend {
         if (side == BEHIND) {
           for (int j = 0; j < S; j++)
             if (scene_.weight[j]) add_some(weight_[j] + at, of_behind, n);
-          continue;
+          return;
         }
         Pixels p;
         weigh<S>(l, at, n, p);
@@ -806,7 +815,7 @@ class Blend {
           add_some(place_[j] + at, swap<S>(p, of_place, j), n);
           if (scene_.weight[j]) add_some(weight_[j] + at, swap<S>(p, of_counted, j), n);
         }
-      }
+    });
   }
 
   const torchdof_layers &scene_;
