@@ -636,6 +636,11 @@ void composite(const Job &job, const RayKernels &ray_kernels, float *out);
 void blend(const torchdof_layers &scene, float *out);
 void blend_gradient(const torchdof_layers &scene, const float *out_gradient, float *const *light, float *const *place, float *const *weight);
 
+// The finest level of the pyramid from which hidden surfaces are filled, forward and backward; farthest.cpp
+void farthest(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads, float *out);
+void farthest_gradient(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads, const float *gradient,
+                       float *const *of_maps);
+
 // The surfaces behind pixels, read from a pyramid, forward and backward; look_behind.cpp
 void look_behind(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads, float *out);
 void look_behind_gradient(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads,
