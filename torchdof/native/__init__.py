@@ -37,6 +37,8 @@ __all__ = [
     "kernels",
     "look_behind",
     "look_behind_gradient",
+    "matte",
+    "matte_gradient",
     "plan",
     "render",
     "repair_edges",
@@ -488,6 +490,40 @@ def _farthest_arguments(maps: Sequence[Tensor], size: tuple[int, int]) -> tuple[
     return (_pointers([*memory, None]), *memory[0].shape, *size, torch.get_num_threads()), memory
 
 
+def matte(maps: Sequence[Tensor]) -> Tensor:
+    """Splits the pixels of an image at depth edges between two surfaces, as ``torchdof.render.matting.matte``.
+
+    Args:
+        maps: Light ``[C, H, W]``, signed coc ``[1, H, W]`` and optionally ``[1, H, W]`` with 0 for pixels that are left
+            out; float32.
+
+    Returns:
+        Light of each pixel's own surface, light of the other one, and coc and weight of the other one,
+        ``[2 C + 2, H, W]``, float32; the same bits for any number of threads.
+
+    Raises:
+        MemoryError: If there is not enough memory.
+    """
+    memory = [values.contiguous() for values in maps]
+    out = torch.empty(2 * len(memory[0]) + 2, *memory[0].shape[1:], dtype=torch.float32, device="cpu")
+    arguments = (*memory[0].shape, torch.get_num_threads(), None, _pointers([out]))
+    _check(_engine().torchdof_matte(_pointers([*memory, None]), *arguments))
+    return out
+
+
+def matte_gradient(maps: Sequence[Tensor], gradient: Tensor) -> list[Tensor]:
+    """The gradients of :func:`matte` by light and coc, given the one by its result, ``[2 C + 2, H, W]``.
+
+    Raises:
+        MemoryError: If there is not enough memory.
+    """
+    memory, gradient = [values.contiguous() for values in maps], gradient.contiguous()
+    found = [torch.empty_like(values) for values in memory[:2]]
+    arguments = (*memory[0].shape, torch.get_num_threads(), gradient.data_ptr(), _pointers(found))
+    _check(_engine().torchdof_matte(_pointers([*memory, None]), *arguments))
+    return found
+
+
 def look_behind(levels: Sequence[Tensor], rules: Rules, coc: Tensor) -> Tensor:
     """Surfaces behind those of an image with coc ``[H, W]``, as ``torchdof.render.disocclusion`` defines them.
 
@@ -796,6 +832,7 @@ def _library() -> tuple[ctypes.CDLL | None, str]:
     whole, numbers = ctypes.c_int32, ctypes.POINTER(ctypes.c_double)
     of_levels: list[Any] = [ctypes.POINTER(_Level), whole, whole, pointer, whole, whole, whole]
     of_surfaces: list[Any] = [maps, *[whole] * 6]
+    library.torchdof_matte.argtypes = [maps, *[whole] * 4, pointer, maps]
     library.torchdof_farthest.argtypes = [*of_surfaces, pointer]
     library.torchdof_farthest_gradient.argtypes = [*of_surfaces, pointer, maps]
     library.torchdof_look_behind.argtypes = [*of_levels, pointer]

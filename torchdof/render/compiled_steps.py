@@ -10,7 +10,7 @@ from .. import native
 from ..tensors import is_in_memory, is_traced
 from .surfaces import PaddedFrame, PaddedSurface
 
-__all__ = ["blended", "finest_level", "looked_behind"]
+__all__ = ["blended", "finest_level", "looked_behind", "matted"]
 
 
 def blended(
@@ -104,6 +104,27 @@ def finest_level(
         return [*native.farthest_gradient(given, size, gradient), *[None] * len(constant)]
 
     result: Tensor = _Step.apply(forward, backward, lambda *given: plain(*given[:5]), *maps, *constant)
+    return result
+
+
+def matted(
+    light: Tensor, coc_px: Tensor, valid: Tensor | None, plain: Callable[[Tensor, Tensor], Tensor]
+) -> Tensor | None:
+    """Both surfaces of each pixel, ``[B, 2 C + 2, H, W]``: their light, coc and weight of the other one, with gradient.
+
+    Arguments are those of :func:`torchdof.render.matting.matte`; ``plain`` is the same computation by PyTorch, from
+    light and coc. None if the compiled engine cannot compute it, as in :func:`blended`.
+    """
+    constant = [] if valid is None else [valid]
+    if not _supported([light, coc_px, *constant]):
+        return None
+
+    def backward(gradient: Tensor, *given: Tensor) -> list[Tensor | None]:
+        return [*native.matte_gradient(given, gradient), *[None] * len(constant)]
+
+    result: Tensor = _Step.apply(
+        lambda *given: native.matte(given), backward, lambda *given: plain(*given[:2]), light, coc_px, *constant
+    )
     return result
 
 

@@ -224,11 +224,12 @@ def fill_hidden(
     surfaces, size = (light, coc_px, other_light, other_coc_px, other_weight), (whole[0] // 2, whole[1] // 2)
 
     def finest(*surfaces: Tensor) -> Tensor:
-        return _finest_level(*surfaces, threshold, valid, size)
+        return _finest_level(surfaces, threshold, valid, size)
 
     first = finest_level(surfaces, threshold, valid, size, finest)
     first = finest(*surfaces) if first is None else first
-    pyramid = [_repeated((first[:, :colours], first[:, -2:-1], first[:, -1:]), sizes, 1)]
+    far_light, far_coc, far_weight = first.split([colours, 1, 1], 1)
+    pyramid = [_repeated((far_light, far_coc, far_weight), sizes, 1)]
     for level in range(2, max(levels) + 1):
         pyramid.append(_repeated(_farthest(*pyramid[-1]), sizes, level))
     # cells without valid pixels get the mean light of the others
@@ -261,8 +262,9 @@ def fill_hidden(
     # limit, where light and coc jump from one to the other.
     free_weight = (HIDDEN_WEIGHT - 2.0 * other_weight).clamp_min(0.0)
     hidden = (total / _CERTAIN).clamp(max=1.0) * free_weight
-    light = torch.where(hidden > 0, seen[:, :-1], other_light)
-    coc_px = torch.where(hidden > 0, seen[:, -1:], other_coc_px)
+    is_hidden, (seen_light, seen_coc) = hidden > 0, seen.split([colours, 1], 1)
+    light = torch.where(is_hidden, seen_light, other_light)
+    coc_px = torch.where(is_hidden, seen_coc, other_coc_px)
     weight = hidden + _counted(other_weight)
     return light, coc_px, weight, behind
 
@@ -294,21 +296,21 @@ def _repeated(
     return light, coc, weight
 
 
-def _finest_level(
-    light: Tensor,
-    coc_px: Tensor,
-    other_light: Tensor,
-    other_coc_px: Tensor,
-    other_weight: Tensor,
-    threshold: Tensor,
-    valid: Tensor | None,
-    size: tuple[int, int],
-) -> Tensor:
+def _finest_level(surfaces: Sequence[Tensor], threshold: Tensor, valid: Tensor | None, size: tuple[int, int]) -> Tensor:
     """The finest level of the pyramid: at every second pixel from the centre, the farthest of the pixels around it.
 
-    Each pixel shows its farther surface, dimmed to the threshold. Arguments are those of :func:`fill_hidden`; the
-    result is light, coc and weight, ``[B, C + 2, *size]``.
+    Each pixel shows its farther surface, dimmed to the threshold.
+
+    Args:
+        surfaces: Light and coc of each pixel's own surface, the same of its other surface, and the weight of that one.
+        threshold: As for :func:`fill_hidden`.
+        valid: As for :func:`fill_hidden`.
+        size: Height and width of the level, h and w.
+
+    Returns:
+        Light, coc and weight, ``[B, C + 2, h, w]``.
     """
+    light, coc_px, other_light, other_coc_px, other_weight = surfaces
     is_mixed = (other_weight > 0.05) & (other_coc_px > coc_px)
     coc_px, light = torch.where(is_mixed, other_coc_px, coc_px), torch.where(is_mixed, other_light, light)
     brightest = light.amax(1, keepdim=True)
@@ -366,7 +368,8 @@ def _seen(levels: Sequence[Level], coc_px: Tensor) -> Seen:
     values = [level.values for level in levels]
     found = looked_behind(values, [(level.step, *_rule(level)) for level in levels], coc_px, plain)
     found = recomputed(lambda: plain(values, coc_px)) if found is None else found
-    return found[:, :-1], found[:, -1:]
+    seen, votes = found.split([found.shape[1] - 1, 1], 1)  # not two slices, each of whose gradients is a whole map
+    return seen, votes
 
 
 def _samples(levels: Sequence[Level], size: tuple[int, int], step: int) -> tuple[list[Tensor], Tensor]:
