@@ -34,17 +34,19 @@ class Counted(TorchDispatchMode):
         return function(*args, **(kwargs or {}))
 
 
-def seconds(call: Callable[[], object], times: int = 5, device: str = "cpu") -> float:
+def seconds(
+    call: Callable[[], object], times: int = 5, device: str = "cpu", clock: Callable[[], float] = time.perf_counter
+) -> float:
     """Median time of some calls, after one that warms up, with all operations that they start on a GPU."""
     wait = (lambda: None) if device == "cpu" else torch.cuda.synchronize
     call()
     durations = []
     for _ in range(times):
         wait()
-        start = time.perf_counter()
+        start = clock()
         call()
         wait()
-        durations.append(time.perf_counter() - start)
+        durations.append(clock() - start)
     return statistics.median(durations)
 
 

@@ -3,8 +3,9 @@
 python examples/benchmarks/steps.py [--device cuda] [--threads 1] [--repeat 7]
 
 A step renders, and takes the gradients by light and radius. Each row is a process of its own, and every picture and
-step has a new focus. The last two columns are the most memory that a picture and a step take, on the CPU that of the
-process beyond that before the first picture. Rows with `splat` blur each pixel with its own kernel.
+step has a new focus. Times on the CPU are processor time, which other programs change less. The last two columns are
+the most memory that a picture and a step take, on the CPU that of the process beyond that before the first picture.
+Rows with `splat` blur each pixel with its own kernel.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import json
 import resource
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -77,7 +79,8 @@ def measure(size: tuple[int, int, int], renderer: str, device: str, repeat: int)
         """Median seconds of some calls, and the most MiB taken since the start; on a GPU since the first call."""
         if device != "cpu":
             torch.cuda.reset_peak_memory_stats()
-        return seconds(call, repeat, device), (most_bytes() - before) / 2**20
+        clock = time.process_time if device == "cpu" else time.perf_counter
+        return seconds(call, repeat, device, clock), (most_bytes() - before) / 2**20
 
     before = most_bytes()
     (frame_s, frame_mib), (step_s, step_mib) = measured(picture), measured(step)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchdof import BlurTable, blur_by_coc, native
-from torchdof.render import disocclusion
+from torchdof.render import compiled_steps, disocclusion, matting
 from torchdof.render.ops import Level
 from torchdof.render.plan import Plan
 from torchdof.tensors import TRACEABLE
@@ -179,4 +179,65 @@ def test_surfaces_behind_and_their_gradients_equal_the_plain_engines(
     assert len(used) == 2
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
     for ours, plain in zip(found, looked(), strict=True):
+        assert difference(ours, plain) < 1e-4
+
+
+def edges(channels: int, hole: bool) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Light, coc with steps, slopes and single pixels off both, and pixels that are left out."""
+    generator = torch.Generator().manual_seed(7)
+    light = torch.rand(2, channels, 54, 75, generator=generator) ** 3
+    coc = scene((-4.0, 6.0), channels)[1]
+    noise = torch.rand(coc.shape, generator=generator)
+    coc = coc + torch.where(noise > 0.8, 2.0 * noise - 1.6, 0.0)
+    coc[..., :10] = 1.0  # surfaces of one coc, whose extremes are equal
+    coc[..., 4:12, 3:5] = 2.5
+    return light, coc, (noise > 0.1).float() if hole else None
+
+
+STEPS: dict[str, Any] = {"matted": "matte_gradient", "finest_level": "farthest_gradient"}
+
+
+@pytest.mark.parametrize("hole", [False, True])
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("step", STEPS)
+def test_surfaces_of_pixels_and_their_gradients_equal_the_plain_engines(
+    step: str, channels: int, hole: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    light, coc, valid = edges(channels, hole)
+    given = (light, coc)
+    if step == "finest_level":
+        generator = torch.Generator().manual_seed(8)
+        weight = 0.5 * torch.rand(coc.shape, generator=generator)
+        given = (light, coc, light.flip(-1), coc.flip(-1), torch.where(weight > 0.2, weight, 0.0))
+
+    def computed() -> list[Tensor]:
+        leaves = [t.clone().requires_grad_() for t in given]
+        if step == "matted":
+            own, other, other_coc, share = matting.matte(*leaves, valid)
+            out = torch.cat([own, other * share, other_coc, share], 1)  # light of a tiny share is rounding
+        else:
+            limit, size = torch.full_like(coc, 0.7), (32, 44)
+            level = compiled_steps.finest_level(leaves, limit, valid, size, lambda *_: light)
+            out = disocclusion._finest_level(leaves, limit, valid, size) if level is None else level
+            out = torch.where(out < -1e8, 0.0, out)
+        seen = torch.rand(out.shape, generator=torch.Generator().manual_seed(1)) - 0.3
+        return [out.detach(), *torch.autograd.grad((out * seen).sum(), leaves)]
+
+    used: list[list[Tensor]] = []
+    of = getattr(native, STEPS[step])
+
+    def recorded(*arguments: Any) -> list[Tensor]:
+        used.append(of(*arguments))
+        threads = torch.get_num_threads()
+        torch.set_num_threads(3)
+        again = of(*arguments)
+        torch.set_num_threads(threads)
+        assert all(map(torch.equal, used[-1], again)), "the number of threads does not change the bits"
+        return used[-1]
+
+    monkeypatch.setattr(native, STEPS[step], recorded)
+    found = computed()
+    assert len(used) == 2
+    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
+    for ours, plain in zip(found, computed(), strict=True):
         assert difference(ours, plain) < 1e-4

@@ -32,9 +32,13 @@ __all__ = [
     "convolve",
     "describe",
     "ends",
+    "farthest",
+    "farthest_gradient",
     "kernels",
     "look_behind",
     "look_behind_gradient",
+    "matte",
+    "matte_gradient",
     "plan",
     "render",
     "repair_edges",
@@ -58,7 +62,7 @@ _KINDS: dict[Kind, int] = {"image": 0, "background": 1, "stack": 2}
 _SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
 _SMALL_FRAME = 2**16  # pixels; up to this size the main thread renders itself, which saves 0.1 ms
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
-_REVISION = 7  # of ``src/api.h``
+_REVISION = 8  # of ``src/api.h``
 
 Rules = Sequence[tuple[int, float, float, float]]
 _Floats = ctypes.POINTER(ctypes.c_float)
@@ -447,6 +451,79 @@ def _of_layers(nodes: Sequence[float], layers: Sequence[tuple[Tensor, int]]) -> 
     return made, bank
 
 
+def farthest(maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
+    """The finest level of a pyramid of an image's farthest surfaces, as ``torchdof.render.disocclusion`` defines it.
+
+    Args:
+        maps: Light ``[C, H, W]`` and coc ``[1, H, W]`` of each pixel's own surface, the same of its other surface, the
+            weight of the other one ``[1, H, W]``, the light above which a pixel is a highlight ``[1, H, W]``, and
+            optionally ``[1, H, W]`` with 0 for pixels that are left out; float32.
+        size: Height and width of the level, h and w.
+
+    Returns:
+        Light, coc and weight, ``[C + 2, h, w]``, float32; the same bits for any number of threads.
+
+    Raises:
+        MemoryError: If there is not enough memory.
+    """
+    arguments, memory = _farthest_arguments(maps, size)
+    out = torch.empty(memory[0].shape[0] + 2, *size, dtype=torch.float32, device="cpu")
+    _check(_engine().torchdof_farthest(*arguments, out.data_ptr()))
+    return out
+
+
+def farthest_gradient(maps: Sequence[Tensor], size: tuple[int, int], gradient: Tensor) -> list[Tensor]:
+    """The gradients of :func:`farthest` by its first five maps, given the one by its result, ``[C + 2, h, w]``.
+
+    Raises:
+        MemoryError: If there is not enough memory.
+    """
+    (arguments, memory), gradient = _farthest_arguments(maps, size), gradient.contiguous()
+    sums = [torch.zeros_like(values) for values in memory[:5]]
+    _check(_engine().torchdof_farthest_gradient(*arguments, gradient.data_ptr(), _pointers(sums)))
+    return sums
+
+
+def _farthest_arguments(maps: Sequence[Tensor], size: tuple[int, int]) -> tuple[tuple[Any, ...], list[Tensor]]:
+    """Arguments of both functions, and the memory to which they point."""
+    memory = [values.contiguous() for values in maps]
+    return (_pointers([*memory, None]), *memory[0].shape, *size, torch.get_num_threads()), memory
+
+
+def matte(maps: Sequence[Tensor]) -> Tensor:
+    """Splits the pixels of an image at depth edges between two surfaces, as ``torchdof.render.matting.matte``.
+
+    Args:
+        maps: Light ``[C, H, W]``, signed coc ``[1, H, W]`` and optionally ``[1, H, W]`` with 0 for pixels that are left
+            out; float32.
+
+    Returns:
+        Light of each pixel's own surface, light of the other one, and coc and weight of the other one,
+        ``[2 C + 2, H, W]``, float32; the same bits for any number of threads.
+
+    Raises:
+        MemoryError: If there is not enough memory.
+    """
+    memory = [values.contiguous() for values in maps]
+    out = torch.empty(2 * len(memory[0]) + 2, *memory[0].shape[1:], dtype=torch.float32, device="cpu")
+    arguments = (*memory[0].shape, torch.get_num_threads(), None, _pointers([out]))
+    _check(_engine().torchdof_matte(_pointers([*memory, None]), *arguments))
+    return out
+
+
+def matte_gradient(maps: Sequence[Tensor], gradient: Tensor) -> list[Tensor]:
+    """The gradients of :func:`matte` by light and coc, given the one by its result, ``[2 C + 2, H, W]``.
+
+    Raises:
+        MemoryError: If there is not enough memory.
+    """
+    memory, gradient = [values.contiguous() for values in maps], gradient.contiguous()
+    found = [torch.empty_like(values) for values in memory[:2]]
+    arguments = (*memory[0].shape, torch.get_num_threads(), gradient.data_ptr(), _pointers(found))
+    _check(_engine().torchdof_matte(_pointers([*memory, None]), *arguments))
+    return found
+
+
 def look_behind(levels: Sequence[Tensor], rules: Rules, coc: Tensor) -> Tensor:
     """Surfaces behind those of an image with coc ``[H, W]``, as ``torchdof.render.disocclusion`` defines them.
 
@@ -754,6 +831,10 @@ def _library() -> tuple[ctypes.CDLL | None, str]:
     library.torchdof_blend_gradient.argtypes = [ctypes.POINTER(_Layers), pointer, maps, maps, maps]
     whole, numbers = ctypes.c_int32, ctypes.POINTER(ctypes.c_double)
     of_levels: list[Any] = [ctypes.POINTER(_Level), whole, whole, pointer, whole, whole, whole]
+    of_surfaces: list[Any] = [maps, *[whole] * 6]
+    library.torchdof_matte.argtypes = [maps, *[whole] * 4, pointer, maps]
+    library.torchdof_farthest.argtypes = [*of_surfaces, pointer]
+    library.torchdof_farthest_gradient.argtypes = [*of_surfaces, pointer, maps]
     library.torchdof_look_behind.argtypes = [*of_levels, pointer]
     library.torchdof_look_behind_gradient.argtypes = [*of_levels, pointer, maps, pointer]
     real = ctypes.c_float

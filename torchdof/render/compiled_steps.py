@@ -10,7 +10,7 @@ from .. import native
 from ..tensors import is_in_memory, is_traced
 from .surfaces import PaddedFrame, PaddedSurface
 
-__all__ = ["blended", "looked_behind"]
+__all__ = ["blended", "finest_level", "looked_behind", "matted"]
 
 
 def blended(
@@ -66,7 +66,65 @@ def looked_behind(
     """
     if not _supported([coc_px, *values]) or len(values) > native.MOST_LEVELS or values[0].shape[1] > native.MOST_PLANES:
         return None
-    result: Tensor = _LookBehind.apply(rules, plain, coc_px, *values)
+
+    def forward(coc: Tensor, *levels: Tensor) -> Tensor:
+        return native.look_behind(levels, rules, coc[0])
+
+    def backward(gradient: Tensor, coc: Tensor, *levels: Tensor) -> list[Tensor]:
+        return native.look_behind_gradient(levels, rules, coc[0], gradient)
+
+    result: Tensor = _Step.apply(forward, backward, lambda coc, *levels: plain(levels, coc), coc_px, *values)
+    return result
+
+
+def finest_level(
+    maps: Sequence[Tensor], threshold: Tensor, valid: Tensor | None, size: tuple[int, int], plain: Callable[..., Tensor]
+) -> Tensor | None:
+    """The finest level of a pyramid of an image's farthest surfaces, ``[B, C + 2, h, w]``, with its gradient.
+
+    Args:
+        maps: Light and coc of each pixel's own surface, the same of its other surface, and the weight of that one,
+            ``[B, C or 1, H, W]``.
+        threshold: Light above which a pixel is a highlight, ``[B, 1, H, W]``, constant to autograd.
+        valid: ``[B, 1, H, W]``, 0 where a pixel is left out; None means all count.
+        size: Height and width of the level, h and w.
+        plain: The same computation by PyTorch, from ``maps``.
+
+    Returns:
+        None if the compiled engine cannot compute it, as in :func:`blended`.
+    """
+    constant = [threshold, *([] if valid is None else [valid])]
+    if not _supported([*maps, *constant]) or maps[0].shape[1] > native.MOST_PLANES:
+        return None
+
+    def forward(*given: Tensor) -> Tensor:
+        return native.farthest(given, size)
+
+    def backward(gradient: Tensor, *given: Tensor) -> list[Tensor | None]:
+        return [*native.farthest_gradient(given, size, gradient), *[None] * len(constant)]
+
+    result: Tensor = _Step.apply(forward, backward, lambda *given: plain(*given[:5]), *maps, *constant)
+    return result
+
+
+def matted(
+    light: Tensor, coc_px: Tensor, valid: Tensor | None, plain: Callable[[Tensor, Tensor], Tensor]
+) -> Tensor | None:
+    """Both surfaces of each pixel, ``[B, 2 C + 2, H, W]``: their light, coc and weight of the other one, with gradient.
+
+    Arguments are those of :func:`torchdof.render.matting.matte`; ``plain`` is the same computation by PyTorch, from
+    light and coc. None if the compiled engine cannot compute it, as in :func:`blended`.
+    """
+    constant = [] if valid is None else [valid]
+    if not _supported([light, coc_px, *constant]):
+        return None
+
+    def backward(gradient: Tensor, *given: Tensor) -> list[Tensor | None]:
+        return [*native.matte_gradient(given, gradient), *[None] * len(constant)]
+
+    result: Tensor = _Step.apply(
+        lambda *given: native.matte(given), backward, lambda *given: plain(*given[:2]), light, coc_px, *constant
+    )
     return result
 
 
@@ -109,27 +167,28 @@ def _items(counts: Sequence[int], tensors: Sequence[Tensor]) -> list[list[tuple[
     ]
 
 
-class _LookBehind(torch.autograd.Function):
+class _Step(torch.autograd.Function):
+    """A step that the compiled engine computes for one item of a batch after the other.
+
+    ``forward(*tensors)`` and ``backward(gradient, *tensors)`` compute it and its gradients by each tensor, None for
+    constants, from the tensors of one item; ``plain(*tensors)`` is the same computation by PyTorch for all items.
+    """
+
     @staticmethod
-    def forward(ctx: Any, rules: native.Rules, plain: Any, *tensors: Tensor) -> Tensor:
-        ctx.rules, ctx.plain = rules, plain
+    def forward(ctx: Any, forward: Any, backward: Any, plain: Any, *tensors: Tensor) -> Tensor:
+        ctx.backward_of_item, ctx.plain = backward, plain
         ctx.save_for_backward(*tensors)
-        items = zip(*(t.detach() for t in tensors), strict=True)
-        return torch.stack([native.look_behind(levels, rules, coc[0]) for coc, *levels in items])
+        return torch.stack([forward(*item) for item in zip(*(t.detach() for t in tensors), strict=True)])
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,), tensors = gradients, ctx.saved_tensors
         if torch.is_grad_enabled():
-            coc, *values = tensors
-            return None, None, *_differentiable(ctx.plain(values, coc), tensors, gradient)
+            return None, None, None, *_differentiable(ctx.plain(*tensors), tensors, gradient)
         items = zip(gradient, *(t.detach() for t in tensors), strict=True)
-        found = [native.look_behind_gradient(levels, ctx.rules, coc[0], of_item) for of_item, coc, *levels in items]
-        return (
-            None,
-            None,
-            *(torch.stack(each).view_as(t) for each, t in zip(zip(*found, strict=True), tensors, strict=True)),
-        )
+        found = zip(*(ctx.backward_of_item(*item) for item in items), strict=True)
+        pairs = zip(found, tensors, strict=True)
+        return None, None, None, *(None if each[0] is None else torch.stack(each).view_as(t) for each, t in pairs)
 
 
 def _differentiable(result: Tensor, inputs: Sequence[Tensor], gradient: Tensor) -> list[Tensor | None]:

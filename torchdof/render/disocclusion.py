@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..optics.kernel_cache import kept
 from ..tensors import recomputed
-from .compiled_steps import looked_behind
+from .compiled_steps import finest_level, looked_behind
 from .downsampling import downsampled
 from .matting import NEVER_PX, attribute_emitters, matte
 from .ops import EAGER, Level, Ops, Seen
@@ -221,16 +221,15 @@ def fill_hidden(
     sizes = [[_continued(n, 2**own) for own in levels] for n in (height, width)]
     whole = [max(of_items) for of_items in sizes]  # pixels of a level, centred on the image
 
-    # the farther surface of each pixel, dimmed to the threshold
-    is_mixed = (other_weight > 0.05) & (other_coc_px > coc_px)
-    far_coc, far_light = torch.where(is_mixed, other_coc_px, coc_px), torch.where(is_mixed, other_light, light)
-    brightest = far_light.amax(1, keepdim=True)
-    is_bright = brightest > threshold
-    far_light = far_light * torch.where(is_bright, threshold / torch.where(is_bright, brightest, 1.0), 1.0)
-    far_weight = torch.where(is_mixed, other_weight, 1.0 - other_weight)
-    if valid is not None:
-        far_coc, far_weight = torch.where(valid > 0, far_coc, -NEVER_PX), far_weight * valid
-    pyramid = [_repeated(_first_level(far_light, far_coc, far_weight, whole[0] // 2, whole[1] // 2), sizes, 1)]
+    surfaces, size = (light, coc_px, other_light, other_coc_px, other_weight), (whole[0] // 2, whole[1] // 2)
+
+    def finest(*surfaces: Tensor) -> Tensor:
+        return _finest_level(surfaces, threshold, valid, size)
+
+    first = finest_level(surfaces, threshold, valid, size, finest)
+    first = finest(*surfaces) if first is None else first
+    far_light, far_coc, far_weight = first.split([colours, 1, 1], 1)
+    pyramid = [_repeated((far_light, far_coc, far_weight), sizes, 1)]
     for level in range(2, max(levels) + 1):
         pyramid.append(_repeated(_farthest(*pyramid[-1]), sizes, level))
     # cells without valid pixels get the mean light of the others
@@ -263,8 +262,9 @@ def fill_hidden(
     # limit, where light and coc jump from one to the other.
     free_weight = (HIDDEN_WEIGHT - 2.0 * other_weight).clamp_min(0.0)
     hidden = (total / _CERTAIN).clamp(max=1.0) * free_weight
-    light = torch.where(hidden > 0, seen[:, :-1], other_light)
-    coc_px = torch.where(hidden > 0, seen[:, -1:], other_coc_px)
+    is_hidden, (seen_light, seen_coc) = hidden > 0, seen.split([colours, 1], 1)
+    light = torch.where(is_hidden, seen_light, other_light)
+    coc_px = torch.where(is_hidden, seen_coc, other_coc_px)
     weight = hidden + _counted(other_weight)
     return light, coc_px, weight, behind
 
@@ -296,16 +296,35 @@ def _repeated(
     return light, coc, weight
 
 
-def _first_level(
-    light: Tensor, coc_px: Tensor, weight: Tensor, height: int, width: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The finest level of the pyramid: at every second pixel from the centre, the farthest of the pixels around it."""
+def _finest_level(surfaces: Sequence[Tensor], threshold: Tensor, valid: Tensor | None, size: tuple[int, int]) -> Tensor:
+    """The finest level of the pyramid: at every second pixel from the centre, the farthest of the pixels around it.
+
+    Each pixel shows its farther surface, dimmed to the threshold.
+
+    Args:
+        surfaces: Light and coc of each pixel's own surface, the same of its other surface, and the weight of that one.
+        threshold: As for :func:`fill_hidden`.
+        valid: As for :func:`fill_hidden`.
+        size: Height and width of the level, h and w.
+
+    Returns:
+        Light, coc and weight, ``[B, C + 2, h, w]``.
+    """
+    light, coc_px, other_light, other_coc_px, other_weight = surfaces
+    is_mixed = (other_weight > 0.05) & (other_coc_px > coc_px)
+    coc_px, light = torch.where(is_mixed, other_coc_px, coc_px), torch.where(is_mixed, other_light, light)
+    brightest = light.amax(1, keepdim=True)
+    is_bright = brightest > threshold
+    light = light * torch.where(is_bright, threshold / torch.where(is_bright, brightest, 1.0), 1.0)
+    weight = torch.where(is_mixed, other_weight, 1.0 - other_weight)
+    if valid is not None:
+        coc_px, weight = torch.where(valid > 0, coc_px, -NEVER_PX), weight * valid
     shares, ends = [], []
-    for dim, samples in ((-1, width), (-2, height)):
-        size = coc_px.shape[dim]
-        shares.append(_window(size, samples, 2, coc_px.dtype, coc_px.device)[1].t())
-        before = (2 * samples - size + 1) // 2
-        ends += [before, 2 * samples + 2 - size - before]
+    for dim, samples in ((-1, size[1]), (-2, size[0])):
+        pixels = coc_px.shape[dim]
+        shares.append(_window(pixels, samples, 2, coc_px.dtype, coc_px.device)[1].t())
+        before = (2 * samples - pixels + 1) // 2
+        ends += [before, 2 * samples + 2 - pixels - before]
     values = functional.pad(torch.cat([light, coc_px, weight], 1), ends, mode="replicate")
     planes = [values[..., row::2, column::2] for row in (0, 1) for column in (0, 1)]  # [B, C + 2, h + 1, w + 1]
     first, last = slice(0, -1), slice(1, None)
@@ -323,7 +342,7 @@ def _first_level(
     for k in range(1, 9):
         summed = torch.addcmul(summed, around[k][:, :-1], counts[:, k, None])
     mean = summed / total.clamp_min(1e-9)
-    return mean[:, :-1], torch.where(total > 0, mean[:, -1:], -NEVER_PX), total
+    return torch.cat([mean[:, :-1], torch.where(total > 0, mean[:, -1:], -NEVER_PX), total], 1)
 
 
 def _farthest(light: Tensor, coc_px: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -349,7 +368,8 @@ def _seen(levels: Sequence[Level], coc_px: Tensor) -> Seen:
     values = [level.values for level in levels]
     found = looked_behind(values, [(level.step, *_rule(level)) for level in levels], coc_px, plain)
     found = recomputed(lambda: plain(values, coc_px)) if found is None else found
-    return found[:, :-1], found[:, -1:]
+    seen, votes = found.split([found.shape[1] - 1, 1], 1)  # not two slices, each of whose gradients is a whole map
+    return seen, votes
 
 
 def _samples(levels: Sequence[Level], size: tuple[int, int], step: int) -> tuple[list[Tensor], Tensor]:

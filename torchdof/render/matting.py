@@ -14,6 +14,7 @@ from torch import Tensor
 
 from .. import pixels
 from ..tensors import is_traced
+from .compiled_steps import matted
 from .ops import EAGER, Ops
 
 __all__ = ["NEVER_PX", "Matted", "attribute_emitters", "matte"]
@@ -68,6 +69,19 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops =
     Returns:
         The surfaces; the weight of the other one is in [0, 1/2].
     """
+    colours = light.shape[1]
+
+    def plain(light: Tensor, coc_px: Tensor) -> Tensor:
+        return torch.cat(_matte(light, coc_px, valid, ops), 1)
+
+    both = matted(light, coc_px, valid, plain)
+    if both is None:
+        return _matte(light, coc_px, valid, ops)
+    return Matted(*both.split([colours, colours, 1, 1], 1))
+
+
+def _matte(light: Tensor, coc_px: Tensor, valid: Tensor | None, ops: Ops) -> Matted:
+    """:func:`matte` by PyTorch."""
     # pixels beside another surface
     known = None if valid is None else valid > 0
     high, low = (c if known is None else torch.where(known, c, -NEVER_PX) for c in (coc_px.detach(), -coc_px.detach()))

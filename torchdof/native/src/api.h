@@ -166,6 +166,24 @@ typedef struct {
 } torchdof_level;
 #define TORCHDOF_MOST_LEVELS 4
 
+// Splits the pixels at depth edges; see render/matting.py. maps: light [channels, height, width], coc [height, width], and 0
+// for pixels that are left out, or null. Without a gradient, out[0] [2 channels + 2, height, width]: light of each pixel's own
+// surface and of the other one, coc and weight of the other one. From the gradient of these: the gradients of light and
+// coc, out.
+TORCHDOF_API int32_t torchdof_matte(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t threads,
+                                    const float *gradient, float *const *out);
+
+// The finest level of that pyramid, [channels + 2, rows, columns], from the surfaces of an image. maps: light [channels, height,
+// width], coc [height, width]; the same of each pixel's other surface, and its weight; light above which a pixel is a
+// highlight; and 0 for pixels that are left out, or null.
+TORCHDOF_API int32_t torchdof_farthest(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t rows,
+                                       int32_t columns, int32_t threads, float *out);
+
+// From the gradient of `out`: adds to the gradients of the first five maps.
+TORCHDOF_API int32_t torchdof_farthest_gradient(const float *const *maps, int32_t channels, int32_t height, int32_t width,
+                                                int32_t rows, int32_t columns, int32_t threads, const float *gradient,
+                                                float *const *of_maps);
+
 // The surfaces behind pixels with coc [height, width]. out: light, coc and votes, [channels + 2, height, width].
 TORCHDOF_API int32_t torchdof_look_behind(const torchdof_level *levels, int32_t count, int32_t channels, const float *coc, int32_t height,
                                           int32_t width, int32_t threads, float *out);
@@ -184,7 +202,7 @@ TORCHDOF_API void torchdof_convolve(const float *in, int32_t height, int32_t wid
 
 // Version of this interface, for the caller to check first: sizes of its structures and, in the upper half,
 // TORCHDOF_REVISION, which increases with every other change of this file.
-#define TORCHDOF_REVISION 7
+#define TORCHDOF_REVISION 8
 TORCHDOF_API int64_t torchdof_interface(void);
 
 // "avx2" or "baseline".

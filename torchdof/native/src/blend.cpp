@@ -34,26 +34,35 @@ inline vec slope_of_ramp(vec v, bool ease) {
   return inside ? slope : vec{};
 }
 
-// Consecutive layers of one resolution on one side of the focus, on a grid of their pixels: the padded frame, with
-// `guard` pixels around it that stay 0.
+// Consecutive layers of one resolution on one side of the focus, on a grid of their pixels, the padded frame's.
 struct Run {
   int scale, margin;                     // margin: pixels of the grid before the picture
-  int rows, columns, pitch, guard;       // of the grid
+  int rows, columns, pitch;              // of the grid
+  int half;                              // largest half width of its kernels
   int block_rows, block_columns;
   int top, left, bottom, right;          // its canvas in the grid; a coarse one has one more pixel on each side
   std::vector<int> layers;               // far to near
   size_t plane;                          // values of a plane of the grid
   Buffer<float> canvas, slopes;          // light and coverage [planes, plane], and their gradient
-  size_t at(int y, int x) const { return (size_t)(y + guard) * pitch + x + guard; }
+  size_t at(int y, int x) const { return (size_t)y * pitch + x; }
   int blocks() const { return block_rows * block_columns; }
+};
+
+// A tile of a run's grid, whose layers are blurred one after the other while its pixels are in the cache: blocks
+// [row0, row1) x [column0, column1). Its planes also hold the pixels around it that the kernels reach.
+struct Tile {
+  int row0, row1, column0, column1;
+  int top, left, rows, columns;  // pixels of the planes
+  size_t plane;
+  std::vector<float> &memory;
+  float *at(int v, int y, int x) const { return memory.data() + v * plane + (size_t)(y - top) * columns + x - left; }
 };
 
 // A layer: which blocks of its run's grid its light reaches, and the blurred terms there.
 struct Blurred {
   std::vector<int> index;   // of each block in `values`, or -1
   std::vector<int> reached;  // blocks with blurred terms
-  std::vector<int> needed;   // blocks that are read for these
-  std::vector<int> around;   // blocks that are read for the gradient of `needed`
+  std::vector<uint8_t> needed;  // blocks that are read for these
   std::vector<uint8_t> occupied, behind;  // blocks in which the layer occurs; in which a surface lies behind it
   Buffer<float> values;     // [blocks, terms, BLOCK_PIXELS]
   std::vector<Kernel> kernels, turned;  // for each colour
@@ -114,10 +123,7 @@ class Blend {
       });
     }
     light_ = light, place_ = place, weight_ = weight;
-    for (const Run &run : runs_) {
-      Buffer<float> planes = grid_planes(run, values_);
-      for (int k : run.layers) scatter_back(run, k, planes.data());
-    }
+    for (const Run &run : runs_) each_tile(run, values_, [&](int k, const Tile &tile) { scatter_back(run, k, tile); });
   }
 
  private:
@@ -155,11 +161,8 @@ class Blend {
     find_runs();
     mark_cells();
     for (Run &run : runs_) {
-      Buffer<float> planes = grid_planes(run, terms_);
-      for (int k : run.layers) {
-        find_blocks(run, k);
-        blur(run, k, planes.data());
-      }
+      for (int k : run.layers) find_blocks(run, k);
+      each_tile(run, terms_, [&](int k, const Tile &tile) { blur(run, k, tile); });
       if (run.scale == 1) continue;
       run.canvas = grid_planes(run, planes_);
       const std::vector<Step> steps = steps_of(run);
@@ -186,20 +189,20 @@ class Blend {
       run.top = run.left = run.margin - more;
       run.bottom = run.margin + scene_.height / scale + more;
       run.right = run.margin + scene_.width / scale + more;
-      run.guard = 0;
+      run.half = 0;
     };
     for (int k = scene_.layers - 1; k >= 0; k--) {
       const bool follows = !runs_.empty() && runs_.back().scale == layers_[k].scale && (layers_[k].scale == 1 || (layers_[runs_.back().layers.back()].node < 0) == (layers_[k].node < 0));
       if (!follows) add(layers_[k].scale);
       runs_.back().layers.push_back(k);
-      runs_.back().guard = std::max(runs_.back().guard, layers_[k].half + BLOCK);
+      runs_.back().half = std::max(runs_.back().half, layers_[k].half);
     }
     if (!has_fine()) add(1);
     for (Run &run : runs_) {
       run.block_rows = ceil_div(run.rows, BLOCK);
       run.block_columns = ceil_div(run.columns, BLOCK);
-      run.pitch = run.block_columns * BLOCK + 2 * run.guard + LANES;
-      run.plane = (size_t)(run.block_rows * BLOCK + 2 * run.guard) * run.pitch;
+      run.pitch = run.block_columns * BLOCK;
+      run.plane = (size_t)run.block_rows * BLOCK * run.pitch;
     }
   }
   bool has_fine() const {
@@ -237,65 +240,74 @@ class Blend {
         }
     });
   }
-  // Whether a layer occurs in a range of pixels of a run's grid.
-  bool occurs(const Run &run, int k, int y0, int y1, int x0, int x1) const {
+  // Calls body(cell) for the cells of a range of pixels of a run's grid until it returns true; returns whether it did.
+  template <typename Body>
+  bool any_cell(const Run &run, int y0, int y1, int x0, int x1, const Body &body) const {
     const int s = run.scale, r0 = std::max(y0 * s, 0) / CELL, r1 = std::min(y1 * s - 1, scene_.rows - 1) / CELL;
     const int c0 = std::max(x0 * s, 0) / CELL, c1 = std::min(x1 * s - 1, scene_.columns - 1) / CELL;
     for (int r = r0; r <= r1; r++)
       for (int c = c0; c <= c1; c++)
-        if (cells_[((size_t)r * cell_columns_ + c) * words_ + k / 64] >> k % 64 & 1) return true;
+        if (body((size_t)r * cell_columns_ + c)) return true;
     return false;
   }
-
-  // Where all surfaces of a block's pixels lie, relative to a layer.
+  // Whether a layer occurs in a cell.
+  bool is_in(int k, size_t cell) const { return cells_[cell * words_ + k / 64] >> k % 64 & 1; }
+  // Where all surfaces of a cell's pixels lie, relative to a layer.
   enum Side { ACROSS, IN_FRONT, BEHIND };
-  Side side_of(const Run &run, int k, int block) const {
-    if (blurred_[k].occupied[block]) return ACROSS;
-    const Layer &l = layers_[k];
-    if (k == scene_.layers - 1) return IN_FRONT;
-    const int s = run.scale, y0 = block / run.block_columns * BLOCK * s, x0 = block % run.block_columns * BLOCK * s;
-    const int r1 = std::min(y0 + BLOCK * s, scene_.rows), c1 = std::min(x0 + BLOCK * s, scene_.columns);
-    bool in_front = true, behind = true;
-    for (int r = y0 / CELL; r * CELL < r1; r++)
-      for (int c = x0 / CELL; c * CELL < c1; c++) {
-        const size_t cell = (size_t)r * cell_columns_ + c;
-        in_front &= highs_[cell] <= l.at;
-        behind &= lows_[cell] >= layers_[k + 1].at;
-      }
-    return in_front ? IN_FRONT : behind ? BEHIND : ACROSS;
+  Side side_of(int k, size_t cell) const {
+    if (is_in(k, cell)) return ACROSS;
+    if (k == scene_.layers - 1 || highs_[cell] <= layers_[k].at) return IN_FRONT;
+    return lows_[cell] >= layers_[k + 1].at ? BEHIND : ACROSS;
+  }
+  // Whether a layer occurs in a range of pixels of a run's grid; whether a surface lies in it or behind it.
+  bool occurs(const Run &run, int k, int y0, int y1, int x0, int x1) const {
+    return any_cell(run, y0, y1, x0, x1, [&](size_t cell) { return is_in(k, cell); });
+  }
+  bool reaches_behind(const Run &run, int k, int y0, int y1, int x0, int x1) const {
+    return any_cell(run, y0, y1, x0, x1, [&](size_t cell) { return side_of(k, cell) != IN_FRONT; });
   }
 
-  // Finds the blocks that a layer's light reaches, and the blocks that are read for them, forward and backward.
+  // Finds the blocks that a layer's light reaches, and the blocks that are read for them.
   void find_blocks(const Run &run, int k) {
     Blurred &b = blurred_[k];
     const int half = layers_[k].half, count = run.blocks();
     b.index.assign(count, -1);
     b.occupied.assign(count, 0);
-    std::vector<uint8_t> needed(count, 0), around(count, 0);
-    auto spread = [&](int block, std::vector<uint8_t> &to) {
-      const int y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
-      for (int r = std::max(y0 - half, 0) / BLOCK; r <= std::min((y0 + BLOCK - 1 + half) / BLOCK, run.block_rows - 1); r++)
-        for (int c = std::max(x0 - half, 0) / BLOCK; c <= std::min((x0 + BLOCK - 1 + half) / BLOCK, run.block_columns - 1); c++) to[r * run.block_columns + c] = 1;
-    };
+    b.behind.assign(count, 0);
+    b.needed.assign(count, 0);
+    int reached = 0;
     for (int i = 0; i < count; i++) {
       const int y0 = i / run.block_columns * BLOCK, x0 = i % run.block_columns * BLOCK;
       b.occupied[i] = occurs(run, k, y0, y0 + BLOCK, x0, x0 + BLOCK);
+      b.behind[i] = reaches_behind(run, k, y0, y0 + BLOCK, x0, x0 + BLOCK);
       const bool outside = y0 >= run.bottom || y0 + BLOCK <= run.top || x0 >= run.right || x0 + BLOCK <= run.left;
       if (outside || !occurs(run, k, y0 - half, y0 + BLOCK + half, x0 - half, x0 + BLOCK + half)) continue;
-      b.index[i] = (int)b.reached.size();
-      b.reached.push_back(i);
-      spread(i, needed);
+      b.index[i] = reached++;
+      for (int r = std::max(y0 - half, 0) / BLOCK; r <= std::min((y0 + BLOCK - 1 + half) / BLOCK, run.block_rows - 1); r++)
+        for (int c = std::max(x0 - half, 0) / BLOCK; c <= std::min((x0 + BLOCK - 1 + half) / BLOCK, run.block_columns - 1); c++) b.needed[r * run.block_columns + c] = 1;
     }
-    b.behind.assign(count, 0);
-    for (int i = 0; i < count; i++)
-      if (needed[i]) {
-        b.needed.push_back(i);
-        spread(i, around);
-        b.behind[i] = side_of(run, k, i) != IN_FRONT;
-      }
-    for (int i = 0; i < count; i++)
-      if (around[i]) b.around.push_back(i);
-    b.values = Buffer<float>((size_t)b.reached.size() * values_ * BLOCK_PIXELS + 1);
+    b.values = Buffer<float>((size_t)reached * values_ * BLOCK_PIXELS + 1);
+  }
+
+  // Calls body(k, tile) for the layers of a run and the tiles of its grid; planes: number of planes of a tile.
+  template <typename Body>
+  void each_tile(const Run &run, int planes, const Body &body) const {
+    const int side = std::max(TILE, run.half / BLOCK * BLOCK * 2) / BLOCK, guard = ceil_div(run.half, CELL) * CELL;
+    const int down = ceil_div(run.block_rows, side), across = ceil_div(run.block_columns, side);
+    std::vector<std::vector<float>> memory(std::max(1, scene_.threads));
+    parallel(down * across, [&](int i, int worker) {
+      const int row0 = i / across * side, column0 = i % across * side, width = side * BLOCK + 2 * guard;
+      const Tile tile = {row0, std::min(row0 + side, run.block_rows), column0, std::min(column0 + side, run.block_columns),
+                         row0 * BLOCK - guard, column0 * BLOCK - guard, width, width, (size_t)width * width, memory[worker]};
+      tile.memory.resize(planes * tile.plane + LANES);
+      for (int k : run.layers) body(k, tile);
+    });
+  }
+  // Calls body(block) for the blocks of a tile.
+  template <typename Body>
+  void each_block_of(const Run &run, const Tile &tile, const Body &body) const {
+    for (int r = tile.row0; r < tile.row1; r++)
+      for (int c = tile.column0; c < tile.column1; c++) body(r * run.block_columns + c);
   }
 
   float *values_of(int k, int block) const {
@@ -341,86 +353,93 @@ class Blend {
     p.counted[1] += p.extra * (1.0f - clamp01(p.share));
   }
 
-  // The terms of a layer in a block of a run's grid: light, share and the share behind it.
-  template <int S, int CHANNELS>
-  void terms(const Run &run, int k, int block, float *planes) const {
-    const int C = CHANNELS ? CHANNELS : C_, count = C + (over_ ? 2 : 1);
-    const Layer &l = layers_[k];
-    const bool occupied = blurred_[k].occupied[block];
-    const int s = run.scale, y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
-    const int first = occupied ? 0 : count - 1, columns = std::min(BLOCK * s, scene_.columns - x0 * s);
-    const float part = 1.0f / (s * s);
-    for (int v = 0; v < count; v++)
-      for (int y = 0; y < BLOCK; y++) memset(planes + v * run.plane + run.at(y0 + y, x0), 0, BLOCK * sizeof(float));
-    const Side side = side_of(run, k, block);
-    if (side == IN_FRONT || (!occupied && !over_)) return;
-    for (int y = y0 * s; y < std::min((y0 + BLOCK) * s, scene_.rows); y++)
-      for (int x = 0; x < columns; x += LANES) {
-        const int n = std::min(LANES, columns - x);
-        const size_t at = (size_t)y * scene_.columns + x0 * s + x;
-        Pixels p;
-        vec share[2], term[MOST + 2], own = {}, behind = {};
-        if (side == BEHIND)
-          for (int j = 0; j < S; j++) behind += weight_at(j, at, n);
-        else
-          weigh<S>(l, at, n, p);
-        for (int j = 0; side == ACROSS && j < S; j++) {
-          share[j] = (p.h[j] - p.t[j]) * p.counted[j];
-          own += share[j];
-          behind += p.t[j] * p.counted[j];
-        }
-        for (int c = first; c < C; c++) {
-          term[c] = load_some(scene_.light[0] + c * map_ + at, n) * swap<S>(p, share, 0);
-          if (S > 1) term[c] += load_some(scene_.light[1] + c * map_ + at, n) * swap<S>(p, share, 1);
-        }
-        term[C] = own;
-        if (over_) term[C + 1] = behind;
-        for (int v = first; v < count; v++) {
-          float *its = planes + v * run.plane + run.at(y / s, x0 + x / s);
-          if (s == 1)
-            memcpy(its, &term[v], n * sizeof(float));
-          else if (s >= LANES)
-            its[0] += part * sum(term[v]);
-          else
-            for (int i = 0; i < n; i++) its[i / s] += part * term[v][i];
-        }
+  // Calls body(y, x, n, side, occupied) for up to LANES pixels of the padded frame at a time, for those cells of a range of
+  // pixels of a run's grid that are not wholly in front of a layer.
+  template <typename Body>
+  void each_cell(const Run &run, int k, int y0, int y1, int x0, int x1, const Body &body) const {
+    const int s = run.scale, bottom = std::min(y1 * s, scene_.rows), right = std::min(x1 * s, scene_.columns);
+    for (int top = std::max(y0 * s, 0); top < bottom; top += CELL)
+      for (int left = std::max(x0 * s, 0); left < right; left += CELL) {
+        const size_t cell = (size_t)(top / CELL) * cell_columns_ + left / CELL;
+        const Side side = side_of(k, cell);
+        if (side == IN_FRONT || (side == BEHIND && !over_)) continue;
+        const bool occupied = is_in(k, cell);
+        for (int y = top; y < std::min(top + CELL, bottom); y++)
+          for (int x = left; x < std::min(left + CELL, right); x += LANES) body(y, x, std::min(LANES, scene_.columns - x), side, occupied);
       }
+  }
+
+  // The terms of a layer in and around a tile: light, share and the share behind it.
+  template <int S, int CHANNELS>
+  void terms(const Run &run, int k, const Tile &tile) const {
+    const int C = CHANNELS ? CHANNELS : C_, s = run.scale, guard = ceil_div(layers_[k].half, CELL) * CELL;
+    const Layer &l = layers_[k];
+    const float part = 1.0f / (s * s);
+    std::fill(tile.memory.begin(), tile.memory.end(), 0.0f);
+    const int top = tile.row0 * BLOCK - guard, bottom = tile.row1 * BLOCK + guard, left = tile.column0 * BLOCK - guard, right = tile.column1 * BLOCK + guard;
+    each_cell(run, k, top, bottom, left, right, [&](int y, int x, int n, Side side, bool occupied) {
+      const size_t at = (size_t)y * scene_.columns + x;
+      float *its = tile.at(0, y / s, x / s);
+      auto put = [&](int v, vec term) {
+        float *to = its + v * tile.plane;
+        if (s == 1)
+          n == LANES ? store(to, term) : add_some(to, term, n);
+        else if (s >= LANES)
+          to[0] += part * sum(term);
+        else
+          for (int i = 0; i < n; i++) to[i / s] += part * term[i];
+      };
+      vec behind = {};
+      if (side == BEHIND) {
+        for (int j = 0; j < S; j++) behind += weight_at(j, at, n);
+        return put(C + 1, behind);
+      }
+      Pixels p;
+      weigh<S>(l, at, n, p);
+      for (int j = 0; j < S; j++) behind += p.t[j] * p.counted[j];
+      if (over_) put(C + 1, behind);
+      if (!occupied) return;
+      vec share[2], given[2];
+      for (int j = 0; j < S; j++) share[j] = (p.h[j] - p.t[j]) * p.counted[j];
+      for (int j = 0; j < S; j++) given[j] = swap<S>(p, share, j);
+      for (int c = 0; c < C; c++) {
+        const vec own = load_some(scene_.light[0] + c * map_ + at, n) * given[0];
+        put(c, S > 1 ? own + load_some(scene_.light[1] + c * map_ + at, n) * given[1] : own);
+      }
+      put(C, S > 1 ? share[0] + share[1] : share[0]);
+    });
   }
 
   // Rows of a block's window that contain a layer, or surfaces behind it, as column marks for convolve_strip.
   void rows_of(const Run &run, int k, int block, bool behind, std::vector<uint32_t> &rows) const {
-    const int half = layers_[k].half, y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
-    const int c0 = std::max(x0 - half, 0) / BLOCK, c1 = std::min((x0 + BLOCK - 1 + half) / BLOCK, run.block_columns - 1);
+    const int half = layers_[k].half, y0 = block / run.block_columns * BLOCK - half, x0 = block % run.block_columns * BLOCK - half;
     rows.assign(BLOCK + 2 * half, 0);
-    int last = -1;
-    uint32_t any = 0;
-    for (int i = 0; i < (int)rows.size(); i++) {
-      const int y = y0 - half + i;
-      if (y < 0 || y / BLOCK >= run.block_rows) continue;
-      if (y / BLOCK != last) {
-        last = y / BLOCK, any = 0;
-        for (int c = c0; c <= c1; c++) any |= (behind ? blurred_[k].behind : blurred_[k].occupied)[last * run.block_columns + c] ? ~0u : 0u;
-      }
-      rows[i] = any;
+    const int step = std::max(CELL / run.scale, 1);  // rows of a cell
+    for (int i = 0, next; i < (int)rows.size(); i = next) {
+      next = std::min((floor_div(y0 + i, step) + 1) * step - y0, (int)rows.size());
+      const int x1 = x0 + BLOCK + 2 * half;
+      const bool any = behind ? reaches_behind(run, k, y0 + i, y0 + next, x0, x1) : occurs(run, k, y0 + i, y0 + next, x0, x1);
+      std::fill(rows.begin() + i, rows.begin() + next, any ? ~0u : 0u);
     }
   }
 
-  // Convolves a block of a plane: out [BLOCK, BLOCK].
-  void convolve(const Run &run, const float *plane, int block, const Kernel &kernel, const uint32_t *rows, float *out) const {
+  // Convolves a block of a plane: out [BLOCK, BLOCK]. Strips of rows y for which `wanted(y)` is false stay unwritten.
+  template <typename Wanted>
+  void convolve(const Run &run, const Tile &tile, int plane, int block, const Kernel &kernel, const uint32_t *rows, float *out, const Wanted &wanted) const {
     const int y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
     float strip[STRIP];
     for (int y = 0; y < BLOCK; y += STRIP_ROWS)
-      for (int x = 0; x < BLOCK; x += STRIP_COLUMNS) {
-        convolve_strip(plane + run.at(y0 + y - kernel.half, x0 + x - kernel.half), run.pitch, rows + y, ~0u, kernel, strip);
+      for (int x = 0; wanted(y) && x < BLOCK; x += STRIP_COLUMNS) {
+        convolve_strip(tile.at(plane, y0 + y - kernel.half, x0 + x - kernel.half), tile.columns, rows + y, ~0u, kernel, strip);
         for (int i = 0; i < STRIP_ROWS; i++) memcpy(out + (y + i) * BLOCK + x, strip + i * STRIP_COLUMNS, STRIP_COLUMNS * sizeof(float));
       }
   }
 
-  void terms_of(const Run &run, int k, int block, float *planes) const {
+  void terms_of(const Run &run, int k, const Tile &tile) const {
     if (C_ == 3)
-      S_ == 1 ? terms<1, 3>(run, k, block, planes) : terms<2, 3>(run, k, block, planes);
+      S_ == 1 ? terms<1, 3>(run, k, tile) : terms<2, 3>(run, k, tile);
     else
-      S_ == 1 ? terms<1, 0>(run, k, block, planes) : terms<2, 0>(run, k, block, planes);
+      S_ == 1 ? terms<1, 0>(run, k, tile) : terms<2, 0>(run, k, tile);
   }
   void to_surfaces_of(const Run &run, int k, int block, const float *slopes) const {
     if (C_ == 3)
@@ -429,17 +448,21 @@ class Blend {
       S_ == 1 ? to_surfaces<1, 0>(run, k, block, slopes) : to_surfaces<2, 0>(run, k, block, slopes);
   }
 
-  void blur(const Run &run, int k, float *planes) {
+  void blur(const Run &run, int k, const Tile &tile) const {
     const Blurred &b = blurred_[k];
-    parallel((int)b.needed.size(), [&](int i, int) { terms_of(run, k, b.needed[i], planes); });
-    parallel((int)b.reached.size(), [&](int i, int) {
-      std::vector<uint32_t> rows, rows_behind;
-      rows_of(run, k, b.reached[i], false, rows);
-      rows_of(run, k, b.reached[i], true, rows_behind);
-      float *to = values_of(k, b.reached[i]);
+    bool any = false;
+    each_block_of(run, tile, [&](int block) { any |= b.index[block] >= 0; });
+    if (!any) return;
+    terms_of(run, k, tile);
+    std::vector<uint32_t> rows, rows_behind;
+    each_block_of(run, tile, [&](int block) {
+      float *to = values_of(k, block);
+      if (!to) return;
+      rows_of(run, k, block, false, rows);
+      rows_of(run, k, block, true, rows_behind);
       for (int v = 0; v < values_; v++, to += BLOCK_PIXELS) {
         const int term = v < C_ + E_ ? std::min(v, C_) : C_ + 1;
-        convolve(run, planes + term * run.plane, b.reached[i], b.kernels[E_ == 1 ? 0 : v < C_ ? v : (v - C_) % E_], term <= C_ ? rows.data() : rows_behind.data(), to);
+        convolve(run, tile, term, block, b.kernels[E_ == 1 ? 0 : v < C_ ? v : (v - C_) % E_], term <= C_ ? rows.data() : rows_behind.data(), to, [](int) { return true; });
       }
     });
   }
@@ -703,31 +726,44 @@ class Blend {
   }
 
   // Scatters the gradients of a layer's blurred terms to its terms, and on to the surfaces.
-  void scatter_back(const Run &run, int k, float *planes) {
+  void scatter_back(const Run &run, int k, const Tile &tile) const {
     const Blurred &b = blurred_[k];
-    parallel((int)b.around.size(), [&](int i, int) {
-      const int block = b.around[i], y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
-      const float *values = values_of(k, block);
-      for (int v = 0; v < values_; v++)
-        for (int y = 0; y < BLOCK; y++) {
-          float *to = planes + v * run.plane + run.at(y0 + y, x0);
-          if (values)
-            memcpy(to, values + v * BLOCK_PIXELS + y * BLOCK, BLOCK * sizeof(float));
-          else
-            memset(to, 0, BLOCK * sizeof(float));
-        }
-    });
-    parallel((int)b.needed.size(), [&](int i, int) {
-      const int block = b.needed[i];
-      if (!b.occupied[block] && (!over_ || !weighed() || side_of(run, k, block) == IN_FRONT)) return;  // terms are constant
-      const std::vector<uint32_t> every(BLOCK + 2 * layers_[k].half, ~0u);
+    const int half = layers_[k].half;
+    auto has_gradient = [&](int block) {  // otherwise its terms are constant, or nothing reads them
+      return b.needed[block] && (b.occupied[block] || (over_ && weighed() && b.behind[block]));
+    };
+    bool any = false;
+    each_block_of(run, tile, [&](int block) { any |= has_gradient(block); });
+    if (!any) return;
+    const int top = tile.row0 * BLOCK - half, bottom = tile.row1 * BLOCK + half, left = tile.column0 * BLOCK - half, right = tile.column1 * BLOCK + half;
+    for (int r = floor_div(top, BLOCK); r * BLOCK < bottom; r++)
+      for (int c = floor_div(left, BLOCK); c * BLOCK < right; c++) {
+        const bool within = r >= 0 && r < run.block_rows && c >= 0 && c < run.block_columns;
+        const float *values = within ? values_of(k, r * run.block_columns + c) : nullptr;
+        const int x0 = std::max(left, c * BLOCK), count = std::min(right, (c + 1) * BLOCK) - x0;
+        for (int v = 0; v < values_; v++)
+          for (int y = std::max(top, r * BLOCK); y < std::min(bottom, (r + 1) * BLOCK); y++)
+            if (values)
+              memcpy(tile.at(v, y, x0), values + v * BLOCK_PIXELS + (y - r * BLOCK) * BLOCK + x0 - c * BLOCK, count * sizeof(float));
+            else
+              memset(tile.at(v, y, x0), 0, count * sizeof(float));
+      }
+    const std::vector<uint32_t> every(BLOCK + 2 * half, ~0u);
+    each_block_of(run, tile, [&](int block) {
+      if (!has_gradient(block)) return;
       float slopes[(MOST + 2) * BLOCK_PIXELS], more[BLOCK_PIXELS];
+      const int y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
+      bool wanted[2][BLOCK / STRIP_ROWS];  // strips with pixels in the layer; in it or behind it
+      for (int y = 0; y < BLOCK; y += STRIP_ROWS) {
+        wanted[0][y / STRIP_ROWS] = occurs(run, k, y0 + y, y0 + y + STRIP_ROWS, x0, x0 + BLOCK);
+        wanted[1][y / STRIP_ROWS] = reaches_behind(run, k, y0 + y, y0 + y + STRIP_ROWS, x0, x0 + BLOCK);
+      }
       for (int term = b.occupied[block] ? 0 : C_ + 1; term < terms_; term++) {
         float *to = slopes + term * BLOCK_PIXELS;
         const int first = term < C_ ? term : term == C_ ? C_ : C_ + E_, count = term < C_ ? 1 : E_;
         for (int e = 0; e < count; e++) {
           const Kernel &kernel = b.turned[E_ == 1 ? 0 : term < C_ ? term : e];
-          convolve(run, planes + (first + e) * run.plane, block, kernel, every.data(), e ? more : to);
+          convolve(run, tile, first + e, block, kernel, every.data(), e ? more : to, [&](int y) { return wanted[term > C_][y / STRIP_ROWS]; });
           for (int j = 0; e && j < BLOCK_PIXELS; j++) to[j] += more[j];
         }
       }
@@ -746,67 +782,61 @@ class Blend {
   void to_surfaces(const Run &run, int k, int block, const float *slopes) const {
     const int C = CHANNELS ? CHANNELS : C_;
     const Layer &l = layers_[k];
-    const bool occupied = blurred_[k].occupied[block];
-    const Side side = side_of(run, k, block);
     const int s = run.scale, y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
-    const int columns = std::min(BLOCK * s, scene_.columns - x0 * s);
     const float part = 1.0f / (s * s);
-    for (int y = y0 * s; y < std::min((y0 + BLOCK) * s, scene_.rows); y++)
-      for (int x = 0; x < columns; x += LANES) {
-        const int n = std::min(LANES, columns - x);
-        const size_t at = (size_t)y * scene_.columns + x0 * s + x;
-        const float *row = slopes + (y / s - y0) * BLOCK;
-        auto slope = [&](int v) {
-          const float *from = row + v * BLOCK_PIXELS;
-          if (s == 1) return load<vec>(from + x);
-          vec wide;
-          for (int i = 0; i < LANES; i++) wide[i] = from[(x + i) / s];
-          return wide * part;
-        };
-        const vec of_behind = over_ ? slope(C + 1) : vec{};
-        if (side == BEHIND) {
-          for (int j = 0; j < S; j++)
-            if (scene_.weight[j]) add_some(weight_[j] + at, of_behind, n);
-          continue;
-        }
-        Pixels p;
-        weigh<S>(l, at, n, p);
-        vec share[2], of_share[2], of_counted[2], of_h[2] = {}, of_t[2] = {};
-        for (int j = 0; j < S; j++) {
-          share[j] = (p.h[j] - p.t[j]) * p.counted[j];
-          of_share[j] = occupied ? slope(C) : vec{};
-        }
-        for (int c = 0; occupied && c < C; c++) {
-          const vec of_light = slope(c);
-          vec more[2];
-          for (int j = 0; j < S; j++) {
-            more[j] = of_light * load_some(scene_.light[j] + c * map_ + at, n);
-            add_some(light_[j] + c * map_ + at, of_light * swap<S>(p, share, j), n);
-          }
-          for (int j = 0; j < S; j++) of_share[j] += swap<S>(p, more, j);
-        }
-        for (int j = 0; j < S; j++) {
-          of_counted[j] = of_behind * p.t[j];
-          if (!occupied) continue;
-          of_counted[j] += of_share[j] * (p.h[j] - p.t[j]);
-          of_h[j] = of_share[j] * p.counted[j];
-          of_t[j] = (of_behind - of_share[j]) * p.counted[j];
-        }
-        if (S > 1) {
-          const vec hidden = 1.0f - clamp01(p.share);
-          const auto known_inside = (p.known >= vec{}) & (p.known <= all(1.0f)), share_inside = (p.share >= vec{}) & (p.share <= all(1.0f));
-          const vec of_extra = (known_inside ? (1.0f - p.weight[1]) * (1.0f / CONTINUATION_SHARE) : vec{}) - clamp01(p.known);
-          of_h[0] -= share_inside ? of_counted[1] * p.extra * (1.0f / HIDING_SHARE) : vec{};
-          of_counted[1] *= 1.0f + of_extra * hidden;
-        }
-        vec of_place[2];
+    each_cell(run, k, y0, y0 + BLOCK, x0, x0 + BLOCK, [&](int y, int x, int n, Side side, bool occupied) {
+      const size_t at = (size_t)y * scene_.columns + x;
+      const float *row = slopes + (y / s - y0) * BLOCK - x0;
+      auto slope = [&](int v) {
+        const float *from = row + v * BLOCK_PIXELS;
+        if (s == 1) return load<vec>(from + x);
+        vec wide;
+        for (int i = 0; i < LANES; i++) wide[i] = from[(x + i) / s];
+        return wide * part;
+      };
+      const vec of_behind = over_ ? slope(C + 1) : vec{};
+      if (side == BEHIND) {
         for (int j = 0; j < S; j++)
-          of_place[j] = of_h[j] * slope_of_ramp(p.ahead[j], over_) * l.per_before + of_t[j] * slope_of_ramp(p.here[j], over_) * l.per_after;
+          if (scene_.weight[j]) add_some(weight_[j] + at, of_behind, n);
+        return;
+      }
+      Pixels p;
+      weigh<S>(l, at, n, p);
+      vec of_counted[2], of_h[2] = {}, of_t[2] = {};
+      for (int j = 0; j < S; j++) of_counted[j] = of_behind * p.t[j];
+      if (occupied) {
+        vec share[2], given[2], more[2] = {};
+        for (int j = 0; j < S; j++) share[j] = (p.h[j] - p.t[j]) * p.counted[j];
+        for (int j = 0; j < S; j++) given[j] = swap<S>(p, share, j);
+        for (int c = 0; c < C; c++) {
+          const vec of_light = slope(c);
+          for (int j = 0; j < S; j++) {
+            more[j] += of_light * load_some(scene_.light[j] + c * map_ + at, n);
+            add_some(light_[j] + c * map_ + at, of_light * given[j], n);
+          }
+        }
         for (int j = 0; j < S; j++) {
-          add_some(place_[j] + at, swap<S>(p, of_place, j), n);
-          if (scene_.weight[j]) add_some(weight_[j] + at, swap<S>(p, of_counted, j), n);
+          const vec of_share = slope(C) + swap<S>(p, more, j);
+          of_counted[j] += of_share * (p.h[j] - p.t[j]);
+          of_h[j] = of_share * p.counted[j];
+          of_t[j] = (of_behind - of_share) * p.counted[j];
         }
       }
+      if (S > 1) {
+        const vec hidden = 1.0f - clamp01(p.share);
+        const auto known_inside = (p.known >= vec{}) & (p.known <= all(1.0f)), share_inside = (p.share >= vec{}) & (p.share <= all(1.0f));
+        const vec of_extra = (known_inside ? (1.0f - p.weight[1]) * (1.0f / CONTINUATION_SHARE) : vec{}) - clamp01(p.known);
+        of_h[0] -= share_inside ? of_counted[1] * p.extra * (1.0f / HIDING_SHARE) : vec{};
+        of_counted[1] *= 1.0f + of_extra * hidden;
+      }
+      vec of_place[2];
+      for (int j = 0; j < S; j++)
+        of_place[j] = of_h[j] * slope_of_ramp(p.ahead[j], over_) * l.per_before + of_t[j] * slope_of_ramp(p.here[j], over_) * l.per_after;
+      for (int j = 0; j < S; j++) {
+        add_some(place_[j] + at, swap<S>(p, of_place, j), n);
+        if (scene_.weight[j]) add_some(weight_[j] + at, swap<S>(p, of_counted, j), n);
+      }
+    });
   }
 
   const torchdof_layers &scene_;

@@ -310,6 +310,7 @@ struct Job {
   explicit Job(const torchdof_scene &scene);
   void begin();
   void finish(const RayKernels &kernels, float *out);
+  void split_mixed();  // matting.cpp
 
   const torchdof_scene &scene;
   int height, width, channels, colours;  // colours: kernels of each layer, 1 or channels
@@ -341,7 +342,6 @@ struct Job {
  private:
   void take_scene();
   void find_threshold();                  // highlights.cpp
-  void split_mixed();                     // matting.cpp
   void fill_hidden();                     // disocclusion.cpp
   void add_background();           // matting.cpp
   void extract_highlights();              // highlights.cpp
@@ -635,6 +635,15 @@ void composite(const Job &job, const RayKernels &ray_kernels, float *out);
 // Blurs and composites the layers of a padded frame, forward and backward; blend.cpp
 void blend(const torchdof_layers &scene, float *out);
 void blend_gradient(const torchdof_layers &scene, const float *out_gradient, float *const *light, float *const *place, float *const *weight);
+
+// Splits the pixels of an image at depth edges: out[0] [2 channels + 2, height, width]. Or, from a gradient of that,
+// the gradients of light and coc, out; matting.cpp
+void matte(const float *const *maps, int channels, int height, int width, int threads, const float *gradient, float *const *out);
+
+// The finest level of the pyramid from which hidden surfaces are filled, forward and backward; farthest.cpp
+void farthest(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads, float *out);
+void farthest_gradient(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads, const float *gradient,
+                       float *const *of_maps);
 
 // The surfaces behind pixels, read from a pyramid, forward and backward; look_behind.cpp
 void look_behind(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads, float *out);

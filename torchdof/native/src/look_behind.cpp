@@ -150,6 +150,10 @@ struct Behind {
   // Adds a pixel's gradients to those of the samples that it reads, and sets that of its coc.
   void pixel(int y, int x, const float *coc, const float *slopes, float *const *to, const size_t *start, const size_t *size, float *of_coc) const {
     const size_t area = (size_t)height * width, at = (size_t)y * width + x;
+    of_coc[at] = 0;
+    bool used = false;  // pixels without a hidden surface have no gradient
+    for (int c = 0; c < planes; c++) used |= slopes[c * area + at] != 0;
+    if (!used) return;
     Found found[MOST_LEVELS];
     bool any[MOST_LEVELS];
     float sums[MOST_PLANES] = {}, votes = 0, slope[MOST_PLANES], along = 0, of_own = 0;

@@ -92,114 +92,153 @@ vec mean(const vec *light, int channels, const vec *weight, vec *mean) {
   const int C = CHANNELS ? CHANNELS : channels;
   vec total = {}, variance = {};
   for (int i = 0; i < TAPS; i++) total += weight[i];
-  const vec per_total = all(1.0f) / most(total, all(1e-12f));
+  total = most(total, all(1e-12f));  // divided by, not multiplied with its inverse: equal values are exactly their mean
   for (int c = 0; c < C; c++, light += TAPS) {
     vec one = {}, two = {};
     for (int i = 0; i < TAPS; i++) one += light[i] * weight[i];
-    mean[c] = one * per_total;
+    mean[c] = one / total;
     for (int i = 0; i < TAPS; i++) two += (light[i] - mean[c]) * (light[i] - mean[c]) * weight[i];
-    variance += two * per_total;
+    variance += two / total;
   }
   return variance;
 }
 
-// Splits the pixels of `beside`, out of LANES pixels of a row.
+// The two surfaces of LANES pixels of a row, and the terms from which they follow.
+struct Mix {
+  vec coc[TAPS], near, far, gap, per_gap, scale;  // scale: brightest light around; all light is relative to it
+  vec *light, *front, *behind, *colour;           // [channels, TAPS]; colours of both surfaces and of the pixel, [channels]
+  vec weight[TAPS], nearer[TAPS], farther[TAPS];  // of the pixels around: of all, in the front's mean, in the mean behind
+  vec near_weight[TAPS], differs[TAPS];           // weight in the front's mean without `differs`; difference from behind
+  vec whole, clean;                               // sum of `near_weight`; 1 where the front has unmixed pixels
+  vec strength, fitted, misfit, variance, trust, aside, sided, edge, certainty;
+  vec other, own;  // weights of the other surface and of the pixel's own one
+  ivec is_near;
+};
+inline int tap(int i) { return i / AROUND * PITCH + i % AROUND; }
+
 // 1. The near and far coc are the extremes of the 3 x 3 neighbours.
 // 2. The colour of each surface is the mean of its unmixed neighbours. If a thin foreground has no such neighbours, they
 //    count by their difference from the background.
 // 3. The share of the near surface is the projection of the pixel's colour onto the line between both colours.
 // 4. The share of the other surface is at most 1/2, and smaller where texture makes the projection unreliable.
-// 5. The residual colour goes to both in proportion to their shares, within the range of the image's light.
 template <int CHANNELS>
-void split(const Job &job, Window &w, int y, int x, ivec beside, const float *falloff, const Block &block) {
+void mix(const Job &job, Window &w, int y, int x, const float *falloff, Mix &m) {
   const int C = CHANNELS ? CHANNELS : job.channels;
   const bool masked = job.surfaces.valid;
   const size_t first = (size_t)y * PITCH + x, in_coc = first + PITCH + 1;
-  auto tap = [](int i) { return i / AROUND * PITCH + i % AROUND; };
-  vec coc[TAPS], near = all(NEVER), far = all(-NEVER), scale = all(TINY);
+  m.near = all(NEVER), m.far = all(-NEVER), m.scale = all(TINY);
   for (int i = 0; i < TAPS; i++) {
-    coc[i] = load<vec>(w.coc + in_coc + tap(i));
+    m.coc[i] = load<vec>(w.coc + in_coc + tap(i));
     const auto known = masked ? load<vec>(w.valid + in_coc + tap(i)) > vec{} : ivec{} == 0;
-    near = least(near, known ? coc[i] : all(NEVER));
-    far = most(far, known ? coc[i] : all(-NEVER));
+    m.near = least(m.near, known ? m.coc[i] : all(NEVER));
+    m.far = most(m.far, known ? m.coc[i] : all(-NEVER));
   }
-  vec *const light = w.around.data(), *const front = light + C * TAPS, *const behind = front + C, *const colour = behind + C;
+  m.light = w.around.data(), m.front = m.light + C * TAPS, m.behind = m.front + C, m.colour = m.behind + C;
   for (int c = 0; c < C; c++)
     for (int i = 0; i < TAPS; i++) {
-      const vec v = light[c * TAPS + i] = load<vec>(w.light.data() + (size_t)c * EDGES * PITCH + first + tap(i));
-      scale = most(scale, most(v, -v));
+      const vec v = m.light[c * TAPS + i] = load<vec>(w.light.data() + (size_t)c * EDGES * PITCH + first + tap(i));
+      m.scale = most(m.scale, most(v, -v));
     }
-  const vec per_scale = all(1.0f) / scale;
-  for (int i = 0; i < C * TAPS; i++) light[i] *= per_scale;
-  const vec here = coc[TAPS / 2], gap = most(far - near, all(1e-6f)), per_gap = all(1.0f) / gap;
-  vec nearer[TAPS], farther[TAPS], whole = {};
+  for (int i = 0; i < C * TAPS; i++) m.light[i] /= m.scale;
+  const vec here = m.coc[TAPS / 2];
+  m.gap = most(m.far - m.near, all(1e-6f)), m.per_gap = all(1.0f) / m.gap, m.whole = vec{};
   for (int i = 0; i < TAPS; i++) {
-    vec weight = (all(1.0f + UNCLEAN) - load<vec>(w.edge + first + tap(i))) * falloff[i];
-    if (masked) weight *= load<vec>(w.valid + in_coc + tap(i));
-    const vec nearness = (far - coc[i]) * per_gap;
-    nearer[i] = weight * clamp01(4.0f * nearness - 2.8f);
-    farther[i] = weight * clamp01(1.2f - 4.0f * nearness);
-    whole += nearer[i];
+    m.weight[i] = (all(1.0f + UNCLEAN) - load<vec>(w.edge + first + tap(i))) * falloff[i];
+    if (masked) m.weight[i] *= load<vec>(w.valid + in_coc + tap(i));
+    const vec nearness = (m.far - m.coc[i]) / m.gap;  // not times 1 / gap, whose rounding the clamps below enlarge
+    m.nearer[i] = m.near_weight[i] = m.weight[i] * clamp01(4.0f * nearness - 2.8f);
+    m.farther[i] = m.weight[i] * clamp01(1.2f - 4.0f * nearness);
+    m.whole += m.nearer[i];
   }
-  const vec behind_variance = mean<CHANNELS>(light, C, farther, behind);
-  const vec clean = clamp01(whole * (0.1f / UNCLEAN) - 1.0f);
-  if (any_of(clean < all(1.0f))) {
-    vec differs[TAPS] = {}, most_of = {};
+  m.variance = mean<CHANNELS>(m.light, C, m.farther, m.behind);
+  m.clean = clamp01(m.whole * (0.1f / UNCLEAN) - 1.0f);
+  if (any_of(m.clean < all(1.0f))) {
+    vec most_of = {};
+    for (int i = 0; i < TAPS; i++) m.differs[i] = vec{};
     for (int c = 0; c < C; c++)
       for (int i = 0; i < TAPS; i++) {
-        const vec d = light[c * TAPS + i] - behind[c];
-        differs[i] += d * d;
+        const vec d = m.light[c * TAPS + i] - m.behind[c];
+        m.differs[i] += d * d;
       }
-    for (int i = 0; i < TAPS; i++) most_of = most(most_of, differs[i]);
+    for (int i = 0; i < TAPS; i++) most_of = most(most_of, m.differs[i]);
     const vec each = 1.0f / (most_of + ALIKE * ALIKE);
     for (int i = 0; i < TAPS; i++) {
-      const vec part = (differs[i] + ALIKE * ALIKE) * each;
-      nearer[i] *= part + clean * (1.0f - part);
+      const vec part = (m.differs[i] + ALIKE * ALIKE) * each;
+      m.nearer[i] *= part + m.clean * (1.0f - part);
     }
   }
-  const vec front_variance = mean<CHANNELS>(light, C, nearer, front);
+  m.variance += mean<CHANNELS>(m.light, C, m.nearer, m.front);
 
-  vec strength = {}, along = {}, misfit = {};
+  vec along = {};
+  m.strength = m.misfit = vec{};
   for (int c = 0; c < C; c++) {
-    const vec contrast = front[c] - behind[c];
-    colour[c] = light[c * TAPS + TAPS / 2];
-    strength += contrast * contrast;
-    along += (colour[c] - behind[c]) * contrast;
+    const vec contrast = m.front[c] - m.behind[c];
+    m.colour[c] = m.light[c * TAPS + TAPS / 2];
+    m.strength += contrast * contrast;
+    along += (m.colour[c] - m.behind[c]) * contrast;
   }
-  const auto is_near = here - near < far - here;
-  const vec fitted = clamp01(along / most(strength, all(1e-12f)));
+  m.is_near = here - m.near < m.far - here;
+  m.fitted = along / most(m.strength, all(1e-12f));
+  const vec fitted = clamp01(m.fitted);
   for (int c = 0; c < C; c++) {
-    const vec left = colour[c] - behind[c] - fitted * (front[c] - behind[c]);
-    misfit += left * left;
+    const vec left = m.colour[c] - m.behind[c] - fitted * (m.front[c] - m.behind[c]);
+    m.misfit += left * left;
   }
-  const vec trust = strength / (strength + TRUST * (behind_variance + front_variance + misfit) + ALIKE * ALIKE);
-  const vec aside = (here - near) - (far - here), sided = most(aside, -aside) * per_gap;
-  const vec certainty = load<vec>(w.edge + first + tap(TAPS / 2)) * trust * clamp01(4.0f * sided - 2.0f);
-  const vec weight = least(is_near ? 1.0f - fitted : fitted, all(0.5f)) * certainty, own_weight = 1.0f - weight;
-  const vec per_own = 1.0f / own_weight, per_weight = 1.0f / most(weight, all(1e-12f)), of_each = weight / (weight * weight + own_weight * own_weight);
+  m.trust = m.strength / (m.strength + TRUST * (m.variance + m.misfit) + ALIKE * ALIKE);
+  m.aside = (here - m.near) - (m.far - here), m.sided = most(m.aside, -m.aside) * m.per_gap;
+  m.edge = load<vec>(w.edge + first + tap(TAPS / 2));
+  m.certainty = m.edge * m.trust * clamp01(4.0f * m.sided - 2.0f);
+  m.other = least(m.is_near ? 1.0f - fitted : fitted, all(0.5f)) * m.certainty, m.own = 1.0f - m.other;
+}
+
+// Light of the other surface in a pixel, times its weight. The residual colour goes to both surfaces in proportion to their
+// shares, within the range of the image's light.
+struct Moved {
+  vec own_mean, other_mean, darkest, brightest, unexplained, of_each, steps[4], value;
+};
+inline Moved moved_of(const Job &job, const Mix &m, int c) {
+  Moved v;
+  const vec colour = m.colour[c];
+  v.own_mean = m.is_near ? m.front[c] : m.behind[c], v.other_mean = m.is_near ? m.behind[c] : m.front[c];
+  v.unexplained = colour - m.own * v.own_mean - m.other * v.other_mean;
+  v.darkest = most(job.light_least[c] / m.scale, all(-UNBOUNDED)), v.brightest = least(job.light_most[c] / m.scale, all(UNBOUNDED));
+  v.of_each = m.other / (m.other * m.other + m.own * m.own);
+  // the two parts still sum to the pixel, and neither is brighter or darker than the image
+  v.steps[0] = m.other * (v.other_mean + v.unexplained * v.of_each);
+  v.steps[1] = most(v.steps[0], colour - m.own * v.brightest);
+  v.steps[2] = least(v.steps[1], colour - m.own * v.darkest);
+  v.steps[3] = most(v.steps[2], m.other * v.darkest);
+  v.value = least(v.steps[3], m.other * v.brightest);
+  return v;
+}
+
+// Splits the pixels of `beside`, out of LANES pixels of a row.
+template <int CHANNELS>
+void split(const Job &job, Window &w, int y, int x, ivec beside, const float *falloff, const Block &block) {
+  const int C = CHANNELS ? CHANNELS : job.channels;
+  Mix m;
+  mix<CHANNELS>(job, w, y, x, falloff, m);
+  const vec per_own = 1.0f / m.own, per_other = 1.0f / most(m.other, all(1e-12f));
   auto put = [&](float *plane, vec value) {
     float *const to = plane + y * BLOCK + x;
     store(to, beside ? value : load<vec>(to));
   };
   for (int c = 0; c < C; c++) {
-    const vec own_mean = is_near ? front[c] : behind[c], other_mean = is_near ? behind[c] : front[c];
-    const vec unexplained = colour[c] - own_weight * own_mean - weight * other_mean;
-    const vec darkest = most(job.light_least[c] * per_scale, all(-UNBOUNDED)), brightest = least(job.light_most[c] * per_scale, all(UNBOUNDED));
-    // the two parts still sum to the pixel, and neither is brighter or darker than the image
-    vec moved = weight * (other_mean + unexplained * of_each);
-    moved = least(most(moved, colour[c] - own_weight * brightest), colour[c] - own_weight * darkest);
-    moved = least(most(moved, weight * darkest), weight * brightest);
-    put(block.own + c * BLOCK_PIXELS, (colour[c] - moved) * per_own * scale);
-    put(block.other + c * BLOCK_PIXELS, weight > vec{} ? moved * per_weight * scale : vec{});
+    const vec moved = moved_of(job, m, c).value;
+    put(block.own + c * BLOCK_PIXELS, (m.colour[c] - moved) * per_own * m.scale);
+    put(block.other + c * BLOCK_PIXELS, m.other > vec{} ? moved * per_other * m.scale : vec{});
   }
-  const vec valid = masked ? load<vec>(w.valid + in_coc + tap(TAPS / 2)) : all(1.0f);
-  put(block.coc, is_near ? far : near);
-  put(block.weight, weight * valid);
-  put(block.own_weight, own_weight * valid);
+  const vec valid = job.surfaces.valid ? load<vec>(w.valid + (size_t)(y + 1) * PITCH + x + 1 + tap(TAPS / 2)) : all(1.0f);
+  put(block.coc, m.is_near ? m.far : m.near);
+  put(block.weight, m.other * valid);
+  put(block.own_weight, m.own * valid);
 }
 
-void split_block(Job &job, int by, int bx, Window &w, const float *falloff) {
-  const int y0 = by * BLOCK, x0 = bx * BLOCK, height = job.height, width = job.width;
+// Reads the light in and around a block, and calls body(y, x, beside) for each LANES of its pixels of which some lie at an
+// edge.
+template <typename Body>
+void each_edge(const Job &job, int y0, int x0, Window &w, const Body &body) {
+  const int height = job.height, width = job.width;
   const bool inside = x0 >= REACH && x0 + BLOCK + REACH <= width;
   for (int c = 0; c < job.channels; c++)
     for (int i = 0; i < EDGES; i++) {
@@ -210,14 +249,20 @@ void split_block(Job &job, int by, int bx, Window &w, const float *falloff) {
       else
         for (int j = 0; j < EDGES; j++) to[j] = from[std::clamp(x0 - REACH + j, 0, width - 1)];
     }
-  const Block block = job.surfaces.make_block(by * job.surfaces.block_columns + bx);
   ivec lane;
   for (int i = 0; i < LANES; i++) lane[i] = i;
   for (int y = 0; y < std::min(BLOCK, height - y0); y++)
     for (int x = 0; x < std::min(BLOCK, width - x0); x += LANES) {
       const ivec beside = (load<vec>(w.edge + (y + REACH) * PITCH + x + REACH) > vec{}) & (lane < width - x0 - x);
-      if (any_of(beside)) job.channels == 3 ? split<3>(job, w, y, x, beside, falloff, block) : split<0>(job, w, y, x, beside, falloff, block);
+      if (any_of(beside)) body(y, x, beside);
     }
+}
+
+void split_block(Job &job, int by, int bx, Window &w, const float *falloff) {
+  const Block block = job.surfaces.make_block(by * job.surfaces.block_columns + bx);
+  each_edge(job, by * BLOCK, bx * BLOCK, w, [&](int y, int x, ivec beside) {
+    job.channels == 3 ? split<3>(job, w, y, x, beside, falloff, block) : split<0>(job, w, y, x, beside, falloff, block);
+  });
 }
 
 // Estimates from the pixels around a highlight on which surface its emitter lies.
@@ -339,7 +384,331 @@ void attribute_emitter(Job &job, int y, int x, float least_limit, const float *f
   block.own_weight[within] = 1.0f - weight;
 }
 
+// The gradient of `split`, for training: the derivatives of `mix`, `moved_of` and `split`, last operation first.
+class Gradient {
+ public:
+  // slopes: gradient of own light, other light, other coc and other weight, [2 channels + 2, height, width].
+  Gradient(const Job &job, const float *falloff, const float *slopes) : job_(job), s_(job.surfaces), falloff_(falloff), slopes_(slopes), C_(job.channels) {}
+
+  // Adds the gradients of light and coc to those of an image that is not split.
+  void run(float *of_light, float *of_coc) const {
+    const size_t area = s_.area();
+    Buffer<float> of_edge(area);
+    for (size_t i = 0; i < area; i++) of_edge[i] = 0;
+    std::vector<float> of_extremes(2 * C_, 0.0f);
+    each_band([&](int band, std::vector<float> &sums) {
+      Window w;
+      w.light.assign((size_t)C_ * EDGES * PITCH, 0.0f);
+      w.around.resize((size_t)C_ * (2 * TAPS + 6));
+      sums.assign(plane() * (C_ + 2) + 2 * C_, 0.0f);
+      for (int bx = 0; bx < s_.block_columns; bx++)
+        if (find_edges(job_, band * BLOCK, bx * BLOCK, w))
+          each_edge(job_, band * BLOCK, bx * BLOCK, w, [&](int y, int x, ivec beside) {
+            C_ == 3 ? back<3>(w, band * BLOCK, bx * BLOCK, y, x, beside, sums.data()) : back<0>(w, band * BLOCK, bx * BLOCK, y, x, beside, sums.data());
+          });
+    }, [&](int band, const std::vector<float> &sums) {
+      for (int c = 0; c < C_; c++) merge(band, sums.data() + c * plane(), of_light + c * area);
+      merge(band, sums.data() + C_ * plane(), of_coc);
+      merge(band, sums.data() + (C_ + 1) * plane(), of_edge.data());
+      for (int i = 0; i < 2 * C_; i++) of_extremes[i] += sums[plane() * (C_ + 2) + i];
+    });
+    each_band([&](int band, std::vector<float> &sums) {
+      sums.assign(plane(), 0.0f);
+      for (int y = band * BLOCK; y < std::min(s_.height, (band + 1) * BLOCK); y++)
+        for (int x = 0; x < s_.width; x++)
+          if (of_edge[(size_t)y * s_.width + x] != 0) edge_back(y, x, of_edge[(size_t)y * s_.width + x], band, sums.data());
+    }, [&](int band, const std::vector<float> &sums) { merge(band, sums.data(), of_coc); });
+    for (int c = 0; c < C_; c++)
+      for (const bool is_most : {false, true}) {
+        const float extreme = is_most ? job_.light_most[c] : job_.light_least[c], slope = of_extremes[2 * c + is_most];
+        if (slope == 0) continue;
+        const float *light = s_.light + c * area;
+        const float each = slope / std::count(light, light + area, extreme);
+        for (size_t i = 0; i < area; i++) of_light[c * area + i] += light[i] == extreme ? each : 0.0f;
+      }
+  }
+
+ private:
+  size_t plane() const { return (size_t)(BLOCK + 2) * s_.width; }  // rows of a band of blocks, and one more on each side
+
+  // Fills the sums of each band in parallel, and merges them in order, so that threads do not change the bits.
+  template <typename Fill, typename Merge>
+  void each_band(const Fill &fill, const Merge &merge) const {
+    std::vector<std::vector<float>> sums(s_.block_rows);
+    job_.parallel(s_.block_rows, [&](int band, int) { fill(band, sums[band]); });
+    for (int band = 0; band < s_.block_rows; band++) merge(band, sums[band]);
+  }
+  void merge(int band, const float *from, float *to) const {
+    for (int i = 0; i < BLOCK + 2; i++) {
+      const int y = band * BLOCK - 1 + i;
+      for (int x = 0; y >= 0 && y < s_.height && x < s_.width; x++) to[(size_t)y * s_.width + x] += from[(size_t)i * s_.width + x];
+    }
+  }
+  // Position of a pixel around (y, x) in the sums of its band.
+  size_t at(int band, int y, int x, int i) const {
+    const int row = std::clamp(y + i / AROUND - REACH, 0, s_.height - 1), column = std::clamp(x + i % AROUND - REACH, 0, s_.width - 1);
+    return (size_t)(row - band * BLOCK + 1) * s_.width + column;
+  }
+
+  static constexpr float ROUNDING = 1e-6f;
+  static vec when(ivec condition, vec value) { return condition ? value : vec{}; }
+  static ivec inside(vec v) { return (v >= vec{}) & (v <= all(1.0f)); }
+  // Share of the gradient of max(a, b) that goes to a.
+  static vec of_first(vec a, vec b) { return a > b ? all(1.0f) : a == b ? all(0.5f) : vec{}; }
+
+  // Adds to the gradients of light [channels, TAPS] and sets that of the weights, from those of `mean` and its variance.
+  void mean_back(const vec *light, const vec *weight, const vec *mean, const vec *of_mean, vec of_variance, vec *of_light, vec *of_weight) const {
+    vec sum = {};
+    for (int i = 0; i < TAPS; i++) sum += weight[i], of_weight[i] = vec{};
+    const vec per = all(1.0f) / most(sum, all(1e-12f));
+    const ivec counted = sum >= all(1e-12f);  // the sum is the divisor
+    for (int c = 0; c < C_; c++, light += TAPS, of_light += TAPS) {
+      vec moment = {}, spread = {};
+      for (int i = 0; i < TAPS; i++) {
+        const vec away = light[i] - mean[c];
+        moment += away * weight[i];
+        spread += away * away * weight[i];
+      }
+      const vec its = of_mean[c] - 2.0f * of_variance * moment * per, middle = when(counted, mean[c]), variance = when(counted, spread * per);
+      for (int i = 0; i < TAPS; i++) {
+        const vec away = light[i] - mean[c];
+        of_light[i] += (its + 2.0f * of_variance * away) * weight[i] * per;
+        of_weight[i] += (its * (light[i] - middle) + of_variance * (away * away - variance)) * per;
+      }
+    }
+  }
+
+  template <int CHANNELS>
+  void back(Window &w, int y0, int x0, int y, int x, ivec beside, float *sums) const {
+    const int C = CHANNELS ? CHANNELS : C_, n = std::min(LANES, s_.width - x0 - x);
+    const size_t area = s_.area(), here = (size_t)(y0 + y) * s_.width + x0 + x;
+    Mix m;
+    mix<CHANNELS>(job_, w, y, x, falloff_, m);
+    vec *const of_light = m.colour + C, *const of_front = of_light + C * TAPS, *const of_behind = of_front + C, *const of_colour = of_behind + C;
+    for (int i = 0; i < C * TAPS; i++) of_light[i] = vec{};
+    auto slope = [&](int plane) {
+      vec v = {};
+      memcpy(&v, slopes_ + plane * area + here, n * sizeof(float));
+      return beside ? v : vec{};
+    };
+    const vec of_given = slope(2 * C), per_own = 1.0f / m.own, per_other = 1.0f / most(m.other, all(1e-12f));
+    vec of_other = slope(2 * C + 1), of_own = {}, of_each = {}, each = {};
+    vec of_far = when(m.is_near, of_given), of_near = of_given - of_far, of_gap = {}, of_coc[TAPS] = {}, of_edge[TAPS] = {};
+
+    // the light of both surfaces
+    for (int c = 0; c < C; c++) {
+      const Moved v = moved_of(job_, m, c);
+      each = v.of_each;
+      const vec of_its = slope(c) * m.scale * per_own, of_theirs = when(m.other > vec{}, slope(C + c) * m.scale * per_other);
+      vec of_moved = of_theirs - of_its, of_darkest = {}, of_brightest = {};
+      of_colour[c] = of_its;
+      of_own -= of_its * (m.colour[c] - v.value) * per_own;
+      of_other -= when(m.other >= all(1e-12f), of_theirs * v.value * per_other);
+      auto bounded = [&](vec first) {  // keeps the part of the gradient that passes a bound; returns that of the bound
+        const vec of_bound = of_moved * (1.0f - first);
+        of_moved -= of_bound;
+        return of_bound;
+      };
+      vec of_bound = bounded(of_first(-v.steps[3], -m.other * v.brightest));
+      of_other += of_bound * v.brightest, of_brightest += of_bound * m.other;
+      of_bound = bounded(of_first(v.steps[2], m.other * v.darkest));
+      of_other += of_bound * v.darkest, of_darkest += of_bound * m.other;
+      of_bound = bounded(of_first(-v.steps[1], m.own * v.darkest - m.colour[c]));
+      of_colour[c] += of_bound, of_own -= of_bound * v.darkest, of_darkest -= of_bound * m.own;
+      of_bound = bounded(of_first(v.steps[0], m.colour[c] - m.own * v.brightest));
+      of_colour[c] += of_bound, of_own -= of_bound * v.brightest, of_brightest -= of_bound * m.own;
+      const vec of_unexplained = of_moved * m.other * v.of_each;
+      const vec of_own_mean = -of_unexplained * m.own, of_other_mean = of_moved * m.other - of_unexplained * m.other;
+      of_other += of_moved * (v.other_mean + v.unexplained * v.of_each) - of_unexplained * v.other_mean;
+      of_own -= of_unexplained * v.own_mean;
+      of_each += of_moved * m.other * v.unexplained;
+      of_colour[c] += of_unexplained;
+      of_front[c] = m.is_near ? of_own_mean : of_other_mean;
+      of_behind[c] = m.is_near ? of_other_mean : of_own_mean;
+      const vec per_scale = 1.0f / m.scale;
+      float *extremes = sums + plane() * (C + 2) + 2 * c;
+      extremes[0] += sum(when(v.darkest > all(-UNBOUNDED), of_darkest) * per_scale);
+      extremes[1] += sum(when(v.brightest < all(UNBOUNDED), of_brightest) * per_scale);
+    }
+
+    // the weight of the other surface
+    const vec per_squares = 1.0f / (m.other * m.other + m.own * m.own), of_squares = -of_each * each * per_squares;
+    of_other += of_each * per_squares + 2.0f * m.other * of_squares;
+    of_own += 2.0f * m.own * of_squares;
+    of_other -= of_own;
+    const vec fitted = clamp01(m.fitted), share = m.is_near ? 1.0f - fitted : fitted, aside = 4.0f * m.sided - 2.0f;
+    const vec of_certainty = of_other * least(share, all(0.5f)), of_share = when(share <= all(0.5f), of_other * m.certainty);
+    vec of_fitted = m.is_near ? -of_share : of_share;
+    of_edge[TAPS / 2] = of_certainty * m.trust * clamp01(aside);
+    const vec of_trust = of_certainty * m.edge * clamp01(aside), of_sided = when(inside(aside), 4.0f * of_certainty * m.edge * m.trust) * m.per_gap;
+    const vec of_aside = m.aside > vec{} ? of_sided : when(m.aside < vec{}, -of_sided);
+    of_gap -= of_sided * m.sided;
+    of_coc[TAPS / 2] += 2.0f * of_aside;
+    of_near -= of_aside;
+    of_far -= of_aside;
+    const vec per_trust = 1.0f / (m.strength + TRUST * (m.variance + m.misfit) + ALIKE * ALIKE);
+    vec of_strength = of_trust * (1.0f - m.trust) * per_trust;
+    const vec of_variance = -of_trust * m.trust * TRUST * per_trust;
+    for (int c = 0; c < C; c++) of_fitted -= 2.0f * of_variance * (m.colour[c] - m.behind[c] - fitted * (m.front[c] - m.behind[c])) * (m.front[c] - m.behind[c]);
+    // A pixel of the colour of a surface has a share of 1 up to rounding, where the gradient still passes.
+    of_fitted = when((m.fitted >= all(-ROUNDING)) & (m.fitted <= all(1.0f + ROUNDING)), of_fitted) / most(m.strength, all(1e-12f));
+    of_strength -= when(m.strength >= all(1e-12f), of_fitted * m.fitted);
+    for (int c = 0; c < C; c++) {
+      const vec contrast = m.front[c] - m.behind[c], away = m.colour[c] - m.behind[c], of_left = 2.0f * of_variance * (away - fitted * contrast);
+      const vec of_contrast = of_fitted * away + 2.0f * of_strength * contrast - of_left * fitted, of_away = of_fitted * contrast + of_left;
+      of_colour[c] += of_away;
+      of_front[c] += of_contrast;
+      of_behind[c] -= of_contrast + of_away;
+    }
+
+    // the colours of both surfaces
+    vec of_nearer[TAPS], of_farther[TAPS];
+    mean_back(m.light, m.nearer, m.front, of_front, of_variance, of_light, of_nearer);
+    if (any_of(m.clean < all(1.0f))) {
+      vec most_of = {}, of_most = {}, of_clean = {}, of_differs[TAPS], ties = {};
+      for (int i = 0; i < TAPS; i++) most_of = most(most_of, m.differs[i]);
+      const vec per = 1.0f / (most_of + ALIKE * ALIKE);
+      for (int i = 0; i < TAPS; i++) {
+        const vec part = (m.differs[i] + ALIKE * ALIKE) * per, of_factor = of_nearer[i] * m.near_weight[i];
+        of_clean += of_factor * (1.0f - part);
+        of_nearer[i] *= part + m.clean * (1.0f - part);
+        of_differs[i] = of_factor * (1.0f - m.clean) * per;
+        of_most -= of_differs[i] * part;
+        ties += m.differs[i] == most_of ? all(1.0f) : vec{};
+      }
+      for (int i = 0; i < TAPS; i++) {
+        of_differs[i] += when(m.differs[i] == most_of, of_most / ties);
+        of_nearer[i] += when(inside(m.whole * (0.1f / UNCLEAN) - 1.0f), of_clean * (0.1f / UNCLEAN));
+      }
+      for (int c = 0; c < C; c++)
+        for (int i = 0; i < TAPS; i++) {
+          const vec its = 2.0f * of_differs[i] * (m.light[c * TAPS + i] - m.behind[c]);
+          of_light[c * TAPS + i] += its;
+          of_behind[c] -= its;
+        }
+    }
+    mean_back(m.light, m.farther, m.behind, of_behind, of_variance, of_light, of_farther);
+
+    // the places of the pixels around
+    const size_t in_coc = (size_t)(y + 1) * PITCH + x + 1;
+    for (int i = 0; i < TAPS; i++) {
+      const vec nearness = (m.far - m.coc[i]) / m.gap, to_near = 4.0f * nearness - 2.8f, to_far = 1.2f - 4.0f * nearness;
+      const vec of_nearness = 4.0f * m.weight[i] * (when(inside(to_near), of_nearer[i]) - when(inside(to_far), of_farther[i])) * m.per_gap;
+      of_far += of_nearness;
+      of_coc[i] -= of_nearness;
+      of_gap -= of_nearness * nearness;
+      of_edge[i] -= (of_nearer[i] * clamp01(to_near) + of_farther[i] * clamp01(to_far)) * falloff_[i] * (s_.valid ? load<vec>(w.valid + in_coc + tap(i)) : all(1.0f));
+    }
+    of_gap = when(m.far - m.near >= all(1e-6f), of_gap);
+    of_far += of_gap;
+    of_near -= of_gap;
+    vec nearest = {}, farthest = {};  // number of equal extremes, which share the gradient
+    auto known = [&](int i) { return s_.valid ? load<vec>(w.valid + in_coc + tap(i)) > vec{} : ivec{} == 0; };
+    for (int i = 0; i < TAPS; i++) {
+      nearest += when(known(i) & (m.coc[i] == m.near), all(1.0f));
+      farthest += when(known(i) & (m.coc[i] == m.far), all(1.0f));
+    }
+    for (int i = 0; i < TAPS; i++) of_coc[i] += when(known(i) & (m.coc[i] == m.near), of_near / nearest) + when(known(i) & (m.coc[i] == m.far), of_far / farthest);
+
+    for (int c = 0; c < C; c++) of_light[c * TAPS + TAPS / 2] += of_colour[c];
+    const vec per_scale = 1.0f / m.scale;
+    for (int i = 0; i < C * TAPS; i++) of_light[i] *= per_scale;
+    for (int lane = 0; lane < n; lane++) {
+      if (!beside[lane]) continue;
+      for (int i = 0; i < TAPS; i++) {
+        float *to = sums + at(y0 / BLOCK, y0 + y, x0 + x + lane, i);
+        for (int c = 0; c < C; c++) to[c * plane()] += of_light[c * TAPS + i][lane];
+        to[C * plane()] += of_coc[i][lane];
+        to[(C + 1) * plane()] += of_edge[i][lane];
+      }
+      float *to = sums + at(y0 / BLOCK, y0 + y, x0 + x + lane, TAPS / 2);
+      for (int c = 0; c < C; c++) to[c * plane()] -= slopes_[c * area + here + lane];
+      to[C * plane()] -= slopes_[2 * C * area + here + lane];
+    }
+  }
+
+  // Adds the gradients of the coc around a pixel, from that of its confidence of being at an edge.
+  void edge_back(int y, int x, float slope, int band, float *sums) const {
+    float low = NEVER, high = -NEVER, cocs[TAPS];
+    bool known[TAPS];
+    for (int i = 0; i < TAPS; i++) {
+      const size_t from = at(band, y, x, i) + (size_t)(band * BLOCK) * s_.width - s_.width;
+      cocs[i] = s_.coc[from];
+      known[i] = !s_.valid || s_.valid[from] > 0;
+      if (!known[i]) continue;
+      low = std::min(low, cocs[i]);
+      high = std::max(high, cocs[i]);
+    }
+    const float edge = (high - low) / EDGE_PX - 1.0f;
+    if (!known[TAPS / 2] || !(edge > 0 && edge <= 1)) return;
+    int lows = 0, highs = 0;
+    for (int i = 0; i < TAPS; i++) lows += known[i] && cocs[i] == low, highs += known[i] && cocs[i] == high;
+    for (int i = 0; i < TAPS; i++) {
+      if (!known[i]) continue;
+      if (cocs[i] == low) sums[at(band, y, x, i)] -= slope / EDGE_PX / lows;
+      if (cocs[i] == high) sums[at(band, y, x, i)] += slope / EDGE_PX / highs;
+    }
+  }
+
+  const Job &job_;
+  const Surfaces &s_;
+  const float *const falloff_, *const slopes_;
+  const int C_;
+};
+
+std::vector<float> falloff_around(int reach) {
+  std::vector<float> falloff;
+  for (int dy = -reach; dy <= reach; dy++)
+    for (int dx = -reach; dx <= reach; dx++) falloff.push_back(falloff_at(dy, dx));
+  return falloff;
+}
+
 }  // namespace
+
+void matte(const float *const *maps, int channels, int height, int width, int threads, const float *gradient, float *const *out) {
+  torchdof_scene scene = {};
+  scene.height = height, scene.width = width, scene.channels = channels, scene.threads = threads;
+  scene.kind = TORCHDOF_BACKGROUND;  // emitters are not attributed
+  Job job(scene);
+  Surfaces &s = job.surfaces;
+  s.height = height, s.width = width, s.channels = channels, s.count = 2;
+  s.block_rows = ceil_div(height, BLOCK), s.block_columns = ceil_div(width, BLOCK);
+  s.blocks.assign((size_t)s.block_rows * s.block_columns, nullptr);
+  s.light = maps[0], s.coc = maps[1], s.valid = maps[2];
+  const size_t area = s.area();
+  for (int c = 0; c < channels; c++) {
+    find_ends(s.light + c * area, area, threads, &job.light_least.emplace_back(), &job.light_most.emplace_back());
+  }
+  if (gradient) {  // of pixels that are not split: unchanged
+    memcpy(out[0], gradient, channels * area * sizeof(float));
+    memcpy(out[1], gradient + 2 * channels * area, area * sizeof(float));
+    Gradient(job, falloff_around(REACH).data(), gradient).run(out[0], out[1]);
+    return;
+  }
+  job.block_low = Buffer<float>(s.blocks.size()), job.block_high = Buffer<float>(s.blocks.size());
+  std::fill(&job.block_low[0], &job.block_low[0] + s.blocks.size(), NEVER);
+  std::fill(&job.block_high[0], &job.block_high[0] + s.blocks.size(), -NEVER);
+  for (int y = 0; y < height; y++)
+    for (int x = 0; x < width; x++) {
+      const int block = y / BLOCK * s.block_columns + x / BLOCK;
+      job.block_low[block] = std::min(job.block_low[block], s.coc[(size_t)y * width + x]);
+      job.block_high[block] = std::max(job.block_high[block], s.coc[(size_t)y * width + x]);
+    }
+  job.split_mixed();
+  float *const planes = out[0];
+  memcpy(planes, s.light, channels * area * sizeof(float));
+  memset(planes + channels * area, 0, channels * area * sizeof(float));
+  memcpy(planes + 2 * channels * area, s.coc, area * sizeof(float));
+  memset(planes + (2 * channels + 1) * area, 0, area * sizeof(float));
+  for (int i = 0; i < (int)s.blocks.size(); i++) {
+    if (!s.has_block(i)) continue;
+    const float *const from = s.block(i).own;  // own light, other light, coc and weight follow each other
+    const int y0 = i / s.block_columns * BLOCK, x0 = i % s.block_columns * BLOCK, n = std::min(BLOCK, width - x0);
+    for (int v = 0; v < 2 * channels + 2; v++)
+      for (int y = 0; y < std::min(BLOCK, height - y0); y++)
+        memcpy(planes + v * area + (size_t)(y0 + y) * width + x0, from + v * BLOCK_PIXELS + y * BLOCK, n * sizeof(float));
+  }
+}
 
 Block Surfaces::make_block(int i) {
   if (blocks[i]) return block(i);
@@ -367,11 +736,7 @@ Block Surfaces::make_block(int i) {
 }
 
 void Job::split_mixed() {
-  float falloff[TAPS];
-  for (int i = 0; i < TAPS; i++) falloff[i] = falloff_at(i / AROUND - REACH, i % AROUND - REACH);
-  std::vector<float> around_emitter;
-  for (int dy = -EMITTER_REACH; dy <= EMITTER_REACH; dy++)
-    for (int dx = -EMITTER_REACH; dx <= EMITTER_REACH; dx++) around_emitter.push_back(falloff_at(dy, dx));
+  const std::vector<float> falloff = falloff_around(REACH), around_emitter = falloff_around(EMITTER_REACH);
   const bool emitters = scene.kind != TORCHDOF_BACKGROUND;  // a given background replaces the light behind
   const int rows = surfaces.block_rows, columns = surfaces.block_columns;
   std::vector<std::unique_ptr<Window>> windows(std::max(1, scene.threads));
@@ -391,7 +756,7 @@ void Job::split_mixed() {
         }
       if (!(high - low > EDGE_PX)) continue;
       const int y0 = by * BLOCK, x0 = bx * BLOCK;
-      if (find_edges(*this, y0, x0, w)) split_block(*this, by, bx, w, falloff);
+      if (find_edges(*this, y0, x0, w)) split_block(*this, by, bx, w, falloff.data());
       if (!(high - low > 1) || !emitters || !(block_peak[by * columns + bx] > least_threshold(*this, y0, x0))) continue;
       const float least_limit = least_threshold(*this, y0, x0);
       for (int y = y0; y < std::min(height, y0 + BLOCK); y++)
