@@ -19,6 +19,7 @@ from torchdof import DepthOfField
 from torchdof.io.atomic import atomic_file
 from torchdof.options import DepthEdges
 from torchdof.tensors import TRACEABLE
+from torchdof.validation import whole
 
 from . import lists, ray_splats
 from .graph import INPUTS, OUTPUT, Layout, Portable, Size, axes, trace
@@ -91,10 +92,8 @@ def to_onnx(
     """
     if not isinstance(dof, DepthOfField):
         raise ValueError(f"dof must be a torchdof.DepthOfField, got {type(dof).__name__}")
-    if isinstance(opset, bool) or not isinstance(opset, int) or opset < OPSET:
-        raise ValueError(f"opset must be {OPSET} or newer, got {opset!r}")
-    if isinstance(channels, bool) or not isinstance(channels, int) or channels < 1:
-        raise ValueError(f"channels must be a whole number from 1 upwards, got {channels!r}")
+    whole("opset", opset, OPSET, 2**31)
+    whole("channels", channels, 1, 2**31)
     path = Path(path)
     if not path.parent.is_dir():
         raise ValueError(f"cannot write {path}: there is no folder {path.parent}")

@@ -90,7 +90,7 @@ SIMPLY = torchdof.DepthOfField(CAMERA, **SIMPLE)
     ("dof", "change", "message"),
     [
         (SIMPLY, {"inputs": "disparity"}, "inputs must be one of depth, coc_px"),
-        (SIMPLY, {"opset": 17}, "opset must be 20 or newer"),
+        (SIMPLY, {"opset": 17}, "opset must be a whole number from 20"),
         (SIMPLY, {"width": 640}, "same kernels at any image width"),
         (SIMPLY, {"channels": 0}, "channels must be a whole number"),
         (SIMPLY, {"path": "nowhere/dof.onnx"}, "there is no folder"),

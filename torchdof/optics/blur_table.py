@@ -10,11 +10,10 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..tensors import floating
-from ..validation import WHOLE_NUMBERS, number, pixels_wide, real_tensor, refuse_nested, show
+from ..validation import choice, number, numbers, pixels_wide, real_tensor, short, show
 from . import psf, table_file
 from .aperture import Aperture, Number
-from .field import Field
+from .field import Field, bracket
 from .kernel_bank import FADE_IN, bank_of
 
 __all__ = ["BlurTable"]
@@ -89,19 +88,17 @@ class BlurTable:
         aperture: Aperture | None = None,
         field: Field | None = None,
     ) -> None:
-        if not isinstance(family, str) or family not in psf.FAMILIES:
-            raise ValueError(f"family must be one of {', '.join(psf.FAMILIES)}, got {show(family)}")
-        if not isinstance(unit, str) or unit not in UNITS:
-            raise ValueError(f"unit must be one of {', '.join(UNITS)}, got {show(unit)}")
+        choice("family", family, psf.FAMILIES)
+        choice("unit", unit, UNITS)
         if not isinstance(name, str):
             raise ValueError(f"name must be a text, got {show(name)}")
         if provenance is not None and not isinstance(provenance, Mapping):
             raise ValueError(f"provenance must be a dict, got {show(provenance)}")
         self.family, self.unit, self.name = family, unit, str(name)
-        self.coc = _numbers("coc", coc)
+        self.coc = numbers("coc", coc)
         if self.coc.ndim != 1 or not len(self.coc) or bool((self.coc.diff() <= 0).any()) or not self.coc.any():
             raise ValueError(
-                f"coc must be strictly increasing signed numbers, one a node and not only 0, got {_short(self.coc)}"
+                f"coc must be strictly increasing signed numbers, one a node and not only 0, got {short(self.coc)}"
             )
         if len(self.coc) > _MAX_NODES:
             raise ValueError(f"coc must be at most {_MAX_NODES} nodes, got {len(self.coc)}")
@@ -114,11 +111,7 @@ class BlurTable:
             raise ValueError(
                 f"sensor_width_mm goes with unit 'mm' and only with it, got {show(sensor_width_mm)} with {unit!r}"
             )
-        if sensor_width_mm is not None and not isinstance(sensor_width_mm, bool | int | float):
-            raise ValueError(f"sensor_width_mm must be a number, got {show(sensor_width_mm)}")
-        if sensor_width_mm is not None and not 0 < sensor_width_mm < 1e300:
-            raise ValueError(f"sensor_width_mm must be positive, got {show(sensor_width_mm)}")
-        self.sensor_width_mm = None if sensor_width_mm is None else float(sensor_width_mm)
+        self.sensor_width_mm = None if sensor_width_mm is None else number("sensor_width_mm", sensor_width_mm, 0, 1e300)
         self._params = self._check_params(params)
         self.strength = self._per_node("strength", strength)
         self.residual = self._per_node("residual", residual)
@@ -524,7 +517,7 @@ class BlurTable:
             raise ValueError(f"params of {self.family} must be {', '.join(names)}, got {got}")
         checked = {}
         for name in names:
-            value = _numbers(f"params.{name}", params[name])
+            value = numbers(f"params.{name}", params[name])
             value = value.unsqueeze(0) if value.ndim == (2 if name == "values" else 1) else value
             if value.ndim != (3 if name == "values" else 2) or value.shape[1] != len(self.coc) or not value.numel():
                 shape = "[N, P] or [channels, N, P]" if name == "values" else "[N] or [channels, N]"
@@ -604,10 +597,10 @@ class BlurTable:
     def _per_node(self, name: str, value: Sequence[float] | Tensor | None) -> Tensor | None:
         if value is None:
             return None
-        numbers = _numbers(name, value)
-        if numbers.shape != self.coc.shape:
-            raise ValueError(f"{name} must hold one number a node ({len(self.coc)}), got shape {list(numbers.shape)}")
-        return numbers
+        values = numbers(name, value)
+        if values.shape != self.coc.shape:
+            raise ValueError(f"{name} must hold one number a node ({len(self.coc)}), got shape {list(values.shape)}")
+        return values
 
     def _side(self, sign: int) -> tuple[Tensor, dict[str, Tensor]] | None:
         """Nodes of one side of focus, ordered by ``|coc|``, with a node at 0; None if the side has no nodes."""
@@ -628,38 +621,12 @@ class BlurTable:
         """Parameters at unsigned coc ``[...]``, in the table's unit, on one side of focus: ``[channels, ...]``."""
         distances, nodes = self.side_nodes(sign)
         distances, nodes = distances.to(distance.device), {k: v.to(distance.device) for k, v in nodes.items()}
-        upper = torch.searchsorted(distances, distance.detach().contiguous()).clamp(1, len(distances) - 1)
-        lower = upper - 1
-        fraction = ((distance - distances[lower]) / (distances[upper] - distances[lower])).clamp(max=1.0)
+        lower, fraction = bracket(distances, distance)
         growth = (distance / distances[-1]).clamp_min(1.0)
         interpolated = {}
         for name, value in nodes.items():
             weight = fraction.unsqueeze(-1) if name == "values" else fraction
-            interpolated[name] = torch.lerp(value[:, lower], value[:, upper], weight)
+            interpolated[name] = torch.lerp(value[:, lower], value[:, lower + 1], weight)
             if name in psf.LENGTHS:
                 interpolated[name] = interpolated[name] * growth
         return interpolated
-
-
-def _numbers(name: str, value: Any) -> Tensor:
-    """Finite numbers as a float64 tensor on the CPU; raises ``ValueError`` with the name if they are not."""
-    refuse_nested(name, value)
-    if isinstance(value, list | tuple):
-        value = [item.detach() if isinstance(item, Tensor) else item for item in value]
-    try:
-        numbers = torch.as_tensor(value, device="cpu")
-        if not (floating(numbers) or numbers.dtype in WHOLE_NUMBERS) or numbers.layout != torch.strided:
-            raise TypeError
-        if not isinstance(value, Tensor):
-            numbers = torch.as_tensor(value, dtype=torch.float64, device="cpu")  # the line above made a list float32
-        numbers = numbers.detach().to("cpu", torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError):
-        raise ValueError(f"{name} must be numbers, got {str(value)[:60]}") from None
-    if not bool(torch.isfinite(numbers).all()):
-        raise ValueError(f"{name} must be finite numbers, got {_short(numbers)}")
-    return numbers
-
-
-def _short(numbers: Tensor) -> str:
-    text = ", ".join(f"{x:g}" for x in numbers.flatten()[:6].tolist())
-    return f"[{text}{', ...' if numbers.numel() > 6 else ''}] of shape {list(numbers.shape)}"

@@ -28,6 +28,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from ..native import Spots
 from ..tensors import is_differentiated
 from . import psf
 from .aperture import Aperture
@@ -84,33 +85,6 @@ class Lens(Protocol):
 
     def moved_in_focus(self, width: float) -> Tensor:
         """Share of the light that the kernel in focus moves to other pixels."""
-
-
-class Spots(NamedTuple):
-    """Recipe for the kernels of n circles of confusion and C colours, as plain numbers because n is small.
-
-    Args:
-        templates: Cells of the templates in use, each ``[C, 2 cells + 3, 2 cells + 3]``, float32.
-        which: Four indices into ``templates`` for each kernel: node below and above, and both of the next finer level.
-        part: Weight of the node above, in [0, 1].
-        finer: Weight of the finer level, in [0, 1].
-        reach: Radius of the PSF in pixels, C for each kernel.
-        fade: Weight of the kernel against a single pixel, in [0, 1], C for each kernel.
-        flipped: Whether the kernel is point-reflected.
-        half: Half width of each kernel in pixels; light beyond it is cut off.
-        moves: Zeros to add to ``part`` ``[n]`` and ``reach`` ``[n, C]``, through which gradients flow to the coc; None
-            without gradients.
-    """
-
-    templates: list[Tensor]
-    which: list[tuple[int, int, int, int]]
-    part: list[float]
-    finer: list[float]
-    reach: list[list[float]]
-    fade: list[list[float]]
-    flipped: list[bool]
-    half: list[int]
-    moves: tuple[Tensor, Tensor] | None
 
 
 class _Place(NamedTuple):
