@@ -75,17 +75,19 @@ def choice(name: str, value: Any, choices: Collection[str]) -> None:
 
 def numbers(name: str, value: Any) -> Tensor:
     """Finite numbers, such as lists of them or a tensor, as a float64 tensor on the CPU."""
-    if isinstance(value, list | tuple):
-        value = [item.detach() if isinstance(item, Tensor) else item for item in value]
-    try:
-        values = torch.as_tensor(value, device="cpu")
-        if not (floating(values) or values.dtype in WHOLE_NUMBERS) or values.layout != torch.strided:
-            raise TypeError
-        if not isinstance(value, Tensor):
+    if isinstance(value, Tensor):
+        is_whole = value.dtype in WHOLE_NUMBERS and value.layout == torch.strided and value.device.type != "meta"
+        values = (value if is_whole else real_tensor(name, value, "of numbers")).detach().to("cpu", torch.float64)
+    else:
+        if isinstance(value, list | tuple):
+            value = [item.detach() if isinstance(item, Tensor) else item for item in value]
+        try:
+            values = torch.as_tensor(value, device="cpu")
+            if not floating(values) and values.dtype not in WHOLE_NUMBERS:
+                raise TypeError
             values = torch.as_tensor(value, dtype=torch.float64, device="cpu")  # the line above made a list float32
-        values = values.detach().to("cpu", torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError):
-        raise ValueError(f"{name} must be numbers, got {str(value)[:60]}") from None
+        except (TypeError, ValueError, RuntimeError, OverflowError):
+            raise ValueError(f"{name} must be numbers, got {show(value)}") from None
     if not bool(torch.isfinite(values).all()):
         raise ValueError(f"{name} must be finite numbers, got {short(values)}")
     return values

@@ -131,34 +131,3 @@ def test_a_point_at_infinity_fixes_the_offset() -> None:
     scale = solve_scale(row(0.5, 1.0, 2.0), [(0.5, 0.5, INF), (2.5, 0.5, 2.0)], patch=1)
     assert scale.offset == pytest.approx(-0.5) and scale.scale == pytest.approx(3.0)
     assert scale.depth(row(0.25, NAN))[0, 0, 0, 0] == INF and bool(scale.depth(row(0.25, NAN))[0, 0, 0, 1].isnan())
-
-
-def as_read(values: torch.Tensor, most: float, **way: Any) -> torch.Tensor:
-    """The values from 0 to ``most`` for which the depth of a map stands."""
-    return most / from_relative(values, 1.0, INF, value_range=(0.0, most), **way)
-
-
-@pytest.mark.parametrize("level", [1.0, 1.0 / 255.0])
-def test_steps_of_8_bits_on_a_smooth_surface_become_ramps_and_edges_stay(level: float) -> None:
-    given = torch.linspace(20.0, 110.0, 900).round().expand(1, 1, 12, 900).clone()  # ten pixels for each level
-    given[..., 450:] += 40.0
-    found = as_read(given * level, 255.0 * level) / level
-    torch.testing.assert_close(found, given, rtol=0.0, atol=0.5001)
-    steps = found.diff(dim=-1).abs()
-    assert float(steps[..., 449].min()) > 39.0
-    steps[..., 449] = 0.0
-    assert float(steps.max()) < 0.3, "of one level as given"
-
-
-@pytest.mark.parametrize("most", [40.0, 256.0])
-def test_steps_of_few_levels_and_of_more_than_8_bits_stay(most: float) -> None:
-    given = torch.linspace(1.0, most, 600).round().expand(1, 1, 4, 600)
-    torch.testing.assert_close(as_read(given, most), given)
-
-
-def test_an_unknown_value_does_not_move_the_next_level() -> None:
-    given = torch.linspace(1.0, 255.0, 600).round().expand(1, 1, 4, 600).clone()
-    given[..., 0] = 0.0
-    found = as_read(given, 255.0, unknown=0.0)
-    given[..., 0] = NAN
-    torch.testing.assert_close(found, as_read(given, 255.0), equal_nan=True)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Literal
 
 import torch
-import torch.nn.functional as functional
 from torch import Tensor
 
 from ..tensors import is_traced, refuse_old_compiler
@@ -17,9 +16,6 @@ __all__ = ["RELATIVE_KINDS", "RelativeKind", "Scale", "from_relative", "solve_sc
 
 RelativeKind = Literal["disparity", "inverse", "depth"]
 RELATIVE_KINDS: tuple[RelativeKind, ...] = ("disparity", "inverse", "depth")
-
-_LEVELS = 64  # fewest levels that a map of 8 bits spans; with fewer, a step of one level may be an edge
-_REACHES_PX = (4, 2, 1)  # distances over which steps of one level are smoothed; more: wider ramps
 
 
 def from_relative(
@@ -40,9 +36,6 @@ def from_relative(
     inverse     the same                                inverse depth up to scale and shift
     depth       depth is linear, larger is farther      Marigold, and other affine-invariant depth
     =========== ======================================= =====================================================
-
-    Maps of 8 bits, of numbers from 0 to 255 or from 0 to 1, have steps on smooth surfaces. In a strong blur each step
-    near the focus would appear as a fine line, so steps become ramps: values change by at most half a level.
 
     Args:
         values: ``[B, 1, H, W]``, floating point or whole numbers, of any range. NaN and infinite values are holes.
@@ -89,7 +82,6 @@ def from_relative(
             )
     else:
         low, high = (value.new_tensor(x) for x in _range(value_range))
-    value = _smooth_steps(torch.where(is_known, value, torch.nan))
     fraction = (torch.where(is_known, value, low) - low) / (high - low)
     fraction = fraction.clamp(0.0, 1.0)
     if kind == "depth":
@@ -99,32 +91,6 @@ def from_relative(
         depth = 1.0 / torch.where(inverse > 0, inverse, 1.0)
         depth = torch.where(inverse > 0, depth, torch.inf)
     return torch.where(is_known, depth, torch.nan).to(dtype)
-
-
-def _smooth_steps(values: Tensor) -> Tensor:
-    """Turns the steps of one level in maps of 8 bits into ramps; changes a value by at most half a level.
-
-    Over each distance, the values of two pixels that differ by one level at most move towards each other.
-    """
-    known = values.detach().nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
-    low, high = known.amin((1, 2, 3), keepdim=True), known.amax((1, 2, 3), keepdim=True)
-    level = torch.where(high > 1.0, 1.0, 1.0 / 255.0)
-    levels = known / level
-    is_whole = ((levels - levels.round()).abs() < 1e-3).all(-1, True).all(-2, True)
-    is_of_8_bits = is_whole & (high - low > _LEVELS * level) & (low >= 0) & (high <= 255.0 * level)
-    if not is_traced() and not bool(is_of_8_bits.any()):
-        return values
-    smooth = values
-    for reach in _REACHES_PX:
-        for dim in (-1, -2):
-            count, ends = values.shape[dim], (reach, reach, 0, 0) if dim == -1 else (0, 0, reach, reach)
-            given, now = (functional.pad(t, ends, mode="replicate") for t in (values, smooth))
-            middle = now.narrow(dim, reach, count)
-            for start in (0, 2 * reach):
-                is_near = (given.narrow(dim, start, count) - values).abs() < 1.5 * level
-                smooth = smooth + torch.where(is_near, (now.narrow(dim, start, count) - middle) / 4.0, 0.0)
-    smooth = torch.minimum(torch.maximum(smooth, values - level / 2.0), values + level / 2.0)
-    return torch.where(is_of_8_bits, smooth, values)
 
 
 @dataclasses.dataclass(frozen=True)
