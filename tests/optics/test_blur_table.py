@@ -259,7 +259,7 @@ SOFT = {"radius": [0.01], "sigma": [0.003], "b": [1.0]}
         ("radial", [0.01], {"values": [[0.0, 0.0]], "radius": [0.01]}, "params.values must hold at least two values"),
         ("softm", [0.01], {**SOFT, "b": [-2.0], "m": [2.0]}, "params.b must be >= -1, got -2"),
         ("softm", [0.01], {**SOFT, "m": [1000.0]}, "params.m must be <= 100, got 1000"),
-        ("gaussian", [0.01], {"sigma": [1e9]}, "params must be lengths in the unit of coc, got a kernel that reaches"),
+        ("gaussian", [0.01], {"sigma": [1e9]}, "params must be lengths in the unit of coc, got a blur that reaches"),
         ("disc", [-0.01, 1e-320], {"radius": [0.01, 0.02]}, "coc must reach somewhere from 1e-09 to .* got 9.9"),
         ("disc", [-0.01, 1e-7], {"radius": [0.01, 0.02]}, "params must be lengths .* to 0.02 where coc is 1e-07"),
         ("disc", [1e90], {"radius": [1e90]}, r"coc must reach somewhere from 1e-09 to 1e\+06 \(fraction\), got 1e"),

@@ -4,7 +4,6 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -12,7 +11,6 @@ from tests.refused import refuses
 from torchdof import Camera
 
 Number = float | Tensor
-DISTANCE_M = st.floats(0.2, 1e4)
 
 
 def depth_of(*metres: float, dtype: torch.dtype = torch.float64) -> Tensor:

@@ -100,7 +100,8 @@ class Spots(NamedTuple):
 
 # Types of ``src/api.h``. Data are pointers to numbers, Arrays those to the data of several tensors.
 _Int, _Real, _Double, _Data = ctypes.c_int32, ctypes.c_float, ctypes.c_double, ctypes.c_void_p
-_Ints, _Reals, _Doubles, _Arrays = map(ctypes.POINTER, (_Int, _Real, _Double, _Data))
+_Ints, _Reals, _Doubles = ctypes.POINTER(_Int), ctypes.POINTER(_Real), ctypes.POINTER(_Double)
+_Arrays = ctypes.POINTER(_Data)
 
 
 def _fields(*groups: tuple[Any, str]) -> list[tuple[str, Any]]:
@@ -109,7 +110,11 @@ def _fields(*groups: tuple[Any, str]) -> list[tuple[str, Any]]:
 
 
 _LAYERS = (
-    *((_Int, "layers"), (_Doubles, "nodes"), (_Ints, "scales halves"), (_Int, "kernel_colours"), (_Data, "kernels")),
+    (_Int, "layers"),
+    (_Doubles, "nodes"),
+    (_Ints, "scales halves"),
+    (_Int, "kernel_colours"),
+    (_Data, "kernels"),
 )
 """Fields of the structures that have layers, see :func:`_of_layers`."""
 

@@ -551,37 +551,28 @@ class BlurTable:
             raise ValueError("a table with a field must state its unit as 'fraction' (of the image's width) or 'mm'")
         if field.channels != self.channels:
             raise ValueError(f"field must have {self.channels} channels, as params have, got {field.channels}")
-        low, high = _COC_RANGE
-        for name, ends in (("coc", field.coc[[0, -1]].abs()), ("radius", field.radius[-1:])):
-            if not low <= float(ends.min()) <= float(ends.max()) <= high:
-                raise ValueError(
-                    f"field.{name} must reach somewhere from {low:g} to {high:g} ({self.unit}), "
-                    f"got {' and '.join(f'{end:g}' for end in ends.tolist())}"
-                )
+        self._check_extent("field.radius", "field.box", float(field.radius[-1]))
         for cocs in (field.coc[field.coc <= 0], field.coc[field.coc >= 0]):
-            largest, reach = float(cocs.abs().max()), float(field.reach(cocs).max())
-            if reach > _MAX_REACH * largest:
-                raise ValueError(
-                    "field.box must be lengths in the unit of field.coc, got a spot that "
-                    f"reaches to {reach:g} where coc is {largest:g}"
-                )
+            self._check_extent("field.coc", "field.box", float(cocs.abs().max()), float(field.reach(cocs).max()))
         return field
+
+    def _check_extent(self, ends: str, lengths: str, end: float, reach: float = 0.0) -> None:
+        """Refuse a side of focus that ends at an absurd coc, or a blur there that reaches absurdly far."""
+        low, high = _COC_RANGE
+        if not low <= end <= high:
+            raise ValueError(f"{ends} must reach somewhere from {low:g} to {high:g} ({self.unit}), got {end:g}")
+        if reach > _MAX_REACH * end:
+            got = f"a blur that reaches to {reach:g} where coc is {end:g}"
+            raise ValueError(f"{lengths} must be lengths in the unit of {ends}, got {got}")
 
     def _try_kernels(self) -> None:
         """Refuse parameters whose kernels at, between or beyond the nodes are not finite or far too wide."""
-        low, high = _COC_RANGE
         scale, widest = self.px_per_unit(1.0), 0.0
         for coc in (self.coc[self.coc < 0], self.coc[self.coc > 0]):
-            largest = float(coc.abs().max()) if len(coc) else low
-            if not low <= largest <= high:
-                raise ValueError(f"coc must reach somewhere from {low:g} to {high:g} ({self.unit}), got {largest:g}")
-            reach = psf.support(self.family, self.params(coc * scale, 1.0)) / scale if len(coc) else 0.0
-            if reach > _MAX_REACH * largest:
-                raise ValueError(
-                    "params must be lengths in the unit of coc, got a kernel that "
-                    f"reaches to {reach:g} where coc is {largest:g}"
-                )
-            widest = max(widest, reach)
+            if len(coc):
+                reach = psf.support(self.family, self.params(coc * scale, 1.0)) / scale
+                self._check_extent("coc", "params", float(coc.abs().max()), reach)
+                widest = max(widest, reach)
         if widest == 0.0:
             return
         cocs = torch.cat([self.coc, (self.coc[1:] + self.coc[:-1]) / 2, 2.0 * self.coc[[0, -1]]])

@@ -90,8 +90,8 @@ class Camera:
         if not isinstance(self.focus_breathing, bool):
             raise ValueError(f"focus_breathing must be True or False, got {show(self.focus_breathing)}")
         if self.focus_breathing and not is_traced():
-            focal_m = _largest(self.focal_length_mm / 1000.0 / self.focus_m)
-            if focal_m >= 1.0:
+            ratio = self.focal_length_mm / 1000.0 / self.focus_m
+            if (float(ratio.detach().max()) if isinstance(ratio, Tensor) else ratio) >= 1.0:
                 raise ValueError(
                     f"focus_m must be longer than the focal length ({_show(self.focal_length_mm)} mm), got "
                     f"{_show(self.focus_m)} m; nothing nearer than the focal length can be in focus"
@@ -383,10 +383,6 @@ def _weighted_median(values: Tensor, weights: Tensor) -> Tensor:
     values, order = values.sort()
     summed = weights[order].double().cumsum(0)
     return values[int((summed >= 0.5 * summed[-1]).nonzero()[0])]
-
-
-def _largest(value: Number) -> float:
-    return float(value.detach().max()) if isinstance(value, Tensor) else float(value)
 
 
 def _show(value: Number) -> str:

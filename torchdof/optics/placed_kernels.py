@@ -149,7 +149,7 @@ def _computed(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int
     # width of the average: a pixel, minus the variance that cells and linear interpolation between samples add
     sample_px = extent[:, 1:] / counts
     averaged_px = (1.0 - 2.0 * sample_px.square() - 3.0 * cells.square()).clamp_min(_MIN_AVERAGED_PX**2).sqrt()
-    half_length, half_width = 0.5 * averaged_px.unsqueeze(-1).unbind(1)
+    half_length, half_width = (0.5 * averaged_px).unsqueeze(-1).unbind(1)
     values = overlaps(along - half_length, along + half_length, row_edges) @ (mirrored / area)
     values = values @ overlaps(across - half_width, across + half_width, column_edges).transpose(-2, -1)
     return values / values.amax((0, 2, 3), keepdim=True), extent
