@@ -2,6 +2,7 @@
 
 import hashlib
 import itertools
+import json
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,6 +11,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from ..io.atomic import write_text
 from ..validation import choice, number, numbers, pixels_wide, real_tensor, short, show
 from . import psf, table_file
 from .aperture import Aperture, Number
@@ -436,7 +438,7 @@ class BlurTable:
         Raises:
             OSError: If the file cannot be written.
         """
-        table_file.write(self.to_dict(), path)
+        write_text(path, json.dumps(self.to_dict(), indent=1) + "\n")
 
     @classmethod
     def load(cls, source: str | os.PathLike[str]) -> "BlurTable":
@@ -455,7 +457,7 @@ class BlurTable:
         """
         path = table_file.find(source)
         try:
-            return cls.from_dict(table_file.read(path))
+            return cls.from_dict(json.loads(path.read_text(encoding="utf-8")))
         except (ValueError, RecursionError) as error:
             raise ValueError(f"{path}: {error}") from error
 
@@ -463,6 +465,8 @@ class BlurTable:
         """The table as JSON-like data, the inverse of :meth:`from_dict`."""
         one_for_all = self.channels == 1
         fields = {
+            "schema": table_file.SCHEMA,
+            "version": table_file.VERSION,
             "name": self.name,
             "family": self.family,
             "unit": self.unit,
@@ -475,7 +479,7 @@ class BlurTable:
             "aperture": None if self.aperture is None else self.aperture.to_dict(),
             "field": None if self.field is None else self.field.to_dict(),
         }
-        return table_file.with_schema({k: v for k, v in fields.items() if v is not None})
+        return {k: v for k, v in fields.items() if v is not None}
 
     @classmethod
     def from_dict(cls, data: Any) -> "BlurTable":

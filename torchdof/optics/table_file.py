@@ -1,15 +1,13 @@
-"""Blur tables as JSON files: the schema, the checks, and the shipped tables."""
+"""Blur tables as JSON files: the schema, its checks, and the shipped tables."""
 
-import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..io.atomic import write_text
 from ..validation import fields, show
 
-__all__ = ["fields_of", "find", "read", "shipped", "with_schema", "write"]
+__all__ = ["SCHEMA", "VERSION", "fields_of", "find", "shipped"]
 
 SCHEMA = "torchdof/blur-table"
 VERSION = 3
@@ -43,30 +41,6 @@ def find(source: str | os.PathLike[str]) -> Path:
 def shipped() -> list[str]:
     """Names of the tables that come with torchdof, sorted."""
     return sorted(path.stem for path in _FOLDER.glob("*.json"))
-
-
-def read(path: Path) -> Any:
-    """The JSON in a file.
-
-    Raises:
-        ValueError: If the file is not valid JSON.
-        RecursionError: If it is nested too deep.
-    """
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
-def write(data: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
-    """Writes a table's data as JSON, whole or not at all.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
-    write_text(path, json.dumps(data, indent=1) + "\n")
-
-
-def with_schema(data: Mapping[str, Any]) -> dict[str, Any]:
-    """A table's fields with the schema and its version in front."""
-    return {"schema": SCHEMA, "version": VERSION, **data}
 
 
 def fields_of(data: Any) -> dict[str, Any]:
