@@ -47,6 +47,9 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
         passes.ShapeInferencePass(),
         _take_parts,
         _join_cuts,
+        _convolve_averages,
+        _fill_channels,
+        _join_splits,
         passes.IdentityEliminationPass(),
         passes.CommonSubexpressionEliminationPass(),
         passes.RemoveUnusedNodesPass(),
@@ -219,6 +222,80 @@ def _join_cuts(model: onnx_ir.Model) -> None:
                 bounds.append(tape.op("Concat", list(pair), {"axis": 0}))
         tape.op("Slice", [first.inputs[0], *bounds])
         _replace(model.graph, node, tape)
+
+
+def _convolve_averages(model: onnx_ir.Model) -> None:
+    """Block means before a convolution become a convolution, which is several times as fast in runtimes."""
+    for node in list(model.graph):
+        following = [use.node for use in node.outputs[0].uses()] if node.op_type == "AveragePool" else []
+        if [n.op_type for n in following] != ["Pad"]:
+            continue
+        (pad,) = following
+        scale = node.attributes["kernel_shape"].as_ints()[0]
+        filled_shape: Any = pad.outputs[0].shape
+        channels = int(filled_shape[1])
+        weight = np.full((channels, 1, scale, scale), scale**-2.0, np.float32)
+        tape = Tape()
+        filled = tape.op("Pad", [node.inputs[0], *pad.inputs[1:]])
+        name = f"mean_{node.outputs[0].name}"
+        kernel = _initializer(model.graph, weight, f"{name}_weight")
+        tape.op("Conv", [filled, kernel], {"group": channels, "strides": [scale, scale]}, name=name)
+        _replace(model.graph, pad, tape)
+        model.graph.remove(node, safe=True)
+
+
+def _fill_channels(model: onnx_ir.Model) -> None:
+    """Padding channels of a convolution become inputs of the ``Concat`` before it.
+
+    Their values do not matter, because they are not used: they repeat some of the other channels.
+    """
+    graph = model.graph
+    for pad in list(graph):
+        missing = _spare_channels(pad)
+        concat: Any = pad.inputs[0].producer() if missing and pad.inputs[0] is not None else None
+        if concat is None or concat.op_type != "Concat" or concat.attributes["axis"].as_int() != 1:
+            continue
+        filled, tape = list(concat.inputs), Tape()
+        for part in concat.inputs:
+            repeats, missing = divmod(missing, part.shape[1])
+            filled += [part] * repeats
+        if missing:
+            name = f"{pad.outputs[0].name}_fill"
+            ends = {"start": 0, "stop": missing, "axis": 1}
+            bounds = [_initializer(graph, np.array([n]), f"{name}_{end}") for end, n in ends.items()]
+            filled.append(tape.op("Slice", [concat.inputs[0], *bounds]))
+        tape.op("Concat", filled, {"axis": 1})
+        _replace(graph, pad, tape)
+
+
+def _join_splits(model: onnx_ir.Model) -> None:
+    """A slice of the first channels and a split become one split, whose last part is not used."""
+    graph = model.graph
+    for node in [n for n in graph if n.op_type == "Split" and n.attributes["axis"].as_int() == 1]:
+        cut: Any = None if node.inputs[0] is None else node.inputs[0].producer()
+        if cut is None or cut.op_type != "Slice" or cut.inputs[0].shape is None:
+            continue
+        source, kept_shape = cut.inputs[0], cut.outputs[0].shape
+        is_equal = [a == b for a, b in zip(source.shape, kept_shape, strict=True)]
+        bounds: list[Any] = [cut.inputs[1], node.inputs[1]]
+        first, sizes = (onnx_ir.convenience.get_const_tensor(value) for value in bounds)
+        if first is None or sizes is None or first.numpy().any() or is_equal != [True, False, True, True]:
+            continue
+        parts = np.array([*sizes.numpy(), source.shape[1] - kept_shape[1]])
+        all_sizes = _initializer(graph, parts, f"{node.outputs[0].name}_sizes")
+        split = onnx_ir.node("Split", [source, all_sizes], {"axis": 1}, num_outputs=len(parts))
+        graph.insert_before(node, [split])
+        for old, new in zip(node.outputs, split.outputs, strict=False):
+            new.type, new.shape = old.type, old.shape
+            old.replace_all_uses_with(new)
+        graph.remove(node, safe=True)
+
+
+def _spare_channels(node: onnx_ir.Node) -> int:
+    """Number of channels that a ``Pad`` appends, if it does nothing else; otherwise 0."""
+    pads = node.inputs[1] if node.op_type == "Pad" and len(node.inputs) > 1 else None
+    ends = [] if pads is None or pads.const_value is None else pads.const_value.numpy().tolist()
+    return ends[5] if len(ends) == 8 and not any(ends[:5] + ends[6:]) else 0
 
 
 def _part(node: onnx_ir.Node) -> onnx_ir.Value | None:
