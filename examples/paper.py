@@ -15,12 +15,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 
 import torchdof
 from torchdof.fit import BlurFit, blur_strength, fit_captures, fit_pair, fit_profile, natural_psnr, read_captures
 from torchdof.fit.lens.lens import Lens
 from torchdof.fit.lens.spot import Spot, focus_sensor, point_spread
-from torchdof.fit.plots import picture_of_fit, picture_of_quad, picture_of_table, picture_of_texture
+from torchdof.fit.plots import picture_of_fit, picture_of_table
 from torchdof.io.images import Picture, write_image
 from torchdof.optics.psf import pixel_kernels
 
@@ -51,13 +52,12 @@ def draw_table_1(out: Path) -> None:
     picture_of_fit(fit, unit="m on the paper", title="eq. (1) with Table 1").savefig(out / "sato_fig2.png")
     width, field_m = 512, 0.2  # a quad of 80 mm at 0.50 m in a field of 200 mm
     coc_px = float(table.coc[0]) / field_m * width
-    picture_of_texture(table, coc_px, width).savefig(out / "sato_fig3.png")
+    draw_texture(table, coc_px, width, out / "sato_fig3.png")
     sharp = quad(width, width, 0.08 / field_m * width)
     coc = torch.full((1, 1, width, width), coc_px)
     blurred = torchdof.blur_by_coc(sharp[None, None], coc, table=table)
-    picture_of_quad(sharp.numpy(), blurred[0, 0].numpy(), "a quad at 0.50 m, focus at 0.20 m: sato_j15").savefig(
-        out / "sato_fig4.png"
-    )
+    title = "a quad at 0.50 m, focus at 0.20 m: sato_j15"
+    draw_quads(sharp.numpy(), blurred[0, 0].numpy(), title, out / "sato_fig4.png")
     print(
         "Table 1, refitted from samples of its own curve (the paper's samples are not published), proves the fit only:"
     )
@@ -89,7 +89,7 @@ def draw_experiment(out: Path, lens: Lens) -> None:
     table.save(out / "traced.json")
     picture_of_table(table).savefig(out / "traced_table.png")
     (coc_px,) = result.coc_px
-    picture_of_texture(table, coc_px, WIDTH).savefig(out / "traced_fig3.png")
+    draw_texture(table, coc_px, WIDTH, out / "traced_fig3.png")
 
     camera = torchdof.Camera(
         focal_length_mm=lens.paraxial().focal_length, f_number=F_NUMBER, focus_m=FOCUS_M, sensor_width_mm=SENSOR_MM
@@ -100,7 +100,7 @@ def draw_experiment(out: Path, lens: Lens) -> None:
     blurred = dof(sharp[None, None], depth)[0, 0].numpy()
     truth = blur(sharp.numpy(), spot)
     title = f"a quad at {PAPER_M} m, focus at {FOCUS_M} m: {table.name}"
-    picture_of_quad(sharp.numpy(), blurred, title).savefig(out / "traced_fig4.png")
+    draw_quads(sharp.numpy(), blurred, title, out / "traced_fig4.png")
     inner = slice(60, -60), slice(60, -60)
     error = float(np.mean((blurred - truth)[inner] ** 2))
     print(f"quad against the traced spot itself: {-10 * np.log10(error):.1f} dB")
@@ -180,6 +180,31 @@ def quad(width: int, height: int, side: float) -> torch.Tensor:
     top, left = round((height - side) / 2), round((width - side) / 2)
     picture[top : height - top, left : width - left] = 1.0
     return picture
+
+
+def draw_texture(table: torchdof.BlurTable, coc_px: float, width: int, file: Path) -> None:
+    """Fig. 3: the blur texture at a signed circle of confusion, for an image `width` px wide."""
+    figure = Figure(figsize=(4.2, 3.6), layout="constrained")
+    axes = figure.subplots()
+    image = axes.imshow(table.blur_texture(coc_px, width)[0].numpy(), cmap="gray", vmin=0)
+    figure.colorbar(image, ax=axes, label="blur strength")
+    axes.set_title(f"blur texture, coc {coc_px:+.1f} px", fontsize=9)
+    figure.savefig(file)
+
+
+def draw_quads(sharp: np.ndarray, blurred: np.ndarray, title: str, file: Path) -> None:
+    """Fig. 4: a quad in focus and out of focus `[H, W]`, linear light, and their middle rows."""
+    figure = Figure(figsize=(9.6, 3.4), layout="constrained")
+    *pictures, below = figure.subplots(1, 3)
+    for axes, picture, name in zip(pictures, (sharp, blurred), ("in focus", "out of focus"), strict=True):
+        axes.imshow((picture / sharp.max()).clip(0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
+        axes.set_title(name, fontsize=8)
+        axes.set_axis_off()
+        below.plot(picture[len(picture) // 2], label=name)
+    below.set(xlabel="px", ylabel="linear light, middle row")
+    below.legend(frameon=False, fontsize=8)
+    figure.suptitle(title, fontsize=10)
+    figure.savefig(file)
 
 
 def show(title: str, fit: BlurFit) -> None:

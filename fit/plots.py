@@ -1,4 +1,4 @@
-"""The paper's figures for any fit and table, and a sheet that documents a calibration, drawn with matplotlib."""
+"""Figures of a fit and of a table, and a sheet that documents a calibration, drawn with matplotlib."""
 
 from __future__ import annotations
 
@@ -30,9 +30,6 @@ def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
 
     For a forward fit, the samples are the blurred dot's pixels and the curve is their model, together with the kernel's
     own profile; for a profile fit, the samples are blur strengths.
-
-    Raises:
-        FitError: the fit has no samples.
     """
     if not fit.samples.shape[1]:
         raise FitError("this fit carries no samples to draw")
@@ -64,35 +61,6 @@ def _model_line(fit: BlurFit) -> tuple[Array, Array]:
     count = np.bincount(bins)
     r, level = (np.bincount(bins, row)[count > 0] / count[count > 0] for row in fit.curve)
     return r, level
-
-
-def picture_of_texture(table: BlurTable, coc_px: float, width: int, title: str = "") -> Figure:
-    """The blur texture at a signed circle of confusion, for an image `width` px wide (the paper's Fig. 3)."""
-    texture = table.blur_texture(coc_px, width).detach().numpy()
-    figure, axes = _new_figure(4.2, 3.6)
-    half = texture.shape[-1] / 2
-    colours = np.moveaxis(texture, 0, -1) / texture.max() if texture.shape[0] == 3 else texture[0]
-    image = axes.imshow(colours, cmap="gray", vmin=0, extent=(-half, half, half, -half))
-    if texture.shape[0] != 3:
-        figure.colorbar(image, ax=axes, label="blur strength")
-    axes.set(xlabel="px", ylabel="px")
-    axes.set_title(title or f"blur texture, coc {coc_px:+.1f} px", fontsize=9)
-    return figure
-
-
-def picture_of_quad(sharp: Array, blurred: Array, title: str = "") -> Figure:
-    """A quad in focus and out of focus `[H, W]`, linear light, and their middle rows (the paper's Fig. 4)."""
-    figure, (left, right, below) = _new_figure(9.6, 3.4, 3)
-    white = float(sharp.max())
-    _show(left, sharp, "in focus", white=white)
-    _show(right, blurred, "out of focus", white=white)
-    row = sharp.shape[0] // 2
-    below.plot(sharp[row], color=_DATA, label="in focus")
-    below.plot(blurred[row], color=_MODEL, label="out of focus")
-    below.set(xlabel="px", ylabel="linear light, middle row")
-    below.legend(frameon=False, fontsize=8)
-    figure.suptitle(title, fontsize=10)
-    return figure
 
 
 def picture_of_table(table: BlurTable, title: str = "") -> Figure:
@@ -133,12 +101,8 @@ def sheet_of_photographs(
 
     One row for each distance: the target found, the window around its dot, the window's pixels over the distance from
     the centre with the model, the residual, and the kernel. Below, rendered with the table: lights from near to far,
-    and the window of the photograph in focus, blurred as at the most blurred distance.
-
-    Args:
-        photographs: from `read_photographs`.
-        result: from `fit_captures` of the photographs' captures.
-        render: `render(image, coc_px, table)`, with the arguments of `torchdof.blur_by_coc`.
+    and the window of the photograph in focus, blurred as at the most blurred distance. `render(image, coc_px, table)`
+    has the arguments of `torchdof.blur_by_coc`.
     """
     captures = photographs.captures
     rows = len(captures)
@@ -199,11 +163,9 @@ def _rendered(
     return np.clip(picture[0, 0].numpy().astype(np.float64), 0, 1)
 
 
-def _show(
-    axes: Axes, picture: Array, title: str, *, white: float | None = None, box: Sequence[tuple[float, float]] = ()
-) -> None:
+def _show(axes: Axes, picture: Array, title: str, box: Sequence[tuple[float, float]] = ()) -> None:
     """Draws a picture `[H, W]` in linear light, encoded for display, and a line through the corners of a box."""
-    white = max(float(picture.max()) if white is None else white, 1e-12)
+    white = max(float(picture.max()), 1e-12)
     axes.imshow(np.clip(picture / white, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
     if box:
         axes.plot(*zip(*box, strict=True), color=_MODEL, linewidth=1)

@@ -30,8 +30,6 @@ class BlurFit:
         noise: the expected noise in the data, relative to the same norm. NaN if unknown.
         covariance: covariance of the parameters in `names` [n, n].
         names: the order of `covariance`; also includes other fitted parameters ("dx", "dy", "magnification").
-        bic: Bayesian information criterion; lower is better, comparable between families for the same data.
-        count: the number of samples or pixels used.
         model: "forward", "ratio" or "profile".
         gain: the fitted exposure ratio between the pictures (forward model), else 1.
         background: the fitted level under the blurred dot (forward model), else 0.
@@ -54,8 +52,6 @@ class BlurFit:
     noise: float
     covariance: Array
     names: tuple[str, ...]
-    bic: float
-    count: int
     model: str
     gain: float = 1.0
     background: float = 0.0

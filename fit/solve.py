@@ -1,4 +1,4 @@
-"""Least squares by SciPy from several starts, and statistics of a solution; failures raise errors."""
+"""Least squares by SciPy from several starts; failures raise errors."""
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -29,7 +29,6 @@ def best_of(
     *,
     jacobian: Callable[[Array], Array] | None = None,
     tolerance: float = _TOLERANCE,
-    first_bias: float = 0.0,
 ) -> Array:
     """Fits roughly from every start, finishes from the best, and returns the parameters.
 
@@ -40,7 +39,6 @@ def best_of(
         bounds: lower and upper bounds.
         jacobian: the model's derivatives `[n, p]`; None uses three-point differences.
         tolerance: relative change of cost, parameters and gradient that ends the iteration.
-        first_bias: the first start is used unless another one reduces the sum of squares by more than this share.
 
     Raises:
         FitError: of kind "not converged" if no start converged.
@@ -64,13 +62,11 @@ def best_of(
         return (result.cost, result.x) if result.success and np.isfinite(result.cost) else None
 
     rough_fits = [descend(start, max(tolerance, _ROUGH_TOLERANCE)) for start in starts]
-    converged = [r for r in rough_fits if r is not None]
+    converged = [fit for fit in rough_fits if fit is not None]
     if not converged:
         text = f"none of {len(starts)} starts converged; is this a picture of a blurred dot?"
         raise FitError(text, "not converged", number=float(len(starts)))
     best = min(converged, key=lambda r: r[0])
-    if rough_fits[0] is not None and rough_fits[0][0] <= best[0] * (1 + first_bias):
-        best = rough_fits[0]
     # in a long narrow valley the last digits may take too many steps; a less exact solution is then accepted
     refined = descend(best[1], tolerance) or descend(best[1], max(tolerance, _ACCEPTED_TOLERANCE)) or best
     return np.asarray(min(refined, best, key=lambda r: r[0])[1])
@@ -86,8 +82,3 @@ def inverse(information: Array) -> Array:
     affected = (np.abs(vectors[:, is_lost]) > 1e-3).any(axis=1)
     result[affected, affected] = np.inf
     return np.asarray(result, dtype=np.float64)
-
-
-def information_criterion(squares: float, count: int, parameters: int) -> float:
-    """Bayesian information criterion of a least-squares fit, up to a constant that depends on the data only."""
-    return count * float(np.log(max(squares, np.finfo(float).tiny) / count)) + parameters * float(np.log(count))

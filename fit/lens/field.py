@@ -30,11 +30,7 @@ def trace_field(
     rays: int,
     reference: Reference,
 ) -> Field:
-    """Traces spots at signed coc, whose object distances are given by `distance_m`, and at distances from the centre.
-
-    Raises:
-        ValueError: If no ray reaches a position.
-    """
+    """Traces spots at signed coc, whose object distances `distance_m` gives, and at distances from the centre."""
     rows, columns = _CELLS
     heights = [field_height_mm(lens, distance_m(0.0), sensor_mm, radius, reference) for radius in radius_mm]
     boxes, light = [], []

@@ -1,30 +1,22 @@
-"""Nodes of a traced table: their positions, and kernels fitted to their spots, smooth over depth.
+"""Nodes of a traced table: their positions, and profiles fitted to their spots.
 
 Spots and profiles are compared by their transfer functions, which are Hankel transforms; a spot's is a sum of Bessel
 functions over its rays. Both are weighted by the spectrum of natural images (amplitude 1/frequency) and the area of a
 pixel. The squared difference is then the squared error in a photograph, up to a constant.
 
-The default family ``"radial"`` has the radius of the outermost ray, and is linear in its values. So the fit is a convex
-problem with a single solution. It is solved for all nodes at once, against spots at the nodes *and between them*, where
-the table interpolates.
+A profile has the radius of the outermost ray, and is linear in its values. So the fit is a convex problem with a single
+solution. Nodes are added until profiles interpolated between them fit the spots there too.
 """
 
 import functools
-import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
-import torch
-from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import nnls
-from scipy.special import j0, j1
-
-from torchdof.optics.psf import FAMILIES, LENGTHS, profile
+from scipy.special import j0
 
 from ..result import Array
-from ..solve import best_of
 from .spot import Spot
 
 # Places of the nodes
@@ -32,34 +24,13 @@ _MIN_INTERVAL_PX = 0.01  # pixels of coc; narrower intervals are not divided
 _TARGET_DB = 62.0  # PSNR of a natural image in the middle of an interval; elsewhere it may be a few dB less
 _CONTRAST = 0.22  # standard deviation of natural images over their peak
 
-# Fit of radial profiles
+# Fit of the profiles
 _MAX_FREQUENCY = 3.0  # cycles for each pixel; kernels are sampled on the pixel grid, so higher frequencies are aliased
-_FRACTIONS = (0.25, 0.5, 0.75)  # of the interval between two nodes: where more spots are traced for the joint fit
-_SWEEPS = 6  # passes over all nodes of the joint fit
 _PRIOR_WEIGHT = 1e-4  # weight of the ray histogram, which determines details of the profile far below a pixel
-
-# Fit of named shapes; lengths are relative to the distance of the outermost ray
-_RANGES = {"radius": (0.02, 1.3), "sigma": (0.01, 1.0), "r_c": (0.0, 1.3), "b": (-1.0, 20.0), "m": (0.5, 12.0)}
-_SAMPLES, _SAMPLED_REACH = 400, 2.0  # samples of the profile, and the radius to which they reach
-_NEIGHBOUR_WEIGHT = 1e-3  # weight of the neighbour's values for parameters that the spot does not determine
-
-
-class NodeEquations(NamedTuple):
-    """A traced spot as a quadratic form: the squared error of values v is ``v @ gram @ v - 2 pull @ v + constant``."""
-
-    radius: float
-    gram: Array
-    pull: Array
-    constant: float
-    histogram: Array
-
-    def error(self, values: Array) -> float:
-        """Weighted squared error of a profile's values."""
-        return max(float(values @ self.gram @ values - 2.0 * self.pull @ values + self.constant), 0.0)
 
 
 class Tracer:
-    """Traces spots by coc, with a cache; equations are for profiles that are piecewise linear at ``points`` radii."""
+    """Traces spots by coc, and fits profiles that are piecewise linear at ``points`` radii; keeps the results."""
 
     def __init__(self, spot: Callable[[float], Spot], points: int, pixel: float) -> None:
         self.spot, self.points, self.pixel = spot, points, pixel
@@ -71,41 +42,40 @@ class Tracer:
         count = 12 * (points - 1)
         self._r = (np.arange(count) + 0.5) / count  # radii relative to the profile's
         self._light = _hats(self._r, points) * (2.0 * np.pi * self._r / count)[:, None]
-        self.area = self._light.sum(0)  # integral of each hat
-        self.traced, self.alone = functools.cache(self._traced), functools.cache(self._alone)
+        self.traced, self.fitted = functools.cache(self._traced), functools.cache(self._fitted)
 
     def _traced(self, coc: float) -> tuple[Array, Array, Array]:
-        """Radii in pixels, weights and transfer function (a Hankel transform) of the spot."""
+        """Radii in pixels, weights, and weighted transfer function (a Hankel transform) of the spot."""
         spot = self.spot(coc)
         r, light = np.maximum(spot.r / self.pixel, 1e-9), spot.weight
         slices = (slice(i, i + 4096) for i in range(0, len(r), 4096))
-        return r, light, np.sum([j0(2.0 * np.pi * np.outer(self.frequency, r[i])) @ light[i] for i in slices], axis=0)
+        parts = [j0(2.0 * np.pi * np.outer(self.frequency, r[i])) @ light[i] for i in slices]
+        return r, light, np.sum(parts, axis=0) * self.weight
 
-    def _alone(self, coc: float) -> tuple[NodeEquations, Array]:
-        """Equations of the spot at a node, with the radius of the outermost ray, and values that fit it."""
-        node = self.equations(coc, float(self.traced(coc)[0].max()))
-        return node, self.fitted(node.gram, node.pull, node.histogram)
+    def _basis(self, radius: float) -> Array:
+        """Weighted transfer functions ``[F, P]`` of the hats of a profile that ends at ``radius`` pixels."""
+        return j0(2.0 * np.pi * np.outer(self.frequency, self._r * radius)) @ self._light * self.weight[:, None]
 
-    def equations(self, coc: float, radius: float) -> NodeEquations:
-        """Equations of the spot at a coc, for profiles that end at ``radius`` pixels."""
+    def _fitted(self, coc: float) -> tuple[float, Array]:
+        """Radius in pixels of the outermost ray, and values of the profile that fits the spot; their light sums to 1.
+
+        By non-negative least squares. A large weight fixes the total light, a small one of the rays' histogram the
+        details that no picture shows.
+        """
         r, light, transfer = self.traced(coc)
-        basis = j0(2.0 * np.pi * np.outer(self.frequency, self._r * radius)) @ self._light * self.weight[:, None]
-        light_weight = 1e4 * self.weight.max() ** 2  # fixes the total light, whatever the frequencies
-        gram = basis.T @ basis + light_weight * np.outer(self.area, self.area)
-        pull = basis.T @ (transfer * self.weight) + light_weight * self.area
-        histogram = light @ _hats(np.minimum(r / radius, 1.0), self.points) / self.area
-        return NodeEquations(radius, gram, pull, float(((transfer * self.weight) ** 2).sum() + light_weight), histogram)
+        radius, area = float(r.max()), self._light.sum(0)  # integral of each hat
+        basis, total = self._basis(radius), 100.0 * self.weight.max() * area
+        prior = _PRIOR_WEIGHT * np.sqrt((np.sum(basis**2) + np.sum(total**2)) * area / area.sum())
+        histogram = light @ _hats(r / radius, self.points) / area
+        rows = np.vstack([basis, total, np.diag(prior)])
+        target = np.concatenate([transfer, [100.0 * self.weight.max()], prior * histogram])
+        values, _ = nnls(rows, target, maxiter=50 * self.points)
+        return radius, values / (area @ values)
 
-    def fitted(self, gram: Array, pull: Array, prior: Array) -> Array:
-        """Non-negative least squares of a quadratic form, with a prior where it is flat; the light sums to 1."""
-        scale = _PRIOR_WEIGHT**2 * np.trace(gram) / np.sum(self.area) * self.area
-        factor = cholesky(gram + np.diag(scale), lower=True)
-        values, _ = nnls(factor.T, solve_triangular(factor, pull + scale * prior, lower=True), maxiter=50 * len(pull))
-        return values / (self.area @ values)
-
-    def relative(self, error: float) -> float:
-        """Root of a squared error, relative to that of an empty kernel."""
-        return math.sqrt(error / float((self.weight**2).sum()))
+    def error(self, coc: float, radius: float, values: Array) -> float:
+        """Root of the weighted squared error of a profile against the spot, relative to that of an empty kernel."""
+        difference = self._basis(radius) @ values - self.traced(coc)[2]
+        return float(np.linalg.norm(difference) / np.linalg.norm(self.weight))
 
 
 def _hats(r: Array, points: int) -> Array:
@@ -117,22 +87,18 @@ def place_nodes(tracer: Tracer, near: float, far: float, nodes: int | None) -> l
     """Signed coc of the nodes: repeatedly halves the interval with the worst interpolation in its middle.
 
     If ``nodes`` is None, until the interpolation reaches 50 dB everywhere.
-
-    Raises:
-        ValueError: If no interval is left to halve.
     """
 
     def interval_error(left: float, right: float) -> float:
-        (node, values), (next_node, next_values) = tracer.alone(left), tracer.alone(right)
-        if max(node.radius, next_node.radius) <= 0.5 or right - left < _MIN_INTERVAL_PX * tracer.pixel:
+        (radius, values), (next_radius, next_values) = tracer.fitted(left), tracer.fitted(right)
+        if max(radius, next_radius) <= 0.5 or right - left < _MIN_INTERVAL_PX * tracer.pixel:
             return 0.0
-        middle_node = tracer.equations((left + right) / 2, (node.radius + next_node.radius) / 2)
-        return middle_node.error((values + next_values) / 2)
+        return tracer.error((left + right) / 2, (radius + next_radius) / 2, (values + next_values) / 2)
 
     cocs = [near, near / 2, 0.0, far / 2, far] if far > 0 else [near, near / 2, 0.0]
     errors = [interval_error(*pair) for pair in pairwise(cocs)]
     accepted_error = 10.0 ** (-_TARGET_DB / 20.0) / _CONTRAST
-    while len(cocs) < nodes if nodes is not None else tracer.relative(max(errors)) > accepted_error:
+    while len(cocs) < nodes if nodes is not None else max(errors) > accepted_error:
         worst = int(np.argmax(errors))
         if errors[worst] == 0.0:
             raise ValueError(
@@ -146,78 +112,8 @@ def place_nodes(tracer: Tracer, near: float, far: float, nodes: int | None) -> l
     return cocs
 
 
-def fit_radial(tracer: Tracer, cocs: Sequence[float]) -> tuple[dict[str, Array], Array]:
-    """Values of all nodes together, in sweeps from both ends to the focus and back."""
-    nodes, values = map(list, zip(*(tracer.alone(coc) for coc in cocs), strict=True))
-    # for each node: equations that contain its values, their weight in them, and the node with the remaining weight
-    spots: list[list[tuple[NodeEquations, float, int]]] = [[(node, 1.0, i)] for i, node in enumerate(nodes)]
-    for i, (left, right) in enumerate(pairwise(zip(cocs, nodes, strict=True))):
-        for share in _FRACTIONS:
-            coc = (1 - share) * left[0] + share * right[0]
-            equations = tracer.equations(coc, (1 - share) * left[1].radius + share * right[1].radius)
-            spots[i].append((equations, 1 - share, i + 1))
-            spots[i + 1].append((equations, share, i))
-    for order in (_to_focus(cocs), _to_focus(cocs)[::-1]) * (_SWEEPS // 2):
-        for i in order:
-            gram = np.sum([share**2 * spot.gram for spot, share, _ in spots[i]], axis=0)
-            pulls = [share * (spot.pull - (1 - share) * spot.gram @ values[other]) for spot, share, other in spots[i]]
-            values[i] = tracer.fitted(gram, np.sum(pulls, axis=0), nodes[i].histogram)
-    residual = np.array([tracer.relative(node.error(v)) for node, v in zip(nodes, values, strict=True)])
-    return {"values": np.stack(values), "radius": np.array([node.radius for node in nodes]) * tracer.pixel}, residual
-
-
-def fit_shapes(tracer: Tracer, cocs: Sequence[float], family: str) -> tuple[dict[str, Array], Array]:
-    """A named shape at each node, starting from its neighbour's, from both ends to the focus."""
-    names, neighbour = FAMILIES[family], None
-    params, residual = np.zeros((len(names), len(cocs))), np.zeros(len(cocs))
-    for i in _to_focus(cocs):
-        neighbour = None if i == len(cocs) - 1 else neighbour  # the other side begins here
-        neighbour, outermost, error = _fit_shape(family, tracer, cocs[i], neighbour)
-        params[:, i] = neighbour * [outermost * tracer.pixel if name in LENGTHS else 1.0 for name in names]
-        residual[i] = tracer.relative(error)
-    return dict(zip(names, params, strict=True)), residual
-
-
-def _to_focus(cocs: Sequence[float]) -> list[int]:
-    """Indices of the nodes from both ends to the focus."""
-    focus = int(np.argmin(np.abs(cocs)))
-    return [*range(focus), *range(len(cocs) - 1, focus - 1, -1)]
-
-
-def _fit_shape(family: str, tracer: Tracer, coc: float, neighbour: Array | None) -> tuple[Array, float, float]:
-    """Parameters of the shape whose transfer function is nearest to a spot's; the neighbour's are a weak prior.
-
-    Lengths are relative to the distance of the spot's outermost ray. Also returns this distance in px, and the weighted
-    squared error.
-    """
-    (r, light, transfer), names, weight = tracer.traced(coc), FAMILIES[family], tracer.weight
-    outermost = float(r.max())
-    rms, frequency = math.sqrt(float(light @ (r * r))) / outermost, tracer.frequency * outermost
-    low, high = np.array([_RANGES[name] for name in names]).T
-    if family == "softm":  # a second branch has a small radius, a wide edge and a large tilt
-        low[0] = 0.5
-    sigma = {"gaussian": 0.5**0.5, "ring": 0.5}.get(family, 0.05) * rms
-    geometry = {"radius": 2.0**0.5 * rms, "sigma": sigma, "r_c": 0.7 * rms, "b": 0.0, "m": 2.0}
-    radii = (np.arange(_SAMPLES) + 0.5) * (_SAMPLED_REACH / _SAMPLES)
-    bessel = j0(2.0 * np.pi * np.outer(frequency, radii))
-
-    def weighted_transfer(values: Array) -> Array:
-        params = dict(zip(names, values, strict=True))
-        if family == "gaussian":  # it may reach beyond the radii
-            return np.asarray(weight * np.exp(-2.0 * (np.pi * params["sigma"] * frequency) ** 2))
-        if family == "disc":  # its edge lies between the radii
-            phase = 2.0 * np.pi * params["radius"] * frequency
-            return np.asarray(weight * 2.0 * j1(phase) / phase)
-        light = profile(family, torch.from_numpy(radii), params).numpy() * radii
-        return np.asarray(weight * (bessel @ (light / light.sum())))
-
-    start, prior_weight = np.array([geometry[name] for name in names]), 0.0 if neighbour is None else _NEIGHBOUR_WEIGHT
-    expected, target = start if neighbour is None else neighbour, weight * transfer
-    best = best_of(
-        lambda values: np.concatenate([weighted_transfer(values), prior_weight * values]),
-        np.concatenate([target, prior_weight * expected]),
-        [expected, start] if prior_weight else [start],
-        (low, high),
-        tolerance=1e-8,
-    )
-    return best, outermost, float(((weighted_transfer(best) - target) ** 2).sum())
+def profiles(tracer: Tracer, cocs: Sequence[float]) -> tuple[dict[str, Array], Array]:
+    """Parameters of the profiles at the nodes, in the unit of the coc, and the relative residual of each."""
+    radius, values = zip(*map(tracer.fitted, cocs), strict=True)
+    residual = np.array([tracer.error(*node) for node in zip(cocs, radius, values, strict=True)])
+    return {"values": np.stack(values), "radius": np.array(radius) * tracer.pixel}, residual

@@ -198,11 +198,10 @@ def _grid(low: Array, high: Array, steps: Array) -> Array:
 def _rays_of_point(
     lens: Lens, object_mm: float, sensor_mm: float, field_mm: float = 0.0, wavelength_um: float | None = None
 ) -> tuple[Callable[[Array], tuple[Rays, Array]], Array, Array]:
-    """Rays of one wavelength that an object point emits.
+    """Traces the rays of one wavelength that an object point emits.
 
-    Returns:
-        A function that traces rays through points ``[2, R]`` of the entrance pupil's plane, and gives the solid angle
-        of each; and the bounding box, low and high ``[2]``, in that plane of the rays that pass the lens.
+    Returns a function that traces rays through points ``[2, R]`` of the entrance pupil's plane, and gives the solid
+    angle of each; and the bounding box, low and high ``[2]``, in that plane of the rays that pass the lens.
     """
     paraxial = lens.paraxial()
     pupil, front_diameter = paraxial.entrance_pupil, lens.surfaces[0].diameter

@@ -1,4 +1,4 @@
-"""Makes a blur table of a lens prescription: traces spots at many distances, and fits kernels smooth over depth."""
+"""Makes a blur table of a lens prescription: traces spots at many distances, and fits a profile to each."""
 
 import datetime
 import math
@@ -12,16 +12,14 @@ import torch
 
 from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.camera import Camera
-from torchdof.optics.psf import FAMILIES
 from torchdof.validation import number, show, whole
 
 from ..result import Array
 from ..solve import one_thread
-from ..validation import a_choice
 from .field import coc_nodes, trace_field
 from .glass import C_UM, F_UM
 from .lens import Lens
-from .nodes import Tracer, fit_radial, fit_shapes, place_nodes
+from .nodes import Tracer, place_nodes, profiles
 from .spot import Focus, Reference, Spot, focus_sensor, point_spread
 
 
@@ -32,7 +30,6 @@ def trace_table(
     *,
     nodes: int | None = None,
     nearest_m: float | None = None,
-    family: str = "radial",
     points: int = 65,
     focus: Focus = "best",
     reference: Reference = "principal",
@@ -55,7 +52,7 @@ def trace_table(
 
     1. Stop the lens down and focus it: the position of the sensor.
     2. Place the nodes of coc, tracing spots in between to find the worst interpolation.
-    3. Fit a profile to the spots, for all nodes together and for each wavelength.
+    3. Fit a profile to the spot of each node, for each wavelength.
     4. With ``field``, trace spots off the axis too.
 
     The table is exact for its focus and f-number. For another focus at the same f-number it is accurate if the lens's
@@ -68,9 +65,7 @@ def trace_table(
         nodes: Number of nodes, at least 5, or 3 for a focus at infinity; None uses as many as needed.
         nearest_m: Nearest object distance in metres; None is a third of the focus distance (the blur is then twice that
             of infinity), or 25 focal lengths for a focus at infinity. The farthest distance is infinity.
-        family: ``"radial"``, or a named shape fitted by least squares: ``"softm"``, ``"ring"``, ``"gaussian"``,
-            ``"disc"``.
-        points: Number of values of a radial profile, at least 3.
+        points: Number of values of a profile, at least 3.
         focus: ``"best"`` or ``"paraxial"``, see :func:`torchdof.fit.lens.spot.focus_sensor`.
         reference: Reference point of distances, see :mod:`torchdof.fit.lens.spot`. Depth maps must use the same.
         field_mm: Image height in mm. Off the axis, the table has the rotational average of the spot about its centroid,
@@ -128,7 +123,7 @@ def trace_table(
         )
         cocs = place_nodes(d_line, near, far, nodes)
         channels = coloured or [d_line]
-        fitted = [fit_radial(t, cocs) if family == "radial" else fit_shapes(t, cocs, family) for t in channels]
+        fitted = [profiles(tracer, cocs) for tracer in channels]
         spots = None
         if field is not None:
             field_cocs = coc_nodes(near, far, field_nodes)
@@ -151,9 +146,9 @@ def trace_table(
         "command": f"torchdof.fit.trace_table(Lens.read({lens.name!r}), {call})",
     }
     return BlurTable(
-        family,
+        "radial",
         _rounded(np.array(cocs), 9),
-        {key: [_rounded(params[key]) for params, _ in fitted] for key in FAMILIES[family]},
+        {key: [_rounded(params[key]) for params, _ in fitted] for key in ("values", "radius")},
         unit="mm",
         sensor_width_mm=sensor_width_mm,
         name=f"{lens.name}_f{f_number:g}" if name is None else name,
@@ -168,7 +163,6 @@ def _check(arguments: dict[str, Any]) -> None:
     lens, focus_m, wavelengths, field = (arguments[key] for key in ("lens", "focus_m", "wavelengths_um", "field"))
     if not isinstance(lens, Lens):
         raise ValueError(f"lens must be a Lens, got {show(lens)}; read one with Lens.read()")
-    a_choice("family", arguments["family"], tuple(FAMILIES))
     number("focus_m", focus_m, 0, unit="metres", infinite=True)
     number("field_mm", arguments["field_mm"], -1e6, 1e6)
     number("sensor_width_mm", arguments["sensor_width_mm"], 0, 1e9)

@@ -22,17 +22,14 @@ from ..validation import a_number
 from .captures import CAMERA, Captures
 
 _MIN_BLUR_PX = 2.0  # radius of a blur that counts; smaller ones are dominated by aberrations
-_WARN_LOG, _REFUSE_LOG = math.log(1.15), math.log(1.35)  # a thick lens differs by up to 1.1, an f-stop by 1.41
+# log factors between both above which to warn and to refuse; a thick lens differs by up to 1.1, an f-stop by 1.41
+_WARN_LOG, _REFUSE_LOG = math.log(1.15), math.log(1.35)
 _EXPLAINED_LOG = math.log(1.12)  # remaining log factor up to which a cause explains the difference
 _UNITS = {3.28: "feet", 39.4: "inches", 100.0: "centimetres", 1000.0: "millimetres"}
 
 
 def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> None:
-    """Compares the fitted radius at each distance with the camera's, and names the likely cause of a difference.
-
-    Raises:
-        FitError: of kind "camera" if they differ by a factor above 1.35; it warns above 1.15.
-    """
+    """Compares the fitted radius at each distance with the camera's, and names the likely cause of a difference."""
     measured, camera_px = np.asarray(radius_px, dtype=np.float64), captures.promised_px
     defocus = np.abs(captures.defocus)
     expected = defocus * _common_factor(defocus, measured) if camera_px is None else np.abs(camera_px)

@@ -80,12 +80,7 @@ class Captures:
     notes: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Validates the fields.
-
-        Raises:
-            FitError: no pair, or a camera number that is not positive; of kind "distance" if distances are not positive
-            and increasing, or one equals the focus.
-        """
+        """Raises a `FitError` for an invalid field."""
         if not isinstance(self.pairs, Sequence) or not all(isinstance(p, Capture) for p in self.pairs):
             raise FitError(f"pairs must be a tuple of Capture(sharp, blurred, distance_m), got {show(self.pairs)}")
         if not self.pairs:

@@ -4,7 +4,6 @@ import numpy as np
 from scipy.special import chdtrc
 
 from ..result import Array, BlurFit
-from ..solve import information_criterion
 from .forward import OPENINGS, SHAPES, Solution, without_level
 from .noise import fine_variance, independent_share, noise_of
 
@@ -113,7 +112,7 @@ def size_of_blur(solution: Solution) -> tuple[float, float]:
 
 
 def bic_of(solution: Solution) -> float:
-    """Bayesian information criterion of a solution."""
+    """Bayesian information criterion of a solution, up to a constant that depends on the pictures only."""
     pair = solution.pair
     floor = pair.values.size * (1e-6 * pair.unit) ** 2
     parameters = len(SHAPES[solution.family])
@@ -124,9 +123,9 @@ def bic_of(solution: Solution) -> float:
     elif solution.family == "image":
         parameters = int(np.sum(solution.kernel > _LIT_SHARE * solution.kernel.max()))
     # correlated neighbours are not independent samples
-    count = pair.values.size * independent_share(pair.noise_correlation)
-    squares = (solution.squares + floor) * count / pair.values.size
-    return information_criterion(squares, max(round(count), 1), parameters + len(pair.fit_moves) + 2)
+    count = max(round(pair.values.size * independent_share(pair.noise_correlation)), 1)
+    variance = max((solution.squares + floor) / pair.values.size, np.finfo(float).tiny)
+    return count * float(np.log(variance)) + (parameters + len(pair.fit_moves) + 2) * float(np.log(count))
 
 
 def describe(solution: Solution, why: str) -> BlurFit:
@@ -157,8 +156,6 @@ def describe(solution: Solution, why: str) -> BlurFit:
         noise=float(noise) / size,
         covariance=solution.covariance,
         names=solution.names,
-        bic=bic_of(solution),
-        count=pair.values.size,
         model="forward",
         gain=solution.gain,
         background=solution.background,

@@ -1,128 +1,54 @@
-"""Fits all distances of a capture, smoothly over distance, and each colour."""
+"""Fits the pairs of a capture, their uncertainty, and each colour."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from torchdof.optics.aperture import Aperture
-from torchdof.optics.psf import FAMILIES, LENGTHS
 
 from ..problems import without_warnings
 from ..result import Array, BlurFit
 from .captures import Capture, Captures
 from .dot import find_dot
-from .opening import common_opening, turned
+from .opening import turned
 from .pair import fit_pair
 from .source import soft_edge
 
 _KNOTS = 33  # values of a free profile, equal for all distances
-_SWEEPS = 2  # passes of refitting with information from neighbours
 _COLOURS = ("red", "green", "blue")
 _GREEN = 1
 _DEFOCUSED_PX = 1.5  # px; for smaller blurs it is uncertain on which side of focus a colour is
 _RADIUS_ERROR = 0.02  # relative error with which the thin lens gives the radius
 
 
-def fit_one(pair: Capture, focus_m: float, family: str, **arguments: Any) -> BlurFit:
-    """Fits one pair, with the magnification expected from its distance; `arguments` are arguments of `fit_pair`."""
+def fit_one(pair: Capture, focus_m: float, family: str, opening: Aperture | None = None, **arguments: Any) -> BlurFit:
+    """Fits one pair, with the magnification expected from its distance; `arguments` are arguments of `fit_pair`.
+
+    Of an opening, as seen behind the focus, only the size is fitted.
+    """
     expected = {"magnification": focus_m / pair.distance_m, "knots": _KNOTS if family == "radial" else None}
-    return fit_pair(pair.sharp, pair.blurred, family, white=pair.white, files=pair.files, **{**expected, **arguments})
+    arguments = {"white": pair.white, "files": pair.files, **expected, **arguments}
+    if opening is None:
+        return fit_pair(pair.sharp, pair.blurred, family, **arguments)
+    aperture = turned(opening) if pair.distance_m < focus_m else opening
+    return replace(fit_pair(pair.sharp, pair.blurred, "image", aperture=aperture, **arguments), family=family)
 
 
-def fit_distances(
-    captures: Captures, family: str, smooth: bool, done: Callable[[Capture, BlurFit], None]
-) -> list[BlurFit]:
-    """Fits all pairs with one family; `smooth` then refits each with information from neighbouring distances."""
-    defocus, fits = captures.defocus, dict[int, BlurFit]()
-    # in front of the focus and behind it, pairs from the far end towards the focus
-    sides = [sorted(np.flatnonzero(defocus * sign > 0).tolist(), key=lambda k: -abs(defocus[k])) for sign in (-1, 1)]
-    for side in sides:  # each pair starts from its neighbour's fit
-        start: BlurFit | None = None
-        for outer, i in zip([None, *side], side, strict=False):
-            if start is not None:
-                scale = abs(defocus[i] / defocus[outer])
-                start = replace(start, params={n: v * scale if n in LENGTHS else v for n, v in start.params.items()})
-            start = fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=start)
-            done(captures.pairs[i], start)
-    if smooth:
-        with without_warnings():
-            for side in sides:
-                (_refine_aligned if family == "radial" else _refine_together)(captures, family, fits, side)
-    return [fits[i] for i in range(len(defocus))]
-
-
-def _refine_together(captures: Captures, family: str, fits: dict[int, BlurFit], side: list[int]) -> None:
-    """Refits the pairs on one side of the focus, each with a prior: the line between its neighbours.
-
-    Correlated parameters (a rim's height and its steepness) thus become consistent over distance. The prior is loose,
-    so parameters that the pictures determine do not change.
-    """
-    defocus = captures.defocus
-    for order, i in _SWEEPS * list(enumerate(side)):
-        neighbours = side[max(order - 1, 0) : order] + side[order + 1 : order + 2]
-        if not neighbours:
-            continue
-        size = max(float(v) for n, v in fits[i].params.items() if n in LENGTHS)
-        prior = {}
-        for n in FAMILIES[family]:
-            deviation = {"b": 0.1, "m": 0.3}.get(n, 0.05 * size + 0.05)
-            first, last = (float(fits[k].params[n]) for k in (neighbours[0], neighbours[-1]))
-            if len(neighbours) == 1:
-                scaled = first * (abs(defocus[i] / defocus[neighbours[0]]) if n in LENGTHS else 1.0)
-                prior[n] = (float(scaled), 3 * deviation)
-            else:
-                share = (defocus[i] - defocus[neighbours[0]]) / (defocus[neighbours[1]] - defocus[neighbours[0]])
-                prior[n] = (float((1 - share) * first + share * last), deviation)
-        fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=fits[i], prior=prior)
-
-
-def _refine_aligned(captures: Captures, family: str, fits: dict[int, BlurFit], side: list[int]) -> None:
-    """Refits the free profiles on one side of the focus, with radii that lie on a line over the circle of confusion.
-
-    Between nodes a table mixes values at equal fractions of the radius, so the shapes only match if the radii follow
-    one rule.
-    """
-    if len(side) < 2:
-        return
-    ends = np.empty(len(side))  # radii in px that contain all but a thousandth of a profile's light
-    for k, i in enumerate(side):
-        values, radius = np.asarray(fits[i].params["values"]), float(fits[i].params["radius"])
-        r = np.linspace(0, radius, 1001)
-        light = np.cumsum(np.interp(r, np.linspace(0, radius, values.size), values) * r)
-        ends[k] = r[np.searchsorted(light, 0.999 * light[-1])] + radius / (values.size - 1)
-    # near focus a profile may end anywhere: the outer nodes define the line, raised so that it contains theirs
-    x = np.abs(captures.defocus[side])
-    slope, intercept = np.polyfit(x, ends, 1, w=x)
-    lift = max(float(np.max((ends - slope * x - intercept)[x > 0.25 * x.max()])), 0.0)
-    for i, reach in zip(side, np.maximum(np.maximum(slope * x + intercept + lift, ends), 1.0).tolist(), strict=True):
-        fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=fits[i], reach=reach)
-
-
-def fit_openings(
-    captures: Captures, family: str, first_fits: list[BlurFit], done: Callable[[Capture, BlurFit], None]
-) -> tuple[list[BlurFit], Aperture]:
-    """Fits all pairs with kernels that are not round: one opening for all, in different sizes.
-
-    The first fits of `family` ("polygon" or "image") determine the opening, returned as seen behind the focus.
-    """
-    is_nearer = captures.defocus < 0
-    chosen = [i for i, fit in enumerate(first_fits) if fit.family == family]
-    opening = common_opening([first_fits[i] for i in chosen], is_nearer[chosen])
-    fits = []
-    for pair, in_front in zip(captures, is_nearer, strict=True):
-        fit = fit_one(pair, captures.focus_m, "image", aperture=turned(opening) if in_front else opening)
-        fits.append(replace(fit, family=family))
-        done(pair, fits[-1])
-    return fits, opening
+def common_opening(captures: Captures, family: str, fits: Sequence[BlurFit]) -> Aperture:
+    """The opening of the largest blur whose fit is of `family` ("polygon" or "image"), as seen behind the focus."""
+    openings = [(fit, pair) for fit, pair in zip(fits, captures, strict=True) if fit.family == family]
+    largest, pair = max(openings, key=lambda opening: opening[0].radius)
+    opening = largest.aperture or Aperture()
+    return turned(opening) if pair.distance_m < captures.focus_m else opening
 
 
 def _fit_like(fit: BlurFit, pair: Capture, focus_m: float, sharp: Array, blurred: Array, **options: Any) -> BlurFit:
     """Fits other pictures of a pair like its own: with the same family and opening, or free profile's end."""
-    family, start = (fit.family, fit) if fit.aperture is None else ("image", None)
-    options |= {"start": start, "aperture": fit.aperture, "reach": fit.params["radius"] if family == "radial" else None}
+    family = fit.family if fit.aperture is None else "image"
+    options |= {"aperture": fit.aperture, "reach": fit.params["radius"] if family == "radial" else None}
     return fit_one(replace(pair, sharp=sharp, blurred=blurred), focus_m, family, **options)
 
 
@@ -131,13 +57,11 @@ def with_uncertainty(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
     if not pair.uncertain:
         return fit
     with without_warnings():
-        refit, *others = (
-            _fit_like(fit, pair, focus_m, *pictures) for pictures in ((pair.sharp, pair.blurred), *pair.uncertain)
-        )
+        others = [_fit_like(fit, pair, focus_m, *pictures) for pictures in pair.uncertain]
     zero = np.zeros(1)
     names = ("values",) if fit.family == "radial" else fit.names
     changes = np.stack(
-        [np.hstack([np.subtract(o.params.get(n, zero), refit.params.get(n, zero)) for n in names]) for o in others]
+        [np.hstack([np.subtract(o.params.get(n, zero), fit.params.get(n, zero)) for n in names]) for o in others]
     )  # [others, parameters]
     covariance = fit.covariance + changes.T @ changes
     spread = np.sqrt(np.diag(covariance))
@@ -146,7 +70,7 @@ def with_uncertainty(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
         fit,
         stderr=fit.stderr | {n: error for n, error in errors.items() if n in fit.params},
         covariance=covariance,
-        radius_stderr=float(np.hypot(fit.radius_stderr, np.linalg.norm([o.radius - refit.radius for o in others]))),
+        radius_stderr=float(np.hypot(fit.radius_stderr, np.linalg.norm([o.radius - fit.radius for o in others]))),
     )
 
 

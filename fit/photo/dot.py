@@ -54,9 +54,7 @@ def find_dot(picture: Array, *, file: str | None = None) -> Dot:
 def find_dots(picture: Array, *, file: str | None = None, smallest: float = _MIN_LIGHT) -> list[Dot]:
     """Finds dots in a picture `[H, W]` in linear light, brightest first, down to a share `smallest` of its light.
 
-    Raises:
-        FitError: of kind "no dot" if nothing exceeds the noise enough; of kind "window" if the brightest dot touches
-        the edge of the picture.
+    It is an error if nothing exceeds the noise enough, or if the brightest dot touches the edge of the picture.
     """
     height, width = a_picture("a picture of a dot", picture, _MIN_SIDE_PX, file).shape
     noise = noise_of(picture)

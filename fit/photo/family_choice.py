@@ -106,12 +106,9 @@ def choose(
 ) -> tuple[str, str, dict[str, float]]:
     """The cheapest family that a viewer cannot distinguish from the most likely one.
 
-    The most likely one is the simplest family within 2 of the lowest BIC. Another family is accurate enough if its
-    photograph reaches `accuracy_db` against that one's, and its highlight at most 20 dB less.
-
-    Returns:
-        The family, one sentence with the reason and the alternatives, and the PSNR of each family on a natural image
-        against the free profile "radial".
+    The most likely one is the simplest family within 2 of the lowest BIC; the others are compared with it by
+    `looks_alike`. Also returns one sentence with the reason and the alternatives, and the PSNR of each family on a
+    natural image against the free profile "radial".
     """
     by_likelihood = sorted(kernels, key=lambda f: (bic[f], COST.index(f)))
     lowest = bic[by_likelihood[0]]

@@ -8,7 +8,7 @@ the other parameters (variable projection): the kernel's parameters, displacemen
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -22,7 +22,7 @@ from torchdof.optics.psf import FAMILIES, LENGTHS, pixel_kernels, support
 from ..result import Array, Mask
 from ..solve import best_of, inverse
 from .dot import Dot, distance_from
-from .noise import correlate, correlation_of, noise_beside, noise_of
+from .noise import correlate, correlation_of, noise_beside
 from .source import Source
 
 ALL_MOVES = ("dx", "dy", "magnification")
@@ -56,8 +56,6 @@ class Forward:
     magnification: float = 1.0  # expected size of the dot in the blurred picture over that in the sharp one
     fit_moves: tuple[str, ...] = ALL_MOVES  # fitted moves
     held_magnification: float | None = None  # initial or fixed value; None is the expected one
-    start: dict[str, Mapping[str, float]] = field(default_factory=dict)  # initial kernel parameters, by family
-    prior: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # expected parameters, deviations
     shot_noise: float = 0.0  # growth of a pixel's noise variance (by second differences) with its level
     fine_share_of_light: float | None = None  # share of that growth seen in second differences; None: the dark paper's
     opening: Aperture = Aperture()  # of the lens, for the kernels in OPENINGS: blades or an image
@@ -161,30 +159,24 @@ class Forward:
         offset = np.arange(kernels.shape[-1]) - kernels.shape[-1] // 2
         return np.asarray(np.sqrt((kernels * (offset[:, None] ** 2 + offset**2)).sum((1, 2))) / scale)
 
-    def solve(self, family: str) -> Solution:
-        """Fits one family from several starts (or from `start`, and from the moments as well)."""
+    def solve(self, family: str, start: Mapping[str, float] | None = None) -> Solution:
+        """Fits one family, from given kernel parameters or from several shapes."""
         shape = SHAPES[family]
         names = (*shape, *self.fit_moves)
-        unmoved = self.moves({})
-        # the prior is added as data with the uncertainty of a pixel
-        noise = max(noise_of(self.data), 1e-5 * self.unit) / self.unit
-        mean, deviation = np.array([self.prior.get(n, (0.0, np.inf)) for n in names]).T
-        prior_weight = noise / deviation
+        unmoved, starts = self.moves({}), self._starts(family) if start is None else [start]
         numbers = best_of(
-            lambda p: np.concatenate([self.project(self._shaped(family, names, p))[0] / self.unit, prior_weight * p]),
-            np.concatenate([self.values / self.unit, prior_weight * mean]),
-            [[start[n] if n in start else unmoved[n] for n in names] for start in self._starts(family)],
+            lambda p: self.project(self._shaped(family, names, p))[0] / self.unit,
+            self.values / self.unit,
+            [[one[n] if n in one else unmoved[n] for n in names] for one in starts],
             self.bounds(names),
-            jacobian=lambda p: np.concatenate([self._jacobian(family, names, p) / self.unit, np.diag(prior_weight)]),
+            jacobian=lambda p: self._jacobian(family, names, p) / self.unit,
             tolerance=1e-7,
-            # leave the neighbour's branch only if another one reduces chi squared by 12
-            first_bias=12 / self.values.size if family in self.start else 0.0,
         )
         params = {n: float(v) for n, v in zip(names, numbers, strict=True)}
         fitted, gain, background = self.project(self._shaped(family, names, numbers))
-        slopes, penalty = self._jacobian(family, names, numbers), np.diag((self.unit * prior_weight) ** 2)
+        slopes = self._jacobian(family, names, numbers)
         kernel = self.kernels(family, {n: np.array([params[n]]) for n in shape})[0]
-        covariance = self.covariance(slopes, self.values - fitted, kernel, gain, penalty, is_prior=True)
+        covariance = self.covariance(slopes, self.values - fitted, kernel, gain)
         kernel_params: dict[str, float | Array] = {n: params[n] for n in shape}
         moves = self.moves(params)
         return Solution(self, family, kernel_params, moves, gain, background, fitted, names, covariance, slopes)
@@ -195,15 +187,14 @@ class Forward:
         return {n: params.get(n, magnification if n == "magnification" else 0.0) for n in ALL_MOVES}
 
     def covariance(
-        self, slopes: Array, residual: Array, kernel: Array, gain: float, penalty: Array, is_prior: bool = False
+        self, slopes: Array, residual: Array, kernel: Array, gain: float, penalty: Array | float = 0.0
     ) -> Array:
         """Covariance of the parameters under the noise of both pictures (a sandwich estimator).
 
         With J the model's derivatives and B the inverse of J' J + penalty, it is B M B, where M is the covariance of J'
         (noise). The defocused picture's noise is as large as the residual of the lit pixels, and correlated like the
         residual or the paper. The sharp picture's noise passes through the kernel, which correlates it. Ignoring either
-        would make the errors too small. A smoothing penalty `[p, p]` reduces the errors; that of a prior is a
-        measurement with the uncertainty of a pixel and adds its own noise to M.
+        would make the errors too small. A smoothing penalty `[p, p]` reduces them.
         """
         information_inverse = inverse(slopes.T @ slopes + penalty)
         is_determined = np.isfinite(np.diag(information_inverse))
@@ -215,8 +206,7 @@ class Forward:
         correlation = max(self.noise_correlation, residual_correlation, key=np.sum)
         source_variance = (gain * self.source.noise) ** 2 / self.fine_share
         own_variance = max(variance - source_variance * float(np.sum(kernel**2)), 0.1 * variance)
-        prior = penalty if is_prior else 0.0
-        score_cov = own_variance * (slopes.T @ self.correlated_noise(slopes, correlation) + prior)
+        score_cov = own_variance * (slopes.T @ self.correlated_noise(slopes, correlation))
         if source_variance > 0:  # (K' J)' (K' J) over the source's pixels with noise
             pictures = rfft2(self.picture(slopes.T), self.grid)
             has_source_noise = (self.distance <= self.source.reach * self.magnification).ravel()
@@ -287,17 +277,12 @@ class Forward:
         return [table[n][0] for n in names], [table[n][1] for n in names]
 
     def _starts(self, family: str) -> list[Mapping[str, float]]:
-        """Initial kernel parameters: a given start, and shapes with the second moment that the blur has added."""
-        starts = [self.start[family]] if family in self.start else []
-        if self.prior:
-            # the prior leads to its own branch; starts from moments would be pulled away from it
-            return [*starts, {n: mean for n, (mean, _) in self.prior.items()}]
+        """Initial kernel parameters: shapes with the second moment that the blur has added."""
         added_variance = (self.dot.radius**2 - (self.magnification * self.source.radius) ** 2) / 4
         size = min(float(np.sqrt(max(added_variance, 0.15))), self.half / 3)
         if family not in OPENINGS:
-            return [*starts, *({n: v * size if n in LENGTHS else v for n, v in s.items()} for s in _STARTS[family])]
-        # the rotation of an opening is only known from a given start
-        return starts or [{"radius": np.sqrt(2) * size / float(self.rms(family, {"radius": np.ones(1)})[0])}]
+            return [{n: v * size if n in LENGTHS else v for n, v in s.items()} for s in _STARTS[family]]
+        return [{"radius": np.sqrt(2) * size / float(self.rms(family, {"radius": np.ones(1)})[0])}]
 
 
 def without_level(columns: Array, shaped: Array) -> Array:

@@ -50,13 +50,7 @@ def read_picture(
     crop: tuple[int, int, int, int] | None = None,
     bayer: str | None = None,
 ) -> CameraPicture:
-    """Reads a picture; `crop` is left, top, width and height in px, `dark` was taken with the lens cap on.
-
-    Raises:
-        FitError: of kind "manifest" if crop, mosaic or dark frame do not fit the picture, of kind "not finite" if it
-        has NaN.
-        OSError: the file is missing or damaged.
-    """
+    """Reads a picture; `crop` is left, top, width and height in px, `dark` was taken with the lens cap on."""
     invalid = partial(FitError, kind="manifest", file=str(path))
     picture = read_image(path, transfer=transfer)
     pixels = picture.pixels[0].numpy().astype(np.float64)
@@ -116,10 +110,8 @@ def cut_pairs(
 ) -> list[Capture]:
     """Finds the dot, or the dots of a grid, in a sharp and a blurred photograph, and cuts the windows around each.
 
-    `exposure` is the brightness of the blurred photograph over that of the sharp one.
-
-    Raises:
-        FitError: no dot, several dots, or one too close to the frame's edge or to others.
+    `exposure` is the brightness of the blurred photograph over that of the sharp one. A dot too close to the frame's
+    edge or to another one is an error.
     """
     sharp_picture, blurred_picture = pictures
     if dots == "one":

@@ -7,7 +7,6 @@ withheld pixels best.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +15,7 @@ from scipy.ndimage import binary_dilation, center_of_mass, gaussian_filter, lapl
 
 from torchdof.optics.aperture import Aperture
 
-from ..result import Array, BlurFit, Mask
+from ..result import Array, Mask
 from .diagnostics import ASYMMETRIC, P_VALUE, asymmetry_of, bic_of, noise_near, residual_rms, size_of_blur, unexplained
 from .forward import Forward, Solution
 from .noise import independent_share
@@ -78,14 +77,14 @@ def solve_image(previous: Solution, kernel: Array | None = None) -> Solution:
     side = int(min(_MAX_SIDE, round(2 * half_px * _SAMPLES_PER_PX)))
     positions = ((np.arange(side) + 0.5) / side * 2 - 1) * half_px
     mask = map_coordinates(kernel, np.meshgrid(positions + y, positions + x, indexing="ij"), order=3, mode="constant")
-    return _solved(previous, Aperture(mask=torch.from_numpy(np.maximum(mask, 0.0))), "image", {"radius": half_px})
+    mask = np.round(np.maximum(mask / mask.max(), 0.0), 4)  # few digits keep the table's file small
+    return _solved(previous, Aperture(mask=torch.from_numpy(mask)), "image", {"radius": half_px})
 
 
 def _solved(previous: Solution, opening: Aperture, family: str, start: dict[str, float]) -> Solution:
     """The solution with an opening; the magnification starts from that of `previous`."""
     magnification = previous.moves["magnification"]
-    pair = replace(previous.pair, opening=opening, start={family: start}, prior={}, held_magnification=magnification)
-    return pair.solve(family)
+    return replace(previous.pair, opening=opening, held_magnification=magnification).solve(family, start)
 
 
 def _harmonic(round_fit: Solution) -> tuple[int, float, float]:
@@ -117,31 +116,6 @@ def turned(opening: Aperture) -> Aperture:
     if opening.mask is not None:
         return replace(opening, mask=opening.mask.flip(0, 1))
     return replace(opening, rotation_deg=float(opening.rotation_deg) + 180.0)
-
-
-def common_opening(fits: Sequence[BlurFit], nearer: Mask) -> Aperture:
-    """One opening for all distances, as seen behind the focus; larger blurs have more weight.
-
-    The fits are all "polygon", or all "image"; in front of the focus an opening is seen rotated by half a turn.
-    """
-    found = [f.aperture if not near else turned(f.aperture) for f, near in zip(fits, nearer, strict=True) if f.aperture]
-    weight = np.array([f.radius**2 for f in fits])
-    if found[0].mask is None:
-        votes = {a.blades: float(weight[[b.blades == a.blades for b in found]].sum()) for a in found}
-        blades = max(votes, key=votes.__getitem__)
-        weight = weight * [a.blades == blades for a in found]
-        phases = np.exp(1j * np.deg2rad(blades * np.array([float(a.rotation_deg) for a in found])))
-        rotation = math.degrees(float(np.angle(weight @ phases))) / blades
-        return Aperture(blades, rotation, float(weight @ [a.curvature for a in found] / weight.sum()))
-    half_sides = [float(f.params["radius"]) / f.radius for f in fits]
-    positions = ((np.arange(_MAX_SIDE) + 0.5) / _MAX_SIDE * 2 - 1) * max(half_sides)
-    mean = np.zeros((_MAX_SIDE, _MAX_SIDE))
-    for mask, half_side, share in zip(
-        (a.mask.numpy() for a in found if a.mask is not None), half_sides, weight / weight.sum(), strict=True
-    ):
-        coordinates = np.meshgrid(*[(positions / half_side + 1) / 2 * mask.shape[0] - 0.5] * 2, indexing="ij")
-        mean += share * map_coordinates(mask / mask.mean(), coordinates, order=1, mode="constant") / half_side**2
-    return Aperture(mask=torch.from_numpy(np.round(mean / mean.max(), 4)))
 
 
 def _deconvolved(shape: Solution) -> tuple[Array, float]:

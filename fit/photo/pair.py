@@ -1,6 +1,5 @@
 """Fits one kernel to a pair of pictures, sharp and defocused."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal, get_args
 
@@ -50,8 +49,6 @@ def fit_pair(
     magnification: float = 1.0,
     fit_magnification: bool | None = None,
     white: float | None = None,
-    start: BlurFit | None = None,
-    prior: Mapping[str, tuple[float, float]] | None = None,
     knots: int | None = None,
     reach: float | None = None,
     aperture: Aperture | None = None,
@@ -87,9 +84,6 @@ def fit_pair(
         fit_magnification: True fits it, False keeps the expected one, None fits it only if the pictures contradict the
             expected one by more than 3.5 standard errors. If it is not fitted, the standard errors treat it as known.
         white: level from which pixels are clipped; None searches for a plateau.
-        start: a fit of a similar pair, to start from (for several distances of one lens).
-        prior: expected values and standard deviations of parameters of `family`, in px, from other knowledge
-            (neighbouring distances); result and standard errors combine it with the pictures.
         knots: number of values of a "radial" profile; None uses two for each pixel.
         reach: end of a "radial" profile, px; None uses a fitted soft disc.
         aperture: the lens's opening as seen in `blurred`, if it is known (from another distance), for the family
@@ -131,14 +125,6 @@ def fit_pair(
         raise FitError(f"fit_magnification must be True, False or None, got {show(fit_magnification)}")
     if aperture is not None and (not isinstance(aperture, Aperture) or family != "image"):
         raise FitError(f"aperture must be an Aperture, and goes with family='image', got {show(aperture)}")
-    if start is not None and not isinstance(start, BlurFit):
-        raise FitError(f"start must be a BlurFit of a similar pair, got {show(start)}")
-    is_mapping = prior is None or isinstance(prior, Mapping) and all(isinstance(v, tuple) for v in prior.values())
-    if not is_mapping or any(len(v) != 2 for v in (prior or {}).values()):
-        raise FitError(f"prior must map names of parameters to (expected value, deviation), got {show(prior)}")
-    for name, (mean, deviation) in (prior or {}).items():
-        a_number(f"the expected {name}", mean, -1e100, 1e100)
-        a_number(f"the deviation of {name}", deviation, 0)
     data = a_picture("blurred", blurred, _MIN_WINDOW_PX, files[1])
     sharp_picture = None if sharp is None else a_picture("sharp", sharp, _MIN_WINDOW_PX, files[0])
     if sharp_picture is not None and sharp_picture.shape != data.shape:
@@ -153,9 +139,6 @@ def fit_pair(
         return replace(fit_profile(r, strength, "ring" if family == "auto" else family, groups=spokes), model="ratio")
     with one_thread():
         pair, edge, linear = prepared_pair(sharp_picture, data, source, magnification, white, files, softness)
-        if start is not None:
-            pair.start[start.family] = {k: float(v) for k, v in start.params.items() if not isinstance(v, np.ndarray)}
-        pair.prior = prior or {}
         # whether the magnification is known before the fit: a point has none
         is_known = True if sharp is None else None if fit_magnification is None else not fit_magnification
         pair.fit_moves = ALL_MOVES if is_known is False else ("dx", "dy")
@@ -283,6 +266,5 @@ def _choose(radial: Solution, accuracy_db: float, soft: Solution) -> tuple[Solut
     if family == "radial":
         return radial, why, psnr
     if pair.fit_moves == ALL_MOVES:
-        pair.start[family] = {k: float(v) for k, v in solutions[family].params.items()}
         return pair.solve(family), why, psnr
     return solutions[family], why, psnr

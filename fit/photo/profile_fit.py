@@ -11,7 +11,7 @@ from torchdof.validation import show
 
 from ..problems import FitError, warn
 from ..result import Array, BlurFit, Indices
-from ..solve import best_of, information_criterion, inverse
+from ..solve import best_of, inverse
 from ..validation import a_choice, a_picture, real_numbers
 from .dot import find_dot
 
@@ -126,8 +126,6 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
         noise=float(noise * np.sqrt(y.size / np.sum(y**2))),
         covariance=covariance,
         names=names,
-        bic=information_criterion(squares, y.size, len(names)),
-        count=y.size,
         model="profile",
         samples=np.stack([radii, values]),
         curve=np.stack([curve_r, evaluate(family, curve_r, params)]),

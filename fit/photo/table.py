@@ -18,7 +18,7 @@ from ..result import Array, BlurFit
 from ..validation import a_choice
 from .agreement import check_agreement
 from .captures import CAMERA, Capture, Captures
-from .distances import Colour, fit_colours, fit_distances, fit_one, fit_openings, with_uncertainty
+from .distances import Colour, common_opening, fit_colours, fit_one, with_uncertainty
 from .family_choice import COST
 from .forward import OPENINGS, SHAPES
 
@@ -76,7 +76,6 @@ def fit_captures(
     family: str = "auto",
     *,
     accuracy_db: float = 45.0,
-    smooth: bool = True,
     progress: Callable[[int, int, str], None] | None = None,
     command: str = "torchdof.fit.fit_table",
     scale_of: TableFit | None = None,
@@ -88,11 +87,9 @@ def fit_captures(
     same second moment as the fitted kernels, by least squares over all distances.
 
     1. With a free choice of family, or an opening, fit each pair alone: this determines one family for all.
-    2. Fit all pairs with this family, from both ends towards focus. Each fit starts from that of its outer neighbour,
-       scaled by geometry; it uses another start only if that fits clearly better.
-    3. Refit with a loose prior on the line between the neighbours; free profiles get radii on a line instead.
-    4. Compare the radii with the camera's, and determine the scale of the circle of confusion.
-    5. Fit each colour like the mean, if the captures have colours.
+    2. Fit all pairs with this family, or with this opening in different sizes.
+    3. Compare the radii with the camera's, and determine the scale of the circle of confusion.
+    4. Fit each colour like the mean, if the captures have colours.
 
     Args:
         captures: pairs at increasing distances.
@@ -100,7 +97,6 @@ def fit_captures(
             the blur is not round at one distance it is not round at any: "polygon" and "image" use one opening for all
             distances, rotated by half a turn in front of the focus, and fit its size at each.
         accuracy_db: accuracy for "auto", see `fit_pair`.
-        smooth: whether neighbouring distances share information.
         progress: called with (number done, total, text) after each fit.
         command: recorded in the table's provenance.
         scale_of: the fit of another dot in the same photographs, whose scale is used if the camera is unknown. With a
@@ -124,14 +120,7 @@ def fit_captures(
         if progress:
             progress(next(done), len(pairs) * (2 if has_first_fits else 1), f"{pair.distance_m:g} m")
 
-    def check_exposure(pair: Capture, fit: BlurFit) -> None:
-        ratio = 1.0 if pair.exposure is None or not fit.gain > 0 else fit.gain / pair.exposure
-        if max(ratio, 1 / ratio) > _MAX_EXPOSURE_RATIO:
-            text = f"the blurred dot is {ratio:.2f} times as bright as the exposures say; is the image linear, and did "
-            warn(f"{text}the light stay the same?", "exposure", file=pair.files[1], number=ratio)
-        report(pair)
-
-    why, first_fits, opening = f"family {family!r} was asked for", list[BlurFit](), None
+    why, first_fits = f"family {family!r} was asked for", list[BlurFit]()
     if has_first_fits:  # each pair alone determines the family or the opening; the final fits warn
         for pair in pairs:
             with without_warnings():
@@ -142,11 +131,15 @@ def fit_captures(
         richest = max(range(len(pairs)), key=lambda i: _BY_COST.index(first_fits[i].family))
         family = first_fits[richest].family
         why = f"{family}, for {pairs[richest].distance_m:g} m: {first_fits[richest].why}"
-    if family in OPENINGS:
-        fits, opening = fit_openings(captures, family, first_fits, check_exposure)
-    else:
-        fits = fit_distances(captures, family, smooth, check_exposure)
-    fits = [with_uncertainty(pair, captures.focus_m, fit) for pair, fit in zip(pairs, fits, strict=True)]
+    opening, fits = common_opening(captures, family, first_fits) if family in OPENINGS else None, list[BlurFit]()
+    for pair in pairs:
+        fit = fit_one(pair, captures.focus_m, family, opening)
+        ratio = 1.0 if pair.exposure is None or not fit.gain > 0 else fit.gain / pair.exposure
+        if max(ratio, 1 / ratio) > _MAX_EXPOSURE_RATIO:
+            text = f"the blurred dot is {ratio:.2f} times as bright as the exposures say; is the image linear, and did "
+            warn(f"{text}the light stay the same?", "exposure", file=pair.files[1], number=ratio)
+        fits.append(with_uncertainty(pair, captures.focus_m, fit))
+        report(pair)
     radius_px = np.array([f.radius for f in fits])
     check_agreement(captures, radius_px)
     camera_px, defocus = captures.promised_px, captures.defocus

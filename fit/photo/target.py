@@ -34,16 +34,7 @@ _MIN_SHARE, _MAX_SHARE = 0.004, 0.6  # limits of the square's share of the frame
 
 
 def write_target(path: str | os.PathLike[str], paper: Paper = "a4") -> None:
-    """Writes the target as a PDF of one page, to be printed at 100 %.
-
-    Args:
-        path: ends in .pdf.
-        paper: "a4" or "letter".
-
-    Raises:
-        FitError: wrong suffix or paper.
-        OSError: the file cannot be written.
-    """
+    """Writes the target as a PDF of one page, to be printed at 100 %."""
     target = Path(path)
     if target.suffix.lower() != ".pdf":
         raise FitError(f"the target is written as PDF: name it {target.with_suffix('.pdf')}", file=str(path))
@@ -71,11 +62,7 @@ class Target:
 
 
 def find_target(light: Array, *, file: str | None = None) -> Target:
-    """Finds the black square on white paper in a picture `[H, W]` in linear light.
-
-    Raises:
-        FitError: of kind "no dot" if there is no dark square with a bright centre and bright paper around it.
-    """
+    """Finds the black square on white paper in a picture `[H, W]` in linear light, or raises an error."""
     step = max(1, round(light.shape[1] / _THUMBNAIL_PX))
     rows, columns = (n // step for n in light.shape)
     thumbnail = light[: rows * step, : columns * step].reshape(rows, step, columns, step).mean((1, 3))

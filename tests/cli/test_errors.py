@@ -14,6 +14,7 @@ none.exr depth.npy --focus-m 2                        | none.exr: there is no su
 image.exr none.npy --focus-m 2                        | none.npy: there is no such file
 image.exr --focus-m 2                                 | image.exr: has no depth channel; name a depth file
 a.png                                                 | IMAGE DEPTH, which a network such as Depth Anything makes of it
+image.exr turned.npy --focus-m 2                      | turned by 90 degrees it fits
 image.exr small.npy --focus-m 2                       | small.npy: depth is 3 x 4 pixels and the image 24 x 16
 image.exr small.npy --depth-kind coc                  | small.npy: coc is 3 x 4 pixels but the image is 24 x 16
 image.exr holed.npy --focus-m 2                       | holed.npy: 2 pixels (0.5 %) have no depth
@@ -150,6 +151,7 @@ def rows(table: str) -> list[tuple[str, str]]:
 def files(scene: Path) -> Path:
     depth = np.load("depth.npy")
     np.save("small.npy", np.ones((4, 3)))
+    np.save("turned.npy", depth[0, 0].T)
     np.save("zeros.npy", 0 * depth)
     np.save("millimetres.npy", 1000 * depth)
     np.save("unknown.npy", np.nan * depth)

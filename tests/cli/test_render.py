@@ -33,6 +33,8 @@ Run = Callable[..., str]
 LENS = "--focal-length-mm 50 --f-number 1.2 --sensor-width-mm 4"  # blurs by 2.1 px
 ONE = "render image.exr depth.npy -o out.exr --focus-m 2"
 OLDER = "older than their files or options"
+RECORD = Path("out.####.exr.json")
+NO_RECORD = f"{RECORD}, which has the options of existing frames, is missing"
 PULL = "--focus-m 1:2,3:6 --sensor-width-mm 4 --table lens.json"
 SEQUENCE = "render shot.####.exr depth.####.npy -o out.####.exr"
 CAMERA = torchdof.Camera(focal_length_mm=50.0, f_number=1.2, focus_m=2.0, sensor_width_mm=4.0)
@@ -364,24 +366,9 @@ def test_steady_depth_flickers_less_and_resumed_or_partial_runs_give_the_same_fr
         (lambda: write_image("shot.0003.exr", Picture(torch.ones(1, 3, 16, 24))), "", 1, OLDER),
         (lambda: np.save("depth.0002.npy", np.full((16, 24), 5.0)), "--steady", 2, OLDER),
         (lambda: torchdof.BlurTable.gaussian().save("lens.json"), "", 3, OLDER),
-        (
-            lambda: Path("out.####.exr.json").unlink(),
-            "",
-            3,
-            "out.####.exr.json, which has the options of existing frames, is missing",
-        ),
-        (
-            lambda: Path("out.####.exr.json").write_text("[1"),
-            "",
-            3,
-            "out.####.exr.json, which has the options of existing frames, is missing",
-        ),
-        (
-            lambda: Path("out.####.exr.json").write_text(""),
-            "",
-            3,
-            "out.####.exr.json, which has the options of existing frames, is missing",
-        ),
+        (lambda: RECORD.unlink(), "", 3, NO_RECORD),
+        (lambda: RECORD.write_text("[1"), "", 3, NO_RECORD),
+        (lambda: RECORD.write_text(""), "", 3, NO_RECORD),
         (lambda: cut("out.0002.exr", 1), "", 1, "or they are cut short"),
         (lambda: cut("out.0002.exr"), "--steady", 1, "or they are cut short"),
         (lambda: guessed(f"{SEQUENCE} --f-number 4 {PULL} --frames 1"), "", 3, "--f-number changed"),
@@ -421,37 +408,12 @@ def test_an_existing_file_whose_name_looks_like_a_pattern_is_a_single_image(
     assert pixels(str(out)).shape == image.shape
 
 
-def test_frame_numbers_are_only_in_file_names_never_in_folder_names(scene: Path, run: Run) -> None:
-    (scene / "take #1").mkdir()
-    for n in (1, 2, 3):
-        os.replace(f"shot.{n:04d}.exr", f"take #1/shot.{n:04d}.exr")
-    run("render --focus-m 2 --frames 2-3", "take #1/shot.####.exr", "depth.npy", "-o", "take #1/out.%03d.exr")
-    assert sorted(p.name for p in (scene / "take #1").glob("out*.exr")) == ["out.002.exr", "out.003.exr"]
-    run("render image.exr depth.npy --focus-m 2", "-o", "take #2.exr")
-    assert (scene / "take #2.exr").is_file()
-
-
 @pytest.mark.parametrize("link", ["image.exr", "depth.npy", "out.exr"])
 def test_a_link_to_itself_is_refused_in_one_sentence(scene: Path, run: Run, link: str) -> None:
     (scene / link).unlink(missing_ok=True)
     (scene / link).symlink_to(link)
     assert run(ONE, code=2).startswith(f"error: {link}: is a link that leads back to itself")
     assert (scene / link).is_symlink()
-
-
-def test_a_photograph_is_rotated_by_its_orientation_tag(run: Run, image: Tensor, depth: Tensor) -> None:
-    """An upright phone stores a landscape image with orientation 6; depth estimators see the rotated, upright image."""
-    store(Path("phone.png"), (255 * image[0].permute(1, 2, 0)).byte().numpy(), "uint8", Orientation=6)
-    upright = torch.rot90(depth, -1, (-2, -1))  # 24 rows of 16, 2 m above and 6 m below
-    np.save("upright.npy", upright.numpy())
-    line = run(f"render phone.png upright.npy -o out.png --focus-at 8,20 {LENS}")
-    assert "16 x 24" in line
-    out = read_image("out.png")
-    assert out.pixels.shape == (1, 3, 24, 16) and out.metadata["Orientation"][1] == 1
-    seen = read_image("phone.png").pixels
-    torch.testing.assert_close(out.pixels[..., 16:, :], seen[..., 16:, :], rtol=0.0, atol=0.01)  # in focus
-    message = run(f"render phone.png depth.npy -o out.png --focus-m 2 {LENS}", code=2)
-    assert "turned by 90 degrees it fits" in message
 
 
 def test_depth_of_nearly_the_same_shape_is_stretched_and_the_line_states_it(

@@ -1,4 +1,4 @@
-"""Pictures of fits, tables and textures, as in the paper's figures 2 to 4."""
+"""Pictures of fits and tables."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import torch
 
 from torchdof import BlurTable
 from torchdof.fit import BlurFit, FitError, fit_pair, fit_profile
-from torchdof.fit.plots import picture_of_fit, picture_of_quad, picture_of_table, picture_of_texture
+from torchdof.fit.plots import picture_of_fit, picture_of_table
 
 
 def drawn(figure, tmp_path):
@@ -23,19 +23,9 @@ def test_figure_2_shows_samples_and_curve(simulator, tmp_path):
     forward = fit_pair(*simulator.Simulator(size=61).pair("gaussian", {"sigma": 3.0}), "gaussian")
     (axes,) = drawn(picture_of_fit(forward), tmp_path)
     assert [line.get_label() for line in axes.get_lines()] == ["pixels", "forward model", "kernel f(r), scaled"]
-    bare = BlurFit("gaussian", {"sigma": 1.0}, {"sigma": 0.1}, 0.0, 0.0, np.eye(1), ("sigma",), 0.0, 9, "profile")
+    bare = BlurFit("gaussian", {"sigma": 1.0}, {"sigma": 0.1}, 0.0, 0.0, np.eye(1), ("sigma",), "profile")
     with pytest.raises(FitError, match="no samples"):
         picture_of_fit(bare)
-
-
-def test_figures_3_and_4_are_the_blur_texture_and_both_quads(tmp_path):
-    table = BlurTable.load("sato_j15")
-    axes = drawn(picture_of_texture(table, 12.0, 512), tmp_path)
-    np.testing.assert_allclose(axes[0].images[0].get_array(), table.blur_texture(12.0, 512)[0])
-    sharp = np.zeros((40, 60))
-    sharp[10:30, 20:40] = 1
-    axes = drawn(picture_of_quad(sharp, 0.5 * sharp), tmp_path)
-    np.testing.assert_array_equal(axes[2].get_lines()[1].get_ydata(), 0.5 * sharp[20])
 
 
 @pytest.mark.parametrize(

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from torchdof.cli.fit import Fit
     from torchdof.fit.result import BlurFit
 
-_WIDTH = 1920  # px; image width for which the texture of a table is drawn
-
 
 def trace_lens(command: Fit, source: str) -> None:
     """Traces the table of a lens, prints a summary, and writes the table."""
@@ -225,15 +223,12 @@ class FitPrinter:
             self._save(sheet, target)
 
     def draw(self, table: BlurTable, folder: Path, stem: str, fits: Iterable[tuple[float, BlurFit]] = ()) -> None:
-        """Draws the fit at each distance in m, the table over depth, and the texture of its largest coc."""
+        """Draws the fit at each distance in m, and the table over depth; `torchdof tables` draws its kernels."""
         from torchdof.fit import plots
 
         for distance_m, fit in fits:
             self._save(plots.picture_of_fit(fit), folder / f"{stem}_{distance_m * 1000:.0f}mm.png")
         self._save(plots.picture_of_table(table), folder / f"{stem}_table.png")
-        scales = {"fraction": float(_WIDTH), "mm": _WIDTH / (table.sensor_width_mm or 36.0), "relative": 16.0}
-        largest = float(table.coc[table.coc.abs().argmax()]) * scales[table.unit]
-        self._save(plots.picture_of_texture(table, largest, _WIDTH), folder / f"{stem}_texture.png")
 
     def _save(self, figure: Any, target: Path) -> None:
         """Writes a figure, whole or not at all, and prints its path."""

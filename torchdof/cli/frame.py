@@ -124,9 +124,6 @@ def coc_of(
     """Signed radius ``[1, 1, H, W]`` in pixels, the camera (None for ``--depth-kind coc``), and remarks on both.
 
     ``number`` is the frame number, at which the focus is interpolated between keyframes.
-
-    Raises:
-        ValueError: If the lens is impossible, or a mistake is likely and ``notices`` is strict.
     """
     depth_map, lens, values = frame.scene.depth_map, frame.scene.lens, frame.values
     if depth_map.depth_kind == "coc":
@@ -170,7 +167,7 @@ class Renderer:
         return read_frame(image, depth, self.scene, transfer=files.transfer, layer=files.layer)
 
     def render(self, frame: Frame, out: Path, number: int, bar: Bar | None = None) -> Rendered:
-        """Renders a frame; ``bar`` shows the expected time of a long one. Raises as :func:`coc_of`."""
+        """Renders a frame; ``bar`` shows the expected time of a long one."""
         start, picture, command = time.perf_counter(), frame.picture, self.command
         frame = dataclasses.replace(frame, values=frame.values.to(self.device))
         coc_px, camera, remarks = coc_of(frame, self.notices, number, self.is_still)

@@ -44,12 +44,8 @@ class Area(NamedTuple):
     def centred(self, values: "Tensor", size: "tuple[int, int]") -> "tuple[Tensor, Any]":
         """Pads a map so that the optical axis, in the middle of the full frame, is in the middle of the map.
 
-        Args:
-            values: ``[1, 1, h, w]``, a map of the image.
-            size: Height and width of the image in pixels.
-
-        Returns:
-            The padded map, and the index of the given map in it.
+        The map ``[1, 1, h, w]`` is of an image of a height and width in pixels. Also returns its index in the padded
+        one.
         """
         from torch.nn.functional import pad
 

@@ -1,5 +1,3 @@
-import math
-
 import numpy as np
 import pytest
 
@@ -148,18 +146,6 @@ def test_lines_are_read_back_as_the_same_lens(text, lens_of):
 def test_wrong_prescription_is_refused_with_file_line_and_column(lens_of, text, message):
     with pytest.raises(ValueError, match=rf"lens\.txt: {message}"):
         lens_of(text)
-
-
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
-def test_wrong_numbers_are_refused(value):
-    lens = Lens.read("wide_22mm")
-    for change in (lens.with_f_number, lens.scaled):
-        with pytest.raises(ValueError, match="must be a number > 0"):
-            change(value)
-    with pytest.raises(ValueError, match=r"diameter must be a number"):
-        lens.with_stop(value)
-    with pytest.raises(ValueError, match="wavelength_um must be a number of micrometres"):
-        lens.indices(value)
 
 
 def test_impossible_lenses_are_refused_by_name(lens_of):

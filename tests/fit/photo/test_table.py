@@ -66,18 +66,6 @@ def test_kernels_between_the_nodes_equal_the_lens_s(nine):
     assert reached.min() > 55 and np.median(reached) > 62
 
 
-def test_smoothing_over_neighbouring_distances_keeps_parameters_on_one_branch(nine, simulator):
-    places, reached = np.linspace(-5, -1.5, 20), []
-    alone = fit_table(captured(simulator, DISTANCES[1:4], seed=51), "softm", smooth=False)
-    for table in (alone, nine.table):
-        # kernels of the interpolated parameters, without the table's templates, which have errors too
-        lines = [table.params(torch.tensor(coc), WIDTH) for coc in places]
-        drawn = [kernel_of("softm", *(value[0] for value in line.values())) for line in lines]
-        reached.append(psnr_to_the_lens(drawn, places).min())
-    separate, smoothed = reached
-    assert smoothed > 60 and smoothed > separate + 5
-
-
 @pytest.mark.parametrize(
     ("family", "distances", "snr_db", "places", "least"),
     [
@@ -132,7 +120,7 @@ def test_standard_errors_include_the_uncertainty_of_the_pictures(simulator):
     sharp, blurred = camera.pair("disc", {"radius": 5.0}, 1)
     guess = camera.pair("disc", {"radius": 5.2}, 1)
     plain, uncertain = (
-        fit_captures(Captures((Capture(sharp, blurred, 2.0, uncertain=others),), 1.0, WIDTH), "disc", smooth=False)
+        fit_captures(Captures((Capture(sharp, blurred, 2.0, uncertain=others),), 1.0, WIDTH), "disc")
         for others in ((), (guess,))
     )
     (fit,) = uncertain.fits
