@@ -17,6 +17,7 @@ from torchdof.optics.camera import Camera
 from torchdof.options import DepthEdges, Options
 from torchdof.render.ops import Ops
 from torchdof.render.plan import LayerKernel, Plan
+from torchdof.validation import choice
 
 from .operations import GraphOps
 from .whole import WholeOps
@@ -68,8 +69,7 @@ class Portable(nn.Module):
         size: Size = None,
     ) -> None:
         super().__init__()
-        if inputs not in INPUTS:
-            raise ValueError(f"inputs must be one of {', '.join(INPUTS)}, got {inputs!r}")
+        choice("inputs", inputs, INPUTS)
         for name in Camera.__dataclass_fields__:
             if isinstance(getattr(dof.camera, name), Tensor):
                 raise ValueError(
@@ -139,8 +139,7 @@ def check_width(table: BlurTable, width: int | None) -> None:
 
 def _check_layout(layout: str, size: Size, depth_edges: DepthEdges) -> None:
     """Raises an error for options that a layout does not support."""
-    if layout not in LAYOUTS:
-        raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
+    choice("layout", layout, LAYOUTS)
     if size is not None and layout != "whole":
         raise ValueError(f'size is for layout="whole"; a graph of tiles takes frames of any size, got size={size!r}')
     numbers = size if size is not None else (1, 1)

@@ -4,7 +4,7 @@ import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import onnx
@@ -13,6 +13,7 @@ import onnx.version_converter
 import onnx_ir
 
 from torchdof.io.atomic import atomic_file
+from torchdof.validation import choice
 
 from . import bridge
 from .graph import INPUTS, OUTPUT
@@ -64,8 +65,7 @@ def chain(
         ValueError: If the models do not fit together, or the joint graph is invalid or differs from its parts.
         FileNotFoundError: If a file is missing.
     """
-    if estimate not in ("metric", "inverse", "relative-inverse"):
-        raise ValueError(f"estimate must be 'metric', 'inverse' or 'relative-inverse', got {estimate!r}")
+    choice("estimate", estimate, get_args(Estimate))
     path = Path(path)
     if not path.parent.is_dir():
         raise ValueError(f"cannot write {path}: there is no folder {path.parent}")

@@ -2,6 +2,7 @@
 
 import itertools
 import string
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from .structure import structure
 __all__ = ["slim"]
 
 _WINDOW_DEFAULTS = {"pads": 0, "dilations": 1, "strides": 1}  # defaults of these attributes, for each axis
+_Pass = Callable[[onnx_ir.Model], object]
+
 _MAX_EQUAL = 64  # constants with more equal numbers than this are stored as a shape and a value
 
 
@@ -30,29 +33,28 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
     3. Put each convolution's weights into its own graph, and turn initializers into nodes.
     4. Remove default attributes and shorten names.
     """
-    flat: tuple[onnx_ir.passes.PassBase, ...] = (
+    flat: tuple[_Pass, ...] = (
         passes.InlinePass(),
         passes.RemoveUnusedFunctionsPass(),
         passes.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
         passes.DeduplicateInitializersPass(size_limit=2**24),
         # without values of sizes in a straight graph, in which onnx confuses lists of indices with them
         passes.ShapeInferencePass(data_prop=not straight),
-        _Casts(),
+        _cast_plainly,
     )
-    tidy: tuple[onnx_ir.passes.PassBase, ...] = (
+    tidy: tuple[_Pass, ...] = (
         passes.RemoveUnusedNodesPass(),  # folding leaves sequences of a wrong type, which shape inference refuses
         passes.ShapeInferencePass(),
-        _Parts(),
-        _Cuts(),
-        _Averages(),
-        _Fills(),
-        _Splits(),
-        _Ramps(),
+        _take_parts,
+        _join_cuts,
+        _convolve_averages,
+        _fill_channels,
+        _join_splits,
         passes.IdentityEliminationPass(),
         passes.CommonSubexpressionEliminationPass(),
         passes.RemoveUnusedNodesPass(),
     )
-    structured: tuple[onnx_ir.passes.PassBase, ...] = (
+    structured: tuple[_Pass, ...] = (
         passes.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
         passes.DeduplicateInitializersPass(size_limit=2**24),
         passes.CommonSubexpressionEliminationPass(),
@@ -153,213 +155,140 @@ def _initializer(graph: onnx_ir.Graph, array: np.ndarray, name: str) -> onnx_ir.
     return value
 
 
-class _Casts(onnx_ir.passes.InPlacePass):
+def _replace(graph: onnx_ir.Graph, node: onnx_ir.Node, tape: Tape) -> None:
+    """Puts the nodes of a tape in the place of a node; the last one gives the same result."""
+    new, old = tape.nodes[-1].outputs[0], node.outputs[0]
+    new.type, new.shape = old.type, old.shape
+    graph.insert_before(node, list(tape.nodes))
+    old.replace_all_uses_with(new, replace_graph_outputs=True)
+    graph.remove(node, safe=True)
+
+
+def _cast_plainly(model: onnx_ir.Model) -> None:
     """``CastLike`` becomes ``Cast``, or nothing if the type is right already; not every runtime simplifies it."""
-
-    def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        number = itertools.count()
-        for graph in (model.graph, *model.graph.subgraphs()):
-            for node in list(graph):
-                if node.op_type != "CastLike" or node.domain:
-                    continue
-                value, like = node.inputs
-                kind = None if like is None else like.dtype
-                if value is None or kind is None:
-                    continue
-                if value.const_value is not None and value.is_initializer():
-                    new = _cast_constant(model.graph, value, kind, next(number))
-                elif value.dtype == kind and not node.outputs[0].is_graph_output():
-                    new = value
-                else:
-                    cast = onnx_ir.node("Cast", [value], {"to": kind.value})
-                    graph.insert_before(node, [cast])
-                    new = cast.outputs[0]
-                    new.type, new.shape = onnx_ir.TensorType(kind), node.outputs[0].shape
-                node.outputs[0].replace_all_uses_with(new, replace_graph_outputs=True)
-                graph.remove(node, safe=True)
-        return onnx_ir.passes.PassResult(model, modified=True)
+    number = itertools.count()
+    for graph in (model.graph, *model.graph.subgraphs()):
+        for node in list(graph):
+            if node.op_type != "CastLike" or node.domain:
+                continue
+            value, like = node.inputs
+            kind = None if like is None else like.dtype
+            if value is None or kind is None:
+                continue
+            if value.const_value is not None and value.is_initializer():
+                new = _cast_constant(model.graph, value, kind, next(number))
+            elif value.dtype == kind and not node.outputs[0].is_graph_output():
+                new = value
+            else:
+                cast = onnx_ir.node("Cast", [value], {"to": kind.value})
+                graph.insert_before(node, [cast])
+                new = cast.outputs[0]
+                new.type, new.shape = onnx_ir.TensorType(kind), node.outputs[0].shape
+            node.outputs[0].replace_all_uses_with(new, replace_graph_outputs=True)
+            graph.remove(node, safe=True)
 
 
-class _Parts(onnx_ir.passes.InPlacePass):
+def _take_parts(model: onnx_ir.Model) -> None:
     """A slice that is exactly one input of a ``Concat`` becomes that input; onnxruntime would warn of it."""
-
-    def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        for node in list(model.graph):
-            if node.op_type == "Slice" and not node.outputs[0].is_graph_output():
-                part = _part(node)
-                if part is not None:
-                    node.outputs[0].replace_all_uses_with(part)
-                    model.graph.remove(node, safe=True)
-        return onnx_ir.passes.PassResult(model, modified=True)
+    for node in list(model.graph):
+        if node.op_type == "Slice" and not node.outputs[0].is_graph_output():
+            part = _part(node)
+            if part is not None:
+                node.outputs[0].replace_all_uses_with(part)
+                model.graph.remove(node, safe=True)
 
 
-class _Cuts(onnx_ir.passes.InPlacePass):
+def _join_cuts(model: onnx_ir.Model) -> None:
     """Two slices in sequence along different axes become one, because each copies."""
-
-    def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        for node in list(model.graph):
-            source = node.inputs[0] if node.op_type == "Slice" else None
-            first = None if source is None else source.producer()
-            if first is None or first.op_type != "Slice" or len(first.inputs) != len(node.inputs):
-                continue
-            axis_values: list[Any] = [first.inputs[3], node.inputs[3]]
-            axes = [onnx_ir.convenience.get_const_tensor(value) for value in axis_values]
-            if source is None or axes[0] is None or axes[1] is None or source.shape is None:
-                continue
-            rank = len(source.shape)  # an axis may be counted from the last one
-            if {int(a) % rank for a in axes[0].numpy()} & {int(a) % rank for a in axes[1].numpy()}:
-                continue
-            tape, bounds = Tape(), []
-            for number, pair in enumerate(list(zip(first.inputs, node.inputs, strict=True))[1:]):
-                constants = [onnx_ir.convenience.get_const_tensor(value) for value in pair if value is not None]
-                if all(constant is not None for constant in constants):
-                    joined = np.concatenate([constant.numpy() for constant in constants if constant is not None])
-                    bounds.append(_initializer(model.graph, joined, f"{node.outputs[0].name}_bound_{number}"))
-                else:
-                    bounds.append(tape.op("Concat", list(pair), {"axis": 0}))
-            cut = tape.op("Slice", [first.inputs[0], *bounds])
-            cut.type, cut.shape = node.outputs[0].type, node.outputs[0].shape
-            model.graph.insert_before(node, list(tape.nodes))
-            node.outputs[0].replace_all_uses_with(cut, replace_graph_outputs=True)
-            model.graph.remove(node, safe=True)
-        return onnx_ir.passes.PassResult(model, modified=True)
+    for node in list(model.graph):
+        source = node.inputs[0] if node.op_type == "Slice" else None
+        first = None if source is None else source.producer()
+        if first is None or first.op_type != "Slice" or len(first.inputs) != len(node.inputs):
+            continue
+        axis_values: list[Any] = [first.inputs[3], node.inputs[3]]
+        axes = [onnx_ir.convenience.get_const_tensor(value) for value in axis_values]
+        if source is None or axes[0] is None or axes[1] is None or source.shape is None:
+            continue
+        rank = len(source.shape)  # an axis may be counted from the last one
+        if {int(a) % rank for a in axes[0].numpy()} & {int(a) % rank for a in axes[1].numpy()}:
+            continue
+        tape, bounds = Tape(), []
+        for number, pair in enumerate(list(zip(first.inputs, node.inputs, strict=True))[1:]):
+            constants = [onnx_ir.convenience.get_const_tensor(value) for value in pair if value is not None]
+            if all(constant is not None for constant in constants):
+                joined = np.concatenate([constant.numpy() for constant in constants if constant is not None])
+                bounds.append(_initializer(model.graph, joined, f"{node.outputs[0].name}_bound_{number}"))
+            else:
+                bounds.append(tape.op("Concat", list(pair), {"axis": 0}))
+        tape.op("Slice", [first.inputs[0], *bounds])
+        _replace(model.graph, node, tape)
 
 
-class _Averages(onnx_ir.passes.InPlacePass):
+def _convolve_averages(model: onnx_ir.Model) -> None:
     """Block means before a convolution become a convolution, which is several times as fast in runtimes."""
-
-    def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        for node in list(model.graph):
-            following = [use.node for use in node.outputs[0].uses()] if node.op_type == "AveragePool" else []
-            if [n.op_type for n in following] != ["Pad"]:
-                continue
-            (pad,) = following
-            scale = node.attributes["kernel_shape"].as_ints()[0]
-            filled_shape: Any = pad.outputs[0].shape
-            channels = int(filled_shape[1])
-            weight = np.full((channels, 1, scale, scale), scale**-2.0, np.float32)
-            tape = Tape()
-            filled = tape.op("Pad", [node.inputs[0], *pad.inputs[1:]])
-            name = f"mean_{node.outputs[0].name}"
-            kernel = _initializer(model.graph, weight, f"{name}_weight")
-            mean = tape.op("Conv", [filled, kernel], {"group": channels, "strides": [scale, scale]}, name=name)
-            mean.type, mean.shape = pad.outputs[0].type, pad.outputs[0].shape
-            model.graph.insert_before(pad, list(tape.nodes))
-            pad.outputs[0].replace_all_uses_with(mean)
-            model.graph.remove(pad, safe=True)
-            model.graph.remove(node, safe=True)
-        return onnx_ir.passes.PassResult(model, modified=True)
+    for node in list(model.graph):
+        following = [use.node for use in node.outputs[0].uses()] if node.op_type == "AveragePool" else []
+        if [n.op_type for n in following] != ["Pad"]:
+            continue
+        (pad,) = following
+        scale = node.attributes["kernel_shape"].as_ints()[0]
+        filled_shape: Any = pad.outputs[0].shape
+        channels = int(filled_shape[1])
+        weight = np.full((channels, 1, scale, scale), scale**-2.0, np.float32)
+        tape = Tape()
+        filled = tape.op("Pad", [node.inputs[0], *pad.inputs[1:]])
+        name = f"mean_{node.outputs[0].name}"
+        kernel = _initializer(model.graph, weight, f"{name}_weight")
+        tape.op("Conv", [filled, kernel], {"group": channels, "strides": [scale, scale]}, name=name)
+        _replace(model.graph, pad, tape)
+        model.graph.remove(node, safe=True)
 
 
-class _Fills(onnx_ir.passes.InPlacePass):
+def _fill_channels(model: onnx_ir.Model) -> None:
     """Padding channels of a convolution become inputs of the ``Concat`` before it.
 
     Their values do not matter, because they are not used: they repeat some of the other channels.
     """
-
-    def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        graph = model.graph
-        for pad in list(graph):
-            missing = _spare_channels(pad)
-            concat: Any = pad.inputs[0].producer() if missing and pad.inputs[0] is not None else None
-            if concat is None or concat.op_type != "Concat" or concat.attributes["axis"].as_int() != 1:
-                continue
-            filled, tape = list(concat.inputs), Tape()
-            for part in concat.inputs:
-                repeats, missing = divmod(missing, part.shape[1])
-                filled += [part] * repeats
-            if missing:
-                name = f"{pad.outputs[0].name}_fill"
-                ends = {"start": 0, "stop": missing, "axis": 1}
-                bounds = [_initializer(graph, np.array([n]), f"{name}_{end}") for end, n in ends.items()]
-                filled.append(tape.op("Slice", [concat.inputs[0], *bounds]))
-            extended = tape.op("Concat", filled, {"axis": 1})
-            extended.type, extended.shape = pad.outputs[0].type, pad.outputs[0].shape
-            graph.insert_before(pad, list(tape.nodes))
-            pad.outputs[0].replace_all_uses_with(extended)
-            graph.remove(pad, safe=True)
-        return onnx_ir.passes.PassResult(model, modified=True)
+    graph = model.graph
+    for pad in list(graph):
+        missing = _spare_channels(pad)
+        concat: Any = pad.inputs[0].producer() if missing and pad.inputs[0] is not None else None
+        if concat is None or concat.op_type != "Concat" or concat.attributes["axis"].as_int() != 1:
+            continue
+        filled, tape = list(concat.inputs), Tape()
+        for part in concat.inputs:
+            repeats, missing = divmod(missing, part.shape[1])
+            filled += [part] * repeats
+        if missing:
+            name = f"{pad.outputs[0].name}_fill"
+            ends = {"start": 0, "stop": missing, "axis": 1}
+            bounds = [_initializer(graph, np.array([n]), f"{name}_{end}") for end, n in ends.items()]
+            filled.append(tape.op("Slice", [concat.inputs[0], *bounds]))
+        tape.op("Concat", filled, {"axis": 1})
+        _replace(graph, pad, tape)
 
 
-class _Splits(onnx_ir.passes.InPlacePass):
+def _join_splits(model: onnx_ir.Model) -> None:
     """A slice of the first channels and a split become one split, whose last part is not used."""
-
-    def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        graph = model.graph
-        for node in [n for n in graph if n.op_type == "Split" and n.attributes["axis"].as_int() == 1]:
-            cut: Any = None if node.inputs[0] is None else node.inputs[0].producer()
-            if cut is None or cut.op_type != "Slice" or cut.inputs[0].shape is None:
-                continue
-            source, kept_shape = cut.inputs[0], cut.outputs[0].shape
-            is_equal = [a == b for a, b in zip(source.shape, kept_shape, strict=True)]
-            bounds: list[Any] = [cut.inputs[1], node.inputs[1]]
-            first, sizes = (onnx_ir.convenience.get_const_tensor(value) for value in bounds)
-            if first is None or sizes is None or first.numpy().any() or is_equal != [True, False, True, True]:
-                continue
-            parts = np.array([*sizes.numpy(), source.shape[1] - kept_shape[1]])
-            all_sizes = _initializer(graph, parts, f"{node.outputs[0].name}_sizes")
-            split = onnx_ir.node("Split", [source, all_sizes], {"axis": 1}, num_outputs=len(parts))
-            graph.insert_before(node, [split])
-            for old, new in zip(node.outputs, split.outputs, strict=False):
-                new.type, new.shape = old.type, old.shape
-                old.replace_all_uses_with(new)
-            graph.remove(node, safe=True)
-        return onnx_ir.passes.PassResult(model, modified=True)
-
-
-class _Ramps(onnx_ir.passes.InPlacePass):
-    """Linear functions clipped to [0, 1] become one operator instead of three.
-
-    They occur as ``1 - clip(x / width)``, and in an eased ramp as ``1 - slope (1 - w)`` of a clipped ``w``. Where the
-    latter is negative the ramp's foot is used instead, so it may be clipped as well.
-    """
-
-    def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        for node in list(model.graph):
-            clip: Any = _operand(node.outputs[0], "Sub", 1.0)
-            clip = None if clip is None else clip.producer()
-            ratio: Any = None if clip is None or clip.op_type != "Clip" else clip.inputs[0].producer()
-            if ratio is not None and ratio.op_type == "Div" and [_number(v) for v in clip.inputs[1:]] == [0.0, 1.0]:
-                width = _number(ratio.inputs[1])
-                if width is not None:
-                    ramp = onnx_ir.node("HardSigmoid", [ratio.inputs[0]], {"alpha": -1.0 / width, "beta": 1.0})
-                    ramp.outputs[0].type, ramp.outputs[0].shape = node.outputs[0].type, node.outputs[0].shape
-                    model.graph.insert_before(node, [ramp])
-                    node.outputs[0].replace_all_uses_with(ramp.outputs[0])
-            if node.op_type != "Max" or len(node.inputs) != 2:
-                continue
-            linear, difference, complement = node.inputs[0], _operand(node.inputs[0], "Sub", 1.0), None
-            scaled: Any = None if difference is None else difference.producer()
-            slope = None if scaled is None else _number(scaled.inputs[-1])
-            if scaled is not None and scaled.op_type == "Mul" and slope is not None:
-                complement = _operand(scaled.inputs[0], "Sub", 1.0)
-            clipped: Any = None if complement is None else complement.producer()
-            if complement is None or linear is None or slope is None or clipped.op_type != "Clip":
-                continue
-            # exactly 1 at 1: the offset is a multiple of the float32 resolution near the slope
-            offset = round((1.0 - slope) * 2**23) / 2**23
-            ramp = onnx_ir.node("HardSigmoid", [clipped.inputs[0]], {"alpha": 1.0 - offset, "beta": offset})
-            ramp.outputs[0].type, ramp.outputs[0].shape = linear.type, linear.shape
-            model.graph.insert_before(clipped, [ramp])
-            linear.replace_all_uses_with(ramp.outputs[0])
-            for use in list(complement.uses()):
-                if use.node.op_type == "Clip" and use.node.inputs[1] is None:  # the foot
-                    use.node.replace_input_with(0, clipped.inputs[0])
-                    use.node.replace_input_with(1, clipped.inputs[1])
-        return onnx_ir.passes.PassResult(model, modified=True)
-
-
-def _operand(value: onnx_ir.Value | None, operator: str, number: float) -> onnx_ir.Value | None:
-    """The second operand of ``value``, if it is this operator with this number as the first operand; else None."""
-    node = None if value is None else value.producer()
-    matches = node is not None and node.op_type == operator and _number(node.inputs[0]) == number
-    return node.inputs[1] if node is not None and matches else None
-
-
-def _number(value: onnx_ir.Value | None) -> float | None:
-    """The number in a constant with one element, else None."""
-    tensor = None if value is None else onnx_ir.convenience.get_const_tensor(value)
-    return float(tensor.numpy().item()) if tensor is not None and tensor.size == 1 else None
+    graph = model.graph
+    for node in [n for n in graph if n.op_type == "Split" and n.attributes["axis"].as_int() == 1]:
+        cut: Any = None if node.inputs[0] is None else node.inputs[0].producer()
+        if cut is None or cut.op_type != "Slice" or cut.inputs[0].shape is None:
+            continue
+        source, kept_shape = cut.inputs[0], cut.outputs[0].shape
+        is_equal = [a == b for a, b in zip(source.shape, kept_shape, strict=True)]
+        bounds: list[Any] = [cut.inputs[1], node.inputs[1]]
+        first, sizes = (onnx_ir.convenience.get_const_tensor(value) for value in bounds)
+        if first is None or sizes is None or first.numpy().any() or is_equal != [True, False, True, True]:
+            continue
+        parts = np.array([*sizes.numpy(), source.shape[1] - kept_shape[1]])
+        all_sizes = _initializer(graph, parts, f"{node.outputs[0].name}_sizes")
+        split = onnx_ir.node("Split", [source, all_sizes], {"axis": 1}, num_outputs=len(parts))
+        graph.insert_before(node, [split])
+        for old, new in zip(node.outputs, split.outputs, strict=False):
+            new.type, new.shape = old.type, old.shape
+            old.replace_all_uses_with(new)
+        graph.remove(node, safe=True)
 
 
 def _spare_channels(node: onnx_ir.Node) -> int:

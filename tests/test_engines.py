@@ -410,7 +410,7 @@ ENTRIES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "coc_px": DOF.coc_px,
     "depth_of_field": lambda image, depth: depth_of_field(image, depth, CAMERA, occlusion=False),
     "kernels": lambda *_: BlurTable.load("sato_j15").kernels(torch.tensor([-3.0, 7.0]), 640),
-    "lens_views": lambda image, depth: lens_views(image, depth, CAMERA, views=8).image,
+    "lens_views": lambda image, depth: lens_views(image, CAMERA.coc_px(depth, image.shape[-1]), views=8).image,
     "ssim": lambda image, _: torch.as_tensor(ssim(image, image.flip(-1))),
 }  # fmt: skip
 

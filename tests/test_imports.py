@@ -28,7 +28,7 @@ ALLOWED = {
     "module": {"tensors", "validation", "batch", "optics", "options", "render"},
     "functional": {"tensors", "validation", "batch", "optics"},
     "fit": {"validation", "io", "optics"},
-    "export": {"pixels", "tensors", "io", "optics", "options", "render", "reference", "module"},
+    "export": {"pixels", "tensors", "validation", "io", "optics", "options", "render", "reference", "module"},
     "augmentation": {"tensors", "validation", "io", "optics", "options", "module"},
     "distributed": {"validation", "io", "depth", "render", "module", "augmentation"},
     "bench": {"validation", "io", "optics", "reference", "module", "export"},

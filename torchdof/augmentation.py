@@ -10,7 +10,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from kornia.augmentation import AugmentationSequential, IntensityAugmentationBase2D
 from kornia.augmentation import random_generator as rg
@@ -26,7 +25,7 @@ from .optics.blur_table import BlurTable
 from .optics.camera import Camera
 from .options import OptionArguments, Options, spells_options
 from .tensors import floating
-from .validation import FROM_NUMPY, choice, image_and_map, number, real_tensor, refuse_nested, show
+from .validation import choice, image_and_map, number, real_tensor, show
 
 __all__ = ["DepthAugmentationSequential", "RandomDepthOfField"]
 
@@ -400,13 +399,12 @@ def _range(name: str, value: Any, largest: float) -> tuple[float, float]:
 
 def _batch_shape(image: Any) -> tuple[int, ...]:
     """Shape ``[B, C, H, W]`` of one image or a batch."""
-    refuse_nested("image", image)
     if not floating(image) or image.ndim not in (3, 4):
-        hint = "; convert bytes with image.float() / 255, or torchvision's ToDtype(torch.float32, scale=True)"
-        if floating(image):
-            hint = "; join the first axes of clips, as image.flatten(0, 1) does" if image.ndim == 5 else ""
-        elif not isinstance(image, Tensor):
-            hint = FROM_NUMPY if isinstance(image, np.ndarray) else ""
+        hint = ""
+        if isinstance(image, Tensor) and not image.is_floating_point():
+            hint = "; convert bytes with image.float() / 255, or torchvision's ToDtype(torch.float32, scale=True)"
+        elif floating(image) and image.ndim == 5:
+            hint = "; join the first axes of clips, as image.flatten(0, 1) does"
         raise ValueError(f"image must be a floating-point tensor [B, C, H, W] or [C, H, W], got {show(image)}{hint}")
     return tuple(image.shape) if image.ndim == 4 else (1, *image.shape)
 

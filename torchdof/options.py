@@ -1,15 +1,16 @@
 """The options of a rendering, defined once: names, types, defaults, meaning, checks."""
 
+import contextlib
 import dataclasses
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterator
 from typing import Any, Literal, TypedDict, TypeVar, get_args
 
 from typing_extensions import Unpack
 
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera
-from .validation import choice, show, tolerance_of
+from .validation import choice, fields, show, tolerance_of
 
 __all__ = [
     "OPTION_NAMES",
@@ -30,7 +31,7 @@ Tolerance = float | Literal["draft", "preview", "final"]
 """RMS difference, display-encoded, from the same rendering with exact kernels, dense layers and full resolution."""
 
 _DISC = BlurTable.disc()  # shared, because a table caches its hash
-_NEWER_NUMBERS = {"focus_range_m": None, "tilt_deg": 0.0, "swing_deg": 0.0}  # defaults for states of older versions
+_NEWER_NUMBERS = ("focus_range_m", "tilt_deg", "swing_deg")  # missing in states of older versions
 _Decorated = TypeVar("_Decorated")
 
 
@@ -152,31 +153,23 @@ def read_state(state: Any) -> tuple[Camera, Options]:
     Raises:
         ValueError: If a field is missing, unknown or invalid; the message names it.
     """
-    names = ["camera", *(field.name for field in dataclasses.fields(Options))]
-    if not isinstance(state, Mapping):
-        raise ValueError(f"the state of a DepthOfField must be a dict from state_dict(), got {show(state)}")
-    _fields("the state of a DepthOfField", state, names)
-    camera = state["camera"]
-    if not isinstance(camera, Mapping):
-        raise ValueError(f"camera of the state must be a dict, got {show(camera)}")
-    camera = {**_NEWER_NUMBERS, **camera}
-    _fields("camera of the state", camera, list(Camera.__dataclass_fields__))
-    try:
-        restored_camera = Camera(**camera)
-    except ValueError as error:
-        raise ValueError(f"camera of the state: {error}") from error
-    try:
-        table = BlurTable.from_dict(state["table"])
-    except ValueError as error:
-        raise ValueError(f"table of the state: {error}") from error
-    try:
-        return restored_camera, Options(**{**{name: state[name] for name in names[1:]}, "table": table})
-    except ValueError as error:
-        raise ValueError(f"the state of a DepthOfField: {error}") from error
+    given = fields(
+        "the state of a DepthOfField", state, ("camera", *(field.name for field in dataclasses.fields(Options)))
+    )
+    required = [name for name in Camera.__dataclass_fields__ if name not in _NEWER_NUMBERS]
+    numbers = fields("camera of the state", given.pop("camera"), required, _NEWER_NUMBERS)
+    with _named("camera of the state"):
+        restored = Camera(**numbers)
+    with _named("table of the state"):
+        given["table"] = BlurTable.from_dict(given["table"])
+    with _named("the state of a DepthOfField"):
+        return restored, Options(**given)
 
 
-def _fields(what: str, fields: Mapping[str, Any], names: list[str]) -> None:
-    missing, unknown = [n for n in names if n not in fields], [n for n in fields if n not in names]
-    if missing or unknown:
-        problem = f"{missing[0]!r} is missing" if missing else f"{show(unknown[0])} is not one of them"
-        raise ValueError(f"{what} must have the fields {', '.join(names)}; {problem}")
+@contextlib.contextmanager
+def _named(what: str) -> Iterator[None]:
+    """Adds a name to the message of an error."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{what}: {error}") from error

@@ -145,8 +145,8 @@ def has_storage(values: Tensor) -> bool:
 
 
 def floating(value: Any) -> bool:
-    """Whether a value is a tensor of floating-point numbers of at least 16 bits."""
-    return isinstance(value, Tensor) and value.dtype in _FLOATS
+    """Whether a value is a tensor of floating-point numbers of at least 16 bits; False for a nested tensor."""
+    return isinstance(value, Tensor) and value.dtype in _FLOATS and not value.is_nested
 
 
 def _after_fork() -> None:

@@ -5,7 +5,7 @@ tensors are never read in a traced program.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,29 +23,23 @@ WHOLE_NUMBERS = (
     *(torch.int8, torch.int16, torch.int32, torch.int64),
 )
 
-FROM_NUMPY = "; use torch.from_numpy(image).movedim(-1, -3) for an array with channels last"
-"""Advice in messages about an image."""
-
 _MAX_STRETCH = 0.03  # largest change of a depth map's aspect ratio; estimators work at multiples of 14 or 64 px
 
 
 def show(value: Any) -> str:
     """A short text for a value in a message; never raises."""
+    if isinstance(value, Tensor) and value.is_nested:
+        return f"a nested {value.dtype} tensor; pass its parts one by one, or padded"
     if isinstance(value, Tensor):
         return f"a {value.dtype} tensor of shape {list(value.shape)}"
     if isinstance(value, np.ndarray):
-        return f"a {value.dtype} array of shape {list(value.shape)}"
+        advice = "use torch.from_numpy(array), and .movedim(-1, -3) for an image with channels last"
+        return f"a {value.dtype} array of shape {list(value.shape)}; {advice}"
     try:
         text = repr(value)
     except Exception:  # an integer with more digits than Python prints, or an error in the object's own repr
         text = ""
     return text if 0 < len(text) <= 60 else f"{type(value).__name__} {text[:40]}...".replace(" ...", "")
-
-
-def refuse_nested(name: str, value: Any) -> None:
-    """Refuse a nested tensor, whose shape and numbers most operations cannot read; a traced program has none."""
-    if not is_traced() and isinstance(value, Tensor) and value.is_nested:
-        raise ValueError(f"{name} must be a dense tensor, got a nested one; pass its parts one by one, or padded")
 
 
 def number(
@@ -73,11 +67,48 @@ def whole(name: str, value: Any, low: int, high: int) -> int:
     return value
 
 
-def choice(name: str, value: Any, choices: Sequence[str]) -> None:
-    """Refuse a value that is not one of two or more words."""
+def choice(name: str, value: Any, choices: Collection[str]) -> None:
+    """Refuse a value that is not one of some words."""
     if not isinstance(value, str) or value not in choices:
-        *others, last = map(repr, choices)
-        raise ValueError(f"{name} must be {', '.join(others)} or {last}, got {show(value)}")
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {show(value)}")
+
+
+def numbers(name: str, value: Any) -> Tensor:
+    """Finite numbers, such as lists of them or a tensor, as a float64 tensor on the CPU."""
+    if isinstance(value, Tensor):
+        is_whole = value.dtype in WHOLE_NUMBERS and value.layout == torch.strided and value.device.type != "meta"
+        values = (value if is_whole else real_tensor(name, value, "of numbers")).detach().to("cpu", torch.float64)
+    else:
+        if isinstance(value, list | tuple):
+            value = [item.detach() if isinstance(item, Tensor) else item for item in value]
+        try:
+            values = torch.as_tensor(value, device="cpu")
+            if not floating(values) and values.dtype not in WHOLE_NUMBERS:
+                raise TypeError
+            values = torch.as_tensor(value, dtype=torch.float64, device="cpu")  # the line above made a list float32
+        except (TypeError, ValueError, RuntimeError, OverflowError):
+            raise ValueError(f"{name} must be numbers, got {show(value)}") from None
+    if not bool(torch.isfinite(values).all()):
+        raise ValueError(f"{name} must be finite numbers, got {short(values)}")
+    return values
+
+
+def short(numbers: Tensor) -> str:
+    """The first of some numbers, and their shape, for a message."""
+    text = ", ".join(f"{x:g}" for x in numbers.flatten()[:6].tolist())
+    return f"[{text}{', ...' if numbers.numel() > 6 else ''}] of shape {list(numbers.shape)}"
+
+
+def fields(what: str, data: Any, required: Collection[str], optional: Collection[str] = ()) -> dict[str, Any]:
+    """The fields of a dict, which must have all required ones, and no others than these and the optional ones."""
+    if not isinstance(data, Mapping):
+        raise ValueError(f"{what} must be a dict, got {show(data)}")
+    names = (*required, *optional)
+    missing, unknown = [n for n in required if n not in data], [n for n in data if n not in names]
+    if missing or unknown:
+        problem = f"{missing[0]} is missing" if missing else f"{show(unknown[0])} is not one of them"
+        raise ValueError(f"{what} must have the fields {', '.join(names)}; {problem}")
+    return dict(data)
 
 
 def tolerance_of(value: Any) -> float:
@@ -132,9 +163,9 @@ def real_tensor(name: str, value: Any, what: str) -> Tensor:
     """
     if not isinstance(value, Tensor):
         raise ValueError(f"{name} must be a tensor {what}, got {show(value)}")
-    refuse_nested(name, value)
     if not floating(value):
-        raise ValueError(f"{name} must be a floating-point tensor {what}, got {value.dtype}; convert it with .float()")
+        got = show(value) if value.is_nested else f"{value.dtype}; convert it with .float()"
+        raise ValueError(f"{name} must be a floating-point tensor {what}, got {got}")
     if value.layout != torch.strided:
         raise ValueError(f"{name} must be a dense tensor {what}, got {value.layout}; convert it with .to_dense()")
     if value.device.type == "meta":
@@ -165,13 +196,12 @@ def _check_finite(name: str, values: Tensor) -> None:
 def image_and_map(image: Tensor, name: str, value: Tensor, unit: str) -> None:
     """Refuse an image and a one-channel map, in a unit, whose types, sizes or devices do not fit."""
     if not isinstance(image, Tensor):
-        got = show(image) + FROM_NUMPY if isinstance(image, np.ndarray) else type(image).__name__
+        got = show(image) if isinstance(image, np.ndarray) else type(image).__name__
         raise ValueError(f"image must be a tensor [B, C, H, W] in linear light, got {got}")
-    refuse_nested("image", image)
-    refuse_nested(name, value)
     if not floating(image):
         hint = "convert it with .float()" if image.is_floating_point() else "decode it first"
-        raise ValueError(f"image must be floating point in linear light, of 16 bits or more, got {image.dtype}; {hint}")
+        got = show(image) if image.is_nested else f"{image.dtype}; {hint}"
+        raise ValueError(f"image must be floating point in linear light, of 16 bits or more, got {got}")
     if image.ndim != 4:
         hint = "; did you forget the batch dimension? use image[None]" if image.ndim == 3 else ""
         raise ValueError(f"image must be [B, C, H, W] in linear light, got {list(image.shape)}{hint}")
@@ -188,7 +218,7 @@ def _map(name: str, unit: str, value: Tensor, image: Tensor) -> None:
     batch, _, height, width = image.shape
     expected = f"{name} must be [{batch}, 1, {height}, {width}] or [1, 1, {height}, {width}] {unit}"
     if not floating(value):
-        got = f"a {value.dtype} tensor" if isinstance(value, Tensor) else type(value).__name__
+        got = show(value) if isinstance(value, Tensor) else type(value).__name__
         raise ValueError(f"{expected} and floating point, got {got}")
     if value.ndim != 4:
         hint = "; did you forget the channel dimension?" if value.ndim == 3 else ""
@@ -250,10 +280,8 @@ def background(
     if hidden is None or where is None:
         missing = "background" if hidden is None else "background_depth (or background_coc_px)"
         raise ValueError(f"a background needs its depth, and a depth its background: {missing} is missing")
-    refuse_nested("background", hidden)
-    refuse_nested(name, where)
     like = (image.shape, image.dtype, image.device)
-    if not isinstance(hidden, Tensor) or (hidden.shape, hidden.dtype, hidden.device) != like:
+    if not floating(hidden) or (hidden.shape, hidden.dtype, hidden.device) != like:
         raise ValueError(f"background must be like the image, {show(image)}, got {show(hidden)}")
     _map(name, unit, where, image)
     if not is_traced():

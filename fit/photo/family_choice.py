@@ -37,7 +37,8 @@ def natural_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     Example:
         >>> import torch
         >>> from torchdof.optics import psf
-        >>> natural_psnr(psf.disc(6.0), psf.disc(6.0))
+        >>> disc = psf.pixel_kernels("disc", {"radius": 6.0})
+        >>> natural_psnr(disc, disc)
         200.0
     """
     first, second = _square("kernel", kernel), _square("other", other)
@@ -70,7 +71,9 @@ def highlight_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     Example:
         >>> import torch
         >>> from torchdof.optics import psf
-        >>> round(highlight_psnr(psf.disc(6.0), psf.ring(2.0, 5.0)))  # clearly different
+        >>> disc = psf.pixel_kernels("disc", {"radius": 6.0})
+        >>> ring = psf.pixel_kernels("ring", {"sigma": 2.0, "r_c": 5.0})
+        >>> round(highlight_psnr(disc, ring))  # clearly different
         7
     """
     first, second = _square("kernel", kernel), _square("other", other)

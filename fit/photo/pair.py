@@ -104,8 +104,9 @@ def fit_pair(
     Example:
         >>> import torch
         >>> from torchdof.optics import psf
-        >>> sharp = torch.nn.functional.pad(psf.disc(6.0), (20, 20, 20, 20))  # a picture of a dot
-        >>> blurred = torch.nn.functional.conv2d(sharp[None, None], psf.disc(8.0)[None, None], padding=8)[0, 0]
+        >>> dot, blur = (psf.pixel_kernels("disc", {"radius": radius}) for radius in (6.0, 8.0))
+        >>> sharp = torch.nn.functional.pad(dot, (20, 20, 20, 20))  # a picture of a dot
+        >>> blurred = torch.nn.functional.conv2d(sharp[None, None], blur[None, None], padding=8)[0, 0]
         >>> fit = fit_pair(sharp.numpy(), blurred.numpy())
         >>> fit.family, round(fit.params["radius"], 3)
         ('disc', 8.0)

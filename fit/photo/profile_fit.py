@@ -198,7 +198,7 @@ def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, I
 
     Example:
         >>> from torchdof.optics import psf
-        >>> dot = psf.disc(6.0, size=31).numpy()
+        >>> dot = psf.pixel_kernels("disc", {"radius": 6.0}, size=31).numpy()
         >>> r, strength, spoke = blur_strength(dot, 0.5 * dot)
         >>> round(float(r.max())), round(float(strength.mean()), 3), len(set(spoke.tolist()))
         (5, 0.5, 36)

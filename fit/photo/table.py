@@ -60,8 +60,9 @@ def fit_table(captures: Captures, family: str = "auto", **options: Any) -> BlurT
         >>> import torch
         >>> from torchdof.optics import psf
         >>> def picture(radius, blur=0.0):  # a white dot of a radius, blurred by a disc
-        ...     dot = psf.disc(radius, size=61) * 3.14159 * radius**2
-        ...     return torch.nn.functional.conv2d(dot[None, None], psf.disc(blur)[None, None], padding="same")[0, 0]
+        ...     dot = psf.pixel_kernels("disc", {"radius": radius}, size=61) * 3.14159 * radius**2
+        ...     kernel = psf.pixel_kernels("disc", {"radius": blur})
+        ...     return torch.nn.functional.conv2d(dot[None, None], kernel[None, None], padding="same")[0, 0]
         >>> near = Capture(picture(8.0).numpy(), picture(10.0, 5.0).numpy(), distance_m=0.8)
         >>> far = Capture(picture(8.0).numpy(), picture(6.4, 4.0).numpy(), distance_m=1.25)
         >>> fit_table(Captures((near, far), focus_m=1.0, width_px=1000), "disc")

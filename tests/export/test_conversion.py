@@ -68,10 +68,9 @@ def test_the_graph_has_only_standard_operators_and_loops_that_skip_layers_withou
 
 
 def test_convolutions_take_constant_weights_and_inputs_that_are_not_copied(layered: Any) -> None:
-    before, ramps = set(), 0
+    before = set()
     for graph in graphs(onnx.load(layered.path).graph):
         makers = {name: node for node in graph.node for name in node.output}
-        ramps += sum(node.op_type == "HardSigmoid" for node in graph.node)
         for node in graph.node:
             if node.op_type == "Conv":
                 maker, weight = makers.get(node.input[0]), makers[node.input[1]]
@@ -79,7 +78,7 @@ def test_convolutions_take_constant_weights_and_inputs_that_are_not_copied(layer
                 sources = [weight] if weight.op_type != "Gather" else [makers[name] for name in weight.input]
                 assert all(source.op_type in ("Constant", "ConstantOfShape") for source in sources)
                 assert len(node.input) == 2
-    assert before == {"Concat", "Conv"} and ramps == 10, "a ramp is one operator"
+    assert before == {"Concat", "Conv"}
 
 
 CATS_EYES = torchdof.BlurTable.polygon(5, vignetting=0.4)
@@ -90,7 +89,7 @@ SIMPLY = torchdof.DepthOfField(CAMERA, **SIMPLE)
     ("dof", "change", "message"),
     [
         (SIMPLY, {"inputs": "disparity"}, "inputs must be one of depth, coc_px"),
-        (SIMPLY, {"opset": 17}, "opset must be 20 or newer"),
+        (SIMPLY, {"opset": 17}, "opset must be a whole number from 20"),
         (SIMPLY, {"width": 640}, "same kernels at any image width"),
         (SIMPLY, {"channels": 0}, "channels must be a whole number"),
         (SIMPLY, {"path": "nowhere/dof.onnx"}, "there is no folder"),

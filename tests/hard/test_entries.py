@@ -1,4 +1,4 @@
-"""Errors of every public entry: storage-only types, impossible plans, lenses whose blur overflows."""
+"""Errors of every public entry: tensors that hold no numbers, impossible plans, lenses whose blur overflows."""
 
 import functools
 import math
@@ -8,73 +8,102 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
 
+from tests.kernels import kernel_of
 from tests.scenes import CAMERA, slope, texture, whole
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field
 from torchdof.augmentation import RandomDepthOfField
 from torchdof.depth import depth_from_values, fill_holes
 from torchdof.io.images import Picture, write_image
-from torchdof.optics import psf
 from torchdof.render.plan import Plan
 
 pytestmark = pytest.mark.hard
 
 DOF = DepthOfField(CAMERA)
 IMAGE, MAP = torch.ones(1, 3, 4, 5), torch.ones(1, 1, 4, 5)
-TAKES_TENSORS: dict[str, Callable[[Tensor], Any]] = {
-    "image": lambda x: DOF(x.expand(1, 3, 4, 5), MAP),
-    "depth": lambda x: DOF(IMAGE, x),
-    "focus_m": lambda x: DOF(IMAGE, MAP, focus_m=x.flatten()[:1]),
-    "background": lambda x: DOF(IMAGE, MAP, background=x.expand(1, 3, 4, 5), background_depth=MAP),
-    "background_depth": lambda x: DOF(IMAGE, MAP, background=IMAGE, background_depth=x),
-    "attention": lambda x: DOF(IMAGE, MAP, attention=x),
-    "rgba": lambda x: DOF.layers(x[None].expand(1, 2, 4, 4, 5), torch.ones(2)),
-    "depth_m": lambda x: DOF.layers(torch.ones(1, 2, 4, 4, 5), x.flatten()[:2]),
-    "coc_px": lambda x: blur_by_coc(IMAGE, x),
-    "f_number": lambda x: Camera(f_number=x.flatten()[:1]),
-    "depth ": lambda x: CAMERA.coc_px(x, 10),
-    "depth  ": lambda x: CAMERA.focus_at(x, 1, 1),
-    "coc": lambda x: BlurTable("gaussian", x.flatten()[:1], {"sigma": [1.0]}),
-    "sigma": lambda x: BlurTable("gaussian", [1.0], {"sigma": x.flatten()[:1]}),
-    "radius": lambda x: psf.disc(x.flatten()[:1]),
-    "depth values": lambda x: depth_from_values(x),
-    "depth   ": lambda x: fill_holes(x, "far"),
-    "pixels": lambda x: write_image("never.exr", Picture(x.expand(1, 3, 4, 5))),
-}
-TAKES_NESTED: dict[str, Callable[[Tensor], Any]] = {
-    "image": lambda x: DOF(x, MAP),
-    "image ": lambda x: RandomDepthOfField(p=1.0)(x, MAP),
-    "depth": lambda x: DOF(IMAGE, x),
-    "coc_px": lambda x: blur_by_coc(IMAGE, x),
-    "focus_m": lambda x: DOF(IMAGE, MAP, focus_m=x),
-    "tilt_deg": lambda x: Camera(tilt_deg=x),
-    "background": lambda x: DOF(IMAGE, MAP, background=x, background_depth=MAP),
-    "background_depth": lambda x: DOF(IMAGE, MAP, background=IMAGE, background_depth=x),
-    "attention": lambda x: DOF(IMAGE, MAP, attention=x),
-    "rgba": lambda x: DOF.layers(x, torch.ones(2)),
-    "coc": lambda x: BlurTable("gaussian", x, {"sigma": [1.0]}),
-    "depth ": lambda x: CAMERA.coc_px(x, 10),
-    "pixels": lambda x: write_image("never.exr", Picture(x)),
+COLOURS, ALONE, ONE = (1, 3, 4, 5), (1, 1, 4, 5), (1,)
+TAKES_TENSORS: dict[str, tuple[tuple[int, ...], Callable[[Tensor], Any]]] = {  # shape of a valid tensor, call with it
+    "image": (COLOURS, lambda x: DOF(x, MAP)),
+    "image ": (COLOURS, lambda x: RandomDepthOfField(p=1.0)(x, MAP)),
+    "depth": (ALONE, lambda x: DOF(IMAGE, x)),
+    "depth ": (ALONE, lambda x: CAMERA.coc_px(x, 10)),
+    "depth  ": (ALONE, lambda x: CAMERA.focus_at(x, 1, 1)),
+    "depth   ": (ALONE, lambda x: fill_holes(x, "far")),
+    "depth values": (ALONE, lambda x: depth_from_values(x)),
+    "coc_px": (ALONE, lambda x: blur_by_coc(IMAGE, x)),
+    "background": (COLOURS, lambda x: DOF(IMAGE, MAP, background=x, background_depth=MAP)),
+    "background_depth": (ALONE, lambda x: DOF(IMAGE, MAP, background=IMAGE, background_depth=x)),
+    "attention": (ALONE, lambda x: DOF(IMAGE, MAP, attention=x)),
+    "rgba": ((1, 2, 4, 4, 5), lambda x: DOF.layers(x, torch.ones(2))),
+    "depth_m": ((2,), lambda x: DOF.layers(torch.ones(1, 2, 4, 4, 5), x)),
+    "focus_m": (ONE, lambda x: DOF(IMAGE, MAP, focus_m=x)),
+    "f_number": (ONE, lambda x: Camera(f_number=x)),
+    "tilt_deg": (ONE, lambda x: Camera(tilt_deg=x)),
+    "focus_range_m": (ONE, lambda x: Camera(focus_range_m=(x, 2.0))),
+    "coc": (ONE, lambda x: BlurTable("gaussian", x, {"sigma": [1.0]})),
+    "sigma": (ONE, lambda x: BlurTable("gaussian", [1.0], {"sigma": x})),
+    "radius": (ONE, lambda x: kernel_of("disc", x)),
+    "pixels": (COLOURS, lambda x: write_image("never.exr", Picture(x))),
 }
 STORED = [torch.float8_e4m3fn, torch.float8_e5m2, torch.float8_e4m3fnuz, torch.float8_e5m2fnuz]
 NEWER = [getattr(torch, name) for name in ("float8_e8m0fnu", "float4_e2m1fn_x2") if hasattr(torch, name)]
 
 
+def check(name: str, make: Callable[[tuple[int, ...]], Tensor], message: str) -> None:
+    shape, call = TAKES_TENSORS[name]
+    with pytest.raises(ValueError, match=rf"{name.strip()} {message}"):
+        call(make(shape))
+
+
 @pytest.mark.parametrize("dtype", [*STORED, *NEWER], ids=str)
 @pytest.mark.parametrize("name", TAKES_TENSORS)
 def test_storage_only_types_are_refused_by_name(name: str, dtype: torch.dtype) -> None:
-    stored = torch.full((1, 1, 4, 5), 56, dtype=torch.uint8).view(dtype)
-    with pytest.raises(ValueError, match=rf"{name.strip()}\b.* got .*float(8|4)"):
-        TAKES_TENSORS[name](stored)
+    check(name, lambda shape: torch.full(shape, 56, dtype=torch.uint8).view(dtype), ".* got .*float(8|4)")
 
 
 @pytest.mark.filterwarnings("ignore:The PyTorch API of nested tensors:UserWarning")
 @pytest.mark.parametrize("layout", [torch.strided, torch.jagged], ids=str)
-@pytest.mark.parametrize("name", TAKES_NESTED)
+@pytest.mark.parametrize("name", TAKES_TENSORS)
 def test_nested_tensors_are_refused_by_name(name: str, layout: torch.layout) -> None:
     nested = torch.nested.nested_tensor([torch.ones(3, 4, 5), torch.ones(3, 6, 5)], layout=layout)
-    with pytest.raises(ValueError, match=rf"{name.strip()} must be a dense tensor, got a nested one"):
-        TAKES_NESTED[name](nested)
+    check(name, lambda _: nested, "must be .*got .*nested")
+
+
+class Wrapper(Tensor):
+    """A wrapper subclass: it has a shape but no memory."""
+
+    @staticmethod
+    def __new__(cls, shape: tuple[int, ...]) -> "Wrapper":
+        wrapper: Wrapper = torch.Tensor._make_wrapper_subclass(cls, shape, dtype=torch.float32)
+        return wrapper
+
+    @classmethod
+    def __torch_dispatch__(cls, *_: object, **__: object) -> object:
+        raise NotImplementedError
+
+
+def fake(shape: tuple[int, ...]) -> Tensor:
+    with FakeTensorMode():
+        return torch.ones(shape)
+
+
+def with_bytes(shape: tuple[int, ...], count: int) -> Tensor:
+    values = torch.ones(shape)
+    values.untyped_storage().resize_(count)
+    return values
+
+
+@pytest.mark.parametrize("name", TAKES_TENSORS)
+def test_a_tensor_without_its_memory_is_refused_by_name(name: str) -> None:
+    """The compiled engine would read invalid addresses."""
+    check(name, functools.partial(with_bytes, count=0), "must be a.* that holds data, got a freed storage")
+
+
+@pytest.mark.parametrize("make", [functools.partial(with_bytes, count=10), fake, Wrapper])
+@pytest.mark.parametrize("name", ["image", "depth", "coc_px"])
+def test_a_part_of_its_memory_or_a_wrapper_is_refused_by_name(name: str, make: Callable[..., Tensor]) -> None:
+    check(name, make, "must be a tensor .* that holds data")
 
 
 # Plans

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 import torchdof.fit
+from tests.kernels import kernel_of
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
 from torchdof.augmentation import RandomDepthOfField
 from torchdof.cli.main import app
@@ -28,7 +29,6 @@ from torchdof.distributed import Pair, RenderShards, shard_rows
 from torchdof.fit import fit_pair, fit_profile
 from torchdof.functional import splat
 from torchdof.io.images import Picture, read_image, write_image
-from torchdof.optics.psf import gaussian
 
 pytestmark = pytest.mark.hard
 
@@ -84,7 +84,7 @@ def commanded(*options: str) -> Tensor:
 def fitted() -> None:
     dot = torch.zeros(1, 1, 31, 31)
     dot[..., 13:18, 13:18] = 1.0
-    blurred = torch.nn.functional.conv2d(dot, gaussian(2.0, size=15).to(dot)[None, None], padding=7)
+    blurred = torch.nn.functional.conv2d(dot, kernel_of("gaussian", 2.0, size=15).to(dot)[None, None], padding=7)
     fit_pair(dot[0, 0].numpy(), blurred[0, 0].numpy(), "gaussian")
     r = np.linspace(0.0, 5.0, 40)
     fit_profile(r, np.exp(-((r - 1) ** 2)), family="ring")

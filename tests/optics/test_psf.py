@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from tests import loops
+from tests.kernels import kernel_of
 from torchdof.optics import psf
 
 LENGTH_PX = st.one_of(st.just(0.0), st.floats(1e-9, 1e-2), st.floats(0.01, 12.0))
@@ -104,14 +105,14 @@ def test_second_moment_is_that_of_the_profile_without_the_pixel(family: str, par
 
 @pytest.mark.parametrize("radius", [1e-3, 1e-2, 0.03, 0.1])
 def test_a_small_disc_moves_light_by_the_square_of_its_radius(radius: float) -> None:
-    kernel = psf.disc(radius)
+    kernel = kernel_of("disc", radius)
     assert kernel.shape == (3, 3)
     assert 1.0 - float(kernel[1, 1]) == pytest.approx(radius**2, rel=0.03)
 
 
 @pytest.mark.parametrize("radius", [300.0, 500.0])
 def test_kernels_of_hundreds_of_pixels_have_the_right_level_and_moment(radius: float) -> None:
-    kernel = psf.disc(radius)
+    kernel = kernel_of("disc", radius)
     inside = kernel[kernel.shape[-1] // 2, kernel.shape[-1] // 2]
     assert float(inside) == pytest.approx(1 / (math.pi * radius**2), rel=1e-5)
     assert second_moment(kernel) == pytest.approx(radius**2 / 2, abs=0.12)  # a box would add 1/6
@@ -169,16 +170,16 @@ def test_gradients_are_finite_where_kernels_are_not_smooth(family: str, length: 
 @pytest.mark.parametrize(
     ("one", "other", "apart"),
     [
-        (psf.softm(3.3, 0.0, size=9), psf.disc(3.3, size=9), 5e-4),
-        (psf.softm(3.3, 0.4, b=0.0, m=2.0), psf.softm(3.3, 0.4, b=0.0, m=7.0), 1e-300),
-        (psf.ring(1.7, 0.0), psf.gaussian(1.7), 1e-3),
-        (psf.radial(torch.ones(5), 3.3), psf.disc(3.3), 5e-4),
+        (kernel_of("softm", 3.3, 0.0, size=9), kernel_of("disc", 3.3, size=9), 5e-4),
+        (kernel_of("softm", 3.3, 0.4, b=0.0, m=2.0), kernel_of("softm", 3.3, 0.4, b=0.0, m=7.0), 1e-300),
+        (kernel_of("ring", 1.7, 0.0), kernel_of("gaussian", 1.7), 1e-3),
+        (kernel_of("radial", torch.ones(5), 3.3), kernel_of("disc", 3.3), 5e-4),
     ],
     ids=["without a soft rim", "without a tilt", "without a hole", "flat"],
 )
 def test_families_contain_simpler_ones_as_special_cases(one: Tensor, other: Tensor, apart: float) -> None:
     assert distance(one, other) < apart
-    assert psf.softm(3.3, 0.4, size=9)[4, 8] > psf.disc(3.3, size=9)[4, 8]
+    assert kernel_of("softm", 3.3, 0.4, size=9)[4, 8] > kernel_of("disc", 3.3, size=9)[4, 8]
 
 
 @pytest.mark.parametrize("family", psf.FAMILIES)
@@ -192,7 +193,7 @@ def test_kernel_of_size_zero_is_one_pixel(family: str) -> None:
 
 
 def test_positive_tilt_brightens_the_rim() -> None:
-    flat, rim = psf.softm(8.0, 0.2), psf.softm(8.0, 0.2, b=2.0, m=4.0)
+    flat, rim = kernel_of("softm", 8.0, 0.2), kernel_of("softm", 8.0, 0.2, b=2.0, m=4.0)
     centre = flat.shape[-1] // 2
     assert rim[centre, centre] < flat[centre, centre] and rim[centre, centre + 7] > flat[centre, centre + 7]
 
@@ -212,11 +213,11 @@ def test_less_than_1e_5_of_the_light_is_outside_the_support(family: str, params:
 
 def test_a_batch_of_parameters_equals_each_alone() -> None:
     sigma, r_c = torch.tensor([[0.5], [1.0]]), torch.tensor([[0.0, 2.0, 3.0]])
-    together = psf.ring(sigma, r_c, size=15)
+    together = kernel_of("ring", sigma, r_c, size=15)
     assert together.shape == (2, 3, 15, 15)
     for i in range(2):
         for j in range(3):
-            assert_close(together[i, j], psf.ring(float(sigma[i, 0]), float(r_c[0, j]), size=15))
+            assert_close(together[i, j], kernel_of("ring", float(sigma[i, 0]), float(r_c[0, j]), size=15))
 
 
 @pytest.mark.parametrize(
@@ -265,9 +266,9 @@ def test_the_window_of_a_huge_kernel_is_computed_alone(family: str, params: dict
 
 
 def test_sizes_and_windows_are_odd_and_a_smaller_size_keeps_the_sum() -> None:
-    whole, cut = psf.gaussian(2.0, size=21), psf.gaussian(2.0, size=5)
+    whole, cut = kernel_of("gaussian", 2.0, size=21), kernel_of("gaussian", 2.0, size=5)
     assert_close(cut, whole[8:13, 8:13] / whole[8:13, 8:13].sum())
-    assert torch.equal(psf.disc(3.0), psf.pixel_kernels("disc", {"radius": 3.0}, window=99))
+    assert torch.equal(kernel_of("disc", 3.0), psf.pixel_kernels("disc", {"radius": 3.0}, window=99))
     for size in (0, -1, 4):
         for sizes in ({"size": size}, {"window": size}):
             with pytest.raises(ValueError, match=f"size must be a positive odd number of pixels, got {size}"):

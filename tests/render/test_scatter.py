@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from tests import loops
+from tests.kernels import kernel_of
 from tests.tolerances import TOLERANCES
-from torchdof.optics import psf
 from torchdof.render import scatter as literal
 from torchdof.render.convolution import convolve
 from torchdof.render.scatter import fold
@@ -25,18 +25,18 @@ REAL = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def bank(*radii: float, size: int | None = None, dtype: torch.dtype = torch.float64) -> Tensor:
     """One soft disc a channel: `[C, k, k]`."""
     radius = torch.tensor(radii, dtype=torch.float64)
-    return psf.softm(radius, radius / 10, b=0.7, m=2.0, size=size).to(dtype)
+    return kernel_of("softm", radius, radius / 10, b=0.7, m=2.0, size=size).to(dtype)
 
 
 def test_fold_with_a_kernel_of_its_own_for_every_pixel_equals_a_plain_loop() -> None:
     light = torch.rand(2, 3, 5, 6, dtype=torch.float64)
-    kernels = psf.disc(torch.tensor([0.0, 1.3, 2.4]), size=5).unsqueeze(1)
+    kernels = kernel_of("disc", torch.tensor([0.0, 1.3, 2.4]), size=5).unsqueeze(1)
     weights = torch.rand(2, 3, 5, 6, dtype=torch.float64)
 
-    def kernel_of(item: int, row: int, column: int) -> Tensor:
+    def blended(item: int, row: int, column: int) -> Tensor:
         return (weights[item, :, row, column, None, None, None] * kernels).sum(0)
 
-    assert_close(fold(light, kernels, weights=weights), loops.scatter(light, kernel_of), rtol=1e-12, atol=1e-14)
+    assert_close(fold(light, kernels, weights=weights), loops.scatter(light, blended), rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize(("dtype", "limit"), [(torch.float32, 1e-5), (torch.float64, 1e-10)])
@@ -52,7 +52,7 @@ def test_a_highlight_changes_nothing_outside_its_own_disc(radius: float) -> None
     dark = torch.full((1, 1, 9, 201), 0.1)
     lit = dark.clone()
     lit[..., 4, 100] = 6.5e4
-    kernels = psf.disc(radius).unsqueeze(0).float()
+    kernels = kernel_of("disc", radius).unsqueeze(0).float()
     apart = (torch.arange(201) - 100).abs() > radius + 1
     assert_close(convolve(lit, kernels)[..., apart], convolve(dark, kernels)[..., apart], rtol=1e-6, atol=0.0)
 
@@ -69,7 +69,7 @@ def test_the_adjoint_of_fold_is_unfold() -> None:
 def test_strips_agree_with_the_whole_frame(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
     light, kernels = torch.rand(1, 2, 13, 6, dtype=torch.float64), bank(1.2, 2.1, size=7)
     weights = torch.rand(1, 3, 13, 6, dtype=torch.float64)
-    each = psf.disc(torch.tensor([0.0, 1.0, 3.4]), size=7).unsqueeze(1)
+    each = kernel_of("disc", torch.tensor([0.0, 1.0, 3.4]), size=7).unsqueeze(1)
     whole, whole_weighted = fold(light, kernels), fold(light, each, weights=weights)
     strips = []
 
@@ -111,13 +111,13 @@ def test_scatter_of_any_shape_and_stride_equals_a_direct_sum(
 
 @pytest.mark.parametrize("radius", [2.5, 14.0])
 def test_a_single_kernel_applies_to_all_channels(radius: float) -> None:
-    light, kernel = torch.rand(2, 3, 20, 24), psf.disc(radius).float()[None]
+    light, kernel = torch.rand(2, 3, 20, 24), kernel_of("disc", radius).float()[None]
     assert_close(convolve(light, kernel), convolve(light, kernel.repeat(3, 1, 1)), rtol=1e-6, atol=1e-6)
     assert_close(convolve(light, kernel), fold(light, kernel), rtol=1e-5, atol=1e-6)
 
 
 def test_a_large_kernel_uses_the_halo() -> None:
-    light, kernels = torch.rand(1, 2, 90, 100), torch.stack([psf.disc(12.0), psf.disc(11.8)]).float()
+    light, kernels = torch.rand(1, 2, 90, 100), torch.stack([kernel_of("disc", 12.0), kernel_of("disc", 11.8)]).float()
     half = kernels.shape[-1] // 2
     whole = convolve(light, kernels)[..., half:-half, half:-half]
     assert_close(convolve(light, kernels, half), whole, rtol=1e-5, atol=1e-6)
@@ -129,7 +129,7 @@ def test_a_large_kernel_uses_the_halo() -> None:
 @pytest.mark.parametrize("channels", [1, 3, 4, 5, 8, 9])
 @pytest.mark.parametrize("rows", [1, 2, 13])
 def test_the_halo_is_used_for_any_number_of_items_and_channels(rows: int, channels: int, items: int) -> None:
-    bank = torch.stack([psf.disc(1.6 + 0.2 * c, size=7) for c in range(channels)])
+    bank = torch.stack([kernel_of("disc", 1.6 + 0.2 * c, size=7) for c in range(channels)])
     light = torch.rand(items, channels, rows + 6, 17, dtype=torch.float64)
     wanted = fold(light, bank)[..., 3:-3, 3:-3]
     assert_close(convolve(light, bank, halo=3), wanted, rtol=0, atol=1e-12)

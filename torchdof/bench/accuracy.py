@@ -18,7 +18,7 @@ from ..module import blur_by_coc
 from ..reference import metrics
 from ..reference.degraded import KINDS, degrade
 from ..reference.ikoma import layered_fft
-from ..reference.lens_views import lens_views_by_coc
+from ..reference.lens_views import lens_views
 from ..reference.scenes import Scene, read_scenes
 from .measurement import BenchScene, Renderer, error, measure
 from .report import Row, publish, summary
@@ -29,7 +29,7 @@ _TILE_PX = 128
 
 
 def _lens_views(views: int, image: Tensor, coc_px: Tensor) -> Tensor:
-    return lens_views_by_coc(image, coc_px, views=views).image
+    return lens_views(image, coc_px, views=views).image
 
 
 def renderers(degraded: bool) -> dict[str, Renderer]:

@@ -245,7 +245,7 @@ def tint_focus(image: Tensor, coc_px: Tensor, has_alpha: bool = False) -> Tensor
         raise ValueError(f"image must have 1 or 3 channels of colour, got {image.shape[1] - has_alpha}")
     colour, alpha = (image[:, :-1], image[:, -1:]) if has_alpha else (image, image[:, :0])
     near, sharp, far = (image.new_tensor(tint)[:, None, None] for tint in (_NEAR, _SHARP, _FAR))
-    tint = torch.lerp(torch.where(coc_px < 0, near, far), sharp, (2.0 - coc_px.abs()).clamp(0.0, 1.0))
+    tint = torch.lerp(torch.where(coc_px < 0, near, far), sharp, (2.0 - coc_px.abs()).clamp(0.0, 1.0).to(image))
     grey = colour.mean(dim=1, keepdim=True)
     floor = _DARK_LIGHT * grey.mean() * (alpha if has_alpha else 1.0)
     return torch.cat([(1.0 - _TINT) * grey + _TINT * tint * (grey + floor), alpha], dim=1)

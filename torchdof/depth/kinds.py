@@ -6,7 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from ..validation import WHOLE_NUMBERS, number, real_tensor, show
+from ..validation import WHOLE_NUMBERS, choice, number, real_tensor, show
 
 __all__ = ["DepthKind", "depth_from_values", "number_map"]
 
@@ -54,8 +54,7 @@ def depth_from_values(
         >>> depth_from_values(torch.tensor([[[[1500.0, 0.0]]]]), "z", scale=0.001)
         tensor([[[[1.5000,    nan]]]])
     """
-    if not isinstance(kind, str) or kind not in KINDS:
-        raise ValueError(f"the kind of depth must be one of {', '.join(KINDS)}, got {show(kind)}")
+    choice("the kind of depth", kind, KINDS)
     number_map("depth values", values)
     if values.ndim != 4 or values.shape[1] != 1:
         raise ValueError(f"depth values must be [B, 1, H, W], got {list(values.shape)}")
@@ -91,8 +90,7 @@ def depth_from_values(
 
 def _ray_length(like: Tensor, fov_x_deg: float) -> Tensor:
     """Length of the ray to depth 1 through each pixel's centre, ``[1, 1, H, W]``."""
-    if isinstance(fov_x_deg, bool) or not isinstance(fov_x_deg, int | float) or not 0.0 < fov_x_deg < 180.0:
-        raise ValueError(f"the field of view must be in (0, 180) degrees, got {show(fov_x_deg)}")
+    number("the field of view", fov_x_deg, 0.0, 180.0, "degrees")
     height, width = like.shape[-2:]
     focal_px = width / 2 / max(math.tan(math.radians(fov_x_deg) / 2), 1e-300)
     x = (torch.arange(width, dtype=like.dtype, device=like.device) + 0.5 - width / 2) / focal_px

@@ -40,28 +40,17 @@ def motion_between(current_frame: Tensor, previous_frame: Tensor, is_changed: Te
     return 2.0 * F.interpolate(_to_fractions(*levels[0], flow), size=(height, width), mode="nearest")
 
 
-def sample(image: Tensor, flow: Tensor) -> Tensor:
-    """The previous image at ``pixel + flow``, bilinear: ``[B, C, H, W]``."""
-    height, width = image.shape[-2:]
-    y, x = torch.meshgrid(
-        torch.arange(height, dtype=flow.dtype, device=flow.device),
-        torch.arange(width, dtype=flow.dtype, device=flow.device),
-        indexing="ij",
-    )
-    grid = torch.stack([(x + flow[:, 0] + 0.5) * 2 / width - 1, (y + flow[:, 1] + 0.5) * 2 / height - 1], dim=-1)
-    return F.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=False)
+def sample(maps: Tensor, flow: Tensor, mode: str = "bilinear") -> Tensor:
+    """The maps ``[B, C, H, W]`` of the previous frame at ``pixel + flow``, interpolated or of the nearest pixel."""
+    size = maps.shape[-2:]
+    y, x = torch.meshgrid(*(torch.arange(n, dtype=flow.dtype, device=flow.device) + 0.5 for n in size), indexing="ij")
+    grid = torch.stack([(x + flow[:, 0]) * 2 / size[1] - 1, (y + flow[:, 1]) * 2 / size[0] - 1], dim=-1)
+    return F.grid_sample(maps, grid, mode=mode, padding_mode="border", align_corners=False)
 
 
 def shifted(maps: Tensor, flow: Tensor) -> Tensor:
-    """The maps ``[B, K, H, W]`` of the previous frame at ``pixel + flow``, rounded to the nearest pixel."""
-    batch, count, height, width = maps.shape
-    y, x = torch.meshgrid(
-        torch.arange(height, device=flow.device), torch.arange(width, device=flow.device), indexing="ij"
-    )
-    column = (x + flow[:, 0].round().long()).clamp(0, width - 1)
-    row = (y + flow[:, 1].round().long()).clamp(0, height - 1)
-    index = (row * width + column).reshape(batch, 1, -1).expand(-1, count, -1)
-    return maps.flatten(2).gather(2, index).reshape(batch, count, height, width)
+    """The maps ``[B, K, H, W]`` of the previous frame at ``pixel + flow``, rounded to whole pixels."""
+    return sample(maps, flow.round(), "nearest")
 
 
 def _halved(picture: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ..tensors import is_traced, refuse_old_compiler
-from ..validation import number, show
+from ..validation import choice, number, show, whole
 from .kinds import depth_from_values, number_map
 
 __all__ = ["RELATIVE_KINDS", "RelativeKind", "Scale", "from_relative", "solve_scale"]
@@ -69,8 +69,7 @@ def from_relative(
         tensor([[[[5.0000, 1.6623, 1.0000]]]])
     """
     refuse_old_compiler()
-    if not isinstance(kind, str) or kind not in RELATIVE_KINDS:
-        raise ValueError(f"the kind of relative depth must be one of {', '.join(RELATIVE_KINDS)}, got {show(kind)}")
+    choice("the kind of relative depth", kind, RELATIVE_KINDS)
     near_m, far_m = _near_and_far(near_m, far_m, kind)
     _relative_map(values)
     dtype = values.dtype if values.is_floating_point() else torch.float32
@@ -185,13 +184,11 @@ def solve_scale(
         >>> round(scale.scale, 6), round(abs(scale.offset), 6)
         (4.0, 0.0)
     """
-    if not isinstance(kind, str) or kind not in RELATIVE_KINDS:
-        raise ValueError(f"the kind of relative depth must be one of {', '.join(RELATIVE_KINDS)}, got {show(kind)}")
+    choice("the kind of relative depth", kind, RELATIVE_KINDS)
     _relative_map(values)
     if values.shape[0] != 1:
         raise ValueError(f"values must be one map [1, 1, H, W], got {list(values.shape)}; solve each on its own")
-    if isinstance(patch, bool) or not isinstance(patch, int) or patch < 1:
-        raise ValueError(f"patch must be a whole number of pixels, at least 1, got {show(patch)}")
+    whole("patch", patch, 1, 2**31)
     samples = [_point(values, point, kind, patch) for point in points]
     if len({value for value, _ in samples}) < 2:
         raise ValueError(

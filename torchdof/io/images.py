@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..validation import real_tensor, show
+from ..validation import choice, real_tensor, show
 from .atomic import atomic_file
 from .channels import colour_channels, depth_channel
 from .decode import Part, first_line, is_complete, read_array, read_parts, utf8_name
@@ -97,8 +97,8 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
         0.216
     """
     path = existing_image(path)
-    if transfer not in (None, "linear", "srgb"):
-        raise ValueError(f"transfer must be 'linear' or 'srgb', got {transfer!r}")
+    if transfer is not None:
+        choice("transfer", transfer, ("linear", "srgb"))
     with _memory_errors_named(path):
         parts = read_parts(path)
         try:

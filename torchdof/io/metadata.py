@@ -88,7 +88,8 @@ def camera_settings(metadata: Mapping[str, tuple[Any, Any]], width: int, height:
     def number(*names: str, low: float = 0.0, high: float = math.inf) -> float | None:
         for name in names:
             value = metadata.get(name, (None, None))[1]
-            if isinstance(value, int | float) and 0 < value and low <= value <= high:
+            is_number = isinstance(value, float) or (isinstance(value, int) and value < 2**63)
+            if is_number and 0 < value and low <= value <= high:
                 return float(value)
         return None
 

@@ -7,7 +7,7 @@ Reference:
 import os
 import struct
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,7 @@ from .atomic import atomic_file
 __all__ = ["add_exif", "write_animation"]
 
 _DURATION_MS = 40  # of one picture
-_ANIMATION = 0x02  # flag of a WebP that is an animation
-_FLAGS = {b"ICCP": 0x20, b"ALPH": 0x10, b"EXIF": 0x08}  # flags of a WebP with these chunks
+_FLAGS = {b"ICCP": 0x20, b"ALPH": 0x10, b"EXIF": 0x08, b"ANIM": 0x02}  # flags of a WebP with these chunks
 
 
 def add_exif(path: Path, spec: Any) -> None:
@@ -43,8 +42,7 @@ def add_exif(path: Path, spec: Any) -> None:
             raise OSError(f"{pixel}: could not be written; is the disk full?")
         length, _, exif = pixel.read_bytes().partition(b"eXIf")
     chunks = _chunks(path) | {b"EXIF": _chunk(b"EXIF", exif[: int.from_bytes(length[-4:], "big")])}
-    flags = sum(flag for name, flag in _FLAGS.items() if name in chunks)
-    path.write_bytes(_webp(flags, spec.width, spec.height, chunks.values()))
+    path.write_bytes(_webp(chunks, spec.width, spec.height, chunks.values()))
 
 
 def write_animation(path: str | os.PathLike[str], pictures: Sequence[Path]) -> None:
@@ -56,17 +54,17 @@ def write_animation(path: str | os.PathLike[str], pictures: Sequence[Path]) -> N
 
     spec = oiio.ImageBuf(str(pictures[0])).spec()
     place = bytes(6) + _size(spec.width, spec.height) + _DURATION_MS.to_bytes(3, "little")
-    shared, frames, flags = dict[bytes, bytes](), list[bytes](), _ANIMATION
+    shared, frames, names = dict[bytes, bytes](), list[bytes](), {b"ANIM"}
     for picture in pictures:
         chunks = _chunks(picture)
-        flags |= sum(flag for name, flag in _FLAGS.items() if name in chunks)
+        names |= chunks.keys()
         shared |= {name: chunk for name, chunk in chunks.items() if name in (b"ICCP", b"EXIF")}
         image = b"".join(chunk for name, chunk in chunks.items() if name in (b"ALPH", b"VP8 "))
         frames.append(_chunk(b"ANMF", place + b"\2" + image))  # 2: not blended with the picture before
     profile, exif = (shared.get(name, b"") for name in (b"ICCP", b"EXIF"))
     with atomic_file(path) as temporary:
         parts = [profile, _chunk(b"ANIM", bytes(6)), *frames, exif]
-        temporary.write_bytes(_webp(flags, spec.width, spec.height, parts))
+        temporary.write_bytes(_webp(names, spec.width, spec.height, parts))
 
 
 def _chunks(path: Path) -> dict[bytes, bytes]:
@@ -80,8 +78,9 @@ def _chunks(path: Path) -> dict[bytes, bytes]:
     return chunks
 
 
-def _webp(flags: int, width: int, height: int, chunks: Iterable[bytes]) -> bytes:
-    """A file with a header that lists its chunks."""
+def _webp(names: Collection[bytes], width: int, height: int, chunks: Iterable[bytes]) -> bytes:
+    """A file with a header that lists the names of its chunks, those in an animation too."""
+    flags = sum(flag for name, flag in _FLAGS.items() if name in names)
     header = _chunk(b"VP8X", bytes([flags, 0, 0, 0]) + _size(width, height))
     return _chunk(b"RIFF", b"".join([b"WEBP", header, *chunks]))
 

@@ -3,6 +3,8 @@
 It has a plain C interface (``src/api.h``) and is built when the package is installed. Without it the PyTorch engine is
 used. The environment variable ``TORCHDOF_ENGINE`` selects: ``auto`` (the default) uses the compiled engine where it
 can, ``native`` requires it, ``torch`` disables it.
+
+Every computation raises ``MemoryError`` if there is not enough memory.
 """
 
 import ctypes
@@ -14,7 +16,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,8 +25,9 @@ __all__ = [
     "HALF_LARGEST",
     "MOST_LEVELS",
     "MOST_PLANES",
-    "Kind",
     "FrameLayers",
+    "Kind",
+    "Spots",
     "blend",
     "blend_gradient",
     "chosen",
@@ -65,167 +68,122 @@ _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
 _REVISION = 8  # of ``src/api.h``
 
 Rules = Sequence[tuple[int, float, float, float]]
-_Floats = ctypes.POINTER(ctypes.c_float)
+
+KernelMask = tuple[Tensor, Tensor, float, float | Tensor]
+"""Mask of a lens's field for kernels of one radius (:class:`torchdof.optics.placed_kernels.FieldMask`): transmittance
+``[1 or C, distances, rows, columns]``, positions of these samples ``[distances, 3]``, signed radius in pixels; the
+fourth is not used."""
 
 
-class KernelMask(Protocol):
-    """Mask of a lens's field for kernels of one radius: :class:`torchdof.optics.placed_kernels.FieldMask`."""
+class Spots(NamedTuple):
+    """Recipe for the kernels of n circles of confusion and C colours, as plain numbers because n is small.
 
-    @property
-    def values(self) -> Tensor:
-        """Transmittance ``[1 or C, distances, rows, columns]``."""
+    Args:
+        templates: Cells of the templates in use, each ``[C, 2 cells + 3, 2 cells + 3]``, float32.
+        which: Four indices into ``templates`` for each kernel: node below and above, and both of the next finer level.
+        part: Weight of the node above, in [0, 1].
+        finer: Weight of the finer level, in [0, 1].
+        reach: Radius of the PSF in pixels, C for each kernel.
+        fade: Weight of the kernel against a single pixel, in [0, 1], C for each kernel.
+        flipped: Whether the kernel is point-reflected.
+        half: Half width of each kernel in pixels; light beyond it is cut off.
+        moves: Zeros to add to ``part`` ``[n]`` and ``reach`` ``[n, C]``, through which gradients flow to the coc; None
+            without gradients. The engine ignores them.
+    """
 
-    @property
-    def boxes(self) -> Tensor:
-        """Positions of these samples, ``[distances, 3]``."""
+    templates: list[Tensor]
+    which: list[tuple[int, int, int, int]]
+    part: list[float]
+    finer: list[float]
+    reach: list[list[float]]
+    fade: list[list[float]]
+    flipped: list[bool]
+    half: list[int]
+    moves: tuple[Tensor, Tensor] | None
 
-    @property
-    def coc_px(self) -> float:
-        """Signed radius in pixels."""
+
+# Types of ``src/api.h``. Data are pointers to numbers, Arrays those to the data of several tensors.
+_Int, _Real, _Double, _Data = ctypes.c_int32, ctypes.c_float, ctypes.c_double, ctypes.c_void_p
+_Ints, _Reals, _Doubles = ctypes.POINTER(_Int), ctypes.POINTER(_Real), ctypes.POINTER(_Double)
+_Arrays = ctypes.POINTER(_Data)
+
+
+def _fields(*groups: tuple[Any, str]) -> list[tuple[str, Any]]:
+    """Fields of a structure from groups of one type and the names that have it."""
+    return [(name, kind) for kind, names in groups for name in names.split()]
+
+
+_LAYERS = (
+    (_Int, "layers"),
+    (_Doubles, "nodes"),
+    (_Ints, "scales halves"),
+    (_Int, "kernel_colours"),
+    (_Data, "kernels"),
+)
+"""Fields of the structures that have layers, see :func:`_of_layers`."""
 
 
 class _FieldMask(ctypes.Structure):
-    """``torchdof_field_mask`` of ``src/api.h``."""
-
-    _fields_ = [  # noqa: RUF012
-        ("values", ctypes.c_void_p),
-        ("boxes", ctypes.c_void_p),
-        ("radius", ctypes.c_float),
-        ("colours", ctypes.c_int32),
-        ("rows", ctypes.c_int32),
-        ("columns", ctypes.c_int32),
-    ]
-
-
-class KernelSpots(Protocol):
-    """Input from which kernels are made: :class:`torchdof.optics.kernel_bank.Spots`."""
-
-    @property
-    def templates(self) -> list[Tensor]:
-        """Cells of the templates, float32."""
-
-    @property
-    def which(self) -> list[tuple[int, int, int, int]]:
-        """Indices of four templates for each kernel."""
-
-    @property
-    def part(self) -> list[float]:
-        """Interpolation weight of the next node, for each kernel."""
-
-    @property
-    def finer(self) -> list[float]:
-        """Interpolation weight of the finer templates."""
-
-    @property
-    def reach(self) -> list[list[float]]:
-        """Radius in pixels for each colour."""
-
-    @property
-    def fade(self) -> list[list[float]]:
-        """Weight of each colour's kernel against an unblurred pixel."""
-
-    @property
-    def flipped(self) -> list[bool]:
-        """Whether each kernel is rotated by half a turn."""
-
-    @property
-    def half(self) -> list[int]:
-        """Half width of each kernel in pixels."""
+    _fields_ = _fields((_Data, "values boxes"), (_Real, "radius"), (_Int, "colours rows columns"))
 
 
 class _Spots(ctypes.Structure):
-    """``torchdof_spots`` of ``src/api.h``."""
-
-    _fields_ = [  # noqa: RUF012
-        ("count", ctypes.c_int32),
-        ("colours", ctypes.c_int32),
-        ("templates", ctypes.POINTER(ctypes.c_void_p)),
-        *((name, ctypes.POINTER(ctypes.c_int32)) for name in ("cells", "index")),
-        *((name, ctypes.POINTER(ctypes.c_double)) for name in ("part", "finer", "reach", "fade")),
-        *((name, ctypes.POINTER(ctypes.c_int32)) for name in ("flipped", "half")),
-        ("squeeze", ctypes.c_double),
-        ("round", ctypes.c_int32),
-        ("even", ctypes.c_int32),
-    ]
-
-
-_OF_LAYERS: list[Any] = [
-    ("layers", ctypes.c_int32),
-    ("nodes", ctypes.POINTER(ctypes.c_double)),
-    ("scales", ctypes.POINTER(ctypes.c_int32)),
-    ("halves", ctypes.POINTER(ctypes.c_int32)),
-    ("kernel_colours", ctypes.c_int32),
-    ("kernels", ctypes.c_void_p),
-]
-"""Fields of the structures that have layers."""
+    _fields_ = _fields(
+        *((_Int, "count colours"), (_Arrays, "templates"), (_Ints, "cells index")),
+        *((_Doubles, "part finer reach fade"), (_Ints, "flipped half"), (_Double, "squeeze"), (_Int, "round even")),
+    )
 
 
 class _Scene(ctypes.Structure):
-    """``torchdof_scene`` of ``src/api.h``."""
-
-    _fields_ = [  # noqa: RUF012
-        ("height", ctypes.c_int32),
-        ("width", ctypes.c_int32),
-        ("channels", ctypes.c_int32),
-        ("kind", ctypes.c_int32),
-        ("surfaces", ctypes.c_int32),
-        ("light", ctypes.POINTER(ctypes.c_void_p)),
-        ("coc", ctypes.POINTER(ctypes.c_void_p)),
-        ("weight", ctypes.POINTER(ctypes.c_void_p)),
-        ("occlusion", ctypes.c_int32),
-        ("normalize", ctypes.c_int32),
-        ("masked", ctypes.c_int32),
-        ("highlights", ctypes.c_int32),
-        ("crisp_px", ctypes.c_float),
-        *_OF_LAYERS,
-        ("field_masks", ctypes.POINTER(_FieldMask)),
-        ("distances", ctypes.c_int32),
-        ("squeeze", ctypes.c_float),
-        ("threads", ctypes.c_int32),
-        ("cancelled", ctypes.POINTER(ctypes.c_int32)),
-    ]
+    _fields_ = _fields(
+        *((_Int, "height width channels kind surfaces"), (_Arrays, "light coc weight")),
+        *((_Int, "occlusion normalize masked highlights"), (_Real, "crisp_px"), *_LAYERS),
+        *((ctypes.POINTER(_FieldMask), "field_masks"), (_Int, "distances"), (_Real, "squeeze")),
+        *((_Int, "threads"), (_Ints, "cancelled")),
+    )
 
 
 class _Map(ctypes.Structure):
-    """``torchdof_map`` of ``src/api.h``."""
-
-    _fields_ = [  # noqa: RUF012
-        ("height", ctypes.c_int32),
-        ("width", ctypes.c_int32),
-        ("channels", ctypes.c_int32),
-        ("light", ctypes.c_void_p),
-        ("nearness", ctypes.c_void_p),
-        ("of_coc", ctypes.c_int32),
-        ("steps", ctypes.c_void_p),
-        ("step", ctypes.c_float),
-        ("automatic", ctypes.c_int32),
-        ("threads", ctypes.c_int32),
-        ("cancelled", ctypes.POINTER(ctypes.c_int32)),
-        ("out", ctypes.c_void_p),
-    ]
+    _fields_ = _fields(
+        *((_Int, "height width channels"), (_Data, "light nearness"), (_Int, "of_coc"), (_Data, "steps")),
+        *((_Real, "step"), (_Int, "automatic threads"), (_Ints, "cancelled"), (_Data, "out")),
+    )
 
 
 class _Layers(ctypes.Structure):
-    """``torchdof_layers`` of ``src/api.h``."""
-
-    _fields_ = [  # noqa: RUF012
-        *((name, ctypes.c_int32) for name in ("rows", "columns", "margin", "height", "width", "channels", "surfaces")),
-        *((name, ctypes.POINTER(ctypes.c_void_p)) for name in ("light", "place", "weight")),
-        *((name, ctypes.c_int32) for name in ("occlusion", "backed")),
-        *_OF_LAYERS,
-        ("threads", ctypes.c_int32),
-        ("cancelled", ctypes.POINTER(ctypes.c_int32)),
-    ]
+    _fields_ = _fields(
+        *((_Int, "rows columns margin height width channels surfaces"), (_Arrays, "light place weight")),
+        *((_Int, "occlusion backed"), *_LAYERS, (_Int, "threads"), (_Ints, "cancelled")),
+    )
 
 
 class _Level(ctypes.Structure):
-    """``torchdof_level`` of ``src/api.h``."""
+    _fields_ = _fields((_Data, "values"), (_Int, "rows columns step"), (_Real, "least_px slope most"))
 
-    _fields_ = [  # noqa: RUF012
-        ("values", ctypes.c_void_p),
-        *((name, ctypes.c_int32) for name in ("rows", "columns", "step")),
-        *((name, ctypes.c_float) for name in ("least_px", "slope", "most")),
-    ]
+
+_LEVELS = (ctypes.POINTER(_Level), _Int, _Int, _Data, _Int, _Int, _Int)
+_ARGUMENTS: dict[str, tuple[Any, ...]] = {
+    "begin": (ctypes.POINTER(_Scene), _Arrays),
+    "radii": (_Data, ctypes.POINTER(_Ints)),
+    "finish": (_Data, _Arrays, _Ints, ctypes.POINTER(_FieldMask), _Int, _Data),
+    "free": (_Data,),
+    "convolve": (_Data, _Int, _Int, _Data, _Int, _Data),
+    "repair_edges": (ctypes.POINTER(_Map), _Ints),
+    "blend": (ctypes.POINTER(_Layers), _Data),
+    "blend_gradient": (ctypes.POINTER(_Layers), _Data, _Arrays, _Arrays, _Arrays),
+    "matte": (_Arrays, *[_Int] * 4, _Data, _Arrays),
+    "farthest": (_Arrays, *[_Int] * 6, _Data),
+    "farthest_gradient": (_Arrays, *[_Int] * 6, _Data, _Arrays),
+    "look_behind": (*_LEVELS, _Data),
+    "look_behind_gradient": (*_LEVELS, _Data, _Arrays, _Data),
+    "coc": (_Data, ctypes.c_int64, _Real, _Real, _Real, _Int, _Data),
+    "plan": (_Data, _Int, _Int, _Int, _Doubles, _Int, _Doubles, _Int, _Ints),
+    "kernels": (ctypes.POINTER(_Spots), _Int, _Arrays),
+    "ends": (_Data, ctypes.c_int64, _Int, _Reals, _Reals),
+    "instructions": (),
+    "use": (ctypes.c_char_p,),
+}
+_RESULTS = {"radii": ctypes.c_int64, "free": None, "convolve": None, "instructions": ctypes.c_char_p}  # others: int32
 
 
 def chosen() -> bool:
@@ -306,7 +264,6 @@ def render(
         ``[C, H, W]``, float32; the same bits for any number of threads.
 
     Raises:
-        MemoryError: If there is not enough memory.
         OverflowError: If an image's light exceeds 2^28, whose square sums could overflow; scale it down.
     """
     lights = [light.float().contiguous() for light, _, _ in surfaces]
@@ -331,7 +288,7 @@ def render(
         crisp_px,
         *of_layers,
         _field_masks(field_masks) if field_masks else None,
-        field_masks[0].values.shape[1] if field_masks else 0,
+        field_masks[0][0].shape[1] if field_masks else 0,
         squeeze,
         torch.get_num_threads(),
         ctypes.pointer(cancelled),
@@ -387,9 +344,6 @@ def blend(surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: Frame
     Returns:
         Light, then coverage or transmittance of each colour of the kernels (or, without occlusion, the sum of weights),
         ``[planes, height, width]``, float32; the same bits for any number of threads.
-
-    Raises:
-        MemoryError: If there is not enough memory.
     """
     scene, _memory = _layers_of(surfaces, frame)
     out = torch.empty(scene.channels + scene.kernel_colours, *frame.area, dtype=torch.float32, device="cpu")
@@ -404,9 +358,6 @@ def blend_gradient(
 
     Returns:
         Gradients by light, position and, if it has one, weight of each surface, in this order.
-
-    Raises:
-        MemoryError: If there is not enough memory.
     """
     (scene, _memory), gradient = _layers_of(surfaces, frame), gradient.contiguous()
     sums = [
@@ -535,9 +486,6 @@ def look_behind(levels: Sequence[Tensor], rules: Rules, coc: Tensor) -> Tensor:
 
     Returns:
         Light, coc and votes, ``[C + 2, H, W]``, float32; the same bits for any number of threads.
-
-    Raises:
-        MemoryError: If there is not enough memory.
     """
     coc, levels = coc.contiguous(), [values.contiguous() for values in levels]
     out = torch.empty(levels[0].shape[0], *coc.shape, dtype=torch.float32, device="cpu")
@@ -546,11 +494,7 @@ def look_behind(levels: Sequence[Tensor], rules: Rules, coc: Tensor) -> Tensor:
 
 
 def look_behind_gradient(levels: Sequence[Tensor], rules: Rules, coc: Tensor, gradient: Tensor) -> list[Tensor]:
-    """The gradients of :func:`look_behind` by coc and by each level, given the one by its result, ``[C + 2, H, W]``.
-
-    Raises:
-        MemoryError: If there is not enough memory.
-    """
+    """The gradients of :func:`look_behind` by coc and by each level, given the one by its result, ``[C + 2, H, W]``."""
     coc, levels, gradient = coc.contiguous(), [values.contiguous() for values in levels], gradient.contiguous()
     of_coc, of_levels = torch.empty_like(coc), [torch.zeros_like(values) for values in levels]
     pointers = (gradient.data_ptr(), _pointers(of_levels), of_coc.data_ptr())
@@ -576,9 +520,6 @@ def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_c
 
     Returns:
         ``[H, W]``, float32; the same bits for any number of threads. The input itself if it needs no repair.
-
-    Raises:
-        MemoryError: If there is not enough memory.
     """
     light, nearness, step = light.contiguous(), nearness.contiguous(), step.contiguous()
     out, cancelled, changed = torch.empty_like(nearness), ctypes.c_int32(0), ctypes.c_int32(0)
@@ -617,9 +558,6 @@ def coc_px(depth: Tensor, scale: float, nearest_m: float, farthest_m: float) -> 
 
     Returns:
         Pixels, float32, in the shape of ``depth``.
-
-    Raises:
-        MemoryError: If there is not enough memory.
     """
     depth = depth.contiguous()
     out, threads = torch.empty_like(depth), torch.get_num_threads()
@@ -638,9 +576,6 @@ def plan(coc_px: Tensor, tolerance: float) -> tuple[tuple[float, ...], float]:
     Returns:
         Positions of the layers on the blur axis, near to far, and the tolerance, reduced if blurs are as large as the
         frame.
-
-    Raises:
-        MemoryError: If there is not enough memory.
     """
     coc_px, kept, count, capacity = coc_px.contiguous(), ctypes.c_double(tolerance), ctypes.c_int32(), 256
     while True:
@@ -654,7 +589,7 @@ def plan(coc_px: Tensor, tolerance: float) -> tuple[tuple[float, ...], float]:
         capacity = count.value
 
 
-def kernels(spots: KernelSpots, *, squeeze: float, is_round: bool, is_even: bool) -> list[Tensor]:
+def kernels(spots: Spots, *, squeeze: float, is_round: bool, is_even: bool) -> list[Tensor]:
     """Makes the kernels of a lens, with as many threads as PyTorch uses.
 
     Args:
@@ -665,9 +600,6 @@ def kernels(spots: KernelSpots, *, squeeze: float, is_round: bool, is_even: bool
 
     Returns:
         Kernels ``[C, 2 half + 1, 2 half + 1]``, float32, non-negative; they sum to 1 unless they are cropped.
-
-    Raises:
-        MemoryError: If there is not enough memory.
     """
     count, colours = len(spots.reach), len(spots.reach[0])
     sides = [2 * half + 1 for half in spots.half]
@@ -690,9 +622,6 @@ def ends(values: Tensor) -> tuple[float, float]:
     """Smallest and largest of some float32 values; NaN if any value is NaN.
 
     PyTorch's own reduction would leave its threads spinning, which slows down the engine's threads.
-
-    Raises:
-        MemoryError: If there is not enough memory.
     """
     values, low, high = values.contiguous(), ctypes.c_float(), ctypes.c_float()
     threads = torch.get_num_threads()
@@ -757,9 +686,9 @@ def _check(status: int) -> None:
 
 def _field_masks(masks: Sequence[KernelMask]) -> Any:
     made = []
-    for each in masks:
-        colours, _, rows, columns = each.values.shape
-        made.append(_FieldMask(each.values.data_ptr(), each.boxes.data_ptr(), each.coc_px, colours, rows, columns))
+    for values, boxes, coc_px, _ in masks:
+        colours, _, rows, columns = values.shape
+        made.append(_FieldMask(values.data_ptr(), boxes.data_ptr(), coc_px, colours, rows, columns))
     return _array(_FieldMask, len(made))(*made)
 
 
@@ -809,39 +738,7 @@ def _library() -> tuple[ctypes.CDLL | None, str]:
         stale = "the compiled engine is of another version of torchdof"
         warnings.warn(f"{stale}, and is not used: install torchdof again", RuntimeWarning, stacklevel=2)
         return None, stale
-    pointer = ctypes.c_void_p
-    library.torchdof_begin.argtypes = [ctypes.POINTER(_Scene), ctypes.POINTER(pointer)]
-    library.torchdof_radii.argtypes = [pointer, ctypes.POINTER(ctypes.POINTER(ctypes.c_int32))]
-    library.torchdof_radii.restype = ctypes.c_int64
-    library.torchdof_finish.argtypes = [
-        pointer,
-        ctypes.POINTER(pointer),
-        ctypes.POINTER(ctypes.c_int32),
-        ctypes.POINTER(_FieldMask),
-        ctypes.c_int32,
-        pointer,
-    ]
-    library.torchdof_free.argtypes = [pointer]
-    library.torchdof_free.restype = None
-    library.torchdof_convolve.argtypes = [pointer, ctypes.c_int32, ctypes.c_int32, pointer, ctypes.c_int32, pointer]
-    library.torchdof_convolve.restype = None
-    library.torchdof_repair_edges.argtypes = [ctypes.POINTER(_Map), ctypes.POINTER(ctypes.c_int32)]
-    maps = ctypes.POINTER(pointer)
-    library.torchdof_blend.argtypes = [ctypes.POINTER(_Layers), pointer]
-    library.torchdof_blend_gradient.argtypes = [ctypes.POINTER(_Layers), pointer, maps, maps, maps]
-    whole, numbers = ctypes.c_int32, ctypes.POINTER(ctypes.c_double)
-    of_levels: list[Any] = [ctypes.POINTER(_Level), whole, whole, pointer, whole, whole, whole]
-    of_surfaces: list[Any] = [maps, *[whole] * 6]
-    library.torchdof_matte.argtypes = [maps, *[whole] * 4, pointer, maps]
-    library.torchdof_farthest.argtypes = [*of_surfaces, pointer]
-    library.torchdof_farthest_gradient.argtypes = [*of_surfaces, pointer, maps]
-    library.torchdof_look_behind.argtypes = [*of_levels, pointer]
-    library.torchdof_look_behind_gradient.argtypes = [*of_levels, pointer, maps, pointer]
-    real = ctypes.c_float
-    library.torchdof_coc.argtypes = [pointer, ctypes.c_int64, real, real, real, whole, pointer]
-    library.torchdof_plan.argtypes = [pointer, *[whole] * 3, numbers, whole, numbers, whole, ctypes.POINTER(whole)]
-    library.torchdof_kernels.argtypes = [ctypes.POINTER(_Spots), ctypes.c_int32, ctypes.POINTER(pointer)]
-    library.torchdof_ends.argtypes = [pointer, ctypes.c_int64, ctypes.c_int32, _Floats, _Floats]
-    library.torchdof_instructions.restype = ctypes.c_char_p
-    library.torchdof_use.argtypes = [ctypes.c_char_p]
+    for name, arguments in _ARGUMENTS.items():
+        function = getattr(library, f"torchdof_{name}")
+        function.argtypes, function.restype = arguments, _RESULTS.get(name, _Int)
     return library, ""

@@ -12,7 +12,6 @@ the left side of the square. A curved blade is approximated by 48 chords, scaled
 import dataclasses
 import functools
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -20,9 +19,9 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ..tensors import is_differentiated
-from ..validation import broadcast_shapes, real_tensor, show, whole
+from ..validation import broadcast_shapes, fields, numbers, real_tensor, show, whole
 
-__all__ = ["Aperture"]
+__all__ = ["Aperture", "overlaps"]
 
 Number = float | Tensor
 
@@ -145,7 +144,7 @@ class Aperture:
         count = 2 * half + 1
         if self.mask is not None:
             rows, columns = (
-                _overlaps(count, step, size, max(self.mask.shape))
+                _pixels_in_cells(count, step, size, max(self.mask.shape))
                 for step, size in zip((heights, widths), self.mask.shape, strict=True)
             )
             open_areas = rows @ self._turned(self.mask).to(heights.device) @ columns.transpose(-2, -1)
@@ -157,11 +156,11 @@ class Aperture:
 
     def to_dict(self) -> dict[str, Any]:
         """The aperture as JSON-like data, the inverse of :meth:`from_dict`."""
-        fields: dict[str, Any] = {"rotation_deg": _as_float(self.rotation_deg), "squeeze": _as_float(self.squeeze)}
-        fields["vignetting"] = list(self.rims)
+        common: dict[str, Any] = {"rotation_deg": _as_float(self.rotation_deg), "squeeze": _as_float(self.squeeze)}
+        common["vignetting"] = list(self.rims)
         if self.mask is not None:
-            return {**fields, "mask": self.mask.tolist()}
-        return {"blades": self.blades, "curvature": float(self.curvature), **fields}
+            return {**common, "mask": self.mask.tolist()}
+        return {"blades": self.blades, "curvature": float(self.curvature), **common}
 
     @classmethod
     def from_dict(cls, data: Any) -> "Aperture":
@@ -170,19 +169,10 @@ class Aperture:
         Raises:
             ValueError: If a field is unknown or of the wrong kind; the message names it.
         """
-        known = [field.name for field in dataclasses.fields(cls)]
-        if not isinstance(data, Mapping):
-            raise ValueError(f"aperture must be an object with some of {', '.join(known)}, got {show(data)}")
-        unknown = sorted(str(name) for name in set(data) - set(known))
-        if unknown:
-            raise ValueError(f"{unknown[0]} is not a field of an aperture; known are {', '.join(known)}")
-        fields = dict(data)
-        if fields.get("mask") is not None:
-            try:
-                fields["mask"] = torch.tensor(fields["mask"], dtype=torch.float64, device="cpu")
-            except (TypeError, ValueError, RuntimeError, OverflowError):
-                raise ValueError(f"mask must be rows of numbers, got {show(fields['mask'])}") from None
-        return cls(**fields)
+        given = fields("aperture", data, (), [field.name for field in dataclasses.fields(cls)])
+        if given.get("mask") is not None:
+            given["mask"] = numbers("mask", given["mask"])
+        return cls(**given)
 
     def __repr__(self) -> str:
         parts = []
@@ -269,12 +259,21 @@ def _polygon_shares(x: Tensor, y: Tensor, count: int) -> Tensor:
     return areas.diff(dim=-1).clamp_min(0.0).unflatten(0, (-1, count))
 
 
-def _overlaps(count: int, step: Tensor, size: int, longer: int) -> Tensor:
+def overlaps(low: Tensor, high: Tensor, edges: Tensor) -> Tensor:
+    """Overlap of intervals from ``low`` to ``high``, ``[m, n]``, with cells between edges ``[m or 1, c + 1]``.
+
+    Returns:
+        ``[m, n, c]``.
+    """
+    low, edges = low[..., None], edges[..., None, :]
+    return (torch.minimum(high[..., None], edges[..., 1:]) - torch.maximum(low, edges[..., :-1])).clamp_min(0.0)
+
+
+def _pixels_in_cells(count: int, step: Tensor, size: int, longer: int) -> Tensor:
     """Overlap of ``count`` cells of width ``step`` ``[m]`` with each pixel of a mask: ``[m, count, size]``."""
     cell = (torch.arange(count + 1, dtype=torch.float64, device=step.device) - count / 2) * step[:, None]
     pixel = (torch.arange(size + 1, dtype=torch.float64, device=step.device) - size / 2) * (2.0 / longer)
-    low = torch.maximum(cell[:, :-1, None], pixel[:-1])
-    return (torch.minimum(cell[:, 1:, None], pixel[1:]) - low).clamp_min(0.0)
+    return overlaps(cell[:, :-1], cell[:, 1:], pixel)
 
 
 def _checked_mask(mask: Any) -> Tensor:

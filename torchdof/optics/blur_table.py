@@ -2,6 +2,7 @@
 
 import hashlib
 import itertools
+import json
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,11 +11,11 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..tensors import floating
-from ..validation import WHOLE_NUMBERS, number, pixels_wide, real_tensor, refuse_nested, show
+from ..io.atomic import write_text
+from ..validation import choice, number, numbers, pixels_wide, real_tensor, short, show
 from . import psf, table_file
 from .aperture import Aperture, Number
-from .field import Field
+from .field import Field, bracket
 from .kernel_bank import FADE_IN, bank_of
 
 __all__ = ["BlurTable"]
@@ -89,19 +90,17 @@ class BlurTable:
         aperture: Aperture | None = None,
         field: Field | None = None,
     ) -> None:
-        if not isinstance(family, str) or family not in psf.FAMILIES:
-            raise ValueError(f"family must be one of {', '.join(psf.FAMILIES)}, got {show(family)}")
-        if not isinstance(unit, str) or unit not in UNITS:
-            raise ValueError(f"unit must be one of {', '.join(UNITS)}, got {show(unit)}")
+        choice("family", family, psf.FAMILIES)
+        choice("unit", unit, UNITS)
         if not isinstance(name, str):
             raise ValueError(f"name must be a text, got {show(name)}")
         if provenance is not None and not isinstance(provenance, Mapping):
             raise ValueError(f"provenance must be a dict, got {show(provenance)}")
         self.family, self.unit, self.name = family, unit, str(name)
-        self.coc = _numbers("coc", coc)
+        self.coc = numbers("coc", coc)
         if self.coc.ndim != 1 or not len(self.coc) or bool((self.coc.diff() <= 0).any()) or not self.coc.any():
             raise ValueError(
-                f"coc must be strictly increasing signed numbers, one a node and not only 0, got {_short(self.coc)}"
+                f"coc must be strictly increasing signed numbers, one a node and not only 0, got {short(self.coc)}"
             )
         if len(self.coc) > _MAX_NODES:
             raise ValueError(f"coc must be at most {_MAX_NODES} nodes, got {len(self.coc)}")
@@ -114,11 +113,7 @@ class BlurTable:
             raise ValueError(
                 f"sensor_width_mm goes with unit 'mm' and only with it, got {show(sensor_width_mm)} with {unit!r}"
             )
-        if sensor_width_mm is not None and not isinstance(sensor_width_mm, bool | int | float):
-            raise ValueError(f"sensor_width_mm must be a number, got {show(sensor_width_mm)}")
-        if sensor_width_mm is not None and not 0 < sensor_width_mm < 1e300:
-            raise ValueError(f"sensor_width_mm must be positive, got {show(sensor_width_mm)}")
-        self.sensor_width_mm = None if sensor_width_mm is None else float(sensor_width_mm)
+        self.sensor_width_mm = None if sensor_width_mm is None else number("sensor_width_mm", sensor_width_mm, 0, 1e300)
         self._params = self._check_params(params)
         self.strength = self._per_node("strength", strength)
         self.residual = self._per_node("residual", residual)
@@ -443,7 +438,7 @@ class BlurTable:
         Raises:
             OSError: If the file cannot be written.
         """
-        table_file.write(self.to_dict(), path)
+        write_text(path, json.dumps(self.to_dict(), indent=1) + "\n")
 
     @classmethod
     def load(cls, source: str | os.PathLike[str]) -> "BlurTable":
@@ -462,7 +457,7 @@ class BlurTable:
         """
         path = table_file.find(source)
         try:
-            return cls.from_dict(table_file.read(path))
+            return cls.from_dict(json.loads(path.read_text(encoding="utf-8")))
         except (ValueError, RecursionError) as error:
             raise ValueError(f"{path}: {error}") from error
 
@@ -470,6 +465,8 @@ class BlurTable:
         """The table as JSON-like data, the inverse of :meth:`from_dict`."""
         one_for_all = self.channels == 1
         fields = {
+            "schema": table_file.SCHEMA,
+            "version": table_file.VERSION,
             "name": self.name,
             "family": self.family,
             "unit": self.unit,
@@ -482,7 +479,7 @@ class BlurTable:
             "aperture": None if self.aperture is None else self.aperture.to_dict(),
             "field": None if self.field is None else self.field.to_dict(),
         }
-        return table_file.with_schema({k: v for k, v in fields.items() if v is not None})
+        return {k: v for k, v in fields.items() if v is not None}
 
     @classmethod
     def from_dict(cls, data: Any) -> "BlurTable":
@@ -524,7 +521,7 @@ class BlurTable:
             raise ValueError(f"params of {self.family} must be {', '.join(names)}, got {got}")
         checked = {}
         for name in names:
-            value = _numbers(f"params.{name}", params[name])
+            value = numbers(f"params.{name}", params[name])
             value = value.unsqueeze(0) if value.ndim == (2 if name == "values" else 1) else value
             if value.ndim != (3 if name == "values" else 2) or value.shape[1] != len(self.coc) or not value.numel():
                 shape = "[N, P] or [channels, N, P]" if name == "values" else "[N] or [channels, N]"
@@ -558,37 +555,28 @@ class BlurTable:
             raise ValueError("a table with a field must state its unit as 'fraction' (of the image's width) or 'mm'")
         if field.channels != self.channels:
             raise ValueError(f"field must have {self.channels} channels, as params have, got {field.channels}")
-        low, high = _COC_RANGE
-        for name, ends in (("coc", field.coc[[0, -1]].abs()), ("radius", field.radius[-1:])):
-            if not low <= float(ends.min()) <= float(ends.max()) <= high:
-                raise ValueError(
-                    f"field.{name} must reach somewhere from {low:g} to {high:g} ({self.unit}), "
-                    f"got {' and '.join(f'{end:g}' for end in ends.tolist())}"
-                )
+        self._check_extent("field.radius", "field.box", float(field.radius[-1]))
         for cocs in (field.coc[field.coc <= 0], field.coc[field.coc >= 0]):
-            largest, reach = float(cocs.abs().max()), float(field.reach(cocs).max())
-            if reach > _MAX_REACH * largest:
-                raise ValueError(
-                    "field.box must be lengths in the unit of field.coc, got a spot that "
-                    f"reaches to {reach:g} where coc is {largest:g}"
-                )
+            self._check_extent("field.coc", "field.box", float(cocs.abs().max()), float(field.reach(cocs).max()))
         return field
+
+    def _check_extent(self, ends: str, lengths: str, end: float, reach: float = 0.0) -> None:
+        """Refuse a side of focus that ends at an absurd coc, or a blur there that reaches absurdly far."""
+        low, high = _COC_RANGE
+        if not low <= end <= high:
+            raise ValueError(f"{ends} must reach somewhere from {low:g} to {high:g} ({self.unit}), got {end:g}")
+        if reach > _MAX_REACH * end:
+            got = f"a blur that reaches to {reach:g} where coc is {end:g}"
+            raise ValueError(f"{lengths} must be lengths in the unit of {ends}, got {got}")
 
     def _try_kernels(self) -> None:
         """Refuse parameters whose kernels at, between or beyond the nodes are not finite or far too wide."""
-        low, high = _COC_RANGE
         scale, widest = self.px_per_unit(1.0), 0.0
         for coc in (self.coc[self.coc < 0], self.coc[self.coc > 0]):
-            largest = float(coc.abs().max()) if len(coc) else low
-            if not low <= largest <= high:
-                raise ValueError(f"coc must reach somewhere from {low:g} to {high:g} ({self.unit}), got {largest:g}")
-            reach = psf.support(self.family, self.params(coc * scale, 1.0)) / scale if len(coc) else 0.0
-            if reach > _MAX_REACH * largest:
-                raise ValueError(
-                    "params must be lengths in the unit of coc, got a kernel that "
-                    f"reaches to {reach:g} where coc is {largest:g}"
-                )
-            widest = max(widest, reach)
+            if len(coc):
+                reach = psf.support(self.family, self.params(coc * scale, 1.0)) / scale
+                self._check_extent("coc", "params", float(coc.abs().max()), reach)
+                widest = max(widest, reach)
         if widest == 0.0:
             return
         cocs = torch.cat([self.coc, (self.coc[1:] + self.coc[:-1]) / 2, 2.0 * self.coc[[0, -1]]])
@@ -604,10 +592,10 @@ class BlurTable:
     def _per_node(self, name: str, value: Sequence[float] | Tensor | None) -> Tensor | None:
         if value is None:
             return None
-        numbers = _numbers(name, value)
-        if numbers.shape != self.coc.shape:
-            raise ValueError(f"{name} must hold one number a node ({len(self.coc)}), got shape {list(numbers.shape)}")
-        return numbers
+        values = numbers(name, value)
+        if values.shape != self.coc.shape:
+            raise ValueError(f"{name} must hold one number a node ({len(self.coc)}), got shape {list(values.shape)}")
+        return values
 
     def _side(self, sign: int) -> tuple[Tensor, dict[str, Tensor]] | None:
         """Nodes of one side of focus, ordered by ``|coc|``, with a node at 0; None if the side has no nodes."""
@@ -628,38 +616,12 @@ class BlurTable:
         """Parameters at unsigned coc ``[...]``, in the table's unit, on one side of focus: ``[channels, ...]``."""
         distances, nodes = self.side_nodes(sign)
         distances, nodes = distances.to(distance.device), {k: v.to(distance.device) for k, v in nodes.items()}
-        upper = torch.searchsorted(distances, distance.detach().contiguous()).clamp(1, len(distances) - 1)
-        lower = upper - 1
-        fraction = ((distance - distances[lower]) / (distances[upper] - distances[lower])).clamp(max=1.0)
+        lower, fraction = bracket(distances, distance)
         growth = (distance / distances[-1]).clamp_min(1.0)
         interpolated = {}
         for name, value in nodes.items():
             weight = fraction.unsqueeze(-1) if name == "values" else fraction
-            interpolated[name] = torch.lerp(value[:, lower], value[:, upper], weight)
+            interpolated[name] = torch.lerp(value[:, lower], value[:, lower + 1], weight)
             if name in psf.LENGTHS:
                 interpolated[name] = interpolated[name] * growth
         return interpolated
-
-
-def _numbers(name: str, value: Any) -> Tensor:
-    """Finite numbers as a float64 tensor on the CPU; raises ``ValueError`` with the name if they are not."""
-    refuse_nested(name, value)
-    if isinstance(value, list | tuple):
-        value = [item.detach() if isinstance(item, Tensor) else item for item in value]
-    try:
-        numbers = torch.as_tensor(value, device="cpu")
-        if not (floating(numbers) or numbers.dtype in WHOLE_NUMBERS) or numbers.layout != torch.strided:
-            raise TypeError
-        if not isinstance(value, Tensor):
-            numbers = torch.as_tensor(value, dtype=torch.float64, device="cpu")  # the line above made a list float32
-        numbers = numbers.detach().to("cpu", torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError):
-        raise ValueError(f"{name} must be numbers, got {str(value)[:60]}") from None
-    if not bool(torch.isfinite(numbers).all()):
-        raise ValueError(f"{name} must be finite numbers, got {_short(numbers)}")
-    return numbers
-
-
-def _short(numbers: Tensor) -> str:
-    text = ", ".join(f"{x:g}" for x in numbers.flatten()[:6].tolist())
-    return f"[{text}{', ...' if numbers.numel() > 6 else ''}] of shape {list(numbers.shape)}"

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from .. import native
 from ..tensors import floating, is_in_memory, is_traced
-from ..validation import pixels_wide, real_tensor, refuse_nested, show, whole
+from ..validation import number, pixels_wide, real_tensor, show, whole
 
 __all__ = ["CAMERA_NUMBERS", "Camera"]
 
@@ -84,15 +84,14 @@ class Camera:
             halfway = 2.0 / dioptres if isinstance(dioptres, Tensor) or dioptres > 0 else math.inf
             object.__setattr__(self, "focus_m", halfway)
         for name in ("tilt_deg", "swing_deg"):
-            _check_angle(name, getattr(self, name))
+            _check_number(name, getattr(self, name), -90.0, 90.0)
         for name in CAMERA_NUMBERS:
-            value = getattr(self, name)
-            _check_number(name, value)
+            _check_number(name, getattr(self, name))
         if not isinstance(self.focus_breathing, bool):
             raise ValueError(f"focus_breathing must be True or False, got {show(self.focus_breathing)}")
         if self.focus_breathing and not is_traced():
-            focal_m = _largest(self.focal_length_mm / 1000.0 / self.focus_m)
-            if focal_m >= 1.0:
+            ratio = self.focal_length_mm / 1000.0 / self.focus_m
+            if (float(ratio.detach().max()) if isinstance(ratio, Tensor) else ratio) >= 1.0:
                 raise ValueError(
                     f"focus_m must be longer than the focal length ({_show(self.focal_length_mm)} mm), got "
                     f"{_show(self.focus_m)} m; nothing nearer than the focal length can be in focus"
@@ -116,10 +115,8 @@ class Camera:
             >>> round(Camera.from_fov(fov_x_deg=40.0, aperture_radius_m=0.012, focus_m=2.0).focal_px(768), 6)
             1055.031329
         """
-        _check_number("fov_x_deg", fov_x_deg)
+        _check_number("fov_x_deg", fov_x_deg, high=180.0)
         _check_number("aperture_radius_m", aperture_radius_m)
-        if not is_traced() and _largest(fov_x_deg) >= 180.0:
-            raise ValueError(f"fov_x_deg must be in (0, 180) degrees, got {_show(fov_x_deg)}")
         if isinstance(fov_x_deg, Tensor):
             half: Number = torch.tan(torch.deg2rad(fov_x_deg) / 2)
         else:
@@ -161,14 +158,10 @@ class Camera:
         Raises:
             ValueError: If the depth is not a floating-point tensor, or its batch does not fit the camera's.
         """
-        refuse_nested("depth", depth)
-        if not floating(depth):
-            got = f"{depth.dtype} tensor" if isinstance(depth, Tensor) else type(depth).__name__
-            raise ValueError(f"depth must be a floating-point tensor in metres, got {got}; convert it with .float()")
-        if depth.layout != torch.strided:
-            raise ValueError(f"depth must be a dense tensor in metres, got {depth.layout}; convert it with .to_dense()")
         if type(depth) is Tensor and depth.device.type == "cpu":  # not a subclass, which may need no memory
             real_tensor("depth", depth, "in metres")
+        elif not floating(depth) or depth.layout != torch.strided:
+            raise ValueError(f"depth must be a floating-point tensor in metres, dense, got {show(depth)}")
         compiled = self._compiled_coc_px(depth, width)
         if compiled is not None:
             return compiled
@@ -240,9 +233,7 @@ class Camera:
         """
         _check_map("depth", depth)
         whole("patch", patch, 1, 2**31)
-        for value in (x, y):
-            if isinstance(value, bool) or not isinstance(value, int | float):
-                raise ValueError(f"focus point must be two numbers (x, y) in pixels, got {show(value)}")
+        x, y = (number(f"{axis} of the focus point", value, unit="pixels") for axis, value in (("x", x), ("y", y)))
         height, width = depth.shape[-2:]
         if not (0 <= x < width and 0 <= y < height):
             raise ValueError(f"focus point ({x}, {y}) must lie in the frame of {width} x {height} pixels (x, y)")
@@ -394,10 +385,6 @@ def _weighted_median(values: Tensor, weights: Tensor) -> Tensor:
     return values[int((summed >= 0.5 * summed[-1]).nonzero()[0])]
 
 
-def _largest(value: Number) -> float:
-    return float(value.detach().max()) if isinstance(value, Tensor) else float(value)
-
-
 def _show(value: Number) -> str:
     if isinstance(value, Tensor):
         values = [f"{x:.6g}" for x in value.detach().flatten().tolist()]
@@ -405,48 +392,30 @@ def _show(value: Number) -> str:
     return f"{value:.6g}"
 
 
-def _check_number(name: str, value: Number) -> None:
-    """Refuse a number of the camera that is not positive, or neither a float nor a tensor ``[B]``."""
-    refuse_nested(name, value)
+def _check_number(name: str, value: Any, low: float = 0.0, high: float = math.inf) -> None:
+    """Refuse a number of the camera that is neither a float nor a tensor ``[B]``, or outside of ``(low, high)``."""
     if isinstance(value, Tensor):
-        if value.ndim > 1 or not floating(value) or value.layout != torch.strided or not value.numel():
-            raise ValueError(f"{name} must be a float or a floating-point tensor [B], got {show(value)}")
+        is_number = floating(value) and value.ndim <= 1 and value.layout == torch.strided and value.numel() > 0
+    else:
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number:
+        raise ValueError(f"{name} must be a float or a floating-point tensor [B], got {show(value)}")
+    infinite = name in _MAY_BE_INFINITE
+    # compares with inf instead of math.isfinite: torch.compile can then treat the number as a variable
+    if isinstance(value, Tensor):
         if is_traced():
             return
-        if value.device.type == "meta":
-            raise ValueError(f"{name} must be a float or a tensor [B] that holds data, got one on the meta device")
-        real_tensor(name, value, "[B]")
-        is_positive = bool((value.detach() > 0).all())
-    elif isinstance(value, int | float) and not isinstance(value, bool):
-        is_positive = value > 0 and (isinstance(value, float) or value <= 1e300)
+        numbers = real_tensor(name, value, "[B]").detach()
+        is_inside = bool(((numbers > low) & ((numbers <= high) if infinite else (numbers < high))).all())
     else:
-        raise ValueError(f"{name} must be a float or a floating-point tensor [B], got {type(value).__name__}")
-    if not is_positive and not isinstance(value, Tensor):
-        raise ValueError(
-            f"{name} must be positive{'' if name in _MAY_BE_INFINITE else ' and finite'}, got {show(value)}"
+        is_inside = low < value < high or (infinite and value == high)
+        is_inside = is_inside and (isinstance(value, float) or value <= 1e300)
+    if not is_inside:
+        bounds = (
+            f"in ({low:g}, {high:g}) degrees" if high < math.inf else f"positive{'' if infinite else ' and finite'}"
         )
-    # compares with inf instead of math.isfinite: torch.compile can then treat the number as a variable
-    if not is_positive or (
-        name not in _MAY_BE_INFINITE and (_largest(value) if isinstance(value, Tensor) else value) == math.inf
-    ):
-        raise ValueError(
-            f"{name} must be positive{'' if name in _MAY_BE_INFINITE else ' and finite'}, got {_show(value)}"
-        )
-
-
-def _check_angle(name: str, value: Number) -> None:
-    """Refuse an angle that is not a number, or not in (-90, 90) degrees."""
-    refuse_nested(name, value)
-    is_tensor = isinstance(value, Tensor) and value.ndim <= 1 and floating(value) and value.numel() > 0
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_tensor and not is_number:
-        raise ValueError(f"{name} must be degrees, a float or a floating-point tensor [B], got {show(value)}")
-    if is_traced():
-        return
-    if isinstance(value, Tensor):
-        real_tensor(name, value, "[B] in degrees")
-    if not bool((torch.as_tensor(value, device="cpu").detach().abs() < 90.0).all()):
-        raise ValueError(f"{name} must be in (-90, 90) degrees, got {_show(value)}")
+        got = _show(value) if isinstance(value, Tensor | float) else show(value)
+        raise ValueError(f"{name} must be {bounds}, got {got}")
 
 
 def _checked_range(value: Any) -> tuple[Number, Number]:

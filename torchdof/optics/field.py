@@ -20,16 +20,15 @@ import functools
 import hashlib
 import math
 import zlib
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..validation import real_tensor, show
+from ..validation import fields, numbers, real_tensor, show
 
-__all__ = ["Field"]
+__all__ = ["Field", "bracket", "deviations"]
 
 _MAX_CODE = 65535  # integer value of the brightest cell of a spot in a file
 _MAX_CELLS = 2**25  # largest number of cells in a file
@@ -108,9 +107,9 @@ class Field:
     def spots(self, coc: float, radius: Tensor) -> tuple[Tensor, Tensor]:
         """Boxes ``[n, 3]`` and light ``[channels, n, U, V]`` at a signed coc and distances ``[n]``, float64."""
         growth = max(1.0, coc / float(self.coc[-1]), coc / float(self.coc[0]))
-        low, weight = _bracket(self.radius, radius.to(torch.float64))
+        low, weight = bracket(self.radius, radius.to(torch.float64))
         nodes = slice(int(low.min()), int(low.max()) + 2)
-        node, blend = _bracket(self.coc, torch.tensor(coc, dtype=torch.float64, device="cpu"))
+        node, blend = bracket(self.coc, torch.tensor(coc, dtype=torch.float64, device="cpu"))
         box = torch.lerp(self.box[node, nodes], self.box[node + 1, nodes], blend) * growth  # [F, 3]
         light = torch.lerp(self.light[:, node, nodes], self.light[:, node + 1, nodes], blend)  # [channels, F, U, V]
         low = low - nodes.start
@@ -123,7 +122,7 @@ class Field:
         """Radius around the origin that contains all spots of each signed coc ``[n]``."""
         coc = coc.to(torch.float64)
         growth = torch.maximum(coc / self.coc[-1], coc / self.coc[0]).clamp_min(1.0)
-        low, weight = _bracket(self.coc, coc)
+        low, weight = bracket(self.coc, coc)
         return torch.lerp(self._reaches[low], self._reaches[low + 1], weight) * growth
 
     @functools.cached_property
@@ -172,16 +171,9 @@ class Field:
         Raises:
             ValueError: If a field is missing, unknown or of the wrong kind; the message names it.
         """
-        known = ["coc", "radius", "box", "shape", "light"]
-        if not isinstance(data, Mapping) or set(data) != set(known):
-            raise ValueError(f"field must be an object with {', '.join(known)}, got {show(data)}")
-        values = {}
-        for name in known[:4]:
-            try:
-                values[name] = torch.tensor(data[name], dtype=torch.float64, device="cpu")
-            except (TypeError, ValueError, RuntimeError, OverflowError):
-                raise ValueError(f"field.{name} must be rows of numbers, got {show(data[name])}") from None
-        shape = [int(n) for n in values.pop("shape").flatten().nan_to_num().clamp(-1, _MAX_CELLS).tolist()]
+        data = fields("field", data, ("coc", "radius", "box", "shape", "light"))
+        coc, radius, box, sizes = (numbers(f"field.{name}", data[name]) for name in ("coc", "radius", "box", "shape"))
+        shape = [int(n) for n in sizes.flatten().clamp(-1, _MAX_CELLS).tolist()]
         if len(shape) != 5 or min(shape) < 1 or math.prod(shape) > _MAX_CELLS:
             raise ValueError(f"field.shape must be five numbers of cells, got {show(data['shape'])}")
         count = 2 * math.prod(shape)
@@ -193,7 +185,7 @@ class Field:
         if len(cells) != count:
             raise ValueError(f"field.light must hold {count} bytes for field.shape, got {len(cells)}")
         light = np.frombuffer(cells, "<u2").astype(np.float64).reshape(shape)
-        return cls(**values, light=torch.from_numpy(light))
+        return cls(coc, radius, box, torch.from_numpy(light))
 
     def __repr__(self) -> str:
         return f"Field({len(self.coc)} blurs, {len(self.radius)} distances to {float(self.radius[-1]):g})"
@@ -215,7 +207,7 @@ def deviations(box: Tensor, light: Tensor) -> Tensor:
     return spread * box[:, 1:]
 
 
-def _bracket(nodes: Tensor, positions: Tensor) -> tuple[Tensor, Tensor]:
-    """Index of the node before each place, and the weight in [0, 1] of the next node."""
-    low = (torch.searchsorted(nodes, positions.contiguous(), right=True) - 1).clamp(0, len(nodes) - 2)
+def bracket(nodes: Tensor, positions: Tensor) -> tuple[Tensor, Tensor]:
+    """Index of the node before each position, and the weight in [0, 1] of the next node, for linear interpolation."""
+    low = (torch.searchsorted(nodes, positions.detach().contiguous(), right=True) - 1).clamp(0, len(nodes) - 2)
     return low, ((positions - nodes[low]) / (nodes[low + 1] - nodes[low])).clamp(0.0, 1.0)

@@ -20,7 +20,6 @@ The compiled engine makes the same kernels from the same templates (``native/src
 """
 
 import bisect
-import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
@@ -28,6 +27,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from ..native import Spots
 from ..tensors import is_differentiated
 from . import psf
 from .aperture import Aperture
@@ -51,9 +51,10 @@ A larger value makes the blur complete at a smaller circle of confusion.
 _LEVELS = 5  # templates of 16, 32, 64, 128 and 256 cells
 _FADE_START_PX = 0.75  # px a cell; from here to 1 px the next finer template is blended in
 _MIN_REACH_PX = 1e-7  # px; a smaller PSF is rendered with this radius, whose kernel is a single pixel
-_MAX_BANKS = 32  # banks kept in memory
+_MAX_BANKS = 32  # banks kept in memory, the newest
 _MAX_WIDTHS = 64  # image widths for which the blur in focus is kept
 _templates = KernelCache(128 * 2**20)
+_banks: dict[str, "KernelBank"] = {}
 
 
 class Lens(Protocol):
@@ -86,33 +87,6 @@ class Lens(Protocol):
         """Share of the light that the kernel in focus moves to other pixels."""
 
 
-class Spots(NamedTuple):
-    """Recipe for the kernels of n circles of confusion and C colours, as plain numbers because n is small.
-
-    Args:
-        templates: Cells of the templates in use, each ``[C, 2 cells + 3, 2 cells + 3]``, float32.
-        which: Four indices into ``templates`` for each kernel: node below and above, and both of the next finer level.
-        part: Weight of the node above, in [0, 1].
-        finer: Weight of the finer level, in [0, 1].
-        reach: Radius of the PSF in pixels, C for each kernel.
-        fade: Weight of the kernel against a single pixel, in [0, 1], C for each kernel.
-        flipped: Whether the kernel is point-reflected.
-        half: Half width of each kernel in pixels; light beyond it is cut off.
-        moves: Zeros to add to ``part`` ``[n]`` and ``reach`` ``[n, C]``, through which gradients flow to the coc; None
-            without gradients.
-    """
-
-    templates: list[Tensor]
-    which: list[tuple[int, int, int, int]]
-    part: list[float]
-    finer: list[float]
-    reach: list[list[float]]
-    fade: list[list[float]]
-    flipped: list[bool]
-    half: list[int]
-    moves: tuple[Tensor, Tensor] | None
-
-
 class _Place(NamedTuple):
     """Position of a coc among the nodes of a table, and the radius of its PSF.
 
@@ -135,25 +109,13 @@ class _Place(NamedTuple):
 
 def bank_of(table: Lens) -> "KernelBank":
     """The bank of a table; tables with the same fingerprint share it."""
-    return _bank(table.fingerprint(), _IgnoredByCache(table))
-
-
-class _IgnoredByCache:
-    """Passes a table through :func:`functools.lru_cache`, which then compares only the fingerprint beside it."""
-
-    def __init__(self, table: Lens) -> None:
-        self.table = table
-
-    def __eq__(self, other: object) -> bool:
-        return True
-
-    def __hash__(self) -> int:
-        return 0
-
-
-@functools.lru_cache(_MAX_BANKS)
-def _bank(fingerprint: str, uncompared: _IgnoredByCache) -> "KernelBank":
-    return KernelBank(uncompared.table)
+    key = table.fingerprint()
+    bank = _banks.get(key)
+    if bank is None:
+        bank = _banks.setdefault(key, KernelBank(table))
+        for oldest in list(_banks)[:-_MAX_BANKS]:
+            _banks.pop(oldest, None)  # another thread may have removed it
+    return bank
 
 
 class KernelBank:

@@ -17,16 +17,16 @@ already.
   distance in pixels to the edge of the nearer rim, plus half a pixel, clamped to [0, 1].
 """
 
-import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .field import deviations
+from .aperture import overlaps
+from .field import bracket, deviations
 from .kernel_bank import SPOT_MARGIN_PX, Lens
 from .kernel_cache import KernelCache
 
@@ -53,8 +53,7 @@ class PlacedLens(Lens, Protocol):
         """Radius in pixels that holds the kernels at ``+-coc_px``."""
 
 
-@dataclasses.dataclass(frozen=True)
-class FieldMask:
+class FieldMask(NamedTuple):
     """Mask for the kernels of one signed circle of confusion, at :data:`DISTANCES` distances.
 
     Args:
@@ -73,9 +72,7 @@ class FieldMask:
 
     def to(self, like: Tensor) -> "FieldMask":
         """These masks with the dtype and device of ``like``."""
-        return dataclasses.replace(
-            self, values=self.values.to(like).contiguous(), boxes=self.boxes.to(like).contiguous()
-        )
+        return self._replace(values=self.values.to(like).contiguous(), boxes=self.boxes.to(like).contiguous())
 
 
 def layer_mask(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int]) -> FieldMask:
@@ -152,22 +149,10 @@ def _computed(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int
     # width of the average: a pixel, minus the variance that cells and linear interpolation between samples add
     sample_px = extent[:, 1:] / counts
     averaged_px = (1.0 - 2.0 * sample_px.square() - 3.0 * cells.square()).clamp_min(_MIN_AVERAGED_PX**2).sqrt()
-    values = _overlaps(along, row_edges, averaged_px[:, 0]) @ (mirrored / area)
-    values = values @ _overlaps(across, column_edges, averaged_px[:, 1]).transpose(-2, -1)
+    half_length, half_width = (0.5 * averaged_px).unsqueeze(-1).unbind(1)
+    values = overlaps(along - half_length, along + half_length, row_edges) @ (mirrored / area)
+    values = values @ overlaps(across - half_width, across + half_width, column_edges).transpose(-2, -1)
     return values / values.amax((0, 2, 3), keepdim=True), extent
-
-
-def _overlaps(centres: Tensor, edges: Tensor, width: Tensor) -> Tensor:
-    """Overlap of intervals with cells: ``[n, places, cells]``.
-
-    Args:
-        centres: Centres of the intervals ``[n, places]``.
-        edges: Edges of the cells ``[n, cells + 1]``.
-        width: Width of the intervals ``[n]``.
-    """
-    centres, half = centres[:, :, None], 0.5 * width[:, None, None]
-    low = torch.maximum(centres - half, edges[:, None, :-1])
-    return (torch.minimum(centres + half, edges[:, None, 1:]) - low).clamp_min(0.0)
 
 
 def _through_rims(table: PlacedLens, coc_px: float, width: float, distance: Tensor) -> tuple[Tensor, Tensor]:
@@ -236,8 +221,7 @@ def placed_between(kernels: Tensor, masks: Sequence[FieldMask], coc: Tensor, y: 
         x: The same to the right.
     """
     radii = torch.tensor([entry.coc_px for entry in masks], dtype=coc.dtype, device=coc.device)
-    low = (torch.searchsorted(radii, coc.detach().contiguous(), right=True) - 1).clamp(0, len(radii) - 2)
-    weights = ((coc - radii[low]) / (radii[low + 1] - radii[low])).clamp(0.0, 1.0)
+    low, weights = bracket(radii, coc)
     result = torch.empty_like(kernels.expand(-1, max(kernels.shape[1], masks[0].values.shape[0]), -1, -1))
     for k in low.unique().tolist():
         items = (low == k).nonzero()[:, 0]

@@ -41,22 +41,17 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..validation import WHOLE_NUMBERS, broadcast_shapes, real_tensor, show
+from ..validation import WHOLE_NUMBERS, broadcast_shapes, choice, real_tensor, show
 from .aperture import Aperture
 from .kernel_cache import KernelCache
 
 __all__ = [
     "FAMILIES",
-    "disc",
-    "gaussian",
     "opening_radius",
     "pixel_kernels",
     "profile",
-    "radial",
     "reach",
-    "ring",
     "sampled",
-    "softm",
     "support",
     "template",
 ]
@@ -68,7 +63,15 @@ FAMILIES: dict[str, tuple[str, ...]] = {
     "softm": ("radius", "sigma", "b", "m"),
     "radial": ("values", "radius"),
 }
-"""Names of the parameters of each family."""
+"""Names of the parameters of each family; lengths are in pixels, >= 0.
+
+* gaussian: standard deviation ``sigma`` along each axis.
+* ring: the paper's eq. (1) without N, ``exp(-(r - r_c)^2 / (2 sigma^2))``, a Gaussian in r whose peak lies at ``r_c``.
+* disc: uniform up to ``radius``, the image of a point through a perfect lens with a round aperture.
+* softm: ``erfc((r - R) / (sqrt(2) sigma)) / 2 * (1 + b (r / R)^m)`` with ``R = radius``: a disc with a soft edge and a
+  tilt ``b`` >= -1 with exponent ``m`` > 0. ``b > 0`` has the bright rim of an over-corrected lens.
+* radial: ``values`` ``[..., P]`` >= 0 at ``r = radius * i / (P - 1)``, linear in between, 0 beyond ``radius``.
+"""
 
 LENGTHS = frozenset({"sigma", "r_c", "radius"})
 """Parameters that are lengths; the others are pure numbers."""
@@ -90,102 +93,6 @@ _CACHED_HALF_WIDTH = 64  # cells; slices of larger quadrants are not cached
 _quadrants = KernelCache(64 * 2**20)
 
 Number = float | Tensor
-
-
-def gaussian(sigma: Number, size: int | None = None) -> Tensor:
-    """Gaussian of standard deviation ``sigma`` along each axis.
-
-    Args:
-        sigma: Pixels, >= 0, float or ``[...]``.
-        size: Odd width of the kernel; None takes the smallest that holds it.
-
-    Returns:
-        ``[..., size, size]``, float64.
-
-    Example:
-        >>> gaussian(1.0).shape
-        torch.Size([11, 11])
-    """
-    return pixel_kernels("gaussian", {"sigma": sigma}, size)
-
-
-def ring(sigma: Number, r_c: Number, size: int | None = None) -> Tensor:
-    """The paper's blur, ``exp(-(r - r_c)^2 / (2 sigma^2))``: a Gaussian in r whose peak sits at radius ``r_c``.
-
-    Args:
-        sigma: Width of the peak in pixels, >= 0, float or ``[...]``.
-        r_c: Radius of the peak in pixels, >= 0.
-        size: Odd width of the kernel; None takes the smallest that holds it.
-
-    Returns:
-        ``[..., size, size]``, float64. The paper's ``N`` scales light, not shape, and is left out.
-
-    Reference:
-        Sato, Dobashi, Yamamoto, eq. (1): sigma^2 -> ``sigma ** 2``, r_c -> ``r_c``.
-
-    Example:
-        >>> round(float(ring(sigma=1.0, r_c=4.0).sum()), 12)
-        1.0
-    """
-    return pixel_kernels("ring", {"sigma": sigma, "r_c": r_c}, size)
-
-
-def disc(radius: Number, size: int | None = None) -> Tensor:
-    """Uniform disc: the image of a point through a perfect lens with a round aperture.
-
-    Args:
-        radius: Pixels, >= 0, float or ``[...]``.
-        size: Odd width of the kernel; None takes the smallest that holds it.
-
-    Returns:
-        ``[..., size, size]``, float64.
-
-    Example:
-        >>> disc(0.5).shape
-        torch.Size([3, 3])
-    """
-    return pixel_kernels("disc", {"radius": radius}, size)
-
-
-def softm(radius: Number, sigma: Number, b: Number = 0.0, m: Number = 2.0, size: int | None = None) -> Tensor:
-    """Disc with a soft edge and a radial tilt: ``erfc((r - R) / (sqrt(2) sigma)) / 2 * (1 + b (r / R)^m)``.
-
-    ``b = 0`` is a soft disc, ``b = 0`` and ``sigma = 0`` a disc; ``b > 0`` has the bright rim of an over-corrected
-    lens.
-
-    Args:
-        radius: Pixels, >= 0, float or ``[...]`` (``R``).
-        sigma: Softness of the edge in pixels, >= 0.
-        b: Tilt, >= -1.
-        m: Exponent of the tilt, > 0.
-        size: Odd width of the kernel; None takes the smallest that holds it.
-
-    Returns:
-        ``[..., size, size]``, float64.
-
-    Example:
-        >>> bool(torch.allclose(softm(3.0, 0.0, size=9), disc(3.0, size=9), atol=1e-5))
-        True
-    """
-    return pixel_kernels("softm", {"radius": radius, "sigma": sigma, "b": b, "m": m}, size)
-
-
-def radial(values: Tensor, radius: Number, size: int | None = None) -> Tensor:
-    """Any isotropic profile: a table of its values over r.
-
-    Args:
-        values: ``[..., P]``, >= 0: the profile at ``r = radius * i / (P - 1)``, linear in between, 0 beyond ``radius``.
-        radius: Pixels, >= 0, float or ``[...]``.
-        size: Odd width of the kernel; None takes the smallest that holds it.
-
-    Returns:
-        ``[..., size, size]``, float64.
-
-    Example:
-        >>> bool(torch.allclose(radial(torch.ones(5), 3.0), disc(3.0), atol=1e-5))
-        True
-    """
-    return pixel_kernels("radial", {"values": values, "radius": radius}, size)
 
 
 def pixel_kernels(
@@ -217,6 +124,13 @@ def pixel_kernels(
 
     Raises:
         ValueError: If the family, a parameter or the size is not as described.
+
+    Reference:
+        Sato, Dobashi, Yamamoto, eq. (1): the family "ring".
+
+    Example:
+        >>> pixel_kernels("disc", {"radius": 0.5}).shape
+        torch.Size([3, 3])
     """
     checked = _checked(family, params)
     reach_px = _support(family, checked, aperture)
@@ -345,8 +259,7 @@ def half_width(reach: float) -> int:
 
 def _checked(family: str, params: Mapping[str, Number]) -> dict[str, Tensor]:
     """Valid parameters of a family as float64 tensors on one device."""
-    if not isinstance(family, str) or family not in FAMILIES:
-        raise ValueError(f"family must be one of {', '.join(FAMILIES)}, got {show(family)}")
+    choice("family", family, FAMILIES)
     if not isinstance(params, Mapping) or set(params) != set(FAMILIES[family]):
         got = ", ".join(map(str, params)) if isinstance(params, Mapping) else show(params)
         raise ValueError(f"{family} takes the parameters {', '.join(FAMILIES[family])}, got {got}")

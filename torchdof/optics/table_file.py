@@ -1,15 +1,13 @@
-"""Blur tables as JSON files: the schema, the checks, and the shipped tables."""
+"""Blur tables as JSON files: the schema, its checks, and the shipped tables."""
 
-import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..io.atomic import write_text
-from ..validation import show
+from ..validation import fields, show
 
-__all__ = ["fields_of", "find", "read", "shipped", "with_schema", "write"]
+__all__ = ["SCHEMA", "VERSION", "fields_of", "find", "shipped"]
 
 SCHEMA = "torchdof/blur-table"
 VERSION = 3
@@ -17,8 +15,6 @@ READABLE = (1, 2, 3)  # versions that are read; 2 added "aperture", 3 added "fie
 _FOLDER = Path(__file__).parent / "tables"
 _REQUIRED = ("family", "unit", "coc", "params")
 _OPTIONAL = ("name", "sensor_width_mm", "strength", "residual", "provenance", "aperture", "field")
-_KNOWN = {*_REQUIRED, *_OPTIONAL, "schema", "version"}
-_KINDS = {"family": str, "unit": str, "params": dict, "name": str, "provenance": dict, "aperture": dict, "field": dict}
 
 
 def find(source: str | os.PathLike[str]) -> Path:
@@ -47,53 +43,18 @@ def shipped() -> list[str]:
     return sorted(path.stem for path in _FOLDER.glob("*.json"))
 
 
-def read(path: Path) -> Any:
-    """The JSON in a file.
-
-    Raises:
-        ValueError: If the file is not valid JSON.
-        RecursionError: If it is nested too deep.
-    """
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
-def write(data: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
-    """Writes a table's data as JSON, whole or not at all.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
-    write_text(path, json.dumps(data, indent=1) + "\n")
-
-
-def with_schema(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """A table's fields with the schema and its version in front."""
-    return {"schema": SCHEMA, "version": VERSION, **fields}
-
-
 def fields_of(data: Any) -> dict[str, Any]:
     """The fields in a file's data, as arguments of :class:`torchdof.BlurTable`.
 
     Raises:
         ValueError: If one is missing, unknown or of the wrong kind; the message names it.
     """
-    if not isinstance(data, dict):
-        raise ValueError(f"a blur table must be a JSON object, got {type(data).__name__}")
+    if not isinstance(data, Mapping):
+        raise ValueError(f"a blur table must be a dict, got {show(data)}")
     if not isinstance(data.get("schema"), str) or data["schema"] != SCHEMA:
         raise ValueError(f"schema must be {SCHEMA!r}, got {show(data.get('schema'))}; is this a blur table?")
     if not isinstance(data.get("version"), int) or data["version"] not in READABLE:
         readable = " or ".join(map(str, READABLE))
         raise ValueError(f"version must be {readable}, got {show(data.get('version'))}; update torchdof to read it")
-    for field in _REQUIRED:
-        if field not in data:
-            raise ValueError(f"{field} is missing")
-    unknown = sorted(str(field) for field in set(data) - _KNOWN)
-    if unknown:
-        raise ValueError(f"{unknown[0]} is not a field of a blur table; known are {', '.join(sorted(_KNOWN))}")
-    for field, kind in _KINDS.items():
-        if field in data and not isinstance(data[field], kind):
-            raise ValueError(f"{field} must be a {kind.__name__}, got {type(data[field]).__name__}")
-    sensor = data.get("sensor_width_mm")
-    if sensor is not None and (isinstance(sensor, bool) or not isinstance(sensor, int | float)):
-        raise ValueError(f"sensor_width_mm must be a number, got {show(sensor)}")
-    return {name: value for name, value in data.items() if name not in ("schema", "version")}
+    given = {name: value for name, value in data.items() if name not in ("schema", "version")}
+    return fields("a blur table", given, _REQUIRED, _OPTIONAL)

@@ -17,17 +17,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .. import validation
-from ..optics.blur_table import BlurTable
-from ..optics.camera import CAMERA_NUMBERS, Camera
 from ..render.matting import matte
-from .lens_samples import LensSamples
+from ..validation import image_and_coc, whole
+from .scenes import spread_points
 
-__all__ = ["LensViews", "lens_views", "lens_views_by_coc"]
+__all__ = ["LensViews", "lens_views"]
 
 _SAME_SURFACE_PX = 1.0  # neighbours whose coc differs by less belong to one surface without gaps
 _SAME_DEPTH_PX = 0.5  # surfaces whose coc differs by less do not hide each other
 _BRIGHT_RATIO = 8.0  # light above this multiple of the mean is drawn from more points of the lens than there are views
+_POINTS_PER_VIEW = 16  # points around that of the view from which such light is drawn; more make its discs smoother
 
 
 class LensViews(NamedTuple):
@@ -58,29 +57,24 @@ class _Squares:
 
 def lens_views(
     image: Tensor,
-    depth: Tensor,
-    camera: Camera,
+    coc_px: Tensor,
     *,
-    table: BlurTable | None = None,
     views: int = 256,
     surfaces: Sequence[tuple[Tensor, Tensor]] = (),
     mixed_edges: bool | None = None,
 ) -> LensViews:
-    """Renders depth of field from many views through the lens.
+    """Renders the depth of field of an ideal round lens from many views through it.
 
     The time grows with ``views``, the memory does not: about 0.05 s for each view and megapixel on one core. Not
     differentiable.
 
     Args:
         image: ``[B, C, H, W]``, linear light.
-        depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres, > 0, ``inf`` allowed.
-        camera: The camera.
-        table: Blur table of a lens; None is the ideal disc. A view at radius ``rho`` of the lens shifts a surface by
-            the radius that contains the share ``rho^2`` of its kernel's light. This reproduces any radial kernel.
+        coc_px: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, signed radius in pixels, negative in front of the focus plane.
         views: Number of points on the lens. The picture converges as it grows; a blur of radius ``r`` pixels needs
             about ``r^2``.
         surfaces: Further surfaces, such as hidden ones: pairs of premultiplied colour and cover ``[B, C + 1, H, W]``
-            and depth like ``depth``.
+            and coc like ``coc_px``.
         mixed_edges: Whether to split pixels that show two surfaces (:func:`torchdof.render.matting.matte`). None splits
             them if no surfaces are given; with given surfaces the estimate does more harm than good.
 
@@ -91,81 +85,32 @@ def lens_views(
         ValueError: If an argument is invalid.
 
     Example:
-        >>> image, depth = torch.rand(1, 3, 8, 12), torch.full((1, 1, 8, 12), 3.0)
-        >>> lens_views(image, depth, Camera(focus_m=3.0), views=4).image.equal(image)
+        >>> image = torch.rand(1, 3, 8, 12)
+        >>> lens_views(image, torch.zeros(1, 1, 8, 12), views=4).image.equal(image)
         True
     """
-    validation.image_and_depth(image, depth, values=True)
-    width = image.shape[-1]
-    surfaces_coc = []
-    for rgba, behind in surfaces:
-        validation.image_and_depth(rgba, behind, values=True)
-        surfaces_coc.append((rgba, camera.coc_px(behind, width)))
-    coc = camera.coc_px(depth, width)
-    validation.coc_of_lens(coc, depth, {name: getattr(camera, name) for name in CAMERA_NUMBERS})
-    return lens_views_by_coc(image, coc, table=table, views=views, surfaces=surfaces_coc, mixed_edges=mixed_edges)
-
-
-def lens_views_by_coc(
-    image: Tensor,
-    coc_px: Tensor,
-    *,
-    table: BlurTable | None = None,
-    views: int = 256,
-    surfaces: Sequence[tuple[Tensor, Tensor]] = (),
-    mixed_edges: bool | None = None,
-) -> LensViews:
-    """Renders depth of field from many views through the lens, from a signed circle of confusion.
-
-    Args:
-        image: ``[B, C, H, W]``, linear light.
-        coc_px: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, signed radius in pixels, negative in front of the focus plane.
-        table: As in :func:`lens_views`.
-        views: As in :func:`lens_views`.
-        surfaces: Pairs of premultiplied colour and cover ``[B, C + 1, H, W]`` and coc like ``coc_px``.
-        mixed_edges: As in :func:`lens_views`.
-
-    Returns:
-        As :func:`lens_views`.
-
-    Raises:
-        ValueError: If an argument is invalid.
-    """
-    table = BlurTable.disc() if table is None else table
-    if table.aperture is not None:
-        raise ValueError(f"many views are taken through a round lens, got {table!r}; take with_aperture(None) of it")
-    if table.field is not None:
-        raise ValueError(f"many views have one spot all over the frame, got {table!r}; take replace(field=None) of it")
-    validation.image_and_coc(image, coc_px, table.channels, values=True)
-    if isinstance(views, bool) or not isinstance(views, int) or views < 1:
-        raise ValueError(f"views must be a whole number of points on the lens, at least 1, got {views!r}")
+    image_and_coc(image, coc_px, channels=1, values=True)
+    whole("views", views, 1, 2**31)
     batch, channels, height, width = image.shape
     for rgba, coc in surfaces:
         if rgba.shape != (batch, channels + 1, height, width):
             expected = f"[{batch}, {channels + 1}, {height}, {width}], premultiplied colour and cover"
             raise ValueError(f"a surface must be {expected}, got {list(rgba.shape)}")
-        validation.image_and_coc(rgba[:, :1], coc, channels=1, values=True)
+        image_and_coc(rgba, coc, channels=1, values=True)
 
-    images, shares = [], []
+    averages = []
     for item in range(batch):
-        item_maps = (image[item : item + 1].float(), coc_px.expand(batch, -1, -1, -1)[item : item + 1].float())
-        stack = [(*item_maps, torch.ones_like(item_maps[1]))]
+        light, coc = (maps.expand(batch, -1, -1, -1)[item : item + 1].float() for maps in (image, coc_px))
+        stack = [(light, coc, torch.ones_like(coc))]
         if mixed_edges or (mixed_edges is None and not surfaces):
-            stack = _matted(*item_maps)
-        for rgba, coc in surfaces:
+            stack = _matted(light, coc)
+        for rgba, hidden_coc in surfaces:
             cover = rgba[item : item + 1, -1:].float().clamp(0.0, 1.0)
             colour = rgba[item : item + 1, :-1].float() / cover.clamp_min(1e-6)
-            stack.append((colour, coc.expand(batch, -1, -1, -1)[item : item + 1].float(), cover))
-        groups = [slice(None)] if table.channels == 1 else [slice(c, c + 1) for c in range(channels)]
-        parts = []
-        for c, group in enumerate(groups):
-            lens = LensSamples(table, c, views, [coc for _, coc, _ in stack], width)
-            parts.append(_average([(light[:, group], coc, cover) for light, coc, cover in stack], lens, height, width))
-        known = torch.stack([known_share for _, known_share in parts]).amin(0)
-        average = torch.cat([light for light, _ in parts], 1)
-        images.append(torch.where(known > 0, average, item_maps[0]))
-        shares.append(known)
-    return LensViews(torch.cat(images).to(image.dtype), torch.cat(shares).to(image.dtype))
+            stack.append((colour, hidden_coc.expand(batch, -1, -1, -1)[item : item + 1].float(), cover))
+        average, known = _average(stack, views, height, width)
+        averages.append((torch.where(known > 0, average, light), known))
+    return LensViews(*(torch.cat(maps).to(image.dtype) for maps in zip(*averages, strict=True)))
 
 
 def _matted(image: Tensor, coc: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
@@ -182,7 +127,7 @@ def _matted(image: Tensor, coc: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
 
 
 def _average(
-    stack: Sequence[tuple[Tensor, Tensor, Tensor]], lens: LensSamples, height: int, width: int
+    stack: Sequence[tuple[Tensor, Tensor, Tensor]], views: int, height: int, width: int
 ) -> tuple[Tensor, Tensor]:
     """Mean of all views ``[1, C, H, W]`` and the share of views that saw a surface ``[1, 1, H, W]``."""
     limit = _BRIGHT_RATIO * stack[0][0].mean()
@@ -200,10 +145,11 @@ def _average(
     total = torch.zeros(count, channels, dtype=torch.float64, device=device)
     highlights, known_views = torch.zeros_like(total), torch.zeros(count, dtype=torch.float64, device=device)
     thresholds = torch.rand(squares.cover.shape, generator=torch.Generator().manual_seed(0)).to(device)
-    for view in range(lens.views):
+    lens, offsets = spread_points(views), spread_points(_POINTS_PER_VIEW) / views**0.5
+    for view, (ux, uy) in enumerate(lens.tolist()):
         # A square that covers 30 % of its pixel is drawn in 30 % of the views.
         is_drawn = ((thresholds + view * 0.7548776662466927) % 1.0) < squares.cover
-        source, target, light = _draw(squares, is_drawn, *lens.shift(view, squares.coc), height, width)
+        source, target, light = _draw(squares, is_drawn, ux, uy, height, width)
         front = torch.full((count,), torch.inf, device=device)
         front.scatter_reduce_(0, target, squares.coc[source], "amin")
         visible = squares.coc[source] <= front[target] + _SAME_DEPTH_PX
@@ -213,10 +159,11 @@ def _average(
         total += drawn / covered.clamp_min(1.0)[:, None]
         known_views += covered > 0
         if bright_rows.numel():
-            _draw_points(highlights, front, squares, bright_rows, bright_light, lens, view, height, width)
+            points = (lens[view] + offsets).tolist()
+            _draw_points(highlights, front, squares, bright_rows, bright_light, points, height, width)
     # Unknown views get the mean of the known ones, but no highlights.
-    image = (total / known_views.clamp_min(1.0)[:, None] + highlights / lens.views).clamp_min(0.0).float()
-    return image.T.reshape(1, channels, height, width), (known_views / lens.views).float().reshape(1, 1, height, width)
+    image = (total / known_views.clamp_min(1.0)[:, None] + highlights / views).clamp_min(0.0).float()
+    return image.T.reshape(1, channels, height, width), (known_views / views).float().reshape(1, 1, height, width)
 
 
 def _squares(stack: Sequence[tuple[Tensor, Tensor, Tensor]]) -> _Squares:
@@ -262,13 +209,13 @@ def _light_slope(light: Tensor, coc: Tensor) -> Tensor:
 
 
 def _draw(
-    squares: _Squares, is_drawn: Tensor, dx: Tensor, dy: Tensor, ddx: Tensor, ddy: Tensor, height: int, width: int
+    squares: _Squares, is_drawn: Tensor, ux: float, uy: float, height: int, width: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Draws the squares of a view: row of the square, pixel whose centre it covers, and its light there."""
-    x, y = squares.x + dx, squares.y + dy
+    x, y = squares.x + ux * squares.coc, squares.y + uy * squares.coc
     slope_x, slope_y = squares.coc_slope
-    # With slope s the view maps a step v on the surface to v + (ddx, ddy) (s . v); det is the determinant of that map.
-    det = 1.0 + ddx * slope_x + ddy * slope_y
+    # With slope s the view maps a step v on the surface to v + (ux, uy) (s . v); det is the determinant of that map.
+    det = 1.0 + ux * slope_x + uy * slope_y
     det = torch.where(det.abs() < 0.05, 0.05, det)
     sources, targets, lights = [], [], []
     for right in (0, 1):
@@ -276,7 +223,7 @@ def _draw(
             column, row = x.floor() + right, y.floor() + down
             ex, ey = column - x, row - y
             along = (slope_x * ex + slope_y * ey) / det
-            qx, qy = ex - ddx * along, ey - ddy * along
+            qx, qy = ex - ux * along, ey - uy * along
             inside = (qx >= -0.5) & (qx < 0.5) & (qy >= -0.5) & (qy < 0.5)
             inside &= is_drawn & (column >= 0) & (column < width) & (row >= 0) & (row < height)
             s = inside.nonzero()[:, 0]
@@ -293,19 +240,18 @@ def _draw_points(
     squares: _Squares,
     bright_rows: Tensor,
     light: Tensor,
-    lens: LensSamples,
-    view: int,
+    points: Sequence[Sequence[float]],
     height: int,
     width: int,
 ) -> None:
-    """Adds light far above the mean, from all points of the lens that belong to this view, where it is visible.
+    """Adds light far above the mean, seen from points of the lens around that of this view, where it is visible.
 
     A highlight of one pixel is one dot in each view; with these additional points its disc is even.
     """
     coc = squares.coc[bright_rows]
-    for dx, dy in lens.points_of(view, coc):
-        column, row = (squares.x[bright_rows] + dx).round(), (squares.y[bright_rows] + dy).round()
+    for ux, uy in points:
+        column, row = (squares.x[bright_rows] + ux * coc).round(), (squares.y[bright_rows] + uy * coc).round()
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         target = (row * width + column).long()[inside]
         visible = coc[inside] <= front[target] + _SAME_DEPTH_PX
-        highlights.index_add_(0, target[visible], light[inside][visible] / lens.points_per_view)
+        highlights.index_add_(0, target[visible], light[inside][visible] / len(points))

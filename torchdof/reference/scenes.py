@@ -22,7 +22,6 @@ import torch
 from torch import Tensor
 
 from ..optics.camera import Camera
-from .lens_samples import spread_points
 
 __all__ = [
     "Plane",
@@ -33,6 +32,7 @@ __all__ = [
     "plane_views",
     "posts",
     "read_scenes",
+    "spread_points",
     "strands",
     "waves",
 ]
@@ -190,8 +190,7 @@ def plane_scene(
     depths = torch.tensor([p.depth_m for p in planes], dtype=torch.float64).reshape(-1, 1, 1, 1)
     cocs = camera.coc_px(depths, width).flatten().tolist()
     y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in size), indexing="ij")
-    rho, angle = spread_points(samples)
-    points = torch.stack([rho * angle.cos(), rho * angle.sin()], -1).tolist()
+    points = spread_points(samples).tolist()
 
     def pinhole(_: int, x: Tensor, y: Tensor) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
         return [(x, y)] * len(planes), torch.ones_like(x)
@@ -207,10 +206,22 @@ def plane_scene(
     for plane, cover in zip(planes, covers, strict=True):
         is_covered = torch.ones_like(x, dtype=torch.bool) if plane.shape is None else plane.shape(x, y)
         depth = torch.where(is_covered, plane.depth_m, depth)
-        surfaces.append((cover.float()[None], torch.full((1, 1, height, width), plane.depth_m)))
+        surfaces.append((cover.float()[None], camera.coc_px(torch.full((1, 1, height, width), plane.depth_m), width)))
     margin_px = math.ceil(max(abs(c) for c in cocs))
     images = (sharp.float()[None], depth.float()[None, None], camera, truth.float()[None])
     return Scene(name, *images, margin_px, tuple(surfaces))
+
+
+def spread_points(count: int) -> Tensor:
+    """Evenly spread points on the unit disc (a sunflower): x and y, ``[count, 2]``, float64.
+
+    Example:
+        >>> round(float(spread_points(1000).square().sum(1).mean()), 3)
+        0.5
+    """
+    index = torch.arange(count, dtype=torch.float64)
+    radius, angle = ((index + 0.5) / count).sqrt(), index * (math.pi * (3.0 - math.sqrt(5.0)))
+    return torch.stack([radius * angle.cos(), radius * angle.sin()], -1)
 
 
 def plane_views(

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests import loops
+from tests.kernels import kernel_of
 from torchdof import BlurTable, Camera
 from torchdof.fit import natural_psnr, trace_table
 from torchdof.fit.lens.lens import RGB_UM, Lens
@@ -116,7 +117,7 @@ def small(lens: Lens, **changes: Any) -> BlurTable:
 
 def test_a_stopped_down_lens_gives_discs_of_the_thin_lens():
     table = small(read("double_gauss_50mm"), f_number=32.0, focus="paraxial")
-    far = psf.disc(float(table.coc[-1]) / PIXEL)
+    far = kernel_of("disc", float(table.coc[-1]) / PIXEL)
     made = table.kernels(table.coc[-1:] / PIXEL, WIDTH)[0, 0]
     assert natural_psnr(made.numpy(), far.numpy()) > 55.0
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from tests.kernels import kernel_of
 from torchdof import BlurTable, Camera
 from torchdof.fit import Capture, Captures, FitWarning, fit_captures, fit_table, natural_psnr
-from torchdof.optics import psf
 
 WIDTH = 1200
 CAMERA = Camera(focal_length_mm=50.0, f_number=3.5, focus_m=1.0, sensor_width_mm=36.0)
@@ -38,7 +38,7 @@ def captured(simulator, distances, snr_db=40.0, seed=0, known=True, family="soft
 
 
 def psnr_to_the_lens(kernels, places):
-    true = [psf.softm(**{k: torch.tensor(v, dtype=torch.float64) for k, v in lens(coc).items()}) for coc in places]
+    true = [kernel_of("softm", *(torch.tensor(v, dtype=torch.float64) for v in lens(coc).values())) for coc in places]
     return np.array([natural_psnr(found, kernel) for found, kernel in zip(kernels, true, strict=True)])
 
 
