@@ -173,6 +173,7 @@ class _Scene(ctypes.Structure):
         ("masked", ctypes.c_int32),
         ("highlights", ctypes.c_int32),
         ("crisp_px", ctypes.c_float),
+        ("reach", ctypes.c_float),
         *_OF_LAYERS,
         ("field_masks", ctypes.POINTER(_FieldMask)),
         ("distances", ctypes.c_int32),
@@ -272,6 +273,7 @@ def render(
     masked: bool,
     highlights: bool,
     crisp_px: float,
+    reach: float,
     field_masks: Sequence[KernelMask],
     ray_masks: Callable[[list[int]], Sequence[KernelMask]],
     squeeze: float,
@@ -294,6 +296,7 @@ def render(
         masked: Whether values may be NaN or infinite; such pixels are copied.
         highlights: Whether highlights are rendered ray by ray where layers would soften them.
         crisp_px: Blur in pixels above which layers soften highlights.
+        reach: Radius of the widest kernel divided by the radius of its disc, at least 1.
         field_masks: Transmittance of the field for each layer, float32 and contiguous; empty if the lens has no field.
         ray_masks: Field masks for signed radii of highlights, in steps of 1/32 pixel, in ascending order of radius.
         squeeze: Height of the blur divided by its width.
@@ -325,6 +328,7 @@ def render(
         masked,
         highlights,
         crisp_px,
+        reach,
         *of_layers,
         _field_masks(field_masks) if field_masks else None,
         field_masks[0].values.shape[1] if field_masks else 0,
@@ -559,8 +563,8 @@ def plan(coc_px: Tensor, tolerance: float) -> tuple[tuple[float, ...], float]:
         tolerance: Largest error of the picture.
 
     Returns:
-        Positions of the layers on the blur axis, near to far, and the tolerance, reduced if blurs are as large as the
-        frame.
+        Positions of the layers on the blur axis, near to far, and the tolerance, smaller in a frame as small as its
+        blurs, larger in a rough one.
 
     Raises:
         MemoryError: If there is not enough memory.
