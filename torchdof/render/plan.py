@@ -226,7 +226,7 @@ class Plan:
     def reach(self, table: BlurTable, width: int) -> float:
         """Radius of the most blurred layer's kernel divided by the radius of its disc, at least 1."""
         coc = max(self.coc_px, key=abs)
-        reach = bank_of(table).reach_px(coc, 1 if table.unit == "relative" else width)
+        reach = bank_of(table).reach_px(coc, 1 if table.unit == "relative" else int(width))
         return max(reach / max(abs(coc), 1.0), 1.0)
 
     def layer_kernels(
