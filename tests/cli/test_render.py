@@ -17,7 +17,7 @@ from torch import Tensor
 
 import torchdof
 from tests.files import store
-from torchdof.cli.frame import coc_of, read_frame
+from torchdof.cli.frame import Renderer, coc_of, read_frame
 from torchdof.cli.lens import Lens
 from torchdof.cli.main import app
 from torchdof.cli.options import DepthMap, Scene
@@ -391,6 +391,25 @@ def test_resume_renders_frames_again_whose_options_or_files_changed(
     guessed(line.replace("-o out.", "-o new."))
     for n in (1, 2, 3):
         assert torch.equal(pixels(f"out.{n:04d}.exr"), pixels(f"new.{n:04d}.exr"))
+
+
+def test_a_run_ends_if_another_one_renders_its_frames_with_other_options(
+    scene: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torchdof.BlurTable.disc().save("lens.json")
+    render, rendered = Renderer.render, list[int]()
+
+    def render_second_after_another_run(self: Renderer, *arguments: Any) -> Any:
+        rendered.append(arguments[2])
+        if rendered == [1, 2]:
+            monkeypatch.setattr(Renderer, "render", render)
+            run(f"{SEQUENCE} {PULL} --f-number 4")
+        return render(self, *arguments)
+
+    monkeypatch.setattr(Renderer, "render", render_second_after_another_run)
+    told = run(f"{SEQUENCE} {PULL}", code=2)
+    assert "out.####.exr.json: another run renders the same frames with other options (--f-number" in told
+    assert guessed(f"{SEQUENCE} {PULL} --f-number 4 --resume")[0] == "3 of 3 frames are there already\n"
 
 
 # Names

@@ -86,7 +86,8 @@ def main() -> None:
             kind = (name, re.sub(r"\d+|0x\w+", "0", wrong or "")[:50])
             if wrong and kind not in kinds:
                 kinds.add(kind)
-                content = input_of(name, Path(folder)).read_bytes()
+                path = input_of(name, Path(folder))
+                content = path.read_bytes() if path.exists() else b""  # a turn may end before its first input
                 digest = hashlib.sha256(content).hexdigest()[:10]
                 kept = arguments.findings / f"{name}-{digest}{TARGETS[name].suffix}"
                 kept.write_bytes(content)

@@ -87,6 +87,7 @@ struct Scene {
     scene.masked = integer(0, 1) && scene.kind != TORCHDOF_STACK;  // a stack's values are finite
     scene.highlights = integer(0, 3) > 0;
     scene.crisp_px = float(number(0.5, 4.0));
+    scene.reach = float(number(1.0, 3.0));
     scene.squeeze = 1.0f;
     const double largest = number(1.0, 40.0);
     surfaces(integer, number, largest);

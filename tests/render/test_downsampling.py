@@ -52,6 +52,20 @@ def error(table: BlurTable, coc_px: float, scale: int, factor: float) -> float:
     return float((fine - spread(image, table, coc_px))[inner].square().mean().sqrt())
 
 
+@pytest.mark.parametrize("sigma_per_coc", [0.1, 0.5, 1.0])
+@pytest.mark.parametrize(("scale", "radius_px"), [(2, 7.2), (4, 18.0), (8, 36.0)])
+def test_a_gaussian_is_as_exact_at_a_coarser_resolution_as_its_finest_disc(
+    sigma_per_coc: float, scale: int, radius_px: float
+) -> None:
+    table = BlurTable.gaussian(sigma_per_coc)
+    coc_px = radius_px / table.finest_px(1.0, 256.0)
+    errors = [
+        error(each, coc, scale, shrink(each, coc / scale, 256 / scale, scale))
+        for each, coc in ((table, coc_px), (TABLES["disc"], radius_px))
+    ]
+    assert 0.7 < errors[0] / errors[1] < 1.25
+
+
 @pytest.mark.parametrize("scale", [2, 4])
 @pytest.mark.parametrize("coc_px", [1.8, 2.3, 3.6, 4.6, 7.1])
 @pytest.mark.parametrize("name", TABLES)

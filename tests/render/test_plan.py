@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 import torchdof
 from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.kernel_bank import bank_of
+from torchdof.render import layer_cocs
 from torchdof.render.layer_cocs import spacing
 from torchdof.render.layer_weights import blur_axis
 from torchdof.render.plan import Plan, kernels_for
@@ -74,6 +75,27 @@ def test_a_frame_is_planned_for_less_where_it_is_blurred_much_not_where_a_few_pi
     assert Plan.for_scene(coc, 1 / 255, on_grid=True).tolerance == 1 / 255
     for blurred in (torch.full_like(coc, 500.0), torch.cat([torch.full_like(coc, 500.0), coc])):
         assert Plan.for_scene(blurred, 1 / 255).tolerance == pytest.approx(480 / (3 * 500) / 255)
+
+
+def test_a_rough_frame_is_planned_for_more_and_keeps_its_tolerance(engine: str) -> None:
+    generator = torch.Generator().manual_seed(1)
+    image, noise = (torch.rand(1, n, *size, generator=generator) for n, size in ((3, (24, 32)), (1, (96, 128))))
+    image, noise = torch.nn.functional.interpolate(image, scale_factor=4.0, mode="bicubic").clamp(0.0, 1.0), noise - 0.5
+    change = float(layer_cocs.mean_change(40.0 * noise))
+    rough = Plan.for_scene(40.0 * noise, 1 / 255)
+    assert rough.tolerance == pytest.approx(math.sqrt(change / 8) / 255) and change > 20
+    assert Plan.for_scene(40.0 * noise, 1 / 255, on_grid=True).tolerance == 1 / 255
+    exact = torchdof.blur_by_coc(image, 40.0 * noise, plan=Plan.for_scene(40.0 * noise, 0.1 / 255, adapt=False))
+    error = torchdof.blur_by_coc(image, 40.0 * noise, plan=rough) - exact
+    assert float(error.square().mean().sqrt()) < 1 / 255
+    # ordinary frames, one surface of two, and loose tolerances are planned as they are
+    smooth = torch.zeros_like(noise)
+    for calm in (5.0 * noise, torch.cat([40.0 * noise, smooth])):
+        assert Plan.for_scene(calm, 1 / 255).tolerance == 1 / 255
+    assert Plan.for_scene(40.0 * noise, 5 / 255).tolerance == 5 / 255
+    wide = 600.0 * torch.rand(1, 1, 1000, 1000, generator=generator) - 300.0
+    wide[0, 0, 0, 0] = math.nan
+    assert Plan.for_scene(wide, 1 / 255).tolerance == pytest.approx(4 / 255)
 
 
 def test_layers_for_gradients_do_not_depend_on_small_changes_of_the_scene() -> None:

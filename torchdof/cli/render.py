@@ -237,7 +237,8 @@ class Render:
     ) -> None:
         """Renders frames in order; while one is rendered, the next is read and the previous one is written.
 
-        The record is written before the first frame, but after it is rendered: an error in it leaves no file.
+        The record is written before the first frame, but after it is rendered: an error in it leaves no file. Before
+        each later frame it is read: the run ends if another one has begun to write other frames of these names.
         """
         several = len(files) > 1
         with (
@@ -256,6 +257,8 @@ class Render:
                     if k == 0 and record is not None:
                         make_folder_of(out)
                         record.write()
+                    elif record is not None:
+                        record.check()
                     written = writer.submit(renderer.write, rendered)  # Ctrl-C does not stop this thread
             finally:  # a rendered frame is written even if the next one fails
                 written.result()

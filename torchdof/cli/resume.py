@@ -50,6 +50,11 @@ class Record:
         if self.difference():
             write_text(self.path, json.dumps(self._options, indent=1))
 
+    def check(self) -> None:
+        """Refuses to go on if another run has recorded other options since :meth:`write`: frames would be mixed."""
+        if self.path.is_file() and (reason := self.difference()):
+            raise ValueError(f"{self.path}: another run renders the same frames with other options ({reason})")
+
 
 def _changed_ns(path: Path) -> int:
     return path.stat().st_mtime_ns

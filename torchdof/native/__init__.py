@@ -137,7 +137,7 @@ class _Spots(ctypes.Structure):
 class _Scene(ctypes.Structure):
     _fields_ = _fields(
         *((_Int, "height width channels kind surfaces"), (_Arrays, "light coc weight")),
-        *((_Int, "occlusion normalize masked highlights"), (_Real, "crisp_px"), *_LAYERS),
+        *((_Int, "occlusion normalize masked highlights"), (_Real, "crisp_px reach"), *_LAYERS),
         *((ctypes.POINTER(_FieldMask), "field_masks"), (_Int, "distances"), (_Real, "squeeze")),
         *((_Int, "threads"), (_Ints, "cancelled")),
     )
@@ -234,6 +234,7 @@ def render(
     masked: bool,
     highlights: bool,
     crisp_px: float,
+    reach: float,
     field_masks: Sequence[KernelMask],
     ray_masks: Callable[[list[int]], Sequence[KernelMask]],
     squeeze: float,
@@ -256,6 +257,7 @@ def render(
         masked: Whether values may be NaN or infinite; such pixels are copied.
         highlights: Whether highlights are rendered ray by ray where layers would soften them.
         crisp_px: Blur in pixels above which layers soften highlights.
+        reach: Radius of the widest kernel divided by the radius of its disc, at least 1.
         field_masks: Transmittance of the field for each layer, float32 and contiguous; empty if the lens has no field.
         ray_masks: Field masks for signed radii of highlights, in steps of 1/32 pixel, in ascending order of radius.
         squeeze: Height of the blur divided by its width.
@@ -286,6 +288,7 @@ def render(
         masked,
         highlights,
         crisp_px,
+        reach,
         *of_layers,
         _field_masks(field_masks) if field_masks else None,
         field_masks[0][0].shape[1] if field_masks else 0,
@@ -574,8 +577,8 @@ def plan(coc_px: Tensor, tolerance: float) -> tuple[tuple[float, ...], float]:
         tolerance: Largest error of the picture.
 
     Returns:
-        Positions of the layers on the blur axis, near to far, and the tolerance, reduced if blurs are as large as the
-        frame.
+        Positions of the layers on the blur axis, near to far, and the tolerance, smaller in a frame as small as its
+        blurs, larger in a rough one.
     """
     coc_px, kept, count, capacity = coc_px.contiguous(), ctypes.c_double(tolerance), ctypes.c_int32(), 256
     while True:

@@ -22,6 +22,7 @@ __all__ = ["BlurTable"]
 
 UNITS = ("fraction", "mm", "relative")
 _RIM_POWER = 4.0  # exponent m of a bright rim; a larger one makes the rim thinner
+_FINEST_SIGMAS = 3.4  # radius of the disc that is as accurate at a coarser resolution as a Gaussian, in its sigmas
 _SPOT_EDGE_PX = 1.5  # px around a spot of a field in which pixels receive some of its light
 
 # Allowed values
@@ -126,6 +127,9 @@ class BlurTable:
         self._sides = {sign: self._side(sign) for sign in (-1, 1)}
         for sign in (-1, 1):
             self._sides[sign] = self._sides[sign] or self._sides[-sign]
+        if family == "gaussian":
+            spreads = self._params["sigma"].detach() / self.coc.abs()
+            self._gaussian_finest = _FINEST_SIGMAS * float(spreads[:, self.coc != 0].min())
         in_focus = [self._side_params(sign, torch.zeros(1, device="cpu")) for sign in (-1, 1)]
         self.is_sharp_in_focus = not any(bool(p[name].any()) for p in in_focus for name in psf.LENGTHS & p.keys())
         self._try_kernels()
@@ -391,10 +395,12 @@ class BlurTable:
         return max(reach, float(self.field.reach(signed / per_unit).max()) * per_unit + _SPOT_EDGE_PX)
 
     def finest_px(self, coc_px: float, width: float) -> float:
-        """Radius in pixels, at most ``|coc_px|``, of the disc with detail about as fine as the kernel's finest."""
+        """Radius in pixels of the disc with detail about as fine as the kernel's finest."""
         if self.field is not None:
             per_unit = self.px_per_unit(width)
             return min(abs(coc_px), self.field.finest(coc_px / per_unit) * per_unit)
+        if self.family == "gaussian":
+            return abs(coc_px) * self._gaussian_finest
         return abs(coc_px) if self.aperture is None else abs(coc_px) * self.aperture.finest
 
     def blur_texture(self, coc_px: float, width: int, size: int | None = None) -> Tensor:

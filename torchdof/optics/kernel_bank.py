@@ -171,6 +171,10 @@ class KernelBank:
             sizes, slopes = [spot_reach * min(abs(coc_px), 1.0)] * self.colours, [0.0] * self.colours
         return _Place(side, node, part, [size * per_unit for size in sizes], slope / per_unit, slopes)
 
+    def reach_px(self, coc_px: float, width: float) -> float:
+        """Radius in pixels of the kernel of a coc, the largest of all colours."""
+        return max(self._place(coc_px, width).reach) * self.widest
+
     def spots(
         self, coc_px: Tensor | Sequence[float], width: float, scale: Sequence[float] = (), longest: Sequence[int] = ()
     ) -> Spots:

@@ -94,6 +94,7 @@ def _render(
         masked=kind != "stack" and not options.check,
         highlights=plan.rays,
         crisp_px=plan.crisp_px,
+        reach=plan.reach(options.table, lens_width),
         field_masks=plan.field_masks(options.table, [scale for _, scale in layers], (int(height), int(width)), like),
         ray_masks=functools.partial(_ray_masks, options.table, (int(height), int(width))),
         squeeze=float(aperture.squeeze),

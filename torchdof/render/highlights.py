@@ -24,6 +24,7 @@ from .. import pixels
 from ..optics.blur_table import BlurTable
 from ..optics.placed_kernels import FieldMask, placed_between, ray_masks
 from ..tensors import is_traced, recomputed
+from .layer_cocs import mean_change
 from .ops import EAGER, Ops
 from .plan import KERNELS_PER_PX, kernels_for
 from .surfaces import HIDDEN_WEIGHT, Highlights, Surface, continuation_weight
@@ -166,15 +167,17 @@ def extract(
     return surface._replace(light=left), highlights
 
 
-def affordable_taps(coc_px: Tensor) -> Tensor:
+def affordable_taps(coc_px: Tensor, reach: Sequence[float]) -> Tensor:
     """Largest number of rays ``[B]`` of each frame with occlusion and coc ``[B, 1, H, W]``: 16 per pixel or fewer.
 
     Each ray is tested against each possible occluder, and a noisy depth map has many. So the number is inversely
-    proportional to the mean change of the coc between neighbours, above :data:`_FREE_CHANGE_PX`.
+    proportional to the mean change of the coc between neighbours, above :data:`_FREE_CHANGE_PX`. It counts the rays
+    of discs. Other kernels reach ``reach`` times as far, as from :meth:`torchdof.render.plan.Plan.reach`, one number
+    for all frames or one for each.
     """
-    coc, area = coc_px.detach(), math.prod(coc_px.shape[1:])
-    change = (coc.diff(dim=-1).abs().sum((1, 2, 3)) + coc.diff(dim=-2).abs().sum((1, 2, 3))) / area
-    return _TAPS_PER_PIXEL * area / (change / _FREE_CHANGE_PX).clamp_min(1.0)
+    crowd = (mean_change(coc_px.detach()) / _FREE_CHANGE_PX).clamp_min(1.0)
+    area = reach[0] ** 2 if len(reach) == 1 else coc_px.new_tensor(reach) ** 2
+    return _TAPS_PER_PIXEL * math.prod(coc_px.shape[1:]) / (crowd * area)
 
 
 def _least_peak(peak: Tensor, coc: Tensor, share: Tensor, most_taps: Tensor | float) -> Tensor:

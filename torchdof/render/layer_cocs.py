@@ -23,6 +23,7 @@ __all__ = [
     "finest",
     "joined",
     "largest_radii",
+    "mean_change",
     "moved_to_fixed",
     "on_axis",
     "spaced_nodes",
@@ -114,6 +115,8 @@ class Spread(NamedTuple):
     """Farthest place."""
     border: np.ndarray
     """Places of the pixels at the frame's border, ``[n]``."""
+    change: float
+    """Mean change of the coc between neighbouring pixels, as from :func:`mean_change`."""
 
 
 def spreads(coc_px: Tensor) -> list[Spread]:
@@ -122,15 +125,24 @@ def spreads(coc_px: Tensor) -> list[Spread]:
     known = known.to(torch.promote_types(known.dtype, torch.float32))
     both = torch.stack(torch.aminmax(known.flatten(1), dim=1), 1)
     lines = [known[..., 0, :], known[..., -1, :], known[..., 0], known[..., -1]]
-    x = on_axis(torch.cat([both, *(line.flatten(1) for line in lines)], 1), max(coc_px.shape[-2:]))
+    longest = max(coc_px.shape[-2:])
+    x = on_axis(torch.cat([both, *(line.flatten(1) for line in lines)], 1), longest)
     exact = np.float64 if x.dtype == torch.float64 else np.float32
-    return [Spread(low, high, np.array(border, exact)) for low, high, *border in x.tolist()]
+    change = mean_change(known.clamp(-_reach(longest), _reach(longest)))
+    values = torch.cat([change[:, None], x], 1).tolist()
+    return [Spread(low, high, np.array(border, exact), change) for change, low, high, *border in values]
 
 
 def joined(spreads: Sequence[Spread]) -> Spread:
     """The spread of several maps of one scene."""
-    lows, highs, borders = zip(*spreads, strict=True)
-    return Spread(min(lows), max(highs), np.concatenate(borders))
+    lows, highs, borders, changes = zip(*spreads, strict=True)
+    return Spread(min(lows), max(highs), np.concatenate(borders), min(changes))
+
+
+def mean_change(coc_px: Tensor) -> Tensor:
+    """Mean change of each map ``[B, 1, H, W]`` between neighbours, horizontal plus vertical, in pixels: ``[B]``."""
+    sums = coc_px.diff(dim=-1).abs().sum((1, 2, 3)) + coc_px.diff(dim=-2).abs().sum((1, 2, 3))
+    return sums / math.prod(coc_px.shape[1:])
 
 
 def largest_radii(coc_px: Tensor) -> list[float]:

@@ -243,7 +243,8 @@ def _render_items(
         (from_px,) = [0.0] if options.occlusion else _of_plans([(px - 1.0,) for px in crisp_px], coc)
         # with a known background, mixed pixels need no second surface for their highlights
         beside = surfaces[::-1] if len(surfaces) == 2 else [None] * len(surfaces)
-        most = highlights.affordable_taps(coc) if options.occlusion else None
+        reach = [plan.reach(options.table, ops.lens_width or coc.shape[-1]) for plan in plans]
+        most = highlights.affordable_taps(coc, reach) if options.occlusion else None
         extracted = [
             highlights.extract(s, limit, from_px, b, coc, most, len(plans) > 1, ops)
             for s, b in zip(surfaces, beside, strict=True)

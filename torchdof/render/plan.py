@@ -4,7 +4,6 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
@@ -35,6 +34,8 @@ _FEWER_KERNELS_PER_PX = 4  # the same in a graph, which holds all kernels as con
 _COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # px: layers from these radii on have 1/2, 1/4, ... resolution at 1/255
 _LEAST_CUT = 24  # layer pixels: smaller kernels are never cut, so that those of a graph do not depend on its sizes
 _SMALL_RADII = 3.0  # blur radii: frames with a shorter side below this are planned for a smaller tolerance
+_ROUGH_PX = 8.0  # mean change of coc between neighbours, in pixels, above which a frame needs fewer layers
+_ROUGH_TOLERANCE = 4.0 / 255.0  # tolerance of the roughest frames; larger: their errors exceed 1/255
 _FARTHEST_PX = 1e9  # px: upper limit of nodes; frames are smaller
 
 
@@ -108,13 +109,17 @@ class Plan:
             coc_px: Signed coc in pixels.
             tolerance: Largest error of the picture, in [0, 1).
             on_grid: Whether layers lie at places that do not depend on the scene, as gradients need.
-            adapt: Whether the tolerance is reduced for small frames. Errors are largest beside depth edges and the
-                border. In a frame that is small compared with its blur radii, most pixels are near one, so the
-                tolerance is multiplied by ``shorter side / (3 * radius)``, with the mean radius of the most blurred
-                hundredth of its pixels. With ``on_grid`` the factor is rounded down to a power of 1/2.
+            adapt: Whether the tolerance is changed for small and for rough frames. Errors are largest beside depth
+                edges and the border. In a frame that is small compared with its blur radii, most pixels are near one,
+                so the tolerance is multiplied by ``shorter side / (3 * radius)``, with the mean radius of the most
+                blurred hundredth of its pixels. In a rough frame, such as noise as depth, all layers overlap
+                everywhere, which takes long; but each pixel of the picture is a mean over many layers, whose errors
+                cancel. So the tolerance is multiplied by the root of the mean change of the coc between neighbours,
+                divided by 8 px, if this is more than 1, up to a tolerance of 4/255. With ``on_grid`` the factor is
+                rounded down to a power of 2.
         """
         if not adapt:
-            return cls._between(*layer_cocs.joined(layer_cocs.spreads(coc_px)), tolerance)
+            return cls._between(layer_cocs.joined(layer_cocs.spreads(coc_px)), tolerance)
         if not on_grid and coc_px.dtype == torch.float32 and is_in_memory(coc_px) and native.chosen():
             return cls(*native.plan(coc_px, tolerance))
         return cls.for_scenes([coc_px], tolerance, on_grid)[0]
@@ -134,22 +139,25 @@ class Plan:
             largest = layer_cocs.largest_radii(coc_px)
             radii = [max(largest[i : i + count]) for i in range(0, len(coc_px), count)]
         plans = []
-        for (low, high, border), radius in zip(spreads, radii, strict=True):
-            part = min(1.0, shorter / (_SMALL_RADII * max(radius, 1.0)))
+        for spread, radius in zip(spreads, radii, strict=True):
+            factor = min(1.0, shorter / (_SMALL_RADII * max(radius, 1.0)))
+            loosest = max(1.0, _ROUGH_TOLERANCE / max(tolerance * factor, 1e-9))
+            factor *= min(max(1.0, math.sqrt(spread.change / _ROUGH_PX)), loosest)
             if on_grid:
-                loose = tolerance * 2.0 ** math.floor(math.log2(part))
-                plans.append(cls(layer_cocs.spaced_nodes(low, high, loose), loose))
+                planned_for = tolerance * 2.0 ** math.floor(math.log2(factor))
+                plans.append(cls(layer_cocs.spaced_nodes(spread.low, spread.high, planned_for), planned_for))
             else:
-                plans.append(cls._between(low, high, border, tolerance * part))
+                plans.append(cls._between(spread, tolerance * factor))
         return plans
 
     @classmethod
-    def _between(cls, low: float, high: float, border: np.ndarray, tolerance: float) -> "Plan":
-        """Layers for a scene that spans ``low`` to ``high`` on the blur axis, with the places of its border."""
+    def _between(cls, spread: layer_cocs.Spread, tolerance: float) -> "Plan":
+        """Layers for a scene of this spread."""
+        low, high = spread.low, spread.high
         if high <= low:
             return cls((low,), tolerance)
         fixed = [low, high]
-        for crowded in layer_cocs.border_nodes(border):
+        for crowded in layer_cocs.border_nodes(spread.border):
             finest = layer_cocs.finest(crowded)
             if layer_cocs.spacing(crowded, tolerance) > 2.5 * finest:
                 for node in (crowded, crowded - finest, crowded + finest):
@@ -214,6 +222,12 @@ class Plan:
         if not coarse:
             return math.inf
         return max([0.0, *(abs(coc) for coc in self.coc_px if abs(coc) < min(coarse))])
+
+    def reach(self, table: BlurTable, width: int) -> float:
+        """Radius of the most blurred layer's kernel divided by the radius of its disc, at least 1."""
+        coc = max(self.coc_px, key=abs)
+        reach = bank_of(table).reach_px(coc, 1 if table.unit == "relative" else int(width))
+        return max(reach / max(abs(coc), 1.0), 1.0)
 
     def layer_kernels(
         self,

@@ -48,6 +48,7 @@ typedef struct {
   int32_t masked;  // 1: inputs may be NaN or infinite (not in a stack); such pixels are copied and do not affect others
   int32_t highlights;          // 0: highlights are blurred with their layers
   float crisp_px;              // blur in pixels above which layers soften the outlines of highlights
+  float reach;                 // radius of the widest kernel divided by the radius of its disc, at least 1
 
   int32_t layers;          // near to far
   const double *nodes;     // positions of the layers on the blur axis, strictly increasing

@@ -345,7 +345,6 @@ struct Job {
   void fill_hidden();                     // disocclusion.cpp
   void add_background();           // matting.cpp
   void extract_highlights();              // highlights.cpp
-  double change_of_coc() const;
 };
 
 // Smallest highlight threshold in a block.
@@ -615,6 +614,7 @@ inline uint32_t strip_inputs(int x, int half) { return marks(x, x + STRIP_COLUMN
 void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel, float *out);
 
 // Smallest and largest value; both NaN if any value is NaN.
+double mean_change(const float *coc, int height, int width, int threads);
 void find_ends(const float *values, int64_t count, int threads, float *low, float *high);
 
 // Signed coc of depths; everything between the two distances is in focus; plan.cpp

@@ -132,20 +132,6 @@ static float part_sent(const Surfaces &surfaces, int channels, int second, int y
   return cover + continuation(cover) * (stopped * is_dark * is_step);
 }
 
-// Mean change of coc between neighbours, horizontal plus vertical.
-double Job::change_of_coc() const {
-  std::vector<double> changes(height);
-  parallel(height, [&](int y, int) {
-    const float *row = surfaces.coc + (size_t)y * width, *above = y ? row - width : row;
-    double sum = 0;
-    for (int x = 0; x < width; x++) sum += std::fabs(row[x] - above[x]) + (x ? std::fabs(row[x] - row[x - 1]) : 0.0f);
-    changes[y] = sum;
-  });
-  double sum = 0;
-  for (const double change : changes) sum += change;
-  return sum / surfaces.area();
-}
-
 // Moves light above the threshold from the surfaces to rays.
 //
 // 1. Collect the bright, blurred, visible pixels of each surface.
@@ -187,8 +173,9 @@ void Job::extract_highlights() {
     }
   });
   const bool any = std::any_of(bands.begin(), bands.end(), [](const std::vector<Candidate> &band) { return !band.empty(); });
-  const double crowd = any && scene.occlusion ? std::max(change_of_coc() / FREE_CHANGE_PX, 1.0) : 1.0;
-  const double budget = (double)TAPS_PER_PIXEL * area / crowd;
+  const bool limited = any && scene.occlusion;
+  const double crowd = limited ? std::max(mean_change(surfaces.coc, height, width, scene.threads) / FREE_CHANGE_PX, 1.0) : 1.0;
+  const double budget = (double)TAPS_PER_PIXEL * area / (limited ? crowd * scene.reach * scene.reach : 1.0);
   for (int i = 0; i < count; i++) {
     std::vector<Candidate> all;
     for (int by = 0; by < surfaces.block_rows; by++) {

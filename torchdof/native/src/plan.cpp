@@ -14,7 +14,7 @@ namespace {
 constexpr double FINEST = 0.5, FINEST_PARTS = 40, WIDE = FINEST * FINEST_PARTS;
 constexpr double SPACING = 0.25, SPACING_POWER = 0.8, LOOSE = 4, NEAR = 0.3;
 constexpr int FEW = 100;
-constexpr double SMALL_RADII = 3;
+constexpr double SMALL_RADII = 3, ROUGH_PX = 8, ROUGH_TOLERANCE = 4 / 255.0;
 constexpr double CROWD = 0.03;
 constexpr int LEAST_CROWD = 16;
 
@@ -69,6 +69,9 @@ vec dioptres_behind(vec z, float s) {
   return std::isfinite(s) ? (z < all(INFINITY) ? (z - s) / z / s : apart) : apart;
 }
 
+// Radius above which a kernel is constant within the frame.
+float reach_of(int height, int width) { return 4.0f * std::max(height, width) + 4.0f; }
+
 }  // namespace
 
 void coc_of_depth(const float *depth, int64_t count, float scale, float nearest, float farthest, int threads, float *out) {
@@ -86,6 +89,29 @@ void coc_of_depth(const float *depth, int64_t count, float scale, float nearest,
   });
 }
 
+// Mean change of coc between neighbours, horizontal plus vertical. NaN is in focus, larger radii are cut to `reach`.
+double mean_change(const float *coc, int height, int width, int threads) {
+  const float reach = reach_of(height, width);
+  std::vector<double> changes(height);
+  torchdof::parallel(threads, height, nullptr, [&](int y, int) {
+    const float *row = coc + (size_t)y * width, *above = y ? row - width : row;
+    auto known = [&](vec v) { return least(most(v == v ? v : vec{}, all(-reach)), all(reach)); };
+    double sums = 0;
+    int x = 0;
+    for (; x + LANES < width; x += LANES) {
+      const vec here = known(load<vec>(row + x));
+      sums += sum(size_of(here - known(load<vec>(above + x))) + size_of(known(load<vec>(row + x + 1)) - here));
+    }
+    for (; x < width; x++) {
+      const float here = known(all(row[x]))[0];
+      sums += std::fabs(here - known(all(above[x]))[0]);
+      if (x + 1 < width) sums += std::fabs(known(all(row[x + 1]))[0] - here);
+    }
+    changes[y] = sums;
+  });
+  return std::accumulate(changes.begin(), changes.end(), 0.0) / ((double)height * width);
+}
+
 // 1. Fixed nodes: the nearest and the farthest place, and places with much of the border, with a neighbour on each side.
 // 2. Nodes from the focus outwards, with a spacing that grows with the blur and the tolerance.
 // 3. Nodes close to a fixed one move towards it, so that the nodes change continuously with the scene.
@@ -97,7 +123,7 @@ std::vector<double> plan(const float *coc, int maps, int height, int width, doub
     low = high = 0;
     for (int64_t i = 0; i < maps * area; i++) low = std::min(low, coc[i]), high = std::max(high, coc[i]);
   }
-  const float reach = 4.0f * std::max(height, width) + 4.0f;
+  const float reach = reach_of(height, width);
   auto place = [&](float c) { return axis(std::isnan(c) ? 0.0f : clamp(c, -reach, reach), -INFINITY, INFINITY); };
   const double nearest = place(low), farthest = place(high);
   double widest = std::max({-(double)coc_at(nearest), (double)coc_at(farthest), 1.0});  // px
@@ -112,7 +138,10 @@ std::vector<double> plan(const float *coc, int maps, int height, int width, doub
     }
     widest = usual;
   }
+  double change = INFINITY;
+  for (int i = 0; i < maps; i++) change = std::min(change, mean_change(coc + i * area, height, width, threads));
   tolerance *= std::min(1.0, std::min(height, width) / (SMALL_RADII * widest));
+  tolerance = std::max(tolerance, std::min(tolerance * std::sqrt(change / ROUGH_PX), ROUGH_TOLERANCE));
   if (farthest <= nearest) return {nearest};
   std::vector<float> border;
   for (const float *map = coc; map < coc + maps * area; map += area) {
