@@ -204,7 +204,7 @@ def test_surfaces_of_pixels_and_their_gradients_equal_the_plain_engines(
     step: str, channels: int, hole: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     light, coc, valid = edges(channels, hole)
-    given = (light, coc)
+    given: tuple[Tensor, ...] = (light, coc)
     if step == "finest_level":
         generator = torch.Generator().manual_seed(8)
         weight = 0.5 * torch.rand(coc.shape, generator=generator)
@@ -213,7 +213,7 @@ def test_surfaces_of_pixels_and_their_gradients_equal_the_plain_engines(
     def computed() -> list[Tensor]:
         leaves = [t.clone().requires_grad_() for t in given]
         if step == "matted":
-            own, other, other_coc, share = matting.matte(*leaves, valid)
+            own, other, other_coc, share = matting.matte(leaves[0], leaves[1], valid)
             out = torch.cat([own, other * share, other_coc, share], 1)  # light of a tiny share is rounding
         else:
             limit, size = torch.full_like(coc, 0.7), (32, 44)
