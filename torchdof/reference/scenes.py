@@ -25,11 +25,9 @@ from ..optics.camera import Camera
 
 __all__ = [
     "Plane",
-    "Rays",
     "Scene",
     "camera_of",
     "plane_scene",
-    "plane_views",
     "posts",
     "read_scenes",
     "spread_points",
@@ -42,11 +40,6 @@ Light = Callable[[Tensor, Tensor], Tensor]
 
 Shape = Callable[[Tensor, Tensor], Tensor]
 """Whether a surface covers positions x, y ``[...]``, in pixels of the frame: bool ``[...]``."""
-
-Rays = Callable[[int, Tensor, Tensor], tuple[Sequence[tuple[Tensor, Tensor]], Tensor]]
-"""Traces the n-th ray of each position x, y ``[...]``, in pixels of the frame, back into the scene. Returns, for each
-plane from far to near, the position x, y ``[...]`` in the sharp image of the point that the ray meets, and the ray's
-light ``[...]``, 0 if it is blocked."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,17 +183,8 @@ def plane_scene(
     depths = torch.tensor([p.depth_m for p in planes], dtype=torch.float64).reshape(-1, 1, 1, 1)
     cocs = camera.coc_px(depths, width).flatten().tolist()
     y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in size), indexing="ij")
-    points = spread_points(samples).tolist()
-
-    def pinhole(_: int, x: Tensor, y: Tensor) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
-        return [(x, y)] * len(planes), torch.ones_like(x)
-
-    def thin_lens(i: int, x: Tensor, y: Tensor) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
-        ux, uy = points[i]
-        return [(x - coc * ux, y - coc * uy) for coc in cocs], torch.ones_like(x)
-
-    sharp, covers = _average(planes, x, y, pinhole, samples)
-    truth, _ = _average(planes, x, y, thin_lens, samples)
+    sharp, covers = _average(planes, cocs, x, y, torch.zeros(samples, 2))
+    truth, _ = _average(planes, cocs, x, y, spread_points(samples))
     depth = torch.full((height, width), math.inf, dtype=torch.float64)
     surfaces = []
     for plane, cover in zip(planes, covers, strict=True):
@@ -224,44 +208,27 @@ def spread_points(count: int) -> Tensor:
     return torch.stack([radius * angle.cos(), radius * angle.sin()], -1)
 
 
-def plane_views(
-    planes: Sequence[Plane], rays: Rays, size: tuple[int, int], window: tuple[slice, slice], samples: int = 256
-) -> Tensor:
-    """Renders a part of the frame ray by ray: the truth for a lens whose blur varies over the frame.
+def _average(
+    planes: Sequence[Plane], cocs: Sequence[float], x: Tensor, y: Tensor, points: Tensor
+) -> tuple[Tensor, list[Tensor]]:
+    """Mean light ``[C, H, W]`` of visible planes, premultiplied light and cover of each plane ``[C + 1, H, W]``.
 
-    Args:
-        planes: As in :func:`plane_scene`.
-        rays: Rays of the lens.
-        size: Height and width of the frame.
-        window: Rows and columns of the part.
-        samples: Rays for each pixel.
-
-    Returns:
-        ``[1, C, rows, columns]``, linear light: the mean over the unblocked rays, so that a white plane is white
-        everywhere.
+    Planes are sorted far to near, with a signed coc each, and seen from points ``[n, 2]`` of the unit disc of the lens.
     """
-    planes = sorted(planes, key=lambda plane: -plane.depth_m)
-    axes = (torch.arange(n, dtype=torch.float64)[part] + 0.5 for n, part in zip(size, window, strict=True))
-    y, x = torch.meshgrid(*axes, indexing="ij")
-    return _average(planes, x, y, rays, samples)[0].float()[None]
-
-
-def _average(planes: Sequence[Plane], x: Tensor, y: Tensor, rays: Rays, samples: int) -> tuple[Tensor, list[Tensor]]:
-    """Mean light ``[C, H, W]`` of visible planes, premultiplied light and cover of each plane ``[C + 1, H, W]``."""
-    index = torch.arange(samples, dtype=torch.float64)
+    index = torch.arange(len(points), dtype=torch.float64)
     # Additive recurrences, so that position in the pixel and point on the lens are independent.
-    shifts = torch.stack([(index * a + 0.5) % 1.0 - 0.5 for a in (0.7548776662466927, 0.5698402909980532)], -1).tolist()
-    total, total_weight, plane_sums = torch.zeros(()), torch.zeros(()), [torch.zeros(()) for _ in planes]
-    for i, (px, py) in enumerate(shifts):
+    shifts = torch.stack([(index * a + 0.5) % 1.0 - 0.5 for a in (0.7548776662466927, 0.5698402909980532)], -1)
+    total, sums = torch.zeros(()), [torch.zeros(()) for _ in planes]
+    for (px, py), (ux, uy) in zip(shifts.tolist(), points.tolist(), strict=True):
         visible = torch.zeros(())
-        points, weight = rays(i, x + px, y + py)
-        for k, (plane, point) in enumerate(zip(planes, points, strict=True)):
+        for k, (plane, coc) in enumerate(zip(planes, cocs, strict=True)):
+            point = x + px - coc * ux, y + py - coc * uy
             light = plane.light(*point)
             is_covered = torch.ones_like(x, dtype=torch.bool) if plane.shape is None else plane.shape(*point)
             visible = torch.where(is_covered, light, visible)
-            plane_sums[k] = plane_sums[k] + weight * torch.cat([light * is_covered, is_covered[None]])
-        total, total_weight = total + weight * visible, total_weight + weight
-    return total / total_weight, [plane_sum / total_weight for plane_sum in plane_sums]
+            sums[k] = sums[k] + torch.cat([light * is_covered, is_covered[None]])
+        total = total + visible
+    return total / len(points), [each / len(points) for each in sums]
 
 
 def waves(seed: int, mean: Sequence[float] = (0.4, 0.4, 0.4), contrast: float = 0.8, shortest_px: float = 6.0) -> Light:
