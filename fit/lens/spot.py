@@ -86,6 +86,7 @@ def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best", reference: Re
         ValueError: If the object is too near for focusing, or an argument is invalid.
     """
     a_choice("focus", kind, get_args(Focus))
+    a_choice("reference", reference, get_args(Reference))
     paraxial = lens.paraxial()
     sensor = paraxial.back_focal
     for _ in range(100 if reference == "sensor" else 1):  # a distance from the sensor changes with the sensor's place

@@ -267,7 +267,7 @@ def test_webdataset_reads_the_shards(pairs: list[Pair], tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (lambda f: RenderShards(f, format="zip"), ValueError, "format must be 'webdataset' or 'parquet'"),  # type: ignore[arg-type]
+        (lambda f: RenderShards(f, format="zip"), ValueError, "format must be one of webdataset, parquet"),  # type: ignore[arg-type]
         (lambda f: RenderShards(f, keep=[]), ValueError, "keep must be some of blurred, sharp, depth"),
         (lambda f: RenderShards(f, keep="blurred"), ValueError, "keep must be some of"),
         (lambda f: RenderShards(f, picture=".jpg"), ValueError, "picture must be"),  # type: ignore[arg-type]
