@@ -321,8 +321,10 @@ def _noise(nearness: Tensor, valid: Tensor) -> Tensor:
     every = (2 * nearness.shape[-2] * nearness.shape[-1] + _NOISE_SAMPLED - 1) // _NOISE_SAMPLED
     middles, least, ends = [], [], []
     for values, known in ((nearness, valid), (nearness.transpose(-2, -1), valid.transpose(-2, -1))):
-        size = values.shape[-1]
-        lines = (_from_border(values.shape[-2], values.device) % every == 0).nonzero()[:, 0]
+        count, size = values.shape[-2:]
+        first = torch.arange(0, (count + 1) // 2, every, device=values.device)
+        last = count - 1 - torch.arange(0, count // 2, every, device=values.device)
+        lines = torch.cat([first, last])  # from both borders: the same lines in a mirrored frame
         line, has = (functional.pad(t.index_select(-2, lines), (0, 2)) for t in (values, known))
         has = has.narrow(-1, 0, size) & has.narrow(-1, 1, size) & has.narrow(-1, 2, size)
         changes = line.diff()

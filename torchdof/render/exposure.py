@@ -8,9 +8,7 @@ import math
 import torch
 from torch import Tensor
 
-from ..tensors import is_traced
-
-__all__ = ["is_unscaled", "scale_of"]
+__all__ = ["scale_of"]
 
 _SUMMED = 16  # log2 of the largest number of terms in a sum of light; larger: scales down earlier
 
@@ -30,11 +28,6 @@ def scale_of(light: Tensor, behind: Tensor | None = None) -> Tensor:
     if behind is not None:
         excess = torch.maximum(excess, _excess(behind, power=1))
     return torch.exp2(-excess)
-
-
-def is_unscaled(scale: Tensor) -> bool:
-    """Whether all scales are 1; False in traced code, which cannot read them and always applies them."""
-    return not is_traced() and bool((scale == 1.0).all())
 
 
 def _excess(light: Tensor, power: int) -> Tensor:

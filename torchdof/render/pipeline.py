@@ -216,9 +216,7 @@ def _render_items(
         coc, light, weight = torch.where(valid, coc, 0.0), torch.where(valid, light, 0.0), valid.to(light.dtype)
     coc = coc.clamp(*reach)  # differences of huge values would round badly
     scale = exposure.scale_of(light, behind_light)
-    is_unscaled = exposure.is_unscaled(scale)
-    if not is_unscaled:
-        light, behind_light = light * scale, None if behind_light is None else behind_light * scale
+    light, behind_light = light * scale, None if behind_light is None else behind_light * scale
 
     # Limit of highlights. Without occlusion, only highlights that a coarse layer would soften are splatted. A compiled
     # graph has no rays, as their number depends on the light.
@@ -258,7 +256,7 @@ def _render_items(
     # blur and composite the layers, far to near
     own = 0 if behind_light is None else 1
     out = _composite(surfaces, behind, plans, options, ops, own, limit, splats)
-    out = out if is_unscaled else out / scale
+    out = out / scale
     out = out if valid is None else torch.where(valid, out, image)
     return ops.choose(lambda: blur_axis(coc).abs().max() > 0, out, image)
 
