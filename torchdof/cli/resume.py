@@ -51,7 +51,7 @@ class Record:
             write_text(self.path, json.dumps(self._options, indent=1))
 
     def check(self) -> None:
-        """Refuses to go on if another run has recorded other options since :meth:`write`: frames would be mixed."""
+        """Ends the run if another one has recorded other options since :meth:`write`: both would write one folder."""
         if self.path.is_file() and (reason := self.difference()):
             raise ValueError(f"{self.path}: another run renders the same frames with other options ({reason})")
 
