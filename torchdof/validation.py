@@ -126,8 +126,9 @@ def pixels_wide(width: Any) -> None:
     if is_traced() or isinstance(width, torch.SymInt):
         return
     if isinstance(width, Tensor):
-        if width.ndim or width.is_complex() or width.layout != torch.strided or width.device.type == "meta":
-            raise ValueError(f"width must be one number of pixels, got {show(width)}")
+        is_stored = width.layout == torch.strided and width.device.type != "meta"
+        if width.ndim or width.is_complex() or not is_stored or width.requires_grad:
+            raise ValueError(f"width must be one number of pixels, without gradients, got {show(width)}")
         width = width.item()
     number("width", width, low=0, unit="pixels")
 
