@@ -30,14 +30,10 @@ def weight_map(attention: Any, image: Tensor) -> Tensor:
     """
     batch, _, height, width = image.shape
     if isinstance(attention, Tensor):
-        fits = floating(attention) and attention.ndim == 4 and attention.shape[0] in (1, batch)
+        fits = floating(attention) and attention.shape in ((1, 1, height, width), (batch, 1, height, width))
         if fits:
             real_tensor("attention", attention, "[B, 1, H, W]")
-        if (
-            not fits
-            or attention.shape[1:] != (1, height, width)
-            or not bool(((attention >= 0) & (attention <= 1)).all())
-        ):
+        if not fits or not bool(((attention >= 0) & (attention <= 1)).all()):
             raise ValueError(
                 f"attention must be a map [{batch} or 1, 1, {height}, {width}] of floating point values from 0 to 1, "
                 f"or (x, y, radius) in pixels, got {show(attention)}"

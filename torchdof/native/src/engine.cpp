@@ -23,8 +23,7 @@ Job::Job(const torchdof_scene &scene)
   }
 }
 
-// Smallest and largest value of each block of a band. Rows are read in memory order.
-static void ends_of(const float *values, int width, int rows, float *low, float *high) {
+void ends_of(const float *values, int width, int rows, float *low, float *high) {
   const int blocks = ceil_div(width, BLOCK);
   std::vector<float> lows((size_t)blocks * LANES, INFINITY), highs(lows.size(), -INFINITY);
   for (int y = 0; y < rows; y++, values += width)

@@ -613,7 +613,11 @@ inline uint32_t strip_inputs(int x, int half) { return marks(x, x + STRIP_COLUMN
 // and columns before the output. Input row i is skipped if rows[i] has none of the bits of `columns`.
 void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel, float *out);
 
+// Mean change of coc between neighbours, horizontal plus vertical; plan.cpp
 double mean_change(const float *coc, int height, int width, int threads);
+
+// Smallest and largest value of each block of a band of blocks, whose rows are read in memory order; engine.cpp
+void ends_of(const float *values, int width, int rows, float *low, float *high);
 
 // Smallest and largest value; both NaN if any value is NaN.
 void find_ends(const float *values, int64_t count, int threads, float *low, float *high);

@@ -173,9 +173,11 @@ void Job::extract_highlights() {
     }
   });
   const bool any = std::any_of(bands.begin(), bands.end(), [](const std::vector<Candidate> &band) { return !band.empty(); });
-  const bool limited = any && scene.occlusion;
-  const double crowd = limited ? std::max(mean_change(surfaces.coc, height, width, scene.threads) / FREE_CHANGE_PX, 1.0) : 1.0;
-  const double budget = (double)TAPS_PER_PIXEL * area / (limited ? crowd * scene.reach * scene.reach : 1.0);
+  double budget = (double)TAPS_PER_PIXEL * area;
+  if (any && scene.occlusion) {
+    const double crowd = std::max(mean_change(surfaces.coc, height, width, scene.threads) / FREE_CHANGE_PX, 1.0);
+    budget /= crowd * scene.reach * scene.reach;
+  }
   for (int i = 0; i < count; i++) {
     std::vector<Candidate> all;
     for (int by = 0; by < surfaces.block_rows; by++) {

@@ -686,14 +686,10 @@ void matte(const float *const *maps, int channels, int height, int width, int th
     return;
   }
   job.block_low = Buffer<float>(s.blocks.size()), job.block_high = Buffer<float>(s.blocks.size());
-  std::fill(&job.block_low[0], &job.block_low[0] + s.blocks.size(), NEVER);
-  std::fill(&job.block_high[0], &job.block_high[0] + s.blocks.size(), -NEVER);
-  for (int y = 0; y < height; y++)
-    for (int x = 0; x < width; x++) {
-      const int block = y / BLOCK * s.block_columns + x / BLOCK;
-      job.block_low[block] = std::min(job.block_low[block], s.coc[(size_t)y * width + x]);
-      job.block_high[block] = std::max(job.block_high[block], s.coc[(size_t)y * width + x]);
-    }
+  job.parallel(s.block_rows, [&](int by, int) {
+    const int first = by * s.block_columns, y0 = by * BLOCK;
+    ends_of(s.coc + (size_t)y0 * width, width, std::min(BLOCK, height - y0), &job.block_low[first], &job.block_high[first]);
+  });
   job.split_mixed();
   float *const planes = out[0];
   memcpy(planes, s.light, channels * area * sizeof(float));

@@ -89,7 +89,7 @@ void coc_of_depth(const float *depth, int64_t count, float scale, float nearest,
   });
 }
 
-// Mean change of coc between neighbours, horizontal plus vertical. NaN is in focus, larger radii are cut to `reach`.
+// NaN is in focus, larger radii are cut to `reach`.
 double mean_change(const float *coc, int height, int width, int threads) {
   const float reach = reach_of(height, width);
   std::vector<double> changes(height);
