@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,18 +26,13 @@ _DATA, _MODEL = "#7a7a7a", "#c2410c"
 
 
 def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
-    """Samples with the fitted curve (the paper's Fig. 2); lengths are labelled with `unit`.
-
-    For a forward fit, the samples are the blurred dot's pixels and the curve is their model, together with the kernel's
-    own profile; for a profile fit, the samples are blur strengths.
-    """
+    """Samples (pixels, or blur strengths) with the fitted curve, as in the paper's Fig. 2; lengths are in `unit`."""
     if not fit.samples.shape[1]:
         raise FitError("this fit carries no samples to draw")
     figure, axes = _new_figure(5.4, 3.6)
     forward = fit.model == "forward"
-    axes.plot(
-        *fit.samples, ".", color=_DATA, markersize=2.5 if forward else 4, label="pixels" if forward else "samples"
-    )
+    size, label = (2.5, "pixels") if forward else (4, "samples")
+    axes.plot(*fit.samples, ".", color=_DATA, markersize=size, label=label)
     if forward:
         r, level = _model_line(fit)
         axes.plot(r, level, color=_MODEL, label="forward model", zorder=3)
@@ -67,20 +62,17 @@ def picture_of_table(table: BlurTable, title: str = "") -> Figure:
     """A table over depth: every parameter at its nodes, and the table's interpolation between them."""
     names = list(table.node_params)
     figure, axes = _new_figure(3.2 * len(names), 3.2, len(names))
-    largest_coc = float(table.coc.abs().max())
-    width = 1 if table.sensor_width_mm is None else int(table.sensor_width_mm) or 1
-    scale = 1.0 if table.unit != "mm" else width / float(table.sensor_width_mm or 1.0)
+    largest_coc, scale = float(table.coc.abs().max()), table.px_per_unit(1.0)
     coc = torch.linspace(-largest_coc, largest_coc, 401, dtype=torch.float64)
-    interpolated = table.params(coc * scale, width)
+    interpolated = table.params(coc * scale, 1.0)
     unit = {"mm": "mm", "fraction": "of the width", "relative": "relative"}[table.unit]
     for ax, name in zip(np.atleast_1d(axes), names, strict=True):
         nodes = table.node_params[name]
         if name == "values":
             picture = interpolated[name][0].T.numpy()
-            ax.imshow(
-                picture / np.maximum(picture.max(axis=0), 1e-12), aspect="auto", origin="lower", cmap="magma",
-                extent=(-largest_coc, largest_coc, 0, 1),
-            )  # fmt: skip
+            extent = (-largest_coc, largest_coc, 0, 1)
+            profiles = picture / np.maximum(picture.max(axis=0), 1e-12)
+            ax.imshow(profiles, aspect="auto", origin="lower", cmap="magma", extent=extent)
             ax.set(ylabel="r / radius", title="profile, each over its peak")
         else:
             unit_scale = scale if name in LENGTHS else 1.0
@@ -97,12 +89,10 @@ def picture_of_table(table: BlurTable, title: str = "") -> Figure:
 def sheet_of_photographs(
     photographs: Photographs, result: TableFit, render: Callable[[torch.Tensor, torch.Tensor, BlurTable], torch.Tensor]
 ) -> Figure:
-    """One figure that documents a calibration from photographs: targets, data, model, and a rendered example.
+    """One figure that documents a calibration from photographs.
 
-    One row for each distance: the target found, the window around its dot, the window's pixels over the distance from
-    the centre with the model, the residual, and the kernel. Below, rendered with the table: lights from near to far,
-    and the window of the photograph in focus, blurred as at the most blurred distance. `render(image, coc_px, table)`
-    has the arguments of `torchdof.blur_by_coc`.
+    One row for each distance: the target, the window around its dot, data and model over the radius, the residual, and
+    the kernel. Below, by `render(image, coc_px, table)`: lights from near to far, and the sharp window blurred most.
     """
     captures = photographs.captures
     rows = len(captures)
@@ -115,9 +105,9 @@ def sheet_of_photographs(
         height, width = (n // step for n in picture.light.shape)
         thumbnail = picture.light[: height * step, : width * step].reshape(height, step, width, step).mean((1, 3))
         target, half = picture.target, picture.target.side_px / 2
-        signs = [(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]
-        corners = [((target.x + i * half) / step, (target.y + j * half) / step) for i, j in signs]
-        _show(photograph_axes, thumbnail, f"{picture.file}, {pair.distance_m:.3f} m", box=corners)
+        _show(photograph_axes, thumbnail, f"{picture.file}, {pair.distance_m:.3f} m")
+        x, y = np.array([[-1, 1, 1, -1, -1], [-1, -1, 1, 1, -1]]) * half + [[target.x], [target.y]]
+        photograph_axes.plot(x / step, y / step, color=_MODEL, linewidth=1)
         _show(window, pair.blurred, "")
         profile.plot(*fit.samples, ".", color=_DATA, markersize=1.5)
         profile.plot(*_model_line(fit), color=_MODEL)
@@ -135,40 +125,31 @@ def sheet_of_photographs(
     x, y = round(sharp.target.x), round(sharp.target.y)
     window = sharp.light[max(y - half, 0) : y + half, max(x - half, 0) : x + half]
     largest_coc, most_blurred = max(zip(result.coc_px, captures, strict=True), key=lambda node: abs(node[0]))
-    ends = min(0.0, *result.coc_px), max(0.0, *result.coc_px)
     scene = 0.15 + 0.1 * (np.arange(720) // 12 % 2) * np.ones((90, 1))  # small lights on stripes
     scene[44:46, 18::36] = 25.0
-    lights = _rendered(render, scene, result.table, captures.width_px, *ends)
-    rerendered = _rendered(render, window, result.table, captures.width_px, largest_coc, largest_coc)
+
+    def rendered(part: Array, left: float, right: float) -> Array:
+        """Renders a part `[H, W]` of the frame, with a circle of confusion from `left` to `right` px."""
+        coc = torch.linspace(left, right, part.shape[1]).expand(1, 1, *part.shape)
+        table = result.table
+        if table.sensor_width_mm is not None:  # the part has its own share of the sensor
+            table = table.replace(sensor_width_mm=table.sensor_width_mm * part.shape[1] / captures.width_px)
+        picture = render(torch.from_numpy(part).float()[None, None], coc, table)
+        return np.clip(picture[0, 0].numpy().astype(np.float64), 0, 1)
+
+    lights = rendered(scene, min(0.0, *result.coc_px), max(0.0, *result.coc_px))
     caption = "lights and edges from one end of the measured distances through the focus to the other, with this table"
     _show(figure.add_subplot(grid[rows, :3]), lights, caption)
     _show(figure.add_subplot(grid[rows, 3]), window, f"{sharp.file}, in focus")
-    _show(figure.add_subplot(grid[rows, 4]), rerendered, f"with this table, as at {most_blurred.distance_m:.3f} m")
+    caption = f"with this table, as at {most_blurred.distance_m:.3f} m"
+    _show(figure.add_subplot(grid[rows, 4]), rendered(window, largest_coc, largest_coc), caption)
     return figure
 
 
-def _rendered(
-    render: Callable[[torch.Tensor, torch.Tensor, BlurTable], torch.Tensor],
-    scene: Array,
-    table: BlurTable,
-    width_px: int,
-    left: float,
-    right: float,
-) -> Array:
-    """Renders a part `[H, W]` of a frame `width_px` wide, with a circle of confusion from `left` to `right` px."""
-    coc = torch.linspace(left, right, scene.shape[1], dtype=torch.float32).expand(1, 1, *scene.shape)
-    if table.unit == "mm" and table.sensor_width_mm is not None:  # the part has its own share of the sensor
-        table = table.replace(sensor_width_mm=table.sensor_width_mm * scene.shape[1] / width_px)
-    picture = render(torch.from_numpy(scene).float()[None, None], coc, table)
-    return np.clip(picture[0, 0].numpy().astype(np.float64), 0, 1)
-
-
-def _show(axes: Axes, picture: Array, title: str, box: Sequence[tuple[float, float]] = ()) -> None:
-    """Draws a picture `[H, W]` in linear light, encoded for display, and a line through the corners of a box."""
+def _show(axes: Axes, picture: Array, title: str) -> None:
+    """Draws a picture `[H, W]` in linear light, encoded for display."""
     white = max(float(picture.max()), 1e-12)
     axes.imshow(np.clip(picture / white, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
-    if box:
-        axes.plot(*zip(*box, strict=True), color=_MODEL, linewidth=1)
     axes.set_title(title, fontsize=8)
     axes.set_axis_off()
 

@@ -35,13 +35,7 @@ _PACKAGE = str(Path(__file__).parent)
 
 
 class _Problem(Exception):
-    """A message that begins with the file concerned.
-
-    Attributes:
-        kind: the subject.
-        file: the picture or manifest, or None if only arrays were given.
-        number: the measured quantity, or None.
-    """
+    """A message about a subject `kind`, with the picture or manifest `file` and the measured `number`, if any."""
 
     def __init__(
         self, message: str, kind: Kind = "argument", *, file: str | None = None, number: float | None = None

@@ -81,11 +81,11 @@ class BlurFit:
         lines = [f"{self.family} ({self.model})"]
         for name, value in self.params.items():
             array_text = f"  {name}: {np.size(value)} numbers, largest {np.max(value):.4g}"
-            lines.append(array_text if np.ndim(value) else f"  {name} = {value:.6g} +- {self.stderr[name]:.2g}")
-        ratio, (x, y) = self.residual_over_noise, self.shift
+            lines.append(array_text if np.ndim(value) else f"  {name} = {value:.6g} ± {self.stderr[name]:.2g}")
+        ratio = self.residual_over_noise
         noise = "" if math.isnan(ratio) else f", {ratio:.2f} x the noise"
         lines.append(f"  residual {100 * self.residual:.2f} %{noise}")
         if self.model == "forward":
-            moves_text = f"shift ({x:+.2f}, {y:+.2f}) px, magnification {self.magnification:.4f}"
-            lines.append(f"  gain {self.gain:.4g}, {moves_text}")
+            (x, y), size = self.shift, self.magnification
+            lines.append(f"  gain {self.gain:.4g}, shift ({x:+.2f}, {y:+.2f}) px, magnification {size:.4f}")
         return "\n".join([*lines, *([f"  {self.why}"] if self.why else [])])

@@ -1,11 +1,9 @@
 """Least squares by SciPy from several starts; failures raise errors."""
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 
 import numpy as np
 from scipy.optimize import least_squares
-from threadpoolctl import threadpool_limits
 
 from .problems import FitError
 from .result import Array
@@ -14,11 +12,6 @@ _ROUGH_TOLERANCE = 1e-3
 _ACCEPTED_TOLERANCE = 1e-5
 _TOLERANCE = 1e-13  # well-posed data without noise give ten digits
 _MAX_EVALUATIONS = 400
-
-
-def one_thread() -> AbstractContextManager[object]:
-    """Limits numpy, SciPy and PyTorch to one thread: the steps of a fit are too small for more."""
-    return threadpool_limits(limits=1)
 
 
 def best_of(
@@ -47,7 +40,7 @@ def best_of(
     # starts on a bound would be stuck: the trust region vanishes there
     margin = np.where(np.isfinite(high - low), 1e-6 * (high - low), 1e-9)
 
-    def descend(start: Sequence[float] | Array, tolerance: float) -> tuple[float, Array] | None:
+    def descend(start: Sequence[float] | Array, tolerance: float) -> tuple[float, Array]:
         result = least_squares(
             lambda p: model(p) - data,
             np.clip(np.asarray(start, dtype=np.float64), low + margin, high - margin),
@@ -59,17 +52,16 @@ def best_of(
             gtol=tolerance,
             max_nfev=_MAX_EVALUATIONS,
         )
-        return (result.cost, result.x) if result.success and np.isfinite(result.cost) else None
+        return (result.cost if result.success and np.isfinite(result.cost) else np.inf), result.x
 
-    rough_fits = [descend(start, max(tolerance, _ROUGH_TOLERANCE)) for start in starts]
-    converged = [fit for fit in rough_fits if fit is not None]
-    if not converged:
+    rough = min((descend(start, max(tolerance, _ROUGH_TOLERANCE)) for start in starts), key=lambda fit: fit[0])
+    if rough[0] == np.inf:
         text = f"none of {len(starts)} starts converged; is this a picture of a blurred dot?"
         raise FitError(text, "not converged", number=float(len(starts)))
-    best = min(converged, key=lambda r: r[0])
-    # in a long narrow valley the last digits may take too many steps; a less exact solution is then accepted
-    refined = descend(best[1], tolerance) or descend(best[1], max(tolerance, _ACCEPTED_TOLERANCE)) or best
-    return np.asarray(min(refined, best, key=lambda r: r[0])[1])
+    refined = descend(rough[1], tolerance)
+    if refined[0] == np.inf:  # in a long narrow valley the last digits may take too many steps
+        refined = descend(rough[1], max(tolerance, _ACCEPTED_TOLERANCE))
+    return min(refined, rough, key=lambda fit: fit[0])[1]
 
 
 def inverse(information: Array) -> Array:

@@ -37,9 +37,8 @@ class Glass:
         values = coefficients if isinstance(coefficients, tuple) else ()
         are_numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
         if not are_numbers or len(values) not in (3, 6) or not all(abs(v) <= _MAX_COEFFICIENT for v in values):
-            raise ValueError(
-                f"glass {self.name} must have six finite coefficients B1 B2 B3 C1 C2 C3, got {show(coefficients)}"
-            )
+            expected = "six finite coefficients B1 B2 B3 C1 C2 C3"
+            raise ValueError(f"glass {self.name} must have {expected}, got {show(coefficients)}")
         for wavelength_um in (0.4, D_UM, 0.7):
             self.index(wavelength_um)
 
@@ -47,10 +46,8 @@ class Glass:
     def named(cls, name: str) -> Glass:
         """A glass of the catalogue; an unknown name gives a `ValueError` with the alternatives."""
         if not isinstance(name, str) or name.upper() not in catalogue():
-            raise ValueError(
-                f"no glass {show(name)} in the catalogue of SCHOTT; define it by a line "
-                f"`glass {name} B1 B2 B3 C1 C2 C3` (Sellmeier, micrometres), or write index/V or index/V/P_gF instead"
-            )
+            remedy = f"define it by a line `glass {name} B1 B2 B3 C1 C2 C3`, or write index/V or index/V/P_gF"
+            raise ValueError(f"no glass {show(name)} in the catalogue of SCHOTT; {remedy}")
         return catalogue()[name.upper()]
 
     @classmethod

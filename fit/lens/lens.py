@@ -185,9 +185,8 @@ def trace_rays(
     """
     position, direction = (np.asarray(v, dtype=np.float64) for v in (position, direction))
     if position.ndim != 2 or position.shape[0] != 3 or direction.shape != position.shape:
-        raise ValueError(
-            f"position and direction must both be [3, R], got {list(position.shape)} and {list(direction.shape)}"
-        )
+        shapes = f"{list(position.shape)} and {list(direction.shape)}"
+        raise ValueError(f"position and direction must both be [3, R], got {shapes}")
     if (count := position.shape[1]) > _RAYS_AT_ONCE:
         chunks = (slice(start, start + _RAYS_AT_ONCE) for start in range(0, count, _RAYS_AT_ONCE))
         parts = [trace_rays(lens, position[:, chunk], direction[:, chunk], wavelength_um, clip) for chunk in chunks]

@@ -9,7 +9,7 @@ solution. Nodes are added until profiles interpolated between them fit the spots
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -35,8 +35,7 @@ class Tracer:
     def __init__(self, spot: Callable[[float], Spot], points: int, pixel: float) -> None:
         self.spot, self.points, self.pixel = spot, points, pixel
         self.frequency = np.linspace(1 / 256, _MAX_FREQUENCY, 400)
-        # amplitude of natural images times the area of a ring of frequencies; constant beyond Nyquist, because of
-        # aliasing
+        # amplitude of natural images times the area of a ring of frequencies; constant beyond Nyquist (aliasing)
         spectrum = np.minimum(self.frequency, 0.5) ** -0.5
         self.weight = spectrum / np.sqrt(1.0 + (np.pi * self.frequency) ** 2)
         count = 12 * (points - 1)
@@ -57,13 +56,10 @@ class Tracer:
         return j0(2.0 * np.pi * np.outer(self.frequency, self._r * radius)) @ self._light * self.weight[:, None]
 
     def _fitted(self, coc: float) -> tuple[float, Array]:
-        """Radius in pixels of the outermost ray, and values of the profile that fits the spot; their light sums to 1.
-
-        By non-negative least squares. A large weight fixes the total light, a small one of the rays' histogram the
-        details that no picture shows.
-        """
+        """Radius in pixels of the outermost ray, and values of the profile that fits the spot, with a light of 1."""
         r, light, transfer = self.traced(coc)
         radius, area = float(r.max()), self._light.sum(0)  # integral of each hat
+        # a large weight fixes the total light, a small one of the rays' histogram the details that no picture shows
         basis, total = self._basis(radius), 100.0 * self.weight.max() * area
         prior = _PRIOR_WEIGHT * np.sqrt((np.sum(basis**2) + np.sum(total**2)) * area / area.sum())
         histogram = light @ _hats(r / radius, self.points) / area
@@ -84,10 +80,7 @@ def _hats(r: Array, points: int) -> Array:
 
 
 def place_nodes(tracer: Tracer, near: float, far: float, nodes: int | None) -> list[float]:
-    """Signed coc of the nodes: repeatedly halves the interval with the worst interpolation in its middle.
-
-    If ``nodes`` is None, until the interpolation reaches 50 dB everywhere.
-    """
+    """Signed coc of ``nodes`` nodes, or of as many as 50 dB need: halves the interval with the worst interpolation."""
 
     def interval_error(left: float, right: float) -> float:
         (radius, values), (next_radius, next_values) = tracer.fitted(left), tracer.fitted(right)
@@ -101,19 +94,10 @@ def place_nodes(tracer: Tracer, near: float, far: float, nodes: int | None) -> l
     while len(cocs) < nodes if nodes is not None else max(errors) > accepted_error:
         worst = int(np.argmax(errors))
         if errors[worst] == 0.0:
-            raise ValueError(
-                f"nodes must be at most {len(cocs)} for this lens and width_px, got {nodes}: between those the spots "
-                "stay within one pixel, or hardly differ; take fewer nodes or a larger width_px"
-            )
+            most = f"{len(cocs)} for this lens and width_px, got {nodes}"
+            raise ValueError(f"nodes must be at most {most}: more would hardly differ; take a larger width_px")
         left, right = cocs[worst : worst + 2]
         middle = (left + right) / 2
         cocs.insert(worst + 1, middle)
         errors[worst : worst + 1] = [interval_error(left, middle), interval_error(middle, right)]
     return cocs
-
-
-def profiles(tracer: Tracer, cocs: Sequence[float]) -> tuple[dict[str, Array], Array]:
-    """Parameters of the profiles at the nodes, in the unit of the coc, and the relative residual of each."""
-    radius, values = zip(*map(tracer.fitted, cocs), strict=True)
-    residual = np.array([tracer.error(*node) for node in zip(cocs, radius, values, strict=True)])
-    return {"values": np.stack(values), "radius": np.array(radius) * tracer.pixel}, residual

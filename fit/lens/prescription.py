@@ -59,9 +59,7 @@ def parse(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
         except ValueError as error:
             raise ValueError(f"line {line_number}: {error}") from None
     if stop is None:
-        raise ValueError(
-            f"no aperture stop among {len(surfaces)} surfaces; one line must have radius 0, or end in stop"
-        )
+        raise ValueError(f"no aperture stop among {len(surfaces)} surfaces; one line must have radius 0 or end in stop")
     return tuple(surfaces), stop, source
 
 

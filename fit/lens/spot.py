@@ -19,10 +19,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from torchdof.validation import number, whole
+from torchdof.validation import choice, number, whole
 
 from ..result import Array
-from ..validation import a_choice
 from .lens import Lens, Rays, trace_rays
 
 Reference = Literal["principal", "pupil", "vertex", "sensor"]
@@ -61,11 +60,7 @@ class Spot:
 
     @property
     def asymmetry(self) -> float:
-        """Deviation of the spot from a round one: 0 if it is round.
-
-        The light of each of 16 rings of equal light is expanded in the angle; this is the root mean square of the
-        harmonics 1 to 4 relative to the mean. 0.5 means that the light of a ring varies by about half.
-        """
+        """Rms of the harmonics 1 to 4 of the light around 16 rings of equal light, over its mean: 0 if round."""
         if self.meridional:
             return 0.0
         order = np.argsort(self.r)
@@ -85,18 +80,16 @@ def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best", reference: Re
     Raises:
         ValueError: If the object is too near for focusing, or an argument is invalid.
     """
-    a_choice("focus", kind, get_args(Focus))
-    a_choice("reference", reference, get_args(Reference))
+    choice("focus", kind, get_args(Focus))
+    choice("reference", reference, get_args(Reference))
     paraxial = lens.paraxial()
     sensor = paraxial.back_focal
     for _ in range(100 if reference == "sensor" else 1):  # a distance from the sensor changes with the sensor's place
         object_mm, previous = vertex_distance_mm(lens, focus_m, reference, sensor), sensor
         distance = object_mm + paraxial.front_principal
         if distance <= paraxial.focal_length:
-            raise ValueError(
-                f"the focus must be farther than the focal length ({paraxial.focal_length:.4g} mm) from the front "
-                f"principal plane, got {distance:.4g} mm"
-            )
+            least = f"the focal length ({paraxial.focal_length:.4g} mm) from the front principal plane"
+            raise ValueError(f"the focus must be farther than {least}, got {distance:.4g} mm")
         sensor = paraxial.rear_principal + 1.0 / (1.0 / paraxial.focal_length - 1.0 / distance)
         if kind == "best":
             aim, _, high = _rays_of_point(lens, object_mm, sensor)
@@ -106,9 +99,7 @@ def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best", reference: Re
             # the mean squared radius is a parabola over the sensor's position
             steepness = float(weight @ (slope * slope))
             if steepness == 0.0:
-                raise ValueError(
-                    f"no ray of a fan through lens {lens.name!r} comes to a focus; are its openings too narrow?"
-                )
+                raise ValueError(f"no ray through lens {lens.name!r} comes to a focus; are its openings too narrow?")
             sensor -= float(weight @ (height * slope)) / steepness
         if abs(sensor - previous) < 1e-12 * paraxial.focal_length:
             break
@@ -172,18 +163,17 @@ def point_spread(
 
 def vertex_distance_mm(lens: Lens, z_m: float, reference: Reference, sensor_mm: float) -> float:
     """Distance of an object in front of the first vertex, in mm."""
-    a_choice("reference", reference, get_args(Reference))
+    choice("reference", reference, get_args(Reference))
     paraxial = lens.paraxial()
     reference_z = paraxial.front_principal, paraxial.entrance_pupil, 0.0, float(lens.vertices[-1]) + sensor_mm
     reference_mm = dict(zip(get_args(Reference), reference_z, strict=True))[reference]
+    object_mm = 1000.0 * z_m - reference_mm
     if _MAX_DISTANCE_M < z_m < math.inf:
         raise ValueError(f"objects must be at most {_MAX_DISTANCE_M:g} m away, or at infinity, got {z_m} m")
-    if not 1000.0 * z_m - reference_mm > max(0.0, -paraxial.entrance_pupil):
-        raise ValueError(
-            f"objects must lie in front of the lens, more than {max(reference_mm, 0.0) / 1000:.4g} m from its "
-            f"{reference}, got {z_m} m"
-        )
-    return 1000.0 * z_m - reference_mm
+    if not object_mm > max(0.0, -paraxial.entrance_pupil):
+        least = f"{max(reference_mm, 0.0) / 1000:.4g} m from its {reference}"
+        raise ValueError(f"objects must lie in front of the lens, more than {least}, got {z_m} m")
+    return object_mm
 
 
 def _fan(reach: float, rays: int) -> Array:
@@ -199,10 +189,9 @@ def _grid(low: Array, high: Array, steps: Array) -> Array:
 def _rays_of_point(
     lens: Lens, object_mm: float, sensor_mm: float, field_mm: float = 0.0, wavelength_um: float | None = None
 ) -> tuple[Callable[[Array], tuple[Rays, Array]], Array, Array]:
-    """Traces the rays of one wavelength that an object point emits.
+    """A function that traces the rays of an object point, and the bounding box ``[2]`` of those that pass the lens.
 
-    Returns a function that traces rays through points ``[2, R]`` of the entrance pupil's plane, and gives the solid
-    angle of each; and the bounding box, low and high ``[2]``, in that plane of the rays that pass the lens.
+    It takes points ``[2, R]`` of the entrance pupil's plane, in which the box lies; and gives each ray's solid angle.
     """
     paraxial = lens.paraxial()
     pupil, front_diameter = paraxial.entrance_pupil, lens.surfaces[0].diameter

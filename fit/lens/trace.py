@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 import torch
+from threadpoolctl import threadpool_limits
 
 from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.camera import Camera
 from torchdof.validation import number, show, whole
 
 from ..result import Array
-from ..solve import one_thread
 from .field import coc_nodes, trace_field
 from .glass import C_UM, F_UM
 from .lens import Lens
-from .nodes import Tracer, place_nodes, profiles
+from .nodes import Tracer, place_nodes
 from .spot import Focus, Reference, Spot, focus_sensor, point_spread
 
 
@@ -116,14 +116,14 @@ def trace_table(
     def spot(coc: float, wavelength_um: float | None) -> Spot:
         return point_spread(stopped, distance(coc), sensor, wavelength_um=wavelength_um, **options)
 
-    with one_thread():
+    with threadpool_limits(limits=1):
         d_line, *coloured = (
             Tracer(partial(spot, wavelength_um=wavelength), points, sensor_width_mm / width_px)
             for wavelength in (None, *(wavelengths_um or ()))
         )
-        cocs = place_nodes(d_line, near, far, nodes)
-        channels = coloured or [d_line]
-        fitted = [profiles(tracer, cocs) for tracer in channels]
+        cocs, channels = place_nodes(d_line, near, far, nodes), coloured or [d_line]
+        radius, values = zip(*(zip(*map(tracer.fitted, cocs), strict=True) for tracer in channels), strict=True)
+        residuals = [[tracer.error(coc, *tracer.fitted(coc)) for coc in cocs] for tracer in channels]
         spots = None
         if field is not None:
             field_cocs = coc_nodes(near, far, field_nodes)
@@ -148,12 +148,12 @@ def trace_table(
     return BlurTable(
         "radial",
         _rounded(np.array(cocs), 9),
-        {key: [_rounded(params[key]) for params, _ in fitted] for key in ("values", "radius")},
+        {"values": _rounded(np.array(values)), "radius": _rounded(np.array(radius) * channels[0].pixel)},
         unit="mm",
         sensor_width_mm=sensor_width_mm,
         name=f"{lens.name}_f{f_number:g}" if name is None else name,
         provenance=provenance,
-        residual=_rounded(np.sqrt(np.mean([residual**2 for _, residual in fitted], axis=0))),
+        residual=_rounded(np.sqrt(np.mean(np.square(residuals), axis=0))),
         field=spots,
     )
 
@@ -175,7 +175,7 @@ def _check(arguments: dict[str, Any]) -> None:
         raise ValueError(f"name must be a text, got {show(arguments['name'])}")
     if wavelengths is not None:
         if not isinstance(wavelengths, list | tuple) or not wavelengths:
-            raise ValueError(f"wavelengths_um must be a list of wavelengths in micrometres, got {show(wavelengths)}")
+            raise ValueError(f"wavelengths_um must be a list of micrometres, got {show(wavelengths)}")
         for value in wavelengths:
             lens.indices(number("wavelengths_um", value, unit="micrometres"))
         if np.array_equal(lens.indices(F_UM), lens.indices(C_UM)):
@@ -185,8 +185,7 @@ def _check(arguments: dict[str, Any]) -> None:
             raise ValueError("field_mm averages one place, field traces several: give one of them")
         is_list = isinstance(field, list | tuple) and len(field) > 1 and field[0] == 0
         if not is_list or not all(low < number("field", high, 0, 1e6, unit="mm") for low, high in pairwise(field)):
-            text = "field must be increasing distances in mm from the middle of the frame, from 0 on"
-            raise ValueError(f"{text}, got {show(field)}")
+            raise ValueError(f"field must be increasing distances in mm from the middle, from 0 on, got {show(field)}")
 
 
 def _rounded(values: Array, digits: int = 6) -> Any:

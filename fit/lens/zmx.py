@@ -100,8 +100,6 @@ def _glass(fields: list[str]) -> Glass:
     except (IndexError, ValueError):
         index, abbe = 0.0, 0.0
     if not index > 1.0:
-        raise ValueError(
-            f"glass {fields[0]} is not in the catalogue of SCHOTT, and the file gives no index and Abbe number for it "
-            "(GLAS, fourth and fifth)"
-        )
+        missing = "the file gives no index and Abbe number for it (GLAS, fourth and fifth)"
+        raise ValueError(f"glass {fields[0]} is not in the catalogue of SCHOTT, and {missing}")
     return Glass.of_numbers(index, *[abbe] * (abbe > 0))

@@ -26,9 +26,8 @@ def table_of_dots(dots: Sequence[tuple[Captures, TableFit]]) -> BlurTable:
     """One table from all dots of a grid, with a blur that depends on the distance from the centre of the frame.
 
     Each dot gives the size of the blur at its position (field curvature), its profile and, if pictures were fitted, its
-    shape (cat's eyes). Lenses are round, so the blur rotates with the azimuth, and dots at equal distances from the
-    centre are averaged. Details that do not rotate, such as blades, average out if the dots surround the centre. The
-    blur's offset from the sharp picture (coma) cannot be measured this way.
+    shape (cat's eyes). Lenses are round, so dots at equal distances from the centre are averaged, each rotated to one
+    azimuth. The blur's offset from the sharp picture (coma) cannot be measured this way.
 
     Args:
         dots: captures and fit of each dot, the most central first, all with the same scale.
@@ -37,8 +36,7 @@ def table_of_dots(dots: Sequence[tuple[Captures, TableFit]]) -> BlurTable:
         FitError: there are no two dots at different distances from the centre, or their fits differ in kind.
     """
     if not isinstance(dots, Sequence) or len(dots) < 2:
-        got = len(dots) if isinstance(dots, Sequence) else show(dots)
-        raise FitError(f"dots must be those of a grid, two at least, got {got}")
+        raise FitError(f"dots must be a sequence of two dots of a grid at least, got {show(dots)}")
     captures, first_fit = dots[0]
     first = first_fit.table
     for other, fit in dots:
@@ -57,8 +55,7 @@ def table_of_dots(dots: Sequence[tuple[Captures, TableFit]]) -> BlurTable:
 def field_of_dots(tables: Sequence[BlurTable], points: Sequence[tuple[float, float]], scales: Array) -> Field:
     """Spots over blur and distance from the centre, from tables with the same nodes at single positions (x, y).
 
-    Positions are those in the sharp picture, relative to the centre of the frame, in the tables' unit. At each node the
-    picture is smaller by the factor `scales`, the focus distance over the object distance.
+    Positions are in the sharp picture, from the centre, in the tables' unit; at each node they shrink by `scales`.
     """
     radii = np.hypot(*np.array(points, dtype=np.float64).T)
     order = np.argsort(radii)
@@ -98,10 +95,7 @@ def field_of_dots(tables: Sequence[BlurTable], points: Sequence[tuple[float, flo
 def _spot(
     tables: Sequence[BlurTable], points: Sequence[tuple[float, float]], group: np.ndarray, node: int, azimuths: int = 0
 ) -> tuple[float, Tensor]:
-    """Half side of the box, and the light ``[C, U, V]``, of dots at one distance from the centre, at a node.
-
-    Seen in the radial direction of each dot or, in the centre of the frame, averaged over `azimuths` directions.
-    """
+    """Half side of the box, and the light ``[C, U, V]``, of dots seen in their radial, or in `azimuths` directions."""
     unit = tables[0].px_per_unit(1.0)
     coc = float(tables[0].coc[node]) * unit
     reach = max(tables[i].reach_px(coc, 1.0) for i in group) / unit

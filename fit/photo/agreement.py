@@ -14,11 +14,11 @@ import torch
 
 from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.camera import Camera
-from torchdof.validation import show
+from torchdof.validation import number, show
 
 from ..problems import FitError, warn
 from ..result import Array, Mask
-from ..validation import a_number
+from ..validation import checked
 from .captures import CAMERA, Captures
 
 _MIN_BLUR_PX = 2.0  # radius of a blur that counts; smaller ones are dominated by aberrations
@@ -35,21 +35,18 @@ def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> N
     expected = defocus * _common_factor(defocus, measured) if camera_px is None else np.abs(camera_px)
     is_large = np.maximum(expected, measured) > _MIN_BLUR_PX
     # without a camera the scale is fitted to the distances themselves
-    if int(is_large.sum()) < (3 if camera_px is None else 1):
-        return
     misfit_log = _misfit(expected, measured, is_large)
-    if misfit_log < _WARN_LOG:
+    if int(is_large.sum()) < (3 if camera_px is None else 1) or misfit_log < _WARN_LOG:
         return
     readings = sorted(_causes(captures, expected, measured, is_large))
     likely = [text for misfit, text in readings if misfit < min(_EXPLAINED_LOG, 0.5 * misfit_log)]
     worst = int(np.argmax(np.where(is_large, np.abs(np.log(measured / expected)), 0.0)))
     source = "the other distances" if camera_px is None else "the camera's numbers"
+    cause = "likely " + "; or ".join(likely[:2]) if likely else "no single number explains it: check them all"
     text = (
         f"at {captures.distances_m[worst]:g} m the blur has a radius of {measured[worst]:.3g} px, but {source} give "
-        f"{expected[worst]:.3g} px; "
+        f"{expected[worst]:.3g} px; {cause}"
     )
-    cause = "; or ".join(likely[:2])
-    text += f"likely {cause}" if cause else "no single number explains it: check them all, and the picture of the fit"
     file, factor = captures.pairs[worst].files[1], float(measured[worst] / expected[worst])
     if misfit_log > _REFUSE_LOG:
         if camera_px is not None:
@@ -68,9 +65,8 @@ def _causes(captures: Captures, expected: Array, measured: Array, is_large: Mask
         units = [name for unit, name in _UNITS.items() if abs(math.log(factor / unit)) < _EXPLAINED_LOG]
         causes = [f"the distances are in {name}, not in metres" for name in units]
         if factor > 1:
-            text = f"the pictures are a crop of frames about {round(captures.width_px * factor)} px wide (state "
-            text += "full_width_px, or cut them by crop = [left, top, width, height] instead of in an editor)"
-            causes.append(text)
+            width = round(captures.width_px * factor)
+            causes.append(f"the pictures are a crop of frames about {width} px wide (state full_width_px)")
         causes += [
             f"the f-number is {stops / factor:.2g}, not {stops:g}",
             f"the sensor is {sensor / factor:.3g} mm wide, not {sensor:g}",
@@ -80,8 +76,8 @@ def _causes(captures: Captures, expected: Array, measured: Array, is_large: Mask
     for i, k in combinations(range(len(distance)), 2):
         exchanged = expected.copy()
         exchanged[[i, k]] = expected[[k, i]]
-        text = f"the pictures at {distance[i]:g} and {distance[k]:g} m are exchanged"
-        yield _misfit(exchanged, measured, is_large), text
+        what = f"the pictures at {distance[i]:g} and {distance[k]:g} m are exchanged"
+        yield _misfit(exchanged, measured, is_large), what
     if is_large.sum() < 3:
         return
     for i in np.flatnonzero(is_large).tolist():
@@ -120,9 +116,7 @@ def check_reach(
 ) -> dict[str, float]:
     """Checks whether a scene and camera are inside the range in which a table was measured.
 
-    Kernels are looked up by the signed circle of confusion, so a table of a thin lens would hold for any focus and
-    f-number. A real lens's aberrations change with both, so a table becomes less accurate with the distance from its
-    own.
+    Kernels are looked up by the signed circle of confusion; a lens's aberrations also change with focus and f-number.
 
     Args:
         table: with the provenance written by `fit_table` or `trace_table`.
@@ -152,7 +146,7 @@ def check_reach(
             raise FitError(f"{name} must be a torchdof.{kind.__name__}, got {show(value)}")
     if any(isinstance(getattr(camera, name), torch.Tensor) for name in Camera.__dataclass_fields__):
         raise FitError("camera must hold plain numbers, got tensors; check one item of a batch at a time")
-    a_number("width_px", width_px, 0, unit="pixels")
+    checked(number, "width_px", width_px, 0, unit="pixels")
     are_numbers = all(isinstance(z, int | float) and not isinstance(z, bool) for z in (near_m, far_m))
     if not are_numbers or not 0 < near_m <= far_m or near_m > 1e300:
         raise FitError(f"depths must be 0 < near_m <= far_m, got {show(near_m)} and {show(far_m)}")
@@ -169,15 +163,11 @@ def check_reach(
         warn(text, "outside measured", number=factors["coc"])
     for name, limit in (("f_number", 1.05), ("focus_m", 1.25)):
         measured_at, used_at = table.provenance.get(name), float(getattr(camera, name))
-        if not isinstance(measured_at, int | float) or isinstance(measured_at, bool):
-            continue
-        if not 0 < measured_at < math.inf or math.isinf(used_at):
+        is_number = isinstance(measured_at, int | float) and not isinstance(measured_at, bool)
+        if not is_number or not 0 < measured_at < math.inf or math.isinf(used_at):
             continue
         factors[name] = used_at / measured_at
         if max(factors[name], 1 / factors[name]) > limit:
-            text = (
-                f"the table was measured at {name} {measured_at:g} and is used at {used_at:g}; the size of the blur is "
-                "right, its shape is that of the measured one"
-            )
+            text = f"the table was measured at {name} {measured_at:g} and is used at {used_at:g}: its shape differs"
             warn(text, "outside measured", number=factors[name])
     return factors

@@ -8,21 +8,16 @@ import numpy as np
 import torch
 
 from torchdof.optics.camera import Camera
-from torchdof.validation import show
+from torchdof.validation import number, show
 
 from ..problems import FitError
 from ..result import Array
-from ..validation import a_number
+from ..validation import checked
 
 RANGES = {  # wider than any camera's
-    "focus_m": (1e-5, 1e6),
-    "distance_m": (1e-5, 1e6),
-    "focal_length_mm": (1e-3, 1e6),
-    "f_number": (1e-2, 1e4),
-    "sensor_width_mm": (1e-3, 1e5),
-    "exposure_s": (1e-9, 1e7),
-    "width_px": (1, 2**31),
-    "full_width_px": (1, 2**31),
+    **{"focus_m": (1e-5, 1e6), "distance_m": (1e-5, 1e6), "exposure_s": (1e-9, 1e7)},
+    **{"focal_length_mm": (1e-3, 1e6), "f_number": (1e-2, 1e4), "sensor_width_mm": (1e-3, 1e5)},
+    **dict.fromkeys(("width_px", "full_width_px"), (1, 2**31)),
 }
 CAMERA = ("focal_length_mm", "f_number", "sensor_width_mm")
 
@@ -89,7 +84,7 @@ class Captures:
         for name in ("width_px", *CAMERA):
             value = getattr(self, name)
             if value is not None or name == "width_px":
-                a_number(name, value, *RANGES[name])
+                checked(number, name, value, *RANGES[name])
 
     def __iter__(self) -> Iterator[Capture]:
         return iter(self.pairs)
@@ -119,12 +114,11 @@ class Captures:
 
 def check_distances(distances: Sequence[float], focus: float, where: str | None) -> None:
     """Raises an error if distances are not positive and increasing, or one equals the focus."""
-    a_number("focus_m", focus, 0, 1e100, "metres")
+    checked(number, "focus_m", focus, 0, 1e100, "metres")
     for previous, distance in zip([0.0, *distances], distances, strict=False):
-        a_number("distance_m", distance, -1e100, 1e100, "metres")
+        checked(number, "distance_m", distance, -1e100, 1e100, "metres")
         if not previous < distance:
-            distances_text = ", ".join(f"{d:g}" for d in distances)
-            text = f"distances must be positive and increasing, got {distances_text} m"
+            text = f"distances must be positive and increasing, got {', '.join(f'{d:g}' for d in distances)} m"
             raise FitError(text, "distance", file=where, number=float(distance))
         if distance == focus:
             text = f"a shot lies at the focus ({focus:g} m) and has no blur"

@@ -5,7 +5,7 @@ from scipy.ndimage import gaussian_filter
 
 from ..problems import FitError, warn
 from ..result import Array, BlurFit
-from .diagnostics import ASYMMETRIC, P_VALUE, asymmetry_of, size_of_blur, unexplained, unfitted_part
+from .diagnostics import ASYMMETRIC, P_VALUE, asymmetry_of, size_of_blur, unexplained
 from .dot import Dot, inner_pixels
 from .forward import Solution
 from .noise import fine_variance, independent_share, noise_of
@@ -24,7 +24,7 @@ _MIN_SIZE_ERROR = 0.02  # relative error of the kernel's size, from a soft sharp
 _MAX_EXPONENT = 0.7  # exponent of the edge's levels below which the picture counts as sRGB encoded
 _MIN_STEEPNESS, _MIN_SIGMAS = 0.03, 4.0  # steepness of an S-curve: share of the dot's level, and in standard errors
 _SHARED_DIFFERENCES = 1.9  # second differences for each independent one: neighbours share pixels
-_DECODE_ADVICE = "is the image linear? Decode it first"
+_ENCODED = "as in a picture that is left sRGB encoded; decode it first"
 
 # A tone curve in the residual: its strength, and chi squared (two parameters), above which to warn
 _MIN_CURVE, _MIN_CHI = 0.075, 30.0  # a curve of 20 % has this strength in the residual
@@ -54,21 +54,18 @@ def check_linearity(picture: Array, dot: Dot, edge: Edge, file: str | None) -> b
         largest_noise = (1 + 4 / np.sqrt(int(inside.sum() / _SHARED_DIFFERENCES))) * np.sqrt(bright + rounding)
         if dot.noise > max(largest_noise, 1e-4 * dot.peak):
             ratio = dot.noise / max(float(np.sqrt(bright)), 1e-9 * dot.peak)
-            text = f"the dark paper has {ratio:.1f} times the noise of the white dot, as in a picture that is left "
-            warn(f"{text}sRGB encoded; {_DECODE_ADVICE}", "not linear", file=file, number=ratio)
+            text = f"the dark paper has {ratio:.1f} times the noise of the white dot, {_ENCODED}"
+            warn(text, "not linear", file=file, number=ratio)
             return False
     if edge.steepness > max(_MIN_STEEPNESS, _MIN_SIGMAS * edge.steepness_error):
-        text = (
-            f"the dot's edge is steeper than pixels can be, by {100 * edge.steepness:.0f} % of its level: a tone curve "
-            "(an S-curve, a picture style) or sharpening was applied. The kernel comes out too small; develop without "
-            "them"
-        )
+        text = "the dot's edge is steeper than pixels can be: a tone curve or sharpening makes the kernel too small; "
+        text += "develop without them"
         warn(text, "not linear", file=file, number=edge.steepness)
         return False
     encoded = soft_edge(picture, dot, fit_exponent=True) if edge.misfit >= EXPLAINED else edge
     if encoded.exponent < _MAX_EXPONENT and encoded.rms < 0.75 * edge.rms:
-        text = f"the dot's edge is that of light to the power {encoded.exponent:.2f}, as in a picture that is left "
-        warn(f"{text}sRGB encoded (about 0.45); {_DECODE_ADVICE}", "not linear", file=file, number=encoded.exponent)
+        text = f"the dot's edge is that of light to the power {encoded.exponent:.2f}, {_ENCODED}"
+        warn(text, "not linear", file=file, number=encoded.exponent)
         return False
     return True
 
@@ -87,9 +84,7 @@ def check_levels(solution: Solution, expected: Solution, edge: Edge, file: str |
 
     `edge` is that of the sharp dot.
     """
-    curves = _curves(solution, edge.level)
-    products, covariance = unexplained(solution, curves)
-    visible = unfitted_part(solution, curves)
+    products, covariance, visible = unexplained(solution, _curves(solution, edge.level))
     strengths = np.linalg.lstsq(visible.T @ visible, products, rcond=None)[0]
     chi_squared = float(products @ np.linalg.pinv(covariance) @ products)
     steepness = edge.steepness / max(edge.steepness_error, np.finfo(float).tiny)  # in standard errors
@@ -100,18 +95,17 @@ def check_levels(solution: Solution, expected: Solution, edge: Edge, file: str |
             return
         resizing = expected.gain * expected.pair.move_columns(expected.moves, ("magnification",), expected.kernel)[0]
         basis = np.stack([_curves(expected, edge.level)[:, 1], resizing], axis=1)
-        products, covariance = unexplained(expected, basis)
+        products, covariance, visible = unexplained(expected, basis)
         variance = np.maximum(np.diag(covariance), np.finfo(float).tiny)
         contrast_chi, size_chi = np.sign(products) * products**2 / variance
-        strength = products[0] / np.sum(unfitted_part(expected, basis)[:, 0] ** 2)
+        strength = products[0] / np.sum(visible[:, 0] ** 2)
         margin = contrast_chi + steepness * abs(steepness) - abs(size_chi)
         if not (strength > _MIN_CONTRAST and contrast_chi > _MIN_CONTRAST_CHI and margin > _CHI_MARGIN):
             return
     condition = "" if is_bent else "at the expected size of the dot, "
     text = (
-        f"the fit's residual depends on the level, {condition}as with a tone curve (an S-curve, a picture style): the "
-        "kernel is then too small by 5 % or more; develop without it. Colours with different blurs have a similar "
-        f"effect (colours = 'each'), and a blur that is not of family {solution.family!r}"
+        f"the fit's residual depends on the level, {condition}as with a tone curve, which makes the kernel 5 % or more "
+        f"too small; develop without it. Other causes: colours (colours = 'each'), a blur not of {solution.family!r}"
     )
     warn(text, "not linear", file=file, number=float(strengths[1]))
 
@@ -125,10 +119,7 @@ def _curves(solution: Solution, level: float) -> Array:
 
 
 def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | None) -> None:
-    """Warns if the sharp picture is softer than a camera in focus makes it, and this changes the kernel's size.
-
-    `deconvolved`: whether the kernel, of this radius, was fitted to the dot as it would be in focus.
-    """
+    """Warns if a soft sharp picture changes the kernel's size; `deconvolved`: the dot was fitted as in focus."""
     if edge.softness <= _FOCUSED_SIGMA_PX or edge.radius <= 2 * edge.softness:
         return
     # the variance along an axis of a disc of radius R is R^2 / 4
@@ -136,32 +127,25 @@ def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | Non
     size_error = 1 - 1 / np.sqrt(1 + 4 * excess / max(radius_px, 1e-9) ** 2)
     if size_error < _MIN_SIZE_ERROR:
         return
-    text = f"the sharp picture is soft: its dot's edge has a width of {edge.softness:.1f} px"
     effect = f"the kernel is too small by {100 * size_error:.0f} %"
     if edge.softness <= UNFOCUSED_PX:
-        text += f"; if the printed dot's edge is sharp, {effect}"
+        cause = f"; if the printed dot's edge is sharp, {effect}"
     elif not deconvolved:
-        text += f", as out of focus; {effect}: focus again"
+        cause = f", as out of focus; {effect}: focus again"
     else:
-        text += (
-            ", as out of focus; the dot was fitted as it would be in focus. If its printed edge is that soft, the "
-            f"kernel is too large by {100 * size_error:.0f} %. Better focus again"
-        )
+        cause = ", as out of focus; the dot was fitted as it would be in focus: focus again, or print a sharper dot"
+    text = f"the sharp picture is soft: its dot's edge has a width of {edge.softness:.1f} px{cause}"
     warn(text, "not in focus", file=file, number=edge.softness)
 
 
 def check_fit(solution: Solution, fit: BlurFit, file: str | None, freest: BlurFit) -> None:
-    """Raises or warns about problems of a fit to the picture `file`.
-
-    `fit` describes the solution and will be returned; `freest` is the fit with the freest kernel.
-    """
+    """Raises or warns about problems of a fit, which describes the solution; `freest` has the freest kernel."""
     if not fit.gain > 0:
         raise FitError("the blurred picture has nothing in common with the sharp one", file=file, number=fit.gain)
     pair = solution.pair
     # share of the light that the kernel spreads outside the window
-    source = pair.moved_source(solution.moves)
-    total = float(source[0, 0].real)
-    inside = float(pair.convolve(source, solution.kernel[None], all_pixels=True)[0].sum())
+    source = pair.drawn(solution.moves)
+    total, inside = float(source.sum()), float(pair.blurred(source, solution.kernel[None]).sum())
     outside = 1 - inside / total if total > 0 else 1.0
     size = f"{pair.data.shape[1]}x{pair.data.shape[0]} px"
     if outside > _REFUSED_OUTSIDE:
@@ -171,39 +155,29 @@ def check_fit(solution: Solution, fit: BlurFit, file: str | None, freest: BlurFi
         text = f"{100 * outside:.1f} % of the blur's light falls outside the window of {size}; cut a larger one"
         warn(text, "window", file=file, number=outside)
     # the freest residual is far above the noise, or the chosen family adds much to it
-    ratio = freest.residual_over_noise
-    residual = freest.residual
+    residual, ratio = freest.residual, freest.residual_over_noise
     far_above = (residual > _MIN_RESIDUAL and ratio > FAR_ABOVE) or (residual > _MIN_AT_TWICE and ratio > 2.0)
     # a residual far above the noise is reported below; here, only the part that the family adds to it
     warned_ratio = max(2.0, 1.3 * ratio) if far_above else 2.0
     if fit is not freest and fit.residual > _MIN_AT_TWICE and fit.residual_over_noise > warned_ratio:
         text = (
-            f"family {fit.family!r} leaves {fit.residual_over_noise:.1f} times the noise ({100 * fit.residual:.1f} % "
-            f"of the light), the free profile {ratio:.1f} times; it was chosen because the "
-            "difference would not be seen at accuracy_db: ask for more, or for a richer family"
+            f"family {fit.family!r} leaves {fit.residual_over_noise:.1f} times the noise, the free profile {ratio:.1f} "
+            "times: the difference would not be seen at accuracy_db; ask for more, or for a richer family"
         )
         warn(text, "residual", file=file, number=fit.residual_over_noise)
     if far_above:
-        text = (
-            f"the residual is {100 * freest.residual:.1f} %, {ratio:.1f} times the noise; is the image linear, not "
-            "sRGB encoded, a single white dot, and not a strong JPEG?"
-        )
+        text = f"the residual is {100 * residual:.1f} %, {ratio:.1f} times the noise; is the image linear, a single "
+        text += "white dot, and not a strong JPEG?"
         text += f" Family {freest.family!r} may be too simple" if freest.family != "radial" else ""
         warn(text, "residual", file=file, number=ratio)
     change = fit.magnification / pair.magnification
     if abs(np.log(change)) > _MAGNIFICATION_LOG:
-        text = (
-            f"the blurred dot is {change:.3f} times the size it should have; are the distances right, and is the image "
-            "linear, not sRGB encoded?"
-        )
+        text = f"the blurred dot is {change:.3f} times the size it should have; are distances right and light linear?"
         warn(text, "magnification", file=file, number=change)
     _check_spots(solution, file)
     if fit.asymmetry > ASYMMETRIC and asymmetry_of(solution)[1] < P_VALUE:
-        text = (
-            f"the blur is not round: {100 * fit.asymmetry:.0f} % of it depends on the angle in a way that family "
-            f"{fit.family!r} cannot; is the lens decentred, the dot off the axis, or the stop a polygon? Families "
-            "'auto' and 'image' take any shape"
-        )
+        text = f"the blur is not round: {100 * fit.asymmetry:.0f} % of it depends on the angle in a way that family "
+        text += f"{fit.family!r} cannot; families 'auto' and 'image' take any shape"
         warn(text, "asymmetry", file=file, number=fit.asymmetry)
     if solution.family != "radial":
         _check_parameters(solution, file)
@@ -224,11 +198,8 @@ def _check_spots(solution: Solution, file: str | None) -> None:
     values = smoothed_beyond[beyond]
     spread = 1.4826 * float(np.median(np.abs(values - np.median(values))))  # also of a JPEG's blocks
     if height > max(_SPOT_SIGMAS * max(0.14 * noise_of(pair.data) / np.sqrt(smoothing), spread), _MIN_SPOT * peak):
-        text = (
-            f"a spot of {100 * height / peak:.1f} % of the dot's level is left at ({x}, {y}), "
-            f"{pair.distance[y, x]:.0f} px from the dot and beyond its blur: is there another dot, dust or a "
-            "reflection? The error bars do not count it"
-        )
+        text = f"a spot of {100 * height / peak:.1f} % of the dot's level is left at ({x}, {y}), beyond the blur: "
+        text += "is there another dot, dust or a reflection? The error bars do not count it"
         warn(text, "residual", file=file, number=height / peak)
 
 
@@ -248,5 +219,5 @@ def _check_parameters(solution: Solution, file: str | None) -> None:
             warn(f"{name} ended on its bound {value:.4g}; it is only a limit", "boundary", file=file, number=value)
     size, error = size_of_blur(solution)
     if not error < 0.5 * size:
-        text = f"the blur's rms radius of {size:.3g} +- {error:.2g} px is not determined: too little blur, or too noisy"
+        text = f"the blur's rms radius of {size:.3g} ± {error:.2g} px is not determined: too little blur, or too noisy"
         warn(text, "flat profile", file=file, number=error / size if size else np.inf)

@@ -1,6 +1,7 @@
 """Statistics of a solution of the forward model: residual, size of the blur, likelihood; as a `BlurFit`."""
 
 import numpy as np
+from scipy.linalg import orth
 from scipy.special import chdtrc
 
 from ..result import Array, BlurFit
@@ -33,23 +34,18 @@ def noise_near(solution: Solution) -> float:
     return float(np.sqrt(camera_variance + max(fine - dark - light, 0.0)))
 
 
-def unexplained(solution: Solution, basis: Array) -> tuple[Array, Array]:
+def unexplained(solution: Solution, basis: Array) -> tuple[Array, Array, Array]:
     """Products of patterns `[pixels used, n]` with a fit's residual `[n]`, and their covariance under noise alone.
 
-    The parts of the patterns that the fit's parameters can imitate are removed.
+    Also returns the patterns without the parts that the fit's parameters imitate, which are not in the residual.
     """
-    basis = unfitted_part(solution, basis)
+    imitable, _ = np.linalg.qr(solution.slopes[:, np.abs(solution.slopes).max(axis=0) > 0])
+    visible = without_level(basis - imitable @ (imitable.T @ basis), solution.fitted)
     # a smooth deviation must not count as noise: use the level beside the dot and inside it. Noise cannot exceed the
     # residual: in a JPEG, dark areas have less noise than the level in the light suggests
     variance = min(noise_near(solution), residual_rms(solution)) ** 2
-    correlated = solution.pair.correlated_noise(basis, solution.pair.noise_correlation)
-    return basis.T @ solution.residual, variance * basis.T @ correlated
-
-
-def unfitted_part(solution: Solution, basis: Array) -> Array:
-    """Patterns without the parts that the fit's parameters can imitate, which are not in its residual."""
-    imitable, _ = np.linalg.qr(solution.slopes[:, np.abs(solution.slopes).max(axis=0) > 0])
-    return without_level(basis - imitable @ (imitable.T @ basis), solution.fitted)
+    correlated = solution.pair.correlated_noise(visible, solution.pair.noise_correlation)
+    return visible.T @ solution.residual, variance * visible.T @ correlated, visible
 
 
 def asymmetry_of(solution: Solution) -> tuple[float, float]:
@@ -59,17 +55,14 @@ def asymmetry_of(solution: Solution) -> tuple[float, float]:
     the whitened squared coefficients follow a chi squared distribution. The norm is without noise's contribution.
     """
     pair = solution.pair
-    x, y = pair.dot.x + solution.moves["dx"], pair.dot.y + solution.moves["dy"]
-    rows, columns = pair.pixels
-    reach = max(pair.dot.reach, 2.0)
-    angle, ring_at = np.arctan2(rows - y, columns - x), np.hypot(columns - x, rows - y) / reach * _RINGS
+    (x, y), (rows, columns) = solution.centre, np.indices(pair.data.shape)
+    angle = np.arctan2(rows - y, columns - x)
+    ring_at = np.hypot(columns - x, rows - y) / max(pair.dot.reach, 2.0) * _RINGS
     near = (ring_at <= _RINGS) & pair.used
     hats = [(np.clip(1 - np.abs(ring_at - ring + 0.5), 0, None) * near)[pair.used] for ring in range(1, _RINGS + 1)]
     waves = [wave(n * angle[pair.used]) for n in range(1, _HARMONICS + 1) for wave in (np.cos, np.sin)]
-    basis = unfitted_part(solution, np.stack([hat * wave for hat in hats for wave in waves], axis=1))
-    directions, values, _ = np.linalg.svd(basis, full_matrices=False)
-    directions = directions[:, values > 1e-6 * values.max()]
-    found, spread = unexplained(solution, directions)
+    _, _, visible = unexplained(solution, np.stack([hat * wave for hat in hats for wave in waves], axis=1))
+    found, spread, _ = unexplained(solution, orth(visible, rcond=1e-6))
     probability = float(chdtrc(found.size, found @ np.linalg.solve(spread, found))) if np.trace(spread) > 0 else 0.0
     light = float(np.sum((pair.data[near] - solution.background) ** 2))
     share = np.sqrt(max(float(found @ found) - float(np.trace(spread)), 0.0) / light) if light > 0 else np.inf
@@ -125,13 +118,13 @@ def bic_of(solution: Solution) -> float:
     # correlated neighbours are not independent samples
     count = max(round(pair.values.size * independent_share(pair.noise_correlation)), 1)
     variance = max((solution.squares + floor) / pair.values.size, np.finfo(float).tiny)
-    return count * float(np.log(variance)) + (parameters + len(pair.fit_moves) + 2) * float(np.log(count))
+    return count * float(np.log(variance)) + parameters * float(np.log(count))
 
 
 def describe(solution: Solution, why: str) -> BlurFit:
     """The solution as a `BlurFit`: errors by name, residual and noise of the lit pixels, samples for plotting."""
     pair = solution.pair
-    x, y = pair.dot.x + solution.moves["dx"], pair.dot.y + solution.moves["dy"]
+    (x, y), (rows, columns) = solution.centre, np.indices(pair.data.shape)
     size = float(np.sqrt(np.mean((pair.data[pair.lit] - solution.background) ** 2)))
     source_variance = (solution.gain * pair.source.noise) ** 2 / pair.fine_share
     noise = np.sqrt(noise_near(solution) ** 2 + source_variance * float(np.sum(solution.kernel**2)))
@@ -140,7 +133,6 @@ def describe(solution: Solution, why: str) -> BlurFit:
     stderr: dict[str, float | Array] = {
         n: float(s) for n, s in zip(solution.names, errors, strict=True) if n in solution.params
     }
-    rows, columns = pair.pixels
     distance = np.hypot(columns - x, rows - y)
     is_near = (distance <= 1.2 * pair.dot.reach) & pair.used
     order = np.argsort(distance[is_near])

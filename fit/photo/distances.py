@@ -25,10 +25,7 @@ _RADIUS_ERROR = 0.02  # relative error with which the thin lens gives the radius
 
 
 def fit_one(pair: Capture, focus_m: float, family: str, opening: Aperture | None = None, **arguments: Any) -> BlurFit:
-    """Fits one pair, with the magnification expected from its distance; `arguments` are arguments of `fit_pair`.
-
-    Of an opening, as seen behind the focus, only the size is fitted.
-    """
+    """Fits one pair by `fit_pair`, or the size of an opening as seen behind the focus."""
     expected = {"magnification": focus_m / pair.distance_m, "knots": _KNOTS if family == "radial" else None}
     arguments = {"white": pair.white, "files": pair.files, **expected, **arguments}
     if opening is None:
@@ -89,8 +86,7 @@ class Colour:
 def fit_colours(captures: Captures, fits: Sequence[BlurFit]) -> tuple[Colour, ...]:
     """Fits red, green and blue of every pair like their mean.
 
-    In the sharp picture the colours that are not in focus are slightly blurred themselves. The softness of the sharpest
-    colour is used for all, so that each kernel contains all of its colour's blur.
+    The softness of the sharpest colour is used for all, so that each kernel contains all of its colour's blur.
     """
     fits_by_colour: list[list[BlurFit]] = [[] for _ in _COLOURS]
     for pair, mean in zip(captures, fits, strict=True):

@@ -43,10 +43,7 @@ def find_dot(picture: Array, *, file: str | None = None) -> Dot:
     dots = find_dots(picture, file=file)
     if len(dots) > 1:
         positions = ", ".join(f"({d.x:.0f}, {d.y:.0f})" for d in dots[:6])
-        text = (
-            f"{len(dots)} dots where one was expected, at {positions}; cover the others, say crop = [left, top, width, "
-            "height] in capture.toml (cropping in an editor loses the scale), or read a grid with dots='centre'"
-        )
+        text = f"{len(dots)} dots where one was expected, at {positions}; cover the others, or give crop or dots"
         raise FitError(text, "several dots", file=file, number=float(len(dots)))
     return dots[0]
 
@@ -69,10 +66,7 @@ def find_dots(picture: Array, *, file: str | None = None, smallest: float = _MIN
     smoothed_noise = 0.28 * noise
     if not peak > max(8 * smoothed_noise, 1e-9 * max(float(np.abs(picture).max()), 1e-300)):
         ratio = peak / smoothed_noise if smoothed_noise > 0 else 0.0
-        text = (
-            f"no dot found: the brightest spot is {ratio:.1f} times the noise, at least 8 are needed; is it a white "
-            "dot on black paper, well exposed?"
-        )
+        text = f"no dot found: the brightest spot is {ratio:.1f} times the noise, at least 8 are needed; expose more"
         raise FitError(text, "no dot", file=file, number=ratio)
     labels, count = ndimage.label(smooth > max(_THRESHOLD * peak, 5 * smoothed_noise), structure=np.ones((3, 3)))
     light = np.asarray(ndimage.sum_labels(smooth, labels, np.arange(1, count + 1)))
@@ -84,10 +78,7 @@ def find_dots(picture: Array, *, file: str | None = None, smallest: float = _MIN
         rows, columns = boxes[i]
         if rows.start == 0 or columns.start == 0 or rows.stop == height or columns.stop == width:
             if rank == 0:
-                text = (
-                    f"the dot touches the picture's edge (rows {rows.start}-{rows.stop}, columns "
-                    f"{columns.start}-{columns.stop} of {height}x{width}); leave dark paper around the whole blur"
-                )
+                text = "the dot touches the picture's edge; leave dark paper around the whole blur"
                 raise FitError(text, "window", file=file, number=1.0)
             continue
         y, x = ndimage.center_of_mass(smooth, labels, i + 1)
@@ -129,30 +120,21 @@ def inner_pixels(picture: Array, dot: Dot) -> Mask | None:
 
 
 def fine_share_inside(picture: Array, dot: Dot) -> float | None:
-    """Share of the noise's variance in a sharp dot that second differences measure; None if the dot is too small.
-
-    In a JPEG fine noise is kept in the light but removed in the dark. Uneven light is removed by fitting a parabola.
-    """
+    """Share of the noise's variance in a sharp dot that second differences measure; None if the dot is too small."""
     inside = inner_pixels(picture, dot)
     if inside is None:
         return None
     rows, columns = np.nonzero(inside)
     x, y = (columns - dot.x) / dot.radius, (rows - dot.y) / dot.radius
-    light = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    light = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)  # uneven light
     levels = picture[inside]
     residual = levels - light @ np.linalg.lstsq(light, levels, rcond=None)[0]
     variance = float(residual @ residual) / (levels.size - light.shape[1])
     return min(fine_variance(picture, inside) / variance, 1.0) if variance > 0 else 1.0
 
 
-def used_pixels(
-    picture: Array, dot: Dot, white: float | None, file: str | None, name: str, *, refuse: bool = True
-) -> Mask:
-    """Pixels `[H, W]` that are not clipped, excluding those that noise may have clipped.
-
-    With `refuse` it warns about excluded pixels, and raises a `FitError` if too little of the dot is left, both of kind
-    "saturated". If `white` is None, a plateau is searched.
-    """
+def used_pixels(picture: Array, dot: Dot, white: float | None, file: str | None, *, refuse: bool = True) -> Mask:
+    """Pixels `[H, W]` that are not clipped, at a plateau if `white` is None; `refuse`: with a warning or an error."""
     level = white if white is not None else _plateau(picture, dot)
     clipped = picture >= (np.inf if level is None else level * (1 - 1e-6))
     count = int(clipped.sum())
@@ -163,11 +145,10 @@ def used_pixels(
     bright = picture > dot.background + 0.15 * dot.peak
     share = float(np.sum(clipped & bright)) / max(int(bright.sum()), 1)
     if refuse and share > _MAX_CLIPPED:
-        text = f"{100 * share:.0f} % of the {name} dot's pixels are clipped at {level:.4g}; expose less, so that at "
-        text += f"least {100 - 100 * _MAX_CLIPPED:.0f} % are below it"
-        raise FitError(text, "saturated", file=file, number=share)
+        text = f"{100 * share:.0f} % of the blurred dot's pixels are clipped at {level:.4g}; expose less: at least "
+        raise FitError(f"{text}{100 - 100 * _MAX_CLIPPED:.0f} % must be below", "saturated", file=file, number=share)
     if refuse:
-        text = f"{count} pixels of the {name} picture are clipped at {level:.4g} and were left out; expose less"
+        text = f"{count} pixels of the blurred picture are clipped at {level:.4g} and were left out; expose less"
         warn(text, "saturated", file=file, number=float(count))
     return ~clipped
 
@@ -175,8 +156,7 @@ def used_pixels(
 def _plateau(picture: Array, dot: Dot) -> float | None:
     """The level at which a picture is clipped, or None.
 
-    A clipped picture has many pixels at exactly its highest level, more than at the next lower one, although its noise
-    is larger than the distance of its levels. Without noise a flat top may be real.
+    It has more pixels than the next lower one, although the noise is larger than the distance of levels.
     """
     levels, counts = np.unique(picture[picture > dot.background + 0.5 * dot.peak], return_counts=True)
     tail = levels.size > 1 and counts[-1] <= counts[-2]  # few pixels at the top level are the tail of the noise
@@ -187,12 +167,8 @@ def _plateau(picture: Array, dot: Dot) -> float | None:
     return top if dot.noise > 0.6 * spacing and dot.noise > 1e-12 * abs(top) else None
 
 
-def check_blacks(picture: Array, dot: Dot, file: str | None, name: str) -> None:
-    """Warns if the dark paper's noise is cut off below: its mean is then too high, and faint light is lost.
-
-    Paper without noise, or within a few levels of a file, lies on its lowest level without being cut; its noise is then
-    below one level, or symmetric.
-    """
+def check_blacks(picture: Array, dot: Dot, file: str | None) -> None:
+    """Warns if the dark paper's noise is cut off below; noise below a level, or symmetric noise, is not."""
     paper = picture[distance_from(dot, picture.shape) > dot.reach + 1]
     levels, counts = np.unique(paper, return_counts=True)
     if levels.size < 2 or counts[0] < _CUT_BLACKS * paper.size:
@@ -202,8 +178,6 @@ def check_blacks(picture: Array, dot: Dot, file: str | None, name: str) -> None:
     if within_a_level or float(np.quantile(paper, 0.995)) - mean < _NOISE_ASYMMETRY * (mean - levels[0]):
         return
     share = float(counts[0] / paper.size)
-    text = (
-        f"{100 * share:.0f} % of the {name} picture's paper lies on its lowest level, {levels[0]:.3g}: blacks are cut "
-        "off there, and the kernel comes out up to 1 % too small; develop so that black lies above its noise"
-    )
+    text = f"{100 * share:.0f} % of the paper lies on its lowest level, {levels[0]:.3g}: blacks are cut off there, and"
+    text += " the kernel is up to 1 % too small; develop so that black lies above its noise"
     warn(text, "saturated", file=file, number=share)

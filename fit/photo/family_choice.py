@@ -61,9 +61,8 @@ def _natural_power(width: int) -> Array:
 def highlight_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     """PSNR between the pictures of a highlight through two kernels, in dB.
 
-    A highlight shows the kernel itself, unlike a natural image. It is encoded for display with the peak of `other` at
-    white, and compared where either picture is brighter than 2 % of that. Kernels are as for :func:`natural_psnr`;
-    `other` is the reference.
+    A highlight shows the kernel itself. It is encoded for display with the peak of `other`, the reference, at white,
+    and compared where either picture is brighter than 2 % of that. Kernels are as for :func:`natural_psnr`.
 
     Raises:
         FitError: a kernel is not `[k, k]` with an odd k, or not of finite numbers.
@@ -104,11 +103,9 @@ def looks_alike(kernel: Array, other: Array, accuracy_db: float) -> bool:
 def choose(
     kernels: Mapping[str, Array], bic: Mapping[str, float], accuracy_db: float
 ) -> tuple[str, str, dict[str, float]]:
-    """The cheapest family that a viewer cannot distinguish from the most likely one.
+    """The cheapest family that a viewer cannot distinguish from the simplest within 2 of the lowest BIC.
 
-    The most likely one is the simplest family within 2 of the lowest BIC; the others are compared with it by
-    `looks_alike`. Also returns one sentence with the reason and the alternatives, and the PSNR of each family on a
-    natural image against the free profile "radial".
+    Also returns a sentence with the reason and the alternatives, and each family's PSNR against "radial".
     """
     by_likelihood = sorted(kernels, key=lambda f: (bic[f], COST.index(f)))
     lowest = bic[by_likelihood[0]]

@@ -59,16 +59,13 @@ def read_picture(
         if len(pixels) != 1:
             raise invalid(f"bayer = {bayer!r} is for pictures with one colour a pixel, got {len(pixels)} colours")
         if picture.orientation != 1:
-            text = f"bayer = {bayer!r} is for pictures as the sensor is read, got one of EXIF orientation "
-            raise invalid(f"{text}{picture.orientation}; remove the tag")
+            raise invalid(f"bayer is for upright pictures, got EXIF orientation {picture.orientation}; remove the tag")
         pixels = demosaiced(pixels[0], bayer)
     height, width = pixels.shape[1:]
     left, top, columns, rows = crop or (0, 0, width, height)
     if left + columns > width or top + rows > height:
         raise invalid(f"crop {[left, top, columns, rows]} extends beyond the picture of {width}x{height}")
     pixels = pixels[:, top : top + rows, left : left + columns]
-    if bad := int(np.sum(~np.isfinite(pixels))):
-        raise FitError(f"{bad} values are NaN or infinite", "not finite", file=str(path), number=float(bad))
     white = 1.0 if picture.sample in ("8", "16") else None
     is_clipped = pixels >= 1.0 - 1e-6
     if dark is not None:
@@ -85,10 +82,7 @@ def read_picture(
 
 
 def demosaiced(mosaic: Array, pattern: str) -> Array:
-    """Red, green and blue `[3, H, W]` of a mosaic `[H, W]`, interpolated bilinearly.
-
-    Bilinear interpolation is linear, equal in the sharp and the blurred picture, and adds no false colour.
-    """
+    """Red, green and blue `[3, H, W]` of a mosaic `[H, W]`, interpolated bilinearly, which adds no false colour."""
     height, width = mosaic.shape
     names = np.tile(np.array(list(pattern)).reshape(2, 2), (height // 2 + 1, width // 2 + 1))[:height, :width]
     kernels = {"R": _SQUARE, "G": _CROSS, "B": _SQUARE}
@@ -108,15 +102,13 @@ def cut_pairs(
     exposure: float | None,
     colours: bool,
 ) -> list[Capture]:
-    """Finds the dot, or the dots of a grid, in a sharp and a blurred photograph, and cuts the windows around each.
+    """Cuts the windows around the dot, or the dots of a grid, in a sharp and a blurred photograph.
 
-    `exposure` is the brightness of the blurred photograph over that of the sharp one. A dot too close to the frame's
-    edge or to another one is an error.
+    `exposure` is the brightness of the blurred photograph over that of the sharp one.
     """
     sharp_picture, blurred_picture = pictures
     if dots == "one":
-        first, second = (find_dot(picture.light, file=str(picture.file)) for picture in pictures)
-        matched = [(first, second)]
+        matched = [tuple(find_dot(picture.light, file=str(picture.file)) for picture in pictures)]
     else:
         matched = _matched(sharp_picture, blurred_picture, focus_m / distance_m)[: 1 if dots == "centre" else None]
     pairs = []
@@ -130,24 +122,24 @@ def cut_pairs(
             text = f"the frame cuts the blur: it reaches {needed:.0f} px from the dot, the frame ends after {half} px"
             cut_picture = sharp_picture if border_px[0] < sharp_dot.reach + 2 else blurred_picture
             raise FitError(text, "window", file=str(cut_picture.file), number=needed)
-        windows = [(..., slice(y - half, y + half + 1), slice(x - half, x + half + 1)) for x, y in centres]
-        sharp, blurred = (picture.light[window].copy() for picture, window in zip(pictures, windows, strict=True))
-        for picture, window in ((sharp_picture, sharp), (blurred_picture, blurred)):
-            if (count := len(find_dots(window, file=str(picture.file)))) > 1:
+        windows, colour_windows = [], []
+        for picture, (x, y) in zip(pictures, centres, strict=True):
+            window = ..., slice(y - half, y + half + 1), slice(x - half, x + half + 1)
+            windows.append(picture.light[window].copy())
+            colour_windows.append(picture.colours[window].copy())
+            if (count := len(find_dots(windows[-1], file=str(picture.file)))) > 1:
                 text = f"{count} dots in a window of {2 * half + 1} px: print the dots farther apart than their blur"
                 raise FitError(text, "several dots", file=str(picture.file), number=float(count))
         centre = sharp_picture.middle
-        sharp_colours, blurred_colours = (f.colours[window] for f, window in zip(pictures, windows, strict=True))
         pairs.append(
             Capture(
-                sharp,
-                blurred,
+                *windows,
                 distance_m,
                 files=(str(sharp_picture.file), str(blurred_picture.file)),
                 white=sharp_picture.white,
                 exposure=exposure,
                 position_px=(round(sharp_dot.x - centre[0], 2), round(sharp_dot.y - centre[1], 2)),
-                colours=(sharp_colours.copy(), blurred_colours.copy()) if colours else None,
+                colours=(colour_windows[0], colour_windows[1]) if colours else None,
             )
         )
     return pairs

@@ -8,10 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from torchdof.validation import show
+from torchdof.validation import choice, number, show
 
 from ..problems import FitError, warn
-from ..validation import a_choice, a_number
 from .captures import CAMERA, RANGES, Captures, check_distances
 from .frame import PATTERNS, CameraPicture, Dots, cut_pairs, read_picture, size_of
 
@@ -113,37 +112,28 @@ def read_captures(
     dark = read(manifest["dark"], None) if manifest["dark"] else None
     sharp_picture = read(manifest["sharp"], dark)
     by_colour = manifest["colours"] == "each"
-    if by_colour and sharp_picture.colours.shape[0] != 3:
-        text = "colours = 'each' needs pictures of three colours, or bayer = 'RGGB', got"
-        raise invalid(f"{text} {sharp_picture.colours.shape[0]}")
-    columns, encoded = [], [sharp_picture.file.name] if sharp_picture.encoded else []
+    if by_colour and (count := len(sharp_picture.colours)) != 3:
+        raise invalid(f"colours = 'each' needs pictures of three colours, or bayer = 'RGGB', got {count}")
+    dots, columns, encoded = manifest["dots"] or "one", [], [sharp_picture.file.name] * sharp_picture.encoded
     for shot in shots:
         blurred_picture = read(shot["file"], dark)
         _check_alike(sharp_picture, blurred_picture, manifest_name)
-        encoded += [blurred_picture.file.name] if blurred_picture.encoded else []
+        encoded += [blurred_picture.file.name] * blurred_picture.encoded
         seconds = manifest["exposure_s"]
         exposure = shot["exposure_s"] / seconds if shot["exposure_s"] and seconds else None
         pictures = (sharp_picture, blurred_picture)
-        columns.append(cut_pairs(pictures, focus, shot["distance_m"], manifest["dots"] or "one", exposure, by_colour))
+        columns.append(cut_pairs(pictures, focus, shot["distance_m"], dots, exposure, by_colour))
     if manifest["transfer"] is None and encoded:
         further = f" and {len(encoded) - 1} more" if len(encoded) > 1 else ""
-        text = (
-            f"the encoding of {encoded[0]}{further} is not stated; sRGB is assumed. A camera's own tone curve "
-            "or sharpening makes the kernel up to 15 % too small and need not show: develop to linear light without "
-            "them. Then say transfer = 'linear', or 'srgb' if that is all that was done"
-        )
+        text = f"the encoding of {encoded[0]}{further} is not stated; sRGB is assumed. A camera's tone curve or "
+        text += "sharpening makes the kernel up to 15 % too small: develop without, and say transfer = 'linear'/'srgb'"
         warn(text, "not linear", file=manifest_name, number=float(len(encoded)))
-    width = sharp_picture.width_px if manifest["full_width_px"] is None else round(manifest["full_width_px"])
-    if width < sharp_picture.width_px:
-        got = f"got {manifest['full_width_px']:g} for pictures of {sharp_picture.width_px}"
-        raise invalid(f"full_width_px must be at least the pictures' own width, {got}")
+    own_width = sharp_picture.width_px
+    width = own_width if manifest["full_width_px"] is None else round(manifest["full_width_px"])
+    if width < own_width:
+        raise invalid(f"full_width_px must be at least {own_width}, the pictures' own width, got {width}")
     camera = {name: sharp_picture.facts.get(name) if manifest[name] is None else manifest[name] for name in CAMERA}
-    notes = {
-        "manifest": path.name,
-        "transfer": manifest["transfer"] or "by file type",
-        "pictures": files,
-        "dots": manifest["dots"] or "one",
-    }
+    notes = {"manifest": path.name, "transfer": manifest["transfer"] or "by file type", "pictures": files, "dots": dots}
     if from_exif := [name for name in CAMERA if manifest[name] is None and camera[name] is not None]:
         notes["from_exif"] = from_exif
     name = manifest["name"] or folder_path.resolve().name
@@ -159,8 +149,7 @@ def inside(file: Path, root: str | os.PathLike[str], where: str) -> None:
     if not os.path.isdir(folder):
         raise FitError(f"root must be a folder, got {show(str(root))}", "manifest", file=where)
     if os.path.commonpath([folder, real]) != folder:
-        text = f"{str(file)!r} lies outside of {root}, and nothing else may be read (--root)"
-        raise FitError(text, "manifest", file=where)
+        raise FitError(f"{str(file)!r} lies outside of {root} (--root)", "manifest", file=where)
 
 
 def _manifest(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -188,16 +177,16 @@ def _field(fields: Mapping[str, Any], name: str, where: str) -> Any:
         return None
     try:
         if name in RANGES:
-            return a_number(name, value, *RANGES[name])
+            return number(name, value, *RANGES[name])
         if name in _CHOICES:
-            a_choice(name, value, _CHOICES[name])
+            choice(name, value, _CHOICES[name])
         elif name == "crop":
             numbers = value if isinstance(value, list) and len(value) == 4 else [-1]
             if not all(type(v) is int and 0 <= v < 2**31 for v in numbers) or not all(numbers[2:]):
-                raise FitError(f"crop must be [left, top, width, height] in pixels, got {show(value)}")
+                raise ValueError(f"crop must be [left, top, width, height] in pixels, got {show(value)}")
         elif not isinstance(value, str) or not value or "\0" in value:
-            raise FitError(f"{name} must be a text, got {show(value)}")
-    except FitError as error:
+            raise ValueError(f"{name} must be a text, got {show(value)}")
+    except ValueError as error:
         raise FitError(str(error), "manifest", file=where) from None
     return value
 
@@ -206,13 +195,9 @@ def _check_alike(first: CameraPicture, second: CameraPicture, where: str) -> Non
     """Raises an error for pictures of different size, or if the lens was changed between them."""
     if first.light.shape != second.light.shape:
         sizes = f"{second.file.name} is {size_of(second.light)}, {first.file.name} is {size_of(first.light)}"
-        text = f"{sizes}; give pictures of one size, as the camera made them"
-        raise FitError(text, "manifest", file=where)
+        raise FitError(f"{sizes}; give pictures of one size", "manifest", file=where)
     for key, word in (("f_number", "f-number"), ("focal_length_mm", "focal length")):
         before, after = first.facts.get(key), second.facts.get(key)
         if before and after and abs(math.log(before / after)) > 0.02:
-            text = (
-                f"EXIF says this was taken at {word} {after:g}, and {first.file.name} at {before:g}; aperture and "
-                "zoom must stay as they are"
-            )
+            text = f"EXIF says this was taken at {word} {after:g}, and {first.file.name} at {before:g}; change neither"
             raise FitError(text, "manifest", file=str(second.file), number=after)

@@ -1,8 +1,4 @@
-"""The noise of a picture: its size, and its correlation between neighbours.
-
-Demosaicing, denoising and JPEG smooth the noise. It then averages out more slowly than for independent pixels, and
-second differences, which measure only changes from pixel to pixel, underestimate it.
-"""
+"""The noise of a picture: its size, and its correlation between neighbours, which demosaicing and JPEG cause."""
 
 import numpy as np
 from scipy.signal import correlate as correlated
@@ -50,10 +46,9 @@ def _mixed_differences(picture: Array) -> Array:
 
 
 def correlation_of(values: Array, is_used: Mask) -> Array:
-    """Correlation of the noise (mean 0) of a picture's used pixels with their neighbours.
+    """Correlation of the noise (mean 0) of a picture's used pixels `[2 LAGS + 1, 2 LAGS + 1]`; its centre is 1.
 
-    It is `[2 LAGS + 1, 2 LAGS + 1]`, 1 in the centre, and 0 at lags without significant correlation. Its spectrum is
-    non-negative.
+    It is 0 at lags without significant correlation, and its spectrum is non-negative.
     """
     size = 2 * LAGS + 1
     white = np.zeros((size, size))
@@ -95,10 +90,7 @@ def independent_share(correlation: Array) -> float:
 
 
 def noise_beside(picture: Array, background: float, dark: Mask) -> tuple[Array, float]:
-    """Correlation of the noise of the paper beside a dot (pixels `dark`), and the share of it that is fine.
-
-    The fine share is the part of the variance that second differences measure: 1 for independent neighbours.
-    """
+    """Correlation of the noise of some `dark` pixels, and the share of its variance that second differences measure."""
     residual = picture - background
     correlation = correlation_of(residual, dark)
     if dark.sum() < _MIN_PIXELS:

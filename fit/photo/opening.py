@@ -1,9 +1,7 @@
 """Blur that is not round: the lens's opening as a polygon of blades if that explains it, otherwise as a picture.
 
-The picture is the blurred dot deconvolved with the sharp one. Its pixels are free, except that they are non-negative,
-sum to 1, are smooth where the noise leaves them undetermined, and are 0 where a first estimate is almost dark
-(non-negative noise would accumulate there). Cross-validation gives the strength of smoothing: the one that predicts
-withheld pixels best.
+The picture is the blurred dot deconvolved with the sharp one: non-negative, smooth where the noise leaves it
+undetermined, and 0 where a first estimate is almost dark. The smoothing is the one that predicts withheld pixels best.
 """
 
 import math
@@ -11,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from scipy.fft import irfft2, rfft2
 from scipy.ndimage import binary_dilation, center_of_mass, gaussian_filter, laplace, map_coordinates
 
 from torchdof.optics.aperture import Aperture
@@ -60,12 +59,9 @@ def solve_polygon(round_fit: Solution) -> Solution:
     """Fits the regular polygon whose harmonic is the most significant one in a round profile's residual."""
     blades, _, corner = _harmonic(round_fit)
     size = np.sqrt(2) * size_of_blur(round_fit)[0]
-    start = {
-        "radius": size * math.sqrt(3 / (2 + math.cos(2 * math.pi / blades))),
-        "rotation_deg": (-90.0 - corner) % (360.0 / blades),
-        "curvature": 0.1,
-    }
-    return _solved(round_fit, Aperture(blades), "polygon", start)
+    radius = size * math.sqrt(3 / (2 + math.cos(2 * math.pi / blades)))
+    start = {"radius": radius, "rotation_deg": (-90.0 - corner) % (360.0 / blades), "curvature": 0.1}
+    return replace(round_fit.pair, opening=Aperture(blades)).solve("polygon", start)
 
 
 def solve_image(previous: Solution, kernel: Array | None = None) -> Solution:
@@ -78,21 +74,13 @@ def solve_image(previous: Solution, kernel: Array | None = None) -> Solution:
     positions = ((np.arange(side) + 0.5) / side * 2 - 1) * half_px
     mask = map_coordinates(kernel, np.meshgrid(positions + y, positions + x, indexing="ij"), order=3, mode="constant")
     mask = np.round(np.maximum(mask / mask.max(), 0.0), 4)  # few digits keep the table's file small
-    return _solved(previous, Aperture(mask=torch.from_numpy(mask)), "image", {"radius": half_px})
-
-
-def _solved(previous: Solution, opening: Aperture, family: str, start: dict[str, float]) -> Solution:
-    """The solution with an opening; the magnification starts from that of `previous`."""
-    magnification = previous.moves["magnification"]
-    return replace(previous.pair, opening=opening, held_magnification=magnification).solve(family, start)
+    return replace(previous.pair, opening=Aperture(mask=torch.from_numpy(mask))).solve("image", {"radius": half_px})
 
 
 def _harmonic(round_fit: Solution) -> tuple[int, float, float]:
-    """The polygon that is most significant in a round profile's residual.
+    """The polygon that is most significant in a round profile's residual, on a ring, with one period for each blade.
 
-    A polygon is a circle with an angle-dependent radius. The difference from the circle lies on a ring and has one
-    period for each blade. Returns the number of blades, chi squared of the two amplitudes, and the angle of a corner in
-    degrees from the right, clockwise on the screen.
+    Returns the number of blades, chi squared, and the angle of a corner in degrees, clockwise from the right.
     """
     pair, size = round_fit.pair, np.sqrt(2) * size_of_blur(round_fit)[0]
     half = min(int(np.ceil(1.3 * size)) + 3, pair.half)
@@ -100,8 +88,8 @@ def _harmonic(round_fit: Solution) -> tuple[int, float, float]:
     angle, r = np.arctan2(axis[:, None], axis), np.hypot(axis[:, None], axis)
     ring = np.exp(-0.5 * ((r - size) / (0.7 + 0.05 * size)) ** 2)
     waves = [ring * wave(n * angle) for n in _BLADES for wave in (np.cos, np.sin)]
-    basis = pair.convolve(pair.moved_source(round_fit.moves), np.stack(waves)).T
-    products, noise_covariance = unexplained(round_fit, basis)
+    basis = pair.blurred(pair.drawn(round_fit.moves), np.stack(waves))[:, pair.used].T
+    products, noise_covariance, _ = unexplained(round_fit, basis)
     candidates = []
     for i, n in enumerate(_BLADES):
         columns = slice(2 * i, 2 * i + 2)
@@ -119,13 +107,12 @@ def turned(opening: Aperture) -> Aperture:
 
 
 def _deconvolved(shape: Solution) -> tuple[Array, float]:
-    """Deconvolves a pair of pictures, starting from a solution, which gives the moves and the kernel's reach.
+    """The kernel `[k, k]` of a pair of pictures by deconvolution, with the moves and the reach of a solution.
 
-    Returns the kernel `[k, k]`, k odd, non-negative, summing to 1; and twice the increase of the log likelihood of
-    withheld pixels over the solution.
+    Also returns twice the increase of the log likelihood of withheld pixels over the solution.
     """
     pair = shape.pair
-    source = pair.moved_source(shape.moves)
+    source = pair.drawn(shape.moves)
     # withhold a fifth of the pixels, and take the smoothing that predicts them best
     is_withheld = np.random.default_rng(0).random(pair.values.size) < _WITHHELD
     is_judged = is_withheld & pair.lit[pair.used]
@@ -155,23 +142,30 @@ def _descend(
     Reference:
         Beck and Teboulle, "A fast iterative shrinkage-thresholding algorithm", SIAM J. Imaging Sciences 2(1), 2009.
     """
-    level = float(pair.values.mean())
-    blurred = pair.convolve(source, start[None])[0]
-    gain = max(float((blurred - blurred.mean()) @ (pair.values - level)) / float(np.var(blurred) * blurred.size), 1e-12)
-    largest = float(np.abs(source).max()) ** 2
+    transform, half, (height, width) = rfft2(source, pair.grid), len(start) // 2, pair.data.shape
+
+    def blurred(kernel: Array) -> Array:
+        full = irfft2(transform * rfft2(kernel, pair.grid), pair.grid)
+        return np.asarray(full[half : half + height, half : half + width][pair.used])
+
+    def adjoint(values: Array) -> Array:
+        spread = irfft2(np.conj(transform) * rfft2(pair.picture(values), pair.grid), pair.grid)
+        return np.asarray(np.roll(spread, (half, half), (0, 1))[: len(start), : len(start)])
+
+    largest = float(np.abs(transform).max()) ** 2
     penalty = smoothness * largest * 1e-2
     step = 1.0 / (largest + 8 * penalty)
-    weights = extrapolated = gain * start
+    weights = extrapolated = max(pair.project(blurred(start))[1], 1e-12) * start
     momentum = 1.0
     for _ in range(_MAX_STEPS):
-        error = pair.convolve(source, extrapolated[None])[0] - pair.values
+        error = blurred(extrapolated) - pair.values
         error = np.where(is_fitted, error - error[is_fitted].mean(), 0.0)
-        gradient = pair.correlate(source, error, start.shape[0]) - penalty * laplace(extrapolated, mode="constant")
+        gradient = adjoint(error) - penalty * laplace(extrapolated, mode="constant")
         next_weights = np.maximum(extrapolated - step * gradient, 0.0) * (1.0 if is_lit is None else is_lit)
         next_momentum = (1 + np.sqrt(1 + 4 * momentum * momentum)) / 2
         extrapolated = next_weights + (momentum - 1) / next_momentum * (next_weights - weights)
         change, weights, momentum = float(np.abs(next_weights - weights).max()), next_weights, next_momentum
         if change < _MIN_CHANGE * float(next_weights.max()):
             break
-    model = pair.convolve(source, weights[None])[0]
+    model = blurred(weights)
     return weights / float(weights.sum()), model + float((pair.values - model)[is_fitted].mean())

@@ -5,14 +5,14 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
+from threadpoolctl import threadpool_limits
 
 from torchdof.optics.aperture import Aperture
-from torchdof.validation import show
+from torchdof.validation import choice, number, show, whole
 
 from ..problems import FitError, warn
 from ..result import Array, BlurFit
-from ..solve import one_thread
-from ..validation import a_choice, a_count, a_number, a_picture
+from ..validation import a_picture, checked
 from .checks import EXPLAINED, FAR_ABOVE, check_fit, check_focus, check_levels, check_linearity
 from .diagnostics import bic_of, describe
 from .dot import check_blacks, find_dot, fine_share_inside, used_pixels
@@ -111,16 +111,16 @@ def fit_pair(
         >>> fit.family, round(fit.params["radius"], 3)
         ('disc', 8.0)
     """
-    a_choice("family", family, ("auto", *SHAPES))
-    a_choice("model", model, get_args(Model))
-    a_choice("source", source, get_args(SourceKind))
-    a_number("accuracy_db", accuracy_db, -np.inf, unit="dB")
-    a_number("magnification", magnification, 1e-3, 1e3)  # a larger ratio makes one dot invisible
+    checked(choice, "family", family, ("auto", *SHAPES))
+    checked(choice, "model", model, get_args(Model))
+    checked(choice, "source", source, get_args(SourceKind))
+    checked(number, "accuracy_db", accuracy_db, unit="dB")
+    checked(number, "magnification", magnification, 1e-3, 1e3)  # a larger ratio makes one dot invisible
     for name, value, least in (("white", white, -1e100), ("reach", reach, 0), ("softness", softness, -1e-9)):
         if value is not None:
-            a_number(name, value, least, 1e100)
+            checked(number, name, value, least, 1e100)
     if knots is not None:
-        a_count("knots", knots, 2, 1000)
+        checked(whole, "knots", knots, 2, 1000)
     if fit_magnification is not None and not isinstance(fit_magnification, bool):
         raise FitError(f"fit_magnification must be True, False or None, got {show(fit_magnification)}")
     if aperture is not None and (not isinstance(aperture, Aperture) or family != "image"):
@@ -128,35 +128,31 @@ def fit_pair(
     data = a_picture("blurred", blurred, _MIN_WINDOW_PX, files[1])
     sharp_picture = None if sharp is None else a_picture("sharp", sharp, _MIN_WINDOW_PX, files[0])
     if sharp_picture is not None and sharp_picture.shape != data.shape:
-        raise FitError(
-            f"sharp and blurred must have the same shape, got {list(sharp_picture.shape)} and {list(data.shape)}; "
-            "cut the same window from both"
-        )
+        shapes = f"{list(sharp_picture.shape)} and {list(data.shape)}"
+        raise FitError(f"sharp and blurred must have the same shape, got {shapes}; cut the same window from both")
     if model == "ratio":  # errors common to a spoke enter the standard errors
         if sharp_picture is None:
             raise FitError("model='ratio' divides by the sharp picture, got sharp=None; use model='forward'")
         r, strength, spokes = blur_strength(sharp_picture, data)
         return replace(fit_profile(r, strength, "ring" if family == "auto" else family, groups=spokes), model="ratio")
-    with one_thread():
+    with threadpool_limits(limits=1):  # the steps of a fit are too small for more threads
         pair, edge, linear = prepared_pair(sharp_picture, data, source, magnification, white, files, softness)
-        # whether the magnification is known before the fit: a point has none
-        is_known = True if sharp is None else None if fit_magnification is None else not fit_magnification
-        pair.fit_moves = ALL_MOVES if is_known is False else ("dx", "dy")
+        pair.fit_moves = ALL_MOVES if fit_magnification and sharp is not None else ("dx", "dy")
         pair.opening = aperture or Aperture()
-        free_profile = family in ("auto", "radial", *OPENINGS) and aperture is None
+        free_profile, end = family in ("auto", "radial", *OPENINGS) and aperture is None, 0.0
         # a free profile gives an unbiased magnification, unlike a wrong family
         if free_profile:
             soft = pair.solve("softm")
             # a free profile ends slightly outside a fitted soft disc, or at `reach`
             end = float(soft.params["radius"]) + 3.5 * float(soft.params["sigma"]) + 1.0 if reach is None else reach
-            solution = solve_radial(pair, soft.moves, min(end, pair.half - 1.0), knots)
+            end = min(end, pair.half - 1.0)
+            solution = solve_radial(pair, soft.moves, end, knots)
         else:
             solution = pair.solve(family)
         expected = freest = solution
-        if is_known is None:
+        if sharp is not None and fit_magnification is None:
             free_pair = replace(pair, fit_moves=ALL_MOVES)
-            radius = float(solution.params["radius"]) if free_profile else 0.0
-            free = solve_radial(free_pair, solution.moves, radius, knots) if free_profile else free_pair.solve(family)
+            free = solve_radial(free_pair, solution.moves, end, knots) if free_profile else free_pair.solve(family)
             # scale of chi squared: the residual or, without noise, the rounding of a spline; correlated noise counts
             # less
             scale = max(free.squares / pair.values.size, (1e-4 * pair.unit) ** 2)
@@ -168,7 +164,7 @@ def fit_pair(
             pair.held_magnification = freest.moves["magnification"]
             opening = None
             if family == "auto":
-                solution, why, psnr = _choose(freest, accuracy_db, soft)
+                solution, why, psnr = _choose(freest, accuracy_db)
                 opening = solve_opening(freest)
                 if opening is not None and looks_alike(solution.kernel, opening[0].kernel, accuracy_db):
                     opening = None
@@ -201,35 +197,25 @@ def prepared_pair(
     files: tuple[str | None, str | None] = (None, None),
     softness: float | None = None,
 ) -> tuple[Forward, Edge | None, bool]:
-    """Finds the dots, excludes clipped pixels, and chooses the representation of the sharp dot.
-
-    Also returns the sharp dot's edge, and whether the sharp picture appears to be in linear light.
-    """
+    """The problem to solve, the sharp dot's edge, and whether the sharp picture appears to be in linear light."""
     data_dot = find_dot(data, file=files[1])
-    used = used_pixels(data, data_dot, white, files[1], "blurred")
-    check_blacks(data, data_dot, files[1], "blurred")
+    used = used_pixels(data, data_dot, white, files[1])
+    check_blacks(data, data_dot, files[1])
     if sharp_picture is None:
         return Forward(point_source(data.shape, data_dot), data, used, data_dot, magnification), None, False
     dot = find_dot(sharp_picture, file=files[0])
-    check_blacks(sharp_picture, dot, files[0], "sharp")
-    is_unclipped = used_pixels(sharp_picture, dot, white, files[0], "sharp", refuse=False)
+    check_blacks(sharp_picture, dot, files[0])
+    is_unclipped = used_pixels(sharp_picture, dot, white, files[0], refuse=False)
     clipped = int(np.sum(~is_unclipped))
     edge = soft_edge(sharp_picture, dot, white=float(sharp_picture[~is_unclipped].min()) if clipped else None)
     if softness is not None and softness < edge.softness:
         source, edge = "dot", edge.with_softness(softness)
     linear = clipped > 0 or softness is not None or check_linearity(sharp_picture, dot, edge, files[0])
-    if edge.radius * magnification < _MIN_DOT_PX:
-        text = (
-            f"by the distances the dot, {edge.radius:.1f} px in focus, would have a radius of "
-            f"{edge.radius * magnification:.2g} px here, which is too small to see; is the distance misread, or in "
-            "another unit?"
-        )
+    if (radius := edge.radius * magnification) < _MIN_DOT_PX:
+        text = f"by its distance the dot has a radius of {radius:.2g} px here, too small to see; is it in another unit?"
         raise FitError(text, "distance", file=files[1], number=magnification)
     if clipped:
-        text = (
-            f"{clipped} pixels of the sharp picture are clipped; an ideal dot of radius {edge.radius:.2f} px stands in "
-            "for it"
-        )
+        text = f"{clipped} pixels of the sharp picture are clipped; an ideal dot of {edge.radius:.2f} px stands for it"
         warn(text, "saturated", file=files[0], number=float(clipped))
     # An ideal dot is as exact as the dot's own pixels. Magnification makes two errors of a few thousandths: in a spline
     # between the pixels of a hard edge, and in the sensor's softness, which does not grow with the dot.
@@ -238,33 +224,18 @@ def prepared_pair(
     edge_fits = edge.misfit < EXPLAINED or (edge.rms < _MAX_EDGE_RMS and magnification != 1)
     explained = (edge_fits or (softness_matters and unexplained < _MAX_UNEXPLAINED)) and edge.radius > 2 * edge.softness
     ideal = clipped or source == "dot" or (source == "auto" and explained)
-    pair = Forward(
-        ideal_dot(edge) if ideal else picture_of_dot(sharp_picture, dot),
-        data,
-        used,
-        data_dot,
-        magnification,
-        shot_noise=edge.shot_noise / edge.level,
-        fine_share_of_light=fine_share_inside(sharp_picture, dot),
-    )
+    drawn = ideal_dot(edge) if ideal else picture_of_dot(sharp_picture, dot)
+    pair = Forward(drawn, data, used, data_dot, magnification)
+    pair.shot_noise = edge.shot_noise / edge.level
+    pair.fine_share_of_light = fine_share_inside(sharp_picture, dot)
     return pair, edge, linear
 
 
-def _choose(radial: Solution, accuracy_db: float, soft: Solution) -> tuple[Solution, str, dict[str, float]]:
-    """Fits every family at the free profile's magnification and chooses one, which is then fitted with it.
-
-    `soft` is the fit of "softm" that gave the profile's end; it is fitted again only if the moves are others.
-    """
+def _choose(radial: Solution, accuracy_db: float) -> tuple[Solution, str, dict[str, float]]:
+    """Fits every family at the free profile's magnification and chooses one, which is then fitted with it."""
     pair, fixed_pair = radial.pair, replace(radial.pair, fit_moves=("dx", "dy"))
-    is_held = soft.pair.fit_moves == fixed_pair.fit_moves and soft.moves["magnification"] == pair.held_magnification
-    kept = {"radial": radial} | ({"softm": soft} if is_held else {})
-    solutions = {
-        f: replace(kept[f], pair=fixed_pair) if f in kept else fixed_pair.solve(f) for f in ("radial", *COST[:-1])
-    }
-    kernels, bic = {f: s.kernel for f, s in solutions.items()}, {f: bic_of(s) for f, s in solutions.items()}
-    family, why, psnr = choose(kernels, bic, accuracy_db)
-    if family == "radial":
-        return radial, why, psnr
-    if pair.fit_moves == ALL_MOVES:
-        return pair.solve(family), why, psnr
-    return solutions[family], why, psnr
+    solutions = {"radial": radial} | {family: fixed_pair.solve(family) for family in COST[:-1]}
+    bic = {f: bic_of(solution) for f, solution in solutions.items()}
+    family, why, psnr = choose({f: solution.kernel for f, solution in solutions.items()}, bic, accuracy_db)
+    is_final = family == "radial" or pair.fit_moves != ALL_MOVES
+    return solutions[family] if is_final else pair.solve(family), why, psnr

@@ -90,8 +90,8 @@ def read_photographs(
         if refusal := optional_formats.refusal(path):
             raise FitError(refusal, file=str(path))
     if len(files) < 2:
-        text = f"there is neither a {MANIFEST} nor two photographs (.jpg .png .tif .exr) of the target that "
-        raise FitError(f"{text}torchdof fit --target target.pdf makes", "manifest", file=folder_name)
+        text = f"there is neither a {MANIFEST} nor two photographs of the page that torchdof fit --target makes"
+        raise FitError(text, "manifest", file=folder_name)
     pictures: list[Photograph] = []
     advice: list[str] = []
     settings, integers = dict[str, float](), True
@@ -125,28 +125,24 @@ def read_photographs(
         tone = tone_curve([(p.light, p.target) for p in pictures], square_mm)
     elif integers:
         text = (
-            f"{len(pictures)} photographs are too few to find a tone curve, which would make the kernel up to "
-            f"15 % too small: take {_MIN_FOR_TONE} or more"
+            f"{len(pictures)} photographs are too few to find a tone curve, which makes a kernel up to 15 % too small: "
         )
+        text += f"take {_MIN_FOR_TONE} or more"
         warn(text, "not linear", file=folder_name, number=float(len(pictures)))
     bend = (0.0, 0.0, 0.0) if tone is None else tone.bend
     if any(bend):
         pictures = [replace(p, light=untoned(p.light, bend)) for p in pictures]
         pictures = [replace(p, target=find_target(p.light, file=p.file)) for p in pictures]
-        advice.append(
-            "a tone curve was found by the light of the dot and the edges of the square, and undone ("
-            f"{bend[0]:+.2f}, {bend[1]:+.2f}, {bend[2]:+.2f}); the stated errors count how exactly it is known, "
-            "and blurs of a few px may still be 5 % too small; raw pictures need no such guess"
-        )
+        curve = f"({bend[0]:+.2f}, {bend[1]:+.2f}, {bend[2]:+.2f})"
+        text = f"a tone curve {curve} was found by the light of the dot and the edges of the square, and undone; "
+        advice.append(f"{text}blurs of a few px may still be 5 % too small; raw pictures need no such guess")
     sharpest = max(pictures, key=lambda p: p.sharpness)
     focal_px = settings["focal_length_mm"] * width / settings["sensor_width_mm"]
     # distance of the focus, from the square's size there and the thin lens: 1/focal length = 1/focus + 1/image distance
     focus_m = (focal_px * square_mm / sharpest.target.side_px + settings["focal_length_mm"]) / 1000
     image_px = focal_px / (1 - settings["focal_length_mm"] / 1000 / focus_m)
-    pictures = sorted(
-        (replace(p, distance_m=image_px * square_mm / 1000 / p.target.side_px) for p in pictures),
-        key=lambda p: p.distance_m,
-    )
+    pictures = [replace(p, distance_m=image_px * square_mm / 1000 / p.target.side_px) for p in pictures]
+    pictures.sort(key=lambda p: p.distance_m)
     out_of_focus = [p for p in pictures if abs(p.distance_m / focus_m - 1) > _AT_FOCUS]
     advice += _advice(pictures, out_of_focus, sharpest, focus_m)
     if not out_of_focus:

@@ -7,23 +7,19 @@ from scipy.ndimage import map_coordinates
 from scipy.optimize import approx_fprime
 
 from torchdof.optics.psf import LENGTHS, profile
-from torchdof.validation import show
+from torchdof.validation import choice, show
 
 from ..problems import FitError, warn
 from ..result import Array, BlurFit, Indices
 from ..solve import best_of, inverse
-from ..validation import a_choice, a_picture, real_numbers
+from ..validation import a_picture, checked, real_numbers
 from .dot import find_dot
 
 _NAMES = {"gaussian": ("N", "sigma"), "ring": ("N", "r_c", "sigma"), "softm": ("N", "radius", "sigma", "b", "m")}
 # relative to the largest r; N relative to the largest strength
 _BOUNDS = {
-    "N": (0.0, np.inf),
-    "r_c": (0.0, 3.0),
-    "sigma": (1e-3, 30.0),
-    "radius": (1e-2, 3.0),
-    "b": (-1.0, 20.0),
-    "m": (0.5, 12.0),
+    **{"N": (0.0, np.inf), "r_c": (0.0, 3.0), "sigma": (1e-3, 30.0)},
+    **{"radius": (1e-2, 3.0), "b": (-1.0, 20.0), "m": (0.5, 12.0)},
 }
 _STARTS = {
     "gaussian": [[1.0, 0.2], [1.0, 0.5], [1.0, 1.5]],
@@ -31,7 +27,6 @@ _STARTS = {
     "softm": [[1.0, 0.5, 0.1, 0.0, 2.0], [1.0, 0.9, 0.1, 0.0, 4.0], [1.0, 0.3, 0.1, 0.5, 2.0]],
 }
 _FLAT_F = 8.0  # F statistic of a parabola against a constant, below which samples are flat: 1 chance in 1500
-_MIN_LEVEL, _MAX_LEVEL = 1e-60, 1e60  # their squares enter the covariance
 _MIN_SIDE_PX = 5  # noise is estimated from second differences
 _STEP_DEG = 10
 
@@ -75,9 +70,18 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
         >>> f"{fit.params['sigma']:.6f} {fit.params['r_c']:.6f} {fit.params['N']:.4f}"
         '0.002000 0.000400 0.5800'
     """
-    a_choice("family", family, tuple(_NAMES))
+    checked(choice, "family", family, tuple(_NAMES))
     names = _NAMES[family]
-    radii, values = _checked(r, strength, len(names) + 2)
+    radii, values = real_numbers("r", r, "[n]"), real_numbers("strength", strength, "[n]")
+    if radii.shape != values.shape:
+        raise FitError(f"r and strength must both be [n], got {list(radii.shape)} and {list(values.shape)}")
+    if radii.min(initial=0.0) < 0:
+        raise FitError(f"r must be >= 0, got {radii.min():g}", number=float(radii.min()))
+    if (distinct := np.unique(radii).size) < len(names) + 2:
+        text = f"the family takes at least {len(names) + 2} different radii, got {distinct}"
+        raise FitError(text, number=float(distinct))
+    if values.max() <= 0:
+        raise FitError("strength must be positive somewhere; is the dot darker than its paper?", number=values.max())
     labels = np.arange(radii.size) if groups is None else np.asarray(groups)
     if labels.shape != radii.shape or labels.dtype.kind not in "iuf":
         raise FitError(f"groups must be one integer a sample [{radii.size}], got {show(groups)}")
@@ -92,10 +96,7 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
     explained = float(np.sum((y - y.mean()) ** 2)) - unexplained
     variation = float(np.sqrt(max(explained, 0.0) / y.size))
     if variation < 1e-8 or explained / 2 < _FLAT_F * unexplained / (y.size - 3):
-        text = (
-            f"the profile is flat: it varies by {variation:.3g} of its peak over r, in a noise of {noise:.3g}; sample "
-            "farther out, or move the paper farther from focus"
-        )
+        text = f"the profile is flat: it varies by {variation:.3g} of its peak, in noise of {noise:.3g}; sample farther"
         raise FitError(text, "flat profile", number=variation / noise if noise > 0 else 0.0)
 
     def model(p: Array) -> Array:
@@ -135,10 +136,7 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
         # compare the error of r_c with sigma if r_c is smaller, because a peak at the centre has r_c near 0
         reference_length = max(value, float(fit.params["sigma"]) if name == "r_c" else 0.0)
         if not error < 0.25 * reference_length:
-            text = (
-                f"the profile is too flat, or too different from the family, to fix {name} = {value:.4g} +- "
-                f"{error:.2g}; sample farther out, or try another family"
-            )
+            text = f"the profile is too flat, or too different from the family, to fix {name} = {value:.4g}"
             warn(text, "flat profile", number=error / reference_length if reference_length else np.inf)
         if value >= 0.999 * bound:
             warn(f"{name} ended on its bound {bound:.4g}; it is only a limit", "boundary", number=bound)
@@ -150,30 +148,6 @@ def evaluate(family: str, r: Array, params: dict[str, float | Array]) -> Array:
     shape = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in params.items() if k != "N"}
     strength = float(params.get("N", 1.0))
     return strength * profile(family, torch.from_numpy(np.ascontiguousarray(r)), shape).numpy()
-
-
-def _checked(r: ArrayLike, strength: ArrayLike, fewest: int) -> tuple[Array, Array]:
-    """Radii and strengths `[n]` as float64 with at least `fewest` different radii, or an error."""
-    radii, values = real_numbers(r), real_numbers(strength)
-    if radii is None or values is None:
-        raise FitError("r and strength must be numbers, one strength for each radius")
-    if radii.ndim != 1 or radii.shape != values.shape:
-        raise FitError(f"r and strength must both be [n], got {list(radii.shape)} and {list(values.shape)}")
-    if bad := int(np.sum(~np.isfinite(radii) | ~np.isfinite(values))):
-        text = f"{bad} of {radii.size} samples are NaN or infinite; leave them out"
-        raise FitError(text, "not finite", number=float(bad))
-    for name, array in (("r", radii), ("strength", values)):
-        largest = float(np.abs(array).max(initial=0.0))
-        if not _MIN_LEVEL <= largest <= _MAX_LEVEL and largest > 0:
-            text = f"{name} must lie within {_MIN_LEVEL:g} and {_MAX_LEVEL:g}, got up to {largest:g}; take another unit"
-            raise FitError(text, number=largest)
-    if radii.size and radii.min() < 0:
-        raise FitError(f"r must be >= 0, got {radii.min():g}", number=float(radii.min()))
-    if (distinct := np.unique(radii).size) < fewest:
-        raise FitError(f"the family takes at least {fewest} different radii, got {distinct}", number=float(distinct))
-    if values.max() <= 0:
-        raise FitError("strength must be positive somewhere; is the dot darker than its paper?", number=values.max())
-    return radii, values
 
 
 def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, Indices]:

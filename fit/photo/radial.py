@@ -17,12 +17,11 @@ _MAX_STEP = {"dx": 0.5, "dy": 0.5, "magnification": 0.02}  # largest step of an 
 
 
 def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: int | None = None) -> Solution:
-    """Fits values of the profile at equal steps of r, and refines the moves.
+    """Fits values of the profile, densities per square pixel, at equal steps of r up to `radius` px; refines the moves.
 
-    The profile is linear in its values: each is the weight of a hat function, whose kernel is convolved with the sharp
-    dot. A penalty on second differences, chosen by generalised cross-validation, smooths the values that the data do
-    not determine (near the centre, where there are few pixels). The profile ends at `radius` px; if `knots` is None it
-    has two values for each pixel, between 8 and 48. The values are densities per square pixel.
+    Each value is the weight of a hat function, whose kernel is convolved with the sharp dot. A penalty on second
+    differences, chosen by generalised cross-validation, smooths values that the data do not determine. If `knots` is
+    None there are two values for each pixel, between 8 and 48.
     """
     count = knots if knots is not None else int(np.clip(np.ceil(2 * radius), 8, 48))
     half = min(int(np.ceil(radius)) + 1, pair.half)
@@ -31,9 +30,9 @@ def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: i
     h = radius / (count - 1)
     hat_light = 2 * np.pi * h * h * np.arange(count, dtype=np.float64)  # integral of each hat over the plane
     hat_light[0], hat_light[-1] = np.pi * h * h / 3, 2 * np.pi * (radius * h / 2 - h * h / 6)
-    moves, transformed = dict(moves), pair.transformed(hats)
+    moves = dict(moves)
     for _ in range(10):
-        columns = hat_light[:, None] * pair.product(pair.moved_source(moves), transformed)  # [knots, pixels]
+        columns = hat_light[:, None] * pair.blurred(pair.drawn(moves), hats)[:, pair.used]  # [knots, pixels]
         weights, smoothing = _non_negative(columns, pair.values)
         gain = float(hat_light @ weights)
         kernel = np.tensordot(hat_light * weights / gain, hats, 1)
@@ -41,7 +40,7 @@ def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: i
         fitted, gain, background = pair.project(shaped)
         residual = pair.values - fitted
         # one Gauss-Newton step of the moves, for a constant kernel
-        slopes = gain * np.stack(pair.move_columns(moves, pair.fit_moves, kernel), axis=1)
+        slopes = gain * pair.move_columns(moves, pair.fit_moves, kernel).T
         step = np.linalg.lstsq(without_level(slopes, shaped), residual, rcond=None)[0]
         for name, change in zip(pair.fit_moves, step, strict=True):
             moves[name] += float(np.clip(change, -_MAX_STEP[name], _MAX_STEP[name]))
@@ -54,7 +53,7 @@ def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: i
     covariance[np.ix_(free, free)] = np.where(np.isfinite(free_covariance), free_covariance, 0.0)
     params: dict[str, float | Array] = {"values": weights / float(hat_light @ weights), "radius": radius}
     names = tuple(f"values[{i}]" for i in range(count))
-    slopes = np.stack(pair.move_columns(moves, ("dx", "dy"), kernel), axis=1)
+    slopes = pair.move_columns(moves, ("dx", "dy"), kernel).T
     return Solution(pair, "radial", params, moves, gain, background, fitted, names, covariance / gain**2, slopes)
 
 

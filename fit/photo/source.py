@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -48,10 +47,7 @@ def picture_of_dot(picture: Array, dot: Dot) -> Source:
 
 
 def point_source(shape: tuple[int, ...], dot: Dot) -> Source:
-    """A point of light at the pixel nearest to a blurred dot's centre, integrated over that pixel.
-
-    Kernels have only the optical blur; the source has the pixel's own, a variance of 1/12 px^2 along each axis.
-    """
+    """A point of light at the pixel nearest to a blurred dot's centre, blurred by that pixel."""
     x, y = int(round(dot.x)), int(round(dot.y))
     picture = np.zeros(shape)
     picture[y, x] = 1.0
@@ -71,11 +67,7 @@ def _drawn_by_splines(picture: Array, x: float, y: float) -> Draw:
 
 
 def ideal_dot(edge: Edge) -> Source:
-    """A soft disc fitted to the photographed dot: without noise, and exact at any position and size.
-
-    If its edge is softer than that of any camera in focus, it is drawn as in focus. The softness belongs to the sensor,
-    not to the print: it does not grow with the dot.
-    """
+    """A soft disc fitted to the photographed dot, drawn as in focus; the softness, the sensor's, is not magnified."""
     edge = edge.with_softness(_FOCUSED_PX) if edge.softness > UNFOCUSED_PX else edge
     radius, softness = edge.radius, edge.softness
 
@@ -98,8 +90,7 @@ class Edge:
     exponent: float  # of the light in the edge's levels, if fitted; 1 in linear light
     rms: float  # residual of the ideal dot, over the dot's peak
     misfit: float  # the same over the expected noise
-    # mean residual of the edge's upper half minus that of its lower half, over the level. An S-curve separates the
-    # levels of half-covered pixels; blur only brings them together
+    # mean residual of the edge's upper half minus that of its lower half, over the level; positive for an S-curve
     steepness: float
     steepness_error: float
     shot_noise: float  # growth of a pixel's noise variance from the paper to the dot
@@ -116,12 +107,6 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
     With `fit_exponent`, levels are a power of the light. A round white dot loses as much light inside its edge as it
     gains outside; encoding (a power of about 0.45) breaks this balance and can be detected.
     """
-    return _soft_edge(np.asarray(picture, dtype=np.float64).tobytes(), picture.shape, dot, white, fit_exponent)
-
-
-@functools.lru_cache(maxsize=16)  # fits of several distances, families and passes have the same sharp pictures
-def _soft_edge(pixels: bytes, shape: tuple[int, ...], dot: Dot, white: float | None, fit_exponent: bool) -> Edge:
-    picture = np.frombuffer(pixels).reshape(shape)
     grid = np.indices(picture.shape).astype(np.float64)
     is_near = distance_from(dot, picture.shape) <= dot.reach + 3
     rows, columns, levels = grid[0][is_near], grid[1][is_near], (picture[is_near] - dot.background) / dot.peak
@@ -133,12 +118,10 @@ def _soft_edge(pixels: bytes, shape: tuple[int, ...], dot: Dot, white: float | N
         return np.minimum(level * (coverage ** p[5] if fit_exponent else coverage), clip_level)
 
     def jacobian(p: Array) -> Array:
-        slopes = []
-        for i, h in enumerate((1e-2, 1e-2, 1e-2, 1e-2, 1e-4, 1e-4)[: len(p)]):
-            up, down = p.copy(), p.copy()
-            up[i], down[i] = up[i] + h, max(down[i] - h, 0.0) if i > 1 else down[i] - h
-            slopes.append((model(up) - model(down)) / (up[i] - down[i]))
-        return np.stack(slopes, axis=1)
+        steps = np.diag((1e-2, 1e-2, 1e-2, 1e-2, 1e-4, 1e-4)[: len(p)])
+        up, down = p + steps, np.maximum(p - steps, bounds[0])
+        changes = [model(more) - model(less) for more, less in zip(up, down, strict=True)]
+        return np.stack(changes, axis=1) / np.diag(up - down)
 
     bounds = ([-3, -3, 0.2, 0.0, 0.3], [3, 3, dot.reach + 3, dot.reach + 3, 30.0])
     starts = [[0, 0, dot.radius, 0.4, 1.0], [0, 0, dot.radius, 0.3 * dot.radius + 0.1, 1.1]]
@@ -160,19 +143,9 @@ def _soft_edge(pixels: bytes, shape: tuple[int, ...], dot: Dot, white: float | N
         steepness = float(residual[upper].mean() - residual[lower].mean()) / level
         variance = sum(residual[half].var(ddof=1) / half.sum() for half in (lower, upper))
         steepness_error = float(np.sqrt(variance)) / level
-    return Edge(
-        x=dot.x + dx,
-        y=dot.y + dy,
-        radius=radius,
-        softness=softness,
-        level=level * dot.peak,
-        exponent=float(solution[5]) if fit_exponent else 1.0,
-        rms=rms,
-        misfit=rms / expected if expected > 0 else np.inf,
-        steepness=steepness,
-        steepness_error=steepness_error,
-        shot_noise=shot_noise,
-    )
+    exponent, misfit = float(solution[5]) if fit_exponent else 1.0, rms / expected if expected > 0 else np.inf
+    fitted = (dot.x + dx, dot.y + dy, radius, softness, level * dot.peak, exponent)
+    return Edge(*fitted, rms, misfit, steepness, steepness_error, shot_noise)
 
 
 def _coverage(rows: Array, columns: Array, x: float, y: float, radius: float, softness: float) -> Array:

@@ -11,11 +11,11 @@ import numpy as np
 
 from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.psf import FAMILIES, LENGTHS
-from torchdof.validation import show
+from torchdof.validation import choice, show
 
 from ..problems import FitError, warn, without_warnings
 from ..result import Array, BlurFit
-from ..validation import a_choice
+from ..validation import checked
 from .agreement import check_agreement
 from .captures import CAMERA, Capture, Captures
 from .distances import Colour, common_opening, fit_colours, fit_one, with_uncertainty
@@ -111,9 +111,8 @@ def fit_captures(
         a single distance, and of the problems listed at `fit_pair`.
     """
     if not isinstance(captures, Captures):
-        text = "captures must be a Captures(pairs, focus_m=..., width_px=...), which knows the focus and the frame's "
-        raise FitError(f"{text}width; got {show(captures)}")
-    a_choice("family", family, ("auto", *SHAPES))
+        raise FitError(f"captures must be a Captures(pairs, focus_m=..., width_px=...), got {show(captures)}")
+    checked(choice, "family", family, ("auto", *SHAPES))
     pairs, has_first_fits, done = captures.pairs, family == "auto" or family in OPENINGS, count(1)
 
     def report(pair: Capture) -> None:
@@ -136,8 +135,8 @@ def fit_captures(
         fit = fit_one(pair, captures.focus_m, family, opening)
         ratio = 1.0 if pair.exposure is None or not fit.gain > 0 else fit.gain / pair.exposure
         if max(ratio, 1 / ratio) > _MAX_EXPOSURE_RATIO:
-            text = f"the blurred dot is {ratio:.2f} times as bright as the exposures say; is the image linear, and did "
-            warn(f"{text}the light stay the same?", "exposure", file=pair.files[1], number=ratio)
+            text = f"the blurred dot is {ratio:.2f} times as bright as the exposures say; did the light stay the same?"
+            warn(text, "exposure", file=pair.files[1], number=ratio)
         fits.append(with_uncertainty(pair, captures.focus_m, fit))
         report(pair)
     radius_px = np.array([f.radius for f in fits])
@@ -155,12 +154,25 @@ def fit_captures(
         colour_params = [_params(colour.fits, family) for colour in colours]
         params = {n: np.stack([p[n] for p in colour_params]) for n in params}
     if len(pairs) == 1:
-        text = (
-            f"one distance was measured ({pairs[0].distance_m:g} m); the thin lens scales it to all others, and the "
-            "other side of focus mirrors it"
-        )
+        text = f"one distance was measured ({pairs[0].distance_m:g} m); the thin lens scales it to all others"
         warn(text, "single distance", file=pairs[0].files[1], number=pairs[0].distance_m)
-    provenance = _provenance(captures, fits, colours) | {"coc_from": scale, "family_because": why, "command": command}
+    provenance = {
+        "source": "photographs of a dot",
+        "date": datetime.date.today().isoformat(),
+        "focus_m": captures.focus_m,
+        "distances_m": captures.distances_m.tolist(),
+        "width_px": captures.width_px,
+        "residual_over_noise": [round(f.residual_over_noise, 3) for f in fits if math.isfinite(f.residual_over_noise)],
+        "asymmetry": [round(f.asymmetry, 4) for f in fits],
+        **captures.notes,
+        **{name: getattr(captures, name) for name in CAMERA if getattr(captures, name) is not None},
+        **{"coc_from": scale, "family_because": why, "command": command},
+    }
+    if colours:
+        shifts = [c.focus_shift_dioptres for c in colours]
+        provenance["colours"] = [c.name for c in colours]
+        provenance["focus_shift_dioptres"] = [round(s, 5) if math.isfinite(s) else None for s in shifts]
+        provenance["lateral_px"] = [[[round(v, 3) for v in xy] for xy in c.lateral_px] for c in colours]
     sensor = captures.sensor_width_mm
     unit = captures.width_px if sensor is None else captures.width_px / sensor
     table = BlurTable(
@@ -186,23 +198,3 @@ def _params(fits: Sequence[BlurFit], family: str) -> dict[str, Array]:
         return {"values": values, "radius": radius}
     names = ("radius",) if family in OPENINGS else FAMILIES[family]
     return {n: np.array([float(f.params[n]) for f in fits]) for n in names}
-
-
-def _provenance(captures: Captures, fits: Sequence[BlurFit], colours: Sequence[Colour]) -> dict[str, Any]:
-    ratios = [f.residual_over_noise for f in fits]
-    provenance = {
-        "source": "photographs of a dot",
-        "date": datetime.date.today().isoformat(),
-        "focus_m": captures.focus_m,
-        "distances_m": captures.distances_m.tolist(),
-        "width_px": captures.width_px,
-        "residual_over_noise": [round(ratio, 3) for ratio in ratios if math.isfinite(ratio)],
-        "asymmetry": [round(f.asymmetry, 4) for f in fits],
-        **dict(captures.notes),
-    }
-    if colours:
-        shifts = [c.focus_shift_dioptres for c in colours]
-        provenance["colours"] = [c.name for c in colours]
-        provenance["focus_shift_dioptres"] = [round(s, 5) if math.isfinite(s) else None for s in shifts]
-        provenance["lateral_px"] = [[[round(v, 3) for v in xy] for xy in c.lateral_px] for c in colours]
-    return provenance | {name: getattr(captures, name) for name in CAMERA if getattr(captures, name) is not None}

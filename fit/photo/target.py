@@ -1,7 +1,6 @@
 """The printed target (a white dot in a black square on white paper), and its detection in a photograph.
 
-The square gives the scale, and so the distance; the dot gives the blur; the white paper around the square gives the
-level of white in any light.
+The square gives the scale, and so the distance; the dot gives the blur; the paper gives the level of white.
 """
 
 import math
@@ -15,10 +14,11 @@ import numpy as np
 from scipy import ndimage
 
 from torchdof.io.atomic import atomic_file
+from torchdof.validation import choice
 
 from ..problems import FitError
 from ..result import Array, Mask
-from ..validation import a_choice
+from ..validation import checked
 
 Paper = Literal["a4", "letter"]
 
@@ -38,7 +38,7 @@ def write_target(path: str | os.PathLike[str], paper: Paper = "a4") -> None:
     target = Path(path)
     if target.suffix.lower() != ".pdf":
         raise FitError(f"the target is written as PDF: name it {target.with_suffix('.pdf')}", file=str(path))
-    a_choice("paper", paper, get_args(Paper))
+    checked(choice, "paper", paper, get_args(Paper))
     page = Path(__file__).with_name(f"target-{paper}.pdf").read_bytes()
     with atomic_file(target) as temporary:
         Path(temporary).write_bytes(page)
@@ -70,10 +70,7 @@ def find_target(light: Array, *, file: str | None = None) -> Target:
     thresholds = low + _THRESHOLDS * (high - low)
     candidates = [target for level in thresholds for target in _squares(thumbnail, thumbnail < level)]
     if not candidates:
-        text = (
-            "no target found: a black square with a white dot in its middle, white paper around it, all in the frame; "
-            "is it evenly lit, square on and not too small?"
-        )
+        text = "no target found: show a black square with a white dot, white paper around it, evenly lit and square on"
         raise FitError(text, "no dot", file=file)
     best = max(candidates, key=lambda t: (t.white - t.black) / max(t.white + t.black, 1e-12))  # of the highest contrast
     x, y = ((v + 0.5) * step - 0.5 for v in (best.x, best.y))

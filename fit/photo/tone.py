@@ -1,7 +1,6 @@
 """Detects an unknown tone curve, from the light of the dot and the edges of the square.
 
-Relative to the white paper, the light of the dot must equal its printed area for any blur. And across a blurred edge
-between black and white, the dark side must gain as much light as the bright side loses.
+The dot's light over the paper's is its printed area, whatever the blur; a blurred edge darkens as much as it lights up.
 """
 
 import math
@@ -42,8 +41,7 @@ def untoned(light: Array, bend: Sequence[float] | Array) -> Array:
     """Undoes a tone curve.
 
     With the encoded level e and u = 2 e - 1, the slope of the inverse curve is `exp(b1 u + b2 (u^2 - 1/3) + b3 (u^3 -
-    3/5 u))`, times a factor that keeps white. So it is monotonic for any parameters. For a mix with a share t of the
-    S-curve `e^2 (3 - 2 e)`, b2 is near t.
+    3/5 u))`, times a factor that keeps white: it is monotonic. An S-curve has b2 > 0.
     """
     u = 2 * _LEVELS - 1
     slope = np.exp(bend[0] * u + bend[1] * (u**2 - 1 / 3) + bend[2] * (u**3 - 0.6 * u))
@@ -89,10 +87,7 @@ def tone_curve(pictures: Sequence[tuple[Array, Target]], square_mm: float) -> To
 
 
 def _edges(light: Array, target: Target) -> list[tuple[Array, Array]]:
-    """Levels across two opposite sides of the square, from paper to ink in steps of `_BIN`, if they are blurred.
-
-    Uneven light bends opposite edges in opposite directions, so their errors cancel.
-    """
+    """Levels across opposite sides of the square, from paper to ink; uneven light has opposite effects on the two."""
     reach, half_length = int(_ACROSS * target.side_px), int(_ALONG * target.side_px)
     pairs = []
     for picture, x, y in ((light, target.x, target.y), (light.T, target.y, target.x)):

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.ndimage import gaussian_filter
 from scipy.signal import fftconvolve
 
 from torchdof.fit import FitError, FitWarning
@@ -96,8 +95,6 @@ class Simulator:
     jpeg: int | None = None  # quality of the JPEG through which the sRGB-encoded pictures go
     edge_sigma: float = 0.0  # sigma in px of a Gaussian blur of both pictures
     misfocus: float = 0.0  # sigma in px of a Gaussian blur of the sharp picture only
-    texture: float = 0.0  # contrast of a grain of a few px, the same in both pictures
-    uneven: float = 0.0  # relative increase of the light from the window's left edge to its right edge
     tone: float = 0.0  # strength from 0 to 1 of an S-curve over the encoded levels, which is not undone
     bayer: bool = False  # sample with an RGGB mosaic, demosaic bilinearly, take the mean of the colours
 
@@ -109,11 +106,6 @@ class Simulator:
         moved = np.pad(draw_dot(self.size, self.dot_radius * self.magnification, there), self.size)
         if self.edge_sigma:
             sharp, moved = (blur(p, "gaussian", {"sigma": self.edge_sigma}) for p in (sharp, moved))
-        if self.texture:
-            grain = gaussian_filter(np.random.default_rng(7).normal(size=moved.shape), 2.0)
-            grain = 1 + self.texture * grain / grain.std()
-            moved = moved * grain
-            sharp = sharp * grain[self.size : 2 * self.size, self.size : 2 * self.size]
         if self.misfocus:
             sharp = blur(sharp, "gaussian", {"sigma": self.misfocus})
         blurred = blur(moved, family, params)[self.size : 2 * self.size, self.size : 2 * self.size]
@@ -123,7 +115,6 @@ class Simulator:
     def record(self, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """The recorded picture of `light`, in linear light, or sRGB encoded if `srgb`."""
         picture = np.maximum(light, 0.0) + self.black
-        picture = picture * (1 + self.uneven * np.linspace(-0.5, 0.5, picture.shape[1]))
         if self.full_well is not None:
             picture = rng.poisson(picture * self.full_well) / self.full_well
         if self.snr_db is not None:

@@ -172,12 +172,12 @@ G3, G4, D6, R34 = (
 # camera, kernel, seed, options of the fit, kinds of warnings (None: "not linear" or "residual"), words, first number
 WARNED = [
     *(
-        ({"srgb": True, "level": 0.7, **noise}, ("gaussian", {"sigma": s}), 1, {}, None, "linear", None)
+        ({"srgb": True, "level": 0.7, **noise}, ("gaussian", {"sigma": s}), 1, {}, None, "linear|sRGB", None)
         for noise, s in (({"snr_db": None}, 1.0), ({"snr_db": 40.0}, 4.0), ({"snr_db": 60.0, "full_well": 5e3}, 1.0))
     ),
     ({"clip": 0.9}, G4, 0, {}, {"saturated"}, "pixels of the .* picture are", None),
     ({"clip": 0.9, "snr_db": None}, G4, 0, {"white": 0.9}, {"saturated"}, "clipped at 0.9", None),
-    (CUT_OFF, D6, 0, {}, {"saturated"}, "picture's paper lies on its lowest level, 0", 0.5),
+    (CUT_OFF, D6, 0, {}, {"saturated"}, "of the paper lies on its lowest level, 0", 0.5),
     ({"misfocus": 1.4}, G4, 0, {}, {"not in focus"}, "1.4 px, as out of focus; the dot was fitted as", 1.4),
     (TONE, G3, 0, {}, {"not linear"}, "a tone curve", None),
     ({**TONE, "bayer": True, "size": 91}, G3, 1, {}, None, "linear|tone curve", None),  # behind a soft edge
@@ -263,8 +263,12 @@ def test_a_cat_s_eye_gives_a_warning_of_asymmetry_and_round_blur_does_not(simula
 
 NOISE = np.random.default_rng(0).normal(size=(101, 101))
 REFUSED = [  # arguments of the wrong kind: test_arguments.py
-    ({"blurred": np.ones((3, 61, 61))}, "argument", r"blurred must be \[H, W\]"),
-    ({"blurred": np.full((101, 101), np.nan)}, "not finite", "b.png: 10201 pixels of blurred are NaN"),
+    (
+        {"blurred": np.ones((3, 61, 61))},
+        "argument",
+        r"blurred must be an array of real numbers \[H, W\] of one colour",
+    ),
+    ({"blurred": np.full((101, 101), np.nan)}, "not finite", "b.png: 10201 of 10201 values of blurred are NaN"),
     ({"blurred": np.zeros((81, 81))}, "argument", "same shape"),
     ({"family": "airy"}, "argument", "family must be one of auto, gaussian"),
     ({"white": -1.0}, "saturated", "100 % of the blurred dot's pixels are clipped at -1"),
@@ -275,7 +279,7 @@ REFUSED = [  # arguments of the wrong kind: test_arguments.py
     (lambda s, b: {"sharp": np.hstack([s, s]), "blurred": np.hstack([b, b])}, "several dots", "2 dots where one"),
     (lambda s, b: {"sharp": s[:, 45:], "blurred": b[:, 45:]}, "window", "touches the picture's edge"),
     # a metre read as centimetres
-    ({"magnification": 0.008, "family": "radial"}, "distance", "0.096 px here, which is too small to see; is the dist"),
+    ({"magnification": 0.008, "family": "radial"}, "distance", "0.096 px here, too small to see"),
     (lambda s, b: {"blurred": np.minimum(b, 0.5)}, "saturated", "% of the blurred dot's pixels are clipped"),
 ]
 

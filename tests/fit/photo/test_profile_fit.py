@@ -61,7 +61,7 @@ WRONG = [  # arguments of the wrong kind: test_arguments.py
     (R, np.random.default_rng(1).normal(size=60), "flat profile", "the profile is flat"),
     ([0.0, 1, 2], [1.0, 0.5, 0.1], "argument", "at least 5 different radii, got 3"),
     (-NINE, 1 - NINE, "argument", "r must be >= 0, got -1"),
-    (NINE, [np.nan] * 9, "not finite", "9 of 9 samples are NaN"),
+    (NINE, [np.nan] * 9, "not finite", "9 of 9 values of strength are NaN"),
     (NINE, -1 - NINE, "argument", "positive somewhere"),
     (np.ones(9), 1 + NINE, "argument", "different radii, got 1"),
 ]
