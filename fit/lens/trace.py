@@ -47,16 +47,14 @@ def trace_table(
 
     Nodes are keyed by the signed coc that :class:`torchdof.Camera` gives for the lens's paraxial focal length,
     ``f_number`` and ``focus_m``: render with that camera. Nodes are placed where interpolation would be worst, as many
-    as are needed for 50 dB on a natural image between them. Intervals whose spots stay within one pixel, or that are
-    narrower than 1/100 pixel, are not divided.
+    as are needed for 50 dB on a natural image between them.
 
     1. Stop the lens down and focus it: the position of the sensor.
     2. Place the nodes of coc, tracing spots in between to find the worst interpolation.
     3. Fit a profile to the spot of each node, for each wavelength.
     4. With ``field``, trace spots off the axis too.
 
-    The table is exact for its focus and f-number. For another focus at the same f-number it is accurate if the lens's
-    aberrations change little with distance; for another f-number it is not.
+    The table is exact for its focus and f-number only; :func:`torchdof.fit.check_reach` warns of others.
 
     Args:
         lens: The prescription.
@@ -75,11 +73,9 @@ def trace_table(
         sensor_width_mm: Width of the sensor.
         width_px: Width of the images for which the fit is made: details far below a pixel do not count.
         rays: Rays for each spot; None is 2,000 on the axis, traced as a fan, and 50,000 off it.
-        field: Distances in mm from the centre of the frame, increasing from 0, at which spots are traced unaveraged,
-            for a table whose kernels vary over the frame (:class:`torchdof.optics.field.Field`); to 21.6 mm for a full
-            frame of 36 x 24 mm. None traces only the axis.
-        field_nodes: Mean number of blurs on each side of focus at which these are traced; the side with the larger blur
-            gets more.
+        field: Distances in mm from the centre of the frame, increasing from 0 (to 21.6 mm for 36 x 24 mm), at which
+            spots are traced for a table whose kernels vary over the frame (:class:`torchdof.optics.field.Field`).
+        field_nodes: Mean number of blurs on each side of focus at which these are traced.
         field_rays: Rays for each of these spots.
         name: Name of the table; None uses the lens's name and the f-number.
 

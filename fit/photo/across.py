@@ -9,7 +9,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from torchdof.optics.blur_table import BlurTable
-from torchdof.optics.field import Field
+from torchdof.optics.field import Field, bracket
 from torchdof.validation import show
 
 from ..problems import FitError
@@ -66,30 +66,26 @@ def field_of_dots(tables: Sequence[BlurTable], points: Sequence[tuple[float, flo
     ring_radii = np.array([0.0, *(radii[ring].mean() for ring in rings)])
     # distances that dots reach in any picture: from the smallest picture's to the largest picture's
     all_radii = np.sort(np.concatenate([ring_radii * min(scales), ring_radii[1:] * max(scales)]))
-    radius = all_radii[np.concatenate([[True], np.diff(all_radii) > 1e-3 * all_radii[-1]])]
+    radius = torch.from_numpy(all_radii[np.diff(all_radii, prepend=-np.inf) > 1e-3 * all_radii[-1]])
     boxes, light = [], []
     for k in range(len(tables[0].coc)):
         spots = [_spot(tables, points, groups[0], k, azimuths=32), *(_spot(tables, points, ring, k) for ring in rings)]
-        nodes = ring_radii * scales[k]
-        low = np.clip(np.searchsorted(nodes, radius, side="right") - 1, 0, len(nodes) - 2)
-        weight = torch.from_numpy(np.clip((radius - nodes[low]) / (nodes[low + 1] - nodes[low]), 0.0, 1.0))
+        low, weight = bracket(torch.from_numpy(ring_radii * scales[k]), radius)
         half_sides, cells = torch.tensor([spot[0] for spot in spots]).double(), torch.stack([spot[1] for spot in spots])
         boxes.append(torch.lerp(half_sides[low], half_sides[low + 1], weight))
         light.append(torch.lerp(cells[low], cells[low + 1], weight[:, None, None, None]))
     coc, sizes, cells = tables[0].coc, torch.stack(boxes), torch.stack(light)  # [K], [K, F], [K, F, C, U, V]
     if not bool((coc < 0).any() and (coc > 0).any()):  # the other side of focus has these spots rotated by half a turn
         coc, sizes, cells = torch.cat([coc, -coc]), torch.cat([sizes, sizes]), torch.cat([cells, cells.flip(-2)])
-        rising_coc = coc.argsort()
-        coc, sizes, cells = coc[rising_coc], sizes[rising_coc], cells[rising_coc]
-    first_behind = int((coc > 0).nonzero()[0])
     # in focus, interpolate the signed size: if it is not 0, that position has its focus at another depth
-    weight = coc[first_behind - 1] / (coc[first_behind - 1] - coc[first_behind])
-    size = torch.lerp(-sizes[first_behind - 1], sizes[first_behind], weight).abs()
-    focus_cells = torch.lerp(cells[first_behind - 1], cells[first_behind], weight)
-    parts = ((coc, coc.new_zeros(1)), (sizes, size[None]), (cells, focus_cells[None]))
-    coc, sizes, cells = (torch.cat([values[:first_behind], new, values[first_behind:]]) for values, new in parts)
-    box = torch.stack([torch.zeros_like(sizes), sizes, sizes], -1)
-    return Field(coc, torch.from_numpy(radius), box, cells.permute(2, 0, 1, 3, 4))
+    near, far = torch.where(coc < 0, coc, -math.inf).argmax(), torch.where(coc > 0, coc, math.inf).argmin()
+    weight = coc[near] / (coc[near] - coc[far])
+    size, focus_cells = torch.lerp(-sizes[near], sizes[far], weight).abs(), torch.lerp(cells[near], cells[far], weight)
+    parts = ((coc, coc.new_zeros(())), (sizes, size), (cells, focus_cells))
+    coc, sizes, cells = (torch.cat([values, new[None]]) for values, new in parts)
+    rising = coc.argsort()
+    box = torch.stack([torch.zeros_like(sizes), sizes, sizes], -1)[rising]
+    return Field(coc[rising], radius, box, cells[rising].permute(2, 0, 1, 3, 4))
 
 
 def _spot(

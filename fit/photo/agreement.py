@@ -163,8 +163,7 @@ def check_reach(
         warn(text, "outside measured", number=factors["coc"])
     for name, limit in (("f_number", 1.05), ("focus_m", 1.25)):
         measured_at, used_at = table.provenance.get(name), float(getattr(camera, name))
-        is_number = isinstance(measured_at, int | float) and not isinstance(measured_at, bool)
-        if not is_number or not 0 < measured_at < math.inf or math.isinf(used_at):
+        if not isinstance(measured_at, int | float) or not 0 < measured_at < math.inf or math.isinf(used_at):
             continue
         factors[name] = used_at / measured_at
         if max(factors[name], 1 / factors[name]) > limit:

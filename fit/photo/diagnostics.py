@@ -51,8 +51,8 @@ def unexplained(solution: Solution, basis: Array) -> tuple[Array, Array, Array]:
 def asymmetry_of(solution: Solution) -> tuple[float, float]:
     """Norm of the blur's angle-dependent part, relative to its light's, and the probability that noise alone gives it.
 
-    The residual is expanded in the first eight harmonics of the angle on four rings. With noise of known covariance,
-    the whitened squared coefficients follow a chi squared distribution. The norm is without noise's contribution.
+    The residual is expanded in eight harmonics of the angle on four rings. The whitened squared coefficients of noise
+    follow a chi squared distribution; the norm is without noise's contribution.
     """
     pair = solution.pair
     (x, y), (rows, columns) = solution.centre, np.indices(pair.data.shape)

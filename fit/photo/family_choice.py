@@ -41,13 +41,10 @@ def natural_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
         >>> natural_psnr(disc, disc)
         200.0
     """
-    first, second = _square("kernel", kernel), _square("other", other)
-    width = max(_WIDTH, first.shape[-1], second.shape[-1])
-    difference = np.zeros((width, width))
-    for sign, k in ((1, first), (-1, second)):
-        offsets = np.arange(k.shape[0]) - k.shape[0] // 2
-        difference[np.ix_(offsets, offsets)] += sign * k
-    return _decibels(_CONTRAST**2 * float((_natural_power(width) * np.abs(np.fft.fft2(difference)) ** 2).sum()))
+    first, second = _of_one_size(kernel, other)
+    width = max(_WIDTH, len(first))
+    spectrum = np.abs(np.fft.fft2(first - second, (width, width)))
+    return _decibels(_CONTRAST**2 * float((_natural_power(width) * spectrum**2).sum()))
 
 
 @functools.lru_cache(maxsize=8)
@@ -75,23 +72,24 @@ def highlight_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
         >>> round(highlight_psnr(disc, ring))  # clearly different
         7
     """
-    first, second = _square("kernel", kernel), _square("other", other)
-    half = max(first.shape[0], second.shape[0]) // 2
-    scaled = [np.pad(k, half - k.shape[0] // 2) / float(second.max()) for k in (first, second)]
-    is_compared = np.maximum(*scaled) > _COMPARED_LEVEL
-    encoded = [np.clip(k[is_compared], 0, 1) ** _DISPLAY_EXPONENT for k in scaled]
-    return _decibels(float(np.mean((encoded[0] - encoded[1]) ** 2)))
+    kernels = _of_one_size(kernel, other)
+    scaled = kernels / kernels[1].max()
+    first, second = np.clip(scaled[:, scaled.max(axis=0) > _COMPARED_LEVEL], 0, 1) ** _DISPLAY_EXPONENT
+    return _decibels(float(np.mean((first - second) ** 2)))
 
 
 def _decibels(error: float) -> float:
     return 200.0 if error <= 1e-20 else float(-10 * np.log10(error))
 
 
-def _square(name: str, kernel: ArrayLike) -> Array:
-    array = a_picture(name, kernel, 1)
-    if array.shape[0] != array.shape[1] or array.shape[0] % 2 == 0:
-        raise FitError(f"{name} must be [k, k] with an odd k, got {list(array.shape)}")
-    return array
+def _of_one_size(kernel: ArrayLike, other: ArrayLike) -> Array:
+    """Two kernels `[2, k, k]`, the smaller one with a border of zeros."""
+    arrays = [a_picture("kernel", kernel, 1), a_picture("other", other, 1)]
+    for name, array in zip(("kernel", "other"), arrays, strict=True):
+        if array.shape[0] != array.shape[1] or array.shape[0] % 2 == 0:
+            raise FitError(f"{name} must be [k, k] with an odd k, got {list(array.shape)}")
+    size = max(map(len, arrays))
+    return np.stack([np.pad(array, (size - len(array)) // 2) for array in arrays])
 
 
 def looks_alike(kernel: Array, other: Array, accuracy_db: float) -> bool:

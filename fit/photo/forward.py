@@ -72,10 +72,8 @@ class Forward:
 
     def drawn(self, moves: Mapping[str, float]) -> Array:
         """The displaced and magnified source `[H, W]`."""
-        rows, columns = np.indices(self.data.shape).astype(np.float64)
-        return self.source.draw(
-            rows, columns, self.dot.x + moves["dx"], self.dot.y + moves["dy"], moves["magnification"]
-        )
+        x, y = self.dot.x + moves["dx"], self.dot.y + moves["dy"]
+        return self.source.draw(self.data.shape, x, y, moves["magnification"])
 
     def blurred(self, source: Array, kernels: Array) -> Array:
         """Convolves pictures `[H, W]` or `[n, H, W]` with kernels `[n, k, k]`: `[n, H, W]`."""
@@ -89,7 +87,7 @@ class Forward:
         pictures[..., self.used] = values
         return pictures
 
-    def kernels(self, family: str, params: Mapping[str, Array], widest: int | None = None) -> Array:
+    def kernels(self, family: str, params: Mapping[str, Any], widest: int | None = None) -> Array:
         """Kernels `[n, k, k]` for parameters `[n]`, as wide as needed, at most `widest` px or the window."""
         limit = self.half if widest is None else widest
         tensors = {k: torch.from_numpy(np.atleast_1d(v)) for k, v in params.items()}
@@ -126,9 +124,8 @@ class Forward:
         starts = [self.moves({}) | dict(one) for one in (scaled if start is None else [start])]
 
         def shaped(p: Array) -> Array:
-            params = dict(zip(names, p, strict=True))
-            kernels = self.kernels(family, {n: np.array([params[n]]) for n in shape})
-            return self.blurred(self.drawn(self.moves(params)), kernels)[0][self.used]
+            source = self.drawn(self.moves(dict(zip(names, p, strict=True))))
+            return self.blurred(source, self.kernels(family, dict(zip(shape, p, strict=False))))[0][self.used]
 
         numbers = best_of(
             lambda p: self.project(shaped(p))[0] / self.unit,
@@ -140,11 +137,10 @@ class Forward:
         )
         params = dict(zip(names, numbers.tolist(), strict=True))
         fitted, gain, background = self.project(shaped(numbers))
-        slopes = self._jacobian(family, names, numbers)
-        kernel = self.kernels(family, {n: np.array([params[n]]) for n in shape})[0]
-        covariance = self.covariance(slopes, self.values - fitted, kernel, gain)
+        slopes, moves = self._jacobian(family, names, numbers), self.moves(params)
         kernel_params: dict[str, float | Array] = {n: params[n] for n in shape}
-        moves = self.moves(params)
+        kernel = self.kernels(family, kernel_params)[0]
+        covariance = self.covariance(slopes, self.values - fitted, kernel, gain)
         return Solution(self, family, kernel_params, moves, gain, background, fitted, names, covariance, slopes)
 
     def moves(self, params: Mapping[str, float]) -> dict[str, float]:
@@ -252,8 +248,7 @@ class Solution:
     @cached_property
     def kernel(self) -> Array:
         """The kernel `[k, k]`."""
-        params = {k: np.asarray(v, dtype=np.float64)[None] for k, v in self.params.items()}
-        return np.asarray(self.pair.kernels(self.family, params)[0])
+        return self.pair.kernels(self.family, self.params)[0]
 
     @property
     def centre(self) -> tuple[float, float]:

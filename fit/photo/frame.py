@@ -108,7 +108,8 @@ def cut_pairs(
     """
     sharp_picture, blurred_picture = pictures
     if dots == "one":
-        matched = [tuple(find_dot(picture.light, file=str(picture.file)) for picture in pictures)]
+        first, second = (find_dot(picture.light, file=str(picture.file)) for picture in pictures)
+        matched = [(first, second)]
     else:
         matched = _matched(sharp_picture, blurred_picture, focus_m / distance_m)[: 1 if dots == "centre" else None]
     pairs = []
@@ -133,7 +134,8 @@ def cut_pairs(
         centre = sharp_picture.middle
         pairs.append(
             Capture(
-                *windows,
+                windows[0],
+                windows[1],
                 distance_m,
                 files=(str(sharp_picture.file), str(blurred_picture.file)),
                 white=sharp_picture.white,

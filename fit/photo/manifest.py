@@ -60,17 +60,11 @@ def read_captures(
     # shot; dots = "centre", "each" or "field" for a grid; colours = "each"; bayer = "RGGB" for a sensor's mosaic; name
     ```
 
-    1. Read the manifest and check its fields and distances.
-    2. Read the sharp picture and each blurred one, minus the dark frame.
-    3. Cut a window around each dot in both pictures.
-    4. Take missing numbers of the camera from EXIF.
-
     Args:
         folder: folder with the manifest and the pictures, or path of the manifest.
         dots: replaces the manifest's "dots".
         colours: replaces the manifest's "colours".
-        root: folder that must contain the manifest and every picture, after following links, for services that read
-            untrusted manifests. None allows any path, including `../` and absolute ones.
+        root: folder that must contain the manifest and every picture, after following links; None allows any path.
 
     Returns:
         One `Captures`; with `dots="each"` or "field" one for each dot of the grid, the most central first.
@@ -81,8 +75,7 @@ def read_captures(
         OSError: a picture is missing or damaged.
 
     Warns:
-        FitWarning: of kind "not linear" for integers whose transfer is not stated: sRGB is assumed; of kind "distance"
-        if all distances exceed 100 m, as millimetres do.
+        FitWarning: of kind "not linear" for integers without a stated transfer, "distance" if all exceed 100 m.
     """
     if not isinstance(folder, str | os.PathLike):
         raise FitError(f"folder must be the path of a folder or of its {MANIFEST}, got {show(folder)}", "manifest")
@@ -94,7 +87,7 @@ def read_captures(
         inside(path, root, manifest_name)
     fields, shots = _manifest(path)
     fields |= {name: value for name, value in (("dots", dots), ("colours", colours)) if value}
-    manifest = {name: _field(fields, name, manifest_name) for name in _FIELDS[1:]}
+    manifest = {name: _field({"dots": "one"} | fields, name, manifest_name) for name in _FIELDS[1:]}
     shots = [{name: _field(shot, name, manifest_name) for name in _SHOT_FIELDS} for shot in shots]
     focus, files = manifest["focus_m"], [shot["file"] for shot in shots]
     check_distances([shot["distance_m"] for shot in shots], focus, manifest_name)
@@ -114,7 +107,7 @@ def read_captures(
     by_colour = manifest["colours"] == "each"
     if by_colour and (count := len(sharp_picture.colours)) != 3:
         raise invalid(f"colours = 'each' needs pictures of three colours, or bayer = 'RGGB', got {count}")
-    dots, columns, encoded = manifest["dots"] or "one", [], [sharp_picture.file.name] * sharp_picture.encoded
+    columns, encoded = [], [sharp_picture.file.name] * sharp_picture.encoded
     for shot in shots:
         blurred_picture = read(shot["file"], dark)
         _check_alike(sharp_picture, blurred_picture, manifest_name)
@@ -122,7 +115,7 @@ def read_captures(
         seconds = manifest["exposure_s"]
         exposure = shot["exposure_s"] / seconds if shot["exposure_s"] and seconds else None
         pictures = (sharp_picture, blurred_picture)
-        columns.append(cut_pairs(pictures, focus, shot["distance_m"], dots, exposure, by_colour))
+        columns.append(cut_pairs(pictures, focus, shot["distance_m"], manifest["dots"], exposure, by_colour))
     if manifest["transfer"] is None and encoded:
         further = f" and {len(encoded) - 1} more" if len(encoded) > 1 else ""
         text = f"the encoding of {encoded[0]}{further} is not stated; sRGB is assumed. A camera's tone curve or "
@@ -133,7 +126,8 @@ def read_captures(
     if width < own_width:
         raise invalid(f"full_width_px must be at least {own_width}, the pictures' own width, got {width}")
     camera = {name: sharp_picture.facts.get(name) if manifest[name] is None else manifest[name] for name in CAMERA}
-    notes = {"manifest": path.name, "transfer": manifest["transfer"] or "by file type", "pictures": files, "dots": dots}
+    transfer = manifest["transfer"] or "by file type"
+    notes = {"manifest": path.name, "transfer": transfer, "pictures": files, "dots": manifest["dots"]}
     if from_exif := [name for name in CAMERA if manifest[name] is None and camera[name] is not None]:
         notes["from_exif"] = from_exif
     name = manifest["name"] or folder_path.resolve().name

@@ -58,9 +58,8 @@ def fit_pair(
     """Fits the kernel that turns a picture of a sharp dot into the picture of the same dot out of focus.
 
     The forward model explains every pixel of the window: `blurred = gain * (kernel convolved with the sharp picture,
-    moved and magnified) + background`. Exposure, stray light, displacement and magnification are fitted, so they do not
-    bias the kernel. As in rendering, the kernel is the effect of the fitted PSF on a picture made of pixels
-    (`torchdof.optics.psf`): a pixel's own blur, 1/12 px^2 of variance, is in both pictures and not in the parameters.
+    moved and magnified) + background`. All of these are fitted, so they do not bias the kernel. As in rendering, a
+    pixel's own blur, 1/12 px^2 of variance, is in both pictures and not in the parameters.
 
     1. Find both dots, exclude clipped pixels, and choose a representation of the sharp dot.
     2. Fit a free profile, or the given family; fit the magnification too if the pictures contradict the expected one.
@@ -68,28 +67,25 @@ def fit_pair(
     4. Check the residual, the levels and the focus; doubtful results give warnings.
 
     `model="ratio"` is the paper's: `blurred / sharp` along spokes inside the dot, then eq. (1). It measures the dot
-    convolved with the kernel, so its widths depend on the dot. Use it for comparison with the paper.
+    convolved with the kernel, so its widths depend on the dot.
 
     Args:
         sharp: `[H, W]`, linear light, the dot in focus on dark ground; None for a point of light (a star).
         blurred: `[H, W]`, linear light, the same dot out of focus, with the whole blur inside the window.
         family: "gaussian", "ring", "disc", "softm", "radial"; "polygon", an opening formed by blades; "image", a kernel
-            of any shape; or "auto": the cheapest that reaches `accuracy_db`, round unless the pictures contradict that.
-            An "image" does not resolve detail finer than the dot: use a dot of about a third of the blur's size.
+            of any shape, resolved to the dot's size; or "auto": the cheapest that reaches `accuracy_db`.
         model: "forward" or "ratio".
         accuracy_db: PSNR on a natural image against the free profile `radial` that "auto" requires of a family.
-        source: represents the sharp dot. "image": its picture; "dot": an ideal round dot fitted to it, without noise;
-            "auto": the ideal dot if it explains the picture within its noise, or if that is clipped.
+        source: represents the sharp dot. "image": its picture; "dot": an ideal round dot; "auto": the ideal
+            dot if it explains the picture within its noise, or if that is clipped.
         magnification: expected size of the dot in the blurred picture over its size in the sharp one.
-        fit_magnification: True fits it, False keeps the expected one, None fits it only if the pictures contradict the
-            expected one by more than 3.5 standard errors. If it is not fitted, the standard errors treat it as known.
+        fit_magnification: True fits it, False keeps the expected one, None fits it if the pictures contradict the
+            expected one by more than 3.5 standard errors.
         white: level from which pixels are clipped; None searches for a plateau.
         knots: number of values of a "radial" profile; None uses two for each pixel.
         reach: end of a "radial" profile, px; None uses a fitted soft disc.
-        aperture: the lens's opening as seen in `blurred`, if it is known (from another distance), for the family
-            "image"; then only its size is fitted.
-        softness: sigma of the sharp dot's edge in focus, px, if it is known to be less than in `sharp`, as for a colour
-            that is not in focus. An ideal dot then represents the sharp one.
+        aperture: the lens's opening as seen in `blurred`, if known, for the family "image"; only its size is fitted.
+        softness: sigma of the sharp dot's edge in focus, px, if it is known to be less than in `sharp`.
         files: names of the two pictures, for messages.
 
     Returns:

@@ -62,15 +62,13 @@ def read_photographs(
 
     1. Read each photograph and find the target in it; leave out photographs without one.
     2. Find the tone curve, undo it, and measure the targets again.
-    3. Take the sharpest photograph as the one in focus; compute each distance from the size of the square.
-    4. Pair the sharpest photograph with each one out of focus.
+    3. Compute each distance from the size of the square; pair the sharpest photograph with each one out of focus.
 
     Args:
         folder: folder with the photographs; other files are ignored.
         square_mm: side of the black square as printed, mm.
         colours: "mean", or "each" for a kernel for each colour in the table.
-        root: folder that must contain every photograph, after following links, for services that read untrusted
-            folders. None follows any link.
+        root: folder that must contain every photograph, after following links; None follows any link.
 
     Raises:
         FitError: fewer than two photographs show the target, EXIF does not describe the lens, a photograph lies outside
@@ -124,10 +122,7 @@ def read_photographs(
     if integers and len(pictures) >= _MIN_FOR_TONE:
         tone = tone_curve([(p.light, p.target) for p in pictures], square_mm)
     elif integers:
-        text = (
-            f"{len(pictures)} photographs are too few to find a tone curve, which makes a kernel up to 15 % too small: "
-        )
-        text += f"take {_MIN_FOR_TONE} or more"
+        text = f"{len(pictures)} photographs are too few to find a tone curve, which makes kernels up to 15 % too small"
         warn(text, "not linear", file=folder_name, number=float(len(pictures)))
     bend = (0.0, 0.0, 0.0) if tone is None else tone.bend
     if any(bend):

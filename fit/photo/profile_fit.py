@@ -36,18 +36,11 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
 
     Radii may have any unit (the paper's are metres on the paper); lengths among the parameters are returned in it.
 
-    1. Normalise radii and strengths, and estimate the noise from second differences.
-    2. Test whether the samples vary over r at all (F test of a parabola against a constant).
-    3. Fit by least squares from several starts.
-    4. Compute the covariance; with groups, by a sandwich estimator.
-    5. Warn about lengths that the samples do not determine, or that ended on a bound.
-
     Args:
         r: distance from the dot's centre `[n]`, >= 0.
         strength: blur strength `[n]`, in any positive unit.
         family: "gaussian", "ring" (the paper's) or "softm".
-        groups: group of each sample `[n]`, integers (its spoke); samples of a group have common errors, which the
-            standard errors then include. None treats every sample as independent.
+        groups: group of each sample `[n]`, integers (its spoke), whose common errors the standard errors then include.
 
     Returns:
         A `BlurFit` with the family's parameters and "N".
@@ -57,8 +50,7 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
         strength does not vary beyond its noise.
 
     Warns:
-        FitWarning: of kind "flat profile" for a parameter that the samples do not determine, of kind "boundary" for one
-        that ended on its bound.
+        FitWarning: a parameter is not determined ("flat profile") or ended on its bound ("boundary").
 
     Reference:
         Sato, Dobashi, Yamamoto, eq. (1): N -> "N", r_c -> "r_c", sigma -> "sigma" (the paper prints sigma^2).
@@ -153,9 +145,8 @@ def evaluate(family: str, r: Array, params: dict[str, float | Array]) -> Array:
 def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, Indices]:
     """`I_b(r, theta) / I(r, theta)` from the dot's centre to its edge, at every pixel of r and every 10 degrees.
 
-    As in the paper, both pictures are read from the centre of the sharp dot; a displacement of the defocused dot is not
-    corrected. The result is the dot convolved with the kernel, up to the dot's edge: use it for comparison with the
-    paper, and the forward model for rendering.
+    As in the paper, both pictures are read from the centre of the sharp dot. The result is the dot convolved with the
+    kernel: use it for comparison with the paper, and the forward model for rendering.
 
     Args:
         sharp: `[H, W]`, linear light, the dot in focus.

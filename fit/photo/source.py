@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import convolve1d, map_coordinates, spline_filter
+from scipy.ndimage import affine_transform, convolve1d, spline_filter
 from scipy.special import erfc
 
 from ..result import Array
@@ -21,8 +21,8 @@ _FOCUSED_PX = 0.5  # typical for cameras: between a perfect lens and a demosaice
 _SAMPLES_PER_PX = 6  # samples across a pixel near the edge
 
 
-Draw = Callable[[Array, Array, float, float, float], Array]
-"""Computes each pixel's level from rows, columns, the centre (x, y) and the magnification of a dot."""
+Draw = Callable[[tuple[int, ...], float, float, float], Array]
+"""Draws a picture from its shape, and the centre (x, y) and the magnification of a dot."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +59,9 @@ def point_source(shape: tuple[int, ...], dot: Dot) -> Source:
 def _drawn_by_splines(picture: Array, x: float, y: float) -> Draw:
     spline = spline_filter(picture, order=3)
 
-    def draw(rows: Array, columns: Array, centre_x: float, centre_y: float, magnification: float) -> Array:
-        coordinates = [(rows - centre_y) / magnification + y, (columns - centre_x) / magnification + x]
-        return np.asarray(map_coordinates(spline, coordinates, order=3, prefilter=False), dtype=np.float64)
+    def draw(shape: tuple[int, ...], centre_x: float, centre_y: float, magnification: float) -> Array:
+        offset = (y - centre_y / magnification, x - centre_x / magnification)
+        return np.asarray(affine_transform(spline, [1 / magnification] * 2, offset, shape, order=3, prefilter=False))
 
     return draw
 
@@ -71,7 +71,8 @@ def ideal_dot(edge: Edge) -> Source:
     edge = edge.with_softness(_FOCUSED_PX) if edge.softness > UNFOCUSED_PX else edge
     radius, softness = edge.radius, edge.softness
 
-    def draw(rows: Array, columns: Array, x: float, y: float, magnification: float) -> Array:
+    def draw(shape: tuple[int, ...], x: float, y: float, magnification: float) -> Array:
+        rows, columns = np.indices(shape)
         square = magnification**2 * (radius**2 + softness**2) - softness**2  # from the light of a soft disc
         return edge.level * _coverage(rows, columns, x, y, np.sqrt(max(square, 0.0)), softness)
 

@@ -82,9 +82,8 @@ def fit_captures(
 ) -> TableFit:
     """Fits every distance, and makes one table of the fits.
 
-    Nodes are keyed by the thin lens's signed circle of confusion at their distance. If focal length, f-number and
-    sensor width are known it is the camera's. Otherwise its scale is measured: the radius of the uniform disc with the
-    same second moment as the fitted kernels, by least squares over all distances.
+    Nodes are keyed by the thin lens's signed circle of confusion at their distance, of the camera if it is known.
+    Otherwise its scale is measured: the radius of the uniform disc with the second moment of the fitted kernels.
 
     1. With a free choice of family, or an opening, fit each pair alone: this determines one family for all.
     2. Fit all pairs with this family, or with this opening in different sizes.
@@ -93,22 +92,19 @@ def fit_captures(
 
     Args:
         captures: pairs at increasing distances.
-        family: "auto" uses the cheapest family that is accurate enough at every distance; or a family of `fit_pair`. If
-            the blur is not round at one distance it is not round at any: "polygon" and "image" use one opening for all
-            distances, rotated by half a turn in front of the focus, and fit its size at each.
+        family: "auto" uses the cheapest family that is accurate enough at every distance; or a family of `fit_pair`.
+            "polygon" and "image" use one opening, rotated by half a turn in front of the focus, in different sizes.
         accuracy_db: accuracy for "auto", see `fit_pair`.
         progress: called with (number done, total, text) after each fit.
         command: recorded in the table's provenance.
-        scale_of: the fit of another dot in the same photographs, whose scale is used if the camera is unknown. With a
-            scale of its own for each dot, the centre and the corner of a frame would get the same table.
+        scale_of: the fit of another dot in the same photographs, whose scale is used if the camera is unknown.
 
     Returns:
         The table and its fits.
 
     Raises:
         FitError: a pair cannot be fitted (the message names its file), or, of kind "camera", the fitted blur is far
-        from the camera's numbers. It warns if that differs less, if a fitted gain contradicts the stated exposures, of
-        a single distance, and of the problems listed at `fit_pair`.
+        from the camera's numbers. Doubtful results give a `FitWarning`.
     """
     if not isinstance(captures, Captures):
         raise FitError(f"captures must be a Captures(pairs, focus_m=..., width_px=...), got {show(captures)}")

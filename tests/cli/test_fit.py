@@ -24,9 +24,8 @@ def kernel(distance: float) -> tuple[str, dict[str, float]]:
 def folder(simulator: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
     camera = simulator.Simulator(level=0.7, snr_db=46, dot_radius=9.0, black=0.02)
     fields = 'focal_length_mm = 50.0\nf_number = 1.543\nsensor_width_mm = 36.0\nname = "my lens"'
-    return simulator.write_captures(
-        tmp_path_factory.mktemp("lens"), camera, 0.5, [0.4, 0.8, 1.0], kernel, camera_fields=fields
-    )
+    written = tmp_path_factory.mktemp("lens")
+    return simulator.write_captures(written, camera, 0.5, [0.4, 0.8, 1.0], kernel, camera_fields=fields)
 
 
 def test_a_folder_becomes_a_table_with_pictures(run: Run, folder: Path, tmp_path: Path) -> None:
@@ -66,11 +65,8 @@ def test_a_warning_about_a_grid_of_dots_is_printed_once(run: Run, simulator: Mod
 
 def test_a_polygon_becomes_a_table_with_its_blades(run: Run, simulator: ModuleType, tmp_path: Path) -> None:
     camera = simulator.Simulator(level=0.7, snr_db=46, dot_radius=7.0, black=0.02)
-
-    def hexagon(distance: float) -> tuple[str, dict[str, float]]:
-        return "hexagon", {"radius": 10.0 * abs(1 / 0.5 - 1 / distance)}
-
-    folder = simulator.write_captures(tmp_path / "lens", camera, 0.5, [0.8], hexagon, width=110, height=90)
+    hexagon = "hexagon", {"radius": 7.5}
+    folder = simulator.write_captures(tmp_path / "lens", camera, 0.5, [0.8], lambda d: hexagon, width=110, height=90)
     out = tmp_path / "mine.json"
     output = run("fit", folder, "-o", out, "--family", "polygon", "--plots", tmp_path)
     table = BlurTable.load(out)

@@ -9,10 +9,12 @@ from __future__ import annotations
 import inspect
 import io
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+import OpenImageIO as oiio
 import torch
+from PIL import Image
 from scipy.signal import fftconvolve
 
 from torchdof.fit import FitError, FitWarning
@@ -28,50 +30,37 @@ def draw_dot(size: int, radius: float, centre: tuple[float, float] = (0.0, 0.0),
     return inside.reshape(size, oversample, size, oversample).mean((1, 3))
 
 
-def shape(kind: str, radius: float, size: int = 41, fine: int = 8, turn_deg: float = 11.0) -> np.ndarray:
-    """Kernel `[size, size]` of a blur that no round family can fit; it sums to 1 and is not centred on its mass.
+def shape(kind: str, radius: float) -> np.ndarray:
+    """Kernel `[41, 41]` of a blur that no round family can fit; it sums to 1 and is not centred on its mass.
 
-    | kind | kernel, with y down |
-    | --- | --- |
-    | "hexagon" | inscribed in a circle of `radius` px, a corner `turn_deg` clockwise from the right |
-    | "cat's eye" | the intersection of two discs, 0.7 radii apart |
-    | "coma" | a disc whose rays are displaced by the square of their height in the pupil |
-    | "mirror" | a disc with a central hole of 0.45 radii |
+    "hexagon" has a corner 11 degrees clockwise from the right, "cat's eye" is the intersection of two discs, "coma" a
+    disc whose rays are displaced by the square of their height in the pupil, "mirror" a disc with a central hole.
     """
+    size, fine = 41, 8
     axis = (np.arange(size * fine) + 0.5) / fine - size / 2
     x, y = np.meshgrid(axis, axis)
     r = np.hypot(x, y) / radius
     if kind == "hexagon":
-        wedge = np.pi / 3
-        from_corner = (np.arctan2(y, x) - np.deg2rad(turn_deg)) % wedge
-        light = r * np.cos(from_corner - wedge / 2) < np.cos(wedge / 2)
+        from_corner = (np.arctan2(y, x) - np.deg2rad(11.0)) % (np.pi / 3)
+        light = r * np.cos(from_corner - np.pi / 6) < np.cos(np.pi / 6)
     elif kind == "coma":
-        rays = r < 1
-        a, b, far = x[rays], y[rays], 0.15 / radius
-        there = a + far * (3 * a**2 + b**2), b + far * 2 * a * b
+        a, b, far = x[r < 1], y[r < 1], 0.15 / radius
         edges = np.arange(size * fine + 1) / fine - size / 2
-        light = np.histogram2d(there[1], there[0], bins=(edges, edges))[0]
+        light = np.histogram2d(b + far * 2 * a * b, a + far * (3 * a**2 + b**2), bins=(edges, edges))[0]
     else:
-        cut = {"cat's eye": np.hypot(x - 0.7 * radius, y) < radius, "mirror": r > 0.45}[kind]
-        light = (r < 1) & cut
+        light = (r < 1) & (np.hypot(x - 0.7 * radius, y) < radius if kind == "cat's eye" else r > 0.45)
     kernel = np.asarray(light, dtype=np.float64).reshape(size, fine, size, fine).mean((1, 3))
     return kernel / kernel.sum()
 
 
-def through(kernel: np.ndarray, camera: Simulator, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Sharp and defocused picture of a dot, the blur a kernel `[k, k]`."""
-    rng = np.random.default_rng(seed)
-    still = camera.level * draw_dot(camera.size, camera.dot_radius)
-    moved = camera.level * draw_dot(camera.size, camera.dot_radius * camera.magnification, camera.shift)
-    return camera.record(still, rng), camera.record(fftconvolve(moved, kernel, mode="same"), rng)
-
-
-def blur(picture: np.ndarray, family: str, params: dict) -> np.ndarray:
-    """The picture convolved with a kernel of `torchdof.optics.psf`, or with the `shape` "hexagon"."""
-    if family == "hexagon":
-        return fftconvolve(picture, shape(family, **params), mode="same")
-    kernel = pixel_kernels(family, {k: torch.as_tensor(v, dtype=torch.float64) for k, v in params.items()}).numpy()
-    return fftconvolve(picture, kernel, mode="same")
+def blur(picture: np.ndarray, family: str | np.ndarray, params: dict) -> np.ndarray:
+    """The picture convolved with a kernel `[k, k]`, with that of a family, or with the `shape` "hexagon"."""
+    if isinstance(family, str) and family == "hexagon":
+        family = shape(family, **params)
+    if isinstance(family, str):
+        tensors = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in params.items()}
+        family = pixel_kernels(family, tensors).numpy()
+    return fftconvolve(picture, family, mode="same")
 
 
 @dataclass
@@ -98,7 +87,7 @@ class Simulator:
     tone: float = 0.0  # strength from 0 to 1 of an S-curve over the encoded levels, which is not undone
     bayer: bool = False  # sample with an RGGB mosaic, demosaic bilinearly, take the mean of the colours
 
-    def pair(self, family: str, params: dict, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    def pair(self, family: str | np.ndarray, params: dict, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Sharp and defocused picture `[size, size]` of one dot."""
         rng = np.random.default_rng(seed)
         there = self.place[0] + self.shift[0], self.place[1] + self.shift[1]
@@ -127,7 +116,11 @@ class Simulator:
             encoded = encode_srgb(picture)
             picture = decode_srgb((1 - self.tone) * encoded + self.tone * encoded**2 * (3 - 2 * encoded))
         if self.jpeg is not None:
-            return decode_srgb(_through_jpeg(encode_srgb(picture), self.jpeg))
+            stored = io.BytesIO()
+            Image.fromarray(np.round(255 * encode_srgb(picture)).astype(np.uint8)).save(
+                stored, "jpeg", quality=self.jpeg
+            )
+            return decode_srgb(np.asarray(Image.open(stored), dtype=np.float64) / 255)
         if self.srgb:
             picture = encode_srgb(picture)
         if self.bits is not None:
@@ -147,14 +140,6 @@ def decode_srgb(encoded: np.ndarray) -> np.ndarray:
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
-def _through_jpeg(picture: np.ndarray, quality: int) -> np.ndarray:
-    from PIL import Image
-
-    stored = io.BytesIO()
-    Image.fromarray(np.round(255 * picture).astype(np.uint8)).save(stored, "jpeg", quality=quality)
-    return np.asarray(Image.open(stored), dtype=np.float64) / 255
-
-
 def result_and_warnings(call) -> tuple:
     """The result of a call, or its `FitError`, and a list of its `FitWarning`s; other warnings are errors."""
     with warnings.catch_warnings(record=True) as caught:
@@ -167,34 +152,22 @@ def result_and_warnings(call) -> tuple:
     return result, [w.message for w in caught]
 
 
-def write_captures(
-    folder, camera, focus_m, distances, kernel, width=400, height=240, camera_fields="", grid=(), **harm
-):
-    """Writes a folder of 16-bit sRGB PNGs with their capture.toml, and returns it.
+def write_captures(folder, camera, focus_m, distances, kernel, width=400, height=240, camera_fields="", grid=()):
+    """Writes a folder of 16-bit sRGB PNGs of a dot, or of a `grid` of positions (x, y), with capture.toml; returns it.
 
-    Args:
-        camera: A `Simulator`; its `size` is not used.
-        kernel: ``kernel(distance)`` gives (family, params) of the blur; ``kernel(distance, x, y)`` also depends on the
-            dot's position in the sharp picture.
-        grid: Positions (x, y) of the dots in px from the frame's centre; by default one dot in the centre.
-        harm: Changes of `camera`.
+    ``kernel(distance)`` gives (family, params) of the blur; ``kernel(distance, x, y)`` that of a dot at (x, y).
     """
     folder.mkdir(parents=True, exist_ok=True)
-    places, across = grid or [(0.0, 0.0)], len(inspect.signature(kernel).parameters) == 3
-    shots = []
+    shots, arguments = [], len(inspect.signature(kernel).parameters)
     for i, distance in enumerate([focus_m, *distances]):
         m = focus_m / distance
         light = np.zeros((height, width))
-        for x, y in places:
+        for x, y in grid or [(0.0, 0.0)]:
             square = draw_dot(max(width, height) + 1, camera.dot_radius * m, (x * m, y * m), oversample=8)
             top, left = (square.shape[0] - height) // 2, (square.shape[1] - width) // 2
             dot = square[top : top + height, left : left + width]
-            if distance != focus_m and across:
-                dot = blur(dot, *kernel(distance, x, y))
-            light += dot
-        if distance != focus_m and not across:
-            light = blur(light, *kernel(distance))
-        picture = replace(camera, **harm).record(camera.level * light, np.random.default_rng(100 + i))
+            light += dot if distance == focus_m else blur(dot, *kernel(*(distance, x, y)[:arguments]))
+        picture = camera.record(camera.level * light, np.random.default_rng(100 + i))
         name = f"{round(distance * 1000):04d}mm.png"
         pixels = torch.from_numpy(np.repeat(picture[None, None], 3, 1)).float()
         write_image(folder / name, Picture(pixels), transfer="srgb", sample="16")
@@ -204,18 +177,15 @@ def write_captures(
     return folder
 
 
-def write_photographs(folder, focus_m, distances, width=800, tone=0.5, noise=0.01, kernel="disc", jpeg=90, exif=True):
-    """Writes JPEGs of the printed target on a grey desk, focused at `focus_m`; returns {distance: blur radius in px}.
+def write_photographs(folder, focus_m, distances, width=800, tone=0.5, noise=0.01, jpeg=90, exif=True):
+    """Writes JPEGs of the printed target on a grey desk, focused at `focus_m`.
 
     The phone has a lens of 26 mm equivalent focal length at f/1.8; `tone` is the strength of its S-curve.
     """
-    import OpenImageIO as oiio
-
     folder.mkdir(parents=True, exist_ok=True)
     focal_mm, f_number = 5.4, 1.8
     image_px = focal_mm / (36 * focal_mm / 26) * width / (1 - focal_mm / 1000 / focus_m)
     height, fine = width * 3 // 4, 3
-    radius = {}
     for i, distance in enumerate([focus_m, *distances]):
         scale = image_px / distance / 1000  # px a mm
         turn, (x0, y0) = np.deg2rad(1.5), place_of_target(i, width)
@@ -228,10 +198,9 @@ def write_photographs(folder, focus_m, distances, width=800, tone=0.5, noise=0.0
         light += inside * (0.035 - light)
         light += np.clip((2.5 - np.hypot(x, y)) * scale * fine + 0.5, 0, 1) * (0.8 - light)
         light = light.reshape(height, fine, width, fine).mean((1, 3)) * (1 + 0.1 * np.linspace(-1, 1, width))
-        radius[distance] = focal_mm / 2000 / f_number * image_px * abs(1 / focus_m - 1 / distance)
-        if radius[distance]:
-            wide = np.pad(light, 40, mode="edge")
-            light = blur(wide, kernel, {"radius": radius[distance]})[40:-40, 40:-40]
+        radius = focal_mm / 2000 / f_number * image_px * abs(1 / focus_m - 1 / distance)
+        if radius:
+            light = blur(np.pad(light, 40, mode="edge"), "disc", {"radius": radius})[40:-40, 40:-40]
         camera = Simulator(snr_db=-20 * np.log10(noise), bayer=True, tone=tone)
         pixels = np.round(255 * encode_srgb(camera.record(light, np.random.default_rng(i)))).astype(np.uint8)
         spec = oiio.ImageSpec(width, height, 3, "uint8")
@@ -244,14 +213,9 @@ def write_photographs(folder, focus_m, distances, width=800, tone=0.5, noise=0.0
         out.open(str(folder / f"img_{i:04d}.jpg"), spec)
         out.write_image(np.ascontiguousarray(np.repeat(pixels[..., None], 3, 2)))
         out.close()
-    return radius
 
 
 def place_of_target(i: int, width: int) -> tuple[float, float]:
-    """Position (x, y) of the target's centre in photograph `i` of `write_photographs`, px from the frame's centre.
-
-    It differs between photographs, as with a hand-held phone: at one position among the pixels of the Bayer pattern
-    all photographs would have the same error.
-    """
+    """Position (x, y) in px of the target's centre in photograph `i` from the frame's, as with a hand-held phone."""
     x, y = np.random.default_rng(900 + i).uniform(-3, 3, 2)
     return 0.02 * width + x, -0.015 * width + y

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from tests.lenses import turned
-from torchdof.fit.lens.glass import C_UM, D_UM, F_UM, G_UM, Glass, catalogue
+from torchdof.fit.lens.glass import C_UM, D_UM, F_UM, G_UM, catalogue
 from torchdof.fit.lens.lens import Lens
-from torchdof.fit.lens.surface import Surface
 
 FACTS = {
     "double_gauss_50mm": (50.3582, 36.1059),
@@ -122,11 +121,8 @@ def test_lines_are_read_back_as_the_same_lens(text, lens_of):
         ("50 5 1.5/1e-9 20\n", r"line 1: the Abbe number must be at least 1"),
         ("50 5 1.5/60/1.5 20\n", r"line 1: .*P_gF between 0 and 1, got 1.5/60/1.5"),
         ("50 5 0.9 20\n", r"line 1: glass 0.9 has no refractive index from 1 to 5"),
-        ("50 5 nan 20\n", r"line 1: glass nan must have"),
-        ("50 5 inf/60 20\n", r"line 1: no glass 'inf/60'"),
         ("50 -5 1.5 20\n", r"line 1: thickness must be a number from 0 to"),
         ("# comment\n50 5 1.5 0\n", r"line 2: diameter must be a number from 0.001 to"),
-        ("50 5 1.5 1e-300\n", r"line 1: diameter must be"),
         ("nan 5 1.5 20\n", r"line 1: radius must be a number"),
         ("1e-300 5 1.5 20\n", r"line 1: radius must be inf, or 0.001 to 1e\+07 mm long"),
         ("0 1 0 18\n0 1 0 18\n", r"line 2: radius: a second stop"),
@@ -153,7 +149,3 @@ def test_impossible_lenses_are_refused_by_name(lens_of):
         Lens.read("triplet")
     with pytest.raises(ValueError, match="does not converge light"):
         lens_of("-50 5 1.5 20\n0 1 0 18\n50 0 1 20\n").paraxial()
-    with pytest.raises(ValueError, match="surfaces must be a tuple of Surface"):
-        Lens((Glass.named("F2"),), 0)
-    with pytest.raises(ValueError, match="glass must be a Glass"):
-        Surface(50.0, 1.0, "F2", 10.0)

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from tests import loops
-from tests.kernels import kernel_of
 from torchdof import BlurTable, Camera
 from torchdof.fit import natural_psnr, trace_table
 from torchdof.fit.lens.lens import RGB_UM, Lens
@@ -113,13 +112,6 @@ def test_the_number_of_nodes_is_chosen_for_50_db(lens_of):
 def small(lens: Lens, **changes: Any) -> BlurTable:
     given = {"f_number": 8.0, "focus_m": 2.0, "nodes": 5, "points": 17, "rays": 300}
     return trace_table(lens, **{**given, **changes})
-
-
-def test_a_stopped_down_lens_gives_discs_of_the_thin_lens():
-    table = small(read("double_gauss_50mm"), f_number=32.0, focus="paraxial")
-    far = kernel_of("disc", float(table.coc[-1]) / PIXEL)
-    made = table.kernels(table.coc[-1:] / PIXEL, WIDTH)[0, 0]
-    assert natural_psnr(made.numpy(), far.numpy()) > 55.0
 
 
 def test_nodes_reach_from_the_nearest_distance_to_infinity():

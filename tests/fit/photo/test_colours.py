@@ -19,9 +19,8 @@ def frames(simulator, distance, seed, size=61):
     for focus, (x, y) in zip(FOCUS, SIDE, strict=True):
         dot = simulator.draw_dot(size, 7.0 * m, (x * m, y * m))
         radius = abs(PER_DIOPTRE * (1 - 1 / distance + focus))
-        seen.append(
-            (simulator.blur(dot, "disc", {"radius": radius}) if radius else dot) + rng.normal(0, 0.005, dot.shape)
-        )
+        blurred = simulator.blur(dot, "disc", {"radius": radius}) if radius else dot
+        seen.append(blurred + rng.normal(0, 0.005, dot.shape))
     return np.stack(seen)
 
 

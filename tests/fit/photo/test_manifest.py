@@ -75,11 +75,10 @@ def test_encoded_pictures_without_a_stated_transfer_give_a_warning(folder):
 
 
 def test_distances_in_millimetres_give_a_warning(folder):
-    for metres, millimetres in (("focus_m = 0.5", "500"), ("distance_m = 0.4", "400"), ("distance_m = 1.0", "1000")):
-        change(folder, metres, f"{metres.split()[0]} = {millimetres}")
+    for name, metres in (("focus_m", 0.5), ("distance_m", 0.4), ("distance_m", 1.0)):
+        change(folder, f"{name} = {metres}", f"{name} = {1000 * metres:g}")
     with pytest.warns(FitWarning, match="all distances are at least 400 m; they are in metres: divide millimetres"):
-        (captures,) = read_captures(folder)
-    assert [pair.distance_m for pair in captures] == [400, 1000]
+        assert [pair.distance_m for pair in read_captures(folder)[0]] == [400, 1000]
 
 
 def test_a_grid_gives_the_dot_in_the_centre_or_every_dot(simulator, tmp_path):
@@ -97,19 +96,19 @@ def test_a_grid_gives_the_dot_in_the_centre_or_every_dot(simulator, tmp_path):
     assert sorted(round(c.pairs[0].position_px[0] / 110) for c in every) == [-1] * 3 + [0] * 3 + [1] * 3
 
 
+CROWDED = [(x, y) for x in (-40, 0, 40) for y in (-40, 0, 40)]
+
+
 @pytest.mark.parametrize(
-    ("sigma", "grid", "size", "dots", "kind", "match"),
+    ("grid", "dots", "kind", "match"),
     [
-        (6.0, [(x, y) for x in (-40, 0, 40) for y in (-40, 0, 40)], (300, 240), "centre", "several dots", "apart than"),
-        (9.0, [(165, 0)], (400, 240), None, "window", "0600mm.png: the frame cuts the blur"),
+        (CROWDED, "centre", "several dots", "apart than"),
+        ([(165, 0)], None, "window", "0600mm.png: the frame cuts the blur"),
     ],
 )
-def test_dots_without_room_for_their_blur_are_refused(simulator, tmp_path, sigma, grid, size, dots, kind, match):
+def test_dots_without_room_for_their_blur_are_refused(simulator, tmp_path, grid, dots, kind, match):
     camera = simulator.Simulator(level=0.7, snr_db=50, dot_radius=8.0)
-    width, height = size
-    folder = simulator.write_captures(
-        tmp_path, camera, 0.5, [0.6], lambda d: ("gaussian", {"sigma": sigma}), grid=grid, width=width, height=height
-    )
+    folder = simulator.write_captures(tmp_path, camera, 0.5, [0.6], lambda d: ("gaussian", {"sigma": 9.0}), grid=grid)
     with pytest.raises(FitError, match=match) as caught:
         read_captures(folder, dots=dots)
     assert caught.value.kind == kind
@@ -121,13 +120,10 @@ WRONG = [
     (SHOT, "distance_m = 0.5", "distance", r"lies at the focus \(0.5 m\)"),
     (SHOT, "distance_m = -1", "manifest", "distance_m must be a number > 1e-05 and < 1e.06, got -1"),
     (SHOT, 'distance_m = "near"', "manifest", "must be a number > .*, got 'near'"),
-    *((FOCUS, f"focus_m = {v}", "manifest", "focus_m must be a number > ") for v in ("nan", "1e-300", "1e30")),
+    (FOCUS, "focus_m = nan", "manifest", "focus_m must be a number > "),
     (FOCUS, "focus_m = ", "manifest", "is not TOML"),
-    *(
-        (FOCUS, f"{FOCUS}\n{name} = {value}", "manifest", f"{name} must be a number > ")
-        for name, value in [("focal_length_mm", "1e300"), ("f_number", "1e-30"), ("sensor_width_mm", "5e-324"),
-                            ("exposure_s", "1e99")]
-    ),
+    (FOCUS, f"{FOCUS}\nf_number = 1e-30", "manifest", "f_number must be a number > "),
+    (FOCUS, f"{FOCUS}\nexposure_s = 1e99", "manifest", "exposure_s must be a number > "),
     (FOCUS, f"{FOCUS}\nfocal = 50", "manifest", "'focal' is not a field; known are shot, crop, focus_m"),
     ('transfer = "srgb"', 'transfer = "gamma"', "manifest", "transfer must be one of linear, srgb, got 'gamma'"),
     (FOCUS, f'{FOCUS}\ndots = "two"', "manifest", "dots must be one of one, centre, each, field, got 'two'"),
@@ -179,15 +175,15 @@ def test_missing_files_are_named(folder, tmp_path):
         read_captures(tmp_path)
 
 
-def test_captures_from_arrays_are_checked():
-    pair = Capture(np.zeros((31, 31)), np.zeros((31, 31)), 1.0)
-    for pairs, more, match in (
-        ((), {}, "no pair"),
-        ((pair, pair), {}, "increasing"),
-        ((pair,), {"f_number": -2}, "-2"),
-    ):
-        with pytest.raises(FitError, match=match):
-            Captures(pairs, focus_m=0.5, width_px=100, **more)
+PAIR = Capture(np.zeros((31, 31)), np.zeros((31, 31)), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "f_number", "match"), [((), 2, "no pair"), ((PAIR,) * 2, 2, "increasing"), ((PAIR,), -2, "-2")]
+)
+def test_captures_from_arrays_are_checked(pairs, f_number, match):
+    with pytest.raises(FitError, match=match):
+        Captures(pairs, focus_m=0.5, width_px=100, f_number=f_number)
 
 
 def test_a_mosaic_with_an_orientation_tag_is_refused(tmp_path: Path) -> None:

@@ -78,9 +78,7 @@ def test_sigma_is_that_of_the_light_without_the_width_of_a_pixel(sigma, most):
 @pytest.mark.filterwarnings("ignore::torchdof.fit.problems.FitWarning")  # without noise every misfit is significant
 def test_the_radius_is_that_of_the_light_rather_than_of_the_non_negative_kernel(simulator):
     pair = simulator.Simulator(size=41, dot_radius=8.0, snr_db=60).pair("disc", {"radius": 0.9})
-    assert fit_pair(*pair, "disc", fit_magnification=False).radius == pytest.approx(
-        0.9, rel=0.01
-    )  # of the kernel: 1.07
+    assert fit_pair(*pair, "disc", **HELD).radius == pytest.approx(0.9, rel=0.01)  # of the kernel: 1.07
 
 
 @pytest.mark.parametrize(
@@ -92,14 +90,9 @@ def test_the_radius_is_that_of_the_light_rather_than_of_the_non_negative_kernel(
         ({"size": 55}, "ring", RING, HELD, 8, (0.5, 1.5)),
         # demosaiced: 2.0 to 2.3 times too small where pixels count as independent
         ({"size": 61, "bayer": True}, "disc", {"radius": 5.0}, HELD, 10, (0.7, 1.4)),
-        *(
-            (harsh, "gaussian", {"sigma": s}, {}, 6, (0.5, 1.5))
-            for harsh, s in [
-                ({"size": 61, "snr_db": 10.0}, 2.0),
-                ({"size": 21, "dot_radius": 3.0}, 1.0),
-                ({"size": 61, "clip": 0.9, "snr_db": 30.0}, 2.0),
-            ]
-        ),
+        ({"size": 61, "snr_db": 10.0}, "gaussian", {"sigma": 2.0}, {}, 6, (0.5, 1.5)),
+        ({"size": 21, "dot_radius": 3.0}, "gaussian", {"sigma": 1.0}, {}, 6, (0.5, 1.5)),
+        ({"size": 61, "clip": 0.9, "snr_db": 30.0}, "gaussian", {"sigma": 2.0}, {}, 6, (0.5, 1.5)),
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*clipped:torchdof.fit.problems.FitWarning")
@@ -110,21 +103,6 @@ def test_standard_errors_hold_in_repeated_captures(simulator, camera, family, tr
         pulls = np.array([(fit.params[name] - value) / fit.stderr[name] for fit in fits])
         assert spread[0] < pulls.std() < spread[1] and abs(pulls.mean()) < 0.6 and np.abs(pulls).max() < 3.5
     assert 0.8 < np.mean([fit.residual_over_noise for fit in fits]) < 1.2
-
-
-@pytest.mark.filterwarnings("ignore::torchdof.fit.problems.FitWarning")
-def test_noise_of_the_sharp_picture_alone_counts_in_the_error_and_explains_the_residual(simulator):
-    sharp, blurred = simulator.Simulator(size=31, dot_radius=6.0, snr_db=None).pair("gaussian", {"sigma": 2.0})
-    noise = np.random.default_rng(0).normal(size=(2, 31, 31))
-    fit = fit_pair(sharp + 0.02 * noise[0], blurred + 1e-3 * noise[1], "gaussian", source="image", **HELD)
-    assert fit.stderr["sigma"] > 0.006  # sigma of ten draws has a spread of 0.017; 0.003 without that noise
-    assert fit.residual_over_noise < 1  # 1.7 without it
-
-
-@pytest.mark.parametrize(("family", "true"), [("gaussian", {"sigma": 3.0}), ("disc", {"radius": 7.0})])
-def test_auto_chooses_the_cheapest_sufficient_family(simulator, family, true):
-    fit = fit_pair(*simulator.Simulator(snr_db=60, size=75).pair(family, true), accuracy_db=60)
-    assert fit.family == family and "60 dB" in fit.why and fit.psnr[family] >= 60
 
 
 def test_auto_does_not_fit_a_disc_to_a_ring(simulator):
@@ -163,12 +141,8 @@ JPEG = {"level": 0.8, "size": 91, "jpeg": 90, "black": 0.02}
 CUT_OFF = {"bits": 16, "snr_db": 45, "level": 0.8}
 TONE = {"tone": 0.5, "level": 0.8, "black": 0.03}
 CHEAP = {"family": "auto", "accuracy_db": 30}
-G3, G4, D6, R34 = (
-    ("gaussian", {"sigma": 3.0}),
-    ("gaussian", GAUSSIAN),
-    ("disc", DISC),
-    ("ring", {"sigma": 3.0, "r_c": 4.0}),
-)
+G3, G4, D6 = ("gaussian", {"sigma": 3.0}), ("gaussian", GAUSSIAN), ("disc", DISC)
+R34 = ("ring", {"sigma": 3.0, "r_c": 4.0})
 # camera, kernel, seed, options of the fit, kinds of warnings (None: "not linear" or "residual"), words, first number
 WARNED = [
     *(
@@ -255,7 +229,7 @@ def test_a_cat_s_eye_gives_a_warning_of_asymmetry_and_round_blur_does_not(simula
         pair.fit_moves = ("dx", "dy")
         chances.append(asymmetry_of(pair.solve("disc"))[1])
     assert min(chances) > 1e-3 and 0.25 < np.mean(chances) < 0.75
-    eye = simulator.through(simulator.shape("cat's eye", 8.0), simulator.Simulator(size=71, dot_radius=10.0))
+    eye = simulator.Simulator(size=71, dot_radius=10.0).pair(simulator.shape("cat's eye", 8.0), {})
     fit, said = simulator.result_and_warnings(lambda: fit_pair(*eye, "disc"))
     (uneven,) = (w for w in said if w.kind == "asymmetry")
     assert fit.asymmetry > 0.03 and uneven.number == fit.asymmetry and "family 'disc' cannot" in str(uneven)

@@ -30,21 +30,15 @@ def captured(simulator, distances, snr_db=40.0, seed=0, known=True, family="soft
     for i, (distance, coc) in enumerate(zip(distances, cocs(distances), strict=True)):
         m = 1.0 / distance
         size = 2 * int(1.3 * (12.0 * max(m, 1.0) + 1.4 * abs(coc)) + 14) + 1
-        sharp, blurred = simulator.Simulator(size=size, magnification=m, snr_db=snr_db).pair(
-            family, params(coc), seed + i
-        )
-        pairs.append(Capture(sharp, blurred, distance, files=("sharp.png", f"{distance}.png"), exposure=exposure))
+        pictures = simulator.Simulator(size=size, magnification=m, snr_db=snr_db).pair(family, params(coc), seed + i)
+        pairs.append(Capture(*pictures, distance, files=("sharp.png", f"{distance}.png"), exposure=exposure))
     return Captures(tuple(pairs), focus_m=1.0, width_px=WIDTH, name="simulated", **(KNOWN if known else {}))
 
 
-def psnr_to_the_lens(kernels, places):
-    true = [kernel_of("softm", *(torch.tensor(v, dtype=torch.float64) for v in lens(coc).values())) for coc in places]
-    return np.array([natural_psnr(found, kernel) for found, kernel in zip(kernels, true, strict=True)])
-
-
 def psnr_between_nodes(table, places):
-    kernels = [table.kernels(torch.tensor([coc], dtype=torch.float64), WIDTH)[0, 0] for coc in places]
-    return psnr_to_the_lens(kernels, places)
+    kernels = table.kernels(torch.tensor(places, dtype=torch.float64), WIDTH)[:, 0]
+    true = [kernel_of("softm", *lens(coc).values()) for coc in places]
+    return np.array([natural_psnr(found, kernel) for found, kernel in zip(kernels, true, strict=True)])
 
 
 @pytest.fixture(scope="module")
@@ -96,11 +90,9 @@ def test_one_distance_makes_a_table_with_a_warning(simulator):
 
 
 def test_auto_chooses_one_family_reports_progress_and_warns_of_a_wrong_exposure(simulator):
-    steps = []
+    steps, captures = [], captured(simulator, [0.7, 1.5], exposure=0.5)
     with pytest.warns(FitWarning, match="times as bright as the exposures say") as caught:
-        result = fit_captures(
-            captured(simulator, [0.7, 1.5], exposure=0.5), accuracy_db=60, progress=lambda *step: steps.append(step[:2])
-        )
+        result = fit_captures(captures, accuracy_db=60, progress=lambda *step: steps.append(step[:2]))
     assert result.table.family == "softm" and "60 dB" in result.why
     assert steps == [(i, 4) for i in (1, 2, 3, 4)]
     assert {w.message.kind for w in caught} == {"exposure"}
