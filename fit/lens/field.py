@@ -37,7 +37,7 @@ def trace_field(
     for coc in coc_mm:
         for height in heights:
             spots = [
-                spot_of_place(lens, distance_m(coc), sensor_mm, height, rays, wavelength, reference)
+                spot_of_place(lens, distance_m(coc), sensor_mm, height, reference, rays=rays, wavelength_um=wavelength)
                 for wavelength in (wavelengths_um or (None,))
             ]
             low, high = min(u.min() for u, _, _ in spots), max(u.max() for u, _, _ in spots)
@@ -70,20 +70,13 @@ def _binned(u: Array, v: Array, weight: Array) -> Array:
 
 
 def spot_of_place(
-    lens: Lens,
-    z_m: float,
-    sensor_mm: float,
-    field_mm: float,
-    rays: int,
-    wavelength_um: float | None = None,
-    reference: Reference = "principal",
+    lens: Lens, z_m: float, sensor_mm: float, field_mm: float, reference: Reference = "principal", **options: Any
 ) -> tuple[Array, Array, Array]:
     """Positions in mm ``[R]`` of a point's light relative to its sharp image: away from the axis, across; and weight.
 
     The sharp image is that of the d line through a small stop. Arguments are those of `point_spread`.
     """
-    options: dict[str, Any] = {"rays": rays, "wavelength_um": wavelength_um, "reference": reference}
-    spot = point_spread(lens, z_m, sensor_mm, field_mm=field_mm, **options)
+    spot = point_spread(lens, z_m, sensor_mm, field_mm=field_mm, reference=reference, **options)
     image_mm = spot.centre - chief_ray_mm(lens, z_m, sensor_mm, field_mm, reference)
     return image_mm - spot.y, spot.x, spot.weight
 
@@ -105,9 +98,7 @@ def field_height_mm(lens: Lens, z_m: float, sensor_mm: float, radius_mm: float, 
 
 
 def coc_nodes(near_mm: float, far_mm: float, count: int) -> list[float]:
-    """Signed coc from the nearest to the farthest, denser near focus, on average `count` on each side.
-
-    The number on each side is proportional to the square root of its reach.
+    """Signed coc, denser near focus, on average `count` on each side, as the square root of that side's reach.
 
     Example:
         >>> [round(coc, 3) for coc in coc_nodes(-0.8, 0.2, 3)]

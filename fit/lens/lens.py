@@ -145,9 +145,7 @@ class Lens:
         return replace(self, surfaces=tuple(surfaces))
 
     def with_f_number(self, f_number: float) -> Lens:
-        """The lens stopped down so that its paraxial f-number is ``f_number``.
-
-        The f-number of a lens is rounded. An ``f_number`` up to 3 % below that of the open stop means fully open.
+        """The lens stopped down to a paraxial f-number; up to 3 % below that of the open stop means fully open.
 
         Raises:
             ValueError: If the lens cannot be opened that far.
@@ -168,9 +166,7 @@ class Lens:
         return prescription.lines(self.surfaces, self.stop)
 
 
-def trace_rays(
-    lens: Lens, position: Array, direction: Array, wavelength_um: float | None = None, clip: bool = True
-) -> Rays:
+def trace_rays(lens: Lens, position: Array, direction: Array, wavelength_um: float | None = None) -> Rays:
     """Traces rays to the last surface; they have the direction behind it.
 
     Args:
@@ -178,7 +174,6 @@ def trace_rays(
         position: A point on each ray ``[3, R]`` in mm, z = 0 at the first vertex; in front of the lens.
         direction: Unit vectors ``[3, R]`` with a positive z.
         wavelength_um: None is the d line.
-        clip: Whether clear diameters, including the stop's, block rays.
 
     Reference:
         Kolb, Mitchell, Hanrahan 1995, section 3.1 (the loop over surfaces), Snell's law in vector form.
@@ -189,18 +184,16 @@ def trace_rays(
         raise ValueError(f"position and direction must both be [3, R], got {shapes}")
     if (count := position.shape[1]) > _RAYS_AT_ONCE:
         chunks = (slice(start, start + _RAYS_AT_ONCE) for start in range(0, count, _RAYS_AT_ONCE))
-        parts = [trace_rays(lens, position[:, chunk], direction[:, chunk], wavelength_um, clip) for chunk in chunks]
+        parts = [trace_rays(lens, position[:, chunk], direction[:, chunk], wavelength_um) for chunk in chunks]
         return Rays(*(np.concatenate(part, -1) for part in zip(*parts, strict=True)))
     index, axis = lens.indices(wavelength_um), np.array([[0.0], [0.0], [1.0]])
     alive = np.ones(position.shape[1], dtype=bool)
     for i, (surface, vertex) in enumerate(zip(lens.surfaces, lens.vertices, strict=True)):
         run, normal, hits = surface.meet(position - vertex * axis, direction)
         position = position + run * direction
-        alive &= hits
+        alive &= hits & (position[0] ** 2 + position[1] ** 2 <= (surface.diameter / 2) ** 2)
         if i > 0:  # where two surfaces intersect there is no lens
             alive &= run >= -_OVERLAP_MM
-        if clip:
-            alive &= position[0] ** 2 + position[1] ** 2 <= (surface.diameter / 2) ** 2
         ratio = index[i] / index[i + 1]
         cosine = (direction * normal).sum(0)
         discriminant = 1.0 - ratio * ratio * (1.0 - cosine * cosine)

@@ -8,8 +8,7 @@ Object distances ``z`` are in metres along the axis, from a reference point of t
 * ``"vertex"``: the first surface, as with a tape measure.
 * ``"sensor"``: the sensor (the film plane), as with the scale on a lens.
 
-The focus distance and the object distances of one call have the same reference. For the 50 mm double Gauss at 2 m the
-four differ by up to 7 cm, and the blur of an object at 1 m by 10 %.
+For the 50 mm double Gauss at 2 m the four differ by up to 7 cm, and the blur of an object at 1 m by 10 %.
 """
 
 import math
@@ -75,7 +74,7 @@ def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best", reference: Re
     """Distance of the sensor behind the last vertex, in mm, for an object at ``focus_m`` (``inf`` allowed) in focus.
 
     The kind ``"paraxial"`` is where rays close to the axis meet; ``"best"`` is where the spot on the axis has the
-    smallest root mean square radius, like the focus of a photographer or an autofocus, and depends on the stop.
+    smallest rms radius, as autofocus finds it; it depends on the stop.
 
     Raises:
         ValueError: If the object is too near for focusing, or an argument is invalid.
@@ -119,8 +118,7 @@ def point_spread(
 ) -> Spot:
     """Traces the spot of an object point.
 
-    Rays fill the unvignetted part of the entrance pupil on a square grid. Each is weighted by its solid angle, because
-    the object point emits equally in all directions.
+    Rays fill the unvignetted part of the entrance pupil on a square grid, weighted by their solid angles.
 
     Args:
         lens: The prescription, stopped down as needed.

@@ -15,7 +15,6 @@ from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.camera import Camera
 from torchdof.validation import number, show, whole
 
-from ..result import Array
 from .field import coc_nodes, trace_field
 from .glass import C_UM, F_UM
 from .lens import Lens
@@ -118,7 +117,7 @@ def trace_table(
             for wavelength in (None, *(wavelengths_um or ()))
         )
         cocs, channels = place_nodes(d_line, near, far, nodes), coloured or [d_line]
-        radius, values = zip(*(zip(*map(tracer.fitted, cocs), strict=True) for tracer in channels), strict=True)
+        fitted = [[tracer.fitted(coc) for coc in cocs] for tracer in channels]
         residuals = [[tracer.error(coc, *tracer.fitted(coc)) for coc in cocs] for tracer in channels]
         spots = None
         if field is not None:
@@ -144,7 +143,10 @@ def trace_table(
     return BlurTable(
         "radial",
         _rounded(np.array(cocs), 9),
-        {"values": _rounded(np.array(values)), "radius": _rounded(np.array(radius) * channels[0].pixel)},
+        {
+            "values": [[_rounded(values) for _, values in nodes] for nodes in fitted],
+            "radius": [[_rounded(radius * d_line.pixel) for radius, _ in nodes] for nodes in fitted],
+        },
         unit="mm",
         sensor_width_mm=sensor_width_mm,
         name=f"{lens.name}_f{f_number:g}" if name is None else name,
@@ -184,5 +186,5 @@ def _check(arguments: dict[str, Any]) -> None:
             raise ValueError(f"field must be increasing distances in mm from the middle, from 0 on, got {show(field)}")
 
 
-def _rounded(values: Array, digits: int = 6) -> Any:
+def _rounded(values: Any, digits: int = 6) -> Any:
     return [_rounded(v, digits) for v in values] if np.ndim(values) else float(f"{values:.{digits}g}")
