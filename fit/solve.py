@@ -25,16 +25,8 @@ def best_of(
 ) -> Array:
     """Fits roughly from every start, finishes from the best, and returns the parameters.
 
-    Args:
-        model: maps parameters `[p]` to a prediction of the data `[n]`.
-        data: `[n]`, more samples than parameters, of order 1.
-        starts: parameter vectors, of order 1; moved inside the bounds.
-        bounds: lower and upper bounds.
-        jacobian: the model's derivatives `[n, p]`; None uses three-point differences.
-        tolerance: relative change of cost, parameters and gradient that ends the iteration.
-
-    Raises:
-        FitError: of kind "not converged" if no start converged.
+    The model maps parameters `[p]` to a prediction of the data `[n]`, its jacobian to `[n, p]`; all are of order 1. It
+    is an error of kind "not converged" if no start converged.
     """
     low, high = (np.asarray(bound, dtype=np.float64) for bound in bounds)
     # starts on a bound would be stuck: the trust region vanishes there

@@ -26,12 +26,7 @@ def checked(check: Callable[..., Value], name: str, value: Any, *limits: Any, **
 
 
 def real_numbers(name: str, value: ArrayLike, axes: str, file: str | None = None) -> Array:
-    """An array of finite real numbers as float64, with axes such as "[H, W]".
-
-    Raises:
-        FitError: it is not an array of real numbers, has other axes, or is so large or small that squares overflow; of
-            kind "not finite" for NaN or infinity.
-    """
+    """An array of finite real numbers as float64, with axes such as "[H, W]", or a `FitError`."""
     expected = f"{name} must be an array of real numbers {axes}, got"
     try:
         array = np.asarray(value)

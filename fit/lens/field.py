@@ -72,10 +72,7 @@ def _binned(u: Array, v: Array, weight: Array) -> Array:
 def spot_of_place(
     lens: Lens, z_m: float, sensor_mm: float, field_mm: float, reference: Reference = "principal", **options: Any
 ) -> tuple[Array, Array, Array]:
-    """Positions in mm ``[R]`` of a point's light relative to its sharp image: away from the axis, across; and weight.
-
-    The sharp image is that of the d line through a small stop. Arguments are those of `point_spread`.
-    """
+    """Positions ``[R]`` in mm of a point's light, from its sharp image away from the axis, and across; and weight."""
     spot = point_spread(lens, z_m, sensor_mm, field_mm=field_mm, reference=reference, **options)
     image_mm = spot.centre - chief_ray_mm(lens, z_m, sensor_mm, field_mm, reference)
     return image_mm - spot.y, spot.x, spot.weight

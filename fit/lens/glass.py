@@ -70,11 +70,7 @@ class Glass:
         return cls(name, tuple(terms.tolist()))
 
     def index(self, wavelength_um: float = D_UM) -> float:
-        """Refractive index in air, from 0.3 to 1.2 micrometres.
-
-        Raises:
-            ValueError: If the index is not from 1 to 5: the wavelength is outside the glass's transmission range.
-        """
+        """Refractive index in air, from 0.3 to 1.2 micrometres; a `ValueError` if it is not from 1 to 5."""
         square = number("wavelength_um", wavelength_um, low=0.299, high=1.201, unit="micrometres") ** 2
         values = self.coefficients
         if len(values) == 3:

@@ -145,11 +145,7 @@ class Lens:
         return replace(self, surfaces=tuple(surfaces))
 
     def with_f_number(self, f_number: float) -> Lens:
-        """The lens stopped down to a paraxial f-number; up to 3 % below that of the open stop means fully open.
-
-        Raises:
-            ValueError: If the lens cannot be opened that far.
-        """
+        """The lens stopped down to a paraxial f-number; up to 3 % below that of the open stop means fully open."""
         number("f_number", f_number, 0, 1e9)
         open_at = self.paraxial().f_number
         if f_number * _F_NUMBER_ROUNDING < open_at:
@@ -169,11 +165,8 @@ class Lens:
 def trace_rays(lens: Lens, position: Array, direction: Array, wavelength_um: float | None = None) -> Rays:
     """Traces rays to the last surface; they have the direction behind it.
 
-    Args:
-        lens: The prescription.
-        position: A point on each ray ``[3, R]`` in mm, z = 0 at the first vertex; in front of the lens.
-        direction: Unit vectors ``[3, R]`` with a positive z.
-        wavelength_um: None is the d line.
+    Rays start at points ``[3, R]`` in mm in front of the lens, z = 0 at the first vertex, along unit vectors ``[3, R]``
+    with a positive z; no wavelength means the d line.
 
     Reference:
         Kolb, Mitchell, Hanrahan 1995, section 3.1 (the loop over surfaces), Snell's law in vector form.

@@ -29,11 +29,7 @@ _SHAPE = ("k", *(f"A{power}" for power in range(2, 18, 2)))
 
 
 def parse(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
-    """Reads the text of a prescription: the surfaces, the index of the stop, and the source.
-
-    Raises:
-        ValueError: If it is not a prescription; the message contains line and column.
-    """
+    """The surfaces of a prescription, the index of the stop, and the source; an error has line and column."""
     surfaces: list[Surface] = []
     defined: dict[str, Glass] = {}
     stop, source = None, ""
@@ -46,7 +42,7 @@ def parse(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
             if words[:1] == ["glass"]:
                 if len(words) != 8 or not words[1][0].isalpha():
                     raise ValueError(f"expected glass NAME B1 B2 B3 C1 C2 C3, got {' '.join(words[1:])!r}")
-                numbers = tuple(_number(f"glass {words[1]}", text) for text in words[2:])
+                numbers = tuple(number_of(f"glass {words[1]}", text) for text in words[2:])
                 defined[words[1]] = Glass(words[1], numbers)
             elif words:
                 surface, is_stop = _surface(words, surfaces[-1].glass if surfaces else AIR, defined)
@@ -67,12 +63,12 @@ def _surface(words: list[str], medium: Glass, defined: dict[str, Glass]) -> tupl
     """The surface on a line, behind a medium, and whether it is the stop."""
     if len(words) < 4:
         raise ValueError(f"expected the columns {_COLUMNS}, got {len(words)}: {' '.join(words)!r}")
-    radius, thickness, diameter = (_number(_COLUMNS.split()[i], words[i]) for i in (0, 1, 3))
+    radius, thickness, diameter = (number_of(_COLUMNS.split()[i], words[i]) for i in (0, 1, 3))
     is_stop, shape = "stop" in words[4:], dict.fromkeys(_SHAPE, 0.0)
     for word in words[4:]:
         name, _, text = word.partition("=")
         if name in shape:
-            shape[name] = _number(name, text)
+            shape[name] = number_of(name, text)
         elif word != "stop":
             raise ValueError(f"behind the columns expected stop, k=NUMBER or A2=NUMBER to A16=NUMBER, got {word!r}")
     glass = medium if radius == 0.0 and words[2] == "0" else _glass(words[2], defined)
@@ -89,13 +85,14 @@ def _glass(text: str, defined: dict[str, Glass]) -> Glass:
         return defined[text]
     if text[0].isalpha() and text.lower() not in ("inf", "nan"):
         return Glass.named(text)
-    numbers = [_number("index", part) for part in text.split("/")]
+    numbers = [number_of("index", part) for part in text.split("/")]
     if len(numbers) > 3:
         raise ValueError(f"index: expected a number, index/V, index/V/P_gF or a glass, got {text!r}")
     return Glass.of_numbers(*numbers)
 
 
-def _number(name: str, text: str) -> float:
+def number_of(name: str, text: str) -> float:
+    """The number that a text states; the error has its name."""
     try:
         return float(text)
     except ValueError:

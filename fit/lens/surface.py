@@ -71,11 +71,9 @@ class Surface:
     def meet(self, position: Array, direction: Array) -> tuple[Array, Array, Mask]:
         """Intersections of rays with the surface; of several the one nearest to the vertex's plane.
 
-        Rays start at points ``[3, R]``, in mm from the vertex, along unit vectors ``[3, R]`` with a positive z.
-
-        Returns:
-            The distance in mm ``[R]``, negative if the surface lies behind; the unit normal there ``[3, R]``, with a
-            positive z; and whether a ray meets the surface ``[R]``; otherwise the other values have no meaning.
+        Rays start at points ``[3, R]``, in mm from the vertex, along unit vectors ``[3, R]`` with a positive z. Returns
+        the distance in mm ``[R]``, negative if the surface lies behind; the unit normal there ``[3, R]``, with a
+        positive z; and whether a ray meets the surface ``[R]``; otherwise the other values have no meaning.
 
         Reference:
             Welford, "Aberrations of Optical Systems", 1986, section 4.5 (conics), 4.6 (aspheres, by iteration).

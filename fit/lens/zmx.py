@@ -10,6 +10,7 @@ import math
 from dataclasses import replace
 
 from .glass import AIR, Glass, catalogue
+from .prescription import number_of
 from .surface import Surface
 
 _UNITS = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "METER": 1000.0}
@@ -17,11 +18,7 @@ _APERTURES = {"SQAP", "ELAP", "OBSC", "SQOB", "ELOB", "SPID", "UDAD", "UDOB"}
 
 
 def parse(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
-    """Reads the content of a .zmx file, UTF-16 or plain: surfaces, the index of the stop, and the source.
-
-    Raises:
-        ValueError: If it is not a sequential lens that can be traced; the message names the surface.
-    """
+    """The surfaces of a .zmx file, UTF-16 or plain, the index of the stop, and the source; an error has the surface."""
     text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     records: list[dict[str, list[str]]] = []
     unit, name = 1.0, ""
@@ -66,10 +63,7 @@ def _surface(record: dict[str, list[str]], unit: float, medium: Glass) -> Surfac
 
     def number(word: str, index: int = 0) -> float:
         fields = record.get(word, [])
-        try:
-            return float(fields[index]) if len(fields) > index else 0.0
-        except ValueError:
-            raise ValueError(f"{word} must be a number, got {fields[index]!r}") from None
+        return number_of(word, fields[index]) if len(fields) > index else 0.0
 
     kind = (record.get("TYPE") or ["STANDARD"])[0]
     if kind not in ("STANDARD", "EVENASPH"):

@@ -1,8 +1,6 @@
 """Compares the fitted blur with the camera's numbers and distances, and finds the likely cause of a difference.
 
-The circle of confusion follows from focal length, f-number, sensor width and distance, and its radius is also measured.
-A wrong number makes the two differ, and the difference over the distances indicates which number it is. `check_reach`
-also checks whether a table is used outside its measured focus and f-number.
+A wrong number makes the fitted radius differ from the camera's, and the difference over the distances indicates which.
 """
 
 import math
@@ -34,8 +32,8 @@ def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> N
     defocus = np.abs(captures.defocus)
     expected = defocus * _common_factor(defocus, measured) if camera_px is None else np.abs(camera_px)
     is_large = np.maximum(expected, measured) > _MIN_BLUR_PX
-    # without a camera the scale is fitted to the distances themselves
     misfit_log = _misfit(expected, measured, is_large)
+    # without a camera the scale is fitted to the distances themselves
     if int(is_large.sum()) < (3 if camera_px is None else 1) or misfit_log < _WARN_LOG:
         return
     readings = sorted(_causes(captures, expected, measured, is_large))
@@ -43,10 +41,8 @@ def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> N
     worst = int(np.argmax(np.where(is_large, np.abs(np.log(measured / expected)), 0.0)))
     source = "the other distances" if camera_px is None else "the camera's numbers"
     cause = "likely " + "; or ".join(likely[:2]) if likely else "no single number explains it: check them all"
-    text = (
-        f"at {captures.distances_m[worst]:g} m the blur has a radius of {measured[worst]:.3g} px, but {source} give "
-        f"{expected[worst]:.3g} px; {cause}"
-    )
+    text = f"at {captures.distances_m[worst]:g} m the blur has a radius of {measured[worst]:.3g} px, but {source} give "
+    text += f"{expected[worst]:.3g} px; {cause}"
     file, factor = captures.pairs[worst].files[1], float(measured[worst] / expected[worst])
     if misfit_log > _REFUSE_LOG:
         if camera_px is not None:

@@ -77,12 +77,9 @@ def check_levels(solution: Solution, expected: Solution, edge: Edge, file: str |
     that hardly increases the residual. There are three kinds of evidence:
 
     1. The part of a curve's effect that the fit's parameters cannot imitate, in the residual of `solution`.
-    2. In a JPEG this part is less certain; an edge of the sharp dot that is slightly too steep then supports it.
+    2. In a JPEG this part is less certain; the sharp dot's `edge`, if slightly too steep, then supports it.
     3. A fitted magnification imitates most of a curve. So the residual of `expected`, the solution with the expected
-       magnification, is tested for an S-curve, which must explain more than a change of magnification does. A sharp
-       dot's edge that is too steep counts in favour of the curve.
-
-    `edge` is that of the sharp dot.
+       magnification, is tested for an S-curve, which must explain more than a change of magnification does.
     """
     products, covariance, visible = unexplained(solution, _curves(solution, edge.level))
     strengths = np.linalg.lstsq(visible.T @ visible, products, rcond=None)[0]

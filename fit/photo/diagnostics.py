@@ -49,17 +49,14 @@ def unexplained(solution: Solution, basis: Array) -> tuple[Array, Array, Array]:
 
 
 def asymmetry_of(solution: Solution) -> tuple[float, float]:
-    """Norm of the blur's angle-dependent part, relative to its light's, and the probability that noise alone gives it.
-
-    The residual is expanded in eight harmonics of the angle on four rings. The whitened squared coefficients of noise
-    follow a chi squared distribution; the norm is without noise's contribution.
-    """
+    """Norm of the blur's angle-dependent part over its light's, without noise, and the probability of it by noise."""
     pair = solution.pair
     (x, y), (rows, columns) = solution.centre, np.indices(pair.data.shape)
     angle = np.arctan2(rows - y, columns - x)
     ring_at = np.hypot(columns - x, rows - y) / max(pair.dot.reach, 2.0) * _RINGS
     near = (ring_at <= _RINGS) & pair.used
     hats = [(np.clip(1 - np.abs(ring_at - ring + 0.5), 0, None) * near)[pair.used] for ring in range(1, _RINGS + 1)]
+    # the whitened squared coefficients of noise follow a chi squared distribution
     waves = [wave(n * angle[pair.used]) for n in range(1, _HARMONICS + 1) for wave in (np.cos, np.sin)]
     _, _, visible = unexplained(solution, np.stack([hat * wave for hat in hats for wave in waves], axis=1))
     found, spread, _ = unexplained(solution, orth(visible, rcond=1e-6))

@@ -49,10 +49,7 @@ def find_dot(picture: Array, *, file: str | None = None) -> Dot:
 
 
 def find_dots(picture: Array, *, file: str | None = None, smallest: float = _MIN_LIGHT) -> list[Dot]:
-    """Finds dots in a picture `[H, W]` in linear light, brightest first, down to a share `smallest` of its light.
-
-    It is an error if nothing exceeds the noise enough, or if the brightest dot touches the edge of the picture.
-    """
+    """Finds dots in a picture `[H, W]` in linear light, brightest first, down to a share `smallest` of its light."""
     height, width = a_picture("a picture of a dot", picture, _MIN_SIDE_PX, file).shape
     noise = noise_of(picture)
     levels = picture[near_border(picture.shape, max(1, min(height, width) // 20))]
@@ -92,16 +89,14 @@ def find_dots(picture: Array, *, file: str | None = None, smallest: float = _MIN
 
 
 def _measured(levels: Array, x: float, y: float, noise: float, peak: float) -> tuple[float, float, float, float]:
-    """Centre, radius and reach of a dot near (x, y), by moments in three rounds, each within the last reach.
-
-    The reach is the radius at which the mean over a ring falls below the noise and is negligible for the moments.
-    """
+    """Centre, radius and reach of a dot near (x, y), by moments in three rounds, each within the last reach."""
     rows, columns = np.indices(levels.shape).astype(np.float64)
     for _ in range(3):
         distance = np.hypot(columns - x, rows - y)
         rings = np.floor(distance + 0.5).astype(np.int64).ravel()  # one px wide
         count = np.bincount(rings)[: max(3, min(levels.shape) // 2 + 1)]  # without rings that the crop cuts
         mean = np.bincount(rings, weights=levels.ravel())[: count.size] / np.maximum(count, 1)
+        # the reach is the radius at which the mean over a ring falls below the noise
         dark = np.abs(mean) < np.maximum(2.5 * noise / np.sqrt(np.maximum(count, 1)), 5e-4 * peak)
         bright = int(np.argmax(mean))
         dark_pairs = np.flatnonzero(dark[bright:-1] & dark[bright + 1 :])
@@ -154,10 +149,7 @@ def used_pixels(picture: Array, dot: Dot, white: float | None, file: str | None,
 
 
 def _plateau(picture: Array, dot: Dot) -> float | None:
-    """The level at which a picture is clipped, or None.
-
-    It has more pixels than the next lower one, although the noise is larger than the distance of levels.
-    """
+    """The level at which a picture is clipped, if more pixels have it than the next one despite noise; or None."""
     levels, counts = np.unique(picture[picture > dot.background + 0.5 * dot.peak], return_counts=True)
     tail = levels.size > 1 and counts[-1] <= counts[-2]  # few pixels at the top level are the tail of the noise
     if tail or counts[-1] < max(5, 0.02 * counts.sum()):

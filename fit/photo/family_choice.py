@@ -101,10 +101,7 @@ def looks_alike(kernel: Array, other: Array, accuracy_db: float) -> bool:
 def choose(
     kernels: Mapping[str, Array], bic: Mapping[str, float], accuracy_db: float
 ) -> tuple[str, str, dict[str, float]]:
-    """The cheapest family that a viewer cannot distinguish from the simplest within 2 of the lowest BIC.
-
-    Also returns a sentence with the reason and the alternatives, and each family's PSNR against "radial".
-    """
+    """The cheapest family that looks like the simplest within 2 of the lowest BIC, why, and PSNRs against "radial"."""
     by_likelihood = sorted(kernels, key=lambda f: (bic[f], COST.index(f)))
     lowest = bic[by_likelihood[0]]
     likeliest = min((f for f in kernels if bic[f] <= lowest + _BIC_TIE), key=COST.index)

@@ -2,7 +2,7 @@
 
 The model is compared with all pixels of the window and divides nothing, so dot size, exposure, stray light,
 displacement and magnification do not bias the kernel. Gain and background are linear and are solved for given values of
-the other parameters (variable projection): the kernel's parameters, displacement and magnification.
+the other parameters (variable projection).
 """
 
 from __future__ import annotations

@@ -102,10 +102,7 @@ def cut_pairs(
     exposure: float | None,
     colours: bool,
 ) -> list[Capture]:
-    """Cuts the windows around the dot, or the dots of a grid, in a sharp and a blurred photograph.
-
-    `exposure` is the brightness of the blurred photograph over that of the sharp one.
-    """
+    """Cuts the windows around the dot, or the dots of a grid, in a sharp and a blurred photograph."""
     sharp_picture, blurred_picture = pictures
     if dots == "one":
         first, second = (find_dot(picture.light, file=str(picture.file)) for picture in pictures)

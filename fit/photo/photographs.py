@@ -1,8 +1,4 @@
-"""Reads photographs of the printed target from a camera or phone, and determines distances, focus and tone curve.
-
-The square's size gives each distance, the sharpest picture is the one in focus, and EXIF describes the lens. A tone
-curve is detected (`tone`) and undone.
-"""
+"""Reads photographs of the printed target from a camera or phone, and determines distances, focus and tone curve."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -47,7 +43,6 @@ class Photographs:
 
     captures: Captures  # for `fit_captures`
     pictures: tuple[Photograph, ...]  # every photograph of the target, by distance
-    tone: tuple[float, float, float]  # parameters of the tone curve that was undone, see `untoned`
     advice: tuple[str, ...]  # improvements, a sentence each
 
 
@@ -156,7 +151,7 @@ def read_photographs(
             "from_exif": list(CAMERA),
         },
     )
-    return Photographs(captures, tuple(pictures), bend, tuple(advice))
+    return Photographs(captures, tuple(pictures), tuple(advice))
 
 
 def _pair(

@@ -19,9 +19,8 @@ _MAX_STEP = {"dx": 0.5, "dy": 0.5, "magnification": 0.02}  # largest step of an 
 def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: int | None = None) -> Solution:
     """Fits values of the profile, densities per square pixel, at equal steps of r up to `radius` px; refines the moves.
 
-    Each value is the weight of a hat function, whose kernel is convolved with the sharp dot. A penalty on second
-    differences, chosen by generalised cross-validation, smooths values that the data do not determine. If `knots` is
-    None there are two values for each pixel, between 8 and 48.
+    Each value is the weight of a hat function. A penalty on second differences, chosen by generalised cross-validation,
+    smooths values that the data do not determine. Without `knots` there are two values for each pixel, from 8 to 48.
     """
     count = knots if knots is not None else int(np.clip(np.ceil(2 * radius), 8, 48))
     half = min(int(np.ceil(radius)) + 1, pair.half)

@@ -65,7 +65,7 @@ def test_inches_are_millimetres_times_25_4(lens_of):
         ("GLAS N-BK7 0 0 1.5168", "GLAS MIRROR 0 0 1.5168", "surface 2: mirrors are not traced"),
         ("GLAS N-BK7 0 0 1.5168 64.17 0", "GLAS S-NICE", "surface 2: glass S-NICE is not in the catalogue of SCHOTT"),
         ("  CLAP 0 8 0", "  OBSC 0 2", "surface 3: only round apertures without obstruction are read, got OBSC"),
-        ("CURV 0.02 0", "CURV x 0", "surface 2: CURV must be a number, got 'x'"),
+        ("CURV 0.02 0", "CURV x 0", "surface 2: CURV: expected a number, got 'x'"),
         ("  DIAM 10 1", "  MEMA 10 1", r"surface 2: no clear semi-diameter \(DIAM\)"),
         ("  STOP\n", "", r"expected one stop \(STOP\) among the surfaces of the lens, got 0"),
         (SINGLET, "SURF 0\n", "expected an object, surfaces of a lens and an image"),

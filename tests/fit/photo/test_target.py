@@ -129,7 +129,7 @@ def test_a_tone_curve_is_found_from_the_total_light_of_the_dot_and_undone(simula
 
 def test_no_tone_curve_is_found_in_photographs_without_one(simulator, tmp_path):
     simulator.write_photographs(tmp_path, 0.2, [0.28, 0.4, 0.6], width=640, tone=0.0)
-    assert read_photographs(tmp_path).tone == (0.0, 0.0, 0.0)
+    assert read_photographs(tmp_path).captures.notes["tone_curve"] == [0.0, 0.0, 0.0]
 
 
 def test_a_table_of_photographs_with_an_unknown_tone_curve_renders_the_true_lens_s_picture(simulator, tmp_path, capsys):
