@@ -34,8 +34,8 @@ class Glass:
     def __post_init__(self) -> None:
         """Raises a `ValueError` unless the coefficients are finite and the index from 1 to 5 between 0.4 and 0.7 um."""
         values = self.coefficients if isinstance(self.coefficients, tuple) else ()
-        are_finite = all(isinstance(v, int | float) and abs(v) <= _MAX_COEFFICIENT for v in values)
-        if not are_finite or len(values) not in (3, 6):
+        are_numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
+        if not are_numbers or len(values) not in (3, 6) or not all(abs(v) <= _MAX_COEFFICIENT for v in values):
             expected = "six finite coefficients B1 B2 B3 C1 C2 C3"
             raise ValueError(f"glass {self.name} must have {expected}, got {show(self.coefficients)}")
         for wavelength_um in (0.4, D_UM, 0.7):

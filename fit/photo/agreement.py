@@ -163,6 +163,6 @@ def check_reach(
             continue
         factors[name] = used_at / measured_at
         if max(factors[name], 1 / factors[name]) > limit:
-            text = f"the table was measured at {name} {measured_at:g} and is used at {used_at:g}: its shape differs"
-            warn(text, "outside measured", number=factors[name])
+            text = f"the table was measured at {name} {measured_at:g} and is used at {used_at:g}"
+            warn(f"{text}; the shape of the blur differs", "outside measured", number=factors[name])
     return factors

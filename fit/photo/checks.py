@@ -102,7 +102,7 @@ def check_levels(solution: Solution, expected: Solution, edge: Edge, file: str |
     condition = "" if is_bent else "at the expected size of the dot, "
     text = (
         f"the fit's residual depends on the level, {condition}as with a tone curve, which makes the kernel 5 % or more "
-        f"too small; develop without it. Other causes: colours (colours = 'each'), a blur not of {solution.family!r}"
+        f"too small; develop without it. Other causes: colours (colours = 'each'), a wrong family {solution.family!r}"
     )
     warn(text, "not linear", file=file, number=float(strengths[1]))
 

@@ -43,7 +43,7 @@ def find_dot(picture: Array, *, file: str | None = None) -> Dot:
     dots = find_dots(picture, file=file)
     if len(dots) > 1:
         positions = ", ".join(f"({d.x:.0f}, {d.y:.0f})" for d in dots[:6])
-        text = f"{len(dots)} dots where one was expected, at {positions}; cover the others, or give crop or dots"
+        text = f"{len(dots)} dots where one was expected, at {positions}; cover the others, or state crop or dots"
         raise FitError(text, "several dots", file=file, number=float(len(dots)))
     return dots[0]
 
@@ -63,7 +63,7 @@ def find_dots(picture: Array, *, file: str | None = None, smallest: float = _MIN
     smoothed_noise = 0.28 * noise
     if not peak > max(8 * smoothed_noise, 1e-9 * max(float(np.abs(picture).max()), 1e-300)):
         ratio = peak / smoothed_noise if smoothed_noise > 0 else 0.0
-        text = f"no dot found: the brightest spot is {ratio:.1f} times the noise, at least 8 are needed; expose more"
+        text = f"no dot found: the brightest spot is {ratio:.1f} times the noise, 8 are needed; a white dot on black?"
         raise FitError(text, "no dot", file=file, number=ratio)
     labels, count = ndimage.label(smooth > max(_THRESHOLD * peak, 5 * smoothed_noise), structure=np.ones((3, 3)))
     light = np.asarray(ndimage.sum_labels(smooth, labels, np.arange(1, count + 1)))

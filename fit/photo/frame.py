@@ -59,7 +59,7 @@ def read_picture(
         if len(pixels) != 1:
             raise invalid(f"bayer = {bayer!r} is for pictures with one colour a pixel, got {len(pixels)} colours")
         if picture.orientation != 1:
-            raise invalid(f"bayer is for upright pictures, got EXIF orientation {picture.orientation}; remove the tag")
+            raise invalid(f"bayer is for unturned pictures, got EXIF orientation {picture.orientation}; remove the tag")
         pixels = demosaiced(pixels[0], bayer)
     height, width = pixels.shape[1:]
     left, top, columns, rows = crop or (0, 0, width, height)

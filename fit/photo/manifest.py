@@ -119,7 +119,7 @@ def read_captures(
     if manifest["transfer"] is None and encoded:
         further = f" and {len(encoded) - 1} more" if len(encoded) > 1 else ""
         text = f"the encoding of {encoded[0]}{further} is not stated; sRGB is assumed. A camera's tone curve or "
-        text += "sharpening makes the kernel up to 15 % too small: develop without, and say transfer = 'linear'/'srgb'"
+        text += "sharpening makes the kernel up to 15 % too small: develop without them and state transfer"
         warn(text, "not linear", file=manifest_name, number=float(len(encoded)))
     own_width = sharp_picture.width_px
     width = own_width if manifest["full_width_px"] is None else round(manifest["full_width_px"])

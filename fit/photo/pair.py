@@ -208,7 +208,7 @@ def prepared_pair(
         source, edge = "dot", edge.with_softness(softness)
     linear = clipped > 0 or softness is not None or check_linearity(sharp_picture, dot, edge, files[0])
     if (radius := edge.radius * magnification) < _MIN_DOT_PX:
-        text = f"by its distance the dot has a radius of {radius:.2g} px here, too small to see; is it in another unit?"
+        text = f"by its distance the dot has a radius of {radius:.2g} px here, too small to see; is that in metres?"
         raise FitError(text, "distance", file=files[1], number=magnification)
     if clipped:
         text = f"{clipped} pixels of the sharp picture are clipped; an ideal dot of {edge.radius:.2f} px stands for it"

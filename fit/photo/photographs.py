@@ -117,7 +117,8 @@ def read_photographs(
     if integers and len(pictures) >= _MIN_FOR_TONE:
         tone = tone_curve([(p.light, p.target) for p in pictures], square_mm)
     elif integers:
-        text = f"{len(pictures)} photographs are too few to find a tone curve, which makes kernels up to 15 % too small"
+        text = f"{len(pictures)} photographs are too few to find a tone curve, which makes a kernel up to 15 % "
+        text += f"too small: take {_MIN_FOR_TONE} or more"
         warn(text, "not linear", file=folder_name, number=float(len(pictures)))
     bend = (0.0, 0.0, 0.0) if tone is None else tone.bend
     if any(bend):

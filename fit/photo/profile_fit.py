@@ -88,7 +88,7 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
     explained = float(np.sum((y - y.mean()) ** 2)) - unexplained
     variation = float(np.sqrt(max(explained, 0.0) / y.size))
     if variation < 1e-8 or explained / 2 < _FLAT_F * unexplained / (y.size - 3):
-        text = f"the profile is flat: it varies by {variation:.3g} of its peak, in noise of {noise:.3g}; sample farther"
+        text = f"the profile is flat: it varies by {variation:.3g} of its peak (noise {noise:.3g}); sample farther out"
         raise FitError(text, "flat profile", number=variation / noise if noise > 0 else 0.0)
 
     def model(p: Array) -> Array:
