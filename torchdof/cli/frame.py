@@ -22,13 +22,14 @@ from ..optics.camera import CAMERA_NUMBERS, Camera
 from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect, stretch
-from .lens import VISIBLE_PX, Area
+from .lens import Area
 from .options import Scene, make_folder_of
 from .output import Notices, print_result
 
 if TYPE_CHECKING:
     from .render import Render
 
+_VISIBLE_PX = 2.0  # px; a note advises more blur if the largest radius is below
 _WITHOUT_EXIF = (".hdr", ".pfm")  # types in which OpenImageIO writes no EXIF data
 _PANEL_PX = 800  # px; longer side of a panel on a sheet
 
@@ -194,9 +195,13 @@ class Renderer:
         (height, width), largest_px = rendered.coc_px.shape[-2:], float(rendered.coc_px.abs().max())
         if frame.guess:
             self.notices.note("guess", f"{frame.name}: {frame.guess}")
-        if camera is not None and largest_px < VISIBLE_PX:
-            advice = frame.scene.lens.blur_advice(largest_px, width, self.is_still)
-            self.notices.note("little blur", f"{out}: {advice}")
+        if camera is not None and largest_px < _VISIBLE_PX:
+            advice = (
+                f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; open the lens wider, with a "
+            )
+            advice += "smaller --f-number, a larger --blur, or a larger --aperture-radius-m"
+            nothing = "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
+            self.notices.note("little blur", f"{out}: {advice if largest_px else nothing}")
         has_exif = any(name.startswith("Exif:") for name in frame.picture.metadata)
         if has_exif and out.suffix.lower() in _WITHOUT_EXIF:
             lost = f"EXIF data are lost in a {out.suffix} file; write .jpg, .png or .tif to keep them"

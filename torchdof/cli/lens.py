@@ -17,14 +17,7 @@ if TYPE_CHECKING:
 
 _DEFAULTS = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
 _LABELS = dict(zip(_DEFAULTS, ("focal length", "f-number", "sensor width"), strict=True))
-_WIDER = {  # option that sets the aperture -> how to open the lens wider
-    "--f-number": "a smaller --f-number",
-    "--aperture-radius-m": "a larger --aperture-radius-m",
-    "--equivalent": "a smaller --equivalent f-number",
-    "--blur": "a larger --blur",
-}
 _PHONE_MM, _PHONE_EQUIVALENT_MM = 10.0, 26.0  # a lens shorter than this is a phone's, whose main lens is like this one
-VISIBLE_PX = 2.0  # px; a note advises more blur if the largest radius is below
 _DEFAULT_BLUR, _VISIBLE_BLUR = 0.02, 0.005  # largest blur radius over the width: by default; the smallest visible one
 _PER_OUTLIER, _MAX_SAMPLES = 1000, 2**20  # one pixel in 1000 is ignored as an outlier; most pixels examined
 
@@ -58,11 +51,8 @@ class Area(NamedTuple):
     def centred_camera(self, camera: "Camera", depth: "Tensor") -> "tuple[Camera, Tensor, Any]":
         """Camera and map with the optical axis in the middle of the map, and the index of ``depth`` in it."""
         padded, place = self.centred(depth, depth.shape[-2:])
-        return (
-            camera.replace(sensor_width_mm=camera.sensor_width_mm * padded.shape[-1] / depth.shape[-1]),
-            padded,
-            place,
-        )
+        wide_mm = camera.sensor_width_mm * padded.shape[-1] / depth.shape[-1]
+        return camera.replace(sensor_width_mm=wide_mm), padded, place
 
     def coc_px(self, camera: "Camera", depth: "Tensor") -> "Tensor":
         """As ``camera.coc_px``, with the axis of a tilted lens in the middle of the full frame."""
@@ -155,8 +145,9 @@ class Lens(Sensor):
     @property
     def _opening(self) -> dict[str, Any]:
         """Option -> value, for the option that sets the aperture; empty if none does."""
-        values = (self.f_number, self.aperture_radius_m, self.equivalent, self.blur_share)
-        return {option: value for option, value in zip(_WIDER, values, strict=True) if value is not None}
+        given = {"--f-number": self.f_number, "--aperture-radius-m": self.aperture_radius_m}
+        given |= {"--equivalent": self.equivalent, "--blur": self.blur_share}
+        return {name: value for name, value in given.items() if value is not None}
 
     @property
     def has_focus(self) -> bool:
@@ -172,16 +163,6 @@ class Lens(Sensor):
         """Refuse keyframes of the focus, for a command that renders a single image."""
         if len(self.focus_m or []) > 1:
             raise ValueError("--focus-m has keyframes but IMAGE is a single image; give one distance in metres")
-
-    def blur_advice(self, largest_px: float, width: int, is_still: bool) -> str:
-        """Advice for a largest blur radius that is hardly visible in an image of a width in pixels."""
-        if largest_px == 0:
-            return "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
-        advice = _WIDER[next(iter(self._opening), "--f-number")]
-        if is_still:
-            share = f"{min(0.5, max(_DEFAULT_BLUR, math.ceil(100 * VISIBLE_PX / width) / 100)):.0%}"
-            advice += f", or --blur {share}" if self.blur_share is None else f", such as {share},"
-        return f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; {advice} makes more of it"
 
     def view_deg(self, metadata: Mapping[str, Any], width: int, area: Area) -> float:
         """Horizontal field of view in degrees of an image, as stated, or from focal length and sensor."""
