@@ -192,8 +192,8 @@ def _print_fit(console: Console, captures: Captures, result: TableFit, messages:
         focuses = [f"{1 / v:.4g}" if v > 0 else "" if math.isnan(v) else "beyond infinity" for v in vergences]
         columns = {"": [colour.name for colour in result.colours], "focus m": focuses}
         for i, pair in enumerate(captures):
-            fits = [colour.fits[i] for colour in result.colours]
-            columns[f"radius px at {pair.distance_m:g} m"] = [f"{f.radius:.2f} ± {f.radius_stderr:.2g}" for f in fits]
+            radii = [f"{c.fits[i].radius:.2f} ± {c.fits[i].radius_stderr:.2g}" for c in result.colours]
+            columns[f"radius px at {pair.distance_m:g} m"] = radii
         lateral = [colour.lateral_px[0] for colour in result.colours]
         columns["lateral px in focus"] = [f"({x:+.2f}, {y:+.2f})" for x, y in lateral]
         print_columns(console, "colours, beside green", columns)

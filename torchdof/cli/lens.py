@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -33,7 +33,7 @@ class Area(NamedTuple):
     width: int
     height: int
 
-    def centred(self, values: "Tensor", size: "tuple[int, int]") -> "tuple[Tensor, Any]":
+    def centred(self, values: "Tensor", size: Sequence[int]) -> "tuple[Tensor, Any]":
         """Pads a map so that the optical axis, in the middle of the full frame, is in the middle of the map.
 
         The map ``[1, 1, h, w]`` is of an image of a height and width in pixels. Also returns its index in the padded
@@ -145,7 +145,7 @@ class Lens(Sensor):
     @property
     def _opening(self) -> dict[str, Any]:
         """Option -> value, for the option that sets the aperture; empty if none does."""
-        given = {"--f-number": self.f_number, "--aperture-radius-m": self.aperture_radius_m}
+        given: dict[str, Any] = {"--f-number": self.f_number, "--aperture-radius-m": self.aperture_radius_m}
         given |= {"--equivalent": self.equivalent, "--blur": self.blur_share}
         return {name: value for name, value in given.items() if value is not None}
 

@@ -21,8 +21,14 @@ COMMANDS = ("render", "fit", "export", "bench", "inspect", "tables")
 _EXTRAS = {"scipy": "fit", "threadpoolctl": "fit", "matplotlib": "plot"}
 _EXTRAS |= dict.fromkeys(("onnx", "onnxscript", "onnxruntime"), "export")
 # Parts of the messages of PyTorch's RuntimeError when memory runs out; they come from several libraries.
-_NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "bad_alloc", "size calculation overflowed")
-_NO_MEMORY += ("new thread",)
+_NO_MEMORY = (
+    "allocate memory",
+    "not enough memory",
+    "out of memory",
+    "bad_alloc",
+    "calculation overflowed",
+    "new thread",
+)
 
 
 class _Commands(click.Group):
