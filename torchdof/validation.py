@@ -307,8 +307,7 @@ def stretch(image: Tensor, depth: Tensor) -> float:
 
 def is_resizable(image: Any, depth: Any) -> bool:
     """Whether a depth map has another size than an image, but nearly the same aspect ratio."""
-    tensors = all(isinstance(t, Tensor) and not t.is_nested for t in (image, depth))
-    maps = tensors and all(t.ndim == 4 and t.is_floating_point() and t.numel() for t in (image, depth))
+    maps = all(floating(t) and t.ndim == 4 and t.numel() for t in (image, depth))
     if not maps or image.shape[-2:] == depth.shape[-2:] or image.device != depth.device:
         return False
     return depth.shape[0] in (1, image.shape[0]) and depth.shape[1] == 1 and stretch(image, depth) <= _MAX_STRETCH

@@ -197,19 +197,6 @@ def test_a_shard_whose_process_ends_between_its_two_files_is_made_again(
     assert made == expected and summary_of(tmp_path / "out").samples == 1
 
 
-def test_a_shard_is_written_completely_or_not_at_all(
-    pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def stopped(path: Path, records: Any) -> None:
-        path.write_bytes(b"half")
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(torchdof.distributed.shards, "_write_tar", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        make_shards(tmp_path / "out", shard_rows(pairs))
-    assert list((tmp_path / "out").iterdir()) == []
-
-
 def test_cameras_may_be_given(pairs: list[Pair], tmp_path: Path) -> None:
     given = [Pair(pairs[0].image, pairs[0].depth, focus_m=1.25, f_number=2.0), Pair(pairs[1].image, pairs[1].depth)]
     make_shards(tmp_path / "out", shard_rows(given), keep=["blurred"])

@@ -71,7 +71,7 @@ def word_or_number(words: tuple[str, ...], expected: str) -> Callable[[str], flo
 def by_option(message: str, parameters: Iterable[click.Parameter]) -> str:
     """A message with options in the place of the library's arguments, which may end with a unit: ``tilt_deg``."""
     names = {f"{p.name}{unit}": p.opts[0] for unit in ("", "_m", "_deg", "_px") for p in parameters}
-    pattern = rf"(^|[(,] ?| (?=\w+=))({'|'.join(names)})(?= must | -?\d| inf|=)"
+    pattern = rf"(^|[(,] ?| (?=\w+=))({'|'.join(names)})(?= must | is | -?\d| inf|=)"
     return re.sub(pattern, lambda match: match[1] + names[match[2]], message)
 
 

@@ -144,8 +144,6 @@ class ApertureOptions:
     def __post_init__(self) -> None:
         if self.aperture is not None and (self.blades or self.curvature):
             raise ValueError("--aperture is the whole opening; leave --blades and --curvature out")
-        if self.curvature and not self.blades:
-            raise ValueError("--curvature is that of blades; give --blades too")
         if self.rotation and not self.blades and self.aperture is None:
             raise ValueError("--rotation turns blades or an image; give --blades or --aperture too")
 
@@ -217,11 +215,10 @@ def check_files(image: Path, depth: Path | None, *outputs: Path | None) -> None:
     existing_image(image)
     if depth is not None:
         existing_map(depth)
-    inputs, written = [os.path.realpath(path) for path in (image, depth) if path is not None], set[str]()
+    inputs = map(os.path.realpath, filter(None, (image, depth)))
+    problems = dict.fromkeys(inputs, "is one of the inputs; write to another file")
     for out in filter(None, outputs):
-        if os.path.realpath(out) in inputs:
-            raise ValueError(f"{out}: is one of the inputs; write to another file")
-        if os.path.realpath(out) in written:
-            raise ValueError(f"{out}: would be written twice; give each picture a file of its own")
+        if problem := problems.get(os.path.realpath(out)):
+            raise ValueError(f"{out}: {problem}")
         samples_of(out)
-        written.add(os.path.realpath(out))
+        problems[os.path.realpath(out)] = "would be written twice; give each picture a file of its own"
