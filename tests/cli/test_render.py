@@ -424,14 +424,6 @@ def test_an_existing_file_whose_name_looks_like_a_pattern_is_a_single_image(
     assert pixels(str(out)).shape == image.shape
 
 
-@pytest.mark.parametrize("link", ["image.exr", "depth.npy", "out.exr"])
-def test_a_link_to_itself_is_refused_in_one_sentence(scene: Path, run: Run, link: str) -> None:
-    (scene / link).unlink(missing_ok=True)
-    (scene / link).symlink_to(link)
-    assert run(ONE, code=2).startswith(f"error: {link}: is a link that leads back to itself")
-    assert (scene / link).is_symlink()
-
-
 def test_depth_of_nearly_the_same_shape_is_stretched_and_the_line_states_it(
     run: Run, image: Tensor, depth: Tensor
 ) -> None:
