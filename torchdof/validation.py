@@ -208,14 +208,6 @@ def image_and_map(image: Tensor, name: str, value: Tensor, unit: str) -> None:
         raise ValueError(f"image must be [B, C, H, W] in linear light, got {list(image.shape)}{hint}")
     if 0 in image.shape:
         raise ValueError(f"image must have at least one pixel, channel and item, got {list(image.shape)}")
-    _map(name, unit, value, image)
-    if not is_traced():
-        real_tensor("image", image, "[B, C, H, W]")
-        real_tensor(name, value, f"[B, 1, H, W] {unit}")
-
-
-def _map(name: str, unit: str, value: Tensor, image: Tensor) -> None:
-    """Refuse a value that is not a map ``[B or 1, 1, H, W]`` for an image, on its device."""
     batch, _, height, width = image.shape
     expected = f"{name} must be [{batch}, 1, {height}, {width}] or [1, 1, {height}, {width}] {unit}"
     if not floating(value):
@@ -230,6 +222,9 @@ def _map(name: str, unit: str, value: Tensor, image: Tensor) -> None:
         raise ValueError(f"{expected} as the image is {list(image.shape)}, got {list(value.shape)}{hint}")
     if value.device != image.device:
         raise ValueError(f"{name} must be on the image's device {image.device}, got {value.device}")
+    if not is_traced():
+        real_tensor("image", image, "[B, C, H, W]")
+        real_tensor(name, value, f"[B, 1, H, W] {unit}")
 
 
 def image_and_depth(image: Tensor, depth: Tensor, values: bool, name: str = "depth") -> None:
@@ -284,10 +279,9 @@ def background(
     like = (image.shape, image.dtype, image.device)
     if not floating(hidden) or (hidden.shape, hidden.dtype, hidden.device) != like:
         raise ValueError(f"background must be like the image, {show(image)}, got {show(hidden)}")
-    _map(name, unit, where, image)
+    image_and_map(image, name, where, unit)
     if not is_traced():
         real_tensor("background", hidden, "[B, C, H, W]")
-        real_tensor(name, where, f"[B, 1, H, W] {unit}")
         if values:
             _check_finite(name, where)
             _check_finite("background", hidden)
@@ -307,8 +301,7 @@ def stretch(image: Tensor, depth: Tensor) -> float:
 
 def is_resizable(image: Any, depth: Any) -> bool:
     """Whether a depth map has another size than an image, but nearly the same aspect ratio."""
-    tensors = all(isinstance(t, Tensor) and not t.is_nested for t in (image, depth))
-    maps = tensors and all(t.ndim == 4 and t.is_floating_point() and t.numel() for t in (image, depth))
+    maps = all(floating(t) and t.ndim == 4 and t.numel() for t in (image, depth))
     if not maps or image.shape[-2:] == depth.shape[-2:] or image.device != depth.device:
         return False
     return depth.shape[0] in (1, image.shape[0]) and depth.shape[1] == 1 and stretch(image, depth) <= _MAX_STRETCH
@@ -341,20 +334,18 @@ def stack(rgba: Tensor, depth_m: Tensor, values: bool) -> Tensor:
     if rgba.ndim != 5 or rgba.shape[2] < 2 or 0 in rgba.shape:
         raise ValueError(f"rgba must be [B, N, C + 1, H, W], premultiplied, got {list(rgba.shape)}")
     batch, count, _, height, width = rgba.shape
-    depth = depth_m
-    if depth.ndim in (1, 2) and depth.shape[-1] == count:
-        depth = depth.reshape(-1, count, 1, 1, 1)
-    if depth.ndim != 5 or depth.shape[0] not in (1, batch) or depth.shape[1:3] != (count, 1):
-        raise ValueError(
-            f"depth_m must be [{count}], [{batch}, {count}] or [B, {count}, 1, H, W], got {[*depth_m.shape]}"
-        )
-    if tuple(depth.shape[3:]) not in ((1, 1), (height, width)):
-        raise ValueError(f"depth_m must have the layers' size {height} x {width}, got {list(depth_m.shape)}")
+    is_short = depth_m.ndim in (1, 2) and depth_m.shape[-1] == count
+    depth = depth_m.reshape(-1, count, 1, 1, 1) if is_short else depth_m
+    is_like_layers = depth.ndim == 5 and depth.shape[0] in (1, batch) and depth.shape[1:3] == (count, 1)
+    if not is_like_layers or tuple(depth.shape[3:]) not in ((1, 1), (height, width)):
+        expected = f"[{count}], [{batch}, {count}] or [B, {count}, 1, H, W] of 1 x 1 or {height} x {width} pixels"
+        raise ValueError(f"depth_m must be {expected}, got {[*depth_m.shape]}")
     if values and not is_traced():
         coverage = rgba[:, :, -1]
         bad = int((~((coverage >= 0) & (coverage <= 1))).sum())
         if bad:
-            message = f"the last channel of rgba is coverage, in [0, 1]; {bad} of {coverage.numel()} values are not"
-            raise ValueError(message)
+            raise ValueError(
+                f"the last channel of rgba is coverage in [0, 1]; {bad} of {coverage.numel()} values are not"
+            )
         _check_finite("rgba", rgba)
     return depth

@@ -229,32 +229,18 @@ def test_a_long_step_shows_a_bar_on_the_terminal_and_results_still_go_to_the_fil
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr(sys, "stdout", file)
     monkeypatch.setenv("TERM", "xterm")
-    with output.Bar("frame 1 of 24", 24):
+    with output.progress_bar("frame 1 of 24", 24):
         pass
     assert terminal.getvalue() == ""
     monkeypatch.setattr(output, "_DELAY_S", 0.0)
-    with output.Bar("", 4) as bar:
+    with output.progress_bar("", 4) as update:
         for done in range(3):
             time.sleep(0.4)
-            bar.update(f"frame {done + 1} of 4", done)
+            update(f"frame {done + 1} of 4", done)
         time.sleep(0.5)
         output.print_result(True, {"out": "a.png"}, "")
     assert "frame 3 of 4" in terminal.getvalue() and re.search(r"0:00:0[01]\S* \S*0:00:0[0-3]", terminal.getvalue())
-    with output.Bar("rendering [out].png"):
+    with output.progress_bar("rendering [out].png"):
         time.sleep(0.5)
     assert "rendering [out].png" in terminal.getvalue()
     assert file.getvalue() == '{"out": "a.png"}\n' and "a.png" not in terminal.getvalue()
-
-
-@pytest.mark.parametrize(("large_px", "options"), [(100, ""), (1000, "--method fold")])
-def test_a_large_image_or_a_fold_shows_an_estimate_of_its_time_only_on_a_terminal(
-    scene: Path, run: Callable[..., str], monkeypatch: pytest.MonkeyPatch, large_px: int, options: str
-) -> None:
-    shown: list[str] = []
-    monkeypatch.setattr(frame, "_LARGE_PX", large_px)
-    monkeypatch.setattr(output.Bar, "update", lambda self, text: shown.append(text))
-    run(f"render image.exr depth.npy -o out.exr --focus-m 2 {options}")
-    assert shown == []
-    monkeypatch.setattr(output, "_is_terminal", lambda: True)
-    run(f"render image.exr depth.npy -o out.exr --focus-m 2 {options}")
-    assert len(shown) == 1 and re.fullmatch(r"rendering out.exr, about \d+ s", shown[0])

@@ -49,11 +49,6 @@ def members(path: Path) -> dict[str, bytes]:
         return {member.name: tar.extractfile(member).read() for member in tar}  # type: ignore[union-attr]
 
 
-def picture(data: bytes, tmp_path: Path, suffix: str = ".png") -> Tensor:
-    (tmp_path / f"read{suffix}").write_bytes(data)
-    return read_image(tmp_path / f"read{suffix}").pixels
-
-
 def test_a_shard_has_each_sample_with_its_parameters(pairs: list[Pair], tmp_path: Path) -> None:
     report = make_shards(tmp_path / "out", shard_rows(pairs, per_shard=5), picture=".exr")
     files = members(tmp_path / "out" / "shard-000000.tar")
@@ -69,9 +64,9 @@ def test_a_shard_has_each_sample_with_its_parameters(pairs: list[Pair], tmp_path
         camera = Camera(facts["focal_length_mm"], facts["f_number"], facts["focus_m"], facts["sensor_width_mm"])
         sharp = read_image(pair.image).pixels
         expected = depth_of_field(sharp, depth[None, None], camera, tolerance=facts["tolerance"], check=False)
-        torch.testing.assert_close(
-            picture(files[f"{key}.blurred.exr"], tmp_path, ".exr"), expected.half().float(), rtol=2e-3, atol=1e-6
-        )
+        (tmp_path / "blurred.exr").write_bytes(files[f"{key}.blurred.exr"])
+        blurred = read_image(tmp_path / "blurred.exr").pixels
+        torch.testing.assert_close(blurred, expected.half().float(), rtol=2e-3, atol=1e-6)
     assert len({json.loads(files[f"{k:08d}.json"])["focus_m"] for k in range(5)}) == 5
 
 
@@ -202,19 +197,6 @@ def test_a_shard_whose_process_ends_between_its_two_files_is_made_again(
     assert made == expected and summary_of(tmp_path / "out").samples == 1
 
 
-def test_a_shard_is_written_completely_or_not_at_all(
-    pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def stopped(path: Path, records: Any) -> None:
-        path.write_bytes(b"half")
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(torchdof.distributed.shards, "_write_tar", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        make_shards(tmp_path / "out", shard_rows(pairs))
-    assert list((tmp_path / "out").iterdir()) == []
-
-
 def test_cameras_may_be_given(pairs: list[Pair], tmp_path: Path) -> None:
     given = [Pair(pairs[0].image, pairs[0].depth, focus_m=1.25, f_number=2.0), Pair(pairs[1].image, pairs[1].depth)]
     make_shards(tmp_path / "out", shard_rows(given), keep=["blurred"])
@@ -224,19 +206,16 @@ def test_cameras_may_be_given(pairs: list[Pair], tmp_path: Path) -> None:
     assert [*files][:2] == ["00000000.blurred.png", "00000000.json"]
 
 
-def test_relative_depth_is_scaled_between_near_m_and_far_m(pairs: list[Pair], tmp_path: Path) -> None:
-    make_shards(tmp_path / "out", shard_rows(pairs), depth={"kind": "relative", "near_m": 1.0, "far_m": 8.0})
-    depth = np.load(io.BytesIO(members(tmp_path / "out" / "shard-000000.tar")["00000000.depth.npy"]))
-    values = torch.from_numpy(np.load(str(pairs[0].depth)))[None, None].float()
-    np.testing.assert_allclose(depth, from_relative(values, 1.0, 8.0)[0, 0].numpy(), rtol=1e-5)
-
-
-def test_a_lens_is_chosen_at_random_and_named(pairs: list[Pair], tmp_path: Path) -> None:
+def test_relative_depth_is_scaled_and_a_lens_is_chosen_at_random_and_named(pairs: list[Pair], tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     blur = RandomDepthOfField(**{**BLUR, "table": [BlurTable.disc(), BlurTable.gaussian()]})
-    RenderShards(tmp_path / "out", blur)(batch(shard_rows(pairs, copies=3)))
+    depth_options = {"kind": "relative", "near_m": 1.0, "far_m": 8.0}
+    RenderShards(tmp_path / "out", blur, depth=depth_options)(batch(shard_rows(pairs, copies=3)))
     files = members(tmp_path / "out" / "shard-000000.tar")
     assert {json.loads(data)["table"] for name, data in files.items() if name.endswith("json")} == {"disc", "gaussian"}
+    values = torch.from_numpy(np.load(str(pairs[0].depth)))[None, None].float()
+    depth = np.load(io.BytesIO(files["00000000.depth.npy"]))
+    np.testing.assert_allclose(depth, from_relative(values, 1.0, 8.0)[0, 0].numpy(), rtol=1e-5)
 
 
 def test_parquet_has_the_same_data(pairs: list[Pair], tmp_path: Path) -> None:
@@ -256,9 +235,8 @@ def test_parquet_has_the_same_data(pairs: list[Pair], tmp_path: Path) -> None:
 def test_webdataset_reads_the_shards(pairs: list[Pair], tmp_path: Path) -> None:
     webdataset = pytest.importorskip("webdataset", reason="webdataset is not installed")
     make_shards(tmp_path / "out", shard_rows(pairs, per_shard=5))
-    read = list(
-        webdataset.WebDataset(str(tmp_path / "out" / "shard-000000.tar"), shardshuffle=False).decode("torchrgb")
-    )
+    shard = str(tmp_path / "out" / "shard-000000.tar")
+    read = list(webdataset.WebDataset(shard, shardshuffle=False).decode("torchrgb"))
     assert [sample["__key__"] for sample in read] == [f"{k:08d}" for k in range(5)]
     assert read[0]["blurred.png"].shape == (3, 12, 16) and read[0]["depth.npy"].shape == (12, 16)
     assert read[0]["json"]["f_number"] > 0

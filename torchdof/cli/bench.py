@@ -28,17 +28,13 @@ class _Speed:
 class _Accuracy:
     """Accuracy."""
 
-    truth: Path | None = option(
-        "Folder with scenes: meta.json, sharp.exr, depth.exr and truth_K.exr, at any depth below it."
-    )
+    truth: Path | None = option("Folder with scenes, at any depth: meta.json, sharp.exr, depth.exr and truth_K.exr.")
     views: tuple[int, ...] = option(
         "Points on the lens for the reference renderer; repeat it to see how it converges.",
         (),
         type=click.IntRange(min=1),
     )
-    degrade: bool = option(
-        "Instead, measure the cost of soft, displaced, coarse or noisy depth; writes degraded.csv and .md.", False
-    )
+    degrade: bool = option("Instead, measure the cost of soft, displaced, coarse or noisy depth.", False)
     peer: tuple[Path, ...] = option("A Python file with another renderer, blur(image, coc_px); may be repeated.", ())
 
 
@@ -46,33 +42,21 @@ class _Accuracy:
 class Bench:
     """Measure speed against error on your own scene, or accuracy where the truth is known.
 
-    Compares each tolerance with the exact rendering on the CPU: time of the first and of a second picture by a camera,
-    memory, RMS error, PSNR and SSIM. Also times a focus pull and fresh processes; with --onnx an exported file, with
-    --compile torch.compile, with --scan several radii and frame sizes:
+    Compares each tolerance with the exact rendering on the CPU: time, memory, RMS error, PSNR and SSIM. The options
+    for camera, depth and blur are those of torchdof render.
 
         torchdof bench photo.png depth.exr --f-number 1.8 --out results
-
-    The options for camera, depth and blur, and their defaults, are those of torchdof render.
 
     Compare torchdof, simpler renderers and GEGL on scenes whose depth of field is known:
 
         torchdof bench --truth scenes --peer examples/benchmarks/tools/gegl.py --out results
-
-    The same with depth that is soft, displaced, coarse or noisy, as real depth is:
-
-        torchdof bench --truth scenes --degrade --out results
-
-    Without --degrade, a picture shows the region of each scene where the error of torchdof is largest: the sharp image,
-    the truth and each renderer.
     """
 
     image: Path | None = argument(
         "Image to measure the speed on; without one, a scene that is built in.", "[IMAGE]", None
     )
     depth: Path | None = argument("Its depth; not needed if IMAGE has a Z channel.", "[DEPTH]", None)
-    out: Path | None = option(
-        "Folder for speed.csv, .md and .png, or accuracy.csv, .md and .png; is made.", names=("--out", "-o")
-    )
+    out: Path | None = option("Folder for tables (.csv, .md) and a picture; is made.", names=("--out", "-o"))
     scene: Scene
     blur: Blur
     speed: _Speed
@@ -89,13 +73,11 @@ class Bench:
     def _measure_accuracy(self, truth: Path) -> None:
         """Checks the options, and measures accuracy on the scenes in a folder."""
         degrade, views = self.accuracy.degrade, self.accuracy.views
-        if self.image is not None or self.speed != _Speed(repeat=self.speed.repeat):
+        others = (self.image, self.scene, self.blur, dataclasses.replace(self.speed, repeat=5))
+        if others != (None, Scene(), Blur(), _Speed()):
             raise ValueError(
-                "--truth measures the scenes of its folder; leave IMAGE and DEPTH out, and --onnx, --compile and --scan"
-            )
-        if self.scene != Scene() or self.blur != Blur():
-            raise ValueError(
-                "the scenes of --truth have their own lens and depth; leave options of these and of blur out"
+                "--truth measures the scenes of its folder with their own lens and depth; leave IMAGE and DEPTH out, "
+                "--onnx, --compile and --scan, and options of lens, depth and blur"
             )
         if self.as_json or self.out is None:
             raise ValueError("--truth writes tables and pictures; give a folder with --out, and leave --json out")
@@ -117,7 +99,7 @@ class Bench:
         if self.out is not None:
             check_writable(self.out / "speed.csv")
         if self.image is not None:
-            check_files(self.image, self.depth, None)
+            check_files(self.image, self.depth)
         for package, is_needed in {"matplotlib": self.out is not None, "onnxruntime": options.onnx}.items():
             if is_needed and importlib.util.find_spec(package) is None:  # check before measuring for minutes
                 raise ModuleNotFoundError(f"no {package}", name=package)

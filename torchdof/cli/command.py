@@ -7,10 +7,9 @@ in ``--help``.
 import contextlib
 import dataclasses
 import inspect
-import math
 import re
 import typing
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Literal
 
 import click
@@ -69,64 +68,77 @@ def word_or_number(words: tuple[str, ...], expected: str) -> Callable[[str], flo
     return lambda text: text if text in words else numbers(1, expected)(text)[0]
 
 
-def positive(_: click.Context, parameter: click.Parameter, value: float | None) -> float | None:
-    """Callback of an option: refuses a number that is not positive and finite; None is allowed."""
-    if value is not None and not 0 < value < math.inf:
-        raise ValueError(f"{parameter.opts[0]} must be positive and finite, got {value:g}")
-    return value
-
-
-@contextlib.contextmanager
-def by_option(names: Mapping[str, str]) -> Iterator[None]:
-    """Replaces names of arguments by names of options (argument -> option) in the message of a ``ValueError``."""
-    try:
-        yield
-    except ValueError as error:
-        pattern = re.compile(r"\b(" + "|".join(names) + r")\b")
-        raise ValueError(pattern.sub(lambda match: names[match.group()], str(error))) from None
+def by_option(message: str, parameters: Iterable[click.Parameter]) -> str:
+    """A message with options in the place of the library's arguments, which may end with a unit: ``tilt_deg``."""
+    names = {f"{p.name}{unit}": p.opts[0] for unit in ("", "_m", "_deg", "_px") for p in parameters}
+    pattern = rf"(^|[(,] ?| (?=\w+=))({'|'.join(names)})(?= must | is | -?\d| inf|=)"
+    return re.sub(pattern, lambda match: match[1] + names[match[2]], message)
 
 
 class _Command(click.Command):
-    """A command whose ``--help`` lists options by group."""
-
-    groups: dict[str | None, str]  # name of a parameter -> heading
+    """A command whose ``--help`` lists options by the heading that each has in its attribute ``heading``."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        rows_by_group: dict[str, list[tuple[str, str]]] = {_BASIC_HEADING: []}
+        rows: dict[str, list[tuple[str, str]]] = {_BASIC_HEADING: []}
         for parameter in self.get_params(ctx):
             row = parameter.get_help_record(ctx)
-            if row is not None and not isinstance(parameter, click.Argument):
-                rows_by_group.setdefault(self.groups.get(parameter.name, _BASIC_HEADING), []).append(row)
-        for group, rows in rows_by_group.items():
-            with formatter.section(group):
-                formatter.write_dl(rows, col_max=28)
+            if row is not None and isinstance(parameter, click.Option):
+                rows.setdefault(getattr(parameter, "heading", _BASIC_HEADING), []).append(row)
+        for heading, rows_of_heading in rows.items():
+            with formatter.section(heading):
+                formatter.write_dl(rows_of_heading, col_max=28)
 
 
 def command_of(name: str, kind: type[Any]) -> click.Command:
     """The command that makes a ``kind`` of its arguments and runs it; the docstring of ``kind`` is the help."""
     parameters, help_text = list(_parameters(kind, _BASIC_HEADING)), inspect.getdoc(kind) or ""
-    command = _Command(
+    return _Command(
         name,
-        params=[parameter for parameter, _ in parameters],
+        params=parameters,
         help=help_text,
         short_help=" ".join(help_text.partition("\n\n")[0].split()),
-        no_args_is_help=any(parameter.required for parameter, _ in parameters),
+        no_args_is_help=any(parameter.required for parameter in parameters),
         callback=lambda **values: _instance(kind, values).run(),
         context_settings={"max_content_width": 120},
     )
-    command.groups = {parameter.name: group for parameter, group in parameters}
-    return command
 
 
-def _parameters(kind: type[Any], group: str) -> Iterator[tuple[click.Parameter, str]]:
-    """Arguments and options for the fields of a class and of the groups in it, each with its heading."""
+def _parameters(kind: type[Any], heading: str) -> Iterator[click.Parameter]:
+    """Arguments and options for the fields of a class and of the groups in it."""
     hints = typing.get_type_hints(kind)
     for field in dataclasses.fields(kind):
         hint = hints[field.name]
         if dataclasses.is_dataclass(hint):
             yield from _parameters(hint, (hint.__doc__ or "").rstrip("."))  # type: ignore[arg-type]
         else:
-            yield _parameter(field, hint), field.metadata["group"] or group
+            parameter = _parameter(field, hint)
+            parameter.heading = field.metadata["group"] or heading  # type: ignore[attr-defined]
+            yield parameter
+
+
+def _parameter(field: Any, hint: Any) -> click.Parameter:
+    """Argument or option for a field of type ``hint``; a tuple without a ``read`` of its own takes several values."""
+    given = field.metadata["details"]
+    required = field.default is dataclasses.MISSING
+    takes_several = typing.get_origin(hint) is tuple and "callback" not in given
+    if typing.get_args(hint) and typing.get_origin(hint) is not Literal:  # X | None, tuple[X, ...]
+        hint = typing.get_args(hint)[0]
+    kind = click.Choice(typing.get_args(hint)) if typing.get_origin(hint) is Literal else hint
+    details = {"type": kind, "required": required, **given}
+    if not required and field.default not in (None, ()):
+        details["default"] = field.default
+    if field.metadata["names"] == ("argument",):
+        return click.Argument([field.name], nargs=-1 if takes_several else 1, **details)
+    if hint is bool:
+        details["is_flag"] = True
+    else:
+        details |= {"multiple": takes_several, "show_default": bool(field.default) and not required}
+    return click.Option([field.name, *_spellings(field)], **details)
+
+
+def _spellings(field: Any) -> tuple[str, ...]:
+    names: tuple[str, ...] = field.metadata["names"]
+    return (field.name.upper(),) if names == ("argument",) else names or (f"--{field.name.replace('_', '-')}",)
 
 
 def options_of(command: Any) -> dict[str, Any]:
@@ -136,30 +148,6 @@ def options_of(command: Any) -> dict[str, Any]:
         value = getattr(command, field.name)
         values |= options_of(value) if dataclasses.is_dataclass(value) else {_spellings(field)[0]: value}
     return values
-
-
-def _spellings(field: Any) -> tuple[str, ...]:
-    names: tuple[str, ...] = field.metadata["names"]
-    return (field.name.upper(),) if names == ("argument",) else names or (f"--{field.name.replace('_', '-')}",)
-
-
-def _parameter(field: Any, hint: Any) -> click.Parameter:
-    """Argument or option for a field of type ``hint``; a tuple without a ``read`` of its own takes several values."""
-    details = dict(field.metadata["details"])
-    required = field.default is dataclasses.MISSING
-    takes_several = typing.get_origin(hint) is tuple and "callback" not in details
-    if typing.get_args(hint) and typing.get_origin(hint) is not Literal:  # X | None, tuple[X, ...]
-        hint = typing.get_args(hint)[0]
-    details.setdefault("type", click.Choice(typing.get_args(hint)) if typing.get_origin(hint) is Literal else hint)
-    if not required and field.default not in (None, ()):
-        details["default"] = field.default
-    if field.metadata["names"] == ("argument",):
-        return click.Argument([field.name], nargs=-1 if takes_several else 1, required=required, **details)
-    if hint is bool:
-        details["is_flag"] = True
-    else:
-        details |= {"multiple": takes_several, "show_default": bool(field.default) and not required}
-    return click.Option([field.name, *_spellings(field)], required=required, **details)
 
 
 def _instance(kind: type[Any], values: dict[str, Any]) -> Any:

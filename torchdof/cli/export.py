@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..io.atomic import check_writable
-from .command import by_option, option
+from .command import option
 from .lens import Sensor
 from .options import Accuracy, Blur, json_option
-from .output import Bar, print_result
+from .output import print_result, progress_bar
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -26,17 +26,12 @@ class _Graph:
     """Graph."""
 
     inputs: Literal["depth", "coc_px"] = option(
-        "The map the graph takes: depth in metres, with focus and f-number as inputs; or the signed blur radius in "
-        "pixels.",
-        "depth",
+        "Depth in metres, with focus and f-number as further inputs; or the signed blur radius in pixels.", "depth"
     )
     channels: int = option("Channels of the image.", 3)
-    width: int | None = option(
-        "Image width whose kernels the file holds, for a table in millimetres or fractions of the width."
-    )
+    width: int | None = option("Image width whose kernels the file holds, for a table in millimetres or fractions.")
     layout: Literal["tiles", "whole"] = option(
-        "tiles: loops that skip work, for CPUs. whole: straight operations on whole frames, for GPUs and browsers; "
-        "without rays of highlights.",
+        "tiles skip work, for CPUs; whole is a straight graph without rays of highlights, for GPUs and browsers.",
         "tiles",
     )
     size: tuple[int, int] | None = option(
@@ -62,10 +57,6 @@ class Export:
     For a GPU, with frames of one size:
 
         torchdof export -o dof.onnx --layout whole --size 1920x1080 --max-coc 16
-
-    Print the metadata of a file:
-
-        torchdof export --show dof.onnx
     """
 
     out: Path | None = option("The file to write.", names=("--out", "-o"))
@@ -79,35 +70,30 @@ class Export:
 
     def run(self) -> None:
         """Writes a file, or prints the metadata of one."""
-        if (self.out is None) == (self.show is None):
-            raise ValueError("give either -o FILE to write or --show FILE to read")
-        if self.show is not None:
+        if self.show is not None and self.out is None:
             from torchdof.export.metadata import describe
 
             metadata = describe(self.show)
-            print_result(self.as_json, metadata, _lines(metadata))
-        elif self.out is not None:
-            self._write(self.out)
-
-    def _write(self, out: Path) -> None:
-        if out.suffix != ".onnx":
-            raise ValueError(f"the file is ONNX: name it {out.with_suffix('.onnx')}")
-        check_writable(out)
+            return print_result(self.as_json, metadata, _lines(metadata))
+        if self.out is None or self.show is not None:
+            raise ValueError("give either -o FILE to write or --show FILE to read")
+        if self.out.suffix != ".onnx":
+            raise ValueError(f"the file is ONNX: name it {self.out.with_suffix('.onnx')}")
+        check_writable(self.out)
         from torchdof import Camera, DepthOfField
         from torchdof.export.conversion import to_onnx
 
         if self.sensor.fov_deg is None:
-            stated = {name: getattr(self.sensor, name) for name in ("focal_length_mm", "sensor_width_mm")}
-            camera = Camera(**{name: value for name, value in stated.items() if value is not None})
+            camera = Camera(**{name: value for name, value in vars(self.sensor).items() if value is not None})
         else:
             camera = Camera.from_fov(self.sensor.fov_deg, 0.01, 2.0)  # aperture and focus are inputs of the graph
         options = {"depth_edges": "as given", **self.accuracy.arguments(), "max_coc_px": self.max_coc, "check": False}
-        table = self.blur.table_of(self.blur.table)
-        with Bar("tracing") as bar, by_option({"max_coc_px": "--max-coc", "width=": "--width "}):
-            dof = DepthOfField(camera, table, **options)
+        with progress_bar("tracing") as update:
+            dof = DepthOfField(camera, self.blur.table_of(self.blur.table), **options)
             graph = dataclasses.asdict(self.graph)
-            report = to_onnx(dof, out, **graph, depth_edges=dof.options.depth_edges, progress=bar.update)
-        print_result(self.as_json, {"out": str(out), **dataclasses.asdict(report)}, f"{report}\nwrote {out}")
+            report = to_onnx(dof, self.out, **graph, depth_edges=dof.options.depth_edges, progress=update)
+        facts = {"out": str(self.out), **dataclasses.asdict(report)}
+        print_result(self.as_json, facts, f"{report}\nwrote {self.out}")
 
 
 def _lines(facts: Mapping[str, Any], indent: str = "") -> str:

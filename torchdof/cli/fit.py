@@ -52,11 +52,9 @@ class _Photographs:
         "One dot; the centre of a grid; each dot of it, a table a place; or one table across the field.", "manifest"
     )
     colours: Literal["manifest", "mean", "each"] = option(
-        "Fit the mean of the colours; or each, which makes a table with a kernel a colour.", "manifest"
+        "Fit the mean of the colours, or each: a table with a kernel a colour.", "manifest"
     )
-    root: Path | None = option(
-        "Folder that capture.toml and all pictures must lie in; by default they may lie anywhere."
-    )
+    root: Path | None = option("Folder that capture.toml and all pictures must lie in. Default: anywhere.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,8 +67,7 @@ class _Lens:
     nodes: int | None = option("Distances traced; by default as many as keep pictures to 50 dB.")
     field_deg: float = option("Angle from the axis, degrees: 0 is the frame's centre.", 0.0)
     field: tuple[float, ...] | None = option(
-        "Trace spots at these distances from the frame's middle: one table across the field; from 0 to 21.6 for full "
-        "frame.",
+        "One table across the field, of spots at these distances from the middle; to 21.6 for full frame.",
         metavar="0,MM,MM,...",
         read=_radii,
     )
@@ -83,30 +80,25 @@ class _Lens:
 class Fit:
     """Make a blur table from photographs of a dot, or from a lens prescription.
 
-    Photograph a white dot on black paper in focus and, without refocusing, at other distances; describe the
-    pictures in capture.toml (see docs/measuring.md); then
+    From photographs of a white dot on black paper, described in capture.toml (see docs/measuring.md):
 
         torchdof fit my-lens/ -o my-lens.json --plots pictures/
 
-    Or print a target and photograph it; no capture.toml is needed (see docs/phone.md):
+    From photographs of a printed target (see docs/phone.md):
 
         torchdof fit --target target.pdf
 
         torchdof fit photographs/ -o my-phone.json
 
-    Or trace a lens:
+    From a lens, on its axis, or from the middle to the corner with cat's eyes and coma:
 
         torchdof fit --lens double_gauss_50mm --f-number 2 --focus-m 2 -o double-gauss.json
-
-    Or trace it across the frame, from the middle to the corner, with cat's eyes and coma:
 
         torchdof fit --lens double_gauss_50mm --field 0,4,8,12,16,20,21.6 -o across-the-field.json
     """
 
     captures: Path | None = argument(
-        "Folder with photographs: of a dot with their capture.toml, or of the printed target as they come.",
-        "[CAPTURES]",
-        None,
+        "Folder with photographs: of a dot with their capture.toml, or of the printed target.", "[CAPTURES]", None
     )
     out: Path = option("The table to write (JSON).", Path("table.json"), names=("--out", "-o"))
     plots: Path | None = option("Folder for pictures of the fits and the table.")
@@ -117,7 +109,7 @@ class Fit:
 
     def run(self) -> None:
         """Checks the options, then makes the table, or writes the target to print."""
-        lens, target, lens_options = self.lens.lens, self.target.target, self.lens
+        lens, target, options = self.lens.lens, self.target.target, self.lens
         if target is not None and (self.captures is not None or lens is not None):
             raise ValueError("--target writes the page to print; give it alone, and the photographs afterwards")
         if target is None and (self.captures is None) == (lens is None):
@@ -126,9 +118,9 @@ class Fit:
             raise ValueError("--root is the folder of photographs; leave it out with --lens")
         if self.out.suffix != ".json":
             raise ValueError(f"{self.out}: the table is written as JSON: name it {self.out.with_suffix('.json')}")
-        if lens is not None and not 0 <= lens_options.field_deg < 90:
-            raise ValueError(f"--field-deg must be 0 to 90 degrees from the axis, got {lens_options.field_deg:g}")
-        if lens is not None and lens_options.field is not None and lens_options.field_deg:
+        if not 0 <= options.field_deg < 90:
+            raise ValueError(f"--field-deg must be 0 to 90 degrees from the axis, got {options.field_deg:g}")
+        if options.field is not None and options.field_deg:
             raise ValueError("--field-deg averages one place, --field traces several; give one of them")
         if target is not None:
             from torchdof.fit.photo.target import write_target

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ from rich.console import Console
 
 from torchdof import BlurTable, blur_by_coc
 from torchdof.cli.options import make_folder_of
-from torchdof.cli.output import Bar, json_line
+from torchdof.cli.output import json_line, progress_bar
 from torchdof.fit.lens import trace
 from torchdof.fit.lens.lens import RGB_UM, Lens
 from torchdof.fit.photo.across import table_of_dots
@@ -28,16 +28,15 @@ from torchdof.validation import number
 
 if TYPE_CHECKING:
     from torchdof.cli.fit import Fit
-    from torchdof.fit.result import BlurFit
 
 
 def trace_lens(command: Fit, source: str) -> None:
     """Traces the table of a lens, prints a summary, and writes the table."""
-    lens, options = Lens.read(source), command.lens
+    lens, options, console = Lens.read(source), command.lens, _console(command)
     focal = lens.paraxial().focal_length
     number("--focus-m", options.focus_m, low=focal / 1000, unit="metres", infinite=True)
     image_mm = focal / (1 - focal / 1000 / options.focus_m)
-    with Bar(f"tracing {source}"):
+    with progress_bar(f"tracing {source}"):
         table = trace.trace_table(
             lens,
             f_number=options.f_number,
@@ -47,26 +46,29 @@ def trace_lens(command: Fit, source: str) -> None:
             wavelengths_um=RGB_UM if options.wavelengths == () else options.wavelengths,
             field=options.field,
         )
-    printer, facts, coc = FitPrinter(quiet=command.as_json), table.provenance, table.coc.tolist()
-    printer.say(
+    facts, coc = table.provenance, table.coc.tolist()
+    console.print(
         f"{facts['lens']}: {facts['focal_length_mm']:g} mm, f/{facts['f_number']:g}, focus {facts['focus_m']} m; "
         f"{len(coc)} distances from {facts['nearest_m']:.3g} m to infinity, circles of confusion "
         f"from {coc[0]:+.3f} to {coc[-1]:+.3f} mm"
     )
     if table.residual is not None:
         median, largest = 100 * float(table.residual.median()), 100 * float(table.residual.max())
-        printer.say(f"family: {table.family}, residual {median:.2f} %, {largest:.2f} % at most")
+        console.print(f"family: {table.family}, residual {median:.2f} %, {largest:.2f} % at most")
     if table.field is not None:
-        printer.say(f"across the field: {table.field.radius.tolist()} mm from the middle")
-    printer.write(table, command.out)
-    printer.facts({"out": str(command.out), "family": table.family, **facts})
+        console.print(f"across the field: {table.field.radius.tolist()} mm from the middle")
+    _write(console, table, command.out)
+    if command.as_json:
+        print(json_line({"out": str(command.out), "family": table.family, **facts}))
     if command.plots is not None:
-        printer.draw(table, command.plots, command.out.stem)
+        from torchdof.fit.plots import picture_of_table
+
+        _save(console, picture_of_table(table), command.plots / f"{command.out.stem}_table.png")
 
 
 def fit_photographs(command: Fit, folder: Path) -> None:
     """Fits photographs of the target, or the dots of a manifest, prints the fits, and writes their tables."""
-    options, photographs, printer = command.photographs, None, FitPrinter(quiet=command.as_json)
+    options, photographs, console = command.photographs, None, _console(command)
     colours, dots = (None if value == "manifest" else value for value in (options.colours, options.dots))
     with _collected_warnings() as reading_warnings:
         if folder.is_dir() and not (folder / MANIFEST).is_file():
@@ -74,7 +76,7 @@ def fit_photographs(command: Fit, folder: Path) -> None:
             square_mm = command.target.square_mm
             photographs = read_photographs(folder, square_mm=square_mm, colours=mode, root=options.root)
             capture_sets = [photographs.captures]
-            printer.photographs(photographs)
+            _print_photographs(console, photographs)
         else:
             capture_sets = read_captures(str(folder), dots=dots, colours=colours, root=options.root)  # type: ignore[arg-type]
     across_field = photographs is None and capture_sets[0].notes["dots"] == "field"
@@ -84,32 +86,40 @@ def fit_photographs(command: Fit, folder: Path) -> None:
         table_file = command.out
         if len(capture_sets) > 1:
             table_file = command.out.with_name(f"{command.out.stem}_{i:02d}.json")
-            printer.say(f"dot {i} at {captures.notes['position_px']} px from the centre")
-        with _collected_warnings() as fit_warnings, Bar("fitting") as bar:
+            console.print(f"dot {i} at {captures.notes['position_px']} px from the centre")
+        with _collected_warnings() as fit_warnings, progress_bar("fitting") as update:
             result = fit_captures(
                 captures,
                 options.family,
                 accuracy_db=options.accuracy_db,
-                progress=lambda done, total, what, bar=bar: bar.update(what, done, total),  # type: ignore[misc]
+                progress=lambda done, total, what, update=update: update(what, done, total),  # type: ignore[misc]
                 command=command_line,
                 scale_of=fitted[0][1] if fitted else None,  # all dots use the scale of the one nearest to the centre
             )
         messages = [*reading_warnings, *fit_warnings]
         fitted.append((captures, result))
-        printer.fit(captures, result, [message for message in messages if message not in printed])
+        _print_fit(console, captures, result, [message for message in messages if message not in printed])
         printed.update(messages)
         if not across_field:
-            printer.write(result.table, table_file)
+            _write(console, result.table, table_file)
         facts = {"out": str(table_file), **_facts_of(captures, result), "warnings": messages}
         if photographs is not None:
-            printer.sheet(photographs, result, command.out.with_suffix(".png"))
+            _draw_sheet(console, photographs, result, command.out.with_suffix(".png"))
             facts["advice"] = list(photographs.advice)
-        printer.facts(facts)
+        if command.as_json:
+            print(json_line(facts), flush=True)
         if command.plots is not None and photographs is None:
-            fits = zip((pair.distance_m for pair in captures), result.fits, strict=True)
-            printer.draw(result.table, command.plots, table_file.stem, fits)
+            from torchdof.fit.plots import picture_of_fit, picture_of_table
+
+            pictures = {
+                f"{1000 * pair.distance_m:.0f}mm": picture_of_fit(fit)
+                for pair, fit in zip(captures, result.fits, strict=True)
+            }
+            pictures["table"] = picture_of_table(result.table)
+            for name, picture in pictures.items():
+                _save(console, picture, command.plots / f"{table_file.stem}_{name}.png")
     if across_field:
-        printer.write(table_of_dots(fitted), command.out)
+        _write(console, table_of_dots(fitted), command.out)
 
 
 @contextmanager
@@ -123,7 +133,7 @@ def _collected_warnings() -> Iterator[list[str]]:
 
 
 def _facts_of(captures: Captures, result: TableFit) -> dict[str, Any]:
-    """The results that :meth:`FitPrinter.fit` prints, as data for JSON."""
+    """The results that :func:`_print_fit` prints, as data for JSON."""
     of_fit = ("params", "stderr", "residual", "residual_over_noise", "magnification")
     of_colour = ("name", "focus_shift_dioptres", "lateral_px")
     return {
@@ -140,98 +150,79 @@ def _facts_of(captures: Captures, result: TableFit) -> dict[str, Any]:
     }
 
 
-class FitPrinter:
-    """Prints results and draws pictures; with ``quiet`` it prints JSON only."""
+def _console(command: Fit) -> Console:
+    """The console for text for people, silent with ``--json``."""
+    return Console(soft_wrap=True, quiet=command.as_json, markup=False, highlight=False)
 
-    def __init__(self, quiet: bool) -> None:
-        self._console = Console(soft_wrap=True, quiet=quiet, markup=False, highlight=False)
 
-    def say(self, text: str, style: str = "") -> None:
-        """Prints text for people, unless quiet."""
-        self._console.print(text, style=style)
+def _print_photographs(console: Console, photographs: Photographs) -> None:
+    """Prints distance, size, brightness and sharpness of each photograph, and advice for better ones."""
+    sharp, pictures = photographs.captures.notes["sharp"], photographs.pictures
+    columns = {
+        "file": [picture.file for picture in pictures],
+        "distance m": [f"{picture.distance_m:.3f}" for picture in pictures],
+        "square px": [f"{picture.target.side_px:.0f}" for picture in pictures],
+        "paper %": [f"{100 * picture.target.white:.0f}" for picture in pictures],
+        "edge px": [f"{1 / picture.sharpness:.1f}" for picture in pictures],
+        "": ["in focus" if picture.file == sharp else "" for picture in pictures],
+    }
+    print_columns(console, "the target in the photographs", columns)
+    for sentence in photographs.advice:
+        console.print(f"better: {sentence}", style="cyan")
 
-    def facts(self, facts: dict[str, Any]) -> None:
-        """Prints one line of JSON, if quiet."""
-        if self._console.quiet:
-            print(json_line(facts), flush=True)
 
-    def photographs(self, photographs: Photographs) -> None:
-        """Prints distance, size, brightness and sharpness of each photograph, and advice for better ones."""
-        sharp, pictures = photographs.captures.notes["sharp"], photographs.pictures
-        columns = {
-            "file": [picture.file for picture in pictures],
-            "distance m": [f"{picture.distance_m:.3f}" for picture in pictures],
-            "square px": [f"{picture.target.side_px:.0f}" for picture in pictures],
-            "paper %": [f"{100 * picture.target.white:.0f}" for picture in pictures],
-            "edge px": [f"{1 / picture.sharpness:.1f}" for picture in pictures],
-            "": ["in focus" if picture.file == sharp else "" for picture in pictures],
-        }
-        print_columns(self._console, "the target in the photographs", columns)
-        for sentence in photographs.advice:
-            self.say(f"better: {sentence}", "cyan")
-
-    def fit(self, captures: Captures, result: TableFit, messages: Sequence[str]) -> None:
-        """Prints the fits at all distances, the reason for the family, and warnings."""
-        fits = result.fits
-        columns = {
-            "distance m": [f"{pair.distance_m:.4g}" for pair in captures],
-            "coc px": [f"{coc:+.2f}" for coc in result.coc_px],
-            "measured": [f"{f.radius:.2f}" for f in fits],
-            **{n: [f"{f.params[n]:.3f} ± {f.stderr[n]:.2g}" for f in fits] for n in fits[0].params if n != "values"},
-            "residual %": [f"{100 * f.residual:.2f}" for f in fits],
-            "x noise": [f"{f.residual_over_noise:.2f}".replace("nan", "") for f in fits],
-            "magnified": [f"{f.magnification:.4f}" for f in fits],
-        }
-        title = f"{captures.name or 'captures'}: {fits[0].family}, focus {captures.focus_m:.4g} m"
-        print_columns(self._console, title, columns)
-        self.say(f"family: {result.why}")
-        how = "from focal length and f-number" if result.scale == "camera" else "measured, the thin lens in between"
-        self.say(f"circles of confusion: {how}")
-        if result.colours:
-            self._colours(captures, result)
-        for message in messages:
-            self.say(f"warning: {message}", "yellow")
-
-    def _colours(self, captures: Captures, result: TableFit) -> None:
-        """Prints focus distance, radius and lateral displacement of each colour."""
+def _print_fit(console: Console, captures: Captures, result: TableFit, messages: Sequence[str]) -> None:
+    """Prints the fits at all distances, the reason for the family, the colours, and warnings."""
+    fits = result.fits
+    columns = {
+        "distance m": [f"{pair.distance_m:.4g}" for pair in captures],
+        "coc px": [f"{coc:+.2f}" for coc in result.coc_px],
+        "measured": [f"{f.radius:.2f}" for f in fits],
+        **{n: [f"{f.params[n]:.3f} ± {f.stderr[n]:.2g}" for f in fits] for n in fits[0].params if n != "values"},
+        "residual %": [f"{100 * f.residual:.2f}" for f in fits],
+        "x noise": [f"{f.residual_over_noise:.2f}".replace("nan", "") for f in fits],
+        "magnified": [f"{f.magnification:.4f}" for f in fits],
+    }
+    title = f"{captures.name or 'captures'}: {fits[0].family}, focus {captures.focus_m:.4g} m"
+    print_columns(console, title, columns)
+    how = "from focal length and f-number" if result.scale == "camera" else "measured, the thin lens in between"
+    console.print(f"family: {result.why}\ncircles of confusion: {how}")
+    if result.colours:
         vergences = [1 / captures.focus_m + colour.focus_shift_dioptres for colour in result.colours]
         focuses = [f"{1 / v:.4g}" if v > 0 else "" if math.isnan(v) else "beyond infinity" for v in vergences]
         columns = {"": [colour.name for colour in result.colours], "focus m": focuses}
         for i, pair in enumerate(captures):
-            fits = [colour.fits[i] for colour in result.colours]
-            columns[f"radius px at {pair.distance_m:g} m"] = [f"{f.radius:.2f} ± {f.radius_stderr:.2g}" for f in fits]
+            radii = [f"{c.fits[i].radius:.2f} ± {c.fits[i].radius_stderr:.2g}" for c in result.colours]
+            columns[f"radius px at {pair.distance_m:g} m"] = radii
         lateral = [colour.lateral_px[0] for colour in result.colours]
         columns["lateral px in focus"] = [f"({x:+.2f}, {y:+.2f})" for x, y in lateral]
-        print_columns(self._console, "colours, beside green", columns)
-        self.say("the table holds a kernel a colour; lateral colour is no blur, and not in it")
+        print_columns(console, "colours, beside green", columns)
+        console.print("the table holds a kernel a colour; lateral colour is no blur, and not in it")
+    for message in messages:
+        console.print(f"warning: {message}", style="yellow")
 
-    def write(self, table: BlurTable, target: Path) -> None:
-        """Writes a table and prints its path."""
-        make_folder_of(target)
-        table.save(target)
-        self.say(f"{target}: {table!r}")
 
-    def sheet(self, photographs: Photographs, result: TableFit, target: Path) -> None:
-        """Draws photographs, fits and a rendering on one sheet; without matplotlib it prints a message."""
-        try:
-            from torchdof.fit.plots import sheet_of_photographs
+def _draw_sheet(console: Console, photographs: Photographs, result: TableFit, target: Path) -> None:
+    """Draws photographs, fits and a rendering on one sheet; without matplotlib it prints a message."""
+    try:
+        from torchdof.fit.plots import sheet_of_photographs
 
-            sheet = sheet_of_photographs(photographs, result, lambda *scene: blur_by_coc(*scene[:2], table=scene[2]))
-        except ModuleNotFoundError as error:
-            self.say(f"no sheet of pictures: {error.name} is not installed (pip install torchdof[plot])")
-        else:
-            self._save(sheet, target)
+        sheet = sheet_of_photographs(photographs, result, lambda *scene: blur_by_coc(*scene[:2], table=scene[2]))
+    except ModuleNotFoundError as error:
+        console.print(f"no sheet of pictures: {error.name} is not installed (pip install torchdof[plot])")
+    else:
+        _save(console, sheet, target)
 
-    def draw(self, table: BlurTable, folder: Path, stem: str, fits: Iterable[tuple[float, BlurFit]] = ()) -> None:
-        """Draws the fit at each distance in m, and the table over depth; `torchdof tables` draws its kernels."""
-        from torchdof.fit import plots
 
-        for distance_m, fit in fits:
-            self._save(plots.picture_of_fit(fit), folder / f"{stem}_{distance_m * 1000:.0f}mm.png")
-        self._save(plots.picture_of_table(table), folder / f"{stem}_table.png")
+def _write(console: Console, table: BlurTable, target: Path) -> None:
+    """Writes a table and prints its path."""
+    make_folder_of(target)
+    table.save(target)
+    console.print(f"{target}: {table!r}")
 
-    def _save(self, figure: Any, target: Path) -> None:
-        """Writes a figure, whole or not at all, and prints its path."""
-        with atomic_file(target) as temporary:
-            figure.savefig(temporary)
-        self.say(str(target))
+
+def _save(console: Console, figure: Any, target: Path) -> None:
+    """Writes a figure, whole or not at all, and prints its path."""
+    with atomic_file(target) as temporary:
+        figure.savefig(temporary)
+    console.print(str(target))

@@ -1,10 +1,7 @@
 """Reads, renders and writes one frame for ``torchdof render``; other commands use parts of it."""
 
 import dataclasses
-import functools
-import math
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,19 +18,18 @@ from ..io.images import Picture, read_image, read_values, write_image
 from ..io.sheet import shrunk, write_sheet
 from ..module import blur_by_coc
 from ..optics.blur_table import BlurTable
-from ..optics.camera import Camera
+from ..optics.camera import CAMERA_NUMBERS, Camera
 from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect, stretch
-from .lens import VISIBLE_PX, Area, centred_coc_px
+from .lens import Area
 from .options import Scene, make_folder_of
-from .output import Bar, Notices, print_result
+from .output import Notices, print_result
 
 if TYPE_CHECKING:
     from .render import Render
 
-_LARGE_PX = 8_000_000  # pixels of an image; the bar shows the expected time of larger ones, and of --method fold
-_STRIPS = 16  # number of strips of an image, of which one is timed
+_VISIBLE_PX = 2.0  # px; a note advises more blur if the largest radius is below
 _WITHOUT_EXIF = (".hdr", ".pfm")  # types in which OpenImageIO writes no EXIF data
 _PANEL_PX = 800  # px; longer side of a panel on a sheet
 
@@ -50,7 +46,6 @@ class Frame:
     filled: int  # number of filled holes, in pixels
     remarks: list[str]  # changes of the depth, and assumptions about it, that no option states
     guess: str  # message about the guessed kind of depth, or empty
-    seconds: float  # time of reading
 
     def mistakes(self, camera: Camera) -> list[Mistake]:
         """Likely mistakes in the depth, given the camera."""
@@ -67,7 +62,7 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
     A depth of the kind "auto" is guessed. Holes are filled as the options state. Without that option they stay NaN
     if ``holes`` is true; otherwise they are filled as the guess proposes, or raise ``ValueError``.
     """
-    start, source, guess = time.perf_counter(), depth or image, ""
+    source, guess = depth or image, ""
     picture, depth_map = read_image(image, **encoding), scene.depth_map
     height, width = picture.pixels.shape[-2:]
     area = Area(0, 0, width, height)
@@ -86,36 +81,35 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
         depth_map, guess = depth_map.guessed(values, source, scene.lens.states_metres)
         fill = fill if holes else depth_map.fill_depth
     kind: Any = depth_map.depth_kind
-    if kind == "coc" and values.shape[-2:] != (height, width):
-        rows, columns = values.shape[-2:]
+    rows, columns = values.shape[-2:]
+    if kind == "coc" and (rows, columns) != (height, width):
         problem = f"coc is {columns} x {rows} pixels but the image is {width} x {height}; they must be the same"
         raise ValueError(f"{source}: {problem}")
-    centred_width = width + abs(area.width - 2 * area.x - width)
-    view_deg = scene.lens.view_deg(picture.metadata, centred_width, area) if kind == "distance" else None
-    unknown, filled, place = depth_map.depth_unknown, 0, (...,)
+    unknown, filled, place, view_deg = depth_map.depth_unknown, 0, (...,), None
+    if kind == "distance":
+        centred_width = width + abs(area.width - 2 * area.x - width)
+        view_deg = scene.lens.view_deg(picture.metadata, centred_width, area)
     try:
         same_aspect(picture.pixels, values)
         stretched = stretch(picture.pixels, values)
         if kind == "relative":
-            value_kind: Any = depth_map.relative_kind or "disparity"
-            values = from_relative(
-                values, *depth_map.ends_m, value_kind, value_range=depth_map.value_range, unknown=unknown
-            )
+            value_kind, value_range = depth_map.relative_kind or "disparity", depth_map.value_range
+            values = from_relative(values, *depth_map.ends_m, value_kind, value_range=value_range, unknown=unknown)
         else:
-            conversion: dict[str, Any] = {"scale": depth_map.depth_scale, "offset": depth_map.depth_offset}
+            scale, offset = depth_map.depth_scale, depth_map.depth_offset
             if kind == "distance":
                 values, place = area.centred(values, (height, width))
-            values = depth_from_values(values, kind, **conversion, unknown=unknown, fov_x_deg=view_deg)[place]
+            values = depth_from_values(values, kind, scale=scale, offset=offset, unknown=unknown, fov_x_deg=view_deg)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
-    values = values if kind == "coc" else at_size_of(picture.pixels, values)
+    values = values if kind == "coc" else at_size_of(picture.pixels, values[place])
     if fill is not None or not holes:
         values, filled = resolve_holes(values, str(source), fill, kind in ("relative", "coc"))
     remarks = [f"depth stretched by {stretched:.1%}"] if stretched else []
     if kind == "relative" and None in (depth_map.near_m, depth_map.far_m):
         remarks.append("depth from {:g} to {:g} m assumed".format(*depth_map.ends_m))
     scene = dataclasses.replace(scene, depth_map=dataclasses.replace(depth_map, fill_depth=fill))
-    return Frame(str(source), scene, picture, area, values, filled, remarks, guess, time.perf_counter() - start)
+    return Frame(str(source), scene, picture, area, values, filled, remarks, guess)
 
 
 def coc_of(
@@ -125,14 +119,14 @@ def coc_of(
 
     ``number`` is the frame number, at which the focus is interpolated between keyframes.
     """
-    depth_map, lens, values = frame.scene.depth_map, frame.scene.lens, frame.values
+    depth_map, values = frame.scene.depth_map, frame.values
     if depth_map.depth_kind == "coc":
         notices.warn(frame.name, coc_mistakes(values))
         return values, None, []
     metadata, is_to_scale = frame.picture.metadata, depth_map.is_to_scale
-    camera, remarks = lens.camera(metadata, values, number, is_still, is_to_scale, frame.area)
-    coc_px = centred_coc_px(camera, values, frame.area)
-    coc_of_lens(coc_px, values, lens.stated(camera))
+    camera, remarks = frame.scene.lens.camera(metadata, values, frame.area, number, is_still, is_to_scale)
+    coc_px = frame.area.coc_px(camera, values)
+    coc_of_lens(coc_px, values, {name: getattr(camera, name) for name in CAMERA_NUMBERS})
     notices.warn(frame.name, frame.mistakes(camera))
     return coc_px, camera, remarks + frame.remarks
 
@@ -147,16 +141,17 @@ class Rendered:
     """A rendered picture, and what its report needs."""
 
     out: Path  # file to write
-    frame: Frame  # with all remarks, and the time of reading and rendering
+    frame: Frame  # with all remarks
     picture: Picture
     coc_px: Tensor
     camera: Camera | None
+    seconds: float
 
 
 class Renderer:
     """Reads, renders and writes the frames of ``torchdof render``."""
 
-    def __init__(self, command: "Render", scene: Scene, is_still: bool, is_animation: bool = False) -> None:
+    def __init__(self, command: "Render", scene: Scene, is_still: bool, is_animation: bool) -> None:
         self.command, self.scene, self.is_still, self.is_animation = command, scene, is_still, is_animation
         self.table, self.device = command.blur.table_of(command.blur.table), _device(command.device)
         self.notices = Notices(scene.depth_map.strict)
@@ -166,8 +161,8 @@ class Renderer:
         files = self.command.files
         return read_frame(image, depth, self.scene, transfer=files.transfer, layer=files.layer)
 
-    def render(self, frame: Frame, out: Path, number: int, bar: Bar | None = None) -> Rendered:
-        """Renders a frame; ``bar`` shows the expected time of a long one."""
+    def render(self, frame: Frame, out: Path, number: int) -> Rendered:
+        """Renders a frame of a number, to be written to ``out``."""
         start, picture, command = time.perf_counter(), frame.picture, self.command
         frame = dataclasses.replace(frame, values=frame.values.to(self.device))
         coc_px, camera, remarks = coc_of(frame, self.notices, number, self.is_still)
@@ -177,37 +172,36 @@ class Renderer:
             picture = dataclasses.replace(picture, channels=("R", "G", "B", "A")[: pixels.shape[1]])
         else:
             table = _with_alpha(self.table) if picture.has_alpha else self.table
-            options = command.accuracy.arguments()
-            blur: Callable[..., Tensor] = functools.partial(blur_by_coc, table=table, **options)
+            attention = command.attention
+            if attention is not None:
+                attention = (attention[0] - frame.area.x, attention[1] - frame.area.y, attention[2])
+            if command.lights:
+                pixels = _with_lights(picture, pixels, command.lights)
             with torch.no_grad():
-                if command.lights:
-                    pixels = _with_lights(picture, pixels, command.lights)
-                is_long = coc_px.numel() > _LARGE_PX or command.accuracy.method == "fold"
-                if bar is not None and bar.is_seen and is_long:
-                    bar.update(f"rendering {out.name}, about {_seconds(blur, pixels, coc_px):.0f} s")
-                attention = command.attention
-                if attention is not None:
-                    attention = (attention[0] - frame.area.x, attention[1] - frame.area.y, attention[2])
-                pixels = blur(pixels, coc_px, attention=attention)
-        seconds = frame.seconds + time.perf_counter() - start
-        frame = dataclasses.replace(frame, remarks=remarks, seconds=seconds)
-        return Rendered(out, frame, dataclasses.replace(picture, pixels=pixels), coc_px, camera)
+                pixels = blur_by_coc(pixels, coc_px, table=table, attention=attention, **command.accuracy.arguments())
+        frame, picture = dataclasses.replace(frame, remarks=remarks), dataclasses.replace(picture, pixels=pixels)
+        return Rendered(out, frame, picture, coc_px, camera, time.perf_counter() - start)
 
     def write(self, rendered: Rendered) -> None:
         """Writes the picture, whole or not at all, and its sheet, and prints notes and one line."""
-        start, files, out, frame = time.perf_counter(), self.command.files, rendered.out, rendered.frame
+        command, files, seconds = self.command, self.command.files, rendered.seconds
+        out, frame, camera, table = rendered.out, rendered.frame, rendered.camera, self.table
         make_folder_of(out)
         write_image(out, rendered.picture, files.out_transfer, files.bits)
-        out = self.command.out if self.is_animation else out
+        out = command.out if self.is_animation else out
         if files.sheet is not None:
             make_folder_of(files.sheet)
             write_sheet(files.sheet, _panels(rendered))
-        largest_px = float(rendered.coc_px.abs().max())
+        (height, width), largest_px = rendered.coc_px.shape[-2:], float(rendered.coc_px.abs().max())
         if frame.guess:
             self.notices.note("guess", f"{frame.name}: {frame.guess}")
-        if rendered.camera is not None and largest_px < VISIBLE_PX:
-            advice = frame.scene.lens.blur_advice(largest_px, rendered.coc_px.shape[-1], self.is_still)
-            self.notices.note("little blur", f"{out}: {advice}")
+        if camera is not None and largest_px < _VISIBLE_PX:
+            advice = (
+                f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; open the lens wider, with a "
+            )
+            advice += "smaller --f-number, a larger --blur, or a larger --aperture-radius-m"
+            nothing = "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
+            self.notices.note("little blur", f"{out}: {advice if largest_px else nothing}")
         has_exif = any(name.startswith("Exif:") for name in frame.picture.metadata)
         if has_exif and out.suffix.lower() in _WITHOUT_EXIF:
             lost = f"EXIF data are lost in a {out.suffix} file; write .jpg, .png or .tif to keep them"
@@ -215,42 +209,35 @@ class Renderer:
         layers = ", ".join(frame.picture.other_layers)
         if layers and out.suffix.lower() == ".exr":
             self.notices.note("layers", f"{out}: is without the other layers of the image: {layers}")
-        words, facts = self._summary(rendered.camera, largest_px, frame)
-        height, width = rendered.picture.pixels.shape[-2:]
-        seconds = frame.seconds + time.perf_counter() - start
-        words += [] if files.sheet is None else [f"sheet {files.sheet}"]
-        words += [f"{width} x {height}", f"{seconds:.2f} s on {self.device}"]
+        options = Options.of(**command.accuracy.arguments())
+        facts = {
+            "out": str(out),
+            "camera": camera and facts_of_camera(camera),
+            "largest_coc_px": largest_px,
+            "filled_px": frame.filled,
+            "show_focus": command.show_focus,
+            "device": str(self.device),
+            "table": table.name or table.family,
+            "aperture": table.aperture and table.aperture.to_dict(),
+            **{name: getattr(options, name) for name in ("method", "occlusion", "tolerance")},
+            "attention": command.attention,
+            "lights": command.lights,
+            "assumed": frame.remarks,
+            **{"width": width, "height": height, "seconds": seconds},
+        }
+        words = [
+            "" if camera is None else repr(camera),
+            f"blur radius up to {largest_px:.1f} px",
+            "focus shown: near orange, sharp green, far blue" if command.show_focus else f"{table!r}, {options.method}",
+            "" if options.occlusion else "no occlusion",
+            f"lights up to {command.lights:g} stops above white" if command.lights else "",
+            f"{frame.filled} px of depth filled ({frame.scene.depth_map.fill_depth})" if frame.filled else "",
+            f"sheet {files.sheet}" if files.sheet else "",
+            f"{width} x {height}",
+            f"{seconds:.2f} s on {self.device}",
+        ]
         remarks = f" [{', '.join(frame.remarks)}]" if frame.remarks else ""
-        facts = {"out": str(out), **facts, "assumed": frame.remarks, "width": width, "height": height}
-        print_result(self.command.as_json, facts | {"seconds": seconds}, f"{out}: {'; '.join(words)}{remarks}")
-
-    def _summary(self, camera: Camera | None, largest_px: float, frame: Frame) -> tuple[list[str], dict[str, Any]]:
-        """Parts of the printed line about a frame, and the same as data for JSON."""
-        command, table, words = self.command, self.table, list[str]()
-        facts: dict[str, Any] = {"camera": camera and facts_of_camera(camera)}
-        facts |= {"largest_coc_px": largest_px, "filled_px": frame.filled}
-        facts |= {"show_focus": command.show_focus, "device": str(self.device)}
-        if camera is not None:
-            ends, angles = camera.focus_range_m, {"tilt": camera.tilt_deg, "swing": camera.swing_deg}
-            focus = " to ".join(f"{end:.4g}" for end in ends or (camera.focus_m,))
-            lens = f"{camera.focal_length_mm:.4g} mm on {camera.sensor_width_mm:.4g} mm"
-            words.append(f"focus {focus} m, f/{camera.f_number:.3g}, {lens}")
-            words += [f"{name} {angle:.4g} degrees" for name, angle in angles.items() if angle != 0.0]
-        words.append(f"blur radius up to {largest_px:.1f} px")
-        if command.show_focus:
-            words.append("focus shown: near orange, sharp green, far blue")
-        else:
-            name, aperture = table.name or table.family, table.aperture
-            options = Options.of(**command.accuracy.arguments())
-            words.append(f"{name}, {options.method}")
-            words += [] if aperture is None else [repr(aperture).removeprefix("Aperture(").removesuffix(")")]
-            words += [] if options.occlusion else ["no occlusion"]
-            words += [f"lights up to {command.lights:g} stops above white"] if command.lights else []
-            facts |= {"table": name, "aperture": None if aperture is None else aperture.to_dict()}
-            facts |= {name: getattr(options, name) for name in ("method", "occlusion", "tolerance")}
-            facts |= {"attention": command.attention, "lights": command.lights}
-        words += [f"{frame.filled} px of depth filled ({frame.scene.depth_map.fill_depth})"] if frame.filled else []
-        return words, facts
+        print_result(command.as_json, facts, f"{out}: {'; '.join(filter(None, words))}{remarks}")
 
 
 def _device(name: str) -> torch.device:
@@ -274,14 +261,6 @@ def _panels(rendered: Rendered) -> dict[str, Tensor]:
         middle = {"depth: near is bright": depth_colours(frame.values)}
     panels = {"before": frame.picture.light, **middle, "after": rendered.picture.light}
     return {name: shrunk(panel.cpu(), _PANEL_PX).expand(-1, 3, -1, -1) for name, panel in panels.items()}
-
-
-def _seconds(blur: Callable[..., Tensor], pixels: Tensor, coc_px: Tensor) -> float:
-    """Expected time of ``blur`` in seconds, extrapolated from a strip across the middle of the image."""
-    start, height = time.perf_counter(), pixels.shape[-2]
-    strip = (..., slice(height // 2, height // 2 + math.ceil(height / _STRIPS)), slice(None))
-    blur(pixels[strip], coc_px[strip])
-    return _STRIPS * (time.perf_counter() - start)
 
 
 def _with_lights(picture: Picture, pixels: Tensor, stops: float) -> Tensor:

@@ -13,19 +13,15 @@ from .output import Notices, print_result
 class Inspect:
     """Report on a depth map and its blur by a camera, before anything is rendered.
 
-    Prints ranges, the histogram of the blur radius, the share in focus, holes, and how many edges of the depth match
-    edges of the image. Draws depth, blur and doubtful edges. Warns of wrong units on standard error.
+    Prints ranges, blur radii, the share in focus, holes, and how many edges of the depth match edges of the image.
+    Draws depth, blur and doubtful edges. The defaults of focus and lens are those of torchdof render.
 
         torchdof inspect photo.jpg depth.png --depth-scale 0.001 --focus-at 320,200 --f-number 1.8
-
-    The defaults of focus and lens are those of torchdof render.
     """
 
     image: Path = argument("All-in-focus image, as for torchdof render.", "IMAGE")
     depth: Path | None = argument("Its depth; not needed if IMAGE has a Z channel.", "[DEPTH]", None)
-    out: Path | None = option(
-        "Picture to write; default: IMAGE's name with .inspect.png, in this folder.", names=("--out", "-o")
-    )
+    out: Path | None = option("Picture to write; default: IMAGE.inspect.png, in this folder.", names=("--out", "-o"))
     scene: Scene
     as_json: bool = json_option()
 
@@ -47,7 +43,7 @@ class Inspect:
         if not bool((metres > 0).any()):
             raise ValueError(f"{frame.name}: no pixel has a depth; check the kind, scale and offset of the depth map")
         camera, notes = frame.scene.lens.camera(
-            frame.picture.metadata, metres, is_to_scale=depth_map.is_to_scale, area=frame.area
+            frame.picture.metadata, metres, frame.area, is_to_scale=depth_map.is_to_scale
         )
         notes += frame.remarks
         report = inspect_depth(light, metres, camera)

@@ -2,13 +2,13 @@
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..io.metadata import camera_settings
 from ..io.sequence import focus_at_frame, parse_focus
-from .command import by_option, numbers, option, positive
+from .command import numbers, option
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -17,17 +17,9 @@ if TYPE_CHECKING:
 
 _DEFAULTS = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
 _LABELS = dict(zip(_DEFAULTS, ("focal length", "f-number", "sensor width"), strict=True))
-_WIDER = {  # option that sets the aperture -> how to open the lens wider
-    "--f-number": "a smaller --f-number",
-    "--aperture-radius-m": "a larger --aperture-radius-m",
-    "--equivalent": "a smaller --equivalent f-number",
-    "--blur": "a larger --blur",
-}
 _PHONE_MM, _PHONE_EQUIVALENT_MM = 10.0, 26.0  # a lens shorter than this is a phone's, whose main lens is like this one
-VISIBLE_PX = 2.0  # px; a note advises more blur if the largest radius is below
 _DEFAULT_BLUR, _VISIBLE_BLUR = 0.02, 0.005  # largest blur radius over the width: by default; the smallest visible one
 _PER_OUTLIER, _MAX_SAMPLES = 1000, 2**20  # one pixel in 1000 is ignored as an outlier; most pixels examined
-_SPELLED = {"focus_range_m": "--focus-range", "tilt_deg": "--tilt", "swing_deg": "--swing", "fov_x_deg": "--fov-deg"}
 
 
 class Area(NamedTuple):
@@ -41,7 +33,7 @@ class Area(NamedTuple):
     width: int
     height: int
 
-    def centred(self, values: "Tensor", size: "tuple[int, int]") -> "tuple[Tensor, Any]":
+    def centred(self, values: "Tensor", size: Sequence[int]) -> "tuple[Tensor, Any]":
         """Pads a map so that the optical axis, in the middle of the full frame, is in the middle of the map.
 
         The map ``[1, 1, h, w]`` is of an image of a height and width in pixels. Also returns its index in the padded
@@ -56,20 +48,16 @@ class Area(NamedTuple):
         padded = pad(values, (left, max(0, across), top, max(0, down)))
         return padded, (..., slice(top, top + rows), slice(left, left + columns))
 
+    def centred_camera(self, camera: "Camera", depth: "Tensor") -> "tuple[Camera, Tensor, Any]":
+        """Camera and map with the optical axis in the middle of the map, and the index of ``depth`` in it."""
+        padded, place = self.centred(depth, depth.shape[-2:])
+        wide_mm = camera.sensor_width_mm * padded.shape[-1] / depth.shape[-1]
+        return camera.replace(sensor_width_mm=wide_mm), padded, place
 
-def centred_coc_px(camera: "Camera", depth: "Tensor", area: Area) -> "Tensor":
-    """As ``camera.coc_px``, with the axis of a tilted lens in the middle of the full frame."""
-    wide, padded, place = _centred(camera, depth, area)
-    return wide.coc_px(padded, padded.shape[-1])[place]
-
-
-def _centred(camera: "Camera", depth: "Tensor", area: Area) -> "tuple[Camera, Tensor, Any]":
-    """Camera and map of a tilted lens with the optical axis in the middle of the map; the index of ``depth`` in it."""
-    rows, columns = depth.shape[-2:]
-    if camera.tilt_deg == camera.swing_deg == 0:
-        return camera, depth, (..., slice(0, rows), slice(0, columns))
-    padded, place = area.centred(depth, (rows, columns))
-    return camera.replace(sensor_width_mm=camera.sensor_width_mm * (padded.shape[-1] / columns)), padded, place
+    def coc_px(self, camera: "Camera", depth: "Tensor") -> "Tensor":
+        """As ``camera.coc_px``, with the axis of a tilted lens in the middle of the full frame."""
+        wide, padded, place = self.centred_camera(camera, depth)
+        return wide.coc_px(padded, padded.shape[-1])[place]
 
 
 def _width_fraction(text: str) -> float:
@@ -98,8 +86,8 @@ def _give_one(options: Mapping[str, Any], problem: str) -> None:
 class Sensor:
     """Focus and lens."""
 
-    focal_length_mm: float | None = option("Real focal length, not the 35 mm equivalent.", callback=positive)
-    sensor_width_mm: float | None = option("36 for full frame.", callback=positive)
+    focal_length_mm: float | None = option("Real focal length, not the 35 mm equivalent.")
+    sensor_width_mm: float | None = option("36 for full frame.")
     fov_deg: float | None = option("Horizontal field of view of a rendered image, instead of a lens.")
 
 
@@ -108,15 +96,13 @@ class Lens(Sensor):
     """Focus and lens."""
 
     focus_m: list[tuple[int, float]] | None = option(
-        "Distance in focus in metres (inf allowed), or keyframes frame:metres such as 1:2.0,48:5.5; between them "
-        "1/distance is linear, so that the blur changes evenly.",
+        "Distance in focus (inf allowed), or keyframes frame:metres such as 1:2.0,48:5.5, linear in 1/distance.",
         metavar="METRES",
         read=parse_focus,
         basic=True,
     )
     focus_at: tuple[float, float] | None = option(
-        "Focus on the surface at this pixel, counted from the top left (of an EXR's display window); in a sequence, "
-        "anew in each frame. Default: the focus that IMAGE's file states, else the subject nearest the middle.",
+        "Focus on the surface at this pixel from the top left; by default as the file states, else on the subject.",
         metavar="X,Y",
         read=numbers(2, "--focus-at expects a pixel X,Y such as 320,200"),
         basic=True,
@@ -128,22 +114,21 @@ class Lens(Sensor):
     )
     tilt: float = option("Degrees by which the lens is tilted down: focus comes nearer towards the bottom.", 0.0)
     swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)
-    f_number: float | None = option("Smaller is blurrier.", callback=positive, basic=True)
+    f_number: float | None = option("Smaller is blurrier.", basic=True)
     blur_share: float | None = option(
-        "Open the lens until the largest blur radius, at the nearest or farthest depth, is this share of the picture's "
-        "width, such as 2%; instead of --f-number.",
+        "Open the lens until the largest blur radius is this share of the width, such as 2%; instead of --f-number.",
         names=("--blur",),
         metavar="SHARE%",
         read=_width_fraction,
         basic=True,
     )
     equivalent: tuple[float, float] | None = option(
-        "Full-frame lens that the picture is taken to be from: focal length and f-number, such as 85mm,1.4.",
+        "Full-frame lens that the picture is taken to be from, such as 85mm,1.4.",
         metavar="MM,F",
         read=_equivalent,
         basic=True,
     )
-    aperture_radius_m: float | None = option("Radius of the opening, with --fov-deg.", callback=positive)
+    aperture_radius_m: float | None = option("Radius of the opening, with --fov-deg.")
 
     def __post_init__(self) -> None:
         focus_options = {"--focus-m": self.focus_m, "--focus-at": self.focus_at, "--focus-range": self.focus_range}
@@ -160,23 +145,14 @@ class Lens(Sensor):
     @property
     def _opening(self) -> dict[str, Any]:
         """Option -> value, for the option that sets the aperture; empty if none does."""
-        values = (self.f_number, self.aperture_radius_m, self.equivalent, self.blur_share)
-        return {option: value for option, value in zip(_WIDER, values, strict=True) if value is not None}
+        given: dict[str, Any] = {"--f-number": self.f_number, "--aperture-radius-m": self.aperture_radius_m}
+        given |= {"--equivalent": self.equivalent, "--blur": self.blur_share}
+        return {name: value for name, value in given.items() if value is not None}
 
     @property
     def has_focus(self) -> bool:
         """Whether an option sets the focus."""
         return (self.focus_m, self.focus_at, self.focus_range) != (None, None, None)
-
-    def blur_advice(self, largest_px: float, width: int, is_still: bool) -> str:
-        """Advice for a largest blur radius that is hardly visible in an image of a width in pixels."""
-        if largest_px == 0:
-            return "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
-        hint = _WIDER[next(iter(self._opening), "--f-number")]
-        share = f"{min(0.5, max(_DEFAULT_BLUR, math.ceil(100 * VISIBLE_PX / width) / 100)):.0%}"
-        other = f", or --blur {share}" if self.blur_share is None else f", such as {share},"
-        other = other if is_still else ""
-        return f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; {hint}{other} makes more of it"
 
     @property
     def states_metres(self) -> bool:
@@ -190,7 +166,7 @@ class Lens(Sensor):
 
     def view_deg(self, metadata: Mapping[str, Any], width: int, area: Area) -> float:
         """Horizontal field of view in degrees of an image, as stated, or from focal length and sensor."""
-        lens = camera_settings(metadata, area.width, area.height) | self._stated(area.width, area.height)
+        lens = camera_settings(metadata, area.width, area.height) | self._stated(area)
         if self.fov_deg is not None:
             half = math.tan(math.radians(self.fov_deg) / 2)
         elif {"focal_length_mm", "sensor_width_mm"} <= set(lens):
@@ -199,70 +175,66 @@ class Lens(Sensor):
             raise ValueError("--depth-kind distance needs --fov-deg, --equivalent, or focal length and sensor width")
         return 2 * math.degrees(math.atan(half * width / area.width))
 
-    def _stated(self, width: int, height: int) -> dict[str, float]:
-        """Numbers of the lens that the options state, for an image of a size in pixels."""
+    def _stated(self, area: Area) -> dict[str, float]:
+        """Numbers of the lens that the options state."""
         if self.equivalent is not None:
-            lens = (*self.equivalent, 36.0 * width / max(width, height))
-            return dict(zip(_DEFAULTS, lens, strict=True))
+            return dict(zip(_DEFAULTS, (*self.equivalent, _full_frame_mm(area)), strict=True))
         return {name: value for name in _DEFAULTS if (value := getattr(self, name)) is not None}
 
     def camera(
         self,
         metadata: Mapping[str, Any],
         depth: "Tensor",
+        area: Area,
         frame: int = 0,
         is_still: bool = True,
         is_to_scale: bool = True,
-        area: Area | None = None,
     ) -> "tuple[Camera, list[str]]":
         """The camera of one picture, and remarks on the source of the numbers that no option states.
 
         1. Take the focus from the options, else from the file, else from the subject of a still.
         2. Take the lens from the options, else from the file, else from ``_DEFAULTS``, or a phone's sensor for a
-           focal length of the file that no larger camera has. It is that of the full frame:
-           ``area`` is the place of the picture in it, None if the picture is the frame.
+           focal length of the file that no larger camera has. It is that of the full frame; ``area`` is the place of
+           the picture in it.
         3. Open the lens for the blur of ``--blur``, or for a visible blur in a still whose options leave it open.
 
         In a sequence nothing is guessed, because guesses would differ from frame to frame. Without ``is_to_scale`` the
-        file's focus is ignored. Raises ``ValueError`` with names of options if no lens has these numbers.
+        file's focus is ignored. Raises ``ValueError`` if no lens has these numbers.
         """
+        from ..depth.guess import subject_m
         from ..optics.camera import Camera
 
-        height, width = depth.shape[-2:]
-        area = area or Area(0, 0, width, height)
-        stated, in_file = self._stated(area.width, area.height), camera_settings(metadata, area.width, area.height)
+        width = depth.shape[-1]
+        stated, in_file = self._stated(area), camera_settings(metadata, area.width, area.height)
         lens: dict[str, Any] = {name: (_DEFAULTS | in_file | stated)[name] for name in _DEFAULTS}
         if in_file.get("focal_length_mm", math.inf) < _PHONE_MM and "sensor_width_mm" not in in_file | stated:
-            full_frame_mm = 36.0 * area.width / max(area.width, area.height)
-            lens["sensor_width_mm"] = full_frame_mm * in_file["focal_length_mm"] / _PHONE_EQUIVALENT_MM
+            lens["sensor_width_mm"] = _full_frame_mm(area) * in_file["focal_length_mm"] / _PHONE_EQUIVALENT_MM
         remarks, focus_m = list[str](), math.inf
         if self.focus_m is not None:
             focus_m = focus_at_frame(self.focus_m, frame)
         elif not self.has_focus and is_to_scale and 1000 * in_file.get("focus_m", 0.0) > lens["focal_length_mm"]:
             focus_m = in_file["focus_m"]
             remarks.append("focus from the file")
-        elif not self.has_focus and not is_still:
-            raise ValueError("where is the focus? give --focus-m METRES or --focus-at X,Y (the file does not say)")
-        elif not self.has_focus:
-            from ..depth.guess import subject_m
-
+        elif not self.has_focus and is_still:
             focus_m = subject_m(depth)
             remarks.append("focus on what is nearest the middle")
+        elif not self.has_focus:
+            raise ValueError("where is the focus? give --focus-m METRES or --focus-at X,Y (the file does not say)")
         if self.fov_deg is not None and not self._opening:
             raise ValueError("--fov-deg needs the opening of the lens: --aperture-radius-m, --f-number or --blur")
         sources = {name: "from the file" if name in in_file else "assumed" for name in _DEFAULTS if name not in stated}
-        with by_option(self._names()):
-            if self.fov_deg is None:
-                camera = Camera(**lens, focus_m=focus_m)
-            else:
-                camera = Camera.from_fov(self.fov_deg, self.aperture_radius_m or 0.01, focus_m)
-                camera = camera if self.f_number is None else camera.replace(f_number=self.f_number)
-            camera = camera.replace(focus_range_m=self.focus_range, tilt_deg=self.tilt, swing_deg=self.swing)
-            camera = camera.replace(sensor_width_mm=camera.sensor_width_mm * (width / area.width))
-            if self.focus_at is not None:
-                wide, padded, (_, rows, columns) = _centred(camera, depth, area)
-                x, y = self.focus_at[0] - area.x + columns.start, self.focus_at[1] - area.y + rows.start
-                camera = camera.replace(focus_m=wide.focus_at(padded, x, y).focus_m)
+        if self.fov_deg is None:
+            camera = Camera(**lens, focus_m=focus_m)
+        else:
+            radius_m = 0.01 if self.aperture_radius_m is None else self.aperture_radius_m
+            camera = Camera.from_fov(self.fov_deg, radius_m, focus_m)
+            camera = camera if self.f_number is None else camera.replace(f_number=self.f_number)
+        camera = camera.replace(focus_range_m=self.focus_range, tilt_deg=self.tilt, swing_deg=self.swing)
+        camera = camera.replace(sensor_width_mm=camera.sensor_width_mm * (width / area.width))
+        if self.focus_at is not None:
+            wide, padded, (_, rows, columns) = area.centred_camera(camera, depth)
+            x, y = self.focus_at[0] - area.x + columns.start, self.focus_at[1] - area.y + rows.start
+            camera = camera.replace(focus_m=wide.focus_at(padded, x, y).focus_m)
         share, is_open = self.blur_share, is_still and not self._opening and (self == Lens() or not is_to_scale)
         largest_px = self._largest_coc_px(camera, depth, area) if share is not None or is_open else 0.0
         if is_open and not (is_to_scale and "f_number" in in_file and largest_px >= _VISIBLE_BLUR * width):
@@ -277,23 +249,11 @@ class Lens(Sensor):
     def _largest_coc_px(self, camera: "Camera", depth: "Tensor", area: Area) -> float:
         """Largest blur radius in pixels at all keyframes of the focus, without the largest thousandth of the pixels."""
         cameras = [camera.replace(focus_m=metres) for _, metres in self.focus_m or []] or [camera]
-        radii = [centred_coc_px(at_key, depth, area).abs().nan_to_num(0.0).flatten() for at_key in cameras]
+        radii = [area.coc_px(at_key, depth).abs().nan_to_num(0.0).flatten() for at_key in cameras]
         sampled = [radius[:: 1 + radius.numel() // _MAX_SAMPLES] for radius in radii]
         return max(float(radius.kthvalue(radius.numel() - radius.numel() // _PER_OUTLIER).values) for radius in sampled)
 
-    def stated(self, camera: "Camera") -> dict[str, Any]:
-        """Option -> number of the camera, for messages."""
-        from ..optics.camera import CAMERA_NUMBERS
 
-        names = self._names()
-        if self.fov_deg is None:
-            return {names[name]: getattr(camera, name) for name in CAMERA_NUMBERS}
-        return {"--fov-deg": self.fov_deg, **self._opening, names["focus_m"]: camera.focus_m}
-
-    def _names(self) -> dict[str, str]:
-        """Argument of :class:`Camera` -> its option, marked if that is not given; for messages."""
-        names = {name: f"--{name.replace('_', '-')}" for name in (*_DEFAULTS, "aperture_radius_m")}
-        names = {name: option + ("" if getattr(self, name) else " (not given)") for name, option in names.items()}
-        focus = "--focus-at" if self.focus_at else "--focus-range" if self.focus_range else "--focus-m"
-        names["focus_m"] = focus + ("" if self.has_focus else " (not given)")
-        return _SPELLED | names | (dict.fromkeys(_DEFAULTS, "--equivalent") if self.equivalent else {})
+def _full_frame_mm(area: Area) -> float:
+    """Width in mm of a full-frame sensor, whose longer side is 36 mm, for a frame in landscape or portrait."""
+    return 36.0 * area.width / max(area.width, area.height)

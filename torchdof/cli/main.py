@@ -7,21 +7,28 @@ import os
 import signal
 import sys
 from types import FrameType
-from typing import Any, NoReturn
+from typing import Any
 
 import click
 
 from ..io.atomic import exit_on_signals
-from .command import command_of
+from .command import by_option, command_of
+from .output import to_stderr
 
 COMMANDS = ("render", "fit", "export", "bench", "inspect", "tables")
 """Names of the commands; each is a module with a class of the same name, capitalised."""
 
 _EXTRAS = {"scipy": "fit", "threadpoolctl": "fit", "matplotlib": "plot"}
 _EXTRAS |= dict.fromkeys(("onnx", "onnxscript", "onnxruntime"), "export")
-_MEMORY_ADVICE = "there is too little memory for this image; a smaller one, or a coarser --tolerance, takes less"
-# Parts of the messages of PyTorch's RuntimeError when memory runs out on the CPU; they come from several libraries.
-_NO_MEMORY = ("can't allocate memory", "not enough memory", "bad_alloc", "size calculation overflowed", "new thread")
+# Parts of the messages of PyTorch's RuntimeError when memory runs out; they come from several libraries.
+_NO_MEMORY = (
+    "allocate memory",
+    "not enough memory",
+    "out of memory",
+    "bad_alloc",
+    "calculation overflowed",
+    "new thread",
+)
 
 
 class _Commands(click.Group):
@@ -46,34 +53,25 @@ class _Commands(click.Group):
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            _end("interrupted", 130)
+            to_stderr("interrupted")
+            raise SystemExit(130) from None
+        except BrokenPipeError:
+            raise
         except ModuleNotFoundError as error:
             package = (error.name or "").partition(".")[0]
             if package not in _EXTRAS:
                 raise
             message = f"this command needs {package}; install it with: pip install 'torchdof[{_EXTRAS[package]}]'"
-        except BrokenPipeError:
-            raise
         except (OSError, ValueError) as error:
-            message = str(error) or type(error).__name__
-        except MemoryError:  # numpy's own message is about arrays
-            message = _MEMORY_ADVICE
-        except RuntimeError as error:
-            torch = sys.modules.get("torch")  # already imported if a device ran out of memory
-            if torch is not None and isinstance(error, torch.OutOfMemoryError):
-                message = "the device has too little memory for this image; try --device cpu"
-            elif any(words in str(error) for words in _NO_MEMORY):
-                message = _MEMORY_ADVICE
-            else:
+            command = self.get_command(ctx, ctx.invoked_subcommand or "")
+            message = by_option(str(error) or type(error).__name__, command.params if command else ())
+        except (MemoryError, RuntimeError) as error:
+            if isinstance(error, RuntimeError) and not any(words in str(error) for words in _NO_MEMORY):
                 raise
-        _end(f"error: {message}", 2)
-
-
-def _end(line: str, code: int) -> NoReturn:
-    """Prints a line and ends the command with an exit code, which is the same if standard error is closed."""
-    with contextlib.suppress(OSError):
-        click.echo(line, err=True)
-    raise SystemExit(code)
+            message = "there is too little memory for this image; try a smaller one, a coarser --tolerance, or another "
+            message += "--device"
+        to_stderr(f"error: {message}")
+        raise SystemExit(2)
 
 
 def _print_version(ctx: click.Context, _: click.Parameter, is_given: bool) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ..io.atomic import check_writable
 from ..io.paths import existing_image, existing_map, samples_of
-from .command import by_option, numbers, option, word_or_number
+from .command import numbers, option, word_or_number
 from .lens import Lens
 
 if TYPE_CHECKING:
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 _NEAR_M, _FAR_PER_NEAR = 1.0, 8.0  # nearest relative depth in m, and farthest over nearest, by default
 _INTEGER_TYPES = (".png", ".jpg", ".jpeg", ".webp")  # types that hold whole numbers only
 _RENDER_TYPES = (".exr", ".tif", ".tiff")  # types whose floats are taken for distances
-_IDEAL_TABLES = ("disc", "gaussian")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,10 +26,9 @@ class DepthMap:
     """Depth map."""
 
     depth_kind: Literal["auto", "z", "distance", "disparity", "inverse", "relative", "coc"] = option(
-        "What the numbers are: z along the optical axis or distance along the ray, in metres after scale * (value + "
-        "offset); disparity or inverse depth, in metres after scale / (value + offset); relative, as estimators give "
-        "it, between --near-m and --far-m; or coc, the signed blur radius in pixels (negative is near). auto guesses "
-        "between relative, millimetres and metres, and says which; in sequences, and with --strict, it is z.",
+        "z along the axis or distance along the ray, in metres after scale * (value + offset); disparity or inverse "
+        "depth, in metres after scale / (value + offset); relative, between --near-m and --far-m; coc, the signed "
+        "blur radius in pixels; auto guesses and says so, but is z in sequences and with --strict.",
         "auto",
         basic=True,
     )
@@ -39,8 +37,7 @@ class DepthMap:
     near_m: float | None = option("Distance of the nearest value of relative depth. Default: 1, or --far-m / 8.")
     far_m: float | None = option("Distance of its farthest value (inf allowed). Default: 8 times --near-m.")
     relative_kind: Literal["disparity", "inverse", "depth"] | None = option(
-        "What relative depth is: disparity or inverse depth, larger is nearer (MiDaS, Depth Anything; the default), or "
-        "depth, larger is farther (Marigold)."
+        "Of relative depth: larger is nearer (MiDaS, Depth Anything; the default), or with depth farther (Marigold)."
     )
     value_range: tuple[float, float] | None = option(
         "Smallest and largest value of relative depth; default: those of each frame.",
@@ -49,8 +46,7 @@ class DepthMap:
     )
     depth_unknown: float | None = option("A value that means 'not measured', such as 0, -1 or inf.")
     fill_depth: float | str | None = option(
-        "Fill pixels without depth: from the nearest one, from the farthest around (stereo misses the background), or "
-        "with a distance (inf for a sky).",
+        "Fill pixels without depth from the nearest one, from the farthest around, or with a distance (inf for a sky).",
         metavar="nearest|far|METRES",
         read=word_or_number(("nearest", "far"), "--fill-depth expects nearest, far or metres"),
     )
@@ -59,8 +55,7 @@ class DepthMap:
 
     def __post_init__(self) -> None:
         has_scale = self.depth_scale is not None or self.depth_offset != 0.0
-        relative_options = (self.near_m, self.far_m, self.relative_kind, self.value_range)
-        is_relative = any(value is not None for value in relative_options)
+        is_relative = (self.near_m, self.far_m, self.relative_kind, self.value_range) != (None, None, None, None)
         if self.depth_kind == "auto" and (is_relative or has_scale or self.strict):  # these options imply the kind
             object.__setattr__(self, "depth_kind", "relative" if is_relative else "z")
         if self.depth_kind == "relative" and has_scale:
@@ -97,21 +92,22 @@ class DepthMap:
         suffix = path.suffix.lower()
         guess = guess_kind(known, suffix in _INTEGER_TYPES, is_metric or suffix in _RENDER_TYPES)
         if guess.kind == "z" and guess.scale == 1.0 and is_metric:
-            metres = replace(self, depth_kind="z")
-            if suffix in _RENDER_TYPES or guess_kind(known).kind == "z":
-                return metres, ""
-            looks = "its numbers grow downwards, as in relative depth (--depth-kind relative)"
-            return metres, f"taken for metres, as the options are in metres, but {looks}"
-        unknown = guess.unknown if self.depth_unknown is None else self.depth_unknown
-        fill = "far" if self.fill_depth is None else self.fill_depth
-        guessed_map = replace(self, depth_kind=guess.kind, depth_unknown=unknown, fill_depth=fill)
+            is_clear = suffix in _RENDER_TYPES or guess_kind(known).kind == "z"
+            doubt = "its numbers grow downwards, as in relative depth (--depth-kind relative)"
+            message = "" if is_clear else f"taken for metres, as the options are in metres, but {doubt}"
+            return replace(self, depth_kind="z"), message
+        guessed_map = replace(
+            self,
+            depth_kind=guess.kind,
+            depth_unknown=guess.unknown if self.depth_unknown is None else self.depth_unknown,
+            fill_depth="far" if self.fill_depth is None else self.fill_depth,
+        )
         if guess.kind == "z":
             unit, scale = ("metres", None) if guess.scale == 1.0 else ("millimetres", guess.scale)
             return replace(guessed_map, depth_scale=scale), f"taken for {unit} (else --depth-kind, --depth-scale)"
         larger, other = ("nearer", "depth") if guess.relative_kind == "disparity" else ("farther", "disparity")
-        near_m, far_m = guessed_map.ends_m
         message = f"taken for relative depth (else --depth-kind), larger is {larger} (else --relative-kind {other}), "
-        message += f"from {near_m:g} to {far_m:g} m (else --near-m, --far-m)"
+        message += "from {:g} to {:g} m (else --near-m, --far-m)".format(*guessed_map.ends_m)
         return replace(guessed_map, relative_kind=guess.relative_kind), message
 
 
@@ -123,8 +119,7 @@ class Scene:
     depth_map: DepthMap = DepthMap()
 
     def __post_init__(self) -> None:
-        lens = self.lens
-        if self.depth_map.depth_kind == "coc" and lens != Lens(fov_deg=lens.fov_deg):
+        if self.depth_map.depth_kind == "coc" and self.lens != Lens(fov_deg=self.lens.fov_deg):
             raise ValueError(
                 "--depth-kind coc is the blur itself and takes no camera; leave focus and lens options out"
             )
@@ -149,8 +144,6 @@ class ApertureOptions:
     def __post_init__(self) -> None:
         if self.aperture is not None and (self.blades or self.curvature):
             raise ValueError("--aperture is the whole opening; leave --blades and --curvature out")
-        if self.curvature and not self.blades:
-            raise ValueError("--curvature is that of blades; give --blades too")
         if self.rotation and not self.blades and self.aperture is None:
             raise ValueError("--rotation turns blades or an image; give --blades or --aperture too")
 
@@ -159,17 +152,10 @@ class ApertureOptions:
         from ..io.images import read_image
         from ..optics.aperture import Aperture
         from ..optics.blur_table import BlurTable
-        from ..optics.table_file import shipped
 
         mask = None if self.aperture is None else read_image(self.aperture).light[0].mean(0)
-        arguments = ("blades", "rotation_deg", "curvature", "squeeze", "vignetting")
-        with by_option({name: f"--{name.removesuffix('_deg')}" for name in arguments}):
-            aperture = Aperture(self.blades, self.rotation, self.curvature, self.squeeze, mask, self.vignetting)
-        try:
-            table = getattr(BlurTable, name)() if name in _IDEAL_TABLES else BlurTable.load(name)
-        except FileNotFoundError:
-            names_known = ", ".join([*_IDEAL_TABLES, *shipped()])
-            raise FileNotFoundError(f"no blur table {name!r}: neither a file nor one of {names_known}") from None
+        aperture = Aperture(self.blades, self.rotation, self.curvature, self.squeeze, mask, self.vignetting)
+        table = getattr(BlurTable, name)() if name in ("disc", "gaussian") else BlurTable.load(name)
         is_default = aperture.is_round and self.squeeze == 1.0 and not aperture.depends_on_place
         return table if is_default else table.with_aperture(aperture)
 
@@ -199,18 +185,15 @@ class Accuracy:
     no_occlusion: bool = option("One pass that ignores occlusion.", False)
     method: Literal["layered", "fold"] = option("fold is the literal scatter: exact, slow, for small radii.", "layered")
     depth_edges: Literal["auto", "repair", "as-given"] | None = option(
-        "Sharpen the edges of the depth and move them to those of the image: auto unless they prove exact, repair each "
-        "one, as-given never. Default: auto; in exported files as-given.",
+        "Move edges of the depth to those of the image: auto unless they prove exact, repair each one, as-given never. "
+        "Default: auto; in exported files as-given.",
         group="Depth map",
     )
 
     def arguments(self) -> dict[str, Any]:
         """These options as arguments of :class:`torchdof.DepthOfField`."""
-        arguments = {name: value for name, value in vars(self).items() if value is not None}
-        arguments["occlusion"] = not arguments.pop("no_occlusion")
-        if self.depth_edges is not None:
-            arguments["depth_edges"] = self.depth_edges.replace("-", " ")
-        return arguments
+        arguments = {"tolerance": self.tolerance, "occlusion": not self.no_occlusion, "method": self.method}
+        return arguments | ({"depth_edges": self.depth_edges.replace("-", " ")} if self.depth_edges else {})
 
 
 def json_option() -> Any:
@@ -232,11 +215,10 @@ def check_files(image: Path, depth: Path | None, *outputs: Path | None) -> None:
     existing_image(image)
     if depth is not None:
         existing_map(depth)
-    inputs, written = [os.path.realpath(path) for path in (image, depth) if path is not None], set[str]()
+    inputs = map(os.path.realpath, filter(None, (image, depth)))
+    problems = dict.fromkeys(inputs, "is one of the inputs; write to another file")
     for out in filter(None, outputs):
-        if os.path.realpath(out) in inputs:
-            raise ValueError(f"{out}: is one of the inputs; write to another file")
-        if os.path.realpath(out) in written:
-            raise ValueError(f"{out}: would be written twice; give each picture a file of its own")
+        if problem := problems.get(os.path.realpath(out)):
+            raise ValueError(f"{out}: {problem}")
         samples_of(out)
-        written.add(os.path.realpath(out))
+        problems[os.path.realpath(out)] = "would be written twice; give each picture a file of its own"

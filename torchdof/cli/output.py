@@ -5,8 +5,7 @@ import json
 import os
 import sys
 import threading
-import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -34,84 +33,67 @@ def json_line(facts: Mapping[str, Any]) -> str:
     return json.dumps(json.loads(text, parse_constant=_NOT_FINITE.__getitem__))
 
 
+def to_stderr(line: str) -> None:
+    """Prints a line on standard error; one that cannot be written must not stop the command."""
+    with contextlib.suppress(OSError):
+        click.echo(line, err=True)
+
+
 class Notices:
     """Notes and warnings of likely mistakes, one line each on standard error; each kind is printed once for all frames.
 
-    With ``strict`` a mistake raises ``ValueError``. ``PYTHONWARNINGS=ignore`` silences warnings.
+    With ``strict`` a mistake raises ``ValueError``.
     """
 
     def __init__(self, strict: bool = False) -> None:
         self._strict, self._kinds = strict, set[str]()
 
-    def note(self, kind: str, line: str) -> None:
+    def note(self, kind: str, line: str, word: str = "note") -> None:
         """Prints a note: an assumption, or advice, with the options that change it."""
         if kind not in self._kinds:
-            _to_stderr(f"note: {line}")
+            to_stderr(f"{word}: {line}")
         self._kinds.add(kind)
 
     def warn(self, source: str | os.PathLike[str], mistakes: "Iterable[Mistake]") -> None:
         """Warns of likely mistakes in a file."""
-        from ..depth.sanity import DepthWarning
-
         for mistake in mistakes:
             message = f"{source}: {mistake.message}"
             if self._strict:
                 raise ValueError(f"{message} (--strict)")
-            if mistake.name not in self._kinds:
-                with warnings.catch_warnings():
-                    warnings.showwarning = lambda warning, *_, **__: _to_stderr(f"warning: {warning}")
-                    try:
-                        warnings.warn(message, DepthWarning, stacklevel=2)
-                    except DepthWarning as warning:  # by PYTHONWARNINGS=error, but only --strict may stop a command
-                        _to_stderr(f"warning: {warning}")
-            self._kinds.add(mistake.name)
+            self.note(mistake.name, message, "warning")
 
 
-def _to_stderr(line: str) -> None:
-    with contextlib.suppress(OSError):  # a message that cannot be written must not stop the command
-        click.echo(line, err=True)
-
-
-def _is_terminal() -> bool:
-    return sys.stderr.isatty()
-
-
-class Bar:
+@contextlib.contextmanager
+def progress_bar(what: str, total: float | None = None) -> Iterator[Callable[..., None]]:
     """A progress bar with the remaining time, shown after three seconds if standard error is a terminal.
 
-    ``what`` describes the current step; ``total`` is the number of steps, or None if it is unknown.
+    Args:
+        what: Description of the current step.
+        total: Number of steps; None if it is unknown.
+
+    Yields:
+        A function that changes ``what``, ``done`` (the number of finished steps) or ``total``.
     """
+    if not sys.stderr.isatty():
+        yield lambda what=None, done=None, total=None: None
+        return
+    from rich import progress
+    from rich.console import Console
 
-    def __init__(self, what: str, total: float | None = None) -> None:
-        self.is_seen = _is_terminal()
-        if self.is_seen:
-            from rich import progress
-            from rich.console import Console
-
-            elapsed, remaining = progress.TimeElapsedColumn(), progress.TimeRemainingColumn()
-            self._progress = progress.Progress(
-                *(progress.TextColumn("{task.description}", markup=False), progress.BarColumn(), elapsed, remaining),
-                console=Console(stderr=True),
-                transient=True,
-                redirect_stdout=sys.stdout.isatty(),  # prints lines above the bar; a file is unaffected
-            )
-            self._task = self._progress.add_task(what, total=total)
-            self._timer = threading.Timer(_DELAY_S, self._progress.start)
-            self._timer.daemon = True
-
-    def update(self, what: str | None = None, done: float | None = None, total: float | None = None) -> None:
-        """Changes the description, the number of finished steps, or their total."""
-        if self.is_seen:
-            self._progress.update(self._task, description=what, completed=done, total=total)
-
-    def __enter__(self) -> "Bar":
-        if self.is_seen:
-            self._timer.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self.is_seen:
-            self._timer.cancel()
-            self._timer.join()
-            if self._progress.live.is_started:
-                self._progress.stop()
+    columns = (progress.TextColumn("{task.description}", markup=False), progress.BarColumn())
+    bar = progress.Progress(
+        *(*columns, progress.TimeElapsedColumn(), progress.TimeRemainingColumn()),
+        console=Console(stderr=True),
+        transient=True,
+        redirect_stdout=sys.stdout.isatty(),  # prints lines above the bar; a file is unaffected
+    )
+    task, timer = bar.add_task(what, total=total), threading.Timer(_DELAY_S, bar.start)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield lambda what=None, done=None, total=None: bar.update(task, description=what, completed=done, total=total)
+    finally:
+        timer.cancel()
+        timer.join()
+        if bar.live.is_started:
+            bar.stop()

@@ -3,11 +3,10 @@
 import dataclasses
 import functools
 import importlib.metadata
-import itertools
 import math
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -18,7 +17,7 @@ from ..io.sequence import FramePattern, parse_frames
 from ..io.webp import write_animation
 from .command import argument, numbers, option, options_of
 from .options import Accuracy, Blur, Scene, check_files, json_option, make_folder_of
-from .output import Bar, json_line
+from .output import json_line, progress_bar
 from .resume import Record
 
 if TYPE_CHECKING:
@@ -39,17 +38,13 @@ class _Files:
     """Files and frames."""
 
     transfer: Encoding | None = option("How IMAGE is encoded. Default: integers srgb, floats linear.")
-    out_transfer: Encoding | None = option(
-        "How OUT is encoded. Default: as IMAGE, or by type if one is integers and the other floats."
-    )
+    out_transfer: Encoding | None = option("How OUT is encoded. Default: as IMAGE, else by type.")
     bits: Literal["8", "16", "half", "float"] | None = option("What OUT stores. Default: as IMAGE, where the type can.")
     layer: str | None = option("Layer or part of an EXR that is the image.")
     sheet: Path | None = option("Also write the image, its depth and the result side by side to this file.")
     frames: tuple[int, int] | None = option("Part of a sequence.", metavar="FIRST-LAST", read=parse_frames)
     steady: bool = option("Filter depth of a sequence along time, where neither image nor depth moved.", False)
-    resume: bool = option(
-        "Render only frames that OUT lacks, that are cut short, or older than their files or than other options.", False
-    )
+    resume: bool = option("Render only frames that are missing, cut short, or older than files or options.", False)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -60,7 +55,7 @@ class Render:
 
         torchdof render photo.jpg depth.png -o out.jpg
 
-    A photograph and its depth in millimetres, focused on the pixel at column 320, row 200:
+    Depth in millimetres, with the focus on the pixel at column 320, row 200:
 
         torchdof render photo.jpg depth.png -o out.jpg --depth-scale 0.001 --focus-at 320,200 --f-number 1.8
 
@@ -68,35 +63,21 @@ class Render:
 
         torchdof render shot.exr -o out.exr --fov-deg 40 --aperture-radius-m 0.012 --focus-m 2
 
-    A sequence with a focus pull from 2 m to 5.5 m; --resume continues after an interruption. OUT.json has the options,
-    so that --resume renders frames again if the options, their files or a table have changed since:
+    A sequence with a focus pull; --resume continues after an interruption, and compares options with OUT.json:
 
         torchdof render shot.####.exr -o out.####.exr --focus-m 1:2,48:5.5 --f-number 2 --resume
 
-    --steady filters flickering depth over time, where neither image nor depth moves. With --frames or --resume the
-    result is the same as for the whole sequence, because up to 63 earlier frames are read first.
-
-    A photograph with a focus pull from 1 m to 5 m in 24 frames; pull.webp would be one animation, 25 frames a second:
+    A photograph with a focus pull; pull.webp would be one animation, 25 frames a second:
 
         torchdof render photo.jpg depth.png -o pull.##.png --focus-m 1:1,24:5
-
-    Seven blades on an anamorphic lens, in focus from 1.5 to 2.2 m:
-
-        torchdof render shot.exr -o out.exr --focus-range 1.5,2.2 --blades 7 --rotation 15 --squeeze 2
 
     A stereo disparity map with holes (scale: baseline in metres * focal length in pixels):
 
         torchdof render l.png disp.npz -o out.png --focus-m 2 --depth-kind disparity --depth-scale 192 --fill-depth far
 
-    Relative depth from an estimator, mapped to distances that you state:
-
-        torchdof render photo.jpg depth.png -o out.jpg --near-m 1.2 --far-m 8 --focus-m 1.5 --f-number 1.4
-
-    The lens is the one you state, else the one in the file's EXIF data, else 50 mm at f/2.8 on a sensor of 36 mm; the
-    printed line names the source. If you state neither focus nor lens, a single image is focused on the subject nearest
-    its middle, and the lens is opened until the largest blur radius is 2 % of the width, unless the file's lens blurs
-    enough. Alpha and metadata are kept (EXIF not in HDR and PFM). A file is written whole or not at all. A likely
-    wrong unit gives a warning on standard error, with --strict an error. --json prints one JSON object per frame.
+    The lens is the one you state, else that of the EXIF data, else 50 mm at f/2.8 on a sensor of 36 mm. If you state
+    neither focus nor lens, a single image is focused on the subject nearest its middle, and the lens is opened until
+    the largest blur radius is 2 % of the width, unless the file's lens blurs enough.
     """
 
     image: Path = argument("All-in-focus image (EXR, PNG, TIFF, JPEG, WebP, HDR, PFM) or shot.####.exr.", "IMAGE")
@@ -108,14 +89,13 @@ class Render:
     blur: Blur
     accuracy: Accuracy
     attention: tuple[float, float, float] | None = option(
-        "Where the viewer looks, in pixels from the top left: the tolerance is kept there, and elsewhere a draft's is "
-        "enough.",
+        "Where the viewer looks, in pixels from the top left: elsewhere a draft's tolerance is enough.",
         metavar="X,Y,RADIUS",
         read=numbers(3, "--attention expects X,Y,RADIUS in pixels such as 320,200,80"),
         group="Blur",
     )
     lights: float = option(
-        "Make small lamps that IMAGE, a photograph, clipped at white brighter by up to this many stops, such as 3.",
+        "Make lamps that a photograph clipped at white brighter by up to this many stops, such as 3.",
         0.0,
         metavar="STOPS",
         group="Blur",
@@ -160,15 +140,18 @@ class Render:
         def sources(n: int) -> tuple[Path, Path | None]:
             return images.name(n) if images else self.image, depths.name(n) if depths else self.depth
 
-        if images is not None:
-            numbers = self._numbers(images, depths)
-        else:
+        if files.frames is not None or images is None:
             first, last = (0, 0) if is_single else files.frames or (keys[0][0], keys[-1][0])
-            numbers = range(first, last + 1)
-        target = FramePattern(self.out).name if not (is_single or is_animation) else lambda _: self.out
-        outputs = {n: target(n) for n in numbers}
-        for n, out in outputs.items():
-            check_files(*sources(n), out, files.sheet)
+            numbers: Sequence[int] = range(first, last + 1)
+        else:
+            numbers = images.frames()
+        if not numbers:
+            raise FileNotFoundError(f"{self.image}: there are no such files")
+        target = None if is_single or is_animation else FramePattern(self.out)
+        outputs: dict[int, Path] = {}
+        for n in numbers:
+            outputs[n] = target.name(n) if target else self.out
+            check_files(*sources(n), outputs[n], files.sheet)
         whole = list(numbers)  # frames of the sequence, each of which may depend on those before it
         if images and files.steady:
             whole = [n for n in images.frames() if depths is None or depths.name(n).is_file()]
@@ -177,8 +160,7 @@ class Render:
         record, existing = Record(self.out, options), [out for out in outputs.values() if out.is_file()]
         reason, done = record.difference(), set[Path]()
         if files.resume and not reason:
-            tables = self.blur.files()
-            done = record.kept(outputs, {n: [*sources(n), *tables] for n in whole}, files.steady)
+            done = record.kept(outputs, {n: [*sources(n), *self.blur.files()] for n in whole}, files.steady)
             reason = "they are older than their files or options, or they are cut short"
         if done:
             share = f"{self.out}: is" if is_single else f"{len(done)} of {len(outputs)} frames are"
@@ -190,6 +172,7 @@ class Render:
         for out in filter(None, [*todo.values(), files.sheet]):
             check_writable(out)
         from ..depth.sanity import Mistake
+        from ..depth.steady import SteadyFrames
         from .frame import Renderer
 
         renderer, depth_map = Renderer(self, scene, images is None, is_animation), scene.depth_map
@@ -201,36 +184,25 @@ class Render:
             renderer.notices.warn(self.depth or self.image, [Mistake("range", _OWN_EXTREMES)])
         read_files = functools.lru_cache(maxsize=1)(renderer.read)  # a focus pull reads one image many times
 
-        def read(n: int) -> "Frame":
-            return read_files(*sources(n))
+        def pixels_and_depth(place: int) -> "tuple[Tensor, Tensor]":
+            frame = read_files(*sources(whole[place]))
+            return frame.picture.pixels, frame.values
 
-        frames = _steadied(read, whole) if images and files.steady else read
+        steady = SteadyFrames(pixels_and_depth)
+
+        def read(n: int) -> "Frame":
+            if not (images and files.steady):
+                return read_files(*sources(n))
+            values = steady.depth(whole.index(n))  # reads frame n last, so that it is still in the cache
+            return dataclasses.replace(read_files(*sources(n)), values=values)
+
         if not is_animation:
-            return self._render_each(renderer, todo, frames, record if is_recorded else None)
+            return self._render_each(renderer, todo, read, record if is_recorded else None)
         with tempfile.TemporaryDirectory() as folder:
             todo = {n: Path(folder, f"{n}.webp") for n in todo}
-            self._render_each(renderer, todo, frames, None)
+            self._render_each(renderer, todo, read, None)
             make_folder_of(self.out)
             write_animation(self.out, list(todo.values()))
-
-    def _numbers(self, images: FramePattern, depths: FramePattern | None) -> Sequence[int]:
-        """Numbers of the requested frames of a sequence; refuses frames without an image or a depth."""
-        numbers: Sequence[int] = images.frames()
-        if self.files.frames is not None:
-            first, last = self.files.frames
-            requested, found = range(first, last + 1), {n for n in numbers if first <= n <= last}
-            if len(found) < len(requested):
-                missing = images.name(next(n for n in requested if n not in found))
-                absent = f"{len(requested) - len(found)} of {len(requested)} frames missing"
-                raise FileNotFoundError(f"{missing}: there is no such file ({absent})")
-            numbers = requested
-        if not numbers:
-            raise FileNotFoundError(f"{self.image}: there are no such files")
-        missing_depths = [path for n in numbers if depths is not None and not (path := depths.name(n)).is_file()]
-        if missing_depths:
-            summary = f"{len(missing_depths)} of {len(numbers)} depths missing"
-            raise FileNotFoundError(f"{missing_depths[0]}: there is no such file ({summary})")
-        return numbers
 
     def _render_each(
         self, renderer: "Renderer", files: Mapping[int, Path], read: "Callable[[int], Frame]", record: Record | None
@@ -240,22 +212,24 @@ class Render:
         The record is written before the first frame, but after it is rendered: an error in it leaves no file. Before
         each later frame it is read: the run ends if another one has begun to write other frames of these names.
         """
-        several = len(files) > 1
+        numbers = list(files)
         with (
-            Bar(f"rendering {self.out.name}", len(files) if several else None) as bar,
+            progress_bar(f"rendering {self.out.name}", len(files) if len(files) > 1 else None) as update,
             ThreadPoolExecutor(1) as reader,
             ThreadPoolExecutor(1) as writer,
         ):
-            numbers, reading, written = iter(files), list["Future[Frame]"](), writer.submit(lambda: None)
+            reading, written = reader.submit(read, numbers[0]), writer.submit(lambda: None)
             try:
-                for k, (n, out) in enumerate(files.items()):
-                    if several:
-                        bar.update(f"frame {k + 1} of {len(files)}", k)
-                    reading += [reader.submit(read, ahead) for ahead in itertools.islice(numbers, 2 - len(reading))]
-                    rendered = renderer.render(reading.pop(0).result(), out, n, None if several else bar)
+                for k, n in enumerate(numbers):
+                    if len(files) > 1:
+                        update(f"frame {k + 1} of {len(files)}", k)
+                    frame = reading.result()
+                    if k + 1 < len(numbers):
+                        reading = reader.submit(read, numbers[k + 1])
+                    rendered = renderer.render(frame, files[n], n)
                     written.result()
                     if k == 0 and record is not None:
-                        make_folder_of(out)
+                        make_folder_of(files[n])
                         record.write()
                     elif record is not None:
                         record.check()
@@ -267,20 +241,3 @@ class Render:
 def _pattern(path: Path | None) -> FramePattern | None:
     """The pattern of a numbered sequence; None for the path of a single file."""
     return FramePattern(path) if path is not None and FramePattern.matches(path) else None
-
-
-def _steadied(read: "Callable[[int], Frame]", numbers: Sequence[int]) -> "Callable[[int], Frame]":
-    """A version of ``read`` with steadied depth; ``numbers`` are all frames of the sequence, in order."""
-    from ..depth.steady import SteadyFrames
-
-    def pixels_and_depth(place: int) -> "tuple[Tensor, Tensor]":
-        frame = read(numbers[place])
-        return frame.picture.pixels, frame.values
-
-    frames, index_of = SteadyFrames(pixels_and_depth), {n: place for place, n in enumerate(numbers)}
-
-    def steadied(n: int) -> "Frame":
-        values = frames.depth(index_of[n])  # reads frame n last, so that ``read`` still has it
-        return dataclasses.replace(read(n), values=values)
-
-    return steadied

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -29,9 +29,7 @@ class Tables:
     """List blur tables, and draw their kernels.
 
     The picture has a column for each table and a row for each signed blur radius, from 24 pixels in front of the focus
-    plane to 24 behind it, in an image 1920 pixels wide. Each kernel is scaled to a largest value of 1 (white). A table
-    whose kernels depend on the place in the frame has four columns, from the middle of a 3:2 frame to its lower right
-    corner.
+    plane to 24 behind it. A table whose kernels depend on the place has four columns, from the middle to the corner.
 
         torchdof tables -o tables.png
 
@@ -39,9 +37,7 @@ class Tables:
     """
 
     names: tuple[str, ...] = argument("Names or JSON files; default: all that ship.", "[TABLE]...", ())
-    out: Path | None = option(
-        "Picture to write: a column of kernels a table, over the blur radius.", names=("--out", "-o")
-    )
+    out: Path | None = option("Picture to write.", names=("--out", "-o"))
     opening: ApertureOptions
     as_json: bool = json_option()
 
@@ -57,8 +53,12 @@ class Tables:
         panels = {}
         for name in self.names or ["disc", "gaussian", *shipped()]:
             table = self.opening.table_of(name)
-            facts = _facts(name, table)
-            print_result(self.as_json, facts, _text_line(facts))
+            source = str(table.provenance.get("source", "")).partition(";")[0]
+            facts = {"table": name, "family": table.family, "nodes": len(table.coc), "coc": table.coc[[0, -1]].tolist()}
+            facts |= {"unit": table.unit, "colours": table.channels, "source": source}
+            facts |= {"aperture": table.aperture and repr(table.aperture), "field": table.field and repr(table.field)}
+            line = f"{name:24s} {table!r}" + (f" ({source})" if source else "")
+            print_result(self.as_json, facts, line)
             if self.out is not None:
                 suffix = ": middle to corner" if table.depends_on_place else ""
                 panels[f"{Path(name).stem}{suffix}"] = _column(table)
@@ -70,32 +70,6 @@ class Tables:
         write_sheet(self.out, panels, rows=[f"{coc:+g} px" for coc in _COC_PX])
         if not self.as_json:
             click.echo(f"{self.out}: a row a blur radius in an image of {_WIDTH} px; negative is in front of focus")
-
-
-def _facts(name: str, table: "BlurTable") -> dict[str, Any]:
-    """Properties of a table, as data for JSON."""
-    return {
-        "table": name,
-        "family": table.family,
-        "nodes": len(table.coc),
-        "coc": [float(table.coc.min()), float(table.coc.max())],
-        "unit": table.unit,
-        "colours": table.channels,
-        "aperture": None if table.aperture is None else repr(table.aperture),
-        "field": None if table.field is None else repr(table.field),
-        "source": str(table.provenance.get("source", "")).partition(";")[0],
-    }
-
-
-def _text_line(facts: dict[str, Any]) -> str:
-    """Properties of a table as one line of text."""
-    parts = [f"{facts['family']}, {facts['nodes']} node{'s' if facts['nodes'] > 1 else ''}"]
-    if facts["unit"] != "relative":
-        low, high = facts["coc"]
-        parts.append(f"coc {low:.3g} to {high:.3g} {'mm' if facts['unit'] == 'mm' else 'of the width'}")
-    parts += [f"{facts['colours']} colours"] if facts["colours"] > 1 else []
-    parts += [facts[name] for name in ("aperture", "field") if facts[name]]
-    return f"{facts['table']:24s} {'; '.join(parts)}" + (f" ({facts['source']})" if facts["source"] else "")
 
 
 def _column(table: "BlurTable") -> "Tensor":

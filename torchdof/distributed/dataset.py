@@ -12,13 +12,16 @@ from typing import Any
 from ..io.atomic import write_text
 from ..io.paths import IMAGE_SUFFIXES, MAP_SUFFIXES
 from ..validation import whole
-from .shards import SUFFIXES, Format, Pair, RenderShards, name_of, samples_of, shard_rows
+from .shards import SUFFIXES, Format, Pair, RenderShards, samples_of, shard_rows
 
 _CARD = """# Defocus data set
 
 Sharp photographs, their depth in metres along the optical axis, and the same photographs as a lens with a random focus
 (even in 1 / metres) and opening (even in stops) would have taken them; each sample holds its own parameters.
 Made by torchdof.
+
+| what | how much |
+| --- | --- |
 """
 
 
@@ -44,22 +47,20 @@ def pairs_in(images: str | os.PathLike[str], depths: str | os.PathLike[str] | No
         ValueError: If an image has no depth file, or several.
     """
     photographs = _by_stem(images, IMAGE_SUFFIXES)
-    depth_files = {} if depths is None else _by_stem(depths, MAP_SUFFIXES)
+    maps = {} if depths is None else _by_stem(depths, MAP_SUFFIXES)
     if not photographs:
         raise FileNotFoundError(f"{images}: no images here ({' '.join(IMAGE_SUFFIXES)})")
-    pairs = []
     for stem, (image, *others) in photographs.items():
-        maps = depth_files.get(stem, [])
         if others:
             raise ValueError(f"{image}: there is {others[0].name} of the same name; keep one of them")
-        if depths is not None and len(maps) != 1:
-            names = " and ".join(path.name for path in maps) or "none"
+        if depths is not None and len(maps.get(stem, [])) != 1:
+            names = " and ".join(path.name for path in maps.get(stem, [])) or "none"
             raise ValueError(f"{image}: needs one depth map {stem}.* in {depths}, found {names}")
-        pairs.append(Pair(str(image), str(maps[0]) if maps else None))
-    return pairs
+    return [Pair(str(image), str(maps[stem][0]) if maps else None) for stem, (image,) in photographs.items()]
 
 
 def _by_stem(folder: str | os.PathLike[str], suffixes: tuple[str, ...]) -> dict[str, list[Path]]:
+    """The files of a folder with one of some suffixes, by their name without suffix."""
     by_stem: dict[str, list[Path]] = {}
     for path in sorted(_existing_folder(folder).absolute().iterdir()):
         if path.suffix.lower() in suffixes and not path.name.startswith("."):
@@ -100,7 +101,7 @@ def make_dataset(
         per_shard: Samples in a shard.
         copies: Number of blurred samples of each image.
         format: "webdataset" or "parquet".
-        say: Gets a line of text for each shard, and the throughput at the end.
+        say: Gets lines of text: the shards that exist, the throughput, the inputs that were left out.
         **render: Further arguments of :class:`RenderShards`.
 
     Returns:
@@ -125,18 +126,15 @@ def make_dataset(
     settings = json.loads(json.dumps(settings | renderer.settings()))  # tuples become lists
     _check_settings(out / "plan.json", settings)
     missing = [row for row in rows if renderer.samples_of(**row) is None]
-    again = sum(samples_of(out / name_of(row["shard"], format)) is not None for row in missing)
     say(f"{len(rows) - len(missing)} of {len(rows)} shards are there already")
-    if again:
-        say(f"{again} of {len(rows)} shards are made again: their input files have changed")
     if missing:
         if not ray.is_initialized():
             ray.init(include_dashboard=False)
         cores = int(ray.cluster_resources().get("CPU", 0))
         if workers > cores:
             raise ValueError(f"workers must be at most the cores of the Ray cluster, {cores}, got {workers}")
-        ray.data.DataContext.get_current().enable_progress_bars = False  # a line for each shard is printed instead
-        results = ray.data.from_items(missing, override_num_blocks=len(missing)).map_batches(
+        start = time.perf_counter()
+        made = ray.data.from_items(missing, override_num_blocks=len(missing)).map_batches(
             RenderShards,
             fn_constructor_args=(str(out.resolve()), blur),
             fn_constructor_kwargs={"format": format, "threads": 1, **render},
@@ -144,13 +142,7 @@ def make_dataset(
             compute=ray.data.ActorPoolStrategy(size=min(workers, len(missing))),
             num_cpus=1,
         )
-        start, count = time.perf_counter(), 0
-        samples_left = {row["shard"]: len(json.loads(row["samples"])) for row in missing}
-        for row in results.iter_rows():
-            count += not row["error"]
-            samples_left[row["shard"]] -= 1
-            if not samples_left[row["shard"]]:
-                say(f"{name_of(row['shard'], format)} is complete")
+        count = sum(not row["error"] for row in made.iter_rows())
         seconds = time.perf_counter() - start
         rate = count / seconds
         say(f"{count} samples in {seconds:.1f} s: {rate:.2f} images/s, {rate / workers:.2f} a worker")
@@ -158,8 +150,8 @@ def make_dataset(
     facts: dict[str, Any] = {"samples": summary.samples, "shards": summary.shards}
     facts |= {"inputs left out": f"{len(summary.broken)}, listed in broken.txt"}
     facts |= {"time": f"{summary.seconds / max(1, summary.samples):.3f} s of one core a sample", **settings}
-    lines = [f"| {name} | {fact if isinstance(fact, str) else json.dumps(fact)} |" for name, fact in facts.items()]
-    write_text(out / "README.md", "\n".join([_CARD, "| what | how much |", "| --- | --- |", *lines, ""]))
+    lines = [f"| {name} | {fact if isinstance(fact, str) else json.dumps(fact)} |\n" for name, fact in facts.items()]
+    write_text(out / "README.md", _CARD + "".join(lines))
     write_text(out / "broken.txt", "".join(f"{image}\t{problem}\n" for image, problem in summary.broken))
     for image, problem in summary.broken:
         say(f"left out: {problem}" if problem.startswith(image) else f"left out: {image}: {problem}")
@@ -169,8 +161,8 @@ def make_dataset(
 def summary_of(out: str | os.PathLike[str]) -> Summary:
     """Contents of the complete shards of a folder; ``FileNotFoundError`` if the folder is missing."""
     shards = [path for path in sorted(_existing_folder(out).glob("shard-*")) if path.suffix in SUFFIXES.values()]
-    noted = [samples for samples in map(samples_of, shards) if samples is not None]
-    rows = [row for samples in noted for row in samples]
+    noted = [notes for shard in shards if (notes := samples_of(shard)) is not None]
+    rows = [row for notes in noted for row in notes]
     broken = [(row["image"], row["error"]) for row in rows if row["error"]]
     return Summary(len(rows) - len(broken), len(noted), broken, sum(row["seconds"] for row in rows))
 

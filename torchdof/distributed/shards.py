@@ -4,12 +4,12 @@ A shard's file name is its number, and its contents depend only on its row, its 
 was interrupted can therefore continue with the missing shards, and gives the same files as an uninterrupted one.
 """
 
-import contextlib
 import dataclasses
 import hashlib
 import importlib.metadata
 import importlib.util
 import inspect
+import io
 import json
 import os
 import tempfile
@@ -86,11 +86,6 @@ def shard_rows(pairs: Sequence[Pair], per_shard: int = 64, copies: int = 1) -> l
     samples = [{"key": f"{n:08d}", **sample} for n, sample in enumerate(repeated)]
     parts = [samples[start : start + per_shard] for start in range(0, len(samples), per_shard)]
     return [{"shard": number, "samples": json.dumps(part)} for number, part in enumerate(parts)]
-
-
-def name_of(shard: int, format: Format) -> str:
-    """The name of a shard's file."""
-    return f"shard-{int(shard):06d}{SUFFIXES[format]}"
 
 
 def samples_of(shard: Path, source: str | None = None) -> list[dict[str, Any]] | None:
@@ -190,14 +185,17 @@ class RenderShards:
         """
         rows: list[dict[str, Any]] = []
         for shard, samples in zip(batch["shard"], batch["samples"], strict=True):
-            path, source = self.out / name_of(shard, self.format), self._source(samples)
-            notes = samples_of(path, source) or self._make(path, source, json.loads(str(samples)))
+            notes = self.samples_of(shard, samples) or self._make(shard, samples)
             rows += [{"shard": int(shard), **row} for row in notes]
         return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
+    def path_of(self, shard: int) -> Path:
+        """The file of a shard."""
+        return self.out / f"shard-{int(shard):06d}{SUFFIXES[self.format]}"
+
     def samples_of(self, shard: int, samples: str) -> list[dict[str, Any]] | None:
         """Notes about the samples of a shard; None if it has to be made."""
-        return samples_of(self.out / name_of(shard, self.format), self._source(samples))
+        return samples_of(self.path_of(shard), self._source(samples))
 
     def settings(self) -> dict[str, Any]:
         """Everything except the rows that determines the shards, as JSON values."""
@@ -213,16 +211,17 @@ class RenderShards:
     def _source(self, samples: str) -> str:
         """Digest of all that determines a shard: settings, samples, and size and time of their files."""
         files = {sample[name] for sample in json.loads(str(samples)) for name in ("image", "depth") if sample[name]}
-        facts = [self.settings(), str(samples), [_size_and_time(file) for file in sorted(files)]]
+        found = [os.stat(file) for file in sorted(files) if os.path.exists(file)]
+        facts = [self.settings(), str(samples), [(file.st_size, file.st_mtime_ns) for file in found]]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
-    def _make(self, path: Path, source: str, samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    def _make(self, shard: int, samples: str) -> list[dict[str, Any]]:
         """Renders and writes one shard; returns the notes about its samples.
 
         Between removing the old notes and writing the new ones a shard counts as incomplete, whatever its file holds.
         """
-        records, rows = [], []
-        for sample in samples:
+        path, source, records, rows = self.path_of(shard), self._source(samples), [], []
+        for sample in json.loads(str(samples)):
             start, error = time.process_time(), ""
             try:
                 records.append(self._record(**sample))
@@ -252,17 +251,16 @@ class RenderShards:
         options = self.blur.renderings[int(drawn["table"])]
         with torch.no_grad():
             blurred = depth_of_field(source.pixels, metres, camera, **options.arguments())
-        files = {
-            f"blurred{self.picture}": lambda path: write_image(path, Picture(blurred, source.channels)),
-            f"sharp{self.picture}": lambda path: write_image(path, Picture(source.pixels, source.channels)),
-            "depth.npy": lambda path: np.save(path, metres[0, 0].numpy()),
-        }
         contents = {}
         with tempfile.TemporaryDirectory() as folder:
-            for path, write in ((Path(folder) / name, write) for name, write in files.items()):
-                if path.stem in self.keep:
-                    write(path)
+            for name, pixels in (("blurred", blurred), ("sharp", source.pixels)):
+                if name in self.keep:
+                    path = Path(folder, name + self.picture)
+                    write_image(path, Picture(pixels, source.channels))
                     contents[path.name] = path.read_bytes()
+        if "depth" in self.keep:
+            np.save(array := io.BytesIO(), metres[0, 0].numpy())
+            contents["depth.npy"] = array.getvalue()
         table, (height, width) = options.table, blurred.shape[-2:]
         parameters = {
             **_json_values(vars(camera) | options.arguments()),
@@ -283,14 +281,6 @@ def _read_relative(
     values = read_values(path, channel)
     metres = from_relative(values, near_m, far_m, relative_kind, value_range=value_range, unknown=unknown)
     return resolve_holes(metres, path, fill)[0]
-
-
-def _size_and_time(file: str) -> tuple[int, int] | None:
-    """Size in bytes and time of the last change in ns; None if the file is missing."""
-    with contextlib.suppress(OSError):
-        facts = os.stat(file)
-        return facts.st_size, facts.st_mtime_ns
-    return None
 
 
 def _text(name: str) -> str:
