@@ -225,7 +225,7 @@ def test_a_batch_of_parameters_equals_each_alone() -> None:
     [
         ("box", {"radius": 1.0}, "family must be one of gaussian, ring, disc, softm, radial, got 'box'"),
         ("disc", {"radius": -0.1}, "radius of disc must be finite and >= 0"),
-        ("gaussian", {"sigma": math.nan}, "sigma of gaussian must be finite"),
+        ("gaussian", {"sigma": math.nan}, "sigma must be finite numbers"),
         ("softm", {"radius": 1.0, "sigma": 0.0, "b": -1.5, "m": 2.0}, "b of softm must be finite and >= -1"),
         ("radial", {"values": torch.tensor([1.0]), "radius": 1.0}, "values must be .* with P >= 2"),
         ("radial", {"values": torch.tensor([1.0, -1.0]), "radius": 1.0}, "values of radial must be finite and >= 0"),
@@ -236,40 +236,9 @@ def test_bad_parameters_are_refused_by_name(family: str, params: dict[str, Any],
         psf.pixel_kernels(family, params)
 
 
-LARGE: dict[str, dict[str, Any]] = {
-    "gaussian": {"sigma": 60.0},
-    "ring": {"sigma": 40.0, "r_c": 90.0},
-    "disc": {"radius": 280.3},
-    "softm": {"radius": 220.0, "sigma": 12.0, "b": 0.5, "m": 3.0},
-    "radial": {"values": torch.linspace(1.0, 0.0, 9), "radius": 280.0},
-}
-
-
-@pytest.mark.parametrize(("family", "params"), LARGE.items())
-@pytest.mark.parametrize("window", [1, 41])
-def test_the_window_of_a_large_kernel_is_the_middle_of_the_whole(
-    family: str, params: dict[str, Any], window: int
-) -> None:
-    whole, part = psf.pixel_kernels(family, params), psf.pixel_kernels(family, params, window=window)
-    spare = (whole.shape[-1] - window) // 2
-    assert spare > 200
-    torch.testing.assert_close(part, whole[spare : spare + window, spare : spare + window], rtol=1e-6, atol=0.0)
-
-
-@pytest.mark.parametrize(("family", "params"), LARGE.items())
-def test_the_window_of_a_huge_kernel_is_computed_alone(family: str, params: dict[str, Any]) -> None:
-    """A kernel of 1e8 pixels a side does not fit into memory; its window is nearly constant."""
-    huge = {k: v * 1e6 if k in psf.LENGTHS else v for k, v in params.items()}
-    part, smaller = psf.pixel_kernels(family, huge, window=9), psf.pixel_kernels(family, params, window=1)
-    assert part.shape == (9, 9)
-    torch.testing.assert_close(1e12 * part, smaller.expand(9, 9), rtol=3e-2, atol=0.0)
-
-
-def test_sizes_and_windows_are_odd_and_a_smaller_size_keeps_the_sum() -> None:
+def test_sizes_are_odd_and_a_smaller_size_keeps_the_sum() -> None:
     whole, cut = kernel_of("gaussian", 2.0, size=21), kernel_of("gaussian", 2.0, size=5)
     assert_close(cut, whole[8:13, 8:13] / whole[8:13, 8:13].sum())
-    assert torch.equal(kernel_of("disc", 3.0), psf.pixel_kernels("disc", {"radius": 3.0}, window=99))
     for size in (0, -1, 4):
-        for sizes in ({"size": size}, {"window": size}):
-            with pytest.raises(ValueError, match=f"size must be a positive odd number of pixels, got {size}"):
-                psf.pixel_kernels("disc", {"radius": 2.0}, **sizes)  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match=f"size must be a positive odd number of pixels, got {size}"):
+            kernel_of("disc", 2.0, size=size)

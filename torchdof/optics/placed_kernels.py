@@ -19,7 +19,7 @@ already.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as functional
@@ -27,7 +27,7 @@ from torch import Tensor
 
 from .aperture import overlaps
 from .field import bracket, deviations
-from .kernel_bank import SPOT_MARGIN_PX, Lens
+from .kernel_bank import SPOT_MARGIN_PX, Table
 from .kernel_cache import KernelCache
 
 __all__ = ["DISTANCES", "FieldMask", "layer_mask", "placed", "placed_between", "ray_masks"]
@@ -44,13 +44,6 @@ _MIN_LIGHT = 1e-6  # share of a kernel's light; where less passes, the kernel is
 _MIN_SHRINK = 0.5  # smallest scale of a spot, which is shrunk by the blur that sampling adds
 _RADIUS_RATIO = 1.09  # ratio of neighbouring radii at which the masks of highlights are computed
 _masks = KernelCache(128 * 2**20)
-
-
-class PlacedLens(Lens, Protocol):
-    """The part of :class:`torchdof.BlurTable` that masks are computed from."""
-
-    def reach_px(self, coc_px: float, width: float) -> float:
-        """Radius in pixels that holds the kernels at ``+-coc_px``."""
 
 
 class FieldMask(NamedTuple):
@@ -75,7 +68,7 @@ class FieldMask(NamedTuple):
         return self._replace(values=self.values.to(like).contiguous(), boxes=self.boxes.to(like).contiguous())
 
 
-def layer_mask(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int]) -> FieldMask:
+def layer_mask(table: Table, coc_px: float, scale: int, size: tuple[int, int]) -> FieldMask:
     """Field mask of a layer.
 
     Args:
@@ -89,7 +82,7 @@ def layer_mask(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, in
     return FieldMask(values, boxes, coc_px / scale, _squeeze(table))
 
 
-def ray_masks(table: PlacedLens, coc_px: Sequence[float], size: tuple[int, int]) -> list[FieldMask]:
+def ray_masks(table: Table, coc_px: Sequence[float], size: tuple[int, int]) -> list[FieldMask]:
     """Field masks for highlights with signed ``coc_px``, ordered by coc.
 
     They are computed at fixed radii, powers of ``_RADIUS_RATIO``: the two around each highlight.
@@ -105,12 +98,12 @@ def ray_masks(table: PlacedLens, coc_px: Sequence[float], size: tuple[int, int])
     return [FieldMask(values, boxes, radius, squeeze) for (values, boxes), radius in zip(computed, radii, strict=True)]
 
 
-def _squeeze(table: PlacedLens) -> float | Tensor:
+def _squeeze(table: Table) -> float | Tensor:
     return 1.0 if table.aperture is None else table.aperture.squeeze
 
 
 @torch.inference_mode(False)  # cached tensors must be usable by autograd
-def _computed(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def _computed(table: Table, coc_px: float, scale: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Values and boxes of :class:`FieldMask`, float64.
 
     For the spots of a field:
@@ -155,10 +148,8 @@ def _computed(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int
     return values / values.amax((0, 2, 3), keepdim=True), extent
 
 
-def _through_rims(table: PlacedLens, coc_px: float, width: float, distance: Tensor) -> tuple[Tensor, Tensor]:
+def _through_rims(table: Table, coc_px: float, width: float, distance: Tensor) -> tuple[Tensor, Tensor]:
     """Values and boxes for cat's eyes: signed distances in pixels to the nearer rim, plus half a pixel, unclamped."""
-    if table.aperture is None:
-        raise AssertionError("a table that depends on the place has a field or rims")
     # whole pixels, so that samples lie a pixel apart, whatever the squeeze
     reach = math.ceil((math.ceil(table.reach_px(coc_px, width)) + 1) * max(1.0, float(table.aperture.squeeze)))
     boxes = torch.tensor([0.0, reach, reach], dtype=torch.float64, device="cpu").expand(len(distance), 3)

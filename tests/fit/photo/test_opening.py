@@ -14,7 +14,7 @@ from torchdof.optics.psf import pixel_kernels
 def kernel_of(fit):
     tensors = {k: torch.as_tensor(v) for k, v in fit.kernel_params().items()}
     family = fit.family if fit.aperture is None else "disc"
-    return pixel_kernels(family, tensors, None, None, fit.aperture).numpy()
+    return pixel_kernels(family, tensors, None, fit.aperture).numpy()
 
 
 def centred(kernel):
