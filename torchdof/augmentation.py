@@ -147,12 +147,9 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         options = self.renderings[0].arguments()
         del options["table"]
         tables = [rendering.table for rendering in self.renderings]
-        shown = {
-            **{"focus_m": self.focus_m, "f_number": self.f_number, "camera": self.camera},
-            **{"table": tables if len(tables) > 1 else tables[0], **self.flags},
-            **{"same_on_batch": self.same_on_batch, "p": self.p, "keepdim": self.keepdim},
-            **{"return_label": self.return_label, **options},
-        }
+        names = ("focus_m", "f_number", "camera", "same_on_batch", "p", "keepdim", "return_label")
+        shown = {name: getattr(self, name) for name in names}
+        shown |= {"table": tables if len(tables) > 1 else tables[0], **self.flags, **options}
         return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in shown.items())})"
 
     def __call__(self, input: Any, *arguments: Any, **kwargs: Any) -> Any:

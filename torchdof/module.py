@@ -188,14 +188,9 @@ class DepthOfField(nn.Module):
         f_number: float | Tensor | None,
         name: str = "depth",
     ) -> Tensor:
-        """The circle of confusion of a depth map without repair of its edges.
+        """The circle of confusion of a depth map without repair of its edges, for images ``[B, C, H, W]``.
 
-        Args:
-            image: ``[B, C, H, W]``.
-            depth: ``[B or 1, 1, H, W]``, of the image's size, or of a size that can be resampled to it.
-            focus_m: A number or ``[B]``; None uses the camera's.
-            f_number: The same.
-            name: Name of the depth in messages.
+        The depth ``[B or 1, 1, H, W]`` may have a size that can be resampled to the image's.
         """
         check = self.options.check
         if not is_traced() and validation.is_resizable(image, depth):
@@ -240,8 +235,7 @@ class DepthOfField(nn.Module):
     def get_extra_state(self) -> dict[str, Any]:
         """Camera, table and options: the whole configuration travels with ``state_dict``."""
         camera = {k: getattr(self.camera, k) for k in Camera.__dataclass_fields__}
-        options = self.options
-        return {"camera": camera, **options.arguments(), "table": options.table.to_dict()}
+        return {"camera": camera, **self.options.arguments(), "table": self.options.table.to_dict()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore the result of :meth:`get_extra_state`; an error changes nothing.
@@ -253,7 +247,7 @@ class DepthOfField(nn.Module):
 
     def extra_repr(self) -> str:
         """Camera, table and options, as ``repr`` shows them."""
-        options: dict[str, Any] = {**self.options.arguments()}
+        options = self.options.arguments()
         table = options.pop("table")
         return f"{self.camera!r},\n{table!r},\n" + ", ".join(f"{k}={v!r}" for k, v in options.items())
 
@@ -364,31 +358,19 @@ def blur(
 
     Arguments as in :func:`blur_by_coc`, with four axes, and the operations ``ops`` (an exported graph has its own).
     """
-    channels = options.table.channels
-    validation.image_and_coc(image, coc_px, channels, values=options.check)
-    _check_plan(plan)
-    validation.background(image, background, "background_coc_px", background_coc_px, "in pixels", options.check)
-    hidden = None if background is None or background_coc_px is None else (background, background_coc_px)
-    if hidden is not None and not options.occlusion:
-        raise ValueError("without occlusion nothing is hidden: a background needs occlusion=True")
-    _check_attention(attention, plan, options)
-    with without_autocast(image.device.type):  # it would convolve in half precision
-        return pipeline.blur(image, coc_px, plan, options, hidden, attention, ops)
-
-
-def _check_plan(plan: Plan | None) -> None:
+    validation.image_and_coc(image, coc_px, options.table.channels, values=options.check)
     if plan is not None and not isinstance(plan, Plan):
         raise ValueError(
             f"plan must be a Plan from DepthOfField.plan(image, depth) or None, got {validation.show(plan)}; "
             "leave it out to plan for this image"
         )
-
-
-def _check_attention(attention: Attention | None, plan: Plan | None, options: Options) -> None:
-    """Refuse attention beside a plan, which has one tolerance, and in traced code."""
-    if attention is None:
-        return
-    if plan is not None:
+    validation.background(image, background, "background_coc_px", background_coc_px, "in pixels", options.check)
+    hidden = None if background is None or background_coc_px is None else (background, background_coc_px)
+    if hidden is not None and not options.occlusion:
+        raise ValueError("without occlusion nothing is hidden: a background needs occlusion=True")
+    if attention is not None and plan is not None:
         raise ValueError("attention plans for two tolerances; leave plan out, or attention")
-    if is_traced():
+    if attention is not None and is_traced():
         raise ValueError("attention chooses its work by where the viewer looks; a compiled or exported graph cannot")
+    with without_autocast(image.device.type):  # it would convolve in half precision
+        return pipeline.blur(image, coc_px, plan, options, hidden, attention, ops)

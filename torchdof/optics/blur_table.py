@@ -94,7 +94,7 @@ class BlurTable:
             raise ValueError(f"name must be a text, got {show(name)}")
         if provenance is not None and not isinstance(provenance, Mapping):
             raise ValueError(f"provenance must be a dict, got {show(provenance)}")
-        self.family, self.unit, self.name = family, unit, str(name)
+        self.family, self.unit, self.name = family, unit, name
         self.coc = numbers("coc", coc)
         if self.coc.ndim != 1 or not len(self.coc) or bool((self.coc.diff() <= 0).any()) or not self.coc.any():
             raise ValueError(
@@ -256,12 +256,7 @@ class BlurTable:
         return self.aperture is not None and self.aperture.is_differentiated
 
     def fingerprint(self) -> str:
-        """Hash of all numbers that kernels depend on; computed once.
-
-        Example:
-            >>> BlurTable.disc().fingerprint() == BlurTable.disc().fingerprint() != BlurTable.gaussian().fingerprint()
-            True
-        """
+        """Hash of all numbers that kernels depend on; computed once."""
         if self._fingerprint is None:
             data: list[Any] = [self.family, self.unit, self.sensor_width_mm, self.px_per_unit(1.0), self.coc.tolist()]
             data += [(name, value.tolist()) for name, value in self._params.items()]

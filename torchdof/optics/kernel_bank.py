@@ -144,11 +144,10 @@ class KernelBank:
         """The recipe of kernels: templates, weights, radii.
 
         Args:
-            coc_px: Signed coc ``[n]`` in pixels of the image.
+            coc_px: Signed coc ``[n]`` in pixels of an image ``width`` pixels wide.
             width: Width of the image in pixels.
-            scale: Downsampling factor of each kernel's layer, n of them; empty means 1.
-            longest: Longer side of the frame in downsampled pixels, n of them: a half width is limited to one less.
-                Empty leaves the kernels whole.
+            scale: Downsampling factors ``[n]`` of the layers; empty means 1.
+            longest: Longer sides ``[n]`` of the frame in downsampled pixels, to which kernels are cut; empty: uncut.
         """
         cocs = coc_px.detach().to("cpu", torch.float64).tolist() if isinstance(coc_px, Tensor) else list(coc_px)
         scales = list(scale) or [1.0] * len(cocs)
@@ -205,9 +204,8 @@ class KernelBank:
     def kernels(
         self, coc_px: Tensor | Sequence[float], width: float, scale: Sequence[float] = (), longest: Sequence[int] = ()
     ) -> Tensor:
-        """Kernels ``[n, C, k, k]``, float64 on the CPU, as :meth:`torchdof.BlurTable.kernels` has them.
+        """Kernels ``[n, C, k, k]``, float64 on the CPU, as wide as the widest; each sums to 1 minus the light cut off.
 
-        All have the width of the widest. They are non-negative; each sums to 1, minus the light that is cut off.
         Arguments as in :meth:`spots`. Differentiable in ``coc_px``.
         """
         return self.of_spots(self.spots(coc_px, width, scale, longest))
@@ -279,10 +277,9 @@ class KernelBank:
         return self._sums[key]
 
     def kept(self, sign: float, find: Callable[["KernelBank", float, float], float]) -> float:
-        """A number that depends only on the blur on one side of focus, computed by ``find`` once.
+        """A number that depends only on the blur on one side of focus, computed once: ``find(bank, coc_px, width)``.
 
-        ``find(bank, coc_px, width)`` gets a coc of 1 or -1 pixel, and the image width at which that is the coc of the
-        last node of the side.
+        The coc is 1 or -1 pixel, and the width is that of the image in which the last node of the side has this coc.
         """
         sign = 1.0 if self._mirrored and self.table.is_round else sign
         if sign not in self._found:

@@ -134,16 +134,9 @@ def pixel_kernels(
 
 
 def template(family: str, params: Mapping[str, Tensor], cells: int, aperture: Aperture | None = None) -> Tensor:
-    """Light in the cells of a PSF with a radius of ``cells`` cells, from which :func:`sampled` makes kernels.
+    """Light ``[C, 2 cells + 3, 2 cells + 3]`` in the cells of a PSF whose radius is ``cells`` cells, up to a factor.
 
-    Args:
-        family: A key of :data:`FAMILIES`.
-        params: Checked parameters by name, ``[C]`` (``values``: ``[C, P]``), in any unit, float64.
-        cells: Number of cells from the centre to the end.
-        aperture: The opening that the profile is multiplied by; None is a round one.
-
-    Returns:
-        ``[C, 2 cells + 3, 2 cells + 3]``, float64, up to a factor.
+    :func:`sampled` makes kernels of it. Parameters ``[C]`` (``values``: ``[C, P]``) are checked, and in any unit.
     """
     lengths = _rendered(params)
     cell = reach(family, lengths, aperture) / cells
@@ -161,18 +154,9 @@ def sampled(cells: Tensor, height: Tensor, width: Tensor, half: int) -> Tensor:
 
 
 def profile(family: str, r: Tensor, params: Mapping[str, Number]) -> Tensor:
-    """The profile ``f(r)`` itself, not normalised and not integrated: eq. (1) without N for ``ring``.
+    """The profile ``f(r)`` itself, ``[..., n]``, not normalised and not integrated: eq. (1) without N for ``ring``.
 
-    Args:
-        family: A key of :data:`FAMILIES`.
-        r: Distances from the centre, ``[n]``, in the unit of the lengths among the parameters.
-        params: Parameters by name, floats or ``[...]``.
-
-    Returns:
-        ``[..., n]``, float64.
-
-    Raises:
-        ValueError: If the family or a parameter is not as described.
+    ``r`` ``[n]`` are distances from the centre, in the unit of the lengths among the parameters ``[...]``.
     """
     checked = {k: v if k == "values" else v.unsqueeze(-1) for k, v in _checked(family, params).items()}
     r = real_tensor("r", r, "[n]").to(torch.float64)
