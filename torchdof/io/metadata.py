@@ -14,8 +14,10 @@ Metadata = dict[str, tuple[Any, Any]]
 
 # Attributes of the storage of one file, which do not apply to a copy.
 _STORAGE_PREFIXES = ("oiio:", "tiff:", "openexr:", "png:", "pnm:", "jpeg:", "rgbe:", "thumbnail", "Exif:ExifVersion")
-_STORAGE_NAMES: tuple[str, ...] = ("name", "planarconfig", "textureformat", "CompressionQuality")
-_STORAGE_NAMES += ("Exif:FlashPixVersion", "Exif:ColorSpace")
+_STORAGE_NAMES = (
+    *("name", "planarconfig", "textureformat", "CompressionQuality"),
+    *("Exif:FlashPixVersion", "Exif:ColorSpace"),
+)
 _MM_PER_UNIT: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
 _FLIPPED: dict[Any, tuple[int, ...]] = {2: (1,), 3: (0, 1), 4: (0,), 5: (), 6: (1,), 7: (0, 1), 8: (0,)}
 """EXIF orientation (0x0112) -> flipped axes. Orientations from 5 up first transpose the image."""
@@ -28,14 +30,7 @@ _AXIS_TAGS = (  # tags that are swapped when an image is transposed
 
 
 def upright(values: "np.ndarray", metadata: Metadata) -> "tuple[np.ndarray, Metadata]":
-    """Turns an image ``[H, W, C]`` upright by its orientation tag, and sets the tag to 1.
-
-    Example:
-        >>> import numpy as np
-        >>> lying = np.arange(6).reshape(2, 3, 1)
-        >>> upright(lying, {"Orientation": ("uint16", 6)})[0][..., 0].tolist()
-        [[3, 0], [4, 1], [5, 2]]
-    """
+    """Turns an image ``[H, W, C]`` upright by its orientation tag, and sets the tag to 1."""
     kind, orientation = metadata.get("Orientation", (None, 1))
     if orientation not in _FLIPPED:
         return values, metadata
@@ -52,11 +47,7 @@ def upright(values: "np.ndarray", metadata: Metadata) -> "tuple[np.ndarray, Meta
 
 
 def kept_metadata(attributes: Iterable[Any]) -> Metadata:
-    """Metadata for a copy of an image, from OpenImageIO's ``extra_attribs``.
-
-    Returns:
-        Name -> (type, value), without attributes of the storage.
-    """
+    """Metadata for a copy of an image: OpenImageIO's ``extra_attribs``, without those of the storage."""
     return {
         a.name: (a.type, a.value)
         for a in attributes
@@ -65,19 +56,11 @@ def kept_metadata(attributes: Iterable[Any]) -> Metadata:
 
 
 def camera_settings(metadata: Mapping[str, tuple[Any, Any]], width: int, height: int) -> dict[str, float]:
-    """Camera settings found in the metadata, under the names of ``torchdof.Camera``.
+    """Camera settings found in the metadata of a picture of a size in pixels, under the names of ``torchdof.Camera``.
 
     The sensor width comes from the resolution of the focal plane (EXIF 0xA20E). If that is missing, or differs by more
     than 25 % (for example after scaling the picture), it comes from the 35 mm equivalent focal length, with 36 mm for
     the longer side of the picture. Numbers that no lens has are ignored.
-
-    Args:
-        metadata: As in ``Picture.metadata``.
-        width: Width of the image in pixels.
-        height: Height of the image in pixels.
-
-    Returns:
-        Those of ``focal_length_mm``, ``f_number``, ``focus_m`` and ``sensor_width_mm`` that are known.
 
     Example:
         >>> tags = {"Exif:FocalLength": 50.0, "FNumber": 1.8, "Exif:FocalLengthIn35mmFilm": 75}
