@@ -68,36 +68,30 @@ def camera_settings(metadata: Mapping[str, tuple[Any, Any]], width: int, height:
         {'focal_length_mm': 50.0, 'f_number': 1.8, 'sensor_width_mm': 24.0}
     """
 
-    def number(*names: str, low: float = 0.0, high: float = math.inf) -> float | None:
+    def number(*names: str, ends: tuple[float, float] = (0.0, math.inf)) -> float | None:
         for name in names:
             value = metadata.get(name, (None, None))[1]
             is_number = isinstance(value, float) or (isinstance(value, int) and value < 2**63)
-            if is_number and 0 < value and low <= value <= high:
+            if is_number and 0 < value and ends[0] <= value <= ends[1]:
                 return float(value)
         return None
 
     settings: dict[str, float] = {}
-    names = ("Exif:FocalLength", "effectiveFocalLength", "nominalFocalLength")
-    focal_length_mm = number(*names, low=_FOCAL_MM[0], high=_FOCAL_MM[1])
-    if focal_length_mm is not None:
+    if focal_length_mm := number("Exif:FocalLength", "effectiveFocalLength", "nominalFocalLength", ends=_FOCAL_MM):
         settings["focal_length_mm"] = focal_length_mm
-    f_number = number("FNumber", "Exif:FNumber", "aperture", low=_F_NUMBERS[0], high=_F_NUMBERS[1])
-    f_stops = number("Exif:ApertureValue", high=20.0)
-    if f_number is None and f_stops is not None:
+    f_number = number("FNumber", "Exif:FNumber", "aperture", ends=_F_NUMBERS)
+    if f_number is None and (f_stops := number("Exif:ApertureValue", ends=(0.0, 20.0))):
         f_number = 2 ** (f_stops / 2)  # APEX
     if f_number is not None:
         settings["f_number"] = round(f_number, 6)
-    focus_m = number("Exif:SubjectDistance", "focus")
-    if focus_m is not None:
+    if focus_m := number("Exif:SubjectDistance", "focus"):
         settings["focus_m"] = math.inf if focus_m > 1e6 else focus_m  # EXIF writes infinity as 2^32 - 1
-    film_mm = number("Exif:FocalLengthIn35mmFilm", low=_FOCAL_MM[0], high=_FOCAL_MM[1])
-    if film_mm is not None:
+    if film_mm := number("Exif:FocalLengthIn35mmFilm", ends=_FOCAL_MM):
         focal_length_mm = settings.setdefault("focal_length_mm", film_mm)  # the equivalent lens, if no other is known
         width_mm = 36.0 * focal_length_mm / film_mm * (width / max(width, height))
         if _SENSOR_MM[0] <= width_mm <= _SENSOR_MM[1]:
             settings["sensor_width_mm"] = width_mm
-    px_per_unit = number("Exif:FocalPlaneXResolution")
-    if px_per_unit is not None:
+    if px_per_unit := number("Exif:FocalPlaneXResolution"):
         original_width = number("Exif:PixelXDimension") or width
         mm_per_unit = _MM_PER_UNIT.get(number("Exif:FocalPlaneResolutionUnit") or 2, 25.4)
         plane_mm = original_width / px_per_unit * mm_per_unit

@@ -132,10 +132,8 @@ class Aperture:
     def shares(self, half: int, step_y: Tensor, step_x: Tensor) -> Tensor:
         """Open share of each cell of a grid, without the squeeze: ``[..., 2 half + 1, 2 half + 1]``, float64.
 
-        Args:
-            half: Cells on each side of the middle one, which is centred on the opening.
-            step_y: Height of the cells ``[...]``; the circumscribed circle of the opening has radius 1.
-            step_x: Width of the cells ``[...]``.
+        The middle cell is centred on the opening, whose circumscribed circle has radius 1; ``step_y`` and ``step_x``
+        ``[...]`` are the height and width of the cells.
         """
         batch = broadcast_shapes(step_y.shape, step_x.shape)
         heights, widths = (step.to(torch.float64).expand(batch).reshape(-1) for step in (step_y, step_x))

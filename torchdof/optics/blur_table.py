@@ -162,15 +162,12 @@ class BlurTable:
 
         Args:
             blades: Number of blades, from 3.
-            rotation_deg: Turns the polygon counter-clockwise, as it appears behind the focus plane; at 0 a corner
-                points up. A float, or a tensor ``[]``, which may require a gradient.
+            rotation_deg: Degrees, as in :class:`torchdof.optics.aperture.Aperture`.
             curvature: 0 for straight blades to 1 for a circle.
-            squeeze: Height of the blur over its width, 2 for a common anamorphic lens; the circle of confusion is the
-                height. A float, or a tensor ``[]``, which may require a gradient.
+            squeeze: Height of the blur over its width, 2 for a common anamorphic lens, as in ``Aperture``.
             rim: Brightness of the edge over that of the middle, minus 1: positive for an over-corrected lens (spherical
                 aberration), 0 for an even disc, -1 for a dark edge.
-            vignetting: Cat's eyes, 0 (round) to 1 (closed in the corner), or a pair for the front and rear rim
-                (:class:`torchdof.optics.aperture.Aperture`).
+            vignetting: Cat's eyes, 0 (round) to 1 (closed in the corner), as in ``Aperture``.
 
         Raises:
             ValueError: If a number is out of its range.
@@ -276,15 +273,10 @@ class BlurTable:
         return dict(self._params)
 
     def params(self, coc_px: Tensor, width: float) -> dict[str, Tensor]:
-        """Kernel parameters at a signed coc.
+        """Kernel parameters at a signed coc ``[...]`` in pixels of an image ``width`` pixels wide, lengths in pixels.
 
-        Args:
-            coc_px: Signed coc in pixels, any shape ``[...]``.
-            width: Width in pixels of the image to which the coc refers.
-
-        Returns:
-            Parameters by name, lengths in pixels: ``[channels, ...]`` (``values``: ``[channels, ..., P]``), float64.
-            Continuous in ``coc_px`` and differentiable wherever it lies between nodes.
+        By name, ``[channels, ...]`` (``values``: ``[channels, ..., P]``), float64. Continuous in ``coc_px``, and
+        differentiable wherever it lies between nodes.
         """
         pixels_wide(width)
         scale = self.px_per_unit(width)
@@ -367,13 +359,7 @@ class BlurTable:
     def blur_texture(self, coc_px: float, width: int, size: int | None = None) -> Tensor:
         """The paper's blur texture: the fitted profile f(r), strength N included, at the pixels' centres.
 
-        Args:
-            coc_px: Signed coc in pixels.
-            width: Width in pixels of the image.
-            size: Odd width of the texture; None takes the smallest that holds the kernel.
-
-        Returns:
-            ``[channels, size, size]``, float64; not normalised.
+        ``[channels, size, size]``, float64, not normalised. Arguments as in :meth:`kernels`.
 
         Reference:
             Sato, Dobashi, Yamamoto, Fig. 3.
@@ -400,19 +386,12 @@ class BlurTable:
         return texture * self.strength[nearest]
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the table as JSON, whole or not at all.
-
-        Raises:
-            OSError: If the file cannot be written.
-        """
+        """Write the table as JSON, whole or not at all; ``OSError`` if the file cannot be written."""
         write_text(path, json.dumps(self.to_dict(), indent=1) + "\n")
 
     @classmethod
     def load(cls, source: str | os.PathLike[str]) -> "BlurTable":
-        """Read a table from a JSON file, or a shipped one by its name.
-
-        Args:
-            source: Path of a file, or the name of a shipped table such as ``"sato_j15"``.
+        """Read a table from a JSON file, or a shipped one by its name, such as ``"sato_j15"``.
 
         Raises:
             ValueError: If the content is not a valid table; the message names the file and the field.

@@ -224,11 +224,10 @@ class Camera:
         """This camera focused on the surface at a pixel.
 
         Args:
-            depth: ``[B, 1, H, W]``, metres.
+            depth: ``[B, 1, H, W]``, metres. Zero, negative and NaN depths are left out; infinite ones count.
             x: Column, in pixels from the left edge (pixel centres lie at half-integers), in [0, W).
             y: Row, in pixels from the top edge, in [0, H).
-            patch: Side of the square patch around the pixel, whose median counts. Zero, negative and NaN depths are
-                left out; infinite ones count.
+            patch: Side of the square patch around the pixel, whose median counts.
 
         Returns:
             A camera whose ``focus_m`` is the median of each item's patch: a float for one item, else ``[B]``.
@@ -251,11 +250,8 @@ class Camera:
         """This camera focused on a subject: on the median of its depths, each weighted by the mask.
 
         Args:
-            depth: ``[B, 1, H, W]``, metres; values that are not > 0 are left out.
+            depth: As in :meth:`focus_at`.
             focus_mask: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, >= 0: weight of each pixel.
-
-        Returns:
-            A camera with that ``focus_m``: a float for one item, else ``[B]``.
 
         Raises:
             ValueError: If the shapes are not as described, or the subject has no valid depth.
@@ -280,11 +276,8 @@ class Camera:
         Weights are Gaussian; the standard deviation along each axis is a quarter of the box's side.
 
         Args:
-            depth: ``[B, 1, H, W]``, metres; values that are not > 0 are left out.
+            depth: As in :meth:`focus_at`.
             box: ``(left, top, right, bottom)`` in pixels from the frame's top left corner.
-
-        Returns:
-            A camera with that ``focus_m``: a float for one item, else ``[B]``.
 
         Raises:
             ValueError: If the box holds no pixel's centre, or no valid depth.
@@ -325,16 +318,10 @@ class Camera:
         return self.replace(focus_m=focus_m)
 
     def hyperfocal_m(self, coc_px: float, width: int) -> Number:
-        """Nearest focus distance at which infinity is still acceptably sharp.
+        """Nearest focus distance in metres, a float or ``[B]``, at which infinity is still acceptably sharp.
 
-        ``f^2 / (n c) + f`` for a lens with an acceptable circle of *diameter* ``c`` on the sensor.
-
-        Args:
-            coc_px: Acceptable radius of the circle of confusion, in pixels, > 0.
-            width: Width of the image in pixels.
-
-        Returns:
-            Metres, a float or ``[B]``.
+        ``coc_px`` > 0 is the acceptable radius in pixels of an image ``width`` pixels wide. With the *diameter* ``c``
+        on the sensor, the distance is ``f^2 / (n c) + f``.
         """
         _check_number("coc_px", coc_px)
         at_infinity = self.replace(focus_m=math.inf)
@@ -342,15 +329,10 @@ class Camera:
         return hyperfocal + self.focal_length_mm / 1000.0 if self.focus_breathing else hyperfocal
 
     def sharp_limits_m(self, coc_px: float, width: int) -> tuple[Number, Number]:
-        """Nearest and farthest depth that is acceptably sharp.
+        """Nearest and farthest depth in metres on the image's axis, floats or ``[B]``, that is acceptably sharp.
 
-        Args:
-            coc_px: Acceptable radius of the circle of confusion, in pixels, > 0.
-            width: Width of the image in pixels.
-
-        Returns:
-            ``(near, far)`` in metres on the image's axis, floats or ``[B]``; far is ``inf`` at and beyond the
-            hyperfocal distance.
+        ``coc_px`` > 0 is the acceptable radius in pixels of an image ``width`` pixels wide. The farthest depth is
+        ``inf`` at and beyond the hyperfocal distance.
         """
         _check_number("coc_px", coc_px)
         scale = self.aperture_radius_m * self.focal_px(width)

@@ -32,14 +32,12 @@ from ..tensors import is_differentiated
 from . import psf
 from .kernel_cache import KernelCache
 
-__all__ = ["LEAST_CELLS", "SPOT_MARGIN_PX", "KernelBank", "Spots", "Table", "bank_of"]
-
-LEAST_CELLS = 16
-"""Cells from the centre to the end of a PSF in the coarsest template."""
+__all__ = ["SPOT_MARGIN_PX", "KernelBank", "Spots", "Table", "bank_of"]
 
 SPOT_MARGIN_PX = 1.0
 """Empty margin in pixels around a spot of a field, so that its samples fall to 0 at their border."""
 
+_LEAST_CELLS = 16  # from the centre to the end of a PSF in the coarsest template
 _LEVELS = 5  # templates of 16, 32, 64, 128 and 256 cells
 _FADE_START_PX = 0.75  # px a cell; from here to 1 px the next finer template is blended in
 _FADE_IN = 4.0  # weight of a blur in focus, over coc_px^2 / M; a larger one makes it complete at a smaller coc
@@ -168,9 +166,9 @@ class KernelBank:
                 reach = [max(r, _MIN_REACH_PX) for r in reach]
                 largest = max(reach) * self.widest
                 half = max(0, math.ceil(largest - 1e-9))
-                level = min(max(0, math.ceil(math.log2(largest / LEAST_CELLS))), _LEVELS - 1)
+                level = min(max(0, math.ceil(math.log2(largest / _LEAST_CELLS))), _LEVELS - 1)
                 if level < _LEVELS - 1:
-                    cell = largest / (LEAST_CELLS << level)
+                    cell = largest / (_LEAST_CELLS << level)
                     finer = min(max((cell - _FADE_START_PX) / (1.0 - _FADE_START_PX), 0.0), 1.0)
                 ends = [
                     (place.side, place.node + above, level + up) for up in range(1 + (finer > 0)) for above in (0, 1)
@@ -270,7 +268,9 @@ class KernelBank:
         key = (1 if self._mirrored else side, self._shapes[side][node])
         if key not in self._sums:
             template = _templates.get((self._lens, *key, 0), lambda: self._kept_template(*key, 0)).double()
-            step = torch.arange(-LEAST_CELLS - 1.0, LEAST_CELLS + 2.0, dtype=torch.float64, device="cpu") / LEAST_CELLS
+            step = (
+                torch.arange(-_LEAST_CELLS - 1.0, _LEAST_CELLS + 2.0, dtype=torch.float64, device="cpu") / _LEAST_CELLS
+            )
             square = 0.5 * (step[:, None] ** 2 + step**2 / self.squeeze**2)
             light, moment = template.sum((-2, -1)).tolist(), (template * square).sum((-2, -1)).tolist()
             self._sums[key] = list(zip(light, moment, strict=True))
@@ -290,7 +290,7 @@ class KernelBank:
     def _template(self, side: int, node: int, level: int) -> Tensor:
         """Light ``[C, 2 n + 3, 2 n + 3]`` of the cells of a node's PSF, float64."""
         params = {name: values[:, node] for name, values in self._nodes[side].items()}
-        return psf.template(self.table.family, params, LEAST_CELLS << level, self.table.aperture)
+        return psf.template(self.table.family, params, _LEAST_CELLS << level, self.table.aperture)
 
     @torch.inference_mode(False)
     @torch.no_grad()
