@@ -160,11 +160,7 @@ class DepthOfField(nn.Module):
             return pipeline.blur_stack(rgba, torch.stack(cocs, 1), options)
 
     def coc_px(
-        self,
-        image: Tensor,
-        depth: Tensor,
-        focus_m: Number | None = None,
-        f_number: Number | None = None,
+        self, image: Tensor, depth: Tensor, focus_m: Number | None = None, f_number: Number | None = None
     ) -> Tensor:
         """Signed circle of confusion that :meth:`forward` uses for the same arguments: ``[B, 1, H, W]``, pixels.
 
@@ -208,13 +204,7 @@ class DepthOfField(nn.Module):
         validation.coc_of_lens(coc, depth, {name: getattr(camera, name) for name in CAMERA_NUMBERS})
         return coc
 
-    def plan(
-        self,
-        image: Tensor,
-        depth: Tensor,
-        focus_m: Number | None = None,
-        f_number: Number | None = None,
-    ) -> Plan:
+    def plan(self, image: Tensor, depth: Tensor, focus_m: Number | None = None, f_number: Number | None = None) -> Plan:
         """The layers for a scene; one plan can be used for a whole shot. Arguments as in :meth:`forward`.
 
         Plan for the frame with the largest blur: a frame with larger radii adds layers in every call.
@@ -265,18 +255,17 @@ def depth_of_field(
     attention: Attention | None = None,
     **options: Unpack[OptionArguments],
 ) -> Tensor:
-    """Functional form of :class:`DepthOfField`.
+    """Functional form of :class:`DepthOfField`, whose arguments and those of :meth:`DepthOfField.forward` it takes.
 
     Args:
         image: ``[B, C, H, W]``, linear light; also ``[C, H, W]`` or ``[B, T, C, H, W]``.
         depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres; of the image's rank.
         camera: The camera.
         table: Blur measured from a lens; None takes the ideal disc.
-        focus_m: Overrides the camera's focus distance: a number, or one for each image, as in
-            :meth:`DepthOfField.forward`.
-        f_number: Overrides the camera's f-number, in the same forms.
+        focus_m: Overrides the camera's focus distance.
+        f_number: Overrides the camera's f-number.
         plan: Layers to render with; None plans for this image.
-        attention: Where the viewer looks, as in :meth:`DepthOfField.forward`.
+        attention: Where the viewer looks.
         **options: As in :class:`torchdof.options.Options`.
 
     Returns:

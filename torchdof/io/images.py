@@ -34,7 +34,7 @@ _ALPHA_SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".webp")
 _GREY_SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pfm")
 _LOSSLESS_EXR = ("none", "rle", "zip", "zips", "piz")
 _JPEG = {"compression": "jpeg:95", "jpeg:subsampling": "4:4:4"}
-_SETTINGS: dict[str, dict[str, str | int]] = {
+_SETTINGS: dict[str, Mapping[str, object]] = {
     **{".jpg": _JPEG, ".jpeg": _JPEG, ".webp": {"compression": "webp:95"}},
     ".png": {"png:compressionLevel": 4},  # a third of the time of the default, 6, and a twentieth more bytes
 }
@@ -238,8 +238,10 @@ def write_image(
         if name == "compression" and not (suffix == ".exr" and value in _LOSSLESS_EXR):
             continue
         if name != "ICCProfile" or transfer == picture.transfer:
-            # OpenImageIO drops an integer given with a 16-bit type
-            spec.attribute(name, *([] if isinstance(value, int) else [kind]), value)
+            if isinstance(value, int):  # OpenImageIO drops an integer given with a 16-bit type
+                spec.attribute(name, value)
+            else:
+                spec.attribute(name, kind, value)
     if transfer == "srgb" or suffix != ".exr":  # not of linear EXR files, whose primaries are those of the input
         spec.attribute("oiio:ColorSpace", "srgb_rec709_scene" if transfer == "srgb" else "lin_rec709_scene")
     if transfer == "linear" and suffix != ".exr":
