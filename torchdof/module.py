@@ -228,11 +228,7 @@ class DepthOfField(nn.Module):
         return {"camera": camera, **self.options.arguments(), "table": self.options.table.to_dict()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore the result of :meth:`get_extra_state`; an error changes nothing.
-
-        Raises:
-            ValueError: If a field is missing, unknown or invalid; the message names it.
-        """
+        """Restore the result of :meth:`get_extra_state`; ``ValueError`` names a bad field, and changes nothing."""
         self.camera, self.options = read_state(state)
 
     def extra_repr(self) -> str:

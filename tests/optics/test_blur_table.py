@@ -103,14 +103,6 @@ def test_a_blur_in_focus_fades_in_with_the_square_of_the_coc() -> None:
     assert float(large[4, 4]) > 0.9
 
 
-def test_kernels_are_those_of_the_family_at_the_table_s_parameters() -> None:
-    coc = torch.tensor([-30.0, 70.0])
-    kernels = TWO_SIDES.kernels(coc, 1, size=31)
-    params = {name: value[0] for name, value in TWO_SIDES.params(coc, 1).items()}
-    assert_close(kernels[:, 0], psf.pixel_kernels("ring", params, 31), rtol=0, atol=4e-6)
-    assert kernels.shape == (2, 1, 31, 31) and kernels.dtype == torch.float64
-
-
 def test_channels_have_their_own_kernels() -> None:
     table = BlurTable("disc", [-1.0, 1.0], {"radius": [[1.0, 1.0], [1.1, 0.9], [1.2, 0.8]]})
     assert table.channels == 3 and "3 channels" in repr(table)

@@ -74,9 +74,6 @@ def subject_m(depth: Tensor) -> float:
 
     The subject is the nearest surface that fills at least a fifth of the middle, which is a Gaussian weight with a
     standard deviation of a sixth of each side. The distance is the median of that surface.
-
-    Raises:
-        ValueError: If no pixel has a depth.
     """
     depth = _sampled(depth).double().cpu()
     y, x = (torch.linspace(-0.5, 0.5, size + 2, dtype=torch.float64)[1:-1] for size in depth.shape)

@@ -153,7 +153,7 @@ def _mistakes(
             return [Mistake("gap", message)]
         message += _out_of_focus(near, far, extent, focus_m, is_whole, factor, kind, scale)
         return [Mistake("focus", message)]
-    mistakes = []
+    mistakes, focal_mm, sensor_mm = [], float(camera.focal_length_mm), float(camera.sensor_width_mm)
     is_8_bit, is_unit_range = is_whole and far <= 255 and far - near >= 64, 0.9 < far <= 1.0 and near < 0.05
     if kind != "relative" and (is_8_bit or is_unit_range):
         description = f"whole numbers {extent}, as files of 8 bits hold" if is_8_bit else f"between 0 and 1 {extent}"
@@ -163,8 +163,16 @@ def _mistakes(
         message = f"all depth is far {extent}, and nothing is blurred; is it {unit}? The focus too is in metres"
         mistakes.append(Mistake("far", message))
     if is_too_blurred:
-        mistakes.append(Mistake("blur", _too_blurred(largest, width, far, extent, camera)))
-    if (focal_mm := float(camera.focal_length_mm)) < _SHORTEST_WIDTHS * (sensor_mm := float(camera.sensor_width_mm)):
+        hand = "all depth lies within a hand's breadth" if far < _NEAR_M else "the depth"
+        message = (
+            f"a blur radius of {largest:.6g} px on an image of {width} px is more than a lens makes: {hand} {extent}, "
+            f"the focus {focus_m:.4g} m, the opening {2 * float(camera.aperture_radius_m):.4g} m across "
+            f"(f/{float(camera.f_number):.2g}, {focal_mm:.4g} mm on a sensor of {sensor_mm:.4g} mm); which is in "
+            "another unit? --depth-scale, --focus-m and --aperture-radius-m make or take metres, --focal-length-mm and "
+            "--sensor-width-mm millimetres"
+        )
+        mistakes.append(Mistake("blur", message))
+    if focal_mm < _SHORTEST_WIDTHS * sensor_mm:
         lens = f"a focal length of {focal_mm:.4g} mm on a sensor of {sensor_mm:.4g} mm is shorter than any lens's"
         mistakes.append(Mistake("lens", f"{lens}; --focal-length-mm and --sensor-width-mm take millimetres"))
     return mistakes
@@ -201,18 +209,6 @@ def _out_of_focus(
         hints.append("all of it lies within a hand's breadth")
     hints.append("if the depth is right, focus with --focus-m METRES or --focus-at X,Y")
     return f"the focus at {focus_m:.4g} m is {side} than all depth {extent}; {'; '.join(hints)}"
-
-
-def _too_blurred(largest: float, width: int, far: float, extent: str, camera: Camera) -> str:
-    """Message for a blur radius that is larger than lenses make."""
-    hand = "all depth lies within a hand's breadth" if far < _NEAR_M else "the depth"
-    return (
-        f"a blur radius of {largest:.6g} px on an image of {width} px is more than a lens makes: {hand} {extent}, "
-        f"the focus {float(camera.focus_m):.4g} m, the opening {2 * float(camera.aperture_radius_m):.4g} m across "
-        f"(f/{float(camera.f_number):.2g}, {float(camera.focal_length_mm):.4g} mm on a sensor of "
-        f"{float(camera.sensor_width_mm):.4g} mm); which is in another unit? --depth-scale, --focus-m and "
-        "--aperture-radius-m make or take metres, --focal-length-mm and --sensor-width-mm millimetres"
-    )
 
 
 _RELATIVE = "--depth-kind relative --near-m METRES --far-m METRES"

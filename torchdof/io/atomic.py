@@ -54,9 +54,6 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     """Refuses a file that is read-only, or that lies in a read-only folder or in a missing folder within one.
 
     A rename could replace a read-only file; like other programs, this one does not.
-
-    Raises:
-        PermissionError: If the file may not be written.
     """
     target = Path(os.path.realpath(path))
     if target.is_file() and not os.access(target, os.W_OK):

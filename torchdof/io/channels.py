@@ -13,9 +13,6 @@ def colour_channels(parts: Parts, layer: str | None, layered: bool) -> tuple[int
 
     Returns:
         Index of the part, indices of the channels in it, and their names without layer.
-
-    Raises:
-        ValueError: If there is no colour, or no such layer with colour.
     """
     layers_with_colour = []
     for part, (label, names) in enumerate(parts):

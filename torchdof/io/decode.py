@@ -57,12 +57,7 @@ def utf8_name(path: Path) -> Iterator[str]:
 
 
 def read_parts(path: Path) -> list[Part]:
-    """All parts of an image file.
-
-    Raises:
-        OSError: If it is damaged.
-        ValueError: If it is too large or of an unsupported kind.
-    """
+    """All parts of an image file; ``OSError`` if damaged, ``ValueError`` if too large or of an unsupported kind."""
     if path.suffix.lower() == ".pfm":
         return [_read_pfm(path)]
     _check_header(path)

@@ -160,11 +160,7 @@ class Aperture:
 
     @classmethod
     def from_dict(cls, data: Any) -> "Aperture":
-        """Build an aperture from :meth:`to_dict`'s data.
-
-        Raises:
-            ValueError: If a field is unknown or of the wrong kind; the message names it.
-        """
+        """Build an aperture from :meth:`to_dict`'s data; ``ValueError`` names a field that is unknown or wrong."""
         given = fields("aperture", data, (), [field.name for field in dataclasses.fields(cls)])
         if given.get("mask") is not None:
             given["mask"] = numbers("mask", given["mask"])

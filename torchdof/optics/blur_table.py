@@ -429,11 +429,7 @@ class BlurTable:
 
     @classmethod
     def from_dict(cls, data: Any) -> "BlurTable":
-        """Build a table from :meth:`to_dict`'s data.
-
-        Raises:
-            ValueError: If a field is missing, unknown or of the wrong kind; the message names it.
-        """
+        """Build a table from :meth:`to_dict`'s data; ``ValueError`` names a field that is missing, unknown or wrong."""
         fields = table_file.fields_of(data)
         if fields.get("aperture") is not None:
             fields["aperture"] = Aperture.from_dict(fields["aperture"])

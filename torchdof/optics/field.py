@@ -161,11 +161,7 @@ class Field:
 
     @classmethod
     def from_dict(cls, data: Any) -> "Field":
-        """Build a field from :meth:`to_dict`'s data.
-
-        Raises:
-            ValueError: If a field is missing, unknown or of the wrong kind; the message names it.
-        """
+        """Build a field from :meth:`to_dict`'s data; ``ValueError`` names a field that is missing, unknown or wrong."""
         data = fields("field", data, ("coc", "radius", "box", "shape", "light"))
         coc, radius, box, sizes = (numbers(f"field.{name}", data[name]) for name in ("coc", "radius", "box", "shape"))
         shape = [int(n) for n in sizes.flatten().clamp(-1, _MAX_CELLS).tolist()]

@@ -86,12 +86,8 @@ class KernelBank:
     """
 
     def __init__(self, table: Table, gradients: bool = False) -> None:
-        self.table, self.colours, self.is_even, self._gradients = (
-            table,
-            table.channels,
-            table.field is not None,
-            gradients,
-        )
+        self.table, self._gradients = table, gradients
+        self.colours, self.is_even = table.channels, table.field is not None
         squeeze = torch.as_tensor(1.0 if table.aperture is None else table.aperture.squeeze, device="cpu")
         self.squeeze = float(squeeze.detach())
         self._squeeze = squeeze if gradients else self.squeeze

@@ -185,11 +185,7 @@ def support(family: str, params: Mapping[str, Number], aperture: Aperture | None
 
 
 def width_of(size: int | None, reach_px: float) -> int:
-    """Width in pixels of kernels: ``size`` if given, else the smallest that holds a PSF of radius ``reach_px``.
-
-    Raises:
-        ValueError: If the size is not odd and positive, or the kernel would be too wide.
-    """
+    """Width in pixels of kernels: ``size`` if given, else the smallest that holds a PSF of radius ``reach_px``."""
     if size is None:
         size = 2 * half_width(reach_px) + 1
         if size > _MAX_WIDTH_PX:
