@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from torchdof import Camera, DepthOfField, blur_by_coc
-from torchdof.batch import flattened
 
 DOF = DepthOfField(Camera(focus_m=1.0, sensor_width_mm=6.0))
 
@@ -48,12 +47,6 @@ def test_maps_may_be_shared_by_clips_or_frames(axes: tuple[int, int]) -> None:
     depth = depths[: axes[0], : axes[1]]
     expected = DOF(images, depth.expand(2, 3, -1, -1, -1).contiguous())
     assert torch.equal(DOF(images, depth), expected)
-
-
-@pytest.mark.parametrize("axes", [(), (1,), (2, 1)])
-def test_a_crop_of_a_frame_is_made_contiguous(axes: tuple[int, ...]) -> None:
-    part = torch.rand(*axes, 3, 9, 12)[..., 2:7, 3:9]
-    assert flattened(axes, "image", part, "C").is_contiguous()
 
 
 def test_background_and_attention_of_a_single_image_have_its_rank() -> None:

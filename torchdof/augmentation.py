@@ -147,12 +147,9 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         options = self.renderings[0].arguments()
         del options["table"]
         tables = [rendering.table for rendering in self.renderings]
-        shown = {
-            **{"focus_m": self.focus_m, "f_number": self.f_number, "camera": self.camera},
-            **{"table": tables if len(tables) > 1 else tables[0], **self.flags},
-            **{"same_on_batch": self.same_on_batch, "p": self.p, "keepdim": self.keepdim},
-            **{"return_label": self.return_label, **options},
-        }
+        names = ("focus_m", "f_number", "camera", "same_on_batch", "p", "keepdim", "return_label")
+        shown = {name: getattr(self, name) for name in names}
+        shown |= {"table": tables if len(tables) > 1 else tables[0], **self.flags, **options}
         return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in shown.items())})"
 
     def __call__(self, input: Any, *arguments: Any, **kwargs: Any) -> Any:
@@ -275,30 +272,22 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         """Blur the images ``[B, C, H, W]`` that ``params`` select."""
         image, depth, passed_on = _image_and_depth(input, params.get("depth"))
         blurred = self._chosen(params, len(input))
-        out = image
         for index in params["table"][blurred].unique().tolist():
             items = blurred[params["table"][blurred] == index].to(input.device)
-            all_items = len(items) == len(input)  # all images have this lens: copy none
-            pair = (image, depth) if all_items else (image[items], depth[items])
-            rendered = self._blurred(*pair, params, items, int(index), flags["transfer"])
-            out = rendered if all_items else out.index_copy(0, items, rendered)
-        return torch.cat([out, passed_on], dim=1) if passed_on.shape[1] else out
+            options: Any = self.renderings[int(index)].arguments()
+            lens: Any = {name: params[name].to(items.device)[items] for name in ("focus_m", "f_number")}
+            light = self._light(image[items], flags["transfer"])
+            rendered = depth_of_field(light, depth[items], self._camera_of(items), **lens, **options)
+            if flags["transfer"] == "srgb":
+                rendered = encode(rendered, "srgb", has_alpha=False, straight=False)
+            image = image.index_copy(0, items, rendered)
+        return torch.cat([image, passed_on], dim=1) if passed_on.shape[1] else image
 
     def _chosen(self, params: Mapping[str, Tensor], count: int) -> Tensor:
         """Indices of the items to blur: all if the probability is 1, as in Kornia, else those with an open gate."""
         if (self.p == 1.0 and self.p_batch == 1.0) or "batch_prob" not in params:
             return torch.arange(count, device="cpu")
         return torch.atleast_1d(params["batch_prob"] > 0.5).expand(count).nonzero()[:, 0].cpu()
-
-    def _blurred(
-        self, image: Tensor, depth: Tensor, params: Mapping[str, Tensor], items: Tensor, index: int, transfer: Transfer
-    ) -> Tensor:
-        """Blur items ``[N, C, H, W]`` with one lens."""
-        image = self._light(image, transfer)
-        options: Any = self.renderings[index].arguments()
-        focus_m, f_number = (params[name].to(items.device)[items] for name in ("focus_m", "f_number"))
-        out = depth_of_field(image, depth, self._camera_of(items), focus_m=focus_m, f_number=f_number, **options)
-        return encode(out, "srgb", has_alpha=False, straight=False) if transfer == "srgb" else out
 
     def _camera_of(self, items: Tensor) -> Camera:
         """The camera, with the numbers of these items where it has one for each image."""

@@ -152,14 +152,10 @@ class _Scatter(torch.autograd.Function):
 
     @staticmethod
     def forward(light: Tensor, fraction: Tensor, indices: Tensor, taps: Tensor, steps: list[tuple[int, int]]) -> Tensor:
-        """Scatter light.
+        """Scatter light ``[B, n, 1 or C, H, W]``.
 
-        Args:
-            light: ``[B, n, 1 or C, H, W]``.
-            fraction: Weight of the second of each pixel's two kernels, 0 to 1: ``[B, 1, H, W]``.
-            indices: Indices of the two kernels of each pixel, ``[2, B, 1, H, W]``.
-            taps: Values of all kernels at each offset, ``[steps, 1 or C, kernels]``.
-            steps: The offsets: rows down and columns to the right by which light moves.
+        ``indices`` ``[2, B, 1, H, W]`` are those of each pixel's two kernels, ``fraction`` ``[B, 1, H, W]`` weighs the
+        second. ``taps`` ``[steps, 1 or C, kernels]`` are all kernels at the offsets ``steps``, down and right.
         """
         out = torch.zeros_like(light)
         for tap, _, source, target in _moves(fraction, indices, taps, steps):

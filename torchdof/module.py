@@ -160,11 +160,7 @@ class DepthOfField(nn.Module):
             return pipeline.blur_stack(rgba, torch.stack(cocs, 1), options)
 
     def coc_px(
-        self,
-        image: Tensor,
-        depth: Tensor,
-        focus_m: Number | None = None,
-        f_number: Number | None = None,
+        self, image: Tensor, depth: Tensor, focus_m: Number | None = None, f_number: Number | None = None
     ) -> Tensor:
         """Signed circle of confusion that :meth:`forward` uses for the same arguments: ``[B, 1, H, W]``, pixels.
 
@@ -188,14 +184,9 @@ class DepthOfField(nn.Module):
         f_number: float | Tensor | None,
         name: str = "depth",
     ) -> Tensor:
-        """The circle of confusion of a depth map without repair of its edges.
+        """The circle of confusion of a depth map without repair of its edges, for images ``[B, C, H, W]``.
 
-        Args:
-            image: ``[B, C, H, W]``.
-            depth: ``[B or 1, 1, H, W]``, of the image's size, or of a size that can be resampled to it.
-            focus_m: A number or ``[B]``; None uses the camera's.
-            f_number: The same.
-            name: Name of the depth in messages.
+        The depth ``[B or 1, 1, H, W]`` may have a size that can be resampled to the image's.
         """
         check = self.options.check
         if not is_traced() and validation.is_resizable(image, depth):
@@ -213,13 +204,7 @@ class DepthOfField(nn.Module):
         validation.coc_of_lens(coc, depth, {name: getattr(camera, name) for name in CAMERA_NUMBERS})
         return coc
 
-    def plan(
-        self,
-        image: Tensor,
-        depth: Tensor,
-        focus_m: Number | None = None,
-        f_number: Number | None = None,
-    ) -> Plan:
+    def plan(self, image: Tensor, depth: Tensor, focus_m: Number | None = None, f_number: Number | None = None) -> Plan:
         """The layers for a scene; one plan can be used for a whole shot. Arguments as in :meth:`forward`.
 
         Plan for the frame with the largest blur: a frame with larger radii adds layers in every call.
@@ -240,20 +225,15 @@ class DepthOfField(nn.Module):
     def get_extra_state(self) -> dict[str, Any]:
         """Camera, table and options: the whole configuration travels with ``state_dict``."""
         camera = {k: getattr(self.camera, k) for k in Camera.__dataclass_fields__}
-        options = self.options
-        return {"camera": camera, **options.arguments(), "table": options.table.to_dict()}
+        return {"camera": camera, **self.options.arguments(), "table": self.options.table.to_dict()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore the result of :meth:`get_extra_state`; an error changes nothing.
-
-        Raises:
-            ValueError: If a field is missing, unknown or invalid; the message names it.
-        """
+        """Restore the result of :meth:`get_extra_state`; ``ValueError`` names a bad field, and changes nothing."""
         self.camera, self.options = read_state(state)
 
     def extra_repr(self) -> str:
         """Camera, table and options, as ``repr`` shows them."""
-        options: dict[str, Any] = {**self.options.arguments()}
+        options = self.options.arguments()
         table = options.pop("table")
         return f"{self.camera!r},\n{table!r},\n" + ", ".join(f"{k}={v!r}" for k, v in options.items())
 
@@ -271,18 +251,17 @@ def depth_of_field(
     attention: Attention | None = None,
     **options: Unpack[OptionArguments],
 ) -> Tensor:
-    """Functional form of :class:`DepthOfField`.
+    """Functional form of :class:`DepthOfField`, whose arguments and those of :meth:`DepthOfField.forward` it takes.
 
     Args:
         image: ``[B, C, H, W]``, linear light; also ``[C, H, W]`` or ``[B, T, C, H, W]``.
         depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres; of the image's rank.
         camera: The camera.
         table: Blur measured from a lens; None takes the ideal disc.
-        focus_m: Overrides the camera's focus distance: a number, or one for each image, as in
-            :meth:`DepthOfField.forward`.
-        f_number: Overrides the camera's f-number, in the same forms.
+        focus_m: Overrides the camera's focus distance.
+        f_number: Overrides the camera's f-number.
         plan: Layers to render with; None plans for this image.
-        attention: Where the viewer looks, as in :meth:`DepthOfField.forward`.
+        attention: Where the viewer looks.
         **options: As in :class:`torchdof.options.Options`.
 
     Returns:
@@ -364,31 +343,19 @@ def blur(
 
     Arguments as in :func:`blur_by_coc`, with four axes, and the operations ``ops`` (an exported graph has its own).
     """
-    channels = options.table.channels
-    validation.image_and_coc(image, coc_px, channels, values=options.check)
-    _check_plan(plan)
-    validation.background(image, background, "background_coc_px", background_coc_px, "in pixels", options.check)
-    hidden = None if background is None or background_coc_px is None else (background, background_coc_px)
-    if hidden is not None and not options.occlusion:
-        raise ValueError("without occlusion nothing is hidden: a background needs occlusion=True")
-    _check_attention(attention, plan, options)
-    with without_autocast(image.device.type):  # it would convolve in half precision
-        return pipeline.blur(image, coc_px, plan, options, hidden, attention, ops)
-
-
-def _check_plan(plan: Plan | None) -> None:
+    validation.image_and_coc(image, coc_px, options.table.channels, values=options.check)
     if plan is not None and not isinstance(plan, Plan):
         raise ValueError(
             f"plan must be a Plan from DepthOfField.plan(image, depth) or None, got {validation.show(plan)}; "
             "leave it out to plan for this image"
         )
-
-
-def _check_attention(attention: Attention | None, plan: Plan | None, options: Options) -> None:
-    """Refuse attention beside a plan, which has one tolerance, and in traced code."""
-    if attention is None:
-        return
-    if plan is not None:
+    validation.background(image, background, "background_coc_px", background_coc_px, "in pixels", options.check)
+    hidden = None if background is None or background_coc_px is None else (background, background_coc_px)
+    if hidden is not None and not options.occlusion:
+        raise ValueError("without occlusion nothing is hidden: a background needs occlusion=True")
+    if attention is not None and plan is not None:
         raise ValueError("attention plans for two tolerances; leave plan out, or attention")
-    if is_traced():
+    if attention is not None and is_traced():
         raise ValueError("attention chooses its work by where the viewer looks; a compiled or exported graph cannot")
+    with without_autocast(image.device.type):  # it would convolve in half precision
+        return pipeline.blur(image, coc_px, plan, options, hidden, attention, ops)

@@ -95,7 +95,7 @@ class Forward:
             size = 2 * min(int(np.ceil(float(tensors["radius"].max()))) + 1, limit) + 1
             openings = [self.opening_with({n: v[i] for n, v in tensors.items()}) for i in range(len(tensors["radius"]))]
             shapes = zip(tensors["radius"], openings, strict=True)
-            return torch.stack([pixel_kernels("disc", {"radius": r}, size, None, o) for r, o in shapes]).numpy()
+            return torch.stack([pixel_kernels("disc", {"radius": r}, size, o) for r, o in shapes]).numpy()
         half = min(int(np.ceil(support(family, tensors))) + 1, limit)
         return pixel_kernels(family, tensors, 2 * half + 1).numpy()
 

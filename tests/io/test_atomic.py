@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -104,21 +103,6 @@ def test_termination_during_a_write_removes_the_temporary_files(tmp_path: Path, 
         run.send_signal(number)
         assert run.wait(timeout=30) == 128 + number
     assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("x.exr", "old")]
-
-
-@pytest.mark.skipif(os.name != "posix", reason="signals")
-def test_temporary_files_of_a_killed_process_are_removed_by_a_write_a_day_later(tmp_path: Path) -> None:
-    with writing(tmp_path / "x.exr") as run:
-        run.kill()
-    left = {*tmp_path.iterdir()}
-    other = tmp_path / ".y.exr-like.part"
-    other.write_text("of another program")
-    for path in (*left, other):
-        os.utime(path, (time.time() - 90_000,) * 2)
-    with writing(tmp_path / "z.exr") as living:
-        begun = {*tmp_path.iterdir()} - {other}
-        assert len(left) == len(begun) == 2 and not begun & left
-        living.kill()
 
 
 def test_a_signal_handler_of_the_caller_is_kept(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 tests/fuzz changes arbitrary bytes of files.
 """
 
-import contextlib
 import os
 import re
 import shutil
@@ -236,22 +235,6 @@ def test_a_truncated_file_is_refused(tmp_path: Path, suffix: str, sample: Any, s
     assert decode.is_complete(tmp_path / f"whole{suffix}") and not decode.is_complete(tmp_path / f"cut{suffix}")
 
 
-@pytest.mark.parametrize("suffix", KINDS)
-def test_libraries_print_nothing_about_a_damaged_picture(
-    suffix: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / f"x{suffix}"
-    write_image(path, tiny())
-    content = path.read_bytes()
-    cuts = [content[:end] for end in range(1, len(content), 1 + len(content) // 50)]
-    places = range(0, len(content), 1 + len(content) // 100)
-    for damaged in (*cuts, *(content[:n] + bytes([content[n] ^ 77]) + content[n + 1 :] for n in places)):
-        path.write_bytes(damaged)
-        with contextlib.suppress(ValueError, OSError):
-            read_image(path)
-    assert tuple(capfd.readouterr()) == ("", "")
-
-
 def with_attributes(path: Path, count: int) -> None:
     """Writes an EXR with ``count`` more attributes in its header."""
     write_image(path, tiny())
@@ -391,6 +374,6 @@ def test_a_picture_that_does_not_fit_into_memory_is_refused(tmp_path: Path) -> N
     code = f"{each}decode.free_bytes = lambda: float('inf')\n{each}"
     lines = output_of(READ + code, *names, cwd=tmp_path).splitlines()
     assert len(lines) == 20
-    why = "GiB of memory are free|more than there is memory for|allocate"
+    why = "GiB of memory are free|than there is memory for|allocate"
     for half, words in ((lines[:10], why), (lines[10:], f"{why}|does not fit into memory")):
         assert all(re.match(rf"(x\.\w+) refused: \1: .*({words})", line) for line in half), half

@@ -296,12 +296,3 @@ def test_array_of_an_npz_is_chosen_by_name(tmp_path: Path) -> None:
 def test_equal_channels_are_one_map(tmp_path: Path) -> None:
     path = store(tmp_path / "x.png", np.repeat(np.full((2, 2, 1), 9, np.uint8), 3, axis=2), "uint8")
     assert read_values(path).unique().tolist() == [9.0]
-
-
-def test_light_is_float32_with_any_default_dtype(tmp_path: Path) -> None:
-    path = store(tmp_path / "x.png", np.full((2, 2, 3), 128, np.uint8), "uint8")
-    torch.set_default_dtype(torch.float64)
-    try:
-        assert read_image(path).pixels.dtype == torch.float32
-    finally:
-        torch.set_default_dtype(torch.float32)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from tests.refused import refuses
-from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
+from torchdof import BlurTable, blur_by_coc
 from torchdof.optics import psf
 from torchdof.optics.aperture import Aperture
 
@@ -154,10 +154,6 @@ def test_a_table_with_an_aperture_survives_save_and_load(tmp_path: Path) -> None
         assert_close(loaded.kernels(coc, 900), table.kernels(coc, 900), rtol=0, atol=0)
     written = json.loads((tmp_path / "lens.json").read_text())
     assert written["version"] == 3 and written["aperture"]["blades"] == 7
-    state = DepthOfField(Camera(), LOPSIDED[0]).state_dict()
-    restored = DepthOfField(Camera())
-    restored.load_state_dict(state)
-    assert restored.options.table.fingerprint() == LOPSIDED[0].fingerprint()
 
 
 test_an_invalid_opening_is_refused_by_name = refuses(

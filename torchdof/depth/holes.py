@@ -58,19 +58,10 @@ def fill_holes(depth: Tensor, fill: Fill) -> Tensor:
 
 
 def resolve_holes(depth: Tensor, name: str, fill: Fill | None, zero_is_known: bool = False) -> tuple[Tensor, int]:
-    """Counts the pixels without depth (NaN), and refuses or fills them.
+    """The depth without holes (NaN), filled as by :func:`fill_holes` or, with None, refused; and how many there were.
 
-    Args:
-        depth: ``[1, 1, H, W]``.
-        name: Name of the file, for the message.
-        fill: As for :func:`fill_holes`; None refuses holes.
-        zero_is_known: Whether zero and negative numbers are known depths, as in relative depth; for the message.
-
-    Returns:
-        The depth without holes, and how many there were.
-
-    Raises:
-        ValueError: If there are holes and ``fill`` is None, or nothing to fill them from.
+    For the message: ``name`` is that of the file, ``zero_is_known`` whether zero and negative numbers are known depths,
+    as in relative depth.
     """
     holes = int(depth.isnan().sum())
     if holes == 0:
@@ -105,13 +96,9 @@ def _nearest(depth: Tensor) -> Tensor:
     """Fills NaN in ``[H, W]`` with the nearest depth, by jump flooding (Rong and Tan 2006) on the holes alone."""
     height, width = depth.shape
     y, x = torch.nonzero(depth.isnan(), as_tuple=True)
-    rows, columns = torch.meshgrid(*(torch.arange(n, device=depth.device) for n in depth.shape), indexing="ij")
-    seed = torch.where(depth.isnan(), -1, rows * width + columns)
-    step = 1 << max(height, width).bit_length()
-    steps = [step]
-    while steps[-1] > 1:
-        steps.append(steps[-1] // 2)
-    for step in [*steps, 2, 1]:
+    places = torch.arange(depth.numel(), device=depth.device).reshape(depth.shape)
+    seed = torch.where(depth.isnan(), -1, places)
+    for step in [*(1 << k for k in range(max(height, width).bit_length(), -1, -1)), 2, 1]:
         best = seed[y, x]
         best_distance = _squared_distance(best, y, x, width)
         for dy in (-step, 0, step):

@@ -27,6 +27,7 @@ _NEAR, _SHARP, _FAR = (1.3, 0.6, 0.0), (0.1, 1.3, 0.3), (0.1, 0.5, 1.3)  # RGB o
 _TINT, _DARK_LIGHT = 0.4, 0.1  # share of the tint in a pixel; its light in dark pixels, as a share of the mean light
 _HOLE = (0.6, 0.0, 0.6)  # RGB of pixels without depth
 _BOUNDS_PX = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)  # bounds of the histogram in px
+_QUANTILES = {"1 %": 0.01, "median": 0.5, "99 %": 0.99}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,9 +79,9 @@ class DepthReport:
         finite = self.depth[self.depth.isfinite()]
         if not finite.numel():
             return {}
-        quantiles = torch.quantile(finite.flatten()[:: max(1, finite.numel() // 2**20)].double(), _QUANTILES).tolist()
-        by_name = dict(zip(_QUANTILE_NAMES, quantiles, strict=True))
-        return {"nearest": float(finite.min()), **by_name, "farthest": float(finite.max())}
+        sample = finite[:: max(1, finite.numel() // 2**20)].double()
+        quantiles = {name: float(sample.quantile(share)) for name, share in _QUANTILES.items()}
+        return {"nearest": float(finite.min()), **quantiles, "farthest": float(finite.max())}
 
     def facts(self) -> dict[str, Any]:
         """The numbers of ``str`` as JSON-like data: distances in metres, radii in pixels, shares in [0, 1]."""
@@ -96,15 +97,14 @@ class DepthReport:
         }
 
     def __str__(self) -> str:
-        total = self.depth.numel()
+        facts, total = self.facts(), self.depth.numel()
         lines = []
-        if distances := self.distances():
-            lines.append("depth, m      " + "  ".join(f"{name} {metres:.4g}" for name, metres in distances.items()))
-        infinite = int(self.depth.isinf().sum())
-        lines.append(f"at infinity   {_percent(infinite, total)}   holes {self.holes} ({_percent(self.holes, total)})")
-        coc_px = self.coc_px[~self.coc_px.isnan()]
-        if coc_px.numel():
-            lines.append(f"blur radius   {float(coc_px.min()):+.1f} to {float(coc_px.max()):+.1f} px, negative is near")
+        if facts["depth_m"]:
+            lines.append("depth, m      " + "  ".join(f"{name} {z:.4g}" for name, z in facts["depth_m"].items()))
+        infinite = _percent(facts["at_infinity_px"], total)
+        lines.append(f"at infinity   {infinite}   holes {self.holes} ({_percent(self.holes, total)})")
+        if facts["coc_px"]:
+            lines.append("blur radius   {:+.1f} to {:+.1f} px, negative is near".format(*facts["coc_px"]))
             lines.append(f"in focus      {100 * self.sharp:.1f} % of the pixels (radius of at most 1 px)")
             longest = max(share for _, _, share in self.histogram())
             for low, high, share in self.histogram():
@@ -117,10 +117,6 @@ class DepthReport:
             treatment = "are repaired before rendering" if self.doubtful else "are exact and stay unchanged"
             lines.append(f"              they {treatment} (depth edges auto)")
         return "\n".join(lines)
-
-
-_QUANTILES = torch.tensor([0.01, 0.5, 0.99], dtype=torch.float64, device="cpu")
-_QUANTILE_NAMES = ("1 %", "median", "99 %")
 
 
 def inspect_depth(image: Tensor, depth: Tensor, camera: Camera) -> DepthReport:
@@ -157,13 +153,9 @@ def inspect_depth(image: Tensor, depth: Tensor, camera: Camera) -> DepthReport:
 
 
 def depth_colours(depth: Tensor) -> Tensor:
-    """A map of depth as a picture: grey, even in 1 / distance, near bright and far dark; holes (NaN) are magenta.
+    """Depth ``[1, 1, H, W]`` in metres as a picture ``[1, 3, H, W]`` in linear light.
 
-    Args:
-        depth: ``[1, 1, H, W]``, metres.
-
-    Returns:
-        ``[1, 3, H, W]`` in linear light.
+    It is grey, even in 1 / distance, near bright and far dark; holes (NaN) are magenta.
 
     Example:
         >>> depth_colours(torch.tensor([[[[1.0, 2.0, torch.inf]]]]))[0, 0, 0, [0, 2]].tolist()
@@ -177,13 +169,9 @@ def depth_colours(depth: Tensor) -> Tensor:
 
 
 def coc_colours(coc_px: Tensor) -> Tensor:
-    """A map of signed radii in colour: orange in front of the focus, black in focus, blue behind; linear light.
+    """Signed radii ``[1, 1, H, W]`` in pixels as a picture ``[1, 3, H, W]`` in linear light.
 
-    Args:
-        coc_px: ``[1, 1, H, W]``, pixels.
-
-    Returns:
-        ``[1, 3, H, W]``; the largest radius, or 1 px if that is larger, has full colour.
+    It is orange in front of the focus, black in focus, blue behind; the largest radius (at least 1 px) has full colour.
 
     Example:
         >>> coc_colours(torch.tensor([[[[-2.0, 0.0, 2.0]]]]))[0, :, 0].argmax(dim=0).tolist()
@@ -195,24 +183,17 @@ def coc_colours(coc_px: Tensor) -> Tensor:
 
 
 def panels(image: Tensor, report: DepthReport) -> dict[str, Tensor]:
-    """Pictures of a report: caption -> ``[1, 3, H, W]`` in linear light.
-
-    Args:
-        image: ``[1, C, H, W]``, linear light.
-        report: Result of :func:`inspect_depth` for this image.
-    """
+    """Pictures of the report of an image ``[1, C, H, W]``: caption -> ``[1, 3, H, W]`` in linear light."""
     is_hole = report.depth.isnan()
-    magenta = report.depth.new_tensor(_HOLE)[:, None, None]
     coc_px = torch.where(is_hole, 0.0, report.coc_px)
+    blur = torch.where(is_hole, image.new_tensor(_HOLE)[:, None, None], coc_colours(coc_px))
     colours = image.new_tensor([[0, 0, 0], [0.0, 0.7, 0.1], [1.0, 0.05, 0.0], [1.0, 0.0, 0.8], [0.05, 0.1, 0.5]])
     marks = colours[report.edges[:, 0].long()].permute(0, 3, 1, 2)  # [1, H, W, 3] -> [1, 3, H, W]
     brightness = image.mean(1, keepdim=True) / image.mean().clamp(min=1e-12)
     background = (0.08 * brightness).clamp(0, 0.3).expand(-1, 3, -1, -1)
     return {
         "depth: near is bright, holes magenta": depth_colours(report.depth),
-        f"blur radius {float(coc_px.min()):+.1f} to {float(coc_px.max()):+.1f} px: near orange, far blue": torch.where(
-            is_hole, magenta, coc_colours(coc_px)
-        ),
+        f"blur radius {float(coc_px.min()):+.1f} to {float(coc_px.max()):+.1f} px: near orange, far blue": blur,
         "depth edges: exact green, ramps red, beside the image's pink, unclear blue": torch.where(
             report.edges > 0, marks, background
         ),

@@ -99,11 +99,7 @@ def _ray_length(like: Tensor, fov_x_deg: float) -> Tensor:
 
 
 def number_map(name: str, values: Tensor) -> None:
-    """Refuse a value that is not a non-empty tensor of floating-point or whole numbers.
-
-    Raises:
-        ValueError: If it is not a tensor of real numbers, or empty.
-    """
+    """Refuse a value that is not a non-empty tensor of floating-point or whole numbers."""
     if isinstance(values, Tensor) and values.dtype in WHOLE_NUMBERS and values.layout == torch.strided:
         values = values.double()
     real_tensor(name, values, "[B, 1, H, W]")

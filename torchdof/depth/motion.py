@@ -15,16 +15,10 @@ _STILL_SHARE = 1e-3  # share of changed pixels below which motion is not searche
 
 
 def motion_between(current_frame: Tensor, previous_frame: Tensor, is_changed: Tensor) -> Tensor:
-    """Optical flow ``[B, 2, H, W]`` from each pixel of a frame to its content in the previous frame.
+    """Optical flow ``[B, 2, H, W]`` (x, y) in pixels from each pixel of a frame to its content in the previous one.
 
-    Args:
-        current_frame: ``[B, C, H, W]``.
-        previous_frame: The previous frame, ``[B, C, H, W]``.
-        is_changed: ``[B, 1, H, W]``, bool: pixels that differ between both frames. If they are less than 0.1 %, the
-            flow is 0.
-
-    Returns:
-        x and y in pixels, with subpixel precision, computed at half the resolution.
+    Frames are ``[B, C, H, W]``. It has subpixel precision, and is computed at half the resolution. It is 0 if less than
+    0.1 % of the pixels differ between both frames (``is_changed``).
     """
     batch, _, height, width = current_frame.shape
     if float(is_changed.float().mean()) <= _STILL_SHARE:

@@ -70,8 +70,11 @@ def from_relative(
     """
     refuse_old_compiler()
     choice("the kind of relative depth", kind, RELATIVE_KINDS)
-    near_m, far_m = _near_and_far(near_m, far_m, kind)
-    _relative_map(values)
+    near_m = number("near_m", near_m, low=0, unit="metres")
+    far_m = number("far_m", far_m, low=0, unit="metres", infinite=kind != "depth")
+    if not near_m < far_m:
+        raise ValueError(f"near_m must be nearer than far_m, got near_m={near_m:g} and far_m={far_m:g}")
+    _check_map(values)
     dtype = values.dtype if values.is_floating_point() else torch.float32
     value = values.to(torch.promote_types(dtype, torch.float32)) if values.is_floating_point() else values.double()
     is_known = value.isfinite()
@@ -88,10 +91,14 @@ def from_relative(
                 "give value_range=(smallest, largest) (--value-range) if the values mean something beyond this map"
             )
     else:
-        low, high = (value.new_tensor(x) for x in _range(value_range))
+        if not isinstance(value_range, tuple | list) or len(value_range) != 2:
+            raise ValueError(f"value_range must be (smallest, largest), got {show(value_range)}")
+        smallest, largest = (number("value_range", x) for x in value_range)
+        if not smallest < largest:
+            raise ValueError(f"value_range must be (smallest, largest), got ({smallest:g}, {largest:g})")
+        low, high = value.new_tensor(smallest), value.new_tensor(largest)
     value = _smooth_steps(torch.where(is_known, value, torch.nan))
-    fraction = (torch.where(is_known, value, low) - low) / (high - low)
-    fraction = fraction.clamp(0.0, 1.0)
+    fraction = ((torch.where(is_known, value, low) - low) / (high - low)).clamp(0.0, 1.0)
     if kind == "depth":
         depth = near_m + (far_m - near_m) * fraction
     else:
@@ -185,19 +192,18 @@ def solve_scale(
         (4.0, 0.0)
     """
     choice("the kind of relative depth", kind, RELATIVE_KINDS)
-    _relative_map(values)
+    _check_map(values)
     if values.shape[0] != 1:
         raise ValueError(f"values must be one map [1, 1, H, W], got {list(values.shape)}; solve each on its own")
     whole("patch", patch, 1, 2**31)
-    samples = [_point(values, point, kind, patch) for point in points]
-    if len({value for value, _ in samples}) < 2:
+    samples = torch.tensor([_point(values, p, kind, patch) for p in points], dtype=torch.float64, device="cpu")
+    value, metres = samples.reshape(-1, 2).unbind(1)
+    if len(value.unique()) < 2:
         raise ValueError(
-            f"scale and offset need at least two points of different values, got {len(samples)} points of values "
-            f"{sorted({value for value, _ in samples})}"
+            f"scale and offset need at least two points of different values, got {len(value)} points of values "
+            f"{value.unique().tolist()}"
         )
     # Solve a v + b = y with y = z for "depth", else 1/z. Each row is divided by y, so that errors are relative.
-    value = torch.tensor([v for v, _ in samples], dtype=torch.float64, device="cpu")
-    metres = torch.tensor([z for _, z in samples], dtype=torch.float64, device="cpu")
     weight = 1.0 / metres if kind == "depth" else metres.clamp(max=1e6 * float(metres.min()))
     target = metres.isfinite().double() if kind != "depth" else torch.ones_like(value)
     design = torch.stack([value * weight, weight], dim=1)
@@ -211,30 +217,8 @@ def solve_scale(
     return Scale("disparity", 1.0 / factor, constant / factor, residual)
 
 
-def _near_and_far(near_m: float, far_m: float, kind: RelativeKind) -> tuple[float, float]:
-    """Refuse distances that are not numbers, or in the wrong order."""
-    near_m = number("near_m", near_m, low=0, unit="metres")
-    far_m = number("far_m", far_m, low=0, unit="metres", infinite=kind != "depth")
-    if not near_m < far_m:
-        raise ValueError(f"near_m must be nearer than far_m, got near_m={near_m:g} and far_m={far_m:g}")
-    return near_m, far_m
-
-
-def _range(value_range: tuple[float, float]) -> tuple[float, float]:
-    """Refuse a range that is not two increasing numbers."""
-    if not isinstance(value_range, tuple | list) or len(value_range) != 2:
-        raise ValueError(f"value_range must be (smallest, largest), got {show(value_range)}")
-    low, high = (number("value_range", x) for x in value_range)
-    if not low < high:
-        raise ValueError(f"value_range must be (smallest, largest), got ({low:g}, {high:g})")
-    return low, high
-
-
-def _relative_map(values: Tensor) -> None:
+def _check_map(values: Tensor) -> None:
     """Refuse a value that is not a tensor ``[B, 1, H, W]`` of numbers."""
-    if not isinstance(values, Tensor):
-        hint = "; convert an array with torch.from_numpy(array)[None, None]"
-        raise ValueError(f"relative depth must be a tensor [B, 1, H, W], got {type(values).__name__}{hint}")
     number_map("relative depth", values)
     if values.ndim != 4 or values.shape[1] != 1:
         hint = "; add the missing dimensions, as values[:, None] does" if values.ndim < 4 else ""

@@ -37,18 +37,10 @@ class DepthWarning(UserWarning):
 
 @dataclasses.dataclass(frozen=True)
 class Mistake:
-    """A likely mistake in a depth map or its camera.
-
-    Args:
-        name: "focus": the focus lies outside of all depth; "gap": no pixel lies near it; "far": all depth is far and
-            nothing is blurred; "bits": whole numbers, as in files of 8 bits, or numbers from 0 to 1; "blur": a larger
-            blur than lenses make; "lens": a shorter focal length than lenses have; "range": relative depth of a
-            sequence without ``value_range``.
-        message: The observation, the likely mistake and its remedy.
-    """
+    """A likely mistake in a depth map or its camera."""
 
     name: Literal["focus", "gap", "far", "bits", "blur", "lens", "range"]
-    message: str
+    message: str  # the observation, the likely mistake and its remedy
 
 
 def check(depth: Tensor, camera: Camera, *, strict: bool = False) -> None:
@@ -82,23 +74,9 @@ def check(depth: Tensor, camera: Camera, *, strict: bool = False) -> None:
 def depth_mistakes(
     depth: Tensor, camera: Camera, kind: DepthKind | Literal["relative"] = "z", scale: float | None = None
 ) -> list[Mistake]:
-    """Likely mistakes in a depth map and its camera.
+    """Likely mistakes in a depth map and its camera, as :func:`check` takes them: at most one of each name.
 
-    Args:
-        depth: ``[B, 1, H, W]``, metres; ``inf`` and holes (NaN, zero, negative) are left out.
-        camera: The camera; its numbers floats or ``[B]``.
-        kind: Kind of the numbers before their conversion to metres, for the advice in the message.
-        scale: Factor of that conversion, for the same.
-
-    Returns:
-        At most one mistake of each name, from the first item that has it.
-
-    Raises:
-        ValueError: If an argument is not as described.
-
-    Example:
-        >>> depth_mistakes(torch.full((1, 1, 4, 6), 3.0), Camera(focus_m=3.0))
-        []
+    ``kind`` and ``scale`` are those of the conversion of the numbers to metres, for the advice in the message.
     """
     real_tensor("depth", depth, "[B, 1, H, W] in metres")
     if depth.ndim != 4 or depth.shape[1] != 1:
@@ -120,19 +98,14 @@ def depth_mistakes(
 
 
 def coc_mistakes(coc_px: Tensor) -> list[Mistake]:
-    """Likely mistakes in a map of the circle of confusion, ``[B, 1, H, W]`` in pixels.
-
-    Example:
-        >>> [mistake.name for mistake in coc_mistakes(torch.full((1, 1, 4, 6), 1500.0))]
-        ['blur']
-    """
+    """Likely mistakes in a map of the circle of confusion, ``[B, 1, H, W]`` in pixels."""
     real_tensor("coc_px", coc_px, "[B, 1, H, W] in pixels")
     size, width = _sample(coc_px.abs()), coc_px.shape[-1]
     if not bool(size.isfinite().any()) or _quantile(size[size.isfinite()], 0.99) <= _LARGEST_WIDTHS * width:
         return []
     size = coc_px[coc_px.isfinite()].abs()
     message = (
-        f"a blur radius of {_pixels(float(size.max()))} px on an image of {width} px is more than a lens makes; are "
+        f"a blur radius of {float(size.max()):.6g} px on an image of {width} px is more than a lens makes; are "
         "these depths instead of circles of confusion? (--depth-kind)"
     )
     return [Mistake("blur", message)]
@@ -170,11 +143,17 @@ def _mistakes(
     is_sharp = smallest <= sharp_px
     factor = next((factor for factor in _FACTORS if near * factor <= focus_m <= far * factor), None)
     is_far_off = factor is not None and not near / _FAR_OFF_RATIO <= focus_m <= far * _FAR_OFF_RATIO
-    if (not is_sharp and not (is_too_blurred and near <= focus_m <= far)) or is_far_off:
-        message = _out_of_focus(near, far, extent, focus_m, is_whole, factor, kind, scale)
-        name: Literal["gap", "focus"] = "gap" if near <= focus_m <= far else "focus"
-        return [Mistake(name, message if is_sharp else f"nothing is in focus: {message}")]
-    mistakes = []
+    is_within = near <= focus_m <= far
+    if (not is_sharp and not (is_too_blurred and is_within)) or is_far_off:
+        message = "" if is_sharp else "nothing is in focus: "
+        if is_within:
+            message += (
+                f"no pixel lies near the focus at {focus_m:.4g} m, all {extent}; focus on something with --focus-at X,Y"
+            )
+            return [Mistake("gap", message)]
+        message += _out_of_focus(near, far, extent, focus_m, is_whole, factor, kind, scale)
+        return [Mistake("focus", message)]
+    mistakes, focal_mm, sensor_mm = [], float(camera.focal_length_mm), float(camera.sensor_width_mm)
     is_8_bit, is_unit_range = is_whole and far <= 255 and far - near >= 64, 0.9 < far <= 1.0 and near < 0.05
     if kind != "relative" and (is_8_bit or is_unit_range):
         description = f"whole numbers {extent}, as files of 8 bits hold" if is_8_bit else f"between 0 and 1 {extent}"
@@ -184,8 +163,16 @@ def _mistakes(
         message = f"all depth is far {extent}, and nothing is blurred; is it {unit}? The focus too is in metres"
         mistakes.append(Mistake("far", message))
     if is_too_blurred:
-        mistakes.append(Mistake("blur", _too_blurred(largest, width, far, extent, camera)))
-    if (focal_mm := float(camera.focal_length_mm)) < _SHORTEST_WIDTHS * (sensor_mm := float(camera.sensor_width_mm)):
+        hand = "all depth lies within a hand's breadth" if far < _NEAR_M else "the depth"
+        message = (
+            f"a blur radius of {largest:.6g} px on an image of {width} px is more than a lens makes: {hand} {extent}, "
+            f"the focus {focus_m:.4g} m, the opening {2 * float(camera.aperture_radius_m):.4g} m across "
+            f"(f/{float(camera.f_number):.2g}, {focal_mm:.4g} mm on a sensor of {sensor_mm:.4g} mm); which is in "
+            "another unit? --depth-scale, --focus-m and --aperture-radius-m make or take metres, --focal-length-mm and "
+            "--sensor-width-mm millimetres"
+        )
+        mistakes.append(Mistake("blur", message))
+    if focal_mm < _SHORTEST_WIDTHS * sensor_mm:
         lens = f"a focal length of {focal_mm:.4g} mm on a sensor of {sensor_mm:.4g} mm is shorter than any lens's"
         mistakes.append(Mistake("lens", f"{lens}; --focal-length-mm and --sensor-width-mm take millimetres"))
     return mistakes
@@ -202,8 +189,6 @@ def _out_of_focus(
     scale: float | None,
 ) -> str:
     """Message for a focus outside of all depth."""
-    if near <= focus_m <= far:
-        return f"no pixel lies near the focus at {focus_m:.4g} m, all {extent}; focus on something with --focus-at X,Y"
     side, hints = "nearer" if focus_m < near else "farther", []
     if kind in ("disparity", "inverse"):
         hints.append(
@@ -224,22 +209,6 @@ def _out_of_focus(
         hints.append("all of it lies within a hand's breadth")
     hints.append("if the depth is right, focus with --focus-m METRES or --focus-at X,Y")
     return f"the focus at {focus_m:.4g} m is {side} than all depth {extent}; {'; '.join(hints)}"
-
-
-def _pixels(count: float) -> str:
-    return f"{count:.0f}" if count < 1e6 else f"{count:.1e}"
-
-
-def _too_blurred(largest: float, width: int, far: float, extent: str, camera: Camera) -> str:
-    """Message for a blur radius that is larger than lenses make."""
-    hand = "all depth lies within a hand's breadth" if far < _NEAR_M else "the depth"
-    return (
-        f"a blur radius of {_pixels(largest)} px on an image of {width} px is more than a lens makes: {hand} {extent}, "
-        f"the focus {float(camera.focus_m):.4g} m, the opening {2 * float(camera.aperture_radius_m):.4g} m across "
-        f"(f/{float(camera.f_number):.2g}, {float(camera.focal_length_mm):.4g} mm on a sensor of "
-        f"{float(camera.sensor_width_mm):.4g} mm); which is in another unit? --depth-scale, --focus-m and "
-        "--aperture-radius-m make or take metres, --focal-length-mm and --sensor-width-mm millimetres"
-    )
 
 
 _RELATIVE = "--depth-kind relative --near-m METRES --far-m METRES"

@@ -82,8 +82,7 @@ class Steady:
         else:
             memory = _next_memory(now, self._before, self._memory, inverse)
         self._before, self._memory = now, memory
-        steady = 1.0 / memory[:, :1]
-        return steady.to(depth.dtype)
+        return (1.0 / memory[:, :1]).to(depth.dtype)
 
 
 class SteadyFrames:

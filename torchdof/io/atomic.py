@@ -1,15 +1,12 @@
 """Writes a file whole or not at all: under a temporary name in the same folder, renamed when it is complete.
 
-The temporary file is removed on any error, including Ctrl-C, SIGTERM and SIGHUP. A process killed by SIGKILL leaves it
-behind; the next process that writes to the folder removes it if it is older than a day.
+The temporary file is removed on any error, including Ctrl-C, SIGTERM and SIGHUP. Only SIGKILL leaves it behind.
 """
 
 import contextlib
-import functools
 import os
 import signal
 import threading
-import time
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,8 +14,6 @@ from types import FrameType
 from typing import NoReturn
 
 __all__ = ["atomic_file", "check_writable", "exit_on_signals", "write_text"]
-
-_DAY_S = 86_400.0
 
 
 @contextlib.contextmanager
@@ -44,7 +39,6 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     if target.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; name a file in it")
     check_writable(path)
-    _remove_abandoned(target.parent)
     temporary = target.with_name(f".{uuid.uuid4().hex}.part{target.suffix}")
     with exit_on_signals():
         try:
@@ -60,9 +54,6 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     """Refuses a file that is read-only, or that lies in a read-only folder or in a missing folder within one.
 
     A rename could replace a read-only file; like other programs, this one does not.
-
-    Raises:
-        PermissionError: If the file may not be written.
     """
     target = Path(os.path.realpath(path))
     if target.is_file() and not os.access(target, os.W_OK):
@@ -76,15 +67,6 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Writes a text file in UTF-8, whole or not at all."""
     with atomic_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
-
-
-@functools.cache  # once for each folder, because listing many frames takes long
-def _remove_abandoned(folder: Path) -> None:
-    """Removes temporary files older than a day, left by killed processes."""
-    for temporary in folder.glob("." + "[0-9a-f]" * 32 + ".part*"):
-        with contextlib.suppress(OSError):
-            if time.time() - temporary.stat().st_mtime > _DAY_S:
-                temporary.unlink()
 
 
 @contextlib.contextmanager

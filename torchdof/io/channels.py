@@ -8,20 +8,11 @@ Parts = list[tuple[str, tuple[str, ...]]]  # label and channel names of each par
 def colour_channels(parts: Parts, layer: str | None, layered: bool) -> tuple[int, list[int], tuple[str, ...]]:
     """Finds R, G, B (or grey, Y) and, if present, A.
 
-    Args:
-        parts: Label and channel names of each part of the file.
-        layer: Name of the part or layer; None takes the first with colour, preferring channels without a layer name.
-        layered: Whether names may have a layer before a dot (EXR).
+    Names may have a layer before a dot if the file is ``layered`` (EXR). ``layer`` is the name of the part or layer;
+    None takes the first with colour, preferring channels without a layer name.
 
     Returns:
         Index of the part, indices of the channels in it, and their names without layer.
-
-    Raises:
-        ValueError: If there is no colour, or no such layer with colour.
-
-    Example:
-        >>> colour_channels([("", ("A", "B", "G", "R", "Z"))], None, True)
-        (0, [3, 2, 1, 0], ('R', 'G', 'B', 'A'))
     """
     layers_with_colour = []
     for part, (label, names) in enumerate(parts):
@@ -49,12 +40,7 @@ def colour_channels(parts: Parts, layer: str | None, layered: bool) -> tuple[int
 
 
 def depth_channel(parts: Parts) -> tuple[int, int] | None:
-    """Indices of the part and of the depth channel in it: ``Z``, ``depth``, ``ViewLayer.Depth.Z``; not ``Normal.Z``.
-
-    Example:
-        >>> depth_channel([("", ("N.X", "N.Y", "N.Z", "ViewLayer.Depth.Z"))])
-        (0, 3)
-    """
+    """Indices of the part and of the depth channel in it: ``Z``, ``depth``, ``ViewLayer.Depth.Z``; not ``Normal.Z``."""
     for part, (label, names) in enumerate(parts):
         for index, name in enumerate(names):
             words = name.lower().split(".")

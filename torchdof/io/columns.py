@@ -18,26 +18,7 @@ def print_columns(
 ) -> None:
     """Prints a table; columns that do not fit are printed below in further tables, each starting with the first column.
 
-    Args:
-        console: Console to print on.
-        title: Line above the table.
-        columns: Heading -> cells, the same number in each column.
-        words: Headings of columns of text, which are aligned left; numbers are aligned right.
-
-    Example:
-        >>> from rich.console import Console
-        >>> columns = {"m": ["1", "2"], "radius": ["3.25", "4.5"], "noise": ["1", "1"]}
-        >>> print_columns(Console(width=10), "two", columns)
-        two
-        m   radius
-        ──────────
-        1     3.25
-        2      4.5
-        <BLANKLINE>
-        m   noise
-        ─────────
-        1       1
-        2       1
+    ``columns`` maps headings to cells, the same number in each. Numbers are aligned right, columns of ``words`` left.
     """
     from rich.box import SIMPLE_HEAD
     from rich.measure import Measurement

@@ -33,6 +33,11 @@ _WHITE = {"8": 255.0, "16": 65535.0, "half": 1.0, "float": 1.0}
 _ALPHA_SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".webp")
 _GREY_SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pfm")
 _LOSSLESS_EXR = ("none", "rle", "zip", "zips", "piz")
+_JPEG = {"compression": "jpeg:95", "jpeg:subsampling": "4:4:4"}
+_SETTINGS: dict[str, Mapping[str, object]] = {
+    **{".jpg": _JPEG, ".jpeg": _JPEG, ".webp": {"compression": "webp:95"}},
+    ".png": {"png:compressionLevel": 4},  # a third of the time of the default, 6, and a twentieth more bytes
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,11 +180,6 @@ def write_image(
 ) -> None:
     """Writes a picture whole or not at all.
 
-    1. Choose the sample type and the transfer curve, and drop alpha or add channels as the format requires.
-    2. Encode the light, in strips of rows.
-    3. Add the window, the metadata and the settings of the compression.
-    4. Write a temporary file, check that it is complete, and rename it.
-
     Args:
         path: Output file; its suffix gives the format (.exr .png .tif .tiff .jpg .jpeg .webp .hdr .pfm).
         picture: Pixels in linear light; metadata that the format supports is written too.
@@ -202,14 +202,13 @@ def write_image(
     suffix = path.suffix.lower()
     sample_types = samples_of(path)
     if sample is None:
-        floats = picture.sample in ("half", "float")
-        default = "float" if floats and suffix[:4] == ".tif" else sample_types[0]
+        default: PixelType = "float" if picture.sample == "half" and suffix[:4] == ".tif" else sample_types[0]
         sample = picture.sample if picture.sample in sample_types else default
     if sample not in sample_types:
         raise ValueError(f"{path}: a {suffix} file holds samples of {' or '.join(sample_types)}, not {sample}")
     if transfer is None:
-        both_same = (sample in ("half", "float")) == (picture.sample in ("half", "float"))  # floats, or integers
-        transfer = picture.transfer if both_same else default_transfer(sample)
+        both_floats_or_integers = default_transfer(sample) == default_transfer(picture.sample)
+        transfer = picture.transfer if both_floats_or_integers else default_transfer(sample)
     pixels = real_tensor("pixels", picture.pixels, "[1, C, H, W] in linear light").detach().cpu().float()
     names = picture.channels
     if pixels.ndim != 4 or pixels.shape[0] != 1 or pixels.shape[1] != len(names):
@@ -236,10 +235,9 @@ def write_image(
     if picture.window is not None:
         spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height = picture.window
     for name, (kind, value) in picture.metadata.items():
-        if name == "compression":
-            if suffix == ".exr" and value in _LOSSLESS_EXR:
-                spec.attribute(name, value)
-        elif name != "ICCProfile" or transfer == picture.transfer:
+        if name == "compression" and not (suffix == ".exr" and value in _LOSSLESS_EXR):
+            continue
+        if name != "ICCProfile" or transfer == picture.transfer:
             if isinstance(value, int):  # OpenImageIO drops an integer given with a 16-bit type
                 spec.attribute(name, value)
             else:
@@ -250,13 +248,8 @@ def write_image(
         spec.attribute("Exif:ColorSpace", 65535)  # "uncalibrated"; OpenImageIO cannot write a TIFF without any EXIF
     if straight:
         spec.attribute("oiio:UnassociatedAlpha", 1)
-    if suffix in (".jpg", ".jpeg"):
-        spec.attribute("compression", "jpeg:95")
-        spec.attribute("jpeg:subsampling", "4:4:4")
-    if suffix == ".png":
-        spec.attribute("png:compressionLevel", 4)  # a third of the time of the default, 6, and a twentieth more bytes
-    if suffix == ".webp":
-        spec.attribute("compression", "webp:95")
+    for name, setting in _SETTINGS.get(suffix, {}).items():
+        spec.attribute(name, setting)
 
     with atomic_file(path) as temporary:
         with temporary.open("wb") as file:
@@ -267,10 +260,9 @@ def write_image(
             if output is None or not output.open(name, spec):
                 problem = (oiio if output is None else output).geterror()
                 raise OSError(f"{path}: could not be opened for writing ({first_line(problem)})")
-            is_written = output.write_image(array)
-            is_written = output.close() and is_written
+            is_written, is_closed = output.write_image(array), output.close()
             problem = output.geterror()  # of a full disk, unless it fills up in the last flush of the buffer
-            if not is_written or problem or not is_complete(temporary):
+            if not (is_written and is_closed) or problem or not is_complete(temporary):
                 raise OSError(f"{path}: could not be written ({first_line(problem)}); is the disk full?")
             if suffix == ".webp" and picture.metadata:
                 add_exif(temporary, spec)

@@ -15,12 +15,7 @@ _CGROUP_FILES = (  # limit and use of a control group, version 2 and 1
 
 
 def free_bytes() -> float:
-    """Bytes that this process can still allocate, limited by machine, ulimit and container; ``inf`` if unknown.
-
-    Example:
-        >>> free_bytes() > 2**20
-        True
-    """
+    """Bytes that this process can still allocate, limited by machine, ulimit and container; ``inf`` if unknown."""
     limits = [math.inf]
     with contextlib.suppress(OSError):
         limits += [1024.0 * int(kib) for kib in re.findall(r"MemAvailable:\s*(\d+)", Path("/proc/meminfo").read_text())]

@@ -14,8 +14,10 @@ Metadata = dict[str, tuple[Any, Any]]
 
 # Attributes of the storage of one file, which do not apply to a copy.
 _STORAGE_PREFIXES = ("oiio:", "tiff:", "openexr:", "png:", "pnm:", "jpeg:", "rgbe:", "thumbnail", "Exif:ExifVersion")
-_STORAGE_NAMES: tuple[str, ...] = ("name", "planarconfig", "textureformat", "CompressionQuality")
-_STORAGE_NAMES += ("Exif:FlashPixVersion", "Exif:ColorSpace")
+_STORAGE_NAMES = (
+    *("name", "planarconfig", "textureformat", "CompressionQuality"),
+    *("Exif:FlashPixVersion", "Exif:ColorSpace"),
+)
 _MM_PER_UNIT: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
 _FLIPPED: dict[Any, tuple[int, ...]] = {2: (1,), 3: (0, 1), 4: (0,), 5: (), 6: (1,), 7: (0, 1), 8: (0,)}
 """EXIF orientation (0x0112) -> flipped axes. Orientations from 5 up first transpose the image."""
@@ -28,14 +30,7 @@ _AXIS_TAGS = (  # tags that are swapped when an image is transposed
 
 
 def upright(values: "np.ndarray", metadata: Metadata) -> "tuple[np.ndarray, Metadata]":
-    """Turns an image ``[H, W, C]`` upright by its orientation tag, and sets the tag to 1.
-
-    Example:
-        >>> import numpy as np
-        >>> lying = np.arange(6).reshape(2, 3, 1)
-        >>> upright(lying, {"Orientation": ("uint16", 6)})[0][..., 0].tolist()
-        [[3, 0], [4, 1], [5, 2]]
-    """
+    """Turns an image ``[H, W, C]`` upright by its orientation tag, and sets the tag to 1."""
     kind, orientation = metadata.get("Orientation", (None, 1))
     if orientation not in _FLIPPED:
         return values, metadata
@@ -52,11 +47,7 @@ def upright(values: "np.ndarray", metadata: Metadata) -> "tuple[np.ndarray, Meta
 
 
 def kept_metadata(attributes: Iterable[Any]) -> Metadata:
-    """Metadata for a copy of an image, from OpenImageIO's ``extra_attribs``.
-
-    Returns:
-        Name -> (type, value), without attributes of the storage.
-    """
+    """Metadata for a copy of an image: OpenImageIO's ``extra_attribs``, without those of the storage."""
     return {
         a.name: (a.type, a.value)
         for a in attributes
@@ -65,19 +56,11 @@ def kept_metadata(attributes: Iterable[Any]) -> Metadata:
 
 
 def camera_settings(metadata: Mapping[str, tuple[Any, Any]], width: int, height: int) -> dict[str, float]:
-    """Camera settings found in the metadata, under the names of ``torchdof.Camera``.
+    """Camera settings found in the metadata of a picture of a size in pixels, under the names of ``torchdof.Camera``.
 
     The sensor width comes from the resolution of the focal plane (EXIF 0xA20E). If that is missing, or differs by more
     than 25 % (for example after scaling the picture), it comes from the 35 mm equivalent focal length, with 36 mm for
     the longer side of the picture. Numbers that no lens has are ignored.
-
-    Args:
-        metadata: As in ``Picture.metadata``.
-        width: Width of the image in pixels.
-        height: Height of the image in pixels.
-
-    Returns:
-        Those of ``focal_length_mm``, ``f_number``, ``focus_m`` and ``sensor_width_mm`` that are known.
 
     Example:
         >>> tags = {"Exif:FocalLength": 50.0, "FNumber": 1.8, "Exif:FocalLengthIn35mmFilm": 75}
@@ -85,36 +68,30 @@ def camera_settings(metadata: Mapping[str, tuple[Any, Any]], width: int, height:
         {'focal_length_mm': 50.0, 'f_number': 1.8, 'sensor_width_mm': 24.0}
     """
 
-    def number(*names: str, low: float = 0.0, high: float = math.inf) -> float | None:
+    def number(*names: str, ends: tuple[float, float] = (0.0, math.inf)) -> float | None:
         for name in names:
             value = metadata.get(name, (None, None))[1]
             is_number = isinstance(value, float) or (isinstance(value, int) and value < 2**63)
-            if is_number and 0 < value and low <= value <= high:
+            if is_number and 0 < value and ends[0] <= value <= ends[1]:
                 return float(value)
         return None
 
     settings: dict[str, float] = {}
-    names = ("Exif:FocalLength", "effectiveFocalLength", "nominalFocalLength")
-    focal_length_mm = number(*names, low=_FOCAL_MM[0], high=_FOCAL_MM[1])
-    if focal_length_mm is not None:
+    if focal_length_mm := number("Exif:FocalLength", "effectiveFocalLength", "nominalFocalLength", ends=_FOCAL_MM):
         settings["focal_length_mm"] = focal_length_mm
-    f_number = number("FNumber", "Exif:FNumber", "aperture", low=_F_NUMBERS[0], high=_F_NUMBERS[1])
-    f_stops = number("Exif:ApertureValue", high=20.0)
-    if f_number is None and f_stops is not None:
+    f_number = number("FNumber", "Exif:FNumber", "aperture", ends=_F_NUMBERS)
+    if f_number is None and (f_stops := number("Exif:ApertureValue", ends=(0.0, 20.0))):
         f_number = 2 ** (f_stops / 2)  # APEX
     if f_number is not None:
         settings["f_number"] = round(f_number, 6)
-    focus_m = number("Exif:SubjectDistance", "focus")
-    if focus_m is not None:
+    if focus_m := number("Exif:SubjectDistance", "focus"):
         settings["focus_m"] = math.inf if focus_m > 1e6 else focus_m  # EXIF writes infinity as 2^32 - 1
-    film_mm = number("Exif:FocalLengthIn35mmFilm", low=_FOCAL_MM[0], high=_FOCAL_MM[1])
-    if film_mm is not None:
+    if film_mm := number("Exif:FocalLengthIn35mmFilm", ends=_FOCAL_MM):
         focal_length_mm = settings.setdefault("focal_length_mm", film_mm)  # the equivalent lens, if no other is known
         width_mm = 36.0 * focal_length_mm / film_mm * (width / max(width, height))
         if _SENSOR_MM[0] <= width_mm <= _SENSOR_MM[1]:
             settings["sensor_width_mm"] = width_mm
-    px_per_unit = number("Exif:FocalPlaneXResolution")
-    if px_per_unit is not None:
+    if px_per_unit := number("Exif:FocalPlaneXResolution"):
         original_width = number("Exif:PixelXDimension") or width
         mm_per_unit = _MM_PER_UNIT.get(number("Exif:FocalPlaneResolutionUnit") or 2, 25.4)
         plane_mm = original_width / px_per_unit * mm_per_unit

@@ -25,12 +25,7 @@ def readable() -> tuple[str, ...]:
 
 
 def refusal(path: Any) -> str | None:
-    """Message with the reason and the conversion for a file that cannot be read here; None for other files.
-
-    Example:
-        >>> refusal("holiday.jpg") is None
-        True
-    """
+    """Message with the reason and the conversion for a file that cannot be read here; None for other files."""
     suffix = Path(path).suffix.lower() if isinstance(path, str | os.PathLike) else ""
     if suffix not in SUFFIXES or suffix in readable():
         return None

@@ -36,11 +36,7 @@ MAP_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".npz")
 
 
 def samples_of(path: Path) -> tuple[PixelType, ...]:
-    """Sample types that an image file can hold, by its suffix; the default is first.
-
-    Raises:
-        ValueError: If files with this suffix cannot be written.
-    """
+    """Sample types that an image file can hold, by its suffix, the default first; refuses other suffixes."""
     suffix = path.suffix.lower()
     if suffix not in _SAMPLES:
         kind = f"files of type {suffix!r}" if suffix else "a file without a type"
@@ -50,13 +46,11 @@ def samples_of(path: Path) -> tuple[PixelType, ...]:
 
 def existing_image(path: str | os.PathLike[str]) -> Path:
     """Checks the path of an image, as :func:`existing_file`."""
-    refusal = optional_formats.refusal(path)
-    if refusal is not None:
+    if refusal := optional_formats.refusal(path):
         raise ValueError(f"{path}: {refusal}")
     is_known = isinstance(path, str | os.PathLike) and Path(path).suffix.lower() in IMAGE_SUFFIXES
-    return existing_file(
-        path, IMAGE_SUFFIXES if is_known else (*IMAGE_SUFFIXES, *optional_formats.readable()), "an image"
-    )
+    others = () if is_known else optional_formats.readable()  # which imports OpenImageIO
+    return existing_file(path, (*IMAGE_SUFFIXES, *others), "an image")
 
 
 def existing_map(path: str | os.PathLike[str]) -> Path:
@@ -65,12 +59,7 @@ def existing_map(path: str | os.PathLike[str]) -> Path:
 
 
 def existing_file(path: str | os.PathLike[str], suffixes: tuple[str, ...], what: str) -> Path:
-    """Returns ``path`` if it is a file with one of ``suffixes`` that is not empty; ``what`` describes it in messages.
-
-    Raises:
-        OSError: If the file is missing, empty or not a regular file.
-        ValueError: If ``path`` is not a path, or has another suffix.
-    """
+    """Returns ``path`` if it is a file with one of ``suffixes`` and is not empty; messages call it ``what``."""
     if not isinstance(path, str | os.PathLike) or "\0" in os.fspath(path):
         from ..validation import show  # imports PyTorch
 

@@ -18,10 +18,6 @@ class FramePattern:
 
     Raises:
         ValueError: If there is not exactly one placeholder, or it has more than 18 digits.
-
-    Example:
-        >>> FramePattern("out/shot.####.exr").name(7)
-        PosixPath('out/shot.0007.exr')
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -61,12 +57,7 @@ class FramePattern:
 
 
 def parse_frames(text: str) -> tuple[int, int]:
-    """Reads ``first-last`` or a single number; ``ValueError`` for other text, or if last comes before first.
-
-    Example:
-        >>> parse_frames("10-24")
-        (10, 24)
-    """
+    """Reads ``first-last`` or a single number; ``ValueError`` for other text, or if last comes before first."""
     match = re.fullmatch(r"\s*(\d{1,18})(?:\s*-\s*(\d{1,18}))?\s*", text)
     if match is None:
         raise ValueError(f"--frames expects first-last, such as 1-48, got {reprlib.repr(text)}")
@@ -77,15 +68,7 @@ def parse_frames(text: str) -> tuple[int, int]:
 
 
 def parse_focus(text: str) -> list[tuple[int, float]]:
-    """Reads a focus distance in metres, ``2.0``, as one keyframe, or keyframes ``frame:metres``, sorted by frame.
-
-    Raises:
-        ValueError: If a part cannot be read, a distance is not positive, or a frame is given twice.
-
-    Example:
-        >>> parse_focus("1:2.0,48:inf")
-        [(1, 2.0), (48, inf)]
-    """
+    """Reads a focus distance in metres, ``2.0``, as one keyframe, or keyframes ``frame:metres``, sorted by frame."""
     keys: dict[int, float] = {}
     try:
         for part in text.split(","):
@@ -106,13 +89,7 @@ def focus_at_frame(keys: list[tuple[int, float]], frame: int) -> float:
 
     The blur radius is linear in the inverse focus distance, so the blur changes at a constant rate, and the focus can
     end at infinity.
-
-    Example:
-        >>> focus_at_frame([(0, 1.0), (10, 2.0)], 5)
-        1.3333333333333333
     """
-    if not keys:
-        raise ValueError("focus needs at least one keyframe (frame, metres), got none")
     from ..validation import number  # imports PyTorch, which parsing of arguments must not need
 
     number("frame", frame)

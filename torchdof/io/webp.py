@@ -23,9 +23,6 @@ def add_exif(path: Path, spec: Any) -> None:
     """Adds the tags of an OpenImageIO specification to a WebP file, which OpenImageIO writes without them.
 
     OpenImageIO encodes tags only in files that it writes, so they are taken from a PNG of one pixel.
-
-    Raises:
-        OSError: If a file cannot be written.
     """
     import numpy as np
     import OpenImageIO as oiio

@@ -74,21 +74,19 @@ class Aperture:
         if isinstance(self.curvature, Tensor):
             raise ValueError(f"curvature must be a number from 0 to 1, got {show(self.curvature)}")
         _check("curvature", self.curvature, 0.0, 1.0)
-        if isinstance(self.vignetting, tuple | list):
-            if len(self.vignetting) != 2:
-                raise ValueError(f"vignetting must be a number or (front, rear), got {show(self.vignetting)}")
-            for share in self.vignetting:
-                _check("each share of vignetting", share, 0.0, 1.0)
+        if isinstance(self.vignetting, list):
             object.__setattr__(self, "vignetting", tuple(self.vignetting))
-        else:
-            _check("vignetting", self.vignetting, 0.0, 1.0)
-        if self.mask is None:
-            if self.blades == 0 and self.curvature != 0.0:
-                raise ValueError(f"curvature is that of blades; give their number too, got {self.curvature:g}")
-            return
-        if self.blades != 0:
-            raise ValueError(f"an opening has blades or a mask, got {self.blades} blades and a mask")
-        object.__setattr__(self, "mask", _checked_mask(self.mask))
+        shares = self.vignetting if isinstance(self.vignetting, tuple) else (self.vignetting,) * 2
+        if len(shares) != 2:
+            raise ValueError(f"vignetting must be a number or (front, rear), got {show(self.vignetting)}")
+        for share in shares:
+            _check("vignetting", share, 0.0, 1.0)
+        if self.mask is not None:
+            if self.blades != 0:
+                raise ValueError(f"an opening has blades or a mask, got {self.blades} blades and a mask")
+            object.__setattr__(self, "mask", _checked_mask(self.mask))
+        elif self.blades == 0 and self.curvature != 0.0:
+            raise ValueError(f"curvature is that of blades; give their number too, got {self.curvature:g}")
 
     @property
     def depends_on_place(self) -> bool:
@@ -134,10 +132,8 @@ class Aperture:
     def shares(self, half: int, step_y: Tensor, step_x: Tensor) -> Tensor:
         """Open share of each cell of a grid, without the squeeze: ``[..., 2 half + 1, 2 half + 1]``, float64.
 
-        Args:
-            half: Cells on each side of the middle one, which is centred on the opening.
-            step_y: Height of the cells ``[...]``; the circumscribed circle of the opening has radius 1.
-            step_x: Width of the cells ``[...]``.
+        The middle cell is centred on the opening, whose circumscribed circle has radius 1; ``step_y`` and ``step_x``
+        ``[...]`` are the height and width of the cells.
         """
         batch = broadcast_shapes(step_y.shape, step_x.shape)
         heights, widths = (step.to(torch.float64).expand(batch).reshape(-1) for step in (step_y, step_x))
@@ -164,11 +160,7 @@ class Aperture:
 
     @classmethod
     def from_dict(cls, data: Any) -> "Aperture":
-        """Build an aperture from :meth:`to_dict`'s data.
-
-        Raises:
-            ValueError: If a field is unknown or of the wrong kind; the message names it.
-        """
+        """Build an aperture from :meth:`to_dict`'s data; ``ValueError`` names a field that is unknown or wrong."""
         given = fields("aperture", data, (), [field.name for field in dataclasses.fields(cls)])
         if given.get("mask") is not None:
             given["mask"] = numbers("mask", given["mask"])
@@ -188,7 +180,7 @@ class Aperture:
         return f"Aperture({', '.join(parts) or 'round'})"
 
     def _outline(self, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Corners ``[V]`` of the outline, x and y with y down, ordered counter-clockwise as seen with y up."""
+        """Corners ``[V]`` of the outline, x and y with y down, counter-clockwise as seen with y up."""
         half_angle = math.pi / self.blades
         along, outward = _blade(half_angle, self.curvature)  # the blade whose outward normal points up
         normal = torch.arange(self.blades, dtype=torch.float64, device=device)[:, None] * (2.0 * half_angle)
@@ -235,8 +227,6 @@ def _blade(half_angle: float, curvature: float) -> tuple[Tensor, Tensor]:
 def _polygon_shares(x: Tensor, y: Tensor, count: int) -> Tensor:
     """Area of polygons with corners ``[m, V]`` in unit squares: ``[m, count, count]``, the first square at (0, 0).
 
-    Corners are counter-clockwise as seen with y up.
-
     1. Cut each edge at the rows of squares.
     2. For each piece and each vertical grid line, integrate over y the part of ``[0, line]`` left of the piece.
     3. Sum over the pieces, signed by their direction; neighbouring grid lines differ by the area between them.
@@ -260,11 +250,7 @@ def _polygon_shares(x: Tensor, y: Tensor, count: int) -> Tensor:
 
 
 def overlaps(low: Tensor, high: Tensor, edges: Tensor) -> Tensor:
-    """Overlap of intervals from ``low`` to ``high``, ``[m, n]``, with cells between edges ``[m or 1, c + 1]``.
-
-    Returns:
-        ``[m, n, c]``.
-    """
+    """Overlap ``[m, n, c]`` of intervals from ``low`` to ``high``, ``[m, n]``, with the cells between edges."""
     low, edges = low[..., None], edges[..., None, :]
     return (torch.minimum(high[..., None], edges[..., 1:]) - torch.maximum(low, edges[..., :-1])).clamp_min(0.0)
 
@@ -291,12 +277,10 @@ def _checked_mask(mask: Any) -> Tensor:
 
 
 def _check(name: str, value: Any, low: float, high: float) -> None:
-    """Refuse a value that is not a number, or is outside ``[low, high]``."""
-    if isinstance(value, Tensor):
-        is_number = value.ndim == 0 and value.is_floating_point()
-    else:
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not low <= value <= high:
+    """Refuse a value that is neither a number nor a tensor ``[]``, or is outside ``[low, high]``."""
+    is_tensor = isinstance(value, Tensor) and value.ndim == 0 and value.is_floating_point()
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not (is_tensor or is_number) or not low <= value <= high:
         raise ValueError(f"{name} must be a number from {low:g} to {high:g}, got {show(value)}")
 
 

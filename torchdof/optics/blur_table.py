@@ -1,7 +1,6 @@
 """Blur tables: signed circle of confusion to kernel parameters, as measured from a camera or a lens."""
 
 import hashlib
-import itertools
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -16,7 +15,7 @@ from ..validation import choice, number, numbers, pixels_wide, real_tensor, shor
 from . import psf, table_file
 from .aperture import Aperture, Number
 from .field import Field, bracket
-from .kernel_bank import FADE_IN, bank_of
+from .kernel_bank import KernelBank, bank_of
 
 __all__ = ["BlurTable"]
 
@@ -29,10 +28,8 @@ _SPOT_EDGE_PX = 1.5  # px around a spot of a field in which pixels receive some 
 _MAX_NODES = 4096
 _COC_RANGE = (1e-9, 1e6)  # |coc| of the outermost nodes, in the table's unit
 _MAX_REACH = 1e4  # largest radius of a kernel over |coc| of its node; allows a blur that remains in focus
-_MIN_PARAMETER, _MAX_PARAMETER = 1e-100, 1e100  # sums and products of parameters stay finite in float64
+_MIN_PARAMETER, _MAX_PARAMETER = 1e-100, 1e100
 _MAX_EXPONENT = 100.0  # largest exponent m of "softm"; with a steeper tilt the light would lie in the tail of the edge
-_CHECKED_PX = (0.5, 6.0)  # px; radii to which the widest kernel is scaled for the check
-_CHECKED_AT_ONCE = 64  # kernels checked together; limits memory
 
 
 class BlurTable:
@@ -97,7 +94,7 @@ class BlurTable:
             raise ValueError(f"name must be a text, got {show(name)}")
         if provenance is not None and not isinstance(provenance, Mapping):
             raise ValueError(f"provenance must be a dict, got {show(provenance)}")
-        self.family, self.unit, self.name = family, unit, str(name)
+        self.family, self.unit, self.name = family, unit, name
         self.coc = numbers("coc", coc)
         if self.coc.ndim != 1 or not len(self.coc) or bool((self.coc.diff() <= 0).any()) or not self.coc.any():
             raise ValueError(
@@ -116,6 +113,11 @@ class BlurTable:
             )
         self.sensor_width_mm = None if sensor_width_mm is None else number("sensor_width_mm", sensor_width_mm, 0, 1e300)
         self._params = self._check_params(params)
+        self._sides = {sign: self._side(sign) for sign in (-1, 1) if bool((self.coc * sign > 0).any())}
+        for distances, nodes in self._sides.values():
+            self._check_extent("coc", "params", float(distances[-1]), float(psf.reach(family, nodes).max()))
+        lengths = [nodes[name][:, 0] for _, nodes in self._sides.values() for name in psf.LENGTHS & nodes.keys()]
+        self.is_sharp_in_focus = not bool(torch.cat(lengths).any())
         self.strength = self._per_node("strength", strength)
         self.residual = self._per_node("residual", residual)
         self.provenance = dict(provenance or {})
@@ -124,15 +126,6 @@ class BlurTable:
         self.aperture = aperture
         self.field = self._check_field(field)
         self._fingerprint: str | None = None
-        self._sides = {sign: self._side(sign) for sign in (-1, 1)}
-        for sign in (-1, 1):
-            self._sides[sign] = self._sides[sign] or self._sides[-sign]
-        if family == "gaussian":
-            spreads = self._params["sigma"].detach() / self.coc.abs()
-            self._gaussian_finest = _FINEST_SIGMAS * float(spreads[:, self.coc != 0].min())
-        in_focus = [self._side_params(sign, torch.zeros(1, device="cpu")) for sign in (-1, 1)]
-        self.is_sharp_in_focus = not any(bool(p[name].any()) for p in in_focus for name in psf.LENGTHS & p.keys())
-        self._try_kernels()
 
     @classmethod
     def disc(cls) -> "BlurTable":
@@ -169,15 +162,12 @@ class BlurTable:
 
         Args:
             blades: Number of blades, from 3.
-            rotation_deg: Turns the polygon counter-clockwise, as it appears behind the focus plane; at 0 a corner
-                points up. A float, or a tensor ``[]``, which may require a gradient.
+            rotation_deg: Degrees, as in :class:`torchdof.optics.aperture.Aperture`.
             curvature: 0 for straight blades to 1 for a circle.
-            squeeze: Height of the blur over its width, 2 for a common anamorphic lens; the circle of confusion is the
-                height. A float, or a tensor ``[]``, which may require a gradient.
+            squeeze: Height of the blur over its width, 2 for a common anamorphic lens, as in ``Aperture``.
             rim: Brightness of the edge over that of the middle, minus 1: positive for an over-corrected lens (spherical
                 aberration), 0 for an even disc, -1 for a dark edge.
-            vignetting: Cat's eyes, 0 (round) to 1 (closed in the corner), or a pair for the front and rear rim
-                (:class:`torchdof.optics.aperture.Aperture`).
+            vignetting: Cat's eyes, 0 (round) to 1 (closed in the corner), as in ``Aperture``.
 
         Raises:
             ValueError: If a number is out of its range.
@@ -263,12 +253,7 @@ class BlurTable:
         return self.aperture is not None and self.aperture.is_differentiated
 
     def fingerprint(self) -> str:
-        """Hash of all numbers that kernels depend on; computed once.
-
-        Example:
-            >>> BlurTable.disc().fingerprint() == BlurTable.disc().fingerprint() != BlurTable.gaussian().fingerprint()
-            True
-        """
+        """Hash of all numbers that kernels depend on; computed once."""
         if self._fingerprint is None:
             data: list[Any] = [self.family, self.unit, self.sensor_width_mm, self.px_per_unit(1.0), self.coc.tolist()]
             data += [(name, value.tolist()) for name, value in self._params.items()]
@@ -288,28 +273,17 @@ class BlurTable:
         return dict(self._params)
 
     def params(self, coc_px: Tensor, width: float) -> dict[str, Tensor]:
-        """Kernel parameters at a signed coc.
+        """Kernel parameters at a signed coc ``[...]`` in pixels of an image ``width`` pixels wide, lengths in pixels.
 
-        Args:
-            coc_px: Signed coc in pixels, any shape ``[...]``.
-            width: Width in pixels of the image to which the coc refers.
-
-        Returns:
-            Parameters by name, lengths in pixels: ``[channels, ...]`` (``values``: ``[channels, ..., P]``), float64.
-            Continuous in ``coc_px`` and differentiable wherever it lies between nodes.
+        By name, ``[channels, ...]`` (``values``: ``[channels, ..., P]``), float64. Continuous in ``coc_px``, and
+        differentiable wherever it lies between nodes.
         """
         pixels_wide(width)
         scale = self.px_per_unit(width)
         signed = real_tensor("coc_px", coc_px, "[...] in pixels").to(torch.float64) / scale
-        near, far = (self._side_params(sign, signed.abs()) for sign in (-1, 1))
-        interpolated = {}
-        for name in self._params:
-            behind = signed >= 0
-            behind = behind.unsqueeze(-1) if name == "values" else behind
-            interpolated[name] = torch.where(behind, far[name], near[name])
-            if name in psf.LENGTHS:
-                interpolated[name] = interpolated[name] * scale
-        return interpolated
+        near, far = (self._side_params(sign, signed.abs(), scale) for sign in (-1, 1))
+        behind = signed >= 0
+        return {k: torch.where(behind[..., None] if k == "values" else behind, far[k], near[k]) for k in self._params}
 
     def kernels(self, coc_px: Tensor, width: float, size: int | None = None, window: int | None = None) -> Tensor:
         """Kernels of the middle of the frame at a signed coc, for pictures made of pixels (:mod:`torchdof.optics.psf`).
@@ -337,28 +311,13 @@ class BlurTable:
         params = self.params(coc_px, width)
         if coc_px.ndim != 1 or not coc_px.numel():
             raise ValueError(f"coc_px must be [n] in pixels, got {list(coc_px.shape)}")
-        if not self.is_differentiated and self.field is None:
-            return self._from_templates(coc_px, width, size, window)
-        kernels = psf.pixel_kernels(self.family, params, size, window, self.aperture).transpose(0, 1)
-        if not self.is_round:
-            behind = (coc_px.detach() >= 0).to(kernels.device)[:, None, None, None]
-            kernels = torch.where(behind, kernels, kernels.flip(-2, -1))
-        if self.is_sharp_in_focus:
-            return kernels
-        steepness = FADE_IN / self.moved_in_focus(width).clamp_min(torch.finfo(torch.float64).tiny)
-        fade = (coc_px.to(torch.float64).square()[:, None] * steepness).clamp(max=1.0)[:, :, None, None]
-        centre = torch.zeros_like(kernels)
-        centre[..., kernels.shape[-2] // 2, kernels.shape[-1] // 2] = 1.0
-        return torch.lerp(centre, kernels, fade)
-
-    def _from_templates(self, coc_px: Tensor, width: float, size: int | None, window: int | None) -> Tensor:
-        """The kernels of :meth:`kernels` without gradients to the aperture, interpolated from templates."""
-        signed = coc_px.to(torch.float64)
-        reach = psf.support(self.family, self.params(signed.detach(), width), self.aperture)
+        reach = psf.support(self.family, {name: value.detach() for name, value in params.items()}, self.aperture)
         full_half = psf.half_width(reach) if size is None and window is not None else psf.width_of(size, reach) // 2
         half = full_half if window is None else min(full_half, psf.width_of(window, reach) // 2)
         longest = [(full_half if size is not None else half) + 1] * len(coc_px) if half < reach else []
-        kernels = bank_of(self).kernels(signed, width, longest=longest)
+        central = self if self.field is None else self.replace(field=None)
+        bank = KernelBank(central, gradients=True) if self.is_differentiated else bank_of(central)
+        kernels = bank.kernels(coc_px.to(torch.float64), width, longest=longest)
         if size is not None:  # kernels that are cut off to a given size sum to 1 as well
             kernels = kernels / kernels.sum((-2, -1), keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
         padding = half - kernels.shape[-1] // 2
@@ -371,18 +330,11 @@ class BlurTable:
         return 1.0 - in_focus[:, in_focus.shape[-2] // 2, in_focus.shape[-1] // 2]
 
     def side_nodes(self, sign: int) -> tuple[Tensor, dict[str, Tensor]]:
-        """Nodes of one side of focus, ordered by ``|coc|`` from 0.
+        """Nodes of one side of focus, -1 in front of it, ordered by ``|coc|`` from 0, in the table's unit.
 
-        Args:
-            sign: -1 in front of the focus plane, 1 behind it.
-
-        Returns:
-            Unsigned coc ``[N]`` and parameters ``[channels, N]``, in the table's unit.
+        Unsigned coc ``[N]`` and parameters ``[channels, N]``; a side without nodes has those of the other.
         """
-        side = self._sides[sign]
-        if side is None:
-            raise AssertionError("a table has nodes on at least one side")
-        return side
+        return self._sides.get(sign) or self._sides[-sign]
 
     def reach_px(self, coc_px: float, width: float) -> float:
         """Radius in pixels that holds the kernels at ``+-coc_px``."""
@@ -400,19 +352,14 @@ class BlurTable:
             per_unit = self.px_per_unit(width)
             return min(abs(coc_px), self.field.finest(coc_px / per_unit) * per_unit)
         if self.family == "gaussian":
-            return abs(coc_px) * self._gaussian_finest
+            spreads = (self._params["sigma"] / self.coc.abs())[:, self.coc != 0]
+            return abs(coc_px) * _FINEST_SIGMAS * float(spreads.min())
         return abs(coc_px) if self.aperture is None else abs(coc_px) * self.aperture.finest
 
     def blur_texture(self, coc_px: float, width: int, size: int | None = None) -> Tensor:
         """The paper's blur texture: the fitted profile f(r), strength N included, at the pixels' centres.
 
-        Args:
-            coc_px: Signed coc in pixels.
-            width: Width in pixels of the image.
-            size: Odd width of the texture; None takes the smallest that holds the kernel.
-
-        Returns:
-            ``[channels, size, size]``, float64; not normalised.
+        ``[channels, size, size]``, float64, not normalised. Arguments as in :meth:`kernels`.
 
         Reference:
             Sato, Dobashi, Yamamoto, Fig. 3.
@@ -439,19 +386,12 @@ class BlurTable:
         return texture * self.strength[nearest]
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the table as JSON, whole or not at all.
-
-        Raises:
-            OSError: If the file cannot be written.
-        """
+        """Write the table as JSON, whole or not at all; ``OSError`` if the file cannot be written."""
         write_text(path, json.dumps(self.to_dict(), indent=1) + "\n")
 
     @classmethod
     def load(cls, source: str | os.PathLike[str]) -> "BlurTable":
-        """Read a table from a JSON file, or a shipped one by its name.
-
-        Args:
-            source: Path of a file, or the name of a shipped table such as ``"sato_j15"``.
+        """Read a table from a JSON file, or a shipped one by its name, such as ``"sato_j15"``.
 
         Raises:
             ValueError: If the content is not a valid table; the message names the file and the field.
@@ -489,11 +429,7 @@ class BlurTable:
 
     @classmethod
     def from_dict(cls, data: Any) -> "BlurTable":
-        """Build a table from :meth:`to_dict`'s data.
-
-        Raises:
-            ValueError: If a field is missing, unknown or of the wrong kind; the message names it.
-        """
+        """Build a table from :meth:`to_dict`'s data; ``ValueError`` names a field that is missing, unknown or wrong."""
         fields = table_file.fields_of(data)
         if fields.get("aperture") is not None:
             fields["aperture"] = Aperture.from_dict(fields["aperture"])
@@ -575,26 +511,6 @@ class BlurTable:
             got = f"a blur that reaches to {reach:g} where coc is {end:g}"
             raise ValueError(f"{lengths} must be lengths in the unit of {ends}, got {got}")
 
-    def _try_kernels(self) -> None:
-        """Refuse parameters whose kernels at, between or beyond the nodes are not finite or far too wide."""
-        scale, widest = self.px_per_unit(1.0), 0.0
-        for coc in (self.coc[self.coc < 0], self.coc[self.coc > 0]):
-            if len(coc):
-                reach = psf.support(self.family, self.params(coc * scale, 1.0)) / scale
-                self._check_extent("coc", "params", float(coc.abs().max()), reach)
-                widest = max(widest, reach)
-        if widest == 0.0:
-            return
-        cocs = torch.cat([self.coc, (self.coc[1:] + self.coc[:-1]) / 2, 2.0 * self.coc[[0, -1]]])
-        params = self.params(cocs * scale, 1.0)
-        for pixels, start in itertools.product(_CHECKED_PX, range(0, len(cocs), _CHECKED_AT_ONCE)):
-            batch = {name: value[:, start : start + _CHECKED_AT_ONCE] for name, value in params.items()}
-            factor = pixels / widest / scale
-            lengths = {name: value * factor if name in psf.LENGTHS else value for name, value in batch.items()}
-            if not bool(torch.isfinite(psf.pixel_kernels(self.family, lengths)).all()):
-                ranges = ", ".join(f"{name} up to {float(value.max()):g}" for name, value in self._params.items())
-                raise ValueError(f"params of {self.family} make kernels that are not finite: {ranges}")
-
     def _per_node(self, name: str, value: Sequence[float] | Tensor | None) -> Tensor | None:
         if value is None:
             return None
@@ -603,11 +519,9 @@ class BlurTable:
             raise ValueError(f"{name} must hold one number a node ({len(self.coc)}), got shape {list(values.shape)}")
         return values
 
-    def _side(self, sign: int) -> tuple[Tensor, dict[str, Tensor]] | None:
-        """Nodes of one side of focus, ordered by ``|coc|``, with a node at 0; None if the side has no nodes."""
+    def _side(self, sign: int) -> tuple[Tensor, dict[str, Tensor]]:
+        """Nodes of one side of focus, ordered by ``|coc|``, with a node at 0."""
         on_side = self.coc * sign >= 0
-        if not bool((self.coc * sign > 0).any()):
-            return None
         order = torch.argsort(self.coc[on_side].abs())
         distances = self.coc[on_side].abs()[order]
         nodes = {k: v[:, on_side][:, order] for k, v in self._params.items()}
@@ -618,8 +532,8 @@ class BlurTable:
                 nodes[name] = torch.cat([first, value], 1)
         return distances, nodes
 
-    def _side_params(self, sign: int, distance: Tensor) -> dict[str, Tensor]:
-        """Parameters at unsigned coc ``[...]``, in the table's unit, on one side of focus: ``[channels, ...]``."""
+    def _side_params(self, sign: int, distance: Tensor, scale: float) -> dict[str, Tensor]:
+        """Parameters at unsigned coc ``[...]`` on one side of focus, lengths times ``scale``: ``[channels, ...]``."""
         distances, nodes = self.side_nodes(sign)
         distances, nodes = distances.to(distance.device), {k: v.to(distance.device) for k, v in nodes.items()}
         lower, fraction = bracket(distances, distance)
@@ -629,5 +543,5 @@ class BlurTable:
             weight = fraction.unsqueeze(-1) if name == "values" else fraction
             interpolated[name] = torch.lerp(value[:, lower], value[:, lower + 1], weight)
             if name in psf.LENGTHS:
-                interpolated[name] = interpolated[name] * growth
+                interpolated[name] = interpolated[name] * growth * scale
         return interpolated

@@ -78,7 +78,8 @@ class Camera:
 
     def __post_init__(self) -> None:
         if self.focus_range_m is not None:
-            near, far = _checked_range(self.focus_range_m)
+            _check_range(self.focus_range_m)
+            near, far = self.focus_range_m
             object.__setattr__(self, "focus_range_m", (near, far))
             dioptres = 1.0 / near + 1.0 / far
             halfway = 2.0 / dioptres if isinstance(dioptres, Tensor) or dioptres > 0 else math.inf
@@ -132,6 +133,11 @@ class Camera:
         """Radius of the aperture, ``f / (2 n)``, in metres."""
         return self.focal_length_mm / (2000.0 * self.f_number)
 
+    @property
+    def _ends(self) -> tuple[Number, Number]:
+        """Nearest and farthest distance in focus."""
+        return self.focus_range_m or (self.focus_m, self.focus_m)
+
     def focal_px(self, width: int) -> Number:
         """Image distance over pixel pitch, in pixels of an image ``width`` pixels wide (``F`` of the convention)."""
         pixels_wide(width)
@@ -181,8 +187,7 @@ class Camera:
         """:meth:`coc_px` by the compiled engine; None if it does not support the call (traced, batched, tilted)."""
         if is_traced() or depth.dtype != torch.float32 or not is_in_memory(depth) or not native.chosen():
             return None
-        ends = self.focus_range_m or (self.focus_m, self.focus_m)
-        numbers = [self.aperture_radius_m * self.focal_px(width), *ends, self.tilt_deg, self.swing_deg]
+        numbers = [self.aperture_radius_m * self.focal_px(width), *self._ends, self.tilt_deg, self.swing_deg]
         if any(isinstance(n, Tensor) and (n.numel() > 1 or not is_in_memory(n)) for n in numbers):
             return None
         scale, nearest, farthest, tilt, swing = (float(n) for n in numbers)
@@ -219,11 +224,10 @@ class Camera:
         """This camera focused on the surface at a pixel.
 
         Args:
-            depth: ``[B, 1, H, W]``, metres.
+            depth: ``[B, 1, H, W]``, metres. Zero, negative and NaN depths are left out; infinite ones count.
             x: Column, in pixels from the left edge (pixel centres lie at half-integers), in [0, W).
             y: Row, in pixels from the top edge, in [0, H).
-            patch: Side of the square patch around the pixel, whose median counts. Zero, negative and NaN depths are
-                left out; infinite ones count.
+            patch: Side of the square patch around the pixel, whose median counts.
 
         Returns:
             A camera whose ``focus_m`` is the median of each item's patch: a float for one item, else ``[B]``.
@@ -246,11 +250,8 @@ class Camera:
         """This camera focused on a subject: on the median of its depths, each weighted by the mask.
 
         Args:
-            depth: ``[B, 1, H, W]``, metres; values that are not > 0 are left out.
+            depth: As in :meth:`focus_at`.
             focus_mask: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, >= 0: weight of each pixel.
-
-        Returns:
-            A camera with that ``focus_m``: a float for one item, else ``[B]``.
 
         Raises:
             ValueError: If the shapes are not as described, or the subject has no valid depth.
@@ -275,11 +276,8 @@ class Camera:
         Weights are Gaussian; the standard deviation along each axis is a quarter of the box's side.
 
         Args:
-            depth: ``[B, 1, H, W]``, metres; values that are not > 0 are left out.
+            depth: As in :meth:`focus_at`.
             box: ``(left, top, right, bottom)`` in pixels from the frame's top left corner.
-
-        Returns:
-            A camera with that ``focus_m``: a float for one item, else ``[B]``.
 
         Raises:
             ValueError: If the box holds no pixel's centre, or no valid depth.
@@ -320,16 +318,10 @@ class Camera:
         return self.replace(focus_m=focus_m)
 
     def hyperfocal_m(self, coc_px: float, width: int) -> Number:
-        """Nearest focus distance at which infinity is still acceptably sharp.
+        """Nearest focus distance in metres, a float or ``[B]``, at which infinity is still acceptably sharp.
 
-        ``f^2 / (n c) + f`` for a lens with an acceptable circle of *diameter* ``c`` on the sensor.
-
-        Args:
-            coc_px: Acceptable radius of the circle of confusion, in pixels, > 0.
-            width: Width of the image in pixels.
-
-        Returns:
-            Metres, a float or ``[B]``.
+        ``coc_px`` > 0 is the acceptable radius in pixels of an image ``width`` pixels wide. With the *diameter* ``c``
+        on the sensor, the distance is ``f^2 / (n c) + f``.
         """
         _check_number("coc_px", coc_px)
         at_infinity = self.replace(focus_m=math.inf)
@@ -337,29 +329,22 @@ class Camera:
         return hyperfocal + self.focal_length_mm / 1000.0 if self.focus_breathing else hyperfocal
 
     def sharp_limits_m(self, coc_px: float, width: int) -> tuple[Number, Number]:
-        """Nearest and farthest depth that is acceptably sharp.
+        """Nearest and farthest depth in metres on the image's axis, floats or ``[B]``, that is acceptably sharp.
 
-        Args:
-            coc_px: Acceptable radius of the circle of confusion, in pixels, > 0.
-            width: Width of the image in pixels.
-
-        Returns:
-            ``(near, far)`` in metres on the image's axis, floats or ``[B]``; far is ``inf`` at and beyond the
-            hyperfocal distance.
+        ``coc_px`` > 0 is the acceptable radius in pixels of an image ``width`` pixels wide. The farthest depth is
+        ``inf`` at and beyond the hyperfocal distance.
         """
         _check_number("coc_px", coc_px)
         scale = self.aperture_radius_m * self.focal_px(width)
         dioptres = coc_px / scale if isinstance(scale, Tensor) or scale > 0 else math.inf
-        nearest, farthest = self.focus_range_m or (self.focus_m, self.focus_m)
+        nearest, farthest = self._ends
         near, far = 1.0 / (1.0 / nearest + dioptres), 1.0 / farthest - dioptres
         if isinstance(far, Tensor):
             return near, torch.where(far > 0, 1.0 / far, torch.inf)
         return near, 1.0 / far if far > 0 else math.inf
 
     def __repr__(self) -> str:
-        focus = _show(self.focus_m)
-        if self.focus_range_m is not None:
-            focus = " to ".join(_show(end) for end in self.focus_range_m)
+        focus = " to ".join(map(_show, self.focus_range_m or (self.focus_m,)))
         numbers = [f"{_show(self.focal_length_mm)} mm", f"f/{_show(self.f_number)}", f"focus {focus} m"]
         numbers.append(f"sensor {_show(self.sensor_width_mm)} mm")
         if not self.focus_breathing:
@@ -397,48 +382,44 @@ def _check_number(name: str, value: Any, low: float = 0.0, high: float = math.in
     if isinstance(value, Tensor):
         is_number = floating(value) and value.ndim <= 1 and value.layout == torch.strided and value.numel() > 0
     else:
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        is_number = isinstance(value, float) or (
+            isinstance(value, int) and not isinstance(value, bool) and value < 1e300
+        )
     if not is_number:
         raise ValueError(f"{name} must be a float or a floating-point tensor [B], got {show(value)}")
-    infinite = name in _MAY_BE_INFINITE
-    # compares with inf instead of math.isfinite: torch.compile can then treat the number as a variable
+    smallest = largest = value
     if isinstance(value, Tensor):
         if is_traced():
             return
-        numbers = real_tensor(name, value, "[B]").detach()
-        is_inside = bool(((numbers > low) & ((numbers <= high) if infinite else (numbers < high))).all())
-    else:
-        is_inside = low < value < high or (infinite and value == high)
-        is_inside = is_inside and (isinstance(value, float) or value <= 1e300)
-    if not is_inside:
-        bounds = (
-            f"in ({low:g}, {high:g}) degrees" if high < math.inf else f"positive{'' if infinite else ' and finite'}"
+        smallest, largest = real_tensor(name, value, "[B]").detach().aminmax()
+    # compares with inf instead of math.isfinite: torch.compile can then treat the number as a variable
+    infinite = name in _MAY_BE_INFINITE
+    if not (low < smallest and (largest < high or (infinite and largest == high))):
+        bounds = f"in ({low:g}, {high:g}) degrees" if high < math.inf else "positive" + " and finite" * (not infinite)
+        raise ValueError(
+            f"{name} must be {bounds}, got {_show(value) if isinstance(value, Tensor | float) else show(value)}"
         )
-        got = _show(value) if isinstance(value, Tensor | float) else show(value)
-        raise ValueError(f"{name} must be {bounds}, got {got}")
 
 
-def _checked_range(value: Any) -> tuple[Number, Number]:
-    """The ends ``(near, far)`` of a focus range; raises ``ValueError`` if it is not one."""
+def _check_range(value: Any) -> None:
+    """Refuse a focus range that is not ``(near, far)``."""
     if not isinstance(value, tuple | list) or len(value) != 2:
         raise ValueError(f"focus_range_m must be (near, far) in metres, got {show(value)}")
-    near, far = value
-    for end in (near, far):
+    for end in value:
         _check_number("focus_range_m", end)
     if is_traced():
-        return near, far
+        return
     low, high = (torch.as_tensor(end, device="cpu").detach() for end in value)
     if not bool((low <= high).all()):
-        raise ValueError(f"focus_range_m must go from near to far, got ({_show(near)}, {_show(far)})")
-    return near, far
+        raise ValueError(f"focus_range_m must go from near to far, got ({', '.join(map(_show, value))})")
 
 
 def _check_map(name: str, value: Any) -> None:
     """Refuse a value that is not a map ``[B, 1, H, W]``."""
-    real_tensor(name, value, "[B, 1, H, W]" + (" in metres" if name == "depth" else ""))
+    what = "[B, 1, H, W]" + (" in metres" if name == "depth" else "")
+    real_tensor(name, value, what)
     if value.ndim != 4 or value.shape[1] != 1 or not value.numel():
-        unit = " in metres" if name == "depth" else ""
-        raise ValueError(f"{name} must be [B, 1, H, W]{unit}, got {list(value.shape)}")
+        raise ValueError(f"{name} must be {what}, got {list(value.shape)}")
 
 
 def _as_map(value: Number, like: Tensor) -> Tensor:

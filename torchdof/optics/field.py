@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..validation import fields, numbers, real_tensor, show
+from ..validation import fields, numbers, real_tensor, short, show
 
 __all__ = ["Field", "bracket", "deviations"]
 
@@ -65,25 +65,20 @@ class Field:
 
     def __post_init__(self) -> None:
         for name in ("coc", "radius", "box", "light"):
-            value = real_tensor(f"field.{name}", getattr(self, name), "numbers").detach().to("cpu", torch.float64)
-            if not value.numel() or not bool(torch.isfinite(value).all()):
-                raise ValueError(f"field.{name} must hold finite numbers, got {show(value)}")
-            object.__setattr__(self, name, value)
-        for name, low in (("coc", 2), ("radius", 2)):
+            value = real_tensor(f"field.{name}", getattr(self, name), "numbers")
+            object.__setattr__(self, name, numbers(f"field.{name}", value))
+        for name in ("coc", "radius"):
             value = getattr(self, name)
-            if value.ndim != 1 or len(value) < low or bool((value.diff() <= 0).any()):
-                raise ValueError(f"field.{name} must be at least two strictly increasing numbers, got {show(value)}")
+            if value.ndim != 1 or len(value) < 2 or bool((value.diff() <= 0).any()):
+                raise ValueError(f"field.{name} must be at least two strictly increasing numbers, got {short(value)}")
         if self.radius[0] != 0 or not self.coc[0] < 0 < self.coc[-1]:
             raise ValueError(
                 "field.radius must begin at 0 and field.coc reach to both sides of it, "
                 f"got {float(self.radius[0]):g} and {float(self.coc[0]):g} to {float(self.coc[-1]):g}"
             )
         nodes = (len(self.coc), len(self.radius))
-        if (
-            self.box.shape != (*nodes, 3)
-            or bool((self.box[..., 1:] < 0).any())
-            or not bool((self.box[..., 1:] > 0).any())
-        ):
+        sides = self.box[..., 1:]
+        if self.box.shape != (*nodes, 3) or bool((sides < 0).any()) or not bool((sides > 0).any()):
             raise ValueError(
                 f"field.box must be [{nodes[0]}, {nodes[1]}, 3] with lengths >= 0, got {list(self.box.shape)}"
             )
@@ -96,7 +91,7 @@ class Field:
         if not bool((total > 0).all()):
             raise ValueError("field.light must hold some light at every node")
         object.__setattr__(self, "light", light / total)
-        sides = self.box[..., 1:].clamp_min(_MIN_SIDE * float(self.box[..., 1:].max()))
+        sides = sides.clamp_min(_MIN_SIDE * float(sides.max()))
         object.__setattr__(self, "box", torch.cat([self.box[..., :1], sides], -1))
 
     @property
@@ -166,11 +161,7 @@ class Field:
 
     @classmethod
     def from_dict(cls, data: Any) -> "Field":
-        """Build a field from :meth:`to_dict`'s data.
-
-        Raises:
-            ValueError: If a field is missing, unknown or of the wrong kind; the message names it.
-        """
+        """Build a field from :meth:`to_dict`'s data; ``ValueError`` names a field that is missing, unknown or wrong."""
         data = fields("field", data, ("coc", "radius", "box", "shape", "light"))
         coc, radius, box, sizes = (numbers(f"field.{name}", data[name]) for name in ("coc", "radius", "box", "shape"))
         shape = [int(n) for n in sizes.flatten().clamp(-1, _MAX_CELLS).tolist()]
@@ -192,11 +183,9 @@ class Field:
 
 
 def deviations(box: Tensor, light: Tensor) -> Tensor:
-    """Standard deviations ``[n, 2]`` along u and v of spots, the smallest of the channels.
+    """Standard deviations ``[n, 2]`` along u and v (about ``v = 0``) of spots, the smallest of the channels.
 
-    Args:
-        box: Boxes ``[n, 3]`` of the spots.
-        light: Their light ``[channels, n, U, V]``, each spot with sum 1. Along v the deviation is about ``v = 0``.
+    Spots have boxes ``[n, 3]`` and light ``[channels, n, U, V]``, each with sum 1.
     """
     length, width = light.shape[-2:]
     u = (torch.arange(length, dtype=torch.float64, device=light.device) + 0.5) * (2.0 / length) - 1.0

@@ -22,7 +22,7 @@ The compiled engine makes the same kernels from the same templates (``native/src
 import bisect
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -30,84 +30,41 @@ from torch import Tensor
 from ..native import Spots
 from ..tensors import is_differentiated
 from . import psf
-from .aperture import Aperture
-from .field import Field
 from .kernel_cache import KernelCache
 
-__all__ = ["LEAST_CELLS", "SPOT_MARGIN_PX", "KernelBank", "Spots", "bank_of"]
-
-LEAST_CELLS = 16
-"""Cells from the centre to the end of a PSF in the coarsest template."""
+__all__ = ["SPOT_MARGIN_PX", "KernelBank", "Spots", "Table", "bank_of"]
 
 SPOT_MARGIN_PX = 1.0
 """Empty margin in pixels around a spot of a field, so that its samples fall to 0 at their border."""
 
-FADE_IN = 4.0
-"""Weight of a table's own blur in focus, over ``coc_px^2 / M`` with ``M`` the share of light that this blur moves.
-
-A larger value makes the blur complete at a smaller circle of confusion.
-"""
-
+_LEAST_CELLS = 16  # from the centre to the end of a PSF in the coarsest template
 _LEVELS = 5  # templates of 16, 32, 64, 128 and 256 cells
 _FADE_START_PX = 0.75  # px a cell; from here to 1 px the next finer template is blended in
+_FADE_IN = 4.0  # weight of a blur in focus, over coc_px^2 / M; a larger one makes it complete at a smaller coc
 _MIN_REACH_PX = 1e-7  # px; a smaller PSF is rendered with this radius, whose kernel is a single pixel
+_MAX_LIGHT = 1e30  # of a cell; more would overflow in float32
 _MAX_BANKS = 32  # banks kept in memory, the newest
 _MAX_WIDTHS = 64  # image widths for which the blur in focus is kept
 _templates = KernelCache(128 * 2**20)
 _banks: dict[str, "KernelBank"] = {}
 
 
-class Lens(Protocol):
-    """The part of :class:`torchdof.BlurTable` that a bank uses."""
-
-    family: str
-    unit: str
-    aperture: Aperture | None
-    field: Field | None
-    is_sharp_in_focus: bool
-
-    @property
-    def channels(self) -> int:
-        """Kernels at a node."""
-
-    @property
-    def is_round(self) -> bool:
-        """Whether kernels equal their point reflection."""
-
-    def fingerprint(self) -> str:
-        """Hash of all numbers that kernels depend on."""
-
-    def px_per_unit(self, width: float) -> float:
-        """Length of the table's unit in pixels of an image ``width`` pixels wide."""
-
-    def side_nodes(self, sign: int) -> tuple[Tensor, dict[str, Tensor]]:
-        """Unsigned coc and parameters of the nodes of one side of focus."""
-
-    def moved_in_focus(self, width: float) -> Tensor:
-        """Share of the light that the kernel in focus moves to other pixels."""
+Table = Any
+"""A :class:`torchdof.BlurTable`, whose module imports this one."""
 
 
 class _Place(NamedTuple):
-    """Position of a coc among the nodes of a table, and the radius of its PSF.
+    """Position of a coc among the nodes of a table, and the radius of its PSF."""
 
-    Args:
-        side: 0 in front of focus, 1 behind it.
-        node: Index of the node below.
-        part: Weight of the next node, in [0, 1].
-        reach: Radius of the PSF of each colour, in pixels.
-        part_slope: Derivative of ``part`` with respect to ``|coc|`` in pixels.
-        reach_slopes: Derivative of each ``reach`` with respect to it.
-    """
-
-    side: int
-    node: int
-    part: float
-    reach: list[float]
-    part_slope: float
-    reach_slopes: list[float]
+    side: int  # 0 in front of focus, 1 behind it
+    node: int  # index of the node below
+    part: float  # weight of the next node, in [0, 1]
+    reach: list[float]  # radius of the PSF of each colour, in pixels
+    part_slope: float  # derivative of part with respect to |coc| in pixels
+    reach_slopes: list[float]  # derivatives of reach with respect to it
 
 
-def bank_of(table: Lens) -> "KernelBank":
+def bank_of(table: Table) -> "KernelBank":
     """The bank of a table; tables with the same fingerprint share it."""
     key = table.fingerprint()
     bank = _banks.get(key)
@@ -125,15 +82,15 @@ class KernelBank:
     the same template at once both compute it. Kernels are those of the middle of the frame. For a table with a field
     they are uniform discs as large as its spots, which :mod:`torchdof.optics.placed_kernels` multiplies by the spots.
 
-    Args:
-        table: The rotation and squeeze of its aperture are used as numbers, without gradients.
+    With ``gradients`` the templates are not kept, and have gradients to the rotation and squeeze of the aperture.
     """
 
-    def __init__(self, table: Lens) -> None:
-        self.table, self.colours, self.is_even = table, table.channels, table.field is not None
-        self.squeeze = (
-            1.0 if table.aperture is None else float(torch.as_tensor(table.aperture.squeeze, device="cpu").detach())
-        )
+    def __init__(self, table: Table, gradients: bool = False) -> None:
+        self.table, self._gradients = table, gradients
+        self.colours, self.is_even = table.channels, table.field is not None
+        squeeze = torch.as_tensor(1.0 if table.aperture is None else table.aperture.squeeze, device="cpu")
+        self.squeeze = float(squeeze.detach())
+        self._squeeze = squeeze if gradients else self.squeeze
         self.widest = max(1.0, 1.0 / self.squeeze)
         self._lens = table.fingerprint()
         self._moved: dict[float, list[float]] = {}
@@ -181,11 +138,10 @@ class KernelBank:
         """The recipe of kernels: templates, weights, radii.
 
         Args:
-            coc_px: Signed coc ``[n]`` in pixels of the image.
+            coc_px: Signed coc ``[n]`` in pixels of an image ``width`` pixels wide.
             width: Width of the image in pixels.
-            scale: Downsampling factor of each kernel's layer, n of them; empty means 1.
-            longest: Longer side of the frame in downsampled pixels, n of them: a half width is limited to one less.
-                Empty leaves the kernels whole.
+            scale: Downsampling factors ``[n]`` of the layers; empty means 1.
+            longest: Longer sides ``[n]`` of the frame in downsampled pixels, to which kernels are cut; empty: uncut.
         """
         cocs = coc_px.detach().to("cpu", torch.float64).tolist() if isinstance(coc_px, Tensor) else list(coc_px)
         scales = list(scale) or [1.0] * len(cocs)
@@ -206,9 +162,9 @@ class KernelBank:
                 reach = [max(r, _MIN_REACH_PX) for r in reach]
                 largest = max(reach) * self.widest
                 half = max(0, math.ceil(largest - 1e-9))
-                level = min(max(0, math.ceil(math.log2(largest / LEAST_CELLS))), _LEVELS - 1)
+                level = min(max(0, math.ceil(math.log2(largest / _LEAST_CELLS))), _LEVELS - 1)
                 if level < _LEVELS - 1:
-                    cell = largest / (LEAST_CELLS << level)
+                    cell = largest / (_LEAST_CELLS << level)
                     finer = min(max((cell - _FADE_START_PX) / (1.0 - _FADE_START_PX), 0.0), 1.0)
                 ends = [
                     (place.side, place.node + above, level + up) for up in range(1 + (finer > 0)) for above in (0, 1)
@@ -222,8 +178,13 @@ class KernelBank:
             spots.fade.append(self._fade(coc / size, width / size))
             spots.flipped.append(place.side == 0 and not self.table.is_round)
             spots.half.append(half)
-        template_keys = [(self._lens, *key) for key in keys]
-        templates = _templates.get_all(template_keys, lambda missing: [self._template(*key[1:]) for key in missing])
+        if self._gradients:
+            templates = [self._template(*key) for key in keys]
+        else:
+            template_keys = [(self._lens, *key) for key in keys]
+            templates = _templates.get_all(
+                template_keys, lambda missing: [self._kept_template(*k[1:]) for k in missing]
+            )
         halves = [min(half, n - 1) for half, n in zip(spots.half, longest, strict=True)] if longest else spots.half
         moves = None
         if isinstance(coc_px, Tensor) and is_differentiated(coc_px):
@@ -237,9 +198,8 @@ class KernelBank:
     def kernels(
         self, coc_px: Tensor | Sequence[float], width: float, scale: Sequence[float] = (), longest: Sequence[int] = ()
     ) -> Tensor:
-        """Kernels ``[n, C, k, k]``, float64 on the CPU, as :meth:`torchdof.BlurTable.kernels` has them.
+        """Kernels ``[n, C, k, k]``, float64 on the CPU, as wide as the widest; each sums to 1 minus the light cut off.
 
-        All have the width of the widest. They are non-negative; each sums to 1, minus the light that is cut off.
         Arguments as in :meth:`spots`. Differentiable in ``coc_px``.
         """
         return self.of_spots(self.spots(coc_px, width, scale, longest))
@@ -282,7 +242,7 @@ class KernelBank:
         They are 0 at the pixels ``outside`` ``[n, 1, k, k]``. Each sums to 1; those with ``cut`` to the light inside.
         """
         height = reach / (cells.shape[-1] // 2 - 1)
-        width = height / self.squeeze
+        width = height / self._squeeze
         kernel = psf.sampled(cells, height, height if self.squeeze == 1.0 else width, outside.shape[-1] // 2)
         kernel = kernel.masked_fill(outside, 0.0)
         light = cells.sum((-2, -1)) * height.clamp_min(1.0) * width.clamp_min(1.0)  # sum of the uncut kernel
@@ -303,18 +263,19 @@ class KernelBank:
         """Sum of a template of each colour, and its second moment for a reach of 1."""
         key = (1 if self._mirrored else side, self._shapes[side][node])
         if key not in self._sums:
-            template = _templates.get((self._lens, *key, 0), lambda: self._template(*key, 0)).double()
-            step = torch.arange(-LEAST_CELLS - 1.0, LEAST_CELLS + 2.0, dtype=torch.float64, device="cpu") / LEAST_CELLS
+            template = _templates.get((self._lens, *key, 0), lambda: self._kept_template(*key, 0)).double()
+            step = (
+                torch.arange(-_LEAST_CELLS - 1.0, _LEAST_CELLS + 2.0, dtype=torch.float64, device="cpu") / _LEAST_CELLS
+            )
             square = 0.5 * (step[:, None] ** 2 + step**2 / self.squeeze**2)
             light, moment = template.sum((-2, -1)).tolist(), (template * square).sum((-2, -1)).tolist()
             self._sums[key] = list(zip(light, moment, strict=True))
         return self._sums[key]
 
     def kept(self, sign: float, find: Callable[["KernelBank", float, float], float]) -> float:
-        """A number that depends only on the blur on one side of focus, computed by ``find`` once.
+        """A number that depends only on the blur on one side of focus, computed once: ``find(bank, coc_px, width)``.
 
-        ``find(bank, coc_px, width)`` gets a coc of 1 or -1 pixel, and the image width at which that is the coc of the
-        last node of the side.
+        The coc is 1 or -1 pixel, and the width is that of the image in which the last node of the side has this coc.
         """
         sign = 1.0 if self._mirrored and self.table.is_round else sign
         if sign not in self._found:
@@ -322,12 +283,15 @@ class KernelBank:
             self._found[sign] = find(self, sign, 1.0 if self.table.unit == "relative" else 1.0 / outermost)
         return self._found[sign]
 
+    def _template(self, side: int, node: int, level: int) -> Tensor:
+        """Light ``[C, 2 n + 3, 2 n + 3]`` of the cells of a node's PSF, float64."""
+        params = {name: values[:, node] for name, values in self._nodes[side].items()}
+        return psf.template(self.table.family, params, _LEAST_CELLS << level, self.table.aperture)
+
     @torch.inference_mode(False)
     @torch.no_grad()
-    def _template(self, side: int, node: int, level: int) -> Tensor:
-        """Light ``[C, 2 n + 3, 2 n + 3]`` of the cells of a node's PSF, float32."""
-        params = {name: values[:, node] for name, values in self._nodes[side].items()}
-        return psf.template(self.table.family, params, LEAST_CELLS << level, self.table.aperture).float().contiguous()
+    def _kept_template(self, side: int, node: int, level: int) -> Tensor:
+        return self._template(side, node, level).clamp(-_MAX_LIGHT, _MAX_LIGHT).float().contiguous()
 
     def _fade(self, coc_px: float, width: float) -> list[float]:
         """Weight of the kernel of each colour against a single pixel; below 1 where a blur in focus fades in."""
@@ -337,4 +301,4 @@ class KernelBank:
             if len(self._moved) >= _MAX_WIDTHS:
                 self._moved.clear()
             self._moved[width] = self.table.moved_in_focus(width).tolist()
-        return [min(coc_px**2 * FADE_IN / max(moved_light, 1e-300), 1.0) for moved_light in self._moved[width]]
+        return [min(coc_px**2 * _FADE_IN / max(moved_light, 1e-300), 1.0) for moved_light in self._moved[width]]

@@ -14,10 +14,7 @@ from ..tensors import is_fake, is_traced
 __all__ = ["KernelCache", "kept"]
 
 _ENTRY_BYTES = 384  # bytes counted for a key and its dictionary entry, besides the tensors
-
 _TENSOR_BYTES = 640  # bytes counted for a tensor besides its values: its object, its storage, their alignment
-
-_CONSTANT_BYTES = 16 * 2**20  # largest size in bytes of the results of all functions decorated with kept
 
 _Arguments = ParamSpec("_Arguments")
 _Key = TypeVar("_Key", bound=Hashable)
@@ -29,11 +26,6 @@ class KernelCache:
 
     Args:
         limit_bytes: Largest size of all results together; a single result that is larger is not kept.
-
-    Example:
-        >>> cache = KernelCache(2**20)
-        >>> cache.get(("one", 1), lambda: 1.0), cache.get(("one", 1), lambda: 2.0)
-        (1.0, 1.0)
     """
 
     def __init__(self, limit_bytes: int) -> None:
@@ -85,7 +77,7 @@ def _bytes(result: Tensor | tuple[Tensor, ...] | float) -> int:
     return sum(_TENSOR_BYTES + t.untyped_storage().nbytes() for t in tensors if isinstance(t, Tensor))
 
 
-_CONSTANTS = KernelCache(_CONSTANT_BYTES)
+_CONSTANTS = KernelCache(16 * 2**20)  # the results of all functions decorated with kept
 
 
 def kept(make: Callable[_Arguments, Kept]) -> Callable[_Arguments, Kept]:

@@ -19,7 +19,7 @@ already.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as functional
@@ -27,7 +27,7 @@ from torch import Tensor
 
 from .aperture import overlaps
 from .field import bracket, deviations
-from .kernel_bank import SPOT_MARGIN_PX, Lens
+from .kernel_bank import SPOT_MARGIN_PX, Table
 from .kernel_cache import KernelCache
 
 __all__ = ["DISTANCES", "FieldMask", "layer_mask", "placed", "placed_between", "ray_masks"]
@@ -46,71 +46,47 @@ _RADIUS_RATIO = 1.09  # ratio of neighbouring radii at which the masks of highli
 _masks = KernelCache(128 * 2**20)
 
 
-class PlacedLens(Lens, Protocol):
-    """The part of :class:`torchdof.BlurTable` that masks are computed from."""
-
-    def reach_px(self, coc_px: float, width: float) -> float:
-        """Radius in pixels that holds the kernels at ``+-coc_px``."""
-
-
 class FieldMask(NamedTuple):
-    """Mask for the kernels of one signed circle of confusion, at :data:`DISTANCES` distances.
+    """Mask for the kernels of one signed circle of confusion, at :data:`DISTANCES` distances from middle to corner."""
 
-    Args:
-        values: ``[1 or C, distances, rows, columns]``; rows along increasing u, columns along v from 0. Distances are
-            spaced evenly from the middle of the frame to its corner.
-        boxes: Extent of the values ``[distances, 3]``: centre in u, half length in u and width in v, in pixels of the
-            kernel.
-        coc_px: Signed circle of confusion in pixels of the kernel.
-        squeeze: Height of the blur over its width; horizontal offsets are multiplied by it before the lookup.
-    """
-
-    values: Tensor
-    boxes: Tensor
-    coc_px: float
-    squeeze: float | Tensor = 1.0
+    values: Tensor  # [1 or C, distances, rows, columns]; rows along increasing u, columns along v from 0
+    boxes: Tensor  # [distances, 3], extent of the values: centre in u, half length in u, width in v, in kernel pixels
+    coc_px: float  # in pixels of the kernel
+    squeeze: float | Tensor = 1.0  # height of the blur over its width; horizontal offsets are multiplied by it
 
     def to(self, like: Tensor) -> "FieldMask":
         """These masks with the dtype and device of ``like``."""
         return self._replace(values=self.values.to(like).contiguous(), boxes=self.boxes.to(like).contiguous())
 
 
-def layer_mask(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int]) -> FieldMask:
-    """Field mask of a layer.
-
-    Args:
-        table: A table with ``depends_on_place``.
-        coc_px: Signed coc in pixels of the image.
-        scale: Downsampling factor of the layer.
-        size: Height and width of the image.
-    """
+def layer_mask(table: Table, coc_px: float, scale: int, size: tuple[int, int]) -> FieldMask:
+    """Field mask of a layer downsampled by ``scale``, with a signed coc in pixels of an image ``size`` (H, W)."""
     key = ("layer", table.fingerprint(), coc_px, scale, size)
     values, boxes = _masks.get(key, lambda: _computed(table, coc_px, scale, size))
     return FieldMask(values, boxes, coc_px / scale, _squeeze(table))
 
 
-def ray_masks(table: PlacedLens, coc_px: Sequence[float], size: tuple[int, int]) -> list[FieldMask]:
+def ray_masks(table: Table, coc_px: Sequence[float], size: tuple[int, int]) -> list[FieldMask]:
     """Field masks for highlights with signed ``coc_px``, ordered by coc.
 
     They are computed at fixed radii, powers of ``_RADIUS_RATIO``: the two around each highlight.
     """
-    exponents = set()
-    for coc in coc_px:
-        exponent = math.floor(math.log(max(abs(coc), 1.0)) / math.log(_RADIUS_RATIO))
-        exponents |= {(coc < 0, exponent), (coc < 0, exponent + 1)}
-    radii = sorted(math.copysign(_RADIUS_RATIO**exponent, -1.0 if near else 1.0) for near, exponent in exponents)
+    below = {
+        (math.floor(math.log(max(abs(coc), 1.0)) / math.log(_RADIUS_RATIO)), -1.0 if coc < 0 else 1.0) for coc in coc_px
+    }
+    radii = sorted({sign * _RADIUS_RATIO ** (exponent + up) for exponent, sign in below for up in (0, 1)})
     keys = [("ray", table.fingerprint(), radius, 1, size) for radius in radii]
     computed = _masks.get_all(keys, lambda missing: [_computed(table, key[2], 1, size) for key in missing])
     squeeze = _squeeze(table)
     return [FieldMask(values, boxes, radius, squeeze) for (values, boxes), radius in zip(computed, radii, strict=True)]
 
 
-def _squeeze(table: PlacedLens) -> float | Tensor:
+def _squeeze(table: Table) -> float | Tensor:
     return 1.0 if table.aperture is None else table.aperture.squeeze
 
 
 @torch.inference_mode(False)  # cached tensors must be usable by autograd
-def _computed(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def _computed(table: Table, coc_px: float, scale: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Values and boxes of :class:`FieldMask`, float64.
 
     For the spots of a field:
@@ -155,10 +131,8 @@ def _computed(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int
     return values / values.amax((0, 2, 3), keepdim=True), extent
 
 
-def _through_rims(table: PlacedLens, coc_px: float, width: float, distance: Tensor) -> tuple[Tensor, Tensor]:
+def _through_rims(table: Table, coc_px: float, width: float, distance: Tensor) -> tuple[Tensor, Tensor]:
     """Values and boxes for cat's eyes: signed distances in pixels to the nearer rim, plus half a pixel, unclamped."""
-    if table.aperture is None:
-        raise AssertionError("a table that depends on the place has a field or rims")
     # whole pixels, so that samples lie a pixel apart, whatever the squeeze
     reach = math.ceil((math.ceil(table.reach_px(coc_px, width)) + 1) * max(1.0, float(table.aperture.squeeze)))
     boxes = torch.tensor([0.0, reach, reach], dtype=torch.float64, device="cpu").expand(len(distance), 3)
@@ -176,16 +150,15 @@ def _through_rims(table: PlacedLens, coc_px: float, width: float, distance: Tens
 
 
 def placed(kernel: Tensor, masks: Sequence[tuple[FieldMask, Tensor]], y: Tensor, x: Tensor) -> Tensor:
-    """Kernels of places in the frame.
+    """Kernels ``[n, 1 or C, k, k]`` of places in the frame, from that of the middle ``[1 or n, 1 or C, k, k]``.
+
+    Each keeps the sum of ``kernel``.
 
     Args:
-        kernel: Kernel of the middle of the frame, ``[1 or n, 1 or C, k, k]``.
+        kernel: Kernel of the middle of the frame.
         masks: Masks of one radius, or of two neighbouring ones, each with its weight ``[n]`` or ``[]``.
         y: Places ``[n]``, in half diagonals down from the middle of the frame.
         x: The same to the right.
-
-    Returns:
-        ``[n, 1 or C, k, k]``, each with the same sum as ``kernel``.
     """
     offset = torch.arange(kernel.shape[-1], dtype=kernel.dtype, device=kernel.device) - kernel.shape[-1] // 2
     y, x = (t.to(kernel.dtype)[:, None, None] for t in (y, x))
@@ -211,15 +184,7 @@ def placed(kernel: Tensor, masks: Sequence[tuple[FieldMask, Tensor]], y: Tensor,
 
 
 def placed_between(kernels: Tensor, masks: Sequence[FieldMask], coc: Tensor, y: Tensor, x: Tensor) -> Tensor:
-    """Kernels ``[n, 1 or C, k, k]`` of sources at places, with masks interpolated between the radii around each.
-
-    Args:
-        kernels: Kernels of the middle of the frame, ``[n, 1 or C, k, k]``.
-        masks: Result of :func:`ray_masks`, ordered by coc.
-        coc: Signed coc of the sources ``[n]`` in pixels.
-        y: Places ``[n]``, in half diagonals down from the middle of the frame.
-        x: The same to the right.
-    """
+    """As :func:`placed`, with masks of :func:`ray_masks` interpolated between the radii around each coc ``[n]``."""
     radii = torch.tensor([entry.coc_px for entry in masks], dtype=coc.dtype, device=coc.device)
     low, weights = bracket(radii, coc)
     result = torch.empty_like(kernels.expand(-1, max(kernels.shape[1], masks[0].values.shape[0]), -1, -1))

@@ -24,7 +24,7 @@ An aperture (:mod:`torchdof.optics.aperture`) multiplies the profile, and cuts o
 circumscribed circle of the opening has the radius ``radius``, ``2 sigma`` for ``gaussian`` and ``r_c + 2 sigma`` for
 ``ring``. The light of a ``disc`` in a cell is the area of the opening in it. For the other families it is the mean of
 the profile in the cell times the open area; in kernels of up to 64 cells a side, each cell is split in nine for this. A
-squeeze stretches the cells horizontally instead of shrinking the profile.
+squeeze makes the cells narrower than high.
 
 Reference:
     Field, "Relations between the statistics of natural images and the response properties of cortical cells", Journal
@@ -41,7 +41,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..validation import WHOLE_NUMBERS, broadcast_shapes, choice, real_tensor, show
+from ..validation import WHOLE_NUMBERS, broadcast_shapes, choice, numbers, real_tensor, short, show
 from .aperture import Aperture
 from .kernel_cache import KernelCache
 
@@ -79,48 +79,32 @@ LENGTHS = frozenset({"sigma", "r_c", "radius"})
 # Accuracy; larger: more exact, slower
 _CELLS = 16  # least cells from the centre to the end of a PSF; larger PSFs have cells of a pixel
 _CELL_PARTS = 3  # parts of a cell along each axis where an opening cuts the profile
-_MASS_CELLS = 60  # cells on each side over which the light of a large kernel with an opening is summed
-_RINGS = 2**14  # rings over which the light of a large round kernel is summed; agrees with its pixels to 1e-6
+_FINE_CELLS = 64  # cells from the centre to the end of a PSF; larger ones are sliced and split less finely
 
-# Limits
 _MIN_LENGTH_PX = 1e-7  # px; a length below it is rendered as this, which is a kernel of one pixel to 1e-14
 _TILT_EXPONENT = 460.0  # largest logarithm of (r / R)^m, e^460 = 1e200; a larger power would overflow
 _MAX_WIDTH_PX = 2**16 + 1  # px; a kernel of this width takes 34 GB
-_FULL_UP_TO_PX = 256  # px on each side of the centre; smaller kernels are computed whole, whatever the window
 _MARGIN_PX = 2  # px around a kernel that its values depend on (the four neighbours in _non_negative, and theirs)
 _SLICES_AT_ONCE = 2**20  # slices computed together; limits memory
-_CACHED_HALF_WIDTH = 64  # cells; slices of larger quadrants are not cached
 _quadrants = KernelCache(64 * 2**20)
 
 Number = float | Tensor
 
 
 def pixel_kernels(
-    family: str,
-    params: Mapping[str, Number],
-    size: int | None = None,
-    window: int | None = None,
-    aperture: Aperture | None = None,
+    family: str, params: Mapping[str, Number], size: int | None = None, aperture: Aperture | None = None
 ) -> Tensor:
     """Kernel of a family by name: the effect of its PSF on pixels.
 
-    1. Choose the widths of the kernel and of the part to compute.
-    2. Scale the lengths to cells and integrate the PSF over each cell.
-    3. Weight the cells with the interpolator of each pixel, and remove negative values.
-    4. Scale the kernel to a sum of 1; without any light it is a single pixel.
-
     Args:
         family: A key of :data:`FAMILIES`.
-        params: Its parameters by name; lengths in pixels, floats or ``[...]`` (``values``: ``[..., P]``), which
-            broadcast against each other.
-        size: Odd width of the kernel; None takes the smallest that holds the largest kernel.
-        window: Odd width of the middle part to return; None returns all. Of a large kernel only this part is computed.
+        params: Its parameters by name, numbers or tensors ``[...]`` (``values``: ``[..., P]``), which broadcast against
+            each other; lengths in pixels.
+        size: Odd width of the kernel, at which the PSF is cut off; None takes the smallest that holds the largest PSF.
         aperture: The opening that the profile is multiplied by; None is a round one.
 
     Returns:
-        ``[..., size, size]``, float64, non-negative, each kernel summing to 1, for a point behind the focus plane. The
-        PSF is cut off at ``size``.
-        With a smaller ``window``: the middle part ``[..., window, window]``, which sums to its share of the light.
+        ``[..., size, size]``, float64, non-negative, each kernel summing to 1, for a point behind the focus plane.
 
     Raises:
         ValueError: If the family, a parameter or the size is not as described.
@@ -133,77 +117,46 @@ def pixel_kernels(
         torch.Size([3, 3])
     """
     checked = _checked(family, params)
-    reach_px = _support(family, checked, aperture)
-    full_half = half_width(reach_px) if size is None and window is not None else width_of(size, reach_px) // 2
-    window_half = full_half if window is None else min(full_half, width_of(window, reach_px) // 2)
-    half = full_half if full_half <= _FULL_UP_TO_PX else window_half
-    lengths = {k: v.clamp_min(_MIN_LENGTH_PX) if k in ("sigma", "radius") else v for k, v in checked.items()}
+    widest, squeeze = (1.0, 1.0) if aperture is None else (aperture.widest, aperture.squeeze)
+    half = width_of(size, widest * float(reach(family, checked, aperture).detach().max())) // 2
+    lengths = _rendered(checked)
     end = reach(family, lengths, aperture)
-    height = width = (end / _CELLS).clamp(max=1.0)  # sides of a cell, in pixels
-    if aperture is not None:
-        width = (end / aperture.squeeze / _CELLS).clamp(max=1.0)
+    height = (end / _CELLS).clamp(max=1.0 / widest)  # sides of a cell, at most a pixel
     in_cells = {k: v / height if k in LENGTHS else v for k, v in lengths.items()}
-    aspect = None if aperture is None else width * aperture.squeeze / height  # of a cell, without the squeeze
-    farthest = math.ceil(min(_support(family, lengths, aperture), half + _MARGIN_PX))  # px; large PSFs have 1 px cells
-    cells = _sharpened(_cells(family, in_cells, max(_CELLS, farthest) + 1, full_half, aperture, aspect))
-    kernel = sampled(cells, height, width, half)
-    if half == full_half:
-        total = kernel.sum((-2, -1), keepdim=True)
-    else:
-        total = _total_light(family, in_cells, full_half, aperture, aspect)[..., None, None]
+    farthest = min(float((end / height).detach().max()), (half + _MARGIN_PX) * widest * max(1.0, float(squeeze)))
+    cells = _sharpened(_cells(family, in_cells, max(_CELLS, math.ceil(farthest - 1e-9)) + 1, aperture))
+    kernel = sampled(cells, height, height if aperture is None else height / squeeze, half)
     centre = torch.zeros_like(kernel)
     centre[..., half, half] = 1.0
+    total = kernel.sum((-2, -1), keepdim=True)
     # no light at all: the PSF underflows in float64, or lies beyond size
-    kernel = torch.where(total > 0, kernel / torch.where(total > 0, total, 1.0), centre)
-    return kernel[..., half - window_half : half + window_half + 1, half - window_half : half + window_half + 1]
+    return torch.where(total > 0, kernel / torch.where(total > 0, total, 1.0), centre)
 
 
 def template(family: str, params: Mapping[str, Tensor], cells: int, aperture: Aperture | None = None) -> Tensor:
-    """Light in the cells of a PSF with a radius of ``cells`` cells, from which :func:`sampled` makes kernels.
+    """Light ``[C, 2 cells + 3, 2 cells + 3]`` in the cells of a PSF whose radius is ``cells`` cells, up to a factor.
 
-    The blur of integrating over cells is removed (:func:`_sharpened`).
-
-    Args:
-        family: A key of :data:`FAMILIES`.
-        params: Checked parameters by name, ``[C]`` (``values``: ``[C, P]``), in any unit, float64.
-        cells: Number of cells from the centre to the end.
-        aperture: The opening that the profile is multiplied by; None is a round one.
-
-    Returns:
-        ``[C, 2 cells + 3, 2 cells + 3]``, float64, up to a factor.
+    :func:`sampled` makes kernels of it. Parameters ``[C]`` (``values``: ``[C, P]``) are checked, and in any unit.
     """
-    lengths = {k: v.clamp_min(_MIN_LENGTH_PX) if k in ("sigma", "radius") else v for k, v in params.items()}
+    lengths = _rendered(params)
     cell = reach(family, lengths, aperture) / cells
     in_cells = {k: v / cell if k in LENGTHS else v for k, v in lengths.items()}
-    return _sharpened(_cells(family, in_cells, cells + 1, cells, aperture))
+    return _sharpened(_cells(family, in_cells, cells + 1, aperture))
 
 
 def sampled(cells: Tensor, height: Tensor, width: Tensor, half: int) -> Tensor:
-    """Kernels of PSFs from the light in their cells, up to a factor: ``[..., 2 half + 1, 2 half + 1]``.
+    """Kernels ``[..., 2 half + 1, 2 half + 1]``, up to a factor, from the light in cells ``[..., n, n]``.
 
-    Args:
-        cells: Light of square cells around the centre, ``[..., n, n]``.
-        height: Height of a cell in pixels, ``[...]``.
-        width: Its width.
-        half: Pixels on each side of the centre.
+    ``height`` and ``width`` are those of a cell in pixels, ``[...]``.
     """
     kernels = _non_negative(_interpolated(cells, height, width, half + _MARGIN_PX))
     return kernels[..., _MARGIN_PX:-_MARGIN_PX, _MARGIN_PX:-_MARGIN_PX]
 
 
 def profile(family: str, r: Tensor, params: Mapping[str, Number]) -> Tensor:
-    """The profile ``f(r)`` itself, not normalised and not integrated: eq. (1) without N for ``ring``.
+    """The profile ``f(r)`` itself, ``[..., n]``, not normalised and not integrated: eq. (1) without N for ``ring``.
 
-    Args:
-        family: A key of :data:`FAMILIES`.
-        r: Distances from the centre, ``[n]``, in the unit of the lengths among the parameters.
-        params: Parameters by name, floats or ``[...]``.
-
-    Returns:
-        ``[..., n]``, float64.
-
-    Raises:
-        ValueError: If the family or a parameter is not as described.
+    ``r`` ``[n]`` are distances from the centre, in the unit of the lengths among the parameters ``[...]``.
     """
     checked = {k: v if k == "values" else v.unsqueeze(-1) for k, v in _checked(family, params).items()}
     r = real_tensor("r", r, "[n]").to(torch.float64)
@@ -227,20 +180,12 @@ def profile(family: str, r: Tensor, params: Mapping[str, Number]) -> Tensor:
 
 def support(family: str, params: Mapping[str, Number], aperture: Aperture | None = None) -> float:
     """Radius in pixels beyond which a kernel holds less than 4e-6 of its light (for the largest parameters given)."""
-    return _support(family, _checked(family, params), aperture)
-
-
-def _support(family: str, checked: Mapping[str, Tensor], aperture: Aperture | None) -> float:
-    farthest = float(reach(family, checked, aperture).detach().max())
+    farthest = float(reach(family, _checked(family, params), aperture).detach().max())
     return farthest if aperture is None else farthest * aperture.widest
 
 
 def width_of(size: int | None, reach_px: float) -> int:
-    """Width in pixels of kernels: ``size`` if given, else the smallest that holds a PSF of radius ``reach_px``.
-
-    Raises:
-        ValueError: If the size is not odd and positive, or the kernel would be too wide.
-    """
+    """Width in pixels of kernels: ``size`` if given, else the smallest that holds a PSF of radius ``reach_px``."""
     if size is None:
         size = 2 * half_width(reach_px) + 1
         if size > _MAX_WIDTH_PX:
@@ -264,11 +209,16 @@ def _checked(family: str, params: Mapping[str, Number]) -> dict[str, Tensor]:
         got = ", ".join(map(str, params)) if isinstance(params, Mapping) else show(params)
         raise ValueError(f"{family} takes the parameters {', '.join(FAMILIES[family])}, got {got}")
     device = next((p.device for p in params.values() if isinstance(p, Tensor)), torch.device("cpu"))
-    checked = {k: _parameter(k, v, device) for k, v in params.items()}
-    for name, value in checked.items():
+    checked = {}
+    for name, value in params.items():
+        if isinstance(value, Tensor) and value.dtype not in WHOLE_NUMBERS:
+            value = real_tensor(name, value, "[...]")
+        else:
+            value = numbers(name, value)
         low = -1.0 if name == "b" else 0.0
-        if not bool((torch.isfinite(value.detach()) & (value.detach() >= low)).all()):
-            raise ValueError(f"{name} of {family} must be finite and >= {low:g}, got {value.detach().flatten()[:4]}")
+        if not value.numel() or not bool((torch.isfinite(value.detach()) & (value.detach() >= low)).all()):
+            raise ValueError(f"{name} of {family} must be finite and >= {low:g}, got {short(value)}")
+        checked[name] = value.to(device, torch.float64)
     if family == "radial" and (checked["values"].ndim < 1 or checked["values"].shape[-1] < 2):
         raise ValueError(f"values must be [..., P] with P >= 2, got {list(checked['values'].shape)}")
     shapes = {k: tuple(v.shape[:-1] if k == "values" else v.shape) for k, v in checked.items()}
@@ -280,19 +230,9 @@ def _checked(family: str, params: Mapping[str, Number]) -> dict[str, Tensor]:
     return checked
 
 
-def _parameter(name: str, value: Number, device: torch.device) -> Tensor:
-    """One valid parameter as a float64 tensor."""
-    if isinstance(value, Tensor):
-        tensor = real_tensor(name, value.double() if value.dtype in WHOLE_NUMBERS else value, "[...]")
-        if not tensor.numel():
-            raise ValueError(f"{name} must hold at least one number, got {show(value)}")
-        return tensor.to(device, torch.float64)
-    if name == "values":
-        raise ValueError(f"values must be a tensor [..., P], got {show(value)}")
-    valid = isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool) and abs(value) < 1e300)
-    if not valid:
-        raise ValueError(f"{name} must be a number or a tensor of them, got {show(value)}")
-    return torch.tensor(value, dtype=torch.float64, device=device)
+def _rendered(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Parameters whose lengths are above 0, so that nothing divides by 0."""
+    return {k: v.clamp_min(_MIN_LENGTH_PX) if k in ("sigma", "radius") else v for k, v in params.items()}
 
 
 def reach(family: str, params: Mapping[str, Tensor], aperture: Aperture | None = None) -> Tensor:
@@ -324,49 +264,36 @@ def _tilt_factor(r: Tensor, params: Mapping[str, Tensor]) -> Tensor:
     return (1.0 + params["b"] * torch.minimum(r / params["radius"], farthest) ** params["m"]).clamp_min(0.0)
 
 
-def _cells(
-    family: str,
-    lengths: Mapping[str, Tensor],
-    half: int,
-    full_half: int,
-    aperture: Aperture | None = None,
-    aspect: Tensor | None = None,
-) -> Tensor:
-    """Integral of a PSF over the cells around its centre: ``[..., 2 half + 1, 2 half + 1]``, up to a factor.
+def _cells(family: str, lengths: Mapping[str, Tensor], half: int, aperture: Aperture | None = None) -> Tensor:
+    """Integral of a PSF over the cells around its centre, lengths in cells: ``[..., 2 half + 1, 2 half + 1]``.
 
-    Args:
-        family: A key of :data:`FAMILIES`.
-        lengths: Checked parameters, lengths in cells.
-        half: Cells on each side of the centre.
-        full_half: Half width of the whole kernel in pixels; a smaller one is integrated more finely.
-        aperture: The opening; None is a round one.
-        aspect: Width of a cell over its height; None is 1.
+    It is right up to a factor if there is an opening.
     """
-    slices = 16 if full_half <= 64 else 8
+    slices = 16 if half - 1 <= _FINE_CELLS else 8
     if aperture is None or aperture.is_round:
-        return _round_cells(family, lengths, half, slices, aspect)
+        return _round_cells(family, lengths, half, slices)
     radius = opening_radius(family, lengths)
-    width = torch.ones_like(radius) if aspect is None else aspect
     if family == "disc":
-        return aperture.shares(half, 1.0 / radius, width / radius)
-    parts = _CELL_PARTS if half <= _CACHED_HALF_WIDTH else 1
+        return aperture.shares(half, 1.0 / radius, 1.0 / radius)
+    parts = _CELL_PARTS if half <= _FINE_CELLS else 1
     fine_half = parts * half + parts // 2
     fine_lengths = {k: v * parts if k in LENGTHS else v for k, v in lengths.items()}
-    light = _round_cells(family, fine_lengths, fine_half, slices // parts, aspect)
-    covered = _round_cells("disc", {"radius": reach(family, fine_lengths)}, fine_half, slices, aspect)
-    share = aperture.shares(fine_half, 1.0 / (parts * radius), width / (parts * radius))
+    light = _round_cells(family, fine_lengths, fine_half, slices // parts)
+    covered = _round_cells("disc", {"radius": reach(family, fine_lengths)}, fine_half, slices)
+    share = aperture.shares(fine_half, 1.0 / (parts * radius), 1.0 / (parts * radius))
     means = torch.where(covered > 0, light / torch.where(covered > 0, covered, 1.0), 0.0) * share
     return means.unflatten(-1, (-1, parts)).unflatten(-3, (-1, parts)).mean((-3, -1))
 
 
-def _round_cells(family: str, lengths: Mapping[str, Tensor], half: int, slices: int, aspect: Tensor | None) -> Tensor:
+def _round_cells(family: str, lengths: Mapping[str, Tensor], half: int, slices: int) -> Tensor:
     """Integral of a profile over each cell, lengths in cells: ``[..., 2 half + 1, 2 half + 1]``."""
     if family == "gaussian":
-        quadrant = _gaussian_quadrant(lengths["sigma"], half, aspect)
+        line = _gaussian_line(lengths["sigma"], half)
+        quadrant = line.unsqueeze(-1) * line.unsqueeze(-2)
     elif family == "disc":
-        quadrant = _disc_quadrant(lengths["radius"], half, aspect)
+        quadrant = _disc_quadrant(lengths["radius"], half)
     else:
-        quadrant = _sliced_quadrant(family, lengths, half, slices, aspect)
+        quadrant = _sliced_quadrant(family, lengths, half, slices)
     cells = torch.cat([quadrant[..., 1:, :].flip(-2), quadrant], -2)
     return torch.cat([cells[..., 1:].flip(-1), cells], -1)
 
@@ -384,13 +311,7 @@ def _interpolated(cells: Tensor, height: Tensor, width: Tensor, half: int) -> Te
     """Integrals of a PSF with the interpolator of each pixel: ``[..., 2 half + 1, 2 half + 1]``.
 
     A pixel is limited to twice the result of linear interpolation. This removes the ripples of the cubic interpolator
-    where the PSF has no light. Cells larger than a pixel are interpolated linearly.
-
-    Args:
-        cells: Light in the cells of the PSF, ``[..., n, n]``.
-        height: Height of a cell in pixels ``[...]``.
-        width: Width of a cell in pixels ``[...]``.
-        half: Pixels on each side of the centre.
+    where the PSF has no light. Cells larger than a pixel are interpolated linearly. Arguments as in :func:`sampled`.
     """
     n = cells.shape[-1] // 2
     if bool((height == 1.0).all() and (width == 1.0).all()):  # cells are pixels, which need no interpolation
@@ -453,13 +374,6 @@ def _neighbours(values: Tensor) -> Tensor:
     return rows[..., :-2, :] + rows[..., 2:, :] + columns[..., :-2] + columns[..., 2:]
 
 
-def _gaussian_quadrant(sigma: Tensor, half: int, aspect: Tensor | None = None) -> Tensor:
-    """Integral of a Gaussian over each cell right of and below its centre: ``[..., half + 1, half + 1]``."""
-    down = _gaussian_line(sigma, half)
-    across = down if aspect is None else _gaussian_line(sigma / aspect, half)
-    return down.unsqueeze(-1) * across.unsqueeze(-2)
-
-
 def _gaussian_line(sigma: Tensor, half: int) -> Tensor:
     """Integral of a Gaussian over each unit step outwards from its centre: ``[..., half + 1]``."""
     edges = torch.arange(half + 2, dtype=torch.float64, device=sigma.device) - 0.5
@@ -469,18 +383,15 @@ def _gaussian_line(sigma: Tensor, half: int) -> Tensor:
     return torch.where(edges[:-1] < 1.0, cumulative[..., 1:] - cumulative[..., :-1], tail[..., :-1] - tail[..., 1:])
 
 
-def _disc_quadrant(radius: Tensor, half: int, aspect: Tensor | None = None) -> Tensor:
+def _disc_quadrant(radius: Tensor, half: int) -> Tensor:
     """Area of a disc in each cell right of and below its centre, ``[..., half + 1, half + 1]``, each axis included."""
     radius = radius[..., None, None]
     index = torch.arange(half + 1, dtype=torch.float64, device=radius.device)
     edge = torch.cat([index.new_zeros(1), index + 0.5])
-    across = edge if aspect is None else edge * aspect[..., None]  # [..., half + 2]
-    covered = _corner_area(across[..., None, :], edge[:, None], radius).diff(dim=-1).diff(dim=-2).clamp_min(0.0)
-    heights, widths = edge.diff(), across.diff()
+    covered = _corner_area(edge, edge[:, None], radius).diff(dim=-1).diff(dim=-2).clamp_min(0.0)
     # cells wholly outside or inside the circle are exact, without the rounding of differences
-    nearest = torch.hypot(edge[:-1, None], across[..., None, :-1])
-    farthest = torch.hypot(edge[1:, None], across[..., None, 1:])
-    covered = torch.where(farthest <= radius, heights[:, None] * widths[..., None, :], covered)
+    farthest, nearest = (torch.hypot(side[:, None], side) for side in (edge[1:], edge[:-1]))
+    covered = torch.where(farthest <= radius, edge.diff()[:, None] * edge.diff(), covered)
     return torch.where(nearest < radius, covered, 0.0) * _mirror_factor(index)
 
 
@@ -490,51 +401,16 @@ def _mirror_factor(index: Tensor) -> Tensor:
     return twice[:, None] * twice[None, :]
 
 
-def _sliced_quadrant(
-    family: str, lengths: Mapping[str, Tensor], half: int, slices: int, aspect: Tensor | None = None
-) -> Tensor:
+def _sliced_quadrant(family: str, lengths: Mapping[str, Tensor], half: int, slices: int) -> Tensor:
     """Integral of any profile over each cell right of and below its centre, cut by circles into thin slices."""
     rows = max(1, _SLICES_AT_ONCE // ((half + 1) * slices))
     strips = []
     for top in range(0, half + 1, rows):
-        rows_part = (half, slices, top, min(top + rows, half + 1))
-        if aspect is None:
-            make = functools.partial(_square_slices, *rows_part)
-            parts = _quadrants.get(rows_part, make) if half <= _CACHED_HALF_WIDTH else make()
-        else:
-            parts = _slices(*rows_part, aspect)
-        inner, outer, area = (t.to(lengths[FAMILIES[family][-1]].device) for t in parts)
+        part = (half, slices, top, min(top + rows, half + 1))
+        cut = _quadrants.get(part, functools.partial(_slices, *part)) if half <= _FINE_CELLS else _slices(*part)
+        inner, outer, area = (t.to(lengths[FAMILIES[family][-1]].device) for t in cut)
         strips.append((_slice_means(family, lengths, inner, outer) * area).sum(-1).unflatten(-1, (-1, half + 1)))
     return torch.cat(strips, -2)
-
-
-def _total_light(
-    family: str,
-    lengths: Mapping[str, Tensor],
-    half: int,
-    aperture: Aperture | None = None,
-    aspect: Tensor | None = None,
-) -> Tensor:
-    """Sum over the pixels of a kernel with ``half`` pixels on each side of its centre: ``[...]``.
-
-    Round kernels are summed over rings, those with an opening over coarser cells.
-    """
-    top = torch.full_like(reach(family, lengths), half + 0.5)
-    if aperture is not None and not aperture.is_round:
-        pixels = (half + 0.5) / (_MASS_CELLS + 0.5)  # of a coarser cell
-        coarse = {k: v / pixels if k in LENGTHS else v for k, v in lengths.items()}
-        return _cells(family, coarse, _MASS_CELLS, half, aperture, aspect).sum((-2, -1)) * pixels**2
-    right = top if aspect is None else top * aspect
-    if family == "gaussian":
-        root = math.sqrt(2) * lengths["sigma"]
-        return 4.0 * torch.erf(top / root) * torch.erf(right / root)
-    if family == "disc":
-        return 4.0 * _corner_area(right, top, lengths["radius"])
-    end = reach(family, lengths)
-    fractions = torch.linspace(0.0, 1.0, _RINGS + 1, dtype=torch.float64, device=end.device)
-    r = torch.minimum(2.0 * end, torch.hypot(top, right)).detach()[..., None, None] * fractions  # [..., 1, rings]
-    area = 4.0 * _corner_area(right[..., None, None], top[..., None, None], r).diff(dim=-1)
-    return (_slice_means(family, lengths, r[..., :-1], r[..., 1:]) * area).sum((-2, -1))
 
 
 def _slice_means(family: str, p: Mapping[str, Tensor], inner: Tensor, outer: Tensor) -> Tensor:
@@ -578,20 +454,14 @@ def _table_integral(r: Tensor, p: Mapping[str, Tensor]) -> Tensor:
 
 
 @torch.inference_mode(False)  # cached tensors must be usable by autograd
-def _square_slices(half: int, slices: int, top: int, bottom: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Slices of the square cells of a quadrant's rows, as in :func:`_slices`."""
-    return _slices(half, slices, top, bottom, torch.ones((), dtype=torch.float64, device="cpu"))
-
-
-def _slices(half: int, slices: int, top: int, bottom: int, aspect: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Slices of the cells of a quadrant's rows: inner and outer radius and area, each ``[..., cells, slices]``."""
-    index = torch.arange(half + 1, dtype=torch.float64, device=aspect.device)
+def _slices(half: int, slices: int, top: int, bottom: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Slices of the cells of a quadrant's rows: inner and outer radius and area, each ``[cells, slices]``."""
+    index = torch.arange(half + 1, dtype=torch.float64, device="cpu")
     low, high = (index - 0.5).clamp_min(0.0), index + 0.5
     low_y, low_x = (v.flatten()[:, None] for v in torch.meshgrid(low[top:bottom], low, indexing="ij"))
     high_y, high_x = (v.flatten()[:, None] for v in torch.meshgrid(high[top:bottom], high, indexing="ij"))
-    low_x, high_x = (v * aspect[..., None, None] for v in (low_x, high_x))
     nearest, farthest = torch.hypot(low_y, low_x), torch.hypot(high_y, high_x)
-    fractions = torch.linspace(0.0, 1.0, slices + 1, dtype=torch.float64, device=aspect.device)
+    fractions = torch.linspace(0.0, 1.0, slices + 1, dtype=torch.float64, device="cpu")
     r = nearest + (farthest - nearest) * fractions
     covered = (
         _corner_area(high_x, high_y, r)
@@ -600,7 +470,7 @@ def _slices(half: int, slices: int, top: int, bottom: int, aspect: Tensor) -> tu
         + _corner_area(low_x, low_y, r)
     )
     covered = covered * _mirror_factor(index)[top:bottom].flatten()[:, None]
-    return r[..., :-1].contiguous(), r[..., 1:].contiguous(), covered.diff(dim=-1).clamp_min(0.0)
+    return r[:, :-1].contiguous(), r[:, 1:].contiguous(), covered.diff(dim=-1).clamp_min(0.0)
 
 
 def _corner_area(x: Tensor, y: Tensor, r: Tensor) -> Tensor:

@@ -18,12 +18,7 @@ _OPTIONAL = ("name", "sensor_width_mm", "strength", "residual", "provenance", "a
 
 
 def find(source: str | os.PathLike[str]) -> Path:
-    """The file of a table: a path, or the name of a shipped table such as ``"sato_j15"``.
-
-    Raises:
-        ValueError: If ``source`` is neither a string nor a path.
-        FileNotFoundError: If no file and no shipped table has this name.
-    """
+    """The file of a table: a path, or the name of a shipped table such as ``"sato_j15"``."""
     if not isinstance(source, str | os.PathLike):
         raise ValueError(f"source must be the name or the path of a blur table, got {show(source)}")
     path = Path(source)
@@ -44,11 +39,7 @@ def shipped() -> list[str]:
 
 
 def fields_of(data: Any) -> dict[str, Any]:
-    """The fields in a file's data, as arguments of :class:`torchdof.BlurTable`.
-
-    Raises:
-        ValueError: If one is missing, unknown or of the wrong kind; the message names it.
-    """
+    """The fields in a file's data, as arguments of :class:`torchdof.BlurTable`."""
     if not isinstance(data, Mapping):
         raise ValueError(f"a blur table must be a dict, got {show(data)}")
     if not isinstance(data.get("schema"), str) or data["schema"] != SCHEMA:

@@ -13,7 +13,7 @@ from torchdof.optics.psf import pixel_kernels
 
 def kernel_of(fit):
     family = fit.family if fit.aperture is None else "disc"
-    return pixel_kernels(family, fit.kernel_params(), None, None, fit.aperture).numpy()
+    return pixel_kernels(family, fit.kernel_params(), None, fit.aperture).numpy()
 
 
 def centred(kernel):
