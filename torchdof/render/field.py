@@ -14,32 +14,20 @@ from torch import Tensor
 
 from ..optics.placed_kernels import FieldMask, placed
 
-__all__ = ["BLOCK", "scattered"]
-
 BLOCK = (8, 16)
 """Height and width of a block whose pixels share a kernel, in pixels of the layer; larger: faster, less accurate."""
 
 
-def scattered(
-    mask: FieldMask,
-    light: Tensor,
-    kernel: Tensor,
-    half: int,
-    scale: int,
-    size: tuple[int, int],
-) -> Tensor:
-    """Scatters a layer's light with the kernel of the block in which it lands.
+def scattered(mask: FieldMask, light: Tensor, kernel: Tensor, half: int, scale: int, size: tuple[int, int]) -> Tensor:
+    """Scatters a layer's light with the kernel of the block in which it lands: ``[B, C, h - 2 half, w - 2 half]``.
 
     Args:
         mask: How the field changes the layer's kernel.
         light: ``[B, C, h, w]``; begins ``half`` pixels before the frame, or ``half + 1`` at coarser resolutions.
-        kernel: Kernel of the blur table, ``[1 or C, k, k]``.
-        half: Radius of the kernel: pixels on each side of ``light`` that the result lacks.
+        kernel: Kernel of the blur table, ``[1 or C, k, k]``, of radius ``half``.
+        half: Pixels on each side of ``light`` that the result lacks.
         scale: Pixel of the layer in pixels of the image.
         size: Height and width of the image.
-
-    Returns:
-        ``[B, C, h - 2 half, w - 2 half]``.
     """
     high, wide = BLOCK
     (batch, channels), (rows, columns) = light.shape[:2], (n - 2 * half for n in light.shape[2:])
