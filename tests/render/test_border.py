@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from torch import Tensor
 from torch.testing import assert_close
 
 from torchdof import blur_by_coc
@@ -33,21 +32,6 @@ def test_a_highlight_on_the_border_is_not_continued() -> None:
     light[..., -1, 20] = 300.0
     out = continued([light], None, limit, (4, 4, 4, 4), 4)[0]
     assert float(out[..., 12:, :].max()) < 0.8
-
-
-def turned(values: Tensor, turns: int, flip: bool) -> Tensor:
-    values = torch.rot90(values, turns, (-2, -1))
-    return values.flip(-1) if flip else values
-
-
-@pytest.mark.parametrize("flip", [False, True])
-@pytest.mark.parametrize("turns", [0, 1, 2, 3])
-def test_continuation_commutes_with_flips_and_turns(turns: int, flip: bool) -> None:
-    light = torch.rand(1, 2, 13, 21, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    weight = torch.rand(1, 1, 13, 21, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    out = continued([light], weight, None, (6, 6, 6, 6), 6)[0]
-    other = continued([turned(light, turns, flip)], turned(weight, turns, flip), None, (6, 6, 6, 6), 6)[0]
-    assert_close(other, turned(out, turns, flip))
 
 
 def test_a_texture_is_averaged_outside_the_frame(engine: str) -> None:

@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchdof import BlurTable
-from torchdof.render.layer_weights import blur_axis, eased, from_blur_axis, ramps, weights_at_or_behind
+from torchdof.render.layer_weights import blur_axis, from_blur_axis, ramps, weights_at_or_behind
 
 NODES = (-4.0, -1.5, 0.0, 0.5, 2.0)
 
@@ -52,11 +52,3 @@ def test_weights_of_a_pixel_are_in_0_to_1_and_sum_to_1(x: float) -> None:
     parts = weights(torch.tensor(x, dtype=torch.float64))
     assert (parts >= 0).all() and (parts <= 1).all() and int((parts > 0).sum()) <= 2
     assert_close(float(parts.sum()), 1.0, rtol=0.0, atol=1e-15)
-
-
-def test_an_eased_ramp_rises_smoothly_from_0_to_1() -> None:
-    ramp = torch.linspace(0.0, 1.0, 2001, dtype=torch.float64)
-    steps = eased(ramp).diff()
-    assert float(eased(ramp)[0]) == 0.0 and float(eased(ramp)[-1]) == 1.0
-    assert float(steps[0]) < 1e-2 / 2000 and (steps > 0).all() and float(steps.diff().abs().max()) < 0.02 / 2000
-    assert float((eased(ramp) - ramp).abs().max()) < 0.08
