@@ -11,7 +11,6 @@ from torch import Tensor
 from torchdof import BlurTable, blur_by_coc
 from torchdof.reference import metrics
 from torchdof.render import highlights
-from torchdof.render.plan import Plan
 from torchdof.render.surfaces import HIDDEN_WEIGHT, Surface
 
 LAMP = 3000.0
@@ -162,28 +161,6 @@ def test_a_surface_that_is_not_visible_has_no_rays(cover: float) -> None:
     left, rays = highlights.extract(surface, highlights.threshold(image))
     assert rays is None
     assert left.light is image
-
-
-def test_the_number_of_rays_is_limited_to_the_brightest_pixels() -> None:
-    generator = torch.Generator().manual_seed(2)
-    image = torch.rand(1, 1, 128, 128, generator=generator)
-    image = torch.where(torch.rand(image.shape, generator=generator) < 0.05, 100.0 * (1.0 + image), 0.01 * image)
-    coc = torch.full((1, 1, 128, 128), 20.0)
-    _, rays = highlights.extract(Surface(image, coc), highlights.threshold(image))
-    assert rays is not None
-    assert len(rays.pixels) * 41**2 <= 2 * highlights._TAPS_PER_PIXEL * 128**2
-    taken = torch.zeros(128 * 128, dtype=torch.bool).index_fill(0, rays.pixels, True)
-    assert image.flatten()[taken].min() >= image.flatten()[~taken].max()
-
-
-def test_fewer_highlights_are_rays_if_kernels_reach_farther() -> None:
-    plan, coc = Plan((0.0, 10.0), 1 / 255), torch.full((1, 1, 32, 32), 10.0)
-    reach = [plan.reach(table, 32) for table in (BlurTable.disc(), BlurTable.gaussian())]
-    assert reach == pytest.approx([1.0, 2.5])
-    disc, wide = (highlights.affordable_taps(coc, [each]) for each in reach)
-    assert float(disc) == 16 * 32 * 32 and float(wide) == pytest.approx(float(disc) / 6.25)
-    both = highlights.affordable_taps(coc.expand(2, -1, -1, -1), reach)
-    torch.testing.assert_close(both, torch.cat([disc, wide]))
 
 
 @pytest.mark.parametrize("range_of_light", [0.0, 1.0])
