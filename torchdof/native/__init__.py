@@ -228,14 +228,14 @@ def render(
         nodes: Positions of the layers on the blur axis, near to far.
         layers: Kernel ``[1 or C, k, k]`` and pixel size of each layer.
         psfs: Kernels ``[1 or C, k, k]`` for signed radii of highlights, in steps of 1/32 pixel.
-        occlusion: As in :class:`torchdof.DepthOfField`.
-        normalize: As in :class:`torchdof.DepthOfField`.
+        occlusion: As in :class:`torchdof.DepthOfField`, as ``normalize``.
+        normalize: The same.
         masked: Whether values may be NaN or infinite; such pixels are copied.
         highlights: Whether highlights are rendered ray by ray where layers would soften them.
         crisp_px: Blur in pixels above which layers soften highlights.
         reach: Radius of the widest kernel divided by the radius of its disc, at least 1.
         field_masks: Transmittance of the field for each layer, contiguous; empty if the lens has no field.
-        ray_masks: Field masks for signed radii of highlights, in steps of 1/32 pixel, in ascending order of radius.
+        ray_masks: The same for highlights, as ``psfs``, in ascending order of radius.
         squeeze: Height of the blur divided by its width.
 
     Raises:
