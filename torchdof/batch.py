@@ -9,17 +9,11 @@ from torch import Tensor
 from .tensors import is_traced
 from .validation import show
 
-__all__ = ["flattened", "leading_axes", "numbers", "restored"]
-
 
 def leading_axes(image: Any) -> tuple[int, ...]:
     """The axes of an image before its channels: ``()`` for one image, ``(B,)`` for a batch, ``(B, T)`` for clips.
 
     Any other value counts as a batch; the checks of a batch then refuse it.
-
-    Example:
-        >>> leading_axes(torch.rand(2, 5, 3, 8, 12))
-        (2, 5)
     """
     if isinstance(image, Tensor) and image.ndim in (3, 5):
         return tuple(image.shape[:-3])
@@ -29,11 +23,8 @@ def leading_axes(image: Any) -> tuple[int, ...]:
 def flattened(axes: tuple[int, ...], name: str, value: Any, what: str = "1") -> Any:
     """A tensor of images or maps as a contiguous batch ``[B, ..., H, W]``; a single map for all images stays one item.
 
-    Args:
-        axes: :func:`leading_axes` of the image.
-        name: Name of the argument.
-        value: A tensor of the image's rank; any other value is returned unchanged.
-        what: Its channels, for the message.
+    ``axes`` are the :func:`leading_axes` of the image; ``name`` of the argument and ``what``, its channels, are for the
+    message. A value that is no tensor is returned unchanged.
 
     Raises:
         ValueError: If its leading axes do not fit, or it comes from ``torch.vmap``.
@@ -63,10 +54,8 @@ def flattened(axes: tuple[int, ...], name: str, value: Any, what: str = "1") -> 
 def numbers(axes: tuple[int, ...], name: str, value: Any) -> Any:
     """A number of the camera: a float, or a tensor with one value for each image of the batch.
 
-    Args:
-        axes: :func:`leading_axes` of the image.
-        name: Name of the argument.
-        value: A number, a list, or a tensor ``[B]``, ``[B, 1]``, or ``[B, T]`` for clips; None stays None.
+    ``value`` is a number, a list, or a tensor ``[B]``, ``[B, 1]``, or ``[B, T]`` for clips; None stays None. The other
+    arguments are those of :func:`flattened`.
 
     Raises:
         ValueError: If a list does not hold numbers, a tensor has another shape, or it comes from ``torch.vmap``.
@@ -95,12 +84,7 @@ def numbers(axes: tuple[int, ...], name: str, value: Any) -> Any:
 
 
 def restored(axes: tuple[int, ...], batch: Tensor) -> Tensor:
-    """A rendered batch with the leading axes of the input image.
-
-    Example:
-        >>> restored((2, 5), torch.ones(10, 3, 8, 12)).shape, restored((), torch.ones(1, 3, 8, 12)).shape
-        (torch.Size([2, 5, 3, 8, 12]), torch.Size([3, 8, 12]))
-    """
+    """A rendered batch with the leading axes of the input image."""
     if not axes:
         return batch[0]
     return batch if len(axes) == 1 else batch.unflatten(0, axes)

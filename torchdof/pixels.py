@@ -6,8 +6,6 @@ Depth edges, hidden surfaces and highlights concern few pixels, which are proces
 import torch
 from torch import Tensor
 
-__all__ = ["Selected", "around", "corners", "indices", "pick", "places", "put"]
-
 
 class Selected:
     """Pixels of a mask ``[B, 1, H, W]``, as lists of P values."""

@@ -10,20 +10,6 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.autograd.graph import saved_tensors_hooks
 
-__all__ = [
-    "TRACEABLE",
-    "floating",
-    "has_storage",
-    "is_differentiated",
-    "is_exporting",
-    "is_fake",
-    "is_in_memory",
-    "is_traced",
-    "recomputed",
-    "refuse_old_compiler",
-    "without_autocast",
-]
-
 TRACEABLE = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 13)
 """Whether this PyTorch, 2.13 or newer, can compile and export the renderer, and transform it with torch.func."""
 

@@ -1,5 +1,6 @@
 """The steps of a differentiated rendering that the compiled engine computes equal the plain engine's."""
 
+import functools
 import math
 from typing import Any
 
@@ -8,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchdof import BlurTable, blur_by_coc, native
-from torchdof.render import compiled_steps, disocclusion, matting
+from torchdof.render import disocclusion, matting
 from torchdof.render.ops import Level
 from torchdof.render.plan import Plan
 from torchdof.tensors import TRACEABLE
@@ -61,16 +62,21 @@ def rendered(way: dict[str, Any], dtype: torch.dtype = torch.float32) -> tuple[T
     return out.detach(), of_light, of_coc
 
 
+STEPS = ("blend", "farthest", "look_behind", "matte")
+
+
 @pytest.fixture
-def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
-    """The arguments of every gradient that the compiled engine computes."""
-    found: list[tuple[Any, ...]] = []
+def calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[tuple[Any, ...]]]:
+    """The arguments of every gradient that the compiled engine computes, by the name of its step."""
+    found: dict[str, list[tuple[Any, ...]]] = {step: [] for step in STEPS}
 
-    def recorded(*arguments: Any, of: Any = native.blend_gradient) -> list[Tensor]:
-        found.append(arguments)
-        return list(of(*arguments))
+    def recorded(step: str, gradient: Any, *arguments: Any) -> list[Tensor]:
+        found[step].append(arguments)
+        return list(gradient(*arguments))
 
-    monkeypatch.setattr(native, "blend_gradient", recorded)
+    for step in STEPS:
+        gradient = getattr(native, f"{step}_gradient")
+        monkeypatch.setattr(native, f"{step}_gradient", functools.partial(recorded, step, gradient))
     return found
 
 
@@ -81,28 +87,34 @@ def difference(values: Tensor, other: Tensor) -> float:
 
 @pytest.mark.parametrize("name", WAYS)
 def test_pictures_and_gradients_equal_the_plain_engines(
-    name: str, calls: list[Any], monkeypatch: pytest.MonkeyPatch
+    name: str, calls: dict[str, list[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = rendered(WAYS[name])
-    assert len(calls) == 2, "the compiled engine computes the gradient of both items"
+    assert len(calls["blend"]) == 2, "the compiled engine computes the gradient of both items"
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
     plain = rendered(WAYS[name])
-    assert len(calls) == 2, "and the plain one computes it alone"
+    assert len(calls["blend"]) == 2, "and the plain one computes it alone"
     for ours, other, most in zip(found, plain, (1e-6, 1e-5, 5e-5), strict=True):
         assert difference(ours, other) < most
 
 
-@pytest.mark.parametrize("name", ["over", "coarse", "sum", "by colour"])
-def test_gradients_have_the_same_bits_for_any_number_of_threads_and_batch(name: str, calls: list[Any]) -> None:
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("name", ["over", "coarse", "sum", "by colour", "holes"])
+def test_gradients_have_the_same_bits_for_any_number_of_threads(
+    name: str, step: str, calls: dict[str, list[Any]]
+) -> None:
     rendered(WAYS[name])
-    arguments, threads = calls[1], torch.get_num_threads()
+    if "sum" in name and step != "blend":
+        assert not calls[step]
+        return
+    arguments, gradient, threads = calls[step][1], getattr(native, f"{step}_gradient"), torch.get_num_threads()
     try:
         results = []
         for count in (1, 2, 5):
             torch.set_num_threads(count)
-            results.append(native.blend_gradient(*arguments))
+            results.append(gradient(*arguments))
         native.use_instructions("baseline")
-        baseline = native.blend_gradient(*arguments)
+        baseline = gradient(*arguments)
     finally:
         torch.set_num_threads(threads)
         native.use_instructions("avx2")
@@ -111,9 +123,9 @@ def test_gradients_have_the_same_bits_for_any_number_of_threads_and_batch(name: 
         assert difference(other, one) < 5e-5
 
 
-def test_float64_is_the_plain_engines_and_differs_by_rounding_alone(calls: list[Any]) -> None:
+def test_float64_is_the_plain_engines_and_differs_by_rounding_alone(calls: dict[str, list[Any]]) -> None:
     exact = rendered({}, torch.float64)
-    assert not calls
+    assert not any(calls.values())
     for ours, other in zip(rendered({}), exact, strict=True):
         assert difference(ours.double(), other) < 2e-5
 
@@ -149,17 +161,17 @@ def test_forward_mode_and_torch_func_agree_with_reverse_mode() -> None:
 
 @pytest.mark.parametrize("channels", [1, 3])
 def test_surfaces_behind_and_their_gradients_equal_the_plain_engines(
-    channels: int, monkeypatch: pytest.MonkeyPatch
+    channels: int, calls: dict[str, list[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Levels of random samples, some empty; some pixels lie exactly where a level begins to be read."""
     generator, levels = torch.Generator().manual_seed(3), []
     coc = 20.0 * torch.rand(2, 1, 70, 101, generator=generator) - 10.0
     coc[..., 5:9] = 2.0
-    for step, vote in ((2, 0.35), (4, 0.12), (4, None)):
+    for step, slope, most in ((2, 3.5, 0.35), (4, 1.2, 0.12), (4, 1.0, math.inf)):
         values = torch.rand(2, channels + 2, 80 // step, 112 // step, generator=generator)
         values[:, -2] = 20.0 * values[:, -2] - 8.0
         values[:, -1] *= torch.rand(values[:, -1].shape, generator=generator) > 0.3
-        levels.append(Level(values, step, vote, step / 4.0))
+        levels.append(Level(values, step, step / 4.0, slope, most))
     seen = torch.rand(2, channels + 2, 70, 101, generator=generator) - 0.3
 
     def looked() -> list[Tensor]:
@@ -168,15 +180,8 @@ def test_surfaces_behind_and_their_gradients_equal_the_plain_engines(
         out = torch.cat(disocclusion._seen(given, leaves[0]), 1)
         return [out.detach(), *torch.autograd.grad((out * seen).sum(), leaves)]
 
-    used: list[int] = []
-
-    def recorded(*arguments: Any, of: Any = native.look_behind_gradient) -> list[Tensor]:
-        used.append(1)
-        return list(of(*arguments))
-
-    monkeypatch.setattr(native, "look_behind_gradient", recorded)
     found = looked()
-    assert len(used) == 2
+    assert len(calls["look_behind"]) == 2
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
     for ours, plain in zip(found, looked(), strict=True):
         assert difference(ours, plain) < 1e-4
@@ -194,50 +199,33 @@ def edges(channels: int, hole: bool) -> tuple[Tensor, Tensor, Tensor | None]:
     return light, coc, (noise > 0.1).float() if hole else None
 
 
-STEPS: dict[str, Any] = {"matted": "matte_gradient", "finest_level": "farthest_gradient"}
-
-
 @pytest.mark.parametrize("hole", [False, True])
 @pytest.mark.parametrize("channels", [1, 3])
-@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("step", ["matte", "farthest"])
 def test_surfaces_of_pixels_and_their_gradients_equal_the_plain_engines(
-    step: str, channels: int, hole: bool, monkeypatch: pytest.MonkeyPatch
+    step: str, channels: int, hole: bool, calls: dict[str, list[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     light, coc, valid = edges(channels, hole)
     given: tuple[Tensor, ...] = (light, coc)
-    if step == "finest_level":
+    if step == "farthest":
         generator = torch.Generator().manual_seed(8)
         weight = 0.5 * torch.rand(coc.shape, generator=generator)
         given = (light, coc, light.flip(-1), coc.flip(-1), torch.where(weight > 0.2, weight, 0.0))
 
     def computed() -> list[Tensor]:
         leaves = [t.clone().requires_grad_() for t in given]
-        if step == "matted":
+        if step == "matte":
             own, other, other_coc, share = matting.matte(leaves[0], leaves[1], valid)
             out = torch.cat([own, other * share, other_coc, share], 1)  # light of a tiny share is rounding
         else:
-            limit, size = torch.full_like(coc, 0.7), (32, 44)
-            level = compiled_steps.finest_level(leaves, limit, valid, size, lambda *_: light)
-            out = disocclusion._finest_level(leaves, limit, valid, size) if level is None else level
+            constant = [torch.full_like(coc, 0.7), *([] if valid is None else [valid])]
+            out = disocclusion.finest_level((32, 44), *leaves, *constant)
             out = torch.where(out < -1e8, 0.0, out)
         seen = torch.rand(out.shape, generator=torch.Generator().manual_seed(1)) - 0.3
         return [out.detach(), *torch.autograd.grad((out * seen).sum(), leaves)]
 
-    used: list[list[Tensor]] = []
-    of = getattr(native, STEPS[step])
-
-    def recorded(*arguments: Any) -> list[Tensor]:
-        used.append(of(*arguments))
-        threads = torch.get_num_threads()
-        torch.set_num_threads(3)
-        again = of(*arguments)
-        torch.set_num_threads(threads)
-        assert all(map(torch.equal, used[-1], again)), "the number of threads does not change the bits"
-        return used[-1]
-
-    monkeypatch.setattr(native, STEPS[step], recorded)
     found = computed()
-    assert len(used) == 2
+    assert len(calls[step]) == 2
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
     for ours, plain in zip(found, computed(), strict=True):
         assert difference(ours, plain) < 1e-4

@@ -1,8 +1,7 @@
-"""Light outside the frame: that of the border, smoothed along it, equivariant under flips and turns."""
+"""Light outside the frame: that of the border, smoothed along it."""
 
 import pytest
 import torch
-from torch import Tensor
 from torch.testing import assert_close
 
 from torchdof import blur_by_coc
@@ -19,35 +18,6 @@ def test_continued_light_is_half_the_nearest_pixel_and_half_a_mean_along_the_bor
         expected = (light[..., -1, 20] + mean) / 2
         assert_close(out[..., 19 + distance, 20], expected)
     assert_close(out[..., 19 + 3, :], (out[..., 19 + 2, :] + out[..., 19 + 4, :]) / 2)
-
-
-def test_pixels_that_a_surface_does_not_cover_are_not_in_its_mean() -> None:
-    light, weight = torch.full((1, 1, 6, 30), 0.5), torch.ones(1, 1, 6, 30)
-    light[..., 10:], weight[..., 10:] = 0.0, 0.0
-    out = continued([light], weight, None, (0, 0, 8, 8), 8)[0]
-    assert_close(out[..., :10], torch.full_like(out[..., :10], 0.5))
-
-
-def test_a_highlight_on_the_border_is_not_continued() -> None:
-    light, limit = torch.full((1, 3, 8, 50), 0.1), torch.full((1, 1, 8, 50), 0.8)
-    light[..., -1, 20] = 300.0
-    out = continued([light], None, limit, (4, 4, 4, 4), 4)[0]
-    assert float(out[..., 12:, :].max()) < 0.8
-
-
-def turned(values: Tensor, turns: int, flip: bool) -> Tensor:
-    values = torch.rot90(values, turns, (-2, -1))
-    return values.flip(-1) if flip else values
-
-
-@pytest.mark.parametrize("flip", [False, True])
-@pytest.mark.parametrize("turns", [0, 1, 2, 3])
-def test_continuation_commutes_with_flips_and_turns(turns: int, flip: bool) -> None:
-    light = torch.rand(1, 2, 13, 21, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    weight = torch.rand(1, 1, 13, 21, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    out = continued([light], weight, None, (6, 6, 6, 6), 6)[0]
-    other = continued([turned(light, turns, flip)], turned(weight, turns, flip), None, (6, 6, 6, 6), 6)[0]
-    assert_close(other, turned(out, turns, flip))
 
 
 def test_a_texture_is_averaged_outside_the_frame(engine: str) -> None:
@@ -68,18 +38,3 @@ def test_a_subject_cut_by_the_border_gives_no_light_to_its_background(engine: st
     assert float((out[..., :78] - 60 / 255).abs().max()) < 1 / 255
     if occlusion:
         assert_close(out[..., 52:, 82:128], image[..., 52:, 82:128], atol=1 / 255, rtol=0.0)
-
-
-def test_a_slope_along_the_border_is_one_surface() -> None:
-    light = torch.rand(1, 3, 8, 60, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    slope = torch.linspace(-10, 10, 60, dtype=torch.float64).expand(1, 1, 8, 60)
-    ends = (0, 0, 0, 8)
-    assert_close(continued([light], None, None, ends, 8, slope)[0], continued([light], None, None, ends, 8)[0])
-
-
-def test_the_mean_along_the_border_excludes_nearer_and_includes_farther_surfaces() -> None:
-    light, x = torch.zeros(1, 1, 4, 40), torch.zeros(1, 1, 4, 40)
-    light[..., 20:], x[..., 20:] = 1.0, 20.0  # bright and far
-    out = continued([light], None, None, (0, 0, 0, 4), 4, x)[0]
-    assert_close(out[..., 4:, 20:], torch.ones(1, 1, 4, 20))
-    assert float(out[..., -1, 19]) > 0.2

@@ -1,19 +1,14 @@
 """Disocclusion: filled surfaces behind blurred ones, and the background behind all layers."""
 
-import pytest
 import torch
-import torch.nn.functional as functional
 from torch import Tensor
 from torch.testing import assert_close
 
 from tests.scenes import BLUE, mixed_edge
 from tests.traced import TRACED
-from torchdof.render.composite import over
-from torchdof.render.convolution import convolve
-from torchdof.render.disocclusion import behind_pixels, fill_hidden, surfaces_of_image
+from torchdof.render.disocclusion import behind_pixels, surfaces_of_image
 from torchdof.render.highlights import threshold
-from torchdof.render.plan import LayerKernel
-from torchdof.render.surfaces import HIDDEN_WEIGHT, Surface, pad_to_frame
+from torchdof.render.surfaces import Surface
 
 
 def surfaces(image: Tensor, coc: Tensor, levels: int) -> tuple[Surface, Surface, Tensor]:
@@ -32,15 +27,6 @@ def test_hidden_surfaces_have_the_colour_and_depth_of_their_surroundings_within_
     assert torch.allclose(other[0, :, 24, 20:31], BLUE[:, None].expand(3, 11), atol=1e-5)
     assert float(other_coc[0, 0, 24, 20:31].abs().max()) < 1e-5
     assert torch.allclose(behind[0, :, 24, 20:28], BLUE[:, None].expand(3, 8), atol=1e-5)
-
-
-@pytest.mark.parametrize(("near_px", "share"), [(-0.5, 0.0), (-0.507, 0.49), (-0.5225, 1.0), (-3.0, 1.0)])
-def test_hidden_surfaces_fade_in_with_the_blur_in_front_of_them(near_px: float, share: float) -> None:
-    """The finest level is used above a blur of half a pixel; a sample has full weight above a hundredth of a vote."""
-    image, coc = mixed_edge(1.0, near_px=near_px, far_px=2.0)
-    _, (_, _, weight), _ = surfaces(image, coc, levels=5)
-    assert weight is not None
-    assert float(weight[0, 0, 24, 31]) == pytest.approx(share * HIDDEN_WEIGHT, rel=0.02, abs=1e-6)
 
 
 def test_a_highlight_is_not_copied_into_the_hidden_surface_beside_it() -> None:
@@ -64,80 +50,6 @@ def test_the_background_behind_two_blurred_surfaces_is_the_farthest_one_around()
     _, (_, _, weight), behind = surfaces(image, coc, levels=6)
     assert weight is not None and float(weight[0, 0, 24, 16]) > 0
     assert torch.allclose(behind[0, :, 24, 16], BLUE, atol=0.02)  # the wall, not the surface in between
-
-
-def sloping(behind_px: float) -> tuple[Tensor, Tensor]:
-    """A red slope of 30 to 20 px in front of the focus, a green surface at ``behind_px``, a blue wall 60 px behind."""
-    image, coc = (torch.empty(1, channels, 48, 96) for channels in (3, 1))
-    coc[..., :40] = torch.linspace(-30.0, -20.0, 40)
-    coc[..., 40:44], coc[..., 44:] = behind_px, 60.0
-    image[..., :40] = torch.tensor([0.7, 0.1, 0.1])[:, None, None]
-    image[..., 40:44], image[..., 44:] = torch.tensor([0.1, 0.6, 0.1])[:, None, None], BLUE[:, None, None]
-    return image, coc
-
-
-def test_the_surface_behind_a_slope_is_no_part_of_the_slope() -> None:
-    """A mean of the slope in front of the focus and of the wall behind it would be in focus: a sharp speck."""
-    image, coc = sloping(60.0)
-    _, (other, other_coc, weight), _ = surfaces(image, coc, levels=6)
-    assert weight is not None
-    hidden = (weight > 0) & (coc < 0)
-    assert int(hidden.sum()) > 500
-    assert float(other_coc[hidden].min()) > 40.0
-    assert float(other[:, :1][hidden].max()) < 0.25, "little of the slope's red"
-
-
-def test_a_surface_between_a_slope_and_a_wall_lies_behind_the_slope() -> None:
-    image, coc = sloping(-1.0)
-    _, (other, other_coc, weight), _ = surfaces(image, coc, levels=6)
-    assert weight is not None and float(weight[0, 0, 24, 38:40].min()) > 0
-    assert torch.allclose(other_coc[0, 0, 24, 39], torch.tensor(-1.0), atol=6.0)
-    assert float(other[0, 1, 24, 39]) > 0.4, "its green"
-
-
-def test_a_level_beyond_the_largest_blur_changes_nothing() -> None:
-    made = torch.Generator().manual_seed(1)
-    image, coc = torch.rand(1, 3, 51, 66, generator=made), 16.0 * torch.rand(1, 1, 7, 9, generator=made) - 8.0
-    coc = functional.interpolate(coc, scale_factor=8.0)[..., :51, :66]
-    fewer, more = (surfaces(image, coc, levels=levels) for levels in (4, 5))
-    torch.testing.assert_close(fewer, more, rtol=0, atol=1e-6)
-
-
-def test_a_hidden_surface_replaces_a_second_surface_of_small_coverage_smoothly() -> None:
-    image, coc = mixed_edge(1.0, near_px=-12.0)
-    most = threshold(image)
-    weights = torch.linspace(0.0, 1.2 * HIDDEN_WEIGHT, 40)
-    light, found = [], []
-    for mixed in weights.tolist():
-        own_weight = torch.full_like(coc, mixed)
-        other, _, weight, _ = fill_hidden(image, coc, torch.zeros_like(image), coc, own_weight, None, most, [5])
-        light.append((other * weight)[0, :, 24, 30])
-        found.append(float(weight[0, 0, 24, 30]))
-    assert found[0] == pytest.approx(HIDDEN_WEIGHT) and found[-1] == pytest.approx(float(weights[-1]))
-    steps = torch.stack(light).diff(dim=0).abs().max() / HIDDEN_WEIGHT, torch.tensor(found).diff().abs().max()
-    assert float(steps[0]) < 0.1 and float(steps[1]) < 0.1 * HIDDEN_WEIGHT
-
-
-@pytest.mark.parametrize("size", [(20, 30), (150, 170), (128, 64)])
-def test_a_hole_in_all_layers_shows_the_background(size: tuple[int, int]) -> None:
-    cells = torch.rand(1, 3, size[0] // 4 + 3, size[1] // 4 + 2, generator=torch.Generator().manual_seed(2))
-    behind = functional.interpolate(cells, scale_factor=4.0, mode="bilinear")  # same centre as the image
-    top, left = ((length - part) // 2 for length, part in zip(behind.shape[-2:], size, strict=True))
-    behind = behind[..., top : top + size[0], left : left + size[1]]
-    coc = torch.zeros(1, 1, *size)
-    blurs = [
-        LayerKernel(torch.ones(1, 1, 1), 1),
-        LayerKernel(torch.zeros(1, 1, 1), 1),
-    ]  # the farther layer leaves a hole
-    for cover in (0.0, 0.75, 1.0):
-        light = torch.full((1, 3, *size), 0.2)
-        surfaces = [
-            Surface(light, coc, torch.full_like(coc, cover)),
-            Surface(light, coc + 9.0, torch.full_like(coc, 1 - cover)),
-        ]
-        frame = pad_to_frame(surfaces, behind_pixels(cells, size), [(0.0, 1.0)], 0, 1, occlusion=True, stacked=False)
-        shown = over(frame, blurs, convolve)
-        torch.testing.assert_close(shown, 0.2 * cover + (1 - cover) * behind, rtol=0, atol=1e-6)
 
 
 @TRACED

@@ -74,27 +74,3 @@ def test_the_scale_of_the_coarse_kernel_is_near_the_best(name: str, coc_px: floa
     best = min(error(table, meant, scale, 0.5 + 0.04 * step) for step in range(14))
     assert error(table, meant, scale, shrink(table, coc_px, 256 / scale, scale)) < 1.1 * best
     assert error(table, meant, scale, 1.0) > 1.05 * best or coc_px > 3.0, "the test cannot detect a wrong scale"
-
-
-def test_a_wide_gaussian_keeps_its_second_moment() -> None:
-    # variance added by averaging 2 x 2 pixels and by linear interpolation, in squared coarse pixels
-    others = 1 / 4 - 1 / 48
-    table = TABLES["gaussian"]
-    kernel = table.kernels(torch.tensor([6.0], dtype=torch.float64), 128)[0, 0]
-    axis = torch.arange(kernel.shape[-1], dtype=torch.float64) - kernel.shape[-1] // 2
-    variance = float((kernel.sum(0) * axis**2).sum())
-    assert shrink(table, 6.0, 128, 2) == pytest.approx((1 - others / variance) ** 0.5, abs=2e-3)
-
-
-@pytest.mark.parametrize("coc_px", [-3.0, 0.3, 11.0, 400.0])
-def test_the_scale_is_in_half_to_one_and_equal_on_both_sides_of_focus(coc_px: float) -> None:
-    assert 0.5 <= shrink(TABLES["disc"], coc_px, 500.0, 2) <= 1.0
-    mirrored = shrink(TABLES["disc"], -coc_px, 500.0, 2)
-    assert shrink(TABLES["disc"], coc_px, 500.0, 2) == pytest.approx(mirrored, rel=1e-12)
-
-
-@pytest.mark.parametrize("scale", [1, 2, 8])
-def test_each_coarse_pixel_is_the_mean_of_its_block(scale: int) -> None:
-    values = torch.rand(2, 3, 16, 24, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    blocks = values.unflatten(3, (-1, scale)).unflatten(2, (-1, scale))
-    torch.testing.assert_close(downsampled(values, scale), blocks.mean((3, 5)))

@@ -10,8 +10,6 @@ from torch import Tensor
 from examples.benchmarks.operations import Counted
 from tests.scenes import TABLES, assert_same_picture, random_scene
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
-from torchdof.render.layer_weights import blur_axis, ramps, weights_at_or_behind
-from torchdof.render.plan import Plan, joined_layers
 
 SIZE = (48, 64)
 RADII = (1.5, 30.0, 4.0, 0.0, 9.0)  # px: different layers, resolutions and pyramids; one item is in focus
@@ -95,28 +93,3 @@ def test_a_stack_in_a_batch_is_rendered_as_alone(tolerance: Any) -> None:
     together = dof.layers(rgba, depth)
     for i in range(2):
         assert_same_picture(dof.layers(rgba[i : i + 1], depth[i : i + 1]), together[i : i + 1], rgba[i : i + 1, 0])
-
-
-def test_layers_of_several_plans_are_joined_by_side_and_resolution() -> None:
-    plans = [
-        Plan.for_scene(torch.tensor(ends).reshape(1, 1, 1, -1).expand(1, 1, 100, -1), 1 / 255, adapt=False)
-        for ends in ([-40.0, 3.0], [-1.0, 0.0, 25.0], [5.0, 9.0])
-    ]
-    nodes, blurs = joined_layers(plans, BlurTable.disc(), SIZE, torch.empty(0, dtype=torch.float64))
-    assert len(blurs) == len(nodes[0]) < sum(len(plan.nodes) for plan in plans)
-    for item, (plan, places) in enumerate(zip(plans, nodes, strict=True)):
-        x = blur_axis(torch.linspace(-41.0, 26.0, 300).double()).clamp(plan.nodes[0], plan.nodes[-1])
-        behind = weights_at_or_behind(x.reshape(1, 1, 1, -1), ramps([places], x))[0, :, 0]
-        of_layer = behind[:-1] - behind[1:]
-        used = of_layer.sum(1) > 0
-        assert [place for place, is_used in zip(places, used, strict=True) if is_used] == list(plan.nodes)
-        alone = weights_at_or_behind(x.reshape(1, 1, 1, -1), ramps([plan.nodes], x))[0, :, 0]
-        torch.testing.assert_close(of_layer[used], alone[:-1] - alone[1:])
-        own = plan.layer_kernels(BlurTable.disc(), SIZE, torch.float64, torch.device("cpu"), True)
-        joined = [blur for blur, is_used in zip(blurs, used, strict=True) if is_used]
-        for blur, alone_blur in zip(joined, own, strict=True):
-            assert blur.scale == alone_blur.scale
-            spare = blur.half - alone_blur.half
-            inside = slice(spare, blur.kernel.shape[-1] - spare)
-            torch.testing.assert_close(blur.kernel[item, :, inside, inside], alone_blur.kernel)
-            torch.testing.assert_close(blur.kernel[item].sum(), alone_blur.kernel.sum())

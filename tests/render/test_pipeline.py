@@ -10,11 +10,8 @@ from torch import Tensor
 
 from tests.refused import refuses
 from torchdof import Camera, DepthOfField, blur_by_coc
-from torchdof.options import Options
 from torchdof.reference import metrics
 from torchdof.reference.scenes import Plane, Scene, plane_scene, posts, waves
-from torchdof.render.pipeline import _before_background
-from torchdof.render.surfaces import Surface
 
 CAMERA = Camera.from_fov(40.0, 0.09, 3.0)
 DEPTHS = (6.0, 2.0, 1.2)
@@ -85,13 +82,6 @@ def test_layers_in_focus_are_composited_by_over(engine: str) -> None:
     rgba = torch.cat([torch.rand(1, 2, 3, 12, 16, generator=generator) * cover, cover], 2)
     out = DepthOfField(CAMERA.replace(focus_m=1.0)).layers(rgba, torch.tensor([1.0, 1.0001]))  # both in focus
     torch.testing.assert_close(out, rgba[:, 0] + (1 - rgba[:, 0, 3:]) * rgba[:, 1])
-
-
-@pytest.mark.parametrize(("apart_px", "weight"), [(0.5, 0.0), (0.75, 0.25), (1.5, 1.0), (-3.0, 0.0)])
-def test_the_weight_of_a_background_rises_from_half_a_pixel_behind_the_image(apart_px: float, weight: float) -> None:
-    image, coc = torch.full((1, 1, 6, 8), 0.5), torch.full((1, 1, 6, 8), 2.0)
-    *_, background = _before_background(Surface(image, coc), image, coc + apart_px, (-9.0, 9.0), Options())
-    torch.testing.assert_close(background.weight, torch.full_like(coc, weight))
 
 
 def test_gradients_reach_the_background() -> None:

@@ -11,7 +11,7 @@ from torchdof.optics.kernel_bank import bank_of
 from torchdof.render import layer_cocs
 from torchdof.render.layer_cocs import spacing
 from torchdof.render.layer_weights import blur_axis
-from torchdof.render.plan import Plan, kernels_for
+from torchdof.render.plan import Plan
 
 TOLERANCE = st.sampled_from([0.0, 1 / 1000, 1 / 255, 1 / 60, 1 / 20, 0.5])
 
@@ -158,22 +158,3 @@ def test_a_printed_plan_shows_resolution_and_share_of_the_pixels_of_each_layer()
     assert plan.pixels is not None and sum(plan.pixels) == pytest.approx(1.0)
     assert torch.equal(dof(image, depth, plan=plan), dof(image, depth))
     assert "%" not in str(Plan(plan.nodes, plan.tolerance))
-
-
-def test_kernels_of_highlights_are_interpolated_between_multiples_of_1_32_px() -> None:
-    table, coc = BlurTable.disc(), torch.tensor([3.0, 3.0078125, -7.26], dtype=torch.float64)
-    kernels = kernels_for(table, coc, 100, 100)
-    low, high = (
-        table.kernels(torch.tensor([3.0, 3.03125, -7.28125, -7.25], dtype=torch.float64), 100)
-        .unflatten(0, (2, 2))
-        .unbind(1)
-    )
-    torch.testing.assert_close(kernels[0], low[0])
-    torch.testing.assert_close(kernels[1], torch.lerp(low[0], high[0], 0.25))
-    torch.testing.assert_close(kernels[2], torch.lerp(low[1], high[1], 0.68))
-    assert kernels_for(table, coc, 100, 4).shape[-1] == 7
-    moving = coc.clone().requires_grad_()
-    differentiable, seen = kernels_for(table, moving, 100, 100), torch.rand_like(kernels)
-    torch.testing.assert_close(differentiable, kernels, rtol=0.0, atol=0.0)
-    (slope,) = torch.autograd.grad((differentiable * seen).sum(), moving)
-    torch.testing.assert_close(slope[1], 32.0 * ((high[0] - low[0]) * seen[1]).sum())

@@ -109,13 +109,6 @@ def test_scatter_of_any_shape_and_stride_equals_a_direct_sum(
     assert_close(out, direct.to(dtype), **TOLERANCES[dtype])
 
 
-@pytest.mark.parametrize("radius", [2.5, 14.0])
-def test_a_single_kernel_applies_to_all_channels(radius: float) -> None:
-    light, kernel = torch.rand(2, 3, 20, 24), kernel_of("disc", radius).float()[None]
-    assert_close(convolve(light, kernel), convolve(light, kernel.repeat(3, 1, 1)), rtol=1e-6, atol=1e-6)
-    assert_close(convolve(light, kernel), fold(light, kernel), rtol=1e-5, atol=1e-6)
-
-
 def test_a_large_kernel_uses_the_halo() -> None:
     light, kernels = torch.rand(1, 2, 90, 100), torch.stack([kernel_of("disc", 12.0), kernel_of("disc", 11.8)]).float()
     half = kernels.shape[-1] // 2

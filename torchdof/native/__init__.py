@@ -4,7 +4,8 @@ It has a plain C interface (``src/api.h``) and is built when the package is inst
 used. The environment variable ``TORCHDOF_ENGINE`` selects: ``auto`` (the default) uses the compiled engine where it
 can, ``native`` requires it, ``torch`` disables it.
 
-Every computation raises ``MemoryError`` if there is not enough memory.
+Tensors are float32. Every computation uses as many threads as PyTorch does, gives the same bits for any number of them,
+and raises ``MemoryError`` if there is not enough memory.
 """
 
 import ctypes
@@ -20,33 +21,6 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
-
-__all__ = [
-    "HALF_LARGEST",
-    "MOST_LEVELS",
-    "MOST_PLANES",
-    "FrameLayers",
-    "Kind",
-    "Spots",
-    "blend",
-    "blend_gradient",
-    "chosen",
-    "coc_px",
-    "convolve",
-    "describe",
-    "ends",
-    "farthest",
-    "farthest_gradient",
-    "kernels",
-    "look_behind",
-    "look_behind_gradient",
-    "matte",
-    "matte_gradient",
-    "plan",
-    "render",
-    "repair_edges",
-    "use_instructions",
-]
 
 Kind = Literal["image", "background", "stack"]
 """Meaning of the surfaces: one image; an image and the background behind it; any number of surfaces that cover each
@@ -68,6 +42,9 @@ _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
 _REVISION = 8  # of ``src/api.h``
 
 Rules = Sequence[tuple[int, float, float, float]]
+
+Surface = tuple[Tensor, Tensor, Tensor | None]
+"""Light ``[C, H, W]``, signed coc in pixels and weight (None: 1), ``[H, W]`` or ``[1, H, W]``."""
 
 KernelMask = tuple[Tensor, Tensor, float, float | Tensor]
 """Mask of a lens's field for kernels of one radius (:class:`torchdof.optics.placed_kernels.FieldMask`): transmittance
@@ -223,7 +200,7 @@ def use_instructions(name: Literal["avx2", "baseline"]) -> bool:
 
 
 def render(
-    surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]],
+    surfaces: Sequence[Surface],
     kind: Kind,
     *,
     nodes: Sequence[float],
@@ -239,76 +216,53 @@ def render(
     ray_masks: Callable[[list[int]], Sequence[KernelMask]],
     squeeze: float,
 ) -> Tensor:
-    """Renders depth of field for one image, with as many threads as PyTorch uses.
+    """Renders depth of field for one image: ``[C, H, W]``.
 
     1. Begin: the engine splits pixels, fills hidden areas and finds the radii of the highlights' kernels.
     2. Make these kernels and their field masks.
     3. Finish: the engine composites the layers and splats the highlights.
 
     Args:
-        surfaces: Light ``[C, H, W]``, signed coc in pixels ``[H, W]`` and weight ``[H, W]`` (None: 1) of each surface,
-            float32.
+        surfaces: Surfaces of the scene.
         kind: Meaning of the surfaces.
         nodes: Positions of the layers on the blur axis, near to far.
         layers: Kernel ``[1 or C, k, k]`` and pixel size of each layer.
         psfs: Kernels ``[1 or C, k, k]`` for signed radii of highlights, in steps of 1/32 pixel.
-        occlusion: As in :class:`torchdof.DepthOfField`.
-        normalize: As in :class:`torchdof.DepthOfField`.
+        occlusion: As in :class:`torchdof.DepthOfField`, as ``normalize``.
+        normalize: The same.
         masked: Whether values may be NaN or infinite; such pixels are copied.
         highlights: Whether highlights are rendered ray by ray where layers would soften them.
         crisp_px: Blur in pixels above which layers soften highlights.
         reach: Radius of the widest kernel divided by the radius of its disc, at least 1.
-        field_masks: Transmittance of the field for each layer, float32 and contiguous; empty if the lens has no field.
-        ray_masks: Field masks for signed radii of highlights, in steps of 1/32 pixel, in ascending order of radius.
+        field_masks: Transmittance of the field for each layer, contiguous; empty if the lens has no field.
+        ray_masks: The same for highlights, as ``psfs``, in ascending order of radius.
         squeeze: Height of the blur divided by its width.
-
-    Returns:
-        ``[C, H, W]``, float32; the same bits for any number of threads.
 
     Raises:
         OverflowError: If an image's light exceeds 2^28, whose square sums could overflow; scale it down.
     """
-    lights = [light.float().contiguous() for light, _, _ in surfaces]
-    cocs = [coc.float().contiguous() for _, coc, _ in surfaces]
-    weights = [None if weight is None else weight.float().contiguous() for _, _, weight in surfaces]
+    maps = [[None if t is None else t.float().contiguous() for t in each] for each in zip(*surfaces, strict=True)]
     of_layers, _kernels = _of_layers(nodes, layers)
     cancelled = ctypes.c_int32(0)
-    channels, height, width = lights[0].shape
-    scene = _Scene(
-        height,
-        width,
-        channels,
-        _KINDS[kind],
-        len(surfaces),
-        _pointers(lights),
-        _pointers(cocs),
-        _pointers(weights),
-        occlusion,
-        normalize,
-        masked,
-        highlights,
-        crisp_px,
-        reach,
-        *of_layers,
-        _field_masks(field_masks) if field_masks else None,
-        field_masks[0][0].shape[1] if field_masks else 0,
-        squeeze,
-        torch.get_num_threads(),
-        ctypes.pointer(cancelled),
-    )
+    channels, height, width = surfaces[0][0].shape
+    how = (occlusion, normalize, masked, highlights, crisp_px, reach, *of_layers)
+    field = (_field_masks(field_masks), field_masks[0][0].shape[1]) if field_masks else (None, 0)
+    threads = torch.get_num_threads()
+    size = (height, width, channels, _KINDS[kind], len(surfaces))
+    scene = _Scene(*size, *map(_pointers, maps), *how, *field, squeeze, threads, ctypes.pointer(cancelled))
     out = torch.empty(channels, height, width, dtype=torch.float32, device="cpu")
 
     def run() -> None:
         engine, job = _engine(), ctypes.c_void_p()
         try:
-            _check(engine.torchdof_begin(ctypes.byref(scene), ctypes.byref(job)))
+            _run("begin", ctypes.byref(scene), ctypes.byref(job))
             steps = ctypes.POINTER(ctypes.c_int32)()
             count = engine.torchdof_radii(job, ctypes.byref(steps))
             rays = [psf.contiguous() for psf in psfs(steps[:count])] if count else []
             halves = _array(ctypes.c_int32, max(1, count))(*(psf.shape[-1] // 2 for psf in rays))
             spots = ray_masks(steps[:count]) if count and field_masks else []
             of_rays = _field_masks(spots) if spots else None
-            _check(engine.torchdof_finish(job, _pointers(rays), halves, of_rays, len(spots), out.data_ptr()))
+            _run("finish", job, _pointers(rays), halves, of_rays, len(spots), out.data_ptr())
         finally:
             engine.torchdof_free(job)
 
@@ -316,10 +270,46 @@ def render(
     return out
 
 
-class FrameLayers(NamedTuple):
-    """Layers and geometry of a padded frame, for :func:`blend`; maps ``[., rows, columns]`` include a margin.
+def blend(surfaces: Sequence[Surface], *frame: Any) -> Tensor:
+    """Blurs and composites the layers of a padded frame, as :func:`torchdof.render.composite.over`, for one image.
+
+    Arguments are those of :func:`_layers_of`. The result ``[planes, height, width]`` is light, then coverage or
+    transmittance of each colour of the kernels (or, without occlusion, the sum of weights).
+    """
+    scene, _memory = _layers_of(surfaces, *frame)
+    planes, size = scene.channels + scene.kernel_colours, (scene.height, scene.width)
+    out = torch.empty(planes, *size, dtype=torch.float32, device="cpu")
+    run = functools.partial(_run, "blend", ctypes.byref(scene), out.data_ptr())
+    _interruptible(run, scene.cancelled.contents, scene.rows * scene.columns)
+    return out
+
+
+def blend_gradient(gradient: Tensor, surfaces: Sequence[Surface], *frame: Any) -> list[Tensor]:
+    """The gradients of :func:`blend` by each map of its surfaces that is given, surface by surface."""
+    (scene, _memory), gradient = _layers_of(surfaces, *frame), gradient.contiguous()
+    sums = [
+        [None if t is None else torch.zeros_like(t, memory_format=torch.contiguous_format) for t in each]
+        for each in zip(*surfaces, strict=True)
+    ]
+    arguments = (ctypes.byref(scene), gradient.data_ptr(), *map(_pointers, sums))
+    run = functools.partial(_run, "blend_gradient", *arguments)
+    _interruptible(run, scene.cancelled.contents, scene.rows * scene.columns)
+    return [t for of_surface in zip(*sums, strict=True) for t in of_surface if t is not None]
+
+
+def _layers_of(
+    surfaces: Sequence[Surface],
+    margin: int,
+    area: tuple[int, int],
+    nodes: Sequence[float],
+    layers: Sequence[tuple[Tensor, int]],
+    occlusion: bool,
+    backed: bool,
+) -> tuple[_Layers, list[Any]]:
+    """The structure for :func:`blend`, and the memory to which it points.
 
     Args:
+        surfaces: One, or two that share each pixel, with places on the blur axis instead of the coc.
         margin: Pixels of the maps before the picture.
         area: Height and width of the picture. They, the margin and the maps' sizes are multiples of all pixel sizes.
         nodes: Positions of the layers on the blur axis, near to far.
@@ -327,70 +317,16 @@ class FrameLayers(NamedTuple):
         occlusion: Whether layers occlude each other; otherwise their light and weights are added.
         backed: Whether the transmittance of all layers is computed, not their coverage.
     """
-
-    margin: int
-    area: tuple[int, int]
-    nodes: Sequence[float]
-    layers: Sequence[tuple[Tensor, int]]
-    occlusion: bool
-    backed: bool
-
-
-def blend(surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: FrameLayers) -> Tensor:
-    """Blurs and composites the layers of a padded frame, as :func:`torchdof.render.composite.over`, for one image.
-
-    Args:
-        surfaces: Light ``[C, rows, columns]``, position on the blur axis and weight ``[rows, columns]`` (None: 1) of
-            one surface, or of two that share each pixel; float32.
-        frame: Layers and geometry.
-
-    Returns:
-        Light, then coverage or transmittance of each colour of the kernels (or, without occlusion, the sum of weights),
-        ``[planes, height, width]``, float32; the same bits for any number of threads.
-    """
-    scene, _memory = _layers_of(surfaces, frame)
-    out = torch.empty(scene.channels + scene.kernel_colours, *frame.area, dtype=torch.float32, device="cpu")
-    _blended(scene, lambda: _engine().torchdof_blend(ctypes.byref(scene), out.data_ptr()))
-    return out
-
-
-def blend_gradient(
-    surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: FrameLayers, gradient: Tensor
-) -> list[Tensor]:
-    """The gradients of :func:`blend` by its surfaces, given the one by its result, ``[planes, height, width]``.
-
-    Returns:
-        Gradients by light, position and, if it has one, weight of each surface, in this order.
-    """
-    (scene, _memory), gradient = _layers_of(surfaces, frame), gradient.contiguous()
-    sums = [
-        [None if t is None else torch.zeros_like(t, memory_format=torch.contiguous_format) for t in each]
-        for each in zip(*surfaces, strict=True)
-    ]
-    arguments = (ctypes.byref(scene), gradient.data_ptr(), *map(_pointers, sums))
-    _blended(scene, lambda: _engine().torchdof_blend_gradient(*arguments))
-    return [t for of_surface in zip(*sums, strict=True) for t in of_surface if t is not None]
-
-
-def _layers_of(
-    surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]], frame: FrameLayers
-) -> tuple[_Layers, list[Any]]:
-    """The structure for :func:`blend`, and the memory to which it points."""
     maps = [[None if t is None else t.contiguous() for t in each] for each in zip(*surfaces, strict=True)]
-    of_layers, kernels = _of_layers(frame.nodes, frame.layers)
+    of_layers, kernels = _of_layers(nodes, layers)
     channels, rows, columns = surfaces[0][0].shape
-    cancelled = ctypes.c_int32(0)
-    size = (rows, columns, frame.margin, *frame.area, channels, len(surfaces))
-    how = (frame.occlusion, frame.backed, *of_layers, torch.get_num_threads(), ctypes.pointer(cancelled))
+    size = (rows, columns, margin, *area, channels, len(surfaces))
+    how = (occlusion, backed, *of_layers, torch.get_num_threads(), ctypes.pointer(ctypes.c_int32(0)))
     return _Layers(*size, *map(_pointers, maps), *how), [maps, kernels]
 
 
-def _blended(scene: _Layers, run: Callable[[], int]) -> None:
-    _interruptible(lambda: _check(run()), scene.cancelled.contents, scene.rows * scene.columns)
-
-
 def _of_layers(nodes: Sequence[float], layers: Sequence[tuple[Tensor, int]]) -> tuple[list[Any], Tensor]:
-    """Values of :data:`_OF_LAYERS`, and the memory of the kernels, which must outlive them."""
+    """Values of :data:`_LAYERS`, and the memory of the kernels, which must outlive them."""
     kernels, count = [kernel.float() for kernel, _ in layers], len(nodes)
     colours = max(kernel.shape[0] for kernel in kernels)
     bank = torch.cat([kernel.expand(colours, -1, -1).flatten() for kernel in kernels])
@@ -406,194 +342,125 @@ def _of_layers(nodes: Sequence[float], layers: Sequence[tuple[Tensor, int]]) -> 
 
 
 def farthest(maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
-    """The finest level of a pyramid of an image's farthest surfaces, as ``torchdof.render.disocclusion`` defines it.
+    """The finest level of a pyramid of the farthest surfaces, as ``torchdof.render.disocclusion`` defines it.
 
-    Args:
-        maps: Light ``[C, H, W]`` and coc ``[1, H, W]`` of each pixel's own surface, the same of its other surface, the
-            weight of the other one ``[1, H, W]``, the light above which a pixel is a highlight ``[1, H, W]``, and
-            optionally ``[1, H, W]`` with 0 for pixels that are left out; float32.
-        size: Height and width of the level, h and w.
-
-    Returns:
-        Light, coc and weight, ``[C + 2, h, w]``, float32; the same bits for any number of threads.
-
-    Raises:
-        MemoryError: If there is not enough memory.
+    ``maps`` are those of ``_finest_level`` there, for one image; ``size`` is the level's height and width. The result
+    is light, coc and weight, ``[C + 2, h, w]``.
     """
-    arguments, memory = _farthest_arguments(maps, size)
+    memory = [values.contiguous() for values in maps]
     out = torch.empty(memory[0].shape[0] + 2, *size, dtype=torch.float32, device="cpu")
-    _check(_engine().torchdof_farthest(*arguments, out.data_ptr()))
+    _run("farthest", _pointers([*memory, None]), *memory[0].shape, *size, torch.get_num_threads(), out.data_ptr())
     return out
 
 
 def farthest_gradient(maps: Sequence[Tensor], size: tuple[int, int], gradient: Tensor) -> list[Tensor]:
-    """The gradients of :func:`farthest` by its first five maps, given the one by its result, ``[C + 2, h, w]``.
-
-    Raises:
-        MemoryError: If there is not enough memory.
-    """
-    (arguments, memory), gradient = _farthest_arguments(maps, size), gradient.contiguous()
+    """The gradients of :func:`farthest` by its first five maps."""
+    memory, gradient = [values.contiguous() for values in maps], gradient.contiguous()
     sums = [torch.zeros_like(values) for values in memory[:5]]
-    _check(_engine().torchdof_farthest_gradient(*arguments, gradient.data_ptr(), _pointers(sums)))
+    arguments = (*memory[0].shape, *size, torch.get_num_threads(), gradient.data_ptr(), _pointers(sums))
+    _run("farthest_gradient", _pointers([*memory, None]), *arguments)
     return sums
-
-
-def _farthest_arguments(maps: Sequence[Tensor], size: tuple[int, int]) -> tuple[tuple[Any, ...], list[Tensor]]:
-    """Arguments of both functions, and the memory to which they point."""
-    memory = [values.contiguous() for values in maps]
-    return (_pointers([*memory, None]), *memory[0].shape, *size, torch.get_num_threads()), memory
 
 
 def matte(maps: Sequence[Tensor]) -> Tensor:
     """Splits the pixels of an image at depth edges between two surfaces, as ``torchdof.render.matting.matte``.
 
-    Args:
-        maps: Light ``[C, H, W]``, signed coc ``[1, H, W]`` and optionally ``[1, H, W]`` with 0 for pixels that are left
-            out; float32.
-
-    Returns:
-        Light of each pixel's own surface, light of the other one, and coc and weight of the other one,
-        ``[2 C + 2, H, W]``, float32; the same bits for any number of threads.
-
-    Raises:
-        MemoryError: If there is not enough memory.
+    ``maps`` are light ``[C, H, W]``, signed coc ``[1, H, W]`` and optionally ``[1, H, W]`` with 0 for pixels that are
+    left out. The result ``[2 C + 2, H, W]`` is light of each pixel's own surface, and light, coc and weight of the
+    other one.
     """
     memory = [values.contiguous() for values in maps]
     out = torch.empty(2 * len(memory[0]) + 2, *memory[0].shape[1:], dtype=torch.float32, device="cpu")
-    arguments = (*memory[0].shape, torch.get_num_threads(), None, _pointers([out]))
-    _check(_engine().torchdof_matte(_pointers([*memory, None]), *arguments))
+    _run("matte", _pointers([*memory, None]), *memory[0].shape, torch.get_num_threads(), None, _pointers([out]))
     return out
 
 
 def matte_gradient(maps: Sequence[Tensor], gradient: Tensor) -> list[Tensor]:
-    """The gradients of :func:`matte` by light and coc, given the one by its result, ``[2 C + 2, H, W]``.
-
-    Raises:
-        MemoryError: If there is not enough memory.
-    """
+    """The gradients of :func:`matte` by light and coc."""
     memory, gradient = [values.contiguous() for values in maps], gradient.contiguous()
     found = [torch.empty_like(values) for values in memory[:2]]
     arguments = (*memory[0].shape, torch.get_num_threads(), gradient.data_ptr(), _pointers(found))
-    _check(_engine().torchdof_matte(_pointers([*memory, None]), *arguments))
+    _run("matte", _pointers([*memory, None]), *arguments)
     return found
 
 
 def look_behind(levels: Sequence[Tensor], rules: Rules, coc: Tensor) -> Tensor:
-    """Surfaces behind those of an image with coc ``[H, W]``, as ``torchdof.render.disocclusion`` defines them.
+    """Surfaces behind those of an image with coc ``[1, H, W]``, as ``torchdof.render.disocclusion`` defines them.
 
     Args:
-        levels: Light, coc and weight of each level of a pyramid, ``[C + 2, h, w]``, float32.
+        levels: Light, coc and weight of each level of a pyramid, ``[C + 2, h, w]``.
         rules: For each level the distance of two samples in pixels, the smallest blur at which a pixel reads it, the
             votes for each weight, and the most votes.
         coc: Signed coc of the image.
 
     Returns:
-        Light, coc and votes, ``[C + 2, H, W]``, float32; the same bits for any number of threads.
+        Light, coc and votes, ``[C + 2, H, W]``.
     """
     coc, levels = coc.contiguous(), [values.contiguous() for values in levels]
-    out = torch.empty(levels[0].shape[0], *coc.shape, dtype=torch.float32, device="cpu")
-    _check(_engine().torchdof_look_behind(*_level_arguments(levels, rules, coc), out.data_ptr()))
+    out = torch.empty(levels[0].shape[0], *coc.shape[1:], dtype=torch.float32, device="cpu")
+    _run("look_behind", *_level_arguments(levels, rules, coc), out.data_ptr())
     return out
 
 
 def look_behind_gradient(levels: Sequence[Tensor], rules: Rules, coc: Tensor, gradient: Tensor) -> list[Tensor]:
-    """The gradients of :func:`look_behind` by coc and by each level, given the one by its result, ``[C + 2, H, W]``."""
+    """The gradients of :func:`look_behind` by coc and by each level."""
     coc, levels, gradient = coc.contiguous(), [values.contiguous() for values in levels], gradient.contiguous()
     of_coc, of_levels = torch.empty_like(coc), [torch.zeros_like(values) for values in levels]
     pointers = (gradient.data_ptr(), _pointers(of_levels), of_coc.data_ptr())
-    _check(_engine().torchdof_look_behind_gradient(*_level_arguments(levels, rules, coc), *pointers))
+    _run("look_behind_gradient", *_level_arguments(levels, rules, coc), *pointers)
     return [of_coc, *of_levels]
 
 
 def _level_arguments(levels: Sequence[Tensor], rules: Rules, coc: Tensor) -> tuple[Any, ...]:
     each = [_Level(values.data_ptr(), *values.shape[1:], *rule) for values, rule in zip(levels, rules, strict=True)]
     count, threads = len(each), torch.get_num_threads()
-    return _array(_Level, count)(*each), count, levels[0].shape[0] - 2, coc.data_ptr(), *coc.shape, threads
+    return _array(_Level, count)(*each), count, levels[0].shape[0] - 2, coc.data_ptr(), *coc.shape[1:], threads
 
 
 def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool = False) -> Tensor:
     """Repairs the edges of a depth map, as :func:`torchdof.render.edges.repair`, for one image.
 
-    Args:
-        light: ``[C, H, W]``, float32.
-        nearness: ``[H, W]``, float32.
-        step: ``[H, W]`` or ``[]``, float32.
-        auto: As in that function.
-        of_coc: As in that function.
-
-    Returns:
-        ``[H, W]``, float32; the same bits for any number of threads. The input itself if it needs no repair.
+    ``light`` is ``[C, H, W]``, ``nearness`` ``[H, W]``, ``step`` ``[H, W]`` or ``[]``. The result ``[H, W]`` is the
+    input itself if it needs no repair.
     """
     light, nearness, step = light.contiguous(), nearness.contiguous(), step.contiguous()
     out, cancelled, changed = torch.empty_like(nearness), ctypes.c_int32(0), ctypes.c_int32(0)
-    same = step.ndim == 0
-    height, width = nearness.shape
-    scene = _Map(
-        height,
-        width,
-        light.shape[0],
-        light.data_ptr(),
-        nearness.data_ptr(),
-        of_coc,
-        None if same else step.data_ptr(),
-        float(step) if same else 0.0,
-        auto,
-        torch.get_num_threads(),
-        ctypes.pointer(cancelled),
-        out.data_ptr(),
-    )
-
-    def run() -> None:
-        _check(_engine().torchdof_repair_edges(ctypes.byref(scene), ctypes.byref(changed)))
-
-    _interruptible(run, cancelled, height * width)
+    steps = (None, float(step)) if step.ndim == 0 else (step.data_ptr(), 0.0)
+    maps = (*nearness.shape, light.shape[0], light.data_ptr(), nearness.data_ptr(), of_coc, *steps)
+    scene = _Map(*maps, auto, torch.get_num_threads(), ctypes.pointer(cancelled), out.data_ptr())
+    run = functools.partial(_run, "repair_edges", ctypes.byref(scene), ctypes.byref(changed))
+    _interruptible(run, cancelled, nearness.numel())
     return out if changed.value else nearness
 
 
 def coc_px(depth: Tensor, scale: float, nearest_m: float, farthest_m: float) -> Tensor:
-    """Signed circle of confusion, as :meth:`torchdof.Camera.coc_px` for a lens without tilt.
+    """Signed circle of confusion in pixels, as :meth:`torchdof.Camera.coc_px` for a lens without tilt.
 
-    Args:
-        depth: Metres, any shape, float32. The result is NaN where depth is not > 0.
-        scale: Radius in pixels for each dioptre between a depth and the focus.
-        nearest_m: Nearest distance in focus.
-        farthest_m: Farthest distance in focus.
-
-    Returns:
-        Pixels, float32, in the shape of ``depth``.
+    ``depth`` in metres has any shape; ``scale`` is the radius in pixels for each dioptre between a depth and the focus,
+    and depths from ``nearest_m`` to ``farthest_m`` are in focus. NaN where depth is not > 0.
     """
     depth = depth.contiguous()
     out, threads = torch.empty_like(depth), torch.get_num_threads()
-    arguments = (depth.numel(), scale, nearest_m, farthest_m, threads, out.data_ptr())
-    _check(_engine().torchdof_coc(depth.data_ptr(), *arguments))
+    _run("coc", depth.data_ptr(), depth.numel(), scale, nearest_m, farthest_m, threads, out.data_ptr())
     return out
 
 
 def plan(coc_px: Tensor, tolerance: float) -> tuple[tuple[float, ...], float]:
-    """Positions of the layers for a frame, as ``torchdof.render.plan.Plan.for_scene``.
-
-    Args:
-        coc_px: Signed coc of the frame, ``[B, 1, H, W]``, float32, in pixels.
-        tolerance: Largest error of the picture.
-
-    Returns:
-        Positions of the layers on the blur axis, near to far, and the tolerance, smaller in a frame as small as its
-        blurs, larger in a rough one.
-    """
-    coc_px, kept, count, capacity = coc_px.contiguous(), ctypes.c_double(tolerance), ctypes.c_int32(), 256
+    """Positions of the layers for a frame ``[B, 1, H, W]``, and its tolerance, as ``torchdof.render.plan``."""
+    coc_px, kept, count, capacity = coc_px.contiguous(), ctypes.c_double(), ctypes.c_int32(), 256
     while True:
         nodes = _array(ctypes.c_double, capacity)()
         size = (coc_px.shape[0], *coc_px.shape[-2:])
         kept.value = tolerance
         arguments = (*size, ctypes.byref(kept), torch.get_num_threads(), nodes, capacity, ctypes.byref(count))
-        _check(_engine().torchdof_plan(coc_px.data_ptr(), *arguments))
+        _run("plan", coc_px.data_ptr(), *arguments)
         if count.value <= capacity:
             return tuple(nodes[: count.value]), kept.value
         capacity = count.value
 
 
 def kernels(spots: Spots, *, squeeze: float, is_round: bool, is_even: bool) -> list[Tensor]:
-    """Makes the kernels of a lens, with as many threads as PyTorch uses.
+    """Makes the kernels of a lens.
 
     Args:
         spots: Input from which they are made.
@@ -602,7 +469,7 @@ def kernels(spots: Spots, *, squeeze: float, is_round: bool, is_even: bool) -> l
         is_even: Whether they are constant within their radius.
 
     Returns:
-        Kernels ``[C, 2 half + 1, 2 half + 1]``, float32, non-negative; they sum to 1 unless they are cropped.
+        Kernels ``[C, 2 half + 1, 2 half + 1]``, non-negative; they sum to 1 unless they are cropped.
     """
     count, colours = len(spots.reach), len(spots.reach[0])
     sides = [2 * half + 1 for half in spots.half]
@@ -617,7 +484,7 @@ def kernels(spots: Spots, *, squeeze: float, is_round: bool, is_even: bool) -> l
     numbers = [_array(ctypes.c_double, len(each))(*each) for each in (spots.part, spots.finer, reach, fade)]
     arrays = [*whole[:2], *numbers, *whole[2:]]
     scene = _Spots(count, colours, _pointers(spots.templates), *arrays, squeeze, is_round, is_even)
-    _check(_engine().torchdof_kernels(ctypes.byref(scene), torch.get_num_threads(), _pointers(made)))
+    _run("kernels", ctypes.byref(scene), torch.get_num_threads(), _pointers(made))
     return made
 
 
@@ -628,17 +495,8 @@ def ends(values: Tensor) -> tuple[float, float]:
     """
     values, low, high = values.contiguous(), ctypes.c_float(), ctypes.c_float()
     threads = torch.get_num_threads()
-    _check(_engine().torchdof_ends(values.data_ptr(), values.numel(), threads, ctypes.byref(low), ctypes.byref(high)))
+    _run("ends", values.data_ptr(), values.numel(), threads, ctypes.byref(low), ctypes.byref(high))
     return low.value, high.value
-
-
-def convolve(values: Tensor, kernel: Tensor) -> Tensor:
-    """Convolves values ``[H, W]`` with a kernel ``[k, k]``, float32; light that leaves the frame is lost."""
-    out, values, kernel = torch.empty_like(values), values.contiguous(), kernel.contiguous()
-    _engine().torchdof_convolve(
-        values.data_ptr(), *values.shape, kernel.data_ptr(), kernel.shape[-1] // 2, out.data_ptr()
-    )
-    return out
 
 
 def _interruptible(run: Callable[[], None], cancelled: ctypes.c_int32, pixels: int) -> None:
@@ -678,7 +536,9 @@ def _interruptible(run: Callable[[], None], cancelled: ctypes.c_int32, pixels: i
         raise failure[0]
 
 
-def _check(status: int) -> None:
+def _run(name: str, *arguments: Any) -> None:
+    """Calls a function of the engine, and raises the error that its status means."""
+    status = getattr(_engine(), f"torchdof_{name}")(*arguments)
     if status == _NO_MEMORY:
         raise MemoryError("there is too little memory to render this image")
     if status == _TOO_BRIGHT:

@@ -13,8 +13,6 @@ from torch import Tensor
 from ..tensors import floating
 from ..validation import real_tensor, show
 
-__all__ = ["Attention", "box_around", "weight_map"]
-
 Attention = tuple[float, float, float] | Tensor
 """A disc ``(x, y, radius)`` in pixels at which the viewer looks, or a map ``[B or 1, 1, H, W]``, 0 to 1."""
 

@@ -16,14 +16,13 @@ Reference:
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
 from ..optics.kernel_cache import kept
-
-__all__ = ["continued"]
 
 _WIDTH = 4  # half width of the mean along the border, over the distance from the border; larger smooths more
 _BINS = 16  # number of bins; more of them separate more surfaces
@@ -56,22 +55,15 @@ def continued(
             surface belong together.
         image_x: The same for the image itself, ``[B, 1, H, W]``; None: it equals ``x``.
     """
-    count = len(lights)
+    maps = [lights, [weight], [x], [limit] * len(lights), [image_x] * len(lights)]
     rows, columns = (
-        _beyond(
-            _both(lights, dim),
-            None if weight is None else _both([weight], dim),
-            None if x is None else _both([x], dim),
-            None if limit is None else _both([limit] * count, dim),
-            None if image_x is None else _both([image_x] * count, dim),
-            farthest,
-        ).unflatten(1, (count, -1))
-        for dim in (-2, -1)
+        _beyond(farthest, *(_both(each, dim) for each in maps)).unflatten(1, (len(lights), -1)) for dim in (-2, -1)
     )  # [2, S, B, C, farthest, W]: top and bottom; [2, S, B, C, farthest, H]: left and right
     # corners: the continuations of the row (outwards) and of the column (sideways)
     outwards = torch.stack([rows[..., 0], rows[..., -1]], 1)[..., None]  # [top or bottom, left or right, ..., 1]
     sideways = torch.stack([columns[..., 0], columns[..., -1]])[..., None, :]
-    far, across = _distances(rows, farthest)[:, None], _distances(rows, farthest)
+    across = torch.arange(1, farthest + 1, device=rows.device).to(rows.dtype)
+    far = across[:, None]
     corners = (outwards * far + sideways * across) / (far + across)
     left, right, top, bottom = ends
     wide = []
@@ -85,14 +77,10 @@ def continued(
     return wide
 
 
-def _both(maps: Sequence[Tensor], dim: int) -> Tensor:
-    """First and last line of maps ``[B, c, H, W]`` along ``dim``: ``[2, maps B, c, n]``."""
-    return torch.stack([torch.cat([values.select(dim, end) for values in maps]) for end in (0, -1)])
-
-
-def _distances(like: Tensor, reach: int) -> Tensor:
-    """Distances in pixels from the frame's last pixel: 1, 2, ... ``reach``."""
-    return torch.arange(1, reach + 1, device=like.device).to(like.dtype)
+def _both(maps: Sequence[Tensor | None], dim: int) -> Any:
+    """First and last line of maps ``[B, c, H, W]`` along ``dim``: ``[2, maps B, c, n]``; None if there are no maps."""
+    known = [values for values in maps if values is not None]
+    return torch.stack([torch.cat([values.select(dim, end) for values in known]) for end in (0, -1)]) if known else None
 
 
 def _bins(x: Tensor, image_x: Tensor) -> Tensor:
@@ -111,7 +99,7 @@ def _step(difference: Tensor) -> Tensor:
 
 
 def _beyond(
-    line: Tensor, weight: Tensor | None, x: Tensor | None, most: Tensor | None, image_x: Tensor | None, farthest: int
+    farthest: int, line: Tensor, weight: Tensor | None, x: Tensor | None, most: Tensor | None, image_x: Tensor | None
 ) -> Tensor:
     """Continue lines ``[..., C, n]`` at the border by ``farthest`` pixels, nearest first: ``[..., C, farthest, n]``.
 

@@ -8,16 +8,15 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from .. import native
 from ..tensors import recomputed
 from . import field
-from .compiled_steps import blended
+from .compiled_steps import compiled_step
 from .downsampling import downsampled, upsampled
 from .ops import EAGER, Ops
 from .plan import LayerKernel
 from .scatter import fold
-from .surfaces import PaddedFrame
-
-__all__ = ["Scatter", "accumulate", "accumulate_once", "mean", "over"]
+from .surfaces import PaddedFrame, PaddedSurface
 
 Scatter = Callable[[Tensor, Tensor, int], Tensor]
 """``(light [B, C, H, W], kernels [1 or C, k, k], halo) -> [B, C, H - 2 halo, W - 2 halo]``."""
@@ -25,84 +24,41 @@ Scatter = Callable[[Tensor, Tensor, int], Tensor]
 Picture = tuple[Tensor, Tensor]
 """Light ``[B, C, h, w]`` and its weight ``[B, 1 or C, h, w]``: a sum of weights, a coverage or a transmittance."""
 
-Pictures = Sequence[Picture]
-Lights = Sequence[Tensor]  # an alias, because torch.compile evaluates the annotations of inner functions
-
 _LEAST = 1e-6  # scattered weight, of 1: pixels with less are unknown and become 0
 _KNOWN = 0.002  # scattered weight, of 1: layers with less cover gradually less; larger fades more of them
 
 
 def over(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter: Scatter, ops: Ops = EAGER) -> Tensor:
-    """Normalised "over" of soft layers.
+    """Normalised "over" of soft layers: ``[B, C, H, W]``. Pixels that no layer covers show ``frame.behind``.
 
     With ``m_k`` the weight of layer k, ``M_k`` the weight at or behind it and ``K_k`` its kernel:
     ``colour = K_k * (m_k I) / K_k * M_k``, coverage ``a = K_k * m_k / K_k * M_k``, ``out = colour + (1 - a) out``.
     Dividing by ``K_k * M_k`` keeps a surface that spans several layers closed and lets the background reach under the
     blurred edge of a foreground. Where ``K_k * M_k`` is near 0 the coverage fades to 0; otherwise the first bit of
-    weight in a layer would change the picture abruptly. Pixels that no layer covers show ``frame.behind``.
-
-    Args:
-        frame: Surfaces of each pixel.
-        blurs: Kernel and resolution of each layer.
-        scatter: Function that scatters a layer.
-        ops: Operations; ``ops.choose`` skips empty layers.
+    weight in a layer would change the picture abruptly.
 
     Reference:
         Ikoma, Nguyen, Metzler, Peng, Wetzstein, "Depth from defocus with learned optics", ICCP 2021.
     """
-    colours, backed = frame.colours, frame.behind is not None
-
-    # The second part of a picture is the transmittance 1 - a, computed as a sum of positive terms: a difference would
-    # round badly behind bright light. If ``frame.behind`` is None, it is the coverage a, which divides the final light.
-    def normalised(lights: Lights, weight: Tensor, beyond: Tensor) -> Pictures:
-        lacking = (_KNOWN - weight - beyond).clamp_min(0.0)
-        beyond = beyond + lacking * lacking * (0.5 / _KNOWN)
-        known = weight + beyond
-        share = (beyond if backed else weight) / known
-        return [(light / k, s) for light, k, s in zip(lights, *_each(known, share, layers=len(lights)), strict=True)]
-
-    def composited(front: Picture, behind: Picture) -> Picture:
-        (light, share), (light_behind, share_behind) = front, behind
-        left = share if backed else (1.0 - share).clamp_min(0.0)
-        share = left * share_behind if backed else torch.addcmul(share, left, share_behind)
-        return torch.addcmul(light, left, light_behind), share
-
-    def plain(frame: PaddedFrame) -> Tensor:
-        empty = 1.0 if backed else 0.0
-        return _composite_layers(frame.near_to_far(), blurs, scatter, composited, ops, empty, normalised)
-
-    picture = _picture(frame, blurs, scatter, backed, plain)
-    light, left = _parts(picture, colours)
-    out = mean(picture, colours) if frame.behind is None else torch.addcmul(light, left, frame.behind)
+    picture = _layers(frame, blurs, scatter, ops)
+    light, left = _parts(picture, frame.colours)
+    out = mean(picture, frame.colours) if frame.behind is None else torch.addcmul(light, left, frame.behind)
     return out[..., : frame.size[0], : frame.size[1]]
 
 
 def accumulate(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter: Scatter, ops: Ops = EAGER) -> Tensor:
-    """The paper's scatter: add the light of all layers, ignoring occlusion; channels of weights follow the light.
-
-    Pass the result to :func:`mean`. Arguments are those of :func:`over`.
+    """The paper's scatter: the light of all layers, ignoring occlusion, then the sum of its weights, for :func:`mean`.
 
     Reference:
         Sato, Dobashi, Yamamoto, section 3.
     """
-
-    def added(front: Picture, behind: Picture) -> Picture:
-        return front[0] + behind[0], front[1] + behind[1]
-
-    def plain(frame: PaddedFrame) -> Tensor:
-        return _composite_layers(frame, blurs, scatter, added, ops)
-
-    return _picture(frame, blurs, scatter, False, plain)[..., : frame.size[0], : frame.size[1]]
+    return _layers(frame, blurs, scatter, ops)[..., : frame.size[0], : frame.size[1]]
 
 
 def accumulate_once(frame: PaddedFrame, blurs: Sequence[LayerKernel]) -> Tensor:
     """The scatter of :func:`accumulate` as in the paper: one pass, in which each pixel has its own kernel.
 
     The kernel is interpolated between those of the two layers around the pixel's coc, at full resolution.
-
-    Reference:
-        Sato, Dobashi, Yamamoto, section 3: (a) read the depth, (b) choose its blur texture, (c) multiply and
-        accumulate.
     """
     halo = frame.margin
     weights = frame.layers(0, len(blurs), halo)[1][:, :, 0]
@@ -115,69 +71,84 @@ def accumulate_once(frame: PaddedFrame, blurs: Sequence[LayerKernel]) -> Tensor:
     return summed[..., : frame.size[0], : frame.size[1]]
 
 
-def _picture(
-    frame: PaddedFrame,
-    blurs: Sequence[LayerKernel],
-    scatter: Scatter,
-    backed: bool,
-    plain: Callable[[PaddedFrame], Tensor],
-) -> Tensor:
-    """All layers of a frame, composited by the compiled engine if it supports the arguments, else by ``plain(frame)``.
+def _layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter: Scatter, ops: Ops) -> Tensor:
+    """:func:`_composite_layers`, by the compiled engine if it can compute it."""
+    kernels, maps = [blur.kernel for blur in blurs], [t for s in frame.surfaces for t in s if t is not None]
+    each = len(maps) // len(frame.surfaces)
 
-    ``backed`` is as for :func:`torchdof.render.compiled_steps.blended`.
-    """
-    picture = None
-    if scatter is not fold and blurs[0].mask is None:
-        layers = [(blur.kernel, blur.scale) for blur in blurs]
-        picture = blended(frame, layers, backed, lambda surfaces: plain(dataclasses.replace(frame, surfaces=surfaces)))
-    return plain(frame) if picture is None else picture
+    def surfaces(maps: tuple[Tensor, ...]) -> list[PaddedSurface]:
+        return [PaddedSurface(*maps[i : i + each]) for i in range(0, len(maps), each)]
+
+    def plain(*maps: Tensor) -> Tensor:
+        given = dataclasses.replace(frame, surfaces=surfaces(maps))
+        return _composite_layers(given.near_to_far(), blurs, scatter, ops)
+
+    planes, half = frame.colours + max(k.shape[-3] for k in kernels), max(blur.half for blur in blurs)
+    found, is_one_plan = None, len(frame.nodes) == 1 and not frame.stacked
+    if is_one_plan and planes <= native.MOST_PLANES and half <= native.HALF_LARGEST:
+        if scatter is not fold and blurs[0].mask is None and not any(k.requires_grad for k in kernels):
+            scaled = [(blur.kernel, blur.scale) for blur in blurs]
+            how = (frame.margin, frame.area, frame.nodes[0], scaled, frame.occlusion, frame.behind is not None)
+            found = compiled_step(
+                lambda *maps: native.blend(surfaces(maps), *how),
+                lambda gradient, *maps: native.blend_gradient(gradient, surfaces(maps), *how),
+                plain,
+                *maps,
+            )
+    return plain(*maps) if found is None else found
 
 
-def _composite_layers(
-    frame: PaddedFrame,
-    blurs: Sequence[LayerKernel],
-    scatter: Scatter,
-    composited: Callable[[Picture, Picture], Picture],
-    ops: Ops,
-    empty: float = 0.0,
-    normalised: Callable[[Lights, Tensor, Tensor], Pictures] | None = None,
-) -> Tensor:
+def _composite_layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter: Scatter, ops: Ops) -> Tensor:
     """Composite all layers, far to near: light ``[B, C, h, w]`` followed by its weights.
+
+    The weight is the transmittance of all layers, or, if there is no light behind them, the coverage, by which the
+    final light is divided; without occlusion the sum of weights. It has C channels if each colour has its own kernel.
 
     1. Drop empty layers.
     2. Group neighbours of one resolution whose kernels have similar sizes.
-    3. Scatter each group by one convolution, and convert it to pictures with ``normalised(lights, weights, behind)``.
-    4. Put them in front of the picture at their resolution with ``composited(front, behind)``.
+    3. Scatter each group by one convolution.
+    4. Put its layers in front of the picture at their resolution.
     5. Upsample coarse results and put them in front of the full picture in the same way.
-
-    Weights have one channel, or C if each colour has its own kernel; without any layer they are ``empty``.
     """
     order = [k for k, occupied in enumerate(frame.occupied()) if occupied][::-1]
-    light, colours = frame.surfaces[0].light, frame.colours
+    light, colours, backed = frame.surfaces[0].light, frame.colours, frame.behind is not None
     each = blurs[0].kernel.shape[-3]
 
     def blank(height: int, width: int) -> Tensor:
         none = light.new_zeros(light.shape[0], colours, height, width)
-        return torch.cat([none, light.new_full((light.shape[0], each, height, width), empty)], 1)
+        return torch.cat([none, light.new_full((light.shape[0], each, height, width), 1.0 if backed else 0.0)], 1)
 
-    def in_front(part: Tensor, group: list[int]) -> Tensor:
-        """Put a group of layers in front of a picture."""
-        lights, *weights = _scattered(frame, blurs, scatter, group, normalised is not None)
-        if normalised is None:
-            layers: Pictures = list(zip(lights, *_each(weights[0], layers=len(group)), strict=True))
-        else:
-            layers = normalised(lights, *weights)
-        front = _parts(part, colours)
-        for layer in reversed(layers):
-            front = composited(layer, front)
-        return torch.cat(front, 1)
+    def in_front(front: Picture, behind: Picture) -> Picture:
+        (light, share), (light_behind, share_behind) = front, behind
+        if not frame.occlusion:
+            return light + light_behind, share + share_behind
+        left = share if backed else (1.0 - share).clamp_min(0.0)
+        share = left * share_behind if backed else torch.addcmul(share, left, share_behind)
+        return torch.addcmul(light, left, light_behind), share
+
+    def with_group(part: Tensor, group: list[int]) -> Tensor:
+        """A picture with a group of layers in front of it."""
+        lights, weights = _scattered(frame, blurs, scatter, group)
+        shares = weights[0].split(each, 1)
+        if frame.occlusion:
+            weight, beyond = weights
+            lacking = (_KNOWN - weight - beyond).clamp_min(0.0)
+            beyond = beyond + lacking * lacking * (0.5 / _KNOWN)
+            known = weight + beyond
+            # the transmittance as a sum of positive terms: a difference would round badly behind bright light
+            shares = ((beyond if backed else weight) / known).split(each, 1)
+            lights = [light / k for light, k in zip(lights, known.split(each, 1), strict=True)]
+        picture = _parts(part, colours)
+        for layer in list(zip(lights, shares, strict=True))[::-1]:
+            picture = in_front(layer, picture)
+        return torch.cat(picture, 1)
 
     picture = blank(*frame.area)
 
     # A run has one resolution. A coarse one stays on one side of the focus, because finer layers lie between the sides.
     # A group of a run has at most as many layers as fill the channels of one convolution.
     uniform = each == 1 and blurs[0].mask is None
-    most = ops.channels // (colours + (2 if normalised else 1)) if uniform else 1
+    most = ops.channels // (colours + 1 + frame.occlusion) if uniform else 1
     runs: dict[tuple[int, bool], list[list[int]]] = {}
     for k in order:
         groups = runs.setdefault((blurs[k].scale, blurs[k].scale > 1 and min(row[k] for row in frame.nodes) < 0), [])
@@ -192,29 +163,29 @@ def _composite_layers(
         if scale > 1:  # one more pixel on each side, for the interpolation
             part = blank(*(n // scale + 2 for n in frame.area))
         for group in groups:
-            front = recomputed(functools.partial(in_front, part, group))
+            front = recomputed(functools.partial(with_group, part, group))
             part = ops.choose(_needed(frame, blurs, group), front, part)
         if scale > 1:
             fine = upsampled(part, scale)
             fine = fine[..., scale:-scale, scale:-scale]
             needed = _needed(frame, blurs, [k for group in groups for k in group])
-            together = torch.cat(composited(_parts(fine, colours), _parts(picture, colours)), 1)
+            together = torch.cat(in_front(_parts(fine, colours), _parts(picture, colours)), 1)
             part = ops.choose(needed, together, picture)
         picture = part
     return picture
 
 
 def _scattered(
-    frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter: Scatter, group: list[int], visibility: bool
-) -> tuple[Lights, Tensor] | tuple[Lights, Tensor, Tensor]:
-    """Scatter the layers of a group, near to far: light of each, weights and, with ``visibility``, weights behind.
+    frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter: Scatter, group: list[int]
+) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+    """Scatter the layers of a group, near to far: light of each; and weights, with occlusion also the weights behind.
 
     Light is ``[B, C, h, w]``; the weights of n layers are ``[B, n, h, w]``, or ``[B, n C, h, w]`` if each colour has
     its own kernel.
     """
     halo, half, each = max(blurs[k].halo for k in group), max(blurs[k].half for k in group), blurs[0].kernel.shape[-3]
     mask, scale, kernels = blurs[group[0]].mask, blurs[group[0]].scale, blurs[group[0]].kernel
-    terms = frame.layers(min(group), len(group), halo)[: 2 + visibility]
+    terms = frame.layers(min(group), len(group), halo)[: 2 + frame.occlusion]
     if each > 1:
         terms = tuple(term.expand(-1, -1, each, -1, -1) for term in terms)
     widths = [term.shape[2] for term in terms]  # C, and 1 or C
@@ -234,7 +205,7 @@ def _scattered(
             kernels = torch.cat([kernels] * len(terms), -3)
         scattered = scatter(channels, kernels, half)
     parts = scattered.split([widths[0]] * len(group) + [width * len(group) for width in widths[1:]], 1)
-    return parts[: len(group)], *parts[len(group) :]
+    return parts[: len(group)], parts[len(group) :]
 
 
 def _needed(frame: PaddedFrame, blurs: Sequence[LayerKernel], layers: list[int]) -> Callable[[], Tensor]:
@@ -243,11 +214,6 @@ def _needed(frame: PaddedFrame, blurs: Sequence[LayerKernel], layers: list[int])
     ends = (nodes[0] - 1.0, *nodes, nodes[-1] + 1.0)
     halo = max(blurs[k].halo for k in layers)
     return functools.partial(frame.any_between, ends[min(layers)], ends[max(layers) + 2], halo)
-
-
-def _each(*weights: Tensor, layers: int) -> list[tuple[Tensor, ...]]:
-    """Split weights ``[B, n or n C, h, w]`` into those of each layer."""
-    return [t.split([t.shape[1] // layers] * layers, 1) for t in weights]
 
 
 def _parts(values: Tensor, colours: int) -> Picture:

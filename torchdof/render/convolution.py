@@ -9,8 +9,6 @@ from torch import Tensor
 
 from ..tensors import is_traced
 
-__all__ = ["CHANNELS", "DIRECT_TAPS", "convolve", "widest_float"]
-
 CHANNELS = 16
 """Channels of one depthwise convolution: on CPUs fewer take as long, in PyTorch and in onnxruntime."""
 
@@ -29,13 +27,11 @@ def convolve(light: Tensor, kernels: Tensor, halo: int = 0, turned: bool = False
     Args:
         light: ``[B, C, H, W]``.
         kernels: ``[1 or C, k, k]``, k odd; or one set for each item, ``[B, 1 or C, k, k]``.
-        halo: Pixels on each side that scatter into the result ``[B, C, H - 2 halo, W - 2 halo]`` but are not in it.
+        halo: Pixels on each side that scatter into the result ``[B, C, H - 2 halo, W - 2 halo]`` but are not in it; at
+            most half of k.
         turned: Whether ``conv2d`` needs the kernels turned; those of a round lens are symmetric, which saves the step.
     """
     half, channels = kernels.shape[-1] // 2, light.shape[1]
-    if halo > half:
-        spare = halo - half
-        light, halo = light[..., spare : light.shape[-2] - spare, spare : light.shape[-1] - spare], half
     if half == 0:
         return light * kernels
     if (2 * half + 1) ** 2 > DIRECT_TAPS and not is_traced():

@@ -25,8 +25,6 @@ from torch import Tensor
 
 from ..optics.kernel_bank import KernelBank
 
-__all__ = ["downsampled", "shrink", "upsampled"]
-
 _LEAST = 0.5  # lower limit of the factor, for kernels hardly wider than the averaging itself
 
 # The comparison in which _correction finds k
@@ -47,16 +45,9 @@ def upsampled(values: Tensor, scale: int) -> Tensor:
 
 
 def shrink(bank: KernelBank, coc_px: float, width: float, scale: int) -> float:
-    """Factor for the coc of a kernel that is used at every ``scale``-th pixel, to undo the blur of averaging.
+    """Factor, 1/2 to 1, for the coc of a kernel that is used at every ``scale``-th pixel, to undo the averaging's blur.
 
-    Args:
-        bank: Kernels of the lens.
-        coc_px: Signed coc, in pixels of the image.
-        width: Width of the image in pixels.
-        scale: Downsampling factor, a power of two.
-
-    Returns:
-        1 if ``scale`` is 1, else 1/2 to 1.
+    ``coc_px`` is the signed coc, and ``width`` the width of the image, in pixels of the image.
     """
     if bank.is_even or scale == 1:  # of a lens with a field, the masks are shrunk instead
         return 1.0

@@ -5,7 +5,6 @@ fraction of a pixel. So layers use the kernel of the place where light lands; hi
 comes from.
 """
 
-import functools
 import math
 
 import torch
@@ -14,41 +13,35 @@ from torch import Tensor
 
 from ..optics.placed_kernels import FieldMask, placed
 
-__all__ = ["BLOCK", "scattered"]
-
 BLOCK = (8, 16)
 """Height and width of a block whose pixels share a kernel, in pixels of the layer; larger: faster, less accurate."""
 
 
-def scattered(
-    mask: FieldMask,
-    light: Tensor,
-    kernel: Tensor,
-    half: int,
-    scale: int,
-    size: tuple[int, int],
-) -> Tensor:
-    """Scatters a layer's light with the kernel of the block in which it lands.
+def scattered(mask: FieldMask, light: Tensor, kernel: Tensor, half: int, scale: int, size: tuple[int, int]) -> Tensor:
+    """Scatters a layer's light with the kernel of the block in which it lands: ``[B, C, h - 2 half, w - 2 half]``.
 
     Args:
         mask: How the field changes the layer's kernel.
         light: ``[B, C, h, w]``; begins ``half`` pixels before the frame, or ``half + 1`` at coarser resolutions.
-        kernel: Kernel of the blur table, ``[1 or C, k, k]``.
-        half: Radius of the kernel: pixels on each side of ``light`` that the result lacks.
+        kernel: Kernel of the blur table, ``[1 or C, k, k]``, of radius ``half``.
+        half: Pixels on each side of ``light`` that the result lacks.
         scale: Pixel of the layer in pixels of the image.
         size: Height and width of the image.
-
-    Returns:
-        ``[B, C, h - 2 half, w - 2 half]``.
     """
     high, wide = BLOCK
     (batch, channels), (rows, columns) = light.shape[:2], (n - 2 * half for n in light.shape[2:])
     light = functional.pad(light, (0, -columns % wide, 0, -rows % high))
     mask, whole = mask.to(light), light.new_ones(())
-    places = functools.partial(_places, scale=scale, half_diagonal=0.5 * math.hypot(*size))
-    x = places(columns, wide, size[1], light)
+
+    def places(count: int, block: int, length: int) -> Tensor:
+        """Middles of the blocks along an axis, as distances from the middle of the frame in half diagonals."""
+        middle = torch.arange(0, count, block, dtype=light.dtype, device=light.device) + block / 2
+        before = 1 if scale > 1 else 0  # pixels before the frame, for interpolation
+        return ((middle - before) * scale - length / 2) / (0.5 * math.hypot(*size))
+
+    x = places(columns, wide, size[1])
     bands = []
-    for band, y in enumerate(places(rows, high, size[0], light)):
+    for band, y in enumerate(places(rows, high, size[0])):
         kernels = placed(kernel[None], [(mask, whole)], y.expand_as(x), x)  # [blocks, 1 or C, k, k]
         window = light[:, :, band * high : (band + 1) * high + 2 * half]
         blocks = window.unfold(-1, wide + 2 * half, wide).permute(0, 3, 1, 2, 4)  # [B, blocks, C, rows, columns]
@@ -57,10 +50,3 @@ def scattered(
         spread = functional.conv2d(blocks.flatten(1, 2), kernels, groups=len(kernels))
         bands.append(spread.unflatten(1, (len(x), channels)).permute(0, 2, 3, 1, 4).flatten(3))
     return torch.cat(bands, 2)[:, :, :rows, :columns].reshape(batch, channels, rows, columns)
-
-
-def _places(count: int, block: int, size: int, like: Tensor, scale: int, half_diagonal: float) -> Tensor:
-    """Middles of the blocks along an axis, as distances from the middle of the frame in half diagonals."""
-    middle = torch.arange(0, count, block, dtype=like.dtype, device=like.device) + block / 2
-    before = 1 if scale > 1 else 0  # pixels before the frame, for interpolation
-    return ((middle - before) * scale - size / 2) / half_diagonal

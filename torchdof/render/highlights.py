@@ -29,8 +29,6 @@ from .ops import EAGER, Ops
 from .plan import KERNELS_PER_PX, kernels_for
 from .surfaces import HIDDEN_WEIGHT, Highlights, Surface, continuation_weight
 
-__all__ = ["COARSE_CELL", "FACTOR", "NEARER_PX", "affordable_taps", "covered_cells", "extract", "splat", "threshold"]
-
 FACTOR = 8.0
 """A highlight is brighter than its surroundings by more than this factor."""
 
@@ -87,8 +85,7 @@ def extract(
     surface: Surface,
     limit: Tensor,
     from_px: float | Tensor = _LEAST_PX,
-    beside: Surface | None = None,
-    image_coc_px: Tensor | None = None,
+    beside: tuple[Surface, Tensor] | None = None,
     most_taps: Tensor | None = None,
     apart: bool = False,
     ops: Ops = EAGER,
@@ -110,8 +107,7 @@ def extract(
         limit: Threshold as from :func:`threshold`, ``[B, 1, H, W]``.
         from_px: Smallest blur of a highlight in pixels, of all items or ``[B, 1, 1, 1]``; its excess is splatted in
             full at 1 px more.
-        beside: The other surface of each pixel.
-        image_coc_px: Coc of the image, ``[B, 1, H, W]``; None: the cover stays that of the surface.
+        beside: The other surface of each pixel, and coc of the image, ``[B, 1, H, W]``; None keeps the cover.
         most_taps: Largest number of rays of each item ``[B]``, as from :func:`affordable_taps`; None: 16 per pixel.
         apart: Whether each item keeps to its own number of rays. Otherwise all share the sum of them.
         ops: Keeps a frame without highlights as it is.
@@ -153,27 +149,26 @@ def extract(
     left = ops.choose(lambda: is_bright.any(), left, light)
     if weight is not None:
         cover = pixels.pick(weight, bright)
-        if beside is not None and image_coc_px is not None:
-            gap = coc - pixels.pick(beside.coc_px, bright)[0]
+        if beside is not None:
+            other, image_coc_px = beside
+            gap = coc - pixels.pick(other.coc_px, bright)[0]
             stopped = (gap - NEARER_PX).clamp(0.0, 1.0)
-            beside_peak = pixels.pick(beside.light, bright).amax(0)
+            beside_peak = pixels.pick(other.light, bright).amax(0)
             is_dark = (2.0 - beside_peak / most.clamp_min(torch.finfo(most.dtype).tiny)).clamp(0.0, 1.0)
             around = pixels.pick(image_coc_px, pixels.around(bright, image_coc_px, 2))[0]
             off_middle = (around - (coc - 0.5 * gap)).abs() / gap.clamp_min(NEARER_PX)  # 1/2 at the coc of a surface
             is_step = (1.5 - 10.0 * (3.5 - 8.0 * off_middle).clamp(0.0, 1.0).mean(0)).clamp(0.0, 1.0)
             cover = cover + continuation_weight(cover) * (stopped * is_dark * is_step)
         excess = excess * cover
-    highlights = Highlights(bright, excess, coc)
-    return surface._replace(light=left), highlights
+    return surface._replace(light=left), Highlights(bright, excess, coc)
 
 
 def affordable_taps(coc_px: Tensor, reach: Sequence[float]) -> Tensor:
     """Largest number of rays ``[B]`` of each frame with occlusion and coc ``[B, 1, H, W]``: 16 per pixel or fewer.
 
     Each ray is tested against each possible occluder, and a noisy depth map has many. So the number is inversely
-    proportional to the mean change of the coc between neighbours, above :data:`_FREE_CHANGE_PX`. It counts the rays
-    of discs. Other kernels reach ``reach`` times as far, as from :meth:`torchdof.render.plan.Plan.reach`, one number
-    for all frames or one for each.
+    proportional to the mean change of the coc between neighbours, above :data:`_FREE_CHANGE_PX`. Kernels reach
+    ``reach`` times as far as discs (:meth:`torchdof.render.plan.Plan.reach`), one number for all frames or for each.
     """
     crowd = (mean_change(coc_px.detach()) / _FREE_CHANGE_PX).clamp_min(1.0)
     area = reach[0] ** 2 if len(reach) == 1 else coc_px.new_tensor(reach) ** 2
@@ -215,11 +210,8 @@ def splat(
     """
     together = Highlights(*(torch.cat(parts, -1) for parts in zip(*rays, strict=True)))
     coc_px, in_the_way = shown[0].coc_px, _obstacles(shown) if occlusion else []
-
-    def splatted() -> Tensor:
-        return _splatted(together, coc_px, in_the_way, table, kernels_per_px, ops.lens_width)
-
-    return ops.splat(splatted, together, coc_px, in_the_way)
+    eager = functools.partial(_splatted, together, coc_px, in_the_way, table, kernels_per_px, ops.lens_width)
+    return ops.splat(eager, together, coc_px, in_the_way)
 
 
 def _splatted(
@@ -243,10 +235,10 @@ def _splatted(
     order = torch.argsort(coc.detach().abs())
     item, row, column = pixels.places(source[order], height, width)
     light, coc = light.index_select(1, order), coc.index_select(0, order)
+    radii = coc.detach().tolist()
     masks: list[FieldMask] = []
     if table.depends_on_place:
-        masks = [s.to(light) for s in ray_masks(table, coc.detach().tolist(), (height, width))]
-    radii = coc.detach().tolist()
+        masks = [mask.to(light) for mask in ray_masks(table, radii, (height, width))]
 
     def half_of(radius: float) -> int:
         return min(math.ceil(table.reach_px(radius, lens_width) + 0.5), longest - 1)
@@ -301,17 +293,10 @@ class _Occluders:
         self.shown = [torch.stack([t.flatten() for t in maps]) for maps in zip(*shown, strict=True)]
 
     def hidden(self, item: Tensor, row: Tensor, column: Tensor, coc: Tensor, step: Tensor) -> Tensor:
-        """Fraction of each ray that is blocked, ``[n, k, k]``.
+        """Fraction of each ray that is blocked, ``[n, k, k]``, of highlights ``[n]`` with their place and signed coc.
 
-        A ray that lands ``step`` from its pixel crosses a bin of coc ``c'`` at ``(1 - c' / coc) step``. The cover there
-        is interpolated between four pixels.
-
-        Args:
-            item: Index in the batch of each highlight, ``[n]``.
-            row: Row of each highlight, ``[n]``.
-            column: Column of each highlight, ``[n]``.
-            coc: Signed coc of each highlight in pixels, ``[n]``.
-            step: Offsets in pixels at which rays land, along each axis, ``[k]``.
+        A ray that lands ``step``, ``[k]`` pixels along each axis, from its pixel crosses a bin of coc ``c'`` at
+        ``(1 - c' / coc) step``. The cover there is interpolated between four pixels.
         """
         bins = torch.arange(self.bins, device=coc.device)
         nearer = self.low.index_select(0, item)[:, None] + bins
@@ -351,10 +336,8 @@ class _Occluders:
 def covered_cells(places: Sequence[tuple[Tensor, Tensor]], bins: int) -> Tensor:
     """Summed-area table of the non-empty cells of each bin: ``[bins, B, rows + 1, columns + 1]``.
 
-    Args:
-        places: Coc in bins and cover of each surface, ``[B, 1, H, W]`` each. A pixel belongs to the two bins that its
-            coc lies between.
-        bins: Number of bins.
+    ``places`` are coc in bins and cover of each surface, ``[B, 1, H, W]``. A pixel belongs to the two bins that its coc
+    lies between.
     """
     batch, _, height, width = places[0][0].shape
     rows, columns = ((n + COARSE_CELL - 1) // COARSE_CELL for n in (height, width))

@@ -15,22 +15,6 @@ from ..validation import ends
 from .convolution import widest_float
 from .layer_weights import blur_axis
 
-__all__ = [
-    "DENSE",
-    "Spread",
-    "border_nodes",
-    "extent",
-    "finest",
-    "joined",
-    "largest_radii",
-    "mean_change",
-    "moved_to_fixed",
-    "on_axis",
-    "spaced_nodes",
-    "spacing",
-    "spreads",
-]
-
 DENSE = 0.65
 """Factor on the tolerance for the spacing of coarse layers, if the coc of the scene's border is unknown.
 
@@ -107,20 +91,20 @@ def extent(coc_px: Tensor) -> tuple[float, float]:
 
 
 class Spread(NamedTuple):
-    """Values of a map from which its layers are planned, in host memory."""
+    """Values of a scene from which its layers are planned, in host memory.
+
+    They are the nearest and the farthest place on the blur axis, the places of the pixels at the frame's border, and
+    the mean change of the coc between neighbours, as from :func:`mean_change`.
+    """
 
     low: float
-    """Nearest place on the blur axis."""
     high: float
-    """Farthest place."""
     border: np.ndarray
-    """Places of the pixels at the frame's border, ``[n]``."""
     change: float
-    """Mean change of the coc between neighbouring pixels, as from :func:`mean_change`."""
 
 
-def spreads(coc_px: Tensor) -> list[Spread]:
-    """The spread of each item of ``coc_px [B, 1, H, W]``; values on another device are copied to the host once."""
+def spreads(coc_px: Tensor, count: int) -> list[Spread]:
+    """The spread of each scene, which has ``count`` maps of ``coc_px [B, 1, H, W]``, copied to the host once."""
     known = torch.nan_to_num(coc_px.detach(), nan=0.0, posinf=torch.inf, neginf=-torch.inf)
     known = known.to(torch.promote_types(known.dtype, torch.float32))
     both = torch.stack(torch.aminmax(known.flatten(1), dim=1), 1)
@@ -130,13 +114,11 @@ def spreads(coc_px: Tensor) -> list[Spread]:
     exact = np.float64 if x.dtype == torch.float64 else np.float32
     change = mean_change(known.clamp(-_reach(longest), _reach(longest)))
     values = torch.cat([change[:, None], x], 1).tolist()
-    return [Spread(low, high, np.array(border, exact), change) for change, low, high, *border in values]
-
-
-def joined(spreads: Sequence[Spread]) -> Spread:
-    """The spread of several maps of one scene."""
-    lows, highs, borders, changes = zip(*spreads, strict=True)
-    return Spread(min(lows), max(highs), np.concatenate(borders), min(changes))
+    scenes = []
+    for i in range(0, len(values), count):
+        changes, lows, highs, *borders = zip(*values[i : i + count], strict=True)
+        scenes.append(Spread(min(lows), max(highs), np.array(borders, exact).flatten(), min(changes)))
+    return scenes
 
 
 def mean_change(coc_px: Tensor) -> Tensor:
@@ -145,14 +127,15 @@ def mean_change(coc_px: Tensor) -> Tensor:
     return sums / math.prod(coc_px.shape[1:])
 
 
-def largest_radii(coc_px: Tensor) -> list[float]:
-    """Mean radius in pixels of the most blurred hundredth of each map of ``[B, 1, H, W]``.
+def largest_radii(coc_px: Tensor, count: int) -> list[float]:
+    """Mean radius in pixels of the most blurred hundredth of each scene's most blurred map, a robust largest radius.
 
-    A few pixels hardly change it.
+    Each scene has ``count`` maps of ``coc_px [B, 1, H, W]``.
     """
     radii = torch.where(torch.isnan(coc_px), 0.0, coc_px).abs().clamp(max=_reach(max(coc_px.shape[-2:]))).flatten(1)
     most = radii.topk(-(-radii.shape[1] // _FEW), sorted=False).values
-    return most.to(widest_float(most.device)).mean(1).tolist()
+    means = most.to(widest_float(most.device)).mean(1).tolist()
+    return [max(means[i : i + count]) for i in range(0, len(means), count)]
 
 
 def border_nodes(border: np.ndarray) -> list[float]:

@@ -21,8 +21,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["blur_axis", "blur_axis_of_radius", "eased", "from_blur_axis", "ramps", "weights_at_or_behind"]
-
 _SQUARE_PX = 0.5  # px of coc around which x changes from the square of the coc to the coc itself
 _IN_FOCUS = 2e-4  # x below which a pixel is in focus, at a coc of 0.01 px; larger: more pixels pass unchanged
 _FOOT = 0.15  # weight up to which an eased ramp is a parabola; larger: it leaves 0 more slowly
@@ -48,13 +46,11 @@ def from_blur_axis(x: float) -> float:
 
 
 def ramps(nodes: Sequence[Sequence[float]], like: Tensor) -> Tensor:
-    """Start and width of the layers' ramps, ``[P, 2, n + 1]``, for :func:`weights_at_or_behind`.
+    """Start and width of the layers' ramps, ``[P, 2, n + 1]`` like a tensor, for :func:`weights_at_or_behind`.
 
-    Args:
-        nodes: Places of the layers, near to far: one row for all items of a batch, or one for each item. Every pixel
-            is at or behind the first node, none behind the last. An unused layer, which no pixel lies in, has the
-            place of the next used one, or infinity behind the last used one.
-        like: Tensor with the dtype and device of the result.
+    ``nodes`` are the places of the layers, near to far: one row for all items of a batch, or one for each item. Every
+    pixel is at or behind the first node, none behind the last. An unused layer, which no pixel lies in, has the place
+    of the next used one, or infinity behind the last used one.
     """
     rows = []
     for places in nodes:
@@ -71,9 +67,8 @@ def ramps(nodes: Sequence[Sequence[float]], like: Tensor) -> Tensor:
 def weights_at_or_behind(x: Tensor, ramps: Tensor) -> Tensor:
     """Share of each pixel, 0 to 1, that lies in layer k or behind it: ``M_k`` of the composite, ``[B, n, H, W]``.
 
-    Args:
-        x: Places on the blur axis ``[B, 1, H, W]``; those beyond the outermost nodes belong to these.
-        ramps: All or some columns of the result of :func:`ramps`, ``[P, 2, n]``.
+    ``x`` are places on the blur axis ``[B, 1, H, W]``; those beyond the outermost nodes belong to these. ``ramps`` are
+    all or some columns of the result of :func:`ramps`, ``[P, 2, n]``.
     """
     start, width = ramps[..., None, None].unbind(1)
     return ((x - start) / width).clamp(0.0, 1.0)

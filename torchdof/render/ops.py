@@ -16,23 +16,21 @@ from ..tensors import is_traced
 from .convolution import CHANNELS
 from .surfaces import Highlights, PaddedFrame
 
-__all__ = ["EAGER", "Level", "Ops", "Seen"]
-
 _PART = 40_000  # pixels that are processed at once; larger: faster, with more memory
 
 
 class Level(NamedTuple):
     """A level of a pyramid: the farthest surfaces at every ``step``-th pixel.
 
-    ``values`` are light, coc and weight, ``[B, C + 2, H, W]``. ``vote`` is the weight of the level against others; None
-    means that the weights in ``values`` include it. A pixel uses the level if its blur exceeds ``least_px`` pixels, and
-    fully from twice that blur.
+    ``values`` are light, coc and weight, ``[B, C + 2, H, W]``. A sample of weight w has ``min(slope w, most)`` votes
+    against other levels. A pixel uses the level above a blur of ``least_px`` pixels, and fully from twice that blur.
     """
 
     values: Tensor
     step: int
-    vote: float | None
     least_px: float
+    slope: float
+    most: float
 
 
 Seen = tuple[Tensor, Tensor]

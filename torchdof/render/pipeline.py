@@ -29,8 +29,6 @@ from .scatter import fold
 from .surfaces import PaddedFrame, Surface, pad_to_frame
 from .traced import is_compiled
 
-__all__ = ["blur", "blur_stack"]
-
 _REACH = 4.0  # margin around an attention area, in largest blur radii; less changes its light and hidden surfaces
 _TOGETHER = 2**21  # pixels of items rendered together; larger: fewer, larger operations, and more memory
 _SAME_PX = 0.5  # px of coc: a background at most this far behind the image's surface counts as the same surface
@@ -87,8 +85,7 @@ def _planned(
             "a compiled or exported graph has one kernel a layer; take a table without vignetting or field"
         )
     wide = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
-    maps = [image, coc_px, *(behind or ())]
-    maps = [t.to(wide).contiguous() for t in maps]
+    maps = [t.to(wide).contiguous() for t in (image, coc_px, *(behind or ()))]
     maps = [(t if is_traced() else t.resolve_neg()).expand(image.shape[0], -1, -1, -1) for t in maps]
     if plan is None and is_traced():
         # Floats rebuilt from hex become constants of the graph. The options' own floats would become inputs of the
@@ -100,14 +97,29 @@ def _planned(
     elif plan is not None and not is_traced():
         plan = plan.extended_to(torch.cat(maps[1::2]))
     if plan is not None:
-        return _render_items([plan], options, ops, *maps).to(image.dtype)
+        return _image(options, ops, [plan], *maps).to(image.dtype)
     # one plan for each item, so that the result does not depend on the rest of the batch
     scenes = [torch.cat(cocs) for cocs in zip(*(t.split(1) for t in maps[1::2]), strict=True)]
+    return _each_planned(functools.partial(_image, options, ops), scenes, options, maps).to(image.dtype)
 
-    def render(plans: Sequence[Plan], *maps: Tensor) -> Tensor:
-        return _render_items(plans, options, ops, *maps)
 
-    return _each_planned(render, scenes, options, maps).to(image.dtype)
+def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
+    """Render checked layers ``[B, N, C + 1, H, W]``; see :meth:`torchdof.DepthOfField.layers`."""
+    wide = torch.float64 if torch.float64 in (rgba.dtype, coc_px.dtype) else torch.float32
+    light, coc = rgba.to(wide), coc_px.to(wide)
+    order = torch.where(torch.isfinite(coc), coc, torch.inf).argsort(1)  # near to far
+    cover = light[:, :, -1:].clamp(0.0, 1.0)
+    scale = exposure.scale_of(light.flatten(1, 2))  # before the division, which makes light of tiny coverage huge
+    valid = torch.isfinite(coc) & torch.isfinite(light).all(2, keepdim=True) & (cover > 0)
+    cover, coc = torch.where(valid, cover, 0.0), torch.where(valid, coc, coc.new_zeros(()))
+    light = torch.where(valid, light * scale[:, None] / cover.clamp_min(1e-12), 0.0)
+    maps = [t.gather(1, order.expand_as(t)) for t in (light, coc, cover)]
+    if is_differentiated(coc):
+        plan = Plan.for_scene(maps[1].flatten(0, 1), options.tolerance, on_grid=True)
+        rendered = _stack(options, [plan], *maps)
+    else:
+        rendered = _each_planned(functools.partial(_stack, options), [*maps[1]], options, maps)
+    return (rendered / scale).to(rgba.dtype)
 
 
 def _each_planned(
@@ -115,11 +127,8 @@ def _each_planned(
 ) -> Tensor:
     """Render items, each with its own plan, as many together as have layers that can be joined.
 
-    Args:
-        render: ``render(plans, *maps)`` renders some items, with one plan or one for each of them.
-        scenes: Coc of all maps of each item, ``[N, 1, H, W]``.
-        options: Options of the rendering.
-        maps: Maps of all items, ``[B, ...]``.
+    ``render(plans, *maps)`` renders some items, with one plan or one for each. ``scenes`` are the coc of all maps of
+    each item, ``[N, 1, H, W]``; ``maps`` are those of all items, ``[B, ...]``.
     """
     uniform = options.method == "layered" and not options.table.depends_on_place
     if len(scenes) == 1 or not uniform or (native.chosen() and all(is_in_memory(t, backward=True) for t in maps)):
@@ -141,80 +150,53 @@ def _each_planned(
     return torch.cat([by_index[i] for i in range(len(plans))])
 
 
-def _levels(plan: Plan) -> int:
-    """Levels of the pyramid from which hidden surfaces are filled."""
-    widest = max(2.0, *map(abs, plan.coc_px))
-    return min(math.ceil(math.log2(widest)) + 1, 7)
+def _stack(options: Options, plans: Sequence[Plan], light: Tensor, coc: Tensor, cover: Tensor) -> Tensor:
+    """Render float maps of layers ``[B, N, ...]``, near to far, with one plan or with one for each item."""
+    if len(plans) == 1 and plans[0].nodes != (0.0,):
+        picture = compiled.picture(plans[0], options, light, coc, cover=cover)
+        if picture is not None:
+            return picture
+    reach = _reach(plans, coc)
+    stack = [Surface(light[:, i], coc[:, i].clamp(*reach), cover[:, i]) for i in range(light.shape[1])]
+    # a black surface behind the layers, for pixels that no layer covers
+    stack.append(Surface(torch.zeros_like(light[:, 0]), torch.zeros_like(coc[:, 0]) + reach[1]))
+    return _composite(stack, None, plans, options, EAGER, image=None)
 
 
-def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
-    """Render checked layers ``[B, N, C + 1, H, W]``; see :meth:`torchdof.DepthOfField.layers`."""
-    wide = torch.float64 if torch.float64 in (rgba.dtype, coc_px.dtype) else torch.float32
-    light, coc = rgba.to(wide), coc_px.to(wide)
-    order = torch.where(torch.isfinite(coc), coc, torch.inf).argsort(1)  # near to far
-    cover = light[:, :, -1:].clamp(0.0, 1.0)
-    scale = exposure.scale_of(light.flatten(1, 2))  # before the division, which makes light of tiny coverage huge
-    valid = torch.isfinite(coc) & torch.isfinite(light).all(2, keepdim=True) & (cover > 0)
-    cover, coc = torch.where(valid, cover, 0.0), torch.where(valid, coc, coc.new_zeros(()))
-    light = torch.where(valid, light * scale[:, None] / cover.clamp_min(1e-12), 0.0)
-    light, coc, cover = (t.gather(1, order.expand_as(t)) for t in (light, coc, cover))
-
-    def render(plans: Sequence[Plan], light: Tensor, coc: Tensor, cover: Tensor) -> Tensor:
-        plans = [dataclasses.replace(plan, rays=False) for plan in plans]
-        return _render_items(plans, options, EAGER, light, coc, cover=cover)
-
-    if is_differentiated(coc):
-        rendered = render([Plan.for_scene(coc.flatten(0, 1), options.tolerance, on_grid=True)], light, coc, cover)
-    else:
-        rendered = _each_planned(render, [*coc], options, [light, coc, cover])
-    return (rendered / scale).to(rgba.dtype)
-
-
-def _render_items(
-    plans: Sequence[Plan],
+def _image(
     options: Options,
     ops: Ops,
+    plans: Sequence[Plan],
     light: Tensor,
     coc: Tensor,
     behind_light: Tensor | None = None,
     behind_coc: Tensor | None = None,
-    cover: Tensor | None = None,
 ) -> Tensor:
-    """Render float maps to ``[B, C, H, W]``, with one plan or with one for each item: the only entry to both engines.
+    """Render float maps of images, optionally with a known background, with one plan or with one for each item.
 
     Several plans have more than one layer each, and their table does not depend on the place in the frame.
 
-    The maps are either an image ``light [B, C, H, W]`` with ``coc [B, 1, H, W]`` and optionally a known background,
-    ``behind_light`` and ``behind_coc``; or, with ``cover [B, N, 1, H, W]``, a stack of layers ``[B, N, ...]``, near to
-    far.
-
-    1. Let the compiled engine render, if it supports the arguments.
-    2. A stack: composite its layers in front of a black surface. All in focus: return the image.
-    3. Set invalid pixels to 0, and scale down light whose powers would overflow.
-    4. Compute the limit above which light belongs to a highlight.
-    5. Split mixed pixels, and fill hidden surfaces or take the known background.
-    6. Take the highlights out of the surfaces and splat them ray by ray.
-    7. Blur and composite the layers, add the highlights, and undo step 3.
+    1. Let the compiled engine render, if it supports the arguments. All in focus: return the image.
+    2. Set invalid pixels to 0, and scale down light whose powers would overflow.
+    3. Compute the limit above which light belongs to a highlight.
+    4. Split mixed pixels, and fill hidden surfaces or take the known background.
+    5. Take the highlights out of the surfaces and splat them ray by ray.
+    6. Blur and composite the layers, add the highlights, and undo step 2.
     """
     plan = plans[0]
-    if len(plans) == 1 and plan.nodes != (0.0,):
-        picture = compiled.picture(plan, options, light, coc, behind_light, behind_coc, cover, ops.lens_width)
-        if picture is not None:
-            return picture
-    reach = _of_plans([(plan.coc_px[0], plan.coc_px[-1]) for plan in plans], coc)
-    if cover is not None:
-        stack = [Surface(light[:, i], coc[:, i].clamp(*reach), cover[:, i]) for i in range(light.shape[1])]
-        # a black surface behind the layers, for pixels that no layer covers
-        stack.append(Surface(torch.zeros_like(light[:, 0]), torch.zeros_like(coc[:, 0]) + reach[1]))
-        return _composite(stack, None, plans, options, ops, image=None)
-    if plan.nodes == (0.0,):
+    if len(plans) == 1 and plan.nodes == (0.0,):
         # all in focus: the image is unchanged; with the term 0 * coc, the coc has a gradient of 0 instead of None
         return light + 0.0 * torch.nan_to_num(coc) if is_differentiated(coc) else light.clone()
+    if len(plans) == 1:
+        picture = compiled.picture(plan, options, light, coc, behind_light, behind_coc, lens_width=ops.lens_width)
+        if picture is not None:
+            return picture
     image, valid, weight = light, None, None
     if not options.check:
         valid = torch.isfinite(coc) & torch.isfinite(light).all(1, keepdim=True)
         coc, light, weight = torch.where(valid, coc, 0.0), torch.where(valid, light, 0.0), valid.to(light.dtype)
-    coc = coc.clamp(*reach)  # differences of huge values would round badly
+    ends = _reach(plans, coc)
+    coc = coc.clamp(*ends)  # differences of huge values would round badly
     scale = exposure.scale_of(light, behind_light)
     light, behind_light = light * scale, None if behind_light is None else behind_light * scale
 
@@ -222,7 +204,8 @@ def _render_items(
     # graph has no rays, as their number depends on the light.
     has_rays = plan.rays and ops.has_rays and not is_compiled()
     crisp_px = [plan.crisp_px if options.method == "layered" else math.inf for plan in plans]
-    coarse = has_rays and any(px < max(map(abs, plan.coc_px)) for plan, px in zip(plans, crisp_px, strict=True))
+    widest = [max(map(abs, plan.coc_px)) for plan in plans]
+    coarse = has_rays and any(crisp < most for crisp, most in zip(crisp_px, widest, strict=True))
     limit = highlights.threshold(light, weight) if options.occlusion or options.normalize or coarse else None
     # One layer needs no rays: its kernel is exact, unless blocks of pixels share kernels that change across the frame.
     several = len(plan.nodes) > 1 or options.table.depends_on_place
@@ -231,20 +214,21 @@ def _render_items(
     # surfaces of each pixel, and the light behind all of them
     surfaces, behind = [Surface(light, coc, weight)], None
     if behind_light is not None and behind_coc is not None and limit is not None:
-        surfaces = _before_background(surfaces[0], behind_light, behind_coc, reach, options)
+        surfaces = _before_background(surfaces[0], behind_light, behind_coc, ends, options)
     elif options.occlusion and limit is not None and splatted:
-        surfaces, behind = surfaces_of_image(light, coc, weight, limit, [*map(_levels, plans)], ops)
+        levels = [min(math.ceil(math.log2(max(2.0, most))) + 1, 7) for most in widest]
+        surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels, ops)
 
     # highlights of these surfaces, ray by ray
     splats = None
     if limit is not None and splatted and has_rays:
         (from_px,) = [0.0] if options.occlusion else _of_plans([(px - 1.0,) for px in crisp_px], coc)
         # with a known background, mixed pixels need no second surface for their highlights
-        beside = surfaces[::-1] if len(surfaces) == 2 else [None] * len(surfaces)
+        beside = [(s, coc) for s in surfaces[::-1]] if len(surfaces) == 2 else [None] * len(surfaces)
         reach = [plan.reach(options.table, ops.lens_width or coc.shape[-1]) for plan in plans]
-        most = highlights.affordable_taps(coc, reach) if options.occlusion else None
+        most_taps = highlights.affordable_taps(coc, reach) if options.occlusion else None
         extracted = [
-            highlights.extract(s, limit, from_px, b, coc, most, len(plans) > 1, ops)
+            highlights.extract(s, limit, from_px, b, most_taps, len(plans) > 1, ops)
             for s, b in zip(surfaces, beside, strict=True)
         ]
         surfaces, rays = [s for s, _ in extracted], [r for _, r in extracted if r is not None]
@@ -261,18 +245,23 @@ def _render_items(
     return ops.choose(lambda: blur_axis(coc).abs().max() > 0, out, image)
 
 
+def _reach(plans: Sequence[Plan], like: Tensor) -> Sequence[Any]:
+    """Smallest and largest coc of the layers, of the only plan or ``[B, 1, 1, 1]``."""
+    return _of_plans([(plan.coc_px[0], plan.coc_px[-1]) for plan in plans], like)
+
+
 def _of_plans(values: Sequence[Sequence[float]], like: Tensor) -> Sequence[Any]:
     """The values of the only plan, or tensors ``[B, 1, 1, 1]`` of those of all plans."""
     return values[0] if len(values) == 1 else like.new_tensor(values)[..., None, None, None].unbind(1)
 
 
 def _before_background(
-    surface: Surface, behind: Tensor, behind_coc: Tensor, reach: Sequence[Any], options: Options
+    surface: Surface, behind: Tensor, behind_coc: Tensor, ends: Sequence[Any], options: Options
 ) -> list[Surface]:
-    """Surfaces of an image in front of a known background, near to far; coc is clamped to ``reach``."""
+    """Surfaces of an image in front of a known background, near to far; its coc is clamped to ``ends``."""
     light, coc, weight = surface
     valid = None if options.check else torch.isfinite(behind_coc) & torch.isfinite(behind).all(1, keepdim=True)
-    behind_coc = behind_coc.clamp(*reach)
+    behind_coc = behind_coc.clamp(*ends)
     own_light, other_light, other_coc, other_weight = matte(light, coc, weight)
     # of the second surfaces of mixed pixels keep the nearer ones; the known background replaces the farther ones
     own_weight, other_weight = 1.0 - other_weight, torch.where(other_coc < coc, other_weight, 0.0)
@@ -309,7 +298,7 @@ def _composite(
     margin = -(-max(blur.halo for blur in blurs) // coarsest) * coarsest
     behind = None if behind is None else behind_pixels(behind, size)
     lit, multiple = options.occlusion or options.normalize, ops.align(margin, coarsest)
-    frame = pad_to_frame(surfaces, behind, nodes, margin, multiple, options.occlusion, image != 0, lit, limit, image)
+    frame = pad_to_frame(surfaces, behind, nodes, margin, multiple, options.occlusion, lit, limit, image)
     scatter = functools.partial(convolve, turned=not options.table.is_round) if layered else fold
 
     def scattered(frame: PaddedFrame) -> Tensor:

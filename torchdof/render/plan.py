@@ -18,17 +18,6 @@ from . import layer_cocs, traced
 from .downsampling import shrink
 from .layer_weights import blur_axis_of_radius, from_blur_axis, ramps, weights_at_or_behind
 
-__all__ = [
-    "KERNELS_PER_PX",
-    "LayerKernel",
-    "Plan",
-    "joined_layers",
-    "kernels_for",
-    "kernels_of",
-    "layer_spots",
-    "longest_px",
-]
-
 KERNELS_PER_PX = 32  # kernels for highlights, per px of radius; more are smoother and take more memory
 _FEWER_KERNELS_PER_PX = 4  # the same in a graph, which holds all kernels as constants; costs up to 0.02 dB
 _COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # px: layers from these radii on have 1/2, 1/4, ... resolution at 1/255
@@ -37,6 +26,8 @@ _SMALL_RADII = 3.0  # blur radii: frames with a shorter side below this are plan
 _ROUGH_PX = 8.0  # mean change of coc between neighbours, in pixels, above which a frame needs fewer layers
 _ROUGH_TOLERANCE = 4.0 / 255.0  # tolerance of the roughest frames; larger: their errors exceed 1/255
 _FARTHEST_PX = 1e9  # px: upper limit of nodes; frames are smaller
+
+_Layer = tuple[float, Tensor] | None  # place on the blur axis and kernel of a layer of one item; None: it has none
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,14 +103,13 @@ class Plan:
             adapt: Whether the tolerance is changed for small and for rough frames. Errors are largest beside depth
                 edges and the border. In a frame that is small compared with its blur radii, most pixels are near one,
                 so the tolerance is multiplied by ``shorter side / (3 * radius)``, with the mean radius of the most
-                blurred hundredth of its pixels. In a rough frame, such as noise as depth, all layers overlap
-                everywhere, which takes long; but each pixel of the picture is a mean over many layers, whose errors
-                cancel. So the tolerance is multiplied by the root of the mean change of the coc between neighbours,
-                divided by 8 px, if this is more than 1, up to a tolerance of 4/255. With ``on_grid`` the factor is
-                rounded down to a power of 2.
+                blurred hundredth of its pixels. In a rough frame, such as noise as depth, each pixel of the picture is
+                a mean over many layers, whose errors cancel. So the tolerance is multiplied by the root of the mean
+                change of the coc between neighbours, divided by 8 px, if this is more than 1, up to a tolerance of
+                4/255. With ``on_grid`` the factor is rounded down to a power of 2.
         """
         if not adapt:
-            return cls._between(layer_cocs.joined(layer_cocs.spreads(coc_px)), tolerance)
+            return cls._between(layer_cocs.spreads(coc_px, len(coc_px))[0], tolerance)
         if not on_grid and coc_px.dtype == torch.float32 and is_in_memory(coc_px) and native.chosen():
             return cls(*native.plan(coc_px, tolerance))
         return cls.for_scenes([coc_px], tolerance, on_grid)[0]
@@ -132,12 +122,10 @@ class Plan:
         """
         coc_px = torch.cat([scene.detach() for scene in scenes])
         count, shorter = len(scenes[0]), min(coc_px.shape[-2:])
-        spreads = layer_cocs.spreads(coc_px)
-        spreads = [layer_cocs.joined(spreads[i : i + count]) for i in range(0, len(coc_px), count)]
+        spreads = layer_cocs.spreads(coc_px, count)
         radii = [max(abs(from_blur_axis(spread.low)), abs(from_blur_axis(spread.high))) for spread in spreads]
         if shorter < _SMALL_RADII * max(radii):  # otherwise the mean radius is not needed
-            largest = layer_cocs.largest_radii(coc_px)
-            radii = [max(largest[i : i + count]) for i in range(0, len(coc_px), count)]
+            radii = layer_cocs.largest_radii(coc_px, count)
         plans = []
         for spread, radius in zip(spreads, radii, strict=True):
             factor = min(1.0, shorter / (_SMALL_RADII * max(radius, 1.0)))
@@ -246,34 +234,30 @@ class Plan:
         ``lens_width`` is the width of the image whose kernels are used, if it differs from the frame's; ``kept`` are
         the results of :meth:`constants`, if they exist already.
         """
-        width, scales = self.layer_sizes(table, (size[0], lens_width or size[1]), coarse)
+        width, scales = self.layer_sizes(table, lens_width or size[1], coarse)
         if kept is not None or is_traced():
             whole = traced.constants(_layer_kernels, table, self.coc_px, width, scales) if kept is None else kept
             bank = [_masked(k.to(device, dtype), size, s) for k, s in zip(whole, scales, strict=True)]
         else:
             made = _layer_kernels(table, self.coc_px, width, scales, longest_px(size, scales), dtype)
             bank = _moved(made, device, dtype)
-        if not table.depends_on_place:
-            return [LayerKernel(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
-        masks = self.field_masks(table, scales, (int(size[0]), int(size[1])))
+        masks: Sequence[FieldMask | None] = self.field_masks(table, scales, size) or [None] * len(bank)
         return [LayerKernel(*each) for each in zip(bank, scales, masks, strict=True)]
 
     def constants(self, table: BlurTable, coarse: bool, lens_width: int) -> list[Tensor]:
         """Kernels of the layers as constants of a trace, not cut to a frame."""
-        return _layer_kernels(table, self.coc_px, *self.layer_sizes(table, (1, lens_width), coarse))
+        return _layer_kernels(table, self.coc_px, *self.layer_sizes(table, lens_width, coarse))
 
-    def field_masks(
-        self, table: BlurTable, scales: Sequence[int], size: tuple[int, int], like: Tensor | None = None
-    ) -> list[FieldMask]:
-        """Field masks of each layer's kernel, in the dtype and device of ``like``; empty for a lens without a field."""
+    def field_masks(self, table: BlurTable, scales: Sequence[int], size: tuple[int, int]) -> Sequence[FieldMask]:
+        """Field masks of each layer's kernel; empty for a lens without a field."""
         if not table.depends_on_place:
             return []
-        masks = [layer_mask(table, coc, scale, size) for coc, scale in zip(self.coc_px, scales, strict=True)]
-        return masks if like is None else [each.to(like) for each in masks]
+        size = (int(size[0]), int(size[1]))  # only here: it would fix the size of a graph
+        return [layer_mask(table, coc, scale, size) for coc, scale in zip(self.coc_px, scales, strict=True)]
 
-    def layer_sizes(self, table: BlurTable, size: tuple[int, int], coarse: bool) -> tuple[int, tuple[int, ...]]:
+    def layer_sizes(self, table: BlurTable, width: int, coarse: bool) -> tuple[int, tuple[int, ...]]:
         """Image width for the kernels (1 if they do not depend on it) and downsampling factor of each layer."""
-        width = 1 if table.unit == "relative" else int(size[1])
+        width = 1 if table.unit == "relative" else int(width)
         coarse = coarse and len(self.nodes) > 1  # a plane is exact
         return width, tuple(self._scale(table.finest_px(coc, width)) if coarse else 1 for coc in self.coc_px)
 
@@ -292,45 +276,36 @@ def joined_layers(
     Layers are joined if they lie on the same side of the focus and have the same resolution. An item with fewer of them
     than another has unused layers, see :func:`torchdof.render.layer_weights.ramps`.
 
-    Args:
-        plans: The plan of each item.
-        table: Table of the kernels, which does not depend on the place in the frame.
-        size: Height and width of the frame.
-        like: Tensor with the dtype and device of the kernels.
-
-    Returns:
-        Places on the blur axis, ``[B][n]``, and the kernels of each of the n layers.
+    Returns places on the blur axis, ``[B][n]``, and the kernels of each of the n layers, with the dtype and device of
+    ``like``, for a frame of ``size``. The table does not depend on the place in the frame.
     """
-    sizes = [plan.layer_sizes(table, size, coarse=True) for plan in plans]
+    sizes = [plan.layer_sizes(table, size[1], coarse=True) for plan in plans]
     scales = [scale for _, of_plan in sizes for scale in of_plan]
     coc_px = [coc for plan in plans for coc in plan.coc_px]
     kernels = iter(_layer_kernels(table, coc_px, sizes[0][0], scales, longest_px(size, scales), like.dtype))
     # place and kernel of the layers of each plan, by a key that grows from near to far: signed resolution
-    layers: list[dict[int, list[tuple[float, Tensor]]]] = [{} for _ in plans]
+    layers: list[dict[int, list[_Layer]]] = [{} for _ in plans]
     for of_plan, plan, (_, own_scales) in zip(layers, plans, sizes, strict=True):
         for node, scale in zip(plan.nodes, own_scales, strict=True):
             key = 0 if node == 0.0 else int(math.copysign(scale, node))
             of_plan.setdefault(key, []).append((node, next(kernels)))
-    rows: list[list[float | None]] = [[] for _ in plans]
-    joined, joined_scales = [], []
+    columns: list[tuple[_Layer, ...]] = []
+    joined_scales = []
     for key in sorted({key for of_plan in layers for key in of_plan}):
-        most = max(len(of_plan.get(key, [])) for of_plan in layers)
-        for k in range(most):  # aligned at the focus, where kernels are small
-            column = []
-            for of_plan in layers:
-                own = of_plan.get(key, [])
-                i = k - (most - len(own)) if key < 0 else k
-                column.append(own[i] if 0 <= i < len(own) else None)
-            for row, each in zip(rows, column, strict=True):
-                row.append(None if each is None else each[0])
-            joined.append(_stacked([None if each is None else each[1] for each in column]))
-            joined_scales.append(max(abs(key), 1))
+        rows = [of_plan.get(key, []) for of_plan in layers]
+        most = max(map(len, rows))
+        unused: list[list[_Layer]] = [[None] * (most - len(row)) for row in rows]
+        # at the focus, where kernels are small
+        aligned = [none + row if key < 0 else row + none for none, row in zip(unused, rows, strict=True)]
+        columns += zip(*aligned, strict=True)
+        joined_scales += [max(abs(key), 1)] * most
     nodes = []
-    for row in rows:
+    for of_item in zip(*columns, strict=True):
         places = [math.inf]
-        for place in reversed(row):  # an unused layer has the place of the next used one
-            places.append(places[-1] if place is None else place)
+        for layer in reversed(of_item):  # an unused layer has the place of the next used one
+            places.append(places[-1] if layer is None else layer[0])
         nodes.append(tuple(places[:0:-1]))
+    joined = [_stacked([None if layer is None else layer[1] for layer in column]) for column in columns]
     moved = _moved(joined, like.device, like.dtype)
     return nodes, [LayerKernel(kernel, scale) for kernel, scale in zip(moved, joined_scales, strict=True)]
 

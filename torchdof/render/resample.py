@@ -9,8 +9,6 @@ from torch import Tensor
 from .. import validation
 from .edges import repair_edges
 
-__all__ = ["at_size_of"]
-
 _LARGEST_FACTOR = 4  # largest enlargement in one step: its ramps are the widest that the repair takes for edges
 
 

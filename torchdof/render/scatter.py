@@ -14,8 +14,6 @@ from ..optics.placed_kernels import FieldMask, placed
 from ..tensors import is_traced
 from .convolution import DIRECT_TAPS, widest_float
 
-__all__ = ["fold"]
-
 _COLUMN_BYTES = 256 * 2**20  # bytes of the columns in memory at once; larger: fewer, larger strips
 
 
@@ -36,8 +34,8 @@ def fold(
         kernels: ``[1 or C, k, k]``, k odd; or, with weights, a bank of them ``[n, 1 or C, k, k]``.
         halo: Pixels on each side that scatter into the result ``[B, C, H - 2 halo, W - 2 halo]`` but are not in it.
         weights: Weight of each kernel of the bank in the kernel of each pixel, ``[B, n, H, W]``.
-        masks: Masks that change each kernel of the bank across the frame; None: kernels are the same everywhere.
-        frame: Height and width of the frame, which begins ``halo`` pixels after the light; used with ``masks``.
+        masks: Masks that change each kernel of the bank across the frame.
+        frame: Height and width of the frame of the masks, which begins ``halo`` pixels after the light.
 
     Reference:
         Sato, Dobashi, Yamamoto, section 3, steps (a) to (c). The adjoint is ``unfold``.
@@ -59,9 +57,8 @@ def fold(
         else:
             taps = light.new_zeros(())
             for kernel, mask, part in zip(kernels, masks, weight.flatten(2).unbind(1), strict=True):
-                each = _of_pixels(
-                    kernel, mask, (top - halo, -halo), (strip.shape[-2], width), frame
-                )  # [pixels, C, k, k]
+                block = ((top - halo, -halo), (strip.shape[-2], width))
+                each = _of_pixels(kernel, mask, *block, frame)  # [pixels, C, k, k]
                 taps = taps + torch.einsum("bp,pct->bctp", part, each.flatten(2))
         columns = strip.flatten(2).unsqueeze(2) * taps  # [B, C, k*k, pixels]
         area = (strip.shape[-2] + 2 * half, width + 2 * half)
@@ -78,14 +75,9 @@ def fold(
 def _of_pixels(
     kernel: Tensor, mask: FieldMask, first: tuple[int, int], count: tuple[int, int], size: tuple[int, int]
 ) -> Tensor:
-    """The masked kernel of each pixel of a block, ``[n, 1 or C, k, k]``.
+    """The masked kernel of each pixel of a block of a frame of ``size``, ``[n, 1 or C, k, k]``.
 
-    Args:
-        kernel: Kernel of the table, ``[1 or C, k, k]``; those of C colours may be repeated.
-        mask: Mask at the frame's resolution.
-        first: Row and column of the block's first pixel.
-        count: Rows and columns of the block.
-        size: Height and width of the frame.
+    ``first`` are row and column of the block's first pixel, ``count`` its rows and columns.
     """
     half_diagonal = 0.5 * math.hypot(*size)
     y, x = (
@@ -93,5 +85,5 @@ def _of_pixels(
         for n, start, side in zip(count, first, size, strict=True)
     )
     y, x = (t.flatten() for t in torch.meshgrid(y, x, indexing="ij"))
-    each = kernel[: mask.values.shape[0]] if mask.values.shape[0] > 1 else kernel
+    each = kernel[: mask.values.shape[0]] if mask.values.shape[0] > 1 else kernel  # those of C colours may be repeated
     return placed(each[None], [(mask.to(kernel), kernel.new_ones(()))], y, x).repeat(1, len(kernel) // len(each), 1, 1)

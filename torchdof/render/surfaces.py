@@ -14,16 +14,6 @@ from ..tensors import is_traced
 from .border import continued
 from .layer_weights import blur_axis, eased, ramps, weights_at_or_behind
 
-__all__ = [
-    "HIDDEN_WEIGHT",
-    "Highlights",
-    "PaddedFrame",
-    "PaddedSurface",
-    "Surface",
-    "continuation_weight",
-    "pad_to_frame",
-]
-
 HIDDEN_WEIGHT = 0.003
 """Weight of a hidden sample, which is guessed; a visible one has 1. A larger value mixes more guessed light in."""
 
@@ -66,9 +56,8 @@ class PaddedFrame:
 
     Args:
         surfaces: ``[B, ., h + 2 margin, w + 2 margin]`` where ``h, w`` is the area; stacked ones are near to far.
-        nodes: Places of the layers on the blur axis, near to far: one row for the whole batch or one for each item, as
-            for :func:`torchdof.render.layer_weights.ramps`.
-        ramps: Ramps of the nodes, from :func:`torchdof.render.layer_weights.ramps`.
+        nodes: Places of the layers as for :func:`torchdof.render.layer_weights.ramps`.
+        ramps: Its result.
         behind: Light behind all surfaces, ``[B, C, h, w]``; None: there is no such light.
         margin: Pixels added on each side, as many as the widest kernel reaches.
         area: Height and width of the image, extended to whole blocks of the coarsest layer.
@@ -220,7 +209,6 @@ def pad_to_frame(
     margin: int,
     multiple: int,
     occlusion: bool,
-    stacked: bool,
     lit: bool = True,
     limit: Tensor | None = None,
     image: int | None = 0,
@@ -229,15 +217,15 @@ def pad_to_frame(
 
     Args:
         surfaces: Near to far if stacked; else one surface, or the two that share each pixel.
-        nodes: As in :class:`PaddedFrame`; surfaces beyond the outermost nodes are clamped to them.
-        behind: Light behind all surfaces, ``[B, C, H, W]``; None: there is no such light.
-        margin: As in :class:`PaddedFrame`.
+        behind: As in :class:`PaddedFrame`, as ``nodes``, ``margin`` and ``occlusion``.
+        nodes: Surfaces beyond the outermost nodes are clamped to them.
+        margin: Pixels added on each side.
         multiple: The area is extended to multiples of this many pixels, at least a pixel of the coarsest layer.
-        occlusion: As in :class:`PaddedFrame`.
-        stacked: As in :class:`PaddedFrame`.
+        occlusion: Whether layers occlude each other.
         lit: Whether light is continued beyond the border too; False: it is 0 there.
         limit: Largest light that is not a highlight, ``[B, 1, H, W]``: light above it is not continued; None: all is.
-        image: Index of the image's own surface; None: the surfaces are layers, each known everywhere.
+        image: Index of the image's own surface; None: the surfaces are layers, each known everywhere. Unless it is 0,
+            the surfaces are stacked.
     """
     size = (surfaces[0].light.shape[-2], surfaces[0].light.shape[-1])
     height, width = ((n + multiple - 1) // multiple * multiple for n in size)
@@ -265,6 +253,5 @@ def pad_to_frame(
     padded = [PaddedSurface(*parts) for parts in zip(lights, *maps, strict=True)]
     if behind is not None:
         behind = functional.pad(behind, beyond, mode="replicate")
-    return PaddedFrame(
-        padded, nodes, ramps(nodes, padded[0].x), behind, margin, (height, width), size, occlusion, stacked
-    )
+    starts = ramps(nodes, padded[0].x)
+    return PaddedFrame(padded, nodes, starts, behind, margin, (height, width), size, occlusion, image != 0)

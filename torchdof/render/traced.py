@@ -13,8 +13,6 @@ from torch import Tensor
 
 from ..tensors import is_exporting
 
-__all__ = ["constants", "is_compiled", "one_operator"]
-
 _KEPT = 4  # cached lists of constants; a compiled graph asks for each of its lists twice
 
 
@@ -26,21 +24,19 @@ def is_compiled() -> bool:
 def one_operator(
     name: str, empty: Callable[..., Any], differentiable: int = 0
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Make a function an operator of PyTorch, which a compiled graph calls as a whole.
+    """Make functions of tensors, None and numbers that return new contiguous tensors operators of PyTorch.
+
+    A compiled graph calls an operator as a whole.
 
     Args:
         name: Name of the operator.
         empty: Function of the same arguments that returns empty tensors like the results.
         differentiable: Number of leading arguments that get gradients; the backward pass runs the function again.
-
-    Returns:
-        A decorator for functions that take tensors, None and numbers, and return new contiguous tensors.
     """
 
     def decorated(function: Callable[..., Any]) -> Callable[..., Any]:
         operator = torch.library.custom_op(name, function, mutates_args=())
         operator.register_fake(empty)
-
         if differentiable:
             _differentiate(operator, name, function, differentiable)
         return operator
