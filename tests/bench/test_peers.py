@@ -40,7 +40,7 @@ def fault(blur: Any, radius_px: float) -> str:
     return ""
 
 
-@pytest.mark.parametrize("name", ["torchdof", "blender", "ffmpeg", "gegl", "ikoma", "kornia_bins"])
+@pytest.mark.parametrize("name", ["torchdof", "gegl", "ikoma", "kornia_bins"])
 def test_a_renderer_blurs_by_the_circle_of_confusion_that_it_is_given(name: str) -> None:
     blur: Any = renderers(degraded=False).get(name)
     if blur is None:
