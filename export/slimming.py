@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import onnx
 import onnx_ir
-from onnx.reference import ReferenceEvaluator
 from onnx_ir.passes import common as passes
 from onnx_ir.tape import Tape
 from onnxscript.optimizer import fold_constants
@@ -28,7 +27,7 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
 
     A ``straight`` graph has none of these; its constants stay initializers, which runtimes for GPUs load once.
 
-    1. Inline functions, fold constants, and replace operators and chains of operators by faster or more common ones.
+    1. Inline functions, fold constants, and replace block means by convolutions.
     2. Make loops and branches.
     3. Put each convolution's weights into its own graph, and turn initializers into nodes.
     4. Remove default attributes and shorten names.
@@ -40,16 +39,11 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
         passes.DeduplicateInitializersPass(size_limit=2**24),
         # without values of sizes in a straight graph, in which onnx confuses lists of indices with them
         passes.ShapeInferencePass(data_prop=not straight),
-        _cast_plainly,
     )
     tidy: tuple[_Pass, ...] = (
         passes.RemoveUnusedNodesPass(),  # folding leaves sequences of a wrong type, which shape inference refuses
         passes.ShapeInferencePass(),
-        _take_parts,
-        _join_cuts,
         _convolve_averages,
-        _fill_channels,
-        _join_splits,
         passes.IdentityEliminationPass(),
         passes.CommonSubexpressionEliminationPass(),
         passes.RemoveUnusedNodesPass(),
@@ -64,8 +58,8 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
     )
     for step in flat:
         step(model)
-    fold_constants(model, input_size_limit=2**24, output_size_limit=2**13)
-    _fold_weights(model)
+    # in a graph of tiles, weights are stored once and gathered; in a straight one they must be constants
+    fold_constants(model, input_size_limit=2**24, output_size_limit=2**20 if straight else 2**13)
     for step in tidy:
         step(model)
     structure(model)
@@ -79,28 +73,6 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
     _drop_defaults(model)
     _shorten(model)
     return model
-
-
-def _fold_weights(model: onnx_ir.Model) -> None:
-    """Makes constants of weights of convolutions that are larger than the other constants which are folded."""
-    for node in [node for node in model.graph if node.op_type == "Conv"]:
-        weight = node.inputs[1]
-        array = None if weight is None or weight.const_value is not None else _folded(weight)
-        if weight is not None and array is not None:
-            node.replace_input_with(1, _initializer(model.graph, array, f"{weight.name}_folded"))
-
-
-def _folded(value: onnx_ir.Value | None) -> np.ndarray | None:
-    """The numbers of a value that does not depend on the graph's inputs, else None."""
-    tensor = None if value is None else onnx_ir.convenience.get_const_tensor(value)
-    node = None if value is None else value.producer()
-    if tensor is not None or node is None:
-        return None if tensor is None else tensor.numpy()
-    feed = {str(source.name): _folded(source) for source in node.inputs if source is not None}
-    if any(array is None for array in feed.values()):
-        return None
-    results: Any = ReferenceEvaluator(onnx_ir.to_proto(node)).run(None, feed)
-    return np.asarray(results[0])
 
 
 def _place_weights(model: onnx_ir.Model) -> None:
@@ -124,7 +96,7 @@ def _place_weights(model: onnx_ir.Model) -> None:
 
 
 def _as_nodes(graph: onnx_ir.Graph) -> None:
-    """Turns initializers into ``Constant`` nodes, which ``onnx.compose`` renames in branches too."""
+    """Turns initializers into nodes; many equal numbers then take no space."""
     first = next(iter(graph), None)
     values: list[Any] = list(graph.initializers.values())
     for value in values:
@@ -164,66 +136,6 @@ def _replace(graph: onnx_ir.Graph, node: onnx_ir.Node, tape: Tape) -> None:
     graph.remove(node, safe=True)
 
 
-def _cast_plainly(model: onnx_ir.Model) -> None:
-    """``CastLike`` becomes ``Cast``, or nothing if the type is right already; not every runtime simplifies it."""
-    number = itertools.count()
-    for graph in (model.graph, *model.graph.subgraphs()):
-        for node in list(graph):
-            if node.op_type != "CastLike" or node.domain:
-                continue
-            value, like = node.inputs
-            kind = None if like is None else like.dtype
-            if value is None or kind is None:
-                continue
-            if value.const_value is not None and value.is_initializer():
-                new = _cast_constant(model.graph, value, kind, next(number))
-            elif value.dtype == kind and not node.outputs[0].is_graph_output():
-                new = value
-            else:
-                cast = onnx_ir.node("Cast", [value], {"to": kind.value})
-                graph.insert_before(node, [cast])
-                new = cast.outputs[0]
-                new.type, new.shape = onnx_ir.TensorType(kind), node.outputs[0].shape
-            node.outputs[0].replace_all_uses_with(new, replace_graph_outputs=True)
-            graph.remove(node, safe=True)
-
-
-def _take_parts(model: onnx_ir.Model) -> None:
-    """A slice that is exactly one input of a ``Concat`` becomes that input; onnxruntime would warn of it."""
-    for node in list(model.graph):
-        if node.op_type == "Slice" and not node.outputs[0].is_graph_output():
-            part = _part(node)
-            if part is not None:
-                node.outputs[0].replace_all_uses_with(part)
-                model.graph.remove(node, safe=True)
-
-
-def _join_cuts(model: onnx_ir.Model) -> None:
-    """Two slices in sequence along different axes become one, because each copies."""
-    for node in list(model.graph):
-        source = node.inputs[0] if node.op_type == "Slice" else None
-        first = None if source is None else source.producer()
-        if first is None or first.op_type != "Slice" or len(first.inputs) != len(node.inputs):
-            continue
-        axis_values: list[Any] = [first.inputs[3], node.inputs[3]]
-        axes = [onnx_ir.convenience.get_const_tensor(value) for value in axis_values]
-        if source is None or axes[0] is None or axes[1] is None or source.shape is None:
-            continue
-        rank = len(source.shape)  # an axis may be counted from the last one
-        if {int(a) % rank for a in axes[0].numpy()} & {int(a) % rank for a in axes[1].numpy()}:
-            continue
-        tape, bounds = Tape(), []
-        for number, pair in enumerate(list(zip(first.inputs, node.inputs, strict=True))[1:]):
-            constants = [onnx_ir.convenience.get_const_tensor(value) for value in pair if value is not None]
-            if all(constant is not None for constant in constants):
-                joined = np.concatenate([constant.numpy() for constant in constants if constant is not None])
-                bounds.append(_initializer(model.graph, joined, f"{node.outputs[0].name}_bound_{number}"))
-            else:
-                bounds.append(tape.op("Concat", list(pair), {"axis": 0}))
-        tape.op("Slice", [first.inputs[0], *bounds])
-        _replace(model.graph, node, tape)
-
-
 def _convolve_averages(model: onnx_ir.Model) -> None:
     """Block means before a convolution become a convolution, which is several times as fast in runtimes."""
     for node in list(model.graph):
@@ -242,90 +154,6 @@ def _convolve_averages(model: onnx_ir.Model) -> None:
         tape.op("Conv", [filled, kernel], {"group": channels, "strides": [scale, scale]}, name=name)
         _replace(model.graph, pad, tape)
         model.graph.remove(node, safe=True)
-
-
-def _fill_channels(model: onnx_ir.Model) -> None:
-    """Padding channels of a convolution become inputs of the ``Concat`` before it.
-
-    Their values do not matter, because they are not used: they repeat some of the other channels.
-    """
-    graph = model.graph
-    for pad in list(graph):
-        missing = _spare_channels(pad)
-        concat: Any = pad.inputs[0].producer() if missing and pad.inputs[0] is not None else None
-        if concat is None or concat.op_type != "Concat" or concat.attributes["axis"].as_int() != 1:
-            continue
-        filled, tape = list(concat.inputs), Tape()
-        for part in concat.inputs:
-            repeats, missing = divmod(missing, part.shape[1])
-            filled += [part] * repeats
-        if missing:
-            name = f"{pad.outputs[0].name}_fill"
-            ends = {"start": 0, "stop": missing, "axis": 1}
-            bounds = [_initializer(graph, np.array([n]), f"{name}_{end}") for end, n in ends.items()]
-            filled.append(tape.op("Slice", [concat.inputs[0], *bounds]))
-        tape.op("Concat", filled, {"axis": 1})
-        _replace(graph, pad, tape)
-
-
-def _join_splits(model: onnx_ir.Model) -> None:
-    """A slice of the first channels and a split become one split, whose last part is not used."""
-    graph = model.graph
-    for node in [n for n in graph if n.op_type == "Split" and n.attributes["axis"].as_int() == 1]:
-        cut: Any = None if node.inputs[0] is None else node.inputs[0].producer()
-        if cut is None or cut.op_type != "Slice" or cut.inputs[0].shape is None:
-            continue
-        source, kept_shape = cut.inputs[0], cut.outputs[0].shape
-        is_equal = [a == b for a, b in zip(source.shape, kept_shape, strict=True)]
-        bounds: list[Any] = [cut.inputs[1], node.inputs[1]]
-        first, sizes = (onnx_ir.convenience.get_const_tensor(value) for value in bounds)
-        if first is None or sizes is None or first.numpy().any() or is_equal != [True, False, True, True]:
-            continue
-        parts = np.array([*sizes.numpy(), source.shape[1] - kept_shape[1]])
-        all_sizes = _initializer(graph, parts, f"{node.outputs[0].name}_sizes")
-        split = onnx_ir.node("Split", [source, all_sizes], {"axis": 1}, num_outputs=len(parts))
-        graph.insert_before(node, [split])
-        for old, new in zip(node.outputs, split.outputs, strict=False):
-            new.type, new.shape = old.type, old.shape
-            old.replace_all_uses_with(new)
-        graph.remove(node, safe=True)
-
-
-def _spare_channels(node: onnx_ir.Node) -> int:
-    """Number of channels that a ``Pad`` appends, if it does nothing else; otherwise 0."""
-    pads = node.inputs[1] if node.op_type == "Pad" and len(node.inputs) > 1 else None
-    ends = [] if pads is None or pads.const_value is None else pads.const_value.numpy().tolist()
-    return ends[5] if len(ends) == 8 and not any(ends[:5] + ends[6:]) else 0
-
-
-def _part(node: onnx_ir.Node) -> onnx_ir.Value | None:
-    """The input of a ``Concat`` that a slice cuts out exactly, else None."""
-    source_value, *bounds = node.inputs
-    numbers = [v.const_value.numpy().tolist() for v in bounds if v is not None and v.const_value is not None]
-    source = None if source_value is None else source_value.producer()
-    if source is None or len(numbers) < max(3, len(bounds)) or any(len(n) != 1 for n in numbers):
-        return None
-    (start,), (end,), (axis,), (step,) = (*numbers, [1])[:4]
-    if (start, end) == (0, 2**63 - 1) and step == 1:
-        return source_value
-    if source.op_type != "Concat" or step != 1 or source.attributes["axis"].as_int() != axis:
-        return None
-    first = 0
-    for value in source.inputs:
-        size = None if value is None or value.shape is None else value.shape[axis]
-        if not isinstance(size, int):
-            return None
-        if (first, first + size) == (start, end):
-            return value
-        first += size
-    return None
-
-
-def _cast_constant(graph: onnx_ir.Graph, value: onnx_ir.Value, kind: onnx_ir.DataType, number: int) -> onnx_ir.Value:
-    """A constant cast to another type, as an initializer of the graph."""
-    if value.const_value is None:
-        raise ValueError(f"{value.name} is not a constant")
-    return _initializer(graph, value.const_value.numpy().astype(kind.numpy()), f"cast_{number}")
 
 
 def _drop_defaults(model: onnx_ir.Model) -> None:
