@@ -127,15 +127,6 @@ def _initializer(graph: onnx_ir.Graph, array: np.ndarray, name: str) -> onnx_ir.
     return value
 
 
-def _replace(graph: onnx_ir.Graph, node: onnx_ir.Node, tape: Tape) -> None:
-    """Puts the nodes of a tape in the place of a node; the last one gives the same result."""
-    new, old = tape.nodes[-1].outputs[0], node.outputs[0]
-    new.type, new.shape = old.type, old.shape
-    graph.insert_before(node, list(tape.nodes))
-    old.replace_all_uses_with(new, replace_graph_outputs=True)
-    graph.remove(node, safe=True)
-
-
 def _convolve_averages(model: onnx_ir.Model) -> None:
     """Block means before a convolution become a convolution, which is several times as fast in runtimes."""
     for node in list(model.graph):
@@ -151,26 +142,22 @@ def _convolve_averages(model: onnx_ir.Model) -> None:
         filled = tape.op("Pad", [node.inputs[0], *pad.inputs[1:]])
         name = f"mean_{node.outputs[0].name}"
         kernel = _initializer(model.graph, weight, f"{name}_weight")
-        tape.op("Conv", [filled, kernel], {"group": channels, "strides": [scale, scale]}, name=name)
-        _replace(model.graph, pad, tape)
-        model.graph.remove(node, safe=True)
+        mean = tape.op("Conv", [filled, kernel], {"group": channels, "strides": [scale, scale]}, name=name)
+        old = pad.outputs[0]
+        mean.type, mean.shape = old.type, old.shape
+        model.graph.insert_before(pad, list(tape.nodes))
+        old.replace_all_uses_with(mean)
+        model.graph.remove([pad, node], safe=True)
 
 
 def _drop_defaults(model: onnx_ir.Model) -> None:
     for node in model.graph.all_nodes():
         schema = onnx.defs.get_schema(node.op_type, model.opset_imports[""]).attributes
         for name, attribute in list(node.attributes.items()):
-            default = schema[name].default_value
-            is_default = default.type and onnx.helper.get_attribute_value(default) == _onnx_value(attribute)
+            is_default = onnx_ir.to_proto(attribute) == schema[name].default_value
             is_window_default = name in _WINDOW_DEFAULTS and set(attribute.as_ints()) == {_WINDOW_DEFAULTS[name]}
             if is_default or is_window_default or (node.op_type, name) == ("Conv", "kernel_shape"):
                 del node.attributes[name]
-
-
-def _onnx_value(attribute: onnx_ir.Attr) -> Any:
-    """Value of an attribute in :mod:`onnx`'s types; None for graphs and tensors."""
-    value = attribute.value
-    return value.encode() if isinstance(value, str) else value if isinstance(value, int | float) else None
 
 
 def _shorten(model: onnx_ir.Model) -> None:
@@ -190,8 +177,6 @@ def _shorten(model: onnx_ir.Model) -> None:
                 if not value.is_graph_output():
                     value.shape = value.type = None
     values = sorted((v for v in values if v.name not in interface_names), key=lambda v: -len(v.uses()))
-    alphabet = string.ascii_letters
-    lengths = ([alphabet] + [alphabet + string.digits] * n for n in range(4))
-    names = ("".join(letters) for length in lengths for letters in itertools.product(*length))
+    names = ("".join(letters) for n in range(1, 5) for letters in itertools.product(string.ascii_letters, repeat=n))
     for value, name in zip(values, (name for name in names if name not in interface_names), strict=False):
         value.name = name
