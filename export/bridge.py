@@ -6,38 +6,20 @@ inverse depth planes stay planes.
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import onnx
-import onnxscript
 
-from .operators import DOMAIN
-
-if TYPE_CHECKING:  # onnxscript compiles these functions, and types differ
-    from typing import Any
-    from typing import Any as Depth
-    from typing import Any as Floats
-    from typing import Any as Image
-    from typing import Any as Items
-
-    op: Any
-else:
-    from onnxscript import opset20 as op
-
-    Floats = onnxscript.FLOAT[...]
-    Image, Depth = onnxscript.FLOAT["B", 3, "H", "W"], onnxscript.FLOAT["B", 1, "H", "W"]
-    Items = onnxscript.FLOAT["B"]
+from .scripting import Depth, Floats, Image, Items, op, script
 
 __all__ = ["decode", "encode"]
-
-_script = onnxscript.script(onnxscript.values.Opset(DOMAIN, 1), default_opset=op)
 
 
 def encode(size: tuple[int, int] | None, mean: Sequence[float], std: Sequence[float]) -> onnx.ModelProto:
     """A graph that converts linear light ``[B, 3, H, W]`` to an estimator's input."""
     means, divisors, target = list(map(float, mean)), list(map(float, std)), list(size or ())
 
-    @_script
+    @script
     def normal(image: Image) -> Floats:
         per_channel = op.Constant(value_ints=[1, 3, 1, 1])
         clipped = op.Clip(image, 0.0, 1.0)
@@ -45,11 +27,11 @@ def encode(size: tuple[int, int] | None, mean: Sequence[float], std: Sequence[fl
         centred = display - op.Reshape(op.Constant(value_floats=means), per_channel)
         return centred / op.Reshape(op.Constant(value_floats=divisors), per_channel)
 
-    @_script
+    @script
     def encode(image: Image) -> Floats:
         return normal(image)
 
-    @_script
+    @script
     def encode_resized(image: Image) -> Floats:
         full = op.Concat(op.Shape(image, start=0, end=2), op.Constant(value_ints=target), axis=0)
         return op.Resize(normal(image), None, None, full, mode="linear", antialias=1)
@@ -57,7 +39,7 @@ def encode(size: tuple[int, int] | None, mean: Sequence[float], std: Sequence[fl
     return (encode if size is None else encode_resized).to_model_proto()
 
 
-@_script
+@script
 def depth_of(inverse: Floats, light: Floats) -> Floats:
     """Depth in metres at the size of the image; infinite where inverse depth is not positive."""
     size = op.Concat(op.Shape(inverse, start=0, end=2), op.Shape(light, start=2, end=4), axis=0)
@@ -65,7 +47,7 @@ def depth_of(inverse: Floats, light: Floats) -> Floats:
     return op.Reciprocal(op.Where(resized < 0.0, 0.0, resized))
 
 
-@_script
+@script
 def maps_of(estimate: Floats) -> Floats:
     """``[B, h, w]`` or ``[B, 1, h, w]`` as ``[B, 1, h, w]``."""
     frame = op.Shape(estimate, start=-2)
@@ -76,15 +58,15 @@ def decode(kind: str, scale: float, shift: float) -> onnx.ModelProto:
     """A graph that converts an estimator's output ``[B, h, w]`` or ``[B, 1, h, w]`` to depth in metres."""
     scale, shift = float(scale), float(shift)
 
-    @_script
+    @script
     def metric(estimate: Floats, light: Image) -> Depth:
         return depth_of(op.Reciprocal(maps_of(estimate) * scale), light)
 
-    @_script
+    @script
     def inverse(estimate: Floats, light: Image) -> Depth:
         return depth_of(maps_of(estimate) * scale + shift, light)
 
-    @_script
+    @script
     def relative(estimate: Floats, light: Image, near_m: Items, far_m: Items) -> Depth:
         axes = op.Constant(value_ints=[1, 2, 3])
         values = maps_of(estimate)
@@ -93,4 +75,6 @@ def decode(kind: str, scale: float, shift: float) -> onnx.ModelProto:
         farthest = op.Reciprocal(op.Unsqueeze(far_m, axes))
         return depth_of(fraction * (op.Reciprocal(op.Unsqueeze(near_m, axes)) - farthest) + farthest, light)
 
-    return {"metric": metric, "inverse": inverse, "relative-inverse": relative}[kind].to_model_proto()
+    graphs: dict[str, Any] = {"metric": metric, "inverse": inverse, "relative-inverse": relative}
+    model: onnx.ModelProto = graphs[kind].to_model_proto()
+    return model

@@ -3,35 +3,17 @@
 Sources are in lists ``[n]``. Kernels ``[m, k, k]`` of a part of the sources are as wide as its widest kernel.
 """
 
-from typing import TYPE_CHECKING
-
-import onnxscript
-
 from torchdof.render.highlights import COARSE_CELL, NEARER_PX
 
-from .operators import DOMAIN
-
-if TYPE_CHECKING:  # onnxscript compiles these functions, and types differ
-    from typing import Any
-    from typing import Any as Flag
-    from typing import Any as Floats
-    from typing import Any as Ints
-
-    op: Any
-else:
-    from onnxscript import opset20 as op
-
-    Flag, Floats, Ints = onnxscript.BOOL[...], onnxscript.FLOAT[...], onnxscript.INT64[...]
+from .scripting import Flag, Floats, Ints, op, script
 
 __all__ = ["FUNCTIONS"]
 
 _MAX_TAPS = 2**16
 """Largest number of rays splatted together."""
 
-_script = onnxscript.script(onnxscript.values.Opset(DOMAIN, 1), default_opset=op)
 
-
-@_script
+@script
 def values_at(values: Floats, origins: Ints, halves: Ints, round: Flag, node: Ints, step: Ints) -> Floats:
     """Kernels ``[1 or C, m, k, k]`` at nodes ``[m]``; 0 outside."""
     axes = op.Constant(value_ints=[1, 2])
@@ -43,14 +25,14 @@ def values_at(values: Floats, origins: Ints, halves: Ints, round: Flag, node: In
     return op.Gather(values, op.Where(larger > half, op.Constant(value_int=0), index), axis=1)
 
 
-@_script
+@script
 def covered_at(places: Floats, covers: Floats, pixel: Ints, bin: Floats) -> Floats:
     """Share of pixels ``[p, k, k]`` covered by surfaces in bins ``[p, 1, 1, 1]``."""
     near = op.Relu(1.0 - op.Abs(op.Gather(places, pixel) - bin))
     return op.ReduceSum(op.Gather(covers, pixel) * near, op.Constant(value_ints=[3]), keepdims=0)
 
 
-@_script
+@script
 def count_in(cells: Floats, bin: Ints, item: Ints, row: Ints, column: Ints) -> Floats:
     """Number of cells above and left of ``[m, bins]`` that may contain surfaces in bins ``[bins]``."""
     items = op.Squeeze(op.Shape(cells, start=1, end=2))
@@ -60,7 +42,7 @@ def count_in(cells: Floats, bin: Ints, item: Ints, row: Ints, column: Ints) -> F
     return op.Gather(op.Reshape(cells, op.Constant(value_ints=[-1])), index)
 
 
-@_script
+@script
 def splat(
     blank: Floats,
     light: Floats,
