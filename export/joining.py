@@ -147,8 +147,9 @@ def _join(parts: Sequence[onnx.ModelProto]) -> onnx.ModelProto:
         name="estimated_depth_of_field",
     )
     dof = parts[-1]
-    producer = {"producer_name": dof.producer_name, "producer_version": dof.producer_version}
-    return onnx_ir.to_proto(onnx_ir.Model(joint, ir_version=dof.ir_version, **producer))
+    model = onnx_ir.Model(joint, ir_version=dof.ir_version)
+    model.producer_name, model.producer_version = dof.producer_name, dof.producer_version
+    return onnx_ir.to_proto(model)
 
 
 def _prefixed(part: onnx.ModelProto, prefix: str) -> onnx_ir.Graph:

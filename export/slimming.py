@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import onnx
 import onnx_ir
+from onnx.reference import ReferenceEvaluator
 from onnx_ir.passes import common as passes
 from onnx_ir.tape import Tape
 from onnxscript.optimizer import fold_constants
@@ -58,8 +59,8 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
     )
     for step in flat:
         step(model)
-    # in a graph of tiles, weights are stored once and gathered; in a straight one they must be constants
-    fold_constants(model, input_size_limit=2**24, output_size_limit=2**20 if straight else 2**13)
+    fold_constants(model, input_size_limit=2**24, output_size_limit=2**13)
+    _fold_weights(model)
     for step in tidy:
         step(model)
     structure(model)
@@ -73,6 +74,28 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
     _drop_defaults(model)
     _shorten(model)
     return model
+
+
+def _fold_weights(model: onnx_ir.Model) -> None:
+    """Makes constants of weights of convolutions that are larger than the other constants which are folded."""
+    for node in [node for node in model.graph if node.op_type == "Conv"]:
+        weight = node.inputs[1]
+        array = None if weight is None or weight.const_value is not None else _folded(weight)
+        if weight is not None and array is not None:
+            node.replace_input_with(1, _initializer(model.graph, array, f"{weight.name}_folded"))
+
+
+def _folded(value: onnx_ir.Value | None) -> np.ndarray | None:
+    """The numbers of a value that does not depend on the graph's inputs, else None."""
+    tensor = None if value is None else onnx_ir.convenience.get_const_tensor(value)
+    node = None if value is None else value.producer()
+    if tensor is not None or node is None:
+        return None if tensor is None else tensor.numpy()
+    feed = {str(source.name): _folded(source) for source in node.inputs if source is not None}
+    if any(array is None for array in feed.values()):
+        return None
+    results: Any = ReferenceEvaluator(onnx_ir.to_proto(node)).run(None, feed)
+    return np.asarray(results[0])
 
 
 def _place_weights(model: onnx_ir.Model) -> None:
