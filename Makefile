@@ -70,7 +70,7 @@ sanitize: $(INSTALLED)
 
 SECONDS := 3600
 fuzz: $(INSTALLED)
-	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz.run --seconds $(SECONDS)
+	FUZZ_SECONDS=$(SECONDS) $(BIN)/python -m pytest -n 1 -m hard tests/fuzz
 
 soak: $(INSTALLED)
 	$(BIN)/python -m tests.hard.soak --renderings 1000

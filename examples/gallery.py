@@ -71,30 +71,10 @@ def inner(scene: Scene, pixels: Tensor) -> Tensor:
     return pixels[..., m : pixels.shape[-2] - m, m : pixels.shape[-1] - m]
 
 
-def draw_before(path: Path) -> None:
-    """The photograph, sharp everywhere."""
-    photograph(path, motorcycle()[0])
-
-
-def draw_after(path: Path) -> None:
-    """Focused on the front wheel."""
-    photograph(path, focused(2.3))
-
-
-def draw_far(path: Path) -> None:
-    """Focused on the shelf behind."""
-    photograph(path, focused(4.6))
-
-
 def portrait(stops: float = 0.0) -> Tensor:
     """The demo's portrait; lamps behind the face get up to ``stops`` more light before they are blurred."""
     picture, depth, camera = DEMO["portrait"](PORTRAIT, stops)
     return torchdof.depth_of_field(picture.pixels, depth, camera)
-
-
-def draw_portrait(path: Path) -> None:
-    """A face in focus before lamps."""
-    photograph(path, portrait(4.0))
 
 
 def draw_portrait_lights(path: Path) -> None:
@@ -262,10 +242,10 @@ def draw_thin_lens(path: Path) -> None:
 
 
 GALLERY: dict[str, Callable[[Path], None]] = {
-    "before.jpg": draw_before,
-    "after.jpg": draw_after,
-    "far.jpg": draw_far,
-    "portrait.jpg": draw_portrait,
+    "before.jpg": lambda path: photograph(path, motorcycle()[0]),
+    "after.jpg": lambda path: photograph(path, focused(2.3)),  # on the front wheel
+    "far.jpg": lambda path: photograph(path, focused(4.6)),  # on the shelf behind
+    "portrait.jpg": lambda path: photograph(path, portrait(4.0)),
     "portrait_lights.jpg": draw_portrait_lights,
     "blur_radius.jpg": draw_blur_radius,
     "apertures.jpg": draw_apertures,

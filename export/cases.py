@@ -1,8 +1,8 @@
 """The cases on which a file is verified: frames, lenses and scenes other than the traced ones."""
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as functional
@@ -15,14 +15,8 @@ from .graph import Portable
 __all__ = ["Case", "cases"]
 
 
-@dataclasses.dataclass(frozen=True)
-class Case:
-    """The inputs of one call.
-
-    Args:
-        name: Short description.
-        tensors: The inputs, in the order of the graph.
-    """
+class Case(NamedTuple):
+    """The name of a call, and its inputs in the order of the graph."""
 
     name: str
     tensors: tuple[Tensor, ...]

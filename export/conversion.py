@@ -254,24 +254,18 @@ _TRANSLATIONS: dict[Callable[..., Any], Callable[..., Any]] = {
 """Translations of operators that torch.onnx does not translate itself."""
 
 
-_LOGGERS = ("torch.onnx", "torch.fx.experimental.symbolic_shapes", "onnxscript", "onnx_ir")
-
-
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """Silences messages of torch.onnx and onnxscript that do not concern the module."""
-    loggers = [logging.getLogger(name) for name in _LOGGERS]
-    levels = [logger.level for logger in loggers]
     with warnings.catch_warnings():
         # torch's own copy of its tree specs calls a constructor that torch deprecates
         warnings.filterwarnings("ignore", message=r".*isinstance\(treespec, LeafSpec\).*", category=FutureWarning)
         # depth, focus and f-number share the image's axes, as intended
         warnings.filterwarnings("ignore", message=r".*axis name: [BHW] will not be used", category=UserWarning)
-        for logger in loggers:
-            # each export warns of missing torchvision operators and of size ranges that torch cannot express
-            logger.setLevel(logging.ERROR)
+        # each export warns of missing torchvision operators and of size ranges that torch cannot express
+        before = logging.root.manager.disable
+        logging.disable(logging.WARNING)
         try:
             yield
         finally:
-            for logger, level in zip(loggers, levels, strict=True):
-                logger.setLevel(level)
+            logging.disable(before)

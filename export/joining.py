@@ -1,16 +1,15 @@
 """Joins a depth estimator and a module, with the conversions between them, in one graph."""
 
 import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import onnx
-import onnx.compose
 import onnx.version_converter
 import onnx_ir
+import onnx_ir.passes.common
 
 from torchdof.io.atomic import atomic_file
 from torchdof.validation import choice
@@ -75,15 +74,9 @@ def chain(
         raise ValueError(f"dof_model must take a depth and an image of 3 channels, it takes {facts['inputs']}")
     if facts["size"] is not None:
         raise ValueError(f"dof_model takes only frames of {facts['size']}; export it without a size")
-    opset, ir = _opset(dof), dof.ir_version
-    estimator, declared_size, rank = _prepare(depth_model, opset, ir)
+    estimator, declared_size = _prepare(depth_model, _opset(dof))
     size = size or declared_size
-    parts = [
-        bridge.encode(opset, ir, size, mean, std),
-        estimator,
-        bridge.decode(opset, ir, estimate, rank, scale, shift),
-        dof,
-    ]
+    parts = [bridge.encode(size, mean, std), estimator, bridge.decode(estimate, scale, shift), dof]
     joint = _join(parts)
     facts["inputs"] = {value.name: UNITS[value.name].format(channels=3) for value in joint.graph.input}
     facts["output"]["depth"] = UNITS["depth"]
@@ -96,8 +89,8 @@ def chain(
         _compare(joint, str(temporary), parts, size or (42, 56))
 
 
-def _prepare(depth_model: Model, opset: int, ir: int) -> tuple[onnx.ModelProto, tuple[int, int] | None, int]:
-    """The estimator in the module's version of ONNX, the input size it declares, and the rank of its output."""
+def _prepare(depth_model: Model, opset: int) -> tuple[onnx.ModelProto, tuple[int, int] | None]:
+    """The estimator in the module's version of ONNX, and the input size it declares."""
     model = depth_model if isinstance(depth_model, onnx.ModelProto) else load(depth_model)
     weights = {tensor.name for tensor in model.graph.initializer}
     inputs = [value for value in model.graph.input if value.name not in weights]
@@ -120,41 +113,56 @@ def _prepare(depth_model: Model, opset: int, ir: int) -> tuple[onnx.ModelProto, 
         model = onnx.version_converter.convert_version(model, opset)
     else:
         model = onnx.ModelProto.FromString(model.SerializeToString())
-    model.ir_version = ir
     del model.graph.value_info[:]  # its names of sizes would clash
-    return model, (shape[2], shape[3]) if shape[2] and shape[3] else None, rank
+    return model, (shape[2], shape[3]) if shape[2] and shape[3] else None
 
 
 def _join(parts: Sequence[onnx.ModelProto]) -> onnx.ModelProto:
     """Encoding, estimator, decoding and module as one graph; each part's names get a prefix."""
     names = ("encode/", "estimator/", "decode/", "dof/")
-    encode, estimator, decode, dof = (_prefixed(part, name) for part, name in zip(parts, names, strict=True))
-    estimator_input, estimator_output = f"{estimator.graph.input[0].name}", f"{estimator.graph.output[0].name}"
-    joint = onnx.compose.merge_models(
-        encode, estimator, [("encode/encoded", estimator_input)], outputs=[estimator_output, "encode/light"]
+    graphs = [_prefixed(part, name) for part, name in zip(parts, names, strict=True)]
+    inputs: list[list[Any]] = [list(graph.inputs) for graph in graphs]
+    (encoded,), (estimate,), (depth,), (out,) = (list(graph.outputs) for graph in graphs)
+    (image,), (pixels,), (values, light, *ends), (sharp, metres, *lens) = inputs
+    nodes, initializers = [], []
+    for graph in graphs:
+        graph.inputs.clear()
+        graph.outputs.clear()
+        initializers += list(graph.initializers.values())
+        graph.initializers.clear()
+        nodes += list(graph)
+        graph.remove(list(graph))
+    for old, new in ((pixels, encoded), (values, estimate), (light, image), (sharp, image), (metres, depth)):
+        old.replace_all_uses_with(new)
+    for value in (image, *ends, *lens, out, depth):
+        value.name = value.name.rpartition("/")[2]
+    depth.name, depth.shape = "depth", metres.shape
+    opsets = {"": _opset(parts[-1])}
+    joint = onnx_ir.Graph(
+        [image, *ends, *lens],
+        [out, depth],
+        nodes=nodes,
+        initializers=initializers,
+        opset_imports=opsets,
+        name="estimated_depth_of_field",
     )
-    joint = onnx.compose.merge_models(
-        joint, decode, [(estimator_output, "decode/estimate"), ("encode/light", "decode/light")]
-    )
-    io_map = [("decode/depth", "dof/depth"), ("decode/image", "dof/image")]
-    joint = onnx.compose.merge_models(joint, dof, io_map, outputs=[f"dof/{OUTPUT}", "decode/depth"])
-    graph = onnx_ir.from_proto(joint)
-    for value in (*graph.graph.inputs, *graph.graph.outputs):
-        value.name = str(value.name).rpartition("/")[2]
-    joint = onnx_ir.to_proto(graph)
-    joint.producer_name, joint.producer_version = dof.producer_name, dof.producer_version
-    joint.graph.name = "estimated_depth_of_field"
-    return joint
+    dof = parts[-1]
+    model = onnx_ir.Model(joint, ir_version=dof.ir_version)
+    model.producer_name, model.producer_version = dof.producer_name, dof.producer_version
+    return onnx_ir.to_proto(model)
 
 
-def _prefixed(model: onnx.ModelProto, prefix: str) -> onnx.ModelProto:
-    """Adds a prefix to every name; ``onnx.compose.add_prefix`` misses outer names used in the body of a loop."""
-    copy = onnx_ir.from_proto(onnx.ModelProto.FromString(model.SerializeToString()))  # shares tensors with its source
+def _prefixed(part: onnx.ModelProto, prefix: str) -> onnx_ir.Graph:
+    """A copy of a graph without functions and with a prefix before every name."""
+    copy = onnx_ir.from_proto(onnx.ModelProto.FromString(part.SerializeToString()))  # shares tensors with its source
+    onnx_ir.passes.common.InlinePass()(copy)
     for graph in (copy.graph, *copy.graph.subgraphs()):
         values = [*graph.inputs, *graph.initializers.values(), *(value for node in graph for value in node.outputs)]
         for value in {id(value): value for value in values}.values():
             value.name = f"{prefix}{value.name}"
-    return onnx_ir.to_proto(copy)
+        for node in graph:
+            node.name = node.name and f"{prefix}{node.name}"
+    return copy.graph
 
 
 def _compare(joint: onnx.ModelProto, path: str, parts: Sequence[onnx.ModelProto], size: tuple[int, int]) -> None:
@@ -163,21 +171,15 @@ def _compare(joint: onnx.ModelProto, path: str, parts: Sequence[onnx.ModelProto]
     values = {"image": np.random.default_rng(4).random((1, 3, *frame), dtype=np.float32)}
     for name, number in (("focus_m", 1.5), ("f_number", 4.0), ("near_m", 0.7), ("far_m", 30.0)):
         values[name] = np.full(1, number, dtype=np.float32)
-    feed = {value.name: values[value.name] for value in joint.graph.input}
-    joint_results = session(path).run([OUTPUT, "depth"], feed)
-    for part in parts:
-        with tempfile.TemporaryDirectory() as folder:
-            single = os.path.join(folder, "part.onnx")
-            onnx.save_model(part, single)
-            run = session(single)
+    results = session(path).run([OUTPUT, "depth"], {value.name: values[value.name] for value in joint.graph.input})
+    values["light"] = values["image"]
+    for part, output in zip(parts, ("encoded", "estimate", "depth", OUTPUT), strict=True):
+        run = session(part.SerializeToString())
         names = [value.name for value in run.get_inputs()]
-        if part is parts[1]:
+        if output == "estimate":
             values[names[0]] = values["encoded"]
-        results = dict(
-            zip([v.name for v in run.get_outputs()], run.run(None, {n: values[n] for n in names}), strict=True)
-        )
-        values |= {"estimate": next(iter(results.values()))} if part is parts[1] else results
-    for name, result in zip((OUTPUT, "depth"), joint_results, strict=True):
+        values[output] = run.run(None, {name: values[name] for name in names})[0]
+    for name, result in zip((OUTPUT, "depth"), results, strict=True):
         expected = values[name]
         error = float(np.nanmax(np.abs(result - expected) / np.maximum(np.abs(expected), 1.0)))
         if result.shape != expected.shape or not error <= TOLERANCE:

@@ -4,30 +4,16 @@ Each part is a window of a narrow map, so that the loop over tiles (:mod:`.struc
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
-import onnxscript
 from torch import Tensor
 
-from .operators import DOMAIN, collect, operator, window
-
-if TYPE_CHECKING:  # onnxscript compiles these functions, and types differ
-    from typing import Any
-    from typing import Any as Floats
-    from typing import Any as Ints
-
-    op: Any
-else:
-    from onnxscript import opset20 as op
-
-    Floats, Ints = onnxscript.FLOAT[...], onnxscript.INT64[...]
+from .operators import collect, operator, window
+from .scripting import Floats, Ints, op, script
 
 __all__ = ["FUNCTIONS", "by_parts"]
 
 _PART_SIDE = 32  # side of the map that holds a part; larger: fewer steps of the loop, more memory
 _PART_SIZE = _PART_SIDE * _PART_SIDE
-
-_script = onnxscript.script(onnxscript.values.Opset(DOMAIN, 1), default_opset=op)
 
 
 def by_parts(look: Callable[[Tensor], Tensor], pixels: Tensor) -> Tensor:
@@ -40,7 +26,7 @@ def by_parts(look: Callable[[Tensor], Tensor], pixels: Tensor) -> Tensor:
     return operator("joined_parts", [pixels, collect(tile, parts)], (results.shape[0], count))
 
 
-@_script
+@script
 def parts_of(pixels: Ints) -> Ints:
     """A list as rows of a map ``[1, 1, n, side]``, padded with zeros to whole parts."""
     count = op.Shape(pixels)
@@ -49,7 +35,7 @@ def parts_of(pixels: Ints) -> Ints:
     return op.Reshape(op.Pad(pixels, ends), op.Constant(value_ints=[1, 1, -1, _PART_SIDE]))
 
 
-@_script
+@script
 def joined_parts(pixels: Ints, tiles: Floats) -> Floats:
     """Joins the results of the parts ``[n, C, side, side]`` to lists ``[C, P]``."""
     lists = op.Transpose(tiles, perm=[1, 0, 2, 3])

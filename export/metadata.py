@@ -3,7 +3,7 @@
 import hashlib
 import json
 import os
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from typing import Any
 
 import onnx
@@ -33,12 +33,12 @@ UNITS = {
 
 def label(model: onnx.ModelProto, dof: DepthOfField, portable: Portable, channels: int, opset: int) -> None:
     """Writes producer and metadata into a model."""
-    model.producer_name, model.producer_version = "torchdof", _version()
+    model.producer_name, model.producer_version = "torchdof", version("torchdof")
     model.doc_string = "Depth of field: an all-in-focus image and its depth in, the photograph of a real lens out."
     model.graph.name = "depth_of_field"
     options = {k: v for k, v in dof.options.arguments().items() if k not in ("table", "check", "depth_edges")}
     facts: dict[str, Any] = {
-        "version": _version(),
+        "version": model.producer_version,
         "inputs": {v.name: UNITS[v.name].format(channels=channels) for v in model.graph.input},
         "output": {OUTPUT: UNITS["image"].format(channels=channels)},
         "camera": {k: getattr(dof.camera, k) for k in Camera.__dataclass_fields__},
@@ -142,10 +142,3 @@ def shown(text: str) -> str:
 def table_hash(table: BlurTable) -> str:
     """SHA-256 of a table's content."""
     return hashlib.sha256(json.dumps(table.to_dict(), sort_keys=True).encode()).hexdigest()
-
-
-def _version() -> str:
-    try:
-        return version("torchdof")
-    except PackageNotFoundError:
-        return "unknown"

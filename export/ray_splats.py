@@ -3,44 +3,17 @@
 Sources are in lists ``[n]``. Kernels ``[m, k, k]`` of a part of the sources are as wide as its widest kernel.
 """
 
-from typing import TYPE_CHECKING
-
-import onnxscript
-
 from torchdof.render.highlights import COARSE_CELL, NEARER_PX
 
-from .operators import DOMAIN
-
-if TYPE_CHECKING:  # onnxscript compiles these functions, and types differ
-    from typing import Any
-    from typing import Any as Flag
-    from typing import Any as Floats
-    from typing import Any as Ints
-
-    op: Any
-else:
-    from onnxscript import opset20 as op
-
-    Flag, Floats, Ints = onnxscript.BOOL[...], onnxscript.FLOAT[...], onnxscript.INT64[...]
+from .scripting import Flag, Floats, Ints, op, script
 
 __all__ = ["FUNCTIONS"]
 
 _MAX_TAPS = 2**16
 """Largest number of rays splatted together."""
 
-_script = onnxscript.script(onnxscript.values.Opset(DOMAIN, 1), default_opset=op)
 
-
-@_script
-def part_end(half: Ints, start: Ints) -> Ints:
-    """End of the part of the sources that begins at ``start``; sources are sorted by width; the taps are limited."""
-    side = 2 * op.Gather(half, start) + 1
-    stop = op.Min(start + op.Max(_MAX_TAPS / (side * side), 1), op.Size(half))
-    side = 2 * op.Gather(half, stop - 1) + 1
-    return op.Min(start + op.Max(_MAX_TAPS / (side * side), 1), stop)
-
-
-@_script
+@script
 def values_at(values: Floats, origins: Ints, halves: Ints, round: Flag, node: Ints, step: Ints) -> Floats:
     """Kernels ``[1 or C, m, k, k]`` at nodes ``[m]``; 0 outside."""
     axes = op.Constant(value_ints=[1, 2])
@@ -52,24 +25,14 @@ def values_at(values: Floats, origins: Ints, halves: Ints, round: Flag, node: In
     return op.Gather(values, op.Where(larger > half, op.Constant(value_int=0), index), axis=1)
 
 
-@_script
-def kernels_at(
-    values: Floats, origins: Ints, halves: Ints, round: Flag, node: Ints, part: Floats, step: Ints
-) -> Floats:
-    """Kernels ``[1 or C, m, k, k]`` interpolated between nodes ``[m]`` and the next ones."""
-    near = values_at(values, origins, halves, round, node, step)
-    far = values_at(values, origins, halves, round, node + 1, step)
-    return near + (far - near) * op.Unsqueeze(part, op.Constant(value_ints=[1, 2]))
-
-
-@_script
+@script
 def covered_at(places: Floats, covers: Floats, pixel: Ints, bin: Floats) -> Floats:
     """Share of pixels ``[p, k, k]`` covered by surfaces in bins ``[p, 1, 1, 1]``."""
     near = op.Relu(1.0 - op.Abs(op.Gather(places, pixel) - bin))
     return op.ReduceSum(op.Gather(covers, pixel) * near, op.Constant(value_ints=[3]), keepdims=0)
 
 
-@_script
+@script
 def count_in(cells: Floats, bin: Ints, item: Ints, row: Ints, column: Ints) -> Floats:
     """Number of cells above and left of ``[m, bins]`` that may contain surfaces in bins ``[bins]``."""
     items = op.Squeeze(op.Shape(cells, start=1, end=2))
@@ -79,94 +42,7 @@ def count_in(cells: Floats, bin: Ints, item: Ints, row: Ints, column: Ints) -> F
     return op.Gather(op.Reshape(cells, op.Constant(value_ints=[-1])), index)
 
 
-@_script
-def blocked_share(
-    coc: Floats,
-    item: Ints,
-    row: Ints,
-    column: Ints,
-    step: Ints,
-    height: Ints,
-    width: Ints,
-    places: Floats,
-    covers: Floats,
-    cells: Floats,
-    nearest: Floats,
-) -> Floats:
-    """Share of each ray that nearer surfaces block, ``[m, k, k]``.
-
-    1. Find the pairs of source and bin for which the bin may contain a surface within the reach of the rays.
-    2. Interpolate the cover of that bin where each ray crosses it.
-    3. Add up the covers of all bins of a source, at most 1.
-    """
-    axis_1 = op.Constant(value_ints=[1])
-    axis_2 = op.Constant(value_ints=[2])
-    axes = op.Constant(value_ints=[1, 2])
-    coc = op.Unsqueeze(coc, axis_1)
-    item = op.Unsqueeze(item, axis_1)
-    row = op.Cast(op.Unsqueeze(row, axis_1), to=1)
-    column = op.Cast(op.Unsqueeze(column, axis_1), to=1)
-    last_row = op.Cast(height - 1, to=1)
-    last_column = op.Cast(width - 1, to=1)
-    step = op.Cast(step, to=1)
-
-    # pairs of a source and a bin that may contain a surface within reach of its rays
-    zero = op.Constant(value_int=0)
-    one = op.Constant(value_int=1)
-    bin = op.Range(zero, op.Squeeze(op.Shape(cells, start=0, end=1)), one)
-    nearer = op.Gather(nearest, item) + op.Cast(bin, to=1)
-    scale = 1.0 - nearer / coc
-    fade = op.Clip(coc - NEARER_PX - nearer, 0.0, 1.0)
-    reach = op.Abs(scale) * op.ReduceMax(step, keepdims=0)
-    top = op.Cast(op.Clip(row - reach, 0.0, last_row), to=7) / COARSE_CELL
-    bottom = op.Cast(op.Clip(row + reach + 1.0, 0.0, last_row), to=7) / COARSE_CELL + 1
-    left = op.Cast(op.Clip(column - reach, 0.0, last_column), to=7) / COARSE_CELL
-    right = op.Cast(op.Clip(column + reach + 1.0, 0.0, last_column), to=7) / COARSE_CELL + 1
-    below = count_in(cells, bin, item, bottom, right) - count_in(cells, bin, item, top, right)
-    count = below - count_in(cells, bin, item, bottom, left) + count_in(cells, bin, item, top, left)
-    pairs = op.NonZero(op.And(count > 0.0, fade > 0.0))
-    pair = op.Transpose(pairs, perm=[1, 0])
-    source = op.Gather(pairs, zero)
-    pair_bin = op.Unsqueeze(op.Cast(op.Gather(pairs, one), to=1), op.Constant(value_ints=[1, 2, 3]))
-
-    # each ray of a pair crosses the bin's surface between four pixels
-    offset = op.Unsqueeze(op.GatherND(scale, pair), axis_1) * step
-    rows = op.Clip(op.Gather(row, source) + offset, 0.0, last_row)
-    columns = op.Clip(op.Gather(column, source) + offset, 0.0, last_column)
-    top = op.Min(op.Floor(rows), op.Max(last_row - 1.0, 0.0))
-    left = op.Min(op.Floor(columns), op.Max(last_column - 1.0, 0.0))
-    row_start = (op.Gather(item, source) * height + op.Cast(top, to=7)) * width
-    first = op.Unsqueeze(row_start, axis_2) + op.Unsqueeze(op.Cast(left, to=7), axis_1)
-    to_right = op.Min(width - 1, one)
-    to_below = op.Min(height - 1, one) * width
-    right_share = op.Unsqueeze(columns - left, axis_1)
-    upper = covered_at(places, covers, first, pair_bin)
-    upper = upper + (covered_at(places, covers, first + to_right, pair_bin) - upper) * right_share
-    first = first + to_below
-    lower = covered_at(places, covers, first, pair_bin)
-    lower = lower + (covered_at(places, covers, first + to_right, pair_bin) - lower) * right_share
-    covered = upper + (lower - upper) * op.Unsqueeze(rows - top, axis_2)
-    blocked = covered * op.Unsqueeze(op.GatherND(fade, pair), axes)
-    side = op.Shape(step)
-    nothing = op.ConstantOfShape(op.Concat(op.Shape(item, start=0, end=1), side, side, axis=0))
-    # not ScatterND: runtimes add in parallel there, and would lose some bins of a source that has several
-    target = op.Expand(op.Unsqueeze(source, axes), op.Shape(blocked))
-    return op.Min(op.ScatterElements(nothing, target, blocked, axis=0, reduction="add"), 1.0)
-
-
-@_script
-def add_light(splats: Floats, light: Floats, first: Ints, kernels: Floats, step: Ints, across: Ints) -> Floats:
-    """Adds the light ``[m, C]`` of sources, centred at ``first`` ``[m]``, to splats ``[C, n]``."""
-    axes = op.Constant(value_ints=[1, 2])
-    rest_axis = op.Constant(value_ints=[-1])
-    scattered = kernels * op.Unsqueeze(op.Transpose(light, perm=[1, 0]), op.Constant(value_ints=[2, 3]))
-    scattered = op.Reshape(scattered, op.Concat(op.Shape(scattered, start=0, end=1), rest_axis, axis=0))
-    offset = op.Unsqueeze(step * across, op.Constant(value_ints=[1])) + step
-    target = op.Reshape(op.Unsqueeze(first, axes) + offset, rest_axis)
-    return op.ScatterElements(splats, op.Expand(target, op.Shape(scattered)), scattered, axis=1, reduction="add")
-
-
-@_script
+@script
 def splat(
     blank: Floats,
     light: Floats,
@@ -190,35 +66,96 @@ def splat(
     cells: Floats,
     nearest: Floats,
 ) -> Floats:
-    """Light ``[C, B, H, W]`` of all sources on a blank frame with a margin, except light blocked by nearer surfaces."""
+    """Light ``[C, B, H, W]`` of all sources on a blank frame with a margin, except light blocked by nearer surfaces.
+
+    1. Take the next part of the sources, which are sorted by width, and interpolate their kernels.
+    2. Find the pairs of source and bin for which the bin may contain a surface within the reach of the rays.
+    3. Interpolate the cover of that bin where each ray crosses it, and add up those of all bins of a source, at most 1.
+    4. Add the light that is not blocked where the rays land.
+    """
+    zero = op.Constant(value_int=0)
+    one = op.Constant(value_int=1)
+    axis_1 = op.Constant(value_ints=[1])
+    axis_2 = op.Constant(value_ints=[2])
+    axes = op.Constant(value_ints=[1, 2])
+    rest_axis = op.Constant(value_ints=[-1])
+    last_row = op.Cast(height - 1, to=1)
+    last_column = op.Cast(width - 1, to=1)
+    to_right = op.Min(width - 1, one)
+    to_below = op.Min(height - 1, one) * width
+    bin = op.Range(zero, op.Squeeze(op.Shape(cells, start=0, end=1)), one)
     splats = op.Reshape(blank, op.Constant(value_ints=[0, -1]))
     start = op.Constant(value_int=0)
     has_more = op.Size(half) > 0
     while has_more:
-        stop = part_end(half, start)
-        reach = op.Gather(half, stop - 1)
-        step = op.Range(-reach, reach + 1, 1)
+        # as many sources as the taps allow, by the first width, then by the last
+        side = 2 * op.Gather(half, start) + 1
+        limit = op.Min(start + op.Max(_MAX_TAPS / (side * side), 1), op.Size(half))
+        side = 2 * op.Gather(half, limit - 1) + 1
+        stop = op.Min(start + op.Max(_MAX_TAPS / (side * side), 1), limit)
         index = op.Range(start, stop, 1)
-        kernels = kernels_at(values, origins, halves, round, op.Gather(node, index), op.Gather(part, index), step)
-        hidden = blocked_share(
-            op.Gather(coc, index),
-            op.Gather(item, index),
-            op.Gather(row, index),
-            op.Gather(column, index),
-            step,
-            height,
-            width,
-            places,
-            covers,
-            cells,
-            nearest,
-        )
-        kernels = kernels * (1.0 - hidden)
-        splats = add_light(splats, op.Gather(light, index), op.Gather(first, index), kernels, step, across)
+        reach_px = op.Gather(half, stop - 1)
+        step = op.Range(-reach_px, reach_px + 1, 1)
+        offset = op.Cast(step, to=1)
+
+        # kernels [1 or C, m, k, k], interpolated between nodes
+        before = op.Gather(node, index)
+        near = values_at(values, origins, halves, round, before, step)
+        far = values_at(values, origins, halves, round, before + 1, step)
+        kernels = near + (far - near) * op.Unsqueeze(op.Gather(part, index), axes)
+
+        # pairs of a source and a bin that may contain a surface within reach of its rays
+        coc_px = op.Unsqueeze(op.Gather(coc, index), axis_1)
+        of_item = op.Unsqueeze(op.Gather(item, index), axis_1)
+        y = op.Cast(op.Unsqueeze(op.Gather(row, index), axis_1), to=1)
+        x = op.Cast(op.Unsqueeze(op.Gather(column, index), axis_1), to=1)
+        nearer = op.Gather(nearest, of_item) + op.Cast(bin, to=1)
+        scale = 1.0 - nearer / coc_px
+        fade = op.Clip(coc_px - NEARER_PX - nearer, 0.0, 1.0)
+        reach = op.Abs(scale) * op.ReduceMax(offset, keepdims=0)
+        top = op.Cast(op.Clip(y - reach, 0.0, last_row), to=7) / COARSE_CELL
+        bottom = op.Cast(op.Clip(y + reach + 1.0, 0.0, last_row), to=7) / COARSE_CELL + 1
+        left = op.Cast(op.Clip(x - reach, 0.0, last_column), to=7) / COARSE_CELL
+        right = op.Cast(op.Clip(x + reach + 1.0, 0.0, last_column), to=7) / COARSE_CELL + 1
+        below = count_in(cells, bin, of_item, bottom, right) - count_in(cells, bin, of_item, top, right)
+        count = below - count_in(cells, bin, of_item, bottom, left) + count_in(cells, bin, of_item, top, left)
+        pairs = op.NonZero(op.And(count > 0.0, fade > 0.0))
+        pair = op.Transpose(pairs, perm=[1, 0])
+        source = op.Gather(pairs, zero)
+        pair_bin = op.Unsqueeze(op.Cast(op.Gather(pairs, one), to=1), op.Constant(value_ints=[1, 2, 3]))
+
+        # each ray of a pair crosses the bin's surface between four pixels
+        way = op.Unsqueeze(op.GatherND(scale, pair), axis_1) * offset
+        rows = op.Clip(op.Gather(y, source) + way, 0.0, last_row)
+        columns = op.Clip(op.Gather(x, source) + way, 0.0, last_column)
+        upper_row = op.Min(op.Floor(rows), op.Max(last_row - 1.0, 0.0))
+        left_column = op.Min(op.Floor(columns), op.Max(last_column - 1.0, 0.0))
+        line = (op.Gather(of_item, source) * height + op.Cast(upper_row, to=7)) * width
+        corner = op.Unsqueeze(line, axis_2) + op.Unsqueeze(op.Cast(left_column, to=7), axis_1)
+        right_share = op.Unsqueeze(columns - left_column, axis_1)
+        upper = covered_at(places, covers, corner, pair_bin)
+        upper = upper + (covered_at(places, covers, corner + to_right, pair_bin) - upper) * right_share
+        corner = corner + to_below
+        lower = covered_at(places, covers, corner, pair_bin)
+        lower = lower + (covered_at(places, covers, corner + to_right, pair_bin) - lower) * right_share
+        covered = upper + (lower - upper) * op.Unsqueeze(rows - upper_row, axis_2)
+        blocked = covered * op.Unsqueeze(op.GatherND(fade, pair), axes)
+        across_rays = op.Shape(step)
+        nothing = op.ConstantOfShape(op.Concat(op.Shape(of_item, start=0, end=1), across_rays, across_rays, axis=0))
+        # not ScatterND: runtimes add in parallel there, and would lose some bins of a source that has several
+        target = op.Expand(op.Unsqueeze(source, axes), op.Shape(blocked))
+        hidden = op.Min(op.ScatterElements(nothing, target, blocked, axis=0, reduction="add"), 1.0)
+
+        colours = op.Unsqueeze(op.Transpose(op.Gather(light, index), perm=[1, 0]), op.Constant(value_ints=[2, 3]))
+        scattered = (kernels * (1.0 - hidden)) * colours
+        scattered = op.Reshape(scattered, op.Concat(op.Shape(scattered, start=0, end=1), rest_axis, axis=0))
+        lands = op.Unsqueeze(op.Gather(first, index), axes) + (op.Unsqueeze(step * across, axis_1) + step)
+        lands = op.Expand(op.Reshape(lands, rest_axis), op.Shape(scattered))
+        splats = op.ScatterElements(splats, lands, scattered, axis=1, reduction="add")
         start = stop
         has_more = start < op.Size(half)
     return op.Reshape(splats, op.Shape(blank))
 
 
-FUNCTIONS = (part_end, values_at, kernels_at, covered_at, count_in, blocked_share, add_light, splat)
+FUNCTIONS = (values_at, covered_at, count_in, splat)
 """The functions called in the graph."""

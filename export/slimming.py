@@ -28,7 +28,7 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
 
     A ``straight`` graph has none of these; its constants stay initializers, which runtimes for GPUs load once.
 
-    1. Inline functions, fold constants, and replace operators and chains of operators by faster or more common ones.
+    1. Inline functions, fold constants, and replace block means by convolutions.
     2. Make loops and branches.
     3. Put each convolution's weights into its own graph, and turn initializers into nodes.
     4. Remove default attributes and shorten names.
@@ -40,16 +40,11 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
         passes.DeduplicateInitializersPass(size_limit=2**24),
         # without values of sizes in a straight graph, in which onnx confuses lists of indices with them
         passes.ShapeInferencePass(data_prop=not straight),
-        _cast_plainly,
     )
     tidy: tuple[_Pass, ...] = (
         passes.RemoveUnusedNodesPass(),  # folding leaves sequences of a wrong type, which shape inference refuses
         passes.ShapeInferencePass(),
-        _take_parts,
-        _join_cuts,
         _convolve_averages,
-        _fill_channels,
-        _join_splits,
         passes.IdentityEliminationPass(),
         passes.CommonSubexpressionEliminationPass(),
         passes.RemoveUnusedNodesPass(),
@@ -124,7 +119,7 @@ def _place_weights(model: onnx_ir.Model) -> None:
 
 
 def _as_nodes(graph: onnx_ir.Graph) -> None:
-    """Turns initializers into ``Constant`` nodes, which ``onnx.compose`` renames in branches too."""
+    """Turns initializers into nodes; many equal numbers then take no space."""
     first = next(iter(graph), None)
     values: list[Any] = list(graph.initializers.values())
     for value in values:
@@ -155,75 +150,6 @@ def _initializer(graph: onnx_ir.Graph, array: np.ndarray, name: str) -> onnx_ir.
     return value
 
 
-def _replace(graph: onnx_ir.Graph, node: onnx_ir.Node, tape: Tape) -> None:
-    """Puts the nodes of a tape in the place of a node; the last one gives the same result."""
-    new, old = tape.nodes[-1].outputs[0], node.outputs[0]
-    new.type, new.shape = old.type, old.shape
-    graph.insert_before(node, list(tape.nodes))
-    old.replace_all_uses_with(new, replace_graph_outputs=True)
-    graph.remove(node, safe=True)
-
-
-def _cast_plainly(model: onnx_ir.Model) -> None:
-    """``CastLike`` becomes ``Cast``, or nothing if the type is right already; not every runtime simplifies it."""
-    number = itertools.count()
-    for graph in (model.graph, *model.graph.subgraphs()):
-        for node in list(graph):
-            if node.op_type != "CastLike" or node.domain:
-                continue
-            value, like = node.inputs
-            kind = None if like is None else like.dtype
-            if value is None or kind is None:
-                continue
-            if value.const_value is not None and value.is_initializer():
-                new = _cast_constant(model.graph, value, kind, next(number))
-            elif value.dtype == kind and not node.outputs[0].is_graph_output():
-                new = value
-            else:
-                cast = onnx_ir.node("Cast", [value], {"to": kind.value})
-                graph.insert_before(node, [cast])
-                new = cast.outputs[0]
-                new.type, new.shape = onnx_ir.TensorType(kind), node.outputs[0].shape
-            node.outputs[0].replace_all_uses_with(new, replace_graph_outputs=True)
-            graph.remove(node, safe=True)
-
-
-def _take_parts(model: onnx_ir.Model) -> None:
-    """A slice that is exactly one input of a ``Concat`` becomes that input; onnxruntime would warn of it."""
-    for node in list(model.graph):
-        if node.op_type == "Slice" and not node.outputs[0].is_graph_output():
-            part = _part(node)
-            if part is not None:
-                node.outputs[0].replace_all_uses_with(part)
-                model.graph.remove(node, safe=True)
-
-
-def _join_cuts(model: onnx_ir.Model) -> None:
-    """Two slices in sequence along different axes become one, because each copies."""
-    for node in list(model.graph):
-        source = node.inputs[0] if node.op_type == "Slice" else None
-        first = None if source is None else source.producer()
-        if first is None or first.op_type != "Slice" or len(first.inputs) != len(node.inputs):
-            continue
-        axis_values: list[Any] = [first.inputs[3], node.inputs[3]]
-        axes = [onnx_ir.convenience.get_const_tensor(value) for value in axis_values]
-        if source is None or axes[0] is None or axes[1] is None or source.shape is None:
-            continue
-        rank = len(source.shape)  # an axis may be counted from the last one
-        if {int(a) % rank for a in axes[0].numpy()} & {int(a) % rank for a in axes[1].numpy()}:
-            continue
-        tape, bounds = Tape(), []
-        for number, pair in enumerate(list(zip(first.inputs, node.inputs, strict=True))[1:]):
-            constants = [onnx_ir.convenience.get_const_tensor(value) for value in pair if value is not None]
-            if all(constant is not None for constant in constants):
-                joined = np.concatenate([constant.numpy() for constant in constants if constant is not None])
-                bounds.append(_initializer(model.graph, joined, f"{node.outputs[0].name}_bound_{number}"))
-            else:
-                bounds.append(tape.op("Concat", list(pair), {"axis": 0}))
-        tape.op("Slice", [first.inputs[0], *bounds])
-        _replace(model.graph, node, tape)
-
-
 def _convolve_averages(model: onnx_ir.Model) -> None:
     """Block means before a convolution become a convolution, which is several times as fast in runtimes."""
     for node in list(model.graph):
@@ -239,110 +165,22 @@ def _convolve_averages(model: onnx_ir.Model) -> None:
         filled = tape.op("Pad", [node.inputs[0], *pad.inputs[1:]])
         name = f"mean_{node.outputs[0].name}"
         kernel = _initializer(model.graph, weight, f"{name}_weight")
-        tape.op("Conv", [filled, kernel], {"group": channels, "strides": [scale, scale]}, name=name)
-        _replace(model.graph, pad, tape)
-        model.graph.remove(node, safe=True)
-
-
-def _fill_channels(model: onnx_ir.Model) -> None:
-    """Padding channels of a convolution become inputs of the ``Concat`` before it.
-
-    Their values do not matter, because they are not used: they repeat some of the other channels.
-    """
-    graph = model.graph
-    for pad in list(graph):
-        missing = _spare_channels(pad)
-        concat: Any = pad.inputs[0].producer() if missing and pad.inputs[0] is not None else None
-        if concat is None or concat.op_type != "Concat" or concat.attributes["axis"].as_int() != 1:
-            continue
-        filled, tape = list(concat.inputs), Tape()
-        for part in concat.inputs:
-            repeats, missing = divmod(missing, part.shape[1])
-            filled += [part] * repeats
-        if missing:
-            name = f"{pad.outputs[0].name}_fill"
-            ends = {"start": 0, "stop": missing, "axis": 1}
-            bounds = [_initializer(graph, np.array([n]), f"{name}_{end}") for end, n in ends.items()]
-            filled.append(tape.op("Slice", [concat.inputs[0], *bounds]))
-        tape.op("Concat", filled, {"axis": 1})
-        _replace(graph, pad, tape)
-
-
-def _join_splits(model: onnx_ir.Model) -> None:
-    """A slice of the first channels and a split become one split, whose last part is not used."""
-    graph = model.graph
-    for node in [n for n in graph if n.op_type == "Split" and n.attributes["axis"].as_int() == 1]:
-        cut: Any = None if node.inputs[0] is None else node.inputs[0].producer()
-        if cut is None or cut.op_type != "Slice" or cut.inputs[0].shape is None:
-            continue
-        source, kept_shape = cut.inputs[0], cut.outputs[0].shape
-        is_equal = [a == b for a, b in zip(source.shape, kept_shape, strict=True)]
-        bounds: list[Any] = [cut.inputs[1], node.inputs[1]]
-        first, sizes = (onnx_ir.convenience.get_const_tensor(value) for value in bounds)
-        if first is None or sizes is None or first.numpy().any() or is_equal != [True, False, True, True]:
-            continue
-        parts = np.array([*sizes.numpy(), source.shape[1] - kept_shape[1]])
-        all_sizes = _initializer(graph, parts, f"{node.outputs[0].name}_sizes")
-        split = onnx_ir.node("Split", [source, all_sizes], {"axis": 1}, num_outputs=len(parts))
-        graph.insert_before(node, [split])
-        for old, new in zip(node.outputs, split.outputs, strict=False):
-            new.type, new.shape = old.type, old.shape
-            old.replace_all_uses_with(new)
-        graph.remove(node, safe=True)
-
-
-def _spare_channels(node: onnx_ir.Node) -> int:
-    """Number of channels that a ``Pad`` appends, if it does nothing else; otherwise 0."""
-    pads = node.inputs[1] if node.op_type == "Pad" and len(node.inputs) > 1 else None
-    ends = [] if pads is None or pads.const_value is None else pads.const_value.numpy().tolist()
-    return ends[5] if len(ends) == 8 and not any(ends[:5] + ends[6:]) else 0
-
-
-def _part(node: onnx_ir.Node) -> onnx_ir.Value | None:
-    """The input of a ``Concat`` that a slice cuts out exactly, else None."""
-    source_value, *bounds = node.inputs
-    numbers = [v.const_value.numpy().tolist() for v in bounds if v is not None and v.const_value is not None]
-    source = None if source_value is None else source_value.producer()
-    if source is None or len(numbers) < max(3, len(bounds)) or any(len(n) != 1 for n in numbers):
-        return None
-    (start,), (end,), (axis,), (step,) = (*numbers, [1])[:4]
-    if (start, end) == (0, 2**63 - 1) and step == 1:
-        return source_value
-    if source.op_type != "Concat" or step != 1 or source.attributes["axis"].as_int() != axis:
-        return None
-    first = 0
-    for value in source.inputs:
-        size = None if value is None or value.shape is None else value.shape[axis]
-        if not isinstance(size, int):
-            return None
-        if (first, first + size) == (start, end):
-            return value
-        first += size
-    return None
-
-
-def _cast_constant(graph: onnx_ir.Graph, value: onnx_ir.Value, kind: onnx_ir.DataType, number: int) -> onnx_ir.Value:
-    """A constant cast to another type, as an initializer of the graph."""
-    if value.const_value is None:
-        raise ValueError(f"{value.name} is not a constant")
-    return _initializer(graph, value.const_value.numpy().astype(kind.numpy()), f"cast_{number}")
+        mean = tape.op("Conv", [filled, kernel], {"group": channels, "strides": [scale, scale]}, name=name)
+        old = pad.outputs[0]
+        mean.type, mean.shape = old.type, old.shape
+        model.graph.insert_before(pad, list(tape.nodes))
+        old.replace_all_uses_with(mean)
+        model.graph.remove([pad, node], safe=True)
 
 
 def _drop_defaults(model: onnx_ir.Model) -> None:
     for node in model.graph.all_nodes():
         schema = onnx.defs.get_schema(node.op_type, model.opset_imports[""]).attributes
         for name, attribute in list(node.attributes.items()):
-            default = schema[name].default_value
-            is_default = default.type and onnx.helper.get_attribute_value(default) == _onnx_value(attribute)
+            is_default = onnx_ir.to_proto(attribute) == schema[name].default_value
             is_window_default = name in _WINDOW_DEFAULTS and set(attribute.as_ints()) == {_WINDOW_DEFAULTS[name]}
             if is_default or is_window_default or (node.op_type, name) == ("Conv", "kernel_shape"):
                 del node.attributes[name]
-
-
-def _onnx_value(attribute: onnx_ir.Attr) -> Any:
-    """Value of an attribute in :mod:`onnx`'s types; None for graphs and tensors."""
-    value = attribute.value
-    return value.encode() if isinstance(value, str) else value if isinstance(value, int | float) else None
 
 
 def _shorten(model: onnx_ir.Model) -> None:
@@ -362,8 +200,6 @@ def _shorten(model: onnx_ir.Model) -> None:
                 if not value.is_graph_output():
                     value.shape = value.type = None
     values = sorted((v for v in values if v.name not in interface_names), key=lambda v: -len(v.uses()))
-    alphabet = string.ascii_letters
-    lengths = ([alphabet] + [alphabet + string.digits] * n for n in range(4))
-    names = ("".join(letters) for length in lengths for letters in itertools.product(*length))
+    names = ("".join(letters) for n in range(1, 5) for letters in itertools.product(string.ascii_letters, repeat=n))
     for value, name in zip(values, (name for name in names if name not in interface_names), strict=False):
         value.name = name

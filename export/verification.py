@@ -142,8 +142,8 @@ def verify(
     return report
 
 
-def session(path: str | os.PathLike[str]) -> onnxruntime.InferenceSession:
-    """An onnxruntime session on the CPU with as many threads as PyTorch uses."""
+def session(path: str | os.PathLike[str] | bytes) -> onnxruntime.InferenceSession:
+    """An onnxruntime session of a file, or of its bytes, on the CPU with as many threads as PyTorch uses."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     options.log_severity_level = 3

@@ -100,30 +100,13 @@ class DepthOfFieldNode:
         squeeze: float,
         quality: Any,
     ) -> tuple[Tensor, Tensor]:
-        """Render.
+        """Renders; the inputs are explained in :meth:`INPUT_TYPES`.
 
-        Args:
-            image: ``[B, H, W, 3 or 4]`` as ComfyUI passes images: encoded for display, in [0, 1].
-            depth: ``[B or 1, h, w, C]``; its colours are averaged. All images of a batch share the range of values, so
-                that the focus of a clip does not pulse.
-            depth_kind: Kind of the values.
-            near_m: Distance of the nearest value in metres.
-            far_m: Distance of the farthest value in metres.
-            focus: "point" or "metres".
-            focus_x: The point, from 0 (left) to 1.
-            focus_y: The point, from 0 (top) to 1.
-            focus_m: The distance in metres.
-            f_number: Opening of the lens.
-            focal_length_mm: Its focal length.
-            sensor_width_mm: Width of the sensor.
-            lens: Name of a blur table.
-            shape: Shape of points out of focus.
-            rotation_deg: Turns it.
-            squeeze: Height of the blur over its width.
-            quality: Tolerance by name.
+        All images of a batch share the range of values of ``depth`` ``[B or 1, h, w, C]``, so that the focus of a clip
+        does not pulse.
 
         Returns:
-            Two images ``[B, H, W, 3 or 4]`` and ``[B, H, W, 3]``.
+            Two images ``[B, H, W, 3 or 4]`` and ``[B, H, W, 3]``, encoded for display as ComfyUI passes images.
 
         Raises:
             ValueError: If an input is not as described, or the focus point has no depth.

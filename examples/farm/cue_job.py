@@ -16,56 +16,6 @@ import outline.backend.cue
 import outline.cuerun
 from outline.modules.shell import Shell
 
-__all__ = ["job", "main"]
-
-
-def job(
-    image: str,
-    depth: str | None,
-    out: str,
-    frames: str,
-    options: list[str],
-    chunk: int = 8,
-    cores: int = 2,
-    show: str = "testing",
-    shot: str = "default",
-) -> outline.cuerun.OutlineLauncher:
-    """The job: one layer, whose frames Cuebot hands out in chunks.
-
-    Args:
-        image: All-in-focus frames, such as ``/shot/beauty.####.exr``.
-        depth: Their depth; None uses the images' Z channel.
-        out: Frames to write.
-        frames: First and last, such as ``1-48``.
-        options: Further options of ``torchdof render``.
-        chunk: Frames of one task.
-        cores: Cores of one task.
-        show: Show in OpenCue.
-        shot: Shot in OpenCue.
-    """
-    command = [
-        "env",
-        f"OMP_NUM_THREADS={cores}",
-        "torchdof",
-        "render",
-        image,
-        *([] if depth is None else [depth]),
-        "--out",
-        out,
-        *options,
-    ]
-    words = " ".join(map(shlex.quote, command))
-    layer = Shell(
-        "torchdof",
-        command=f"{words} --resume --frames #FRAME_START#-#FRAME_END#",
-        range=frames,
-        chunk=chunk,
-        threads=cores,
-    )
-    shot_job = outline.Outline("torchdof", frame_range=frames, name_unique=False, show=show, shot=shot)
-    shot_job.add_layer(layer)
-    return outline.cuerun.OutlineLauncher(shot_job)
-
 
 def main() -> None:
     """Send the job, or print it."""
@@ -81,7 +31,18 @@ def main() -> None:
     parser.add_argument("--print", action="store_true", dest="shown", help="show the job without sending it")
     parser.add_argument("options", nargs="*", help="options of torchdof render, after --")
     a = parser.parse_args()
-    launcher = job(a.image, a.depth, a.out, a.frames, a.options, a.chunk, a.cores, a.show, a.shot)
+    command = ["env", f"OMP_NUM_THREADS={a.cores}", "torchdof", "render", a.image, *([a.depth] if a.depth else [])]
+    words = shlex.join([*command, "--out", a.out, *a.options])
+    layer = Shell(
+        "torchdof",
+        command=f"{words} --resume --frames #FRAME_START#-#FRAME_END#",
+        range=a.frames,
+        chunk=a.chunk,
+        threads=a.cores,
+    )
+    shot_job = outline.Outline("torchdof", frame_range=a.frames, name_unique=False, show=a.show, shot=a.shot)
+    shot_job.add_layer(layer)
+    launcher = outline.cuerun.OutlineLauncher(shot_job)
     if a.shown:
         print(outline.backend.cue.serialize_simple(launcher))
     else:

@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from torchdof import blur_by_coc
-from torchdof.bench.accuracy import read_peer
+from torchdof.bench.accuracy import read_peer, renderers
 
 TOOLS = Path(__file__).parents[2] / "examples" / "benchmarks" / "tools"
 SIDE = 65
@@ -41,10 +40,10 @@ def fault(blur: Any, radius_px: float) -> str:
     return ""
 
 
-@pytest.mark.parametrize("name", ["torchdof", "blender", "ffmpeg", "gegl", "ikoma", "kornia_bins"])
+@pytest.mark.parametrize("name", ["torchdof", "gegl", "ikoma", "kornia_bins"])
 def test_a_renderer_blurs_by_the_circle_of_confusion_that_it_is_given(name: str) -> None:
-    blur: Any = blur_by_coc
-    if name != "torchdof":
+    blur: Any = renderers(degraded=False).get(name)
+    if blur is None:
         try:
             blur = read_peer(TOOLS / f"{name}.py")[1]
         except ValueError as error:

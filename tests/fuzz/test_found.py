@@ -1,6 +1,9 @@
 """Findings of the fuzzer stay fixed, and a short run of every target finds nothing new."""
 
+import itertools
+import os
 import random
+import time
 from pathlib import Path
 
 import pytest
@@ -15,21 +18,36 @@ pytestmark = pytest.mark.hard
 FOUND = sorted(path for path in Path(__file__).with_name("found").glob("*/*") if path.is_file())
 
 
+def printed(capfd: pytest.CaptureFixture[str]) -> list[str]:
+    """Lines on the terminal, except those of libpng."""
+    return [line for text in capfd.readouterr() for line in text.splitlines() if not line.startswith("libpng ")]
+
+
 @pytest.mark.parametrize("path", FOUND, ids=lambda path: f"{path.parent.name}-{path.name}")
 def test_earlier_findings_are_read_or_refused(path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert targets.finding(TARGETS[path.parent.name], path) is None
-    printed = [line for text in capfd.readouterr() for line in text.splitlines() if not line.startswith("libpng ")]
-    assert printed == []
+    assert printed(capfd) == []
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_valid_and_mutated_inputs_give_no_finding(name: str, tmp_path: Path) -> None:
-    target, rng = TARGETS[name], random.Random(0)
+def test_valid_and_mutated_inputs_give_no_finding(name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """With FUZZ_SECONDS in the environment it goes on for that time, over all targets, with other mutations each time.
+
+    The file of a finding stays in the folder that pytest names; copied to ``found/TARGET/`` it becomes a test.
+    """
+    seconds = float(os.environ.get("FUZZ_SECONDS", 0.0)) / len(TARGETS)
+    seed, end = time.time_ns() if seconds else 0, time.monotonic() + seconds
+    target, rng = TARGETS[name], random.Random(seed)
     count = 20 if target.suffix == ".scene" else 100  # rendering is slow
-    corpus = list(targets.seeds(target, tmp_path))
-    path = tmp_path / f"input{target.suffix}"
-    inputs = corpus + [mutated(rng.choice(corpus), corpus, target.suffix, rng) for _ in range(count)]
-    for content in inputs:
+    (tmp_path / "seeds").mkdir()
+    corpus, contents = list(targets.seeds(target, tmp_path / "seeds")), set[int]()
+    path = tmp_path / ("capture.toml" if name == "manifest" else f"input{target.suffix}")
+    for number in itertools.count():
+        if number >= len(corpus) + count and time.monotonic() >= end:
+            break
+        content = corpus[number] if number < len(corpus) else mutated(rng.choice(corpus), corpus, target.suffix, rng)
+        contents.add(hash(content))
         path.write_bytes(content)
-        assert targets.finding(target, path) is None
-    assert len(set(inputs)) > len(corpus) + 10
+        assert targets.finding(target, path) is None, path
+        assert not printed(capfd), path
+    assert len(contents) > len(corpus) + 10

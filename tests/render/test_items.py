@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from examples.benchmarks.operations import Counted
+from examples.benchmarks.steps import Counted
 from tests.scenes import TABLES, assert_same_picture, random_scene
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
 

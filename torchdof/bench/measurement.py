@@ -78,10 +78,10 @@ class BenchScene:
         shifted = self.coc_px - 0.5 * focus * (self.coc_px.max() - self.coc_px.min())
         return dataclasses.replace(self, coc_px=shifted * (radius_px / shifted.abs().max().clamp_min(1e-9)))
 
-    def cameras(self, count: int, smallest: float, seed: str) -> "list[BenchScene]":
-        """The scene by ``count`` random cameras, whose largest radius is ``smallest`` to 1 times that of the scene."""
+    def cameras(self, count: int, seed: str) -> "list[BenchScene]":
+        """The scene by ``count`` random cameras, whose largest radius is 0.7 to 1 times that of the scene."""
         rng, widest_px = random.Random(seed), float(self.coc_px.abs().max())
-        return [self.seen(rng.uniform(-0.5, 0.5), widest_px * smallest ** rng.random()) for _ in range(count)]
+        return [self.seen(rng.uniform(-0.5, 0.5), widest_px * 0.7 ** rng.random()) for _ in range(count)]
 
     def pull(self, count: int) -> "list[BenchScene]":
         """A sequence of ``count`` pictures whose focus moves through the scene."""
@@ -96,16 +96,14 @@ class BenchScene:
         return dataclasses.replace(self, image=image, coc_px=coc_px * (width / self.image.shape[-1]))
 
 
-def measure(
-    blur: Renderer, scene: BenchScene, beside: Callable[[], Any] | None = None, again: bool = True
-) -> tuple[Tensor, dict[str, float]]:
-    """Renders a scene with a camera that was not rendered before, once more with the same camera, and a reference run.
+def measure(blur: Renderer, scene: BenchScene, again: bool = True) -> tuple[Tensor, dict[str, float]]:
+    """Renders a scene with a camera that was not rendered before, and once more with the same camera.
+
+    A depthwise 17 x 17 convolution of ``[1, 16, 540, 960]`` beside it makes times comparable between machines.
 
     Args:
         blur: The renderer.
         scene: The scene by that camera.
-        beside: The reference run; its time makes results comparable between machines. None is a depthwise 17 x 17
-            convolution of ``[1, 16, 540, 960]``, channels last.
         again: Whether to render with the same camera once more.
 
     Returns:
@@ -114,9 +112,8 @@ def measure(
     Raises:
         RuntimeError: If the picture is not finite.
     """
-    if beside is None:
-        frame = torch.ones(1, 16, 540, 960).contiguous(memory_format=torch.channels_last)
-        beside = functools.partial(functional.conv2d, frame, torch.ones(16, 1, 17, 17), padding=8, groups=16)
+    frame = torch.ones(1, 16, 540, 960).contiguous(memory_format=torch.channels_last)
+    beside = functools.partial(functional.conv2d, frame, torch.ones(16, 1, 17, 17), padding=8, groups=16)
     time.sleep(0.02)  # PyTorch's threads spin for a while after each operation
     picture, new = timed(blur, scene.image, scene.coc_px)
     if not bool(picture.isfinite().all()):

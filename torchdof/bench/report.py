@@ -25,7 +25,7 @@ Row = Mapping[str, Any]
 LEGEND = (
     "new_ms, spread_ms: median and interquartile range of the clock over pictures by cameras that were not rendered "
     "before; cpu_ms: their processor time over all threads; again_ms: the same camera a second time; beside_ms: a "
-    "reference run beside each, unless it is named a depthwise 17 x 17 convolution of 1 x 16 x 540 x 960; over_again, "
+    "depthwise 17 x 17 convolution of 1 x 16 x 540 x 960 beside each; over_again, "
     "over_beside: ratios of processor times; peak_mb: growth of resident memory. Errors are as displayed (clipped to "
     "[0, 1], sRGB curve): rms_255 of 255, psnr_db, ssim."
 )

@@ -59,7 +59,7 @@ def works(
         setting = name + " without occlusion" * (not occlusion)
         frame = f"{view.image.shape[-1]} x {view.image.shape[-2]}"
         columns = {"setting": setting, "tolerance": tolerance / 255, "frame": frame}
-        for camera in view.pull(repeat) if name.startswith("focus pull") else view.cameras(repeat, 0.7, setting):
+        for camera in view.pull(repeat) if name.startswith("focus pull") else view.cameras(repeat, setting):
             yield columns, render, camera, False
         if view in (scene, small):
             yield columns, render, view, True

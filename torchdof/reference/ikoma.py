@@ -5,14 +5,8 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ..optics.blur_table import BlurTable
-from .scenes import Scene
 
-__all__ = ["ikoma", "layered_fft"]
-
-
-def ikoma(scene: Scene, spacing_px: float = 0.75) -> Tensor:
-    """:func:`layered_fft` of a scene in float64, with dense layers and exact discs."""
-    return layered_fft(scene.image.double(), scene.coc_px, spacing_px).to(scene.image.dtype)
+__all__ = ["layered_fft"]
 
 
 def layered_fft(image: Tensor, coc_px: Tensor, spacing_px: float = 0.75) -> Tensor:

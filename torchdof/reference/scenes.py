@@ -31,7 +31,6 @@ __all__ = [
     "posts",
     "read_scenes",
     "spread_points",
-    "strands",
     "waves",
 ]
 
@@ -264,29 +263,5 @@ def posts(pitch_px: float, width_px: float, slant: float = 0.1, start_px: float 
 
     def shape(x: Tensor, y: Tensor) -> Tensor:
         return (x + slant * y - start_px) % pitch_px < width_px
-
-    return shape
-
-
-def strands(lines: Sequence[tuple[float, float, float, float]], widths_px: Sequence[float]) -> Shape:
-    """Straight strands with round ends: wires, hair, twigs.
-
-    Args:
-        lines: x and y of the first and of the last point of each strand, in pixels of the frame.
-        widths_px: Widths in pixels.
-
-    Example:
-        >>> y = torch.tensor([2.0, 2.3, 2.6])
-        >>> strands([(0.0, 2.0, 10.0, 2.0)], [0.8])(torch.full_like(y, 5.0), y).tolist()
-        [True, True, False]
-    """
-
-    def shape(x: Tensor, y: Tensor) -> Tensor:
-        is_covered = torch.zeros_like(x, dtype=torch.bool)
-        for (x0, y0, x1, y1), width in zip(lines, widths_px, strict=True):
-            dx, dy = x1 - x0, y1 - y0
-            along = (((x - x0) * dx + (y - y0) * dy) / (dx * dx + dy * dy)).clamp(0.0, 1.0)
-            is_covered |= torch.hypot(x - x0 - along * dx, y - y0 - along * dy) < 0.5 * width
-        return is_covered
 
     return shape

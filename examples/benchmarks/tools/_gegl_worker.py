@@ -1,6 +1,6 @@
 """Runs GEGL for ``gegl.py``, in an interpreter that has GEGL's bindings.
 
-Usage: python _gegl_worker.py FOLDER WIDTH HEIGHT RADIUS; prints seconds. Or: python _gegl_worker.py --version
+Usage: python _gegl_worker.py FOLDER WIDTH HEIGHT RADIUS; prints seconds.
 """
 
 import sys
@@ -16,10 +16,6 @@ from gi.repository import Gegl  # noqa: E402
 def main() -> None:
     """Reads ``image`` and ``radius``, writes ``out``."""
     Gegl.init([])
-    if sys.argv[1] == "--version":
-        version = Gegl.get_version()
-        print(f"{version.major}.{version.minor}.{version.micro}")
-        return
     folder, width, height, largest = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])
     frame = Gegl.Rectangle.new(0, 0, width, height)
 

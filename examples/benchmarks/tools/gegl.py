@@ -28,11 +28,6 @@ def available() -> str | None:
     return None if _python() else "Debian and Ubuntu: apt install gir1.2-gegl-0.4 python3-gi"
 
 
-def version() -> str:
-    """Version of GEGL."""
-    return _run("--version").strip()
-
-
 def blur(image: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
     """Blurs ``image`` ``[1, 3, H, W]`` by ``coc_px`` ``[1, 1, H, W]``; returns it and the seconds that GEGL took."""
     height, width = image.shape[-2:]
@@ -41,24 +36,20 @@ def blur(image: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
     with tempfile.TemporaryDirectory() as folder:
         image[0].permute(1, 2, 0).contiguous().numpy().astype(np.float32).tofile(f"{folder}/image")  # [H, W, 3]
         (radius / largest).numpy().astype(np.float32).tofile(f"{folder}/radius")
-        seconds = float(_run(folder, str(width), str(height), str(largest)))
+        command = [_python() or sys.executable, str(_WORKER), folder, str(width), str(height), str(largest)]
+        environment = {**os.environ, "GEGL_THREADS": str(torch.get_num_threads())}
+        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        if done.returncode:
+            raise ChildProcessError(f"GEGL failed: {done.stderr[-500:]}")
         out = np.fromfile(f"{folder}/out", np.float32).reshape(height, width, 3)
-    return torch.from_numpy(out).permute(2, 0, 1)[None], seconds
+    return torch.from_numpy(out).permute(2, 0, 1)[None], float(done.stdout)
 
 
 @functools.cache
 def _python() -> str | None:
     """The first interpreter that has GEGL's bindings: this one, or the system's."""
     for python in (sys.executable, shutil.which("python3", path=os.defpath)):
-        if python and subprocess.run([python, str(_WORKER), "--version"], capture_output=True).returncode == 0:
+        check = "import gi; gi.require_version('Gegl', '0.4')"
+        if python and subprocess.run([python, "-c", check], capture_output=True).returncode == 0:
             return python
     return None
-
-
-def _run(*arguments: str) -> str:
-    command = [_python() or sys.executable, str(_WORKER), *arguments]
-    environment = {**os.environ, "GEGL_THREADS": str(torch.get_num_threads())}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment)
-    if done.returncode:
-        raise ChildProcessError(f"GEGL failed: {done.stderr[-500:]}")
-    return done.stdout

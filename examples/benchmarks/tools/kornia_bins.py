@@ -1,6 +1,5 @@
 """kornia's filter2d with discs of 16 radii; each pixel takes the result with the nearest radius."""
 
-import kornia
 import torch
 from kornia.filters import filter2d
 from torch import Tensor
@@ -9,15 +8,6 @@ NAME = "kornia, 16 bins"
 NOTE = "float32; 16 radii from 0 to the largest, discs with smooth edges. Time: the whole call."
 _BINS = 16
 _SAMPLES_PER_PX = 8  # samples along a pixel
-
-
-def available() -> None:
-    """Kornia comes with torchdof."""
-
-
-def version() -> str:
-    """Version of kornia."""
-    return str(kornia.__version__)
 
 
 def blur(image: Tensor, coc_px: Tensor) -> Tensor:
