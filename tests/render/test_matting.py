@@ -1,5 +1,7 @@
 """Matting: mixed pixels are split between their two surfaces."""
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -30,13 +32,29 @@ def test_a_mixed_pixel_is_split_between_its_two_surfaces(share: float) -> None:
 
 
 def test_a_split_is_trusted_in_proportion_to_the_contrast_of_the_surfaces() -> None:
-    """The split has half its effect at a contrast of 1/255 of the light around, and none at 1e-7, which is rounding."""
-    for contrast, trusted in ((0.1, 1.0), (1 / 255, 0.5), (1e-7, 0.0)):
+    """Below a contrast of 1/255 of the light around, the share is that under a Gaussian of 0.6 px."""
+    beside, diagonal = math.exp(-1 / 0.72), math.exp(-2 / 0.72)
+    under_gaussian = (beside + 2 * diagonal) / (1 + 4 * beside + 4 * diagonal)
+    for contrast, share in ((0.1, 0.4), (1 / 255, 0.2 + 0.5 * under_gaussian), (1e-7, under_gaussian)):
         image, coc = mixed_edge(0.6)
         image, coc = torch.where(coc < 0, 1.0, 1.0 - contrast).double(), coc.double()
         image[..., 31] = 1.0 - 0.4 * contrast
         weight = matte(image, coc).other_weight[0, 0, 24, 31]
-        assert float(weight) == pytest.approx(0.4 * trusted, abs=0.01)
+        assert float(weight) == pytest.approx(share, abs=0.01)
+
+
+def test_a_soft_edge_is_split_into_the_colours_beyond_it() -> None:
+    """A photograph's edge is wider than a pixel: neighbours on the other side are mixed too."""
+    coc = torch.where(torch.arange(60) < 31, -6.0, 0.0).expand(1, 1, 48, -1)
+    near, far = torch.tensor([0.1, 0.3, 0.2]).view(1, 3, 1, 1), torch.tensor([0.8, 0.6, 0.7]).view(1, 3, 1, 1)
+    distance = torch.arange(60) - 30.5
+    covered = 0.5 - 0.5 * torch.erf(distance / (0.8 * math.sqrt(2)))
+    own, other, _, share = matte((covered * near + (1 - covered) * far).expand(-1, -1, 48, -1), coc)
+    for x, mine, theirs in ((30, near, far), (31, far, near)):
+        assert torch.allclose(own[..., x], mine[..., 0], atol=0.03) and torch.allclose(
+            other[..., x], theirs[..., 0], atol=0.03
+        )
+        assert torch.allclose(share[..., x], (1 - covered if x == 30 else covered)[x], atol=0.03)
 
 
 def test_a_split_conserves_light() -> None:
@@ -53,6 +71,22 @@ def strands_before_a_lamp() -> tuple[Tensor, Tensor, Tensor]:
     light = torch.where(is_strand, 0.05 + 0.4 * lamp, 0.2 + lamp).expand(1, 3, -1, -1)
     coc = torch.where(is_strand & (rows % 3 > 0), 0.0, 12.0).expand(1, 1, -1, -1)
     return light, coc, is_strand & (lamp > 0) & (rows % 3 > 0)
+
+
+def test_a_lamp_beside_a_strand_before_it_keeps_its_light() -> None:
+    rows, columns = torch.meshgrid(torch.arange(40), torch.arange(41), indexing="ij")
+    lamp = 30.0 * torch.exp(-((rows - 20) ** 2 + (columns - 20) ** 2) / 4.0)
+    is_strand = columns == 20
+    light, coc = (
+        t.expand(1, 3, -1, -1)
+        for t in (0.1 + torch.where(is_strand, 0.8 * lamp, lamp), torch.where(is_strand, -7.0, 0.0))
+    )
+    coc = coc[:, :1]
+    surfaces = attribute_emitters(light, coc, threshold(light), None, matte(light, coc))
+    of_the_strand = torch.where(
+        is_strand, (1 - surfaces.other_weight) * surfaces.own, surfaces.other_weight * surfaces.other
+    )
+    assert float(of_the_strand.sum()) < 0.05 * float(light.sum())
 
 
 def test_light_of_a_lamp_seen_through_strands_is_assigned_to_the_lamp() -> None:

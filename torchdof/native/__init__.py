@@ -39,7 +39,7 @@ _KINDS: dict[Kind, int] = {"image": 0, "background": 1, "stack": 2}
 _SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
 _SMALL_FRAME = 2**16  # pixels; up to this size the main thread renders itself, which saves 0.1 ms
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
-_REVISION = 8  # of ``src/api.h``
+_REVISION = 9  # of ``src/api.h``
 
 Rules = Sequence[tuple[int, float, float, float]]
 
@@ -148,7 +148,6 @@ _ARGUMENTS: dict[str, tuple[Any, ...]] = {
     "repair_edges": (ctypes.POINTER(_Map), _Ints),
     "blend": (ctypes.POINTER(_Layers), _Data),
     "blend_gradient": (ctypes.POINTER(_Layers), _Data, _Arrays, _Arrays, _Arrays),
-    "matte": (_Arrays, *[_Int] * 4, _Data, _Arrays),
     "farthest": (_Arrays, *[_Int] * 6, _Data),
     "farthest_gradient": (_Arrays, *[_Int] * 6, _Data, _Arrays),
     "look_behind": (*_LEVELS, _Data),
@@ -360,28 +359,6 @@ def farthest_gradient(maps: Sequence[Tensor], size: tuple[int, int], gradient: T
     arguments = (*memory[0].shape, *size, torch.get_num_threads(), gradient.data_ptr(), _pointers(sums))
     _run("farthest_gradient", _pointers([*memory, None]), *arguments)
     return sums
-
-
-def matte(maps: Sequence[Tensor]) -> Tensor:
-    """Splits the pixels of an image at depth edges between two surfaces, as ``torchdof.render.matting.matte``.
-
-    ``maps`` are light ``[C, H, W]``, signed coc ``[1, H, W]`` and optionally ``[1, H, W]`` with 0 for pixels that are
-    left out. The result ``[2 C + 2, H, W]`` is light of each pixel's own surface, and light, coc and weight of the
-    other one.
-    """
-    memory = [values.contiguous() for values in maps]
-    out = torch.empty(2 * len(memory[0]) + 2, *memory[0].shape[1:], dtype=torch.float32, device="cpu")
-    _run("matte", _pointers([*memory, None]), *memory[0].shape, torch.get_num_threads(), None, _pointers([out]))
-    return out
-
-
-def matte_gradient(maps: Sequence[Tensor], gradient: Tensor) -> list[Tensor]:
-    """The gradients of :func:`matte` by light and coc."""
-    memory, gradient = [values.contiguous() for values in maps], gradient.contiguous()
-    found = [torch.empty_like(values) for values in memory[:2]]
-    arguments = (*memory[0].shape, torch.get_num_threads(), gradient.data_ptr(), _pointers(found))
-    _run("matte", _pointers([*memory, None]), *arguments)
-    return found
 
 
 def look_behind(levels: Sequence[Tensor], rules: Rules, coc: Tensor) -> Tensor:

@@ -36,22 +36,6 @@ def compiled_step(
     return result
 
 
-def matted(
-    light: Tensor, coc_px: Tensor, valid: Tensor | None, plain: Callable[[Tensor, Tensor], Tensor]
-) -> Tensor | None:
-    """Both surfaces of each pixel, ``[B, 2 C + 2, H, W]``: their light, coc and weight of the other one.
-
-    Arguments are those of :func:`torchdof.render.matting.matte`; ``plain`` is the same computation by PyTorch, from
-    light and coc. None if the compiled engine cannot compute it.
-    """
-    return compiled_step(
-        lambda *maps: native.matte(maps),
-        lambda gradient, *maps: native.matte_gradient(maps, gradient),
-        lambda light, coc_px, *_: plain(light, coc_px),
-        *(t for t in (light, coc_px, valid) if t is not None),
-    )
-
-
 class _Step(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, forward: Any, backward: Any, plain: Any, *tensors: Tensor) -> Tensor:
@@ -64,6 +48,7 @@ class _Step(torch.autograd.Function):
         (gradient,), tensors = gradients, ctx.saved_tensors
         found: list[Tensor | None]
         if torch.is_grad_enabled():  # the gradients will be differentiated again
+            tensors = [t.view_as(t) for t in tensors]  # one may be computed from another: gradients stop at the views
             wanted = [t for t in tensors if t.requires_grad]
             of_wanted = iter(torch.autograd.grad(ctx.plain(*tensors), wanted, gradient, create_graph=True))
             found = [next(of_wanted) if t.requires_grad else None for t in tensors]

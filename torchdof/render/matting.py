@@ -14,7 +14,6 @@ from torch import Tensor
 
 from .. import pixels
 from ..tensors import is_traced
-from .compiled_steps import matted
 from .ops import EAGER, Ops
 
 __all__ = ["NEVER_PX", "Matted", "attribute_emitters", "matte"]
@@ -26,7 +25,10 @@ NEVER_PX = 1e9
 _EDGE_PX = 0.5  # px; smallest difference in coc of neighbours on two surfaces; larger: fewer edges
 _FALLOFF = math.exp(-1 / 4.5)  # weight of a neighbour at a distance of 1 px: a Gaussian of sigma 1.5
 _UNCLEAN = 1e-2  # weight in a surface's mean colour of pixels that may be mixed; others have 1
-_TRUST = 4.0  # weight of variance against contrast; larger: texture stops more splits
+_TRUST = 10.0  # weight of variance against contrast; larger: texture stops more splits by colour
+_TEXTURE = 50.0  # weight of variance against contrast; larger: texture keeps more of a neighbour's mixed light
+_MOST_CLEAN = 4.0  # upper limit for a neighbour's clean light, as a multiple of the brightest neighbour
+_SOFTNESS_PX = 0.6  # standard deviation of the Gaussian by which two surfaces mix where colours do not tell how
 _ALIKE = 1.0 / 255.0  # contrast at which trust is halved, as a fraction of the brightest light around
 _UNBOUNDED = 1e6  # upper limit for either part, as a multiple of the brightest neighbour; avoids 0 * inf
 
@@ -54,10 +56,11 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops =
     """Splits pixels at depth edges between their own surface and the one across the edge.
 
     1. Take the nearest and the farthest coc of the 3 x 3 pixels around as those of the two surfaces.
-    2. Take their colours F (near) and B (far), each ``[C]``, as means of neighbours on one surface.
+    2. Take their colours F (near) and B (far), each ``[C]``, as means of neighbours on one surface. Mixed neighbours
+       count without the light of the other surface: a photograph's edges are wider than a pixel.
     3. Fit ``I = a F + (1 - a) B`` to the pixel's light I by least squares: ``a = (I - B) (F - B) / |F - B|^2``.
-    4. Keep a on the side of 1/2 of the pixel's own surface, on which its centre lies. Shrink the other surface's weight
-       where contrast is small against texture.
+    4. Keep a on the side of 1/2 of the pixel's own surface, on which its centre lies. Where contrast is small against
+       texture, a is the near surface's share under a small Gaussian, as far as the pixel's colour agrees.
     5. Distribute the residual over both parts: they sum to I, and neither leaves the image's range.
 
     Args:
@@ -69,19 +72,6 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops =
     Returns:
         The surfaces; the weight of the other one is in [0, 1/2].
     """
-    colours = light.shape[1]
-
-    def plain(light: Tensor, coc_px: Tensor) -> Tensor:
-        return torch.cat(_matte(light, coc_px, valid, ops), 1)
-
-    both = matted(light, coc_px, valid, plain)
-    if both is None:
-        return _matte(light, coc_px, valid, ops)
-    return Matted(*both.split([colours, colours, 1, 1], 1))
-
-
-def _matte(light: Tensor, coc_px: Tensor, valid: Tensor | None, ops: Ops) -> Matted:
-    """:func:`matte` by PyTorch."""
     # pixels beside another surface
     known = None if valid is None else valid > 0
     high, low = (c if known is None else torch.where(known, c, -NEVER_PX) for c in (coc_px.detach(), -coc_px.detach()))
@@ -110,6 +100,13 @@ def _matte(light: Tensor, coc_px: Tensor, valid: Tensor | None, ops: Ops) -> Mat
         weight = weight * counted
     nearness = (far - window_coc) / gap
     near_weight, far_weight = weight * (4 * nearness - 2.8).clamp(0, 1), weight * (1.2 - 4 * nearness).clamp(0, 1)
+    # a photograph's edges are wider than a pixel: mixed neighbours count without the light of the other surface
+    same = weight * (2.0 - 2.0 * (window_coc - own_coc).abs() / _EDGE_PX).clamp(0.0, 1.0)
+    clean = (window_light * same).sum(1) / same.sum(0).clamp_min(1e-12)
+    clean = torch.lerp(colour, clean, edge * ((0.1 / _UNCLEAN) * same.sum(0) - 1.0).clamp(0.0, 1.0))
+    clean = selected.around(selected.put(light, clean * brightest)) / brightest
+    clean = clean.clamp(-_MOST_CLEAN, _MOST_CLEAN)
+    window_light = window_light - _mixed_light(window_light, clean, near_weight, far_weight)
     back, back_variance = _mean_of(window_light, far_weight)
     # a thin foreground has no unmixed pixel: prefer those that differ most from the background
     differs = ((window_light - back[:, None]) ** 2).sum(0)
@@ -125,8 +122,14 @@ def _matte(light: Tensor, coc_px: Tensor, valid: Tensor | None, ops: Ops) -> Mat
     trust = strength / (strength + _TRUST * (back_variance + front_variance + misfit) + _ALIKE**2)
     # a depth between the two belongs to a steep surface, not to an edge
     sided = ((own_coc - near) - (far - own_coc)).abs() / gap
-    certainty = edge * trust * (4.0 * sided - 2.0).clamp(0.0, 1.0)
-    weight = torch.where(is_near, 1.0 - fitted, fitted).clamp(max=0.5) * certainty  # weight of the other surface
+    clear = edge * (4.0 * sided - 2.0).clamp(0.0, 1.0)
+    weight = torch.where(is_near, 1.0 - fitted, fitted).clamp(max=0.5) * clear * trust  # of the other surface
+    small = _falloff(light, 1) ** (2.25 / _SOFTNESS_PX**2)
+    small = small if counted is None else small * counted
+    covered = (small * nearness).sum(0) / small.sum(0).clamp_min(1e-12)  # by the near surface, under the Gaussian
+    noise, misfit = back_variance + front_variance + _ALIKE**2, misfit + (covered - fitted) ** 2 * strength
+    geometric = torch.where(is_near, 1.0 - covered, covered).clamp(max=0.5) * clear * (1.0 - trust)
+    weight = weight + geometric * noise / (noise + misfit)
 
     # Each part gets a share of the residual in proportion to its weight squared: the smallest change of both colours.
     # Then limit the parts to the image's range.
@@ -231,13 +234,30 @@ def attribute_emitters(
         other = torch.where(weight > 0, moved / known, 0.0)
         other_coc = torch.lerp(other_coc, emitter_coc, given * share / known)
 
-        # the other way round: an emitter on the own surface
+    # The other way round: an emitter on the own surface. The other surface is dark around the pixel, without the light
+    # of emitters seen through it, which was taken from it above.
+    own = pixels.put(surfaces.own, bright, (seen - weight * other) / (1.0 - weight) * scale)
+    peaks = pixels.pick(own.amax(1, keepdim=True), window)[0] / scale
+    for side in (-1.0, 1.0):
         bright_other = (other.amax(0) / limit.clamp_min(torch.finfo(light.dtype).tiny) - 1.0).clamp(0.0, 1.0)
         apart = (side * (own_coc - other_coc) - 1.0).clamp(0.0, 1.0)
         weight = weight * (1.0 - apart * bright_other * beyond(other_coc, side, 1.0)[0])
     own = (seen - weight * other) / (1.0 - weight)
     changed = zip(surfaces, (own * scale, other * scale, other_coc, weight), strict=True)
     return Matted(*(pixels.put(maps, bright, values) for maps, values in changed))
+
+
+def _mixed_light(window: Tensor, clean: Tensor, near_weight: Tensor, far_weight: Tensor) -> Tensor:
+    """Light of the other surface in neighbours ``[C, 9, P]``, which have clean light ``[C, 9, P]``.
+
+    It is the part of their difference on the line between the colours of both surfaces, less where texture is strong.
+    """
+    back, back_variance = _mean_of(clean, far_weight)
+    front, front_variance = _mean_of(clean, near_weight)
+    contrast = (front - back)[:, None]
+    strength = (contrast**2).sum(0) + _TEXTURE * (back_variance + front_variance) + _ALIKE**2
+    share = ((window - clean) * contrast).sum(0) / strength
+    return torch.where(near_weight > far_weight, -(-share).clamp(0.0, 1.0), share.clamp(0.0, 1.0)) * contrast
 
 
 def _falloff(light: Tensor, reach: int) -> Tensor:

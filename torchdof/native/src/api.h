@@ -167,13 +167,6 @@ typedef struct {
 } torchdof_level;
 #define TORCHDOF_MOST_LEVELS 4
 
-// Splits the pixels at depth edges; see render/matting.py. maps: light [channels, height, width], coc [height, width], and 0
-// for pixels that are left out, or null. Without a gradient, out[0] [2 channels + 2, height, width]: light of each pixel's own
-// surface and of the other one, coc and weight of the other one. From the gradient of these: the gradients of light and
-// coc, out.
-TORCHDOF_API int32_t torchdof_matte(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t threads,
-                                    const float *gradient, float *const *out);
-
 // The finest level of that pyramid, [channels + 2, rows, columns], from the surfaces of an image. maps: light [channels, height,
 // width], coc [height, width]; the same of each pixel's other surface, and its weight; light above which a pixel is a
 // highlight; and 0 for pixels that are left out, or null.
@@ -203,7 +196,7 @@ TORCHDOF_API void torchdof_convolve(const float *in, int32_t height, int32_t wid
 
 // Version of this interface, for the caller to check first: sizes of its structures and, in the upper half,
 // TORCHDOF_REVISION, which increases with every other change of this file.
-#define TORCHDOF_REVISION 8
+#define TORCHDOF_REVISION 9
 TORCHDOF_API int64_t torchdof_interface(void);
 
 // "avx2" or "baseline".

@@ -107,11 +107,6 @@ int32_t torchdof_blend_gradient(const torchdof_layers *layers, const float *grad
   return torchdof::guarded([&] { torchdof::chosen().blend_gradient(*layers, gradient, light, place, weight); });
 }
 
-int32_t torchdof_matte(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t threads,
-                       const float *gradient, float *const *out) {
-  return torchdof::guarded([&] { torchdof::chosen().matte(maps, channels, height, width, threads, gradient, out); });
-}
-
 int32_t torchdof_farthest(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t rows, int32_t columns,
                           int32_t threads, float *out) {
   return torchdof::guarded([&] { torchdof::chosen().farthest(maps, channels, height, width, rows, columns, threads, out); });

@@ -234,6 +234,6 @@ static void convolve_all(const float *in, int height, int width, const float *va
     }
 }
 extern const Variant variant;
-const Variant variant = {begin, repair_edges, find_ends, coc_of_depth, plan, make_kernels, convolve_all, blend, blend_gradient, matte, farthest, farthest_gradient, look_behind, look_behind_gradient};
+const Variant variant = {begin, repair_edges, find_ends, coc_of_depth, plan, make_kernels, convolve_all, blend, blend_gradient, farthest, farthest_gradient, look_behind, look_behind_gradient};
 }  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

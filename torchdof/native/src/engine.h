@@ -158,6 +158,8 @@ inline float peak_of(const float *light, size_t step, int channels) {
   return peak;
 }
 
+inline int place_in_block(int y, int x) { return y % BLOCK * BLOCK + x % BLOCK; }
+
 // The surfaces of a scene: either an image with a second surface in some blocks, or any number of full planes.
 class Surfaces {
  public:
@@ -170,6 +172,7 @@ class Surfaces {
 
   bool full_planes() const { return !lights.empty(); }
   size_t area() const { return (size_t)height * width; }
+  int block_of(int y, int x) const { return y / BLOCK * block_columns + x / BLOCK; }
   bool has_block(int i) const { return blocks[i]; }
   Block block(int i) const {
     float *p = blocks[i];
@@ -193,7 +196,7 @@ class Surfaces {
       weight_of = weights[i] ? weights[i] + at : nullptr;
       return true;
     }
-    const int which = y / BLOCK * block_columns + x / BLOCK, within = y % BLOCK * BLOCK + x % BLOCK;
+    const int which = block_of(y, x), within = place_in_block(y, x);
     if (!has_block(which)) {
       if (i) return false;
       for (int c = 0; c < channels; c++) light_of[c] = light + c * area() + at;
@@ -640,10 +643,6 @@ void composite(const Job &job, const RayKernels &ray_kernels, float *out);
 // Blurs and composites the layers of a padded frame, forward and backward; blend.cpp
 void blend(const torchdof_layers &scene, float *out);
 void blend_gradient(const torchdof_layers &scene, const float *out_gradient, float *const *light, float *const *place, float *const *weight);
-
-// Splits the pixels of an image at depth edges: out[0] [2 channels + 2, height, width]. Or, from a gradient of that,
-// the gradients of light and coc, out; matting.cpp
-void matte(const float *const *maps, int channels, int height, int width, int threads, const float *gradient, float *const *out);
 
 // The finest level of the pyramid from which hidden surfaces are filled, forward and backward; farthest.cpp
 void farthest(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads, float *out);

@@ -31,7 +31,6 @@ struct Variant {
   void (*convolve)(const float *in, int height, int width, const float *kernel, int half, float *out);
   void (*blend)(const torchdof_layers &layers, float *out);
   void (*blend_gradient)(const torchdof_layers &layers, const float *gradient, float *const *light, float *const *place, float *const *weight);
-  void (*matte)(const float *const *maps, int channels, int height, int width, int threads, const float *gradient, float *const *out);
   void (*farthest)(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads, float *out);
   void (*farthest_gradient)(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads,
                             const float *gradient, float *const *of_maps);
