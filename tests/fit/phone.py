@@ -23,7 +23,7 @@ DISTANCES_M = (0.24, 0.27, 0.30, 0.35, 0.40, 0.50, 0.65, 0.80)
 
 
 def run(*words):
-    """Run a command of torchdof, and print what it prints."""
+    """Run a command of torchdof, and print its output."""
     result = CliRunner().invoke(app, [str(w) for w in words])
     if result.exit_code:
         raise SystemExit(result.output)

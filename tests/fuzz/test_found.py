@@ -31,7 +31,7 @@ def test_earlier_findings_are_read_or_refused(path: Path, capfd: pytest.CaptureF
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_valid_and_mutated_inputs_give_no_finding(name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """With FUZZ_SECONDS in the environment it goes on for that time, over all targets, with other mutations each time.
+    """FUZZ_SECONDS in the environment is the time in seconds for all targets, with other mutations each time.
 
     The file of a finding stays in the folder that pytest names; copied to ``found/TARGET/`` it becomes a test.
     """

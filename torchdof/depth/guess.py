@@ -47,8 +47,8 @@ def guess_kind(values: Tensor, integers: bool = False, metric: bool = False) -> 
     * Relative depth is "disparity" (larger is nearer), unless the values clearly shrink downwards: the ground is nearer
       than the sky. For the same reason distances that clearly grow downwards are taken for relative disparity.
 
-    ``integers`` tells that the file type holds whole numbers only; otherwise the values are examined. ``metric`` tells
-    that other input is in metres; distances are then never taken for disparity.
+    ``integers``: the file type holds whole numbers only; otherwise the values are examined. ``metric``: other input is
+    in metres; distances are then never taken for disparity.
     """
     negative = values[values < 0]
     if negative.numel() > 1 and bool((negative == negative[0]).all()):

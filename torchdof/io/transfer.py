@@ -1,6 +1,6 @@
 """Transfer curves: file values to linear light and back, with straight or premultiplied alpha.
 
-Kornia's curves give the same bits, but for three channels and light in [0, 1] alone, and take a second to import.
+Kornia's curves give the same bits, for three channels and light in [0, 1] only, and take a second to import.
 """
 
 from typing import Literal

@@ -64,7 +64,7 @@ def surfaces_of_image(
         ops: Operations.
 
     Returns:
-        The surfaces, the second one with weight 0 where there is none. And the light behind both at every
+        The surfaces, the second one with weight 0 where the pixel has one surface; and the light behind both at every
         :data:`BEHIND_STEP`-th pixel, ``[B, C, h, w]``, for an area slightly larger than the image.
     """
     if is_compiled():

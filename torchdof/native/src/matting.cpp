@@ -165,8 +165,12 @@ void separate(const Window &w, size_t first, int C, Mix &m) {
   vec *const light = m.light, *const clean = m.light + C * TAPS, *const front = m.front, *const behind = m.behind;
   const vec per_scale = 1.0f / m.scale;
   for (int c = 0; c < C; c++)
-    for (int i = 0; i < TAPS; i++) clean[c * TAPS + i] = load<vec>(w.clean.data() + (size_t)c * EDGES * PITCH + first + tap(i)) * per_scale, clean[c * TAPS + i] = most(least(clean[c * TAPS + i], all(MOST_CLEAN)), all(-MOST_CLEAN));
-  vec texture = mean<CHANNELS>(clean, C, m.farther, behind) + mean<CHANNELS>(clean, C, m.nearer, front), strength = {}, moved[TAPS] = {};
+    for (int i = 0; i < TAPS; i++) {
+      const vec relative = load<vec>(w.clean.data() + (size_t)c * EDGES * PITCH + first + tap(i)) * per_scale;
+      clean[c * TAPS + i] = most(least(relative, all(MOST_CLEAN)), all(-MOST_CLEAN));
+    }
+  const vec texture = mean<CHANNELS>(clean, C, m.farther, behind) + mean<CHANNELS>(clean, C, m.nearer, front);
+  vec strength = {}, moved[TAPS] = {};
   for (int c = 0; c < C; c++) {
     const vec contrast = front[c] - behind[c];
     strength += contrast * contrast;
