@@ -11,6 +11,7 @@ from torch import Tensor
 from torchdof import BlurTable, blur_by_coc
 from torchdof.reference import metrics
 from torchdof.render import highlights
+from torchdof.render.plan import Plan
 from torchdof.render.surfaces import HIDDEN_WEIGHT, Surface
 
 LAMP = 3000.0
@@ -161,6 +162,14 @@ def test_a_surface_that_is_not_visible_has_no_rays(cover: float) -> None:
     left, rays = highlights.extract(surface, highlights.threshold(image))
     assert rays is None
     assert left.light is image
+
+
+def test_fewer_highlights_are_rays_if_kernels_reach_farther() -> None:
+    plan, coc = Plan((0.0, 10.0), 1 / 255), torch.full((1, 1, 32, 32), 10.0)
+    reach = [plan.reach(table, 32) for table in (BlurTable.disc(), BlurTable.gaussian())]
+    assert reach == pytest.approx([1.0, 2.5])
+    disc, wide = (highlights.affordable_taps(coc, [each]) for each in reach)
+    assert float(disc) == 16 * 32 * 32 and float(wide) == pytest.approx(float(disc) / 6.25)
 
 
 @pytest.mark.parametrize("range_of_light", [0.0, 1.0])
