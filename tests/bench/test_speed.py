@@ -162,7 +162,7 @@ def test_bench_measures_the_given_lens_and_focus_and_json_has_the_rows(
         (["IMAGE", "IMAGE"], "which of the channels"),
         (["IMAGE", "DEPTH", "--truth", "."], "leave IMAGE and DEPTH out"),
         (["IMAGE", "DEPTH", "--out", "IMAGE"], "File exists"),
-        (["--truth", ".", "--out", ".", "--f-number", "2"], "have their own lens and depth"),
+        (["--truth", ".", "--out", ".", "--f-number", "2"], "with their own lens and depth"),
         (["--vignetting", "0.4", "--onnx"], "one kernel a layer"),
         (["IMAGE", "DEPTH", "--views", "4"], "name its folder with --truth"),
         (["IMAGE", "DEPTH", "--depth-kind", "coc", "--focus-m", "2"], "takes no camera"),
@@ -172,7 +172,7 @@ def test_bench_measures_the_given_lens_and_focus_and_json_has_the_rows(
         (["--truth", "."], "give a folder with --out"),
         (["--truth", ".", "--json"], "leave --json out"),
         (["IMAGE", "DEPTH", "--fill-depth", "x"], "--fill-depth expects nearest, far or metres"),
-        (["--truth", ".", "--scan"], "leave IMAGE and DEPTH out, and --onnx, --compile and --scan"),
+        (["--truth", ".", "--scan"], "leave IMAGE and DEPTH out, --onnx, --compile and --scan"),
     ],
 )
 def test_bad_arguments_are_refused_in_a_sentence(

@@ -17,6 +17,7 @@ from ..io.highlights import expand_highlights
 from ..io.images import Picture, read_image, read_values, write_image
 from ..io.sheet import shrunk, write_sheet
 from ..module import blur_by_coc
+from ..optics.aperture import Aperture
 from ..optics.blur_table import BlurTable
 from ..optics.camera import CAMERA_NUMBERS, Camera
 from ..options import Options
@@ -225,10 +226,12 @@ class Renderer:
             "assumed": frame.remarks,
             **{"width": width, "height": height, "seconds": seconds},
         }
+        blur = f"{facts['table']}, {options.method}"
         words = [
-            "" if camera is None else repr(camera),
+            camera and _inside(camera),
             f"blur radius up to {largest_px:.1f} px",
-            "focus shown: near orange, sharp green, far blue" if command.show_focus else f"{table!r}, {options.method}",
+            "focus shown: near orange, sharp green, far blue" if command.show_focus else blur,
+            table.aperture and _inside(table.aperture),
             "" if options.occlusion else "no occlusion",
             f"lights up to {command.lights:g} stops above white" if command.lights else "",
             f"{frame.filled} px of depth filled ({frame.scene.depth_map.fill_depth})" if frame.filled else "",
@@ -238,6 +241,11 @@ class Renderer:
         ]
         remarks = f" [{', '.join(frame.remarks)}]" if frame.remarks else ""
         print_result(command.as_json, facts, f"{out}: {'; '.join(filter(None, words))}{remarks}")
+
+
+def _inside(value: Camera | Aperture) -> str:
+    """The text of a camera or an opening without its brackets."""
+    return repr(value).partition("(")[2].removesuffix(")")
 
 
 def _device(name: str) -> torch.device:

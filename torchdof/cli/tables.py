@@ -57,7 +57,9 @@ class Tables:
             facts = {"table": name, "family": table.family, "nodes": len(table.coc), "coc": table.coc[[0, -1]].tolist()}
             facts |= {"unit": table.unit, "colours": table.channels, "source": source}
             facts |= {"aperture": table.aperture and repr(table.aperture), "field": table.field and repr(table.field)}
-            line = f"{name:24s} {table!r}" + (f" ({source})" if source else "")
+            parts = [table.family, f"{len(table.coc)} node{'s' if len(table.coc) > 1 else ''}"]
+            parts += [str(part) for part in (table.aperture, table.field) if part is not None]
+            line = f"{name:24s} {', '.join(parts)}" + (f" ({source})" if source else "")
             print_result(self.as_json, facts, line)
             if self.out is not None:
                 suffix = ": middle to corner" if table.depends_on_place else ""

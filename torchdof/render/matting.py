@@ -128,7 +128,9 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops =
     small = small if counted is None else small * counted
     covered = (small * nearness).sum(0) / small.sum(0).clamp_min(1e-12)  # by the near surface, under the Gaussian
     noise, misfit = back_variance + front_variance + _ALIKE**2, misfit + (covered - fitted) ** 2 * strength
+    # below 1 px of coc the two may be a steep surface, and nothing is to be seen of a soft edge
     geometric = torch.where(is_near, 1.0 - covered, covered).clamp(max=0.5) * clear * (1.0 - trust)
+    geometric = geometric * (gap / _EDGE_PX - 2.0).clamp(0.0, 1.0)
     weight = weight + geometric * noise / (noise + misfit)
 
     # Each part gets a share of the residual in proportion to its weight squared: the smallest change of both colours.

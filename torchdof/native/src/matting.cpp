@@ -266,6 +266,7 @@ void mix(const Job &job, Window &w, int y, int x, const float *falloff, Mix &m) 
   const vec clear = m.edge * clamp01(4.0f * m.sided - 2.0f), noise = m.variance + ALIKE * ALIKE;
   const vec misfit = m.misfit + (covered - fitted) * (covered - fitted) * m.strength;
   m.geometric = least(m.is_near ? 1.0f - covered : covered, all(0.5f)) * clear * (1.0f - m.trust) * noise / (noise + misfit);
+  m.geometric *= clamp01(m.gap * (1.0f / EDGE_PX) - 2.0f);
   m.certainty = clear * m.trust;
   m.other = least(m.is_near ? 1.0f - fitted : fitted, all(0.5f)) * m.certainty + m.geometric, m.own = 1.0f - m.other;
 }
