@@ -199,7 +199,7 @@ NOT_FINITE = [1.0, math.nan, 2.0]
         ({"coc": [0.1, -0.1, 0.3]}, "coc must be strictly increasing"),
         ({"coc": [0.0]}, "coc must be strictly increasing signed numbers, one a node and not only 0"),
         ({"sensor_width_mm": None}, "sensor_width_mm"),
-        ({"sensor_width_mm": 0.0}, "sensor_width_mm must be a number > 0"),
+        ({"sensor_width_mm": 0.0}, "sensor_width_mm must be a number of millimetres > 1e-06"),
         ({"unit": "relative", "sensor_width_mm": None}, "unit 'relative' takes one node on each side"),
         ({"strength": [1.0]}, r"strength must hold one number a node \(3\), got shape \[1\]"),
     ],

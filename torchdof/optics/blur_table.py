@@ -111,7 +111,9 @@ class BlurTable:
             raise ValueError(
                 f"sensor_width_mm goes with unit 'mm' and only with it, got {show(sensor_width_mm)} with {unit!r}"
             )
-        self.sensor_width_mm = None if sensor_width_mm is None else number("sensor_width_mm", sensor_width_mm, 0, 1e300)
+        self.sensor_width_mm = (
+            None if sensor_width_mm is None else number("sensor_width_mm", sensor_width_mm, 1e-6, 1e9, "millimetres")
+        )
         self._params = self._check_params(params)
         self._sides = {sign: self._side(sign) for sign in (-1, 1) if bool((self.coc * sign > 0).any())}
         for distances, nodes in self._sides.values():
