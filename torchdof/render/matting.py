@@ -196,7 +196,7 @@ def attribute_emitters(
     touches = counted * (near_by > _FALLOFF ** (2 * _TOUCHING**2 + 1))
     nearest = window_coc.amin(0)
 
-    brightness = peaks**2
+    brightness = (peaks**2).clamp(max=1e30)  # 0 * inf would be NaN, beside negative light
     dimness = 1.0 / (brightness + (_DIM * own_peak) ** 2).clamp_min(1e-24)
 
     def beyond(coc: Tensor, side: float, share: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -392,8 +392,8 @@ class Around {
     float dimmest_sum = 0, lit_sum = 0, lit_coc = 0;
     surface.assign(s_.channels, 0.0f);
     for (int i = 0; i < COUNT; i++) {
-      const float peak = peaks_[i] / scale, dimmest = dim_[i] / std::max(peak * peak + least_dim * least_dim, 1e-24f);
-      const float lit = there_[i] * falloff_[i] * peak * peak;
+      const float peak = peaks_[i] / scale, brightness = std::min(peak * peak, 1e30f);
+      const float dimmest = dim_[i] / std::max(brightness + least_dim * least_dim, 1e-24f), lit = there_[i] * falloff_[i] * brightness;
       dimmest_sum += dimmest;
       for (int c = 0; c < s_.channels; c++) surface[c] += s_.light[c * s_.area() + at_[i]] / scale * dimmest;
       lit_sum += lit;
