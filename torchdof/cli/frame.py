@@ -228,10 +228,10 @@ class Renderer:
         }
         blur = f"{facts['table']}, {options.method}"
         words = [
-            camera and _inside(camera),
+            _inside(camera),
             f"blur radius up to {largest_px:.1f} px",
             "focus shown: near orange, sharp green, far blue" if command.show_focus else blur,
-            table.aperture and _inside(table.aperture),
+            _inside(table.aperture),
             "" if options.occlusion else "no occlusion",
             f"lights up to {command.lights:g} stops above white" if command.lights else "",
             f"{frame.filled} px of depth filled ({frame.scene.depth_map.fill_depth})" if frame.filled else "",
@@ -243,8 +243,8 @@ class Renderer:
         print_result(command.as_json, facts, f"{out}: {'; '.join(filter(None, words))}{remarks}")
 
 
-def _inside(value: Camera | Aperture) -> str:
-    """The text of a camera or an opening without its brackets."""
+def _inside(value: Camera | Aperture | None) -> str:
+    """The text of a camera or an opening without its brackets; "" for None."""
     return repr(value).partition("(")[2].removesuffix(")")
 
 
