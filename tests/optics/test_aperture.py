@@ -168,3 +168,11 @@ test_an_invalid_opening_is_refused_by_name = refuses(
     (lambda: Aperture.from_dict({"leaves": 7}), "aperture must have the fields .*; 'leaves' is not one"),
     (lambda: Aperture.from_dict({"mask": [[1.0], [2.0, 3.0]]}), "mask must be numbers"),
 )
+
+
+def test_an_opening_that_passes_no_light_is_refused() -> None:
+    mask = torch.zeros(55, 5)
+    mask[0, 0] = 1.0
+    table = BlurTable.gaussian().with_aperture(Aperture(rotation_deg=30.0, mask=mask))
+    with pytest.raises(ValueError, match="passes no light"):
+        table.kernels(torch.tensor([-5.0]), 16)

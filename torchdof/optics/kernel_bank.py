@@ -286,7 +286,13 @@ class KernelBank:
     def _template(self, side: int, node: int, level: int) -> Tensor:
         """Light ``[C, 2 n + 3, 2 n + 3]`` of the cells of a node's PSF, float64."""
         params = {name: values[:, node] for name, values in self._nodes[side].items()}
-        return psf.template(self.table.family, params, _LEAST_CELLS << level, self.table.aperture)
+        template = psf.template(self.table.family, params, _LEAST_CELLS << level, self.table.aperture)
+        if not bool((template.detach().sum((-2, -1)) > 0).all()):
+            raise ValueError(
+                f"the aperture passes no light of a {self.table.family}: its mask is open where the profile is dark; "
+                "open it nearer the middle"
+            )
+        return template
 
     @torch.inference_mode(False)
     @torch.no_grad()
