@@ -103,7 +103,7 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops =
     # a photograph's edges are wider than a pixel: mixed neighbours count without the light of the other surface
     same = weight * (2.0 - 2.0 * (window_coc - own_coc).abs() / _EDGE_PX).clamp(0.0, 1.0)
     clean = (window_light * same).sum(1) / same.sum(0).clamp_min(1e-12)
-    clean = torch.lerp(colour, clean, edge * ((0.1 / _UNCLEAN) * same.sum(0) - 1.0).clamp(0.0, 1.0))
+    clean = torch.lerp(colour, clean, edge * (same.sum(0) - 10.0 * _UNCLEAN).clamp(0.0, 1.0))
     clean = selected.around(selected.put(light, clean * brightest)) / brightest
     clean = clean.clamp(-_MOST_CLEAN, _MOST_CLEAN)
     window_light = window_light - _mixed_light(window_light, clean, near_weight, far_weight)
@@ -199,14 +199,17 @@ def attribute_emitters(
     brightness = (peaks**2).clamp(max=1e30)  # 0 * inf would be NaN, beside negative light
     dimness = 1.0 / (brightness + (_DIM * own_peak) ** 2).clamp_min(1e-24)
 
-    def beyond(coc: Tensor, side: float, share: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def beyond(
+        coc: Tensor, side: float | Tensor, among: Tensor, share: float, peaks: Tensor = peaks
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Confidence that the emitter lies behind (side 1) or in front of (-1) surfaces with coc ``coc``, 0 to 1.
 
-        It is above 0 only if pixels there have a peak above ``share`` times that of the surfaces. Also returns the
-        weights of the window's pixels beyond the surfaces, those of dim pixels on them, and the larger of both peaks.
+        It is above 0 only if pixels there, ``among`` some of the window, have a peak above ``share`` times that of the
+        surfaces. Also returns the weights of the window's pixels beyond the surfaces, those of dim pixels on them, and
+        the larger of both peaks.
         """
         away = side * (window_coc - coc)
-        there = (counted if side > 0 else touches) * (away - 1.0).clamp(0.0, 1.0)
+        there = among * (away - 1.0).clamp(0.0, 1.0)
         same = counted * (2.0 - away.abs()).clamp(0.0, 1.0)
         dim = same * near_by * (2.5 - 5.0 * peaks / own_peak.clamp_min(1e-12)).clamp(0.0, 1.0)
         emitter_peak, same_peak = (there * peaks).amax(0), (same * peaks).amax(0).clamp_min(1e-12)
@@ -216,14 +219,14 @@ def attribute_emitters(
 
     _, other, other_coc, weight = (pixels.pick(t, bright) for t in surfaces)
     other, other_coc, weight = other / scale, other_coc[0], weight[0]
-    for side, least_share in ((-1.0, 1.0), (1.0, 0.5)):
-        sureness, there, dim, top = beyond(own_coc, side, least_share)
+    for side, among, least_share in ((-1.0, touches, 1.0), (1.0, counted, 0.5)):
+        sureness, there, dim, top = beyond(own_coc, side, among, least_share)
         dimmest = dim * dimness
         surface = (colour * dimmest).sum(1) / dimmest.sum(0).clamp_min(1e-12)  # its light where it is dimmest
         lit = there * near_by * brightness
         emitter_coc = nearest + ((window_coc - nearest) * lit).sum(0) / lit.sum(0).clamp_min(1e-12)
         if side < 0:  # an emitter seen through a surface is not in front of it
-            sureness = sureness * (1.0 - beyond(emitter_coc, 1.0, 0.5)[0])
+            sureness = sureness * (1.0 - beyond(emitter_coc, 1.0, counted, 0.5)[0])
         floor = surface.amax(0)
         share = ((own_peak - floor) / (top - floor).clamp_min(1e-12)).clamp(1.0 - _MOST_WEIGHT, _MOST_WEIGHT)
         emitter = (seen - (1.0 - share) * surface).clamp_min(0.0)
@@ -239,11 +242,11 @@ def attribute_emitters(
     # The other way round: an emitter on the own surface. The other surface is dark around the pixel, without the light
     # of emitters seen through it, which was taken from it above.
     own = pixels.put(surfaces.own, bright, (seen - weight * other) / (1.0 - weight) * scale)
-    peaks = pixels.pick(own.amax(1, keepdim=True), window)[0] / scale
-    for side in (-1.0, 1.0):
-        bright_other = (other.amax(0) / limit.clamp_min(torch.finfo(light.dtype).tiny) - 1.0).clamp(0.0, 1.0)
-        apart = (side * (own_coc - other_coc) - 1.0).clamp(0.0, 1.0)
-        weight = weight * (1.0 - apart * bright_other * beyond(other_coc, side, 1.0)[0])
+    own_peaks = pixels.pick(own.amax(1, keepdim=True), window)[0] / scale
+    bright_other = (other.amax(0) / limit.clamp_min(torch.finfo(light.dtype).tiny) - 1.0).clamp(0.0, 1.0)
+    apart = own_coc - other_coc
+    sureness = beyond(other_coc, apart.sign(), torch.where(apart > 0, counted, touches), 1.0, own_peaks)[0]
+    weight = weight * (1.0 - (apart.abs() - 1.0).clamp(0.0, 1.0) * bright_other * sureness)
     own = (seen - weight * other) / (1.0 - weight)
     changed = zip(surfaces, (own * scale, other * scale, other_coc, weight), strict=True)
     return Matted(*(pixels.put(maps, bright, values) for maps, values in changed))
@@ -259,7 +262,7 @@ def _mixed_light(window: Tensor, clean: Tensor, near_weight: Tensor, far_weight:
     contrast = (front - back)[:, None]
     strength = (contrast**2).sum(0) + _TEXTURE * (back_variance + front_variance) + _ALIKE**2
     share = ((window - clean) * contrast).sum(0) / strength
-    return torch.where(near_weight > far_weight, -(-share).clamp(0.0, 1.0), share.clamp(0.0, 1.0)) * contrast
+    return torch.where(near_weight > far_weight, share.clamp(-1.0, 0.0), share.clamp(0.0, 1.0)) * contrast
 
 
 def _falloff(light: Tensor, reach: int) -> Tensor:

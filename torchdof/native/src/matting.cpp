@@ -141,7 +141,7 @@ void clean_light(const Job &job, int y0, int x0, Window &w, const float *falloff
         if (job.surfaces.valid) weight[k] *= load<vec>(w.valid + in_coc + to);
         total += weight[k];
       }
-      const vec is_clean = edge * clamp01(total * (0.1f / UNCLEAN) - 1.0f), per_total = 1.0f / most(total, all(1e-12f));
+      const vec is_clean = edge * clamp01(total - 10.0f * UNCLEAN), per_total = 1.0f / most(total, all(1e-12f));
       for (int c = 0; c < job.channels; c++) {
         const float *const light = w.light.data() + (size_t)c * EDGES * PITCH + at;
         vec sum = {};
@@ -368,8 +368,9 @@ class Around {
     if (!scale)
       for (int i = 0; i < COUNT; i++) {
         scale = std::max(scale, peaks_[i] = peak_of(s_.light + at_[i], s_.area(), s_.channels));
+        if (!matted_) continue;
         const int row = (int)(at_[i] / s_.width), column = (int)(at_[i] % s_.width), which = s_.block_of(row, column);
-        if (matted_ && s_.has_block(which)) peaks_[i] = peak_of(s_.block(which).own + place_in_block(row, column), BLOCK_PIXELS, s_.channels);
+        if (s_.has_block(which)) peaks_[i] = peak_of(s_.block(which).own + place_in_block(row, column), BLOCK_PIXELS, s_.channels);
       }
     const float own_peak = light / scale, dim_below = 5.0f / std::max(own_peak, 1e-12f);
     float dim_sum = 0, emitter_peak = 0, same_peak = 1e-12f;
