@@ -197,12 +197,11 @@ class Renderer:
         if frame.guess:
             self.notices.note("guess", f"{frame.name}: {frame.guess}")
         if camera is not None and largest_px < _VISIBLE_PX:
-            advice = (
-                f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; open the lens wider, with a "
-            )
-            advice += "smaller --f-number, a larger --blur, or a larger --aperture-radius-m"
-            nothing = "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
-            self.notices.note("little blur", f"{out}: {advice if largest_px else nothing}")
+            advice = "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
+            if largest_px:
+                advice = f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; open the lens wider, "
+                advice += "with a smaller --f-number, a larger --blur, or a larger --aperture-radius-m"
+            self.notices.note("little blur", f"{out}: {advice}")
         has_exif = any(name.startswith("Exif:") for name in frame.picture.metadata)
         if has_exif and out.suffix.lower() in _WITHOUT_EXIF:
             lost = f"EXIF data are lost in a {out.suffix} file; write .jpg, .png or .tif to keep them"

@@ -126,11 +126,14 @@ def is_complete(path: Path) -> bool:
             return False
         spec = source.spec()
         if source.format_name() == "png":
-            return path.read_bytes()[-8:-4] == b"IEND"
-        last_row = source.read_scanline(spec.y + spec.height - 1, 0, "float")
+            with path.open("rb") as file:
+                file.seek(-8, os.SEEK_END)
+                is_whole = file.read(4) == b"IEND"
+        else:
+            is_whole = source.read_scanline(spec.y + spec.height - 1, 0, "float") is not None
         problem = source.geterror()
         source.close()
-    return last_row is not None and not problem
+    return is_whole and not problem
 
 
 def _check_header(path: Path) -> None:

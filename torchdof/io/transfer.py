@@ -52,11 +52,14 @@ def encode_8_bits(pixels: Tensor, transfer: Transfer, has_alpha: bool) -> np.nda
         pixels = torch.cat([_divide(pixels[:, :-1], pixels[:, -1:]), pixels[:, -1:]], 1)
     halves = np.arange(65536, dtype=np.uint16).view(np.float16).astype(np.float32)
     light = torch.from_numpy(halves).nan_to_num(0.0)
+    colour, alpha = (
+        (encode(light, curve, False, False).clamp(0.0, 1.0) * 255.0).round().byte().numpy()
+        for curve in (transfer, "linear")
+    )
     encoded = np.empty((*pixels.shape[-2:], pixels.shape[1]), np.uint8)
     for k, channel in enumerate(pixels[0].half().numpy().view(np.uint16)):
         is_alpha = has_alpha and k == pixels.shape[1] - 1
-        codes = (encode(light, "linear" if is_alpha else transfer, False, False).clamp(0.0, 1.0) * 255.0).round()
-        encoded[..., k] = np.take(codes.byte().numpy(), channel, mode="clip")
+        encoded[..., k] = np.take(alpha if is_alpha else colour, channel, mode="clip")
     return encoded
 
 

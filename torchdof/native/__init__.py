@@ -227,8 +227,8 @@ def render(
         nodes: Positions of the layers on the blur axis, near to far.
         layers: Kernel ``[1 or C, k, k]`` and pixel size of each layer.
         psfs: Kernels ``[1 or C, k, k]`` for signed radii of highlights, in steps of 1/32 pixel.
-        occlusion: As in :class:`torchdof.DepthOfField`, as ``normalize``.
-        normalize: The same.
+        occlusion: As in :class:`torchdof.DepthOfField`.
+        normalize: As in :class:`torchdof.DepthOfField`.
         masked: Whether values may be NaN or infinite; such pixels are copied.
         highlights: Whether highlights are rendered ray by ray where layers would soften them.
         crisp_px: Blur in pixels above which layers soften highlights.
