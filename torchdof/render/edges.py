@@ -47,6 +47,8 @@ _NOISE_SAMPLED = 2**13  # pixels per frame that are sampled, half along rows and
 _REACH = 5  # px; half the width of the window of samples around a pixel
 _FALLOFF_PX = 2.5  # standard deviation of the Gaussian weights of these samples
 _SURE = (0.0, 0.02, 0.06, 0.2, 1.0)  # weight of a sample, by ring: beside a step its depth may be wrong
+_CLEAR = 0.1  # sum of these weights from which samples beside a step count in full; larger: thin strands stay
+_CLEAR_IN_PRIOR = 0.25  # the same where the share of wrong pixels is estimated; larger: soft pictures stay
 _SHARPNESS = 1.6  # factor on scores, which samples on the wrong side reduce; larger: colour outweighs the map
 
 # Prior: how often each kind of edge pixel shows the near surface
@@ -252,7 +254,7 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops 
     sampled = pixels.indices(edges.is_edge & ((rows[:, None] + columns) % every == 0))
     level = ((given - edges.far) / (edges.near - edges.far).clamp_min(1e-12)).clamp(0.0, 1.0)
     kind = _kind(level, edges)
-    sampled_score = _judge(light, given, witness, edges, sampled, ops)[0]
+    sampled_score = _judge(light, given, witness, edges, sampled, _CLEAR_IN_PRIOR, ops)[0]
     prior = _calibrate(kind, sampled, sampled_score, given.shape[0])[kind]
     wrong = torch.where(is_near, 1.0 - prior, prior)
     climb = _climb(given, valid, edges)
@@ -272,7 +274,7 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops 
     edge_pixels = pixels.indices(doubtful)
     if auto and not is_traced() and len(edge_pixels) == 0:  # nor lamps: a soft map has ramps, which are selected
         return nearness
-    score, evidence, near, far = _judge(light, given, witness, edges, edge_pixels, ops)
+    score, evidence, near, far = _judge(light, given, witness, edges, edge_pixels, _CLEAR, ops)
     shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0])
     if auto:  # without auto, correct steps are decided too, and the lead would move them
         shows_near = shows_near + _LEAN * (score.abs() - 1.0).clamp(0.0, 1.0)
@@ -282,6 +284,7 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops 
     climbed = (climb * is_mixed).sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
     ramp_px = _CLIMBED * is_mixed.sum((1, 2, 3), keepdim=True) / climbed
     sigma = (ramp_px.square() - _PIXEL).clamp_min(0.0).sqrt().clamp(0.2, 3.0)
+
     label = pixels.put(is_near.to(given.dtype), edge_pixels, shows_near.to(given.dtype))
     length = climb.sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
     lost_px = torch.where(edges.is_edge, label - level, 0.0).sum((1, 2, 3), keepdim=True) / length
@@ -395,15 +398,18 @@ def _kind(level: Tensor, edges: _Edges) -> Tensor:
 
 
 def _judge(
-    light: Tensor, nearness: Tensor, witness: Tensor, edges: _Edges, edge_pixels: Tensor, ops: Ops
+    light: Tensor, nearness: Tensor, witness: Tensor, edges: _Edges, edge_pixels: Tensor, clear: float, ops: Ops
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Scores by colour which of two surfaces pixels ``[P]`` show.
 
     1. Take samples of both surfaces from a window around each pixel, weighted by distance and by ``witness``.
     2. Compute mean and spread of both colours, and how well these separate the surfaces, in [0, 1].
     3. Compute the likelihood of each surface: the share of its samples that resemble the pixel. A surface of several
-       colours has no useful mean, so a share of samples decides and the distance to the mean counts little.
+       colours has no useful mean. Beside a step, few samples prove little: in a photograph, whose edges are soft, a
+       strand of a pixel has mostly the colour of its background.
     4. Average scores over neighbours of similar colour.
+
+    ``clear`` is the sum of weights from which samples of a surface count in full.
 
     Returns:
         ``[P]`` each: the log-likelihood ratio, positive for the near surface; the evidence, 0 to 1; and the nearness
@@ -438,17 +444,15 @@ def _judge(
 
         # likelihoods
         alike = (1.0 + (others - own[:, None]).square().sum(0) / (0.3 * spread)).square().reciprocal()
-        close = [(1.0 + (own - m).square().sum(0) / (0.3 * spread)).square().reciprocal() for m in means]
-        likelihoods = [
-            (side * alike).sum(0) / total + 0.02 * at_mean + 1e-9
-            for side, total, at_mean in zip(sides, totals, close, strict=True)
-        ]
-        score = torch.where(known, torch.log(likelihoods[0] / likelihoods[1]), 0.0)
+        likelihoods = [(side * alike).sum(0) / total + 1e-9 for side, total in zip(sides, totals, strict=True)]
+        score = torch.where(known, torch.log(likelihoods[0] / likelihoods[1]), 0.0).clamp(-8.0, 8.0)
+        is_clear = pixels.pick(edges.is_ramp, part)[0] | (torch.minimum(*sums) > clear)
+        score = torch.where(is_clear, score, score * torch.minimum(*sums) / clear)
         surfaces = []
         for side, end in zip(sides, (near, far), strict=True):
             share = side * (alike + 1e-3)
             surfaces.append(torch.where(known, (share * values).sum(0) / share.sum(0).clamp_min(1e-12), end))
-        return torch.stack([score.clamp(-8.0, 8.0), separation, *surfaces])
+        return torch.stack([score, separation, *surfaces])
 
     score, separation, near, far = ops.by_parts(look, edge_pixels).unbind(0)
 
@@ -462,9 +466,6 @@ def _judge(
     scores = torch.where(scores.isnan(), 0.0, scores)
     score = (_SHARPNESS * separation * (alike * scores).sum(0) / alike.sum(0).clamp_min(1e-12)).clamp(-6.0, 6.0)
     evidence = (2.0 * separation * scores.abs().amax(0) - 1.0).clamp(0.0, 1.0)
-    # at the ends of a wide ramp the window holds only one of the surfaces: use the evidence of its middle
-    known = _highest(pixels.put(torch.zeros_like(nearness), edge_pixels, evidence), 3)
-    evidence = pixels.pick(known, edge_pixels)[0]
     return score, evidence, near, far
 
 
@@ -516,12 +517,7 @@ def _calibrate(kind: Tensor, sampled: Tensor, score: Tensor, items: int) -> Tens
 
     is_step = (torch.arange(_PLACES, device=device) < 2 * _RINGS).repeat(items)
     together = fit(places, torch.where(is_step, 0.5, assumed), assumed).repeat_interleave(_DIRECTIONS)
-    shares = fit(kinds, torch.full_like(together, 0.5), together)
-    shares = shares.view(items, _PLACES, _DIRECTIONS)
-    # pixels farther from a step are at least as often right as those beside it
-    far = [shares[:, :k].amin(1) for k in range(1, _RINGS + 1)]
-    near = [shares[:, _RINGS : _RINGS + k].amax(1) for k in range(1, _RINGS + 1)]
-    return torch.cat([torch.stack(far + near, 1), shares[:, 2 * _RINGS :]], 1).flatten()
+    return fit(kinds, torch.full_like(together, 0.5), together)
 
 
 def _climb(nearness: Tensor, valid: Tensor, edges: _Edges) -> Tensor:

@@ -20,7 +20,7 @@ constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TIE = 0.017f;
 constexpr float NOISES = 12.0f, LEVELS_OF_A_FILE = 64.0f;  // noise
 constexpr int NOISE_SAMPLED = 1 << 13;
 constexpr int REACH = 5;  // colour
-constexpr float SHARPNESS = 1.6f;
+constexpr float CLEAR = 0.1f, CLEAR_IN_PRIOR = 0.25f, SHARPNESS = 1.6f;
 constexpr int DIRECTIONS = 5, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, KINDS = DIRECTIONS * PLACES;  // prior
 constexpr int SAMPLED = 12000, SAMPLE_BLOCK = 8, ROUNDS = 10;
 constexpr float TRUSTED = 0.05f, PRIOR_COUNT = 30.0f;
@@ -43,9 +43,8 @@ constexpr float LARGEST = 1e15f, BRIGHTEST = 1e30f, FINITE = 3.402823466e38f;
 constexpr int SIDE = 2 * REACH + 1, WHOLE = SIDE / LANES * LANES, ROWS_AT_ONCE = LANES / 4, WINDOW = SIDE * WHOLE / LANES + (SIDE + ROWS_AT_ONCE - 1) / ROWS_AT_ONCE;
 static_assert(SIDE - WHOLE <= 4 && WHOLE > REACH + 1);
 
-// Bits of a pixel's mark. NEAR: it shows the near surface. GIVEN_NEAR: the map gives it the near surface's depth. Bits
-// from UNSURE up: index into SURE.
-constexpr uint8_t EDGE = 1, RAMP = 2, NEAR = 4, GIVEN_NEAR = 8, LISTED = 16, UNSURE = 32;
+// Bits of a pixel's mark. NEAR: the map gives it the near surface's depth. Bits from UNSURE up: index into SURE.
+constexpr uint8_t EDGE = 1, RAMP = 2, NEAR = 4, LISTED = 8, UNSURE = 32;
 // weight as a colour reference: far from steps, RINGS pixels from one, ..., beside one; 0 for invalid pixels and ramps
 constexpr float SURE[256 / UNSURE] = {1.0f, 0.2f, 0.06f, 0.02f, 0.0f};
 
@@ -242,9 +241,9 @@ void sums(const Grid &in, const Grid &out, const Grid &rows, const Part &part, f
 }
 
 // Which surface a pixel shows. score: log-odds of the near surface. reliability: 0 to 1, how well colours separate the
-// two surfaces. near, far: nearness of the surfaces.
+// two surfaces. evidence: 0 to 1. near, far: nearness of the surfaces.
 struct Judgement {
-  float score, reliability, near, far;
+  float score, reliability, evidence, near, far;
 };
 
 struct Around {
@@ -299,7 +298,7 @@ class Repair {
     choose_edges(sampled, [&](const Edge &edge) { return is_sampled(edge.i / width_, edge.i % width_); });
     allocate_results(sampled);
     judge(sampled, false);
-    decide(sampled, [](const Edge &, float) {});
+    decide(sampled);
     calibrate(sampled);
     const bool is_soft = is_on_ramps(sampled);
     if (map_.automatic && (!is_related(sampled) || !(is_soft || is_inexact(sampled)))) return false;
@@ -313,10 +312,10 @@ class Repair {
       choose_edges(groups, [&](const Edge &edge) { return doubtful[given_kind_of(edge)]; });
     allocate_results(groups);
     judge(groups, true);
-    const float sigma = blur(), lost_px = choose(groups);
-    move(groups, is_soft);
+    decide(groups);
+    const float lost_px = move(groups);
     if (is_soft) remove_ringing();
-    if (is_soft) lift_lamps(sigma, lost_px);
+    if (is_soft) lift_lamps(blur(), lost_px);
     return true;
   }
 
@@ -332,7 +331,7 @@ class Repair {
   float step(size_t i) const { return std::max(map_.steps ? map_.steps[i] : map_.step, noise_step_); }
   float nearness(size_t i) const { return sign_ * map_.nearness[i]; }
   // Kind of an edge pixel, plus KINDS if the map gives it the near surface: an index into a KindMask.
-  int given_kind_of(const Edge &edge) const { return edge.kind + (marks_[edge.i] & GIVEN_NEAR ? KINDS : 0); }
+  int given_kind_of(const Edge &edge) const { return edge.kind + (marks_[edge.i] & NEAR ? KINDS : 0); }
   // Share of the pixels of a given kind to which the map gives the wrong surface.
   float wrong(int given_kind) const { return given_kind >= KINDS ? 1.0f - shares_[given_kind - KINDS] : shares_[given_kind]; }
   static float valid(float v) { return std::fabs(v) <= LARGEST ? v : 0.0f; }
@@ -515,7 +514,6 @@ class Repair {
 
   void allocate() {
     score_ = Buffer<float>(area_);
-    evidence_ = Buffer<float>(area_);
     marks_ = Buffer<uint8_t>(area_);
   }
 
@@ -734,7 +732,7 @@ class Repair {
         far = is_ramp > none ? -load<vec>(down.at(y, x)) : -far;
         const auto is_edge = (is_ramp + unsure > none) & (near - far > s) & is_valid;
         const vec is_near = 2.0f * v > near + far ? one : none;
-        const vec mark = (is_edge ? all((float)EDGE) : none) + is_near * (float)(NEAR + GIVEN_NEAR) + is_ramp * (float)RAMP;
+        const vec mark = (is_edge ? all((float)EDGE) : none) + is_near * (float)NEAR + is_ramp * (float)RAMP;
         store(marks_of_row + k, (is_edge | (is_ramp > none) ? mark : none) + (float)UNSURE * (is_valid & (is_ramp <= none) ? unsure : all((float)(RINGS + 1))));
         const int first = std::max(0, own.x0 - x), last = std::min(LANES, std::min(inner.right(), own.right()) - x);
         int edges_here = is_own && first < last ? bits(is_edge) & ((1 << last) - (1 << first)) : 0;
@@ -867,7 +865,8 @@ class Repair {
   // 1. Sum over each pixel's window the weights and colour differences of the references of both surfaces.
   // 2. For LANES pixels at once, compute the spread of the references' colours, and the contrast of the surfaces.
   // 3. Sum the likelihoods over the windows, which need the spread.
-  // 4. The score is the logarithm of the likelihoods' ratio; the reliability grows with the contrast.
+  // 4. The score is the logarithm of the likelihoods' ratio, less beside a step with few samples; the reliability grows
+  //    with the contrast.
   template <int C>
   void judge(Group &group, const float *falloff, bool wants_surfaces) const {
     const int channels = C ? C : channels_, count = 4 + 2 * channels;
@@ -966,23 +965,18 @@ class Repair {
       }
       for (int n = 0; n < 8; n++) store(around + n * LANES, 1.0f / (1.0f + load<vec>(around + n * LANES) * per_light));
       vec likelihood[2];
-      for (int side = 0; side < 2; side++) {
-        const vec t = 1.0f + from_mean[side] * per_spread;
-        likelihood[side] = load<vec>(likely[side]) * per_total[side] + 0.02f / (t * t) + 1e-9f;
-      }
-      const vec odds = likelihood[0] / likelihood[1];
+      for (int side = 0; side < 2; side++) likelihood[side] = load<vec>(likely[side]) * per_total[side] + 1e-9f;
+      const vec odds = likelihood[0] / likelihood[1], clear = least(least(of(0), of(1)) / (wants_surfaces ? CLEAR : CLEAR_IN_PRIOR), one);
       for (int l = 0; l <= lane; l++) {
         const Edge &edge = group.edges[k - lane + l];
-        score_[edge.i] = is_known[l] ? clamp(std::log(odds[l]), -8.0f, 8.0f) : 0.0f;
-        group.judged[k - lane + l] = {0.0f, reliability[l], is_known[l] ? surfaces[0][l] : edge.near, is_known[l] ? surfaces[1][l] : edge.far};
+        score_[edge.i] = is_known[l] ? clamp(std::log(odds[l]), -8.0f, 8.0f) * (marks_[edge.i] & RAMP ? 1.0f : clear[l]) : 0.0f;
+        group.judged[k - lane + l] = {0.0f, reliability[l], 0.0f, is_known[l] ? surfaces[0][l] : edge.near, is_known[l] ? surfaces[1][l] : edge.far};
       }
     });
   }
 
-  // Averages the scores of neighbours of similar colour, then calls body(edge, evidence) for each edge. evidence: 0 to
-  // 1.
-  template <typename Body>
-  void decide(const std::vector<Group> &groups, const Body &body) const {
+  // Averages the scores of neighbours of similar colour, and finds the evidence.
+  void decide(const std::vector<Group> &groups) const {
     parallel((int)groups.size(), [&](int g) {
       const Group &group = groups[g];
       if (group.edges.empty()) return;
@@ -1006,10 +1000,9 @@ class Repair {
         }
         score /= total;
         for (int l = 0; l <= lane; l++) {
-          const size_t at = k - lane + l;
-          const float reliability = group.judged[at].reliability;
-          group.judged[at].score = clamp(SHARPNESS * reliability * score[l], -6.0f, 6.0f);
-          body(group.edges[at], clamp01(2.0f * reliability * strongest[l] - 1.0f));
+          Judgement &judged = group.judged[k - lane + l];
+          judged.score = clamp(SHARPNESS * judged.reliability * score[l], -6.0f, 6.0f);
+          judged.evidence = clamp01(2.0f * judged.reliability * strongest[l] - 1.0f);
         }
       });
     });
@@ -1064,13 +1057,6 @@ class Repair {
     std::vector<float> each(KINDS);
     for (int k = 0; k < KINDS; k++) each[k] = together[k / DIRECTIONS];
     shares_ = fit(observations, 1, std::vector<float>(KINDS, 0.5f), each);
-    // pixels farther from a step are at least as often right as those beside it
-    for (int r = 1; r < RINGS; r++)
-      for (int d = 0; d < DIRECTIONS; d++) {
-        float *far = &shares_[r * DIRECTIONS + d], *near = &shares_[(RINGS + r) * DIRECTIONS + d];
-        *far = std::min(*far, far[-DIRECTIONS]);
-        *near = std::max(*near, near[-DIRECTIONS]);
-      }
   }
 
   // Scores of the pixels of one kind: weight, and odds of the far surface. Padded to whole vectors with weight 0.
@@ -1107,21 +1093,25 @@ class Repair {
     return clamp((float)std::sqrt(std::max(width * width - PIXEL, 0.0)), 0.2f, 3.0f);
   }
 
-  // Decides which surface pixels show. Returns the width, in pixels, by which the map's near surfaces are too thin.
-  float choose(const std::vector<Group> &groups) {
+  // Decides which surface pixels show, and moves them to its nearness; on ramps in proportion to the evidence. Returns the
+  // width, in pixels, by which the map's near surfaces are too thin.
+  float move(const std::vector<Group> &groups) const {
     const float lean = map_.automatic ? LEAN : 0.0f;
     float prior[KINDS];
     for (int k = 0; k < KINDS; k++) prior[k] = std::log(shares_[k] / (1.0f - shares_[k]));
     std::vector<int64_t> lost(groups.size(), 0);
-    decide(groups, [&](const Edge &edge, float evidence) { evidence_[edge.i] = evidence; });
-    parallel((int)groups.size(), [&](int g) {  // only after all decisions, which read the marks of neighbouring groups
+    parallel((int)groups.size(), [&](int g) {
       for (size_t k = 0; k < groups[g].edges.size(); k++) {
         const Edge &edge = groups[g].edges[k];
-        const float score = groups[g].judged[k].score;
-        const bool shows_near = score + prior[edge.kind] > -lean * clamp01(std::fabs(score) - 1.0f);
-        uint8_t &marks = marks_[edge.i];
-        lost[g] += shows_near - (marks & NEAR) / NEAR;
-        marks = (uint8_t)((marks & ~NEAR) | shows_near * NEAR);
+        const Judgement &judged = groups[g].judged[k];
+        const bool shows_near = judged.score + prior[edge.kind] > -lean * clamp01(std::fabs(judged.score) - 1.0f);
+        const uint8_t marks = marks_[edge.i];
+        const bool was_near = marks & NEAR;
+        lost[g] += shows_near - was_near;
+        const float moved = marks & RAMP ? judged.evidence : (float)(shows_near != was_near);
+        if (!(moved > 0)) continue;
+        const float own = nearness(edge.i), surface = shows_near ? judged.near : judged.far;
+        map_.out[edge.i] = sign_ * (own + moved * (surface - own));
       }
     });
     double total = found_.lost;
@@ -1129,33 +1119,11 @@ class Repair {
     return (float)(total / std::max(found_.length, 1e-12));
   }
 
-  // Moves pixels to the nearness of the surface that they show; on ramps in proportion to the evidence.
-  void move(const std::vector<Group> &groups, bool is_soft) const {
-    parallel((int)groups.size(), [&](int g) {
-      const Group &group = groups[g];
-      if (group.edges.empty()) return;
-      // near the end of a wide ramp only one surface is in reach: use the strongest evidence within three pixels
-      const Part around = group.bounds.grown(3);
-      const Grid evidence(around), strongest(group.bounds), rows(around);
-      if (is_soft || !map_.automatic) {  // otherwise no ramps are selected
-        take_listed(evidence_.data(), evidence, 0.0f);
-        max_filter<3>(evidence, strongest, rows, group.bounds);
-      }
-      each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
-        const uint8_t marks = marks_[edge.i];
-        const bool shows_near = marks & NEAR, given_near = marks & GIVEN_NEAR;
-        const float moved = marks & RAMP ? *strongest.at(y, x) : (float)(shows_near != given_near);
-        if (!(moved > 0)) return;
-        const float own = nearness(edge.i), surface = shows_near ? group.judged[k].near : group.judged[k].far;
-        map_.out[edge.i] = sign_ * (own + moved * (surface - own));
-      });
-    });
-  }
-
   // Removes rims beside steps that are a little nearer, or farther, than the surface to which they belong: the ringing
   // of interpolation. Such pixels move to the closer end of the range between the closed opening and the opened closing.
   void remove_ringing() {
-    memcpy(evidence_.data(), map_.out, area_ * sizeof(float));
+    const Buffer<float> repaired(area_);
+    memcpy(repaired.data(), map_.out, area_ * sizeof(float));
     const std::vector<Group> parts = tiles();
     parallel((int)parts.size(), [&](int g) {
       const Part &part = parts[g].part, whole = part.grown(4 * RINGING_REACH);
@@ -1166,8 +1134,8 @@ class Repair {
         clamp_to_frame(values, over);
         if (negated) each_vector(over, [&](int y, int x) { store(values.at(y, x), -load<vec>(values.at(y, x))); });
       };
-      fetch(evidence_.data(), up, [this](float v) { return std::fabs(v) <= LARGEST ? sign_ * v : -NONE; });
-      fetch(evidence_.data(), down, [this](float v) { return std::fabs(v) <= LARGEST ? -sign_ * v : -NONE; });
+      fetch(repaired.data(), up, [this](float v) { return std::fabs(v) <= LARGEST ? sign_ * v : -NONE; });
+      fetch(repaired.data(), down, [this](float v) { return std::fabs(v) <= LARGEST ? -sign_ * v : -NONE; });
       for (const Grid *values : {&up, &down}) spread(*values, 3, true);
       vec widest = all(-NONE);
       each_vector(part, [&](int y, int x) {
@@ -1362,7 +1330,7 @@ class Repair {
   const int height_, width_, channels_;
   const size_t area_;
   float noise_step_ = 0.0f;  // smallest step that is larger than the map's noise
-  Buffer<float> score_, evidence_;
+  Buffer<float> score_;
   Buffer<uint8_t> marks_;
   Buffer<Judgement> judged_;  // of the edges given memory last
   Buffer<Around> around_;
