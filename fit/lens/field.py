@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -34,18 +35,17 @@ def trace_field(
     rows, columns = _CELLS
     heights = [field_height_mm(lens, distance_m(0.0), sensor_mm, radius, reference) for radius in radius_mm]
     boxes, light = [], []
-    for coc in coc_mm:
-        for height in heights:
-            spots = [
-                spot_of_place(lens, distance_m(coc), sensor_mm, height, reference, rays=rays, wavelength_um=wavelength)
-                for wavelength in (wavelengths_um or (None,))
-            ]
-            low, high = min(u.min() for u, _, _ in spots), max(u.max() for u, _, _ in spots)
-            # a ray's light is split among the cells around it, so rays lie half a cell inside the box
-            centre, length = (low + high) / 2, max(high - low, 1e-9) / 2 * rows / (rows - 1)
-            width = max(1e-9, *(np.abs(v).max() for _, v, _ in spots)) * 2 * columns / (2 * columns - 1)
-            boxes.append((centre, length, width))
-            light.append([_binned((u - centre) / length, np.abs(v) / width, weight) for u, v, weight in spots])
+    for coc, height in product(coc_mm, heights):
+        spots = [
+            spot_of_place(lens, distance_m(coc), sensor_mm, height, reference, rays=rays, wavelength_um=wavelength)
+            for wavelength in (wavelengths_um or (None,))
+        ]
+        low, high = min(u.min() for u, _, _ in spots), max(u.max() for u, _, _ in spots)
+        # a ray's light is split among the cells around it, so rays lie half a cell inside the box
+        centre, length = (low + high) / 2, max(high - low, 1e-9) / 2 * rows / (rows - 1)
+        width = max(1e-9, *(np.abs(v).max() for _, v, _ in spots)) * 2 * columns / (2 * columns - 1)
+        boxes.append((centre, length, width))
+        light.append([_binned((u - centre) / length, np.abs(v) / width, weight) for u, v, weight in spots])
     nodes = (len(coc_mm), len(radius_mm))
     return Field(
         torch.tensor(list(coc_mm), dtype=torch.float64),

@@ -28,7 +28,7 @@ Focus = Literal["best", "paraxial"]
 
 _PUPIL_INTERVALS = 64  # grid intervals along each side of a box in the pupil
 _FAN_RAYS = 4096
-_MAX_DISTANCE_M, _MAX_HEIGHT_MM = 1e12, 1e9
+_MAX_DISTANCE_M = 1e12
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,7 @@ def point_spread(
         0.3705
     """
     whole("rays", rays, 16, 10**8)
-    number("field_mm", field_mm, low=-_MAX_HEIGHT_MM, high=_MAX_HEIGHT_MM, unit="millimetres")
+    number("field_mm", field_mm, low=-1e9, high=1e9, unit="millimetres")
     if meridional and field_mm:
         raise ValueError(f"meridional is for points on the axis, got field_mm = {field_mm}")
     object_mm, side = vertex_distance_mm(lens, z_m, reference, sensor_mm), max(4, round(math.sqrt(rays)))
@@ -153,18 +153,17 @@ def point_spread(
         raise ValueError(f"no ray from z = {z_m} m at field {field_mm} mm passes lens {lens.name!r}")
     hits, weight = traced.at(lens.vertices[-1] + sensor_mm)[:, passed], weight[passed] / weight[passed].sum()
     if meridional:
-        return Spot(hits[0], hits[1], weight, 0.0, math.pi * float(points[1, passed].max()) ** 2, True)
+        return Spot(*hits, weight, 0.0, math.pi * float(points[1, passed].max()) ** 2, True)
     centre = hits @ weight
-    x, y = hits - centre[:, None]
-    return Spot(x, y, weight, -float(centre[1]), float(np.prod(high - low) * passed.mean()))
+    return Spot(*(hits - centre[:, None]), weight, -float(centre[1]), float(np.prod(high - low) * passed.mean()))
 
 
 def vertex_distance_mm(lens: Lens, z_m: float, reference: Reference, sensor_mm: float) -> float:
     """Distance of an object in front of the first vertex, in mm."""
     choice("reference", reference, get_args(Reference))
     paraxial = lens.paraxial()
-    reference_z = paraxial.front_principal, paraxial.entrance_pupil, 0.0, float(lens.vertices[-1]) + sensor_mm
-    reference_mm = dict(zip(get_args(Reference), reference_z, strict=True))[reference]
+    places_mm = paraxial.front_principal, paraxial.entrance_pupil, 0.0, float(lens.vertices[-1]) + sensor_mm
+    reference_mm = places_mm[get_args(Reference).index(reference)]
     object_mm = 1000.0 * z_m - reference_mm
     if _MAX_DISTANCE_M < z_m < math.inf:
         raise ValueError(f"objects must be at most {_MAX_DISTANCE_M:g} m away, or at infinity, got {z_m} m")

@@ -116,9 +116,3 @@ def test_many_rays_give_the_results_of_few():
         few = trace_rays(small, position[:, start : start + 100], direction[:, :100])
         for found, expected in zip(many, few, strict=True):
             np.testing.assert_array_equal(found[..., start : start + 100], expected)
-
-
-@pytest.mark.parametrize("shapes", [((3,), (3,)), ((3, 2), (3, 1)), ((2, 5), (2, 5))])
-def test_wrong_shapes_are_refused(shapes):
-    with pytest.raises(ValueError, match=r"position and direction must both be \[3, R\]"):
-        trace_rays(WALL, *map(np.zeros, shapes))
