@@ -14,9 +14,8 @@ from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.camera import Camera
 from torchdof.validation import number, show
 
-from ..problems import FitError, warn
+from ..problems import FitError, checked, warn
 from ..result import Array, Mask
-from ..validation import checked
 from .captures import CAMERA, Captures
 
 _MIN_BLUR_PX = 2.0  # radius of a blur that counts; smaller ones are dominated by aberrations

@@ -10,9 +10,8 @@ import torch
 from torchdof.optics.camera import Camera
 from torchdof.validation import number, show
 
-from ..problems import FitError
+from ..problems import FitError, checked
 from ..result import Array
-from ..validation import checked
 
 RANGES = {  # wider than any camera's
     **{"focus_m": (1e-5, 1e6), "distance_m": (1e-5, 1e6), "exposure_s": (1e-9, 1e7)},

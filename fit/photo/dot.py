@@ -6,9 +6,8 @@ import numpy as np
 from scipy import ndimage
 from scipy.ndimage import uniform_filter
 
-from ..problems import FitError, warn
+from ..problems import FitError, a_picture, warn
 from ..result import Array, Mask
-from ..validation import a_picture
 from .noise import fine_variance, near_border, noise_of
 
 _THRESHOLD = 0.15  # of the peak; low enough to keep an uneven ring in one piece

@@ -6,9 +6,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..problems import FitError
+from ..problems import FitError, a_picture
 from ..result import Array
-from ..validation import a_picture
 
 COST = ("gaussian", "disc", "ring", "softm", "radial")
 """Families by growing number of parameters."""

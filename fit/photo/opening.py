@@ -99,13 +99,6 @@ def _harmonic(round_fit: Solution) -> tuple[int, float, float]:
     return max(candidates, key=lambda candidate: candidate[1])
 
 
-def turned(opening: Aperture) -> Aperture:
-    """The opening rotated by half a turn, as seen on the other side of the focus plane."""
-    if opening.mask is not None:
-        return replace(opening, mask=opening.mask.flip(0, 1))
-    return replace(opening, rotation_deg=float(opening.rotation_deg) + 180.0)
-
-
 def _deconvolved(shape: Solution) -> tuple[Array, float]:
     """The kernel `[k, k]` of a pair of pictures by deconvolution, with the moves and the reach of a solution.
 

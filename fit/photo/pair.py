@@ -10,9 +10,8 @@ from threadpoolctl import threadpool_limits
 from torchdof.optics.aperture import Aperture
 from torchdof.validation import choice, number, show, whole
 
-from ..problems import FitError, warn
+from ..problems import FitError, a_picture, checked, warn
 from ..result import Array, BlurFit
-from ..validation import a_picture, checked
 from .checks import EXPLAINED, FAR_ABOVE, check_fit, check_focus, check_levels, check_linearity
 from .diagnostics import bic_of, describe
 from .dot import check_blacks, find_dot, fine_share_inside, used_pixels

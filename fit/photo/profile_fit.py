@@ -9,10 +9,9 @@ from scipy.optimize import approx_fprime
 from torchdof.optics.psf import LENGTHS, profile
 from torchdof.validation import choice, show
 
-from ..problems import FitError, warn
+from ..problems import FitError, a_picture, checked, real_numbers, warn
 from ..result import Array, BlurFit, Indices
 from ..solve import best_of, inverse
-from ..validation import a_picture, checked, real_numbers
 from .dot import find_dot
 
 _NAMES = {"gaussian": ("N", "sigma"), "ring": ("N", "r_c", "sigma"), "softm": ("N", "radius", "sigma", "b", "m")}

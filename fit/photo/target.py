@@ -16,9 +16,8 @@ from scipy import ndimage
 from torchdof.io.atomic import atomic_file
 from torchdof.validation import choice
 
-from ..problems import FitError
+from ..problems import FitError, checked
 from ..result import Array, Mask
-from ..validation import checked
 
 Paper = Literal["a4", "letter"]
 
