@@ -3,7 +3,7 @@
 import math
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -23,14 +23,32 @@ MANIFEST = "capture.toml"
 _FAR_M = 100.0  # m; a dot on paper is not seen from farther, so larger distances are likely in millimetres
 Colours = Literal["mean", "each"]
 
-_CHOICES: Mapping[str, tuple[str, ...]] = {
-    "transfer": ("linear", "srgb"),
-    "dots": get_args(Dots),
-    "colours": get_args(Colours),
-    "bayer": PATTERNS,
+
+def _number(name: str, value: Any) -> float:
+    return number(name, value, *RANGES[name])
+
+
+def _text(name: str, value: Any) -> None:
+    if not isinstance(value, str) or not value or "\0" in value:
+        raise ValueError(f"{name} must be a text, got {show(value)}")
+
+
+def _crop(name: str, value: Any) -> None:
+    numbers = value if isinstance(value, list) and len(value) == 4 else [-1]
+    if not all(type(v) is int and 0 <= v < 2**31 for v in numbers) or not all(numbers[2:]):
+        raise ValueError(f"{name} must be [left, top, width, height] in pixels, got {show(value)}")
+
+
+_FIELDS: Mapping[str, Callable[..., Any]] = {
+    **dict.fromkeys(("focus_m", "exposure_s", "full_width_px", *CAMERA), _number),
+    **dict.fromkeys(("sharp", "dark", "name"), _text),
+    "crop": _crop,
+    "transfer": partial(choice, choices=("linear", "srgb")),
+    "dots": partial(choice, choices=get_args(Dots)),
+    "colours": partial(choice, choices=get_args(Colours)),
+    "bayer": partial(choice, choices=PATTERNS),
 }
-_FIELDS = (*("shot", "crop", "focus_m", "exposure_s", "full_width_px", *CAMERA, "sharp", "dark", "name"), *_CHOICES)
-_SHOT_FIELDS = ("file", "distance_m", "exposure_s")
+_SHOT_FIELDS: Mapping[str, Callable[..., Any]] = {"file": _text, "distance_m": _number, "exposure_s": _number}
 _REQUIRED = ("focus_m", "sharp", "file", "distance_m")
 
 
@@ -85,10 +103,18 @@ def read_captures(
     invalid = partial(FitError, kind="manifest", file=manifest_name)
     if root is not None:
         inside(path, root, manifest_name)
-    fields, shots = _manifest(path)
+    if not path.is_file():
+        raise invalid("there is no such manifest; write a capture.toml beside the pictures")
+    try:
+        fields = {"dots": "one"} | tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise invalid(f"is not TOML: {error}") from error
+    shots = fields.pop("shot", None)
+    if not isinstance(shots, list) or not shots or not all(isinstance(shot, dict) for shot in shots):
+        raise invalid("give at least one [[shot]] with file and distance_m")
     fields |= {name: value for name, value in (("dots", dots), ("colours", colours)) if value}
-    manifest = {name: _field({"dots": "one"} | fields, name, manifest_name) for name in _FIELDS[1:]}
-    shots = [{name: _field(shot, name, manifest_name) for name in _SHOT_FIELDS} for shot in shots]
+    manifest = _valid(fields, _FIELDS, manifest_name)
+    shots = [_valid(shot, _SHOT_FIELDS, manifest_name) for shot in shots]
     focus, files = manifest["focus_m"], [shot["file"] for shot in shots]
     check_distances([shot["distance_m"] for shot in shots], focus, manifest_name)
     nearest = min(focus, shots[0]["distance_m"])
@@ -146,43 +172,19 @@ def inside(file: Path, root: str | os.PathLike[str], where: str) -> None:
         raise FitError(f"{str(file)!r} lies outside of {root} (--root)", "manifest", file=where)
 
 
-def _manifest(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The fields of a manifest and those of its shots, with known names only."""
-    invalid = partial(FitError, kind="manifest", file=str(path))
-    if not path.is_file():
-        raise invalid("there is no such manifest; write a capture.toml beside the pictures")
+def _valid(fields: Mapping[str, Any], checks: Mapping[str, Callable[..., Any]], where: str) -> dict[str, Any]:
+    """The fields of a part of the manifest, each checked; None for those that are missing and optional."""
+    valid = dict[str, Any]()
     try:
-        fields = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise invalid(f"is not TOML: {error}") from error
-    shots = fields.get("shot")
-    if not isinstance(shots, list) or not shots or not all(isinstance(s, dict) for s in shots):
-        raise invalid("give at least one [[shot]] with file and distance_m")
-    for table, names in ((fields, _FIELDS), *((shot, _SHOT_FIELDS) for shot in shots)):
-        if unknown := [name for name in table if name not in names]:
-            raise invalid(f"{unknown[0]!r} is not a field; known are {', '.join(names)}")
-    return fields, shots
-
-
-def _field(fields: Mapping[str, Any], name: str, where: str) -> Any:
-    """A valid field of the manifest, or None if it is missing and optional."""
-    value = fields.get(name)
-    if value is None and name not in _REQUIRED:
-        return None
-    try:
-        if name in RANGES:
-            return number(name, value, *RANGES[name])
-        if name in _CHOICES:
-            choice(name, value, _CHOICES[name])
-        elif name == "crop":
-            numbers = value if isinstance(value, list) and len(value) == 4 else [-1]
-            if not all(type(v) is int and 0 <= v < 2**31 for v in numbers) or not all(numbers[2:]):
-                raise ValueError(f"crop must be [left, top, width, height] in pixels, got {show(value)}")
-        elif not isinstance(value, str) or not value or "\0" in value:
-            raise ValueError(f"{name} must be a text, got {show(value)}")
+        if unknown := [name for name in fields if name not in checks]:
+            raise ValueError(f"{unknown[0]!r} is not a field; known are {', '.join(checks)}")
+        for name, check in checks.items():
+            value = valid[name] = fields.get(name)
+            if value is not None or name in _REQUIRED:
+                valid[name] = check(name, value) or value
     except ValueError as error:
         raise FitError(str(error), "manifest", file=where) from None
-    return value
+    return valid
 
 
 def _check_alike(first: CameraPicture, second: CameraPicture, where: str) -> None:

@@ -124,7 +124,7 @@ WRONG = [
     (FOCUS, "focus_m = ", "manifest", "is not TOML"),
     (FOCUS, f"{FOCUS}\nf_number = 1e-30", "manifest", "f_number must be a number > "),
     (FOCUS, f"{FOCUS}\nexposure_s = 1e99", "manifest", "exposure_s must be a number > "),
-    (FOCUS, f"{FOCUS}\nfocal = 50", "manifest", "'focal' is not a field; known are shot, crop, focus_m"),
+    (FOCUS, f"{FOCUS}\nfocal = 50", "manifest", "'focal' is not a field; known are focus_m, exposure_s"),
     ('transfer = "srgb"', 'transfer = "gamma"', "manifest", "transfer must be one of linear, srgb, got 'gamma'"),
     (FOCUS, f'{FOCUS}\ndots = "two"', "manifest", "dots must be one of one, centre, each, field, got 'two'"),
     (FOCUS, f'{FOCUS}\nbayer = "RGBG"', "manifest", "bayer must be one of RGGB, BGGR"),
