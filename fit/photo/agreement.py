@@ -43,13 +43,13 @@ def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> N
         f"at {captures.distances_m[worst]:g} m the blur has a radius of {measured[worst]:.3g} px, but "
         f"{'the other distances' if camera_px is None else 'the camera numbers'} give {expected[worst]:.3g} px; {cause}"
     )
-    file, factor = captures.pairs[worst].files[1], float(measured[worst] / expected[worst])
+    file = captures.pairs[worst].files[1]
     if misfit_log <= _REFUSE_LOG:
-        warn(text, "camera", file=file, number=factor)
+        warn(text, "camera", file)
         return
     if camera_px is not None:
         text += ". Leave out focal_length_mm, f_number and sensor_width_mm to have the scale measured instead"
-    raise FitError(text, "camera", file=file, number=factor)
+    raise FitError(text, "camera", file)
 
 
 def _causes(captures: Captures, expected: Array, measured: Array, is_large: Mask) -> Iterator[tuple[float, str]]:
@@ -156,12 +156,12 @@ def check_reach(
     if factors["coc"] > 1.0001:
         largest = "the other side of focus" if math.isinf(factors["coc"]) else f"{factors['coc']:.2g} times the largest"
         text = f"the scene's blur is {largest} that was measured; beyond it kernels are scaled as a thin lens would"
-        warn(text, "outside measured", number=factors["coc"])
+        warn(text, "outside measured")
     for name, limit in (("f_number", 1.05), ("focus_m", 1.25)):
         measured_at, used_at = table.provenance.get(name), float(getattr(camera, name))
         if isinstance(measured_at, int | float) and 0 < measured_at < math.inf and math.isfinite(used_at):
             factors[name] = used_at / measured_at
         if max(factors[name], 1 / factors[name]) > limit:
             text = f"the table was measured at {name} {measured_at:g} and is used at {used_at:g}"
-            warn(f"{text}; the shape of the blur differs", "outside measured", number=factors[name])
+            warn(f"{text}; the shape of the blur differs", "outside measured")
     return factors

@@ -1,6 +1,5 @@
 """Reads a folder of photographs of a dot, described by its `capture.toml`, and cuts windows around the dot."""
 
-import math
 import os
 import sys
 from collections.abc import Callable, Mapping
@@ -11,8 +10,7 @@ from typing import Any, Literal, get_args
 from torchdof.validation import choice, number, show
 
 from ..problems import FitError, warn
-from .captures import CAMERA, RANGES, Captures, check_distances
-from .frame import PATTERNS, CameraPicture, Dots, cut_pairs, read_picture, size_of
+from .captures import CAMERA, PATTERNS, RANGES, Captures, Dots, check_distances, cut_pairs, read_picture
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -120,23 +118,20 @@ def read_captures(
     nearest = min(focus, shots[0]["distance_m"])
     if nearest > _FAR_M:
         text = f"all distances are at least {nearest:g} m; they are in metres: divide millimetres by 1000"
-        warn(text, "distance", file=manifest_name, number=nearest)
+        warn(text, "distance", manifest_name)
     if root is not None:
         for name in filter(None, [manifest["sharp"], *files, manifest["dark"]]):
             inside(folder_path / name, root, manifest_name)
 
-    def read(name: str, dark: CameraPicture | None) -> CameraPicture:
-        return read_picture(folder_path / name, manifest["transfer"], dark, manifest["crop"], manifest["bayer"])
-
-    dark = read(manifest["dark"], None) if manifest["dark"] else None
-    sharp_picture = read(manifest["sharp"], dark)
+    read = partial(read_picture, **{name: manifest[name] for name in ("transfer", "crop", "bayer")})
+    dark = read(folder_path / manifest["dark"]) if manifest["dark"] else None
+    sharp_picture = read(folder_path / manifest["sharp"], dark=dark)
     by_colour = manifest["colours"] == "each"
     if by_colour and (count := len(sharp_picture.colours)) != 3:
         raise invalid(f"colours = 'each' needs pictures of three colours, or bayer = 'RGGB', got {count}")
     columns, encoded = [], [sharp_picture.file.name] * sharp_picture.encoded
     for shot in shots:
-        blurred_picture = read(shot["file"], dark)
-        _check_alike(sharp_picture, blurred_picture, manifest_name)
+        blurred_picture = read(folder_path / shot["file"], dark=dark)
         encoded += [blurred_picture.file.name] * blurred_picture.encoded
         seconds = manifest["exposure_s"]
         exposure = shot["exposure_s"] / seconds if shot["exposure_s"] and seconds else None
@@ -146,7 +141,7 @@ def read_captures(
         further = f" and {len(encoded) - 1} more" if len(encoded) > 1 else ""
         text = f"the encoding of {encoded[0]}{further} is not stated; sRGB is assumed. A camera's tone curve or "
         text += "sharpening makes the kernel up to 15 % too small: develop without them and state transfer"
-        warn(text, "not linear", file=manifest_name, number=float(len(encoded)))
+        warn(text, "not linear", manifest_name)
     own_width = sharp_picture.width_px
     width = own_width if manifest["full_width_px"] is None else round(manifest["full_width_px"])
     if width < own_width:
@@ -167,9 +162,9 @@ def inside(file: Path, root: str | os.PathLike[str], where: str) -> None:
     """Raises an error if a file, after following links, lies outside a folder."""
     folder, real = os.path.realpath(root), os.path.realpath(file)
     if not os.path.isdir(folder):
-        raise FitError(f"root must be a folder, got {show(str(root))}", "manifest", file=where)
+        raise FitError(f"root must be a folder, got {show(str(root))}", "manifest", where)
     if os.path.commonpath([folder, real]) != folder:
-        raise FitError(f"{str(file)!r} lies outside of {root} (--root)", "manifest", file=where)
+        raise FitError(f"{str(file)!r} lies outside of {root} (--root)", "manifest", where)
 
 
 def _valid(fields: Mapping[str, Any], checks: Mapping[str, Callable[..., Any]], where: str) -> dict[str, Any]:
@@ -183,17 +178,5 @@ def _valid(fields: Mapping[str, Any], checks: Mapping[str, Callable[..., Any]], 
             if value is not None or name in _REQUIRED:
                 valid[name] = check(name, value) or value
     except ValueError as error:
-        raise FitError(str(error), "manifest", file=where) from None
+        raise FitError(str(error), "manifest", where) from None
     return valid
-
-
-def _check_alike(first: CameraPicture, second: CameraPicture, where: str) -> None:
-    """Raises an error for pictures of different size, or if the lens was changed between them."""
-    if first.light.shape != second.light.shape:
-        sizes = f"{second.file.name} is {size_of(second.light)}, {first.file.name} is {size_of(first.light)}"
-        raise FitError(f"{sizes}; give pictures of one size", "manifest", file=where)
-    for key, word in (("f_number", "f-number"), ("focal_length_mm", "focal length")):
-        before, after = first.facts.get(key), second.facts.get(key)
-        if before and after and abs(math.log(before / after)) > 0.02:
-            text = f"EXIF says this was taken at {word} {after:g}, and {first.file.name} at {before:g}; change neither"
-            raise FitError(text, "manifest", file=str(second.file), number=after)

@@ -153,7 +153,7 @@ def fit_captures(
         ratio = 1.0 if pair.exposure is None or not fit.gain > 0 else fit.gain / pair.exposure
         if max(ratio, 1 / ratio) > _MAX_EXPOSURE_RATIO:
             text = f"the blurred dot is {ratio:.2f} times as bright as the exposures say; did the light stay the same?"
-            warn(text, "exposure", file=pair.files[1], number=ratio)
+            warn(text, "exposure", pair.files[1])
         fits.append(_with_uncertainty(pair, captures.focus_m, fit))
         report(pair)
     radius_px = np.array([f.radius for f in fits])
@@ -167,7 +167,7 @@ def fit_captures(
         coc_px, scale = float(np.abs(defocus) @ radius_px / (defocus @ defocus)) * defocus, "measured"
     if len(pairs) == 1:
         text = f"one distance was measured ({pairs[0].distance_m:g} m); the thin lens scales it to all others"
-        warn(text, "single distance", file=pairs[0].files[1], number=pairs[0].distance_m)
+        warn(text, "single distance", pairs[0].files[1])
     params = _params(fits, family)
     provenance = {
         "source": "photographs of a dot",

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from torchdof.fit import fit_pair
-from torchdof.fit.photo.frame import demosaiced
-from torchdof.fit.photo.noise import LAGS, correlate, correlation_of, independent_share, noise_beside
+from torchdof.fit.photo.captures import demosaiced
+from torchdof.fit.photo.dot import LAGS, correlate, correlation_of, independent_share, noise_beside
 from torchdof.fit.photo.pair import prepared_pair
 
 
