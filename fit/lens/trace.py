@@ -26,10 +26,9 @@ from torchdof.optics.camera import Camera
 from torchdof.validation import number, show, whole
 
 from ..result import Array
-from .field import coc_nodes, trace_field
 from .glass import C_UM, F_UM
 from .lens import Lens
-from .spot import Focus, Reference, Spot, focus_sensor, point_spread
+from .spot import Focus, Reference, Spot, coc_nodes, focus_sensor, point_spread, trace_field
 
 # Places of the nodes
 _MIN_INTERVAL_PX = 0.01  # pixels of coc; narrower intervals are not divided

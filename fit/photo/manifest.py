@@ -62,19 +62,15 @@ def read_captures(
     ```toml
     focus_m = 0.20                # the lens stays focused here
     sharp = "0200mm.png"          # the dot at that distance
-    focal_length_mm = 50.0        # missing camera fields are read from EXIF; with all three the table's unit is known
-    f_number = 2.8
-    sensor_width_mm = 36.0
     transfer = "srgb"             # or "linear"; if missing, floats are linear, and integers sRGB with a warning
 
     [[shot]]                      # by increasing distance
     file = "0500mm.png"
     distance_m = 0.50
-
-    # optional, before the shots: full_width_px = 6000 of the whole frame, if the pictures were cropped before;
-    # crop = [left, top, width, height] in px; dark = "dark.png", with the lens cap on; exposure_s, here and in each
-    # shot; dots = "centre", "each" or "field" for a grid; colours = "each"; bayer = "RGGB" for a sensor's mosaic; name
     ```
+
+    Fields of the camera (`focal_length_mm`, `f_number`, `sensor_width_mm`) are read from EXIF if they are missing; with
+    all three the table's unit is known. The other fields, all optional, are in docs/measuring.md.
 
     Args:
         folder: folder with the manifest and the pictures, or path of the manifest.

@@ -36,7 +36,6 @@ SURF 5
     [
         ("N-BK7", "N-BK7", "utf-8"),
         ("S-BSL7", "1.5168/64.17", "utf-16"),  # not in the catalogue
-        ("___BLANK", "1.5168/64.17", "utf-8"),
     ],
 )
 def test_asphere_glass_curved_stop_and_clear_aperture_are_read(written, glass, encoding, lens_of):

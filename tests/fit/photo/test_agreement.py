@@ -26,12 +26,6 @@ def true_radius(distances=DISTANCES, focus_m=1.0):
     return 1.03 * np.abs(captures(distances, focus_m=focus_m).promised_px) + 0.2
 
 
-def test_promised_px_is_the_thin_lens_s_blur_radius():
-    there = captures([0.5, 4.0], width_px=1000, focus_m=2.0, f_number=4.0).promised_px
-    assert there[1] == pytest.approx(0.5 * (0.05 / 4) * (2 * 0.05 / 1.95) * (1 / 2 - 1 / 4) / 0.036 * 1000)
-    assert there[0] < 0
-
-
 def test_a_right_capture_gives_no_warning_and_blur_below_two_pixels_is_not_checked():
     check_agreement(captures(), true_radius())
     check_agreement(captures((0.98, 1.02)), [1.5, 1.5])
