@@ -163,9 +163,10 @@ def point_spread(
         raise ValueError(f"no ray from z = {z_m} m at field {field_mm} mm passes lens {lens.name!r}")
     hits, weight = traced.at(lens.vertices[-1] + sensor_mm)[:, passed], weight[passed] / weight[passed].sum()
     if meridional:
-        return Spot(*hits, weight, 0.0, math.pi * float(points[1, passed].max()) ** 2, True)
+        return Spot(hits[0], hits[1], weight, 0.0, math.pi * float(points[1, passed].max()) ** 2, True)
     centre = hits @ weight
-    return Spot(*(hits - centre[:, None]), weight, -float(centre[1]), float(np.prod(high - low) * passed.mean()))
+    x, y = hits - centre[:, None]
+    return Spot(x, y, weight, -float(centre[1]), float(np.prod(high - low) * passed.mean()))
 
 
 def vertex_distance_mm(lens: Lens, z_m: float, reference: Reference, sensor_mm: float) -> float:

@@ -119,15 +119,15 @@ def read_captures(
         for name in filter(None, [manifest["sharp"], *files, manifest["dark"]]):
             inside(folder_path / name, root, manifest_name)
 
-    read = partial(read_picture, **{name: manifest[name] for name in ("transfer", "crop", "bayer")})
-    dark = read(folder_path / manifest["dark"]) if manifest["dark"] else None
-    sharp_picture = read(folder_path / manifest["sharp"], dark=dark)
+    options = {name: manifest[name] for name in ("transfer", "crop", "bayer")}
+    options["dark"] = read_picture(folder_path / manifest["dark"], **options) if manifest["dark"] else None
+    sharp_picture = read_picture(folder_path / manifest["sharp"], **options)
     by_colour = manifest["colours"] == "each"
     if by_colour and (count := len(sharp_picture.colours)) != 3:
         raise invalid(f"colours = 'each' needs pictures of three colours, or bayer = 'RGGB', got {count}")
     columns, encoded = [], [sharp_picture.file.name] * sharp_picture.encoded
     for shot in shots:
-        blurred_picture = read(folder_path / shot["file"], dark=dark)
+        blurred_picture = read_picture(folder_path / shot["file"], **options)
         encoded += [blurred_picture.file.name] * blurred_picture.encoded
         seconds = manifest["exposure_s"]
         exposure = shot["exposure_s"] / seconds if shot["exposure_s"] and seconds else None

@@ -54,7 +54,6 @@ class TableFit:
         coc_px: signed circle of confusion of each pair, px of the frame.
         why: reason for the family.
         scale: source of the circles of confusion: "camera" or "measured".
-        coc_per_dioptre_px: circle of confusion over 1/focus - 1/distance [1/m], px of the frame.
         colours: fits of red, green and blue, if the captures have colours; the table then has a kernel for each, and
             `fits` are those of their mean.
     """
@@ -64,7 +63,6 @@ class TableFit:
     coc_px: tuple[float, ...]
     why: str
     scale: str
-    coc_per_dioptre_px: float
     colours: tuple[Colour, ...] = ()
 
 
@@ -110,7 +108,8 @@ def fit_captures(
         accuracy_db: accuracy for "auto", see `fit_pair`.
         progress: called with (number done, total, text) after each fit.
         command: recorded in the table's provenance.
-        scale_of: the fit of another dot in the same photographs, whose scale is used if the camera is unknown.
+        scale_of: the fit of another dot in the same photographs, whose circles of confusion are used if the camera is
+            unknown.
 
     Returns:
         The table and its fits.
@@ -162,7 +161,7 @@ def fit_captures(
     if camera_px is not None:
         coc_px, scale = camera_px, "camera"
     elif scale_of is not None:
-        coc_px, scale = scale_of.coc_per_dioptre_px * defocus, scale_of.scale
+        coc_px, scale = np.array(scale_of.coc_px), scale_of.scale
     else:
         coc_px, scale = float(np.abs(defocus) @ radius_px / (defocus @ defocus)) * defocus, "measured"
     if len(pairs) == 1:
@@ -202,7 +201,7 @@ def fit_captures(
         residual=[round(f.residual, 6) for f in fits],
         aperture=opening,
     )
-    return TableFit(table, tuple(fits), tuple(coc_px.tolist()), why, scale, float(coc_px[0] / defocus[0]), colours)
+    return TableFit(table, tuple(fits), tuple(coc_px.tolist()), why, scale, colours)
 
 
 def _params(fits: Sequence[BlurFit], family: str) -> dict[str, Array]:
@@ -264,10 +263,10 @@ def _fit_colours(captures: Captures, fits: Sequence[BlurFit]) -> tuple[Colour, .
     """
     fits_by_colour: list[list[BlurFit]] = [[] for _ in _COLOURS]
     for pair, mean in zip(captures, fits, strict=True):
-        pictures = pair.colours or ()
-        softness = min(soft_edge(sharp, find_dot(sharp, file=pair.files[0])).softness for sharp in pictures[0])
+        sharp_colours, blurred_colours = pair.colours or ((), ())
+        softness = min(soft_edge(sharp, find_dot(sharp, file=pair.files[0])).softness for sharp in sharp_colours)
         fixed: dict[str, Any] = {"magnification": mean.magnification, "fit_magnification": False, "softness": softness}
-        for colour, *windows in zip(fits_by_colour, *pictures, strict=True):
+        for colour, *windows in zip(fits_by_colour, sharp_colours, blurred_colours, strict=True):
             colour.append(_fit_like(mean, pair, captures.focus_m, *windows, **fixed))
     green = fits_by_colour[1]
     shifts = [_focus_shift(captures.defocus, colour) for colour in fits_by_colour]
