@@ -1,6 +1,5 @@
 """Chooses the kernel family: the cheapest whose picture a viewer cannot distinguish from the most likely one's."""
 
-import functools
 from collections.abc import Mapping
 
 import numpy as np
@@ -42,16 +41,10 @@ def natural_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     """
     first, second = _of_one_size(kernel, other)
     width = max(_WIDTH, len(first))
-    spectrum = np.abs(np.fft.fft2(first - second, (width, width)))
-    return _decibels(_CONTRAST**2 * float((_natural_power(width) * spectrum**2).sum()))
-
-
-@functools.lru_cache(maxsize=8)
-def _natural_power(width: int) -> Array:
-    """Power spectrum `[width, width]` of natural images; it sums to 1."""
     frequency = np.hypot(np.fft.fftfreq(width)[:, None], np.fft.fftfreq(width))
     frequency[0, 0] = np.inf
-    return np.asarray(frequency**-2 / np.sum(frequency**-2))
+    natural, difference = frequency**-2, np.abs(np.fft.fft2(first - second, (width, width))) ** 2
+    return _decibels(_CONTRAST**2 * float((natural * difference).sum() / natural.sum()))
 
 
 def highlight_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
