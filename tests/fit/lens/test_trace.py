@@ -119,6 +119,10 @@ def test_nodes_reach_from_the_nearest_distance_to_infinity():
     table = small(lens, nearest_m=1.0)
     ends = [coc_mm(z_m, lens, 8.0, 2.0) for z_m in (1.0, math.inf)]
     assert table.coc[[0, -1]].tolist() == pytest.approx(ends, rel=1e-6)
+    stopped = lens.with_f_number(8.0)
+    spots = [point_spread(stopped, z, focus_sensor(stopped, 2.0), meridional=True, rays=300) for z in (1.0, math.inf)]
+    radii = table.node_params["radius"][0, [0, -1]].tolist()
+    assert radii == pytest.approx([spot.radius for spot in spots], rel=1e-5)
     assert 0.0 in table.coc.tolist() and table.provenance["asymmetry"] == 0.0
     command = table.provenance["command"].removeprefix("torchdof.fit.")
     assert eval(command, {"trace_table": trace_table, "Lens": Lens}).to_dict() == table.to_dict()
