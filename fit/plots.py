@@ -31,16 +31,14 @@ def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
         raise FitError("this fit carries no samples to draw")
     figure, axes = _new_figure(5.4, 3.6)
     forward = fit.model == "forward"
-    size, label = (2.5, "pixels") if forward else (4, "samples")
-    axes.plot(*fit.samples, ".", color=_DATA, markersize=size, label=label)
+    axes.plot(*fit.samples, ".", color=_DATA, markersize=3, label="pixels" if forward else "samples")
     if forward:
         r, level = _model_line(fit)
         axes.plot(r, level, color=_MODEL, label="forward model", zorder=3)
         if fit.aperture is None:  # kernels that are not round have no profile
             radii = np.linspace(0, fit.samples[0].max(), 400)
-            shape = evaluate(fit.family, radii, fit.kernel_params())
-            scaled_profile = shape / shape.max() * level.max()
-            axes.plot(radii, scaled_profile, "--", color="#1d4ed8", label="kernel f(r), scaled", zorder=2)
+            profile = evaluate(fit.family, radii, fit.kernel_params())
+            axes.plot(radii, profile / profile.max() * level.max(), "--", color="#1d4ed8", label="kernel f(r), scaled")
     else:
         axes.plot(*fit.curve, color=_MODEL, label=f"fitted {fit.family}", zorder=3)
     axes.set(xlabel=f"r [{unit}]", ylabel="level above background" if forward else "blur strength", ylim=(0, None))
@@ -98,14 +96,11 @@ def sheet_of_photographs(
     rows = len(captures)
     figure, axes = _new_figure(12.5, 2.1 * rows + 2.6, 5, rows + 1)
     by_distance = {p.distance_m: p for p in photographs.pictures}
-    for i, (pair, fit, coc) in enumerate(zip(captures, result.fits, result.coc_px, strict=True)):
-        photograph_axes, window, profile, residual, kernel = axes[i]
+    for panels, pair, fit, coc in zip(axes, captures, result.fits, result.coc_px, strict=False):
+        photograph_axes, window, profile, residual, kernel = panels
         picture = by_distance[pair.distance_m]
-        step = max(1, picture.light.shape[1] // 300)
-        height, width = (n // step for n in picture.light.shape)
-        thumbnail = picture.light[: height * step, : width * step].reshape(height, step, width, step).mean((1, 3))
-        target, half = picture.target, picture.target.side_px / 2
-        _show(photograph_axes, thumbnail, f"{picture.file}, {pair.distance_m:.3f} m")
+        target, half, step = picture.target, picture.target.side_px / 2, max(1, picture.light.shape[1] // 300)
+        _show(photograph_axes, picture.light[::step, ::step], f"{picture.file}, {pair.distance_m:.3f} m")
         x, y = np.array([[-1, 1, 1, -1, -1], [-1, -1, 1, 1, -1]]) * half + [[target.x], [target.y]]
         photograph_axes.plot(x / step, y / step, color=_MODEL, linewidth=1)
         _show(window, pair.blurred, "")
@@ -115,15 +110,13 @@ def sheet_of_photographs(
         residual.plot(fit.samples[0], fit.samples[1] - fit.curve[1], ".", color=_DATA, markersize=1.5)
         residual.axhline(0, color=_MODEL, linewidth=1)
         residual.set_title(f"residual {fit.residual_over_noise:.2f} x noise", fontsize=8)
-        shape = result.table.kernels(torch.tensor([coc], dtype=torch.float64), captures.width_px)[0, 0]
-        _show(kernel, shape.detach().numpy(), f"kernel at coc {coc:+.2f} px")
+        kernels = result.table.kernels(torch.tensor([coc], dtype=torch.float64), captures.width_px)
+        _show(kernel, kernels[0, 0].detach().numpy(), f"kernel at coc {coc:+.2f} px")
     for unused in axes[rows]:
         unused.remove()
     grid = axes[rows, 0].get_gridspec()
     (sharp,) = (p for p in photographs.pictures if p.file == captures.notes["sharp"])
-    half = int(min(sharp.target.side_px / 4, 120))
-    x, y = round(sharp.target.x), round(sharp.target.y)
-    window = sharp.light[max(y - half, 0) : y + half, max(x - half, 0) : x + half]
+    window = sharp.target.window(sharp.light, int(min(sharp.target.side_px / 4, 120)))
     largest_coc, most_blurred = max(zip(result.coc_px, captures, strict=True), key=lambda node: abs(node[0]))
     scene = 0.15 + 0.1 * (np.arange(720) // 12 % 2) * np.ones((90, 1))  # small lights on stripes
     scene[44:46, 18::36] = 25.0

@@ -40,7 +40,6 @@ class BlurFit:
             None for a round kernel.
         asymmetry: share of the blur's light that depends on the angle but is not in the kernel; NaN if unknown.
         why: one sentence on the choice of the family.
-        psnr: for family="auto", the PSNR of each family on a natural image against "radial", dB.
         samples: radii and strengths [2, n] for plotting.
         curve: the fitted curve for plotting, [2, m].
     """
@@ -63,7 +62,6 @@ class BlurFit:
     radius_stderr: float = math.nan
     why: str = ""
     aperture: Aperture | None = None
-    psnr: dict[str, float] = field(default_factory=dict)
     samples: Array = field(default_factory=lambda: np.zeros((2, 0)), repr=False)
     curve: Array = field(default_factory=lambda: np.zeros((2, 0)), repr=False)
 

@@ -48,8 +48,7 @@ def best_of(
 
     rough = min((descend(start, max(tolerance, _ROUGH_TOLERANCE)) for start in starts), key=lambda fit: fit[0])
     if rough[0] == np.inf:
-        text = f"none of {len(starts)} starts converged; is this a picture of a blurred dot?"
-        raise FitError(text, "not converged", number=float(len(starts)))
+        raise FitError(f"none of {len(starts)} starts converged; is this a picture of a blurred dot?", "not converged")
     refined = descend(rough[1], tolerance)
     if refined[0] == np.inf:  # in a long narrow valley the last digits may take too many steps
         refined = descend(rough[1], max(tolerance, _ACCEPTED_TOLERANCE))

@@ -20,8 +20,6 @@ import numpy as np
 from torchdof.validation import number, show
 
 D_UM, F_UM, C_UM, G_UM = 0.58756, 0.48613, 0.65627, 0.43584
-_MAX_COEFFICIENT = 1e100  # of a coefficient; products stay finite
-_CATALOGUE = Path(__file__).parent / "glasses" / "schott.txt"
 
 
 @dataclass(frozen=True)
@@ -35,7 +33,7 @@ class Glass:
         """Raises a `ValueError` unless the coefficients are finite and the index from 1 to 5 between 0.4 and 0.7 um."""
         values = self.coefficients if isinstance(self.coefficients, tuple) else ()
         are_numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
-        if not are_numbers or len(values) not in (3, 6) or not all(abs(v) <= _MAX_COEFFICIENT for v in values):
+        if not are_numbers or len(values) not in (3, 6) or not all(abs(v) <= 1e100 for v in values):
             expected = "six finite coefficients B1 B2 B3 C1 C2 C3"
             raise ValueError(f"glass {self.name} must have {expected}, got {show(self.coefficients)}")
         for wavelength_um in (0.4, D_UM, 0.7):
@@ -86,8 +84,9 @@ class Glass:
 @functools.cache
 def catalogue() -> dict[str, Glass]:
     """The glasses of the catalogue, by upper-case name."""
-    lines = (line.partition("#")[0].split() for line in _CATALOGUE.read_text(encoding="utf-8").splitlines())
-    return {name: Glass(name, tuple(map(float, numbers))) for name, *numbers in filter(None, lines)}
+    text = (Path(__file__).parent / "glasses" / "schott.txt").read_text(encoding="utf-8")
+    lines = filter(None, (line.partition("#")[0].split() for line in text.splitlines()))
+    return {name: Glass(name, tuple(map(float, numbers))) for name, *numbers in lines}
 
 
 AIR = Glass("1", (1.0, 0.0, 0.0))

@@ -16,7 +16,7 @@ import numpy as np
 from torchdof.validation import number, show, whole
 
 from ..result import Array, Mask
-from . import prescription, zmx
+from . import prescription
 from .glass import C_UM, D_UM, F_UM
 from .surface import Surface
 
@@ -60,9 +60,6 @@ class Rays(NamedTuple):
 class Lens:
     """Surfaces on one axis, one of them the aperture stop, in air.
 
-    Reference:
-        Kolb, Mitchell, Hanrahan, "A realistic camera model for computer graphics", SIGGRAPH 1995, section 3.1.
-
     Example:
         >>> lens = Lens.read("double_gauss_50mm")
         >>> round(lens.paraxial().focal_length, 4), round(lens.paraxial().back_focal, 4)
@@ -101,7 +98,7 @@ class Lens:
             shipped = ", ".join(sorted(p.stem for p in _SHIPPED.glob("*.txt")))
             raise FileNotFoundError(f"no lens {str(source)!r}: neither a file nor one of the shipped ({shipped})")
         try:
-            parse = zmx.parse if path.suffix.lower() == ".zmx" else prescription.parse
+            parse = prescription.parse_zemax if path.suffix.lower() == ".zmx" else prescription.parse
             surfaces, stop, comment = parse(path.read_bytes())
             return cls(surfaces, stop, path.stem, comment)
         except ValueError as error:
@@ -114,8 +111,8 @@ class Lens:
 
     def indices(self, wavelength_um: float | None = None) -> Array:
         """Refractive indices before the first surface (air) and behind each surface ``[S + 1]``; None is the d line."""
-        wavelength_um = D_UM if wavelength_um is None else wavelength_um
-        return np.array([1.0, *(surface.glass.index(wavelength_um) for surface in self.surfaces)])
+        line_um = D_UM if wavelength_um is None else wavelength_um
+        return np.array([1.0, *(surface.glass.index(line_um) for surface in self.surfaces)])
 
     def paraxial(self) -> Paraxial:
         """First-order properties, by ray transfer matrices; a `ValueError` if the lens does not converge light."""
@@ -155,7 +152,12 @@ class Lens:
     def scaled(self, focal_length_mm: float) -> Lens:
         """The lens scaled to another focal length; its f-number is unchanged."""
         factor = number("focal_length_mm", focal_length_mm, 0, 1e9) / self.paraxial().focal_length
-        return replace(self, surfaces=tuple(surface.scaled(factor) for surface in self.surfaces))
+        surfaces = []
+        for surface in self.surfaces:
+            lengths = {name: getattr(surface, name) * factor for name in ("radius", "thickness", "diameter")}
+            polynomial = tuple(a / factor ** (2 * i + 1) for i, a in enumerate(surface.polynomial))
+            surfaces.append(replace(surface, **lengths, polynomial=polynomial))
+        return replace(self, surfaces=tuple(surfaces))
 
     def lines(self) -> list[str]:
         """The surfaces as lines of a prescription file."""
@@ -169,12 +171,8 @@ def trace_rays(lens: Lens, position: Array, direction: Array, wavelength_um: flo
     with a positive z; no wavelength means the d line.
 
     Reference:
-        Kolb, Mitchell, Hanrahan 1995, section 3.1 (the loop over surfaces), Snell's law in vector form.
+        Kolb, Mitchell, Hanrahan, "A realistic camera model for computer graphics", SIGGRAPH 1995, section 3.1.
     """
-    position, direction = (np.asarray(v, dtype=np.float64) for v in (position, direction))
-    if position.ndim != 2 or position.shape[0] != 3 or direction.shape != position.shape:
-        shapes = f"{list(position.shape)} and {list(direction.shape)}"
-        raise ValueError(f"position and direction must both be [3, R], got {shapes}")
     if (count := position.shape[1]) > _RAYS_AT_ONCE:
         chunks = (slice(start, start + _RAYS_AT_ONCE) for start in range(0, count, _RAYS_AT_ONCE))
         parts = [trace_rays(lens, position[:, chunk], direction[:, chunk], wavelength_um) for chunk in chunks]

@@ -10,7 +10,7 @@ with the curvature c = 1 / radius and the conic constant k: 0 is a sphere, -1 a 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from numbers import Real
 
 import numpy as np
@@ -43,18 +43,12 @@ class Surface:
         _check("diameter", self.diameter, _MIN_MM, _MAX_MM)
         _check("thickness", self.thickness, 0.0, _MAX_MM)
         _check("radius", self.radius, -math.inf, math.inf)
-        if not (_MIN_MM <= abs(self.radius) <= _MAX_MM or abs(self.radius) == math.inf):
+        if not (_MIN_MM <= abs(self.radius) <= _MAX_MM or math.isinf(self.radius)):
             raise ValueError(f"radius must be inf, or {_MIN_MM:g} to {_MAX_MM:g} mm long, got {self.radius}")
         _check("conic constant", self.conic, -_MAX_CONIC, _MAX_CONIC)
         for i, coefficient in enumerate(self.polynomial):
             limit = _MAX_DEPTH_MM / (self.diameter / 2.0) ** (2 * i + 2)  # limits the depth of the surface's rim
             _check(f"A{2 * i + 2}", coefficient, -limit, limit)
-
-    def scaled(self, factor: float) -> Surface:
-        """The surface with all lengths multiplied by a factor."""
-        lengths = {name: getattr(self, name) * factor for name in ("radius", "thickness", "diameter")}
-        polynomial = tuple(a / factor ** (2 * i + 1) for i, a in enumerate(self.polynomial))
-        return replace(self, **lengths, polynomial=polynomial)
 
     def sag(self, square: Array) -> tuple[Array, Array]:
         """Height z above the vertex's plane at r^2, and its derivative by r^2; NaN beyond the conic's rim."""

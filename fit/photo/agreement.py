@@ -14,9 +14,8 @@ from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.camera import Camera
 from torchdof.validation import number, show
 
-from ..problems import FitError, warn
+from ..problems import FitError, checked, warn
 from ..result import Array, Mask
-from ..validation import checked
 from .captures import CAMERA, Captures
 
 _MIN_BLUR_PX = 2.0  # radius of a blur that counts; smaller ones are dominated by aberrations
@@ -38,23 +37,31 @@ def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> N
         return
     readings = sorted(_causes(captures, expected, measured, is_large))
     likely = [text for misfit, text in readings if misfit < min(_EXPLAINED_LOG, 0.5 * misfit_log)]
-    worst = int(np.argmax(np.where(is_large, np.abs(np.log(measured / expected)), 0.0)))
-    source = "the other distances" if camera_px is None else "the camera's numbers"
     cause = "likely " + "; or ".join(likely[:2]) if likely else "no single number explains it: check them all"
-    text = f"at {captures.distances_m[worst]:g} m the blur has a radius of {measured[worst]:.3g} px, but {source} give "
-    text += f"{expected[worst]:.3g} px; {cause}"
-    file, factor = captures.pairs[worst].files[1], float(measured[worst] / expected[worst])
-    if misfit_log > _REFUSE_LOG:
-        if camera_px is not None:
-            text += ". Leave out focal_length_mm, f_number and sensor_width_mm to have the scale measured instead"
-        raise FitError(text, "camera", file=file, number=factor)
-    warn(text, "camera", file=file, number=factor)
+    worst = int(np.argmax(np.where(is_large, np.abs(np.log(measured / expected)), 0.0)))
+    text = (
+        f"at {captures.distances_m[worst]:g} m the blur has a radius of {measured[worst]:.3g} px, but "
+        f"{'the other distances' if camera_px is None else 'the camera numbers'} give {expected[worst]:.3g} px; {cause}"
+    )
+    file = captures.pairs[worst].files[1]
+    if misfit_log <= _REFUSE_LOG:
+        warn(text, "camera", file)
+        return
+    if camera_px is not None:
+        text += ". Leave out focal_length_mm, f_number and sensor_width_mm to have the scale measured instead"
+    raise FitError(text, "camera", file)
 
 
 def _causes(captures: Captures, expected: Array, measured: Array, is_large: Mask) -> Iterator[tuple[float, str]]:
     """Possible single mistakes: the misfit that remains if each is corrected, and its description."""
     distance, defocus = captures.distances_m, captures.defocus
     per_dioptre = float(np.median(expected / np.abs(defocus)))
+
+    def place(defocus: float) -> str:
+        """The distance with this defocus [1/m], as text; empty if no distance has it."""
+        vergence = 1 / captures.focus_m - defocus
+        return f"{1 / vergence:.3g} m" if vergence > 0 else ""
+
     if captures.promised_px is not None:
         factor = _common_factor(expected, measured)  # of all blurs
         focal, stops, sensor = (float(getattr(captures, name)) for name in CAMERA)
@@ -72,25 +79,19 @@ def _causes(captures: Captures, expected: Array, measured: Array, is_large: Mask
     for i, k in combinations(range(len(distance)), 2):
         exchanged = expected.copy()
         exchanged[[i, k]] = expected[[k, i]]
-        what = f"the pictures at {distance[i]:g} and {distance[k]:g} m are exchanged"
-        yield _misfit(exchanged, measured, is_large), what
+        text = f"the pictures at {distance[i]:g} and {distance[k]:g} m are exchanged"
+        yield _misfit(exchanged, measured, is_large), text
     if is_large.sum() < 3:
         return
     for i in np.flatnonzero(is_large).tolist():
-        stands = _distance_at(captures, math.copysign(measured[i] / per_dioptre, defocus[i])) or "beyond infinity"
+        stands = place(math.copysign(measured[i] / per_dioptre, defocus[i])) or "beyond infinity"
         text = f"the distance of {distance[i]:g} m is misread: by its blur it stands at {stands}"
         yield _misfit(expected, measured, is_large & (np.arange(len(distance)) != i)), text
     if (defocus[is_large] > 0).any() and (defocus[is_large] < 0).any():
         shifts = np.linspace(-1, 1, 401) * float(np.abs(defocus).max())
         misfit, shift = min((_misfit(per_dioptre * np.abs(defocus - m), measured, is_large), m) for m in shifts)
-        if stands := _distance_at(captures, shift):
+        if stands := place(shift):
             yield misfit, f"the lens was focused at {stands}, not at {captures.focus_m:g} m"
-
-
-def _distance_at(captures: Captures, defocus: float) -> str:
-    """The distance with this defocus [1/m], as text; empty if no distance has it."""
-    vergence = 1 / captures.focus_m - defocus
-    return f"{1 / vergence:.3g} m" if vergence > 0 else ""
 
 
 def _common_factor(expected: Array, measured: Array) -> float:
@@ -143,26 +144,24 @@ def check_reach(
     if any(isinstance(getattr(camera, name), torch.Tensor) for name in Camera.__dataclass_fields__):
         raise FitError("camera must hold plain numbers, got tensors; check one item of a batch at a time")
     checked(number, "width_px", width_px, 0, unit="pixels")
-    are_numbers = all(isinstance(z, int | float) and not isinstance(z, bool) for z in (near_m, far_m))
-    if not are_numbers or not 0 < near_m <= far_m or near_m > 1e300:
-        raise FitError(f"depths must be 0 < near_m <= far_m, got {show(near_m)} and {show(far_m)}")
+    near, far = checked(number, "near_m", near_m, 0, 1e300), checked(number, "far_m", far_m, 0, infinite=True)
+    if near > far:
+        raise FitError(f"depths must be near_m <= far_m, got {near_m} and {far_m}")
     factors = {"coc": 0.0, "f_number": 1.0, "focus_m": 1.0}
     if table.unit != "relative":
-        ends = [float(near_m), math.inf if far_m > 1e300 else float(far_m)]
-        depth = torch.tensor(ends, dtype=torch.float64)[None, None, None]
+        depth = torch.tensor([near, far], dtype=torch.float64)[None, None, None]
         for coc in (camera.coc_px(depth, width=width_px) / table.px_per_unit(width_px)).flatten().tolist():
             measured = max((abs(c) for c in table.coc.tolist() if c * coc > 0), default=0.0)
             factors["coc"] = max(factors["coc"], abs(coc) / measured if measured else math.inf if coc else 0.0)
     if factors["coc"] > 1.0001:
         largest = "the other side of focus" if math.isinf(factors["coc"]) else f"{factors['coc']:.2g} times the largest"
         text = f"the scene's blur is {largest} that was measured; beyond it kernels are scaled as a thin lens would"
-        warn(text, "outside measured", number=factors["coc"])
+        warn(text, "outside measured")
     for name, limit in (("f_number", 1.05), ("focus_m", 1.25)):
         measured_at, used_at = table.provenance.get(name), float(getattr(camera, name))
-        if not isinstance(measured_at, int | float) or not 0 < measured_at < math.inf or math.isinf(used_at):
-            continue
-        factors[name] = used_at / measured_at
+        if isinstance(measured_at, int | float) and 0 < measured_at < math.inf and math.isfinite(used_at):
+            factors[name] = used_at / measured_at
         if max(factors[name], 1 / factors[name]) > limit:
             text = f"the table was measured at {name} {measured_at:g} and is used at {used_at:g}"
-            warn(f"{text}; the shape of the blur differs", "outside measured", number=factors[name])
+            warn(f"{text}; the shape of the blur differs", "outside measured")
     return factors

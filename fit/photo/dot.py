@@ -1,15 +1,21 @@
-"""The dot in a picture: position, size, background, noise, and clipped pixels."""
+"""The dot in a picture: position, size, background, clipped pixels; and the noise, which neighbouring pixels share.
+
+Demosaicing and JPEG make the noise of neighbouring pixels similar.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 from scipy.ndimage import uniform_filter
+from scipy.signal import correlate as correlated
+from scipy.signal import fftconvolve
 
-from ..problems import FitError, warn
+from ..problems import FitError, a_picture, warn
 from ..result import Array, Mask
-from ..validation import a_picture
-from .noise import fine_variance, near_border, noise_of
+
+LAGS = 6
+"""Largest distance in pixels of correlated noise; demosaicing reaches 2, a JPEG's blocks 7."""
 
 _THRESHOLD = 0.15  # of the peak; low enough to keep an uneven ring in one piece
 _MIN_SIDE_PX = 9
@@ -17,6 +23,9 @@ _MIN_LIGHT = 0.08  # share of the brightest dot's light above which another spot
 _MAX_CLIPPED = 0.6  # share of clipped pixels of the dot above which it cannot be fitted
 _CUT_BLACKS = 0.1  # share of the paper on its lowest level above which blacks are cut
 _NOISE_ASYMMETRY = 1.5  # noise above the mean over noise below it; 1.9 if a tenth of it is cut off
+_MIN_PIXELS = 300  # pixels below which a correlation is not estimated
+_MIN_SIGMAS = 4.0  # standard errors above which a correlation is significant
+_MIN_FINE_SHARE = 1e-4  # smallest share of fine noise
 
 
 @dataclass(frozen=True)
@@ -42,9 +51,9 @@ def find_dot(picture: Array, *, file: str | None = None) -> Dot:
     """Finds the only dot in a picture `[H, W]` in linear light; an error of kind "several dots" if there are more."""
     dots = find_dots(picture, file=file)
     if len(dots) > 1:
-        positions = ", ".join(f"({d.x:.0f}, {d.y:.0f})" for d in dots[:6])
-        text = f"{len(dots)} dots where one was expected, at {positions}; cover the others, or state crop or dots"
-        raise FitError(text, "several dots", file=file, number=float(len(dots)))
+        places = ", ".join(f"({d.x:.0f}, {d.y:.0f})" for d in dots[:6])
+        text = f"{len(dots)} dots where one was expected, at {places}; cover the others, or state crop or dots"
+        raise FitError(text, "several dots", file)
     return dots[0]
 
 
@@ -52,7 +61,7 @@ def find_dots(picture: Array, *, file: str | None = None, smallest: float = _MIN
     """Finds dots in a picture `[H, W]` in linear light, brightest first, down to a share `smallest` of its light."""
     height, width = a_picture("a picture of a dot", picture, _MIN_SIDE_PX, file).shape
     noise = noise_of(picture)
-    levels = picture[near_border(picture.shape, max(1, min(height, width) // 20))]
+    levels = picture[_near_border(picture.shape, max(1, min(height, width) // 20))]
     # a mean without outliers: the median is biased if blacks are cut off at 0, which removes half of the noise
     background = float(np.median(levels))
     if noise > 0 and (is_usual := np.abs(levels - background) <= 5 * noise).any():
@@ -64,19 +73,18 @@ def find_dots(picture: Array, *, file: str | None = None, smallest: float = _MIN
     if not peak > max(8 * smoothed_noise, 1e-9 * max(float(np.abs(picture).max()), 1e-300)):
         ratio = peak / smoothed_noise if smoothed_noise > 0 else 0.0
         text = f"no dot found: the brightest spot is {ratio:.1f} times the noise, 8 are needed; a white dot on black?"
-        raise FitError(text, "no dot", file=file, number=ratio)
+        raise FitError(text, "no dot", file)
     labels, count = ndimage.label(smooth > max(_THRESHOLD * peak, 5 * smoothed_noise), structure=np.ones((3, 3)))
     light = np.asarray(ndimage.sum_labels(smooth, labels, np.arange(1, count + 1)))
     boxes = ndimage.find_objects(labels)
-    dots = []
-    for rank, i in enumerate(map(int, np.argsort(light)[::-1])):
+    dots: list[Dot] = []
+    for i in map(int, np.argsort(light)[::-1]):
         if light[i] < smallest * light.max():
             break
         rows, columns = boxes[i]
         if rows.start == 0 or columns.start == 0 or rows.stop == height or columns.stop == width:
-            if rank == 0:
-                text = "the dot touches the picture's edge; leave dark paper around the whole blur"
-                raise FitError(text, "window", file=file, number=1.0)
+            if light[i] == light.max():
+                raise FitError("the dot touches the picture's edge; leave dark paper around the blur", "window", file)
             continue
         y, x = ndimage.center_of_mass(smooth, labels, i + 1)
         # measure in a crop, which is much faster in a large frame
@@ -140,11 +148,11 @@ def used_pixels(picture: Array, dot: Dot, white: float | None, file: str | None,
     bright = picture > dot.background + 0.15 * dot.peak
     share = float(np.sum(clipped & bright)) / max(int(bright.sum()), 1)
     if refuse and share > _MAX_CLIPPED:
-        text = f"{100 * share:.0f} % of the blurred dot's pixels are clipped at {level:.4g}; expose less: at least "
-        raise FitError(f"{text}{100 - 100 * _MAX_CLIPPED:.0f} % must be below", "saturated", file=file, number=share)
+        text = f"{100 * share:.0f} % of the blurred dot's pixels are clipped at {level:.4g}; at least "
+        raise FitError(f"{text}{100 - 100 * _MAX_CLIPPED:.0f} % must be below: expose less", "saturated", file)
     if refuse:
         text = f"{count} pixels of the blurred picture are clipped at {level:.4g} and were left out; expose less"
-        warn(text, "saturated", file=file, number=float(count))
+        warn(text, "saturated", file)
     return ~clipped
 
 
@@ -167,9 +175,93 @@ def check_blacks(picture: Array, dot: Dot, file: str | None) -> None:
         return
     mean = float(paper.mean())
     within_a_level = not dot.noise > max(0.6 * (levels[1] - levels[0]), 1e-6 * dot.peak)
-    if within_a_level or float(np.quantile(paper, 0.995)) - mean < _NOISE_ASYMMETRY * (mean - levels[0]):
-        return
-    share = float(counts[0] / paper.size)
-    text = f"{100 * share:.0f} % of the paper lies on its lowest level, {levels[0]:.3g}: blacks are cut off there, and"
-    text += " the kernel is up to 1 % too small; develop so that black lies above its noise"
-    warn(text, "saturated", file=file, number=share)
+    if not within_a_level and np.quantile(paper, 0.995) - mean >= _NOISE_ASYMMETRY * (mean - levels[0]):
+        share = f"{100 * float(counts[0] / paper.size):.0f} % of the paper lies on its lowest level, {levels[0]:.3g}"
+        text = f"{share}: cut blacks make the kernel up to 1 % too small; develop so that black lies above its noise"
+        warn(text, "saturated", file)
+
+
+def noise_of(picture: Array) -> float:
+    """Standard deviation of a pixel's noise, from second differences, which vanish in a smooth picture."""
+    differences = _mixed_differences(picture)
+    # near the border, away from the dot's edges
+    magnitudes = np.abs(differences[_near_border(differences.shape, max(3, min(picture.shape) // 5))])
+    # pixels of a mosaic differ in noise, so use the mean square, without outliers. If most pixels are interpolated (one
+    # colour of a mosaic), the others carry the noise
+    typical = 1.4826 * float(np.median(magnitudes))
+    typical = typical if typical > 1e-9 * float(np.abs(picture).max()) else float(np.percentile(magnitudes, 90))
+    return float(np.sqrt(np.mean(magnitudes[magnitudes <= 5 * typical] ** 2)))
+
+
+def _near_border(shape: tuple[int, ...], width: int) -> Mask:
+    """Pixels `[H, W]` of a frame of this width along a picture's border."""
+    frame = np.ones(shape, dtype=bool)
+    frame[width:-width, width:-width] = False
+    return frame
+
+
+def fine_variance(picture: Array, pixels: Mask) -> float:
+    """Variance of the noise of some pixels `[H, W]`, by second differences; NaN without pixels."""
+    inside = pixels[1:-1, 1:-1]
+    return float(np.mean(_mixed_differences(picture)[inside] ** 2)) if inside.any() else np.nan
+
+
+def _mixed_differences(picture: Array) -> Array:
+    """Second differences in both directions `[H - 2, W - 2]`, scaled to the size of independent noise."""
+    return np.diff(np.diff(picture, 2, axis=1), 2, axis=0) / 6.0
+
+
+def correlation_of(values: Array, is_used: Mask) -> Array:
+    """Correlation of the noise (mean 0) of a picture's used pixels `[2 LAGS + 1, 2 LAGS + 1]`; its centre is 1.
+
+    It is 0 at lags without significant correlation, and its spectrum is non-negative.
+    """
+    size = 2 * LAGS + 1
+    white = np.zeros((size, size))
+    white[LAGS, LAGS] = 1.0
+    power = float(np.mean(values[is_used] ** 2)) if is_used.any() else 0.0
+    if is_used.sum() < _MIN_PIXELS or power <= 0:
+        return white
+    # clip outliers (dust, an edge that is not fitted well) at five standard deviations
+    clipped = np.where(is_used, np.clip(values, -5 * np.sqrt(power), 5 * np.sqrt(power)), 0.0)
+    lags = tuple(slice(n - 1 - LAGS, n + LAGS) for n in values.shape)
+    sums, pairs = (correlated(p, p, method="fft")[lags] for p in (clipped, is_used.astype(np.float64)))
+    pairs = np.maximum(np.round(pairs), 1.0)
+    correlation = sums / pairs
+    correlation = correlation / max(float(correlation[LAGS, LAGS]), np.finfo(float).tiny)
+    # correlation makes the estimates at other lags less certain
+    significant = np.where(np.abs(correlation) > _MIN_SIGMAS / np.sqrt(pairs), correlation, 0.0)
+    threshold = _MIN_SIGMAS * np.sqrt(np.sum(significant**2) / pairs)
+    padded = np.pad(np.where(np.abs(correlation) > threshold, correlation, 0.0), 2 * size)
+    spectrum = np.maximum(np.fft.rfft2(np.fft.ifftshift(padded)).real, 0.0)
+    correlation = np.fft.fftshift(np.fft.irfft2(spectrum, padded.shape))[2 * size : 3 * size, 2 * size : 3 * size]
+    if not correlation[LAGS, LAGS] > 0:
+        return white
+    correlation = correlation / correlation[LAGS, LAGS]
+    return np.asarray(np.where(np.abs(correlation) > 1e-9, correlation, 0.0))  # removes the transform's rounding
+
+
+def correlate(pictures: Array, correlation: Array) -> Array:
+    """Convolves pictures `[n, H, W]` with a correlation, that is, multiplies them by the correlation matrix."""
+    if np.count_nonzero(correlation) == 1:
+        return pictures
+    reach = int(np.abs(np.argwhere(correlation) - LAGS).max())
+    middle = slice(LAGS - reach, LAGS + reach + 1)
+    return np.asarray(fftconvolve(pictures, correlation[None, middle, middle], mode="same", axes=(1, 2)))
+
+
+def independent_share(correlation: Array) -> float:
+    """Number of independent pixels for each pixel, at most 1."""
+    return float(min(1.0, 1.0 / max(correlation.sum(), 1e-3)))
+
+
+def noise_beside(picture: Array, background: float, dark: Mask) -> tuple[Array, float]:
+    """Correlation of the noise of some `dark` pixels, and the share of its variance that second differences measure."""
+    residual = picture - background
+    correlation = correlation_of(residual, dark)
+    if dark.sum() < _MIN_PIXELS:
+        return correlation, 1.0
+    # use the paper's own spread: an insignificant part of the correlation would raise the fine share, and a mosaic's
+    # noise differs between pixels
+    spread = 1.4826 * float(np.median(np.abs(residual[dark] - np.median(residual[dark]))))
+    return correlation, min(max((noise_of(picture) / spread) ** 2, _MIN_FINE_SHARE), 1.0) if spread > 0 else 1.0

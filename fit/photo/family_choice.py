@@ -1,14 +1,12 @@
 """Chooses the kernel family: the cheapest whose picture a viewer cannot distinguish from the most likely one's."""
 
-import functools
 from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..problems import FitError
+from ..problems import FitError, a_picture
 from ..result import Array
-from ..validation import a_picture
 
 COST = ("gaussian", "disc", "ring", "softm", "radial")
 """Families by growing number of parameters."""
@@ -43,16 +41,10 @@ def natural_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     """
     first, second = _of_one_size(kernel, other)
     width = max(_WIDTH, len(first))
-    spectrum = np.abs(np.fft.fft2(first - second, (width, width)))
-    return _decibels(_CONTRAST**2 * float((_natural_power(width) * spectrum**2).sum()))
-
-
-@functools.lru_cache(maxsize=8)
-def _natural_power(width: int) -> Array:
-    """Power spectrum `[width, width]` of natural images; it sums to 1."""
     frequency = np.hypot(np.fft.fftfreq(width)[:, None], np.fft.fftfreq(width))
     frequency[0, 0] = np.inf
-    return np.asarray(frequency**-2 / np.sum(frequency**-2))
+    natural, difference = frequency**-2, np.abs(np.fft.fft2(first - second, (width, width))) ** 2
+    return _decibels(_CONTRAST**2 * float((natural * difference).sum() / natural.sum()))
 
 
 def highlight_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
@@ -98,25 +90,21 @@ def looks_alike(kernel: Array, other: Array, accuracy_db: float) -> bool:
     return natural_psnr(kernel, other) >= accuracy_db and highlight >= accuracy_db - _HIGHLIGHT_ALLOWANCE_DB
 
 
-def choose(
-    kernels: Mapping[str, Array], bic: Mapping[str, float], accuracy_db: float
-) -> tuple[str, str, dict[str, float]]:
-    """The cheapest family that looks like the simplest within 2 of the lowest BIC, why, and PSNRs against "radial"."""
+def choose(kernels: Mapping[str, Array], bic: Mapping[str, float], accuracy_db: float) -> tuple[str, str]:
+    """The cheapest family that looks like the simplest one within 2 of the lowest BIC, and why."""
     by_likelihood = sorted(kernels, key=lambda f: (bic[f], COST.index(f)))
     lowest = bic[by_likelihood[0]]
     likeliest = min((f for f in kernels if bic[f] <= lowest + _BIC_TIE), key=COST.index)
-    runner_up = next(f for f in by_likelihood if f != likeliest)
     best = kernels[likeliest]
-    accuracy = {f: f"{natural_psnr(k, best):.1f} and {highlight_psnr(k, best):.1f} dB" for f, k in kernels.items()}
+    family = min((f for f in kernels if f == likeliest or looks_alike(kernels[f], best, accuracy_db)), key=COST.index)
     required = f"{accuracy_db:g} dB on a natural image and {accuracy_db - _HIGHLIGHT_ALLOWANCE_DB:g} dB on a highlight"
-    sufficient = [f for f in kernels if looks_alike(kernels[f], best, accuracy_db)]
-    family = min([*sufficient, likeliest], key=COST.index)
-    remaining = [f for f in by_likelihood if f not in (family, likeliest)]
-    others = ", ".join(f"{f} {accuracy[f]}, BIC {bic[f] - bic[likeliest]:+.0f}" for f in remaining)
+    accuracy = {f: f"{natural_psnr(k, best):.1f} and {highlight_psnr(k, best):.1f} dB" for f, k in kernels.items()}
+    others = [f for f in by_likelihood if f not in (family, likeliest)]
+    compared = ", ".join(f"{f} {accuracy[f]}, BIC {bic[f] - bic[likeliest]:+.0f}" for f in others)
     if family == likeliest:
         reason = "the lowest BIC" if bic[family] == lowest else f"the simplest within {_BIC_TIE:g} of the lowest BIC"
-        margin = bic[runner_up] - bic[likeliest]
-        why = f"{reason} ({runner_up} second by {margin:.0f}), and no cheaper family has {required}"
+        second = others[0]
+        why = f"{reason} ({second} second by {bic[second] - bic[likeliest]:.0f}), and no cheaper family has {required}"
     else:
         why = f"the cheapest with {required} ({accuracy[family]}) against {likeliest}, the likeliest"
-    return family, f"{why} ({others})", {f: natural_psnr(kernels[f], kernels["radial"]) for f in kernels}
+    return family, f"{why} ({compared})"

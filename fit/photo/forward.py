@@ -21,8 +21,7 @@ from torchdof.optics.psf import FAMILIES, LENGTHS, pixel_kernels, support
 
 from ..result import Array, Mask
 from ..solve import best_of, inverse
-from .dot import Dot, distance_from
-from .noise import correlate, correlation_of, noise_beside
+from .dot import Dot, correlate, correlation_of, distance_from, noise_beside
 from .source import Source
 
 ALL_MOVES = ("dx", "dy", "magnification")
@@ -89,15 +88,14 @@ class Forward:
 
     def kernels(self, family: str, params: Mapping[str, Any], widest: int | None = None) -> Array:
         """Kernels `[n, k, k]` for parameters `[n]`, as wide as needed, at most `widest` px or the window."""
-        limit = self.half if widest is None else widest
         tensors = {k: torch.from_numpy(np.atleast_1d(v)) for k, v in params.items()}
-        if family in OPENINGS:
-            size = 2 * min(int(np.ceil(float(tensors["radius"].max()))) + 1, limit) + 1
-            openings = [self.opening_with({n: v[i] for n, v in tensors.items()}) for i in range(len(tensors["radius"]))]
-            shapes = zip(tensors["radius"], openings, strict=True)
-            return torch.stack([pixel_kernels("disc", {"radius": r}, size, o) for r, o in shapes]).numpy()
-        half = min(int(np.ceil(support(family, tensors))) + 1, limit)
-        return pixel_kernels(family, tensors, 2 * half + 1).numpy()
+        reach = float(tensors["radius"].max()) if family in OPENINGS else support(family, tensors)
+        size = 2 * min(int(np.ceil(reach)) + 1, self.half if widest is None else widest) + 1
+        if family not in OPENINGS:
+            return pixel_kernels(family, tensors, size).numpy()
+        openings = [self.opening_with({n: v[i] for n, v in tensors.items()}) for i in range(len(tensors["radius"]))]
+        shapes = zip(tensors["radius"], openings, strict=True)
+        return torch.stack([pixel_kernels("disc", {"radius": r}, size, o) for r, o in shapes]).numpy()
 
     def opening_with(self, params: Mapping[str, Any]) -> Aperture:
         """The lens's opening with these of its parameters."""
@@ -120,8 +118,8 @@ class Forward:
         # shapes with the second moment that the blur has added
         added_variance = (self.dot.radius**2 - (self.magnification * self.source.radius) ** 2) / 4
         size = min(float(np.sqrt(max(added_variance, 0.15))), self.half / 3)
-        scaled = [{n: v * size if n in LENGTHS else v for n, v in s.items()} for s in _STARTS.get(family, ())]
-        starts = [self.moves({}) | dict(one) for one in (scaled if start is None else [start])]
+        shapes = [{n: v * size if n in LENGTHS else v for n, v in s.items()} for s in _STARTS.get(family, ())]
+        starts = [self.moves({}) | dict(one) for one in (shapes if start is None else [start])]
 
         def shaped(p: Array) -> Array:
             source = self.drawn(self.moves(dict(zip(names, p, strict=True))))
@@ -154,9 +152,8 @@ class Forward:
     ) -> Array:
         """Covariance of the parameters under the noise of both pictures (a sandwich estimator).
 
-        With J the model's derivatives and B the inverse of J' J + penalty, it is B M B, where M is the covariance of J'
-        (noise). The defocused picture's noise is as large as the residual of the lit pixels, and correlated like the
-        residual or the paper. The sharp picture's noise passes through the kernel, which correlates it.
+        The defocused picture's noise is as large as the residual of the lit pixels, and correlated like the residual or
+        the paper. The sharp picture's noise passes through the kernel, which correlates it.
         """
         information_inverse = inverse(slopes.T @ slopes + penalty)
         is_determined = np.isfinite(np.diag(information_inverse))
@@ -180,7 +177,7 @@ class Forward:
 
     def correlated_noise(self, columns: Array, correlation: Array) -> Array:
         """Product of the noise's correlation matrix with columns `[pixels used, p]`."""
-        return np.asarray(correlate(self.picture(columns.T), correlation)[:, self.used].T)
+        return correlate(self.picture(columns.T), correlation)[:, self.used].T
 
     def project(self, shaped: Array) -> tuple[Array, float, float]:
         """Fits gain and background by linear least squares; returns the model of the used pixels, and both."""
@@ -207,17 +204,17 @@ class Forward:
 
     def move_columns(self, moves: Mapping[str, float], names: tuple[str, ...], kernel: Array) -> Array:
         """Derivatives of the blurred source with respect to displacement and magnification `[n, pixels used]`."""
-        changed = [self.drawn({**moves, n: moves[n] + _STEP[n]}) for n in names]
-        changes = [(picture - self.drawn(moves)) / _STEP[n] for n, picture in zip(names, changed, strict=True)]
+        still = self.drawn(moves)
+        changes = [(self.drawn({**moves, n: moves[n] + _STEP[n]}) - still) / _STEP[n] for n in names]
         return self.blurred(np.stack(changes), kernel[None])[:, self.used]
 
     def bounds(self, names: tuple[str, ...]) -> tuple[list[float], list[float]]:
         """Lower and upper bounds of the named parameters."""
-        largest_shift = max(2.0, 0.3 * self.dot.radius)
+        shift = max(2.0, 0.3 * self.dot.radius)
         table = {
             **{"sigma": (0.05, self.half), "r_c": (0.0, self.half), "radius": (0.1, self.half), "m": (0.5, 12.0)},
             **{"b": (-0.98, 8.0), "rotation_deg": (-400.0, 400.0), "curvature": (0.0, 1.0)},
-            **dict.fromkeys(("dx", "dy"), (-largest_shift, largest_shift)),
+            **{"dx": (-shift, shift), "dy": (-shift, shift)},
             "magnification": (0.7 * self.magnification, 1.4 * self.magnification),
         }
         return [table[n][0] for n in names], [table[n][1] for n in names]

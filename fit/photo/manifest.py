@@ -1,9 +1,8 @@
 """Reads a folder of photographs of a dot, described by its `capture.toml`, and cuts windows around the dot."""
 
-import math
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -11,8 +10,7 @@ from typing import Any, Literal, get_args
 from torchdof.validation import choice, number, show
 
 from ..problems import FitError, warn
-from .captures import CAMERA, RANGES, Captures, check_distances
-from .frame import PATTERNS, CameraPicture, Dots, cut_pairs, read_picture, size_of
+from .captures import CAMERA, PATTERNS, RANGES, Captures, Dots, check_distances, cut_pairs, read_picture
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -23,14 +21,32 @@ MANIFEST = "capture.toml"
 _FAR_M = 100.0  # m; a dot on paper is not seen from farther, so larger distances are likely in millimetres
 Colours = Literal["mean", "each"]
 
-_CHOICES: Mapping[str, tuple[str, ...]] = {
-    "transfer": ("linear", "srgb"),
-    "dots": get_args(Dots),
-    "colours": get_args(Colours),
-    "bayer": PATTERNS,
+
+def _number(name: str, value: Any) -> float:
+    return number(name, value, *RANGES[name])
+
+
+def _text(name: str, value: Any) -> None:
+    if not isinstance(value, str) or not value or "\0" in value:
+        raise ValueError(f"{name} must be a text, got {show(value)}")
+
+
+def _crop(name: str, value: Any) -> None:
+    numbers = value if isinstance(value, list) and len(value) == 4 else [-1]
+    if not all(type(v) is int and 0 <= v < 2**31 for v in numbers) or not all(numbers[2:]):
+        raise ValueError(f"{name} must be [left, top, width, height] in pixels, got {show(value)}")
+
+
+_FIELDS: Mapping[str, Callable[..., Any]] = {
+    **dict.fromkeys(("focus_m", "exposure_s", "full_width_px", *CAMERA), _number),
+    **dict.fromkeys(("sharp", "dark", "name"), _text),
+    "crop": _crop,
+    "transfer": partial(choice, choices=("linear", "srgb")),
+    "dots": partial(choice, choices=get_args(Dots)),
+    "colours": partial(choice, choices=get_args(Colours)),
+    "bayer": partial(choice, choices=PATTERNS),
 }
-_FIELDS = (*("shot", "crop", "focus_m", "exposure_s", "full_width_px", *CAMERA, "sharp", "dark", "name"), *_CHOICES)
-_SHOT_FIELDS = ("file", "distance_m", "exposure_s")
+_SHOT_FIELDS: Mapping[str, Callable[..., Any]] = {"file": _text, "distance_m": _number, "exposure_s": _number}
 _REQUIRED = ("focus_m", "sharp", "file", "distance_m")
 
 
@@ -46,19 +62,15 @@ def read_captures(
     ```toml
     focus_m = 0.20                # the lens stays focused here
     sharp = "0200mm.png"          # the dot at that distance
-    focal_length_mm = 50.0        # missing camera fields are read from EXIF; with all three the table's unit is known
-    f_number = 2.8
-    sensor_width_mm = 36.0
     transfer = "srgb"             # or "linear"; if missing, floats are linear, and integers sRGB with a warning
 
     [[shot]]                      # by increasing distance
     file = "0500mm.png"
     distance_m = 0.50
-
-    # optional, before the shots: full_width_px = 6000 of the whole frame, if the pictures were cropped before;
-    # crop = [left, top, width, height] in px; dark = "dark.png", with the lens cap on; exposure_s, here and in each
-    # shot; dots = "centre", "each" or "field" for a grid; colours = "each"; bayer = "RGGB" for a sensor's mosaic; name
     ```
+
+    Fields of the camera (`focal_length_mm`, `f_number`, `sensor_width_mm`) are read from EXIF if they are missing; with
+    all three the table's unit is known. The other fields, all optional, are in docs/measuring.md.
 
     Args:
         folder: folder with the manifest and the pictures, or path of the manifest.
@@ -85,32 +97,37 @@ def read_captures(
     invalid = partial(FitError, kind="manifest", file=manifest_name)
     if root is not None:
         inside(path, root, manifest_name)
-    fields, shots = _manifest(path)
+    if not path.is_file():
+        raise invalid("there is no such manifest; write a capture.toml beside the pictures")
+    try:
+        fields = {"dots": "one"} | tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise invalid(f"is not TOML: {error}") from error
+    shots = fields.pop("shot", None)
+    if not isinstance(shots, list) or not shots or not all(isinstance(shot, dict) for shot in shots):
+        raise invalid("give at least one [[shot]] with file and distance_m")
     fields |= {name: value for name, value in (("dots", dots), ("colours", colours)) if value}
-    manifest = {name: _field({"dots": "one"} | fields, name, manifest_name) for name in _FIELDS[1:]}
-    shots = [{name: _field(shot, name, manifest_name) for name in _SHOT_FIELDS} for shot in shots]
+    manifest = _valid(fields, _FIELDS, manifest_name)
+    shots = [_valid(shot, _SHOT_FIELDS, manifest_name) for shot in shots]
     focus, files = manifest["focus_m"], [shot["file"] for shot in shots]
     check_distances([shot["distance_m"] for shot in shots], focus, manifest_name)
     nearest = min(focus, shots[0]["distance_m"])
     if nearest > _FAR_M:
         text = f"all distances are at least {nearest:g} m; they are in metres: divide millimetres by 1000"
-        warn(text, "distance", file=manifest_name, number=nearest)
+        warn(text, "distance", manifest_name)
     if root is not None:
         for name in filter(None, [manifest["sharp"], *files, manifest["dark"]]):
             inside(folder_path / name, root, manifest_name)
 
-    def read(name: str, dark: CameraPicture | None) -> CameraPicture:
-        return read_picture(folder_path / name, manifest["transfer"], dark, manifest["crop"], manifest["bayer"])
-
-    dark = read(manifest["dark"], None) if manifest["dark"] else None
-    sharp_picture = read(manifest["sharp"], dark)
+    options = {name: manifest[name] for name in ("transfer", "crop", "bayer")}
+    options["dark"] = read_picture(folder_path / manifest["dark"], **options) if manifest["dark"] else None
+    sharp_picture = read_picture(folder_path / manifest["sharp"], **options)
     by_colour = manifest["colours"] == "each"
     if by_colour and (count := len(sharp_picture.colours)) != 3:
         raise invalid(f"colours = 'each' needs pictures of three colours, or bayer = 'RGGB', got {count}")
     columns, encoded = [], [sharp_picture.file.name] * sharp_picture.encoded
     for shot in shots:
-        blurred_picture = read(shot["file"], dark)
-        _check_alike(sharp_picture, blurred_picture, manifest_name)
+        blurred_picture = read_picture(folder_path / shot["file"], **options)
         encoded += [blurred_picture.file.name] * blurred_picture.encoded
         seconds = manifest["exposure_s"]
         exposure = shot["exposure_s"] / seconds if shot["exposure_s"] and seconds else None
@@ -120,7 +137,7 @@ def read_captures(
         further = f" and {len(encoded) - 1} more" if len(encoded) > 1 else ""
         text = f"the encoding of {encoded[0]}{further} is not stated; sRGB is assumed. A camera's tone curve or "
         text += "sharpening makes the kernel up to 15 % too small: develop without them and state transfer"
-        warn(text, "not linear", file=manifest_name, number=float(len(encoded)))
+        warn(text, "not linear", manifest_name)
     own_width = sharp_picture.width_px
     width = own_width if manifest["full_width_px"] is None else round(manifest["full_width_px"])
     if width < own_width:
@@ -141,57 +158,21 @@ def inside(file: Path, root: str | os.PathLike[str], where: str) -> None:
     """Raises an error if a file, after following links, lies outside a folder."""
     folder, real = os.path.realpath(root), os.path.realpath(file)
     if not os.path.isdir(folder):
-        raise FitError(f"root must be a folder, got {show(str(root))}", "manifest", file=where)
+        raise FitError(f"root must be a folder, got {show(str(root))}", "manifest", where)
     if os.path.commonpath([folder, real]) != folder:
-        raise FitError(f"{str(file)!r} lies outside of {root} (--root)", "manifest", file=where)
+        raise FitError(f"{str(file)!r} lies outside of {root} (--root)", "manifest", where)
 
 
-def _manifest(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The fields of a manifest and those of its shots, with known names only."""
-    invalid = partial(FitError, kind="manifest", file=str(path))
-    if not path.is_file():
-        raise invalid("there is no such manifest; write a capture.toml beside the pictures")
+def _valid(fields: Mapping[str, Any], checks: Mapping[str, Callable[..., Any]], where: str) -> dict[str, Any]:
+    """The fields of a part of the manifest, each checked; None for those that are missing and optional."""
+    valid = dict[str, Any]()
     try:
-        fields = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise invalid(f"is not TOML: {error}") from error
-    shots = fields.get("shot")
-    if not isinstance(shots, list) or not shots or not all(isinstance(s, dict) for s in shots):
-        raise invalid("give at least one [[shot]] with file and distance_m")
-    for table, names in ((fields, _FIELDS), *((shot, _SHOT_FIELDS) for shot in shots)):
-        if unknown := [name for name in table if name not in names]:
-            raise invalid(f"{unknown[0]!r} is not a field; known are {', '.join(names)}")
-    return fields, shots
-
-
-def _field(fields: Mapping[str, Any], name: str, where: str) -> Any:
-    """A valid field of the manifest, or None if it is missing and optional."""
-    value = fields.get(name)
-    if value is None and name not in _REQUIRED:
-        return None
-    try:
-        if name in RANGES:
-            return number(name, value, *RANGES[name])
-        if name in _CHOICES:
-            choice(name, value, _CHOICES[name])
-        elif name == "crop":
-            numbers = value if isinstance(value, list) and len(value) == 4 else [-1]
-            if not all(type(v) is int and 0 <= v < 2**31 for v in numbers) or not all(numbers[2:]):
-                raise ValueError(f"crop must be [left, top, width, height] in pixels, got {show(value)}")
-        elif not isinstance(value, str) or not value or "\0" in value:
-            raise ValueError(f"{name} must be a text, got {show(value)}")
+        if unknown := [name for name in fields if name not in checks]:
+            raise ValueError(f"{unknown[0]!r} is not a field; known are {', '.join(checks)}")
+        for name, check in checks.items():
+            value = valid[name] = fields.get(name)
+            if value is not None or name in _REQUIRED:
+                valid[name] = check(name, value) or value
     except ValueError as error:
-        raise FitError(str(error), "manifest", file=where) from None
-    return value
-
-
-def _check_alike(first: CameraPicture, second: CameraPicture, where: str) -> None:
-    """Raises an error for pictures of different size, or if the lens was changed between them."""
-    if first.light.shape != second.light.shape:
-        sizes = f"{second.file.name} is {size_of(second.light)}, {first.file.name} is {size_of(first.light)}"
-        raise FitError(f"{sizes}; give pictures of one size", "manifest", file=where)
-    for key, word in (("f_number", "f-number"), ("focal_length_mm", "focal length")):
-        before, after = first.facts.get(key), second.facts.get(key)
-        if before and after and abs(math.log(before / after)) > 0.02:
-            text = f"EXIF says this was taken at {word} {after:g}, and {first.file.name} at {before:g}; change neither"
-            raise FitError(text, "manifest", file=str(second.file), number=after)
+        raise FitError(str(error), "manifest", where) from None
+    return valid

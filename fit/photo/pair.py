@@ -10,18 +10,14 @@ from threadpoolctl import threadpool_limits
 from torchdof.optics.aperture import Aperture
 from torchdof.validation import choice, number, show, whole
 
-from ..problems import FitError, warn
+from ..problems import FitError, a_picture, checked, warn
 from ..result import Array, BlurFit
-from ..validation import a_picture, checked
-from .checks import EXPLAINED, FAR_ABOVE, check_fit, check_focus, check_levels, check_linearity
-from .diagnostics import bic_of, describe
-from .dot import check_blacks, find_dot, fine_share_inside, used_pixels
+from .diagnostics import EXPLAINED, FAR_ABOVE, bic_of, check_fit, check_focus, check_levels, check_linearity, describe
+from .dot import check_blacks, find_dot, fine_share_inside, independent_share, used_pixels
 from .family_choice import COST, choose, looks_alike
 from .forward import ALL_MOVES, OPENINGS, SHAPES, Forward, Solution
-from .noise import independent_share
-from .opening import solve_image, solve_opening, solve_polygon
+from .free_kernels import solve_image, solve_opening, solve_polygon, solve_radial
 from .profile_fit import blur_strength, fit_profile
-from .radial import solve_radial
 from .source import Edge, ideal_dot, picture_of_dot, point_source, soft_edge
 
 Model = Literal["forward", "ratio"]
@@ -60,11 +56,6 @@ def fit_pair(
     The forward model explains every pixel of the window: `blurred = gain * (kernel convolved with the sharp picture,
     moved and magnified) + background`. All of these are fitted, so they do not bias the kernel. As in rendering, a
     pixel's own blur, 1/12 px^2 of variance, is in both pictures and not in the parameters.
-
-    1. Find both dots, exclude clipped pixels, and choose a representation of the sharp dot.
-    2. Fit a free profile, or the given family; fit the magnification too if the pictures contradict the expected one.
-    3. With "auto", choose the cheapest family that is accurate enough, or an opening if the blur is not round.
-    4. Check the residual, the levels and the focus; doubtful results give warnings.
 
     `model="ratio"` is the paper's: `blurred / sharp` along spokes inside the dot, then eq. (1). It measures the dot
     convolved with the kernel, so its widths depend on the dot.
@@ -155,20 +146,18 @@ def fit_pair(
             chi_gain = (solution.squares - free.squares) / scale * independent_share(pair.noise_correlation)
             if chi_gain > _MIN_CHI_GAIN:
                 pair, freest, solution = free_pair, free, free
-        why, psnr = "", dict[str, float]()
-        if free_profile:
-            pair.held_magnification = freest.moves["magnification"]
-            opening = None
-            if family == "auto":
-                solution, why, psnr = _choose(freest, accuracy_db)
-                opening = solve_opening(freest)
-                if opening is not None and looks_alike(solution.kernel, opening[0].kernel, accuracy_db):
-                    opening = None
-            elif family != "radial":
-                opening = (solve_polygon if family == "polygon" else solve_image)(freest), ""
-            if opening is not None:
-                solution, why = opening
-                freest = expected = solution
+        why, opening = "", None
+        pair.held_magnification = freest.moves["magnification"]
+        if free_profile and family == "auto":
+            solution, why = _choose(freest, accuracy_db)
+            opening = solve_opening(freest)
+            if opening is not None and looks_alike(solution.kernel, opening[0].kernel, accuracy_db):
+                opening = None
+        elif free_profile and family in OPENINGS:
+            opening = (solve_polygon if family == "polygon" else solve_image)(freest), ""
+        if opening is not None:
+            solution, why = opening
+            freest = expected = solution
         fit = describe(solution, why)
         # warn about the pictures by the freest kernel's residual; a family chosen for its cost adds some
         freest_fit = fit if freest is solution else describe(freest, "")
@@ -181,7 +170,7 @@ def fit_pair(
             if linear and is_large and freest_fit.residual_over_noise < largest_ratio:
                 check_levels(freest, expected, edge, files[1])
             check_focus(edge, fit.radius, pair.source.ideal, files[0])
-    return replace(fit, psnr=psnr)
+    return fit
 
 
 def prepared_pair(
@@ -209,10 +198,10 @@ def prepared_pair(
     linear = clipped > 0 or softness is not None or check_linearity(sharp_picture, dot, edge, files[0])
     if (radius := edge.radius * magnification) < _MIN_DOT_PX:
         text = f"by its distance the dot has a radius of {radius:.2g} px here, too small to see; is that in metres?"
-        raise FitError(text, "distance", file=files[1], number=magnification)
+        raise FitError(text, "distance", files[1])
     if clipped:
         text = f"{clipped} pixels of the sharp picture are clipped; an ideal dot of {edge.radius:.2f} px stands for it"
-        warn(text, "saturated", file=files[0], number=float(clipped))
+        warn(text, "saturated", files[0])
     # An ideal dot is as exact as the dot's own pixels. Magnification makes two errors of a few thousandths: in a spline
     # between the pixels of a hard edge, and in the sensor's softness, which does not grow with the dot.
     unexplained = edge.rms * np.sqrt(max(1 - 1 / max(edge.misfit, 1e-9) ** 2, 0.0))
@@ -227,11 +216,11 @@ def prepared_pair(
     return pair, edge, linear
 
 
-def _choose(radial: Solution, accuracy_db: float) -> tuple[Solution, str, dict[str, float]]:
+def _choose(radial: Solution, accuracy_db: float) -> tuple[Solution, str]:
     """Fits every family at the free profile's magnification and chooses one, which is then fitted with it."""
     pair, fixed_pair = radial.pair, replace(radial.pair, fit_moves=("dx", "dy"))
     solutions = {"radial": radial} | {family: fixed_pair.solve(family) for family in COST[:-1]}
     bic = {f: bic_of(solution) for f, solution in solutions.items()}
-    family, why, psnr = choose({f: solution.kernel for f, solution in solutions.items()}, bic, accuracy_db)
+    family, why = choose({f: solution.kernel for f, solution in solutions.items()}, bic, accuracy_db)
     is_final = family == "radial" or pair.fit_moves != ALL_MOVES
-    return solutions[family] if is_final else pair.solve(family), why, psnr
+    return solutions[family] if is_final else pair.solve(family), why

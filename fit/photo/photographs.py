@@ -1,7 +1,7 @@
 """Reads photographs of the printed target from a camera or phone, and determines distances, focus and tone curve."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,8 +17,7 @@ from ..problems import FitError, warn
 from ..result import Array
 from .captures import CAMERA, Capture, Captures
 from .manifest import MANIFEST, Colours, inside
-from .target import DOT_MM, SQUARE_MM, Target, find_target
-from .tone import WINDOW, Tone, tone_curve, untoned
+from .target import DOT_MM, SQUARE_MM, WINDOW, Target, find_target, tone_curve, untoned
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
 _AT_FOCUS = 0.03  # relative difference of distance up to which a photograph is at the focus
@@ -55,9 +54,8 @@ def read_photographs(
 ) -> Photographs:
     """Reads a folder of photographs of the target, without a description.
 
-    1. Read each photograph and find the target in it; leave out photographs without one.
-    2. Find the tone curve, undo it, and measure the targets again.
-    3. Compute each distance from the size of the square; pair the sharpest photograph with each one out of focus.
+    A tone curve is found and undone, each distance is computed from the size of the square, and the sharpest photograph
+    is paired with each one out of focus.
 
     Args:
         folder: folder with the photographs; other files are ignored.
@@ -84,7 +82,7 @@ def read_photographs(
             raise FitError(refusal, file=str(path))
     if len(files) < 2:
         text = f"there is neither a {MANIFEST} nor two photographs of the page that torchdof fit --target makes"
-        raise FitError(text, "manifest", file=folder_name)
+        raise FitError(text, "manifest", folder_name)
     pictures: list[Photograph] = []
     advice: list[str] = []
     settings, integers = dict[str, float](), True
@@ -94,9 +92,9 @@ def read_photographs(
             raise FitError("colours = 'each' needs pictures of three colours", file=str(path))
         light = picture.pixels[0, : 3 if len(picture.channels) >= 3 else 1].mean(0).double().numpy()
         try:
-            target = find_target(light, file=str(path))
+            target = find_target(light)
         except FitError as error:
-            advice.append(f"{path.name}: left out, {str(error).split(': ', 1)[1]}")
+            advice.append(f"{path.name}: left out, {error}")
             continue
         height, width = light.shape
         if pictures and width != pictures[0].light.shape[1]:
@@ -112,20 +110,18 @@ def read_photographs(
         raise FitError("; ".join(["fewer than two photographs show the target", *advice]), file=folder_name)
     if missing := [name for name in CAMERA if name not in settings]:
         text = f"EXIF has no {', '.join(missing)}: share the originals, or describe them in a {MANIFEST}"
-        raise FitError(text, "manifest", file=folder_name)
-    tone, original_light = None, {p.file: p.light for p in pictures}
+        raise FitError(text, "manifest", folder_name)
+    bend, errors, original_light = np.zeros(3), np.zeros((0, 3)), {p.file: p.light for p in pictures}
     if integers and len(pictures) >= _MIN_FOR_TONE:
-        tone = tone_curve([(p.light, p.target) for p in pictures], square_mm)
+        bend, errors = tone_curve([(p.light, p.target) for p in pictures], square_mm)
     elif integers:
-        text = f"{len(pictures)} photographs are too few to find a tone curve, which makes a kernel up to 15 % "
-        text += f"too small: take {_MIN_FOR_TONE} or more"
-        warn(text, "not linear", file=folder_name, number=float(len(pictures)))
-    bend = (0.0, 0.0, 0.0) if tone is None else tone.bend
-    if any(bend):
+        text = f"{len(pictures)} photographs are too few to find a tone curve: take {_MIN_FOR_TONE} or more"
+        warn(f"{text}; it makes a kernel up to 15 % too small", "not linear", folder_name)
+    if bend.any():
         pictures = [replace(p, light=untoned(p.light, bend)) for p in pictures]
         pictures = [replace(p, target=find_target(p.light, file=p.file)) for p in pictures]
-        curve = f"({bend[0]:+.2f}, {bend[1]:+.2f}, {bend[2]:+.2f})"
-        text = f"a tone curve {curve} was found by the light of the dot and the edges of the square, and undone; "
+        curve = ", ".join(f"{value:+.2f}" for value in bend)
+        text = f"a tone curve ({curve}) was found by the light of the dot and the edges of the square, and undone; "
         advice.append(f"{text}blurs of a few px may still be 5 % too small; raw pictures need no such guess")
     sharpest = max(pictures, key=lambda p: p.sharpness)
     focal_px = settings["focal_length_mm"] * width / settings["sensor_width_mm"]
@@ -138,44 +134,36 @@ def read_photographs(
     advice += _advice(pictures, out_of_focus, sharpest, focus_m)
     if not out_of_focus:
         raise FitError("all photographs were taken at one distance: step back, without refocusing", file=folder_name)
-    captures = Captures(
-        pairs=tuple(_pair(Path(folder), sharpest, p, original_light, tone, colours == "each") for p in out_of_focus),
-        focus_m=focus_m,
-        width_px=width,
-        **{name: settings[name] for name in CAMERA},
-        name=Path(folder).resolve().name,
-        notes={
-            "target_square_mm": square_mm,
-            "pictures": [p.file for p in pictures],
-            "sharp": sharpest.file,
-            "tone_curve": list(bend),
-            "from_exif": list(CAMERA),
-        },
-    )
+
+    def colours_of(picture: Photograph, half: int) -> Array:
+        pixels = read_image(Path(folder) / picture.file).pixels[0, :3].double().numpy()
+        return np.stack([untoned(c, bend) if len(errors) else c for c in picture.target.window(pixels, half)])
+
+    pairs = []
+    for blurred in out_of_focus:
+        both = sharpest, blurred
+        half = int(WINDOW * min(p.target.side_px for p in both))
+        windows = [p.target.window(original_light[p.file], half) for p in both]
+        capture = Capture(
+            sharpest.target.window(sharpest.light, half),
+            blurred.target.window(blurred.light, half),
+            blurred.distance_m,
+            files=(str(Path(folder) / sharpest.file), str(Path(folder) / blurred.file)),
+            white=1.0 if sharpest.clipped else None,
+            colours=(colours_of(sharpest, half), colours_of(blurred, half)) if colours == "each" else None,
+            uncertain=tuple((untoned(windows[0], bend + step), untoned(windows[1], bend + step)) for step in errors),
+        )
+        pairs.append(capture)
+    notes = {
+        "target_square_mm": square_mm,
+        "pictures": [p.file for p in pictures],
+        "sharp": sharpest.file,
+        "tone_curve": bend.tolist(),
+        "from_exif": list(CAMERA),
+    }
+    camera, name = {name: settings[name] for name in CAMERA}, Path(folder).resolve().name
+    captures = Captures(tuple(pairs), focus_m, width, **camera, name=name, notes=notes)
     return Photographs(captures, tuple(pictures), tuple(advice))
-
-
-def _pair(
-    folder: Path, sharp: Photograph, blurred: Photograph, original: Mapping[str, Array], tone: Tone | None, each: bool
-) -> Capture:
-    """Windows of the dot in two photographs, with colours if `each`; also, from `original` light, for other curves."""
-    half = int(WINDOW * min(sharp.target.side_px, blurred.target.side_px))
-
-    def colours_of(picture: Photograph) -> Array:
-        window = picture.target.window(read_image(folder / picture.file).pixels[0, :3].double().numpy(), half)
-        return np.stack([c if tone is None else untoned(c, tone.bend) for c in window])
-
-    windows = [picture.target.window(original[picture.file], half) for picture in (sharp, blurred)]
-    other_curves = [] if tone is None else [np.add(tone.bend, step) for step in tone.errors]
-    return Capture(
-        sharp.target.window(sharp.light, half),
-        blurred.target.window(blurred.light, half),
-        blurred.distance_m,
-        files=(str(folder / sharp.file), str(folder / blurred.file)),
-        white=1.0 if sharp.clipped else None,
-        colours=(colours_of(sharp), colours_of(blurred)) if each else None,
-        uncertain=tuple((untoned(windows[0], bend), untoned(windows[1], bend)) for bend in other_curves),
-    )
 
 
 def _advice(

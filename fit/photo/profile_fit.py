@@ -9,10 +9,9 @@ from scipy.optimize import approx_fprime
 from torchdof.optics.psf import LENGTHS, profile
 from torchdof.validation import choice, show
 
-from ..problems import FitError, warn
+from ..problems import FitError, a_picture, checked, real_numbers, warn
 from ..result import Array, BlurFit, Indices
 from ..solve import best_of, inverse
-from ..validation import a_picture, checked, real_numbers
 from .dot import find_dot
 
 _NAMES = {"gaussian": ("N", "sigma"), "ring": ("N", "r_c", "sigma"), "softm": ("N", "radius", "sigma", "b", "m")}
@@ -63,17 +62,15 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
         '0.002000 0.000400 0.5800'
     """
     checked(choice, "family", family, tuple(_NAMES))
-    names = _NAMES[family]
-    radii, values = real_numbers("r", r, "[n]"), real_numbers("strength", strength, "[n]")
+    names, radii, values = _NAMES[family], real_numbers("r", r, "[n]"), real_numbers("strength", strength, "[n]")
     if radii.shape != values.shape:
         raise FitError(f"r and strength must both be [n], got {list(radii.shape)} and {list(values.shape)}")
     if radii.min(initial=0.0) < 0:
-        raise FitError(f"r must be >= 0, got {radii.min():g}", number=float(radii.min()))
+        raise FitError(f"r must be >= 0, got {radii.min():g}")
     if (distinct := np.unique(radii).size) < len(names) + 2:
-        text = f"the family takes at least {len(names) + 2} different radii, got {distinct}"
-        raise FitError(text, number=float(distinct))
+        raise FitError(f"the family takes at least {len(names) + 2} different radii, got {distinct}")
     if values.max() <= 0:
-        raise FitError("strength must be positive somewhere; is the dot darker than its paper?", number=values.max())
+        raise FitError("strength must be positive somewhere; is the dot darker than its paper?")
     labels = np.arange(radii.size) if groups is None else np.asarray(groups)
     if labels.shape != radii.shape or labels.dtype.kind not in "iuf":
         raise FitError(f"groups must be one integer a sample [{radii.size}], got {show(groups)}")
@@ -89,7 +86,7 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
     variation = float(np.sqrt(max(explained, 0.0) / y.size))
     if variation < 1e-8 or explained / 2 < _FLAT_F * unexplained / (y.size - 3):
         text = f"the profile is flat: it varies by {variation:.3g} of its peak (noise {noise:.3g}); sample farther out"
-        raise FitError(text, "flat profile", number=variation / noise if noise > 0 else 0.0)
+        raise FitError(text, "flat profile")
 
     def model(p: Array) -> Array:
         return evaluate(family, x, dict(zip(names, p, strict=True)))
@@ -129,9 +126,9 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
         reference_length = max(value, float(fit.params["sigma"]) if name == "r_c" else 0.0)
         if not error < 0.25 * reference_length:
             text = f"the profile is too flat, or too different from the family, to fix {name} = {value:.4g}"
-            warn(text, "flat profile", number=error / reference_length if reference_length else np.inf)
+            warn(text, "flat profile")
         if value >= 0.999 * bound:
-            warn(f"{name} ended on its bound {bound:.4g}; it is only a limit", "boundary", number=bound)
+            warn(f"{name} ended on its bound {bound:.4g}; it is only a limit", "boundary")
     return fit
 
 
@@ -168,14 +165,14 @@ def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, I
         >>> round(float(r.max())), round(float(strength.mean()), 3), len(set(spoke.tolist()))
         (5, 0.5, 36)
     """
-    focused, defocused = a_picture("sharp", sharp, _MIN_SIDE_PX), a_picture("blurred", blurred, _MIN_SIDE_PX)
-    dot, blurred_dot = find_dot(focused), find_dot(defocused)
+    pictures = a_picture("sharp", sharp, _MIN_SIDE_PX), a_picture("blurred", blurred, _MIN_SIDE_PX)
+    dot, blurred_dot = map(find_dot, pictures)
     # the outermost pixel of the dot is half paper
     r = np.arange(0.0, max(dot.radius - 1.0, 1.0) + 1e-9)
     theta = np.deg2rad(np.arange(0, 360, _STEP_DEG))[:, None]
     positions = [dot.y + r * np.sin(theta), dot.x + r * np.cos(theta)]
-    sharp_level, blurred_level = (map_coordinates(p, positions, order=1, mode="nearest") for p in (focused, defocused))
-    sharp_level, blurred_level = sharp_level - dot.background, blurred_level - blurred_dot.background
-    is_lit = sharp_level > 0.2 * dot.peak
+    levels, blurred_levels = (map_coordinates(picture, positions, order=1, mode="nearest") for picture in pictures)
+    is_lit = levels - dot.background > 0.2 * dot.peak
     spokes, rays = np.nonzero(is_lit)
-    return r[rays], blurred_level[is_lit] / sharp_level[is_lit], spokes
+    strength = (blurred_levels[is_lit] - blurred_dot.background) / (levels[is_lit] - dot.background)
+    return r[rays], strength, spokes

@@ -11,8 +11,7 @@ from scipy.special import erfc
 
 from ..result import Array
 from ..solve import best_of
-from .dot import Dot, distance_from, inner_pixels
-from .noise import fine_variance, noise_beside, noise_of
+from .dot import Dot, distance_from, fine_variance, inner_pixels, noise_beside, noise_of
 
 UNFOCUSED_PX = 1.0
 """Sigma of an edge, px, above which it is out of focus; every camera gives a sharper edge in focus."""
@@ -105,8 +104,7 @@ class Edge:
 def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_exponent: bool = False) -> Edge:
     """Fits a soft disc to a dot in a picture `[H, W]`; pixels from level `white` up may be clipped.
 
-    With `fit_exponent`, levels are a power of the light. A round white dot loses as much light inside its edge as it
-    gains outside; encoding (a power of about 0.45) breaks this balance and can be detected.
+    With `fit_exponent`, levels are a power of the light (encoding: about 0.45), which breaks the symmetry of the edge.
     """
     grid = np.indices(picture.shape).astype(np.float64)
     is_near = distance_from(dot, picture.shape) <= dot.reach + 3
@@ -145,8 +143,10 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
         variance = sum(residual[half].var(ddof=1) / half.sum() for half in (lower, upper))
         steepness_error = float(np.sqrt(variance)) / level
     exponent, misfit = float(solution[5]) if fit_exponent else 1.0, rms / expected if expected > 0 else np.inf
-    fitted = (dot.x + dx, dot.y + dy, radius, softness, level * dot.peak, exponent)
-    return Edge(*fitted, rms, misfit, steepness, steepness_error, shot_noise)
+    place = dot.x + dx, dot.y + dy
+    return Edge(
+        *place, radius, softness, level * dot.peak, exponent, rms, misfit, steepness, steepness_error, shot_noise
+    )
 
 
 def _coverage(rows: Array, columns: Array, x: float, y: float, radius: float, softness: float) -> Array:
@@ -157,8 +157,6 @@ def _coverage(rows: Array, columns: Array, x: float, y: float, radius: float, so
     sigma = max(softness, 0.3 / _SAMPLES_PER_PX)
     band = np.abs(distance - radius) < 0.75 + 5 * sigma
     step = (np.arange(_SAMPLES_PER_PX) + 0.5) / _SAMPLES_PER_PX - 0.5
-    fine = np.hypot(
-        (columns[band] - x)[:, None, None] + step[None, None, :], (rows[band] - y)[:, None, None] + step[None, :, None]
-    )
-    level[band] = (0.5 * erfc((fine - radius) / (np.sqrt(2) * sigma))).mean((1, 2))
+    fine_x, fine_y = (columns[band] - x)[:, None, None] + step, (rows[band] - y)[:, None, None] + step[:, None]
+    level[band] = (0.5 * erfc((np.hypot(fine_x, fine_y) - radius) / (np.sqrt(2) * sigma))).mean((1, 2))
     return level

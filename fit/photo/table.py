@@ -1,29 +1,47 @@
-"""Makes one blur table of fits at several distances, keyed by the signed circle of confusion."""
+"""Fits the pairs of a capture, and makes one blur table of the fits, keyed by the signed circle of confusion."""
 
 import datetime
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any
 
 import numpy as np
 
+from torchdof.optics.aperture import Aperture
 from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.psf import FAMILIES, LENGTHS
 from torchdof.validation import choice, show
 
-from ..problems import FitError, warn, without_warnings
+from ..problems import FitError, checked, warn, without_warnings
 from ..result import Array, BlurFit
-from ..validation import checked
 from .agreement import check_agreement
 from .captures import CAMERA, Capture, Captures
-from .distances import Colour, common_opening, fit_colours, fit_one, with_uncertainty
+from .dot import find_dot
 from .family_choice import COST
 from .forward import OPENINGS, SHAPES
+from .pair import fit_pair
+from .source import soft_edge
 
 _MAX_EXPOSURE_RATIO = 1.3  # ratio of fitted to stated exposure above which to warn
 _BY_COST = (*COST, *OPENINGS)
+_KNOTS = 33  # values of a free profile, equal for all distances
+_COLOURS = ("red", "green", "blue")
+_DEFOCUSED_PX = 1.5  # px; for smaller blurs it is uncertain on which side of focus a colour is
+_RADIUS_ERROR = 0.02  # relative error with which the thin lens gives the radius
+
+
+@dataclass(frozen=True)
+class Colour:
+    """One colour of a capture."""
+
+    name: str  # "red", "green" or "blue"
+    fits: tuple[BlurFit, ...]  # one for each distance, like those of the mean of the colours
+    # longitudinal colour: 1/distance of its focus minus that of green, 1/m; NaN unless two distances are blurred enough
+    focus_shift_dioptres: float
+    # lateral colour: (x, y) offsets of its dot from green's, px: in focus, then at each distance
+    lateral_px: tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -38,7 +56,6 @@ class TableFit:
         scale: source of the circles of confusion: "camera" or "measured".
         colours: fits of red, green and blue, if the captures have colours; the table then has a kernel for each, and
             `fits` are those of their mean.
-        coc_per_dioptre_px: circle of confusion over 1/focus - 1/distance [1/m], px of the frame.
     """
 
     table: BlurTable
@@ -46,7 +63,6 @@ class TableFit:
     coc_px: tuple[float, ...]
     why: str
     scale: str
-    coc_per_dioptre_px: float
     colours: tuple[Colour, ...] = ()
 
 
@@ -85,19 +101,15 @@ def fit_captures(
     Nodes are keyed by the thin lens's signed circle of confusion at their distance, of the camera if it is known.
     Otherwise its scale is measured: the radius of the uniform disc with the second moment of the fitted kernels.
 
-    1. With a free choice of family, or an opening, fit each pair alone: this determines one family for all.
-    2. Fit all pairs with this family, or with this opening in different sizes.
-    3. Compare the radii with the camera's, and determine the scale of the circle of confusion.
-    4. Fit each colour like the mean, if the captures have colours.
-
     Args:
-        captures: pairs at increasing distances.
+        captures: pairs at increasing distances; with colours, each colour is fitted like their mean.
         family: "auto" uses the cheapest family that is accurate enough at every distance; or a family of `fit_pair`.
             "polygon" and "image" use one opening, rotated by half a turn in front of the focus, in different sizes.
         accuracy_db: accuracy for "auto", see `fit_pair`.
         progress: called with (number done, total, text) after each fit.
         command: recorded in the table's provenance.
-        scale_of: the fit of another dot in the same photographs, whose scale is used if the camera is unknown.
+        scale_of: the fit of another dot in the same photographs, whose circles of confusion are used if the camera is
+            unknown.
 
     Returns:
         The table and its fits.
@@ -115,25 +127,33 @@ def fit_captures(
         if progress:
             progress(next(done), len(pairs) * (2 if has_first_fits else 1), f"{pair.distance_m:g} m")
 
-    why, first_fits = f"family {family!r} was asked for", list[BlurFit]()
+    why, opening, first_fits = f"family {family!r} was asked for", None, list[BlurFit]()
     if has_first_fits:  # each pair alone determines the family or the opening; the final fits warn
         for pair in pairs:
             with without_warnings():
-                first_fits.append(fit_one(pair, captures.focus_m, family, accuracy_db=accuracy_db))
+                first_fits.append(_fit_one(pair, captures.focus_m, family, accuracy_db=accuracy_db))
             report(pair)
     if family == "auto":
         # the richest family needed at any distance is used for all
         richest = max(range(len(pairs)), key=lambda i: _BY_COST.index(first_fits[i].family))
         family = first_fits[richest].family
         why = f"{family}, for {pairs[richest].distance_m:g} m: {first_fits[richest].why}"
-    opening, fits = common_opening(captures, family, first_fits) if family in OPENINGS else None, list[BlurFit]()
+    if family in OPENINGS:  # that of the largest blur, as seen behind the focus
+        openings = [(fit, pair) for fit, pair in zip(first_fits, pairs, strict=True) if fit.family == family]
+        largest, pair = max(openings, key=lambda one: one[0].radius)
+        opening = _seen(largest.aperture or Aperture(), pair, captures.focus_m)
+    fits = list[BlurFit]()
     for pair in pairs:
-        fit = fit_one(pair, captures.focus_m, family, opening)
+        if opening is None:
+            fit = _fit_one(pair, captures.focus_m, family)
+        else:
+            aperture = _seen(opening, pair, captures.focus_m)
+            fit = replace(_fit_one(pair, captures.focus_m, "image", aperture=aperture), family=family)
         ratio = 1.0 if pair.exposure is None or not fit.gain > 0 else fit.gain / pair.exposure
         if max(ratio, 1 / ratio) > _MAX_EXPOSURE_RATIO:
             text = f"the blurred dot is {ratio:.2f} times as bright as the exposures say; did the light stay the same?"
-            warn(text, "exposure", file=pair.files[1], number=ratio)
-        fits.append(with_uncertainty(pair, captures.focus_m, fit))
+            warn(text, "exposure", pair.files[1])
+        fits.append(_with_uncertainty(pair, captures.focus_m, fit))
         report(pair)
     radius_px = np.array([f.radius for f in fits])
     check_agreement(captures, radius_px)
@@ -141,17 +161,13 @@ def fit_captures(
     if camera_px is not None:
         coc_px, scale = camera_px, "camera"
     elif scale_of is not None:
-        coc_px, scale = scale_of.coc_per_dioptre_px * defocus, scale_of.scale
+        coc_px, scale = np.array(scale_of.coc_px), scale_of.scale
     else:
         coc_px, scale = float(np.abs(defocus) @ radius_px / (defocus @ defocus)) * defocus, "measured"
-    params, colours = _params(fits, family), tuple[Colour, ...]()
-    if all(pair.colours is not None for pair in pairs):
-        colours = fit_colours(captures, fits)
-        colour_params = [_params(colour.fits, family) for colour in colours]
-        params = {n: np.stack([p[n] for p in colour_params]) for n in params}
     if len(pairs) == 1:
         text = f"one distance was measured ({pairs[0].distance_m:g} m); the thin lens scales it to all others"
-        warn(text, "single distance", file=pairs[0].files[1], number=pairs[0].distance_m)
+        warn(text, "single distance", pairs[0].files[1])
+    params = _params(fits, family)
     provenance = {
         "source": "photographs of a dot",
         "date": datetime.date.today().isoformat(),
@@ -164,7 +180,10 @@ def fit_captures(
         **{name: getattr(captures, name) for name in CAMERA if getattr(captures, name) is not None},
         **{"coc_from": scale, "family_because": why, "command": command},
     }
+    colours = _fit_colours(captures, fits) if all(pair.colours is not None for pair in pairs) else ()
     if colours:
+        colour_params = [_params(colour.fits, family) for colour in colours]
+        params = {n: np.stack([p[n] for p in colour_params]) for n in params}
         shifts = [c.focus_shift_dioptres for c in colours]
         provenance["colours"] = [c.name for c in colours]
         provenance["focus_shift_dioptres"] = [round(s, 5) if math.isfinite(s) else None for s in shifts]
@@ -182,15 +201,91 @@ def fit_captures(
         residual=[round(f.residual, 6) for f in fits],
         aperture=opening,
     )
-    return TableFit(table, tuple(fits), tuple(coc_px.tolist()), why, scale, float(coc_px[0] / defocus[0]), colours)
+    return TableFit(table, tuple(fits), tuple(coc_px.tolist()), why, scale, colours)
 
 
 def _params(fits: Sequence[BlurFit], family: str) -> dict[str, Array]:
     """Parameters of a table of these fits, px: `[N]`, and `values` `[N, P]`."""
-    if family == "radial":
-        # profiles relative to their radius change little over distance
-        radius = np.array([float(f.params["radius"]) for f in fits])
-        values = np.stack([np.asarray(f.params["values"]) for f in fits]) * radius[:, None] ** 2
-        return {"values": values, "radius": radius}
     names = ("radius",) if family in OPENINGS else FAMILIES[family]
-    return {n: np.array([float(f.params[n]) for f in fits]) for n in names}
+    params = {n: np.array([f.params[n] for f in fits]) for n in names}
+    if family == "radial":  # profiles relative to their radius change little over distance
+        params["values"] *= params["radius"][:, None] ** 2
+    return params
+
+
+def _seen(opening: Aperture, pair: Capture, focus_m: float) -> Aperture:
+    """The opening as seen behind the focus in a pair's picture, or the other way round: in front of it half a turn."""
+    if pair.distance_m > focus_m:
+        return opening
+    if opening.mask is not None:
+        return replace(opening, mask=opening.mask.flip(0, 1))
+    return replace(opening, rotation_deg=float(opening.rotation_deg) + 180.0)
+
+
+def _fit_one(pair: Capture, focus_m: float, family: str, **options: Any) -> BlurFit:
+    """Fits one pair by `fit_pair`."""
+    expected = {"magnification": focus_m / pair.distance_m, "knots": _KNOTS if family == "radial" else None}
+    options = {"white": pair.white, "files": pair.files, **expected, **options}
+    return fit_pair(pair.sharp, pair.blurred, family, **options)
+
+
+def _fit_like(fit: BlurFit, pair: Capture, focus_m: float, sharp: Array, blurred: Array, **options: Any) -> BlurFit:
+    """Fits other pictures of a pair like its own: with the same family and opening, or free profile's end."""
+    family = fit.family if fit.aperture is None else "image"
+    options |= {"aperture": fit.aperture, "reach": fit.params["radius"] if family == "radial" else None}
+    with without_warnings():  # the pair's own fit has already warned
+        return _fit_one(replace(pair, sharp=sharp, blurred=blurred), focus_m, family, **options)
+
+
+def _with_uncertainty(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
+    """Adds the uncertainty of a pair's pictures (``pair.uncertain``) to the standard errors of its fit."""
+    if not pair.uncertain:
+        return fit
+    others = [_fit_like(fit, pair, focus_m, *pictures) for pictures in pair.uncertain]
+    names = ("values",) if fit.family == "radial" else fit.names
+    values = [np.hstack([one.params.get(n, np.zeros(1)) for n in names]) for one in (fit, *others)]
+    changes = np.array(values[1:]) - values[0]  # [others, parameters]
+    covariance = fit.covariance + changes.T @ changes
+    spread = np.sqrt(np.diag(covariance))
+    errors = {"values": spread} if fit.family == "radial" else dict(zip(names, spread.tolist(), strict=True))
+    return replace(
+        fit,
+        stderr=fit.stderr | {n: error for n, error in errors.items() if n in fit.params},
+        covariance=covariance,
+        radius_stderr=float(np.hypot(fit.radius_stderr, np.linalg.norm([o.radius - fit.radius for o in others]))),
+    )
+
+
+def _fit_colours(captures: Captures, fits: Sequence[BlurFit]) -> tuple[Colour, ...]:
+    """Fits red, green and blue of every pair like their mean.
+
+    The softness of the sharpest colour is used for all, so that each kernel contains all of its colour's blur.
+    """
+    fits_by_colour: list[list[BlurFit]] = [[] for _ in _COLOURS]
+    for pair, mean in zip(captures, fits, strict=True):
+        sharp_colours, blurred_colours = pair.colours or ((), ())
+        softness = min(soft_edge(sharp, find_dot(sharp, file=pair.files[0])).softness for sharp in sharp_colours)
+        fixed: dict[str, Any] = {"magnification": mean.magnification, "fit_magnification": False, "softness": softness}
+        for colour, *windows in zip(fits_by_colour, sharp_colours, blurred_colours, strict=True):
+            colour.append(_fit_like(mean, pair, captures.focus_m, *windows, **fixed))
+    green = fits_by_colour[1]
+    shifts = [_focus_shift(captures.defocus, colour) for colour in fits_by_colour]
+    colours = []
+    for name, colour, shift in zip(_COLOURS, fits_by_colour, shifts, strict=True):
+        blurred = np.array([np.subtract(f.centre, g.centre) for f, g in zip(colour, green, strict=True)])
+        shifts_from_green = np.array([np.subtract(f.shift, g.shift) for f, g in zip(colour, green, strict=True)])
+        lateral = tuple((float(x), float(y)) for x, y in [(blurred - shifts_from_green).mean(axis=0), *blurred])
+        colours.append(Colour(name, tuple(colour), shift - shifts[1], lateral))
+    return tuple(colours)
+
+
+def _focus_shift(defocus: Array, fits: Sequence[BlurFit]) -> float:
+    """1/distance of a colour's focus minus the capture's, 1/m: where the line through its signed radii crosses 0."""
+    radius: Array = np.array([f.radius for f in fits]) * np.sign(defocus)
+    error = np.hypot([f.radius_stderr for f in fits], _RADIUS_ERROR * radius)
+    is_blurred = np.abs(radius) > _DEFOCUSED_PX
+    if is_blurred.sum() < 2:
+        return math.nan
+    slope, intercept = np.polyfit(defocus[is_blurred], radius[is_blurred], 1, w=1 / error[is_blurred])
+    # radius = slope * (1/focus - shift - 1/distance), with the colour's own focus 1/focus - shift
+    return float(intercept / slope)

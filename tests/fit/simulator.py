@@ -18,7 +18,7 @@ from PIL import Image
 from scipy.signal import fftconvolve
 
 from torchdof.fit import FitError, FitWarning
-from torchdof.fit.photo.frame import demosaiced
+from torchdof.fit.photo.captures import demosaiced
 from torchdof.io.images import Picture, write_image
 from torchdof.optics.psf import pixel_kernels
 

@@ -25,35 +25,6 @@ def test_the_reference_point_of_distances_changes_the_blur_but_not_the_focus(gau
     assert point_spread(lens, 2.0, sensor, reference=reference, meridional=True).radius < 1e-3
 
 
-def over_thin_lens(lens: Lens, f_number: float, focus_m: float, z_m: float) -> float:
-    """Blur radius over that of the thin lens, minus 1; the thin lens has its pupil where the entrance pupil is."""
-    first, stopped = lens.paraxial(), lens.with_f_number(f_number)
-    apart, focal_m = (first.front_principal - first.entrance_pupil) / 1000.0, first.focal_length / 1000.0
-    blur = first.entrance_pupil_diameter / 2 * focal_m / (1 - focal_m / focus_m) * abs(1 / focus_m - 1 / z_m)
-    thin = blur * first.f_number / f_number / (1.0 - apart / z_m)
-    sensor = focus_sensor(stopped, focus_m, "paraxial")
-    return point_spread(stopped, z_m, sensor, meridional=True, rays=20_000).radius / thin - 1.0
-
-
-@pytest.mark.parametrize(("name", "focus_m"), [("double_gauss_50mm", 2.0), ("wide_22mm", 1.0)])
-@pytest.mark.parametrize("z_m", [0.7, 1.5, 5.0, math.inf])
-def test_a_tiny_aperture_gives_the_thin_lens(name, focus_m, z_m):
-    lens = Lens.read(name)
-    assert abs(over_thin_lens(lens, 400.0, focus_m, z_m)) < 2e-4
-    # the difference is a third-order aberration: proportional to the square of the stop's diameter
-    wide, narrow = (over_thin_lens(lens, f_number, focus_m, z_m) for f_number in (22.0, 44.0))
-    assert abs(wide) > 1e-3
-    assert wide / narrow == pytest.approx(4.0, rel=0.06)
-
-
-def test_best_focus_has_the_least_rms_radius(gauss):
-    best = focus_sensor(gauss, 2.0, "best")
-    rms = [point_spread(gauss, 2.0, best + shift, meridional=True).rms for shift in (-0.005, 0.0, 0.005)]
-    assert rms[1] < min(rms[0], rms[2])
-    assert rms[0] == pytest.approx(rms[2], rel=1e-3)  # the RMS is a parabola around its minimum
-    assert abs(best - focus_sensor(gauss, 2.0, "paraxial")) < 0.02
-
-
 @pytest.mark.parametrize("z_m", [1.0, 2.0, 1e12, math.inf])
 def test_spot_on_axis_is_round_and_agrees_with_the_fan(gauss, z_m):
     sensor = focus_sensor(gauss, 2.0)
@@ -128,9 +99,7 @@ def test_vignetting_reduces_light_and_symmetry_towards_the_corner(gauss):
 
 
 @pytest.mark.parametrize("z_m", [2.0, math.inf])
-@pytest.mark.parametrize(
-    ("field_mm", "distortion"), [(0.1, 1e-4), (3.0, 1e-3), (10.0, 0.008)]
-)  # distortion grows with the square of field_mm
+@pytest.mark.parametrize(("field_mm", "distortion"), [(0.1, 1e-4), (10.0, 0.008)])
 def test_field_mm_is_the_height_of_a_pinholes_image(gauss, z_m, field_mm, distortion):
     lens = gauss.with_f_number(16.0)
     centre = point_spread(lens, z_m, focus_sensor(lens, z_m), field_mm=field_mm, rays=5_000).centre
@@ -144,7 +113,6 @@ def test_field_mm_is_the_height_of_a_pinholes_image(gauss, z_m, field_mm, distor
         (focus_sensor, {"reference": "film"}, "reference must be one of principal, pupil"),
         (focus_sensor, {"focus_m": 0.02}, "must lie in front of the lens"),
         (focus_sensor, {"focus_m": 0.045}, r"farther than the focal length \(50.36 mm\)"),
-        (focus_sensor, {"focus_m": math.nan}, "must lie in front of the lens"),
         (point_spread, {"rays": 3}, "rays must be a whole number from 16"),
         (point_spread, {"field_mm": 1.0, "meridional": True}, "points on the axis"),
         (point_spread, {"field_mm": 90.0}, "no ray of the object point passes"),

@@ -5,7 +5,7 @@ import pytest
 
 from torchdof import BlurTable
 from torchdof.fit import Capture, Captures, fit_captures, read_captures
-from torchdof.fit.photo.frame import PATTERNS, demosaiced
+from torchdof.fit.photo.captures import PATTERNS, demosaiced
 
 PER_DIOPTRE, FOCUS = 24.0, (-0.04, 0.0, 0.05)  # blur radius in px per dioptre; focus of each colour minus green's, 1/m
 SIDE = ((0.5, -0.2), (0.0, 0.0), (-0.3, 0.4))  # displacement (x, y) of each colour from green, px

@@ -10,8 +10,7 @@ from tests.fit import phone
 from torchdof import BlurTable
 from torchdof.fit import FitError, FitWarning, fit_captures
 from torchdof.fit.photo.photographs import read_photographs
-from torchdof.fit.photo.target import DOT_MM, SQUARE_MM, Target, find_target, write_target
-from torchdof.fit.photo.tone import tone_curve, untoned
+from torchdof.fit.photo.target import DOT_MM, SQUARE_MM, Target, find_target, tone_curve, untoned, write_target
 from torchdof.io.images import read_image
 
 
@@ -61,9 +60,8 @@ def test_the_target_is_found_on_a_desk_and_measured(simulator, folder):
 
 
 def test_distances_and_focus_are_found_from_the_photographs(folder):
-    with pytest.warns(FitWarning, match="3 photographs are too few to find a tone curve") as caught:
+    with pytest.warns(FitWarning, match="3 photographs are too few to find a tone curve"):
         found = read_photographs(folder)
-    assert caught[0].message.number == 3
     assert [q.distance_m for q in found.pictures] == pytest.approx([0.2, 0.3, 0.5], rel=3e-3)
     captures = found.captures
     assert captures.focus_m == pytest.approx(0.2, rel=3e-3) and captures.notes["sharp"] == "img_0000.jpg"
@@ -123,8 +121,8 @@ def left_of(simulator, tone, bend):
 
 
 def test_a_tone_curve_is_found_from_the_total_light_of_the_dot_and_undone(simulator):
-    assert tone_curve(_photographs(simulator, 0.0), SQUARE_MM).bend == (0.0, 0.0, 0.0)
-    assert left_of(simulator, 0.5, tone_curve(_photographs(simulator, 0.5), SQUARE_MM).bend) < 0.4
+    assert tone_curve(_photographs(simulator, 0.0), SQUARE_MM)[0].tolist() == [0.0, 0.0, 0.0]
+    assert left_of(simulator, 0.5, tone_curve(_photographs(simulator, 0.5), SQUARE_MM)[0]) < 0.4
 
 
 def test_no_tone_curve_is_found_in_photographs_without_one(simulator, tmp_path):
