@@ -122,8 +122,7 @@ class RenderShards:
         threads: Threads of each process; Ray gives each process a core.
 
     Raises:
-        ValueError: If an argument is invalid.
-        FileNotFoundError: If the folder is missing.
+        ValueError: If an argument is invalid; an ``OSError`` if the folder is missing.
         ModuleNotFoundError: If the package that writes the format is not installed.
 
     Example:
@@ -160,7 +159,7 @@ class RenderShards:
         choice("picture", picture, (".png", ".exr"))
         if importlib.util.find_spec(_WRITERS[format]) is None:
             raise ModuleNotFoundError(f"{format} needs {_WRITERS[format]}: pip install 'torchdof[ray]'")
-        if not keep or isinstance(keep, str) or not set(keep) <= set(_FILES):
+        if not keep or not set(keep) <= set(_FILES):
             raise ValueError(f"keep must be some of {', '.join(_FILES)}, got {show(keep)}")
         if not isinstance(self.blur, RandomDepthOfField):
             raise ValueError(f"blur must be a RandomDepthOfField, got {show(blur)}")
@@ -174,14 +173,11 @@ class RenderShards:
             torch.set_num_threads(whole("threads", threads, 1, 4096))
 
     def __call__(self, batch: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Makes the shards of a batch with the columns ``shard`` and ``samples``.
+        """Makes the shards of a batch with the columns ``shard`` and ``samples``; ``OSError`` if one cannot be written.
 
         Returns:
             Columns ``shard``, ``key``, ``image``, ``error`` ("" if none) and ``seconds`` (processor time), a row for
             each sample.
-
-        Raises:
-            OSError: If a shard cannot be written.
         """
         rows: list[dict[str, Any]] = []
         for shard, samples in zip(batch["shard"], batch["samples"], strict=True):
@@ -226,11 +222,22 @@ class RenderShards:
             try:
                 records.append(self._record(**sample))
             except (OSError, ValueError, MemoryError, RuntimeError) as failure:  # torch's allocator raises RuntimeError
-                error = _text(str(failure) or type(failure).__name__)
-            row = {"key": sample["key"], "image": _text(sample["image"]), "error": error}
+                error = str(failure) or type(failure).__name__
+            row = {"key": sample["key"], "image": _text(sample["image"]), "error": _text(error)}
             rows.append({**row, "seconds": round(time.process_time() - start, 4)})
         with atomic_file(path) as temporary:
-            (_write_tar if self.format == "webdataset" else _write_parquet)(temporary, records)
+            if self.format == "webdataset":
+                import webdataset
+
+                with webdataset.TarWriter(str(temporary), mtime=0) as tar:  # the same records give the same bytes
+                    for record in records:
+                        tar.write(record)
+            else:
+                import pyarrow
+                import pyarrow.parquet
+
+                columns = [{"key": r.pop("__key__"), **r.pop("json"), **r} for r in records]
+                pyarrow.parquet.write_table(pyarrow.Table.from_pylist(columns), temporary)
             path.with_suffix(".json").unlink(missing_ok=True)
         notes = {"bytes": path.stat().st_size, "source": source, "samples": rows}
         write_text(path.with_suffix(".json"), json.dumps(notes, indent=1))
@@ -239,7 +246,7 @@ class RenderShards:
     def _record(
         self, key: str, image: str, depth: str | None, focus_m: float | None, f_number: float | None
     ) -> dict[str, Any]:
-        """One sample: its key, the contents of its files by name, and its parameters as ``json``."""
+        """One sample as WebDataset takes it: its key, the contents of its files by name, its parameters as ``json``."""
         source = read_image(image, self.transfer)
         metres = at_size_of(source.pixels, self._read_depth(depth or image, **self.depth))
         digest = hashlib.sha256(f"{self.seed} {key}".encode()).digest()
@@ -251,18 +258,18 @@ class RenderShards:
         options = self.blur.renderings[int(drawn["table"])]
         with torch.no_grad():
             blurred = depth_of_field(source.pixels, metres, camera, **options.arguments())
-        contents = {}
+        record: dict[str, Any] = {"__key__": key}
         with tempfile.TemporaryDirectory() as folder:
             for name, pixels in (("blurred", blurred), ("sharp", source.pixels)):
                 if name in self.keep:
                     path = Path(folder, name + self.picture)
                     write_image(path, Picture(pixels, source.channels))
-                    contents[path.name] = path.read_bytes()
+                    record[path.name] = path.read_bytes()
         if "depth" in self.keep:
             np.save(array := io.BytesIO(), metres[0, 0].numpy())
-            contents["depth.npy"] = array.getvalue()
+            record["depth.npy"] = array.getvalue()
         table, (height, width) = options.table, blurred.shape[-2:]
-        parameters = {
+        record["json"] = {
             **_json_values(vars(camera) | options.arguments()),
             **{"table": table.name or table.family, "table_fingerprint": table.fingerprint()},
             "aperture": None if table.aperture is None else repr(table.aperture),
@@ -270,12 +277,12 @@ class RenderShards:
             "largest_coc_px": float(camera.coc_px(metres, width).abs().nan_to_num().max()),
             **{"seed": self.seed, "torchdof": importlib.metadata.version("torchdof")},
         }
-        return {"key": key, **contents, "json": parameters}
+        return record
 
 
 def _read_relative(
-    path: str, kind: str, near_m: float, far_m: float, relative_kind: Any = "disparity",
-    value_range: Any = None, unknown: float | None = None, fill: Any = None, channel: str | None = None,
+    path: str, kind: str, near_m: float, far_m: float, relative_kind: Any = "disparity", *,
+    fill: Any = None, channel: str | None = None, value_range: Any = None, unknown: float | None = None,
 ) -> Tensor:  # fmt: skip
     """Reads depth without a scale and converts it to metres, ``[1, 1, H, W]``, without holes."""
     values = read_values(path, channel)
@@ -292,21 +299,3 @@ def _json_values(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Numbers and strings of a camera or of options, as JSON values."""
     numbers = {name: float(value) if isinstance(value, Tensor) else value for name, value in arguments.items()}
     return {name: value for name, value in numbers.items() if name != "table"}
-
-
-def _write_tar(path: Path, records: Sequence[dict[str, Any]]) -> None:
-    """Writes a WebDataset shard; the same records give the same bytes."""
-    import webdataset
-
-    with webdataset.TarWriter(str(path), mtime=0) as tar:
-        for record in records:
-            tar.write({name if name != "key" else "__key__": value for name, value in record.items()})
-
-
-def _write_parquet(path: Path, records: Sequence[dict[str, Any]]) -> None:
-    """Writes a Parquet shard: pictures as bytes, each parameter a column."""
-    import pyarrow
-    import pyarrow.parquet
-
-    rows = [{**{k: v for k, v in record.items() if k != "json"}, **record["json"]} for record in records]
-    pyarrow.parquet.write_table(pyarrow.Table.from_pylist(rows), path)
