@@ -222,17 +222,13 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_a_long_step_shows_a_bar_on_the_terminal_and_results_still_go_to_the_file(
+def test_a_step_shows_a_bar_on_the_terminal_and_results_still_go_to_the_file(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     terminal, file = Terminal(), io.StringIO()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr(sys, "stdout", file)
     monkeypatch.setenv("TERM", "xterm")
-    with output.progress_bar("frame 1 of 24", 24):
-        pass
-    assert terminal.getvalue() == ""
-    monkeypatch.setattr(output, "_DELAY_S", 0.0)
     with output.progress_bar("", 4) as update:
         for done in range(3):
             time.sleep(0.4)

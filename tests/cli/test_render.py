@@ -18,9 +18,8 @@ from torch import Tensor
 import torchdof
 from tests.files import store
 from torchdof.cli.frame import Renderer, coc_of, read_frame
-from torchdof.cli.lens import Lens
 from torchdof.cli.main import app
-from torchdof.cli.options import DepthMap, Scene
+from torchdof.cli.options import Scene
 from torchdof.cli.output import Notices
 from torchdof.depth.inspect import tint_focus
 from torchdof.io.highlights import expand_highlights
@@ -552,10 +551,9 @@ def test_a_part_of_the_frame_has_the_blur_that_it_has_in_the_whole(left: int, to
         place = (area[1].start - 7, area[0].start + 4, -7, 4, 48, 40)
         write_image("part.exr", Picture(light, sample="float", window=place))
         np.save("part.npy", rays[(0, 0, *area)].numpy())
-        lens = Lens(
-            tilt=0.4, swing=-0.3, focus_at=(left + 8, top + 9), focal_length_mm=30, sensor_width_mm=36, f_number=1
-        )
-        scene = Scene(lens=lens, depth_map=DepthMap(depth_kind="distance"))
+        lens: dict[str, Any] = {"focal_length_mm": 30.0, "sensor_width_mm": 36.0, "f_number": 1.0}
+        lens |= {"tilt": 0.4, "swing": -0.3, "focus_at": (left + 8, top + 9)}
+        scene = Scene(**lens, depth_kind="distance")
         frame = read_frame(Path("part.exr"), Path("part.npy"), scene)
         found.append((frame.values, *coc_of(frame, Notices())[:2]))
     (whole_m, whole_px, camera), (part_m, part_px, part_camera) = found

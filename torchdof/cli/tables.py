@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import click
 
 from ..io.atomic import check_writable
-from .command import argument, option
-from .options import ApertureOptions, json_option, make_folder_of
+from .command import Command, argument, option
+from .options import ApertureOptions, make_folder_of
 from .output import print_result
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ _POSITIONS = (0.0, 0.4, 0.7, 0.95)  # distances from the middle of the frame; it
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Tables:
+class Tables(ApertureOptions, Command):
     """List blur tables, and draw their kernels.
 
     The picture has a column for each table and a row for each signed blur radius, from 24 pixels in front of the focus
@@ -38,8 +38,6 @@ class Tables:
 
     names: tuple[str, ...] = argument("Names or JSON files; default: all that ship.", "[TABLE]...", ())
     out: Path | None = option("Picture to write.", names=("--out", "-o"))
-    opening: ApertureOptions
-    as_json: bool = json_option()
 
     def run(self) -> None:
         """Lists tables, and draws them if a picture is asked for."""
@@ -52,7 +50,7 @@ class Tables:
 
         panels = {}
         for name in self.names or ["disc", "gaussian", *shipped()]:
-            table = self.opening.table_of(name)
+            table = self.table_of(name)
             source = str(table.provenance.get("source", "")).partition(";")[0]
             facts = {"table": name, "family": table.family, "nodes": len(table.coc), "coc": table.coc[[0, -1]].tolist()}
             facts |= {"unit": table.unit, "colours": table.channels, "source": source}
