@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import mmap
 import os
+import re
 import tempfile
 import zipfile
 from collections.abc import Iterator
@@ -153,21 +154,14 @@ def _check_header(path: Path) -> None:
                     return
             type_end = content.find(b"\0", content.find(b"\0", offset) + 1)
             start, size = type_end + 5, int.from_bytes(content[type_end + 1 : type_end + 5], "little")
-            if content[type_end - 6 : type_end] == b"chlist":
-                _check_channels(path, content[start : start + size])
+            is_list = content[type_end - 6 : type_end] == b"chlist"  # of channels, each a name, a zero and 16 bytes
+            count = len(re.findall(rb"[^\0]+\0.{16}", content[start : start + size], re.DOTALL)) if is_list else 0
+            if count > MAX_CHANNELS:
+                raise ValueError(f"{path}: its header has {count} channels in a part; at most {MAX_CHANNELS} are read")
             offset = start + size
             if type_end < offset - 2**31 or offset >= len(content):  # damaged: the reader will refuse it
                 return
     raise ValueError(f"{path}: its headers hold more than {MAX_ATTRIBUTES} attributes, which is the limit")
-
-
-def _check_channels(path: Path, channels: bytes) -> None:
-    """Refuse a list of channels, each a name, a zero and 16 bytes, that is longer than ``MAX_CHANNELS``."""
-    count = offset = 0
-    while 0 < (end := channels.find(b"\0", offset)) and end > offset:
-        count, offset = count + 1, end + 17
-    if count > MAX_CHANNELS:
-        raise ValueError(f"{path}: its header has {count} channels in a part; at most {MAX_CHANNELS} are read")
 
 
 def _check_colours(path: Path, spec: Any) -> None:
@@ -184,22 +178,20 @@ def _check_colours(path: Path, spec: Any) -> None:
 def _read_pfm(path: Path) -> Part:
     """Reads a PFM file. OpenImageIO would multiply disparities by the scale in the header."""
     with path.open("rb") as file:
-        words: list[bytes] = []
-        while len(words) < 4 and (line := file.readline(100)):
-            words += line.split()
-        try:
-            channels = {b"PF": 3, b"Pf": 1}[words[0]]
-            width, height, scale = int(words[1]), int(words[2]), float(words[3])
-        except (IndexError, KeyError, ValueError):
-            raise OSError(f"{path}: is not a PFM file (its header should read 'PF' or 'Pf', size and scale)") from None
-        _check_size(path, width, height, 2 * 4 * channels)
-        count = width * height * channels
+        header = re.match(rb"P([Ff])\s+(-?\d+)\s+(-?\d+)\s+([-+.\deE]+)\s", file.read(400))
+        if header is None:
+            raise OSError(f"{path}: is not a PFM file (its header should read 'PF' or 'Pf', size and scale)")
+        names = "RGB" if header[1] == b"F" else "Y"
+        width, height = int(header[2]), int(header[3])
+        _check_size(path, width, height, 2 * 4 * len(names))
+        count = width * height * len(names)
+        file.seek(header.end())
         data = file.read(4 * count)
     if len(data) != 4 * count:
         raise OSError(f"{path}: is cut short ({len(data)} of {4 * count} bytes of pixels)")
-    values = np.frombuffer(data, dtype="<f4" if scale < 0 else ">f4").astype(np.float32)
-    values = values.reshape(height, width, channels)[::-1]  # the bottom row is stored first
-    return Part("", tuple("Y" if channels == 1 else "RGB"), values, ("float",) * channels)
+    values = np.frombuffer(data, dtype="<f4" if header[4].startswith(b"-") else ">f4").astype(np.float32)
+    values = values.reshape(height, width, len(names))[::-1]  # the bottom row is stored first
+    return Part("", tuple(names), values, ("float",) * len(names))
 
 
 def read_array(path: Path, key: str | None) -> np.ndarray:

@@ -22,7 +22,7 @@ from .atomic import atomic_file
 from .channels import colour_channels, depth_channel
 from .decode import Part, first_line, is_complete, read_array, read_parts, utf8_name
 from .paths import PixelType, existing_image, existing_map, samples_of
-from .transfer import Transfer, decode, default_transfer, encode, encode_8_bits
+from .transfer import Transfer, decode, default_transfer, encode
 from .webp import add_exif
 
 __all__ = ["Picture", "read_image", "read_values", "write_image"]
@@ -135,31 +135,19 @@ def _light(
     path: Path, source: Part, indices: list[int], transfer: Transfer | None, has_alpha: bool
 ) -> tuple[Tensor, PixelType, Transfer]:
     """Light ``[1, C, H, W]`` from stored numbers, their type, and their encoding."""
-    kinds = [source.kinds[k] for k in indices]
-    kind = kinds[0] if len(set(kinds)) == 1 else "float"
+    kinds = {source.kinds[k] for k in indices}
+    kind = kinds.pop() if len(kinds) == 1 else "float"
     if kind not in _SAMPLE_TYPES and not source.is_exr:
         raise ValueError(f"{path}: holds numbers of type {kind}, for which white is not defined; store 16 bits")
     sample = _SAMPLE_TYPES.get(kind, "float")
-    transfer, white = transfer or default_transfer(sample), _WHITE[sample]
-    curve = None
-    if white > 1 and (source.straight_alpha or not has_alpha):
-        levels = np.arange(white + 1, dtype=np.float32).reshape(1, 1, 1, -1) / np.float32(white)
-        curve = decode(torch.from_numpy(levels), transfer, has_alpha=False, straight=False).flatten().numpy()
+    transfer = transfer or default_transfer(sample)
     height, width = source.values.shape[:2]
     light, bad_pixels = torch.from_numpy(np.empty((1, len(indices), height, width), np.float32)), 0
     for rows in _strips(height, width * len(indices)):
-        stored = source.values[rows][..., indices]
-        if curve is not None:
-            values = curve[stored]
-            if has_alpha:
-                values[..., -1] = stored[..., -1] / np.float32(white)
-        else:
-            values = _float32(stored)
-            values = values / np.float32(white) if white > 1 else values
-            bad_pixels += int((~np.isfinite(values)).any(axis=-1).sum())
+        values = _float32(source.values[rows][..., indices]) / np.float32(_WHITE[sample])
+        bad_pixels += int((~np.isfinite(values)).any(axis=-1).sum())
         pixels = torch.from_numpy(values).permute(2, 0, 1)[None]  # [h, W, C] -> [1, C, h, W]
-        encoded: Transfer = "linear" if curve is not None else transfer
-        light[:, :, rows] = decode(pixels, encoded, has_alpha, source.straight_alpha)
+        light[:, :, rows] = decode(pixels, transfer, has_alpha, source.straight_alpha)
         if not bad_pixels and not bool(torch.isfinite(light[:, :, rows]).all()):
             raise ValueError(f"{path}: its light is beyond the range of float32; scale it down")
     if bad_pixels:
@@ -220,14 +208,11 @@ def write_image(
     if names[0] == "Y" and suffix not in _GREY_SUFFIXES:
         pixels, names = pixels.expand(-1, 3, -1, -1), ("R", "G", "B")
     straight = names[-1] == "A" and suffix != ".exr"
-    if sample == "8" and (straight or names[-1] != "A"):
-        array = encode_8_bits(pixels, transfer, straight)
-    else:
-        array = np.empty((*pixels.shape[2:], len(names)), np.float32)
-        for rows in _strips(array.shape[0], array.shape[1] * len(names)):
-            encoded = encode(pixels[:, :, rows], transfer, names[-1] == "A", straight)
-            encoded = encoded.clamp(-65504.0, 65504.0) if sample == "half" else encoded
-            array[rows] = encoded[0].permute(1, 2, 0).numpy()  # [C, h, W] -> [h, W, C]
+    array = np.empty((*pixels.shape[2:], len(names)), np.float32)
+    for rows in _strips(array.shape[0], array.shape[1] * len(names)):
+        encoded = encode(pixels[:, :, rows], transfer, names[-1] == "A", straight)
+        encoded = encoded.clamp(-65504.0, 65504.0) if sample == "half" else encoded
+        array[rows] = encoded[0].permute(1, 2, 0).numpy()  # [C, h, W] -> [h, W, C]
 
     spec = oiio.ImageSpec(array.shape[1], array.shape[0], array.shape[2], _OIIO_SAMPLE[sample])
     spec.channelnames = names
