@@ -32,7 +32,7 @@ none.####.exr depth.npy --focus-m 2 -o o.#.exr        | none.####.exr: there are
 shot.####.exr depth.npy --focus-m 2 -o shot.####.exr  | shot.0001.exr: is one of the inputs
 image.exr shot.0003.exr --focus-m 1:2,3:4 -o shot.####.exr | shot.0003.exr: is one of the inputs
 shot.####.exr depth.####.npy -o o.#.exr --depth-kind coc --steady | --steady filters depth in metres
-shot.####.exr depth.npy --focus-m 2 -o o.#.exr --frames 5-2   | --frames must not end before it starts
+shot.####.exr depth.npy --focus-m 2 -o o.#.exr --frames 5-2   | --frames expects first-last
 shot.%099999999d.exr depth.npy --focus-m 2            | must have at most 18 digits
 image.exr depth.npy --focus-m 2 -o depth.npy          | depth.npy: is one of the inputs
 image.exr depth.npy --focus-m 2 -o depth.npy/out.exr  | its folder cannot be made

@@ -38,7 +38,7 @@ def option(
     basic: bool = False,
     **details: Any,
 ) -> Any:
-    """Declares a dataclass field as an option.
+    """Declares a dataclass field as an option of :class:`click.Option`, whose type is that of the field.
 
     Args:
         help: Text in ``--help``.
@@ -47,7 +47,7 @@ def option(
         read: Converts the text to the value, or raises ``ValueError`` with the expected form.
         group: Heading in ``--help``; empty uses the docstring of the field's class.
         basic: Whether ``--help`` lists the option before the groups.
-        **details: Further arguments of :class:`click.Option`; its ``type`` is otherwise that of the field.
+        **details: Further arguments of the option.
     """
     details["help"] = help
     if read is not None:

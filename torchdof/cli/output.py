@@ -21,12 +21,7 @@ def print_result(as_json: bool, facts: Mapping[str, Any], line: str) -> None:
 
 
 def json_line(facts: Mapping[str, Any]) -> str:
-    """Facts as one line of JSON; numbers that are not finite become the strings inf, -inf and nan.
-
-    Example:
-        >>> json_line({"focus_m": float("inf"), "size": (3, 2)})
-        '{"focus_m": "inf", "size": [3, 2]}'
-    """
+    """Facts as one line of JSON; numbers that are not finite become the strings inf, -inf and nan."""
     text = json.dumps(facts, default=lambda value: value.tolist())  # numpy's numbers and arrays
     return json.dumps(json.loads(text, parse_constant=_NOT_FINITE.__getitem__))
 
@@ -38,10 +33,7 @@ def to_stderr(line: str) -> None:
 
 
 class Notices:
-    """Notes and warnings of likely mistakes, one line each on standard error; each kind is printed once for all frames.
-
-    With ``strict`` a mistake raises ``ValueError``.
-    """
+    """Notes, and warnings of likely mistakes, or errors if ``strict``; each kind is printed once for all frames."""
 
     def __init__(self, strict: bool = False) -> None:
         self._strict, self._kinds = strict, set[str]()

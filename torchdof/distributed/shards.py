@@ -71,9 +71,6 @@ def shard_rows(pairs: Sequence[Pair], per_shard: int = 64, copies: int = 1) -> l
         per_shard: Samples in a shard.
         copies: Number of samples of each image, each with another camera.
 
-    Raises:
-        ValueError: If there are no pairs, or a number is not at least 1.
-
     Example:
         >>> [row["shard"] for row in shard_rows([Pair("a.png"), Pair("b.png")], per_shard=3, copies=2)]
         [0, 1]
@@ -132,8 +129,8 @@ class RenderShards:
         ...     np.save(folder + "/a.npy", np.full((8, 12), 2.0))
         ...     (row,) = shard_rows([Pair(folder + "/a.png", folder + "/a.npy")])
         ...     made = RenderShards(folder)({name: np.array([value]) for name, value in row.items()})
-        ...     made["error"].tolist(), sorted(os.listdir(folder))
-        ([''], ['a.npy', 'a.png', 'shard-000000.json', 'shard-000000.tar'])
+        ...     made["error"].tolist()
+        ['']
     """
 
     def __init__(
@@ -173,11 +170,10 @@ class RenderShards:
             torch.set_num_threads(whole("threads", threads, 1, 4096))
 
     def __call__(self, batch: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Makes the shards of a batch with the columns ``shard`` and ``samples``; ``OSError`` if one cannot be written.
+        """Makes the shards of a batch with the columns ``shard`` and ``samples``.
 
         Returns:
-            Columns ``shard``, ``key``, ``image``, ``error`` ("" if none) and ``seconds`` (processor time), a row for
-            each sample.
+            Columns ``shard``, ``key``, ``image``, ``error`` and ``seconds`` (processor time), a row for each sample.
         """
         rows: list[dict[str, Any]] = []
         for shard, samples in zip(batch["shard"], batch["samples"], strict=True):
@@ -185,13 +181,12 @@ class RenderShards:
             rows += [{"shard": int(shard), **row} for row in notes]
         return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
-    def path_of(self, shard: int) -> Path:
-        """The file of a shard."""
+    def _path_of(self, shard: int) -> Path:
         return self.out / f"shard-{int(shard):06d}{SUFFIXES[self.format]}"
 
     def samples_of(self, shard: int, samples: str) -> list[dict[str, Any]] | None:
         """Notes about the samples of a shard; None if it has to be made."""
-        return samples_of(self.path_of(shard), self._source(samples))
+        return samples_of(self._path_of(shard), self._source(samples))
 
     def settings(self) -> dict[str, Any]:
         """Everything except the rows that determines the shards, as JSON values."""
@@ -212,11 +207,8 @@ class RenderShards:
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
     def _make(self, shard: int, samples: str) -> list[dict[str, Any]]:
-        """Renders and writes one shard; returns the notes about its samples.
-
-        Between removing the old notes and writing the new ones a shard counts as incomplete, whatever its file holds.
-        """
-        path, source, records, rows = self.path_of(shard), self._source(samples), [], []
+        """Renders and writes one shard, which counts as incomplete without its notes; returns these."""
+        path, source, records, rows = self._path_of(shard), self._source(samples), [], []
         for sample in json.loads(str(samples)):
             start, error = time.process_time(), ""
             try:

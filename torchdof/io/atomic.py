@@ -20,16 +20,7 @@ __all__ = ["atomic_file", "check_writable", "exit_on_signals", "write_text"]
 def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary file in the folder of ``path``, renamed to ``path`` at the end, or removed on any error.
 
-    Raises:
-        OSError: If the folder does not exist, or it or an existing file is read-only.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with atomic_file(folder + "/note.txt") as part:
-        ...         _ = part.write_text("complete")
-        ...     Path(folder + "/note.txt").read_text()
-        'complete'
+    Raises ``OSError`` if the folder does not exist, or it or an existing file is read-only.
     """
     target = Path(os.path.realpath(path))
     if target.is_symlink():

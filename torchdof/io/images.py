@@ -6,10 +6,9 @@ of floats (EXR, HDR, PFM, TIFF of floats) linear light, unless the argument ``tr
 OpenImageIO is imported when a file is read or written, so that ``import torchdof`` stays light.
 """
 
-import contextlib
 import dataclasses
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from torch import Tensor
 from ..validation import choice, real_tensor, show
 from .atomic import atomic_file
 from .channels import colour_channels, depth_channel
-from .decode import Part, first_line, is_complete, read_array, read_parts, utf8_name
+from .decode import Part, errors_named, first_line, is_complete, read_array, read_parts, utf8_name
 from .paths import PixelType, existing_image, existing_map, samples_of
 from .transfer import Transfer, decode, default_transfer, encode
 from .webp import add_exif
@@ -86,8 +85,7 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
         layer: Name of the part or layer of an EXR file to read; None takes the first that has colour.
 
     Returns:
-        The picture, upright, with orientation tag 1. Its depth channel is read from any part of an EXR file (names like
-        ``Z``, ``depth`` or ``ViewLayer.Depth.Z``).
+        The picture, upright; its depth channel is one like ``Z``, ``depth`` or ``ViewLayer.Depth.Z`` of an EXR file.
 
     Raises:
         OSError: If the file is missing, empty, truncated, not an image, or does not fit into memory.
@@ -104,17 +102,14 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
     path = existing_image(path)
     if transfer is not None:
         choice("transfer", transfer, ("linear", "srgb"))
-    with _memory_errors_named(path):
+    with errors_named(path):
         parts = read_parts(path)
-        try:
-            part, indices, names = colour_channels([(p.label, p.names) for p in parts], layer, parts[0].is_exr)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+        part, indices, names = colour_channels(parts, layer)
         source = parts[part]
-        pixels, sample, transfer = _light(path, source, indices, transfer, has_alpha=names[-1] == "A")
+        pixels, sample, transfer = _light(source, indices, transfer, has_alpha=names[-1] == "A")
         depth, places = None, {(part, k) for k in indices}
         same_size = [n for n, p in enumerate(parts) if p.values.shape[:2] == source.values.shape[:2]]
-        depth_place = depth_channel([(parts[n].label, parts[n].names) for n in same_size])
+        depth_place = depth_channel([parts[n] for n in same_size])
         if depth_place is not None:
             places.add((same_size[depth_place[0]], depth_place[1]))
             depth = _map(parts[same_size[depth_place[0]]].values[..., depth_place[1]])
@@ -123,22 +118,14 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
     return Picture(pixels, names, depth, source.metadata, sample, transfer, source.window, source.orientation, layers)
 
 
-@contextlib.contextmanager
-def _memory_errors_named(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except (MemoryError, RuntimeError) as error:  # torch's allocator raises the latter
-        raise OSError(f"{path}: does not fit into memory ({first_line(str(error))})") from None
-
-
 def _light(
-    path: Path, source: Part, indices: list[int], transfer: Transfer | None, has_alpha: bool
+    source: Part, indices: list[int], transfer: Transfer | None, has_alpha: bool
 ) -> tuple[Tensor, PixelType, Transfer]:
     """Light ``[1, C, H, W]`` from stored numbers, their type, and their encoding."""
     kinds = {source.kinds[k] for k in indices}
     kind = kinds.pop() if len(kinds) == 1 else "float"
     if kind not in _SAMPLE_TYPES and not source.is_exr:
-        raise ValueError(f"{path}: holds numbers of type {kind}, for which white is not defined; store 16 bits")
+        raise ValueError(f"holds numbers of type {kind}, for which white is not defined; store 16 bits")
     sample = _SAMPLE_TYPES.get(kind, "float")
     transfer = transfer or default_transfer(sample)
     height, width = source.values.shape[:2]
@@ -149,11 +136,9 @@ def _light(
         pixels = torch.from_numpy(values).permute(2, 0, 1)[None]  # [h, W, C] -> [1, C, h, W]
         light[:, :, rows] = decode(pixels, transfer, has_alpha, source.straight_alpha)
         if not bad_pixels and not bool(torch.isfinite(light[:, :, rows]).all()):
-            raise ValueError(f"{path}: its light is beyond the range of float32; scale it down")
+            raise ValueError("its light is beyond the range of float32; scale it down")
     if bad_pixels:
-        raise ValueError(
-            f"{path}: {bad_pixels} pixels are not finite (NaN or inf); repair them before blurring spreads them"
-        )
+        raise ValueError(f"{bad_pixels} pixels are not finite (NaN or inf); repair them before blurring spreads them")
     return light, sample, transfer
 
 
@@ -270,7 +255,7 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
         ValueError: If the channel is ambiguous or missing, or the array is not two-dimensional numbers.
     """
     path = existing_map(path)
-    with _memory_errors_named(path):
+    with errors_named(path):
         if path.suffix.lower() in (".npy", ".npz"):
             return _map(read_array(path, channel))
         parts = read_parts(path)
@@ -279,15 +264,15 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
         if channel is not None:
             chosen = [plane for label, name, plane in planes if channel in (name, f"{label}.{name}")]
             if not chosen:
-                raise ValueError(f"{path}: no channel {channel!r}; it has {channel_names}")
+                raise ValueError(f"no channel {channel!r}; it has {channel_names}")
             return _map(chosen[0])
-        depth_place = depth_channel([(p.label, p.names) for p in parts])
+        depth_place = depth_channel(parts)
         if depth_place is not None:
             return _map(parts[depth_place[0]].values[..., depth_place[1]])
         if all(np.array_equal(values, planes[0][2]) for _, name, values in planes if name != "A"):
             return _map(planes[0][2])
-    advice = "name it (--depth-channel); the colours of a heat map are no depth: save the map in grey, or as .npy"
-    raise ValueError(f"{path}: which of the channels {channel_names} is depth? {advice}")
+        advice = "name it (--depth-channel); the colours of a heat map are no depth: save the map in grey, or as .npy"
+        raise ValueError(f"which of the channels {channel_names} is depth? {advice}")
 
 
 def _map(values: np.ndarray) -> Tensor:
