@@ -15,9 +15,10 @@ import argparse
 import functools
 import itertools
 import json
-import multiprocessing
 import resource
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -32,7 +33,7 @@ from torchdof import blur_by_coc
 from torchdof.depth.reading import read_depth
 from torchdof.functional import splat
 from torchdof.io.images import read_image
-from torchdof.reference.scenes import read_scenes
+from torchdof.reference.scenes import Scene, read_scenes
 
 DATA = Path(__file__).parents[1] / "data" / "motorcycle"
 RENDERERS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
@@ -42,8 +43,8 @@ RENDERERS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 }
 SIZES = {"cpu": [(256, 256, 1), (256, 256, 8), (480, 480, 1)], "cuda": [(256, 256, 8), (512, 512, 8), (1080, 1920, 1)]}
 READS = ("_local_scalar_dense", "nonzero", "equal", "_unique2")
-Pictures = dict[str, tuple[Tensor, Tensor]]
-"""Name -> light ``[B, C, H, W]`` and nearness ``[B, 1, H, W]``, which is linear in the circle of confusion."""
+Made = Callable[[], tuple[Tensor, Tensor]]
+"""Light ``[B, C, H, W]`` and nearness ``[B, 1, H, W]``, which is linear in the circle of confusion."""
 
 
 class Counted(TorchDispatchMode):
@@ -57,46 +58,53 @@ class Counted(TorchDispatchMode):
         return function(*args, **(kwargs or {}))
 
 
-def of_photograph(device: str) -> Pictures:
-    """Parts of the photograph, which is enlarged if it is smaller, with their dioptres."""
+def parts(height: int, width: int, batch: int) -> tuple[Tensor, Tensor]:
+    """Light and dioptres of parts of the photograph, which is enlarged if it is smaller."""
     calibration = json.loads((DATA / "camera.json").read_text())
-    photo = read_image(DATA / "motorcycle_left.png").pixels
-    photo = torch.cat([photo, 1.0 / read_depth(DATA / "motorcycle_disp.npz", **calibration["depth"])], 1)
-    made: Pictures = {}
-    for height, width, batch in SIZES[device.split(":")[0]]:
-        factor = max(1.0, height / photo.shape[-2], width / photo.shape[-1])
-        large = functional.interpolate(photo, [round(factor * n) for n in photo.shape[-2:]], mode="nearest")
-        rows, columns = (n - side + 1 for n, side in zip(large.shape[-2:], (height, width), strict=True))
-        corners = [(97 * i % rows, 211 * i % columns) for i in range(batch)]
-        parts = torch.cat([large[..., y : y + height, x : x + width] for y, x in corners])
-        made[f"{batch} of {width} x {height}"] = parts[:, :3], parts[:, 3:]
-    return made
+    image = read_image(DATA / "motorcycle_left.png").pixels
+    dioptres = 1.0 / read_depth(DATA / "motorcycle_disp.npz", **calibration["depth"])
+    factor = max(1.0, height / image.shape[-2], width / image.shape[-1])
+    size = [round(factor * n) for n in image.shape[-2:]]
+    image = functional.interpolate(image, size, mode="bilinear", align_corners=False)
+    dioptres = functional.interpolate(dioptres, size, mode="nearest")
+    corners = [(97 * i % (size[0] - height + 1), 211 * i % (size[1] - width + 1)) for i in range(batch)]
+    light, near = (torch.cat([t[..., y : y + height, x : x + width] for y, x in corners]) for t in (image, dioptres))
+    return light, near
 
 
-def of_scenes(folder: Path) -> Pictures:
-    """The scenes of a folder, each alone, and four of one size together."""
-    made: Pictures = {}
+def together(scenes: tuple[Scene, ...]) -> tuple[Tensor, Tensor]:
+    """Light and nearness of scenes of one size."""
+    return torch.cat([scene.image for scene in scenes]), torch.cat([-scene.coc_px for scene in scenes])
+
+
+def pictures(folder: Path | None, device: str) -> dict[str, Made]:
+    """The pictures to render, by name."""
+    if folder is None:
+        sizes = SIZES[device.split(":")[0]]
+        return {
+            f"{batch} of {width} x {height}": functools.partial(parts, height, width, batch)
+            for height, width, batch in sizes
+        }
+    made: dict[str, Made] = {}
     for _, of_size in itertools.groupby(read_scenes(folder), lambda scene: scene.image.shape):
-        scenes = list(of_size)
+        scenes = tuple(of_size)
         for count in (1, 4):
             for start in range(0, len(scenes) - count + 1, count):
                 some = scenes[start : start + count]
-                tensors = torch.cat([scene.image for scene in some]), torch.cat([-scene.coc_px for scene in some])
-                made[" to ".join(dict.fromkeys((some[0].name, some[-1].name)))] = tensors
+                made[" to ".join(dict.fromkeys((some[0].name, some[-1].name)))] = functools.partial(together, some)
     return made
 
 
-def measure(case: tuple[str, str, float], arguments: argparse.Namespace) -> str:
-    """The row of a picture, a renderer and a radius in pixels."""
-    (name, renderer, radius_px), device = case, arguments.device
-    torch.set_num_threads(arguments.threads)
-    made = of_photograph(device) if arguments.scenes is None else of_scenes(arguments.scenes)
-    image, near = (t.to(device).contiguous() for t in made[name])
+def measure(name: str, made: Made, renderer: str, radius_px: float, device: str, repeat: int) -> None:
+    """Print one row."""
+    image, near = (t.to(device).contiguous() for t in made())
     low, high = near.aminmax()
     near = (near - low) / (high - low)
     focus_positions = itertools.cycle(0.05 + 0.9 * torch.rand(97, generator=torch.Generator().manual_seed(0)))
-    render, is_cpu = RENDERERS[renderer], device == "cpu"
+    render = RENDERERS[renderer]
+    is_cpu = device == "cpu"
     clock = time.process_time if is_cpu else time.perf_counter
+    wait = (lambda: None) if is_cpu else torch.cuda.synchronize
 
     def coc_px() -> Tensor:
         return radius_px * (float(next(focus_positions)) - near)
@@ -112,26 +120,26 @@ def measure(case: tuple[str, str, float], arguments: argparse.Namespace) -> str:
     def most_bytes() -> int:
         if is_cpu:
             return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-        torch.cuda.synchronize()
         return torch.cuda.max_memory_allocated()
 
     def measured(call: Callable[[], None]) -> tuple[float, float]:
         """Median milliseconds of some calls after a first one, and the most MiB taken since the start."""
         if not is_cpu:
             torch.cuda.reset_peak_memory_stats()
-        durations, most = [], before
-        for _ in range(arguments.repeat + 1):
+        durations = []
+        for _ in range(repeat + 1):
+            wait()
             start = clock()
             call()
-            most = most_bytes()  # waits for a GPU
+            wait()
             durations.append(clock() - start)
-        return 1e3 * statistics.median(durations[1:]), (most - before) / 2**20
+        return 1e3 * statistics.median(durations[1:]), (most_bytes() - before) / 2**20
 
     before = most_bytes()
     (frame_ms, frame_mib), (step_ms, step_mib) = measured(picture), measured(step)
     with Counted() as counted:
         picture()
-    return (
+    print(
         f"{f'{name}, {renderer}, {radius_px:g} px':46} {frame_ms:8.2f} ms {step_ms:8.2f} ms {step_ms / frame_ms:6.1f} "
         f"{frame_mib:7.0f} MiB {step_mib:7.0f} MiB {counted.operations:10} {counted.reads:5}"
     )
@@ -145,22 +153,22 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--radius", type=float, nargs="+", default=[8.0], help="largest blur radii in pixels")
     parser.add_argument("--repeat", type=int, default=7, help="calls of which the median is taken")
+    parser.add_argument("--row", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    made = of_photograph(arguments.device) if arguments.scenes is None else of_scenes(arguments.scenes)
+    torch.set_num_threads(arguments.threads)
+    made = pictures(arguments.scenes, arguments.device)
+    rows = list(itertools.product(made.items(), RENDERERS, arguments.radius))
+    if arguments.row is not None:
+        (name, of_name), renderer, radius_px = rows[arguments.row]
+        measure(name, of_name, renderer, radius_px, arguments.device, arguments.repeat)
+        return
     titles = (
-        ("picture", 11),
-        ("step", 11),
-        ("ratio", 6),
-        ("memory", 11),
-        ("of a step", 11),
-        ("operations", 10),
-        ("reads", 5),
+        f"{'picture':>11} {'step':>11} {'ratio':>6} {'memory':>11} {'of a step':>11} {'operations':>10} {'reads':>5}"
     )
-    print(" " * 46, *(f"{title:>{width}}" for title, width in titles))
-    with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as processes:
-        cases = itertools.product(made, RENDERERS, arguments.radius)
-        for row in processes.imap(functools.partial(measure, arguments=arguments), cases, chunksize=1):
-            print(row, flush=True)
+    print(f"{'':46} {titles}")
+    for row in range(len(rows)):
+        sys.stdout.flush()
+        subprocess.run([sys.executable, __file__, *sys.argv[1:], "--row", str(row)], check=True)
 
 
 if __name__ == "__main__":
