@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -131,9 +132,12 @@ class Fit(_Photographs, _Target, _Lens, Command):
         from rich.console import Console
 
         from torchdof.cli.fit_tables import fit_photographs, trace_lens
+        from torchdof.fit.problems import FitWarning
 
         console = Console(soft_wrap=True, quiet=self.as_json, markup=False, highlight=False)
         if self.lens is not None:
             trace_lens(self, self.lens, console)
         elif self.captures is not None:
-            fit_photographs(self, self.captures, console)
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always", FitWarning)
+                fit_photographs(self, self.captures, console, caught)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +19,6 @@ from torchdof.fit.photo.captures import Captures
 from torchdof.fit.photo.manifest import MANIFEST, read_captures
 from torchdof.fit.photo.photographs import read_photographs
 from torchdof.fit.photo.table import TableFit, fit_captures
-from torchdof.fit.problems import FitWarning
 from torchdof.io.atomic import atomic_file
 from torchdof.io.columns import print_columns
 from torchdof.validation import number
@@ -66,38 +63,43 @@ def trace_lens(command: Fit, source: str, console: Console) -> None:
         _save(console, picture_of_table(table), command.plots / f"{command.out.stem}_table.png")
 
 
-def fit_photographs(command: Fit, folder: Path, console: Console) -> None:
-    """Fits photographs of the target, or the dots of a manifest, prints the fits, and writes their tables."""
+def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[warnings.WarningMessage]) -> None:
+    """Fits photographs of the target, or the dots of a manifest, prints the fits, and writes their tables.
+
+    ``caught`` is the list in which Python collects warnings.
+    """
     photographs, printed, fitted = None, set[str](), list[tuple[Captures, TableFit]]()
     dots: Any = None if command.dots == "manifest" else command.dots
     colours: Any = None if command.colours == "manifest" else command.colours
-    with _collected_warnings() as reading_warnings:
-        if folder.is_dir() and not (folder / MANIFEST).is_file():
-            photographs = read_photographs(
-                folder, square_mm=command.square_mm, colours=colours or "mean", root=command.root
-            )
-            capture_sets = [photographs.captures]
-            sharp, pictures = photographs.captures.notes["sharp"], photographs.pictures
-            columns = {
-                "file": [picture.file for picture in pictures],
-                "distance m": [f"{picture.distance_m:.3f}" for picture in pictures],
-                "square px": [f"{picture.target.side_px:.0f}" for picture in pictures],
-                "paper %": [f"{100 * picture.target.white:.0f}" for picture in pictures],
-                "edge px": [f"{1 / picture.sharpness:.1f}" for picture in pictures],
-                "": ["in focus" if picture.file == sharp else "" for picture in pictures],
-            }
-            print_columns(console, "the target in the photographs", columns)
-            for sentence in photographs.advice:
-                console.print(f"better: {sentence}", style="cyan")
-        else:
-            capture_sets = read_captures(str(folder), dots=dots, colours=colours, root=command.root)
+    if folder.is_dir() and not (folder / MANIFEST).is_file():
+        mode: Any = colours or "mean"
+        photographs = read_photographs(folder, square_mm=command.square_mm, colours=mode, root=command.root)
+        capture_sets = [photographs.captures]
+        sharp, pictures = photographs.captures.notes["sharp"], photographs.pictures
+        columns = {
+            "file": [picture.file for picture in pictures],
+            "distance m": [f"{picture.distance_m:.3f}" for picture in pictures],
+            "square px": [f"{picture.target.side_px:.0f}" for picture in pictures],
+            "paper %": [f"{100 * picture.target.white:.0f}" for picture in pictures],
+            "edge px": [f"{1 / picture.sharpness:.1f}" for picture in pictures],
+            "": ["in focus" if picture.file == sharp else "" for picture in pictures],
+        }
+        print_columns(console, "the target in the photographs", columns)
+        for sentence in photographs.advice:
+            console.print(f"better: {sentence}", style="cyan")
+    else:
+        capture_sets = read_captures(str(folder), dots=dots, colours=colours, root=command.root)
     across_field = photographs is None and capture_sets[0].notes["dots"] == "field"
+    of_fit = ("params", "stderr", "residual", "residual_over_noise", "magnification")
+    of_colour = ("name", "focus_shift_dioptres", "lateral_px")
+    of_reading = len(caught)
     for i, captures in enumerate(capture_sets):
         out = command.out
         if len(capture_sets) > 1:
             out = out.with_name(f"{out.stem}_{i:02d}.json")
             console.print(f"dot {i} at {captures.notes['position_px']} px from the centre")
-        with _collected_warnings() as fit_warnings, progress_bar("fitting") as update:
+        del caught[of_reading:]  # the warnings of other dots
+        with progress_bar("fitting") as update:
             result = fit_captures(
                 captures,
                 command.family,
@@ -106,13 +108,27 @@ def fit_photographs(command: Fit, folder: Path, console: Console) -> None:
                 command=f"torchdof fit {folder.name} --family {command.family} --accuracy-db {command.accuracy_db:g}",
                 scale_of=fitted[0][1] if fitted else None,  # all dots use the scale of the one nearest to the centre
             )
-        messages = [*reading_warnings, *fit_warnings]
         fitted.append((captures, result))
-        _print_fit(console, captures, result, [message for message in messages if message not in printed])
+        _print_fit(console, captures, result)
+        messages = list(dict.fromkeys(str(warning.message) for warning in caught))
+        for message in (message for message in messages if message not in printed):
+            console.print(f"warning: {message}", style="yellow")
         printed.update(messages)
         if not across_field:
             _write(console, result.table, out)
-        facts = {"out": str(out), **_facts_of(captures, result), "warnings": messages}
+        facts: dict[str, Any] = {
+            **{"out": str(out), "name": captures.name, "family": result.fits[0].family},
+            **{"why": result.why, "scale": result.scale, "focus_m": captures.focus_m},
+            "fits": [
+                {"distance_m": pair.distance_m, "coc_px": coc, **{name: getattr(fit, name) for name in of_fit}}
+                for pair, fit, coc in zip(captures, result.fits, result.coc_px, strict=True)
+            ],
+            "colours": [
+                {**{name: getattr(c, name) for name in of_colour}, "radius_px": [fit.radius for fit in c.fits]}
+                for c in result.colours
+            ],
+            "warnings": messages,
+        }
         if photographs is not None:
             facts["advice"] = list(photographs.advice)
             try:
@@ -121,7 +137,7 @@ def fit_photographs(command: Fit, folder: Path, console: Console) -> None:
                 sheet = sheet_of_photographs(
                     photographs, result, lambda *scene: blur_by_coc(*scene[:2], table=scene[2])
                 )
-                _save(console, sheet, command.out.with_suffix(".png"))
+                _save(console, sheet, out.with_suffix(".png"))
             except ModuleNotFoundError as error:
                 console.print(f"no sheet of pictures: {error.name} is not installed (pip install torchdof[plot])")
         elif command.plots is not None:
@@ -137,36 +153,8 @@ def fit_photographs(command: Fit, folder: Path, console: Console) -> None:
         _write(console, table_of_dots(fitted), command.out)
 
 
-@contextmanager
-def _collected_warnings() -> Iterator[list[str]]:
-    """Collects warnings in a list, which is filled at the end of the block, without duplicates."""
-    messages = list[str]()
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", FitWarning)
-        yield messages
-    messages += dict.fromkeys(str(w.message) for w in caught)
-
-
-def _facts_of(captures: Captures, result: TableFit) -> dict[str, Any]:
-    """The results that :func:`_print_fit` prints, as data for JSON."""
-    of_fit = ("params", "stderr", "residual", "residual_over_noise", "magnification")
-    of_colour = ("name", "focus_shift_dioptres", "lateral_px")
-    return {
-        **{"name": captures.name, "family": result.fits[0].family, "why": result.why, "scale": result.scale},
-        "focus_m": captures.focus_m,
-        "fits": [
-            {"distance_m": pair.distance_m, "coc_px": coc, **{name: getattr(fit, name) for name in of_fit}}
-            for pair, fit, coc in zip(captures, result.fits, result.coc_px, strict=True)
-        ],
-        "colours": [
-            {**{name: getattr(colour, name) for name in of_colour}, "radius_px": [fit.radius for fit in colour.fits]}
-            for colour in result.colours
-        ],
-    }
-
-
-def _print_fit(console: Console, captures: Captures, result: TableFit, messages: Sequence[str]) -> None:
-    """Prints the fits at all distances, the reason for the family, the colours, and warnings."""
+def _print_fit(console: Console, captures: Captures, result: TableFit) -> None:
+    """Prints the fits at all distances, the reason for the family, and the colours."""
     fits = result.fits
     columns = {
         "distance m": [f"{pair.distance_m:.4g}" for pair in captures],
@@ -191,8 +179,6 @@ def _print_fit(console: Console, captures: Captures, result: TableFit, messages:
         columns["lateral px in focus"] = [f"({x:+.2f}, {y:+.2f})" for x, y in lateral]
         print_columns(console, "colours, beside green", columns)
         console.print("the table holds a kernel a colour; lateral colour is no blur, and not in it")
-    for message in messages:
-        console.print(f"warning: {message}", style="yellow")
 
 
 def _write(console: Console, table: BlurTable, target: Path) -> None:

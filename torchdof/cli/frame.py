@@ -58,23 +58,21 @@ class Frame:
 
 
 def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = False, **encoding: Any) -> Frame:
-    """Reads an image, as :func:`torchdof.io.images.read_image` does, and its depth, which may be a channel of it.
+    """Reads an image, with arguments of ``read_image``, and its depth, which may be a channel of it.
 
-    A depth of the kind "auto" is guessed. Holes are filled as the options state. Without that option they stay NaN
-    if ``holes`` is true; otherwise they are filled as the guess proposes, or raise ``ValueError``.
+    Holes are filled as the options state, else stay NaN if ``holes`` is true, else are filled as a guess proposes.
     """
     source, guess, picture, fill = depth or image, "", read_image(image, **encoding), scene.fill_depth
     height, width = picture.pixels.shape[-2:]
-    area = Area(0, 0, width, height)
-    if picture.window is not None and image.suffix.lower() == ".exr":
-        x, y, full_x, full_y, *size = picture.window
-        area = Area(x - full_x, y - full_y, *size)
+    is_exr = image.suffix.lower() == ".exr"
+    x, y, full_x, full_y, *size = (picture.window if is_exr else None) or (0, 0, 0, 0, width, height)
+    area = Area(x - full_x, y - full_y, *size)
     if depth is not None or scene.depth_channel is not None:
         values = read_values(source, scene.depth_channel)
     elif picture.depth is not None:
         values = picture.depth
     else:
-        hint = "" if image.suffix.lower() == ".exr" else ", which a network such as Depth Anything makes of it"
+        hint = "" if is_exr else ", which a network such as Depth Anything makes of it"
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH{hint}")
     if scene.depth_kind == "auto":
         is_metric = bool(scene.given(Lens) & {"focus_m", "focus_range", "aperture_radius_m"})
@@ -115,15 +113,12 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
 def coc_of(
     frame: Frame, notices: Notices, number: int = 0, is_still: bool = True
 ) -> tuple[Tensor, Camera | None, list[str]]:
-    """Signed radius ``[1, 1, H, W]`` in pixels, the camera (None for ``--depth-kind coc``), and remarks on both.
-
-    ``number`` is the frame number, at which the focus is interpolated between keyframes.
-    """
+    """Signed radius ``[1, 1, H, W]`` in pixels, the camera (None for ``--depth-kind coc``), and remarks on both."""
     scene, values = frame.scene, frame.values
     if scene.depth_kind == "coc":
         notices.warn(frame.name, coc_mistakes(values))
         return values, None, []
-    camera, remarks = scene.camera(frame.picture.metadata, values, frame.area, number, is_still, scene.is_to_scale)
+    camera, remarks = scene.camera(frame, number, is_still)
     coc_px = frame.area.coc_px(camera, values)
     coc_of_lens(coc_px, values, {name: getattr(camera, name) for name in CAMERA_NUMBERS})
     notices.warn(frame.name, frame.mistakes(camera))

@@ -40,7 +40,7 @@ class Inspect(Scene, Command):
         light, metres = frame.picture.light, frame.values
         if not bool((metres > 0).any()):
             raise ValueError(f"{frame.name}: no pixel has a depth; check the kind, scale and offset of the depth map")
-        camera, notes = scene.camera(frame.picture.metadata, metres, frame.area, is_to_scale=scene.is_to_scale)
+        camera, notes = scene.camera(frame)
         notes += frame.remarks
         report = inspect_depth(light, metres, camera)
         make_folder_of(target)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from ..optics.camera import Camera
+    from .frame import Frame
 
 _DEFAULTS = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
 _LABELS = dict(zip(_DEFAULTS, ("focal length", "f-number", "sensor width"), strict=True))
@@ -23,10 +24,7 @@ _PER_OUTLIER, _MAX_SAMPLES = 1000, 2**20  # one pixel in 1000 is ignored as an o
 
 
 class Area(NamedTuple):
-    """Place of an image's first pixel in the full frame, and the size of that frame, in pixels.
-
-    An EXR stores a data window, which may be a part of the frame (its display window) or extend beyond it.
-    """
+    """Place of an image (an EXR's data window) in the full frame (its display window), and that frame's size, in px."""
 
     x: int
     y: int
@@ -34,11 +32,7 @@ class Area(NamedTuple):
     height: int
 
     def centred(self, values: "Tensor", size: Sequence[int]) -> "tuple[Tensor, Any]":
-        """Pads a map so that the optical axis, in the middle of the full frame, is in the middle of the map.
-
-        The map ``[1, 1, h, w]`` is of an image of a height and width in pixels. Also returns its index in the padded
-        one.
-        """
+        """A map of an image of a size, padded so that the optical axis is in its middle, and the map's index in it."""
         from torch.nn.functional import pad
 
         (height, width), (rows, columns) = size, values.shape[-2:]
@@ -168,36 +162,29 @@ class Lens(Sensor):
             return dict(zip(_DEFAULTS, (*self.equivalent, _full_frame_mm(area)), strict=True))
         return {name: value for name in _DEFAULTS if (value := getattr(self, name)) is not None}
 
-    def camera(
-        self,
-        metadata: Mapping[str, Any],
-        depth: "Tensor",
-        area: Area,
-        frame: int = 0,
-        is_still: bool = True,
-        is_to_scale: bool = True,
-    ) -> "tuple[Camera, list[str]]":
-        """The camera of one picture, and remarks on the source of the numbers that no option states.
+    def camera(self, frame: "Frame", number: int = 0, is_still: bool = True) -> "tuple[Camera, list[str]]":
+        """The camera of one frame, and remarks on the source of the numbers that no option states.
 
         1. Take the focus from the options, else from the file, else from the subject of a still.
         2. Take the lens of the full frame from the options, else from the file, else from ``_DEFAULTS``, or a phone's
            sensor for a focal length of the file that no larger camera has.
         3. Open the lens for the blur of ``--blur``, or for a visible blur in a still whose options leave it open.
 
-        In a sequence nothing is guessed, because guesses would differ from frame to frame. Without ``is_to_scale`` the
-        file's focus is ignored.
+        In a sequence nothing is guessed, because guesses would differ from frame to frame. The focus of the file is
+        ignored if the depth is not to scale.
         """
         from ..depth.guess import subject_m
         from ..optics.camera import Camera
 
-        width = depth.shape[-1]
-        stated, in_file = self._stated(area), camera_settings(metadata, area.width, area.height)
+        area, depth, is_to_scale = frame.area, frame.values, frame.scene.is_to_scale
+        width, stated = depth.shape[-1], self._stated(area)
+        in_file = camera_settings(frame.picture.metadata, area.width, area.height)
         lens: dict[str, Any] = {name: (_DEFAULTS | in_file | stated)[name] for name in _DEFAULTS}
         if in_file.get("focal_length_mm", math.inf) < _PHONE_MM and "sensor_width_mm" not in in_file | stated:
             lens["sensor_width_mm"] = _full_frame_mm(area) * in_file["focal_length_mm"] / _PHONE_EQUIVALENT_MM
         remarks, focus_m = list[str](), math.inf
         if self.focus_m is not None:
-            focus_m = focus_at_frame(self.focus_m, frame)
+            focus_m = focus_at_frame(self.focus_m, number)
         elif not self.has_focus and is_to_scale and 1000 * in_file.get("focus_m", 0.0) > lens["focal_length_mm"]:
             focus_m = in_file["focus_m"]
             remarks.append("focus from the file")
