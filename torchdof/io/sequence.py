@@ -73,14 +73,10 @@ def parse_focus(text: str) -> list[tuple[int, float]]:
 
 def focus_at_frame(keys: list[tuple[int, float]], frame: int) -> float:
     """Focus distance in metres at a frame: linear in 1/distance, as blur is, between keyframes, constant beyond."""
+    import numpy as np
+
     from ..validation import number  # imports PyTorch, which parsing of arguments must not need
 
-    number("frame", frame)
-    if frame <= keys[0][0]:
-        return keys[0][1]
-    for (first_frame, near), (last_frame, far) in zip(keys, keys[1:], strict=False):
-        if frame <= last_frame:
-            fraction = (frame - first_frame) / (last_frame - first_frame)
-            dioptres = (1.0 - fraction) / near + fraction / far
-            return far if frame == last_frame else 1.0 / dioptres if dioptres > 0 else math.inf
-    return keys[-1][1]
+    distances = dict(keys)
+    dioptres = float(np.interp(number("frame", frame), [*distances], [1.0 / metres for metres in distances.values()]))
+    return distances[frame] if frame in distances else 1.0 / dioptres if dioptres > 0 else math.inf
