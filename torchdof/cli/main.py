@@ -101,11 +101,7 @@ def main() -> None:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raises ``KeyboardInterrupt``, but ends the process while PyTorch is imported.
-
-    PyTorch imports NumPy from C++ and ignores any error there; after an interrupt the command would continue without
-    NumPy. No file is being written during the import.
-    """
+    """Raises ``KeyboardInterrupt``, but ends the process while PyTorch, which ignores it, imports NumPy from C++."""
     if getattr(getattr(sys.modules.get("torch"), "__spec__", None), "_initializing", False):
         with contextlib.suppress(OSError):
             os.write(2, b"interrupted\n")

@@ -81,11 +81,9 @@ class DepthMap(Group):
         return self.depth_kind != "relative" or self.near_m is not None or self.far_m is not None
 
     def guessed(self, values: "Tensor", path: Path, is_metric: bool) -> "tuple[Self, str]":
-        """These options with a guessed kind instead of ``auto``, and a message about the guess.
+        """These options with a guessed kind instead of ``auto``, and a message about the guess, or none if it is clear.
 
-        If other options are in metres (``is_metric``) and so is the guess, there is a message only for numbers that
-        would be taken for relative depth without these options. Otherwise holes are filled from the far side by
-        default.
+        ``is_metric``: other options are in metres.
         """
         from ..depth.guess import guess_kind
 

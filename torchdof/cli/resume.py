@@ -32,10 +32,7 @@ class Record:
     def kept(
         self, frames: Mapping[int, Path], sources: Mapping[int, Sequence[Path | None]], is_steady: bool
     ) -> set[Path]:
-        """The existing frames that are complete, and not older than the record and the ``sources`` of each frame.
-
-        With ``is_steady`` a frame also depends on the sources of those before it.
-        """
+        """The complete existing frames not older than the record and their sources (if steady, those of all before)."""
         from ..io.decode import is_complete  # imports NumPy
 
         def changed_ns(*paths: Path | None) -> int:

@@ -1,8 +1,4 @@
-"""Makes one shard of a data set: reads images, blurs them with random or given cameras, writes all samples or none.
-
-A shard's file name is its number, and its contents depend only on its row, its input files and the settings. A run that
-was interrupted can therefore continue with the missing shards, and gives the same files as an uninterrupted one.
-"""
+"""Makes one shard of a data set, whose contents depend only on its row, its input files and the settings."""
 
 import dataclasses
 import hashlib
@@ -170,11 +166,7 @@ class RenderShards:
             torch.set_num_threads(whole("threads", threads, 1, 4096))
 
     def __call__(self, batch: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Makes the shards of a batch with the columns ``shard`` and ``samples``.
-
-        Returns:
-            Columns ``shard``, ``key``, ``image``, ``error`` and ``seconds`` (processor time), a row for each sample.
-        """
+        """Makes the shards of a batch; returns shard, key, image, error and processor seconds of each sample."""
         rows: list[dict[str, Any]] = []
         for shard, samples in zip(batch["shard"], batch["samples"], strict=True):
             notes = self.samples_of(shard, samples) or self._make(shard, samples)

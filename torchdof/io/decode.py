@@ -1,8 +1,4 @@
-"""The stored numbers of image files and arrays, before their conversion to light or depth.
-
-The size in a header is compared with limits and with free memory before anything is decoded. OpenImageIO is imported
-when a file is read, so that ``import torchdof`` stays light.
-"""
+"""The stored numbers of image files and arrays, whose size is compared with limits and memory before it is decoded."""
 
 import contextlib
 import dataclasses

@@ -2,8 +2,6 @@
 
 The transfer curve is never guessed from a tag. Files of integers (PNG, JPEG, TIFF of 8 or 16 bits) are sRGB, and files
 of floats (EXR, HDR, PFM, TIFF of floats) linear light, unless the argument ``transfer`` changes that.
-
-OpenImageIO is imported when a file is read or written, so that ``import torchdof`` stays light.
 """
 
 import dataclasses

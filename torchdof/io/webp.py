@@ -1,8 +1,4 @@
-"""Chunks of WebP files: EXIF data of a picture, and pictures joined to an animation.
-
-Reference:
-    WebP Container Specification, developers.google.com/speed/webp/docs/riff_container.
-"""
+"""Chunks of WebP files (RIFF containers): EXIF data of a picture, and pictures joined to an animation."""
 
 import os
 import struct
