@@ -129,7 +129,9 @@ def _light(
     height, width = source.values.shape[:2]
     light, bad_pixels = torch.from_numpy(np.empty((1, len(indices), height, width), np.float32)), 0
     for rows in _strips(height, width * len(indices)):
-        values = _float32(source.values[rows][..., indices]) / np.float32(_WHITE[sample])
+        values = _float32(source.values[rows][..., indices])
+        if _WHITE[sample] > 1:
+            values /= np.float32(_WHITE[sample])
         bad_pixels += int((~np.isfinite(values)).any(axis=-1).sum())
         pixels = torch.from_numpy(values).permute(2, 0, 1)[None]  # [h, W, C] -> [1, C, h, W]
         light[:, :, rows] = decode(pixels, transfer, has_alpha, source.straight_alpha)
