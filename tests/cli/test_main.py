@@ -42,29 +42,6 @@ def test_an_option_means_the_same_in_all_commands() -> None:
     assert all("--json" in {option for p in command.params for option in p.opts} for command in PARSED.values())
 
 
-NAMES = """
-render: image depth out focus_m focus_at focus_range tilt swing f_number focal_length_mm sensor_width_mm fov_deg
-    aperture_radius_m blur_share equivalent depth_kind depth_scale depth_offset near_m far_m relative_kind value_range
-    strict depth_unknown fill_depth depth_channel depth_edges table blades rotation curvature squeeze aperture
-    vignetting tolerance attention lights no_occlusion method show_focus device transfer out_transfer bits layer
-    sheet frames steady resume as_json
-inspect: image depth out focus_m focus_at focus_range tilt swing f_number focal_length_mm sensor_width_mm fov_deg
-    aperture_radius_m depth_kind depth_scale depth_offset near_m far_m relative_kind value_range strict depth_unknown
-    fill_depth depth_channel as_json
-tables: names out blades rotation curvature squeeze aperture vignetting as_json
-export: out show focal_length_mm sensor_width_mm fov_deg table blades rotation curvature squeeze aperture max_coc
-    tolerance no_occlusion method depth_edges inputs channels width opset as_json
-fit: captures out family accuracy_db dots colours target paper square_mm root lens f_number focus_m nodes field_deg
-    field wavelengths plots as_json
-"""
-
-
-@pytest.mark.parametrize("line", NAMES.replace("\n    ", " ").strip().splitlines(), ids=lambda line: line.split(":")[0])
-def test_names_of_options_that_scripts_use_still_exist(line: str) -> None:
-    command, _, names = line.partition(": ")
-    assert set(names.split()) <= {parameter.name for parameter in PARSED[command].params}
-
-
 def test_defaults_equal_those_of_the_library() -> None:
     from torchdof.export.conversion import OPSET
     from torchdof.fit.photo.target import SQUARE_MM

@@ -21,7 +21,7 @@ from ..reference.ikoma import layered_fft
 from ..reference.lens_views import lens_views
 from ..reference.scenes import Scene, read_scenes
 from .measurement import BenchScene, Renderer, error, measure
-from .report import Row, publish, summary
+from .report import publish, summary
 
 __all__ = ["compare", "read_peer", "renderers"]
 
@@ -33,12 +33,7 @@ def _lens_views(views: int, image: Tensor, coc_px: Tensor) -> Tensor:
 
 
 def renderers(degraded: bool) -> dict[str, Renderer]:
-    """The renderers compared, by name, with disc kernels.
-
-    Example:
-        >>> list(renderers(degraded=False))
-        ['untouched', 'scatter', 'ikoma', 'torchdof', 'torchdof dense']
-    """
+    """The renderers compared, by name, with disc kernels."""
     common: dict[str, Renderer] = {"ikoma": layered_fft, "torchdof": blur_by_coc}
     if degraded:
         return {"as given": functools.partial(blur_by_coc, depth_edges="as given"), **common}
@@ -48,15 +43,7 @@ def renderers(degraded: bool) -> dict[str, Renderer]:
 
 
 def read_peer(path: Path) -> tuple[str, Renderer]:
-    """Loads another renderer: a Python file with ``blur(image, coc_px)``, as in ``examples/benchmarks/tools``.
-
-    Returns:
-        Its name and version, and its function.
-
-    Raises:
-        OSError: If the file is missing.
-        ValueError: If it has no such function, or cannot run here.
-    """
+    """Name with version, and function of another renderer: a Python file as in ``examples/benchmarks/tools``."""
     peer = runpy.run_path(str(path))
     if not callable(peer.get("blur")):
         raise ValueError(f"{path}: has no function blur(image, coc_px)")
@@ -69,16 +56,8 @@ def read_peer(path: Path) -> tuple[str, Renderer]:
 def compare(truth: Path, out: Path, views: Sequence[int], degraded: bool, peers: Sequence[Path]) -> None:
     """Scores every renderer on every scene of a folder; prints and writes tables and a picture of the worst regions.
 
-    Args:
-        truth: Folder of scenes, see :func:`torchdof.reference.scenes.read_scenes`.
-        out: Folder for ``accuracy.csv``, ``.md`` and ``.png``, or ``degraded.csv`` and ``.md``.
-        views: Numbers of views with which the reference renderer is compared as well.
-        degraded: Use every kind of degraded depth instead of the exact depth.
-        peers: Further renderers, see :func:`read_peer`.
-
-    Raises:
-        ValueError: If a scene or a peer is invalid.
-        OSError: If the folder has no scene, or a file cannot be read or written.
+    The reference renderer is compared with each number of ``views``. With ``degraded`` every kind of degraded depth is
+    used instead of the exact depth, and no picture is written.
     """
     by_name = renderers(degraded) | dict(map(read_peer, peers))
     for count in sorted({*views}):
@@ -103,17 +82,13 @@ def compare(truth: Path, out: Path, views: Sequence[int], degraded: bool, peers:
         window = _worst(pictures["torchdof"], scene, tile_px)
         for name, picture in {"sharp": scene.image, "truth": scene.truth, **pictures}.items():
             panels.setdefault(name, []).append(picture[window][:, :3].expand(-1, 3, -1, -1))
-    tables: dict[str, Sequence[Row]] = {
-        "Means": summary(rows, ["depth", "renderer"], statistics.fmean),
-        "Scenes": rows,
-    }
+    tables = {"Means": summary(rows, ["depth", "renderer"], statistics.fmean), "Scenes": rows}
     remark = "psnr_inner: without the border reached by light from outside the frame; flip: smaller is better."
     if degraded:
         publish("What inexact depth costs", tables, [remark], out / "degraded")
         return
     remark += f" accuracy.png: for each scene, the {tile_px} x {tile_px} pixels with torchdof's largest error."
-    sheet = {name: torch.cat(parts, 2) for name, parts in panels.items()}
-    draw = functools.partial(write_sheet, panels=sheet)
+    draw = functools.partial(write_sheet, panels={name: torch.cat(parts, 2) for name, parts in panels.items()})
     publish("Accuracy against the truth", tables, [remark], out / "accuracy", draw)
 
 

@@ -46,35 +46,22 @@ def timed(work: Callable[..., Any], *arguments: Any) -> tuple[Any, Seconds]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BenchScene:
-    """A scene to be rendered.
-
-    Args:
-        name: Title in the report.
-        image: ``[B, C, H, W]``, linear light, without alpha.
-        coc_px: ``[B, 1, H, W]``, signed radius in pixels.
-        remark: Camera and focus, in words.
-        table: Blur table of the lens; the disc by default.
-    """
+    """A scene to be rendered, and the blur table of its lens."""
 
     name: str
-    image: Tensor
-    coc_px: Tensor
-    remark: str = ""
+    image: Tensor  # [B, C, H, W], linear light, without alpha
+    coc_px: Tensor  # [B, 1, H, W], signed radius in pixels
+    remark: str = ""  # camera and focus, in words
     table: BlurTable = dataclasses.field(default_factory=BlurTable.disc)
 
     def __post_init__(self) -> None:
-        (h, w), (height, width) = self.coc_px.shape[-2:], self.image.shape[-2:]
-        if (h, w) != (height, width):
-            raise ValueError(f"{self.name}: depth is {w} x {h} pixels but the image is {width} x {height}")
-        if min(h, w) < _MIN_SIDE:
+        height, width = self.image.shape[-2:]
+        if min(height, width) < _MIN_SIDE:
             raise ValueError(f"{self.name}: is {width} x {height}; speed is measured from {_MIN_SIDE} pixels a side on")
 
     def seen(self, focus: float, radius_px: float) -> "BenchScene":
-        """The scene by another camera: focused nearer (down to -1) or farther (up to 1), with another largest radius.
-
-        A thin lens's circle of confusion is linear in 1 / distance: another focus adds a constant, here at most half of
-        its range, and another opening multiplies it.
-        """
+        """The scene by another camera: focused nearer (from -1) or farther (to 1), with another largest radius."""
+        # a thin lens's circle of confusion is linear in 1 / distance: focus adds a constant, the opening multiplies
         shifted = self.coc_px - 0.5 * focus * (self.coc_px.max() - self.coc_px.min())
         return dataclasses.replace(self, coc_px=shifted * (radius_px / shifted.abs().max().clamp_min(1e-9)))
 
@@ -97,20 +84,9 @@ class BenchScene:
 
 
 def measure(blur: Renderer, scene: BenchScene, again: bool = True) -> tuple[Tensor, dict[str, float]]:
-    """Renders a scene with a camera that was not rendered before, and once more with the same camera.
+    """The picture of a scene by a new camera, and a row as in :data:`torchdof.bench.report.LEGEND`.
 
-    A depthwise 17 x 17 convolution of ``[1, 16, 540, 960]`` beside it makes times comparable between machines.
-
-    Args:
-        blur: The renderer.
-        scene: The scene by that camera.
-        again: Whether to render with the same camera once more.
-
-    Returns:
-        The picture, and a row with the columns explained in :data:`torchdof.bench.report.LEGEND`.
-
-    Raises:
-        RuntimeError: If the picture is not finite.
+    With ``again`` it is rendered twice. A convolution beside it makes times comparable between machines.
     """
     frame = torch.ones(1, 16, 540, 960).contiguous(memory_format=torch.channels_last)
     beside = functools.partial(functional.conv2d, frame, torch.ones(16, 1, 17, 17), padding=8, groups=16)
@@ -140,12 +116,7 @@ def peak_of(work: Callable[[], _Result]) -> tuple[_Result, float]:
 
 
 def shipped(height: int = 540, width: int = 960) -> BenchScene:
-    """A slope from 1 m to 10 m behind posts at 0.9 m to 1 m; the largest blur radius is 1/60 of the width.
-
-    Example:
-        >>> shipped(54, 96).image.shape
-        torch.Size([1, 3, 54, 96])
-    """
+    """A slope from 1 m to 10 m behind posts at 0.9 m to 1 m; the largest blur radius is 1/60 of the width."""
     y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in (height, width)), indexing="ij")
     is_post = posts(width / 6, width / 40)(x, y)
     light = torch.where(is_post, waves(2, (0.6, 0.3, 0.2))(x, y), waves(1)(x, y)).float()[None]

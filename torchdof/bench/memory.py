@@ -3,21 +3,18 @@
 import contextlib
 import ctypes
 import math
+import re
 from pathlib import Path
 
 __all__ = ["peak_mb", "reset_peak"]
 
 
 def peak_mb() -> float:
-    """Peak memory of this process since it started or since :func:`reset_peak`, in MiB.
-
-    Unlike ``ru_maxrss``, it does not include the memory of the parent process at its start.
-    """
+    """Peak memory of this process, without its parent's, since it started or since :func:`reset_peak`, in MiB."""
     try:
-        lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
-    except OSError:
+        return int(re.findall(r"VmHWM:\s*(\d+)", Path("/proc/self/status").read_text())[0]) / 1024
+    except (OSError, IndexError):
         return math.nan
-    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM:")), math.nan)
 
 
 def reset_peak() -> float:

@@ -32,25 +32,21 @@ LEGEND = (
 
 
 def summary(rows: Sequence[Row], keys: Sequence[str], mean: Callable[[list[float]], float]) -> list[dict[str, Any]]:
-    """Groups rows by their values under the keys; returns a row for each group with the means of float columns.
-
-    Example:
-        >>> rows = [{"a": "x", "new_ms": v, "spread_ms": 0.0} for v in (4.0, 1.0, 2.0, 3.0, 20.0)]
-        >>> summary(rows, ["a"], statistics.median)
-        [{'a': 'x', 'new_ms': 3.0, 'spread_ms': 2.0}]
-    """
-    groups: dict[tuple[Any, ...], dict[str, list[float]]] = {}
+    """Groups rows by their values under the keys; returns a row for each group with the means of float columns."""
+    groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
-        columns = groups.setdefault(tuple(row[key] for key in keys), {})
-        for name, value in row.items():
-            if isinstance(value, float) and name not in keys:
-                columns.setdefault(name, []).append(value)
+        groups.setdefault(tuple(row[key] for key in keys), []).append(row)
     summaries: list[dict[str, Any]] = []
-    for values, columns in groups.items():
-        summaries.append(dict(zip(keys, values, strict=True)) | {name: mean(v) for name, v in columns.items()})
-        if len(columns.get("new_ms", ())) > 1:
-            low, _, high = statistics.quantiles(columns["new_ms"], n=4, method="inclusive")
-            summaries[-1]["spread_ms"] = high - low
+    for values, of_group in groups.items():
+        means = dict(zip(keys, values, strict=True))
+        for name in dict.fromkeys(name for row in of_group for name in row if name not in keys):
+            column = [row[name] for row in of_group if isinstance(row.get(name), float)]
+            if name == "spread_ms" and len(new := [row["new_ms"] for row in of_group if "new_ms" in row]) > 1:
+                low, _, high = statistics.quantiles(new, n=4, method="inclusive")
+                column = [high - low]
+            if column:
+                means[name] = mean(column)
+        summaries.append(means)
     return summaries
 
 
@@ -64,16 +60,7 @@ def publish(
 ) -> None:
     """Prints the first table and the remarks; writes ``stem.md``, ``.csv`` of the last table and ``.png``: all or none.
 
-    Args:
-        title: Heading.
-        tables: Rows by heading; missing values stay empty.
-        remarks: Paragraphs that follow hardware, threads, versions and :data:`LEGEND`.
-        stem: Folder and name of the files; None writes none.
-        picture: Writes a picture to a path; None writes none.
-        quiet: Print nothing.
-
-    Raises:
-        OSError: If a file cannot be written.
+    ``tables`` maps headings to rows, whose missing values stay empty; ``picture`` writes a picture to a path.
     """
     machine = (
         f"{platform.processor() or platform.machine()}, {os.cpu_count()} CPUs, {torch.get_num_threads()} threads; "

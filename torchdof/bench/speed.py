@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -17,13 +17,10 @@ from torch import Tensor
 
 from ..module import DepthOfField, blur_by_coc
 from ..optics.camera import Camera
-from ..validation import whole
 from .measurement import BenchScene, Renderer, Seconds, error, measure, peak_of, timed
 from .report import Row, publish, summary
 
-__all__ = ["Runtime", "compare", "report", "works"]
-
-Runtime = Literal["compiled", "onnxruntime"]
+__all__ = ["compare", "report", "works"]
 
 _TOLERANCES = (8.0, 4.0, 2.0, 1.0, 0.5, 0.0)  # tolerances, in 1/255
 _RADII_PX, _SIZES = (4.0, 8.0, 16.0, 32.0, 64.0), (0.25, 0.5)
@@ -32,13 +29,12 @@ _ROUNDING = 1e-6  # RMS error, of 1, by which rounding may exceed the tolerance
 
 
 def works(
-    scene: BenchScene, occlusion: bool, repeat: int, runtimes: Sequence[Runtime] = (), scan: bool = False
+    scene: BenchScene, occlusion: bool, repeat: int, runtimes: Sequence[str] = (), scan: bool = False
 ) -> Iterator[tuple[dict[str, Any], Renderer, BenchScene, bool]]:
     """The measurements: first columns of the row, renderer, scene by a camera, and whether to measure its error.
 
-    The settings are tolerances from coarse to exact, further runtimes, a focus pull, first pictures of new processes,
-    the literal scatter beside layers on a small frame and, with ``scan``, other radii and frame sizes. Errors are
-    measured with the scene's own camera, times with ``repeat`` other cameras, different ones for each setting.
+    Errors are measured with the scene's own camera, times with ``repeat`` other cameras, different ones for each
+    setting. ``scan`` adds other radii and frame sizes.
     """
     blur = functools.partial(blur_by_coc, table=scene.table, occlusion=occlusion)
     small = scene.resized(min(1.0, _FOLD_PX / scene.image.shape[-1]))
@@ -65,7 +61,7 @@ def works(
             yield columns, render, view, True
 
 
-def _prepared(runtime: Runtime, scene: BenchScene, occlusion: bool) -> Renderer:
+def _prepared(runtime: str, scene: BenchScene, occlusion: bool) -> Renderer:
     """A renderer at 1/255 with ``torch.compile`` or an exported file, compiled or exported beforehand."""
     reach = max(1.0, float(math.ceil(scene.coc_px.abs().max())))
     options: dict[str, Any] = {"table": scene.table, "occlusion": occlusion, "max_coc_px": reach, "check": False}
@@ -93,21 +89,9 @@ def _in_a_fresh_process(blur: Renderer, image: Tensor, coc_px: Tensor) -> tuple[
 
 
 def compare(
-    scene: BenchScene, repeat: int, console: Console | None = None, runtimes: Sequence[Runtime] = (), scan: bool = False
+    scene: BenchScene, repeat: int, console: Console | None = None, runtimes: Sequence[str] = (), scan: bool = False
 ) -> list[Row]:
-    """Measures every setting of :func:`works`, with and without occlusion; a row for each.
-
-    Args:
-        scene: The scene.
-        repeat: Number of cameras for each setting.
-        console: Console for the progress bar; None shows none.
-        runtimes: ``compiled`` needs a C++ compiler, ``onnxruntime`` the extra ``export``; both take minutes.
-        scan: Whether to measure other blur radii and frame sizes too.
-
-    Raises:
-        ValueError: If ``repeat`` is not a positive number.
-    """
-    whole("--repeat", repeat, 1, 10000)
+    """Measures every setting of :func:`works`, with and without occlusion; a row for each."""
     hidden, rows = console is None or not console.is_terminal, []
     with torch.no_grad():
         for occlusion in (True, False):
@@ -126,12 +110,7 @@ def compare(
 
 
 def report(rows: Sequence[Row], scene: BenchScene, out: Path | None, quiet: bool = False) -> None:
-    """Prints a table unless quiet; writes ``speed.csv``, ``.md`` and ``.png`` to a folder: all of them or none.
-
-    Raises:
-        OSError: If a file cannot be written.
-        ModuleNotFoundError: If matplotlib is missing.
-    """
+    """Prints a table unless quiet; writes ``speed.csv``, ``.md`` and ``.png`` to a folder: all of them or none."""
     low, high = float(scene.coc_px.min()), float(scene.coc_px.max())
     title = f"{scene.name}, blur radius {low:.1f} to {high:.1f} px, {scene.table!r}"
     exceeded = "; ".join(row["setting"] for row in rows if not row["kept"])

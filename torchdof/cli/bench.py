@@ -1,21 +1,18 @@
 """``torchdof bench``: speed against error on a scene, or accuracy of renderers where the truth is known."""
 
 import dataclasses
-import importlib.util
-import os
-import shutil
 from pathlib import Path
 
 import click
 
 from ..io.atomic import check_writable
-from .command import argument, option
-from .options import Blur, Scene, check_files, json_option, make_folder_of
+from .command import Command, Group, argument, option
+from .options import Blur, Scene, check_files, make_folder_of
 from .output import Notices, json_line
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Speed:
+class _Speed(Group):
     """Speed."""
 
     repeat: int = option("Cameras that each setting is timed with.", 5, type=click.IntRange(min=1), basic=True)
@@ -25,7 +22,7 @@ class _Speed:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Accuracy:
+class _Accuracy(Group):
     """Accuracy."""
 
     truth: Path | None = option("Folder with scenes, at any depth: meta.json, sharp.exr, depth.exr and truth_K.exr.")
@@ -39,7 +36,7 @@ class _Accuracy:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Bench:
+class Bench(Scene, Blur, _Speed, _Accuracy, Command):
     """Measure speed against error on your own scene, or accuracy where the truth is known.
 
     Compares each tolerance with the exact rendering on the CPU: time, memory, RMS error, PSNR and SSIM. The options
@@ -57,81 +54,56 @@ class Bench:
     )
     depth: Path | None = argument("Its depth; not needed if IMAGE has a Z channel.", "[DEPTH]", None)
     out: Path | None = option("Folder for tables (.csv, .md) and a picture; is made.", names=("--out", "-o"))
-    scene: Scene
-    blur: Blur
-    speed: _Speed
-    accuracy: _Accuracy
-    as_json: bool = json_option()
 
     def run(self) -> None:
-        """Measures accuracy or speed."""
-        if self.accuracy.truth is not None:
-            self._measure_accuracy(self.accuracy.truth)
-        else:
-            self._measure_speed()
-
-    def _measure_accuracy(self, truth: Path) -> None:
-        """Checks the options, and measures accuracy on the scenes in a folder."""
-        degrade, views = self.accuracy.degrade, self.accuracy.views
-        others = (self.image, self.scene, self.blur, dataclasses.replace(self.speed, repeat=5))
-        if others != (None, Scene(), Blur(), _Speed()):
+        """Measures accuracy where the truth is known, else speed against error."""
+        if self.truth is None:
+            return self._measure_speed()
+        if self.image is not None or self.given(Scene, Blur, _Speed) - {"repeat"}:
             raise ValueError(
                 "--truth measures the scenes of its folder with their own lens and depth; leave IMAGE and DEPTH out, "
                 "--onnx, --compile and --scan, and options of lens, depth and blur"
             )
         if self.as_json or self.out is None:
             raise ValueError("--truth writes tables and pictures; give a folder with --out, and leave --json out")
-        if degrade and views:
+        if self.degrade and self.views:
             raise ValueError("--degrade compares without the reference; leave --views out")
         from ..bench import accuracy
 
         make_folder_of(self.out / "accuracy.csv")
-        accuracy.compare(truth, self.out, [] if degrade else views or [256], degrade, self.accuracy.peer)
+        accuracy.compare(self.truth, self.out, [] if self.degrade else self.views or [256], self.degrade, self.peer)
 
     def _measure_speed(self) -> None:
         """Checks the options, and measures speed against error on the user's scene or on the built-in one."""
-        options, lens = self.speed, self.scene.lens
-        if self.accuracy != _Accuracy():
+        if self.given(_Accuracy):
             raise ValueError("--views, --degrade and --peer compare with a truth; name its folder with --truth")
-        if self.image is None and self.scene != Scene():
+        if self.image is None and self.given(Scene):
             raise ValueError("the built-in scene has its own camera and depth; name an IMAGE for these options")
-        lens.refuse_keyframes()
+        self.refuse_keyframes()
         if self.out is not None:
             check_writable(self.out / "speed.csv")
+            import matplotlib  # noqa: F401  # a missing package is named before measuring for minutes
         if self.image is not None:
             check_files(self.image, self.depth)
-        for package, is_needed in {"matplotlib": self.out is not None, "onnxruntime": options.onnx}.items():
-            if is_needed and importlib.util.find_spec(package) is None:  # check before measuring for minutes
-                raise ModuleNotFoundError(f"no {package}", name=package)
-        if options.compiled and not any(map(shutil.which, (os.environ.get("CXX", ""), "g++", "clang++", "c++"))):
-            raise FileNotFoundError(
-                "torch.compile needs a C++ compiler, and none was found; install g++ or leave --compile out"
-            )
         from rich.console import Console
 
         from ..bench import speed
         from ..bench.measurement import BenchScene, shipped
-        from ..tensors import TRACEABLE
         from .frame import coc_of, read_frame
 
-        if options.compiled and not TRACEABLE:
-            raise ValueError("torch.compile needs PyTorch 2.13 or newer here; leave --compile out")
-        table = self.blur.table_of(self.blur.table)
-        if (options.onnx or options.compiled) and table.depends_on_place:
-            raise ValueError("compiled and exported graphs have one kernel a layer; leave --onnx and --compile out")
+        table = self.table_of(self.table)
         if self.image is None:
             scene = dataclasses.replace(shipped(), table=table)
         else:
-            frame = read_frame(self.image, self.depth, self.scene)
-            coc_px, camera, remarks = coc_of(frame, Notices(self.scene.depth_map.strict))
-            remarks = ["focus as stated"] * lens.has_focus + remarks + [f"depth {frame.guess}"] * bool(frame.guess)
+            frame = read_frame(self.image, self.depth, self)
+            coc_px, camera, remarks = coc_of(frame, Notices(self.strict))
+            remarks = ["focus as stated"] * self.has_focus + remarks + [f"depth {frame.guess}"] * bool(frame.guess)
             remark = "blur as given" if camera is None else f"{camera!r}; {', '.join(remarks)}"
             scene = BenchScene(self.image.name, frame.picture.light, coc_px, remark, table)
         if self.out is not None:
             make_folder_of(self.out / "speed.csv")
-        chosen: dict[speed.Runtime, bool] = {"onnxruntime": options.onnx, "compiled": options.compiled}
-        runtimes = [runtime for runtime, is_chosen in chosen.items() if is_chosen]
-        rows = speed.compare(scene, options.repeat, Console(stderr=True), runtimes, options.scan)
+        runtimes = ["onnxruntime"] * self.onnx + ["compiled"] * self.compiled
+        rows = speed.compare(scene, self.repeat, Console(stderr=True), runtimes, self.scan)
         if self.as_json:
             facts = {"scene": scene.name, "remark": scene.remark, "table": repr(scene.table)}
             click.echo(json_line({**facts, "settings": rows}))

@@ -1,10 +1,9 @@
 """Builds Click commands from dataclasses, whose fields are the arguments and options of the command.
 
-A field that is itself a dataclass is a group of options, which several commands can share; its docstring is the heading
-in ``--help``.
+A command inherits groups of options, which several commands can share; the docstring of a group is its heading in
+``--help``.
 """
 
-import contextlib
 import dataclasses
 import inspect
 import re
@@ -17,6 +16,18 @@ import click
 _BASIC_HEADING = "Options"  # heading of the options that --help lists first
 
 
+class Group:
+    """Base of all groups of options, and of commands."""
+
+    def __post_init__(self) -> None:
+        """Refuses options that contradict each other."""
+
+    def given(self, *groups: type[Any]) -> set[str]:
+        """Names of the options of some groups that are not at their default."""
+        fields = [field for group in groups for field in dataclasses.fields(group)]
+        return {field.name for field in fields if getattr(self, field.name) != field.default}
+
+
 def option(
     help: str,
     default: Any = None,
@@ -27,7 +38,7 @@ def option(
     basic: bool = False,
     **details: Any,
 ) -> Any:
-    """Declares a dataclass field as an option.
+    """Declares a dataclass field as an option of :class:`click.Option`, whose type is that of the field.
 
     Args:
         help: Text in ``--help``.
@@ -36,7 +47,7 @@ def option(
         read: Converts the text to the value, or raises ``ValueError`` with the expected form.
         group: Heading in ``--help``; empty uses the docstring of the field's class.
         basic: Whether ``--help`` lists the option before the groups.
-        **details: Further arguments of :class:`click.Option`; its ``type`` is otherwise that of the field.
+        **details: Further arguments of the option.
     """
     details["help"] = help
     if read is not None:
@@ -45,27 +56,45 @@ def option(
     return dataclasses.field(**({} if default is ... else {"default": default}), metadata=metadata)
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Command(Group):
+    """Options."""
+
+    as_json: bool = option("Print results as JSON, for programs: one object a line.", False, names=("--json",))
+
+
 def argument(help: str, metavar: str, default: Any = ...) -> Any:
     """Declares a dataclass field as a positional argument, which a default makes optional."""
     return option(help, default, metavar=metavar, names=("argument",))
 
 
-def numbers(count: int | None, expected: str) -> Callable[[str], tuple[float, ...]]:
-    """A parser of ``count`` numbers (None: any count) separated by commas; its errors start with ``expected``."""
+def reader(expected: str, parse: Callable[[str], Any]) -> Callable[[str], Any]:
+    """``parse``, whose ``ValueError`` gets a message that starts with ``expected``."""
 
-    def read(text: str) -> tuple[float, ...]:
-        with contextlib.suppress(ValueError):
-            values = tuple(map(float, text.split(",")))
-            if count in (None, len(values)):
-                return values
-        raise ValueError(f"{expected}, got {text!r}")
+    def read(text: str) -> Any:
+        try:
+            return parse(text)
+        except ValueError:
+            raise ValueError(f"{expected}, got {text!r}") from None
 
     return read
 
 
+def numbers(count: int | None, expected: str) -> Callable[[str], tuple[float, ...]]:
+    """A reader of ``count`` numbers (None: any count) separated by commas."""
+
+    def parse(text: str) -> tuple[float, ...]:
+        values = tuple(map(float, text.split(",")))
+        if count not in (None, len(values)):
+            raise ValueError
+        return values
+
+    return reader(expected, parse)
+
+
 def word_or_number(words: tuple[str, ...], expected: str) -> Callable[[str], float | str]:
-    """A parser of one of ``words`` or a number; its errors start with ``expected``."""
-    return lambda text: text if text in words else numbers(1, expected)(text)[0]
+    """A reader of one of ``words`` or a number."""
+    return reader(expected, lambda text: text if text in words else float(text))
 
 
 def by_option(message: str, parameters: Iterable[click.Parameter]) -> str:
@@ -91,34 +120,32 @@ class _Command(click.Command):
 
 def command_of(name: str, kind: type[Any]) -> click.Command:
     """The command that makes a ``kind`` of its arguments and runs it; the docstring of ``kind`` is the help."""
-    parameters, help_text = list(_parameters(kind, _BASIC_HEADING)), inspect.getdoc(kind) or ""
+    parameters, help_text = list(_parameters(kind)), inspect.getdoc(kind) or ""
     return _Command(
         name,
         params=parameters,
         help=help_text,
         short_help=" ".join(help_text.partition("\n\n")[0].split()),
         no_args_is_help=any(parameter.required for parameter in parameters),
-        callback=lambda **values: _instance(kind, values).run(),
+        callback=lambda **values: kind(**values).run(),
         context_settings={"max_content_width": 120},
     )
 
 
-def _parameters(kind: type[Any], heading: str) -> Iterator[click.Parameter]:
-    """Arguments and options for the fields of a class and of the groups in it."""
-    hints = typing.get_type_hints(kind)
-    for field in dataclasses.fields(kind):
-        hint = hints[field.name]
-        if dataclasses.is_dataclass(hint):
-            yield from _parameters(hint, (hint.__doc__ or "").rstrip("."))  # type: ignore[arg-type]
-        else:
-            parameter = _parameter(field, hint)
-            parameter.heading = field.metadata["group"] or heading  # type: ignore[attr-defined]
+def _parameters(kind: type[Any]) -> Iterator[click.Parameter]:
+    """Arguments and options of a command: its own, and those of its groups in order."""
+    hints, fields = typing.get_type_hints(kind), {field.name: field for field in dataclasses.fields(kind)}
+    for home in kind.__mro__:
+        heading = _BASIC_HEADING if home is kind else (home.__doc__ or "").rstrip(".")
+        for name in inspect.get_annotations(home):
+            parameter = _parameter(fields[name], hints[name])
+            parameter.heading = fields[name].metadata["group"] or heading  # type: ignore[attr-defined]
             yield parameter
 
 
 def _parameter(field: Any, hint: Any) -> click.Parameter:
     """Argument or option for a field of type ``hint``; a tuple without a ``read`` of its own takes several values."""
-    given = field.metadata["details"]
+    given, names = field.metadata["details"], field.metadata["names"]
     required = field.default is dataclasses.MISSING
     takes_several = typing.get_origin(hint) is tuple and "callback" not in given
     if typing.get_args(hint) and typing.get_origin(hint) is not Literal:  # X | None, tuple[X, ...]
@@ -127,31 +154,10 @@ def _parameter(field: Any, hint: Any) -> click.Parameter:
     details = {"type": kind, "required": required, **given}
     if not required and field.default not in (None, ()):
         details["default"] = field.default
-    if field.metadata["names"] == ("argument",):
+    if names == ("argument",):
         return click.Argument([field.name], nargs=-1 if takes_several else 1, **details)
     if hint is bool:
         details["is_flag"] = True
     else:
         details |= {"multiple": takes_several, "show_default": bool(field.default) and not required}
-    return click.Option([field.name, *_spellings(field)], **details)
-
-
-def _spellings(field: Any) -> tuple[str, ...]:
-    names: tuple[str, ...] = field.metadata["names"]
-    return (field.name.upper(),) if names == ("argument",) else names or (f"--{field.name.replace('_', '-')}",)
-
-
-def options_of(command: Any) -> dict[str, Any]:
-    """Values of a command's arguments and options, also those of its groups, by their first spelling."""
-    values: dict[str, Any] = {}
-    for field in dataclasses.fields(command):
-        value = getattr(command, field.name)
-        values |= options_of(value) if dataclasses.is_dataclass(value) else {_spellings(field)[0]: value}
-    return values
-
-
-def _instance(kind: type[Any], values: dict[str, Any]) -> Any:
-    """Creates an object of ``kind`` with its groups; ``values`` has the values of all their fields by name."""
-    hints = typing.get_type_hints(kind)
-    groups: dict[str, Any] = {name: hint for name, hint in hints.items() if dataclasses.is_dataclass(hint)}
-    return kind(**{name: _instance(groups[name], values) if name in groups else values[name] for name in hints})
+    return click.Option([field.name, *(names or [f"--{field.name.replace('_', '-')}"])], **details)

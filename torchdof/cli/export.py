@@ -7,22 +7,20 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..io.atomic import check_writable
-from .command import option
+from .command import Command, Group, option, reader
 from .lens import Sensor
-from .options import Accuracy, Blur, json_option
+from .options import Accuracy, Blur
 from .output import print_result, progress_bar
 
 
 def _size(text: str) -> tuple[int, int]:
     """Reads ``WIDTHxHEIGHT`` as height and width."""
-    width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal()):
-        raise ValueError(f"--size is a width and a height in pixels, such as 1920x1080, got {text!r}")
-    return int(height), int(width)
+    width, height = map(int, text.lower().split("x"))
+    return height, width
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Graph:
+class _Graph(Group):
     """Graph."""
 
     inputs: Literal["depth", "coc_px"] = option(
@@ -37,13 +35,13 @@ class _Graph:
     size: tuple[int, int] | None = option(
         "Width and height of the only frame, for --layout whole and runtimes that need fixed sizes.",
         metavar="WxH",
-        read=_size,
+        read=reader("--size is a width and a height in pixels, such as 1920x1080", _size),
     )
     opset: int = option("ONNX operator set.", 20)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Export:
+class Export(Sensor, Blur, Accuracy, _Graph, Command):
     """Write depth of field as one ONNX file, for pipelines without PyTorch.
 
     The file is compared with the module in onnxruntime before it is written; the comparison is printed.
@@ -61,12 +59,7 @@ class Export:
 
     out: Path | None = option("The file to write.", names=("--out", "-o"))
     show: Path | None = option("Write nothing; print the metadata of this file.", metavar="FILE")
-    sensor: Sensor
-    blur: Blur
     max_coc: float = option("Largest radius in pixels that the file holds.", 32.0, basic=True)
-    accuracy: Accuracy
-    graph: _Graph
-    as_json: bool = json_option()
 
     def run(self) -> None:
         """Writes a file, or prints the metadata of one."""
@@ -83,14 +76,14 @@ class Export:
         from torchdof import Camera, DepthOfField
         from torchdof.export.conversion import to_onnx
 
-        if self.sensor.fov_deg is None:
-            camera = Camera(**{name: value for name, value in vars(self.sensor).items() if value is not None})
+        if self.fov_deg is None:
+            camera = Camera(**{name: getattr(self, name) for name in self.given(Sensor)})
         else:
-            camera = Camera.from_fov(self.sensor.fov_deg, 0.01, 2.0)  # aperture and focus are inputs of the graph
-        options = {"depth_edges": "as given", **self.accuracy.arguments(), "max_coc_px": self.max_coc, "check": False}
+            camera = Camera.from_fov(self.fov_deg, 0.01, 2.0)  # aperture and focus are inputs of the graph
+        options = {"depth_edges": "as given", **self.arguments(), "max_coc_px": self.max_coc, "check": False}
         with progress_bar("tracing") as update:
-            dof = DepthOfField(camera, self.blur.table_of(self.blur.table), **options)
-            graph = dataclasses.asdict(self.graph)
+            dof = DepthOfField(camera, self.table_of(self.table), **options)
+            graph = {field.name: getattr(self, field.name) for field in dataclasses.fields(_Graph)}
             report = to_onnx(dof, self.out, **graph, depth_edges=dof.options.depth_edges, progress=update)
         facts = {"out": str(self.out), **dataclasses.asdict(report)}
         print_result(self.as_json, facts, f"{report}\nwrote {self.out}")

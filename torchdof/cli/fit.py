@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -10,29 +11,23 @@ from typing import Literal
 
 import click
 
-from torchdof.cli.command import argument, numbers, option
-from torchdof.cli.options import json_option, make_folder_of
+from torchdof.cli.command import Command, Group, argument, numbers, option, reader
+from torchdof.cli.options import make_folder_of
 from torchdof.io.atomic import check_writable
 
-_micrometres = numbers(None, "--wavelengths takes rgb, or micrometres like 0.65,0.55,0.45")
-_FIELD_EXPECTED = "--field takes distances in mm from the middle of the frame, rising from 0, like 0,7,14,21.6"
-
-
-def _wavelengths(text: str) -> tuple[float, ...]:
-    """Reads wavelengths in micrometres; ``rgb`` gives an empty tuple, which means red, green and blue."""
-    return () if text == "rgb" else _micrometres(text)
+_NUMBERS = numbers(None, "expected numbers")
 
 
 def _radii(text: str) -> tuple[float, ...]:
     """Reads distances in mm from the middle of the frame, rising from 0."""
-    radii_mm = numbers(None, _FIELD_EXPECTED)(text)
+    radii_mm = _NUMBERS(text)
     if len(radii_mm) < 2 or radii_mm[0] != 0 or not all(low < high < math.inf for low, high in pairwise(radii_mm)):
-        raise ValueError(f"{_FIELD_EXPECTED}, got {text!r}")
+        raise ValueError
     return radii_mm
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Target:
+class _Target(Group):
     """With the printed target."""
 
     target: Path | None = option("Write the target to print (PDF), and nothing else.")
@@ -41,7 +36,7 @@ class _Target:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Photographs:
+class _Photographs(Group):
     """From photographs."""
 
     family: Literal["auto", "gaussian", "ring", "disc", "softm", "radial", "polygon", "image"] = option(
@@ -58,7 +53,7 @@ class _Photographs:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Lens:
+class _Lens(Group):
     """From a lens prescription."""
 
     lens: str | None = option("Prescription or Zemax file (.zmx), or the name of a shipped lens.", basic=True)
@@ -69,15 +64,21 @@ class _Lens:
     field: tuple[float, ...] | None = option(
         "One table across the field, of spots at these distances from the middle; to 21.6 for full frame.",
         metavar="0,MM,MM,...",
-        read=_radii,
+        read=reader(
+            "--field takes distances in mm from the middle of the frame, rising from 0, like 0,7,14,21.6", _radii
+        ),
     )
     wavelengths: tuple[float, ...] | None = option(
-        "One table a colour: rgb, or micrometres like 0.65,0.55,0.45; for lenses with Abbe numbers.", read=_wavelengths
+        "One table a colour: rgb, or micrometres like 0.65,0.55,0.45; for lenses with Abbe numbers.",
+        read=reader(
+            "--wavelengths takes rgb, or micrometres like 0.65,0.55,0.45",
+            lambda text: () if text == "rgb" else _NUMBERS(text),  # () stands for red, green and blue
+        ),
     )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit:
+class Fit(_Photographs, _Target, _Lens, Command):
     """Make a blur table from photographs of a dot, or from a lens prescription.
 
     From photographs of a white dot on black paper, described in capture.toml (see docs/measuring.md):
@@ -102,40 +103,41 @@ class Fit:
     )
     out: Path = option("The table to write (JSON).", Path("table.json"), names=("--out", "-o"))
     plots: Path | None = option("Folder for pictures of the fits and the table.")
-    photographs: _Photographs
-    target: _Target
-    lens: _Lens
-    as_json: bool = json_option()
 
     def run(self) -> None:
         """Checks the options, then makes the table, or writes the target to print."""
-        lens, target, options = self.lens.lens, self.target.target, self.lens
-        if target is not None and (self.captures is not None or lens is not None):
+        if self.target is not None and (self.captures is not None or self.lens is not None):
             raise ValueError("--target writes the page to print; give it alone, and the photographs afterwards")
-        if target is None and (self.captures is None) == (lens is None):
+        if self.target is None and (self.captures is None) == (self.lens is None):
             raise ValueError("give either a folder of captures or --lens FILE")
-        if self.photographs.root is not None and lens is not None:
+        if self.root is not None and self.lens is not None:
             raise ValueError("--root is the folder of photographs; leave it out with --lens")
         if self.out.suffix != ".json":
             raise ValueError(f"{self.out}: the table is written as JSON: name it {self.out.with_suffix('.json')}")
-        if not 0 <= options.field_deg < 90:
-            raise ValueError(f"--field-deg must be 0 to 90 degrees from the axis, got {options.field_deg:g}")
-        if options.field is not None and options.field_deg:
+        if not 0 <= self.field_deg < 90:
+            raise ValueError(f"--field-deg must be 0 to 90 degrees from the axis, got {self.field_deg:g}")
+        if self.field is not None and self.field_deg:
             raise ValueError("--field-deg averages one place, --field traces several; give one of them")
-        if target is not None:
+        if self.target is not None:
             from torchdof.fit.photo.target import write_target
 
-            write_target(target, self.target.paper)
+            write_target(self.target, self.paper)
             if not self.as_json:
                 advice = "print it at 100 %, photograph it as it says, then: torchdof fit FOLDER -o table.json"
-                click.echo(f"{target}: {advice}")
+                click.echo(f"{self.target}: {advice}")
             return
         check_writable(self.out)
         if self.plots is not None:
             make_folder_of(self.plots / "table.png")
-        from torchdof.cli.fit_tables import fit_photographs, trace_lens
+        from rich.console import Console
 
-        if lens is not None:
-            trace_lens(self, lens)
+        from torchdof.cli.fit_tables import fit_photographs, trace_lens
+        from torchdof.fit.problems import FitWarning
+
+        console = Console(soft_wrap=True, quiet=self.as_json, markup=False, highlight=False)
+        if self.lens is not None:
+            trace_lens(self, self.lens, console)
         elif self.captures is not None:
-            fit_photographs(self, self.captures)
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always", FitWarning)
+                fit_photographs(self, self.captures, console, caught)

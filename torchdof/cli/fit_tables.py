@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +17,8 @@ from torchdof.fit.lens.lens import RGB_UM, Lens
 from torchdof.fit.photo.across import table_of_dots
 from torchdof.fit.photo.captures import Captures
 from torchdof.fit.photo.manifest import MANIFEST, read_captures
-from torchdof.fit.photo.photographs import Photographs, read_photographs
+from torchdof.fit.photo.photographs import read_photographs
 from torchdof.fit.photo.table import TableFit, fit_captures
-from torchdof.fit.problems import FitWarning
 from torchdof.io.atomic import atomic_file
 from torchdof.io.columns import print_columns
 from torchdof.validation import number
@@ -30,21 +27,21 @@ if TYPE_CHECKING:
     from torchdof.cli.fit import Fit
 
 
-def trace_lens(command: Fit, source: str) -> None:
+def trace_lens(command: Fit, source: str, console: Console) -> None:
     """Traces the table of a lens, prints a summary, and writes the table."""
-    lens, options, console = Lens.read(source), command.lens, _console(command)
+    lens = Lens.read(source)
     focal = lens.paraxial().focal_length
-    number("--focus-m", options.focus_m, low=focal / 1000, unit="metres", infinite=True)
-    image_mm = focal / (1 - focal / 1000 / options.focus_m)
+    number("--focus-m", command.focus_m, low=focal / 1000, unit="metres", infinite=True)
+    image_mm = focal / (1 - focal / 1000 / command.focus_m)
     with progress_bar(f"tracing {source}"):
         table = trace.trace_table(
             lens,
-            f_number=options.f_number,
-            focus_m=options.focus_m,
-            nodes=options.nodes,
-            field_mm=image_mm * math.tan(math.radians(options.field_deg)),
-            wavelengths_um=RGB_UM if options.wavelengths == () else options.wavelengths,
-            field=options.field,
+            f_number=command.f_number,
+            focus_m=command.focus_m,
+            nodes=command.nodes,
+            field_mm=image_mm * math.tan(math.radians(command.field_deg)),
+            wavelengths_um=RGB_UM if command.wavelengths == () else command.wavelengths,
+            field=command.field,
         )
     facts, coc = table.provenance, table.coc.tolist()
     console.print(
@@ -66,113 +63,98 @@ def trace_lens(command: Fit, source: str) -> None:
         _save(console, picture_of_table(table), command.plots / f"{command.out.stem}_table.png")
 
 
-def fit_photographs(command: Fit, folder: Path) -> None:
-    """Fits photographs of the target, or the dots of a manifest, prints the fits, and writes their tables."""
-    options, photographs, console = command.photographs, None, _console(command)
-    colours, dots = (None if value == "manifest" else value for value in (options.colours, options.dots))
-    with _collected_warnings() as reading_warnings:
-        if folder.is_dir() and not (folder / MANIFEST).is_file():
-            mode: Any = colours or "mean"
-            square_mm = command.target.square_mm
-            photographs = read_photographs(folder, square_mm=square_mm, colours=mode, root=options.root)
-            capture_sets = [photographs.captures]
-            _print_photographs(console, photographs)
-        else:
-            capture_sets = read_captures(str(folder), dots=dots, colours=colours, root=options.root)  # type: ignore[arg-type]
+def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[warnings.WarningMessage]) -> None:
+    """Fits photographs of the target, or the dots of a manifest, prints the fits, and writes their tables.
+
+    ``caught`` is the list in which Python collects warnings.
+    """
+    photographs, printed, fitted = None, set[str](), list[tuple[Captures, TableFit]]()
+    dots: Any = None if command.dots == "manifest" else command.dots
+    colours: Any = None if command.colours == "manifest" else command.colours
+    if folder.is_dir() and not (folder / MANIFEST).is_file():
+        mode: Any = colours or "mean"
+        photographs = read_photographs(folder, square_mm=command.square_mm, colours=mode, root=command.root)
+        capture_sets = [photographs.captures]
+        sharp, pictures = photographs.captures.notes["sharp"], photographs.pictures
+        columns = {
+            "file": [picture.file for picture in pictures],
+            "distance m": [f"{picture.distance_m:.3f}" for picture in pictures],
+            "square px": [f"{picture.target.side_px:.0f}" for picture in pictures],
+            "paper %": [f"{100 * picture.target.white:.0f}" for picture in pictures],
+            "edge px": [f"{1 / picture.sharpness:.1f}" for picture in pictures],
+            "": ["in focus" if picture.file == sharp else "" for picture in pictures],
+        }
+        print_columns(console, "the target in the photographs", columns)
+        for sentence in photographs.advice:
+            console.print(f"better: {sentence}", style="cyan")
+    else:
+        capture_sets = read_captures(str(folder), dots=dots, colours=colours, root=command.root)
     across_field = photographs is None and capture_sets[0].notes["dots"] == "field"
-    command_line = f"torchdof fit {folder.name} --family {options.family} --accuracy-db {options.accuracy_db:g}"
-    printed, fitted = set[str](), list[tuple[Captures, TableFit]]()
+    of_fit = ("params", "stderr", "residual", "residual_over_noise", "magnification")
+    of_colour = ("name", "focus_shift_dioptres", "lateral_px")
+    of_reading = len(caught)
     for i, captures in enumerate(capture_sets):
-        table_file = command.out
+        out = command.out
         if len(capture_sets) > 1:
-            table_file = command.out.with_name(f"{command.out.stem}_{i:02d}.json")
+            out = out.with_name(f"{out.stem}_{i:02d}.json")
             console.print(f"dot {i} at {captures.notes['position_px']} px from the centre")
-        with _collected_warnings() as fit_warnings, progress_bar("fitting") as update:
+        del caught[of_reading:]  # the warnings of other dots
+        with progress_bar("fitting") as update:
             result = fit_captures(
                 captures,
-                options.family,
-                accuracy_db=options.accuracy_db,
+                command.family,
+                accuracy_db=command.accuracy_db,
                 progress=lambda done, total, what, update=update: update(what, done, total),  # type: ignore[misc]
-                command=command_line,
+                command=f"torchdof fit {folder.name} --family {command.family} --accuracy-db {command.accuracy_db:g}",
                 scale_of=fitted[0][1] if fitted else None,  # all dots use the scale of the one nearest to the centre
             )
-        messages = [*reading_warnings, *fit_warnings]
         fitted.append((captures, result))
-        _print_fit(console, captures, result, [message for message in messages if message not in printed])
+        _print_fit(console, captures, result)
+        messages = list(dict.fromkeys(str(warning.message) for warning in caught))
+        for message in (message for message in messages if message not in printed):
+            console.print(f"warning: {message}", style="yellow")
         printed.update(messages)
         if not across_field:
-            _write(console, result.table, table_file)
-        facts = {"out": str(table_file), **_facts_of(captures, result), "warnings": messages}
+            _write(console, result.table, out)
+        facts: dict[str, Any] = {
+            **{"out": str(out), "name": captures.name, "family": result.fits[0].family},
+            **{"why": result.why, "scale": result.scale, "focus_m": captures.focus_m},
+            "fits": [
+                {"distance_m": pair.distance_m, "coc_px": coc, **{name: getattr(fit, name) for name in of_fit}}
+                for pair, fit, coc in zip(captures, result.fits, result.coc_px, strict=True)
+            ],
+            "colours": [
+                {**{name: getattr(c, name) for name in of_colour}, "radius_px": [fit.radius for fit in c.fits]}
+                for c in result.colours
+            ],
+            "warnings": messages,
+        }
         if photographs is not None:
-            _draw_sheet(console, photographs, result, command.out.with_suffix(".png"))
             facts["advice"] = list(photographs.advice)
-        if command.as_json:
-            print(json_line(facts), flush=True)
-        if command.plots is not None and photographs is None:
+            try:
+                from torchdof.fit.plots import sheet_of_photographs
+
+                sheet = sheet_of_photographs(
+                    photographs, result, lambda *scene: blur_by_coc(*scene[:2], table=scene[2])
+                )
+                _save(console, sheet, out.with_suffix(".png"))
+            except ModuleNotFoundError as error:
+                console.print(f"no sheet of pictures: {error.name} is not installed (pip install torchdof[plot])")
+        elif command.plots is not None:
             from torchdof.fit.plots import picture_of_fit, picture_of_table
 
-            pictures = {
-                f"{1000 * pair.distance_m:.0f}mm": picture_of_fit(fit)
-                for pair, fit in zip(captures, result.fits, strict=True)
-            }
-            pictures["table"] = picture_of_table(result.table)
-            for name, picture in pictures.items():
-                _save(console, picture, command.plots / f"{table_file.stem}_{name}.png")
+            for pair, fit in zip(captures, result.fits, strict=True):
+                picture = command.plots / f"{out.stem}_{1000 * pair.distance_m:.0f}mm.png"
+                _save(console, picture_of_fit(fit), picture)
+            _save(console, picture_of_table(result.table), command.plots / f"{out.stem}_table.png")
+        if command.as_json:
+            print(json_line(facts), flush=True)
     if across_field:
         _write(console, table_of_dots(fitted), command.out)
 
 
-@contextmanager
-def _collected_warnings() -> Iterator[list[str]]:
-    """Collects warnings in a list, which is filled at the end of the block, without duplicates."""
-    messages = list[str]()
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", FitWarning)
-        yield messages
-    messages += dict.fromkeys(str(w.message) for w in caught)
-
-
-def _facts_of(captures: Captures, result: TableFit) -> dict[str, Any]:
-    """The results that :func:`_print_fit` prints, as data for JSON."""
-    of_fit = ("params", "stderr", "residual", "residual_over_noise", "magnification")
-    of_colour = ("name", "focus_shift_dioptres", "lateral_px")
-    return {
-        **{"name": captures.name, "family": result.fits[0].family, "why": result.why, "scale": result.scale},
-        "focus_m": captures.focus_m,
-        "fits": [
-            {"distance_m": pair.distance_m, "coc_px": coc, **{name: getattr(fit, name) for name in of_fit}}
-            for pair, fit, coc in zip(captures, result.fits, result.coc_px, strict=True)
-        ],
-        "colours": [
-            {**{name: getattr(colour, name) for name in of_colour}, "radius_px": [fit.radius for fit in colour.fits]}
-            for colour in result.colours
-        ],
-    }
-
-
-def _console(command: Fit) -> Console:
-    """The console for text for people, silent with ``--json``."""
-    return Console(soft_wrap=True, quiet=command.as_json, markup=False, highlight=False)
-
-
-def _print_photographs(console: Console, photographs: Photographs) -> None:
-    """Prints distance, size, brightness and sharpness of each photograph, and advice for better ones."""
-    sharp, pictures = photographs.captures.notes["sharp"], photographs.pictures
-    columns = {
-        "file": [picture.file for picture in pictures],
-        "distance m": [f"{picture.distance_m:.3f}" for picture in pictures],
-        "square px": [f"{picture.target.side_px:.0f}" for picture in pictures],
-        "paper %": [f"{100 * picture.target.white:.0f}" for picture in pictures],
-        "edge px": [f"{1 / picture.sharpness:.1f}" for picture in pictures],
-        "": ["in focus" if picture.file == sharp else "" for picture in pictures],
-    }
-    print_columns(console, "the target in the photographs", columns)
-    for sentence in photographs.advice:
-        console.print(f"better: {sentence}", style="cyan")
-
-
-def _print_fit(console: Console, captures: Captures, result: TableFit, messages: Sequence[str]) -> None:
-    """Prints the fits at all distances, the reason for the family, the colours, and warnings."""
+def _print_fit(console: Console, captures: Captures, result: TableFit) -> None:
+    """Prints the fits at all distances, the reason for the family, and the colours."""
     fits = result.fits
     columns = {
         "distance m": [f"{pair.distance_m:.4g}" for pair in captures],
@@ -183,8 +165,7 @@ def _print_fit(console: Console, captures: Captures, result: TableFit, messages:
         "x noise": [f"{f.residual_over_noise:.2f}".replace("nan", "") for f in fits],
         "magnified": [f"{f.magnification:.4f}" for f in fits],
     }
-    title = f"{captures.name or 'captures'}: {fits[0].family}, focus {captures.focus_m:.4g} m"
-    print_columns(console, title, columns)
+    print_columns(console, f"{captures.name or 'captures'}: {fits[0].family}, focus {captures.focus_m:.4g} m", columns)
     how = "from focal length and f-number" if result.scale == "camera" else "measured, the thin lens in between"
     console.print(f"family: {result.why}\ncircles of confusion: {how}")
     if result.colours:
@@ -198,20 +179,6 @@ def _print_fit(console: Console, captures: Captures, result: TableFit, messages:
         columns["lateral px in focus"] = [f"({x:+.2f}, {y:+.2f})" for x, y in lateral]
         print_columns(console, "colours, beside green", columns)
         console.print("the table holds a kernel a colour; lateral colour is no blur, and not in it")
-    for message in messages:
-        console.print(f"warning: {message}", style="yellow")
-
-
-def _draw_sheet(console: Console, photographs: Photographs, result: TableFit, target: Path) -> None:
-    """Draws photographs, fits and a rendering on one sheet; without matplotlib it prints a message."""
-    try:
-        from torchdof.fit.plots import sheet_of_photographs
-
-        sheet = sheet_of_photographs(photographs, result, lambda *scene: blur_by_coc(*scene[:2], table=scene[2]))
-    except ModuleNotFoundError as error:
-        console.print(f"no sheet of pictures: {error.name} is not installed (pip install torchdof[plot])")
-    else:
-        _save(console, sheet, target)
 
 
 def _write(console: Console, table: BlurTable, target: Path) -> None:

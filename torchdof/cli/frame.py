@@ -23,7 +23,7 @@ from ..optics.camera import CAMERA_NUMBERS, Camera
 from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect, stretch
-from .lens import Area
+from .lens import Area, Lens
 from .options import Scene, make_folder_of
 from .output import Notices, print_result
 
@@ -50,82 +50,75 @@ class Frame:
 
     def mistakes(self, camera: Camera) -> list[Mistake]:
         """Likely mistakes in the depth, given the camera."""
-        kind: Any = self.scene.depth_map.depth_kind
-        mistakes = depth_mistakes(self.values, camera, kind, self.scene.depth_map.depth_scale)
-        meant = ["blur"] * (self.scene.lens.blur_share is not None)  # --blur states it, so that no unit is wrong
-        meant += ["gap"] * (len(self.scene.lens.focus_m or []) > 1)  # a focus pull passes between surfaces
+        kind: Any = self.scene.depth_kind
+        meant = ["blur"] * (self.scene.blur_share is not None)  # --blur states it, so that no unit is wrong
+        meant += ["gap"] * (len(self.scene.focus_m or []) > 1)  # a focus pull passes between surfaces
+        mistakes = depth_mistakes(self.values, camera, kind, self.scene.depth_scale)
         return [mistake for mistake in mistakes if mistake.name not in meant]
 
 
 def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = False, **encoding: Any) -> Frame:
-    """Reads an image, as :func:`torchdof.io.images.read_image` does, and its depth, which may be a channel of it.
+    """Reads an image, with arguments of ``read_image``, and its depth, which may be a channel of it.
 
-    A depth of the kind "auto" is guessed. Holes are filled as the options state. Without that option they stay NaN
-    if ``holes`` is true; otherwise they are filled as the guess proposes, or raise ``ValueError``.
+    Holes are filled as the options state, else stay NaN if ``holes`` is true, else are filled as a guess proposes.
     """
-    source, guess = depth or image, ""
-    picture, depth_map = read_image(image, **encoding), scene.depth_map
+    source, guess, picture, fill = depth or image, "", read_image(image, **encoding), scene.fill_depth
     height, width = picture.pixels.shape[-2:]
-    area = Area(0, 0, width, height)
-    if picture.window is not None and image.suffix.lower() == ".exr":
-        x, y, full_x, full_y, *size = picture.window
-        area = Area(x - full_x, y - full_y, *size)
-    if depth is not None or depth_map.depth_channel is not None:
-        values = read_values(source, depth_map.depth_channel)
+    is_exr = image.suffix.lower() == ".exr"
+    x, y, full_x, full_y, *size = (picture.window if is_exr else None) or (0, 0, 0, 0, width, height)
+    area = Area(x - full_x, y - full_y, *size)
+    if depth is not None or scene.depth_channel is not None:
+        values = read_values(source, scene.depth_channel)
     elif picture.depth is not None:
         values = picture.depth
     else:
-        hint = "" if image.suffix.lower() == ".exr" else ", which a network such as Depth Anything makes of it"
+        hint = "" if is_exr else ", which a network such as Depth Anything makes of it"
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH{hint}")
-    fill: Any = depth_map.fill_depth
-    if depth_map.depth_kind == "auto":
-        depth_map, guess = depth_map.guessed(values, source, scene.lens.states_metres)
-        fill = fill if holes else depth_map.fill_depth
-    kind: Any = depth_map.depth_kind
+    if scene.depth_kind == "auto":
+        is_metric = bool(scene.given(Lens) & {"focus_m", "focus_range", "aperture_radius_m"})
+        scene, guess = scene.guessed(values, source, is_metric)
+        scene = dataclasses.replace(scene, fill_depth=fill if holes else scene.fill_depth)
+    kind: Any = scene.depth_kind
+    given: dict[str, Any] = {"unknown": scene.depth_unknown}
     rows, columns = values.shape[-2:]
     if kind == "coc" and (rows, columns) != (height, width):
         problem = f"coc is {columns} x {rows} pixels but the image is {width} x {height}; they must be the same"
         raise ValueError(f"{source}: {problem}")
-    unknown, filled, place, view_deg = depth_map.depth_unknown, 0, (...,), None
+    place: Any = (...,)
     if kind == "distance":
         centred_width = width + abs(area.width - 2 * area.x - width)
-        view_deg = scene.lens.view_deg(picture.metadata, centred_width, area)
+        given["fov_x_deg"] = scene.view_deg(picture.metadata, centred_width, area)
     try:
         same_aspect(picture.pixels, values)
         stretched = stretch(picture.pixels, values)
         if kind == "relative":
-            value_kind, value_range = depth_map.relative_kind or "disparity", depth_map.value_range
-            values = from_relative(values, *depth_map.ends_m, value_kind, value_range=value_range, unknown=unknown)
+            given["value_range"] = scene.value_range
+            values = from_relative(values, *scene.ends_m, scene.relative_kind or "disparity", **given)
         else:
-            scale, offset = depth_map.depth_scale, depth_map.depth_offset
             if kind == "distance":
                 values, place = area.centred(values, (height, width))
-            values = depth_from_values(values, kind, scale=scale, offset=offset, unknown=unknown, fov_x_deg=view_deg)
+            values = depth_from_values(values, kind, scale=scene.depth_scale, offset=scene.depth_offset, **given)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
-    values = values if kind == "coc" else at_size_of(picture.pixels, values[place])
-    if fill is not None or not holes:
-        values, filled = resolve_holes(values, str(source), fill, kind in ("relative", "coc"))
+    values, filled = values if kind == "coc" else at_size_of(picture.pixels, values[place]), 0
+    fill_by: Any = scene.fill_depth
+    if fill_by is not None or not holes:
+        values, filled = resolve_holes(values, str(source), fill_by, kind in ("relative", "coc"))
     remarks = [f"depth stretched by {stretched:.1%}"] if stretched else []
-    if kind == "relative" and None in (depth_map.near_m, depth_map.far_m):
-        remarks.append("depth from {:g} to {:g} m assumed".format(*depth_map.ends_m))
-    scene = dataclasses.replace(scene, depth_map=dataclasses.replace(depth_map, fill_depth=fill))
+    if kind == "relative" and None in (scene.near_m, scene.far_m):
+        remarks.append("depth from {:g} to {:g} m assumed".format(*scene.ends_m))
     return Frame(str(source), scene, picture, area, values, filled, remarks, guess)
 
 
 def coc_of(
     frame: Frame, notices: Notices, number: int = 0, is_still: bool = True
 ) -> tuple[Tensor, Camera | None, list[str]]:
-    """Signed radius ``[1, 1, H, W]`` in pixels, the camera (None for ``--depth-kind coc``), and remarks on both.
-
-    ``number`` is the frame number, at which the focus is interpolated between keyframes.
-    """
-    depth_map, values = frame.scene.depth_map, frame.values
-    if depth_map.depth_kind == "coc":
+    """Signed radius ``[1, 1, H, W]`` in pixels, the camera (None for ``--depth-kind coc``), and remarks on both."""
+    scene, values = frame.scene, frame.values
+    if scene.depth_kind == "coc":
         notices.warn(frame.name, coc_mistakes(values))
         return values, None, []
-    metadata, is_to_scale = frame.picture.metadata, depth_map.is_to_scale
-    camera, remarks = frame.scene.lens.camera(metadata, values, frame.area, number, is_still, is_to_scale)
+    camera, remarks = scene.camera(frame, number, is_still)
     coc_px = frame.area.coc_px(camera, values)
     coc_of_lens(coc_px, values, {name: getattr(camera, name) for name in CAMERA_NUMBERS})
     notices.warn(frame.name, frame.mistakes(camera))
@@ -137,91 +130,87 @@ def facts_of_camera(camera: Camera) -> dict[str, Any]:
     return {name: value for name, value in vars(camera).items() if name != "focus_breathing"}
 
 
-@dataclasses.dataclass(frozen=True)
-class Rendered:
-    """A rendered picture, and what its report needs."""
-
-    out: Path  # file to write
-    frame: Frame  # with all remarks
-    picture: Picture
-    coc_px: Tensor
-    camera: Camera | None
-    seconds: float
-
-
 class Renderer:
     """Reads, renders and writes the frames of ``torchdof render``."""
 
-    def __init__(self, command: "Render", scene: Scene, is_still: bool, is_animation: bool) -> None:
-        self.command, self.scene, self.is_still, self.is_animation = command, scene, is_still, is_animation
-        self.table, self.device = command.blur.table_of(command.blur.table), _device(command.device)
-        self.notices = Notices(scene.depth_map.strict)
+    def __init__(self, command: "Render", is_still: bool, is_animation: bool) -> None:
+        self.command, self.is_still, self.is_animation = command, is_still, is_animation
+        self.table, self.device = command.table_of(command.table), _device(command.device)
+        self.notices = Notices(command.strict)
 
     def read(self, image: Path, depth: Path | None) -> Frame:
         """Reads a frame as :func:`read_frame`, with the transfer curve and layer of the options."""
-        files = self.command.files
-        return read_frame(image, depth, self.scene, transfer=files.transfer, layer=files.layer)
+        return read_frame(image, depth, self.command, transfer=self.command.transfer, layer=self.command.layer)
 
-    def render(self, frame: Frame, out: Path, number: int) -> Rendered:
-        """Renders a frame of a number, to be written to ``out``."""
+    def render(self, frame: Frame, out: Path, number: int) -> tuple[Any, ...]:
+        """Renders a frame of a number, to be written to ``out``; returns the arguments of :meth:`write`."""
         start, picture, command = time.perf_counter(), frame.picture, self.command
         frame = dataclasses.replace(frame, values=frame.values.to(self.device))
         coc_px, camera, remarks = coc_of(frame, self.notices, number, self.is_still)
-        pixels = picture.pixels.to(self.device)
+        pixels, colours = picture.pixels.to(self.device), picture.light.shape[1]
         if command.show_focus:
             pixels = tint_focus(pixels, coc_px, picture.has_alpha)
             picture = dataclasses.replace(picture, channels=("R", "G", "B", "A")[: pixels.shape[1]])
         else:
-            table = _with_alpha(self.table) if picture.has_alpha else self.table
             attention = command.attention
             if attention is not None:
                 attention = (attention[0] - frame.area.x, attention[1] - frame.area.y, attention[2])
+            if command.lights and picture.sample in ("half", "float"):
+                raise ValueError(
+                    "--lights is for photographs of 8 or 16 bits, which clip at white; this image holds "
+                    f"{picture.sample} numbers, light above white included: leave --lights out"
+                )
             if command.lights:
-                pixels = _with_lights(picture, pixels, command.lights)
+                pixels = torch.cat([expand_highlights(pixels[:, :colours], command.lights), pixels[:, colours:]], 1)
+            table = _with_alpha(self.table) if picture.has_alpha else self.table
             with torch.no_grad():
-                pixels = blur_by_coc(pixels, coc_px, table=table, attention=attention, **command.accuracy.arguments())
+                pixels = blur_by_coc(pixels, coc_px, table=table, attention=attention, **command.arguments())
         frame, picture = dataclasses.replace(frame, remarks=remarks), dataclasses.replace(picture, pixels=pixels)
-        return Rendered(out, frame, picture, coc_px, camera, time.perf_counter() - start)
+        return out, frame, picture, coc_px, camera, time.perf_counter() - start
 
-    def write(self, rendered: Rendered) -> None:
+    def write(
+        self, out: Path, frame: Frame, picture: Picture, coc_px: Tensor, camera: Camera | None, seconds: float
+    ) -> None:
         """Writes the picture, whole or not at all, and its sheet, and prints notes and one line."""
-        command, files, seconds = self.command, self.command.files, rendered.seconds
-        out, frame, camera, table = rendered.out, rendered.frame, rendered.camera, self.table
+        command, note = self.command, self.notices.note
         make_folder_of(out)
-        write_image(out, rendered.picture, files.out_transfer, files.bits)
+        write_image(out, picture, command.out_transfer, command.bits)
         out = command.out if self.is_animation else out
-        if files.sheet is not None:
-            make_folder_of(files.sheet)
-            write_sheet(files.sheet, _panels(rendered))
-        (height, width), largest_px = rendered.coc_px.shape[-2:], float(rendered.coc_px.abs().max())
+        if command.sheet is not None:
+            middle = {"depth: near is bright": depth_colours(frame.values)}
+            if camera is None:
+                middle = {"blur radius: near orange, far blue": coc_colours(coc_px)}
+            panels = {"before": frame.picture.light, **middle, "after": picture.light}
+            make_folder_of(command.sheet)
+            write_sheet(
+                command.sheet, {name: shrunk(p.cpu(), _PANEL_PX).expand(-1, 3, -1, -1) for name, p in panels.items()}
+            )
+        (height, width), largest_px = coc_px.shape[-2:], float(coc_px.abs().max())
         if frame.guess:
-            self.notices.note("guess", f"{frame.name}: {frame.guess}")
+            note("guess", f"{frame.name}: {frame.guess}")
         if camera is not None and largest_px < _VISIBLE_PX:
             advice = "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
             if largest_px:
                 advice = f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; open the lens wider, "
                 advice += "with a smaller --f-number, a larger --blur, or a larger --aperture-radius-m"
-            self.notices.note("little blur", f"{out}: {advice}")
-        has_exif = any(name.startswith("Exif:") for name in frame.picture.metadata)
-        if has_exif and out.suffix.lower() in _WITHOUT_EXIF:
-            lost = f"EXIF data are lost in a {out.suffix} file; write .jpg, .png or .tif to keep them"
-            self.notices.note("exif", f"{out}: {lost}")
-        layers = ", ".join(frame.picture.other_layers)
-        if layers and out.suffix.lower() == ".exr":
-            self.notices.note("layers", f"{out}: is without the other layers of the image: {layers}")
-        options = Options.of(**command.accuracy.arguments())
+            note("little blur", f"{out}: {advice}")
+        has_exif, suffix = any(name.startswith("Exif:") for name in frame.picture.metadata), out.suffix.lower()
+        if has_exif and suffix in _WITHOUT_EXIF:
+            note("exif", f"{out}: EXIF data are lost in a {suffix} file; write .jpg, .png or .tif to keep them")
+        if frame.picture.other_layers and suffix == ".exr":
+            layers = ", ".join(frame.picture.other_layers)
+            note("layers", f"{out}: is without the other layers of the image: {layers}")
+        options, table = Options.of(**command.arguments()), self.table
         facts = {
             "out": str(out),
             "camera": camera and facts_of_camera(camera),
             "largest_coc_px": largest_px,
             "filled_px": frame.filled,
-            "show_focus": command.show_focus,
             "device": str(self.device),
             "table": table.name or table.family,
             "aperture": table.aperture and table.aperture.to_dict(),
             **{name: getattr(options, name) for name in ("method", "occlusion", "tolerance")},
-            "attention": command.attention,
-            "lights": command.lights,
+            **{name: getattr(command, name) for name in ("attention", "lights", "show_focus")},
             "assumed": frame.remarks,
             **{"width": width, "height": height, "seconds": seconds},
         }
@@ -233,8 +222,8 @@ class Renderer:
             _inside(table.aperture),
             "" if options.occlusion else "no occlusion",
             f"lights up to {command.lights:g} stops above white" if command.lights else "",
-            f"{frame.filled} px of depth filled ({frame.scene.depth_map.fill_depth})" if frame.filled else "",
-            f"sheet {files.sheet}" if files.sheet else "",
+            f"{frame.filled} px of depth filled ({frame.scene.fill_depth})" if frame.filled else "",
+            f"sheet {command.sheet}" if command.sheet else "",
             f"{width} x {height}",
             f"{seconds:.2f} s on {self.device}",
         ]
@@ -257,28 +246,6 @@ def _device(name: str) -> torch.device:
     except (RuntimeError, AssertionError, NotImplementedError):
         raise ValueError(f"--device {name}: there is no such device here; use cpu") from None
     return device
-
-
-def _panels(rendered: Rendered) -> dict[str, Tensor]:
-    """Panels of a sheet: caption -> ``[1, 3, H, W]`` in linear light."""
-    frame = rendered.frame
-    if rendered.camera is None:
-        middle = {"blur radius: near orange, far blue": coc_colours(rendered.coc_px)}
-    else:
-        middle = {"depth: near is bright": depth_colours(frame.values)}
-    panels = {"before": frame.picture.light, **middle, "after": rendered.picture.light}
-    return {name: shrunk(panel.cpu(), _PANEL_PX).expand(-1, 3, -1, -1) for name, panel in panels.items()}
-
-
-def _with_lights(picture: Picture, pixels: Tensor, stops: float) -> Tensor:
-    """Pixels with the light of clipped lamps restored; alpha is unchanged. Refuses floats, which do not clip."""
-    if picture.sample in ("half", "float"):
-        raise ValueError(
-            f"--lights is for photographs of 8 or 16 bits, which clip at white; this image holds {picture.sample} "
-            "numbers, light above white included: leave --lights out"
-        )
-    colours = picture.light.shape[1]
-    return torch.cat([expand_highlights(pixels[:, :colours], stops), pixels[:, colours:]], 1)
 
 
 def _with_alpha(table: BlurTable) -> BlurTable:

@@ -4,13 +4,13 @@ import dataclasses
 from pathlib import Path
 
 from ..io.atomic import check_writable
-from .command import argument, option
-from .options import Scene, check_files, json_option, make_folder_of
+from .command import Command, argument, option
+from .options import Scene, check_files, make_folder_of
 from .output import Notices, print_result
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Inspect:
+class Inspect(Scene, Command):
     """Report on a depth map and its blur by a camera, before anything is rendered.
 
     Prints ranges, blur radii, the share in focus, holes, and how many edges of the depth match edges of the image.
@@ -22,13 +22,11 @@ class Inspect:
     image: Path = argument("All-in-focus image, as for torchdof render.", "IMAGE")
     depth: Path | None = argument("Its depth; not needed if IMAGE has a Z channel.", "[DEPTH]", None)
     out: Path | None = option("Picture to write; default: IMAGE.inspect.png, in this folder.", names=("--out", "-o"))
-    scene: Scene
-    as_json: bool = json_option()
 
     def run(self) -> None:
         """Prints the report, and draws it."""
-        self.scene.lens.refuse_keyframes()
-        if self.scene.depth_map.depth_kind == "coc":
+        self.refuse_keyframes()
+        if self.depth_kind == "coc":
             raise ValueError("--depth-kind coc is the blur itself: there is no depth to inspect")
         target = Path(f"{self.image.stem}.inspect.png") if self.out is None else self.out
         check_files(self.image, self.depth, target)
@@ -37,14 +35,12 @@ class Inspect:
         from ..io.sheet import write_sheet
         from .frame import facts_of_camera, read_frame
 
-        frame = read_frame(self.image, self.depth, self.scene, holes=True)
-        depth_map = frame.scene.depth_map
+        frame = read_frame(self.image, self.depth, self, holes=True)
+        scene = frame.scene
         light, metres = frame.picture.light, frame.values
         if not bool((metres > 0).any()):
             raise ValueError(f"{frame.name}: no pixel has a depth; check the kind, scale and offset of the depth map")
-        camera, notes = frame.scene.lens.camera(
-            frame.picture.metadata, metres, frame.area, is_to_scale=depth_map.is_to_scale
-        )
+        camera, notes = scene.camera(frame)
         notes += frame.remarks
         report = inspect_depth(light, metres, camera)
         make_folder_of(target)
@@ -54,12 +50,12 @@ class Inspect:
         lines += [f"camera        {camera!r}" + (f" [{', '.join(notes)}]" if notes else ""), str(report)]
         if frame.filled:
             share = 100 * frame.filled / metres.numel()
-            lines.append(f"filled        {frame.filled} holes ({share:.1f} %), {depth_map.fill_depth}")
+            lines.append(f"filled        {frame.filled} holes ({share:.1f} %), {scene.fill_depth}")
         lines.append(f"picture       {target}")
         facts = {"image": str(self.image), "width": width, "height": height, "camera": facts_of_camera(camera)}
         facts |= {"assumed": notes, **report.facts(), "filled_px": frame.filled, "picture": str(target)}
         print_result(self.as_json, facts, "\n".join(lines))
-        notices = Notices(depth_map.strict)
+        notices = Notices(self.strict)
         if frame.guess:
             notices.note("guess", f"{frame.name}: {frame.guess}")
         notices.warn(frame.name, frame.mistakes(camera))

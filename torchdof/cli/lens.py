@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..io.metadata import camera_settings
 from ..io.sequence import focus_at_frame, parse_focus
-from .command import numbers, option
+from .command import Group, numbers, option, reader
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from ..optics.camera import Camera
+    from .frame import Frame
 
 _DEFAULTS = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
 _LABELS = dict(zip(_DEFAULTS, ("focal length", "f-number", "sensor width"), strict=True))
@@ -23,10 +24,7 @@ _PER_OUTLIER, _MAX_SAMPLES = 1000, 2**20  # one pixel in 1000 is ignored as an o
 
 
 class Area(NamedTuple):
-    """Place of an image's first pixel in the full frame, and the size of that frame, in pixels.
-
-    An EXR stores a data window, which may be a part of the frame (its display window) or extend beyond it.
-    """
+    """Place of an image (an EXR's data window) in the full frame (its display window), and that frame's size, in px."""
 
     x: int
     y: int
@@ -34,11 +32,7 @@ class Area(NamedTuple):
     height: int
 
     def centred(self, values: "Tensor", size: Sequence[int]) -> "tuple[Tensor, Any]":
-        """Pads a map so that the optical axis, in the middle of the full frame, is in the middle of the map.
-
-        The map ``[1, 1, h, w]`` is of an image of a height and width in pixels. Also returns its index in the padded
-        one.
-        """
+        """A map of an image of a size, padded so that the optical axis is in its middle, and the map's index in it."""
         from torch.nn.functional import pad
 
         (height, width), (rows, columns) = size, values.shape[-2:]
@@ -62,28 +56,18 @@ class Area(NamedTuple):
 
 def _width_fraction(text: str) -> float:
     """Reads a percentage of the width, as a fraction."""
-    expected = "--blur expects a share of the picture's width, above 0 and at most 50 %, such as 2%"
-    share = numbers(1, expected)(text.removesuffix("%"))[0] / 100
+    share = float(text.removesuffix("%")) / 100
     if not (text.endswith("%") and 0 < share <= 0.5):
-        raise ValueError(f"{expected}, got {text!r}")
+        raise ValueError
     return share
 
 
-def _equivalent(text: str) -> tuple[float, ...]:
-    """Reads a focal length in mm and an f-number."""
-    expected = "--equivalent expects a focal length and an f-number such as 85mm,1.4"
-    return numbers(2, expected)(re.sub(r"\s*(mm)?\s*[, ]\s*(f/?)?", ",", text, count=1))
-
-
-def _give_one(options: Mapping[str, Any], problem: str) -> None:
-    """Refuse more than one given option (option -> value or None); ``problem`` is the reason."""
-    given = [name for name, value in options.items() if value is not None]
-    if len(given) > 1:
-        raise ValueError(f"{' and '.join(given)} {problem}; give one of them")
+_SHARE = reader("--blur expects a share of the picture's width, above 0 and at most 50 %, such as 2%", _width_fraction)
+_EQUIVALENT = numbers(2, "--equivalent expects a focal length and an f-number such as 85mm,1.4")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sensor:
+class Sensor(Group):
     """Focus and lens."""
 
     focal_length_mm: float | None = option("Real focal length, not the 35 mm equivalent.")
@@ -119,45 +103,42 @@ class Lens(Sensor):
         "Open the lens until the largest blur radius is this share of the width, such as 2%; instead of --f-number.",
         names=("--blur",),
         metavar="SHARE%",
-        read=_width_fraction,
+        read=_SHARE,
         basic=True,
     )
     equivalent: tuple[float, float] | None = option(
         "Full-frame lens that the picture is taken to be from, such as 85mm,1.4.",
         metavar="MM,F",
-        read=_equivalent,
+        read=lambda text: _EQUIVALENT(re.sub(r"\s*(mm)?\s*[, ]\s*(f/?)?", ",", text, count=1)),
         basic=True,
     )
     aperture_radius_m: float | None = option("Radius of the opening, with --fov-deg.")
 
     def __post_init__(self) -> None:
-        focus_options = {"--focus-m": self.focus_m, "--focus-at": self.focus_at, "--focus-range": self.focus_range}
-        lens_options = {"--fov-deg": self.fov_deg, "--equivalent": self.equivalent}
+        super().__post_init__()
         real_lens = self.focal_length_mm if self.focal_length_mm is not None else self.sensor_width_mm
-        _give_one(focus_options, "both say where to focus")
-        _give_one(lens_options | {"--focal-length-mm with --sensor-width-mm": real_lens}, "say the same")
+        focus = {"--focus-m": self.focus_m, "--focus-at": self.focus_at, "--focus-range": self.focus_range}
+        lens = {"--fov-deg": self.fov_deg, "--equivalent": self.equivalent}
+        lens["--focal-length-mm with --sensor-width-mm"] = real_lens
+        opening: dict[str, Any] = {"--f-number": self.f_number, "--aperture-radius-m": self.aperture_radius_m}
+        opening |= {"--equivalent": self.equivalent, "--blur": self.blur_share}
+        for options, problem in (
+            (focus, "both say where to focus"),
+            (lens, "say the same"),
+            (opening, "both say how wide the lens opens"),
+        ):
+            given = [name for name, value in options.items() if value is not None]
+            if len(given) > 1:
+                raise ValueError(f"{' and '.join(given)} {problem}; give one of them")
         if self.fov_deg is None and self.aperture_radius_m is not None:
             raise ValueError("--aperture-radius-m goes with --fov-deg; a real lens has --f-number instead")
-        _give_one(self._opening, "both say how wide the lens opens")
         if self.fov_deg is not None and not 0 < self.fov_deg < 180:
             raise ValueError(f"--fov-deg must be a number of degrees > 0 and < 180, got {self.fov_deg:g}")
 
     @property
-    def _opening(self) -> dict[str, Any]:
-        """Option -> value, for the option that sets the aperture; empty if none does."""
-        given: dict[str, Any] = {"--f-number": self.f_number, "--aperture-radius-m": self.aperture_radius_m}
-        given |= {"--equivalent": self.equivalent, "--blur": self.blur_share}
-        return {name: value for name, value in given.items() if value is not None}
-
-    @property
     def has_focus(self) -> bool:
         """Whether an option sets the focus."""
-        return (self.focus_m, self.focus_at, self.focus_range) != (None, None, None)
-
-    @property
-    def states_metres(self) -> bool:
-        """Whether an option states a length in metres."""
-        return (self.focus_m, self.focus_range, self.aperture_radius_m) != (None, None, None)
+        return bool(self.given(Lens) & {"focus_m", "focus_at", "focus_range"})
 
     def refuse_keyframes(self) -> None:
         """Refuse keyframes of the focus, for a command that renders a single image."""
@@ -181,37 +162,29 @@ class Lens(Sensor):
             return dict(zip(_DEFAULTS, (*self.equivalent, _full_frame_mm(area)), strict=True))
         return {name: value for name in _DEFAULTS if (value := getattr(self, name)) is not None}
 
-    def camera(
-        self,
-        metadata: Mapping[str, Any],
-        depth: "Tensor",
-        area: Area,
-        frame: int = 0,
-        is_still: bool = True,
-        is_to_scale: bool = True,
-    ) -> "tuple[Camera, list[str]]":
-        """The camera of one picture, and remarks on the source of the numbers that no option states.
+    def camera(self, frame: "Frame", number: int = 0, is_still: bool = True) -> "tuple[Camera, list[str]]":
+        """The camera of one frame, and remarks on the source of the numbers that no option states.
 
         1. Take the focus from the options, else from the file, else from the subject of a still.
-        2. Take the lens from the options, else from the file, else from ``_DEFAULTS``, or a phone's sensor for a
-           focal length of the file that no larger camera has. It is that of the full frame; ``area`` is the place of
-           the picture in it.
+        2. Take the lens of the full frame from the options, else from the file, else from ``_DEFAULTS``, or a phone's
+           sensor for a focal length of the file that no larger camera has.
         3. Open the lens for the blur of ``--blur``, or for a visible blur in a still whose options leave it open.
 
-        In a sequence nothing is guessed, because guesses would differ from frame to frame. Without ``is_to_scale`` the
-        file's focus is ignored. Raises ``ValueError`` if no lens has these numbers.
+        In a sequence nothing is guessed, because guesses would differ from frame to frame. The focus of the file is
+        ignored if the depth is not to scale.
         """
         from ..depth.guess import subject_m
         from ..optics.camera import Camera
 
-        width = depth.shape[-1]
-        stated, in_file = self._stated(area), camera_settings(metadata, area.width, area.height)
+        area, depth, is_to_scale = frame.area, frame.values, frame.scene.is_to_scale
+        width, stated = depth.shape[-1], self._stated(area)
+        in_file = camera_settings(frame.picture.metadata, area.width, area.height)
         lens: dict[str, Any] = {name: (_DEFAULTS | in_file | stated)[name] for name in _DEFAULTS}
         if in_file.get("focal_length_mm", math.inf) < _PHONE_MM and "sensor_width_mm" not in in_file | stated:
             lens["sensor_width_mm"] = _full_frame_mm(area) * in_file["focal_length_mm"] / _PHONE_EQUIVALENT_MM
         remarks, focus_m = list[str](), math.inf
         if self.focus_m is not None:
-            focus_m = focus_at_frame(self.focus_m, frame)
+            focus_m = focus_at_frame(self.focus_m, number)
         elif not self.has_focus and is_to_scale and 1000 * in_file.get("focus_m", 0.0) > lens["focal_length_mm"]:
             focus_m = in_file["focus_m"]
             remarks.append("focus from the file")
@@ -220,7 +193,8 @@ class Lens(Sensor):
             remarks.append("focus on what is nearest the middle")
         elif not self.has_focus:
             raise ValueError("where is the focus? give --focus-m METRES or --focus-at X,Y (the file does not say)")
-        if self.fov_deg is not None and not self._opening:
+        has_opening = bool(self.given(Lens) & {"f_number", "aperture_radius_m", "equivalent", "blur_share"})
+        if self.fov_deg is not None and not has_opening:
             raise ValueError("--fov-deg needs the opening of the lens: --aperture-radius-m, --f-number or --blur")
         sources = {name: "from the file" if name in in_file else "assumed" for name in _DEFAULTS if name not in stated}
         if self.fov_deg is None:
@@ -228,14 +202,14 @@ class Lens(Sensor):
         else:
             radius_m = 0.01 if self.aperture_radius_m is None else self.aperture_radius_m
             camera = Camera.from_fov(self.fov_deg, radius_m, focus_m)
-            camera = camera if self.f_number is None else camera.replace(f_number=self.f_number)
+            camera = camera.replace(f_number=camera.f_number if self.f_number is None else self.f_number)
         camera = camera.replace(focus_range_m=self.focus_range, tilt_deg=self.tilt, swing_deg=self.swing)
         camera = camera.replace(sensor_width_mm=camera.sensor_width_mm * (width / area.width))
         if self.focus_at is not None:
             wide, padded, (_, rows, columns) = area.centred_camera(camera, depth)
             x, y = self.focus_at[0] - area.x + columns.start, self.focus_at[1] - area.y + rows.start
             camera = camera.replace(focus_m=wide.focus_at(padded, x, y).focus_m)
-        share, is_open = self.blur_share, is_still and not self._opening and (self == Lens() or not is_to_scale)
+        share, is_open = self.blur_share, is_still and not has_opening and not (is_to_scale and self.given(Lens))
         largest_px = self._largest_coc_px(camera, depth, area) if share is not None or is_open else 0.0
         if is_open and not (is_to_scale and "f_number" in in_file and largest_px >= _VISIBLE_BLUR * width):
             share = _DEFAULT_BLUR

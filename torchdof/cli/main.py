@@ -4,10 +4,10 @@ import contextlib
 import importlib
 import importlib.metadata
 import os
+import re
 import signal
 import sys
 from types import FrameType
-from typing import Any
 
 import click
 
@@ -21,18 +21,11 @@ COMMANDS = ("render", "fit", "export", "bench", "inspect", "tables")
 _EXTRAS = {"scipy": "fit", "threadpoolctl": "fit", "matplotlib": "plot"}
 _EXTRAS |= dict.fromkeys(("onnx", "onnxscript", "onnxruntime"), "export")
 # Parts of the messages of PyTorch's RuntimeError when memory runs out; they come from several libraries.
-_NO_MEMORY = (
-    "allocate memory",
-    "not enough memory",
-    "out of memory",
-    "bad_alloc",
-    "calculation overflowed",
-    "new thread",
-)
+_NO_MEMORY = "allocate memory|not enough memory|out of memory|bad_alloc|calculation overflowed|new thread"
 
 
 class _Commands(click.Group):
-    """The group of all commands."""
+    """All commands."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -46,10 +39,7 @@ class _Commands(click.Group):
         return command_of(cmd_name, getattr(module, cmd_name.capitalize()))
 
     def invoke(self, ctx: click.Context) -> object:
-        """Prints errors of input, files, memory and missing packages, and exits with code 2; other errors pass.
-
-        Ctrl-C ends the command with code 130, as in other programs, and one word; Click would exit with 1.
-        """
+        """Prints errors of input, files, memory and missing packages, and exits with code 2, or 130 after Ctrl-C."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
@@ -66,10 +56,9 @@ class _Commands(click.Group):
             command = self.get_command(ctx, ctx.invoked_subcommand or "")
             message = by_option(str(error) or type(error).__name__, command.params if command else ())
         except (MemoryError, RuntimeError) as error:
-            if isinstance(error, RuntimeError) and not any(words in str(error) for words in _NO_MEMORY):
+            if isinstance(error, RuntimeError) and not re.search(_NO_MEMORY, str(error)):
                 raise
-            message = "there is too little memory for this image; try a smaller one, a coarser --tolerance, or another "
-            message += "--device"
+            message = "there is too little memory for this image; try a smaller one, or a coarser --tolerance"
         to_stderr(f"error: {message}")
         raise SystemExit(2)
 
@@ -82,11 +71,15 @@ def _print_version(ctx: click.Context, _: click.Parameter, is_given: bool) -> No
         ctx.exit()
 
 
-_VERSION: dict[str, Any] = {"is_flag": True, "is_eager": True, "expose_value": False, "callback": _print_version}
-
-
 @click.group(cls=_Commands, context_settings={"max_content_width": 120})
-@click.option("--version", **_VERSION, help="Print the version and the engine in use.")
+@click.option(
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_print_version,
+    help="Print the version and the engine in use.",
+)
 def app() -> None:
     """Depth of field from an image and its depth: the photograph that a real lens would have taken."""
 
@@ -108,11 +101,7 @@ def main() -> None:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raises ``KeyboardInterrupt``, but ends the process while PyTorch is imported.
-
-    PyTorch imports NumPy from C++ and ignores any error there; after an interrupt the command would continue without
-    NumPy. No file is being written during the import.
-    """
+    """Raises ``KeyboardInterrupt``, but ends the process while PyTorch, which ignores it, imports NumPy from C++."""
     if getattr(getattr(sys.modules.get("torch"), "__spec__", None), "_initializing", False):
         with contextlib.suppress(OSError):
             os.write(2, b"interrupted\n")

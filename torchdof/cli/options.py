@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ..io.atomic import check_writable
 from ..io.paths import existing_image, existing_map, samples_of
-from .command import numbers, option, word_or_number
+from .command import Group, numbers, option, word_or_number
 from .lens import Lens
 
 if TYPE_CHECKING:
     from torch import Tensor
+    from typing_extensions import Self
 
     from ..optics.blur_table import BlurTable
 
@@ -22,7 +23,7 @@ _RENDER_TYPES = (".exr", ".tif", ".tiff")  # types whose floats are taken for di
 
 
 @dataclass(frozen=True, kw_only=True)
-class DepthMap:
+class DepthMap(Group):
     """Depth map."""
 
     depth_kind: Literal["auto", "z", "distance", "disparity", "inverse", "relative", "coc"] = option(
@@ -54,17 +55,17 @@ class DepthMap:
     strict: bool = option("Refuse what looks like a wrong unit or scale, instead of warning.", False)
 
     def __post_init__(self) -> None:
-        has_scale = self.depth_scale is not None or self.depth_offset != 0.0
-        is_relative = (self.near_m, self.far_m, self.relative_kind, self.value_range) != (None, None, None, None)
+        super().__post_init__()
+        given = self.given(DepthMap)
+        has_scale = bool(given & {"depth_scale", "depth_offset"})
+        is_relative = bool(given & {"near_m", "far_m", "relative_kind", "value_range"})
         if self.depth_kind == "auto" and (is_relative or has_scale or self.strict):  # these options imply the kind
             object.__setattr__(self, "depth_kind", "relative" if is_relative else "z")
         if self.depth_kind == "relative" and has_scale:
             raise ValueError("relative depth has no --depth-scale and --depth-offset: near and far say it")
         if self.depth_kind != "relative" and is_relative:
-            raise ValueError(
-                "--near-m, --far-m, --relative-kind and --value-range are for relative depth, and not for --depth-kind "
-                f"{self.depth_kind}"
-            )
+            options = "--near-m, --far-m, --relative-kind and --value-range"
+            raise ValueError(f"{options} are for relative depth, and not for --depth-kind {self.depth_kind}")
 
     @property
     def ends_m(self) -> tuple[float, float]:
@@ -79,12 +80,10 @@ class DepthMap:
         """Whether distances are in metres, and not only assumed for relative depth."""
         return self.depth_kind != "relative" or self.near_m is not None or self.far_m is not None
 
-    def guessed(self, values: "Tensor", path: Path, is_metric: bool) -> "tuple[DepthMap, str]":
-        """These options with a guessed kind instead of ``auto``, and a message about the guess.
+    def guessed(self, values: "Tensor", path: Path, is_metric: bool) -> "tuple[Self, str]":
+        """These options with a guessed kind instead of ``auto``, and a message about the guess, or none if it is clear.
 
-        If other options are in metres (``is_metric``) and so is the guess, there is a message only for numbers that
-        would be taken for relative depth without these options. Otherwise holes are filled from the far side by
-        default.
+        ``is_metric``: other options are in metres.
         """
         from ..depth.guess import guess_kind
 
@@ -96,42 +95,35 @@ class DepthMap:
             doubt = "its numbers grow downwards, as in relative depth (--depth-kind relative)"
             message = "" if is_clear else f"taken for metres, as the options are in metres, but {doubt}"
             return replace(self, depth_kind="z"), message
-        guessed_map = replace(
-            self,
-            depth_kind=guess.kind,
-            depth_unknown=guess.unknown if self.depth_unknown is None else self.depth_unknown,
-            fill_depth="far" if self.fill_depth is None else self.fill_depth,
-        )
+        changes: dict[str, Any] = {
+            "depth_kind": guess.kind,
+            "fill_depth": "far" if self.fill_depth is None else self.fill_depth,
+        }
+        changes["depth_unknown"] = guess.unknown if self.depth_unknown is None else self.depth_unknown
         if guess.kind == "z":
-            unit, scale = ("metres", None) if guess.scale == 1.0 else ("millimetres", guess.scale)
-            return replace(guessed_map, depth_scale=scale), f"taken for {unit} (else --depth-kind, --depth-scale)"
+            changes["depth_scale"] = None if guess.scale == 1.0 else guess.scale
+            unit = "metres" if guess.scale == 1.0 else "millimetres"
+            return replace(self, **changes), f"taken for {unit} (else --depth-kind, --depth-scale)"
         larger, other = ("nearer", "depth") if guess.relative_kind == "disparity" else ("farther", "disparity")
         message = f"taken for relative depth (else --depth-kind), larger is {larger} (else --relative-kind {other}), "
-        message += "from {:g} to {:g} m (else --near-m, --far-m)".format(*guessed_map.ends_m)
-        return replace(guessed_map, relative_kind=guess.relative_kind), message
+        message += "from {:g} to {:g} m (else --near-m, --far-m)".format(*self.ends_m)
+        return replace(self, **changes, relative_kind=guess.relative_kind), message
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
+class Scene(Lens, DepthMap):
     """Options for focus, lens and depth map, for commands that take an image and its depth."""
 
-    lens: Lens = Lens()
-    depth_map: DepthMap = DepthMap()
-
     def __post_init__(self) -> None:
-        if self.depth_map.depth_kind == "coc" and self.lens != Lens(fov_deg=self.lens.fov_deg):
+        super().__post_init__()
+        if self.depth_kind == "coc" and self.given(Lens) - {"fov_deg"}:
             raise ValueError(
                 "--depth-kind coc is the blur itself and takes no camera; leave focus and lens options out"
             )
 
-    def of_sequence(self) -> "Scene":
-        """The options for a sequence: "auto" becomes "z", because a guess could differ from frame to frame."""
-        is_guessed = self.depth_map.depth_kind == "auto"
-        return replace(self, depth_map=replace(self.depth_map, depth_kind="z")) if is_guessed else self
-
 
 @dataclass(frozen=True, kw_only=True)
-class ApertureOptions:
+class ApertureOptions(Group):
     """Blur."""
 
     blades: int = option("Aperture blades, from 3; 0 is a round lens.", 0)
@@ -142,6 +134,7 @@ class ApertureOptions:
     vignetting: float = option("Cat's eyes towards the corners: 0 none, 1 closed; not in exported files.", 0.0)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.aperture is not None and (self.blades or self.curvature):
             raise ValueError("--aperture is the whole opening; leave --blades and --curvature out")
         if self.rotation and not self.blades and self.aperture is None:
@@ -172,7 +165,7 @@ class Blur(ApertureOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Accuracy:
+class Accuracy(Group):
     """Blur."""
 
     tolerance: Any = option(
@@ -194,11 +187,6 @@ class Accuracy:
         """These options as arguments of :class:`torchdof.DepthOfField`."""
         arguments = {"tolerance": self.tolerance, "occlusion": not self.no_occlusion, "method": self.method}
         return arguments | ({"depth_edges": self.depth_edges.replace("-", " ")} if self.depth_edges else {})
-
-
-def json_option() -> Any:
-    """The option ``--json``, which every command has."""
-    return option("Print results as JSON, for programs: one object a line.", False, names=("--json",))
 
 
 def make_folder_of(path: Path) -> None:

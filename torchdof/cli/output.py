@@ -4,7 +4,6 @@ import contextlib
 import json
 import os
 import sys
-import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +12,6 @@ import click
 if TYPE_CHECKING:
     from ..depth.sanity import Mistake
 
-_DELAY_S = 3.0  # s before the bar appears
 _NOT_FINITE = {"Infinity": "inf", "-Infinity": "-inf", "NaN": "nan"}
 
 
@@ -23,12 +21,7 @@ def print_result(as_json: bool, facts: Mapping[str, Any], line: str) -> None:
 
 
 def json_line(facts: Mapping[str, Any]) -> str:
-    """Facts as one line of JSON; numbers that are not finite become the strings inf, -inf and nan.
-
-    Example:
-        >>> json_line({"focus_m": float("inf"), "size": (3, 2)})
-        '{"focus_m": "inf", "size": [3, 2]}'
-    """
+    """Facts as one line of JSON; numbers that are not finite become the strings inf, -inf and nan."""
     text = json.dumps(facts, default=lambda value: value.tolist())  # numpy's numbers and arrays
     return json.dumps(json.loads(text, parse_constant=_NOT_FINITE.__getitem__))
 
@@ -40,10 +33,7 @@ def to_stderr(line: str) -> None:
 
 
 class Notices:
-    """Notes and warnings of likely mistakes, one line each on standard error; each kind is printed once for all frames.
-
-    With ``strict`` a mistake raises ``ValueError``.
-    """
+    """Notes, and warnings of likely mistakes, or errors if ``strict``; each kind is printed once for all frames."""
 
     def __init__(self, strict: bool = False) -> None:
         self._strict, self._kinds = strict, set[str]()
@@ -65,35 +55,20 @@ class Notices:
 
 @contextlib.contextmanager
 def progress_bar(what: str, total: float | None = None) -> Iterator[Callable[..., None]]:
-    """A progress bar with the remaining time, shown after three seconds if standard error is a terminal.
+    """A progress bar with the remaining time, if standard error is a terminal.
 
-    Args:
-        what: Description of the current step.
-        total: Number of steps; None if it is unknown.
-
-    Yields:
-        A function that changes ``what``, ``done`` (the number of finished steps) or ``total``.
+    Yields a function that changes ``what`` (the current step), ``done`` (finished steps) or ``total``.
     """
-    if not sys.stderr.isatty():
-        yield lambda what=None, done=None, total=None: None
-        return
     from rich import progress
     from rich.console import Console
 
     columns = (progress.TextColumn("{task.description}", markup=False), progress.BarColumn())
-    bar = progress.Progress(
+    with progress.Progress(
         *(*columns, progress.TimeElapsedColumn(), progress.TimeRemainingColumn()),
         console=Console(stderr=True),
         transient=True,
+        disable=not sys.stderr.isatty(),
         redirect_stdout=sys.stdout.isatty(),  # prints lines above the bar; a file is unaffected
-    )
-    task, timer = bar.add_task(what, total=total), threading.Timer(_DELAY_S, bar.start)
-    timer.daemon = True
-    timer.start()
-    try:
+    ) as bar:
+        task = bar.add_task(what, total=total)
         yield lambda what=None, done=None, total=None: bar.update(task, description=what, completed=done, total=total)
-    finally:
-        timer.cancel()
-        timer.join()
-        if bar.live.is_started:
-            bar.stop()

@@ -15,8 +15,8 @@ import click
 from ..io.atomic import check_writable
 from ..io.sequence import FramePattern, parse_frames
 from ..io.webp import write_animation
-from .command import argument, numbers, option, options_of
-from .options import Accuracy, Blur, Scene, check_files, json_option, make_folder_of
+from .command import Command, Group, argument, numbers, option
+from .options import Accuracy, Blur, Scene, check_files, make_folder_of
 from .output import json_line, progress_bar
 from .resume import Record
 
@@ -30,11 +30,36 @@ _OWN_EXTREMES = (
     "far have in all frames: --value-range LOW,HIGH"
 )
 Encoding = Literal["linear", "srgb"]
-_NOT_OF_FRAMES = ("--out", "--sheet", "--frames", "--resume", "--strict", "--device", "--json")  # do not change frames
+_NOT_OF_FRAMES = ("out", "sheet", "frames", "resume", "strict", "device", "as_json")  # options that change no frame
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Files:
+class _Effects(Group):
+    """Blur."""
+
+    attention: tuple[float, float, float] | None = option(
+        "Where the viewer looks, in pixels from the top left: elsewhere a draft's tolerance is enough.",
+        metavar="X,Y,RADIUS",
+        read=numbers(3, "--attention expects X,Y,RADIUS in pixels such as 320,200,80"),
+    )
+    lights: float = option(
+        "Make lamps that a photograph clipped at white brighter by up to this many stops, such as 3.",
+        0.0,
+        metavar="STOPS",
+    )
+    show_focus: bool = option(
+        "Don't blur: show the image in grey, tinted: near orange, in focus green, far blue.", False
+    )
+    device: str = option("auto, cpu, cuda, cuda:1, ...", "auto")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.lights < math.inf:
+            raise ValueError(f"--lights must be a finite number of stops from 0 on, got {self.lights:g}")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Files(Group):
     """Files and frames."""
 
     transfer: Encoding | None = option("How IMAGE is encoded. Default: integers srgb, floats linear.")
@@ -48,7 +73,7 @@ class _Files:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Render:
+class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
     """Blur IMAGE by its DEPTH as a lens would.
 
     A photograph and its depth map of any kind; the assumptions are printed:
@@ -85,31 +110,6 @@ class Render:
         "Its depth (the same types, .npy, .npz); not needed if IMAGE has a Z channel.", "[DEPTH]", None
     )
     out: Path = option("File to write, or out.####.exr.", ..., names=("--out", "-o"), metavar="OUT")
-    scene: Scene
-    blur: Blur
-    accuracy: Accuracy
-    attention: tuple[float, float, float] | None = option(
-        "Where the viewer looks, in pixels from the top left: elsewhere a draft's tolerance is enough.",
-        metavar="X,Y,RADIUS",
-        read=numbers(3, "--attention expects X,Y,RADIUS in pixels such as 320,200,80"),
-        group="Blur",
-    )
-    lights: float = option(
-        "Make lamps that a photograph clipped at white brighter by up to this many stops, such as 3.",
-        0.0,
-        metavar="STOPS",
-        group="Blur",
-    )
-    show_focus: bool = option(
-        "Don't blur: show the image in grey, tinted: near orange, in focus green, far blue.", False, group="Blur"
-    )
-    device: str = option("auto, cpu, cuda, cuda:1, ...", "auto", group="Blur")
-    files: _Files
-    as_json: bool = json_option()
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.lights < math.inf:
-            raise ValueError(f"--lights must be a finite number of stops from 0 on, got {self.lights:g}")
 
     def run(self) -> None:
         """Renders one image, the frames of a sequence, or a focus pull in a still image.
@@ -118,30 +118,29 @@ class Render:
         2. With ``--resume`` leave out those that are complete, and neither their options nor their files have changed.
         3. Record the options, and render the frames in order.
         """
-        images, depths, files = _pattern(self.image), _pattern(self.depth), self.files
-        keys = (self.scene.lens.focus_m or []) if images is None else []
+        images, depths = _pattern(self.image), _pattern(self.depth)
+        keys = (self.focus_m or []) if images is None else []
         is_single = images is None and len(keys) < 2
-        scene = self.scene if images is None else self.scene.of_sequence()
         is_animation = images is None and not is_single and not _pattern(self.out)
+        has_number = FramePattern.is_padded(self.out) and not FramePattern.is_padded(self.image) and _pattern(self.out)
         if is_animation and self.out.suffix.lower() != ".webp":
             raise ValueError(f"{self.out}: expected one place for the frame number, such as pull.##.png, or a .webp")
-        if is_animation and files.resume:
+        if is_animation and self.resume:
             raise ValueError("--resume is of frames; an animation is one file, so leave it out")
-        if files.sheet is not None and not is_single:
+        if self.sheet is not None and not is_single:
             raise ValueError("--sheet is of one picture; leave it out where there are more")
-        has_number = FramePattern.is_padded(self.out) and not FramePattern.is_padded(self.image) and _pattern(self.out)
-        if (images is None and (files.steady or depths)) or (is_single and (files.frames or has_number)):
+        if (images is None and (self.steady or depths)) or (is_single and (self.frames or has_number)):
             raise ValueError(f"{self.image}: is a single image; for a sequence write it as shot.####.exr")
-        if images and scene.lens.blur_share is not None:
+        if images and self.blur_share is not None:
             raise ValueError("--blur would open the lens anew in each frame of a sequence; give --f-number")
-        if files.steady and scene.depth_map.depth_kind == "coc":
+        if self.steady and self.depth_kind == "coc":
             raise ValueError("--steady filters depth in metres; --depth-kind coc has none")
 
         def sources(n: int) -> tuple[Path, Path | None]:
             return images.name(n) if images else self.image, depths.name(n) if depths else self.depth
 
-        if files.frames is not None or images is None:
-            first, last = (0, 0) if is_single else files.frames or (keys[0][0], keys[-1][0])
+        if self.frames is not None or images is None:
+            first, last = (0, 0) if is_single else self.frames or (keys[0][0], keys[-1][0])
             numbers: Sequence[int] = range(first, last + 1)
         else:
             numbers = images.frames()
@@ -151,16 +150,17 @@ class Render:
         outputs: dict[int, Path] = {}
         for n in numbers:
             outputs[n] = target.name(n) if target else self.out
-            check_files(*sources(n), outputs[n], files.sheet)
+            check_files(*sources(n), outputs[n], self.sheet)
         whole = list(numbers)  # frames of the sequence, each of which may depend on those before it
-        if images and files.steady:
+        if images and self.steady:
             whole = [n for n in images.frames() if depths is None or depths.name(n).is_file()]
-        options = {name: value for name, value in options_of(self).items() if name not in _NOT_OF_FRAMES}
-        options |= {"files": self.blur.files(), "torchdof": importlib.metadata.version("torchdof")}
+        parameters = click.get_current_context().command.params
+        options = {p.opts[0]: getattr(self, p.name) for p in parameters if p.name and p.name not in _NOT_OF_FRAMES}
+        options |= {"files": self.files(), "torchdof": importlib.metadata.version("torchdof")}
         record, existing = Record(self.out, options), [out for out in outputs.values() if out.is_file()]
         reason, done = record.difference(), set[Path]()
-        if files.resume and not reason:
-            done = record.kept(outputs, {n: [*sources(n), *self.blur.files()] for n in whole}, files.steady)
+        if self.resume and not reason:
+            done = record.kept(outputs, {n: [*sources(n), *self.files()] for n in whole}, self.steady)
             reason = "they are older than their files or options, or they are cut short"
         if done:
             share = f"{self.out}: is" if is_single else f"{len(done)} of {len(outputs)} frames are"
@@ -169,18 +169,19 @@ class Render:
         todo = {n: out for n, out in outputs.items() if out not in done}
         if not todo:
             return
-        for out in filter(None, [*todo.values(), files.sheet]):
+        for out in filter(None, [*todo.values(), self.sheet]):
             check_writable(out)
         from ..depth.sanity import Mistake
         from ..depth.steady import SteadyFrames
         from .frame import Renderer
 
-        renderer, depth_map = Renderer(self, scene, images is None, is_animation), scene.depth_map
-        if files.resume and len(existing) > len(done):
+        is_guessed = images and self.depth_kind == "auto"  # a guess could differ from frame to frame
+        command = dataclasses.replace(self, depth_kind="z") if is_guessed else self
+        renderer = Renderer(command, images is None, is_animation)
+        if self.resume and len(existing) > len(done):
             again = f"{len(existing) - len(done)} of {len(outputs)} frames are rendered again"
             renderer.notices.note("again", f"{self.out}: {again}: {reason}")
-        is_recorded = files.resume or not is_single or record.path.is_file()
-        if images and depth_map.depth_kind == "relative" and depth_map.value_range is None and len(numbers) > 1:
+        if images and self.depth_kind == "relative" and self.value_range is None and len(numbers) > 1:
             renderer.notices.warn(self.depth or self.image, [Mistake("range", _OWN_EXTREMES)])
         read_files = functools.lru_cache(maxsize=1)(renderer.read)  # a focus pull reads one image many times
 
@@ -191,12 +192,13 @@ class Render:
         steady = SteadyFrames(pixels_and_depth)
 
         def read(n: int) -> "Frame":
-            if not (images and files.steady):
+            if not (images and self.steady):
                 return read_files(*sources(n))
             values = steady.depth(whole.index(n))  # reads frame n last, so that it is still in the cache
             return dataclasses.replace(read_files(*sources(n)), values=values)
 
         if not is_animation:
+            is_recorded = self.resume or not is_single or record.path.is_file()
             return self._render_each(renderer, todo, read, record if is_recorded else None)
         with tempfile.TemporaryDirectory() as folder:
             todo = {n: Path(folder, f"{n}.webp") for n in todo}
@@ -231,9 +233,10 @@ class Render:
                     if k == 0 and record is not None:
                         make_folder_of(files[n])
                         record.write()
-                    elif record is not None:
-                        record.check()
-                    written = writer.submit(renderer.write, rendered)  # Ctrl-C does not stop this thread
+                    elif record is not None and record.path.is_file() and (reason := record.difference()):
+                        problem = f"another run renders the same frames with other options ({reason})"
+                        raise ValueError(f"{record.path}: {problem}")
+                    written = writer.submit(renderer.write, *rendered)  # Ctrl-C does not stop this thread
             finally:  # a rendered frame is written even if the next one fails
                 written.result()
 

@@ -3,7 +3,7 @@
 import itertools
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,29 +32,18 @@ class Record:
     def kept(
         self, frames: Mapping[int, Path], sources: Mapping[int, Sequence[Path | None]], is_steady: bool
     ) -> set[Path]:
-        """The existing frames that are complete, and not older than the record and their sources.
-
-        ``sources`` are the files from which each frame is rendered, in the order of the sequence; with ``is_steady`` a
-        frame also depends on those before it.
-        """
+        """The complete existing frames not older than the record and their sources (if steady, those of all before)."""
         from ..io.decode import is_complete  # imports NumPy
 
-        times: Iterable[int] = (max(map(_changed_ns, filter(None, paths))) for paths in sources.values())
+        def changed_ns(*paths: Path | None) -> int:
+            return max(path.stat().st_mtime_ns for path in paths if path is not None)
+
+        times = [changed_ns(self.path, *paths) for paths in sources.values()]
         newest = dict(zip(sources, itertools.accumulate(times, max) if is_steady else times, strict=True))
-        start = _changed_ns(self.path)
-        recent = (out for n, out in frames.items() if out.is_file() and _changed_ns(out) >= max(start, newest[n]))
-        return {out for out in recent if is_complete(out)}
+        existing = ((n, out) for n, out in frames.items() if out.is_file())
+        return {out for n, out in existing if changed_ns(out) >= newest[n] and is_complete(out)}
 
     def write(self) -> None:
         """Writes the options, if they differ from those of the last run."""
         if self.difference():
             write_text(self.path, json.dumps(self._options, indent=1))
-
-    def check(self) -> None:
-        """Ends the run if another one has recorded other options since :meth:`write`: both would write one folder."""
-        if self.path.is_file() and (reason := self.difference()):
-            raise ValueError(f"{self.path}: another run renders the same frames with other options ({reason})")
-
-
-def _changed_ns(path: Path) -> int:
-    return path.stat().st_mtime_ns

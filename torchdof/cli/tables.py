@@ -1,15 +1,14 @@
 """``torchdof tables``: lists blur tables and draws their kernels."""
 
 import dataclasses
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from ..io.atomic import check_writable
-from .command import argument, option
-from .options import ApertureOptions, json_option, make_folder_of
+from .command import Command, argument, option
+from .options import ApertureOptions, make_folder_of
 from .output import print_result
 
 if TYPE_CHECKING:
@@ -21,11 +20,11 @@ _WIDTH = 1920  # px; image width for which kernels are drawn
 _COC_PX = (-24.0, -12.0, -6.0, 6.0, 12.0, 24.0)  # px; signed blur radii of the rows
 _CELL_PX = (200, 230)  # px; height and width of a kernel's picture, wide enough for its caption
 _ZOOM = 2  # width in the picture of one pixel of a kernel
-_POSITIONS = (0.0, 0.4, 0.7, 0.95)  # distances from the middle of the frame; its corner is at 1
+_POSITIONS = (0.0, 0.4, 0.7, 0.92)  # distances from the middle of the frame; its corner is at 1
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Tables:
+class Tables(ApertureOptions, Command):
     """List blur tables, and draw their kernels.
 
     The picture has a column for each table and a row for each signed blur radius, from 24 pixels in front of the focus
@@ -38,8 +37,6 @@ class Tables:
 
     names: tuple[str, ...] = argument("Names or JSON files; default: all that ship.", "[TABLE]...", ())
     out: Path | None = option("Picture to write.", names=("--out", "-o"))
-    opening: ApertureOptions
-    as_json: bool = json_option()
 
     def run(self) -> None:
         """Lists tables, and draws them if a picture is asked for."""
@@ -52,7 +49,7 @@ class Tables:
 
         panels = {}
         for name in self.names or ["disc", "gaussian", *shipped()]:
-            table = self.opening.table_of(name)
+            table = self.table_of(name)
             source = str(table.provenance.get("source", "")).partition(";")[0]
             facts = {"table": name, "family": table.family, "nodes": len(table.coc), "coc": table.coc[[0, -1]].tolist()}
             facts |= {"unit": table.unit, "colours": table.channels, "source": source}
@@ -79,23 +76,22 @@ def _column(table: "BlurTable") -> "Tensor":
     import torch
     import torch.nn.functional as functional
 
-    from ..optics.kernel_bank import bank_of
-    from ..optics.placed_kernels import layer_mask, placed
+    from ..module import blur_by_coc
 
-    size, columns = _CELL_PX[0] // _ZOOM // 2 * 2 - 1, []
-    for position in _POSITIONS if table.depends_on_place else ():
-        kernels, frame = [], (round(_WIDTH / 1.5), _WIDTH)
-        y, x = (torch.tensor([position * side / math.hypot(*frame)]) for side in frame)
-        for coc in _COC_PX:
-            central = bank_of(table).kernels(torch.tensor([coc]), _WIDTH, longest=[size // 2 + 1]).float()
-            mask = layer_mask(table, coc, 1, frame).to(central)
-            kernel = placed(central, [(mask, central.new_ones(()))], y, x)[0]
-            kernels.append(functional.pad(kernel, ((size - kernel.shape[-1]) // 2,) * 4))
-        columns.append(torch.stack(kernels))
-    columns = columns or [table.kernels(torch.tensor(_COC_PX), _WIDTH, size=size).float()]  # [n, 1 or C, size, size]
-    picture = torch.cat([k / k.amax((1, 2, 3), keepdim=True) for k in columns], -1)
-    picture = picture[:, :3] if picture.shape[1] >= 3 else picture[:, :1].expand(-1, 3, -1, -1)
-    picture = functional.interpolate(picture, scale_factor=float(_ZOOM), mode="nearest")
-    padding_y, padding_x = _CELL_PX[0] - picture.shape[-2], max(0, _CELL_PX[1] - picture.shape[-1])
-    cells = functional.pad(picture, (padding_x // 2, padding_x - padding_x // 2, padding_y, 0))
-    return cells.transpose(0, 1).flatten(1, 2)[None]  # [n, 3, h, w] -> [1, 3, n h, w]
+    half = _CELL_PX[0] // _ZOOM // 2 - 1
+    height, places = 2 * half + 1, [(half, _WIDTH // 2)]  # row and column of the dots of light that are blurred
+    if table.depends_on_place:
+        height = round(_WIDTH / 1.5)
+        places = [(round((1 + p) * height / 2), round((1 + p) * _WIDTH / 2)) for p in _POSITIONS]
+    dots = torch.zeros(1, max(3, table.channels), height, _WIDTH)
+    for y, x in places:
+        dots[..., y, x] = 1.0
+    cells = []
+    for coc_px in _COC_PX:
+        blurred = blur_by_coc(dots, torch.full((1, 1, height, _WIDTH), coc_px), table=table, tolerance=0)
+        kernels = [blurred[:, :3, y - half : y + half + 1, x - half : x + half + 1] for y, x in places]
+        row = torch.cat([kernel / kernel.amax() for kernel in kernels], -1)
+        row = functional.interpolate(row, scale_factor=float(_ZOOM), mode="nearest")
+        padding_y, padding_x = _CELL_PX[0] - row.shape[-2], max(0, _CELL_PX[1] - row.shape[-1])
+        cells.append(functional.pad(row, (padding_x // 2, padding_x - padding_x // 2, padding_y, 0)))
+    return torch.cat(cells, 2)

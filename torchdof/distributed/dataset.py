@@ -1,18 +1,17 @@
 """Makes a whole data set on a Ray cluster: missing shards, a list of broken inputs, and a card with its facts."""
 
-import dataclasses
 import hashlib
 import json
 import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..io.atomic import write_text
 from ..io.paths import IMAGE_SUFFIXES, MAP_SUFFIXES
 from ..validation import whole
-from .shards import SUFFIXES, Format, Pair, RenderShards, samples_of, shard_rows
+from .shards import SUFFIXES, Pair, RenderShards, samples_of, shard_rows
 
 _CARD = """# Defocus data set
 
@@ -25,8 +24,7 @@ Made by torchdof.
 """
 
 
-@dataclasses.dataclass(frozen=True)
-class Summary:
+class Summary(NamedTuple):
     """Contents of a data set: number of samples and shards, and image and error of each broken input."""
 
     samples: int
@@ -62,16 +60,10 @@ def pairs_in(images: str | os.PathLike[str], depths: str | os.PathLike[str] | No
 def _by_stem(folder: str | os.PathLike[str], suffixes: tuple[str, ...]) -> dict[str, list[Path]]:
     """The files of a folder with one of some suffixes, by their name without suffix."""
     by_stem: dict[str, list[Path]] = {}
-    for path in sorted(_existing_folder(folder).absolute().iterdir()):
+    for path in sorted(Path(folder).absolute().iterdir()):
         if path.suffix.lower() in suffixes and not path.name.startswith("."):
             by_stem.setdefault(path.stem, []).append(path)
     return by_stem
-
-
-def _existing_folder(folder: str | os.PathLike[str]) -> Path:
-    if not Path(folder).is_dir():
-        raise FileNotFoundError(f"{folder}: there is no such folder")
-    return Path(folder)
 
 
 def make_dataset(
@@ -82,16 +74,13 @@ def make_dataset(
     workers: int = 2,
     per_shard: int = 64,
     copies: int = 1,
-    format: Format = "webdataset",
     say: Callable[[str], object] = print,
     **render: Any,
 ) -> Summary:
-    """Makes the missing shards of a data set, on the Ray cluster in use or on this machine.
+    """Makes the missing shards of a data set with Ray, on the cluster in use or on this machine.
 
-    1. List the shards, and check that the folder has the same settings.
-    2. Render the shards that are missing or incomplete, or whose input files have changed, with Ray; so a call with the
-       same arguments continues after an interruption.
-    3. Write a summary and the list of broken inputs.
+    Shards that are complete, and whose settings and input files have not changed, are kept; so a call with the same
+    arguments continues after an interruption.
 
     Args:
         pairs: Images and depths.
@@ -100,9 +89,8 @@ def make_dataset(
         workers: Processes, each on one core.
         per_shard: Samples in a shard.
         copies: Number of blurred samples of each image.
-        format: "webdataset" or "parquet".
         say: Gets lines of text: the shards that exist, the throughput, the inputs that were left out.
-        **render: Further arguments of :class:`RenderShards`.
+        **render: Further arguments of :class:`RenderShards`, such as ``format``.
 
     Returns:
         Contents of the folder, also written as ``README.md``; broken inputs are listed in ``broken.txt``.
@@ -112,7 +100,6 @@ def make_dataset(
         ModuleNotFoundError: If Ray is not installed.
     """
     try:
-        import ray
         import ray.data
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError("data sets need Ray; install it with: pip install 'torchdof[ray]'") from error
@@ -120,11 +107,20 @@ def make_dataset(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     rows = shard_rows(pairs, per_shard, copies)
-    renderer = RenderShards(out, blur, format=format, **render)  # validates the arguments before Ray starts
+    renderer = RenderShards(out, blur, **render)  # validates the arguments before Ray starts
     digest = hashlib.sha256(json.dumps(rows).encode()).hexdigest()
     settings = {"images": len(pairs), "copies": copies, "per_shard": per_shard, "sha256_of_samples": digest}
     settings = json.loads(json.dumps(settings | renderer.settings()))  # tuples become lists
-    _check_settings(out / "plan.json", settings)
+    plan = out / "plan.json"
+    if not plan.is_file():
+        write_text(plan, json.dumps(settings, indent=1))
+    try:
+        recorded = dict(json.loads(plan.read_bytes()))
+    except (ValueError, TypeError):
+        raise ValueError(f"{plan}: cannot be read; put it back, or use another folder") from None
+    if differing := [name for name, value in settings.items() if recorded.get(name) != value]:
+        remedy = f"go on with those in {plan.name}, or use another folder"
+        raise ValueError(f"{out}: was begun with other settings ({', '.join(differing)}); {remedy}")
     missing = [row for row in rows if renderer.samples_of(**row) is None]
     say(f"{len(rows) - len(missing)} of {len(rows)} shards are there already")
     if missing:
@@ -137,19 +133,21 @@ def make_dataset(
         made = ray.data.from_items(missing, override_num_blocks=len(missing)).map_batches(
             RenderShards,
             fn_constructor_args=(str(out.resolve()), blur),
-            fn_constructor_kwargs={"format": format, "threads": 1, **render},
+            fn_constructor_kwargs={"threads": 1, **render},
             batch_size=1,
             compute=ray.data.ActorPoolStrategy(size=min(workers, len(missing))),
             num_cpus=1,
         )
         count = sum(not row["error"] for row in made.iter_rows())
         seconds = time.perf_counter() - start
-        rate = count / seconds
-        say(f"{count} samples in {seconds:.1f} s: {rate:.2f} images/s, {rate / workers:.2f} a worker")
+        say(f"{count} samples in {seconds:.1f} s: {count / seconds:.2f} images/s with {workers} workers")
     summary = summary_of(out)
-    facts: dict[str, Any] = {"samples": summary.samples, "shards": summary.shards}
-    facts |= {"inputs left out": f"{len(summary.broken)}, listed in broken.txt"}
-    facts |= {"time": f"{summary.seconds / max(1, summary.samples):.3f} s of one core a sample", **settings}
+    facts = {
+        **{"samples": summary.samples, "shards": summary.shards},
+        "inputs left out": f"{len(summary.broken)}, listed in broken.txt",
+        "time": f"{summary.seconds / max(1, summary.samples):.3f} s of one core a sample",
+        **settings,
+    }
     lines = [f"| {name} | {fact if isinstance(fact, str) else json.dumps(fact)} |\n" for name, fact in facts.items()]
     write_text(out / "README.md", _CARD + "".join(lines))
     write_text(out / "broken.txt", "".join(f"{image}\t{problem}\n" for image, problem in summary.broken))
@@ -160,24 +158,8 @@ def make_dataset(
 
 def summary_of(out: str | os.PathLike[str]) -> Summary:
     """Contents of the complete shards of a folder; ``FileNotFoundError`` if the folder is missing."""
-    shards = [path for path in sorted(_existing_folder(out).glob("shard-*")) if path.suffix in SUFFIXES.values()]
+    shards = [path for path in sorted(Path(out).iterdir()) if path.suffix in SUFFIXES.values()]
     noted = [notes for shard in shards if (notes := samples_of(shard)) is not None]
     rows = [row for notes in noted for row in notes]
     broken = [(row["image"], row["error"]) for row in rows if row["error"]]
     return Summary(len(rows) - len(broken), len(noted), broken, sum(row["seconds"] for row in rows))
-
-
-def _check_settings(path: Path, settings: dict[str, Any]) -> None:
-    """Writes the settings of a new folder, or refuses a folder that was begun with other settings."""
-    if not path.is_file():
-        write_text(path, json.dumps(settings, indent=1))
-    try:
-        recorded = json.loads(path.read_bytes())
-        differing = [name for name, value in settings.items() if recorded.get(name) != value]
-    except (ValueError, AttributeError):
-        raise ValueError(f"{path}: cannot be read; put it back, or use another folder") from None
-    if differing:
-        raise ValueError(
-            f"{path.parent}: was begun with other settings ({', '.join(differing)}); go on with those in {path.name}, "
-            "or use another folder"
-        )

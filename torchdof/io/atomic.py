@@ -18,19 +18,7 @@ __all__ = ["atomic_file", "check_writable", "exit_on_signals", "write_text"]
 
 @contextlib.contextmanager
 def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary file in the folder of ``path``, renamed to ``path`` at the end, or removed on any error.
-
-    Raises:
-        OSError: If the folder does not exist, or it or an existing file is read-only.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with atomic_file(folder + "/note.txt") as part:
-        ...         _ = part.write_text("complete")
-        ...     Path(folder + "/note.txt").read_text()
-        'complete'
-    """
+    """A temporary file in the folder of ``path``, renamed to ``path`` at the end, or removed on any error."""
     target = Path(os.path.realpath(path))
     if target.is_symlink():
         raise OSError(f"{path}: is a link that leads back to itself; name a file")
@@ -51,10 +39,7 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Refuses a file that is read-only, or that lies in a read-only folder or in a missing folder within one.
-
-    A rename could replace a read-only file; like other programs, this one does not.
-    """
+    """Refuses a file that is read-only, or that lies in a read-only folder or in a missing folder within one."""
     target = Path(os.path.realpath(path))
     if target.is_file() and not os.access(target, os.W_OK):
         raise PermissionError(f"{path}: is read-only; make it writable or name another file")

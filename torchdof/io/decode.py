@@ -1,13 +1,10 @@
-"""The stored numbers of image files and arrays, before their conversion to light or depth.
-
-The size in a header is compared with limits and with free memory before anything is decoded. OpenImageIO is imported
-when a file is read, so that ``import torchdof`` stays light.
-"""
+"""The stored numbers of image files and arrays, whose size is compared with limits and memory before it is decoded."""
 
 import contextlib
 import dataclasses
 import mmap
 import os
+import re
 import tempfile
 import zipfile
 from collections.abc import Iterator
@@ -19,13 +16,11 @@ import numpy as np
 from .memory import free_bytes
 from .metadata import Metadata, kept_metadata, upright
 
-__all__ = ["MAX_ATTRIBUTES", "Part", "first_line", "is_complete", "read_array", "read_parts", "utf8_name"]
+__all__ = ["Part", "errors_named", "first_line", "is_complete", "read_array", "read_parts", "utf8_name"]
 
 MAX_PIXELS = 2**28  # of an image or array; a larger limit allows damaged headers to claim more memory
-MAX_ATTRIBUTES = 4096
-"""Largest number of attributes in all parts of an EXR file together; renderers write a few hundred."""
-MAX_CHANNELS = 1024
-"""Largest number of channels in a part of an EXR file; OpenImageIO has the same limit."""
+MAX_ATTRIBUTES = 4096  # in all parts of an EXR file together; renderers write a few hundred
+MAX_CHANNELS = 1024  # in a part of an EXR file; OpenImageIO has the same limit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,19 +51,29 @@ def utf8_name(path: Path) -> Iterator[str]:
         yield name
 
 
+@contextlib.contextmanager
+def errors_named(path: Path) -> Iterator[None]:
+    """Puts the name of a file before the message of an error."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:  # torch's allocator raises the latter
+        raise OSError(f"{path}: does not fit into memory ({first_line(str(error))})") from None
+    except UnicodeDecodeError:
+        raise OSError(f"{path}: is damaged (a name in its header is not text)") from None
+    except (OSError, ValueError) as error:
+        raise (OSError if isinstance(error, OSError) else ValueError)(f"{path}: {error}") from None
+
+
 def read_parts(path: Path) -> list[Part]:
     """All parts of an image file; ``OSError`` if damaged, ``ValueError`` if too large or of an unsupported kind."""
     if path.suffix.lower() == ".pfm":
         return [_read_pfm(path)]
     _check_header(path)
-    try:
-        with utf8_name(path) as name:
-            return list(_parts(path, name))
-    except UnicodeDecodeError:
-        raise OSError(f"{path}: is damaged (a name in its header is not text)") from None
+    with utf8_name(path) as name:
+        return list(_parts(name))
 
 
-def _parts(path: Path, name: str) -> Iterator[Part]:
+def _parts(name: str) -> Iterator[Part]:
     """The parts of a file that OpenImageIO reads; only EXR files have several."""
     import OpenImageIO as oiio
 
@@ -76,23 +81,23 @@ def _parts(path: Path, name: str) -> Iterator[Part]:
     config.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(name, config)
     if source is None:
-        raise OSError(f"{path}: cannot be read ({first_line(oiio.geterror())})")
+        raise OSError(f"cannot be read ({first_line(oiio.geterror())})")
     specs: list[Any] = []
     is_exr, total_bytes = source.format_name() == "openexr", 0
     try:
         while (is_exr or not specs) and source.seek_subimage(len(specs), 0):
             specs.append(spec := source.spec())
             pixel_bytes = spec.nchannels * (spec.format.size() + 4)
-            total_bytes += _check_size(path, spec.width, spec.height, pixel_bytes, total_bytes)
+            total_bytes += _check_size(spec.width, spec.height, pixel_bytes, total_bytes)
             if spec.deep:
-                raise ValueError(f"{path}: holds deep samples; flatten it to one sample a pixel first")
-            _check_colours(path, spec)
+                raise ValueError("holds deep samples; flatten it to one sample a pixel first")
+            _check_colours(spec)
         for number, spec in enumerate(specs):
             source.seek_subimage(number, 0)
             values = source.read_image(spec.format)
             problem = source.geterror()
             if values is None or problem:
-                raise OSError(f"{path}: is damaged or cut short ({first_line(problem)})")
+                raise OSError(f"is damaged or cut short ({first_line(problem)})")
             names, orientation = tuple(spec.channelnames), 1
             values, metadata = values.reshape(spec.height, spec.width, len(names)), kept_metadata(spec.extra_attribs)
             window = (spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height)
@@ -137,11 +142,7 @@ def is_complete(path: Path) -> bool:
 
 
 def _check_header(path: Path) -> None:
-    """Refuse an EXR with more than ``MAX_ATTRIBUTES`` or ``MAX_CHANNELS``; OpenEXR takes minutes for 1e5.
-
-    Reference:
-        OpenEXR File Layout, openexr.com.
-    """
+    """Refuse an EXR with more than ``MAX_ATTRIBUTES`` or ``MAX_CHANNELS``; OpenEXR takes minutes for 1e5."""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         if content[:4] != b"v/1\x01" or len(content) < 9:
             return
@@ -153,53 +154,42 @@ def _check_header(path: Path) -> None:
                     return
             type_end = content.find(b"\0", content.find(b"\0", offset) + 1)
             start, size = type_end + 5, int.from_bytes(content[type_end + 1 : type_end + 5], "little")
-            if content[type_end - 6 : type_end] == b"chlist":
-                _check_channels(path, content[start : start + size])
+            is_list = content[type_end - 6 : type_end] == b"chlist"  # of channels, each a name, a zero and 16 bytes
+            count = len(re.findall(rb"[^\0]+\0.{16}", content[start : start + size], re.DOTALL)) if is_list else 0
+            if count > MAX_CHANNELS:
+                raise ValueError(f"its header has {count} channels in a part; at most {MAX_CHANNELS} are read")
             offset = start + size
             if type_end < offset - 2**31 or offset >= len(content):  # damaged: the reader will refuse it
                 return
-    raise ValueError(f"{path}: its headers hold more than {MAX_ATTRIBUTES} attributes, which is the limit")
+    raise ValueError(f"its headers hold more than {MAX_ATTRIBUTES} attributes, which is the limit")
 
 
-def _check_channels(path: Path, channels: bytes) -> None:
-    """Refuse a list of channels, each a name, a zero and 16 bytes, that is longer than ``MAX_CHANNELS``."""
-    count = offset = 0
-    while 0 < (end := channels.find(b"\0", offset)) and end > offset:
-        count, offset = count + 1, end + 17
-    if count > MAX_CHANNELS:
-        raise ValueError(f"{path}: its header has {count} channels in a part; at most {MAX_CHANNELS} are read")
-
-
-def _check_colours(path: Path, spec: Any) -> None:
+def _check_colours(spec: Any) -> None:
     """Refuse a TIFF whose colours OpenImageIO does not convert: CIELAB, a raw mosaic, negatives."""
     code = spec.get_int_attribute("tiff:PhotometricInterpretation", 2)  # 0, 1: grey; 2: RGB; 3: palette; 6: YCbCr
     is_cmyk = code == 5 and spec.get_string_attribute("tiff:ColorSpace") == "CMYK"
     if code not in (1, 2, 3, 6) and not (code == 0 and str(spec.format) == "uint8") and not is_cmyk:
-        raise ValueError(
-            f"{path}: its colours are not stored as RGB or grey (photometric interpretation {code}: CIELAB, a raw "
-            "mosaic, a negative or the like); convert it to RGB"
-        )
+        kind = f"photometric interpretation {code}: CIELAB, a raw mosaic, a negative or the like"
+        raise ValueError(f"its colours are not stored as RGB or grey ({kind}); convert it to RGB")
 
 
 def _read_pfm(path: Path) -> Part:
     """Reads a PFM file. OpenImageIO would multiply disparities by the scale in the header."""
     with path.open("rb") as file:
-        words: list[bytes] = []
-        while len(words) < 4 and (line := file.readline(100)):
-            words += line.split()
-        try:
-            channels = {b"PF": 3, b"Pf": 1}[words[0]]
-            width, height, scale = int(words[1]), int(words[2]), float(words[3])
-        except (IndexError, KeyError, ValueError):
-            raise OSError(f"{path}: is not a PFM file (its header should read 'PF' or 'Pf', size and scale)") from None
-        _check_size(path, width, height, 2 * 4 * channels)
-        count = width * height * channels
+        header = re.match(rb"P([Ff])\s+(-?\d+)\s+(-?\d+)\s+([-+.\deE]+)\s", file.read(400))
+        if header is None:
+            raise OSError("is not a PFM file (its header should read 'PF' or 'Pf', size and scale)")
+        names = "RGB" if header[1] == b"F" else "Y"
+        width, height = int(header[2]), int(header[3])
+        _check_size(width, height, 2 * 4 * len(names))
+        count = width * height * len(names)
+        file.seek(header.end())
         data = file.read(4 * count)
     if len(data) != 4 * count:
-        raise OSError(f"{path}: is cut short ({len(data)} of {4 * count} bytes of pixels)")
-    values = np.frombuffer(data, dtype="<f4" if scale < 0 else ">f4").astype(np.float32)
-    values = values.reshape(height, width, channels)[::-1]  # the bottom row is stored first
-    return Part("", tuple("Y" if channels == 1 else "RGB"), values, ("float",) * channels)
+        raise OSError(f"is cut short ({len(data)} of {4 * count} bytes of pixels)")
+    values = np.frombuffer(data, dtype="<f4" if header[4].startswith(b"-") else ">f4").astype(np.float32)
+    values = values.reshape(height, width, len(names))[::-1]  # the bottom row is stored first
+    return Part("", tuple(names), values, ("float",) * len(names))
 
 
 def read_array(path: Path, key: str | None) -> np.ndarray:
@@ -211,38 +201,35 @@ def read_array(path: Path, key: str | None) -> np.ndarray:
             if largest > 8 * MAX_PIXELS + 4096 or 2 * largest > free_bytes():
                 raise ValueError(f"holds {largest} bytes, more than {MAX_PIXELS} pixels or than there is memory for")
             with np.load(path, allow_pickle=False) as arrays:
+                names = ", ".join(arrays.files)
                 if key is None and len(arrays.files) != 1:
-                    raise ValueError(
-                        f"which of the arrays {', '.join(arrays.files)} is depth? name it (--depth-channel)"
-                    )
+                    raise ValueError(f"which of the arrays {names} is depth? name it (--depth-channel)")
                 if key is not None and key not in arrays.files:
-                    raise ValueError(f"no array {key!r}; it has {', '.join(arrays.files)}")
+                    raise ValueError(f"no array {key!r}; it has {names}")
                 array = arrays[key or arrays.files[0]]
         else:
             array = np.load(path, allow_pickle=False, mmap_mode="r")
         if not isinstance(array, np.ndarray):
             raise ValueError("it is not an array")
     except Exception as error:  # numpy and zipfile raise a dozen kinds of errors for damaged files
-        raise ValueError(f"{path}: cannot be read as an array ({first_line(str(error))})") from None
+        raise ValueError(f"cannot be read as an array ({first_line(str(error))})") from None
     shape = array.shape
     while array.ndim > 2 and 1 in (array.shape[0], array.shape[-1]):
         array = array[0] if array.shape[0] == 1 else array[..., 0]
     if array.ndim != 2 or array.dtype.kind not in "fiu" or array.size == 0:
-        raise ValueError(f"{path}: expected an array [H, W] of numbers, got {list(shape)} of {array.dtype}")
-    _check_size(path, array.shape[1], array.shape[0], array.dtype.itemsize + 4)
+        raise ValueError(f"expected an array [H, W] of numbers, got {list(shape)} of {array.dtype}")
+    _check_size(array.shape[1], array.shape[0], array.dtype.itemsize + 4)
     return np.asarray(array)
 
 
-def _check_size(path: Path, width: int, height: int, pixel_bytes: int, others: int = 0) -> int:
+def _check_size(width: int, height: int, pixel_bytes: int, others: int = 0) -> int:
     """Bytes needed to decode a picture; refuses it if they and those of ``others`` exceed the free memory."""
     if width < 1 or height < 1 or width * height > MAX_PIXELS:
-        raise ValueError(f"{path}: its header claims {width} x {height} pixels; between 1 and {MAX_PIXELS} are read")
+        raise ValueError(f"its header claims {width} x {height} pixels; between 1 and {MAX_PIXELS} are read")
     needed, free = width * height * pixel_bytes, free_bytes()
     if needed + others > free:
-        raise ValueError(
-            f"{path}: its header claims {width} x {height} pixels, which take {(needed + others) / 2**30:.3g} GiB; "
-            f"{max(0.0, free) / 2**30:.3g} GiB of memory are free"
-        )
+        gib = f"{(needed + others) / 2**30:.3g} GiB; {max(0.0, free) / 2**30:.3g} GiB of memory are free"
+        raise ValueError(f"its header claims {width} x {height} pixels, which take {gib}")
     return needed
 
 

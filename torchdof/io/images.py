@@ -2,14 +2,11 @@
 
 The transfer curve is never guessed from a tag. Files of integers (PNG, JPEG, TIFF of 8 or 16 bits) are sRGB, and files
 of floats (EXR, HDR, PFM, TIFF of floats) linear light, unless the argument ``transfer`` changes that.
-
-OpenImageIO is imported when a file is read or written, so that ``import torchdof`` stays light.
 """
 
-import contextlib
 import dataclasses
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +17,9 @@ from torch import Tensor
 from ..validation import choice, real_tensor, show
 from .atomic import atomic_file
 from .channels import colour_channels, depth_channel
-from .decode import Part, first_line, is_complete, read_array, read_parts, utf8_name
+from .decode import Part, errors_named, first_line, is_complete, read_array, read_parts, utf8_name
 from .paths import PixelType, existing_image, existing_map, samples_of
-from .transfer import Transfer, decode, default_transfer, encode, encode_8_bits
+from .transfer import Transfer, decode, default_transfer, encode
 from .webp import add_exif
 
 __all__ = ["Picture", "read_image", "read_values", "write_image"]
@@ -86,8 +83,7 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
         layer: Name of the part or layer of an EXR file to read; None takes the first that has colour.
 
     Returns:
-        The picture, upright, with orientation tag 1. Its depth channel is read from any part of an EXR file (names like
-        ``Z``, ``depth`` or ``ViewLayer.Depth.Z``).
+        The picture, upright; its depth channel is one like ``Z``, ``depth`` or ``ViewLayer.Depth.Z`` of an EXR file.
 
     Raises:
         OSError: If the file is missing, empty, truncated, not an image, or does not fit into memory.
@@ -104,17 +100,14 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
     path = existing_image(path)
     if transfer is not None:
         choice("transfer", transfer, ("linear", "srgb"))
-    with _memory_errors_named(path):
+    with errors_named(path):
         parts = read_parts(path)
-        try:
-            part, indices, names = colour_channels([(p.label, p.names) for p in parts], layer, parts[0].is_exr)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+        part, indices, names = colour_channels(parts, layer)
         source = parts[part]
-        pixels, sample, transfer = _light(path, source, indices, transfer, has_alpha=names[-1] == "A")
+        pixels, sample, transfer = _light(source, indices, transfer, has_alpha=names[-1] == "A")
         depth, places = None, {(part, k) for k in indices}
         same_size = [n for n, p in enumerate(parts) if p.values.shape[:2] == source.values.shape[:2]]
-        depth_place = depth_channel([(parts[n].label, parts[n].names) for n in same_size])
+        depth_place = depth_channel([parts[n] for n in same_size])
         if depth_place is not None:
             places.add((same_size[depth_place[0]], depth_place[1]))
             depth = _map(parts[same_size[depth_place[0]]].values[..., depth_place[1]])
@@ -123,49 +116,29 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
     return Picture(pixels, names, depth, source.metadata, sample, transfer, source.window, source.orientation, layers)
 
 
-@contextlib.contextmanager
-def _memory_errors_named(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except (MemoryError, RuntimeError) as error:  # torch's allocator raises the latter
-        raise OSError(f"{path}: does not fit into memory ({first_line(str(error))})") from None
-
-
 def _light(
-    path: Path, source: Part, indices: list[int], transfer: Transfer | None, has_alpha: bool
+    source: Part, indices: list[int], transfer: Transfer | None, has_alpha: bool
 ) -> tuple[Tensor, PixelType, Transfer]:
     """Light ``[1, C, H, W]`` from stored numbers, their type, and their encoding."""
-    kinds = [source.kinds[k] for k in indices]
-    kind = kinds[0] if len(set(kinds)) == 1 else "float"
+    kinds = {source.kinds[k] for k in indices}
+    kind = kinds.pop() if len(kinds) == 1 else "float"
     if kind not in _SAMPLE_TYPES and not source.is_exr:
-        raise ValueError(f"{path}: holds numbers of type {kind}, for which white is not defined; store 16 bits")
+        raise ValueError(f"holds numbers of type {kind}, for which white is not defined; store 16 bits")
     sample = _SAMPLE_TYPES.get(kind, "float")
-    transfer, white = transfer or default_transfer(sample), _WHITE[sample]
-    curve = None
-    if white > 1 and (source.straight_alpha or not has_alpha):
-        levels = np.arange(white + 1, dtype=np.float32).reshape(1, 1, 1, -1) / np.float32(white)
-        curve = decode(torch.from_numpy(levels), transfer, has_alpha=False, straight=False).flatten().numpy()
+    transfer = transfer or default_transfer(sample)
     height, width = source.values.shape[:2]
     light, bad_pixels = torch.from_numpy(np.empty((1, len(indices), height, width), np.float32)), 0
     for rows in _strips(height, width * len(indices)):
-        stored = source.values[rows][..., indices]
-        if curve is not None:
-            values = curve[stored]
-            if has_alpha:
-                values[..., -1] = stored[..., -1] / np.float32(white)
-        else:
-            values = _float32(stored)
-            values = values / np.float32(white) if white > 1 else values
-            bad_pixels += int((~np.isfinite(values)).any(axis=-1).sum())
+        values = _float32(source.values[rows][..., indices])
+        if _WHITE[sample] > 1:
+            values /= np.float32(_WHITE[sample])
+        bad_pixels += int((~np.isfinite(values)).any(axis=-1).sum())
         pixels = torch.from_numpy(values).permute(2, 0, 1)[None]  # [h, W, C] -> [1, C, h, W]
-        encoded: Transfer = "linear" if curve is not None else transfer
-        light[:, :, rows] = decode(pixels, encoded, has_alpha, source.straight_alpha)
+        light[:, :, rows] = decode(pixels, transfer, has_alpha, source.straight_alpha)
         if not bad_pixels and not bool(torch.isfinite(light[:, :, rows]).all()):
-            raise ValueError(f"{path}: its light is beyond the range of float32; scale it down")
+            raise ValueError("its light is beyond the range of float32; scale it down")
     if bad_pixels:
-        raise ValueError(
-            f"{path}: {bad_pixels} pixels are not finite (NaN or inf); repair them before blurring spreads them"
-        )
+        raise ValueError(f"{bad_pixels} pixels are not finite (NaN or inf); repair them before blurring spreads them")
     return light, sample, transfer
 
 
@@ -220,14 +193,11 @@ def write_image(
     if names[0] == "Y" and suffix not in _GREY_SUFFIXES:
         pixels, names = pixels.expand(-1, 3, -1, -1), ("R", "G", "B")
     straight = names[-1] == "A" and suffix != ".exr"
-    if sample == "8" and (straight or names[-1] != "A"):
-        array = encode_8_bits(pixels, transfer, straight)
-    else:
-        array = np.empty((*pixels.shape[2:], len(names)), np.float32)
-        for rows in _strips(array.shape[0], array.shape[1] * len(names)):
-            encoded = encode(pixels[:, :, rows], transfer, names[-1] == "A", straight)
-            encoded = encoded.clamp(-65504.0, 65504.0) if sample == "half" else encoded
-            array[rows] = encoded[0].permute(1, 2, 0).numpy()  # [C, h, W] -> [h, W, C]
+    array = np.empty((*pixels.shape[2:], len(names)), np.float32)
+    for rows in _strips(array.shape[0], array.shape[1] * len(names)):
+        encoded = encode(pixels[:, :, rows], transfer, names[-1] == "A", straight)
+        encoded = encoded.clamp(-65504.0, 65504.0) if sample == "half" else encoded
+        array[rows] = encoded[0].permute(1, 2, 0).numpy()  # [C, h, W] -> [h, W, C]
 
     spec = oiio.ImageSpec(array.shape[1], array.shape[0], array.shape[2], _OIIO_SAMPLE[sample])
     spec.channelnames = names
@@ -285,7 +255,7 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
         ValueError: If the channel is ambiguous or missing, or the array is not two-dimensional numbers.
     """
     path = existing_map(path)
-    with _memory_errors_named(path):
+    with errors_named(path):
         if path.suffix.lower() in (".npy", ".npz"):
             return _map(read_array(path, channel))
         parts = read_parts(path)
@@ -294,15 +264,15 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
         if channel is not None:
             chosen = [plane for label, name, plane in planes if channel in (name, f"{label}.{name}")]
             if not chosen:
-                raise ValueError(f"{path}: no channel {channel!r}; it has {channel_names}")
+                raise ValueError(f"no channel {channel!r}; it has {channel_names}")
             return _map(chosen[0])
-        depth_place = depth_channel([(p.label, p.names) for p in parts])
+        depth_place = depth_channel(parts)
         if depth_place is not None:
             return _map(parts[depth_place[0]].values[..., depth_place[1]])
         if all(np.array_equal(values, planes[0][2]) for _, name, values in planes if name != "A"):
             return _map(planes[0][2])
-    advice = "name it (--depth-channel); the colours of a heat map are no depth: save the map in grey, or as .npy"
-    raise ValueError(f"{path}: which of the channels {channel_names} is depth? {advice}")
+        advice = "name it (--depth-channel); the colours of a heat map are no depth: save the map in grey, or as .npy"
+        raise ValueError(f"which of the channels {channel_names} is depth? {advice}")
 
 
 def _map(values: np.ndarray) -> Tensor:

@@ -1,6 +1,7 @@
 """Metadata of an image file: tags that a copy keeps, orientation, camera settings."""
 
 import math
+import re
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -13,20 +14,15 @@ Metadata = dict[str, tuple[Any, Any]]
 """Name -> (OpenImageIO type, value)."""
 
 # Attributes of the storage of one file, which do not apply to a copy.
-_STORAGE_PREFIXES = ("oiio:", "tiff:", "openexr:", "png:", "pnm:", "jpeg:", "rgbe:", "thumbnail", "Exif:ExifVersion")
-_STORAGE_NAMES = (
-    *("name", "planarconfig", "textureformat", "CompressionQuality"),
-    *("Exif:FlashPixVersion", "Exif:ColorSpace"),
-)
+_STORAGE = "oiio:|tiff:|openexr:|png:|pnm:|jpeg:|rgbe:|thumbnail|Exif:(ExifVersion|FlashPixVersion|ColorSpace)|"
+_STORAGE += "(name|planarconfig|textureformat|CompressionQuality)$"
 _MM_PER_UNIT: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
 _FLIPPED: dict[Any, tuple[int, ...]] = {2: (1,), 3: (0, 1), 4: (0,), 5: (), 6: (1,), 7: (0, 1), 8: (0,)}
 """EXIF orientation (0x0112) -> flipped axes. Orientations from 5 up first transpose the image."""
 _FOCAL_MM, _SENSOR_MM, _F_NUMBERS = (0.5, 3000.0), (1.0, 300.0), (0.5, 1000.0)
 """Smallest and largest number of a lens that is believed: cameras write 0, or micrometres, for unknown numbers."""
-_AXIS_TAGS = (  # tags that are swapped when an image is transposed
-    ("Exif:PixelXDimension", "Exif:PixelYDimension"),
-    ("Exif:FocalPlaneXResolution", "Exif:FocalPlaneYResolution"),
-)
+_AXES = (("Exif:PixelXDimension", "Exif:PixelYDimension"), ("Exif:FocalPlaneXResolution", "Exif:FocalPlaneYResolution"))
+_SWAPPED = {**dict(_AXES), **{down: across for across, down in _AXES}}  # names of tags when an image is transposed
 
 
 def upright(values: "np.ndarray", metadata: Metadata) -> "tuple[np.ndarray, Metadata]":
@@ -37,22 +33,14 @@ def upright(values: "np.ndarray", metadata: Metadata) -> "tuple[np.ndarray, Meta
     upright_metadata = metadata | {"Orientation": (kind, 1)}
     if orientation >= 5:
         values = values.swapaxes(0, 1)
-        for across, down in _AXIS_TAGS:
-            for name, other in ((across, down), (down, across)):
-                upright_metadata.pop(name, None)
-                if other in metadata:
-                    upright_metadata[name] = metadata[other]
+        upright_metadata = {_SWAPPED.get(name, name): value for name, value in upright_metadata.items()}
     rows, columns = (slice(None, None, -1 if axis in _FLIPPED[orientation] else 1) for axis in (0, 1))
     return values[rows, columns], upright_metadata
 
 
 def kept_metadata(attributes: Iterable[Any]) -> Metadata:
     """Metadata for a copy of an image: OpenImageIO's ``extra_attribs``, without those of the storage."""
-    return {
-        a.name: (a.type, a.value)
-        for a in attributes
-        if not a.name.startswith(_STORAGE_PREFIXES) and a.name not in _STORAGE_NAMES
-    }
+    return {a.name: (a.type, a.value) for a in attributes if not re.match(_STORAGE, a.name)}
 
 
 def camera_settings(metadata: Mapping[str, tuple[Any, Any]], width: int, height: int) -> dict[str, float]:

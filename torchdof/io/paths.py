@@ -9,15 +9,7 @@ from typing import Literal
 
 from . import optional_formats
 
-__all__ = [
-    "IMAGE_SUFFIXES",
-    "MAP_SUFFIXES",
-    "PixelType",
-    "existing_file",
-    "existing_image",
-    "existing_map",
-    "samples_of",
-]
+__all__ = ["IMAGE_SUFFIXES", "MAP_SUFFIXES", "PixelType", "existing_image", "existing_map", "samples_of"]
 
 PixelType = Literal["8", "16", "half", "float"]
 
@@ -45,20 +37,18 @@ def samples_of(path: Path) -> tuple[PixelType, ...]:
 
 
 def existing_image(path: str | os.PathLike[str]) -> Path:
-    """Checks the path of an image, as :func:`existing_file`."""
+    """Checks the path of an image; errors name it."""
     if refusal := optional_formats.refusal(path):
         raise ValueError(f"{path}: {refusal}")
-    is_known = isinstance(path, str | os.PathLike) and Path(path).suffix.lower() in IMAGE_SUFFIXES
-    others = () if is_known else optional_formats.readable()  # which imports OpenImageIO
-    return existing_file(path, (*IMAGE_SUFFIXES, *others), "an image")
+    return _existing_file(path, (*IMAGE_SUFFIXES, *optional_formats.SUFFIXES), "an image")
 
 
 def existing_map(path: str | os.PathLike[str]) -> Path:
-    """Checks the path of a depth map, as :func:`existing_file`."""
-    return existing_file(path, MAP_SUFFIXES, "a depth map")
+    """Checks the path of a depth map; errors name it."""
+    return _existing_file(path, MAP_SUFFIXES, "a depth map")
 
 
-def existing_file(path: str | os.PathLike[str], suffixes: tuple[str, ...], what: str) -> Path:
+def _existing_file(path: str | os.PathLike[str], suffixes: tuple[str, ...], what: str) -> Path:
     """Returns ``path`` if it is a file with one of ``suffixes`` and is not empty; messages call it ``what``."""
     if not isinstance(path, str | os.PathLike) or "\0" in os.fspath(path):
         from ..validation import show  # imports PyTorch
@@ -68,9 +58,8 @@ def existing_file(path: str | os.PathLike[str], suffixes: tuple[str, ...], what:
     if os.path.islink(os.path.realpath(path)):
         raise OSError(f"{path}: is a link that leads back to itself")
     if path.suffix.lower() not in suffixes:
-        raise ValueError(
-            f"{path}: {path.suffix or 'no suffix'} is not {what} that can be read; use {' '.join(suffixes)}"
-        )
+        kind = path.suffix or "no suffix"
+        raise ValueError(f"{path}: {kind} is not {what} that can be read; use {' '.join(suffixes)}")
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
     if not path.is_file():

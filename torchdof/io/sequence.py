@@ -7,36 +7,26 @@ from pathlib import Path
 
 __all__ = ["FramePattern", "focus_at_frame", "parse_focus", "parse_frames"]
 
-_PLACEHOLDER = re.compile(r"#+|%0?(\d*)d")
 _MAX_DIGITS = 18  # of a frame number
 
 
 class FramePattern:
-    """A file name with a placeholder for the frame number: ``####`` or ``%04d``, zero-padded to that many digits.
-
-    Only the last component of the path may have a placeholder; folder names are used literally.
-
-    Raises:
-        ValueError: If there is not exactly one placeholder, or it has more than 18 digits.
-    """
+    """A file name with a placeholder for the frame number: ``####`` or ``%04d``, zero-padded to that many digits."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        placeholders = list(_PLACEHOLDER.finditer(self.path.name))
-        if len(placeholders) != 1:
-            expected = "expected one place for the frame number in the file's name, such as shot.####.exr"
-            raise ValueError(f"{path}: {expected}")
-        placeholder = placeholders[0]
-        self._before, self._after = self.path.name[: placeholder.start()], self.path.name[placeholder.end() :]
-        text = placeholder.group()
-        self._digits = len(text) if text.startswith("#") else int((placeholder.group(1) or "1")[:9])
+        parts = re.split(r"(#+|%0?\d*d)", self.path.name)  # folders are taken literally
+        if len(parts) != 3:
+            raise ValueError(f"{path}: expected one place for the frame number in the file's name, as shot.####.exr")
+        self._before, place, self._after = parts
+        self._digits = len(place) if place[0] == "#" else int(place[1:-1][:9] or 1)
         if self._digits > _MAX_DIGITS:
             raise ValueError(f"{path}: the frame number must have at most {_MAX_DIGITS} digits, got {self._digits}")
 
     @staticmethod
     def matches(path: str | Path) -> bool:
         """Whether a path has a placeholder, and no file has literally this name."""
-        return _PLACEHOLDER.search(Path(path).name) is not None and not Path(path).is_file()
+        return re.search(r"#|%\d*d", Path(path).name) is not None and not Path(path).is_file()
 
     @staticmethod
     def is_padded(path: str | Path) -> bool:
@@ -52,19 +42,16 @@ class FramePattern:
         if not self.path.parent.is_dir():
             return []
         pattern = re.compile(re.escape(self._before) + r"(\d+)" + re.escape(self._after))
-        numbers = [int(m.group(1)) for p in self.path.parent.iterdir() if (m := pattern.fullmatch(p.name))]
-        return sorted({n for n in numbers if self.name(n).is_file()})
+        numbers = {int(match[1]) for path in self.path.parent.iterdir() if (match := pattern.fullmatch(path.name))}
+        return sorted(n for n in numbers if self.name(n).is_file())
 
 
 def parse_frames(text: str) -> tuple[int, int]:
-    """Reads ``first-last`` or a single number; ``ValueError`` for other text, or if last comes before first."""
+    """Reads ``first-last`` or a single number."""
     match = re.fullmatch(r"\s*(\d{1,18})(?:\s*-\s*(\d{1,18}))?\s*", text)
-    if match is None:
+    if match is None or int(match[2] or match[1]) < int(match[1]):
         raise ValueError(f"--frames expects first-last, such as 1-48, got {reprlib.repr(text)}")
-    first, last = int(match.group(1)), int(match.group(2) or match.group(1))
-    if last < first:
-        raise ValueError(f"--frames must not end before it starts, got {text!r}")
-    return first, last
+    return int(match[1]), int(match[2] or match[1])
 
 
 def parse_focus(text: str) -> list[tuple[int, float]]:
@@ -85,19 +72,11 @@ def parse_focus(text: str) -> list[tuple[int, float]]:
 
 
 def focus_at_frame(keys: list[tuple[int, float]], frame: int) -> float:
-    """Focus distance in metres at a frame: linear in 1/distance between keyframes, constant before and after them.
+    """Focus distance in metres at a frame: linear in 1/distance, as blur is, between keyframes, constant beyond."""
+    import numpy as np
 
-    The blur radius is linear in the inverse focus distance, so the blur changes at a constant rate, and the focus can
-    end at infinity.
-    """
     from ..validation import number  # imports PyTorch, which parsing of arguments must not need
 
-    number("frame", frame)
-    if frame <= keys[0][0]:
-        return keys[0][1]
-    for (first_frame, near), (last_frame, far) in zip(keys, keys[1:], strict=False):
-        if frame <= last_frame:
-            fraction = (frame - first_frame) / (last_frame - first_frame)
-            dioptres = (1.0 - fraction) / near + fraction / far
-            return far if frame == last_frame else 1.0 / dioptres if dioptres > 0 else math.inf
-    return keys[-1][1]
+    distances = dict(keys)
+    dioptres = float(np.interp(number("frame", frame), [*distances], [1.0 / metres for metres in distances.values()]))
+    return distances[frame] if frame in distances else 1.0 / dioptres if dioptres > 0 else math.inf

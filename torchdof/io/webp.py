@@ -1,8 +1,4 @@
-"""Chunks of WebP files: EXIF data of a picture, and pictures joined to an animation.
-
-Reference:
-    WebP Container Specification, developers.google.com/speed/webp/docs/riff_container.
-"""
+"""Chunks of WebP files (RIFF containers): EXIF data of a picture, and pictures joined to an animation."""
 
 import os
 import struct
@@ -20,11 +16,7 @@ _FLAGS = {b"ICCP": 0x20, b"ALPH": 0x10, b"EXIF": 0x08, b"ANIM": 0x02}  # flags o
 
 
 def add_exif(path: Path, spec: Any) -> None:
-    """Adds the tags of an OpenImageIO specification to a WebP file, which OpenImageIO writes without them.
-
-    OpenImageIO encodes tags only in files that it writes, so they are taken from a PNG of one pixel.
-    """
-    import numpy as np
+    """Adds the tags of an OpenImageIO specification to a WebP file; OpenImageIO encodes them in a PNG of one pixel."""
     import OpenImageIO as oiio
 
     tags = oiio.ImageSpec(1, 1, 3, "uint8")
@@ -32,10 +24,7 @@ def add_exif(path: Path, spec: Any) -> None:
     tags.erase_attribute("ICCProfile")
     with tempfile.TemporaryDirectory() as folder:
         pixel = Path(folder, "pixel.png")
-        output = oiio.ImageOutput.create(str(pixel))
-        if output is None or not (
-            output.open(str(pixel), tags) and output.write_image(np.zeros((1, 1, 3), np.uint8)) and output.close()
-        ):
+        if not oiio.ImageBuf(tags).write(str(pixel)):
             raise OSError(f"{pixel}: could not be written; is the disk full?")
         length, _, exif = pixel.read_bytes().partition(b"eXIf")
     chunks = _chunks(path) | {b"EXIF": _chunk(b"EXIF", exif[: int.from_bytes(length[-4:], "big")])}
@@ -43,24 +32,19 @@ def add_exif(path: Path, spec: Any) -> None:
 
 
 def write_animation(path: str | os.PathLike[str], pictures: Sequence[Path]) -> None:
-    """Joins WebP files of one size to an animation that repeats, 25 a second; it is written whole or not at all.
-
-    The animation has the compressed pictures of the files as they are, and one colour profile and EXIF data.
-    """
+    """Joins WebP files of one size, as they are, to an animation that repeats, with their profile and EXIF data."""
     import OpenImageIO as oiio
 
     spec = oiio.ImageBuf(str(pictures[0])).spec()
     place = bytes(6) + _size(spec.width, spec.height) + _DURATION_MS.to_bytes(3, "little")
-    shared, frames, names = dict[bytes, bytes](), list[bytes](), {b"ANIM"}
+    names, frames = {b"ANIM"}, list[bytes]()
     for picture in pictures:
         chunks = _chunks(picture)
         names |= chunks.keys()
-        shared |= {name: chunk for name, chunk in chunks.items() if name in (b"ICCP", b"EXIF")}
         image = b"".join(chunk for name, chunk in chunks.items() if name in (b"ALPH", b"VP8 "))
         frames.append(_chunk(b"ANMF", place + b"\2" + image))  # 2: not blended with the picture before
-    profile, exif = (shared.get(name, b"") for name in (b"ICCP", b"EXIF"))
+    parts = [chunks.get(b"ICCP", b""), _chunk(b"ANIM", bytes(6)), *frames, chunks.get(b"EXIF", b"")]
     with atomic_file(path) as temporary:
-        parts = [profile, _chunk(b"ANIM", bytes(6)), *frames, exif]
         temporary.write_bytes(_webp(names, spec.width, spec.height, parts))
 
 
