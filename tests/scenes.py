@@ -12,6 +12,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
+from torchdof.optics.aperture import Aperture
 from torchdof.optics.field import Field
 from torchdof.render.border import continued
 from torchdof.render.highlights import threshold
@@ -34,6 +35,12 @@ def texture(dtype: torch.dtype = torch.float32, channels: int = 3) -> Tensor:
     """Random light from 0.05 to 1."""
     noise = torch.rand(1, channels, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
     return (0.05 + 0.95 * noise).to(dtype)
+
+
+def smooth(channels: int, height: int, width: int, factor: int = 4) -> Tensor:
+    """Random light from 0 to 1 without detail finer than ``factor`` pixels."""
+    noise = torch.rand(1, channels, height // factor, width // factor, generator=torch.Generator().manual_seed(3))
+    return functional.interpolate(noise, (height, width), mode="bicubic").clamp(0.0, 1.0)
 
 
 def whole(value: float, height: int = HEIGHT, width: int = WIDTH) -> Tensor:
@@ -285,6 +292,8 @@ CASES = [
     Case("even light, slope from -20 to 20 px", [slope(-20, 20)], light=even(0.75), **_EVEN),
     Case("even light, a depth of its own for every pixel", [r * noise(2) for r in (1.0, 8.0, 30.0)], itself, even(0.75),
          float32=1.2e-6, float16=0.0),
+    Case("even light, cat's eyes", [slope(-12, 14)], itself, even(0.75), float32=1.2e-6, float16=0.0,
+         options={"table": BlurTable.disc().with_aperture(Aperture(vignetting=0.4))}),
     Case("even light, one near pixel before infinity", [_with(whole(0.0), 12, 16, value=-30.0)], light=even(0.75),
          **_EVEN),
     Case("2001 layers accumulated", [torch.linspace(-1.5, 1.5, HEIGHT * WIDTH).reshape(1, 1, HEIGHT, WIDTH)],
@@ -438,7 +447,7 @@ def random_scene(
 
 def made(kind: str, height: int, width: int, radius: float, **options: Any) -> Scene:
     """Random light, multiplied by ``lamps`` on a grid of pixels, and a smooth coc map or one of three planes."""
-    torch.manual_seed(3)
+    torch.manual_seed(options.pop("seed", 3))
     items, lamps = options.pop("items", 1), options.pop("lamps", 1.0)
     image = torch.rand(items, 3, height, width)
     image[..., height // 5 :: 9, width // 6 :: 13] *= lamps

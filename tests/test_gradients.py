@@ -46,7 +46,7 @@ def test_gradients_equal_finite_differences(way: dict[str, Any]) -> None:
     assert gradcheck(lambda x: blur_by_coc(leaves[0].detach(), x, tolerance=1 / 60, **way), (coc,))
 
 
-@pytest.mark.parametrize("which", ["a measured table", "leaves of the camera", "a plan", "a plan, sum"])
+@pytest.mark.parametrize("which", ["a measured table", "cat's eyes", "leaves of the camera", "a plan", "a plan, sum"])
 def test_gradients_flow_through(which: str) -> None:
     image, depth, focus, f_number = case().values()
     if which == "leaves of the camera":
@@ -57,9 +57,9 @@ def test_gradients_flow_through(which: str) -> None:
         assert gradcheck(render, (focus.requires_grad_(), f_number.requires_grad_()))
         return
     plan = Plan.static(6.0, 1 / 60) if "plan" in which else None
-    table = BlurTable.load("sato_j15") if "table" in which else BlurTable.disc()
-    dof = DepthOfField(SMALL, table, tolerance=1 / 60, occlusion=which == "a plan")
-    assert gradcheck(lambda d: dof(image, d, focus, f_number, plan), (depth.requires_grad_(),))
+    tables = {"a measured table": BlurTable.load("sato_j15"), "cat's eyes": BlurTable.polygon(5, vignetting=0.4)}
+    dof = DepthOfField(SMALL, tables.get(which), tolerance=1 / 60, occlusion=which in ("a plan", "cat's eyes"))
+    assert gradcheck(lambda i, d: dof(i, d, focus, f_number, plan), (image.requires_grad_(), depth.requires_grad_()))
 
 
 @EVERY_WAY
