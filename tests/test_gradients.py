@@ -46,20 +46,24 @@ def test_gradients_equal_finite_differences(way: dict[str, Any]) -> None:
     assert gradcheck(lambda x: blur_by_coc(leaves[0].detach(), x, tolerance=1 / 60, **way), (coc,))
 
 
-@pytest.mark.parametrize("which", ["a measured table", "cat's eyes", "leaves of the camera", "a plan", "a plan, sum"])
+@pytest.mark.parametrize(
+    "which", ["a measured table", "cat's eyes", "leaves of the camera", "a background", "a plan", "a plan, sum"]
+)
 def test_gradients_flow_through(which: str) -> None:
-    image, depth, focus, f_number = case().values()
-    if which == "leaves of the camera":
-
-        def render(focus: Tensor, f_number: Tensor) -> Tensor:
-            return DepthOfField(Camera(50.0, f_number, focus, 0.6), tolerance=1 / 60)(image, depth)
-
-        assert gradcheck(render, (focus.requires_grad_(), f_number.requires_grad_()))
-        return
+    image, depth, *lens = (value.requires_grad_() for value in case().values())
+    table = {"a measured table": BlurTable.load("sato_j15"), "cat's eyes": BlurTable.polygon(5, vignetting=0.4)}.get(
+        which
+    )
     plan = Plan.static(6.0, 1 / 60) if "plan" in which else None
-    tables = {"a measured table": BlurTable.load("sato_j15"), "cat's eyes": BlurTable.polygon(5, vignetting=0.4)}
-    dof = DepthOfField(SMALL, tables.get(which), tolerance=1 / 60, occlusion=which in ("a plan", "cat's eyes"))
-    assert gradcheck(lambda i, d: dof(i, d, focus, f_number, plan), (image.requires_grad_(), depth.requires_grad_()))
+    occlusion = which not in ("a measured table", "a plan, sum")
+
+    def render(image: Tensor, depth: Tensor, focus: Tensor, f_number: Tensor, *behind: Tensor) -> Tensor:
+        own = Camera(50.0, f_number, focus, 0.6) if which == "leaves of the camera" else SMALL
+        given = () if own is not SMALL else (focus, f_number, plan, *behind)
+        return DepthOfField(own, table, tolerance=1 / 60, occlusion=occlusion)(image, depth, *given)
+
+    behind = (torch.rand_like(image), depth.detach() + 2.0) if which == "a background" else ()
+    assert gradcheck(render, (image, depth, *lens, *(value.requires_grad_() for value in behind)))
 
 
 @EVERY_WAY
