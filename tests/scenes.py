@@ -117,52 +117,35 @@ def _brightest(truth: Tensor) -> Tensor:
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A hostile scene of 32 x 24 pixels with its truth and limits of the error.
-
-    Args:
-        name: Description of the difficulty.
-        maps: Circles of confusion in pixels, or depths in metres if there are cameras; one picture each.
-        truth: Closed form as a function of image and circle of confusion; None is the same rendering in float64.
-        light: The image as a function of the dtype.
-        cameras: One for each map, or one for all.
-        float32, float16: Largest relative error.
-        per: Divisor of the error, as a function of the truth.
-        where: Mask of the pixels that are checked.
-        options: Options of the rendering.
-    """
+    """A hostile scene of 32 x 24 pixels with its truth and limits of the error."""
 
     name: str
-    maps: Sequence[Tensor]
-    truth: Callable[[Tensor, Tensor], Tensor] | None = None
-    light: Light = texture
-    cameras: Sequence[Camera] = ()
-    float32: float = 1e-5
+    maps: Sequence[Tensor]  # circles of confusion in pixels, or depths in metres if there are cameras; one picture each
+    truth: Callable[[Tensor, Tensor], Tensor] | None = None  # of image and coc; None: the same rendering in float64
+    light: Light = texture  # the image as a function of the dtype
+    cameras: Sequence[Camera] = ()  # one for each map, or one for all
+    float32: float = 1e-5  # largest relative errors
     float16: float = 2**-11 + 1e-5
-    per: Callable[[Tensor], Tensor] = Tensor.abs
-    where: Tensor | None = None
+    per: Callable[[Tensor], Tensor] = Tensor.abs  # divisor of the error, as a function of the truth
+    where: Tensor | None = None  # pixels that are checked
     options: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def pairs(self, dtype: torch.dtype = torch.float32) -> Iterator[tuple[Tensor, Tensor, Camera | None]]:
         """Image, map and camera of each picture; without a camera the map is a circle of confusion."""
-        cameras: list[Camera | None] = list(self.cameras) or [None]
-        maps = list(self.maps)
-        if len(cameras) == 1:
-            cameras *= len(maps)
-        elif len(maps) == 1:
-            maps *= len(cameras)
-        for values, camera in zip(maps, cameras, strict=True):
-            yield self.light(dtype), values, camera
+        cameras: Sequence[Camera | None] = self.cameras or [None]
+        for i in range(max(len(self.maps), len(cameras))):
+            yield self.light(dtype), self.maps[i % len(self.maps)], cameras[i % len(cameras)]
 
-    def error(self, dtype: torch.dtype, **way: Any) -> float:
+    def error(self, dtype: torch.dtype) -> float:
         """The largest error in any of the pictures; infinite if a picture is not finite."""
         errors = []
         for image, values, camera in self.pairs(dtype):
-            out = rendered(image, values, camera, **{**self.options, **way}).double()
+            exact = image.double(), values.double()
+            out = rendered(image, values, camera, **self.options).double()
             if self.truth is None:
-                truth = rendered(image.double(), values.double(), camera, **{**self.options, **way})
+                truth = rendered(*exact, camera, **self.options)
             else:
-                coc_px = values.double() if camera is None else camera.coc_px(values.double(), WIDTH)
-                truth = self.truth(image.double(), coc_px)
+                truth = self.truth(exact[0], exact[1] if camera is None else camera.coc_px(exact[1], WIDTH))
             apart = torch.where(out == truth, 0.0, (out - truth).abs() / self.per(truth).clamp_min(1e-300))
             errors.append(torch.nan_to_num(apart if self.where is None else apart[..., self.where], nan=math.inf).max())
         return float(max(errors))
@@ -308,13 +291,7 @@ CASES = [
 
 
 def lens_with_a_field(colours: int = 3, unit: float = 1.0, **change: Any) -> BlurTable:
-    """A lens with random spots that change across the field.
-
-    Args:
-        colours: Number of colours.
-        unit: Factor on all lengths; with 1 the sensor is 36 mm wide.
-        change: Other arguments of the :class:`torchdof.optics.field.Field`.
-    """
+    """A lens with random spots that change across the field; ``unit`` is a factor on all lengths."""
     dice = torch.Generator().manual_seed(colours)
     coc, radius = unit * torch.tensor([-0.4, -0.1, 0.2, 0.5]), unit * torch.tensor([0.0, 9.0, 20.0])
     box = (torch.rand(4, 3, 3, generator=dice) + 0.5) * coc.abs()[:, None, None]
@@ -372,14 +349,8 @@ def random_scene(
 ) -> Scene:
     """Images of noise, blocks, gradients and edges; coc of planes, discs, slopes, checkerboards, steps and noise.
 
-    Args:
-        seed: Seed of the random numbers.
-        ways: Ways of rendering to choose from: ``"filled"`` (hidden surfaces are estimated), ``"background"`` (known),
-            ``"accumulated"`` (without occlusion).
-        lamps: Whether there may be highlights.
-        multiple: The sides of the frame are multiples of this.
-        side: Longest side in pixels.
-        kinds: Kinds of coc maps to choose from.
+    It is drawn from ways of rendering (hidden surfaces are estimated, or known, or there is no occlusion) and kinds of
+    coc maps, with highlights if there may be ``lamps``; sides are multiples of ``multiple`` up to ``side`` pixels.
     """
     draw, generator = random.Random(seed), torch.Generator().manual_seed(seed)
 

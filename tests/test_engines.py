@@ -6,7 +6,7 @@ measured errors.
 
 import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -43,7 +43,6 @@ from torchdof.reference.metrics import ssim
 from torchdof.render.plan import Plan
 
 BY_COLOUR = BlurTable("gaussian", [1.0], {"sigma": torch.tensor([[0.4], [0.5], [0.6]])}, name="by colour")
-
 
 LENSES = {
     **{str(table): table for table in (*TABLES, BY_COLOUR)},
@@ -111,18 +110,14 @@ def test_the_error_of_a_file_is_within_1e_5(file: File, case: Case) -> None:
 # Invalid light and depth
 
 
-def _hole(values: Tensor, bad: float) -> Tensor:
-    values = values.clone()
-    values[..., 9:11, 8:10] = bad
-    return values
-
-
-HOLE = _hole(torch.zeros(1, 1, HEIGHT, WIDTH), 1.0)[0, 0] > 0
+HOLE = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+HOLE[9:11, 8:10] = True
+BAD = pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, -math.inf])
 
 
 def assert_untouched_by_a_hole(render: Callable[[Tensor, Tensor], Tensor], bad: float) -> None:
     """A pixel with a bad depth stays sharp, and its light does not reach other pixels."""
-    image, other, depth = texture(), _hole(texture(), 1e6), _hole(slope(1.2, 6.0), bad)
+    image, other, depth = texture(), torch.where(HOLE, 1e6, texture()), torch.where(HOLE, bad, slope(1.2, 6.0))
     out = render(image, depth)
     assert torch.equal(out[..., HOLE], image[..., HOLE]) and torch.isfinite(out).all()
     assert torch.equal(render(other, depth)[..., ~HOLE], out[..., ~HOLE])
@@ -130,12 +125,12 @@ def assert_untouched_by_a_hole(render: Callable[[Tensor, Tensor], Tensor], bad: 
 
 
 @EVERY_WAY
-@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, -math.inf])
+@BAD
 def test_a_bad_depth_stays_sharp_and_does_not_affect_others(engine: str, way: dict[str, Any], bad: float) -> None:
     assert_untouched_by_a_hole(DepthOfField(CAMERA, check=False, **way), bad)
 
 
-@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, -math.inf])
+@BAD
 def test_a_bad_depth_in_a_file_stays_sharp_and_does_not_affect_others(file: File, bad: float) -> None:
     assert_untouched_by_a_hole(lambda image, depth: file.render(image, depth, CAMERA)[0], bad)
 
@@ -161,14 +156,10 @@ def test_bad_light_stays_within_its_disc(engine: str, way: dict[str, Any], bad: 
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf], ids=str)
-def test_bad_light_in_a_file_stays_in_its_pixel(file: File, bad: float) -> None:
-    image = texture()
-    image[0, 1, 12, 20] = bad
-    out, truth = file.render(image, slope(1.2, 6.0), CAMERA)
-    here = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
-    here[12, 20] = True
-    assert torch.equal(torch.isfinite(out).all(1)[0], ~here)
-    assert_close(out.double()[..., ~here], truth[..., ~here], rtol=1e-5, atol=0.0)
+def test_bad_light_in_a_file_stays_in_its_pixels(file: File, bad: float) -> None:
+    out, truth = file.render(torch.where(HOLE, bad, texture()), slope(1.2, 6.0), CAMERA)
+    assert torch.equal(torch.isfinite(out).all(1)[0], ~HOLE)
+    assert_close(out.double()[..., ~HOLE], truth[..., ~HOLE], rtol=1e-5, atol=0.0)
 
 
 # Light of any size
@@ -222,25 +213,30 @@ def test_light_of_1e30_agrees_with_float64_for_any_lens(engine: str, name: str) 
 
 
 @pytest.fixture
-def by_both(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Compares the pictures of both engines, to 1e-5 of the light nearby, and checks that each engine was used."""
-    served = []
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """List of the items that the compiled engine renders, by kind."""
+    kinds: list[str] = []
 
-    def render(*arguments: Any, native_render: Any = native.render, **options: Any) -> Tensor:
-        served.append(native_render(*arguments, **options))
-        return served[-1]
+    def render(surfaces: Any, kind: Any, native_render: Any = native.render, **options: Any) -> Tensor:
+        kinds.append(kind)
+        return native_render(surfaces, kind, **options)
 
     monkeypatch.setattr(native, "render", render)
+    monkeypatch.setenv("TORCHDOF_ENGINE", "native")
+    return kinds
+
+
+@pytest.fixture
+def by_both(counted: list[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Compares the pictures of both engines, to 1e-5 of the light nearby, and checks that each engine was used."""
 
     def compared(make: Callable[[], Tensor], image: Tensor, in_focus: bool = False) -> None:
-        monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
-        plain = make()
-        assert not served
-        monkeypatch.setenv("TORCHDOF_ENGINE", "native")
-        compiled = make()
-        assert served or in_focus
-        served.clear()
-        assert_same_picture(plain, compiled, image)
+        pictures = []
+        for engine in ("torch", "native"):
+            monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+            pictures.append(make())
+            assert bool(counted) == (engine == "native") or in_focus
+        assert_same_picture(*pictures, image)
 
     return compared
 
@@ -428,20 +424,6 @@ def test_a_plan_of_one_plane_renders_another(engine: str, planned: float, shown:
 
 
 # Which engine renders
-
-
-@pytest.fixture
-def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """List of the items that the compiled engine renders, by kind."""
-    kinds: list[str] = []
-
-    def render(surfaces: Any, kind: Any, native_render: Any = native.render, **options: Any) -> Tensor:
-        kinds.append(kind)
-        return native_render(surfaces, kind, **options)
-
-    monkeypatch.setattr(native, "render", render)
-    monkeypatch.setenv("TORCHDOF_ENGINE", "native")
-    yield kinds
 
 
 @pytest.mark.parametrize(("wanted", "served"), [("native", 3), ("auto", 3), ("torch", 0)])

@@ -102,12 +102,6 @@ def _beside(first: float, second: float) -> Tensor:
     return torch.tensor([first, second]).repeat(54).reshape(1, 1, 9, 12)
 
 
-def _holes() -> Tensor:
-    depth = slope(1.2, 9.0, 9, 12)
-    depth[0, 0, 3:5, 4:7], depth[0, 0, 7, 2] = math.nan, 0.0
-    return depth
-
-
 EVEN = torch.linspace(-4, 4, 108).reshape(1, 1, 9, 12)
 DEPTHS: dict[str, Tensor] = {
     "focus plane": whole(2.0, 9, 12),
@@ -118,7 +112,7 @@ DEPTHS: dict[str, Tensor] = {
     "a micrometre beside infinity": _beside(1e-6, math.inf),
     "checkerboard": _beside(1.2, 9.0),
     "noise": 2.0 * 10 ** (0.5 * torch.randn(1, 1, 9, 12, generator=torch.Generator().manual_seed(0))),
-    "holes": _holes(),
+    "holes": torch.where(EVEN.abs() < 1.0, math.nan, slope(1.2, 9.0, 9, 12) * (EVEN < 3.9)),
 }
 COCS: dict[str, Tensor] = {
     "nodes of layers": _nodes(),

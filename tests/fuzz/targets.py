@@ -35,19 +35,12 @@ REFUSED = (ValueError, OSError, FitError)
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """A target of the fuzzer.
-
-    Args:
-        suffix: Suffix of its files.
-        seeds: Writes valid files into a folder.
-        runs: Read a file; an exception other than ``REFUSED`` is a finding.
-        named: Whether a refusal must name the file.
-    """
+    """A target of the fuzzer."""
 
     suffix: str
-    seeds: Callable[[Path], None]
-    runs: tuple[Callable[[Path], object], ...]
-    named: bool = True
+    seeds: Callable[[Path], None]  # writes valid files into a folder
+    runs: tuple[Callable[[Path], object], ...]  # read a file; an exception other than ``REFUSED`` is a finding
+    named: bool = True  # whether a refusal must name the file
 
 
 def _image_seeds(folder: Path, suffix: str) -> None:
