@@ -13,6 +13,8 @@ import OpenImageIO as oiio
 import pytest
 import torch.nn.functional as functional
 
+from torchdof.cli.command import command_of
+from torchdof.cli.render import Render
 from torchdof.io.images import read_image
 from torchdof.reference.metrics import display
 
@@ -106,3 +108,12 @@ def test_gradient_descent_finds_the_blur_and_with_a_known_lens_the_metres(
     assert close_db > rows["true"][6] - 0.3
     assert depth_percent < 4
     assert (tmp_path / "room_1_scale.png").is_file()
+
+
+def test_the_template_for_render_farms_uses_existing_options() -> None:
+    text = (EXAMPLES / "farm" / "openjd.yaml").read_text()
+    called = set(re.findall(r"^ +- (--[a-z-]+)$", text, flags=re.MULTILINE))
+    existing = {option for parameter in command_of("render", Render).params for option in parameter.opts}
+    assert {"--frames", "--resume", "--out", "--focus-m"} <= called <= existing
+    declared = set(re.findall(r"^  - name: (\w+)$", text, flags=re.MULTILINE)) - {"Render"}
+    assert set(re.findall(r"\{\{Param\.(\w+)\}\}", text)) == declared

@@ -68,10 +68,6 @@ TAGS = ("Exif:FocalLength", "FNumber", "Exif:SubjectDistance", "Exif:FocalLength
         "Exif:FocalPlaneXResolution", "Exif:FocalPlaneResolutionUnit", "Exif:PixelXDimension")  # fmt: skip
 
 
-def facts(**tags: Any) -> dict[str, float]:
-    return camera_settings({name: (None, value) for name, value in zip(TAGS, tags.values(), strict=True)}, 100, 80)
-
-
 def kernels_of_fields(**fields: Any) -> None:
     kernels = BlurTable.from_dict(fields).kernels(torch.tensor([-3.0, 4.0]), 36, size=5)
     assert torch.isfinite(kernels).all()
@@ -139,7 +135,10 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "fill_holes": (fill_holes, {"depth": VALUES, "fill": "far"}),
     "tint_focus": (tint_focus, {"image": IMAGE, "coc_px": COC}),
     "focus_at_frame": (lambda frame: focus_at_frame([(0, 1.0), (5, 2.0)], frame), {"frame": 3}),
-    "camera_settings": (facts, {name: 2.0 for name in TAGS}),
+    "camera_settings": (
+        lambda **tags: camera_settings({name: (None, value) for name, value in tags.items()}, 100, 80),
+        {name: 2.0 for name in TAGS},
+    ),
 }  # fmt: skip
 
 

@@ -37,8 +37,8 @@ def assert_like_alone(images: Tensor, cocs: Tensor, **options: Any) -> None:
 
 OPTIONS: list[dict[str, Any]] = [
     *({"table": table, "occlusion": occlusion} for table in TABLES for occlusion in (True, False)),
-    {"check": False},
     {"background": torch.full((5, 3, *SIZE), 0.3), "background_coc_px": torch.full((5, 1, *SIZE), 31.0)},
+    {"check": False},
     {"tolerance": "draft", "normalize": False, "occlusion": False},
     {"depth_edges": "repair"},
 ]
