@@ -179,12 +179,13 @@ def draw_edges(path: Path) -> None:
     """A ray-traced cut-out with depth of a quarter of the resolution, as given and repaired, and with exact depth."""
     (scene,) = read_scenes(SCENES / "planes")
     soft = degrade(scene.depth, "quarter-res")
-    given, repaired, exact = (
-        torchdof.depth_of_field(scene.image, depth, scene.camera, depth_edges=edges)
-        for depth, edges in ((soft, "as given"), (soft, "auto"), (scene.depth, "auto"))
-    )
-    pictures = {"soft depth, as given": given, "soft depth, repaired": repaired, "exact depth": exact}
-    cut_out(path, scene, pictures | {"path-traced": scene.truth})
+    pictures = {
+        "soft depth, as given": torchdof.depth_of_field(scene.image, soft, scene.camera, depth_edges="as given"),
+        "soft depth, repaired": torchdof.depth_of_field(scene.image, soft, scene.camera, depth_edges="auto"),
+        "exact depth": torchdof.depth_of_field(scene.image, scene.depth, scene.camera),
+        "path-traced": scene.truth,
+    }
+    cut_out(path, scene, pictures)
 
 
 def draw_fit(path: Path) -> None:

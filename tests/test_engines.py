@@ -236,7 +236,7 @@ def by_both(counted: list[str], monkeypatch: pytest.MonkeyPatch) -> Callable[...
             monkeypatch.setenv("TORCHDOF_ENGINE", engine)
             pictures.append(make())
             assert bool(counted) == (engine == "native") or in_focus
-        assert_same_picture(*pictures, image)
+        assert_same_picture(pictures[0], pictures[1], image)
 
     return compared
 

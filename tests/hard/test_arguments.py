@@ -50,7 +50,11 @@ def tensors(draw: st.DrawFn) -> Tensor:
     fill = draw(st.sampled_from([0.0, 1.0, 0.5, 2.5, -1.0, math.nan, math.inf, 1e30]))
     plain = dtype.is_floating_point or dtype == torch.complex64 or math.isfinite(fill) and abs(fill) < 100
     made = torch.full(shape, fill if plain else 1.0).to(dtype)
-    kinds = {"meta": lambda: made.to("meta"), "sparse": made.to_sparse, "gradient": made.requires_grad_}
+    kinds: dict[str, Callable[[], Tensor]] = {
+        "meta": lambda: made.to("meta"),
+        "sparse": made.to_sparse,
+        "gradient": made.requires_grad_,
+    }
     kind = draw(st.sampled_from(["dense", "dense", "dense", *kinds]))
     return kinds[kind]() if kind in kinds and (kind != "gradient" or made.is_floating_point()) else made
 

@@ -63,6 +63,10 @@ class Wrapper(Tensor):
         raise NotImplementedError
 
 
+def stored(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    return torch.full(shape, 56, dtype=torch.uint8).view(dtype)
+
+
 def fake(shape: tuple[int, ...]) -> Tensor:
     with FakeTensorMode():
         return torch.ones(shape)
@@ -78,14 +82,14 @@ def nested(_: tuple[int, ...], layout: torch.layout) -> Tensor:
     return torch.nested.nested_tensor([torch.ones(3, 4, 5), torch.ones(3, 6, 5)], layout=layout)
 
 
-STRANGE: dict[str, tuple[Callable[[tuple[int, ...]], Tensor], str]] = {  # a tensor of a shape, message
-    **{str(dtype): (lambda shape, dtype=dtype: torch.full(shape, 56, dtype=torch.uint8).view(dtype),
-                    ".* got .*float(8|4)") for dtype in (*STORED, *NEWER)},
-    **{f"nested {layout}": (functools.partial(nested, layout=layout), "must be .*got .*nested")
-       for layout in (torch.strided, torch.jagged)},
+Make = Callable[[tuple[int, ...]], Tensor]
+STRANGE: dict[str, tuple[Make, str]] = {  # a tensor of a shape, message
+    **{str(dtype): (functools.partial(stored, dtype=dtype), ".* got .*float(8|4)") for dtype in (*STORED, *NEWER)},
+    "nested": (functools.partial(nested, layout=torch.strided), "must be .*got .*nested"),
+    "jagged": (functools.partial(nested, layout=torch.jagged), "must be .*got .*nested"),
     "without memory": (functools.partial(with_bytes, count=0), "must be a.* that holds data, got a freed storage"),
-}  # fmt: skip
-PARTIAL = {"with a part of its memory": functools.partial(with_bytes, count=10), "fake": fake, "wrapper": Wrapper}
+}
+PARTIAL: dict[str, Make] = {"part": functools.partial(with_bytes, count=10), "fake": fake, "wrapper": Wrapper}
 STRANGE |= {kind: (make, "must be a tensor .* that holds data") for kind, make in PARTIAL.items()}
 PAIRS = [(n, k) for n in TAKES_TENSORS for k in STRANGE if k not in PARTIAL or n in ("image", "depth", "coc_px")]
 
