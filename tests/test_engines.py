@@ -36,7 +36,6 @@ from tests.scenes import (
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field, native
 from torchdof.depth import repair_edges
 from torchdof.export.graph import Portable
-from torchdof.export.verification import session
 from torchdof.optics.aperture import Aperture
 from torchdof.reference.lens_views import lens_views
 from torchdof.reference.metrics import ssim
@@ -67,40 +66,28 @@ def test_the_error_of_a_hostile_scene_is_within_its_limit(case: Case, dtype: tor
     assert error <= case.limit(dtype)
 
 
-class File:
-    """An exported file, and its module with the same layers."""
+def by_file(exported: Any, image: Tensor, values: Tensor, camera: Camera | None) -> tuple[Tensor, Tensor]:
+    """Pictures of an exported file, and of its module with the same layers in float64.
 
-    def __init__(self, exported: Any) -> None:
-        self.camera, self.session, self.portable = exported.dof.camera, session(exported.path), Portable(exported.dof)
-
-    def render(self, image: Tensor, values: Tensor, camera: Camera | None) -> tuple[Tensor, Tensor]:
-        """Pictures of the file and of the module in float64.
-
-        Without a camera ``values`` are circles of confusion, which are converted to depth because the file takes that.
-        """
-        if camera is None:
-            reach = 1.05 * float(values.max().clamp_min(1.0))  # coc at infinity
-            wide = self.camera.replace(f_number=1.0).coc_px(torch.full((1, 1, 1, 1), torch.inf), image.shape[-1])
-            values = float(self.camera.focus_m) / (1.0 - values.double() / reach)
-            camera = self.camera.replace(f_number=float(wide) / reach)
-        image = image.float().expand(-1, 3, -1, -1)
-        lens = [torch.full(image.shape[:1], float(number)) for number in (camera.focus_m, camera.f_number)]
-        tensors = [image.contiguous(), values.float().contiguous(), *lens]
-        names = ("image", "depth", "focus_m", "f_number")
-        (got,) = self.session.run(None, {n: t.numpy() for n, t in zip(names, tensors, strict=True)})
-        with torch.no_grad():
-            return torch.from_numpy(got), self.portable(*(tensor.double() for tensor in tensors))
-
-
-@pytest.fixture(scope="module")
-def file(layered: Any) -> File:
-    return File(layered)
+    Without a camera ``values`` are circles of confusion, which are converted to depth because the file takes that.
+    """
+    if camera is None:
+        reach = 1.05 * float(values.max().clamp_min(1.0))  # coc at infinity
+        camera = exported.dof.camera
+        wide = camera.replace(f_number=1.0).coc_px(torch.full((1, 1, 1, 1), torch.inf), image.shape[-1])
+        values = float(camera.focus_m) / (1.0 - values.double() / reach)
+        camera = camera.replace(f_number=float(wide) / reach)
+    image = image.float().expand(-1, 3, -1, -1)
+    lens = [torch.full(image.shape[:1], float(number)) for number in (camera.focus_m, camera.f_number)]
+    tensors = [image.contiguous(), values.float().contiguous(), *lens]
+    with torch.no_grad():
+        return exported.render(*tensors), Portable(exported.dof)(*(tensor.double() for tensor in tensors))
 
 
 @pytest.mark.parametrize("case", [case for case in CASES if not case.options], ids=lambda case: case.name)
-def test_the_error_of_a_file_is_within_1e_5(file: File, case: Case) -> None:
+def test_the_error_of_a_file_is_within_1e_5(layered: Any, case: Case) -> None:
     for image, values, camera in case.pairs():
-        got, truth = file.render(image, values, camera)
+        got, truth = by_file(layered, image, values, camera)
         # relative to each pixel, or to the brightest one if negative light can cancel
         scale = truth.abs() if float(image.min()) >= 0 else truth.abs().max()
         apart = (got.double() - truth).abs() / scale.clamp_min(torch.finfo(torch.float32).tiny)
@@ -131,8 +118,8 @@ def test_a_bad_depth_stays_sharp_and_does_not_affect_others(engine: str, way: di
 
 
 @BAD
-def test_a_bad_depth_in_a_file_stays_sharp_and_does_not_affect_others(file: File, bad: float) -> None:
-    assert_untouched_by_a_hole(lambda image, depth: file.render(image, depth, CAMERA)[0], bad)
+def test_a_bad_depth_in_a_file_stays_sharp_and_does_not_affect_others(layered: Any, bad: float) -> None:
+    assert_untouched_by_a_hole(lambda image, depth: by_file(layered, image, depth, CAMERA)[0], bad)
 
 
 @EVERY_WAY
@@ -156,8 +143,8 @@ def test_bad_light_stays_within_its_disc(engine: str, way: dict[str, Any], bad: 
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf], ids=str)
-def test_bad_light_in_a_file_stays_in_its_pixels(file: File, bad: float) -> None:
-    out, truth = file.render(torch.where(HOLE, bad, texture()), slope(1.2, 6.0), CAMERA)
+def test_bad_light_in_a_file_stays_in_its_pixels(layered: Any, bad: float) -> None:
+    out, truth = by_file(layered, torch.where(HOLE, bad, texture()), slope(1.2, 6.0), CAMERA)
     assert torch.equal(torch.isfinite(out).all(1)[0], ~HOLE)
     assert_close(out.double()[..., ~HOLE], truth[..., ~HOLE], rtol=1e-5, atol=0.0)
 
