@@ -192,12 +192,9 @@ def noise(seed: int) -> Tensor:
 
 def _near_a_node(offset: int) -> Tensor:
     """Two planes; the nearer one is ``offset`` units in the last place from a layer's node."""
-    node = torch.tensor(
-        [c for c in Plan.for_scene(torch.tensor([[[[0.0, 9.0]]]]), 1 / 255, adapt=False).coc_px if 2 < c < 6][0]
-    )
-    for _ in range(abs(offset)):
-        node = torch.nextafter(node, torch.tensor(math.copysign(math.inf, offset)))
-    coc = halves(float(node), 9.0)
+    plan = Plan.for_scene(torch.tensor([[[[0.0, 9.0]]]]), 1 / 255, adapt=False)
+    node = torch.tensor(next(c for c in plan.coc_px if 2 < c < 6))
+    coc = halves(float(torch.nextafter(node, node + offset)), 9.0)
     coc[..., 0, 0] = 0.0
     return coc
 
