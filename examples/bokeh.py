@@ -41,21 +41,16 @@ def main() -> None:
 def lenses() -> dict[str, BlurTable]:
     """Caption -> blur table of each lens."""
     traced = BlurTable.load("double_gauss_50mm_f2")
+    y, x = torch.meshgrid(torch.linspace(1.35, -1.15, 64), torch.linspace(-1.25, 1.25, 64), indexing="ij")
+    heart = ((x**2 + y**2 - 1.0) ** 3 - x**2 * y**3 <= 0.0).float()
     return {
         "perfect": BlurTable.disc(),
         "seven blades": BlurTable.polygon(7, rotation_deg=12.0, curvature=0.2),
         "double Gauss": traced.with_aperture(Aperture(blades=9, curvature=0.6)),
         "anamorphic": BlurTable.polygon(9, curvature=1.0, squeeze=2.0, rim=0.7),
         "cat's eyes": BlurTable.disc().with_aperture(Aperture(vignetting=0.45)),
-        "heart": BlurTable.from_aperture(heart()),
+        "heart": BlurTable.from_aperture(heart),
     }
-
-
-def heart(size: int = 64) -> Tensor:
-    """An opening in the shape of a heart, ``[size, size]``."""
-    axis = torch.linspace(-1.25, 1.25, size)
-    x, y = axis[None, :], -axis[:, None] + 0.1
-    return ((x**2 + y**2 - 1.0) ** 3 - x**2 * y**3 <= 0.0).float()
 
 
 def street(height: int, width: int) -> tuple[Tensor, Tensor]:

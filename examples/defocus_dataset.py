@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument("--focal-length-mm", type=float, default=50.0)
     parser.add_argument("--sensor-width-mm", type=float, default=36.0)
     parser.add_argument(
-        "--table", action="append", help="a lens, such as sato_j15; if repeated, one is chosen at random"
+        "--table", action="append", help="a lens, such as sato_j15; of several, one is chosen at random"
     )
     parser.add_argument("--tolerance", default="final", help="draft, preview or final")
     parser.add_argument("--format", choices=("webdataset", "parquet"), default="webdataset")
@@ -53,17 +53,9 @@ def main() -> None:
     numbers = {"scale": arguments.depth_scale, "offset": arguments.depth_offset}
     if arguments.depth_kind == "relative":
         numbers = {"near_m": arguments.near_m, "far_m": arguments.far_m}
-    make_dataset(
-        pairs_in(arguments.images, arguments.depths),
-        arguments.out,
-        blur,
-        workers=arguments.workers,
-        per_shard=arguments.per_shard,
-        copies=arguments.copies,
-        format=arguments.format,
-        seed=arguments.seed,
-        depth={"kind": arguments.depth_kind, "fill": arguments.fill_depth, **numbers},
-    )
+    depth = {"kind": arguments.depth_kind, "fill": arguments.fill_depth, **numbers}
+    options = {name: getattr(arguments, name) for name in ("workers", "per_shard", "copies", "format", "seed")}
+    make_dataset(pairs_in(arguments.images, arguments.depths), arguments.out, blur, depth=depth, **options)
 
 
 if __name__ == "__main__":

@@ -12,10 +12,8 @@ import json
 import math
 import time
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from torch import Tensor
 
 import torchdof
@@ -27,23 +25,16 @@ from torchdof.io.sheet import write_sheet
 
 FOCUS_M = {"near": 2.3, "middle": 3.1, "far": 4.6}
 APERTURE_RADIUS_M = 0.04  # larger than in most lenses, so that the blur is visible in a picture 741 pixels wide
+Shot = tuple[Picture, Tensor, torchdof.Camera]  # a photograph, its depth, and a lens
 
 
-class Shot(NamedTuple):
-    """A photograph, its depth, and a lens."""
-
-    picture: Picture
-    depth: Tensor
-    camera: torchdof.Camera
-
-
-def motorcycle(folder: Path, focus_m: float) -> Shot:
+def motorcycle(folder: Path, focus_m: float, aperture_radius_m: float = APERTURE_RADIUS_M) -> Shot:
     """A photograph with depth measured by stereo."""
     calibration = json.loads((folder / "camera.json").read_text())
     depth = read_depth(folder / "motorcycle_disp.npz", **calibration["depth"])
     fov_x_deg = math.degrees(2 * math.atan(depth.shape[-1] / 2 / calibration["focal_length_px"]))
-    camera = torchdof.Camera.from_fov(fov_x_deg, APERTURE_RADIUS_M, focus_m)
-    return Shot(read_image(folder / "motorcycle_left.png"), depth, camera)
+    camera = torchdof.Camera.from_fov(fov_x_deg, aperture_radius_m, focus_m)
+    return read_image(folder / "motorcycle_left.png"), depth, camera
 
 
 def portrait(folder: Path, stops: float) -> Shot:
@@ -52,11 +43,11 @@ def portrait(folder: Path, stops: float) -> Shot:
     depth = from_relative(read_values(folder / "depth.png"), near_m=0.744, far_m=14.0)
     camera = torchdof.Camera.from_fov(36.0, aperture_radius_m=0.0173, focus_m=1.14)
     light = expand_highlights(picture.pixels, stops) if stops else picture.pixels
-    return Shot(dataclasses.replace(picture, pixels=light), depth, camera)
+    return dataclasses.replace(picture, pixels=light), depth, camera
 
 
-def render(name: str, shot: Shot, out: Path) -> str:
-    """Write a picture and its sheet; return a line that describes them."""
+def render(name: str, shot: Shot, out: Path) -> None:
+    """Write a picture and its sheet, and print a line that describes them."""
     picture, depth, camera = shot
     height, width = depth.shape[-2:]
     dof = torchdof.DepthOfField(camera, depth_edges="repair")  # stereo edges may be a pixel off
@@ -72,7 +63,7 @@ def render(name: str, shot: Shot, out: Path) -> str:
         f"focus at {camera.focus_m:g} m": blurred,
     }
     write_sheet(out / f"{name}_sheet.png", panels)
-    return (
+    print(
         f"{name:8s} focus {camera.focus_m:.2f} m, f/{camera.f_number:.2f}, blur radius up to "
         f"{float(coc_px.abs().max()):.1f} px, disc, {width} x {height}: {seconds:.2f} s -> {out / name}.png, "
         f"{name}_sheet.png"
@@ -88,14 +79,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the pictures")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    shots = {name: motorcycle(arguments.data, focus_m) for name, focus_m in FOCUS_M.items()}
-    shots["portrait"] = portrait(arguments.data.parent / "portrait", stops=4.0)
-    with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), transient=True) as progress:
-        task = progress.add_task("rendering", total=len(shots))
-        for name, shot in shots.items():
-            progress.update(task, description=name)
-            print(render(name, shot, arguments.out))
-            progress.advance(task)
+    for name, focus_m in FOCUS_M.items():
+        render(name, motorcycle(arguments.data, focus_m), arguments.out)
+    render("portrait", portrait(arguments.data.parent / "portrait", stops=4.0), arguments.out)
 
 
 if __name__ == "__main__":

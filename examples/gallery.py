@@ -6,8 +6,6 @@ Usage: python examples/gallery.py --out docs/pictures
 """
 
 import argparse
-import json
-import math
 import runpy
 import subprocess
 import sys
@@ -21,7 +19,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 import torchdof
-from torchdof.depth import inspect_depth, read_depth
+from torchdof.depth import inspect_depth
 from torchdof.depth.inspect import coc_colours, panels, tint_focus
 from torchdof.io.images import Picture, read_image, write_image
 from torchdof.io.sheet import write_sheet
@@ -32,22 +30,19 @@ ROOT = Path(__file__).parents[1]
 MOTORCYCLE, PORTRAIT = ROOT / "examples/data/motorcycle", ROOT / "examples/data/portrait"
 SCENES = ROOT / "tests/data/scenes"
 DEMO = runpy.run_path(str(ROOT / "examples/demo.py"))
-CALIBRATION = json.loads((MOTORCYCLE / "camera.json").read_text())
-FOV_X_DEG = math.degrees(2 * math.atan(741 / 2 / CALIBRATION["focal_length_px"]))
-APERTURE_RADIUS_M = 0.04  # larger than in most lenses, so that the blur is visible in a picture 741 pixels wide
 TABLES = ("sato_j15", "double_gauss_50mm_f2", "wide_22mm_f4")
 
 
-def motorcycle() -> tuple[Tensor, Tensor]:
-    """The photograph, ``[1, 3, 500, 741]`` in linear light, and its depth in metres."""
-    depth = read_depth(MOTORCYCLE / "motorcycle_disp.npz", **CALIBRATION["depth"])
-    return read_image(MOTORCYCLE / "motorcycle_left.png").pixels, depth
+def motorcycle(focus_m: float = 2.3, aperture_radius_m: float = 0.04) -> tuple[Tensor, Tensor, torchdof.Camera]:
+    """The photograph, ``[1, 3, 500, 741]`` in linear light, its depth in metres, and a lens."""
+    picture, depth, camera = DEMO["motorcycle"](MOTORCYCLE, focus_m, aperture_radius_m)
+    return picture.pixels, depth, camera
 
 
-def focused(focus_m: float, aperture_radius_m: float = APERTURE_RADIUS_M) -> Tensor:
-    """The photograph through a lens focused at ``focus_m``."""
-    camera = torchdof.Camera.from_fov(FOV_X_DEG, aperture_radius_m, focus_m)
-    return torchdof.depth_of_field(*motorcycle(), camera, depth_edges="repair")  # stereo edges may be a pixel off
+def focused(focus_m: float, aperture_radius_m: float = 0.04) -> Tensor:
+    """The photograph through the lens."""
+    shot = motorcycle(focus_m, aperture_radius_m)
+    return torchdof.depth_of_field(*shot, depth_edges="repair")  # stereo edges may be a pixel off
 
 
 def photograph(path: Path, pixels: Tensor) -> None:
@@ -60,15 +55,11 @@ def half(pixels: Tensor) -> Tensor:
     return functional.avg_pool2d(pixels, 2)
 
 
-def twice(pixels: Tensor) -> Tensor:
-    """At twice the resolution, each pixel a square."""
-    return functional.interpolate(pixels, scale_factor=2.0, mode="nearest")
-
-
-def inner(scene: Scene, pixels: Tensor) -> Tensor:
-    """A picture of a scene without its margin."""
+def cut_out(path: Path, scene: Scene, pictures: dict[str, Tensor]) -> None:
+    """Writes pictures of a scene without its margin, at twice the resolution, each pixel a square."""
     m = scene.margin_px
-    return pixels[..., m : pixels.shape[-2] - m, m : pixels.shape[-1] - m]
+    inner = {caption: pixels[..., m:-m, m:-m] for caption, pixels in pictures.items()}
+    write_sheet(path, {name: functional.interpolate(pixels, scale_factor=2.0) for name, pixels in inner.items()})
 
 
 def portrait(stops: float = 0.0) -> Tensor:
@@ -87,17 +78,11 @@ def draw_portrait_lights(path: Path) -> None:
 
 def draw_blur_radius(path: Path) -> None:
     """Photograph, signed circle of confusion, result."""
-    image, depth = motorcycle()
-    camera = torchdof.Camera.from_fov(FOV_X_DEG, APERTURE_RADIUS_M, 3.1)
+    image, depth, camera = motorcycle(3.1)
     coc_px = camera.coc_px(depth, image.shape[-1])
-    write_sheet(
-        path,
-        {
-            "sharp": half(image),
-            f"radius {float(coc_px.min()):+.1f} to {float(coc_px.max()):+.1f} px": half(coc_colours(coc_px)),
-            "focus at 3.1 m": half(focused(3.1)),
-        },
-    )
+    radii = f"radius {float(coc_px.min()):+.1f} to {float(coc_px.max()):+.1f} px"
+    pictures = {"sharp": image, radii: coc_colours(coc_px), "focus at 3.1 m": focused(3.1)}
+    write_sheet(path, {caption: half(pixels) for caption, pixels in pictures.items()})
 
 
 def draw_apertures(path: Path) -> None:
@@ -108,14 +93,14 @@ def draw_apertures(path: Path) -> None:
 
 def draw_show_focus(path: Path) -> None:
     """The picture of ``torchdof render --show-focus``."""
-    image, depth = motorcycle()
-    photograph(path, tint_focus(image, torchdof.Camera.from_fov(FOV_X_DEG, 0.02, 2.8).coc_px(depth, image.shape[-1])))
+    image, depth, camera = motorcycle(2.8, 0.02)
+    photograph(path, tint_focus(image, camera.coc_px(depth, image.shape[-1])))
 
 
 def draw_inspect(path: Path) -> None:
     """The picture of ``torchdof inspect``."""
-    image, depth = motorcycle()
-    report = inspect_depth(image, depth, torchdof.Camera.from_fov(FOV_X_DEG, 0.02, 2.8))
+    image, depth, camera = motorcycle(2.8, 0.02)
+    report = inspect_depth(image, depth, camera)
     write_sheet(path, {caption.partition(":")[0]: half(panel) for caption, panel in panels(image, report).items()})
 
 
@@ -172,8 +157,7 @@ def draw_lights(path: Path, tables: dict[str, torchdof.BlurTable]) -> None:
 
 def draw_layers(path: Path) -> None:
     """Surfaces behind the focus, in focus and in front of it, each blurred alone, on grey."""
-    image, depth = motorcycle()
-    camera = torchdof.Camera.from_fov(FOV_X_DEG, APERTURE_RADIUS_M, 2.5)
+    image, depth, camera = motorcycle(2.5)
     coc_px, dof = camera.coc_px(depth, image.shape[-1]), torchdof.DepthOfField(camera)
     parts = {"behind the focus": coc_px > 2, "in focus": coc_px.abs() <= 2, "in front of it": coc_px < -2}
     pictures = {}
@@ -188,8 +172,7 @@ def draw_truth(path: Path) -> None:
     """A ray-traced cut-out: sharp, torchdof, and the path-traced picture through the lens."""
     (scene,) = read_scenes(SCENES / {"truth_lamps": "highlights", "truth_bars": "planes"}[path.stem])
     rendered = torchdof.depth_of_field(scene.image, scene.depth, scene.camera)
-    pictures = {"sharp": scene.image, "torchdof": rendered, "path-traced": scene.truth}
-    write_sheet(path, {caption: twice(inner(scene, pixels)) for caption, pixels in pictures.items()})
+    cut_out(path, scene, {"sharp": scene.image, "torchdof": rendered, "path-traced": scene.truth})
 
 
 def draw_edges(path: Path) -> None:
@@ -202,7 +185,7 @@ def draw_edges(path: Path) -> None:
         "exact depth": torchdof.depth_of_field(scene.image, scene.depth, scene.camera),
         "path-traced": scene.truth,
     }
-    write_sheet(path, {caption: twice(inner(scene, pixels)) for caption, pixels in pictures.items()})
+    cut_out(path, scene, pictures)
 
 
 def draw_fit(path: Path) -> None:

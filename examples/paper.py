@@ -24,6 +24,7 @@ from torchdof.fit.lens.spot import Spot, focus_sensor, point_spread
 from torchdof.fit.plots import picture_of_fit, picture_of_table
 from torchdof.io.images import Picture, write_image
 from torchdof.optics.psf import pixel_kernels
+from torchdof.reference.metrics import psnr
 
 FOCUS_M, PAPER_M = 0.20, 0.50  # distances of the dot in focus and out of focus
 WIDTH, HEIGHT, SENSOR_MM = 480, 360, 9.0  # the middle of a 36 mm sensor of 1920 pixels
@@ -54,16 +55,11 @@ def draw_table_1(out: Path) -> None:
     coc_px = float(table.coc[0]) / field_m * width
     draw_texture(table, coc_px, width, out / "sato_fig3.png")
     sharp = quad(width, width, 0.08 / field_m * width)
-    coc = torch.full((1, 1, width, width), coc_px)
-    blurred = torchdof.blur_by_coc(sharp[None, None], coc, table=table)
-    title = "a quad at 0.50 m, focus at 0.20 m: sato_j15"
-    draw_quads(sharp.numpy(), blurred[0, 0].numpy(), title, out / "sato_fig4.png")
-    print(
-        "Table 1, refitted from samples of its own curve (the paper's samples are not published), proves the fit only:"
-    )
-    print(
-        f"  sato_j15: N = {fit.params['N']:.5g}, r_c = {fit.params['r_c']:.5g} m, sigma = {fit.params['sigma']:.5g} m"
-    )
+    blurred = torchdof.blur_by_coc(sharp, torch.full_like(sharp, coc_px), table=table)
+    draw_quads(sharp, blurred, table, out / "sato_fig4.png")
+    print("Table 1, refitted from samples of its own curve (the paper's are not published), proves the fit only:")
+    params = ", ".join(f"{name} = {value:.5g}{'' if name == 'N' else ' m'}" for name, value in fit.params.items())
+    print(f"  sato_j15: {params}")
 
 
 def draw_experiment(out: Path, lens: Lens) -> None:
@@ -75,13 +71,13 @@ def draw_experiment(out: Path, lens: Lens) -> None:
 
     ratio = fit_pair(pair.sharp, pair.blurred, model="ratio")
     picture_of_fit(ratio, title="the paper's ratio, eq. (1)").savefig(out / "traced_fig2_ratio.png")
-    show("the paper's ratio, which measures the dot and the kernel together", ratio)
+    print(f"the paper's ratio, which measures the dot and the kernel together:\n{ratio.summary()}")
     print(f"  from {blur_strength(pair.sharp, pair.blurred)[0].size} samples along 36 spokes")
 
     result = fit_captures(captures, command="examples/paper.py")
     (forward,) = result.fits
     picture_of_fit(forward).savefig(out / "traced_fig2_forward.png")
-    show("the forward model, which measures the kernel", forward)
+    print(f"the forward model, which measures the kernel:\n{forward.summary()}")
 
     compare(spot, ratio, forward)
 
@@ -96,14 +92,10 @@ def draw_experiment(out: Path, lens: Lens) -> None:
     )
     dof = torchdof.DepthOfField(camera, table, occlusion=False)
     sharp = quad(WIDTH, HEIGHT, 150)
-    depth = torch.full((1, 1, HEIGHT, WIDTH), PAPER_M)
-    blurred = dof(sharp[None, None], depth)[0, 0].numpy()
-    truth = blur(sharp.numpy(), spot)
-    title = f"a quad at {PAPER_M} m, focus at {FOCUS_M} m: {table.name}"
-    draw_quads(sharp.numpy(), blurred, title, out / "traced_fig4.png")
-    inner = slice(60, -60), slice(60, -60)
-    error = float(np.mean((blurred - truth)[inner] ** 2))
-    print(f"quad against the traced spot itself: {-10 * np.log10(error):.1f} dB")
+    blurred = dof(sharp, torch.full_like(sharp, PAPER_M))
+    draw_quads(sharp, blurred, table, out / "traced_fig4.png")
+    truth = torch.from_numpy(blur(sharp[0, 0].numpy(), spot))[None, None]
+    print(f"quad against the traced spot itself: {psnr(*(t[..., 60:-60, 60:-60] for t in (blurred, truth))):.1f} dB")
 
 
 def compare(spot: Spot, ratio: BlurFit, forward: BlurFit) -> None:
@@ -113,9 +105,9 @@ def compare(spot: Spot, ratio: BlurFit, forward: BlurFit) -> None:
     for name, fit in (("ratio", ratio), ("forward", forward)):
         shape = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in fit.kernel_params().items()}
         kernel = pixel_kernels(fit.family, shape).numpy()
-        error = rms_radius(kernel) / rms_radius(true) - 1
-        print(f"  {name:8s} rms radius {rms_radius(kernel):.3f} px, {100 * error:+.1f} %", end="")
-        print(f"; {natural_psnr(kernel, true):.1f} dB on a natural image")
+        percent = 100 * (rms_radius(kernel) / rms_radius(true) - 1)
+        size, db = f"rms radius {rms_radius(kernel):.3f} px, {percent:+.1f} %", natural_psnr(kernel, true)
+        print(f"  {name:8s} {size}; {db:.1f} dB on a natural image")
 
 
 def rms_radius(kernel: np.ndarray) -> float:
@@ -136,12 +128,7 @@ def photograph(folder: Path, lens: Lens) -> Spot:
         radius_px = DOT_RADIUS_MM * image_mm / (1000 * distance) * WIDTH / SENSOR_MM
         light = WHITE * blur(disc(radius_px), spot) + 0.02
         pixels = torch.from_numpy(light + rng.normal(0, NOISE, light.shape)).float()
-        write_image(
-            folder / f"{1000 * distance:.0f}mm.png",
-            Picture(pixels.expand(1, 3, -1, -1)),
-            transfer="srgb",
-            sample="16",
-        )
+        write_image(folder / f"{1000 * distance:.0f}mm.png", Picture(pixels.expand(1, 3, -1, -1)), "srgb", "16")
     (folder / "capture.toml").write_text(
         f'focus_m = {FOCUS_M}\nsharp = "{1000 * FOCUS_M:.0f}mm.png"\nfocal_length_mm = {focal:.4f}\n'
         f'transfer = "srgb"\nf_number = {F_NUMBER}\nsensor_width_mm = {SENSOR_MM}\nname = "{lens.name} at 0.20 m"\n'
@@ -175,10 +162,10 @@ def disc(radius_px: float, samples: int = 8) -> np.ndarray:
 
 
 def quad(width: int, height: int, side: float) -> torch.Tensor:
-    """A white quad in the middle of a black frame."""
-    picture = torch.zeros(height, width)
+    """A white quad in the middle of a black frame, ``[1, 1, height, width]``."""
+    picture = torch.zeros(1, 1, height, width)
     top, left = round((height - side) / 2), round((width - side) / 2)
-    picture[top : height - top, left : width - left] = 1.0
+    picture[..., top : height - top, left : width - left] = 1.0
     return picture
 
 
@@ -192,24 +179,20 @@ def draw_texture(table: torchdof.BlurTable, coc_px: float, width: int, file: Pat
     figure.savefig(file)
 
 
-def draw_quads(sharp: np.ndarray, blurred: np.ndarray, title: str, file: Path) -> None:
-    """Fig. 4: a quad in focus and out of focus `[H, W]`, linear light, and their middle rows."""
+def draw_quads(sharp: torch.Tensor, blurred: torch.Tensor, table: torchdof.BlurTable, file: Path) -> None:
+    """Fig. 4: a quad in focus and out of focus, linear light, and their middle rows."""
     figure = Figure(figsize=(9.6, 3.4), layout="constrained")
     *pictures, below = figure.subplots(1, 3)
-    for axes, picture, name in zip(pictures, (sharp, blurred), ("in focus", "out of focus"), strict=True):
-        axes.imshow((picture / sharp.max()).clip(0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
+    for axes, light, name in zip(pictures, (sharp, blurred), ("in focus", "out of focus"), strict=True):
+        picture = light[0, 0].numpy()
+        axes.imshow(picture.clip(0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
         axes.set_title(name, fontsize=8)
         axes.set_axis_off()
         below.plot(picture[len(picture) // 2], label=name)
     below.set(xlabel="px", ylabel="linear light, middle row")
     below.legend(frameon=False, fontsize=8)
-    figure.suptitle(title, fontsize=10)
+    figure.suptitle(f"a quad at {PAPER_M} m, focus at {FOCUS_M} m: {table.name}", fontsize=10)
     figure.savefig(file)
-
-
-def show(title: str, fit: BlurFit) -> None:
-    """Print a fit."""
-    print(f"{title}:\n{fit.summary()}")
 
 
 if __name__ == "__main__":

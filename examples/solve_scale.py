@@ -13,13 +13,11 @@ focus_m``). Otherwise the solution renders the same picture, but its metres are 
 """
 
 import argparse
-import dataclasses
 from collections.abc import Collection
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from torch import Tensor
 
 import torchdof
@@ -29,20 +27,7 @@ from torchdof.reference.scenes import Scene, read_scenes
 
 # Downsampling factor, steps, learning rate. Coarse stages come first: far from the solution, detail misleads.
 STAGES = ((4, 60, 0.08), (2, 40, 0.04), (1, 25, 0.02))
-
-
-@dataclasses.dataclass(frozen=True)
-class Numbers:
-    """Numbers of the lens and of the depth: ``1 / depth = scale * disparity + shift``."""
-
-    scale: float
-    shift: float
-    focus_m: float
-    f_number: float
-
-    def depth(self, disparity: Tensor) -> Tensor:
-        """Metres, ``[1, 1, H, W]``."""
-        return 1 / (self.scale * disparity + self.shift).clamp(min=1e-6)
+Numbers = dict[str, float]  # "scale", "shift", "focus_m", "f_number"; 1 / depth = scale * disparity + shift
 
 
 def solve(
@@ -58,27 +43,24 @@ def solve(
         guess: Starting values.
         known: Names of the numbers that are kept fixed.
     """
-    logs = {name: torch.tensor(value).log() for name, value in dataclasses.asdict(guess).items()}
+    logs = {name: torch.tensor(value).log() for name, value in guess.items()}
     free_logs = [logs[name].requires_grad_() for name in logs if name not in known]
-    with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), transient=True) as progress:
-        task = progress.add_task("solving", total=sum(steps for _, steps, _ in STAGES))
-        for factor, steps, rate in STAGES:
-            image_level, target, map_ = (F.avg_pool2d(x, factor) for x in (image, blurred, disparity))
-            target, margin = display(target), max(2, 24 // factor)  # light from outside the frame reaches its border
-            dof = torchdof.DepthOfField(camera, tolerance=2 / 255, check=False)
-            optimizer = torch.optim.Adam(free_logs, lr=rate)
-            schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
-            for _ in range(steps):
-                numbers = {name: log.exp() for name, log in logs.items()}
-                depth = 1 / (numbers["scale"] * map_ + numbers["shift"])
-                picture = dof(image_level, depth, focus_m=numbers["focus_m"], f_number=numbers["f_number"])
-                error = (display(picture) - target)[..., margin:-margin, margin:-margin].square().mean()
-                optimizer.zero_grad()
-                error.backward()
-                optimizer.step()
-                schedule.step()
-                progress.advance(task)
-    return Numbers(**{name: float(log.detach().exp()) for name, log in logs.items()})
+    dof = torchdof.DepthOfField(camera, tolerance=2 / 255, check=False)
+    for factor, steps, rate in STAGES:
+        print(f"solving at 1/{factor} of the size", flush=True)
+        image_level, target, map_ = (F.avg_pool2d(x, factor) for x in (image, blurred, disparity))
+        target, margin = display(target), max(2, 24 // factor)  # light from outside the frame reaches its border
+        optimizer = torch.optim.Adam(free_logs, lr=rate)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
+        for _ in range(steps):
+            scale, shift, focus_m, f_number = (log.exp() for log in logs.values())
+            picture = dof(image_level, 1 / (scale * map_ + shift), focus_m=focus_m, f_number=f_number)
+            error = (display(picture) - target)[..., margin:-margin, margin:-margin].square().mean()
+            optimizer.zero_grad()
+            error.backward()
+            optimizer.step()
+            schedule.step()
+    return {name: float(log.detach().exp()) for name, log in logs.items()}
 
 
 def as_estimated(depth: Tensor) -> tuple[Tensor, float, float]:
@@ -90,22 +72,24 @@ def as_estimated(depth: Tensor) -> tuple[Tensor, float, float]:
 def run(scene: Scene, known: Collection[str], out: Path) -> None:
     """Solves one scene, prints guess, solution and truth, and writes pictures."""
     disparity, scale, shift = as_estimated(scene.depth)
-    true = Numbers(scale, shift, float(scene.camera.focus_m), float(scene.camera.f_number))
-    guess = Numbers(0.6 * scale, 1.3 * shift, 0.8 * true.focus_m, 1.5 * true.f_number)
-    guess = dataclasses.replace(guess, **{name: getattr(true, name) for name in known})
+    lens = {name: float(getattr(scene.camera, name)) for name in ("focus_m", "f_number")}
+    true = {"scale": scale, "shift": shift, **lens}
+    factors = zip(true, (0.6, 1.3, 0.8, 1.5), strict=True)
+    guess = {name: true[name] * (1.0 if name in known else factor) for name, factor in factors}
     solution = solve(scene.image, scene.truth, disparity, scene.camera, guess, known)
     print(f"{scene.name}: {'nothing' if not known else ', '.join(known)} known")
     print("            scale   shift   focus m   f-number   mean error of the blur radius, px   of depth, %   PSNR, dB")
     pictures = {"all in focus": scene.image, "the picture": scene.truth}
     for name, numbers in (("guess", guess), ("found", solution), ("true", true)):
-        camera = scene.camera.replace(focus_m=numbers.focus_m, f_number=numbers.f_number)
-        depth = numbers.depth(disparity)
+        camera = scene.camera.replace(**{name: numbers[name] for name in lens})
+        depth = 1 / (numbers["scale"] * disparity + numbers["shift"]).clamp(min=1e-6)  # metres
         radius_error = (camera.coc_px(depth, depth.shape[-1]) - scene.coc_px).abs().mean()
         with torch.no_grad():
             picture = torchdof.depth_of_field(scene.image, depth, camera)
         psnr_db = psnr(display(picture), display(scene.truth), scene.inner)
         print(
-            f"  {name:6s} {numbers.scale:9.4f} {numbers.shift:7.4f} {numbers.focus_m:9.3f} {numbers.f_number:10.3f} "
+            f"  {name:6s} {numbers['scale']:9.4f} {numbers['shift']:7.4f} {numbers['focus_m']:9.3f} "
+            f"{numbers['f_number']:10.3f} "
             f"{float(radius_error):35.3f} {float(100 * (depth / scene.depth - 1).abs().mean()):13.2f} {psnr_db:10.2f}"
         )
         pictures[f"rendered: {name}"] = picture
@@ -119,7 +103,7 @@ def main() -> None:
     parser.add_argument(
         "--scene", type=Path, required=True, help="folder with sharp.exr, depth.exr, truth_K.exr, meta.json"
     )
-    parser.add_argument("--known", nargs="*", default=[], choices=[f.name for f in dataclasses.fields(Numbers)])
+    parser.add_argument("--known", nargs="*", default=[], choices=("scale", "shift", "focus_m", "f_number"))
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the pictures")
     arguments = parser.parse_args()
     torch.set_num_threads(1)  # faster for pictures this small

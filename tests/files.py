@@ -1,4 +1,4 @@
-"""Pictures written with OpenImageIO alone, and rights to write."""
+"""Pictures written with OpenImageIO alone, small ONNX files, and rights to write."""
 
 import os
 import stat
@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import OpenImageIO as oiio
 
 
@@ -37,6 +38,21 @@ def store_parts(path: Path, parts: list[tuple[oiio.ImageSpec, np.ndarray]]) -> P
         assert output.write_image(np.ascontiguousarray(array)), output.geterror()
     assert output.close()
     return path
+
+
+def store_model(path: Path, facts: dict[str, str], external: str | None = None) -> None:
+    """Writes an ONNX file with metadata and optionally a tensor stored in another file."""
+    node = onnx.helper.make_node("Identity", ["image"], ["out"])
+    values = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1]) for name in ("image", "out")]
+    graph = onnx.helper.make_graph([node], "g", values[:1], values[1:])
+    if external is not None:
+        tensor = graph.initializer.add(name="w", data_type=onnx.TensorProto.FLOAT, dims=[1])
+        tensor.data_location = onnx.TensorProto.EXTERNAL
+        tensor.external_data.add(key="location", value=external)
+    model = onnx.helper.make_model(graph)
+    for key, value in {"torchdof.options": "{}", **facts}.items():
+        model.metadata_props.add(key=key, value=value)
+    onnx.save_model(model, path)
 
 
 def as_an_ordinary_user(path: str | os.PathLike[str], mode: int) -> bool:

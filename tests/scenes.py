@@ -12,6 +12,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
+from torchdof.optics.aperture import Aperture
 from torchdof.optics.field import Field
 from torchdof.render.border import continued
 from torchdof.render.highlights import threshold
@@ -34,6 +35,12 @@ def texture(dtype: torch.dtype = torch.float32, channels: int = 3) -> Tensor:
     """Random light from 0.05 to 1."""
     noise = torch.rand(1, channels, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
     return (0.05 + 0.95 * noise).to(dtype)
+
+
+def smooth(channels: int, height: int, width: int, factor: int = 4) -> Tensor:
+    """Random light from 0 to 1 without detail finer than ``factor`` pixels."""
+    noise = torch.rand(1, channels, height // factor, width // factor, generator=torch.Generator().manual_seed(3))
+    return functional.interpolate(noise, (height, width), mode="bicubic").clamp(0.0, 1.0)
 
 
 def whole(value: float, height: int = HEIGHT, width: int = WIDTH) -> Tensor:
@@ -110,52 +117,35 @@ def _brightest(truth: Tensor) -> Tensor:
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A hostile scene of 32 x 24 pixels with its truth and limits of the error.
-
-    Args:
-        name: Description of the difficulty.
-        maps: Circles of confusion in pixels, or depths in metres if there are cameras; one picture each.
-        truth: Closed form as a function of image and circle of confusion; None is the same rendering in float64.
-        light: The image as a function of the dtype.
-        cameras: One for each map, or one for all.
-        float32, float16: Largest relative error.
-        per: Divisor of the error, as a function of the truth.
-        where: Mask of the pixels that are checked.
-        options: Options of the rendering.
-    """
+    """A hostile scene of 32 x 24 pixels with its truth and limits of the error."""
 
     name: str
-    maps: Sequence[Tensor]
-    truth: Callable[[Tensor, Tensor], Tensor] | None = None
-    light: Light = texture
-    cameras: Sequence[Camera] = ()
-    float32: float = 1e-5
+    maps: Sequence[Tensor]  # circles of confusion in pixels, or depths in metres if there are cameras; one picture each
+    truth: Callable[[Tensor, Tensor], Tensor] | None = None  # of image and coc; None: the same rendering in float64
+    light: Light = texture  # the image as a function of the dtype
+    cameras: Sequence[Camera] = ()  # one for each map, or one for all
+    float32: float = 1e-5  # largest relative errors
     float16: float = 2**-11 + 1e-5
-    per: Callable[[Tensor], Tensor] = Tensor.abs
-    where: Tensor | None = None
+    per: Callable[[Tensor], Tensor] = Tensor.abs  # divisor of the error, as a function of the truth
+    where: Tensor | None = None  # pixels that are checked
     options: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def pairs(self, dtype: torch.dtype = torch.float32) -> Iterator[tuple[Tensor, Tensor, Camera | None]]:
         """Image, map and camera of each picture; without a camera the map is a circle of confusion."""
-        cameras: list[Camera | None] = list(self.cameras) or [None]
-        maps = list(self.maps)
-        if len(cameras) == 1:
-            cameras *= len(maps)
-        elif len(maps) == 1:
-            maps *= len(cameras)
-        for values, camera in zip(maps, cameras, strict=True):
-            yield self.light(dtype), values, camera
+        cameras: Sequence[Camera | None] = self.cameras or [None]
+        for i in range(max(len(self.maps), len(cameras))):
+            yield self.light(dtype), self.maps[i % len(self.maps)], cameras[i % len(cameras)]
 
-    def error(self, dtype: torch.dtype, **way: Any) -> float:
+    def error(self, dtype: torch.dtype) -> float:
         """The largest error in any of the pictures; infinite if a picture is not finite."""
         errors = []
         for image, values, camera in self.pairs(dtype):
-            out = rendered(image, values, camera, **{**self.options, **way}).double()
+            exact = image.double(), values.double()
+            out = rendered(image, values, camera, **self.options).double()
             if self.truth is None:
-                truth = rendered(image.double(), values.double(), camera, **{**self.options, **way})
+                truth = rendered(*exact, camera, **self.options)
             else:
-                coc_px = values.double() if camera is None else camera.coc_px(values.double(), WIDTH)
-                truth = self.truth(image.double(), coc_px)
+                truth = self.truth(exact[0], exact[1] if camera is None else camera.coc_px(exact[1], WIDTH))
             apart = torch.where(out == truth, 0.0, (out - truth).abs() / self.per(truth).clamp_min(1e-300))
             errors.append(torch.nan_to_num(apart if self.where is None else apart[..., self.where], nan=math.inf).max())
         return float(max(errors))
@@ -202,12 +192,9 @@ def noise(seed: int) -> Tensor:
 
 def _near_a_node(offset: int) -> Tensor:
     """Two planes; the nearer one is ``offset`` units in the last place from a layer's node."""
-    node = torch.tensor(
-        [c for c in Plan.for_scene(torch.tensor([[[[0.0, 9.0]]]]), 1 / 255, adapt=False).coc_px if 2 < c < 6][0]
-    )
-    for _ in range(abs(offset)):
-        node = torch.nextafter(node, torch.tensor(math.copysign(math.inf, offset)))
-    coc = halves(float(node), 9.0)
+    plan = Plan.for_scene(torch.tensor([[[[0.0, 9.0]]]]), 1 / 255, adapt=False)
+    node = torch.tensor(next(c for c in plan.coc_px if 2 < c < 6))
+    coc = halves(float(torch.nextafter(node, node + offset)), 9.0)
     coc[..., 0, 0] = 0.0
     return coc
 
@@ -285,6 +272,8 @@ CASES = [
     Case("even light, slope from -20 to 20 px", [slope(-20, 20)], light=even(0.75), **_EVEN),
     Case("even light, a depth of its own for every pixel", [r * noise(2) for r in (1.0, 8.0, 30.0)], itself, even(0.75),
          float32=1.2e-6, float16=0.0),
+    Case("even light, cat's eyes", [slope(-12, 14)], itself, even(0.75), float32=1.2e-6, float16=0.0,
+         options={"table": BlurTable.disc().with_aperture(Aperture(vignetting=0.4))}),
     Case("even light, one near pixel before infinity", [_with(whole(0.0), 12, 16, value=-30.0)], light=even(0.75),
          **_EVEN),
     Case("2001 layers accumulated", [torch.linspace(-1.5, 1.5, HEIGHT * WIDTH).reshape(1, 1, HEIGHT, WIDTH)],
@@ -299,13 +288,7 @@ CASES = [
 
 
 def lens_with_a_field(colours: int = 3, unit: float = 1.0, **change: Any) -> BlurTable:
-    """A lens with random spots that change across the field.
-
-    Args:
-        colours: Number of colours.
-        unit: Factor on all lengths; with 1 the sensor is 36 mm wide.
-        change: Other arguments of the :class:`torchdof.optics.field.Field`.
-    """
+    """A lens with random spots that change across the field; ``unit`` is a factor on all lengths."""
     dice = torch.Generator().manual_seed(colours)
     coc, radius = unit * torch.tensor([-0.4, -0.1, 0.2, 0.5]), unit * torch.tensor([0.0, 9.0, 20.0])
     box = (torch.rand(4, 3, 3, generator=dice) + 0.5) * coc.abs()[:, None, None]
@@ -363,14 +346,8 @@ def random_scene(
 ) -> Scene:
     """Images of noise, blocks, gradients and edges; coc of planes, discs, slopes, checkerboards, steps and noise.
 
-    Args:
-        seed: Seed of the random numbers.
-        ways: Ways of rendering to choose from: ``"filled"`` (hidden surfaces are estimated), ``"background"`` (known),
-            ``"accumulated"`` (without occlusion).
-        lamps: Whether there may be highlights.
-        multiple: The sides of the frame are multiples of this.
-        side: Longest side in pixels.
-        kinds: Kinds of coc maps to choose from.
+    It is drawn from ways of rendering (hidden surfaces are estimated, or known, or there is no occlusion) and kinds of
+    coc maps, with highlights if there may be ``lamps``; sides are multiples of ``multiple`` up to ``side`` pixels.
     """
     draw, generator = random.Random(seed), torch.Generator().manual_seed(seed)
 
@@ -438,7 +415,7 @@ def random_scene(
 
 def made(kind: str, height: int, width: int, radius: float, **options: Any) -> Scene:
     """Random light, multiplied by ``lamps`` on a grid of pixels, and a smooth coc map or one of three planes."""
-    torch.manual_seed(3)
+    torch.manual_seed(options.pop("seed", 3))
     items, lamps = options.pop("items", 1), options.pop("lamps", 1.0)
     image = torch.rand(items, 3, height, width)
     image[..., height // 5 :: 9, width // 6 :: 13] *= lamps

@@ -6,7 +6,7 @@ measured errors.
 
 import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -36,14 +36,12 @@ from tests.scenes import (
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field, native
 from torchdof.depth import repair_edges
 from torchdof.export.graph import Portable
-from torchdof.export.verification import session
 from torchdof.optics.aperture import Aperture
 from torchdof.reference.lens_views import lens_views
 from torchdof.reference.metrics import ssim
 from torchdof.render.plan import Plan
 
 BY_COLOUR = BlurTable("gaussian", [1.0], {"sigma": torch.tensor([[0.4], [0.5], [0.6]])}, name="by colour")
-
 
 LENSES = {
     **{str(table): table for table in (*TABLES, BY_COLOUR)},
@@ -68,40 +66,28 @@ def test_the_error_of_a_hostile_scene_is_within_its_limit(case: Case, dtype: tor
     assert error <= case.limit(dtype)
 
 
-class File:
-    """An exported file, and its module with the same layers."""
+def by_file(exported: Any, image: Tensor, values: Tensor, camera: Camera | None) -> tuple[Tensor, Tensor]:
+    """Pictures of an exported file, and of its module with the same layers in float64.
 
-    def __init__(self, exported: Any) -> None:
-        self.camera, self.session, self.portable = exported.dof.camera, session(exported.path), Portable(exported.dof)
-
-    def render(self, image: Tensor, values: Tensor, camera: Camera | None) -> tuple[Tensor, Tensor]:
-        """Pictures of the file and of the module in float64.
-
-        Without a camera ``values`` are circles of confusion, which are converted to depth because the file takes that.
-        """
-        if camera is None:
-            reach = 1.05 * float(values.max().clamp_min(1.0))  # coc at infinity
-            wide = self.camera.replace(f_number=1.0).coc_px(torch.full((1, 1, 1, 1), torch.inf), image.shape[-1])
-            values = float(self.camera.focus_m) / (1.0 - values.double() / reach)
-            camera = self.camera.replace(f_number=float(wide) / reach)
-        image = image.float().expand(-1, 3, -1, -1)
-        lens = [torch.full(image.shape[:1], float(number)) for number in (camera.focus_m, camera.f_number)]
-        tensors = [image.contiguous(), values.float().contiguous(), *lens]
-        names = ("image", "depth", "focus_m", "f_number")
-        (got,) = self.session.run(None, {n: t.numpy() for n, t in zip(names, tensors, strict=True)})
-        with torch.no_grad():
-            return torch.from_numpy(got), self.portable(*(tensor.double() for tensor in tensors))
-
-
-@pytest.fixture(scope="module")
-def file(layered: Any) -> File:
-    return File(layered)
+    Without a camera ``values`` are circles of confusion, which are converted to depth because the file takes that.
+    """
+    if camera is None:
+        reach = 1.05 * float(values.max().clamp_min(1.0))  # coc at infinity
+        camera = exported.dof.camera
+        wide = camera.replace(f_number=1.0).coc_px(torch.full((1, 1, 1, 1), torch.inf), image.shape[-1])
+        values = float(camera.focus_m) / (1.0 - values.double() / reach)
+        camera = camera.replace(f_number=float(wide) / reach)
+    image = image.float().expand(-1, 3, -1, -1)
+    lens = [torch.full(image.shape[:1], float(number)) for number in (camera.focus_m, camera.f_number)]
+    tensors = [image.contiguous(), values.float().contiguous(), *lens]
+    with torch.no_grad():
+        return exported.render(*tensors), Portable(exported.dof)(*(tensor.double() for tensor in tensors))
 
 
 @pytest.mark.parametrize("case", [case for case in CASES if not case.options], ids=lambda case: case.name)
-def test_the_error_of_a_file_is_within_1e_5(file: File, case: Case) -> None:
+def test_the_error_of_a_file_is_within_1e_5(layered: Any, case: Case) -> None:
     for image, values, camera in case.pairs():
-        got, truth = file.render(image, values, camera)
+        got, truth = by_file(layered, image, values, camera)
         # relative to each pixel, or to the brightest one if negative light can cancel
         scale = truth.abs() if float(image.min()) >= 0 else truth.abs().max()
         apart = (got.double() - truth).abs() / scale.clamp_min(torch.finfo(torch.float32).tiny)
@@ -111,18 +97,14 @@ def test_the_error_of_a_file_is_within_1e_5(file: File, case: Case) -> None:
 # Invalid light and depth
 
 
-def _hole(values: Tensor, bad: float) -> Tensor:
-    values = values.clone()
-    values[..., 9:11, 8:10] = bad
-    return values
-
-
-HOLE = _hole(torch.zeros(1, 1, HEIGHT, WIDTH), 1.0)[0, 0] > 0
+HOLE = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+HOLE[9:11, 8:10] = True
+BAD = pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, -math.inf])
 
 
 def assert_untouched_by_a_hole(render: Callable[[Tensor, Tensor], Tensor], bad: float) -> None:
     """A pixel with a bad depth stays sharp, and its light does not reach other pixels."""
-    image, other, depth = texture(), _hole(texture(), 1e6), _hole(slope(1.2, 6.0), bad)
+    image, other, depth = texture(), torch.where(HOLE, 1e6, texture()), torch.where(HOLE, bad, slope(1.2, 6.0))
     out = render(image, depth)
     assert torch.equal(out[..., HOLE], image[..., HOLE]) and torch.isfinite(out).all()
     assert torch.equal(render(other, depth)[..., ~HOLE], out[..., ~HOLE])
@@ -130,14 +112,14 @@ def assert_untouched_by_a_hole(render: Callable[[Tensor, Tensor], Tensor], bad: 
 
 
 @EVERY_WAY
-@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, -math.inf])
+@BAD
 def test_a_bad_depth_stays_sharp_and_does_not_affect_others(engine: str, way: dict[str, Any], bad: float) -> None:
     assert_untouched_by_a_hole(DepthOfField(CAMERA, check=False, **way), bad)
 
 
-@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, -math.inf])
-def test_a_bad_depth_in_a_file_stays_sharp_and_does_not_affect_others(file: File, bad: float) -> None:
-    assert_untouched_by_a_hole(lambda image, depth: file.render(image, depth, CAMERA)[0], bad)
+@BAD
+def test_a_bad_depth_in_a_file_stays_sharp_and_does_not_affect_others(layered: Any, bad: float) -> None:
+    assert_untouched_by_a_hole(lambda image, depth: by_file(layered, image, depth, CAMERA)[0], bad)
 
 
 @EVERY_WAY
@@ -161,14 +143,10 @@ def test_bad_light_stays_within_its_disc(engine: str, way: dict[str, Any], bad: 
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf], ids=str)
-def test_bad_light_in_a_file_stays_in_its_pixel(file: File, bad: float) -> None:
-    image = texture()
-    image[0, 1, 12, 20] = bad
-    out, truth = file.render(image, slope(1.2, 6.0), CAMERA)
-    here = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
-    here[12, 20] = True
-    assert torch.equal(torch.isfinite(out).all(1)[0], ~here)
-    assert_close(out.double()[..., ~here], truth[..., ~here], rtol=1e-5, atol=0.0)
+def test_bad_light_in_a_file_stays_in_its_pixels(layered: Any, bad: float) -> None:
+    out, truth = by_file(layered, torch.where(HOLE, bad, texture()), slope(1.2, 6.0), CAMERA)
+    assert torch.equal(torch.isfinite(out).all(1)[0], ~HOLE)
+    assert_close(out.double()[..., ~HOLE], truth[..., ~HOLE], rtol=1e-5, atol=0.0)
 
 
 # Light of any size
@@ -222,25 +200,30 @@ def test_light_of_1e30_agrees_with_float64_for_any_lens(engine: str, name: str) 
 
 
 @pytest.fixture
-def by_both(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Compares the pictures of both engines, to 1e-5 of the light nearby, and checks that each engine was used."""
-    served = []
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """List of the items that the compiled engine renders, by kind."""
+    kinds: list[str] = []
 
-    def render(*arguments: Any, native_render: Any = native.render, **options: Any) -> Tensor:
-        served.append(native_render(*arguments, **options))
-        return served[-1]
+    def render(surfaces: Any, kind: Any, native_render: Any = native.render, **options: Any) -> Tensor:
+        kinds.append(kind)
+        return native_render(surfaces, kind, **options)
 
     monkeypatch.setattr(native, "render", render)
+    monkeypatch.setenv("TORCHDOF_ENGINE", "native")
+    return kinds
+
+
+@pytest.fixture
+def by_both(counted: list[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Compares the pictures of both engines, to 1e-5 of the light nearby, and checks that each engine was used."""
 
     def compared(make: Callable[[], Tensor], image: Tensor, in_focus: bool = False) -> None:
-        monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
-        plain = make()
-        assert not served
-        monkeypatch.setenv("TORCHDOF_ENGINE", "native")
-        compiled = make()
-        assert served or in_focus
-        served.clear()
-        assert_same_picture(plain, compiled, image)
+        pictures = []
+        for engine in ("torch", "native"):
+            monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+            pictures.append(make())
+            assert bool(counted) == (engine == "native") or in_focus
+        assert_same_picture(pictures[0], pictures[1], image)
 
     return compared
 
@@ -428,20 +411,6 @@ def test_a_plan_of_one_plane_renders_another(engine: str, planned: float, shown:
 
 
 # Which engine renders
-
-
-@pytest.fixture
-def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """List of the items that the compiled engine renders, by kind."""
-    kinds: list[str] = []
-
-    def render(surfaces: Any, kind: Any, native_render: Any = native.render, **options: Any) -> Tensor:
-        kinds.append(kind)
-        return native_render(surfaces, kind, **options)
-
-    monkeypatch.setattr(native, "render", render)
-    monkeypatch.setenv("TORCHDOF_ENGINE", "native")
-    yield kinds
 
 
 @pytest.mark.parametrize(("wanted", "served"), [("native", 3), ("auto", 3), ("torch", 0)])

@@ -46,20 +46,24 @@ def test_gradients_equal_finite_differences(way: dict[str, Any]) -> None:
     assert gradcheck(lambda x: blur_by_coc(leaves[0].detach(), x, tolerance=1 / 60, **way), (coc,))
 
 
-@pytest.mark.parametrize("which", ["a measured table", "leaves of the camera", "a plan", "a plan, sum"])
+@pytest.mark.parametrize(
+    "which", ["a measured table", "cat's eyes", "leaves of the camera", "a background", "a plan", "a plan, sum"]
+)
 def test_gradients_flow_through(which: str) -> None:
-    image, depth, focus, f_number = case().values()
-    if which == "leaves of the camera":
-
-        def render(focus: Tensor, f_number: Tensor) -> Tensor:
-            return DepthOfField(Camera(50.0, f_number, focus, 0.6), tolerance=1 / 60)(image, depth)
-
-        assert gradcheck(render, (focus.requires_grad_(), f_number.requires_grad_()))
-        return
+    image, depth, *lens = (value.requires_grad_() for value in case().values())
+    table = {"a measured table": BlurTable.load("sato_j15"), "cat's eyes": BlurTable.polygon(5, vignetting=0.4)}.get(
+        which
+    )
     plan = Plan.static(6.0, 1 / 60) if "plan" in which else None
-    table = BlurTable.load("sato_j15") if "table" in which else BlurTable.disc()
-    dof = DepthOfField(SMALL, table, tolerance=1 / 60, occlusion=which == "a plan")
-    assert gradcheck(lambda d: dof(image, d, focus, f_number, plan), (depth.requires_grad_(),))
+    occlusion = which not in ("a measured table", "a plan, sum")
+
+    def render(image: Tensor, depth: Tensor, focus: Tensor, f_number: Tensor, *behind: Tensor) -> Tensor:
+        own = Camera(50.0, f_number, focus, 0.6) if which == "leaves of the camera" else SMALL
+        given = () if own is not SMALL else (focus, f_number, plan, *behind)
+        return DepthOfField(own, table, tolerance=1 / 60, occlusion=occlusion)(image, depth, *given)
+
+    behind = (torch.rand_like(image), depth.detach() + 2.0) if which == "a background" else ()
+    assert gradcheck(render, (image, depth, *lens, *(value.requires_grad_() for value in behind)))
 
 
 @EVERY_WAY
@@ -98,12 +102,6 @@ def _beside(first: float, second: float) -> Tensor:
     return torch.tensor([first, second]).repeat(54).reshape(1, 1, 9, 12)
 
 
-def _holes() -> Tensor:
-    depth = slope(1.2, 9.0, 9, 12)
-    depth[0, 0, 3:5, 4:7], depth[0, 0, 7, 2] = math.nan, 0.0
-    return depth
-
-
 EVEN = torch.linspace(-4, 4, 108).reshape(1, 1, 9, 12)
 DEPTHS: dict[str, Tensor] = {
     "focus plane": whole(2.0, 9, 12),
@@ -114,7 +112,7 @@ DEPTHS: dict[str, Tensor] = {
     "a micrometre beside infinity": _beside(1e-6, math.inf),
     "checkerboard": _beside(1.2, 9.0),
     "noise": 2.0 * 10 ** (0.5 * torch.randn(1, 1, 9, 12, generator=torch.Generator().manual_seed(0))),
-    "holes": _holes(),
+    "holes": torch.where(EVEN.abs() < 1.0, math.nan, slope(1.2, 9.0, 9, 12) * (EVEN < 3.9)),
 }
 COCS: dict[str, Tensor] = {
     "nodes of layers": _nodes(),

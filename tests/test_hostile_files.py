@@ -3,10 +3,10 @@
 import json
 from pathlib import Path
 
-import onnx
 import pytest
 from click.testing import CliRunner
 
+from tests.files import store_model
 from torchdof.cli.main import app
 from torchdof.export import describe
 
@@ -16,21 +16,6 @@ pytestmark = pytest.mark.hard
 # Metadata shown by `torchdof export --show`
 
 
-def model_with(path: Path, facts: dict[str, str], external: str | None = None) -> None:
-    """Writes an ONNX file with metadata and optionally a tensor stored in another file."""
-    node = onnx.helper.make_node("Identity", ["image"], ["out"])
-    values = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1]) for name in ("image", "out")]
-    graph = onnx.helper.make_graph([node], "g", values[:1], values[1:])
-    if external is not None:
-        tensor = graph.initializer.add(name="w", data_type=onnx.TensorProto.FLOAT, dims=[1])
-        tensor.data_location = onnx.TensorProto.EXTERNAL
-        tensor.external_data.add(key="location", value=external)
-    model = onnx.helper.make_model(graph)
-    for key, value in {"torchdof.options": "{}", **facts}.items():
-        model.metadata_props.add(key=key, value=value)
-    onnx.save_model(model, path)
-
-
 @pytest.mark.parametrize(
     "text",
     ["\x1b[2J\x1b]0;title\x07", "line\nbreak\rback", "\u202edrow", "\x00\x08\x7f\x9b", "x" * 20_000],
@@ -38,51 +23,41 @@ def model_with(path: Path, facts: dict[str, str], external: str | None = None) -
 )
 def test_shown_metadata_have_no_control_characters_and_are_short(tmp_path: Path, text: str) -> None:
     facts = {"torchdof.table": json.dumps({"name": text, text: 1}), f"torchdof.{text}": json.dumps(text)}
-    model_with(tmp_path / "x.onnx", facts)
+    store_model(tmp_path / "x.onnx", facts)
     result = CliRunner().invoke(app, ["export", "--show", str(tmp_path / "x.onnx")])
     assert result.exit_code == 0 and len(result.output) < 3000
     assert all(line.isprintable() for line in result.output.split("\n"))
 
 
 @pytest.mark.parametrize(
-    ("value", "message"),
+    ("facts", "message"),
     [
-        ('"' + "x" * 2**20 + '"', "are more than torchdof.export writes"),
-        ("[" * 50_000, "are not JSON"),
-        ("9" * 10_000, "are not JSON"),
-        ("__import__('pathlib').Path('ran').touch()", "are not JSON"),
+        ({f"torchdof.k{i}": "1" for i in range(1000)}, r"torchdof.k\d+ are more than torchdof.export writes"),
+        ({"torchdof.camera": '"' + "x" * 2**20 + '"'}, "torchdof.camera are more than torchdof.export writes"),
+        *(({"torchdof.camera": value}, "torchdof.camera are not JSON")
+          for value in ("[" * 50_000, "9" * 10_000, "__import__('pathlib').Path('ran').touch()")),
     ],
-    ids=lambda text: text[:12],
-)
+)  # fmt: skip
 def test_foreign_metadata_are_not_executed_and_refused_by_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, value: str, message: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, facts: dict[str, str], message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    model_with(tmp_path / "x.onnx", {"torchdof.camera": value})
-    with pytest.raises(ValueError, match=rf"x\.onnx: its metadata torchdof.camera {message}"):
+    store_model(tmp_path / "x.onnx", facts)
+    with pytest.raises(ValueError, match=rf"x\.onnx: its metadata {message}"):
         describe(tmp_path / "x.onnx")
     assert [path.name for path in tmp_path.iterdir()] == ["x.onnx"]
 
 
-def test_too_many_metadata_are_refused(tmp_path: Path) -> None:
-    model_with(tmp_path / "x.onnx", {f"torchdof.k{i}": "1" for i in range(1000)})
-    with pytest.raises(ValueError, match="are more than torchdof.export writes"):
-        describe(tmp_path / "x.onnx")
-
-
 def test_describe_opens_no_other_file(tmp_path: Path) -> None:
-    (tmp_path / "secret").write_bytes(b"1234")
-    model_with(tmp_path / "x.onnx", {}, external="secret")
-    (tmp_path / "secret").unlink()
-    assert describe(tmp_path / "x.onnx") == {"options": {}}
-    model_with(tmp_path / "y.onnx", {}, external="/etc/passwd")
-    assert describe(tmp_path / "y.onnx") == {"options": {}}
+    for external in ("missing", "/etc/passwd"):
+        store_model(tmp_path / "x.onnx", {}, external)
+        assert describe(tmp_path / "x.onnx") == {"options": {}}
 
 
 def test_an_onnx_file_larger_than_memory_is_refused_before_it_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model_with(tmp_path / "x.onnx", {})
+    store_model(tmp_path / "x.onnx", {})
     monkeypatch.setattr("torchdof.export.metadata.free_bytes", lambda: 100.0)
     with pytest.raises(ValueError, match=r"x\.onnx takes .* more than there is memory for"):
         describe(tmp_path / "x.onnx")

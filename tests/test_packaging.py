@@ -10,21 +10,14 @@ import pytest
 from click.testing import CliRunner
 
 import torchdof
+from tests.test_imports import FILES
 from tests.traced import TRACED
 from torchdof.cli.main import app
 
-ROOT = Path(__file__).parents[1]
-FOLDERS = {"torchdof": "torchdof", "fit": "torchdof.fit", "export": "torchdof.export"}
-MODULES = sorted(
-    ".".join([package, *path.relative_to(ROOT / folder).with_suffix("").parts]).removesuffix(".__init__")
-    for folder, package in FOLDERS.items()
-    for path in (ROOT / folder).rglob("*.py")
-    if path.name != "__main__.py"
-)
-
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[TRACED] if name == "torchdof.export.conversion" else []) for name in MODULES]
+    "name",
+    [pytest.param(n, marks=[TRACED] if n == "torchdof.export.conversion" else []) for n in FILES if "__" not in n],
 )
 def test_examples_in_docstrings_run(name: str, request: pytest.FixtureRequest) -> None:
     names: dict[str, Any] = {}

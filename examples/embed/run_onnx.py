@@ -38,14 +38,9 @@ def main() -> None:
     depth = read_depth(arguments.depth, arguments.disparity_scale, arguments.disparity_offset)
     if light.shape[-2:] != depth.shape[-2:]:
         raise SystemExit(f"the image is {light.shape[-2:]}, its depth {depth.shape[-2:]}")
-    feed = {
-        "image": light,
-        "depth": depth,
-        "focus_m": np.full(1, arguments.focus_m, np.float32),
-        "f_number": np.full(1, arguments.f_number, np.float32),
-    }
+    lens = {name: np.full(1, getattr(arguments, name), np.float32) for name in ("focus_m", "f_number")}
     start = time.perf_counter()
-    (out,) = session.run(None, feed)
+    (out,) = session.run(None, {"image": light, "depth": depth, **lens})
     print(f"{light.shape[-1]} x {light.shape[-2]}: {time.perf_counter() - start:.2f} s")
     write_image(arguments.out, out)
 

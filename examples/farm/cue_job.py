@@ -33,15 +33,9 @@ def main() -> None:
     a = parser.parse_args()
     command = ["env", f"OMP_NUM_THREADS={a.cores}", "torchdof", "render", a.image, *([a.depth] if a.depth else [])]
     words = shlex.join([*command, "--out", a.out, *a.options])
-    layer = Shell(
-        "torchdof",
-        command=f"{words} --resume --frames #FRAME_START#-#FRAME_END#",
-        range=a.frames,
-        chunk=a.chunk,
-        threads=a.cores,
-    )
+    words += " --resume --frames #FRAME_START#-#FRAME_END#"
     shot_job = outline.Outline("torchdof", frame_range=a.frames, name_unique=False, show=a.show, shot=a.shot)
-    shot_job.add_layer(layer)
+    shot_job.add_layer(Shell("torchdof", command=words, range=a.frames, chunk=a.chunk, threads=a.cores))
     launcher = outline.cuerun.OutlineLauncher(shot_job)
     if a.shown:
         print(outline.backend.cue.serialize_simple(launcher))

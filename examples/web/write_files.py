@@ -11,14 +11,11 @@ import json
 import shutil
 from pathlib import Path
 
-import numpy as np
-import OpenImageIO as oiio
-
 import torchdof
 from torchdof.depth import repair_edges
 from torchdof.depth.reading import read_depth
 from torchdof.export import describe, to_onnx
-from torchdof.io.images import read_image
+from torchdof.io.images import Picture, read_image, write_image
 
 FOV_X_DEG = 40.0  # horizontal field of view of a 50 mm lens on full frame
 MAX_COC_PX = 64.0
@@ -66,14 +63,7 @@ def main() -> None:
     depth_options = json.loads((DATA / "camera.json").read_text())["depth"]
     depth_m = read_depth(DATA / "motorcycle_disp.npz", **depth_options)
     depth_m = repair_edges(read_image(DATA / "motorcycle_left.png").pixels, depth_m)
-    write_millimetres(sample / "motorcycle_depth.png", depth_m[0, 0].numpy())
-
-
-def write_millimetres(path: Path, depth_m: np.ndarray) -> None:
-    """Depth ``[H, W]`` in metres to a grey PNG of 16 bits, in whole millimetres."""
-    buffer = oiio.ImageBuf(np.rint(1000.0 * depth_m).astype(np.uint16)[..., None])
-    if not buffer.write(str(path)):
-        raise SystemExit(f"cannot write {path}: {buffer.geterror()}")
+    write_image(sample / "motorcycle_depth.png", Picture(depth_m / 65.535, ("Y",)), "linear", "16")  # millimetres
 
 
 if __name__ == "__main__":

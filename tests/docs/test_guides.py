@@ -6,7 +6,6 @@ import runpy
 import shlex
 import shutil
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -30,10 +29,8 @@ else:
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-RUN = [ROOT / "README.md", ROOT / "docs" / "speed.md", *sorted((ROOT / "docs" / "guides").glob("*.md"))]
-RUN += [
-    ROOT / "docs" / f"{name}.md" for name in ("index", "datasets", "depth", "embedding", "measuring", "phone", "shapes")
-]
+_RUN = ("index", "datasets", "depth", "embedding", "measuring", "phone", "shapes", "speed")
+RUN = [*PAGES[:1], *(ROOT / f"docs/{name}.md" for name in _RUN), *sorted((ROOT / "docs" / "guides").glob("*.md"))]
 """Pages whose blocks are run from top to bottom; a comment ``<!-- not run: why -->`` excludes a block."""
 
 _BLOCK = re.compile(r"(?P<skip><!-- not run: [^\n]+ -->\n)?^```(?P<kind>sh|python)\n(?P<text>.*?)^```$", re.M | re.S)
@@ -53,16 +50,14 @@ def commands_of(text: str) -> list[list[str]]:
     return [words for words in map(shlex.split, lines) if words]
 
 
-def run_command(words: list[str]) -> None:
+def run_command(program: str, *words: str) -> None:
     """Runs a torchdof command; of ``make`` it checks only that the targets exist."""
-    if words[0] == "torchdof":
-        result = CliRunner().invoke(app, words[1:], catch_exceptions=False)
-        assert result.exit_code == 0, result.output
-    elif words[0] == "make":
-        targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.M)
-        assert set(words[1:]) <= set(targets)
+    assert program in ("torchdof", "make"), f"{program}: a command that this test does not know"
+    if program == "make":
+        assert set(words) <= set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.M))
     else:
-        raise AssertionError(f"{words[0]}: a command that this test does not know")
+        result = CliRunner().invoke(app, words, catch_exceptions=False)
+        assert result.exit_code == 0, result.output
 
 
 def given(folder: Path) -> dict[str, Any]:
@@ -98,25 +93,13 @@ def captures_of_measuring(folder: Path, simulator: ModuleType) -> None:
 
     dot = simulator.Simulator(level=0.7, snr_db=46, dot_radius=9.0, black=0.02)
     shots = manifest["shot"]
-    simulator.write_captures(
-        lens, dot, manifest["focus_m"], [shot["distance_m"] for shot in shots], kernel, width, height=240
-    )
+    distances_m = [shot["distance_m"] for shot in shots]
+    simulator.write_captures(lens, dot, manifest["focus_m"], distances_m, kernel, width, height=240)
     for path in lens.glob("*.png"):
         write_image(path.with_suffix(".tif"), Picture(read_image(path).pixels), manifest["transfer"], "16")
         path.unlink()
     assert {path.name for path in lens.glob("*.tif")} == {manifest["sharp"], *(shot["file"] for shot in shots)}
     (lens / "capture.toml").write_text(text)
-
-
-def photographs_of_a_phone(folder: Path, simulator: ModuleType) -> None:
-    """Writes two photographs of the target, one of them in focus."""
-    simulator.write_photographs(folder / "photographs", 0.2, [0.45], width=500, tone=0.0, noise=0.003, jpeg=97)
-
-
-STAND_INS: dict[str, Callable[[Path, ModuleType], None]] = {
-    "docs/measuring.md": captures_of_measuring,
-    "docs/phone.md": photographs_of_a_phone,
-}
 
 
 def _text_block(page: str, kind: str) -> str:
@@ -125,19 +108,19 @@ def _text_block(page: str, kind: str) -> str:
 
 
 @pytest.mark.parametrize("name", _names(RUN))
+@pytest.mark.usefixtures("capsys")
 def test_blocks_of_a_guide_run_from_top_to_bottom(
-    name: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    request: pytest.FixtureRequest,
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for folder in ("examples", "tests"):
         (tmp_path / folder).symlink_to(ROOT / folder)
     names = given(tmp_path)
-    if name in STAND_INS:
-        STAND_INS[name](tmp_path, request.getfixturevalue("simulator"))
+    if name == "docs/measuring.md":
+        captures_of_measuring(tmp_path, request.getfixturevalue("simulator"))
+    if name == "docs/phone.md":
+        options = {"width": 500, "tone": 0.0, "noise": 0.003, "jpeg": 97}
+        request.getfixturevalue("simulator").write_photographs(tmp_path / "photographs", 0.2, [0.45], **options)
     if name == "docs/embedding.md":
         shutil.copyfile(request.getfixturevalue("plain").path, "dof.onnx")
         names |= {key: names[key].numpy() for key in ("image", "depth")}
@@ -148,7 +131,7 @@ def test_blocks_of_a_guide_run_from_top_to_bottom(
             exec(compile(block["text"], name, "exec"), names)
         else:
             for words in commands_of(block["text"]):
-                run_command(words)
+                run_command(*words)
 
 
 def test_the_prescription_that_measuring_shows_is_read(tmp_path: Path) -> None:
@@ -194,10 +177,7 @@ _QUICK = ("lenses.jpg", "truth_lamps.jpg", "truth_bars.jpg")
 
 
 def test_every_picture_of_the_documentation_has_a_script() -> None:
-    elsewhere = {
-        "worst_places.jpg",  # from scenes that are not in the repository
-        "phone_sheet.jpg",  # tests/fit/phone.py, in minutes
-    }
+    elsewhere = {"worst_places.jpg", "phone_sheet.jpg"}  # from other scenes; by tests/fit/phone.py, in minutes
     assert {*_GALLERY, *elsewhere} == {path.name for path in (ROOT / "docs" / "pictures").iterdir()}
 
 

@@ -20,69 +20,55 @@ FOLDER = Path(__file__).parents[2] / "examples" / "comfyui"
 TYPES = {"IMAGE", "MASK", "INT", "FLOAT", "STRING", "BOOLEAN"}
 
 
-@pytest.fixture(scope="module")
-def package() -> ModuleType:
+def loaded() -> ModuleType:
     """As ComfyUI's ``load_custom_node``: the folder is a package whose name is its path."""
     name = str(FOLDER).replace(".", "_x_")
     spec = importlib.util.spec_from_file_location(name, FOLDER / "__init__.py")
     assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
-@pytest.fixture(scope="module")
-def node(package: ModuleType) -> Any:
-    (node,) = package.NODE_CLASS_MAPPINGS.values()
-    return node
-
-
-def defaults(node: Any) -> dict[str, Any]:
-    """The values that ComfyUI's page starts with: the first of a list, or the input's default."""
-    given = {}
-    for name, (kind, *extra) in node.INPUT_TYPES()["required"].items():
-        if isinstance(kind, list):
-            given[name] = kind[0]
-        elif kind != "IMAGE":
-            given[name] = extra[0]["default"]
-    return given
+PACKAGE = loaded()
+(NODE,) = PACKAGE.NODE_CLASS_MAPPINGS.values()
+INPUTS: dict[str, Any] = NODE.INPUT_TYPES()["required"]
+DEFAULTS = {  # that ComfyUI's page starts with: the first of a list, or the input's default
+    name: kind[0] if isinstance(kind, list) else extra[0]["default"]
+    for name, (kind, *extra) in INPUTS.items()
+    if kind != "IMAGE"
+}
 
 
 def scene() -> tuple[Tensor, Tensor]:
     return torch.rand(2, 18, 24, 3), torch.rand(2, 18, 24, 1).expand(-1, -1, -1, 3)
 
 
-def render(node: Any, image: Tensor, depth: Tensor, **changes: Any) -> tuple[Tensor, Tensor]:
+def render(image: Tensor, depth: Tensor, **changes: Any) -> tuple[Tensor, Tensor]:
     """As ComfyUI's ``execution``: a new node, its FUNCTION by name, inputs by keyword."""
-    out = getattr(node(), node.FUNCTION)(image=image, depth=depth, **{**defaults(node), **changes})
-    assert isinstance(out, tuple) and len(out) == len(node.RETURN_TYPES) == len(node.RETURN_NAMES)
-    for pixels, kind in zip(out, node.RETURN_TYPES, strict=True):
+    given = {"sensor_width_mm": 4.0, **changes}
+    out = getattr(NODE(), NODE.FUNCTION)(image=image, depth=depth, **{**DEFAULTS, **given})
+    assert isinstance(out, tuple) and len(out) == len(NODE.RETURN_TYPES) == len(NODE.RETURN_NAMES)
+    for pixels, kind in zip(out, NODE.RETURN_TYPES, strict=True):
         assert kind == "IMAGE" and pixels.ndim == 4 and pixels.dtype == torch.float32
         assert 0.0 <= float(pixels.min()) and float(pixels.max()) <= 1.0
     return out
 
 
-def test_the_folder_is_a_custom_node_with_inputs_by_comfyuis_rules(package: ModuleType, node: Any) -> None:
-    assert set(package.NODE_DISPLAY_NAME_MAPPINGS) == set(package.NODE_CLASS_MAPPINGS)
-    assert isinstance(node.CATEGORY, str) and callable(getattr(node, node.FUNCTION))
+def test_the_folder_is_a_custom_node_with_inputs_by_comfyuis_rules() -> None:
+    assert set(PACKAGE.NODE_DISPLAY_NAME_MAPPINGS) == set(PACKAGE.NODE_CLASS_MAPPINGS)
+    assert isinstance(NODE.CATEGORY, str) and set(NODE.INPUT_TYPES()) <= {"required", "optional", "hidden"}
     assert (FOLDER / "requirements.txt").read_text().split() == ["torchdof"]
-    inputs = node.INPUT_TYPES()
-    assert set(inputs) <= {"required", "optional", "hidden"}
-    for kind, *extra in inputs["required"].values():
-        if isinstance(kind, list):
-            assert kind and all(isinstance(value, str) for value in kind)
-        else:
-            assert kind in TYPES
-            if kind == "FLOAT":
-                assert extra[0]["min"] <= extra[0]["default"] <= extra[0]["max"] and extra[0]["step"] > 0
-    arguments = list(inspect.signature(getattr(node, node.FUNCTION)).parameters)
-    assert arguments == ["self", *inputs["required"]]
+    for kind, *extra in INPUTS.values():
+        assert all(isinstance(value, str) for value in kind) if isinstance(kind, list) else kind in TYPES
+        if kind == "FLOAT":
+            assert extra[0]["min"] <= extra[0]["default"] <= extra[0]["max"] and extra[0]["step"] > 0
+    assert list(inspect.signature(getattr(NODE, NODE.FUNCTION)).parameters) == ["self", *INPUTS]
 
 
-def test_it_renders_the_same_picture_as_torchdof(node: Any) -> None:
+def test_it_renders_the_same_picture_as_torchdof() -> None:
     image, depth = scene()
-    out, _ = render(node, image, depth, focus="metres", focus_m=1.5, sensor_width_mm=4.0)
+    out, _ = render(image, depth, focus="metres", focus_m=1.5)
     light = decode(image.movedim(-1, 1), "srgb", False, False)
     values = depth[..., :1].movedim(-1, 1)
     metres = from_relative(values, 1.0, 10.0, value_range=(float(values.min()), float(values.max())))
@@ -91,44 +77,42 @@ def test_it_renders_the_same_picture_as_torchdof(node: Any) -> None:
     torch.testing.assert_close(out, expected.movedim(1, -1), rtol=1e-5, atol=1e-5)
 
 
-def test_the_point_of_focus_is_sharp(node: Any) -> None:
+def test_the_point_of_focus_is_sharp() -> None:
     image, depth = torch.rand(1, 18, 24, 3), torch.full((1, 18, 24, 3), 2.0)
     depth[:, :, 12:] = 5.0
-    changes = {"depth_kind": "metres", "focus": "point", "focus_y": 1.0, "sensor_width_mm": 4.0}
-    left, near = render(node, image, depth, focus_x=0.1, **changes)
-    right, far = render(node, image, depth, focus_x=1.0, **changes)
+    changes = {"depth_kind": "metres", "focus": "point", "focus_y": 1.0}
+    left, near = render(image, depth, focus_x=0.1, **changes)
+    right, far = render(image, depth, focus_x=1.0, **changes)
     torch.testing.assert_close(left[:, :, :6], image[:, :, :6], rtol=0.0, atol=1e-3)
     assert float((right[:, :, :6] - image[:, :, :6]).abs().max()) > 0.05
     assert not torch.equal(near, far)
 
 
-def test_kinds_of_depth_and_lenses_make_different_pictures(node: Any) -> None:
+def test_kinds_of_depth_and_lenses_make_different_pictures() -> None:
     image, depth = scene()
-    changes = {"focus": "metres", "focus_m": 1.0, "sensor_width_mm": 4.0}
-    near, _ = render(node, image, depth, **changes)
+    changes = {"focus": "metres", "focus_m": 1.0}
+    near, _ = render(image, depth, **changes)
     for other in ({"depth_kind": "white is far"}, {"lens": "gaussian"}, {"lens": "sato_j15"}):
-        assert not torch.allclose(near, render(node, image, depth, **changes, **other)[0], atol=1e-2)
-    for name in node.INPUT_TYPES()["required"]["lens"][0][2:]:
+        assert not torch.allclose(near, render(image, depth, **changes, **other)[0], atol=1e-2)
+    for name in INPUTS["lens"][0][2:]:
         assert BlurTable.load(name).name
 
 
-def test_points_out_of_focus_have_the_shape(node: Any) -> None:
+def test_points_out_of_focus_have_the_shape() -> None:
     image, depth = torch.zeros(1, 41, 41, 3), torch.full((1, 41, 41, 3), 5.0)
     image[:, 20, 20] = 1.0
     changes = {"depth_kind": "metres", "focus": "metres", "focus_m": 1.5, "sensor_width_mm": 1.6}
-    spots = {}
-    shapes: dict[str, dict[str, Any]] = {"round": {}, "blades": {"shape": "5 blades"}, "oval": {"squeeze": 2.0}}
-    for name, shape in shapes.items():
-        spots[name] = render(node, image, depth, **changes, **shape)[0][0, ..., 0]
-    high, wide = ((spots["oval"] > 0.02).any(dim).sum() for dim in (1, 0))
+    shapes: list[dict[str, Any]] = [{}, {"shape": "5 blades"}, {"squeeze": 2.0}]
+    around, blades, oval = (render(image, depth, **changes, **shape)[0][0, ..., 0] for shape in shapes)
+    high, wide = ((oval > 0.02).any(dim).sum() for dim in (1, 0))
     assert float(high / wide) > 1.5
-    torch.testing.assert_close(spots["round"], spots["round"].flip(0), rtol=0.0, atol=0.02)
-    assert float((spots["blades"] - spots["blades"].flip(0)).abs().max()) > 0.03
+    torch.testing.assert_close(around, around.flip(0), rtol=0.0, atol=0.02)
+    assert float((blades - blades.flip(0)).abs().max()) > 0.03
 
 
-def test_a_smaller_depth_map_a_shared_one_and_alpha_are_accepted(node: Any) -> None:
+def test_a_smaller_depth_map_a_shared_one_and_alpha_are_accepted() -> None:
     image = torch.rand(2, 18, 24, 4)
-    out, focus = render(node, image.half(), torch.rand(1, 9, 12, 3).half(), sensor_width_mm=4.0)
+    out, focus = render(image.half(), torch.rand(1, 9, 12, 3).half())
     assert out.shape == (2, 18, 24, 4) and focus.shape == (2, 18, 24, 3)
 
 
@@ -136,21 +120,19 @@ def test_a_smaller_depth_map_a_shared_one_and_alpha_are_accepted(node: Any) -> N
     ("depth", "message"),
     [(torch.rand(3, 18, 24, 3), "one for each of the 2 images, got 3"), (torch.ones(1, 18, 24, 3), "got 1 everywhere")],
 )
-def test_depth_that_does_not_fit_is_refused_in_one_sentence(node: Any, depth: Tensor, message: str) -> None:
+def test_depth_that_does_not_fit_is_refused_in_one_sentence(depth: Tensor, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        render(node, scene()[0], depth)
+        render(scene()[0], depth)
 
 
-def test_the_workflow_is_valid_for_the_node(node: Any) -> None:
+def test_the_workflow_is_valid_for_the_node() -> None:
     """What ComfyUI's page checks when it opens a workflow: types, sockets, links and the values of all widgets."""
     workflow = json.loads((FOLDER / "workflow.json").read_text())
     nodes = {each["id"]: each for each in workflow["nodes"]}
     (ours,) = (each for each in nodes.values() if each["type"] == "TorchdofDepthOfField")
-    inputs = node.INPUT_TYPES()["required"]
-    sockets = [name for name, (kind, *_) in inputs.items() if kind == "IMAGE"]
-    assert [each["name"] for each in ours["inputs"]] == sockets
-    assert [each["name"] for each in ours["outputs"]] == list(node.RETURN_NAMES)
-    assert dict(zip(defaults(node), ours["widgets_values"], strict=True)) == defaults(node)
+    assert [each["name"] for each in ours["inputs"]] == [name for name in INPUTS if name not in DEFAULTS]
+    assert [each["name"] for each in ours["outputs"]] == list(NODE.RETURN_NAMES)
+    assert ours["widgets_values"] == list(DEFAULTS.values())
     for number, source, of_source, target, of_target, kind in workflow["links"]:
         assert number in nodes[source]["outputs"][of_source]["links"]
         assert number == nodes[target]["inputs"][of_target]["link"]
@@ -158,7 +140,7 @@ def test_the_workflow_is_valid_for_the_node(node: Any) -> None:
     assert workflow["last_node_id"] == max(nodes) and workflow["last_link_id"] == max(k for k, *_ in workflow["links"])
 
 
-def test_comfyuis_progress_bar_moves_with_every_image(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_comfyuis_progress_bar_moves_with_every_image(monkeypatch: pytest.MonkeyPatch) -> None:
     moved: list[int] = []
 
     class ProgressBar:
@@ -172,5 +154,5 @@ def test_comfyuis_progress_bar_moves_with_every_image(node: Any, monkeypatch: py
     utils.ProgressBar = ProgressBar  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "comfy", ModuleType("comfy"))
     monkeypatch.setitem(sys.modules, "comfy.utils", utils)
-    render(node, *scene())
+    render(*scene())
     assert moved == [-2, 1, 1]

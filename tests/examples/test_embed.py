@@ -44,9 +44,8 @@ def crop() -> tuple[np.ndarray, np.ndarray]:
     piece = np.s_[150:246, 300:428]
     disparity = np.load(DATA / "motorcycle_disp.npz")["arr_0"][piece][..., None]
     depth_mm = np.where(np.isfinite(disparity), 1000 * DISPARITY["scale"] / (disparity + DISPARITY["offset"]), 0)
-    return np.rint(255 * pixels(DATA / "motorcycle_left.png")[piece]).astype(np.uint8), np.rint(depth_mm).astype(
-        np.uint16
-    )
+    photo = np.rint(255 * pixels(DATA / "motorcycle_left.png")[piece])
+    return photo.astype(np.uint8), np.rint(depth_mm).astype(np.uint16)
 
 
 def linear(encoded: np.ndarray) -> np.ndarray:

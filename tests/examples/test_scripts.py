@@ -1,7 +1,5 @@
 """The scripts of ``examples`` run and print or draw the right things."""
 
-import json
-import math
 import re
 import runpy
 import subprocess
@@ -15,9 +13,9 @@ import OpenImageIO as oiio
 import pytest
 import torch.nn.functional as functional
 
-from torchdof.depth.reading import read_depth
+from torchdof.cli.command import command_of
+from torchdof.cli.render import Render
 from torchdof.io.images import read_image
-from torchdof.optics.camera import Camera
 from torchdof.reference.metrics import display
 
 Run = Callable[..., tuple[dict[str, Any], str]]
@@ -65,15 +63,12 @@ MAX_OUTLIERS = {"near": 680, "middle": 1070, "far": 390}
 
 def test_few_pixels_differ_from_their_blurred_surroundings(tmp_path: Path, run: Run) -> None:
     demo, _ = run("demo.py", "--data", DATA, "--out", tmp_path)
-    known = json.loads((DATA / "camera.json").read_text())
-    depth = read_depth(DATA / "motorcycle_disp.npz", **known["depth"])
-    width = depth.shape[-1]
-    fov_x_deg = math.degrees(2 * math.atan(width / 2 / known["focal_length_px"]))
     for name, focus_m in demo["FOCUS_M"].items():
         shown = display(read_image(tmp_path / f"{name}.png").pixels).mean(1, keepdim=True)
         around = functional.unfold(functional.pad(shown, (1,) * 4, mode="replicate"), 3)
         median = around.median(1).values.view_as(shown)
-        coc_px = Camera.from_fov(fov_x_deg, demo["APERTURE_RADIUS_M"], focus_m).coc_px(depth, width)
+        _, depth, camera = demo["motorcycle"](DATA, focus_m)
+        coc_px = camera.coc_px(depth, depth.shape[-1])
         outliers = int((((shown - median).abs() > 8 / 255) & (coc_px.abs() > 2)).sum())
         assert outliers <= MAX_OUTLIERS[name], f"{name}: {outliers}"
 
@@ -88,10 +83,8 @@ def test_the_paper_s_experiment_reaches_its_figure_4(tmp_path: Path, run: Run) -
     assert 16.9 < float(re.findall(r"radius = ([\d.]+)", printed)[0]) < 17.3
     assert "sigma = 0.0023476 m" in printed
     assert "samples of its own curve" in printed
-    off = {
-        n: float(re.findall(rf"{n} +rms radius [\d.]+ px, ([+-][\d.]+) %", printed)[0]) for n in ("ratio", "forward")
-    }
-    assert abs(off["forward"]) < 2 < abs(off["ratio"])
+    of_ratio, of_forward = map(float, re.findall(r"rms radius [\d.]+ px, ([+-][\d.]+) %", printed))
+    assert abs(of_forward) < 2 < abs(of_ratio)
     assert float(re.findall(r"spot itself: ([\d.]+) dB", printed)[0]) > 45
 
 
@@ -115,3 +108,12 @@ def test_gradient_descent_finds_the_blur_and_with_a_known_lens_the_metres(
     assert close_db > rows["true"][6] - 0.3
     assert depth_percent < 4
     assert (tmp_path / "room_1_scale.png").is_file()
+
+
+def test_the_template_for_render_farms_uses_existing_options() -> None:
+    text = (EXAMPLES / "farm" / "openjd.yaml").read_text()
+    called = set(re.findall(r"^ +- (--[a-z-]+)$", text, flags=re.MULTILINE))
+    existing = {option for parameter in command_of("render", Render).params for option in parameter.opts}
+    assert {"--frames", "--resume", "--out", "--focus-m"} <= called <= existing
+    declared = set(re.findall(r"^  - name: (\w+)$", text, flags=re.MULTILINE)) - {"Render"}
+    assert set(re.findall(r"\{\{Param\.(\w+)\}\}", text)) == declared

@@ -21,7 +21,7 @@ def mutated(content: bytes, others: list[bytes], suffix: str, rng: random.Random
     """`content` after 1 to 6 random changes of bytes or, in formats with a structure, of tokens and numbers."""
     made = content
     for _ in range(rng.choice((1, 1, 1, 2, 3, 6))):
-        kinds = [_bytes, _bytes, _number, _cut, _splice, _repeat]
+        kinds = [_bytes, _bytes, _piece, _piece]
         if suffix in (".json", ".toml", ".txt", ".zmx"):
             kinds += [_token] * 12
         if suffix == ".json" and _PACKED.search(made):
@@ -36,35 +36,26 @@ def mutated(content: bytes, others: list[bytes], suffix: str, rng: random.Random
 
 def _bytes(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
     made = bytearray(content or b"\0")
-    limit = (
-        len(made) if rng.random() < 0.5 else min(len(made), 400)
-    )  # half of the changes hit headers, with sizes and offsets
+    limit = len(made) if rng.random() < 0.5 else min(len(made), 400)  # half hit headers, with sizes and offsets
     for _change in range(rng.choice((1, 1, 2, 4))):
         place = rng.randrange(limit)
         made[place] = rng.choice((0, 255, 1 << rng.randrange(8) ^ made[place], rng.randrange(256)))
     return bytes(made)
 
 
-def _number(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
-    form = rng.choice(("<I", ">I", "<H", ">H", "<Q"))
-    number = struct.pack(form, rng.choice(_NUMBERS) % 256 ** struct.calcsize(form))
-    place = rng.randrange(max(1, min(len(content), 1000)))
-    return content[:place] + number + content[place + len(number) :]
-
-
-def _cut(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
-    return content[: rng.randrange(len(content) + 1)]
-
-
-def _splice(content: bytes, others: list[bytes], rng: random.Random) -> bytes:
-    other = rng.choice(others)
-    return content[: rng.randrange(len(content) + 1)] + other[rng.randrange(len(other) + 1) :]
-
-
-def _repeat(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
+def _piece(content: bytes, others: list[bytes], rng: random.Random) -> bytes:
+    """Replaces a piece by a number, nothing, the rest of another file, or repetitions."""
     start = rng.randrange(len(content) + 1)
     end = min(len(content), start + rng.randrange(1, 64))
-    return content[:end] + content[start:end] * rng.choice((1, 2, 50)) + content[end:]
+    kind = rng.choice(("number", "cut", "splice", "repeat"))
+    if kind == "number":
+        form, start = rng.choice(("<I", ">I", "<H", ">H", "<Q")), min(start, rng.randrange(1000))
+        number = struct.pack(form, rng.choice(_NUMBERS) % 256 ** struct.calcsize(form))
+        return content[:start] + number + content[start + len(number) :]
+    if kind == "repeat":
+        return content[:end] + content[start:end] * rng.choice((1, 2, 50)) + content[end:]
+    other = rng.choice(others) if kind == "splice" else b""
+    return content[:start] + other[rng.randrange(len(other) + 1) :]
 
 
 def _token(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
@@ -80,12 +71,11 @@ def _packed(content: bytes, others: list[bytes], rng: random.Random) -> bytes:
     """Changes the bytes of a deflated, base64-encoded array."""
     found = _PACKED.search(content)
     try:
-        numbers = zlib.decompress(base64.b64decode(found.group(1), validate=True)) if found else b""
-    except (binascii.Error, zlib.error):
-        numbers = b""
-    if found is None or not numbers:
+        assert found is not None
+        numbers = zlib.decompress(base64.b64decode(found.group(1), validate=True))
+    except (AssertionError, binascii.Error, zlib.error):  # changed before
         return content
-    numbers = rng.choice((_bytes, _bytes, _number, _cut, _repeat))(numbers, others, rng)
+    numbers = rng.choice((_bytes, _piece))(numbers, others, rng)
     return content[: found.start(1)] + base64.b64encode(zlib.compress(numbers)) + content[found.end(1) :]
 
 

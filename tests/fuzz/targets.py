@@ -5,6 +5,7 @@ is a finding: another exception, a crash, a line on the terminal, a picture that
 """
 
 import dataclasses
+import functools
 import json
 import os
 import struct
@@ -13,11 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import OpenImageIO as oiio
 import torch
 
-from tests.files import spec_with, store_parts
+from tests.files import spec_with, store_model, store_parts
 from tests.scenes import lens_with_a_field
 from torchdof import BlurTable, blur_by_coc
 from torchdof.depth import read_depth
@@ -35,43 +35,26 @@ REFUSED = (ValueError, OSError, FitError)
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """A target of the fuzzer.
-
-    Args:
-        suffix: Suffix of its files.
-        seeds: Writes valid files into a folder.
-        run: Reads a file; an exception other than ``REFUSED`` is a finding.
-        named: Whether a refusal must name the file.
-    """
+    """A target of the fuzzer."""
 
     suffix: str
-    seeds: Callable[[Path], None]
-    run: Callable[[Path], None]
-    named: bool = True
+    seeds: Callable[[Path], None]  # writes valid files into a folder
+    runs: tuple[Callable[[Path], object], ...]  # read a file; an exception other than ``REFUSED`` is a finding
+    named: bool = True  # whether a refusal must name the file
 
 
-def _picture(channels: int = 3) -> Picture:
-    pixels = torch.linspace(0, 1, channels * 6 * 7).reshape(1, channels, 6, 7)
-    return Picture(pixels, ("R", "G", "B", "A")[:channels] if channels > 1 else ("Y",))
-
-
-def _image_seeds(suffix: str) -> Callable[[Path], None]:
-    def write(folder: Path) -> None:
-        for sample in {".png": ("8", "16"), ".exr": ("half", "float"), ".tif": ("8", "float")}.get(suffix, (None,)):
-            write_image(folder / f"rgb{sample}{suffix}", _picture(), sample=sample)  # type: ignore[arg-type]
-        if suffix not in (".hdr", ".jpg", ".pfm"):
-            write_image(folder / f"alpha{suffix}", _picture(4))
-        if suffix == ".exr":
-            _exr_seeds(folder)
-        if suffix == ".jpg":
-            tags = {
-                "Exif:FocalLength": ("float", 50.0),
-                "FNumber": ("float", 1.8),
-                "Exif:SubjectDistance": ("float", 2.0),
-            }
-            write_image(folder / "exif.jpg", dataclasses.replace(_picture(), metadata=tags))
-
-    return write
+def _image_seeds(folder: Path, suffix: str) -> None:
+    pixels = torch.linspace(0, 1, 4 * 6 * 7).reshape(1, 4, 6, 7)
+    rgb = Picture(pixels[:, :3], ("R", "G", "B"))
+    for sample in {".png": ("8", "16"), ".exr": ("half", "float"), ".tif": ("8", "float")}.get(suffix, (None,)):
+        write_image(folder / f"rgb{sample}{suffix}", rgb, sample=sample)  # type: ignore[arg-type]
+    if suffix in (".png", ".exr", ".tif"):
+        write_image(folder / f"alpha{suffix}", Picture(pixels, ("R", "G", "B", "A")))
+    if suffix == ".exr":
+        _exr_seeds(folder)
+    if suffix == ".jpg":
+        tags = {name: ("float", 2.0) for name in ("Exif:FocalLength", "FNumber", "Exif:SubjectDistance")}
+        write_image(folder / "exif.jpg", dataclasses.replace(rgb, metadata=tags))
 
 
 def _part(channels: tuple[str, ...] = ("R", "G", "B", "Z"), **attributes: Any) -> tuple[oiio.ImageSpec, np.ndarray]:
@@ -93,41 +76,23 @@ def _exr_seeds(folder: Path) -> None:
     store_parts(folder / "parts.exr", [_part(("R", "G", "B"), name="beauty"), _part(("Z",), name="depth")])
 
 
-def _read_picture(path: Path) -> None:
-    for read in (read_image, read_values):
-        try:
-            found = read(path)
-        except REFUSED as error:
-            assert path.name in str(error), f"not named: {error}"
+def _read_image(path: Path) -> None:
+    found = read_image(path)
+    assert torch.isfinite(found.pixels).all(), "pixels that are not finite"
+    camera_settings(found.metadata, found.pixels.shape[-1], found.pixels.shape[-2])
+
+
+def _array_seeds(folder: Path, suffix: str) -> None:
+    for number, kind in enumerate(("<f4", ">f8", "<u2", "<f2")):
+        values = np.linspace(1, 2, 12).reshape(3, 4).astype(kind)
+        if suffix == ".npy":
+            np.save(folder / f"{number}.npy", values)
         else:
-            if isinstance(found, Picture):
-                assert torch.isfinite(found.pixels).all(), "pixels that are not finite"
-                camera_settings(found.metadata, found.pixels.shape[-1], found.pixels.shape[-2])
+            (np.savez_compressed if number % 2 else np.savez)(folder / f"{number}.npz", depth=values)
 
 
-def _array_seeds(suffix: str) -> Callable[[Path], None]:
-    def write(folder: Path) -> None:
-        for number, kind in enumerate(("<f4", ">f8", "<u2", "<f2")):
-            values = np.linspace(1, 2, 12).reshape(3, 4).astype(kind)
-            path = folder / f"{number}{suffix}"
-            if suffix == ".npy":
-                np.save(path, values)
-            elif number % 2:
-                np.savez_compressed(path, depth=values)
-            else:
-                np.savez(path, depth=values, mask=values > 1)
-
-    return write
-
-
-def _read_array(path: Path) -> None:
-    for fill in ("far", 3.0, None):
-        try:
-            depth = read_depth(path, fill=fill)
-        except REFUSED as error:
-            assert path.name in str(error), f"not named: {error}"
-        else:
-            assert bool((depth > 0).all()), "a depth of 0 or less"
+def _read_array(path: Path, fill: Any) -> None:
+    assert bool((read_depth(path, fill=fill) > 0).all()), "a depth of 0 or less"
 
 
 def _table_seeds(folder: Path) -> None:
@@ -148,9 +113,7 @@ def _read_table(path: Path) -> None:
         except ValueError as error:
             assert "at most" in str(error) or "passes no light" in str(error), f"read, but: {error}"
         else:
-            assert torch.isfinite(kernels).all() and float(kernels.min()) >= 0, (
-                "kernels that are not finite or negative"
-            )
+            assert torch.isfinite(kernels).all() and float(kernels.min()) >= 0, "kernels not finite, or negative"
 
 
 def _field_seeds(folder: Path) -> None:
@@ -161,17 +124,16 @@ def _field_seeds(folder: Path) -> None:
 
 def _read_field(path: Path) -> None:
     table = BlurTable.load(path)
-    image = torch.linspace(0, 1, 3 * 12 * 16).reshape(1, 3, 12, 16) if table.channels in (1, 3) else None
-    if image is None:
+    if table.channels not in (1, 3):
         return
+    image = torch.linspace(0, 1, 3 * 12 * 16).reshape(1, 3, 12, 16)
     image[..., 6, 8] = 50.0
     coc = torch.linspace(-3, 4, 16).expand(1, 1, 12, 16)
-    pictures = _by_both_engines(lambda: blur_by_coc(image, coc, table=table, tolerance="preview"))
-    for picture in pictures:
+    plain, compiled = _by_both_engines(lambda: blur_by_coc(image, coc, table=table, tolerance="preview"))
+    for picture in (plain, compiled):
         assert torch.isfinite(picture).all(), "read, but the picture is not finite"
         assert float(picture.max()) <= 60.0 and float(picture.min()) >= -1e-3, "brighter than its light"
-    apart = float((pictures[0] - pictures[1]).abs().max())
-    assert apart <= 1e-3 * 50.0, f"the engines differ by {apart:.2g}"
+    assert float((plain - compiled).abs().max()) <= 1e-3 * 50.0, "the engines differ"
 
 
 def _by_both_engines(make: Callable[[], torch.Tensor]) -> list[torch.Tensor]:
@@ -189,10 +151,6 @@ def _manifest_seeds(folder: Path) -> None:
         '[[shot]]\nfile = "near.png"\ndistance_m = 0.4\nexposure_s = 0.02\n\n'
         '[[shot]]\nfile = "far.png"\ndistance_m = 0.9\n'
     )
-
-
-def _read_manifest(path: Path) -> None:
-    read_captures(path, root=path.parent)
 
 
 def _lens_seeds(folder: Path) -> None:
@@ -230,17 +188,8 @@ def _read_lens(path: Path) -> None:
 
 
 def _onnx_seeds(folder: Path) -> None:
-    node = onnx.helper.make_node("Identity", ["image"], ["out"])
-    values = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1]) for name in ("image", "out")]
-    model = onnx.helper.make_model(onnx.helper.make_graph([node], "g", values[:1], values[1:]))
     facts: dict[str, Any] = {"options": {"tolerance": 0.1}, "camera": {"f_number": 2.0}, "width": None, "layers": 9}
-    for key, value in facts.items():
-        model.metadata_props.add(key=f"torchdof.{key}", value=json.dumps(value))
-    onnx.save_model(model, folder / "dof.onnx")
-
-
-def _read_onnx(path: Path) -> None:
-    describe(path)
+    store_model(folder / "dof.onnx", {f"torchdof.{key}": json.dumps(value) for key, value in facts.items()})
 
 
 def _scene_seeds(folder: Path) -> None:
@@ -256,13 +205,10 @@ def scene_of(content: bytes) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]
     head = content[:5].ljust(5, b"\0")
     height, width, channels = 1 + head[0] % 24, 1 + head[1] % 32, 1 + head[2] % 4
     flags, scale = head[3], (1.0, 30.0, 300.0, 1e-3)[head[4] % 4]
-    numbers = np.frombuffer(content[5 : 5 + (len(content) - 5) // 4 * 4], np.float32)
-    if not len(numbers):
-        numbers = np.ones(1, np.float32)
-    needed = height * width * (channels + 1)
-    numbers = np.resize(numbers, needed)
-    image = torch.from_numpy(numbers[: height * width * channels].reshape(1, channels, height, width).copy())
-    coc = torch.from_numpy(numbers[height * width * channels :].reshape(1, 1, height, width).copy()) * scale
+    numbers = np.frombuffer(content[5 : max(5, 5 + (len(content) - 5) // 4 * 4)], np.float32)
+    maps = np.resize(numbers if len(numbers) else np.ones(1, np.float32), (1, channels + 1, height, width))
+    image, coc = torch.from_numpy(maps).split([channels, 1], dim=1)
+    coc = coc * scale
     if flags & 16:  # planes instead of noise
         coc = torch.round(coc / 8) * 8
     if flags & 32:
@@ -280,16 +226,11 @@ def scene_of(content: bytes) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]
 
 def _render(path: Path) -> None:
     image, coc, options = scene_of(path.read_bytes())
-    pictures = []
-    for engine in ("torch", "native"):
-        os.environ["TORCHDOF_ENGINE"] = engine
-        try:
-            pictures.append(blur_by_coc(image, coc, **options))
-        except ValueError as error:
-            assert options["check"] and "finite" in str(error), f"refused: {error}"
-    if not pictures:
+    try:
+        plain, compiled = _by_both_engines(lambda: blur_by_coc(image, coc, **options))
+    except ValueError as error:
+        assert options["check"] and "finite" in str(error), f"refused: {error}"
         return
-    plain, compiled = pictures
     good = torch.isfinite(image).all(1, keepdim=True) & torch.isfinite(coc)
     light = torch.where(good, image, 0.0).abs().amax().double()
     if not options["normalize"] and light > 1e37:  # without normalization a sum may overflow float32
@@ -321,31 +262,37 @@ def _repair(path: Path) -> None:
     assert not usual or float(same) > 0.9, f"the engines agree on {float(same):.2f} of the pixels"
 
 
+def _with_suffix(seeds: Callable[[Path, str], None], suffix: str, *runs: Callable[[Path], object]) -> Target:
+    return Target(suffix, lambda folder: seeds(folder, suffix), runs)
+
+
+_FILLS = tuple(functools.partial(_read_array, fill=fill) for fill in ("far", 3.0, None))
 TARGETS: dict[str, Target] = {
-    **{s[1:]: Target(s, _image_seeds(s), _read_picture) for s in (".png", ".exr", ".tif", ".jpg", ".hdr", ".pfm")},
-    **{suffix[1:]: Target(suffix, _array_seeds(suffix), _read_array) for suffix in (".npy", ".npz")},
-    "table": Target(".json", _table_seeds, _read_table),
-    "manifest": Target(".toml", _manifest_seeds, _read_manifest, named=False),  # errors name missing pictures
-    "field": Target(".json", _field_seeds, _read_field),
-    "lens": Target(".txt", _lens_seeds, _read_lens),
-    "zmx": Target(".zmx", _zmx_seeds, _read_lens),
-    "onnx": Target(".onnx", _onnx_seeds, _read_onnx),
-    "engines": Target(".scene", _scene_seeds, _render, named=False),
-    "repair": Target(".scene", _scene_seeds, _repair, named=False),
-}
+    **{suffix[1:]: _with_suffix(_image_seeds, suffix, _read_image, read_values)
+       for suffix in (".png", ".exr", ".tif", ".jpg", ".hdr", ".pfm")},
+    **{suffix[1:]: _with_suffix(_array_seeds, suffix, *_FILLS) for suffix in (".npy", ".npz")},
+    "table": Target(".json", _table_seeds, (_read_table,)),
+    "manifest": Target(".toml", _manifest_seeds, (lambda path: read_captures(path, root=path.parent),), named=False),
+    "field": Target(".json", _field_seeds, (_read_field,)),
+    "lens": Target(".txt", _lens_seeds, (_read_lens,)),
+    "zmx": Target(".zmx", _zmx_seeds, (_read_lens,)),
+    "onnx": Target(".onnx", _onnx_seeds, (describe,)),
+    "engines": Target(".scene", _scene_seeds, (_render,), named=False),
+    "repair": Target(".scene", _scene_seeds, (_repair,), named=False),
+}  # fmt: skip
+"""The errors of a manifest name the pictures that are missing instead."""
 
 
 def finding(target: Target, path: Path) -> str | None:
     """Description of a target's fault on a file, or None."""
-    try:
-        target.run(path)
-    except REFUSED as error:
-        if target.named and path.name not in str(error):
-            return f"refused without its name: {type(error).__name__}: {str(error)[:200]}"
-    except BaseException as error:
-        if isinstance(error, KeyboardInterrupt | SystemExit):
-            raise
-        return f"{type(error).__name__}: {str(error)[:200]}"
+    for run in target.runs:
+        try:
+            run(path)
+        except REFUSED as error:
+            if target.named and path.name not in str(error):
+                return f"refused without its name: {type(error).__name__}: {str(error)[:200]}"
+        except Exception as error:
+            return f"{type(error).__name__}: {str(error)[:200]}"
     return None
 
 

@@ -7,6 +7,7 @@ PyTorch refuses gradients after those of the parent, the same pictures.
 
 import argparse
 import ctypes
+import functools
 import gc
 import multiprocessing
 import os
@@ -56,7 +57,7 @@ def growth_kb(renderings: int) -> float:
     sizes = []
     torch.backends.mkldnn.set_flags(_enabled=False)
     for seed in range(renderings):
-        assert torch.isfinite(rendering(seed, seed % 2 == 1, (100, 130))).all(), f"seed {seed}"
+        assert torch.isfinite(rendering(seed, largest=(100, 130))).all(), f"seed {seed}"
         if (seed + 1) % (renderings // 5) == 0:
             sizes.append(resident_mb())
             print(f"{seed + 1:6} renderings, {sizes[-1]:.1f} MB", flush=True)
@@ -64,8 +65,8 @@ def growth_kb(renderings: int) -> float:
     return (max(sizes[-2:]) - sizes[1]) * 1024 / (3 * (renderings // 5))
 
 
-def rendering(seed: int, gradients: bool = False, largest: tuple[int, int] = (200, 260)) -> torch.Tensor:
-    """A picture of random size up to ``largest``, camera, table and options; then any gradients of image and depth."""
+def rendering(seed: int, gradients: bool = True, largest: tuple[int, int] = (200, 260)) -> torch.Tensor:
+    """A picture of random size up to ``largest``, camera, table and options; of odd seeds with gradients."""
     rng, draw = random.Random(seed), torch.Generator().manual_seed(seed)
     height, width = (rng.randint(1, pixels) for pixels in largest)
     image = torch.rand(rng.choice((1, 1, 2)), 3, height, width, generator=draw)
@@ -80,18 +81,13 @@ def rendering(seed: int, gradients: bool = False, largest: tuple[int, int] = (20
         check=rng.random() < 0.7,
         depth_edges=rng.choice(("auto", "repair", "as given")),
     )
-    if not gradients:
+    if not gradients or seed % 2 == 0:
         with torch.inference_mode():
             return dof(image, depth).flatten()
     inputs = [image.requires_grad_(), depth.requires_grad_()]
     out = dof(*inputs)
     found = torch.autograd.grad(out.square().sum(), inputs)
     return torch.cat([t.detach().flatten() for t in (out, *found)])
-
-
-def every_second_with_gradients(seed: int) -> torch.Tensor:
-    """The rendering of a seed, with gradients if it is odd."""
-    return rendering(seed, seed % 2 == 1)
 
 
 def main() -> None:
@@ -107,7 +103,7 @@ def main() -> None:
         pools[f"workers by {kind}"] = ProcessPoolExecutor(2, multiprocessing.get_context(kind))
     equal = True
     for name, pool in pools.items():
-        render = rendering if "fork" in name else every_second_with_gradients
+        render = functools.partial(rendering, gradients="fork" not in name)
         truth = list(map(render, range(arguments.pictures)))
         with pool:
             pictures = list(pool.map(render, range(arguments.pictures), timeout=300))

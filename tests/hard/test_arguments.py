@@ -50,10 +50,13 @@ def tensors(draw: st.DrawFn) -> Tensor:
     fill = draw(st.sampled_from([0.0, 1.0, 0.5, 2.5, -1.0, math.nan, math.inf, 1e30]))
     plain = dtype.is_floating_point or dtype == torch.complex64 or math.isfinite(fill) and abs(fill) < 100
     made = torch.full(shape, fill if plain else 1.0).to(dtype)
-    kind = draw(st.sampled_from(["dense", "dense", "dense", "meta", "sparse", "gradient"]))
-    if kind == "gradient" and made.is_floating_point():
-        return made.requires_grad_()
-    return made.to("meta") if kind == "meta" else made.to_sparse() if kind == "sparse" else made
+    kinds: dict[str, Callable[[], Tensor]] = {
+        "meta": lambda: made.to("meta"),
+        "sparse": made.to_sparse,
+        "gradient": made.requires_grad_,
+    }
+    kind = draw(st.sampled_from(["dense", "dense", "dense", *kinds]))
+    return kinds[kind]() if kind in kinds and (kind != "gradient" or made.is_floating_point()) else made
 
 
 JUNK = st.one_of(
@@ -69,28 +72,18 @@ TAGS = ("Exif:FocalLength", "FNumber", "Exif:SubjectDistance", "Exif:FocalLength
         "Exif:FocalPlaneXResolution", "Exif:FocalPlaneResolutionUnit", "Exif:PixelXDimension")  # fmt: skip
 
 
-def facts(**tags: Any) -> dict[str, float]:
-    return camera_settings({name: (None, value) for name, value in zip(TAGS, tags.values(), strict=True)}, 100, 80)
-
-
 def kernels_of_fields(**fields: Any) -> None:
     kernels = BlurTable.from_dict(fields).kernels(torch.tensor([-3.0, 4.0]), 36, size=5)
     assert torch.isfinite(kernels).all()
 
 
-def rendered(image: Tensor, **others: Any) -> None:
-    render = others.pop("render")
+def rendered(render: Callable[..., Tensor], image: Tensor = IMAGE, **others: Any) -> None:
     out = render(image, **others)
     assert out.shape == image.shape and out.dtype == image.dtype
     assert torch.isfinite(out).all() or not others.get("check", True)
 
 
-def blurred(image: Tensor, **others: Any) -> None:
-    rendered(image, render=blur_by_coc, **others)
-
-
-def depth_blurred(image: Tensor, **others: Any) -> None:
-    rendered(image, render=depth_of_field, **others)
+blurred, photographed = (functools.partial(rendered, render) for render in (blur_by_coc, depth_of_field))
 
 
 OPTIONS: dict[str, Any] = {
@@ -130,17 +123,13 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "psf.profile": (psf.profile, {"family": "disc", "r": torch.ones(2), "params": {"radius": 1.0}}),
     "psf.support": (psf.support, {"family": "disc", "params": {"radius": 1.0}}),
     "DepthOfField": (DepthOfField, {"camera": Camera(), **OPTIONS}),
-    "depth_of_field": (depth_blurred, {"image": IMAGE, "depth": DEPTH, "camera": Camera()}),
-    "depth_of_field, lens": (
-        lambda **a: depth_blurred(IMAGE, depth=DEPTH, camera=Camera(), **a),
-        {"focus_m": 1.0, "f_number": 2.0},
+    "depth_of_field": (
+        photographed, {"image": IMAGE, "depth": DEPTH, "camera": Camera(), "focus_m": 1.0, "f_number": 2.0}
     ),
-    "depth_of_field, options": (
-        lambda **a: depth_blurred(IMAGE, depth=DEPTH, camera=Camera(focus_m=1.0), **a), OPTIONS
-    ),
+    "depth_of_field, options": (functools.partial(photographed, depth=DEPTH, camera=Camera(focus_m=1.0)), OPTIONS),
     "blur_by_coc": (blurred, {"image": IMAGE, "coc_px": COC}),
-    "blur_by_coc, unchecked": (lambda **a: blurred(check=False, **a), {"image": IMAGE, "coc_px": COC}),
-    "blur_by_coc, options": (lambda **a: blurred(IMAGE, coc_px=COC, **a), OPTIONS),
+    "blur_by_coc, unchecked": (functools.partial(blurred, check=False), {"image": IMAGE, "coc_px": COC}),
+    "blur_by_coc, options": (functools.partial(blurred, coc_px=COC), OPTIONS),
     "DepthOfField.plan": (DepthOfField(Camera()).plan, {"image": IMAGE, "depth": DEPTH, "focus_m": None}),
     "DepthOfField.coc_px": (DepthOfField(Camera()).coc_px, {"image": IMAGE, "depth": DEPTH, "f_number": None}),
     "depth_from_values": (
@@ -150,7 +139,10 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "fill_holes": (fill_holes, {"depth": VALUES, "fill": "far"}),
     "tint_focus": (tint_focus, {"image": IMAGE, "coc_px": COC}),
     "focus_at_frame": (lambda frame: focus_at_frame([(0, 1.0), (5, 2.0)], frame), {"frame": 3}),
-    "camera_settings": (facts, {name: 2.0 for name in TAGS}),
+    "camera_settings": (
+        lambda **tags: camera_settings({name: (None, value) for name, value in tags.items()}, 100, 80),
+        {name: 2.0 for name in TAGS},
+    ),
 }  # fmt: skip
 
 
@@ -181,12 +173,6 @@ def test_any_argument_gives_a_result_or_a_named_error(name: str, data: st.DataOb
 @FEW
 @given(st.text(max_size=12) | st.from_regex(r"[-0-9:.,einfa ]{0,12}", fullmatch=True))
 def test_any_text_is_parsed_or_gives_a_named_error(text: str) -> None:
-    two = numbers(2, "--range expects two numbers such as 1,2")
-    for read in (
-        parse_frames,
-        parse_focus,
-        FramePattern,
-        two,
-        word_or_number(("far",), "--fill expects far or metres"),
-    ):
+    options = numbers(2, "--range expects two numbers such as 1,2"), word_or_number(("far",), "--fill expects far")
+    for read in (parse_frames, parse_focus, FramePattern, *options):
         check_error(functools.partial(read, text))

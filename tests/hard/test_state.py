@@ -37,6 +37,7 @@ ERRORS = (KeyboardInterrupt, RuntimeError, OSError, ValueError, SystemExit)
 STOPS = 6  # places at which a call is interrupted
 COC = torch.linspace(-9.0, 9.0, 40).expand(1, 1, 30, 40)
 DEPTH = 2.0 + COC / 9.0
+DOF = DepthOfField(Camera(focus_m=2.0, sensor_width_mm=6.0))
 
 
 def differentiated(render: Callable[[Tensor, Tensor], Tensor], map_: Tensor) -> list[Tensor]:
@@ -47,18 +48,11 @@ def differentiated(render: Callable[[Tensor, Tensor], Tensor], map_: Tensor) -> 
     return [out, *torch.autograd.grad(out.square().sum(), inputs)]
 
 
-def layers() -> Tensor:
-    dof = DepthOfField(Camera(focus_m=2.0, sensor_width_mm=6.0))
-    return dof.layers(COC.new_full((1, 2, 4, 30, 40), 0.5), COC.new_tensor([1.0, 3.0]))
-
-
 def augmented() -> Tensor:
     blur = RandomDepthOfField(camera=Camera(sensor_width_mm=6.0), p=1.0)
-    drawn = blur.draw(torch.Generator().manual_seed(1))
-    shape = torch.tensor([1, 3, 30, 40])
-    params = {**drawn, "batch_prob": torch.ones(1), "forward_input_shape": shape}
-    blurred: Tensor = blur(COC.new_full((1, 3, 30, 40), 0.5), DEPTH, params)
-    return blurred
+    known = {"batch_prob": torch.ones(1), "forward_input_shape": torch.tensor([1, 3, 30, 40])}
+    params = blur.draw(torch.Generator().manual_seed(1)) | known
+    return torch.as_tensor(blur(COC.new_full((1, 3, 30, 40), 0.5), DEPTH, params))
 
 
 def files() -> Tensor:
@@ -90,15 +84,13 @@ def fitted() -> None:
     fit_profile(r, np.exp(-((r - 1) ** 2)), family="ring")
 
 
-RENDER: dict[str, Callable[[], Any]] = {
+CALLS: dict[str, Callable[[], Any]] = {
     "blur_by_coc": lambda: differentiated(blur_by_coc, COC),
-    "DepthOfField": lambda: differentiated(DepthOfField(Camera(focus_m=2.0, sensor_width_mm=6.0)), DEPTH),
+    "DepthOfField": lambda: differentiated(DOF, DEPTH),
     "fold": lambda: differentiated(lambda image, coc: blur_by_coc(image, coc, method="fold"), COC / 4),
     "field": lambda: blur_by_coc(COC.new_ones(1, 1, 30, 40), COC, table=BlurTable.polygon(5, vignetting=0.4)),
-    "layers": layers,
+    "layers": lambda: DOF.layers(COC.new_full((1, 2, 4, 30, 40), 0.5), COC.new_tensor([1.0, 3.0])),
     "repair_edges": lambda: repair_edges(COC.new_ones(1, 3, 30, 40), from_relative(COC, 1.0, 3.0)),
-}
-OTHERS: dict[str, Callable[[], Any]] = {
     "splat": lambda: differentiated(splat, COC),
     "augmentation": augmented,
     "files": files,
@@ -164,19 +156,11 @@ def _unusual_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[
         torch.use_deterministic_algorithms(False)
 
 
-@pytest.mark.parametrize("name", RENDER)
-def test_rendering_leaves_the_state_of_the_process_as_it_was(name: str, engine: str) -> None:
-    check_state(RENDER[name])
-
-
 @pytest.mark.filterwarnings("ignore::torchdof.fit.FitWarning")
-@pytest.mark.parametrize("name", OTHERS)
-def test_a_call_leaves_the_state_of_the_process_as_it_was(name: str) -> None:
-    check_state(OTHERS[name])
-
-
-def check_state(call: Callable[[], Any]) -> None:
+@pytest.mark.parametrize("name", CALLS)
+def test_a_call_leaves_the_state_of_the_process_as_it_was(name: str, engine: str) -> None:
     """Compares the state after a result, and after errors and Ctrl-C at some places in the package's functions."""
+    call = CALLS[name]
     with entries(0, None) as names:
         first = call()  # imports packages, which may have state of their own
     before = state()

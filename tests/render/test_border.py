@@ -22,10 +22,8 @@ def test_continued_light_is_half_the_nearest_pixel_and_half_a_mean_along_the_bor
 
 def test_a_texture_is_averaged_outside_the_frame(engine: str) -> None:
     """Repeating the border's pixels would extend the stripes instead."""
-    stripes = torch.tensor([0.2, 0.8, 0.8, 0.2]).repeat(24)
-    image = stripes.expand(1, 3, 96, 96).clone()
-    coc = torch.full((1, 1, 96, 96), 9.0)
-    out = blur_by_coc(image, coc)
+    image = torch.tensor([0.2, 0.8, 0.8, 0.2]).repeat(24).expand(1, 3, 96, 96).clone()
+    out = blur_by_coc(image, torch.full((1, 1, 96, 96), 9.0))
     assert float((out[..., 0, 30:66] - 0.5).abs().max()) < 0.02
 
 

@@ -30,21 +30,17 @@ def test_hidden_surfaces_have_the_colour_and_depth_of_their_surroundings_within_
 
 
 def test_a_highlight_is_not_copied_into_the_hidden_surface_beside_it() -> None:
-    image, coc = mixed_edge(1.0, near_px=-12.0)
-    image = image.clone()
+    image, coc = (t.clone() for t in mixed_edge(1.0, near_px=-12.0))
     image[..., 20:28, 32:36] = 500.0
     _, (other, _, weight), behind = surfaces(image, coc, levels=5)
     assert weight is not None and float(weight[0, 0, 24, 26]) > 0
     most = float(threshold(image).max())
-    assert most < 10.0, "the scene tests nothing"
-    assert float(other[0, :, 24, :32].max()) <= most
-    assert float(behind[0, :, 24, 20:28].max()) <= most
+    assert max(float(other[0, :, 24, :32].max()), float(behind[0, :, 24, 20:28].max())) <= most < 10.0
 
 
 def test_the_background_behind_two_blurred_surfaces_is_the_farthest_one_around() -> None:
     green = torch.tensor([0.1, 0.6, 0.1])
-    image, coc = mixed_edge(1.0, near_px=-18.0)
-    image, coc = image.clone(), coc.clone()
+    image, coc = (t.clone() for t in mixed_edge(1.0, near_px=-18.0))
     image[..., 20:28], coc[..., 20:28] = green[:, None, None], -12.0  # red in front of green, and a blue wall
     image[..., 28:], coc[..., 28:] = BLUE[:, None, None], 0.0
     _, (_, _, weight), behind = surfaces(image, coc, levels=6)

@@ -16,7 +16,7 @@ from torchdof.reference.degraded import KINDS, degrade
 from torchdof.reference.scenes import Plane, Scene, plane_scene, posts, waves
 from torchdof.render import edges
 
-compiled = pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built here")
+COMPILED = pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built here")
 
 
 @pytest.fixture(scope="module")
@@ -36,9 +36,11 @@ def wrong(depth: Tensor, exact: Tensor) -> float:
     return float(((depth / exact - 1).abs() > 0.1).float().mean())
 
 
+@pytest.mark.parametrize("sky", [False, True])
 @pytest.mark.parametrize("kind", ["exact", "8 bit", "noise 1%"])
-def test_exact_edges_stay_bit_for_bit(scene: Scene, kind: str) -> None:
+def test_exact_edges_stay_bit_for_bit(scene: Scene, kind: str, sky: bool) -> None:
     depth = degrade(scene.depth, kind)
+    depth = torch.where(scene.depth == 6.0, math.inf, depth) if sky else depth
     assert torch.equal(repair_edges(scene.image, depth, "auto"), depth)
 
 
@@ -99,23 +101,15 @@ def test_narrow_ramps_of_averaged_depth_are_repaired(scene: Scene, engine: str) 
     assert between[1] < 0.3 * between[0]
 
 
-@pytest.mark.parametrize(
-    ("kind", "left"),
-    [
-        ("half-res", 0.2),
-        ("quarter-res", 0.4),
-        ("shift 1px", 0.6),
-        ("near -1px", 0.25),
-        ("near -2px", 0.25),
-        ("near +1px", 0.25),
-        ("displaced", 0.6),
-        ("blur 1.5", 0.3),
-    ],
-)
+LEFT = {"half-res": 0.2, "quarter-res": 0.4, "blur 1.5": 0.3, "displaced": 0.6, "shift 1px": 0.6}
+LEFT |= dict.fromkeys(("near -1px", "near -2px", "near +1px"), 0.25)
+
+
+@pytest.mark.parametrize("kind", LEFT)
 @pytest.mark.parametrize("how", ["auto", "repair"])
-def test_edges_move_to_those_of_the_image(scene: Scene, kind: str, left: float, how: DepthEdges) -> None:
+def test_edges_move_to_those_of_the_image(scene: Scene, kind: str, how: DepthEdges) -> None:
     depth = degrade(scene.depth, kind)
-    assert wrong(repair_edges(scene.image, depth, how), scene.depth) < left * wrong(depth, scene.depth)
+    assert wrong(repair_edges(scene.image, depth, how), scene.depth) < LEFT[kind] * wrong(depth, scene.depth)
 
 
 @pytest.mark.parametrize("kind", sorted(set(KINDS) - {"exact"}))
@@ -255,10 +249,8 @@ def test_the_direction_of_an_edge_does_not_depend_on_rounding(moved: float) -> N
 
 def test_infinite_depth_is_a_surface(scene: Scene) -> None:
     depth = torch.where(scene.depth == 6.0, math.inf, scene.depth)
-    assert torch.equal(repair_edges(scene.image, depth, "auto"), depth)
     given = degrade(depth, "near -1px")
-    repaired = repair_edges(scene.image, given, "auto")
-    errors = [(d.isinf() != depth.isinf()).float().mean() for d in (repaired, given)]
+    errors = [(d.isinf() != depth.isinf()).float().mean() for d in (repair_edges(scene.image, given, "auto"), given)]
     assert float(errors[0]) < 0.3 * float(errors[1])
 
 
@@ -290,65 +282,47 @@ def test_the_renderer_repairs_by_its_option_depth_edges(scene: Scene) -> None:
     assert not torch.equal(as_given(scene.image, depth), expected)
 
 
-@compiled
-@pytest.mark.parametrize("kind", sorted(KINDS))
-@pytest.mark.parametrize("auto", [True, False])
-def test_engines_agree(scene: Scene, kind: str, auto: bool) -> None:
-    nearness = -scene.camera.coc_px(degrade(scene.depth, kind), 192)
-    nearness[..., 50:55, 60:70] = torch.nan
-    plain = edges._repair(scene.image, nearness, torch.tensor(1.0), auto)
-    fast = native.repair_edges(scene.image[0], nearness[0, 0], torch.tensor(1.0), auto)
+def assert_engines_agree(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> None:
+    plain = edges._repair(image, nearness, step, auto)
+    fast, coc = (native.repair_edges(image[0], n[0, 0], step.squeeze(), auto, of_coc=of_coc)
+                 for n, of_coc in ((nearness, False), (-nearness, True)))  # fmt: skip
     same = torch.isclose(fast, plain[0, 0], rtol=1e-3, atol=1e-3, equal_nan=True)
     assert float(same.float().mean()) > 0.999  # rounding may decide if both surfaces are equally likely
-    coc = native.repair_edges(scene.image[0], -nearness[0, 0], torch.tensor(1.0), auto, of_coc=True)
     torch.testing.assert_close(coc, -fast, rtol=0, atol=0, equal_nan=True)
+    unchanged = [torch.allclose(n, nearness[0, 0], rtol=0, atol=0, equal_nan=True) for n in (plain[0, 0], fast)]
+    assert unchanged[0] == unchanged[1]
 
 
-@compiled
-@pytest.mark.parametrize(("kind", "is_exact"), [("exact", True), ("shift 1px", False), ("half-res", False)])
-def test_engines_agree_on_frames_that_are_sampled(scene: Scene, kind: str, is_exact: bool) -> None:
-    image = scene.image.repeat(1, 1, 3, 3)
-    nearness = -scene.camera.coc_px(degrade(scene.depth, kind), 192).repeat(1, 1, 3, 3)
-    assert nearness[0, 0].numel() > 4 * edges._SAMPLED
-    plain = edges._repair(image, nearness, torch.tensor(1.0), True)[0, 0]
-    fast = native.repair_edges(image[0], nearness[0, 0], torch.tensor(1.0), True)
-    assert torch.equal(fast, nearness[0, 0]) == torch.equal(plain, nearness[0, 0]) == is_exact
-    assert float(torch.isclose(fast, plain, rtol=1e-3, atol=1e-3).float().mean()) > 0.999
+@COMPILED
+@pytest.mark.parametrize("auto", [True, False])
+@pytest.mark.parametrize(("kind", "times"), [*((kind, 1) for kind in KINDS), ("exact", 3), ("half-res", 3)])
+def test_engines_agree(scene: Scene, kind: str, times: int, auto: bool) -> None:
+    nearness = -scene.camera.coc_px(degrade(scene.depth, kind), 192).repeat(1, 1, times, times)
+    nearness[..., 50:55, 60:70] = torch.nan
+    assert times == 1 or nearness.numel() > 4 * edges._SAMPLED
+    assert_engines_agree(scene.image.repeat(1, 1, times, times), nearness, torch.tensor(1.0), auto)
 
 
-@compiled
+@COMPILED
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 3), (65, 130)])
 def test_engines_agree_on_frames_of_any_size(size: tuple[int, int]) -> None:
     blocks = 9 * torch.rand(1, 1, 1 + size[0] // 5, 1 + size[1] // 5)  # blocks, because noise would not be repaired
     nearness = blocks.repeat_interleave(5, -2).repeat_interleave(5, -1)[..., : size[0], : size[1]].contiguous()
-    image = torch.rand(1, 2, *size)
-    plain = edges._repair(image, nearness, torch.full_like(nearness, 0.5), False)
-    fast = native.repair_edges(image[0], nearness[0, 0], torch.full(size, 0.5), False)
-    same = torch.isclose(fast, plain[0, 0], rtol=1e-3, atol=1e-3)
-    assert float(same.float().mean()) > 0.99
+    assert_engines_agree(torch.rand(1, 2, *size), nearness, torch.full_like(nearness, 0.5), False)
 
 
-@compiled
+@COMPILED
 def test_any_number_of_threads_gives_the_same_bits(scene: Scene) -> None:
     nearness = -scene.camera.coc_px(degrade(scene.depth, "half-res"), 192)[0, 0]
-    threads = torch.get_num_threads()
-    try:
-        results = []
-        for count in (1, 2, 5):
-            torch.set_num_threads(count)
-            results.append(native.repair_edges(scene.image[0], nearness, torch.tensor(1.0), True))
-    finally:
-        torch.set_num_threads(threads)
-    assert torch.equal(results[0], results[1])
-    assert torch.equal(results[0], results[2])
+    threads, results = torch.get_num_threads(), []
+    for count in (1, 2, 5, threads):
+        torch.set_num_threads(count)
+        results.append(native.repair_edges(scene.image[0], nearness, torch.tensor(1.0), True))
+    assert all(torch.equal(result, results[0]) for result in results)
 
 
 def test_repair_compiles_without_graph_breaks(scene: Scene) -> None:
     coc = scene.camera.coc_px(degrade(scene.depth, "half-res"), 192)
-
-    @torch.compile(backend="eager", fullgraph=True)
-    def repaired(image: Tensor, nearness: Tensor) -> Tensor:
-        return edges.repair(image, nearness, 1.0, True)
-
-    function: Callable[[Tensor, Tensor], Tensor] = repaired
-    torch.testing.assert_close(function(scene.image, -coc), edges._repair(scene.image, -coc, torch.tensor(1.0), True))
+    compiled = torch.compile(edges.repair, backend="eager", fullgraph=True)
+    plain = edges._repair(scene.image, -coc, torch.tensor(1.0), True)
+    torch.testing.assert_close(compiled(scene.image, -coc, 1.0, True), plain)

@@ -103,55 +103,40 @@ def test_splatting_in_parts_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> 
     torch.testing.assert_close(blur_by_coc(image, coc), whole, rtol=1e-5, atol=1e-5)
 
 
-def sent_by_a_covered_lamp(cover: float, beside: Surface, image_coc_px: Tensor) -> float:
-    """Light of a lamp of 100 with coc 6 px, sent by a surface with ``cover``, as a share of that above the limit."""
+@pytest.mark.parametrize(
+    ("changes", "sent"),
+    [
+        ({}, 1.0),
+        ({"nearer_px": 1.5}, 0.7),  # depends on the distance to the nearer surface
+        ({"nearer_px": 1.0}, 0.4),
+        ({"nearer_px": -3.0}, 0.4),
+        ({"beside_light": 1.2}, 0.7),  # on the light of the nearer surface, which must not be a highlight
+        ({"beside_light": 1.6}, 0.4),
+        ({"cover": 0.053}, 0.5265),  # on the coverage, as in layers
+        ({"between": 1}, 1.0),
+        ({"between": 2}, 0.82),  # on the pixels between the surfaces: the light is multiplied by 1.5 - 10 * 2 / 25
+        ({"between": 4}, 0.4),
+        ({"between": 25, "share": 0.05}, 1.0),  # not those near one of the surfaces
+        ({"between": 25, "share": 0.95}, 1.0),
+        ({"between": 3, "share": 0.125}, 0.94),  # counts half
+    ],
+)
+def test_a_highlight_partly_covered_at_a_step_of_depth_sends_the_light_of_a_whole_pixel(
+    changes: dict[str, float], sent: float
+) -> None:
+    given = {"cover": 0.4, "nearer_px": 4.0, "beside_light": 0.1, "between": 0, "share": 0.5} | changes
     image = torch.full((1, 1, 40, 40), 0.1)
     image[..., 20, 20] = 100.0
-    surface, limit = Surface(image, torch.full_like(image, 6.0), torch.full_like(image, cover)), 0.8
-    beside = beside._replace(weight=torch.full_like(image, 1.0 - cover))
-    _, rays = highlights.extract(surface, highlights.threshold(image), beside=(beside, image_coc_px))
+    ones, limit = torch.ones_like(image), 0.8
+    beside_px = (6.0 - given["nearer_px"]) * ones
+    image_px = beside_px.clone()
+    is_between = (torch.arange(25) < given["between"]).view(5, 5)
+    image_px[..., 18:23, 18:23] += given["nearer_px"] * given["share"] * is_between
+    beside = Surface(given["beside_light"] * ones, beside_px, (1.0 - given["cover"]) * ones)
+    surface = Surface(image, 6.0 * ones, given["cover"] * ones)
+    _, rays = highlights.extract(surface, highlights.threshold(image), beside=(beside, image_px))
     assert rays is not None
-    return float(rays.light) / (100.0 - limit)
-
-
-@pytest.mark.parametrize(
-    ("cover", "nearer_px", "beside_light", "sent"),
-    [
-        (0.4, 3.0, 0.1, 1.0),  # depends on the distance to the nearer surface
-        (0.4, 1.5, 0.1, 0.7),
-        (0.4, 1.0, 0.1, 0.4),
-        (0.4, -3.0, 0.1, 0.4),
-        (0.4, 3.0, 1.2, 0.7),  # on the light of the nearer surface, which must not be a highlight
-        (0.4, 3.0, 1.6, 0.4),
-        (0.053, 3.0, 0.1, 0.5265),  # on the coverage, as in layers
-    ],
-)
-def test_highlights_partly_covered_by_a_nearer_surface_send_the_light_of_a_whole_pixel(
-    cover: float, nearer_px: float, beside_light: float, sent: float
-) -> None:
-    beside = Surface(torch.full((1, 1, 40, 40), beside_light), torch.full((1, 1, 40, 40), 6.0 - nearer_px))
-    assert sent_by_a_covered_lamp(cover, beside, beside.coc_px) == pytest.approx(sent, rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("between", "share", "sent"),
-    [
-        (0, 0.5, 1.0),
-        (1, 0.5, 1.0),
-        (2, 0.5, 0.82),  # the additional light is multiplied by 1.5 - 10 * 2 / 25
-        (4, 0.5, 0.4),
-        (25, 0.05, 1.0),  # pixels near one of the surfaces are not between them
-        (25, 0.95, 1.0),
-        (3, 0.125, 0.94),  # counts half
-    ],
-)
-def test_highlights_send_the_light_of_a_whole_pixel_only_at_steps_of_depth(
-    between: int, share: float, sent: float
-) -> None:
-    beside = Surface(torch.full((1, 1, 40, 40), 0.1), torch.full((1, 1, 40, 40), 2.0))
-    image_coc = beside.coc_px.clone()
-    image_coc[..., 18:23, 18:23] += 4.0 * share * (torch.arange(25) < between).view(5, 5)
-    assert sent_by_a_covered_lamp(0.4, beside, image_coc) == pytest.approx(sent, rel=1e-4)
+    assert float(rays.light) / (100.0 - limit) == pytest.approx(sent, rel=1e-5)
 
 
 @pytest.mark.parametrize("cover", [0.0, HIDDEN_WEIGHT])
@@ -195,20 +180,15 @@ def test_unknown_light_does_not_lower_the_threshold() -> None:
 
 def test_rays_are_differentiable_in_light_and_coc() -> None:
     image, coc, (row, column) = street(6.13, -2.9)  # no ray hits the centre of a pixel
-    generator = torch.Generator().manual_seed(3)
-    target = torch.rand(1, 3, 96, 96, generator=generator)
-    light, blur = image.double().requires_grad_(), coc.double().requires_grad_()
-    loss = (blur_by_coc(light, blur) * target).sum()
-    by_light, by_coc = torch.autograd.grad(loss, (light, blur))
-    for tensor, gradient, step in ((image, by_light, 1e-2), (coc, by_coc, 1e-4)):
-        moved = [tensor.double().clone() for _ in range(2)]
-        for m, sign in zip(moved, (1, -1), strict=True):
-            m[0, 0, row, column] += sign * step
-        inputs = [(m, coc.double()) if tensor is image else (image.double(), m) for m in moved]
-        # requires_grad_ selects the fixed layers of gradients
-        values = [(blur_by_coc(a, b.requires_grad_()) * target).sum().detach() for a, b in inputs]
-        slope = float(values[0] - values[1]) / (2 * step)
-        assert float(gradient[0, 0, row, column]) == pytest.approx(slope, rel=1e-3)
+    target = torch.rand(1, 3, 96, 96, generator=torch.Generator().manual_seed(3))
+    lamp = torch.zeros_like(coc, dtype=torch.float64)
+    lamp[0, 0, row, column] = 1.0
+
+    def seen(light: Tensor, radius: Tensor) -> Tensor:
+        return (blur_by_coc(image + light * lamp, coc + radius * lamp) * target).sum()
+
+    leaves = [torch.zeros((), dtype=torch.float64, requires_grad=True) for _ in range(2)]
+    assert torch.autograd.gradcheck(seen, leaves, eps=1e-4, atol=0.0, rtol=1e-3)
 
 
 @pytest.mark.parametrize("normalize", [True, False])

@@ -10,15 +10,21 @@ from tests.scenes import BLUE, RED, mixed_edge
 from torchdof import blur_by_coc
 from torchdof.reference.scenes import Plane, camera_of, plane_scene, waves
 from torchdof.render.highlights import threshold
-from torchdof.render.matting import attribute_emitters, matte
+from torchdof.render.matting import Matted, attribute_emitters, matte
+
+ROWS, COLUMNS = torch.meshgrid(torch.arange(64), torch.arange(80), indexing="ij")
 
 
-def random_scene() -> tuple[Tensor, Tensor]:
-    made = torch.Generator().manual_seed(5)
-    image, coc = torch.rand(1, 3, 150, 170, generator=made), torch.full((1, 1, 150, 170), 3.0)
-    coc[..., 20:70, 30:90], coc[..., 90:140, 60:160] = -14.0, -6.0
-    image[..., 30:40, 30:60] *= 40.0
-    return image, coc
+def colours(light: Tensor) -> Tensor:
+    return light.expand(1, 3, -1, -1).clone()
+
+
+def with_emitters(light: Tensor, coc: Tensor) -> Matted:
+    """The matte after its emitters are attributed, which conserves light."""
+    made = attribute_emitters(light, coc, threshold(light), None, matte(light, coc))
+    total = (1 - made.other_weight) * made.own + made.other_weight * made.other
+    torch.testing.assert_close(total, light, rtol=1e-5, atol=1e-5)
+    return made
 
 
 @pytest.mark.parametrize("share", [0.2, 0.4, 0.6, 0.8])
@@ -57,83 +63,57 @@ def test_a_soft_edge_is_split_into_the_colours_beyond_it() -> None:
         assert torch.allclose(share[..., x], (1 - covered if x == 30 else covered)[x], atol=0.03)
 
 
-def test_a_split_conserves_light() -> None:
-    image, coc = random_scene()
-    own, other, _, share = matte(image, coc)
-    assert torch.allclose((1 - share) * own + share * other, image, atol=1e-5)
-
-
-def strands_before_a_lamp() -> tuple[Tensor, Tensor, Tensor]:
-    """Dark strands one pixel wide, every third column, in focus before a lamp; depth has two thirds of each."""
-    rows, columns = torch.meshgrid(torch.arange(64), torch.arange(80), indexing="ij")
-    is_strand = columns % 3 == 0
-    lamp = ((rows - 30) ** 2 + (columns - 40) ** 2 <= 16) * 50.0
-    light = torch.where(is_strand, 0.05 + 0.4 * lamp, 0.2 + lamp).expand(1, 3, -1, -1)
-    coc = torch.where(is_strand & (rows % 3 > 0), 0.0, 12.0).expand(1, 1, -1, -1)
-    return light, coc, is_strand & (lamp > 0) & (rows % 3 > 0)
-
-
 def test_a_lamp_beside_a_strand_before_it_keeps_its_light() -> None:
-    rows, columns = torch.meshgrid(torch.arange(40), torch.arange(41), indexing="ij")
-    lamp = 30.0 * torch.exp(-((rows - 20) ** 2 + (columns - 20) ** 2) / 4.0)
-    is_strand = columns == 20
-    light, coc = (
-        t.expand(1, 3, -1, -1)
-        for t in (0.1 + torch.where(is_strand, 0.8 * lamp, lamp), torch.where(is_strand, -7.0, 0.0))
-    )
-    coc = coc[:, :1]
-    surfaces = attribute_emitters(light, coc, threshold(light), None, matte(light, coc))
-    of_the_strand = torch.where(
-        is_strand, (1 - surfaces.other_weight) * surfaces.own, surfaces.other_weight * surfaces.other
-    )
-    assert float(of_the_strand.sum()) < 0.05 * float(light.sum())
+    lamp = 30.0 * torch.exp(-((ROWS - 20) ** 2 + (COLUMNS - 20) ** 2) / 4.0)
+    is_strand = COLUMNS == 20
+    light = colours(0.1 + torch.where(is_strand, 0.8 * lamp, lamp))
+    made = with_emitters(light, torch.where(is_strand, -7.0, 0.0)[None, None])
+    share = torch.where(is_strand, 1 - made.other_weight, made.other_weight)
+    of_the_strand = share * torch.where(is_strand, made.own, made.other)
+    assert float(of_the_strand.sum()) < 0.05 * float(light[..., :40, :41].sum())
 
 
 def test_light_of_a_lamp_seen_through_strands_is_assigned_to_the_lamp() -> None:
-    light, coc, shone_through = strands_before_a_lamp()
-    own, other, other_coc, weight = attribute_emitters(light, coc, threshold(light), None, matte(light, coc))
-    inner = shone_through
-    assert int(inner.sum()) > 5
-    assert torch.allclose(weight[0, 0][inner], torch.tensor(0.4), atol=0.05)
-    assert torch.allclose(other_coc[0, 0][inner], torch.tensor(12.0), atol=0.1)
-    assert float(own[..., inner].max()) < 1.0 and float(other[..., inner].min()) > 45.0
-    torch.testing.assert_close((1 - weight) * own + weight * other, light, rtol=1e-5, atol=1e-5)
-    sharp = blur_by_coc(light, coc)[0, 0]
-    assert float(sharp.max()) < 8.0, "the lamp, 20 or more, must not stay in focus"
+    """Dark strands one pixel wide, every third column, in focus before a lamp; depth has two thirds of each."""
+    is_strand = COLUMNS % 3 == 0
+    lamp = ((ROWS - 30) ** 2 + (COLUMNS - 40) ** 2 <= 16) * 50.0
+    light = colours(torch.where(is_strand, 0.05 + 0.4 * lamp, 0.2 + lamp))
+    in_focus = is_strand & (ROWS % 3 > 0)
+    coc = torch.where(in_focus, 0.0, 12.0)[None, None]
+    own, other, other_coc, weight = (t[..., in_focus & (lamp > 0)] for t in with_emitters(light, coc))
+    assert weight.numel() > 5
+    assert torch.allclose(weight, torch.tensor(0.4), atol=0.05)
+    assert torch.allclose(other_coc, torch.tensor(12.0), atol=0.1)
+    assert float(own.max()) < 1.0 and float(other.min()) > 45.0
+    assert float(blur_by_coc(light, coc).max()) < 8.0, "the lamp, 20 or more, must not stay in focus"
 
 
 def test_the_rim_of_a_lamp_is_not_assigned_to_dim_hair_beside_it() -> None:
-    rows, columns = torch.meshgrid(torch.arange(64), torch.arange(80), indexing="ij")
-    across = (columns - 40).abs() <= 2
-    is_rim, is_hair = across & ((rows == 29) | (rows == 34)), columns == 40
-    light = torch.where(is_rim, 16.0, torch.where(across & (rows >= 30) & (rows < 34), 50.0, 0.1))
-    light = torch.where(is_hair, 0.5 * light + 0.02, light).expand(1, 3, -1, -1).clone()
-    coc = torch.where(is_hair, 1.0, 12.0).expand(1, 1, -1, -1)
+    across = (COLUMNS - 40).abs() <= 2
+    is_rim, is_hair = across & ((ROWS == 29) | (ROWS == 34)), COLUMNS == 40
+    light = torch.where(is_rim, 16.0, torch.where(across & (ROWS >= 30) & (ROWS < 34), 50.0, 0.1))
+    light = colours(torch.where(is_hair, 0.5 * light + 0.02, light))
+    coc = torch.where(is_hair, 1.0, 12.0)[None, None]
+    beside_hair = is_rim & ((COLUMNS - 40).abs() == 1)
     found = matte(light, coc)
-    beside_hair = is_rim & ((columns - 40).abs() == 1)
-    assert float(found.other_weight[0, 0][beside_hair].min()) > 0.03
+    assert float(found.other_weight[..., beside_hair].min()) > 0.03
     assert float(found.other[..., beside_hair].min()) > 2.0, "the matte alone makes the hair, 0.02, too bright"
-    own, other, _, weight = attribute_emitters(light, coc, threshold(light), None, found)
-    assert float(weight[0, 0][beside_hair].max()) < 1e-6
-    torch.testing.assert_close((1 - weight) * own + weight * other, light, rtol=1e-5, atol=1e-5)
+    assert float(with_emitters(light, coc).other_weight[..., beside_hair].max()) < 1e-6
     # hair that is as bright as the lamp keeps its part
-    beside_hair = (rows >= 29) & (rows < 35) & ((columns - 40).abs() == 1)
+    beside_hair = (ROWS >= 29) & (ROWS < 35) & ((COLUMNS - 40).abs() == 1)
     light[..., 28:36, 40] = 50.0
     found = matte(light, coc)
-    assert float(found.other_weight[0, 0][beside_hair].max()) > 0.03
-    for before, after in zip(found, attribute_emitters(light, coc, threshold(light), None, found), strict=True):
+    assert float(found.other_weight[..., beside_hair].max()) > 0.03
+    for before, after in zip(found, with_emitters(light, coc), strict=True):
         torch.testing.assert_close(before[..., beside_hair], after[..., beside_hair], rtol=1e-6, atol=1e-6)
 
 
 def test_a_lamp_on_a_near_surface_stays_there_with_its_rim() -> None:
-    rows, columns = torch.meshgrid(torch.arange(64), torch.arange(80), indexing="ij")
-    is_post = (columns >= 30) & (columns < 42)
-    lamp = (rows >= 30) & (rows < 32) & (columns >= 40) & (columns < 42)
-    light = torch.where(lamp, 50.0, torch.where(is_post, 0.05, 0.2)).expand(1, 3, -1, -1).clone()
+    is_post = (COLUMNS >= 30) & (COLUMNS < 42)
+    lamp = (ROWS >= 30) & (ROWS < 32) & (COLUMNS >= 40) & (COLUMNS < 42)
+    light = colours(torch.where(lamp, 50.0, torch.where(is_post, 0.05, 0.2)))
     light[..., 30:32, 42] = 20.0  # the rim of the lamp, in pixels whose centre shows the wall
-    coc = torch.where(is_post, 0.0, 12.0).expand(1, 1, -1, -1)
-    surfaces = attribute_emitters(light, coc, threshold(light), None, matte(light, coc))
-    own, other, other_coc, weight = (t[0, 0] for t in surfaces)
+    own, other, other_coc, weight = (t[0, 0] for t in with_emitters(light, torch.where(is_post, 0.0, 12.0)[None, None]))
     torch.testing.assert_close(((1 - weight) * own)[lamp], torch.full((4,), 50.0))
     torch.testing.assert_close((weight * other)[30:32, 42], torch.full((2,), 20.0 - 0.6 * 0.2), rtol=0.01, atol=0.0)
     torch.testing.assert_close(own[30:32, 42], torch.full((2,), 0.2))
@@ -155,11 +135,13 @@ def test_lamps_in_focus_leave_no_halo_on_the_blurred_wall_behind_them() -> None:
     assert float((made - scene.truth[0])[:, around].abs().max()) < 0.02  # 0.18 with mean colours alone
 
 
-def test_split_light_stays_within_the_range_of_the_image() -> None:
+def test_a_split_conserves_light_and_stays_within_the_range_of_the_image() -> None:
     made = torch.Generator().manual_seed(3)
     for _ in range(20):
         image = 0.2 + 0.6 * torch.rand(1, 3, 40, 40, generator=made)
         coc = 20.0 * torch.rand(1, 1, 40, 40, generator=made).round(decimals=0)
-        for light in matte(image, coc)[:2]:
+        own, other, _, share = matte(image, coc)
+        assert torch.allclose((1 - share) * own + share * other, image, atol=1e-5)
+        for light in (own, other):
             light = light[(light != 0).all(1, keepdim=True).expand_as(light)]  # pixels with a second surface
             assert float(light.min()) >= 0.2 - 1e-5 and float(light.max()) <= 0.8 + 1e-5

@@ -1,3 +1,6 @@
+"""Layers of a scene: their number, blurs and resolutions."""
+
+import itertools
 import math
 
 import pytest
@@ -6,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import torchdof
+from tests.scenes import smooth
 from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.kernel_bank import bank_of
 from torchdof.render import layer_cocs
@@ -18,12 +22,6 @@ TOLERANCE = st.sampled_from([0.0, 1 / 1000, 1 / 255, 1 / 60, 1 / 20, 0.5])
 
 def coc_map(*values: float) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float64).reshape(1, 1, 1, -1)
-
-
-def largest_gaps(plan: Plan) -> list[tuple[float, float]]:
-    """Each gap between layers, with the place of its end nearer to focus."""
-    pairs = zip(plan.nodes, plan.nodes[1:], strict=False)
-    return [(high - low, min(abs(low), abs(high))) for low, high in pairs]
 
 
 def place_of(coc_px: float) -> float:
@@ -40,7 +38,7 @@ def test_layers_increase_and_span_the_scene(coc: list[float], tolerance: float) 
     scene = torch.tensor(coc, dtype=torch.float64).reshape(1, 1, 1, -1).expand(1, 1, 200, -1)
     plan = Plan.for_scene(scene, tolerance, adapt=False)
     blur = blur_axis(scene[0, 0, 0]).tolist()
-    assert all(low < high for low, high in zip(plan.nodes, plan.nodes[1:], strict=False))
+    assert all(low < high for low, high in itertools.pairwise(plan.nodes))
     assert plan.nodes[0] == pytest.approx(min(blur), abs=1e-9) and plan.nodes[-1] == pytest.approx(max(blur), abs=1e-9)
     if min(blur) < 0 < max(blur):
         assert 0.0 in plan.nodes  # the sharp layer
@@ -49,8 +47,9 @@ def test_layers_increase_and_span_the_scene(coc: list[float], tolerance: float) 
 @given(st.floats(0.6, 200.0), TOLERANCE)
 def test_gaps_between_layers_are_at_most_the_spacing_of_the_tolerance(reach: float, tolerance: float) -> None:
     for plan in (Plan.for_scene(coc_map(-reach, reach), tolerance, adapt=False), Plan.static(reach, tolerance)):
-        for gap, inner in largest_gaps(plan):
-            assert gap <= spacing(inner, tolerance) + 0.3 * spacing(inner + gap, tolerance) + 1e-9
+        for low, high in itertools.pairwise(plan.nodes):
+            inner, outer = sorted((abs(low), abs(high)))
+            assert high - low <= spacing(inner, tolerance) + 0.3 * spacing(outer, tolerance) + 1e-9
     assert plan.coc_px[-1] == pytest.approx(reach)  # of the plan for all scenes
     assert 0.0 in plan.nodes or tolerance == 0.5
     assert [-x for x in reversed(plan.nodes)] == list(plan.nodes)
@@ -60,8 +59,7 @@ def test_a_static_plan_is_as_exact_on_a_slope_as_the_plan_of_the_scene() -> None
     """A static plan has denser layers, because it cannot place layers at the blurs of the frame's border."""
     y, x = torch.linspace(0.0, 1.0, 160)[:, None], torch.linspace(0.0, 1.0, 240)
     coc = (8.0 + 16.0 * (0.7 * x + 0.3 * y))[None, None]
-    image = torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(1))
-    image = torch.nn.functional.interpolate(image, coc.shape[-2:], mode="bicubic").clamp(0.0, 1.0)
+    image = smooth(3, 160, 240)
     exact = torchdof.blur_by_coc(image, coc, tolerance=0)
     plans = Plan.static(24.0, 1 / 255), Plan.for_scene(coc, 1 / 255, adapt=False)
     every, own = (float((torchdof.blur_by_coc(image, coc, plan=p) - exact).square().mean().sqrt()) for p in plans)
@@ -78,9 +76,7 @@ def test_a_frame_is_planned_for_less_where_it_is_blurred_much_not_where_a_few_pi
 
 
 def test_a_rough_frame_is_planned_for_more_and_keeps_its_tolerance(engine: str) -> None:
-    generator = torch.Generator().manual_seed(1)
-    image, noise = (torch.rand(1, n, *size, generator=generator) for n, size in ((3, (24, 32)), (1, (96, 128))))
-    image, noise = torch.nn.functional.interpolate(image, scale_factor=4.0, mode="bicubic").clamp(0.0, 1.0), noise - 0.5
+    image, noise = smooth(3, 96, 128), torch.rand(1, 1, 96, 128) - 0.5
     change = float(layer_cocs.mean_change(40.0 * noise))
     rough = Plan.for_scene(40.0 * noise, 1 / 255)
     assert rough.tolerance == pytest.approx(math.sqrt(change / 8) / 255) and change > 20
@@ -89,11 +85,10 @@ def test_a_rough_frame_is_planned_for_more_and_keeps_its_tolerance(engine: str) 
     error = torchdof.blur_by_coc(image, 40.0 * noise, plan=rough) - exact
     assert float(error.square().mean().sqrt()) < 1 / 255
     # ordinary frames, one surface of two, and loose tolerances are planned as they are
-    smooth = torch.zeros_like(noise)
-    for calm in (5.0 * noise, torch.cat([40.0 * noise, smooth])):
+    for calm in (5.0 * noise, torch.cat([40.0 * noise, 0.0 * noise])):
         assert Plan.for_scene(calm, 1 / 255).tolerance == 1 / 255
     assert Plan.for_scene(40.0 * noise, 5 / 255).tolerance == 5 / 255
-    wide = 600.0 * torch.rand(1, 1, 1000, 1000, generator=generator) - 300.0
+    wide = 600.0 * torch.rand(1, 1, 1000, 1000) - 300.0
     wide[0, 0, 0, 0] = math.nan
     assert Plan.for_scene(wide, 1 / 255).tolerance == pytest.approx(4 / 255)
 
@@ -137,6 +132,26 @@ def test_highlights_become_rays_at_all_radii_of_coarse_layers(tolerance: float) 
         beside = [b.scale for b in blurs[max(0, k - 1) : k + 2]]
         assert max(beside) == 1 or abs(coc) >= plan.crisp_px or plan.nodes[k] == 0.0
     assert any(abs(c) < plan.crisp_px for c in plan.coc_px if c) and any(blur.scale > 1 for blur in blurs)
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1 / 255, 4 / 255])
+def test_layers_move_smoothly_with_the_ends_of_a_scene(tolerance: float) -> None:
+    """Where the number of layers changes, the new layer coincides with another one."""
+    reaches = torch.linspace(1.0, 9.0, 4001, dtype=torch.float64).tolist()
+    nodes = [Plan.for_scene(coc_map(-2.2, far), tolerance, adapt=False).nodes for far in reaches]  # steps of 2e-3 px
+    for before, after in itertools.pairwise(nodes):
+        assert max(min(abs(x - y) for y in before) for x in after) < 0.01, f"{before} to {after}"
+    assert len(nodes[-1]) > 4
+
+
+@pytest.mark.parametrize("times", [1, 3], ids=["12 px", "36 px"])
+def test_layers_are_dense_at_the_radii_of_the_border(times: int) -> None:
+    """Surfaces continued outside the frame have the blur of the border; distant layers would be visible there."""
+    y = torch.linspace(0, 1, 240)[:, None].expand(240, 320)
+    coc = torch.where(torch.arange(320) < 20, -13.0, -12.0 * y**2)[None, None] * times  # a post is nearer yet
+    image = 0.5 + 0.4 * torch.sin(y * 90)[None, None].expand(1, 3, -1, -1)
+    exact, close = (torchdof.blur_by_coc(image, coc, tolerance=tolerance) for tolerance in (0, 1 / 255))
+    assert float((close - exact)[..., -12:, 40:].abs().max()) < 4 / 255
 
 
 def test_layers_of_larger_blur_have_lower_resolution() -> None:

@@ -52,20 +52,14 @@ def test_another_aspect_ratio_is_refused(size: tuple[int, int]) -> None:
         at_size_of(image, torch.ones(1, 1, *size))
 
 
-def test_the_module_resamples_a_smaller_map() -> None:
+def test_the_module_resamples_a_smaller_map_and_stretches_one_of_nearly_the_aspect_ratio() -> None:
+    """Estimators work at multiples of several pixels: here 194 x 132 instead of 194 x 129 for 96 x 64."""
     image, depth = scene()
-    dof = DepthOfField(Camera.from_fov(40.0, 0.05, 5.0))
-    small = depth[..., 1::2, 1::2]
+    dof, small = DepthOfField(Camera.from_fov(40.0, 0.05, 5.0)), depth[..., 1::2, 1::2]
     assert torch.equal(dof(image, small), dof(image, at_size_of(image, small)))
     with pytest.raises(ValueError, match=r"depth must be \[1, 1, 64, 96\].* got \[1, 1, 20, 48\]"):
         dof(image, depth[..., :20, ::2])
-
-
-def test_a_map_of_nearly_the_aspect_ratio_is_stretched_with_a_warning() -> None:
-    """Estimators work at multiples of several pixels: here 194 x 132 instead of 194 x 129 for 96 x 64."""
-    image, depth = scene()
-    dof = DepthOfField(Camera.from_fov(40.0, 0.05, 5.0))
-    near = torch.nn.functional.interpolate(depth, (132, 194), mode="nearest")
+    near = functional.interpolate(depth, (132, 194), mode="nearest")
     with pytest.warns(UserWarning, match=r"depth is stretched by 2\.1% to the shape of the image"):
         out = dof(image, near)
     assert torch.equal(out, dof(image, at_size_of(image, near)))
