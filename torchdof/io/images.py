@@ -19,7 +19,7 @@ from .atomic import atomic_file
 from .channels import colour_channels, depth_channel
 from .decode import Part, errors_named, first_line, is_complete, read_array, read_parts, utf8_name
 from .paths import PixelType, existing_image, existing_map, samples_of
-from .transfer import Transfer, decode, default_transfer, encode
+from .transfer import Transfer, decode, default_transfer, encode, encode_8_bits
 from .webp import add_exif
 
 __all__ = ["Picture", "read_image", "read_values", "write_image"]
@@ -125,16 +125,23 @@ def _light(
     if kind not in _SAMPLE_TYPES and not source.is_exr:
         raise ValueError(f"holds numbers of type {kind}, for which white is not defined; store 16 bits")
     sample = _SAMPLE_TYPES.get(kind, "float")
-    transfer = transfer or default_transfer(sample)
+    transfer, white = transfer or default_transfer(sample), _WHITE[sample]
+    curve = None  # light of each stored number, twice as fast as computing it for each pixel
+    if white > 1 and (source.straight_alpha or not has_alpha):
+        levels = torch.arange(white + 1, dtype=torch.float32) / white
+        curve = decode(levels.reshape(1, 1, 1, -1), transfer, has_alpha=False, straight=False).flatten().numpy()
     height, width = source.values.shape[:2]
     light, bad_pixels = torch.from_numpy(np.empty((1, len(indices), height, width), np.float32)), 0
     for rows in _strips(height, width * len(indices)):
-        values = _float32(source.values[rows][..., indices])
-        if _WHITE[sample] > 1:
-            values /= np.float32(_WHITE[sample])
-        bad_pixels += int((~np.isfinite(values)).any(axis=-1).sum())
+        stored = source.values[rows][..., indices]
+        values = _float32(stored) if curve is None else curve[stored]
+        if curve is None and white > 1:
+            values /= np.float32(white)
+        elif curve is not None and has_alpha:
+            values[..., -1] = stored[..., -1] / np.float32(white)
+        bad_pixels += int((~np.isfinite(values)).any(axis=-1).sum()) if curve is None else 0
         pixels = torch.from_numpy(values).permute(2, 0, 1)[None]  # [h, W, C] -> [1, C, h, W]
-        light[:, :, rows] = decode(pixels, transfer, has_alpha, source.straight_alpha)
+        light[:, :, rows] = decode(pixels, transfer if curve is None else "linear", has_alpha, source.straight_alpha)
         if not bad_pixels and not bool(torch.isfinite(light[:, :, rows]).all()):
             raise ValueError("its light is beyond the range of float32; scale it down")
     if bad_pixels:
@@ -193,11 +200,14 @@ def write_image(
     if names[0] == "Y" and suffix not in _GREY_SUFFIXES:
         pixels, names = pixels.expand(-1, 3, -1, -1), ("R", "G", "B")
     straight = names[-1] == "A" and suffix != ".exr"
-    array = np.empty((*pixels.shape[2:], len(names)), np.float32)
-    for rows in _strips(array.shape[0], array.shape[1] * len(names)):
-        encoded = encode(pixels[:, :, rows], transfer, names[-1] == "A", straight)
-        encoded = encoded.clamp(-65504.0, 65504.0) if sample == "half" else encoded
-        array[rows] = encoded[0].permute(1, 2, 0).numpy()  # [C, h, W] -> [h, W, C]
+    if sample == "8" and (straight or names[-1] != "A"):
+        array = encode_8_bits(pixels, transfer, straight)
+    else:
+        array = np.empty((*pixels.shape[2:], len(names)), np.float32)
+        for rows in _strips(array.shape[0], array.shape[1] * len(names)):
+            encoded = encode(pixels[:, :, rows], transfer, names[-1] == "A", straight)
+            encoded = encoded.clamp(-65504.0, 65504.0) if sample == "half" else encoded
+            array[rows] = encoded[0].permute(1, 2, 0).numpy()  # [C, h, W] -> [h, W, C]
 
     spec = oiio.ImageSpec(array.shape[1], array.shape[0], array.shape[2], _OIIO_SAMPLE[sample])
     spec.channelnames = names
