@@ -21,10 +21,10 @@ from torchdof.options import DepthEdges
 from torchdof.tensors import TRACEABLE
 from torchdof.validation import whole
 
-from . import lists, ray_splats
 from .graph import INPUTS, OUTPUT, Layout, Portable, Size, axes, trace
 from .interface import broadcast
 from .metadata import label
+from .rays import FUNCTIONS
 from .slimming import slim
 from .verification import Verification, verify
 
@@ -135,7 +135,7 @@ def _translate(program: torch.export.ExportedProgram, portable: Portable, opset:
         )
     if converted is None:
         raise RuntimeError("torch.onnx.export gave no program")
-    for function in (*ray_splats.FUNCTIONS, *lists.FUNCTIONS):
+    for function in FUNCTIONS:
         translated = onnx_ir.serde.deserialize_function(function.to_function_proto())
         translated.opset_imports[""] = opset
         converted.model.functions[translated.identifier()] = translated

@@ -19,8 +19,7 @@ from torchdof.render.ops import Ops
 from torchdof.render.plan import LayerKernel, Plan
 from torchdof.validation import choice
 
-from .operations import GraphOps
-from .whole import WholeOps
+from .operations import GraphOps, WholeOps
 
 __all__ = ["INPUTS", "LAYOUTS", "OUTPUT", "Layout", "Portable", "Size", "axes", "trace"]
 

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from tests.exported import SIZES
 from torchdof import BlurTable
-from torchdof.export import ray_splats
-from torchdof.export.rays import kernels_of
+from torchdof.export import rays
 from torchdof.export.verification import TOLERANCE, local_range
 from torchdof.reference.scenes import read_scenes
 from torchdof.render.plan import Plan
@@ -81,8 +80,8 @@ def test_kernels_of_a_file_equal_those_of_its_table(shape: str) -> None:
     made = {"disc": BlurTable.disc, "polygon": lambda: BlurTable.polygon(blades=5, rotation_deg=10.0)}
     table = made[shape]() if shape in made else BlurTable.load(shape)
     plan = Plan.static(3.0, 1 / 255, rays=True)
-    values, origins, halves, is_round, per_px, *_ = kernels_of(table, plan, 1)
-    values_at: Any = ray_splats.values_at
+    values, origins, halves, is_round, per_px, *_ = rays.kernels_of(table, plan, 1)
+    values_at: Any = rays.values_at
     for coc_px in (-2.75, 0.5, 3.0):
         expected = table.kernels(torch.tensor([coc_px]), 1).float()[0, :, None]
         half = expected.shape[-1] // 2 + 2  # 2 px of zeros around the kernel
