@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import onnx
 import onnx_ir
-from onnx.reference import ReferenceEvaluator
 from onnx_ir.passes import common as passes
 from onnx_ir.tape import Tape
 from onnxscript.optimizer import fold_constants
@@ -130,24 +129,16 @@ def _constant(value: onnx_ir.Value | None) -> Any:
 
 
 def _fold_weights(model: onnx_ir.Model) -> None:
-    """Makes constants of weights of convolutions that are larger than the other constants which are folded."""
-    for node in [node for node in model.graph if node.op_type == "Conv"]:
-        weight = node.inputs[1]
-        array = None if weight is None or weight.const_value is not None else _folded(weight)
-        if weight is not None and array is not None:
-            node.replace_input_with(1, _initializer(model.graph, array, f"{weight.name}_folded"))
-
-
-def _folded(value: onnx_ir.Value | None) -> Any:
-    """The numbers of a value that does not depend on the graph's inputs, else None."""
-    node = None if value is None else value.producer()
-    if node is None or _constant(value) is not None:
-        return _constant(value)
-    feed = {str(source.name): _folded(source) for source in node.inputs if source is not None}
-    if any(array is None for array in feed.values()):
-        return None
-    results: Any = ReferenceEvaluator(onnx_ir.to_proto(node)).run(None, feed)
-    return np.asarray(results[0])
+    """Makes constants of weights of convolutions, which are larger than the other constants that are folded."""
+    weights, makers = [node.inputs[1] for node in model.graph if node.op_type == "Conv"], set()
+    while weights:
+        weight = weights.pop()
+        maker = None if weight is None else weight.producer()
+        if maker is not None and maker not in makers:
+            makers.add(maker)
+            weights += maker.inputs
+    size = 2**24
+    fold_constants(model, input_size_limit=size, output_size_limit=size, should_fold=makers.__contains__)
 
 
 def _place_weights(model: onnx_ir.Model) -> None:

@@ -168,7 +168,9 @@ def _compare(runner: onnxruntime.InferenceSession, portable: Portable, case: Cas
     if got.dtype != np.float32 or got.shape != tuple(expected.shape):
         raise ValueError(f"{case.name}: expected float32 {list(expected.shape)}, got {got.dtype} {list(got.shape)}")
     # coarse layers average light over their pixels before blurring it
-    kernels = portable.layer_kernels((int(expected.shape[2]), int(expected.shape[3])))
+    options, size = portable.dof.options, (int(expected.shape[2]), int(expected.shape[3]))
+    how = (torch.float32, torch.device("cpu"), options.method == "layered", portable.width)
+    kernels = portable.plan.layer_kernels(options.table, size, *how)
     reach = max(kernel.halo + kernel.scale - 1 for kernel in kernels)
     light_range = local_range(case.tensors[0], min(reach, max(expected.shape[-2:])))
     error = (torch.from_numpy(got) - expected).abs() / light_range.clamp_min(torch.finfo(torch.float32).tiny)
