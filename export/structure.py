@@ -27,7 +27,7 @@ def choose(needed: Tensor, result: Tensor, given: Tensor) -> Tensor:
     return operator(_CHOICE, [result, given, needed], result.shape)
 
 
-def steps(count: int | torch.SymInt) -> Tensor:
+def steps(count: Any) -> Tensor:
     """Number of the current step in a loop of ``count`` steps, int64 ``[]``; what depends on it is computed there."""
     return operator(_STEP, [torch.scalar_tensor(count, dtype=torch.int64)], ())
 

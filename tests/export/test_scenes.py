@@ -20,25 +20,19 @@ DATA = Path(__file__).parents[1] / "data" / "scenes"
 SIZE = SIZES["fold"]
 
 
-def inputs(name: str, max_coc_px: float) -> tuple[Tensor, ...]:
-    """Image, depth and focus of a part of a scene, and the largest CoC that its file can render, in px."""
-    scene = {scene.name: scene for scene in read_scenes(DATA)}[name]
-    image, depth = (t[..., : SIZE[0], : SIZE[1]].contiguous() for t in (scene.image[:, :3], scene.depth))
-    camera = scene.camera.replace(focus_m=float(depth.median()), f_number=1.0)
-    return image, depth, torch.tensor([float(camera.focus_m)]), torch.tensor([max_coc_px])
-
-
 SCENES = ["highlights/0", "planes/0", "room/1"]
 
 
 def compared(exported: Any, name: str) -> tuple[tuple[Tensor, ...], Tensor, Tensor]:
-    """Inputs of a scene, its eager picture, and the local range of light that errors are divided by.
+    """Inputs of a part of a scene, its eager picture, and the local range of light that errors are divided by.
 
     The f-number is the one at which the scene's largest circle of confusion is the file's largest.
     """
-    image, depth, focus, reach = inputs(name, exported.dof.options.max_coc_px)
+    scene = {scene.name: scene for scene in read_scenes(DATA)}[name]
+    image, depth = (t[..., : SIZE[0], : SIZE[1]].contiguous() for t in (scene.image[:, :3], scene.depth))
+    focus = depth.median().reshape(1)
     camera = exported.dof.camera.replace(focus_m=float(focus), f_number=1.0)
-    f_number = camera.coc_px(depth, SIZE[1]).abs().amax().reshape(1) / reach
+    f_number = camera.coc_px(depth, SIZE[1]).abs().amax().reshape(1) / exported.dof.options.max_coc_px
     tensors = (image, depth, focus, f_number)
     eager = exported.eager(*tensors)
     assert float((eager - image).abs().max()) > 0.05, "nothing is blurred"

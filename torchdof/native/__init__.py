@@ -113,7 +113,7 @@ class _Structure(ctypes.Structure):
 
     def __init__(self, *values: Any) -> None:
         self.kept = _contiguous(values)
-        super().__init__(*(_plain(kind, value) for (_, kind), value in zip(self._fields_, self.kept, strict=True)))
+        super().__init__(*(_plain(field[1], value) for field, value in zip(self._fields_, self.kept, strict=True)))
 
 
 def _type(name: str) -> Any:
