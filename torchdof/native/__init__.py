@@ -428,7 +428,9 @@ def _contiguous(value: Any) -> Any:
     """Nested lists of values, in which tensors are contiguous."""
     if isinstance(value, Tensor):
         return value.contiguous()
-    return [_contiguous(each) for each in value] if isinstance(value, (list, tuple)) else value
+    if not isinstance(value, (list, tuple)):
+        return value
+    return [each if type(each) in (int, float) else _contiguous(each) for each in value]
 
 
 def _plain(kind: Any, value: Any) -> Any:
@@ -438,7 +440,8 @@ def _plain(kind: Any, value: Any) -> Any:
     if not isinstance(value, list):
         return value
     element = kind._type_
-    return _array(element, max(1, len(value)))(*(_plain(element, each) for each in value))
+    is_numbers = value and isinstance(value[0], (int, float))
+    return _array(element, max(1, len(value)))(*(value if is_numbers else (_plain(element, each) for each in value)))
 
 
 def _empty(*size: int) -> Tensor:
