@@ -17,26 +17,21 @@ __all__ = ["decode", "encode"]
 
 def encode(size: tuple[int, int] | None, mean: Sequence[float], std: Sequence[float]) -> onnx.ModelProto:
     """A graph that converts linear light ``[B, 3, H, W]`` to an estimator's input."""
-    means, divisors, target = list(map(float, mean)), list(map(float, std)), list(size or ())
+    means, divisors, target = list(map(float, mean)), list(map(float, std)), list(size or (0, 0))
 
     @script
-    def normal(image: Image) -> Floats:
+    def encode(image: Image) -> Floats:
         per_channel = op.Constant(value_ints=[1, 3, 1, 1])
         clipped = op.Clip(image, 0.0, 1.0)
         display = op.Where(clipped <= 0.0031308, clipped * 12.92, 1.055 * op.Pow(clipped, 0.41666666) - 0.055)
         centred = display - op.Reshape(op.Constant(value_floats=means), per_channel)
-        return centred / op.Reshape(op.Constant(value_floats=divisors), per_channel)
+        normal = centred / op.Reshape(op.Constant(value_floats=divisors), per_channel)
+        wanted = op.Constant(value_ints=target)
+        frame = op.Where(wanted > 0, wanted, op.Shape(image, start=2, end=4))
+        sizes = op.Concat(op.Shape(image, start=0, end=2), frame, axis=0)
+        return op.Resize(normal, None, None, sizes, mode="linear", antialias=1)
 
-    @script
-    def encode(image: Image) -> Floats:
-        return normal(image)
-
-    @script
-    def encode_resized(image: Image) -> Floats:
-        full = op.Concat(op.Shape(image, start=0, end=2), op.Constant(value_ints=target), axis=0)
-        return op.Resize(normal(image), None, None, full, mode="linear", antialias=1)
-
-    return (encode if size is None else encode_resized).to_model_proto()
+    return encode.to_model_proto()
 
 
 @script

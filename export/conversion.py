@@ -21,10 +21,10 @@ from torchdof.options import DepthEdges
 from torchdof.tensors import TRACEABLE
 from torchdof.validation import whole
 
-from . import lists, ray_splats
 from .graph import INPUTS, OUTPUT, Layout, Portable, Size, axes, trace
 from .interface import broadcast
 from .metadata import label
+from .rays import FUNCTIONS
 from .slimming import slim
 from .verification import Verification, verify
 
@@ -135,7 +135,7 @@ def _translate(program: torch.export.ExportedProgram, portable: Portable, opset:
         )
     if converted is None:
         raise RuntimeError("torch.onnx.export gave no program")
-    for function in (*ray_splats.FUNCTIONS, *lists.FUNCTIONS):
+    for function in FUNCTIONS:
         translated = onnx_ir.serde.deserialize_function(function.to_function_proto())
         translated.opset_imports[""] = opset
         converted.model.functions[translated.identifier()] = translated
@@ -163,14 +163,6 @@ def _values_as_traced() -> AbstractContextManager[object]:
         """Its base class calls ``run_node`` of the class above."""
 
     return mock.patch.object(type_promotion, "_TypePromotionInterpreter", Promotion)
-
-
-def _to_dtype(self: Any, dtype: int, non_blocking: bool = False, copy: bool = False) -> Any:
-    return opset20.Cast(self, to=dtype)
-
-
-def _to_device(self: Any, device: str, dtype: int, non_blocking: bool = False, copy: bool = False) -> Any:
-    return opset20.Cast(self, to=dtype)
 
 
 def _index_copy(self: Any, dim: int, index: Any, source: Any) -> Any:
@@ -210,10 +202,6 @@ def _index_select(self: Any, dim: int, index: Any) -> Any:
     return opset20.GatherElements(self, index, axis=dim)  # five times as fast in onnxruntime as Gather
 
 
-def _aminmax(self: Any, dim: int | None = None, keepdim: bool = False) -> Any:
-    return opset20.ReduceMin(self, keepdims=0), opset20.ReduceMax(self, keepdims=0)
-
-
 def _diff(self: Any, n: int = 1, dim: int = -1, prepend: Any = None, append: Any = None) -> Any:
     axis: Any = [dim]
     bounds: Any = [0], [1], [-1], [2**63 - 1]
@@ -221,24 +209,21 @@ def _diff(self: Any, n: int = 1, dim: int = -1, prepend: Any = None, append: Any
     return opset20.Sub(opset20.Slice(self, bounds[1], bounds[3], axis), before)
 
 
-def _addcmul(self: Any, tensor1: Any, tensor2: Any, value: float = 1.0) -> Any:
-    return opset20.Add(self, opset20.Mul(tensor1, tensor2))
-
-
-def _index_add(self: Any, dim: int, index: Any, source: Any, alpha: float = 1.0) -> Any:
-    return opset20.ScatterElements(self, index, source, axis=dim, reduction="add")
-
-
 _TRANSLATIONS: dict[Callable[..., Any], Callable[..., Any]] = {
-    torch.ops.aten.to.dtype: _to_dtype,
-    torch.ops.aten.to.device: _to_device,
+    torch.ops.aten.to.dtype: lambda self, dtype, non_blocking=False, copy=False: opset20.Cast(self, to=dtype),
+    torch.ops.aten.to.device: lambda self, device, dtype, non_blocking=False, copy=False: opset20.Cast(self, to=dtype),
     torch.ops.aten.all.dim: _all,
     torch.ops.aten.where.self: _where,
     torch.ops.aten.index_select.default: _index_select,
-    torch.ops.aten.aminmax.default: _aminmax,
+    torch.ops.aten.aminmax.default: lambda self: (
+        opset20.ReduceMin(self, keepdims=0),
+        opset20.ReduceMax(self, keepdims=0),
+    ),
     torch.ops.aten.diff.default: _diff,
-    torch.ops.aten.index_add.default: _index_add,
-    torch.ops.aten.addcmul.default: _addcmul,
+    torch.ops.aten.index_add.default: lambda self, dim, index, source: opset20.ScatterElements(
+        self, index, source, axis=dim, reduction="add"
+    ),
+    torch.ops.aten.addcmul.default: lambda self, first, second: opset20.Add(self, opset20.Mul(first, second)),
     torch.ops.aten.index_copy.default: _index_copy,
     torch.ops.aten.detach_.default: lambda self: opset20.Identity(self),
     torch.ops.aten.__and__.Tensor: lambda self, other: opset20.And(self, other),

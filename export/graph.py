@@ -11,16 +11,15 @@ import torch.fx.config
 from torch import Tensor, nn
 from torch.fx.experimental import proxy_tensor
 
-from torchdof import BlurTable, DepthOfField
+from torchdof import DepthOfField
 from torchdof.module import blur
 from torchdof.optics.camera import Camera
 from torchdof.options import DepthEdges, Options
 from torchdof.render.ops import Ops
-from torchdof.render.plan import LayerKernel, Plan
+from torchdof.render.plan import Plan
 from torchdof.validation import choice
 
-from .operations import GraphOps
-from .whole import WholeOps
+from .operations import GraphOps, WholeOps
 
 __all__ = ["INPUTS", "LAYOUTS", "OUTPUT", "Layout", "Portable", "Size", "axes", "trace"]
 
@@ -70,17 +69,32 @@ class Portable(nn.Module):
     ) -> None:
         super().__init__()
         choice("inputs", inputs, INPUTS)
+        choice("layout", layout, LAYOUTS)
         for name in Camera.__dataclass_fields__:
             if isinstance(getattr(dof.camera, name), Tensor):
                 raise ValueError(
-                    f"the camera's {name} must be a float to be exported, got a tensor; "
-                    "focus_m and f_number are inputs "
-                    "of the graph, so any value does for them"
+                    f"the camera's {name} must be a float to be exported, got a tensor; focus_m and f_number are "
+                    "inputs of the graph, so any value does for them"
                 )
-        _check_layout(layout, size, depth_edges)
-        if size is not None and width is None and dof.options.table.unit != "relative":
-            width = size[1]
-        check_width(dof.options.table, width)
+        if size is not None and layout != "whole":
+            raise ValueError(f'size is for layout="whole"; tiles are for frames of any size, got size={size!r}')
+        if size is not None and (len(size) != 2 or any(not isinstance(n, int) or n < 1 for n in size)):
+            raise ValueError(f"size must be height and width of a frame in pixels, such as (1080, 1920), got {size!r}")
+        if layout == "whole" and depth_edges != "as given":
+            raise ValueError(
+                'layout="whole" cannot repair depth edges, whose number depends on the map; repair the map before, or '
+                f'use layout="tiles"; got depth_edges={depth_edges!r}'
+            )
+        table = dof.options.table
+        if table.unit == "relative" and width is not None:
+            raise ValueError(f"{table!r} has the same kernels at any image width; leave out width={width}")
+        if table.unit != "relative":
+            width = size[1] if width is None and size is not None else width
+            if isinstance(width, bool) or not isinstance(width, int) or width < 1:
+                raise ValueError(
+                    f"{table!r} holds lengths in {table.unit!r}, and the kernels in the file are those of one image "
+                    f"width; state it as width=1920, say, got {width!r}"
+                )
         self.inputs, self.width, self.layout, self.size = inputs, width, layout, size
         self.dof = copy.copy(dof)
         self.dof.options = dataclasses.replace(dof.options, check=False, depth_edges=depth_edges)
@@ -112,44 +126,6 @@ class Portable(nn.Module):
         focus_m, f_number = lens
         coc_px = self.dof.coc_as_given(image, map_, focus_m, f_number)
         return blur(image, coc_px, options, plan, ops=self.ops)
-
-    def layer_kernels(self, size: tuple[int, int]) -> list[LayerKernel]:
-        """Kernels of the graph's layers, for a frame of this height and width."""
-        coarse = self.dof.options.method == "layered"
-        return self.plan.layer_kernels(
-            self.dof.options.table, size, torch.float32, torch.device("cpu"), coarse, self.width
-        )
-
-
-def check_width(table: BlurTable, width: int | None) -> None:
-    """Raises an error for a width that the table does not need, or a missing width that it needs.
-
-    Raises:
-        ValueError: With the required change.
-    """
-    if table.unit == "relative":
-        if width is not None:
-            raise ValueError(f"{table!r} has the same kernels at any image width; leave out width={width}")
-    elif isinstance(width, bool) or not isinstance(width, int) or width < 1:
-        raise ValueError(
-            f"{table!r} holds lengths in {table.unit!r}, and the kernels in the file are those of one image width; "
-            f"state it as width=1920, say, got {width!r}"
-        )
-
-
-def _check_layout(layout: str, size: Size, depth_edges: DepthEdges) -> None:
-    """Raises an error for options that a layout does not support."""
-    choice("layout", layout, LAYOUTS)
-    if size is not None and layout != "whole":
-        raise ValueError(f'size is for layout="whole"; a graph of tiles takes frames of any size, got size={size!r}')
-    numbers = size if size is not None else (1, 1)
-    if len(numbers) != 2 or any(isinstance(n, bool) or not isinstance(n, int) or n < 1 for n in numbers):
-        raise ValueError(f"size must be the height and width of a frame in pixels, such as (1080, 1920), got {size!r}")
-    if layout == "whole" and depth_edges != "as given":
-        raise ValueError(
-            f'layout="whole" cannot repair depth edges, whose number depends on the map; repair the map before, or use '
-            f'layout="tiles"; got depth_edges={depth_edges!r}'
-        )
 
 
 def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:

@@ -22,11 +22,8 @@ def broadcast(model: onnx_ir.Model, inputs: str) -> onnx_ir.Model:
     inputs_in_order: list[Any] = list(graph.inputs)
     image, *others = inputs_in_order
     tape = Tape()
-    shape = tape.op("Shape", [image])
-    batch, channels, stop = (tape.op("Constant", [], {"value_ints": [n]}) for n in (0, 1, 4))
-    two = tape.op("Constant", [], {"value_ints": [2]})
-    items, size = tape.op("Slice", [shape, batch, channels]), tape.op("Slice", [shape, two, stop])
-    full = tape.op("Concat", [items, channels, size], {"axis": 0})
+    items, size = (tape.op("Shape", [image], {"start": a, "end": b}) for a, b in ((0, 1), (2, 4)))
+    full = tape.op("Concat", [items, tape.op("Constant", [], {"value_ints": [1]}), size], {"axis": 0})
     for value in others:
         is_map = value.name == INPUTS[inputs][1]
         hint = "one_item_or_as_many_as_image" + ("_and_its_height_and_width" if is_map else "")

@@ -8,13 +8,13 @@ from typing import Any
 
 import onnx
 
-from torchdof import BlurTable, DepthOfField
+from torchdof import DepthOfField
 from torchdof.io.memory import free_bytes
 from torchdof.optics.camera import Camera
 
 from .graph import OUTPUT, Portable
 
-__all__ = ["UNITS", "describe", "facts_of", "label", "load", "shown", "table_hash", "write_facts"]
+__all__ = ["UNITS", "describe", "facts_of", "label", "load", "settings", "shown", "write_facts"]
 
 PREFIX = "torchdof."
 _MAX_CHARACTERS, _MAX_VALUES = 2**16, 100  # limits: characters of one value, number of values
@@ -36,15 +36,11 @@ def label(model: onnx.ModelProto, dof: DepthOfField, portable: Portable, channel
     model.producer_name, model.producer_version = "torchdof", version("torchdof")
     model.doc_string = "Depth of field: an all-in-focus image and its depth in, the photograph of a real lens out."
     model.graph.name = "depth_of_field"
-    options = {k: v for k, v in dof.options.arguments().items() if k not in ("table", "check", "depth_edges")}
     facts: dict[str, Any] = {
         "version": model.producer_version,
         "inputs": {v.name: UNITS[v.name].format(channels=channels) for v in model.graph.input},
         "output": {OUTPUT: UNITS["image"].format(channels=channels)},
-        "camera": {k: getattr(dof.camera, k) for k in Camera.__dataclass_fields__},
-        "table": {"name": dof.options.table.name, "family": dof.options.table.family, "unit": dof.options.table.unit}
-        | {"sha256": table_hash(dof.options.table)},
-        "options": options,
+        **settings(dof),
         "depth_edges": portable.dof.options.depth_edges,
         "width": portable.width,
         "layout": portable.layout,
@@ -53,6 +49,17 @@ def label(model: onnx.ModelProto, dof: DepthOfField, portable: Portable, channel
         "opset": opset,
     }
     write_facts(model, facts)
+
+
+def settings(dof: DepthOfField) -> dict[str, dict[str, Any]]:
+    """Camera, table and options of a module, of those that are fixed in a file."""
+    table, options = dof.options.table, dof.options.arguments()
+    hashed = hashlib.sha256(json.dumps(table.to_dict(), sort_keys=True).encode()).hexdigest()
+    return {
+        "camera": {name: getattr(dof.camera, name) for name in Camera.__dataclass_fields__},
+        "table": {"name": table.name, "family": table.family, "unit": table.unit, "sha256": hashed},
+        "options": {name: v for name, v in options.items() if name not in ("table", "check", "depth_edges")},
+    }
 
 
 def write_facts(model: onnx.ModelProto, facts: dict[str, Any]) -> None:
@@ -137,8 +144,3 @@ def shown(text: str) -> str:
     """Untrusted text on one line: control characters escaped, and cut if it is long."""
     line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text[:_MAX_PRINTED])
     return line if len(text) <= _MAX_PRINTED else f"{line}... ({len(text)} characters)"
-
-
-def table_hash(table: BlurTable) -> str:
-    """SHA-256 of a table's content."""
-    return hashlib.sha256(json.dumps(table.to_dict(), sort_keys=True).encode()).hexdigest()

@@ -1,21 +1,22 @@
-"""The operations of an exported graph, in place of those of eager code (:mod:`torchdof.render.ops`)."""
+"""The operations of exported graphs, in place of those of eager code (:mod:`torchdof.render.ops`)."""
 
 from collections.abc import Callable, Sequence
 
 import torch
+import torch.nn.functional as functional
 from torch import Tensor
 
 from torchdof.optics.blur_table import BlurTable
+from torchdof.pixels import Selected
 from torchdof.render.ops import Level, Ops, Seen
 from torchdof.render.plan import Plan
 from torchdof.render.surfaces import Highlights, PaddedFrame
 
-from .lists import by_parts
-from .operators import choose
 from .rays import kernels_of, splat
-from .tiling import seen, side, tile_by_tile
+from .structure import choose
+from .tiling import by_parts, seen, side, tile_by_tile
 
-__all__ = ["GraphOps"]
+__all__ = ["GraphOps", "WholeOps"]
 
 
 class GraphOps(Ops):
@@ -69,3 +70,42 @@ class GraphOps(Ops):
     def render(self, frame: PaddedFrame, render: Callable[[PaddedFrame], Tensor]) -> Tensor:
         """A loop over tiles."""
         return tile_by_tile(frame, render, self)
+
+
+class WholeOps(Ops):
+    """Operations of a graph without control flow (``layout="whole"``), which renders all layers of the whole frame.
+
+    Runtimes on GPUs and in browsers compute loops, branches and lists of pixels on the CPU, or not at all. This graph
+    has none: it computes every pixel, also where a tiled graph skips work, and it has no rays of highlights.
+    """
+
+    channels = 32
+    has_rays = False
+
+    def select(self, mask: Tensor) -> Selected:
+        """All pixels; only those of the mask are changed."""
+        return _Everywhere(mask)
+
+
+class _Everywhere(Selected):
+    """All pixels of a map, P = B H W, as lists of values; :meth:`put` changes only those of the mask."""
+
+    def __init__(self, mask: Tensor) -> None:
+        self._mask = mask
+
+    def pick(self, values: Tensor) -> Tensor:
+        return values.transpose(0, 1).flatten(1)
+
+    def around(self, values: Tensor) -> Tensor:
+        padded = functional.pad(values, (1, 1, 1, 1), mode="replicate").transpose(0, 1).unsqueeze(1)
+        kept = [slice(first, first - 2 or None) for first in range(3)]
+        return torch.cat([padded[..., rows, columns] for rows in kept for columns in kept], 1).flatten(2)
+
+    def of_item(self, values: Tensor) -> Tensor:
+        height, width = self._mask.shape[-2:]
+        return values.t()[..., None].expand(-1, -1, height * width).flatten(1)
+
+    def put(self, values: Tensor, new: Tensor) -> Tensor:
+        batch, channels, height, width = values.shape
+        maps = new.reshape(channels, batch, height, width).transpose(0, 1)
+        return torch.where(self._mask, maps, values)

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import onnxscript
 
-from .operators import DOMAIN
+from .structure import DOMAIN
 
 if TYPE_CHECKING:  # the functions are not run as Python, and types differ
     from typing import Any

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import onnx
 import onnx_ir
-from onnx.reference import ReferenceEvaluator
 from onnx_ir.passes import common as passes
 from onnx_ir.tape import Tape
 from onnxscript.optimizer import fold_constants
@@ -20,6 +19,7 @@ __all__ = ["slim"]
 _WINDOW_DEFAULTS = {"pads": 0, "dilations": 1, "strides": 1}  # defaults of these attributes, for each axis
 _Pass = Callable[[onnx_ir.Model], object]
 
+_WHOLE_AXIS = 2**62  # ends of slices beyond it are those of an axis of any length
 _MAX_EQUAL = 64  # constants with more equal numbers than this are stored as a shape and a value
 
 
@@ -44,6 +44,8 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
     tidy: tuple[_Pass, ...] = (
         passes.RemoveUnusedNodesPass(),  # folding leaves sequences of a wrong type, which shape inference refuses
         passes.ShapeInferencePass(),
+        *((_share_sizes,) if straight else ()),
+        _join_slices,
         _convolve_averages,
         passes.IdentityEliminationPass(),
         passes.CommonSubexpressionEliminationPass(),
@@ -76,26 +78,67 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
     return model
 
 
-def _fold_weights(model: onnx_ir.Model) -> None:
-    """Makes constants of weights of convolutions that are larger than the other constants which are folded."""
-    for node in [node for node in model.graph if node.op_type == "Conv"]:
-        weight = node.inputs[1]
-        array = None if weight is None or weight.const_value is not None else _folded(weight)
-        if weight is not None and array is not None:
-            node.replace_input_with(1, _initializer(model.graph, array, f"{weight.name}_folded"))
+def _share_sizes(model: onnx_ir.Model) -> None:
+    """Reads sizes that several values have in common from the first of them; tracing gave equal sizes one name."""
+    first: dict[str, onnx_ir.Value] = {}
+    sizes: dict[Any, list[Any]] = {}  # names of the sizes that a value holds
+    for node in model.graph:
+        source: Any = node.inputs[0] if node.inputs else None
+        numbers = [_constant(value) for value in node.inputs[1:]]
+        if node.op_type == "Shape" and source.shape is not None:
+            ends = [node.attributes[name].as_int() if name in node.attributes else None for name in ("start", "end")]
+            held = list(source.shape)[slice(*ends)]
+        elif node.op_type == "Slice" and source in sizes and not any(n is None for n in numbers):
+            held = sizes[source][int(numbers[0][0]) : int(numbers[1][0])]
+        elif node.op_type == "Gather" and source in sizes and numbers[0] is not None:
+            held = [sizes[source][n] for n in numbers[0].flat]
+        else:
+            continue
+        output = node.outputs[0]
+        sizes[output] = held
+        key = f"{held} {output.shape}"
+        if "None" not in key:
+            output.replace_all_uses_with(first.setdefault(key, output))
 
 
-def _folded(value: onnx_ir.Value | None) -> np.ndarray | None:
-    """The numbers of a value that does not depend on the graph's inputs, else None."""
+def _join_slices(model: onnx_ir.Model) -> None:
+    """Makes one slice along several axes of slices in a row, and removes those that keep everything."""
+    for node in model.graph:
+        numbers = [_constant(value) for value in node.inputs[1:]]
+        if node.op_type != "Slice" or len(numbers) != 4 or any(n is None for n in numbers):
+            continue
+        source: Any = node.inputs[0]
+        if not numbers[0].any() and (numbers[1] > _WHOLE_AXIS).all() and (numbers[3] == 1).all():
+            node.outputs[0].replace_all_uses_with(source)
+            continue
+        before = source.producer()
+        others = [_constant(value) for value in before.inputs[1:]] if before and before.op_type == "Slice" else []
+        if len(others) != 4 or any(n is None for n in others) or min(*numbers[2], *others[2]) < 0:
+            continue
+        if not set(numbers[2]) & set(others[2]):
+            node.replace_input_with(0, before.inputs[0])
+            for index, pair in enumerate(zip(others, numbers, strict=True)):
+                name = f"{node.outputs[0].name}_{index}"
+                node.replace_input_with(1 + index, _initializer(model.graph, np.concatenate(pair), name))
+
+
+def _constant(value: onnx_ir.Value | None) -> Any:
+    """The numbers of a constant, else None."""
     tensor = None if value is None else onnx_ir.convenience.get_const_tensor(value)
-    node = None if value is None else value.producer()
-    if tensor is not None or node is None:
-        return None if tensor is None else tensor.numpy()
-    feed = {str(source.name): _folded(source) for source in node.inputs if source is not None}
-    if any(array is None for array in feed.values()):
-        return None
-    results: Any = ReferenceEvaluator(onnx_ir.to_proto(node)).run(None, feed)
-    return np.asarray(results[0])
+    return None if tensor is None else tensor.numpy()
+
+
+def _fold_weights(model: onnx_ir.Model) -> None:
+    """Makes constants of weights of convolutions, which are larger than the other constants that are folded."""
+    weights, makers = [node.inputs[1] for node in model.graph if node.op_type == "Conv"], set()
+    while weights:
+        weight = weights.pop()
+        maker = None if weight is None else weight.producer()
+        if maker is not None and maker not in makers:
+            makers.add(maker)
+            weights += maker.inputs
+    size = 2**24
+    fold_constants(model, input_size_limit=size, output_size_limit=size, should_fold=makers.__contains__)
 
 
 def _place_weights(model: onnx_ir.Model) -> None:

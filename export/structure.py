@@ -1,17 +1,46 @@
-"""Makes loops and branches of the placeholder operators in a traced graph (:mod:`.operators`).
+"""Loops and branches: placeholder operators in a traced graph, which is flat, and what becomes of them.
 
-Nodes that depend on a window become the body of a ``Loop`` over tiles. Nodes that only one side of a choice uses become
-that side's branch of an ``If``, and are computed only if it is taken.
+One operator numbers the steps of a loop, another collects their results: nodes that depend on a step become the body of
+a ``Loop``. A third chooses between two results: nodes that only one side of a choice uses become that side's branch of
+an ``If``, and are computed only if it is taken.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import onnx_ir
+import torch
 from onnx_ir.tape import Tape
+from torch import Tensor
 
-from .operators import CHOICE, COLLECT, DOMAIN, WINDOW
+__all__ = ["DOMAIN", "choose", "collect", "operator", "steps", "structure"]
 
-__all__ = ["structure"]
+DOMAIN = "torchdof"
+"""Domain of these operators; a finished file contains none."""
+
+_CHOICE, _STEP, _COLLECT = (f"{DOMAIN}::{name}" for name in ("Choice", "Step", "Collect"))
+"""``Choice(result, given, needed)``; ``Step(count)``, the number of a step from 0; ``Collect(result, step)``."""
+
+
+def choose(needed: Tensor, result: Tensor, given: Tensor) -> Tensor:
+    """A branch in the graph: ``result`` if ``needed`` (bool ``[]``) is true, else ``given``."""
+    return operator(_CHOICE, [result, given, needed], result.shape)
+
+
+def steps(count: Any) -> Tensor:
+    """Number of the current step in a loop of ``count`` steps, int64 ``[]``; what depends on it is computed there."""
+    return operator(_STEP, [torch.scalar_tensor(count, dtype=torch.int64)], ())
+
+
+def collect(step: Tensor, result: Tensor, count: int | torch.SymInt) -> Tensor:
+    """The results ``[1, ...]`` of all steps: ``[count, ...]``."""
+    return operator(_COLLECT, [result, step], (count, *result.shape[1:]))
+
+
+def operator(name: str, inputs: Sequence[Tensor], shape: Sequence[int | torch.SymInt]) -> Tensor:
+    """An operator of ONNX in a graph; its result has the dtype of its first input."""
+    return torch.onnx.ops.symbolic(name, inputs, dtype=inputs[0].dtype, shape=list(shape))
+
 
 _Owners = dict[Any, onnx_ir.Node]  # node that owns a subgraph
 
@@ -19,86 +48,50 @@ _Owners = dict[Any, onnx_ir.Node]  # node that owns a subgraph
 def structure(model: onnx_ir.Model) -> None:
     """Makes loops and branches of a flat graph, in place."""
     owners: _Owners = {a.as_graph(): n for n in model.graph for a in n.attributes.values() if _is_graph(a)}
-    for node in _ours(model.graph, COLLECT):
+    for node in _ours(model.graph, _COLLECT):
         _loop(model.graph, node, owners)
     _branches(model.graph, owners)
 
 
 def _ours(graph: onnx_ir.Graph, name: str) -> list[onnx_ir.Node]:
-    return [node for node in graph if node.domain == DOMAIN and node.op_type == name]
+    return [node for node in graph if f"{node.domain}::{node.op_type}" == name]
 
 
 def _loop(graph: onnx_ir.Graph, collect: onnx_ir.Node, owners: _Owners) -> None:
-    """Moves the nodes between windows and ``collect`` into the body of a loop that slices its windows from the frame.
-
-    1. Before the loop: number of tiles, from the frame's size.
-    2. In the body: slice each window at the tile's position, then compute the tile.
-    3. Replace ``collect`` by the loop's output.
-    """
-    windows, dependent, body_nodes = [], set(), []
+    """Moves the nodes between a step and ``collect`` into the body of a loop."""
+    inputs: list[Any] = list(collect.inputs)
+    result, step = inputs
+    dependent, body_nodes = {step.producer()}, []
     for node in graph:
-        if node is collect:
-            break
-        if node.domain == DOMAIN and node.op_type == WINDOW:
-            windows.append(node)
-            dependent.add(node)
-        elif any(v is not None and v.producer() in dependent for v in node.inputs):
+        if node is not collect and any(v is not None and v.producer() in dependent for v in node.inputs):
             dependent.add(node)
             body_nodes.append(node)
-    frame = windows[0].inputs[0]
-    tile: Any = collect.inputs[0]
-    side, margin = (windows[0].attributes[name].as_int() for name in ("side", "margin"))
-
-    outer = Tape()
-    shape = outer.op("Shape", [frame])
-    sizes = outer.op("Slice", [shape, _ints(outer, 2), _ints(outer, 4)])
-    counts = outer.op("Div", [outer.op("Sub", [sizes, _ints(outer, 2 * margin)]), _ints(outer, side)])
-    batch = outer.op("Slice", [shape, _ints(outer, 0), _ints(outer, 1)])
-    grid = outer.op("Concat", [batch, counts], {"axis": 0})  # items, rows, columns
-    total = outer.op("ReduceProd", [grid], {"keepdims": 0})
-    rows = outer.op("Slice", [grid, _ints(outer, 1), _ints(outer, 2)])
-    columns = outer.op("Slice", [grid, _ints(outer, 2), _ints(outer, 3)])
-    true = outer.op("Constant", [], {"value": onnx_ir.tensor(True)})
-
-    step = _value("step", onnx_ir.DataType.INT64, [])
-    keep_going = _value("going", onnx_ir.DataType.BOOL, [])
-    inner = Tape()
-    line = inner.op("Div", [step, columns])
-    position = [inner.op("Div", [line, rows]), inner.op("Mod", [line, rows]), inner.op("Mod", [step, columns])]
-    tile_position = inner.op("Concat", position, {"axis": 0})
-    for window in windows:
-        side, margin = (window.attributes[name].as_int() for name in ("side", "margin"))
-        start = inner.op("Mul", [tile_position, _ints(inner, 1, side, side)])
-        stop = inner.op("Add", [start, _ints(inner, 1, side + 2 * margin, side + 2 * margin)])
-        sliced = inner.op("Slice", [window.inputs[0], start, stop, _ints(inner, 0, 2, 3)])
-        # runtimes do not know the size of a slice, and use fast convolutions only for known sizes
-        size = window.outputs[0].shape
-        cut = inner.op("Reshape", [sliced, _ints(inner, *(size.numpy() if size else ()))])
-        window.outputs[0].replace_all_uses_with(cut)
     for node in body_nodes:
         graph.remove(node)
+    number, keep_going = _value("step", onnx_ir.DataType.INT64), _value("going", onnx_ir.DataType.BOOL)
+    step.replace_all_uses_with(number)
+    inner, outer = Tape(), Tape()
     condition = inner.op("Identity", [keep_going])
-    last = Tape()
-    squeezed = last.op("Squeeze", [tile, _ints(last, 0)])
-    nodes = [*inner.nodes, *body_nodes, *last.nodes]
+    squeezed = inner.op("Squeeze", [result, inner.op("Constant", [], {"value_ints": [0]})])
     _type(condition, onnx_ir.DataType.BOOL, [])
-    _type(squeezed, tile.dtype, tile.shape[1:])
-    body = onnx_ir.Graph([step, keep_going], [condition, squeezed], nodes=nodes, name="tile")
-    loop = onnx_ir.node("Loop", [total, true], {"body": body})
+    _type(squeezed, result.dtype, result.shape[1:])
+    nodes = [*body_nodes, *inner.nodes]
+    body = onnx_ir.Graph([number, keep_going], [condition, squeezed], nodes=nodes, name="step")
+    true = outer.op("Constant", [], {"value": onnx_ir.tensor(True)})
+    loop = onnx_ir.node("Loop", [step.producer().inputs[0], true], {"body": body})
     graph.insert_before(collect, [*outer.nodes, loop])
     owners[body] = loop
     _replace(graph, collect, loop)
-    for window in windows:
-        graph.remove(window, safe=True)
+    graph.remove(step.producer(), safe=True)
 
 
 def _branches(graph: onnx_ir.Graph, owners: _Owners) -> None:
     """Makes an ``If`` of each choice in a graph, outermost first, then of those in its branches and loops."""
     subgraphs: list[onnx_ir.Graph] = []
-    while choices := _ours(graph, CHOICE):
+    while choices := _ours(graph, _CHOICE):
         choice = choices[-1]
-        branches = [_branch(graph, choice, index, owners) for index in (1, 2)]
-        if_node = onnx_ir.node("If", [choice.inputs[0]], {"then_branch": branches[0], "else_branch": branches[1]})
+        branches = [_branch(graph, choice, index, owners) for index in (0, 1)]
+        if_node = onnx_ir.node("If", [choice.inputs[2]], {"then_branch": branches[0], "else_branch": branches[1]})
         for branch in branches:
             owners[branch] = if_node
         graph.insert_before(choice, [if_node])
@@ -161,12 +154,8 @@ def _replace(graph: onnx_ir.Graph, old: onnx_ir.Node, new: onnx_ir.Node) -> None
     graph.remove(old, safe=True)
 
 
-def _ints(tape: Tape, *values: int) -> onnx_ir.Value:
-    return tape.op("Constant", [], {"value_ints": values})
-
-
-def _value(name: str, kind: onnx_ir.DataType, shape: list[int]) -> onnx_ir.Value:
-    return onnx_ir.Value(name=name, shape=onnx_ir.Shape(shape), type=onnx_ir.TensorType(kind))
+def _value(name: str, kind: onnx_ir.DataType) -> onnx_ir.Value:
+    return onnx_ir.Value(name=name, shape=onnx_ir.Shape([]), type=onnx_ir.TensorType(kind))
 
 
 def _type(value: onnx_ir.Value, kind: onnx_ir.DataType, shape: Any) -> None:

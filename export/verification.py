@@ -4,7 +4,6 @@ import dataclasses
 import os
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import numpy as np
 import onnx
@@ -19,7 +18,7 @@ from torchdof.reference import metrics
 from .cases import Case, cases
 from .graph import INPUTS, OUTPUT, Portable
 from .interface import ITEMS
-from .metadata import facts_of, load, table_hash
+from .metadata import facts_of, load, settings
 
 __all__ = ["TOLERANCE", "CaseComparison", "Verification", "check_format", "session", "verify"]
 
@@ -169,7 +168,9 @@ def _compare(runner: onnxruntime.InferenceSession, portable: Portable, case: Cas
     if got.dtype != np.float32 or got.shape != tuple(expected.shape):
         raise ValueError(f"{case.name}: expected float32 {list(expected.shape)}, got {got.dtype} {list(got.shape)}")
     # coarse layers average light over their pixels before blurring it
-    kernels = portable.layer_kernels((int(expected.shape[2]), int(expected.shape[3])))
+    options, size = portable.dof.options, (int(expected.shape[2]), int(expected.shape[3]))
+    how = (torch.float32, torch.device("cpu"), options.method == "layered", portable.width)
+    kernels = portable.plan.layer_kernels(options.table, size, *how)
     reach = max(kernel.halo + kernel.scale - 1 for kernel in kernels)
     light_range = local_range(case.tensors[0], min(reach, max(expected.shape[-2:])))
     error = (torch.from_numpy(got) - expected).abs() / light_range.clamp_min(torch.finfo(torch.float32).tiny)
@@ -212,15 +213,10 @@ def _tensors(graph: onnx.GraphProto) -> Iterator[onnx.TensorProto]:
 
 def _check_origin(facts: dict, dof: DepthOfField) -> None:
     """Raises an error if a file was made from another table, options or camera than the module's."""
-    if facts["table"]["sha256"] != table_hash(dof.options.table):
-        raise ValueError(f"the file was made with the table {facts['table']}, the module has {dof.options.table!r}")
-    options: dict[str, Any] = {**dof.options.arguments()}
-    for name, value in facts["options"].items():
-        if options[name] != value:
-            raise ValueError(f"the file was made with {name}={value!r}, the module has {options[name]!r}")
-    for name in ("focal_length_mm", "sensor_width_mm", "focus_breathing"):
-        if facts["camera"][name] != getattr(dof.camera, name):
-            raise ValueError(f"the file's camera has {name}={facts['camera'][name]!r}, the module's {dof.camera!r}")
+    for kind, own in settings(dof).items():
+        for name, value in facts[kind].items():
+            if own[name] != value and name not in ("focus_m", "f_number"):  # which are inputs of the graph
+                raise ValueError(f"the file was made with {kind} {name}={value!r}, the module has {own[name]!r}")
 
 
 def _check_interface(model: onnx.ModelProto, portable: Portable) -> int:

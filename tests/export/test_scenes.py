@@ -11,8 +11,7 @@ from torch import Tensor
 
 from tests.exported import SIZES
 from torchdof import BlurTable
-from torchdof.export import ray_splats
-from torchdof.export.rays import kernels_of
+from torchdof.export import rays
 from torchdof.export.verification import TOLERANCE, local_range
 from torchdof.reference.scenes import read_scenes
 from torchdof.render.plan import Plan
@@ -21,25 +20,19 @@ DATA = Path(__file__).parents[1] / "data" / "scenes"
 SIZE = SIZES["fold"]
 
 
-def inputs(name: str, max_coc_px: float) -> tuple[Tensor, ...]:
-    """Image, depth and focus of a part of a scene, and the largest CoC that its file can render, in px."""
-    scene = {scene.name: scene for scene in read_scenes(DATA)}[name]
-    image, depth = (t[..., : SIZE[0], : SIZE[1]].contiguous() for t in (scene.image[:, :3], scene.depth))
-    camera = scene.camera.replace(focus_m=float(depth.median()), f_number=1.0)
-    return image, depth, torch.tensor([float(camera.focus_m)]), torch.tensor([max_coc_px])
-
-
 SCENES = ["highlights/0", "planes/0", "room/1"]
 
 
 def compared(exported: Any, name: str) -> tuple[tuple[Tensor, ...], Tensor, Tensor]:
-    """Inputs of a scene, its eager picture, and the local range of light that errors are divided by.
+    """Inputs of a part of a scene, its eager picture, and the local range of light that errors are divided by.
 
     The f-number is the one at which the scene's largest circle of confusion is the file's largest.
     """
-    image, depth, focus, reach = inputs(name, exported.dof.options.max_coc_px)
+    scene = {scene.name: scene for scene in read_scenes(DATA)}[name]
+    image, depth = (t[..., : SIZE[0], : SIZE[1]].contiguous() for t in (scene.image[:, :3], scene.depth))
+    focus = depth.median().reshape(1)
     camera = exported.dof.camera.replace(focus_m=float(focus), f_number=1.0)
-    f_number = camera.coc_px(depth, SIZE[1]).abs().amax().reshape(1) / reach
+    f_number = camera.coc_px(depth, SIZE[1]).abs().amax().reshape(1) / exported.dof.options.max_coc_px
     tensors = (image, depth, focus, f_number)
     eager = exported.eager(*tensors)
     assert float((eager - image).abs().max()) > 0.05, "nothing is blurred"
@@ -81,8 +74,8 @@ def test_kernels_of_a_file_equal_those_of_its_table(shape: str) -> None:
     made = {"disc": BlurTable.disc, "polygon": lambda: BlurTable.polygon(blades=5, rotation_deg=10.0)}
     table = made[shape]() if shape in made else BlurTable.load(shape)
     plan = Plan.static(3.0, 1 / 255, rays=True)
-    values, origins, halves, is_round, per_px, *_ = kernels_of(table, plan, 1)
-    values_at: Any = ray_splats.values_at
+    values, origins, halves, is_round, per_px, *_ = rays.kernels_of(table, plan, 1)
+    values_at: Any = rays.values_at
     for coc_px in (-2.75, 0.5, 3.0):
         expected = table.kernels(torch.tensor([coc_px]), 1).float()[0, :, None]
         half = expected.shape[-1] // 2 + 2  # 2 px of zeros around the kernel

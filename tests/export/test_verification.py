@@ -27,11 +27,11 @@ def save(model: onnx.ModelProto, folder: Path) -> Path:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"tolerance": 0.01}, "made with tolerance="),
-        ({"max_coc_px": 5.0}, "made with max_coc_px="),
-        ({"occlusion": True}, "made with occlusion="),
-        ({"table": torchdof.BlurTable.gaussian()}, "made with the table"),
-        ({"camera": torchdof.Camera()}, "camera has"),
+        ({"tolerance": 0.01}, "made with options tolerance="),
+        ({"max_coc_px": 5.0}, "made with options max_coc_px="),
+        ({"occlusion": True}, "made with options occlusion="),
+        ({"table": torchdof.BlurTable.gaussian()}, "made with table name="),
+        ({"camera": torchdof.Camera()}, "made with camera "),
     ],
 )
 def test_another_module_is_refused(plain: Any, change: dict[str, Any], message: str) -> None:

@@ -14,8 +14,8 @@ from tests.exported import CAMERA
 from torchdof import BlurTable
 from torchdof.export import chain, describe, to_onnx, verify
 from torchdof.export.graph import Portable
+from torchdof.export.operations import WholeOps
 from torchdof.export.verification import session
-from torchdof.export.whole import WholeOps
 from torchdof.render.matting import matte
 from torchdof.render.plan import Plan
 

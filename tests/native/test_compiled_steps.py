@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
@@ -85,17 +86,23 @@ def difference(values: Tensor, other: Tensor) -> float:
     return float((values - other).norm() / other.norm())
 
 
+def assert_both_engines_agree(
+    computed: Callable[[], Sequence[Tensor]], of_step: list[Any], most: Sequence[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The compiled engine computes a gradient for each of two items; the plain engine's results are the same."""
+    found = computed()
+    assert len(of_step) == 2
+    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
+    for ours, plain, limit in zip(found, computed(), most, strict=True):
+        assert difference(ours, plain) < limit
+    assert len(of_step) == 2
+
+
 @pytest.mark.parametrize("name", WAYS)
 def test_pictures_and_gradients_equal_the_plain_engines(
     name: str, calls: dict[str, list[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = rendered(WAYS[name])
-    assert len(calls["blend"]) == 2, "the compiled engine computes the gradient of both items"
-    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
-    plain = rendered(WAYS[name])
-    assert len(calls["blend"]) == 2, "and the plain one computes it alone"
-    for ours, other, most in zip(found, plain, (1e-6, 1e-5, 5e-5), strict=True):
-        assert difference(ours, other) < most
+    assert_both_engines_agree(lambda: rendered(WAYS[name]), calls["blend"], (1e-6, 1e-5, 5e-5), monkeypatch)
 
 
 @pytest.mark.parametrize("step", STEPS)
@@ -181,11 +188,7 @@ def test_surfaces_behind_and_their_gradients_equal_the_plain_engines(
         out = torch.cat(disocclusion._seen(given, leaves[0]), 1)
         return [out.detach(), *torch.autograd.grad((out * seen).sum(), leaves)]
 
-    found = looked()
-    assert len(calls["look_behind"]) == 2
-    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
-    for ours, plain in zip(found, looked(), strict=True):
-        assert difference(ours, plain) < 1e-4
+    assert_both_engines_agree(looked, calls["look_behind"], [1e-4] * 5, monkeypatch)
 
 
 def edges(channels: int, hole: bool) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -217,8 +220,4 @@ def test_the_finest_level_and_its_gradients_equal_the_plain_engines(
         seen = torch.rand(out.shape, generator=torch.Generator().manual_seed(1)) - 0.3
         return [out.detach(), *torch.autograd.grad((out * seen).sum(), leaves)]
 
-    found = computed()
-    assert len(calls["farthest"]) == 2
-    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
-    for ours, plain in zip(found, computed(), strict=True):
-        assert difference(ours, plain) < 1e-4
+    assert_both_engines_agree(computed, calls["farthest"], [1e-4] * 6, monkeypatch)

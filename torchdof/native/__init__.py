@@ -8,6 +8,7 @@ Tensors are float32. Every computation uses as many threads as PyTorch does, giv
 and raises ``MemoryError`` if there is not enough memory.
 """
 
+import concurrent.futures
 import ctypes
 import functools
 import importlib.resources
@@ -17,7 +18,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -26,16 +27,10 @@ Kind = Literal["image", "background", "stack"]
 """Meaning of the surfaces: one image; an image and the background behind it; any number of surfaces that cover each
 other, near to far."""
 
-HALF_LARGEST = 256
-"""Largest half width of a kernel, in pixels of its layer; larger kernels need the PyTorch engine."""
+HALF_LARGEST = 256  # largest half width of a kernel, in pixels of its layer; PyTorch blurs with larger ones
+MOST_LEVELS = 4  # most levels of look_behind
+MOST_PLANES = 16  # most channels of light and kernels' colours together in blend
 
-MOST_LEVELS = 4
-"""Most levels of :func:`look_behind`."""
-
-MOST_PLANES = 16
-"""Most channels of light and kernels' colours together in :func:`blend`."""
-
-_KINDS: dict[Kind, int] = {"image": 0, "background": 1, "stack": 2}
 _SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
 _SMALL_FRAME = 2**16  # pixels; up to this size the main thread renders itself, which saves 0.1 ms
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
@@ -53,113 +48,82 @@ fourth is not used."""
 
 
 class Spots(NamedTuple):
-    """Recipe for the kernels of n circles of confusion and C colours, as plain numbers because n is small.
+    """Recipe for the kernels of n circles of confusion and C colours, as plain numbers because n is small."""
 
-    Args:
-        templates: Cells of the templates in use, each ``[C, 2 cells + 3, 2 cells + 3]``, float32.
-        which: Four indices into ``templates`` for each kernel: node below and above, and both of the next finer level.
-        part: Weight of the node above, in [0, 1].
-        finer: Weight of the finer level, in [0, 1].
-        reach: Radius of the PSF in pixels, C for each kernel.
-        fade: Weight of the kernel against a single pixel, in [0, 1], C for each kernel.
-        flipped: Whether the kernel is point-reflected.
-        half: Half width of each kernel in pixels; light beyond it is cut off.
-        moves: Zeros to add to ``part`` ``[n]`` and ``reach`` ``[n, C]``, through which gradients flow to the coc; None
-            without gradients. The engine ignores them.
-    """
-
-    templates: list[Tensor]
-    which: list[tuple[int, int, int, int]]
-    part: list[float]
-    finer: list[float]
-    reach: list[list[float]]
-    fade: list[list[float]]
-    flipped: list[bool]
-    half: list[int]
+    templates: list[Tensor]  # those in use, each [C, 2 cells + 3, 2 cells + 3], float32
+    which: list[tuple[int, int, int, int]]  # their indices: node below and above, and both of the next finer level
+    part: list[float]  # weight of the node above, in [0, 1]
+    finer: list[float]  # weight of the finer level, in [0, 1]
+    reach: list[list[float]]  # radius of the PSF in pixels, C for each kernel
+    fade: list[list[float]]  # weight of the kernel against a single pixel, in [0, 1], C for each kernel
+    flipped: list[bool]  # whether the kernel is point-reflected
+    half: list[int]  # half width of each kernel in pixels; light beyond it is cut off
     moves: tuple[Tensor, Tensor] | None
+    """Zeros to add to ``part`` ``[n]`` and ``reach`` ``[n, C]``, through which gradients flow to the coc; None without
+    gradients. The engine ignores them."""
 
 
-# Types of ``src/api.h``. Data are pointers to numbers, Arrays those to the data of several tensors.
-_Int, _Real, _Double, _Data = ctypes.c_int32, ctypes.c_float, ctypes.c_double, ctypes.c_void_p
-_Ints, _Reals, _Doubles = ctypes.POINTER(_Int), ctypes.POINTER(_Real), ctypes.POINTER(_Double)
-_Arrays = ctypes.POINTER(_Data)
-
-
-def _fields(*groups: tuple[Any, str]) -> list[tuple[str, Any]]:
-    """Fields of a structure from groups of one type and the names that have it."""
-    return [(name, kind) for kind, names in groups for name in names.split()]
-
-
-_LAYERS = (
-    (_Int, "layers"),
-    (_Doubles, "nodes"),
-    (_Ints, "scales halves"),
-    (_Int, "kernel_colours"),
-    (_Data, "kernels"),
-)
-"""Fields of the structures that have layers, see :func:`_of_layers`."""
-
-
-class _FieldMask(ctypes.Structure):
-    _fields_ = _fields((_Data, "values boxes"), (_Real, "radius"), (_Int, "colours rows columns"))
-
-
-class _Spots(ctypes.Structure):
-    _fields_ = _fields(
-        *((_Int, "count colours"), (_Arrays, "templates"), (_Ints, "cells index")),
-        *((_Doubles, "part finer reach fade"), (_Ints, "flipped half"), (_Double, "squeeze"), (_Int, "round even")),
-    )
-
-
-class _Scene(ctypes.Structure):
-    _fields_ = _fields(
-        *((_Int, "height width channels kind surfaces"), (_Arrays, "light coc weight")),
-        *((_Int, "occlusion normalize masked highlights"), (_Real, "crisp_px reach"), *_LAYERS),
-        *((ctypes.POINTER(_FieldMask), "field_masks"), (_Int, "distances"), (_Real, "squeeze")),
-        *((_Int, "threads"), (_Ints, "cancelled")),
-    )
-
-
-class _Map(ctypes.Structure):
-    _fields_ = _fields(
-        *((_Int, "height width channels"), (_Data, "light nearness"), (_Int, "of_coc"), (_Data, "steps")),
-        *((_Real, "step"), (_Int, "automatic threads"), (_Ints, "cancelled"), (_Data, "out")),
-    )
-
-
-class _Layers(ctypes.Structure):
-    _fields_ = _fields(
-        *((_Int, "rows columns margin height width channels surfaces"), (_Arrays, "light place weight")),
-        *((_Int, "occlusion backed"), *_LAYERS, (_Int, "threads"), (_Ints, "cancelled")),
-    )
-
-
-class _Level(ctypes.Structure):
-    _fields_ = _fields((_Data, "values"), (_Int, "rows columns step"), (_Real, "least_px slope most"))
-
-
-_LEVELS = (ctypes.POINTER(_Level), _Int, _Int, _Data, _Int, _Int, _Int)
-_ARGUMENTS: dict[str, tuple[Any, ...]] = {
-    "begin": (ctypes.POINTER(_Scene), _Arrays),
-    "radii": (_Data, ctypes.POINTER(_Ints)),
-    "finish": (_Data, _Arrays, _Ints, ctypes.POINTER(_FieldMask), _Int, _Data),
-    "free": (_Data,),
-    "convolve": (_Data, _Int, _Int, _Data, _Int, _Data),
-    "repair_edges": (ctypes.POINTER(_Map), _Ints),
-    "blend": (ctypes.POINTER(_Layers), _Data),
-    "blend_gradient": (ctypes.POINTER(_Layers), _Data, _Arrays, _Arrays, _Arrays),
-    "farthest": (_Arrays, *[_Int] * 6, _Data),
-    "farthest_gradient": (_Arrays, *[_Int] * 6, _Data, _Arrays),
-    "look_behind": (*_LEVELS, _Data),
-    "look_behind_gradient": (*_LEVELS, _Data, _Arrays, _Data),
-    "coc": (_Data, ctypes.c_int64, _Real, _Real, _Real, _Int, _Data),
-    "plan": (_Data, _Int, _Int, _Int, _Doubles, _Int, _Doubles, _Int, _Ints),
-    "kernels": (ctypes.POINTER(_Spots), _Int, _Arrays),
-    "ends": (_Data, ctypes.c_int64, _Int, _Reals, _Reals),
-    "instructions": (),
-    "use": (ctypes.c_char_p,),
+_TYPES: dict[str, Any] = {
+    **{"int": ctypes.c_int32, "long": ctypes.c_int64, "real": ctypes.c_float, "double": ctypes.c_double},
+    **{"data": ctypes.c_void_p, "text": ctypes.c_char_p, "nothing": None},
 }
-_RESULTS = {"radii": ctypes.c_int64, "free": None, "convolve": None, "instructions": ctypes.c_char_p}  # others: int32
+_LAYERS = "int layers, double* nodes, int* scales halves, int kernel_colours, data kernels"
+_STRUCTURES = {
+    "field_mask": "data values boxes, real radius, int colours rows columns",
+    "spots": "int count colours, data* templates, int* cells index, double* part finer reach fade, int* flipped half, "
+    "double squeeze, int round even",
+    "scene": "int height width channels kind surfaces, data* light coc weight, int occlusion normalize masked, "
+    f"int highlights, real crisp_px reach, {_LAYERS}, field_mask* field_masks, int distances, real squeeze, "
+    "int threads, int* cancelled",
+    "map": "int height width channels, data light nearness, int of_coc, data steps, real step, int automatic threads, "
+    "int* cancelled, data out",
+    "layers": "int rows columns margin height width channels surfaces, data* light place weight, int occlusion backed, "
+    f"{_LAYERS}, int threads, int* cancelled",
+    "level": "data values, int rows columns step, real least_px slope most",
+}
+"""Structures of ``src/api.h``: types with the fields that have them. Data are pointers to numbers."""
+
+_LEVELS = "level* int int data int int int"
+_FUNCTIONS = {
+    "begin": "int scene* data*",
+    "radii": "long data int**",
+    "finish": "int data data* int* field_mask* int data",
+    "free": "nothing data",
+    "convolve": "nothing data int int data int data",
+    "repair_edges": "int map* int*",
+    "blend": "int layers* data",
+    "blend_gradient": "int layers* data data* data* data*",
+    "farthest": "int data* int int int int int int data",
+    "farthest_gradient": "int data* int int int int int int data data*",
+    "look_behind": f"int {_LEVELS} data",
+    "look_behind_gradient": f"int {_LEVELS} data data* data",
+    "coc": "int data long real real real int data",
+    "plan": "int data int int int double* int double* int int*",
+    "kernels": "int spots* int data*",
+    "ends": "int data long int real* real*",
+    "interface": "long",
+    "instructions": "text",
+    "use": "int text",
+}
+"""Functions of ``src/api.h``: types of the result and of the arguments."""
+
+
+class _Structure(ctypes.Structure):
+    """A structure made of a value for each field, which it keeps in memory."""
+
+    def __init__(self, *values: Any) -> None:
+        self.kept = _contiguous(values)
+        super().__init__(*(_plain(field[1], value) for field, value in zip(self._fields_, self.kept, strict=True)))
+
+
+def _type(name: str) -> Any:
+    return ctypes.POINTER(_type(name[:-1])) if name.endswith("*") else _TYPES[name]
+
+
+for _name, _groups in _STRUCTURES.items():
+    _of_type = (group.split() for group in _groups.split(", "))
+    _fields = [(field, _type(kind)) for kind, *fields in _of_type for field in fields]
+    _TYPES[_name] = type(_name, (_Structure,), {"_fields_": _fields})
 
 
 def chosen() -> bool:
@@ -221,49 +185,33 @@ def render(
     2. Make these kernels and their field masks.
     3. Finish: the engine composites the layers and splats the highlights.
 
-    Args:
-        surfaces: Surfaces of the scene.
-        kind: Meaning of the surfaces.
-        nodes: Positions of the layers on the blur axis, near to far.
-        layers: Kernel ``[1 or C, k, k]`` and pixel size of each layer.
-        psfs: Kernels ``[1 or C, k, k]`` for signed radii of highlights, in steps of 1/32 pixel.
-        occlusion: As in :class:`torchdof.DepthOfField`.
-        normalize: As in :class:`torchdof.DepthOfField`.
-        masked: Whether values may be NaN or infinite; such pixels are copied.
-        highlights: Whether highlights are rendered ray by ray where layers would soften them.
-        crisp_px: Blur in pixels above which layers soften highlights.
-        reach: Radius of the widest kernel divided by the radius of its disc, at least 1.
-        field_masks: Transmittance of the field for each layer, contiguous; empty if the lens has no field.
-        ray_masks: The same for highlights, as ``psfs``, in ascending order of radius.
-        squeeze: Height of the blur divided by its width.
+    Arguments are the fields of ``torchdof_scene``, with a kernel ``[1 or C, k, k]`` and a pixel size for each layer.
+    ``psfs`` and ``ray_masks`` make such kernels and their field masks for the signed radii of highlights, ascending,
+    in steps of 1/32 pixel. Without a field of the lens, there are no ``field_masks``.
 
     Raises:
         OverflowError: If an image's light exceeds 2^28, whose square sums could overflow; scale it down.
     """
-    maps = [[None if t is None else t.float().contiguous() for t in each] for each in zip(*surfaces, strict=True)]
-    of_layers, _kernels = _of_layers(nodes, layers)
-    cancelled = ctypes.c_int32(0)
-    channels, height, width = surfaces[0][0].shape
-    how = (occlusion, normalize, masked, highlights, crisp_px, reach, *of_layers)
-    field = (_field_masks(field_masks), field_masks[0][0].shape[1]) if field_masks else (None, 0)
-    threads = torch.get_num_threads()
-    size = (height, width, channels, _KINDS[kind], len(surfaces))
-    scene = _Scene(*size, *map(_pointers, maps), *how, *field, squeeze, threads, ctypes.pointer(cancelled))
-    out = torch.empty(channels, height, width, dtype=torch.float32, device="cpu")
+    cancelled, (channels, height, width) = ctypes.c_int32(0), surfaces[0][0].shape
+    scene = _TYPES["scene"](
+        *(height, width, channels, get_args(Kind).index(kind), len(surfaces), *_maps(surfaces)),
+        *(occlusion, normalize, masked, highlights, crisp_px, reach, *_of_layers(nodes, layers)),
+        *(_field_masks(field_masks), field_masks[0][0].shape[1] if field_masks else 0, squeeze),
+        *(torch.get_num_threads(), ctypes.pointer(cancelled)),
+    )
+    out = _empty(channels, height, width)
 
     def run() -> None:
-        engine, job = _engine(), ctypes.c_void_p()
+        job, steps = ctypes.c_void_p(), ctypes.POINTER(ctypes.c_int32)()
         try:
-            _run("begin", ctypes.byref(scene), ctypes.byref(job))
-            steps = ctypes.POINTER(ctypes.c_int32)()
-            count = engine.torchdof_radii(job, ctypes.byref(steps))
-            rays = [psf.contiguous() for psf in psfs(steps[:count])] if count else []
-            halves = _array(ctypes.c_int32, max(1, count))(*(psf.shape[-1] // 2 for psf in rays))
-            spots = ray_masks(steps[:count]) if count and field_masks else []
-            of_rays = _field_masks(spots) if spots else None
-            _run("finish", job, _pointers(rays), halves, of_rays, len(spots), out.data_ptr())
+            _run("begin", scene, job)
+            count = _engine().torchdof_radii(job, steps)
+            rays = [*psfs(steps[:count])] if count else []
+            masks = ray_masks(steps[:count]) if count and field_masks else []
+            halves = [psf.shape[-1] // 2 for psf in rays]
+            _run("finish", job, rays, halves, _field_masks(masks), len(masks), out)
         finally:
-            engine.torchdof_free(job)
+            _engine().torchdof_free(job)
 
     _interruptible(run, cancelled, height * width)
     return out
@@ -275,23 +223,17 @@ def blend(surfaces: Sequence[Surface], *frame: Any) -> Tensor:
     Arguments are those of :func:`_layers_of`. The result ``[planes, height, width]`` is light, then coverage or
     transmittance of each colour of the kernels (or, without occlusion, the sum of weights).
     """
-    scene, _memory = _layers_of(surfaces, *frame)
-    planes, size = scene.channels + scene.kernel_colours, (scene.height, scene.width)
-    out = torch.empty(planes, *size, dtype=torch.float32, device="cpu")
-    run = functools.partial(_run, "blend", ctypes.byref(scene), out.data_ptr())
-    _interruptible(run, scene.cancelled.contents, scene.rows * scene.columns)
+    scene = _layers_of(surfaces, *frame)
+    out = _empty(scene.channels + scene.kernel_colours, scene.height, scene.width)
+    _interruptible(lambda: _run("blend", scene, out), scene.cancelled.contents, scene.rows * scene.columns)
     return out
 
 
 def blend_gradient(gradient: Tensor, surfaces: Sequence[Surface], *frame: Any) -> list[Tensor]:
     """The gradients of :func:`blend` by each map of its surfaces that is given, surface by surface."""
-    (scene, _memory), gradient = _layers_of(surfaces, *frame), gradient.contiguous()
-    sums = [
-        [None if t is None else torch.zeros_like(t, memory_format=torch.contiguous_format) for t in each]
-        for each in zip(*surfaces, strict=True)
-    ]
-    arguments = (ctypes.byref(scene), gradient.data_ptr(), *map(_pointers, sums))
-    run = functools.partial(_run, "blend_gradient", *arguments)
+    scene = _layers_of(surfaces, *frame)
+    sums = [[None if t is None else _empty(*t.shape).zero_() for t in maps] for maps in zip(*surfaces, strict=True)]
+    run = functools.partial(_run, "blend_gradient", scene, gradient, *sums)
     _interruptible(run, scene.cancelled.contents, scene.rows * scene.columns)
     return [t for of_surface in zip(*sums, strict=True) for t in of_surface if t is not None]
 
@@ -304,40 +246,31 @@ def _layers_of(
     layers: Sequence[tuple[Tensor, int]],
     occlusion: bool,
     backed: bool,
-) -> tuple[_Layers, list[Any]]:
-    """The structure for :func:`blend`, and the memory to which it points.
-
-    Args:
-        surfaces: One, or two that share each pixel, with places on the blur axis instead of the coc.
-        margin: Pixels of the maps before the picture.
-        area: Height and width of the picture. They, the margin and the maps' sizes are multiples of all pixel sizes.
-        nodes: Positions of the layers on the blur axis, near to far.
-        layers: Kernel ``[1 or C, k, k]`` and pixel size of each layer.
-        occlusion: Whether layers occlude each other; otherwise their light and weights are added.
-        backed: Whether the transmittance of all layers is computed, not their coverage.
-    """
-    maps = [[None if t is None else t.contiguous() for t in each] for each in zip(*surfaces, strict=True)]
-    of_layers, kernels = _of_layers(nodes, layers)
+) -> Any:
+    """``torchdof_layers`` for :func:`blend`; ``area`` is the picture's height and width."""
     channels, rows, columns = surfaces[0][0].shape
     size = (rows, columns, margin, *area, channels, len(surfaces))
-    how = (occlusion, backed, *of_layers, torch.get_num_threads(), ctypes.pointer(ctypes.c_int32(0)))
-    return _Layers(*size, *map(_pointers, maps), *how), [maps, kernels]
+    how = (occlusion, backed, *_of_layers(nodes, layers), torch.get_num_threads(), ctypes.pointer(ctypes.c_int32(0)))
+    return _TYPES["layers"](*size, *_maps(surfaces), *how)
 
 
-def _of_layers(nodes: Sequence[float], layers: Sequence[tuple[Tensor, int]]) -> tuple[list[Any], Tensor]:
-    """Values of :data:`_LAYERS`, and the memory of the kernels, which must outlive them."""
-    kernels, count = [kernel.float() for kernel, _ in layers], len(nodes)
+def _maps(surfaces: Sequence[Surface]) -> list[list[Tensor | None]]:
+    """Light, coc and weight, each a list with one map of every surface."""
+    return [[None if t is None else t.float() for t in maps] for maps in zip(*surfaces, strict=True)]
+
+
+def _of_layers(nodes: Sequence[float], layers: Sequence[tuple[Tensor, int]]) -> tuple[Any, ...]:
+    """Values of :data:`_LAYERS`."""
+    kernels = [kernel.float() for kernel, _ in layers]
     colours = max(kernel.shape[0] for kernel in kernels)
     bank = torch.cat([kernel.expand(colours, -1, -1).flatten() for kernel in kernels])
-    made = [
-        count,
-        _array(ctypes.c_double, count)(*nodes),
-        _array(ctypes.c_int32, count)(*(scale for _, scale in layers)),
-        _array(ctypes.c_int32, count)(*(kernel.shape[-1] // 2 for kernel in kernels)),
-        colours,
-        bank.data_ptr(),
-    ]
-    return made, bank
+    halves = [kernel.shape[-1] // 2 for kernel in kernels]
+    return len(nodes), nodes, [scale for _, scale in layers], halves, colours, bank
+
+
+def _field_masks(masks: Sequence[KernelMask]) -> list[Any] | None:
+    mask_of = _TYPES["field_mask"]
+    return [mask_of(values, boxes, coc, len(values), *values.shape[2:]) for values, boxes, coc, _ in masks] or None
 
 
 def farthest(maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
@@ -346,52 +279,40 @@ def farthest(maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
     ``maps`` are those of ``_finest_level`` there, for one image; ``size`` is the level's height and width. The result
     is light, coc and weight, ``[C + 2, h, w]``.
     """
-    memory = [values.contiguous() for values in maps]
-    out = torch.empty(memory[0].shape[0] + 2, *size, dtype=torch.float32, device="cpu")
-    _run("farthest", _pointers([*memory, None]), *memory[0].shape, *size, torch.get_num_threads(), out.data_ptr())
+    out = _empty(maps[0].shape[0] + 2, *size)
+    _run("farthest", [*maps, None], *maps[0].shape, *size, torch.get_num_threads(), out)
     return out
 
 
 def farthest_gradient(maps: Sequence[Tensor], size: tuple[int, int], gradient: Tensor) -> list[Tensor]:
     """The gradients of :func:`farthest` by its first five maps."""
-    memory, gradient = [values.contiguous() for values in maps], gradient.contiguous()
-    sums = [torch.zeros_like(values) for values in memory[:5]]
-    arguments = (*memory[0].shape, *size, torch.get_num_threads(), gradient.data_ptr(), _pointers(sums))
-    _run("farthest_gradient", _pointers([*memory, None]), *arguments)
+    sums = [_empty(*values.shape).zero_() for values in maps[:5]]
+    arguments = (*maps[0].shape, *size, torch.get_num_threads(), gradient, sums)
+    _run("farthest_gradient", [*maps, None], *arguments)
     return sums
 
 
 def look_behind(levels: Sequence[Tensor], rules: Rules, coc: Tensor) -> Tensor:
     """Surfaces behind those of an image with coc ``[1, H, W]``, as ``torchdof.render.disocclusion`` defines them.
 
-    Args:
-        levels: Light, coc and weight of each level of a pyramid, ``[C + 2, h, w]``.
-        rules: For each level the distance of two samples in pixels, the smallest blur at which a pixel reads it, the
-            votes for each weight, and the most votes.
-        coc: Signed coc of the image.
-
-    Returns:
-        Light, coc and votes, ``[C + 2, H, W]``.
+    ``levels`` have light, coc and weight of each level of a pyramid, ``[C + 2, h, w]``, and ``rules`` its step,
+    least_px, slope and most, as in ``torchdof_level``. The result is light, coc and votes, ``[C + 2, H, W]``.
     """
-    coc, levels = coc.contiguous(), [values.contiguous() for values in levels]
-    out = torch.empty(levels[0].shape[0], *coc.shape[1:], dtype=torch.float32, device="cpu")
-    _run("look_behind", *_level_arguments(levels, rules, coc), out.data_ptr())
+    out = _empty(levels[0].shape[0], *coc.shape[1:])
+    _run("look_behind", *_level_arguments(levels, rules, coc), out)
     return out
 
 
 def look_behind_gradient(levels: Sequence[Tensor], rules: Rules, coc: Tensor, gradient: Tensor) -> list[Tensor]:
     """The gradients of :func:`look_behind` by coc and by each level."""
-    coc, levels, gradient = coc.contiguous(), [values.contiguous() for values in levels], gradient.contiguous()
-    of_coc, of_levels = torch.empty_like(coc), [torch.zeros_like(values) for values in levels]
-    pointers = (gradient.data_ptr(), _pointers(of_levels), of_coc.data_ptr())
-    _run("look_behind_gradient", *_level_arguments(levels, rules, coc), *pointers)
+    of_coc, of_levels = _empty(*coc.shape), [_empty(*values.shape).zero_() for values in levels]
+    _run("look_behind_gradient", *_level_arguments(levels, rules, coc), gradient, of_levels, of_coc)
     return [of_coc, *of_levels]
 
 
 def _level_arguments(levels: Sequence[Tensor], rules: Rules, coc: Tensor) -> tuple[Any, ...]:
-    each = [_Level(values.data_ptr(), *values.shape[1:], *rule) for values, rule in zip(levels, rules, strict=True)]
-    count, threads = len(each), torch.get_num_threads()
-    return _array(_Level, count)(*each), count, levels[0].shape[0] - 2, coc.data_ptr(), *coc.shape[1:], threads
+    each = [_TYPES["level"](values, *values.shape[1:], *rule) for values, rule in zip(levels, rules, strict=True)]
+    return each, len(each), levels[0].shape[0] - 2, coc, *coc.shape[1:], torch.get_num_threads()
 
 
 def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool = False) -> Tensor:
@@ -400,13 +321,11 @@ def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_c
     ``light`` is ``[C, H, W]``, ``nearness`` ``[H, W]``, ``step`` ``[H, W]`` or ``[]``. The result ``[H, W]`` is the
     input itself if it needs no repair.
     """
-    light, nearness, step = light.contiguous(), nearness.contiguous(), step.contiguous()
-    out, cancelled, changed = torch.empty_like(nearness), ctypes.c_int32(0), ctypes.c_int32(0)
-    steps = (None, float(step)) if step.ndim == 0 else (step.data_ptr(), 0.0)
-    maps = (*nearness.shape, light.shape[0], light.data_ptr(), nearness.data_ptr(), of_coc, *steps)
-    scene = _Map(*maps, auto, torch.get_num_threads(), ctypes.pointer(cancelled), out.data_ptr())
-    run = functools.partial(_run, "repair_edges", ctypes.byref(scene), ctypes.byref(changed))
-    _interruptible(run, cancelled, nearness.numel())
+    out, cancelled, changed = _empty(*nearness.shape), ctypes.c_int32(0), ctypes.c_int32(0)
+    steps = (None, float(step)) if step.ndim == 0 else (step, 0.0)
+    maps = (*nearness.shape, light.shape[0], light, nearness, of_coc, *steps)
+    scene = _TYPES["map"](*maps, auto, torch.get_num_threads(), ctypes.pointer(cancelled), out)
+    _interruptible(lambda: _run("repair_edges", scene, changed), cancelled, nearness.numel())
     return out if changed.value else nearness
 
 
@@ -416,52 +335,36 @@ def coc_px(depth: Tensor, scale: float, nearest_m: float, farthest_m: float) -> 
     ``depth`` in metres has any shape; ``scale`` is the radius in pixels for each dioptre between a depth and the focus,
     and depths from ``nearest_m`` to ``farthest_m`` are in focus. NaN where depth is not > 0.
     """
-    depth = depth.contiguous()
-    out, threads = torch.empty_like(depth), torch.get_num_threads()
-    _run("coc", depth.data_ptr(), depth.numel(), scale, nearest_m, farthest_m, threads, out.data_ptr())
+    out = _empty(*depth.shape)
+    _run("coc", depth, depth.numel(), scale, nearest_m, farthest_m, torch.get_num_threads(), out)
     return out
 
 
 def plan(coc_px: Tensor, tolerance: float) -> tuple[tuple[float, ...], float]:
     """Positions of the layers for a frame ``[B, 1, H, W]``, and its tolerance, as ``torchdof.render.plan``."""
-    coc_px, kept, count, capacity = coc_px.contiguous(), ctypes.c_double(), ctypes.c_int32(), 256
+    count, capacity = ctypes.c_int32(0), 256
     while True:
-        nodes = _array(ctypes.c_double, capacity)()
+        nodes, kept = _array(ctypes.c_double, capacity)(), ctypes.c_double(tolerance)
         size = (coc_px.shape[0], *coc_px.shape[-2:])
-        kept.value = tolerance
-        arguments = (*size, ctypes.byref(kept), torch.get_num_threads(), nodes, capacity, ctypes.byref(count))
-        _run("plan", coc_px.data_ptr(), *arguments)
+        _run("plan", coc_px, *size, kept, torch.get_num_threads(), nodes, capacity, count)
         if count.value <= capacity:
             return tuple(nodes[: count.value]), kept.value
         capacity = count.value
 
 
 def kernels(spots: Spots, *, squeeze: float, is_round: bool, is_even: bool) -> list[Tensor]:
-    """Makes the kernels of a lens.
+    """Makes the kernels of a lens, ``[C, 2 half + 1, 2 half + 1]``; they sum to 1 unless they are cropped.
 
-    Args:
-        spots: Input from which they are made.
-        squeeze: Height of the blur divided by its width.
-        is_round: Whether they are symmetric about both axes.
-        is_even: Whether they are constant within their radius.
-
-    Returns:
-        Kernels ``[C, 2 half + 1, 2 half + 1]``, non-negative; they sum to 1 unless they are cropped.
+    ``squeeze`` is the height of the blur divided by its width; a round kernel is symmetric about both axes, an even one
+    is constant within its radius.
     """
-    count, colours = len(spots.reach), len(spots.reach[0])
-    sides = [2 * half + 1 for half in spots.half]
-    areas = [colours * side * side for side in sides]
-    memory = torch.empty(sum(areas), dtype=torch.float32, device="cpu")
-    made = [part.view(colours, side, side) for part, side in zip(memory.split(areas), sides, strict=True)]
+    colours = len(spots.reach[0])
+    made = [_empty(colours, 2 * half + 1, 2 * half + 1) for half in spots.half]
     cells = [template.shape[-1] // 2 - 1 for template in spots.templates]
-    reach, fade = (list(itertools.chain.from_iterable(each)) for each in (spots.reach, spots.fade))
-    index = list(itertools.chain.from_iterable(spots.which))
-    lists: list[list[int]] = [cells, index, list(map(int, spots.flipped)), spots.half]
-    whole = [_array(ctypes.c_int32, max(1, len(each)))(*each) for each in lists]
-    numbers = [_array(ctypes.c_double, len(each))(*each) for each in (spots.part, spots.finer, reach, fade)]
-    arrays = [*whole[:2], *numbers, *whole[2:]]
-    scene = _Spots(count, colours, _pointers(spots.templates), *arrays, squeeze, is_round, is_even)
-    _run("kernels", ctypes.byref(scene), torch.get_num_threads(), _pointers(made))
+    index, reach, fade = ([*itertools.chain(*each)] for each in (spots.which, spots.reach, spots.fade))
+    numbers = (spots.part, spots.finer, reach, fade, spots.flipped, spots.half)
+    scene = _TYPES["spots"](len(made), colours, spots.templates, cells, index, *numbers, squeeze, is_round, is_even)
+    _run("kernels", scene, torch.get_num_threads(), made)
     return made
 
 
@@ -470,9 +373,8 @@ def ends(values: Tensor) -> tuple[float, float]:
 
     PyTorch's own reduction would leave its threads spinning, which slows down the engine's threads.
     """
-    values, low, high = values.contiguous(), ctypes.c_float(), ctypes.c_float()
-    threads = torch.get_num_threads()
-    _run("ends", values.data_ptr(), values.numel(), threads, ctypes.byref(low), ctypes.byref(high))
+    low, high = ctypes.c_float(), ctypes.c_float()
+    _run("ends", values, values.numel(), torch.get_num_threads(), low, high)
     return low.value, high.value
 
 
@@ -485,37 +387,35 @@ def _interruptible(run: Callable[[], None], cancelled: ctypes.c_int32, pixels: i
     if pixels <= _SMALL_FRAME or threading.current_thread() is not threading.main_thread():
         run()
         return
-    failure: list[BaseException] = []
+    outcome: concurrent.futures.Future[None] = concurrent.futures.Future()
     grad_enabled, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
-    finished = threading.Event()
 
     def guarded() -> None:
         try:
             with torch.inference_mode(inference), torch.set_grad_enabled(grad_enabled):
                 run()
+            outcome.set_result(None)
         except BaseException as error:  # of any kind: the main thread raises it
-            failure.append(error)
-        finally:
-            finished.set()
+            outcome.set_exception(error)
 
     # Not Thread.join: once interrupted, in Python 3.11 it takes a running thread for finished, and the next call
     # returns at once. The arrays would then be freed, or the process end, while the engine still runs.
     interruption: BaseException | None = None
     threading.Thread(target=guarded, name="torchdof").start()
-    while not finished.is_set():
+    while not outcome.done():
         try:
-            finished.wait()
+            outcome.exception()
         except BaseException as error:  # Ctrl-C, possibly several times
             cancelled.value, interruption = 1, error
     if interruption:
         raise interruption
-    if failure:
-        raise failure[0]
+    outcome.result()
 
 
 def _run(name: str, *arguments: Any) -> None:
     """Calls a function of the engine, and raises the error that its status means."""
-    status = getattr(_engine(), f"torchdof_{name}")(*arguments)
+    function, kept = getattr(_engine(), f"torchdof_{name}"), _contiguous(arguments)
+    status = function(*(_plain(kind, value) for kind, value in zip(function.argtypes, kept, strict=True)))
     if status == _NO_MEMORY:
         raise MemoryError("there is too little memory to render this image")
     if status == _TOO_BRIGHT:
@@ -524,16 +424,28 @@ def _run(name: str, *arguments: Any) -> None:
         raise KeyboardInterrupt
 
 
-def _field_masks(masks: Sequence[KernelMask]) -> Any:
-    made = []
-    for values, boxes, coc_px, _ in masks:
-        colours, _, rows, columns = values.shape
-        made.append(_FieldMask(values.data_ptr(), boxes.data_ptr(), coc_px, colours, rows, columns))
-    return _array(_FieldMask, len(made))(*made)
+def _contiguous(value: Any) -> Any:
+    """Nested lists of values, in which tensors are contiguous."""
+    if isinstance(value, Tensor):
+        return value.contiguous()
+    if not isinstance(value, (list, tuple)):
+        return value
+    return [each if type(each) in (int, float) else _contiguous(each) for each in value]
 
 
-def _pointers(tensors: Sequence[Tensor | None]) -> Any:
-    return _array(ctypes.c_void_p, max(1, len(tensors)))(*(None if t is None else t.data_ptr() for t in tensors))
+def _plain(kind: Any, value: Any) -> Any:
+    """A value as ctypes takes it for a type: a tensor becomes a pointer to its numbers, a list an array."""
+    if isinstance(value, Tensor):
+        return value.data_ptr()
+    if not isinstance(value, list):
+        return value
+    element = kind._type_
+    is_numbers = value and isinstance(value[0], (int, float))
+    return _array(element, max(1, len(value)))(*(value if is_numbers else (_plain(element, each) for each in value)))
+
+
+def _empty(*size: int) -> Tensor:
+    return torch.empty(size, dtype=torch.float32, device="cpu")
 
 
 @functools.lru_cache(maxsize=1024)
@@ -549,18 +461,6 @@ def _engine() -> ctypes.CDLL:
     return library
 
 
-def _fits(library: ctypes.CDLL) -> bool:
-    """Whether a library has this file's interface: an old build may be left beside new sources."""
-    try:
-        interface = library.torchdof_interface
-    except AttributeError:
-        return False
-    interface.restype = ctypes.c_int64
-    others = ctypes.sizeof(_Map) + ctypes.sizeof(_Layers) + ctypes.sizeof(_Level)
-    expected: int = _REVISION << 32 | ctypes.sizeof(_Scene) << 16 | others
-    return bool(interface() == expected)
-
-
 @functools.cache
 def _library() -> tuple[ctypes.CDLL | None, str]:
     """The compiled engine, or the reason why it is missing."""
@@ -574,11 +474,16 @@ def _library() -> tuple[ctypes.CDLL | None, str]:
         if "failed to map segment" in str(error) and "permitted" not in str(error):  # a file system may also forbid it
             raise MemoryError("there is too little memory to load the compiled engine") from None
         return None, f"the compiled engine cannot be loaded: {error}"
-    if not _fits(library):
-        stale = "the compiled engine is of another version of torchdof"
-        warnings.warn(f"{stale}, and is not used: install torchdof again", RuntimeWarning, stacklevel=2)
-        return None, stale
-    for name, arguments in _ARGUMENTS.items():
-        function = getattr(library, f"torchdof_{name}")
-        function.argtypes, function.restype = arguments, _RESULTS.get(name, _Int)
-    return library, ""
+    scene, *others = (ctypes.sizeof(_TYPES[name]) for name in ("scene", "map", "layers", "level"))
+    try:
+        for name, types in _FUNCTIONS.items():
+            function = getattr(library, f"torchdof_{name}")
+            function.restype, *function.argtypes = map(_type, types.split())
+        is_current = library.torchdof_interface() == _REVISION << 32 | scene << 16 | sum(others)
+    except AttributeError:  # an old build, left beside new sources
+        is_current = False
+    if is_current:
+        return library, ""
+    stale = "the compiled engine is of another version of torchdof"
+    warnings.warn(f"{stale}, and is not used: install torchdof again", RuntimeWarning, stacklevel=2)
+    return None, stale
