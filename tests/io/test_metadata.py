@@ -26,6 +26,7 @@ FULL = {"sensor_width_mm": 36.0}
         ({"FNumber": float("nan"), FOCAL: 4250.0, FILM: 0, DISTANCE: float("nan")}, {}),
         ({"FNumber": 4294967295.0, FOCAL: 4.0, FILM: 65535, PLANE: 1e-9, UNIT: 2}, {"focal_length_mm": 4.0}),
         ({"FNumber": 0.001, FOCAL: 1e-6, PLANE: float("nan"), UNIT: 9}, {}),
+        ({PLANE: float("inf"), UNIT: 2}, {}),
         ({"FNumber": 0.0, "Exif:ApertureValue": 2.0}, {"f_number": 2.0}),
         ({FOCAL: 0.0, FILM: 26}, {"focal_length_mm": 26.0, **FULL}),  # the equivalent lens
         ({PLANE: 6000 / 36 * 25.4, UNIT: 2}, FULL),  # 6000 pixels at 4233.333 pixels an inch are 36 mm

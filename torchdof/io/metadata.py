@@ -79,7 +79,7 @@ def camera_settings(metadata: Mapping[str, tuple[Any, Any]], width: int, height:
         width_mm = 36.0 * focal_length_mm / film_mm * (width / max(width, height))
         if _SENSOR_MM[0] <= width_mm <= _SENSOR_MM[1]:
             settings["sensor_width_mm"] = width_mm
-    if px_per_unit := number("Exif:FocalPlaneXResolution"):
+    if px_per_unit := number("Exif:FocalPlaneXResolution", ends=(0.0, 1e9)):
         original_width = number("Exif:PixelXDimension") or width
         mm_per_unit = _MM_PER_UNIT.get(number("Exif:FocalPlaneResolutionUnit") or 2, 25.4)
         plane_mm = original_width / px_per_unit * mm_per_unit
