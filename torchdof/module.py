@@ -11,7 +11,7 @@ from typing_extensions import Unpack
 from . import validation
 from .batch import flattened, leading_axes, numbers, restored
 from .optics.blur_table import BlurTable
-from .optics.camera import CAMERA_NUMBERS, Camera
+from .optics.camera import Camera
 from .options import OPTION_NAMES, OptionArguments, Options, read_state, spells_options
 from .render import edges, pipeline
 from .render.attention import Attention
@@ -149,11 +149,24 @@ class DepthOfField(nn.Module):
             torch.Size([1, 4, 8, 12])
         """
         options = self.options
-        depth = validation.stack(rgba, depth_m, options.check)
-        batch, count, _, height, width = rgba.shape
-        maps = depth.expand(batch, -1, 1, height, width)
         if not options.occlusion:
             raise ValueError("layers hide each other: they need occlusion=True")
+        validation.real_tensor("rgba", rgba, "[B, N, C + 1, H, W]")
+        validation.real_tensor("depth_m", depth_m, "in metres")
+        if rgba.ndim != 5 or rgba.shape[2] < 2 or 0 in rgba.shape:
+            raise ValueError(f"rgba must be [B, N, C + 1, H, W], premultiplied, got {list(rgba.shape)}")
+        batch, count, _, height, width = rgba.shape
+        maps = depth_m[..., None, None, None] if depth_m.ndim in (1, 2) else depth_m
+        try:
+            maps = maps.expand(batch, count, 1, height, width)
+        except RuntimeError:
+            expected = f"[{count}], [{batch}, {count}] or [{batch}, {count}, 1, {height}, {width}]"
+            raise ValueError(f"depth_m must be {expected} in metres, got {list(depth_m.shape)}") from None
+        if options.check:
+            validation.finite("rgba", rgba)
+            low, high = (0.0, 1.0) if is_traced() else validation.ends(rgba[:, :, -1])
+            if not 0.0 <= low <= high <= 1.0:
+                raise ValueError(f"coverage, the last channel of rgba, must lie in [0, 1], got {low:g} to {high:g}")
         frame = rgba.new_empty(batch, 1, height, width)
         cocs = [self.coc_as_given(frame, layer, focus_m, f_number, name="depth_m") for layer in maps.unbind(1)]
         with without_autocast(rgba.device.type):
@@ -189,8 +202,9 @@ class DepthOfField(nn.Module):
         The depth ``[B or 1, 1, H, W]`` may have a size that can be resampled to the image's.
         """
         check = self.options.check
-        if not is_traced() and validation.is_resizable(image, depth):
-            if stretch := validation.stretch(image, depth):
+        stretch = None if is_traced() else validation.stretch(image, depth)
+        if stretch is not None and image.shape[-2:] != depth.shape[-2:]:
+            if stretch:
                 warnings.warn(f"{name} is stretched by {stretch:.1%} to the shape of the image", stacklevel=3)
             depth = at_size_of(image, depth)
         validation.image_and_depth(image, depth, values=check, name=name)
@@ -201,7 +215,7 @@ class DepthOfField(nn.Module):
         coc = camera.coc_px(depth, width)
         if not check:
             return torch.where(depth > 0, coc, torch.nan)
-        validation.coc_of_lens(coc, depth, {name: getattr(camera, name) for name in CAMERA_NUMBERS})
+        camera.refuse_overflow(coc, depth)
         return coc
 
     def plan(self, image: Tensor, depth: Tensor, focus_m: Number | None = None, f_number: Number | None = None) -> Plan:

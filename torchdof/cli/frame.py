@@ -19,10 +19,10 @@ from ..io.sheet import shrunk, write_sheet
 from ..module import blur_by_coc
 from ..optics.aperture import Aperture
 from ..optics.blur_table import BlurTable
-from ..optics.camera import CAMERA_NUMBERS, Camera
+from ..optics.camera import Camera
 from ..options import Options
 from ..render.resample import at_size_of
-from ..validation import coc_of_lens, same_aspect, stretch
+from ..validation import same_aspect, stretch
 from .lens import Area
 from .options import Scene, make_folder_of
 from .output import Notices, print_result
@@ -127,7 +127,7 @@ def coc_of(
     metadata, is_to_scale = frame.picture.metadata, depth_map.is_to_scale
     camera, remarks = frame.scene.lens.camera(metadata, values, frame.area, number, is_still, is_to_scale)
     coc_px = frame.area.coc_px(camera, values)
-    coc_of_lens(coc_px, values, {name: getattr(camera, name) for name in CAMERA_NUMBERS})
+    camera.refuse_overflow(coc_px, values)
     notices.warn(frame.name, frame.mistakes(camera))
     return coc_px, camera, remarks + frame.remarks
 

@@ -30,12 +30,12 @@ from torch import Tensor
 
 from .. import native
 from ..tensors import floating, is_in_memory, is_traced
-from ..validation import number, pixels_wide, real_tensor, show, whole
+from ..validation import ends, number, pixels_wide, real_tensor, show, whole
 
-__all__ = ["CAMERA_NUMBERS", "Camera"]
+__all__ = ["Camera"]
 
 _MAY_BE_INFINITE = ("focus_m", "focus_range_m")
-CAMERA_NUMBERS = ("focal_length_mm", "f_number", "focus_m", "sensor_width_mm")
+_NUMBERS = ("focal_length_mm", "f_number", "focus_m", "sensor_width_mm")
 
 Number = float | Tensor
 
@@ -86,7 +86,7 @@ class Camera:
             object.__setattr__(self, "focus_m", halfway)
         for name in ("tilt_deg", "swing_deg"):
             _check_number(name, getattr(self, name), -90.0, 90.0)
-        for name in CAMERA_NUMBERS:
+        for name in _NUMBERS:
             _check_number(name, getattr(self, name))
         if not isinstance(self.focus_breathing, bool):
             raise ValueError(f"focus_breathing must be True or False, got {show(self.focus_breathing)}")
@@ -182,6 +182,15 @@ class Camera:
             near, far = (_dioptres_behind(z, _as_map(end, z)) + shift for end in self.focus_range_m)
             dioptres = near.clamp(max=0.0) + far.clamp_min(0.0)
         return torch.where(is_valid, scale * dioptres, torch.nan)
+
+    def refuse_overflow(self, coc_px: Tensor, depth: Tensor) -> None:
+        """Refuse a circle of confusion of a depth if it overflowed; the message has the numbers of the lens."""
+        if not is_traced() and not all(map(math.isfinite, ends(coc_px))):
+            stated = ", ".join(f"{name} {_show(getattr(self, name))}" for name in _NUMBERS)
+            raise ValueError(
+                f"depth and lens must give a finite blur radius, got an infinite one: check this lens ({stated}) "
+                f"and the depth, which starts at {float(depth.detach().min()):.3g} m"
+            )
 
     def _compiled_coc_px(self, depth: Tensor, width: int) -> Tensor | None:
         """:meth:`coc_px` by the compiled engine; None if it does not support the call (traced, batched, tilted)."""
