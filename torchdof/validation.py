@@ -78,9 +78,9 @@ def numbers(name: str, value: Any) -> Tensor:
     if isinstance(value, Tensor):
         values = real_tensor(name, value, "of numbers", whole=True).detach().to("cpu", torch.float64)
     else:
-        if isinstance(value, list | tuple):
-            value = [item.tolist() if isinstance(item, Tensor) else item for item in value]
         try:
+            if isinstance(value, list | tuple):
+                value = [item.tolist() if isinstance(item, Tensor) else item for item in value]
             array = np.asarray(value)
             if array.dtype.kind not in "iuf":
                 raise TypeError
@@ -172,6 +172,14 @@ def real_tensor(name: str, value: Any, what: str, whole: bool = False) -> Tensor
     raise ValueError(
         f"{name} must be a tensor {what}, floating point (.float()), dense (.to_dense()), that holds data, got {got}"
     )
+
+
+def one_channel(name: str, value: Any, unit: str = "", whole: bool = False) -> None:
+    """Refuse a value that is not a map ``[B, 1, H, W]`` in a unit; arguments as of :func:`real_tensor`."""
+    expected = f"[B, 1, H, W] {unit}".rstrip()
+    real_tensor(name, value, expected, whole)
+    if value.ndim != 4 or value.shape[1] != 1 or not value.numel():
+        raise ValueError(f"{name} must be {expected} with at least one pixel, got {list(value.shape)}")
 
 
 def finite(name: str, values: Tensor) -> None:

@@ -84,9 +84,9 @@ test_invalid_arguments_are_refused = refuses(
     (relative(TWO, 1.0, 2.0, "metric"), "must be one of disparity, inverse, depth, got 'metric'"),
     (relative(row(3.0, 3.0), 1.0, 2.0), r"two different values .* one value everywhere; give value_range"),
     (relative(row(NAN, INF), 1.0, 2.0), "no pixel has a depth; check the map"),
-    (relative(torch.ones(3, 4), 1.0, 2.0), r"\[B, 1, H, W\], got \[3, 4\]; add the missing dimensions"),
+    (relative(torch.ones(3, 4), 1.0, 2.0), r"\[B, 1, H, W\] .*got \[3, 4\]"),
     (relative(np.ones((3, 4)), 1.0, 2.0), r"got a float64 array of shape \[3, 4\]; use torch.from_numpy"),
-    (relative(torch.ones(1, 1, 3, 4, dtype=torch.bool), 1.0, 2.0), "got torch.bool"),
+    (relative(torch.ones(1, 1, 3, 4, dtype=torch.bool), 1.0, 2.0), "got a torch.bool"),
     (relative(torch.ones(1, 1, 0, 4), 1.0, 2.0), "at least one pixel"),
     *((relative(TWO, 1.0, 2.0, value_range=pair), "value_range")
       for pair in ((2.0, 1.0), (0.0, NAN), (1.0,), "0,1")),

@@ -177,7 +177,7 @@ test_invalid_arguments_are_refused_by_name = refuses(
       for name in ("focal_length_mm", "f_number", "sensor_width_mm")),
     (lambda: Camera(focus_m=0.05), r"focus_m must be longer than the focal length \(50 mm\), got 0.05 m"),
     (lambda: Camera.from_fov(180.0, 0.01, 1.0), "^fov_x_deg must be"),
-    *((partial(Camera().coc_px, depth, 100), "depth must be a floating-point tensor in metres")
+    *((partial(Camera().coc_px, depth, 100), "depth must be a tensor in metres, floating point")
       for depth in (torch.ones(1, 1, 2, 2, dtype=torch.int32), 2.0, None)),
     (lambda: TWO.coc_px(torch.ones(3, 1, 4, 4), 100), r"depth must be \[2, 1, H, W\].* got \[3, 1, 4, 4\]"),
     *((partial(Camera, focus_range_m=value), "^focus_range_m must")

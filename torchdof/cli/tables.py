@@ -48,7 +48,7 @@ class Tables:
         import torch.nn.functional as functional
 
         from ..io.sheet import write_sheet
-        from ..optics.table_file import shipped
+        from ..optics.blur_table import shipped
 
         panels = {}
         for name in self.names or ["disc", "gaussian", *shipped()]:

@@ -6,8 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from ..validation import show
-from .kinds import number_map
+from ..validation import number, one_channel, show
 
 __all__ = ["Fill", "fill_holes", "resolve_holes"]
 
@@ -35,15 +34,13 @@ def fill_holes(depth: Tensor, fill: Fill) -> Tensor:
         >>> fill_holes(torch.tensor([[[[1.0, torch.nan, torch.nan, 4.0]]]]), "far")
         tensor([[[[1., 4., 4., 4.]]]])
     """
-    number_map("depth", depth)
-    if isinstance(fill, int | float) and not isinstance(fill, bool):
-        largest = torch.finfo(depth.dtype).max if depth.is_floating_point() else math.inf
-        if not fill > 0 or largest < fill < math.inf:
-            raise ValueError(f"the depth to fill with must be positive metres (inf allowed), got {show(fill)}")
-        return torch.where(depth.isnan(), float(fill), depth) if depth.is_floating_point() else depth
-    if not isinstance(fill, str) or fill not in ("nearest", "far"):
+    one_channel("depth", depth, "in metres")
+    if not isinstance(fill, str):
+        metres = number("fill (the depth in holes)", fill, 0, unit="metres", infinite=True)
+        return torch.where(depth.isnan(), torch.tensor(metres, dtype=torch.float64).to(depth), depth)
+    if fill not in ("nearest", "far"):
         raise ValueError(f"fill must be 'nearest', 'far' or metres, got {show(fill)}")
-    if depth.ndim != 4 or depth.shape[:2] != (1, 1):
+    if len(depth) != 1:
         raise ValueError(f"depth must be [1, 1, H, W], got {list(depth.shape)}")
     if not bool(depth.isnan().any()):
         return depth

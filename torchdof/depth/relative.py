@@ -10,8 +10,8 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ..tensors import is_traced, refuse_old_compiler
-from ..validation import choice, number, show, whole
-from .kinds import depth_from_values, number_map
+from ..validation import choice, number, one_channel, show, whole
+from .kinds import depth_from_values
 
 __all__ = ["RELATIVE_KINDS", "RelativeKind", "Scale", "from_relative", "solve_scale"]
 
@@ -74,7 +74,7 @@ def from_relative(
     far_m = number("far_m", far_m, low=0, unit="metres", infinite=kind != "depth")
     if not near_m < far_m:
         raise ValueError(f"near_m must be nearer than far_m, got near_m={near_m:g} and far_m={far_m:g}")
-    _check_map(values)
+    one_channel("relative depth", values, whole=True)
     dtype = values.dtype if values.is_floating_point() else torch.float32
     value = values.to(torch.promote_types(dtype, torch.float32)) if values.is_floating_point() else values.double()
     is_known = value.isfinite()
@@ -192,7 +192,7 @@ def solve_scale(
         (4.0, 0.0)
     """
     choice("the kind of relative depth", kind, RELATIVE_KINDS)
-    _check_map(values)
+    one_channel("relative depth", values, whole=True)
     if values.shape[0] != 1:
         raise ValueError(f"values must be one map [1, 1, H, W], got {list(values.shape)}; solve each on its own")
     whole("patch", patch, 1, 2**31)
@@ -215,14 +215,6 @@ def solve_scale(
     if kind == "depth":
         return Scale("z", factor, constant / factor, residual)
     return Scale("disparity", 1.0 / factor, constant / factor, residual)
-
-
-def _check_map(values: Tensor) -> None:
-    """Refuse a value that is not a tensor ``[B, 1, H, W]`` of numbers."""
-    number_map("relative depth", values)
-    if values.ndim != 4 or values.shape[1] != 1:
-        hint = "; add the missing dimensions, as values[:, None] does" if values.ndim < 4 else ""
-        raise ValueError(f"relative depth must be [B, 1, H, W], got {list(values.shape)}{hint}")
 
 
 def _point(values: Tensor, point: tuple[float, float, float], kind: RelativeKind, patch: int) -> tuple[float, float]:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..optics.camera import Camera
-from ..validation import real_tensor
+from ..validation import one_channel
 from .kinds import DepthKind
 
 __all__ = ["DepthWarning", "Mistake", "check", "coc_mistakes", "depth_mistakes", "whole_numbers"]
@@ -78,9 +78,7 @@ def depth_mistakes(
 
     ``kind`` and ``scale`` are those of the conversion of the numbers to metres, for the advice in the message.
     """
-    real_tensor("depth", depth, "[B, 1, H, W] in metres")
-    if depth.ndim != 4 or depth.shape[1] != 1:
-        raise ValueError(f"depth must be [B, 1, H, W] in metres, got {list(depth.shape)}")
+    one_channel("depth", depth, "in metres")
     in_focus = camera.focus_range_m or (camera.focus_m, camera.focus_m)
     lens = [getattr(camera, name) for name in _NUMBERS]
     numbers = [torch.as_tensor(value, device="cpu").reshape(-1) for value in (*lens, *in_focus)]
@@ -99,7 +97,7 @@ def depth_mistakes(
 
 def coc_mistakes(coc_px: Tensor) -> list[Mistake]:
     """Likely mistakes in a map of the circle of confusion, ``[B, 1, H, W]`` in pixels."""
-    real_tensor("coc_px", coc_px, "[B, 1, H, W] in pixels")
+    one_channel("coc_px", coc_px, "in pixels")
     size, width = _sample(coc_px.abs()), coc_px.shape[-1]
     if not bool(size.isfinite().any()) or _quantile(size[size.isfinite()], 0.99) <= _LARGEST_WIDTHS * width:
         return []
