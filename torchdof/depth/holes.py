@@ -1,6 +1,5 @@
 """Pixels without depth: count, refuse or fill them."""
 
-import math
 from typing import Literal
 
 import torch
@@ -37,7 +36,7 @@ def fill_holes(depth: Tensor, fill: Fill) -> Tensor:
     one_channel("depth", depth, "in metres")
     if not isinstance(fill, str):
         metres = number("fill (the depth in holes)", fill, 0, unit="metres", infinite=True)
-        return torch.where(depth.isnan(), torch.tensor(metres, dtype=torch.float64).to(depth), depth)
+        return torch.where(depth.isnan(), torch.tensor(metres, dtype=torch.float64, device="cpu").to(depth), depth)
     if fill not in ("nearest", "far"):
         raise ValueError(f"fill must be 'nearest', 'far' or metres, got {show(fill)}")
     if len(depth) != 1:

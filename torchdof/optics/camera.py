@@ -393,7 +393,7 @@ def _check_number(name: str, value: Any, low: float = 0.0, high: float = math.in
     infinite = name in _MAY_BE_INFINITE
     if not (is_number and low < smallest and (largest < high or (infinite and largest == high))):
         bounds = f"in ({low:g}, {high:g}) degrees" if high < math.inf else "positive" + " and finite" * (not infinite)
-        got = _show(value) if is_number else show(value)
+        got = _show(value) if is_number and not isinstance(value, int) else show(value)
         raise ValueError(f"{name} must be {bounds}, a float or a floating-point tensor [B], got {got}")
 
 
