@@ -52,13 +52,13 @@ class DepthOfField(nn.Module):
         if not isinstance(camera, Camera):
             raise ValueError(f"camera must be a torchdof.Camera, got {type(camera).__name__}")
         self.camera = camera
-        self.options = Options.of(table, **options)
+        self.options = Options(table, **options)
 
     @property
     def options(self) -> Options:
         """The options of the next rendering; each is also an attribute of the module, which may be set."""
         values: Any = {name: getattr(self, name) for name in OPTION_NAMES}
-        return Options.of(**values)
+        return Options(**values)
 
     @options.setter
     def options(self, options: Options) -> None:
@@ -109,15 +109,19 @@ class DepthOfField(nn.Module):
         refuse_old_compiler()
         options, axes = self.options, leading_axes(image)
         lens = (numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number))
-        image, depth = flattened(axes, "image", image, "C"), flattened(axes, "depth", depth)
-        background = flattened(axes, "background", background, "C")
-        background_depth = flattened(axes, "background_depth", background_depth)
+        image, depth, background, background_depth, attention = flattened(
+            axes,
+            image=image,
+            depth=depth,
+            background=background,
+            background_depth=background_depth,
+            attention=attention,
+        )
         coc = self.coc_as_given(image, depth, *lens)
         validation.background(image, background, "background_depth", background_depth, "in metres")
         behind = None
         if background is not None and background_depth is not None:
             behind = self.coc_as_given(background, background_depth, *lens, name="background_depth")
-        attention = flattened(axes, "attention", attention)
         return restored(axes, blur(image, coc, options, plan, background, behind, attention))
 
     def layers(
@@ -184,7 +188,7 @@ class DepthOfField(nn.Module):
         """
         axes = leading_axes(image)
         lens = (numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number))
-        image, depth = flattened(axes, "image", image, "C"), flattened(axes, "depth", depth)
+        image, depth = flattened(axes, image=image, depth=depth)
         coc = self.coc_as_given(image, depth, *lens)
         validation.image_and_map(image, "coc_px", coc, "in pixels")  # a lens of another batch size changes its shape
         return restored(axes, edges.mended(image, coc, self.options.depth_edges))
@@ -233,7 +237,7 @@ class DepthOfField(nn.Module):
               coc px  radius    at  pixels
             ...
         """
-        coc = flattened(leading_axes(image), "coc_px", self.coc_px(image, depth, focus_m, f_number))
+        (coc,) = flattened(leading_axes(image), coc_px=self.coc_px(image, depth, focus_m, f_number))
         return Plan.for_scene(coc, self.options.tolerance).with_pixels(coc)
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -330,17 +334,11 @@ def blur_by_coc(
         torch.Size([1, 3, 8, 12])
     """
     refuse_old_compiler()
-    axes = leading_axes(image)
-    rendered = blur(
-        flattened(axes, "image", image, "C"),
-        flattened(axes, "coc_px", coc_px),
-        Options.of(table, **options),
-        plan,
-        flattened(axes, "background", background, "C"),
-        flattened(axes, "background_coc_px", background_coc_px),
-        flattened(axes, "attention", attention),
+    axes, hidden_coc = leading_axes(image), background_coc_px
+    image, coc_px, background, hidden_coc, attention = flattened(
+        axes, image=image, coc_px=coc_px, background=background, background_coc_px=hidden_coc, attention=attention
     )
-    return restored(axes, rendered)
+    return restored(axes, blur(image, coc_px, Options(table, **options), plan, background, hidden_coc, attention))
 
 
 def blur(
@@ -359,10 +357,8 @@ def blur(
     """
     validation.image_and_coc(image, coc_px, options.table.channels, values=options.check)
     if plan is not None and not isinstance(plan, Plan):
-        raise ValueError(
-            f"plan must be a Plan from DepthOfField.plan(image, depth) or None, got {validation.show(plan)}; "
-            "leave it out to plan for this image"
-        )
+        got = validation.show(plan)
+        raise ValueError(f"plan must be a Plan from DepthOfField.plan(image, depth), or left out, got {got}")
     validation.background(image, background, "background_coc_px", background_coc_px, "in pixels", options.check)
     hidden = None if background is None or background_coc_px is None else (background, background_coc_px)
     if hidden is not None and not options.occlusion:

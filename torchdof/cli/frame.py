@@ -209,7 +209,7 @@ class Renderer:
         layers = ", ".join(frame.picture.other_layers)
         if layers and out.suffix.lower() == ".exr":
             self.notices.note("layers", f"{out}: is without the other layers of the image: {layers}")
-        options = Options.of(**command.accuracy.arguments())
+        options = Options(**command.accuracy.arguments())
         facts = {
             "out": str(out),
             "camera": camera and facts_of_camera(camera),
