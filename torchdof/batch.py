@@ -95,7 +95,6 @@ def _refuse_vmap(name: str, value: Tensor) -> None:
     while not is_traced() and torch._C._functorch.is_functorch_wrapped_tensor(value):
         if torch._C._functorch.is_batchedtensor(value):
             raise ValueError(
-                f"{name} comes from torch.vmap, which cannot follow this rendering: layers are planned from the "
-                "numbers of the depth; call it with the whole batch instead, [B, C, H, W] and [B, 1, H, W]"
+                f"{name} comes from torch.vmap, in which no values can be read; pass the whole batch instead"
             )
         value = torch._C._functorch.get_unwrapped(value)  # torch.func.grad inside of torch.vmap wraps it once more

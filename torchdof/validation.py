@@ -138,10 +138,8 @@ def ends(values: Tensor) -> tuple[float, float]:
         ValueError: If they come from ``torch.func`` of a PyTorch older than 2.13, where they cannot be read.
     """
     if not TRACEABLE and torch._C._functorch.is_functorch_wrapped_tensor(values):
-        raise ValueError(
-            "the image, the depth or a number of the camera comes from torch.func, for which torchdof needs PyTorch "
-            f"2.13 or newer, this is {torch.__version__}; use torch.autograd instead"
-        )
+        needed = f"PyTorch 2.13 or newer, this is {torch.__version__}"
+        raise ValueError(f"an argument comes from torch.func, for which torchdof needs {needed}; use torch.autograd")
     if values.dtype == torch.float32 and is_in_memory(values) and native.chosen():
         return native.ends(values)
     # in float32 at least: autocast supports only one half-precision dtype at a time
@@ -274,7 +272,5 @@ def same_aspect(image: Tensor, depth: Tensor) -> None:
         (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
         is_turned = stretch(image, depth.mT) is not None
         hint = "turned by 90 degrees it fits: rotate one" if is_turned else "crop one, so that both show the same area"
-        raise ValueError(
-            f"depth is {columns} x {rows} pixels and the image {width} x {height}: a depth map may have another size, "
-            f"but must have the same aspect ratio, to within 3 %; {hint}"
-        )
+        sizes = f"depth is {columns} x {rows} pixels and the image {width} x {height}"
+        raise ValueError(f"{sizes}: they must have the same aspect ratio, to within 3 %; {hint}")

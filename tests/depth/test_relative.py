@@ -82,7 +82,7 @@ test_invalid_arguments_are_refused = refuses(
     (relative(TWO, 0.0, 1.0), "near_m must be a number of metres > 0"),
     (relative(TWO, 1.0, INF, "depth"), "far_m must be a number"),
     (relative(TWO, 1.0, 2.0, "metric"), "must be one of disparity, inverse, depth, got 'metric'"),
-    (relative(row(3.0, 3.0), 1.0, 2.0), r"two different values .* one value everywhere; give value_range"),
+    (relative(row(3.0, 3.0), 1.0, 2.0), "two different values, got one value everywhere; give value_range"),
     (relative(row(NAN, INF), 1.0, 2.0), "no pixel has a depth; check the map"),
     (relative(torch.ones(3, 4), 1.0, 2.0), r"\[B, 1, H, W\] .*got \[3, 4\]"),
     (relative(np.ones((3, 4)), 1.0, 2.0), r"got a float64 array of shape \[3, 4\]; use torch.from_numpy"),

@@ -10,7 +10,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ..tensors import is_traced, refuse_old_compiler
-from ..validation import choice, number, one_channel, show, whole
+from ..validation import choice, number, numbers, one_channel, show, whole
 from .kinds import depth_from_values
 
 __all__ = ["RELATIVE_KINDS", "RelativeKind", "Scale", "from_relative", "solve_scale"]
@@ -86,17 +86,13 @@ def from_relative(
         if not is_traced() and not bool((low < high).all()):
             if bool((low > high).any()):
                 raise ValueError("no pixel has a depth; check the map, and the value that means unknown")
-            raise ValueError(
-                "relative depth needs two different values to distinguish near from far, got one value everywhere; "
-                "give value_range=(smallest, largest) (--value-range) if the values mean something beyond this map"
-            )
+            problem = "relative depth needs two different values, got one value everywhere"
+            raise ValueError(f"{problem}; give value_range=(smallest, largest) (--value-range) to say its place")
     else:
-        if not isinstance(value_range, tuple | list) or len(value_range) != 2:
+        ends = numbers("value_range", value_range)
+        if ends.shape != (2,) or not ends[0] < ends[1]:
             raise ValueError(f"value_range must be (smallest, largest), got {show(value_range)}")
-        smallest, largest = (number("value_range", x) for x in value_range)
-        if not smallest < largest:
-            raise ValueError(f"value_range must be (smallest, largest), got ({smallest:g}, {largest:g})")
-        low, high = value.new_tensor(smallest), value.new_tensor(largest)
+        low, high = ends.to(value)
     value = _smooth_steps(torch.where(is_known, value, torch.nan))
     fraction = ((torch.where(is_known, value, low) - low) / (high - low)).clamp(0.0, 1.0)
     if kind == "depth":
@@ -199,10 +195,8 @@ def solve_scale(
     samples = torch.tensor([_point(values, p, kind, patch) for p in points], dtype=torch.float64, device="cpu")
     value, metres = samples.reshape(-1, 2).unbind(1)
     if len(value.unique()) < 2:
-        raise ValueError(
-            f"scale and offset need at least two points of different values, got {len(value)} points of values "
-            f"{value.unique().tolist()}"
-        )
+        got = f"{len(value)} points of values {value.unique().tolist()}"
+        raise ValueError(f"scale and offset need at least two points of different values, got {got}")
     # Solve a v + b = y with y = z for "depth", else 1/z. Each row is divided by y, so that errors are relative.
     weight = 1.0 / metres if kind == "depth" else metres.clamp(max=1e6 * float(metres.min()))
     target = metres.isfinite().double() if kind != "depth" else torch.ones_like(value)

@@ -95,27 +95,20 @@ class BlurTable:
     ) -> None:
         choice("family", family, psf.FAMILIES)
         choice("unit", unit, _UNITS)
-        given: tuple[tuple[str, Any, type], ...] = (
-            ("name", name, str),
-            ("provenance", {} if provenance is None else provenance, Mapping),
-            ("aperture", Aperture() if aperture is None else aperture, Aperture),
-        )
-        for what, value, kind in given:
-            if not isinstance(value, kind):
+        kinds: dict[str, tuple[Any, type]] = {"name": (name, str), "provenance": (provenance, Mapping)}
+        kinds |= {"aperture": (aperture, Aperture), "field": (field, Field)}
+        for what, (value, kind) in kinds.items():
+            if value is not None and not isinstance(value, kind):
                 raise ValueError(f"{what} must be of type {kind.__name__}, got {show(value)}")
-        self.family, self.unit, self.name = family, unit, name
+        self.family, self.unit, self.name = family, unit, name or ""
         self.coc = numbers("coc", coc)
-        if self.coc.ndim != 1 or not len(self.coc) or bool((self.coc.diff() <= 0).any()) or not self.coc.any():
-            raise ValueError(
-                f"coc must be strictly increasing signed numbers, one a node and not only 0, got {short(self.coc)}"
-            )
-        if len(self.coc) > _MAX_NODES:
-            raise ValueError(f"coc must be at most {_MAX_NODES} nodes, got {len(self.coc)}")
+        if self.coc.ndim != 1 or not 0 < len(self.coc) <= _MAX_NODES or bool((self.coc.diff() <= 0).any()):
+            raise ValueError(f"coc must be 1 to {_MAX_NODES} strictly increasing signed numbers, got {short(self.coc)}")
+        if not self.coc.any():
+            raise ValueError("coc must have a node that is not 0")
         if unit == "relative" and max(int((self.coc > 0).sum()), int((self.coc < 0).sum())) > 1:
-            raise ValueError(
-                f"unit 'relative' takes one node on each side of focus at most, got {len(self.coc)}; "
-                "state the unit as 'fraction' (of the image's width) or 'mm'"
-            )
+            got = f"{len(self.coc)}; state the unit as 'fraction' (of the image's width) or 'mm'"
+            raise ValueError(f"unit 'relative' takes one node on each side of focus at most, got {got}")
         if (unit == "mm") != (sensor_width_mm is not None):
             got = f"{show(sensor_width_mm)} with {unit!r}"
             raise ValueError(f"sensor_width_mm goes with unit 'mm' and only with it, got {got}")
@@ -414,10 +407,8 @@ class BlurTable:
         if not path.suffix and not path.exists():
             path = _FOLDER / f"{path}.json"
         if not path.is_file():
-            raise FileNotFoundError(
-                f"no blur table {str(source)!r}: neither a file nor one of the shipped ({', '.join(shipped())}); "
-                "ideal lenses are BlurTable.disc() and BlurTable.gaussian()"
-            )
+            names = ", ".join(shipped())
+            raise FileNotFoundError(f"no blur table {str(source)!r}: neither a file nor one of the shipped ({names})")
         try:
             return cls.from_dict(json.loads(path.read_text(encoding="utf-8")))
         except (ValueError, RecursionError) as error:
@@ -487,11 +478,9 @@ class BlurTable:
         channels = max(v.shape[0] for v in checked.values())
         return {name: value.expand(channels, *value.shape[1:]).contiguous() for name, value in checked.items()}
 
-    def _check_field(self, field: Any) -> Field | None:
+    def _check_field(self, field: Field | None) -> Field | None:
         if field is None:
             return None
-        if not isinstance(field, Field):
-            raise ValueError(f"field must be a Field or None, got {show(field)}")
         if self.aperture is not None:
             raise ValueError(f"a table with a field has its own opening, got {self.aperture!r} too; leave one out")
         if self.unit == "relative":

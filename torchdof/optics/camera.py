@@ -184,10 +184,8 @@ class Camera:
         """Refuse a circle of confusion of a depth if it overflowed; the message has the numbers of the lens."""
         if not is_traced() and not all(map(math.isfinite, ends(coc_px))):
             stated = ", ".join(f"{name} {_show(getattr(self, name))}" for name in _NUMBERS)
-            raise ValueError(
-                f"depth and lens must give a finite blur radius, got an infinite one: check this lens ({stated}) "
-                f"and the depth, which starts at {float(depth.detach().min()):.3g} m"
-            )
+            checked = f"this lens ({stated}) and the depth, which starts at {float(depth.detach().min()):.3g} m"
+            raise ValueError(f"depth and lens must give a finite blur radius, got an infinite one: check {checked}")
 
     def _compiled_coc_px(self, depth: Tensor, width: int) -> Tensor | None:
         """:meth:`coc_px` by the compiled engine; None if it does not support the call (traced, batched, tilted)."""

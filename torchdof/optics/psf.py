@@ -33,7 +33,6 @@ Reference:
 All arithmetic is in float64 on the CPU's or the parameter's device; parameters are in pixels.
 """
 
-import functools
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -44,7 +43,7 @@ from torch import Tensor
 
 from ..validation import broadcast_shapes, choice, numbers, real_tensor, short, show
 from .aperture import Aperture
-from .kernel_cache import KernelCache
+from .kernel_cache import kept
 
 __all__ = [
     "FAMILIES",
@@ -88,7 +87,6 @@ _TILT_EXPONENT = 460.0  # largest logarithm of (r / R)^m, e^460 = 1e200; a large
 _MAX_WIDTH_PX = 2**16 + 1  # px; a kernel of this width takes 34 GB
 _MARGIN_PX = 2  # px around a kernel that its values depend on (the four neighbours in _non_negative, and theirs)
 _SLICES_AT_ONCE = 2**20  # slices computed together; limits memory
-_quadrants = KernelCache(64 * 2**20)
 
 Number = float | Tensor
 
@@ -188,12 +186,7 @@ def support(family: str, params: Mapping[str, Number], aperture: Aperture | None
 
 def width_of(size: int | None, reach_px: float) -> int:
     """Width in pixels of kernels: ``size`` if given, else the smallest that holds a PSF of radius ``reach_px``."""
-    if size is None:
-        size = 2 * half_width(reach_px) + 1
-        if size > _MAX_WIDTH_PX:
-            raise ValueError(
-                f"a kernel must be at most {_MAX_WIDTH_PX} pixels wide, got parameters that need {size}; state its size"
-            )
+    size = 2 * half_width(reach_px) + 1 if size is None else size
     if isinstance(size, bool) or not isinstance(size, int) or not 1 <= size <= _MAX_WIDTH_PX or size % 2 == 0:
         raise ValueError(f"size must be a positive odd number of pixels, got {show(size)} (at most {_MAX_WIDTH_PX})")
     return size
@@ -408,8 +401,7 @@ def _sliced_quadrant(family: str, lengths: Mapping[str, Tensor], half: int, slic
     rows = max(1, _SLICES_AT_ONCE // ((half + 1) * slices))
     strips = []
     for top in range(0, half + 1, rows):
-        part = (half, slices, top, min(top + rows, half + 1))
-        cut = _quadrants.get(part, functools.partial(_slices, *part)) if half <= _FINE_CELLS else _slices(*part)
+        cut = _slices(half, slices, top, min(top + rows, half + 1))
         inner, outer, area = (t.to(lengths[FAMILIES[family][-1]].device) for t in cut)
         strips.append((_slice_means(family, lengths, inner, outer) * area).sum(-1).unflatten(-1, (-1, half + 1)))
     return torch.cat(strips, -2)
@@ -455,7 +447,7 @@ def _table_integral(r: Tensor, p: Mapping[str, Tensor]) -> Tensor:
     return (start + left * fraction + (right - left) * fraction * fraction / 2) * radius / last
 
 
-@torch.inference_mode(False)  # cached tensors must be usable by autograd
+@kept
 def _slices(half: int, slices: int, top: int, bottom: int) -> tuple[Tensor, Tensor, Tensor]:
     """Slices of the cells of a quadrant's rows: inner and outer radius and area, each ``[cells, slices]``."""
     index = torch.arange(half + 1, dtype=torch.float64, device="cpu")
