@@ -108,7 +108,7 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         self.return_label = return_label
         options.setdefault("check", False)
         self.focus_m, self.f_number = (near_m, far_m), (smallest_f, largest_f)
-        self.renderings = [Options(table, **options) for table in tables]
+        self.renderings = [Options(table, **options) for table in tables]  # type: ignore[arg-type]
         self.flags = {"transfer": transfer}
         self._ranges = (
             ((1.0 / far_m, 1.0 / near_m), "focus", None, None),  # dioptres

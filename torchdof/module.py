@@ -52,7 +52,7 @@ class DepthOfField(nn.Module):
         if not isinstance(camera, Camera):
             raise ValueError(f"camera must be a torchdof.Camera, got {type(camera).__name__}")
         self.camera = camera
-        self.options = Options(table, **options)
+        self.options = Options(table, **options)  # type: ignore[arg-type]
 
     @property
     def options(self) -> Options:
@@ -338,7 +338,8 @@ def blur_by_coc(
     image, coc_px, background, hidden_coc, attention = flattened(
         axes, image=image, coc_px=coc_px, background=background, background_coc_px=hidden_coc, attention=attention
     )
-    return restored(axes, blur(image, coc_px, Options(table, **options), plan, background, hidden_coc, attention))
+    given = Options(table, **options)  # type: ignore[arg-type]
+    return restored(axes, blur(image, coc_px, given, plan, background, hidden_coc, attention))
 
 
 def blur(

@@ -62,7 +62,7 @@ class Options:
     """
 
     table: BlurTable = None  # type: ignore[assignment]  # becomes the disc
-    tolerance: Tolerance = 1 / 255
+    tolerance: float = 1 / 255
     occlusion: bool = True
     normalize: bool = True
     method: Method = "layered"
