@@ -122,8 +122,8 @@ class Camera:
         """
         _check_number("fov_x_deg", fov_x_deg, low=1e-9, high=180.0)
         _check_number("aperture_radius_m", aperture_radius_m)
-        is_tensor = isinstance(fov_x_deg, Tensor)
-        half = torch.tan(torch.deg2rad(fov_x_deg) / 2) if is_tensor else math.tan(math.radians(fov_x_deg) / 2)
+        angle = fov_x_deg * (math.pi / 180.0) / 2
+        half = torch.tan(angle) if isinstance(angle, Tensor) else math.tan(angle)
         focal_length_mm = 18.0 / half
         f_number = focal_length_mm / (2000.0 * aperture_radius_m)
         return cls(focal_length_mm, f_number, focus_m, 36.0, focus_breathing=False)
