@@ -33,14 +33,9 @@ def scene(batch: int = 2, most_px: float = 4.0, height: int = 7, width: int = 9)
 @pytest.mark.parametrize("normalize", [True, False])
 @pytest.mark.parametrize("table", TABLES, ids=NAMES)
 def test_scatter_equals_a_plain_loop_with_a_kernel_for_each_pixel(table: BlurTable, normalize: bool) -> None:
-    image, coc = scene(1)
-    expected = loops.accumulate(image, coc, table, None, normalize)
-    assert_close(splat(image, coc, table, normalize=normalize), expected, rtol=0, atol=3e-4)
-
-
-def test_a_wide_blur_in_a_small_frame_equals_the_loop() -> None:
-    image, coc = scene(1, most_px=30.0, height=3, width=6)
-    assert_close(splat(image, coc), loops.accumulate(image, coc, BlurTable.disc()), rtol=0, atol=3e-4)
+    for image, coc in (scene(1), scene(1, most_px=30.0, height=3, width=6)) if table is TABLES[0] else (scene(1),):
+        expected = loops.accumulate(image, coc, table, None, normalize)
+        assert_close(splat(image, coc, table, normalize=normalize), expected, rtol=0, atol=3e-4)
 
 
 def gauss_psf(image: Tensor, c_px: Tensor) -> Tensor:

@@ -108,7 +108,7 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         self.return_label = return_label
         options.setdefault("check", False)
         self.focus_m, self.f_number = (near_m, far_m), (smallest_f, largest_f)
-        self.renderings = [Options.of(table, **options) for table in tables]
+        self.renderings = [Options(table, **options) for table in tables]  # type: ignore[arg-type]
         self.flags = {"transfer": transfer}
         self._ranges = (
             ((1.0 / far_m, 1.0 / near_m), "focus", None, None),  # dioptres
@@ -144,12 +144,11 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         }
 
     def __repr__(self) -> str:
-        options = self.renderings[0].arguments()
-        del options["table"]
-        tables = [rendering.table for rendering in self.renderings]
         names = ("focus_m", "f_number", "camera", "same_on_batch", "p", "keepdim", "return_label")
+        tables = [rendering.table for rendering in self.renderings]
+        table = tables if len(tables) > 1 else tables[0]
         shown = {name: getattr(self, name) for name in names}
-        shown |= {"table": tables if len(tables) > 1 else tables[0], **self.flags, **options}
+        shown |= {**self.flags, **self.renderings[0].arguments(), "table": table}
         return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in shown.items())})"
 
     def __call__(self, input: Any, *arguments: Any, **kwargs: Any) -> Any:
@@ -203,8 +202,8 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         self, sample: Mapping[str, Any], params: dict[str, Tensor] | None, **kwargs: Any
     ) -> dict[str, Any]:
         """Blur a sample that is a dict, as in torchvision's transforms."""
-        key = next((name for name in _IMAGE_NAMES if name in sample), None)
-        if key is None or "depth" not in sample:
+        key = next((name for name in _IMAGE_NAMES if name in sample), "image")
+        if key not in sample or "depth" not in sample:
             raise ValueError(f"a dict must have 'image' and 'depth', got the keys {', '.join(map(str, sample))}")
         image, depth = (_as_plain_tensor(sample[name]) for name in (key, "depth"))
         blurred = self.forward(image, depth, params, **kwargs)
@@ -302,10 +301,8 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
             return image
         low, high = (float(value) for value in image.detach().aminmax())
         if not _ENCODED_RANGE[0] <= low <= high <= _ENCODED_RANGE[1]:
-            raise ValueError(
-                f"images with transfer='srgb' must lie in [0, 1], got {low:.4g} to {high:.4g}; put normalization "
-                "behind RandomDepthOfField, or say transfer='linear'"
-            )
+            got = f"{low:.4g} to {high:.4g}; normalize after RandomDepthOfField, or say transfer='linear'"
+            raise ValueError(f"images with transfer='srgb' must lie in [0, 1], got {got}")
         return decode(image, "srgb", has_alpha=False, straight=False)
 
 
@@ -363,9 +360,8 @@ def _image_and_depth(input: Tensor, depth: Tensor | None) -> tuple[Tensor, Tenso
     if depth is None:
         if input.shape[1] not in (2, 4):
             raise ValueError(
-                "RandomDepthOfField needs a depth: give it as the second argument or as the last channel of an "
-                "image of 2 or 4 channels, or use torchdof.augmentation.DepthAugmentationSequential, whose first "
-                f"mask is the depth; got an image of {input.shape[1]} channels alone"
+                "RandomDepthOfField needs a depth: the second argument, the last of 2 or 4 channels, or the first mask "
+                f"of DepthAugmentationSequential; got an image of {input.shape[1]} channels alone"
             )
         image, depth, passed_on = input[:, :-1], input[:, -1:], input[:, -1:]
     real_tensor("depth", depth, "[B, 1, H, W] in metres")
@@ -389,12 +385,10 @@ def _range(name: str, value: Any, largest: float) -> tuple[float, float]:
 def _batch_shape(image: Any) -> tuple[int, ...]:
     """Shape ``[B, C, H, W]`` of one image or a batch."""
     if not floating(image) or image.ndim not in (3, 4):
-        hint = ""
-        if isinstance(image, Tensor) and not image.is_floating_point():
-            hint = "; convert bytes with image.float() / 255, or torchvision's ToDtype(torch.float32, scale=True)"
-        elif floating(image) and image.ndim == 5:
-            hint = "; join the first axes of clips, as image.flatten(0, 1) does"
-        raise ValueError(f"image must be a floating-point tensor [B, C, H, W] or [C, H, W], got {show(image)}{hint}")
+        expected = (
+            "a floating-point tensor [B, C, H, W] or [C, H, W] (bytes: image.float() / 255; clips: flatten(0, 1))"
+        )
+        raise ValueError(f"image must be {expected}, got {show(image)}")
     return tuple(image.shape) if image.ndim == 4 else (1, *image.shape)
 
 

@@ -20,35 +20,35 @@ def leading_axes(image: Any) -> tuple[int, ...]:
     return (1,)
 
 
-def flattened(axes: tuple[int, ...], name: str, value: Any, what: str = "1") -> Any:
-    """A tensor of images or maps as a contiguous batch ``[B, ..., H, W]``; a single map for all images stays one item.
+def flattened(axes: tuple[int, ...], **values: Any) -> list[Any]:
+    """Tensors of images and maps, by argument name, as contiguous batches ``[B, ..., H, W]``; one for all stays one.
 
-    ``axes`` are the :func:`leading_axes` of the image; ``name`` of the argument and ``what``, its channels, are for the
-    message. A value that is no tensor is returned unchanged.
+    ``axes`` are the :func:`leading_axes` of the image. Only ``image`` and ``background`` may have several channels.
+    A value that is no tensor is returned unchanged.
 
     Raises:
         ValueError: If its leading axes do not fit, or it comes from ``torch.vmap``.
 
     Example:
-        >>> flattened((2, 5), "depth", torch.ones(2, 1, 1, 8, 12)).shape
+        >>> flattened((2, 5), depth=torch.ones(2, 1, 1, 8, 12))[0].shape
         torch.Size([10, 1, 8, 12])
     """
-    if not isinstance(value, Tensor) or value.layout != torch.strided:  # the checks of the batch refuse it
-        return value
-    _refuse_vmap(name, value)
-    if len(axes) == 1:
-        return value.contiguous()
-    fits = value.ndim == len(axes) + 3 and (what == "C" or value.shape[-3] == 1)
-    fits = fits and all(n in (1, m) for n, m in zip(value.shape, axes, strict=False))
-    if not fits:
-        leading = ", ".join(map(str, axes)) + ", " * bool(axes)
-        raise ValueError(
-            f"{name} must be [{leading}{what}, H, W] beside an image [{leading}C, H, W], got {list(value.shape)}"
-        )
-    if not axes:
-        return value[None].contiguous()
-    shared = all(n == 1 for n in value.shape[: len(axes)])
-    return (value if shared else value.expand(*axes, -1, -1, -1)).flatten(0, 1).contiguous()
+    batches = []
+    for name, value in values.items():
+        if isinstance(value, Tensor) and value.layout == torch.strided:  # the checks of the batch refuse others
+            _refuse_vmap(name, value)
+            channels = "C" if name in ("image", "background") else "1"
+            if len(axes) != 1:
+                fits = value.ndim == len(axes) + 3 and (channels == "C" or value.shape[-3] == 1)
+                if not fits or not all(n in (1, m) for n, m in zip(value.shape, axes, strict=False)):
+                    start = ", ".join(map(str, axes)) + ", " * bool(axes)
+                    expected = f"[{start}{channels}, H, W] beside an image [{start}C, H, W]"
+                    raise ValueError(f"{name} must be {expected}, got {list(value.shape)}")
+                is_shared = all(n == 1 for n in value.shape[: len(axes)])
+                value = (value if is_shared else value.expand(*axes, -1, -1, -1)).reshape(-1, *value.shape[-3:])
+            value = value.contiguous()
+        batches.append(value)
+    return batches
 
 
 def numbers(axes: tuple[int, ...], name: str, value: Any) -> Any:
@@ -95,7 +95,6 @@ def _refuse_vmap(name: str, value: Tensor) -> None:
     while not is_traced() and torch._C._functorch.is_functorch_wrapped_tensor(value):
         if torch._C._functorch.is_batchedtensor(value):
             raise ValueError(
-                f"{name} comes from torch.vmap, which cannot follow this rendering: layers are planned from the "
-                "numbers of the depth; call it with the whole batch instead, [B, C, H, W] and [B, 1, H, W]"
+                f"{name} comes from torch.vmap, in which no values can be read; pass the whole batch instead"
             )
         value = torch._C._functorch.get_unwrapped(value)  # torch.func.grad inside of torch.vmap wraps it once more

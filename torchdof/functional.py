@@ -79,13 +79,9 @@ def splat(
         True
     """
     if is_traced():
-        raise ValueError(
-            "splat makes kernels of the radii that occur, which a compiled or exported graph cannot; call it outside, "
-            "as torch.compiler.disable(splat), or use blur_by_coc(..., occlusion=False)"
-        )
+        raise ValueError("splat cannot be compiled or exported; use torch.compiler.disable(splat), or blur_by_coc")
     axes = leading_axes(image)
-    image, coc_px = flattened(axes, "image", image, "C"), flattened(axes, "coc_px", coc_px)
-    sigma_px = flattened(axes, "sigma_px", sigma_px)
+    image, coc_px, sigma_px = flattened(axes, image=image, coc_px=coc_px, sigma_px=sigma_px)
     if (coc_px is None) == (sigma_px is None):
         got = "neither" if coc_px is None else "both"
         raise ValueError(f"splat takes coc_px, with a table, or sigma_px, of Gaussians; got {got}")
@@ -101,15 +97,9 @@ def splat(
         raise ValueError(f"table must be a torchdof.BlurTable, got {show(table)}; read a file with BlurTable.load()")
     image_and_coc(image, coc_px, table.channels, values=True)
     if table.depends_on_place:
-        raise ValueError(
-            "splat takes one kernel a radius, not a table with a field or vignetting; leave these out, or use "
-            "blur_by_coc(..., occlusion=False)"
-        )
+        raise ValueError("splat takes one kernel a radius, no table with a field or vignetting; use blur_by_coc")
     if table.is_differentiated:
-        raise ValueError(
-            "splat gives no gradient to the aperture; detach its rotation and squeeze, or use "
-            "blur_by_coc(..., occlusion=False)"
-        )
+        raise ValueError("splat gives no gradient to the aperture; detach its rotation and squeeze, or use blur_by_coc")
     return restored(axes, _splatted(image, coc_px, table, normalize))
 
 

@@ -11,7 +11,7 @@ from typing_extensions import Unpack
 from . import validation
 from .batch import flattened, leading_axes, numbers, restored
 from .optics.blur_table import BlurTable
-from .optics.camera import CAMERA_NUMBERS, Camera
+from .optics.camera import Camera
 from .options import OPTION_NAMES, OptionArguments, Options, read_state, spells_options
 from .render import edges, pipeline
 from .render.attention import Attention
@@ -52,13 +52,13 @@ class DepthOfField(nn.Module):
         if not isinstance(camera, Camera):
             raise ValueError(f"camera must be a torchdof.Camera, got {type(camera).__name__}")
         self.camera = camera
-        self.options = Options.of(table, **options)
+        self.options = Options(table, **options)  # type: ignore[arg-type]
 
     @property
     def options(self) -> Options:
         """The options of the next rendering; each is also an attribute of the module, which may be set."""
         values: Any = {name: getattr(self, name) for name in OPTION_NAMES}
-        return Options.of(**values)
+        return Options(**values)
 
     @options.setter
     def options(self, options: Options) -> None:
@@ -109,15 +109,19 @@ class DepthOfField(nn.Module):
         refuse_old_compiler()
         options, axes = self.options, leading_axes(image)
         lens = (numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number))
-        image, depth = flattened(axes, "image", image, "C"), flattened(axes, "depth", depth)
-        background = flattened(axes, "background", background, "C")
-        background_depth = flattened(axes, "background_depth", background_depth)
+        image, depth, background, background_depth, attention = flattened(
+            axes,
+            image=image,
+            depth=depth,
+            background=background,
+            background_depth=background_depth,
+            attention=attention,
+        )
         coc = self.coc_as_given(image, depth, *lens)
         validation.background(image, background, "background_depth", background_depth, "in metres")
         behind = None
         if background is not None and background_depth is not None:
             behind = self.coc_as_given(background, background_depth, *lens, name="background_depth")
-        attention = flattened(axes, "attention", attention)
         return restored(axes, blur(image, coc, options, plan, background, behind, attention))
 
     def layers(
@@ -149,11 +153,24 @@ class DepthOfField(nn.Module):
             torch.Size([1, 4, 8, 12])
         """
         options = self.options
-        depth = validation.stack(rgba, depth_m, options.check)
-        batch, count, _, height, width = rgba.shape
-        maps = depth.expand(batch, -1, 1, height, width)
         if not options.occlusion:
             raise ValueError("layers hide each other: they need occlusion=True")
+        validation.real_tensor("rgba", rgba, "[B, N, C + 1, H, W]")
+        validation.real_tensor("depth_m", depth_m, "in metres")
+        if rgba.ndim != 5 or rgba.shape[2] < 2 or 0 in rgba.shape:
+            raise ValueError(f"rgba must be [B, N, C + 1, H, W], premultiplied, got {list(rgba.shape)}")
+        batch, count, _, height, width = rgba.shape
+        maps = depth_m[..., None, None, None] if depth_m.ndim in (1, 2) else depth_m
+        try:
+            maps = maps.expand(batch, count, 1, height, width)
+        except RuntimeError:
+            expected = f"[{count}], [{batch}, {count}] or [{batch}, {count}, 1, {height}, {width}]"
+            raise ValueError(f"depth_m must be {expected} in metres, got {list(depth_m.shape)}") from None
+        if options.check:
+            validation.finite("rgba", rgba)
+            low, high = (0.0, 1.0) if is_traced() else validation.ends(rgba[:, :, -1])
+            if not 0.0 <= low <= high <= 1.0:
+                raise ValueError(f"coverage, the last channel of rgba, must lie in [0, 1], got {low:g} to {high:g}")
         frame = rgba.new_empty(batch, 1, height, width)
         cocs = [self.coc_as_given(frame, layer, focus_m, f_number, name="depth_m") for layer in maps.unbind(1)]
         with without_autocast(rgba.device.type):
@@ -171,7 +188,7 @@ class DepthOfField(nn.Module):
         """
         axes = leading_axes(image)
         lens = (numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number))
-        image, depth = flattened(axes, "image", image, "C"), flattened(axes, "depth", depth)
+        image, depth = flattened(axes, image=image, depth=depth)
         coc = self.coc_as_given(image, depth, *lens)
         validation.image_and_map(image, "coc_px", coc, "in pixels")  # a lens of another batch size changes its shape
         return restored(axes, edges.mended(image, coc, self.options.depth_edges))
@@ -189,8 +206,9 @@ class DepthOfField(nn.Module):
         The depth ``[B or 1, 1, H, W]`` may have a size that can be resampled to the image's.
         """
         check = self.options.check
-        if not is_traced() and validation.is_resizable(image, depth):
-            if stretch := validation.stretch(image, depth):
+        stretch = None if is_traced() else validation.stretch(image, depth)
+        if stretch is not None and image.shape[-2:] != depth.shape[-2:]:
+            if stretch:
                 warnings.warn(f"{name} is stretched by {stretch:.1%} to the shape of the image", stacklevel=3)
             depth = at_size_of(image, depth)
         validation.image_and_depth(image, depth, values=check, name=name)
@@ -201,7 +219,7 @@ class DepthOfField(nn.Module):
         coc = camera.coc_px(depth, width)
         if not check:
             return torch.where(depth > 0, coc, torch.nan)
-        validation.coc_of_lens(coc, depth, {name: getattr(camera, name) for name in CAMERA_NUMBERS})
+        camera.refuse_overflow(coc, depth)
         return coc
 
     def plan(self, image: Tensor, depth: Tensor, focus_m: Number | None = None, f_number: Number | None = None) -> Plan:
@@ -219,7 +237,7 @@ class DepthOfField(nn.Module):
               coc px  radius    at  pixels
             ...
         """
-        coc = flattened(leading_axes(image), "coc_px", self.coc_px(image, depth, focus_m, f_number))
+        (coc,) = flattened(leading_axes(image), coc_px=self.coc_px(image, depth, focus_m, f_number))
         return Plan.for_scene(coc, self.options.tolerance).with_pixels(coc)
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -316,17 +334,12 @@ def blur_by_coc(
         torch.Size([1, 3, 8, 12])
     """
     refuse_old_compiler()
-    axes = leading_axes(image)
-    rendered = blur(
-        flattened(axes, "image", image, "C"),
-        flattened(axes, "coc_px", coc_px),
-        Options.of(table, **options),
-        plan,
-        flattened(axes, "background", background, "C"),
-        flattened(axes, "background_coc_px", background_coc_px),
-        flattened(axes, "attention", attention),
+    axes, hidden_coc = leading_axes(image), background_coc_px
+    image, coc_px, background, hidden_coc, attention = flattened(
+        axes, image=image, coc_px=coc_px, background=background, background_coc_px=hidden_coc, attention=attention
     )
-    return restored(axes, rendered)
+    given = Options(table, **options)  # type: ignore[arg-type]
+    return restored(axes, blur(image, coc_px, given, plan, background, hidden_coc, attention))
 
 
 def blur(
@@ -345,10 +358,8 @@ def blur(
     """
     validation.image_and_coc(image, coc_px, options.table.channels, values=options.check)
     if plan is not None and not isinstance(plan, Plan):
-        raise ValueError(
-            f"plan must be a Plan from DepthOfField.plan(image, depth) or None, got {validation.show(plan)}; "
-            "leave it out to plan for this image"
-        )
+        got = validation.show(plan)
+        raise ValueError(f"plan must be a Plan from DepthOfField.plan(image, depth), or left out, got {got}")
     validation.background(image, background, "background_coc_px", background_coc_px, "in pixels", options.check)
     hidden = None if background is None or background_coc_px is None else (background, background_coc_px)
     if hidden is not None and not options.occlusion:

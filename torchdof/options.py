@@ -1,12 +1,8 @@
 """The options of a rendering, defined once: names, types, defaults, meaning, checks."""
 
-import contextlib
 import dataclasses
 import inspect
-from collections.abc import Iterator
 from typing import Any, Literal, TypedDict, TypeVar, get_args
-
-from typing_extensions import Unpack
 
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera
@@ -61,11 +57,11 @@ class Options:
         ValueError: If an option is invalid; the message names it.
 
     Example:
-        >>> Options().tolerance == 1 / 255
+        >>> Options(table=None, tolerance="preview") == Options(tolerance=4 / 255)
         True
     """
 
-    table: BlurTable = _DISC
+    table: BlurTable = None  # type: ignore[assignment]  # becomes the disc
     tolerance: float = 1 / 255
     occlusion: bool = True
     normalize: bool = True
@@ -75,10 +71,11 @@ class Options:
     depth_edges: DepthEdges = "auto"
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "table", _DISC if self.table is None else self.table)
         if not isinstance(self.table, BlurTable):
             got = type(self.table).__name__
             raise ValueError(f"table must be a torchdof.BlurTable, got {got}; read a file with BlurTable.load()")
-        tolerance_of(self.tolerance)
+        object.__setattr__(self, "tolerance", tolerance_of(self.tolerance))
         for name in ("occlusion", "normalize", "check"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name} must be True or False, got {show(getattr(self, name))}")
@@ -89,26 +86,6 @@ class Options:
         radius = self.max_coc_px
         if isinstance(radius, bool) or not isinstance(radius, int | float) or not 0.5 < radius < 1e300:
             raise ValueError(f"max_coc_px must be a radius above 0.5 pixels, got {show(radius)}")
-
-    @classmethod
-    def of(cls, table: BlurTable | None = None, **arguments: Unpack["OptionArguments"]) -> "Options":
-        """Options from a caller's arguments: ``table=None`` means the disc, a named tolerance its number.
-
-        Raises:
-            ValueError: If an option is invalid; the message names it.
-            TypeError: If an argument is not an option; the message names it.
-
-        Example:
-            >>> Options.of(table=None, tolerance="preview") == Options(tolerance=4 / 255)
-            True
-        """
-        values: dict[str, Any] = dict(arguments)
-        for name in values:
-            if name not in OPTION_NAMES:
-                raise TypeError(f"there is no option {name!r}; options are {', '.join(OPTION_NAMES)}")
-        if "tolerance" in values:
-            values["tolerance"] = tolerance_of(values["tolerance"])
-        return cls(_DISC if table is None else table, **values)
 
     def arguments(self) -> dict[str, Any]:
         """These options as keyword arguments of :class:`torchdof.DepthOfField` or :func:`torchdof.blur_by_coc`."""
@@ -148,28 +125,17 @@ def spells_options(function: _Decorated) -> _Decorated:
 
 
 def read_state(state: Any) -> tuple[Camera, Options]:
-    """Camera and options (with the table) from the state of a module.
-
-    Raises:
-        ValueError: If a field is missing, unknown or invalid; the message names it.
-    """
-    given = fields(
-        "the state of a DepthOfField", state, ("camera", *(field.name for field in dataclasses.fields(Options)))
-    )
+    """Camera and options (with the table) from the state of a module; ``ValueError`` names a wrong field."""
+    part = "the state of a DepthOfField"
+    given = fields(part, state, ("camera", *OPTION_NAMES))
     required = [name for name in Camera.__dataclass_fields__ if name not in _NEWER_NUMBERS]
     numbers = fields("camera of the state", given.pop("camera"), required, _NEWER_NUMBERS)
-    with _named("camera of the state"):
-        restored = Camera(**numbers)
-    with _named("table of the state"):
-        given["table"] = BlurTable.from_dict(given["table"])
-    with _named("the state of a DepthOfField"):
-        return restored, Options(**given)
-
-
-@contextlib.contextmanager
-def _named(what: str) -> Iterator[None]:
-    """Adds a name to the message of an error."""
     try:
-        yield
+        part = "camera of the state"
+        camera = Camera(**numbers)
+        part = "table of the state"
+        given["table"] = BlurTable.from_dict(given["table"])
+        part = "the state of a DepthOfField"
+        return camera, Options(**given)
     except ValueError as error:
-        raise ValueError(f"{what}: {error}") from error
+        raise ValueError(f"{part}: {error}") from error

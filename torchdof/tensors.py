@@ -38,10 +38,8 @@ def refuse_old_compiler() -> None:
 
 
 def _refuse_compiler() -> None:
-    raise RuntimeError(
-        f"torchdof needs PyTorch 2.13 or newer to be compiled, this is {torch.__version__}; leave it out of compiled "
-        "code, with torch.compiler.disable(dof)"
-    )
+    needed = f"torchdof needs PyTorch 2.13 or newer to be compiled, this is {torch.__version__}"
+    raise RuntimeError(f"{needed}; leave it out of compiled code, with torch.compiler.disable(dof)")
 
 
 # With this flag the compiler calls the function, so that its message is seen; at a plain exception it would only stop

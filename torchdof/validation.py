@@ -38,8 +38,8 @@ def show(value: Any) -> str:
     try:
         text = repr(value)
     except Exception:  # an integer with more digits than Python prints, or an error in the object's own repr
-        text = ""
-    return text if 0 < len(text) <= 60 else f"{type(value).__name__} {text[:40]}...".replace(" ...", "")
+        return type(value).__name__
+    return text if len(text) <= 60 else f"{type(value).__name__} {text[:40]}..."
 
 
 def number(
@@ -76,18 +76,17 @@ def choice(name: str, value: Any, choices: Collection[str]) -> None:
 def numbers(name: str, value: Any) -> Tensor:
     """Finite numbers, such as lists of them or a tensor, as a float64 tensor on the CPU."""
     if isinstance(value, Tensor):
-        is_whole = value.dtype in WHOLE_NUMBERS and value.layout == torch.strided and value.device.type != "meta"
-        values = (value if is_whole else real_tensor(name, value, "of numbers")).detach().to("cpu", torch.float64)
+        values = real_tensor(name, value, "of numbers", whole=True).detach().to("cpu", torch.float64)
     else:
-        if isinstance(value, list | tuple):
-            value = [item.detach() if isinstance(item, Tensor) else item for item in value]
         try:
-            values = torch.as_tensor(value, device="cpu")
-            if not floating(values) and values.dtype not in WHOLE_NUMBERS:
+            if isinstance(value, list | tuple):
+                value = [item.tolist() if isinstance(item, Tensor) else item for item in value]
+            array = np.asarray(value)
+            if array.dtype.kind not in "iuf":
                 raise TypeError
-            values = torch.as_tensor(value, dtype=torch.float64, device="cpu")  # the line above made a list float32
-        except (TypeError, ValueError, RuntimeError, OverflowError):
+        except (TypeError, ValueError, RuntimeError):
             raise ValueError(f"{name} must be numbers, got {show(value)}") from None
+        values = torch.from_numpy(array.astype(np.float64))
     if not bool(torch.isfinite(values).all()):
         raise ValueError(f"{name} must be finite numbers, got {short(values)}")
     return values
@@ -123,14 +122,8 @@ def tolerance_of(value: Any) -> float:
 
 def pixels_wide(width: Any) -> None:
     """Refuse a width that is not a positive number of pixels; symbols and tensors of a traced program pass."""
-    if is_traced() or isinstance(width, torch.SymInt):
-        return
-    if isinstance(width, Tensor):
-        is_stored = width.layout == torch.strided and width.device.type != "meta"
-        if width.ndim or width.is_complex() or not is_stored or width.requires_grad:
-            raise ValueError(f"width must be one number of pixels, without gradients, got {show(width)}")
-        width = width.item()
-    number("width", width, low=0, unit="pixels")
+    if not is_traced() and not isinstance(width, torch.SymInt):
+        number("width", numbers("width", width).tolist() if isinstance(width, Tensor) else width, 0, unit="pixels")
 
 
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
@@ -145,10 +138,8 @@ def ends(values: Tensor) -> tuple[float, float]:
         ValueError: If they come from ``torch.func`` of a PyTorch older than 2.13, where they cannot be read.
     """
     if not TRACEABLE and torch._C._functorch.is_functorch_wrapped_tensor(values):
-        raise ValueError(
-            "the image, the depth or a number of the camera comes from torch.func, for which torchdof needs PyTorch "
-            f"2.13 or newer, this is {torch.__version__}; use torch.autograd instead"
-        )
+        needed = f"PyTorch 2.13 or newer, this is {torch.__version__}"
+        raise ValueError(f"an argument comes from torch.func, for which torchdof needs {needed}; use torch.autograd")
     if values.dtype == torch.float32 and is_in_memory(values) and native.chosen():
         return native.ends(values)
     # in float32 at least: autocast supports only one half-precision dtype at a time
@@ -157,74 +148,61 @@ def ends(values: Tensor) -> tuple[float, float]:
     return low, high
 
 
-def real_tensor(name: str, value: Any, what: str) -> Tensor:
-    """A dense floating-point tensor that holds data.
+def real_tensor(name: str, value: Any, what: str, whole: bool = False) -> Tensor:
+    """A dense tensor that holds data, of floating-point numbers or, if ``whole`` allows them, of whole ones.
 
     ``what`` is the expected shape and unit for the message, such as ``"[B, 1, H, W] in metres"``.
     """
-    if not isinstance(value, Tensor):
-        raise ValueError(f"{name} must be a tensor {what}, got {show(value)}")
-    if not floating(value):
-        got = show(value) if value.is_nested else f"{value.dtype}; convert it with .float()"
-        raise ValueError(f"{name} must be a floating-point tensor {what}, got {got}")
-    if value.layout != torch.strided:
-        raise ValueError(f"{name} must be a dense tensor {what}, got {value.layout}; convert it with .to_dense()")
-    if value.device.type == "meta":
-        raise ValueError(f"{name} must be a tensor {what} that holds data, got one on the meta device")
-    if is_traced():
+    if not floating(value) and not (whole and isinstance(value, Tensor) and value.dtype in WHOLE_NUMBERS):
+        got = show(value)
+    elif value.layout != torch.strided:
+        got = f"one of layout {value.layout}"
+    elif value.device.type == "meta":
+        got = "one on the meta device"
+    elif is_traced():
         return value
-    if torch.jit.is_tracing():
-        raise ValueError(
-            f"{name} must not be recorded by torch.jit.trace; use torch.compile or torchdof.export.to_onnx"
-        )
-    if not torch._C._functorch.is_functorch_wrapped_tensor(value) and not has_storage(value):
-        kind = f"a {type(value).__name__} without memory of its own" if type(value) is not Tensor else "a freed storage"
-        raise ValueError(
-            f"{name} must be a tensor {what} that holds data, got {kind}; pass the tensor with its numbers"
-        )
-    return value
+    elif torch.jit.is_tracing():
+        got = "one recorded by torch.jit.trace; use torch.compile or torchdof.export.to_onnx"
+    elif torch._C._functorch.is_functorch_wrapped_tensor(value) or has_storage(value):
+        return value
+    else:
+        got = "a freed storage" if type(value) is Tensor else f"a {type(value).__name__} without memory of its own"
+    raise ValueError(
+        f"{name} must be a tensor {what}, floating point (.float()), dense (.to_dense()), that holds data, got {got}"
+    )
 
 
-def _check_finite(name: str, values: Tensor) -> None:
-    if not all(map(math.isfinite, ends(values))):
+def one_channel(name: str, value: Any, unit: str = "", whole: bool = False) -> None:
+    """Refuse a value that is not a map ``[B, 1, H, W]`` in a unit; arguments as of :func:`real_tensor`."""
+    expected = f"[B, 1, H, W] {unit}".rstrip()
+    real_tensor(name, value, expected, whole)
+    if value.ndim != 4 or value.shape[1] != 1 or not value.numel():
+        raise ValueError(f"{name} must be {expected} with at least one pixel, got {list(value.shape)}")
+
+
+def finite(name: str, values: Tensor) -> None:
+    """Refuse values that are NaN or infinite; those of a traced program pass."""
+    if not is_traced() and not all(map(math.isfinite, ends(values))):
         bad = values.numel() - int(torch.isfinite(values).sum())
-        raise ValueError(
-            f"{name} must be finite, got {bad} of {values.numel()} values that are NaN or infinite; "
-            "repair them, or pass check=False"
-        )
+        raise ValueError(f"{name} must be finite, got {bad} of {values.numel()} NaN or infinite (or pass check=False)")
 
 
 def image_and_map(image: Tensor, name: str, value: Tensor, unit: str) -> None:
     """Refuse an image and a one-channel map, in a unit, whose types, sizes or devices do not fit."""
-    if not isinstance(image, Tensor):
-        got = show(image) if isinstance(image, np.ndarray) else type(image).__name__
-        raise ValueError(f"image must be a tensor [B, C, H, W] in linear light, got {got}")
-    if not floating(image):
-        hint = "convert it with .float()" if image.is_floating_point() else "decode it first"
-        got = show(image) if image.is_nested else f"{image.dtype}; {hint}"
-        raise ValueError(f"image must be floating point in linear light, of 16 bits or more, got {got}")
-    if image.ndim != 4:
+    real_tensor("image", image, "[B, C, H, W] in linear light")
+    if image.ndim != 4 or 0 in image.shape:
         hint = "; did you forget the batch dimension? use image[None]" if image.ndim == 3 else ""
-        raise ValueError(f"image must be [B, C, H, W] in linear light, got {list(image.shape)}{hint}")
-    if 0 in image.shape:
-        raise ValueError(f"image must have at least one pixel, channel and item, got {list(image.shape)}")
+        raise ValueError(f"image must be [B, C, H, W] with at least one pixel, got {list(image.shape)}{hint}")
     batch, _, height, width = image.shape
-    expected = f"{name} must be [{batch}, 1, {height}, {width}] or [1, 1, {height}, {width}] {unit}"
-    if not floating(value):
-        got = show(value) if isinstance(value, Tensor) else type(value).__name__
-        raise ValueError(f"{expected} and floating point, got {got}")
-    if value.ndim != 4:
+    expected = f"[{batch}, 1, {height}, {width}] or [1, 1, {height}, {width}] {unit} beside this image"
+    real_tensor(name, value, expected)
+    if value.ndim != 4 or value.shape[1:] != (1, height, width) or value.shape[0] not in (1, batch):
         hint = "; did you forget the channel dimension?" if value.ndim == 3 else ""
-        raise ValueError(f"{expected}, got {list(value.shape)}{hint}")
-    if value.shape[1:] != (1, height, width) or value.shape[0] not in (1, batch):
-        is_last = value.shape[-2:] == image.shape[1:3]
-        hint = "; channels come before height and width: image.movedim(-1, -3)" if is_last else ""
-        raise ValueError(f"{expected} as the image is {list(image.shape)}, got {list(value.shape)}{hint}")
+        if value.shape[-2:] == image.shape[1:3]:
+            hint = "; channels come before height and width: image.movedim(-1, -3)"
+        raise ValueError(f"{name} must be {expected}, got {list(value.shape)}{hint}")
     if value.device != image.device:
         raise ValueError(f"{name} must be on the image's device {image.device}, got {value.device}")
-    if not is_traced():
-        real_tensor("image", image, "[B, C, H, W]")
-        real_tensor(name, value, f"[B, 1, H, W] {unit}")
 
 
 def image_and_depth(image: Tensor, depth: Tensor, values: bool, name: str = "depth") -> None:
@@ -233,10 +211,8 @@ def image_and_depth(image: Tensor, depth: Tensor, values: bool, name: str = "dep
     if values and not is_traced() and not ends(depth)[0] > 0:
         bad = int((~(depth > 0)).sum())
         remedy = "check its unit and kind" if bad == depth.numel() else "fill the holes"
-        raise ValueError(
-            f"{name} must be > 0 (inf allowed), got {bad} of {depth.numel()} pixels that are NaN, zero or "
-            f"negative; {remedy}, or pass check=False to let these pixels through sharp"
-        )
+        got = f"{bad} of {depth.numel()} pixels that are NaN, zero or negative"
+        raise ValueError(f"{name} must be > 0 (inf allowed), got {got}; {remedy}, or let them sharp with check=False")
 
 
 def image_and_coc(image: Tensor, coc_px: Tensor, channels: int, values: bool) -> None:
@@ -248,20 +224,9 @@ def image_and_coc(image: Tensor, coc_px: Tensor, channels: int, values: bool) ->
     image_and_map(image, "coc_px", coc_px, "in pixels")
     if channels not in (1, image.shape[1]):
         raise ValueError(f"the table blurs {channels} channels, the image has {image.shape[1]}")
-    if values and not is_traced():
-        _check_finite("coc_px", coc_px)
-        _check_finite("image", image)
-
-
-def coc_of_lens(coc_px: Tensor, depth: Tensor, lens: Mapping[str, Any]) -> None:
-    """Refuse a circle of confusion that overflowed; the message has the numbers of the lens, floats or tensors."""
-    if not is_traced() and not all(map(math.isfinite, ends(coc_px))):
-        given = {n: value.flatten().tolist() if isinstance(value, Tensor) else [value] for n, value in lens.items()}
-        stated = ", ".join(" ".join([name, *(f"{x:.6g}" for x in numbers)]) for name, numbers in given.items())
-        raise ValueError(
-            f"depth and lens must give a finite blur radius, got an infinite one: check this lens ({stated}) "
-            f"and the depth, which starts at {float(depth.detach().min()):.3g} m"
-        )
+    if values:
+        finite("coc_px", coc_px)
+        finite("image", image)
 
 
 def background(
@@ -274,78 +239,38 @@ def background(
     if hidden is None and where is None:
         return
     if hidden is None or where is None:
-        missing = "background" if hidden is None else "background_depth (or background_coc_px)"
-        raise ValueError(f"a background needs its depth, and a depth its background: {missing} is missing")
-    like = (image.shape, image.dtype, image.device)
-    if not floating(hidden) or (hidden.shape, hidden.dtype, hidden.device) != like:
-        raise ValueError(f"background must be like the image, {show(image)}, got {show(hidden)}")
+        raise ValueError(f"background and {name} need each other, got only {name if hidden is None else 'background'}")
+    real_tensor("background", hidden, "like the image")
+    if (hidden.shape, hidden.dtype, hidden.device) != (image.shape, image.dtype, image.device):
+        raise ValueError(f"background must be like the image, {show(image)}, got {show(hidden)} on {hidden.device}")
     image_and_map(image, name, where, unit)
-    if not is_traced():
-        real_tensor("background", hidden, "[B, C, H, W]")
-        if values:
-            _check_finite(name, where)
-            _check_finite("background", hidden)
+    if values:
+        finite(name, where)
+        finite("background", hidden)
 
 
-def stretch(image: Tensor, depth: Tensor) -> float:
-    """Relative stretch of a depth map along one axis to the aspect ratio of an image; 0 for less than a pixel.
+def stretch(image: Any, depth: Any) -> float | None:
+    """Relative stretch of a depth map along one axis to the aspect ratio of an image, 0 for less than a pixel.
+
+    None if it is more than 3 %, or if one of the two is not a map ``[B, C, H, W]``.
 
     Example:
         >>> round(stretch(torch.rand(1, 3, 1080, 1920), torch.rand(1, 1, 294, 518)), 4)  # multiples of 14
         0.009
     """
+    if not all(isinstance(t, Tensor) and not t.is_nested and t.ndim == 4 and t.numel() for t in (image, depth)):
+        return None
     (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
     across, down = height * columns, width * rows
-    return abs(across - down) / min(across, down) if abs(across - down) >= max(width, columns) else 0.0
-
-
-def is_resizable(image: Any, depth: Any) -> bool:
-    """Whether a depth map has another size than an image, but nearly the same aspect ratio."""
-    maps = all(floating(t) and t.ndim == 4 and t.numel() for t in (image, depth))
-    if not maps or image.shape[-2:] == depth.shape[-2:] or image.device != depth.device:
-        return False
-    return depth.shape[0] in (1, image.shape[0]) and depth.shape[1] == 1 and stretch(image, depth) <= _MAX_STRETCH
+    share = abs(across - down) / min(across, down) if abs(across - down) >= max(width, columns) else 0.0
+    return share if share <= _MAX_STRETCH else None
 
 
 def same_aspect(image: Tensor, depth: Tensor) -> None:
-    """Refuse a depth map whose aspect ratio differs by more than 3 % from that of an image ``[..., H, W]``."""
-    if 0 in depth.shape or stretch(image, depth) > _MAX_STRETCH:
+    """Refuse a depth map whose aspect ratio differs by more than 3 % from that of an image."""
+    if stretch(image, depth) is None:
         (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
-        if 0 not in depth.shape and stretch(image, depth.transpose(-1, -2)) <= _MAX_STRETCH:
-            hint = "turned by 90 degrees it fits: rotate one of the two"
-        else:
-            hint = "crop one of the two, so that both show the same area"
-        raise ValueError(
-            f"depth is {columns} x {rows} pixels and the image {width} x {height}: a depth map may have another size, "
-            f"but must have the same aspect ratio, to within 3 %; {hint}"
-        )
-
-
-def stack(rgba: Tensor, depth_m: Tensor, values: bool) -> Tensor:
-    """Refuse a stack of layers and depths that do not fit.
-
-    With ``values`` coverage must lie in [0, 1] and light must be finite.
-
-    Returns:
-        The depths as ``[B or 1, N, 1, H or 1, W or 1]``.
-    """
-    real_tensor("rgba", rgba, "[B, N, C + 1, H, W]")
-    real_tensor("depth_m", depth_m, "in metres")
-    if rgba.ndim != 5 or rgba.shape[2] < 2 or 0 in rgba.shape:
-        raise ValueError(f"rgba must be [B, N, C + 1, H, W], premultiplied, got {list(rgba.shape)}")
-    batch, count, _, height, width = rgba.shape
-    is_short = depth_m.ndim in (1, 2) and depth_m.shape[-1] == count
-    depth = depth_m.reshape(-1, count, 1, 1, 1) if is_short else depth_m
-    is_like_layers = depth.ndim == 5 and depth.shape[0] in (1, batch) and depth.shape[1:3] == (count, 1)
-    if not is_like_layers or tuple(depth.shape[3:]) not in ((1, 1), (height, width)):
-        expected = f"[{count}], [{batch}, {count}] or [B, {count}, 1, H, W] of 1 x 1 or {height} x {width} pixels"
-        raise ValueError(f"depth_m must be {expected}, got {[*depth_m.shape]}")
-    if values and not is_traced():
-        coverage = rgba[:, :, -1]
-        bad = int((~((coverage >= 0) & (coverage <= 1))).sum())
-        if bad:
-            raise ValueError(
-                f"the last channel of rgba is coverage in [0, 1]; {bad} of {coverage.numel()} values are not"
-            )
-        _check_finite("rgba", rgba)
-    return depth
+        is_turned = stretch(image, depth.mT) is not None
+        hint = "turned by 90 degrees it fits: rotate one" if is_turned else "crop one, so that both show the same area"
+        sizes = f"depth is {columns} x {rows} pixels and the image {width} x {height}"
+        raise ValueError(f"{sizes}: they must have the same aspect ratio, to within 3 %; {hint}")

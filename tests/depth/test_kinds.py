@@ -115,8 +115,8 @@ test_invalid_arguments_are_refused = refuses(
     (lambda: depth_from_values(row(1.0), "disparity"), "disparity needs a scale"),
     (lambda: depth_from_values(row(1.0), "distance"), "needs the horizontal field of view"),
     (lambda: depth_from_values(row(1.0), "distance", fov_x_deg=180.0), r"must be a number of degrees > 0 and < 180"),
-    (lambda: depth_from_values(row(1.0), "z", scale=0.0), r"scale \(--depth-scale\) must be finite and not 0"),
-    (lambda: depth_from_values(row(1.0), "z", offset=NAN), r"offset \(--depth-offset\) finite"),
+    (lambda: depth_from_values(row(1.0), "z", scale=0.0), r"scale \(--depth-scale\) must not be 0"),
+    (lambda: depth_from_values(row(1.0), "z", offset=NAN), r"offset \(--depth-offset\) must be a number"),
     *((functools.partial(fill_holes, row(NAN), fill), "no pixel has a depth; check the kind, scale and offset")
       for fill in cast(Any, ("nearest", "far"))),
     *((functools.partial(fill_holes, row(1.0, NAN), fill), "fill")

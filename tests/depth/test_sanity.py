@@ -151,6 +151,6 @@ def test_the_advice_depends_on_the_kind_and_the_scale(metres: torch.Tensor) -> N
 
 
 test_a_tensor_that_is_not_a_depth_map_is_refused = refuses(
-    (lambda: check(torch.ones(8, 8), Camera()), r"depth must be \[B, 1, H, W\] in metres, got \[8, 8\]"),
-    (lambda: check(torch.ones(1, 1, 8, 8, dtype=torch.int32), Camera()), "floating-point"),
+    (lambda: check(torch.ones(8, 8), Camera()), r"depth must be \[B, 1, H, W\] in metres .*got \[8, 8\]"),
+    (lambda: check(torch.ones(1, 1, 8, 8, dtype=torch.int32), Camera()), "floating point"),
 )

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchdof import Camera, depth_of_field
 from torchdof.depth import Steady, SteadyFrames
-from torchdof.depth.motion import motion_between, shifted
+from torchdof.depth.steady import motion_between, shifted
 from torchdof.reference.metrics import display
 
 HEIGHT, WIDTH, SCALE = 64, 112, 3  # pixels, and samples along each side of one

@@ -163,8 +163,8 @@ test_an_invalid_opening_is_refused_by_name = refuses(
     (lambda: Aperture(blades=5, mask=torch.ones(3, 3)), "blades or a mask, got 5"),
     (lambda: BlurTable.from_aperture(torch.zeros(4, 4)), "not all of them 0"),
     (lambda: BlurTable.from_aperture(torch.ones(3, 4, 4)), r"transmission \[H, W\] of an opening, got \[3, 4, 4\]"),
-    (lambda: BlurTable.polygon(5, rim=-2.0), "b must be >= -1, got -2"),
-    (lambda: BlurTable("disc", [1.0], {"radius": [1.0]}, **SEVEN), "aperture must be an Aperture or None"),
+    (lambda: BlurTable.polygon(5, rim=-2.0), r"b of softm must be finite and >= -1, got \[-2\]"),
+    (lambda: BlurTable("disc", [1.0], {"radius": [1.0]}, **SEVEN), "aperture must be of type Aperture, got 7"),
     (lambda: Aperture.from_dict({"leaves": 7}), "aperture must have the fields .*; 'leaves' is not one"),
     (lambda: Aperture.from_dict({"mask": [[1.0], [2.0, 3.0]]}), "mask must be numbers"),
 )

@@ -22,15 +22,8 @@ def field(channels: int = 1) -> Field:
 
 
 def table(channels: int = 1, **arguments: Any) -> BlurTable:
-    return BlurTable(
-        "disc",
-        [-2.0, 1.0],
-        {"radius": torch.ones(channels, 2)},
-        unit="mm",
-        sensor_width_mm=36.0,
-        field=field(channels),
-        **arguments,
-    )
+    arguments |= {"unit": "mm", "sensor_width_mm": 36.0, "field": field(channels)}
+    return BlurTable("disc", [-2.0, 1.0], {"radius": torch.ones(channels, 2)}, **arguments)
 
 
 def test_spots_are_linear_between_nodes_and_grow_beyond_the_last_coc() -> None:

@@ -167,13 +167,6 @@ def test_kernel_of_size_zero_is_one_pixel(family: str) -> None:
     assert_close(psf.pixel_kernels(family, params, size=5), expected, rtol=0.0, atol=1e-12)
 
 
-def test_ring_profile_is_equation_one_of_the_paper() -> None:
-    r = torch.tensor([0.0, 4.2853e-4, 2e-3], dtype=torch.float64)
-    sigma = math.sqrt(5.5114e-6)
-    expected = torch.exp(-((r - 4.2853e-4) ** 2) / (2 * 5.5114e-6))
-    assert_close(psf.profile("ring", r, {"sigma": sigma, "r_c": 4.2853e-4}), expected)
-
-
 @pytest.mark.parametrize(("family", "params"), [*EXAMPLES, ("disc", {"radius": 4.2})])
 def test_less_than_1e_5_of_the_light_is_outside_the_support(family: str, params: dict[str, Any]) -> None:
     r, mass = mass_by_radius(family, params)

@@ -88,7 +88,7 @@ test_a_background_or_stack_that_does_not_fit_is_refused = refuses(
     (partial(SUM, IMAGE, DEPTH, background=IMAGE, background_depth=DEPTH), "occlusion=True"),
     (stacked(RGBA[0], torch.ones(1)), r"rgba must be \[B, N, C \+ 1, H, W\]"),
     (stacked(RGBA, torch.ones(3)), r"depth_m must be \[2\]"),
-    (stacked(RGBA, torch.ones(1, 2, 1, 8, 9)), "8 x 8"),
+    (stacked(RGBA, torch.ones(1, 2, 1, 8, 9)), "1, 8, 8"),
     (stacked(RGBA, torch.tensor([1.0, -1.0])), "depth_m must be > 0"),
     (stacked(RGBA + 1.5, torch.ones(2)), "coverage"),
     (partial(SUM.layers, RGBA, torch.ones(2)), "occlusion=True"),

@@ -19,10 +19,10 @@ from ..io.sheet import shrunk, write_sheet
 from ..module import blur_by_coc
 from ..optics.aperture import Aperture
 from ..optics.blur_table import BlurTable
-from ..optics.camera import CAMERA_NUMBERS, Camera
+from ..optics.camera import Camera
 from ..options import Options
 from ..render.resample import at_size_of
-from ..validation import coc_of_lens, same_aspect, stretch
+from ..validation import same_aspect, stretch
 from .lens import Area, Lens
 from .options import Scene, make_folder_of
 from .output import Notices, print_result
@@ -120,7 +120,7 @@ def coc_of(
         return values, None, []
     camera, remarks = scene.camera(frame, number, is_still)
     coc_px = frame.area.coc_px(camera, values)
-    coc_of_lens(coc_px, values, {name: getattr(camera, name) for name in CAMERA_NUMBERS})
+    camera.refuse_overflow(coc_px, values)
     notices.warn(frame.name, frame.mistakes(camera))
     return coc_px, camera, remarks + frame.remarks
 
@@ -200,7 +200,7 @@ class Renderer:
         if frame.picture.other_layers and suffix == ".exr":
             layers = ", ".join(frame.picture.other_layers)
             note("layers", f"{out}: is without the other layers of the image: {layers}")
-        options, table = Options.of(**command.arguments()), self.table
+        options, table = Options(**command.arguments()), self.table
         facts = {
             "out": str(out),
             "camera": camera and facts_of_camera(camera),

@@ -45,7 +45,7 @@ class Tables(ApertureOptions, Command):
         import torch.nn.functional as functional
 
         from ..io.sheet import write_sheet
-        from ..optics.table_file import shipped
+        from ..optics.blur_table import shipped
 
         panels = {}
         for name in self.names or ["disc", "gaussian", *shipped()]:

@@ -58,15 +58,16 @@ def guess_kind(values: Tensor, integers: bool = False, metric: bool = False) -> 
     if low == high:
         return Guess("z")
     downwards = _growth_downwards(values)
-    if integers or whole_numbers(finite):
+    is_whole = integers or whole_numbers(finite)
+    if is_whole:
         is_relative = high <= _MAX_8_BIT or high >= _MIN_16_BIT
-        metric_guess = Guess("z", 0.001, 0.0)
     else:
         is_relative = low < 0 or (high <= 1 and low < _NEAR_ZERO)
-        metric_guess = Guess("z")
     if is_relative:
         return Guess("relative", relative_kind="depth" if downwards < -_CLEAR_CORRELATION else "disparity")
-    return Guess("relative") if downwards > _CLEAR_CORRELATION and not metric else metric_guess
+    if downwards > _CLEAR_CORRELATION and not metric:
+        return Guess("relative")
+    return Guess("z", 0.001, 0.0) if is_whole else Guess("z")
 
 
 def subject_m(depth: Tensor) -> float:

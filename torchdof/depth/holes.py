@@ -1,13 +1,12 @@
 """Pixels without depth: count, refuse or fill them."""
 
-import math
+import itertools
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from ..validation import show
-from .kinds import number_map
+from ..validation import number, one_channel, show
 
 __all__ = ["Fill", "fill_holes", "resolve_holes"]
 
@@ -35,15 +34,13 @@ def fill_holes(depth: Tensor, fill: Fill) -> Tensor:
         >>> fill_holes(torch.tensor([[[[1.0, torch.nan, torch.nan, 4.0]]]]), "far")
         tensor([[[[1., 4., 4., 4.]]]])
     """
-    number_map("depth", depth)
-    if isinstance(fill, int | float) and not isinstance(fill, bool):
-        largest = torch.finfo(depth.dtype).max if depth.is_floating_point() else math.inf
-        if not fill > 0 or largest < fill < math.inf:
-            raise ValueError(f"the depth to fill with must be positive metres (inf allowed), got {show(fill)}")
-        return torch.where(depth.isnan(), float(fill), depth) if depth.is_floating_point() else depth
-    if not isinstance(fill, str) or fill not in ("nearest", "far"):
+    one_channel("depth", depth, "in metres")
+    if not isinstance(fill, str):
+        metres = number("fill (the depth in holes)", fill, 0, unit="metres", infinite=True)
+        return torch.where(depth.isnan(), torch.tensor(metres, dtype=torch.float64, device="cpu").to(depth), depth)
+    if fill not in ("nearest", "far"):
         raise ValueError(f"fill must be 'nearest', 'far' or metres, got {show(fill)}")
-    if depth.ndim != 4 or depth.shape[:2] != (1, 1):
+    if len(depth) != 1:
         raise ValueError(f"depth must be [1, 1, H, W], got {list(depth.shape)}")
     if not bool(depth.isnan().any()):
         return depth
@@ -67,12 +64,12 @@ def resolve_holes(depth: Tensor, name: str, fill: Fill | None, zero_is_known: bo
     if holes == 0:
         return depth, 0
     if fill is None and holes < depth.numel():
-        causes = "NaN or marked unknown" if zero_is_known else "NaN, zero, negative or marked unknown"
-        hint = "; if zero is the far end of relative depth, say that (--depth-kind relative)"
-        raise ValueError(
-            f"{name}: {holes} pixels ({100 * holes / depth.numel():.1f} %) have no depth ({causes}); say how to fill "
-            f"them: fill 'nearest' or 'far' (--fill-depth){'' if zero_is_known else hint}"
-        )
+        causes, hint = "NaN or marked unknown", ""
+        if not zero_is_known:
+            causes = "NaN, zero, negative or marked unknown"
+            hint = "; if zero is the far end of relative depth, say that (--depth-kind relative)"
+        share = f"{holes} pixels ({100 * holes / depth.numel():.1f} %) have no depth ({causes})"
+        raise ValueError(f"{name}: {share}; say how to fill them: fill 'nearest' or 'far' (--fill-depth){hint}")
     try:
         return fill_holes(depth, "far" if fill is None else fill), holes
     except ValueError as error:
@@ -99,20 +96,13 @@ def _nearest(depth: Tensor) -> Tensor:
     places = torch.arange(depth.numel(), device=depth.device).reshape(depth.shape)
     seed = torch.where(depth.isnan(), -1, places)
     for step in [*(1 << k for k in range(max(height, width).bit_length(), -1, -1)), 2, 1]:
-        best = seed[y, x]
-        best_distance = _squared_distance(best, y, x, width)
-        for dy in (-step, 0, step):
-            for dx in (-step, 0, step):
-                inside = (y + dy >= 0) & (y + dy < height) & (x + dx >= 0) & (x + dx < width)
-                neighbour = seed[(y + dy).clamp(0, height - 1), (x + dx).clamp(0, width - 1)]
-                neighbour = torch.where(inside, neighbour, -1)
-                distance = _squared_distance(neighbour, y, x, width)
-                best = torch.where(distance < best_distance, neighbour, best)
-                best_distance = torch.minimum(best_distance, distance)
+        best, best_distance = seed[y, x], torch.full_like(y, torch.iinfo(torch.int64).max)
+        for dy, dx in [(0, 0), *itertools.product((-step, 0, step), repeat=2)]:
+            inside = (y + dy >= 0) & (y + dy < height) & (x + dx >= 0) & (x + dx < width)
+            candidate = seed[(y + dy).clamp(0, height - 1), (x + dx).clamp(0, width - 1)]
+            distance = (candidate // width - y) ** 2 + (candidate % width - x) ** 2
+            is_nearer = inside & (candidate >= 0) & (distance < best_distance)
+            best = torch.where(is_nearer, candidate, best)
+            best_distance = torch.where(is_nearer, distance, best_distance)
         seed[y, x] = best
     return depth.flatten()[seed]
-
-
-def _squared_distance(seed: Tensor, y: Tensor, x: Tensor, width: int) -> Tensor:
-    far = torch.iinfo(torch.int64).max
-    return torch.where(seed < 0, far, (seed // width - y) ** 2 + (seed % width - x) ** 2)

@@ -6,9 +6,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from ..validation import WHOLE_NUMBERS, choice, number, real_tensor, show
+from ..validation import choice, number, one_channel
 
-__all__ = ["DepthKind", "depth_from_values", "number_map"]
+__all__ = ["DepthKind", "depth_from_values"]
 
 DepthKind = Literal["z", "distance", "disparity", "inverse", "coc"]
 KINDS: tuple[DepthKind, ...] = ("z", "distance", "disparity", "inverse", "coc")
@@ -55,19 +55,16 @@ def depth_from_values(
         tensor([[[[1.5000,    nan]]]])
     """
     choice("the kind of depth", kind, KINDS)
-    number_map("depth values", values)
-    if values.ndim != 4 or values.shape[1] != 1:
-        raise ValueError(f"depth values must be [B, 1, H, W], got {list(values.shape)}")
+    one_channel("depth values", values, whole=True)
     if kind == "disparity" and scale is None:
         raise ValueError(
             "disparity needs a scale (--depth-scale): the baseline in metres times the focal length in pixels; "
             "if it is unknown, treat the map as relative depth: from_relative (--depth-kind relative)"
         )
-    scale = 1.0 if scale is None else scale
-    for factor in (scale, offset):
-        if isinstance(factor, bool) or not isinstance(factor, int | float) or not abs(factor) < 1e300 or scale == 0.0:
-            got = f"got scale {show(scale)} and offset {show(offset)}"
-            raise ValueError(f"scale (--depth-scale) must be finite and not 0, offset (--depth-offset) finite, {got}")
+    scale = number("scale (--depth-scale)", 1.0 if scale is None else scale, -1e300, 1e300)
+    if scale == 0.0:
+        raise ValueError("scale (--depth-scale) must not be 0, got 0")
+    offset = number("offset (--depth-offset)", offset, -1e300, 1e300)
     if unknown is not None and not math.isnan(unknown if isinstance(unknown, float) else 0.0):
         unknown = number("unknown", unknown, infinite=True)
     # in double precision and in place, because maps have millions of pixels
@@ -83,25 +80,9 @@ def depth_from_values(
     if kind == "distance":
         if fov_x_deg is None:
             raise ValueError("distance along the ray needs the horizontal field of view (--fov-deg) to become depth")
-        depth /= _ray_length(depth, fov_x_deg)
+        number("the field of view", fov_x_deg, 0.0, 180.0, "degrees")
+        slope = max(math.tan(math.radians(fov_x_deg) / 2), 1e-300) * 2 / depth.shape[-1]  # of the ray, for each pixel
+        y, x = ((torch.arange(n, dtype=depth.dtype, device=depth.device) + 0.5 - n / 2) for n in depth.shape[-2:])
+        depth /= torch.sqrt(1.0 + (x * slope) ** 2 + (y[:, None] * slope) ** 2)
     metres = depth.float()
     return torch.where(metres.isfinite() if kind == "coc" else metres > 0, metres, torch.nan)
-
-
-def _ray_length(like: Tensor, fov_x_deg: float) -> Tensor:
-    """Length of the ray to depth 1 through each pixel's centre, ``[1, 1, H, W]``."""
-    number("the field of view", fov_x_deg, 0.0, 180.0, "degrees")
-    height, width = like.shape[-2:]
-    focal_px = width / 2 / max(math.tan(math.radians(fov_x_deg) / 2), 1e-300)
-    x = (torch.arange(width, dtype=like.dtype, device=like.device) + 0.5 - width / 2) / focal_px
-    y = (torch.arange(height, dtype=like.dtype, device=like.device) + 0.5 - height / 2) / focal_px
-    return torch.sqrt(1.0 + x[None, :] ** 2 + y[:, None] ** 2)[None, None]
-
-
-def number_map(name: str, values: Tensor) -> None:
-    """Refuse a value that is not a non-empty tensor of floating-point or whole numbers."""
-    if isinstance(values, Tensor) and values.dtype in WHOLE_NUMBERS and values.layout == torch.strided:
-        values = values.double()
-    real_tensor(name, values, "[B, 1, H, W]")
-    if not values.numel():
-        raise ValueError(f"{name} must have at least one pixel, got {list(values.shape)}")

@@ -10,8 +10,8 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ..tensors import is_traced, refuse_old_compiler
-from ..validation import choice, number, show, whole
-from .kinds import depth_from_values, number_map
+from ..validation import choice, number, numbers, one_channel, show, whole
+from .kinds import depth_from_values
 
 __all__ = ["RELATIVE_KINDS", "RelativeKind", "Scale", "from_relative", "solve_scale"]
 
@@ -74,7 +74,7 @@ def from_relative(
     far_m = number("far_m", far_m, low=0, unit="metres", infinite=kind != "depth")
     if not near_m < far_m:
         raise ValueError(f"near_m must be nearer than far_m, got near_m={near_m:g} and far_m={far_m:g}")
-    _check_map(values)
+    one_channel("relative depth", values, whole=True)
     dtype = values.dtype if values.is_floating_point() else torch.float32
     value = values.to(torch.promote_types(dtype, torch.float32)) if values.is_floating_point() else values.double()
     is_known = value.isfinite()
@@ -86,17 +86,13 @@ def from_relative(
         if not is_traced() and not bool((low < high).all()):
             if bool((low > high).any()):
                 raise ValueError("no pixel has a depth; check the map, and the value that means unknown")
-            raise ValueError(
-                "relative depth needs two different values to distinguish near from far, got one value everywhere; "
-                "give value_range=(smallest, largest) (--value-range) if the values mean something beyond this map"
-            )
+            problem = "relative depth needs two different values, got one value everywhere"
+            raise ValueError(f"{problem}; give value_range=(smallest, largest) (--value-range) to say its place")
     else:
-        if not isinstance(value_range, tuple | list) or len(value_range) != 2:
+        ends = numbers("value_range", value_range)
+        if ends.shape != (2,) or not ends[0] < ends[1]:
             raise ValueError(f"value_range must be (smallest, largest), got {show(value_range)}")
-        smallest, largest = (number("value_range", x) for x in value_range)
-        if not smallest < largest:
-            raise ValueError(f"value_range must be (smallest, largest), got ({smallest:g}, {largest:g})")
-        low, high = value.new_tensor(smallest), value.new_tensor(largest)
+        low, high = ends.to(value)
     value = _smooth_steps(torch.where(is_known, value, torch.nan))
     fraction = ((torch.where(is_known, value, low) - low) / (high - low)).clamp(0.0, 1.0)
     if kind == "depth":
@@ -192,17 +188,15 @@ def solve_scale(
         (4.0, 0.0)
     """
     choice("the kind of relative depth", kind, RELATIVE_KINDS)
-    _check_map(values)
+    one_channel("relative depth", values, whole=True)
     if values.shape[0] != 1:
         raise ValueError(f"values must be one map [1, 1, H, W], got {list(values.shape)}; solve each on its own")
     whole("patch", patch, 1, 2**31)
     samples = torch.tensor([_point(values, p, kind, patch) for p in points], dtype=torch.float64, device="cpu")
     value, metres = samples.reshape(-1, 2).unbind(1)
     if len(value.unique()) < 2:
-        raise ValueError(
-            f"scale and offset need at least two points of different values, got {len(value)} points of values "
-            f"{value.unique().tolist()}"
-        )
+        got = f"{len(value)} points of values {value.unique().tolist()}"
+        raise ValueError(f"scale and offset need at least two points of different values, got {got}")
     # Solve a v + b = y with y = z for "depth", else 1/z. Each row is divided by y, so that errors are relative.
     weight = 1.0 / metres if kind == "depth" else metres.clamp(max=1e6 * float(metres.min()))
     target = metres.isfinite().double() if kind != "depth" else torch.ones_like(value)
@@ -215,14 +209,6 @@ def solve_scale(
     if kind == "depth":
         return Scale("z", factor, constant / factor, residual)
     return Scale("disparity", 1.0 / factor, constant / factor, residual)
-
-
-def _check_map(values: Tensor) -> None:
-    """Refuse a value that is not a tensor ``[B, 1, H, W]`` of numbers."""
-    number_map("relative depth", values)
-    if values.ndim != 4 or values.shape[1] != 1:
-        hint = "; add the missing dimensions, as values[:, None] does" if values.ndim < 4 else ""
-        raise ValueError(f"relative depth must be [B, 1, H, W], got {list(values.shape)}{hint}")
 
 
 def _point(values: Tensor, point: tuple[float, float, float], kind: RelativeKind, patch: int) -> tuple[float, float]:

@@ -13,14 +13,19 @@ import torch
 from torch import Tensor
 
 from ..optics.camera import Camera
-from ..validation import real_tensor
+from ..validation import one_channel
 from .kinds import DepthKind
 
 __all__ = ["DepthWarning", "Mistake", "check", "coc_mistakes", "depth_mistakes", "whole_numbers"]
 
 _NUMBERS = ("focal_length_mm", "f_number", "sensor_width_mm")
-_FACTORS = (0.001, 0.01, 1000.0, 100.0)  # by which depth may be wrong: mm or cm taken for metres, or scaled twice
-_UNITS = {0.001: "millimetres", 0.01: "centimetres"}
+_UNITS = {  # factors by which depth may be wrong: mm or cm taken for metres, or scaled twice
+    0.001: "millimetres",
+    0.01: "centimetres",
+    1000.0: "1000 times too small for metres",
+    100.0: "100 times too small for metres",
+}
+_RELATIVE = "--depth-kind relative --near-m METRES --far-m METRES"
 
 # Limits at which depth or camera are suspicious
 _SHARP_PX, _SHARP_WIDTHS = 1.0, 1e-3  # largest radius in focus: in px, and in image widths; the larger of both
@@ -78,9 +83,7 @@ def depth_mistakes(
 
     ``kind`` and ``scale`` are those of the conversion of the numbers to metres, for the advice in the message.
     """
-    real_tensor("depth", depth, "[B, 1, H, W] in metres")
-    if depth.ndim != 4 or depth.shape[1] != 1:
-        raise ValueError(f"depth must be [B, 1, H, W] in metres, got {list(depth.shape)}")
+    one_channel("depth", depth, "in metres")
     in_focus = camera.focus_range_m or (camera.focus_m, camera.focus_m)
     lens = [getattr(camera, name) for name in _NUMBERS]
     numbers = [torch.as_tensor(value, device="cpu").reshape(-1) for value in (*lens, *in_focus)]
@@ -99,11 +102,10 @@ def depth_mistakes(
 
 def coc_mistakes(coc_px: Tensor) -> list[Mistake]:
     """Likely mistakes in a map of the circle of confusion, ``[B, 1, H, W]`` in pixels."""
-    real_tensor("coc_px", coc_px, "[B, 1, H, W] in pixels")
-    size, width = _sample(coc_px.abs()), coc_px.shape[-1]
-    if not bool(size.isfinite().any()) or _quantile(size[size.isfinite()], 0.99) <= _LARGEST_WIDTHS * width:
+    one_channel("coc_px", coc_px, "in pixels")
+    size, width = coc_px[coc_px.isfinite()].abs(), coc_px.shape[-1]
+    if not size.numel() or _quantile(size, 0.99) <= _LARGEST_WIDTHS * width:
         return []
-    size = coc_px[coc_px.isfinite()].abs()
     message = (
         f"a blur radius of {float(size.max()):.6g} px on an image of {width} px is more than a lens makes; are "
         "these depths instead of circles of confusion? (--depth-kind)"
@@ -121,10 +123,9 @@ def _mistakes(
     3. Otherwise check for 8-bit files, far depth, impossible blur, and an impossible focal length.
     """
     width, focus_m, valid = depth.shape[-1], float(camera.focus_m), depth.detach().flatten()
-    if not float(valid.min()) > 0:
-        valid = valid[valid > 0]
-        if not valid.numel():
-            return []
+    valid = valid[valid > 0]
+    if not valid.numel():
+        return []
     nearest, farthest = (float(end) for end in valid.aminmax())
     finite = valid if farthest < math.inf or nearest == math.inf else valid[valid < math.inf]
     near, far = nearest, float(finite.max())
@@ -140,18 +141,37 @@ def _mistakes(
     sharp_px = max(_SHARP_PX, _SHARP_WIDTHS * width)
     is_wide_open = float(camera.f_number) < _WIDEST_F_NUMBER and largest > _LARGE_WIDTHS * width
     is_too_blurred = is_wide_open or _quantile(blur, 0.99) > _LARGEST_WIDTHS * width
-    is_sharp = smallest <= sharp_px
-    factor = next((factor for factor in _FACTORS if near * factor <= focus_m <= far * factor), None)
+    is_sharp, is_within = smallest <= sharp_px, near <= focus_m <= far
+    factor = next((factor for factor in _UNITS if near * factor <= focus_m <= far * factor), None)
     is_far_off = factor is not None and not near / _FAR_OFF_RATIO <= focus_m <= far * _FAR_OFF_RATIO
-    is_within = near <= focus_m <= far
-    if (not is_sharp and not (is_too_blurred and is_within)) or is_far_off:
-        message = "" if is_sharp else "nothing is in focus: "
-        if is_within:
-            message += (
-                f"no pixel lies near the focus at {focus_m:.4g} m, all {extent}; focus on something with --focus-at X,Y"
+    observed = "" if is_sharp else "nothing is in focus: "
+    if is_within and not is_sharp and not is_too_blurred:
+        message = (
+            f"no pixel lies near the focus at {focus_m:.4g} m, all {extent}; focus on something with --focus-at X,Y"
+        )
+        return [Mistake("gap", observed + message)]
+    if (not is_sharp and not is_within) or is_far_off:
+        side, hints = "nearer" if focus_m < near else "farther", []
+        if kind in ("disparity", "inverse"):
+            given = "not given" if scale is None else f"now {scale:g}"
+            hints.append(
+                "disparity needs its scale, the baseline in metres times the focal length in pixels (--depth-scale, "
+                f"{given}); if it is unknown, {_RELATIVE}"
             )
-            return [Mistake("gap", message)]
-        message += _out_of_focus(near, far, extent, focus_m, is_whole, factor, kind, scale)
+        elif kind != "relative" and is_whole and far <= 255:
+            hints.append(f"its whole numbers are those of a file of 8 bits; if they are relative depth, {_RELATIVE}")
+        elif kind != "relative" and 0.9 < far <= 1.0 and focus_m > far:
+            hints.append(f"if these are relative depth from 0 to 1, {_RELATIVE}")
+        elif kind != "relative" and factor is not None:
+            hints.append(f"is it {_advice(factor, scale)}?")
+            if factor > 1.0 and far >= _NEAR_M and scale is None:
+                hints.append(f"or is the focus in {_UNITS[1.0 / factor]} (--focus-m {focus_m / factor:.4g})?")
+        if kind in ("z", "distance") and focus_m < near:
+            hints.append("if near has large values in it, it is disparity (--depth-kind disparity)")
+        if far < _NEAR_M:
+            hints.append("all of it lies within a hand's breadth")
+        hints.append("if the depth is right, focus with --focus-m METRES or --focus-at X,Y")
+        message = f"{observed}the focus at {focus_m:.4g} m is {side} than all depth {extent}; {'; '.join(hints)}"
         return [Mistake("focus", message)]
     mistakes, focal_mm, sensor_mm = [], float(camera.focal_length_mm), float(camera.sensor_width_mm)
     is_8_bit, is_unit_range = is_whole and far <= 255 and far - near >= 64, 0.9 < far <= 1.0 and near < 0.05
@@ -178,49 +198,12 @@ def _mistakes(
     return mistakes
 
 
-def _out_of_focus(
-    near: float,
-    far: float,
-    extent: str,
-    focus_m: float,
-    is_whole: bool,
-    factor: float | None,
-    kind: DepthKind | Literal["relative"],
-    scale: float | None,
-) -> str:
-    """Message for a focus outside of all depth."""
-    side, hints = "nearer" if focus_m < near else "farther", []
-    if kind in ("disparity", "inverse"):
-        hints.append(
-            "disparity needs its scale, the baseline in metres times the focal length in pixels (--depth-scale, "
-            f"{'not given' if scale is None else f'now {scale:g}'}); if it is unknown, {_RELATIVE}"
-        )
-    elif kind != "relative" and is_whole and far <= 255:
-        hints.append(f"its whole numbers are those of a file of 8 bits; if they are relative depth, {_RELATIVE}")
-    elif kind != "relative" and 0.9 < far <= 1.0 and focus_m > far:
-        hints.append(f"if these are relative depth from 0 to 1, {_RELATIVE}")
-    elif kind != "relative" and factor is not None:
-        hints.append(f"is it {_advice(factor, scale)}?")
-        if factor > 1.0 and far >= _NEAR_M and scale is None:
-            hints.append(f"or is the focus in {_UNITS[1.0 / factor]} (--focus-m {focus_m / factor:.4g})?")
-    if kind in ("z", "distance") and focus_m < near:
-        hints.append("if near has large values in it, it is disparity (--depth-kind disparity)")
-    if far < _NEAR_M:
-        hints.append("all of it lies within a hand's breadth")
-    hints.append("if the depth is right, focus with --focus-m METRES or --focus-at X,Y")
-    return f"the focus at {focus_m:.4g} m is {side} than all depth {extent}; {'; '.join(hints)}"
-
-
-_RELATIVE = "--depth-kind relative --near-m METRES --far-m METRES"
-
-
 def _advice(factor: float, scale: float | None) -> str:
     """The unit of depth that ``factor`` converts to metres, and the option that does so."""
     total = factor * (1.0 if scale is None else scale)
-    option = "leave --depth-scale out" if math.isclose(total, 1.0) else f"--depth-scale {total:.4g}"
-    if factor > 1.0:
-        return f"{factor:g} times too small for metres ({option})"
-    return f"{_UNITS[factor]} ({option})"
+    return (
+        f"{_UNITS[factor]} ({'leave --depth-scale out' if math.isclose(total, 1.0) else f'--depth-scale {total:.4g}'})"
+    )
 
 
 def _sample(values: Tensor) -> Tensor:

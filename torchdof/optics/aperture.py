@@ -69,18 +69,15 @@ class Aperture:
     def __post_init__(self) -> None:
         if self.blades != 0 or isinstance(self.blades, bool):
             whole("blades", self.blades, 3, _MAX_BLADES)
+        pair = self.vignetting if isinstance(self.vignetting, tuple | list) else (self.vignetting,) * 2
+        if len(pair) != 2:
+            raise ValueError(f"vignetting must be a number or (front, rear), got {show(self.vignetting)}")
+        if isinstance(self.vignetting, list):
+            object.__setattr__(self, "vignetting", tuple(pair))
         _check("rotation_deg", self.rotation_deg, -1e6, 1e6)
         _check("squeeze", self.squeeze, *_SQUEEZE)
-        if isinstance(self.curvature, Tensor):
-            raise ValueError(f"curvature must be a number from 0 to 1, got {show(self.curvature)}")
-        _check("curvature", self.curvature, 0.0, 1.0)
-        if isinstance(self.vignetting, list):
-            object.__setattr__(self, "vignetting", tuple(self.vignetting))
-        shares = self.vignetting if isinstance(self.vignetting, tuple) else (self.vignetting,) * 2
-        if len(shares) != 2:
-            raise ValueError(f"vignetting must be a number or (front, rear), got {show(self.vignetting)}")
-        for share in shares:
-            _check("vignetting", share, 0.0, 1.0)
+        for name, value in (("curvature", self.curvature), *(("vignetting", share) for share in pair)):
+            _check(name, value, 0.0, 1.0, tensors=False)
         if self.mask is not None:
             if self.blades != 0:
                 raise ValueError(f"an opening has blades or a mask, got {self.blades} blades and a mask")
@@ -152,11 +149,13 @@ class Aperture:
 
     def to_dict(self) -> dict[str, Any]:
         """The aperture as JSON-like data, the inverse of :meth:`from_dict`."""
-        common: dict[str, Any] = {"rotation_deg": _as_float(self.rotation_deg), "squeeze": _as_float(self.squeeze)}
-        common["vignetting"] = list(self.rims)
-        if self.mask is not None:
-            return {**common, "mask": self.mask.tolist()}
-        return {"blades": self.blades, "curvature": float(self.curvature), **common}
+        shape = {"blades": self.blades, "curvature": float(self.curvature)}
+        return {
+            **(shape if self.mask is None else {"mask": self.mask.tolist()}),
+            "rotation_deg": _as_float(self.rotation_deg),
+            "squeeze": _as_float(self.squeeze),
+            "vignetting": list(self.rims),
+        }
 
     @classmethod
     def from_dict(cls, data: Any) -> "Aperture":
@@ -276,9 +275,9 @@ def _checked_mask(mask: Any) -> Tensor:
     return values / values.max()
 
 
-def _check(name: str, value: Any, low: float, high: float) -> None:
-    """Refuse a value that is neither a number nor a tensor ``[]``, or is outside ``[low, high]``."""
-    is_tensor = isinstance(value, Tensor) and value.ndim == 0 and value.is_floating_point()
+def _check(name: str, value: Any, low: float, high: float, tensors: bool = True) -> None:
+    """Refuse a value that is neither a number nor, with ``tensors``, a tensor ``[]``, or is outside ``[low, high]``."""
+    is_tensor = tensors and isinstance(value, Tensor) and value.ndim == 0 and value.is_floating_point()
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if not (is_tensor or is_number) or not low <= value <= high:
         raise ValueError(f"{name} must be a number from {low:g} to {high:g}, got {show(value)}")

@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -11,15 +12,19 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ..io.atomic import write_text
-from ..validation import choice, number, numbers, pixels_wide, real_tensor, short, show
-from . import psf, table_file
+from ..validation import choice, fields, number, numbers, pixels_wide, real_tensor, short, show
+from . import psf
 from .aperture import Aperture, Number
 from .field import Field, bracket
 from .kernel_bank import KernelBank, bank_of
 
-__all__ = ["BlurTable"]
+__all__ = ["BlurTable", "shipped"]
 
-UNITS = ("fraction", "mm", "relative")
+_SCHEMA = "torchdof/blur-table"
+_VERSIONS = (1, 2, 3)  # that are read, the last is written; 2 added "aperture", 3 added "field"
+_FOLDER = Path(__file__).parent / "tables"
+_UNITS = ("fraction", "mm", "relative")
+_OPTIONAL = ("sensor_width_mm", "strength", "name", "provenance", "residual", "aperture", "field")
 _RIM_POWER = 4.0  # exponent m of a bright rim; a larger one makes the rim thinner
 _FINEST_SIGMAS = 3.4  # radius of the disc that is as accurate at a coarser resolution as a Gaussian, in its sigmas
 _SPOT_EDGE_PX = 1.5  # px around a spot of a field in which pixels receive some of its light
@@ -89,31 +94,27 @@ class BlurTable:
         field: Field | None = None,
     ) -> None:
         choice("family", family, psf.FAMILIES)
-        choice("unit", unit, UNITS)
-        if not isinstance(name, str):
-            raise ValueError(f"name must be a text, got {show(name)}")
-        if provenance is not None and not isinstance(provenance, Mapping):
-            raise ValueError(f"provenance must be a dict, got {show(provenance)}")
-        self.family, self.unit, self.name = family, unit, name
+        choice("unit", unit, _UNITS)
+        kinds: dict[str, tuple[Any, type]] = {"name": (name, str), "provenance": (provenance, Mapping)}
+        kinds |= {"aperture": (aperture, Aperture), "field": (field, Field)}
+        for what, (value, kind) in kinds.items():
+            if value is not None and not isinstance(value, kind):
+                raise ValueError(f"{what} must be of type {kind.__name__}, got {show(value)}")
+        self.family, self.unit, self.name = family, unit, name or ""
         self.coc = numbers("coc", coc)
-        if self.coc.ndim != 1 or not len(self.coc) or bool((self.coc.diff() <= 0).any()) or not self.coc.any():
-            raise ValueError(
-                f"coc must be strictly increasing signed numbers, one a node and not only 0, got {short(self.coc)}"
-            )
-        if len(self.coc) > _MAX_NODES:
-            raise ValueError(f"coc must be at most {_MAX_NODES} nodes, got {len(self.coc)}")
+        if self.coc.ndim != 1 or not 0 < len(self.coc) <= _MAX_NODES or bool((self.coc.diff() <= 0).any()):
+            raise ValueError(f"coc must be 1 to {_MAX_NODES} strictly increasing signed numbers, got {short(self.coc)}")
+        if not self.coc.any():
+            raise ValueError("coc must have a node that is not 0")
         if unit == "relative" and max(int((self.coc > 0).sum()), int((self.coc < 0).sum())) > 1:
-            raise ValueError(
-                f"unit 'relative' takes one node on each side of focus at most, got {len(self.coc)}; "
-                "state the unit as 'fraction' (of the image's width) or 'mm'"
-            )
+            got = f"{len(self.coc)}; state the unit as 'fraction' (of the image's width) or 'mm'"
+            raise ValueError(f"unit 'relative' takes one node on each side of focus at most, got {got}")
         if (unit == "mm") != (sensor_width_mm is not None):
-            raise ValueError(
-                f"sensor_width_mm goes with unit 'mm' and only with it, got {show(sensor_width_mm)} with {unit!r}"
-            )
-        self.sensor_width_mm = (
-            None if sensor_width_mm is None else number("sensor_width_mm", sensor_width_mm, 1e-6, 1e9, "millimetres")
-        )
+            got = f"{show(sensor_width_mm)} with {unit!r}"
+            raise ValueError(f"sensor_width_mm goes with unit 'mm' and only with it, got {got}")
+        if sensor_width_mm is not None:
+            sensor_width_mm = number("sensor_width_mm", sensor_width_mm, 1e-6, 1e9, "millimetres")
+        self.sensor_width_mm = sensor_width_mm
         self._params = self._check_params(params)
         self._sides = {sign: self._side(sign) for sign in (-1, 1) if bool((self.coc * sign > 0).any())}
         for distances, nodes in self._sides.values():
@@ -123,8 +124,6 @@ class BlurTable:
         self.strength = self._per_node("strength", strength)
         self.residual = self._per_node("residual", residual)
         self.provenance = dict(provenance or {})
-        if aperture is not None and not isinstance(aperture, Aperture):
-            raise ValueError(f"aperture must be an Aperture or None, got {show(aperture)}")
         self.aperture = aperture
         self.field = self._check_field(field)
         self._fingerprint: str | None = None
@@ -137,7 +136,7 @@ class BlurTable:
             >>> BlurTable.disc()
             BlurTable('disc', disc, 1 node)
         """
-        return cls("disc", [1.0], {"radius": [1.0]}, name="disc")
+        return cls._of_rim(0.0, "disc")
 
     @classmethod
     def gaussian(cls, sigma_per_coc: float = 0.5) -> "BlurTable":
@@ -179,7 +178,7 @@ class BlurTable:
             BlurTable('polygon', disc, 1 node, Aperture(6 blades, turned by 15, squeeze 2))
         """
         opening = Aperture(blades, rotation_deg, curvature, squeeze, vignetting=vignetting)
-        return cls._of_rim(rim, "polygon").with_aperture(opening)
+        return cls._of_rim(rim, "polygon", opening)
 
     @classmethod
     def from_aperture(
@@ -209,15 +208,15 @@ class BlurTable:
             BlurTable('aperture', disc, 1 node, Aperture(mask 9 x 9))
         """
         opening = Aperture(rotation_deg=rotation_deg, squeeze=squeeze, mask=image, vignetting=vignetting)
-        return cls._of_rim(rim, "aperture").with_aperture(opening)
+        return cls._of_rim(rim, "aperture", opening)
 
     @classmethod
-    def _of_rim(cls, rim: float, name: str) -> "BlurTable":
+    def _of_rim(cls, rim: float, name: str, aperture: Aperture | None = None) -> "BlurTable":
         """An ideal disc, or one whose edge is brighter than its middle."""
-        number("rim", rim)
-        if rim == 0.0:
-            return cls("disc", [1.0], {"radius": [1.0]}, name=name)
-        return cls("softm", [1.0], {"radius": [1.0], "sigma": [0.0], "b": [rim], "m": [_RIM_POWER]}, name=name)
+        if number("rim", rim) == 0.0:
+            return cls("disc", [1.0], {"radius": [1.0]}, name=name, aperture=aperture)
+        params = {"radius": [1.0], "sigma": [0.0], "b": [rim], "m": [_RIM_POWER]}
+        return cls("softm", [1.0], params, name=name, aperture=aperture)
 
     def with_aperture(self, aperture: Aperture | None) -> "BlurTable":
         """The same lens with another opening; None leaves it round.
@@ -235,9 +234,8 @@ class BlurTable:
             ValueError: If one is not as described there.
             TypeError: If a name is unknown.
         """
-        names = ("unit", "sensor_width_mm", "strength", "name", "provenance", "residual", "aperture", "field")
-        fields = {"family": self.family, "coc": self.coc, "params": self._params}
-        return BlurTable(**{**fields, **{name: getattr(self, name) for name in names}, **changes})
+        given = {name: getattr(self, name) for name in ("family", "unit", "coc", *_OPTIONAL)}
+        return BlurTable(**{**given, "params": self._params, **changes})
 
     @property
     def is_round(self) -> bool:
@@ -403,7 +401,14 @@ class BlurTable:
             >>> BlurTable.load("sato_j15").family
             'ring'
         """
-        path = table_file.find(source)
+        if not isinstance(source, str | os.PathLike):
+            raise ValueError(f"source must be the name or the path of a blur table, got {show(source)}")
+        path = Path(source)
+        if not path.suffix and not path.exists():
+            path = _FOLDER / f"{path}.json"
+        if not path.is_file():
+            names = ", ".join(shipped())
+            raise FileNotFoundError(f"no blur table {str(source)!r}: neither a file nor one of the shipped ({names})")
         try:
             return cls.from_dict(json.loads(path.read_text(encoding="utf-8")))
         except (ValueError, RecursionError) as error:
@@ -411,33 +416,31 @@ class BlurTable:
 
     def to_dict(self) -> dict[str, Any]:
         """The table as JSON-like data, the inverse of :meth:`from_dict`."""
-        one_for_all = self.channels == 1
-        fields = {
-            "schema": table_file.SCHEMA,
-            "version": table_file.VERSION,
-            "name": self.name,
-            "family": self.family,
-            "unit": self.unit,
-            "sensor_width_mm": self.sensor_width_mm,
-            "coc": self.coc.tolist(),
-            "params": {k: (v[0] if one_for_all else v).tolist() for k, v in self._params.items()},
-            "strength": None if self.strength is None else self.strength.tolist(),
-            "residual": None if self.residual is None else self.residual.tolist(),
-            "provenance": self.provenance,
-            "aperture": None if self.aperture is None else self.aperture.to_dict(),
-            "field": None if self.field is None else self.field.to_dict(),
-        }
-        return {k: v for k, v in fields.items() if v is not None}
+        params = {k: (v[0] if self.channels == 1 else v).tolist() for k, v in self._params.items()}
+        data: dict[str, Any] = {"schema": _SCHEMA, "version": _VERSIONS[-1], "family": self.family, "unit": self.unit}
+        data |= {"coc": self.coc.tolist(), "params": params}
+        for name in _OPTIONAL:
+            value = getattr(self, name)
+            if value is not None:
+                is_part = isinstance(value, Aperture | Field)
+                data[name] = value.to_dict() if is_part else value.tolist() if isinstance(value, Tensor) else value
+        return data
 
     @classmethod
     def from_dict(cls, data: Any) -> "BlurTable":
         """Build a table from :meth:`to_dict`'s data; ``ValueError`` names a field that is missing, unknown or wrong."""
-        fields = table_file.fields_of(data)
-        if fields.get("aperture") is not None:
-            fields["aperture"] = Aperture.from_dict(fields["aperture"])
-        if fields.get("field") is not None:
-            fields["field"] = Field.from_dict(fields["field"])
-        return cls(**fields)
+        schema, version = (data.get(k) if isinstance(data, Mapping) else None for k in ("schema", "version"))
+        if not isinstance(schema, str) or schema != _SCHEMA:
+            raise ValueError(f"schema must be {_SCHEMA!r}, got {show(schema)}; is this a blur table?")
+        if not isinstance(version, int) or version not in _VERSIONS:
+            readable = " or ".join(map(str, _VERSIONS))
+            raise ValueError(f"version must be {readable}, got {show(version)}; update torchdof to read it")
+        given = fields("a blur table", data, ("schema", "version", "family", "unit", "coc", "params"), _OPTIONAL)
+        del given["schema"], given["version"]
+        for name, part in (("aperture", Aperture), ("field", Field)):
+            if given.get(name) is not None:
+                given[name] = part.from_dict(given[name])
+        return cls(**given)
 
     def __repr__(self) -> str:
         nodes = f"{len(self.coc)} node{'s' if len(self.coc) > 1 else ''}"
@@ -459,40 +462,25 @@ class BlurTable:
 
     def _check_params(self, params: Mapping[str, Any]) -> dict[str, Tensor]:
         """Valid parameters as ``[channels, N]`` (``values``: ``[channels, N, P]``), float64."""
-        names = psf.FAMILIES[self.family]
-        if not isinstance(params, Mapping) or set(params) != set(names):
-            got = ", ".join(map(str, params)) if isinstance(params, Mapping) else type(params).__name__
-            raise ValueError(f"params of {self.family} must be {', '.join(names)}, got {got}")
-        checked = {}
-        for name in names:
-            value = numbers(f"params.{name}", params[name])
-            value = value.unsqueeze(0) if value.ndim == (2 if name == "values" else 1) else value
-            if value.ndim != (3 if name == "values" else 2) or value.shape[1] != len(self.coc) or not value.numel():
+        checked = {name: value.detach().cpu() for name, value in psf.checked(self.family, params).items()}
+        for name, value in checked.items():
+            axes = 3 if name == "values" else 2
+            value = value.unsqueeze(0) if value.ndim == axes - 1 else value
+            if value.ndim != axes or value.shape[1] != len(self.coc):
                 shape = "[N, P] or [channels, N, P]" if name == "values" else "[N] or [channels, N]"
-                raise ValueError(
-                    f"params.{name} must be {shape} with N = {len(self.coc)} nodes, got {list(value.shape)}"
-                )
-            low = -1.0 if name == "b" else 0.0
-            if bool((value < low).any()):
-                raise ValueError(f"params.{name} must be >= {low:g}, got {float(value.min()):g}")
+                raise ValueError(f"params.{name} must be {shape} with N = {len(self.coc)}, got {list(value.shape)}")
             high = _MAX_EXPONENT if name == "m" else _MAX_PARAMETER
             if bool((value > high).any()):
                 raise ValueError(f"params.{name} must be <= {high:g}, got {float(value.max()):g}")
-            if name == "values" and (value.shape[-1] < 2 or bool((value.amax(-1) < _MIN_PARAMETER).any())):
-                raise ValueError("params.values must hold at least two values a node, not all of them 0")
+            if name == "values" and bool((value.amax(-1) < _MIN_PARAMETER).any()):
+                raise ValueError("params.values must not all be 0 at a node")
             checked[name] = value
         channels = max(v.shape[0] for v in checked.values())
-        for name, value in checked.items():
-            if value.shape[0] not in (1, channels):
-                raise ValueError(f"params.{name} has {value.shape[0]} channels where other parameters have {channels}")
-            checked[name] = value.expand(channels, *value.shape[1:]).contiguous()
-        return checked
+        return {name: value.expand(channels, *value.shape[1:]).contiguous() for name, value in checked.items()}
 
-    def _check_field(self, field: Any) -> Field | None:
+    def _check_field(self, field: Field | None) -> Field | None:
         if field is None:
             return None
-        if not isinstance(field, Field):
-            raise ValueError(f"field must be a Field or None, got {show(field)}")
         if self.aperture is not None:
             raise ValueError(f"a table with a field has its own opening, got {self.aperture!r} too; leave one out")
         if self.unit == "relative":
@@ -547,3 +535,8 @@ class BlurTable:
             if name in psf.LENGTHS:
                 interpolated[name] = interpolated[name] * growth * scale
         return interpolated
+
+
+def shipped() -> list[str]:
+    """Names of the tables that come with torchdof, sorted."""
+    return sorted(path.stem for path in _FOLDER.glob("*.json"))

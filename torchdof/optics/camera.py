@@ -30,12 +30,12 @@ from torch import Tensor
 
 from .. import native
 from ..tensors import floating, is_in_memory, is_traced
-from ..validation import number, pixels_wide, real_tensor, show, whole
+from ..validation import ends, number, one_channel, pixels_wide, real_tensor, show, whole
 
-__all__ = ["CAMERA_NUMBERS", "Camera"]
+__all__ = ["Camera"]
 
 _MAY_BE_INFINITE = ("focus_m", "focus_range_m")
-CAMERA_NUMBERS = ("focal_length_mm", "f_number", "focus_m", "sensor_width_mm")
+_NUMBERS = ("focal_length_mm", "f_number", "focus_m", "sensor_width_mm")
 
 Number = float | Tensor
 
@@ -78,25 +78,29 @@ class Camera:
 
     def __post_init__(self) -> None:
         if self.focus_range_m is not None:
-            _check_range(self.focus_range_m)
-            near, far = self.focus_range_m
-            object.__setattr__(self, "focus_range_m", (near, far))
+            given = self.focus_range_m
+            if not isinstance(given, tuple | list) or len(given) != 2:
+                raise ValueError(f"focus_range_m must be (near, far) in metres, got {show(given)}")
+            for end in given:
+                _check_number("focus_range_m", end)
+            near, far = given
+            if not is_traced() and not bool(torch.as_tensor(near <= far, device="cpu").all()):
+                raise ValueError(f"focus_range_m must go from near to far, got ({_show(near)}, {_show(far)})")
             dioptres = 1.0 / near + 1.0 / far
             halfway = 2.0 / dioptres if isinstance(dioptres, Tensor) or dioptres > 0 else math.inf
+            object.__setattr__(self, "focus_range_m", (near, far))
             object.__setattr__(self, "focus_m", halfway)
         for name in ("tilt_deg", "swing_deg"):
             _check_number(name, getattr(self, name), -90.0, 90.0)
-        for name in CAMERA_NUMBERS:
+        for name in _NUMBERS:
             _check_number(name, getattr(self, name))
         if not isinstance(self.focus_breathing, bool):
             raise ValueError(f"focus_breathing must be True or False, got {show(self.focus_breathing)}")
         if self.focus_breathing and not is_traced():
             ratio = self.focal_length_mm / 1000.0 / self.focus_m
             if (float(ratio.detach().max()) if isinstance(ratio, Tensor) else ratio) >= 1.0:
-                raise ValueError(
-                    f"focus_m must be longer than the focal length ({_show(self.focal_length_mm)} mm), got "
-                    f"{_show(self.focus_m)} m; nothing nearer than the focal length can be in focus"
-                )
+                focal = f"the focal length ({_show(self.focal_length_mm)} mm)"
+                raise ValueError(f"focus_m must be longer than {focal}, got {_show(self.focus_m)} m")
 
     @classmethod
     def from_fov(cls, fov_x_deg: Number, aperture_radius_m: Number, focus_m: Number) -> "Camera":
@@ -116,14 +120,10 @@ class Camera:
             >>> round(Camera.from_fov(fov_x_deg=40.0, aperture_radius_m=0.012, focus_m=2.0).focal_px(768), 6)
             1055.031329
         """
-        _check_number("fov_x_deg", fov_x_deg, high=180.0)
+        _check_number("fov_x_deg", fov_x_deg, low=1e-9, high=180.0)
         _check_number("aperture_radius_m", aperture_radius_m)
-        if isinstance(fov_x_deg, Tensor):
-            half: Number = torch.tan(torch.deg2rad(fov_x_deg) / 2)
-        else:
-            half = math.tan(math.radians(fov_x_deg) / 2)
-        if not isinstance(half, Tensor) and half < 1e-300:
-            raise ValueError(f"fov_x_deg must be in (0, 180) degrees, got {_show(fov_x_deg)}, which is too small")
+        angle = fov_x_deg * (math.pi / 180.0) / 2
+        half = torch.tan(angle) if isinstance(angle, Tensor) else math.tan(angle)
         focal_length_mm = 18.0 / half
         f_number = focal_length_mm / (2000.0 * aperture_radius_m)
         return cls(focal_length_mm, f_number, focus_m, 36.0, focus_breathing=False)
@@ -164,10 +164,7 @@ class Camera:
         Raises:
             ValueError: If the depth is not a floating-point tensor, or its batch does not fit the camera's.
         """
-        if type(depth) is Tensor and depth.device.type == "cpu":  # not a subclass, which may need no memory
-            real_tensor("depth", depth, "in metres")
-        elif not floating(depth) or depth.layout != torch.strided:
-            raise ValueError(f"depth must be a floating-point tensor in metres, dense, got {show(depth)}")
+        real_tensor("depth", depth, "in metres")
         compiled = self._compiled_coc_px(depth, width)
         if compiled is not None:
             return compiled
@@ -182,6 +179,13 @@ class Camera:
             near, far = (_dioptres_behind(z, _as_map(end, z)) + shift for end in self.focus_range_m)
             dioptres = near.clamp(max=0.0) + far.clamp_min(0.0)
         return torch.where(is_valid, scale * dioptres, torch.nan)
+
+    def refuse_overflow(self, coc_px: Tensor, depth: Tensor) -> None:
+        """Refuse a circle of confusion of a depth if it overflowed; the message has the numbers of the lens."""
+        if not is_traced() and not all(map(math.isfinite, ends(coc_px))):
+            stated = ", ".join(f"{name} {_show(getattr(self, name))}" for name in _NUMBERS)
+            checked = f"this lens ({stated}) and the depth, which starts at {float(depth.detach().min()):.3g} m"
+            raise ValueError(f"depth and lens must give a finite blur radius, got an infinite one: check {checked}")
 
     def _compiled_coc_px(self, depth: Tensor, width: int) -> Tensor | None:
         """:meth:`coc_px` by the compiled engine; None if it does not support the call (traced, batched, tilted)."""
@@ -214,10 +218,7 @@ class Camera:
             TypeError: If a name is unknown.
         """
         if "focus_m" in changes and changes.get("focus_range_m", self.focus_range_m) is not None:
-            raise ValueError(
-                "focus_m is given by the camera's focus_range_m, got focus_m as well; "
-                "change focus_range_m, or remove it with camera.replace(focus_range_m=None)"
-            )
+            raise ValueError("focus_m is given by the camera's focus_range_m, got both; remove it: focus_range_m=None")
         return dataclasses.replace(self, **changes)
 
     def focus_at(self, depth: Tensor, x: float, y: float, patch: int = 5) -> "Camera":
@@ -235,7 +236,7 @@ class Camera:
         Raises:
             ValueError: If the pixel lies outside the frame or the patch holds no valid depth.
         """
-        _check_map("depth", depth)
+        one_channel("depth", depth, "in metres")
         whole("patch", patch, 1, 2**31)
         x, y = (number(f"{axis} of the focus point", value, unit="pixels") for axis, value in (("x", x), ("y", y)))
         height, width = depth.shape[-2:]
@@ -261,9 +262,9 @@ class Camera:
             >>> round(Camera().focus_on(depth, depth < 2).focus_m, 3)
             1.2
         """
-        _check_map("depth", depth)
+        one_channel("depth", depth, "in metres")
         mask = focus_mask.to(depth.dtype) if isinstance(focus_mask, Tensor) else focus_mask
-        _check_map("focus_mask", mask)
+        one_channel("focus_mask", mask)
         if mask.shape[0] not in (1, depth.shape[0]) or mask.shape[1:] != depth.shape[1:]:
             raise ValueError(f"focus_mask must have the depth's shape {list(depth.shape)}, got {list(mask.shape)}")
         if not bool((mask >= 0).all()):
@@ -282,7 +283,7 @@ class Camera:
         Raises:
             ValueError: If the box holds no pixel's centre, or no valid depth.
         """
-        _check_map("depth", depth)
+        one_channel("depth", depth, "in metres")
         if len(box) != 4 or any(isinstance(v, bool) or not isinstance(v, int | float) for v in box):
             raise ValueError(f"box must be (left, top, right, bottom) in pixels, got {show(box)}")
         weights = []
@@ -290,10 +291,8 @@ class Camera:
             centres = torch.arange(size, dtype=depth.dtype, device=depth.device) + 0.5
             inside = (centres >= low) & (centres <= high)
             if not bool(inside.any()):
-                raise ValueError(
-                    f"box must be (left, top, right, bottom) and hold pixels of the frame of {depth.shape[-1]} x "
-                    f"{depth.shape[-2]}, got {show(box)}"
-                )
+                frame = f"{depth.shape[-1]} x {depth.shape[-2]}"
+                raise ValueError(f"box must hold pixels of the frame of {frame}: (left, top, right, bottom), got {box}")
             offset = (centres - (low + high) / 2) / max((high - low) / 4, 1e-3)
             weights.append(torch.where(inside, torch.exp(-0.5 * offset.square()), 0.0))
         return self._focused(depth, (weights[0][:, None] * weights[1])[None, None], f"in the box {show(box)}")
@@ -379,47 +378,21 @@ def _show(value: Number) -> str:
 
 def _check_number(name: str, value: Any, low: float = 0.0, high: float = math.inf) -> None:
     """Refuse a number of the camera that is neither a float nor a tensor ``[B]``, or outside of ``(low, high)``."""
-    if isinstance(value, Tensor):
-        is_number = floating(value) and value.ndim <= 1 and value.layout == torch.strided and value.numel() > 0
-    else:
-        is_number = isinstance(value, float) or (
-            isinstance(value, int) and not isinstance(value, bool) and value < 1e300
-        )
-    if not is_number:
-        raise ValueError(f"{name} must be a float or a floating-point tensor [B], got {show(value)}")
     smallest = largest = value
-    if isinstance(value, Tensor):
-        if is_traced():
+    if floating(value):
+        real_tensor(name, value, "[B]")
+        is_number = value.ndim <= 1 and value.numel() > 0
+        if is_number and is_traced():
             return
-        smallest, largest = real_tensor(name, value, "[B]").detach().aminmax()
+        smallest, largest = value.detach().aminmax() if is_number else (low, high)
+    else:
+        is_number = isinstance(value, float) or (type(value) is int and value < 1e300)
     # compares with inf instead of math.isfinite: torch.compile can then treat the number as a variable
     infinite = name in _MAY_BE_INFINITE
-    if not (low < smallest and (largest < high or (infinite and largest == high))):
+    if not (is_number and low < smallest and (largest < high or (infinite and largest == high))):
         bounds = f"in ({low:g}, {high:g}) degrees" if high < math.inf else "positive" + " and finite" * (not infinite)
-        raise ValueError(
-            f"{name} must be {bounds}, got {_show(value) if isinstance(value, Tensor | float) else show(value)}"
-        )
-
-
-def _check_range(value: Any) -> None:
-    """Refuse a focus range that is not ``(near, far)``."""
-    if not isinstance(value, tuple | list) or len(value) != 2:
-        raise ValueError(f"focus_range_m must be (near, far) in metres, got {show(value)}")
-    for end in value:
-        _check_number("focus_range_m", end)
-    if is_traced():
-        return
-    low, high = (torch.as_tensor(end, device="cpu").detach() for end in value)
-    if not bool((low <= high).all()):
-        raise ValueError(f"focus_range_m must go from near to far, got ({', '.join(map(_show, value))})")
-
-
-def _check_map(name: str, value: Any) -> None:
-    """Refuse a value that is not a map ``[B, 1, H, W]``."""
-    what = "[B, 1, H, W]" + (" in metres" if name == "depth" else "")
-    real_tensor(name, value, what)
-    if value.ndim != 4 or value.shape[1] != 1 or not value.numel():
-        raise ValueError(f"{name} must be {what}, got {list(value.shape)}")
+        got = _show(value) if is_number and not isinstance(value, int) else show(value)
+        raise ValueError(f"{name} must be {bounds}, a float or a floating-point tensor [B], got {got}")
 
 
 def _as_map(value: Number, like: Tensor) -> Tensor:
@@ -430,8 +403,6 @@ def _as_map(value: Number, like: Tensor) -> Tensor:
     if value.ndim == 0 or value.numel() == 1:
         return value.reshape(())
     if like.ndim != 4 or (like.shape[0] != value.shape[0] and like.shape[0] != 1):
-        raise ValueError(
-            f"depth must be [{value.shape[0]}, 1, H, W] (or [1, 1, H, W]) for a camera whose numbers are "
-            f"[{value.shape[0]}], got {list(like.shape)}"
-        )
+        expected = f"[{value.shape[0]}, 1, H, W] (or [1, 1, H, W]) for a camera whose numbers are [{value.shape[0]}]"
+        raise ValueError(f"depth must be {expected}, got {list(like.shape)}")
     return value.reshape(-1, 1, 1, 1)

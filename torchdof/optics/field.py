@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..validation import fields, numbers, real_tensor, short, show
+from ..validation import fields, numbers, short, show
 
 __all__ = ["Field", "bracket", "deviations"]
 
@@ -65,28 +65,20 @@ class Field:
 
     def __post_init__(self) -> None:
         for name in ("coc", "radius", "box", "light"):
-            value = real_tensor(f"field.{name}", getattr(self, name), "numbers")
-            object.__setattr__(self, name, numbers(f"field.{name}", value))
+            object.__setattr__(self, name, numbers(f"field.{name}", getattr(self, name)))
         for name in ("coc", "radius"):
             value = getattr(self, name)
             if value.ndim != 1 or len(value) < 2 or bool((value.diff() <= 0).any()):
                 raise ValueError(f"field.{name} must be at least two strictly increasing numbers, got {short(value)}")
         if self.radius[0] != 0 or not self.coc[0] < 0 < self.coc[-1]:
-            raise ValueError(
-                "field.radius must begin at 0 and field.coc reach to both sides of it, "
-                f"got {float(self.radius[0]):g} and {float(self.coc[0]):g} to {float(self.coc[-1]):g}"
-            )
-        nodes = (len(self.coc), len(self.radius))
-        sides = self.box[..., 1:]
+            raise ValueError("field.radius must begin at 0, and field.coc reach to both sides of it")
+        nodes, sides = (len(self.coc), len(self.radius)), self.box[..., 1:]
         if self.box.shape != (*nodes, 3) or bool((sides < 0).any()) or not bool((sides > 0).any()):
-            raise ValueError(
-                f"field.box must be [{nodes[0]}, {nodes[1]}, 3] with lengths >= 0, got {list(self.box.shape)}"
-            )
+            raise ValueError(f"field.box must be {[*nodes, 3]} with lengths >= 0, got {list(self.box.shape)}")
         light = self.light if self.light.ndim == 5 else self.light.unsqueeze(0)
         if light.ndim != 5 or light.shape[1:3] != nodes or min(light.shape[3:]) < 2 or bool((light < 0).any()):
-            raise ValueError(
-                f"field.light must be [channels, {nodes[0]}, {nodes[1]}, U, V] >= 0, got {list(self.light.shape)}"
-            )
+            expected = f"[channels, {nodes[0]}, {nodes[1]}, U, V]"
+            raise ValueError(f"field.light must be {expected} >= 0, got {list(self.light.shape)}")
         total = light.sum((-2, -1), keepdim=True)
         if not bool((total > 0).all()):
             raise ValueError("field.light must hold some light at every node")

@@ -20,6 +20,7 @@ The compiled engine makes the same kernels from the same templates (``native/src
 """
 
 import bisect
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -93,9 +94,9 @@ class KernelBank:
         self._squeeze = squeeze if gradients else self.squeeze
         self.widest = max(1.0, 1.0 / self.squeeze)
         self._lens = table.fingerprint()
-        self._moved: dict[float, list[float]] = {}
+        self._moved_in_focus = functools.lru_cache(_MAX_WIDTHS)(lambda width: table.moved_in_focus(width).tolist())
         self._found: dict[float, float] = {}
-        self._sums: dict[tuple[int, int], list[tuple[float, float]]] = {}
+        self._light_and_moment = functools.lru_cache(None)(self._summed)
         with torch.inference_mode(False), torch.no_grad():
             sides = [table.side_nodes(sign) for sign in (-1, 1)]
             reaches = [psf.reach(table.family, nodes, table.aperture) for _, nodes in sides]  # [C, N]
@@ -259,18 +260,14 @@ class KernelBank:
             total += moment / light * (reach / scale) ** 2
         return total / self.colours
 
-    def _light_and_moment(self, side: int, node: int) -> list[tuple[float, float]]:
+    def _summed(self, side: int, node: int) -> list[tuple[float, float]]:
         """Sum of a template of each colour, and its second moment for a reach of 1."""
-        key = (1 if self._mirrored else side, self._shapes[side][node])
-        if key not in self._sums:
-            template = _templates.get((self._lens, *key, 0), lambda: self._kept_template(*key, 0)).double()
-            step = (
-                torch.arange(-_LEAST_CELLS - 1.0, _LEAST_CELLS + 2.0, dtype=torch.float64, device="cpu") / _LEAST_CELLS
-            )
-            square = 0.5 * (step[:, None] ** 2 + step**2 / self.squeeze**2)
-            light, moment = template.sum((-2, -1)).tolist(), (template * square).sum((-2, -1)).tolist()
-            self._sums[key] = list(zip(light, moment, strict=True))
-        return self._sums[key]
+        key = (1 if self._mirrored else side, self._shapes[side][node], 0)
+        template = _templates.get((self._lens, *key), lambda: self._kept_template(*key)).double()
+        half = template.shape[-1] // 2
+        step = torch.arange(-half, half + 1, dtype=torch.float64, device="cpu") / _LEAST_CELLS
+        square = 0.5 * (step[:, None] ** 2 + step**2 / self.squeeze**2)
+        return [(float(cells.sum()), float((cells * square).sum())) for cells in template]
 
     def kept(self, sign: float, find: Callable[["KernelBank", float, float], float]) -> float:
         """A number that depends only on the blur on one side of focus, computed once: ``find(bank, coc_px, width)``.
@@ -288,10 +285,8 @@ class KernelBank:
         params = {name: values[:, node] for name, values in self._nodes[side].items()}
         template = psf.template(self.table.family, params, _LEAST_CELLS << level, self.table.aperture)
         if not bool((template.detach().sum((-2, -1)) > 0).all()):
-            raise ValueError(
-                f"the aperture passes no light of a {self.table.family}: its mask is open where the profile is dark; "
-                "open it nearer the middle"
-            )
+            problem = f"the aperture passes no light of a {self.table.family}"
+            raise ValueError(f"{problem}: its mask is open where the profile is dark; open it nearer the middle")
         return template
 
     @torch.inference_mode(False)
@@ -303,8 +298,4 @@ class KernelBank:
         """Weight of the kernel of each colour against a single pixel; below 1 where a blur in focus fades in."""
         if self.table.is_sharp_in_focus or self.is_even:
             return [1.0] * self.colours
-        if width not in self._moved:
-            if len(self._moved) >= _MAX_WIDTHS:
-                self._moved.clear()
-            self._moved[width] = self.table.moved_in_focus(width).tolist()
-        return [min(coc_px**2 * _FADE_IN / max(moved_light, 1e-300), 1.0) for moved_light in self._moved[width]]
+        return [min(coc_px**2 * _FADE_IN / max(moved, 1e-300), 1.0) for moved in self._moved_in_focus(width)]

@@ -33,20 +33,21 @@ Reference:
 All arithmetic is in float64 on the CPU's or the parameter's device; parameters are in pixels.
 """
 
-import functools
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..validation import WHOLE_NUMBERS, broadcast_shapes, choice, numbers, real_tensor, short, show
+from ..validation import broadcast_shapes, choice, numbers, real_tensor, short, show
 from .aperture import Aperture
-from .kernel_cache import KernelCache
+from .kernel_cache import kept
 
 __all__ = [
     "FAMILIES",
+    "checked",
     "opening_radius",
     "pixel_kernels",
     "profile",
@@ -86,7 +87,6 @@ _TILT_EXPONENT = 460.0  # largest logarithm of (r / R)^m, e^460 = 1e200; a large
 _MAX_WIDTH_PX = 2**16 + 1  # px; a kernel of this width takes 34 GB
 _MARGIN_PX = 2  # px around a kernel that its values depend on (the four neighbours in _non_negative, and theirs)
 _SLICES_AT_ONCE = 2**20  # slices computed together; limits memory
-_quadrants = KernelCache(64 * 2**20)
 
 Number = float | Tensor
 
@@ -116,10 +116,10 @@ def pixel_kernels(
         >>> pixel_kernels("disc", {"radius": 0.5}).shape
         torch.Size([3, 3])
     """
-    checked = _checked(family, params)
+    valid = checked(family, params)
     widest, squeeze = (1.0, 1.0) if aperture is None else (aperture.widest, aperture.squeeze)
-    half = width_of(size, widest * float(reach(family, checked, aperture).detach().max())) // 2
-    lengths = _rendered(checked)
+    half = width_of(size, widest * float(reach(family, valid, aperture).detach().max())) // 2
+    lengths = _rendered(valid)
     end = reach(family, lengths, aperture)
     height = (end / _CELLS).clamp(max=1.0 / widest)  # sides of a cell, at most a pixel
     in_cells = {k: v / height if k in LENGTHS else v for k, v in lengths.items()}
@@ -158,18 +158,18 @@ def profile(family: str, r: Tensor, params: Mapping[str, Number]) -> Tensor:
 
     ``r`` ``[n]`` are distances from the centre, in the unit of the lengths among the parameters ``[...]``.
     """
-    checked = {k: v if k == "values" else v.unsqueeze(-1) for k, v in _checked(family, params).items()}
+    valid = {k: v if k == "values" else v.unsqueeze(-1) for k, v in checked(family, params).items()}
     r = real_tensor("r", r, "[n]").to(torch.float64)
     if family == "gaussian":
-        return torch.exp(-0.5 * (r / checked["sigma"]) ** 2)
+        return torch.exp(-0.5 * (r / valid["sigma"]) ** 2)
     if family == "ring":
-        return torch.exp(-0.5 * ((r - checked["r_c"]) / checked["sigma"]) ** 2)
+        return torch.exp(-0.5 * ((r - valid["r_c"]) / valid["sigma"]) ** 2)
     if family == "disc":
-        return (r <= checked["radius"]).to(torch.float64)
+        return (r <= valid["radius"]).to(torch.float64)
     if family == "softm":
-        edge = 0.5 * torch.erfc((r - checked["radius"]) / (math.sqrt(2) * checked["sigma"].clamp_min(1e-12)))
-        return edge * _tilt_factor(r, checked)
-    values, radius = checked["values"], checked["radius"]
+        edge = 0.5 * torch.erfc((r - valid["radius"]) / (math.sqrt(2) * valid["sigma"].clamp_min(1e-12)))
+        return edge * _tilt_factor(r, valid)
+    values, radius = valid["values"], valid["radius"]
     position = (r / radius).clamp(max=1.0) * (values.shape[-1] - 1)
     low = position.floor().long().clamp(max=values.shape[-1] - 2)
     batch = broadcast_shapes(values.shape[:-1], low.shape[:-1])
@@ -180,18 +180,13 @@ def profile(family: str, r: Tensor, params: Mapping[str, Number]) -> Tensor:
 
 def support(family: str, params: Mapping[str, Number], aperture: Aperture | None = None) -> float:
     """Radius in pixels beyond which a kernel holds less than 4e-6 of its light (for the largest parameters given)."""
-    farthest = float(reach(family, _checked(family, params), aperture).detach().max())
+    farthest = float(reach(family, checked(family, params), aperture).detach().max())
     return farthest if aperture is None else farthest * aperture.widest
 
 
 def width_of(size: int | None, reach_px: float) -> int:
     """Width in pixels of kernels: ``size`` if given, else the smallest that holds a PSF of radius ``reach_px``."""
-    if size is None:
-        size = 2 * half_width(reach_px) + 1
-        if size > _MAX_WIDTH_PX:
-            raise ValueError(
-                f"a kernel must be at most {_MAX_WIDTH_PX} pixels wide, got parameters that need {size}; state its size"
-            )
+    size = 2 * half_width(reach_px) + 1 if size is None else size
     if isinstance(size, bool) or not isinstance(size, int) or not 1 <= size <= _MAX_WIDTH_PX or size % 2 == 0:
         raise ValueError(f"size must be a positive odd number of pixels, got {show(size)} (at most {_MAX_WIDTH_PX})")
     return size
@@ -202,32 +197,32 @@ def half_width(reach: float) -> int:
     return max(0, math.ceil(min(reach, 1e18) - 1e-9))
 
 
-def _checked(family: str, params: Mapping[str, Number]) -> dict[str, Tensor]:
+def checked(family: str, params: Mapping[str, Any]) -> dict[str, Tensor]:
     """Valid parameters of a family as float64 tensors on one device."""
     choice("family", family, FAMILIES)
     if not isinstance(params, Mapping) or set(params) != set(FAMILIES[family]):
         got = ", ".join(map(str, params)) if isinstance(params, Mapping) else show(params)
         raise ValueError(f"{family} takes the parameters {', '.join(FAMILIES[family])}, got {got}")
     device = next((p.device for p in params.values() if isinstance(p, Tensor)), torch.device("cpu"))
-    checked = {}
-    for name, value in params.items():
-        if isinstance(value, Tensor) and value.dtype not in WHOLE_NUMBERS:
-            value = real_tensor(name, value, "[...]")
+    valid = {}
+    for name in FAMILIES[family]:
+        value = params[name]
+        if isinstance(value, Tensor):
+            value = real_tensor(name, value, "[...]", whole=True)
         else:
             value = numbers(name, value)
         low = -1.0 if name == "b" else 0.0
         if not value.numel() or not bool((torch.isfinite(value.detach()) & (value.detach() >= low)).all()):
             raise ValueError(f"{name} of {family} must be finite and >= {low:g}, got {short(value)}")
-        checked[name] = value.to(device, torch.float64)
-    if family == "radial" and (checked["values"].ndim < 1 or checked["values"].shape[-1] < 2):
-        raise ValueError(f"values must be [..., P] with P >= 2, got {list(checked['values'].shape)}")
-    shapes = {k: tuple(v.shape[:-1] if k == "values" else v.shape) for k, v in checked.items()}
+        valid[name] = value.to(device, torch.float64)
+    if family == "radial" and (valid["values"].ndim < 1 or valid["values"].shape[-1] < 2):
+        raise ValueError(f"values must be [..., P] with P >= 2, got {list(valid['values'].shape)}")
+    shapes = {k: list(v.shape[:-1] if k == "values" else v.shape) for k, v in valid.items()}
     try:
         broadcast_shapes(*shapes.values())
     except RuntimeError:
-        listed = ", ".join(f"{k} {list(v)}" for k, v in shapes.items())
-        raise ValueError(f"parameters of {family} must broadcast against each other, got {listed}") from None
-    return checked
+        raise ValueError(f"parameters of {family} must broadcast against each other, got shapes {shapes}") from None
+    return valid
 
 
 def _rendered(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -406,8 +401,7 @@ def _sliced_quadrant(family: str, lengths: Mapping[str, Tensor], half: int, slic
     rows = max(1, _SLICES_AT_ONCE // ((half + 1) * slices))
     strips = []
     for top in range(0, half + 1, rows):
-        part = (half, slices, top, min(top + rows, half + 1))
-        cut = _quadrants.get(part, functools.partial(_slices, *part)) if half <= _FINE_CELLS else _slices(*part)
+        cut = _slices(half, slices, top, min(top + rows, half + 1))
         inner, outer, area = (t.to(lengths[FAMILIES[family][-1]].device) for t in cut)
         strips.append((_slice_means(family, lengths, inner, outer) * area).sum(-1).unflatten(-1, (-1, half + 1)))
     return torch.cat(strips, -2)
@@ -453,7 +447,7 @@ def _table_integral(r: Tensor, p: Mapping[str, Tensor]) -> Tensor:
     return (start + left * fraction + (right - left) * fraction * fraction / 2) * radius / last
 
 
-@torch.inference_mode(False)  # cached tensors must be usable by autograd
+@kept
 def _slices(half: int, slices: int, top: int, bottom: int) -> tuple[Tensor, Tensor, Tensor]:
     """Slices of the cells of a quadrant's rows: inner and outer radius and area, each ``[cells, slices]``."""
     index = torch.arange(half + 1, dtype=torch.float64, device="cpu")

@@ -31,9 +31,8 @@ def degrade(depth: Tensor, kind: str) -> Tensor:
 
 
 def _resampled(depth: Tensor, factor: int) -> Tensor:
-    size = (int(depth.shape[-2]), int(depth.shape[-1]))
-    small = functional.interpolate(1 / depth, size=(size[0] // factor, size[1] // factor), mode="area")
-    return 1 / functional.interpolate(small, size=size, mode="bilinear", align_corners=False)
+    small = functional.interpolate(1 / depth, size=[n // factor for n in depth.shape[-2:]], mode="area")
+    return 1 / functional.interpolate(small, size=depth.shape[-2:], mode="bilinear", align_corners=False)
 
 
 def _blurred(depth: Tensor, sigma: float) -> Tensor:
@@ -70,10 +69,6 @@ def _displaced(depth: Tensor, sigma: float) -> Tensor:
     return functional.grid_sample(depth, grid.to(depth), mode="nearest", padding_mode="border", align_corners=False)
 
 
-def _noisy(depth: Tensor, share: float) -> Tensor:
-    return depth * (1 + share * torch.randn(depth.shape, generator=torch.Generator().manual_seed(0)))
-
-
 KINDS: Mapping[str, Callable[[Tensor], Tensor]] = {
     "exact": lambda z: z,
     "half-res": lambda z: _resampled(z, 2),
@@ -85,6 +80,6 @@ KINDS: Mapping[str, Callable[[Tensor], Tensor]] = {
     "displaced": lambda z: _displaced(z, 1.5),
     "blur 1.5": lambda z: _blurred(z, 1.5),  # typical of estimators
     "8 bit": lambda z: _quantised(z, 255),
-    "noise 1%": lambda z: _noisy(z, 0.01),
+    "noise 1%": lambda z: z * (1 + 0.01 * torch.randn(z.shape, generator=torch.Generator().manual_seed(0))),
 }
 """The degradations, by name."""

@@ -10,7 +10,7 @@ from torch import Tensor
 from ..io.transfer import encode
 from ..validation import real_tensor, show
 
-__all__ = ["display", "flip", "flip_map", "has_flip", "psnr", "ssim"]
+__all__ = ["display", "flip", "has_flip", "psnr", "ssim"]
 
 
 def display(linear: Tensor) -> Tensor:
@@ -57,18 +57,15 @@ def psnr(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
     _check_pair(image, truth)
     squared = (image.double() - truth.double()).square().mean(1, keepdim=True)
     if mask is not None:
-        batch, _, height, width = image.shape
-        if not isinstance(mask, Tensor) or mask.dtype != torch.bool or mask.device != image.device:
-            raise ValueError(f"mask must be a bool tensor on the image's device {image.device}, got {show(mask)}")
-        if mask.ndim != 4 or mask.shape[0] not in (1, batch) or mask.shape[1:] != (1, height, width):
-            raise ValueError(f"mask must be [{batch} or 1, 1, {height}, {width}], got {list(mask.shape)}")
+        if not isinstance(mask, Tensor) or mask.dtype != torch.bool or mask.shape[1:] != squared.shape[1:]:
+            raise ValueError(f"mask must be bool [B or 1, {', '.join(map(str, squared.shape[1:]))}], got {show(mask)}")
         squared = squared[mask.expand_as(squared)]
-    if not squared.numel():
-        raise ValueError("no pixel counts: the mask is empty")
     error = float(squared.mean())
     if not math.isfinite(error):
-        bad = squared.numel() - int(torch.isfinite(squared).sum())
-        raise ValueError(f"image and truth must be finite, got {bad} of {squared.numel()} pixels that are not")
+        finite = int(torch.isfinite(squared).sum())
+        raise ValueError(
+            f"psnr needs finite pixels, at least one in the mask, got {finite} of {squared.numel()} finite"
+        )
     return -10.0 * math.log10(error) if error > 0 else math.inf
 
 
@@ -83,14 +80,14 @@ def ssim(image: Tensor, truth: Tensor) -> float:
         Mean over pixels and channels, at most 1.
 
     Raises:
-        ValueError: If shapes or types are invalid, or a value is not finite.
+        ValueError: If shapes or types are invalid.
 
     Reference:
         Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment", IEEE TIP 2004; computed by kornia.
     """
     from kornia.metrics import ssim as kornia_ssim
 
-    _check_pair(image, truth, finite=True)
+    _check_pair(image, truth)
     if min(image.shape[-2:]) < 6:
         raise ValueError(f"SSIM needs at least 6 pixels a side, got {list(image.shape)}")
     return float(kornia_ssim(image.double(), truth.double(), window_size=11).mean())
@@ -102,47 +99,34 @@ def has_flip() -> bool:
 
 
 def flip(image: Tensor, truth: Tensor) -> float:
-    """Mean FLIP error of display-encoded images; arguments as in :func:`flip_map`."""
-    return float(flip_map(image, truth).double().mean())
-
-
-def flip_map(image: Tensor, truth: Tensor) -> Tensor:
-    """Difference visible when flipping between two images on a display (67 pixels a degree).
+    """Mean difference visible when flipping between two images on a display (67 pixels a degree), from 0 to 1.
 
     Args:
         image: ``[1, 3, H, W]``, display-encoded, in [0, 1].
         truth: ``[1, 3, H, W]``.
 
-    Returns:
-        ``[1, 1, H, W]``, in [0, 1].
-
     Raises:
-        ValueError: If shapes differ or are not one RGB image, or a value is not finite.
+        ValueError: If shapes differ or are not one RGB image.
         ModuleNotFoundError: If ``flip-evaluator`` is not installed.
 
     Reference:
         Andersson et al., "FLIP: a difference evaluator for alternating images", HPG 2020.
     """
-    _check_pair(image, truth, finite=True)
+    _check_pair(image, truth)
     if image.shape[:2] != (1, 3):
         raise ValueError(f"FLIP compares one RGB image, [1, 3, H, W], got {list(image.shape)}")
     flip_evaluator = importlib.import_module("flip_evaluator")
     arrays = [x.detach().float().cpu()[0].permute(1, 2, 0).contiguous().numpy() for x in (truth, image)]
     error, _, _ = flip_evaluator.evaluate(*arrays, "LDR", applyMagma=False)
-    return torch.from_numpy(error).reshape(1, 1, *image.shape[-2:])
+    return float(error.mean(dtype="float64"))
 
 
-def _check_pair(image: Tensor, truth: Tensor, finite: bool = False) -> None:
-    """Raises an error if two images cannot be compared: other shapes or devices or, if asked, values not finite."""
+def _check_pair(image: Tensor, truth: Tensor) -> None:
+    """Refuse two images that cannot be compared."""
     for name, value in (("image", image), ("truth", truth)):
         real_tensor(name, value, "[B, C, H, W]")
-        if value.ndim != 4 or not value.numel():
-            raise ValueError(f"{name} must be [B, C, H, W] with at least one pixel, got {list(value.shape)}")
-        bad = value.numel() - int(torch.isfinite(value).sum()) if finite else 0
-        if bad:
-            raise ValueError(f"{name} must be finite, got {bad} of {value.numel()} values that are NaN or infinite")
-    if image.shape != truth.shape or image.device != truth.device:
+    if image.ndim != 4 or not image.numel() or image.shape != truth.shape or image.device != truth.device:
         raise ValueError(
-            f"image and truth must have the same shape and device, got {list(image.shape)} on {image.device} and "
-            f"{list(truth.shape)} on {truth.device}"
+            "image and truth must be [B, C, H, W] of the same shape and device, "
+            f"got {list(image.shape)} on {image.device} and {list(truth.shape)} on {truth.device}"
         )

@@ -14,25 +14,16 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..optics.camera import Camera
+from ..validation import number
 
-__all__ = [
-    "Plane",
-    "Scene",
-    "camera_of",
-    "plane_scene",
-    "posts",
-    "read_scenes",
-    "spread_points",
-    "waves",
-]
+__all__ = ["Plane", "Scene", "camera_of", "plane_scene", "posts", "read_scenes", "spread_points", "waves"]
 
 Light = Callable[[Tensor, Tensor], Tensor]
 """Linear light ``[C, ...]`` at positions x, y ``[...]``, in pixels of the frame."""
@@ -83,44 +74,29 @@ def read_scenes(folder: str | os.PathLike[str]) -> Iterator[Scene]:
         OSError: If the folder has no scene, or a file is missing.
         ValueError: If a file is invalid; the message names it.
     """
-    folder = Path(folder)
-    metas = sorted(folder.rglob("meta.json"))
+    from ..io.images import read_image, read_values
+
+    metas = sorted(Path(folder).rglob("meta.json"))
     if not metas:
         raise FileNotFoundError(f"{folder}: there is no scene here; a scene is a folder with meta.json and sharp.exr")
     for meta in metas:
-        yield from _read_scene(meta)
-
-
-def _read_scene(meta: Path) -> Iterator[Scene]:
-    """Every setting of the scene that one ``meta.json`` describes."""
-    from ..io.images import read_image, read_values
-
-    try:
-        data = json.loads(meta.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{meta}: is not JSON ({error})") from None
-    focal_px = _number(meta, data, "F_px")
-    truths = data.get("truths") if isinstance(data, Mapping) else None
-    if not isinstance(truths, list) or not truths:
-        raise ValueError(f"{meta}: truths must be a list of lens settings, got {str(truths)[:60]}")
-    image = read_image(meta.with_name("sharp.exr")).pixels
-    depth = read_values(meta.with_name("depth.exr"))
-    for index, entry in enumerate(truths):
-        radius, focus = _number(meta, entry, "aperture_radius_m"), _number(meta, entry, "focus_distance_m")
-        truth = read_image(meta.with_name(str(entry.get("file", f"truth_{index}.exr")))).pixels
-        if truth.shape != image.shape:
-            raise ValueError(f"{meta}: truth {index} is {list(truth.shape)}, the sharp image {list(image.shape)}")
-        name = f"{data.get('name', meta.parent.name)}/{entry.get('index', index)}"
-        camera = camera_of(focal_px, image.shape[-1], radius, focus)
-        largest_coc = math.ceil(float(camera.coc_px(depth, image.shape[-1]).abs().max()))
-        yield Scene(name, image, depth, camera, truth, max(largest_coc, int(entry.get("margin_px", 0))))
-
-
-def _number(meta: Path, data: Any, field: str) -> float:
-    value = data.get(field) if isinstance(data, Mapping) else None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
-        raise ValueError(f"{meta}: {field} must be a positive number, got {value!r}")
-    return float(value)
+        try:
+            data = json.loads(meta.read_text(encoding="utf-8"))
+            focal_px, truths = number("F_px", data["F_px"], 0), data["truths"]
+            lenses = [
+                {k: number(k, truth[k], 0) for k in ("aperture_radius_m", "focus_distance_m")} for truth in truths
+            ]
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{meta}: must describe a scene as torchdof.reference.scenes says; {error!r}") from None
+        image, depth = read_image(meta.with_name("sharp.exr")).pixels, read_values(meta.with_name("depth.exr"))
+        for index, (entry, lens) in enumerate(zip(truths, lenses, strict=True)):
+            truth = read_image(meta.with_name(str(entry.get("file", f"truth_{index}.exr")))).pixels
+            if truth.shape != image.shape:
+                raise ValueError(f"{meta}: truth {index} is {list(truth.shape)}, the sharp image {list(image.shape)}")
+            name = f"{data.get('name', meta.parent.name)}/{entry.get('index', index)}"
+            camera = camera_of(focal_px, image.shape[-1], *lens.values())
+            largest_coc = math.ceil(float(camera.coc_px(depth, image.shape[-1]).abs().max()))
+            yield Scene(name, image, depth, camera, truth, max(largest_coc, int(entry.get("margin_px", 0))))
 
 
 def camera_of(focal_px: float, width: int, aperture_radius_m: float, focus_m: float) -> Camera:
@@ -149,14 +125,12 @@ class Plane:
     light: Light
     shape: Shape | None = None
 
+    def covers(self, x: Tensor, y: Tensor) -> Tensor:
+        """Whether the plane covers positions ``[...]``, bool."""
+        return torch.ones_like(x, dtype=torch.bool) if self.shape is None else self.shape(x, y)
 
-def plane_scene(
-    planes: Sequence[Plane],
-    camera: Camera,
-    size: tuple[int, int],
-    samples: int = 1024,
-    name: str = "planes",
-) -> Scene:
+
+def plane_scene(planes: Sequence[Plane], camera: Camera, size: tuple[int, int], samples: int = 1024) -> Scene:
     """Renders planes: exact except for the number of samples, because textures and shapes are known everywhere.
 
     A plane with circle of confusion ``c``, seen from the point ``u`` of a round lens, shows at pixel ``x`` what the
@@ -167,7 +141,6 @@ def plane_scene(
         camera: The setting of the lens.
         size: Height and width in pixels.
         samples: Points on lens and pixel, for each pixel; the sharp image uses as many on the pixel alone.
-        name: Name of the scene.
 
     Returns:
         The scene; ``surfaces`` are all planes, far to near, including hidden parts.
@@ -175,24 +148,20 @@ def plane_scene(
     Raises:
         ValueError: If the farthest plane has a shape.
     """
-    height, width = size
-    if not planes or max(planes, key=lambda plane: plane.depth_m).shape is not None:
-        raise ValueError("the farthest plane must have no shape: it has to cover the frame")
     planes = sorted(planes, key=lambda plane: -plane.depth_m)  # far to near
-    depths = torch.tensor([p.depth_m for p in planes], dtype=torch.float64).reshape(-1, 1, 1, 1)
-    cocs = camera.coc_px(depths, width).flatten().tolist()
+    if not planes or planes[0].shape is not None:
+        raise ValueError("the farthest plane must have no shape: it has to cover the frame")
     y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in size), indexing="ij")
-    sharp, covers = _average(planes, cocs, x, y, torch.zeros(samples, 2))
+    distances = [torch.full((1, 1, *size), plane.depth_m, dtype=torch.float64) for plane in planes]
+    depth = distances[0]
+    for plane, distance in zip(planes, distances, strict=True):
+        depth = torch.where(plane.covers(x, y), distance, depth)
+    cocs = [float(camera.coc_px(distance, size[1])[0, 0, 0, 0]) for distance in distances]
+    sharp, surfaces = _average(planes, cocs, x, y, torch.zeros(samples, 2))
     truth, _ = _average(planes, cocs, x, y, spread_points(samples))
-    depth = torch.full((height, width), math.inf, dtype=torch.float64)
-    surfaces = []
-    for plane, cover in zip(planes, covers, strict=True):
-        is_covered = torch.ones_like(x, dtype=torch.bool) if plane.shape is None else plane.shape(x, y)
-        depth = torch.where(is_covered, plane.depth_m, depth)
-        surfaces.append((cover.float()[None], camera.coc_px(torch.full((1, 1, height, width), plane.depth_m), width)))
-    margin_px = math.ceil(max(abs(c) for c in cocs))
-    images = (sharp.float()[None], depth.float()[None, None], camera, truth.float()[None])
-    return Scene(name, *images, margin_px, tuple(surfaces))
+    coc_maps = [camera.coc_px(distance.float(), size[1]) for distance in distances]
+    margin_px = math.ceil(max(map(abs, cocs)))
+    return Scene("planes", sharp, depth.float(), camera, truth, margin_px, tuple(zip(surfaces, coc_maps, strict=True)))
 
 
 def spread_points(count: int) -> Tensor:
@@ -210,7 +179,7 @@ def spread_points(count: int) -> Tensor:
 def _average(
     planes: Sequence[Plane], cocs: Sequence[float], x: Tensor, y: Tensor, points: Tensor
 ) -> tuple[Tensor, list[Tensor]]:
-    """Mean light ``[C, H, W]`` of visible planes, premultiplied light and cover of each plane ``[C + 1, H, W]``.
+    """Mean light ``[1, C, H, W]`` of visible planes, premultiplied light and cover of each ``[1, C + 1, H, W]``.
 
     Planes are sorted far to near, with a signed coc each, and seen from points ``[n, 2]`` of the unit disc of the lens.
     """
@@ -222,12 +191,11 @@ def _average(
         visible = torch.zeros(())
         for k, (plane, coc) in enumerate(zip(planes, cocs, strict=True)):
             point = x + px - coc * ux, y + py - coc * uy
-            light = plane.light(*point)
-            is_covered = torch.ones_like(x, dtype=torch.bool) if plane.shape is None else plane.shape(*point)
+            light, is_covered = plane.light(*point), plane.covers(*point)
             visible = torch.where(is_covered, light, visible)
             sums[k] = sums[k] + torch.cat([light * is_covered, is_covered[None]])
         total = total + visible
-    return total / len(points), [each / len(points) for each in sums]
+    return (total / len(points)).float()[None], [(each / len(points)).float()[None] for each in sums]
 
 
 def waves(seed: int, mean: Sequence[float] = (0.4, 0.4, 0.4), contrast: float = 0.8, shortest_px: float = 6.0) -> Light:
