@@ -65,7 +65,7 @@ def test_light_is_monotone_and_continuous_in_the_level_of_a_lamp_and_in_the_stop
 test_wrong_input_is_refused = refuses(
     (lambda: expand_highlights(torch.ones(3, 4, 4), 3.0), r"light must be \[B, C, H, W\]"),
     (lambda: expand_highlights(torch.ones(1, 3, 0, 4), 3.0), "at least one pixel"),
-    (lambda: expand_highlights(torch.ones(1, 3, 4, 4, dtype=torch.uint8), 3.0), "floating-point"),
+    (lambda: expand_highlights(torch.ones(1, 3, 4, 4, dtype=torch.uint8), 3.0), "floating point"),
     (lambda: expand_highlights(torch.ones(1, 3, 4, 4), -1.0), "stops must be a finite number from 0 on, got -1.0"),
 )
 

@@ -452,9 +452,9 @@ def _judge(
         for side, end in zip(sides, (near, far), strict=True):
             share = side * (alike + 1e-3)
             surfaces.append(torch.where(known, (share * values).sum(0) / share.sum(0).clamp_min(1e-12), end))
-        return torch.stack([score, separation, *surfaces])
+        return torch.stack([score, separation, *surfaces, known.to(score.dtype)])
 
-    score, separation, near, far = ops.by_parts(look, edge_pixels).unbind(0)
+    score, separation, near, far, known = ops.by_parts(look, edge_pixels).unbind(0)
 
     # neighbours of similar colour decide together
     scores = pixels.put(torch.full_like(nearness, torch.nan), edge_pixels, score)
@@ -466,6 +466,9 @@ def _judge(
     scores = torch.where(scores.isnan(), 0.0, scores)
     score = (_SHARPNESS * separation * (alike * scores).sum(0) / alike.sum(0).clamp_min(1e-12)).clamp(-6.0, 6.0)
     evidence = (2.0 * separation * scores.abs().amax(0) - 1.0).clamp(0.0, 1.0)
+    # at the ends of a wide ramp the window holds only one of the surfaces: use the evidence of its middle
+    around = _highest(pixels.put(torch.zeros_like(nearness), edge_pixels, evidence), 3)
+    evidence = torch.where(known > 0, evidence, pixels.pick(around, edge_pixels)[0])
     return score, evidence, near, far
 
 

@@ -241,9 +241,10 @@ void sums(const Grid &in, const Grid &out, const Grid &rows, const Part &part, f
 }
 
 // Which surface a pixel shows. score: log-odds of the near surface. reliability: 0 to 1, how well colours separate the
-// two surfaces. evidence: 0 to 1. near, far: nearness of the surfaces.
+// two surfaces. near, far: nearness of the surfaces. known: whether both are in reach.
 struct Judgement {
-  float score, reliability, evidence, near, far;
+  float score, reliability, near, far;
+  bool known;
 };
 
 struct Around {
@@ -514,6 +515,7 @@ class Repair {
 
   void allocate() {
     score_ = Buffer<float>(area_);
+    evidence_ = Buffer<float>(area_);
     marks_ = Buffer<uint8_t>(area_);
   }
 
@@ -970,13 +972,13 @@ class Repair {
       for (int l = 0; l <= lane; l++) {
         const Edge &edge = group.edges[k - lane + l];
         score_[edge.i] = is_known[l] ? clamp(std::log(odds[l]), -8.0f, 8.0f) * (marks_[edge.i] & RAMP ? 1.0f : clear[l]) : 0.0f;
-        group.judged[k - lane + l] = {0.0f, reliability[l], 0.0f, is_known[l] ? surfaces[0][l] : edge.near, is_known[l] ? surfaces[1][l] : edge.far};
+        group.judged[k - lane + l] = {0.0f, reliability[l], is_known[l] ? surfaces[0][l] : edge.near, is_known[l] ? surfaces[1][l] : edge.far, (bool)is_known[l]};
       }
     });
   }
 
   // Averages the scores of neighbours of similar colour, and finds the evidence.
-  void decide(const std::vector<Group> &groups) const {
+  void decide(const std::vector<Group> &groups) {
     parallel((int)groups.size(), [&](int g) {
       const Group &group = groups[g];
       if (group.edges.empty()) return;
@@ -1002,7 +1004,7 @@ class Repair {
         for (int l = 0; l <= lane; l++) {
           Judgement &judged = group.judged[k - lane + l];
           judged.score = clamp(SHARPNESS * judged.reliability * score[l], -6.0f, 6.0f);
-          judged.evidence = clamp01(2.0f * judged.reliability * strongest[l] - 1.0f);
+          evidence_[group.edges[k - lane + l].i] = clamp01(2.0f * judged.reliability * strongest[l] - 1.0f);
         }
       });
     });
@@ -1108,7 +1110,7 @@ class Repair {
         const uint8_t marks = marks_[edge.i];
         const bool was_near = marks & NEAR;
         lost[g] += shows_near - was_near;
-        const float moved = marks & RAMP ? judged.evidence : (float)(shows_near != was_near);
+        const float moved = !(marks & RAMP) ? (float)(shows_near != was_near) : judged.known ? evidence_[edge.i] : evidence_around(edge.i);
         if (!(moved > 0)) continue;
         const float own = nearness(edge.i), surface = shows_near ? judged.near : judged.far;
         map_.out[edge.i] = sign_ * (own + moved * (surface - own));
@@ -1119,11 +1121,19 @@ class Repair {
     return (float)(total / std::max(found_.length, 1e-12));
   }
 
+  // The strongest evidence within three pixels, for the ends of wide ramps, where only one surface is in reach.
+  float evidence_around(int i) const {
+    float strongest = 0;
+    for (int y = std::max(i / width_ - 3, 0); y <= std::min(i / width_ + 3, height_ - 1); y++)
+      for (int x = std::max(i % width_ - 3, 0); x <= std::min(i % width_ + 3, width_ - 1); x++)
+        if (const int at = y * width_ + x; marks_[at] & LISTED) strongest = std::max(strongest, evidence_[at]);
+    return strongest;
+  }
+
   // Removes rims beside steps that are a little nearer, or farther, than the surface to which they belong: the ringing
   // of interpolation. Such pixels move to the closer end of the range between the closed opening and the opened closing.
   void remove_ringing() {
-    const Buffer<float> repaired(area_);
-    memcpy(repaired.data(), map_.out, area_ * sizeof(float));
+    memcpy(evidence_.data(), map_.out, area_ * sizeof(float));
     const std::vector<Group> parts = tiles();
     parallel((int)parts.size(), [&](int g) {
       const Part &part = parts[g].part, whole = part.grown(4 * RINGING_REACH);
@@ -1134,8 +1144,8 @@ class Repair {
         clamp_to_frame(values, over);
         if (negated) each_vector(over, [&](int y, int x) { store(values.at(y, x), -load<vec>(values.at(y, x))); });
       };
-      fetch(repaired.data(), up, [this](float v) { return std::fabs(v) <= LARGEST ? sign_ * v : -NONE; });
-      fetch(repaired.data(), down, [this](float v) { return std::fabs(v) <= LARGEST ? -sign_ * v : -NONE; });
+      fetch(evidence_.data(), up, [this](float v) { return std::fabs(v) <= LARGEST ? sign_ * v : -NONE; });
+      fetch(evidence_.data(), down, [this](float v) { return std::fabs(v) <= LARGEST ? -sign_ * v : -NONE; });
       for (const Grid *values : {&up, &down}) spread(*values, 3, true);
       vec widest = all(-NONE);
       each_vector(part, [&](int y, int x) {
@@ -1330,7 +1340,7 @@ class Repair {
   const int height_, width_, channels_;
   const size_t area_;
   float noise_step_ = 0.0f;  // smallest step that is larger than the map's noise
-  Buffer<float> score_;
+  Buffer<float> score_, evidence_;
   Buffer<uint8_t> marks_;
   Buffer<Judgement> judged_;  // of the edges given memory last
   Buffer<Around> around_;
