@@ -74,6 +74,8 @@ def test_gradients_reach_a_column_of_focus() -> None:
         ((2, 3, 3, 9, 12), (2, 3, 1, 9, 12), [1.0, 2.0, 3.0], r"focus_m must be a number, \[2\] or \[2, 3\]"),
         ((2, 3, 9, 12), (2, 1, 9, 12), ["near", 2.0], "focus_m must be a number, a list of numbers"),
         ((3, 12), (1, 12), None, r"image must be \[B, C, H, W\]"),
+        ((0, 0, 0), (1, 0, 0), None, "image must be .* with at least one pixel"),
+        ((2, 0, 3, 0, 0), (2, 0, 1, 0, 0), None, "image must be .* with at least one pixel"),
     ],
 )
 def test_mismatched_shapes_are_refused(

@@ -45,7 +45,8 @@ def flattened(axes: tuple[int, ...], **values: Any) -> list[Any]:
                     expected = f"[{start}{channels}, H, W] beside an image [{start}C, H, W]"
                     raise ValueError(f"{name} must be {expected}, got {list(value.shape)}")
                 is_shared = all(n == 1 for n in value.shape[: len(axes)])
-                value = (value if is_shared else value.expand(*axes, -1, -1, -1)).reshape(-1, *value.shape[-3:])
+                value = value if is_shared else value.expand(*axes, -1, -1, -1)
+                value = value.flatten(0, 1) if axes else value[None]
             value = value.contiguous()
         batches.append(value)
     return batches
