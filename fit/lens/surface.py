@@ -43,7 +43,7 @@ class Surface:
         _check("diameter", self.diameter, _MIN_MM, _MAX_MM)
         _check("thickness", self.thickness, 0.0, _MAX_MM)
         _check("radius", self.radius, -math.inf, math.inf)
-        if not (_MIN_MM <= abs(self.radius) <= _MAX_MM or math.isinf(self.radius)):
+        if not (_MIN_MM <= abs(self.radius) <= _MAX_MM or abs(self.radius) == math.inf):
             raise ValueError(f"radius must be inf, or {_MIN_MM:g} to {_MAX_MM:g} mm long, got {self.radius}")
         _check("conic constant", self.conic, -_MAX_CONIC, _MAX_CONIC)
         for i, coefficient in enumerate(self.polynomial):

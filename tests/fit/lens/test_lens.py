@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -146,3 +148,8 @@ def test_impossible_lenses_are_refused_by_name(lens_of):
         Lens.read("triplet")
     with pytest.raises(ValueError, match="does not converge light"):
         lens_of("-50 5 1.5 20\n0 1 0 18\n50 0 1 20\n").paraxial()
+
+
+def test_a_radius_beyond_all_floats_is_refused():
+    with pytest.raises(ValueError, match="radius must be inf"):
+        dataclasses.replace(Lens.read("double_gauss_50mm").surfaces[0], radius=10**400)
