@@ -107,7 +107,7 @@ def trace_table(
         raise ValueError(f"lens must be a Lens, got {show(lens)}; read one with Lens.read()")
     number("focus_m", focus_m, 0, unit="metres", infinite=True)
     number("field_mm", field_mm, -1e6, 1e6)
-    number("sensor_width_mm", sensor_width_mm, 0, 1e9)
+    number("sensor_width_mm", sensor_width_mm, 1e-6, 1e9, unit="millimetres")
     number("width_px", width_px, 0, 1e9, unit="pixels")
     if nodes is not None:
         whole("nodes", nodes, 5 if math.isfinite(focus_m) else 3, 1000)

@@ -151,6 +151,7 @@ def test_off_axis_table_states_its_asymmetry():
         ({"nodes": 4}, "nodes must be a whole number from 5"),
         ({"nodes": 40, "width_px": 20}, "nodes must be at most [0-9]+ for this lens and width_px, got 40"),
         ({"focus_m": 0.04}, "farther than the focal length"),
+        ({"sensor_width_mm": 5e-324}, "sensor_width_mm must be a number of millimetres > 1e-06"),
         ({"nearest_m": 3.0}, "nearest_m must be a number of metres > 0 and < 2, got 3.0"),
         ({"wavelengths_um": RGB_UM, "lens": "wide_22mm"}, "wavelengths_um need a lens with Abbe numbers"),
         ({"wavelengths_um": (0.1,)}, "wavelength_um must be a number of micrometres > 0.299"),
