@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from torchdof.io.paths import named_file
 from torchdof.validation import number, show, whole
 
 from ..result import Array, Mask
@@ -89,14 +90,7 @@ class Lens:
             ValueError: If the content is not a prescription; the message contains file, line and column.
             FileNotFoundError: If there is no such file and no included lens of this name.
         """
-        if not isinstance(source, str | os.PathLike):
-            raise ValueError(f"source must be the name or the path of a prescription, got {show(source)}")
-        path = Path(source)
-        if not path.suffix and not path.exists():
-            path = _SHIPPED / f"{path}.txt"
-        if not path.is_file():
-            shipped = ", ".join(sorted(p.stem for p in _SHIPPED.glob("*.txt")))
-            raise FileNotFoundError(f"no lens {str(source)!r}: neither a file nor one of the shipped ({shipped})")
+        path = named_file(source, _SHIPPED, ".txt", "lens prescription")
         try:
             parse = prescription.parse_zemax if path.suffix.lower() == ".zmx" else prescription.parse
             surfaces, stop, comment = parse(path.read_bytes())

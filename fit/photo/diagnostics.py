@@ -222,7 +222,7 @@ def check_levels(solution: Solution, expected: Solution, edge: Edge, file: str |
     """Warns if a tone curve would explain the residual of a fit, or of `expected`, at the expected magnification.
 
     A kernel cannot make all pixels of one level brighter and all of another level darker, but a fitted magnification
-    imitates most of such a curve. In a JPEG its effect is less certain; a steep `edge` of the sharp dot supports it.
+    imitates most of such a curve. A residual too weak to prove it, as in a JPEG, is enough beside a steep `edge`.
     """
     products, covariance, visible = unexplained(solution, _curves(solution, edge.level))
     strengths = np.linalg.lstsq(visible.T @ visible, products, rcond=None)[0]

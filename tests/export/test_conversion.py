@@ -82,7 +82,11 @@ SIMPLY = torchdof.DepthOfField(CAMERA, **SIMPLE)
         (torch.nn.Identity(), {}, r"dof must be a torchdof\.DepthOfField"),
         (torchdof.DepthOfField(torchdof.Camera(focus_m=torch.tensor([1.0, 2.0]))), {}, "focus_m must be a float"),
         (torchdof.DepthOfField(CAMERA, CATS_EYES, **SIMPLE), {}, "take a table without vignetting"),
-        (torchdof.DepthOfField(CAMERA.replace(focus_range_m=(1.0, 2.0)), **SIMPLE), {}, "remove it: focus_range_m=None"),
+        (
+            torchdof.DepthOfField(CAMERA.replace(focus_range_m=(1.0, 2.0)), **SIMPLE),
+            {},
+            "remove it: focus_range_m=None",
+        ),
     ],
 )
 def test_bad_arguments_are_refused_and_no_file_is_written(

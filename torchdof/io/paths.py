@@ -9,7 +9,7 @@ from typing import Literal
 
 from . import optional_formats
 
-__all__ = ["IMAGE_SUFFIXES", "MAP_SUFFIXES", "PixelType", "existing_image", "existing_map", "samples_of"]
+__all__ = ["IMAGE_SUFFIXES", "MAP_SUFFIXES", "PixelType", "existing_image", "existing_map", "named_file", "samples_of"]
 
 PixelType = Literal["8", "16", "half", "float"]
 
@@ -46,6 +46,21 @@ def existing_image(path: str | os.PathLike[str]) -> Path:
 def existing_map(path: str | os.PathLike[str]) -> Path:
     """Checks the path of a depth map; errors name it."""
     return _existing_file(path, MAP_SUFFIXES, "a depth map")
+
+
+def named_file(source: str | os.PathLike[str], folder: Path, suffix: str, what: str) -> Path:
+    """The file of a path, or of a name without suffix that is shipped in ``folder``; messages call it ``what``."""
+    if not isinstance(source, str | os.PathLike):
+        from ..validation import show  # imports PyTorch
+
+        raise ValueError(f"source must be the name or the path of a {what}, got {show(source)}")
+    path = Path(source)
+    if not path.suffix and not path.exists():
+        path = folder / f"{path}{suffix}"
+    if not path.is_file():
+        names = ", ".join(sorted(each.stem for each in folder.glob(f"*{suffix}")))
+        raise FileNotFoundError(f"no {what} {str(source)!r}: neither a file nor one of the shipped ({names})")
+    return path
 
 
 def _existing_file(path: str | os.PathLike[str], suffixes: tuple[str, ...], what: str) -> Path:

@@ -12,6 +12,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ..io.atomic import write_text
+from ..io.paths import named_file
 from ..validation import choice, fields, number, numbers, pixels_wide, real_tensor, short, show
 from . import psf
 from .aperture import Aperture, Number
@@ -401,14 +402,7 @@ class BlurTable:
             >>> BlurTable.load("sato_j15").family
             'ring'
         """
-        if not isinstance(source, str | os.PathLike):
-            raise ValueError(f"source must be the name or the path of a blur table, got {show(source)}")
-        path = Path(source)
-        if not path.suffix and not path.exists():
-            path = _FOLDER / f"{path}.json"
-        if not path.is_file():
-            names = ", ".join(shipped())
-            raise FileNotFoundError(f"no blur table {str(source)!r}: neither a file nor one of the shipped ({names})")
+        path = named_file(source, _FOLDER, ".json", "blur table")
         try:
             return cls.from_dict(json.loads(path.read_text(encoding="utf-8")))
         except (ValueError, RecursionError) as error:

@@ -446,8 +446,8 @@ def _judge(
         alike = (1.0 + (others - own[:, None]).square().sum(0) / (0.3 * spread)).square().reciprocal()
         likelihoods = [(side * alike).sum(0) / total + 1e-9 for side, total in zip(sides, totals, strict=True)]
         score = torch.where(known, torch.log(likelihoods[0] / likelihoods[1]), 0.0).clamp(-8.0, 8.0)
-        is_clear = pixels.pick(edges.is_ramp, part)[0] | (torch.minimum(*sums) > clear)
-        score = torch.where(is_clear, score, score * torch.minimum(*sums) / clear)
+        certainty = (torch.minimum(*sums) / clear).clamp(max=1.0)
+        score = torch.where(pixels.pick(edges.is_ramp, part)[0], score, score * certainty)
         surfaces = []
         for side, end in zip(sides, (near, far), strict=True):
             share = side * (alike + 1e-3)
