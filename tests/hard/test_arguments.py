@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field
-from torchdof.cli.command import numbers, word_or_number
+from torchdof.cli.command import command_of
+from torchdof.cli.render import Render
 from torchdof.depth.holes import fill_holes
 from torchdof.depth.inspect import tint_focus
 from torchdof.depth.kinds import depth_from_values
@@ -173,6 +174,8 @@ def test_any_argument_gives_a_result_or_a_named_error(name: str, data: st.DataOb
 @FEW
 @given(st.text(max_size=12) | st.from_regex(r"[-0-9:.,einfa ]{0,12}", fullmatch=True))
 def test_any_text_is_parsed_or_gives_a_named_error(text: str) -> None:
-    options = numbers(2, "--range expects two numbers such as 1,2"), word_or_number(("far",), "--fill expects far")
-    for read in (parse_frames, parse_focus, FramePattern, *options):
+    for read in (parse_frames, parse_focus, FramePattern):
         check_error(functools.partial(read, text))
+    for option in command_of("render", Render).params:
+        if option.callback is not None:
+            check_error(functools.partial(option.callback, None, option, text))  # type: ignore[arg-type]

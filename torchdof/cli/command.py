@@ -34,6 +34,7 @@ def option(
     *,
     names: tuple[str, ...] = (),
     read: Callable[[str], Any] | None = None,
+    expected: str = "",
     group: str = "",
     basic: bool = False,
     **details: Any,
@@ -44,16 +45,17 @@ def option(
         help: Text in ``--help``.
         default: Default value; ``...`` makes the option required.
         names: Spellings on the command line; empty uses the field's name with dashes.
-        read: Converts the text to the value, or raises ``ValueError`` with the expected form.
+        read: Converts the text to the value, or raises ``ValueError``.
+        expected: What ``read`` takes, for the message of an error; empty keeps the message of ``read``.
         group: Heading in ``--help``; empty uses the docstring of the field's class.
         basic: Whether ``--help`` lists the option before the groups.
         **details: Further arguments of the option.
     """
-    details["help"] = help
-    if read is not None:
-        details |= {"type": str, "callback": lambda _, __, text: None if text is None else read(text)}
-    metadata = {"names": names, "group": _BASIC_HEADING if basic else group, "details": details}
-    return dataclasses.field(**({} if default is ... else {"default": default}), metadata=metadata)
+    metadata = {"names": names, "read": read, "expected": expected, "group": _BASIC_HEADING if basic else group}
+    required = default is ...
+    return dataclasses.field(
+        **({} if required else {"default": default}), metadata={**metadata, "details": {"help": help, **details}}
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -68,33 +70,14 @@ def argument(help: str, metavar: str, default: Any = ...) -> Any:
     return option(help, default, metavar=metavar, names=("argument",))
 
 
-def reader(expected: str, parse: Callable[[str], Any]) -> Callable[[str], Any]:
-    """``parse``, whose ``ValueError`` gets a message that starts with ``expected``."""
-
-    def read(text: str) -> Any:
-        try:
-            return parse(text)
-        except ValueError:
-            raise ValueError(f"{expected}, got {text!r}") from None
-
-    return read
+def numbers(text: str) -> tuple[float, ...]:
+    """Reads numbers separated by commas."""
+    return tuple(map(float, text.split(",")))
 
 
-def numbers(count: int | None, expected: str) -> Callable[[str], tuple[float, ...]]:
-    """A reader of ``count`` numbers (None: any count) separated by commas."""
-
-    def parse(text: str) -> tuple[float, ...]:
-        values = tuple(map(float, text.split(",")))
-        if count not in (None, len(values)):
-            raise ValueError
-        return values
-
-    return reader(expected, parse)
-
-
-def word_or_number(words: tuple[str, ...], expected: str) -> Callable[[str], float | str]:
-    """A reader of one of ``words`` or a number."""
-    return reader(expected, lambda text: text if text in words else float(text))
+def number_or(*words: str) -> Callable[[str], float | str]:
+    """A reader of a number or one of some words."""
+    return lambda text: text if text in words else float(text)
 
 
 def by_option(message: str, parameters: Iterable[click.Parameter]) -> str:
@@ -145,15 +128,19 @@ def _parameters(kind: type[Any]) -> Iterator[click.Parameter]:
 
 def _parameter(field: Any, hint: Any) -> click.Parameter:
     """Argument or option for a field of type ``hint``; a tuple without a ``read`` of its own takes several values."""
-    given, names = field.metadata["details"], field.metadata["names"]
-    required = field.default is dataclasses.MISSING
-    takes_several = typing.get_origin(hint) is tuple and "callback" not in given
-    if typing.get_args(hint) and typing.get_origin(hint) is not Literal:  # X | None, tuple[X, ...]
+    names, read, required = field.metadata["names"], field.metadata["read"], field.default is dataclasses.MISSING
+    if type(None) in typing.get_args(hint):
         hint = typing.get_args(hint)[0]
-    kind = click.Choice(typing.get_args(hint)) if typing.get_origin(hint) is Literal else hint
-    details = {"type": kind, "required": required, **given}
+    parts, is_tuple = typing.get_args(hint), typing.get_origin(hint) is tuple
+    details = {"required": required, "type": parts[0] if is_tuple else hint}
+    if read is not None:
+        details |= {"type": str, "callback": _callback(read, field.metadata["expected"], is_tuple and parts)}
+    elif typing.get_origin(hint) is Literal:
+        details["type"] = click.Choice(parts)
     if not required and field.default not in (None, ()):
         details["default"] = field.default
+    details |= field.metadata["details"]
+    takes_several = is_tuple and read is None
     if names == ("argument",):
         return click.Argument([field.name], nargs=-1 if takes_several else 1, **details)
     if hint is bool:
@@ -161,3 +148,22 @@ def _parameter(field: Any, hint: Any) -> click.Parameter:
     else:
         details |= {"multiple": takes_several, "show_default": bool(field.default) and not required}
     return click.Option([field.name, *(names or [f"--{field.name.replace('_', '-')}"])], **details)
+
+
+def _callback(read: Callable[[str], Any], expected: str, parts: Any) -> Callable[..., Any]:
+    """Click's callback that reads the text of an option, whose value has as many ``parts`` as its type."""
+
+    def value_of(_: click.Context, option: click.Parameter, text: str | None) -> Any:
+        if text is None:
+            return None
+        try:
+            value = read(text)
+            if parts and ... not in parts and len(value) != len(parts):
+                raise ValueError
+            return value
+        except ValueError:
+            if not expected:
+                raise
+            raise ValueError(f"{option.opts[0]} expects {expected}, got {text!r}") from None
+
+    return value_of

@@ -2,28 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
 import click
 
-from torchdof.cli.command import Command, Group, argument, numbers, option, reader
+from torchdof.cli.command import Command, Group, argument, numbers, option
 from torchdof.cli.options import make_folder_of
 from torchdof.io.atomic import check_writable
-
-_NUMBERS = numbers(None, "expected numbers")
-
-
-def _radii(text: str) -> tuple[float, ...]:
-    """Reads distances in mm from the middle of the frame, rising from 0."""
-    radii_mm = _NUMBERS(text)
-    if len(radii_mm) < 2 or radii_mm[0] != 0 or not all(low < high < math.inf for low, high in pairwise(radii_mm)):
-        raise ValueError
-    return radii_mm
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,16 +52,13 @@ class _Lens(Group):
     field: tuple[float, ...] | None = option(
         "One table across the field, of spots at these distances from the middle; to 21.6 for full frame.",
         metavar="0,MM,MM,...",
-        read=reader(
-            "--field takes distances in mm from the middle of the frame, rising from 0, like 0,7,14,21.6", _radii
-        ),
+        read=numbers,
+        expected="distances in mm from the middle of the frame, rising from 0, like 0,7,14,21.6",
     )
     wavelengths: tuple[float, ...] | None = option(
         "One table a colour: rgb, or micrometres like 0.65,0.55,0.45; for lenses with Abbe numbers.",
-        read=reader(
-            "--wavelengths takes rgb, or micrometres like 0.65,0.55,0.45",
-            lambda text: () if text == "rgb" else _NUMBERS(text),  # () stands for red, green and blue
-        ),
+        read=lambda text: () if text == "rgb" else numbers(text),  # () stands for red, green and blue
+        expected="rgb, or micrometres like 0.65,0.55,0.45",
     )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..io.metadata import camera_settings
 from ..io.sequence import focus_at_frame, parse_focus
-from .command import Group, numbers, option, reader
+from .command import Group, numbers, option
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -62,10 +62,6 @@ def _width_fraction(text: str) -> float:
     return share
 
 
-_SHARE = reader("--blur expects a share of the picture's width, above 0 and at most 50 %, such as 2%", _width_fraction)
-_EQUIVALENT = numbers(2, "--equivalent expects a focal length and an f-number such as 85mm,1.4")
-
-
 @dataclass(frozen=True, kw_only=True)
 class Sensor(Group):
     """Focus and lens."""
@@ -88,13 +84,15 @@ class Lens(Sensor):
     focus_at: tuple[float, float] | None = option(
         "Focus on the surface at this pixel from the top left; by default as the file states, else on the subject.",
         metavar="X,Y",
-        read=numbers(2, "--focus-at expects a pixel X,Y such as 320,200"),
+        read=numbers,
+        expected="a pixel X,Y such as 320,200",
         basic=True,
     )
     focus_range: tuple[float, float] | None = option(
         "In focus from NEAR to FAR metres, blurred beyond; instead of --focus-m.",
         metavar="NEAR,FAR",
-        read=numbers(2, "--focus-range expects two numbers such as 1.5,2.2"),
+        read=numbers,
+        expected="two numbers such as 1.5,2.2",
     )
     tilt: float = option("Degrees by which the lens is tilted down: focus comes nearer towards the bottom.", 0.0)
     swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)
@@ -103,13 +101,15 @@ class Lens(Sensor):
         "Open the lens until the largest blur radius is this share of the width, such as 2%; instead of --f-number.",
         names=("--blur",),
         metavar="SHARE%",
-        read=_SHARE,
+        read=_width_fraction,
+        expected="a share of the picture's width, above 0 and at most 50 %, such as 2%",
         basic=True,
     )
     equivalent: tuple[float, float] | None = option(
         "Full-frame lens that the picture is taken to be from, such as 85mm,1.4.",
         metavar="MM,F",
-        read=lambda text: _EQUIVALENT(re.sub(r"\s*(mm)?\s*[, ]\s*(f/?)?", ",", text, count=1)),
+        read=lambda text: numbers(re.sub(r"\s*(mm)?\s*[, ]\s*(f/?)?", ",", text, count=1)),
+        expected="a focal length and an f-number such as 85mm,1.4",
         basic=True,
     )
     aperture_radius_m: float | None = option("Radius of the opening, with --fov-deg.")

@@ -40,7 +40,8 @@ class _Effects(Group):
     attention: tuple[float, float, float] | None = option(
         "Where the viewer looks, in pixels from the top left: elsewhere a draft's tolerance is enough.",
         metavar="X,Y,RADIUS",
-        read=numbers(3, "--attention expects X,Y,RADIUS in pixels such as 320,200,80"),
+        read=numbers,
+        expected="X,Y,RADIUS in pixels such as 320,200,80",
     )
     lights: float = option(
         "Make lamps that a photograph clipped at white brighter by up to this many stops, such as 3.",
