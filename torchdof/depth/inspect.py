@@ -68,26 +68,21 @@ class DepthReport:
         """
         bounds = [-math.inf, *(-x for x in reversed(_BOUNDS_PX)), *_BOUNDS_PX, math.inf]
         coc_px = self.coc_px[~self.coc_px.isnan()]
-        edges = torch.tensor(bounds[1:-1], dtype=coc_px.dtype, device=coc_px.device)
-        counts = torch.bincount(torch.bucketize(coc_px, edges), minlength=len(bounds) - 1).tolist()
+        counts = torch.bucketize(coc_px, coc_px.new_tensor(bounds[1:-1])).bincount(minlength=len(bounds) - 1).tolist()
         filled = [k for k, count in enumerate(counts) if count] or [len(_BOUNDS_PX)]
         total = max(1, coc_px.numel())
         return [(bounds[k], bounds[k + 1], counts[k] / total) for k in range(filled[0], filled[-1] + 1)]
 
-    def distances(self) -> dict[str, float]:
-        """Nearest and farthest finite depth and the 1, 50 and 99 % quantiles, in metres; empty without finite depth."""
-        finite = self.depth[self.depth.isfinite()]
-        if not finite.numel():
-            return {}
-        sample = finite[:: max(1, finite.numel() // 2**20)].double()
-        quantiles = {name: float(sample.quantile(share)) for name, share in _QUANTILES.items()}
-        return {"nearest": float(finite.min()), **quantiles, "farthest": float(finite.max())}
-
     def facts(self) -> dict[str, Any]:
         """The numbers of ``str`` as JSON-like data: distances in metres, radii in pixels, shares in [0, 1]."""
-        coc_px = self.coc_px[~self.coc_px.isnan()]
+        coc_px, finite = self.coc_px[~self.coc_px.isnan()], self.depth[self.depth.isfinite()]
+        distances = {}
+        if finite.numel():
+            sample = finite[:: max(1, finite.numel() // 2**20)].double()
+            quantiles = {name: float(sample.quantile(share)) for name, share in _QUANTILES.items()}
+            distances = {"nearest": float(finite.min()), **quantiles, "farthest": float(finite.max())}
         return {
-            "depth_m": self.distances(),
+            "depth_m": distances,
             "at_infinity_px": int(self.depth.isinf().sum()),
             "holes_px": self.holes,
             "coc_px": [float(coc_px.min()), float(coc_px.max())] if coc_px.numel() else [],
@@ -97,7 +92,7 @@ class DepthReport:
         }
 
     def __str__(self) -> str:
-        facts, total = self.facts(), self.depth.numel()
+        facts, total, edge_px = self.facts(), self.depth.numel(), sum(self.counts)
         lines = []
         if facts["depth_m"]:
             lines.append("depth, m      " + "  ".join(f"{name} {z:.4g}" for name, z in facts["depth_m"].items()))
@@ -110,8 +105,7 @@ class DepthReport:
             for low, high, share in self.histogram():
                 bar = "#" * math.ceil(40 * share / longest)
                 lines.append(f"{low:+8.0f} to {high:+5.0f} px {100 * share:5.1f} % {bar}".rstrip())
-        edge_px = sum(self.counts)
-        shares = ", ".join(f"{_percent(n, edge_px)} {name}" for n, name in zip(self.counts, EDGES, strict=True))
+        shares = ", ".join(f"{_percent(n, edge_px)} {name}" for name, n in facts["depth_edges"].items())
         lines.append(f"depth edges   {edge_px} pixels: {shares}")
         if edge_px:
             treatment = "are repaired before rendering" if self.doubtful else "are exact and stay unchanged"

@@ -7,7 +7,7 @@ The renderer itself does not check, because the checks read values and would sta
 import dataclasses
 import math
 import warnings
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -44,7 +44,7 @@ class DepthWarning(UserWarning):
 class Mistake:
     """A likely mistake in a depth map or its camera."""
 
-    name: Literal["focus", "gap", "far", "bits", "blur", "lens", "range"]
+    name: str
     message: str  # the observation, the likely mistake and its remedy
 
 
@@ -84,17 +84,14 @@ def depth_mistakes(
     ``kind`` and ``scale`` are those of the conversion of the numbers to metres, for the advice in the message.
     """
     one_channel("depth", depth, "in metres")
-    in_focus = camera.focus_range_m or (camera.focus_m, camera.focus_m)
-    lens = [getattr(camera, name) for name in _NUMBERS]
-    numbers = [torch.as_tensor(value, device="cpu").reshape(-1) for value in (*lens, *in_focus)]
-    batch = max(depth.shape[0], *(x.numel() for x in numbers))
+    focus = camera.focus_range_m or (camera.focus_m, camera.focus_m)
+    numbers = [torch.as_tensor(n, device="cpu").reshape(-1) for n in (*(getattr(camera, n) for n in _NUMBERS), *focus)]
     mistakes: dict[str, Mistake] = {}
-    for item in range(batch):
+    for item in range(max(depth.shape[0], *(x.numel() for x in numbers))):
         *lens, near, far = (float(x[min(item, x.numel() - 1)]) for x in numbers)
         # without tilt, because the checks below do not depend on the place in the frame
-        item_camera = camera.replace(
-            **dict(zip(_NUMBERS, lens, strict=True)), focus_range_m=(near, far), tilt_deg=0.0, swing_deg=0.0
-        )
+        of_item: dict[str, Any] = dict(zip(_NUMBERS, lens, strict=True), focus_range_m=(near, far))
+        item_camera = camera.replace(**of_item, tilt_deg=0.0, swing_deg=0.0)
         for mistake in _mistakes(depth[min(item, depth.shape[0] - 1)], item_camera, kind, scale):
             mistakes.setdefault(mistake.name, mistake)
     return list(mistakes.values())
@@ -106,36 +103,22 @@ def coc_mistakes(coc_px: Tensor) -> list[Mistake]:
     size, width = coc_px[coc_px.isfinite()].abs(), coc_px.shape[-1]
     if not size.numel() or _quantile(size, 0.99) <= _LARGEST_WIDTHS * width:
         return []
-    message = (
-        f"a blur radius of {float(size.max()):.6g} px on an image of {width} px is more than a lens makes; are "
-        "these depths instead of circles of confusion? (--depth-kind)"
-    )
-    return [Mistake("blur", message)]
+    radius = f"a blur radius of {float(size.max()):.6g} px on an image of {width} px is more than a lens makes"
+    return [Mistake("blur", f"{radius}; are these depths instead of circles of confusion? (--depth-kind)")]
 
 
-def _mistakes(
-    depth: Tensor, camera: Camera, kind: DepthKind | Literal["relative"], scale: float | None
-) -> list[Mistake]:
+def _mistakes(depth: Tensor, camera: Camera, kind: str, scale: float | None) -> list[Mistake]:
     """Likely mistakes of one map ``[1, H, W]`` and a camera of plain numbers.
 
-    1. Find the range of depth, and the smallest and largest blur radius.
-    2. Nothing in focus, or the focus far from all depth: report only that.
-    3. Otherwise check for 8-bit files, far depth, impossible blur, and an impossible focal length.
+    If nothing is in focus, or the focus is far from all depth, only that is reported.
     """
-    width, focus_m, valid = depth.shape[-1], float(camera.focus_m), depth.detach().flatten()
-    valid = valid[valid > 0]
+    width, focus_m, valid = depth.shape[-1], float(camera.focus_m), depth.detach()[depth > 0]
     if not valid.numel():
         return []
-    nearest, farthest = (float(end) for end in valid.aminmax())
-    finite = valid if farthest < math.inf or nearest == math.inf else valid[valid < math.inf]
-    near, far = nearest, float(finite.max())
-    # blur grows away from the focus: it is largest at an end of the range, smallest at the depth next to the focus
-    ends = camera.focus_range_m or (camera.focus_m, camera.focus_m)
-    in_front = torch.where(valid <= float(ends[1]), valid, nearest).max()
-    behind = torch.where(valid >= float(ends[0]), valid, farthest).min()
-    extremes = torch.stack([in_front, behind, valid.new_tensor(nearest), valid.new_tensor(farthest)])
-    blur = camera.coc_px(torch.cat([extremes, _sample(valid)]).reshape(1, 1, 1, -1), width).abs().flatten()
-    smallest, largest, blur = float(blur[:2].min()), float(blur[2:4].max()), blur[4:]
+    blur = camera.coc_px(valid.reshape(1, 1, 1, -1), width).abs()
+    smallest, largest = map(float, blur.aminmax())
+    finite = valid[valid < math.inf] if bool((valid < math.inf).any()) else valid
+    near, far = map(float, finite.aminmax())
     extent = f"({near:.4g} to {far:.4g} m)" if near < far else f"({near:.4g} m)"
     is_whole = far <= 65535 and whole_numbers(finite)
     sharp_px = max(_SHARP_PX, _SHARP_WIDTHS * width)
@@ -146,17 +129,14 @@ def _mistakes(
     is_far_off = factor is not None and not near / _FAR_OFF_RATIO <= focus_m <= far * _FAR_OFF_RATIO
     observed = "" if is_sharp else "nothing is in focus: "
     if is_within and not is_sharp and not is_too_blurred:
-        message = (
-            f"no pixel lies near the focus at {focus_m:.4g} m, all {extent}; focus on something with --focus-at X,Y"
-        )
-        return [Mistake("gap", observed + message)]
+        problem = f"no pixel lies near the focus at {focus_m:.4g} m, all {extent}"
+        return [Mistake("gap", f"{observed}{problem}; focus on something with --focus-at X,Y")]
     if (not is_sharp and not is_within) or is_far_off:
         side, hints = "nearer" if focus_m < near else "farther", []
         if kind in ("disparity", "inverse"):
-            given = "not given" if scale is None else f"now {scale:g}"
             hints.append(
                 "disparity needs its scale, the baseline in metres times the focal length in pixels (--depth-scale, "
-                f"{given}); if it is unknown, {_RELATIVE}"
+                f"{'not given' if scale is None else f'now {scale:g}'}); if it is unknown, {_RELATIVE}"
             )
         elif kind != "relative" and is_whole and far <= 255:
             hints.append(f"its whole numbers are those of a file of 8 bits; if they are relative depth, {_RELATIVE}")
@@ -182,28 +162,28 @@ def _mistakes(
         unit = _advice(0.001, scale)
         message = f"all depth is far {extent}, and nothing is blurred; is it {unit}? The focus too is in metres"
         mistakes.append(Mistake("far", message))
+    lens = f"{focal_mm:.4g} mm on a sensor of {sensor_mm:.4g} mm"
     if is_too_blurred:
-        hand = "all depth lies within a hand's breadth" if far < _NEAR_M else "the depth"
-        message = (
-            f"a blur radius of {largest:.6g} px on an image of {width} px is more than a lens makes: {hand} {extent}, "
-            f"the focus {focus_m:.4g} m, the opening {2 * float(camera.aperture_radius_m):.4g} m across "
-            f"(f/{float(camera.f_number):.2g}, {focal_mm:.4g} mm on a sensor of {sensor_mm:.4g} mm); which is in "
-            "another unit? --depth-scale, --focus-m and --aperture-radius-m make or take metres, --focal-length-mm and "
-            "--sensor-width-mm millimetres"
+        mistakes.append(
+            Mistake(
+                "blur",
+                f"a blur radius of {largest:.6g} px on an image of {width} px is more than a lens makes: the depth "
+                f"{extent}, the focus {focus_m:.4g} m, the opening {2 * float(camera.aperture_radius_m):.4g} m across "
+                f"(f/{float(camera.f_number):.2g}, {lens}); which is in another unit? --depth-scale, --focus-m and "
+                "--aperture-radius-m make or take metres, --focal-length-mm and --sensor-width-mm millimetres",
+            )
         )
-        mistakes.append(Mistake("blur", message))
     if focal_mm < _SHORTEST_WIDTHS * sensor_mm:
-        lens = f"a focal length of {focal_mm:.4g} mm on a sensor of {sensor_mm:.4g} mm is shorter than any lens's"
-        mistakes.append(Mistake("lens", f"{lens}; --focal-length-mm and --sensor-width-mm take millimetres"))
+        problem = f"a focal length of {lens} is shorter than any lens's"
+        mistakes.append(Mistake("lens", f"{problem}; --focal-length-mm and --sensor-width-mm take millimetres"))
     return mistakes
 
 
 def _advice(factor: float, scale: float | None) -> str:
     """The unit of depth that ``factor`` converts to metres, and the option that does so."""
     total = factor * (1.0 if scale is None else scale)
-    return (
-        f"{_UNITS[factor]} ({'leave --depth-scale out' if math.isclose(total, 1.0) else f'--depth-scale {total:.4g}'})"
-    )
+    remedy = "leave --depth-scale out" if math.isclose(total, 1.0) else f"--depth-scale {total:.4g}"
+    return f"{_UNITS[factor]} ({remedy})"
 
 
 def _sample(values: Tensor) -> Tensor:

@@ -1,5 +1,7 @@
 """Removing flicker from depth: a temporal filter where neither the image nor the depth moved."""
 
+import itertools
+from collections import defaultdict
 from collections.abc import Callable
 
 import torch
@@ -116,7 +118,7 @@ class SteadyFrames:
 
     def __init__(self, read: Callable[[int], tuple[Tensor, Tensor]]) -> None:
         self._read = read
-        self._filters: dict[int, Steady] = {}  # first frame -> filter
+        self._filters = defaultdict[int, Steady](Steady)  # first frame -> filter
         self._next = 0
 
     def depth(self, place: int) -> Tensor:
@@ -127,20 +129,15 @@ class SteadyFrames:
         """
         start = self._start(place)
         if self._next > place or start not in self._filters:
-            self._filters, self._next = {}, start
-        steady: Tensor | None = None
+            self._filters, self._next = defaultdict(Steady), start
         while self._next <= place:
             image, depth = self._read(self._next)
-            for first in {start, self._start(self._next + self._LEAD)}:
-                if first == self._next:
-                    self._filters[first] = Steady()
-                if first in self._filters:
-                    filtered = self._filters[first](image, depth)
-                    steady = filtered if first == start else steady
+            used = {start, self._start(self._next + self._LEAD)}
+            depths = {first: self._filters[first](image, depth) for first in used}
             self._next += 1
-        self._filters = {first: filter_ for first, filter_ in self._filters.items() if first >= start}
-        assert steady is not None  # the loop ran at least once: self._next <= place
-        return steady
+        for first in [first for first in self._filters if first < start]:
+            del self._filters[first]
+        return depths[start]
 
     def _start(self, place: int) -> int:
         """First frame of the filter that gives the depth of frame ``place``."""
@@ -162,9 +159,8 @@ def _next_memory(now: Tensor, previous: Tensor, memory: Tensor, inverse: Tensor)
     """
     level = previous.clamp(min=0).sqrt().mean((1, 2, 3), keepdim=True).clamp(min=1e-12)
     now, previous = (frame.clamp(min=0).sqrt() / level for frame in (now, previous))
-    flow = motion_between(
-        now.clamp(max=3), previous.clamp(max=3), (now - previous).abs().amax(1, keepdim=True) > _CHANGE[0]
-    )
+    is_changed = (now - previous).abs().amax(1, keepdim=True) > _CHANGE[0]
+    flow = motion_between(now.clamp(max=3), previous.clamp(max=3), is_changed)
     change = F.avg_pool2d((now - sample(previous, flow)).abs().mean(1, keepdim=True), 3, 1, 1, count_include_pad=False)
     noise = change.flatten(1).median(dim=1).values.reshape(-1, 1, 1, 1)
     is_kept = change <= (3.0 * noise).clamp(*_CHANGE)
@@ -236,14 +232,10 @@ def _block_mean(values: Tensor) -> Tensor:
 
 
 def _matched(current: Tensor, previous: Tensor, flow: Tensor, reach: int) -> Tensor:
-    """Integer flow of least cost.
+    """Integer flow of least cost, among all displacements of up to ``reach`` pixels around the best of some guesses.
 
-    1. Choose among the guess ``flow``, no motion, and the guesses of the four neighbouring blocks.
-    2. Search all displacements of up to ``reach`` pixels around the choice.
+    The guesses are ``flow``, no motion, and those of the four neighbouring blocks.
     """
-    guesses = [flow, torch.zeros_like(flow)]
-    for dim in (-2, -1):
-        guesses += [flow.roll(step, dims=dim) for step in (-_BLOCK, _BLOCK)]
     best, best_cost = flow, torch.full_like(current, torch.inf)
 
     def compare(candidate: Tensor) -> None:
@@ -252,13 +244,13 @@ def _matched(current: Tensor, previous: Tensor, flow: Tensor, reach: int) -> Ten
         is_better = cost < best_cost - 1e-4  # nearly equal costs keep the earlier one, so flat areas keep the guess
         best_cost, best = torch.where(is_better, cost, best_cost), torch.where(is_better, candidate, best)
 
-    for guess in guesses:
-        compare(guess)
+    compare(flow)
+    compare(torch.zeros_like(flow))
+    for dim, step in itertools.product((-2, -1), (-_BLOCK, _BLOCK)):
+        compare(flow.roll(step, dims=dim))
     start = best
-    for dy in range(-reach, reach + 1):
-        for dx in range(-reach, reach + 1):
-            if dx or dy:
-                compare(start + start.new_tensor([dx, dy]).reshape(1, 2, 1, 1))
+    for offset in itertools.product(range(-reach, reach + 1), repeat=2):
+        compare(start + start.new_tensor(offset[::-1]).reshape(1, 2, 1, 1))
     return best
 
 
@@ -271,9 +263,6 @@ def _to_fractions(current: Tensor, previous: Tensor, flow: Tensor) -> Tensor:
         before, after = (_block_mean((current - shifted(previous, flow + sign * offset)).square()) for sign in (-1, 1))
         bend = (before + after - 2 * middle).clamp(min=1e-6)
         gain = (before - after).square() / (8 * bend)  # the middle value minus the minimum of the parabola
-        fractions.append(
-            torch.where(gain > _SUBPIXEL_GAIN * middle.clamp(min=_NOISE), 0.5 * (before - after) / bend, 0.0).clamp(
-                -0.5, 0.5
-            )
-        )
+        fraction = (0.5 * (before - after) / bend).clamp(-0.5, 0.5)
+        fractions.append(torch.where(gain > _SUBPIXEL_GAIN * middle.clamp(min=_NOISE), fraction, 0.0))
     return flow + torch.cat(fractions, dim=1)
