@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from ..io.atomic import write_text
 from ..io.paths import IMAGE_SUFFIXES, MAP_SUFFIXES
 from ..validation import whole
-from .shards import SUFFIXES, Pair, RenderShards, samples_of, shard_rows
+from .shards import Pair, RenderShards, samples_of, shard_rows
 
 _CARD = """# Defocus data set
 
@@ -90,7 +90,7 @@ def make_dataset(
         per_shard: Samples in a shard.
         copies: Number of blurred samples of each image.
         say: Gets lines of text: the shards that exist, the throughput, the inputs that were left out.
-        **render: Further arguments of :class:`RenderShards`, such as ``format``.
+        **render: Further arguments of :class:`RenderShards`, such as ``keep``.
 
     Returns:
         Contents of the folder, also written as ``README.md``; broken inputs are listed in ``broken.txt``.
@@ -158,7 +158,7 @@ def make_dataset(
 
 def summary_of(out: str | os.PathLike[str]) -> Summary:
     """Contents of the complete shards of a folder; ``FileNotFoundError`` if the folder is missing."""
-    shards = [path for path in sorted(Path(out).iterdir()) if path.suffix in SUFFIXES.values()]
+    shards = [path for path in sorted(Path(out).iterdir()) if path.suffix == ".tar"]
     noted = [notes for shard in shards if (notes := samples_of(shard)) is not None]
     rows = [row for notes in noted for row in notes]
     broken = [(row["image"], row["error"]) for row in rows if row["error"]]
