@@ -1,4 +1,4 @@
-"""Makes a whole data set on a Ray cluster: missing shards, a list of broken inputs, and a card with its facts."""
+"""Makes a whole data set on a Ray cluster: missing shards, and a list of broken inputs."""
 
 import hashlib
 import json
@@ -12,16 +12,6 @@ from ..io.atomic import write_text
 from ..io.paths import IMAGE_SUFFIXES, MAP_SUFFIXES
 from ..validation import whole
 from .shards import Pair, RenderShards, samples_of, shard_rows
-
-_CARD = """# Defocus data set
-
-Sharp photographs, their depth in metres along the optical axis, and the same photographs as a lens with a random focus
-(even in 1 / metres) and opening (even in stops) would have taken them; each sample holds its own parameters.
-Made by torchdof.
-
-| what | how much |
-| --- | --- |
-"""
 
 
 class Summary(NamedTuple):
@@ -89,11 +79,11 @@ def make_dataset(
         workers: Processes, each on one core.
         per_shard: Samples in a shard.
         copies: Number of blurred samples of each image.
-        say: Gets lines of text: the shards that exist, the throughput, the inputs that were left out.
+        say: Gets lines of text: the shards that exist, the throughput, the contents, the inputs that were left out.
         **render: Further arguments of :class:`RenderShards`, such as ``keep``.
 
     Returns:
-        Contents of the folder, also written as ``README.md``; broken inputs are listed in ``broken.txt``.
+        Contents of the folder. All settings are written to ``plan.json``, broken inputs to ``broken.txt``.
 
     Raises:
         ValueError: If an argument is invalid, or the folder has the shards of another data set.
@@ -142,14 +132,7 @@ def make_dataset(
         seconds = time.perf_counter() - start
         say(f"{count} samples in {seconds:.1f} s: {count / seconds:.2f} images/s with {workers} workers")
     summary = summary_of(out)
-    facts = {
-        **{"samples": summary.samples, "shards": summary.shards},
-        "inputs left out": f"{len(summary.broken)}, listed in broken.txt",
-        "time": f"{summary.seconds / max(1, summary.samples):.3f} s of one core a sample",
-        **settings,
-    }
-    lines = [f"| {name} | {fact if isinstance(fact, str) else json.dumps(fact)} |\n" for name, fact in facts.items()]
-    write_text(out / "README.md", _CARD + "".join(lines))
+    say(f"{summary.samples} samples in {summary.shards} shards; {len(summary.broken)} inputs left out")
     write_text(out / "broken.txt", "".join(f"{image}\t{problem}\n" for image, problem in summary.broken))
     for image, problem in summary.broken:
         say(f"left out: {problem}" if problem.startswith(image) else f"left out: {image}: {problem}")
