@@ -1,8 +1,8 @@
 """The scripts of ``examples`` run and print or draw the right things."""
 
+import math
 import re
 import runpy
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+import torch
 import torch.nn.functional as functional
 
 from torchdof.cli.command import command_of
@@ -46,15 +47,17 @@ def test_the_sheet_of_bokeh_shows_six_lenses(tmp_path: Path, run: Run) -> None:
         assert all(float((panel - other).abs().mean()) > 2e-3 for other in panels[:k])
 
 
-@pytest.mark.parametrize("arguments", [["--row", "1"], [str(ROOT / "tests/data/scenes/planes"), "--row", "1"]])
-def test_steps_prints_the_cost_of_a_step(arguments: list[str]) -> None:  # in a process of its own, for its memory
-    call = [sys.executable, str(EXAMPLES / "benchmarks/steps.py"), "--repeat", "1", *arguments]
-    row = subprocess.run(call, capture_output=True, text=True, timeout=110, check=True).stdout
-    name = "1 of 256 x 256" if len(arguments) == 2 else "planes/0"
-    assert row[:46].strip() == f"{name}, without occlusion, 8 px"
-    picture, step, ratio, memory, of_step, operations, reads = map(float, re.findall(r"-?[\d.]+", row[46:]))
-    assert picture > 0 and step > 0 and ratio == pytest.approx(step / picture, abs=0.06)
-    assert 0 <= memory <= of_step < 1000 and operations > reads > 0
+def test_steps_prints_the_cost_of_a_step(run: Run) -> None:
+    threads = ("--threads", torch.get_num_threads())
+    names, printed = run("benchmarks/steps.py", ROOT / "tests/data/scenes/planes", "--repeat", 1, *threads)
+    _, *rows = printed.splitlines()
+    assert [row[:46].strip() for row in rows] == [f"planes/0, {name}, 8 px" for name in names["RENDERERS"]]
+    for row in rows:
+        picture, step, ratio, memory, of_step, operations, reads = map(float, re.findall(r"-?[\d.]+|nan", row[46:]))
+        assert picture > 0 and step > 0 and ratio == pytest.approx(step / picture, abs=0.06)
+        assert (memory <= of_step < 1000 or math.isnan(memory)) and operations > reads > 0
+    made = [(light.shape, near.shape) for _, light, near in names["pictures"](None, "cpu")]
+    assert made == [((n, 3, *size), (n, 1, *size)) for *size, n in names["SIZES"]["cpu"]]
 
 
 MAX_OUTLIERS = {"near": 680, "middle": 1070, "far": 390}
