@@ -66,29 +66,6 @@ def test_an_interrupted_sequence_keeps_its_complete_frames_and_resumes(
     assert {path: path.stat().st_mtime_ns for path in done} == before
 
 
-SWALLOWED = """
-import os, signal
-try:
-    os.kill(os.getpid(), signal.SIGINT)
-    sum(range(1000))
-except KeyboardInterrupt:
-    pass
-"""
-
-
-def test_ctrl_c_while_pytorch_is_imported_ends_the_command(tmp_path: Path) -> None:
-    """PyTorch imports NumPy from C++, and ignores that this failed; NumPy cannot be imported again."""
-    (tmp_path / "torch.py").write_text(SWALLOWED)
-    run = subprocess.run(
-        [sys.executable, "-m", "torchdof", "--version"],
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-        capture_output=True,
-        check=False,
-        preexec_fn=handle_interrupts,
-    )
-    assert (run.returncode, run.stderr) == (130, b"interrupted\n")
-
-
 @pytest.mark.parametrize("streams", ["<&- >&- 2>&-", "2>/dev/full"])
 def test_a_picture_is_written_where_nobody_can_be_told(scene: Path, streams: str) -> None:
     line = "-m torchdof render shot.0001.exr depth.npy -o out.exr --focus-m 2000"  # gives a warning

@@ -1,13 +1,10 @@
 """The command line; it imports a command when that is called, and reports wrong input in one sentence."""
 
-import contextlib
 import importlib
 import importlib.metadata
 import os
 import re
-import signal
 import sys
-from types import FrameType
 
 import click
 
@@ -94,16 +91,5 @@ def main() -> None:
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode))  # gets the lowest free number, the stream's own
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _interrupt)
     with exit_on_signals():
         app(prog_name="torchdof")
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raises ``KeyboardInterrupt``, but ends the process while PyTorch, which ignores it, imports NumPy from C++."""
-    if getattr(getattr(sys.modules.get("torch"), "__spec__", None), "_initializing", False):
-        with contextlib.suppress(OSError):
-            os.write(2, b"interrupted\n")
-        os._exit(130)
-    signal.default_int_handler(number, frame)
