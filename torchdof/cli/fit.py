@@ -48,7 +48,9 @@ class _Lens(Group):
     f_number: float = option("Aperture of the lens.", 2.0)
     focus_m: float = option("Focus distance in metres; inf allowed.", 2.0)
     nodes: int | None = option("Distances traced; by default as many as keep pictures to 50 dB.")
-    field_deg: float = option("Angle from the axis, degrees: 0 is the frame's centre.", 0.0)
+    field_deg: float = option(
+        "Angle from the axis, degrees: 0 is the frame's centre.", 0.0, type=click.FloatRange(0, 90, max_open=True)
+    )
     field: tuple[float, ...] | None = option(
         "One table across the field, of spots at these distances from the middle; to 21.6 for full frame.",
         metavar="0,MM,MM,...",
@@ -99,8 +101,6 @@ class Fit(_Photographs, _Target, _Lens, Command):
             raise ValueError("--root is the folder of photographs; leave it out with --lens")
         if self.out.suffix != ".json":
             raise ValueError(f"{self.out}: the table is written as JSON: name it {self.out.with_suffix('.json')}")
-        if not 0 <= self.field_deg < 90:
-            raise ValueError(f"--field-deg must be 0 to 90 degrees from the axis, got {self.field_deg:g}")
         if self.field is not None and self.field_deg:
             raise ValueError("--field-deg averages one place, --field traces several; give one of them")
         if self.target is not None:

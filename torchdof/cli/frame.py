@@ -1,7 +1,9 @@
 """Reads, renders and writes one frame for ``torchdof render``; other commands use parts of it."""
 
 import dataclasses
+import functools
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -142,8 +144,8 @@ class Renderer:
         """Reads a frame as :func:`read_frame`, with the transfer curve and layer of the options."""
         return read_frame(image, depth, self.command, transfer=self.command.transfer, layer=self.command.layer)
 
-    def render(self, frame: Frame, out: Path, number: int) -> tuple[Any, ...]:
-        """Renders a frame of a number, to be written to ``out``; returns the arguments of :meth:`write`."""
+    def render(self, frame: Frame, out: Path, number: int) -> Callable[[], None]:
+        """Renders a frame of a number; returns the function that writes it to ``out``."""
         start, picture, command = time.perf_counter(), frame.picture, self.command
         frame = dataclasses.replace(frame, values=frame.values.to(self.device))
         coc_px, camera, remarks = coc_of(frame, self.notices, number, self.is_still)
@@ -152,9 +154,6 @@ class Renderer:
             pixels = tint_focus(pixels, coc_px, picture.has_alpha)
             picture = dataclasses.replace(picture, channels=("R", "G", "B", "A")[: pixels.shape[1]])
         else:
-            attention = command.attention
-            if attention is not None:
-                attention = (attention[0] - frame.area.x, attention[1] - frame.area.y, attention[2])
             if command.lights and picture.sample in ("half", "float"):
                 raise ValueError(
                     "--lights is for photographs of 8 or 16 bits, which clip at white; this image holds "
@@ -162,11 +161,14 @@ class Renderer:
                 )
             if command.lights:
                 pixels = torch.cat([expand_highlights(pixels[:, :colours], command.lights), pixels[:, colours:]], 1)
+            x, y, *radius = command.attention or (0.0, 0.0)
+            attention = (x - frame.area.x, y - frame.area.y, *radius) if radius else None
             table = _with_alpha(self.table) if picture.has_alpha else self.table
             with torch.no_grad():
                 pixels = blur_by_coc(pixels, coc_px, table=table, attention=attention, **command.arguments())
         frame, picture = dataclasses.replace(frame, remarks=remarks), dataclasses.replace(picture, pixels=pixels)
-        return out, frame, picture, coc_px, camera, time.perf_counter() - start
+        seconds = time.perf_counter() - start
+        return functools.partial(self.write, out, frame, picture, coc_px, camera, seconds)
 
     def write(
         self, out: Path, frame: Frame, picture: Picture, coc_px: Tensor, camera: Camera | None, seconds: float
@@ -181,10 +183,9 @@ class Renderer:
             if camera is None:
                 middle = {"blur radius: near orange, far blue": coc_colours(coc_px)}
             panels = {"before": frame.picture.light, **middle, "after": picture.light}
+            panels = {name: shrunk(p.cpu(), _PANEL_PX).expand(-1, 3, -1, -1) for name, p in panels.items()}
             make_folder_of(command.sheet)
-            write_sheet(
-                command.sheet, {name: shrunk(p.cpu(), _PANEL_PX).expand(-1, 3, -1, -1) for name, p in panels.items()}
-            )
+            write_sheet(command.sheet, panels)
         (height, width), largest_px = coc_px.shape[-2:], float(coc_px.abs().max())
         if frame.guess:
             note("guess", f"{frame.name}: {frame.guess}")

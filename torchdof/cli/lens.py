@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import click
+
 from ..io.metadata import camera_settings
 from ..io.sequence import focus_at_frame, parse_focus
 from .command import Group, numbers, option
@@ -68,7 +70,9 @@ class Sensor(Group):
 
     focal_length_mm: float | None = option("Real focal length, not the 35 mm equivalent.")
     sensor_width_mm: float | None = option("36 for full frame.")
-    fov_deg: float | None = option("Horizontal field of view of a rendered image, instead of a lens.")
+    fov_deg: float | None = option(
+        "Horizontal field of view of a rendered image, instead of a lens.", type=click.FloatRange(0, 180, True, True)
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,8 +136,6 @@ class Lens(Sensor):
                 raise ValueError(f"{' and '.join(given)} {problem}; give one of them")
         if self.fov_deg is None and self.aperture_radius_m is not None:
             raise ValueError("--aperture-radius-m goes with --fov-deg; a real lens has --f-number instead")
-        if self.fov_deg is not None and not 0 < self.fov_deg < 180:
-            raise ValueError(f"--fov-deg must be a number of degrees > 0 and < 180, got {self.fov_deg:g}")
 
     @property
     def has_focus(self) -> bool:

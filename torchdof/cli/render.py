@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import importlib.metadata
-import math
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -47,16 +46,12 @@ class _Effects(Group):
         "Make lamps that a photograph clipped at white brighter by up to this many stops, such as 3.",
         0.0,
         metavar="STOPS",
+        type=click.FloatRange(min=0),
     )
     show_focus: bool = option(
         "Don't blur: show the image in grey, tinted: near orange, in focus green, far blue.", False
     )
     device: str = option("auto, cpu, cuda, cuda:1, ...", "auto")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 <= self.lights < math.inf:
-            raise ValueError(f"--lights must be a finite number of stops from 0 on, got {self.lights:g}")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -124,27 +119,31 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         is_single = images is None and len(keys) < 2
         is_animation = images is None and not is_single and not _pattern(self.out)
         has_number = FramePattern.is_padded(self.out) and not FramePattern.is_padded(self.image) and _pattern(self.out)
-        if is_animation and self.out.suffix.lower() != ".webp":
-            raise ValueError(f"{self.out}: expected one place for the frame number, such as pull.##.png, or a .webp")
-        if is_animation and self.resume:
-            raise ValueError("--resume is of frames; an animation is one file, so leave it out")
-        if self.sheet is not None and not is_single:
-            raise ValueError("--sheet is of one picture; leave it out where there are more")
-        if (images is None and (self.steady or depths)) or (is_single and (self.frames or has_number)):
-            raise ValueError(f"{self.image}: is a single image; for a sequence write it as shot.####.exr")
-        if images and self.blur_share is not None:
-            raise ValueError("--blur would open the lens anew in each frame of a sequence; give --f-number")
-        if self.steady and self.depth_kind == "coc":
-            raise ValueError("--steady filters depth in metres; --depth-kind coc has none")
+        of_sequences = (images is None and (self.steady or depths)) or (is_single and (self.frames or has_number))
+        no_number = f"{self.out}: expected one place for the frame number, such as pull.##.png, or a .webp"
+        for is_wrong, problem in (
+            (is_animation and self.out.suffix.lower() != ".webp", no_number),
+            (is_animation and self.resume, "--resume is of frames; an animation is one file, so leave it out"),
+            (self.sheet and not is_single, "--sheet is of one picture; leave it out where there are more"),
+            (of_sequences, f"{self.image}: is a single image; for a sequence write it as shot.####.exr"),
+            (
+                images and self.blur_share,
+                "--blur would open the lens anew in each frame of a sequence; give --f-number",
+            ),
+            (self.steady and self.depth_kind == "coc", "--steady filters depth in metres; --depth-kind coc has none"),
+        ):
+            if is_wrong:
+                raise ValueError(problem)
 
         def sources(n: int) -> tuple[Path, Path | None]:
             return images.name(n) if images else self.image, depths.name(n) if depths else self.depth
 
-        if self.frames is not None or images is None:
-            first, last = (0, 0) if is_single else self.frames or (keys[0][0], keys[-1][0])
-            numbers: Sequence[int] = range(first, last + 1)
-        else:
+        numbers: Sequence[int] = [0]
+        if images and not self.frames:
             numbers = images.frames()
+        elif not is_single:
+            first, last = self.frames or (keys[0][0], keys[-1][0])
+            numbers = range(first, last + 1)
         if not numbers:
             raise FileNotFoundError(f"{self.image}: there are no such files")
         target = None if is_single or is_animation else FramePattern(self.out)
@@ -229,15 +228,12 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
                     frame = reading.result()
                     if k + 1 < len(numbers):
                         reading = reader.submit(read, numbers[k + 1])
-                    rendered = renderer.render(frame, files[n], n)
+                    write = renderer.render(frame, files[n], n)
                     written.result()
-                    if k == 0 and record is not None:
+                    if record is not None:
                         make_folder_of(files[n])
-                        record.write()
-                    elif record is not None and record.path.is_file() and (reason := record.difference()):
-                        problem = f"another run renders the same frames with other options ({reason})"
-                        raise ValueError(f"{record.path}: {problem}")
-                    written = writer.submit(renderer.write, *rendered)  # Ctrl-C does not stop this thread
+                        record.write(is_first=k == 0)
+                    written = writer.submit(write)  # Ctrl-C does not stop this thread
             finally:  # a rendered frame is written even if the next one fails
                 written.result()
 

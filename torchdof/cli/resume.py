@@ -43,7 +43,11 @@ class Record:
         existing = ((n, out) for n, out in frames.items() if out.is_file())
         return {out for n, out in existing if changed_ns(out) >= newest[n] and is_complete(out)}
 
-    def write(self) -> None:
-        """Writes the options, if they differ from those of the last run."""
-        if self.difference():
+    def write(self, is_first: bool) -> None:
+        """Before the first frame, writes the options if they differ; later refuses those of another run."""
+        reason = self.difference() if is_first or self.path.is_file() else ""
+        if reason and not is_first:
+            problem = f"another run renders the same frames with other options ({reason})"
+            raise ValueError(f"{self.path}: {problem}")
+        if reason:
             write_text(self.path, json.dumps(self._options, indent=1))
