@@ -125,8 +125,7 @@ def test_a_lens_is_traced_in_its_colours_and_across_its_field(
     assert BlurTable.load(file).channels == 3
     output = run("fit", *options, "--field", "0,6,12")
     assert "across the field: [0.0, 6.0, 12.0] mm" in output
-    drawn = run("tables", file, "-o", tmp_path / "table.png")
-    assert "distances to 12" in drawn and (tmp_path / "table.png").is_file()
+    assert "distances to 12" in run("tables", file)
     field = BlurTable.load(file).field
     assert field is not None and field.radius.tolist() == [0.0, 6.0, 12.0]
     assert 1.02 * field.box[0, 0, 1] < field.box[0, 2, 1]  # a single lens blurs more off its axis

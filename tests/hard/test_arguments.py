@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field
-from torchdof.cli.command import command_of
+from torchdof.cli.command import Parsed, command_of
 from torchdof.cli.render import Render
 from torchdof.depth.holes import fill_holes
 from torchdof.depth.inspect import tint_focus
 from torchdof.depth.kinds import depth_from_values
 from torchdof.io.metadata import camera_settings
-from torchdof.io.sequence import FramePattern, focus_at_frame, parse_focus, parse_frames
+from torchdof.io.sequence import FramePattern, focus_at_frame
 from torchdof.optics import psf
 
 pytestmark = pytest.mark.hard
@@ -174,8 +174,7 @@ def test_any_argument_gives_a_result_or_a_named_error(name: str, data: st.DataOb
 @FEW
 @given(st.text(max_size=12) | st.from_regex(r"[-0-9:.,einfa ]{0,12}", fullmatch=True))
 def test_any_text_is_parsed_or_gives_a_named_error(text: str) -> None:
-    for read in (parse_frames, parse_focus, FramePattern):
-        check_error(functools.partial(read, text))
+    check_error(functools.partial(FramePattern, text))
     for option in command_of("render", Render).params:
-        if option.callback is not None:
-            check_error(functools.partial(option.callback, None, option, text))  # type: ignore[arg-type]
+        if isinstance(option.type, Parsed):
+            check_error(functools.partial(option.type.convert, text, option, None))

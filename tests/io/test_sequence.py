@@ -49,7 +49,7 @@ FRAMES = ["", "a", "1-", "5-1", "1,2", "1.5"]
 
 @pytest.mark.parametrize(("read", "text"), [*((parse_focus, t) for t in FOCUS), *((parse_frames, t) for t in FRAMES)])
 def test_invalid_ranges_and_keyframes_are_refused(read: Callable[[str], object], text: str) -> None:
-    with pytest.raises(ValueError, match=r"--frames|--focus-m expects metres \(2.0\) or keyframes"):
+    with pytest.raises(ValueError):
         read(text)
 
 

@@ -7,6 +7,7 @@ A command inherits groups of options, which several commands can share; the docs
 import dataclasses
 import inspect
 import re
+import reprlib
 import typing
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Literal
@@ -29,15 +30,7 @@ class Group:
 
 
 def option(
-    help: str,
-    default: Any = None,
-    *,
-    names: tuple[str, ...] = (),
-    read: Callable[[str], Any] | None = None,
-    expected: str = "",
-    group: str = "",
-    basic: bool = False,
-    **details: Any,
+    help: str, default: Any = None, *, names: tuple[str, ...] = (), group: str = "", basic: bool = False, **details: Any
 ) -> Any:
     """Declares a dataclass field as an option of :class:`click.Option`, whose type is that of the field.
 
@@ -45,17 +38,12 @@ def option(
         help: Text in ``--help``.
         default: Default value; ``...`` makes the option required.
         names: Spellings on the command line; empty uses the field's name with dashes.
-        read: Converts the text to the value, or raises ``ValueError``.
-        expected: What ``read`` takes, for the message of an error; empty keeps the message of ``read``.
         group: Heading in ``--help``; empty uses the docstring of the field's class.
         basic: Whether ``--help`` lists the option before the groups.
         **details: Further arguments of the option.
     """
-    metadata = {"names": names, "read": read, "expected": expected, "group": _BASIC_HEADING if basic else group}
-    required = default is ...
-    return dataclasses.field(
-        **({} if required else {"default": default}), metadata={**metadata, "details": {"help": help, **details}}
-    )
+    metadata = {"names": names, "group": _BASIC_HEADING if basic else group, "details": {"help": help, **details}}
+    return dataclasses.field(**({} if default is ... else {"default": default}), metadata=metadata)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -70,9 +58,29 @@ def argument(help: str, metavar: str, default: Any = ...) -> Any:
     return option(help, default, metavar=metavar, names=("argument",))
 
 
-def numbers(text: str) -> tuple[float, ...]:
-    """Reads numbers separated by commas."""
-    return tuple(map(float, text.split(",")))
+class Parsed(click.ParamType):
+    """The type of an option whose text ``parse`` reads; its ``ValueError`` becomes a message with what is expected."""
+
+    name = "text"
+
+    def __init__(self, expected: str, parse: Callable[[str], Any]) -> None:
+        self.expected, self.parse = expected, parse
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Click's conversion of a text."""
+        try:
+            return self.parse(value)
+        except ValueError:
+            option_name = param.opts[0] if param else self.name
+            raise ValueError(f"{option_name} expects {self.expected}, got {reprlib.repr(value)}") from None
+
+
+def numbers(text: str, count: int | None = None) -> tuple[float, ...]:
+    """Reads ``count`` numbers (None: any count) separated by commas."""
+    values = tuple(map(float, text.split(",")))
+    if count not in (None, len(values)):
+        raise ValueError
+    return values
 
 
 def number_or(*words: str) -> Callable[[str], float | str]:
@@ -127,20 +135,15 @@ def _parameters(kind: type[Any]) -> Iterator[click.Parameter]:
 
 
 def _parameter(field: Any, hint: Any) -> click.Parameter:
-    """Argument or option for a field of type ``hint``; a tuple without a ``read`` of its own takes several values."""
-    names, read, required = field.metadata["names"], field.metadata["read"], field.default is dataclasses.MISSING
-    if type(None) in typing.get_args(hint):
+    """Argument or option for a field of type ``hint``; a tuple that is not :class:`Parsed` takes several values."""
+    given, names, required = field.metadata["details"], field.metadata["names"], field.default is dataclasses.MISSING
+    takes_several = typing.get_origin(hint) is tuple and not isinstance(given.get("type"), Parsed)
+    if typing.get_args(hint) and typing.get_origin(hint) is not Literal:  # X | None, tuple[X, ...]
         hint = typing.get_args(hint)[0]
-    parts, is_tuple = typing.get_args(hint), typing.get_origin(hint) is tuple
-    details = {"required": required, "type": parts[0] if is_tuple else hint}
-    if read is not None:
-        details |= {"type": str, "callback": _callback(read, field.metadata["expected"], is_tuple and parts)}
-    elif typing.get_origin(hint) is Literal:
-        details["type"] = click.Choice(parts)
+    kind = click.Choice(typing.get_args(hint)) if typing.get_origin(hint) is Literal else hint
+    details = {"type": kind, "required": required, **given}
     if not required and field.default not in (None, ()):
         details["default"] = field.default
-    details |= field.metadata["details"]
-    takes_several = is_tuple and read is None
     if names == ("argument",):
         return click.Argument([field.name], nargs=-1 if takes_several else 1, **details)
     if hint is bool:
@@ -148,22 +151,3 @@ def _parameter(field: Any, hint: Any) -> click.Parameter:
     else:
         details |= {"multiple": takes_several, "show_default": bool(field.default) and not required}
     return click.Option([field.name, *(names or [f"--{field.name.replace('_', '-')}"])], **details)
-
-
-def _callback(read: Callable[[str], Any], expected: str, parts: Any) -> Callable[..., Any]:
-    """Click's callback that reads the text of an option, whose value has as many ``parts`` as its type."""
-
-    def value_of(_: click.Context, option: click.Parameter, text: str | None) -> Any:
-        if text is None:
-            return None
-        try:
-            value = read(text)
-            if parts and ... not in parts and len(value) != len(parts):
-                raise ValueError
-            return value
-        except ValueError:
-            if not expected:
-                raise
-            raise ValueError(f"{option.opts[0]} expects {expected}, got {text!r}") from None
-
-    return value_of

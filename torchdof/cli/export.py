@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..io.atomic import check_writable
-from .command import Command, Group, option
+from .command import Command, Group, Parsed, option
 from .lens import Sensor
 from .options import Accuracy, Blur
 from .output import print_result, progress_bar
@@ -35,8 +35,7 @@ class _Graph(Group):
     size: tuple[int, int] | None = option(
         "Width and height of the only frame, for --layout whole and runtimes that need fixed sizes.",
         metavar="WxH",
-        read=_size,
-        expected="a width and a height in pixels, such as 1920x1080",
+        type=Parsed("a width and a height in pixels, such as 1920x1080", _size),
     )
     opset: int = option("ONNX operator set.", 20)
 

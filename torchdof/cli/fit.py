@@ -9,7 +9,7 @@ from typing import Literal
 
 import click
 
-from torchdof.cli.command import Command, Group, argument, numbers, option
+from torchdof.cli.command import Command, Group, Parsed, argument, numbers, option
 from torchdof.cli.options import make_folder_of
 from torchdof.io.atomic import check_writable
 
@@ -31,11 +31,12 @@ class _Photographs(Group):
         "Kernel family; auto takes the cheapest that is accurate enough, image any shape.", "auto", basic=True
     )
     accuracy_db: float = option("PSNR on a natural image that auto asks for.", 45.0)
-    dots: Literal["manifest", "one", "centre", "each", "field"] = option(
-        "One dot; the centre of a grid; each dot of it, a table a place; or one table across the field.", "manifest"
+    dots: Literal["one", "centre", "each", "field"] | None = option(
+        "One dot; the centre of a grid; each dot of it, a table a place; or one table across the field. Default: as "
+        "capture.toml says."
     )
-    colours: Literal["manifest", "mean", "each"] = option(
-        "Fit the mean of the colours, or each: a table with a kernel a colour.", "manifest"
+    colours: Literal["mean", "each"] | None = option(
+        "Fit the mean of the colours, or each: a table with a kernel a colour. Default: as capture.toml, or mean."
     )
     root: Path | None = option("Folder that capture.toml and all pictures must lie in. Default: anywhere.")
 
@@ -54,13 +55,11 @@ class _Lens(Group):
     field: tuple[float, ...] | None = option(
         "One table across the field, of spots at these distances from the middle; to 21.6 for full frame.",
         metavar="0,MM,MM,...",
-        read=numbers,
-        expected="distances in mm from the middle of the frame, rising from 0, like 0,7,14,21.6",
+        type=Parsed("distances in mm from the middle of the frame, rising from 0, like 0,7,14,21.6", numbers),
     )
     wavelengths: tuple[float, ...] | None = option(
         "One table a colour: rgb, or micrometres like 0.65,0.55,0.45; for lenses with Abbe numbers.",
-        read=lambda text: () if text == "rgb" else numbers(text),  # () stands for red, green and blue
-        expected="rgb, or micrometres like 0.65,0.55,0.45",
+        type=Parsed("rgb, or micrometres like 0.65,0.55,0.45", lambda text: () if text == "rgb" else numbers(text)),
     )
 
 

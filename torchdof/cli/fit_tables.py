@@ -69,11 +69,9 @@ def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[w
     ``caught`` is the list in which Python collects warnings.
     """
     photographs, printed, fitted = None, set[str](), list[tuple[Captures, TableFit]]()
-    dots: Any = None if command.dots == "manifest" else command.dots
-    colours: Any = None if command.colours == "manifest" else command.colours
     if folder.is_dir() and not (folder / MANIFEST).is_file():
-        mode: Any = colours or "mean"
-        photographs = read_photographs(folder, square_mm=command.square_mm, colours=mode, root=command.root)
+        colours = command.colours or "mean"
+        photographs = read_photographs(folder, square_mm=command.square_mm, colours=colours, root=command.root)
         capture_sets = [photographs.captures]
         sharp, pictures = photographs.captures.notes["sharp"], photographs.pictures
         columns = {
@@ -88,10 +86,8 @@ def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[w
         for sentence in photographs.advice:
             console.print(f"better: {sentence}", style="cyan")
     else:
-        capture_sets = read_captures(str(folder), dots=dots, colours=colours, root=command.root)
+        capture_sets = read_captures(str(folder), dots=command.dots, colours=command.colours, root=command.root)
     across_field = photographs is None and capture_sets[0].notes["dots"] == "field"
-    of_fit = ("params", "stderr", "residual", "residual_over_noise", "magnification")
-    of_colour = ("name", "focus_shift_dioptres", "lateral_px")
     of_reading = len(caught)
     for i, captures in enumerate(capture_sets):
         out = command.out
@@ -116,21 +112,7 @@ def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[w
         printed.update(messages)
         if not across_field:
             _write(console, result.table, out)
-        facts: dict[str, Any] = {
-            **{"out": str(out), "name": captures.name, "family": result.fits[0].family},
-            **{"why": result.why, "scale": result.scale, "focus_m": captures.focus_m},
-            "fits": [
-                {"distance_m": pair.distance_m, "coc_px": coc, **{name: getattr(fit, name) for name in of_fit}}
-                for pair, fit, coc in zip(captures, result.fits, result.coc_px, strict=True)
-            ],
-            "colours": [
-                {**{name: getattr(c, name) for name in of_colour}, "radius_px": [fit.radius for fit in c.fits]}
-                for c in result.colours
-            ],
-            "warnings": messages,
-        }
         if photographs is not None:
-            facts["advice"] = list(photographs.advice)
             try:
                 from torchdof.fit.plots import sheet_of_photographs
 
@@ -148,9 +130,28 @@ def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[w
                 _save(console, picture_of_fit(fit), picture)
             _save(console, picture_of_table(result.table), command.plots / f"{out.stem}_table.png")
         if command.as_json:
-            print(json_line(facts), flush=True)
+            facts = {"out": str(out), **_facts(captures, result), "warnings": messages}
+            print(json_line(facts | ({"advice": photographs.advice} if photographs else {})), flush=True)
     if across_field:
         _write(console, table_of_dots(fitted), command.out)
+
+
+def _facts(captures: Captures, result: TableFit) -> dict[str, Any]:
+    """The numbers that :func:`_print_fit` prints."""
+    of_fit = ("params", "stderr", "residual", "residual_over_noise", "magnification")
+    of_colour = ("name", "focus_shift_dioptres", "lateral_px")
+    return {
+        **{"name": captures.name, "family": result.fits[0].family, "why": result.why, "scale": result.scale},
+        "focus_m": captures.focus_m,
+        "fits": [
+            {"distance_m": pair.distance_m, "coc_px": coc, **{name: getattr(fit, name) for name in of_fit}}
+            for pair, fit, coc in zip(captures, result.fits, result.coc_px, strict=True)
+        ],
+        "colours": [
+            {**{name: getattr(c, name) for name in of_colour}, "radius_px": [fit.radius for fit in c.fits]}
+            for c in result.colours
+        ],
+    }
 
 
 def _print_fit(console: Console, captures: Captures, result: TableFit) -> None:

@@ -10,7 +10,7 @@ import click
 
 from ..io.metadata import camera_settings
 from ..io.sequence import focus_at_frame, parse_focus
-from .command import Group, numbers, option
+from .command import Group, Parsed, numbers, option
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -82,21 +82,19 @@ class Lens(Sensor):
     focus_m: list[tuple[int, float]] | None = option(
         "Distance in focus (inf allowed), or keyframes frame:metres such as 1:2.0,48:5.5, linear in 1/distance.",
         metavar="METRES",
-        read=parse_focus,
+        type=Parsed("metres (2.0) or keyframes frame:metres (1:2.0,48:5.5), all positive", parse_focus),
         basic=True,
     )
     focus_at: tuple[float, float] | None = option(
         "Focus on the surface at this pixel from the top left; by default as the file states, else on the subject.",
         metavar="X,Y",
-        read=numbers,
-        expected="a pixel X,Y such as 320,200",
+        type=Parsed("a pixel X,Y such as 320,200", lambda text: numbers(text, 2)),
         basic=True,
     )
     focus_range: tuple[float, float] | None = option(
         "In focus from NEAR to FAR metres, blurred beyond; instead of --focus-m.",
         metavar="NEAR,FAR",
-        read=numbers,
-        expected="two numbers such as 1.5,2.2",
+        type=Parsed("two numbers such as 1.5,2.2", lambda text: numbers(text, 2)),
     )
     tilt: float = option("Degrees by which the lens is tilted down: focus comes nearer towards the bottom.", 0.0)
     swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)
@@ -105,15 +103,16 @@ class Lens(Sensor):
         "Open the lens until the largest blur radius is this share of the width, such as 2%; instead of --f-number.",
         names=("--blur",),
         metavar="SHARE%",
-        read=_width_fraction,
-        expected="a share of the picture's width, above 0 and at most 50 %, such as 2%",
+        type=Parsed("a share of the picture's width, above 0 and at most 50 %, such as 2%", _width_fraction),
         basic=True,
     )
     equivalent: tuple[float, float] | None = option(
         "Full-frame lens that the picture is taken to be from, such as 85mm,1.4.",
         metavar="MM,F",
-        read=lambda text: numbers(re.sub(r"\s*(mm)?\s*[, ]\s*(f/?)?", ",", text, count=1)),
-        expected="a focal length and an f-number such as 85mm,1.4",
+        type=Parsed(
+            "a focal length and an f-number such as 85mm,1.4",
+            lambda text: numbers(re.sub(r"\s*(mm)?\s*[, ]\s*(f/?)?", ",", text, count=1), 2),
+        ),
         basic=True,
     )
     aperture_radius_m: float | None = option("Radius of the opening, with --fov-deg.")

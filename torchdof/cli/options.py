@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ..io.atomic import check_writable
 from ..io.paths import existing_image, existing_map, samples_of
-from .command import Group, number_or, numbers, option
+from .command import Group, Parsed, number_or, numbers, option
 from .lens import Lens
 
 if TYPE_CHECKING:
@@ -43,15 +43,13 @@ class DepthMap(Group):
     value_range: tuple[float, float] | None = option(
         "Smallest and largest value of relative depth; default: those of each frame.",
         metavar="LOW,HIGH",
-        read=numbers,
-        expected="two numbers such as 0,255",
+        type=Parsed("two numbers such as 0,255", lambda text: numbers(text, 2)),
     )
     depth_unknown: float | None = option("A value that means 'not measured', such as 0, -1 or inf.")
     fill_depth: float | str | None = option(
         "Fill pixels without depth from the nearest one, from the farthest around, or with a distance (inf for a sky).",
         metavar="nearest|far|METRES",
-        read=number_or("nearest", "far"),
-        expected="nearest, far or metres",
+        type=Parsed("nearest, far or metres", number_or("nearest", "far")),
     )
     depth_channel: str | None = option("Channel (or array of an .npz) that is depth.")
     strict: bool = option("Refuse what looks like a wrong unit or scale, instead of warning.", False)
@@ -174,8 +172,7 @@ class Accuracy(Group):
         "Accepted RMS error on display, of 1: draft (8/255), preview (4/255), final (1/255) or a number; 0 is exact.",
         "final",
         metavar="NAME|NUMBER",
-        read=number_or("draft", "preview", "final"),
-        expected="draft, preview, final or a number",
+        type=Parsed("draft, preview, final or a number", number_or("draft", "preview", "final")),
         basic=True,
     )
     no_occlusion: bool = option("One pass that ignores occlusion.", False)

@@ -14,7 +14,7 @@ import click
 from ..io.atomic import check_writable
 from ..io.sequence import FramePattern, parse_frames
 from ..io.webp import write_animation
-from .command import Command, Group, argument, numbers, option
+from .command import Command, Group, Parsed, argument, numbers, option
 from .options import Accuracy, Blur, Scene, check_files, make_folder_of
 from .output import json_line, progress_bar
 from .resume import Record
@@ -39,8 +39,7 @@ class _Effects(Group):
     attention: tuple[float, float, float] | None = option(
         "Where the viewer looks, in pixels from the top left: elsewhere a draft's tolerance is enough.",
         metavar="X,Y,RADIUS",
-        read=numbers,
-        expected="X,Y,RADIUS in pixels such as 320,200,80",
+        type=Parsed("X,Y,RADIUS in pixels such as 320,200,80", lambda text: numbers(text, 3)),
     )
     lights: float = option(
         "Make lamps that a photograph clipped at white brighter by up to this many stops, such as 3.",
@@ -63,7 +62,9 @@ class _Files(Group):
     bits: Literal["8", "16", "half", "float"] | None = option("What OUT stores. Default: as IMAGE, where the type can.")
     layer: str | None = option("Layer or part of an EXR that is the image.")
     sheet: Path | None = option("Also write the image, its depth and the result side by side to this file.")
-    frames: tuple[int, int] | None = option("Part of a sequence.", metavar="FIRST-LAST", read=parse_frames)
+    frames: tuple[int, int] | None = option(
+        "Part of a sequence.", metavar="FIRST-LAST", type=Parsed("first-last, such as 1-48", parse_frames)
+    )
     steady: bool = option("Filter depth of a sequence along time, where neither image nor depth moved.", False)
     resume: bool = option("Render only frames that are missing, cut short, or older than files or options.", False)
 

@@ -2,7 +2,6 @@
 
 import math
 import re
-import reprlib
 from pathlib import Path
 
 __all__ = ["FramePattern", "focus_at_frame", "parse_focus", "parse_frames"]
@@ -47,27 +46,22 @@ class FramePattern:
 
 
 def parse_frames(text: str) -> tuple[int, int]:
-    """Reads ``first-last`` or a single number."""
+    """Reads ``first-last`` or a single number; ``ValueError`` if it is neither."""
     match = re.fullmatch(r"\s*(\d{1,18})(?:\s*-\s*(\d{1,18}))?\s*", text)
     if match is None or int(match[2] or match[1]) < int(match[1]):
-        raise ValueError(f"--frames expects first-last, such as 1-48, got {reprlib.repr(text)}")
+        raise ValueError(text)
     return int(match[1]), int(match[2] or match[1])
 
 
 def parse_focus(text: str) -> list[tuple[int, float]]:
     """Reads a focus distance in metres, ``2.0``, as one keyframe, or keyframes ``frame:metres``, sorted by frame."""
     keys: dict[int, float] = {}
-    try:
-        for part in text.split(","):
-            frame, colon, metres = part.partition(":")
-            key, distance = (int(frame), float(metres)) if colon else (0, float(part))
-            if not distance > 0 or key in keys or (not colon and "," in text):
-                raise ValueError
-            keys[key] = distance
-    except ValueError:
-        raise ValueError(
-            f"--focus-m expects metres (2.0) or keyframes frame:metres (1:2.0,48:5.5), all positive, got {text!r}"
-        ) from None
+    for part in text.split(","):
+        frame, colon, metres = part.partition(":")
+        key, distance = (int(frame), float(metres)) if colon else (0, float(part))
+        if not distance > 0 or key in keys or (not colon and "," in text):
+            raise ValueError(text)
+        keys[key] = distance
     return sorted(keys.items())
 
 
