@@ -314,7 +314,7 @@ test_a_wrong_argument_is_refused_in_one_sentence = refuses(
     *((module(depth_edges=value), "must be one of auto, repair, as given, got") for value in ("Auto", None, True)),
     (module(method="scatter"), "^method must be one of layered, fold, got 'scatter'"),
     (module(normalize=False), "^normalize=False is the plain sum of occlusion=False"),
-    *((module(max_coc_px=value), "^max_coc_px must be a radius above 0.5 pixels") for value in (0.5, math.inf)),
+    *((module(max_coc_px=value), "^max_coc_px must be a number of pixels > 0.5") for value in (0.5, math.inf)),
     (lambda: blur_by_coc(IMAGE, COC[0, 0]), r"coc_px must be \[1, 1, 4, 5\].* in pixels"),
     (lambda: blur_by_coc(IMAGE[:, :1], COC, table=TABLES["colours"]), "the table blurs 3 channels, the image has 1"),
     (called(plan=3), r"plan must be a Plan from.* got "),

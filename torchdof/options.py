@@ -6,7 +6,7 @@ from typing import Any, Literal, TypedDict, TypeVar, get_args
 
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera
-from .validation import choice, fields, show, tolerance_of
+from .validation import choice, fields, number, show, tolerance_of
 
 __all__ = [
     "OPTION_NAMES",
@@ -27,7 +27,6 @@ Tolerance = float | Literal["draft", "preview", "final"]
 """RMS difference, display-encoded, from the same rendering with exact kernels, dense layers and full resolution."""
 
 _DISC = BlurTable.disc()  # shared, because a table caches its hash
-_NEWER_NUMBERS = ("focus_range_m", "tilt_deg", "swing_deg")  # missing in states of older versions
 _Decorated = TypeVar("_Decorated")
 
 
@@ -83,9 +82,7 @@ class Options:
         choice("depth_edges", self.depth_edges, get_args(DepthEdges))
         if self.occlusion and not self.normalize:
             raise ValueError("normalize=False is the plain sum of occlusion=False; set occlusion=False as well")
-        radius = self.max_coc_px
-        if isinstance(radius, bool) or not isinstance(radius, int | float) or not 0.5 < radius < 1e300:
-            raise ValueError(f"max_coc_px must be a radius above 0.5 pixels, got {show(radius)}")
+        number("max_coc_px", self.max_coc_px, 0.5, 1e300, "pixels")
 
     def arguments(self) -> dict[str, Any]:
         """These options as keyword arguments of :class:`torchdof.DepthOfField` or :func:`torchdof.blur_by_coc`."""
@@ -128,8 +125,7 @@ def read_state(state: Any) -> tuple[Camera, Options]:
     """Camera and options (with the table) from the state of a module; ``ValueError`` names a wrong field."""
     part = "the state of a DepthOfField"
     given = fields(part, state, ("camera", *OPTION_NAMES))
-    required = [name for name in Camera.__dataclass_fields__ if name not in _NEWER_NUMBERS]
-    numbers = fields("camera of the state", given.pop("camera"), required, _NEWER_NUMBERS)
+    numbers = fields("camera of the state", given.pop("camera"), Camera.__dataclass_fields__)
     try:
         part = "camera of the state"
         camera = Camera(**numbers)
