@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import itertools
 import mmap
 import os
 import re
@@ -82,18 +83,16 @@ def _parts(name: str) -> Iterator[Part]:
     source = oiio.ImageInput.open(name, config)
     if source is None:
         raise OSError(f"cannot be read ({first_line(oiio.geterror())})")
-    specs: list[Any] = []
-    is_exr, total_bytes = source.format_name() == "openexr", 0
+    is_exr = source.format_name() == "openexr"
     try:
-        while (is_exr or not specs) and source.seek_subimage(len(specs), 0):
-            specs.append(spec := source.spec())
-            pixel_bytes = spec.nchannels * (spec.format.size() + 4)
-            total_bytes += _check_size(spec.width, spec.height, pixel_bytes, total_bytes)
+        for number in itertools.count() if is_exr else (0,):
+            if not source.seek_subimage(number, 0):
+                return
+            spec = source.spec()
+            _check_size(spec.width, spec.height, spec.nchannels * (spec.format.size() + 4))
             if spec.deep:
                 raise ValueError("holds deep samples; flatten it to one sample a pixel first")
             _check_colours(spec)
-        for number, spec in enumerate(specs):
-            source.seek_subimage(number, 0)
             values = source.read_image(spec.format)
             problem = source.geterror()
             if values is None or problem:
@@ -222,15 +221,15 @@ def read_array(path: Path, key: str | None) -> np.ndarray:
     return np.asarray(array)
 
 
-def _check_size(width: int, height: int, pixel_bytes: int, others: int = 0) -> int:
-    """Bytes needed to decode a picture; refuses it if they and those of ``others`` exceed the free memory."""
+def _check_size(width: int, height: int, pixel_bytes: int) -> None:
+    """Refuses a picture with too many pixels, or for which there is too little memory."""
+    claim = f"its header claims {width} x {height} pixels"
     if width < 1 or height < 1 or width * height > MAX_PIXELS:
-        raise ValueError(f"its header claims {width} x {height} pixels; between 1 and {MAX_PIXELS} are read")
+        raise ValueError(f"{claim}; between 1 and {MAX_PIXELS} are read")
     needed, free = width * height * pixel_bytes, free_bytes()
-    if needed + others > free:
-        gib = f"{(needed + others) / 2**30:.3g} GiB; {max(0.0, free) / 2**30:.3g} GiB of memory are free"
-        raise ValueError(f"its header claims {width} x {height} pixels, which take {gib}")
-    return needed
+    if needed > free:
+        gib = f"{needed / 2**30:.3g} GiB; {max(0.0, free) / 2**30:.3g} GiB of memory are free"
+        raise ValueError(f"{claim}, which take {gib}")
 
 
 def first_line(text: str) -> str:

@@ -200,7 +200,7 @@ def write_image(
     if names[0] == "Y" and suffix not in _GREY_SUFFIXES:
         pixels, names = pixels.expand(-1, 3, -1, -1), ("R", "G", "B")
     straight = names[-1] == "A" and suffix != ".exr"
-    if sample == "8" and (straight or names[-1] != "A"):
+    if sample == "8":
         array = encode_8_bits(pixels, transfer, straight)
     else:
         array = np.empty((*pixels.shape[2:], len(names)), np.float32)
