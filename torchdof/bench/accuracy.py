@@ -54,10 +54,9 @@ def read_peer(path: Path) -> tuple[str, Renderer]:
 
 
 def compare(truth: Path, out: Path, views: Sequence[int], degraded: bool, peers: Sequence[Path]) -> None:
-    """Scores every renderer on every scene of a folder; prints and writes tables and a picture of the worst regions.
+    """Scores every renderer, and the reference with each number of ``views``, on every scene of a folder.
 
-    The reference renderer is compared with each number of ``views``. With ``degraded`` every kind of degraded depth is
-    used instead of the exact depth, and no picture is written.
+    Writes tables and a picture of the worst regions, or with ``degraded`` depth of every kind only tables.
     """
     by_name = renderers(degraded) | dict(map(read_peer, peers))
     for count in sorted({*views}):

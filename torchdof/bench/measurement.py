@@ -84,10 +84,7 @@ class BenchScene:
 
 
 def measure(blur: Renderer, scene: BenchScene, again: bool = True) -> tuple[Tensor, dict[str, float]]:
-    """The picture of a scene by a new camera, and a row as in :data:`torchdof.bench.report.LEGEND`.
-
-    With ``again`` it is rendered twice. A convolution beside it makes times comparable between machines.
-    """
+    """The picture of a scene by a new camera, and a row as in :data:`torchdof.bench.report.LEGEND`."""
     frame = torch.ones(1, 16, 540, 960).contiguous(memory_format=torch.channels_last)
     beside = functools.partial(functional.conv2d, frame, torch.ones(16, 1, 17, 17), padding=8, groups=16)
     time.sleep(0.02)  # PyTorch's threads spin for a while after each operation

@@ -33,8 +33,7 @@ def works(
 ) -> Iterator[tuple[dict[str, Any], Renderer, BenchScene, bool]]:
     """The measurements: first columns of the row, renderer, scene by a camera, and whether to measure its error.
 
-    Errors are measured with the scene's own camera, times with ``repeat`` other cameras, different ones for each
-    setting. ``scan`` adds other radii and frame sizes.
+    That is of the scene's own camera; times are of ``repeat`` others. ``scan`` adds other radii and frame sizes.
     """
     blur = functools.partial(blur_by_coc, table=scene.table, occlusion=occlusion)
     small = scene.resized(min(1.0, _FOLD_PX / scene.image.shape[-1]))

@@ -34,13 +34,8 @@ def option(
 ) -> Any:
     """Declares a dataclass field as an option of :class:`click.Option`, whose type is that of the field.
 
-    Args:
-        help: Text in ``--help``.
-        default: Default value; ``...`` makes the option required.
-        names: Spellings on the command line; empty uses the field's name with dashes.
-        group: Heading in ``--help``; empty uses the docstring of the field's class.
-        basic: Whether ``--help`` lists the option before the groups.
-        **details: Further arguments of the option.
+    ``default=...`` makes it required. Without ``names`` it is spelled like the field, with dashes. ``group`` is its
+    heading in ``--help``, by default the docstring of the class; ``basic`` options are listed before the groups.
     """
     metadata = {"names": names, "group": _BASIC_HEADING if basic else group, "details": {"help": help, **details}}
     return dataclasses.field(**({} if default is ... else {"default": default}), metadata=metadata)

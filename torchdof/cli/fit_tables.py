@@ -64,10 +64,7 @@ def trace_lens(command: Fit, source: str, console: Console) -> None:
 
 
 def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[warnings.WarningMessage]) -> None:
-    """Fits photographs of the target, or the dots of a manifest, prints the fits, and writes their tables.
-
-    ``caught`` is the list in which Python collects warnings.
-    """
+    """Fits photographs of the target, or the dots of a manifest; ``caught`` is the list of Python's warnings."""
     photographs, printed, fitted = None, set[str](), list[tuple[Captures, TableFit]]()
     if folder.is_dir() and not (folder / MANIFEST).is_file():
         colours = command.colours or "mean"

@@ -60,10 +60,7 @@ class Frame:
 
 
 def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = False, **encoding: Any) -> Frame:
-    """Reads an image, with arguments of ``read_image``, and its depth, which may be a channel of it.
-
-    Holes are filled as the options state, else stay NaN if ``holes`` is true, else are filled as a guess proposes.
-    """
+    """Reads an image, with arguments of ``read_image``, and its depth; ``holes`` that no option fills stay NaN."""
     source, guess, picture, fill = depth or image, "", read_image(image, **encoding), scene.fill_depth
     height, width = picture.pixels.shape[-2:]
     is_exr = image.suffix.lower() == ".exr"

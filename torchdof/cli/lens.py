@@ -166,13 +166,8 @@ class Lens(Sensor):
     def camera(self, frame: "Frame", number: int = 0, is_still: bool = True) -> "tuple[Camera, list[str]]":
         """The camera of one frame, and remarks on the source of the numbers that no option states.
 
-        1. Take the focus from the options, else from the file, else from the subject of a still.
-        2. Take the lens of the full frame from the options, else from the file, else from ``_DEFAULTS``, or a phone's
-           sensor for a focal length of the file that no larger camera has.
-        3. Open the lens for the blur of ``--blur``, or for a visible blur in a still whose options leave it open.
-
-        In a sequence nothing is guessed, because guesses would differ from frame to frame. The focus of the file is
-        ignored if the depth is not to scale.
+        Options come before the file, and this before the subject of a still and ``_DEFAULTS``. In a sequence nothing is
+        guessed, because guesses would differ from frame to frame.
         """
         from ..depth.guess import subject_m
         from ..optics.camera import Camera

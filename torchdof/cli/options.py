@@ -81,10 +81,7 @@ class DepthMap(Group):
         return self.depth_kind != "relative" or self.near_m is not None or self.far_m is not None
 
     def guessed(self, values: "Tensor", path: Path, is_metric: bool) -> "tuple[Self, str]":
-        """These options with a guessed kind instead of ``auto``, and a message about the guess, or none if it is clear.
-
-        ``is_metric``: other options are in metres.
-        """
+        """These options with a guessed kind, and a message unless it is clear; ``is_metric``: others are in metres."""
         from ..depth.guess import guess_kind
 
         known = values if self.depth_unknown is None else values.masked_fill(values == self.depth_unknown, math.nan)

@@ -55,10 +55,7 @@ class Notices:
 
 @contextlib.contextmanager
 def progress_bar(what: str, total: float | None = None) -> Iterator[Callable[..., None]]:
-    """A progress bar with the remaining time, if standard error is a terminal.
-
-    Yields a function that changes ``what`` (the current step), ``done`` (finished steps) or ``total``.
-    """
+    """A bar on a terminal's standard error, as a function of ``what`` (the current step), ``done`` and ``total``."""
     from rich import progress
     from rich.console import Console
 

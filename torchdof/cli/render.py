@@ -109,12 +109,7 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
     out: Path = option("File to write, or out.####.exr.", ..., names=("--out", "-o"), metavar="OUT")
 
     def run(self) -> None:
-        """Renders one image, the frames of a sequence, or a focus pull in a still image.
-
-        1. List the frames, and check all their files.
-        2. With ``--resume`` leave out those that are complete, and neither their options nor their files have changed.
-        3. Record the options, and render the frames in order.
-        """
+        """Renders one image, the frames of a sequence, or a focus pull in a still image."""
         images, depths = _pattern(self.image), _pattern(self.depth)
         keys = (self.focus_m or []) if images is None else []
         is_single = images is None and len(keys) < 2

@@ -147,14 +147,7 @@ def inspect_depth(image: Tensor, depth: Tensor, camera: Camera) -> DepthReport:
 
 
 def depth_colours(depth: Tensor) -> Tensor:
-    """Depth ``[1, 1, H, W]`` in metres as a picture ``[1, 3, H, W]`` in linear light.
-
-    It is grey, even in 1 / distance, near bright and far dark; holes (NaN) are magenta.
-
-    Example:
-        >>> depth_colours(torch.tensor([[[[1.0, 2.0, torch.inf]]]]))[0, 0, 0, [0, 2]].tolist()
-        [1.0, 0.0]
-    """
+    """Depth ``[1, 1, H, W]`` as ``[1, 3, H, W]`` in linear light: grey, even in 1 / distance; holes are magenta."""
     is_hole = depth.isnan()
     inverse = torch.where(is_hole, 0.0, 1.0 / depth)
     low, high = inverse[~is_hole].aminmax() if bool((~is_hole).any()) else (inverse.min(), inverse.max())
@@ -163,13 +156,9 @@ def depth_colours(depth: Tensor) -> Tensor:
 
 
 def coc_colours(coc_px: Tensor) -> Tensor:
-    """Signed radii ``[1, 1, H, W]`` in pixels as a picture ``[1, 3, H, W]`` in linear light.
+    """Signed radii ``[1, 1, H, W]`` in pixels as ``[1, 3, H, W]`` in linear light.
 
-    It is orange in front of the focus, black in focus, blue behind; the largest radius (at least 1 px) has full colour.
-
-    Example:
-        >>> coc_colours(torch.tensor([[[[-2.0, 0.0, 2.0]]]]))[0, :, 0].argmax(dim=0).tolist()
-        [0, 0, 2]
+    Orange is in front of the focus, blue behind; the largest radius (at least 1 px) has full colour.
     """
     size = (coc_px / coc_px.abs().max().clamp(min=1.0)).clamp(-1, 1)
     near, far = coc_px.new_tensor([1.0, 0.35, 0.02]), coc_px.new_tensor([0.05, 0.3, 1.0])

@@ -105,10 +105,7 @@ def from_relative(
 
 
 def _smooth_steps(values: Tensor) -> Tensor:
-    """Turns the steps of one level in maps of 8 bits into ramps; changes a value by at most half a level.
-
-    Over each distance, the values of two pixels that differ by one level at most move towards each other.
-    """
+    """Turns the steps of one level in maps of 8 bits into ramps; changes a value by at most half a level."""
     known = values.detach().nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
     low, high = known.amin((1, 2, 3), keepdim=True), known.amax((1, 2, 3), keepdim=True)
     level = torch.where(high > 1.0, 1.0, 1.0 / 255.0)

@@ -150,13 +150,7 @@ def _first_memory(inverse: Tensor) -> Tensor:
 
 
 def _next_memory(now: Tensor, previous: Tensor, memory: Tensor, inverse: Tensor) -> Tensor:
-    """Memory ``[B, 4, H, W]`` after one more frame.
-
-    1. Find the motion of the image, and the pixels that it explains; move the memory along.
-    2. Compare the new depth with the first surface, in multiples of the typical difference.
-    3. Find areas whose depth has moved; they start anew.
-    4. Update the means and votes of both surfaces, and swap them where the second one wins.
-    """
+    """Memory ``[B, 4, H, W]`` after one more frame, as :class:`Steady` describes it."""
     level = previous.clamp(min=0).sqrt().mean((1, 2, 3), keepdim=True).clamp(min=1e-12)
     now, previous = (frame.clamp(min=0).sqrt() / level for frame in (now, previous))
     is_changed = (now - previous).abs().amax(1, keepdim=True) > _CHANGE[0]

@@ -14,10 +14,7 @@ __all__ = ["print_columns"]
 def print_columns(
     console: Console, title: str, columns: Mapping[str, Sequence[str]], words: Collection[str] = ()
 ) -> None:
-    """Prints a table, a line for each row, however wide the terminal is.
-
-    ``columns`` maps headings to cells, the same number in each. Numbers are aligned right, columns of ``words`` left.
-    """
+    """Prints cells by heading, a line for each row, however wide the terminal is; ``words`` are aligned left."""
     widths = [max(map(len, (name, *cells))) for name, cells in columns.items()]
     signs = ["<" if name in words else ">" for name in columns]
     console.print(title, markup=False, highlight=False, style="italic")
