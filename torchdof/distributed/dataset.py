@@ -34,25 +34,21 @@ def pairs_in(images: str | os.PathLike[str], depths: str | os.PathLike[str] | No
         FileNotFoundError: If a folder is missing or has no image.
         ValueError: If an image has no depth file, or several.
     """
-    photographs = _by_stem(images, IMAGE_SUFFIXES)
-    maps = {} if depths is None else _by_stem(depths, MAP_SUFFIXES)
+    photographs, maps = _by_stem(images, IMAGE_SUFFIXES), {} if depths is None else _by_stem(depths, MAP_SUFFIXES)
     if not photographs:
         raise FileNotFoundError(f"{images}: no images here ({' '.join(IMAGE_SUFFIXES)})")
-    for stem, (image, *others) in photographs.items():
-        if others:
-            raise ValueError(f"{image}: there is {others[0].name} of the same name; keep one of them")
-        if depths is not None and len(maps.get(stem, [])) != 1:
-            names = " and ".join(path.name for path in maps.get(stem, [])) or "none"
-            raise ValueError(f"{image}: needs one depth map {stem}.* in {depths}, found {names}")
-    return [Pair(str(image), str(maps[stem][0]) if maps else None) for stem, (image,) in photographs.items()]
+    if depths is not None and (missing := [stem for stem in photographs if stem not in maps]):
+        raise ValueError(f"{photographs[missing[0]]}: needs a depth map {missing[0]}.* in {depths}, found none")
+    return [Pair(str(image), str(maps[stem]) if maps else None) for stem, image in photographs.items()]
 
 
-def _by_stem(folder: str | os.PathLike[str], suffixes: tuple[str, ...]) -> dict[str, list[Path]]:
-    """The files of a folder with one of some suffixes, by their name without suffix."""
-    by_stem: dict[str, list[Path]] = {}
+def _by_stem(folder: str | os.PathLike[str], suffixes: tuple[str, ...]) -> dict[str, Path]:
+    """The files of a folder with one of some suffixes, by their name without suffix; refuses two of one name."""
+    by_stem: dict[str, Path] = {}
     for path in sorted(Path(folder).absolute().iterdir()):
         if path.suffix.lower() in suffixes and not path.name.startswith("."):
-            by_stem.setdefault(path.stem, []).append(path)
+            if (other := by_stem.setdefault(path.stem, path)) is not path:
+                raise ValueError(f"{other}: there is {path.name} of the same name; keep one of them")
     return by_stem
 
 
