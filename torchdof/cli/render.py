@@ -110,11 +110,11 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
 
     def run(self) -> None:
         """Renders one image, the frames of a sequence, or a focus pull in a still image."""
-        images, depths = _pattern(self.image), _pattern(self.depth)
+        images, depths, numbered = map(FramePattern.of, (self.image, self.depth, self.out))
         keys = (self.focus_m or []) if images is None else []
         is_single = images is None and len(keys) < 2
-        is_animation = images is None and not is_single and not _pattern(self.out)
-        has_number = FramePattern.is_padded(self.out) and not FramePattern.is_padded(self.image) and _pattern(self.out)
+        is_animation = images is None and not is_single and not numbered
+        has_number = numbered and FramePattern.is_padded(self.out) and not FramePattern.is_padded(self.image)
         of_sequences = (images is None and (self.steady or depths)) or (is_single and (self.frames or has_number))
         no_number = f"{self.out}: expected one place for the frame number, such as pull.##.png, or a .webp"
         for is_wrong, problem in (
@@ -232,8 +232,3 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
                     written = writer.submit(write)  # Ctrl-C does not stop this thread
             finally:  # a rendered frame is written even if the next one fails
                 written.result()
-
-
-def _pattern(path: Path | None) -> FramePattern | None:
-    """The pattern of a numbered sequence; None for the path of a single file."""
-    return FramePattern(path) if path is not None and FramePattern.matches(path) else None

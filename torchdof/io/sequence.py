@@ -22,10 +22,10 @@ class FramePattern:
         if self._digits > _MAX_DIGITS:
             raise ValueError(f"{path}: the frame number must have at most {_MAX_DIGITS} digits, got {self._digits}")
 
-    @staticmethod
-    def matches(path: str | Path) -> bool:
-        """Whether a path has a placeholder, and no file has literally this name."""
-        return re.search(r"#|%\d*d", Path(path).name) is not None and not Path(path).is_file()
+    @classmethod
+    def of(cls, path: Path | None) -> "FramePattern | None":
+        """The pattern of a path with a placeholder, unless a file has literally this name; None for other paths."""
+        return None if path is None or not re.search(r"#|%\d*d", path.name) or path.is_file() else cls(path)
 
     @staticmethod
     def is_padded(path: str | Path) -> bool:
