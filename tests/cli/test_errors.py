@@ -55,7 +55,7 @@ image.exr depth.npy --focus-m 2 --fov-deg 40 --focal-length-mm 50 | say the same
 image.exr depth.npy --focus-m 2 --fov-deg 40 --f-number 2 --aperture-radius-m 1 | both say how wide the lens opens
 image.exr depth.npy --focus-m 2 --fov-deg 40 --aperture-radius-m 1e45 | check this lens (--focal-length-mm 49.4
 image.exr depth.npy --focus-m 2 --f-number 2 --blur 2% | --f-number and --blur both say how wide the lens opens
-image.exr depth.npy --focus-m 2 --equivalent 85,1.4 --focal-length-mm 50 | --equivalent and --focal-length-mm with
+image.exr depth.npy --focus-m 2 --equivalent 85,1.4 --focal-length-mm 50 | --equivalent and --focal-length-mm say
 image.exr depth.npy --focus-m 2 --equivalent 85       | --equivalent expects a focal length and an f-number such as
 image.exr depth.npy --focus-m 2 --blur 99%            | --blur expects a share of the picture's width
 image.exr depth.npy --focus-m 2 --blur 2              | --blur expects a share of the picture's width

@@ -53,7 +53,7 @@ class Frame:
     def mistakes(self, camera: Camera) -> list[Mistake]:
         """Likely mistakes in the depth, given the camera."""
         kind: Any = self.scene.depth_kind
-        meant = ["blur"] * (self.scene.blur_share is not None)  # --blur states it, so that no unit is wrong
+        meant = ["blur"] * (self.scene.blur is not None)  # --blur states it, so that no unit is wrong
         meant += ["gap"] * (len(self.scene.focus_m or []) > 1)  # a focus pull passes between surfaces
         mistakes = depth_mistakes(self.values, camera, kind, self.scene.depth_scale)
         return [mistake for mistake in mistakes if mistake.name not in meant]

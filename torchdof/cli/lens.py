@@ -99,9 +99,8 @@ class Lens(Sensor):
     tilt: float = option("Degrees by which the lens is tilted down: focus comes nearer towards the bottom.", 0.0)
     swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)
     f_number: float | None = option("Smaller is blurrier.", basic=True)
-    blur_share: float | None = option(
+    blur: float | None = option(
         "Open the lens until the largest blur radius is this share of the width, such as 2%; instead of --f-number.",
-        names=("--blur",),
         metavar="SHARE%",
         type=Parsed("a share of the picture's width, above 0 and at most 50 %, such as 2%", _width_fraction),
         basic=True,
@@ -119,18 +118,13 @@ class Lens(Sensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        real_lens = self.focal_length_mm if self.focal_length_mm is not None else self.sensor_width_mm
-        focus = {"--focus-m": self.focus_m, "--focus-at": self.focus_at, "--focus-range": self.focus_range}
-        lens = {"--fov-deg": self.fov_deg, "--equivalent": self.equivalent}
-        lens["--focal-length-mm with --sensor-width-mm"] = real_lens
-        opening: dict[str, Any] = {"--f-number": self.f_number, "--aperture-radius-m": self.aperture_radius_m}
-        opening |= {"--equivalent": self.equivalent, "--blur": self.blur_share}
-        for options, problem in (
-            (focus, "both say where to focus"),
-            (lens, "say the same"),
-            (opening, "both say how wide the lens opens"),
+        for names, problem in (
+            (("focus_m", "focus_at", "focus_range"), "both say where to focus"),
+            (("fov_deg", "equivalent", "focal_length_mm"), "say the same"),
+            (("fov_deg", "equivalent", "sensor_width_mm"), "say the same"),
+            (("f_number", "aperture_radius_m", "equivalent", "blur"), "both say how wide the lens opens"),
         ):
-            given = [name for name, value in options.items() if value is not None]
+            given = [f"--{name.replace('_', '-')}" for name in names if getattr(self, name) is not None]
             if len(given) > 1:
                 raise ValueError(f"{' and '.join(given)} {problem}; give one of them")
         if self.fov_deg is None and self.aperture_radius_m is not None:
@@ -189,7 +183,7 @@ class Lens(Sensor):
             remarks.append("focus on what is nearest the middle")
         elif not self.has_focus:
             raise ValueError("where is the focus? give --focus-m METRES or --focus-at X,Y (the file does not say)")
-        has_opening = bool(self.given(Lens) & {"f_number", "aperture_radius_m", "equivalent", "blur_share"})
+        has_opening = bool(self.given(Lens) & {"f_number", "aperture_radius_m", "equivalent", "blur"})
         if self.fov_deg is not None and not has_opening:
             raise ValueError("--fov-deg needs the opening of the lens: --aperture-radius-m, --f-number or --blur")
         sources = {name: "from the file" if name in in_file else "assumed" for name in _DEFAULTS if name not in stated}
@@ -205,7 +199,7 @@ class Lens(Sensor):
             wide, padded, (_, rows, columns) = area.centred_camera(camera, depth)
             x, y = self.focus_at[0] - area.x + columns.start, self.focus_at[1] - area.y + rows.start
             camera = camera.replace(focus_m=wide.focus_at(padded, x, y).focus_m)
-        share, is_open = self.blur_share, is_still and not has_opening and not (is_to_scale and self.given(Lens))
+        share, is_open = self.blur, is_still and not has_opening and not (is_to_scale and self.given(Lens))
         largest_px = self._largest_coc_px(camera, depth, area) if share is not None or is_open else 0.0
         if is_open and not (is_to_scale and "f_number" in in_file and largest_px >= _VISIBLE_BLUR * width):
             share = _DEFAULT_BLUR

@@ -123,7 +123,7 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
             (self.sheet and not is_single, "--sheet is of one picture; leave it out where there are more"),
             (of_sequences, f"{self.image}: is a single image; for a sequence write it as shot.####.exr"),
             (
-                images and self.blur_share,
+                images and self.blur,
                 "--blur would open the lens anew in each frame of a sequence; give --f-number",
             ),
             (self.steady and self.depth_kind == "coc", "--steady filters depth in metres; --depth-kind coc has none"),
