@@ -281,7 +281,7 @@ def test_json_has_the_facts_of_the_line(depth: Tensor, run: Run) -> None:
     camera: dict[str, Any] = {"focus_m": "inf", "f_number": 1.2, "focal_length_mm": 50.0, "sensor_width_mm": 4.0}
     radius = float(CAMERA.replace(focus_m=math.inf).coc_px(depth, 24).abs().max())
     expected: dict[str, Any] = {"out": "out.0002.exr", "assumed": [], "largest_coc_px": pytest.approx(radius)}
-    expected |= {"camera": camera | {"focus_range_m": None, "tilt_deg": 0.0, "swing_deg": 0.0}}
+    expected |= {"camera": camera | {"focus_range_m": None, "tilt_deg": 0.0, "swing_deg": 0.0, "focus_breathing": True}}
     expected |= {"width": 24, "height": 16, "filled_px": 0, "show_focus": False, "table": "disc", "aperture": None}
     expected |= {"method": "layered", "occlusion": True, "tolerance": 1 / 255, "attention": [18.0, 8.0, 4.0]}
     assert frames[0] == expected | {"lights": 0.0}

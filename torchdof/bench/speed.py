@@ -24,7 +24,6 @@ __all__ = ["compare", "report", "works"]
 
 _TOLERANCES = (8.0, 4.0, 2.0, 1.0, 0.5, 0.0)  # tolerances, in 1/255
 _RADII_PX, _SIZES = (4.0, 8.0, 16.0, 32.0, 64.0), (0.25, 0.5)
-_FOLD_PX = 128  # width for the literal scatter, which takes k * k columns for each pixel
 _ROUNDING = 1e-6  # RMS error, of 1, by which rounding may exceed the tolerance
 
 
@@ -36,17 +35,11 @@ def works(
     That is of the scene's own camera; times are of ``repeat`` others. ``scan`` adds other radii and frame sizes.
     """
     blur = functools.partial(blur_by_coc, table=scene.table, occlusion=occlusion)
-    small = scene.resized(min(1.0, _FOLD_PX / scene.image.shape[-1]))
-    height, width = scene.image.shape[-2:]
-    with_attention = functools.partial(blur, attention=(width / 2, height / 2, height / 8))
     settings: list[tuple[str, float, Renderer, BenchScene]] = [
         *((f"{n:g}/255" if n else "exact", n, functools.partial(blur, tolerance=n / 255), scene) for n in _TOLERANCES),
         *((f"{runtime} 1/255", 1, _prepared(runtime, scene, occlusion), scene) for runtime in runtimes),
         ("focus pull 1/255", 1, blur, scene),
         ("fresh process 1/255", 1, functools.partial(_in_a_fresh_process, blur), scene),
-        ("looked at 1/255, else 8/255", 8, with_attention, scene),
-        ("small frame 1/255", 1, blur, small),
-        ("small frame fold 1/255", 1, functools.partial(blur, method="fold"), small),
         *((f"{px:g} px 1/255", 1, blur, scene.seen(0.0, px)) for px in _RADII_PX * scan),
         *((f"{share:g} of the frame 1/255", 1, blur, scene.resized(share)) for share in _SIZES * scan),
     ]
@@ -56,7 +49,7 @@ def works(
         columns = {"setting": setting, "tolerance": tolerance / 255, "frame": frame}
         for camera in view.pull(repeat) if name.startswith("focus pull") else view.cameras(repeat, setting):
             yield columns, render, camera, False
-        if view in (scene, small):
+        if view is scene:
             yield columns, render, view, True
 
 

@@ -124,11 +124,6 @@ def coc_of(
     return coc_px, camera, remarks + frame.remarks
 
 
-def facts_of_camera(camera: Camera) -> dict[str, Any]:
-    """The numbers of a camera, as data for JSON."""
-    return {name: value for name, value in vars(camera).items() if name != "focus_breathing"}
-
-
 class Renderer:
     """Reads, renders and writes the frames of ``torchdof render``."""
 
@@ -201,7 +196,7 @@ class Renderer:
         options, table = Options(**command.arguments()), self.table
         facts = {
             "out": str(out),
-            "camera": camera and facts_of_camera(camera),
+            "camera": camera and vars(camera),
             "largest_coc_px": largest_px,
             "filled_px": frame.filled,
             "device": str(self.device),

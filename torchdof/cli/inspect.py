@@ -33,7 +33,7 @@ class Inspect(Scene, Command):
         check_writable(target)
         from ..depth.inspect import inspect_depth, panels
         from ..io.sheet import write_sheet
-        from .frame import facts_of_camera, read_frame
+        from .frame import read_frame
 
         frame = read_frame(self.image, self.depth, self, holes=True)
         scene = frame.scene
@@ -52,7 +52,7 @@ class Inspect(Scene, Command):
             share = 100 * frame.filled / metres.numel()
             lines.append(f"filled        {frame.filled} holes ({share:.1f} %), {scene.fill_depth}")
         lines.append(f"picture       {target}")
-        facts = {"image": str(self.image), "width": width, "height": height, "camera": facts_of_camera(camera)}
+        facts = {"image": str(self.image), "width": width, "height": height, "camera": vars(camera)}
         facts |= {"assumed": notes, **report.facts(), "filled_px": frame.filled, "picture": str(target)}
         print_result(self.as_json, facts, "\n".join(lines))
         notices = Notices(self.strict)

@@ -59,9 +59,9 @@ def progress_bar(what: str, total: float | None = None) -> Iterator[Callable[...
     from rich import progress
     from rich.console import Console
 
-    columns = (progress.TextColumn("{task.description}", markup=False), progress.BarColumn())
     with progress.Progress(
-        *(*columns, progress.TimeElapsedColumn(), progress.TimeRemainingColumn()),
+        *(progress.TextColumn("{task.description}", markup=False), progress.BarColumn()),
+        *(progress.TimeElapsedColumn(), progress.TimeRemainingColumn()),
         console=Console(stderr=True),
         transient=True,
         disable=not sys.stderr.isatty(),

@@ -198,6 +198,5 @@ def whole_numbers(values: Tensor) -> bool:
 
 
 def _quantile(values: Tensor, share: float) -> float:
-    """Quantile of a sample of the values: a share ``share`` of them does not exceed it."""
-    sample = _sample(values).float()
-    return float(sample.sort().values[min(sample.numel() - 1, int(share * sample.numel()))])
+    """Quantile of a sample of the values."""
+    return float(_sample(values).float().quantile(share, interpolation="lower"))
