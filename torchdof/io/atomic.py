@@ -20,8 +20,6 @@ __all__ = ["atomic_file", "check_writable", "exit_on_signals", "write_text"]
 def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary file in the folder of ``path``, renamed to ``path`` at the end, or removed on any error."""
     target = Path(os.path.realpath(path))
-    if target.is_symlink():
-        raise OSError(f"{path}: is a link that leads back to itself; name a file")
     if not target.parent.is_dir():
         raise FileNotFoundError(f"{path}: there is no folder {target.parent}; make it first")
     if target.is_dir():

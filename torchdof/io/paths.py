@@ -70,8 +70,6 @@ def _existing_file(path: str | os.PathLike[str], suffixes: tuple[str, ...], what
 
         raise ValueError(f"expected the path of {what}, got {show(path)}")
     path = Path(path)
-    if os.path.islink(os.path.realpath(path)):
-        raise OSError(f"{path}: is a link that leads back to itself")
     if path.suffix.lower() not in suffixes:
         kind = path.suffix or "no suffix"
         raise ValueError(f"{path}: {kind} is not {what} that can be read; use {' '.join(suffixes)}")
