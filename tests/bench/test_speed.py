@@ -7,7 +7,6 @@ import json
 import math
 import shutil
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -90,8 +89,8 @@ def test_the_report_names_a_tolerance_that_was_not_kept(
     def wrong(*arguments: Any, **options: Any) -> Tensor:
         return blur_by_coc(*arguments, **options) + 0.2 * (options.get("tolerance") == 4 / 255)
 
-    def two(*arguments: Any, works: Any = speed.works) -> Iterator[Any]:
-        return (work for work in works(*arguments) if work[0]["setting"].startswith(("8/255", "4/255")))
+    def two(*arguments: Any, works: Any = speed.works) -> list[Any]:
+        return [work for work in works(*arguments) if work[0]["setting"].startswith(("8/255", "4/255"))]
 
     monkeypatch.setattr(speed, "blur_by_coc", wrong)
     monkeypatch.setattr(speed, "works", two)
@@ -142,7 +141,7 @@ def test_bench_measures_the_given_lens_and_focus_and_json_has_the_rows(
     depth = torch.linspace(1.0, 4.0, 64).expand(1, 1, 36, 64)
     camera = Camera.from_fov(40.0, 0.02, 1.0).focus_at(depth, 0.0, 0.0)
     torch.testing.assert_close(measured[0].coc_px, camera.coc_px(depth, 64))
-    blur = {f["setting"]: blur for f, blur, _, _ in speed.works(measured[0], True, 1)}["exact"]
+    blur = {f["setting"]: blur for f, blur, _ in speed.works(measured[0], True)}["exact"]
     even = blur_by_coc(measured[0].image, measured[0].coc_px, tolerance=0.0)
     assert float((blur(measured[0].image, measured[0].coc_px) - even).abs().max()) > 0.01
     for options in (("--focus-m", 1.0), ("--depth-kind", "coc", "--depth-scale", 2.0)):
@@ -197,7 +196,7 @@ def test_an_exported_file_is_a_row(exported_by_command: tuple[Path, str], monkey
 def test_a_compiled_module_is_a_row(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
     scene = shipped(64, 96)
-    works = {facts["setting"]: blur for facts, blur, _, _ in speed.works(scene, False, 1, ["compiled"])}
+    works = {facts["setting"]: blur for facts, blur, _ in speed.works(scene, False, ["compiled"])}
     picture = works["compiled 1/255 without occlusion"](scene.image, scene.coc_px)
     exact = blur_by_coc(scene.image, scene.coc_px, occlusion=False, tolerance=0.0)
     assert error(picture, exact)["rms_255"] < 0.3

@@ -28,10 +28,6 @@ __all__ = ["compare", "read_peer", "renderers"]
 _TILE_PX = 128
 
 
-def _lens_views(views: int, image: Tensor, coc_px: Tensor) -> Tensor:
-    return lens_views(image, coc_px, views=views).image
-
-
 def renderers(degraded: bool) -> dict[str, Renderer]:
     """The renderers compared, by name, with disc kernels."""
     common: dict[str, Renderer] = {"ikoma": layered_fft, "torchdof": blur_by_coc}
@@ -60,7 +56,7 @@ def compare(truth: Path, out: Path, views: Sequence[int], degraded: bool, peers:
     """
     by_name = renderers(degraded) | dict(map(read_peer, peers))
     for count in sorted({*views}):
-        by_name[f"reference {count}"] = functools.partial(_lens_views, count)
+        by_name[f"reference {count}"] = lambda *scene, count=count: lens_views(*scene, views=count).image
     scenes, console, rows = list(read_scenes(truth)), Console(stderr=True), []
     tile_px = min(_TILE_PX, *(size for scene in scenes for size in scene.image.shape[-2:]))
     panels: dict[str, list[Tensor]] = {}

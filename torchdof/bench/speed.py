@@ -5,7 +5,7 @@ import math
 import multiprocessing
 import statistics
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -28,12 +28,9 @@ _ROUNDING = 1e-6  # RMS error, of 1, by which rounding may exceed the tolerance
 
 
 def works(
-    scene: BenchScene, occlusion: bool, repeat: int, runtimes: Sequence[str] = (), scan: bool = False
-) -> Iterator[tuple[dict[str, Any], Renderer, BenchScene, bool]]:
-    """The measurements: first columns of the row, renderer, scene by a camera, and whether to measure its error.
-
-    That is of the scene's own camera; times are of ``repeat`` others. ``scan`` adds other radii and frame sizes.
-    """
+    scene: BenchScene, occlusion: bool, runtimes: Sequence[str] = (), scan: bool = False
+) -> list[tuple[dict[str, Any], Renderer, BenchScene]]:
+    """The settings: first columns of the row, renderer, and scene; ``scan`` adds other radii and frame sizes."""
     blur = functools.partial(blur_by_coc, table=scene.table, occlusion=occlusion)
     settings: list[tuple[str, float, Renderer, BenchScene]] = [
         *((f"{n:g}/255" if n else "exact", n, functools.partial(blur, tolerance=n / 255), scene) for n in _TOLERANCES),
@@ -43,14 +40,18 @@ def works(
         *((f"{px:g} px 1/255", 1, blur, scene.seen(0.0, px)) for px in _RADII_PX * scan),
         *((f"{share:g} of the frame 1/255", 1, blur, scene.resized(share)) for share in _SIZES * scan),
     ]
-    for name, tolerance, render, view in settings:
-        setting = name + " without occlusion" * (not occlusion)
-        frame = f"{view.image.shape[-1]} x {view.image.shape[-2]}"
-        columns = {"setting": setting, "tolerance": tolerance / 255, "frame": frame}
-        for camera in view.pull(repeat) if name.startswith("focus pull") else view.cameras(repeat, setting):
-            yield columns, render, camera, False
-        if view is scene:
-            yield columns, render, view, True
+    return [
+        (
+            {
+                "setting": name + " without occlusion" * (not occlusion),
+                "tolerance": tolerance / 255,
+                "frame": f"{view.image.shape[-1]} x {view.image.shape[-2]}",
+            },
+            render,
+            view,
+        )
+        for name, tolerance, render, view in settings
+    ]
 
 
 def _prepared(runtime: str, scene: BenchScene, occlusion: bool) -> Renderer:
@@ -83,20 +84,23 @@ def _in_a_fresh_process(blur: Renderer, image: Tensor, coc_px: Tensor) -> tuple[
 def compare(
     scene: BenchScene, repeat: int, console: Console | None = None, runtimes: Sequence[str] = (), scan: bool = False
 ) -> list[Row]:
-    """Measures every setting of :func:`works`, with and without occlusion; a row for each."""
+    """Measures every setting of :func:`works`, with and without occlusion; a row for each.
+
+    Errors are of the scene's own camera, times of ``repeat`` others, different ones for each setting.
+    """
     hidden, rows = console is None or not console.is_terminal, []
     with torch.no_grad():
         for occlusion in (True, False):
-            dense = functools.partial(blur_by_coc, table=scene.table, occlusion=occlusion, tolerance=0.0)
-            exact = functools.cache(lambda camera, dense=dense: dense(camera.image, camera.coc_px))
-            cases = list(works(scene, occlusion, repeat, runtimes, scan))
-            for columns, blur, camera, is_error in track(cases, "", console=console, transient=True, disable=hidden):
-                if is_error:
-                    (picture, _), peak_mb = peak_of(functools.partial(timed, blur, camera.image, camera.coc_px))
-                    rows.append({**columns, "peak_mb": peak_mb, **error(picture, exact(camera))})
-                else:
-                    repeat_camera = not columns["setting"].startswith("fresh process")
-                    rows.append(columns | measure(blur, camera, again=repeat_camera)[1])
+            exact = blur_by_coc(scene.image, scene.coc_px, table=scene.table, occlusion=occlusion, tolerance=0.0)
+            cases = works(scene, occlusion, runtimes, scan)
+            for columns, blur, view in track(cases, "", console=console, transient=True, disable=hidden):
+                setting = columns["setting"]
+                again = not setting.startswith("fresh process")
+                cameras = view.pull(repeat) if setting.startswith("focus pull") else view.cameras(repeat, setting)
+                rows += [columns | measure(blur, camera, again)[1] for camera in cameras]
+                if view is scene:
+                    (picture, _), peak_mb = peak_of(functools.partial(timed, blur, view.image, view.coc_px))
+                    rows.append({**columns, "peak_mb": peak_mb, **error(picture, exact)})
     summaries = summary(rows, ["setting", "tolerance", "frame"], statistics.median)
     return [{**row, "kept": row.get("rms_255", 0.0) <= 255 * (row["tolerance"] + _ROUNDING)} for row in summaries]
 

@@ -63,10 +63,6 @@ class Steady:
         self._before: Tensor | None = None
         self._memory: Tensor | None = None
 
-    def reset(self) -> None:
-        """Forgets all earlier frames, as a cut does."""
-        self._before = self._memory = None
-
     @torch.no_grad()
     def __call__(self, image: Tensor, depth: Tensor) -> Tensor:
         """The depth of the next frame.
