@@ -95,7 +95,5 @@ def _refuse_vmap(name: str, value: Tensor) -> None:
     """Refuse a tensor inside ``torch.vmap``, because planning layers reads its values."""
     while not is_traced() and torch._C._functorch.is_functorch_wrapped_tensor(value):
         if torch._C._functorch.is_batchedtensor(value):
-            raise ValueError(
-                f"{name} comes from torch.vmap, in which no values can be read; pass the whole batch instead"
-            )
+            raise ValueError(f"{name} comes from torch.vmap, in which no values can be read; pass the whole batch")
         value = torch._C._functorch.get_unwrapped(value)  # torch.func.grad inside of torch.vmap wraps it once more

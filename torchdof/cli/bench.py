@@ -60,9 +60,9 @@ class Bench(Scene, Blur, _Speed, _Accuracy, Command):
         if self.truth is None:
             return self._measure_speed()
         if self.image is not None or self.given(Scene, Blur, _Speed) - {"repeat"}:
+            problem = "--truth measures scenes with their own lens and depth"
             raise ValueError(
-                "--truth measures the scenes of its folder with their own lens and depth; leave IMAGE and DEPTH out, "
-                "--onnx, --compile and --scan, and options of lens, depth and blur"
+                f"{problem}; leave IMAGE and DEPTH out, --onnx, --compile and --scan, and the other options"
             )
         if self.as_json or self.out is None:
             raise ValueError("--truth writes tables and pictures; give a folder with --out, and leave --json out")

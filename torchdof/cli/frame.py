@@ -148,8 +148,7 @@ class Renderer:
         else:
             if command.lights and picture.sample in ("half", "float"):
                 raise ValueError(
-                    "--lights is for photographs of 8 or 16 bits, which clip at white; this image holds "
-                    f"{picture.sample} numbers, light above white included: leave --lights out"
+                    f"--lights is for photographs of 8 or 16 bits; leave it out for {picture.sample} numbers"
                 )
             if command.lights:
                 pixels = torch.cat([expand_highlights(pixels[:, :colours], command.lights), pixels[:, colours:]], 1)

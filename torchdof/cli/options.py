@@ -114,9 +114,7 @@ class Scene(Lens, DepthMap):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.depth_kind == "coc" and self.given(Lens) - {"fov_deg"}:
-            raise ValueError(
-                "--depth-kind coc is the blur itself and takes no camera; leave focus and lens options out"
-            )
+            raise ValueError("--depth-kind coc is the blur itself and takes no camera; leave focus and lens out")
 
 
 @dataclass(frozen=True, kw_only=True)

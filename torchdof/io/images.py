@@ -176,9 +176,7 @@ def write_image(
 
     path = Path(path)
     if not isinstance(picture, Picture):
-        raise ValueError(
-            f"{path}: expected a Picture, got {show(picture)}; wrap a tensor [1, 3, H, W]: Picture(pixels)"
-        )
+        raise ValueError(f"{path}: expected a Picture, such as Picture(tensor [1, 3, H, W]), got {show(picture)}")
     suffix = path.suffix.lower()
     sample_types = samples_of(path)
     if sample is None:
