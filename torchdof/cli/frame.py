@@ -152,8 +152,8 @@ class Renderer:
                 )
             if command.lights:
                 pixels = torch.cat([expand_highlights(pixels[:, :colours], command.lights), pixels[:, colours:]], 1)
-            x, y, *radius = command.attention or (0.0, 0.0)
-            attention = (x - frame.area.x, y - frame.area.y, *radius) if radius else None
+            x, y, radius_px = command.attention or (0.0, 0.0, 0.0)
+            attention = (x - frame.area.x, y - frame.area.y, radius_px) if command.attention else None
             table = _with_alpha(self.table) if picture.has_alpha else self.table
             with torch.no_grad():
                 pixels = blur_by_coc(pixels, coc_px, table=table, attention=attention, **command.arguments())

@@ -87,24 +87,21 @@ class DepthMap(Group):
         known = values if self.depth_unknown is None else values.masked_fill(values == self.depth_unknown, math.nan)
         suffix = path.suffix.lower()
         guess = guess_kind(known, suffix in _INTEGER_TYPES, is_metric or suffix in _RENDER_TYPES)
-        if guess.kind == "z" and guess.scale == 1.0 and is_metric:
+        if guess.kind == "z" and guess.scale is None and is_metric:
             is_clear = suffix in _RENDER_TYPES or guess_kind(known).kind == "z"
             doubt = "its numbers grow downwards, as in relative depth (--depth-kind relative)"
             message = "" if is_clear else f"taken for metres, as the options are in metres, but {doubt}"
             return replace(self, depth_kind="z"), message
-        changes: dict[str, Any] = {
-            "depth_kind": guess.kind,
-            "fill_depth": "far" if self.fill_depth is None else self.fill_depth,
-        }
-        changes["depth_unknown"] = guess.unknown if self.depth_unknown is None else self.depth_unknown
+        fill = "far" if self.fill_depth is None else self.fill_depth
+        unknown = guess.unknown if self.depth_unknown is None else self.depth_unknown
+        options = replace(self, depth_kind=guess.kind, fill_depth=fill, depth_unknown=unknown)
         if guess.kind == "z":
-            changes["depth_scale"] = None if guess.scale == 1.0 else guess.scale
-            unit = "metres" if guess.scale == 1.0 else "millimetres"
-            return replace(self, **changes), f"taken for {unit} (else --depth-kind, --depth-scale)"
+            unit = "metres" if guess.scale is None else "millimetres"
+            return replace(options, depth_scale=guess.scale), f"taken for {unit} (else --depth-kind, --depth-scale)"
         larger, other = ("nearer", "depth") if guess.relative_kind == "disparity" else ("farther", "disparity")
         message = f"taken for relative depth (else --depth-kind), larger is {larger} (else --relative-kind {other}), "
         message += "from {:g} to {:g} m (else --near-m, --far-m)".format(*self.ends_m)
-        return replace(self, **changes, relative_kind=guess.relative_kind), message
+        return replace(options, relative_kind=guess.relative_kind), message
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -32,7 +32,7 @@ class Guess:
     """The meaning of the numbers of a depth map."""
 
     kind: Literal["z", "relative"]  # metres after multiplication by scale; near and far, without a unit
-    scale: float = 1.0  # metres per unit, for "z"
+    scale: float | None = None  # metres per unit, for "z"; None for metres
     unknown: float | None = None  # the value that means "not measured"
     relative_kind: RelativeKind = "disparity"  # larger for nearer surfaces; "depth" is larger for farther ones
 
