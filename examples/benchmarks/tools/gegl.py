@@ -1,7 +1,8 @@
 """GEGL's lens-blur (the engine of GIMP), float32: a disc with its own radius for each pixel.
 
-GEGL's disc extends half a pixel beyond its radius, so the radius is reduced by half a pixel. An interpreter that has
-GEGL's bindings, and may lack PyTorch, runs ``gegl.py FOLDER WIDTH HEIGHT RADIUS``.
+GEGL's disc extends half a pixel beyond its radius, so the radius is reduced by half a pixel. Its time is that of the
+graph a second time, from buffer to buffer. An interpreter that has GEGL's bindings, and may lack PyTorch, runs
+``gegl.py FOLDER WIDTH HEIGHT RADIUS``.
 """
 
 import functools
@@ -18,10 +19,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 NAME = "GEGL lens-blur"
-NOTE = (
-    "float32; a radius map, |coc| - 0.5 over its maximum, as aux. Time: processing the graph a second time, "
-    "from buffer to buffer; without process start, file i/o and filling the buffers."
-)
 
 
 def available() -> str | None:

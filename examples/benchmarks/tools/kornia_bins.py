@@ -5,7 +5,6 @@ from kornia.filters import filter2d
 from torch import Tensor
 
 NAME = "kornia, 16 bins"
-NOTE = "float32; 16 radii from 0 to the largest, discs with smooth edges. Time: the whole call."
 _BINS = 16
 _SAMPLES_PER_PX = 8  # samples along a pixel
 
