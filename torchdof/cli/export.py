@@ -2,8 +2,9 @@
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from ..io.atomic import check_writable
 from .command import Command, Group, Parsed, option
@@ -66,8 +67,7 @@ class Export(Sensor, Blur, Accuracy, _Graph, Command):
             from torchdof.export.metadata import describe
 
             metadata = describe(self.show)
-            lines = [f"{name}: {json.dumps(value)}" for name, value in metadata.items()]
-            return print_result(self.as_json, metadata, "\n".join(lines))
+            return print_result(self.as_json, metadata, _lines(metadata))
         if self.out is None or self.show is not None:
             raise ValueError("give either -o FILE to write or --show FILE to read")
         if self.out.suffix != ".onnx":
@@ -87,3 +87,16 @@ class Export(Sensor, Blur, Accuracy, _Graph, Command):
             report = to_onnx(dof, self.out, **graph, depth_edges=dof.options.depth_edges, progress=update)
         facts = {"out": str(self.out), **dataclasses.asdict(report)}
         print_result(self.as_json, facts, f"{report}\nwrote {self.out}")
+
+
+def _lines(facts: Mapping[str, Any], indent: str = "") -> str:
+    """Metadata as text, one line for each entry."""
+    from torchdof.export.metadata import shown
+
+    lines = []
+    for name, value in facts.items():
+        if isinstance(value, dict) and not indent:
+            lines += [f"{shown(name)}:", _lines(value, "  ")]
+        else:
+            lines.append(f"{indent}{shown(name)}: {shown(value if isinstance(value, str) else json.dumps(value))}")
+    return "\n".join(lines)
