@@ -2,8 +2,8 @@
 
 import datetime
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import Any
 
@@ -28,20 +28,6 @@ _MAX_EXPOSURE_RATIO = 1.3  # ratio of fitted to stated exposure above which to w
 _BY_COST = (*COST, *OPENINGS)
 _KNOTS = 33  # values of a free profile, equal for all distances
 _COLOURS = ("red", "green", "blue")
-_DEFOCUSED_PX = 1.5  # px; for smaller blurs it is uncertain on which side of focus a colour is
-_RADIUS_ERROR = 0.02  # relative error with which the thin lens gives the radius
-
-
-@dataclass(frozen=True)
-class Colour:
-    """One colour of a capture."""
-
-    name: str  # "red", "green" or "blue"
-    fits: tuple[BlurFit, ...]  # one for each distance, like those of the mean of the colours
-    # longitudinal colour: 1/distance of its focus minus that of green, 1/m; NaN unless two distances are blurred enough
-    focus_shift_dioptres: float
-    # lateral colour: (x, y) offsets of its dot from green's, px: in focus, then at each distance
-    lateral_px: tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -54,8 +40,8 @@ class TableFit:
         coc_px: signed circle of confusion of each pair, px of the frame.
         why: reason for the family.
         scale: source of the circles of confusion: "camera" or "measured".
-        colours: fits of red, green and blue, if the captures have colours; the table then has a kernel for each, and
-            `fits` are those of their mean.
+        colours: fits of "red", "green" and "blue", if the captures have colours; the table then has a kernel for each,
+            and `fits` are those of their mean.
     """
 
     table: BlurTable
@@ -63,7 +49,7 @@ class TableFit:
     coc_px: tuple[float, ...]
     why: str
     scale: str
-    colours: tuple[Colour, ...] = ()
+    colours: Mapping[str, tuple[BlurFit, ...]] = field(default_factory=dict)
 
 
 def fit_table(captures: Captures, family: str = "auto", **options: Any) -> BlurTable:
@@ -180,14 +166,13 @@ def fit_captures(
         **{name: getattr(captures, name) for name in CAMERA if getattr(captures, name) is not None},
         **{"coc_from": scale, "family_because": why, "command": command},
     }
-    colours = _fit_colours(captures, fits) if all(pair.colours is not None for pair in pairs) else ()
-    if colours:
-        colour_params = [_params(colour.fits, family) for colour in colours]
+    colours: dict[str, tuple[BlurFit, ...]] = {}
+    if all(pair.colours is not None for pair in pairs):
+        by_pair = [_fit_colours(pair, captures.focus_m, fit) for pair, fit in zip(pairs, fits, strict=True)]
+        colours = dict(zip(_COLOURS, zip(*by_pair, strict=True), strict=True))
+        colour_params = [_params(colour_fits, family) for colour_fits in colours.values()]
         params = {n: np.stack([p[n] for p in colour_params]) for n in params}
-        shifts = [c.focus_shift_dioptres for c in colours]
-        provenance["colours"] = [c.name for c in colours]
-        provenance["focus_shift_dioptres"] = [round(s, 5) if math.isfinite(s) else None for s in shifts]
-        provenance["lateral_px"] = [[[round(v, 3) for v in xy] for xy in c.lateral_px] for c in colours]
+        provenance["colours"] = list(colours)
     sensor = captures.sensor_width_mm
     unit = captures.width_px if sensor is None else captures.width_px / sensor
     table = BlurTable(
@@ -256,36 +241,13 @@ def _with_uncertainty(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
     )
 
 
-def _fit_colours(captures: Captures, fits: Sequence[BlurFit]) -> tuple[Colour, ...]:
-    """Fits red, green and blue of every pair like their mean.
+def _fit_colours(pair: Capture, focus_m: float, mean: BlurFit) -> list[BlurFit]:
+    """Fits red, green and blue like their mean.
 
     The softness of the sharpest colour is used for all, so that each kernel contains all of its colour's blur.
     """
-    fits_by_colour: list[list[BlurFit]] = [[] for _ in _COLOURS]
-    for pair, mean in zip(captures, fits, strict=True):
-        sharp_colours, blurred_colours = pair.colours or ((), ())
-        softness = min(soft_edge(sharp, find_dot(sharp, file=pair.files[0])).softness for sharp in sharp_colours)
-        fixed: dict[str, Any] = {"magnification": mean.magnification, "fit_magnification": False, "softness": softness}
-        for colour, *windows in zip(fits_by_colour, sharp_colours, blurred_colours, strict=True):
-            colour.append(_fit_like(mean, pair, captures.focus_m, *windows, **fixed))
-    green = fits_by_colour[1]
-    shifts = [_focus_shift(captures.defocus, colour) for colour in fits_by_colour]
-    colours = []
-    for name, colour, shift in zip(_COLOURS, fits_by_colour, shifts, strict=True):
-        blurred = np.array([np.subtract(f.centre, g.centre) for f, g in zip(colour, green, strict=True)])
-        shifts_from_green = np.array([np.subtract(f.shift, g.shift) for f, g in zip(colour, green, strict=True)])
-        lateral = tuple((float(x), float(y)) for x, y in [(blurred - shifts_from_green).mean(axis=0), *blurred])
-        colours.append(Colour(name, tuple(colour), shift - shifts[1], lateral))
-    return tuple(colours)
-
-
-def _focus_shift(defocus: Array, fits: Sequence[BlurFit]) -> float:
-    """1/distance of a colour's focus minus the capture's, 1/m: where the line through its signed radii crosses 0."""
-    radius: Array = np.array([f.radius for f in fits]) * np.sign(defocus)
-    error = np.hypot([f.radius_stderr for f in fits], _RADIUS_ERROR * radius)
-    is_blurred = np.abs(radius) > _DEFOCUSED_PX
-    if is_blurred.sum() < 2:
-        return math.nan
-    slope, intercept = np.polyfit(defocus[is_blurred], radius[is_blurred], 1, w=1 / error[is_blurred])
-    # radius = slope * (1/focus - shift - 1/distance), with the colour's own focus 1/focus - shift
-    return float(intercept / slope)
+    sharp_colours, blurred_colours = pair.colours or ((), ())
+    softness = min(soft_edge(sharp, find_dot(sharp, file=pair.files[0])).softness for sharp in sharp_colours)
+    fixed: dict[str, Any] = {"magnification": mean.magnification, "fit_magnification": False, "softness": softness}
+    windows = zip(sharp_colours, blurred_colours, strict=True)
+    return [_fit_like(mean, pair, focus_m, sharp, blurred, **fixed) for sharp, blurred in windows]

@@ -91,7 +91,6 @@ def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[w
         capture_sets = read_captures(str(folder), dots=dots, colours=colours, root=command.root)
     across_field = photographs is None and capture_sets[0].notes["dots"] == "field"
     of_fit = ("params", "stderr", "residual", "residual_over_noise", "magnification")
-    of_colour = ("name", "focus_shift_dioptres", "lateral_px")
     of_reading = len(caught)
     for i, captures in enumerate(capture_sets):
         out = command.out
@@ -124,8 +123,7 @@ def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[w
                 for pair, fit, coc in zip(captures, result.fits, result.coc_px, strict=True)
             ],
             "colours": [
-                {**{name: getattr(c, name) for name in of_colour}, "radius_px": [fit.radius for fit in c.fits]}
-                for c in result.colours
+                {"name": name, "radius_px": [fit.radius for fit in fits]} for name, fits in result.colours.items()
             ],
             "warnings": messages,
         }
@@ -169,16 +167,11 @@ def _print_fit(console: Console, captures: Captures, result: TableFit) -> None:
     how = "from focal length and f-number" if result.scale == "camera" else "measured, the thin lens in between"
     console.print(f"family: {result.why}\ncircles of confusion: {how}")
     if result.colours:
-        vergences = [1 / captures.focus_m + colour.focus_shift_dioptres for colour in result.colours]
-        focuses = [f"{1 / v:.4g}" if v > 0 else "" if math.isnan(v) else "beyond infinity" for v in vergences]
-        columns = {"": [colour.name for colour in result.colours], "focus m": focuses}
+        columns = {"": list(result.colours)}
         for i, pair in enumerate(captures):
-            radii = [f"{c.fits[i].radius:.2f} ± {c.fits[i].radius_stderr:.2g}" for c in result.colours]
+            radii = [f"{fits[i].radius:.2f} ± {fits[i].radius_stderr:.2g}" for fits in result.colours.values()]
             columns[f"radius px at {pair.distance_m:g} m"] = radii
-        lateral = [colour.lateral_px[0] for colour in result.colours]
-        columns["lateral px in focus"] = [f"({x:+.2f}, {y:+.2f})" for x, y in lateral]
-        print_columns(console, "colours, beside green", columns)
-        console.print("the table holds a kernel a colour; lateral colour is no blur, and not in it")
+        print_columns(console, "colours: the table holds a kernel for each", columns)
 
 
 def _write(console: Console, table: BlurTable, target: Path) -> None:
