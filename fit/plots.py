@@ -87,11 +87,7 @@ def picture_of_table(table: BlurTable, title: str = "") -> Figure:
 def sheet_of_photographs(
     photographs: Photographs, result: TableFit, render: Callable[[torch.Tensor, torch.Tensor, BlurTable], torch.Tensor]
 ) -> Figure:
-    """One figure that documents a calibration from photographs.
-
-    One row for each distance: the target, the window around its dot, data and model over the radius, the residual, and
-    the kernel. Below, by `render(image, coc_px, table)`: lights from near to far, and the sharp window blurred most.
-    """
+    """Draws each distance's target, dot, fit, residual and kernel; and with `render` lights and the sharp dot."""
     captures = photographs.captures
     rows = len(captures)
     figure, axes = _new_figure(12.5, 2.1 * rows + 2.6, 5, rows + 1)

@@ -14,7 +14,7 @@ from torchdof.validation import show
 
 from .result import Array
 
-Kind = Literal[
+Kind = Literal[  # the subject of a problem
     "argument",  # an argument of a function is invalid
     "asymmetry",  # the blur is not round
     "boundary",  # a parameter ended on its bound
@@ -36,7 +36,6 @@ Kind = Literal[
     "single distance",  # only one distance was measured and is scaled to all others
     "window",  # the window cuts the blur
 ]
-"""The subject of a problem."""
 
 _PACKAGE = str(Path(__file__).parent)
 _BRIGHTEST, _DARKEST = 1e30, 1e-30  # the fourth powers of levels are summed

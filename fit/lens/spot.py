@@ -197,10 +197,7 @@ def _grid(low: Array, high: Array, steps: Array) -> Array:
 def _rays_of_point(
     lens: Lens, object_mm: float, sensor_mm: float, field_mm: float = 0.0, wavelength_um: float | None = None
 ) -> tuple[Callable[[Array], tuple[Rays, Array]], Array, Array]:
-    """A function that traces the rays of an object point, and the bounding box ``[2]`` of those that pass the lens.
-
-    It takes points ``[2, R]`` of the entrance pupil's plane, in which the box lies; and gives each ray's solid angle.
-    """
+    """A function from points ``[2, R]`` in the pupil to rays and their solid angles, and the box of those that pass."""
     paraxial = lens.paraxial()
     pupil, front_diameter = paraxial.entrance_pupil, lens.surfaces[0].diameter
     distance = object_mm + pupil  # from the entrance pupil

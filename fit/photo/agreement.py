@@ -1,7 +1,4 @@
-"""Compares the fitted blur with the camera's numbers and distances, and finds the likely cause of a difference.
-
-A wrong number makes the fitted radius differ from the camera's, and the difference over the distances indicates which.
-"""
+"""Compares the fitted blur with the camera's numbers and distances, and finds the likely cause of a difference."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -39,17 +36,14 @@ def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> N
     likely = [text for misfit, text in readings if misfit < min(_EXPLAINED_LOG, 0.5 * misfit_log)]
     cause = "likely " + "; or ".join(likely[:2]) if likely else "no single number explains it: check them all"
     worst = int(np.argmax(np.where(is_large, np.abs(np.log(measured / expected)), 0.0)))
-    text = (
-        f"at {captures.distances_m[worst]:g} m the blur has a radius of {measured[worst]:.3g} px, but "
-        f"{'the other distances' if camera_px is None else 'the camera numbers'} give {expected[worst]:.3g} px; {cause}"
-    )
-    file = captures.pairs[worst].files[1]
+    giver, file = "the other distances" if camera_px is None else "the camera numbers", captures.pairs[worst].files[1]
+    text = f"at {captures.distances_m[worst]:g} m the blur has a radius of {measured[worst]:.3g} px, but {giver} give "
+    text += f"{expected[worst]:.3g} px; {cause}"
     if misfit_log <= _REFUSE_LOG:
         warn(text, "camera", file)
-        return
-    if camera_px is not None:
-        text += ". Leave out focal_length_mm, f_number and sensor_width_mm to have the scale measured instead"
-    raise FitError(text, "camera", file)
+    else:
+        remedy = "" if camera_px is None else f". Leave out {', '.join(CAMERA)} to have the scale measured instead"
+        raise FitError(text + remedy, "camera", file)
 
 
 def _causes(captures: Captures, expected: Array, measured: Array, is_large: Mask) -> Iterator[tuple[float, str]]:
@@ -58,9 +52,9 @@ def _causes(captures: Captures, expected: Array, measured: Array, is_large: Mask
     per_dioptre = float(np.median(expected / np.abs(defocus)))
 
     def place(defocus: float) -> str:
-        """The distance with this defocus [1/m], as text; empty if no distance has it."""
+        """The distance with this defocus [1/m], as text."""
         vergence = 1 / captures.focus_m - defocus
-        return f"{1 / vergence:.3g} m" if vergence > 0 else ""
+        return f"{1 / vergence:.3g} m" if vergence > 0 else "beyond infinity"
 
     if captures.promised_px is not None:
         factor = _common_factor(expected, measured)  # of all blurs
@@ -84,14 +78,13 @@ def _causes(captures: Captures, expected: Array, measured: Array, is_large: Mask
     if is_large.sum() < 3:
         return
     for i in np.flatnonzero(is_large).tolist():
-        stands = place(math.copysign(measured[i] / per_dioptre, defocus[i])) or "beyond infinity"
+        stands = place(math.copysign(measured[i] / per_dioptre, defocus[i]))
         text = f"the distance of {distance[i]:g} m is misread: by its blur it stands at {stands}"
         yield _misfit(expected, measured, is_large & (np.arange(len(distance)) != i)), text
     if (defocus[is_large] > 0).any() and (defocus[is_large] < 0).any():
         shifts = np.linspace(-1, 1, 401) * float(np.abs(defocus).max())
         misfit, shift = min((_misfit(per_dioptre * np.abs(defocus - m), measured, is_large), m) for m in shifts)
-        if stands := place(shift):
-            yield misfit, f"the lens was focused at {stands}, not at {captures.focus_m:g} m"
+        yield misfit, f"the lens was focused at {place(shift)}, not at {captures.focus_m:g} m"
 
 
 def _common_factor(expected: Array, measured: Array) -> float:
@@ -141,7 +134,7 @@ def check_reach(
     for name, value, kind in (("table", table, BlurTable), ("camera", camera, Camera)):
         if not isinstance(value, kind):
             raise FitError(f"{name} must be a torchdof.{kind.__name__}, got {show(value)}")
-    if any(isinstance(getattr(camera, name), torch.Tensor) for name in Camera.__dataclass_fields__):
+    if any(isinstance(value, torch.Tensor) for value in vars(camera).values()):
         raise FitError("camera must hold plain numbers, got tensors; check one item of a batch at a time")
     checked(number, "width_px", width_px, 0, unit="pixels")
     near, far = checked(number, "near_m", near_m, 0, 1e300), checked(number, "far_m", far_m, 0, infinite=True)

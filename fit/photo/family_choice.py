@@ -8,9 +8,7 @@ from numpy.typing import ArrayLike
 from ..problems import FitError, a_picture
 from ..result import Array
 
-COST = ("gaussian", "disc", "ring", "softm", "radial")
-"""Families by growing number of parameters."""
-
+COST = ("gaussian", "disc", "ring", "softm", "radial")  # families by growing number of parameters
 _CONTRAST = 0.22  # standard deviation of a photograph's levels over their peak
 _WIDTH = 256  # px; smallest picture for the comparison
 _BIC_TIE = 2.0  # difference of BIC that is not significant

@@ -242,11 +242,9 @@ def _with_uncertainty(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
 
 
 def _fit_colours(pair: Capture, focus_m: float, mean: BlurFit) -> list[BlurFit]:
-    """Fits red, green and blue like their mean.
-
-    The softness of the sharpest colour is used for all, so that each kernel contains all of its colour's blur.
-    """
+    """Fits red, green and blue like their mean."""
     sharp_colours, blurred_colours = pair.colours or ((), ())
+    # the sharpest colour's softness is used for all, so that each kernel contains all of its colour's blur
     softness = min(soft_edge(sharp, find_dot(sharp, file=pair.files[0])).softness for sharp in sharp_colours)
     fixed: dict[str, Any] = {"magnification": mean.magnification, "fit_magnification": False, "softness": softness}
     windows = zip(sharp_colours, blurred_colours, strict=True)

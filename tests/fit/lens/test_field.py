@@ -92,18 +92,3 @@ def test_lateral_colour_displaces_the_colours_of_a_point() -> None:
     across = picture.sum(1) @ (torch.arange(width) - column).double() / picture.sum((1, 2))
     assert centres[2] - centres[0] > 0.2  # px
     assert (across - across[1]).tolist() == pytest.approx([c - centres[1] for c in centres], abs=0.05)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"field": (1.0, 20.0)}, "from 0 on"),
-        ({"field": (0.0, 20.0, 10.0)}, "must be increasing"),
-        ({"field": (0.0, 20.0), "field_mm": 3.0}, "give one of them"),
-        ({"field": (0.0, 20.0), "field_nodes": 1}, "field_nodes must be"),
-        ({"field": (0.0, 20.0), "field_rays": 5}, "field_rays must be"),
-    ],
-)
-def test_bad_fields_are_refused_by_name(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        trace_table(GAUSS, 2.0, 2.0, **change)

@@ -173,7 +173,7 @@ PAIR = Capture(np.zeros((31, 31)), np.zeros((31, 31)), 1.0)
 
 
 @pytest.mark.parametrize(
-    ("pairs", "f_number", "match"), [((), 2, "no pair"), ((PAIR,) * 2, 2, "increasing"), ((PAIR,), -2, "-2")]
+    ("pairs", "f_number", "match"), [((), 2, "one or more"), ((PAIR,) * 2, 2, "increasing"), ((PAIR,), -2, "-2")]
 )
 def test_captures_from_arrays_are_checked(pairs, f_number, match):
     with pytest.raises(FitError, match=match):
