@@ -29,7 +29,6 @@ Kind = Literal[  # the subject of a problem
     "not finite",  # NaN or infinity in the data
     "not in focus",  # the sharp picture is soft
     "not linear",  # the pictures are not in linear light, or their encoding is unknown
-    "outside measured",  # a table is used outside its measured range
     "residual",  # the residual is far above the noise
     "saturated",  # pixels are clipped, or blacks are cut off
     "several dots",  # more than one dot where one was expected

@@ -66,7 +66,7 @@ def trace_table(
     ``f_number`` and ``focus_m``: render with that camera. Nodes are placed where interpolation would be worst, as many
     as are needed for 50 dB on a natural image between them.
 
-    The table is exact for its focus and f-number only; :func:`torchdof.fit.check_reach` warns of others.
+    The table is exact for its focus and f-number only.
 
     Args:
         lens: The prescription.

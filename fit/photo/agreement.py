@@ -5,13 +5,8 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
-import torch
 
-from torchdof.optics.blur_table import BlurTable
-from torchdof.optics.camera import Camera
-from torchdof.validation import number, show
-
-from ..problems import FitError, checked, warn
+from ..problems import FitError, warn
 from ..result import Array, Mask
 from .captures import CAMERA, Captures
 
@@ -99,62 +94,3 @@ def _misfit(expected: Array, measured: Array, is_large: Mask) -> float:
     difference = np.maximum(np.abs(measured - expected) - 0.5, 0.0)
     factor = np.log1p(difference / np.maximum(np.minimum(measured, expected), 1e-9))
     return float(np.max(np.where(is_large, factor, 0.0)))
-
-
-def check_reach(
-    table: BlurTable, camera: Camera, near_m: float, far_m: float, width_px: int = 1920
-) -> dict[str, float]:
-    """Checks whether a scene and camera are inside the range in which a table was measured.
-
-    Kernels are looked up by the signed circle of confusion; a lens's aberrations also change with focus and f-number.
-
-    Args:
-        table: with the provenance written by `fit_table` or `trace_table`.
-        camera: the camera for rendering.
-        near_m: nearest depth of the scene, m.
-        far_m: farthest depth of the scene, m; `inf` allowed.
-        width_px: width of the image, px.
-
-    Returns:
-        Ratios of used to measured: "coc" (the scene's largest circle of confusion over the largest measured one on the
-        same side), "f_number" and "focus_m" (1 if unknown).
-
-    Raises:
-        FitError: the depths are not 0 < near <= far.
-
-    Warns:
-        FitWarning: of kind "outside measured", for each of the three outside the measured range.
-
-    Example:
-        >>> table = BlurTable("disc", [-0.1, 0.1], {"radius": [0.1, 0.1]}, unit="mm", sensor_width_mm=36.0)
-        >>> factors = check_reach(table, Camera(f_number=8.0), near_m=1.5, far_m=3.0)
-        >>> factors["coc"] < 1
-        True
-    """
-    for name, value, kind in (("table", table, BlurTable), ("camera", camera, Camera)):
-        if not isinstance(value, kind):
-            raise FitError(f"{name} must be a torchdof.{kind.__name__}, got {show(value)}")
-    if any(isinstance(value, torch.Tensor) for value in vars(camera).values()):
-        raise FitError("camera must hold plain numbers, got tensors; check one item of a batch at a time")
-    checked(number, "width_px", width_px, 0, unit="pixels")
-    near, far = checked(number, "near_m", near_m, 0, 1e300), checked(number, "far_m", far_m, 0, infinite=True)
-    if near > far:
-        raise FitError(f"depths must be near_m <= far_m, got {near_m} and {far_m}")
-    factors = {"coc": 0.0, "f_number": 1.0, "focus_m": 1.0}
-    if table.unit != "relative":
-        depth = torch.tensor([near, far], dtype=torch.float64)[None, None, None]
-        for coc in (camera.coc_px(depth, width=width_px) / table.px_per_unit(width_px)).flatten().tolist():
-            measured = max((abs(c) for c in table.coc.tolist() if c * coc > 0), default=0.0)
-            factors["coc"] = max(factors["coc"], abs(coc) / measured if measured else math.inf if coc else 0.0)
-    if factors["coc"] > 1.0001:
-        largest = "the other side of focus" if math.isinf(factors["coc"]) else f"{factors['coc']:.2g} times the largest"
-        text = f"the scene's blur is {largest} that was measured; beyond it kernels are scaled as a thin lens would"
-        warn(text, "outside measured")
-    for name, limit in (("f_number", 1.05), ("focus_m", 1.25)):
-        measured_at, used_at = table.provenance.get(name), float(getattr(camera, name))
-        if isinstance(measured_at, int | float) and 0 < measured_at < math.inf and math.isfinite(used_at):
-            factors[name] = used_at / measured_at
-        if max(factors[name], 1 / factors[name]) > limit:
-            text = f"the table was measured at {name} {measured_at:g} and is used at {used_at:g}"
-            warn(f"{text}; the shape of the blur differs", "outside measured")
-    return factors

@@ -1,13 +1,10 @@
-"""Checks of measured blur against the thin lens: wrong camera numbers, distances and crops; and reach of a table."""
-
-import math
+"""Checks of measured blur against the thin lens: wrong camera numbers, distances and crops."""
 
 import numpy as np
 import pytest
 import torch
 
-from torchdof import BlurTable, Camera
-from torchdof.fit import Capture, Captures, FitError, FitWarning, check_reach, fit_captures, read_captures
+from torchdof.fit import Capture, Captures, FitError, FitWarning, fit_captures, read_captures
 from torchdof.fit.photo.agreement import check_agreement
 from torchdof.io.images import Picture, read_image, write_image
 
@@ -122,26 +119,3 @@ def test_dots_of_one_frame_share_a_scale_if_the_camera_is_unknown(simulator):
     shown = [t.kernels(torch.tensor([8.0], dtype=torch.float64), 600) for t in (centre.table, corner.table)]
     widths = [float((k[0, 0].sum(0) > 1e-3).sum()) for k in shown]
     assert corner.coc_px == centre.coc_px and widths[1] < 0.75 * widths[0]
-
-
-LENS = Camera(focal_length_mm=50.0, f_number=4.0, focus_m=2.0, sensor_width_mm=36.0)
-KNOWN = {"f_number": 4.0, "focus_m": 2.0}
-MEASURED = BlurTable("disc", [-0.1, 0.1], {"radius": [0.1, 0.1]}, unit="mm", sensor_width_mm=36.0, provenance=KNOWN)
-ONE_SIDED = BlurTable("disc", [0.5], {"radius": [0.5]}, unit="mm", sensor_width_mm=36.0)
-
-
-@pytest.mark.parametrize(
-    ("table", "change", "near_m", "far_m", "name", "factor", "message"),
-    [
-        (MEASURED, {}, 1.6, 3.0, "coc", 0.534, None),
-        (MEASURED, {}, 0.5, 3.0, "coc", 4.81, "4.8 times the largest that was measured"),
-        (ONE_SIDED, {}, 1.0, 3.0, "coc", math.inf, "other side of focus"),
-        (MEASURED, {"f_number": 8.0}, 1.9, 2.1, "f_number", 2.0, "measured at f_number 4 and is used at 8"),
-        (MEASURED, {"focus_m": 4.0}, 3.9, 4.1, "focus_m", 2.0, "measured at focus_m 2 and is used at 4"),
-    ],
-)
-def test_a_table_used_outside_the_measured_range_warns(simulator, table, change, near_m, far_m, name, factor, message):
-    factors, found = simulator.result_and_warnings(lambda: check_reach(table, LENS.replace(**change), near_m, far_m))
-    assert factors[name] == pytest.approx(factor, rel=0.02)
-    assert [w.kind for w in found] == ["outside measured"] * (message is not None)
-    assert message is None or message in str(found[0])
