@@ -1,4 +1,4 @@
-"""Figures of a fit and of a table, and a sheet that documents a calibration, drawn with matplotlib."""
+"""Figures of a fit, and a sheet that documents a calibration, drawn with matplotlib."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from torchdof.optics.blur_table import BlurTable
-from torchdof.optics.psf import LENGTHS
 
 from .photo.profile_fit import evaluate
 from .problems import FitError
@@ -54,34 +53,6 @@ def _model_line(fit: BlurFit) -> tuple[Array, Array]:
     count = np.bincount(bins)
     r, level = (np.bincount(bins, row)[count > 0] / count[count > 0] for row in fit.curve)
     return r, level
-
-
-def picture_of_table(table: BlurTable, title: str = "") -> Figure:
-    """A table over depth: every parameter at its nodes, and the table's interpolation between them."""
-    names = list(table.node_params)
-    figure, axes = _new_figure(3.2 * len(names), 3.2, len(names))
-    largest_coc, scale = float(table.coc.abs().max()), table.px_per_unit(1.0)
-    coc = torch.linspace(-largest_coc, largest_coc, 401, dtype=torch.float64)
-    interpolated = table.params(coc * scale, 1.0)
-    unit = {"mm": "mm", "fraction": "of the width", "relative": "relative"}[table.unit]
-    for ax, name in zip(np.atleast_1d(axes), names, strict=True):
-        nodes = table.node_params[name]
-        if name == "values":
-            picture = interpolated[name][0].T.numpy()
-            extent = (-largest_coc, largest_coc, 0, 1)
-            profiles = picture / np.maximum(picture.max(axis=0), 1e-12)
-            ax.imshow(profiles, aspect="auto", origin="lower", cmap="magma", extent=extent)
-            ax.set(ylabel="r / radius", title="profile, each over its peak")
-        else:
-            unit_scale = scale if name in LENGTHS else 1.0
-            for channel in range(nodes.shape[0]):
-                colour = _MODEL if nodes.shape[0] == 1 else ("#dc2626", "#16a34a", "#2563eb")[channel % 3]
-                ax.plot(coc, interpolated[name][channel] / unit_scale, color=colour, linewidth=1)
-                ax.plot(table.coc, nodes[channel], "o", color=colour, markersize=3)
-            ax.set(ylabel=name + (f" [{unit}]" if name in LENGTHS else ""))
-        ax.set(xlabel=f"signed coc [{unit}]")
-    figure.suptitle(title or f"{table.name or 'table'} ({table.family})", fontsize=10)
-    return figure
 
 
 def sheet_of_photographs(

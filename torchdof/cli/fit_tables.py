@@ -57,10 +57,6 @@ def trace_lens(command: Fit, source: str, console: Console) -> None:
     _write(console, table, command.out)
     if command.as_json:
         print(json_line({"out": str(command.out), "family": table.family, **facts}))
-    if command.plots is not None:
-        from torchdof.fit.plots import picture_of_table
-
-        _save(console, picture_of_table(table), command.plots / f"{command.out.stem}_table.png")
 
 
 def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[warnings.WarningMessage]) -> None:
@@ -139,12 +135,11 @@ def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[w
             except ModuleNotFoundError as error:
                 console.print(f"no sheet of pictures: {error.name} is not installed (pip install torchdof[plot])")
         elif command.plots is not None:
-            from torchdof.fit.plots import picture_of_fit, picture_of_table
+            from torchdof.fit.plots import picture_of_fit
 
             for pair, fit in zip(captures, result.fits, strict=True):
                 picture = command.plots / f"{out.stem}_{1000 * pair.distance_m:.0f}mm.png"
                 _save(console, picture_of_fit(fit), picture)
-            _save(console, picture_of_table(result.table), command.plots / f"{out.stem}_table.png")
         if command.as_json:
             print(json_line(facts), flush=True)
     if across_field:
