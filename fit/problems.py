@@ -107,6 +107,5 @@ def a_picture(name: str, picture: ArrayLike, smallest: int, file: str | None = N
     """A picture `[H, W]` of finite numbers with at least `smallest` pixels on each side, or a `FitError`."""
     array = real_numbers(name, picture, "[H, W] of one colour", file)
     if min(array.shape) < smallest:
-        text = f"{name} must be [H, W] with at least {smallest} pixels on a side, got {list(array.shape)}"
-        raise FitError(text, file=file)
+        raise FitError(f"{name} must be [H, W], at least {smallest} pixels on a side, got {[*array.shape]}", file=file)
     return array

@@ -68,8 +68,7 @@ def _causes(captures: Captures, expected: Array, measured: Array, is_large: Mask
     for i, k in combinations(range(len(distance)), 2):
         exchanged = expected.copy()
         exchanged[[i, k]] = expected[[k, i]]
-        text = f"the pictures at {distance[i]:g} and {distance[k]:g} m are exchanged"
-        yield _misfit(exchanged, measured, is_large), text
+        yield _misfit(exchanged, measured, is_large), f"pictures at {distance[i]:g} and {distance[k]:g} m are exchanged"
     if is_large.sum() < 3:
         return
     for i in np.flatnonzero(is_large).tolist():

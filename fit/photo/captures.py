@@ -128,8 +128,7 @@ def check_distances(distances: Sequence[float], focus: float, where: str | None 
     checked(number, "focus_m", focus, 0, 1e100, "metres")
     numbers = [checked(number, "distance_m", distance, -1e100, 1e100, "metres") for distance in distances]
     if not all(previous < distance for previous, distance in pairwise([0.0, *numbers])):
-        text = f"distances must be positive and increasing, got {', '.join(f'{d:g}' for d in numbers)} m"
-        raise FitError(text, "distance", where)
+        raise FitError(f"distances must be positive and increasing, got {numbers} m", "distance", where)
     if focus in numbers:
         raise FitError(f"a shot lies at the focus ({focus:g} m) and has no blur", "distance", where)
 

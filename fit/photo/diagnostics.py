@@ -254,8 +254,7 @@ def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | Non
         cause = ", as out of focus; the dot was fitted as it would be in focus: focus again, or print a sharper dot"
     else:
         cause = f", as out of focus; {effect}: focus again"
-    text = f"the sharp picture is soft: its dot's edge has a width of {edge.softness:.1f} px{cause}"
-    warn(text, "not in focus", file)
+    warn(f"the sharp picture is soft: its dot's edge is blurred by {edge.softness:.1f} px{cause}", "not in focus", file)
 
 
 def check_fit(solution: Solution, fit: BlurFit, file: str | None, freest: BlurFit) -> None:
@@ -286,8 +285,7 @@ def check_fit(solution: Solution, fit: BlurFit, file: str | None, freest: BlurFi
         warn(f"{text}, and not a strong JPEG?{simple}", "residual", file)
     change = fit.magnification / pair.magnification
     if abs(np.log(change)) > _MAGNIFICATION_LOG:
-        text = f"the blurred dot is {change:.3f} times the size it should have; are distances right and light linear?"
-        warn(text, "magnification", file)
+        warn(f"the blurred dot is {change:.3f} times the size it should have; check distances", "magnification", file)
     beyond = (pair.distance > pair.dot.reach + 4) & pair.used
     if beyond.any():  # the residual is not sensitive to small spots
         smoothed = np.where(beyond, gaussian_filter(pair.picture(solution.residual), 2.0, mode="constant"), -np.inf)
@@ -316,5 +314,4 @@ def check_fit(solution: Solution, fit: BlurFit, file: str | None, freest: BlurFi
             warn(f"{name} ended on its bound {value:.4g}; it is only a limit", "boundary", file)
     size, error = size_of_blur(solution)
     if not error < 0.5 * size:
-        text = f"the blur's rms radius of {size:.3g} ± {error:.2g} px is not determined: too little blur, or too noisy"
-        warn(text, "flat profile", file)
+        warn(f"too little blur or light: its rms radius is {size:.3g} ± {error:.2g} px", "flat profile", file)

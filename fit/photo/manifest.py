@@ -113,8 +113,7 @@ def read_captures(
     check_distances([shot["distance_m"] for shot in shots], focus, manifest_name)
     nearest = min(focus, shots[0]["distance_m"])
     if nearest > _FAR_M:
-        text = f"all distances are at least {nearest:g} m; they are in metres: divide millimetres by 1000"
-        warn(text, "distance", manifest_name)
+        warn(f"all distances are at least {nearest:g} m; divide millimetres by 1000", "distance", manifest_name)
     if root is not None:
         for name in filter(None, [manifest["sharp"], *files, manifest["dark"]]):
             inside(folder_path / name, root, manifest_name)

@@ -78,8 +78,7 @@ def find_target(light: Array, *, file: str | None = None) -> Target:
     thresholds = low + _THRESHOLDS * (high - low)
     candidates = [target for level in thresholds for target in _squares(thumbnail, thumbnail < level)]
     if not candidates:
-        text = "no target found: show a black square with a white dot, white paper around it, evenly lit and square on"
-        raise FitError(text, "no dot", file)
+        raise FitError("no target found: show the black square with its dot on white paper, evenly lit", "no dot", file)
     best = max(candidates, key=lambda t: (t.white - t.black) / max(t.white + t.black, 1e-12))  # highest contrast
     x, y = ((v + 0.5) * step - 0.5 for v in (best.x, best.y))
     return _refined(light, replace(best, x=x, y=y, side_px=best.side_px * step))
