@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..problems import FitError, warn
-from ..result import Array, Mask
+from ..result import Array
 from .captures import CAMERA, Captures
 
 _MIN_BLUR_PX = 2.0  # radius of a blur that counts; smaller ones are dominated by aberrations
@@ -17,10 +17,17 @@ _WARN_LOG, _REFUSE_LOG = math.log(1.15), math.log(1.35)
 def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> None:
     """Compares the fitted radius at each distance with the camera's, or without one with the other distances'."""
     measured, camera_px = np.asarray(radius_px, dtype=np.float64), captures.promised_px
-    defocus = np.abs(captures.defocus)
-    expected = defocus * _common_factor(defocus, measured) if camera_px is None else np.abs(camera_px)
+    if camera_px is None:  # the scale is a median weighted by the defocus, so that one wrong distance has no effect
+        defocus = np.abs(captures.defocus)
+        order = np.argsort(measured / defocus)
+        weight = np.cumsum(defocus[order])
+        expected = defocus * (measured / defocus)[order][np.searchsorted(weight, 0.5 * weight[-1])]
+    else:
+        expected = np.abs(camera_px)
     is_large = np.maximum(expected, measured) > _MIN_BLUR_PX
-    misfit_log = _misfit(expected, measured, is_large)
+    difference = np.maximum(np.abs(measured - expected) - 0.5, 0.0)  # half a pixel is for aberrations
+    misfit = np.log1p(difference / np.maximum(np.minimum(measured, expected), 1e-9))
+    misfit_log = float(np.max(np.where(is_large, misfit, 0.0)))
     # without a camera the scale is fitted to the distances themselves
     if int(is_large.sum()) < (3 if camera_px is None else 1) or misfit_log < _WARN_LOG:
         return
@@ -35,17 +42,3 @@ def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> N
     if misfit_log > _REFUSE_LOG:
         raise FitError(text, "camera", file)
     warn(text, "camera", file)
-
-
-def _common_factor(expected: Array, measured: Array) -> float:
-    """Measured over expected: a median weighted by the expected values, so that one wrong distance has no effect."""
-    order = np.argsort(measured / expected)
-    weight = np.cumsum(expected[order])
-    return float((measured / expected)[order][np.searchsorted(weight, 0.5 * weight[-1])])
-
-
-def _misfit(expected: Array, measured: Array, is_large: Mask) -> float:
-    """Largest |log(measured / expected)|, after subtracting half a pixel for aberrations."""
-    difference = np.maximum(np.abs(measured - expected) - 0.5, 0.0)
-    factor = np.log1p(difference / np.maximum(np.minimum(measured, expected), 1e-9))
-    return float(np.max(np.where(is_large, factor, 0.0)))
