@@ -9,7 +9,7 @@ from torchdof.optics.psf import LENGTHS
 
 from ..problems import FitError, warn
 from ..result import Array, BlurFit
-from .dot import Dot, fine_variance, independent_share, inner_pixels, noise_of
+from .dot import Dot, correlate, fine_variance, independent_share, inner_pixels, noise_of
 from .forward import OPENINGS, SHAPES, Solution, without_level
 from .source import UNFOCUSED_PX, Edge, soft_edge
 from .target import untoned
@@ -67,7 +67,8 @@ def unexplained(solution: Solution, basis: Array) -> tuple[Array, Array, Array]:
     # a smooth deviation must not count as noise: use the level beside the dot and inside it. Noise cannot exceed the
     # residual: in a JPEG, dark areas have less noise than the level in the light suggests
     variance = min(noise_near(solution), residual_rms(solution)) ** 2
-    correlated = solution.pair.correlated_noise(visible, solution.pair.noise_correlation)
+    pair = solution.pair
+    correlated = correlate(pair.picture(visible.T), pair.noise_correlation)[:, pair.used].T
     return visible.T @ solution.residual, variance * visible.T @ correlated, visible
 
 

@@ -147,7 +147,8 @@ class Forward:
         source_variance = (gain * self.source.noise) ** 2 / self.fine_share
         # the sharp picture's noise passes through the kernel, which correlates it; the rest is the defocused picture's
         own_variance = max(variance - source_variance * float(np.sum(kernel**2)), 0.1 * variance)
-        score_cov = own_variance * (slopes.T @ self.correlated_noise(slopes, correlation))
+        correlated = correlate(self.picture(slopes.T), correlation)[:, self.used].T
+        score_cov = own_variance * (slopes.T @ correlated)
         if source_variance > 0:  # (K' J)' (K' J) over the source's pixels with noise
             has_source_noise = self.distance <= self.source.reach * self.magnification
             spread = np.where(has_source_noise, self.blurred(self.picture(slopes.T), kernel[None]), 0.0)
@@ -156,10 +157,6 @@ class Forward:
         covariance = information_inverse @ score_cov @ information_inverse
         covariance[~is_determined, ~is_determined] = np.inf
         return np.asarray(covariance)
-
-    def correlated_noise(self, columns: Array, correlation: Array) -> Array:
-        """Product of the noise's correlation matrix with columns `[pixels used, p]`."""
-        return correlate(self.picture(columns.T), correlation)[:, self.used].T
 
     def project(self, shaped: Array) -> tuple[Array, float, float]:
         """Fits gain and background by linear least squares; returns the model of the used pixels, and both."""

@@ -43,10 +43,12 @@ def test_pictures_without_a_stated_transfer_give_a_warning(run: Run, folder: Pat
     shutil.copytree(folder, tmp_path / "lens")
     manifest = tmp_path / "lens" / "capture.toml"
     manifest.write_text(manifest.read_text().replace('transfer = "srgb"', ""))
-    facts = json.loads(run("fit", tmp_path / "lens", "-o", tmp_path / "mine.json", "--family", "disc", "--json"))
+    options = ("-o", tmp_path / "mine.json", "--family", "disc", "--colours", "each", "--json")
+    facts = json.loads(run("fit", tmp_path / "lens", *options))
     assert facts["name"] == "my lens" and facts["focus_m"] == 0.5 and facts["family"] == "disc"
     assert [fit["distance_m"] for fit in facts["fits"]] == [0.4, 0.8, 1.0]
     assert all(fit["stderr"]["radius"] > 0 for fit in facts["fits"])
+    assert [colour["name"] for colour in facts["colours"]] == ["red", "green", "blue"]
     assert "the encoding of 0500mm.png and 3 more is not stated" in facts["warnings"][0]
 
 
