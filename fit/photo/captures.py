@@ -203,7 +203,7 @@ def cut_pairs(
             text = f"taken at {word} {after:g} by EXIF, {sharp.file.name} at {before:g}; change neither"
             raise FitError(text, "manifest", blurred_file)
     if dots == "one":
-        matched = [[find_dot(picture.light, file=str(picture.file)) for picture in pictures]]
+        matched = [(find_dot(sharp.light, file=str(sharp.file)), find_dot(blurred.light, file=blurred_file))]
     else:
         matched = _matched(sharp, blurred, magnification)[: 1 if dots == "centre" else None]
     for both in matched:
