@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from torchdof.optics.blur_table import BlurTable
-
 from .photo.profile_fit import evaluate
 from .problems import FitError
 from .result import Array, BlurFit
@@ -55,10 +53,8 @@ def _model_line(fit: BlurFit) -> tuple[Array, Array]:
     return r, level
 
 
-def sheet_of_photographs(
-    photographs: Photographs, result: TableFit, render: Callable[[torch.Tensor, torch.Tensor, BlurTable], torch.Tensor]
-) -> Figure:
-    """Draws each distance's target, dot, fit, residual and kernel; and with `render` lights and the sharp dot."""
+def sheet_of_photographs(photographs: Photographs, result: TableFit, blur: Callable[..., torch.Tensor]) -> Figure:
+    """Draws each distance's target, dot, fit, residual and kernel; and lights, by `blur`: `torchdof.blur_by_coc`."""
     captures = photographs.captures
     rows = len(captures)
     figure, axes = _new_figure(12.5, 2.1 * rows + 2.6, 5, rows + 1)
@@ -81,28 +77,15 @@ def sheet_of_photographs(
         _show(kernel, kernels[0, 0].detach().numpy(), f"kernel at coc {coc:+.2f} px")
     for unused in axes[rows]:
         unused.remove()
-    grid = axes[rows, 0].get_gridspec()
-    (sharp,) = (p for p in photographs.pictures if p.file == captures.notes["sharp"])
-    window = sharp.target.window(sharp.light, int(min(sharp.target.side_px / 4, 120)))
-    largest_coc, most_blurred = max(zip(result.coc_px, captures, strict=True), key=lambda node: abs(node[0]))
     scene = 0.15 + 0.1 * (np.arange(720) // 12 % 2) * np.ones((90, 1))  # small lights on stripes
     scene[44:46, 18::36] = 25.0
-
-    def rendered(part: Array, left: float, right: float) -> Array:
-        """Renders a part `[H, W]` of the frame, with a circle of confusion from `left` to `right` px."""
-        coc = torch.linspace(left, right, part.shape[1]).expand(1, 1, *part.shape)
-        table = result.table
-        if table.sensor_width_mm is not None:  # the part has its own share of the sensor
-            table = table.replace(sensor_width_mm=table.sensor_width_mm * part.shape[1] / captures.width_px)
-        picture = render(torch.from_numpy(part).float()[None, None], coc, table)
-        return np.clip(picture[0, 0].numpy().astype(np.float64), 0, 1)
-
-    lights = rendered(scene, min(0.0, *result.coc_px), max(0.0, *result.coc_px))
+    coc_px = torch.linspace(min(0.0, *result.coc_px), max(0.0, *result.coc_px), 720).expand(1, 1, 90, 720)
+    table = result.table
+    if table.sensor_width_mm is not None:  # the scene has its own share of the sensor
+        table = table.replace(sensor_width_mm=table.sensor_width_mm * scene.shape[1] / captures.width_px)
+    lights = blur(torch.from_numpy(scene).float()[None, None], coc_px, table=table)[0, 0].double().numpy()
     caption = "lights and edges from one end of the measured distances through the focus to the other, with this table"
-    _show(figure.add_subplot(grid[rows, :3]), lights, caption)
-    _show(figure.add_subplot(grid[rows, 3]), window, f"{sharp.file}, in focus")
-    caption = f"with this table, as at {most_blurred.distance_m:.3f} m"
-    _show(figure.add_subplot(grid[rows, 4]), rendered(window, largest_coc, largest_coc), caption)
+    _show(figure.add_subplot(axes[rows, 0].get_gridspec()[rows, :]), np.clip(lights, 0, 1), caption)
     return figure
 
 

@@ -109,10 +109,8 @@ def test_photographs_of_the_target_become_a_table_and_a_sheet(
     table = BlurTable.load(tmp_path / "phone.json")
     assert table.unit == "mm" and table.provenance["sharp"] == "img_0000.jpg"
     assert (tmp_path / "phone.png").stat().st_size > 20_000
-    # the first call renders lights at every CoC, the second the photograph in focus at the largest CoC
-    (_, lights), (photograph, coc_px) = rendered
-    assert lights.min() == 0 and coc_px.unique().tolist() == [lights.max()]
-    assert photograph.shape[-1] > 60 and photograph.max() > 0.7 and photograph[..., :5].max() < 0.1
+    ((picture, lights),) = rendered  # lights at every CoC
+    assert lights.min() == 0 and lights.max() > 1 and picture.shape == lights.shape
 
 
 def test_a_lens_is_traced_in_its_colours_and_across_its_field(

@@ -128,10 +128,7 @@ def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[w
             try:
                 from torchdof.fit.plots import sheet_of_photographs
 
-                sheet = sheet_of_photographs(
-                    photographs, result, lambda *scene: blur_by_coc(*scene[:2], table=scene[2])
-                )
-                _save(console, sheet, out.with_suffix(".png"))
+                _save(console, sheet_of_photographs(photographs, result, blur_by_coc), out.with_suffix(".png"))
             except ModuleNotFoundError as error:
                 console.print(f"no sheet of pictures: {error.name} is not installed (pip install torchdof[plot])")
         elif command.plots is not None:
