@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchdof.fit import Capture, Captures, FitError, FitWarning, fit_captures, read_captures
-from torchdof.fit.photo.agreement import check_agreement
+from torchdof.fit.photo.table import check_agreement
 from torchdof.io.images import Picture, read_image, write_image
 
 DISTANCES = (0.6, 0.7, 0.8, 1.25, 1.5, 2.0)
