@@ -106,7 +106,7 @@ fit --lens double_gauss_50mm --root .            | --root is the folder of photo
 fit --lens double_gauss_50mm --wavelengths red   | --wavelengths takes rgb, or micrometres
 fit --lens double_gauss_50mm --field-deg 95      | --field-deg must be 0 to 90
 fit --lens double_gauss_50mm --field 0,6 --field-deg 5 | give one of them
-fit --lens double_gauss_50mm --field 0,12,6      | --field takes distances in mm
+fit --lens double_gauss_50mm --field 0,12,6      | --field must be increasing distances in mm
 fit --lens double_gauss_50mm --focus-m 0.01      | --focus-m must be
 """
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -14,16 +12,6 @@ import click
 from torchdof.cli.command import Command, Group, argument, numbers, option, reader
 from torchdof.cli.options import make_folder_of
 from torchdof.io.atomic import check_writable
-
-_NUMBERS = numbers(None, "expected numbers")
-
-
-def _radii(text: str) -> tuple[float, ...]:
-    """Reads distances in mm from the middle of the frame, rising from 0."""
-    radii_mm = _NUMBERS(text)
-    if len(radii_mm) < 2 or radii_mm[0] != 0 or not all(low < high < math.inf for low, high in pairwise(radii_mm)):
-        raise ValueError
-    return radii_mm
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,15 +52,13 @@ class _Lens(Group):
     field: tuple[float, ...] | None = option(
         "One table across the field, of spots at these distances from the middle; to 21.6 for full frame.",
         metavar="0,MM,MM,...",
-        read=reader(
-            "--field takes distances in mm from the middle of the frame, rising from 0, like 0,7,14,21.6", _radii
-        ),
+        read=numbers(None, "--field takes distances in mm from the middle of the frame, like 0,7,14,21.6"),
     )
     wavelengths: tuple[float, ...] | None = option(
         "One table a colour: rgb, or micrometres like 0.65,0.55,0.45; for lenses with Abbe numbers.",
-        read=reader(
+        read=reader(  # () stands for red, green and blue
             "--wavelengths takes rgb, or micrometres like 0.65,0.55,0.45",
-            lambda text: () if text == "rgb" else _NUMBERS(text),  # () stands for red, green and blue
+            lambda text: () if text == "rgb" else tuple(map(float, text.split(","))),
         ),
     )
 
@@ -111,7 +97,7 @@ class Fit(_Photographs, _Target, _Lens, Command):
         if self.target is None and (self.captures is None) == (self.lens is None):
             raise ValueError("give either a folder of captures or --lens FILE")
         if self.lens is not None and (self.root or self.plots):
-            raise ValueError("--root and --plots are for photographs; leave them out with --lens")
+            raise ValueError("--root is the folder of photographs, --plots of their fits; leave them out with --lens")
         if self.out.suffix != ".json":
             raise ValueError(f"{self.out}: the table is written as JSON: name it {self.out.with_suffix('.json')}")
         if not 0 <= self.field_deg < 90:
