@@ -31,11 +31,11 @@ class _Photographs(Group):
         "Kernel family; auto takes the cheapest that is accurate enough, image any shape.", "auto", basic=True
     )
     accuracy_db: float = option("PSNR on a natural image that auto asks for.", 45.0)
-    dots: Literal["manifest", "one", "centre", "each", "field"] = option(
-        "One dot; the centre of a grid; each dot of it, a table a place; or one table across the field.", "manifest"
+    dots: Literal["one", "centre", "each", "field"] | None = option(
+        "One dot; the centre of a grid; each dot, a table a place; a table across the field. Default: capture.toml's."
     )
-    colours: Literal["manifest", "mean", "each"] = option(
-        "Fit the mean of the colours, or each: a table with a kernel a colour.", "manifest"
+    colours: Literal["mean", "each"] | None = option(
+        "Fit the mean of the colours, or each: a table with a kernel a colour. Default: capture.toml's."
     )
     root: Path | None = option("Folder that capture.toml and all pictures must lie in. Default: anywhere.")
 

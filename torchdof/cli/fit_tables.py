@@ -65,11 +65,9 @@ def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[w
     ``caught`` is the list in which Python collects warnings.
     """
     photographs, printed, fitted = None, set[str](), list[tuple[Captures, TableFit]]()
-    dots: Any = None if command.dots == "manifest" else command.dots
-    colours: Any = None if command.colours == "manifest" else command.colours
     if folder.is_dir() and not (folder / MANIFEST).is_file():
-        mode: Any = colours or "mean"
-        photographs = read_photographs(folder, square_mm=command.square_mm, colours=mode, root=command.root)
+        colours = command.colours or "mean"
+        photographs = read_photographs(folder, square_mm=command.square_mm, colours=colours, root=command.root)
         capture_sets = [photographs.captures]
         sharp, pictures = photographs.captures.notes["sharp"], photographs.pictures
         columns = {
@@ -84,7 +82,7 @@ def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[w
         for sentence in photographs.advice:
             console.print(f"better: {sentence}", style="cyan")
     else:
-        capture_sets = read_captures(str(folder), dots=dots, colours=colours, root=command.root)
+        capture_sets = read_captures(str(folder), dots=command.dots, colours=command.colours, root=command.root)
     across_field = photographs is None and capture_sets[0].notes["dots"] == "field"
     of_fit = ("params", "stderr", "residual", "residual_over_noise", "magnification")
     of_reading = len(caught)
