@@ -21,7 +21,7 @@ import torchdof
 from torchdof.fit import BlurFit, blur_strength, fit_captures, fit_pair, fit_profile, natural_psnr, read_captures
 from torchdof.fit.lens.lens import Lens
 from torchdof.fit.lens.spot import Spot, focus_sensor, point_spread
-from torchdof.fit.plots import picture_of_fit, picture_of_table
+from torchdof.fit.plots import picture_of_fit
 from torchdof.io.images import Picture, write_image
 from torchdof.optics.psf import pixel_kernels
 from torchdof.reference.metrics import psnr
@@ -83,7 +83,6 @@ def draw_experiment(out: Path, lens: Lens) -> None:
 
     table = result.table
     table.save(out / "traced.json")
-    picture_of_table(table).savefig(out / "traced_table.png")
     (coc_px,) = result.coc_px
     draw_texture(table, coc_px, WIDTH, out / "traced_fig3.png")
 

@@ -2,7 +2,6 @@
 
 from .lens.trace import trace_table
 from .photo.across import table_of_dots
-from .photo.agreement import check_reach
 from .photo.captures import Capture, Captures
 from .photo.family_choice import highlight_psnr, natural_psnr
 from .photo.manifest import read_captures
@@ -20,7 +19,6 @@ __all__ = [
     "FitWarning",
     "TableFit",
     "blur_strength",
-    "check_reach",
     "fit_captures",
     "fit_pair",
     "fit_profile",

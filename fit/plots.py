@@ -1,4 +1,4 @@
-"""Figures of a fit and of a table, and a sheet that documents a calibration, drawn with matplotlib."""
+"""Figures of a fit, and a sheet that documents a calibration, drawn with matplotlib."""
 
 from __future__ import annotations
 
@@ -7,9 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-
-from torchdof.optics.blur_table import BlurTable
-from torchdof.optics.psf import LENGTHS
 
 from .photo.profile_fit import evaluate
 from .problems import FitError
@@ -56,42 +53,8 @@ def _model_line(fit: BlurFit) -> tuple[Array, Array]:
     return r, level
 
 
-def picture_of_table(table: BlurTable, title: str = "") -> Figure:
-    """A table over depth: every parameter at its nodes, and the table's interpolation between them."""
-    names = list(table.node_params)
-    figure, axes = _new_figure(3.2 * len(names), 3.2, len(names))
-    largest_coc, scale = float(table.coc.abs().max()), table.px_per_unit(1.0)
-    coc = torch.linspace(-largest_coc, largest_coc, 401, dtype=torch.float64)
-    interpolated = table.params(coc * scale, 1.0)
-    unit = {"mm": "mm", "fraction": "of the width", "relative": "relative"}[table.unit]
-    for ax, name in zip(np.atleast_1d(axes), names, strict=True):
-        nodes = table.node_params[name]
-        if name == "values":
-            picture = interpolated[name][0].T.numpy()
-            extent = (-largest_coc, largest_coc, 0, 1)
-            profiles = picture / np.maximum(picture.max(axis=0), 1e-12)
-            ax.imshow(profiles, aspect="auto", origin="lower", cmap="magma", extent=extent)
-            ax.set(ylabel="r / radius", title="profile, each over its peak")
-        else:
-            unit_scale = scale if name in LENGTHS else 1.0
-            for channel in range(nodes.shape[0]):
-                colour = _MODEL if nodes.shape[0] == 1 else ("#dc2626", "#16a34a", "#2563eb")[channel % 3]
-                ax.plot(coc, interpolated[name][channel] / unit_scale, color=colour, linewidth=1)
-                ax.plot(table.coc, nodes[channel], "o", color=colour, markersize=3)
-            ax.set(ylabel=name + (f" [{unit}]" if name in LENGTHS else ""))
-        ax.set(xlabel=f"signed coc [{unit}]")
-    figure.suptitle(title or f"{table.name or 'table'} ({table.family})", fontsize=10)
-    return figure
-
-
-def sheet_of_photographs(
-    photographs: Photographs, result: TableFit, render: Callable[[torch.Tensor, torch.Tensor, BlurTable], torch.Tensor]
-) -> Figure:
-    """One figure that documents a calibration from photographs.
-
-    One row for each distance: the target, the window around its dot, data and model over the radius, the residual, and
-    the kernel. Below, by `render(image, coc_px, table)`: lights from near to far, and the sharp window blurred most.
-    """
+def sheet_of_photographs(photographs: Photographs, result: TableFit, blur: Callable[..., torch.Tensor]) -> Figure:
+    """Draws each distance's target, dot, fit, residual and kernel; and lights, by `blur`: `torchdof.blur_by_coc`."""
     captures = photographs.captures
     rows = len(captures)
     figure, axes = _new_figure(12.5, 2.1 * rows + 2.6, 5, rows + 1)
@@ -114,28 +77,15 @@ def sheet_of_photographs(
         _show(kernel, kernels[0, 0].detach().numpy(), f"kernel at coc {coc:+.2f} px")
     for unused in axes[rows]:
         unused.remove()
-    grid = axes[rows, 0].get_gridspec()
-    (sharp,) = (p for p in photographs.pictures if p.file == captures.notes["sharp"])
-    window = sharp.target.window(sharp.light, int(min(sharp.target.side_px / 4, 120)))
-    largest_coc, most_blurred = max(zip(result.coc_px, captures, strict=True), key=lambda node: abs(node[0]))
     scene = 0.15 + 0.1 * (np.arange(720) // 12 % 2) * np.ones((90, 1))  # small lights on stripes
     scene[44:46, 18::36] = 25.0
-
-    def rendered(part: Array, left: float, right: float) -> Array:
-        """Renders a part `[H, W]` of the frame, with a circle of confusion from `left` to `right` px."""
-        coc = torch.linspace(left, right, part.shape[1]).expand(1, 1, *part.shape)
-        table = result.table
-        if table.sensor_width_mm is not None:  # the part has its own share of the sensor
-            table = table.replace(sensor_width_mm=table.sensor_width_mm * part.shape[1] / captures.width_px)
-        picture = render(torch.from_numpy(part).float()[None, None], coc, table)
-        return np.clip(picture[0, 0].numpy().astype(np.float64), 0, 1)
-
-    lights = rendered(scene, min(0.0, *result.coc_px), max(0.0, *result.coc_px))
+    coc_px = torch.linspace(min(0.0, *result.coc_px), max(0.0, *result.coc_px), 720).expand(1, 1, 90, 720)
+    table = result.table
+    if table.sensor_width_mm is not None:  # the scene has its own share of the sensor
+        table = table.replace(sensor_width_mm=table.sensor_width_mm * scene.shape[1] / captures.width_px)
+    lights = blur(torch.from_numpy(scene).float()[None, None], coc_px, table=table)[0, 0].double().numpy()
     caption = "lights and edges from one end of the measured distances through the focus to the other, with this table"
-    _show(figure.add_subplot(grid[rows, :3]), lights, caption)
-    _show(figure.add_subplot(grid[rows, 3]), window, f"{sharp.file}, in focus")
-    caption = f"with this table, as at {most_blurred.distance_m:.3f} m"
-    _show(figure.add_subplot(grid[rows, 4]), rendered(window, largest_coc, largest_coc), caption)
+    _show(figure.add_subplot(axes[rows, 0].get_gridspec()[rows, :]), np.clip(lights, 0, 1), caption)
     return figure
 
 

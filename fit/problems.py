@@ -14,7 +14,7 @@ from torchdof.validation import show
 
 from .result import Array
 
-Kind = Literal[
+Kind = Literal[  # the subject of a problem
     "argument",  # an argument of a function is invalid
     "asymmetry",  # the blur is not round
     "boundary",  # a parameter ended on its bound
@@ -29,14 +29,12 @@ Kind = Literal[
     "not finite",  # NaN or infinity in the data
     "not in focus",  # the sharp picture is soft
     "not linear",  # the pictures are not in linear light, or their encoding is unknown
-    "outside measured",  # a table is used outside its measured range
     "residual",  # the residual is far above the noise
     "saturated",  # pixels are clipped, or blacks are cut off
     "several dots",  # more than one dot where one was expected
     "single distance",  # only one distance was measured and is scaled to all others
     "window",  # the window cuts the blur
 ]
-"""The subject of a problem."""
 
 _PACKAGE = str(Path(__file__).parent)
 _BRIGHTEST, _DARKEST = 1e30, 1e-30  # the fourth powers of levels are summed
@@ -109,6 +107,5 @@ def a_picture(name: str, picture: ArrayLike, smallest: int, file: str | None = N
     """A picture `[H, W]` of finite numbers with at least `smallest` pixels on each side, or a `FitError`."""
     array = real_numbers(name, picture, "[H, W] of one colour", file)
     if min(array.shape) < smallest:
-        text = f"{name} must be [H, W] with at least {smallest} pixels on a side, got {list(array.shape)}"
-        raise FitError(text, file=file)
+        raise FitError(f"{name} must be [H, W], at least {smallest} pixels on a side, got {[*array.shape]}", file=file)
     return array

@@ -6,6 +6,7 @@ object. Lengths are in millimetres. :mod:`torchdof.fit.lens.prescription` descri
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,12 +19,10 @@ from torchdof.validation import number, show, whole
 
 from ..result import Array, Mask
 from . import prescription
-from .glass import C_UM, D_UM, F_UM
+from .glass import AIR, C_UM, D_UM, F_UM, catalogue
 from .surface import Surface
 
-RGB_UM = (C_UM, 0.54607, F_UM)
-"""Wavelengths for red, green and blue, in micrometres: the lines C, e and F."""
-
+RGB_UM = (C_UM, 0.54607, F_UM)  # wavelengths for red, green and blue, in micrometres: the lines C, e and F
 _SHIPPED = Path(__file__).parent / "lenses"
 _MAX_MM = 1e12  # mm; limit of focal lengths and other first-order properties
 _RAYS_AT_ONCE = 1 << 14  # rays that fit into the processor's cache together
@@ -154,8 +153,18 @@ class Lens:
         return replace(self, surfaces=tuple(surfaces))
 
     def lines(self) -> list[str]:
-        """The surfaces as lines of a prescription file."""
-        return prescription.lines(self.surfaces, self.stop)
+        """The surfaces as lines of a prescription file, which :meth:`read` turns back into the same lens."""
+        media = [AIR, *(surface.glass for surface in self.surfaces)]
+        named = {g.name: g for g in media if len(g.coefficients) == 6 and g not in catalogue().values()}
+        lines = [" ".join(["glass", name, *map(repr, glass.coefficients)]) for name, glass in named.items()]
+        for i, surface in enumerate(self.surfaces):
+            shape = zip(prescription.SHAPE, (surface.conic, *surface.polynomial), strict=False)
+            words = [f"{name}={value:.9g}" for name, value in shape if value]
+            is_plain = not words and math.isinf(surface.radius) and media[i + 1] == media[i]
+            curve, index = ("0", "0") if i == self.stop and is_plain else (f"{surface.radius:.9g}", surface.glass.name)
+            words += ["stop"] * (i == self.stop and not is_plain)
+            lines.append(" ".join([curve, f"{surface.thickness:.9g}", index, f"{surface.diameter:.9g}", *words]))
+        return lines
 
 
 def trace_rays(lens: Lens, position: Array, direction: Array, wavelength_um: float | None = None) -> Rays:

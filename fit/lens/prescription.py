@@ -24,7 +24,6 @@ configurations raise errors.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 from .glass import AIR, Glass, catalogue
@@ -32,7 +31,7 @@ from .surface import Surface
 
 _COLUMNS = ("radius", "thickness", "index", "diameter")
 _MAX_SURFACES = 1000
-_SHAPE = ("k", *(f"A{power}" for power in range(2, 18, 2)))
+SHAPE = ("k", *(f"A{power}" for power in range(2, 18, 2)))
 _UNITS = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "METER": 1000.0}
 _APERTURES = {"SQAP", "ELAP", "OBSC", "SQOB", "ELOB", "SPID", "UDAD", "UDOB"}
 
@@ -72,7 +71,7 @@ def _surface(words: list[str], medium: Glass, defined: dict[str, Glass]) -> tupl
     if len(words) < 4:
         raise ValueError(f"expected the columns {' '.join(_COLUMNS)}, got {len(words)}: {' '.join(words)!r}")
     radius, thickness, diameter = (_number(_COLUMNS[i], words[i]) for i in (0, 1, 3))
-    is_stop, shape, index = "stop" in words[4:], dict.fromkeys(_SHAPE, 0.0), words[2]
+    is_stop, shape, index = "stop" in words[4:], dict.fromkeys(SHAPE, 0.0), words[2]
     for word in words[4:]:
         name, _, text = word.partition("=")
         if name in shape:
@@ -103,21 +102,6 @@ def _number(name: str, text: str) -> float:
         return float(text)
     except ValueError:
         raise ValueError(f"{name}: expected a number, got {text!r}") from None
-
-
-def lines(surfaces: Sequence[Surface], stop: int) -> list[str]:
-    """Surfaces as lines of a prescription; the inverse of :func:`parse`."""
-    media = [AIR, *(surface.glass for surface in surfaces)]
-    named = {glass.name: glass for glass in media if len(glass.coefficients) == 6 and glass not in catalogue().values()}
-    text_lines = [" ".join(["glass", name, *map(repr, glass.coefficients)]) for name, glass in named.items()]
-    for i, surface in enumerate(surfaces):
-        shape = zip(_SHAPE, (surface.conic, *surface.polynomial), strict=False)
-        shape_words = [f"{name}={value:.9g}" for name, value in shape if value]
-        is_plain = not shape_words and math.isinf(surface.radius) and media[i + 1] == media[i]
-        curve, index = ("0", "0") if i == stop and is_plain else (f"{surface.radius:.9g}", surface.glass.name)
-        shape_words += ["stop"] * (i == stop and not is_plain)
-        text_lines.append(" ".join([curve, f"{surface.thickness:.9g}", index, f"{surface.diameter:.9g}", *shape_words]))
-    return text_lines
 
 
 def parse_zemax(content: bytes) -> tuple[tuple[Surface, ...], int, str]:

@@ -1,14 +1,9 @@
 """The spot of a point of light on the sensor, the sensor's position for a focus distance, and spots over the field.
 
-Object distances ``z`` are in metres along the axis, from a reference point of the lens:
-
-* ``"principal"`` (the default): the front principal plane. This is the distance in the thin lens formula, used by
-  :class:`torchdof.Camera` for circles of confusion.
-* ``"pupil"``: the entrance pupil, the centre of perspective of a picture; depth in computer vision.
-* ``"vertex"``: the first surface, as with a tape measure.
-* ``"sensor"``: the sensor (the film plane), as with the scale on a lens.
-
-For the 50 mm double Gauss at 2 m the four differ by up to 7 cm, and the blur of an object at 1 m by 10 %.
+Object distances ``z`` are in metres along the axis from the front principal plane, as in the thin lens formula of
+:class:`torchdof.Camera`. Depth in computer vision starts at the entrance pupil, a tape measure's distance at the first
+surface: add ``paraxial().front_principal`` minus ``paraxial().entrance_pupil`` or 0, in mm. For the 50 mm double Gauss
+at 2 m this is up to 7 cm, and changes the blur of an object at 1 m by 10 %.
 """
 
 import math
@@ -26,7 +21,6 @@ from torchdof.validation import choice, number, whole
 from ..result import Array
 from .lens import Lens, Rays, trace_rays
 
-Reference = Literal["principal", "pupil", "vertex", "sensor"]
 Focus = Literal["best", "paraxial"]
 
 _PUPIL_INTERVALS = 64  # grid intervals along each side of a box in the pupil
@@ -80,7 +74,7 @@ class Spot:
         return math.sqrt(2.0 * float(np.mean(np.sum(np.square(waves), 0) / np.bincount(ring, light, 16) ** 2)))
 
 
-def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best", reference: Reference = "principal") -> float:
+def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best") -> float:
     """Distance of the sensor behind the last vertex, in mm, for an object at ``focus_m`` (``inf`` allowed) in focus.
 
     The kind ``"paraxial"`` is where rays close to the axis meet; ``"best"`` is where the spot on the axis has the
@@ -90,28 +84,22 @@ def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best", reference: Re
         ValueError: If the object is too near for focusing, or an argument is invalid.
     """
     choice("focus", kind, get_args(Focus))
-    choice("reference", reference, get_args(Reference))
-    paraxial = lens.paraxial()
-    sensor = paraxial.back_focal
-    for _ in range(100 if reference == "sensor" else 1):  # a distance from the sensor changes with the sensor's place
-        object_mm, previous = vertex_distance_mm(lens, focus_m, reference, sensor), sensor
-        distance = object_mm + paraxial.front_principal
-        if distance <= paraxial.focal_length:
-            least = f"the focal length ({paraxial.focal_length:.4g} mm) from the front principal plane"
-            raise ValueError(f"the focus must be farther than {least}, got {distance:.4g} mm")
-        sensor = paraxial.rear_principal + 1.0 / (1.0 / paraxial.focal_length - 1.0 / distance)
-        if kind == "best":
-            aim, _, high = _rays_of_point(lens, object_mm, sensor)
-            traced, weight = aim(_fan(high[1], _FAN_RAYS))
-            weight, height = weight * traced.alive, traced.at(lens.vertices[-1] + sensor)[1]
-            slope = traced.direction[1] / traced.direction[2]
-            # the mean squared radius is a parabola over the sensor's position
-            steepness = float(weight @ (slope * slope))
-            if steepness == 0.0:
-                raise ValueError(f"no ray through lens {lens.name!r} comes to a focus; are its openings too narrow?")
-            sensor -= float(weight @ (height * slope)) / steepness
-        if abs(sensor - previous) < 1e-12 * paraxial.focal_length:
-            break
+    paraxial, object_mm = lens.paraxial(), _vertex_distance_mm(lens, focus_m)
+    distance = object_mm + paraxial.front_principal
+    if distance <= paraxial.focal_length:
+        least = f"the focal length ({paraxial.focal_length:.4g} mm) from the front principal plane"
+        raise ValueError(f"the focus must be farther than {least}, got {distance:.4g} mm")
+    sensor = paraxial.rear_principal + 1.0 / (1.0 / paraxial.focal_length - 1.0 / distance)
+    if kind == "best":
+        aim, _, high = _rays_of_point(lens, object_mm, sensor)
+        traced, weight = aim(_fan(high[1], _FAN_RAYS))
+        weight, height = weight * traced.alive, traced.at(lens.vertices[-1] + sensor)[1]
+        slope = traced.direction[1] / traced.direction[2]
+        # the mean squared radius is a parabola over the sensor's position
+        steepness = float(weight @ (slope * slope))
+        if steepness == 0.0:
+            raise ValueError(f"no ray through lens {lens.name!r} comes to a focus; are its openings too narrow?")
+        sensor -= float(weight @ (height * slope)) / steepness
     return sensor
 
 
@@ -123,7 +111,6 @@ def point_spread(
     field_mm: float = 0.0,
     rays: int = 50_000,
     wavelength_um: float | None = None,
-    reference: Reference = "principal",
     meridional: bool = False,
 ) -> Spot:
     """Traces the spot of an object point.
@@ -132,13 +119,12 @@ def point_spread(
 
     Args:
         lens: The prescription, stopped down as needed.
-        z_m: Object distance in metres from the reference; ``inf`` allowed.
+        z_m: Object distance in metres from the front principal plane; ``inf`` allowed.
         sensor_mm: Distance of the sensor behind the last vertex, from :func:`focus_sensor`.
         field_mm: Image height in mm in a pinhole camera with its hole in the front principal plane and its sensor at
             the distance from H'; the real image is there too, up to distortion.
         rays: Number of rays aimed at the lens; vignetting blocks some.
         wavelength_um: None is the d line.
-        reference: Reference point of ``z_m``, see the module.
         meridional: On the axis only: trace a fan that represents its rotation; as accurate with 2,000 rays.
 
     Raises:
@@ -154,7 +140,7 @@ def point_spread(
     number("field_mm", field_mm, low=-1e9, high=1e9, unit="millimetres")
     if meridional and field_mm:
         raise ValueError(f"meridional is for points on the axis, got field_mm = {field_mm}")
-    object_mm, side = vertex_distance_mm(lens, z_m, reference, sensor_mm), max(4, round(math.sqrt(rays)))
+    object_mm, side = _vertex_distance_mm(lens, z_m), max(4, round(math.sqrt(rays)))
     aim, low, high = _rays_of_point(lens, object_mm, sensor_mm, field_mm, wavelength_um)
     points = _fan(high[1], rays) if meridional else _grid(low, high, (np.arange(side) + 0.5) / side)
     traced, weight = aim(points)
@@ -169,17 +155,14 @@ def point_spread(
     return Spot(x, y, weight, -float(centre[1]), float(np.prod(high - low) * passed.mean()))
 
 
-def vertex_distance_mm(lens: Lens, z_m: float, reference: Reference, sensor_mm: float) -> float:
-    """Distance of an object in front of the first vertex, in mm."""
-    choice("reference", reference, get_args(Reference))
+def _vertex_distance_mm(lens: Lens, z_m: float) -> float:
+    """Distance in mm of an object in front of the first vertex."""
     paraxial = lens.paraxial()
-    places_mm = paraxial.front_principal, paraxial.entrance_pupil, 0.0, float(lens.vertices[-1]) + sensor_mm
-    reference_mm = places_mm[get_args(Reference).index(reference)]
-    object_mm = 1000.0 * z_m - reference_mm
+    object_mm = 1000.0 * z_m - paraxial.front_principal
     if _MAX_DISTANCE_M < z_m < math.inf:
         raise ValueError(f"objects must be at most {_MAX_DISTANCE_M:g} m away, or at infinity, got {z_m} m")
     if not object_mm > max(0.0, -paraxial.entrance_pupil):
-        least = f"{max(reference_mm, 0.0) / 1000:.4g} m from its {reference}"
+        least = f"{max(paraxial.front_principal, 0.0) / 1000:.4g} m from its front principal plane"
         raise ValueError(f"objects must lie in front of the lens, more than {least}, got {z_m} m")
     return object_mm
 
@@ -197,10 +180,7 @@ def _grid(low: Array, high: Array, steps: Array) -> Array:
 def _rays_of_point(
     lens: Lens, object_mm: float, sensor_mm: float, field_mm: float = 0.0, wavelength_um: float | None = None
 ) -> tuple[Callable[[Array], tuple[Rays, Array]], Array, Array]:
-    """A function that traces the rays of an object point, and the bounding box ``[2]`` of those that pass the lens.
-
-    It takes points ``[2, R]`` of the entrance pupil's plane, in which the box lies; and gives each ray's solid angle.
-    """
+    """A function from points ``[2, R]`` in the pupil to rays and their solid angles, and the box of those that pass."""
     paraxial = lens.paraxial()
     pupil, front_diameter = paraxial.entrance_pupil, lens.surfaces[0].diameter
     distance = object_mm + pupil  # from the entrance pupil
@@ -240,15 +220,14 @@ def trace_field(
     radius_mm: Sequence[float],
     wavelengths_um: Sequence[float] | None,
     rays: int,
-    reference: Reference,
 ) -> Field:
     """Traces spots at signed coc, whose object distances `distance_m` gives, and at distances from the centre."""
     rows, columns = _CELLS
-    heights = [field_height_mm(lens, distance_m(0.0), sensor_mm, radius, reference) for radius in radius_mm]
+    heights = [field_height_mm(lens, distance_m(0.0), sensor_mm, radius) for radius in radius_mm]
     boxes, light = [], []
     for coc, height in product(coc_mm, heights):
         spots = [
-            spot_of_place(lens, distance_m(coc), sensor_mm, height, reference, rays=rays, wavelength_um=wavelength)
+            spot_of_place(lens, distance_m(coc), sensor_mm, height, rays=rays, wavelength_um=wavelength)
             for wavelength in (wavelengths_um or (None,))
         ]
         low, high = min(u.min() for u, _, _ in spots), max(u.max() for u, _, _ in spots)
@@ -281,27 +260,26 @@ def _binned(u: Array, v: Array, weight: Array) -> Array:
 
 
 def spot_of_place(
-    lens: Lens, z_m: float, sensor_mm: float, field_mm: float, reference: Reference = "principal", **options: Any
+    lens: Lens, z_m: float, sensor_mm: float, field_mm: float, **options: Any
 ) -> tuple[Array, Array, Array]:
     """Positions ``[R]`` in mm of a point's light, from its sharp image away from the axis, and across; and weight."""
-    spot = point_spread(lens, z_m, sensor_mm, field_mm=field_mm, reference=reference, **options)
-    image_mm = spot.centre - chief_ray_mm(lens, z_m, sensor_mm, field_mm, reference)
-    return image_mm - spot.y, spot.x, spot.weight
+    spot = point_spread(lens, z_m, sensor_mm, field_mm=field_mm, **options)
+    return spot.centre - _chief_ray_mm(lens, z_m, sensor_mm, field_mm) - spot.y, spot.x, spot.weight
 
 
-def chief_ray_mm(lens: Lens, z_m: float, sensor_mm: float, field_mm: float, reference: Reference) -> float:
+def _chief_ray_mm(lens: Lens, z_m: float, sensor_mm: float, field_mm: float) -> float:
     """Distance from the axis, in mm, of a point's image through a small stop, in the d line."""
     if field_mm == 0.0:
         return 0.0
     stopped = lens.with_stop(lens.surfaces[lens.stop].diameter * _CHIEF_STOP)
-    return point_spread(stopped, z_m, sensor_mm, field_mm=field_mm, rays=_CHIEF_RAYS, reference=reference).centre
+    return point_spread(stopped, z_m, sensor_mm, field_mm=field_mm, rays=_CHIEF_RAYS).centre
 
 
-def field_height_mm(lens: Lens, z_m: float, sensor_mm: float, radius_mm: float, reference: Reference) -> float:
+def field_height_mm(lens: Lens, z_m: float, sensor_mm: float, radius_mm: float) -> float:
     """The ``field_mm`` of a point whose image is at `radius_mm` from the centre; corrects the distortion."""
     height = radius_mm
     for _ in range(_DISTORTION_STEPS if radius_mm else 0):
-        height *= radius_mm / chief_ray_mm(lens, z_m, sensor_mm, height, reference)
+        height *= radius_mm / _chief_ray_mm(lens, z_m, sensor_mm, height)
     return height
 
 

@@ -28,7 +28,7 @@ from torchdof.validation import number, show, whole
 from ..result import Array
 from .glass import C_UM, F_UM
 from .lens import Lens
-from .spot import Focus, Reference, Spot, coc_nodes, focus_sensor, point_spread, trace_field
+from .spot import Focus, Spot, coc_nodes, focus_sensor, point_spread, trace_field
 
 # Places of the nodes
 _MIN_INTERVAL_PX = 0.01  # pixels of coc; narrower intervals are not divided
@@ -49,7 +49,6 @@ def trace_table(
     nearest_m: float | None = None,
     points: int = 65,
     focus: Focus = "best",
-    reference: Reference = "principal",
     field_mm: float = 0.0,
     wavelengths_um: Sequence[float] | None = None,
     sensor_width_mm: float = 36.0,
@@ -66,18 +65,18 @@ def trace_table(
     ``f_number`` and ``focus_m``: render with that camera. Nodes are placed where interpolation would be worst, as many
     as are needed for 50 dB on a natural image between them.
 
-    The table is exact for its focus and f-number only; :func:`torchdof.fit.check_reach` warns of others.
+    The table is exact for its focus and f-number only.
 
     Args:
         lens: The prescription.
         f_number: Marked f-number; up to 3 % below that of the open stop means fully open.
-        focus_m: Focus distance in metres from ``reference``; ``inf`` allowed.
+        focus_m: Focus distance in metres from the front principal plane, see :mod:`torchdof.fit.lens.spot`; ``inf``
+            allowed. Depth maps must start there too.
         nodes: Number of nodes, at least 5, or 3 for a focus at infinity; None uses as many as needed.
         nearest_m: Nearest object distance in metres; None is a third of the focus distance (the blur is then twice that
             of infinity), or 25 focal lengths for a focus at infinity. The farthest distance is infinity.
         points: Number of values of a profile, at least 3.
         focus: ``"best"`` or ``"paraxial"``, see :func:`torchdof.fit.lens.spot.focus_sensor`.
-        reference: Reference point of distances, see :mod:`torchdof.fit.lens.spot`. Depth maps must use the same.
         field_mm: Image height in mm. Off the axis, the table has the rotational average of the spot about its centroid,
             and ``provenance["asymmetry"]`` the spot's deviation from a round one.
         wavelengths_um: One wavelength for each channel, such as :data:`torchdof.fit.lens.lens.RGB_UM`, for a lens whose
@@ -128,7 +127,7 @@ def trace_table(
             raise ValueError(f"field must be increasing distances in mm from the middle, from 0 on, got {show(field)}")
     stopped = lens.with_f_number(f_number)
     focal = lens.paraxial().focal_length
-    sensor = focus_sensor(stopped, focus_m, focus, reference)
+    sensor = focus_sensor(stopped, focus_m, focus)
     if nearest_m is None:
         nearest_m = focus_m / 3.0 if math.isfinite(focus_m) else 0.025 * focal
     number("nearest_m", nearest_m, 0, focus_m, unit="metres")
@@ -140,7 +139,7 @@ def trace_table(
         dioptres = 1.0 / focus_m - coc / near * (1.0 / focus_m - 1.0 / nearest_m)
         return 1.0 / dioptres if dioptres > 1e-9 else math.inf
 
-    options: dict[str, Any] = {"field_mm": field_mm, "rays": rays, "reference": reference, "meridional": not field_mm}
+    options: dict[str, Any] = {"field_mm": field_mm, "rays": rays, "meridional": not field_mm}
 
     def spot(coc: float, wavelength_um: float | None) -> Spot:
         return point_spread(stopped, distance(coc), sensor, wavelength_um=wavelength_um, **options)
@@ -156,7 +155,7 @@ def trace_table(
         spots = None
         if field is not None:
             places = coc_nodes(near, far, field_nodes), field
-            spots = trace_field(stopped, sensor, distance, *places, wavelengths_um, field_rays, reference)
+            spots = trace_field(stopped, sensor, distance, *places, wavelengths_um, field_rays)
     arguments |= {"nearest_m": nearest_m, "rays": rays}
     call = ", ".join(f"{key}={value!r}" for key, value in arguments.items() if key != "lens")
     provenance = {
@@ -165,7 +164,7 @@ def trace_table(
         "prescription": "; ".join(lens.lines()),
         "focal_length_mm": round(focal, 4),
         "f_number_paraxial": round(stopped.paraxial().f_number, 4),
-        **{key: arguments[key] for key in ("f_number", "focus", "reference", "field_mm")},
+        **{key: arguments[key] for key in ("f_number", "focus", "field_mm")},
         "focus_m": focus_m if math.isfinite(focus_m) else "inf",
         "nearest_m": round(nearest_m, 6),
         "wavelengths_um": list(wavelengths_um or ()) or "d line",

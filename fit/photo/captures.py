@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,9 +30,7 @@ RANGES = {  # wider than any camera's
 CAMERA = ("focal_length_mm", "f_number", "sensor_width_mm")
 Dots = Literal["one", "centre", "each", "field"]
 
-PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
-"""Colours of the upper left 2 x 2 pixels of a mosaic, in rows."""
-
+PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")  # colours of the upper left 2 x 2 pixels of a mosaic, in rows
 _MARGIN = 1.35  # window over the blur's reach
 _CROSS = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]]) / 4
 _SQUARE = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 4
@@ -91,10 +90,9 @@ class Captures:
 
     def __post_init__(self) -> None:
         """Raises a `FitError` for an invalid field."""
-        if not isinstance(self.pairs, Sequence) or not all(isinstance(p, Capture) for p in self.pairs):
-            raise FitError(f"pairs must be a tuple of Capture(sharp, blurred, distance_m), got {show(self.pairs)}")
-        if not self.pairs:
-            raise FitError("captures hold no pair of pictures; photograph the dot at one more distance at least")
+        pairs = self.pairs if isinstance(self.pairs, Sequence) else ()
+        if not pairs or not all(isinstance(pair, Capture) for pair in pairs):
+            raise FitError(f"pairs must be one or more Capture(sharp, blurred, distance_m), got {show(self.pairs)}")
         check_distances([p.distance_m for p in self.pairs], self.focus_m)
         for name in ("width_px", *(name for name in CAMERA if getattr(self, name) is not None)):
             checked(number, name, getattr(self, name), *RANGES[name])
@@ -128,13 +126,11 @@ class Captures:
 def check_distances(distances: Sequence[float], focus: float, where: str | None = None) -> None:
     """Raises an error if distances are not positive and increasing, or one equals the focus."""
     checked(number, "focus_m", focus, 0, 1e100, "metres")
-    for previous, distance in zip([0.0, *distances], distances, strict=False):
-        checked(number, "distance_m", distance, -1e100, 1e100, "metres")
-        if not previous < distance:
-            text = f"distances must be positive and increasing, got {', '.join(f'{d:g}' for d in distances)} m"
-            raise FitError(text, "distance", where)
-        if distance == focus:
-            raise FitError(f"a shot lies at the focus ({focus:g} m) and has no blur", "distance", where)
+    numbers = [checked(number, "distance_m", distance, -1e100, 1e100, "metres") for distance in distances]
+    if not all(previous < distance for previous, distance in pairwise([0.0, *numbers])):
+        raise FitError(f"distances must be positive and increasing, got {numbers} m", "distance", where)
+    if focus in numbers:
+        raise FitError(f"a shot lies at the focus ({focus:g} m) and has no blur", "distance", where)
 
 
 @dataclass(frozen=True)
@@ -152,13 +148,9 @@ class CameraPicture:
 
 
 def read_picture(
-    path: Path,
-    transfer: Transfer | None,
-    dark: CameraPicture | None = None,
-    crop: tuple[int, int, int, int] | None = None,
-    bayer: str | None = None,
+    path: Path, transfer: Transfer | None, dark: Array | None = None, crop: Any = None, bayer: str | None = None
 ) -> CameraPicture:
-    """Reads a picture; `crop` is left, top, width and height in px, `dark` was taken with the lens cap on."""
+    """Reads a picture; `crop` is left, top, width and height in px, `dark` is light under the lens cap `[C, H, W]`."""
     invalid = partial(FitError, kind="manifest", file=str(path))
     picture = read_image(path, transfer=transfer)
     pixels = picture.pixels[0].numpy().astype(np.float64)
@@ -177,9 +169,9 @@ def read_picture(
     white = 1.0 if picture.sample in ("8", "16") else None
     is_clipped = pixels >= 1.0 - 1e-6
     if dark is not None:
-        if dark.colours.shape != pixels.shape:
-            raise invalid(f"the dark frame is {_size(dark.light)}, the picture {_size(pixels[0])}")
-        pixels = pixels - dark.colours
+        if dark.shape != pixels.shape:
+            raise invalid(f"the dark frame is {_size(dark[0])}, the picture {_size(pixels[0])}")
+        pixels = pixels - dark
     light = pixels.mean(axis=0)
     if white is not None:
         pixels[is_clipped] = white
@@ -198,59 +190,47 @@ def demosaiced(mosaic: Array, pattern: str) -> Array:
 
 
 def cut_pairs(
-    pictures: tuple[CameraPicture, CameraPicture],
-    focus_m: float,
-    distance_m: float,
-    dots: Dots,
-    exposure: float | None,
-    colours: bool,
-) -> list[Capture]:
-    """Cuts the windows around the dot, or the dots of a grid, in a sharp and a blurred photograph."""
-    sharp_picture, blurred_picture = pictures
-    middle, blurred_file = sharp_picture.middle, str(blurred_picture.file)
-    if sharp_picture.light.shape != blurred_picture.light.shape:
-        text = f"is {_size(blurred_picture.light)}, {sharp_picture.file.name} is {_size(sharp_picture.light)}"
-        raise FitError(f"{text}; give pictures of one size", "manifest", blurred_file)
+    sharp: CameraPicture, blurred: CameraPicture, magnification: float, dots: Dots, by_colour: bool, **facts: Any
+) -> Iterator[Capture]:
+    """Cuts the windows around the dot, or the dots of a grid, in two photographs; every capture has the `facts`."""
+    pictures, blurred_file, (height, width) = (sharp, blurred), str(blurred.file), sharp.light.shape
+    if sharp.light.shape != blurred.light.shape:
+        text = f"is {_size(blurred.light)}, {sharp.file.name} is {_size(sharp.light)}; give pictures of one size"
+        raise FitError(text, "manifest", blurred_file)
     for key, word in (("f_number", "f-number"), ("focal_length_mm", "focal length")):
-        before, after = sharp_picture.facts.get(key), blurred_picture.facts.get(key)
+        before, after = (picture.facts.get(key) for picture in pictures)
         if before and after and abs(math.log(before / after)) > 0.02:
-            text = f"taken at {word} {after:g} by EXIF, {sharp_picture.file.name} at {before:g}; change neither"
+            text = f"taken at {word} {after:g} by EXIF, {sharp.file.name} at {before:g}; change neither"
             raise FitError(text, "manifest", blurred_file)
     if dots == "one":
-        first, second = (find_dot(picture.light, file=str(picture.file)) for picture in pictures)
-        matched = [(first, second)]
+        matched = [(find_dot(sharp.light, file=str(sharp.file)), find_dot(blurred.light, file=blurred_file))]
     else:
-        matched = _matched(sharp_picture, blurred_picture, focus_m / distance_m)[: 1 if dots == "centre" else None]
-    pairs = []
-    for sharp_dot, blurred_dot in matched:
-        centres = [(round(dot.x), round(dot.y)) for dot in (sharp_dot, blurred_dot)]
-        height, width = sharp_picture.light.shape
+        matched = _matched(sharp, blurred, magnification)[: 1 if dots == "centre" else None]
+    for both in matched:
+        centres = [(round(dot.x), round(dot.y)) for dot in both]
         border_px = [min(x, y, width - 1 - x, height - 1 - y) for x, y in centres]
-        needed = max(sharp_dot.reach, blurred_dot.reach) + 2
+        needed = max(dot.reach for dot in both) + 2
         half = min(*border_px, math.ceil(_MARGIN * needed) + 8)
         if half < needed:
             text = f"the frame cuts the blur: it reaches {needed:.0f} px from the dot, the frame ends after {half} px"
-            raise FitError(text, "window", str(pictures[border_px[0] >= sharp_dot.reach + 2].file))
-        windows, colour_windows = [], []
-        for picture, (x, y) in zip(pictures, centres, strict=True):
-            window = ..., slice(y - half, y + half + 1), slice(x - half, x + half + 1)
-            windows.append(picture.light[window].copy())
-            colour_windows.append(picture.colours[window].copy())
-            if (count := len(find_dots(windows[-1], file=str(picture.file)))) > 1:
+            raise FitError(text, "window", str(pictures[border_px[0] >= both[0].reach + 2].file))
+        cuts = [(..., slice(y - half, y + half + 1), slice(x - half, x + half + 1)) for x, y in centres]
+        windows, colours = (
+            (getattr(sharp, name)[cuts[0]].copy(), getattr(blurred, name)[cuts[1]].copy())
+            for name in ("light", "colours")
+        )
+        for picture, window in zip(pictures, windows, strict=True):
+            if (count := len(find_dots(window, file=str(picture.file)))) > 1:
                 text = f"{count} dots in a window of {2 * half + 1} px: print the dots farther apart than their blur"
                 raise FitError(text, "several dots", str(picture.file))
-        capture = Capture(
-            windows[0],
-            windows[1],
-            distance_m,
-            files=(str(sharp_picture.file), str(blurred_picture.file)),
-            white=sharp_picture.white,
-            exposure=exposure,
-            position_px=(round(sharp_dot.x - middle[0], 2), round(sharp_dot.y - middle[1], 2)),
-            colours=(colour_windows[0], colour_windows[1]) if colours else None,
+        yield Capture(
+            *windows,
+            files=(str(sharp.file), blurred_file),
+            white=sharp.white,
+            position_px=(round(both[0].x - sharp.middle[0], 2), round(both[0].y - sharp.middle[1], 2)),
+            colours=colours if by_colour else None,
+            **facts,
         )
-        pairs.append(capture)
-    return pairs
 
 
 def _size(picture: Array) -> str:

@@ -5,27 +5,21 @@ from scipy.linalg import orth
 from scipy.ndimage import gaussian_filter
 from scipy.special import chdtrc
 
+from torchdof.optics.psf import LENGTHS
+
 from ..problems import FitError, warn
 from ..result import Array, BlurFit
-from .dot import Dot, fine_variance, independent_share, inner_pixels, noise_of
+from .dot import Dot, correlate, fine_variance, independent_share, inner_pixels, noise_of
 from .forward import OPENINGS, SHAPES, Solution, without_level
 from .source import UNFOCUSED_PX, Edge, soft_edge
 from .target import untoned
 
-ASYMMETRIC = 0.02
-"""Share of a blur's light that depends on the angle, above which it is not round."""
-
-P_VALUE = 1e-6
-"""Probability of a deviation by noise alone, below which it is significant."""
-
-EXPLAINED = 1.15
-"""Largest misfit of an ideal dot, over the noise, with which it explains a sharp picture."""
-
-FAR_ABOVE = 1.6
-"""Residual over noise above which a warning is given."""
-
+ASYMMETRIC = 0.02  # share of a blur's light that depends on the angle, above which it is not round
+P_VALUE = 1e-6  # probability of a deviation by noise alone, below which it is significant
+EXPLAINED = 1.15  # largest misfit of an ideal dot, over the noise, with which it explains a sharp picture
+FAR_ABOVE = 1.6  # residual over noise above which a warning is given
 _HARMONICS, _RINGS = 8, 4
-_LIT_SHARE = 0.01  # share of the peak above which a pixel of a free kernel counts as a parameter
+_RMS_DRAWN_PX = 16.0  # px; size at which a PSF is drawn to measure it; larger: more exact, slower
 
 # A sharp picture
 _FOCUSED_SIGMA_PX = 0.7  # sigma of the edge that demosaicing, a filter before the sensor or a good lens leave in focus
@@ -66,16 +60,15 @@ def noise_near(solution: Solution) -> float:
 
 
 def unexplained(solution: Solution, basis: Array) -> tuple[Array, Array, Array]:
-    """Products of patterns `[pixels used, n]` with a fit's residual `[n]`, and their covariance under noise alone.
-
-    Also returns the patterns without the parts that the fit's parameters imitate, which are not in the residual.
-    """
+    """Products of patterns `[pixels used, n]` and the residual, their covariance by noise, and the visible patterns."""
+    # what the parameters imitate is not in the residual
     imitable, _ = np.linalg.qr(solution.slopes[:, np.abs(solution.slopes).max(axis=0) > 0])
     visible = without_level(basis - imitable @ (imitable.T @ basis), solution.fitted)
     # a smooth deviation must not count as noise: use the level beside the dot and inside it. Noise cannot exceed the
     # residual: in a JPEG, dark areas have less noise than the level in the light suggests
     variance = min(noise_near(solution), residual_rms(solution)) ** 2
-    correlated = solution.pair.correlated_noise(visible, solution.pair.noise_correlation)
+    pair = solution.pair
+    correlated = correlate(pair.picture(visible.T), pair.noise_correlation)[:, pair.used].T
     return visible.T @ solution.residual, variance * visible.T @ correlated, visible
 
 
@@ -112,28 +105,27 @@ def size_of_blur(solution: Solution) -> tuple[float, float]:
     values = np.array([float(solution.params[n]) for n in shape])
     steps = 1e-3 * np.maximum(np.abs(values), 0.1)
     varied = np.vstack([values, values + np.diag(steps)]).T  # a row for each parameter, changed in one column
-    rms, *varied_rms = pair.rms(solution.family, dict(zip(shape, varied, strict=True))).tolist()
+    is_length = np.array([n in LENGTHS for n in shape])
+    scale = max(1.0, _RMS_DRAWN_PX / np.abs(varied[is_length]).max())  # drawn large, pixels have no effect
+    varied[is_length] *= scale
+    kernels = pair.kernels(solution.family, dict(zip(shape, varied, strict=True)), int(np.ceil(scale * pair.half)))
+    offset = np.arange(kernels.shape[-1]) - kernels.shape[-1] // 2
+    rms, *varied_rms = (np.sqrt((kernels * (offset[:, None] ** 2 + offset**2)).sum((1, 2))) / scale).tolist()
     slope = (np.array(varied_rms) - rms) / steps
     covariance = solution.covariance[: len(shape), : len(shape)]
-    if np.isfinite(np.diag(covariance)).all():
-        variance, moment_error = max(float(slope @ covariance @ slope), 0.0), 0.0
-        if solution.family == "image":  # its shape is free: only the picture's second moment determines its size
-            squared, light = pair.distance[pair.lit] ** 2, pair.data[pair.lit] - solution.background
-            centred = squared - float(light @ squared / light.sum())
-            noise = noise_near(solution) / np.sqrt(independent_share(pair.noise_correlation))
-            moment_error = float(noise * np.linalg.norm(centred) / abs(light.sum()) / (2 * max(rms, 1e-9)))
-        return rms, float(np.sqrt(variance + moment_error**2))
-    # single parameters are undetermined, but their combination may determine the size
-    _, values, right = np.linalg.svd(solution.slopes[:, : len(shape)], full_matrices=False)
-    seen = values > 1e-6 * values.max()
-    projected = right @ slope
-    if not seen.any() or np.abs(projected[~seen]).sum() > 0.1 * np.abs(projected).sum():
+    if np.abs(slope[np.isinf(np.diag(covariance))]).sum() > 0.1 * np.abs(slope).sum():
         return rms, np.inf
-    return rms, float(np.sqrt(solution.squares / pair.values.size) * np.linalg.norm(projected[seen] / values[seen]))
+    variance, moment_error = max(float(slope @ np.where(np.isinf(covariance), 0.0, covariance) @ slope), 0.0), 0.0
+    if solution.family == "image":  # its shape is free: only the picture's second moment determines its size
+        squared, light = pair.distance[pair.lit] ** 2, pair.data[pair.lit] - solution.background
+        centred = squared - float(light @ squared / light.sum())
+        noise = noise_near(solution) / np.sqrt(independent_share(pair.noise_correlation))
+        moment_error = float(noise * np.linalg.norm(centred) / abs(light.sum()) / (2 * max(rms, 1e-9)))
+    return rms, float(np.sqrt(variance + moment_error**2))
 
 
 def bic_of(solution: Solution) -> float:
-    """Bayesian information criterion of a solution, up to a constant that depends on the pictures only."""
+    """Bayesian information criterion of a profile or polygon, up to a constant that depends on the pictures only."""
     pair = solution.pair
     floor = pair.values.size * (1e-6 * pair.unit) ** 2
     parameters = len(SHAPES[solution.family])
@@ -141,8 +133,6 @@ def bic_of(solution: Solution) -> float:
         parameters = int(np.sum(np.asarray(solution.params["values"]) > 0))
     elif solution.family == "polygon":
         parameters += 1  # the number of blades
-    elif solution.family == "image":
-        parameters = int(np.sum(solution.kernel > _LIT_SHARE * solution.kernel.max()))
     # correlated neighbours are not independent samples
     count = max(round(pair.values.size * independent_share(pair.noise_correlation)), 1)
     variance = max((solution.squares + floor) / pair.values.size, np.finfo(float).tiny)
@@ -207,8 +197,7 @@ def check_linearity(picture: Array, dot: Dot, edge: Edge, file: str | None) -> b
             ratio = dot.noise / max(float(np.sqrt(bright)), 1e-9 * dot.peak)
             text = f"the dark paper has {ratio:.1f} times the noise of the white dot, {_ENCODED}"
     if not text and edge.steepness > max(_MIN_STEEPNESS, _MIN_SIGMAS * edge.steepness_error):
-        text = "the dot's edge is steeper than pixels can be: develop without a tone curve and sharpening, which make "
-        text += "the kernel too small"
+        text = "the dot's edge is steeper than pixels can be: develop without a tone curve and sharpening"
     if not text and edge.misfit >= EXPLAINED:
         encoded = soft_edge(picture, dot, fit_exponent=True)
         if encoded.exponent < _MAX_EXPONENT and encoded.rms < 0.75 * edge.rms:
@@ -219,18 +208,15 @@ def check_linearity(picture: Array, dot: Dot, edge: Edge, file: str | None) -> b
 
 
 def check_levels(solution: Solution, expected: Solution, edge: Edge, file: str | None) -> None:
-    """Warns if a tone curve would explain the residual of a fit, or of `expected`, at the expected magnification.
-
-    A kernel cannot make all pixels of one level brighter and all of another level darker, but a fitted magnification
-    imitates most of such a curve. A residual too weak to prove it, as in a JPEG, is enough beside a steep `edge`.
-    """
+    """Warns if a tone curve would explain the residual of a fit, or of `expected`, at the expected magnification."""
     products, covariance, visible = unexplained(solution, _curves(solution, edge.level))
     strengths = np.linalg.lstsq(visible.T @ visible, products, rcond=None)[0]
     chi_squared = float(products @ np.linalg.pinv(covariance) @ products)
     steepness = edge.steepness / max(edge.steepness_error, np.finfo(float).tiny)  # in standard errors
     agrees = edge.steepness > _SUPPORTING_EDGE and steepness > 1 and chi_squared + steepness**2 > _SUPPORTED_CHI
+    # a residual too weak to prove a curve, as in a JPEG, is enough beside a steep edge
     is_bent = float(np.linalg.norm(strengths)) > _MIN_CURVE and (chi_squared > _MIN_CHI or agrees)
-    if not is_bent:
+    if not is_bent:  # a fitted magnification imitates most of a curve
         if abs(solution.moves["magnification"] / expected.moves["magnification"] - 1) > _MIN_RESIZING:
             return
         resizing = expected.gain * expected.pair.move_columns(expected.moves, ("magnification",), expected.kernel)[0]
@@ -242,12 +228,9 @@ def check_levels(solution: Solution, expected: Solution, edge: Edge, file: str |
         margin = contrast_chi + steepness * abs(steepness) - abs(size_chi)
         if not (strength > _MIN_CONTRAST and contrast_chi > _MIN_CONTRAST_CHI and margin > _CHI_MARGIN):
             return
-    condition = "" if is_bent else "at the expected size of the dot, "
-    text = (
-        f"the fit's residual depends on the level, {condition}as with a tone curve: develop without it, it makes the "
-    )
-    text += f"kernel 5 % or more too small. Or it is colour (colours = 'each'), or a wrong family {solution.family!r}"
-    warn(text, "not linear", file)
+    where = "" if is_bent else "at the expected size of the dot, "
+    text = f"the fit's residual depends on the level, {where}as with a tone curve: develop without it. Or it is colour "
+    warn(f"{text}(colours = 'each'), or a wrong family {solution.family!r}", "not linear", file)
 
 
 def _curves(solution: Solution, level: float) -> Array:
@@ -260,21 +243,19 @@ def _curves(solution: Solution, level: float) -> Array:
 
 def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | None) -> None:
     """Warns if a soft sharp picture changes the kernel's size; `deconvolved`: the dot was fitted as in focus."""
-    if edge.softness <= _FOCUSED_SIGMA_PX or edge.radius <= 2 * edge.softness:
-        return
     # the variance along an axis of a disc of radius R is R^2 / 4
-    excess = edge.softness**2 - _FOCUSED_SIGMA_PX**2
+    excess = max(edge.softness**2 - _FOCUSED_SIGMA_PX**2, 0.0)
     size_error = 1 - 1 / np.sqrt(1 + 4 * excess / max(radius_px, 1e-9) ** 2)
+    if size_error < _MIN_SIZE_ERROR or edge.radius <= 2 * edge.softness:
+        return
     effect = f"the kernel is too small by {100 * size_error:.0f} %"
     if edge.softness <= UNFOCUSED_PX:
         cause = f"; if the printed dot's edge is sharp, {effect}"
-    elif not deconvolved:
-        cause = f", as out of focus; {effect}: focus again"
-    else:
+    elif deconvolved:
         cause = ", as out of focus; the dot was fitted as it would be in focus: focus again, or print a sharper dot"
-    if size_error >= _MIN_SIZE_ERROR:
-        text = f"the sharp picture is soft: its dot's edge has a width of {edge.softness:.1f} px{cause}"
-        warn(text, "not in focus", file)
+    else:
+        cause = f", as out of focus; {effect}: focus again"
+    warn(f"the sharp picture is soft: its dot's edge is blurred by {edge.softness:.1f} px{cause}", "not in focus", file)
 
 
 def check_fit(solution: Solution, fit: BlurFit, file: str | None, freest: BlurFit) -> None:
@@ -297,63 +278,41 @@ def check_fit(solution: Solution, fit: BlurFit, file: str | None, freest: BlurFi
     # a residual far above the noise is reported below; here, only the part that the family adds to it
     warned_ratio = max(2.0, 1.3 * ratio) if far_above else 2.0
     if fit is not freest and fit.residual > _MIN_AT_TWICE and fit.residual_over_noise > warned_ratio:
-        text = (
-            f"family {fit.family!r} leaves {fit.residual_over_noise:.1f} times the noise, a free profile {ratio:.1f}: "
-        )
-        text += "that would not be seen at accuracy_db; ask for more, or for a richer family"
-        warn(text, "residual", file)
+        text = f"family {fit.family!r} leaves {fit.residual_over_noise:.1f} times the noise, a free profile {ratio:.1f}"
+        warn(f"{text}: that would not be seen at accuracy_db; ask for more, or for a richer family", "residual", file)
     if far_above:
         simple = f" Family {freest.family!r} may be too simple" if freest.family != "radial" else ""
-        text = (
-            f"the residual is {100 * residual:.1f} %, {ratio:.1f} times the noise; is the image linear, one white dot, "
-        )
-        warn(f"{text}and not a strong JPEG?{simple}", "residual", file)
+        text = f"the residual of {100 * residual:.1f} % is {ratio:.1f} times the noise; is the picture linear, one dot"
+        warn(f"{text}, and not a strong JPEG?{simple}", "residual", file)
     change = fit.magnification / pair.magnification
     if abs(np.log(change)) > _MAGNIFICATION_LOG:
-        text = f"the blurred dot is {change:.3f} times the size it should have; are distances right and light linear?"
-        warn(text, "magnification", file)
-    _check_spots(solution, file)
+        warn(f"the blurred dot is {change:.3f} times the size it should have; check distances", "magnification", file)
+    beyond = (pair.distance > pair.dot.reach + 4) & pair.used
+    if beyond.any():  # the residual is not sensitive to small spots
+        smoothed = np.where(beyond, gaussian_filter(pair.picture(solution.residual), 2.0, mode="constant"), -np.inf)
+        y, x = np.unravel_index(int(np.argmax(smoothed)), smoothed.shape)
+        # smoothing by sigma = 2 px leaves 0.14 of white noise, and more of correlated noise
+        smoothing = pair.fine_share * independent_share(pair.noise_correlation)
+        spread = 1.4826 * float(np.median(np.abs(smoothed[beyond] - np.median(smoothed[beyond]))))  # a JPEG's blocks
+        noise = max(0.14 * noise_of(pair.data) / np.sqrt(smoothing), spread)
+        if (height := float(smoothed[y, x])) > max(_SPOT_SIGMAS * noise, _MIN_SPOT * pair.dot.peak):
+            text = f"a spot of {100 * height / pair.dot.peak:.1f} % of the dot's level at ({x}, {y}), beyond the blur: "
+            warn(f"{text}another dot, dust, a reflection? The error bars do not count it", "residual", file)
     if fit.asymmetry > ASYMMETRIC and asymmetry_of(solution)[1] < P_VALUE:
         text = f"the blur is not round: {100 * fit.asymmetry:.0f} % of it depends on the angle, which family "
         warn(f"{text}{fit.family!r} cannot; 'auto' and 'image' take any shape", "asymmetry", file)
-    if solution.family != "radial":
-        _check_parameters(solution, file)
-
-
-def _check_spots(solution: Solution, file: str | None) -> None:
-    """Warns about light beyond the dot's blur; the residual is not sensitive to small amounts."""
-    pair = solution.pair
-    beyond = (pair.distance > pair.dot.reach + 4) & pair.used
-    if not beyond.any():
+    if solution.family == "radial":
         return
-    smoothed = gaussian_filter(pair.picture(solution.residual), 2.0, mode="constant")
-    smoothed_beyond = np.where(beyond, smoothed, -np.inf)
-    y, x = np.unravel_index(int(np.argmax(smoothed_beyond)), smoothed_beyond.shape)
-    height, peak = float(smoothed_beyond[y, x]), pair.dot.peak
-    # smoothing by sigma = 2 px leaves 0.14 of white noise, and more of correlated noise
-    smoothing = pair.fine_share * independent_share(pair.noise_correlation)
-    values = smoothed_beyond[beyond]
-    spread = 1.4826 * float(np.median(np.abs(values - np.median(values))))  # also of a JPEG's blocks
-    if height > max(_SPOT_SIGMAS * max(0.14 * noise_of(pair.data) / np.sqrt(smoothing), spread), _MIN_SPOT * peak):
-        text = f"a spot of {100 * height / peak:.1f} % of the dot's level is left at ({x}, {y}), beyond the blur"
-        warn(f"{text}: another dot, dust, a reflection? The error bars do not count it", "residual", file)
-
-
-def _check_parameters(solution: Solution, file: str | None) -> None:
-    """Warns about parameters on their bounds, and about a blur whose size the pictures do not determine."""
-    low, high = solution.pair.bounds(solution.names)
-    for name, lower, upper in zip(solution.names, low, high, strict=True):
+    for name, lower, upper in zip(solution.names, *pair.bounds(solution.names), strict=True):
         value = float({**solution.moves, **solution.params}[name])
         at_least, at_most = value <= lower + 1e-6 * abs(lower), value >= upper * (1 - 1e-6)
         is_length = name in ("sigma", "radius", "r_c")
         if at_most and is_length:
-            text = f"the blur is wider than the window: {name} ran to {value:.3g} px"
-            raise FitError(text, "flat profile", file)
+            raise FitError(f"the blur is wider than the window: {name} ran to {value:.3g} px", "flat profile", file)
         # exempt: the shape of a blur below a pixel, the exponent of a missing tilt, the curvature of straight or
         # circular blades
         if (at_least and not is_length and name != "b" or at_most) and name not in ("m", "curvature"):
             warn(f"{name} ended on its bound {value:.4g}; it is only a limit", "boundary", file)
     size, error = size_of_blur(solution)
     if not error < 0.5 * size:
-        text = f"the blur's rms radius of {size:.3g} ± {error:.2g} px is not determined: too little blur, or too noisy"
-        warn(text, "flat profile", file)
+        warn(f"too little blur or light: its rms radius is {size:.3g} ± {error:.2g} px", "flat profile", file)

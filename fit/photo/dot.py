@@ -1,7 +1,4 @@
-"""The dot in a picture: position, size, background, clipped pixels; and the noise, which neighbouring pixels share.
-
-Demosaicing and JPEG make the noise of neighbouring pixels similar.
-"""
+"""The dot in a picture: position, size, background, clipped pixels; and the noise, which neighbours share."""
 
 from dataclasses import dataclass
 
@@ -14,9 +11,7 @@ from scipy.signal import fftconvolve
 from ..problems import FitError, a_picture, warn
 from ..result import Array, Mask
 
-LAGS = 6
-"""Largest distance in pixels of correlated noise; demosaicing reaches 2, a JPEG's blocks 7."""
-
+LAGS = 6  # largest distance in pixels of correlated noise; demosaicing reaches 2, a JPEG's blocks 7
 _THRESHOLD = 0.15  # of the peak; low enough to keep an uneven ring in one piece
 _MIN_SIDE_PX = 9
 _MIN_LIGHT = 0.08  # share of the brightest dot's light above which another spot is a dot and not dirt
@@ -212,10 +207,7 @@ def _mixed_differences(picture: Array) -> Array:
 
 
 def correlation_of(values: Array, is_used: Mask) -> Array:
-    """Correlation of the noise (mean 0) of a picture's used pixels `[2 LAGS + 1, 2 LAGS + 1]`; its centre is 1.
-
-    It is 0 at lags without significant correlation, and its spectrum is non-negative.
-    """
+    """Significant correlation of used pixels' noise `[2 LAGS + 1, 2 LAGS + 1]`, with a non-negative spectrum."""
     size = 2 * LAGS + 1
     white = np.zeros((size, size))
     white[LAGS, LAGS] = 1.0

@@ -8,9 +8,7 @@ from numpy.typing import ArrayLike
 from ..problems import FitError, a_picture
 from ..result import Array
 
-COST = ("gaussian", "disc", "ring", "softm", "radial")
-"""Families by growing number of parameters."""
-
+COST = ("gaussian", "disc", "ring", "softm", "radial")  # families by growing number of parameters
 _CONTRAST = 0.22  # standard deviation of a photograph's levels over their peak
 _WIDTH = 256  # px; smallest picture for the comparison
 _BIC_TIE = 2.0  # difference of BIC that is not significant
@@ -92,19 +90,14 @@ def looks_alike(kernel: Array, other: Array, accuracy_db: float) -> bool:
 
 def choose(kernels: Mapping[str, Array], bic: Mapping[str, float], accuracy_db: float) -> tuple[str, str]:
     """The cheapest family that looks like the simplest one within 2 of the lowest BIC, and why."""
-    by_likelihood = sorted(kernels, key=lambda f: (bic[f], COST.index(f)))
-    lowest = bic[by_likelihood[0]]
+    lowest = min(bic[f] for f in kernels)
     likeliest = min((f for f in kernels if bic[f] <= lowest + _BIC_TIE), key=COST.index)
     best = kernels[likeliest]
     family = min((f for f in kernels if f == likeliest or looks_alike(kernels[f], best, accuracy_db)), key=COST.index)
     required = f"{accuracy_db:g} dB on a natural image and {accuracy_db - _HIGHLIGHT_ALLOWANCE_DB:g} dB on a highlight"
-    accuracy = {f: f"{natural_psnr(k, best):.1f} and {highlight_psnr(k, best):.1f} dB" for f, k in kernels.items()}
-    others = [f for f in by_likelihood if f not in (family, likeliest)]
-    compared = ", ".join(f"{f} {accuracy[f]}, BIC {bic[f] - bic[likeliest]:+.0f}" for f in others)
-    if family == likeliest:
-        reason = "the lowest BIC" if bic[family] == lowest else f"the simplest within {_BIC_TIE:g} of the lowest BIC"
-        second = others[0]
-        why = f"{reason} ({second} second by {bic[second] - bic[likeliest]:.0f}), and no cheaper family has {required}"
-    else:
-        why = f"the cheapest with {required} ({accuracy[family]}) against {likeliest}, the likeliest"
-    return family, f"{why} ({compared})"
+    compared = [
+        f"{f} {natural_psnr(k, best):.1f} and {highlight_psnr(k, best):.1f} dB, BIC {bic[f] - bic[likeliest]:+.0f}"
+        for f, k in kernels.items()
+        if f != likeliest
+    ]
+    return family, f"the cheapest with {required} against {likeliest}, the likeliest ({'; '.join(compared)})"

@@ -1,8 +1,6 @@
 """The forward model: defocused picture = gain * (kernel convolved with the moved sharp picture) + background.
 
-The model is compared with all pixels of the window and divides nothing, so dot size, exposure, stray light,
-displacement and magnification do not bias the kernel. Gain and background are linear and are solved for given values of
-the other parameters (variable projection).
+Gain and background are linear: they are solved for given values of the other parameters (variable projection).
 """
 
 from __future__ import annotations
@@ -25,12 +23,9 @@ from .dot import Dot, correlate, correlation_of, distance_from, noise_beside
 from .source import Source
 
 ALL_MOVES = ("dx", "dy", "magnification")
+# parameters of kernels that are not round: discs seen through a lens's opening
 OPENINGS = {"polygon": ("radius", "rotation_deg", "curvature"), "image": ("radius",)}
-"""Parameters of kernels that are not round: discs seen through a lens's opening."""
-
-SHAPES = {**FAMILIES, **OPENINGS}
-"""Parameters of all kernels."""
-
+SHAPES = {**FAMILIES, **OPENINGS}  # parameters of all kernels
 _STARTS = {  # lengths relative to the increase of the dot's standard deviation along an axis
     "gaussian": [{"sigma": 1.0}, {"sigma": 0.5}],
     "disc": [{"radius": 2.0}, {"radius": 1.7}],
@@ -39,7 +34,6 @@ _STARTS = {  # lengths relative to the increase of the dot's standard deviation 
     "softm": [{"radius": 2.0, "sigma": 0.15, "b": 0.0, "m": 2.0}, {"radius": 1.7, "sigma": 0.4, "b": 0.5, "m": 3.0}],
 }
 _STEP = {"dx": 1e-4, "dy": 1e-4, "magnification": 1e-5}  # of finite differences of the moves
-_RMS_DRAWN_PX = 16.0  # px; rms radius at which a PSF is drawn to measure it; larger: more exact, slower
 
 
 @dataclass
@@ -102,15 +96,6 @@ class Forward:
         changed: dict[str, Any] = {n: float(params[n]) for n in ("rotation_deg", "curvature") if n in params}
         return replace(self.opening, **changed)
 
-    def rms(self, family: str, params: Mapping[str, Array]) -> Array:
-        """Rms radius of the PSFs `[n]` for parameters `[n]`, px, drawn large so that pixels have no effect."""
-        lengths = [np.abs(v).max() for n, v in params.items() if n in LENGTHS]
-        scale = max(1.0, _RMS_DRAWN_PX / max(lengths))
-        scaled = {n: scale * v if n in LENGTHS else v for n, v in params.items()}
-        kernels = self.kernels(family, scaled, int(np.ceil(scale * self.half)))
-        offset = np.arange(kernels.shape[-1]) - kernels.shape[-1] // 2
-        return np.asarray(np.sqrt((kernels * (offset[:, None] ** 2 + offset**2)).sum((1, 2))) / scale)
-
     def solve(self, family: str, start: Mapping[str, float] | None = None) -> Solution:
         """Fits one family, from given kernel parameters or from several shapes."""
         shape = SHAPES[family]
@@ -150,11 +135,7 @@ class Forward:
     def covariance(
         self, slopes: Array, residual: Array, kernel: Array, gain: float, penalty: Array | float = 0.0
     ) -> Array:
-        """Covariance of the parameters under the noise of both pictures (a sandwich estimator).
-
-        The defocused picture's noise is as large as the residual of the lit pixels, and correlated like the residual or
-        the paper. The sharp picture's noise passes through the kernel, which correlates it.
-        """
+        """Covariance of the parameters under the noise of both pictures (a sandwich estimator)."""
         information_inverse = inverse(slopes.T @ slopes + penalty)
         is_determined = np.isfinite(np.diag(information_inverse))
         information_inverse = np.where(np.outer(is_determined, is_determined), information_inverse, 0.0)
@@ -164,8 +145,10 @@ class Forward:
         residual_correlation = correlation_of(full, self.used & (self.distance <= self.dot.reach + 2))
         correlation = max(self.noise_correlation, residual_correlation, key=np.sum)
         source_variance = (gain * self.source.noise) ** 2 / self.fine_share
+        # the sharp picture's noise passes through the kernel, which correlates it; the rest is the defocused picture's
         own_variance = max(variance - source_variance * float(np.sum(kernel**2)), 0.1 * variance)
-        score_cov = own_variance * (slopes.T @ self.correlated_noise(slopes, correlation))
+        correlated = correlate(self.picture(slopes.T), correlation)[:, self.used].T
+        score_cov = own_variance * (slopes.T @ correlated)
         if source_variance > 0:  # (K' J)' (K' J) over the source's pixels with noise
             has_source_noise = self.distance <= self.source.reach * self.magnification
             spread = np.where(has_source_noise, self.blurred(self.picture(slopes.T), kernel[None]), 0.0)
@@ -174,10 +157,6 @@ class Forward:
         covariance = information_inverse @ score_cov @ information_inverse
         covariance[~is_determined, ~is_determined] = np.inf
         return np.asarray(covariance)
-
-    def correlated_noise(self, columns: Array, correlation: Array) -> Array:
-        """Product of the noise's correlation matrix with columns `[pixels used, p]`."""
-        return correlate(self.picture(columns.T), correlation)[:, self.used].T
 
     def project(self, shaped: Array) -> tuple[Array, float, float]:
         """Fits gain and background by linear least squares; returns the model of the used pixels, and both."""

@@ -1,9 +1,4 @@
-"""Kernels of a free shape: a table over r, and the lens's opening as a polygon of blades or, if need be, as a picture.
-
-The table is fitted by non-negative least squares, with a smoothness chosen by the data. The picture is the blurred dot
-deconvolved with the sharp one: non-negative, smooth where the noise leaves it undetermined, and 0 where a first
-estimate is almost dark. The smoothing is the one that predicts withheld pixels best.
-"""
+"""Kernels of a free shape: a profile by non-negative least squares, a polygon of blades, a deconvolved picture."""
 
 import math
 from dataclasses import replace
@@ -43,11 +38,7 @@ _WORSE_IN_A_ROW = 3  # number of successively worse strengths of smoothing after
 
 
 def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: int | None = None) -> Solution:
-    """Fits values of the profile, densities per square pixel, at equal steps of r up to `radius` px; refines the moves.
-
-    Each value is the weight of a hat function. A penalty on second differences, chosen by generalised cross-validation,
-    smooths values that the data do not determine. Without `knots` there are two values for each pixel, from 8 to 48.
-    """
+    """Fits densities per square pixel at `knots` radii up to `radius` px (default: 2 a px), and refines the moves."""
     count = knots if knots is not None else int(np.clip(np.ceil(2 * radius), 8, 48))
     half = min(int(np.ceil(radius)) + 1, pair.half)
     values = torch.eye(count, dtype=torch.float64)
@@ -83,7 +74,7 @@ def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: i
 
 
 def _non_negative(columns: Array, data: Array) -> tuple[Array, Array]:
-    """Weights `[knots]`, and the matrix of the penalty with which they were found."""
+    """Weights `[knots]` by generalised cross-validation, and the penalty on second differences that it chose."""
     centred = columns - columns.mean(axis=1, keepdims=True)
     level = data - data.mean()
     normal, right, total = centred @ centred.T, centred @ level, float(level @ level)
@@ -145,10 +136,7 @@ def solve_image(previous: Solution, kernel: Array | None = None) -> Solution:
 
 
 def _harmonic(round_fit: Solution) -> tuple[int, float, float]:
-    """The most significant polygon in a round profile's residual: blades, chi squared, angle of a corner.
-
-    The angle is in degrees, clockwise from the right.
-    """
+    """The polygon in a round profile's residual: blades, chi squared, and a corner's angle, degrees clockwise."""
     pair, size = round_fit.pair, np.sqrt(2) * size_of_blur(round_fit)[0]
     half = min(int(np.ceil(1.3 * size)) + 3, pair.half)
     axis = np.arange(2 * half + 1) - half
@@ -167,10 +155,7 @@ def _harmonic(round_fit: Solution) -> tuple[int, float, float]:
 
 
 def _deconvolved(shape: Solution) -> tuple[Array, float]:
-    """The kernel `[k, k]` of a pair of pictures by deconvolution, with the moves and the reach of a solution.
-
-    Also returns twice the increase of the log likelihood of withheld pixels over the solution.
-    """
+    """A kernel `[k, k]` by deconvolution, and twice the increase of withheld pixels' log likelihood over a solution."""
     pair = shape.pair
     source = pair.drawn(shape.moves)
     # withhold a fifth of the pixels, and take the smoothing that predicts them best

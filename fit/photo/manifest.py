@@ -113,41 +113,36 @@ def read_captures(
     check_distances([shot["distance_m"] for shot in shots], focus, manifest_name)
     nearest = min(focus, shots[0]["distance_m"])
     if nearest > _FAR_M:
-        text = f"all distances are at least {nearest:g} m; they are in metres: divide millimetres by 1000"
-        warn(text, "distance", manifest_name)
+        warn(f"all distances are at least {nearest:g} m; divide millimetres by 1000", "distance", manifest_name)
     if root is not None:
         for name in filter(None, [manifest["sharp"], *files, manifest["dark"]]):
             inside(folder_path / name, root, manifest_name)
 
     options = {name: manifest[name] for name in ("transfer", "crop", "bayer")}
-    options["dark"] = read_picture(folder_path / manifest["dark"], **options) if manifest["dark"] else None
-    sharp_picture = read_picture(folder_path / manifest["sharp"], **options)
+    options["dark"] = read_picture(folder_path / manifest["dark"], **options).colours if manifest["dark"] else None
+    sharp = read_picture(folder_path / manifest["sharp"], **options)
     by_colour = manifest["colours"] == "each"
-    if by_colour and (count := len(sharp_picture.colours)) != 3:
+    if by_colour and (count := len(sharp.colours)) != 3:
         raise invalid(f"colours = 'each' needs pictures of three colours, or bayer = 'RGGB', got {count}")
-    columns, encoded = [], [sharp_picture.file.name] * sharp_picture.encoded
+    columns, encoded = [], [sharp.file.name] * sharp.encoded
     for shot in shots:
-        blurred_picture = read_picture(folder_path / shot["file"], **options)
-        encoded += [blurred_picture.file.name] * blurred_picture.encoded
-        seconds = manifest["exposure_s"]
-        exposure = shot["exposure_s"] / seconds if shot["exposure_s"] and seconds else None
-        pictures = (sharp_picture, blurred_picture)
-        columns.append(cut_pairs(pictures, focus, shot["distance_m"], manifest["dots"], exposure, by_colour))
+        blurred = read_picture(folder_path / shot["file"], **options)
+        encoded += [blurred.file.name] * blurred.encoded
+        sharp_s, blurred_s, magnification = manifest["exposure_s"], shot["exposure_s"], focus / shot["distance_m"]
+        facts = {"distance_m": shot["distance_m"], "exposure": blurred_s / sharp_s if sharp_s and blurred_s else None}
+        columns.append([*cut_pairs(sharp, blurred, magnification, manifest["dots"], by_colour, **facts)])
     if manifest["transfer"] is None and encoded:
         further = f" and {len(encoded) - 1} more" if len(encoded) > 1 else ""
-        text = f"the encoding of {encoded[0]}{further} is not stated; sRGB is assumed. A camera's tone curve or "
-        text += "sharpening makes the kernel up to 15 % too small: develop without them and state transfer"
-        warn(text, "not linear", manifest_name)
-    own_width = sharp_picture.width_px
-    width = own_width if manifest["full_width_px"] is None else round(manifest["full_width_px"])
-    if width < own_width:
-        raise invalid(f"full_width_px must be at least {own_width}, the pictures' own width, got {width}")
-    camera = {name: sharp_picture.facts.get(name) if manifest[name] is None else manifest[name] for name in CAMERA}
-    transfer = manifest["transfer"] or "by file type"
+        text = f"the encoding of {encoded[0]}{further} is not stated; sRGB is assumed: state transfer, and develop "
+        warn(f"{text}without a tone curve, which makes the kernel up to 15 % too small", "not linear", manifest_name)
+    width = sharp.width_px if manifest["full_width_px"] is None else round(manifest["full_width_px"])
+    if width < sharp.width_px:
+        raise invalid(f"full_width_px must be at least {sharp.width_px}, the pictures' own width, got {width}")
+    camera = {name: sharp.facts.get(name) if manifest[name] is None else manifest[name] for name in CAMERA}
+    transfer, name = manifest["transfer"] or "by file type", manifest["name"] or folder_path.resolve().name
     notes = {"manifest": path.name, "transfer": transfer, "pictures": files, "dots": manifest["dots"]}
     if from_exif := [name for name in CAMERA if manifest[name] is None and camera[name] is not None]:
         notes["from_exif"] = from_exif
-    name = manifest["name"] or folder_path.resolve().name
     return [
         Captures(pairs, focus, width, **camera, name=name, notes=notes | {"position_px": list(pairs[0].position_px)})
         for pairs in zip(*columns, strict=False)

@@ -15,7 +15,7 @@ from ..result import Array, BlurFit
 from .diagnostics import EXPLAINED, FAR_ABOVE, bic_of, check_fit, check_focus, check_levels, check_linearity, describe
 from .dot import check_blacks, find_dot, fine_share_inside, independent_share, used_pixels
 from .family_choice import COST, choose, looks_alike
-from .forward import ALL_MOVES, OPENINGS, SHAPES, Forward, Solution
+from .forward import ALL_MOVES, OPENINGS, SHAPES, Forward
 from .free_kernels import solve_image, solve_opening, solve_polygon, solve_radial
 from .profile_fit import blur_strength, fit_profile
 from .source import Edge, ideal_dot, picture_of_dot, point_source, soft_edge
@@ -149,7 +149,13 @@ def fit_pair(
         why, opening = "", None
         pair.held_magnification = freest.moves["magnification"]
         if free_profile and family == "auto":
-            solution, why = _choose(freest, accuracy_db)
+            # every family at the free profile's magnification; the chosen one is then fitted with it
+            held_pair = replace(pair, fit_moves=("dx", "dy"))
+            solutions = {"radial": freest} | {f: held_pair.solve(f) for f in COST[:-1]}
+            kernels, bic = {f: s.kernel for f, s in solutions.items()}, {f: bic_of(s) for f, s in solutions.items()}
+            chosen, why = choose(kernels, bic, accuracy_db)
+            is_final = chosen == "radial" or pair.fit_moves != ALL_MOVES
+            solution = solutions[chosen] if is_final else pair.solve(chosen)
             opening = solve_opening(freest)
             if opening is not None and looks_alike(solution.kernel, opening[0].kernel, accuracy_db):
                 opening = None
@@ -214,13 +220,3 @@ def prepared_pair(
     pair.shot_noise = edge.shot_noise / edge.level
     pair.fine_share_of_light = fine_share_inside(sharp_picture, dot)
     return pair, edge, linear
-
-
-def _choose(radial: Solution, accuracy_db: float) -> tuple[Solution, str]:
-    """Fits every family at the free profile's magnification and chooses one, which is then fitted with it."""
-    pair, fixed_pair = radial.pair, replace(radial.pair, fit_moves=("dx", "dy"))
-    solutions = {"radial": radial} | {family: fixed_pair.solve(family) for family in COST[:-1]}
-    bic = {f: bic_of(solution) for f, solution in solutions.items()}
-    family, why = choose({f: solution.kernel for f, solution in solutions.items()}, bic, accuracy_db)
-    is_final = family == "radial" or pair.fit_moves != ALL_MOVES
-    return solutions[family] if is_final else pair.solve(family), why

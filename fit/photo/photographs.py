@@ -98,8 +98,7 @@ def read_photographs(
             continue
         height, width = light.shape
         if pictures and width != pictures[0].light.shape[1]:
-            text = f"is {width} px wide, the others {pictures[0].light.shape[1]}: all from one camera"
-            raise FitError(text, file=str(path))
+            raise FitError(f"is {width} px wide, others {pictures[0].light.shape[1]}: use one camera", file=str(path))
         settings = settings or camera_settings(picture.metadata, width, height)
         is_integer = picture.sample in ("8", "16")
         integers = integers and is_integer

@@ -125,8 +125,7 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
         # compare the error of r_c with sigma if r_c is smaller, because a peak at the centre has r_c near 0
         reference_length = max(value, float(fit.params["sigma"]) if name == "r_c" else 0.0)
         if not error < 0.25 * reference_length:
-            text = f"the profile is too flat, or too different from the family, to fix {name} = {value:.4g}"
-            warn(text, "flat profile")
+            warn(f"the profile is flat, or too different from the family, to fix {name} = {value:.4g}", "flat profile")
         if value >= 0.999 * bound:
             warn(f"{name} ended on its bound {bound:.4g}; it is only a limit", "boundary")
     return fit

@@ -13,15 +13,9 @@ from ..result import Array
 from ..solve import best_of
 from .dot import Dot, distance_from, fine_variance, inner_pixels, noise_beside, noise_of
 
-UNFOCUSED_PX = 1.0
-"""Sigma of an edge, px, above which it is out of focus; every camera gives a sharper edge in focus."""
-
+UNFOCUSED_PX = 1.0  # sigma of an edge, px, above which it is out of focus; every camera gives a sharper edge in focus
 _FOCUSED_PX = 0.5  # typical for cameras: between a perfect lens and a demosaiced picture
 _SAMPLES_PER_PX = 6  # samples across a pixel near the edge
-
-
-Draw = Callable[[tuple[int, ...], float, float, float], Array]
-"""Draws a picture from its shape, and the centre (x, y) and the magnification of a dot."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +26,7 @@ class Source:
     y: float
     radius: float  # of a uniform disc with the same second moment
     reach: float  # dark beyond this radius
-    draw: Draw
+    draw: Callable[..., Array]  # a picture, from its shape, and the centre (x, y) and the magnification of the dot
     noise: float = 0.0  # standard deviation of its pixels
     ideal: bool = False  # whether it is an ideal dot: without noise, and not softer than in focus
 
@@ -55,7 +49,7 @@ def point_source(shape: tuple[int, ...], dot: Dot) -> Source:
     return Source(x, y, 0.0, 4.0, _drawn_by_splines(picture, x, y))
 
 
-def _drawn_by_splines(picture: Array, x: float, y: float) -> Draw:
+def _drawn_by_splines(picture: Array, x: float, y: float) -> Callable[..., Array]:
     spline = spline_filter(picture, order=3)
 
     def draw(shape: tuple[int, ...], centre_x: float, centre_y: float, magnification: float) -> Array:
@@ -143,10 +137,8 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
         variance = sum(residual[half].var(ddof=1) / half.sum() for half in (lower, upper))
         steepness_error = float(np.sqrt(variance)) / level
     exponent, misfit = float(solution[5]) if fit_exponent else 1.0, rms / expected if expected > 0 else np.inf
-    place = dot.x + dx, dot.y + dy
-    return Edge(
-        *place, radius, softness, level * dot.peak, exponent, rms, misfit, steepness, steepness_error, shot_noise
-    )
+    found = radius, softness, level * dot.peak, exponent, rms, misfit, steepness, steepness_error, shot_noise
+    return Edge(dot.x + dx, dot.y + dy, *found)
 
 
 def _coverage(rows: Array, columns: Array, x: float, y: float, radius: float, softness: float) -> Array:

@@ -2,8 +2,8 @@
 
 import datetime
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import Any
 
@@ -16,7 +16,6 @@ from torchdof.validation import choice, show
 
 from ..problems import FitError, checked, warn, without_warnings
 from ..result import Array, BlurFit
-from .agreement import check_agreement
 from .captures import CAMERA, Capture, Captures
 from .dot import find_dot
 from .family_choice import COST
@@ -24,24 +23,13 @@ from .forward import OPENINGS, SHAPES
 from .pair import fit_pair
 from .source import soft_edge
 
+_MIN_BLUR_PX = 2.0  # radius of a blur that is compared with the camera's; aberrations dominate smaller ones
+# log factors between both above which to warn and to refuse; a thick lens differs by up to 1.1, an f-stop by 1.41
+_WARN_LOG, _REFUSE_LOG = math.log(1.15), math.log(1.35)
 _MAX_EXPOSURE_RATIO = 1.3  # ratio of fitted to stated exposure above which to warn
 _BY_COST = (*COST, *OPENINGS)
 _KNOTS = 33  # values of a free profile, equal for all distances
 _COLOURS = ("red", "green", "blue")
-_DEFOCUSED_PX = 1.5  # px; for smaller blurs it is uncertain on which side of focus a colour is
-_RADIUS_ERROR = 0.02  # relative error with which the thin lens gives the radius
-
-
-@dataclass(frozen=True)
-class Colour:
-    """One colour of a capture."""
-
-    name: str  # "red", "green" or "blue"
-    fits: tuple[BlurFit, ...]  # one for each distance, like those of the mean of the colours
-    # longitudinal colour: 1/distance of its focus minus that of green, 1/m; NaN unless two distances are blurred enough
-    focus_shift_dioptres: float
-    # lateral colour: (x, y) offsets of its dot from green's, px: in focus, then at each distance
-    lateral_px: tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -54,8 +42,8 @@ class TableFit:
         coc_px: signed circle of confusion of each pair, px of the frame.
         why: reason for the family.
         scale: source of the circles of confusion: "camera" or "measured".
-        colours: fits of red, green and blue, if the captures have colours; the table then has a kernel for each, and
-            `fits` are those of their mean.
+        colours: fits of "red", "green" and "blue", if the captures have colours; the table then has a kernel for each,
+            and `fits` are those of their mean.
     """
 
     table: BlurTable
@@ -63,7 +51,7 @@ class TableFit:
     coc_px: tuple[float, ...]
     why: str
     scale: str
-    colours: tuple[Colour, ...] = ()
+    colours: Mapping[str, tuple[BlurFit, ...]] = field(default_factory=dict)
 
 
 def fit_table(captures: Captures, family: str = "auto", **options: Any) -> BlurTable:
@@ -180,14 +168,13 @@ def fit_captures(
         **{name: getattr(captures, name) for name in CAMERA if getattr(captures, name) is not None},
         **{"coc_from": scale, "family_because": why, "command": command},
     }
-    colours = _fit_colours(captures, fits) if all(pair.colours is not None for pair in pairs) else ()
-    if colours:
-        colour_params = [_params(colour.fits, family) for colour in colours]
+    colours: dict[str, tuple[BlurFit, ...]] = {}
+    if all(pair.colours is not None for pair in pairs):
+        by_pair = [_fit_colours(pair, captures.focus_m, fit) for pair, fit in zip(pairs, fits, strict=True)]
+        colours = dict(zip(_COLOURS, zip(*by_pair, strict=True), strict=True))
+        colour_params = [_params(colour_fits, family) for colour_fits in colours.values()]
         params = {n: np.stack([p[n] for p in colour_params]) for n in params}
-        shifts = [c.focus_shift_dioptres for c in colours]
-        provenance["colours"] = [c.name for c in colours]
-        provenance["focus_shift_dioptres"] = [round(s, 5) if math.isfinite(s) else None for s in shifts]
-        provenance["lateral_px"] = [[[round(v, 3) for v in xy] for xy in c.lateral_px] for c in colours]
+        provenance["colours"] = list(colours)
     sensor = captures.sensor_width_mm
     unit = captures.width_px if sensor is None else captures.width_px / sensor
     table = BlurTable(
@@ -202,6 +189,36 @@ def fit_captures(
         aperture=opening,
     )
     return TableFit(table, tuple(fits), tuple(coc_px.tolist()), why, scale, colours)
+
+
+def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> None:
+    """Compares the fitted radius at each distance with the camera's, or without one with the other distances'."""
+    measured, camera_px = np.asarray(radius_px, dtype=np.float64), captures.promised_px
+    if camera_px is None:  # the scale is a median weighted by the defocus, so that one wrong distance has no effect
+        defocus = np.abs(captures.defocus)
+        order = np.argsort(measured / defocus)
+        weight = np.cumsum(defocus[order])
+        expected = defocus * (measured / defocus)[order][np.searchsorted(weight, 0.5 * weight[-1])]
+    else:
+        expected = np.abs(camera_px)
+    is_large = np.maximum(expected, measured) > _MIN_BLUR_PX
+    difference = np.maximum(np.abs(measured - expected) - 0.5, 0.0)  # half a pixel is for aberrations
+    misfit = np.log1p(difference / np.maximum(np.minimum(measured, expected), 1e-9))
+    misfit_log = float(np.max(np.where(is_large, misfit, 0.0)))
+    # without a camera the scale is fitted to the distances themselves
+    if int(is_large.sum()) < (3 if camera_px is None else 1) or misfit_log < _WARN_LOG:
+        return
+    worst = int(np.argmax(np.where(is_large, np.abs(np.log(measured / expected)), 0.0)))
+    each = zip(measured / expected, captures.distances_m, strict=True)
+    ratios = ", ".join(f"{ratio:.2f} at {distance:g} m" for ratio, distance in each)
+    text = f"the blur's radius over the expected one is {ratios}: check the distance of a single odd one, the focus if "
+    text += "near and far ones differ, and units, a crop (full_width_px) and the camera's numbers if all do"
+    if camera_px is not None:
+        text += f"; without {', '.join(CAMERA)} the scale is measured"
+    file = captures.pairs[worst].files[1]
+    if misfit_log > _REFUSE_LOG:
+        raise FitError(text, "camera", file)
+    warn(text, "camera", file)
 
 
 def _params(fits: Sequence[BlurFit], family: str) -> dict[str, Array]:
@@ -256,36 +273,11 @@ def _with_uncertainty(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
     )
 
 
-def _fit_colours(captures: Captures, fits: Sequence[BlurFit]) -> tuple[Colour, ...]:
-    """Fits red, green and blue of every pair like their mean.
-
-    The softness of the sharpest colour is used for all, so that each kernel contains all of its colour's blur.
-    """
-    fits_by_colour: list[list[BlurFit]] = [[] for _ in _COLOURS]
-    for pair, mean in zip(captures, fits, strict=True):
-        sharp_colours, blurred_colours = pair.colours or ((), ())
-        softness = min(soft_edge(sharp, find_dot(sharp, file=pair.files[0])).softness for sharp in sharp_colours)
-        fixed: dict[str, Any] = {"magnification": mean.magnification, "fit_magnification": False, "softness": softness}
-        for colour, *windows in zip(fits_by_colour, sharp_colours, blurred_colours, strict=True):
-            colour.append(_fit_like(mean, pair, captures.focus_m, *windows, **fixed))
-    green = fits_by_colour[1]
-    shifts = [_focus_shift(captures.defocus, colour) for colour in fits_by_colour]
-    colours = []
-    for name, colour, shift in zip(_COLOURS, fits_by_colour, shifts, strict=True):
-        blurred = np.array([np.subtract(f.centre, g.centre) for f, g in zip(colour, green, strict=True)])
-        shifts_from_green = np.array([np.subtract(f.shift, g.shift) for f, g in zip(colour, green, strict=True)])
-        lateral = tuple((float(x), float(y)) for x, y in [(blurred - shifts_from_green).mean(axis=0), *blurred])
-        colours.append(Colour(name, tuple(colour), shift - shifts[1], lateral))
-    return tuple(colours)
-
-
-def _focus_shift(defocus: Array, fits: Sequence[BlurFit]) -> float:
-    """1/distance of a colour's focus minus the capture's, 1/m: where the line through its signed radii crosses 0."""
-    radius: Array = np.array([f.radius for f in fits]) * np.sign(defocus)
-    error = np.hypot([f.radius_stderr for f in fits], _RADIUS_ERROR * radius)
-    is_blurred = np.abs(radius) > _DEFOCUSED_PX
-    if is_blurred.sum() < 2:
-        return math.nan
-    slope, intercept = np.polyfit(defocus[is_blurred], radius[is_blurred], 1, w=1 / error[is_blurred])
-    # radius = slope * (1/focus - shift - 1/distance), with the colour's own focus 1/focus - shift
-    return float(intercept / slope)
+def _fit_colours(pair: Capture, focus_m: float, mean: BlurFit) -> list[BlurFit]:
+    """Fits red, green and blue like their mean."""
+    sharp_colours, blurred_colours = pair.colours or ((), ())
+    # the sharpest colour's softness is used for all, so that each kernel contains all of its colour's blur
+    softness = min(soft_edge(sharp, find_dot(sharp, file=pair.files[0])).softness for sharp in sharp_colours)
+    fixed: dict[str, Any] = {"magnification": mean.magnification, "fit_magnification": False, "softness": softness}
+    windows = zip(sharp_colours, blurred_colours, strict=True)
+    return [_fit_like(mean, pair, focus_m, sharp, blurred, **fixed) for sharp, blurred in windows]

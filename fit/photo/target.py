@@ -1,8 +1,7 @@
 """The printed target (a white dot in a black square on white paper), and its detection in photographs.
 
-The square gives the scale, and so the distance; the dot gives the blur; the paper gives the level of white. An unknown
-tone curve is found from them: the dot's light over the paper's is its printed area, whatever the blur, and a blurred
-edge of the square darkens as much as it lights up.
+An unknown tone curve is found from it: the dot's light over the paper's is its printed area, whatever the blur, and a
+blurred edge of the square darkens as much as it lights up.
 """
 
 import math
@@ -26,15 +25,9 @@ from ..result import Array, Mask
 
 Paper = Literal["a4", "letter"]
 
-SQUARE_MM = 100.0
-"""Side of the black square, mm."""
-
-DOT_MM = 5.0
-"""Diameter of the white dot in its centre, mm."""
-
-WINDOW = 0.36
-"""Half side of the dot's window, relative to the square's side."""
-
+SQUARE_MM = 100.0  # side of the black square, mm
+DOT_MM = 5.0  # diameter of the white dot in its centre, mm
+WINDOW = 0.36  # half side of the dot's window, relative to the square's side
 _THUMBNAIL_PX = 500  # width of the reduced copy in which the square is searched
 _THRESHOLDS = np.linspace(0.1, 0.75, 14)  # fractions of the range between dark and bright
 _MIN_SHARE, _MAX_SHARE = 0.004, 0.6  # limits of the square's share of the frame
@@ -85,8 +78,7 @@ def find_target(light: Array, *, file: str | None = None) -> Target:
     thresholds = low + _THRESHOLDS * (high - low)
     candidates = [target for level in thresholds for target in _squares(thumbnail, thumbnail < level)]
     if not candidates:
-        text = "no target found: show a black square with a white dot, white paper around it, evenly lit and square on"
-        raise FitError(text, "no dot", file)
+        raise FitError("no target found: show the black square with its dot on white paper, evenly lit", "no dot", file)
     best = max(candidates, key=lambda t: (t.white - t.black) / max(t.white + t.black, 1e-12))  # highest contrast
     x, y = ((v + 0.5) * step - 0.5 for v in (best.x, best.y))
     return _refined(light, replace(best, x=x, y=y, side_px=best.side_px * step))
@@ -155,11 +147,7 @@ def _refined(light: Array, rough: Target) -> Target:
 
 
 def untoned(light: Array, bend: Sequence[float] | Array) -> Array:
-    """Undoes a tone curve.
-
-    With the encoded level e and u = 2 e - 1, the slope of the inverse curve is `exp(b1 u + b2 (u^2 - 1/3) + b3 (u^3 -
-    3/5 u))`, times a factor that keeps white: it is monotonic. An S-curve has b2 > 0.
-    """
+    """Undoes a tone curve, whose inverse has a positive slope over the encoded levels; an S-curve has `bend[1] > 0`."""
     u = 2 * _LEVELS - 1
     slope = np.exp(bend[0] * u + bend[1] * (u**2 - 1 / 3) + bend[2] * (u**3 - 0.6 * u))
     inverse_curve = np.concatenate([[0.0], np.cumsum(slope[1:] + slope[:-1])])
@@ -169,10 +157,7 @@ def untoned(light: Array, bend: Sequence[float] | Array) -> Array:
 
 
 def tone_curve(pictures: Sequence[tuple[Array, Target]], square_mm: float) -> tuple[Array, Array]:
-    """The parameters of `untoned` [3] for which dots and edges are as expected; 0 if noise would explain them as well.
-
-    Also returns steps of one standard error in independent directions [3, 3]; they include an insignificant curve.
-    """
+    """The `bend` of `untoned` [3] that dots and edges show, 0 if insignificant; and its independent errors [3, 3]."""
     dots = []
     for light, target in pictures:
         half = int(WINDOW * target.side_px)

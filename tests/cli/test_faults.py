@@ -100,7 +100,7 @@ def test_a_frame_that_cannot_be_read_or_written_stops_the_sequence_and_is_named(
         "bench --table nowhere --out kept/x",
         "bench broken.exr depth.npy --out kept",
         "fit nowhere -o kept/x.json",
-        "fit --lens nowhere -o x.json --plots kept/x",
+        "fit nowhere -o x.json --plots kept/x",
         "fit --lens nowhere -o old.json",
         "export -o kept/x.onnx --table nowhere",
     ],

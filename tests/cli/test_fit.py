@@ -35,7 +35,7 @@ def test_a_folder_becomes_a_table_with_pictures(run: Run, folder: Path, tmp_path
     assert table.provenance["command"].startswith("torchdof fit ")
     assert all(words in output for words in ("±", "family: disc", "x noise")) and "warning" not in output
     assert sorted(f.name for f in (tmp_path / "pictures").iterdir()) == [
-        "mine_1000mm.png", "mine_400mm.png", "mine_800mm.png", "mine_table.png",
+        "mine_1000mm.png", "mine_400mm.png", "mine_800mm.png",
     ]  # fmt: skip
 
 
@@ -43,10 +43,12 @@ def test_pictures_without_a_stated_transfer_give_a_warning(run: Run, folder: Pat
     shutil.copytree(folder, tmp_path / "lens")
     manifest = tmp_path / "lens" / "capture.toml"
     manifest.write_text(manifest.read_text().replace('transfer = "srgb"', ""))
-    facts = json.loads(run("fit", tmp_path / "lens", "-o", tmp_path / "mine.json", "--family", "disc", "--json"))
+    options = ("-o", tmp_path / "mine.json", "--family", "disc", "--colours", "each", "--json")
+    facts = json.loads(run("fit", tmp_path / "lens", *options))
     assert facts["name"] == "my lens" and facts["focus_m"] == 0.5 and facts["family"] == "disc"
     assert [fit["distance_m"] for fit in facts["fits"]] == [0.4, 0.8, 1.0]
     assert all(fit["stderr"]["radius"] > 0 for fit in facts["fits"])
+    assert [colour["name"] for colour in facts["colours"]] == ["red", "green", "blue"]
     assert "the encoding of 0500mm.png and 3 more is not stated" in facts["warnings"][0]
 
 
@@ -107,10 +109,8 @@ def test_photographs_of_the_target_become_a_table_and_a_sheet(
     table = BlurTable.load(tmp_path / "phone.json")
     assert table.unit == "mm" and table.provenance["sharp"] == "img_0000.jpg"
     assert (tmp_path / "phone.png").stat().st_size > 20_000
-    # the first call renders lights at every CoC, the second the photograph in focus at the largest CoC
-    (_, lights), (photograph, coc_px) = rendered
-    assert lights.min() == 0 and coc_px.unique().tolist() == [lights.max()]
-    assert photograph.shape[-1] > 60 and photograph.max() > 0.7 and photograph[..., :5].max() < 0.1
+    ((picture, lights),) = rendered  # lights at every CoC
+    assert lights.min() == 0 and lights.max() > 1 and picture.shape == lights.shape
 
 
 def test_a_lens_is_traced_in_its_colours_and_across_its_field(

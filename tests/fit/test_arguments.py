@@ -13,13 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.hard.test_arguments import FEW, JUNK, NUMBERS
-from torchdof import BlurTable, Camera
 from torchdof.fit import (
     Capture,
     Captures,
     FitWarning,
     blur_strength,
-    check_reach,
     fit_captures,
     fit_pair,
     fit_profile,
@@ -57,7 +55,6 @@ def options_of(function: Callable[..., Any]) -> dict[str, Any]:
 SHARP, BLURRED = dot(), dot(sigma=4.0)
 PAIR = Capture(SHARP, BLURRED, 1.5)
 R = np.linspace(0, 8, 20)
-TABLE = BlurTable("disc", [-0.1, 0.1], {"radius": [0.1, 0.1]}, unit="fraction")
 LENS = Lens.read("double_gauss_50mm")
 CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "fit_profile": (fit_profile, {"r": R, "strength": dot(39)[19, 19:], "family": "gaussian", "groups": None}),
@@ -69,9 +66,6 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "fit_captures": (fit_captures, {"captures": None, "family": "gaussian"}),
     "blur_strength": (blur_strength, {"sharp": SHARP, "blurred": BLURRED}),
     "natural_psnr": (natural_psnr, {"kernel": SHARP, "other": BLURRED}),
-    "check_reach": (
-        check_reach, {"table": TABLE, "camera": Camera(), "near_m": 1.0, "far_m": 3.0, "width_px": 100}
-    ),
     "trace_table": (
         trace_table,
         {**options_of(trace_table), "lens": None, "nodes": 5, "points": 9, "width_px": 100, "rays": 100}

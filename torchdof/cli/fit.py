@@ -88,7 +88,7 @@ class Fit(_Photographs, _Target, _Lens, Command):
         "Folder with photographs: of a dot with their capture.toml, or of the printed target.", "[CAPTURES]", None
     )
     out: Path = option("The table to write (JSON).", Path("table.json"), names=("--out", "-o"))
-    plots: Path | None = option("Folder for pictures of the fits and the table.")
+    plots: Path | None = option("Folder for pictures of the fits to photographs.")
 
     def run(self) -> None:
         """Checks the options, then makes the table, or writes the target to print."""
@@ -96,8 +96,8 @@ class Fit(_Photographs, _Target, _Lens, Command):
             raise ValueError("--target writes the page to print; give it alone, and the photographs afterwards")
         if self.target is None and (self.captures is None) == (self.lens is None):
             raise ValueError("give either a folder of captures or --lens FILE")
-        if self.root is not None and self.lens is not None:
-            raise ValueError("--root is the folder of photographs; leave it out with --lens")
+        if self.lens is not None and (self.root or self.plots):
+            raise ValueError("--root is the folder of photographs, --plots of their fits; leave them out with --lens")
         if self.out.suffix != ".json":
             raise ValueError(f"{self.out}: the table is written as JSON: name it {self.out.with_suffix('.json')}")
         if self.field is not None and self.field_deg:

@@ -57,10 +57,6 @@ def trace_lens(command: Fit, source: str, console: Console) -> None:
     _write(console, table, command.out)
     if command.as_json:
         print(json_line({"out": str(command.out), "family": table.family, **facts}))
-    if command.plots is not None:
-        from torchdof.fit.plots import picture_of_table
-
-        _save(console, picture_of_table(table), command.plots / f"{command.out.stem}_table.png")
 
 
 def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[warnings.WarningMessage]) -> None:
@@ -113,19 +109,15 @@ def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[w
             try:
                 from torchdof.fit.plots import sheet_of_photographs
 
-                sheet = sheet_of_photographs(
-                    photographs, result, lambda *scene: blur_by_coc(*scene[:2], table=scene[2])
-                )
-                _save(console, sheet, out.with_suffix(".png"))
+                _save(console, sheet_of_photographs(photographs, result, blur_by_coc), out.with_suffix(".png"))
             except ModuleNotFoundError as error:
                 console.print(f"no sheet of pictures: {error.name} is not installed (pip install torchdof[plot])")
         elif command.plots is not None:
-            from torchdof.fit.plots import picture_of_fit, picture_of_table
+            from torchdof.fit.plots import picture_of_fit
 
             for pair, fit in zip(captures, result.fits, strict=True):
                 picture = command.plots / f"{out.stem}_{1000 * pair.distance_m:.0f}mm.png"
                 _save(console, picture_of_fit(fit), picture)
-            _save(console, picture_of_table(result.table), command.plots / f"{out.stem}_table.png")
         if command.as_json:
             facts = {"out": str(out), **_facts(captures, result), "warnings": messages}
             print(json_line(facts | ({"advice": photographs.advice} if photographs else {})), flush=True)
@@ -136,7 +128,6 @@ def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[w
 def _facts(captures: Captures, result: TableFit) -> dict[str, Any]:
     """The numbers that :func:`_print_fit` prints."""
     of_fit = ("params", "stderr", "residual", "residual_over_noise", "magnification")
-    of_colour = ("name", "focus_shift_dioptres", "lateral_px")
     return {
         **{"name": captures.name, "family": result.fits[0].family, "why": result.why, "scale": result.scale},
         "focus_m": captures.focus_m,
@@ -145,8 +136,7 @@ def _facts(captures: Captures, result: TableFit) -> dict[str, Any]:
             for pair, fit, coc in zip(captures, result.fits, result.coc_px, strict=True)
         ],
         "colours": [
-            {**{name: getattr(c, name) for name in of_colour}, "radius_px": [fit.radius for fit in c.fits]}
-            for c in result.colours
+            {"name": name, "radius_px": [fit.radius for fit in fits]} for name, fits in result.colours.items()
         ],
     }
 
@@ -167,16 +157,11 @@ def _print_fit(console: Console, captures: Captures, result: TableFit) -> None:
     how = "from focal length and f-number" if result.scale == "camera" else "measured, the thin lens in between"
     console.print(f"family: {result.why}\ncircles of confusion: {how}")
     if result.colours:
-        vergences = [1 / captures.focus_m + colour.focus_shift_dioptres for colour in result.colours]
-        focuses = [f"{1 / v:.4g}" if v > 0 else "" if math.isnan(v) else "beyond infinity" for v in vergences]
-        columns = {"": [colour.name for colour in result.colours], "focus m": focuses}
+        columns = {"": list(result.colours)}
         for i, pair in enumerate(captures):
-            radii = [f"{c.fits[i].radius:.2f} ± {c.fits[i].radius_stderr:.2g}" for c in result.colours]
+            radii = [f"{fits[i].radius:.2f} ± {fits[i].radius_stderr:.2g}" for fits in result.colours.values()]
             columns[f"radius px at {pair.distance_m:g} m"] = radii
-        lateral = [colour.lateral_px[0] for colour in result.colours]
-        columns["lateral px in focus"] = [f"({x:+.2f}, {y:+.2f})" for x, y in lateral]
-        print_columns(console, "colours, beside green", columns)
-        console.print("the table holds a kernel a colour; lateral colour is no blur, and not in it")
+        print_columns(console, "colours: the table holds a kernel for each", columns)
 
 
 def _write(console: Console, table: BlurTable, target: Path) -> None:

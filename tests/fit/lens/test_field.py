@@ -29,7 +29,7 @@ CAMERA = Camera(GAUSS.paraxial().focal_length, F_NUMBER, FOCUS_M, SENSOR_MM)
 
 def traced_spot(z_m: float, radius_mm: float, azimuth: float, half: int, width: int, rays: int = 160_000) -> np.ndarray:
     """Pixels ``[2 half + 1, 2 half + 1]`` of the traced spot of a point whose sharp image is a small Gaussian."""
-    height = field_height_mm(STOPPED, z_m, SENSOR, radius_mm, "principal")
+    height = field_height_mm(STOPPED, z_m, SENSOR, radius_mm)
     u, v, weight = spot_of_place(STOPPED, z_m, SENSOR, height, rays=rays)
     u, v = u * (width / SENSOR_MM), v * (width / SENSOR_MM)
     y, x = u * math.sin(azimuth) + v * math.cos(azimuth), u * math.cos(azimuth) - v * math.sin(azimuth)
@@ -79,7 +79,7 @@ def test_lateral_colour_displaces_the_colours_of_a_point() -> None:
     assert table.field is not None
     stopped, width, column = GAUSS.with_f_number(4.0), 3840, 3680  # the column is 16.5 mm from the centre of 36 mm
     sensor = focus_sensor(stopped, 2.0)
-    height = field_height_mm(stopped, 2.0, sensor, 16.5, "principal")
+    height = field_height_mm(stopped, 2.0, sensor, 16.5)
     centres = []
     for wavelength in RGB_UM:
         u, _, weight = spot_of_place(stopped, math.inf, sensor, height, rays=3_000, wavelength_um=wavelength)
@@ -92,18 +92,3 @@ def test_lateral_colour_displaces_the_colours_of_a_point() -> None:
     across = picture.sum(1) @ (torch.arange(width) - column).double() / picture.sum((1, 2))
     assert centres[2] - centres[0] > 0.2  # px
     assert (across - across[1]).tolist() == pytest.approx([c - centres[1] for c in centres], abs=0.05)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"field": (1.0, 20.0)}, "from 0 on"),
-        ({"field": (0.0, 20.0, 10.0)}, "must be increasing"),
-        ({"field": (0.0, 20.0), "field_mm": 3.0}, "give one of them"),
-        ({"field": (0.0, 20.0), "field_nodes": 1}, "field_nodes must be"),
-        ({"field": (0.0, 20.0), "field_rays": 5}, "field_rays must be"),
-    ],
-)
-def test_bad_fields_are_refused_by_name(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        trace_table(GAUSS, 2.0, 2.0, **change)

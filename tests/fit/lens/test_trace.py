@@ -155,6 +155,11 @@ def test_off_axis_table_states_its_asymmetry():
         ({"nearest_m": 3.0}, "nearest_m must be a number of metres > 0 and < 2, got 3.0"),
         ({"wavelengths_um": RGB_UM, "lens": "wide_22mm"}, "wavelengths_um need a lens with Abbe numbers"),
         ({"wavelengths_um": (0.1,)}, "wavelength_um must be a number of micrometres > 0.299"),
+        ({"field": (1.0, 20.0)}, "from 0 on"),
+        ({"field": (0.0, 20.0, 10.0)}, "must be increasing"),
+        ({"field": (0.0, 20.0), "field_mm": 3.0}, "give one of them"),
+        ({"field": (0.0, 20.0), "field_nodes": 1}, "field_nodes must be"),
+        ({"field": (0.0, 20.0), "field_rays": 5}, "field_rays must be"),
     ],
 )
 def test_impossible_tables_are_refused(changes, message):  # arguments of the wrong kind: test_arguments.py

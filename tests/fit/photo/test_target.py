@@ -83,8 +83,8 @@ def test_each_colour_of_photographs_has_its_own_kernel(folder):
     np.testing.assert_allclose(pair.colours[1].mean(0), pair.blurred, atol=1e-6)
     with pytest.warns(FitWarning, match="one distance"):
         found = fit_captures(replace(captures, pairs=(pair,)), "disc")
-    assert found.table.channels == 3 and [c.name for c in found.colours] == ["red", "green", "blue"]
-    assert [c.fits[0].radius for c in found.colours] == pytest.approx([found.fits[0].radius] * 3, rel=0.01)
+    assert found.table.channels == 3 and list(found.colours) == ["red", "green", "blue"]
+    assert [fits[0].radius for fits in found.colours.values()] == pytest.approx([found.fits[0].radius] * 3, rel=0.01)
 
 
 def test_errors_of_unreadable_folders_state_the_remedy(simulator, tmp_path):
