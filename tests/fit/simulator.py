@@ -12,11 +12,11 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-import OpenImageIO as oiio
 import torch
 from PIL import Image
 from scipy.signal import fftconvolve
 
+from tests.files import store
 from torchdof.fit import FitError, FitWarning
 from torchdof.fit.photo.captures import demosaiced
 from torchdof.io.images import Picture, write_image
@@ -203,16 +203,9 @@ def write_photographs(folder, focus_m, distances, width=800, tone=0.5, noise=0.0
             light = blur(np.pad(light, 40, mode="edge"), "disc", {"radius": radius})[40:-40, 40:-40]
         camera = Simulator(snr_db=-20 * np.log10(noise), bayer=True, tone=tone)
         pixels = np.round(255 * encode_srgb(camera.record(light, np.random.default_rng(i)))).astype(np.uint8)
-        spec = oiio.ImageSpec(width, height, 3, "uint8")
-        spec.attribute("Compression", f"jpeg:{jpeg}")
-        if exif:
-            spec.attribute("Exif:FocalLength", focal_mm)
-            spec.attribute("FNumber", f_number)
-            spec.attribute("Exif:FocalLengthIn35mmFilm", 26)
-        out = oiio.ImageOutput.create(str(folder / f"img_{i:04d}.jpg"))
-        out.open(str(folder / f"img_{i:04d}.jpg"), spec)
-        out.write_image(np.ascontiguousarray(np.repeat(pixels[..., None], 3, 2)))
-        out.close()
+        tags = {"Exif__FocalLength": focal_mm, "FNumber": f_number, "Exif__FocalLengthIn35mmFilm": 26} if exif else {}
+        grey = np.repeat(pixels[..., None], 3, 2)
+        store(folder / f"img_{i:04d}.jpg", grey, "uint8", Compression=f"jpeg:{jpeg}", **tags)
 
 
 def place_of_target(i: int, width: int) -> tuple[float, float]:

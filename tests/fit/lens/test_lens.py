@@ -1,10 +1,9 @@
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.lenses import turned
-from torchdof.fit.lens.glass import C_UM, D_UM, F_UM, G_UM, catalogue
+from torchdof.fit.lens.glass import AIR, C_UM, D_UM, F_UM, G_UM, catalogue
 from torchdof.fit.lens.lens import Lens
 
 FACTS = {
@@ -14,6 +13,16 @@ FACTS = {
 }
 SINGLET = "50 5 1.5168/64.17 20\n0 1 0 18\n-50 0 1 20\n"
 ASPHERE = "40 3 1.5 20 stop k=-0.6 A4=1.2e-06 A10=-3e-13\n-40 2 1 20 A2=0.001\n"
+
+
+def turned(lens):
+    """The lens with front and rear exchanged: radii and polynomials change their signs."""
+    media = [(AIR, 0.0), *((surface.glass, surface.thickness) for surface in lens.surfaces[:-1])]
+    surfaces = [
+        replace(one, radius=-one.radius, polynomial=tuple(-a for a in one.polynomial), glass=glass, thickness=gap)
+        for one, (glass, gap) in zip(lens.surfaces, media, strict=True)
+    ]
+    return replace(lens, surfaces=tuple(surfaces[::-1]), stop=len(surfaces) - 1 - lens.stop)
 
 
 @pytest.mark.parametrize("name", FACTS)
@@ -152,4 +161,4 @@ def test_impossible_lenses_are_refused_by_name(lens_of):
 
 def test_a_radius_beyond_all_floats_is_refused():
     with pytest.raises(ValueError, match="radius must be inf"):
-        dataclasses.replace(Lens.read("double_gauss_50mm").surfaces[0], radius=10**400)
+        replace(Lens.read("double_gauss_50mm").surfaces[0], radius=10**400)
