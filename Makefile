@@ -7,7 +7,7 @@
 # make wheel      build the wheel for this machine into dist/ and try it, and installation, without a compiler
 # make sanitize   run the compiled engine's tests under AddressSanitizer and ThreadSanitizer; needs GCC
 # make fuzz       changed files to every reader, and scenes to both engines, for an hour (SECONDS=3600); lists what it finds
-# make soak       1,000 renderings in one process, 8 threads, forked and spawned workers: memory and pictures stay the same
+# make soak       1,000 renderings in one process, 8 threads and spawned workers: memory and pictures stay the same
 # All but oldest need only make and Python 3.11 or newer: the first run makes .venv and installs what constraints.txt
 # pins. PYTHON=/path/to/python chooses the Python.
 # Where there is a C++ compiler the engine is compiled too.
@@ -73,7 +73,7 @@ fuzz: $(INSTALLED)
 	FUZZ_SECONDS=$(SECONDS) $(BIN)/python -m pytest -n 1 -m hard tests/fuzz
 
 soak: $(INSTALLED)
-	$(BIN)/python -m tests.hard.soak --renderings 1000
+	$(BIN)/python -m pytest -m sweep tests/hard/test_soak.py
 
 INSTALLS_FROM := pyproject.toml constraints.txt CMakeLists.txt $(wildcard torchdof/native/src/*) build/modules
 

@@ -325,29 +325,16 @@ def test_engines_agree_on_stacks(seed: int, by_both: Any) -> None:
 # Dtypes and contexts
 
 
-def _again(scene: Scene, way: dict[str, Any], out: Tensor) -> None:
-    image, coc_px = scene.image.clone(), scene.coc_px.clone()
-    for context in (torch.no_grad(), torch.inference_mode(), torch.autocast("cpu", torch.bfloat16)):
-        with context:
-            assert torch.equal(scene.blurred(**way), out)
-    assert torch.equal(image, scene.image) and torch.equal(coc_px, scene.coc_px)
-
-
-def _types(scene: Scene, way: dict[str, Any], out: Tensor) -> None:
+@EVERY_WAY
+def test_the_picture_does_not_depend_on_half_precision(engine: str, way: dict[str, Any]) -> None:
+    scene = made("smooth", 18, 22, 3.0, items=2, lamps=100.0)
+    scene.coc_px[0] *= 0.1
     for dtype in (torch.float16, torch.bfloat16):
         image = scene.image.to(dtype)
         expected = blur_by_coc(image.float(), scene.coc_px, **way).to(dtype)
         assert torch.equal(blur_by_coc(image, scene.coc_px, **way), expected)
         coc = scene.coc_px.to(dtype)
         assert_close(blur_by_coc(image, coc, **way), blur_by_coc(image, coc.float(), **way), rtol=1e-2, atol=1e-3)
-
-
-@EVERY_WAY
-@pytest.mark.parametrize("check", [_again, _types], ids=lambda check: check.__name__.strip("_"))
-def test_the_picture_does_not_depend_on(engine: str, way: dict[str, Any], check: Any) -> None:
-    scene = made("smooth", 18, 22, 3.0, items=2, lamps=100.0)
-    scene.coc_px[0] *= 0.1
-    check(scene, way, scene.blurred(**way))
 
 
 def posts(soft: bool = False) -> Tensor:
@@ -364,6 +351,7 @@ ENTRIES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "edges repaired": lambda i, _: REPAIRING(0.1 * i + (posts() < 2.0), posts(soft=True)),
     "cat's eyes": DepthOfField(CAMERA, BlurTable.polygon(5, vignetting=0.4)),
     "depth": DOF,
+    "fold": DepthOfField(CAMERA, method="fold"),
     "a plan": lambda image, depth: DOF(image, depth, plan=DOF.plan(image, depth)),
     "a background": lambda image, depth: DOF(image, depth, background=image, background_depth=2 * depth),
     "attention": lambda image, depth: DOF(image, depth, attention=(9.0, 9.0, 3.0)),
@@ -378,10 +366,13 @@ ENTRIES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 
 
 @pytest.mark.parametrize("name", ENTRIES)
-def test_autocast_does_not_change(name: str, engine: str) -> None:
-    plain = ENTRIES[name](texture(), slope(1.2, 6.0))
-    with torch.autocast("cpu", torch.bfloat16):
-        assert torch.equal(ENTRIES[name](texture(), slope(1.2, 6.0)), plain)
+def test_contexts_change_neither_picture_nor_input_of(name: str, engine: str) -> None:
+    image, depth = texture(), slope(1.2, 6.0)
+    plain = ENTRIES[name](image, depth)
+    for context in (torch.no_grad(), torch.inference_mode(), torch.autocast("cpu", torch.bfloat16)):
+        with context:
+            assert torch.equal(ENTRIES[name](image, depth), plain)
+    assert torch.equal(image, texture()) and torch.equal(depth, slope(1.2, 6.0))
 
 
 @pytest.mark.parametrize("method", ["layered", "fold"])
