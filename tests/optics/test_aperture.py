@@ -1,3 +1,4 @@
+import functools
 import json
 import math
 from pathlib import Path
@@ -156,9 +157,12 @@ def test_a_table_with_an_aperture_survives_save_and_load(tmp_path: Path) -> None
     assert written["version"] == 3 and written["aperture"]["blades"] == 7
 
 
+partial: Any = functools.partial
 test_an_invalid_opening_is_refused_by_name = refuses(
     (lambda: BlurTable.polygon(2), "blades must be a whole number from 3 to 64, got 2"),
     (lambda: BlurTable.polygon(5, torch.zeros(2)), "rotation_deg must be a number"),
+    *((partial(Aperture, **{"blades": 5, name: 10**400}), name)
+      for name in ("blades", "rotation_deg", "curvature", "squeeze", "vignetting")),
     (lambda: Aperture(curvature=0.5), "curvature is that of blades"),
     (lambda: Aperture(blades=5, mask=torch.ones(3, 3)), "blades or a mask, got 5"),
     (lambda: BlurTable.from_aperture(torch.zeros(4, 4)), "not all of them 0"),
@@ -167,7 +171,7 @@ test_an_invalid_opening_is_refused_by_name = refuses(
     (lambda: BlurTable("disc", [1.0], {"radius": [1.0]}, **SEVEN), "aperture must be of type Aperture, got 7"),
     (lambda: Aperture.from_dict({"leaves": 7}), "aperture must have the fields .*; 'leaves' is not one"),
     (lambda: Aperture.from_dict({"mask": [[1.0], [2.0, 3.0]]}), "mask must be numbers"),
-)
+)  # fmt: skip
 
 
 def test_an_opening_that_passes_no_light_is_refused() -> None:

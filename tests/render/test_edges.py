@@ -238,6 +238,27 @@ def test_differences_below_half_a_step_are_not_edges(scene: Scene, kind: str, en
     assert torch.equal(edges.repair(image, nearness, 2.001 * float(high - low), False), nearness)
 
 
+@pytest.mark.parametrize("auto", [True, False])
+@pytest.mark.parametrize(
+    ("near", "far", "light"),
+    [(3e38, 1.0, 1.0), (1e16, -1e16, 1.0), (1e14, -1e14, 1.0), (3e38, -3e38, 1.0), (math.nan, 1.0, 1.0),
+     (4.0, 1.0, 3e38), (4.0, 1.0, 1e-45)],
+)  # fmt: skip
+def test_repairs_of_maps_and_light_of_any_size_stay_finite(
+    near: float, far: float, light: float, engine: str, auto: bool
+) -> None:
+    nearness = torch.full((1, 1, 24, 32), far)
+    nearness[..., 6:18, 9:21] = near  # one pixel right of the image's square
+    image = torch.full((1, 3, 24, 32), 0.1 * light)
+    image[..., 6:18, 8:20] = light
+    repaired = edges.repair(image, nearness, torch.tensor(1.0), auto)
+    known = torch.isfinite(nearness)
+    assert torch.equal(torch.isfinite(repaired), known)
+    assert float(repaired[known].abs().max()) <= 1.001 * float(nearness[known].abs().max())
+    too_large = nearness.abs() > 1e15
+    assert torch.equal(repaired[too_large], nearness[too_large])
+
+
 @pytest.mark.parametrize("moved", [1e-4, -1e-4])
 def test_the_direction_of_an_edge_does_not_depend_on_rounding(moved: float) -> None:
     """Where four blocks meet, the near surface is equally beside and below a pixel."""

@@ -1,10 +1,14 @@
+import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
-from torchdof.fit.lens.glass import AIR, C_UM, D_UM, F_UM, G_UM, catalogue
+from tests.refused import refuses
+from torchdof.fit.lens.glass import AIR, C_UM, D_UM, F_UM, G_UM, Glass, catalogue
 from torchdof.fit.lens.lens import Lens
+from torchdof.fit.lens.spot import focus_sensor
 
 FACTS = {
     "double_gauss_50mm": (50.3582, 36.1059),
@@ -143,10 +147,12 @@ def test_lines_are_read_back_as_the_same_lens(text, lens_of):
         ("glass X 1 2 3\n", r"line 1: expected glass NAME B1 B2 B3 C1 C2 C3, got 'X 1 2 3'"),
         ("glass X 30 0 0 0.01 0.02 90\n", r"line 1: glass X has no refractive index from 1 to 5 at 0.4 um"),
         ("glass X nan 0 0 0.01 0.02 90\n", r"line 1: glass X must have six finite coefficients"),
+        *((f"50 5 1.5 20 {words}\n", "line 1: (A16|A2|conic constant) must")
+          for words in ("A2=1e308", "A2=1e300 A4=-1e300", "k=1e300", "A16=1e308")),
         ("50 5 1.5 20\n0 1 0 18\n", r"the index behind the last surface must be 1"),
         ("50 5 1.5 20\n" * 2000 + "0 1 0 18\n-50 0 1 20\n", "line 1001: a lens has at most 1000 surfaces"),
     ],
-)
+)  # fmt: skip
 def test_wrong_prescription_is_refused_with_file_line_and_column(lens_of, text, message):
     with pytest.raises(ValueError, match=rf"lens\.txt: {message}"):
         lens_of(text)
@@ -157,6 +163,17 @@ def test_impossible_lenses_are_refused_by_name(lens_of):
         Lens.read("triplet")
     with pytest.raises(ValueError, match="does not converge light"):
         lens_of("-50 5 1.5 20\n0 1 0 18\n50 0 1 20\n").paraxial()
+    with pytest.raises(ValueError, match="'lens' bends light beyond measure"):
+        focus_sensor(lens_of("0.001 1e7 4.9 20\n-0.001 1e7 1 20\n" * 30 + "-50 3 1 20\n0 0 0 15"), 2.0)
+
+
+test_absurd_glasses_and_wavelengths_are_refused = refuses(
+    *((partial(Glass, "x", six), "glass x must have six finite coefficients")
+      for six in (("a",) * 6, None, (10**400,) * 6, (True,) * 6, (1.0,) * 5, (math.nan,) * 6)),
+    *((partial(Glass.named("N-BK7").index, um), "wavelength_um must be a number of micrometres")
+      for um in (None, "red", 10**400, math.nan, 0.0, -1.0)),
+    *((partial(Glass.named, name), "no glass") for name in (None, "red", 10**400, math.nan, 0.0)),
+)  # fmt: skip
 
 
 def test_a_radius_beyond_all_floats_is_refused():

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
+from torchdof.fit import FitError
 from torchdof.fit.photo.dot import find_dot, find_dots
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 200), (8, 8)])
+def test_a_small_picture_is_refused(size):
+    with pytest.raises(FitError, match="a picture of a dot must be .* at least 9 pixels on a side"):
+        find_dot(np.random.default_rng(0).random(size), file="dot.png")
 
 
 @pytest.mark.parametrize(("gain", "level"), [(1.0, 0.0), (300.0, 64.0)])

@@ -11,7 +11,7 @@ from torchdof import BlurTable, Camera, blur_by_coc
 from torchdof.fit import FitError, FitWarning, fit_captures
 from torchdof.fit.photo.photographs import read_photographs
 from torchdof.fit.photo.target import DOT_MM, SQUARE_MM, Target, find_target, tone_curve, untoned, write_target
-from torchdof.io.images import read_image
+from torchdof.io.images import Picture, read_image, write_image
 from torchdof.reference.metrics import psnr
 
 
@@ -97,6 +97,16 @@ def test_errors_of_unreadable_folders_state_the_remedy(simulator, tmp_path):
     (tmp_path / "img_9.heic").write_bytes(b"")
     with pytest.raises(FitError, match="heic is not read here: convert it to JPEG"):
         read_photographs(tmp_path)
+
+
+def test_root_also_limits_photographs_without_a_description(tmp_path):
+    (tmp_path / "photographs").mkdir()
+    for number in range(2):
+        write_image(tmp_path / f"{number}.png", Picture(torch.rand(1, 3, 40, 40)))
+        (tmp_path / "photographs" / f"{number}.png").symlink_to(tmp_path / f"{number}.png")
+    for root, message in ((tmp_path / "photographs", "lies outside of"), (tmp_path, "show the target")):
+        with pytest.raises(FitError, match=message):
+            read_photographs(tmp_path / "photographs", root=root)
 
 
 def _photographs(simulator, tone, seed=0):
