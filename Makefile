@@ -6,7 +6,7 @@
 # make sweep      run the hard tests at full length: whole frames instead of strips, up to twenty times as many examples
 # make wheel      build the wheel for this machine into dist/ and try it, and installation, without a compiler
 # make sanitize   run the compiled engine's tests under AddressSanitizer and ThreadSanitizer; needs GCC
-# make fuzz       changed files to every reader, and scenes to both engines, for an hour (SECONDS=3600); lists what it finds
+# make fuzz       changed files to every reader, for an hour (SECONDS=3600); lists what it finds
 # make soak       1,000 renderings in one process, 8 threads and spawned workers: memory and pictures stay the same
 # All but oldest need only make and Python 3.11 or newer: the first run makes .venv and installs what constraints.txt
 # pins. PYTHON=/path/to/python chooses the Python.

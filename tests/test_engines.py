@@ -39,6 +39,7 @@ from torchdof.export.graph import Portable
 from torchdof.optics.aperture import Aperture
 from torchdof.reference.lens_views import lens_views
 from torchdof.reference.metrics import ssim
+from torchdof.render.edges import repair
 from torchdof.render.plan import Plan
 
 BY_COLOUR = BlurTable("gaussian", [1.0], {"sigma": torch.tensor([[0.4], [0.5], [0.6]])}, name="by colour")
@@ -320,6 +321,31 @@ def test_engines_agree_on_stacks(seed: int, by_both: Any) -> None:
     if seed == 3:
         rgba[0, 0, 0, 3, 5], depth[0, 0, :, 20:25] = torch.nan, torch.nan
     by_both(lambda: dof.layers(rgba, depth), torch.zeros_like(rgba[:, 0]))
+
+
+SIZES = torch.tensor([0.0, 1e-45, 1e-38, 1.0, 2e9, 2e19, 1e30, 3.4e38, -1.0, -1e30, math.inf, math.nan])
+
+
+@pytest.mark.hard
+@pytest.mark.parametrize("seed", [*range(40), *(pytest.param(n, marks=pytest.mark.sweep) for n in range(40, 1000))])
+def test_engines_agree_on_numbers_of_any_size(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, dice = random_scene(seed, ["filled", "accumulated"], side=32), torch.Generator().manual_seed(seed)
+    image, coc = scene.image.float(), scene.coc_px.float()
+    for values in (image, coc):
+        strange = SIZES[torch.randint(len(SIZES), values.shape, generator=dice)]
+        values.copy_(torch.where(torch.rand(values.shape, generator=dice) < 0.05, strange, values))
+    known = torch.isfinite(image).all(1, keepdim=True) & torch.isfinite(coc)
+    light, span = (float(t.where(known, 0.0).abs().max()) for t in (image, coc))
+    pictures, maps = [], []
+    for engine in ("torch", "native"):
+        monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+        pictures.append(blur_by_coc(image, coc, check=False, depth_edges="as given", **scene.options).where(known, 0.0))
+        maps.append(repair(image, -coc, torch.tensor(2.0), seed % 2 > 0))
+    for picture, repaired in zip(pictures, maps, strict=True):
+        assert float(picture.abs().max()) <= 1.5 * light
+        assert torch.equal(repaired.isfinite(), coc.isfinite())
+        assert float(repaired.abs().where(coc.isfinite(), 0.0).max()) <= 10.0 * span
+    assert float((pictures[0].double() - pictures[1]).abs().max()) <= 1e-3 * light + 1e-37
 
 
 # Dtypes and contexts

@@ -154,31 +154,6 @@ def test_bench_measures_the_given_lens_and_focus_and_json_has_the_rows(
     assert float(given.coc_px.max()) == pytest.approx(8.0)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["IMAGE", "DEPTH", "--truth", "."], "leave IMAGE and DEPTH out"),
-        (["IMAGE", "DEPTH", "--out", "IMAGE"], "File exists"),
-        (["--truth", ".", "--out", ".", "--f-number", "2"], "with their own lens and depth"),
-        (["--vignetting", "0.4", "--onnx"], "one kernel a layer"),
-        (["IMAGE", "DEPTH", "--views", "4"], "name its folder with --truth"),
-        (["TINY", "TINY", "--depth-kind", "z"], "from 16 pixels a side on"),
-        (["--truth", "."], "give a folder with --out"),
-        (["--truth", ".", "--json"], "leave --json out"),
-        (["--truth", ".", "--scan"], "leave IMAGE and DEPTH out, --onnx, --compile and --scan"),
-    ],
-)
-def test_bad_arguments_are_refused_in_a_sentence(
-    files: tuple[Path, Path], tmp_path: Path, arguments: list[str], message: str
-) -> None:
-    write_image(tmp_path / "tiny.exr", Picture(torch.ones(1, 1, 8, 8), ("Y",)))
-    names = {"IMAGE": files[0], "DEPTH": files[1], "TINY": tmp_path / "tiny.exr"}
-    result = run(*(names.get(a, a) for a in arguments))
-    assert result.exit_code == 2
-    assert message in result.output
-    assert result.output.count("\n") == 1
-
-
 def test_an_exported_file_is_a_row(exported_by_command: tuple[Path, str], monkeypatch: pytest.MonkeyPatch) -> None:
     def copied(dof: DepthOfField, path: str, inputs: str, channels: int, width: int | None) -> None:
         assert dof.options.max_coc_px == 2.0 and not dof.options.occlusion and (inputs, channels) == ("coc_px", 1)

@@ -35,10 +35,7 @@ def photo(scene: Path) -> Path:
     ("arguments", "words"),
     [
         (f"near.npy {LENS}", FACTS),
-        (
-            "near.npy",
-            ["[focus on what is nearest the middle, focal length assumed, f-number for a blur of 2% of the w"],
-        ),
+        ("near.npy", ["[focus on what is nearest the middle, focal length assumed, f-number for a blur of 2% of"]),
         ("near.npy --focus-range 1.5,2.2 --tilt 3", ["focus 1.5 to 2.2 m", "tilt 3 degrees"]),
         ("near.npy --depth-kind relative --near-m 1 --far-m 3 --relative-kind depth", ["nearest 1 ", "farthest 3"]),
         ("near.npy --far-m 4 --relative-kind depth", ["nearest 0.5 ", "farthest 4"]),

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
@@ -12,9 +11,7 @@ from torch import Tensor
 from torchdof import Camera, DepthOfField
 from torchdof.depth import inspect_depth
 from torchdof.depth.inspect import EDGES, panels
-from torchdof.reference.scenes import read_scenes
 
-SCENES = list(read_scenes(Path(__file__).parents[1] / "data" / "scenes"))
 CAMERA = Camera.from_fov(fov_x_deg=40.0, aperture_radius_m=0.5, focus_m=2.0)  # 11 px between the surfaces below
 
 

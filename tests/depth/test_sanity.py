@@ -105,11 +105,7 @@ SHARES = torch.linspace(0.0, 1.0, 96).expand(1, 1, 64, 96)
         ((3000.0 * SMALL).round(), Camera(focus_m=INF), "millimetres"),
         (torch.cat([SMALL, 1000.0 * SMALL]), Camera(focus_m=3.0), "millimetres"),  # in one item of a batch
         (field(2.0, 5.0), Camera(0.05, 1.8, 3.0), "focal length of 0.05 mm on a sensor of 36 mm .* take millimetres"),
-        (
-            object_before(torch.full((1, 1, 120, 160), 1.0), 9.0),
-            Camera(85.0, 1.4, 3.0),
-            r"no pixel lies near the focus at 3 m, all \(1 to 9 m\)",
-        ),
+        (object_before(0 * field(1.0, 2.0) + 1.0, 9.0), Camera(85.0, 1.4, 3.0), r"no pixel lies near the focus at 3 m"),
         *((depth, camera, "more than a lens makes.*on a sensor of .*which is in another unit")
           for depth, camera in (
               (field(0.002, 0.005), Camera.from_fov(40.0, 0.01, 0.003)),  # depth and focus scaled, the opening not

@@ -68,6 +68,7 @@ def test_convolutions_take_constant_weights_of_their_own_graph(layered: Any) -> 
 
 
 CATS_EYES = torchdof.BlurTable.polygon(5, vignetting=0.4)
+RANGE = CAMERA.replace(focus_range_m=(1.0, 2.0))
 SIMPLY = torchdof.DepthOfField(CAMERA, **SIMPLE)
 
 
@@ -82,11 +83,7 @@ SIMPLY = torchdof.DepthOfField(CAMERA, **SIMPLE)
         (torch.nn.Identity(), {}, r"dof must be a torchdof\.DepthOfField"),
         (torchdof.DepthOfField(torchdof.Camera(focus_m=torch.tensor([1.0, 2.0]))), {}, "focus_m must be a float"),
         (torchdof.DepthOfField(CAMERA, CATS_EYES, **SIMPLE), {}, "take a table without vignetting"),
-        (
-            torchdof.DepthOfField(CAMERA.replace(focus_range_m=(1.0, 2.0)), **SIMPLE),
-            {},
-            "remove it: focus_range_m=None",
-        ),
+        (torchdof.DepthOfField(RANGE, **SIMPLE), {}, "remove it: focus_range_m=None"),
     ],
 )
 def test_bad_arguments_are_refused_and_no_file_is_written(

@@ -54,9 +54,7 @@ def shape(kind: str, radius: float) -> np.ndarray:
 
 
 def blur(picture: np.ndarray, family: str | np.ndarray, params: dict) -> np.ndarray:
-    """The picture convolved with a kernel `[k, k]`, with that of a family, or with the `shape` "hexagon"."""
-    if isinstance(family, str) and family == "hexagon":
-        family = shape(family, **params)
+    """The picture convolved with a kernel `[k, k]`, or with that of a family."""
     if isinstance(family, str):
         tensors = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in params.items()}
         family = pixel_kernels(family, tensors).numpy()

@@ -112,7 +112,6 @@ FILES: list[tuple[str, Made | None, str | None, str | None]] = [
     ("none.npy", None, "is not an image that can be read", "there is no such file"),
     ("empty.png", with_bytes(b""), "the file is empty", "the file is empty"),
     ("folder.png", Path.mkdir, "is not a file", "is not a file"),
-    ("text.exr", with_bytes(TEXT), "cannot be read", "cannot be read"),
     ("text.png", with_bytes(TEXT), "cannot be read", "cannot be read"),
     ("text.pfm", with_bytes(b"hello\n"), "is not a PFM file", "is not a PFM file"),
     ("header.pfm", with_bytes(b"PF\n3 2\n"), "is not a PFM file", None),
@@ -132,17 +131,13 @@ FILES: list[tuple[str, Made | None, str | None, str | None]] = [
         for c in "RGB"
     ),
     ("lab.tif", with_values(COLOUR, kind="uint8", tags={262: 8}), f"{NOT_RGB} 8", f"{NOT_RGB} 8"),
-    ("lab16.tif", with_values(COLOUR, kind="uint16", tags={262: 8}), f"{NOT_RGB} 8", f"{NOT_RGB} 8"),
-    ("inks.tif", with_values(COLOUR, kind="uint8", tags={262: 5}), f"{NOT_RGB} 5", f"{NOT_RGB} 5"),
     ("mosaic.tif", with_values(GREY, kind="uint16", tags={262: 32803}), f"{NOT_RGB} 32803", f"{NOT_RGB} 32803"),
     ("negative.tif", with_values(GREY, kind="uint16", tags={262: 0}), f"{NOT_RGB} 0", f"{NOT_RGB} 0"),
     ("signed.tif", with_values(GREY, kind="int16"), "numbers of type int16, for which white is not defined", None),
     ("colour.png", with_values(np.eye(3, dtype=np.float32)[None], kind="uint8"), None, "colours of a heat map"),
-    ("object.npy", with_array(np.array([[{"a": 1}]], object)), None, "cannot be read as an array"),
     ("bomb.npy", with_array(np.array([[Bomb()]], object)), None, "cannot be read as an array"),
     ("bomb.npz", with_array(np.array([[Bomb()]], object)), None, "cannot be read as an array"),
     ("text.npy", with_array(np.array([["a"]])), None, r"expected an array \[H, W\] of numbers"),
-    ("vector.npy", with_array(np.zeros(5)), None, r"expected an array \[H, W\] of numbers"),
     ("complex.npy", with_array(np.zeros((2, 2), complex)), None, r"expected an array \[H, W\] of numbers"),
     ("zero.npy", with_array(np.zeros((0, 4))), None, r"expected an array \[H, W\] of numbers"),
     ("cut.npy", with_array(np.zeros((50, 50)), cut=500), None, "cannot be read as an array"),
@@ -235,28 +230,16 @@ def test_a_truncated_file_is_refused(tmp_path: Path, suffix: str, sample: Any, s
     assert decode.is_complete(tmp_path / f"whole{suffix}") and not decode.is_complete(tmp_path / f"cut{suffix}")
 
 
-def with_attributes(path: Path, count: int) -> None:
-    """Writes an EXR with ``count`` more attributes in its header."""
-    write_image(path, tiny())
-    content, end = path.read_bytes(), 8
-    while content[end]:
-        name_end = content.index(b"\0", end)
-        type_end = content.index(b"\0", name_end + 1)
-        end = type_end + 5 + int.from_bytes(content[type_end + 1 : type_end + 5], "little")
-    more = b"".join(b"a%d\0int\0" % i + struct.pack("<Ii", 4, i) for i in range(count))
-    (pixels_at,) = struct.unpack("<Q", content[end + 1 : end + 9])  # offset of the only block of lines
-    path.write_bytes(content[:end] + more + b"\0" + struct.pack("<Q", pixels_at + len(more)) + content[end + 9 :])
-
-
 def test_attributes_are_kept_and_too_many_are_refused_at_once(tmp_path: Path) -> None:
-    with_attributes(tmp_path / "some.exr", 500)
-    assert read_image(tmp_path / "some.exr").metadata["a499"][1] == 499
-    for count in (MAX_ATTRIBUTES, 100_000):
-        with_attributes(tmp_path / "x.exr", count)
+    for count in (500, MAX_ATTRIBUTES):
+        path = store(tmp_path / f"{count}.exr", COLOUR, "half", **{f"a{n}": n for n in range(count)})
+        if count == 500:
+            assert read_image(path).metadata["a499"][1] == 499
+            continue
         start = time.perf_counter()
-        with pytest.raises(ValueError, match=rf"x\.exr: its headers hold more than {MAX_ATTRIBUTES} attributes"):
-            read_image(tmp_path / "x.exr")
-        assert time.perf_counter() - start < 2.0  # OpenEXR takes minutes
+        with pytest.raises(ValueError, match=rf"exr: its headers hold more than {MAX_ATTRIBUTES} attributes"):
+            read_image(path)
+        assert time.perf_counter() - start < 2.0  # OpenEXR takes minutes for many
 
 
 # Sizes

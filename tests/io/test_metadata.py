@@ -37,10 +37,8 @@ FULL = {"sensor_width_mm": 36.0}
         # the same without that tag: the 35 mm equivalent contradicts it and wins
         ({PLANE: 12000 / 36, UNIT: 4, FOCAL: 50.0, FILM: 50}, {"focal_length_mm": 50.0, **FULL}),
         ({FOCAL: 4.2, FILM: 27}, {"focal_length_mm": 4.2, "sensor_width_mm": 5.6}),
-        (
-            {"focus": 3.0, "aperture": 2.0, "nominalFocalLength": 35.0},
-            {"focus_m": 3.0, "f_number": 2.0, "focal_length_mm": 35.0},
-        ),
+        ({"focus": 3.0, "aperture": 2.0}, {"focus_m": 3.0, "f_number": 2.0}),
+        ({"nominalFocalLength": 35.0}, {"focal_length_mm": 35.0}),
     ],
 )
 def test_camera_facts_are_those_of_the_tags(tags: dict[str, Any], facts: dict[str, float]) -> None:

@@ -130,13 +130,6 @@ def test_gradients_have_the_same_bits_for_any_number_of_threads(
         assert difference(other, one) < 5e-5
 
 
-def test_float64_is_the_plain_engines_and_differs_by_rounding_alone(calls: dict[str, list[Any]]) -> None:
-    exact = rendered({}, torch.float64)
-    assert not any(calls.values())
-    for ours, other in zip(rendered({}), exact, strict=True):
-        assert difference(ours.double(), other) < 2e-5
-
-
 @pytest.mark.parametrize("left", [0, 22])
 def test_the_gradient_of_a_gradient_is_the_plain_engines(left: int) -> None:
     def curvature(dtype: torch.dtype) -> list[Tensor]:

@@ -10,8 +10,6 @@ from torch.testing import assert_close
 from tests.refused import refuses
 from torchdof import Camera
 
-Number = float | Tensor
-
 
 def depth_of(*metres: float, dtype: torch.dtype = torch.float64) -> Tensor:
     return torch.tensor(metres, dtype=dtype).reshape(1, 1, 1, -1)
