@@ -153,11 +153,6 @@ def test_the_signature_has_every_option_with_its_default_and_help_names_their_cl
     assert "**options: As in :class:`torchdof.options.Options`" in (function.__doc__ or "")
 
 
-def test_an_unknown_option_is_refused_by_name() -> None:
-    with pytest.raises(TypeError, match="unexpected keyword argument 'blades'"):
-        DepthOfField(Camera(), blades=5)  # type: ignore[call-arg]
-
-
 # Compiled
 
 COMPILED: dict[str, Any] = {"max_coc_px": 3.0, "tolerance": 1 / 60}

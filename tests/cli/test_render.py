@@ -21,7 +21,6 @@ from torchdof.cli.frame import Renderer, coc_of, read_frame
 from torchdof.cli.main import app
 from torchdof.cli.options import Scene
 from torchdof.cli.output import Notices
-from torchdof.depth.inspect import tint_focus
 from torchdof.io.highlights import expand_highlights
 from torchdof.io.images import Picture, read_image, write_image
 from torchdof.optics.field import Field
@@ -254,15 +253,6 @@ def test_show_focus_tints_by_zone_and_keeps_light_and_shade(run: Run) -> None:
     assert "focus shown" in line
     run("render grey.png coc.npy -o tint.png --depth-kind coc --show-focus")
     assert pixels("tint.png")[0, :, 0, [0, 8, 16]].argmax(dim=0).tolist() == [0, 1, 2]
-
-
-def test_the_focus_tint_is_continuous_and_keeps_transparent_pixels() -> None:
-    coc_px = torch.linspace(-4.0, 4.0, 1601)[None, None, None]
-    premultiplied = torch.full((1, 4, 1, 1601), 0.4)
-    premultiplied[..., :400] = 0.0
-    tinted = tint_focus(premultiplied, coc_px, has_alpha=True)
-    assert float(tinted[..., 400:].diff(dim=-1).abs().max()) < 0.002
-    assert bool((tinted[..., :400] == 0).all())
 
 
 def test_json_has_the_facts_of_the_line(depth: Tensor, run: Run) -> None:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchdof import Camera, depth_of_field
 from torchdof.depth import Steady, SteadyFrames
-from torchdof.depth.steady import motion_between, shifted
+from torchdof.depth.steady import shifted
 from torchdof.reference.metrics import display
 from torchdof.reference.scenes import waves
 
@@ -178,13 +178,6 @@ def test_a_frame_of_another_size_starts_anew(size: tuple[int, int]) -> None:
     for _ in range(3):
         given = torch.full((1, 1, *size), 2.0, dtype=torch.float64)
         torch.testing.assert_close(steady(torch.rand(1, 3, *size), given), given)  # and its dtype
-
-
-def test_motion_of_a_pan_is_found_with_subpixel_precision() -> None:
-    (before, _), (now, _) = shot(2, pan_px=2.4)
-    flow = motion_between(now, before, torch.ones_like(now[:, :1], dtype=torch.bool))
-    assert flow[0, 0].median().item() == pytest.approx(2.4, abs=0.25)
-    assert flow[0, 1].median().item() == pytest.approx(0.0, abs=0.25)
 
 
 @pytest.mark.parametrize("parts", [[range(40, 60)], [range(0, 3), range(3, 50)], [[47], [48], [90], [12]]])

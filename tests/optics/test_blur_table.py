@@ -213,13 +213,10 @@ def test_a_bad_field_is_refused_by_name(changes: dict[str, Any], message: str, t
 @pytest.mark.parametrize(
     "content",
     [
-        "",
         "[1, 2]",
-        "1e999",
         json.dumps(example()).replace("0.12", "1e999"),
         json.dumps(example(version=10**400)),
         "[" * 100_000,
-        "\x00\xff",
     ],
 )
 def test_a_file_that_is_not_a_table_is_refused_with_its_name(content: str, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.scenes import slope, smooth, whole
+from tests.scenes import slope, smooth
 from torchdof import BlurTable, blur_by_coc
 from torchdof.io.transfer import encode
 from torchdof.optics.aperture import Aperture
@@ -192,9 +192,3 @@ def test_a_highlight_has_the_kernel_of_its_radius_and_place(table: BlurTable) ->
     half = len(expected) // 2
     spot = spot[row - half : row + half + 1, column - half : column + half + 1]
     assert float((spot - expected).abs().sum()) < 0.01  # share of the light
-
-
-def test_attention_is_ignored_if_kernels_depend_on_the_place() -> None:
-    image, coc = torch.rand(1, 3, 40, 60), whole(2.0, 40, 60)
-    looked_at = blur_by_coc(image, coc, table=TABLE, attention=(4.0, 4.0, 2.0))
-    assert torch.equal(looked_at, blur_by_coc(image, coc, table=TABLE))

@@ -171,13 +171,6 @@ def test_rays_above_the_limit_fade_into_the_layers(range_of_light: float) -> Non
     assert float(steps.abs().max()) < 0.02 * light[0]
 
 
-def test_unknown_light_does_not_lower_the_threshold() -> None:
-    image = torch.zeros(1, 1, 64, 64)
-    image[..., 30:33, 30:33] = 1.0
-    valid = (image > 0).float()
-    assert float(highlights.threshold(image, valid).min()) >= 1.0
-
-
 def test_rays_are_differentiable_in_light_and_coc() -> None:
     image, coc, (row, column) = street(6.13, -2.9)  # no ray hits the centre of a pixel
     target = torch.rand(1, 3, 96, 96, generator=torch.Generator().manual_seed(3))
