@@ -76,18 +76,3 @@ def test_a_file_can_have_one_size_and_one_channel(tmp_path: Path) -> None:
     assert torch.equal(out[..., 4, 7], image[..., 4, 7])
     options = {**dof.options.arguments(), "plan": Plan.static(1.0, dof.options.tolerance)}
     torch.testing.assert_close(out, torchdof.blur_by_coc(image, coc, **options), atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"layout": "rows"}, "layout must be one of tiles, whole, got 'rows'"),
-        ({"size": (40, 50)}, 'size is for layout="whole"'),
-        ({"layout": "whole", "size": (40, 0)}, r"height and width of a frame in pixels, .* got \(40, 0\)"),
-        ({"layout": "whole", "depth_edges": "auto"}, "cannot repair depth edges"),
-    ],
-)
-def test_what_a_layout_does_not_support_is_refused(change: dict[str, Any], message: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=message):
-        to_onnx(torchdof.DepthOfField(CAMERA, **FEW), tmp_path / "dof.onnx", **change)
-    assert not list(tmp_path.iterdir())

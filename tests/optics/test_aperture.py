@@ -1,7 +1,5 @@
 import functools
-import json
 import math
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -134,19 +132,6 @@ def test_kernels_differentiate_in_rotation_squeeze_and_coc() -> None:
         given = (torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (11.0, 1.3))
         places = (coc + 0.1 * torch.rand(1, generator=dice)).double().requires_grad_()
         assert torch.autograd.gradcheck(kernels, (*given, places), atol=1e-6, fast_mode=True)
-
-
-def test_a_table_with_an_aperture_survives_save_and_load(tmp_path: Path) -> None:
-    for table in LOPSIDED:
-        table.save(tmp_path / "lens.json")
-        loaded = BlurTable.load(tmp_path / "lens.json")
-        assert loaded.fingerprint() == table.fingerprint() != table.with_aperture(None).fingerprint()
-        assert loaded.aperture is not None and table.aperture is not None
-        assert loaded.aperture.rims == table.aperture.rims
-        coc = torch.tensor([-6.0, 6.0])
-        assert_close(loaded.kernels(coc, 900), table.kernels(coc, 900), rtol=0, atol=0)
-    written = json.loads((tmp_path / "lens.json").read_text())
-    assert written["version"] == 3 and written["aperture"]["blades"] == 7
 
 
 partial: Any = functools.partial

@@ -160,6 +160,8 @@ ROUND_TRIPS = [
     BlurTable.from_dict(example()),
     BlurTable("disc", [1.0], {"radius": [[1.0], [1.1], [1.2]]}),
     BlurTable("radial", [0.1, 0.2], {"values": [[[1.0, 0.3]] * 2] * 3, "radius": [0.1, 0.2]}, unit="fraction"),
+    BlurTable.polygon(5, 7.0, 0.4, rim=2.0, squeeze=1.6, vignetting=(0.3, 0.1)),
+    BlurTable.from_aperture(torch.eye(9).cumsum(0)[:, :6], squeeze=0.8),
 ]
 
 
@@ -171,6 +173,8 @@ def test_a_table_survives_save_and_load(table: BlurTable, tmp_path: Path) -> Non
     assert json.loads(path.read_text())["name"] == table.name and repr(table.name or "unnamed") in repr(table)
     back = BlurTable.load(path)
     assert back.to_dict() == table.to_dict() and repr(back) == repr(table)
+    assert back.fingerprint() == table.fingerprint()
+    assert table.aperture is None or table.with_aperture(None).fingerprint() != table.fingerprint()
     coc = torch.tensor([-30.0, -0.7, 0.0, 12.0])
     assert_close(back.kernels(coc, 64, size=15), table.kernels(coc, 64, size=15), rtol=0.0, atol=0.0)
 

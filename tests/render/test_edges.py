@@ -172,6 +172,12 @@ def test_repair_commutes_with_flips_and_turns(
     torch.testing.assert_close(turned, turn(repaired), rtol=0, atol=1e-3)
 
 
+def test_noise_along_rows_and_along_columns_is_not_an_edge(scene: Scene, engine: str) -> None:
+    for shape in ((1, 1, 128, 1), (1, 1, 1, 192)):
+        noise = (2.0 * torch.randn(shape, generator=torch.Generator().manual_seed(0))).expand(scene.depth.shape)
+        assert torch.equal(edges.repair(scene.image, noise.contiguous(), edges.STEP_PX, False), noise)
+
+
 @pytest.mark.parametrize("marked", [0.0, -3.0])
 def test_markers_of_holes_are_kept_and_act_like_nan(scene: Scene, marked: float) -> None:
     depth, holes = degrade(scene.depth, "near -1px"), torch.zeros_like(scene.depth, dtype=torch.bool)
@@ -179,6 +185,15 @@ def test_markers_of_holes_are_kept_and_act_like_nan(scene: Scene, marked: float)
     repaired, same = (repair_edges(scene.image, torch.where(holes, value, depth)) for value in (torch.nan, marked))
     assert bool((same[holes] == marked).all()) and bool(repaired[holes].isnan().all())
     assert torch.equal(repaired[~holes], same[~holes])
+
+
+def test_a_hole_within_a_surface_changes_no_other_pixel(scene: Scene) -> None:
+    depth, holes = torch.full((1, 1, 128, 192), 4.0), torch.zeros(1, 1, 128, 192, dtype=torch.bool)
+    depth[..., 101:], holes[..., 40:60, 20:60] = 2.0, True
+    image = scene.image * torch.where(torch.arange(192) < 100, 0.3, 1.0)
+    whole = repair_edges(image, depth)
+    assert bool((whole != depth).any())
+    assert torch.equal(repair_edges(image, torch.where(holes, torch.nan, depth))[~holes], whole[~holes])
 
 
 @pytest.mark.parametrize("auto", [True, False])
