@@ -405,9 +405,6 @@ def test_tiles_rendered_separately_with_a_halo_leave_no_seam(method: Any) -> Non
         assert_close(tile, picture[..., left : left + 40], rtol=1e-6, atol=1e-6)
 
 
-# Plans of other scenes
-
-
 @pytest.mark.parametrize("occlusion", [True, False])
 @pytest.mark.parametrize(
     ("planned", "shown"), [(0.0, 6.0), (0.0, -6.0), (-2.0, -3.0), (3.0, 20.0), (4.0, -4.0), (5.0, 0.0)]

@@ -60,9 +60,6 @@ def test_an_image_in_focus_is_returned_bit_exact() -> None:
     assert torch.equal(splat(image, torch.zeros(1, 1, 8, 9), normalize=False), image)
 
 
-# Batches
-
-
 def test_items_of_batches_and_clips_equal_each_alone_and_may_share_a_map() -> None:
     image, coc = scene(6)
     together = splat(image, coc)
@@ -125,8 +122,6 @@ def test_a_training_step_stores_a_few_images_for_the_backward_pass() -> None:
     taps = 17**2 * 40 * 50 * 4
     assert 0 < sum(kept.values()) - 17**2 * 500 * 4 < 0.2 * taps  # the second: kernels of all radii
 
-
-# Refused
 
 IMAGE, COC = torch.rand(2, 3, 8, 9), torch.rand(2, 1, 8, 9)
 test_invalid_arguments_are_refused_by_name = refuses(

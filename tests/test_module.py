@@ -39,9 +39,6 @@ def rms(first: Tensor, second: Tensor) -> float:
     return float((metrics.display(first) - metrics.display(second)).square().mean().sqrt())
 
 
-# A plane
-
-
 @EVERY_WAY
 @pytest.mark.parametrize("name", TABLES)
 def test_a_plane_is_the_convolution_with_the_kernel_of_its_table(name: str, way: dict[str, Any]) -> None:
@@ -50,9 +47,6 @@ def test_a_plane_is_the_convolution_with_the_kernel_of_its_table(name: str, way:
         values = constant_map(coc, image)
         out = blur_by_coc(image, values, table=TABLES[name], **way)
         assert_close(out.double(), disc(image, values, TABLES[name]), rtol=1e-5, atol=1e-6)
-
-
-# Focus
 
 
 @EVERY_WAY
@@ -66,9 +60,6 @@ def test_in_focus_plane_is_returned_bit_exact(way: dict[str, Any], dtype: torch.
     assert torch.equal(blur_by_coc(image, below_a_hundredth, **way), image)
 
 
-# Cameras and batches
-
-
 def test_the_functional_form_equals_the_module() -> None:
     image, depth = torch.rand(1, 3, 9, 12), 0.6 + 4 * torch.rand(1, 1, 9, 12)
     camera, table = Camera(sensor_width_mm=1.0), BlurTable.gaussian()
@@ -77,9 +68,6 @@ def test_the_functional_form_equals_the_module() -> None:
     assert torch.equal(out, expected)
     coc = camera.replace(focus_m=1.2, f_number=1.7).coc_px(depth, 12)
     assert torch.equal(blur_by_coc(image, coc, table=table, method="fold", occlusion=False), expected)
-
-
-# Types, shapes, strides
 
 
 @settings(max_examples=25)

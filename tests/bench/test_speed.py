@@ -16,10 +16,9 @@ import torch
 from click.testing import CliRunner, Result
 from torch import Tensor
 
-from tests.traced import TRACED
 from torchdof import Camera, DepthOfField, blur_by_coc
 from torchdof.bench import speed
-from torchdof.bench.measurement import BenchScene, error, shipped, timed
+from torchdof.bench.measurement import BenchScene, shipped, timed
 from torchdof.cli.main import app
 from torchdof.depth.guess import subject_m
 from torchdof.io.images import Picture, read_image, write_image
@@ -155,18 +154,6 @@ def test_an_exported_file_is_a_row(exported_by_command: tuple[Path, str], monkey
     exact = blur_by_coc(scene.image, scene.coc_px, occlusion=False, tolerance=0.0)
     error = (metrics.display(picture) - metrics.display(exact)).square().mean().sqrt()
     assert 0 < 255 * float(error) < 1, "the file's tolerance is that of the row"
-
-
-@TRACED
-@pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning")  # from within inductor
-@pytest.mark.parametrize("backend", ["eager", pytest.param("inductor", marks=pytest.mark.sweep)])
-def test_a_compiled_module_is_a_row(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
-    scene = shipped(64, 96)
-    works = {facts["setting"]: blur for facts, blur, _, _ in speed.works(scene, False, 1, ["compiled"])}
-    picture = works["compiled 1/255 without occlusion"](scene.image, scene.coc_px)
-    exact = blur_by_coc(scene.image, scene.coc_px, occlusion=False, tolerance=0.0)
-    assert error(picture, exact)["rms_255"] < 0.3
 
 
 def test_bench_does_not_start_without_matplotlib(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

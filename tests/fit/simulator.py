@@ -73,7 +73,6 @@ class Simulator:
     exposure: float = 1.0  # light of the defocused picture over that of the sharp one
     black: float = 0.0  # level added to both pictures
     offset: float = 0.0  # level added to the defocused picture only (stray light)
-    place: tuple[float, float] = (0.0, 0.0)  # position (x, y) of the dot in both pictures, px from the centre
     shift: tuple[float, float] = (0.0, 0.0)  # displacement (x, y) of the defocused dot, px
     magnification: float = 1.0  # size of the dot in the defocused picture over that in the sharp one
     bits: int | None = None  # bits of the quantization, which also clips to 0..1
@@ -88,9 +87,8 @@ class Simulator:
     def pair(self, family: str | np.ndarray, params: dict, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Sharp and defocused picture `[size, size]` of one dot."""
         rng = np.random.default_rng(seed)
-        there = self.place[0] + self.shift[0], self.place[1] + self.shift[1]
-        sharp = draw_dot(self.size, self.dot_radius, self.place)
-        moved = np.pad(draw_dot(self.size, self.dot_radius * self.magnification, there), self.size)
+        sharp = draw_dot(self.size, self.dot_radius)
+        moved = np.pad(draw_dot(self.size, self.dot_radius * self.magnification, self.shift), self.size)
         if self.edge_sigma:
             sharp, moved = (blur(p, "gaussian", {"sigma": self.edge_sigma}) for p in (sharp, moved))
         if self.misfocus:

@@ -103,9 +103,6 @@ def test_tensors_that_hold_no_numbers_are_refused_by_name(name: str, kind: str) 
         call(make(shape))
 
 
-# Plans
-
-
 def test_a_plan_with_enough_layers_is_unchanged_and_a_short_one_is_extended() -> None:
     plan = DOF.plan(texture(), slope(1.2, 6.0))
     coc = DOF.coc_px(texture(), slope(1.2, 6.0))
@@ -129,9 +126,6 @@ def test_a_plan_without_layers_in_order_or_a_tolerance_is_refused(nodes: Any, to
         nodes, message = (0.0, 1.0), r"tolerance .*must be a number in \[0, 1\), such as 1/255"
     with pytest.raises(ValueError, match=message):
         Plan(nodes, tolerance)
-
-
-# Lenses whose blur overflows
 
 
 @pytest.mark.parametrize(

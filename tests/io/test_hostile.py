@@ -264,9 +264,6 @@ def test_attributes_are_kept_and_too_many_are_refused_at_once(tmp_path: Path) ->
         assert time.perf_counter() - start < 2.0  # OpenEXR takes minutes for many
 
 
-# Sizes
-
-
 def test_all_parts_are_held_against_memory_before_the_first_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
