@@ -254,7 +254,8 @@ def test_a_truncated_file_is_refused(tmp_path: Path, suffix: str, sample: Any, s
 
 def test_attributes_are_kept_and_too_many_are_refused_at_once(tmp_path: Path) -> None:
     for count in (500, MAX_ATTRIBUTES):
-        path = store(tmp_path / f"{count}.exr", COLOUR, "half", **{f"a{n}": n for n in range(count)})
+        attributes: dict[str, Any] = {f"a{n}": n for n in range(count)}
+        path = store(tmp_path / f"{count}.exr", COLOUR, "half", **attributes)
         if count == 500:
             assert read_image(path).metadata["a499"][1] == 499
             continue
