@@ -419,9 +419,7 @@ def test_a_plan_of_one_plane_renders_another(engine: str, planned: float, shown:
 
 
 @pytest.mark.parametrize(("wanted", "served"), [("native", 3), ("auto", 3), ("torch", 0)])
-def test_the_environment_chooses_the_engine(
-    wanted: str, served: int, counted: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_environment_chooses(wanted: str, served: int, counted: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", wanted)
     scene = made("smooth", 30, 40, 3.0, items=3)
     out = scene.blurred()

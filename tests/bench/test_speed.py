@@ -92,9 +92,7 @@ def test_the_report_names_a_tolerance_that_was_not_kept(
     assert "tolerance was not kept by: 4/255; 4/255 without occlusion." in " ".join(capsys.readouterr().out.split())
 
 
-def test_bench_measures_the_users_scene_and_makes_the_output_folder(
-    in_this_process: None, files: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_bench_measures_the_users_scene(in_this_process: None, files: tuple[Path, Path], tmp_path: Path) -> None:
     out = tmp_path / "new" / "out"
     result = run(*files, "--repeat", 1, "--out", out, "--f-number", 1.4, "--sensor-width-mm", 6)
     assert result.exit_code == 0, result.output
@@ -117,9 +115,7 @@ def test_bench_measures_the_users_scene_and_makes_the_output_folder(
     assert math.isinf(float(rows["exact"]["psnr_db"]))
 
 
-def test_bench_measures_the_given_lens_and_focus_and_json_has_the_rows(
-    files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bench_takes_lens_and_focus_and_prints_json(files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     measured: list[BenchScene] = []
     row = {"setting": "exact", "new_ms": 0.5, "psnr_db": math.inf, "rms_255": math.nan, "kept": True}
     monkeypatch.setattr(speed, "compare", lambda scene, *_: measured.append(scene) or [row])  # type: ignore[func-returns-value]

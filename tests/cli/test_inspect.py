@@ -41,9 +41,7 @@ def photo(scene: Path) -> Path:
         ("holed.npy --focus-m 2 --fill-depth nearest", ["holes 0", "filled        96 holes (10.0 %), nearest"]),
     ],
 )
-def test_the_text_states_lens_depth_and_blur(
-    photo: Path, run: Callable[..., str], arguments: str, words: list[str]
-) -> None:
+def test_text_states_lens_depth_blur(photo: Path, run: Callable[..., str], arguments: str, words: list[str]) -> None:
     output = run(f"inspect photo.png {arguments}")
     assert all(part in output for part in words), output
     sheet = read_image("photo.inspect.png").pixels

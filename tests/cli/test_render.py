@@ -128,9 +128,7 @@ def test_render_equals_the_function_on_tensors(
     assert "[" not in line and line.count("\n") == 1
 
 
-def test_lights_expand_the_clipped_lamps_of_a_photograph_and_alpha_is_blurred_premultiplied(
-    depth: Tensor, run: Run
-) -> None:
+def test_lights_expand_clipped_lamps_of_a_photograph_and_alpha_is_premultiplied(depth: Tensor, run: Run) -> None:
     night = torch.full((1, 4, 16, 24), 0.01)
     night[:, :3, 8, 18], night[:, 3] = 1.0, 1.0
     night[..., 21:] = 0.0
@@ -285,9 +283,7 @@ def test_metadata_are_copied_and_bits_and_transfer_follow_the_options(image: Ten
     torch.testing.assert_close(pixels("again.exr"), image, rtol=0, atol=1e-5)
 
 
-def test_a_phones_lens_without_a_sensor_is_a_wide_one_and_an_impossible_distance_is_not_the_focus(
-    image: Tensor, run: Run
-) -> None:
+def test_a_phones_lens_without_a_sensor_is_wide_and_an_impossible_distance_is_no_focus(image: Tensor, run: Run) -> None:
     write_image("phone.png", with_tags(image, "8", FocalLength=4.0, SubjectDistance=0.001))
     line = run("render phone.png depth.npy -o out.png")
     assert ": 4 mm, f/" in line and "sensor 5.53846 mm" in line and "sensor width assumed" in line  # 36 / 26 * 4 mm
@@ -398,9 +394,7 @@ def test_a_run_ends_if_another_one_renders_its_frames_with_other_options(
 
 
 @pytest.mark.parametrize("name", ["take #1/x.exr", "50%done/x.exr", "IMG #1.exr", "a##b.exr", "%d.exr", "x %03d.exr"])
-def test_an_existing_file_whose_name_looks_like_a_pattern_is_a_single_image(
-    scene: Path, image: Tensor, run: Run, name: str
-) -> None:
+def test_an_existing_file_named_like_a_pattern_is_one_image(scene: Path, image: Tensor, run: Run, name: str) -> None:
     path = scene / name
     path.parent.mkdir(exist_ok=True)
     write_image(path, Picture(image))
@@ -409,9 +403,7 @@ def test_an_existing_file_whose_name_looks_like_a_pattern_is_a_single_image(
     assert pixels(str(out)).shape == image.shape
 
 
-def test_depth_of_nearly_the_same_shape_is_stretched_and_the_line_states_it(
-    run: Run, image: Tensor, depth: Tensor
-) -> None:
+def test_depth_of_nearly_the_same_shape_is_stretched_as_the_line_states(run: Run, image: Tensor, depth: Tensor) -> None:
     write_image("large.exr", Picture(torch.nn.functional.interpolate(image, (64, 96)), sample="float"))
     np.save("near.npy", torch.nn.functional.interpolate(depth, (132, 194), mode="nearest").numpy())
     line = run(f"render large.exr near.npy -o out.exr --focus-m 2 {LENS}")
@@ -487,9 +479,7 @@ def test_blur_sets_the_largest_radius_as_a_share_of_the_width(depth: Tensor, run
 
 
 @pytest.mark.parametrize(("size", "sensor_mm"), [((16, 24), 36.0), ((24, 16), 24.0)])
-def test_an_equivalent_lens_is_for_full_frame_in_landscape_and_portrait(
-    run: Run, size: tuple[int, int], sensor_mm: float
-) -> None:
+def test_an_equivalent_lens_is_for_full_frame_either_way_up(run: Run, size: tuple[int, int], sensor_mm: float) -> None:
     image, depth = torch.rand(1, 3, *size), torch.full((1, 1, *size), 6.0)
     depth[..., : size[0] // 2, :] = 1.5
     write_image("phone.exr", with_tags(image, "float", FocalLength=5.7, FNumber=1.8, FocalLengthIn35mmFilm=26.0))

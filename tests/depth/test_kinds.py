@@ -37,9 +37,7 @@ def row(*values: float) -> torch.Tensor:
         ("coc", {}, 0.0, 0.0),
     ],
 )
-def test_kinds_of_depth_agree_with_their_formulas(
-    kind: Any, options: dict[str, float], value: float, expected: float
-) -> None:
+def test_kinds_of_depth_follow_formulas(kind: Any, options: dict[str, float], value: float, expected: float) -> None:
     assert depth_from_values(row(value), kind, **options).item() == pytest.approx(expected, rel=1e-5)
 
 

@@ -83,9 +83,7 @@ def test_sensible_extremes_raise_no_doubt(depth: torch.Tensor, camera: Camera) -
         (0.199, 3.0, r"relative depth from 0 to 1, --depth-kind relative --near-m METRES --far-m METRES"),
     ],
 )
-def test_unit_mistakes_are_named_with_their_remedy(
-    metres: torch.Tensor, factor: float, focus_m: float, message: str
-) -> None:
+def test_unit_mistakes_have_their_remedy(metres: torch.Tensor, factor: float, focus_m: float, message: str) -> None:
     with pytest.warns(DepthWarning, match=message):
         check(metres * factor, Camera(focus_m=focus_m))
     with pytest.raises(ValueError, match=message):

@@ -52,9 +52,7 @@ def expected(exported: Any, folder: Path, u: float, v: float, f_number: float) -
 
 
 @pytest.mark.parametrize(("name", "other"), [("near", "far"), ("far", "near")])
-def test_a_click_gives_the_picture_of_the_file_which_is_sharp_there(
-    plain: Any, used: Any, name: str, other: str
-) -> None:
+def test_a_click_gives_the_picture_of_the_file_sharp_there(plain: Any, used: Any, name: str, other: str) -> None:
     folder, seen = used
     u, v = CLICKS[name]
     picture, focus_m = expected(plain, folder, u, v, 2 ** (-3 / 6))

@@ -99,9 +99,7 @@ def test_bad_arguments_are_refused_and_no_file_is_written(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_file_that_differs_from_the_module_is_not_written(
-    plain: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_unlike_its_module_is_not_written(plain: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "dof.onnx").write_text("older")
     monkeypatch.setattr("torchdof.export.verification.TOLERANCE", -1.0)
     monkeypatch.setattr(conversion, "trace", lambda *_: None)  # the graph is that of a file, to save its tracing
@@ -114,9 +112,7 @@ def test_a_file_that_differs_from_the_module_is_not_written(
     assert (tmp_path / "dof.onnx").read_text() == "older"
 
 
-def test_an_exporter_that_cannot_follow_is_refused_before_it_starts(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_an_exporter_that_is_too_old_is_refused_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(conversion, "TRACEABLE", False)
     with pytest.raises(ValueError, match=r"needs PyTorch 2\.13 or newer to write ONNX files, this is "):
         to_onnx(torchdof.DepthOfField(torchdof.Camera()), tmp_path / "dof.onnx")

@@ -82,9 +82,7 @@ def with_another_interface(model: onnx.ModelProto, path: Path) -> None:
         (with_another_interface, "the graph must take and give"),
     ],
 )
-def test_a_file_that_is_not_portable_is_refused(
-    plain: Any, model: onnx.ModelProto, change: Any, message: str, tmp_path: Path
-) -> None:
+def test_unportable_is_refused(plain: Any, model: onnx.ModelProto, change: Any, message: str, tmp_path: Path) -> None:
     change(model, tmp_path / "other.onnx")
     with pytest.raises(ValueError, match=message):
         verify(tmp_path / "other.onnx", plain.dof)
@@ -154,9 +152,7 @@ def test_describe_opens_no_other_file(tmp_path: Path) -> None:
         assert describe(tmp_path / "x.onnx") == {"options": {}}
 
 
-def test_an_onnx_file_larger_than_memory_is_refused_before_it_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_larger_than_memory_is_refused_before_reading(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store_model(tmp_path / "x.onnx", {})
     monkeypatch.setattr("torchdof.export.metadata.free_bytes", lambda: 100.0)
     with pytest.raises(ValueError, match=r"x\.onnx takes .* more than there is memory for"):

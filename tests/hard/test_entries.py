@@ -139,9 +139,7 @@ def test_a_plan_without_layers_in_order_or_a_tolerance_is_refused(nodes: Any, to
         (Camera(), 1e-45, "which starts at 1.4e-45 m"),
     ],
 )
-def test_an_infinite_blur_radius_is_refused_with_the_lens_and_the_depth(
-    camera: Camera, depth: float, named: str
-) -> None:
+def test_an_infinite_blur_radius_is_refused_with_lens_and_depth(camera: Camera, depth: float, named: str) -> None:
     image, depths, dof = texture(), whole(depth), DepthOfField(camera)
     calls: list[Callable[[], Any]] = [
         functools.partial(dof, image, depths),

@@ -63,9 +63,7 @@ SEEN: dict[int, Any] = {
 
 @pytest.mark.parametrize(("suffix", "out"), [(".png", ".png"), (".tif", ".tif"), (".jpg", ".jpg"), (".jpg", ".webp")])
 @pytest.mark.parametrize("orientation", SEEN)
-def test_a_picture_is_upright_after_reading_and_writing(
-    orientation: int, suffix: str, out: str, tmp_path: Path
-) -> None:
+def test_a_picture_is_upright_when_read_and_written(orientation: int, suffix: str, out: str, tmp_path: Path) -> None:
     height, width = 16, 24
     stored = np.zeros((height, width, 3), np.uint8)
     stored[0:8, 8:16] = 255

@@ -107,9 +107,7 @@ def test_pictures_and_gradients_equal_the_plain_engines(
 
 @pytest.mark.parametrize("step", STEPS)
 @pytest.mark.parametrize("name", ["over", "coarse", "sum", "by colour", "holes"])
-def test_gradients_have_the_same_bits_for_any_number_of_threads(
-    name: str, step: str, calls: dict[str, list[Any]]
-) -> None:
+def test_gradients_have_the_same_bits_for_any_threads(name: str, step: str, calls: dict[str, list[Any]]) -> None:
     rendered(WAYS[name])
     if "sum" in name and step != "blend":
         assert not calls[step]

@@ -202,9 +202,7 @@ def test_a_hole_within_a_surface_changes_no_other_pixel(scene: Scene) -> None:
     [(3e38, 1.0, 1.0), (1e16, -1e16, 1.0), (1e14, -1e14, 1.0), (3e38, -3e38, 1.0), (math.nan, 1.0, 1.0),
      (4.0, 1.0, 3e38), (4.0, 1.0, 1e-45)],
 )  # fmt: skip
-def test_repairs_of_maps_and_light_of_any_size_stay_finite(
-    near: float, far: float, light: float, engine: str, auto: bool
-) -> None:
+def test_repairs_of_all_maps_are_finite(near: float, far: float, light: float, engine: str, auto: bool) -> None:
     nearness = torch.full((1, 1, 24, 32), far)
     nearness[..., 6:18, 9:21] = near  # one pixel right of the image's square
     image = torch.full((1, 3, 24, 32), 0.1 * light)

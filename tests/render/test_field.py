@@ -56,9 +56,7 @@ def cats_eye(coc_px: float, y: float, x: float, half: int, front: float, rear: f
 
 @pytest.mark.parametrize("coc_px", [-15.0, 15.0])
 @pytest.mark.parametrize(("y", "x", "vignetting"), [(0.6, 0.8, 0.4), (-0.5, 0.1, (0.7, 0.0)), (0.6, -0.8, (0.1, 0.4))])
-def test_the_kernel_of_a_place_is_the_intersection_of_disc_and_rims(
-    coc_px: float, y: float, x: float, vignetting: Any
-) -> None:
+def test_the_kernel_of_a_place_is_that_of_disc_and_rims(coc_px: float, y: float, x: float, vignetting: Any) -> None:
     aperture = Aperture(vignetting=vignetting)
     kernel = passed(BlurTable.disc(), coc_px, y, x)
     cut = passed(BlurTable.disc().with_aperture(aperture), coc_px, y, x)
@@ -139,9 +137,7 @@ def test_fold_scatters_each_pixel_with_the_kernel_of_its_place(colours: int) -> 
     [(STRONG, True), (lopsided(3), False)],
     ids=["cat's eyes", "a field of three colours"],
 )
-def test_layers_agree_with_the_literal_scatter_within_the_error_of_blocks(
-    table: BlurTable, occlusion: bool, engine: str
-) -> None:
+def test_layers_agree_with_fold_within_the_error_of_blocks(table: BlurTable, occlusion: bool, engine: str) -> None:
     image, coc = smooth(3, 64, 96), slope(-4.0, 2.0, 64, 96)
     options: dict[str, Any] = {"method": "fold", "occlusion": occlusion}
     literal, plain = (blur_by_coc(image, coc, table=t, **options) for t in (table, BlurTable.disc()))

@@ -121,9 +121,7 @@ def test_splatting_in_parts_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> 
         ({"between": 3, "share": 0.125}, 0.94),  # counts half
     ],
 )
-def test_a_highlight_partly_covered_at_a_step_of_depth_sends_the_light_of_a_whole_pixel(
-    changes: dict[str, float], sent: float
-) -> None:
+def test_a_partly_covered_highlight_at_a_step_sends_its_whole_light(changes: dict[str, float], sent: float) -> None:
     given = {"cover": 0.4, "nearer_px": 4.0, "beside_light": 0.1, "between": 0, "share": 0.5} | changes
     image = torch.full((1, 1, 40, 40), 0.1)
     image[..., 20, 20] = 100.0

@@ -81,9 +81,7 @@ def test_scatter_of_any_shape_and_stride_equals_a_direct_sum(
 @pytest.mark.parametrize("channels", [1, 3, 4, 5, 8, 9])
 @pytest.mark.parametrize("rows", [1, 2, 13])
 @pytest.mark.parametrize("radius", [1.6, 12.0])
-def test_the_halo_is_used_for_any_kernel_and_number_of_items_and_channels(
-    radius: float, rows: int, channels: int, items: int
-) -> None:
+def test_the_halo_is_used_for_any_kernel_and_channels(radius: float, rows: int, channels: int, items: int) -> None:
     half = math.ceil(radius) + 1
     bank = torch.stack([kernel_of("disc", radius + 0.2 * c, size=2 * half + 1) for c in range(channels)])
     light = torch.rand(items, channels, rows + 2 * half, 17 + 2 * half, dtype=torch.float64)
