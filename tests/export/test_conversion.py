@@ -42,10 +42,10 @@ def test_the_kernels_of_a_graph_are_those_of_the_stated_width(monkeypatch: pytes
     assert ops.lens_width == 1920
 
 
-def test_the_graph_has_only_standard_operators_and_loops_that_skip_layers_without_pixels(layered: Any) -> None:
+def test_the_graph_has_standard_operators_and_loops_that_skip_layers_without_pixels(layered: Any) -> None:
     model = onnx_ir.load(layered.path)
     assert model.opset_imports.keys() == {""}
-    nodes = list(model.graph.all_nodes())
+    nodes: list[Any] = list(model.graph.all_nodes())
     loops = [node.attributes["body"].as_graph() for node in nodes if node.op_type == "Loop"]
     kinds = [[node.op_type for node in body.all_nodes()] for body in loops]
     rays, looking, layers = sorted(kinds, key=lambda of_loop: of_loop.count("If"))
@@ -55,11 +55,7 @@ def test_the_graph_has_only_standard_operators_and_loops_that_skip_layers_withou
     # operators that a frame in focus does not need are inside a branch
     assert len(model.graph) < 0.1 * len(nodes)
     assert not {node.op_type for node in model.graph} & {"Conv", "Loop", "NonZero", "TopK", "ScatterElements"}
-
-
-def test_convolutions_take_constant_weights_of_their_own_graph(layered: Any) -> None:
-    nodes: list[Any] = list(onnx_ir.load(layered.path).graph.all_nodes())
-    for node in nodes:
+    for node in nodes:  # convolutions take constant weights of their own graph
         if node.op_type == "Conv":
             _, weight = node.inputs
             maker = weight.producer()
