@@ -11,8 +11,9 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from tests.kernels import kernel_of
+from tests.refused import refuses
 from tests.scenes import CAMERA, slope, texture, whole
-from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field
+from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
 from torchdof.augmentation import RandomDepthOfField
 from torchdof.depth import depth_from_values, fill_holes
 from torchdof.io.images import Picture, write_image
@@ -128,29 +129,18 @@ def test_a_plan_without_layers_in_order_or_a_tolerance_is_refused(nodes: Any, to
         Plan(nodes, tolerance)
 
 
-@pytest.mark.parametrize(
-    ("camera", "depth", "named"),
-    [
+OVERFLOWING, PICTURE, DEPTH = DepthOfField(Camera(f_number=1e-42)), texture(), whole(3.0)
+partial: Any = functools.partial
+test_an_infinite_blur_radius_is_refused_with_lens_and_depth = refuses(
+    *((partial(DepthOfField(camera), PICTURE, whole(depth)), f"this lens .*{named}") for camera, depth, named in (
         (Camera(f_number=1e-42), 3.0, "f_number 1e-42"),
         (Camera(sensor_width_mm=1e-300), 3.0, "sensor_width_mm 1e-300"),
         (Camera(focal_length_mm=1e200, focus_m=1e250), 3.0, r"focal_length_mm 1e\+200"),
         (Camera(focus_m=1e-45, focus_breathing=False), 3.0, "focus_m 1e-45"),
         (Camera(focus_m=torch.tensor([1e-45]), focus_breathing=False), 3.0, "focus_m 1.4013e-45"),
-        (Camera(), 1e-45, "which starts at 1.4e-45 m"),
-    ],
-)
-def test_an_infinite_blur_radius_is_refused_with_lens_and_depth(camera: Camera, depth: float, named: str) -> None:
-    image, depths, dof = texture(), whole(depth), DepthOfField(camera)
-    calls: list[Callable[[], Any]] = [
-        functools.partial(dof, image, depths),
-        functools.partial(dof.plan, image, depths),
-        functools.partial(dof.coc_px, image, depths),
-        functools.partial(depth_of_field, image, depths, camera),
-        functools.partial(dof.layers, torch.ones(1, 2, 4, 24, 32), torch.tensor([depth, 5.0])),
-        functools.partial(dof, image, torch.full_like(depths, 1e-30 if depth > 1 else depth), background=image,
-                          background_depth=depths),
-    ]  # fmt: skip
-    for call in calls:
-        with pytest.raises(ValueError, match=f"this lens .*{named}") as caught:
-            call()
-        assert "coc_px" not in str(caught.value) and "check=False" not in str(caught.value)
+        (Camera(), 1e-45, "which starts at 1.4e-45 m"))),
+    (partial(OVERFLOWING.plan, PICTURE, DEPTH), "this lens .*f_number 1e-42"),
+    (partial(OVERFLOWING.coc_px, PICTURE, DEPTH), "this lens .*f_number 1e-42"),
+    (partial(OVERFLOWING.layers, torch.ones(1, 2, 4, 24, 32), torch.tensor([3.0, 5.0])), "this lens .*f_number 1e-42"),
+    (partial(DOF, PICTURE, DEPTH, background=PICTURE, background_depth=whole(1e-45)), "which starts at 1.4e-45 m"),
+)  # fmt: skip

@@ -187,15 +187,6 @@ def test_markers_of_holes_are_kept_and_act_like_nan(scene: Scene, marked: float)
     assert torch.equal(repaired[~holes], same[~holes])
 
 
-def test_a_hole_within_a_surface_changes_no_other_pixel(scene: Scene) -> None:
-    depth, holes = torch.full((1, 1, 128, 192), 4.0), torch.zeros(1, 1, 128, 192, dtype=torch.bool)
-    depth[..., 101:], holes[..., 40:60, 20:60] = 2.0, True
-    image = scene.image * torch.where(torch.arange(192) < 100, 0.3, 1.0)
-    whole = repair_edges(image, depth)
-    assert bool((whole != depth).any())
-    assert torch.equal(repair_edges(image, torch.where(holes, torch.nan, depth))[~holes], whole[~holes])
-
-
 @pytest.mark.parametrize("auto", [True, False])
 @pytest.mark.parametrize(
     ("near", "far", "light"),
