@@ -6,8 +6,7 @@
 # make sweep      run the hard tests at full length: whole frames instead of strips, up to twenty times as many examples
 # make wheel      build the wheel for this machine into dist/ and try it, and installation, without a compiler
 # make sanitize   run the compiled engine's tests under AddressSanitizer and ThreadSanitizer; needs GCC
-# make fuzz       changed files to every reader, and scenes to both engines, for an hour (SECONDS=3600); lists what it finds
-# make soak       1,000 renderings in one process, 8 threads, forked and spawned workers: memory and pictures stay the same
+# make fuzz       changed files to every reader, for an hour (SECONDS=3600); lists what it finds
 # All but oldest need only make and Python 3.11 or newer: the first run makes .venv and installs what constraints.txt
 # pins. PYTHON=/path/to/python chooses the Python.
 # Where there is a C++ compiler the engine is compiled too.
@@ -23,7 +22,7 @@ FOR_DEMO := $(VENV)/.installed-for-demo
 export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export PIP_BUILD_CONSTRAINT := $(PIP_CONSTRAINT)
 
-.PHONY: demo test oldest docs pictures sweep install check package wheel sanitize fuzz soak clean
+.PHONY: demo test oldest docs pictures sweep install check package wheel sanitize fuzz clean
 
 demo: $(FOR_DEMO)
 	$(BIN)/python examples/demo.py --data examples/data/motorcycle --out out
@@ -71,9 +70,6 @@ sanitize: $(INSTALLED)
 SECONDS := 3600
 fuzz: $(INSTALLED)
 	FUZZ_SECONDS=$(SECONDS) $(BIN)/python -m pytest -n 1 -m hard tests/fuzz
-
-soak: $(INSTALLED)
-	$(BIN)/python -m tests.hard.soak --renderings 1000
 
 INSTALLS_FROM := pyproject.toml constraints.txt CMakeLists.txt $(wildcard torchdof/native/src/*) build/modules
 

@@ -1,7 +1,6 @@
 """Slow and obvious reference implementations: plain loops in float64."""
 
 import functools
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -10,8 +9,6 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from torchdof import BlurTable
-
-IN_FOCUS = 2e-4  # on the blur axis; smaller blurs count as in focus
 
 
 def scatter(light: Tensor, kernel_of: Callable[[int, int, int], Tensor]) -> Tensor:
@@ -33,47 +30,12 @@ def scatter(light: Tensor, kernel_of: Callable[[int, int, int], Tensor]) -> Tens
     return out
 
 
-def kernel_between(coc: float, nodes: list[float] | None, table: BlurTable, width: int) -> Tensor:
-    """Kernel of one pixel: its own (nodes None), or the linear mixture of the two neighbouring layers.
-
-    The nodes are places of layers on the blur axis: `sign (radius^2 / (radius + 1/2) - IN_FOCUS)`.
-    """
-
-    def at(signed: float) -> Tensor:
-        return table.kernels(torch.tensor([signed], dtype=torch.float64), width)[0]
-
-    def in_pixels(x: float) -> float:
-        return 0.0 if x == 0 else math.copysign(((y := abs(x) + IN_FOCUS) + math.sqrt(y * y + 2.0 * y)) / 2.0, x)
-
-    x = math.copysign(max(coc**2 / (abs(coc) + 0.5) - IN_FOCUS, 0.0), coc)
-    if nodes is None:
-        return at(coc if x else 0.0)
-    x = min(max(x, nodes[0]), nodes[-1])
-    for low, high in zip(nodes, nodes[1:], strict=False):
-        if low <= x <= high:
-            share = (x - low) / (high - low)
-            return mix(at(in_pixels(low)), at(in_pixels(high)), share)
-    return at(in_pixels(x))
-
-
-def mix(first: Tensor, second: Tensor, share: float) -> Tensor:
-    """`(1 - share) first + share second` for kernels of different sizes."""
-    size = max(first.shape[-1], second.shape[-1])
-    total = torch.zeros(first.shape[0], size, size, dtype=torch.float64)
-    for kernel, weight in ((first, 1 - share), (second, share)):
-        margin = (size - kernel.shape[-1]) // 2
-        total[:, margin : size - margin, margin : size - margin] += weight * kernel
-    return total
-
-
-def accumulate(
-    image: Tensor, coc: Tensor, table: BlurTable, nodes: list[float] | None = None, normalize: bool = True
-) -> Tensor:
+def accumulate(image: Tensor, coc: Tensor, table: BlurTable, normalize: bool = True) -> Tensor:
     """The paper's renderer: the sum of every pixel's billboard, with `normalize` divided by the sum of the weights."""
 
     @functools.cache
     def kernel_of(item: int, row: int, column: int) -> Tensor:
-        return kernel_between(float(coc[item, 0, row, column]), nodes, table, image.shape[-1])
+        return table.kernels(coc[item, :, row, column].double(), image.shape[-1])[0]
 
     total = scatter(image, kernel_of)
     return total / scatter(torch.ones_like(image), kernel_of) if normalize else total

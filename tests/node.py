@@ -6,6 +6,8 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+import OpenImageIO as oiio
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -26,3 +28,19 @@ def run(call: Sequence[object], environment: Mapping[str, str] = ENVIRONMENT) ->
     done = subprocess.run(list(map(str, call)), capture_output=True, text=True, env=environment, timeout=240)
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
+
+
+def pixels(path: Path) -> np.ndarray:
+    """Values of a picture as stored, 0 to 1."""
+    return np.asarray(oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT))
+
+
+def linear(encoded: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def srgb_codes(light: np.ndarray) -> np.ndarray:
+    """8-bit sRGB of linear light."""
+    value = np.clip(light, 0, 1)
+    return np.rint(255 * np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055))

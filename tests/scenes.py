@@ -167,11 +167,11 @@ def even(value: float, channels: int = 3) -> Light:
     return lambda dtype: torch.full((1, channels, HEIGHT, WIDTH), min(value, torch.finfo(dtype).max), dtype=dtype)
 
 
-def highlight(value: float, around: float = 1e-4, dtype: torch.dtype | None = None, side: int = 1) -> Light:
+def highlight(value: float, around: float = 1e-4, side: int = 1) -> Light:
     """A square of light in the middle of the frame."""
 
-    def light(given: torch.dtype) -> Tensor:
-        image = torch.full((1, 1, HEIGHT, WIDTH), around, dtype=dtype or given)
+    def light(dtype: torch.dtype) -> Tensor:
+        image = torch.full((1, 1, HEIGHT, WIDTH), around, dtype=dtype)
         rows, columns = (slice(n // 2 - side // 2, n // 2 + side // 2 + 1) for n in (HEIGHT, WIDTH))
         image[..., rows, columns] = min(value, torch.finfo(image.dtype).max)
         return image
@@ -215,7 +215,7 @@ def _bright(dtype: torch.dtype) -> Tensor:
 
 _CHECKERBOARD = torch.where((torch.arange(HEIGHT)[:, None] + torch.arange(WIDTH)) % 2 == 0, 1.2, 30.0)[None, None]
 _FAR = _with(_with(whole(1e-6), slice(8, 20), value=1e12), slice(20, None), value=math.inf)
-_DEPTH, _DEEP, _COC = slope(1.2, 6.0), slope(1.0, 9.0), slope(-5.0, 5.0)
+_COC = slope(-5.0, 5.0)
 _MANY = Plan(tuple(torch.linspace(-1, 1, 2001).double().tolist()), 0.0)
 _FOCUS_ENDS = from_blur_axis(1e-12)
 _EXACT: dict[str, Any] = {"float32": 0.0, "float16": 0.0}
@@ -227,32 +227,23 @@ CASES = [
     Case("1e-6 m everywhere: a blur of 4e6 px", [whole(1e-6)], mean, cameras=[CAMERA]),
     Case("1e-6 m, 1e12 m and infinity side by side", [_FAR], cameras=[CAMERA]),
     Case("all in focus", [whole(2.0)], itself, cameras=[CAMERA], **_EXACT),
-    Case("two values, half of the frame each", [halves(1.2, 9.0)], cameras=[CAMERA]),
     Case("a step at every pixel", [_CHECKERBOARD], cameras=[CAMERA]),
     Case("noise over four decades", [2.0 * 10 ** noise(1).clamp(-1, 3)], cameras=[CAMERA]),
-    Case("focus at one pixel's depth", [_DEPTH], cameras=[CAMERA.replace(focus_m=float(_DEPTH[0, 0, 0, 11]))]),
     Case("focus at infinity", [_with(slope(3.0, 50.0), slice(-4, None), value=math.inf)],
          cameras=[CAMERA.replace(focus_m=math.inf)]),
-    Case("focus in front of everything and behind", [_DEEP], cameras=[CAMERA.replace(focus_m=s) for s in (0.6, 40.0)]),
-    Case("f-number 0.5, 1, 2, 4, 1e3", [_DEPTH], cameras=[CAMERA.replace(f_number=n) for n in (0.5, 1, 2, 4, 1e3)]),
     Case("f-number 1e6: a pinhole", [slope(0.1, 6.0)], itself, cameras=[CAMERA.replace(f_number=1e6)], **_EXACT),
-    Case("a plane exactly on a layer's node", [_near_a_node(0)]),
     Case("one unit in the last place to either side of a node", [_near_a_node(-1), _near_a_node(1)],
          lambda image, _: blur_by_coc(image, _near_a_node(0).double())),
     Case("just in focus", [whole(c * _FOCUS_ENDS) for c in (0.9999, -0.9999)], itself, **_EXACT),
     Case("just out of focus", [whole(c * _FOCUS_ENDS) for c in (1.0001, -1.0001)], disc),
-    Case("coc 0, 1e-7 and 0.009 px", [whole(c) for c in (0.0, 1e-7, -1e-7, 0.009, -0.009)], itself, **_EXACT),
     Case("coc 0.6 to 23 px", [whole(c) for c in (0.625, 1.0, -1.5, 3.375, -8.75, 12.75, 23.0)], disc),
     Case("coc larger than the frame", [whole(c) for c in (45.0, -45.0, 1e5, -1e5)], mean),
     Case("coc from -1e5 to 1e5 px in one frame", [slope(-1e5, 1e5)]),
     Case("two far groups of depth and nothing between", [halves(-18.0, 18.0)]),
     Case("6.5e4 in 1e-4, outside its disc of 5 px", [whole(5.0)], light=highlight(6.5e4), where=beyond(6.0), **_DARK),
-    Case("1e6 in 1e-4, outside its disc of 5 px (image in float32)", [whole(5.0)], darkest, float32=1e-6, float16=1e-6,
-         light=highlight(1e6, dtype=torch.float32), where=beyond(6.0)),
     Case("6.5e4 in 1e-4 on a slope, beyond its largest disc", [slope(-3, 5)], light=highlight(6.5e4),
          where=beyond(8.0), **_DARK),
     Case("6.5e4 in 1e-4, inside its disc of 5 px", [whole(5.0)], disc, highlight(6.5e4), where=~beyond(4.0)),
-    Case("5000 in 0.1", [whole(4.0)], disc, highlight(5000.0, 0.1)),
     Case("a single pixel lit", [whole(4.5)], disc, highlight(1.0, 0.0), per=lambda truth: truth.clamp_min(1e-3)),
     Case("all zero", [_COC], itself, even(0.0), **_EXACT),
     Case("1e-30 everywhere (float16: 1e-7)", [_COC], itself, lambda d: even(1e-30 if d == torch.float32 else 1e-7)(d),
@@ -264,12 +255,10 @@ CASES = [
          light=lambda d: texture(d) - 0.5, per=_brightest),
     Case("negative light, a plane, in closed form", [whole(3.25)], disc, lambda d: texture(d) - 0.5, float32=1e-6,
          per=_brightest),
-    Case("65504 everywhere: the largest of float16", [_COC], light=even(65504.0), **_EVEN),
     Case("3e38 everywhere (float16: 65504)", [whole(4.0)], light=even(3e38, 1), **_EVEN),
     Case("1e30 at random beside a depth step (float16: 65504)", [halves(-5.0, 4.0)], light=_bright),
     Case("1e30 in 0.1, 3 x 3 pixels, beside a depth step (float16: 65504)", [halves(-5.0, 4.0)], per=_brightest,
          light=highlight(1e30, 0.1, side=3), float32=1e-6),
-    Case("even light, slope from -20 to 20 px", [slope(-20, 20)], light=even(0.75), **_EVEN),
     Case("even light, a depth of its own for every pixel", [r * noise(2) for r in (1.0, 8.0, 30.0)], itself, even(0.75),
          float32=1.2e-6, float16=0.0),
     Case("even light, cat's eyes", [slope(-12, 14)], itself, even(0.75), float32=1.2e-6, float16=0.0,

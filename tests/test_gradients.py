@@ -141,9 +141,7 @@ def test_gradients_are_finite_on_hostile_maps(name: str, way: dict[str, Any]) ->
 @pytest.mark.parametrize(("dtype", "light"), [
     *((torch.float32, light) for light in (0.0, 1e-30, 1e-40, 1e8)), (torch.float16, 1.0), (torch.bfloat16, 1.0)
 ])  # fmt: skip
-def test_gradients_are_finite_at_hostile_light_and_of_its_type(
-    way: dict[str, Any], dtype: torch.dtype, light: float
-) -> None:
+def test_gradients_are_finite_at_hostile_light_and_types(way: dict[str, Any], dtype: torch.dtype, light: float) -> None:
     image = torch.full((1, 2, 9, 12), light, dtype=dtype)
     image[..., 4, 5] = 2 * light
     leaves = [image.requires_grad_(), EVEN.clone().requires_grad_()]
@@ -207,9 +205,7 @@ def test_torch_func_of_an_old_pytorch_is_refused_by_name(which: str, monkeypatch
 
 
 @pytest.mark.parametrize(("occlusion", "frames"), [(True, 150), (False, 40)])
-def test_autograd_keeps_a_bounded_number_of_frames(
-    occlusion: bool, frames: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_autograd_keeps_few_frames(occlusion: bool, frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Layers, hidden surfaces and rays are computed again in the backward pass."""
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
     light, coc_px = post_before_lamps()

@@ -1,4 +1,5 @@
 import dataclasses
+import inspect
 import io
 import math
 from collections.abc import Callable
@@ -6,20 +7,17 @@ from typing import Any
 
 import pytest
 import torch
-import torch.nn.functional as functional
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests import loops
 from tests.refused import refuses
 from tests.scenes import CAMERA, EVERY_WAY, HEIGHT, WAYS, WIDTH, disc, slope, texture
 from tests.traced import TRACED
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field, tensors
+from torchdof.options import OptionArguments, Options
 from torchdof.reference import metrics
-from torchdof.render.border import continued
-from torchdof.render.layer_weights import blur_axis
 from torchdof.render.plan import Plan
 
 TYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
@@ -36,22 +34,9 @@ def constant_map(value: float, image: Tensor, dtype: torch.dtype = torch.float32
     return torch.full((1, 1, *image.shape[-2:]), value, dtype=dtype)
 
 
-def scene(height: int = 12, width: int = 17, reach: float = 4.0, seed: int = 1) -> tuple[Tensor, Tensor]:
-    """A random image and a coc of slopes, steps and noise from -reach to reach."""
-    generator = torch.Generator().manual_seed(seed)
-    image = 4 * torch.rand(1, 3, height, width, generator=generator) ** 4
-    coc = torch.linspace(-1, 1, width).expand(height, width).clone()
-    coc[height // 3 : height // 2] = -0.9
-    coc[-2:] += 0.3 * torch.randn(2, width, generator=generator)
-    return image, reach * coc.clamp(-1, 1)[None, None]
-
-
 def rms(first: Tensor, second: Tensor) -> float:
     """Of display-encoded values."""
     return float((metrics.display(first) - metrics.display(second)).square().mean().sqrt())
-
-
-# A plane
 
 
 @EVERY_WAY
@@ -62,18 +47,6 @@ def test_a_plane_is_the_convolution_with_the_kernel_of_its_table(name: str, way:
         values = constant_map(coc, image)
         out = blur_by_coc(image, values, table=TABLES[name], **way)
         assert_close(out.double(), disc(image, values, TABLES[name]), rtol=1e-5, atol=1e-6)
-
-
-def test_a_plane_in_depth_is_convolved_with_the_disc_of_the_thin_lens() -> None:
-    camera = Camera(focal_length_mm=85.0, f_number=2.0, focus_m=1.5, sensor_width_mm=4.0)
-    image, depth = torch.rand(1, 3, 15, 20), torch.full((1, 1, 15, 20), 6.0)
-    radius = 0.085 / 2.0 / 2 * (1.5 * 0.085 / (1.5 - 0.085)) / (0.004 / 20) * (1 / 1.5 - 1 / 6.0)
-    assert 4 < radius < 20
-    expected = disc(image, constant_map(radius, image, torch.float64))
-    assert_close(DepthOfField(camera)(image, depth).double(), expected, rtol=1e-5, atol=1e-6)
-
-
-# Focus
 
 
 @EVERY_WAY
@@ -87,43 +60,6 @@ def test_in_focus_plane_is_returned_bit_exact(way: dict[str, Any], dtype: torch.
     assert torch.equal(blur_by_coc(image, below_a_hundredth, **way), image)
 
 
-# Sums
-
-
-def test_the_plain_sum_keeps_all_light_at_any_depths() -> None:
-    image, coc = torch.zeros(1, 3, 30, 34), scene(30, 34, reach=5.0)[1]
-    image[..., 8:22, 8:26] = 100 * torch.rand(3, 14, 18)
-    for method in ("layered", "fold"):
-        out = blur_by_coc(image, coc, occlusion=False, normalize=False, method=method)
-        assert_close(out.double().sum((-2, -1)), image.double().sum((-2, -1)), rtol=1e-5, atol=0.0)
-
-
-# Against the paper's renderer, a plain loop
-
-
-def wider(image: Tensor, coc: Tensor, beyond: int) -> tuple[Tensor, Tensor]:
-    """An image and its coc, continued by ``beyond`` pixels on each side."""
-    light = continued([image], None, None, (beyond,) * 4, beyond, blur_axis(coc))[0]
-    return light, functional.pad(coc, (beyond,) * 4, mode="replicate")
-
-
-@pytest.mark.parametrize(
-    ("name", "method", "normalize"),
-    [("disc", "layered", True), ("disc", "fold", False), ("sato_j15", "fold", True), ("sato_j15", "layered", False)],
-)
-def test_accumulating_billboards_equals_a_plain_loop_over_pixels(name: str, method: Any, normalize: bool) -> None:
-    image, coc = (x.double() for x in scene(5, 6, reach=1.8))
-    nodes = list(Plan.for_scene(coc, 1 / 255, adapt=False).nodes)
-    options: dict[str, Any] = {"occlusion": False, "normalize": normalize, "method": method}
-    out = blur_by_coc(image, coc, table=TABLES[name], **options)
-    beyond = 8 if normalize else 0  # the plain sum does not continue the image
-    summed = loops.accumulate(*wider(image, coc, beyond), TABLES[name], nodes, normalize)
-    assert_close(out, functional.pad(summed, (-beyond,) * 4), rtol=1e-10, atol=1e-12)
-
-
-# Cameras and batches
-
-
 def test_the_functional_form_equals_the_module() -> None:
     image, depth = torch.rand(1, 3, 9, 12), 0.6 + 4 * torch.rand(1, 1, 9, 12)
     camera, table = Camera(sensor_width_mm=1.0), BlurTable.gaussian()
@@ -132,9 +68,6 @@ def test_the_functional_form_equals_the_module() -> None:
     assert torch.equal(out, expected)
     coc = camera.replace(focus_m=1.2, f_number=1.7).coc_px(depth, 12)
     assert torch.equal(blur_by_coc(image, coc, table=table, method="fold", occlusion=False), expected)
-
-
-# Types, shapes, strides
 
 
 @settings(max_examples=25)
@@ -185,18 +118,27 @@ def test_the_configuration_travels_with_the_state_dict() -> None:
     assert torch.equal(other(image, depth), dof(image, depth))
 
 
-def test_a_module_can_be_moved_copied_and_put_in_a_sequence() -> None:
-    model = torch.nn.ModuleList([DepthOfField(Camera())]).to(torch.float64).eval()
-    image, depth = torch.rand(1, 3, 5, 6), torch.full((1, 1, 5, 6), 3.0)
-    assert model[0](image, depth).dtype == torch.float32
-    assert list(model.parameters()) == []
-
-
 def test_repr_shows_camera_table_and_options() -> None:
     text = repr(DepthOfField(Camera(35.0, 1.4, 0.8), BlurTable.load("sato_j15"), method="fold"))
     assert text.startswith("DepthOfField(")
     for part in ("35 mm, f/1.4, focus 0.8 m", "'sato_j15', ring", "tolerance=0.0039", "method='fold'", "occlusion=T"):
         assert part in text
+
+
+# Signatures, help and type hints have the options of the dataclass ``Options``
+
+DEFAULTS = {field.name: field.default for field in dataclasses.fields(Options)}
+
+
+def test_type_hints_have_every_option() -> None:
+    assert ["table", *OptionArguments.__annotations__] == list(DEFAULTS)
+
+
+@pytest.mark.parametrize("function", [DepthOfField, depth_of_field, blur_by_coc])
+def test_the_signature_has_every_option_with_its_default_and_help_names_their_class(function: object) -> None:
+    parameters = inspect.signature(function).parameters  # type: ignore[arg-type]
+    assert {name: parameters[name].default for name in DEFAULTS} == {**DEFAULTS, "table": None}
+    assert "**options: As in :class:`torchdof.options.Options`" in (function.__doc__ or "")
 
 
 # Compiled
@@ -290,14 +232,10 @@ def called(**arguments: Any) -> Callable[[], Any]:
 
 
 test_a_wrong_argument_is_refused_in_one_sentence = refuses(
-    (called(image=IMAGE[0]), r"depth must be \[1, H, W\] beside an image \[C, H, W\], got \[1, 1, 4, 5\]"),
     (called(image=IMAGE.byte()), "image must be a tensor .* floating point .*got a torch.uint8"),
     (called(image=[[1.0]]), r"image must be a tensor .*got \[\[1.0\]\]"),
     (called(image=IMAGE[0].numpy()), r"image must be a tensor .*got a float32 array .*; use torch.from_numpy"),
     (called(image=IMAGE.movedim(1, -1)), r"got \[1, 1, 4, 5\]; channels come before .*image.movedim\(-1, -3\)"),
-    (called(image=torch.ones(1, 3, 2, 4, 5), depth=torch.ones(1, 1, 2, 4, 5)),
-     r"depth must be \[1, 3, 1, H, W\] beside an image \[1, 3, C, H, W\], got \[1, 1, 2, 4, 5\]"),
-    (called(image=IMAGE[:, :, :0]), "image must be .* with at least one pixel"),
     (called(depth=DEPTH[0]), r"depth must be \[1, 1, 4, 5\].*did you forget the channel dimension"),
     *((called(depth=torch.ones(size)), r"depth must be \[1, 1, 4, 5\].* got \[{}, {}, {}, {}\]".format(*size))
       for size in ((1, 1, 5, 4), (2, 1, 4, 5), (1, 3, 4, 5))),

@@ -3,7 +3,6 @@
 import doctest
 import importlib
 import importlib.metadata
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -32,12 +31,6 @@ def test_examples_in_docstrings_run(name: str, request: pytest.FixtureRequest) -
 def test_public_names_have_an_example() -> None:
     without = [name for name in torchdof.__all__ if ">>>" not in (getattr(torchdof, name).__doc__ or "")]
     assert without == []
-
-
-def test_tables_and_type_information_are_installed() -> None:
-    folder = Path(torchdof.__file__).parent
-    assert (folder / "py.typed").is_file()
-    assert (folder / "optics" / "tables" / "sato_j15.json").is_file()
 
 
 def test_command_is_installed() -> None:

@@ -11,7 +11,6 @@ from torchdof.io.images import Picture, write_image
 
 _RENDER = """
 none.exr depth.npy --focus-m 2                        | none.exr: there is no such file
-image.exr none.npy --focus-m 2                        | none.npy: there is no such file
 image.exr --focus-m 2                                 | image.exr: has no depth channel; name a depth file
 a.png                                                 | IMAGE DEPTH, which a network such as Depth Anything makes of it
 image.exr turned.npy --focus-m 2                      | turned by 90 degrees it fits
@@ -21,19 +20,13 @@ image.exr holed.npy --focus-m 2                       | holed.npy: 2 pixels (0.5
 image.exr unknown.npy --focus-m 2                     | unknown.npy: no pixel has a depth; check the kind
 image.exr partly.npy --depth-kind coc                 | have no depth (NaN or marked unknown); say how to fill them: fi
 image.exr millimetres.npy --focus-at 3,3 --depth-scale 1e-6 | --focus-m must be longer than the focal length
-image.exr depth.npy --focus-m 2 --layer b             | image.exr: has no layer 'b'
 image.exr depth.####.npy --focus-m 2                  | image.exr: is a single image
-image.exr depth.npy --focus-m 2 --frames 1-2          | image.exr: is a single image
-shot.####.exr depth.npy --focus-m 2                   | out.exr: expected one place for the frame number
 shot.####.exr none.####.npy --focus-m 2 -o o.#.exr    | none.0001.npy: there is no such file
-shot.####.exr depth.npy --focus-m 2 -o o.#.exr --frames 2-5 | shot.0004.exr: there is no such file
 none.####.exr depth.npy --focus-m 2 -o o.#.exr        | none.####.exr: there are no such files
 shot.####.exr depth.npy --focus-m 2 -o shot.####.exr  | shot.0001.exr: is one of the inputs
 image.exr shot.0003.exr --focus-m 1:2,3:4 -o shot.####.exr | shot.0003.exr: is one of the inputs
 shot.####.exr depth.####.npy -o o.#.exr --depth-kind coc --steady | --steady filters depth in metres
-shot.####.exr depth.npy --focus-m 2 -o o.#.exr --frames 5-2   | --frames expects first-last
 shot.%099999999d.exr depth.npy --focus-m 2            | must have at most 18 digits
-image.exr depth.npy --focus-m 2 -o depth.npy          | depth.npy: is one of the inputs
 image.exr depth.npy --focus-m 2 -o depth.npy/out.exr  | its folder cannot be made
 image.exr depth.npy --focus-m 2 --sheet image.exr     | image.exr: is one of the inputs
 image.exr depth.npy --focus-m 2 --sheet ./out.exr     | out.exr: would be written twice
@@ -42,7 +35,6 @@ shot.####.exr depth.npy -o o.#.exr                    | where is the focus? give
 image.exr depth.npy --focus-m near                    | --focus-m expects metres (2.0) or keyframes
 image.exr depth.npy --focus-m 1:2,5:3                 | out.exr: expected one place for the frame number
 image.exr depth.npy --focus-m 1:2,5:3 -o o.#.exr --sheet s.png | --sheet is of one picture
-image.exr depth.npy --focus-m 2 -o o.##.exr           | image.exr: is a single image
 image.exr depth.npy --focus-m 0.01                    | --focus-m must be longer than the focal length
 image.exr depth.npy --focus-at 3                      | --focus-at expects a pixel X,Y such as 320,200, got '3'
 image.exr depth.npy --focus-at 99,5                   | focus point (99.0, 5.0) must lie in the frame of 24 x 16
@@ -58,7 +50,6 @@ image.exr depth.npy --focus-m 2 --f-number 2 --blur 2% | --f-number and --blur b
 image.exr depth.npy --focus-m 2 --equivalent 85,1.4 --focal-length-mm 50 | --equivalent and --focal-length-mm say
 image.exr depth.npy --focus-m 2 --equivalent 85       | --equivalent expects a focal length and an f-number such as
 image.exr depth.npy --focus-m 2 --blur 99%            | --blur expects a share of the picture's width
-image.exr depth.npy --focus-m 2 --blur 2              | --blur expects a share of the picture's width
 image.exr depth.npy --depth-kind coc --blur 2%        | --depth-kind coc is the blur itself and takes no camera
 shot.####.exr depth.npy -o o.#.exr --focus-m 2 --blur 2% | --blur would open the lens anew in each frame
 image.exr depth.npy --focus-m 2 --aperture-radius-m 1 | --aperture-radius-m goes with --fov-deg
@@ -89,6 +80,15 @@ inspect image.exr depth.npy --depth-kind coc     | there is no depth to inspect
 inspect image.exr depth.npy --focus-m 1:2,3:4    | --focus-m has keyframes but IMAGE is a single image
 tables nothing                                   | no blur table 'nothing'
 bench --focus-m 2                                | the built-in scene has its own camera and depth
+bench image.exr depth.npy --truth .              | leave IMAGE and DEPTH out
+bench image.exr depth.npy --out image.exr        | File exists
+bench --truth . --out . --f-number 2             | with their own lens and depth
+bench --vignetting 0.4 --onnx                    | one kernel a layer
+bench image.exr depth.npy --views 4              | name its folder with --truth
+bench a.png tiny.npy --depth-kind z              | from 16 pixels a side on
+bench --truth .                                  | give a folder with --out
+bench --truth . --json                           | leave --json out
+bench --truth . --scan                           | leave IMAGE and DEPTH out, --onnx, --compile and --scan
 export                                           | give either -o FILE to write or --show FILE to read
 export -o dof.bin                                | name it dof.onnx
 export -o dof.onnx --table double_gauss_50mm_f2  | state it as --width=1920
@@ -116,6 +116,7 @@ def rows(table: str) -> list[tuple[str, str]]:
 def files(scene: Path) -> Path:
     depth = np.load("depth.npy")
     np.save("small.npy", np.ones((4, 3)))
+    np.save("tiny.npy", np.ones((4, 4)))
     np.save("turned.npy", depth[0, 0].T)
     np.save("zeros.npy", 0 * depth)
     np.save("millimetres.npy", 1000 * depth)

@@ -25,9 +25,7 @@ def test_a_file_is_written_and_its_verification_printed(exported_by_command: tup
     assert [file.name for file in path.parent.iterdir()] == ["dof.onnx"]
 
 
-def test_options_of_the_aperture_reach_the_module(
-    scene: Path, run: Callable[..., str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_options_of_the_aperture_arrive(scene: Path, run: Callable[..., str], monkeypatch: pytest.MonkeyPatch) -> None:
     modules: list[DepthOfField] = []
 
     def record(dof: DepthOfField, *_: Any, **__: Any) -> None:

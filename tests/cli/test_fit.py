@@ -65,17 +65,6 @@ def test_a_warning_about_a_grid_of_dots_is_printed_once(run: Run, simulator: Mod
     assert ["the encoding of" in json.loads(line)["warnings"][0] for line in lines] == [True, True]
 
 
-def test_a_polygon_becomes_a_table_with_its_blades(run: Run, simulator: ModuleType, tmp_path: Path) -> None:
-    camera = simulator.Simulator(level=0.7, snr_db=46, dot_radius=7.0, black=0.02)
-    hexagon = "hexagon", {"radius": 7.5}
-    folder = simulator.write_captures(tmp_path / "lens", camera, 0.5, [0.8], lambda d: hexagon, width=110, height=90)
-    out = tmp_path / "mine.json"
-    output = run("fit", folder, "-o", out, "--family", "polygon", "--plots", tmp_path)
-    table = BlurTable.load(out)
-    assert table.family == "disc" and table.aperture is not None and table.aperture.blades == 6
-    assert "6 blades" in output and (tmp_path / "mine_800mm.png").is_file()
-
-
 def test_a_lens_becomes_a_table(run: Run, tmp_path: Path) -> None:
     arguments = ("--lens", "double_gauss_50mm", "--f-number", "4", "--nodes", "5", "-o", tmp_path / "lens.json")
     output = run("fit", *arguments)

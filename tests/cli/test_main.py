@@ -50,9 +50,7 @@ def test_defaults_equal_those_of_the_library() -> None:
     assert (defaults["export"]["opset"], defaults["fit"]["square_mm"]) == (OPSET, SQUARE_MM)
 
 
-def test_a_missing_package_is_named_with_the_extra_that_installs_it(
-    monkeypatch: pytest.MonkeyPatch, run: Callable[..., str]
-) -> None:
+def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch, run: Callable[..., str]) -> None:
     def missing(self: Export) -> None:
         import scipy  # noqa: F401
 
@@ -73,9 +71,7 @@ def test_ctrl_c_gives_one_word_and_code_130(
 
 
 @pytest.mark.parametrize("variables", [{}, {"GOMP_SPINCOUNT": "77"}, {"OMP_WAIT_POLICY": "active"}], ids=str)
-def test_waiting_threads_do_not_spin_unless_the_environment_asks_for_it(
-    variables: dict[str, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_waiting_threads_do_not_spin_unless_asked(variables: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     """PyTorch, whose libraries read these variables, is not loaded before: tests/test_imports.py."""
     names = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
     environment = {name: value for name, value in os.environ.items() if name not in names} | variables

@@ -177,7 +177,7 @@ _QUICK = ("lenses.jpg", "truth_lamps.jpg", "truth_bars.jpg")
 
 
 def test_every_picture_of_the_documentation_has_a_script() -> None:
-    elsewhere = {"worst_places.jpg", "phone_sheet.jpg"}  # from other scenes; by tests/fit/phone.py, in minutes
+    elsewhere = {"worst_places.jpg", "phone_sheet.jpg"}  # of other scenes, and of a simulated phone
     assert {*_GALLERY, *elsewhere} == {path.name for path in (ROOT / "docs" / "pictures").iterdir()}
 
 

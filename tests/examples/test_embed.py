@@ -14,7 +14,7 @@ import OpenImageIO as oiio
 import pytest
 import torch
 
-from tests.node import NEEDS_NODE, NODE_FOLDER, ROOT, needs, run
+from tests.node import NEEDS_NODE, NODE_FOLDER, ROOT, linear, needs, pixels, run, srgb_codes
 from torchdof.depth import from_relative
 
 DATA = ROOT / "examples" / "data" / "motorcycle"
@@ -30,10 +30,6 @@ def header_folder() -> Path | None:
     return next((folder for folder in folders if (folder / "onnxruntime_cxx_api.h").is_file()), None)
 
 
-def pixels(path: Path) -> np.ndarray:
-    return np.asarray(oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT))
-
-
 def write(path: Path, values: np.ndarray) -> Path:
     assert oiio.ImageBuf(np.ascontiguousarray(values)).write(str(path))
     return path
@@ -46,10 +42,6 @@ def crop() -> tuple[np.ndarray, np.ndarray]:
     depth_mm = np.where(np.isfinite(disparity), 1000 * DISPARITY["scale"] / (disparity + DISPARITY["offset"]), 0)
     photo = np.rint(255 * pixels(DATA / "motorcycle_left.png")[piece])
     return photo.astype(np.uint8), np.rint(depth_mm).astype(np.uint16)
-
-
-def linear(encoded: np.ndarray) -> np.ndarray:
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def area_means(old: int, new: int) -> np.ndarray:
@@ -89,9 +81,8 @@ def test_javascript_gives_the_pixels_of_the_file(plain: Any, tmp_path: Path) -> 
     call += [write(tmp_path / "depth.png", depth_mm), tmp_path / "out.png"]
     call += ["--focus-m", FOCUS_M, "--f-number", F_NUMBER, "--scale", 0.001]
     assert "128 x 96" in run(call)
-    value = rendered(plain, linear(photo / 255), np.where(depth_mm > 0, depth_mm / 1000, np.nan)).clip(0, 1)
-    codes = np.rint(255 * np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055))
-    difference = np.abs(np.rint(255 * pixels(tmp_path / "out.png")[..., :3]) - codes)
+    value = rendered(plain, linear(photo / 255), np.where(depth_mm > 0, depth_mm / 1000, np.nan))
+    difference = np.abs(np.rint(255 * pixels(tmp_path / "out.png")[..., :3]) - srgb_codes(value))
     assert difference.max() <= 1 and (difference > 0).mean() < 1e-3
 
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 from filelock import FileLock
 
-from tests.node import ENVIRONMENT, ROOT, needs, run
+from tests.node import ENVIRONMENT, ROOT, linear, needs, pixels, run, srgb_codes
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "google-chrome"))), None)
 CLICKS = {"near": (0.55, 0.6), "far": (0.2, 0.12)}  # shares of width and height, as in web.mjs
@@ -38,10 +38,6 @@ def used(plain: Any, shared_folder: Path) -> tuple[Path, Mapping[str, Any]]:
     return folder, json.loads((folder / "results.json").read_text())
 
 
-def pixels(path: Path) -> np.ndarray:
-    return np.asarray(oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT))
-
-
 def expected(exported: Any, folder: Path, u: float, v: float, f_number: float) -> tuple[np.ndarray, float]:
     """8-bit sRGB of the file in onnxruntime, focused on a point of the sample, and the distance of that point."""
     sample = folder / "dist" / "sample"
@@ -50,17 +46,13 @@ def expected(exported: Any, folder: Path, u: float, v: float, f_number: float) -
     height, width = depth.shape
     row, column = int(v * height), int(u * width)
     focus_m = float(np.median(depth[row - 2 : row + 3, column - 2 : column + 3]))
-    light = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    tensors = [light.transpose(2, 0, 1)[None], depth[None, None], [focus_m], [f_number]]
+    tensors = [linear(encoded).transpose(2, 0, 1)[None], depth[None, None], [focus_m], [f_number]]
     out = exported.render(*(torch.tensor(np.asarray(x), dtype=torch.float32) for x in tensors))[0]
-    value = np.clip(out.numpy().transpose(1, 2, 0), 0, 1)
-    return np.rint(255 * np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)), focus_m
+    return srgb_codes(out.numpy().transpose(1, 2, 0)), focus_m
 
 
 @pytest.mark.parametrize(("name", "other"), [("near", "far"), ("far", "near")])
-def test_a_click_gives_the_picture_of_the_file_which_is_sharp_there(
-    plain: Any, used: Any, name: str, other: str
-) -> None:
+def test_a_click_gives_the_picture_of_the_file_sharp_there(plain: Any, used: Any, name: str, other: str) -> None:
     folder, seen = used
     u, v = CLICKS[name]
     picture, focus_m = expected(plain, folder, u, v, 2 ** (-3 / 6))

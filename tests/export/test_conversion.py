@@ -42,10 +42,10 @@ def test_the_kernels_of_a_graph_are_those_of_the_stated_width(monkeypatch: pytes
     assert ops.lens_width == 1920
 
 
-def test_the_graph_has_only_standard_operators_and_loops_that_skip_layers_without_pixels(layered: Any) -> None:
+def test_the_graph_has_standard_operators_and_loops_that_skip_layers_without_pixels(layered: Any) -> None:
     model = onnx_ir.load(layered.path)
     assert model.opset_imports.keys() == {""}
-    nodes = list(model.graph.all_nodes())
+    nodes: list[Any] = list(model.graph.all_nodes())
     loops = [node.attributes["body"].as_graph() for node in nodes if node.op_type == "Loop"]
     kinds = [[node.op_type for node in body.all_nodes()] for body in loops]
     rays, looking, layers = sorted(kinds, key=lambda of_loop: of_loop.count("If"))
@@ -55,11 +55,7 @@ def test_the_graph_has_only_standard_operators_and_loops_that_skip_layers_withou
     # operators that a frame in focus does not need are inside a branch
     assert len(model.graph) < 0.1 * len(nodes)
     assert not {node.op_type for node in model.graph} & {"Conv", "Loop", "NonZero", "TopK", "ScatterElements"}
-
-
-def test_convolutions_take_constant_weights_of_their_own_graph(layered: Any) -> None:
-    nodes: list[Any] = list(onnx_ir.load(layered.path).graph.all_nodes())
-    for node in nodes:
+    for node in nodes:  # convolutions take constant weights of their own graph
         if node.op_type == "Conv":
             _, weight = node.inputs
             maker = weight.producer()
@@ -68,6 +64,7 @@ def test_convolutions_take_constant_weights_of_their_own_graph(layered: Any) -> 
 
 
 CATS_EYES = torchdof.BlurTable.polygon(5, vignetting=0.4)
+RANGE = CAMERA.replace(focus_range_m=(1.0, 2.0))
 SIMPLY = torchdof.DepthOfField(CAMERA, **SIMPLE)
 
 
@@ -79,14 +76,14 @@ SIMPLY = torchdof.DepthOfField(CAMERA, **SIMPLE)
         (SIMPLY, {"width": 640}, "same kernels at any image width"),
         (SIMPLY, {"channels": 0}, "channels must be a whole number"),
         (SIMPLY, {"path": "nowhere/dof.onnx"}, "there is no folder"),
+        (SIMPLY, {"layout": "rows"}, "layout must be one of tiles, whole, got 'rows'"),
+        (SIMPLY, {"size": (40, 50)}, 'size is for layout="whole"'),
+        (SIMPLY, {"layout": "whole", "size": (40, 0)}, r"height and width of a frame in pixels, .* got \(40, 0\)"),
+        (SIMPLY, {"layout": "whole", "depth_edges": "auto"}, "cannot repair depth edges"),
         (torch.nn.Identity(), {}, r"dof must be a torchdof\.DepthOfField"),
         (torchdof.DepthOfField(torchdof.Camera(focus_m=torch.tensor([1.0, 2.0]))), {}, "focus_m must be a float"),
         (torchdof.DepthOfField(CAMERA, CATS_EYES, **SIMPLE), {}, "take a table without vignetting"),
-        (
-            torchdof.DepthOfField(CAMERA.replace(focus_range_m=(1.0, 2.0)), **SIMPLE),
-            {},
-            "remove it: focus_range_m=None",
-        ),
+        (torchdof.DepthOfField(RANGE, **SIMPLE), {}, "remove it: focus_range_m=None"),
     ],
 )
 def test_bad_arguments_are_refused_and_no_file_is_written(
@@ -98,9 +95,7 @@ def test_bad_arguments_are_refused_and_no_file_is_written(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_file_that_differs_from_the_module_is_not_written(
-    plain: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_unlike_its_module_is_not_written(plain: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "dof.onnx").write_text("older")
     monkeypatch.setattr("torchdof.export.verification.TOLERANCE", -1.0)
     monkeypatch.setattr(conversion, "trace", lambda *_: None)  # the graph is that of a file, to save its tracing
@@ -113,9 +108,7 @@ def test_a_file_that_differs_from_the_module_is_not_written(
     assert (tmp_path / "dof.onnx").read_text() == "older"
 
 
-def test_an_exporter_that_cannot_follow_is_refused_before_it_starts(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_an_exporter_that_is_too_old_is_refused_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(conversion, "TRACEABLE", False)
     with pytest.raises(ValueError, match=r"needs PyTorch 2\.13 or newer to write ONNX files, this is "):
         to_onnx(torchdof.DepthOfField(torchdof.Camera()), tmp_path / "dof.onnx")

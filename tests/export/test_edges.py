@@ -1,6 +1,5 @@
 """Exported files repair depth edges and render the pictures of the PyTorch engine."""
 
-import importlib.util
 from pathlib import Path
 
 import numpy as np
@@ -86,16 +85,3 @@ def test_a_file_without_edges_to_repair_is_bit_exact_in_focus(
     image = tensors[0]
     got = runner.run(None, {"image": image.numpy(), "coc_px": np.zeros_like(tensors[1])})[0]
     assert np.array_equal(got, image.numpy())
-
-
-@pytest.mark.skipif(importlib.util.find_spec("openvino") is None, reason="openvino is not installed (pip)")
-def test_openvino_repairs_the_same(exported_by_command: tuple[Path, str], tensors: tuple[Tensor, Tensor]) -> None:
-    import openvino
-
-    path, _ = exported_by_command
-    compiled = openvino.Core().compile_model(str(path), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
-    image, coc = tensors
-    feed = {"image": image.numpy(), "coc_px": coc.numpy()}
-    compiled(feed)  # the first inference of a size may be wrong: docs/embedding.md
-    got = compiled(feed)[0]
-    assert error(got, rendered(image, coc, "auto"), image) <= 10 * TOLERANCE

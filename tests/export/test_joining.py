@@ -37,9 +37,7 @@ def network(size: str = "28,42") -> onnx.ModelProto:
         ("relative-inverse", "28,42", {"mean": (0.5, 0.4, 0.4), "std": (0.2, 0.2, 0.2)}),
     ],
 )
-def test_every_kind_of_estimate_makes_one_file(
-    plain: Any, estimate: Any, size: str, more: dict[str, Any], tmp_path: Path
-) -> None:
+def test_each_estimate_gives_a_file(plain: Any, estimate: Any, size: str, more: dict[str, Any], tmp_path: Path) -> None:
     path = tmp_path / "both.onnx"
     chain(network(size), plain.path, path, estimate=estimate, **more)
     facts = describe(path)

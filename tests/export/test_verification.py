@@ -1,5 +1,6 @@
 """``verify`` refuses files that are damaged, not portable, or exported from another module."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -8,8 +9,11 @@ import onnx
 import onnx.helper
 import onnx.numpy_helper
 import pytest
+from click.testing import CliRunner
 
 import torchdof
+from tests.files import store_model
+from torchdof.cli.main import app
 from torchdof.export import describe, verify
 from torchdof.export.verification import _tensors
 
@@ -78,9 +82,7 @@ def with_another_interface(model: onnx.ModelProto, path: Path) -> None:
         (with_another_interface, "the graph must take and give"),
     ],
 )
-def test_a_file_that_is_not_portable_is_refused(
-    plain: Any, model: onnx.ModelProto, change: Any, message: str, tmp_path: Path
-) -> None:
+def test_unportable_is_refused(plain: Any, model: onnx.ModelProto, change: Any, message: str, tmp_path: Path) -> None:
     change(model, tmp_path / "other.onnx")
     with pytest.raises(ValueError, match=message):
         verify(tmp_path / "other.onnx", plain.dof)
@@ -107,3 +109,51 @@ def test_metadata_describe_inputs_camera_table_and_options(plain: Any, model: on
     del model.metadata_props[:]
     with pytest.raises(ValueError, match="not written by torchdof.export"):
         describe(save(model, tmp_path))
+
+
+# Malicious metadata; tests/fuzz changes arbitrary bytes
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["\x1b[2J\x1b]0;title\x07", "line\nbreak\rback", "\u202edrow", "\x00\x08\x7f\x9b", "x" * 20_000],
+    ids=["escape", "lines", "direction", "control", "long"],
+)
+def test_shown_metadata_have_no_control_characters_and_are_short(tmp_path: Path, text: str) -> None:
+    facts = {"torchdof.table": json.dumps({"name": text, text: 1}), f"torchdof.{text}": json.dumps(text)}
+    store_model(tmp_path / "x.onnx", facts)
+    result = CliRunner().invoke(app, ["export", "--show", str(tmp_path / "x.onnx")])
+    assert result.exit_code == 0 and len(result.output) < 3000
+    assert all(line.isprintable() for line in result.output.split("\n"))
+
+
+@pytest.mark.parametrize(
+    ("facts", "message"),
+    [
+        ({f"torchdof.k{i}": "1" for i in range(1000)}, r"torchdof.k\d+ are more than torchdof.export writes"),
+        ({"torchdof.camera": '"' + "x" * 2**20 + '"'}, "torchdof.camera are more than torchdof.export writes"),
+        *(({"torchdof.camera": value}, "torchdof.camera are not JSON")
+          for value in ("[" * 50_000, "9" * 10_000, "__import__('pathlib').Path('ran').touch()")),
+    ],
+)  # fmt: skip
+def test_foreign_metadata_are_not_executed_and_refused_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, facts: dict[str, str], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    store_model(tmp_path / "x.onnx", facts)
+    with pytest.raises(ValueError, match=rf"x\.onnx: its metadata {message}"):
+        describe(tmp_path / "x.onnx")
+    assert [path.name for path in tmp_path.iterdir()] == ["x.onnx"]
+
+
+def test_describe_opens_no_other_file(tmp_path: Path) -> None:
+    for external in ("missing", "/etc/passwd"):
+        store_model(tmp_path / "x.onnx", {}, external)
+        assert describe(tmp_path / "x.onnx") == {"options": {}}
+
+
+def test_a_file_larger_than_memory_is_refused_before_reading(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store_model(tmp_path / "x.onnx", {})
+    monkeypatch.setattr("torchdof.export.metadata.free_bytes", lambda: 100.0)
+    with pytest.raises(ValueError, match=r"x\.onnx takes .* more than there is memory for"):
+        describe(tmp_path / "x.onnx")

@@ -14,9 +14,7 @@ from tests.exported import CAMERA
 from torchdof import BlurTable
 from torchdof.export import chain, describe, to_onnx, verify
 from torchdof.export.graph import Portable
-from torchdof.export.operations import WholeOps
 from torchdof.export.verification import session
-from torchdof.render.matting import matte
 from torchdof.render.plan import Plan
 
 CONTROL = {"Loop", "If", "Scan", "NonZero", "SequenceMap"}
@@ -78,28 +76,3 @@ def test_a_file_can_have_one_size_and_one_channel(tmp_path: Path) -> None:
     assert torch.equal(out[..., 4, 7], image[..., 4, 7])
     options = {**dof.options.arguments(), "plan": Plan.static(1.0, dof.options.tolerance)}
     torch.testing.assert_close(out, torchdof.blur_by_coc(image, coc, **options), atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"layout": "rows"}, "layout must be one of tiles, whole, got 'rows'"),
-        ({"size": (40, 50)}, 'size is for layout="whole"'),
-        ({"layout": "whole", "size": (40, 0)}, r"height and width of a frame in pixels, .* got \(40, 0\)"),
-        ({"layout": "whole", "depth_edges": "auto"}, "cannot repair depth edges"),
-    ],
-)
-def test_what_a_layout_does_not_support_is_refused(change: dict[str, Any], message: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=message):
-        to_onnx(torchdof.DepthOfField(CAMERA, **FEW), tmp_path / "dof.onnx", **change)
-    assert not list(tmp_path.iterdir())
-
-
-def test_matting_of_all_pixels_equals_matting_of_a_list() -> None:
-    generator = torch.Generator().manual_seed(0)
-    image, coc = torch.rand(2, 3, 24, 31, generator=generator), torch.zeros(2, 1, 24, 31)
-    coc[..., 8:16, 9:20] = torch.rand(2, 1, 8, 11, generator=generator) - 6.0
-    valid = (torch.rand(2, 1, 24, 31, generator=generator) > 0.1).float()
-    for given in (None, valid):
-        for listed, everywhere in zip(matte(image, coc, given), matte(image, coc, given, WholeOps()), strict=True):
-            torch.testing.assert_close(everywhere, listed, atol=1e-6, rtol=0)

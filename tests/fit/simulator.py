@@ -12,11 +12,11 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-import OpenImageIO as oiio
 import torch
 from PIL import Image
 from scipy.signal import fftconvolve
 
+from tests.files import store
 from torchdof.fit import FitError, FitWarning
 from torchdof.fit.photo.captures import demosaiced
 from torchdof.io.images import Picture, write_image
@@ -54,9 +54,7 @@ def shape(kind: str, radius: float) -> np.ndarray:
 
 
 def blur(picture: np.ndarray, family: str | np.ndarray, params: dict) -> np.ndarray:
-    """The picture convolved with a kernel `[k, k]`, with that of a family, or with the `shape` "hexagon"."""
-    if isinstance(family, str) and family == "hexagon":
-        family = shape(family, **params)
+    """The picture convolved with a kernel `[k, k]`, or with that of a family."""
     if isinstance(family, str):
         tensors = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in params.items()}
         family = pixel_kernels(family, tensors).numpy()
@@ -75,7 +73,6 @@ class Simulator:
     exposure: float = 1.0  # light of the defocused picture over that of the sharp one
     black: float = 0.0  # level added to both pictures
     offset: float = 0.0  # level added to the defocused picture only (stray light)
-    place: tuple[float, float] = (0.0, 0.0)  # position (x, y) of the dot in both pictures, px from the centre
     shift: tuple[float, float] = (0.0, 0.0)  # displacement (x, y) of the defocused dot, px
     magnification: float = 1.0  # size of the dot in the defocused picture over that in the sharp one
     bits: int | None = None  # bits of the quantization, which also clips to 0..1
@@ -90,9 +87,8 @@ class Simulator:
     def pair(self, family: str | np.ndarray, params: dict, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Sharp and defocused picture `[size, size]` of one dot."""
         rng = np.random.default_rng(seed)
-        there = self.place[0] + self.shift[0], self.place[1] + self.shift[1]
-        sharp = draw_dot(self.size, self.dot_radius, self.place)
-        moved = np.pad(draw_dot(self.size, self.dot_radius * self.magnification, there), self.size)
+        sharp = draw_dot(self.size, self.dot_radius)
+        moved = np.pad(draw_dot(self.size, self.dot_radius * self.magnification, self.shift), self.size)
         if self.edge_sigma:
             sharp, moved = (blur(p, "gaussian", {"sigma": self.edge_sigma}) for p in (sharp, moved))
         if self.misfocus:
@@ -203,16 +199,9 @@ def write_photographs(folder, focus_m, distances, width=800, tone=0.5, noise=0.0
             light = blur(np.pad(light, 40, mode="edge"), "disc", {"radius": radius})[40:-40, 40:-40]
         camera = Simulator(snr_db=-20 * np.log10(noise), bayer=True, tone=tone)
         pixels = np.round(255 * encode_srgb(camera.record(light, np.random.default_rng(i)))).astype(np.uint8)
-        spec = oiio.ImageSpec(width, height, 3, "uint8")
-        spec.attribute("Compression", f"jpeg:{jpeg}")
-        if exif:
-            spec.attribute("Exif:FocalLength", focal_mm)
-            spec.attribute("FNumber", f_number)
-            spec.attribute("Exif:FocalLengthIn35mmFilm", 26)
-        out = oiio.ImageOutput.create(str(folder / f"img_{i:04d}.jpg"))
-        out.open(str(folder / f"img_{i:04d}.jpg"), spec)
-        out.write_image(np.ascontiguousarray(np.repeat(pixels[..., None], 3, 2)))
-        out.close()
+        tags = {"Exif__FocalLength": focal_mm, "FNumber": f_number, "Exif__FocalLengthIn35mmFilm": 26} if exif else {}
+        grey = np.repeat(pixels[..., None], 3, 2)
+        store(folder / f"img_{i:04d}.jpg", grey, "uint8", Compression=f"jpeg:{jpeg}", **tags)
 
 
 def place_of_target(i: int, width: int) -> tuple[float, float]:

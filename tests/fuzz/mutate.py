@@ -12,7 +12,6 @@ __all__ = ["mutated"]
 _WORDS = [b"", b"0", b"-1", b"1", b"nan", b"inf", b"-inf", b"1e308", b"-1e308", b"1e-320", b"9" * 400, b"null", b"true",
           b'"x"', b"[]", b"{}", b"[[1]]", b"\x00", b"\xff\xfe", b"../x", b"/dev/null", b"/"]  # fmt: skip
 _NUMBERS = [0, 1, 127, 128, 255, 256, 32767, 65535, 2**31 - 1, 2**31, 2**32 - 1]
-_FLOATS = [0.0, -0.0, 1e-45, 1e-38, 1.0, 2e9, 2e19, 1e30, 3.4e38, -1.0, -1e30, float("inf"), float("nan"), 0.5, 64.0]
 _PACKED = re.compile(rb'"light": "([A-Za-z0-9+/=]+)"')
 _TOKEN = re.compile(rb'-?\d[\d.eE+-]*|"[^"]*"|[a-z_]+')
 
@@ -26,8 +25,6 @@ def mutated(content: bytes, others: list[bytes], suffix: str, rng: random.Random
             kinds += [_token] * 12
         if suffix == ".json" and _PACKED.search(made):
             kinds += [_packed] * 3
-        if suffix == ".scene":
-            kinds += [_float] * 12
         made = rng.choice(kinds)(made, others, rng)
     if suffix == ".png" and rng.random() < 0.8:
         made = _with_checksums(made)
@@ -63,7 +60,7 @@ def _token(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
     if not tokens:
         return content
     token = rng.choice(tokens)
-    word = rng.choice([*_WORDS, rng.choice(tokens).group(), repr(rng.choice(_FLOATS)).encode()])
+    word = rng.choice([*_WORDS, rng.choice(tokens).group()])
     return content[: token.start()] + word + content[token.end() :]
 
 
@@ -77,14 +74,6 @@ def _packed(content: bytes, others: list[bytes], rng: random.Random) -> bytes:
         return content
     numbers = rng.choice((_bytes, _piece))(numbers, others, rng)
     return content[: found.start(1)] + base64.b64encode(zlib.compress(numbers)) + content[found.end(1) :]
-
-
-def _float(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
-    made = bytearray(content)
-    for _change in range(rng.choice((1, 3, 20))):
-        place = 5 + 4 * rng.randrange(max(1, (len(made) - 5) // 4))
-        made[place : place + 4] = struct.pack("<f", rng.choice(_FLOATS) if rng.random() < 0.6 else rng.gauss(0, 20))
-    return bytes(made)
 
 
 def _with_checksums(content: bytes) -> bytes:

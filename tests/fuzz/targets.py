@@ -1,4 +1,4 @@
-"""Targets of the fuzzer: every reader of files, and rendering and edge repair by both engines, each with valid inputs.
+"""Targets of the fuzzer: every reader of files, with valid inputs.
 
 A target reads a file and may refuse it by an error of ``REFUSED``, one sentence that names the file. Everything else
 is a finding: another exception, a crash, a line on the terminal, a picture that is not finite, too much time or memory.
@@ -8,7 +8,6 @@ import dataclasses
 import functools
 import json
 import os
-import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ import OpenImageIO as oiio
 import torch
 
 from tests.files import spec_with, store_model, store_parts
+from tests.fit.lens.test_zmx import HEAD, SINGLET
 from tests.scenes import lens_with_a_field
 from torchdof import BlurTable, blur_by_coc
 from torchdof.depth import read_depth
@@ -28,7 +28,6 @@ from torchdof.fit.lens.spot import focus_sensor, point_spread
 from torchdof.io.images import Picture, read_image, read_values, write_image
 from torchdof.io.metadata import camera_settings
 from torchdof.optics.aperture import Aperture
-from torchdof.render import edges
 
 REFUSED = (ValueError, OSError, FitError)
 
@@ -129,19 +128,13 @@ def _read_field(path: Path) -> None:
     image = torch.linspace(0, 1, 3 * 12 * 16).reshape(1, 3, 12, 16)
     image[..., 6, 8] = 50.0
     coc = torch.linspace(-3, 4, 16).expand(1, 1, 12, 16)
-    plain, compiled = _by_both_engines(lambda: blur_by_coc(image, coc, table=table, tolerance="preview"))
-    for picture in (plain, compiled):
-        assert torch.isfinite(picture).all(), "read, but the picture is not finite"
-        assert float(picture.max()) <= 60.0 and float(picture.min()) >= -1e-3, "brighter than its light"
-    assert float((plain - compiled).abs().max()) <= 1e-3 * 50.0, "the engines differ"
-
-
-def _by_both_engines(make: Callable[[], torch.Tensor]) -> list[torch.Tensor]:
     pictures = []
     for engine in ("torch", "native"):
         os.environ["TORCHDOF_ENGINE"] = engine
-        pictures.append(make())
-    return pictures
+        pictures.append(blur_by_coc(image, coc, table=table, tolerance="preview"))
+        assert torch.isfinite(pictures[-1]).all(), "read, but the picture is not finite"
+        assert float(pictures[-1].max()) <= 60.0 and float(pictures[-1].min()) >= -1e-3, "brighter than its light"
+    assert float((pictures[0] - pictures[1]).abs().max()) <= 1e-3 * 50.0, "the engines differ"
 
 
 def _manifest_seeds(folder: Path) -> None:
@@ -160,19 +153,8 @@ def _lens_seeds(folder: Path) -> None:
 
 
 def _zmx_seeds(folder: Path) -> None:
-    for name, encoding in (("double_gauss_50mm", "utf-16"), ("telephoto_250mm", "utf-8")):
-        lens = Lens.read(name)
-        text = "MODE SEQ\nNAME A lens\nUNIT MM X W X CM MR CPMM\nSURF 0\n  CURV 0\n  DISZ INFINITY\n"
-        for i, surface in enumerate(lens.surfaces):
-            index = surface.glass.index()
-            text += f"SURF {i + 1}\n  TYPE {'EVENASPH' if i == 1 else 'STANDARD'}\n" + "  STOP\n" * (i == lens.stop)
-            text += f"  CURV {1 / surface.radius:.6g} 0 0\n  DISZ {surface.thickness:.6g}\n"
-            text += f"  DIAM {surface.diameter / 2:.6g} 1 0 0 1\n"
-            text += "  PARM 1 0\n  PARM 2 -1.5e-8\n  CONI -0.1\n" if i == 1 else ""
-            glass = "N-BK7" if i == 1 else "___BLANK"
-            text += f"  GLAS {glass} 1 0 {index:.6g} 50 0\n" if index > 1 else ""
-        text += f"SURF {len(lens.surfaces) + 1}\n  TYPE STANDARD\n  CURV 0\n  DISZ 0\n"
-        (folder / f"{name}.zmx").write_text(text, encoding=encoding)
+    for encoding in ("utf-16", "utf-8"):
+        (folder / f"{encoding}.zmx").write_text(HEAD.format("MM") + SINGLET, encoding=encoding)
 
 
 def _read_lens(path: Path) -> None:
@@ -192,76 +174,6 @@ def _onnx_seeds(folder: Path) -> None:
     store_model(folder / "dof.onnx", {f"torchdof.{key}": json.dumps(value) for key, value in facts.items()})
 
 
-def _scene_seeds(folder: Path) -> None:
-    for seed in range(8):
-        random = np.random.default_rng(seed)
-        head = struct.pack("<5B", *random.integers(0, 256, 5))
-        numbers = random.normal(size=400).astype(np.float32)
-        (folder / f"{seed}.scene").write_bytes(head + numbers.tobytes())
-
-
-def scene_of(content: bytes) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
-    """Image, CoC and options from bytes: five for sizes and options, then float32 for the pixels, repeated."""
-    head = content[:5].ljust(5, b"\0")
-    height, width, channels = 1 + head[0] % 24, 1 + head[1] % 32, 1 + head[2] % 4
-    flags, scale = head[3], (1.0, 30.0, 300.0, 1e-3)[head[4] % 4]
-    numbers = np.frombuffer(content[5 : max(5, 5 + (len(content) - 5) // 4 * 4)], np.float32)
-    maps = np.resize(numbers if len(numbers) else np.ones(1, np.float32), (1, channels + 1, height, width))
-    image, coc = torch.from_numpy(maps).split([channels, 1], dim=1)
-    coc = coc * scale
-    if flags & 16:  # planes instead of noise
-        coc = torch.round(coc / 8) * 8
-    if flags & 32:
-        image = image.abs()
-    occlusion = bool(flags & 1)
-    options = {
-        "occlusion": occlusion,
-        "check": bool(flags & 4),
-        "normalize": occlusion or bool(flags & 8),
-        "tolerance": "preview" if flags & 64 else "final",
-        "table": BlurTable.gaussian() if flags & 128 else BlurTable.disc(),
-    }
-    return image, coc, options
-
-
-def _render(path: Path) -> None:
-    image, coc, options = scene_of(path.read_bytes())
-    try:
-        plain, compiled = _by_both_engines(lambda: blur_by_coc(image, coc, **options))
-    except ValueError as error:
-        assert options["check"] and "finite" in str(error), f"refused: {error}"
-        return
-    good = torch.isfinite(image).all(1, keepdim=True) & torch.isfinite(coc)
-    light = torch.where(good, image, 0.0).abs().amax().double()
-    if not options["normalize"] and light > 1e37:  # without normalization a sum may overflow float32
-        return
-    for name, picture in (("plain", plain), ("compiled", compiled)):
-        assert bool(torch.isfinite(picture[good.expand_as(picture)]).all()), f"{name}: the picture is not finite"
-        largest = torch.where(good, picture, 0.0).abs().amax().double()
-        assert not options["normalize"] or largest <= 1.5 * light, f"{name}: brighter than its light"
-    apart = torch.where(good, plain.double() - compiled.double(), 0.0).abs().amax()
-    assert float(apart) <= 1e-3 * float(light) + 1e-37, f"the engines differ by {float(apart / light):.2g}"
-
-
-def _repair(path: Path) -> None:
-    image, coc, options = scene_of(path.read_bytes())
-    nearness = -coc
-    span = float(torch.where(torch.isfinite(coc), coc, 0.0).abs().amax())
-    step = torch.tensor(span / 8 if options["check"] else 2.0)
-    if options["normalize"]:
-        step = step.expand_as(nearness)
-    repaired = _by_both_engines(lambda: edges.repair(image, nearness, step, options["occlusion"]))
-    known = torch.isfinite(nearness)
-    for name, one in zip(("plain", "compiled"), repaired, strict=True):
-        assert torch.equal(torch.isfinite(one), known), f"{name}: finite where the map is not, or the reverse"
-        assert torch.equal(one.nan_to_num()[~known], nearness.nan_to_num()[~known]), f"{name}: unknown values change"
-        assert float(one[known].abs().amax() if known.any() else 0.0) <= 10.0 * span, f"{name}: far beyond the map"
-    usual = float(image.nan_to_num(0.0, 0.0, 0.0).abs().amax()) < 1e6 and span < 1e6
-    plain, compiled = repaired
-    same = torch.isclose(plain, compiled, rtol=1e-3, atol=1e-3 * span, equal_nan=True).float().mean()
-    assert not usual or float(same) > 0.9, f"the engines agree on {float(same):.2f} of the pixels"
-
-
 def _with_suffix(seeds: Callable[[Path, str], None], suffix: str, *runs: Callable[[Path], object]) -> Target:
     return Target(suffix, lambda folder: seeds(folder, suffix), runs)
 
@@ -277,8 +189,6 @@ TARGETS: dict[str, Target] = {
     "lens": Target(".txt", _lens_seeds, (_read_lens,)),
     "zmx": Target(".zmx", _zmx_seeds, (_read_lens,)),
     "onnx": Target(".onnx", _onnx_seeds, (describe,)),
-    "engines": Target(".scene", _scene_seeds, (_render,), named=False),
-    "repair": Target(".scene", _scene_seeds, (_repair,), named=False),
 }  # fmt: skip
 """The errors of a manifest name the pictures that are missing instead."""
 

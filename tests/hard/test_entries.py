@@ -11,8 +11,9 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from tests.kernels import kernel_of
+from tests.refused import refuses
 from tests.scenes import CAMERA, slope, texture, whole
-from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field
+from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
 from torchdof.augmentation import RandomDepthOfField
 from torchdof.depth import depth_from_values, fill_holes
 from torchdof.io.images import Picture, write_image
@@ -103,9 +104,6 @@ def test_tensors_that_hold_no_numbers_are_refused_by_name(name: str, kind: str) 
         call(make(shape))
 
 
-# Plans
-
-
 def test_a_plan_with_enough_layers_is_unchanged_and_a_short_one_is_extended() -> None:
     plan = DOF.plan(texture(), slope(1.2, 6.0))
     coc = DOF.coc_px(texture(), slope(1.2, 6.0))
@@ -118,47 +116,26 @@ def test_a_plan_with_enough_layers_is_unchanged_and_a_short_one_is_extended() ->
     assert min(gaps) > 0.05 and max(gaps) < 3.0
 
 
-BAD_NODES = [(), (1.0, 0.0), (0.0, 0.0), (math.nan,), (0.0, math.inf), (1e300,), (1.1e9,), 5, [0.0, 1.0], None, "ab"]
-BAD_TOLERANCES = [math.nan, math.inf, -1, 1, "final", "fine", None, True, 10**400]
+partial: Any = functools.partial
+test_a_plan_without_layers_in_order_or_a_tolerance_is_refused = refuses(
+    *((partial(Plan, nodes, 0.1), "plan must hold layers as a tuple of strictly increasing numbers below 1e9 px")
+      for nodes in ((), (1.0, 0.0), (0.0, 0.0), (math.nan,), (0.0, math.inf), (1.1e9,), 5, [0.0], None, "ab")),
+    *((partial(Plan, (0.0, 1.0), tolerance), r"tolerance .*must be a number in \[0, 1\), such as 1/255")
+      for tolerance in (math.nan, math.inf, -1, 1, "final", "fine", None, True, 10**400)),
+)  # fmt: skip
 
 
-@pytest.mark.parametrize(("nodes", "tolerance"), [*((n, 0.1) for n in BAD_NODES), *((None, t) for t in BAD_TOLERANCES)])
-def test_a_plan_without_layers_in_order_or_a_tolerance_is_refused(nodes: Any, tolerance: Any) -> None:
-    message = r"plan must hold layers as a tuple of strictly increasing numbers below 1e9 px"
-    if tolerance != 0.1:
-        nodes, message = (0.0, 1.0), r"tolerance .*must be a number in \[0, 1\), such as 1/255"
-    with pytest.raises(ValueError, match=message):
-        Plan(nodes, tolerance)
-
-
-# Lenses whose blur overflows
-
-
-@pytest.mark.parametrize(
-    ("camera", "depth", "named"),
-    [
+OVERFLOWING, PICTURE, DEPTH = DepthOfField(Camera(f_number=1e-42)), texture(), whole(3.0)
+test_an_infinite_blur_radius_is_refused_with_lens_and_depth = refuses(
+    *((partial(DepthOfField(camera), PICTURE, whole(depth)), f"this lens .*{named}") for camera, depth, named in (
         (Camera(f_number=1e-42), 3.0, "f_number 1e-42"),
         (Camera(sensor_width_mm=1e-300), 3.0, "sensor_width_mm 1e-300"),
         (Camera(focal_length_mm=1e200, focus_m=1e250), 3.0, r"focal_length_mm 1e\+200"),
         (Camera(focus_m=1e-45, focus_breathing=False), 3.0, "focus_m 1e-45"),
         (Camera(focus_m=torch.tensor([1e-45]), focus_breathing=False), 3.0, "focus_m 1.4013e-45"),
-        (Camera(), 1e-45, "which starts at 1.4e-45 m"),
-    ],
-)
-def test_an_infinite_blur_radius_is_refused_with_the_lens_and_the_depth(
-    camera: Camera, depth: float, named: str
-) -> None:
-    image, depths, dof = texture(), whole(depth), DepthOfField(camera)
-    calls: list[Callable[[], Any]] = [
-        functools.partial(dof, image, depths),
-        functools.partial(dof.plan, image, depths),
-        functools.partial(dof.coc_px, image, depths),
-        functools.partial(depth_of_field, image, depths, camera),
-        functools.partial(dof.layers, torch.ones(1, 2, 4, 24, 32), torch.tensor([depth, 5.0])),
-        functools.partial(dof, image, torch.full_like(depths, 1e-30 if depth > 1 else depth), background=image,
-                          background_depth=depths),
-    ]  # fmt: skip
-    for call in calls:
-        with pytest.raises(ValueError, match=f"this lens .*{named}") as caught:
-            call()
-        assert "coc_px" not in str(caught.value) and "check=False" not in str(caught.value)
+        (Camera(), 1e-45, "which starts at 1.4e-45 m"))),
+    (partial(OVERFLOWING.plan, PICTURE, DEPTH), "this lens .*f_number 1e-42"),
+    (partial(OVERFLOWING.coc_px, PICTURE, DEPTH), "this lens .*f_number 1e-42"),
+    (partial(OVERFLOWING.layers, torch.ones(1, 2, 4, 24, 32), torch.tensor([3.0, 5.0])), "this lens .*f_number 1e-42"),
+    (partial(DOF, PICTURE, DEPTH, background=PICTURE, background_depth=whole(1e-45)), "which starts at 1.4e-45 m"),
+)  # fmt: skip

@@ -1,4 +1,4 @@
-"""Many renderings in one process: memory does not grow; threads and worker processes render the same pictures."""
+"""Many renderings in one process: memory does not grow, and forked workers render."""
 
 import sys
 from pathlib import Path

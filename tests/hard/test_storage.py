@@ -5,7 +5,6 @@ import torch
 
 from tests.processes import output_of
 from torchdof import Camera, DepthOfField, blur_by_coc
-from torchdof.tensors import has_storage
 
 DOF = DepthOfField(Camera(focus_m=2.0), check=False)
 
@@ -38,11 +37,6 @@ with contextlib.suppress(Exception), FakeTensorMode(allow_non_fake_inputs=True):
 
 def test_a_default_device_changes_nothing_of_pictures_on_another_and_a_fake_mode_does_not_crash(engine: str) -> None:
     assert output_of(ELSEWHERE) == "True\n"
-
-
-def test_views_and_empty_tensors_have_storage() -> None:
-    values = torch.ones(4, 5, 6)
-    assert all(map(has_storage, (values[2:, ::2], values.permute(2, 0, 1), values[:1].expand(9, 5, 6), values[:0])))
 
 
 def test_a_negated_view_renders_as_its_values(engine: str) -> None:

@@ -4,10 +4,8 @@ tests/fuzz changes arbitrary bytes of files.
 """
 
 import os
-import re
 import shutil
 import struct
-import sys
 import time
 import zipfile
 import zlib
@@ -21,7 +19,6 @@ import pytest
 import torch
 
 from tests.files import spec_with, store, store_parts
-from tests.processes import output_of
 from torchdof import BlurTable
 from torchdof.io import decode, optional_formats
 from torchdof.io.decode import MAX_ATTRIBUTES
@@ -103,6 +100,27 @@ def holed() -> np.ndarray:
     return values
 
 
+def chunk(name: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+
+def png(side: int, pixels: bytes) -> bytes:
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+
+
+def huge_exr(path: Path) -> None:
+    write_image(path, tiny())
+    content = bytearray(path.read_bytes())
+    for name in (b"dataWindow\0box2i\0", b"displayWindow\0box2i\0"):
+        start = content.index(name) + len(name) + 4
+        content[start : start + 16] = struct.pack("<iiii", 0, 0, 1_000_000, 1_000_000)
+    path.write_bytes(content)
+
+
+SHAPE = "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000, 1000000), }".ljust(117).encode() + b"\n"
+NPY = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(SHAPE)) + SHAPE
+HDR = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 900000 +X 900000\n" + bytes(100)
 GREY, COLOUR, TEXT = np.ones((2, 3, 1), np.float32), np.ones((2, 3, 3), np.float32), b"hello world, this is no image\n"
 NOT_RGB = r"colours are not stored as RGB or grey \(photometric interpretation"
 
@@ -112,13 +130,16 @@ FILES: list[tuple[str, Made | None, str | None, str | None]] = [
     ("none.npy", None, "is not an image that can be read", "there is no such file"),
     ("empty.png", with_bytes(b""), "the file is empty", "the file is empty"),
     ("folder.png", Path.mkdir, "is not a file", "is not a file"),
-    ("text.exr", with_bytes(TEXT), "cannot be read", "cannot be read"),
     ("text.png", with_bytes(TEXT), "cannot be read", "cannot be read"),
     ("text.pfm", with_bytes(b"hello\n"), "is not a PFM file", "is not a PFM file"),
     ("header.pfm", with_bytes(b"PF\n3 2\n"), "is not a PFM file", None),
     ("short.pfm", with_bytes(b"PF\n3 2\n-1\n12345"), "is cut short", None),
     ("huge.pfm", with_bytes(b"PF\n999999 999999\n-1\n12345"), "claims 999999 x 999999 pixels", None),
     ("negative.pfm", with_bytes(b"PF\n-3 2\n-1\n12345"), "claims -3 x 2 pixels", None),
+    ("huge.png", with_bytes(png(200_000, zlib.compress(b"0" * 100))), "exceeds the .* limit", "exceeds the .* limit"),
+    ("huge.exr", huge_exr, "exceeds the .* limit", "exceeds the .* limit"),
+    ("huge.hdr", with_bytes(HDR), "resolution may not exceed", "resolution may not exceed"),
+    ("huge.npy", with_bytes(NPY), None, "cannot be read as an array"),
     ("picture.gif", with_bytes(b"GIF89a"), "is not an image that can be read", "is not a depth map"),
     ("picture", with_bytes(b"x"), "no suffix is not an image", "no suffix is not a depth map"),
     *((f"loop{suffix}", loop, None, "there is no such file") for suffix in (".png", ".npy", ".npz")),
@@ -132,17 +153,13 @@ FILES: list[tuple[str, Made | None, str | None, str | None]] = [
         for c in "RGB"
     ),
     ("lab.tif", with_values(COLOUR, kind="uint8", tags={262: 8}), f"{NOT_RGB} 8", f"{NOT_RGB} 8"),
-    ("lab16.tif", with_values(COLOUR, kind="uint16", tags={262: 8}), f"{NOT_RGB} 8", f"{NOT_RGB} 8"),
-    ("inks.tif", with_values(COLOUR, kind="uint8", tags={262: 5}), f"{NOT_RGB} 5", f"{NOT_RGB} 5"),
     ("mosaic.tif", with_values(GREY, kind="uint16", tags={262: 32803}), f"{NOT_RGB} 32803", f"{NOT_RGB} 32803"),
     ("negative.tif", with_values(GREY, kind="uint16", tags={262: 0}), f"{NOT_RGB} 0", f"{NOT_RGB} 0"),
     ("signed.tif", with_values(GREY, kind="int16"), "numbers of type int16, for which white is not defined", None),
     ("colour.png", with_values(np.eye(3, dtype=np.float32)[None], kind="uint8"), None, "colours of a heat map"),
-    ("object.npy", with_array(np.array([[{"a": 1}]], object)), None, "cannot be read as an array"),
     ("bomb.npy", with_array(np.array([[Bomb()]], object)), None, "cannot be read as an array"),
     ("bomb.npz", with_array(np.array([[Bomb()]], object)), None, "cannot be read as an array"),
     ("text.npy", with_array(np.array([["a"]])), None, r"expected an array \[H, W\] of numbers"),
-    ("vector.npy", with_array(np.zeros(5)), None, r"expected an array \[H, W\] of numbers"),
     ("complex.npy", with_array(np.zeros((2, 2), complex)), None, r"expected an array \[H, W\] of numbers"),
     ("zero.npy", with_array(np.zeros((0, 4))), None, r"expected an array \[H, W\] of numbers"),
     ("cut.npy", with_array(np.zeros((50, 50)), cut=500), None, "cannot be read as an array"),
@@ -231,49 +248,17 @@ def test_a_truncated_file_is_refused(tmp_path: Path, suffix: str, sample: Any, s
     assert decode.is_complete(tmp_path / f"whole{suffix}") and not decode.is_complete(tmp_path / f"cut{suffix}")
 
 
-def with_attributes(path: Path, count: int) -> None:
-    """Writes an EXR with ``count`` more attributes in its header."""
-    write_image(path, tiny())
-    content, end = path.read_bytes(), 8
-    while content[end]:
-        name_end = content.index(b"\0", end)
-        type_end = content.index(b"\0", name_end + 1)
-        end = type_end + 5 + int.from_bytes(content[type_end + 1 : type_end + 5], "little")
-    more = b"".join(b"a%d\0int\0" % i + struct.pack("<Ii", 4, i) for i in range(count))
-    (pixels_at,) = struct.unpack("<Q", content[end + 1 : end + 9])  # offset of the only block of lines
-    path.write_bytes(content[:end] + more + b"\0" + struct.pack("<Q", pixels_at + len(more)) + content[end + 9 :])
-
-
 def test_attributes_are_kept_and_too_many_are_refused_at_once(tmp_path: Path) -> None:
-    with_attributes(tmp_path / "some.exr", 500)
-    assert read_image(tmp_path / "some.exr").metadata["a499"][1] == 499
-    for count in (MAX_ATTRIBUTES, 100_000):
-        with_attributes(tmp_path / "x.exr", count)
+    for count in (500, MAX_ATTRIBUTES):
+        attributes: dict[str, Any] = {f"a{n}": n for n in range(count)}
+        path = store(tmp_path / f"{count}.exr", COLOUR, "half", **attributes)
+        if count == 500:
+            assert read_image(path).metadata["a499"][1] == 499
+            continue
         start = time.perf_counter()
-        with pytest.raises(ValueError, match=rf"x\.exr: its headers hold more than {MAX_ATTRIBUTES} attributes"):
-            read_image(tmp_path / "x.exr")
-        assert time.perf_counter() - start < 2.0  # OpenEXR takes minutes
-
-
-# Sizes
-
-
-def chunk(name: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-
-
-def png(side: int, pixels: bytes) -> bytes:
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
-
-
-def huge_exr(path: Path) -> None:
-    write_image(path, tiny())
-    content = bytearray(path.read_bytes())
-    for name in (b"dataWindow\0box2i\0", b"displayWindow\0box2i\0"):
-        start = content.index(name) + len(name) + 4
-        content[start : start + 16] = struct.pack("<iiii", 0, 0, 1_000_000, 1_000_000)
-    path.write_bytes(content)
+        with pytest.raises(ValueError, match=rf"exr: its headers hold more than {MAX_ATTRIBUTES} attributes"):
+            read_image(path)
+        assert time.perf_counter() - start < 2.0  # OpenEXR takes minutes for many
 
 
 def test_each_part_is_held_against_the_memory_that_the_others_leave(
@@ -289,59 +274,19 @@ def test_each_part_is_held_against_the_memory_that_the_others_leave(
         read_image(tmp_path / "x.exr")
 
 
-NPY = "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000, 1000000), }".ljust(117).encode() + b"\n"
-HUGE: dict[str, Made] = {
-    "huge.png": with_bytes(png(200_000, zlib.compress(b"0" * 100))),
-    "huge.exr": huge_exr,
-    "huge.hdr": with_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 900000 +X 900000\n" + bytes(100)),
-    "huge.npy": with_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(NPY)) + NPY),
-}
-READ = """
-import resource, sys
-import OpenImageIO
-from torchdof.bench import memory
-from torchdof.io import decode
-from torchdof.io.images import read_image, read_values
-from torchdof.io.memory import free_bytes
-def limit(megabytes):
-    pages = int(open("/proc/self/statm").read().split()[0])
-    space = pages * resource.getpagesize() + (megabytes << 20)
-    resource.setrlimit(resource.RLIMIT_AS, (space, resource.RLIM_INFINITY))
-def read(name):
-    for reader in (read_values, read_image)[: 1 if name[-4:] in (".npy", ".npz") else 2]:
-        try:
-            reader(name)
-            print(name, "read")
-        except (ValueError, OSError) as error:
-            print(name, "refused:", error)
-"""
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="limits memory")
-def test_huge_sizes_in_a_header_are_refused_without_the_memory(tmp_path: Path) -> None:
-    for name, make in HUGE.items():
-        make(tmp_path / name)
-    code = "limit(6000)\nfor name in sys.argv[1:]:\n    read(name)\nprint(memory.peak_mb())"
-    *lines, megabytes = output_of(READ + code, *HUGE, cwd=tmp_path).splitlines()
-    assert len(lines) == 7 and all(re.match(r"(huge\.\w+) refused: .*\1", line) for line in lines), lines
-    assert float(megabytes) < 1500
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="limits memory")
-def test_a_picture_that_does_not_fit_into_memory_is_refused(tmp_path: Path) -> None:
-    """The memory that is free is known, and then unknown."""
-    side = 4096
-    zeros = np.zeros((side, side), np.float32)
-    np.save(tmp_path / "x.npy", zeros)
-    np.savez_compressed(tmp_path / "x.npz", depth=zeros)
-    for name in ("x.exr", "x.tif", "x.pfm"):
-        write_image(tmp_path / name, Picture(torch.zeros(1, 1, side, side), channels=("Y",)), sample="float")
-    (tmp_path / "x.png").write_bytes(png(side, zlib.compress(bytes(side * (3 * side + 1)))))
-    names = sorted(path.name for path in tmp_path.iterdir())
-    each = "limit(24)\nfor name in sys.argv[1:]:\n    read(name)\n"
-    code = f"{each}decode.free_bytes = lambda: float('inf')\n{each}"
-    lines = output_of(READ + code, *names, cwd=tmp_path).splitlines()
-    assert len(lines) == 20
-    why = "GiB of memory are free|than there is memory for|allocate"
-    for half, words in ((lines[:10], why), (lines[10:], f"{why}|does not fit into memory")):
-        assert all(re.match(rf"(x\.\w+) refused: \1: .*({words})", line) for line in half), half
+def test_a_picture_that_does_not_fit_into_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for suffix, sample in KINDS.items():
+        write_image(tmp_path / f"x{suffix}", tiny(), sample=sample)  # type: ignore[arg-type]
+    np.save(tmp_path / "x.npy", np.zeros((40, 40)))
+    np.savez_compressed(tmp_path / "x.npz", depth=np.zeros((40, 40)))
+    files = [(path, read) for path in tmp_path.iterdir() for read in (read_image, read_values)]
+    with monkeypatch.context() as patch:
+        patch.setattr(decode, "free_bytes", lambda: 1e2)
+        for path, read in files:
+            if read is read_values or path.suffix in KINDS:
+                with pytest.raises((ValueError, OSError), match=rf"{path.name}: .*(GiB of memory are free|memory for)"):
+                    read(path)
+    # where the memory that is free is unknown
+    monkeypatch.setattr(oiio.ImageInput, "read_image", lambda *_: torch.empty(2**50))
+    with pytest.raises(OSError, match=r"x\.exr: does not fit into memory"):
+        read_image(tmp_path / "x.exr")

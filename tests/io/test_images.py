@@ -98,9 +98,7 @@ FLOATS = [(".tif", "float"), (".tif", "double"), (".exr", "half")]  # although t
     ("suffix", "sample", "light"),
     [(".png", "uint8", GREY), (".tif", "uint16", GREY), (".jpg", "uint8", GREY), *((*kind, 0.5) for kind in FLOATS)],
 )
-def test_integers_are_srgb_and_floats_are_linear_unless_stated(
-    tmp_path: Path, suffix: str, sample: str, light: float
-) -> None:
+def test_integers_are_srgb_and_floats_linear_by_default(tmp_path: Path, suffix: str, sample: str, light: float) -> None:
     path = store(tmp_path / f"x{suffix}", np.full((2, 2, 3), 0.5, np.float32), sample, FNumber=2.0)
     assert suffix != ".tif" or spec_of(path).get_string_attribute("oiio:ColorSpace").lower().startswith("srgb")
     for transfer, expected in ((None, light), ("linear", 0.5), ("srgb", GREY)):

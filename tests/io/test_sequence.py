@@ -1,8 +1,9 @@
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 
+from tests.refused import refuses
 from torchdof.io.sequence import FramePattern, focus_at_frame, parse_focus, parse_frames
 
 
@@ -21,12 +22,6 @@ def test_pattern_names_frames(pattern: str, frame: int, name: str) -> None:
     assert FramePattern(pattern).name(frame) == Path(name)
 
 
-@pytest.mark.parametrize("pattern", ["a.exr", "a.##.##.exr", "shot.##/a.exr"])
-def test_a_pattern_without_exactly_one_placeholder_is_refused(pattern: str) -> None:
-    with pytest.raises(ValueError, match="expected one place for the frame number"):
-        FramePattern(pattern)
-
-
 def test_frames_are_found_in_order_and_only_with_their_padding(tmp_path: Path) -> None:
     for name in ("a.0010.exr", "a.0002.exr", "a.10000.exr", "a.3.exr", "b.0001.exr", "a.0004.exr.part"):
         (tmp_path / name).touch()
@@ -43,14 +38,13 @@ def test_frame_ranges_are_read(text: str, expected: tuple[int, int]) -> None:
     assert parse_frames(text) == expected
 
 
-FOCUS = ["", "near", "0", "-1", "nan", "1:2,", "1:2,1:3", "1:2,3", "2,3", "1:0", "x:2", "1.5:2", "1:2:3"]
-FRAMES = ["", "a", "1-", "5-1", "1,2", "1.5"]
-
-
-@pytest.mark.parametrize(("read", "text"), [*((parse_focus, t) for t in FOCUS), *((parse_frames, t) for t in FRAMES)])
-def test_invalid_ranges_and_keyframes_are_refused(read: Callable[[str], object], text: str) -> None:
-    with pytest.raises(ValueError):
-        read(text)
+test_invalid_patterns_ranges_and_keyframes_are_refused = refuses(
+    *((partial(FramePattern, text), "expected one place for the frame number")
+      for text in ("a.exr", "a.##.##.exr", "shot.##/a.exr")),
+    *((partial(parse_frames, text), "--frames") for text in ("", "a", "1-", "5-1", "1,2", "1.5")),
+    *((partial(parse_focus, text), r"--focus-m expects metres \(2.0\) or keyframes")
+      for text in ("", "near", "0", "-1", "nan", "1:2,", "1:2,1:3", "1:2,3", "2,3", "1:0", "x:2", "1.5:2", "1:2:3")),
+)  # fmt: skip
 
 
 def test_focus_is_linear_in_dioptres_between_keyframes_and_constant_outside() -> None:

@@ -1,4 +1,4 @@
-"""The compiled engine in a process: threads, interrupts, instruction sets; and its convolution."""
+"""The compiled engine in a process: threads, interrupts, instruction sets; and its choice."""
 
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -8,7 +8,7 @@ import torch
 
 from tests.processes import output_of
 from tests.scenes import Scene, assert_same_picture, made
-from torchdof import native
+from torchdof import blur_by_coc, native
 
 
 @pytest.fixture(autouse=True)
@@ -87,7 +87,7 @@ def test_ctrl_c_ends_a_long_rendering() -> None:
 INTERRUPTED_TWICE = """
 import ctypes, os, signal, threading, time
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from torchdof import native
+from torchdof import blur_by_coc, native
 cancelled, ended = ctypes.c_int32(0), []
 def engine():
     while not cancelled.value:
@@ -109,16 +109,27 @@ def test_ctrl_c_is_raised_after_the_engine_has_stopped() -> None:
     assert output_of(INTERRUPTED_TWICE, flags=["-I"]) == "after the engine\n"
 
 
-@pytest.mark.parametrize("half", [0, 1, 2, 3, 7, 8, 10, 20, 64])
-@pytest.mark.parametrize(("height", "width"), [(1, 1), (5, 6), (16, 16), (19, 37)])
-def test_convolution_scatters_an_asymmetric_kernel(height: int, width: int, half: int) -> None:
-    light, kernel = torch.rand(height, width), torch.rand(2 * half + 1, 2 * half + 1)
-    wanted = torch.zeros(height + 2 * half, width + 2 * half, dtype=torch.float64)
-    for row in range(height):
-        for column in range(width):
-            wanted[row : row + 2 * half + 1, column : column + 2 * half + 1] += light[row, column] * kernel
-    wanted = wanted[half : half + height, half : half + width].float()
-    out = torch.empty_like(light)
-    arguments = (light.data_ptr(), height, width, kernel.data_ptr(), half, out.data_ptr())
-    native._engine().torchdof_convolve(*arguments)
-    torch.testing.assert_close(out, wanted, rtol=1e-5, atol=1e-6)
+# Choice of the engine by ``TORCHDOF_ENGINE``
+
+
+def test_an_engine_of_another_version_is_not_used_and_gives_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("TORCHDOF_ENGINE", raising=False)
+    monkeypatch.setattr(native, "_REVISION", -1)
+    native._library.cache_clear()
+    try:
+        with pytest.warns(RuntimeWarning, match="of another version of torchdof, and is not used: install"):
+            assert not native.chosen()
+        assert native.describe() == "torch (the compiled engine is of another version of torchdof)"
+        monkeypatch.setenv("TORCHDOF_ENGINE", "native")
+        with pytest.raises(ValueError, match="is native, but the compiled engine is of another version"):
+            native.chosen()
+    finally:
+        native._library.cache_clear()
+
+
+def test_an_unknown_engine_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCHDOF_ENGINE", "numpy")
+    with pytest.raises(ValueError, match="must be auto, native or torch, got 'numpy'"):
+        native.describe()
+    with pytest.raises(ValueError, match="must be auto, native or torch, got 'numpy'"):
+        blur_by_coc(torch.rand(1, 3, 3, 4), torch.full((1, 1, 3, 4), 3.0))

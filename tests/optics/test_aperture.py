@@ -1,6 +1,5 @@
-import json
+import functools
 import math
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -61,9 +60,7 @@ def test_areas_of_polygons_are_exact(blades: int, curvature: float) -> None:
 
 @pytest.mark.parametrize("coc_px", [-43.4, 36.0])
 @pytest.mark.parametrize("table", [BlurTable.polygon(5, 11.0), BlurTable.polygon(3, 20.0, squeeze=1.6), LOPSIDED[2]])
-def test_a_point_of_light_shows_the_aperture_upright_behind_focus_and_reflected_in_front(
-    table: BlurTable, coc_px: float
-) -> None:
+def test_a_point_of_light_shows_the_opening_upright_or_turned_before_focus(table: BlurTable, coc_px: float) -> None:
     picture = point_of_light(coc_px, table)
     opening = table.aperture
     assert opening is not None
@@ -124,14 +121,6 @@ def test_kernels_with_an_opening_are_non_negative_and_sum_to_one(table: BlurTabl
             assert_close(kernels.sum((-2, -1)), torch.ones(2, 1, dtype=torch.float64), rtol=0, atol=1e-12)
 
 
-def test_the_middle_of_a_large_kernel_with_an_opening_has_its_share_of_the_light() -> None:
-    table = BlurTable.polygon(6, rim=1.0)
-    whole = table.kernels(torch.tensor([255.0]), 1000)[0, 0]
-    middle = table.kernels(torch.tensor([260.0]), 1000, window=101)[0, 0]
-    share = whole[205:306, 205:306].sum() * (255.0 / 260.0) ** 2
-    assert_close(middle.sum(), share, rtol=3e-3, atol=0)
-
-
 def test_kernels_differentiate_in_rotation_squeeze_and_coc() -> None:
     def kernels(rotation: Tensor, squeeze: Tensor, coc: Tensor) -> Tensor:
         return BlurTable.polygon(5, rotation, 0.3, squeeze=squeeze).kernels(coc, 100, size=7)
@@ -143,22 +132,12 @@ def test_kernels_differentiate_in_rotation_squeeze_and_coc() -> None:
         assert torch.autograd.gradcheck(kernels, (*given, places), atol=1e-6, fast_mode=True)
 
 
-def test_a_table_with_an_aperture_survives_save_and_load(tmp_path: Path) -> None:
-    for table in LOPSIDED:
-        table.save(tmp_path / "lens.json")
-        loaded = BlurTable.load(tmp_path / "lens.json")
-        assert loaded.fingerprint() == table.fingerprint() != table.with_aperture(None).fingerprint()
-        assert loaded.aperture is not None and table.aperture is not None
-        assert loaded.aperture.rims == table.aperture.rims
-        coc = torch.tensor([-6.0, 6.0])
-        assert_close(loaded.kernels(coc, 900), table.kernels(coc, 900), rtol=0, atol=0)
-    written = json.loads((tmp_path / "lens.json").read_text())
-    assert written["version"] == 3 and written["aperture"]["blades"] == 7
-
-
+partial: Any = functools.partial
 test_an_invalid_opening_is_refused_by_name = refuses(
     (lambda: BlurTable.polygon(2), "blades must be a whole number from 3 to 64, got 2"),
     (lambda: BlurTable.polygon(5, torch.zeros(2)), "rotation_deg must be a number"),
+    *((partial(Aperture, **{"blades": 5, name: 10**400}), name)
+      for name in ("blades", "rotation_deg", "curvature", "squeeze", "vignetting")),
     (lambda: Aperture(curvature=0.5), "curvature is that of blades"),
     (lambda: Aperture(blades=5, mask=torch.ones(3, 3)), "blades or a mask, got 5"),
     (lambda: BlurTable.from_aperture(torch.zeros(4, 4)), "not all of them 0"),
@@ -167,7 +146,7 @@ test_an_invalid_opening_is_refused_by_name = refuses(
     (lambda: BlurTable("disc", [1.0], {"radius": [1.0]}, **SEVEN), "aperture must be of type Aperture, got 7"),
     (lambda: Aperture.from_dict({"leaves": 7}), "aperture must have the fields .*; 'leaves' is not one"),
     (lambda: Aperture.from_dict({"mask": [[1.0], [2.0, 3.0]]}), "mask must be numbers"),
-)
+)  # fmt: skip
 
 
 def test_an_opening_that_passes_no_light_is_refused() -> None:

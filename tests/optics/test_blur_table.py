@@ -59,12 +59,8 @@ IN_MM = BlurTable("disc", [0.1, 0.2], {"radius": [0.1, 0.3]}, unit="mm", sensor_
         (IN_FOCUS, 100, [0, 5, 10, -5], {"sigma": [1, 3, 5, 3]}),
         (BlurTable("disc", [1.0], {"radius": [1.2]}), 100, [-3, 3], {"radius": [3.6, 3.6]}),
         (BlurTable("disc", [-1.0], {"radius": [1.2]}), 100, [-3, 3], {"radius": [3.6, 3.6]}),
-        (
-            TILTED,
-            100,
-            [-6, 6, 500],
-            {"radius": [6, 6.6, 550], "sigma": [0.6, 1.2, 100], "b": [-0.5, 2, 2], "m": [2, 4, 4]},
-        ),
+        (TILTED, 100, [-6, 6, 500], {"radius": [6, 6.6, 550], "sigma": [0.6, 1.2, 100], "b": [-0.5, 2, 2]}),
+        (TILTED, 100, [-6, 6, 500], {"m": [2, 4, 4]}),
         (WIDENING, 1000, [15], {"radius": [20]}),
         (WIDENING, 2000, [30], {"radius": [40]}),
         (IN_MM, 2400, [15], {"radius": [20]}),
@@ -164,6 +160,8 @@ ROUND_TRIPS = [
     BlurTable.from_dict(example()),
     BlurTable("disc", [1.0], {"radius": [[1.0], [1.1], [1.2]]}),
     BlurTable("radial", [0.1, 0.2], {"values": [[[1.0, 0.3]] * 2] * 3, "radius": [0.1, 0.2]}, unit="fraction"),
+    BlurTable.polygon(5, 7.0, 0.4, rim=2.0, squeeze=1.6, vignetting=(0.3, 0.1)),
+    BlurTable.from_aperture(torch.eye(9).cumsum(0)[:, :6], squeeze=0.8),
 ]
 
 
@@ -175,11 +173,20 @@ def test_a_table_survives_save_and_load(table: BlurTable, tmp_path: Path) -> Non
     assert json.loads(path.read_text())["name"] == table.name and repr(table.name or "unnamed") in repr(table)
     back = BlurTable.load(path)
     assert back.to_dict() == table.to_dict() and repr(back) == repr(table)
+    assert back.fingerprint() == table.fingerprint()
+    assert table.aperture is None or table.with_aperture(None).fingerprint() != table.fingerprint()
     coc = torch.tensor([-30.0, -0.7, 0.0, 12.0])
     assert_close(back.kernels(coc, 64, size=15), table.kernels(coc, 64, size=15), rtol=0.0, atol=0.0)
 
 
 NOT_FINITE = [1.0, math.nan, 2.0]
+SOFT = {"radius": [0.01], "sigma": [0.003], "b": [1.0]}
+
+
+def bare(family: str, coc: list[float], params: dict[str, Any]) -> dict[str, Any]:
+    """Changes of a whole table that leave these fields alone."""
+    others = dict.fromkeys(("sensor_width_mm", "strength", "residual"))
+    return {"family": family, "unit": "fraction", "coc": coc, "params": params, **others}
 
 
 @pytest.mark.parametrize(
@@ -194,20 +201,47 @@ NOT_FINITE = [1.0, math.nan, 2.0]
         ({"params": {"sigma": [1.0, 2.0, 3.0]}}, "ring takes the parameters sigma, r_c, got sigma"),
         ({"params": {"sigma": [1.0, 2.0, 3.0], "r_c": [1.0]}}, r"params.r_c must be \[N\] .* N = 3, got \[1, 1\]"),
         ({"params": {"sigma": NOT_FINITE, "r_c": [0.0] * 3}}, "sigma must be finite numbers"),
-        (
-            {"params": {"sigma": [1.0] * 3, "r_c": [0.0, -0.1, 0.0]}},
-            r"r_c of ring must be finite and >= 0, got \[0, -0.1, 0\]",
-        ),
-        (
-            {"params": {"sigma": [[1.0] * 3] * 3, "r_c": [[1.0] * 3] * 2}},
-            "parameters of ring must broadcast against each other",
-        ),
+        ({"params": {"sigma": [1.0] * 3, "r_c": [0.0, -0.1, 0.0]}}, r"r_c of ring must be finite and >= 0, got \[0, -"),
+        ({"params": {"sigma": [[1.0] * 3] * 3, "r_c": [[1.0] * 3] * 2}}, "parameters of ring must broadcast against e"),
         ({"coc": [0.1, -0.1, 0.3]}, "coc must be 1 to 4096 strictly increasing"),
         ({"coc": [0.0]}, "coc must have a node that is not 0"),
         ({"sensor_width_mm": None}, "sensor_width_mm"),
         ({"sensor_width_mm": 0.0}, "sensor_width_mm must be a number of millimetres > 1e-06"),
         ({"unit": "relative", "sensor_width_mm": None}, "unit 'relative' takes one node on each side"),
         ({"strength": [1.0]}, r"strength must hold one number a node \(3\), got shape \[1\]"),
+        (bare("radial", [0.01], {"values": [[1.0]], "radius": [0.01]}), r".*values must be \[..., P\] with P >= 2"),
+        (
+            bare("radial", [0.01], {"values": [[0.0, 0.0]], "radius": [0.01]}),
+            ".*params.values must not all be 0 at a node",
+        ),
+        (
+            bare("softm", [0.01], {**SOFT, "b": [-2.0], "m": [2.0]}),
+            r".*b of softm must be finite and >= -1, got \[-2\]",
+        ),
+        (bare("radial", [1.0], {"values": [[1.0, 1e308, 1.0]], "radius": [1.0]}), "params.values must"),
+        (bare("radial", [1.0], {"values": [[0.0, 5e-324, 0.0]], "radius": [1.0]}), "params.values must"),
+        (bare("softm", [1.0], {"radius": [1.0], "sigma": [0.1], "b": [1e308], "m": [4.0]}), "params.b must"),
+        (bare("softm", [0.01], {**SOFT, "m": [1000.0]}), "params.m must be <= 100, got 1000"),
+        (
+            bare("gaussian", [0.01], {"sigma": [1e9]}),
+            ".*params must be lengths in the unit of coc, got a blur that reaches",
+        ),
+        (
+            bare("disc", [-0.01, 1e-320], {"radius": [0.01, 0.02]}),
+            ".*coc must reach somewhere from 1e-09 to .* got 9.9",
+        ),
+        (
+            bare("disc", [-0.01, 1e-7], {"radius": [0.01, 0.02]}),
+            ".*params must be lengths .* to 0.02 where coc is 1e-07",
+        ),
+        (
+            bare("disc", [*range(1, 4098)], {"radius": [1.0] * 4097}),
+            r".*coc must be 1 to 4096 strictly .* of shape \[4097\]",
+        ),
+        (
+            bare("disc", [1e90], {"radius": [1e90]}),
+            r".*coc must reach somewhere from 1e-09 to 1e\+06 \(fraction\), got 1e",
+        ),
     ],
 )
 def test_a_bad_field_is_refused_by_name(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
@@ -223,13 +257,10 @@ def test_a_bad_field_is_refused_by_name(changes: dict[str, Any], message: str, t
 @pytest.mark.parametrize(
     "content",
     [
-        "",
         "[1, 2]",
-        "1e999",
         json.dumps(example()).replace("0.12", "1e999"),
         json.dumps(example(version=10**400)),
         "[" * 100_000,
-        "\x00\xff",
     ],
 )
 def test_a_file_that_is_not_a_table_is_refused_with_its_name(content: str, tmp_path: Path) -> None:
@@ -242,40 +273,6 @@ def test_a_file_that_is_not_a_table_is_refused_with_its_name(content: str, tmp_p
 def test_an_unknown_name_lists_the_shipped_tables() -> None:
     with pytest.raises(FileNotFoundError, match=r"no blur table 'sato': .*sato_j15"):
         BlurTable.load("sato")
-
-
-SOFT = {"radius": [0.01], "sigma": [0.003], "b": [1.0]}
-
-
-@pytest.mark.parametrize(
-    ("family", "coc", "params", "message"),
-    [
-        ("radial", [0.01], {"values": [[1.0]], "radius": [0.01]}, r"values must be \[..., P\] with P >= 2"),
-        ("radial", [0.01], {"values": [[0.0, 0.0]], "radius": [0.01]}, "params.values must not all be 0 at a node"),
-        ("softm", [0.01], {**SOFT, "b": [-2.0], "m": [2.0]}, r"b of softm must be finite and >= -1, got \[-2\]"),
-        ("softm", [0.01], {**SOFT, "m": [1000.0]}, "params.m must be <= 100, got 1000"),
-        ("gaussian", [0.01], {"sigma": [1e9]}, "params must be lengths in the unit of coc, got a blur that reaches"),
-        ("disc", [-0.01, 1e-320], {"radius": [0.01, 0.02]}, "coc must reach somewhere from 1e-09 to .* got 9.9"),
-        ("disc", [-0.01, 1e-7], {"radius": [0.01, 0.02]}, "params must be lengths .* to 0.02 where coc is 1e-07"),
-        (
-            "disc",
-            [*range(1, 4098)],
-            {"radius": [1.0] * 4097},
-            r"coc must be 1 to 4096 strictly increasing .* of shape \[4097\]",
-        ),
-        ("disc", [1e90], {"radius": [1e90]}, r"coc must reach somewhere from 1e-09 to 1e\+06 \(fraction\), got 1e"),
-    ],
-)
-def test_tables_without_valid_kernels_are_refused(
-    tmp_path: Path, family: str, coc: list[float], params: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        BlurTable(family, coc, params, unit="fraction")
-    fields = {"family": family, "unit": "fraction", "coc": coc, "params": params}
-    path = tmp_path / "lens.json"
-    path.write_text(json.dumps({"schema": "torchdof/blur-table", "version": 1, **fields}))
-    with pytest.raises(ValueError, match="lens.json: .*" + message):
-        BlurTable.load(path)
 
 
 @pytest.mark.parametrize(("m", "sigma"), [(2.0, 0.003), (8.0, 0.003), (100.0, 0.0005), (100.0, 0.003)])

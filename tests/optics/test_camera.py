@@ -10,8 +10,6 @@ from torch.testing import assert_close
 from tests.refused import refuses
 from torchdof import Camera
 
-Number = float | Tensor
-
 
 def depth_of(*metres: float, dtype: torch.dtype = torch.float64) -> Tensor:
     return torch.tensor(metres, dtype=dtype).reshape(1, 1, 1, -1)
@@ -246,7 +244,7 @@ def test_a_tilted_lens_is_in_focus_on_the_plane_through_its_hinge(tilt: float, s
     assert_close(torch.nn.functional.avg_pool2d(fine, 2), coarse, rtol=1e-9, atol=1e-12)
 
 
-def test_focus_on_takes_the_median_of_the_subject() -> None:
+def test_focus_on_takes_the_median_of_the_subject_and_focus_in_prefers_the_middle_of_its_box() -> None:
     depth = torch.tensor([[1.0, 2.0, 3.0, math.nan], [9.0, 9.0, 9.0, 9.0]]).reshape(1, 1, 2, 4)
     mask = torch.tensor([[1, 1, 1, 1], [0, 0, 0, 0]]).reshape(1, 1, 2, 4)
     assert Camera().focus_on(depth, mask > 0).focus_m == 2.0
@@ -254,9 +252,6 @@ def test_focus_on_takes_the_median_of_the_subject() -> None:
     assert Camera().focus_on(depth, weighted).focus_m == 3.0
     both = Camera().focus_on(torch.cat([depth, depth + 1]), mask > 0).focus_m
     assert torch.as_tensor(both).tolist() == [2.0, 3.0]
-
-
-def test_focus_in_a_box_prefers_its_middle() -> None:
     depth = torch.full((1, 1, 40, 40), 6.0)
     depth[..., 10:30, 10:30] = 2.0  # a third of the box's pixels
     assert Camera().focus_in(depth, (2, 2, 38, 38)).focus_m == 2.0

@@ -135,9 +135,7 @@ def _facts(captures: Captures, result: TableFit) -> dict[str, Any]:
             {"distance_m": pair.distance_m, "coc_px": coc, **{name: getattr(fit, name) for name in of_fit}}
             for pair, fit, coc in zip(captures, result.fits, result.coc_px, strict=True)
         ],
-        "colours": [
-            {"name": name, "radius_px": [fit.radius for fit in fits]} for name, fits in result.colours.items()
-        ],
+        "colours": [{"name": name, "radius_px": [fit.radius for fit in fits]} for name, fits in result.colours.items()],
     }
 
 

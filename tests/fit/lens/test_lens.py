@@ -1,11 +1,14 @@
-import dataclasses
+import math
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
-from tests.lenses import turned
-from torchdof.fit.lens.glass import C_UM, D_UM, F_UM, G_UM, catalogue
+from tests.refused import refuses
+from torchdof.fit.lens.glass import AIR, C_UM, D_UM, F_UM, G_UM, Glass, catalogue
 from torchdof.fit.lens.lens import Lens
+from torchdof.fit.lens.spot import focus_sensor
 
 FACTS = {
     "double_gauss_50mm": (50.3582, 36.1059),
@@ -14,6 +17,16 @@ FACTS = {
 }
 SINGLET = "50 5 1.5168/64.17 20\n0 1 0 18\n-50 0 1 20\n"
 ASPHERE = "40 3 1.5 20 stop k=-0.6 A4=1.2e-06 A10=-3e-13\n-40 2 1 20 A2=0.001\n"
+
+
+def turned(lens):
+    """The lens with front and rear exchanged: radii and polynomials change their signs."""
+    media = [(AIR, 0.0), *((surface.glass, surface.thickness) for surface in lens.surfaces[:-1])]
+    surfaces = [
+        replace(one, radius=-one.radius, polynomial=tuple(-a for a in one.polynomial), glass=glass, thickness=gap)
+        for one, (glass, gap) in zip(lens.surfaces, media, strict=True)
+    ]
+    return replace(lens, surfaces=tuple(surfaces[::-1]), stop=len(surfaces) - 1 - lens.stop)
 
 
 @pytest.mark.parametrize("name", FACTS)
@@ -134,10 +147,12 @@ def test_lines_are_read_back_as_the_same_lens(text, lens_of):
         ("glass X 1 2 3\n", r"line 1: expected glass NAME B1 B2 B3 C1 C2 C3, got 'X 1 2 3'"),
         ("glass X 30 0 0 0.01 0.02 90\n", r"line 1: glass X has no refractive index from 1 to 5 at 0.4 um"),
         ("glass X nan 0 0 0.01 0.02 90\n", r"line 1: glass X must have six finite coefficients"),
+        *((f"50 5 1.5 20 {words}\n", "line 1: (A16|A2|conic constant) must")
+          for words in ("A2=1e308", "A2=1e300 A4=-1e300", "k=1e300", "A16=1e308")),
         ("50 5 1.5 20\n0 1 0 18\n", r"the index behind the last surface must be 1"),
         ("50 5 1.5 20\n" * 2000 + "0 1 0 18\n-50 0 1 20\n", "line 1001: a lens has at most 1000 surfaces"),
     ],
-)
+)  # fmt: skip
 def test_wrong_prescription_is_refused_with_file_line_and_column(lens_of, text, message):
     with pytest.raises(ValueError, match=rf"lens\.txt: {message}"):
         lens_of(text)
@@ -148,8 +163,15 @@ def test_impossible_lenses_are_refused_by_name(lens_of):
         Lens.read("triplet")
     with pytest.raises(ValueError, match="does not converge light"):
         lens_of("-50 5 1.5 20\n0 1 0 18\n50 0 1 20\n").paraxial()
+    with pytest.raises(ValueError, match="'lens' bends light beyond measure"):
+        focus_sensor(lens_of("0.001 1e7 4.9 20\n-0.001 1e7 1 20\n" * 30 + "-50 3 1 20\n0 0 0 15"), 2.0)
 
 
-def test_a_radius_beyond_all_floats_is_refused():
-    with pytest.raises(ValueError, match="radius must be inf"):
-        dataclasses.replace(Lens.read("double_gauss_50mm").surfaces[0], radius=10**400)
+test_absurd_numbers_are_refused = refuses(
+    *((partial(Glass, "x", six), "glass x must have six finite coefficients")
+      for six in (("a",) * 6, None, (10**400,) * 6, (True,) * 6, (1.0,) * 5, (math.nan,) * 6)),
+    *((partial(Glass.named("N-BK7").index, um), "wavelength_um must be a number of micrometres")
+      for um in (None, "red", 10**400, math.nan, 0.0, -1.0)),
+    *((partial(Glass.named, name), "no glass") for name in (None, "red", 10**400, math.nan, 0.0)),
+    (partial(replace, Lens.read("double_gauss_50mm").surfaces[0], radius=10**400), "radius must be inf"),
+)  # fmt: skip

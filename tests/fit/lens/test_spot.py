@@ -1,8 +1,11 @@
 import math
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.refused import refuses
 from torchdof.fit.lens.glass import C_UM, D_UM, F_UM
 from torchdof.fit.lens.lens import Lens
 from torchdof.fit.lens.spot import focus_sensor, point_spread
@@ -101,18 +104,18 @@ def test_field_mm_is_the_height_of_a_pinholes_image(gauss, z_m, field_mm, distor
     assert centre == pytest.approx(field_mm, rel=distortion)
 
 
-@pytest.mark.parametrize(
-    ("call", "given", "message"),
-    [
-        (focus_sensor, {"kind": "film"}, "focus must be one of best, paraxial, got 'film'"),
-        (focus_sensor, {"focus_m": 0.02}, "must lie in front of the lens"),
-        (focus_sensor, {"focus_m": 0.045}, r"farther than the focal length \(50.36 mm\)"),
-        (point_spread, {"rays": 3}, "rays must be a whole number from 16"),
-        (point_spread, {"field_mm": 1.0, "meridional": True}, "points on the axis"),
-        (point_spread, {"field_mm": 90.0}, "no ray of the object point passes"),
-    ],
+focused: Any = partial(partial, focus_sensor, Lens.read("double_gauss_50mm"), focus_m=2.0)
+spread: Any = partial(partial, point_spread, Lens.read("double_gauss_50mm"), z_m=1.0, sensor_mm=37.4)
+test_wrong_arguments_are_refused = refuses(
+    (focused(kind="film"), "focus must be one of best, paraxial, got 'film'"),
+    (focused(focus_m=0.02), "must lie in front of the lens"),
+    (focused(focus_m=0.045), r"farther than the focal length \(50.36 mm\)"),
+    (spread(rays=3), "rays must be a whole number from 16 to 100000000, got 3"),
+    (spread(rays=10**12), "rays must be a whole number from 16"),
+    (spread(rays=16.5), "rays must be"),
+    (spread(z_m=1e300), r"at most 1e\+12 m away"),
+    (spread(field_mm=1e300), "field_mm"),
+    (spread(field_mm=math.nan), "field_mm"),
+    (spread(field_mm=1.0, meridional=True), "points on the axis"),
+    (spread(field_mm=90.0), "no ray of the object point passes"),
 )
-def test_wrong_arguments_are_refused(gauss, call, given, message):
-    good = {"focus_m": 2.0} if call is focus_sensor else {"z_m": 1.0, "sensor_mm": 37.4}
-    with pytest.raises(ValueError, match=message):
-        call(gauss, **{**good, **given})

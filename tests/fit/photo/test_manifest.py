@@ -4,10 +4,10 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 import torch
 
+from tests.files import store
 from torchdof.fit import Capture, Captures, FitError, FitWarning, fit_pair, read_captures
 from torchdof.fit.photo.captures import read_picture
 from torchdof.io.images import Picture, read_image, write_image
@@ -182,10 +182,6 @@ def test_captures_from_arrays_are_checked(pairs, f_number, match):
 
 def test_a_mosaic_with_an_orientation_tag_is_refused(tmp_path: Path) -> None:
     """Rotation would change the colours of the pattern's upper left pixels."""
-    spec = oiio.ImageSpec(8, 6, 1, "uint16")
-    spec.attribute("Orientation", 6)
-    output = oiio.ImageOutput.create(str(tmp_path / "mosaic.tif"))
-    assert output is not None and output.open(str(tmp_path / "mosaic.tif"), spec)
-    assert output.write_image(np.ones((6, 8, 1), np.uint16)) and output.close()
+    store(tmp_path / "mosaic.tif", np.ones((6, 8, 1), np.uint16), "uint16", Orientation=6)
     with pytest.raises(FitError, match="got EXIF orientation 6; remove the tag"):
         read_picture(tmp_path / "mosaic.tif", "linear", bayer="RGGB")

@@ -5,13 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-from tests.fit import phone
-from torchdof import BlurTable
+from torchdof import BlurTable, Camera, blur_by_coc
 from torchdof.fit import FitError, FitWarning, fit_captures
 from torchdof.fit.photo.photographs import read_photographs
 from torchdof.fit.photo.target import DOT_MM, SQUARE_MM, Target, find_target, tone_curve, untoned, write_target
-from torchdof.io.images import read_image
+from torchdof.io.images import Picture, read_image, write_image
+from torchdof.reference.metrics import psnr
 
 
 @pytest.mark.parametrize(("paper", "width", "height"), [("a4", 595.28, 841.89), ("letter", 612.0, 792.0)])
@@ -98,6 +99,16 @@ def test_errors_of_unreadable_folders_state_the_remedy(simulator, tmp_path):
         read_photographs(tmp_path)
 
 
+def test_root_also_limits_photographs_without_a_description(tmp_path):
+    (tmp_path / "photographs").mkdir()
+    for number in range(2):
+        write_image(tmp_path / f"{number}.png", Picture(torch.rand(1, 3, 40, 40)))
+        (tmp_path / "photographs" / f"{number}.png").symlink_to(tmp_path / f"{number}.png")
+    for root, message in ((tmp_path / "photographs", "lies outside of"), (tmp_path, "show the target")):
+        with pytest.raises(FitError, match=message):
+            read_photographs(tmp_path / "photographs", root=root)
+
+
 def _photographs(simulator, tone, seed=0):
     """Dots of large photographs with five blur radii and an S-curve."""
     rng, found = np.random.default_rng(seed), []
@@ -130,10 +141,27 @@ def test_no_tone_curve_is_found_in_photographs_without_one(simulator, tmp_path):
     assert read_photographs(tmp_path).captures.notes["tone_curve"] == [0.0, 0.0, 0.0]
 
 
-def test_a_table_of_photographs_with_an_unknown_tone_curve_renders_the_true_lens_s_picture(simulator, tmp_path, capsys):
-    found, untouched = phone.measure(tmp_path, simulator, distances=(0.28, 0.4, 0.6), width=800, family="disc")
-    assert found > 42 and found > untouched + 12, (found, untouched)
-    table = BlurTable.load(tmp_path / "phone.json")
+def scene(width):
+    """A desk from 0.2 m to 0.8 m with stripes and lights `[1, 3, H, W]`, and its depth in metres `[1, 1, H, W]`."""
+    height = width * 3 // 4
+    stripes = 0.2 + 0.3 * ((torch.arange(width) // (width // 40)) % 2)
+    image = stripes.expand(height, width).clone()
+    image[height // 2 :] = 0.05
+    image[height * 3 // 4 :: height // 12, width // 20 :: width // 10] = 60.0
+    tint = torch.tensor([1.0, 0.8, 0.6])[:, None, None]
+    return (image * tint)[None], torch.linspace(0.2, 0.8, width).expand(1, 1, height, width).clone()
+
+
+def test_a_table_of_photographs_with_an_unknown_tone_curve_renders_the_true_lens_s_picture(simulator, tmp_path):
+    simulator.write_photographs(tmp_path, 0.2, [0.28, 0.4, 0.6])
+    found = read_photographs(tmp_path)
     # these dots are too small to use their total light
-    assert "the edges of the square" in " ".join(capsys.readouterr().out.split())
-    assert len(table.coc) == 3 and left_of(simulator, 0.5, table.provenance["tone_curve"]) < 0.5
+    assert "the edges of the square" in " ".join(found.advice)
+    assert left_of(simulator, 0.5, found.captures.notes["tone_curve"]) < 0.5
+    table = fit_captures(found.captures, "disc").table
+    image, depth = scene(800)
+    coc_px = Camera(5.4, 1.8, 0.2, 36 * 5.4 / 26).coc_px(depth, width=800)
+    rendered, true = (blur_by_coc(image, coc_px, table=each) for each in (table, BlurTable.disc()))
+    shown = [light.clamp(0, 1) ** (1 / 2.2) for light in (rendered, image, true)]
+    of_table, of_sharp = psnr(shown[0], shown[2]), psnr(shown[1], shown[2])
+    assert of_table > 42 and of_table > of_sharp + 12, (of_table, of_sharp)
