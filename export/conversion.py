@@ -24,7 +24,6 @@ from torchdof.validation import whole
 from .graph import INPUTS, OUTPUT, Layout, Portable, Size, axes, trace
 from .interface import broadcast
 from .metadata import label
-from .rays import FUNCTIONS
 from .slimming import slim
 from .verification import Verification, verify
 
@@ -121,6 +120,8 @@ def _translate(program: torch.export.ExportedProgram, portable: Portable, opset:
     """The module as an ONNX graph, translated by torch.onnx and not yet simplified."""
     # torch.onnx would trace everything again to decompose operators, most of which it can translate as they are
     vars(program)["run_decompositions"] = lambda _: program
+    # conditions on sizes; torch.onnx leaves their terms, some of which are beyond 64 bits
+    program.graph.eliminate_dead_code(lambda node: node.op in ("placeholder", "output"))
     with _quiet(), _values_as_traced():
         converted = torch.onnx.export(
             program,
@@ -135,10 +136,6 @@ def _translate(program: torch.export.ExportedProgram, portable: Portable, opset:
         )
     if converted is None:
         raise RuntimeError("torch.onnx.export gave no program")
-    for function in FUNCTIONS:
-        translated = onnx_ir.serde.deserialize_function(function.to_function_proto())
-        translated.opset_imports[""] = opset
-        converted.model.functions[translated.identifier()] = translated
     return converted.model
 
 
@@ -202,6 +199,18 @@ def _index_select(self: Any, dim: int, index: Any) -> Any:
     return opset20.GatherElements(self, index, axis=dim)  # five times as fast in onnxruntime as Gather
 
 
+def _index_add(self: Any, dim: int, index: Any, source: Any) -> Any:
+    # not ScatterND: runtimes add in parallel there, and would lose some values
+    others: Any = opset20.Constant(value_ints=[axis for axis in range(len(source.shape)) if axis != dim])
+    places: Any = opset20.Expand(opset20.Unsqueeze(index, others), opset20.Shape(source))
+    return opset20.ScatterElements(self, places, source, axis=dim, reduction="add")
+
+
+def _floor_divide(self: Any, other: Any) -> Any:
+    other = opset20.CastLike(other, self)
+    return opset20.Div(opset20.Sub(self, opset20.Mod(self, other)), other)  # torch.onnx needs eight operators
+
+
 def _diff(self: Any, n: int = 1, dim: int = -1, prepend: Any = None, append: Any = None) -> Any:
     axis: Any = [dim]
     bounds: Any = [0], [1], [-1], [2**63 - 1]
@@ -220,11 +229,11 @@ _TRANSLATIONS: dict[Callable[..., Any], Callable[..., Any]] = {
         opset20.ReduceMax(self, keepdims=0),
     ),
     torch.ops.aten.diff.default: _diff,
-    torch.ops.aten.index_add.default: lambda self, dim, index, source: opset20.ScatterElements(
-        self, index, source, axis=dim, reduction="add"
-    ),
+    torch.ops.aten.index_add.default: _index_add,
     torch.ops.aten.addcmul.default: lambda self, first, second: opset20.Add(self, opset20.Mul(first, second)),
     torch.ops.aten.index_copy.default: _index_copy,
+    torch.ops.aten.sym_numel.default: lambda self: opset20.Size(self),
+    torch.ops.aten.item.default: lambda self: opset20.Identity(self),
     torch.ops.aten.detach_.default: lambda self: opset20.Identity(self),
     torch.ops.aten.__and__.Tensor: lambda self, other: opset20.And(self, other),
     torch.ops.aten.__or__.Tensor: lambda self, other: opset20.Or(self, other),
@@ -232,6 +241,7 @@ _TRANSLATIONS: dict[Callable[..., Any], Callable[..., Any]] = {
     torch.ops.aten.rsub.Scalar: lambda self, other: opset20.Sub(opset20.CastLike(other, self), self),
     # index % width with a width known only at run time; torch.onnx accepts only numbers
     torch.ops.aten.remainder.Scalar: lambda self, other: opset20.Mod(self, opset20.CastLike(other, self)),
+    torch.ops.aten.floor_divide.default: _floor_divide,
     torch.ops.aten.hypot.default: lambda self, other: opset20.Sqrt(
         opset20.Add(opset20.Mul(self, self), opset20.Mul(other, other))
     ),
