@@ -20,6 +20,7 @@ _WINDOW_DEFAULTS = {"pads": 0, "dilations": 1, "strides": 1}  # defaults of thes
 _Pass = Callable[[onnx_ir.Model], object]
 
 _WHOLE_AXIS = 2**62  # ends of slices beyond it are those of an axis of any length
+_LARGEST_FOLDED = 2**15  # numbers; larger constants are computed, and do not fill the file
 _MAX_EQUAL = 64  # constants with more equal numbers than this are stored as a shape and a value
 
 
@@ -28,7 +29,7 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
 
     A ``straight`` graph has none of these; its constants stay initializers, which runtimes for GPUs load once.
 
-    1. Inline functions, fold constants, and replace block means by convolutions.
+    1. Inline functions and fold constants.
     2. Make loops and branches.
     3. Put each convolution's weights into its own graph, and turn initializers into nodes.
     4. Remove default attributes and shorten names.
@@ -46,7 +47,6 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
         passes.ShapeInferencePass(),
         *((_share_sizes,) if straight else ()),
         _join_slices,
-        _convolve_averages,
         passes.IdentityEliminationPass(),
         passes.CommonSubexpressionEliminationPass(),
         passes.RemoveUnusedNodesPass(),
@@ -61,8 +61,7 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
     )
     for step in flat:
         step(model)
-    fold_constants(model, input_size_limit=2**24, output_size_limit=2**13)
-    _fold_weights(model)
+    fold_constants(model, input_size_limit=2**24, output_size_limit=_LARGEST_FOLDED)
     for step in tidy:
         step(model)
     structure(model)
@@ -128,19 +127,6 @@ def _constant(value: onnx_ir.Value | None) -> Any:
     return None if tensor is None else tensor.numpy()
 
 
-def _fold_weights(model: onnx_ir.Model) -> None:
-    """Makes constants of weights of convolutions, which are larger than the other constants that are folded."""
-    weights, makers = [node.inputs[1] for node in model.graph if node.op_type == "Conv"], set()
-    while weights:
-        weight = weights.pop()
-        maker = None if weight is None else weight.producer()
-        if maker is not None and maker not in makers:
-            makers.add(maker)
-            weights += maker.inputs
-    size = 2**24
-    fold_constants(model, input_size_limit=size, output_size_limit=size, should_fold=makers.__contains__)
-
-
 def _place_weights(model: onnx_ir.Model) -> None:
     """Puts weights of convolutions into the graph that uses them; only then runtimes arrange them for speed."""
     for graph in (model.graph, *model.graph.subgraphs()):
@@ -191,29 +177,6 @@ def _initializer(graph: onnx_ir.Graph, array: np.ndarray, name: str) -> onnx_ir.
     )
     graph.register_initializer(value)
     return value
-
-
-def _convolve_averages(model: onnx_ir.Model) -> None:
-    """Block means before a convolution become a convolution, which is several times as fast in runtimes."""
-    for node in list(model.graph):
-        following = [use.node for use in node.outputs[0].uses()] if node.op_type == "AveragePool" else []
-        if [n.op_type for n in following] != ["Pad"]:
-            continue
-        (pad,) = following
-        scale = node.attributes["kernel_shape"].as_ints()[0]
-        filled_shape: Any = pad.outputs[0].shape
-        channels = int(filled_shape[1])
-        weight = np.full((channels, 1, scale, scale), scale**-2.0, np.float32)
-        tape = Tape()
-        filled = tape.op("Pad", [node.inputs[0], *pad.inputs[1:]])
-        name = f"mean_{node.outputs[0].name}"
-        kernel = _initializer(model.graph, weight, f"{name}_weight")
-        mean = tape.op("Conv", [filled, kernel], {"group": channels, "strides": [scale, scale]}, name=name)
-        old = pad.outputs[0]
-        mean.type, mean.shape = old.type, old.shape
-        model.graph.insert_before(pad, list(tape.nodes))
-        old.replace_all_uses_with(mean)
-        model.graph.remove([pad, node], safe=True)
 
 
 def _drop_defaults(model: onnx_ir.Model) -> None:
