@@ -13,7 +13,10 @@ import onnxscript
 
 if TYPE_CHECKING:  # the functions below are not run as Python, and types differ
     op: Any
-    Depth = Floats = Image = Items = Any
+    Depth = Any
+    Floats = Any
+    Image = Any
+    Items = Any
 else:
     from onnxscript import opset20 as op
 

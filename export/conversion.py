@@ -5,14 +5,13 @@ import logging
 import os
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import onnx
 import onnx_ir
 import torch
+from onnx_ir.tape import Tape
 from onnxscript import opset20
 
 from torchdof import DepthOfField
@@ -21,8 +20,7 @@ from torchdof.options import DepthEdges
 from torchdof.tensors import TRACEABLE
 from torchdof.validation import whole
 
-from .graph import INPUTS, OUTPUT, Layout, Portable, Size, axes, trace
-from .interface import broadcast
+from .graph import INPUTS, ITEMS, OUTPUT, Layout, Portable, Size, axes, trace
 from .metadata import label
 from .slimming import slim
 from .verification import Verification, verify
@@ -116,13 +114,39 @@ def to_onnx(
         return verify(temporary, dof, progress=progress)
 
 
+def broadcast(model: onnx_ir.Model, inputs: str) -> onnx_ir.Model:
+    """Lets every input except the image have one item for the whole batch, in place.
+
+    For a wrong shape, a runtime's error message contains the name of the node that cannot expand it.
+    """
+    graph = model.graph
+    inputs_in_order: list[Any] = list(graph.inputs)
+    image, *others = inputs_in_order
+    tape = Tape()
+    items, size = (tape.op("Shape", [image], {"start": a, "end": b}) for a, b in ((0, 1), (2, 4)))
+    full = tape.op("Concat", [items, tape.op("Constant", [], {"value_ints": [1]}), size], {"axis": 0})
+    for value in others:
+        is_map = value.name == INPUTS[inputs][1]
+        hint = "one_item_or_as_many_as_image" + ("_and_its_height_and_width" if is_map else "")
+        uses = list(value.uses())
+        expanded = tape.op("Expand", [value, full if is_map else items], name=f"{value.name}_must_have_{hint}")
+        for use in uses:
+            use.node.replace_input_with(use.idx, expanded)
+        value.shape = onnx_ir.Shape([ITEMS, *value.shape[1:]])
+    graph.outputs[0].shape = onnx_ir.Shape(image.shape)
+    graph.insert_before(next(iter(graph)), list(tape.nodes))
+    for number, node in enumerate(tape.nodes):
+        node.outputs[0].name = f"batch_{number}"
+    return model
+
+
 def _translate(program: torch.export.ExportedProgram, portable: Portable, opset: int) -> onnx_ir.Model:
     """The module as an ONNX graph, translated by torch.onnx and not yet simplified."""
     # torch.onnx would trace everything again to decompose operators, most of which it can translate as they are
     vars(program)["run_decompositions"] = lambda _: program
     # conditions on sizes; torch.onnx leaves their terms, some of which are beyond 64 bits
     program.graph.eliminate_dead_code(lambda node: node.op in ("placeholder", "output"))
-    with _quiet(), _values_as_traced():
+    with _quiet():
         converted = torch.onnx.export(
             program,
             dynamo=True,
@@ -137,29 +161,6 @@ def _translate(program: torch.export.ExportedProgram, portable: Portable, opset:
     if converted is None:
         raise RuntimeError("torch.onnx.export gave no program")
     return converted.model
-
-
-def _values_as_traced() -> AbstractContextManager[object]:
-    """Lets torch.onnx cast arguments of mixed types without computing every node again, half of a translation's time.
-
-    The values of a graph's nodes are those of its tracing; only nodes that are added since are computed. Where PyTorch
-    has no such pass, nothing changes: its own gives the same file.
-    """
-    try:
-        from torch.onnx._internal.fx.passes import type_promotion
-    except ImportError:
-        return contextlib.nullcontext()
-    if not hasattr(type_promotion, "_TypePromotionInterpreter"):
-        return contextlib.nullcontext()
-
-    class TracedValues(torch.fx.Interpreter):
-        def run_node(self, n: torch.fx.Node) -> Any:
-            return n.meta["val"] if "val" in n.meta else super().run_node(n)
-
-    class Promotion(type_promotion._TypePromotionInterpreter, TracedValues):
-        """Its base class calls ``run_node`` of the class above."""
-
-    return mock.patch.object(type_promotion, "_TypePromotionInterpreter", Promotion)
 
 
 def _index_copy(self: Any, dim: int, index: Any, source: Any) -> Any:
@@ -201,9 +202,11 @@ def _index_select(self: Any, dim: int, index: Any) -> Any:
 
 def _index_add(self: Any, dim: int, index: Any, source: Any) -> Any:
     # not ScatterND: runtimes add in parallel there, and would lose some values
-    others: Any = opset20.Constant(value_ints=[axis for axis in range(len(source.shape)) if axis != dim])
-    places: Any = opset20.Expand(opset20.Unsqueeze(index, others), opset20.Shape(source))
-    return opset20.ScatterElements(self, places, source, axis=dim, reduction="add")
+    others = [axis for axis in range(len(source.shape)) if axis != dim]
+    if others:
+        index = opset20.Unsqueeze(index, opset20.Constant(value_ints=others))  # type: ignore[arg-type]
+        index = opset20.Expand(index, opset20.Shape(source))
+    return opset20.ScatterElements(self, index, source, axis=dim, reduction="add")
 
 
 def _floor_divide(self: Any, other: Any) -> Any:

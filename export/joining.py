@@ -3,7 +3,7 @@
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import onnx
@@ -116,7 +116,10 @@ def _prepare(depth_model: Model, opset: int) -> tuple[onnx.ModelProto, tuple[int
 
 def _join(parts: Sequence[onnx.ModelProto]) -> onnx.ModelProto:
     """Encoding, estimator, decoding and module as one graph; each part's names get a prefix."""
-    nodes, initializers, inputs, outputs = [], [], {}, {}
+    nodes: list[Any] = []
+    initializers: list[Any] = []
+    inputs: dict[str, Any] = {}
+    outputs: dict[str, Any] = {}
     result = ""
     for name, part, takes_result in zip(("encode", "estimator", "decode", "dof"), parts, (None, 0, 0, 1), strict=True):
         graph = onnx.compose.add_prefix(onnx.inliner.inline_local_functions(part), f"{name}/").graph
@@ -135,7 +138,8 @@ def _join(parts: Sequence[onnx.ModelProto]) -> onnx.ModelProto:
     nodes += [onnx.helper.make_node("Identity", [value.name], [name]) for name, value in interface.items()]
     for name, value in (*inputs.items(), *interface.items()):
         value.name = name
-    joint = onnx.helper.make_graph(nodes, "estimated_depth_of_field", inputs.values(), interface.values(), initializers)
+    ends = [*inputs.values()], [*interface.values()]
+    joint = onnx.helper.make_graph(nodes, "estimated_depth_of_field", *ends, initializers)
     dof = parts[-1]
     return onnx.helper.make_model(
         joint,

@@ -1,5 +1,6 @@
 """Simplifies a translated graph: one flat, small graph of plain operators that many runtimes can read."""
 
+import functools
 import itertools
 import string
 from collections.abc import Callable
@@ -17,10 +18,8 @@ from .structure import structure
 __all__ = ["slim"]
 
 _WINDOW_DEFAULTS = {"pads": 0, "dilations": 1, "strides": 1}  # defaults of these attributes, for each axis
-_Pass = Callable[[onnx_ir.Model], object]
 
 _WHOLE_AXIS = 2**62  # ends of slices beyond it are those of an axis of any length
-_LARGEST_FOLDED = 2**15  # numbers; larger constants are computed, and do not fill the file
 _MAX_EQUAL = 64  # constants with more equal numbers than this are stored as a shape and a value
 
 
@@ -34,15 +33,18 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
     3. Put each convolution's weights into its own graph, and turn initializers into nodes.
     4. Remove default attributes and shorten names.
     """
-    flat: tuple[_Pass, ...] = (
+    share = passes.DeduplicateInitializersPass(size_limit=2**24)
+    lift = passes.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0)
+    # in a straight graph the weights of all convolutions become constants; in tiles more would fill the file
+    limits: Any = {"input_size_limit": 2**24, "output_size_limit": 2**15 if straight else 2**13}
+    steps: tuple[Callable[[onnx_ir.Model], object], ...] = (
         passes.InlinePass(),
         passes.RemoveUnusedFunctionsPass(),
-        passes.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
-        passes.DeduplicateInitializersPass(size_limit=2**24),
+        lift,
+        share,
         # without values of sizes in a straight graph, in which onnx confuses lists of indices with them
         passes.ShapeInferencePass(data_prop=not straight),
-    )
-    tidy: tuple[_Pass, ...] = (
+        functools.partial(fold_constants, **limits),
         passes.RemoveUnusedNodesPass(),  # folding leaves sequences of a wrong type, which shape inference refuses
         passes.ShapeInferencePass(),
         *((_share_sizes,) if straight else ()),
@@ -50,30 +52,19 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
         passes.IdentityEliminationPass(),
         passes.CommonSubexpressionEliminationPass(),
         passes.RemoveUnusedNodesPass(),
-    )
-    structured: tuple[_Pass, ...] = (
-        passes.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
-        passes.DeduplicateInitializersPass(size_limit=2**24),
+        structure,
+        lift,
+        share,
         passes.CommonSubexpressionEliminationPass(),
         passes.RemoveUnusedNodesPass(),
         passes.RemoveUnusedOpsetsPass(),
         passes.ClearMetadataAndDocStringPass(),
+        *(() if straight else (_place_weights, passes.RemoveUnusedNodesPass(), _as_nodes)),
+        _drop_defaults,
+        _shorten,
     )
-    for step in flat:
+    for step in steps:
         step(model)
-    fold_constants(model, input_size_limit=2**24, output_size_limit=_LARGEST_FOLDED)
-    for step in tidy:
-        step(model)
-    structure(model)
-    for step in structured:
-        step(model)
-    if not straight:
-        _place_weights(model)
-        passes.RemoveUnusedNodesPass()(model)
-        for graph in (model.graph, *model.graph.subgraphs()):
-            _as_nodes(graph)
-    _drop_defaults(model)
-    _shorten(model)
     return model
 
 
@@ -89,8 +80,6 @@ def _share_sizes(model: onnx_ir.Model) -> None:
             held = list(source.shape)[slice(*ends)]
         elif node.op_type == "Slice" and source in sizes and not any(n is None for n in numbers):
             held = sizes[source][int(numbers[0][0]) : int(numbers[1][0])]
-        elif node.op_type == "Gather" and source in sizes and numbers[0] is not None:
-            held = [sizes[source][n] for n in numbers[0].flat]
         else:
             continue
         output = node.outputs[0]
@@ -147,27 +136,26 @@ def _place_weights(model: onnx_ir.Model) -> None:
             node.replace_input_with(1, local_weight)
 
 
-def _as_nodes(graph: onnx_ir.Graph) -> None:
+def _as_nodes(model: onnx_ir.Model) -> None:
     """Turns initializers into nodes; many equal numbers then take no space."""
-    first = next(iter(graph), None)
-    values: list[Any] = list(graph.initializers.values())
-    for value in values:
-        if not value.uses():
+    for graph in (model.graph, *model.graph.subgraphs()):
+        tape = Tape()
+        values: list[Any] = list(graph.initializers.values())
+        for value in values:
             del graph.initializers[value.name]
-            continue
-        tape, array = Tape(), value.const_value.numpy()
-        if array.size > _MAX_EQUAL and (array == array.flat[0]).all():
-            shape = tape.op("Constant", [], {"value_ints": list(array.shape)})
-            tape.op("ConstantOfShape", [shape], {"value": onnx_ir.tensor(array.flat[:1])})
-            shape.name = f"{value.name}_shape"
-        else:
-            tape.op("Constant", [], {"value": value.const_value})
-        constant = tape.nodes[-1].outputs[0]
-        constant.name = value.name
-        del graph.initializers[value.name]
-        value.replace_all_uses_with(constant)
-        if first is not None:
-            graph.insert_before(first, list(tape.nodes))
+            if not value.uses():
+                continue
+            array = value.const_value.numpy()
+            if array.size > _MAX_EQUAL and (array == array.flat[0]).all():
+                shape = tape.op("Constant", [], {"value_ints": list(array.shape)})
+                shape.name = f"{value.name}_shape"
+                constant = tape.op("ConstantOfShape", [shape], {"value": onnx_ir.tensor(array.flat[:1])})
+            else:
+                constant = tape.op("Constant", [], {"value": value.const_value})
+            constant.name = value.name
+            value.replace_all_uses_with(constant)
+        if tape.nodes:
+            graph.insert_before(next(iter(graph)), list(tape.nodes))
 
 
 def _initializer(graph: onnx_ir.Graph, array: np.ndarray, name: str) -> onnx_ir.Value:

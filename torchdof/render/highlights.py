@@ -306,8 +306,9 @@ class Occluders:
         fades = (coc[:, None] - NEARER_PX - nearer).clamp(0.0, 1.0)
         # pairs of a highlight and a bin with a non-empty cell within reach
         reach = scale.detach().abs() * step[-1]
+        ends = (-reach, reach + 1.0)
         (top, bottom), (left, right) = (
-            [(place[:, None] + end).clamp(0, size - 1).long() // COARSE_CELL for end in (-reach, reach + 1.0)]
+            [(place[:, None] + end).clamp_min(0).long().clamp(max=size - 1) // COARSE_CELL for end in ends]
             for place, size in ((row, self.height), (column, self.width))
         )
         bottom, right = bottom + 1, right + 1
