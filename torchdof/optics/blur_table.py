@@ -452,6 +452,7 @@ class BlurTable:
         """
         if self.unit == "relative":
             return 1.0
+        width = width.detach() if isinstance(width, Tensor) else width
         return float(width) if self.sensor_width_mm is None else width / self.sensor_width_mm
 
     def _check_params(self, params: Mapping[str, Any]) -> dict[str, Tensor]:
