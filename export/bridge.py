@@ -6,13 +6,27 @@ inverse depth planes stay planes.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import onnx
+import onnxscript
 
-from .scripting import Depth, Floats, Image, Items, op, script
+if TYPE_CHECKING:  # the functions below are not run as Python, and types differ
+    op: Any
+    Depth = Any
+    Floats = Any
+    Image = Any
+    Items = Any
+else:
+    from onnxscript import opset20 as op
+
+    Floats, Items = onnxscript.FLOAT[...], onnxscript.FLOAT["B"]
+    Image, Depth = onnxscript.FLOAT["B", 3, "H", "W"], onnxscript.FLOAT["B", 1, "H", "W"]
 
 __all__ = ["decode", "encode"]
+
+script = onnxscript.script(onnxscript.values.Opset("torchdof", 1), default_opset=op)
+"""Decorator of functions that :mod:`onnxscript` compiles to ONNX."""
 
 
 def encode(size: tuple[int, int] | None, mean: Sequence[float], std: Sequence[float]) -> onnx.ModelProto:

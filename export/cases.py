@@ -8,8 +8,6 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from torchdof.optics.camera import Camera
-
 from .graph import Portable
 
 __all__ = ["Case", "cases"]
@@ -25,9 +23,8 @@ class Case(NamedTuple):
 def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Case]:
     """The calls for which a file must give the module's result.
 
-    1. List frames, each with a size and a shape of its coc; a file with a fixed size gets scenes of this size.
-    2. Draw an image, and make the coc of that shape.
-    3. Find a camera and the depth that has this coc, and insert bad and infinite depths.
+    Each frame has a size and a shape of its coc; a file with a fixed size gets scenes of this size. The f-number and
+    the depth are those that give this coc.
 
     Args:
         portable: The exported module.
@@ -84,9 +81,10 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
                 coc[:, :, ::7, 3::11] = math.nan
             yield Case(name, (image, coc))
             continue
-        focus = torch.linspace(1.2, 3.1, batch, dtype=torch.float32)
-        camera, f_number = _lens(portable.dof.camera, focus, 1.05 * coc.abs().amax().clamp_min(1.0), width)
-        depth = _depth(camera, coc, width)
+        focus, farthest = torch.linspace(1.2, 3.1, batch, dtype=torch.float32), 1.05 * coc.abs().amax().clamp_min(1.0)
+        widest = portable.dof.camera.replace(focus_m=focus, f_number=1.0)
+        f_number = widest.coc_px(focus.new_full((batch, 1, 1, 1), math.inf), width).flatten() / farthest
+        depth = focus.reshape(-1, 1, 1, 1) / (1.0 - coc / farthest)
         if name.startswith("infinitely far"):
             depth[..., -height // 4 :, :] = math.inf
             depth[..., -height // 4 :, : width // 2] = 1e30
@@ -110,17 +108,3 @@ def _steps(batch: int, height: int, width: int) -> Tensor:
     coc = torch.linspace(0.0, 1.0, width, dtype=torch.float32).expand(batch, 1, height, width).clone()
     coc[..., width // 3 : width // 2] = -0.7
     return coc
-
-
-def _lens(camera: Camera, focus: Tensor, reach: Tensor, width: int) -> tuple[Camera, Tensor]:
-    """The camera with f-numbers at which infinity has a coc of ``reach`` pixels, and these f-numbers."""
-    widest = camera.replace(focus_m=focus, f_number=torch.ones_like(focus))
-    f_number = widest.coc_px(focus.new_full((len(focus), 1, 1, 1), math.inf), width).flatten() / reach
-    return widest.replace(f_number=f_number), f_number
-
-
-def _depth(camera: Camera, coc: Tensor, width: int) -> Tensor:
-    """The depth with this coc, which must be smaller than that of infinity."""
-    far = camera.coc_px(torch.full_like(coc[..., :1, :1], math.inf), width)
-    focus = torch.as_tensor(camera.focus_m).reshape(-1, 1, 1, 1)
-    return focus / (1.0 - coc / far)

@@ -5,14 +5,13 @@ import logging
 import os
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import onnx
 import onnx_ir
 import torch
+from onnx_ir.tape import Tape
 from onnxscript import opset20
 
 from torchdof import DepthOfField
@@ -21,10 +20,8 @@ from torchdof.options import DepthEdges
 from torchdof.tensors import TRACEABLE
 from torchdof.validation import whole
 
-from .graph import INPUTS, OUTPUT, Layout, Portable, Size, axes, trace
-from .interface import broadcast
+from .graph import INPUTS, ITEMS, OUTPUT, Layout, Portable, Size, axes, trace
 from .metadata import label
-from .rays import FUNCTIONS
 from .slimming import slim
 from .verification import Verification, verify
 
@@ -117,11 +114,39 @@ def to_onnx(
         return verify(temporary, dof, progress=progress)
 
 
+def broadcast(model: onnx_ir.Model, inputs: str) -> onnx_ir.Model:
+    """Lets every input except the image have one item for the whole batch, in place.
+
+    For a wrong shape, a runtime's error message contains the name of the node that cannot expand it.
+    """
+    graph = model.graph
+    inputs_in_order: list[Any] = list(graph.inputs)
+    image, *others = inputs_in_order
+    tape = Tape()
+    items, size = (tape.op("Shape", [image], {"start": a, "end": b}) for a, b in ((0, 1), (2, 4)))
+    full = tape.op("Concat", [items, tape.op("Constant", [], {"value_ints": [1]}), size], {"axis": 0})
+    for value in others:
+        is_map = value.name == INPUTS[inputs][1]
+        hint = "one_item_or_as_many_as_image" + ("_and_its_height_and_width" if is_map else "")
+        uses = list(value.uses())
+        expanded = tape.op("Expand", [value, full if is_map else items], name=f"{value.name}_must_have_{hint}")
+        for use in uses:
+            use.node.replace_input_with(use.idx, expanded)
+        value.shape = onnx_ir.Shape([ITEMS, *value.shape[1:]])
+    graph.outputs[0].shape = onnx_ir.Shape(image.shape)
+    graph.insert_before(next(iter(graph)), list(tape.nodes))
+    for number, node in enumerate(tape.nodes):
+        node.outputs[0].name = f"batch_{number}"
+    return model
+
+
 def _translate(program: torch.export.ExportedProgram, portable: Portable, opset: int) -> onnx_ir.Model:
     """The module as an ONNX graph, translated by torch.onnx and not yet simplified."""
     # torch.onnx would trace everything again to decompose operators, most of which it can translate as they are
     vars(program)["run_decompositions"] = lambda _: program
-    with _quiet(), _values_as_traced():
+    # conditions on sizes; torch.onnx leaves their terms, some of which are beyond 64 bits
+    program.graph.eliminate_dead_code(lambda node: node.op in ("placeholder", "output"))
+    with _quiet():
         converted = torch.onnx.export(
             program,
             dynamo=True,
@@ -135,34 +160,7 @@ def _translate(program: torch.export.ExportedProgram, portable: Portable, opset:
         )
     if converted is None:
         raise RuntimeError("torch.onnx.export gave no program")
-    for function in FUNCTIONS:
-        translated = onnx_ir.serde.deserialize_function(function.to_function_proto())
-        translated.opset_imports[""] = opset
-        converted.model.functions[translated.identifier()] = translated
     return converted.model
-
-
-def _values_as_traced() -> AbstractContextManager[object]:
-    """Lets torch.onnx cast arguments of mixed types without computing every node again, half of a translation's time.
-
-    The values of a graph's nodes are those of its tracing; only nodes that are added since are computed. Where PyTorch
-    has no such pass, nothing changes: its own gives the same file.
-    """
-    try:
-        from torch.onnx._internal.fx.passes import type_promotion
-    except ImportError:
-        return contextlib.nullcontext()
-    if not hasattr(type_promotion, "_TypePromotionInterpreter"):
-        return contextlib.nullcontext()
-
-    class TracedValues(torch.fx.Interpreter):
-        def run_node(self, n: torch.fx.Node) -> Any:
-            return n.meta["val"] if "val" in n.meta else super().run_node(n)
-
-    class Promotion(type_promotion._TypePromotionInterpreter, TracedValues):
-        """Its base class calls ``run_node`` of the class above."""
-
-    return mock.patch.object(type_promotion, "_TypePromotionInterpreter", Promotion)
 
 
 def _index_copy(self: Any, dim: int, index: Any, source: Any) -> Any:
@@ -202,6 +200,20 @@ def _index_select(self: Any, dim: int, index: Any) -> Any:
     return opset20.GatherElements(self, index, axis=dim)  # five times as fast in onnxruntime as Gather
 
 
+def _index_add(self: Any, dim: int, index: Any, source: Any) -> Any:
+    # not ScatterND: runtimes add in parallel there, and would lose some values
+    others = [axis for axis in range(len(source.shape)) if axis != dim]
+    if others:
+        index = opset20.Unsqueeze(index, opset20.Constant(value_ints=others))  # type: ignore[arg-type]
+        index = opset20.Expand(index, opset20.Shape(source))
+    return opset20.ScatterElements(self, index, source, axis=dim, reduction="add")
+
+
+def _floor_divide(self: Any, other: Any) -> Any:
+    other = opset20.CastLike(other, self)
+    return opset20.Div(opset20.Sub(self, opset20.Mod(self, other)), other)  # torch.onnx needs eight operators
+
+
 def _diff(self: Any, n: int = 1, dim: int = -1, prepend: Any = None, append: Any = None) -> Any:
     axis: Any = [dim]
     bounds: Any = [0], [1], [-1], [2**63 - 1]
@@ -220,11 +232,11 @@ _TRANSLATIONS: dict[Callable[..., Any], Callable[..., Any]] = {
         opset20.ReduceMax(self, keepdims=0),
     ),
     torch.ops.aten.diff.default: _diff,
-    torch.ops.aten.index_add.default: lambda self, dim, index, source: opset20.ScatterElements(
-        self, index, source, axis=dim, reduction="add"
-    ),
+    torch.ops.aten.index_add.default: _index_add,
     torch.ops.aten.addcmul.default: lambda self, first, second: opset20.Add(self, opset20.Mul(first, second)),
     torch.ops.aten.index_copy.default: _index_copy,
+    torch.ops.aten.sym_numel.default: lambda self: opset20.Size(self),
+    torch.ops.aten.item.default: lambda self: opset20.Identity(self),
     torch.ops.aten.detach_.default: lambda self: opset20.Identity(self),
     torch.ops.aten.__and__.Tensor: lambda self, other: opset20.And(self, other),
     torch.ops.aten.__or__.Tensor: lambda self, other: opset20.Or(self, other),
@@ -232,6 +244,7 @@ _TRANSLATIONS: dict[Callable[..., Any], Callable[..., Any]] = {
     torch.ops.aten.rsub.Scalar: lambda self, other: opset20.Sub(opset20.CastLike(other, self), self),
     # index % width with a width known only at run time; torch.onnx accepts only numbers
     torch.ops.aten.remainder.Scalar: lambda self, other: opset20.Mod(self, opset20.CastLike(other, self)),
+    torch.ops.aten.floor_divide.default: _floor_divide,
     torch.ops.aten.hypot.default: lambda self, other: opset20.Sqrt(
         opset20.Add(opset20.Mul(self, self), opset20.Mul(other, other))
     ),

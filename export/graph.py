@@ -21,7 +21,7 @@ from torchdof.validation import choice
 
 from .operations import GraphOps, WholeOps
 
-__all__ = ["INPUTS", "LAYOUTS", "OUTPUT", "Layout", "Portable", "Size", "axes", "trace"]
+__all__ = ["INPUTS", "ITEMS", "LAYOUTS", "OUTPUT", "Layout", "Portable", "Size", "axes", "trace"]
 
 Layout = Literal["tiles", "whole"]
 """Structure of a graph: a loop over tiles, or straight operations on whole frames."""
@@ -33,6 +33,9 @@ Size = tuple[int, int] | None
 
 INPUTS = {"depth": ("image", "depth", "focus_m", "f_number"), "coc_px": ("image", "coc_px")}
 """Names of the graph's inputs, in order, for each kind of map."""
+
+ITEMS = "B_or_1"
+"""Name of the batch axis of every input except the image."""
 
 OUTPUT = "out"
 """Name of the graph's output; ONNX does not let it share the name of the input ``image``."""

@@ -7,9 +7,9 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import onnx
+import onnx.compose
+import onnx.inliner
 import onnx.version_converter
-import onnx_ir
-import onnx_ir.passes.common
 
 from torchdof.io.atomic import atomic_file
 from torchdof.validation import choice
@@ -111,58 +111,43 @@ def _prepare(depth_model: Model, opset: int) -> tuple[onnx.ModelProto, tuple[int
         )
     if _opset(model) < opset:
         model = onnx.version_converter.convert_version(model, opset)
-    else:
-        model = onnx.ModelProto.FromString(model.SerializeToString())
-    del model.graph.value_info[:]  # its names of sizes would clash
     return model, (shape[2], shape[3]) if shape[2] and shape[3] else None
 
 
 def _join(parts: Sequence[onnx.ModelProto]) -> onnx.ModelProto:
     """Encoding, estimator, decoding and module as one graph; each part's names get a prefix."""
-    names = ("encode/", "estimator/", "decode/", "dof/")
-    graphs = [_prefixed(part, name) for part, name in zip(parts, names, strict=True)]
-    inputs: list[list[Any]] = [list(graph.inputs) for graph in graphs]
-    (encoded,), (estimate,), (depth,), (out,) = (list(graph.outputs) for graph in graphs)
-    (image,), (pixels,), (values, light, *ends), (sharp, metres, *lens) = inputs
-    nodes, initializers = [], []
-    for graph in graphs:
-        graph.inputs.clear()
-        graph.outputs.clear()
-        initializers += list(graph.initializers.values())
-        graph.initializers.clear()
-        nodes += list(graph)
-        graph.remove(list(graph))
-    for old, new in ((pixels, encoded), (values, estimate), (light, image), (sharp, image), (metres, depth)):
-        old.replace_all_uses_with(new)
-    for value in (image, *ends, *lens, out, depth):
-        value.name = value.name.rpartition("/")[2]
-    depth.name, depth.shape = "depth", metres.shape
-    opsets = {"": _opset(parts[-1])}
-    joint = onnx_ir.Graph(
-        [image, *ends, *lens],
-        [out, depth],
-        nodes=nodes,
-        initializers=initializers,
-        opset_imports=opsets,
-        name="estimated_depth_of_field",
-    )
+    nodes: list[Any] = []
+    initializers: list[Any] = []
+    inputs: dict[str, Any] = {}
+    outputs: dict[str, Any] = {}
+    result = ""
+    for name, part, takes_result in zip(("encode", "estimator", "decode", "dof"), parts, (None, 0, 0, 1), strict=True):
+        graph = onnx.compose.add_prefix(onnx.inliner.inline_local_functions(part), f"{name}/").graph
+        weights = {tensor.name for tensor in graph.initializer}
+        for index, value in enumerate(value for value in graph.input if value.name not in weights):
+            source = "image" if value.name == "decode/light" else value.name.removeprefix(f"{name}/")
+            if index == takes_result:
+                source = result
+            else:
+                inputs.setdefault(source, value)
+            nodes.append(onnx.helper.make_node("Identity", [source], [value.name]))
+        nodes += graph.node
+        initializers += graph.initializer
+        outputs[name], result = graph.output[0], graph.output[0].name
+    interface = {OUTPUT: outputs["dof"], "depth": outputs["decode"]}
+    nodes += [onnx.helper.make_node("Identity", [value.name], [name]) for name, value in interface.items()]
+    for name, value in (*inputs.items(), *interface.items()):
+        value.name = name
+    ends = [*inputs.values()], [*interface.values()]
+    joint = onnx.helper.make_graph(nodes, "estimated_depth_of_field", *ends, initializers)
     dof = parts[-1]
-    model = onnx_ir.Model(joint, ir_version=dof.ir_version)
-    model.producer_name, model.producer_version = dof.producer_name, dof.producer_version
-    return onnx_ir.to_proto(model)
-
-
-def _prefixed(part: onnx.ModelProto, prefix: str) -> onnx_ir.Graph:
-    """A copy of a graph without functions and with a prefix before every name."""
-    copy = onnx_ir.from_proto(onnx.ModelProto.FromString(part.SerializeToString()))  # shares tensors with its source
-    onnx_ir.passes.common.InlinePass()(copy)
-    for graph in (copy.graph, *copy.graph.subgraphs()):
-        values = [*graph.inputs, *graph.initializers.values(), *(value for node in graph for value in node.outputs)]
-        for value in {id(value): value for value in values}.values():
-            value.name = f"{prefix}{value.name}"
-        for node in graph:
-            node.name = node.name and f"{prefix}{node.name}"
-    return copy.graph
+    return onnx.helper.make_model(
+        joint,
+        opset_imports=[onnx.helper.make_opsetid("", _opset(dof))],
+        ir_version=dof.ir_version,
+        producer_name=dof.producer_name,
+        producer_version=dof.producer_version,
+    )
 
 
 def _compare(joint: onnx.ModelProto, path: str, parts: Sequence[onnx.ModelProto], size: tuple[int, int]) -> None:

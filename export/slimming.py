@@ -1,5 +1,6 @@
 """Simplifies a translated graph: one flat, small graph of plain operators that many runtimes can read."""
 
+import functools
 import itertools
 import string
 from collections.abc import Callable
@@ -17,7 +18,6 @@ from .structure import structure
 __all__ = ["slim"]
 
 _WINDOW_DEFAULTS = {"pads": 0, "dilations": 1, "strides": 1}  # defaults of these attributes, for each axis
-_Pass = Callable[[onnx_ir.Model], object]
 
 _WHOLE_AXIS = 2**62  # ends of slices beyond it are those of an axis of any length
 _MAX_EQUAL = 64  # constants with more equal numbers than this are stored as a shape and a value
@@ -28,53 +28,43 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
 
     A ``straight`` graph has none of these; its constants stay initializers, which runtimes for GPUs load once.
 
-    1. Inline functions, fold constants, and replace block means by convolutions.
+    1. Inline functions and fold constants.
     2. Make loops and branches.
     3. Put each convolution's weights into its own graph, and turn initializers into nodes.
     4. Remove default attributes and shorten names.
     """
-    flat: tuple[_Pass, ...] = (
+    share = passes.DeduplicateInitializersPass(size_limit=2**24)
+    lift = passes.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0)
+    # in a straight graph the weights of all convolutions become constants; in tiles more would fill the file
+    limits: Any = {"input_size_limit": 2**24, "output_size_limit": 2**15 if straight else 2**13}
+    steps: tuple[Callable[[onnx_ir.Model], object], ...] = (
         passes.InlinePass(),
         passes.RemoveUnusedFunctionsPass(),
-        passes.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
-        passes.DeduplicateInitializersPass(size_limit=2**24),
+        lift,
+        share,
         # without values of sizes in a straight graph, in which onnx confuses lists of indices with them
         passes.ShapeInferencePass(data_prop=not straight),
-    )
-    tidy: tuple[_Pass, ...] = (
+        functools.partial(fold_constants, **limits),
         passes.RemoveUnusedNodesPass(),  # folding leaves sequences of a wrong type, which shape inference refuses
         passes.ShapeInferencePass(),
         *((_share_sizes,) if straight else ()),
         _join_slices,
-        _convolve_averages,
         passes.IdentityEliminationPass(),
         passes.CommonSubexpressionEliminationPass(),
         passes.RemoveUnusedNodesPass(),
-    )
-    structured: tuple[_Pass, ...] = (
-        passes.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
-        passes.DeduplicateInitializersPass(size_limit=2**24),
+        structure,
+        lift,
+        share,
         passes.CommonSubexpressionEliminationPass(),
         passes.RemoveUnusedNodesPass(),
         passes.RemoveUnusedOpsetsPass(),
         passes.ClearMetadataAndDocStringPass(),
+        *(() if straight else (_place_weights, passes.RemoveUnusedNodesPass(), _as_nodes)),
+        _drop_defaults,
+        _shorten,
     )
-    for step in flat:
+    for step in steps:
         step(model)
-    fold_constants(model, input_size_limit=2**24, output_size_limit=2**13)
-    _fold_weights(model)
-    for step in tidy:
-        step(model)
-    structure(model)
-    for step in structured:
-        step(model)
-    if not straight:
-        _place_weights(model)
-        passes.RemoveUnusedNodesPass()(model)
-        for graph in (model.graph, *model.graph.subgraphs()):
-            _as_nodes(graph)
-    _drop_defaults(model)
-    _shorten(model)
     return model
 
 
@@ -90,8 +80,6 @@ def _share_sizes(model: onnx_ir.Model) -> None:
             held = list(source.shape)[slice(*ends)]
         elif node.op_type == "Slice" and source in sizes and not any(n is None for n in numbers):
             held = sizes[source][int(numbers[0][0]) : int(numbers[1][0])]
-        elif node.op_type == "Gather" and source in sizes and numbers[0] is not None:
-            held = [sizes[source][n] for n in numbers[0].flat]
         else:
             continue
         output = node.outputs[0]
@@ -128,19 +116,6 @@ def _constant(value: onnx_ir.Value | None) -> Any:
     return None if tensor is None else tensor.numpy()
 
 
-def _fold_weights(model: onnx_ir.Model) -> None:
-    """Makes constants of weights of convolutions, which are larger than the other constants that are folded."""
-    weights, makers = [node.inputs[1] for node in model.graph if node.op_type == "Conv"], set()
-    while weights:
-        weight = weights.pop()
-        maker = None if weight is None else weight.producer()
-        if maker is not None and maker not in makers:
-            makers.add(maker)
-            weights += maker.inputs
-    size = 2**24
-    fold_constants(model, input_size_limit=size, output_size_limit=size, should_fold=makers.__contains__)
-
-
 def _place_weights(model: onnx_ir.Model) -> None:
     """Puts weights of convolutions into the graph that uses them; only then runtimes arrange them for speed."""
     for graph in (model.graph, *model.graph.subgraphs()):
@@ -161,27 +136,26 @@ def _place_weights(model: onnx_ir.Model) -> None:
             node.replace_input_with(1, local_weight)
 
 
-def _as_nodes(graph: onnx_ir.Graph) -> None:
+def _as_nodes(model: onnx_ir.Model) -> None:
     """Turns initializers into nodes; many equal numbers then take no space."""
-    first = next(iter(graph), None)
-    values: list[Any] = list(graph.initializers.values())
-    for value in values:
-        if not value.uses():
+    for graph in (model.graph, *model.graph.subgraphs()):
+        tape = Tape()
+        values: list[Any] = list(graph.initializers.values())
+        for value in values:
             del graph.initializers[value.name]
-            continue
-        tape, array = Tape(), value.const_value.numpy()
-        if array.size > _MAX_EQUAL and (array == array.flat[0]).all():
-            shape = tape.op("Constant", [], {"value_ints": list(array.shape)})
-            tape.op("ConstantOfShape", [shape], {"value": onnx_ir.tensor(array.flat[:1])})
-            shape.name = f"{value.name}_shape"
-        else:
-            tape.op("Constant", [], {"value": value.const_value})
-        constant = tape.nodes[-1].outputs[0]
-        constant.name = value.name
-        del graph.initializers[value.name]
-        value.replace_all_uses_with(constant)
-        if first is not None:
-            graph.insert_before(first, list(tape.nodes))
+            if not value.uses():
+                continue
+            array = value.const_value.numpy()
+            if array.size > _MAX_EQUAL and (array == array.flat[0]).all():
+                shape = tape.op("Constant", [], {"value_ints": list(array.shape)})
+                shape.name = f"{value.name}_shape"
+                constant = tape.op("ConstantOfShape", [shape], {"value": onnx_ir.tensor(array.flat[:1])})
+            else:
+                constant = tape.op("Constant", [], {"value": value.const_value})
+            constant.name = value.name
+            value.replace_all_uses_with(constant)
+        if tape.nodes:
+            graph.insert_before(next(iter(graph)), list(tape.nodes))
 
 
 def _initializer(graph: onnx_ir.Graph, array: np.ndarray, name: str) -> onnx_ir.Value:
@@ -191,29 +165,6 @@ def _initializer(graph: onnx_ir.Graph, array: np.ndarray, name: str) -> onnx_ir.
     )
     graph.register_initializer(value)
     return value
-
-
-def _convolve_averages(model: onnx_ir.Model) -> None:
-    """Block means before a convolution become a convolution, which is several times as fast in runtimes."""
-    for node in list(model.graph):
-        following = [use.node for use in node.outputs[0].uses()] if node.op_type == "AveragePool" else []
-        if [n.op_type for n in following] != ["Pad"]:
-            continue
-        (pad,) = following
-        scale = node.attributes["kernel_shape"].as_ints()[0]
-        filled_shape: Any = pad.outputs[0].shape
-        channels = int(filled_shape[1])
-        weight = np.full((channels, 1, scale, scale), scale**-2.0, np.float32)
-        tape = Tape()
-        filled = tape.op("Pad", [node.inputs[0], *pad.inputs[1:]])
-        name = f"mean_{node.outputs[0].name}"
-        kernel = _initializer(model.graph, weight, f"{name}_weight")
-        mean = tape.op("Conv", [filled, kernel], {"group": channels, "strides": [scale, scale]}, name=name)
-        old = pad.outputs[0]
-        mean.type, mean.shape = old.type, old.shape
-        model.graph.insert_before(pad, list(tape.nodes))
-        old.replace_all_uses_with(mean)
-        model.graph.remove([pad, node], safe=True)
 
 
 def _drop_defaults(model: onnx_ir.Model) -> None:

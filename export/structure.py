@@ -1,8 +1,8 @@
 """Loops and branches: placeholder operators in a traced graph, which is flat, and what becomes of them.
 
-One operator numbers the steps of a loop, another collects their results: nodes that depend on a step become the body of
-a ``Loop``. A third chooses between two results: nodes that only one side of a choice uses become that side's branch of
-an ``If``, and are computed only if it is taken.
+One operator numbers the steps of a loop, another takes their results: nodes that depend on a step become the body of a
+``Loop``. A third chooses between two results: nodes that only one side of a choice uses become that side's branch of an
+``If``, and are computed only if it is taken.
 """
 
 from collections.abc import Sequence
@@ -13,13 +13,11 @@ import torch
 from onnx_ir.tape import Tape
 from torch import Tensor
 
-__all__ = ["DOMAIN", "choose", "collect", "operator", "steps", "structure"]
+__all__ = ["carried", "choose", "collect", "last", "operator", "steps", "structure"]
 
-DOMAIN = "torchdof"
-"""Domain of these operators; a finished file contains none."""
-
-_CHOICE, _STEP, _COLLECT = (f"{DOMAIN}::{name}" for name in ("Choice", "Step", "Collect"))
-"""``Choice(result, given, needed)``; ``Step(count)``, the number of a step from 0; ``Collect(result, step)``."""
+_CHOICE, _STEP, _COLLECT, _CARRIED, _LAST = (f"torchdof::{n}" for n in ("Choice", "Step", "Collect", "Carried", "Last"))
+"""``Choice(result, given, needed)``; ``Step(count)``, the number of a step from 0; ``Collect(result, step)``;
+``Carried(initial, step)``; ``Last(after, step, carried)``. A finished file contains none of them."""
 
 
 def choose(needed: Tensor, result: Tensor, given: Tensor) -> Tensor:
@@ -37,6 +35,16 @@ def collect(step: Tensor, result: Tensor, count: int | torch.SymInt) -> Tensor:
     return operator(_COLLECT, [result, step], (count, *result.shape[1:]))
 
 
+def carried(step: Tensor, initial: Tensor) -> Tensor:
+    """A value that each step takes over from the step before it (:func:`last`); in the first step ``initial``."""
+    return operator(_CARRIED, [initial, step], initial.shape)
+
+
+def last(step: Tensor, before: Tensor, after: Tensor) -> Tensor:
+    """The value after all steps, each of which makes ``after`` of ``before``, a value of :func:`carried`."""
+    return operator(_LAST, [after, step, before], after.shape)
+
+
 def operator(name: str, inputs: Sequence[Tensor], shape: Sequence[int | torch.SymInt]) -> Tensor:
     """An operator of ONNX in a graph; its result has the dtype of its first input."""
     return torch.onnx.ops.symbolic(name, inputs, dtype=inputs[0].dtype, shape=list(shape))
@@ -48,7 +56,7 @@ _Owners = dict[Any, onnx_ir.Node]  # node that owns a subgraph
 def structure(model: onnx_ir.Model) -> None:
     """Makes loops and branches of a flat graph, in place."""
     owners: _Owners = {a.as_graph(): n for n in model.graph for a in n.attributes.values() if _is_graph(a)}
-    for node in _ours(model.graph, _COLLECT):
+    for node in (*_ours(model.graph, _COLLECT), *_ours(model.graph, _LAST)):
         _loop(model.graph, node, owners)
     _branches(model.graph, owners)
 
@@ -57,32 +65,37 @@ def _ours(graph: onnx_ir.Graph, name: str) -> list[onnx_ir.Node]:
     return [node for node in graph if f"{node.domain}::{node.op_type}" == name]
 
 
-def _loop(graph: onnx_ir.Graph, collect: onnx_ir.Node, owners: _Owners) -> None:
-    """Moves the nodes between a step and ``collect`` into the body of a loop."""
-    inputs: list[Any] = list(collect.inputs)
-    result, step = inputs
+def _loop(graph: onnx_ir.Graph, end: onnx_ir.Node, owners: _Owners) -> None:
+    """Moves the nodes between a step and ``end``, which takes its result, into the body of a loop."""
+    inputs: list[Any] = list(end.inputs)
+    result, step, *carried = inputs
     dependent, body_nodes = {step.producer()}, []
     for node in graph:
-        if node is not collect and any(v is not None and v.producer() in dependent for v in node.inputs):
+        if node is not end and any(v is not None and v.producer() in dependent for v in node.inputs):
             dependent.add(node)
-            body_nodes.append(node)
+            if node not in [value.producer() for value in carried]:
+                body_nodes.append(node)
     for node in body_nodes:
         graph.remove(node)
-    number, keep_going = _value("step", onnx_ir.DataType.INT64), _value("going", onnx_ir.DataType.BOOL)
-    step.replace_all_uses_with(number)
+    number, keep_going = _value("step", onnx_ir.DataType.INT64, []), _value("going", onnx_ir.DataType.BOOL, [])
+    befores = [_value("before", value.dtype, value.shape) for value in carried]
+    for old, new in zip((step, *carried), (number, *befores), strict=True):
+        old.replace_all_uses_with(new)
     inner, outer = Tape(), Tape()
     condition = inner.op("Identity", [keep_going])
-    squeezed = inner.op("Squeeze", [result, inner.op("Constant", [], {"value_ints": [0]})])
     _type(condition, onnx_ir.DataType.BOOL, [])
-    _type(squeezed, result.dtype, result.shape[1:])
+    axis = inner.op("Constant", [], {"value_ints": [0]})
+    after = inner.op("Identity", [result]) if carried else inner.op("Squeeze", [result, axis])
+    _type(after, result.dtype, result.shape if carried else result.shape[1:])
     nodes = [*body_nodes, *inner.nodes]
-    body = onnx_ir.Graph([number, keep_going], [condition, squeezed], nodes=nodes, name="step")
+    body = onnx_ir.Graph([number, keep_going, *befores], [condition, after], nodes=nodes, name="step")
     true = outer.op("Constant", [], {"value": onnx_ir.tensor(True)})
-    loop = onnx_ir.node("Loop", [step.producer().inputs[0], true], {"body": body})
-    graph.insert_before(collect, [*outer.nodes, loop])
+    initials = [value.producer().inputs[0] for value in carried]
+    loop = onnx_ir.node("Loop", [step.producer().inputs[0], true, *initials], {"body": body})
+    graph.insert_before(end, [*outer.nodes, loop])
     owners[body] = loop
-    _replace(graph, collect, loop)
-    graph.remove(step.producer(), safe=True)
+    _replace(graph, end, loop)
+    graph.remove([value.producer() for value in (*carried, step)], safe=True)
 
 
 def _branches(graph: onnx_ir.Graph, owners: _Owners) -> None:
@@ -154,8 +167,8 @@ def _replace(graph: onnx_ir.Graph, old: onnx_ir.Node, new: onnx_ir.Node) -> None
     graph.remove(old, safe=True)
 
 
-def _value(name: str, kind: onnx_ir.DataType) -> onnx_ir.Value:
-    return onnx_ir.Value(name=name, shape=onnx_ir.Shape([]), type=onnx_ir.TensorType(kind))
+def _value(name: str, kind: onnx_ir.DataType, shape: Any) -> onnx_ir.Value:
+    return onnx_ir.Value(name=name, shape=onnx_ir.Shape(shape), type=onnx_ir.TensorType(kind))
 
 
 def _type(value: onnx_ir.Value, kind: onnx_ir.DataType, shape: Any) -> None:

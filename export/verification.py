@@ -16,8 +16,7 @@ from torchdof import DepthOfField
 from torchdof.reference import metrics
 
 from .cases import Case, cases
-from .graph import INPUTS, OUTPUT, Portable
-from .interface import ITEMS
+from .graph import INPUTS, ITEMS, OUTPUT, Portable
 from .metadata import facts_of, load, settings
 
 __all__ = ["TOLERANCE", "CaseComparison", "Verification", "check_format", "session", "verify"]

@@ -198,9 +198,7 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
                 if drawn is not None:
                     drawn.pop("depth", None)
 
-    def _forward_dict(
-        self, sample: Mapping[str, Any], params: dict[str, Tensor] | None, **kwargs: Any
-    ) -> dict[str, Any]:
+    def _forward_dict(self, sample: Mapping[str, Any], params: Any, **kwargs: Any) -> dict[str, Any]:
         """Blur a sample that is a dict, as in torchvision's transforms."""
         key = next((name for name in _IMAGE_NAMES if name in sample), "image")
         if key not in sample or "depth" not in sample:
@@ -385,9 +383,7 @@ def _range(name: str, value: Any, largest: float) -> tuple[float, float]:
 def _batch_shape(image: Any) -> tuple[int, ...]:
     """Shape ``[B, C, H, W]`` of one image or a batch."""
     if not floating(image) or image.ndim not in (3, 4):
-        expected = (
-            "a floating-point tensor [B, C, H, W] or [C, H, W] (bytes: image.float() / 255; clips: flatten(0, 1))"
-        )
+        expected = "floating point [B, C, H, W] or [C, H, W] (bytes: image.float() / 255; clips: flatten(0, 1))"
         raise ValueError(f"image must be {expected}, got {show(image)}")
     return tuple(image.shape) if image.ndim == 4 else (1, *image.shape)
 

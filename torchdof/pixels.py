@@ -77,10 +77,12 @@ def corners(item: Tensor, row: Tensor, column: Tensor, height: int, width: int) 
 
     Returns:
         The four pixels around each place (top left, top right, bottom left, bottom right), and the weights of the lower
-        row and of the right column. On an axis of one pixel the weight is 0.
+        row and of the right column. On an axis of one pixel both are the same pixel.
     """
-    row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)
-    top, left = row.floor().clamp(max=max(0, height - 2)), column.floor().clamp(max=max(0, width - 2))
-    first = (item * height + top.long()) * width + left.long()
-    down, right = min(1, height - 1) * width, min(1, width - 1)  # index steps; 0 on an axis of one pixel
-    return [first, first + right, first + down, first + (down + right)], row - top, column - left
+    row, column = row.clamp_min(0), column.clamp_min(0)
+    top, left = (t.long().clamp(max=n - 2).clamp_min(0) for t, n in ((row, height), (column, width)))
+    first = (item * height + top) * width + left
+    # index steps; 0 on an axis of one pixel
+    down, right = torch.sym_min(1, height - 1) * width, torch.sym_min(1, width - 1)
+    weights = (row - top).clamp(max=1), (column - left).clamp(max=1)
+    return [first, first + right, first + down, first + (down + right)], *weights

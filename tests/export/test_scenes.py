@@ -4,7 +4,6 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -74,12 +73,10 @@ def test_kernels_of_a_file_equal_those_of_its_table(shape: str) -> None:
     made = {"disc": BlurTable.disc, "polygon": lambda: BlurTable.polygon(blades=5, rotation_deg=10.0)}
     table = made[shape]() if shape in made else BlurTable.load(shape)
     plan = Plan.static(3.0, 1 / 255, rays=True)
-    values, origins, halves, is_round, per_px, *_ = rays.kernels_of(table, plan, 1)
-    values_at: Any = rays.values_at
+    kernels = rays.kernels_of(table, plan, 1)
     for coc_px in (-2.75, 0.5, 3.0):
         expected = table.kernels(torch.tensor([coc_px]), 1).float()[0, :, None]
         half = expected.shape[-1] // 2 + 2  # 2 px of zeros around the kernel
-        node = np.array([len(halves) // 2 + round(coc_px * per_px)])
-        arrays = [t.numpy() for t in (values, origins, halves, is_round)]
-        got = torch.from_numpy(values_at(*arrays, node, np.arange(-half, half + 1)))
+        node = torch.tensor([len(kernels.halves) // 2 + round(coc_px * kernels.per_px)])
+        got = rays._values_at(kernels, node, torch.arange(-half, half + 1))
         torch.testing.assert_close(got, torch.nn.functional.pad(expected, (2, 2, 2, 2)), rtol=1e-6, atol=1e-9)

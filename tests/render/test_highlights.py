@@ -76,7 +76,7 @@ def test_a_ray_is_stopped_by_every_nearer_surface_it_hits(stretch: float, half: 
     others = torch.where(covers < 0.3, 0.9 - covers, HIDDEN_WEIGHT)  # a hidden surface stops no rays
     nothing = torch.zeros_like(coc_px)
     shown = [Surface(nothing, coc_px, covers), Surface(nothing, other_px, others)]
-    hiding = highlights._Occluders(highlights._obstacles(shown))
+    hiding = highlights.Occluders(highlights._obstacles(shown))
     hidden = hiding.hidden(torch.zeros_like(source), row, column, coc, step)
 
     wanted = torch.zeros_like(hidden)

@@ -226,9 +226,8 @@ def _blade(half_angle: float, curvature: float) -> tuple[Tensor, Tensor]:
 def _polygon_shares(x: Tensor, y: Tensor, count: int) -> Tensor:
     """Area of polygons with corners ``[m, V]`` in unit squares: ``[m, count, count]``, the first square at (0, 0).
 
-    1. Cut each edge at the rows of squares.
-    2. For each piece and each vertical grid line, integrate over y the part of ``[0, line]`` left of the piece.
-    3. Sum over the pieces, signed by their direction; neighbouring grid lines differ by the area between them.
+    Each edge is cut at the rows of squares. The area left of each vertical grid line is a sum over these pieces,
+    signed by their direction.
     """
     items, next_x, next_y = len(x), x.roll(-1, -1), y.roll(-1, -1)
     row = torch.arange(count, dtype=torch.float64, device=x.device)[:, None]

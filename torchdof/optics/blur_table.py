@@ -125,8 +125,8 @@ class BlurTable:
         self.strength = self._per_node("strength", strength)
         self.residual = self._per_node("residual", residual)
         self.provenance = dict(provenance or {})
-        self.aperture = aperture
-        self.field = self._check_field(field)
+        self.aperture, self.field = aperture, field
+        self._check_field()
         self._fingerprint: str | None = None
 
     @classmethod
@@ -256,10 +256,10 @@ class BlurTable:
     def fingerprint(self) -> str:
         """Hash of all numbers that kernels depend on; computed once."""
         if self._fingerprint is None:
-            data: list[Any] = [self.family, self.unit, self.sensor_width_mm, self.px_per_unit(1.0), self.coc.tolist()]
-            data += [(name, value.tolist()) for name, value in self._params.items()]
-            data.append(None if self.aperture is None else self.aperture.to_dict())
-            data.append(None if self.field is None else self.field.fingerprint())
+            aperture = None if self.aperture is None else self.aperture.to_dict()
+            field = None if self.field is None else self.field.fingerprint()
+            params = {name: value.tolist() for name, value in self._params.items()}
+            data = (self.family, self.unit, self.sensor_width_mm, self.coc.tolist(), params, aperture, field)
             self._fingerprint = hashlib.sha256(repr(data).encode()).hexdigest()
         return self._fingerprint
 
@@ -452,6 +452,7 @@ class BlurTable:
         """
         if self.unit == "relative":
             return 1.0
+        width = width.detach() if isinstance(width, Tensor) else width
         return float(width) if self.sensor_width_mm is None else width / self.sensor_width_mm
 
     def _check_params(self, params: Mapping[str, Any]) -> dict[str, Tensor]:
@@ -472,9 +473,10 @@ class BlurTable:
         channels = max(v.shape[0] for v in checked.values())
         return {name: value.expand(channels, *value.shape[1:]).contiguous() for name, value in checked.items()}
 
-    def _check_field(self, field: Field | None) -> Field | None:
+    def _check_field(self) -> None:
+        field = self.field
         if field is None:
-            return None
+            return
         if self.aperture is not None:
             raise ValueError(f"a table with a field has its own opening, got {self.aperture!r} too; leave one out")
         if self.unit == "relative":
@@ -484,7 +486,6 @@ class BlurTable:
         self._check_extent("field.radius", "field.box", float(field.radius[-1]))
         for cocs in (field.coc[field.coc <= 0], field.coc[field.coc >= 0]):
             self._check_extent("field.coc", "field.box", float(cocs.abs().max()), float(field.reach(cocs).max()))
-        return field
 
     def _check_extent(self, ends: str, lengths: str, end: float, reach: float = 0.0) -> None:
         """Refuse a side of focus that ends at an absurd coc, or a blur there that reaches absurdly far."""

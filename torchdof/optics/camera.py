@@ -271,32 +271,6 @@ class Camera:
             raise ValueError("focus_mask must be >= 0 everywhere")
         return self._focused(depth, mask, "where focus_mask is above 0")
 
-    def focus_in(self, depth: Tensor, box: tuple[float, float, float, float]) -> "Camera":
-        """This camera focused on the content of a box, as autofocus does: the median, weighted towards the middle.
-
-        Weights are Gaussian; the standard deviation along each axis is a quarter of the box's side.
-
-        Args:
-            depth: As in :meth:`focus_at`.
-            box: ``(left, top, right, bottom)`` in pixels from the frame's top left corner.
-
-        Raises:
-            ValueError: If the box holds no pixel's centre, or no valid depth.
-        """
-        one_channel("depth", depth, "in metres")
-        if len(box) != 4 or any(isinstance(v, bool) or not isinstance(v, int | float) for v in box):
-            raise ValueError(f"box must be (left, top, right, bottom) in pixels, got {show(box)}")
-        weights = []
-        for low, high, size in ((box[1], box[3], depth.shape[-2]), (box[0], box[2], depth.shape[-1])):
-            centres = torch.arange(size, dtype=depth.dtype, device=depth.device) + 0.5
-            inside = (centres >= low) & (centres <= high)
-            if not bool(inside.any()):
-                frame = f"{depth.shape[-1]} x {depth.shape[-2]}"
-                raise ValueError(f"box must hold pixels of the frame of {frame}: (left, top, right, bottom), got {box}")
-            offset = (centres - (low + high) / 2) / max((high - low) / 4, 1e-3)
-            weights.append(torch.where(inside, torch.exp(-0.5 * offset.square()), 0.0))
-        return self._focused(depth, (weights[0][:, None] * weights[1])[None, None], f"in the box {show(box)}")
-
     def _focused(self, depth: Tensor, weight: Tensor, location: str) -> "Camera":
         """This camera with the weighted median of the distances that would bring each pixel into focus."""
         distance = depth
@@ -323,7 +297,7 @@ class Camera:
         on the sensor, the distance is ``f^2 / (n c) + f``.
         """
         _check_number("coc_px", coc_px)
-        at_infinity = self.replace(focus_m=math.inf)
+        at_infinity = dataclasses.replace(self, focus_m=math.inf, focus_range_m=None)
         hyperfocal = at_infinity.aperture_radius_m * at_infinity.focal_px(width) / coc_px
         return hyperfocal + self.focal_length_mm / 1000.0 if self.focus_breathing else hyperfocal
 

@@ -123,9 +123,8 @@ class KernelBank:
             slopes = [(r[node + 1] - r[node]) * slope for r in reaches]
             sizes = [r[node] + part * (r[node + 1] - r[node]) for r in reaches]
         if self.table.field is not None:
-            spot_reach = float(
-                self.table.field.reach(torch.tensor([coc_px / per_unit], dtype=torch.float64, device="cpu"))[0]
-            )
+            coc = torch.tensor([coc_px / per_unit], dtype=torch.float64, device="cpu")
+            spot_reach = float(self.table.field.reach(coc)[0])
             sizes, slopes = [spot_reach * min(abs(coc_px), 1.0)] * self.colours, [0.0] * self.colours
         return _Place(side, node, part, [size * per_unit for size in sizes], slope / per_unit, slopes)
 
@@ -167,11 +166,9 @@ class KernelBank:
                 if level < _LEVELS - 1:
                     cell = largest / (_LEAST_CELLS << level)
                     finer = min(max((cell - _FADE_START_PX) / (1.0 - _FADE_START_PX), 0.0), 1.0)
-                ends = [
-                    (place.side, place.node + above, level + up) for up in range(1 + (finer > 0)) for above in (0, 1)
-                ]
-                indices = [index_of(*end) for end in ends]
-                index = (indices[0], indices[1], indices[-2], indices[-1])
+                nodes, levels = (place.node, place.node + 1), (level, level + (finer > 0))
+                low, high, fine_low, fine_high = (index_of(place.side, n, each) for each in levels for n in nodes)
+                index = (low, high, fine_low, fine_high)
             spots.which.append(index)
             spots.part.append(place.part)
             spots.finer.append(finer)
@@ -182,10 +179,8 @@ class KernelBank:
         if self._gradients:
             templates = [self._template(*key) for key in keys]
         else:
-            template_keys = [(self._lens, *key) for key in keys]
-            templates = _templates.get_all(
-                template_keys, lambda missing: [self._kept_template(*k[1:]) for k in missing]
-            )
+            of_lens = [(self._lens, *key) for key in keys]
+            templates = _templates.get_all(of_lens, lambda missing: [self._kept_template(*k[1:]) for k in missing])
         halves = [min(half, n - 1) for half, n in zip(spots.half, longest, strict=True)] if longest else spots.half
         moves = None
         if isinstance(coc_px, Tensor) and is_differentiated(coc_px):

@@ -89,24 +89,20 @@ def _squeeze(table: Table) -> float | Tensor:
 def _computed(table: Table, coc_px: float, scale: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Values and boxes of :class:`FieldMask`, float64.
 
-    For the spots of a field:
-
-    1. Take boxes and light at each distance, in pixels of the layer, shrunk to 0 in focus.
-    2. Shrink the boxes so that the blur that downsampling and sampling add leaves the right variance.
-    3. Average the cells of each spot over the pixel around each sample, and scale the maximum to 1.
+    Of a spot, the values are means over the pixel around each sample, with a maximum of 1. Its box is shrunk so that
+    the blur that downsampling and sampling add leaves the right variance.
     """
-    half_diagonal = 0.5 * math.hypot(*size)
-    distance = torch.linspace(0.0, 1.0, DISTANCES, dtype=torch.float64, device="cpu")
+    distance = _line(0.0, DISTANCES)
     if table.field is None:
         return _through_rims(table, coc_px / scale, size[1] / scale, distance)
     per_unit = table.px_per_unit(size[1])
-    boxes, light = table.field.spots(coc_px / per_unit, distance * half_diagonal / per_unit)
+    boxes, light = table.field.spots(coc_px / per_unit, distance * (0.5 * math.hypot(*size)) / per_unit)
     # below 1 px the spot shrinks with the coc, so that a point in focus stays a point and blur starts continuously
     boxes = boxes * (per_unit / scale * min(1.0, max(abs(coc_px), _MIN_SCALE_PX)))
     # variance added by averaging blocks, interpolating between them, and by the box of a pixel below, in px^2
     added_variance = (1 / 4 - 1 / (12 * scale**2) if scale > 1 else 0.0) + 1 / 12
-    rows, columns = light.shape[-2:]
-    cells = boxes[:, 1:] * torch.tensor([2.0 / rows, 1.0 / columns], dtype=torch.float64, device="cpu")
+    length, width = light.shape[-2:]
+    cells = boxes[:, 1:] * torch.tensor([2.0 / length, 1.0 / width], dtype=torch.float64, device="cpu")
     spread = deviations(boxes, light).square()
     shrink = (1.0 - added_variance / spread.clamp_min(1e-12)).clamp_min(_MIN_SHRINK**2).sqrt()
     boxes = torch.cat([boxes[:, :1], boxes[:, 1:] * shrink], -1)
@@ -115,11 +111,9 @@ def _computed(table: Table, coc_px: float, scale: int, size: tuple[int, int]) ->
     rows, columns = (math.ceil(number) for number in ideal_counts.tolist())
     counts = torch.tensor([rows, columns], device="cpu")
     extent[:, 1:] *= counts / ideal_counts  # a sample's size is a continuous function of the radius
-    along = torch.linspace(-1.0, 1.0, 2 * rows + 1, dtype=torch.float64, device="cpu") * extent[:, 1:2] + extent[:, :1]
-    across = torch.linspace(0.0, 1.0, columns + 1, dtype=torch.float64, device="cpu") * extent[:, 2:]
-    length, width = light.shape[-2:]
-    row_edges = torch.linspace(-1.0, 1.0, length + 1, dtype=torch.float64, device="cpu") * boxes[:, 1:2] + boxes[:, :1]
-    column_edges = torch.linspace(-1.0, 1.0, 2 * width + 1, dtype=torch.float64, device="cpu") * boxes[:, 2:]
+    along, across = _line(-1.0, 2 * rows + 1) * extent[:, 1:2] + extent[:, :1], _line(0.0, columns + 1) * extent[:, 2:]
+    row_edges = _line(-1.0, length + 1) * boxes[:, 1:2] + boxes[:, :1]
+    column_edges = _line(-1.0, 2 * width + 1) * boxes[:, 2:]
     mirrored = torch.cat([light.flip(-1), light], -1)  # [C, distances, U, 2 V]
     area = cells.prod(-1)[:, None, None]
     # width of the average: a pixel, minus the variance that cells and linear interpolation between samples add
@@ -137,8 +131,7 @@ def _through_rims(table: Table, coc_px: float, width: float, distance: Tensor) -
     reach = math.ceil((math.ceil(table.reach_px(coc_px, width)) + 1) * max(1.0, float(table.aperture.squeeze)))
     boxes = torch.tensor([0.0, reach, reach], dtype=torch.float64, device="cpu").expand(len(distance), 3)
     count = min(2 * _MAX_SAMPLES, reach)
-    along = torch.linspace(-1.0, 1.0, 2 * count + 1, dtype=torch.float64, device="cpu") * boxes[0, 1]
-    across = torch.linspace(0.0, 1.0, count + 1, dtype=torch.float64, device="cpu") * boxes[0, 2]
+    along, across = _line(-1.0, 2 * count + 1) * reach, _line(0.0, count + 1) * reach
     front, rear = table.aperture.rims
     depths = []
     for shift in (2.0 * front * coc_px, -2.0 * rear * coc_px):
@@ -147,6 +140,11 @@ def _through_rims(table: Table, coc_px: float, width: float, distance: Tensor) -
         slack = 4.0 * (abs(coc_px) + 1.0) * (1.0 - abs(shift) * distance).clamp_min(0.0)[:, None, None]
         depths.append(abs(coc_px) + 0.5 + slack - distance_px)
     return torch.minimum(*depths).unsqueeze(0), boxes.contiguous()
+
+
+def _line(start: float, count: int) -> Tensor:
+    """Numbers from ``start`` to 1, float64."""
+    return torch.linspace(start, 1.0, count, dtype=torch.float64, device="cpu")
 
 
 def placed(kernel: Tensor, masks: Sequence[tuple[FieldMask, Tensor]], y: Tensor, x: Tensor) -> Tensor:

@@ -9,16 +9,14 @@ estimate J between the samples. The kernel of least error over pictures of a pow
     ``K^(f) = sum_i P(f + i) psf^(f + i) / sum_i P(f + i)``,
 
 that is ``K[m] = integral psf(x) phi(m - x) dx``, with the interpolator ``phi^(f) = P(f) / sum_i P(f + i)``. Photographs
-have ``S ~ 1 / f^2``; for them the separable cardinal cubic spline is as good a phi. It changes no second moment: a
-Gaussian of 1.3 px gives a kernel of standard deviation 1.3 px. Where the lobes of phi make a pixel negative, its four
-neighbours give up light to raise it to 0 (:func:`_non_negative`). Kernels of discs are then within 0.3 dB of the
-non-negative kernel of least error. As a length goes to 0, the kernel approaches a single pixel with its square.
+have ``S ~ 1 / f^2``; for them the separable cardinal cubic spline is as good a phi. It changes no second moment. Where
+its lobes make a pixel negative, the four neighbours give up light to raise it to 0 (:func:`_non_negative`). Kernels of
+discs are then within 0.3 dB of the non-negative kernel of least error.
 
 The integral is a sum over square cells: 16 from the centre to the end of a small PSF, cells of a pixel in a large one.
 Every family is a profile ``f(r)`` over the distance ``r`` from the centre. The integral over a cell is exact for
-``gaussian`` and ``disc``. For the other families, circles cut the cell into thin slices. The area of each slice is
-exact (circle against square), and within a slice ``f`` is replaced by its mean over r, which has a closed form for
-every family.
+``gaussian`` and ``disc``. For the others, circles cut the cell into thin slices of exact area, in which ``f`` is
+replaced by its mean over r in closed form.
 
 An aperture (:mod:`torchdof.optics.aperture`) multiplies the profile, and cuts off the part outside of the opening. The
 circumscribed circle of the opening has the radius ``radius``, ``2 sigma`` for ``gaussian`` and ``r_c + 2 sigma`` for
@@ -45,17 +43,7 @@ from ..validation import broadcast_shapes, choice, numbers, real_tensor, short, 
 from .aperture import Aperture
 from .kernel_cache import kept
 
-__all__ = [
-    "FAMILIES",
-    "checked",
-    "opening_radius",
-    "pixel_kernels",
-    "profile",
-    "reach",
-    "sampled",
-    "support",
-    "template",
-]
+__all__ = ["FAMILIES", "LENGTHS", "checked", "pixel_kernels", "profile", "reach", "sampled", "support", "template"]
 
 FAMILIES: dict[str, tuple[str, ...]] = {
     "gaussian": ("sigma",),
@@ -352,10 +340,9 @@ def _cardinal_spline(t: Tensor) -> Tensor:
 
 
 def _non_negative(kernel: Tensor) -> Tensor:
-    """Raises negative values ``[..., n, n]`` to 0 with light from their four neighbours.
+    """Raises negative values ``[..., n, n]`` to 0 with light from their four neighbours, in proportion to their own.
 
-    Each neighbour gives light in proportion to its own. Light moves by one pixel only, which hardly changes the low
-    frequencies, where photographs have most of their power.
+    Light moves by one pixel only, which hardly changes the low frequencies, where photographs have most of their power.
     """
     positive, deficit = kernel.clamp_min(0.0), (-kernel).clamp_min(0.0)
     neighbour_light = _neighbours(positive)
@@ -434,9 +421,7 @@ def _table_integral(r: Tensor, p: Mapping[str, Tensor]) -> Tensor:
     last = values.shape[-1] - 1
     position = (r / radius).clamp(max=1.0) * last
     low = position.detach().floor().long().clamp(max=last - 1)
-    cumulative = torch.cat(
-        [torch.zeros_like(values[..., :1]), torch.cumsum((values[..., 1:] + values[..., :-1]) / 2, -1)], -1
-    )
+    cumulative = functional.pad(torch.cumulative_trapezoid(values), (1, 0))
     batch = broadcast_shapes(values.shape[:-1], low.shape[:-2])
     flat = low.expand(*batch, *low.shape[-2:]).flatten(-2)
     start, left, right = (

@@ -247,7 +247,7 @@ def _splatted(
     across = width + 2 * margin
     area = (height + 2 * margin) * across
     splats = light.new_zeros(len(light), batch * area)
-    hiding = _Occluders(obstacles) if obstacles else None
+    hiding = Occluders(obstacles) if obstacles else None
     most = len(radii) if hiding is None else max(1, _PAIRS // hiding.bins)
     start = 0
     while start < len(radii):  # bounded by the first radius of the chunk, then by its last
@@ -280,15 +280,17 @@ def _obstacles(surfaces: Sequence[Surface]) -> list[tuple[Tensor, Tensor]]:
     return [(s.coc_px, cover) for s, cover in zip(surfaces, covers, strict=True)]
 
 
-class _Occluders:
+class Occluders:
     """Occluders: coc and cover of the surfaces of an image, in bins of 1 px of coc."""
 
-    def __init__(self, obstacles: Sequence[tuple[Tensor, Tensor]]) -> None:
+    def __init__(self, obstacles: Sequence[tuple[Tensor, Tensor]], bins: int | None = None) -> None:
         coc_px = obstacles[0][0].detach()
-        self.height, self.width = int(coc_px.shape[-2]), int(coc_px.shape[-1])
+        self.height, self.width = coc_px.shape[-2:]
         self.low = coc_px.amin((1, 2, 3))
         shown = [(coc - self.low[:, None, None, None], cover) for coc, cover in obstacles]  # coc in bins
-        self.bins = int(torch.stack([place.detach().amax() for place, _ in shown]).amax()) + 2
+        if bins is None:
+            bins = int(torch.stack([place.detach().amax() for place, _ in shown]).amax()) + 2
+        self.bins = bins
         self.counts = covered_cells([(place.detach(), cover.detach()) for place, cover in shown], self.bins)
         self.shown = [torch.stack([t.flatten() for t in maps]) for maps in zip(*shown, strict=True)]
 
@@ -304,22 +306,29 @@ class _Occluders:
         fades = (coc[:, None] - NEARER_PX - nearer).clamp(0.0, 1.0)
         # pairs of a highlight and a bin with a non-empty cell within reach
         reach = scale.detach().abs() * step[-1]
+        ends = (-reach, reach + 1.0)
         (top, bottom), (left, right) = (
-            [(place[:, None] + end).clamp(0, size - 1).long() // COARSE_CELL for end in (-reach, reach + 1.0)]
+            [(place[:, None] + end).clamp_min(0).long().clamp(max=size - 1) // COARSE_CELL for end in ends]
             for place, size in ((row, self.height), (column, self.width))
         )
         bottom, right = bottom + 1, right + 1
-        corners = ((bottom, right, 1), (top, right, -1), (bottom, left, -1), (top, left, 1))
-        count = sum(sign * self.counts[bins, item[:, None], y, x] for y, x, sign in corners)
-        pairs = ((count > 0) & (fades.detach() > 0)).nonzero()
-        hidden = coc.new_zeros(len(coc), len(step), len(step))
+        _, items, rows, columns = self.counts.shape
+        line = (bins * items + item[:, None]) * rows
 
-        def blocked(source: Tensor, bin_of: Tensor) -> Tensor:
-            """Fraction of the rays of highlights ``[P]`` that these bins ``[P]`` block, ``[P, k, k]``."""
-            pair = source * self.bins + bin_of
+        def count_at(y: Tensor, x: Tensor) -> Tensor:
+            return self.counts.flatten().index_select(0, ((line + y) * columns + x).flatten())
+
+        count = count_at(bottom, right) - count_at(top, right) - count_at(bottom, left) + count_at(top, left)
+        pairs = ((count > 0) & (fades.detach().flatten() > 0)).nonzero()[:, 0]
+        hidden = coc.new_zeros(coc.shape[0], step.shape[0], step.shape[0])
+
+        def blocked(pair: Tensor) -> Tensor:
+            """Fraction of the rays of pairs ``[P]`` that is blocked, ``[P, k, k]``."""
+            source, bin_of = pair // self.bins, pair % self.bins
             way = scale.flatten().index_select(0, pair)[:, None] * step
-            rows, columns = (row[source, None] + way)[:, :, None], (column[source, None] + way)[:, None, :]
-            around, down, aside = pixels.corners(item[source, None, None], rows, columns, self.height, self.width)
+            items, rows, columns = (t.index_select(0, source)[:, None] for t in (item, row, column))
+            rows, columns = (rows + way)[:, :, None], (columns + way)[:, None, :]
+            around, down, aside = pixels.corners(items[:, :, None], rows, columns, self.height, self.width)
             pixel = torch.stack(around)  # [4, P, k, k]
             place, cover = (t.index_select(1, pixel.flatten()).unflatten(1, pixel.shape) for t in self.shown)
             covered = (cover * (1.0 - (place - bin_of[:, None, None]).abs()).clamp_min(0.0)).sum(0)
@@ -327,9 +336,8 @@ class _Occluders:
             return torch.lerp(above, below, down) * fades.flatten().index_select(0, pair)[:, None, None]
 
         most = _PAIR_TAPS if coc.device.type == "cpu" else _PAIR_TAPS_GPU
-        for part in pairs.split(max(1, most // len(step) ** 2)):
-            source, bin_of = part.unbind(1)
-            hidden = hidden.index_add(0, source, recomputed(functools.partial(blocked, source, bin_of)))
+        for part in [pairs] if is_traced() else pairs.split(max(1, most // len(step) ** 2)):
+            hidden = hidden.index_add(0, part // self.bins, recomputed(functools.partial(blocked, part)))
         return hidden.clamp(max=1.0)
 
 
