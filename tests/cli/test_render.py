@@ -415,8 +415,9 @@ def test_the_folder_of_the_output_is_made(run: Run) -> None:
     assert read_image("new/folder/out.exr").pixels.shape[-1] == 24
     run(f"inspect image.exr depth.npy -o other/sheet.png --focus-m 2 {LENS}")
     assert Path("other/sheet.png").is_file()
+    run("tables disc -o third/disc.png")
     run("fit --lens double_gauss_50mm --f-number 8 --nodes 5 -o fourth/lens.json")
-    assert Path("fourth/lens.json").is_file()
+    assert Path("third/disc.png").is_file() and Path("fourth/lens.json").is_file()
 
 
 # The first command
