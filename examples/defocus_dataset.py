@@ -36,6 +36,7 @@ def main() -> None:
         "--table", action="append", help="a lens, such as sato_j15; of several, one is chosen at random"
     )
     parser.add_argument("--tolerance", default="final", help="draft, preview or final")
+    parser.add_argument("--format", choices=("webdataset", "parquet"), default="webdataset")
     parser.add_argument("--per-shard", type=int, default=64, help="samples in a shard")
     parser.add_argument("--copies", type=int, default=1, help="number of blurred versions of each image")
     parser.add_argument("--workers", type=int, default=2, help="processes")
@@ -53,7 +54,7 @@ def main() -> None:
     if arguments.depth_kind == "relative":
         numbers = {"near_m": arguments.near_m, "far_m": arguments.far_m}
     depth = {"kind": arguments.depth_kind, "fill": arguments.fill_depth, **numbers}
-    options = {name: getattr(arguments, name) for name in ("workers", "per_shard", "copies", "seed")}
+    options = {name: getattr(arguments, name) for name in ("workers", "per_shard", "copies", "format", "seed")}
     make_dataset(pairs_in(arguments.images, arguments.depths), arguments.out, blur, depth=depth, **options)
 
 

@@ -207,6 +207,19 @@ def test_relative_depth_is_scaled_and_a_lens_is_chosen_at_random_and_named(pairs
     np.testing.assert_allclose(depth, from_relative(values, 1.0, 8.0)[0, 0].numpy(), rtol=1e-5)
 
 
+def test_parquet_has_the_same_data(pairs: list[Pair], tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
+    rows = shard_rows(pairs)
+    make_shards(tmp_path / "tar", rows)
+    make_shards(tmp_path / "parquet", rows, format="parquet")
+    files = members(tmp_path / "tar" / "shard-000000.tar")
+    for row in parquet.read_table(tmp_path / "parquet" / "shard-000000.parquet").to_pylist():
+        key = row.pop("key")
+        for name in ("blurred.png", "sharp.png", "depth.npy"):
+            assert row.pop(name) == files[f"{key}.{name}"]
+        assert row == json.loads(files[f"{key}.json"])
+
+
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # webdataset does not close its files
 def test_webdataset_reads_the_shards(pairs: list[Pair], tmp_path: Path) -> None:
     webdataset = pytest.importorskip("webdataset", reason="webdataset is not installed")
@@ -221,6 +234,7 @@ def test_webdataset_reads_the_shards(pairs: list[Pair], tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
+        (lambda f: RenderShards(f, format="zip"), ValueError, "format must be one of webdataset, parquet"),  # type: ignore[arg-type]
         (lambda f: RenderShards(f, keep=[]), ValueError, "keep must be some of blurred, sharp, depth"),
         (lambda f: RenderShards(f, keep="blurred"), ValueError, "keep must be some of"),
         (lambda f: RenderShards(f, picture=".jpg"), ValueError, "picture must be"),  # type: ignore[arg-type]
@@ -241,6 +255,14 @@ def test_errors_name_the_argument(
 ) -> None:
     with pytest.raises(error, match=message):
         call(tmp_path)
+
+
+def test_a_missing_package_of_a_format_is_reported_before_rendering(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ModuleNotFoundError, match=r"parquet needs pyarrow: pip install 'torchdof\[ray\]'"):
+        RenderShards(tmp_path, format="parquet")
 
 
 def test_pairs_are_found_by_their_names(pairs: list[Pair], tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from ..io.atomic import write_text
 from ..io.paths import IMAGE_SUFFIXES, MAP_SUFFIXES
 from ..validation import whole
-from .shards import Pair, RenderShards, samples_of, shard_rows
+from .shards import SUFFIXES, Pair, RenderShards, samples_of, shard_rows
 
 
 class Summary(NamedTuple):
@@ -76,7 +76,7 @@ def make_dataset(
         per_shard: Samples in a shard.
         copies: Number of blurred samples of each image.
         say: Gets lines of text: the shards that exist, the throughput, the contents, the inputs that were left out.
-        **render: Further arguments of :class:`RenderShards`, such as ``keep``.
+        **render: Further arguments of :class:`RenderShards`, such as ``format``.
 
     Returns:
         Contents of the folder. All settings are written to ``plan.json``, broken inputs to ``broken.txt``.
@@ -137,7 +137,7 @@ def make_dataset(
 
 def summary_of(out: str | os.PathLike[str]) -> Summary:
     """Contents of the complete shards of a folder; ``FileNotFoundError`` if the folder is missing."""
-    shards = [path for path in sorted(Path(out).iterdir()) if path.suffix == ".tar"]
+    shards = [path for path in sorted(Path(out).iterdir()) if path.suffix in SUFFIXES.values()]
     noted = [notes for shard in shards if (notes := samples_of(shard)) is not None]
     rows = [row for notes in noted for row in notes]
     broken = [(row["image"], row["error"]) for row in rows if row["error"]]

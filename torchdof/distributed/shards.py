@@ -3,11 +3,11 @@
 import dataclasses
 import hashlib
 import importlib.metadata
+import importlib.util
 import inspect
 import io
 import json
 import os
-import tarfile
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -29,6 +29,10 @@ from ..module import depth_of_field
 from ..render.resample import at_size_of
 from ..validation import choice, number, show, whole
 
+Format = Literal["webdataset", "parquet"]
+
+SUFFIXES = {"webdataset": ".tar", "parquet": ".parquet"}
+_WRITERS = {"webdataset": "webdataset", "parquet": "pyarrow"}
 _FILES = ("blurred", "sharp", "depth")
 
 
@@ -94,8 +98,8 @@ class RenderShards:
     row, or size or time of an input file have changed. An input that cannot be read or rendered is skipped and listed
     with its error in ``shard-NNNNNN.json`` beside the shard.
 
-    A shard is a tar file as WebDataset reads it. It has for each key ``KEY.blurred.png``, ``KEY.sharp.png``,
-    ``KEY.depth.npy`` (metres, float32) and ``KEY.json`` with all parameters.
+    A WebDataset shard has for each key ``KEY.blurred.png``, ``KEY.sharp.png``, ``KEY.depth.npy`` (metres, float32) and
+    ``KEY.json`` with all parameters. A Parquet shard has the same as columns; pictures are the bytes of their files.
 
     Args:
         out: Folder of the shards; it must exist.
@@ -103,6 +107,7 @@ class RenderShards:
         depth: How to read depth maps: keyword arguments of :func:`torchdof.depth.reading.read_depth`; or, for depth
             without a scale, ``{"kind": "relative", "near_m": 1.0, "far_m": 8.0}``, with ``relative_kind``,
             ``value_range`` and ``unknown`` as in :func:`torchdof.depth.from_relative`, and ``fill`` and ``channel``.
+        format: "webdataset" or "parquet"; requires the package webdataset or pyarrow.
         keep: Files written for each sample: any of "blurred", "sharp" and "depth".
         seed: Seed of the draws; a sample's draw depends only on the seed and its key.
         transfer: Encoding of the images; None reads integers as sRGB and floats as linear.
@@ -111,6 +116,7 @@ class RenderShards:
 
     Raises:
         ValueError: If an argument is invalid; an ``OSError`` if the folder is missing.
+        ModuleNotFoundError: If the package that writes the format is not installed.
 
     Example:
         >>> import tempfile
@@ -129,6 +135,7 @@ class RenderShards:
         blur: RandomDepthOfField | None = None,
         *,
         depth: Mapping[str, Any] | None = None,
+        format: Format = "webdataset",
         keep: Sequence[str] = _FILES,
         seed: int = 0,
         transfer: Transfer | None = None,
@@ -137,11 +144,14 @@ class RenderShards:
     ) -> None:
         self.out, self.depth = Path(out), dict(depth or {})
         self.blur = RandomDepthOfField() if blur is None else blur
-        self.keep, self.transfer, self.picture = tuple(keep), transfer, picture
+        self.format, self.keep, self.transfer, self.picture = format, tuple(keep), transfer, picture
         self.seed = whole("seed", seed, 0, 2**62)
         if not self.out.is_dir():
             raise FileNotFoundError(f"{out}: there is no such folder; make it first")
+        choice("format", format, tuple(SUFFIXES))
         choice("picture", picture, (".png", ".exr"))
+        if importlib.util.find_spec(_WRITERS[format]) is None:
+            raise ModuleNotFoundError(f"{format} needs {_WRITERS[format]}: pip install 'torchdof[ray]'")
         if not keep or not set(keep) <= set(_FILES):
             raise ValueError(f"keep must be some of {', '.join(_FILES)}, got {show(keep)}")
         if not isinstance(self.blur, RandomDepthOfField):
@@ -164,7 +174,7 @@ class RenderShards:
         return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
     def _path_of(self, shard: int) -> Path:
-        return self.out / f"shard-{int(shard):06d}.tar"
+        return self.out / f"shard-{int(shard):06d}{SUFFIXES[self.format]}"
 
     def samples_of(self, shard: int, samples: str) -> list[dict[str, Any]] | None:
         """Notes about the samples of a shard; None if it has to be made."""
@@ -174,7 +184,7 @@ class RenderShards:
         """Everything except the rows that determines the shards, as JSON values."""
         lenses = [rendering.table for rendering in self.blur.renderings]
         return {
-            **{name: getattr(self, name) for name in ("keep", "picture", "transfer", "seed", "depth")},
+            **{name: getattr(self, name) for name in ("format", "keep", "picture", "transfer", "seed", "depth")},
             **{name: getattr(self.blur, name) for name in ("focus_m", "f_number")},
             "camera": repr(self.blur.camera),
             "lenses": {table.fingerprint(): table.name or table.family for table in lenses},
@@ -190,30 +200,37 @@ class RenderShards:
 
     def _make(self, shard: int, samples: str) -> list[dict[str, Any]]:
         """Renders and writes one shard, which counts as incomplete without its notes; returns these."""
-        path, source, rows = self._path_of(shard), self._source(samples), []
+        path, source, records, rows = self._path_of(shard), self._source(samples), [], []
+        for sample in json.loads(str(samples)):
+            start, error = time.process_time(), ""
+            try:
+                records.append(self._record(**sample))
+            except (OSError, ValueError, MemoryError, RuntimeError) as failure:  # torch's allocator raises RuntimeError
+                error = str(failure) or type(failure).__name__
+            row = {"key": sample["key"], "image": _text(sample["image"]), "error": _text(error)}
+            rows.append({**row, "seconds": round(time.process_time() - start, 4)})
         with atomic_file(path) as temporary:
-            with tarfile.open(temporary, "w") as tar:
-                for sample in json.loads(str(samples)):
-                    start, error, files = time.process_time(), "", dict[str, bytes]()
-                    try:
-                        files = self._files(**sample)
-                    except (OSError, ValueError, MemoryError, RuntimeError) as failure:  # the last one is torch's
-                        error = str(failure) or type(failure).__name__
-                    for name, content in files.items():
-                        entry = tarfile.TarInfo(f"{sample['key']}.{name}")  # the same files give the same bytes
-                        entry.size = len(content)
-                        tar.addfile(entry, io.BytesIO(content))
-                    row = {"key": sample["key"], "image": _text(sample["image"]), "error": _text(error)}
-                    rows.append({**row, "seconds": round(time.process_time() - start, 4)})
+            if self.format == "webdataset":
+                import webdataset
+
+                with webdataset.TarWriter(str(temporary), mtime=0) as tar:  # the same records give the same bytes
+                    for record in records:
+                        tar.write(record)
+            else:
+                import pyarrow
+                import pyarrow.parquet
+
+                columns = [{"key": r.pop("__key__"), **r.pop("json"), **r} for r in records]
+                pyarrow.parquet.write_table(pyarrow.Table.from_pylist(columns), temporary)
             path.with_suffix(".json").unlink(missing_ok=True)
         notes = {"bytes": path.stat().st_size, "source": source, "samples": rows}
         write_text(path.with_suffix(".json"), json.dumps(notes, indent=1))
         return rows
 
-    def _files(
+    def _record(
         self, key: str, image: str, depth: str | None, focus_m: float | None, f_number: float | None
-    ) -> dict[str, bytes]:
-        """The files of one sample: their contents by name, without the key."""
+    ) -> dict[str, Any]:
+        """One sample as WebDataset takes it: its key, the contents of its files by name, its parameters as ``json``."""
         source = read_image(image, self.transfer)
         metres = at_size_of(source.pixels, self._read_depth(depth or image, **self.depth))
         digest = hashlib.sha256(f"{self.seed} {key}".encode()).digest()
@@ -225,18 +242,18 @@ class RenderShards:
         options = self.blur.renderings[int(drawn["table"])]
         with torch.no_grad():
             blurred = depth_of_field(source.pixels, metres, camera, **options.arguments())
-        files = {}
+        record: dict[str, Any] = {"__key__": key}
         with tempfile.TemporaryDirectory() as folder:
             for name, pixels in (("blurred", blurred), ("sharp", source.pixels)):
                 if name in self.keep:
                     path = Path(folder, name + self.picture)
                     write_image(path, Picture(pixels, source.channels))
-                    files[path.name] = path.read_bytes()
+                    record[path.name] = path.read_bytes()
         if "depth" in self.keep:
             np.save(array := io.BytesIO(), metres[0, 0].numpy())
-            files["depth.npy"] = array.getvalue()
+            record["depth.npy"] = array.getvalue()
         table, (height, width) = options.table, blurred.shape[-2:]
-        facts = {
+        record["json"] = {
             **_json_values(vars(camera) | options.arguments()),
             **{"table": table.name or table.family, "table_fingerprint": table.fingerprint()},
             "aperture": None if table.aperture is None else repr(table.aperture),
@@ -244,7 +261,7 @@ class RenderShards:
             "largest_coc_px": float(camera.coc_px(metres, width).abs().nan_to_num().max()),
             **{"seed": self.seed, "torchdof": importlib.metadata.version("torchdof")},
         }
-        return {**files, "json": json.dumps(facts).encode()}
+        return record
 
 
 def _read_relative(
