@@ -39,10 +39,37 @@ def test_scatter_equals_a_plain_loop_with_a_kernel_for_each_pixel(table: BlurTab
         assert_close(splat(image, coc, table, normalize=normalize), expected, rtol=0, atol=3e-4)
 
 
-def test_sigma_is_that_of_a_gaussian_table() -> None:
+def gauss_psf(image: Tensor, c_px: Tensor) -> Tensor:
+    """The layer of Gur and Wolf as published: Gaussians of a diameter, sampled at pixels, divided by their sum."""
+    batch, channels, height, width = image.shape
+    y, x = (t.flatten().to(WIDE) for t in torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij"))
+    square = (y[:, None] - y) ** 2 + (x[:, None] - x) ** 2  # [to, from]
+    c = c_px.flatten(1)[:, None]
+    weight = torch.exp(-2.0 * square / c**2) / c**2
+    out = weight @ image.flatten(2).transpose(1, 2) / weight.sum(2, keepdim=True)
+    return out.transpose(1, 2).reshape(batch, channels, height, width)
+
+
+def test_sigma_is_half_of_the_diameter_that_the_layer_of_gur_and_wolf_takes() -> None:
     image = torch.rand(2, 3, 12, 14, dtype=WIDE)
     sigma = 1.0 + 1.5 * torch.rand(2, 1, 12, 14, dtype=WIDE)
+    assert_close(splat(image, sigma_px=sigma), gauss_psf(image, 2.0 * sigma), rtol=0, atol=2e-3)
     assert_close(splat(image, sigma_px=sigma), splat(image, sigma, BlurTable.gaussian(1.0)), rtol=0, atol=0)
+
+
+def test_without_normalizing_light_is_kept_away_from_the_border() -> None:
+    image = torch.zeros(1, 2, 31, 31)
+    image[..., 15, 15] = torch.tensor([3.0, 5.0])
+    summed = splat(image, torch.full((1, 1, 31, 31), -6.3), BlurTable.polygon(7), normalize=False)
+    assert_close(summed.sum((2, 3)), torch.tensor([[3.0, 5.0]]))
+    assert float(splat(torch.ones(1, 1, 9, 9), torch.full((1, 1, 9, 9), 3.0), normalize=False)[0, 0, 0, 0]) < 0.5
+    assert_close(splat(torch.ones(1, 1, 9, 9), torch.full((1, 1, 9, 9), 3.0)), torch.ones(1, 1, 9, 9))
+
+
+def test_an_image_in_focus_is_returned_bit_exact() -> None:
+    image = torch.rand(2, 3, 8, 9)
+    assert torch.equal(splat(image, torch.zeros(1, 1, 8, 9)), image)
+    assert torch.equal(splat(image, torch.zeros(1, 1, 8, 9), normalize=False), image)
 
 
 def test_without_normalizing_light_is_kept_away_from_the_border() -> None:

@@ -1,5 +1,7 @@
-"""A call leaves the state of the process as it was."""
+"""A call leaves the state of the process as it was: after a result, after an error, and after Ctrl-C in the middle."""
 
+import contextlib
+import inspect
 import locale
 import logging
 import os
@@ -9,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -16,6 +19,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import torchdof.fit
 from tests.kernels import kernel_of
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
 from torchdof.augmentation import RandomDepthOfField
@@ -28,6 +32,9 @@ from torchdof.io.images import Picture, read_image, write_image
 
 pytestmark = pytest.mark.hard
 
+PACKAGES = tuple(str(Path(str(package.__file__)).parent) for package in (torchdof, torchdof.fit))
+ERRORS = (KeyboardInterrupt, RuntimeError, OSError, ValueError, SystemExit)
+STOPS = 6  # places at which a call is interrupted
 COC = torch.linspace(-9.0, 9.0, 40).expand(1, 1, 30, 40)
 DEPTH = 2.0 + COC / 9.0
 DOF = DepthOfField(Camera(focus_m=2.0, sensor_width_mm=6.0))
@@ -110,6 +117,29 @@ def state() -> dict[str, Any]:
     }
 
 
+@contextlib.contextmanager
+def entries(stop: int, error: BaseException | None) -> Iterator[list[str]]:
+    """Lists the functions of the package that are entered, and raises ``error`` in the one with number ``stop``.
+
+    Ctrl-C between two instructions of a ``finally`` block can always undo it half; therefore generators, which such
+    blocks resume, do not count.
+    """
+    names: list[str] = []
+
+    def enter(frame: FrameType, event: str, _: Any) -> None:
+        code = frame.f_code
+        if event == "call" and code.co_filename.startswith(PACKAGES) and not code.co_flags & inspect.CO_GENERATOR:
+            names.append(code.co_name)
+            if len(names) == stop and error is not None:
+                raise error
+
+    sys.setprofile(enter)
+    try:
+        yield names
+    finally:
+        sys.setprofile(None)
+
+
 @pytest.fixture(autouse=True)
 def _unusual_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Starts from unusual values, so that a call that restores the usual ones instead fails its test."""
@@ -129,10 +159,20 @@ def _unusual_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[
 @pytest.mark.filterwarnings("ignore::torchdof.fit.FitWarning")
 @pytest.mark.parametrize("name", CALLS)
 def test_a_call_leaves_the_state_of_the_process_as_it_was(name: str, engine: str) -> None:
+    """Compares the state after a result, and after errors and Ctrl-C at some places in the package's functions."""
     call = CALLS[name]
-    first = call()  # imports packages, which may have state of their own
+    with entries(0, None) as names:
+        first = call()  # imports packages, which may have state of their own
     before = state()
     again = call()
     assert state() == before
     if isinstance(first, list | Tensor):
         torch.testing.assert_close(again, first, rtol=0.0, atol=0.0)
+    count = len(names)
+    for i in range(STOPS):
+        error = RuntimeError("a test") if i % 2 else KeyboardInterrupt()
+        with contextlib.suppress(*ERRORS), entries(1 + (2 * i + 1) * count // (2 * STOPS), error) as names:
+            call()
+        assert state() == before, f"{error!r} in {names[-1]}"
+    if isinstance(first, list | Tensor):
+        torch.testing.assert_close(call(), first, rtol=0.0, atol=0.0)

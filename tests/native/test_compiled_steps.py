@@ -107,7 +107,9 @@ def test_pictures_and_gradients_equal_the_plain_engines(
 
 @pytest.mark.parametrize("step", STEPS)
 @pytest.mark.parametrize("name", ["over", "coarse", "sum", "by colour", "holes"])
-def test_gradients_have_the_same_bits_for_any_threads(name: str, step: str, calls: dict[str, list[Any]]) -> None:
+def test_gradients_have_the_same_bits_for_any_number_of_threads(
+    name: str, step: str, calls: dict[str, list[Any]]
+) -> None:
     rendered(WAYS[name])
     if "sum" in name and step != "blend":
         assert not calls[step]
@@ -126,6 +128,13 @@ def test_gradients_have_the_same_bits_for_any_threads(name: str, step: str, call
     for one, two, five, other in zip(*results, baseline, strict=True):
         assert torch.equal(one, two) and torch.equal(one, five)
         assert difference(other, one) < 5e-5
+
+
+def test_float64_is_the_plain_engines_and_differs_by_rounding_alone(calls: dict[str, list[Any]]) -> None:
+    exact = rendered({}, torch.float64)
+    assert not any(calls.values())
+    for ours, other in zip(rendered({}), exact, strict=True):
+        assert difference(ours.double(), other) < 2e-5
 
 
 @pytest.mark.parametrize("left", [0, 22])
@@ -180,3 +189,35 @@ def test_surfaces_behind_and_their_gradients_equal_the_plain_engines(
         return [out.detach(), *torch.autograd.grad((out * seen).sum(), leaves)]
 
     assert_both_engines_agree(looked, calls["look_behind"], [1e-4] * 5, monkeypatch)
+
+
+def edges(channels: int, hole: bool) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Light, coc with steps, slopes and single pixels off both, and pixels that are left out."""
+    generator = torch.Generator().manual_seed(7)
+    light = torch.rand(2, channels, 54, 75, generator=generator) ** 3
+    coc = scene((-4.0, 6.0), channels)[1]
+    noise = torch.rand(coc.shape, generator=generator)
+    coc = coc + torch.where(noise > 0.8, 2.0 * noise - 1.6, 0.0)
+    coc[..., :10] = 1.0  # surfaces of one coc, whose extremes are equal
+    coc[..., 4:12, 3:5] = 2.5
+    return light, coc, (noise > 0.1).float() if hole else None
+
+
+@pytest.mark.parametrize("hole", [False, True])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_the_finest_level_and_its_gradients_equal_the_plain_engines(
+    channels: int, hole: bool, calls: dict[str, list[Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    light, coc, valid = edges(channels, hole)
+    weight = 0.5 * torch.rand(coc.shape, generator=torch.Generator().manual_seed(8))
+    given = (light, coc, light.flip(-1), coc.flip(-1), torch.where(weight > 0.2, weight, 0.0))
+    constant = [torch.full_like(coc, 0.7), *([] if valid is None else [valid])]
+
+    def computed() -> list[Tensor]:
+        leaves = [t.clone().requires_grad_() for t in given]
+        out = disocclusion.finest_level((32, 44), *leaves, *constant)
+        out = torch.where(out < -1e8, 0.0, out)
+        seen = torch.rand(out.shape, generator=torch.Generator().manual_seed(1)) - 0.3
+        return [out.detach(), *torch.autograd.grad((out * seen).sum(), leaves)]
+
+    assert_both_engines_agree(computed, calls["farthest"], [1e-4] * 6, monkeypatch)

@@ -75,3 +75,20 @@ def test_both_engines_make_the_same_kernels(table: BlurTable, longest: int | Non
             spare = other.shape[-1] // 2 - half
             expected = other[:, spare : other.shape[-1] - spare, spare : other.shape[-1] - spare].float()
             torch.testing.assert_close(kernel, expected, rtol=0.0, atol=3e-6 * float(expected.max()))
+
+
+@ALL
+def test_kernels_change_continuously_with_the_radius(table: BlurTable) -> None:
+    # with the radii at which templates have cells of a pixel: 16 and 32 px for a disc
+    coc = torch.cat([torch.arange(2.0, 17.5, 0.5), torch.arange(18.0, 41.0, 2.0)]).double()
+    step = torch.tensor(1e-6, dtype=torch.float64)
+    for radius in coc.split(5):
+        one, other = (bank_of(table).kernels(radius * factor, 400) for factor in (1.0, 1.0 + step))
+        spare = (other.shape[-1] - one.shape[-1]) // 2
+        assert float((torch.nn.functional.pad(one, (spare,) * 4) - other).abs().sum((-2, -1)).max()) < 1e-3
+
+
+def test_a_kernel_far_larger_than_the_frame_is_constant() -> None:
+    (kernel,) = bank_of(TABLES["disc"]).kernels(torch.tensor([5000.0], dtype=torch.float64), 400, longest=[30])
+    assert kernel.shape == (1, 59, 59)
+    torch.testing.assert_close(kernel, torch.full_like(kernel, 1.0 / (torch.pi * 5000.0**2)), rtol=2e-3, atol=0.0)

@@ -1,4 +1,5 @@
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -31,6 +32,17 @@ def test_a_result_above_the_limit_is_not_kept_and_a_view_counts_with_its_whole_s
     cache.get("view", lambda: torch.zeros(10_000)[:10])
     assert first is not second and cache.bytes < 2000
     assert cache.get("small", lambda: torch.ones(100)) is small
+
+
+def test_threads_share_a_cache() -> None:
+    cache = KernelCache(20_000)
+
+    def look(i: int) -> bool:
+        return float(cache.get(i % 7, lambda: torch.full((500,), float(i % 7)))[0]) == i % 7
+
+    with ThreadPoolExecutor(8) as pool:
+        assert all(pool.map(look, range(2000)))
+    assert 0 < cache.bytes <= 20_000
 
 
 SMALL = """

@@ -90,6 +90,17 @@ def test_levels_of_a_file_are_not_edges_however_large_the_blur(engine: str) -> N
     assert not edges.judged(image, coc_px, edges.STEP_PX)[0].any()
 
 
+def test_narrow_ramps_of_averaged_depth_are_repaired(scene: Scene, engine: str) -> None:
+    """Depth is averaged if it was downsampled with its image, or rendered with anti-aliasing."""
+    image = functional.avg_pool2d(scene.image, 2)
+    depth = 1 / functional.avg_pool2d(1 / scene.depth, 2)
+    nearest = -functional.max_pool2d(-scene.depth, 2), functional.max_pool2d(scene.depth, 2)
+    repaired = repair_edges(image, depth, "auto")
+    between = [((d > 1.1 * nearest[0]) & (d < nearest[1] / 1.1)).float().mean() for d in (depth, repaired)]
+    assert between[0] > 0.05
+    assert between[1] < 0.3 * between[0]
+
+
 LEFT = {"half-res": 0.2, "quarter-res": 0.4, "blur 1.5": 0.3, "displaced": 0.6, "shift 1px": 0.6}
 LEFT |= dict.fromkeys(("near -1px", "near -2px", "near +1px"), 0.25)
 
@@ -107,6 +118,14 @@ def test_depth_with_an_unrelated_image_is_unchanged(scene: Scene, kind: str) -> 
     assert torch.equal(repair_edges(torch.rand_like(scene.image), depth, "auto"), depth)
 
 
+def test_noise_is_not_an_edge_and_edges_in_noise_are_repaired(scene: Scene) -> None:
+    exact, thin = (-8.0 * scene.camera.coc_px(degrade(scene.depth, kind), 192) for kind in ("exact", "near -1px"))
+    noise = 0.3 * torch.randn(exact.shape)  # its range within five pixels is as large as a step
+    assert torch.equal(edges.repair(scene.image, exact + noise, 1.0, True), exact + noise)
+    left = (edges.repair(scene.image, thin + noise, 1.0, True) - exact).abs() > 10.0
+    assert float(left.float().mean()) < 0.25 * float(((thin - exact).abs() > 10.0).float().mean())
+
+
 @pytest.mark.parametrize("steepness", [0.02, 0.3, 1.0])
 @pytest.mark.parametrize("how", ["auto", "repair"])
 def test_a_slope_is_unchanged(steepness: float, how: DepthEdges) -> None:
@@ -114,6 +133,18 @@ def test_a_slope_is_unchanged(steepness: float, how: DepthEdges) -> None:
     coc = (steepness * (x + 0.3 * y))[None, None]
     image = waves(5)(x.double(), y.double()).float()[None]
     assert torch.equal(-edges.repair(image, -coc, torch.tensor(1.0), how == "auto"), coc)
+
+
+def test_a_thin_structure_of_a_soft_map_comes_no_nearer_than_the_map(scene: Scene) -> None:
+    planes = [
+        Plane(6.0, waves(1, mean=(0.5, 0.5, 0.5), contrast=0.3)),
+        Plane(1.5, waves(2, mean=(0.1, 0.1, 0.05)), posts(23.0, 2.0, 0.2)),
+    ]
+    thin = plane_scene(planes, scene.camera, (96, 160), samples=16)
+    given = degrade(thin.depth, "half-res")
+    nearness, repaired = 1 / given, 1 / repair_edges(thin.image, given, "auto")
+    assert not torch.equal(repaired, nearness)
+    assert bool((repaired <= functional.max_pool2d(nearness, 11, 1, 5) + 1e-6).all())
 
 
 def discs(square_px: float) -> Tensor:
@@ -187,23 +218,24 @@ def test_markers_of_holes_are_kept_and_act_like_nan(scene: Scene, marked: float)
     assert torch.equal(repaired[~holes], same[~holes])
 
 
-@pytest.mark.parametrize("auto", [True, False])
-@pytest.mark.parametrize(
-    ("near", "far", "light"),
-    [(3e38, 1.0, 1.0), (1e16, -1e16, 1.0), (1e14, -1e14, 1.0), (3e38, -3e38, 1.0), (math.nan, 1.0, 1.0),
-     (4.0, 1.0, 3e38), (4.0, 1.0, 1e-45)],
-)  # fmt: skip
-def test_repairs_of_all_maps_are_finite(near: float, far: float, light: float, engine: str, auto: bool) -> None:
-    nearness = torch.full((1, 1, 24, 32), far)
-    nearness[..., 6:18, 9:21] = near  # one pixel right of the image's square
-    image = torch.full((1, 3, 24, 32), 0.1 * light)
-    image[..., 6:18, 8:20] = light
-    repaired = edges.repair(image, nearness, torch.tensor(1.0), auto)
-    known = torch.isfinite(nearness)
-    assert torch.equal(torch.isfinite(repaired), known)
-    assert float(repaired[known].abs().max()) <= 1.001 * float(nearness[known].abs().max())
-    too_large = nearness.abs() > 1e15
-    assert torch.equal(repaired[too_large], nearness[too_large])
+def test_a_hole_within_a_surface_changes_no_other_pixel(scene: Scene) -> None:
+    depth, holes = torch.full((1, 1, 128, 192), 4.0), torch.zeros(1, 1, 128, 192, dtype=torch.bool)
+    depth[..., 101:], holes[..., 40:60, 20:60] = 2.0, True
+    image = scene.image * torch.where(torch.arange(192) < 100, 0.3, 1.0)
+    whole = repair_edges(image, depth)
+    assert bool((whole != depth).any())
+    assert torch.equal(repair_edges(image, torch.where(holes, torch.nan, depth))[~holes], whole[~holes])
+
+
+@pytest.mark.parametrize("kind", ["half-res", "near -1px"])
+def test_differences_below_half_a_step_are_not_edges(scene: Scene, kind: str, engine: str) -> None:
+    nearness = 1.0 / degrade(scene.depth, kind)
+    image = scene.image.clone()
+    image[..., 60:62, 90:92] = 500.0
+    nearness[..., 60:62, 90:92] = nearness.max()
+    low, high = nearness.aminmax()
+    assert not torch.equal(edges.repair(image, nearness, 0.5 * float(high - low), False), nearness)
+    assert torch.equal(edges.repair(image, nearness, 2.001 * float(high - low), False), nearness)
 
 
 @pytest.mark.parametrize("moved", [1e-4, -1e-4])
@@ -227,6 +259,14 @@ def test_gradients_flow_to_pixels_that_are_not_repaired(scene: Scene) -> None:
     repaired = repair_edges(scene.image, depth)
     (gradient,) = torch.autograd.grad(repaired.sum(), depth)
     assert torch.equal(gradient, (repaired == depth).float())
+
+
+def test_items_of_a_batch_are_repaired_independently(scene: Scene) -> None:
+    images = torch.cat([scene.image, torch.rand_like(scene.image)])
+    depth = degrade(scene.depth, "half-res")
+    together = repair_edges(images, depth, "auto")
+    assert torch.equal(together[:1], repair_edges(images[:1], depth, "auto"))
+    assert torch.equal(together[1:], depth)
 
 
 def test_the_renderer_repairs_by_its_option_depth_edges(scene: Scene) -> None:
@@ -286,3 +326,22 @@ def test_repair_compiles_without_graph_breaks(scene: Scene) -> None:
     compiled = torch.compile(edges.repair, backend="eager", fullgraph=True)
     plain = edges._repair(scene.image, -coc, torch.tensor(1.0), True)
     torch.testing.assert_close(compiled(scene.image, -coc, 1.0, True), plain)
+
+
+@pytest.mark.parametrize("auto", [True, False])
+@pytest.mark.parametrize(
+    ("near", "far", "light"),
+    [(3e38, 1.0, 1.0), (1e16, -1e16, 1.0), (1e14, -1e14, 1.0), (3e38, -3e38, 1.0), (math.nan, 1.0, 1.0),
+     (4.0, 1.0, 3e38), (4.0, 1.0, 1e-45)],
+)  # fmt: skip
+def test_repairs_of_all_maps_are_finite(near: float, far: float, light: float, engine: str, auto: bool) -> None:
+    nearness = torch.full((1, 1, 24, 32), far)
+    nearness[..., 6:18, 9:21] = near  # one pixel right of the image's square
+    image = torch.full((1, 3, 24, 32), 0.1 * light)
+    image[..., 6:18, 8:20] = light
+    repaired = edges.repair(image, nearness, torch.tensor(1.0), auto)
+    known = torch.isfinite(nearness)
+    assert torch.equal(torch.isfinite(repaired), known)
+    assert float(repaired[known].abs().max()) <= 1.001 * float(nearness[known].abs().max())
+    too_large = nearness.abs() > 1e15
+    assert torch.equal(repaired[too_large], nearness[too_large])

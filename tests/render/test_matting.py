@@ -63,6 +63,16 @@ def test_a_soft_edge_is_split_into_the_colours_beyond_it() -> None:
         assert torch.allclose(share[..., x], (1 - covered if x == 30 else covered)[x], atol=0.03)
 
 
+def test_a_lamp_beside_a_strand_before_it_keeps_its_light() -> None:
+    lamp = 30.0 * torch.exp(-((ROWS - 20) ** 2 + (COLUMNS - 20) ** 2) / 4.0)
+    is_strand = COLUMNS == 20
+    light = colours(0.1 + torch.where(is_strand, 0.8 * lamp, lamp))
+    made = with_emitters(light, torch.where(is_strand, -7.0, 0.0)[None, None])
+    share = torch.where(is_strand, 1 - made.other_weight, made.other_weight)
+    of_the_strand = share * torch.where(is_strand, made.own, made.other)
+    assert float(of_the_strand.sum()) < 0.05 * float(light[..., :40, :41].sum())
+
+
 def test_light_of_a_lamp_seen_through_strands_is_assigned_to_the_lamp() -> None:
     """Dark strands one pixel wide, every third column, in focus before a lamp; depth has two thirds of each."""
     is_strand = COLUMNS % 3 == 0
@@ -96,6 +106,18 @@ def test_the_rim_of_a_lamp_is_not_assigned_to_dim_hair_beside_it() -> None:
     assert float(found.other_weight[..., beside_hair].max()) > 0.03
     for before, after in zip(found, with_emitters(light, coc), strict=True):
         torch.testing.assert_close(before[..., beside_hair], after[..., beside_hair], rtol=1e-6, atol=1e-6)
+
+
+def test_a_lamp_on_a_near_surface_stays_there_with_its_rim() -> None:
+    is_post = (COLUMNS >= 30) & (COLUMNS < 42)
+    lamp = (ROWS >= 30) & (ROWS < 32) & (COLUMNS >= 40) & (COLUMNS < 42)
+    light = colours(torch.where(lamp, 50.0, torch.where(is_post, 0.05, 0.2)))
+    light[..., 30:32, 42] = 20.0  # the rim of the lamp, in pixels whose centre shows the wall
+    own, other, other_coc, weight = (t[0, 0] for t in with_emitters(light, torch.where(is_post, 0.0, 12.0)[None, None]))
+    torch.testing.assert_close(((1 - weight) * own)[lamp], torch.full((4,), 50.0))
+    torch.testing.assert_close((weight * other)[30:32, 42], torch.full((2,), 20.0 - 0.6 * 0.2), rtol=0.01, atol=0.0)
+    torch.testing.assert_close(own[30:32, 42], torch.full((2,), 0.2))
+    assert float(other_coc[30:32, 42].abs().max()) == 0.0
 
 
 def test_lamps_in_focus_leave_no_halo_on_the_blurred_wall_behind_them() -> None:
