@@ -72,21 +72,6 @@ def test_an_image_in_focus_is_returned_bit_exact() -> None:
     assert torch.equal(splat(image, torch.zeros(1, 1, 8, 9), normalize=False), image)
 
 
-def test_without_normalizing_light_is_kept_away_from_the_border() -> None:
-    image = torch.zeros(1, 2, 31, 31)
-    image[..., 15, 15] = torch.tensor([3.0, 5.0])
-    summed = splat(image, torch.full((1, 1, 31, 31), -6.3), BlurTable.polygon(7), normalize=False)
-    assert_close(summed.sum((2, 3)), torch.tensor([[3.0, 5.0]]))
-    assert float(splat(torch.ones(1, 1, 9, 9), torch.full((1, 1, 9, 9), 3.0), normalize=False)[0, 0, 0, 0]) < 0.5
-    assert_close(splat(torch.ones(1, 1, 9, 9), torch.full((1, 1, 9, 9), 3.0)), torch.ones(1, 1, 9, 9))
-
-
-def test_an_image_in_focus_is_returned_bit_exact() -> None:
-    image = torch.rand(2, 3, 8, 9)
-    assert torch.equal(splat(image, torch.zeros(1, 1, 8, 9)), image)
-    assert torch.equal(splat(image, torch.zeros(1, 1, 8, 9), normalize=False), image)
-
-
 def test_items_of_batches_and_clips_equal_each_alone_and_may_share_a_map() -> None:
     image, coc = scene(6)
     together = splat(image, coc)
