@@ -412,7 +412,7 @@ class Composite {
     const vec at = all((float)k), before = all((float)(k - 1));
     for (int y = spare; y < height - spare; y++) {
       const size_t to = (size_t)y * pitch_;
-      const float *node = d.row(0, top + y) + left, *one = d.row(1, top + y) + left, *two = d.row(2, top + y) + left;
+      const float *node = d.row(0, top + y) + left, *one = d.row(1, top + y) + left, *two = d.row(C + 2, top + y) + left;
       float *share = b.term[C] + to, *normalizer = b.term[C + 1] + to;
       uint32_t occupied = 0, partial = 0, varying = 0;
       for (int x0 = 0; x0 < width; x0 += MARKED) {
@@ -439,7 +439,7 @@ class Composite {
       b.partial[y] = partial;
       b.varying[y] = varying;
       for (int c = 0; c < C; c++) {
-        const float *light = d.row(3 + c, top + y) + left, *far = d.row(3 + C + c, top + y) + left;
+        const float *light = d.row(2 + c, top + y) + left, *far = d.row(3 + C + c, top + y) + left;
         float *term = b.term[c] + to;
         for (int x0 = 0; x0 < width; x0 += MARKED) {
           if (!(occupied & mark(x0))) {

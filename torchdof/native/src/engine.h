@@ -491,8 +491,7 @@ class Downsampled {
 
   int stride() const { return 2 * (channels + 1); }  // number of values of a piece
   bool needed(int interval) const { return wanted[interval] || behind[interval]; }
-  // A row of a plane, from the frame's first block. Planes: node before, weight, weight times position between the
-  // nodes, light, light times position.
+  // A row of a plane, from the frame's first block. Planes: node before, and the values of a piece.
   float *row(int plane, int y) const { return planes.data() + plane * size + (size_t)(y + margin) * pitch + margin; }
 
  private:
