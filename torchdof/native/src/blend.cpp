@@ -856,10 +856,9 @@ class Blend {
 
 }  // namespace
 
-void blend(const torchdof_layers &scene, float *out) { Blend(scene).picture(out); }
-
-void blend_gradient(const torchdof_layers &scene, const float *out_gradient, float *const *light, float *const *place, float *const *weight) {
-  Blend(scene).gradient(out_gradient, light, place, weight);
+void blend(const torchdof_layers &scene, float *out, const float *gradient, float *const *of_light, float *const *of_place, float *const *of_weight) {
+  Blend blend(scene);
+  gradient ? blend.gradient(gradient, of_light, of_place, of_weight) : blend.picture(out);
 }
 
 }  // namespace TORCHDOF_SIMD

@@ -98,41 +98,23 @@ int32_t torchdof_ends(const float *values, int64_t count, int32_t threads, float
   return torchdof::guarded([&] { torchdof::chosen().ends(values, count, threads, low, high); });
 }
 
-int32_t torchdof_blend(const torchdof_layers *layers, float *out) {
-  return torchdof::guarded([&] { torchdof::chosen().blend(*layers, out); });
-}
-
-int32_t torchdof_blend_gradient(const torchdof_layers *layers, const float *gradient, float *const *light, float *const *place,
-                                float *const *weight) {
-  return torchdof::guarded([&] { torchdof::chosen().blend_gradient(*layers, gradient, light, place, weight); });
+int32_t torchdof_blend(const torchdof_layers *layers, float *out, const float *gradient, float *const *of_light,
+                       float *const *of_place, float *const *of_weight) {
+  return torchdof::guarded([&] { torchdof::chosen().blend(*layers, out, gradient, of_light, of_place, of_weight); });
 }
 
 int32_t torchdof_farthest(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t rows, int32_t columns,
-                          int32_t threads, float *out) {
-  return torchdof::guarded([&] { torchdof::chosen().farthest(maps, channels, height, width, rows, columns, threads, out); });
-}
-
-int32_t torchdof_farthest_gradient(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t rows,
-                                   int32_t columns, int32_t threads, const float *gradient, float *const *of_maps) {
+                          int32_t threads, float *out, const float *gradient, float *const *of_maps) {
   return torchdof::guarded([&] {
-    torchdof::chosen().farthest_gradient(maps, channels, height, width, rows, columns, threads, gradient, of_maps);
+    torchdof::chosen().farthest(maps, channels, height, width, rows, columns, threads, out, gradient, of_maps);
   });
 }
 
 int32_t torchdof_look_behind(const torchdof_level *levels, int32_t count, int32_t channels, const float *coc, int32_t height, int32_t width,
-                             int32_t threads, float *out) {
-  return torchdof::guarded([&] { torchdof::chosen().look_behind(levels, count, channels, coc, height, width, threads, out); });
-}
-
-int32_t torchdof_look_behind_gradient(const torchdof_level *levels, int32_t count, int32_t channels, const float *coc, int32_t height,
-                                      int32_t width, int32_t threads, const float *gradient, float *const *of_levels, float *of_coc) {
+                             int32_t threads, float *out, const float *gradient, float *const *of_levels, float *of_coc) {
   return torchdof::guarded([&] {
-    torchdof::chosen().look_behind_gradient(levels, count, channels, coc, height, width, threads, gradient, of_levels, of_coc);
+    torchdof::chosen().look_behind(levels, count, channels, coc, height, width, threads, out, gradient, of_levels, of_coc);
   });
-}
-
-void torchdof_convolve(const float *in, int32_t height, int32_t width, const float *kernel, int32_t half, float *out) {
-  torchdof::chosen().convolve(in, height, width, kernel, half, out);
 }
 
 int64_t torchdof_interface(void) {

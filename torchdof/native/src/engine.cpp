@@ -219,21 +219,7 @@ class JobOf : public AnyJob {
 
 namespace TORCHDOF_SIMD {
 static AnyJob *begin(const torchdof_scene &scene) { return new JobOf<Job>(scene); }
-static void convolve_all(const float *in, int height, int width, const float *values, int half, float *out) {
-  const Kernel kernel = make_kernel(values, half, true);
-  const int rows = (height + 15) / 16 * 16, columns = (width + 15) / 16 * 16, pitch = columns + 2 * half + 16;
-  std::vector<float> window((size_t)(rows + 2 * half) * pitch);
-  float spread[STRIP];
-  const std::vector<uint32_t> every(rows + 2 * half, ~0u);
-  for (int y = 0; y < height; y++) memcpy(&window[(size_t)(y + half) * pitch + half], in + (size_t)y * width, width * sizeof(float));
-  for (int y = 0; y < height; y += STRIP_ROWS)
-    for (int x = 0; x < width; x += STRIP_COLUMNS) {
-      convolve_strip(&window[(size_t)y * pitch + x], pitch, every.data(), ~0u, kernel, spread);
-      const size_t bytes = std::min(STRIP_COLUMNS, width - x) * sizeof(float);
-      for (int i = 0; i < std::min(STRIP_ROWS, height - y); i++) memcpy(out + (size_t)(y + i) * width + x, spread + i * STRIP_COLUMNS, bytes);
-    }
-}
 extern const Variant variant;
-const Variant variant = {begin, repair_edges, find_ends, coc_of_depth, plan, make_kernels, convolve_all, blend, blend_gradient, farthest, farthest_gradient, look_behind, look_behind_gradient};
+const Variant variant = {begin, repair_edges, find_ends, coc_of_depth, plan, make_kernels, blend, farthest, look_behind};
 }  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

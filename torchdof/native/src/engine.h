@@ -639,19 +639,12 @@ bool repair_edges(const torchdof_map &map);
 
 void composite(const Job &job, const RayKernels &ray_kernels, float *out);
 
-// Blurs and composites the layers of a padded frame, forward and backward; blend.cpp
-void blend(const torchdof_layers &scene, float *out);
-void blend_gradient(const torchdof_layers &scene, const float *out_gradient, float *const *light, float *const *place, float *const *weight);
-
-// The finest level of the pyramid from which hidden surfaces are filled, forward and backward; farthest.cpp
-void farthest(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads, float *out);
-void farthest_gradient(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads, const float *gradient,
-                       float *const *of_maps);
-
-// The surfaces behind pixels, read from a pyramid, forward and backward; look_behind.cpp
-void look_behind(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads, float *out);
-void look_behind_gradient(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads,
-                          const float *gradient, float *const *of_levels, float *of_coc);
+// Steps with a gradient; see api.h.
+void blend(const torchdof_layers &scene, float *out, const float *gradient, float *const *of_light, float *const *of_place, float *const *of_weight);
+void farthest(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads, float *out, const float *gradient,
+              float *const *of_maps);
+void look_behind(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads, float *out,
+                 const float *gradient, float *const *of_levels, float *of_coc);
 
 }  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

@@ -205,13 +205,10 @@ struct Behind {
 
 }  // namespace
 
-void look_behind(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads, float *out) {
-  Behind(levels, count, channels, height, width).look(coc, threads, out);
-}
-
-void look_behind_gradient(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads,
-                          const float *gradient, float *const *of_levels, float *of_coc) {
-  Behind(levels, count, channels, height, width).gradient(coc, gradient, threads, of_levels, of_coc);
+void look_behind(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads, float *out,
+                 const float *gradient, float *const *of_levels, float *of_coc) {
+  const Behind behind(levels, count, channels, height, width);
+  gradient ? behind.gradient(coc, gradient, threads, of_levels, of_coc) : behind.look(coc, threads, out);
 }
 
 }  // namespace TORCHDOF_SIMD
