@@ -32,7 +32,6 @@ constexpr int BLUR_REACH = 9, RINGING_REACH = 3;
 constexpr int USUAL_REACH = REACH + 2, LAMP_REACH = 2;
 
 constexpr int AREA = 96;       // side of a tile in pixels
-constexpr int ROWS_AHEAD = 8;  // rows by which values are prefetched
 // A pixel's result depends on the pixels within this many of it: without ramps, and with ramps.
 constexpr int STEP_HALO = RINGS + REACH, HALO = RINGS + RAMP_REACH + FLAT_REACH + 3;
 constexpr float NONE = 1e30f;       // negated, replaces invalid values in maxima
@@ -82,17 +81,6 @@ class Grid : public Part {
  private:
   const Buffer<float> data_;
 };
-
-// Packs the sign bit of each lane.
-inline int bits(ivec mask) {
-#if defined(__AVX2__)
-  return __builtin_ia32_movmskps256((vec)mask);
-#else
-  int lanes = 0;
-  for (int i = 0; i < LANES; i++) lanes |= (mask[i] & 1) << i;
-  return lanes;
-#endif
-}
 
 // Calls look(n, take) for each vector n of a window; take(p, pitch) loads it from a grid, p being the window's first
 // value.
@@ -184,9 +172,9 @@ struct Around {
 struct Group {
   Part part;
   std::vector<Edge> edges;
-  Part bounds = {};             // bounding box of the edges
-  Judgement *judged = nullptr;  // one for each edge
-  Around *around = nullptr;     // one for every LANES edges
+  Part bounds = {};               // bounding box of the edges
+  std::vector<Judgement> judged;  // one for each edge
+  std::vector<Around> around;     // one for every LANES edges
 };
 
 // Selects edge pixels by kind: first those to which the map gives the far surface, then those with the near one.
@@ -203,7 +191,7 @@ struct EdgeSums {
 class Repair {
  public:
   explicit Repair(const torchdof_map &map)
-      : map_(map), sign_(map.of_coc ? -1.0f : 1.0f), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)map.height * map.width) {}
+      : map_(map), sign_(map.of_coc ? -1.0f : 1.0f), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)map.height * map.width), score_(area_), evidence_(area_), marks_(area_) {}
 
   // 1. Find the edges of a sample of the frame and decide by colour which surface each pixel shows.
   // 2. Calibrate: for each kind of edge pixel, the share that shows the near surface.
@@ -211,7 +199,6 @@ class Repair {
   // 4. Find and decide the edges of the whole frame; move pixels that have the depth of the wrong surface.
   // 5. In a soft map also remove ringing, and restore the nearness of small lamps that a blur has reduced.
   bool run() {
-    allocate();
     noise_step_ = NOISES * noise();
     const int every = (int)std::ceil(std::sqrt((double)area_ / SAMPLED));
     const bool finds_twice = map_.automatic && every > 4;  // the sample is a small part of the frame: find only its edges first
@@ -226,7 +213,6 @@ class Repair {
     }
     // blocks and tiles contain edge pixels that are not sampled
     choose_edges(sampled, [&](const Edge &edge) { return is_sampled(edge.i / width_, edge.i % width_); });
-    allocate_results(sampled);
     judge(sampled, false);
     decide(sampled);
     calibrate(sampled);
@@ -240,7 +226,6 @@ class Repair {
       groups = find_in(tiles(), 0, is_soft, is_soft, doubtful);
     else
       choose_edges(groups, [&](const Edge &edge) { return doubtful[given_kind_of(edge)]; });
-    allocate_results(groups);
     judge(groups, true);
     decide(groups);
     const float lost_px = move(groups);
@@ -393,24 +378,8 @@ class Repair {
         if (is_listed) group.edges[kept++] = edge;
       }
       group.edges.resize(kept);
-      group.bounds = bounds(group, [](size_t) { return true; });
+      group.bounds = bounds(group);
     });
-  }
-
-  // Gives each group its part of the result buffers.
-  void allocate_results(std::vector<Group> &groups) {
-    size_t count = 0;
-    for (const Group &group : groups) count += group.edges.size();
-    judged_ = Buffer<Judgement>(count);
-    around_ = Buffer<Around>(count / LANES + groups.size());
-    count = 0;
-    size_t arounds = 0;
-    for (Group &group : groups) {
-      group.judged = judged_.data() + count;
-      group.around = around_.data() + arounds;
-      count += group.edges.size();
-      arounds += (group.edges.size() + LANES - 1) / LANES;
-    }
   }
 
   // Calls body(k, edge, y, x) for each edge of a group.
@@ -423,12 +392,10 @@ class Repair {
     }
   }
 
-  // Bounding box of a group's chosen edges.
-  template <typename Chosen>
-  Part bounds(const Group &group, const Chosen &chosen) const {
+  // Bounding box of a group's edges.
+  Part bounds(const Group &group) const {
     int top = height_, left = width_, bottom = 0, right = 0;
-    each_edge(group, [&](size_t k, const Edge &, int y, int x) {
-      if (!chosen(k)) return;
+    each_edge(group, [&](size_t, const Edge &, int y, int x) {
       top = std::min(top, y);
       left = std::min(left, x);
       bottom = y + 1;
@@ -437,23 +404,9 @@ class Repair {
     return {top, left, bottom - top, right - left};
   }
 
-  void allocate() {
-    score_ = Buffer<float>(area_);
-    evidence_ = Buffer<float>(area_);
-    marks_ = Buffer<uint8_t>(area_);
-  }
-
   Part in_frame(const Part &part) const {
     const int y0 = std::max(0, part.y0), x0 = std::max(0, part.x0);
     return {y0, x0, std::min(height_, part.bottom()) - y0, std::min(width_, part.right()) - x0};
-  }
-
-  // Prefetches values ROWS_AHEAD rows below: rows of a tile are too short for the hardware prefetcher. Always inlined,
-  // because GCC otherwise removes the call as having no effect.
-  template <typename Value>
-  __attribute__((always_inline)) void prefetch_below(const Value *values, int y, int count) const {
-    const Value *soon = values + (ptrdiff_t)std::min(ROWS_AHEAD, std::max(0, height_ - 1 - std::max(y, 0))) * width_;
-    for (int x = 0; x < count; x += 64 / (int)sizeof(Value)) __builtin_prefetch(soon + x);
   }
 
   // Fills all rows of a grid from a plane of the frame, padding with the nearest border pixel.
@@ -462,7 +415,6 @@ class Repair {
     const int first = std::max(0, -grid.x0), last = std::min(grid.pitch, width_ - grid.x0);
     for (int y = grid.y0; y < grid.bottom(); y++, to += grid.pitch) {
       const Value *from = plane + (ptrdiff_t)std::min(std::max(y, 0), height_ - 1) * width_ + grid.x0;
-      prefetch_below(from + first, y, last - first);
       for (int x = first; x < last; x++) to[x] = of(from[x]);
       std::fill(to, to + first, to[first]);
       std::fill(to + last, to + grid.pitch, to[last - 1]);
@@ -492,7 +444,7 @@ class Repair {
     parallel((int)groups.size(), [&](int g) {
       Group &group = groups[g];
       find_in(group.part, in_frame(group.part.grown(halo)), expects_ramps, selected, measures ? &found[g] : nullptr, group.edges);
-      group.bounds = bounds(group, [](size_t) { return true; });
+      group.bounds = bounds(group);
     });
     found_ = {};
     for (const EdgeSums &here : found) {
@@ -510,7 +462,6 @@ class Repair {
       const size_t i = (size_t)y * width_ + part.x0;
       const float *values = map_.nearness + i;
       uint8_t *marks = marks_.data() + i;
-      prefetch_below(values, y, part.width);
       for (int x = 0; x < part.width; x++) marks[x] = std::fabs(values[x]) <= LARGEST ? 0 : (RINGS + 1) * UNSURE;
     }
     const Part busy = changing(part);
@@ -768,12 +719,9 @@ class Repair {
     const std::vector<float> falloff = window([](float square) { return square > 0 ? std::exp(-square / 12.5f) : 0.0f; });
     parallel((int)groups.size(), [&](int g) {
       if (groups[g].edges.empty()) return;
-      switch (channels_) {
-        case 1: return judge<1>(groups[g], falloff.data(), wants_surfaces);
-        case 3: return judge<3>(groups[g], falloff.data(), wants_surfaces);
-        case 4: return judge<4>(groups[g], falloff.data(), wants_surfaces);
-        default: judge<0>(groups[g], falloff.data(), wants_surfaces);
-      }
+      groups[g].judged.resize(groups[g].edges.size());
+      groups[g].around.resize((groups[g].edges.size() + LANES - 1) / LANES);
+      channels_ == 3 ? judge<3>(groups[g], falloff.data(), wants_surfaces) : judge<0>(groups[g], falloff.data(), wants_surfaces);
     });
   }
 
@@ -797,12 +745,8 @@ class Repair {
     fetch(marks_.data(), witness, [](uint8_t marks) { return (float)(marks / UNSURE); });
     float *sure = witness.at(around.y0, around.x0);
     for (size_t i = 0; i < witness.size; i += LANES) store(sure + i, pick(SURE, convert(load<vec>(sure + i))));
-    struct Lanes {
-      vec lanes;
-    };
-    std::vector<Lanes> many(C ? 0 : count);
-    // of LANES pixels: totals, own colours
-    std::vector<float> numbers(C ? 0 : count + 3 + channels), of_lanes((count + channels) * LANES);
+    std::vector<vec> many(C ? 0 : count);
+    std::vector<float> of_lanes((count + channels) * LANES);  // of LANES pixels: totals, own colours
     struct Window {
       vec weights[2][WINDOW], values[WINDOW], apart[WINDOW];
     } windows[LANES];
@@ -814,19 +758,18 @@ class Repair {
       const float near = edge.near, far = edge.far;
       const vec most_difference = all(0.25f * std::max(near - far, 1e-12f));
       vec few[C ? 4 + 2 * C : 1];
-      float few_sums[C ? 4 + 2 * C + 3 : 1], few_own[C ? C : 1];
       // of both surfaces: weights, squared colour differences, colour differences of each channel
-      vec *sums = C ? few : &many[0].lanes;
-      float *totals = C ? few_sums : numbers.data(), *own = C ? few_own : numbers.data() + count + 3;
+      vec *sums = C ? few : many.data();
+      float *own = &of_lanes[count * LANES + lane];
       for (int n = 0; n < count; n++) sums[n] = none;
       const float *given_at = given.at(y - REACH, x - REACH), *witness_at = witness.at(y - REACH, x - REACH), *colour_at = colour.at(y - REACH, x - REACH);
-      for (int c = 0; c < channels; c++) own[c] = colour_at[c * colour.size + REACH * colour.pitch + REACH];
+      for (int c = 0; c < channels; c++) own[c * LANES] = colour_at[c * colour.size + REACH * colour.pitch + REACH];
       each_of_window([&](int n, const auto &take) {
         const vec value = take(given_at, given.pitch), weight = load<vec>(falloff + n * LANES) * take(witness_at, given.pitch), off = value - near;
         const vec w[2] = {size_of(off) < most_difference ? weight : none, size_of(value - far) < most_difference ? weight : none};
         vec apart = none;  // squared colour difference
         for (int c = 0; c < channels; c++) {
-          const vec d = take(colour_at + c * colour.size, given.pitch) - own[c];
+          const vec d = take(colour_at + c * colour.size, given.pitch) - own[c * LANES];
           apart += d * d;
           for (int side = 0; side < 2; side++) sums[4 + 2 * c + side] += w[side] * d;
         }
@@ -838,9 +781,7 @@ class Repair {
         window.values[n] = off;
         window.apart[n] = apart;
       });
-      sum(sums, count, totals);
-      for (int n = 0; n < count; n++) of_lanes[n * LANES + lane] = totals[n];
-      for (int c = 0; c < channels; c++) of_lanes[(count + c) * LANES + lane] = own[c];
+      for (int n = 0; n < count; n++) of_lanes[n * LANES + lane] = sum(sums[n]);
       if (lane < LANES - 1 && k + 1 < group.edges.size()) return;
 
       // LANES pixels at once
@@ -876,11 +817,9 @@ class Repair {
             parts[4 + side] += part * window.values[n];
           }
         }
-        float of_parts[6 + 3];
-        sum(parts, 6, of_parts);
         for (int side = 0; side < 2; side++) {
-          likely[side][l] = of_parts[side];
-          surfaces[side][l] = edge.near + of_parts[4 + side] / std::max(of_parts[2 + side], 1e-12f);
+          likely[side][l] = sum(parts[side]);
+          surfaces[side][l] = edge.near + sum(parts[4 + side]) / std::max(sum(parts[2 + side]), 1e-12f);
         }
       }
       for (int n = 0; n < 8; n++) store(around + n * LANES, 1.0f / (1.0f + load<vec>(around + n * LANES) * per_light));
@@ -896,9 +835,9 @@ class Repair {
   }
 
   // Averages the scores of neighbours of similar colour, and finds the evidence.
-  void decide(const std::vector<Group> &groups) {
+  void decide(std::vector<Group> &groups) {
     parallel((int)groups.size(), [&](int g) {
-      const Group &group = groups[g];
+      Group &group = groups[g];
       if (group.edges.empty()) return;
       const Grid scores(group.bounds.grown(1));
       take_listed(score_.data(), scores, NO_SCORE);
@@ -1149,7 +1088,7 @@ class Repair {
       if (!map_.steps && !(largest(high) - smallest(low) > 0.5f * step(0))) return;
       const Group group{part, lamps_of(part, near)};
       if (group.edges.empty()) return;
-      const Part around = bounds(group, [](size_t) { return true; }).grown(REACH), covered = around.grown(reach), whole = covered.grown(USUAL_REACH);
+      const Part around = bounds(group).grown(REACH), covered = around.grown(reach), whole = covered.grown(USUAL_REACH);
       const Grid bright(whole), usual(whole), rows(whole), peak(covered), blurred(around), given(around);
       brightest(bright, usual, rows, covered);
       max_filter<2>(bright, peak, rows, covered);
@@ -1258,10 +1197,8 @@ class Repair {
   const int height_, width_, channels_;
   const size_t area_;
   float noise_step_ = 0.0f;  // smallest step that is larger than the map's noise
-  Buffer<float> score_, evidence_;
-  Buffer<uint8_t> marks_;
-  Buffer<Judgement> judged_;  // of the edges given memory last
-  Buffer<Around> around_;
+  const Buffer<float> score_, evidence_;
+  const Buffer<uint8_t> marks_;
   std::vector<float> shares_;
   EdgeSums found_;
 };

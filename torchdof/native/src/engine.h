@@ -67,24 +67,11 @@ inline float largest(vec v) {
 inline float smallest(vec v) { return -largest(-v); }
 inline vec size_of(vec v) { return (vec)((ivec)v & 0x7fffffff); }
 typedef float quad __attribute__((vector_size(16)));
-inline quad quad_of(vec v) {
-  quad parts[LANES / 4], total;
-  memcpy(parts, &v, sizeof(v));
-  total = parts[0];
-  for (int i = 1; i < LANES / 4; i++) total += parts[i];
-  return total;
-}
 inline float sum(vec v) {
-  const quad total = quad_of(v);
-  return (total[0] + total[1]) + (total[2] + total[3]);
-}
-// Sums each of `count` vectors; writes up to three values beyond them.
-inline void sum(const vec *v, int count, float *out) {
-  for (int i = 0; i < count; i += 4) {
-    const quad none = {}, a = quad_of(v[i]), b = i + 1 < count ? quad_of(v[i + 1]) : none, c = i + 2 < count ? quad_of(v[i + 2]) : none, d = i + 3 < count ? quad_of(v[i + 3]) : none;
-    const quad ab = quad{a[0], b[0], a[1], b[1]} + quad{a[2], b[2], a[3], b[3]}, cd = quad{c[0], d[0], c[1], d[1]} + quad{c[2], d[2], c[3], d[3]};
-    store(out + i, quad{ab[0], ab[1], cd[0], cd[1]} + quad{ab[2], ab[3], cd[2], cd[3]});
-  }
+  quad parts[LANES / 4];
+  memcpy(parts, &v, sizeof(v));
+  for (int i = 1; i < LANES / 4; i++) parts[0] += parts[i];
+  return (parts[0][0] + parts[0][2]) + (parts[0][1] + parts[0][3]);
 }
 // Looks up LANES of eight values by index.
 inline vec pick(const float *values, ivec index) {
@@ -96,15 +83,21 @@ inline vec pick(const float *values, ivec index) {
   return picked;
 #endif
 }
-inline bool any_of(ivec mask) {
+// Packs the sign bit of each lane.
 #if defined(__AVX2__)
-  return __builtin_ia32_movmskps256((vec)mask) != 0;
+inline int bits(ivec mask) { return __builtin_ia32_movmskps256((vec)mask); }
+inline bool any_of(ivec mask) { return bits(mask) != 0; }
 #else
-  typedef long long wide __attribute__((vector_size(LANES * 4)));
-  const wide bits = (wide)mask;
-  return (bits[0] | bits[1]) != 0;
-#endif
+inline int bits(ivec mask) {
+  int lanes = 0;
+  for (int i = 0; i < LANES; i++) lanes |= (mask[i] & 1) << i;
+  return lanes;
 }
+inline bool any_of(ivec mask) {
+  typedef long long wide __attribute__((vector_size(LANES * 4)));
+  return (((wide)mask)[0] | ((wide)mask)[1]) != 0;
+}
+#endif
 inline bool any_positive(vec v) { return any_of(v > vec{}); }
 inline float clamp(float v, float low, float high) { return std::min(std::max(v, low), high); }
 inline float clamp01(float v) { return clamp(v, 0.0f, 1.0f); }
