@@ -14,7 +14,7 @@ namespace {
 
 constexpr float MIXED = 0.05f;          // weight above which the other surface counts
 constexpr float LEAST_TOTAL = 1e-9f;    // smallest divisor
-constexpr int BAND = 16;                // rows of samples whose gradients one thread adds up
+constexpr int BAND = 32;                // rows of pixels whose gradients one thread adds up
 
 // The pixels of an axis around each sample: `taps` of them from 2 sample - before on, which the frame's ends repeat.
 struct Axis {
@@ -23,6 +23,9 @@ struct Axis {
   int pixel(int sample, int tap) const { return std::clamp(2 * sample + tap - before, 0, size - 1); }
   // On an axis of odd size a sample covers half of its first and last pixel.
   float share(int tap) const { return taps == 3 && tap != 1 ? 0.5f : 1.0f; }
+  // Samples whose pixels are in [from, to).
+  int first(int from) const { return from == 0 ? 0 : std::max(0, ceil_div(from + before - taps + 1, 2)); }
+  int last(int to) const { return to == size ? samples : std::min(samples, (to - 1 + before) / 2 + 1); }
 };
 
 template <int CHANNELS>
@@ -47,11 +50,11 @@ class Farthest {
 
   // of_maps: the gradients of light, coc, other light, other coc and other weight, to which those of the level are added.
   void gradient(const float *slopes, float *const *of_maps) const {
-    for (int odd : {0, 1})  // two bands with one between them cover different pixels
-      torchdof::parallel(threads_, ceil_div(rows_.samples, 2 * BAND), nullptr, [&](int i, int) {
-        for (int y = (2 * i + odd) * BAND; y < std::min((2 * i + odd + 1) * BAND, rows_.samples); y++)
-          for (int x = 0; x < columns_.samples; x++) back(y, x, slopes, of_maps);
-      });
+    torchdof::parallel(threads_, ceil_div(rows_.size, BAND), nullptr, [&](int band, int) {
+      const int from = band * BAND, to = std::min(rows_.size, from + BAND);
+      for (int y = rows_.first(from); y < rows_.last(to); y++)
+        for (int x = 0; x < columns_.samples; x++) back(y, x, slopes, from * (size_t)columns_.size, to * (size_t)columns_.size, of_maps);
+    });
   }
 
  private:
@@ -97,8 +100,8 @@ class Farthest {
     for (int c = 0; c <= C_; c++) s.mean[c] *= 1.0f / std::max(s.total, LEAST_TOTAL);
   }
 
-  // Adds a sample's gradients to those of its pixels.
-  void back(int y, int x, const float *slopes, float *const *of_maps) const {
+  // Adds a sample's gradients to those of its pixels in [from, to).
+  void back(int y, int x, const float *slopes, size_t from, size_t to, float *const *of_maps) const {
     const size_t size = (size_t)rows_.samples * columns_.samples, at = (size_t)y * columns_.samples + x;
     Sample s;
     look(y, x, s);
@@ -119,6 +122,7 @@ class Farthest {
         of_coc[k] -= of_behind;
       }
       ties += t.coc == s.farthest;
+      if (t.at < from || t.at >= to) continue;
       for (int c = 0; c < C_; c++) {
         of_maps[2 * t.mixed][c * area_ + t.at] += slope[c] * t.count * t.dimmed;
         of_dimmed += slope[c] * t.count * light(t, c);
@@ -133,7 +137,7 @@ class Farthest {
     }
     for (int k = 0; k < s.number; k++) {
       const Tap &t = s.taps[k];
-      if (!(t.valid > 0)) continue;
+      if (t.at < from || t.at >= to || !(t.valid > 0)) continue;
       of_maps[1 + 2 * t.mixed][t.at] += of_coc[k] + (t.coc == s.farthest ? of_farthest / ties : 0.0f);
     }
   }
