@@ -526,9 +526,8 @@ class Composite {
       for (int c = 0; c < C_; c++) {
         float *row = light[i * C_ + c];
         extend(row);
-        for (int x = 0; x < before; x++) row[x] = border_.light(i, c, y, x0 + x, row[x]);
-        for (int x = n - after; x < n; x++) row[x] = border_.light(i, c, y, x0 + x, row[x]);
-        if (y != at_y && before + after < n) border_.continue_row(i, c, y, x0 + before, n - before - after, row + before);
+        for (int x = 0; x < n; x++)
+          if (y != at_y || x < before || x >= n - after) row[x] = border_.light(i, c, y, x0 + x, row[x]);
       }
       extend(coc[i]);
       extend(weight[i]);
@@ -939,7 +938,8 @@ class Composite {
       const Layer &l = layers_[k];
       if (l.scale > 1) continue;
       const int reach = ceil_div(l.half, CELL);
-      if (reach != known_reach) look_around(y0, x0, known_reach = reach, b);
+      if (reach != known_reach) around(y0 / CELL - reach, (y0 + TILE) / CELL - 1 + reach, x0 / CELL - reach, (x0 + TILE) / CELL - 1 + reach, b.layers.data());
+      known_reach = reach;
       if (!has(b.layers.data(), k)) continue;
       reaching.push_back(k);
       halo = std::max(halo, l.half);
@@ -965,10 +965,6 @@ class Composite {
       }
     }
     finish(tile_row * ceil_div(W_, TILE) + tile_column, y0, x0, rows, columns, b);
-  }
-
-  bool look_around(int y0, int x0, int reach, Scratch &b) const {
-    return around(y0 / CELL - reach, (y0 + TILE) / CELL - 1 + reach, x0 / CELL - reach, (x0 + TILE) / CELL - 1 + reach, b.layers.data());
   }
 
   // Composites the tile onto the light behind all layers, adds the light of highlights and writes the picture.

@@ -33,16 +33,12 @@ inline float is_behind(float distance_px) { return clamp01(distance_px - (BEHIND
 typedef float f8 __attribute__((vector_size(32)));
 constexpr int F8 = 8;
 
-// Even and odd elements of two adjacent vectors. Lane i holds element even_place(i) of them.
-#if defined(__AVX2__)  // within the halves of a vector; across them takes twice as long
-inline vec evens(vec a, vec b) { return __builtin_ia32_shufps256(a, b, 0x88); }
-inline vec odds(vec a, vec b) { return __builtin_ia32_shufps256(a, b, 0xdd); }
-constexpr int even_place(int lane) { return lane % 2 + lane / 4 * 2 + lane % 4 / 2 * 4; }
-#else
-inline vec evens(vec a, vec b) { return vec{a[0], a[2], b[0], b[2]}; }
-inline vec odds(vec a, vec b) { return vec{a[1], a[3], b[1], b[3]}; }
-constexpr int even_place(int lane) { return lane; }
-#endif
+// Every second of 2 LANES values.
+inline vec evens(const float *from) {
+  vec v;
+  for (int i = 0; i < LANES; i++) v[i] = from[2 * i];
+  return v;
+}
 
 // A position between two samples along an axis: index of the first, and fraction of the way to the next.
 struct Place {
@@ -251,18 +247,12 @@ class Filling {
         for (int i = 0; i < rows_count; i++) {
           const float *from = rows[i] + plane * across + 2 * x0;
           vec *to = child + i * COLUMNS;
-          to[0] = evens(load<vec>(from), load<vec>(from + LANES));
-          to[1] = odds(load<vec>(from), load<vec>(from + LANES));
-          if (COLUMNS == 3) to[2] = evens(load<vec>(from + 2), load<vec>(from + 2 + LANES));
+          for (int column = 0; column < COLUMNS; column++) to[column] = evens(from + column);
         }
       };
       const int n = std::min(LANES, width - x0);
       auto put = [&](int plane, vec value) {
-        if (n == LANES)
-          for (int i = 0; i < LANES; i++) out[even_place(i) * stride_ + plane] = value[i];
-        else
-          for (int i = 0; i < LANES; i++)
-            if (even_place(i) < n) out[even_place(i) * stride_ + plane] = value[i];
+        for (int i = 0; i < n; i++) out[i * stride_ + plane] = value[i];
       };
       read(C);
       vec farthest_coc = child[0];

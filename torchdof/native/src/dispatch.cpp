@@ -1,17 +1,12 @@
 // The C interface, and the choice of the instruction set.
 #include <atomic>
 #include <cstring>
-#include <memory>
 #include <new>
 #include <stdexcept>
 
 #include "api.h"
 #include "threads.h"
 #include "variants.h"
-
-struct torchdof_job {
-  std::unique_ptr<torchdof::AnyJob> job;
-};
 
 namespace torchdof {
 namespace {
@@ -54,21 +49,17 @@ int32_t guarded(const Body &body) {
 
 int32_t torchdof_begin(const torchdof_scene *scene, torchdof_job **job) {
   *job = nullptr;
-  return torchdof::guarded([&] {
-    std::unique_ptr<torchdof_job> made(new torchdof_job());
-    made->job.reset(torchdof::chosen().begin(*scene));
-    *job = made.release();
-  });
+  return torchdof::guarded([&] { *job = torchdof::chosen().begin(*scene); });
 }
 
 int64_t torchdof_radii(const torchdof_job *job, const int32_t **steps) {
-  *steps = job->job->radii().data();
-  return (int64_t)job->job->radii().size();
+  *steps = job->radii.data();
+  return (int64_t)job->radii.size();
 }
 
 int32_t torchdof_finish(torchdof_job *job, const float *const *kernels, const int32_t *halves,
                         const torchdof_field_mask *field_masks, int32_t field_masks_count, float *out) {
-  return torchdof::guarded([&] { job->job->finish({kernels, halves, field_masks, field_masks_count}, out); });
+  return torchdof::guarded([&] { job->finish({kernels, halves, field_masks, field_masks_count}, out); });
 }
 
 void torchdof_free(torchdof_job *job) { delete job; }

@@ -13,9 +13,7 @@ class Downsampling {
  public:
   Downsampling(const Job &job, const LayerIndex &index, const Border &border, Downsampled &to)
       : job_(job), s_(job.surfaces), index_(index), border_(border), over_(job.scene.occlusion), to_(to), C_(job.channels), stride_(to.stride()), each_(1.0f / (to.scale * to.scale)),
-        light_(C_), light_of_{light_, light_}, beyond_((size_t)2 * C_ * BLOCK_PIXELS) {
-    for (const Layer &l : job.layers) ramps_.push_back({l.at, l.per_after});
-  }
+        light_(C_), light_of_{light_, light_}, beyond_((size_t)2 * C_ * BLOCK_PIXELS) {}
 
   // Computes all blocks of a band of BLOCK rows of pixels.
   void band(int band) {
@@ -30,8 +28,6 @@ class Downsampling {
         // up to the next block of the image, or in the margin
         const int block_of = std::clamp(floor_div(column * s, BLOCK), 0, s_.block_columns - 1);
         int end = block_of + 1 == s_.block_columns ? to_.columns + to_.margin : (block_of + 1) * BLOCK / s;
-        if (row >= 0 && row * s < job_.height && block_of + 2 < s_.block_columns)
-          s_.fetch_block(row * s / BLOCK * s_.block_columns + block_of + 2, row * s % BLOCK, s);
         if (!near[block_of]) {
           std::fill(to_.row(0, row) + column, to_.row(0, row) + end, FARTHEST);
           std::fill(to_.row(1, row) + column, to_.row(1, row) + end, 1.0f);
@@ -287,8 +283,8 @@ class Downsampling {
   vec far_between(int surface, int i) const {
     vec at, per;
     for (int lane = 0; lane < LANES; lane++) {
-      const Ramp &of = ramps_[interval_[surface][i + lane]];
-      at[lane] = of.at, per[lane] = of.per;
+      const Layer &before = job_.layers[interval_[surface][i + lane]];
+      at[lane] = before.at, per[lane] = before.per_after;
     }
     return ramp((index_.place(load<vec>(coc_[surface] + i)) - at) * per, over_);
   }
@@ -342,10 +338,6 @@ class Downsampling {
   // For a cell's pixels and both surfaces. before, after: weight in the layers before and after the pixel.
   float coc_[2][BLOCK_PIXELS], weight_[2][BLOCK_PIXELS], before_[2][BLOCK_PIXELS], after_[2][BLOCK_PIXELS];
   int32_t interval_[2][BLOCK_PIXELS];
-  struct Ramp {
-    float at, per;
-  };
-  std::vector<Ramp> ramps_;  // beyond each layer
   std::vector<NormalizerCorrection> corrections_;
   std::vector<int> cell_nodes_;    // nodes in a row of blocks,
   std::vector<float> cell_sums_;  // and their values in the layout of pieces [nodes, stride, blocks]

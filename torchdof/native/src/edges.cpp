@@ -2,13 +2,9 @@
 //
 // The frame is processed in tiles of AREA x AREA pixels, and within a tile only where the map changes. Each tile is
 // copied with a margin, padded beyond the frame with the nearest border pixel, so that loops run in whole vectors.
-#include <algorithm>
 #include <array>
-#include <cmath>
-#include <vector>
 
 #include "engine.h"
-#include "variants.h"
 
 namespace torchdof {
 namespace TORCHDOF_SIMD {

@@ -1,8 +1,6 @@
 // Prepares a scene: cleaned copies, second surfaces, highlights.
 #include "engine.h"
 
-#include "variants.h"
-
 namespace torchdof {
 namespace TORCHDOF_SIMD {
 
@@ -185,21 +183,12 @@ void Job::begin() {
 
 void Job::finish(const RayKernels &kernels, float *out) { composite(*this, kernels, out); }
 
-}  // namespace TORCHDOF_SIMD
+static torchdof_job *begin(const torchdof_scene &scene) {
+  auto job = std::make_unique<Job>(scene);
+  job->begin();
+  return job.release();
+}
 
-template <typename Job>
-class JobOf : public AnyJob {
- public:
-  explicit JobOf(const torchdof_scene &scene) : job_(scene) { job_.begin(); }
-  const std::vector<int32_t> &radii() const override { return job_.radii; }
-  void finish(const RayKernels &kernels, float *out) override { job_.finish(kernels, out); }
-
- private:
-  Job job_;
-};
-
-namespace TORCHDOF_SIMD {
-static AnyJob *begin(const torchdof_scene &scene) { return new JobOf<Job>(scene); }
 extern const Variant variant;
 const Variant variant = {begin, repair_edges, find_ends, coc_of_depth, plan, make_kernels, blend, farthest, look_behind};
 }  // namespace TORCHDOF_SIMD

@@ -56,6 +56,11 @@ inline vec least(vec a, vec b) {
   return __builtin_ia32_minps256(a, b);
 }
 #endif
+inline vec counting() {  // 0, 1, 2, ...
+  vec v;
+  for (int i = 0; i < LANES; i++) v[i] = i;
+  return v;
+}
 inline ivec convert(vec v) { return __builtin_convertvector(v, ivec); }
 inline vec convert(ivec v) { return __builtin_convertvector(v, vec); }
 inline vec clamp01(vec v) { return least(most(v, vec{}), all(1.0f)); }
@@ -171,11 +176,6 @@ class Surfaces {
     float *p = blocks[i];
     return {p, p + channels * BLOCK_PIXELS, p + 2 * channels * BLOCK_PIXELS, p + (2 * channels + 1) * BLOCK_PIXELS,
             p + (2 * channels + 2) * BLOCK_PIXELS};
-  }
-  // Prefetches rows of a block. Always inlined, because GCC otherwise removes the call as having no effect.
-  __attribute__((always_inline)) void fetch_block(int i, int first, int rows) const {
-    for (int k = 0; blocks[i] && k < 2 * channels + 3; k++)
-      for (int y = first; y < first + rows; y++) __builtin_prefetch(blocks[i] + k * BLOCK_PIXELS + y * BLOCK);
   }
   // Returns a block; creates it from the image if it does not exist yet.
   Block make_block(int i);
@@ -302,17 +302,16 @@ inline Layer make_layer(const double *nodes, int count, int k) {
   return l;
 }
 
-struct Job {
+struct Job : torchdof_job {
   explicit Job(const torchdof_scene &scene);
   void begin();
-  void finish(const RayKernels &kernels, float *out);
+  void finish(const RayKernels &kernels, float *out) override;
   void split_mixed();  // matting.cpp
 
   const torchdof_scene &scene;
   int height, width, channels, colours;  // colours: kernels of each layer, 1 or channels
   std::vector<Layer> layers;
   Surfaces surfaces;
-  std::vector<int32_t> radii;  // radii of highlight kernels, in steps of 1/32 px
   std::vector<Ray> rays;       // sorted by surface and position
   std::vector<float> ray_light;  // [rays, channels]
 
@@ -381,8 +380,6 @@ class Border {
     for (int i = 0; i < n; i++) on += mean(side, surface, channel, nearest_distance + i, place);
     return 0.5f * (nearest * shares_[side][(size_t)surface * length(side) + place] + on / n);
   }
-  // Overwrites n pixels of a row above or below the frame with the estimate.
-  void continue_row(int surface, int channel, int y, int x, int n, float *row) const;
 
  private:
   friend Border border_of(const Job &job, int farthest);
@@ -532,20 +529,10 @@ class FieldMask {
       s.next = s.values + count;
     }
   }
-  // Transmittance at dx, dx + 1, ...
-  vec transmittance_along(float dy, float dx) const {
-    vec across;
-    for (int i = 0; i < LANES; i++) across[i] = (dx + i) * squeeze_;
-    const vec u = dy * down_ + across * right_, v = across * down_ - dy * right_, first = samples_[0].at(u, most(v, -v));
-    return both_ ? (1.0f - part_) * first + part_ * samples_[1].at(u, most(v, -v)) : first;
-  }
-  // Transmittance at dy, dy - 1, ... for samples of a single radius.
-  vec transmittance(float dy, float dx) const {
-    const float across = dx * squeeze_;
-    vec step;
-    for (int i = 0; i < LANES; i++) step[i] = dy - i;
-    const vec u = step * down_ + across * right_, v = across * down_ - step * right_;
-    return samples_[0].at(u, most(v, -v));
+  // Transmittance at offsets from the kernel's centre.
+  vec transmittance(vec dy, vec dx) const {
+    const vec across = dx * squeeze_, u = dy * down_ + across * right_, v = size_of(across * down_ - dy * right_), first = samples_[0].at(u, v);
+    return both_ ? (1.0f - part_) * first + part_ * samples_[1].at(u, v) : first;
   }
   // Range of rows of a column that the samples cover.
   void rows_of(float dx, float &low, float &high) const {

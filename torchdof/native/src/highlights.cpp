@@ -229,13 +229,22 @@ void Job::extract_highlights() {
 }
 
 // Calls body(is_own, coc, weight, least_weight) for the surfaces shown in a row of a block column, from column x. A
-// surface covers weight - least_weight of a pixel (weight null: 1), so that hidden surfaces cover nothing.
+// surface covers weight - least_weight of a pixel (weight null: 1), so that hidden surfaces cover nothing. Both are BLOCK values.
 template <typename Body>
 static void each_shown(const Surfaces &surfaces, int y, int x, const float **light, const Body &body) {
   const int own = surfaces.full_planes() ? 1 : 0;  // with a given background the first plane is the other surface
-  const float *coc, *weight;
-  for (int i : {own, 1 - own})
-    if (surfaces.row(i, y, x, light, coc, weight)) body(i == own, coc, weight, i == own ? 0.0f : HIDDEN_WEIGHT);
+  const int n = std::min(BLOCK, surfaces.width - x);
+  for (int i : {own, 1 - own}) {
+    const float *coc, *weight;
+    if (!surfaces.row(i, y, x, light, coc, weight)) continue;
+    float its_coc[BLOCK] = {}, its_weight[BLOCK] = {};
+    if (n < BLOCK) {  // pixels beyond the frame get the weight 0
+      std::copy(coc, coc + n, its_coc);
+      for (int j = 0; j < n; j++) its_weight[j] = weight ? weight[j] : 1.0f;
+      coc = its_coc, weight = its_weight;
+    }
+    body(i == own, coc, weight, i == own ? 0.0f : HIDDEN_WEIGHT);
+  }
 }
 
 // Half width of a ray's kernel.
@@ -306,12 +315,6 @@ Visibility find_visibility(const Job &job, const RayKernels &kernels) {
       for (int y = row * CELL; y < std::min(H, (row + 1) * CELL) && !(flat && !surfaces.has_block(block)); y++)
         each_shown(surfaces, y, x, light.data(), [&](bool own, const float *coc, const float *weight, float least_weight) {
           if (own && flat) return;
-          float its_coc[BLOCK] = {}, its_weight[BLOCK] = {};
-          if (n < BLOCK) {
-            memcpy(its_coc, coc, n * sizeof(float));
-            for (int j = 0; j < n; j++) its_weight[j] = weight ? weight[j] : 1.0f;
-            coc = its_coc, weight = its_weight;
-          }
           for (int j = 0; j < BLOCK; j += LANES)
             add_bits(bits[j / CELL], load<vec>(coc + j), weight ? load<vec>(weight + j) > all(least_weight) : ivec{} == 0);
         });
@@ -336,15 +339,9 @@ namespace {
 bool cover_row(const Job &job, int y, int block_column, int block_columns, float place, const float **light, float *covered) {
   vec most_cover = {};
   for (int i = 0; i < block_columns; i++, covered += BLOCK) {
-    const int x = (block_column + i) * BLOCK, n = std::min(BLOCK, job.width - x);
+    const int x = (block_column + i) * BLOCK;
     for (int j = 0; j < BLOCK; j += LANES) store(covered + j, vec{});
     each_shown(job.surfaces, y, x, light, [&](bool, const float *coc, const float *weight, float least_weight) {
-      float its_coc[BLOCK] = {}, its_weight[BLOCK] = {};
-      if (n < BLOCK) {
-        memcpy(its_coc, coc, n * sizeof(float));
-        coc = its_coc;
-        if (weight) memcpy(its_weight, weight, n * sizeof(float)), weight = its_weight;
-      }
       for (int j = 0; j < BLOCK; j += LANES) {
         const vec apart = load<vec>(coc + j) - all(place);
         vec cover = most(all(1.0f) - most(apart, -apart), vec{});
@@ -463,7 +460,7 @@ std::vector<float> gains_of(const Job &job, const RayKernels &kernels) {
       for (int x = 0; x < side; x += LANES) {
         const vec light = load<vec>(row.data() + x);
         if (!any_positive(light)) continue;
-        const vec passed = light * mask.transmittance_along((float)y, (float)(x - half));
+        const vec passed = light * mask.transmittance(all((float)y), (float)(x - half) + counting());
         for (int lane = 0; lane < LANES; lane++) all_light += light[lane], left += passed[lane];
       }
     }
@@ -538,7 +535,7 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
             add_taps(ray_kernels, ray, e, py + i - ray.row, px - ray.column, nx, row);
             for (int x = 0; x < nx && gain > 0; x += LANES)
               if (any_positive(load<vec>(row + x)))
-                store(row + x, load<vec>(row + x) * gain * masks[e].transmittance_along((float)(py + i - ray.row), (float)(px + x - ray.column)));
+                store(row + x, load<vec>(row + x) * gain * masks[e].transmittance(all((float)(py + i - ray.row)), (float)(px + x - ray.column) + counting()));
             for (int x = 0; x < PATCH; x += LANES) any |= any_positive(load<vec>(row + x));
           }
         }

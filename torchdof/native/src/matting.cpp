@@ -265,11 +265,9 @@ void split_block(Job &job, int by, int bx, Window &w, const float *falloff) {
   for (int c = 0; c < job.channels; c++)
     read_window(job, job.surfaces.light + c * job.surfaces.area(), y0 - RIM, x0 - RIM, EDGES, w.light.data() + (size_t)c * EDGES * PITCH);
   clean_light(job, y0, x0, w, falloff);
-  ivec lane;
-  for (int i = 0; i < LANES; i++) lane[i] = i;
   for (int y = 0; y < std::min(BLOCK, job.height - y0); y++)
     for (int x = 0; x < std::min(BLOCK, job.width - x0); x += LANES) {
-      const ivec beside = (load<vec>(w.edge + (y + RIM) * PITCH + x + RIM) > vec{}) & (lane < job.width - x0 - x);
+      const ivec beside = (load<vec>(w.edge + (y + RIM) * PITCH + x + RIM) > vec{}) & (counting() < (float)(job.width - x0 - x));
       if (!any_of(beside)) continue;
       job.channels == 3 ? split<3>(job, w, y, x, beside, falloff, block) : split<0>(job, w, y, x, beside, falloff, block);
     }

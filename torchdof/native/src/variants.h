@@ -14,15 +14,18 @@ struct RayKernels {
   int32_t field_masks_count;
 };
 
-class AnyJob {
- public:
-  virtual ~AnyJob() = default;
-  virtual const std::vector<int32_t> &radii() const = 0;
-  virtual void finish(const RayKernels &kernels, float *out) = 0;
+}  // namespace torchdof
+
+struct torchdof_job {
+  std::vector<int32_t> radii;  // of highlight kernels, in steps of 1/32 px
+  virtual ~torchdof_job() = default;
+  virtual void finish(const torchdof::RayKernels &kernels, float *out) = 0;
 };
 
+namespace torchdof {
+
 struct Variant {
-  AnyJob *(*begin)(const torchdof_scene &scene);
+  torchdof_job *(*begin)(const torchdof_scene &scene);
   bool (*repair_edges)(const torchdof_map &map);
   void (*ends)(const float *values, int64_t count, int threads, float *low, float *high);
   void (*coc_of_depth)(const float *depth, int64_t count, float scale, float nearest, float farthest, int threads, float *out);
