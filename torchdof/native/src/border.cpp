@@ -96,5 +96,18 @@ Border border_of(const Job &job, int farthest) {
   return border;
 }
 
+void Border::continue_row(int surface, int channel, int y, int x, int n, float *row) const {
+  if (dark_) {
+    std::fill(row, row + n, 0.0f);
+    return;
+  }
+  const int far = y < 0 ? -y : y - height_ + 1;
+  const float part = part_of_[far];
+  const Side side = y < 0 ? TOP : BOTTOM;
+  const float *nearer = means_[side].data() + start(side, surface, channel, level_of_[far]) + x, *farther = nearer + length(side);
+  const float *share = shares_[side].data() + (size_t)surface * length(side) + x;
+  for (int i = 0; i < n; i++) row[i] = 0.5f * (row[i] * share[i] + nearer[i] + part * (farther[i] - nearer[i]));
+}
+
 }  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

@@ -526,8 +526,9 @@ class Composite {
       for (int c = 0; c < C_; c++) {
         float *row = light[i * C_ + c];
         extend(row);
-        for (int x = 0; x < n; x++)
-          if (y != at_y || x < before || x >= n - after) row[x] = border_.light(i, c, y, x0 + x, row[x]);
+        for (int x = 0; x < before; x++) row[x] = border_.light(i, c, y, x0 + x, row[x]);
+        for (int x = n - after; x < n; x++) row[x] = border_.light(i, c, y, x0 + x, row[x]);
+        if (y != at_y && before + after < n) border_.continue_row(i, c, y, x0 + before, n - before - after, row + before);
       }
       extend(coc[i]);
       extend(weight[i]);

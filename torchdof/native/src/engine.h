@@ -380,6 +380,8 @@ class Border {
     for (int i = 0; i < n; i++) on += mean(side, surface, channel, nearest_distance + i, place);
     return 0.5f * (nearest * shares_[side][(size_t)surface * length(side) + place] + on / n);
   }
+  // Overwrites n pixels of a row above or below the frame with the estimate.
+  void continue_row(int surface, int channel, int y, int x, int n, float *row) const;
 
  private:
   friend Border border_of(const Job &job, int farthest);
