@@ -208,11 +208,6 @@ void check(unsigned seed) {
     for (float value : alone)
       if (!std::isfinite(value)) fail("finite light gives a picture that is not", number);
 
-  const int half = number % 20;
-  std::vector<float> spread(size_t(scene.scene.height) * scene.scene.width);
-  torchdof_convolve(scene.light[0].data(), scene.scene.height, scene.scene.width, disc(half, half, 1).data(), half,
-                    spread.data());
-
   float low = 0, high = 0;
   if (torchdof_ends(alone.data(), int64_t(alone.size()), 3, &low, &high) != TORCHDOF_OK) fail("its ends cannot be told", number);
   if (!scene.scene.masked && (low != *std::min_element(alone.begin(), alone.end()) || high != *std::max_element(alone.begin(), alone.end())))
@@ -335,10 +330,10 @@ void check_blend(unsigned seed) {
     its_frame.threads = threads;
     its_frame.cancelled = &cancelled;
     std::vector<float> all(slopes.size());
-    const int result = torchdof_blend(&its_frame, all.data());
+    const int result = torchdof_blend(&its_frame, all.data(), nullptr, nullptr, nullptr, nullptr);
     if (result != TORCHDOF_CANCELLED && result != TORCHDOF_OK) fail("cancelling its layers is an error", int(seed));
     its_frame.cancelled = &never;
-    if (torchdof_blend(&its_frame, all.data()) != TORCHDOF_OK) fail("its layers cannot be blended", int(seed));
+    if (torchdof_blend(&its_frame, all.data(), nullptr, nullptr, nullptr, nullptr) != TORCHDOF_OK) fail("its layers cannot be blended", int(seed));
     std::vector<float> of_light[2], of_place[2], of_weight[2];
     float *of_light_at[2], *of_place_at[2], *of_weight_at[2];
     for (int s = 0; s < frame.surfaces; s++) {
@@ -349,7 +344,7 @@ void check_blend(unsigned seed) {
       of_place_at[s] = of_place[s].data();
       of_weight_at[s] = weight[s].empty() ? nullptr : of_weight[s].data();
     }
-    if (torchdof_blend_gradient(&its_frame, slopes.data(), of_light_at, of_place_at, of_weight_at) != TORCHDOF_OK)
+    if (torchdof_blend(&its_frame, nullptr, slopes.data(), of_light_at, of_place_at, of_weight_at) != TORCHDOF_OK)
       fail("its layers have no gradient", int(seed));
     for (int s = 0; s < frame.surfaces; s++)
       for (const std::vector<float> *part : {&of_light[s], &of_place[s], &of_weight[s]}) append(all, *part);
@@ -383,10 +378,11 @@ void check_look_behind(unsigned seed) {
     std::vector<float *> of_levels_at;
     for (const std::vector<float> &of_level : values) of_levels.emplace_back(of_level.size(), 0.0f);
     for (std::vector<float> &of_level : of_levels) of_levels_at.push_back(of_level.data());
-    if (torchdof_look_behind(levels.data(), count, channels, coc.data(), height, width, threads, all.data()) != TORCHDOF_OK)
+    if (torchdof_look_behind(levels.data(), count, channels, coc.data(), height, width, threads, all.data(), nullptr, nullptr,
+                             nullptr) != TORCHDOF_OK)
       fail("surfaces behind cannot be found", int(seed));
-    if (torchdof_look_behind_gradient(levels.data(), count, channels, coc.data(), height, width, threads, slopes.data(),
-                                      of_levels_at.data(), of_coc.data()) != TORCHDOF_OK)
+    if (torchdof_look_behind(levels.data(), count, channels, coc.data(), height, width, threads, nullptr, slopes.data(),
+                             of_levels_at.data(), of_coc.data()) != TORCHDOF_OK)
       fail("surfaces behind have no gradient", int(seed));
     append(all, of_coc);
     for (const std::vector<float> &of_level : of_levels) append(all, of_level);

@@ -1,4 +1,4 @@
-"""The compiled engine in a process: threads, interrupts, instruction sets; and its choice."""
+"""The compiled engine in a process: threads, interrupts, instruction sets; its convolution and its choice."""
 
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -107,6 +107,21 @@ except KeyboardInterrupt:
 def test_ctrl_c_is_raised_after_the_engine_has_stopped() -> None:
     """Otherwise the engine would use memory that its caller has freed."""
     assert output_of(INTERRUPTED_TWICE, flags=["-I"]) == "after the engine\n"
+
+
+@pytest.mark.parametrize("half", [0, 1, 2, 3, 7, 8, 10, 20, 64])
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (5, 6), (16, 16), (19, 37)])
+def test_convolution_scatters_an_asymmetric_kernel(height: int, width: int, half: int) -> None:
+    light, kernel = torch.rand(height, width), torch.rand(2 * half + 1, 2 * half + 1)
+    wanted = torch.zeros(height + 2 * half, width + 2 * half, dtype=torch.float64)
+    for row in range(height):
+        for column in range(width):
+            wanted[row : row + 2 * half + 1, column : column + 2 * half + 1] += light[row, column] * kernel
+    wanted = wanted[half : half + height, half : half + width].float()
+    padded = torch.nn.functional.pad(light, (half,) * 4)[None]
+    surface = (padded, torch.zeros_like(padded[0]), None)
+    out = native.blend([surface], half, (height, width), [0.0], [(kernel[None], 1)], False, False)[0]
+    torch.testing.assert_close(out, wanted, rtol=1e-5, atol=1e-6)
 
 
 # Choice of the engine by ``TORCHDOF_ENGINE``

@@ -34,7 +34,7 @@ MOST_PLANES = 16  # most channels of light and kernels' colours together in blen
 _SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
 _SMALL_FRAME = 2**16  # pixels; up to this size the main thread renders itself, which saves 0.1 ms
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
-_REVISION = 9  # of ``src/api.h``
+_REVISION = 10  # of ``src/api.h``
 
 Rules = Sequence[tuple[int, float, float, float]]
 
@@ -83,20 +83,15 @@ _STRUCTURES = {
 }
 """Structures of ``src/api.h``: types with the fields that have them. Data are pointers to numbers."""
 
-_LEVELS = "level* int int data int int int"
 _FUNCTIONS = {
     "begin": "int scene* data*",
     "radii": "long data int**",
     "finish": "int data data* int* field_mask* int data",
     "free": "nothing data",
-    "convolve": "nothing data int int data int data",
     "repair_edges": "int map* int*",
-    "blend": "int layers* data",
-    "blend_gradient": "int layers* data data* data* data*",
-    "farthest": "int data* int int int int int int data",
-    "farthest_gradient": "int data* int int int int int int data data*",
-    "look_behind": f"int {_LEVELS} data",
-    "look_behind_gradient": f"int {_LEVELS} data data* data",
+    "blend": "int layers* data data data* data* data*",
+    "farthest": "int data* int int int int int int data data data*",
+    "look_behind": "int level* int int data int int int data data data* data",
     "coc": "int data long real real real int data",
     "plan": "int data int int int double* int double* int int*",
     "kernels": "int spots* int data*",
@@ -225,7 +220,8 @@ def blend(surfaces: Sequence[Surface], *frame: Any) -> Tensor:
     """
     scene = _layers_of(surfaces, *frame)
     out = _empty(scene.channels + scene.kernel_colours, scene.height, scene.width)
-    _interruptible(lambda: _run("blend", scene, out), scene.cancelled.contents, scene.rows * scene.columns)
+    run = functools.partial(_run, "blend", scene, out, None, None, None, None)
+    _interruptible(run, scene.cancelled.contents, scene.rows * scene.columns)
     return out
 
 
@@ -233,7 +229,7 @@ def blend_gradient(gradient: Tensor, surfaces: Sequence[Surface], *frame: Any) -
     """The gradients of :func:`blend` by each map of its surfaces that is given, surface by surface."""
     scene = _layers_of(surfaces, *frame)
     sums = [[None if t is None else _empty(*t.shape).zero_() for t in maps] for maps in zip(*surfaces, strict=True)]
-    run = functools.partial(_run, "blend_gradient", scene, gradient, *sums)
+    run = functools.partial(_run, "blend", scene, None, gradient, *sums)
     _interruptible(run, scene.cancelled.contents, scene.rows * scene.columns)
     return [t for of_surface in zip(*sums, strict=True) for t in of_surface if t is not None]
 
@@ -280,15 +276,14 @@ def farthest(maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
     is light, coc and weight, ``[C + 2, h, w]``.
     """
     out = _empty(maps[0].shape[0] + 2, *size)
-    _run("farthest", [*maps, None], *maps[0].shape, *size, torch.get_num_threads(), out)
+    _run("farthest", [*maps, None], *maps[0].shape, *size, torch.get_num_threads(), out, None, None)
     return out
 
 
 def farthest_gradient(maps: Sequence[Tensor], size: tuple[int, int], gradient: Tensor) -> list[Tensor]:
     """The gradients of :func:`farthest` by its first five maps."""
     sums = [_empty(*values.shape).zero_() for values in maps[:5]]
-    arguments = (*maps[0].shape, *size, torch.get_num_threads(), gradient, sums)
-    _run("farthest_gradient", [*maps, None], *arguments)
+    _run("farthest", [*maps, None], *maps[0].shape, *size, torch.get_num_threads(), None, gradient, sums)
     return sums
 
 
@@ -299,14 +294,14 @@ def look_behind(levels: Sequence[Tensor], rules: Rules, coc: Tensor) -> Tensor:
     least_px, slope and most, as in ``torchdof_level``. The result is light, coc and votes, ``[C + 2, H, W]``.
     """
     out = _empty(levels[0].shape[0], *coc.shape[1:])
-    _run("look_behind", *_level_arguments(levels, rules, coc), out)
+    _run("look_behind", *_level_arguments(levels, rules, coc), out, None, None, None)
     return out
 
 
 def look_behind_gradient(levels: Sequence[Tensor], rules: Rules, coc: Tensor, gradient: Tensor) -> list[Tensor]:
     """The gradients of :func:`look_behind` by coc and by each level."""
     of_coc, of_levels = _empty(*coc.shape), [_empty(*values.shape).zero_() for values in levels]
-    _run("look_behind_gradient", *_level_arguments(levels, rules, coc), gradient, of_levels, of_coc)
+    _run("look_behind", *_level_arguments(levels, rules, coc), None, gradient, of_levels, of_coc)
     return [of_coc, *of_levels]
 
 

@@ -149,13 +149,13 @@ typedef struct {
 } torchdof_layers;
 #define TORCHDOF_MOST_PLANES 16
 
-// out: [channels + kernel_colours, height, width]: light, and coverage or transmittance, or sum of weights.
-TORCHDOF_API int32_t torchdof_blend(const torchdof_layers *layers, float *out);
+// Steps with a gradient. Without `gradient` they write `out`; else, given the gradient of `out`, they add to the gradients
+// of the inputs, which have the inputs' shapes, and write nothing else.
 
-// From the gradient of `out`: adds to the gradients of all surfaces, which have the shapes in `layers`. A surface without
-// weight has no gradient of the weight.
-TORCHDOF_API int32_t torchdof_blend_gradient(const torchdof_layers *layers, const float *gradient, float *const *light,
-                                             float *const *place, float *const *weight);
+// out: [channels + kernel_colours, height, width]: light, and coverage or transmittance, or sum of weights. A surface
+// without weight has no gradient of the weight.
+TORCHDOF_API int32_t torchdof_blend(const torchdof_layers *layers, float *out, const float *gradient, float *const *of_light,
+                                    float *const *of_place, float *const *of_weight);
 
 // A level of the pyramid from which hidden surfaces are filled; see render/disocclusion.py.
 typedef struct {
@@ -169,34 +169,21 @@ typedef struct {
 
 // The finest level of that pyramid, [channels + 2, rows, columns], from the surfaces of an image. maps: light [channels, height,
 // width], coc [height, width]; the same of each pixel's other surface, and its weight; light above which a pixel is a
-// highlight; and 0 for pixels that are left out, or null.
+// highlight; and 0 for pixels that are left out, or null. The first five maps have gradients.
 TORCHDOF_API int32_t torchdof_farthest(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t rows,
-                                       int32_t columns, int32_t threads, float *out);
-
-// From the gradient of `out`: adds to the gradients of the first five maps.
-TORCHDOF_API int32_t torchdof_farthest_gradient(const float *const *maps, int32_t channels, int32_t height, int32_t width,
-                                                int32_t rows, int32_t columns, int32_t threads, const float *gradient,
-                                                float *const *of_maps);
+                                       int32_t columns, int32_t threads, float *out, const float *gradient, float *const *of_maps);
 
 // The surfaces behind pixels with coc [height, width]. out: light, coc and votes, [channels + 2, height, width].
 TORCHDOF_API int32_t torchdof_look_behind(const torchdof_level *levels, int32_t count, int32_t channels, const float *coc, int32_t height,
-                                          int32_t width, int32_t threads, float *out);
-
-// From the gradient of `out`: adds to the gradients of the levels' values, sets that of coc.
-TORCHDOF_API int32_t torchdof_look_behind_gradient(const torchdof_level *levels, int32_t count, int32_t channels, const float *coc,
-                                                   int32_t height, int32_t width, int32_t threads, const float *gradient,
-                                                   float *const *of_levels, float *of_coc);
+                                          int32_t width, int32_t threads, float *out, const float *gradient,
+                                          float *const *of_levels, float *of_coc);
 
 // Smallest and largest value; both NaN if any value is NaN.
 TORCHDOF_API int32_t torchdof_ends(const float *values, int64_t count, int32_t threads, float *low, float *high);
 
-// out[y, x] = sum of kernel[v, u] in[y - v, x - u], as a layer is blurred. For tests and benchmarks.
-TORCHDOF_API void torchdof_convolve(const float *in, int32_t height, int32_t width, const float *kernel, int32_t half,
-                                    float *out);
-
 // Version of this interface, for the caller to check first: sizes of its structures and, in the upper half,
 // TORCHDOF_REVISION, which increases with every other change of this file.
-#define TORCHDOF_REVISION 9
+#define TORCHDOF_REVISION 10
 TORCHDOF_API int64_t torchdof_interface(void);
 
 // "avx2" or "baseline".

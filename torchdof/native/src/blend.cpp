@@ -370,9 +370,9 @@ class Blend {
   }
 
   // The terms of a layer in and around a tile: light, share and the share behind it.
-  template <int S, int CHANNELS>
+  template <int S>
   void terms(const Run &run, int k, const Tile &tile) const {
-    const int C = CHANNELS ? CHANNELS : C_, s = run.scale, guard = ceil_div(layers_[k].half, CELL) * CELL;
+    const int C = C_, s = run.scale, guard = ceil_div(layers_[k].half, CELL) * CELL;
     const Layer &l = layers_[k];
     const float part = 1.0f / (s * s);
     std::fill(tile.memory.begin(), tile.memory.end(), 0.0f);
@@ -435,25 +435,12 @@ class Blend {
       }
   }
 
-  void terms_of(const Run &run, int k, const Tile &tile) const {
-    if (C_ == 3)
-      S_ == 1 ? terms<1, 3>(run, k, tile) : terms<2, 3>(run, k, tile);
-    else
-      S_ == 1 ? terms<1, 0>(run, k, tile) : terms<2, 0>(run, k, tile);
-  }
-  void to_surfaces_of(const Run &run, int k, int block, const float *slopes) const {
-    if (C_ == 3)
-      S_ == 1 ? to_surfaces<1, 3>(run, k, block, slopes) : to_surfaces<2, 3>(run, k, block, slopes);
-    else
-      S_ == 1 ? to_surfaces<1, 0>(run, k, block, slopes) : to_surfaces<2, 0>(run, k, block, slopes);
-  }
-
   void blur(const Run &run, int k, const Tile &tile) const {
     const Blurred &b = blurred_[k];
     bool any = false;
     each_block_of(run, tile, [&](int block) { any |= b.index[block] >= 0; });
     if (!any) return;
-    terms_of(run, k, tile);
+    S_ == 1 ? terms<1>(run, k, tile) : terms<2>(run, k, tile);
     std::vector<uint32_t> rows, rows_behind;
     each_block_of(run, tile, [&](int block) {
       float *to = values_of(k, block);
@@ -767,7 +754,7 @@ class Blend {
           for (int j = 0; e && j < BLOCK_PIXELS; j++) to[j] += more[j];
         }
       }
-      to_surfaces_of(run, k, block, slopes);
+      S_ == 1 ? to_surfaces<1>(run, k, block, slopes) : to_surfaces<2>(run, k, block, slopes);
     });
   }
   bool weighed() const {
@@ -778,9 +765,9 @@ class Blend {
 
   // Adds the gradients of a layer's terms in a block to those of the surfaces: the derivatives of `terms` and `weigh`,
   // last operation first.
-  template <int S, int CHANNELS>
+  template <int S>
   void to_surfaces(const Run &run, int k, int block, const float *slopes) const {
-    const int C = CHANNELS ? CHANNELS : C_;
+    const int C = C_;
     const Layer &l = layers_[k];
     const int s = run.scale, y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
     const float part = 1.0f / (s * s);
@@ -856,10 +843,9 @@ class Blend {
 
 }  // namespace
 
-void blend(const torchdof_layers &scene, float *out) { Blend(scene).picture(out); }
-
-void blend_gradient(const torchdof_layers &scene, const float *out_gradient, float *const *light, float *const *place, float *const *weight) {
-  Blend(scene).gradient(out_gradient, light, place, weight);
+void blend(const torchdof_layers &scene, float *out, const float *gradient, float *const *of_light, float *const *of_place, float *const *of_weight) {
+  Blend blend(scene);
+  gradient ? blend.gradient(gradient, of_light, of_place, of_weight) : blend.picture(out);
 }
 
 }  // namespace TORCHDOF_SIMD

@@ -72,31 +72,15 @@ struct Scratch {
   std::vector<float *> term;    // of one layer: light, share, normalizer
   std::vector<float *> canvas;  // light and coverage of a tile
   float *traced;                // light of highlights in a tile
-  std::vector<float *> surface_share;  // a row of each surface's share
   float *farther;  // weight of surfaces that lie wholly behind a coarse layer
-  std::vector<uint32_t> occupied, partial, varying, every;  // column marks (see `mark`) of each row
+  // column marks (see `mark`) of each row: where the layer has a share, where its normalizer exceeds the share (so that
+  // coverage is below 1), and where the normalizer differs from 1
+  std::vector<uint32_t> occupied, partial, varying, every;
   std::vector<MaskedKernels> masked_kernels = std::vector<MaskedKernels>(TILE / FieldMask::COLUMNS);
   std::vector<const float *> pointers;
   std::vector<uint64_t> layers, block_layers;
   std::vector<WindowBlock> blocks;
   WindowPieces pieces;
-};
-
-// Column marks of a row: where the layer has a share (some), where its normalizer exceeds the share (partial: coverage
-// is below 1), and where the normalizer differs from 1 (varying).
-struct Occupied {
-  uint32_t some = 0, partial = 0, varying = 0;
-  void add(int x, float share, float normalizer, bool over) {
-    const uint32_t bit = mark(x);
-    if (share > 0) some |= bit;
-    if (over && normalizer != share) partial |= bit;  // may also be smaller where a surface's share is below HIDING_SHARE
-    if (over && (normalizer - 1.0f) * (normalizer - 1.0f) > EVEN_SQUARED) varying |= bit;
-  }
-  void put(Scratch &b, int y) const {
-    b.occupied[y] = some;
-    b.partial[y] = partial;
-    b.varying[y] = varying;
-  }
 };
 
 }  // namespace
@@ -173,7 +157,7 @@ class Composite {
       Scratch &b = *scratches_[worker];
       const size_t plane = (size_t)window_ * pitch_;
       const int count = s_.count, planes = count * (C_ + 2) + (C_ + 2) + 1;
-      b.memory.assign(planes * plane + (size_t)(2 * C_ + E_) * TILE_PIXELS + (size_t)(count + 2) * pitch_ + 16, 0.0f);
+      b.memory.assign(planes * plane + (size_t)(2 * C_ + E_) * TILE_PIXELS + 16, 0.0f);
       float *p = b.memory.data();
       auto take = [&](size_t size) { return (p += size) - size; };
       for (int i = 0; i < count * C_; i++) b.light.push_back(take(plane));
@@ -182,7 +166,6 @@ class Composite {
       b.farther = take(plane);
       b.traced = take((size_t)C_ * TILE_PIXELS);
       for (int i = 0; i < C_ + E_; i++) b.canvas.push_back(take(TILE_PIXELS));
-      for (int i = 0; i < count + 2; i++) b.surface_share.push_back(take(pitch_));
       for (auto *rows : {&b.occupied, &b.partial, &b.varying}) rows->resize(window_);
       b.every.assign(window_, ~0u);
       b.pointers.resize(C_);
@@ -193,9 +176,8 @@ class Composite {
 
   // Finds the node before each pixel of each surface, and the layers that occur in each cell of CELL x CELL pixels.
   //
-  // 1. Tabulate the node before places at even distances.
-  // 2. Fill a block at once if it shows one surface that lies between two neighbouring nodes.
-  // 3. In other blocks, compare the places of a cell's pixels with the nodes between the smallest and the largest one.
+  // Fills a block at once if it shows one surface that lies between two neighbouring nodes. In other blocks, compares the
+  // places of a cell's pixels with the nodes between the smallest and the largest one.
   void index() {
     index_.words = (N_ + 63) / 64;
     index_.rows = ceil_div(H_, CELL);
@@ -204,18 +186,9 @@ class Composite {
     index_.single.assign((size_t)index_.rows * index_.columns, 0);
     index_.mixed.assign(index_.single.size(), 0);
     for (int i = 0; i < s_.count; i++) index_.intervals.emplace_back(s_.area());
-    constexpr int STEPS = 4096;
-    std::vector<int> start(STEPS + 2);
-    const double reach = (double)index_.high - index_.low;
-    for (int i = 0, k = 0; i <= STEPS + 1; i++) {
-      while (k + 1 < N_ && (float)layers_[k + 1].node <= index_.low + (i - 1) * reach / STEPS) k++;
-      start[i] = k;
-    }
-    const float scale = reach > 0 ? (float)(STEPS / reach) : 0.0f;
     auto node_before = [&](float place) {
-      int k = start[std::clamp((int)((place - index_.low) * scale), 0, STEPS)];
-      while (k + 1 < N_ && place >= layers_[k + 1].at) k++;
-      return k;
+      const auto after = std::upper_bound(layers_.begin() + 1, layers_.end(), place, [](float at, const Layer &l) { return at < l.at; });
+      return (int)(after - layers_.begin()) - 1;
     };
     auto mark = [&](uint64_t *bits, float place, int k) {
       bits[k / 64] |= 1ull << k % 64;
@@ -355,8 +328,7 @@ class Composite {
       if (d)
         downsampled_terms(run, *d, k, top, left, height, width, spare, b);
       else
-        block_means(k, s, top + spare, left + spare, rows + 2 * l.half, columns + 2 * l.half, (size_t)spare * pitch_ + spare, b);
-      if (!d) find_occupied(b, spare, rows + 2 * l.half, spare, columns + 2 * l.half);
+        block_means(k, s, top + spare, left + spare, rows + 2 * l.half, columns + 2 * l.half, spare, spare, b);
       composite_layer(b, l, rows, columns, spare, spare, tile_y - 1, tile_x - 1);
     }
     for (int c = 0; c < C_ + E_; c++)
@@ -412,7 +384,7 @@ class Composite {
     const vec at = all((float)k), before = all((float)(k - 1));
     for (int y = spare; y < height - spare; y++) {
       const size_t to = (size_t)y * pitch_;
-      const float *node = d.row(0, top + y) + left, *one = d.row(1, top + y) + left, *two = d.row(2, top + y) + left;
+      const float *node = d.row(0, top + y) + left, *one = d.row(1, top + y) + left, *two = d.row(C + 2, top + y) + left;
       float *share = b.term[C] + to, *normalizer = b.term[C + 1] + to;
       uint32_t occupied = 0, partial = 0, varying = 0;
       for (int x0 = 0; x0 < width; x0 += MARKED) {
@@ -439,7 +411,7 @@ class Composite {
       b.partial[y] = partial;
       b.varying[y] = varying;
       for (int c = 0; c < C; c++) {
-        const float *light = d.row(3 + c, top + y) + left, *far = d.row(3 + C + c, top + y) + left;
+        const float *light = d.row(2 + c, top + y) + left, *far = d.row(3 + C + c, top + y) + left;
         float *term = b.term[c] + to;
         for (int x0 = 0; x0 < width; x0 += MARKED) {
           if (!(occupied & mark(x0))) {
@@ -488,26 +460,28 @@ class Composite {
     }
   }
 
-  // The terms of layer k for surfaces that cover each other: computes each row of pixels and averages over s x s.
-  void block_means(int k, int s, int top, int left, int height, int width, size_t shift, Scratch &b) {
+  // The terms of layer k for surfaces that cover each other, in rows from `first` and columns from `from` of a window: computes
+  // each row of pixels and averages over s x s.
+  void block_means(int k, int s, int top, int left, int height, int width, int first, int from, Scratch &b) {
     const float each = 1.0f / (s * s);
     const int n = width * s;
-    std::vector<float> memory((size_t)(s_.count * (C_ + 2) + C_ + 2 + s_.count + 2) * (n + LANES));
+    std::vector<float> memory((size_t)(s_.count + 1) * (C_ + 2) * (n + LANES));
     float *m = memory.data();
     auto take = [&] { return (m += n + LANES) - (n + LANES); };  // vectors may read beyond the end
-    std::vector<float *> light(s_.count * C_), coc(s_.count), weight(s_.count), term(C_ + 2), surface_share(s_.count + 2);
-    for (auto *v : {&light, &coc, &weight, &term, &surface_share})
+    std::vector<float *> light(s_.count * C_), coc(s_.count), weight(s_.count), term(C_ + 2);
+    for (auto *v : {&light, &coc, &weight, &term})
       for (float *&row : *v) row = take();
     for (int by = 0; by < height; by++) {
-      const size_t to = shift + (size_t)by * pitch_;
+      const size_t to = (size_t)(first + by) * pitch_ + from;
       for (int c = 0; c < C_ + 2; c++) memset(b.term[c] + to, 0, width * sizeof(float));
       for (int y = 0; y < s; y++) {
         read_row((top + by) * s + y, left * s, n, false, light.data(), coc.data(), weight.data(), b);
-        row_terms(layers_[k], n, light.data(), coc.data(), weight.data(), surface_share.data(), term.data());
+        row_terms(layers_[k], n, light.data(), coc.data(), weight.data(), term.data());
         for (int x = 0; x < n; x++)
           for (int c = 0; c < C_ + 2; c++) b.term[c][to + x / s] += term[c][x] * each;
       }
     }
+    find_occupied(b, first, height, from, width);
   }
 
   // Reads a row of all surfaces, extended beyond the frame: light [surfaces, channels], place on the blur axis, weight.
@@ -566,43 +540,42 @@ class Composite {
   // behind the layer; g: its share at the layer. Each surface in turn takes its part of what nearer surfaces at the
   // layer left. The normalizer is the share that surfaces in front of the layer leave visible, where any surface behind
   // them is known.
-  void row_terms(const Layer &l, int n, const float *const *light, const float *const *place, const float *const *weight,
-                 float *const *surface_share, float *const *term) const {
-    float *share = term[C_], *normalizer = term[C_ + 1];
-    float *left = surface_share[s_.count], *unknown = surface_share[s_.count + 1];
-    for (int i = 0; i < n; i++) normalizer[i] = left[i] = unknown[i] = 1.0f;
-    for (int j = 0; j < s_.count; j++) {
-      const float *p = place[j], *w = weight[j];
-      float *m = surface_share[j];
-      for (int i = 0; i < n; i++) {
-        const float cover = w[i], h = at_or_behind(l, p[i], over_), g = h - behind(l, p[i], over_);
-        const float here = cover * eased(std::min(h / HIDING_SHARE, 1.0f)), there = 1.0f - here * (1.0f - h);
-        const float stops = cover * g / std::max(there, LEAST);
-        m[i] = left[i] * stops;
-        left[i] *= 1.0f - stops;
-        normalizer[i] *= there;
-        unknown[i] *= 1.0f - here;
+  void row_terms(const Layer &l, int n, const float *const *light, const float *const *place, const float *const *weight, float *const *term) const {
+    std::vector<vec> m(s_.count);  // share of each surface
+    for (int i = 0; i < n; i += LANES) {
+      vec left = all(1.0f), unknown = left, normalizer = left, share = {};
+      for (int j = 0; j < s_.count; j++) {
+        const vec p = load<vec>(place[j] + i), cover = load<vec>(weight[j] + i), h = at_or_behind(l, p, over_);
+        const vec here = cover * eased(least(h / HIDING_SHARE, all(1.0f))), there = 1.0f - here * (1.0f - h);
+        const vec stops = cover * (h - behind(l, p, over_)) / most(there, all(LEAST));
+        m[j] = left * stops;
+        left *= 1.0f - stops;
+        normalizer *= there;
+        unknown *= 1.0f - here;
       }
-    }
-    for (int i = 0; i < n; i++) share[i] = 0;
-    for (int j = 0; j < s_.count; j++)
-      for (int i = 0; i < n; i++) share[i] += surface_share[j][i] *= normalizer[i];
-    for (int i = 0; i < n; i++) normalizer[i] *= 1.0f - unknown[i];
-    for (int c = 0; c < C_; c++)
-      for (int i = 0; i < n; i += LANES) {
-        vec sum = load<vec>(light[c] + i) * load<vec>(surface_share[0] + i);
-        for (int j = 1; j < s_.count; j++) sum += load<vec>(light[j * C_ + c] + i) * load<vec>(surface_share[j] + i);
+      for (vec &its_share : m) share += its_share *= normalizer;
+      store(term[C_] + i, share);
+      store(term[C_ + 1] + i, normalizer * (1.0f - unknown));
+      for (int c = 0; c < C_; c++) {
+        vec sum = {};
+        for (int j = 0; j < s_.count; j++) sum += load<vec>(light[j * C_ + c] + i) * m[j];
         store(term[c] + i, sum);
       }
+    }
   }
 
   // Marks the columns in which a layer's terms are used, in rows from `top` and columns from `left` of a window.
   void find_occupied(Scratch &b, int top, int rows, int left, int columns) const {
     for (int y = top; y < top + rows; y++) {
       const float *share = b.term[C_] + (size_t)y * pitch_, *normalizer = b.term[C_ + 1] + (size_t)y * pitch_;
-      Occupied row;
-      for (int x = left; x < left + columns; x++) row.add(x, share[x], normalizer[x], over_);
-      row.put(b, y);
+      b.occupied[y] = b.partial[y] = b.varying[y] = 0;
+      for (int x = left; x < left + columns; x++) {
+        const float from_one = normalizer[x] - 1.0f;
+        b.occupied[y] |= share[x] > 0 ? mark(x) : 0;
+        if (!over_) continue;
+        b.partial[y] |= normalizer[x] != share[x] ? mark(x) : 0;  // may also be smaller, where a share is below HIDING_SHARE
+        b.varying[y] |= from_one * from_one > EVEN_SQUARED ? mark(x) : 0;
+      }
     }
   }
 
@@ -684,10 +657,9 @@ class Composite {
       if (has(w.layers, k)) {
         w.clear = false;
         w.normalizer = WindowBlock::STALE;
-        if (C_ == 3)
-          w.count == 1 ? block_terms<3, 1>(layers_[k], w, y0, y1, x0, x1, b) : block_terms<3, 2>(layers_[k], w, y0, y1, x0, x1, b);
-        else
-          w.count == 1 ? block_terms<0, 1>(layers_[k], w, y0, y1, x0, x1, b) : block_terms<0, 2>(layers_[k], w, y0, y1, x0, x1, b);
+        const auto terms = C_ == 3 ? (w.count == 1 ? &Composite::block_terms<3, 1, true> : &Composite::block_terms<3, 2, true>)
+                                   : (w.count == 1 ? &Composite::block_terms<0, 1, true> : &Composite::block_terms<0, 2, true>);
+        (this->*terms)(layers_[k], w, y0, y1, x0, x1, &b.partial[w.top], &b.varying[w.top], b);
         continue;
       }
       if (!w.clear) {
@@ -698,7 +670,12 @@ class Composite {
       const uint32_t bits = marks(w.column, w.column + BLOCK - 1);
       if ((before && behind) || (behind && (w.count > 1 || w.surfaces[0].weight))) {
         // layers in between may have been left out here, as their kernels do not reach the block
-        if (w.normalizer != WindowBlock::KEPT || w.before != before) block_normalizer(layers_[k], w, b);
+        if (w.normalizer != WindowBlock::KEPT || w.before != before) {
+          std::fill(w.partial, w.partial + BLOCK, 0u);
+          std::fill(w.varying, w.varying + BLOCK, 0u);
+          const auto terms = w.count == 1 ? &Composite::block_terms<0, 1, false> : &Composite::block_terms<0, 2, false>;
+          (this->*terms)(layers_[k], w, w.top, w.top + w.rows, 0, BLOCK, w.partial, w.varying, b);
+        }
         w.normalizer = WindowBlock::KEPT;
         w.before = before;
         for (int y = y0; y < y1; y++) {
@@ -721,9 +698,10 @@ class Composite {
     }
   }
 
-  // The terms of layer l in columns x0 to x1 of a block and rows y0 to y1 of the window.
-  template <int CHANNELS, int COUNT>
-  void block_terms(const Layer &l, const WindowBlock &w, int y0, int y1, int x0, int x1, Scratch &b) {
+  // The terms of layer l in columns x0 to x1 of a block and rows y0 to y1 of the window; only the normalizer, if the layer
+  // does not occur in the block. partial, varying: marks of the block's rows.
+  template <int CHANNELS, int COUNT, bool OCCURS>
+  void block_terms(const Layer &l, const WindowBlock &w, int y0, int y1, int x0, int x1, uint32_t *partial, uint32_t *varying, Scratch &b) {
     const int C = CHANNELS ? CHANNELS : C_;
     for (int y = y0; y < y1; y++) {
       const size_t row = y - w.top, at = (size_t)y * pitch_ + w.column;
@@ -736,54 +714,31 @@ class Composite {
           weight[j] = of.weight ? load<vec>(of.weight + row * of.weight_pitch + x) : all(1.0f);
         }
         if (COUNT == 2) add_continuation(p, h, weight);
-        for (int j = 0; j < COUNT; j++) {
-          surface_share[j] = (h[j] - behind(l, p[j], over_)) * weight[j];
-          share += surface_share[j];
-          normalizer += h[j] * weight[j];
-        }
-        const bool some = any_positive(share);
-        bool has_light[COUNT];
-        for (int j = 0; j < COUNT; j++) has_light[j] = COUNT == 1 ? some : any_positive(surface_share[j]);
+        for (int j = 0; j < COUNT; j++) normalizer += h[j] * weight[j];
         const uint32_t bit = mark(w.column + x);
-        store(b.term[C] + at + x, share);
-        for (int c = 0; c < C; c++) {
-          vec sum = {};
-          for (int j = 0; j < COUNT; j++)
-            if (has_light[j]) sum += load<vec>(w.surfaces[j].light + c * w.surfaces[j].channel + row * w.surfaces[j].light_pitch + x) * surface_share[j];
-          store(b.term[c] + at + x, sum);
+        if (OCCURS) {
+          bool has_light[COUNT];
+          for (int j = 0; j < COUNT; j++) {
+            surface_share[j] = (h[j] - behind(l, p[j], over_)) * weight[j];
+            share += surface_share[j];
+            has_light[j] = any_positive(surface_share[j]);
+          }
+          store(b.term[C] + at + x, share);
+          for (int c = 0; c < C; c++) {
+            vec sum = {};
+            for (int j = 0; j < COUNT; j++)
+              if (has_light[j]) sum += load<vec>(w.surfaces[j].light + c * w.surfaces[j].channel + row * w.surfaces[j].light_pitch + x) * surface_share[j];
+            store(b.term[c] + at + x, sum);
+          }
+          b.occupied[y] |= any_positive(share) ? bit : 0;
         }
-        b.occupied[y] |= some ? bit : 0;
-        if (over_) put_normalizer(normalizer, share, bit, b.term[C + 1] + at + x, b.partial[y], b.varying[y]);
+        if (!over_) continue;
+        const vec from_one = normalizer - all(1.0f);
+        store(b.term[C + 1] + at + x, normalizer);
+        partial[row] |= any_positive(normalizer - share) ? bit : 0;
+        varying[row] |= any_positive(from_one * from_one - all(EVEN_SQUARED)) ? bit : 0;
       }
     }
-  }
-
-  // The normalizer of a whole block in which the layer does not occur.
-  void block_normalizer(const Layer &l, WindowBlock &w, Scratch &b) {
-    for (int row = 0; row < w.rows; row++) {
-      const size_t at = (size_t)(w.top + row) * pitch_ + w.column;
-      w.partial[row] = w.varying[row] = 0;
-      for (int x = 0; x < BLOCK; x += LANES) {
-        vec normalizer = {}, p[2], h[2], weight[2];
-        for (int j = 0; j < w.count; j++) {
-          const WindowBlock::Surface &of = w.surfaces[j];
-          p[j] = load<vec>(b.coc[j] + at + x);
-          h[j] = at_or_behind(l, p[j], over_);
-          weight[j] = of.weight ? load<vec>(of.weight + row * of.weight_pitch + x) : all(1.0f);
-        }
-        if (w.count == 2) add_continuation(p, h, weight);
-        for (int j = 0; j < w.count; j++) normalizer += h[j] * weight[j];
-        put_normalizer(normalizer, vec{}, mark(w.column + x), b.term[C_ + 1] + at + x, w.partial[row], w.varying[row]);
-      }
-    }
-  }
-
-  // Stores a layer's normalizer and marks where it exceeds the share and where it differs from 1.
-  static void put_normalizer(vec normalizer, vec share, uint32_t bit, float *term, uint32_t &partial, uint32_t &varying) {
-    const vec from_one = normalizer - all(1.0f);
-    store(term, normalizer);
-    partial |= any_positive(normalizer - share) ? bit : 0;
-    varying |= any_positive(from_one * from_one - all(EVEN_SQUARED)) ? bit : 0;
   }
 
   // Adds the continuation of the farther surface behind the nearer one to the weights of two surfaces.
@@ -848,24 +803,11 @@ class Composite {
     }
   }
 
-  // Blurs one term of a layer into a strip. Kernels of half 0 have one tap.
-  void spread(const Scratch &b, int term, size_t from, const uint32_t *rows, uint32_t within, const Kernel &kernel, float *to) const {
-    convolve_strip(b.term[term] + from, pitch_, rows, within, kernel, to);
-  }
-
   void add_strip(Scratch &b, const Kernel *kernels, size_t from, int y, uint32_t within, int at) {
     float spread_of[STRIP];
     for (int v = 0; v < C_ + E_; v++) {
       const Kernel &kernel = kernels[E_ == 1 ? 0 : v < C_ ? v : v - C_];
-      if (!kernel.half) {  // one tap
-        const float *term = b.term[std::min(v, C_)] + from;
-        for (int i = 0; i < STRIP; i += LANES) {
-          float *to = b.canvas[v] + at + i / STRIP_COLUMNS * TILE + i % STRIP_COLUMNS;
-          store(to, load<vec>(to) + load<vec>(term + i / STRIP_COLUMNS * pitch_ + i % STRIP_COLUMNS) * kernel.sum);
-        }
-        continue;
-      }
-      spread(b, std::min(v, C_), from, &b.occupied[y], within, kernel, spread_of);
+      convolve_strip(b.term[std::min(v, C_)] + from, pitch_, &b.occupied[y], within, kernel, spread_of);
       for (int i = 0; i < STRIP; i += LANES) {
         float *to = b.canvas[v] + at + i / STRIP_COLUMNS * TILE + i % STRIP_COLUMNS;
         store(to, load<vec>(to) + load<vec>(spread_of + i));
@@ -878,11 +820,11 @@ class Composite {
     for (int e = 0; e < E_; e++) {
       const Kernel &kernel = kernels[e];
       if (varying)
-        spread(b, C_ + 1, from, b.every.data(), ~0u, kernel, normalizer);
+        convolve_strip(b.term[C_ + 1] + from, pitch_, b.every.data(), ~0u, kernel, normalizer);
       else
         std::fill(normalizer, normalizer + STRIP, kernel.sum);
       if (partial)
-        spread(b, C_, from, &b.occupied[y], within, kernel, share);
+        convolve_strip(b.term[C_] + from, pitch_, &b.occupied[y], within, kernel, share);
       else
         memcpy(share, normalizer, sizeof(normalizer));
       // colour = light / normalizer, coverage = share / normalizer
@@ -898,7 +840,7 @@ class Composite {
         store(to, cover + its_left * load<vec>(to));
       }
       for (int c = E_ == 1 ? 0 : e; c < (E_ == 1 ? C_ : e + 1); c++) {
-        spread(b, c, from, &b.occupied[y], within, kernel, light);
+        convolve_strip(b.term[c] + from, pitch_, &b.occupied[y], within, kernel, light);
         for (int i = 0; i < STRIP; i += LANES) {
           float *to = b.canvas[c] + at + i / STRIP_COLUMNS * TILE + i % STRIP_COLUMNS;
           store(to, load<vec>(light + i) * load<vec>(gain + i) + load<vec>(left + i) * load<vec>(to));
@@ -997,14 +939,15 @@ class Composite {
       const Layer &l = layers_[k];
       if (l.scale > 1) continue;
       const int reach = ceil_div(l.half, CELL);
-      if (reach != known_reach) look_around(y0, x0, known_reach = reach, b);
+      if (reach != known_reach) around(y0 / CELL - reach, (y0 + TILE) / CELL - 1 + reach, x0 / CELL - reach, (x0 + TILE) / CELL - 1 + reach, b.layers.data());
+      known_reach = reach;
       if (!has(b.layers.data(), k)) continue;
       reaching.push_back(k);
       halo = std::max(halo, l.half);
     }
     const int top = y0 - halo, left = floor_div(x0 - halo, BLOCK) * BLOCK;  // of the window
     const int height = rows + 2 * halo, across = ceil_div(x0 + columns + halo - left, BLOCK) * BLOCK;
-    if (!reaching.empty()) s_.independent ? read_window(top, height, left, across, b) : find_blocks(top, height, left, across, b);
+    if (!reaching.empty() && !s_.independent) find_blocks(top, height, left, across, b);
     size_t next = 0;
     for (int r = (int)runs_.size() - 1; r >= 0; r--) {
       const Run &run = runs_[r];
@@ -1016,43 +959,13 @@ class Composite {
         const Layer &l = layers_[reaching[next]];
         const int first = halo - l.half, from = x0 - l.half - left, reach_rows = rows + 2 * l.half, reach_columns = columns + 2 * l.half;
         if (s_.independent)
-          stack_terms(l, first, reach_rows, from, reach_columns, b);
+          block_means(reaching[next], 1, top + first, left + from, reach_rows, reach_columns, first, from, b);
         else
           window_terms(reaching[next], first, reach_rows, from, reach_columns, b);
         composite_layer(b, l, rows, columns, first, from, y0, x0);
       }
     }
     finish(tile_row * ceil_div(W_, TILE) + tile_column, y0, x0, rows, columns, b);
-  }
-
-  // Reads all surfaces of a window; for surfaces that cover each other.
-  void read_window(int top, int rows, int left, int columns, Scratch &b) {
-    std::vector<float *> light(b.light), coc(b.coc), weight(b.weight);
-    for (int y = 0; y < rows; y++) {
-      read_row(top + y, left, columns, false, light.data(), coc.data(), weight.data(), b);
-      for (auto *v : {&light, &coc, &weight})
-        for (float *&row : *v) row += pitch_;
-    }
-  }
-
-  void stack_terms(const Layer &l, int first, int rows, int from, int columns, Scratch &b) {
-    std::vector<const float *> light(s_.count * C_), coc(s_.count), weight(s_.count);
-    std::vector<float *> term(C_ + 2);
-    for (int y = first; y < first + rows; y++) {
-      const size_t at = (size_t)y * pitch_ + from;
-      for (int i = 0; i < s_.count; i++) {
-        for (int c = 0; c < C_; c++) light[i * C_ + c] = b.light[i * C_ + c] + at;
-        coc[i] = b.coc[i] + at;
-        weight[i] = b.weight[i] + at;
-      }
-      for (int c = 0; c < C_ + 2; c++) term[c] = b.term[c] + at;
-      row_terms(l, columns, light.data(), coc.data(), weight.data(), b.surface_share.data(), term.data());
-    }
-    find_occupied(b, first, rows, from, columns);
-  }
-
-  bool look_around(int y0, int x0, int reach, Scratch &b) const {
-    return around(y0 / CELL - reach, (y0 + TILE) / CELL - 1 + reach, x0 / CELL - reach, (x0 + TILE) / CELL - 1 + reach, b.layers.data());
   }
 
   // Composites the tile onto the light behind all layers, adds the light of highlights and writes the picture.
@@ -1097,18 +1010,12 @@ class Composite {
       for (int i = 0; i < TILE_PIXELS; i += LANES) least_cover = least(least_cover, load<vec>(b.canvas[C_ + e] + i));
     if (!any_of(least_cover < all(1.0f - COVERED))) return;
     const int h = job_.behind_height, w = job_.behind_width;
-    // for each vector of columns: index of its first sample, samples left and right of each pixel, fraction between
-    // them
-    int first[TILE / LANES];
-    ivec left[TILE / LANES], right[TILE / LANES];
-    vec across[TILE / LANES];
+    int before[TILE];
+    float across[TILE];  // fraction of the way to the next sample
     for (int x = 0; x < TILE; x++) {
       const float at_x = (x0 + x - 0.5f * (W_ - 1)) / BEHIND_STEP + 0.5f * (w - 1);
-      const int v = x / LANES, lane = x % LANES, before = std::min((int)at_x, w - 1);
-      if (!lane) first[v] = before;
-      left[v][lane] = before - first[v];
-      right[v][lane] = std::min(before + 1, w - 1) - first[v];
-      across[v][lane] = at_x - before;
+      before[x] = std::min((int)at_x, w - 1);
+      across[x] = at_x - before[x];
     }
     for (int y = 0; y < rows; y++) {
       // image and samples have the same centre
@@ -1119,16 +1026,18 @@ class Composite {
         const float *cover = b.canvas[C_ + (E_ > 1 ? c : 0)] + y * TILE;
         float *canvas = b.canvas[c] + y * TILE;
         const float *upper = &job_.behind[((size_t)c * h + top) * w], *lower = &job_.behind[((size_t)c * h + bottom) * w];
-        for (int v = 0; v * LANES < columns; v++) {
-          const vec uncovered = all(1.0f) - load<vec>(cover + v * LANES);
+        for (int x = 0; x < columns; x += LANES) {
+          const vec uncovered = all(1.0f) - load<vec>(cover + x), old = load<vec>(canvas + x);
           const auto is_uncovered = uncovered > all(COVERED);
           if (!any_of(is_uncovered)) continue;
-          auto between = [&](const float *row) {
-            const vec before = pick(row + first[v], left[v]);
-            return before + across[v] * (pick(row + first[v], right[v]) - before);
-          };
-          const vec above = between(upper), light = above + down * (between(lower) - above), old = load<vec>(canvas + v * LANES);
-          store(canvas + v * LANES, is_uncovered ? old + uncovered * light : old);
+          vec above_left, above_right, below_left, below_right;
+          for (int i = 0; i < LANES; i++) {
+            const int left = before[x + i], right = std::min(left + 1, w - 1);
+            above_left[i] = upper[left], above_right[i] = upper[right], below_left[i] = lower[left], below_right[i] = lower[right];
+          }
+          const vec part = load<vec>(across + x);
+          const vec above = above_left + part * (above_right - above_left), below = below_left + part * (below_right - below_left);
+          store(canvas + x, is_uncovered ? old + uncovered * (above + down * (below - above)) : old);
         }
       }
     }

@@ -121,7 +121,7 @@ void mask_kernel(const Layer &layer, int colour, const FieldMask &mask, Kernel &
       const int n = std::min(LANES, end - y);
       vec taps = {};
       memcpy(&taps, from + y, n * sizeof(float));
-      taps *= mask.transmittance((float)(half - y), (float)-d);
+      taps *= mask.transmittance((float)(half - y) - counting(), all((float)-d));
       left += taps;
       memcpy(to + y, &taps, n * sizeof(float));
     }

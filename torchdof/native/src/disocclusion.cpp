@@ -10,6 +10,7 @@ namespace {
 constexpr float FALL = 0.35f, SURE = 0.1f, CERTAIN = 0.01f;
 constexpr int FINE_LEVELS = 2, STEP = 1 << FINE_LEVELS;
 constexpr float MIXED = 0.05f;  // share above which a second surface is used in the pyramid
+constexpr int BAND = 8;         // rows of a level computed together
 constexpr int CELL_LEVEL = 3;   // cells that may show hidden surfaces have the size of this level's samples
 
 // One level of a pyramid of the farthest surfaces. A sample has `stride` values: light of each channel, coc, weight,
@@ -29,35 +30,15 @@ struct Level {
 // Confidence, 0 to 1, that a surface farther by this difference in coc is another surface.
 inline float is_behind(float distance_px) { return clamp01(distance_px - (BEHIND_PX - 0.5f)); }
 
-// Mean of the farthest of four children.
-void farthest(const float *const *child, int channels, int stride, float *out) {
-  float most = child[0][channels];
-  for (int i = 1; i < 4; i++) most = std::max(most, child[i][channels]);
-  float total = 0, counts[4];
-  for (int i = 0; i < 4; i++) total += counts[i] = child[i][channels + 1] * (1.0f - is_behind(most - child[i][channels]));
-  total *= 0.25f;
-  const float each = 0.25f / std::max(total, 1e-9f);
-  for (int i = 0; i < 4; i++) counts[i] *= each;
-  for (int c = 0; c <= channels; c++)
-    out[c] = child[0][c] * counts[0] + child[1][c] * counts[1] + child[2][c] * counts[2] + child[3][c] * counts[3];
-  if (!(total > 0)) out[channels] = -NEVER;
-  out[channels + 1] = total;
-  for (int c = channels + 2; c < stride; c++) out[c] = 0;
-}
-
 typedef float f8 __attribute__((vector_size(32)));
 constexpr int F8 = 8;
 
-// Even and odd elements of two adjacent vectors. Lane i holds element even_place(i) of them.
-#if defined(__AVX2__)  // within the halves of a vector; across them takes twice as long
-inline vec evens(vec a, vec b) { return __builtin_ia32_shufps256(a, b, 0x88); }
-inline vec odds(vec a, vec b) { return __builtin_ia32_shufps256(a, b, 0xdd); }
-constexpr int even_place(int lane) { return lane % 2 + lane / 4 * 2 + lane % 4 / 2 * 4; }
-#else
-inline vec evens(vec a, vec b) { return vec{a[0], a[2], b[0], b[2]}; }
-inline vec odds(vec a, vec b) { return vec{a[1], a[3], b[1], b[3]}; }
-constexpr int even_place(int lane) { return lane; }
-#endif
+// Every second of 2 LANES values.
+inline vec evens(const float *from) {
+  vec v;
+  for (int i = 0; i < LANES; i++) v[i] = from[2 * i];
+  return v;
+}
 
 // A position between two samples along an axis: index of the first, and fraction of the way to the next.
 struct Place {
@@ -71,75 +52,58 @@ inline Place place_in(float at, int size) {
   return {before, at - before};
 }
 
-// The four samples of a level around a position.
-struct Corners {
-  const float *of[4];
-  Corners(const Level &level, int row, int column) {
-    const float *first = level.at(row, column);
-    const size_t below = level.height > 1 ? (size_t)level.width * level.stride : 0, beside = level.width > 1 ? level.stride : 0;
-    of[0] = first, of[1] = first + beside, of[2] = first + below, of[3] = first + below + beside;
-  }
-  // Whether one of them may lie behind coc `here`.
-  bool behind(float here, int channels) const {
-    return std::max(std::max(of[0][channels], of[1][channels]), std::max(of[2][channels], of[3][channels])) - here > BEHIND_PX - 0.5f;
-  }
-};
-
-// Bilinear mean of the four samples around a position, without those in front of or at coc `here`. Returns the weight
-// of the others; `seen` is only written if it exceeds LEAST_SEEN.
-template <int VECTORS>
-float behind(const Level &level, Place row, Place column, float here, f8 *seen) {
-  const int count = VECTORS ? VECTORS : level.stride / F8, C = level.channels;
-  const Corners corner(level, row.before, column.before);
-  if (!corner.behind(here, C)) return 0;
-  const float down = row.part, right = column.part;
-  const float share[4] = {(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right};
-  float total = 0, counts[4];
-  for (int k = 0; k < 4; k++) total += counts[k] = share[k] * corner.of[k][C + 1] * is_behind(corner.of[k][C] - here);
-  if (!(total > LEAST_SEEN)) return 0;
-  const float each = 1.0f / total;
-  for (int i = 0; i < count; i++) seen[i] = f8{};
-  for (int k = 0; k < 4; k++)
-    for (int i = 0; i < count; i++) seen[i] += load<f8>(corner.of[k] + F8 * i) * (counts[k] * each);
-  return total;
-}
-
 // A level's sample behind a pixel.
 struct Sample {
-  float level_weight;  // of the level, for the pixel's blur, 0 to 1
-  float weight;        // of the samples that lie behind the pixel; 0 without them
-  f8 *values;
-  template <int VECTORS>
+  float level_weight;       // of the level, for the pixel's blur, 0 to 1
+  float weight;             // of the samples that lie behind the pixel; 0 without them
+  std::vector<f8> values;  // only valid with a weight
+
+  // Reads the bilinear mean of the four samples around a position, without those in front of or at coc `here`.
   void read(const Level &level, Place row, Place column, float here) {
+    const int C = level.channels;
     level_weight = clamp01(std::fabs(here) / level.least_px - 1.0f);
-    weight = level_weight > 0 ? behind<VECTORS>(level, row, column, end_of_surface(here), values) : 0.0f;
+    weight = 0;
+    if (!(level_weight > 0)) return;
+    const float end = end_of_surface(here), down = row.part, right = column.part;
+    const float share[4] = {(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right};
+    const float *corners[4];
+    float total = 0, counts[4];
+    for (int k = 0; k < 4; k++) {
+      corners[k] = level.at(std::min(row.before + k / 2, level.height - 1), std::min(column.before + k % 2, level.width - 1));
+      total += counts[k] = share[k] * corners[k][C + 1] * is_behind(corners[k][C] - end);
+    }
+    if (!(total > LEAST_SEEN)) return;
+    weight = total;
+    std::fill(values.begin(), values.end(), f8{});
+    for (int k = 0; k < 4; k++)
+      for (size_t i = 0; i < values.size(); i++) values[i] += load<f8>(corners[k] + F8 * i) * (counts[k] * (1.0f / total));
   }
 };
 
 // Combines the samples of several levels: light and coc; returns the sum of their votes. With `farthest`, only the
 // farther of two surfaces counts.
-template <int VECTORS>
-float mix(const Level *const *levels, const Sample *samples, int n, bool farthest, float *out) {
-  const int count = VECTORS ? VECTORS : levels[0]->stride / F8, C = levels[0]->channels;
+float mix(const Level *levels, const Sample *samples, int n, bool farthest, float *out) {
+  const int C = levels->channels;
   float total = 0;
-  for (int i = 0; i < F8 * count; i++) out[i] = 0;
+  std::fill(out, out + levels->stride, 0.0f);
   for (int l = 0; l < n; l++) {
-    const Level &level = *levels[l];
+    const Level &level = levels[l];
     const float weight = samples[l].weight, level_weight = samples[l].level_weight;
     if (!(weight > 0)) continue;
     float vote = level_weight * (level.vote > 0 ? level.vote * std::min(weight / SURE, 1.0f) : weight);
     if (farthest) {
-      const float apart = ((const float *)samples[l].values)[C] - out[C];
+      const float apart = ((const float *)samples[l].values.data())[C] - out[C];
       if (total > 0) vote *= 1.0f - is_behind(-apart);
       total *= 1.0f - std::min(level_weight * weight / CERTAIN, 1.0f) * is_behind(apart);
     }
     total += vote;
     if (!(vote > 0)) continue;
     const float part = vote / std::max(total, 1e-9f);
-    for (int i = 0; i < count; i++) {
-      const f8 o = load<f8>(out + F8 * i);
-      store(out + F8 * i, o + (samples[l].values[i] - o) * part);
+    for (const f8 &value : samples[l].values) {
+      store(out, load<f8>(out) + (value - load<f8>(out)) * part);
+      out += F8;
     }
+    out -= levels->stride;
   }
   return total;
 }
@@ -173,21 +137,12 @@ class Filling {
       l.least_px = (float)std::pow(2.0, i - 1);
       l.values = Buffer<float>((size_t)l.height * l.width * stride_);
     }
-    near_.resize(cell_rows_ * cell_columns_);
-    blur_.resize(near_.size());
-    found_.resize(near_.size());
-    fine_.resize(near_.size());
-    measure_cells();
+    found_.resize(cell_rows_ * cell_columns_);
+    fine_.resize(found_.size());
     job_.parallel(ceil_div(pyramid_[0].height, BLOCK / 2), [&](int band, int) { finest(band); });
-    for (int i = 1; i < levels; i++) {
-      const int bands = ceil_div(pyramid_[i].height, 8);
-      if (i == 1)
-        job_.parallel(bands, [&](int band, int) { coarser(i, band); });
-      else  // too little work for threads
-        for (int band = 0; band < bands; band++) coarser(i, band);
-    }
+    for (int i = 1; i < levels; i++) job_.parallel(ceil_div(pyramid_[i].height, BAND), [&](int band, int) { coarser(i, band); });
     job_.parallel(cell_rows_, [&](int row, int) { find_cells(row); });
-    if (stride_ == F8) fill<1>(); else fill<0>();
+    fill();
     // Until here hidden surfaces have negative weights, which distinguishes them from the second surfaces of mixed
     // pixels. Small weights of the latter fall to 0, so that a hidden surface can take their place without a step.
     job_.parallel((int)s_.blocks.size(), [&](int i, int) {
@@ -208,19 +163,7 @@ class Filling {
   }
 
   // First pixel covered by the first sample of a level; covered by half if the image's size is odd.
-  static int first_pixel(int size, int samples, int step) { return floor_half((size - 1) - step * (samples - 1) - step + 1); }
-  static int floor_half(int a) { return a >= 0 ? a / 2 : -((1 - a) / 2); }
-
-  // Nearest coc and largest blur of each cell.
-  void measure_cells() {
-    for (int row = 0; row < cell_rows_; row++)
-      for (int column = 0; column < cell_columns_; column++) {
-        const size_t cell = (size_t)row * cell_columns_ + column, block = (size_t)(row * cell_ / BLOCK) * s_.block_columns + column * cell_ / BLOCK;
-        const float low = job_.block_low[block], high = job_.block_high[block];
-        near_[cell] = low;  // may be too near: only used to skip cells
-        blur_[cell] = std::max(std::fabs(low), std::fabs(high));
-      }
-  }
+  static int first_pixel(int size, int samples, int step) { return floor_div(size - step * samples, 2); }
 
   // A band of rows of the first level.
   void finest(int band) {
@@ -304,18 +247,12 @@ class Filling {
         for (int i = 0; i < rows_count; i++) {
           const float *from = rows[i] + plane * across + 2 * x0;
           vec *to = child + i * COLUMNS;
-          to[0] = evens(load<vec>(from), load<vec>(from + LANES));
-          to[1] = odds(load<vec>(from), load<vec>(from + LANES));
-          if (COLUMNS == 3) to[2] = evens(load<vec>(from + 2), load<vec>(from + 2 + LANES));
+          for (int column = 0; column < COLUMNS; column++) to[column] = evens(from + column);
         }
       };
       const int n = std::min(LANES, width - x0);
       auto put = [&](int plane, vec value) {
-        if (n == LANES)
-          for (int i = 0; i < LANES; i++) out[even_place(i) * stride_ + plane] = value[i];
-        else
-          for (int i = 0; i < LANES; i++)
-            if (even_place(i) < n) out[even_place(i) * stride_ + plane] = value[i];
+        for (int i = 0; i < n; i++) out[i * stride_ + plane] = value[i];
       };
       read(C);
       vec farthest_coc = child[0];
@@ -340,30 +277,43 @@ class Filling {
     }
   }
 
+  // A band of rows of a coarser level: means of the farthest of each four samples.
   void coarser(int i, int band) {
     const Level &fine = pyramid_[i - 1], &level = pyramid_[i];
-    for (int y = band * 8; y < std::min(level.height, band * 8 + 8); y++)
+    for (int y = band * BAND; y < std::min(level.height, (band + 1) * BAND); y++)
       for (int x = 0; x < level.width; x++) {
-        const float *child[4] = {fine.at(2 * y, 2 * x), fine.at(2 * y, 2 * x + 1), fine.at(2 * y + 1, 2 * x), fine.at(2 * y + 1, 2 * x + 1)};
-        farthest(child, C_, stride_, level.at(y, x));
+        const float *child[4];
+        float farthest = -NEVER, total = 0, counts[4], *out = level.at(y, x);
+        for (int k = 0; k < 4; k++) {
+          child[k] = fine.at(2 * y + k / 2, 2 * x + k % 2);
+          farthest = std::max(farthest, child[k][C_]);
+        }
+        for (int k = 0; k < 4; k++) total += counts[k] = child[k][C_ + 1] * (1.0f - is_behind(farthest - child[k][C_]));
+        total *= 0.25f;
+        for (float &count : counts) count *= 0.25f / std::max(total, 1e-9f);
+        for (int c = 0; c <= C_; c++) out[c] = child[0][c] * counts[0] + child[1][c] * counts[1] + child[2][c] * counts[2] + child[3][c] * counts[3];
+        if (!(total > 0)) out[C_] = -NEVER;
+        out[C_ + 1] = total;
+        std::fill(out + C_ + 2, out + stride_, 0.0f);
       }
   }
 
   // Marks cells near which a level used by their pixels has a farther surface; fine_: a fine level has it.
   void find_cells(int row) {
     for (int column = 0; column < cell_columns_; column++) {
-      const size_t cell = (size_t)row * cell_columns_ + column;
+      const size_t cell = (size_t)row * cell_columns_ + column, block = s_.block_of(row * cell_, column * cell_);
+      const float near = job_.block_low[block], blur = std::max(std::fabs(near), std::fabs(job_.block_high[block]));
       found_[cell] = fine_[cell] = 0;
       for (int i = 0; i < job_.levels; i++) {
         const Level &l = pyramid_[i];
-        if (blur_[cell] <= l.least_px || (found_[cell] && i >= FINE_LEVELS)) break;
+        if (blur <= l.least_px || (found_[cell] && i >= FINE_LEVELS)) break;
         // range of the samples read by the cell's pixels, including those shared with other cells
         const int y0 = (int)l.place_y(row * cell_) - 1, y1 = (int)l.place_y(row * cell_ + cell_ - 1) + 2;
         const int x0 = (int)l.place_x(column * cell_) - 1, x1 = (int)l.place_x(column * cell_ + cell_ - 1) + 2;
         float most = -NEVER;
         for (int y = std::max(0, y0); y <= std::min(l.height - 1, y1); y++)
           for (int x = std::max(0, x0); x <= std::min(l.width - 1, x1); x++) most = std::max(most, l.coc(y, x));
-        if (most > near_[cell] + BEHIND_PX - 0.5f) {
+        if (most > near + BEHIND_PX - 0.5f) {
           found_[cell] = 1;
           if (i < FINE_LEVELS) fine_[cell] = 1;
         }
@@ -372,7 +322,7 @@ class Filling {
   }
 
   bool wanted(int y, int x) const {
-    const int which = y / BLOCK * s_.block_columns + x / BLOCK;
+    const int which = s_.block_of(y, x);
     if (!(std::fabs(s_.coc[(size_t)y * job_.width + x]) > 0.5f)) return false;
     return !s_.has_block(which) || s_.block(which).weight[y % BLOCK * BLOCK + x % BLOCK] < 0.5f * HIDDEN_WEIGHT;
   }
@@ -386,9 +336,8 @@ class Filling {
 
   // Steps 3 and 4 of `run`. The levels from FINE_LEVELS up are combined once for each cell of STEP pixels, and read like
   // one level by the pixels.
-  template <int VECTORS>
   void fill() {
-    const int levels = job_.levels, H = job_.height, W = job_.width, C = C_, count = stride_ / F8;
+    const int levels = job_.levels, H = job_.height, W = job_.width, C = C_;
     const int rows = area_height_ / STEP, columns = area_width_ / STEP, coarse = std::max(levels - FINE_LEVELS, 0);
     const int first_y = first_pixel(H, rows, STEP), first_x = first_pixel(W, columns, STEP);
     job_.behind_height = rows;
@@ -406,10 +355,8 @@ class Filling {
       combined.least_px = pyramid_[FINE_LEVELS].least_px;
       combined.values = Buffer<float>((size_t)rows * columns * stride_);
     }
-    std::vector<const Level *> every;
     std::vector<std::vector<Place>> ys, xs;  // positions of the cells in each level
     for (const Level &l : pyramid_) {
-      every.push_back(&l);
       ys.push_back(places(0.5f * (H - 1) - 0.5f * (rows - 1) * STEP, STEP, rows, l.height, &Level::place_y, l));
       xs.push_back(places(0.5f * (W - 1) - 0.5f * (columns - 1) * STEP, STEP, columns, l.width, &Level::place_x, l));
     }
@@ -428,9 +375,7 @@ class Filling {
     }
     job_.parallel(rows, [&](int row, int) {
       std::vector<float> mean_behind(stride_);
-      std::vector<f8> values((size_t)levels * count);
-      std::vector<Sample> samples(levels);
-      for (int i = 0; i < levels; i++) samples[i].values = values.data() + i * count;
+      std::vector<Sample> samples(levels, {0, 0, std::vector<f8>(stride_ / F8)});
       for (int column = 0; column < columns; column++) {
         const size_t at = (size_t)row * columns + column;
         const float *light = base.at(row, column);
@@ -452,9 +397,9 @@ class Filling {
               needed = needed || wanted(y, x);
             }
           if (needed) {
-            for (int i = 0; i < levels; i++) samples[i].read<VECTORS>(pyramid_[i], ys[i][row], xs[i][column], near);
-            if (coarse) coarse_mean[C + 1] = mix<VECTORS>(every.data() + FINE_LEVELS, samples.data() + FINE_LEVELS, coarse, false, coarse_mean);
-            if (mix<VECTORS>(every.data(), samples.data(), levels, true, mean_behind.data()) > 0) light = mean_behind.data();
+            for (int i = 0; i < levels; i++) samples[i].read(pyramid_[i], ys[i][row], xs[i][column], near);
+            if (coarse) coarse_mean[C + 1] = mix(&pyramid_[FINE_LEVELS], &samples[FINE_LEVELS], coarse, false, coarse_mean);
+            if (mix(pyramid_.data(), samples.data(), levels, true, mean_behind.data()) > 0) light = mean_behind.data();
           }
         }
         for (int c = 0; c < C; c++) job_.behind[(size_t)c * rows * columns + at] = light[c];
@@ -594,7 +539,6 @@ class Filling {
   const int C_, stride_;
   int area_height_, area_width_, coarsest_, cell_, cell_rows_, cell_columns_;
   std::vector<Level> pyramid_;
-  std::vector<float> near_, blur_;     // of each cell
   std::vector<uint8_t> found_, fine_;  // of each cell: a farther surface exists; a fine level has it
 };
 

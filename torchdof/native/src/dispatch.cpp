@@ -1,17 +1,12 @@
 // The C interface, and the choice of the instruction set.
 #include <atomic>
 #include <cstring>
-#include <memory>
 #include <new>
 #include <stdexcept>
 
 #include "api.h"
 #include "threads.h"
 #include "variants.h"
-
-struct torchdof_job {
-  std::unique_ptr<torchdof::AnyJob> job;
-};
 
 namespace torchdof {
 namespace {
@@ -54,21 +49,17 @@ int32_t guarded(const Body &body) {
 
 int32_t torchdof_begin(const torchdof_scene *scene, torchdof_job **job) {
   *job = nullptr;
-  return torchdof::guarded([&] {
-    std::unique_ptr<torchdof_job> made(new torchdof_job());
-    made->job.reset(torchdof::chosen().begin(*scene));
-    *job = made.release();
-  });
+  return torchdof::guarded([&] { *job = torchdof::chosen().begin(*scene); });
 }
 
 int64_t torchdof_radii(const torchdof_job *job, const int32_t **steps) {
-  *steps = job->job->radii().data();
-  return (int64_t)job->job->radii().size();
+  *steps = job->radii.data();
+  return (int64_t)job->radii.size();
 }
 
 int32_t torchdof_finish(torchdof_job *job, const float *const *kernels, const int32_t *halves,
                         const torchdof_field_mask *field_masks, int32_t field_masks_count, float *out) {
-  return torchdof::guarded([&] { job->job->finish({kernels, halves, field_masks, field_masks_count}, out); });
+  return torchdof::guarded([&] { job->finish({kernels, halves, field_masks, field_masks_count}, out); });
 }
 
 void torchdof_free(torchdof_job *job) { delete job; }
@@ -98,41 +89,23 @@ int32_t torchdof_ends(const float *values, int64_t count, int32_t threads, float
   return torchdof::guarded([&] { torchdof::chosen().ends(values, count, threads, low, high); });
 }
 
-int32_t torchdof_blend(const torchdof_layers *layers, float *out) {
-  return torchdof::guarded([&] { torchdof::chosen().blend(*layers, out); });
-}
-
-int32_t torchdof_blend_gradient(const torchdof_layers *layers, const float *gradient, float *const *light, float *const *place,
-                                float *const *weight) {
-  return torchdof::guarded([&] { torchdof::chosen().blend_gradient(*layers, gradient, light, place, weight); });
+int32_t torchdof_blend(const torchdof_layers *layers, float *out, const float *gradient, float *const *of_light,
+                       float *const *of_place, float *const *of_weight) {
+  return torchdof::guarded([&] { torchdof::chosen().blend(*layers, out, gradient, of_light, of_place, of_weight); });
 }
 
 int32_t torchdof_farthest(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t rows, int32_t columns,
-                          int32_t threads, float *out) {
-  return torchdof::guarded([&] { torchdof::chosen().farthest(maps, channels, height, width, rows, columns, threads, out); });
-}
-
-int32_t torchdof_farthest_gradient(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t rows,
-                                   int32_t columns, int32_t threads, const float *gradient, float *const *of_maps) {
+                          int32_t threads, float *out, const float *gradient, float *const *of_maps) {
   return torchdof::guarded([&] {
-    torchdof::chosen().farthest_gradient(maps, channels, height, width, rows, columns, threads, gradient, of_maps);
+    torchdof::chosen().farthest(maps, channels, height, width, rows, columns, threads, out, gradient, of_maps);
   });
 }
 
 int32_t torchdof_look_behind(const torchdof_level *levels, int32_t count, int32_t channels, const float *coc, int32_t height, int32_t width,
-                             int32_t threads, float *out) {
-  return torchdof::guarded([&] { torchdof::chosen().look_behind(levels, count, channels, coc, height, width, threads, out); });
-}
-
-int32_t torchdof_look_behind_gradient(const torchdof_level *levels, int32_t count, int32_t channels, const float *coc, int32_t height,
-                                      int32_t width, int32_t threads, const float *gradient, float *const *of_levels, float *of_coc) {
+                             int32_t threads, float *out, const float *gradient, float *const *of_levels, float *of_coc) {
   return torchdof::guarded([&] {
-    torchdof::chosen().look_behind_gradient(levels, count, channels, coc, height, width, threads, gradient, of_levels, of_coc);
+    torchdof::chosen().look_behind(levels, count, channels, coc, height, width, threads, out, gradient, of_levels, of_coc);
   });
-}
-
-void torchdof_convolve(const float *in, int32_t height, int32_t width, const float *kernel, int32_t half, float *out) {
-  torchdof::chosen().convolve(in, height, width, kernel, half, out);
 }
 
 int64_t torchdof_interface(void) {

@@ -8,70 +8,36 @@
 
 namespace torchdof {
 namespace TORCHDOF_SIMD {
-namespace {
-
-// Sums over a block's pixels, one set of values for each interval between nodes.
-struct Gathered {
-  int count = 0;
-  std::vector<int> nodes;
-  std::vector<float> values;
-  explicit Gathered(int stride) : stride(stride) {}
-  float *between(int node) {
-    for (int i = 0; i < count; i++)
-      if (nodes[i] == node) return &values[(size_t)i * stride];
-    if (count == (int)nodes.size()) {
-      nodes.push_back(0);
-      values.resize(values.size() + stride);
-    }
-    nodes[count] = node;
-    float *made = &values[(size_t)count++ * stride];
-    std::fill(made, made + stride, 0.0f);
-    return made;
-  }
-
- private:
-  const int stride;
-};
-
-}  // namespace
 
 class Downsampling {
  public:
   Downsampling(const Job &job, const LayerIndex &index, const Border &border, Downsampled &to)
       : job_(job), s_(job.surfaces), index_(index), border_(border), over_(job.scene.occlusion), to_(to), C_(job.channels), stride_(to.stride()), each_(1.0f / (to.scale * to.scale)),
-        gathered_(stride_), light_(C_), light_of_{light_, light_} {
-    for (const Layer &l : job.layers) ramps_.push_back({l.at, l.per_after});
-  }
+        light_(C_), light_of_{light_, light_}, beyond_((size_t)2 * C_ * BLOCK_PIXELS) {}
 
   // Computes all blocks of a band of BLOCK rows of pixels.
   void band(int band) {
-    const int s = to_.scale, first = band * (BLOCK / s), columns = job_.width / s;
+    const int s = to_.scale, first = band * (BLOCK / s);
     Pieces &pieces = to_.pieces[band - to_.first_band];
     for (int row = first; row < first + BLOCK / s; row++) {
       pieces.start.push_back((int)pieces.column.size());
       if (row < -to_.margin || row >= to_.rows + to_.margin) continue;
-      const bool inside = row >= 0 && (row + 1) * s <= job_.height;
       const uint8_t *near = &to_.near[(size_t)std::clamp(band, 0, s_.block_rows - 1) * s_.block_columns];
       int column = -to_.margin;
       while (column < to_.columns + to_.margin) {
         // up to the next block of the image, or in the margin
         const int block_of = std::clamp(floor_div(column * s, BLOCK), 0, s_.block_columns - 1);
         int end = block_of + 1 == s_.block_columns ? to_.columns + to_.margin : (block_of + 1) * BLOCK / s;
-        if (row >= 0 && row * s < job_.height && block_of + 2 < s_.block_columns)
-          s_.fetch_block(row * s / BLOCK * s_.block_columns + block_of + 2, row * s % BLOCK, s);
         if (!near[block_of]) {
           std::fill(to_.row(0, row) + column, to_.row(0, row) + end, FARTHEST);
           std::fill(to_.row(1, row) + column, to_.row(1, row) + end, 1.0f);
           column = end;
         }
-        while (column < end) {
-          if (inside && column >= 0 && column < columns) {
-            column += blocks(row, column, std::min(std::min(end, columns) - column, std::max(1, CELL / s)), pieces);
-          } else {
-            to_.row(0, row)[column] = NOWHERE;
-            block(row, column++, false, pieces);
-          }
-        }
+        while (column < end)
+          column = s == 2   ? cell<2>(row, column, end, pieces)
+                   : s == 4 ? cell<4>(row, column, end, pieces)
+                   : s == 8 ? cell<8>(row, column, end, pieces)
+                            : cell<16>(row, column, end, pieces);
       }
       std::fill(to_.row(0, row) + column, to_.row(0, row) - to_.margin + to_.pitch, NOWHERE);
     }
@@ -82,34 +48,12 @@ class Downsampling {
   // Values in place of a node: of empty blocks, and of blocks that no layer of this scale uses.
   static constexpr float NOWHERE = -2.0f, FARTHEST = 1e6f;
 
-  // Computes up to `count` blocks in one cell (or one larger block) of a row; returns how many.
-  int blocks(int row, int column, int count, Pieces &pieces) {
-    const int s = to_.scale, y0 = row * s, x0 = column * s;
-    const size_t cell = (size_t)(y0 / CELL) * index_.columns + x0 / CELL;
-    const int k = s <= CELL && index_.single[cell] ? index_.only_interval(cell) : -1;
-    if (k >= 0 && !to_.wanted[k]) {
-      std::fill(to_.row(0, row) + column, to_.row(0, row) + column + count, (float)to_.stands_for[k]);
-      std::fill(to_.row(1, row) + column, to_.row(1, row) + column + count, 1.0f);
-      return count;
-    }
-    if (count * s == CELL && k >= 0)
-      s == 2 ? cell_means<2>(row, column, k) : s == 4 ? cell_means<4>(row, column, k) : cell_means<8>(row, column, k);
-    else if (count * s == std::max(s, CELL))
-      s == 2   ? cell_sums<2>(row, column, pieces)
-      : s == 4 ? cell_sums<4>(row, column, pieces)
-      : s == 8 ? cell_sums<8>(row, column, pieces)
-               : cell_sums<16>(row, column, pieces);
-    else
-      for (int i = 0; i < count; i++) block(row, column + i, true, pieces);
-    return count;
-  }
-
   // Block means of a cell whose pixels show one surface between the same two nodes.
   template <int S>
   void cell_means(int row, int column, int k) {
     constexpr int PARTS = CELL / LANES, COUNT = CELL / S;
     const int y0 = row * S, x0 = column * S;
-    const size_t light_step = s_.has_block(y0 / BLOCK * s_.block_columns + x0 / BLOCK) ? BLOCK : s_.width;
+    const size_t light_step = s_.has_block(s_.block_of(y0, x0)) ? BLOCK : s_.width;
     const float *coc, *weight;
     s_.row(0, y0, x0, light_.data(), coc, weight);
     auto put = [&](int plane, const vec *sum) {  // means of S neighbours
@@ -120,13 +64,14 @@ class Downsampling {
         for (int x = 1; x < S; x++) to[j] += columns_of[j * S + x];
       }
     };
+    std::fill(to_.row(0, row) + column, to_.row(0, row) + column + COUNT, (float)to_.stands_for[k]);
+    std::fill(to_.row(1, row) + column, to_.row(1, row) + column + COUNT, 1.0f);
+    if (!to_.wanted[k]) return;
     vec far[S][PARTS], sums[PARTS], sums_behind[PARTS] = {};
     for (int y = 0; y < S; y++)
       for (int p = 0; p < PARTS; p++)
         sums_behind[p] += far[y][p] = behind(job_.layers[k], index_.place(load<vec>(coc + y * s_.width + p * LANES)), over_);
-    std::fill(to_.row(0, row) + column, to_.row(0, row) + column + COUNT, (float)to_.stands_for[k]);
-    std::fill(to_.row(1, row) + column, to_.row(1, row) + column + COUNT, 1.0f);
-    put(2, sums_behind);
+    put(C_ + 2, sums_behind);
     for (int c = 0; c < C_; c++) {
       for (int p = 0; p < PARTS; p++) sums[p] = sums_behind[p] = vec{};
       for (int y = 0; y < S; y++)
@@ -135,20 +80,35 @@ class Downsampling {
           sums[p] += v;
           sums_behind[p] += v * far[y][p];
         }
-      put(3 + c, sums);
+      put(2 + c, sums);
       put(3 + C_ + c, sums_behind);
     }
   }
 
-  // Block means of a cell, one interval at a time, whole vectors of pixels.
+  // Computes the blocks of a row from `column` to the end of their cell (or larger block), at most to `end`: one interval
+  // at a time, whole vectors of pixels. Returns the next column.
   template <int S>
-  void cell_sums(int row, int column, Pieces &pieces) {
+  int cell(int row, int column, int end, Pieces &pieces) {
     constexpr int WIDTH = S > CELL ? S : CELL, COUNT = WIDTH / S;
     typedef uint16_t halves __attribute__((vector_size(LANES * 2)));
-    const int y0 = row * S, x0 = column * S;
+    const int first = floor_div(column, COUNT) * COUNT, y0 = row * S, x0 = first * S;
+    end = std::min(end, first + COUNT);
+    const bool inside = y0 >= 0 && x0 >= 0 && y0 + S <= s_.height && x0 + WIDTH <= s_.width;
+    if constexpr (S <= CELL) {
+      const size_t cell = (size_t)(y0 / CELL) * index_.columns + x0 / CELL;
+      const int k = inside && index_.single[cell] ? index_.only_interval(cell) : -1;
+      if (k >= 0) {
+        cell_means<S>(row, column, k);
+        return end;
+      }
+    }
     int there = 0;
     for (; there < s_.count; there++) {
       const float *coc, *weight;
+      if (!inside) {
+        if (!read_beyond<S>(there, y0, x0, column - first, end - first)) break;
+        continue;
+      }
       if (!s_.row(there, y0, x0, light_of_[there].data(), coc, weight)) break;
       const uint16_t *intervals = &index_.intervals[there][(size_t)y0 * s_.width + x0];
       for (int y = 0, i = 0; y < S; y++, coc += there ? BLOCK : s_.width, intervals += s_.width)
@@ -161,7 +121,7 @@ class Downsampling {
         }
     }
     const bool continues = there == 2 && mixed(y0, x0) && continue_farther(S * WIDTH);
-    const size_t light_step = s_.has_block(y0 / BLOCK * s_.block_columns + x0 / BLOCK) ? BLOCK : s_.width;
+    const size_t light_step = !inside ? WIDTH : s_.has_block(s_.block_of(y0, x0)) ? BLOCK : s_.width;
     cell_nodes_.clear();
     for (int i = 0; i < there; i++)
       continues ? sum_intervals<S, true>(i, light_step, before_[i], after_[i]) : sum_intervals<S, false>(i, light_step, weight_[i], weight_[i]);
@@ -171,20 +131,71 @@ class Downsampling {
       sums[0] += of.up_to * each_;
       sums[(C_ + 1) * COUNT] += of.next * each_;
     }
-    for (int j = 0; j < COUNT; j++) {
-      float first = NOWHERE;
-      const float *values_of_first = nullptr;
+    for (; column < end; column++) {  // a block's first interval goes into the planes
+      to_.row(0, row)[column] = NOWHERE;
       for (size_t i = 0; i < cell_nodes_.size(); i++) {
-        const float *values = &cell_sums_[i * stride_ * COUNT] + j;
+        const float *values = &cell_sums_[i * stride_ * COUNT] + column - first;
         const bool normalizer_only = cell_nodes_[i] & Pieces::NORMALIZER_ONLY;
         if (*values == 0 && !(normalizer_only && values[(C_ + 1) * COUNT] != 0)) continue;
-        if (values_of_first || normalizer_only)
-          add_piece(pieces, column + j, cell_nodes_[i], values, COUNT, 1.0f);
-        else
-          first = (float)cell_nodes_[i], values_of_first = values;
+        if (normalizer_only || to_.row(0, row)[column] != NOWHERE) {
+          pieces.column.push_back(column);
+          pieces.node.push_back(cell_nodes_[i]);
+          for (int v = 0; v < stride_; v++) pieces.values.push_back(values[v * COUNT]);
+        } else {
+          to_.row(0, row)[column] = (float)cell_nodes_[i];
+          for (int v = 0; v < stride_; v++) to_.row(1 + v, row)[column] = values[v * COUNT];
+        }
       }
-      put_in_planes(row, column + j, first, values_of_first, COUNT, 1.0f);
     }
+    return end;
+  }
+
+  // Reads blocks of a cell that lies at least partly beyond the frame; the others get the weight 0. Beside one edge of the
+  // frame coc and weight do not change away from it, and the pixels of a line get its mean light. False if all weights are 0.
+  template <int S>
+  bool read_beyond(int surface, int y0, int x0, int first, int last) {
+    constexpr int WIDTH = S > CELL ? S : CELL;
+    const int H = s_.height, W = s_.width;
+    float *const coc = coc_[surface], *const weight = weight_[surface], any = 0;
+    int32_t *const interval = interval_[surface];
+    for (int i = 0; last - first < WIDTH / S && i < S * WIDTH; i++) coc[i] = weight[i] = 0.0f, interval[i] = 0;
+    for (int c = 0; c < C_; c++) light_of_[surface][c] = &beyond_[(size_t)(surface * C_ + c) * BLOCK_PIXELS];
+    for (int block = first; block < last; block++) {
+      const int left = x0 + block * S;
+      const bool above_or_below = left >= 0 && left + S <= W && (y0 + S <= 0 || y0 >= H);
+      const bool beside = y0 >= 0 && y0 + S <= H && (left + S <= 0 || left >= W);
+      for (int row = 0; row < (above_or_below ? 1 : S); row++)
+        for (int column = 0; column < (beside ? 1 : S); column++) {
+          const int y = y0 + row, x = left + column, at_y = std::clamp(y, 0, H - 1), at_x = std::clamp(x, 0, W - 1);
+          const int i = row * WIDTH + block * S + column;
+          const float *its_coc, *its_weight;
+          const bool there = s_.row(surface, at_y, at_x, light_.data(), its_coc, its_weight);
+          coc[i] = there ? *its_coc : 0.0f;
+          any += weight[i] = !there ? 0.0f : its_weight ? *its_weight : 1.0f;
+          interval[i] = index_.intervals[surface][(size_t)at_y * W + at_x];
+          if (weight[i] == 0 || !to_.wanted[interval[i]]) continue;  // no layer needs its light
+          for (int c = 0; c < C_; c++) {
+            const float nearest = *light_[c];
+            float &light = beyond_[(size_t)(surface * C_ + c) * BLOCK_PIXELS + i];
+            if (above_or_below || beside)
+              light = border_.mean_light(surface, c, y, x, S, nearest);
+            else
+              light = y == at_y && x == at_x ? nearest : border_.light(surface, c, y, x, nearest);
+          }
+        }
+      const auto repeat = [&](auto *plane) {  // along the lines
+        plane += block * S;
+        for (int row = 0; row < S; row++) {
+          if (beside) std::fill(plane + row * WIDTH + 1, plane + row * WIDTH + S, plane[row * WIDTH]);
+          if (above_or_below && row) std::copy(plane, plane + S, plane + row * WIDTH);
+        }
+      };
+      repeat(coc);
+      repeat(weight);
+      repeat(interval);
+      for (int c = 0; c < C_; c++) repeat(&beyond_[(size_t)(surface * C_ + c) * BLOCK_PIXELS]);
+    }
+    return any != 0;
   }
 
   // Sums the pixels of a surface. before, after: their weights in the layers before and after each pixel; equal unless
@@ -258,33 +269,6 @@ class Downsampling {
     return i * size;
   }
 
-  // Stores values, `step` apart, times a factor: as a piece, or in the planes.
-  void add_piece(Pieces &pieces, int column, int node, const float *values, int step, float factor) {
-    pieces.column.push_back(column);
-    pieces.node.push_back(node);
-    for (int v = 0; v < stride_; v++) pieces.values.push_back(values[v * step] * factor);
-  }
-  void put_in_planes(int row, int column, float node, const float *values, int step, float factor) {
-    to_.row(0, row)[column] = node;
-    if (!values) return;
-    const float *means = values, *means_behind = values + (C_ + 1) * step;
-    to_.row(1, row)[column] = means[0] * factor;
-    to_.row(2, row)[column] = means_behind[0] * factor;
-    for (int c = 0; c < C_; c++) {
-      to_.row(3 + c, row)[column] = means[(1 + c) * step] * factor;
-      to_.row(3 + C_ + c, row)[column] = means_behind[(1 + c) * step] * factor;
-    }
-  }
-
-  // One block, pixel by pixel. Its first contribution goes into the planes unless the block crosses the frame.
-  void block(int row, int column, bool inside, Pieces &pieces) {
-    gathered_.count = 0;
-    gather(row, column);
-    const float *values = gathered_.values.data();
-    if (inside) put_in_planes(row, column, gathered_.count ? (float)gathered_.nodes[0] : NOWHERE, gathered_.count ? values : nullptr, 1, each_);
-    for (int i = inside ? 1 : 0; i < gathered_.count; i++) add_piece(pieces, column, gathered_.nodes[i], values + (size_t)i * stride_, 1, each_);
-  }
-
   // Whether a block, clamped to the frame, touches cells with mixed pixels.
   bool mixed(int y0, int x0) const {
     auto cell = [&](int at, int size) { return std::clamp(at, 0, size - 1) / CELL; };
@@ -295,28 +279,12 @@ class Downsampling {
     return false;
   }
 
-  // Reads `count` pixels of a surface in a block, clamped to the frame. False if all weights are 0.
-  bool read_beyond(int surface, int y0, int x0, int count, int columns) {
-    const int H = job_.height, W = job_.width;
-    float any = 0;
-    for (int i = 0; i < count; i++) {
-      const int y = std::clamp(y0 + i / columns, 0, H - 1), x = std::clamp(x0 + i % columns, 0, W - 1);
-      const float *coc, *weight;
-      const bool has_it = s_.row(surface, y, x, light_.data(), coc, weight);
-      coc_[surface][i] = has_it ? *coc : 0.0f;
-      any += weight_[surface][i] = !has_it ? 0.0f : weight ? *weight : 1.0f;
-      interval_[surface][i] = index_.intervals[surface][(size_t)y * W + x];
-    }
-    for (int i = count; i % LANES; i++) coc_[surface][i] = weight_[surface][i] = 0.0f, interval_[surface][i] = 0;
-    return any != 0;
-  }
-
   // Position of pixels of a surface between their two nodes, 0 to 1.
   vec far_between(int surface, int i) const {
     vec at, per;
     for (int lane = 0; lane < LANES; lane++) {
-      const Ramp &of = ramps_[interval_[surface][i + lane]];
-      at[lane] = of.at, per[lane] = of.per;
+      const Layer &before = job_.layers[interval_[surface][i + lane]];
+      at[lane] = before.at, per[lane] = before.per_after;
     }
     return ramp((index_.place(load<vec>(coc_[surface] + i)) - at) * per, over_);
   }
@@ -355,73 +323,6 @@ class Downsampling {
     return any;
   }
 
-  void gather(int row, int column) {
-    const int s = to_.scale, y0 = row * s, x0 = column * s, H = job_.height, W = job_.width;
-    // beside one edge of the frame coc and weight do not change away from it: one pixel represents a line of them
-    const bool in_rows = y0 >= 0 && y0 + s <= H, in_columns = x0 >= 0 && x0 + s <= W;
-    const bool above_or_below = in_columns && (y0 + s <= 0 || y0 >= H), beside = in_rows && (x0 + s <= 0 || x0 >= W);
-    const int line = above_or_below || beside ? s : 1, count = s * s / line, columns = beside ? 1 : s;
-    bool there[2] = {};
-    for (int i = 0; i < s_.count; i++) {
-      there[i] = read_beyond(i, y0, x0, count, columns);
-      for (int j = 0; there[i] && j < count; j += LANES) store(far_[i] + j, far_between(i, j));
-    }
-    const bool continues = there[0] && there[1] && mixed(y0, x0) && continue_farther(count);
-    for (int i = 0; i < s_.count; i++)
-      if (there[i]) sum_pixels(i, y0, x0, count, columns, continues ? before_[i] : weight_[i], continues ? after_[i] : weight_[i]);
-    // remove contributions of weight 0
-    for (int i = 0; i < gathered_.count;) {
-      if (gathered_.values[(size_t)i * stride_] != 0) {
-        i++;
-        continue;
-      }
-      gathered_.count--;
-      gathered_.nodes[i] = gathered_.nodes[gathered_.count];
-      memcpy(&gathered_.values[(size_t)i * stride_], &gathered_.values[(size_t)gathered_.count * stride_], stride_ * sizeof(float));
-    }
-    if (!continues) return;
-    for (const NormalizerCorrection &of : corrections_) {
-      float *values = gathered_.between(to_.stands_for[of.node] | Pieces::NORMALIZER_ONLY);
-      values[0] += line * of.up_to;
-      values[C_ + 1] += line * of.next;
-    }
-  }
-
-  // Sums the pixels of a surface in a block; beside the frame each pixel represents a line of them.
-  void sum_pixels(int i, int y0, int x0, int count, int columns, const float *before, const float *after) {
-    const int H = job_.height, W = job_.width, C = C_, line = to_.scale * to_.scale / count;
-    int last = -1;
-    float *sums = nullptr;
-    for (int j = 0; j < count; j++) {
-      const float first = line * before[j], second = line * after[j];
-      if (second == 0) continue;
-      const int k = interval_[i][j];
-      if (!to_.needed(k)) continue;
-      if (k != last) {
-        last = k;
-        sums = gathered_.between(to_.stands_for[k]);
-      }
-      if (!to_.wanted[k]) {
-        sums[0] += first;
-        continue;
-      }
-      const int y = y0 + j / columns, x = x0 + j % columns, at_y = std::clamp(y, 0, H - 1), at_x = std::clamp(x, 0, W - 1);
-      const float far = far_[i][j], part = far * second, w = first + far * (second - first);
-      const float *coc, *weight;
-      s_.row(i, at_y, at_x, light_.data(), coc, weight);
-      float *sums_behind = sums + C + 1;
-      sums[0] += w;
-      sums_behind[0] += part;
-      for (int c = 0; c < C; c++) {
-        const float v = line > 1                   ? border_.mean_light(i, c, y, x, line, *light_[c])
-                        : y != at_y || x != at_x ? border_.light(i, c, y, x, *light_[c])
-                                                 : *light_[c];
-        sums[1 + c] += v * w;
-        sums_behind[1 + c] += v * part;
-      }
-    }
-  }
-
   const Job &job_;
   const Surfaces &s_;
   const LayerIndex &index_;
@@ -431,21 +332,17 @@ class Downsampling {
   const int C_, stride_;
   const float each_;
   struct NormalizerCorrection {
-    int pixel, node;    // index in the block; node before the pixel's nearer surface
+    int pixel, node;    // index in the cell; node before the pixel's nearer surface
     float up_to, next;  // correction of the normalizer in the layers up to that node, and in the next one
   };
-  // For a block's pixels and both surfaces. far: position between the nodes; before, after: weight in these layers.
-  float coc_[2][BLOCK_PIXELS], weight_[2][BLOCK_PIXELS], far_[2][BLOCK_PIXELS], before_[2][BLOCK_PIXELS], after_[2][BLOCK_PIXELS];
+  // For a cell's pixels and both surfaces. before, after: weight in the layers before and after the pixel.
+  float coc_[2][BLOCK_PIXELS], weight_[2][BLOCK_PIXELS], before_[2][BLOCK_PIXELS], after_[2][BLOCK_PIXELS];
   int32_t interval_[2][BLOCK_PIXELS];
-  struct Ramp {
-    float at, per;
-  };
-  std::vector<Ramp> ramps_;  // beyond each layer
   std::vector<NormalizerCorrection> corrections_;
-  Gathered gathered_;
   std::vector<int> cell_nodes_;    // nodes in a row of blocks,
   std::vector<float> cell_sums_;  // and their values in the layout of pieces [nodes, stride, blocks]
   std::vector<const float *> light_, light_of_[2];
+  std::vector<float> beyond_;  // light of pixels in a cell beyond the frame [2, channels, BLOCK_PIXELS]
 };
 
 Downsampled::Downsampled(const Job &job, int scale, int margin)

@@ -2,13 +2,9 @@
 //
 // The frame is processed in tiles of AREA x AREA pixels, and within a tile only where the map changes. Each tile is
 // copied with a margin, padded beyond the frame with the nearest border pixel, so that loops run in whole vectors.
-#include <algorithm>
 #include <array>
-#include <cmath>
-#include <vector>
 
 #include "engine.h"
-#include "variants.h"
 
 namespace torchdof {
 namespace TORCHDOF_SIMD {
@@ -32,7 +28,6 @@ constexpr int BLUR_REACH = 9, RINGING_REACH = 3;
 constexpr int USUAL_REACH = REACH + 2, LAMP_REACH = 2;
 
 constexpr int AREA = 96;       // side of a tile in pixels
-constexpr int ROWS_AHEAD = 8;  // rows by which values are prefetched
 // A pixel's result depends on the pixels within this many of it: without ramps, and with ramps.
 constexpr int STEP_HALO = RINGS + REACH, HALO = RINGS + RAMP_REACH + FLAT_REACH + 3;
 constexpr float NONE = 1e30f;       // negated, replaces invalid values in maxima
@@ -65,79 +60,23 @@ struct Edge {
   uint8_t kind;
 };
 
-// A thread's stack of temporary buffers, reused so that they stay in the processor's cache.
-class Scratch {
- public:
-  float *take(size_t size) {
-    if (blocks_.empty() || blocks_[block_].size - blocks_[block_].used < size) {
-      const size_t next = blocks_.empty() ? 0 : block_ + 1, whole = std::max(size, BLOCK_SIZE);
-      if (next < blocks_.size() && blocks_[next].size < size) blocks_.erase(blocks_.begin() + next, blocks_.end());  // all are free
-      if (next == blocks_.size()) blocks_.push_back({Buffer<float>(whole), whole, 0});
-      block_ = next;
-    }
-    Block &block = blocks_[block_];
-    block.used += size;
-    return block.data.data() + block.used - size;
-  }
-  void give(size_t size) {
-    blocks_[block_].used -= size;
-    if (blocks_[block_].used == 0 && block_ > 0) block_--;
-  }
-
-  const Buffer<Edge> edges{AREA * AREA};  // of a tile
-
-  static thread_local Scratch *mine;
-
- private:
-  static constexpr size_t BLOCK_SIZE = 1 << 19;
-  struct Block {
-    Buffer<float> data;
-    size_t size, used;
-  };
-  std::vector<Block> blocks_;
-  size_t block_ = 0;
-};
-thread_local Scratch *Scratch::mine = nullptr;
-
 // A temporary plane, or several, addressed by frame coordinates. Rows are padded by up to two vectors that may be read.
 class Grid : public Part {
  public:
   explicit Grid(const Part &part, int planes = 1)
-      : Part(part), pitch((part.width + LANES - 1) / LANES * LANES + 2 * LANES), size((size_t)part.height * pitch), taken_((size * planes + LANES + 15) / 16 * 16), data_(Scratch::mine->take(taken_)) {
-    std::fill(data_ + size * planes, data_ + size * planes + LANES, 0.0f);
+      : Part(part), pitch((part.width + LANES - 1) / LANES * LANES + 2 * LANES), size((size_t)part.height * pitch), data_(size * planes + LANES) {
+    std::fill(&data_[size * planes], &data_[size * planes] + LANES, 0.0f);
   }
-  Grid(const Grid &) = delete;
-  Grid &operator=(const Grid &) = delete;
-  ~Grid() { Scratch::mine->give(taken_); }
 
-  float *at(int y, int x) const { return data_ + (size_t)(y - y0) * pitch + (x - x0); }
-  void clear() const { std::fill(data_, data_ + size, 0.0f); }
+  float *at(int y, int x) const { return data_.data() + (size_t)(y - y0) * pitch + (x - x0); }
+  void clear() const { std::fill(data_.data(), data_.data() + size, 0.0f); }
 
   const int pitch;
   const size_t size;  // values in a plane
 
  private:
-  const size_t taken_;
-  float *const data_;
+  const Buffer<float> data_;
 };
-
-// Packs the sign bit of each lane.
-inline int bits(ivec mask) {
-#if defined(__AVX2__)
-  return __builtin_ia32_movmskps256((vec)mask);
-#else
-  int lanes = 0;
-  for (int i = 0; i < LANES; i++) lanes |= (mask[i] & 1) << i;
-  return lanes;
-#endif
-}
-inline float square_root(float v) { return std::sqrt(v); }
-inline vec square_root(vec v) {
-  float lanes[LANES];
-  store(lanes, v);
-  for (float &lane : lanes) lane = std::sqrt(lane);
-  return load<vec>(lanes);
-}
 
 // Calls look(n, take) for each vector n of a window; take(p, pitch) loads it from a grid, p being the window's first
 // value.
@@ -188,10 +127,10 @@ void max_filter(const Grid &in, const Grid &out, const Grid &rows, const Part &p
     return most(load<vec>(from), most(load<vec>(from + MIDDLE * stride), load<vec>(from + LAST * stride)));
   };
   for (int y = part.y0 - REACH_; y < part.bottom() + REACH_; y++) {
-    for (int x = part.x0; x < part.right() + LAST; x += LANES) store(rows.at(y, x), run(in.at(y, x - REACH_), 1));
-    for (int x = part.x0; x < part.right(); x += LANES) store(rows.at(y, x), three(rows.at(y, x), 1));
+    for (int x = part.x0; RUN > 1 && x < part.right() + LAST; x += LANES) store(rows.at(y, x), run(in.at(y, x - REACH_), 1));
+    for (int x = part.x0; x < part.right(); x += LANES) store(rows.at(y, x), three(RUN > 1 ? rows.at(y, x) : in.at(y, x - REACH_), 1));
   }
-  each_vector({part.y0 - REACH_, part.x0, part.height + LAST, part.width}, [&](int y, int x) { store(rows.at(y, x), run(rows.at(y, x), rows.pitch)); });
+  each_vector({part.y0 - REACH_, part.x0, RUN > 1 ? part.height + LAST : 0, part.width}, [&](int y, int x) { store(rows.at(y, x), run(rows.at(y, x), rows.pitch)); });
   each_vector(part, [&](int y, int x) { store(out.at(y, x), three(rows.at(y - REACH_, x), rows.pitch)); });
 }
 
@@ -202,42 +141,16 @@ inline vec max_3x3(const float *from, int pitch) {
   return high;
 }
 
-// Maximum over 3 x 3 values around each value of a part.
-void max_3x3(const Grid &in, const Grid &out, const Part &part) {
-  for (int x = part.x0; x < part.right(); x += LANES) {
-    const auto row = [&](int y) {
-      const float *from = in.at(y, x);
-      return most(load<vec>(from), most(load<vec>(from - 1), load<vec>(from + 1)));
-    };
-    vec above = row(part.y0 - 1), here = row(part.y0);
-    for (int y = part.y0; y < part.bottom(); y++) {
-      const vec below = row(y + 1);
-      store(out.at(y, x), most(here, most(above, below)));
-      above = here;
-      here = below;
-    }
-  }
-}
-
-// Sum over a square of side 2 REACH_ + 1 around each value of a part, times a factor. Adds runs of 3 values if they
-// fit.
+// Sum over a square of side 2 REACH_ + 1 around each value of a part, times a factor.
 template <int REACH_>
 void sums(const Grid &in, const Grid &out, const Grid &rows, const Part &part, float factor) {
-  constexpr int TAPS = 2 * REACH_ + 1, RUN = TAPS % 3 ? 1 : 3, LAST = TAPS - RUN;
-  const auto symmetric = [](const float *from, int stride, int taps, int step) {
-    const int middle = taps / 2 * stride;
-    vec total = load<vec>(from + middle);
-    for (int d = step; d <= taps / 2; d += step) total += load<vec>(from + middle - d * stride) + load<vec>(from + middle + d * stride);
+  const auto sum = [](const float *middle, int stride) {
+    vec total = load<vec>(middle);
+    for (int d = 1; d <= REACH_; d++) total += load<vec>(middle - d * stride) + load<vec>(middle + d * stride);
     return total;
   };
-  for (int y = part.y0 - REACH_; y < part.bottom() + REACH_; y++) {
-    if (RUN > 1)
-      for (int x = part.x0; x < part.right() + LAST; x += LANES) store(rows.at(y, x), symmetric(in.at(y, x - REACH_), 1, RUN, 1));
-    for (int x = part.x0; x < part.right(); x += LANES) store(rows.at(y, x), symmetric(RUN > 1 ? rows.at(y, x) : in.at(y, x - REACH_), 1, LAST + 1, RUN));
-  }
-  if (RUN > 1)
-    each_vector({part.y0 - REACH_, part.x0, part.height + LAST, part.width}, [&](int y, int x) { store(rows.at(y, x), symmetric(rows.at(y, x), rows.pitch, RUN, 1)); });
-  each_vector(part, [&](int y, int x) { store(out.at(y, x), symmetric(rows.at(y - REACH_, x), rows.pitch, LAST + 1, RUN) * factor); });
+  each_vector({part.y0 - REACH_, part.x0, part.height + 2 * REACH_, part.width}, [&](int y, int x) { store(rows.at(y, x), sum(in.at(y, x), 1)); });
+  each_vector(part, [&](int y, int x) { store(out.at(y, x), sum(rows.at(y, x), rows.pitch) * factor); });
 }
 
 // Which surface a pixel shows. score: log-odds of the near surface. reliability: 0 to 1, how well colours separate the
@@ -255,9 +168,9 @@ struct Around {
 struct Group {
   Part part;
   std::vector<Edge> edges;
-  Part bounds = {};             // bounding box of the edges
-  Judgement *judged = nullptr;  // one for each edge
-  Around *around = nullptr;     // one for every LANES edges
+  Part bounds = {};               // bounding box of the edges
+  std::vector<Judgement> judged;  // one for each edge
+  std::vector<Around> around;     // one for every LANES edges
 };
 
 // Selects edge pixels by kind: first those to which the map gives the far surface, then those with the near one.
@@ -274,7 +187,7 @@ struct EdgeSums {
 class Repair {
  public:
   explicit Repair(const torchdof_map &map)
-      : map_(map), sign_(map.of_coc ? -1.0f : 1.0f), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)map.height * map.width), scratch_(std::max(map.threads, 1)) {}
+      : map_(map), sign_(map.of_coc ? -1.0f : 1.0f), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)map.height * map.width), score_(area_), evidence_(area_), marks_(area_) {}
 
   // 1. Find the edges of a sample of the frame and decide by colour which surface each pixel shows.
   // 2. Calibrate: for each kind of edge pixel, the share that shows the near surface.
@@ -282,7 +195,6 @@ class Repair {
   // 4. Find and decide the edges of the whole frame; move pixels that have the depth of the wrong surface.
   // 5. In a soft map also remove ringing, and restore the nearness of small lamps that a blur has reduced.
   bool run() {
-    allocate();
     noise_step_ = NOISES * noise();
     const int every = (int)std::ceil(std::sqrt((double)area_ / SAMPLED));
     const bool finds_twice = map_.automatic && every > 4;  // the sample is a small part of the frame: find only its edges first
@@ -297,7 +209,6 @@ class Repair {
     }
     // blocks and tiles contain edge pixels that are not sampled
     choose_edges(sampled, [&](const Edge &edge) { return is_sampled(edge.i / width_, edge.i % width_); });
-    allocate_results(sampled);
     judge(sampled, false);
     decide(sampled);
     calibrate(sampled);
@@ -311,7 +222,6 @@ class Repair {
       groups = find_in(tiles(), 0, is_soft, is_soft, doubtful);
     else
       choose_edges(groups, [&](const Edge &edge) { return doubtful[given_kind_of(edge)]; });
-    allocate_results(groups);
     judge(groups, true);
     decide(groups);
     const float lost_px = move(groups);
@@ -323,10 +233,7 @@ class Repair {
  private:
   template <typename Body>
   void parallel(int count, const Body &body) const {
-    torchdof::parallel(map_.threads, count, map_.cancelled, [&](int i, int worker) {
-      Scratch::mine = &scratch_[worker];
-      body(i);
-    });
+    torchdof::parallel(map_.threads, count, map_.cancelled, [&](int i, int) { body(i); });
   }
 
   float step(size_t i) const { return std::max(map_.steps ? map_.steps[i] : map_.step, noise_step_); }
@@ -336,7 +243,6 @@ class Repair {
   // Share of the pixels of a given kind to which the map gives the wrong surface.
   float wrong(int given_kind) const { return given_kind >= KINDS ? 1.0f - shares_[given_kind - KINDS] : shares_[given_kind]; }
   static float valid(float v) { return std::fabs(v) <= LARGEST ? v : 0.0f; }
-  static vec valid(vec v) { return size_of(v) <= all(LARGEST) ? v : vec{}; }
   static float root(float light) { return (light <= FINITE) & (light > 0) ? std::sqrt(std::min(light, BRIGHTEST)) : 0.0f; }
 
   // Standard deviation of the map's noise, from the median second difference along rows or columns, whichever is
@@ -394,13 +300,12 @@ class Repair {
 
   // Gradient at a pixel as a fraction of the step `gap`, given the offsets of its neighbours. The sum over a step's
   // pixels is its length in pixels.
-  template <typename V>
-  static V climb(const float *value, int left, int right, int above, int below, V gap) {
-    V steepness{};
+  static float climb(const float *value, int left, int right, int above, int below, float gap) {
+    float steepness = 0;
     for (const int u : {left, right})
       for (const int v : {above, below}) {
-        const V across = valid(load<V>(value + u) - load<V>(value)), along = valid(load<V>(value + v) - load<V>(value));
-        steepness += square_root(across * across + along * along);
+        const float across = valid(value[u] - *value), along = valid(value[v] - *value);
+        steepness += std::sqrt(across * across + along * along);
       }
     return 0.25f * steepness / gap;
   }
@@ -469,24 +374,8 @@ class Repair {
         if (is_listed) group.edges[kept++] = edge;
       }
       group.edges.resize(kept);
-      group.bounds = bounds(group, [](size_t) { return true; });
+      group.bounds = bounds(group);
     });
-  }
-
-  // Gives each group its part of the result buffers.
-  void allocate_results(std::vector<Group> &groups) {
-    size_t count = 0;
-    for (const Group &group : groups) count += group.edges.size();
-    judged_ = Buffer<Judgement>(count);
-    around_ = Buffer<Around>(count / LANES + groups.size());
-    count = 0;
-    size_t arounds = 0;
-    for (Group &group : groups) {
-      group.judged = judged_.data() + count;
-      group.around = around_.data() + arounds;
-      count += group.edges.size();
-      arounds += (group.edges.size() + LANES - 1) / LANES;
-    }
   }
 
   // Calls body(k, edge, y, x) for each edge of a group.
@@ -499,12 +388,10 @@ class Repair {
     }
   }
 
-  // Bounding box of a group's chosen edges.
-  template <typename Chosen>
-  Part bounds(const Group &group, const Chosen &chosen) const {
+  // Bounding box of a group's edges.
+  Part bounds(const Group &group) const {
     int top = height_, left = width_, bottom = 0, right = 0;
-    each_edge(group, [&](size_t k, const Edge &, int y, int x) {
-      if (!chosen(k)) return;
+    each_edge(group, [&](size_t, const Edge &, int y, int x) {
       top = std::min(top, y);
       left = std::min(left, x);
       bottom = y + 1;
@@ -513,23 +400,9 @@ class Repair {
     return {top, left, bottom - top, right - left};
   }
 
-  void allocate() {
-    score_ = Buffer<float>(area_);
-    evidence_ = Buffer<float>(area_);
-    marks_ = Buffer<uint8_t>(area_);
-  }
-
   Part in_frame(const Part &part) const {
     const int y0 = std::max(0, part.y0), x0 = std::max(0, part.x0);
     return {y0, x0, std::min(height_, part.bottom()) - y0, std::min(width_, part.right()) - x0};
-  }
-
-  // Prefetches values ROWS_AHEAD rows below: rows of a tile are too short for the hardware prefetcher. Always inlined,
-  // because GCC otherwise removes the call as having no effect.
-  template <typename Value>
-  __attribute__((always_inline)) void prefetch_below(const Value *values, int y, int count) const {
-    const Value *soon = values + (ptrdiff_t)std::min(ROWS_AHEAD, std::max(0, height_ - 1 - std::max(y, 0))) * width_;
-    for (int x = 0; x < count; x += 64 / (int)sizeof(Value)) __builtin_prefetch(soon + x);
   }
 
   // Fills all rows of a grid from a plane of the frame, padding with the nearest border pixel.
@@ -538,7 +411,6 @@ class Repair {
     const int first = std::max(0, -grid.x0), last = std::min(grid.pitch, width_ - grid.x0);
     for (int y = grid.y0; y < grid.bottom(); y++, to += grid.pitch) {
       const Value *from = plane + (ptrdiff_t)std::min(std::max(y, 0), height_ - 1) * width_ + grid.x0;
-      prefetch_below(from + first, y, last - first);
       for (int x = first; x < last; x++) to[x] = of(from[x]);
       std::fill(to, to + first, to[first]);
       std::fill(to + last, to + grid.pitch, to[last - 1]);
@@ -567,9 +439,8 @@ class Repair {
     std::vector<EdgeSums> found(groups.size());
     parallel((int)groups.size(), [&](int g) {
       Group &group = groups[g];
-      const Edge *edges = Scratch::mine->edges.data();
-      group.edges.assign(edges, find_in(group.part, in_frame(group.part.grown(halo)), expects_ramps, selected, measures ? &found[g] : nullptr));
-      group.bounds = bounds(group, [](size_t) { return true; });
+      find_in(group.part, in_frame(group.part.grown(halo)), expects_ramps, selected, measures ? &found[g] : nullptr, group.edges);
+      group.bounds = bounds(group);
     });
     found_ = {};
     for (const EdgeSums &here : found) {
@@ -581,19 +452,17 @@ class Repair {
     return groups;
   }
 
-  // Finds the edges of one part in the thread's buffer; returns their end.
-  const Edge *find_in(const Part &own, const Part &part, bool expects_ramps, const KindMask &selected, EdgeSums *found) {
+  // Finds the edges of one part.
+  void find_in(const Part &own, const Part &part, bool expects_ramps, const KindMask &selected, EdgeSums *found, std::vector<Edge> &edges) {
     for (int y = part.y0; y < part.bottom(); y++) {
       const size_t i = (size_t)y * width_ + part.x0;
       const float *values = map_.nearness + i;
       uint8_t *marks = marks_.data() + i;
-      prefetch_below(values, y, part.width);
       for (int x = 0; x < part.width; x++) marks[x] = std::fabs(values[x]) <= LARGEST ? 0 : (RINGS + 1) * UNSURE;
     }
     const Part busy = changing(part);
-    if (busy.height <= 0 || busy.width <= 0) return Scratch::mine->edges.data();
-    const Edge *end = expects_ramps ? nullptr : find_in(own, busy, STEP_HALO, selected, found);
-    return end ? end : find_in(own, busy, HALO, selected, found);
+    if (busy.height <= 0 || busy.width <= 0) return;
+    if (expects_ramps || !find_in(own, busy, STEP_HALO, selected, found, edges)) find_in(own, busy, HALO, selected, found, edges);
   }
 
   // Bounding box of the pixels where the map changes enough for an edge, grown by the halo.
@@ -639,13 +508,13 @@ class Repair {
     return {y0, x0, std::min(part.bottom(), wide.bottom()) - y0, std::min(part.right(), wide.right()) - x0};
   }
 
-  // Finds the edges of the changing part; returns null if ramps require the larger halo.
+  // Finds the edges of the changing part; returns false if ramps require the larger halo.
   //
   // 1. Slopes that continue on both sides of a pixel are ramp candidates; end_ramps keeps the true ramps.
   // 2. Near and far surface within 1, 2 and 3 pixels, by maximum filters.
   // 3. A pixel belongs to the step at the smallest distance whose jump is abrupt.
   // 4. Each edge pixel gets its kind: ring or level on the ramp, side, and direction of the near surface.
-  const Edge *find_in(const Part &own, const Part &inner, int halo, const KindMask &selected, EdgeSums *found) {
+  bool find_in(const Part &own, const Part &inner, int halo, const KindMask &selected, EdgeSums *found, std::vector<Edge> &edges) {
     const bool is_wide = halo == HALO;
     const Part whole = inner.grown(halo), beside = inner.grown(RINGS), ramps = inner.grown(is_wide ? RINGS + RAMP_REACH : RINGS);
     const Grid raw(whole), up(whole), down(whole), slope(whole), jump(whole), high(whole), low(whole), rows(whole), ramp(whole);
@@ -683,7 +552,7 @@ class Repair {
       });
     }
     if (any_beside(is_ramp)) {
-      if (!is_wide) return nullptr;
+      if (!is_wide) return false;
       end_ramps(up, down, slope, high, low, rows, ramp, ramps);
       each_vector(beside, [&](int y, int x) {
         const vec near = load<vec>(high.at(y, x)), far = load<vec>(low.at(y, x));
@@ -698,9 +567,9 @@ class Repair {
                jumps[RINGS] = {Grid(beside), Grid(beside), Grid(beside)};
     for (int r = 0; r < RINGS; r++) {
       const Part part = inner.grown(RINGS - 1 - r);
-      max_3x3(r ? nears[r - 1] : up, nears[r], part);
-      max_3x3(r ? fars[r - 1] : down, fars[r], part);
-      max_3x3(r ? jumps[r - 1] : jump, jumps[r], part);
+      max_filter<1>(r ? nears[r - 1] : up, nears[r], rows, part);
+      max_filter<1>(r ? fars[r - 1] : down, fars[r], rows, part);
+      max_filter<1>(r ? jumps[r - 1] : jump, jumps[r], rows, part);
     }
     const Part means = inner.grown(2);  // over 5 x 5 pixels; their differences give the direction of the step
     each_vector(inner.grown(4), [&](int y, int x) {
@@ -709,7 +578,6 @@ class Repair {
     });
     sums<2>(slope, high, rows, means, 1.0f / 25.0f);
 
-    Edge *edges = Scratch::mine->edges.data();
     float marks_of_row[AREA + LANES];
     for (int y = inner.y0; y < inner.bottom(); y++) {
       const size_t row = (size_t)y * width_;
@@ -752,30 +620,27 @@ class Repair {
         const ivec kind = convert(place * (float)DIRECTIONS + 2.0f * along + across + (float)(DIRECTIONS / 2));
         store(kinds, kind);
         store(sides, kind + convert(is_near * (float)KINDS));
-        if (found) measure(*found, edges_here, level, is_near, climb(raw.at(y, x), -1, 1, -raw.pitch, raw.pitch, gap));
         for (; edges_here; edges_here &= edges_here - 1) {
-          const int n = __builtin_ctz(edges_here), is_selected = selected[sides[n]];
-          *edges = {(int)row + x + n, nearest[n], farthest[n], (uint8_t)kinds[n]};
-          marks_of_row[k + n] += (float)(LISTED * is_selected);
-          edges += is_selected;
+          const int n = __builtin_ctz(edges_here);
+          if (found) measure(*found, level[n], is_near[n] > 0, climb(raw.at(y, x + n), -1, 1, -raw.pitch, raw.pitch, gap[n]));
+          if (!selected[sides[n]]) continue;
+          edges.push_back({(int)row + x + n, nearest[n], farthest[n], (uint8_t)kinds[n]});
+          marks_of_row[k + n] += (float)LISTED;
         }
       }
       uint8_t *marks = marks_.data() + row + inner.x0;
       for (int k = 0; k < inner.width; k++) marks[k] = (uint8_t)(int)marks_of_row[k];
     }
-    return edges;
+    return true;
   }
 
-  // Adds selected edge pixels to the statistics.
-  static void measure(EdgeSums &found, int chosen, vec level, vec is_near, vec climbed) {
-    for (; chosen; chosen &= chosen - 1) {
-      const int n = __builtin_ctz(chosen);
-      const bool is_middle = is_mixed(level[n]);
-      found.length += climbed[n];
-      found.climbed += is_middle ? climbed[n] : 0.0f;
-      found.middles += is_middle;
-      found.lost += is_near[n] - clamp01(level[n]);
-    }
+  // Adds an edge pixel to the statistics.
+  static void measure(EdgeSums &found, float level, bool is_near, float climbed) {
+    const bool is_middle = is_mixed(level);
+    found.length += climbed;
+    found.climbed += is_middle ? climbed : 0.0f;
+    found.middles += is_middle;
+    found.lost += is_near - clamp01(level);
   }
 
   // slope: the smaller change to both neighbours if these have one sign, else 0. jump: the larger change minus the slope.
@@ -850,12 +715,9 @@ class Repair {
     const std::vector<float> falloff = window([](float square) { return square > 0 ? std::exp(-square / 12.5f) : 0.0f; });
     parallel((int)groups.size(), [&](int g) {
       if (groups[g].edges.empty()) return;
-      switch (channels_) {
-        case 1: return judge<1>(groups[g], falloff.data(), wants_surfaces);
-        case 3: return judge<3>(groups[g], falloff.data(), wants_surfaces);
-        case 4: return judge<4>(groups[g], falloff.data(), wants_surfaces);
-        default: judge<0>(groups[g], falloff.data(), wants_surfaces);
-      }
+      groups[g].judged.resize(groups[g].edges.size());
+      groups[g].around.resize((groups[g].edges.size() + LANES - 1) / LANES);
+      channels_ == 3 ? judge<3>(groups[g], falloff.data(), wants_surfaces) : judge<0>(groups[g], falloff.data(), wants_surfaces);
     });
   }
 
@@ -879,12 +741,8 @@ class Repair {
     fetch(marks_.data(), witness, [](uint8_t marks) { return (float)(marks / UNSURE); });
     float *sure = witness.at(around.y0, around.x0);
     for (size_t i = 0; i < witness.size; i += LANES) store(sure + i, pick(SURE, convert(load<vec>(sure + i))));
-    struct Lanes {
-      vec lanes;
-    };
-    std::vector<Lanes> many(C ? 0 : count);
-    // of LANES pixels: totals, own colours
-    std::vector<float> numbers(C ? 0 : count + 3 + channels), of_lanes((count + channels) * LANES);
+    std::vector<vec> many(C ? 0 : count);
+    std::vector<float> of_lanes((count + channels) * LANES);  // of LANES pixels: totals, own colours
     struct Window {
       vec weights[2][WINDOW], values[WINDOW], apart[WINDOW];
     } windows[LANES];
@@ -896,19 +754,18 @@ class Repair {
       const float near = edge.near, far = edge.far;
       const vec most_difference = all(0.25f * std::max(near - far, 1e-12f));
       vec few[C ? 4 + 2 * C : 1];
-      float few_sums[C ? 4 + 2 * C + 3 : 1], few_own[C ? C : 1];
       // of both surfaces: weights, squared colour differences, colour differences of each channel
-      vec *sums = C ? few : &many[0].lanes;
-      float *totals = C ? few_sums : numbers.data(), *own = C ? few_own : numbers.data() + count + 3;
+      vec *sums = C ? few : many.data();
+      float *own = &of_lanes[count * LANES + lane];
       for (int n = 0; n < count; n++) sums[n] = none;
       const float *given_at = given.at(y - REACH, x - REACH), *witness_at = witness.at(y - REACH, x - REACH), *colour_at = colour.at(y - REACH, x - REACH);
-      for (int c = 0; c < channels; c++) own[c] = colour_at[c * colour.size + REACH * colour.pitch + REACH];
+      for (int c = 0; c < channels; c++) own[c * LANES] = colour_at[c * colour.size + REACH * colour.pitch + REACH];
       each_of_window([&](int n, const auto &take) {
         const vec value = take(given_at, given.pitch), weight = load<vec>(falloff + n * LANES) * take(witness_at, given.pitch), off = value - near;
         const vec w[2] = {size_of(off) < most_difference ? weight : none, size_of(value - far) < most_difference ? weight : none};
         vec apart = none;  // squared colour difference
         for (int c = 0; c < channels; c++) {
-          const vec d = take(colour_at + c * colour.size, given.pitch) - own[c];
+          const vec d = take(colour_at + c * colour.size, given.pitch) - own[c * LANES];
           apart += d * d;
           for (int side = 0; side < 2; side++) sums[4 + 2 * c + side] += w[side] * d;
         }
@@ -920,9 +777,7 @@ class Repair {
         window.values[n] = off;
         window.apart[n] = apart;
       });
-      sum(sums, count, totals);
-      for (int n = 0; n < count; n++) of_lanes[n * LANES + lane] = totals[n];
-      for (int c = 0; c < channels; c++) of_lanes[(count + c) * LANES + lane] = own[c];
+      for (int n = 0; n < count; n++) of_lanes[n * LANES + lane] = sum(sums[n]);
       if (lane < LANES - 1 && k + 1 < group.edges.size()) return;
 
       // LANES pixels at once
@@ -958,11 +813,9 @@ class Repair {
             parts[4 + side] += part * window.values[n];
           }
         }
-        float of_parts[6 + 3];
-        sum(parts, 6, of_parts);
         for (int side = 0; side < 2; side++) {
-          likely[side][l] = of_parts[side];
-          surfaces[side][l] = edge.near + of_parts[4 + side] / std::max(of_parts[2 + side], 1e-12f);
+          likely[side][l] = sum(parts[side]);
+          surfaces[side][l] = edge.near + sum(parts[4 + side]) / std::max(sum(parts[2 + side]), 1e-12f);
         }
       }
       for (int n = 0; n < 8; n++) store(around + n * LANES, 1.0f / (1.0f + load<vec>(around + n * LANES) * per_light));
@@ -978,9 +831,9 @@ class Repair {
   }
 
   // Averages the scores of neighbours of similar colour, and finds the evidence.
-  void decide(const std::vector<Group> &groups) {
+  void decide(std::vector<Group> &groups) {
     parallel((int)groups.size(), [&](int g) {
-      const Group &group = groups[g];
+      Group &group = groups[g];
       if (group.edges.empty()) return;
       const Grid scores(group.bounds.grown(1));
       take_listed(score_.data(), scores, NO_SCORE);
@@ -1231,7 +1084,7 @@ class Repair {
       if (!map_.steps && !(largest(high) - smallest(low) > 0.5f * step(0))) return;
       const Group group{part, lamps_of(part, near)};
       if (group.edges.empty()) return;
-      const Part around = bounds(group, [](size_t) { return true; }).grown(REACH), covered = around.grown(reach), whole = covered.grown(USUAL_REACH);
+      const Part around = bounds(group).grown(REACH), covered = around.grown(reach), whole = covered.grown(USUAL_REACH);
       const Grid bright(whole), usual(whole), rows(whole), peak(covered), blurred(around), given(around);
       brightest(bright, usual, rows, covered);
       max_filter<2>(bright, peak, rows, covered);
@@ -1340,11 +1193,8 @@ class Repair {
   const int height_, width_, channels_;
   const size_t area_;
   float noise_step_ = 0.0f;  // smallest step that is larger than the map's noise
-  Buffer<float> score_, evidence_;
-  Buffer<uint8_t> marks_;
-  Buffer<Judgement> judged_;  // of the edges given memory last
-  Buffer<Around> around_;
-  mutable std::vector<Scratch> scratch_;  // one for each thread
+  const Buffer<float> score_, evidence_;
+  const Buffer<uint8_t> marks_;
   std::vector<float> shares_;
   EdgeSums found_;
 };

@@ -1,8 +1,6 @@
 // Prepares a scene: cleaned copies, second surfaces, highlights.
 #include "engine.h"
 
-#include "variants.h"
-
 namespace torchdof {
 namespace TORCHDOF_SIMD {
 
@@ -49,10 +47,9 @@ void ends_of(const float *values, int width, int rows, float *low, float *high) 
 
 // Takes the inputs.
 //
-// 1. Replace values that are not finite by 0, in copies, and mark their pixels.
+// 1. Replace values that are not finite by 0, in copies, and mark their pixels. Clamp coc to the range of the layers.
 // 2. Find the extremes of coc and light in each block and in the frame; refuse light whose powers would overflow.
-// 3. Clamp coc to the range of the layers, if it exceeds that.
-// 4. Copy the blocks with marked pixels, where these get the weight 0.
+// 3. Copy the blocks with marked pixels, where these get the weight 0.
 void Job::take_scene() {
   surfaces.height = height;
   surfaces.width = width;
@@ -77,43 +74,35 @@ void Job::take_scene() {
   }
   block_low = Buffer<float>(surfaces.blocks.size());
   block_high = Buffer<float>(surfaces.blocks.size());
-  std::vector<uint8_t> bad(surfaces.block_rows, 0), beyond(surfaces.block_rows, 0);
-  if (scene.masked) {
-    validity = Buffer<float>(area);
-    parallel(surfaces.block_rows, [&](int by, int) {
-      for (size_t i = (size_t)by * BLOCK * width; i < std::min(area, (size_t)(by + 1) * BLOCK * width); i++) {
-        bool finite = std::isfinite(surfaces.coc[i]);
-        for (int c = 0; c < channels; c++) finite &= std::isfinite(surfaces.light[c * area + i]);
-        validity[i] = finite;
-        if (!finite) bad[by] = 1;
-      }
-    });
-  }
-  if (std::count(bad.begin(), bad.end(), 1)) {
-    clean_light = Buffer<float>(area * channels);
+  float nearest, farthest, darkest = 0, brightest = 0;
+  find_ends(surfaces.coc, area, scene.threads, &nearest, &farthest);
+  if (scene.masked) find_ends(surfaces.light, area * channels, scene.threads, &darkest, &brightest);
+  const bool bad = scene.masked && !(std::isfinite(nearest) && std::isfinite(farthest) && std::isfinite(darkest) && std::isfinite(brightest));
+  if (bad || !(nearest >= low && farthest <= high)) {
     clean_coc = Buffer<float>(area);
+    clean_light = Buffer<float>(bad ? area * channels : 0);
+    validity = Buffer<float>(bad ? area : 0);
     parallel(height, [&](int y, int) {
       for (size_t i = (size_t)y * width; i < (size_t)(y + 1) * width; i++) {
-        const bool valid = validity[i] > 0;
-        clean_coc[i] = valid ? surfaces.coc[i] : 0.0f;
-        for (int c = 0; c < channels; c++) clean_light[c * area + i] = valid ? surfaces.light[c * area + i] : 0.0f;
+        bool valid = true;
+        if (bad) {
+          valid = std::isfinite(surfaces.coc[i]);
+          for (int c = 0; c < channels; c++) valid &= std::isfinite(surfaces.light[c * area + i]);
+          for (int c = 0; c < channels; c++) clean_light[c * area + i] = valid ? surfaces.light[c * area + i] : 0.0f;
+          validity[i] = valid;
+        }
+        clean_coc[i] = valid ? clamp(surfaces.coc[i], low, high) : 0.0f;
       }
     });
-    surfaces.valid = validity.data();
-    surfaces.light = clean_light.data();
     surfaces.coc = clean_coc.data();
+    if (bad) surfaces.light = clean_light.data(), surfaces.valid = validity.data();
   }
   block_peak = Buffer<float>(surfaces.blocks.size());
-  auto find_coc_ends = [&](int by) {
-    float *const lows = &block_low[by * surfaces.block_columns], *const highs = &block_high[by * surfaces.block_columns];
-    ends_of(surfaces.coc + (size_t)by * BLOCK * width, width, std::min(BLOCK, height - by * BLOCK), lows, highs);
-    for (int i = 0; i < surfaces.block_columns; i++)
-      if (lows[i] < low || highs[i] > high) beyond[by] = 1;
-  };
   std::vector<float> leasts((size_t)channels * surfaces.block_rows, INFINITY), mosts(leasts.size(), -INFINITY);
   parallel(surfaces.block_rows, [&](int by, int) {
-    find_coc_ends(by);
-    float *const peaks = &block_peak[by * surfaces.block_columns];
+    const size_t first = (size_t)by * surfaces.block_columns;
+    ends_of(surfaces.coc + (size_t)by * BLOCK * width, width, std::min(BLOCK, height - by * BLOCK), &block_low[first], &block_high[first]);
+    float *const peaks = &block_peak[first];
     std::vector<float> lows(surfaces.block_columns), highs(surfaces.block_columns);
     for (int c = 0; c < channels; c++) {
       ends_of(surfaces.light + c * area + (size_t)by * BLOCK * width, width, std::min(BLOCK, height - by * BLOCK), lows.data(), highs.data());
@@ -130,17 +119,7 @@ void Job::take_scene() {
   }
   constexpr float BRIGHTEST = 268435456.0f;  // 2^28: powers of light are summed
   for (int c = 0; c < channels; c++)
-    if (scene.kind != TORCHDOF_STACK && std::max(light_most[c], -light_least[c]) > BRIGHTEST) throw TooBright();
-  if (std::count(beyond.begin(), beyond.end(), 1)) {
-    const float *given = surfaces.coc;
-    Buffer<float> within(area);
-    parallel(height, [&](int y, int) {
-      for (size_t i = (size_t)y * width; i < (size_t)(y + 1) * width; i++) within[i] = clamp(given[i], low, high);
-    });
-    clean_coc = std::move(within);
-    surfaces.coc = clean_coc.data();
-    parallel(surfaces.block_rows, [&](int by, int) { find_coc_ends(by); });
-  }
+    if (std::max(light_most[c], -light_least[c]) > BRIGHTEST) throw TooBright();
   if (surfaces.valid)
     for (int i = 0; i < (int)surfaces.blocks.size(); i++) {
       bool whole = true;
@@ -204,36 +183,13 @@ void Job::begin() {
 
 void Job::finish(const RayKernels &kernels, float *out) { composite(*this, kernels, out); }
 
-}  // namespace TORCHDOF_SIMD
-
-template <typename Job>
-class JobOf : public AnyJob {
- public:
-  explicit JobOf(const torchdof_scene &scene) : job_(scene) { job_.begin(); }
-  const std::vector<int32_t> &radii() const override { return job_.radii; }
-  void finish(const RayKernels &kernels, float *out) override { job_.finish(kernels, out); }
-
- private:
-  Job job_;
-};
-
-namespace TORCHDOF_SIMD {
-static AnyJob *begin(const torchdof_scene &scene) { return new JobOf<Job>(scene); }
-static void convolve_all(const float *in, int height, int width, const float *values, int half, float *out) {
-  const Kernel kernel = make_kernel(values, half, true);
-  const int rows = (height + 15) / 16 * 16, columns = (width + 15) / 16 * 16, pitch = columns + 2 * half + 16;
-  std::vector<float> window((size_t)(rows + 2 * half) * pitch);
-  float spread[STRIP];
-  const std::vector<uint32_t> every(rows + 2 * half, ~0u);
-  for (int y = 0; y < height; y++) memcpy(&window[(size_t)(y + half) * pitch + half], in + (size_t)y * width, width * sizeof(float));
-  for (int y = 0; y < height; y += STRIP_ROWS)
-    for (int x = 0; x < width; x += STRIP_COLUMNS) {
-      convolve_strip(&window[(size_t)y * pitch + x], pitch, every.data(), ~0u, kernel, spread);
-      const size_t bytes = std::min(STRIP_COLUMNS, width - x) * sizeof(float);
-      for (int i = 0; i < std::min(STRIP_ROWS, height - y); i++) memcpy(out + (size_t)(y + i) * width + x, spread + i * STRIP_COLUMNS, bytes);
-    }
+static torchdof_job *begin(const torchdof_scene &scene) {
+  auto job = std::make_unique<Job>(scene);
+  job->begin();
+  return job.release();
 }
+
 extern const Variant variant;
-const Variant variant = {begin, repair_edges, find_ends, coc_of_depth, plan, make_kernels, convolve_all, blend, blend_gradient, farthest, farthest_gradient, look_behind, look_behind_gradient};
+const Variant variant = {begin, repair_edges, find_ends, coc_of_depth, plan, make_kernels, blend, farthest, look_behind};
 }  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

@@ -56,6 +56,11 @@ inline vec least(vec a, vec b) {
   return __builtin_ia32_minps256(a, b);
 }
 #endif
+inline vec counting() {  // 0, 1, 2, ...
+  vec v;
+  for (int i = 0; i < LANES; i++) v[i] = i;
+  return v;
+}
 inline ivec convert(vec v) { return __builtin_convertvector(v, ivec); }
 inline vec convert(ivec v) { return __builtin_convertvector(v, vec); }
 inline vec clamp01(vec v) { return least(most(v, vec{}), all(1.0f)); }
@@ -67,24 +72,11 @@ inline float largest(vec v) {
 inline float smallest(vec v) { return -largest(-v); }
 inline vec size_of(vec v) { return (vec)((ivec)v & 0x7fffffff); }
 typedef float quad __attribute__((vector_size(16)));
-inline quad quad_of(vec v) {
-  quad parts[LANES / 4], total;
-  memcpy(parts, &v, sizeof(v));
-  total = parts[0];
-  for (int i = 1; i < LANES / 4; i++) total += parts[i];
-  return total;
-}
 inline float sum(vec v) {
-  const quad total = quad_of(v);
-  return (total[0] + total[1]) + (total[2] + total[3]);
-}
-// Sums each of `count` vectors; writes up to three values beyond them.
-inline void sum(const vec *v, int count, float *out) {
-  for (int i = 0; i < count; i += 4) {
-    const quad none = {}, a = quad_of(v[i]), b = i + 1 < count ? quad_of(v[i + 1]) : none, c = i + 2 < count ? quad_of(v[i + 2]) : none, d = i + 3 < count ? quad_of(v[i + 3]) : none;
-    const quad ab = quad{a[0], b[0], a[1], b[1]} + quad{a[2], b[2], a[3], b[3]}, cd = quad{c[0], d[0], c[1], d[1]} + quad{c[2], d[2], c[3], d[3]};
-    store(out + i, quad{ab[0], ab[1], cd[0], cd[1]} + quad{ab[2], ab[3], cd[2], cd[3]});
-  }
+  quad parts[LANES / 4];
+  memcpy(parts, &v, sizeof(v));
+  for (int i = 1; i < LANES / 4; i++) parts[0] += parts[i];
+  return (parts[0][0] + parts[0][2]) + (parts[0][1] + parts[0][3]);
 }
 // Looks up LANES of eight values by index.
 inline vec pick(const float *values, ivec index) {
@@ -96,15 +88,21 @@ inline vec pick(const float *values, ivec index) {
   return picked;
 #endif
 }
-inline bool any_of(ivec mask) {
+// Packs the sign bit of each lane.
 #if defined(__AVX2__)
-  return __builtin_ia32_movmskps256((vec)mask) != 0;
+inline int bits(ivec mask) { return __builtin_ia32_movmskps256((vec)mask); }
+inline bool any_of(ivec mask) { return bits(mask) != 0; }
 #else
-  typedef long long wide __attribute__((vector_size(LANES * 4)));
-  const wide bits = (wide)mask;
-  return (bits[0] | bits[1]) != 0;
-#endif
+inline int bits(ivec mask) {
+  int lanes = 0;
+  for (int i = 0; i < LANES; i++) lanes |= (mask[i] & 1) << i;
+  return lanes;
 }
+inline bool any_of(ivec mask) {
+  typedef long long wide __attribute__((vector_size(LANES * 4)));
+  return (((wide)mask)[0] | ((wide)mask)[1]) != 0;
+}
+#endif
 inline bool any_positive(vec v) { return any_of(v > vec{}); }
 inline float clamp(float v, float low, float high) { return std::min(std::max(v, low), high); }
 inline float clamp01(float v) { return clamp(v, 0.0f, 1.0f); }
@@ -178,11 +176,6 @@ class Surfaces {
     float *p = blocks[i];
     return {p, p + channels * BLOCK_PIXELS, p + 2 * channels * BLOCK_PIXELS, p + (2 * channels + 1) * BLOCK_PIXELS,
             p + (2 * channels + 2) * BLOCK_PIXELS};
-  }
-  // Prefetches rows of a block. Always inlined, because GCC otherwise removes the call as having no effect.
-  __attribute__((always_inline)) void fetch_block(int i, int first, int rows) const {
-    for (int k = 0; blocks[i] && k < 2 * channels + 3; k++)
-      for (int y = first; y < first + rows; y++) __builtin_prefetch(blocks[i] + k * BLOCK_PIXELS + y * BLOCK);
   }
   // Returns a block; creates it from the image if it does not exist yet.
   Block make_block(int i);
@@ -309,17 +302,16 @@ inline Layer make_layer(const double *nodes, int count, int k) {
   return l;
 }
 
-struct Job {
+struct Job : torchdof_job {
   explicit Job(const torchdof_scene &scene);
   void begin();
-  void finish(const RayKernels &kernels, float *out);
+  void finish(const RayKernels &kernels, float *out) override;
   void split_mixed();  // matting.cpp
 
   const torchdof_scene &scene;
   int height, width, channels, colours;  // colours: kernels of each layer, 1 or channels
   std::vector<Layer> layers;
   Surfaces surfaces;
-  std::vector<int32_t> radii;  // radii of highlight kernels, in steps of 1/32 px
   std::vector<Ray> rays;       // sorted by surface and position
   std::vector<float> ray_light;  // [rays, channels]
 
@@ -491,8 +483,7 @@ class Downsampled {
 
   int stride() const { return 2 * (channels + 1); }  // number of values of a piece
   bool needed(int interval) const { return wanted[interval] || behind[interval]; }
-  // A row of a plane, from the frame's first block. Planes: node before, weight, weight times position between the
-  // nodes, light, light times position.
+  // A row of a plane, from the frame's first block. Planes: node before, and the values of a piece.
   float *row(int plane, int y) const { return planes.data() + plane * size + (size_t)(y + margin) * pitch + margin; }
 
  private:
@@ -540,20 +531,10 @@ class FieldMask {
       s.next = s.values + count;
     }
   }
-  // Transmittance at dx, dx + 1, ...
-  vec transmittance_along(float dy, float dx) const {
-    vec across;
-    for (int i = 0; i < LANES; i++) across[i] = (dx + i) * squeeze_;
-    const vec u = dy * down_ + across * right_, v = across * down_ - dy * right_, first = samples_[0].at(u, most(v, -v));
-    return both_ ? (1.0f - part_) * first + part_ * samples_[1].at(u, most(v, -v)) : first;
-  }
-  // Transmittance at dy, dy - 1, ... for samples of a single radius.
-  vec transmittance(float dy, float dx) const {
-    const float across = dx * squeeze_;
-    vec step;
-    for (int i = 0; i < LANES; i++) step[i] = dy - i;
-    const vec u = step * down_ + across * right_, v = across * down_ - step * right_;
-    return samples_[0].at(u, most(v, -v));
+  // Transmittance at offsets from the kernel's centre.
+  vec transmittance(vec dy, vec dx) const {
+    const vec across = dx * squeeze_, u = dy * down_ + across * right_, v = size_of(across * down_ - dy * right_), first = samples_[0].at(u, v);
+    return both_ ? (1.0f - part_) * first + part_ * samples_[1].at(u, v) : first;
   }
   // Range of rows of a column that the samples cover.
   void rows_of(float dx, float &low, float &high) const {
@@ -640,19 +621,12 @@ bool repair_edges(const torchdof_map &map);
 
 void composite(const Job &job, const RayKernels &ray_kernels, float *out);
 
-// Blurs and composites the layers of a padded frame, forward and backward; blend.cpp
-void blend(const torchdof_layers &scene, float *out);
-void blend_gradient(const torchdof_layers &scene, const float *out_gradient, float *const *light, float *const *place, float *const *weight);
-
-// The finest level of the pyramid from which hidden surfaces are filled, forward and backward; farthest.cpp
-void farthest(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads, float *out);
-void farthest_gradient(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads, const float *gradient,
-                       float *const *of_maps);
-
-// The surfaces behind pixels, read from a pyramid, forward and backward; look_behind.cpp
-void look_behind(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads, float *out);
-void look_behind_gradient(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads,
-                          const float *gradient, float *const *of_levels, float *of_coc);
+// Steps with a gradient; see api.h.
+void blend(const torchdof_layers &scene, float *out, const float *gradient, float *const *of_light, float *const *of_place, float *const *of_weight);
+void farthest(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads, float *out, const float *gradient,
+              float *const *of_maps);
+void look_behind(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads, float *out,
+                 const float *gradient, float *const *of_levels, float *of_coc);
 
 }  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

@@ -34,7 +34,7 @@ class Farthest {
   Farthest(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads)
       : light_{maps[0], maps[2]}, coc_{maps[1], maps[3]}, weight_(maps[4]), threshold_(maps[5]), valid_(maps[6]), C_(CHANNELS ? CHANNELS : channels), threads_(threads), area_((size_t)height * width), rows_(height, rows), columns_(width, columns) {}
 
-  void level(float *out) const {
+  void write(float *out) const {
     const size_t size = (size_t)rows_.samples * columns_.samples;
     torchdof::parallel(threads_, rows_.samples, nullptr, [&](int y, int) {
       for (int x = 0; x < columns_.samples; x++) {
@@ -150,19 +150,13 @@ class Farthest {
 
 }  // namespace
 
-void farthest(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads, float *out) {
+void farthest(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads, float *out, const float *gradient,
+              float *const *of_maps) {
+  const auto run = [&](const auto &level) { gradient ? level.gradient(gradient, of_maps) : level.write(out); };
   if (channels == 3)
-    Farthest<3>(maps, channels, height, width, rows, columns, threads).level(out);
+    run(Farthest<3>(maps, channels, height, width, rows, columns, threads));
   else
-    Farthest<0>(maps, channels, height, width, rows, columns, threads).level(out);
-}
-
-void farthest_gradient(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads, const float *gradient,
-                       float *const *of_maps) {
-  if (channels == 3)
-    Farthest<3>(maps, channels, height, width, rows, columns, threads).gradient(gradient, of_maps);
-  else
-    Farthest<0>(maps, channels, height, width, rows, columns, threads).gradient(gradient, of_maps);
+    run(Farthest<0>(maps, channels, height, width, rows, columns, threads));
 }
 
 }  // namespace TORCHDOF_SIMD

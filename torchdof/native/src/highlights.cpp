@@ -110,11 +110,11 @@ void Job::find_threshold() {
 // that surface blocks the rays itself; but not where coc around has values between the two surfaces, since the edge is
 // then blurred.
 static float part_sent(const Surfaces &surfaces, int channels, int second, int y, int x, float coc, float limit) {
-  const Block block = surfaces.block(y / BLOCK * surfaces.block_columns + x / BLOCK);
-  const int within = y % BLOCK * BLOCK + x % BLOCK;
+  const Block block = surfaces.block(surfaces.block_of(y, x));
+  const int within = place_in_block(y, x);
   const float cover = (second ? block.weight : block.own_weight)[within];
   const float gap = coc - (second ? surfaces.coc[(size_t)y * surfaces.width + x] : block.coc[within]);
-  const float stopped = clamp(gap - NEARER_PX, 0.0f, 1.0f);
+  const float stopped = clamp01(gap - NEARER_PX);
   if (!(stopped > 0)) return cover;
   const float middle = coc - 0.5f * gap;
   float between = 0;  // of 25 pixels
@@ -123,12 +123,12 @@ static float part_sent(const Surfaces &surfaces, int channels, int second, int y
     for (int dx = -2; dx <= 2; dx++) {
       // 1/2 on either surface
       const float off_middle = std::fabs(row[std::clamp(x + dx, 0, surfaces.width - 1)] - middle) / gap;
-      between += clamp(3.5f - 8.0f * off_middle, 0.0f, 1.0f);
+      between += clamp01(3.5f - 8.0f * off_middle);
     }
   }
-  const float is_step = clamp(1.5f - 10.0f * (between / 25.0f), 0.0f, 1.0f);
+  const float is_step = clamp01(1.5f - 10.0f * (between / 25.0f));
   const float beside = peak_of((second ? block.own : block.other) + within, BLOCK_PIXELS, channels);
-  const float is_dark = clamp(2.0f - beside / std::max(limit, TINY), 0.0f, 1.0f);
+  const float is_dark = clamp01(2.0f - beside / std::max(limit, TINY));
   return cover + continuation(cover) * (stopped * is_dark * is_step);
 }
 
@@ -178,6 +178,8 @@ void Job::extract_highlights() {
     const double crowd = std::max(mean_change(surfaces.coc, height, width, scene.threads) / FREE_CHANGE_PX, 1.0);
     budget /= crowd * scene.reach * scene.reach;
   }
+  std::vector<const float *> light_of(channels);
+  const float *coc, *weight;
   for (int i = 0; i < count; i++) {
     std::vector<Candidate> all;
     for (int by = 0; by < surfaces.block_rows; by++) {
@@ -209,24 +211,14 @@ void Job::extract_highlights() {
     for (const Candidate &p : all) {
       const float share = (1.0f - p.limit / p.peak) * fades(p);
       const float left = (1.0f - fades(p)) + fades(p) * (p.limit / p.peak);  // 1 - share without cancellation
-      const size_t at = (size_t)p.row * width + p.column;
-      float *light;
-      size_t step;
-      if (surfaces.full_planes()) {
-        light = const_cast<float *>(surfaces.lights[i]) + at;  // a copy owned by this job
-        step = area;
-      } else {
-        const Block b = surfaces.make_block(p.row / BLOCK * surfaces.block_columns + p.column / BLOCK);
-        const int within = p.row % BLOCK * BLOCK + p.column % BLOCK;
-        light = (i ? b.other : b.own) + within;
-        step = BLOCK_PIXELS;
-      }
+      if (!surfaces.full_planes()) surfaces.make_block(surfaces.block_of(p.row, p.column));
+      surfaces.row(i, p.row, p.column, light_of.data(), coc, weight);
       const double steps = (double)p.coc * STEPS_PER_PX, below = std::floor(steps);
       rays.push_back({p.row, p.column, (int)below, (float)(steps - below), p.coc});
       for (int c = 0; c < channels; c++) {
-        const float excess = light[c * step] * share;
-        light[c * step] *= left;
-        ray_light.push_back(excess * p.weight);
+        float &light = const_cast<float &>(*light_of[c]);  // of this job: a block, or a copy
+        ray_light.push_back(light * share * p.weight);
+        light *= left;
       }
     }
   }
@@ -237,14 +229,26 @@ void Job::extract_highlights() {
 }
 
 // Calls body(is_own, coc, weight, least_weight) for the surfaces shown in a row of a block column, from column x. A
-// surface covers weight - least_weight of a pixel (weight null: 1), so that hidden surfaces cover nothing.
+// surface covers weight - least_weight of a pixel (weight null: 1), so that hidden surfaces cover nothing. Both are BLOCK values.
 template <typename Body>
 static void each_shown(const Surfaces &surfaces, int y, int x, const float **light, const Body &body) {
   const int own = surfaces.full_planes() ? 1 : 0;  // with a given background the first plane is the other surface
-  const float *coc, *weight;
-  for (int i : {own, 1 - own})
-    if (surfaces.row(i, y, x, light, coc, weight)) body(i == own, coc, weight, i == own ? 0.0f : HIDDEN_WEIGHT);
+  const int n = std::min(BLOCK, surfaces.width - x);
+  for (int i : {own, 1 - own}) {
+    const float *coc, *weight;
+    if (!surfaces.row(i, y, x, light, coc, weight)) continue;
+    float its_coc[BLOCK] = {}, its_weight[BLOCK] = {};
+    if (n < BLOCK) {  // pixels beyond the frame get the weight 0
+      std::copy(coc, coc + n, its_coc);
+      for (int j = 0; j < n; j++) its_weight[j] = weight ? weight[j] : 1.0f;
+      coc = its_coc, weight = its_weight;
+    }
+    body(i == own, coc, weight, i == own ? 0.0f : HIDDEN_WEIGHT);
+  }
 }
+
+// Half width of a ray's kernel.
+static int half_of(const RayKernels &kernels, const Ray &ray) { return std::max(kernels.halves[ray.radius], kernels.halves[ray.radius + 1]); }
 
 // For each cell the number of rays that may cross it on surfaces with coc `low` or larger.
 static std::vector<int> passing(const Job &job, const RayKernels &kernels, float low, int cell_rows, int cell_columns) {
@@ -253,8 +257,7 @@ static std::vector<int> passing(const Job &job, const RayKernels &kernels, float
     if (row < cell_rows && column < cell_columns) count[(size_t)row * cell_columns + column] += n;
   };
   for (const Ray &ray : job.rays) {
-    const int half = std::max(kernels.halves[ray.radius], kernels.halves[ray.radius + 1]);
-    const int reach = (int)std::min(half * std::fabs(1.0f - low / ray.coc), (float)(job.height + job.width)) + 3;
+    const int reach = (int)std::min(half_of(kernels, ray) * std::fabs(1.0f - low / ray.coc), (float)(job.height + job.width)) + 3;
     const int r0 = std::max(ray.row - reach, 0) / CELL, r1 = std::min(ray.row + reach, job.height - 1) / CELL + 1;
     const int c0 = std::max(ray.column - reach, 0) / CELL, c1 = std::min(ray.column + reach, job.width - 1) / CELL + 1;
     add(r0, c0, 1), add(r0, c1, -1), add(r1, c0, -1), add(r1, c1, 1);
@@ -312,12 +315,6 @@ Visibility find_visibility(const Job &job, const RayKernels &kernels) {
       for (int y = row * CELL; y < std::min(H, (row + 1) * CELL) && !(flat && !surfaces.has_block(block)); y++)
         each_shown(surfaces, y, x, light.data(), [&](bool own, const float *coc, const float *weight, float least_weight) {
           if (own && flat) return;
-          float its_coc[BLOCK] = {}, its_weight[BLOCK] = {};
-          if (n < BLOCK) {
-            memcpy(its_coc, coc, n * sizeof(float));
-            for (int j = 0; j < n; j++) its_weight[j] = weight ? weight[j] : 1.0f;
-            coc = its_coc, weight = its_weight;
-          }
           for (int j = 0; j < BLOCK; j += LANES)
             add_bits(bits[j / CELL], load<vec>(coc + j), weight ? load<vec>(weight + j) > all(least_weight) : ivec{} == 0);
         });
@@ -342,15 +339,9 @@ namespace {
 bool cover_row(const Job &job, int y, int block_column, int block_columns, float place, const float **light, float *covered) {
   vec most_cover = {};
   for (int i = 0; i < block_columns; i++, covered += BLOCK) {
-    const int x = (block_column + i) * BLOCK, n = std::min(BLOCK, job.width - x);
+    const int x = (block_column + i) * BLOCK;
     for (int j = 0; j < BLOCK; j += LANES) store(covered + j, vec{});
     each_shown(job.surfaces, y, x, light, [&](bool, const float *coc, const float *weight, float least_weight) {
-      float its_coc[BLOCK] = {}, its_weight[BLOCK] = {};
-      if (n < BLOCK) {
-        memcpy(its_coc, coc, n * sizeof(float));
-        coc = its_coc;
-        if (weight) memcpy(its_weight, weight, n * sizeof(float)), weight = its_weight;
-      }
       for (int j = 0; j < BLOCK; j += LANES) {
         const vec apart = load<vec>(coc + j) - all(place);
         vec cover = most(all(1.0f) - most(apart, -apart), vec{});
@@ -442,35 +433,38 @@ static FieldMask mask_of(const Job &job, const RayKernels &kernels, const Ray &r
   return FieldMask(job.scene, masks[low], &masks[low + 1], part, colour, y, x);
 }
 
+// Adds n values of row y, from column x, of a ray's kernel: the interpolation of those of the two nearest radii.
+static void add_taps(const RayKernels &kernels, const Ray &ray, int colour, int y, int x, int n, float *taps) {
+  for (int which = ray.radius; which <= ray.radius + 1; which++) {
+    const int half = kernels.halves[which], side = 2 * half + 1;
+    if (std::abs(y) > half) continue;
+    const float part = which == ray.radius ? 1.0f - ray.part : ray.part;
+    const float *from = kernels.kernels[which] + ((size_t)colour * side + y + half) * side + half;
+    for (int i = std::max(x, -half); i <= std::min(x + n - 1, half); i++) taps[i - x] += part * from[i];
+  }
+}
+
 std::vector<float> gains_of(const Job &job, const RayKernels &kernels) {
   const int E = job.colours;
   if (!job.scene.field_masks) return {};
   std::vector<float> gains(job.rays.size() * E);
-  job.parallel((int)job.rays.size(), [&](int r, int) {
-    const Ray &ray = job.rays[r];
-    for (int e = 0; e < E; e++) {
-      const FieldMask mask = mask_of(job, kernels, ray, e);
-      const int half = std::max(kernels.halves[ray.radius], kernels.halves[ray.radius + 1]);
-      std::vector<float> row(2 * half + 1 + LANES);
-      double all_light = 0, left = 0;
-      for (int y = -half; y <= half; y++) {
-        std::fill(row.begin(), row.end(), 0.0f);
-        for (int which = ray.radius; which <= ray.radius + 1; which++) {
-          const int h = kernels.halves[which], side = 2 * h + 1;
-          if (std::abs(y) > h) continue;
-          const float part = which == ray.radius ? 1.0f - ray.part : ray.part;
-          const float *values = kernels.kernels[which] + ((size_t)e * side + y + h) * side;
-          for (int x = 0; x < side; x++) row[half - h + x] += part * values[x];
-        }
-        for (int x = 0; x <= 2 * half; x += LANES) {
-          const vec light = load<vec>(row.data() + x);
-          if (!any_positive(light)) continue;
-          const vec passed = light * mask.transmittance_along((float)y, (float)(x - half));
-          for (int lane = 0; lane < LANES; lane++) all_light += light[lane], left += passed[lane];
-        }
+  job.parallel((int)gains.size(), [&](int i, int) {
+    const Ray &ray = job.rays[i / E];
+    const FieldMask mask = mask_of(job, kernels, ray, i % E);
+    const int half = half_of(kernels, ray), side = 2 * half + 1;
+    std::vector<float> row(side + LANES);
+    double all_light = 0, left = 0;
+    for (int y = -half; y <= half; y++) {
+      std::fill(row.begin(), row.end(), 0.0f);
+      add_taps(kernels, ray, i % E, y, -half, side, row.data());
+      for (int x = 0; x < side; x += LANES) {
+        const vec light = load<vec>(row.data() + x);
+        if (!any_positive(light)) continue;
+        const vec passed = light * mask.transmittance(all((float)y), (float)(x - half) + counting());
+        for (int lane = 0; lane < LANES; lane++) all_light += light[lane], left += passed[lane];
       }
-      gains[(size_t)r * E + e] = left > FieldMask::LEAST * all_light ? (float)(all_light / left) : 0.0f;
     }
+    gains[i] = left > FieldMask::LEAST * all_light ? (float)(all_light / left) : 0.0f;
   });
   return gains;
 }
@@ -483,8 +477,6 @@ std::vector<float> gains_of(const Job &job, const RayKernels &kernels) {
 // 3. Add light * tap * (1 - blocked), with blocked at most 1.
 void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays, int count, const RayKernels &ray_kernels,
            const std::vector<float> &gains, float *tile) {
-  const float *const *kernels = ray_kernels.kernels;
-  const int32_t *halves = ray_kernels.halves;
   const int H = job.height, W = job.width, C = job.channels, E = job.colours;
   std::vector<int> nearer;  // bins of surfaces that may block the ray
   std::vector<const float *> surface_light(C);
@@ -493,17 +485,9 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
   for (int r = 0; r < count; r++) {
     const Ray &ray = job.rays[rays[r]];
     const float *light = job.ray_light.data() + (size_t)rays[r] * C;
-    const int half = std::max(halves[ray.radius], halves[ray.radius + 1]);
+    const int half = half_of(ray_kernels, ray);
     masks.clear();
     for (int e = 0; e < E && !gains.empty(); e++) masks.push_back(mask_of(job, ray_kernels, ray, e));
-    // adds a row of one of the ray's two kernels
-    auto add_taps = [&](int which, float part, int e, int y, int x, int n, float *taps) {
-      const int h = halves[which], first = std::max(x, ray.column - h), last = std::min(x + n - 1, ray.column + h);
-      if (std::abs(y - ray.row) > h) return;
-      const size_t side = 2 * h + 1;
-      const float *from = kernels[which] + e * side * side + (y - ray.row + h) * side + h - ray.column;
-      for (int i = first; i <= last; i++) taps[i - x] += part * from[i];
-    };
     const int top = std::max(y0, ray.row - half), bottom = std::min(std::min(y0 + TILE, H), ray.row + half + 1);
     const int left = std::max(x0, ray.column - half), right = std::min(std::min(x0 + TILE, W), ray.column + half + 1);
     // whether rays that land in a rectangle may cross a surface of bin k
@@ -548,11 +532,10 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
           for (int i = 0; i < ny; i++) {
             float *row = &taps[(e * PATCH + i) * PATCH];
             std::fill(row, row + PATCH, 0.0f);
-            add_taps(ray.radius, 1.0f - ray.part, e, py + i, px, nx, row);
-            add_taps(ray.radius + 1, ray.part, e, py + i, px, nx, row);
+            add_taps(ray_kernels, ray, e, py + i - ray.row, px - ray.column, nx, row);
             for (int x = 0; x < nx && gain > 0; x += LANES)
               if (any_positive(load<vec>(row + x)))
-                store(row + x, load<vec>(row + x) * gain * masks[e].transmittance_along((float)(py + i - ray.row), (float)(px + x - ray.column)));
+                store(row + x, load<vec>(row + x) * gain * masks[e].transmittance(all((float)(py + i - ray.row)), (float)(px + x - ray.column) + counting()));
             for (int x = 0; x < PATCH; x += LANES) any |= any_positive(load<vec>(row + x));
           }
         }

@@ -1,8 +1,6 @@
 // Makes kernels of any radius from a lens's templates; formulas in optics/kernel_bank.py and optics/psf.py.
 #include "engine.h"
 
-#include "variants.h"
-
 namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
@@ -47,59 +45,59 @@ double ripple(int pixel, double cell) {
 // Weights that resample a template's cells to a kernel's pixels along one axis, by the spline and linearly. If the
 // kernel is symmetric (folded), only the half from its centre is kept, and each cell also represents its mirror image.
 struct Axis {
+  struct Weights {
+    std::vector<float> values;     // [cells, pixels]
+    std::vector<int> first, last;  // pixels within reach of each cell
+    Weights(int cells, int pixels) : values((size_t)cells * pixels), first(cells), last(cells) {}
+  };
   int pixels, cells;
-  std::vector<float> splines, lines;  // [cells, pixels]
-  std::vector<int> first, last;       // pixels within reach of each cell's spline
-  std::vector<int> nearest, farthest;  // pixels within reach of each cell's linear weights
+  Weights spline, line;
 
   Axis(int half, int count, double cell, bool folded)
-      : pixels(folded ? half + 1 : 2 * half + 1), cells(folded ? count + 1 : 2 * count + 1), splines((size_t)pixels * cells),
-        lines(splines.size()), first(cells), last(cells), nearest(cells), farthest(cells) {
+      : pixels(folded ? half + 1 : 2 * half + 1), cells(folded ? count + 1 : 2 * count + 1), spline(cells, pixels), line(cells, pixels) {
     const int p0 = folded ? 0 : -half, c0 = folded ? 0 : -count;
-    static const Spline spline;
-    const double reach = cell > 1 ? cell : FAR;
+    static const Spline spline_at;
+    const double wide = std::max(cell, 1.0);
     std::vector<float> per_ripple(pixels);
     for (int p = 0; p < pixels; p++) per_ripple[p] = (float)(1 / ripple(p + p0, cell));
     for (int c = 0; c < cells; c++) {
       const double place = (c + c0) * cell;
-      first[c] = std::max((int)std::ceil(place - reach) - p0, 0);
-      last[c] = std::min((int)std::floor(place + reach) - p0, pixels - 1);
-      nearest[c] = std::max((int)std::ceil(place - std::max(cell, 1.0)) - p0, 0);
-      farthest[c] = std::min((int)std::floor(place + std::max(cell, 1.0)) - p0, pixels - 1);
-      for (int p = first[c]; p <= last[c]; p++) {
+      for (Weights *weights : {&spline, &line}) {
+        const double reach = weights == &line || cell > 1 ? wide : FAR;
+        weights->first[c] = std::max((int)std::ceil(place - reach) - p0, 0);
+        weights->last[c] = std::min((int)std::floor(place + reach) - p0, pixels - 1);
+      }
+      for (int p = spline.first[c]; p <= spline.last[c]; p++) {
         float in_spline = 0, in_line = 0;
         for (int side = 0; side < (folded && c ? 2 : 1); side++) {
           const double away = p + p0 + (side ? place : -place);
-          const float line = std::max(1 - (float)(std::fabs(away) / std::max(cell, 1.0)), 0.0f);
-          in_line += line;
-          in_spline += cell > 1 ? line : spline(away) * per_ripple[p];
+          const float of_line = std::max(1 - (float)(std::fabs(away) / wide), 0.0f);
+          in_line += of_line;
+          in_spline += cell > 1 ? of_line : spline_at(away) * per_ripple[p];
         }
-        splines[(size_t)c * pixels + p] = in_spline;
-        lines[(size_t)c * pixels + p] = in_line;
+        spline.values[(size_t)c * pixels + p] = in_spline;
+        line.values[(size_t)c * pixels + p] = in_line;
       }
     }
   }
 };
 
 // Resamples the template: out [down.pixels, across.pixels]; row is a buffer.
-void product(const Axis &down, const Axis &across, const float *light, bool linear, std::vector<float> &row, float *out) {
-  const std::vector<float> &by_row = linear ? down.lines : down.splines, &by_column = linear ? across.lines : across.splines;
-  const std::vector<int> &first_row = linear ? down.nearest : down.first, &last_row = linear ? down.farthest : down.last;
-  const std::vector<int> &first = linear ? across.nearest : across.first, &last = linear ? across.farthest : across.last;
-  row.resize(across.cells);
+void product(const Axis &down, const Axis &across, const float *light, Axis::Weights Axis::*which, std::vector<float> &row, float *out) {
+  const Axis::Weights &by_row = down.*which, &by_column = across.*which;
   std::fill(out, out + (size_t)down.pixels * across.pixels, 0.0f);
   for (int y = 0; y < down.pixels; y++) {
+    row.assign(across.cells, 0.0f);
     float *const u = row.data(), *const to = out + (size_t)y * across.pixels;
-    std::fill(u, u + across.cells, 0.0f);
     for (int c = 0; c < down.cells; c++) {
-      if (y < first_row[c] || y > last_row[c]) continue;
-      const float weight = by_row[(size_t)c * down.pixels + y];
+      if (y < by_row.first[c] || y > by_row.last[c]) continue;
+      const float weight = by_row.values[(size_t)c * down.pixels + y];
       const float *from = light + (size_t)c * across.cells;
       for (int x = 0; x < across.cells; x++) u[x] += weight * from[x];
     }
     for (int c = 0; c < across.cells; c++) {
-      const float value = u[c], *weights = &by_column[(size_t)c * across.pixels];
-      for (int x = first[c]; x <= last[c]; x++) to[x] += value * weights[x];
+      const float value = u[c], *weights = &by_column.values[(size_t)c * across.pixels];
+      for (int x = by_column.first[c]; x <= by_column.last[c]; x++) to[x] += value * weights[x];
     }
   }
 }
@@ -159,14 +157,12 @@ class Maker {
         light_[(size_t)y * cells + x] = a[at] + part * (b[at] - a[at]);
       }
     const Axis down(half + AROUND, count, high, folded_);
-    const bool same = wide == high;
-    std::unique_ptr<Axis> other(same ? nullptr : new Axis(half + AROUND, count, wide, folded_));
-    const Axis &across = same ? down : *other;
+    const Axis across = wide == high ? down : Axis(half + AROUND, count, wide, folded_);
     const int n = down.pixels;
     kernel_.resize((size_t)n * n);
     at_most_.resize(kernel_.size());
-    product(down, across, light_.data(), false, row_, kernel_.data());
-    product(down, across, light_.data(), true, row_, at_most_.data());
+    product(down, across, light_.data(), &Axis::spline, row_, kernel_.data());
+    product(down, across, light_.data(), &Axis::line, row_, at_most_.data());
     settle(n);
     const int start = folded_ ? 0 : AROUND, side = 2 * half + 1;
     double sum = 0;

@@ -16,7 +16,7 @@ namespace TORCHDOF_SIMD {
 namespace {
 
 constexpr float LEAST_VOTE = 1e-9f;  // smallest divisor
-constexpr int BAND = 32;  // rows of pixels whose gradients are summed on their own, so that sums keep their order
+constexpr int BAND = 32;  // rows of pixels whose gradients one thread adds up; at least twice the step of a level
 constexpr int MOST_LEVELS = TORCHDOF_MOST_LEVELS, MOST_PLANES = TORCHDOF_MOST_PLANES + 2;
 
 // The samples before and after each pixel of an axis, and the weight of the one after.
@@ -109,46 +109,16 @@ struct Behind {
     });
   }
 
-  // Rows of a level that a band of pixels reads.
-  void rows_of(int l, int band, int &first, int &last) const {
-    first = rows[l].before[band * BAND];
-    last = rows[l].before[std::min((band + 1) * BAND, height) - 1] + 1;
-  }
-
   void gradient(const float *coc, const float *slopes, int threads, float *const *of_levels, float *of_coc) const {
-    const int bands = ceil_div(height, BAND);
-    std::vector<std::vector<float>> sums(bands);  // for each level [planes, rows, columns] of the rows that it reads
-    torchdof::parallel(threads, bands, nullptr, [&](int band, int) {
-      float *to[MOST_LEVELS];
-      size_t start[MOST_LEVELS], size[MOST_LEVELS], total = 0;
-      for (int l = 0; l < count; l++) {
-        int first, last;
-        rows_of(l, band, first, last);
-        start[l] = (size_t)first * levels[l].columns;
-        size[l] = (size_t)(last - first + 1) * levels[l].columns;
-        total += planes * size[l];
-      }
-      sums[band].assign(total, 0.0f);
-      for (int l = 0; l < count; l++) to[l] = l ? to[l - 1] + planes * size[l - 1] : sums[band].data();
-      for (int y = band * BAND; y < std::min((band + 1) * BAND, height); y++)
-        for (int x = 0; x < width; x++) pixel(y, x, coc, slopes, to, start, size, of_coc);
-    });
-    for (int band = 0; band < bands; band++) {
-      const float *from = sums[band].data();
-      for (int l = 0; l < count; l++) {
-        int first, last;
-        rows_of(l, band, first, last);
-        const size_t n = (size_t)(last - first + 1) * levels[l].columns;
-        for (int v = 0; v < planes; v++, from += n) {
-          float *to = of_levels[l] + ((size_t)v * levels[l].rows + first) * levels[l].columns;
-          for (size_t i = 0; i < n; i++) to[i] += from[i];
-        }
-      }
-    }
+    for (int odd : {0, 1})  // two bands with one between them read different samples
+      torchdof::parallel(threads, ceil_div(height, 2 * BAND), nullptr, [&](int i, int) {
+        for (int y = (2 * i + odd) * BAND; y < std::min((2 * i + odd + 1) * BAND, height); y++)
+          for (int x = 0; x < width; x++) pixel(y, x, coc, slopes, of_levels, of_coc);
+      });
   }
 
   // Adds a pixel's gradients to those of the samples that it reads, and sets that of its coc.
-  void pixel(int y, int x, const float *coc, const float *slopes, float *const *to, const size_t *start, const size_t *size, float *of_coc) const {
+  void pixel(int y, int x, const float *coc, const float *slopes, float *const *of_levels, float *of_coc) const {
     const size_t area = (size_t)height * width, at = (size_t)y * width + x;
     of_coc[at] = 0;
     bool used = false;  // pixels without a hidden surface have no gradient
@@ -173,7 +143,7 @@ struct Behind {
       if (!any[l]) continue;
       const torchdof_level &level = levels[l];
       const Found &f = found[l];
-      const size_t whole = (size_t)level.rows * level.columns;
+      const size_t size = (size_t)level.rows * level.columns;
       float of_vote = slopes[(planes - 1) * area + at] - along, of_parts = 0;
       for (int c = 0; c < planes - 1; c++) of_vote += slope[c] * f.mean[c];
       const float counted = f.weight * level.slope, bounded = std::min(counted, level.most);
@@ -185,17 +155,18 @@ struct Behind {
       }
       const float per_weight = 1.0f / std::max(f.weight, LEAST_SEEN);
       for (int j = 0; j < 4; j++) {
-        const size_t sample = f.at[j] - start[l];
+        const float *value = level.values + f.at[j];
+        float *const of_value = of_levels[l] + f.at[j];
         float of_part = of_parts;
         for (int c = 0; c < planes - 1; c++) {
           const float of_mean = slope[c] * f.vote * per_weight;
-          of_part += of_mean * level.values[c * whole + f.at[j]];
-          to[l][c * size[l] + sample] += of_mean * f.part[j];
+          of_part += of_mean * value[c * size];
+          of_value[c * size] += of_mean * f.part[j];
         }
-        to[l][(planes - 1) * size[l] + sample] += of_part * f.share[j] * clamp01(f.is_behind[j]);
+        of_value[(planes - 1) * size] += of_part * f.share[j] * clamp01(f.is_behind[j]);
         if (f.is_behind[j] < 0 || f.is_behind[j] > 1) continue;
-        const float of_distance = of_part * f.share[j] * level.values[(planes - 1) * whole + f.at[j]];
-        to[l][(planes - 2) * size[l] + sample] += of_distance;
+        const float of_distance = of_part * f.share[j] * value[(planes - 1) * size];
+        of_value[(planes - 2) * size] += of_distance;
         of_own -= of_distance * slope_of_end;
       }
     }
@@ -205,13 +176,10 @@ struct Behind {
 
 }  // namespace
 
-void look_behind(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads, float *out) {
-  Behind(levels, count, channels, height, width).look(coc, threads, out);
-}
-
-void look_behind_gradient(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads,
-                          const float *gradient, float *const *of_levels, float *of_coc) {
-  Behind(levels, count, channels, height, width).gradient(coc, gradient, threads, of_levels, of_coc);
+void look_behind(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads, float *out,
+                 const float *gradient, float *const *of_levels, float *of_coc) {
+  const Behind behind(levels, count, channels, height, width);
+  gradient ? behind.gradient(coc, gradient, threads, of_levels, of_coc) : behind.look(coc, threads, out);
 }
 
 }  // namespace TORCHDOF_SIMD

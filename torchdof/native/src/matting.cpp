@@ -23,72 +23,72 @@ constexpr int SIDE = BLOCK + 2 * MARGIN;   // of the window of coc
 constexpr int EDGES = BLOCK + 2 * RIM;     // of the windows of edges and light
 constexpr int PITCH = 24;                  // of all
 
-float falloff_at(int dy, int dx) { return (float)std::exp(-(dy * dy + dx * dx) / 4.5); }
-constexpr float SMALL_BESIDE = 0.24935221f, SMALL_DIAGONAL = 0.06217652f;  // the same of a Gaussian of 0.6 px: _SOFTNESS_PX
+// Falloff of a Gaussian of 0.6 px, _SOFTNESS_PX, beside its centre.
+constexpr float SMALL_BESIDE = 0.24935221f, SMALL_DIAGONAL = 0.06217652f;
 
 struct Window {
-  explicit Window(int channels) : light((size_t)channels * EDGES * PITCH + LANES), clean(light) {}
+  explicit Window(int channels) : light((size_t)channels * EDGES * PITCH + LANES), clean(light), around((size_t)channels * (2 * TAPS + 3)) {}
 
-  float coc[SIDE * PITCH + LANES], valid[SIDE * PITCH + LANES], edge[EDGES * PITCH + LANES];
+  float coc[SIDE * PITCH + LANES] = {}, valid[SIDE * PITCH + LANES] = {}, edge[EDGES * PITCH + LANES] = {};
   std::vector<float> light;  // [channels, EDGES, PITCH]
   std::vector<float> clean;  // the same, without the light of other surfaces
-  std::vector<vec> around;   // of LANES pixels: light around them [channels, TAPS] and the colours of their surfaces
+  std::vector<vec> around;   // of LANES pixels: light and clean light around them [channels, TAPS], and three colours
 };
+
+// Copies `size` rows and columns of a plane from y0, x0; a pixel outside the frame is the nearest one inside.
+void read_window(const Job &job, const float *plane, int y0, int x0, int size, float *to) {
+  const bool inside = x0 >= 0 && x0 + size <= job.width;
+  for (int i = 0; i < size; i++, to += PITCH) {
+    const float *from = plane + (size_t)std::clamp(y0 + i, 0, job.height - 1) * job.width;
+    if (inside)
+      memcpy(to, from + x0, size * sizeof(float));
+    else
+      for (int j = 0; j < size; j++) to[j] = from[std::clamp(x0 + j, 0, job.width - 1)];
+  }
+}
+
+// Gives pixels outside the frame the value of the nearest one inside, in a window of EDGES x EDGES pixels around a block.
+void clamp_to_frame(const Job &job, int y0, int x0, float *window) {
+  if (y0 >= RIM && x0 >= RIM && y0 + BLOCK + RIM <= job.height && x0 + BLOCK + RIM <= job.width) return;
+  for (int i = 0; i < EDGES; i++)
+    for (int j = 0; j < EDGES; j++) {
+      const int y = std::clamp(y0 - RIM + i, 0, job.height - 1), x = std::clamp(x0 - RIM + j, 0, job.width - 1);
+      window[i * PITCH + j] = window[(y - y0 + RIM) * PITCH + x - x0 + RIM];
+    }
+}
 
 // Computes for each pixel in and around a block the confidence, 0 to 1, that it lies at an edge. False if it is 0 in the
 // whole block.
 bool find_edges(const Job &job, int y0, int x0, Window &w) {
-  const int H = job.height, W = job.width;
-  const float *coc = job.surfaces.coc, *valid = job.surfaces.valid;
+  const float *valid = job.surfaces.valid;
   float lows[SIDE * PITCH], highs[SIDE * PITCH];  // of valid pixels
   const float *low = valid ? lows : w.coc, *high = valid ? highs : w.coc;
-  const bool inside = x0 >= MARGIN && x0 + BLOCK + MARGIN <= W;
-  for (int i = 0; i < SIDE; i++) {
-    const size_t row = (size_t)std::clamp(y0 - MARGIN + i, 0, H - 1) * W;
-    if (inside && !valid) memcpy(w.coc + i * PITCH, coc + row + x0 - MARGIN, SIDE * sizeof(float));
-    for (int j = inside && !valid ? SIDE : 0; j < SIDE; j++) {
-      const size_t at = row + std::clamp(x0 - MARGIN + j, 0, W - 1);
-      w.coc[i * PITCH + j] = coc[at];
-      if (!valid) continue;
-      w.valid[i * PITCH + j] = valid[at];
-      lows[i * PITCH + j] = valid[at] > 0 ? coc[at] : NEVER;
-      highs[i * PITCH + j] = valid[at] > 0 ? coc[at] : -NEVER;
-    }
-    for (int j = SIDE; j < PITCH; j++) w.coc[i * PITCH + j] = lows[i * PITCH + j] = highs[i * PITCH + j] = 0;
+  read_window(job, job.surfaces.coc, y0 - MARGIN, x0 - MARGIN, SIDE, w.coc);
+  if (valid) read_window(job, valid, y0 - MARGIN, x0 - MARGIN, SIDE, w.valid);
+  for (int i = 0; valid && i < SIDE * PITCH; i++) {
+    lows[i] = w.valid[i] > 0 ? w.coc[i] : NEVER;
+    highs[i] = w.valid[i] > 0 ? w.coc[i] : -NEVER;
   }
-  bool any = false;
   for (int i = 0; i < EDGES; i++) {
-    // a pixel outside the frame is the nearest one inside
-    const int y = std::clamp(y0 - RIM + i, 0, H - 1) - y0 + MARGIN;
     float least_of[PITCH + LANES], most_of[PITCH + LANES];
     for (int j = 0; j < PITCH; j += LANES) {
-      auto row = [&](const float *values, int k) { return load<vec>(values + (y - 1 + k) * PITCH + j); };
+      auto row = [&](const float *values, int k) { return load<vec>(values + (i + k) * PITCH + j); };
       store(least_of + j, least(least(row(low, 0), row(low, 1)), row(low, 2)));
       store(most_of + j, most(most(row(high, 0), row(high, 1)), row(high, 2)));
     }
-    if (inside && !valid) {
-      vec most_edge = {};
-      for (int j = 0; j < PITCH; j += LANES) {
-        auto high_of = [&](int k) { return load<vec>(most_of + j + k); };
-        auto low_of = [&](int k) { return load<vec>(least_of + j + k); };
-        const vec gap = most(most(high_of(0), high_of(1)), high_of(2)) - least(least(low_of(0), low_of(1)), low_of(2));
-        store(w.edge + i * PITCH + j, clamp01(gap * (1.0f / EDGE_PX) - all(1.0f)));
-      }
-      for (int j = RIM; j < RIM + BLOCK; j += LANES) most_edge = most(most_edge, load<vec>(w.edge + i * PITCH + j));
-      any |= i >= RIM && i < RIM + BLOCK && any_positive(most_edge);
-      continue;
-    }
-    for (int j = 0; j < EDGES; j++) {
-      const int x = std::clamp(x0 - RIM + j, 0, W - 1) - x0 + MARGIN;
-      const float gap = std::max(std::max(most_of[x - 1], most_of[x]), most_of[x + 1]) -
-                        std::min(std::min(least_of[x - 1], least_of[x]), least_of[x + 1]);
-      float edge = clamp01(gap / EDGE_PX - 1.0f);
-      if (valid) edge *= w.valid[y * PITCH + x];
-      w.edge[i * PITCH + j] = edge;
-      any |= edge > 0 && i >= RIM && i < RIM + BLOCK && j >= RIM && j < RIM + BLOCK;
+    for (int j = 0; j < PITCH; j += LANES) {
+      auto high_of = [&](int k) { return load<vec>(most_of + j + k); };
+      auto low_of = [&](int k) { return load<vec>(least_of + j + k); };
+      const vec gap = most(most(high_of(0), high_of(1)), high_of(2)) - least(least(low_of(0), low_of(1)), low_of(2));
+      const vec edge = clamp01(gap * (1.0f / EDGE_PX) - all(1.0f));
+      store(w.edge + i * PITCH + j, valid ? edge * load<vec>(w.valid + (i + 1) * PITCH + j + 1) : edge);
     }
   }
-  return any;
+  clamp_to_frame(job, y0, x0, w.edge);
+  vec most_edge = {};
+  for (int i = RIM; i < RIM + BLOCK; i++)
+    for (int j = RIM; j < RIM + BLOCK; j += LANES) most_edge = most(most_edge, load<vec>(w.edge + i * PITCH + j));
+  return any_positive(most_edge);
 }
 
 // Weighted mean of the light around pixels [channels, TAPS]. Returns its variance, summed over channels.
@@ -108,25 +108,10 @@ vec mean(const vec *light, int channels, const vec *weight, vec *mean) {
   return variance;
 }
 
-// The two surfaces of LANES pixels of a row, and the terms from which they follow.
-struct Mix {
-  vec coc[TAPS], near, far, gap, per_gap, scale;  // scale: brightest light around; all light is relative to it
-  vec *light, *front, *behind, *colour;           // [channels, TAPS]; colours of both surfaces and of the pixel, [channels]
-  vec weight[TAPS], nearer[TAPS], farther[TAPS];  // of the pixels around: of all, in the front's mean, in the mean behind
-  vec near_weight[TAPS], differs[TAPS];           // weight in the front's mean without `differs`; difference from behind
-  vec whole, clean;                               // sum of `near_weight`; 1 where the front has unmixed pixels
-  vec strength, fitted, misfit, variance, trust, aside, sided, edge, certainty;
-  vec geometric;   // part of the other surface's weight that does not follow from colours
-  vec other, own;  // weights of the other surface and of the pixel's own one
-  ivec is_near;
-};
 inline int tap(int i) { return i / AROUND * PITCH + i % AROUND; }
 
 // Replaces the light of mixed pixels by the mean of the unmixed pixels of the same surface around them.
 void clean_light(const Job &job, int y0, int x0, Window &w, const float *falloff) {
-  const auto clamped = [&](int i, int j) {  // a pixel outside the frame is the nearest one inside
-    return (std::clamp(y0 - RIM + i, 0, job.height - 1) - y0 + RIM) * PITCH + std::clamp(x0 - RIM + j, 0, job.width - 1) - x0 + RIM;
-  };
   w.clean = w.light;
   for (int i = 1; i < EDGES - 1; i++)
     for (int j = 1; j < EDGES - 1; j += LANES) {
@@ -149,201 +134,143 @@ void clean_light(const Job &job, int y0, int x0, Window &w, const float *falloff
         store(w.clean.data() + (light - w.light.data()), load<vec>(light) + is_clean * (sum * per_total - load<vec>(light)));
       }
     }
-  const bool inside = y0 >= RIM && x0 >= RIM && y0 + BLOCK + RIM <= job.height && x0 + BLOCK + RIM <= job.width;
-  for (int i = 1; i < EDGES - 1 && !inside; i++)
-    for (int j = 1; j < EDGES - 1; j++)
-      for (int c = 0; clamped(i, j) != i * PITCH + j && c < job.channels; c++) {
-        float *const clean = w.clean.data() + (size_t)c * EDGES * PITCH;
-        clean[i * PITCH + j] = clean[clamped(i, j)];
-      }
+  for (int c = 0; c < job.channels; c++) clamp_to_frame(job, y0, x0, w.clean.data() + (size_t)c * EDGES * PITCH);
 }
 
-// Takes the light of one surface out of the neighbours on the other: their light moves towards their clean light, along
-// the line between the colours of both surfaces, and less where texture is strong.
+// Splits the pixels of `beside`, out of LANES pixels of a row.
+//
+// 1. The near and far coc are the extremes of the 3 x 3 neighbours.
+// 2. The colour of each surface is the mean of its neighbours. Their light moves towards their clean light, along the line
+//    between the clean colours of both surfaces, and less where texture is strong. If a thin foreground has no unmixed
+//    neighbours, they count by their difference from the background.
+// 3. The share of the near surface is the projection of the pixel's colour onto the line between both colours.
+// 4. The share of the other surface is at most 1/2. Where texture makes the projection unreliable, it is the share that
+//    the other surface has under a small Gaussian, unless this contradicts the pixel's colour.
+// 5. The residual colour goes to both surfaces in proportion to their shares, within the range of the image's light.
 template <int CHANNELS>
-void separate(const Window &w, size_t first, int C, Mix &m) {
-  vec *const light = m.light, *const clean = m.light + C * TAPS, *const front = m.front, *const behind = m.behind;
-  const vec per_scale = 1.0f / m.scale;
+void split(const Job &job, Window &w, int y, int x, ivec beside, const float *falloff, const Block &block) {
+  const int C = CHANNELS ? CHANNELS : job.channels;
+  const bool masked = job.surfaces.valid;
+  const size_t first = (size_t)(y + 1) * PITCH + x + 1, in_coc = first + PITCH + 1;
+  vec coc[TAPS], valid[TAPS], near = all(NEVER), far = all(-NEVER);
+  for (int i = 0; i < TAPS; i++) {
+    coc[i] = load<vec>(w.coc + in_coc + tap(i));
+    valid[i] = masked ? load<vec>(w.valid + in_coc + tap(i)) : all(1.0f);
+    near = least(near, valid[i] > vec{} ? coc[i] : all(NEVER));
+    far = most(far, valid[i] > vec{} ? coc[i] : all(-NEVER));
+  }
+  vec *const light = w.around.data(), *const clean = light + C * TAPS;                        // [channels, TAPS]
+  vec *const front = light + 2 * C * TAPS, *const behind = front + C, *const colour = behind + C;  // [channels]
+  vec scale = all(TINY);  // brightest light around; all light is relative to it
+  for (int c = 0; c < C; c++)
+    for (int i = 0; i < TAPS; i++) {
+      light[c * TAPS + i] = load<vec>(w.light.data() + (size_t)c * EDGES * PITCH + first + tap(i));
+      scale = most(scale, most(light[c * TAPS + i], -light[c * TAPS + i]));
+    }
+  for (int i = 0; i < C * TAPS; i++) light[i] /= scale;
+  for (int c = 0; c < C; c++) colour[c] = light[c * TAPS + TAPS / 2];
+
+  const vec here = coc[TAPS / 2], gap = most(far - near, all(1e-6f));
+  vec nearer[TAPS], farther[TAPS], whole = {};  // weights in the means of both surfaces; sum of those of the front
+  vec covered = {}, counted = {};               // by the near surface, under a small Gaussian
+  for (int i = 0; i < TAPS; i++) {
+    const vec weight = (all(1.0f + UNCLEAN) - load<vec>(w.edge + first + tap(i))) * falloff[i] * valid[i];
+    const vec nearness = (far - coc[i]) / gap;  // not times 1 / gap, whose rounding the clamps below enlarge
+    nearer[i] = weight * clamp01(4.0f * nearness - 2.8f);
+    farther[i] = weight * clamp01(1.2f - 4.0f * nearness);
+    whole += nearer[i];
+    const vec small = (i == TAPS / 2 ? 1.0f : i % 2 ? SMALL_BESIDE : SMALL_DIAGONAL) * valid[i];
+    covered += small * nearness, counted += small;
+  }
+  covered /= most(counted, all(1e-12f));
+
+  const vec per_scale = 1.0f / scale;
   for (int c = 0; c < C; c++)
     for (int i = 0; i < TAPS; i++) {
       const vec relative = load<vec>(w.clean.data() + (size_t)c * EDGES * PITCH + first + tap(i)) * per_scale;
       clean[c * TAPS + i] = most(least(relative, all(MOST_CLEAN)), all(-MOST_CLEAN));
     }
-  const vec texture = mean<CHANNELS>(clean, C, m.farther, behind) + mean<CHANNELS>(clean, C, m.nearer, front);
-  vec strength = {}, moved[TAPS] = {};
+  const vec texture = mean<CHANNELS>(clean, C, farther, behind) + mean<CHANNELS>(clean, C, nearer, front);
+  vec clean_strength = {}, moved[TAPS] = {};
   for (int c = 0; c < C; c++) {
     const vec contrast = front[c] - behind[c];
-    strength += contrast * contrast;
+    clean_strength += contrast * contrast;
     for (int i = 0; i < TAPS; i++) moved[i] += (light[c * TAPS + i] - clean[c * TAPS + i]) * contrast;
   }
-  const vec per_strength = 1.0f / (strength + TEXTURE * texture + ALIKE * ALIKE);
+  const vec per_strength = 1.0f / (clean_strength + TEXTURE * texture + ALIKE * ALIKE);
   for (int i = 0; i < TAPS; i++) {
     moved[i] *= per_strength;
-    moved[i] = m.nearer[i] > m.farther[i] ? -clamp01(-moved[i]) : clamp01(moved[i]);
+    moved[i] = nearer[i] > farther[i] ? -clamp01(-moved[i]) : clamp01(moved[i]);
   }
   for (int c = 0; c < C; c++)
     for (int i = 0; i < TAPS; i++) light[c * TAPS + i] -= moved[i] * (front[c] - behind[c]);
-}
-
-// 1. The near and far coc are the extremes of the 3 x 3 neighbours.
-// 2. The colour of each surface is the mean of its unmixed neighbours, or of the mixed ones without the light of the other
-//    surface. If a thin foreground has no unmixed neighbours, they count by their difference from the background.
-// 3. The share of the near surface is the projection of the pixel's colour onto the line between both colours.
-// 4. The share of the other surface is at most 1/2. Where texture makes the projection unreliable, it is the share that
-//    the other surface has under a small Gaussian, unless this contradicts the pixel's colour.
-template <int CHANNELS>
-void mix(const Job &job, Window &w, int y, int x, const float *falloff, Mix &m) {
-  const int C = CHANNELS ? CHANNELS : job.channels;
-  const bool masked = job.surfaces.valid;
-  const size_t first = (size_t)(y + 1) * PITCH + x + 1, in_coc = first + PITCH + 1;
-  m.near = all(NEVER), m.far = all(-NEVER), m.scale = all(TINY);
-  for (int i = 0; i < TAPS; i++) {
-    m.coc[i] = load<vec>(w.coc + in_coc + tap(i));
-    const auto known = masked ? load<vec>(w.valid + in_coc + tap(i)) > vec{} : ivec{} == 0;
-    m.near = least(m.near, known ? m.coc[i] : all(NEVER));
-    m.far = most(m.far, known ? m.coc[i] : all(-NEVER));
-  }
-  m.light = w.around.data(), m.front = m.light + 2 * C * TAPS, m.behind = m.front + C, m.colour = m.behind + C;
-  for (int c = 0; c < C; c++)
-    for (int i = 0; i < TAPS; i++) {
-      const vec v = m.light[c * TAPS + i] = load<vec>(w.light.data() + (size_t)c * EDGES * PITCH + first + tap(i));
-      m.scale = most(m.scale, most(v, -v));
-    }
-  for (int i = 0; i < C * TAPS; i++) m.light[i] /= m.scale;
-  for (int c = 0; c < C; c++) m.colour[c] = m.light[c * TAPS + TAPS / 2];
-  const vec here = m.coc[TAPS / 2];
-  m.gap = most(m.far - m.near, all(1e-6f)), m.per_gap = all(1.0f) / m.gap, m.whole = vec{};
-  vec covered = {}, counted = {};  // by the near surface, under a small Gaussian
-  for (int i = 0; i < TAPS; i++) {
-    m.weight[i] = (all(1.0f + UNCLEAN) - load<vec>(w.edge + first + tap(i))) * falloff[i];
-    if (masked) m.weight[i] *= load<vec>(w.valid + in_coc + tap(i));
-    const vec nearness = (m.far - m.coc[i]) / m.gap;  // not times 1 / gap, whose rounding the clamps below enlarge
-    m.nearer[i] = m.near_weight[i] = m.weight[i] * clamp01(4.0f * nearness - 2.8f);
-    m.farther[i] = m.weight[i] * clamp01(1.2f - 4.0f * nearness);
-    m.whole += m.nearer[i];
-    vec small = all(i == TAPS / 2 ? 1.0f : i % 2 ? SMALL_BESIDE : SMALL_DIAGONAL);
-    if (masked) small *= load<vec>(w.valid + in_coc + tap(i));
-    covered += small * nearness, counted += small;
-  }
-  covered /= most(counted, all(1e-12f));
-  separate<CHANNELS>(w, first, C, m);
-  m.variance = mean<CHANNELS>(m.light, C, m.farther, m.behind);
-  m.clean = clamp01(m.whole * (0.1f / UNCLEAN) - 1.0f);
-  if (any_of(m.clean < all(1.0f))) {
-    vec most_of = {};
-    for (int i = 0; i < TAPS; i++) m.differs[i] = vec{};
+  vec variance = mean<CHANNELS>(light, C, farther, behind);
+  const vec has_clean = clamp01(whole * (0.1f / UNCLEAN) - 1.0f);
+  if (any_of(has_clean < all(1.0f))) {
+    vec differs[TAPS] = {}, most_of = {};
     for (int c = 0; c < C; c++)
-      for (int i = 0; i < TAPS; i++) {
-        const vec d = m.light[c * TAPS + i] - m.behind[c];
-        m.differs[i] += d * d;
-      }
-    for (int i = 0; i < TAPS; i++) most_of = most(most_of, m.differs[i]);
+      for (int i = 0; i < TAPS; i++) differs[i] += (light[c * TAPS + i] - behind[c]) * (light[c * TAPS + i] - behind[c]);
+    for (int i = 0; i < TAPS; i++) most_of = most(most_of, differs[i]);
     const vec each = 1.0f / (most_of + ALIKE * ALIKE);
     for (int i = 0; i < TAPS; i++) {
-      const vec part = (m.differs[i] + ALIKE * ALIKE) * each;
-      m.nearer[i] *= part + m.clean * (1.0f - part);
+      const vec part = (differs[i] + ALIKE * ALIKE) * each;
+      nearer[i] *= part + has_clean * (1.0f - part);
     }
   }
-  m.variance += mean<CHANNELS>(m.light, C, m.nearer, m.front);
+  variance += mean<CHANNELS>(light, C, nearer, front);
 
-  vec along = {};
-  m.strength = m.misfit = vec{};
+  vec along = {}, strength = {}, misfit = {};
   for (int c = 0; c < C; c++) {
-    const vec contrast = m.front[c] - m.behind[c];
-    m.strength += contrast * contrast;
-    along += (m.colour[c] - m.behind[c]) * contrast;
+    const vec contrast = front[c] - behind[c];
+    strength += contrast * contrast;
+    along += (colour[c] - behind[c]) * contrast;
   }
-  m.is_near = here - m.near < m.far - here;
-  m.fitted = along / most(m.strength, all(1e-12f));
-  const vec fitted = clamp01(m.fitted);
+  const ivec is_near = here - near < far - here;
+  const vec fitted = clamp01(along / most(strength, all(1e-12f)));
   for (int c = 0; c < C; c++) {
-    const vec left = m.colour[c] - m.behind[c] - fitted * (m.front[c] - m.behind[c]);
-    m.misfit += left * left;
+    const vec left = colour[c] - behind[c] - fitted * (front[c] - behind[c]);
+    misfit += left * left;
   }
-  m.trust = m.strength / (m.strength + TRUST * (m.variance + m.misfit) + ALIKE * ALIKE);
-  m.aside = (here - m.near) - (m.far - here), m.sided = most(m.aside, -m.aside) * m.per_gap;
-  m.edge = load<vec>(w.edge + first + tap(TAPS / 2));
-  const vec clear = m.edge * clamp01(4.0f * m.sided - 2.0f), noise = m.variance + ALIKE * ALIKE;
-  const vec misfit = m.misfit + (covered - fitted) * (covered - fitted) * m.strength;
-  m.geometric = least(m.is_near ? 1.0f - covered : covered, all(0.5f)) * clear * (1.0f - m.trust) * noise / (noise + misfit);
-  m.geometric *= clamp01(m.gap * (1.0f / EDGE_PX) - 2.0f);
-  m.certainty = clear * m.trust;
-  m.other = least(m.is_near ? 1.0f - fitted : fitted, all(0.5f)) * m.certainty + m.geometric, m.own = 1.0f - m.other;
-}
+  const vec trust = strength / (strength + TRUST * (variance + misfit) + ALIKE * ALIKE), noise = variance + ALIKE * ALIKE;
+  const vec sided = size_of((here - near) - (far - here)) * (all(1.0f) / gap), edge = load<vec>(w.edge + first + tap(TAPS / 2));
+  const vec clear = edge * clamp01(4.0f * sided - 2.0f), contradiction = misfit + (covered - fitted) * (covered - fitted) * strength;
+  vec geometric = least(is_near ? 1.0f - covered : covered, all(0.5f)) * clear * (1.0f - trust) * noise / (noise + contradiction);
+  geometric *= clamp01(gap * (1.0f / EDGE_PX) - 2.0f);
+  const vec other = least(is_near ? 1.0f - fitted : fitted, all(0.5f)) * (clear * trust) + geometric, own = 1.0f - other;
 
-// Light of the other surface in a pixel, times its weight. The residual colour goes to both surfaces in proportion to their
-// shares, within the range of the image's light.
-struct Moved {
-  vec own_mean, other_mean, darkest, brightest, unexplained, of_each, steps[4], value;
-};
-inline Moved moved_of(const Job &job, const Mix &m, int c) {
-  Moved v;
-  const vec colour = m.colour[c];
-  v.own_mean = m.is_near ? m.front[c] : m.behind[c], v.other_mean = m.is_near ? m.behind[c] : m.front[c];
-  v.unexplained = colour - m.own * v.own_mean - m.other * v.other_mean;
-  v.darkest = most(job.light_least[c] / m.scale, all(-UNBOUNDED)), v.brightest = least(job.light_most[c] / m.scale, all(UNBOUNDED));
-  v.of_each = m.other / (m.other * m.other + m.own * m.own);
-  // the two parts still sum to the pixel, and neither is brighter or darker than the image
-  v.steps[0] = m.other * (v.other_mean + v.unexplained * v.of_each);
-  v.steps[1] = most(v.steps[0], colour - m.own * v.brightest);
-  v.steps[2] = least(v.steps[1], colour - m.own * v.darkest);
-  v.steps[3] = most(v.steps[2], m.other * v.darkest);
-  v.value = least(v.steps[3], m.other * v.brightest);
-  return v;
-}
-
-// Splits the pixels of `beside`, out of LANES pixels of a row.
-template <int CHANNELS>
-void split(const Job &job, Window &w, int y, int x, ivec beside, const float *falloff, const Block &block) {
-  const int C = CHANNELS ? CHANNELS : job.channels;
-  Mix m;
-  mix<CHANNELS>(job, w, y, x, falloff, m);
-  const vec per_own = 1.0f / m.own, per_other = 1.0f / most(m.other, all(1e-12f));
+  const vec per_own = 1.0f / own, per_other = 1.0f / most(other, all(1e-12f)), of_each = other / (other * other + own * own);
   auto put = [&](float *plane, vec value) {
     float *const to = plane + y * BLOCK + x;
     store(to, beside ? value : load<vec>(to));
   };
   for (int c = 0; c < C; c++) {
-    const vec moved = moved_of(job, m, c).value;
-    put(block.own + c * BLOCK_PIXELS, (m.colour[c] - moved) * per_own * m.scale);
-    put(block.other + c * BLOCK_PIXELS, m.other > vec{} ? moved * per_other * m.scale : vec{});
+    const vec own_mean = is_near ? front[c] : behind[c], other_mean = is_near ? behind[c] : front[c];
+    const vec unexplained = colour[c] - own * own_mean - other * other_mean;
+    const vec darkest = most(job.light_least[c] / scale, all(-UNBOUNDED)), brightest = least(job.light_most[c] / scale, all(UNBOUNDED));
+    vec others = other * (other_mean + unexplained * of_each);  // the other surface's light, times its weight
+    // the two parts still sum to the pixel, and neither is brighter or darker than the image
+    others = least(most(others, colour[c] - own * brightest), colour[c] - own * darkest);
+    others = least(most(others, other * darkest), other * brightest);
+    put(block.own + c * BLOCK_PIXELS, (colour[c] - others) * per_own * scale);
+    put(block.other + c * BLOCK_PIXELS, other > vec{} ? others * per_other * scale : vec{});
   }
-  const vec valid = job.surfaces.valid ? load<vec>(w.valid + (size_t)(y + 2) * PITCH + x + 2 + tap(TAPS / 2)) : all(1.0f);
-  put(block.coc, m.is_near ? m.far : m.near);
-  put(block.weight, m.other * valid);
-  put(block.own_weight, m.own * valid);
-}
-
-// Reads the light in and around a block, and calls body(y, x, beside) for each LANES of its pixels of which some lie at an
-// edge.
-template <typename Body>
-void each_edge(const Job &job, int y0, int x0, Window &w, const float *falloff, const Body &body) {
-  const int height = job.height, width = job.width;
-  const bool inside = x0 >= RIM && x0 + BLOCK + RIM <= width;
-  for (int c = 0; c < job.channels; c++)
-    for (int i = 0; i < EDGES; i++) {
-      const float *from = job.surfaces.light + c * job.surfaces.area() + (size_t)std::clamp(y0 - RIM + i, 0, height - 1) * width;
-      float *to = w.light.data() + ((size_t)c * EDGES + i) * PITCH;
-      if (inside)
-        memcpy(to, from + x0 - RIM, EDGES * sizeof(float));
-      else
-        for (int j = 0; j < EDGES; j++) to[j] = from[std::clamp(x0 - RIM + j, 0, width - 1)];
-    }
-  clean_light(job, y0, x0, w, falloff);
-  ivec lane;
-  for (int i = 0; i < LANES; i++) lane[i] = i;
-  for (int y = 0; y < std::min(BLOCK, height - y0); y++)
-    for (int x = 0; x < std::min(BLOCK, width - x0); x += LANES) {
-      const ivec beside = (load<vec>(w.edge + (y + RIM) * PITCH + x + RIM) > vec{}) & (lane < width - x0 - x);
-      if (any_of(beside)) body(y, x, beside);
-    }
+  put(block.coc, is_near ? far : near);
+  put(block.weight, other * valid[TAPS / 2]);
+  put(block.own_weight, own * valid[TAPS / 2]);
 }
 
 void split_block(Job &job, int by, int bx, Window &w, const float *falloff) {
+  const int y0 = by * BLOCK, x0 = bx * BLOCK;
   const Block block = job.surfaces.make_block(by * job.surfaces.block_columns + bx);
-  each_edge(job, by * BLOCK, bx * BLOCK, w, falloff, [&](int y, int x, ivec beside) {
-    job.channels == 3 ? split<3>(job, w, y, x, beside, falloff, block) : split<0>(job, w, y, x, beside, falloff, block);
-  });
+  for (int c = 0; c < job.channels; c++)
+    read_window(job, job.surfaces.light + c * job.surfaces.area(), y0 - RIM, x0 - RIM, EDGES, w.light.data() + (size_t)c * EDGES * PITCH);
+  clean_light(job, y0, x0, w, falloff);
+  for (int y = 0; y < std::min(BLOCK, job.height - y0); y++)
+    for (int x = 0; x < std::min(BLOCK, job.width - x0); x += LANES) {
+      const ivec beside = (load<vec>(w.edge + (y + RIM) * PITCH + x + RIM) > vec{}) & (counting() < (float)(job.width - x0 - x));
+      if (!any_of(beside)) continue;
+      job.channels == 3 ? split<3>(job, w, y, x, beside, falloff, block) : split<0>(job, w, y, x, beside, falloff, block);
+    }
 }
 
 // Estimates from the pixels around a highlight on which surface its emitter lies.
@@ -484,7 +411,7 @@ float weight_left(const Job &job, int y, int x, float least_limit, const float *
 std::vector<float> falloff_around(int reach) {
   std::vector<float> falloff;
   for (int dy = -reach; dy <= reach; dy++)
-    for (int dx = -reach; dx <= reach; dx++) falloff.push_back(falloff_at(dy, dx));
+    for (int dx = -reach; dx <= reach; dx++) falloff.push_back((float)std::exp(-(dy * dy + dx * dx) / 4.5));
   return falloff;
 }
 
@@ -531,10 +458,7 @@ void Job::split_mixed() {
       for (int x = x0; x < std::min(width, x0 + BLOCK); x++) body(y, x, least_limit);
   };
   parallel(rows, [&](int by, int worker) {
-    if (!windows[worker]) {
-      windows[worker].reset(new Window(channels));
-      windows[worker]->around.resize((size_t)channels * (2 * TAPS + 3));
-    }
+    if (!windows[worker]) windows[worker].reset(new Window(channels));
     Window &w = *windows[worker];
     for (int bx = 0; bx < columns; bx++) {
       float low = NEVER, high = -NEVER;
@@ -568,54 +492,39 @@ void Job::split_mixed() {
 
 void Job::add_background() {
   const size_t area = surfaces.area();
-  const float *coc = surfaces.coc, *valid = surfaces.valid;
-  for (int i = 0; i < 3; i++) copies.emplace_back(area * (channels + 2));
-  float *planes[3];
-  for (int i = 0; i < 3; i++) planes[i] = copies[copies.size() - 3 + i].data();
   const float low = coc_at(layers.front().node), high = coc_at(layers.back().node);
-  const float *behind_light = scene.light[1], *behind_coc = scene.coc[1];
+  float *planes[3];  // [channels + 2, height, width] of each surface: light, coc, weight
+  for (float *&plane : planes) plane = copies.emplace_back(area * (channels + 2)).data();
   parallel(height, [&](int y, int) {
     std::vector<const float *> own(channels), other(channels);
     for (int x = 0; x < width; x++) {
       const size_t at = (size_t)y * width + x;
-      const float *own_coc, *other_coc = nullptr, *seen, *weight = nullptr;
-      surfaces.row(0, y, x, own.data(), own_coc, seen);
+      const float *own_coc, *own_weight, *other_coc, *weight;
+      surfaces.row(0, y, x, own.data(), own_coc, own_weight);
       const bool mixed = surfaces.row(1, y, x, other.data(), other_coc, weight);
-      const float valid_here = valid ? valid[at] : 1.0f, here = coc[at];
+      bool known = std::isfinite(scene.coc[1][at]);
+      for (int c = 0; c < channels; c++) known &= std::isfinite(scene.light[1][c * area + at]);
+      const float here = surfaces.coc[at], there = clamp(scene.coc[1][at], low, high), apart = clamp01(there - here - SAME_PX);
       // a given background replaces the farther surface of a mixed pixel
       const float share = mixed && *other_coc < here ? *weight : 0.0f;
-      bool known = true;
       for (int c = 0; c < channels; c++) {
         planes[0][c * area + at] = mixed ? *other[c] : 0.0f;
         planes[1][c * area + at] = *own[c];
-        const float light = behind_light[c * area + at];
-        known &= std::isfinite(light);
-        planes[2][c * area + at] = light;
+        planes[2][c * area + at] = known ? scene.light[1][c * area + at] : 0.0f;
       }
-      known &= std::isfinite(behind_coc[at]);
-      const float there = clamp(behind_coc[at], low, high), apart = clamp01(there - here - SAME_PX);
-      float behind_weight = apart + (1.0f - apart) * share;  // apart = 0: the background is the surface in the image
-      if (!known) {
-        behind_weight = 0;
-        for (int c = 0; c < channels; c++) planes[2][c * area + at] = 0.0f;
-      }
-      float *coc_of[3], *weight_of[3];
+      const float coc[3] = {mixed ? *other_coc : here, here, std::max(known ? there : 0.0f, here)};
+      // apart = 0: the background is the surface in the image
+      const float weights[3] = {share, own_weight ? *own_weight : 1.0f, known ? apart + (1.0f - apart) * share : 0.0f};
       for (int i = 0; i < 3; i++) {
-        coc_of[i] = planes[i] + channels * area + at;
-        weight_of[i] = coc_of[i] + area;
+        planes[i][channels * area + at] = coc[i];
+        planes[i][(channels + 1) * area + at] = weights[i];
       }
-      *coc_of[0] = mixed ? *other_coc : here;
-      *coc_of[1] = here;
-      *coc_of[2] = std::max(known ? there : 0.0f, here);
-      *weight_of[0] = share;
-      *weight_of[1] = seen ? *seen : valid_here;
-      *weight_of[2] = behind_weight;
     }
   });
-  for (int i = 0; i < 3; i++) {
-    surfaces.lights.push_back(planes[i]);
-    surfaces.cocs.push_back(planes[i] + channels * area);
-    surfaces.weights.push_back(planes[i] + (channels + 1) * area);
+  for (float *plane : planes) {
+    surfaces.lights.push_back(plane);
+    surfaces.cocs.push_back(plane + channels * area);
+    surfaces.weights.push_back(plane + (channels + 1) * area);
   }
   surfaces.count = 3;
   surfaces.independent = true;

@@ -4,7 +4,6 @@
 #include <cstdlib>
 #include <mutex>
 #include <new>
-#include <vector>
 
 namespace torchdof {
 namespace {
@@ -15,13 +14,22 @@ constexpr size_t HEADER = 64;
 
 struct Header {
   size_t bytes;
-  void *start;  // of the allocation
+  void *start;   // of the allocation
+  Header *next;  // the block kept before this one
 };
 
 struct Kept {
   std::mutex mutex;  // only try_lock: after a fork a thread that no longer exists may hold it
-  std::vector<Header *> blocks;
+  Header *last = nullptr;
   size_t bytes = 0;
+
+  // Takes a block out of the list.
+  Header *take(Header **place) {
+    Header *header = *place;
+    *place = header->next;
+    bytes -= header->bytes;
+    return header;
+  }
 };
 Kept &kept() {
   static Kept *kept = new Kept();  // never destroyed: threads may outlive it
@@ -36,49 +44,29 @@ void *take_memory(size_t bytes) {
   if (bytes >= LEAST_BYTES) {
     Kept &k = kept();
     std::unique_lock<std::mutex> lock(k.mutex, std::try_to_lock);
-    if (lock) {
-      size_t best = k.blocks.size();
-      for (size_t i = 0; i < k.blocks.size(); i++)
-        if (k.blocks[i]->bytes >= bytes && k.blocks[i]->bytes / 4 * 3 <= bytes &&
-            (best == k.blocks.size() || k.blocks[i]->bytes < k.blocks[best]->bytes))
-          best = i;
-      if (best < k.blocks.size()) {
-        Header *header = k.blocks[best];
-        k.blocks.erase(k.blocks.begin() + best);
-        k.bytes -= header->bytes;
-        return after(header);
-      }
-    }
+    for (Header **place = &k.last; lock && *place; place = &(*place)->next)
+      if ((*place)->bytes >= bytes && (*place)->bytes / 4 * 3 <= bytes) return after(k.take(place));
   }
   if (bytes > SIZE_MAX - 2 * HEADER) throw std::bad_alloc();
   void *start = std::malloc(bytes + 2 * HEADER);
   if (!start) throw std::bad_alloc();
   const uintptr_t aligned = (reinterpret_cast<uintptr_t>(start) + HEADER - 1) / HEADER * HEADER;
-  Header *header = reinterpret_cast<Header *>(aligned);
-  header->bytes = bytes;
-  header->start = start;
-  return after(header);
+  return after(new (reinterpret_cast<void *>(aligned)) Header{bytes, start, nullptr});
 }
 
 void give_memory(void *memory) {
-  if (!memory) return;
   Header *header = reinterpret_cast<Header *>(reinterpret_cast<char *>(memory) - HEADER);
   if (header->bytes >= LEAST_BYTES && header->bytes <= KEPT_BYTES) {
     Kept &k = kept();
     std::unique_lock<std::mutex> lock(k.mutex, std::try_to_lock);
     if (lock) {
-      try {
-        k.blocks.push_back(header);
-      } catch (const std::bad_alloc &) {
-        std::free(header->start);
-        return;
-      }
+      header->next = k.last;
+      k.last = header;
       k.bytes += header->bytes;
       while (k.bytes > KEPT_BYTES) {  // the oldest goes first
-        Header *oldest = k.blocks.front();
-        k.blocks.erase(k.blocks.begin());
-        k.bytes -= oldest->bytes;
-        std::free(oldest->start);
+        Header **oldest = &k.last;
+        while ((*oldest)->next) oldest = &(*oldest)->next;
+        std::free(k.take(oldest)->start);
       }
       return;
     }

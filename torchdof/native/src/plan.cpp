@@ -4,8 +4,6 @@
 
 #include <numeric>
 
-#include "variants.h"
-
 namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {

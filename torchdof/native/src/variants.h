@@ -14,29 +14,29 @@ struct RayKernels {
   int32_t field_masks_count;
 };
 
-class AnyJob {
- public:
-  virtual ~AnyJob() = default;
-  virtual const std::vector<int32_t> &radii() const = 0;
-  virtual void finish(const RayKernels &kernels, float *out) = 0;
+}  // namespace torchdof
+
+struct torchdof_job {
+  std::vector<int32_t> radii;  // of highlight kernels, in steps of 1/32 px
+  virtual ~torchdof_job() = default;
+  virtual void finish(const torchdof::RayKernels &kernels, float *out) = 0;
 };
 
+namespace torchdof {
+
 struct Variant {
-  AnyJob *(*begin)(const torchdof_scene &scene);
+  torchdof_job *(*begin)(const torchdof_scene &scene);
   bool (*repair_edges)(const torchdof_map &map);
   void (*ends)(const float *values, int64_t count, int threads, float *low, float *high);
   void (*coc_of_depth)(const float *depth, int64_t count, float scale, float nearest, float farthest, int threads, float *out);
   std::vector<double> (*plan)(const float *coc, int maps, int height, int width, double &tolerance, int threads);
   void (*make_kernels)(const torchdof_spots &spots, int threads, float *const *out);
-  void (*convolve)(const float *in, int height, int width, const float *kernel, int half, float *out);
-  void (*blend)(const torchdof_layers &layers, float *out);
-  void (*blend_gradient)(const torchdof_layers &layers, const float *gradient, float *const *light, float *const *place, float *const *weight);
-  void (*farthest)(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads, float *out);
-  void (*farthest_gradient)(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads,
-                            const float *gradient, float *const *of_maps);
-  void (*look_behind)(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads, float *out);
-  void (*look_behind_gradient)(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads,
-                               const float *gradient, float *const *of_levels, float *of_coc);
+  void (*blend)(const torchdof_layers &layers, float *out, const float *gradient, float *const *of_light, float *const *of_place,
+                float *const *of_weight);
+  void (*farthest)(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads, float *out,
+                   const float *gradient, float *const *of_maps);
+  void (*look_behind)(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads,
+                      float *out, const float *gradient, float *const *of_levels, float *of_coc);
 };
 
 namespace baseline {
