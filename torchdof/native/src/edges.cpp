@@ -13,7 +13,7 @@ namespace {
 // Constants in the groups of render/edges.py, which gives their meanings, units and effects.
 constexpr int RINGS = 3, RAMP_REACH = 6, FLAT_REACH = 8;  // edges; FLAT_REACH: pixels within which a ramp becomes flat
 constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TIE = 0.017f;
-constexpr float NOISES = 12.0f;  // noise
+constexpr float NOISES = 12.0f, LEVELS_OF_A_FILE = 64.0f;  // noise
 constexpr int NOISE_SAMPLED = 1 << 13;
 constexpr int REACH = 5;  // colour
 constexpr float CLEAR = 0.1f, CLEAR_IN_PRIOR = 0.25f, SHARPNESS = 1.6f;
@@ -246,11 +246,14 @@ class Repair {
   static float root(float light) { return (light <= FINITE) & (light > 0) ? std::sqrt(std::min(light, BRIGHTEST)) : 0.0f; }
 
   // Standard deviation of the map's noise, from the median second difference along rows or columns, whichever is
-  // larger.
+  // larger. At least the noise of rounding, if the map has more than LEVELS_OF_A_FILE levels; their distance is the
+  // smallest difference of two neighbours.
   float noise() const {
     const int every = (int)((2 * (int64_t)area_ + NOISE_SAMPLED - 1) / NOISE_SAMPLED);
+    float quantum = INFINITY, span = 0;
     const auto middle_bend = [&](int lines, int size, int to_line, int stride) {
       std::vector<float> bends;
+      float low = INFINITY, high = -INFINITY;
       for (int n = 0; n < lines; n++) {
         if (std::min(n, lines - 1 - n) % every != 0) continue;
         const float *line = map_.nearness + (ptrdiff_t)n * to_line;
@@ -258,14 +261,19 @@ class Repair {
           const float a = line[0], b = line[stride], c = line[2 * stride];
           if (!(std::fabs(a) <= LARGEST && std::fabs(b) <= LARGEST && std::fabs(c) <= LARGEST)) continue;
           bends.push_back(std::fabs((c - b) - (b - a)));
+          if (a != b) quantum = std::min(quantum, std::fabs(b - a));
+          low = std::min(low, a);
+          high = std::max(high, a);
         }
       }
       if (bends.empty()) return 0.0f;
+      span = std::max(span, high - low);
       const auto middle = bends.begin() + (bends.size() - 1) / 2;
       std::nth_element(bends.begin(), middle, bends.end());
       return *middle;
     };
-    return 0.6053f * std::max(middle_bend(height_, width_, width_, 1), middle_bend(width_, height_, 1, width_));
+    const float bend = std::max(middle_bend(height_, width_, width_, 1), middle_bend(width_, height_, 1, width_));
+    return std::max(0.6053f * bend, span > LEVELS_OF_A_FILE * quantum ? 0.2887f * quantum : 0.0f);
   }
 
   // Whether the sampled steps are ramps that are wide, or whose values are often far from both surfaces.

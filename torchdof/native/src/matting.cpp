@@ -141,7 +141,8 @@ void clean_light(const Job &job, int y0, int x0, Window &w, const float *falloff
 //
 // 1. The near and far coc are the extremes of the 3 x 3 neighbours.
 // 2. The colour of each surface is the mean of its neighbours. Their light moves towards their clean light, along the line
-//    between the clean colours of both surfaces, and less where texture is strong.
+//    between the clean colours of both surfaces, and less where texture is strong. If a thin foreground has no unmixed
+//    neighbours, they count by their difference from the background.
 // 3. The share of the near surface is the projection of the pixel's colour onto the line between both colours.
 // 4. The share of the other surface is at most 1/2. Where texture makes the projection unreliable, it is the share that
 //    the other surface has under a small Gaussian, unless this contradicts the pixel's colour.
@@ -170,13 +171,14 @@ void split(const Job &job, Window &w, int y, int x, ivec beside, const float *fa
   for (int c = 0; c < C; c++) colour[c] = light[c * TAPS + TAPS / 2];
 
   const vec here = coc[TAPS / 2], gap = most(far - near, all(1e-6f));
-  vec nearer[TAPS], farther[TAPS];  // weights in the means of both surfaces
-  vec covered = {}, counted = {};   // by the near surface, under a small Gaussian
+  vec nearer[TAPS], farther[TAPS], whole = {};  // weights in the means of both surfaces; sum of those of the front
+  vec covered = {}, counted = {};               // by the near surface, under a small Gaussian
   for (int i = 0; i < TAPS; i++) {
     const vec weight = (all(1.0f + UNCLEAN) - load<vec>(w.edge + first + tap(i))) * falloff[i] * valid[i];
     const vec nearness = (far - coc[i]) / gap;  // not times 1 / gap, whose rounding the clamps below enlarge
     nearer[i] = weight * clamp01(4.0f * nearness - 2.8f);
     farther[i] = weight * clamp01(1.2f - 4.0f * nearness);
+    whole += nearer[i];
     const vec small = (i == TAPS / 2 ? 1.0f : i % 2 ? SMALL_BESIDE : SMALL_DIAGONAL) * valid[i];
     covered += small * nearness, counted += small;
   }
@@ -202,7 +204,20 @@ void split(const Job &job, Window &w, int y, int x, ivec beside, const float *fa
   }
   for (int c = 0; c < C; c++)
     for (int i = 0; i < TAPS; i++) light[c * TAPS + i] -= moved[i] * (front[c] - behind[c]);
-  const vec variance = mean<CHANNELS>(light, C, farther, behind) + mean<CHANNELS>(light, C, nearer, front);
+  vec variance = mean<CHANNELS>(light, C, farther, behind);
+  const vec has_clean = clamp01(whole * (0.1f / UNCLEAN) - 1.0f);
+  if (any_of(has_clean < all(1.0f))) {
+    vec differs[TAPS] = {}, most_of = {};
+    for (int c = 0; c < C; c++)
+      for (int i = 0; i < TAPS; i++) differs[i] += (light[c * TAPS + i] - behind[c]) * (light[c * TAPS + i] - behind[c]);
+    for (int i = 0; i < TAPS; i++) most_of = most(most_of, differs[i]);
+    const vec each = 1.0f / (most_of + ALIKE * ALIKE);
+    for (int i = 0; i < TAPS; i++) {
+      const vec part = (differs[i] + ALIKE * ALIKE) * each;
+      nearer[i] *= part + has_clean * (1.0f - part);
+    }
+  }
+  variance += mean<CHANNELS>(light, C, nearer, front);
 
   vec along = {}, strength = {}, misfit = {};
   for (int c = 0; c < C; c++) {
