@@ -40,6 +40,7 @@ _TIE = 0.017  # steps by which one axis must lead to give an edge its direction;
 
 # Noise of a map, below which a step is not an edge
 _NOISES = 12.0  # smallest step, in standard deviations of the noise; larger: fewer edges in noisy maps
+_LEVELS_OF_A_FILE = 64  # fewest levels of a map with the noise of rounding; larger: more edges in coarse maps
 _NOISE_SAMPLED = 2**13  # pixels per frame that are sampled, half along rows and half along columns
 
 # Colour: which of two surfaces a pixel resembles
@@ -315,10 +316,13 @@ def _from_border(size: int, device: torch.device) -> Tensor:
 def _noise(nearness: Tensor, valid: Tensor) -> Tensor:
     """Estimates the standard deviation of each item's noise, ``[B, 1, 1, 1]``.
 
-    It is proportional to the median of ``|second difference|``, along rows or columns, whichever is larger.
+    It is proportional to the median of ``|second difference|``, along rows or columns, whichever is larger. A map that
+    holds multiples of a number q, such as one from a file with 8 bits, has at least the noise of rounding to them,
+    ``q / sqrt(12)``; q is the smallest difference of two neighbours. This needs a range of more than
+    :data:`_LEVELS_OF_A_FILE` times q: a map of a few surfaces has a smallest difference too, which is not rounding.
     """
     every = (2 * nearness.shape[-2] * nearness.shape[-1] + _NOISE_SAMPLED - 1) // _NOISE_SAMPLED
-    middles = []
+    middles, least, ends = [], [], []
     for values, known in ((nearness, valid), (nearness.transpose(-2, -1), valid.transpose(-2, -1))):
         count, size = values.shape[-2:]
         first = torch.arange(0, (count + 1) // 2, every, device=values.device)
@@ -326,11 +330,19 @@ def _noise(nearness: Tensor, valid: Tensor) -> Tensor:
         lines = torch.cat([first, last])  # from both borders: the same lines in a mirrored frame
         line, has = (functional.pad(t.index_select(-2, lines), (0, 2)) for t in (values, known))
         has = has.narrow(-1, 0, size) & has.narrow(-1, 1, size) & has.narrow(-1, 2, size)
-        bends = torch.where(has, line.diff().diff().abs(), torch.inf).flatten(1).sort(1).values
+        changes = line.diff()
+        bends = torch.where(has, changes.diff().abs(), torch.inf).flatten(1).sort(1).values
         middle = (has.flatten(1).sum(1, keepdim=True) - 1).clamp_min(0) // 2
         middles.append(bends.gather(1, middle))
+        line, changes = line.narrow(-1, 0, size), changes.narrow(-1, 0, size).abs()
+        least.append(torch.where(has & (changes > 0), changes, torch.inf).amin((-2, -1)))
+        ends.append(
+            torch.where(has, line, -torch.inf).amax((-2, -1)) + torch.where(has, -line, -torch.inf).amax((-2, -1))
+        )
     bend = torch.maximum(*(torch.where(middle < torch.inf, middle, 0.0) for middle in middles))
-    return 0.6053 * bend[..., None, None]  # 1.4826 / sqrt(6), for Gaussian noise
+    quantum, span = torch.minimum(*least), torch.maximum(*ends)
+    noise = torch.where(span > _LEVELS_OF_A_FILE * quantum, 0.2887 * quantum, 0.0)  # 1 / sqrt(12)
+    return torch.maximum(0.6053 * bend, noise)[..., None, None]  # 1.4826 / sqrt(6), for Gaussian noise
 
 
 def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:

@@ -108,7 +108,11 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops =
     clean = clean.clamp(-_MOST_CLEAN, _MOST_CLEAN)
     window_light = window_light - _mixed_light(window_light, clean, near_weight, far_weight)
     back, back_variance = _mean_of(window_light, far_weight)
-    front, front_variance = _mean_of(window_light, near_weight)
+    # a thin foreground has no unmixed pixel: prefer those that differ most from the background
+    differs = ((window_light - back[:, None]) ** 2).sum(0)
+    differs = (differs + _ALIKE**2) / (differs.amax(0) + _ALIKE**2)
+    clean = (0.1 * near_weight.sum(0) / _UNCLEAN - 1.0).clamp(0.0, 1.0)
+    front, front_variance = _mean_of(window_light, near_weight * torch.lerp(differs, torch.ones_like(clean), clean))
 
     # a = (I - B) (F - B) / |F - B|^2, and the trust in it
     contrast = front - back
