@@ -42,8 +42,8 @@ def test_frame_ranges_are_read(text: str, expected: tuple[int, int]) -> None:
 test_invalid_patterns_ranges_and_keyframes_are_refused = refuses(
     *((partial(FramePattern, text), "expected one place for the frame number")
       for text in ("a.exr", "a.##.##.exr", "shot.##/a.exr")),
-    *((partial(parse_frames, text), "") for text in ("", "a", "1-", "5-1", "1,2", "1.5")),
-    *((partial(parse_focus, text), "")
+    *((partial(parse_frames, text), "^") for text in ("", "a", "1-", "5-1", "1,2", "1.5")),
+    *((partial(parse_focus, text), "^")
       for text in ("", "near", "0", "-1", "nan", "1:2,", "1:2,1:3", "1:2,3", "2,3", "1:0", "x:2", "1.5:2", "1:2:3")),
 )  # fmt: skip
 
