@@ -54,7 +54,7 @@ def argument(help: str, metavar: str, default: Any = ...) -> Any:
 
 
 class Parsed(click.ParamType):
-    """The type of an option whose text ``parse`` reads; its ``ValueError`` becomes a message with what is expected."""
+    """The type of an option whose text ``parse`` reads. The message for a ``ValueError`` names the expected form."""
 
     name = "text"
 
@@ -76,6 +76,11 @@ def numbers(text: str, count: int | None = None) -> tuple[float, ...]:
     if count not in (None, len(values)):
         raise ValueError
     return values
+
+
+def pair(text: str) -> tuple[float, ...]:
+    """Reads two numbers separated by a comma."""
+    return numbers(text, 2)
 
 
 def number_or(*words: str) -> Callable[[str], float | str]:

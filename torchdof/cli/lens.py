@@ -10,7 +10,7 @@ import click
 
 from ..io.metadata import camera_settings
 from ..io.sequence import focus_at_frame, parse_focus
-from .command import Group, Parsed, numbers, option
+from .command import Group, Parsed, numbers, option, pair
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -88,13 +88,13 @@ class Lens(Sensor):
     focus_at: tuple[float, float] | None = option(
         "Focus on the surface at this pixel from the top left; by default as the file states, else on the subject.",
         metavar="X,Y",
-        type=Parsed("a pixel X,Y such as 320,200", lambda text: numbers(text, 2)),
+        type=Parsed("a pixel X,Y such as 320,200", pair),
         basic=True,
     )
     focus_range: tuple[float, float] | None = option(
         "In focus from NEAR to FAR metres, blurred beyond; instead of --focus-m.",
         metavar="NEAR,FAR",
-        type=Parsed("two numbers such as 1.5,2.2", lambda text: numbers(text, 2)),
+        type=Parsed("two numbers such as 1.5,2.2", pair),
     )
     tilt: float = option("Degrees by which the lens is tilted down: focus comes nearer towards the bottom.", 0.0)
     swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ..io.atomic import check_writable
 from ..io.paths import existing_image, existing_map, samples_of
-from .command import Group, Parsed, number_or, numbers, option
+from .command import Group, Parsed, number_or, option, pair
 from .lens import Lens
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class DepthMap(Group):
     value_range: tuple[float, float] | None = option(
         "Smallest and largest value of relative depth; default: those of each frame.",
         metavar="LOW,HIGH",
-        type=Parsed("two numbers such as 0,255", lambda text: numbers(text, 2)),
+        type=Parsed("two numbers such as 0,255", pair),
     )
     depth_unknown: float | None = option("A value that means 'not measured', such as 0, -1 or inf.")
     fill_depth: float | str | None = option(

@@ -240,7 +240,8 @@ def _matched(current: Tensor, previous: Tensor, flow: Tensor, reach: int) -> Ten
         compare(flow.roll(step, dims=dim))
     start = best
     for offset in itertools.product(range(-reach, reach + 1), repeat=2):
-        compare(start + start.new_tensor(offset[::-1]).reshape(1, 2, 1, 1))
+        if any(offset):
+            compare(start + start.new_tensor(offset[::-1]).reshape(1, 2, 1, 1))
     return best
 
 
