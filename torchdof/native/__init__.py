@@ -2,7 +2,8 @@
 
 It has a plain C interface (``src/api.h``) and is built when the package is installed. Without it the PyTorch engine is
 used. The environment variable ``TORCHDOF_ENGINE`` selects: ``auto`` (the default) uses the compiled engine where it
-can, ``native`` requires it, ``torch`` disables it.
+can, ``native`` requires it, ``torch`` disables it. The instruction set is the one that PyTorch uses, AVX2 or the
+processor's baseline (``ATEN_CPU_CAPABILITY=default`` selects the baseline for both).
 
 Tensors are float32. Every computation uses as many threads as PyTorch does, gives the same bits for any number of them,
 and raises ``MemoryError`` if there is not enough memory.
@@ -31,10 +32,13 @@ HALF_LARGEST = 256  # largest half width of a kernel, in pixels of its layer; Py
 MOST_LEVELS = 4  # most levels of look_behind
 MOST_PLANES = 16  # most channels of light and kernels' colours together in blend
 
-_SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
+_SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
+_instructions = "avx2" if torch.backends.cpu.get_cpu_capability().startswith("AVX") else "baseline"
+"""Instruction set for which the engine in use is compiled."""
+
 _SMALL_FRAME = 2**16  # pixels; up to this size the main thread renders itself, which saves 0.1 ms
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
-_REVISION = 10  # of ``src/api.h``
+_REVISION = 11  # of ``src/api.h``
 
 Rules = Sequence[tuple[int, float, float, float]]
 
@@ -65,7 +69,7 @@ class Spots(NamedTuple):
 
 _TYPES: dict[str, Any] = {
     **{"int": ctypes.c_int32, "long": ctypes.c_int64, "real": ctypes.c_float, "double": ctypes.c_double},
-    **{"data": ctypes.c_void_p, "text": ctypes.c_char_p, "nothing": None},
+    **{"data": ctypes.c_void_p, "nothing": None},
 }
 _LAYERS = "int layers, double* nodes, int* scales halves, int kernel_colours, data kernels"
 _STRUCTURES = {
@@ -97,8 +101,6 @@ _FUNCTIONS = {
     "kernels": "int spots* int data*",
     "ends": "int data long int real* real*",
     "interface": "long",
-    "instructions": "text",
-    "use": "int text",
 }
 """Functions of ``src/api.h``: types of the result and of the arguments."""
 
@@ -146,15 +148,10 @@ def describe() -> str:
         True
     """
     if chosen():
-        return f"native ({_engine().torchdof_instructions().decode()})"
+        return f"native ({_instructions})"
     if os.environ.get("TORCHDOF_ENGINE") == "torch":
         return "torch (as TORCHDOF_ENGINE says)"
     return f"torch ({_library()[1]})"
-
-
-def use_instructions(name: Literal["avx2", "baseline"]) -> bool:
-    """Selects the instruction set, for tests; False if the processor lacks it."""
-    return bool(_engine().torchdof_use(name.encode()))
 
 
 def render(
@@ -456,10 +453,14 @@ def _engine() -> ctypes.CDLL:
     return library
 
 
-@functools.cache
 def _library() -> tuple[ctypes.CDLL | None, str]:
     """The compiled engine, or the reason why it is missing."""
-    file = importlib.resources.files(__name__) / f"_engine{_SUFFIXES.get(sys.platform, '.so')}"
+    return _loaded("_engine_avx2" if _instructions == "avx2" else "_engine")
+
+
+@functools.cache
+def _loaded(name: str) -> tuple[ctypes.CDLL | None, str]:
+    file = importlib.resources.files(__name__) / f"{name}{_SUFFIX}"
     if not file.is_file():
         return None, "the compiled engine was not built when torchdof was installed"
     try:

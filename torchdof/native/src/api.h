@@ -183,10 +183,5 @@ TORCHDOF_API int32_t torchdof_ends(const float *values, int64_t count, int32_t t
 
 // Version of this interface, for the caller to check first: sizes of its structures and, in the upper half,
 // TORCHDOF_REVISION, which increases with every other change of this file.
-#define TORCHDOF_REVISION 10
+#define TORCHDOF_REVISION 11
 TORCHDOF_API int64_t torchdof_interface(void);
-
-// "avx2" or "baseline".
-TORCHDOF_API const char *torchdof_instructions(void);
-// Selects the instruction set, for tests; returns 0 if the processor lacks it.
-TORCHDOF_API int32_t torchdof_use(const char *instructions);

@@ -12,7 +12,6 @@
 #include "engine.h"
 
 namespace torchdof {
-namespace TORCHDOF_SIMD {
 namespace {
 
 static_assert(BLOCK % STRIP_COLUMNS == 0 && BLOCK % STRIP_ROWS == 0, "strips fill a block");
@@ -842,11 +841,12 @@ class Blend {
 };
 
 }  // namespace
-
-void blend(const torchdof_layers &scene, float *out, const float *gradient, float *const *of_light, float *const *of_place, float *const *of_weight) {
-  Blend blend(scene);
-  gradient ? blend.gradient(gradient, of_light, of_place, of_weight) : blend.picture(out);
-}
-
-}  // namespace TORCHDOF_SIMD
 }  // namespace torchdof
+
+int32_t torchdof_blend(const torchdof_layers *layers, float *out, const float *gradient, float *const *of_light,
+                       float *const *of_place, float *const *of_weight) {
+  return torchdof::guarded([&] {
+    torchdof::Blend blend(*layers);
+    gradient ? blend.gradient(gradient, of_light, of_place, of_weight) : blend.picture(out);
+  });
+}

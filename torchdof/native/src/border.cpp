@@ -2,7 +2,6 @@
 #include "engine.h"
 
 namespace torchdof {
-namespace TORCHDOF_SIMD {
 
 // Constants of render/border.py, which gives their meanings and effects.
 constexpr int WIDTH = 4, BINS = 16;
@@ -109,5 +108,4 @@ void Border::continue_row(int surface, int channel, int y, int x, int n, float *
   for (int i = 0; i < n; i++) row[i] = 0.5f * (row[i] * share[i] + nearer[i] + part * (farther[i] - nearer[i]));
 }
 
-}  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

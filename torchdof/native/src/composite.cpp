@@ -8,7 +8,6 @@
 #include "engine.h"
 
 namespace torchdof {
-namespace TORCHDOF_SIMD {
 namespace {
 
 constexpr float LEAST = 1e-6f;    // blurred weight up to which the light of a pixel is unknown
@@ -1100,5 +1099,4 @@ void composite(const Job &job, const RayKernels &ray_kernels, float *out) {
   Composite(job, ray_kernels, out).run();
 }
 
-}  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

@@ -2,7 +2,6 @@
 #include "engine.h"
 
 namespace torchdof {
-namespace TORCHDOF_SIMD {
 namespace {
 
 constexpr int ROWS = STRIP_ROWS;
@@ -151,5 +150,4 @@ void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t c
     for (int n = 0; n < VECTORS; n++) store(out + o * STRIP_COLUMNS + n * LANES, sum[o][n]);
 }
 
-}  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

@@ -3,7 +3,6 @@
 #include "engine.h"
 
 namespace torchdof {
-namespace TORCHDOF_SIMD {
 namespace {
 
 // Constants of render/disocclusion.py, which gives their meanings and effects.
@@ -546,5 +545,4 @@ class Filling {
 
 void Job::fill_hidden() { Filling(*this).run(); }
 
-}  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

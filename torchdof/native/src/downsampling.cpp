@@ -7,7 +7,6 @@
 #include "engine.h"
 
 namespace torchdof {
-namespace TORCHDOF_SIMD {
 
 class Downsampling {
  public:
@@ -391,5 +390,4 @@ void Downsampled::take(const Job &job, const LayerIndex &index, const Border &bo
   job.parallel((int)pieces.size(), [&](int band, int) { Downsampling(job, index, border, *this).band(first_band + band); });
 }
 
-}  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

@@ -7,7 +7,6 @@
 #include "engine.h"
 
 namespace torchdof {
-namespace TORCHDOF_SIMD {
 namespace {
 
 // Constants in the groups of render/edges.py, which gives their meanings, units and effects.
@@ -1200,8 +1199,8 @@ class Repair {
 };
 
 }  // namespace
-
-bool repair_edges(const torchdof_map &map) { return Repair(map).run(); }
-
-}  // namespace TORCHDOF_SIMD
 }  // namespace torchdof
+
+int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed) {
+  return torchdof::guarded([&] { *changed = torchdof::Repair(*map).run(); });
+}

@@ -2,7 +2,6 @@
 #include "engine.h"
 
 namespace torchdof {
-namespace TORCHDOF_SIMD {
 
 Job::Job(const torchdof_scene &scene)
     : scene(scene), height(scene.height), width(scene.width), channels(scene.channels), colours(scene.kernel_colours) {
@@ -181,15 +180,37 @@ void Job::begin() {
   if (limited && scene.highlights) extract_highlights();
 }
 
-void Job::finish(const RayKernels &kernels, float *out) { composite(*this, kernels, out); }
+}  // namespace torchdof
 
-static torchdof_job *begin(const torchdof_scene &scene) {
-  auto job = std::make_unique<Job>(scene);
-  job->begin();
-  return job.release();
+struct torchdof_job : torchdof::Job {
+  using Job::Job;
+};
+
+int32_t torchdof_begin(const torchdof_scene *scene, torchdof_job **job) {
+  *job = nullptr;
+  return torchdof::guarded([&] {
+    auto begun = std::make_unique<torchdof_job>(*scene);
+    begun->begin();
+    *job = begun.release();
+  });
 }
 
-extern const Variant variant;
-const Variant variant = {begin, repair_edges, find_ends, coc_of_depth, plan, make_kernels, blend, farthest, look_behind};
-}  // namespace TORCHDOF_SIMD
-}  // namespace torchdof
+int64_t torchdof_radii(const torchdof_job *job, const int32_t **steps) {
+  *steps = job->radii.data();
+  return (int64_t)job->radii.size();
+}
+
+int32_t torchdof_finish(torchdof_job *job, const float *const *kernels, const int32_t *halves,
+                        const torchdof_field_mask *field_masks, int32_t field_masks_count, float *out) {
+  return torchdof::guarded([&] { torchdof::composite(*job, {kernels, halves, field_masks, field_masks_count}, out); });
+}
+
+void torchdof_free(torchdof_job *job) { delete job; }
+
+int32_t torchdof_ends(const float *values, int64_t count, int32_t threads, float *low, float *high) {
+  return torchdof::guarded([&] { torchdof::find_ends(values, count, threads, low, high); });
+}
+
+int64_t torchdof_interface(void) {
+  return (int64_t)TORCHDOF_REVISION << 32 | (int64_t)sizeof(torchdof_scene) << 16 | (int64_t)(sizeof(torchdof_map) + sizeof(torchdof_layers) + sizeof(torchdof_level));
+}

@@ -1,5 +1,4 @@
-// Declarations shared by the engine's files. Each is compiled once for every instruction set, in a namespace of its
-// own.
+// Declarations shared by the engine's files.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -8,15 +7,15 @@
 #include <functional>
 #include <memory>
 #include <mutex>
+#include <new>
+#include <stdexcept>
 #include <vector>
 
 #include "api.h"
 #include "memory.h"
 #include "threads.h"
-#include "variants.h"
 
 namespace torchdof {
-namespace TORCHDOF_SIMD {
 
 #if defined(__AVX2__)
 constexpr int LANES = 8;
@@ -302,16 +301,24 @@ inline Layer make_layer(const double *nodes, int count, int k) {
   return l;
 }
 
-struct Job : torchdof_job {
+// Kernels of highlights, for each radius, and the field's transmittance for some radii.
+struct RayKernels {
+  const float *const *kernels;
+  const int32_t *halves;
+  const torchdof_field_mask *field_masks;
+  int32_t field_masks_count;
+};
+
+struct Job {
   explicit Job(const torchdof_scene &scene);
   void begin();
-  void finish(const RayKernels &kernels, float *out) override;
   void split_mixed();  // matting.cpp
 
   const torchdof_scene &scene;
   int height, width, channels, colours;  // colours: kernels of each layer, 1 or channels
   std::vector<Layer> layers;
   Surfaces surfaces;
+  std::vector<int32_t> radii;  // of highlight kernels, in steps of 1/32 px
   std::vector<Ray> rays;       // sorted by surface and position
   std::vector<float> ray_light;  // [rays, channels]
 
@@ -606,27 +613,23 @@ void ends_of(const float *values, int width, int rows, float *low, float *high);
 // Smallest and largest value; both NaN if any value is NaN.
 void find_ends(const float *values, int64_t count, int threads, float *low, float *high);
 
-// Signed coc of depths; everything between the two distances is in focus; plan.cpp
-void coc_of_depth(const float *depth, int64_t count, float scale, float nearest, float farthest, int threads, float *out);
-
-// Positions of the layers for maps of coc [maps, height, width] of one frame; reduces the tolerance of a small frame;
-// plan.cpp
-std::vector<double> plan(const float *coc, int maps, int height, int width, double &tolerance, int threads);
-
-// Kernels from the templates of a lens; kernels.cpp
-void make_kernels(const torchdof_spots &spots, int threads, float *const *out);
-
-// Repairs depth edges; false if the map needs no repair; edges.cpp
-bool repair_edges(const torchdof_map &map);
-
 void composite(const Job &job, const RayKernels &ray_kernels, float *out);
 
-// Steps with a gradient; see api.h.
-void blend(const torchdof_layers &scene, float *out, const float *gradient, float *const *of_light, float *const *of_place, float *const *of_weight);
-void farthest(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads, float *out, const float *gradient,
-              float *const *of_maps);
-void look_behind(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads, float *out,
-                 const float *gradient, float *const *of_levels, float *of_coc);
+// Calls the body of a function of api.h, and returns its status.
+template <typename Body>
+int32_t guarded(const Body &body) {
+  try {
+    body();
+    return TORCHDOF_OK;
+  } catch (const Cancelled &) {
+    return TORCHDOF_CANCELLED;
+  } catch (const TooBright &) {
+    return TORCHDOF_TOO_BRIGHT;
+  } catch (const std::bad_alloc &) {
+    return TORCHDOF_NO_MEMORY;
+  } catch (const std::length_error &) {
+    return TORCHDOF_NO_MEMORY;
+  }
+}
 
-}  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

@@ -9,7 +9,6 @@
 #include "engine.h"
 
 namespace torchdof {
-namespace TORCHDOF_SIMD {
 namespace {
 
 constexpr float MIXED = 0.05f;          // weight above which the other surface counts
@@ -149,15 +148,15 @@ class Farthest {
 };
 
 }  // namespace
-
-void farthest(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads, float *out, const float *gradient,
-              float *const *of_maps) {
-  const auto run = [&](const auto &level) { gradient ? level.gradient(gradient, of_maps) : level.write(out); };
-  if (channels == 3)
-    run(Farthest<3>(maps, channels, height, width, rows, columns, threads));
-  else
-    run(Farthest<0>(maps, channels, height, width, rows, columns, threads));
-}
-
-}  // namespace TORCHDOF_SIMD
 }  // namespace torchdof
+
+int32_t torchdof_farthest(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t rows, int32_t columns,
+                          int32_t threads, float *out, const float *gradient, float *const *of_maps) {
+  return torchdof::guarded([&] {
+    const auto run = [&](const auto &level) { gradient ? level.gradient(gradient, of_maps) : level.write(out); };
+    if (channels == 3)
+      run(torchdof::Farthest<3>(maps, channels, height, width, rows, columns, threads));
+    else
+      run(torchdof::Farthest<0>(maps, channels, height, width, rows, columns, threads));
+  });
+}

@@ -3,7 +3,6 @@
 #include "engine.h"
 
 namespace torchdof {
-namespace TORCHDOF_SIMD {
 namespace {
 
 constexpr float FACTOR = 8.0f;          // a highlight exceeds the usual light around by this factor; larger extracts fewer
@@ -551,5 +550,4 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
   }
 }
 
-}  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

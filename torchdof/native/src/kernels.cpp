@@ -2,7 +2,6 @@
 #include "engine.h"
 
 namespace torchdof {
-namespace TORCHDOF_SIMD {
 namespace {
 
 constexpr int AROUND = 2;  // pixels computed around a kernel: its negative values borrow from them
@@ -223,15 +222,15 @@ class Maker {
 };
 
 }  // namespace
+}  // namespace torchdof
 
-void make_kernels(const torchdof_spots &spots, int threads, float *const *out) {
-  std::vector<std::unique_ptr<Maker>> makers(std::max(threads, 1));
-  torchdof::parallel(threads, spots.count, nullptr, [&](int i, int thread) {
-    if (!makers[thread]) makers[thread].reset(new Maker(spots));
-    const size_t area = (size_t)(2 * spots.half[i] + 1) * (2 * spots.half[i] + 1);
-    for (int e = 0; e < spots.colours; e++) makers[thread]->make(i, e, out[i] + area * e);
+int32_t torchdof_kernels(const torchdof_spots *spots, int32_t threads, float *const *out) {
+  return torchdof::guarded([&] {
+    std::vector<std::unique_ptr<torchdof::Maker>> makers(std::max(threads, 1));
+    torchdof::parallel(threads, spots->count, nullptr, [&](int i, int thread) {
+      if (!makers[thread]) makers[thread].reset(new torchdof::Maker(*spots));
+      const size_t area = (size_t)(2 * spots->half[i] + 1) * (2 * spots->half[i] + 1);
+      for (int e = 0; e < spots->colours; e++) makers[thread]->make(i, e, out[i] + area * e);
+    });
   });
 }
-
-}  // namespace TORCHDOF_SIMD
-}  // namespace torchdof

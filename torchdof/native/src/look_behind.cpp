@@ -12,7 +12,6 @@
 #include "engine.h"
 
 namespace torchdof {
-namespace TORCHDOF_SIMD {
 namespace {
 
 constexpr float LEAST_VOTE = 1e-9f;  // smallest divisor
@@ -175,12 +174,12 @@ struct Behind {
 };
 
 }  // namespace
-
-void look_behind(const torchdof_level *levels, int count, int channels, const float *coc, int height, int width, int threads, float *out,
-                 const float *gradient, float *const *of_levels, float *of_coc) {
-  const Behind behind(levels, count, channels, height, width);
-  gradient ? behind.gradient(coc, gradient, threads, of_levels, of_coc) : behind.look(coc, threads, out);
-}
-
-}  // namespace TORCHDOF_SIMD
 }  // namespace torchdof
+
+int32_t torchdof_look_behind(const torchdof_level *levels, int32_t count, int32_t channels, const float *coc, int32_t height, int32_t width,
+                             int32_t threads, float *out, const float *gradient, float *const *of_levels, float *of_coc) {
+  return torchdof::guarded([&] {
+    const torchdof::Behind behind(levels, count, channels, height, width);
+    gradient ? behind.gradient(coc, gradient, threads, of_levels, of_coc) : behind.look(coc, threads, out);
+  });
+}

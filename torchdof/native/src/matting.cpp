@@ -3,7 +3,6 @@
 #include "engine.h"
 
 namespace torchdof {
-namespace TORCHDOF_SIMD {
 namespace {
 
 // Constants of render/matting.py, which gives their meanings, units and effects: mixed pixels, emitters.
@@ -530,5 +529,4 @@ void Job::add_background() {
   surfaces.independent = true;
 }
 
-}  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

@@ -5,7 +5,6 @@
 #include <numeric>
 
 namespace torchdof {
-namespace TORCHDOF_SIMD {
 namespace {
 
 // Constants of render/layer_cocs.py and render/plan.py, which give their meanings, units and effects.
@@ -70,8 +69,6 @@ vec dioptres_behind(vec z, float s) {
 // Radius above which a kernel is constant within the frame.
 float reach_of(int height, int width) { return 4.0f * std::max(height, width) + 4.0f; }
 
-}  // namespace
-
 void coc_of_depth(const float *depth, int64_t count, float scale, float nearest, float farthest, int threads, float *out) {
   constexpr int64_t PART = 1 << 15;
   torchdof::parallel(threads, (int)((count + PART - 1) / PART), nullptr, [&](int part, int) {
@@ -86,6 +83,8 @@ void coc_of_depth(const float *depth, int64_t count, float scale, float nearest,
     for (; i < end; i++) out[i] = coc_at(all(depth[i]))[0];
   });
 }
+
+}  // namespace
 
 // NaN is in focus, larger radii are cut to `reach`.
 double mean_change(const float *coc, int height, int width, int threads) {
@@ -175,5 +174,17 @@ std::vector<double> plan(const float *coc, int maps, int height, int width, doub
   return nodes;
 }
 
-}  // namespace TORCHDOF_SIMD
 }  // namespace torchdof
+
+int32_t torchdof_coc(const float *depth, int64_t count, float scale, float nearest, float farthest, int32_t threads, float *out) {
+  return torchdof::guarded([&] { torchdof::coc_of_depth(depth, count, scale, nearest, farthest, threads, out); });
+}
+
+int32_t torchdof_plan(const float *coc, int32_t maps, int32_t height, int32_t width, double *tolerance, int32_t threads,
+                      double *nodes, int32_t capacity, int32_t *count) {
+  return torchdof::guarded([&] {
+    const std::vector<double> planned = torchdof::plan(coc, maps, height, width, *tolerance, threads);
+    *count = (int32_t)planned.size();
+    if (*count <= capacity) memcpy(nodes, planned.data(), planned.size() * sizeof(double));
+  });
+}
