@@ -33,7 +33,7 @@ image.exr depth.npy --focus-m 2 --sheet ./out.exr     | out.exr: would be writte
 image.exr depth.npy --focus-m 2 -o out.gif            | cannot write files of type '.gif'
 shot.####.exr depth.npy -o o.#.exr                    | where is the focus? give --focus-m METRES or --focus-at X,Y
 image.exr depth.npy --focus-m near                    | --focus-m expects metres (2.0) or keyframes
-image.exr depth.npy --focus-m 1:2,5:3                 | out.exr: expected one place for the frame number
+image.exr depth.npy --focus-m 1:2,5:3                 | such as pull.##.png; ffmpeg joins frames
 image.exr depth.npy --focus-m 1:2,5:3 -o o.#.exr --sheet s.png | --sheet is of one picture
 image.exr depth.npy --focus-m 0.01                    | --focus-m must be longer than the focal length
 image.exr depth.npy --focus-at 3                      | --focus-at expects a pixel X,Y such as 320,200, got '3'

@@ -127,8 +127,8 @@ def coc_of(
 class Renderer:
     """Reads, renders and writes the frames of ``torchdof render``."""
 
-    def __init__(self, command: "Render", is_still: bool, is_animation: bool) -> None:
-        self.command, self.is_still, self.is_animation = command, is_still, is_animation
+    def __init__(self, command: "Render", is_still: bool) -> None:
+        self.command, self.is_still = command, is_still
         self.table, self.device = command.table_of(command.table), _device(command.device)
         self.notices = Notices(command.strict)
 
@@ -168,7 +168,6 @@ class Renderer:
         command, note = self.command, self.notices.note
         make_folder_of(out)
         write_image(out, picture, command.out_transfer, command.bits)
-        out = command.out if self.is_animation else out
         if command.sheet is not None:
             middle = {"depth: near is bright": depth_colours(frame.values)}
             if camera is None:

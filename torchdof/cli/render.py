@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import importlib.metadata
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -13,7 +12,6 @@ import click
 
 from ..io.atomic import check_writable
 from ..io.sequence import FramePattern, parse_frames
-from ..io.webp import write_animation
 from .command import Command, Group, Parsed, argument, numbers, option
 from .options import Accuracy, Blur, Scene, check_files, make_folder_of
 from .output import json_line, progress_bar
@@ -89,7 +87,7 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
 
         torchdof render shot.####.exr -o out.####.exr --focus-m 1:2,48:5.5 --f-number 2 --resume
 
-    A photograph with a focus pull; pull.webp would be one animation, 25 frames a second:
+    A photograph with a focus pull:
 
         torchdof render photo.jpg depth.png -o pull.##.png --focus-m 1:1,24:5
 
@@ -113,13 +111,11 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         images, depths, numbered = map(FramePattern.of, (self.image, self.depth, self.out))
         keys = (self.focus_m or []) if images is None else []
         is_single = images is None and len(keys) < 2
-        is_animation = images is None and not is_single and not numbered
         has_number = numbered and FramePattern.is_padded(self.out) and not FramePattern.is_padded(self.image)
         of_sequences = (images is None and (self.steady or depths)) or (is_single and (self.frames or has_number))
-        no_number = f"{self.out}: expected one place for the frame number, such as pull.##.png, or a .webp"
+        no_number = f"{self.out}: expected one place for the frame number, such as pull.##.png; ffmpeg joins frames"
         for is_wrong, problem in (
-            (is_animation and self.out.suffix.lower() != ".webp", no_number),
-            (is_animation and self.resume, "--resume is of frames; an animation is one file, so leave it out"),
+            (not is_single and not numbered, no_number),
             (self.sheet and not is_single, "--sheet is of one picture; leave it out where there are more"),
             (of_sequences, f"{self.image}: is a single image; for a sequence write it as shot.####.exr"),
             (
@@ -142,7 +138,7 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
             numbers = range(first, last + 1)
         if not numbers:
             raise FileNotFoundError(f"{self.image}: there are no such files")
-        target = None if is_single or is_animation else FramePattern(self.out)
+        target = None if is_single else FramePattern(self.out)
         outputs: dict[int, Path] = {}
         for n in numbers:
             outputs[n] = target.name(n) if target else self.out
@@ -173,7 +169,7 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
 
         is_guessed = images and self.depth_kind == "auto"  # a guess could differ from frame to frame
         command = dataclasses.replace(self, depth_kind="z") if is_guessed else self
-        renderer = Renderer(command, images is None, is_animation)
+        renderer = Renderer(command, images is None)
         if self.resume and len(existing) > len(done):
             again = f"{len(existing) - len(done)} of {len(outputs)} frames are rendered again"
             renderer.notices.note("again", f"{self.out}: {again}: {reason}")
@@ -193,14 +189,8 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
             values = steady.depth(whole.index(n))  # reads frame n last, so that it is still in the cache
             return dataclasses.replace(read_files(*sources(n)), values=values)
 
-        if not is_animation:
-            is_recorded = self.resume or not is_single or record.path.is_file()
-            return self._render_each(renderer, todo, read, record if is_recorded else None)
-        with tempfile.TemporaryDirectory() as folder:
-            todo = {n: Path(folder, f"{n}.webp") for n in todo}
-            self._render_each(renderer, todo, read, None)
-            make_folder_of(self.out)
-            write_animation(self.out, list(todo.values()))
+        is_recorded = self.resume or not is_single or record.path.is_file()
+        self._render_each(renderer, todo, read, record if is_recorded else None)
 
     def _render_each(
         self, renderer: "Renderer", files: Mapping[int, Path], read: "Callable[[int], Frame]", record: Record | None
