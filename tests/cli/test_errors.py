@@ -81,7 +81,7 @@ inspect image.exr depth.npy --focus-m 1:2,3:4    | --focus-m has keyframes but I
 tables nothing                                   | no blur table 'nothing'
 bench --focus-m 2                                | the built-in scene has its own camera and depth
 bench image.exr depth.npy --truth .              | leave IMAGE and DEPTH out
-bench image.exr depth.npy --out image.exr        | File exists
+bench image.exr depth.npy --out image.exr        | its folder cannot be made
 bench --truth . --out . --f-number 2             | with their own lens and depth
 bench --vignetting 0.4 --onnx                    | one kernel a layer
 bench image.exr depth.npy --views 4              | name its folder with --truth

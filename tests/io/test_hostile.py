@@ -189,7 +189,7 @@ NO_TARGETS: list[tuple[str, Any, str]] = [
     ("x.jpg", "half", r"a \.jpg file holds samples of 8, not half"),
     ("x.gif", None, "cannot write files of type '.gif'"),
     ("x", None, "cannot write a file without a type"),
-    ("missing/x.png", None, "there is no folder .*missing; make it first"),
+    ("file/x.png", None, "x.png: its folder cannot be made, because .*file is a file"),
     ("folder.png", None, r"folder\.png: is a folder"),
 ]
 
@@ -197,6 +197,7 @@ NO_TARGETS: list[tuple[str, Any, str]] = [
 @pytest.mark.parametrize(("name", "sample", "message"), NO_TARGETS)
 def test_a_target_that_cannot_be_written_is_named(name: str, sample: Any, message: str, tmp_path: Path) -> None:
     (tmp_path / "folder.png").mkdir()
+    (tmp_path / "file").touch()
     with pytest.raises((ValueError, OSError), match=message):
         write_image(tmp_path / name, tiny(), sample=sample)
 

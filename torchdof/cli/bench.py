@@ -7,7 +7,7 @@ import click
 
 from ..io.atomic import check_writable
 from .command import Command, Group, argument, option
-from .options import Blur, Scene, check_files, make_folder_of
+from .options import Blur, Scene, check_files
 from .output import Notices, json_line
 
 
@@ -70,7 +70,7 @@ class Bench(Scene, Blur, _Speed, _Accuracy, Command):
             raise ValueError("--degrade compares without the reference; leave --views out")
         from ..bench import accuracy
 
-        make_folder_of(self.out / "accuracy.csv")
+        check_writable(self.out / "accuracy.csv")
         accuracy.compare(self.truth, self.out, [] if self.degrade else self.views or [256], self.degrade, self.peer)
 
     def _measure_speed(self) -> None:
@@ -100,8 +100,6 @@ class Bench(Scene, Blur, _Speed, _Accuracy, Command):
             remarks = ["focus as stated"] * self.has_focus + remarks + [f"depth {frame.guess}"] * bool(frame.guess)
             remark = "blur as given" if camera is None else f"{camera!r}; {', '.join(remarks)}"
             scene = BenchScene(self.image.name, frame.picture.light, coc_px, remark, table)
-        if self.out is not None:
-            make_folder_of(self.out / "speed.csv")
         runtimes = ["onnxruntime"] * self.onnx + ["compiled"] * self.compiled
         rows = speed.compare(scene, self.repeat, Console(stderr=True), runtimes, self.scan)
         if self.as_json:

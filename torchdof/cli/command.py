@@ -17,6 +17,13 @@ import click
 _BASIC_HEADING = "Options"  # heading of the options that --help lists first
 
 
+def refuse(*problems: tuple[object, str]) -> None:
+    """Raises the message of the first problem that is there."""
+    for is_there, message in problems:
+        if is_there:
+            raise ValueError(message)
+
+
 class Group:
     """Base of all groups of options, and of commands."""
 
@@ -56,10 +63,12 @@ def argument(help: str, metavar: str, default: Any = ...) -> Any:
 class Parsed(click.ParamType):
     """The type of an option whose text ``parse`` reads. The message for a ``ValueError`` names the expected form."""
 
-    name = "text"
+    def __init__(self, metavar: str, expected: str, parse: Callable[[str], Any]) -> None:
+        self.name, self.expected, self.parse = metavar, expected, parse
 
-    def __init__(self, expected: str, parse: Callable[[str], Any]) -> None:
-        self.expected, self.parse = expected, parse
+    def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:
+        """The name of the value in ``--help``."""
+        return self.name
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Click's conversion of a text."""
@@ -70,17 +79,16 @@ class Parsed(click.ParamType):
             raise ValueError(f"{option_name} expects {self.expected}, got {reprlib.repr(value)}") from None
 
 
-def numbers(text: str, count: int | None = None) -> tuple[float, ...]:
-    """Reads ``count`` numbers (None: any count) separated by commas."""
-    values = tuple(map(float, text.split(",")))
-    if count not in (None, len(values)):
-        raise ValueError
-    return values
+def numbers(count: int | None = None) -> Callable[[str], tuple[float, ...]]:
+    """A reader of ``count`` numbers (None: any count) separated by commas."""
 
+    def read(text: str) -> tuple[float, ...]:
+        values = tuple(map(float, text.split(",")))
+        if count not in (None, len(values)):
+            raise ValueError
+        return values
 
-def pair(text: str) -> tuple[float, ...]:
-    """Reads two numbers separated by a comma."""
-    return numbers(text, 2)
+    return read
 
 
 def number_or(*words: str) -> Callable[[str], float | str]:

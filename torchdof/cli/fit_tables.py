@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from torchdof import BlurTable, blur_by_coc
-from torchdof.cli.options import make_folder_of
 from torchdof.cli.output import json_line, progress_bar
 from torchdof.fit.lens import trace
 from torchdof.fit.lens.lens import RGB_UM, Lens
@@ -164,7 +163,6 @@ def _print_fit(console: Console, captures: Captures, result: TableFit) -> None:
 
 def _write(console: Console, table: BlurTable, target: Path) -> None:
     """Writes a table and prints its path."""
-    make_folder_of(target)
     table.save(target)
     console.print(f"{target}: {table!r}")
 

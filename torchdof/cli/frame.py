@@ -26,7 +26,7 @@ from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import same_aspect, stretch
 from .lens import Area, Lens
-from .options import Scene, make_folder_of
+from .options import Scene
 from .output import Notices, print_result
 
 if TYPE_CHECKING:
@@ -166,7 +166,6 @@ class Renderer:
     ) -> None:
         """Writes the picture, whole or not at all, and its sheet, and prints notes and one line."""
         command, note = self.command, self.notices.note
-        make_folder_of(out)
         write_image(out, picture, command.out_transfer, command.bits)
         if command.sheet is not None:
             middle = {"depth: near is bright": depth_colours(frame.values)}
@@ -174,7 +173,6 @@ class Renderer:
                 middle = {"blur radius: near orange, far blue": coc_colours(coc_px)}
             panels = {"before": frame.picture.light, **middle, "after": picture.light}
             panels = {name: shrunk(p.cpu(), _PANEL_PX).expand(-1, 3, -1, -1) for name, p in panels.items()}
-            make_folder_of(command.sheet)
             write_sheet(command.sheet, panels)
         (height, width), largest_px = coc_px.shape[-2:], float(coc_px.abs().max())
         if frame.guess:

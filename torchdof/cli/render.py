@@ -12,8 +12,8 @@ import click
 
 from ..io.atomic import check_writable
 from ..io.sequence import FramePattern, parse_frames
-from .command import Command, Group, Parsed, argument, numbers, option
-from .options import Accuracy, Blur, Scene, check_files, make_folder_of
+from .command import Command, Group, Parsed, argument, numbers, option, refuse
+from .options import Accuracy, Blur, Scene, check_files
 from .output import json_line, progress_bar
 from .resume import Record
 
@@ -36,8 +36,7 @@ class _Effects(Group):
 
     attention: tuple[float, float, float] | None = option(
         "Where the viewer looks, in pixels from the top left: elsewhere a draft's tolerance is enough.",
-        metavar="X,Y,RADIUS",
-        type=Parsed("X,Y,RADIUS in pixels such as 320,200,80", lambda text: numbers(text, 3)),
+        type=Parsed("X,Y,RADIUS", "X,Y,RADIUS in pixels such as 320,200,80", numbers(3)),
     )
     lights: float = option(
         "Make lamps that a photograph clipped at white brighter by up to this many stops, such as 3.",
@@ -61,7 +60,7 @@ class _Files(Group):
     layer: str | None = option("Layer or part of an EXR that is the image.")
     sheet: Path | None = option("Also write the image, its depth and the result side by side to this file.")
     frames: tuple[int, int] | None = option(
-        "Part of a sequence.", metavar="FIRST-LAST", type=Parsed("first-last, such as 1-48", parse_frames)
+        "Part of a sequence.", type=Parsed("FIRST-LAST", "first-last, such as 1-48", parse_frames)
     )
     steady: bool = option("Filter depth of a sequence along time, where neither image nor depth moved.", False)
     resume: bool = option("Render only frames that are missing, cut short, or older than files or options.", False)
@@ -114,18 +113,13 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         has_number = numbered and FramePattern.is_padded(self.out) and not FramePattern.is_padded(self.image)
         of_sequences = (images is None and (self.steady or depths)) or (is_single and (self.frames or has_number))
         no_number = f"{self.out}: expected one place for the frame number, such as pull.##.png; ffmpeg joins frames"
-        for is_wrong, problem in (
+        refuse(
             (not is_single and not numbered, no_number),
             (self.sheet and not is_single, "--sheet is of one picture; leave it out where there are more"),
             (of_sequences, f"{self.image}: is a single image; for a sequence write it as shot.####.exr"),
-            (
-                images and self.blur,
-                "--blur would open the lens anew in each frame of a sequence; give --f-number",
-            ),
+            (images and self.blur, "--blur would open the lens anew in each frame of a sequence; give --f-number"),
             (self.steady and self.depth_kind == "coc", "--steady filters depth in metres; --depth-kind coc has none"),
-        ):
-            if is_wrong:
-                raise ValueError(problem)
+        )
 
         def sources(n: int) -> tuple[Path, Path | None]:
             return images.name(n) if images else self.image, depths.name(n) if depths else self.depth
@@ -138,10 +132,9 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
             numbers = range(first, last + 1)
         if not numbers:
             raise FileNotFoundError(f"{self.image}: there are no such files")
-        target = None if is_single else FramePattern(self.out)
         outputs: dict[int, Path] = {}
         for n in numbers:
-            outputs[n] = target.name(n) if target else self.out
+            outputs[n] = self.out if is_single else FramePattern(self.out).name(n)
             check_files(*sources(n), outputs[n], self.sheet)
         whole = list(numbers)  # frames of the sequence, each of which may depend on those before it
         if images and self.steady:
@@ -168,8 +161,7 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         from .frame import Renderer
 
         is_guessed = images and self.depth_kind == "auto"  # a guess could differ from frame to frame
-        command = dataclasses.replace(self, depth_kind="z") if is_guessed else self
-        renderer = Renderer(command, images is None)
+        renderer = Renderer(dataclasses.replace(self, depth_kind="z") if is_guessed else self, images is None)
         if self.resume and len(existing) > len(done):
             again = f"{len(existing) - len(done)} of {len(outputs)} frames are rendered again"
             renderer.notices.note("again", f"{self.out}: {again}: {reason}")
@@ -181,10 +173,10 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
             frame = read_files(*sources(whole[place]))
             return frame.picture.pixels, frame.values
 
-        steady = SteadyFrames(pixels_and_depth)
+        steady = SteadyFrames(pixels_and_depth) if images and self.steady else None
 
         def read(n: int) -> "Frame":
-            if not (images and self.steady):
+            if steady is None:
                 return read_files(*sources(n))
             values = steady.depth(whole.index(n))  # reads frame n last, so that it is still in the cache
             return dataclasses.replace(read_files(*sources(n)), values=values)
@@ -200,25 +192,23 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         The record is written before the first frame, but after it is rendered: an error in it leaves no file. Before
         each later frame it is read: the run ends if another one has begun to write other frames of these names.
         """
-        numbers = list(files)
+        count = len(files)
         with (
-            progress_bar(f"rendering {self.out.name}", len(files) if len(files) > 1 else None) as update,
-            ThreadPoolExecutor(1) as reader,
-            ThreadPoolExecutor(1) as writer,
+            progress_bar(f"rendering {self.out.name}", count if count > 1 else None) as update,
+            ThreadPoolExecutor(2) as pool,
         ):
-            reading, written = reader.submit(read, numbers[0]), writer.submit(lambda: None)
+            frames = (pool.submit(read, n) for n in files)
+            reading, writing = next(frames), pool.submit(lambda: None)
             try:
-                for k, n in enumerate(numbers):
-                    if len(files) > 1:
-                        update(f"frame {k + 1} of {len(files)}", k)
+                for k, (n, out) in enumerate(files.items()):
+                    if count > 1:
+                        update(f"frame {k + 1} of {count}", k)
                     frame = reading.result()
-                    if k + 1 < len(numbers):
-                        reading = reader.submit(read, numbers[k + 1])
-                    write = renderer.render(frame, files[n], n)
-                    written.result()
+                    reading = next(frames, reading)  # starts to read the next frame
+                    write = renderer.render(frame, out, n)
+                    writing.result()
                     if record is not None:
-                        make_folder_of(files[n])
                         record.write(is_first=k == 0)
-                    written = writer.submit(write)  # Ctrl-C does not stop this thread
+                    writing = pool.submit(write)  # Ctrl-C does not stop this thread
             finally:  # a rendered frame is written even if the next one fails
-                written.result()
+                writing.result()

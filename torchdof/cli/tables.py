@@ -8,7 +8,7 @@ import click
 
 from ..io.atomic import check_writable
 from .command import Command, argument, option
-from .options import ApertureOptions, make_folder_of
+from .options import ApertureOptions
 from .output import print_result
 
 if TYPE_CHECKING:
@@ -65,7 +65,6 @@ class Tables(ApertureOptions, Command):
             return
         widest = max(panel.shape[-1] for panel in panels.values())
         panels = {name: functional.pad(panel, (0, widest - panel.shape[-1])) for name, panel in panels.items()}
-        make_folder_of(self.out)
         write_sheet(self.out, panels, rows=[f"{coc:+g} px" for coc in _COC_PX])
         if not self.as_json:
             click.echo(f"{self.out}: a row a blur radius in an image of {_WIDTH} px; negative is in front of focus")

@@ -17,13 +17,12 @@ __all__ = ["atomic_file", "check_writable", "exit_on_signals", "write_text"]
 
 @contextlib.contextmanager
 def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary file in the folder of ``path``, renamed to ``path`` at the end, or removed on any error."""
+    """A temporary file in the folder of ``path``, which is made; renamed to ``path`` at the end, removed on errors."""
     check_writable(path)
     target = Path(os.path.realpath(path))
-    if not target.parent.is_dir():
-        raise FileNotFoundError(f"{path}: there is no folder {target.parent}; make it first")
     if target.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; name a file in it")
+    target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{uuid.uuid4().hex}.part{target.suffix}")
     with exit_on_signals():
         try:
@@ -36,11 +35,13 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Refuses a file that is read-only, or that lies in a read-only folder or in a missing folder within one."""
+    """Refuses a file that is read-only, or whose folder is read-only or cannot be made."""
     target = Path(os.path.realpath(path))
     if target.is_file() and not os.access(target, os.W_OK):
         raise PermissionError(f"{path}: is read-only; make it writable or name another file")
     folder = next(parent for parent in target.parents if parent.exists())
+    if not folder.is_dir():
+        raise NotADirectoryError(f"{path}: its folder cannot be made, because {folder} is a file")
     if not os.access(folder, os.W_OK):
         raise PermissionError(f"{path}: may not write to the folder {folder}")
 
