@@ -96,7 +96,6 @@ def test_a_frame_that_cannot_be_read_or_written_stops_the_sequence_and_is_named(
         "render broken.exr depth.npy -o x.exr --focus-m 2 --sheet kept/x.png",
         "render shot.####.exr broken.exr -o kept/more/x.####.exr --focus-m 2",
         "inspect broken.exr depth.npy -o kept/x.png",
-        "tables nowhere -o kept/x.png",
         "bench --table nowhere --out kept/x",
         "bench broken.exr depth.npy --out kept",
         "fit nowhere -o kept/x.json",

@@ -91,7 +91,7 @@ class Bench(Scene, Blur, _Speed, _Accuracy, Command):
         from ..bench.measurement import BenchScene, shipped
         from .frame import coc_of, read_frame
 
-        table = self.table_of(self.table)
+        table = self.blur_table()
         if self.image is None:
             scene = dataclasses.replace(shipped(), table=table)
         else:

@@ -129,7 +129,7 @@ class Renderer:
 
     def __init__(self, command: "Render", is_still: bool) -> None:
         self.command, self.is_still = command, is_still
-        self.table, self.device = command.table_of(command.table), _device(command.device)
+        self.table, self.device = command.blur_table(), _device(command.device)
         self.notices = Notices(command.strict)
 
     def read(self, image: Path, depth: Path | None) -> Frame:

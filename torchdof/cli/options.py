@@ -116,9 +116,10 @@ class Scene(Lens, DepthMap):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ApertureOptions(Group):
+class Blur(Group):
     """Blur."""
 
+    table: str = option("disc, gaussian, a shipped table such as sato_j15, or a JSON file.", "disc", basic=True)
     blades: int = option("Aperture blades, from 3; 0 is a round lens.", 0)
     rotation: float = option("Degrees by which blades or image are turned, counter-clockwise.", 0.0)
     curvature: float = option("Of the blades: 0 straight, 1 a circle.", 0.0)
@@ -135,25 +136,17 @@ class ApertureOptions(Group):
             (turns_nothing, "--rotation turns blades or an image; give --blades or --aperture too"),
         )
 
-    def table_of(self, name: str) -> "BlurTable":
-        """A table by name or by path of a JSON file; an aperture of these options replaces its own."""
+    def blur_table(self) -> "BlurTable":
+        """The table; an aperture of these options replaces its own."""
         from ..io.images import read_image
         from ..optics.aperture import Aperture
-        from ..optics.blur_table import BlurTable
 
-        table = getattr(BlurTable, name)() if name in ("disc", "gaussian") else BlurTable.load(name)
-        if not self.given(ApertureOptions):
+        table = named_table(self.table)
+        if not self.given(Blur) - {"table"}:
             return table
         mask = None if self.aperture is None else read_image(self.aperture).light[0].mean(0)
         aperture = Aperture(self.blades, self.rotation, self.curvature, self.squeeze, mask, self.vignetting)
         return table.with_aperture(aperture)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Blur(ApertureOptions):
-    """Blur."""
-
-    table: str = option("disc, gaussian, a shipped table such as sato_j15, or a JSON file.", "disc", basic=True)
 
     def files(self) -> list[Path]:
         """The table and the picture of the opening, if they are files."""
@@ -182,6 +175,13 @@ class Accuracy(Group):
         """These options as arguments of :class:`torchdof.DepthOfField`."""
         arguments = {"tolerance": self.tolerance, "occlusion": not self.no_occlusion, "method": self.method}
         return arguments | ({"depth_edges": self.depth_edges.replace("-", " ")} if self.depth_edges else {})
+
+
+def named_table(name: str) -> "BlurTable":
+    """A table by name or by path of a JSON file."""
+    from ..optics.blur_table import BlurTable
+
+    return getattr(BlurTable, name)() if name in ("disc", "gaussian") else BlurTable.load(name)
 
 
 def check_files(image: Path, depth: Path | None, *outputs: Path | None) -> None:
