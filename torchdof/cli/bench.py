@@ -11,7 +11,6 @@ from .options import Blur, Scene, check_files
 from .output import Notices, json_line
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class _Speed(Group):
     """Speed."""
 
@@ -21,7 +20,6 @@ class _Speed(Group):
     scan: bool = option("Also show how cost grows with radius and frame size.", False)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class _Accuracy(Group):
     """Accuracy."""
 
@@ -35,7 +33,6 @@ class _Accuracy(Group):
     peer: tuple[Path, ...] = option("A Python file with another renderer, blur(image, coc_px); may be repeated.", ())
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Bench(Scene, Blur, _Speed, _Accuracy, Command):
     """Measure speed against error on your own scene, or accuracy where the truth is known.
 

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Literal
 
 import click
+from typing_extensions import dataclass_transform
 
 _BASIC_HEADING = "Options"  # heading of the options that --help lists first
 
@@ -22,18 +23,6 @@ def refuse(*problems: tuple[object, str]) -> None:
     for is_there, message in problems:
         if is_there:
             raise ValueError(message)
-
-
-class Group:
-    """Base of all groups of options, and of commands."""
-
-    def __post_init__(self) -> None:
-        """Refuses options that contradict each other."""
-
-    def given(self, *groups: type[Any]) -> set[str]:
-        """Names of the options of some groups that are not at their default."""
-        fields = [field for group in groups for field in dataclasses.fields(group)]
-        return {field.name for field in fields if getattr(self, field.name) != field.default}
 
 
 def option(
@@ -48,16 +37,31 @@ def option(
     return dataclasses.field(**({} if default is ... else {"default": default}), metadata=metadata)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+def argument(help: str, metavar: str, default: Any = ...) -> Any:
+    """Declares a dataclass field as a positional argument, which a default makes optional."""
+    return option(help, default, metavar=metavar, names=("argument",))
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(option, argument))
+class Group:
+    """Base of all groups of options, and of commands; each is a frozen dataclass."""
+
+    def __init_subclass__(cls) -> None:
+        dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+
+    def __post_init__(self) -> None:
+        """Refuses options that contradict each other."""
+
+    def given(self, *groups: type[Any]) -> set[str]:
+        """Names of the options of some groups that are not at their default."""
+        fields = [field for group in groups for field in dataclasses.fields(group)]
+        return {field.name for field in fields if getattr(self, field.name) != field.default}
+
+
 class Command(Group):
     """Options."""
 
     as_json: bool = option("Print results as JSON, for programs: one object a line.", False, names=("--json",))
-
-
-def argument(help: str, metavar: str, default: Any = ...) -> Any:
-    """Declares a dataclass field as a positional argument, which a default makes optional."""
-    return option(help, default, metavar=metavar, names=("argument",))
 
 
 class Parsed(click.ParamType):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -18,7 +17,6 @@ def _wavelengths(text: str) -> tuple[float, ...]:
     return () if text == "rgb" else numbers()(text)
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Target(Group):
     """With the printed target."""
 
@@ -27,7 +25,6 @@ class _Target(Group):
     square_mm: float = option("Side of the target's square as printed.", 100.0)
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Photographs(Group):
     """From photographs."""
 
@@ -45,7 +42,6 @@ class _Photographs(Group):
     root: Path | None = option("Folder that capture.toml and all pictures must lie in. Default: anywhere.")
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Lens(Group):
     """From a lens prescription."""
 
@@ -66,7 +62,6 @@ class _Lens(Group):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class Fit(_Photographs, _Target, _Lens, Command):
     """Make a blur table from photographs of a dot, or from a lens prescription.
 

@@ -15,6 +15,7 @@ from ..depth.inspect import coc_colours, depth_colours, tint_focus
 from ..depth.kinds import depth_from_values
 from ..depth.relative import from_relative
 from ..depth.sanity import Mistake, coc_mistakes, depth_mistakes
+from ..io.decode import errors_named
 from ..io.highlights import expand_highlights
 from ..io.images import Picture, read_image, read_values, write_image
 from ..io.sheet import shrunk, write_sheet
@@ -25,6 +26,7 @@ from ..optics.camera import Camera
 from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import same_aspect, stretch
+from .command import refuse
 from .lens import Area, Lens
 from .options import Scene
 from .output import Notices, print_result
@@ -61,7 +63,7 @@ class Frame:
 
 def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = False, **encoding: Any) -> Frame:
     """Reads an image, with arguments of ``read_image``, and its depth; ``holes`` that no option fills stay NaN."""
-    source, guess, picture, fill = depth or image, "", read_image(image, **encoding), scene.fill_depth
+    source, guess, picture = depth or image, "", read_image(image, **encoding)
     height, width = picture.pixels.shape[-2:]
     is_exr = image.suffix.lower() == ".exr"
     x, y, full_x, full_y, *size = (picture.window if is_exr else None) or (0, 0, 0, 0, width, height)
@@ -75,30 +77,28 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH{hint}")
     if scene.depth_kind == "auto":
         is_metric = bool(scene.given(Lens) & {"focus_m", "focus_range", "aperture_radius_m"})
+        stated_fill = scene.fill_depth
         scene, guess = scene.guessed(values, source, is_metric)
-        scene = dataclasses.replace(scene, fill_depth=fill if holes else scene.fill_depth)
+        scene = dataclasses.replace(scene, fill_depth=stated_fill) if holes else scene
     kind: Any = scene.depth_kind
-    given: dict[str, Any] = {"unknown": scene.depth_unknown}
     rows, columns = values.shape[-2:]
-    if kind == "coc" and (rows, columns) != (height, width):
-        problem = f"coc is {columns} x {rows} pixels but the image is {width} x {height}; they must be the same"
-        raise ValueError(f"{source}: {problem}")
-    place: Any = (...,)
-    if kind == "distance":
-        centred_width = width + abs(area.width - 2 * area.x - width)
-        given["fov_x_deg"] = scene.view_deg(picture.metadata, centred_width, area)
-    try:
+    with errors_named(source):
+        if kind == "coc" and (rows, columns) != (height, width):
+            sizes = f"{columns} x {rows} pixels but the image is {width} x {height}"
+            raise ValueError(f"coc is {sizes}; they must be the same")
         same_aspect(picture.pixels, values)
         stretched = stretch(picture.pixels, values)
+        given: dict[str, Any] = {"unknown": scene.depth_unknown}
+        place: Any = (...,)
+        if kind == "distance":
+            centred_width = width + abs(area.width - 2 * area.x - width)
+            given["fov_x_deg"] = scene.view_deg(picture.metadata, centred_width, area)
+            values, place = area.centred(values, (height, width))
         if kind == "relative":
             given["value_range"] = scene.value_range
             values = from_relative(values, *scene.ends_m, scene.relative_kind or "disparity", **given)
         else:
-            if kind == "distance":
-                values, place = area.centred(values, (height, width))
             values = depth_from_values(values, kind, scale=scene.depth_scale, offset=scene.depth_offset, **given)
-    except ValueError as error:
-        raise ValueError(f"{source}: {error}") from None
     values, filled = values if kind == "coc" else at_size_of(picture.pixels, values[place]), 0
     fill_by: Any = scene.fill_depth
     if fill_by is not None or not holes:
@@ -120,6 +120,8 @@ def coc_of(
     camera, remarks = scene.camera(frame, number, is_still)
     coc_px = frame.area.coc_px(camera, values)
     camera.refuse_overflow(coc_px, values)
+    if frame.guess:
+        notices.note("guess", f"{frame.name}: {frame.guess}")
     notices.warn(frame.name, frame.mistakes(camera))
     return coc_px, camera, remarks + frame.remarks
 
@@ -146,11 +148,9 @@ class Renderer:
             pixels = tint_focus(pixels, coc_px, picture.has_alpha)
             picture = dataclasses.replace(picture, channels=("R", "G", "B", "A")[: pixels.shape[1]])
         else:
-            if command.lights and picture.sample in ("half", "float"):
-                raise ValueError(
-                    f"--lights is for photographs of 8 or 16 bits; leave it out for {picture.sample} numbers"
-                )
             if command.lights:
+                is_float, sample = picture.sample in ("half", "float"), picture.sample
+                refuse((is_float, f"--lights is for photographs of 8 or 16 bits; leave it out for {sample} numbers"))
                 pixels = torch.cat([expand_highlights(pixels[:, :colours], command.lights), pixels[:, colours:]], 1)
             x, y, radius_px = command.attention or (0.0, 0.0, 0.0)
             attention = (x - frame.area.x, y - frame.area.y, radius_px) if command.attention else None
@@ -175,8 +175,6 @@ class Renderer:
             panels = {name: shrunk(p.cpu(), _PANEL_PX).expand(-1, 3, -1, -1) for name, p in panels.items()}
             write_sheet(command.sheet, panels)
         (height, width), largest_px = coc_px.shape[-2:], float(coc_px.abs().max())
-        if frame.guess:
-            note("guess", f"{frame.name}: {frame.guess}")
         if camera is not None and largest_px < _VISIBLE_PX:
             advice = "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
             if largest_px:

@@ -1,6 +1,5 @@
 """``torchdof inspect``: reports on a depth map, its blur by a camera, and likely mistakes."""
 
-import dataclasses
 from pathlib import Path
 
 from ..io.atomic import check_writable
@@ -9,7 +8,6 @@ from .options import Scene, check_files
 from .output import Notices, print_result
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Inspect(Scene, Command):
     """Report on a depth map and its blur by a camera, before anything is rendered.
 

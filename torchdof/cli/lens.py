@@ -3,7 +3,6 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
@@ -69,7 +68,6 @@ def _equivalent(text: str) -> tuple[float, ...]:
     return numbers(2)(re.sub(r"\s*(mm)?\s*[, ]\s*(f/?)?", ",", text, count=1))
 
 
-@dataclass(frozen=True, kw_only=True)
 class Sensor(Group):
     """Focus and lens."""
 
@@ -80,7 +78,6 @@ class Sensor(Group):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class Lens(Sensor):
     """Focus and lens."""
 

@@ -2,7 +2,7 @@
 
 import math
 import os
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -21,7 +21,6 @@ _INTEGER_TYPES = (".png", ".jpg", ".jpeg", ".webp")  # types that hold whole num
 _RENDER_TYPES = (".exr", ".tif", ".tiff")  # types whose floats are taken for distances
 
 
-@dataclass(frozen=True, kw_only=True)
 class DepthMap(Group):
     """Depth map."""
 
@@ -105,7 +104,6 @@ class DepthMap(Group):
         return replace(options, relative_kind=guess.relative_kind), message
 
 
-@dataclass(frozen=True, kw_only=True)
 class Scene(Lens, DepthMap):
     """Options for focus, lens and depth map, for commands that take an image and its depth."""
 
@@ -115,7 +113,6 @@ class Scene(Lens, DepthMap):
         refuse((has_lens, "--depth-kind coc is the blur itself and takes no camera; leave focus and lens out"))
 
 
-@dataclass(frozen=True, kw_only=True)
 class Blur(Group):
     """Blur."""
 
@@ -153,7 +150,6 @@ class Blur(Group):
         return [Path(name) for name in (self.table, self.aperture) if name is not None and Path(name).is_file()]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Accuracy(Group):
     """Blur."""
 

@@ -30,7 +30,6 @@ Encoding = Literal["linear", "srgb"]
 _NOT_OF_FRAMES = ("out", "sheet", "frames", "resume", "strict", "device", "as_json")  # options that change no frame
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class _Effects(Group):
     """Blur."""
 
@@ -50,7 +49,6 @@ class _Effects(Group):
     device: str = option("auto, cpu, cuda, cuda:1, ...", "auto")
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class _Files(Group):
     """Files and frames."""
 
@@ -66,7 +64,6 @@ class _Files(Group):
     resume: bool = option("Render only frames that are missing, cut short, or older than files or options.", False)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
     """Blur IMAGE by its DEPTH as a lens would.
 

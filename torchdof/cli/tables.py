@@ -1,13 +1,10 @@
 """``torchdof tables``: lists blur tables."""
 
-from dataclasses import dataclass
-
 from .command import Command, argument
 from .options import named_table
 from .output import print_result
 
 
-@dataclass(frozen=True, kw_only=True)
 class Tables(Command):
     """List blur tables: name, family, number of distances, opening and source.
 
