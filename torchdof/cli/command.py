@@ -65,10 +65,10 @@ class Command(Group):
 
 
 class Parsed(click.ParamType):
-    """The type of an option whose text ``parse`` reads. The message for a ``ValueError`` names the expected form."""
+    """The type of an option whose text ``parse`` reads. The message for a ``ValueError`` states form and example."""
 
-    def __init__(self, metavar: str, expected: str, parse: Callable[[str], Any]) -> None:
-        self.name, self.expected, self.parse = metavar, expected, parse
+    def __init__(self, form: str, parse: Callable[[str], Any], example: str = "") -> None:
+        self.name, self.parse, self.example = form, parse, example
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:
         """The name of the value in ``--help``."""
@@ -79,8 +79,8 @@ class Parsed(click.ParamType):
         try:
             return self.parse(value)
         except ValueError:
-            option_name = param.opts[0] if param else self.name
-            raise ValueError(f"{option_name} expects {self.expected}, got {reprlib.repr(value)}") from None
+            expected = f"{self.name} such as {self.example}" if self.example else self.name
+            raise ValueError(f"{param and param.opts[0]} expects {expected}, got {reprlib.repr(value)}") from None
 
 
 def numbers(count: int | None = None) -> Callable[[str], tuple[float, ...]]:

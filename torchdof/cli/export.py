@@ -32,7 +32,7 @@ class _Graph(Group):
     )
     size: tuple[int, int] | None = option(
         "Width and height of the only frame, for --layout whole and runtimes that need fixed sizes.",
-        type=Parsed("WxH", "a width and a height in pixels, such as 1920x1080", _size),
+        type=Parsed("WxH", _size, "1920x1080"),
     )
     opset: int = option("ONNX operator set.", 20)
 

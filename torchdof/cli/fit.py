@@ -54,11 +54,11 @@ class _Lens(Group):
     )
     field: tuple[float, ...] | None = option(
         "One table across the field, of spots at these distances from the middle; to 21.6 for full frame.",
-        type=Parsed("0,MM,MM,...", "mm from the middle of the frame, rising from 0, like 0,7,14,21.6", numbers()),
+        type=Parsed("0,MM,MM,...", numbers(), "0,7,14,21.6"),
     )
     wavelengths: tuple[float, ...] | None = option(
-        "One table a colour: rgb, or micrometres like 0.65,0.55,0.45; for lenses with Abbe numbers.",
-        type=Parsed("rgb|UM,UM,...", "rgb, or micrometres like 0.65,0.55,0.45", _wavelengths),
+        "One table a colour, of wavelengths in micrometres; for lenses with Abbe numbers.",
+        type=Parsed("rgb|UM,UM,...", _wavelengths, "0.65,0.55,0.45"),
     )
 
 

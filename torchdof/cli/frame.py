@@ -152,14 +152,14 @@ class Renderer:
                 is_float, sample = picture.sample in ("half", "float"), picture.sample
                 refuse((is_float, f"--lights is for photographs of 8 or 16 bits; leave it out for {sample} numbers"))
                 pixels = torch.cat([expand_highlights(pixels[:, :colours], command.lights), pixels[:, colours:]], 1)
-            x, y, radius_px = command.attention or (0.0, 0.0, 0.0)
-            attention = (x - frame.area.x, y - frame.area.y, radius_px) if command.attention else None
+            attention = command.attention
+            if attention is not None:
+                attention = (attention[0] - frame.area.x, attention[1] - frame.area.y, attention[2])
             table = _with_alpha(self.table) if picture.has_alpha else self.table
             with torch.no_grad():
                 pixels = blur_by_coc(pixels, coc_px, table=table, attention=attention, **command.arguments())
         frame, picture = dataclasses.replace(frame, remarks=remarks), dataclasses.replace(picture, pixels=pixels)
-        seconds = time.perf_counter() - start
-        return functools.partial(self.write, out, frame, picture, coc_px, camera, seconds)
+        return functools.partial(self.write, out, frame, picture, coc_px, camera, time.perf_counter() - start)
 
     def write(
         self, out: Path, frame: Frame, picture: Picture, coc_px: Tensor, camera: Camera | None, seconds: float
@@ -168,19 +168,18 @@ class Renderer:
         command, note = self.command, self.notices.note
         write_image(out, picture, command.out_transfer, command.bits)
         if command.sheet is not None:
-            middle = {"depth: near is bright": depth_colours(frame.values)}
+            caption, colours = "depth: near is bright", depth_colours(frame.values)
             if camera is None:
-                middle = {"blur radius: near orange, far blue": coc_colours(coc_px)}
-            panels = {"before": frame.picture.light, **middle, "after": picture.light}
-            panels = {name: shrunk(p.cpu(), _PANEL_PX).expand(-1, 3, -1, -1) for name, p in panels.items()}
-            write_sheet(command.sheet, panels)
+                caption, colours = "blur radius: near orange, far blue", coc_colours(coc_px)
+            panels = {"before": frame.picture.light, caption: colours, "after": picture.light}
+            small = {name: shrunk(p.cpu(), _PANEL_PX).expand(-1, 3, -1, -1) for name, p in panels.items()}
+            write_sheet(command.sheet, small)
         (height, width), largest_px = coc_px.shape[-2:], float(coc_px.abs().max())
         if camera is not None and largest_px < _VISIBLE_PX:
-            advice = "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
-            if largest_px:
-                advice = f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; open the lens wider, "
-                advice += "with a smaller --f-number, a larger --blur, or a larger --aperture-radius-m"
-            note("little blur", f"{out}: {advice}")
+            wider = "open the lens wider, with a smaller --f-number, a larger --blur, or a larger --aperture-radius-m"
+            little = f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; {wider}"
+            none = "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
+            note("little blur", f"{out}: {little if largest_px else none}")
         has_exif, suffix = any(name.startswith("Exif:") for name in frame.picture.metadata), out.suffix.lower()
         if has_exif and suffix in _WITHOUT_EXIF:
             note("exif", f"{out}: EXIF data are lost in a {suffix} file; write .jpg, .png or .tif to keep them")
@@ -201,11 +200,11 @@ class Renderer:
             "assumed": frame.remarks,
             **{"width": width, "height": height, "seconds": seconds},
         }
-        blur = f"{facts['table']}, {options.method}"
+        shown = "focus shown: near orange, sharp green, far blue"
         words = [
             _inside(camera),
             f"blur radius up to {largest_px:.1f} px",
-            "focus shown: near orange, sharp green, far blue" if command.show_focus else blur,
+            shown if command.show_focus else f"{facts['table']}, {options.method}",
             _inside(table.aperture),
             "" if options.occlusion else "no occlusion",
             f"lights up to {command.lights:g} stops above white" if command.lights else "",

@@ -83,29 +83,29 @@ class Lens(Sensor):
 
     focus_m: list[tuple[int, float]] | None = option(
         "Distance in focus (inf allowed), or keyframes frame:metres such as 1:2.0,48:5.5, linear in 1/distance.",
-        type=Parsed("METRES", "metres (2.0) or keyframes frame:metres (1:2.0,48:5.5), all positive", parse_focus),
+        type=Parsed("METRES", parse_focus, "2.0, or keyframes frame:metres such as 1:2.0,48:5.5, all positive"),
         basic=True,
     )
     focus_at: tuple[float, float] | None = option(
         "Focus on the surface at this pixel from the top left; by default as the file states, else on the subject.",
-        type=Parsed("X,Y", "a pixel X,Y such as 320,200", numbers(2)),
+        type=Parsed("X,Y", numbers(2), "320,200"),
         basic=True,
     )
     focus_range: tuple[float, float] | None = option(
-        "In focus from NEAR to FAR metres, blurred beyond; instead of --focus-m.",
-        type=Parsed("NEAR,FAR", "two numbers such as 1.5,2.2", numbers(2)),
+        "In focus between two distances in metres; not with --focus-m.",
+        type=Parsed("NEAR,FAR", numbers(2), "1.5,2.2"),
     )
     tilt: float = option("Degrees by which the lens is tilted down: focus comes nearer towards the bottom.", 0.0)
     swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)
     f_number: float | None = option("Smaller is blurrier.", basic=True)
     blur: float | None = option(
         "Open the lens until the largest blur radius is this share of the width, such as 2%; instead of --f-number.",
-        type=Parsed("SHARE%", "a share of the picture's width, above 0 and at most 50 %, such as 2%", _width_fraction),
+        type=Parsed("SHARE%", _width_fraction, "2%, above 0 and at most 50%"),
         basic=True,
     )
     equivalent: tuple[float, float] | None = option(
         "Full-frame lens that the picture is taken to be from, such as 85mm,1.4.",
-        type=Parsed("MM,F", "a focal length and an f-number such as 85mm,1.4", _equivalent),
+        type=Parsed("MM,F", _equivalent, "85mm,1.4"),
         basic=True,
     )
     aperture_radius_m: float | None = option("Radius of the opening, with --fov-deg.")

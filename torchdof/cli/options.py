@@ -39,13 +39,12 @@ class DepthMap(Group):
         "Of relative depth: larger is nearer (MiDaS, Depth Anything; the default), or with depth farther (Marigold)."
     )
     value_range: tuple[float, float] | None = option(
-        "Smallest and largest value of relative depth; default: those of each frame.",
-        type=Parsed("LOW,HIGH", "two numbers such as 0,255", numbers(2)),
+        "Its smallest and largest value; default: those of each frame.", type=Parsed("LOW,HIGH", numbers(2), "0,255")
     )
     depth_unknown: float | None = option("A value that means 'not measured', such as 0, -1 or inf.")
     fill_depth: float | str | None = option(
         "Fill pixels without depth from the nearest one, from the farthest around, or with a distance (inf for a sky).",
-        type=Parsed("nearest|far|METRES", "nearest, far or metres", number_or("nearest", "far")),
+        type=Parsed("nearest|far|METRES", number_or("nearest", "far")),
     )
     depth_channel: str | None = option("Channel (or array of an .npz) that is depth.")
     strict: bool = option("Refuse what looks like a wrong unit or scale, instead of warning.", False)
@@ -154,9 +153,9 @@ class Accuracy(Group):
     """Blur."""
 
     tolerance: Any = option(
-        "Accepted RMS error on display, of 1: draft (8/255), preview (4/255), final (1/255) or a number; 0 is exact.",
+        "Accepted RMS error on display, of 1: draft is 8/255, preview 4/255, final 1/255; 0 is exact.",
         "final",
-        type=Parsed("NAME|NUMBER", "draft, preview, final or a number", number_or("draft", "preview", "final")),
+        type=Parsed("draft|preview|final|NUMBER", number_or("draft", "preview", "final")),
         basic=True,
     )
     no_occlusion: bool = option("One pass that ignores occlusion.", False)

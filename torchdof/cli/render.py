@@ -35,7 +35,7 @@ class _Effects(Group):
 
     attention: tuple[float, float, float] | None = option(
         "Where the viewer looks, in pixels from the top left: elsewhere a draft's tolerance is enough.",
-        type=Parsed("X,Y,RADIUS", "X,Y,RADIUS in pixels such as 320,200,80", numbers(3)),
+        type=Parsed("X,Y,RADIUS", numbers(3), "320,200,80"),
     )
     lights: float = option(
         "Make lamps that a photograph clipped at white brighter by up to this many stops, such as 3.",
@@ -57,9 +57,7 @@ class _Files(Group):
     bits: Literal["8", "16", "half", "float"] | None = option("What OUT stores. Default: as IMAGE, where the type can.")
     layer: str | None = option("Layer or part of an EXR that is the image.")
     sheet: Path | None = option("Also write the image, its depth and the result side by side to this file.")
-    frames: tuple[int, int] | None = option(
-        "Part of a sequence.", type=Parsed("FIRST-LAST", "first-last, such as 1-48", parse_frames)
-    )
+    frames: tuple[int, int] | None = option("Part of a sequence.", type=Parsed("FIRST-LAST", parse_frames, "1-48"))
     steady: bool = option("Filter depth of a sequence along time, where neither image nor depth moved.", False)
     resume: bool = option("Render only frames that are missing, cut short, or older than files or options.", False)
 

@@ -2,8 +2,6 @@
 
 from .decode import Part
 
-__all__ = ["colour_channels", "depth_channel"]
-
 
 def colour_channels(parts: list[Part], layer: str | None) -> tuple[int, list[int], tuple[str, ...]]:
     """Index of a part, indices in it of R, G, B (or grey, Y) and, if present, A, and their names without layer.

@@ -17,8 +17,6 @@ import numpy as np
 from .memory import free_bytes
 from .metadata import Metadata, kept_metadata, upright
 
-__all__ = ["Part", "errors_named", "first_line", "is_complete", "read_array", "read_parts", "utf8_name"]
-
 MAX_PIXELS = 2**28  # of an image or array; a larger limit allows damaged headers to claim more memory
 MAX_ATTRIBUTES = 4096  # in all parts of an EXR file together; renderers write a few hundred
 MAX_CHANNELS = 1024  # in a part of an EXR file; OpenImageIO has the same limit

@@ -7,9 +7,6 @@ import os
 from pathlib import Path
 from typing import Literal
 
-__all__ = ["IMAGE_SUFFIXES", "MAP_SUFFIXES", "OPTIONAL_SUFFIXES", "PixelType", "existing_image", "existing_map"]
-__all__ += ["named_file", "refusal", "samples_of"]
-
 PixelType = Literal["8", "16", "half", "float"]
 
 _SAMPLES: dict[str, tuple[PixelType, ...]] = {  # suffix -> sample types, the default first

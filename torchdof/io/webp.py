@@ -5,8 +5,6 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-__all__ = ["add_exif"]
-
 
 def add_exif(path: Path, spec: Any) -> None:
     """Adds the tags of an OpenImageIO specification to a WebP file; OpenImageIO encodes them in a PNG of one pixel."""
