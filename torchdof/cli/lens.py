@@ -92,8 +92,7 @@ class Lens(Sensor):
         basic=True,
     )
     focus_range: tuple[float, float] | None = option(
-        "In focus between two distances in metres; not with --focus-m.",
-        type=Parsed("NEAR,FAR", numbers(2), "1.5,2.2"),
+        "Distances in metres between which all is in focus.", type=Parsed("NEAR,FAR", numbers(2), "1.5,2.2")
     )
     tilt: float = option("Degrees by which the lens is tilted down: focus comes nearer towards the bottom.", 0.0)
     swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)
@@ -162,14 +161,15 @@ class Lens(Sensor):
         area, depth, is_to_scale = frame.area, frame.values, frame.scene.is_to_scale
         width, stated = depth.shape[-1], self._stated(area)
         in_file = camera_settings(frame.picture.metadata, area.width, area.height)
-        lens: dict[str, Any] = {name: (_DEFAULTS | in_file | stated)[name] for name in _DEFAULTS}
+        focus_in_file = in_file.pop("focus_m", 0.0)
+        lens: dict[str, Any] = _DEFAULTS | in_file | stated
         if in_file.get("focal_length_mm", math.inf) < _PHONE_MM and "sensor_width_mm" not in in_file | stated:
             lens["sensor_width_mm"] = _full_frame_mm(area) * in_file["focal_length_mm"] / _PHONE_EQUIVALENT_MM
         remarks, focus_m = list[str](), math.inf
         if self.focus_m is not None:
             focus_m = focus_at_frame(self.focus_m, number)
-        elif not self.has_focus and is_to_scale and 1000 * in_file.get("focus_m", 0.0) > lens["focal_length_mm"]:
-            focus_m = in_file["focus_m"]
+        elif not self.has_focus and is_to_scale and 1000 * focus_in_file > lens["focal_length_mm"]:
+            focus_m = focus_in_file
             remarks.append("focus from the file")
         elif not self.has_focus and is_still:
             focus_m = subject_m(depth)
