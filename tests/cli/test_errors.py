@@ -35,7 +35,6 @@ shot.####.exr depth.npy -o o.#.exr                    | where is the focus? give
 image.exr depth.npy --focus-m near                    | --focus-m expects METRES such as 2.0, or keyframes
 image.exr depth.npy --focus-m 1:2,5:3                 | such as pull.##.png; ffmpeg joins frames
 image.exr depth.npy --focus-m 1:2,5:3 -o o.#.exr --sheet s.png | --sheet is of one picture
-image.exr depth.npy --focus-m 0.01                    | --focus-m must be longer than the focal length
 image.exr depth.npy --focus-at 3                      | --focus-at expects X,Y such as 320,200, got '3'
 image.exr depth.npy --focus-at 99,5                   | focus point (99.0, 5.0) must lie in the frame of 24 x 16
 image.exr depth.npy --focus-m 2 --focus-at 3,3        | --focus-m and --focus-at both say where to focus
@@ -57,7 +56,6 @@ image.exr depth.npy --focus-m 2 --fill-depth x        | --fill-depth expects nea
 image.exr depth.npy --focus-m 2 --fill-depth 1e-45 --depth-unknown 6 | which starts at 1.4e-45 m
 image.exr depth.npy --focus-m 2 --depth-kind disparity | disparity needs a scale (--depth-scale)
 image.exr depth.npy --focus-m 2 --depth-kind distance | --depth-kind distance needs --fov-deg
-image.exr depth.npy --focus-m 2 --depth-kind coc      | --depth-kind coc is the blur itself and takes no camera
 image.exr depth.npy --focus-m 2 --depth-kind relative --near-m 1 --far-m 2 --depth-scale 3 | near and far say it
 image.exr depth.npy --focus-m 2 --depth-kind relative --near-m 5 --far-m 1 | depth.npy: near_m must be nearer than
 image.exr depth.npy --focus-m 2 --near-m 1 --depth-kind z | are for relative depth, and not for --depth-kind z

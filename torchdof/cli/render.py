@@ -18,8 +18,6 @@ from .output import json_line, progress_bar
 from .resume import Record
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from .frame import Frame, Renderer
 
 _OWN_EXTREMES = (
@@ -124,7 +122,7 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
             raise FileNotFoundError(f"{self.image}: there are no such files")
         outputs: dict[int, Path] = {}
         for n in numbers:
-            outputs[n] = self.out if is_single else FramePattern(self.out).name(n)
+            outputs[n] = numbered.name(n) if numbered and not is_single else self.out
             check_files(*sources(n), outputs[n], self.sheet)
         whole = list(numbers)  # frames of the sequence, each of which may depend on those before it
         if images and self.steady:
@@ -159,19 +157,17 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
             renderer.notices.warn(self.depth or self.image, [Mistake("range", _OWN_EXTREMES)])
         read_files = functools.lru_cache(maxsize=1)(renderer.read)  # a focus pull reads one image many times
 
-        def pixels_and_depth(place: int) -> "tuple[Tensor, Tensor]":
-            frame = read_files(*sources(whole[place]))
-            return frame.picture.pixels, frame.values
+        def as_stored(n: int) -> "Frame":
+            return read_files(*sources(n))
 
-        steady = SteadyFrames(pixels_and_depth) if images and self.steady else None
+        steady = SteadyFrames(lambda k: (as_stored(whole[k]).picture.pixels, as_stored(whole[k]).values))
 
-        def read(n: int) -> "Frame":
-            if steady is None:
-                return read_files(*sources(n))
+        def steadied(n: int) -> "Frame":
             values = steady.depth(whole.index(n))  # reads frame n last, so that it is still in the cache
-            return dataclasses.replace(read_files(*sources(n)), values=values)
+            return dataclasses.replace(as_stored(n), values=values)
 
         is_recorded = self.resume or not is_single or record.path.is_file()
+        read = steadied if images and self.steady else as_stored
         self._render_each(renderer, todo, read, record if is_recorded else None)
 
     def _render_each(
