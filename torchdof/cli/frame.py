@@ -15,7 +15,6 @@ from ..depth.inspect import coc_colours, depth_colours, tint_focus
 from ..depth.kinds import depth_from_values
 from ..depth.relative import from_relative
 from ..depth.sanity import Mistake, coc_mistakes, depth_mistakes
-from ..io.decode import errors_named
 from ..io.highlights import expand_highlights
 from ..io.images import Picture, read_image, read_values, write_image
 from ..io.sheet import shrunk, write_sheet
@@ -82,7 +81,7 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
         scene = dataclasses.replace(scene, fill_depth=stated_fill) if holes else scene
     kind: Any = scene.depth_kind
     rows, columns = values.shape[-2:]
-    with errors_named(source):
+    try:
         if kind == "coc" and (rows, columns) != (height, width):
             sizes = f"{columns} x {rows} pixels but the image is {width} x {height}"
             raise ValueError(f"coc is {sizes}; they must be the same")
@@ -99,6 +98,8 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
             values = from_relative(values, *scene.ends_m, scene.relative_kind or "disparity", **given)
         else:
             values = depth_from_values(values, kind, scale=scene.depth_scale, offset=scene.depth_offset, **given)
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from None
     values, filled = values if kind == "coc" else at_size_of(picture.pixels, values[place]), 0
     fill_by: Any = scene.fill_depth
     if fill_by is not None or not holes:

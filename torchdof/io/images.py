@@ -161,7 +161,8 @@ def write_image(
     """Writes a picture whole or not at all.
 
     Args:
-        path: Output file; its suffix gives the format (.exr .png .tif .tiff .jpg .jpeg .webp .hdr .pfm).
+        path: Output file; its suffix gives the format (.exr .png .tif .tiff .jpg .jpeg .webp .hdr .pfm). A missing
+            folder is made.
         picture: Pixels in linear light; metadata that the format supports is written too.
         transfer: "linear" or "srgb". None keeps the picture's own if both its ``sample`` and the new one are integers,
             or both floats; otherwise it is "srgb" for integers and "linear" for floats.
