@@ -148,7 +148,7 @@ WITHOUT_PYTORCH = [
     "render a.####.png d.png -o o.####.png --frames 1-",
     *("render none.png d.png -o o.png", "render pyproject.toml -o o.png"),
     *("inspect a.png d.png --depth-kind coc", "inspect none.png", "bench none.png", "bench --views 3"),
-    *("no-such-command", "export", "fit", "tables --rotation 5"),
+    *("no-such-command", "export", "fit", "render a.png d.png -o o.png --rotation 5"),
 ]  # fmt: skip
 
 

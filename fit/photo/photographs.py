@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import gaussian_gradient_magnitude
 
-from torchdof.io import optional_formats
 from torchdof.io.images import read_image
 from torchdof.io.metadata import camera_settings
+from torchdof.io.paths import OPTIONAL_SUFFIXES, refusal
 from torchdof.validation import number
 
 from ..problems import FitError, warn
@@ -74,12 +74,12 @@ def read_photographs(
     """
     number("square_mm", square_mm, low=1e-2, high=1e5, unit="millimetres")
     folder_name = str(folder)
-    files = sorted(p for p in Path(folder).iterdir() if p.suffix.lower() in (*_SUFFIXES, *optional_formats.SUFFIXES))
+    files = sorted(p for p in Path(folder).iterdir() if p.suffix.lower() in (*_SUFFIXES, *OPTIONAL_SUFFIXES))
     for path in files:
         if root is not None:
             inside(path, root, folder_name)
-        if refusal := optional_formats.refusal(path):
-            raise FitError(refusal, file=str(path))
+        if reason := refusal(path):
+            raise FitError(reason, file=str(path))
     if len(files) < 2:
         text = f"there is neither a {MANIFEST} nor two photographs of the page that torchdof fit --target makes"
         raise FitError(text, "manifest", folder_name)

@@ -32,11 +32,10 @@ image.exr depth.npy --focus-m 2 --sheet image.exr     | image.exr: is one of the
 image.exr depth.npy --focus-m 2 --sheet ./out.exr     | out.exr: would be written twice
 image.exr depth.npy --focus-m 2 -o out.gif            | cannot write files of type '.gif'
 shot.####.exr depth.npy -o o.#.exr                    | where is the focus? give --focus-m METRES or --focus-at X,Y
-image.exr depth.npy --focus-m near                    | --focus-m expects metres (2.0) or keyframes
-image.exr depth.npy --focus-m 1:2,5:3                 | out.exr: expected one place for the frame number
+image.exr depth.npy --focus-m near                    | --focus-m expects METRES such as 2.0, or keyframes
+image.exr depth.npy --focus-m 1:2,5:3                 | such as pull.##.png; ffmpeg joins frames
 image.exr depth.npy --focus-m 1:2,5:3 -o o.#.exr --sheet s.png | --sheet is of one picture
-image.exr depth.npy --focus-m 0.01                    | --focus-m must be longer than the focal length
-image.exr depth.npy --focus-at 3                      | --focus-at expects a pixel X,Y such as 320,200, got '3'
+image.exr depth.npy --focus-at 3                      | --focus-at expects X,Y such as 320,200, got '3'
 image.exr depth.npy --focus-at 99,5                   | focus point (99.0, 5.0) must lie in the frame of 24 x 16
 image.exr depth.npy --focus-m 2 --focus-at 3,3        | --focus-m and --focus-at both say where to focus
 image.exr depth.npy --focus-range 2,1                 | --focus-range must go from near to far
@@ -48,16 +47,15 @@ image.exr depth.npy --focus-m 2 --fov-deg 40 --f-number 2 --aperture-radius-m 1 
 image.exr depth.npy --focus-m 2 --fov-deg 40 --aperture-radius-m 1e45 | check this lens (--focal-length-mm 49.4
 image.exr depth.npy --focus-m 2 --f-number 2 --blur 2% | --f-number and --blur both say how wide the lens opens
 image.exr depth.npy --focus-m 2 --equivalent 85,1.4 --focal-length-mm 50 | --equivalent and --focal-length-mm say
-image.exr depth.npy --focus-m 2 --equivalent 85       | --equivalent expects a focal length and an f-number such as
-image.exr depth.npy --focus-m 2 --blur 99%            | --blur expects a share of the picture's width
+image.exr depth.npy --focus-m 2 --equivalent 85       | --equivalent expects MM,F such as 85mm,1.4, got '85'
+image.exr depth.npy --focus-m 2 --blur 99%            | --blur expects SHARE% such as 2%, above 0 and at most 50%
 image.exr depth.npy --depth-kind coc --blur 2%        | --depth-kind coc is the blur itself and takes no camera
 shot.####.exr depth.npy -o o.#.exr --focus-m 2 --blur 2% | --blur would open the lens anew in each frame
 image.exr depth.npy --focus-m 2 --aperture-radius-m 1 | --aperture-radius-m goes with --fov-deg
-image.exr depth.npy --focus-m 2 --fill-depth x        | --fill-depth expects nearest, far or metres, got 'x'
+image.exr depth.npy --focus-m 2 --fill-depth x        | --fill-depth expects nearest|far|METRES, got 'x'
 image.exr depth.npy --focus-m 2 --fill-depth 1e-45 --depth-unknown 6 | which starts at 1.4e-45 m
 image.exr depth.npy --focus-m 2 --depth-kind disparity | disparity needs a scale (--depth-scale)
 image.exr depth.npy --focus-m 2 --depth-kind distance | --depth-kind distance needs --fov-deg
-image.exr depth.npy --focus-m 2 --depth-kind coc      | --depth-kind coc is the blur itself and takes no camera
 image.exr depth.npy --focus-m 2 --depth-kind relative --near-m 1 --far-m 2 --depth-scale 3 | near and far say it
 image.exr depth.npy --focus-m 2 --depth-kind relative --near-m 5 --far-m 1 | depth.npy: near_m must be nearer than
 image.exr depth.npy --focus-m 2 --near-m 1 --depth-kind z | are for relative depth, and not for --depth-kind z
@@ -65,7 +63,7 @@ image.exr millimetres.npy --focus-m 3 --f-number 1.4 --strict | millimetres.npy:
 image.exr depth.npy --focus-m 2 --table nowhere       | no blur table 'nowhere': neither a file nor one of the shipped
 image.exr depth.npy --focus-m 2 --attention 3,4,0     | (x, y, radius) in pixels, radius > 0
 image.exr depth.npy --focus-m 2 --lights 3            | --lights is for photographs of 8 or 16 bits
-image.exr depth.npy --focus-m 2 --tolerance best      | --tolerance expects draft, preview, final or a number
+image.exr depth.npy --focus-m 2 --tolerance best      | --tolerance expects draft|preview|final|NUMBER
 image.exr depth.npy --focus-m 2 --device warp         | --device warp: there is no such device
 image.exr depth.npy --focus-m 2 --rotation 5          | --rotation turns blades or an image
 image.exr depth.npy --focus-m 2 --squeeze 0           | --squeeze must be a number from 0.1 to 10
@@ -81,7 +79,7 @@ inspect image.exr depth.npy --focus-m 1:2,3:4    | --focus-m has keyframes but I
 tables nothing                                   | no blur table 'nothing'
 bench --focus-m 2                                | the built-in scene has its own camera and depth
 bench image.exr depth.npy --truth .              | leave IMAGE and DEPTH out
-bench image.exr depth.npy --out image.exr        | File exists
+bench image.exr depth.npy --out image.exr        | its folder cannot be made
 bench --truth . --out . --f-number 2             | with their own lens and depth
 bench --vignetting 0.4 --onnx                    | one kernel a layer
 bench image.exr depth.npy --views 4              | name its folder with --truth
@@ -101,7 +99,7 @@ fit --lens nowhere                               | nowhere
 fit nowhere -o table.txt                         | name it table.json
 fit nowhere --target other.pdf                   | --target writes the page to print
 fit --lens double_gauss_50mm --root .            | --root is the folder of photographs
-fit --lens double_gauss_50mm --wavelengths red   | --wavelengths expects rgb, or micrometres
+fit --lens double_gauss_50mm --wavelengths red   | --wavelengths expects rgb|UM,UM,... such as
 fit --lens double_gauss_50mm --field 0,6 --field-deg 5 | give one of them
 fit --lens double_gauss_50mm --field 0,12,6      | --field must be increasing distances in mm
 fit --lens double_gauss_50mm --focus-m 0.01      | --focus-m must be

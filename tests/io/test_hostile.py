@@ -20,7 +20,7 @@ import torch
 
 from tests.files import spec_with, store, store_parts
 from torchdof import BlurTable
-from torchdof.io import decode, optional_formats
+from torchdof.io import decode, paths
 from torchdof.io.decode import MAX_ATTRIBUTES
 from torchdof.io.images import Picture, read_image, read_values, write_image
 
@@ -189,7 +189,7 @@ NO_TARGETS: list[tuple[str, Any, str]] = [
     ("x.jpg", "half", r"a \.jpg file holds samples of 8, not half"),
     ("x.gif", None, "cannot write files of type '.gif'"),
     ("x", None, "cannot write a file without a type"),
-    ("missing/x.png", None, "there is no folder .*missing; make it first"),
+    ("file/x.png", None, "x.png: its folder cannot be made, because .*file is a file"),
     ("folder.png", None, r"folder\.png: is a folder"),
 ]
 
@@ -197,6 +197,7 @@ NO_TARGETS: list[tuple[str, Any, str]] = [
 @pytest.mark.parametrize(("name", "sample", "message"), NO_TARGETS)
 def test_a_target_that_cannot_be_written_is_named(name: str, sample: Any, message: str, tmp_path: Path) -> None:
     (tmp_path / "folder.png").mkdir()
+    (tmp_path / "file").touch()
     with pytest.raises((ValueError, OSError), match=message):
         write_image(tmp_path / name, tiny(), sample=sample)
 
@@ -208,13 +209,14 @@ def test_a_target_that_cannot_be_written_is_named(name: str, sample: Any, messag
 def test_a_format_without_a_reader_is_refused_with_its_conversion(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, how: str
 ) -> None:
-    monkeypatch.setattr(optional_formats, "readable", lambda: ())
+    monkeypatch.setattr(paths, "readers", lambda: ["jpeg"])
+    (tmp_path / name).write_bytes(TEXT)
     with pytest.raises(ValueError, match=rf"{name}: {Path(name).suffix.lower()} is not read here: {how}"):
-        read_image(name)
+        read_image(tmp_path / name)
     # OpenImageIO looks at the content, so that a renamed JPEG replaces a file of this format
     write_image(tmp_path / "a.jpg", Picture(torch.full((1, 3, 8, 8), 0.2159)))
     (tmp_path / "a.jpg").rename(tmp_path / name)
-    monkeypatch.setattr(optional_formats, "readable", lambda: (Path(name).suffix.lower(),))
+    monkeypatch.setattr(paths, "readers", lambda: ["heif", "raw"])
     assert float(read_image(tmp_path / name).pixels.mean()) == pytest.approx(0.2159, abs=0.002)
 
 

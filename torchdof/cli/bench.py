@@ -7,11 +7,10 @@ import click
 
 from ..io.atomic import check_writable
 from .command import Command, Group, argument, option
-from .options import Blur, Scene, check_files, make_folder_of
+from .options import Blur, Scene, check_files
 from .output import Notices, json_line
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class _Speed(Group):
     """Speed."""
 
@@ -21,7 +20,6 @@ class _Speed(Group):
     scan: bool = option("Also show how cost grows with radius and frame size.", False)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class _Accuracy(Group):
     """Accuracy."""
 
@@ -35,7 +33,6 @@ class _Accuracy(Group):
     peer: tuple[Path, ...] = option("A Python file with another renderer, blur(image, coc_px); may be repeated.", ())
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Bench(Scene, Blur, _Speed, _Accuracy, Command):
     """Measure speed against error on your own scene, or accuracy where the truth is known.
 
@@ -70,7 +67,7 @@ class Bench(Scene, Blur, _Speed, _Accuracy, Command):
             raise ValueError("--degrade compares without the reference; leave --views out")
         from ..bench import accuracy
 
-        make_folder_of(self.out / "accuracy.csv")
+        check_writable(self.out / "accuracy.csv")
         accuracy.compare(self.truth, self.out, [] if self.degrade else self.views or [256], self.degrade, self.peer)
 
     def _measure_speed(self) -> None:
@@ -91,7 +88,7 @@ class Bench(Scene, Blur, _Speed, _Accuracy, Command):
         from ..bench.measurement import BenchScene, shipped
         from .frame import coc_of, read_frame
 
-        table = self.table_of(self.table)
+        table = self.blur_table()
         if self.image is None:
             scene = dataclasses.replace(shipped(), table=table)
         else:
@@ -100,8 +97,6 @@ class Bench(Scene, Blur, _Speed, _Accuracy, Command):
             remarks = ["focus as stated"] * self.has_focus + remarks + [f"depth {frame.guess}"] * bool(frame.guess)
             remark = "blur as given" if camera is None else f"{camera!r}; {', '.join(remarks)}"
             scene = BenchScene(self.image.name, frame.picture.light, coc_px, remark, table)
-        if self.out is not None:
-            make_folder_of(self.out / "speed.csv")
         runtimes = ["onnxruntime"] * self.onnx + ["compiled"] * self.compiled
         rows = speed.compare(scene, self.repeat, Console(stderr=True), runtimes, self.scan)
         if self.as_json:

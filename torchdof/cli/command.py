@@ -13,20 +13,16 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Literal
 
 import click
+from typing_extensions import dataclass_transform
 
 _BASIC_HEADING = "Options"  # heading of the options that --help lists first
 
 
-class Group:
-    """Base of all groups of options, and of commands."""
-
-    def __post_init__(self) -> None:
-        """Refuses options that contradict each other."""
-
-    def given(self, *groups: type[Any]) -> set[str]:
-        """Names of the options of some groups that are not at their default."""
-        fields = [field for group in groups for field in dataclasses.fields(group)]
-        return {field.name for field in fields if getattr(self, field.name) != field.default}
+def refuse(*problems: tuple[object, str]) -> None:
+    """Raises the message of the first problem that is there."""
+    for is_there, message in problems:
+        if is_there:
+            raise ValueError(message)
 
 
 def option(
@@ -41,46 +37,62 @@ def option(
     return dataclasses.field(**({} if default is ... else {"default": default}), metadata=metadata)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+def argument(help: str, metavar: str, default: Any = ...) -> Any:
+    """Declares a dataclass field as a positional argument, which a default makes optional."""
+    return option(help, default, metavar=metavar, names=("argument",))
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(option, argument))
+class Group:
+    """Base of all groups of options, and of commands; each is a frozen dataclass."""
+
+    def __init_subclass__(cls) -> None:
+        dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+
+    def __post_init__(self) -> None:
+        """Refuses options that contradict each other."""
+
+    def given(self, *groups: type[Any]) -> set[str]:
+        """Names of the options of some groups that are not at their default."""
+        fields = [field for group in groups for field in dataclasses.fields(group)]
+        return {field.name for field in fields if getattr(self, field.name) != field.default}
+
+
 class Command(Group):
     """Options."""
 
     as_json: bool = option("Print results as JSON, for programs: one object a line.", False, names=("--json",))
 
 
-def argument(help: str, metavar: str, default: Any = ...) -> Any:
-    """Declares a dataclass field as a positional argument, which a default makes optional."""
-    return option(help, default, metavar=metavar, names=("argument",))
-
-
 class Parsed(click.ParamType):
-    """The type of an option whose text ``parse`` reads. The message for a ``ValueError`` names the expected form."""
+    """The type of an option whose text ``parse`` reads. The message for a ``ValueError`` states form and example."""
 
-    name = "text"
+    def __init__(self, form: str, parse: Callable[[str], Any], example: str = "") -> None:
+        self.name, self.parse, self.example = form, parse, example
 
-    def __init__(self, expected: str, parse: Callable[[str], Any]) -> None:
-        self.expected, self.parse = expected, parse
+    def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:
+        """The name of the value in ``--help``."""
+        return self.name
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Click's conversion of a text."""
         try:
             return self.parse(value)
         except ValueError:
-            option_name = param.opts[0] if param else self.name
-            raise ValueError(f"{option_name} expects {self.expected}, got {reprlib.repr(value)}") from None
+            expected = f"{self.name} such as {self.example}" if self.example else self.name
+            raise ValueError(f"{param and param.opts[0]} expects {expected}, got {reprlib.repr(value)}") from None
 
 
-def numbers(text: str, count: int | None = None) -> tuple[float, ...]:
-    """Reads ``count`` numbers (None: any count) separated by commas."""
-    values = tuple(map(float, text.split(",")))
-    if count not in (None, len(values)):
-        raise ValueError
-    return values
+def numbers(count: int | None = None) -> Callable[[str], tuple[float, ...]]:
+    """A reader of ``count`` numbers (None: any count) separated by commas."""
 
+    def read(text: str) -> tuple[float, ...]:
+        values = tuple(map(float, text.split(",")))
+        if count not in (None, len(values)):
+            raise ValueError
+        return values
 
-def pair(text: str) -> tuple[float, ...]:
-    """Reads two numbers separated by a comma."""
-    return numbers(text, 2)
+    return read
 
 
 def number_or(*words: str) -> Callable[[str], float | str]:

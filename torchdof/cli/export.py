@@ -2,9 +2,8 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from ..io.atomic import check_writable
 from .command import Command, Group, Parsed, option
@@ -19,7 +18,6 @@ def _size(text: str) -> tuple[int, int]:
     return height, width
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class _Graph(Group):
     """Graph."""
 
@@ -34,13 +32,11 @@ class _Graph(Group):
     )
     size: tuple[int, int] | None = option(
         "Width and height of the only frame, for --layout whole and runtimes that need fixed sizes.",
-        metavar="WxH",
-        type=Parsed("a width and a height in pixels, such as 1920x1080", _size),
+        type=Parsed("WxH", _size, "1920x1080"),
     )
     opset: int = option("ONNX operator set.", 20)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Export(Sensor, Blur, Accuracy, _Graph, Command):
     """Write depth of field as one ONNX file, for pipelines without PyTorch.
 
@@ -64,10 +60,11 @@ class Export(Sensor, Blur, Accuracy, _Graph, Command):
     def run(self) -> None:
         """Writes a file, or prints the metadata of one."""
         if self.show is not None and self.out is None:
-            from torchdof.export.metadata import describe
+            from torchdof.export.metadata import describe, shown
 
             metadata = describe(self.show)
-            return print_result(self.as_json, metadata, _lines(metadata))
+            lines = map(shown, json.dumps(metadata, indent=1).splitlines())
+            return print_result(self.as_json, metadata, "\n".join(lines))
         if self.out is None or self.show is not None:
             raise ValueError("give either -o FILE to write or --show FILE to read")
         if self.out.suffix != ".onnx":
@@ -82,21 +79,8 @@ class Export(Sensor, Blur, Accuracy, _Graph, Command):
             camera = Camera.from_fov(self.fov_deg, 0.01, 2.0)  # aperture and focus are inputs of the graph
         options = {"depth_edges": "as given", **self.arguments(), "max_coc_px": self.max_coc, "check": False}
         with progress_bar("tracing") as update:
-            dof = DepthOfField(camera, self.table_of(self.table), **options)
+            dof = DepthOfField(camera, self.blur_table(), **options)
             graph = {field.name: getattr(self, field.name) for field in dataclasses.fields(_Graph)}
             report = to_onnx(dof, self.out, **graph, depth_edges=dof.options.depth_edges, progress=update)
         facts = {"out": str(self.out), **dataclasses.asdict(report)}
         print_result(self.as_json, facts, f"{report}\nwrote {self.out}")
-
-
-def _lines(facts: Mapping[str, Any], indent: str = "") -> str:
-    """Metadata as text, one line for each entry."""
-    from torchdof.export.metadata import shown
-
-    lines = []
-    for name, value in facts.items():
-        if isinstance(value, dict) and not indent:
-            lines += [f"{shown(name)}:", _lines(value, "  ")]
-        else:
-            lines.append(f"{indent}{shown(name)}: {shown(value if isinstance(value, str) else json.dumps(value))}")
-    return "\n".join(lines)

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import click
 
-from torchdof.cli.command import Command, Group, Parsed, argument, numbers, option
-from torchdof.cli.options import make_folder_of
+from torchdof.cli.command import Command, Group, Parsed, argument, numbers, option, refuse
 from torchdof.io.atomic import check_writable
 
 
-@dataclass(frozen=True, kw_only=True)
+def _wavelengths(text: str) -> tuple[float, ...]:
+    """Reads wavelengths; () stands for rgb."""
+    return () if text == "rgb" else numbers()(text)
+
+
 class _Target(Group):
     """With the printed target."""
 
@@ -23,7 +25,6 @@ class _Target(Group):
     square_mm: float = option("Side of the target's square as printed.", 100.0)
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Photographs(Group):
     """From photographs."""
 
@@ -41,7 +42,6 @@ class _Photographs(Group):
     root: Path | None = option("Folder that capture.toml and all pictures must lie in. Default: anywhere.")
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Lens(Group):
     """From a lens prescription."""
 
@@ -54,16 +54,14 @@ class _Lens(Group):
     )
     field: tuple[float, ...] | None = option(
         "One table across the field, of spots at these distances from the middle; to 21.6 for full frame.",
-        metavar="0,MM,MM,...",
-        type=Parsed("distances in mm from the middle of the frame, rising from 0, like 0,7,14,21.6", numbers),
+        type=Parsed("0,MM,MM,...", numbers(), "0,7,14,21.6"),
     )
     wavelengths: tuple[float, ...] | None = option(
-        "One table a colour: rgb, or micrometres like 0.65,0.55,0.45; for lenses with Abbe numbers.",
-        type=Parsed("rgb, or micrometres like 0.65,0.55,0.45", lambda text: () if text == "rgb" else numbers(text)),
+        "One table a colour, of wavelengths in micrometres; for lenses with Abbe numbers.",
+        type=Parsed("rgb|UM,UM,...", _wavelengths, "0.65,0.55,0.45"),
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class Fit(_Photographs, _Target, _Lens, Command):
     """Make a blur table from photographs of a dot, or from a lens prescription.
 
@@ -92,16 +90,15 @@ class Fit(_Photographs, _Target, _Lens, Command):
 
     def run(self) -> None:
         """Checks the options, then makes the table, or writes the target to print."""
-        if self.target is not None and (self.captures is not None or self.lens is not None):
-            raise ValueError("--target writes the page to print; give it alone, and the photographs afterwards")
-        if self.target is None and (self.captures is None) == (self.lens is None):
-            raise ValueError("give either a folder of captures or --lens FILE")
-        if self.lens is not None and (self.root or self.plots):
-            raise ValueError("--root is the folder of photographs, --plots of their fits; leave them out with --lens")
-        if self.out.suffix != ".json":
-            raise ValueError(f"{self.out}: the table is written as JSON: name it {self.out.with_suffix('.json')}")
-        if self.field is not None and self.field_deg:
-            raise ValueError("--field-deg averages one place, --field traces several; give one of them")
+        target, of_both = self.target, self.lens and (self.root or self.plots)
+        is_one = bool(self.captures) != bool(self.lens)
+        refuse(
+            (target and (self.captures or self.lens), "--target writes the page to print; give it alone"),
+            (not target and not is_one, "give either a folder of captures or --lens FILE"),
+            (of_both, "--root is the folder of photographs, --plots of their fits; leave them out with --lens"),
+            (self.out.suffix != ".json", f"{self.out}: a table is JSON: name it {self.out.with_suffix('.json')}"),
+            (self.field and self.field_deg, "--field-deg averages one place, --field traces several; give one of them"),
+        )
         if self.target is not None:
             from torchdof.fit.photo.target import write_target
 
@@ -112,7 +109,7 @@ class Fit(_Photographs, _Target, _Lens, Command):
             return
         check_writable(self.out)
         if self.plots is not None:
-            make_folder_of(self.plots / "table.png")
+            check_writable(self.plots / "table.png")
         from rich.console import Console
 
         from torchdof.cli.fit_tables import fit_photographs, trace_lens

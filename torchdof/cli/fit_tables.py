@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from torchdof import BlurTable, blur_by_coc
-from torchdof.cli.options import make_folder_of
 from torchdof.cli.output import json_line, progress_bar
 from torchdof.fit.lens import trace
 from torchdof.fit.lens.lens import RGB_UM, Lens
@@ -98,7 +97,7 @@ def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[w
                 scale_of=fitted[0][1] if fitted else None,  # all dots use the scale of the one nearest to the centre
             )
         fitted.append((captures, result))
-        _print_fit(console, captures, result)
+        facts = {"out": str(out), **_report(console, captures, result)}
         messages = list(dict.fromkeys(str(warning.message) for warning in caught))
         for message in (message for message in messages if message not in printed):
             console.print(f"warning: {message}", style="yellow")
@@ -119,28 +118,14 @@ def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[w
                 picture = command.plots / f"{out.stem}_{1000 * pair.distance_m:.0f}mm.png"
                 _save(console, picture_of_fit(fit), picture)
         if command.as_json:
-            facts = {"out": str(out), **_facts(captures, result), "warnings": messages}
-            print(json_line(facts | ({"advice": photographs.advice} if photographs else {})), flush=True)
+            facts |= {"warnings": messages, **({"advice": photographs.advice} if photographs else {})}
+            print(json_line(facts), flush=True)
     if across_field:
         _write(console, table_of_dots(fitted), command.out)
 
 
-def _facts(captures: Captures, result: TableFit) -> dict[str, Any]:
-    """The numbers that :func:`_print_fit` prints."""
-    of_fit = ("params", "stderr", "residual", "residual_over_noise", "magnification")
-    return {
-        **{"name": captures.name, "family": result.fits[0].family, "why": result.why, "scale": result.scale},
-        "focus_m": captures.focus_m,
-        "fits": [
-            {"distance_m": pair.distance_m, "coc_px": coc, **{name: getattr(fit, name) for name in of_fit}}
-            for pair, fit, coc in zip(captures, result.fits, result.coc_px, strict=True)
-        ],
-        "colours": [{"name": name, "radius_px": [fit.radius for fit in fits]} for name, fits in result.colours.items()],
-    }
-
-
-def _print_fit(console: Console, captures: Captures, result: TableFit) -> None:
-    """Prints the fits at all distances, the reason for the family, and the colours."""
+def _report(console: Console, captures: Captures, result: TableFit) -> dict[str, Any]:
+    """Prints the fits at all distances, the reason for the family, and the colours; returns them as facts."""
     fits = result.fits
     columns = {
         "distance m": [f"{pair.distance_m:.4g}" for pair in captures],
@@ -160,11 +145,20 @@ def _print_fit(console: Console, captures: Captures, result: TableFit) -> None:
             radii = [f"{fits[i].radius:.2f} ± {fits[i].radius_stderr:.2g}" for fits in result.colours.values()]
             columns[f"radius px at {pair.distance_m:g} m"] = radii
         print_columns(console, "colours: the table holds a kernel for each", columns)
+    of_fit = ("params", "stderr", "residual", "residual_over_noise", "magnification")
+    return {
+        **{"name": captures.name, "family": fits[0].family, "why": result.why, "scale": result.scale},
+        "focus_m": captures.focus_m,
+        "fits": [
+            {"distance_m": pair.distance_m, "coc_px": coc, **{name: getattr(fit, name) for name in of_fit}}
+            for pair, fit, coc in zip(captures, fits, result.coc_px, strict=True)
+        ],
+        "colours": [{"name": name, "radius_px": [fit.radius for fit in each]} for name, each in result.colours.items()],
+    }
 
 
 def _write(console: Console, table: BlurTable, target: Path) -> None:
     """Writes a table and prints its path."""
-    make_folder_of(target)
     table.save(target)
     console.print(f"{target}: {table!r}")
 

@@ -25,8 +25,9 @@ from ..optics.camera import Camera
 from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import same_aspect, stretch
+from .command import refuse
 from .lens import Area, Lens
-from .options import Scene, make_folder_of
+from .options import Scene
 from .output import Notices, print_result
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ class Frame:
 
 def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = False, **encoding: Any) -> Frame:
     """Reads an image, with arguments of ``read_image``, and its depth; ``holes`` that no option fills stay NaN."""
-    source, guess, picture, fill = depth or image, "", read_image(image, **encoding), scene.fill_depth
+    source, guess, picture = depth or image, "", read_image(image, **encoding)
     height, width = picture.pixels.shape[-2:]
     is_exr = image.suffix.lower() == ".exr"
     x, y, full_x, full_y, *size = (picture.window if is_exr else None) or (0, 0, 0, 0, width, height)
@@ -75,27 +76,27 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH{hint}")
     if scene.depth_kind == "auto":
         is_metric = bool(scene.given(Lens) & {"focus_m", "focus_range", "aperture_radius_m"})
+        stated_fill = scene.fill_depth
         scene, guess = scene.guessed(values, source, is_metric)
-        scene = dataclasses.replace(scene, fill_depth=fill if holes else scene.fill_depth)
+        scene = dataclasses.replace(scene, fill_depth=stated_fill) if holes else scene
     kind: Any = scene.depth_kind
-    given: dict[str, Any] = {"unknown": scene.depth_unknown}
     rows, columns = values.shape[-2:]
-    if kind == "coc" and (rows, columns) != (height, width):
-        problem = f"coc is {columns} x {rows} pixels but the image is {width} x {height}; they must be the same"
-        raise ValueError(f"{source}: {problem}")
-    place: Any = (...,)
-    if kind == "distance":
-        centred_width = width + abs(area.width - 2 * area.x - width)
-        given["fov_x_deg"] = scene.view_deg(picture.metadata, centred_width, area)
     try:
+        if kind == "coc" and (rows, columns) != (height, width):
+            sizes = f"{columns} x {rows} pixels but the image is {width} x {height}"
+            raise ValueError(f"coc is {sizes}; they must be the same")
         same_aspect(picture.pixels, values)
         stretched = stretch(picture.pixels, values)
+        given: dict[str, Any] = {"unknown": scene.depth_unknown}
+        place: Any = (...,)
+        if kind == "distance":
+            centred_width = width + abs(area.width - 2 * area.x - width)
+            given["fov_x_deg"] = scene.view_deg(picture.metadata, centred_width, area)
+            values, place = area.centred(values, (height, width))
         if kind == "relative":
             given["value_range"] = scene.value_range
             values = from_relative(values, *scene.ends_m, scene.relative_kind or "disparity", **given)
         else:
-            if kind == "distance":
-                values, place = area.centred(values, (height, width))
             values = depth_from_values(values, kind, scale=scene.depth_scale, offset=scene.depth_offset, **given)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
@@ -120,6 +121,8 @@ def coc_of(
     camera, remarks = scene.camera(frame, number, is_still)
     coc_px = frame.area.coc_px(camera, values)
     camera.refuse_overflow(coc_px, values)
+    if frame.guess:
+        notices.note("guess", f"{frame.name}: {frame.guess}")
     notices.warn(frame.name, frame.mistakes(camera))
     return coc_px, camera, remarks + frame.remarks
 
@@ -127,9 +130,9 @@ def coc_of(
 class Renderer:
     """Reads, renders and writes the frames of ``torchdof render``."""
 
-    def __init__(self, command: "Render", is_still: bool, is_animation: bool) -> None:
-        self.command, self.is_still, self.is_animation = command, is_still, is_animation
-        self.table, self.device = command.table_of(command.table), _device(command.device)
+    def __init__(self, command: "Render", is_still: bool) -> None:
+        self.command, self.is_still = command, is_still
+        self.table, self.device = command.blur_table(), _device(command.device)
         self.notices = Notices(command.strict)
 
     def read(self, image: Path, depth: Path | None) -> Frame:
@@ -146,46 +149,38 @@ class Renderer:
             pixels = tint_focus(pixels, coc_px, picture.has_alpha)
             picture = dataclasses.replace(picture, channels=("R", "G", "B", "A")[: pixels.shape[1]])
         else:
-            if command.lights and picture.sample in ("half", "float"):
-                raise ValueError(
-                    f"--lights is for photographs of 8 or 16 bits; leave it out for {picture.sample} numbers"
-                )
             if command.lights:
+                is_float, sample = picture.sample in ("half", "float"), picture.sample
+                refuse((is_float, f"--lights is for photographs of 8 or 16 bits; leave it out for {sample} numbers"))
                 pixels = torch.cat([expand_highlights(pixels[:, :colours], command.lights), pixels[:, colours:]], 1)
-            x, y, radius_px = command.attention or (0.0, 0.0, 0.0)
-            attention = (x - frame.area.x, y - frame.area.y, radius_px) if command.attention else None
+            attention = command.attention
+            if attention is not None:
+                attention = (attention[0] - frame.area.x, attention[1] - frame.area.y, attention[2])
             table = _with_alpha(self.table) if picture.has_alpha else self.table
             with torch.no_grad():
                 pixels = blur_by_coc(pixels, coc_px, table=table, attention=attention, **command.arguments())
         frame, picture = dataclasses.replace(frame, remarks=remarks), dataclasses.replace(picture, pixels=pixels)
-        seconds = time.perf_counter() - start
-        return functools.partial(self.write, out, frame, picture, coc_px, camera, seconds)
+        return functools.partial(self.write, out, frame, picture, coc_px, camera, time.perf_counter() - start)
 
     def write(
         self, out: Path, frame: Frame, picture: Picture, coc_px: Tensor, camera: Camera | None, seconds: float
     ) -> None:
         """Writes the picture, whole or not at all, and its sheet, and prints notes and one line."""
         command, note = self.command, self.notices.note
-        make_folder_of(out)
         write_image(out, picture, command.out_transfer, command.bits)
-        out = command.out if self.is_animation else out
         if command.sheet is not None:
-            middle = {"depth: near is bright": depth_colours(frame.values)}
+            caption, colours = "depth: near is bright", depth_colours(frame.values)
             if camera is None:
-                middle = {"blur radius: near orange, far blue": coc_colours(coc_px)}
-            panels = {"before": frame.picture.light, **middle, "after": picture.light}
-            panels = {name: shrunk(p.cpu(), _PANEL_PX).expand(-1, 3, -1, -1) for name, p in panels.items()}
-            make_folder_of(command.sheet)
-            write_sheet(command.sheet, panels)
+                caption, colours = "blur radius: near orange, far blue", coc_colours(coc_px)
+            panels = {"before": frame.picture.light, caption: colours, "after": picture.light}
+            small = {name: shrunk(p.cpu(), _PANEL_PX).expand(-1, 3, -1, -1) for name, p in panels.items()}
+            write_sheet(command.sheet, small)
         (height, width), largest_px = coc_px.shape[-2:], float(coc_px.abs().max())
-        if frame.guess:
-            note("guess", f"{frame.name}: {frame.guess}")
         if camera is not None and largest_px < _VISIBLE_PX:
-            advice = "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
-            if largest_px:
-                advice = f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; open the lens wider, "
-                advice += "with a smaller --f-number, a larger --blur, or a larger --aperture-radius-m"
-            note("little blur", f"{out}: {advice}")
+            wider = "open the lens wider, with a smaller --f-number, a larger --blur, or a larger --aperture-radius-m"
+            little = f"the largest blur radius is {largest_px:.1f} px, which is hardly seen; {wider}"
+            none = "nothing is blurred, for all depth is in focus; focus elsewhere, or look at the depth"
+            note("little blur", f"{out}: {little if largest_px else none}")
         has_exif, suffix = any(name.startswith("Exif:") for name in frame.picture.metadata), out.suffix.lower()
         if has_exif and suffix in _WITHOUT_EXIF:
             note("exif", f"{out}: EXIF data are lost in a {suffix} file; write .jpg, .png or .tif to keep them")
@@ -206,11 +201,11 @@ class Renderer:
             "assumed": frame.remarks,
             **{"width": width, "height": height, "seconds": seconds},
         }
-        blur = f"{facts['table']}, {options.method}"
+        shown = "focus shown: near orange, sharp green, far blue"
         words = [
             _inside(camera),
             f"blur radius up to {largest_px:.1f} px",
-            "focus shown: near orange, sharp green, far blue" if command.show_focus else blur,
+            shown if command.show_focus else f"{facts['table']}, {options.method}",
             _inside(table.aperture),
             "" if options.occlusion else "no occlusion",
             f"lights up to {command.lights:g} stops above white" if command.lights else "",

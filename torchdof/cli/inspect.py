@@ -1,15 +1,13 @@
 """``torchdof inspect``: reports on a depth map, its blur by a camera, and likely mistakes."""
 
-import dataclasses
 from pathlib import Path
 
 from ..io.atomic import check_writable
 from .command import Command, argument, option
-from .options import Scene, check_files, make_folder_of
+from .options import Scene, check_files
 from .output import Notices, print_result
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Inspect(Scene, Command):
     """Report on a depth map and its blur by a camera, before anything is rendered.
 
@@ -43,7 +41,6 @@ class Inspect(Scene, Command):
         camera, notes = scene.camera(frame)
         notes += frame.remarks
         report = inspect_depth(light, metres, camera)
-        make_folder_of(target)
         write_sheet(target, panels(light, report))
         height, width = metres.shape[-2:]
         lines = [f"image         {width} x {height} px, {', '.join(frame.picture.channels)}"]

@@ -3,14 +3,13 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
 from ..io.metadata import camera_settings
 from ..io.sequence import focus_at_frame, parse_focus
-from .command import Group, Parsed, numbers, option, pair
+from .command import Group, Parsed, numbers, option, refuse
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -64,7 +63,11 @@ def _width_fraction(text: str) -> float:
     return share
 
 
-@dataclass(frozen=True, kw_only=True)
+def _equivalent(text: str) -> tuple[float, ...]:
+    """Reads a focal length and an f-number, as ``85mm,1.4`` or ``85 f/1.4``."""
+    return numbers(2)(re.sub(r"\s*(mm)?\s*[, ]\s*(f/?)?", ",", text, count=1))
+
+
 class Sensor(Group):
     """Focus and lens."""
 
@@ -75,43 +78,33 @@ class Sensor(Group):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class Lens(Sensor):
     """Focus and lens."""
 
     focus_m: list[tuple[int, float]] | None = option(
         "Distance in focus (inf allowed), or keyframes frame:metres such as 1:2.0,48:5.5, linear in 1/distance.",
-        metavar="METRES",
-        type=Parsed("metres (2.0) or keyframes frame:metres (1:2.0,48:5.5), all positive", parse_focus),
+        type=Parsed("METRES", parse_focus, "2.0, or keyframes frame:metres such as 1:2.0,48:5.5, all positive"),
         basic=True,
     )
     focus_at: tuple[float, float] | None = option(
         "Focus on the surface at this pixel from the top left; by default as the file states, else on the subject.",
-        metavar="X,Y",
-        type=Parsed("a pixel X,Y such as 320,200", pair),
+        type=Parsed("X,Y", numbers(2), "320,200"),
         basic=True,
     )
     focus_range: tuple[float, float] | None = option(
-        "In focus from NEAR to FAR metres, blurred beyond; instead of --focus-m.",
-        metavar="NEAR,FAR",
-        type=Parsed("two numbers such as 1.5,2.2", pair),
+        "Distances in metres between which all is in focus.", type=Parsed("NEAR,FAR", numbers(2), "1.5,2.2")
     )
     tilt: float = option("Degrees by which the lens is tilted down: focus comes nearer towards the bottom.", 0.0)
     swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)
     f_number: float | None = option("Smaller is blurrier.", basic=True)
     blur: float | None = option(
         "Open the lens until the largest blur radius is this share of the width, such as 2%; instead of --f-number.",
-        metavar="SHARE%",
-        type=Parsed("a share of the picture's width, above 0 and at most 50 %, such as 2%", _width_fraction),
+        type=Parsed("SHARE%", _width_fraction, "2%, above 0 and at most 50%"),
         basic=True,
     )
     equivalent: tuple[float, float] | None = option(
         "Full-frame lens that the picture is taken to be from, such as 85mm,1.4.",
-        metavar="MM,F",
-        type=Parsed(
-            "a focal length and an f-number such as 85mm,1.4",
-            lambda text: numbers(re.sub(r"\s*(mm)?\s*[, ]\s*(f/?)?", ",", text, count=1), 2),
-        ),
+        type=Parsed("MM,F", _equivalent, "85mm,1.4"),
         basic=True,
     )
     aperture_radius_m: float | None = option("Radius of the opening, with --fov-deg.")
@@ -125,10 +118,9 @@ class Lens(Sensor):
             (("f_number", "aperture_radius_m", "equivalent", "blur"), "both say how wide the lens opens"),
         ):
             given = [f"--{name.replace('_', '-')}" for name in names if getattr(self, name) is not None]
-            if len(given) > 1:
-                raise ValueError(f"{' and '.join(given)} {problem}; give one of them")
-        if self.fov_deg is None and self.aperture_radius_m is not None:
-            raise ValueError("--aperture-radius-m goes with --fov-deg; a real lens has --f-number instead")
+            refuse((len(given) > 1, f"{' and '.join(given)} {problem}; give one of them"))
+        has_radius = self.fov_deg is None and self.aperture_radius_m is not None
+        refuse((has_radius, "--aperture-radius-m goes with --fov-deg; a real lens has --f-number instead"))
 
     @property
     def has_focus(self) -> bool:
@@ -137,8 +129,8 @@ class Lens(Sensor):
 
     def refuse_keyframes(self) -> None:
         """Refuse keyframes of the focus, for a command that renders a single image."""
-        if len(self.focus_m or []) > 1:
-            raise ValueError("--focus-m has keyframes but IMAGE is a single image; give one distance in metres")
+        has_keys = len(self.focus_m or []) > 1
+        refuse((has_keys, "--focus-m has keyframes but IMAGE is a single image; give one distance in metres"))
 
     def view_deg(self, metadata: Mapping[str, Any], width: int, area: Area) -> float:
         """Horizontal field of view in degrees of an image, as stated, or from focal length and sensor."""
@@ -169,14 +161,15 @@ class Lens(Sensor):
         area, depth, is_to_scale = frame.area, frame.values, frame.scene.is_to_scale
         width, stated = depth.shape[-1], self._stated(area)
         in_file = camera_settings(frame.picture.metadata, area.width, area.height)
-        lens: dict[str, Any] = {name: (_DEFAULTS | in_file | stated)[name] for name in _DEFAULTS}
+        focus_in_file = in_file.pop("focus_m", 0.0)
+        lens: dict[str, Any] = _DEFAULTS | in_file | stated
         if in_file.get("focal_length_mm", math.inf) < _PHONE_MM and "sensor_width_mm" not in in_file | stated:
             lens["sensor_width_mm"] = _full_frame_mm(area) * in_file["focal_length_mm"] / _PHONE_EQUIVALENT_MM
         remarks, focus_m = list[str](), math.inf
         if self.focus_m is not None:
             focus_m = focus_at_frame(self.focus_m, number)
-        elif not self.has_focus and is_to_scale and 1000 * in_file.get("focus_m", 0.0) > lens["focal_length_mm"]:
-            focus_m = in_file["focus_m"]
+        elif not self.has_focus and is_to_scale and 1000 * focus_in_file > lens["focal_length_mm"]:
+            focus_m = focus_in_file
             remarks.append("focus from the file")
         elif not self.has_focus and is_still:
             focus_m = subject_m(depth)

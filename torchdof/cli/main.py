@@ -42,14 +42,14 @@ class _Commands(click.Group):
         except KeyboardInterrupt:
             to_stderr("interrupted")
             raise SystemExit(130) from None
-        except BrokenPipeError:
-            raise
         except ModuleNotFoundError as error:
             package = (error.name or "").partition(".")[0]
             if package not in _EXTRAS:
                 raise
             message = f"this command needs {package}; install it with: pip install 'torchdof[{_EXTRAS[package]}]'"
         except (OSError, ValueError) as error:
+            if isinstance(error, BrokenPipeError):
+                raise
             command = self.get_command(ctx, ctx.invoked_subcommand or "")
             message = by_option(str(error) or type(error).__name__, command.params if command else ())
         except (MemoryError, RuntimeError) as error:
@@ -75,7 +75,7 @@ def _print_version(ctx: click.Context, _: click.Parameter, is_given: bool) -> No
     is_eager=True,
     expose_value=False,
     callback=_print_version,
-    help="Print the version and the engine in use.",
+    help="Print version, engine.",
 )
 def app() -> None:
     """Depth of field from an image and its depth: the photograph that a real lens would have taken."""

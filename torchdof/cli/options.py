@@ -2,13 +2,12 @@
 
 import math
 import os
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ..io.atomic import check_writable
 from ..io.paths import existing_image, existing_map, samples_of
-from .command import Group, Parsed, number_or, option, pair
+from .command import Group, Parsed, number_or, numbers, option, refuse
 from .lens import Lens
 
 if TYPE_CHECKING:
@@ -22,7 +21,6 @@ _INTEGER_TYPES = (".png", ".jpg", ".jpeg", ".webp")  # types that hold whole num
 _RENDER_TYPES = (".exr", ".tif", ".tiff")  # types whose floats are taken for distances
 
 
-@dataclass(frozen=True, kw_only=True)
 class DepthMap(Group):
     """Depth map."""
 
@@ -41,15 +39,12 @@ class DepthMap(Group):
         "Of relative depth: larger is nearer (MiDaS, Depth Anything; the default), or with depth farther (Marigold)."
     )
     value_range: tuple[float, float] | None = option(
-        "Smallest and largest value of relative depth; default: those of each frame.",
-        metavar="LOW,HIGH",
-        type=Parsed("two numbers such as 0,255", pair),
+        "Its smallest and largest value; default: those of each frame.", type=Parsed("LOW,HIGH", numbers(2), "0,255")
     )
     depth_unknown: float | None = option("A value that means 'not measured', such as 0, -1 or inf.")
     fill_depth: float | str | None = option(
         "Fill pixels without depth from the nearest one, from the farthest around, or with a distance (inf for a sky).",
-        metavar="nearest|far|METRES",
-        type=Parsed("nearest, far or metres", number_or("nearest", "far")),
+        type=Parsed("nearest|far|METRES", number_or("nearest", "far")),
     )
     depth_channel: str | None = option("Channel (or array of an .npz) that is depth.")
     strict: bool = option("Refuse what looks like a wrong unit or scale, instead of warning.", False)
@@ -61,11 +56,11 @@ class DepthMap(Group):
         is_relative = bool(given & {"near_m", "far_m", "relative_kind", "value_range"})
         if self.depth_kind == "auto" and (is_relative or has_scale or self.strict):  # these options imply the kind
             object.__setattr__(self, "depth_kind", "relative" if is_relative else "z")
-        if self.depth_kind == "relative" and has_scale:
-            raise ValueError("relative depth has no --depth-scale and --depth-offset: near and far say it")
-        if self.depth_kind != "relative" and is_relative:
+        if self.depth_kind == "relative":
+            refuse((has_scale, "relative depth has no --depth-scale and --depth-offset: near and far say it"))
+        else:
             options = "--near-m, --far-m, --relative-kind and --value-range"
-            raise ValueError(f"{options} are for relative depth, and not for --depth-kind {self.depth_kind}")
+            refuse((is_relative, f"{options} are for relative depth, and not for --depth-kind {self.depth_kind}"))
 
     @property
     def ends_m(self) -> tuple[float, float]:
@@ -92,32 +87,35 @@ class DepthMap(Group):
             doubt = "its numbers grow downwards, as in relative depth (--depth-kind relative)"
             message = "" if is_clear else f"taken for metres, as the options are in metres, but {doubt}"
             return replace(self, depth_kind="z"), message
-        fill = "far" if self.fill_depth is None else self.fill_depth
-        unknown = guess.unknown if self.depth_unknown is None else self.depth_unknown
-        options = replace(self, depth_kind=guess.kind, fill_depth=fill, depth_unknown=unknown)
+        options = replace(
+            self,
+            depth_kind=guess.kind,
+            depth_scale=guess.scale,
+            depth_unknown=guess.unknown if self.depth_unknown is None else self.depth_unknown,
+            fill_depth="far" if self.fill_depth is None else self.fill_depth,
+        )
         if guess.kind == "z":
             unit = "metres" if guess.scale is None else "millimetres"
-            return replace(options, depth_scale=guess.scale), f"taken for {unit} (else --depth-kind, --depth-scale)"
+            return options, f"taken for {unit} (else --depth-kind, --depth-scale)"
         larger, other = ("nearer", "depth") if guess.relative_kind == "disparity" else ("farther", "disparity")
         message = f"taken for relative depth (else --depth-kind), larger is {larger} (else --relative-kind {other}), "
         message += "from {:g} to {:g} m (else --near-m, --far-m)".format(*self.ends_m)
         return replace(options, relative_kind=guess.relative_kind), message
 
 
-@dataclass(frozen=True, kw_only=True)
 class Scene(Lens, DepthMap):
     """Options for focus, lens and depth map, for commands that take an image and its depth."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.depth_kind == "coc" and self.given(Lens) - {"fov_deg"}:
-            raise ValueError("--depth-kind coc is the blur itself and takes no camera; leave focus and lens out")
+        has_lens = self.depth_kind == "coc" and self.given(Lens) - {"fov_deg"}
+        refuse((has_lens, "--depth-kind coc is the blur itself and takes no camera; leave focus and lens out"))
 
 
-@dataclass(frozen=True, kw_only=True)
-class ApertureOptions(Group):
+class Blur(Group):
     """Blur."""
 
+    table: str = option("disc, gaussian, a shipped table such as sato_j15, or a JSON file.", "disc", basic=True)
     blades: int = option("Aperture blades, from 3; 0 is a round lens.", 0)
     rotation: float = option("Degrees by which blades or image are turned, counter-clockwise.", 0.0)
     curvature: float = option("Of the blades: 0 straight, 1 a circle.", 0.0)
@@ -127,44 +125,37 @@ class ApertureOptions(Group):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.aperture is not None and (self.blades or self.curvature):
-            raise ValueError("--aperture is the whole opening; leave --blades and --curvature out")
-        if self.rotation and not self.blades and self.aperture is None:
-            raise ValueError("--rotation turns blades or an image; give --blades or --aperture too")
+        has_both = self.aperture and (self.blades or self.curvature)
+        turns_nothing = self.rotation and not self.blades and not self.aperture
+        refuse(
+            (has_both, "--aperture is the whole opening; leave --blades and --curvature out"),
+            (turns_nothing, "--rotation turns blades or an image; give --blades or --aperture too"),
+        )
 
-    def table_of(self, name: str) -> "BlurTable":
-        """A table by name or by path of a JSON file; an aperture of these options replaces its own."""
+    def blur_table(self) -> "BlurTable":
+        """The table; an aperture of these options replaces its own."""
         from ..io.images import read_image
         from ..optics.aperture import Aperture
-        from ..optics.blur_table import BlurTable
 
+        table = named_table(self.table)
+        if not self.given(Blur) - {"table"}:
+            return table
         mask = None if self.aperture is None else read_image(self.aperture).light[0].mean(0)
         aperture = Aperture(self.blades, self.rotation, self.curvature, self.squeeze, mask, self.vignetting)
-        table = getattr(BlurTable, name)() if name in ("disc", "gaussian") else BlurTable.load(name)
-        is_default = aperture.is_round and self.squeeze == 1.0 and not aperture.depends_on_place
-        return table if is_default else table.with_aperture(aperture)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Blur(ApertureOptions):
-    """Blur."""
-
-    table: str = option("disc, gaussian, a shipped table such as sato_j15, or a JSON file.", "disc", basic=True)
+        return table.with_aperture(aperture)
 
     def files(self) -> list[Path]:
         """The table and the picture of the opening, if they are files."""
         return [Path(name) for name in (self.table, self.aperture) if name is not None and Path(name).is_file()]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Accuracy(Group):
     """Blur."""
 
     tolerance: Any = option(
-        "Accepted RMS error on display, of 1: draft (8/255), preview (4/255), final (1/255) or a number; 0 is exact.",
+        "Accepted RMS error on display, of 1: draft is 8/255, preview 4/255, final 1/255; 0 is exact.",
         "final",
-        metavar="NAME|NUMBER",
-        type=Parsed("draft, preview, final or a number", number_or("draft", "preview", "final")),
+        type=Parsed("draft|preview|final|NUMBER", number_or("draft", "preview", "final")),
         basic=True,
     )
     no_occlusion: bool = option("One pass that ignores occlusion.", False)
@@ -181,13 +172,11 @@ class Accuracy(Group):
         return arguments | ({"depth_edges": self.depth_edges.replace("-", " ")} if self.depth_edges else {})
 
 
-def make_folder_of(path: Path) -> None:
-    """Creates the folder of ``path`` if it is missing; raises ``OSError`` if it cannot, or ``path`` is read-only."""
-    check_writable(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OSError(f"{path}: its folder cannot be made ({error.strerror})") from None
+def named_table(name: str) -> "BlurTable":
+    """A table by name or by path of a JSON file."""
+    from ..optics.blur_table import BlurTable
+
+    return getattr(BlurTable, name)() if name in ("disc", "gaussian") else BlurTable.load(name)
 
 
 def check_files(image: Path, depth: Path | None, *outputs: Path | None) -> None:

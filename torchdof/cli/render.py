@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import importlib.metadata
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -13,15 +12,12 @@ import click
 
 from ..io.atomic import check_writable
 from ..io.sequence import FramePattern, parse_frames
-from ..io.webp import write_animation
-from .command import Command, Group, Parsed, argument, numbers, option
-from .options import Accuracy, Blur, Scene, check_files, make_folder_of
+from .command import Command, Group, Parsed, argument, numbers, option, refuse
+from .options import Accuracy, Blur, Scene, check_files
 from .output import json_line, progress_bar
 from .resume import Record
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from .frame import Frame, Renderer
 
 _OWN_EXTREMES = (
@@ -32,28 +28,20 @@ Encoding = Literal["linear", "srgb"]
 _NOT_OF_FRAMES = ("out", "sheet", "frames", "resume", "strict", "device", "as_json")  # options that change no frame
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class _Effects(Group):
     """Blur."""
 
     attention: tuple[float, float, float] | None = option(
         "Where the viewer looks, in pixels from the top left: elsewhere a draft's tolerance is enough.",
-        metavar="X,Y,RADIUS",
-        type=Parsed("X,Y,RADIUS in pixels such as 320,200,80", lambda text: numbers(text, 3)),
+        type=Parsed("X,Y,RADIUS", numbers(3), "320,200,80"),
     )
     lights: float = option(
-        "Make lamps that a photograph clipped at white brighter by up to this many stops, such as 3.",
-        0.0,
-        metavar="STOPS",
-        type=click.FloatRange(min=0),
+        "Brighten lamps that a photograph clipped at white, by up to so many stops.", 0.0, type=click.FloatRange(min=0)
     )
-    show_focus: bool = option(
-        "Don't blur: show the image in grey, tinted: near orange, in focus green, far blue.", False
-    )
+    show_focus: bool = option("Don't blur: tint the grey image: near orange, in focus green, far blue.", False)
     device: str = option("auto, cpu, cuda, cuda:1, ...", "auto")
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class _Files(Group):
     """Files and frames."""
 
@@ -62,14 +50,11 @@ class _Files(Group):
     bits: Literal["8", "16", "half", "float"] | None = option("What OUT stores. Default: as IMAGE, where the type can.")
     layer: str | None = option("Layer or part of an EXR that is the image.")
     sheet: Path | None = option("Also write the image, its depth and the result side by side to this file.")
-    frames: tuple[int, int] | None = option(
-        "Part of a sequence.", metavar="FIRST-LAST", type=Parsed("first-last, such as 1-48", parse_frames)
-    )
+    frames: tuple[int, int] | None = option("Part of a sequence.", type=Parsed("FIRST-LAST", parse_frames, "1-48"))
     steady: bool = option("Filter depth of a sequence along time, where neither image nor depth moved.", False)
     resume: bool = option("Render only frames that are missing, cut short, or older than files or options.", False)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
     """Blur IMAGE by its DEPTH as a lens would.
 
@@ -89,7 +74,7 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
 
         torchdof render shot.####.exr -o out.####.exr --focus-m 1:2,48:5.5 --f-number 2 --resume
 
-    A photograph with a focus pull; pull.webp would be one animation, 25 frames a second:
+    A photograph with a focus pull:
 
         torchdof render photo.jpg depth.png -o pull.##.png --focus-m 1:1,24:5
 
@@ -113,23 +98,16 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         images, depths, numbered = map(FramePattern.of, (self.image, self.depth, self.out))
         keys = (self.focus_m or []) if images is None else []
         is_single = images is None and len(keys) < 2
-        is_animation = images is None and not is_single and not numbered
         has_number = numbered and FramePattern.is_padded(self.out) and not FramePattern.is_padded(self.image)
         of_sequences = (images is None and (self.steady or depths)) or (is_single and (self.frames or has_number))
-        no_number = f"{self.out}: expected one place for the frame number, such as pull.##.png, or a .webp"
-        for is_wrong, problem in (
-            (is_animation and self.out.suffix.lower() != ".webp", no_number),
-            (is_animation and self.resume, "--resume is of frames; an animation is one file, so leave it out"),
+        no_number = f"{self.out}: expected one place for the frame number, such as pull.##.png; ffmpeg joins frames"
+        refuse(
+            (not is_single and not numbered, no_number),
             (self.sheet and not is_single, "--sheet is of one picture; leave it out where there are more"),
             (of_sequences, f"{self.image}: is a single image; for a sequence write it as shot.####.exr"),
-            (
-                images and self.blur,
-                "--blur would open the lens anew in each frame of a sequence; give --f-number",
-            ),
+            (images and self.blur, "--blur would open the lens anew in each frame of a sequence; give --f-number"),
             (self.steady and self.depth_kind == "coc", "--steady filters depth in metres; --depth-kind coc has none"),
-        ):
-            if is_wrong:
-                raise ValueError(problem)
+        )
 
         def sources(n: int) -> tuple[Path, Path | None]:
             return images.name(n) if images else self.image, depths.name(n) if depths else self.depth
@@ -142,10 +120,9 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
             numbers = range(first, last + 1)
         if not numbers:
             raise FileNotFoundError(f"{self.image}: there are no such files")
-        target = None if is_single or is_animation else FramePattern(self.out)
         outputs: dict[int, Path] = {}
         for n in numbers:
-            outputs[n] = target.name(n) if target else self.out
+            outputs[n] = numbered.name(n) if numbered and not is_single else self.out
             check_files(*sources(n), outputs[n], self.sheet)
         whole = list(numbers)  # frames of the sequence, each of which may depend on those before it
         if images and self.steady:
@@ -172,8 +149,7 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         from .frame import Renderer
 
         is_guessed = images and self.depth_kind == "auto"  # a guess could differ from frame to frame
-        command = dataclasses.replace(self, depth_kind="z") if is_guessed else self
-        renderer = Renderer(command, images is None, is_animation)
+        renderer = Renderer(dataclasses.replace(self, depth_kind="z") if is_guessed else self, images is None)
         if self.resume and len(existing) > len(done):
             again = f"{len(existing) - len(done)} of {len(outputs)} frames are rendered again"
             renderer.notices.note("again", f"{self.out}: {again}: {reason}")
@@ -181,26 +157,18 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
             renderer.notices.warn(self.depth or self.image, [Mistake("range", _OWN_EXTREMES)])
         read_files = functools.lru_cache(maxsize=1)(renderer.read)  # a focus pull reads one image many times
 
-        def pixels_and_depth(place: int) -> "tuple[Tensor, Tensor]":
-            frame = read_files(*sources(whole[place]))
-            return frame.picture.pixels, frame.values
+        def as_stored(n: int) -> "Frame":
+            return read_files(*sources(n))
 
-        steady = SteadyFrames(pixels_and_depth)
+        steady = SteadyFrames(lambda k: (as_stored(whole[k]).picture.pixels, as_stored(whole[k]).values))
 
-        def read(n: int) -> "Frame":
-            if not (images and self.steady):
-                return read_files(*sources(n))
+        def steadied(n: int) -> "Frame":
             values = steady.depth(whole.index(n))  # reads frame n last, so that it is still in the cache
-            return dataclasses.replace(read_files(*sources(n)), values=values)
+            return dataclasses.replace(as_stored(n), values=values)
 
-        if not is_animation:
-            is_recorded = self.resume or not is_single or record.path.is_file()
-            return self._render_each(renderer, todo, read, record if is_recorded else None)
-        with tempfile.TemporaryDirectory() as folder:
-            todo = {n: Path(folder, f"{n}.webp") for n in todo}
-            self._render_each(renderer, todo, read, None)
-            make_folder_of(self.out)
-            write_animation(self.out, list(todo.values()))
+        is_recorded = self.resume or not is_single or record.path.is_file()
+        read = steadied if images and self.steady else as_stored
+        self._render_each(renderer, todo, read, record if is_recorded else None)
 
     def _render_each(
         self, renderer: "Renderer", files: Mapping[int, Path], read: "Callable[[int], Frame]", record: Record | None
@@ -210,25 +178,23 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         The record is written before the first frame, but after it is rendered: an error in it leaves no file. Before
         each later frame it is read: the run ends if another one has begun to write other frames of these names.
         """
-        numbers = list(files)
+        count = len(files)
         with (
-            progress_bar(f"rendering {self.out.name}", len(files) if len(files) > 1 else None) as update,
-            ThreadPoolExecutor(1) as reader,
-            ThreadPoolExecutor(1) as writer,
+            progress_bar(f"rendering {self.out.name}", count if count > 1 else None) as update,
+            ThreadPoolExecutor(2) as pool,
         ):
-            reading, written = reader.submit(read, numbers[0]), writer.submit(lambda: None)
+            frames = (pool.submit(read, n) for n in files)
+            reading, writing = next(frames), pool.submit(lambda: None)
             try:
-                for k, n in enumerate(numbers):
-                    if len(files) > 1:
-                        update(f"frame {k + 1} of {len(files)}", k)
+                for k, (n, out) in enumerate(files.items()):
+                    if count > 1:
+                        update(f"frame {k + 1} of {count}", k)
                     frame = reading.result()
-                    if k + 1 < len(numbers):
-                        reading = reader.submit(read, numbers[k + 1])
-                    write = renderer.render(frame, files[n], n)
-                    written.result()
+                    reading = next(frames, reading)  # starts to read the next frame
+                    write = renderer.render(frame, out, n)
+                    writing.result()
                     if record is not None:
-                        make_folder_of(files[n])
                         record.write(is_first=k == 0)
-                    written = writer.submit(write)  # Ctrl-C does not stop this thread
+                    writing = pool.submit(write)  # Ctrl-C does not stop this thread
             finally:  # a rendered frame is written even if the next one fails
-                written.result()
+                writing.result()

@@ -45,9 +45,8 @@ class Record:
 
     def write(self, is_first: bool) -> None:
         """Before the first frame, writes the options if they differ; later refuses those of another run."""
-        reason = self.difference() if is_first or self.path.is_file() else ""
-        if reason and not is_first:
-            problem = f"another run renders the same frames with other options ({reason})"
-            raise ValueError(f"{self.path}: {problem}")
-        if reason:
+        reason = self.difference()
+        if reason and is_first:
             write_text(self.path, json.dumps(self._options, indent=1))
+        elif reason and self.path.is_file():
+            raise ValueError(f"{self.path}: another run renders the same frames with other options ({reason})")

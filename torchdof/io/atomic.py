@@ -6,25 +6,21 @@ The temporary file is removed on any error, including Ctrl-C, SIGTERM and SIGHUP
 import contextlib
 import os
 import signal
+import sys
 import threading
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
-from types import FrameType
-from typing import NoReturn
-
-__all__ = ["atomic_file", "check_writable", "exit_on_signals", "write_text"]
 
 
 @contextlib.contextmanager
 def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary file in the folder of ``path``, renamed to ``path`` at the end, or removed on any error."""
+    """A temporary file in the folder of ``path``, which is made; renamed to ``path`` at the end, removed on errors."""
+    check_writable(path)
     target = Path(os.path.realpath(path))
-    if not target.parent.is_dir():
-        raise FileNotFoundError(f"{path}: there is no folder {target.parent}; make it first")
     if target.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; name a file in it")
-    check_writable(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{uuid.uuid4().hex}.part{target.suffix}")
     with exit_on_signals():
         try:
@@ -37,11 +33,13 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Refuses a file that is read-only, or that lies in a read-only folder or in a missing folder within one."""
+    """Refuses a file that is read-only, or whose folder is read-only or cannot be made."""
     target = Path(os.path.realpath(path))
     if target.is_file() and not os.access(target, os.W_OK):
         raise PermissionError(f"{path}: is read-only; make it writable or name another file")
     folder = next(parent for parent in target.parents if parent.exists())
+    if not folder.is_dir():
+        raise NotADirectoryError(f"{path}: its folder cannot be made, because {folder} is a file")
     if not os.access(folder, os.W_OK):
         raise PermissionError(f"{path}: may not write to the folder {folder}")
 
@@ -55,16 +53,12 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 @contextlib.contextmanager
 def exit_on_signals() -> Iterator[None]:
     """Turns SIGTERM and SIGHUP into ``SystemExit``, so that ``finally`` blocks run; handlers of the caller stay."""
-
-    def exit_with_status(number: int, _: FrameType | None) -> NoReturn:
-        raise SystemExit(128 + number)  # the exit status that shells use for signals
-
-    signals = {getattr(signal, name, signal.SIGTERM) for name in ("SIGTERM", "SIGHUP")}
+    signals = {signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)}
     is_main_thread = threading.current_thread() is threading.main_thread()  # only this thread may set handlers
     unhandled = [number for number in signals if is_main_thread and signal.getsignal(number) == signal.SIG_DFL]
     try:
         for number in unhandled:
-            signal.signal(number, exit_with_status)
+            signal.signal(number, lambda number, _: sys.exit(128 + number))  # as shells count signals
         yield
     finally:
         for number in unhandled:

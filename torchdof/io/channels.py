@@ -2,8 +2,6 @@
 
 from .decode import Part
 
-__all__ = ["colour_channels", "depth_channel"]
-
 
 def colour_channels(parts: list[Part], layer: str | None) -> tuple[int, list[int], tuple[str, ...]]:
     """Index of a part, indices in it of R, G, B (or grey, Y) and, if present, A, and their names without layer.
@@ -12,16 +10,14 @@ def colour_channels(parts: list[Part], layer: str | None) -> tuple[int, list[int
     """
     layers_with_colour = []
     for part, source in enumerate(parts):
-        label, names = source.label, source.names
-        layer_names = dict.fromkeys(name.rpartition(".")[0] if source.is_exr else "" for name in names)
-        for layer_name in layer_names:
+        names = source.names
+        for layer_name in dict.fromkeys(name.rpartition(".")[0] if source.is_exr else "" for name in names):
             start = layer_name + "." if layer_name else ""
-            for colours in (("R", "G", "B"), ("Y",)):
-                if all(start + name in names for name in colours):
-                    channels = (*colours, "A") if start + "A" in names else colours
-                    indices = [names.index(start + name) for name in channels]
-                    layers_with_colour.append((layer_name, label, part, indices, channels))
-                    break
+            colours = next((each for each in ("RGB", "Y") if all(start + name in names for name in each)), "")
+            if colours:
+                channels = tuple(colours + "A" if start + "A" in names else colours)
+                indices = [names.index(start + name) for name in channels]
+                layers_with_colour.append((layer_name, source.label, part, indices, channels))
     if layer is None:
         layers_with_colour.sort(key=lambda entry: entry[0] != "")
         chosen = layers_with_colour[:1]

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["print_columns"]
-
 
 def print_columns(
     console: Console, title: str, columns: Mapping[str, Sequence[str]], words: Collection[str] = ()

@@ -17,8 +17,6 @@ import numpy as np
 from .memory import free_bytes
 from .metadata import Metadata, kept_metadata, upright
 
-__all__ = ["Part", "errors_named", "first_line", "is_complete", "read_array", "read_parts", "utf8_name"]
-
 MAX_PIXELS = 2**28  # of an image or array; a larger limit allows damaged headers to claim more memory
 MAX_ATTRIBUTES = 4096  # in all parts of an EXR file together; renderers write a few hundred
 MAX_CHANNELS = 1024  # in a part of an EXR file; OpenImageIO has the same limit
@@ -42,14 +40,13 @@ class Part:
 @contextlib.contextmanager
 def utf8_name(path: Path) -> Iterator[str]:
     """A UTF-8 name of a file, which OpenImageIO needs; other names get a temporary symbolic link."""
-    with contextlib.ExitStack() as folders:
-        try:
-            name = os.fsencode(path).decode()
-        except UnicodeDecodeError:
-            link = Path(folders.enter_context(tempfile.TemporaryDirectory()), f"picture{path.suffix}")
-            link.symlink_to(path.absolute())
-            name = str(link)
-        yield name
+    if str(path).isprintable():  # bytes that are not UTF-8 are surrogates, which are not printable
+        yield str(path)
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        link = Path(folder, f"picture{path.suffix}")
+        link.symlink_to(path.absolute())
+        yield str(link)
 
 
 @contextlib.contextmanager
@@ -146,20 +143,18 @@ def _check_header(path: Path) -> None:
         if content[:4] != b"v/1\x01" or len(content) < 9:
             return
         has_parts, offset = bool(content[5] & 0x10), 8
+        attribute = re.compile(rb"[^\0]+\0([^\0]+)\0(.{4})", re.DOTALL)  # name, type, size of the value that follows
         for _ in range(MAX_ATTRIBUTES):
-            if content[offset : offset + 1] == b"\0":  # the end of a part's header
+            if content[offset : offset + 1] == b"\0" and has_parts:  # the end of a part's header
                 offset += 1
-                if not has_parts or content[offset : offset + 1] == b"\0":
-                    return
-            type_end = content.find(b"\0", content.find(b"\0", offset) + 1)
-            start, size = type_end + 5, int.from_bytes(content[type_end + 1 : type_end + 5], "little")
-            is_list = content[type_end - 6 : type_end] == b"chlist"  # of channels, each a name, a zero and 16 bytes
-            count = len(re.findall(rb"[^\0]+\0.{16}", content[start : start + size], re.DOTALL)) if is_list else 0
+            found = attribute.match(content, offset)
+            if found is None:  # the end of all headers, or damage that the reader will refuse
+                return
+            start, offset = found.end(), found.end() + int.from_bytes(found[2], "little")
+            is_list = found[1] == b"chlist"  # of channels, each a name, a zero and 16 bytes
+            count = len(re.findall(rb"[^\0]+\0.{16}", content[start:offset], re.DOTALL)) if is_list else 0
             if count > MAX_CHANNELS:
                 raise ValueError(f"its header has {count} channels in a part; at most {MAX_CHANNELS} are read")
-            offset = start + size
-            if type_end < offset - 2**31 or offset >= len(content):  # damaged: the reader will refuse it
-                return
     raise ValueError(f"its headers hold more than {MAX_ATTRIBUTES} attributes, which is the limit")
 
 

@@ -161,7 +161,8 @@ def write_image(
     """Writes a picture whole or not at all.
 
     Args:
-        path: Output file; its suffix gives the format (.exr .png .tif .tiff .jpg .jpeg .webp .hdr .pfm).
+        path: Output file; its suffix gives the format (.exr .png .tif .tiff .jpg .jpeg .webp .hdr .pfm). A missing
+            folder is made.
         picture: Pixels in linear light; metadata that the format supports is written too.
         transfer: "linear" or "srgb". None keeps the picture's own if both its ``sample`` and the new one are integers,
             or both floats; otherwise it is "srgb" for integers and "linear" for floats.
@@ -189,7 +190,7 @@ def write_image(
         transfer = picture.transfer if both_floats_or_integers else default_transfer(sample)
     pixels = real_tensor("pixels", picture.pixels, "[1, C, H, W] in linear light").detach().cpu().float()
     names = picture.channels
-    if pixels.ndim != 4 or pixels.shape[0] != 1 or pixels.shape[1] != len(names):
+    if pixels.ndim != 4 or pixels.shape[:2] != (1, len(names)):
         raise ValueError(f"{path}: pixels must be [1, {len(names)}, H, W] for {names}, got {list(pixels.shape)}")
     if picture.has_alpha and suffix not in _ALPHA_SUFFIXES:
         if bool((pixels[:, -1] < 1.0).any()):
@@ -213,13 +214,10 @@ def write_image(
     if picture.window is not None:
         spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height = picture.window
     for name, (kind, value) in picture.metadata.items():
-        if name == "compression" and not (suffix == ".exr" and value in _LOSSLESS_EXR):
-            continue
-        if name != "ICCProfile" or transfer == picture.transfer:
-            if isinstance(value, int):  # OpenImageIO drops an integer given with a 16-bit type
-                spec.attribute(name, value)
-            else:
-                spec.attribute(name, kind, value)
+        is_lossless = suffix == ".exr" and value in _LOSSLESS_EXR
+        if {"compression": is_lossless, "ICCProfile": transfer == picture.transfer}.get(name, True):
+            typed = (value,) if isinstance(value, int) else (kind, value)  # with a 16-bit type it would be dropped
+            spec.attribute(name, *typed)
     if transfer == "srgb" or suffix != ".exr":  # not of linear EXR files, whose primaries are those of the input
         spec.attribute("oiio:ColorSpace", "srgb_rec709_scene" if transfer == "srgb" else "lin_rec709_scene")
     if transfer == "linear" and suffix != ".exr":
@@ -270,12 +268,11 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
         planes = [(p.label, name, p.values[..., k]) for p in parts for k, name in enumerate(p.names)]
         channel_names = ", ".join(name for _, name, _ in planes)
         if channel is not None:
-            chosen = [plane for label, name, plane in planes if channel in (name, f"{label}.{name}")]
-            if not chosen:
-                raise ValueError(f"no channel {channel!r}; it has {channel_names}")
-            return _map(chosen[0])
-        depth_place = depth_channel(parts)
-        if depth_place is not None:
+            for label, name, values in planes:
+                if channel in (name, f"{label}.{name}"):
+                    return _map(values)
+            raise ValueError(f"no channel {channel!r}; it has {channel_names}")
+        if (depth_place := depth_channel(parts)) is not None:
             return _map(parts[depth_place[0]].values[..., depth_place[1]])
         if all(np.array_equal(values, planes[0][2]) for _, name, values in planes if name != "A"):
             return _map(planes[0][2])

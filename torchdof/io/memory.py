@@ -6,8 +6,6 @@ import os
 import re
 from pathlib import Path
 
-__all__ = ["free_bytes"]
-
 _CGROUP_FILES = (  # limit and use of a control group, version 2 and 1
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
     ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import numpy as np
 
-__all__ = ["Metadata", "camera_settings", "kept_metadata", "upright"]
-
 Metadata = dict[str, tuple[Any, Any]]
 """Name -> (OpenImageIO type, value)."""
 

@@ -7,10 +7,6 @@ import os
 from pathlib import Path
 from typing import Literal
 
-from . import optional_formats
-
-__all__ = ["IMAGE_SUFFIXES", "MAP_SUFFIXES", "PixelType", "existing_image", "existing_map", "named_file", "samples_of"]
-
 PixelType = Literal["8", "16", "half", "float"]
 
 _SAMPLES: dict[str, tuple[PixelType, ...]] = {  # suffix -> sample types, the default first
@@ -26,6 +22,28 @@ IMAGE_SUFFIXES = tuple(_SAMPLES)
 MAP_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".npz")
 """Suffixes of depth maps."""
 
+_CONVERT = "convert it to JPEG or 16-bit TIFF (heif-convert, sips -s format tiff, or let the phone share it as JPEG)"
+_DEVELOP = "develop it to linear 16-bit TIFF (dcraw -4 -T, or a converter's linear profile) and copy its EXIF"
+OPTIONAL_SUFFIXES = {
+    **dict.fromkeys((".heic", ".heif", ".avif"), ("heif", _CONVERT)),
+    **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"), ("raw", _DEVELOP)),
+}
+"""Suffixes of images that OpenImageIO reads only if it was built with a further library, and what to do if not."""
+
+
+def readers() -> list[str]:
+    """Formats that the installed OpenImageIO reads."""
+    import OpenImageIO as oiio
+
+    return oiio.get_string_attribute("format_list").split(",")
+
+
+def refusal(path: str | os.PathLike[str]) -> str | None:
+    """Message with the reason and the conversion for a file that cannot be read here; None for other files."""
+    suffix = Path(path).suffix.lower()
+    reader, remedy = OPTIONAL_SUFFIXES.get(suffix, ("", ""))
+    return f"{suffix} is not read here: {remedy}" if reader and reader not in readers() else None
+
 
 def samples_of(path: Path) -> tuple[PixelType, ...]:
     """Sample types that an image file can hold, by its suffix, the default first; refuses other suffixes."""
@@ -38,9 +56,10 @@ def samples_of(path: Path) -> tuple[PixelType, ...]:
 
 def existing_image(path: str | os.PathLike[str]) -> Path:
     """Checks the path of an image; errors name it."""
-    if refusal := optional_formats.refusal(path):
-        raise ValueError(f"{path}: {refusal}")
-    return _existing_file(path, (*IMAGE_SUFFIXES, *optional_formats.SUFFIXES), "an image")
+    path = _existing_file(path, (*IMAGE_SUFFIXES, *OPTIONAL_SUFFIXES), "an image")
+    if reason := refusal(path):
+        raise ValueError(f"{path}: {reason}")
+    return path
 
 
 def existing_map(path: str | os.PathLike[str]) -> Path:

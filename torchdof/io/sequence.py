@@ -4,8 +4,6 @@ import math
 import re
 from pathlib import Path
 
-__all__ = ["FramePattern", "focus_at_frame", "parse_focus", "parse_frames"]
-
 _MAX_DIGITS = 18  # of a frame number
 
 

@@ -1,7 +1,6 @@
 """Pictures side by side in one file, each with a caption."""
 
 import os
-from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as functional
@@ -12,7 +11,6 @@ from .images import Picture, write_image
 
 __all__ = ["shrunk", "write_sheet"]
 
-_LABEL_PX = 76  # px; width of the column of row labels
 _MARGIN_PX, _CAPTION_PX = 8, 34  # px between panels; height of the line of captions
 
 
@@ -31,13 +29,12 @@ def shrunk(pixels: Tensor, longest: int) -> Tensor:
     return functional.interpolate(pixels, size, mode="bilinear", antialias=True)
 
 
-def write_sheet(path: str | os.PathLike[str], panels: dict[str, Tensor], rows: Sequence[str] = ()) -> None:
+def write_sheet(path: str | os.PathLike[str], panels: dict[str, Tensor]) -> None:
     """Writes panels side by side, each with its caption above.
 
     Args:
         path: Output file, as for :func:`torchdof.io.images.write_image`.
         panels: Caption -> ``[1, 3, H, W]`` in linear light, all of one size.
-        rows: Labels to the left of the panels, one for each of their rows, which have equal height.
 
     Raises:
         ValueError: If the format is unknown.
@@ -48,17 +45,12 @@ def write_sheet(path: str | os.PathLike[str], panels: dict[str, Tensor], rows: S
     if not isinstance(panels, dict) or not panels:
         raise ValueError(f"panels must be a dict with at least one panel, caption: pixels, got {show(panels)}")
     height, width = real_tensor("a panel", next(iter(panels.values())), "[1, 3, H, W] in linear light").shape[-2:]
-    start = _MARGIN_PX + (_LABEL_PX if rows else 0)
-    sheet = torch.full((1, 3, height + _CAPTION_PX + _MARGIN_PX, start + len(panels) * (width + _MARGIN_PX)), 0.8)
-    lefts = [start + k * (width + _MARGIN_PX) for k in range(len(panels))]
+    lefts = range(_MARGIN_PX, len(panels) * (width + _MARGIN_PX), width + _MARGIN_PX)
+    sheet = torch.full((1, 3, height + _CAPTION_PX + _MARGIN_PX, lefts.stop + _MARGIN_PX), 0.8)
     for left, panel in zip(lefts, panels.values(), strict=True):
         sheet[:, :, _CAPTION_PX : _CAPTION_PX + height, left : left + width] = panel.cpu()
     buffer = oiio.ImageBuf(sheet[0].permute(1, 2, 0).contiguous().numpy())  # [3, H, W] -> [H, W, 3]
-    texts = [(left, _CAPTION_PX - 11, text) for left, text in zip(lefts, panels, strict=True)]
-    texts += [
-        (_MARGIN_PX, _CAPTION_PX + round((k + 0.5) * height / len(rows)) + 7, text) for k, text in enumerate(rows)
-    ]
-    for x, y, text in texts:
-        oiio.ImageBufAlgo.render_text(buffer, x, y, text, 20, "", (0.0, 0.0, 0.0))
+    for left, caption in zip(lefts, panels, strict=True):
+        oiio.ImageBufAlgo.render_text(buffer, left, _CAPTION_PX - 11, caption, 20, "", (0.0, 0.0, 0.0))
     pixels = torch.from_numpy(buffer.get_pixels(oiio.FLOAT)).permute(2, 0, 1)[None]
     write_image(path, Picture(pixels, sample="8", transfer="srgb"))

@@ -9,8 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["Transfer", "decode", "default_transfer", "encode", "encode_8_bits"]
-
 Transfer = Literal["linear", "srgb"]
 
 
