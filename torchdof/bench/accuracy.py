@@ -77,14 +77,13 @@ def compare(truth: Path, out: Path, views: Sequence[int], degraded: bool, peers:
         window = _worst(pictures["torchdof"], scene, tile_px)
         for name, picture in {"sharp": scene.image, "truth": scene.truth, **pictures}.items():
             panels.setdefault(name, []).append(picture[window][:, :3].expand(-1, 3, -1, -1))
-    tables = {"Means": summary(rows, ["depth", "renderer"], statistics.fmean), "Scenes": rows}
+    means = summary(rows, ["depth", "renderer"], statistics.fmean)
     remark = "psnr_inner: without the border reached by light from outside the frame; flip: smaller is better."
     if degraded:
-        publish("What inexact depth costs", tables, [remark], out / "degraded")
-        return
+        return publish("What inexact depth costs", means, [remark], out / "degraded", details=rows)
     remark += f" accuracy.png: for each scene, the {tile_px} x {tile_px} pixels with torchdof's largest error."
     draw = functools.partial(write_sheet, panels={name: torch.cat(parts, 2) for name, parts in panels.items()})
-    publish("Accuracy against the truth", tables, [remark], out / "accuracy", draw)
+    publish("Accuracy against the truth", means, [remark], out / "accuracy", draw, details=rows)
 
 
 def _worst(picture: Tensor, scene: Scene, side: int) -> tuple[Any, ...]:
