@@ -27,7 +27,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchdof import blur_by_coc
 from torchdof.bench.measurement import peak_of
-from torchdof.depth.reading import read_depth
+from torchdof.depth import read_depth
 from torchdof.functional import splat
 from torchdof.io.images import read_image
 from torchdof.reference.scenes import read_scenes

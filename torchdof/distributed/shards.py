@@ -20,7 +20,7 @@ from torch import Tensor
 
 from ..augmentation import RandomDepthOfField
 from ..depth.holes import resolve_holes
-from ..depth.reading import read_depth
+from ..depth.kinds import read_depth
 from ..depth.relative import from_relative
 from ..io.atomic import atomic_file, write_text
 from ..io.images import Picture, read_image, read_values, write_image
@@ -104,7 +104,7 @@ class RenderShards:
     Args:
         out: Folder of the shards; it must exist.
         blur: Draws focus, f-number and lens, and renders. Its ``p`` is ignored: every sample is blurred.
-        depth: How to read depth maps: keyword arguments of :func:`torchdof.depth.reading.read_depth`; or, for depth
+        depth: How to read depth maps: keyword arguments of :func:`torchdof.depth.read_depth`; or, for depth
             without a scale, ``{"kind": "relative", "near_m": 1.0, "far_m": 8.0}``, with ``relative_kind``,
             ``value_range`` and ``unknown`` as in :func:`torchdof.depth.from_relative`, and ``fill`` and ``channel``.
         format: "webdataset" or "parquet"; requires the package webdataset or pyarrow.
