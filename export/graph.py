@@ -21,12 +21,10 @@ from torchdof.validation import choice
 
 from .operations import GraphOps, WholeOps
 
-__all__ = ["INPUTS", "ITEMS", "LAYOUTS", "OUTPUT", "Layout", "Portable", "Size", "axes", "trace"]
+__all__ = ["INPUTS", "ITEMS", "OUTPUT", "Layout", "Portable", "Size", "axes", "trace"]
 
 Layout = Literal["tiles", "whole"]
 """Structure of a graph: a loop over tiles, or straight operations on whole frames."""
-
-LAYOUTS = get_args(Layout)
 
 Size = tuple[int, int] | None
 """Height and width of the only frame that a graph takes, as a batch of one; None: any batch, height and width."""
@@ -72,7 +70,7 @@ class Portable(nn.Module):
     ) -> None:
         super().__init__()
         choice("inputs", inputs, INPUTS)
-        choice("layout", layout, LAYOUTS)
+        choice("layout", layout, get_args(Layout))
         for name in Camera.__dataclass_fields__:
             if isinstance(getattr(dof.camera, name), Tensor):
                 raise ValueError(
@@ -110,7 +108,7 @@ class Portable(nn.Module):
     def forward(self, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
         """Renders ``[B, C, H, W]`` from depth and ``(focus_m, f_number)``, or from a map of the coc."""
         out = self._rendered(self.dof.options, self.plan, image, map_, *lens)
-        if self.inputs == "coc_px":
+        if not lens:
             return out
         focus_m, f_number = lens
         camera = self.dof.camera
@@ -124,10 +122,7 @@ class Portable(nn.Module):
         return self._rendered(self.called, None, image, map_, *lens)
 
     def _rendered(self, options: Options, plan: Plan | None, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
-        if self.inputs == "coc_px":
-            return blur(image, map_, options, plan, ops=self.ops)
-        focus_m, f_number = lens
-        coc_px = self.dof.coc_as_given(image, map_, focus_m, f_number)
+        coc_px = self.dof.coc_as_given(image, map_, *lens) if lens else map_
         return blur(image, coc_px, options, plan, ops=self.ops)
 
 
