@@ -105,8 +105,8 @@ def make_dataset(
     except (ValueError, TypeError):
         raise ValueError(f"{plan}: cannot be read; put it back, or use another folder") from None
     if differing := [name for name, value in settings.items() if recorded.get(name) != value]:
-        remedy = f"go on with those in {plan.name}, or use another folder"
-        raise ValueError(f"{out}: was begun with other settings ({', '.join(differing)}); {remedy}")
+        begun = f"{out}: was begun with other settings ({', '.join(differing)})"
+        raise ValueError(f"{begun}; go on with those in {plan.name}, or use another folder")
     missing = [row for row in rows if renderer.samples_of(**row) is None]
     say(f"{len(rows) - len(missing)} of {len(rows)} shards are there already")
     if missing:
