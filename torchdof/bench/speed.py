@@ -103,7 +103,7 @@ def compare(
 
 
 def report(rows: Sequence[Row], scene: BenchScene, out: Path | None, quiet: bool = False) -> None:
-    """Prints a table unless quiet; writes ``speed.csv``, ``.md`` and ``.png`` to a folder: all of them or none."""
+    """Prints a table unless quiet; writes ``speed.csv`` and ``.md`` to a folder: both or none."""
     low, high = float(scene.coc_px.min()), float(scene.coc_px.max())
     title = f"Speed against error: {scene.name}, blur radius {low:.1f} to {high:.1f} px, {scene.table!r}"
     exceeded = "; ".join(row["setting"] for row in rows if not row["kept"])
@@ -112,21 +112,4 @@ def report(rows: Sequence[Row], scene: BenchScene, out: Path | None, quiet: bool
         "against the exact rendering with the same occlusion is within the tolerance.",
         f"**The tolerance was not kept by: {exceeded}.**" if exceeded else "Every tolerance was kept.",
     ]
-    publish(title, rows, remarks, out and out / "speed", functools.partial(_plot, rows=rows, title=title), quiet)
-
-
-def _plot(path: Path, rows: Sequence[Row], title: str) -> None:
-    """Plots the RMS error over the time of a new camera, both logarithmic, as PNG."""
-    from matplotlib.figure import Figure  # not pyplot, which would choose a display and keep every figure in memory
-
-    figure = Figure(figsize=(7, 4.5), dpi=120, layout="constrained")
-    axes = figure.subplots()
-    for row in rows:
-        if row.get("rms_255", 0.0) > 0 and row["frame"] == rows[0]["frame"]:
-            colour = "#1d4ed8" if row["setting"].endswith("without occlusion") else "#c2410c"
-            axes.loglog(row["new_ms"], row["rms_255"], "o", color=colour)
-            axes.annotate(row["setting"], (row["new_ms"], row["rms_255"]), fontsize=6, color=colour)
-    axes.set(xlabel="time of a new camera [ms]", ylabel="RMS error [1/255]")
-    axes.set_title(title, fontsize=9)
-    axes.grid(True, which="both", lw=0.3)
-    figure.savefig(path)
+    publish(title, rows, remarks, out and out / "speed", quiet=quiet)
