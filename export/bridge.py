@@ -5,25 +5,20 @@ converts the estimator's output to depth in metres at the image's size. It resiz
 inverse depth planes stay planes.
 """
 
+# mypy: ignore-errors
+# The functions below are not run as Python, and their types differ from those of Python.
+
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
 
 import onnx
 import onnxscript
-
-if TYPE_CHECKING:  # the functions below are not run as Python, and types differ
-    op: Any
-    Depth = Any
-    Floats = Any
-    Image = Any
-    Items = Any
-else:
-    from onnxscript import opset20 as op
-
-    Floats, Items = onnxscript.FLOAT[...], onnxscript.FLOAT["B"]
-    Image, Depth = onnxscript.FLOAT["B", 3, "H", "W"], onnxscript.FLOAT["B", 1, "H", "W"]
+from onnxscript import FLOAT
+from onnxscript import opset20 as op
 
 __all__ = ["decode", "encode"]
+
+Floats, Items = FLOAT[...], FLOAT["B"]
+Image, Depth = FLOAT["B", 3, "H", "W"], FLOAT["B", 1, "H", "W"]
 
 script = onnxscript.script(onnxscript.values.Opset("torchdof", 1), default_opset=op)
 """Decorator of functions that :mod:`onnxscript` compiles to ONNX."""
@@ -84,6 +79,4 @@ def decode(kind: str, scale: float, shift: float) -> onnx.ModelProto:
         farthest = op.Reciprocal(op.Unsqueeze(far_m, axes))
         return depth_of(fraction * (op.Reciprocal(op.Unsqueeze(near_m, axes)) - farthest) + farthest, image)
 
-    graphs: dict[str, Any] = {"metric": metric, "inverse": inverse, "relative-inverse": relative}
-    model: onnx.ModelProto = graphs[kind].to_model_proto()
-    return model
+    return {"metric": metric, "inverse": inverse, "relative-inverse": relative}[kind].to_model_proto()

@@ -42,21 +42,8 @@ OUTPUT = "out"
 class Portable(nn.Module):
     """The module as computed by its ONNX file: all layers up to ``max_coc_px``; pixels with bad values are copied.
 
-    An impossible camera gives NaN.
-
-    Called outside an export, it gives the same result with eager PyTorch; files are verified against it.
-
-    Args:
-        dof: The module. Its camera must have floats, not tensors.
-        inputs: The map that the graph takes: ``"depth"`` or ``"coc_px"``.
-        width: Image width for the kernels of a table with lengths in millimetres or fractions of the width.
-        depth_edges: Repair of the map's edges in the graph.
-        layout: Structure of the graph. The layout ``"whole"`` renders without rays of highlights.
-        size: Size of the graph's frame, for the layout ``"whole"``.
-
-    Raises:
-        ValueError: If the camera has tensors, the width is missing or superfluous, or the layout does not support an
-            argument.
+    An impossible camera gives NaN. Called outside an export, it gives the same result with eager PyTorch; files are
+    verified against it. Arguments as of :func:`torchdof.export.to_onnx`.
     """
 
     def __init__(
@@ -127,11 +114,7 @@ class Portable(nn.Module):
 
 
 def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
-    """Traces the module, with dynamic batch, height and width unless it has a size.
-
-    Raises:
-        ValueError: If the channels do not fit the table.
-    """
+    """Traces the module, with dynamic batch, height and width unless it has a size."""
     table = portable.dof.options.table
     if table.channels not in (1, channels):
         raise ValueError(f"the table blurs {table.channels} channels, the image has {channels}")

@@ -89,15 +89,9 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def load(path: str | os.PathLike[str], external: bool = True) -> onnx.ModelProto:
-    """Reads an ONNX file.
+    """Reads an ONNX file, which must not be larger than the memory.
 
-    Args:
-        path: The file.
-        external: Whether to read tensors stored in other files; in untrusted files these may be any files.
-
-    Raises:
-        ValueError: If it is not an ONNX file, or larger than the memory.
-        FileNotFoundError: If the file is missing.
+    ``external`` reads tensors stored in other files too; in untrusted files these may be any files.
     """
     if not os.path.isfile(path):
         raise FileNotFoundError(f"there is no file {path}")
@@ -114,11 +108,7 @@ def load(path: str | os.PathLike[str], external: bool = True) -> onnx.ModelProto
 
 
 def facts_of(model: onnx.ModelProto, name: str) -> dict[str, Any]:
-    """The metadata of a loaded model; ``name`` is used in messages.
-
-    Raises:
-        ValueError: If they were not written by an export.
-    """
+    """The metadata of a loaded model that an export has written; ``name`` is used in messages."""
     facts: dict[str, Any] = {}
     for entry in model.metadata_props:
         key, value = entry.key, entry.value
