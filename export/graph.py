@@ -9,7 +9,6 @@ import torch
 import torch._dynamo.config
 import torch.fx.config
 from torch import Tensor, nn
-from torch.fx.experimental import proxy_tensor
 
 from torchdof import DepthOfField
 from torchdof.module import blur
@@ -109,7 +108,7 @@ class Portable(nn.Module):
         return self._rendered(self.called, None, image, map_, *lens)
 
     def _rendered(self, options: Options, plan: Plan | None, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
-        coc_px = self.dof.coc_as_given(image, map_, *lens) if lens else map_
+        coc_px = self.dof.coc_as_given(image, map_, lens[0], lens[1]) if lens else map_
         return blur(image, coc_px, options, plan, ops=self.ops)
 
 
@@ -130,12 +129,11 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
         traced.ops.kernels = portable.plan.constants(table, layered, portable.width or 1)
     else:
         traced.ops = GraphOps(portable.plan, table, layered, portable.width)
-    # Leaving out these three saves a quarter of the time: the cache of fake tensor results, which costs more than it
-    # saves, because sizes are symbols; and stack traces and memory formats of results, which nothing here reads.
+    # Leaving out these two saves half of the time: the cache of fake tensor results, which costs more than it saves,
+    # because sizes are symbols; and stack traces, which nothing here reads.
     uncached = torch._dynamo.config.patch(fake_tensor_cache_enabled=False)
     unexplained = mock.patch.object(torch.fx.config, "do_not_emit_stack_traces", True)
-    without_formats = mock.patch.object(proxy_tensor, "_extract_tensor_metadata", lambda *_: None, create=True)
-    with torch.no_grad(), uncached, unexplained, without_formats:
+    with torch.no_grad(), uncached, unexplained:
         return torch.export.export(
             traced, example, dynamic_shapes=axes(portable, *[torch.export.Dim.AUTO] * 3), strict=False
         )

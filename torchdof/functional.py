@@ -78,9 +78,8 @@ def splat(
     """
     if is_traced():
         raise ValueError("splat cannot be compiled or exported; use torch.compiler.disable(splat), or blur_by_coc")
-    if (coc_px is None) == (sigma_px is None):
-        got = "neither" if coc_px is None else "both"
-        raise ValueError(f"splat takes coc_px, with a table, or sigma_px, of Gaussians; got {got}")
+    if coc_px is not None and sigma_px is not None:
+        raise ValueError("splat takes coc_px, with a table, or sigma_px, of Gaussians; got both")
     if sigma_px is not None:
         if table is not None:
             raise ValueError("sigma_px is that of Gaussians and takes no table; give coc_px beside a table")
@@ -88,6 +87,8 @@ def splat(
         if not 0.0 <= ends(sigma_px)[0]:
             raise ValueError("sigma_px must be >= 0 and finite, got a number that is negative or NaN")
         coc_px, table = sigma_px, _GAUSSIAN
+    if coc_px is None:
+        raise ValueError("splat takes coc_px, with a table, or sigma_px, of Gaussians; got neither")
     table = _DISC if table is None else table
     if not isinstance(table, BlurTable):
         raise ValueError(f"table must be a torchdof.BlurTable, got {show(table)}; read a file with BlurTable.load()")
