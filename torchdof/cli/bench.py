@@ -53,9 +53,7 @@ class Bench(Scene, Blur, _Speed, _Accuracy, Command):
         "Image to measure the speed on; without one, a scene that is built in.", "[IMAGE]", None
     )
     depth: Path | None = argument("Its depth; not needed if IMAGE has a Z channel.", "[DEPTH]", None)
-    out: Path | None = option(
-        "Folder for tables (.csv, .md), and the picture of --truth; is made.", names=("--out", "-o")
-    )
+    out: Path | None = option("Folder for tables (.csv, .md; --truth: and a picture); is made.", names=("--out", "-o"))
 
     def run(self) -> None:
         """Measures accuracy where the truth is known, else speed against error."""
