@@ -5,25 +5,20 @@ converts the estimator's output to depth in metres at the image's size. It resiz
 inverse depth planes stay planes.
 """
 
+# mypy: ignore-errors
+# The functions below are not run as Python, and their types differ from those of Python.
+
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
 
 import onnx
 import onnxscript
-
-if TYPE_CHECKING:  # the functions below are not run as Python, and types differ
-    op: Any
-    Depth = Any
-    Floats = Any
-    Image = Any
-    Items = Any
-else:
-    from onnxscript import opset20 as op
-
-    Floats, Items = onnxscript.FLOAT[...], onnxscript.FLOAT["B"]
-    Image, Depth = onnxscript.FLOAT["B", 3, "H", "W"], onnxscript.FLOAT["B", 1, "H", "W"]
+from onnxscript import FLOAT
+from onnxscript import opset20 as op
 
 __all__ = ["decode", "encode"]
+
+Floats, Items = FLOAT[...], FLOAT["B"]
+Image, Depth = FLOAT["B", 3, "H", "W"], FLOAT["B", 1, "H", "W"]
 
 script = onnxscript.script(onnxscript.values.Opset("torchdof", 1), default_opset=op)
 """Decorator of functions that :mod:`onnxscript` compiles to ONNX."""
@@ -49,9 +44,9 @@ def encode(size: tuple[int, int] | None, mean: Sequence[float], std: Sequence[fl
 
 
 @script
-def depth_of(inverse: Floats, light: Floats) -> Floats:
+def depth_of(inverse: Floats, image: Floats) -> Floats:
     """Depth in metres at the size of the image; infinite where inverse depth is not positive."""
-    size = op.Concat(op.Shape(inverse, start=0, end=2), op.Shape(light, start=2, end=4), axis=0)
+    size = op.Concat(op.Shape(inverse, start=0, end=2), op.Shape(image, start=2, end=4), axis=0)
     resized = op.Resize(inverse, None, None, size, mode="linear")
     return op.Reciprocal(op.Where(resized < 0.0, 0.0, resized))
 
@@ -68,22 +63,20 @@ def decode(kind: str, scale: float, shift: float) -> onnx.ModelProto:
     scale, shift = float(scale), float(shift)
 
     @script
-    def metric(estimate: Floats, light: Image) -> Depth:
-        return depth_of(op.Reciprocal(maps_of(estimate) * scale), light)
+    def metric(estimate: Floats, image: Image) -> Depth:
+        return depth_of(op.Reciprocal(maps_of(estimate) * scale), image)
 
     @script
-    def inverse(estimate: Floats, light: Image) -> Depth:
-        return depth_of(maps_of(estimate) * scale + shift, light)
+    def inverse(estimate: Floats, image: Image) -> Depth:
+        return depth_of(maps_of(estimate) * scale + shift, image)
 
     @script
-    def relative(estimate: Floats, light: Image, near_m: Items, far_m: Items) -> Depth:
+    def relative(estimate: Floats, image: Image, near_m: Items, far_m: Items) -> Depth:
         axes = op.Constant(value_ints=[1, 2, 3])
         values = maps_of(estimate)
         least = op.ReduceMin(values, axes)
         fraction = (values - least) / op.Max(op.ReduceMax(values, axes) - least, 1e-12)
         farthest = op.Reciprocal(op.Unsqueeze(far_m, axes))
-        return depth_of(fraction * (op.Reciprocal(op.Unsqueeze(near_m, axes)) - farthest) + farthest, light)
+        return depth_of(fraction * (op.Reciprocal(op.Unsqueeze(near_m, axes)) - farthest) + farthest, image)
 
-    graphs: dict[str, Any] = {"metric": metric, "inverse": inverse, "relative-inverse": relative}
-    model: onnx.ModelProto = graphs[kind].to_model_proto()
-    return model
+    return {"metric": metric, "inverse": inverse, "relative-inverse": relative}[kind].to_model_proto()

@@ -20,16 +20,11 @@ class Case(NamedTuple):
     tensors: tuple[Tensor, ...]
 
 
-def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Case]:
-    """The calls for which a file must give the module's result.
+def cases(portable: Portable, channels: int) -> Iterator[Case]:
+    """The calls for which a file of a module must give its result, for images of so many channels.
 
     Each frame has a size and a shape of its coc; a file with a fixed size gets scenes of this size. The f-number and
     the depth are those that give this coc.
-
-    Args:
-        portable: The exported module.
-        channels: Channels of the image.
-        large: Add a frame of 960 x 540.
     """
     reach = portable.dof.options.max_coc_px
     generator = torch.Generator().manual_seed(4)
@@ -55,8 +50,6 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
     frames += [*scenes, ("several tiles", (1, 257, 129), _ramp(-0.5, 0.9))]
     if portable.dof.options.depth_edges != "as given":
         frames.append(("soft depth edges", (2, 75, 140), _steps))
-    if large:
-        frames.append(("960 x 540", (1, 540, 960), _steps))
     if portable.size is not None:
         frames = [(name, (1, *portable.size), shape) for name, _, shape in scenes]
     for name, (batch, height, width), shape in frames:

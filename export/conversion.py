@@ -103,30 +103,30 @@ def to_onnx(
     progress("tracing")
     with _quiet():
         program = trace(portable, channels)
-    progress("translating")
-    graph = _translate(program, portable, opset)
+        progress("translating")
+        graph = _translate(program, portable, opset)
     progress("slimming")
     slimmed = slim(graph, straight=layout == "whole")
-    model = onnx_ir.to_proto(slimmed if size is not None else broadcast(slimmed, portable.inputs))
+    model = onnx_ir.to_proto(slimmed if size is not None else broadcast(slimmed))
     label(model, dof, portable, channels, opset)
     with atomic_file(path) as temporary:
         onnx.save_model(model, temporary, format="protobuf")
         return verify(temporary, dof, progress=progress)
 
 
-def broadcast(model: onnx_ir.Model, inputs: str) -> onnx_ir.Model:
+def broadcast(model: onnx_ir.Model) -> onnx_ir.Model:
     """Lets every input except the image have one item for the whole batch, in place.
 
     For a wrong shape, a runtime's error message contains the name of the node that cannot expand it.
     """
     graph = model.graph
-    inputs_in_order: list[Any] = list(graph.inputs)
-    image, *others = inputs_in_order
+    values: list[Any] = list(graph.inputs)
+    image, *others = values
     tape = Tape()
     items, size = (tape.op("Shape", [image], {"start": a, "end": b}) for a, b in ((0, 1), (2, 4)))
     full = tape.op("Concat", [items, tape.op("Constant", [], {"value_ints": [1]}), size], {"axis": 0})
     for value in others:
-        is_map = value.name == INPUTS[inputs][1]
+        is_map = len(value.shape) == 4
         hint = "one_item_or_as_many_as_image" + ("_and_its_height_and_width" if is_map else "")
         uses = list(value.uses())
         expanded = tape.op("Expand", [value, full if is_map else items], name=f"{value.name}_must_have_{hint}")
@@ -146,21 +146,19 @@ def _translate(program: torch.export.ExportedProgram, portable: Portable, opset:
     vars(program)["run_decompositions"] = lambda _: program
     # conditions on sizes; torch.onnx leaves their terms, some of which are beyond 64 bits
     program.graph.eliminate_dead_code(lambda node: node.op in ("placeholder", "output"))
-    with _quiet():
-        converted = torch.onnx.export(
-            program,
-            dynamo=True,
-            opset_version=opset,
-            input_names=list(INPUTS[portable.inputs]),
-            output_names=[OUTPUT],
-            dynamic_shapes=axes(portable, "B", "H", "W"),
-            optimize=False,
-            verbose=False,
-            custom_translation_table=_TRANSLATIONS,
-        )
-    if converted is None:
-        raise RuntimeError("torch.onnx.export gave no program")
-    return converted.model
+    converted: Any = torch.onnx.export(
+        program,
+        dynamo=True,
+        opset_version=opset,
+        input_names=list(INPUTS[portable.inputs]),
+        output_names=[OUTPUT],
+        dynamic_shapes=axes(portable, "B", "H", "W"),
+        optimize=False,
+        verbose=False,
+        custom_translation_table=_TRANSLATIONS,
+    )
+    model: onnx_ir.Model = converted.model
+    return model
 
 
 def _index_copy(self: Any, dim: int, index: Any, source: Any) -> Any:

@@ -9,7 +9,6 @@ import torch
 import torch._dynamo.config
 import torch.fx.config
 from torch import Tensor, nn
-from torch.fx.experimental import proxy_tensor
 
 from torchdof import DepthOfField
 from torchdof.module import blur
@@ -21,12 +20,10 @@ from torchdof.validation import choice
 
 from .operations import GraphOps, WholeOps
 
-__all__ = ["INPUTS", "ITEMS", "LAYOUTS", "OUTPUT", "Layout", "Portable", "Size", "axes", "trace"]
+__all__ = ["INPUTS", "ITEMS", "OUTPUT", "Layout", "Portable", "Size", "axes", "trace"]
 
 Layout = Literal["tiles", "whole"]
 """Structure of a graph: a loop over tiles, or straight operations on whole frames."""
-
-LAYOUTS = get_args(Layout)
 
 Size = tuple[int, int] | None
 """Height and width of the only frame that a graph takes, as a batch of one; None: any batch, height and width."""
@@ -44,21 +41,8 @@ OUTPUT = "out"
 class Portable(nn.Module):
     """The module as computed by its ONNX file: all layers up to ``max_coc_px``; pixels with bad values are copied.
 
-    An impossible camera gives NaN.
-
-    Called outside an export, it gives the same result with eager PyTorch; files are verified against it.
-
-    Args:
-        dof: The module. Its camera must have floats, not tensors.
-        inputs: The map that the graph takes: ``"depth"`` or ``"coc_px"``.
-        width: Image width for the kernels of a table with lengths in millimetres or fractions of the width.
-        depth_edges: Repair of the map's edges in the graph.
-        layout: Structure of the graph. The layout ``"whole"`` renders without rays of highlights.
-        size: Size of the graph's frame, for the layout ``"whole"``.
-
-    Raises:
-        ValueError: If the camera has tensors, the width is missing or superfluous, or the layout does not support an
-            argument.
+    An impossible camera gives NaN. Called outside an export, it gives the same result with eager PyTorch; files are
+    verified against it. Arguments as of :func:`torchdof.export.to_onnx`.
     """
 
     def __init__(
@@ -72,7 +56,7 @@ class Portable(nn.Module):
     ) -> None:
         super().__init__()
         choice("inputs", inputs, INPUTS)
-        choice("layout", layout, LAYOUTS)
+        choice("layout", layout, get_args(Layout))
         for name in Camera.__dataclass_fields__:
             if isinstance(getattr(dof.camera, name), Tensor):
                 raise ValueError(
@@ -110,7 +94,7 @@ class Portable(nn.Module):
     def forward(self, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
         """Renders ``[B, C, H, W]`` from depth and ``(focus_m, f_number)``, or from a map of the coc."""
         out = self._rendered(self.dof.options, self.plan, image, map_, *lens)
-        if self.inputs == "coc_px":
+        if not lens:
             return out
         focus_m, f_number = lens
         camera = self.dof.camera
@@ -124,19 +108,12 @@ class Portable(nn.Module):
         return self._rendered(self.called, None, image, map_, *lens)
 
     def _rendered(self, options: Options, plan: Plan | None, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
-        if self.inputs == "coc_px":
-            return blur(image, map_, options, plan, ops=self.ops)
-        focus_m, f_number = lens
-        coc_px = self.dof.coc_as_given(image, map_, focus_m, f_number)
+        coc_px = self.dof.coc_as_given(image, map_, lens[0], lens[1]) if lens else map_
         return blur(image, coc_px, options, plan, ops=self.ops)
 
 
 def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
-    """Traces the module, with dynamic batch, height and width unless it has a size.
-
-    Raises:
-        ValueError: If the channels do not fit the table.
-    """
+    """Traces the module, with dynamic batch, height and width unless it has a size."""
     table = portable.dof.options.table
     if table.channels not in (1, channels):
         raise ValueError(f"the table blurs {table.channels} channels, the image has {channels}")
@@ -152,12 +129,11 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
         traced.ops.kernels = portable.plan.constants(table, layered, portable.width or 1)
     else:
         traced.ops = GraphOps(portable.plan, table, layered, portable.width)
-    # Leaving out these three saves a quarter of the time: the cache of fake tensor results, which costs more than it
-    # saves, because sizes are symbols; and stack traces and memory formats of results, which nothing here reads.
+    # Leaving out these two saves half of the time: the cache of fake tensor results, which costs more than it saves,
+    # because sizes are symbols; and stack traces, which nothing here reads.
     uncached = torch._dynamo.config.patch(fake_tensor_cache_enabled=False)
     unexplained = mock.patch.object(torch.fx.config, "do_not_emit_stack_traces", True)
-    without_formats = mock.patch.object(proxy_tensor, "_extract_tensor_metadata", lambda *_: None, create=True)
-    with torch.no_grad(), uncached, unexplained, without_formats:
+    with torch.no_grad(), uncached, unexplained:
         return torch.export.export(
             traced, example, dynamic_shapes=axes(portable, *[torch.export.Dim.AUTO] * 3), strict=False
         )

@@ -23,6 +23,7 @@ __all__ = ["chain"]
 
 Estimate = Literal["metric", "inverse", "relative-inverse"]
 Model = str | os.PathLike[str] | onnx.ModelProto
+_RESULTS = ("encoded", "estimate", "depth", OUTPUT)  # of the parts in turn; the estimator's input is the first one
 
 
 def chain(
@@ -115,27 +116,23 @@ def _prepare(depth_model: Model, opset: int) -> tuple[onnx.ModelProto, tuple[int
 
 
 def _join(parts: Sequence[onnx.ModelProto]) -> onnx.ModelProto:
-    """Encoding, estimator, decoding and module as one graph; each part's names get a prefix."""
+    """Encoding, estimator, decoding and module as one graph; the names in each part get its result as a prefix."""
     nodes: list[Any] = []
     initializers: list[Any] = []
     inputs: dict[str, Any] = {}
     outputs: dict[str, Any] = {}
-    result = ""
-    for name, part, takes_result in zip(("encode", "estimator", "decode", "dof"), parts, (None, 0, 0, 1), strict=True):
-        graph = onnx.compose.add_prefix(onnx.inliner.inline_local_functions(part), f"{name}/").graph
+    for result, part in zip(_RESULTS, parts, strict=True):
+        graph = onnx.compose.add_prefix(onnx.inliner.inline_local_functions(part), f"{result}/").graph
         weights = {tensor.name for tensor in graph.initializer}
-        for index, value in enumerate(value for value in graph.input if value.name not in weights):
-            source = "image" if value.name == "decode/light" else value.name.removeprefix(f"{name}/")
-            if index == takes_result:
-                source = result
-            else:
-                inputs.setdefault(source, value)
+        for value in (value for value in graph.input if value.name not in weights):
+            source = "encoded" if result == "estimate" else value.name.removeprefix(f"{result}/")
             nodes.append(onnx.helper.make_node("Identity", [source], [value.name]))
-        nodes += graph.node
+            if source not in _RESULTS:
+                inputs.setdefault(source, value)
+        nodes += [*graph.node, onnx.helper.make_node("Identity", [graph.output[0].name], [result])]
         initializers += graph.initializer
-        outputs[name], result = graph.output[0], graph.output[0].name
-    interface = {OUTPUT: outputs["dof"], "depth": outputs["decode"]}
-    nodes += [onnx.helper.make_node("Identity", [value.name], [name]) for name, value in interface.items()]
+        outputs[result] = graph.output[0]
+    interface = {name: outputs[name] for name in (OUTPUT, "depth")}
     for name, value in (*inputs.items(), *interface.items()):
         value.name = name
     ends = [*inputs.values()], [*interface.values()]
@@ -156,18 +153,16 @@ def _compare(joint: onnx.ModelProto, path: str, parts: Sequence[onnx.ModelProto]
     values = {"image": np.random.default_rng(4).random((1, 3, *frame), dtype=np.float32)}
     for name, number in (("focus_m", 1.5), ("f_number", 4.0), ("near_m", 0.7), ("far_m", 30.0)):
         values[name] = np.full(1, number, dtype=np.float32)
-    results = session(path).run([OUTPUT, "depth"], {value.name: values[value.name] for value in joint.graph.input})
-    values["light"] = values["image"]
-    for part, output in zip(parts, ("encoded", "estimate", "depth", OUTPUT), strict=True):
+    names = (OUTPUT, "depth")
+    results = session(path).run([*names], {value.name: values[value.name] for value in joint.graph.input})
+    for result, part in zip(_RESULTS, parts, strict=True):
         run = session(part.SerializeToString())
-        names = [value.name for value in run.get_inputs()]
-        if output == "estimate":
-            values[names[0]] = values["encoded"]
-        values[output] = run.run(None, {name: values[name] for name in names})[0]
-    for name, result in zip((OUTPUT, "depth"), results, strict=True):
+        sources = {v.name: "encoded" if result == "estimate" else v.name for v in run.get_inputs()}
+        values[result] = run.run(None, {name: values[source] for name, source in sources.items()})[0]
+    for name, got in zip(names, results, strict=True):
         expected = values[name]
-        error = float(np.nanmax(np.abs(result - expected) / np.maximum(np.abs(expected), 1.0)))
-        if result.shape != expected.shape or not error <= TOLERANCE:
+        error = float(np.nanmax(np.abs(got - expected) / np.maximum(np.abs(expected), 1.0)))
+        if got.shape != expected.shape or not error <= TOLERANCE:
             raise ValueError(f"the joint graph differs from its parts run in turn: {name} by {error:g}")
 
 

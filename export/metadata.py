@@ -89,20 +89,14 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def load(path: str | os.PathLike[str], external: bool = True) -> onnx.ModelProto:
-    """Reads an ONNX file.
+    """Reads an ONNX file, which must not be larger than the memory.
 
-    Args:
-        path: The file.
-        external: Whether to read tensors stored in other files; in untrusted files these may be any files.
-
-    Raises:
-        ValueError: If it is not an ONNX file, or larger than the memory.
-        FileNotFoundError: If the file is missing.
+    ``external`` reads tensors stored in other files too; in untrusted files these may be any files.
     """
     if not os.path.isfile(path):
         raise FileNotFoundError(f"there is no file {path}")
-    size, free = os.path.getsize(path), free_bytes()
-    if _MEMORY_PER_BYTE * size > free:
+    size = os.path.getsize(path)
+    if _MEMORY_PER_BYTE * size > free_bytes():
         raise ValueError(f"{path} takes {size / 2**30:.3g} GiB, more than there is memory for")
     try:
         model = onnx.load(path, load_external_data=external)
@@ -114,29 +108,22 @@ def load(path: str | os.PathLike[str], external: bool = True) -> onnx.ModelProto
 
 
 def facts_of(model: onnx.ModelProto, name: str) -> dict[str, Any]:
-    """The metadata of a loaded model; ``name`` is used in messages.
-
-    Raises:
-        ValueError: If they were not written by an export.
-    """
-    texts: dict[str, str] = {}
+    """The metadata of a loaded model that an export has written; ``name`` is used in messages."""
+    facts: dict[str, Any] = {}
     for entry in model.metadata_props:
         key, value = entry.key, entry.value
         if not isinstance(key, str) or not isinstance(value, str):  # other bytes are not decoded
             raise ValueError(f"{name}: its metadata have bytes that are not text")
         if not key.startswith(PREFIX):
             continue
-        if len(value) > _MAX_CHARACTERS or len(texts) == _MAX_VALUES:
+        if len(value) > _MAX_CHARACTERS or len(facts) == _MAX_VALUES:
             raise ValueError(f"{name}: its metadata {shown(key)} are more than torchdof.export writes")
-        texts[key.removeprefix(PREFIX)] = value
-    if "options" not in texts:
-        raise ValueError(f"{name} was not written by torchdof.export: it lacks the metadata {PREFIX}options")
-    facts = {}
-    for key, value in texts.items():
         try:
-            facts[key] = json.loads(value)
+            facts[key.removeprefix(PREFIX)] = json.loads(value)
         except (ValueError, RecursionError) as error:
-            raise ValueError(f"{name}: its metadata {shown(PREFIX + key)} are not JSON: {shown(str(error))}") from None
+            raise ValueError(f"{name}: its metadata {shown(key)} are not JSON: {shown(str(error))}") from None
+    if "options" not in facts:
+        raise ValueError(f"{name} was not written by torchdof.export: it lacks the metadata {PREFIX}options")
     return facts
 
 

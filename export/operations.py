@@ -30,13 +30,9 @@ _PART = 1024  # pixels of a list in one step; larger: fewer steps, more memory
 class GraphOps(Ops):
     """Operations that use a branch for work that only some frames need, and a loop for work on parts of a frame.
 
-    The kernels of layers and highlights are made before tracing and become constants of the graph.
-
-    Args:
-        plan: The layers of the graph.
-        table: Table of the kernels.
-        layered: Whether layers are blurred at coarser resolutions where that is accurate enough.
-        lens_width: Image width in pixels for the kernels of a table with lengths.
+    The kernels of layers and highlights are made before tracing and become constants of the graph. ``layered`` blurs
+    layers at coarser resolutions where that is accurate enough; ``lens_width`` is the image width in pixels for the
+    kernels of a table with lengths.
     """
 
     def __init__(self, plan: Plan, table: BlurTable, layered: bool, lens_width: int | None) -> None:
@@ -154,18 +150,11 @@ class _Tiles:
 
 
 def _samples(values: Tensor, size: tuple[int, int], step: int, half_px: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """The four samples around each pixel of a map, and their shares of the linear mean.
+    """The four samples around each pixel of a map ``[B, C, 4, H, W]``, and their shares of the linear mean.
 
-    The whole map is enlarged and shifted, because runtimes are slow at lists of single pixels.
-
-    Args:
-        values: Samples ``[B, C, h, w]`` at every ``step``-th pixel of the map, with one more on each side.
-        size: Height and width of the map.
-        step: A power of two, 2 or more.
-        half_px: Offset of the map's centre from the samples' centre, below and to the right, in half pixels: 0 or 1.
-
-    Returns:
-        Samples ``[B, C, 4, H, W]`` and shares ``[4, H, W]``.
+    The whole map is enlarged and shifted, because runtimes are slow at lists of single pixels. ``values``
+    ``[B, C, h, w]`` are samples at every ``step``-th pixel, a power of two, with one more on each side; ``half_px`` is
+    the offset of the map's centre from theirs, below and to the right, in half pixels: 0 or 1.
     """
     enlarged = functional.interpolate(values, scale_factor=float(step), mode="nearest")
     first = step // 2  # of the samples before the first pixel

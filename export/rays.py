@@ -66,11 +66,7 @@ def kernels_of(table: BlurTable, plan: Plan, lens_width: int) -> Kernels:
 def splat(rays: Highlights, coc_px: Tensor, obstacles: Sequence[tuple[Tensor, Tensor]], kernels: Kernels) -> Tensor:
     """:func:`torchdof.render.highlights.splat` for one list of highlights, in a graph: ``[B, C, H, W]``.
 
-    Args:
-        rays: The highlights of all surfaces, at least one.
-        coc_px: Coc of the frame, ``[B, 1, H, W]``.
-        obstacles: Coc and cover of surfaces that may block rays, each ``[B, 1, H, W]``.
-        kernels: The graph's kernels.
+    There is at least one highlight; ``obstacles`` are coc and cover of surfaces that may block rays.
     """
     batch, _, height, width = coc_px.shape
     margin, halves = kernels.margin, kernels.halves

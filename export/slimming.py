@@ -159,10 +159,7 @@ def _as_nodes(model: onnx_ir.Model) -> None:
 
 
 def _initializer(graph: onnx_ir.Graph, array: np.ndarray, name: str) -> onnx_ir.Value:
-    tensor = onnx_ir.tensor(array, name=name)
-    value = onnx_ir.Value(
-        name=name, shape=onnx_ir.Shape(array.shape), type=onnx_ir.TensorType(tensor.dtype), const_value=tensor
-    )
+    value = onnx_ir.val(name, const_value=onnx_ir.tensor(array, name=name))
     graph.register_initializer(value)
     return value
 

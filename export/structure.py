@@ -5,7 +5,8 @@ One operator numbers the steps of a loop, another takes their results: nodes tha
 ``If``, and are computed only if it is taken.
 """
 
-from collections.abc import Sequence
+import collections
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import onnx_ir
@@ -50,114 +51,94 @@ def operator(name: str, inputs: Sequence[Tensor], shape: Sequence[int | torch.Sy
     return torch.onnx.ops.symbolic(name, inputs, dtype=inputs[0].dtype, shape=list(shape))
 
 
-_Owners = dict[Any, onnx_ir.Node]  # node that owns a subgraph
-
-
 def structure(model: onnx_ir.Model) -> None:
     """Makes loops and branches of a flat graph, in place."""
-    owners: _Owners = {a.as_graph(): n for n in model.graph for a in n.attributes.values() if _is_graph(a)}
     for node in (*_ours(model.graph, _COLLECT), *_ours(model.graph, _LAST)):
-        _loop(model.graph, node, owners)
-    _branches(model.graph, owners)
+        _loop(model.graph, node)
+    _branches(model.graph)
 
 
 def _ours(graph: onnx_ir.Graph, name: str) -> list[onnx_ir.Node]:
     return [node for node in graph if f"{node.domain}::{node.op_type}" == name]
 
 
-def _loop(graph: onnx_ir.Graph, end: onnx_ir.Node, owners: _Owners) -> None:
+def _loop(graph: onnx_ir.Graph, end: onnx_ir.Node) -> None:
     """Moves the nodes between a step and ``end``, which takes its result, into the body of a loop."""
     inputs: list[Any] = list(end.inputs)
     result, step, *carried = inputs
-    dependent, body_nodes = {step.producer()}, []
+    starts = [value.producer() for value in (step, *carried)]
+    dependent, body_nodes = set(starts[:1]), []
     for node in graph:
         if node is not end and any(v is not None and v.producer() in dependent for v in node.inputs):
             dependent.add(node)
-            if node not in [value.producer() for value in carried]:
+            if node not in starts:
                 body_nodes.append(node)
-    for node in body_nodes:
-        graph.remove(node)
-    number, keep_going = _value("step", onnx_ir.DataType.INT64, []), _value("going", onnx_ir.DataType.BOOL, [])
-    befores = [_value("before", value.dtype, value.shape) for value in carried]
+    graph.remove(body_nodes)
+    number = onnx_ir.val("step", onnx_ir.DataType.INT64, [])
+    keep_going = onnx_ir.val("going", onnx_ir.DataType.BOOL, [])
+    befores = [onnx_ir.val("before", value.dtype, value.shape) for value in carried]
     for old, new in zip((step, *carried), (number, *befores), strict=True):
         old.replace_all_uses_with(new)
     inner, outer = Tape(), Tape()
     condition = inner.op("Identity", [keep_going])
-    _type(condition, onnx_ir.DataType.BOOL, [])
+    condition.dtype, condition.shape = onnx_ir.DataType.BOOL, onnx_ir.Shape([])
     axis = inner.op("Constant", [], {"value_ints": [0]})
     after = inner.op("Identity", [result]) if carried else inner.op("Squeeze", [result, axis])
-    _type(after, result.dtype, result.shape if carried else result.shape[1:])
+    after.dtype, after.shape = result.dtype, onnx_ir.Shape(result.shape if carried else result.shape[1:])
     nodes = [*body_nodes, *inner.nodes]
     body = onnx_ir.Graph([number, keep_going, *befores], [condition, after], nodes=nodes, name="step")
     true = outer.op("Constant", [], {"value": onnx_ir.tensor(True)})
-    initials = [value.producer().inputs[0] for value in carried]
-    loop = onnx_ir.node("Loop", [step.producer().inputs[0], true, *initials], {"body": body})
-    graph.insert_before(end, [*outer.nodes, loop])
-    owners[body] = loop
-    _replace(graph, end, loop)
-    graph.remove([value.producer() for value in (*carried, step)], safe=True)
+    initials = [start.inputs[0] for start in starts[1:]]
+    outer.op("Loop", [starts[0].inputs[0], true, *initials], {"body": body})
+    graph.insert_before(end, outer.nodes)
+    _replace(graph, end, outer.nodes[-1])
+    graph.remove(starts[::-1], safe=True)
 
 
-def _branches(graph: onnx_ir.Graph, owners: _Owners) -> None:
+def _branches(graph: onnx_ir.Graph) -> None:
     """Makes an ``If`` of each choice in a graph, outermost first, then of those in its branches and loops."""
-    subgraphs: list[onnx_ir.Graph] = []
     while choices := _ours(graph, _CHOICE):
         choice = choices[-1]
-        branches = [_branch(graph, choice, index, owners) for index in (0, 1)]
-        if_node = onnx_ir.node("If", [choice.inputs[2]], {"then_branch": branches[0], "else_branch": branches[1]})
-        for branch in branches:
-            owners[branch] = if_node
+        for index, name in enumerate(("then_branch", "else_branch")):
+            choice.attributes.add(onnx_ir.AttrGraph(name, _branch(graph, choice, index)))
+        if_node = onnx_ir.Node("", "If", [choice.inputs[2]], choice.attributes.values())
         graph.insert_before(choice, [if_node])
         _replace(graph, choice, if_node)
-        subgraphs += branches
-    subgraphs += [a.as_graph() for n in graph if n.op_type == "Loop" for a in n.attributes.values()]
-    for subgraph in subgraphs:
-        _branches(subgraph, owners)
+    for subgraph in [subgraph for node in graph for subgraph in _subgraphs(node)]:
+        _branches(subgraph)
 
 
-def _branch(graph: onnx_ir.Graph, choice: onnx_ir.Node, index: int, owners: _Owners) -> onnx_ir.Graph:
+def _branch(graph: onnx_ir.Graph, choice: onnx_ir.Node, index: int) -> onnx_ir.Graph:
     """The branch that computes one input of a choice, with all nodes that nothing else uses."""
     result: Any = choice.inputs[index]
     last = onnx_ir.node("Identity", [result])  # a branch can only return its own values
     graph.insert_before(choice, [last])
     choice.replace_input_with(index, last.outputs[0])
-    branch_nodes, open_nodes = {last}, [last]
-    while open_nodes:
-        for value in _used_values(open_nodes.pop()):
-            node = value.producer()
-            if node is None or node.graph is not graph or node in branch_nodes:
-                continue
-            users = {_enclosing(graph, use.node, owners) for output in node.outputs for use in output.uses()}
-            if users <= branch_nodes and not any(output.is_graph_output() for output in node.outputs):
-                branch_nodes.add(node)
-                open_nodes.append(node)
+    users: dict[Any, set[onnx_ir.Node]] = collections.defaultdict(set)
+    for node in graph:
+        for value in _used_values(node):
+            users[value].add(node)
+    branch_nodes = {last}
+    for node in reversed(graph):  # users come first
+        used_by = set().union(*(users[output] for output in node.outputs))
+        if used_by and used_by <= branch_nodes and not any(output.is_graph_output() for output in node.outputs):
+            branch_nodes.add(node)
     nodes = [node for node in graph if node in branch_nodes]
-    for node in nodes:
-        graph.remove(node)
-    _type(last.outputs[0], result.dtype, result.shape)
-    branch = onnx_ir.Graph([], last.outputs, nodes=nodes, name="branch")
-    owners[branch] = choice
-    return branch
+    graph.remove(nodes)
+    last.outputs[0].dtype, last.outputs[0].shape = result.dtype, result.shape
+    return onnx_ir.Graph([], last.outputs, nodes=nodes, name="branch")
 
 
-def _used_values(node: onnx_ir.Node) -> list[onnx_ir.Value]:
+def _used_values(node: onnx_ir.Node) -> Iterator[onnx_ir.Value | None]:
     """The inputs of a node and of its subgraphs."""
-    values = [value for value in node.inputs if value is not None]
-    for attribute in node.attributes.values():
-        if _is_graph(attribute):
-            values += [value for inner in attribute.as_graph() for value in _used_values(inner)]
-    return values
+    yield from node.inputs
+    for subgraph in _subgraphs(node):
+        for inner in subgraph:
+            yield from _used_values(inner)
 
 
-def _is_graph(attribute: onnx_ir.Attr) -> bool:
-    return attribute.type == onnx_ir.AttributeType.GRAPH
-
-
-def _enclosing(graph: onnx_ir.Graph, node: onnx_ir.Node, owners: _Owners) -> onnx_ir.Node:
-    """The node of ``graph`` that is, or contains, ``node``."""
-    while node.graph is not graph:
-        node = owners[node.graph]
-    return node
+def _subgraphs(node: onnx_ir.Node) -> list[onnx_ir.Graph]:
+    return [a.as_graph() for a in node.attributes.values() if a.type == onnx_ir.AttributeType.GRAPH]
 
 
 def _replace(graph: onnx_ir.Graph, old: onnx_ir.Node, new: onnx_ir.Node) -> None:
@@ -165,11 +146,3 @@ def _replace(graph: onnx_ir.Graph, old: onnx_ir.Node, new: onnx_ir.Node) -> None
     output.type, output.shape, output.name = other.type, other.shape, other.name
     other.replace_all_uses_with(output, replace_graph_outputs=True)
     graph.remove(old, safe=True)
-
-
-def _value(name: str, kind: onnx_ir.DataType, shape: Any) -> onnx_ir.Value:
-    return onnx_ir.Value(name=name, shape=onnx_ir.Shape(shape), type=onnx_ir.TensorType(kind))
-
-
-def _type(value: onnx_ir.Value, kind: onnx_ir.DataType, shape: Any) -> None:
-    value.type, value.shape = onnx_ir.TensorType(kind), onnx_ir.Shape(shape)

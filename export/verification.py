@@ -93,7 +93,6 @@ def verify(
     path: str | os.PathLike[str],
     dof: DepthOfField,
     *,
-    large: bool = False,
     progress: Callable[[str], object] = lambda _: None,
 ) -> Verification:
     """Compares a file with the module from which it was made.
@@ -107,7 +106,6 @@ def verify(
     Args:
         path: The file.
         dof: The module.
-        large: Also compares and times a frame of 960 x 540.
         progress: Called with the name of each case.
 
     Returns:
@@ -118,7 +116,7 @@ def verify(
         the table.
         FileNotFoundError: If the file is missing.
     """
-    model = load(path)
+    model = load(path, external=False)
     facts = facts_of(model, str(path))
     inputs = "depth" if "depth" in facts["inputs"] else "coc_px"
     size = None if facts["size"] is None else tuple(facts["size"])
@@ -128,7 +126,7 @@ def verify(
     channels = _check_interface(model, portable)
     runner = session(path)
     rows = []
-    for case in cases(portable, channels, large):
+    for case in cases(portable, channels):
         progress(f"verifying: {case.name}")
         rows.append(_compare(runner, portable, case))
     options = facts["options"]
@@ -182,13 +180,11 @@ def _compare(runner: onnxruntime.InferenceSession, portable: Portable, case: Cas
 
 
 def check_format(model: onnx.ModelProto, path: str) -> None:
-    """Raises an error if a file is invalid, needs non-standard operators, or keeps weights elsewhere.
+    """Refuses a file that is invalid, needs non-standard operators, or keeps weights elsewhere.
 
-    Raises:
-        ValueError: With the reason.
+    ``model`` is the file as loaded without weights from elsewhere.
     """
-    stored = onnx.load(path, load_external_data=False)  # loading the weights would remove the name of their file
-    if any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in _tensors(stored.graph)):
+    if any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in _tensors(model.graph)):
         raise ValueError(f"{path} keeps weights in another file")
     try:
         onnx.checker.check_model(path, full_check=True)

@@ -27,7 +27,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchdof import blur_by_coc
 from torchdof.bench.measurement import peak_of
-from torchdof.depth.reading import read_depth
+from torchdof.depth import read_depth
 from torchdof.functional import splat
 from torchdof.io.images import read_image
 from torchdof.reference.scenes import read_scenes
@@ -58,11 +58,9 @@ def pictures(folder: Path | None, device: str) -> Iterator[tuple[str, Tensor, Te
     if folder is not None:
         for _, of_size in itertools.groupby(read_scenes(folder), lambda scene: scene.image.shape):
             scenes = list(of_size)
-            for count in (1, 4):
-                for start in range(0, len(scenes) - count + 1, count):
-                    some = scenes[start : start + count]
-                    name = " to ".join(dict.fromkeys((some[0].name, some[-1].name)))
-                    yield name, torch.cat([s.image for s in some]), torch.cat([-s.coc_px for s in some])
+            for group in [[scene] for scene in scenes] + [scenes[k : k + 4] for k in range(0, len(scenes) - 3, 4)]:
+                name = " to ".join(dict.fromkeys((group[0].name, group[-1].name)))
+                yield name, torch.cat([s.image for s in group]), torch.cat([-s.coc_px for s in group])
         return
     calibration = json.loads((DATA / "camera.json").read_text())
     photograph = read_image(DATA / "motorcycle_left.png").pixels

@@ -12,8 +12,7 @@ import shutil
 from pathlib import Path
 
 import torchdof
-from torchdof.depth import repair_edges
-from torchdof.depth.reading import read_depth
+from torchdof.depth import read_depth, repair_edges
 from torchdof.export import describe, to_onnx
 from torchdof.io.images import Picture, read_image, write_image
 

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from torchdof import Camera
-from torchdof.bench import memory
-from torchdof.bench.measurement import BenchScene, Seconds, measure, peak_of, shipped
+from torchdof.bench.measurement import BenchScene, Seconds, measure, peak_mb, peak_of, shipped
 
 SCENE = shipped(36, 64)
 
@@ -44,7 +43,7 @@ def test_a_picture_that_is_not_finite_is_not_timed() -> None:
         measure(lambda image, _: image / 0.0, SCENE)
 
 
-@pytest.mark.skipif(math.isnan(memory.peak_mb()), reason="this system does not report the memory of a process")
+@pytest.mark.skipif(math.isnan(peak_mb()), reason="this system does not report the memory of a process")
 def test_peak_memory_is_of_one_call_and_includes_freed_memory() -> None:
     def allocate(mib: int) -> float:
         return float(torch.ones(mib * 2**18).sum())

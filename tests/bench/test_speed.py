@@ -6,7 +6,6 @@ import functools
 import json
 import math
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -95,14 +94,12 @@ def test_bench_measures_the_users_scene(in_this_process: None, files: tuple[Path
     assert result.exit_code == 0, result.output
     assert "image.exr, blur radius -" in result.output
     assert "focus on what is nearest the middle" in " ".join(result.output.split())
-    assert sorted(p.name for p in out.iterdir()) == ["speed.csv", "speed.md", "speed.png"]
+    assert sorted(p.name for p in out.iterdir()) == ["speed.csv", "speed.md"]
     with (out / "speed.csv").open() as file:
         rows = {row["setting"]: row for row in csv.DictReader(file)}
     assert list(rows) == SETTINGS
-    text = (out / "speed.md").read_text()
+    text = " ".join((out / "speed.md").read_text().split())
     assert "Every tolerance was kept." in text and "| 8/255 |" in text
-    picture = read_image(out / "speed.png").pixels
-    assert picture.shape[-1] > 500 and float(picture.std()) > 0.05
     # the rows are of this image, this depth and this camera
     image = read_image(files[0]).pixels
     depth = torch.linspace(1.0, 4.0, 64).expand(1, 1, 36, 64)
@@ -147,10 +144,3 @@ def test_an_exported_file_is_a_row(exported_by_command: tuple[Path, str], monkey
     exact = blur_by_coc(scene.image, scene.coc_px, occlusion=False, tolerance=0.0)
     error = (metrics.display(picture) - metrics.display(exact)).square().mean().sqrt()
     assert 0 < 255 * float(error) < 1, "the file's tolerance is that of the row"
-
-
-def test_bench_does_not_start_without_matplotlib(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    result = run("--out", tmp_path)
-    assert result.exit_code == 2 and "pip install 'torchdof[plot]'" in result.output
-    assert not list(tmp_path.iterdir())

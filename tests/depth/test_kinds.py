@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from tests.refused import refuses
 from torchdof.depth.holes import fill_holes
-from torchdof.depth.kinds import depth_from_values
-from torchdof.depth.reading import read_depth
+from torchdof.depth.kinds import depth_from_values, read_depth
 
 NAN, INF = math.nan, math.inf
 

@@ -8,8 +8,7 @@ import torch
 
 from tests.refused import refuses
 from torchdof import Camera
-from torchdof.depth import DepthWarning, check, from_relative
-from torchdof.depth.reading import read_depth
+from torchdof.depth import DepthWarning, check, from_relative, read_depth
 from torchdof.depth.sanity import coc_mistakes, depth_mistakes
 from torchdof.reference.scenes import read_scenes
 

@@ -101,7 +101,7 @@ def test_a_file_unlike_its_module_is_not_written(plain: Any, tmp_path: Path, mon
     monkeypatch.setattr(conversion, "trace", lambda *_: None)  # the graph is that of a file, to save its tracing
     monkeypatch.setattr(conversion, "_translate", lambda *_: None)
     monkeypatch.setattr(conversion, "slim", lambda _, straight: onnx_ir.load(plain.path))
-    monkeypatch.setattr(conversion, "broadcast", lambda graph, _: graph)
+    monkeypatch.setattr(conversion, "broadcast", lambda graph: graph)
     with pytest.raises(ValueError, match="differs from the module"):
         to_onnx(plain.dof, tmp_path / "dof.onnx")
     assert [file.name for file in tmp_path.iterdir()] == ["dof.onnx"]

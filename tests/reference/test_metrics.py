@@ -7,9 +7,6 @@ import torch
 from tests.refused import refuses
 from torchdof.reference import metrics
 
-needs_flip = pytest.mark.skipif(not metrics.has_flip(), reason="flip-evaluator is not installed")
-
-
 IMAGE = torch.zeros(1, 3, 8, 8)
 BAD = IMAGE.clone()
 BAD[0, 0, 2, 3] = math.nan
@@ -45,16 +42,6 @@ def test_ssim_is_one_for_equal_images_and_falls_with_noise() -> None:
     assert 1 > little > 0.97 > much
 
 
-@needs_flip
-def test_flip_is_zero_for_equal_images_and_grows_with_the_area_that_differs() -> None:
-    truth = torch.full((1, 3, 64, 64), 0.5)
-    one, two = truth.clone(), truth.clone()
-    one[..., 20:30, 40:50] = two[..., 20:30, 10:20] = two[..., 20:30, 40:50] = 0.9
-    assert metrics.flip(truth, truth) == 0.0
-    assert metrics.flip(two, truth) == pytest.approx(2 * metrics.flip(one, truth), rel=0.02)
-    assert metrics.flip(one, truth) > 0.01
-
-
 test_errors_name_the_argument = refuses(
     (lambda: metrics.display(3.0), "linear must be a tensor of linear light.*got 3.0"),  # type: ignore[arg-type]
     (lambda: metrics.psnr(IMAGE[0], IMAGE[0]), r"image and truth must be \[B, C, H, W\] .*got \[3, 8, 8\]"),
@@ -64,5 +51,4 @@ test_errors_name_the_argument = refuses(
     (lambda: metrics.psnr(IMAGE, IMAGE, IMAGE[:, :1] > 1), "at least one in the mask, got 0 of 0"),
     (lambda: metrics.ssim(IMAGE[..., :5], IMAGE[..., :5]), "SSIM needs at least 6 pixels a side"),
     (lambda: metrics.ssim(IMAGE, IMAGE[..., :7]), r"same shape and device, got \[1, 3, 8, 8\] on cpu and \[1, 3, 8"),
-    (lambda: metrics.flip(IMAGE.repeat(2, 1, 1, 1), IMAGE.repeat(2, 1, 1, 1)), "one RGB image"),
 )

@@ -5,6 +5,7 @@ from functools import partial
 
 import pytest
 import torch
+import torch.nn.functional as functional
 from torch import Tensor
 
 from tests.refused import refuses
@@ -14,14 +15,22 @@ from torchdof.reference.scenes import Plane, Scene, plane_scene, posts, waves
 
 CAMERA = Camera.from_fov(40.0, 0.09, 3.0)
 DEPTHS = (6.0, 2.0, 1.2)
+SHAPES = (None, posts(90, 30), posts(140, 25, -0.2))
+PLANES = [Plane(z, waves(i), shape) for i, (z, shape) in enumerate(zip(DEPTHS, SHAPES, strict=True))]
+
+
+def layers() -> Tensor:
+    """Premultiplied light and coverage of each plane, far to near, with what others hide: ``[1, 3, 4, 110, 150]``."""
+    y, x = torch.meshgrid(*((torch.arange(12 * n, dtype=torch.float64) + 0.5) / 12 for n in (110, 150)), indexing="ij")
+    covers = [plane.covers(x, y) for plane in PLANES]
+    rgba = [torch.cat([p.light(x, y) * cover, cover[None]]) for p, cover in zip(PLANES, covers, strict=True)]
+    return functional.avg_pool2d(torch.stack(rgba).float(), 12)[None]
 
 
 @pytest.fixture(scope="module", params=[2.0, 6.0], ids=lambda focus: f"focus at {focus} m")
 def fence(request: pytest.FixtureRequest) -> Scene:
     """A wall behind two rows of posts, with blurs of up to 20 px."""
-    shapes = [None, posts(90, 30), posts(140, 25, -0.2)]
-    planes = [Plane(z, waves(i), shape) for i, (z, shape) in enumerate(zip(DEPTHS, shapes, strict=True))]
-    return plane_scene(planes, CAMERA.replace(focus_m=request.param), (110, 150), samples=128)
+    return plane_scene(PLANES, CAMERA.replace(focus_m=request.param), (110, 150), samples=128)
 
 
 def psnr(scene: Scene, out: Tensor) -> float:
@@ -31,7 +40,7 @@ def psnr(scene: Scene, out: Tensor) -> float:
 
 def test_a_known_background_adds_3_db(fence: Scene) -> None:
     """It is the scene without the nearest surface of each pixel."""
-    far, middle = (rgba for rgba, _ in fence.surfaces[:2])
+    far, middle = layers()[:, :2].unbind(1)
     under_posts = middle[:, :3] + (1.0 - middle[:, 3:]) * far[:, :3]
     near = fence.depth < 1.5
     depth = torch.where(near & (middle[:, 3:] > 0.5), DEPTHS[1], DEPTHS[0])
@@ -44,7 +53,7 @@ def test_a_known_background_adds_3_db(fence: Scene) -> None:
 
 def test_a_stack_of_complete_layers_renders_the_truth_in_any_order_and_form(fence: Scene) -> None:
     dof = DepthOfField(fence.camera, tolerance=0)
-    stack, depth = torch.stack([rgba for rgba, _ in fence.surfaces], 1), torch.tensor(DEPTHS)
+    stack, depth = layers(), torch.tensor(DEPTHS)
     out = dof.layers(stack, depth)
     assert psnr(fence, out[:, :3]) > 49.0
     torch.testing.assert_close(out[:, 3:], torch.ones_like(out[:, 3:]))

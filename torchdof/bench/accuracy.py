@@ -67,24 +67,21 @@ def compare(truth: Path, out: Path, views: Sequence[int], degraded: bool, peers:
             with torch.inference_mode():
                 picture, row = measure(blur, BenchScene(scene.name, scene.image, coc_px), again=False)
             row |= error(picture, scene.truth)
-            displayed = metrics.display(picture), metrics.display(scene.truth)
             if bool(scene.inner.any()):
+                displayed = metrics.display(picture), metrics.display(scene.truth)
                 row["psnr_inner"] = metrics.psnr(*displayed, scene.inner)
-            if metrics.has_flip() and picture.shape[1] == 3:
-                row["flip"] = metrics.flip(*displayed)
             rows.append({"scene": scene.name, "depth": kind, "renderer": name, **row})
             pictures[name] = picture
         window = _worst(pictures["torchdof"], scene, tile_px)
         for name, picture in {"sharp": scene.image, "truth": scene.truth, **pictures}.items():
             panels.setdefault(name, []).append(picture[window][:, :3].expand(-1, 3, -1, -1))
-    tables = {"Means": summary(rows, ["depth", "renderer"], statistics.fmean), "Scenes": rows}
-    remark = "psnr_inner: without the border reached by light from outside the frame; flip: smaller is better."
+    means = summary(rows, ["depth", "renderer"], statistics.fmean)
+    remark = "psnr_inner: without the border reached by light from outside the frame."
     if degraded:
-        publish("What inexact depth costs", tables, [remark], out / "degraded")
-        return
+        return publish("What inexact depth costs", means, [remark], out / "degraded", details=rows)
     remark += f" accuracy.png: for each scene, the {tile_px} x {tile_px} pixels with torchdof's largest error."
     draw = functools.partial(write_sheet, panels={name: torch.cat(parts, 2) for name, parts in panels.items()})
-    publish("Accuracy against the truth", tables, [remark], out / "accuracy", draw)
+    publish("Accuracy against the truth", means, [remark], out / "accuracy", draw, details=rows)
 
 
 def _worst(picture: Tensor, scene: Scene, side: int) -> tuple[Any, ...]:

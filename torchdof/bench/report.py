@@ -12,10 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.console import Console
 
 from ..io.atomic import atomic_file
-from ..io.columns import print_columns
 
 __all__ = ["LEGEND", "Row", "publish", "summary"]
 
@@ -52,43 +50,47 @@ def summary(rows: Sequence[Row], keys: Sequence[str], mean: Callable[[list[float
 
 def publish(
     title: str,
-    tables: Mapping[str, Sequence[Row]],
+    rows: Sequence[Row],
     remarks: Sequence[str],
     stem: Path | None,
     picture: Callable[[Path], object] | None = None,
     quiet: bool = False,
+    details: Sequence[Row] = (),
 ) -> None:
-    """Prints the first table and the remarks; writes ``stem.md``, ``.csv`` of the last table and ``.png``: all or none.
+    """Prints a table and the remarks; writes them to ``stem.md``, and ``.csv`` and ``.png``: all or none.
 
-    ``tables`` maps headings to rows, whose missing values stay empty; ``picture`` writes a picture to a path.
+    Missing values of ``rows`` stay empty. The CSV has the ``details``, or the same rows without them; ``picture``
+    writes a picture to a path.
     """
     machine = (
         f"{platform.processor() or platform.machine()}, {os.cpu_count()} CPUs, {torch.get_num_threads()} threads; "
         f"torchdof {importlib.metadata.version('torchdof')}, torch {torch.__version__}, "
         f"Python {platform.python_version()}, {platform.system()}."
     )
-    console = Console(quiet=quiet)
-    text = [f"# {title}", machine, LEGEND, *remarks]
-    for number, (name, rows) in enumerate(tables.items()):
-        columns = list(dict.fromkeys(column for row in rows for column in row))
-        cells = [[_cell(row.get(column, "")) for column in columns] for row in rows]
-        if number == 0:
-            text_columns = [column for column in columns if isinstance(rows[0].get(column), str)]
-            print_columns(console, name, dict(zip(columns, zip(*cells, strict=True), strict=True)), text_columns)
-        lines = ["| " + " | ".join(line) + " |" for line in (columns, ["---"] * len(columns), *cells)]
-        text.append(f"## {name}\n\n" + "\n".join(lines))
-    console.print(*text[1 : 3 + len(remarks)], sep="\n", markup=False, highlight=False)
+    lines = [columns := _columns(rows), *([_cell(row.get(name, "")) for name in columns] for row in rows)]
+    widths = [max(map(len, cells)) for cells in zip(*lines, strict=True)]
+    lines.insert(1, ["-" * width for width in widths])
+    lines = [[f"{cell:>{width}}" for cell, width in zip(line, widths, strict=True)] for line in lines]
+    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    text = "\n\n".join([f"# {title}", table, machine, LEGEND, *remarks])
+    if not quiet:
+        print(text)
     if stem is None:
         return
     numbers = io.StringIO()
-    writer = csv.DictWriter(numbers, columns, lineterminator="\n")
+    writer = csv.DictWriter(numbers, _columns(details or rows), lineterminator="\n")
     writer.writeheader()
-    writer.writerows({name: f"{v:.6g}" if isinstance(v, float) else v for name, v in row.items()} for row in rows)
+    for row in details or rows:
+        writer.writerow({name: f"{v:.6g}" if isinstance(v, float) else v for name, v in row.items()})
     with contextlib.ExitStack() as files:
         if picture is not None:
             picture(files.enter_context(atomic_file(stem.with_suffix(".png"))))
-        for suffix, content in ((".csv", numbers.getvalue()), (".md", "\n\n".join(text) + "\n")):
+        for suffix, content in ((".csv", numbers.getvalue()), (".md", text + "\n")):
             files.enter_context(atomic_file(stem.with_suffix(suffix))).write_text(content, encoding="utf-8")
+
+
+def _columns(rows: Sequence[Row]) -> list[str]:
+    return list(dict.fromkeys(column for row in rows for column in row))
 
 
 def _cell(value: object) -> str:

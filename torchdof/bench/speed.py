@@ -40,17 +40,15 @@ def works(
         *((f"{px:g} px 1/255", 1, blur, scene.seen(0.0, px)) for px in _RADII_PX * scan),
         *((f"{share:g} of the frame 1/255", 1, blur, scene.resized(share)) for share in _SIZES * scan),
     ]
+    without = " without occlusion" * (not occlusion)
+    frame = "{1} x {0}"
     return [
         (
-            {
-                "setting": name + " without occlusion" * (not occlusion),
-                "tolerance": tolerance / 255,
-                "frame": f"{view.image.shape[-1]} x {view.image.shape[-2]}",
-            },
-            render,
+            {"setting": f"{name}{without}", "tolerance": n / 255, "frame": frame.format(*view.coc_px.shape[-2:])},
+            blur,
             view,
         )
-        for name, tolerance, render, view in settings
+        for name, n, blur, view in settings
     ]
 
 
@@ -67,10 +65,9 @@ def _prepared(runtime: str, scene: BenchScene, occlusion: bool) -> Renderer:
 
     channels, width = scene.image.shape[1], None if scene.table.unit == "relative" else scene.image.shape[-1]
     with tempfile.TemporaryDirectory() as folder:
-        to_onnx(
-            DepthOfField(Camera(), **options), f"{folder}/dof.onnx", inputs="coc_px", channels=channels, width=width
-        )
-        run = functools.partial(session(f"{folder}/dof.onnx").run, None)
+        path = f"{folder}/dof.onnx"
+        to_onnx(DepthOfField(Camera(), **options), path, inputs="coc_px", channels=channels, width=width)
+        run = functools.partial(session(path).run, None)
     return lambda image, coc_px: torch.from_numpy(run({"image": image.numpy(), "coc_px": coc_px.numpy()})[0])
 
 
@@ -106,34 +103,13 @@ def compare(
 
 
 def report(rows: Sequence[Row], scene: BenchScene, out: Path | None, quiet: bool = False) -> None:
-    """Prints a table unless quiet; writes ``speed.csv``, ``.md`` and ``.png`` to a folder: all of them or none."""
+    """Prints a table unless quiet; writes ``speed.csv`` and ``.md`` to a folder: both or none."""
     low, high = float(scene.coc_px.min()), float(scene.coc_px.max())
-    title = f"{scene.name}, blur radius {low:.1f} to {high:.1f} px, {scene.table!r}"
+    title = f"Speed against error: {scene.name}, blur radius {low:.1f} to {high:.1f} px, {scene.table!r}"
     exceeded = "; ".join(row["setting"] for row in rows if not row["kept"])
     remarks = [
         f"{scene.remark}. A focus pull is a sequence; a fresh process renders its first picture. kept: the RMS error "
         "against the exact rendering with the same occlusion is within the tolerance.",
         f"**The tolerance was not kept by: {exceeded}.**" if exceeded else "Every tolerance was kept.",
     ]
-    draw = functools.partial(_plot, rows=rows, title=title)
-    publish("Speed against error", {title: rows}, remarks, out and out / "speed", draw, quiet)
-
-
-def _plot(path: Path, rows: Sequence[Row], title: str) -> None:
-    """Plots the RMS error over the time of a new camera, both logarithmic, as PNG."""
-    # not pyplot, which would choose a display and keep every figure in memory
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4.5), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots()
-    for row in rows:
-        if row.get("rms_255", 0.0) > 0 and row["frame"] == rows[0]["frame"]:
-            colour = "#1d4ed8" if row["setting"].endswith("without occlusion") else "#c2410c"
-            axes.loglog(row["new_ms"], row["rms_255"], "o", color=colour)
-            axes.annotate(row["setting"], (row["new_ms"], row["rms_255"]), fontsize=6, color=colour)
-    axes.set(xlabel="time of a new camera [ms]", ylabel="RMS error [1/255]")
-    axes.set_title(title, fontsize=9)
-    axes.grid(True, which="both", lw=0.3)
-    figure.savefig(path)
+    publish(title, rows, remarks, out and out / "speed", quiet=quiet)

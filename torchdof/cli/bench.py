@@ -50,7 +50,7 @@ class Bench(Scene, Blur, _Speed, _Accuracy, Command):
         "Image to measure the speed on; without one, a scene that is built in.", "[IMAGE]", None
     )
     depth: Path | None = argument("Its depth; not needed if IMAGE has a Z channel.", "[DEPTH]", None)
-    out: Path | None = option("Folder for tables (.csv, .md) and a picture; is made.", names=("--out", "-o"))
+    out: Path | None = option("Folder for tables (.csv, .md; --truth: and a picture); is made.", names=("--out", "-o"))
 
     def run(self) -> None:
         """Measures accuracy where the truth is known, else speed against error."""
@@ -79,7 +79,6 @@ class Bench(Scene, Blur, _Speed, _Accuracy, Command):
         self.refuse_keyframes()
         if self.out is not None:
             check_writable(self.out / "speed.csv")
-            import matplotlib  # noqa: F401  # a missing package is named before measuring for minutes
         if self.image is not None:
             check_files(self.image, self.depth)
         from rich.console import Console

@@ -48,8 +48,13 @@ def fill_holes(depth: Tensor, fill: Fill) -> Tensor:
         raise ValueError("no pixel has a depth; check the kind, scale and offset of the depth map")
     if fill == "nearest":
         return _nearest(depth[0, 0])[None, None]
-    candidates = torch.stack([_first_along(depth, dim, back) for dim in (-1, -2) for back in (False, True)])
-    farthest = torch.where(candidates.isnan(), -torch.inf, candidates).amax(dim=0)
+    farthest = torch.full_like(depth, -torch.inf)
+    for turns in range(4):  # to the left of each hole, then above it, to the right and below
+        line = depth.rot90(turns, (-2, -1))
+        places = torch.arange(line.shape[-1], device=line.device)
+        last = torch.where(line.isnan(), -1, places).cummax(-1).values
+        values = torch.where(last >= 0, line.gather(-1, last.clamp(min=0)), -torch.inf)
+        farthest = torch.maximum(farthest, values.rot90(-turns, (-2, -1)))
     filled = torch.where(depth.isnan() & (farthest > -torch.inf), farthest, depth)
     return fill_holes(filled, "nearest")  # holes without any depth in their row and column
 
@@ -74,19 +79,6 @@ def resolve_holes(depth: Tensor, name: str, fill: Fill | None, zero_is_known: bo
         return fill_holes(depth, "far" if fill is None else fill), holes
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
-
-
-def _first_along(depth: Tensor, dim: int, back: bool) -> Tensor:
-    """The last value that is not NaN at or before each place along a dimension; NaN if all are.
-
-    With ``back`` it searches from the other end.
-    """
-    line = depth.flip(dim) if back else depth
-    shape = [-1 if d == line.ndim + dim else 1 for d in range(line.ndim)]
-    index = torch.arange(line.shape[dim], device=line.device).reshape(shape)
-    last = torch.where(line.isnan(), -1, index).cummax(dim=dim).values
-    values = torch.where(last >= 0, line.gather(dim, last.clamp(min=0)), torch.nan)
-    return values.flip(dim) if back else values
 
 
 def _nearest(depth: Tensor) -> Tensor:

@@ -60,8 +60,7 @@ class Steady:
     """
 
     def __init__(self) -> None:
-        self._before: Tensor | None = None
-        self._memory: Tensor | None = None
+        self._last: tuple[Tensor, Tensor] | None = None  # image and memory
 
     @torch.no_grad()
     def __call__(self, image: Tensor, depth: Tensor) -> Tensor:
@@ -82,11 +81,11 @@ class Steady:
         image_and_map(image, "depth", depth, "in metres")
         now = image.float()
         inverse = torch.where(depth > 0, 1.0 / depth.float(), torch.nan).expand(image.shape[0], -1, -1, -1)
-        if self._before is None or self._memory is None or self._before.shape != now.shape:
+        if self._last is None or self._last[0].shape != now.shape:
             memory = _first_memory(inverse)
         else:
-            memory = _next_memory(now, self._before, self._memory, inverse)
-        self._before, self._memory = now, memory
+            memory = _next_memory(now, *self._last, inverse)
+        self._last = now, memory
         return (1.0 / memory[:, :1]).to(depth.dtype)
 
 

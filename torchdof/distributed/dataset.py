@@ -100,13 +100,10 @@ def make_dataset(
     plan = out / "plan.json"
     if not plan.is_file():
         write_text(plan, json.dumps(settings, indent=1))
-    try:
-        recorded = dict(json.loads(plan.read_bytes()))
-    except (ValueError, TypeError):
-        raise ValueError(f"{plan}: cannot be read; put it back, or use another folder") from None
+    recorded = json.loads(plan.read_bytes())
     if differing := [name for name, value in settings.items() if recorded.get(name) != value]:
-        remedy = f"go on with those in {plan.name}, or use another folder"
-        raise ValueError(f"{out}: was begun with other settings ({', '.join(differing)}); {remedy}")
+        begun = f"{out}: was begun with other settings ({', '.join(differing)})"
+        raise ValueError(f"{begun}; go on with those in {plan.name}, or use another folder")
     missing = [row for row in rows if renderer.samples_of(**row) is None]
     say(f"{len(rows) - len(missing)} of {len(rows)} shards are there already")
     if missing:

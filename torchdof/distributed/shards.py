@@ -20,7 +20,7 @@ from torch import Tensor
 
 from ..augmentation import RandomDepthOfField
 from ..depth.holes import resolve_holes
-from ..depth.reading import read_depth
+from ..depth.kinds import read_depth
 from ..depth.relative import from_relative
 from ..io.atomic import atomic_file, write_text
 from ..io.images import Picture, read_image, read_values, write_image
@@ -32,7 +32,6 @@ from ..validation import choice, number, show, whole
 Format = Literal["webdataset", "parquet"]
 
 SUFFIXES = {"webdataset": ".tar", "parquet": ".parquet"}
-_WRITERS = {"webdataset": "webdataset", "parquet": "pyarrow"}
 _FILES = ("blurred", "sharp", "depth")
 
 
@@ -104,7 +103,7 @@ class RenderShards:
     Args:
         out: Folder of the shards; it must exist.
         blur: Draws focus, f-number and lens, and renders. Its ``p`` is ignored: every sample is blurred.
-        depth: How to read depth maps: keyword arguments of :func:`torchdof.depth.reading.read_depth`; or, for depth
+        depth: How to read depth maps: keyword arguments of :func:`torchdof.depth.read_depth`; or, for depth
             without a scale, ``{"kind": "relative", "near_m": 1.0, "far_m": 8.0}``, with ``relative_kind``,
             ``value_range`` and ``unknown`` as in :func:`torchdof.depth.from_relative`, and ``fill`` and ``channel``.
         format: "webdataset" or "parquet"; requires the package webdataset or pyarrow.
@@ -150,8 +149,9 @@ class RenderShards:
             raise FileNotFoundError(f"{out}: there is no such folder; make it first")
         choice("format", format, tuple(SUFFIXES))
         choice("picture", picture, (".png", ".exr"))
-        if importlib.util.find_spec(_WRITERS[format]) is None:
-            raise ModuleNotFoundError(f"{format} needs {_WRITERS[format]}: pip install 'torchdof[ray]'")
+        writer = {"webdataset": "webdataset", "parquet": "pyarrow"}[format]
+        if importlib.util.find_spec(writer) is None:
+            raise ModuleNotFoundError(f"{format} needs {writer}: pip install 'torchdof[ray]'")
         if not keep or not set(keep) <= set(_FILES):
             raise ValueError(f"keep must be some of {', '.join(_FILES)}, got {show(keep)}")
         if not isinstance(self.blur, RandomDepthOfField):
@@ -182,14 +182,9 @@ class RenderShards:
 
     def settings(self) -> dict[str, Any]:
         """Everything except the rows that determines the shards, as JSON values."""
-        lenses = [rendering.table for rendering in self.blur.renderings]
-        return {
-            **{name: getattr(self, name) for name in ("format", "keep", "picture", "transfer", "seed", "depth")},
-            **{name: getattr(self.blur, name) for name in ("focus_m", "f_number")},
-            "camera": repr(self.blur.camera),
-            "lenses": {table.fingerprint(): table.name or table.family for table in lenses},
-            "options": _json_values(self.blur.renderings[0].arguments()),
-        }
+        own = {name: getattr(self, name) for name in ("format", "keep", "picture", "transfer", "seed", "depth")}
+        lenses = [rendering.table.fingerprint() for rendering in self.blur.renderings]
+        return {**own, "blur": repr(self.blur), "lenses": lenses}
 
     def _source(self, samples: str) -> str:
         """Digest of all that determines a shard: settings, samples, and size and time of their files."""
@@ -253,8 +248,9 @@ class RenderShards:
             np.save(array := io.BytesIO(), metres[0, 0].numpy())
             record["depth.npy"] = array.getvalue()
         table, (height, width) = options.table, blurred.shape[-2:]
+        numbers = {name: value for name, value in (vars(camera) | options.arguments()).items() if name != "table"}
         record["json"] = {
-            **_json_values(vars(camera) | options.arguments()),
+            **{name: float(value) if isinstance(value, Tensor) else value for name, value in numbers.items()},
             **{"table": table.name or table.family, "table_fingerprint": table.fingerprint()},
             "aperture": None if table.aperture is None else repr(table.aperture),
             **{"image": _text(image), "depth": depth and _text(depth), "height": height, "width": width},
@@ -277,9 +273,3 @@ def _read_relative(
 def _text(name: str) -> str:
     """A file name that UTF-8 can encode: other bytes become escapes."""
     return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
-
-
-def _json_values(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Numbers and strings of a camera or of options, as JSON values."""
-    numbers = {name: float(value) if isinstance(value, Tensor) else value for name, value in arguments.items()}
-    return {name: value for name, value in numbers.items() if name != "table"}

@@ -14,14 +14,7 @@ __all__ = ["KINDS", "degrade"]
 
 
 def degrade(depth: Tensor, kind: str) -> Tensor:
-    """Depth degraded in one way.
-
-    Args:
-        depth: ``[1, 1, H, W]``, metres, exact.
-        kind: One of :data:`KINDS`.
-
-    Returns:
-        ``[1, 1, H, W]``, metres.
+    """Exact depth ``[1, 1, H, W]`` in metres, degraded in one way, the name of one of :data:`KINDS`.
 
     Example:
         >>> degrade(torch.tensor([[[[2.0, 2.0, 1.0, 1.0]]]]), "shift 1px")

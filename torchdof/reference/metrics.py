@@ -1,7 +1,5 @@
-"""Differences between a rendering and the truth: PSNR in linear light and as displayed, SSIM, FLIP."""
+"""Differences between a rendering and the truth: PSNR in linear light and as displayed, SSIM."""
 
-import importlib
-import importlib.util
 import math
 
 import torch
@@ -10,7 +8,7 @@ from torch import Tensor
 from ..io.transfer import encode
 from ..validation import real_tensor, show
 
-__all__ = ["display", "flip", "has_flip", "psnr", "ssim"]
+__all__ = ["display", "psnr", "ssim"]
 
 
 def display(linear: Tensor) -> Tensor:
@@ -91,34 +89,6 @@ def ssim(image: Tensor, truth: Tensor) -> float:
     if min(image.shape[-2:]) < 6:
         raise ValueError(f"SSIM needs at least 6 pixels a side, got {list(image.shape)}")
     return float(kornia_ssim(image.double(), truth.double(), window_size=11).mean())
-
-
-def has_flip() -> bool:
-    """Whether FLIP can be computed, that is, the package ``flip-evaluator`` is installed."""
-    return importlib.util.find_spec("flip_evaluator") is not None
-
-
-def flip(image: Tensor, truth: Tensor) -> float:
-    """Mean difference visible when flipping between two images on a display (67 pixels a degree), from 0 to 1.
-
-    Args:
-        image: ``[1, 3, H, W]``, display-encoded, in [0, 1].
-        truth: ``[1, 3, H, W]``.
-
-    Raises:
-        ValueError: If shapes differ or are not one RGB image.
-        ModuleNotFoundError: If ``flip-evaluator`` is not installed.
-
-    Reference:
-        Andersson et al., "FLIP: a difference evaluator for alternating images", HPG 2020.
-    """
-    _check_pair(image, truth)
-    if image.shape[:2] != (1, 3):
-        raise ValueError(f"FLIP compares one RGB image, [1, 3, H, W], got {list(image.shape)}")
-    flip_evaluator = importlib.import_module("flip_evaluator")
-    arrays = [x.detach().float().cpu()[0].permute(1, 2, 0).contiguous().numpy() for x in (truth, image)]
-    error, _, _ = flip_evaluator.evaluate(*arrays, "LDR", applyMagma=False)
-    return float(error.mean(dtype="float64"))
 
 
 def _check_pair(image: Tensor, truth: Tensor) -> None:

@@ -43,7 +43,6 @@ class Scene:
         camera: The setting of the lens.
         truth: ``[1, C, H, W]``, linear light.
         margin_px: Width of the border reached by light from outside the frame: the largest circle of confusion.
-        surfaces: Known further surfaces, see :func:`torchdof.reference.lens_views.lens_views`.
     """
 
     name: str
@@ -52,7 +51,6 @@ class Scene:
     camera: Camera
     truth: Tensor
     margin_px: int = 0
-    surfaces: tuple[tuple[Tensor, Tensor], ...] = ()
 
     @property
     def coc_px(self) -> Tensor:
@@ -143,7 +141,7 @@ def plane_scene(planes: Sequence[Plane], camera: Camera, size: tuple[int, int], 
         samples: Points on lens and pixel, for each pixel; the sharp image uses as many on the pixel alone.
 
     Returns:
-        The scene; ``surfaces`` are all planes, far to near, including hidden parts.
+        The scene.
 
     Raises:
         ValueError: If the farthest plane has a shape.
@@ -152,16 +150,14 @@ def plane_scene(planes: Sequence[Plane], camera: Camera, size: tuple[int, int], 
     if not planes or planes[0].shape is not None:
         raise ValueError("the farthest plane must have no shape: it has to cover the frame")
     y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in size), indexing="ij")
-    distances = [torch.full((1, 1, *size), plane.depth_m, dtype=torch.float64) for plane in planes]
-    depth = distances[0]
-    for plane, distance in zip(planes, distances, strict=True):
-        depth = torch.where(plane.covers(x, y), distance, depth)
-    cocs = [float(camera.coc_px(distance, size[1])[0, 0, 0, 0]) for distance in distances]
-    sharp, surfaces = _average(planes, cocs, x, y, torch.zeros(samples, 2))
-    truth, _ = _average(planes, cocs, x, y, spread_points(samples))
-    coc_maps = [camera.coc_px(distance.float(), size[1]) for distance in distances]
-    margin_px = math.ceil(max(map(abs, cocs)))
-    return Scene("planes", sharp, depth.float(), camera, truth, margin_px, tuple(zip(surfaces, coc_maps, strict=True)))
+    depth = torch.zeros(1, 1, *size, dtype=torch.float64)
+    for plane in planes:
+        depth = torch.where(plane.covers(x, y), plane.depth_m, depth)
+    distances = torch.tensor([[[[plane.depth_m for plane in planes]]]], dtype=torch.float64)
+    cocs = camera.coc_px(distances, size[1]).flatten().tolist()
+    sharp = _average(planes, cocs, x, y, torch.zeros(samples, 2))
+    truth = _average(planes, cocs, x, y, spread_points(samples))
+    return Scene("planes", sharp, depth.float(), camera, truth, math.ceil(max(map(abs, cocs))))
 
 
 def spread_points(count: int) -> Tensor:
@@ -176,26 +172,22 @@ def spread_points(count: int) -> Tensor:
     return torch.stack([radius * angle.cos(), radius * angle.sin()], -1)
 
 
-def _average(
-    planes: Sequence[Plane], cocs: Sequence[float], x: Tensor, y: Tensor, points: Tensor
-) -> tuple[Tensor, list[Tensor]]:
-    """Mean light ``[1, C, H, W]`` of visible planes, premultiplied light and cover of each ``[1, C + 1, H, W]``.
+def _average(planes: Sequence[Plane], cocs: Sequence[float], x: Tensor, y: Tensor, points: Tensor) -> Tensor:
+    """Mean light ``[1, C, H, W]`` of the visible planes, seen from points ``[n, 2]`` of the unit disc of the lens.
 
-    Planes are sorted far to near, with a signed coc each, and seen from points ``[n, 2]`` of the unit disc of the lens.
+    Planes are sorted far to near, with a signed coc each.
     """
     index = torch.arange(len(points), dtype=torch.float64)
     # Additive recurrences, so that position in the pixel and point on the lens are independent.
     shifts = torch.stack([(index * a + 0.5) % 1.0 - 0.5 for a in (0.7548776662466927, 0.5698402909980532)], -1)
-    total, sums = torch.zeros(()), [torch.zeros(()) for _ in planes]
+    total = torch.zeros(())
     for (px, py), (ux, uy) in zip(shifts.tolist(), points.tolist(), strict=True):
         visible = torch.zeros(())
-        for k, (plane, coc) in enumerate(zip(planes, cocs, strict=True)):
+        for plane, coc in zip(planes, cocs, strict=True):
             point = x + px - coc * ux, y + py - coc * uy
-            light, is_covered = plane.light(*point), plane.covers(*point)
-            visible = torch.where(is_covered, light, visible)
-            sums[k] = sums[k] + torch.cat([light * is_covered, is_covered[None]])
+            visible = torch.where(plane.covers(*point), plane.light(*point), visible)
         total = total + visible
-    return (total / len(points)).float()[None], [(each / len(points)).float()[None] for each in sums]
+    return (total / len(points)).float()[None]
 
 
 def waves(seed: int, mean: Sequence[float] = (0.4, 0.4, 0.4), contrast: float = 0.8, shortest_px: float = 6.0) -> Light:

@@ -1,11 +1,10 @@
 """GEGL's lens-blur (the engine of GIMP), float32: a disc with its own radius for each pixel.
 
 GEGL's disc extends half a pixel beyond its radius, so the radius is reduced by half a pixel. Its time is that of the
-graph a second time, from buffer to buffer. An interpreter that has GEGL's bindings, and may lack PyTorch, runs
+graph a second time, from buffer to buffer. The system's Python, which has GEGL's bindings and may lack PyTorch, runs
 ``gegl.py FOLDER WIDTH HEIGHT RADIUS``.
 """
 
-import functools
 import os
 import shutil
 import subprocess
@@ -19,11 +18,14 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 NAME = "GEGL lens-blur"
+PYTHON = shutil.which("python3", path=os.defpath) or sys.executable
 
 
 def available() -> str | None:
     """None, or what to install."""
-    return None if _python() else "Debian and Ubuntu: apt install gir1.2-gegl-0.4 python3-gi"
+    check = [PYTHON, "-c", "import gi; gi.require_version('Gegl', '0.4')"]
+    has_gegl = subprocess.run(check, capture_output=True).returncode == 0
+    return None if has_gegl else "Debian and Ubuntu: apt install gir1.2-gegl-0.4 python3-gi"
 
 
 def blur(image: "Tensor", coc_px: "Tensor") -> "tuple[Tensor, float]":
@@ -37,23 +39,13 @@ def blur(image: "Tensor", coc_px: "Tensor") -> "tuple[Tensor, float]":
     with tempfile.TemporaryDirectory() as folder:
         image[0].permute(1, 2, 0).contiguous().numpy().astype(np.float32).tofile(f"{folder}/image")  # [H, W, 3]
         (radius / largest).numpy().astype(np.float32).tofile(f"{folder}/radius")
-        command = [_python() or sys.executable, __file__, folder, str(width), str(height), str(largest)]
+        command = [PYTHON, __file__, folder, str(width), str(height), str(largest)]
         environment = {**os.environ, "GEGL_THREADS": str(torch.get_num_threads())}
         done = subprocess.run(command, capture_output=True, text=True, env=environment)
         if done.returncode:
             raise ChildProcessError(f"GEGL failed: {done.stderr[-500:]}")
         out = np.fromfile(f"{folder}/out", np.float32).reshape(height, width, 3)
     return torch.from_numpy(out).permute(2, 0, 1)[None], float(done.stdout)
-
-
-@functools.cache
-def _python() -> str | None:
-    """The first interpreter that has GEGL's bindings: this one, or the system's."""
-    for python in (sys.executable, shutil.which("python3", path=os.defpath)):
-        check = "import gi; gi.require_version('Gegl', '0.4')"
-        if python and subprocess.run([python, "-c", check], capture_output=True).returncode == 0:
-            return python
-    return None
 
 
 def _run_gegl(folder: Path, width: int, height: int, largest: float) -> None:
