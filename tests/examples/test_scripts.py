@@ -91,6 +91,28 @@ def test_the_paper_s_experiment_reaches_its_figure_4(tmp_path: Path, run: Run) -
     assert float(re.findall(r"spot itself: ([\d.]+) dB", printed)[0]) > 45
 
 
+def test_gradient_descent_finds_the_blur_and_with_a_known_lens_the_metres(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The script runs with fewer steps at full size."""
+    example: dict[str, Any] = runpy.run_path(str(EXAMPLES / "solve_scale.py"))
+    main = example["main"]
+    *coarse, (factor, steps, rate) = example["STAGES"]
+    monkeypatch.setitem(main.__globals__, "STAGES", (*coarse, (factor, 4, rate)))
+    scene = ROOT / "tests" / "data" / "scenes" / "room"
+    monkeypatch.setattr(
+        "sys.argv", ["solve_scale.py", "--scene", str(scene), "--out", str(tmp_path), "--known", "f_number", "focus_m"]
+    )
+    main()
+    printed = capsys.readouterr().out
+    rows = {line.split()[0]: [float(x) for x in line.split()[1:]] for line in re.findall(r"  \w+ +[\d. ]+", printed)}
+    (*_, radius_px, depth_percent, close_db), guess = rows["found"], rows["guess"]
+    assert radius_px < 0.15 < 1.0 < guess[4]
+    assert close_db > rows["true"][6] - 0.3
+    assert depth_percent < 4
+    assert (tmp_path / "room_1_scale.png").is_file()
+
+
 def test_the_template_for_render_farms_uses_existing_options() -> None:
     text = (EXAMPLES / "farm" / "openjd.yaml").read_text()
     called = set(re.findall(r"^ +- (--[a-z-]+)$", text, flags=re.MULTILINE))
