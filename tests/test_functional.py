@@ -72,12 +72,14 @@ def test_an_image_in_focus_is_returned_bit_exact() -> None:
     assert torch.equal(splat(image, torch.zeros(1, 1, 8, 9), normalize=False), image)
 
 
-def test_items_of_batches_equal_each_alone_and_may_share_a_map() -> None:
+def test_items_of_batches_and_clips_equal_each_alone_and_may_share_a_map() -> None:
     image, coc = scene(6)
     together = splat(image, coc)
     for item in range(6):
-        assert torch.equal(together[item : item + 1], splat(image[item : item + 1], coc[item : item + 1]))
+        assert torch.equal(together[item], splat(image[item], coc[item]))
     assert torch.equal(splat(image, coc[:1]), splat(image, coc[:1].expand(6, -1, -1, -1)))
+    clips, maps = image.unflatten(0, (2, 3)), coc.unflatten(0, (2, 3))
+    assert torch.equal(splat(clips, maps), together.unflatten(0, (2, 3)))
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])

@@ -20,14 +20,15 @@ ALLOWED = {
     "pixels": set(),
     "tensors": set(),
     "validation": {"native", "tensors"},
+    "batch": {"tensors", "validation"},
     "io": {"validation"},
     "optics": {"tensors", "validation", "native", "io"},
     "options": {"validation", "optics"},
     "render": {"tensors", "validation", "pixels", "native", "optics", "options"},
     "depth": {"tensors", "validation", "io", "optics", "render"},
     "reference": {"validation", "io", "optics", "render"},
-    "module": {"tensors", "validation", "optics", "options", "render"},
-    "functional": {"tensors", "validation", "optics"},
+    "module": {"tensors", "validation", "batch", "optics", "options", "render"},
+    "functional": {"tensors", "validation", "batch", "optics"},
     "fit": {"validation", "io", "optics"},
     "export": {"pixels", "tensors", "validation", "io", "optics", "options", "render", "reference", "module"},
     "augmentation": {"tensors", "validation", "io", "optics", "options", "module"},
@@ -126,7 +127,7 @@ from torchdof import BlurTable, Camera, DepthOfField
 dof = DepthOfField(Camera(focus_m=1.0, sensor_width_mm=4.0), BlurTable.polygon(6))
 image, depth = torch.rand(2, 3, 24, 32), 1 + torch.rand(2, 1, 24, 32).requires_grad_()
 with torch.no_grad():
-    assert not torch.equal(dof(image, depth, focus_m=torch.tensor([1.0, 1.5])), image)
+    assert not torch.equal(dof(image, depth, focus_m=[1.0, 1.5]), image)
 from torchdof.functional import splat
 dof(image, depth).sum().backward()
 splat(image, depth).sum().backward()

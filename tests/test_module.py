@@ -235,9 +235,6 @@ test_a_wrong_argument_is_refused_in_one_sentence = refuses(
     (called(image=IMAGE.byte()), "image must be a tensor .* floating point .*got a torch.uint8"),
     (called(image=[[1.0]]), r"image must be a tensor .*got \[\[1.0\]\]"),
     (called(image=IMAGE[0].numpy()), r"image must be a tensor .*got a float32 array .*; use torch.from_numpy"),
-    (called(image=IMAGE[0]), r"image must be \[B, C, H, W\] .*got \[3, 4, 5\]; .* one image is image\[None\]"),
-    (called(image=IMAGE[None]), r"got \[1, 1, 3, 4, 5\]; .* clips are image.flatten\(0, 1\)"),
-    (called(focus_m=[1.0, 2.0]), r"focus_m must be positive, a float or a floating-point tensor \[B\], got \[1.0"),
     (called(image=IMAGE.movedim(1, -1)), r"got \[1, 1, 4, 5\]; channels come before .*image.movedim\(-1, -3\)"),
     (called(depth=DEPTH[0]), r"depth must be \[1, 1, 4, 5\].*did you forget the channel dimension"),
     *((called(depth=torch.ones(size)), r"depth must be \[1, 1, 4, 5\].* got \[{}, {}, {}, {}\]".format(*size))
@@ -262,15 +259,6 @@ test_a_wrong_argument_is_refused_in_one_sentence = refuses(
     (lambda: depth_of_field(IMAGE, DEPTH, Camera(), plan="plan"), r"plan must be a Plan from"),  # type: ignore[arg-type]
     (lambda: blur_by_coc(IMAGE, COC, plan=(0.0, 1.0)), r"plan must be a Plan from"),  # type: ignore[arg-type]
 )  # fmt: skip
-
-
-def test_vmap_is_refused_by_name() -> None:
-    dof, images, depths = DepthOfField(Camera()), torch.rand(2, 1, 3, 9, 12), torch.ones(2, 1, 1, 9, 12)
-    for call in (dof, torch.func.grad(lambda image, depth: dof(image, depth).sum())):
-        with pytest.raises(ValueError, match=r"image comes from torch\.vmap"):
-            torch.vmap(call)(images, depths)
-    with pytest.raises(ValueError, match=r"focus_m comes from torch\.vmap"):
-        torch.vmap(lambda s: dof(images[:, 0], depths[:, 0], focus_m=s))(torch.ones(2))
 
 
 @pytest.mark.parametrize("name", ["depth", "image", "coc_px", "rgba"])

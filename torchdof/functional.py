@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from .batch import flattened, leading_axes, restored
 from .optics.blur_table import BlurTable
 from .optics.kernel_bank import bank_of
 from .optics.kernel_cache import KernelCache
@@ -46,7 +47,8 @@ def splat(
     more than a few pixels :func:`torchdof.blur_by_coc` is many times faster.
 
     Args:
-        image: ``[B, C, H, W]``, linear light, floating point.
+        image: ``[B, C, H, W]``, linear light, floating point; also ``[C, H, W]`` or ``[B, T, C, H, W]``, with maps of
+            the same rank.
         coc_px: Signed radius of the circle of confusion ``[B, 1, H, W]`` or ``[1, 1, H, W]``, in pixels; negative in
             front of the focus plane.
         table: Blur of a lens, the same across the frame; None takes the ideal disc.
@@ -78,8 +80,11 @@ def splat(
     """
     if is_traced():
         raise ValueError("splat cannot be compiled or exported; use torch.compiler.disable(splat), or blur_by_coc")
-    if coc_px is not None and sigma_px is not None:
-        raise ValueError("splat takes coc_px, with a table, or sigma_px, of Gaussians; got both")
+    axes = leading_axes(image)
+    image, coc_px, sigma_px = flattened(axes, image=image, coc_px=coc_px, sigma_px=sigma_px)
+    if (coc_px is None) == (sigma_px is None):
+        got = "neither" if coc_px is None else "both"
+        raise ValueError(f"splat takes coc_px, with a table, or sigma_px, of Gaussians; got {got}")
     if sigma_px is not None:
         if table is not None:
             raise ValueError("sigma_px is that of Gaussians and takes no table; give coc_px beside a table")
@@ -87,8 +92,6 @@ def splat(
         if not 0.0 <= ends(sigma_px)[0]:
             raise ValueError("sigma_px must be >= 0 and finite, got a number that is negative or NaN")
         coc_px, table = sigma_px, _GAUSSIAN
-    if coc_px is None:
-        raise ValueError("splat takes coc_px, with a table, or sigma_px, of Gaussians; got neither")
     table = _DISC if table is None else table
     if not isinstance(table, BlurTable):
         raise ValueError(f"table must be a torchdof.BlurTable, got {show(table)}; read a file with BlurTable.load()")
@@ -97,7 +100,7 @@ def splat(
         raise ValueError("splat takes one kernel a radius, no table with a field or vignetting; use blur_by_coc")
     if table.is_differentiated:
         raise ValueError("splat gives no gradient to the aperture; detach its rotation and squeeze, or use blur_by_coc")
-    return _splatted(image.contiguous(), coc_px, table, normalize)
+    return restored(axes, _splatted(image, coc_px, table, normalize))
 
 
 def _splatted(image: Tensor, coc_px: Tensor, table: BlurTable, normalize: bool) -> Tensor:

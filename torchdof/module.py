@@ -1,6 +1,7 @@
 """Depth of field as a module and as functions: they check their arguments and call the pipeline."""
 
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -8,6 +9,7 @@ from torch import Tensor, nn
 from typing_extensions import Unpack
 
 from . import validation
+from .batch import flattened, leading_axes, numbers, restored
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera
 from .options import OPTION_NAMES, OptionArguments, Options, read_state, spells_options
@@ -20,7 +22,7 @@ from .tensors import is_traced, refuse_old_compiler, without_autocast
 
 __all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]
 
-Number = float | Tensor
+Number = float | Sequence[float] | Tensor
 
 
 @spells_options
@@ -76,13 +78,16 @@ class DepthOfField(nn.Module):
     ) -> Tensor:
         """Render a batch of images.
 
+        A single image ``[C, H, W]`` and clips ``[B, T, C, H, W]`` are accepted too. All maps then have the image's
+        rank: a depth is ``[1, H, W]`` or ``[B, T, 1, H, W]``.
+
         Args:
             image: ``[B, C, H, W]``, linear light, floating point.
             depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres along the optical axis, > 0, ``inf`` allowed. A map of
                 another size with the same aspect ratio is resampled, guided by the image
                 (:func:`torchdof.depth.at_size_of`); a compiled or exported graph takes only the image's size.
-            focus_m: Focus distance in metres for this call: a number, or one for each image, ``[B]``; None uses the
-                camera's.
+            focus_m: Focus distance in metres for this call: a number, or one for each image as a list, ``[B]`` or
+                ``[B, 1]`` (for clips ``[B]`` or ``[B, T]``); None uses the camera's.
             f_number: F-number for this call, in the same forms; None uses the camera's.
             plan: Layers to render with, from :meth:`plan`; None plans for this image. Layers are added if the image has
                 larger radii than the plan; compiled code uses a plan unchanged.
@@ -102,19 +107,29 @@ class DepthOfField(nn.Module):
             ValueError: If shapes, types or values are not as described, or a tensor comes from ``torch.vmap``.
         """
         refuse_old_compiler()
-        coc = self.coc_as_given(image, depth, focus_m, f_number)
+        options, axes = self.options, leading_axes(image)
+        lens = (numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number))
+        image, depth, background, background_depth, attention = flattened(
+            axes,
+            image=image,
+            depth=depth,
+            background=background,
+            background_depth=background_depth,
+            attention=attention,
+        )
+        coc = self.coc_as_given(image, depth, *lens)
         validation.background(image, background, "background_depth", background_depth, "in metres")
         behind = None
         if background is not None and background_depth is not None:
-            behind = self.coc_as_given(background, background_depth, focus_m, f_number, name="background_depth")
-        return blur(image, coc, self.options, plan, background, behind, attention)
+            behind = self.coc_as_given(background, background_depth, *lens, name="background_depth")
+        return restored(axes, blur(image, coc, options, plan, background, behind, attention))
 
     def layers(
         self,
         rgba: Tensor,
         depth_m: Tensor,
-        focus_m: Number | None = None,
-        f_number: Number | None = None,
+        focus_m: float | Tensor | None = None,
+        f_number: float | Tensor | None = None,
     ) -> Tensor:
         """Render a stack of complete layers, such as a multi-plane image.
 
@@ -166,19 +181,24 @@ class DepthOfField(nn.Module):
     ) -> Tensor:
         """Signed circle of confusion that :meth:`forward` uses for the same arguments: ``[B, 1, H, W]``, pixels.
 
+        For one image it is ``[1, H, W]``, for clips ``[B, T, 1, H, W]``.
+
         Raises:
             ValueError: As :meth:`forward`; also if the circle of confusion is not finite.
         """
-        coc = self.coc_as_given(image, depth, focus_m, f_number)
+        axes = leading_axes(image)
+        lens = (numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number))
+        image, depth = flattened(axes, image=image, depth=depth)
+        coc = self.coc_as_given(image, depth, *lens)
         validation.image_and_map(image, "coc_px", coc, "in pixels")  # a lens of another batch size changes its shape
-        return edges.mended(image, coc, self.options.depth_edges)
+        return restored(axes, edges.mended(image, coc, self.options.depth_edges))
 
     def coc_as_given(
         self,
         image: Tensor,
         depth: Tensor,
-        focus_m: Number | None,
-        f_number: Number | None,
+        focus_m: float | Tensor | None,
+        f_number: float | Tensor | None,
         name: str = "depth",
     ) -> Tensor:
         """The circle of confusion of a depth map without repair of its edges, for images ``[B, C, H, W]``.
@@ -192,9 +212,8 @@ class DepthOfField(nn.Module):
                 warnings.warn(f"{name} is stretched by {stretch:.1%} to the shape of the image", stacklevel=3)
             depth = at_size_of(image, depth)
         validation.image_and_depth(image, depth, values=check, name=name)
-        changes = {k: v for k, v in (("focus_m", focus_m), ("f_number", f_number)) if v is not None}
-        validation.refuse_vmap(**changes)
-        camera = self.camera.replace(**changes)
+        changes = {"focus_m": focus_m, "f_number": f_number}
+        camera = self.camera.replace(**{k: v for k, v in changes.items() if v is not None})
         # a tensor, because an exported graph would do Python's arithmetic with the width in float32
         width: Any = torch.scalar_tensor(image.shape[-1], dtype=torch.float64, device="cpu")
         coc = camera.coc_px(depth, width)
@@ -218,7 +237,7 @@ class DepthOfField(nn.Module):
               coc px  radius    at  pixels
             ...
         """
-        coc = self.coc_px(image, depth, focus_m, f_number)
+        (coc,) = flattened(leading_axes(image), coc_px=self.coc_px(image, depth, focus_m, f_number))
         return Plan.for_scene(coc, self.options.tolerance).with_pixels(coc)
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -253,8 +272,8 @@ def depth_of_field(
     """Functional form of :class:`DepthOfField`, whose arguments and those of :meth:`DepthOfField.forward` it takes.
 
     Args:
-        image: ``[B, C, H, W]``, linear light.
-        depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres.
+        image: ``[B, C, H, W]``, linear light; also ``[C, H, W]`` or ``[B, T, C, H, W]``.
+        depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres; of the image's rank.
         camera: The camera.
         table: Blur measured from a lens; None takes the ideal disc.
         focus_m: Overrides the camera's focus distance.
@@ -293,7 +312,7 @@ def blur_by_coc(
     """Depth of field from a map of the circle of confusion.
 
     Args:
-        image: ``[B, C, H, W]``, linear light.
+        image: ``[B, C, H, W]``, linear light; also ``[C, H, W]`` or ``[B, T, C, H, W]``, all maps then of that rank.
         coc_px: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, signed radius in pixels: negative in front of the focus plane.
             With ``check=False`` it may be NaN where it is unknown.
         table: Blur measured from a lens; None takes the ideal disc.
@@ -315,8 +334,12 @@ def blur_by_coc(
         torch.Size([1, 3, 8, 12])
     """
     refuse_old_compiler()
+    axes, hidden_coc = leading_axes(image), background_coc_px
+    image, coc_px, background, hidden_coc, attention = flattened(
+        axes, image=image, coc_px=coc_px, background=background, background_coc_px=hidden_coc, attention=attention
+    )
     given = Options(table, **options)  # type: ignore[arg-type]
-    return blur(image, coc_px, given, plan, background, background_coc_px, attention)
+    return restored(axes, blur(image, coc_px, given, plan, background, hidden_coc, attention))
 
 
 def blur(

@@ -191,13 +191,11 @@ def image_and_map(image: Tensor, name: str, value: Tensor, unit: str) -> None:
     """Refuse an image and a one-channel map, in a unit, whose types, sizes or devices do not fit."""
     real_tensor("image", image, "[B, C, H, W] in linear light")
     if image.ndim != 4 or 0 in image.shape:
-        hints = {3: "one image is image[None]", 5: "clips are image.flatten(0, 1)"}
-        hint = f"; did you forget the batch dimension? {hints[image.ndim]}" if image.ndim in hints else ""
+        hint = "; did you forget the batch dimension? use image[None]" if image.ndim == 3 else ""
         raise ValueError(f"image must be [B, C, H, W] with at least one pixel, got {list(image.shape)}{hint}")
     batch, _, height, width = image.shape
     expected = f"[{batch}, 1, {height}, {width}] or [1, 1, {height}, {width}] {unit} beside this image"
     real_tensor(name, value, expected)
-    refuse_vmap(**{"image": image, name: value})
     if value.ndim != 4 or value.shape[1:] != (1, height, width) or value.shape[0] not in (1, batch):
         hint = "; did you forget the channel dimension?" if value.ndim == 3 else ""
         if value.shape[-2:] == image.shape[1:3]:
@@ -205,15 +203,6 @@ def image_and_map(image: Tensor, name: str, value: Tensor, unit: str) -> None:
         raise ValueError(f"{name} must be {expected}, got {list(value.shape)}{hint}")
     if value.device != image.device:
         raise ValueError(f"{name} must be on the image's device {image.device}, got {value.device}")
-
-
-def refuse_vmap(**values: Any) -> None:
-    """Refuse tensors, by name, inside ``torch.vmap``, because planning layers reads their values."""
-    for name, value in values.items():
-        while isinstance(value, Tensor) and not is_traced() and torch._C._functorch.is_functorch_wrapped_tensor(value):
-            if torch._C._functorch.is_batchedtensor(value):
-                raise ValueError(f"{name} comes from torch.vmap, in which no values can be read; pass the whole batch")
-            value = torch._C._functorch.get_unwrapped(value)  # torch.func.grad inside of torch.vmap wraps it once more
 
 
 def image_and_depth(image: Tensor, depth: Tensor, values: bool, name: str = "depth") -> None:
