@@ -28,6 +28,12 @@ WAYS: dict[str, dict[str, Any]] = {
     "fold-sum": {"method": "fold", "occlusion": False},
 }
 EVERY_WAY = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
+TURNS: dict[str, Callable[[Tensor], Tensor]] = {
+    "left-right": lambda t: t.flip(-1),
+    "top-bottom": lambda t: t.flip(-2),
+    "diagonal": lambda t: t.mT,
+    "quarter": lambda t: t.rot90(1, (-2, -1)),
+}
 Light = Callable[[torch.dtype], Tensor]
 
 
