@@ -23,10 +23,6 @@ def coc_map(*values: float) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float64).reshape(1, 1, 1, -1)
 
 
-def place_of(coc_px: float) -> float:
-    return float(blur_axis(torch.tensor(coc_px, dtype=torch.float64)))
-
-
 @given(st.floats(-3.0, 3.0) | st.floats(-100.0, 100.0))
 def test_the_blur_axis_is_continuous_and_increasing_and_inverted_by_from_blur_axis(coc: float) -> None:
     place, beside = blur_axis(torch.tensor([coc, coc + 1e-4], dtype=torch.float64)).tolist()
@@ -115,7 +111,7 @@ def test_layers_for_gradients_do_not_depend_on_small_changes_of_the_scene() -> N
 
 
 def test_nan_and_infinite_coc_add_no_layers() -> None:
-    assert Plan.for_scene(coc_map(math.nan, 3.0, 3.0), 1 / 255, adapt=False).nodes[-1] == pytest.approx(place_of(3.0))
+    assert Plan.for_scene(coc_map(math.nan, 3.0, 3.0), 1 / 255, adapt=False).coc_px[-1] == pytest.approx(3.0)
     reaching = Plan.for_scene(coc_map(-math.inf, math.inf), 1 / 20, adapt=False)
     assert all(math.isfinite(x) for x in reaching.nodes)
     coc = torch.zeros(2, 1, 40, 50)

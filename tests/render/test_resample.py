@@ -16,11 +16,6 @@ def scene(height: int = 64, width: int = 96) -> tuple[torch.Tensor, torch.Tensor
     return image, depth
 
 
-def test_a_map_of_the_size_of_the_image_is_returned_itself() -> None:
-    image, depth = scene()
-    assert at_size_of(image, depth) is depth
-
-
 @pytest.mark.parametrize("factor", [2, 4, 6])
 def test_a_smaller_map_gets_the_edges_of_the_image(factor: int) -> None:
     image, depth = (functional.interpolate(values, scale_factor=2) for values in scene(48, 96))
@@ -30,8 +25,9 @@ def test_a_smaller_map_gets_the_edges_of_the_image(factor: int) -> None:
     assert float(wrong) < 0.15 * float(before)
 
 
-def test_a_larger_map_is_averaged() -> None:
+def test_a_map_of_the_size_of_the_image_is_returned_itself_and_a_larger_one_is_averaged() -> None:
     image, depth = scene()
+    assert at_size_of(image, depth) is depth
     large = depth.repeat_interleave(2, -1).repeat_interleave(2, -2)
     torch.testing.assert_close(at_size_of(image, large), depth)
 
