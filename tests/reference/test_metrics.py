@@ -7,9 +7,6 @@ import torch
 from tests.refused import refuses
 from torchdof.reference import metrics
 
-needs_flip = pytest.mark.skipif(not metrics.has_flip(), reason="flip-evaluator is not installed")
-
-
 IMAGE = torch.zeros(1, 3, 8, 8)
 BAD = IMAGE.clone()
 BAD[0, 0, 2, 3] = math.nan
@@ -45,7 +42,7 @@ def test_ssim_is_one_for_equal_images_and_falls_with_noise() -> None:
     assert 1 > little > 0.97 > much
 
 
-@needs_flip
+@pytest.mark.skipif(not metrics.has_flip(), reason="flip-evaluator is not installed")
 def test_flip_is_zero_for_equal_images_and_grows_with_the_area_that_differs() -> None:
     truth = torch.full((1, 3, 64, 64), 0.5)
     one, two = truth.clone(), truth.clone()
