@@ -34,7 +34,9 @@ def test_coc_is_the_cone_of_light_on_the_sensor(focus_m: float, z_m: float) -> N
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_coc_next_to_the_focus_plane_does_not_cancel(dtype: torch.dtype) -> None:
+def test_coc_next_to_the_focus_plane_does_not_cancel_and_half_precision_counts_in_single(dtype: torch.dtype) -> None:
+    half = depth_of(1.0, 3.0, dtype=torch.float16)
+    assert_close(Camera().coc_px(half, 1920), Camera().coc_px(half.float(), 1920), rtol=0.0, atol=0.0)
     focus = torch.tensor([1.7], dtype=dtype)
     beyond = torch.nextafter(focus, focus.new_tensor([9.0]))
     nearer = torch.nextafter(focus, focus.new_tensor([0.0]))
@@ -123,11 +125,6 @@ def test_gradients_at_infinity_are_zero_and_invalid_depths_have_a_nan_coc_and_fi
         assert torch.isnan(coc).flatten().tolist() == [False, True, True, True, False]
         slopes = torch.autograd.grad(torch.nan_to_num(coc).sum(), leaves)
         assert all(torch.isfinite(slope).all() for slope in slopes) and float(slopes[0][..., 4]) == 0.0
-
-
-def test_half_precision_depth_is_computed_in_single() -> None:
-    depth = depth_of(1.0, 3.0, dtype=torch.float16)
-    assert_close(Camera().coc_px(depth, 1920), Camera().coc_px(depth.float(), 1920), rtol=0.0, atol=0.0)
 
 
 def test_focus_at_takes_the_median_of_a_patch_and_ignores_bad_depth() -> None:
