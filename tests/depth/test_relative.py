@@ -50,12 +50,9 @@ def test_holes_stay_holes_and_do_not_stretch_the_range() -> None:
     torch.testing.assert_close(depth, row(1.0, NAN, 2.0, NAN, NAN, NAN), equal_nan=True)
 
 
-def test_each_item_of_a_batch_has_its_own_extremes() -> None:
+def test_each_item_has_its_own_extremes_unless_value_range_sets_the_scale_and_clamps_values() -> None:
     values = torch.stack([row(0.0, 1.0)[0], row(50.0, 90.0)[0]])
     assert from_relative(values, 1.0, 2.0).flatten().tolist() == [2.0, 1.0, 2.0, 1.0]
-
-
-def test_value_range_sets_the_scale_and_clamps_values() -> None:
     depth = from_relative(row(-5.0, 0.0, 50.0, 100.0, 120.0), 1.0, 3.0, "depth", value_range=(0.0, 100.0))
     assert depth.flatten().tolist() == [1.0, 1.0, 2.0, 3.0, 3.0]
     assert from_relative(row(50.0), 1.0, 3.0, "depth", value_range=(0.0, 100.0)).item() == 2.0
