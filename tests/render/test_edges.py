@@ -114,10 +114,15 @@ def test_edges_move_to_those_of_the_image(scene: Scene, kind: str, how: DepthEdg
 
 
 @pytest.mark.parametrize("kind", sorted(set(KINDS) - {"exact"}))
-def test_depth_with_an_unrelated_image_in_a_batch_is_unchanged(scene: Scene, kind: str) -> None:
+def test_depth_with_an_unrelated_image_is_unchanged(scene: Scene, kind: str) -> None:
     depth = degrade(scene.depth, kind)
-    together = repair_edges(torch.cat([scene.image, torch.rand_like(scene.image)]), depth, "auto")
-    assert torch.equal(together[:1], repair_edges(scene.image, depth, "auto"))
+    assert torch.equal(repair_edges(torch.rand_like(scene.image), depth, "auto"), depth)
+
+
+def test_items_of_a_batch_are_repaired_independently(scene: Scene) -> None:
+    images, depth = torch.cat([scene.image, torch.rand_like(scene.image)]), degrade(scene.depth, "half-res")
+    together = repair_edges(images, depth, "auto")
+    assert torch.equal(together[:1], repair_edges(images[:1], depth, "auto"))
     assert torch.equal(together[1:], depth)
 
 
