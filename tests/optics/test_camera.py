@@ -92,7 +92,8 @@ def test_a_batch_of_cameras_equals_each_camera_alone() -> None:
     together = Camera(**numbers).coc_px(depth, 640)
     limits = torch.stack(list(map(torch.as_tensor, Camera(**numbers).sharp_limits_m(1.0, 1920))), 1)
     for i in range(3):
-        alone = Camera(*(float(value[i]) for value in numbers.values()))
+        one: dict[str, Any] = {name: float(value[i]) for name, value in numbers.items()}
+        alone = Camera(**one)
         assert_close(together[i : i + 1], alone.coc_px(depth[i : i + 1], 640))
         assert limits[i].tolist() == pytest.approx(alone.sharp_limits_m(1.0, 1920), rel=1e-7)
     assert Camera(**numbers).coc_px(depth[:1], 640).shape == (3, 1, 4, 5)
