@@ -29,7 +29,7 @@ def save(model: onnx.ModelProto, folder: Path) -> Path:
     return folder / "other.onnx"
 
 
-OTHERS = {"tolerance": 0.01, "max_coc_px": 5.0, "occlusion": True}
+OTHERS: dict[str, Any] = {"tolerance": 0.01, "max_coc_px": 5.0, "occlusion": True}
 OTHERS |= {"table": torchdof.BlurTable.gaussian(), "camera": torchdof.Camera()}
 
 
