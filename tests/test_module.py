@@ -83,7 +83,10 @@ LAYOUTS: list[Callable[[Tensor], Tensor]] = [
 @given(
     st.sampled_from([(1, 1), (1, 7), (8, 1), (3, 5), (6, 9), (2, 2)]),
     st.tuples(st.integers(1, 2), st.integers(1, 5)),
-    *map(st.sampled_from, (TYPES, [0.0, 0.6, 2.0, 5.0], list(WAYS.values()), LAYOUTS)),
+    st.sampled_from(TYPES),
+    st.sampled_from([0.0, 0.6, 2.0, 5.0]),
+    st.sampled_from(list(WAYS.values())),
+    st.sampled_from(LAYOUTS),
 )
 def test_any_shape_type_and_stride_gives_the_picture_of_a_plain_tensor(
     size: tuple[int, int], items: tuple[int, int], dtype: torch.dtype, reach: float, way: Any, layout: Any
@@ -267,7 +270,9 @@ def test_bad_numbers_are_refused_and_counted(name: str, bad: float) -> None:
 
 
 BAD_STATES: list[tuple[Any, str]] = [
-    *((wrong, "the state of a DepthOfField must") for wrong in (None, 5, {})),
+    (None, "the state of a DepthOfField must"),
+    (5, "the state of a DepthOfField must"),
+    ({}, "the state of a DepthOfField must"),
     ({"camera": None}, "camera of the state must be a dict, got None"),
     ({"camera": {"focal_length_mm": 50.0}}, "camera of the state must have the fields .*f_number is missing"),
     ({"camera": {**Camera().__dict__, "f_number": -1.0}}, "camera of the state: f_number must be"),

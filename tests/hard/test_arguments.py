@@ -50,7 +50,7 @@ def tensors(draw: st.DrawFn) -> Tensor:
     kind = draw(st.sampled_from(["dense", "dense", "dense", "meta", "sparse", "gradient"]))
     if kind == "gradient":
         return made.requires_grad_(made.is_floating_point())
-    return {"meta": lambda: made.to("meta"), "sparse": made.to_sparse}.get(kind, lambda: made)()
+    return made.to("meta") if kind == "meta" else made.to_sparse() if kind == "sparse" else made
 
 
 JUNK = st.one_of(

@@ -102,7 +102,7 @@ def test_splatting_in_parts_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> 
     torch.testing.assert_close(blur_by_coc(image, coc), whole, rtol=1e-5, atol=1e-5)
 
 
-SENT: list[tuple[dict[str, float], float]] = [  # changes of the scene, share of the light
+SENT: list[tuple[dict[str, Any], float]] = [  # changes of the scene, share of the light
     ({}, 1.0),
     *(({"nearer_px": px}, sent) for px, sent in ((1.5, 0.7), (1.0, 0.4), (-3.0, 0.4))),  # distance to what is nearer
     *(({"beside_light": light}, sent) for light, sent in ((1.2, 0.7), (1.6, 0.4))),  # which must be no highlight
