@@ -12,10 +12,7 @@ from torchdof import BlurTable
 
 
 def scatter(light: Tensor, kernel_of: Callable[[int, int, int], Tensor]) -> Tensor:
-    """Sum of every pixel's light times its own kernel; light outside the frame is lost.
-
-    `kernel_of(item, row, column)` is `[1 or C, k, k]`, `light` is `[B, C, H, W]`.
-    """
+    """Sum of the light `[B, C, H, W]` of every pixel times its own kernel `[1 or C, k, k]`, without light outside."""
     batch, channels, height, width = light.shape
     out = torch.zeros_like(light, dtype=torch.float64)
     for item in range(batch):

@@ -28,6 +28,12 @@ WAYS: dict[str, dict[str, Any]] = {
     "fold-sum": {"method": "fold", "occlusion": False},
 }
 EVERY_WAY = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
+TURNS: dict[str, Callable[[Tensor], Tensor]] = {
+    "left-right": lambda t: t.flip(-1),
+    "top-bottom": lambda t: t.flip(-2),
+    "diagonal": lambda t: t.mT,
+    "quarter": lambda t: t.rot90(1, (-2, -1)),
+}
 Light = Callable[[torch.dtype], Tensor]
 
 
@@ -106,15 +112,6 @@ def itself(image: Tensor, _: Tensor) -> Tensor:
     return image
 
 
-def darkest(image: Tensor, _: Tensor) -> Tensor:
-    """Closed form outside the disc of a highlight: the light around it."""
-    return torch.full_like(image, float(image.min()))
-
-
-def _brightest(truth: Tensor) -> Tensor:
-    return truth.abs().max()
-
-
 @dataclasses.dataclass(frozen=True)
 class Case:
     """A hostile scene of 32 x 24 pixels with its truth and limits of the error."""
@@ -149,10 +146,6 @@ class Case:
             apart = torch.where(out == truth, 0.0, (out - truth).abs() / self.per(truth).clamp_min(1e-300))
             errors.append(torch.nan_to_num(apart if self.where is None else apart[..., self.where], nan=math.inf).max())
         return float(max(errors))
-
-    def limit(self, dtype: torch.dtype) -> float:
-        """Largest allowed error."""
-        return self.float32 if dtype == torch.float32 else self.float16
 
 
 def rendered(image: Tensor, values: Tensor, camera: Camera | None, **options: Any) -> Tensor:
@@ -205,21 +198,16 @@ def _with(values: Tensor, *place: Any, value: float) -> Tensor:
     return values
 
 
-def _hdr(dtype: torch.dtype) -> Tensor:
-    return (10 ** (-3 + 7.75 * torch.rand(1, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(3)))).to(dtype)
-
-
-def _bright(dtype: torch.dtype) -> Tensor:
-    return texture().mul(min(1e30, torch.finfo(dtype).max)).to(dtype)
-
-
 _CHECKERBOARD = torch.where((torch.arange(HEIGHT)[:, None] + torch.arange(WIDTH)) % 2 == 0, 1.2, 30.0)[None, None]
 _FAR = _with(_with(whole(1e-6), slice(8, 20), value=1e12), slice(20, None), value=math.inf)
 _COC = slope(-5.0, 5.0)
 _MANY = Plan(tuple(torch.linspace(-1, 1, 2001).double().tolist()), 0.0)
 _FOCUS_ENDS = from_blur_axis(1e-12)
 _EXACT: dict[str, Any] = {"float32": 0.0, "float16": 0.0}
-_DARK: dict[str, Any] = {"truth": darkest, "float32": 1e-6, "float16": 0.0}
+# outside the disc of a highlight: the light around it
+_DARK: dict[str, Any] = {"truth": lambda i, _: torch.full_like(i, float(i.min())), "float32": 1e-6, "float16": 0.0}
+_BRIGHTEST: dict[str, Any] = {"per": lambda truth: truth.abs().max()}
+_DECADES = torch.rand(1, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(3))
 _EVEN: dict[str, Any] = {"truth": itself, "float32": 1e-6, "float16": 0.0}
 
 CASES = [
@@ -252,12 +240,13 @@ CASES = [
     Case("1e-40 everywhere, in units of the smallest float32", [_COC], itself, even(1e-40, 1),
          float32=50.0, float16=0.0, per=lambda truth: torch.full_like(truth, 2.0**-149)),
     Case("negative light, a plane, a slope, a step", [whole(3.25), _COC, halves(-5.0, 4.0)],
-         light=lambda d: texture(d) - 0.5, per=_brightest),
+         light=lambda d: texture(d) - 0.5, **_BRIGHTEST),
     Case("negative light, a plane, in closed form", [whole(3.25)], disc, lambda d: texture(d) - 0.5, float32=1e-6,
-         per=_brightest),
+         **_BRIGHTEST),
     Case("3e38 everywhere (float16: 65504)", [whole(4.0)], light=even(3e38, 1), **_EVEN),
-    Case("1e30 at random beside a depth step (float16: 65504)", [halves(-5.0, 4.0)], light=_bright),
-    Case("1e30 in 0.1, 3 x 3 pixels, beside a depth step (float16: 65504)", [halves(-5.0, 4.0)], per=_brightest,
+    Case("1e30 at random beside a depth step (float16: 65504)", [halves(-5.0, 4.0)], 
+         light=lambda d: texture().mul(min(1e30, torch.finfo(d).max)).to(d)),
+    Case("1e30 in 0.1, 3 x 3 pixels, beside a depth step (float16: 65504)", [halves(-5.0, 4.0)], **_BRIGHTEST,
          light=highlight(1e30, 0.1, side=3), float32=1e-6),
     Case("even light, a depth of its own for every pixel", [r * noise(2) for r in (1.0, 8.0, 30.0)], itself, even(0.75),
          float32=1.2e-6, float16=0.0),
@@ -267,7 +256,7 @@ CASES = [
          **_EVEN),
     Case("2001 layers accumulated", [torch.linspace(-1.5, 1.5, HEIGHT * WIDTH).reshape(1, 1, HEIGHT, WIDTH)],
          light=lambda d: texture(d, 1), options={"plan": _MANY}),
-    Case("light from 1e-3 to 6e4 at random", [_COC], light=_hdr),
+    Case("light from 1e-3 to 6e4 at random", [_COC], light=lambda d: (10 ** (-3 + 7.75 * _DECADES)).to(d)),
     Case("a slope by the sum of the paper", [slope(-4, 4)], options=WAYS["sum"]),
     Case("a slope by the literal scatter", [slope(-4, 4)], options=WAYS["fold-over"]),
 ]  # fmt: skip
@@ -314,9 +303,7 @@ class Scene:
 
     def exposed(self, times: float) -> "Scene":
         """The scene with light multiplied by ``times``."""
-        options = dict(self.options)
-        if "background" in options:
-            options["background"] = options["background"] * times
+        options = {k: v * times if k == "background" else v for k, v in self.options.items()}
         return Scene(self.image * times, self.coc_px, options)
 
 
@@ -333,11 +320,7 @@ def random_scene(
     side: int = 64,
     kinds: Sequence[str] = KINDS,
 ) -> Scene:
-    """Images of noise, blocks, gradients and edges; coc of planes, discs, slopes, checkerboards, steps and noise.
-
-    It is drawn from ways of rendering (hidden surfaces are estimated, or known, or there is no occlusion) and kinds of
-    coc maps, with highlights if there may be ``lamps``; sides are multiples of ``multiple`` up to ``side`` pixels.
-    """
+    """A random image and coc map of random ``kinds``, ways of rendering and sides, with highlights if ``lamps``."""
     draw, generator = random.Random(seed), torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int) -> Tensor:

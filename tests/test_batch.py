@@ -28,27 +28,22 @@ def test_a_single_image_is_rendered_like_a_batch_of_one() -> None:
     assert DOF.plan(images[0, 1], depths[0, 1]).coc_px == DOF.plan(images[0, 1:2], depths[0, 1:2]).coc_px
 
 
-@pytest.mark.parametrize(
-    ("focus_m", "each"),
-    [
-        (0.9, [0.9] * 6),
-        ([0.8, 2.0], [0.8] * 3 + [2.0] * 3),
-        (torch.tensor([[0.8], [2.0]], dtype=torch.float64), [0.8] * 3 + [2.0] * 3),
-        (torch.tensor([[0.8, 0.9, 1.0], [2.0, 1.5, 1.0]], dtype=torch.float64), [0.8, 0.9, 1.0, 2.0, 1.5, 1.0]),
-    ],
-)
+@pytest.mark.parametrize(("focus_m", "each"), [
+    (0.9, [0.9] * 6),
+    ([0.8, 2.0], [0.8] * 3 + [2.0] * 3),
+    (torch.tensor([[0.8], [2.0]], dtype=torch.float64), [0.8] * 3 + [2.0] * 3),
+    (torch.tensor([[0.8, 0.9, 1.0], [2.0, 1.5, 1.0]], dtype=torch.float64), [0.8, 0.9, 1.0, 2.0, 1.5, 1.0]),
+])  # fmt: skip
 def test_clips_are_rendered_frame_by_frame(focus_m: Any, each: list[float]) -> None:
     images, depths = clips()
     expected = DOF(images.flatten(0, 1), depths.flatten(0, 1), focus_m=torch.tensor(each, dtype=torch.float64))
     assert torch.equal(DOF(images, depths, focus_m=focus_m), expected.unflatten(0, (2, 3)))
 
 
-@pytest.mark.parametrize("axes", [(1, 1), (2, 1), (1, 3)])
-def test_maps_may_be_shared_by_clips_or_frames(axes: tuple[int, int]) -> None:
+def test_maps_may_be_shared_by_clips_or_frames() -> None:
     images, depths = clips()
-    depth = depths[: axes[0], : axes[1]]
-    expected = DOF(images, depth.expand(2, 3, -1, -1, -1).contiguous())
-    assert torch.equal(DOF(images, depth), expected)
+    for depth in (depths[:1, :1], depths[:, :1], depths[:1]):
+        assert torch.equal(DOF(images, depth), DOF(images, depth.expand(2, 3, -1, -1, -1).contiguous()))
 
 
 def test_background_and_attention_of_a_single_image_have_its_rank() -> None:

@@ -2,7 +2,6 @@
 
 import functools
 import math
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -46,21 +45,22 @@ def test_gradients_equal_finite_differences(way: dict[str, Any]) -> None:
     assert gradcheck(lambda x: blur_by_coc(leaves[0].detach(), x, tolerance=1 / 60, **way), (coc,))
 
 
-@pytest.mark.parametrize(
-    "which", ["a measured table", "cat's eyes", "leaves of the camera", "a background", "a plan", "a plan, sum"]
-)
+OPTIONS: dict[str, dict[str, Any]] = {  # of the module
+    "a measured table": {"table": BlurTable.load("sato_j15"), "occlusion": False},
+    "cat's eyes": {"table": BlurTable.polygon(5, vignetting=0.4)},
+    "a plan, sum": {"occlusion": False},
+}
+
+
+@pytest.mark.parametrize("which", [*OPTIONS, "leaves of the camera", "a background", "a plan"])
 def test_gradients_flow_through(which: str) -> None:
     image, depth, *lens = (value.requires_grad_() for value in case().values())
-    table = {"a measured table": BlurTable.load("sato_j15"), "cat's eyes": BlurTable.polygon(5, vignetting=0.4)}.get(
-        which
-    )
     plan = Plan.static(6.0, 1 / 60) if "plan" in which else None
-    occlusion = which not in ("a measured table", "a plan, sum")
 
     def render(image: Tensor, depth: Tensor, focus: Tensor, f_number: Tensor, *behind: Tensor) -> Tensor:
         own = Camera(50.0, f_number, focus, 0.6) if which == "leaves of the camera" else SMALL
         given = () if own is not SMALL else (focus, f_number, plan, *behind)
-        return DepthOfField(own, table, tolerance=1 / 60, occlusion=occlusion)(image, depth, *given)
+        return DepthOfField(own, tolerance=1 / 60, **OPTIONS.get(which, {}))(image, depth, *given)
 
     behind = (torch.rand_like(image), depth.detach() + 2.0) if which == "a background" else ()
     assert gradcheck(render, (image, depth, *lens, *(value.requires_grad_() for value in behind)))
@@ -78,24 +78,18 @@ def test_the_picture_is_the_same_with_gradients_and_their_adjoint_is_that_of_the
         assert_close((back * other).sum(), (seen * dof(other, *others)).sum(), rtol=1e-11, atol=0.0)
 
 
-@pytest.mark.parametrize(
-    ("function", "channels"),
-    [(expand_highlights, 3)]
-    + [(functools.partial(from_relative, near_m=1.0, far_m=5.0, kind=kind), 1) for kind in RELATIVE_KINDS],
-)
-def test_gradients_of_maps_equal_finite_differences(function: Callable[[Tensor], Tensor], channels: int) -> None:
-    values = 0.9 * torch.rand(1, channels, 6, 7, dtype=torch.float64) + 0.02
-    assert gradcheck(function, (values.requires_grad_(),))
+def test_gradients_of_maps_equal_finite_differences() -> None:
+    values = (0.9 * torch.rand(1, 3, 6, 7, dtype=torch.float64) + 0.02).requires_grad_()
+    assert gradcheck(expand_highlights, (values,))
+    for kind in RELATIVE_KINDS:
+        assert gradcheck(functools.partial(from_relative, near_m=1.0, far_m=5.0, kind=kind), (values[:, :1],))
 
 
 # Finite gradients
 
 
-def _nodes() -> Tensor:
-    coc = torch.tensor([-4.0, 4.0]).expand(1, 1, 100, 2)
-    nodes = torch.tensor(Plan.for_scene(coc, 8 / 255, on_grid=True).coc_px)  # small frames have an 8th of the tolerance
-    assert len(nodes) >= 12
-    return nodes.repeat(9)[:108].reshape(1, 1, 9, 12)
+# small frames have an 8th of the tolerance
+NODES = torch.tensor(Plan.for_scene(torch.tensor([-4.0, 4.0]).expand(1, 1, 100, 2), 8 / 255, on_grid=True).coc_px)
 
 
 def _beside(first: float, second: float) -> Tensor:
@@ -115,7 +109,7 @@ DEPTHS: dict[str, Tensor] = {
     "holes": torch.where(EVEN.abs() < 1.0, math.nan, slope(1.2, 9.0, 9, 12) * (EVEN < 3.9)),
 }
 COCS: dict[str, Tensor] = {
-    "nodes of layers": _nodes(),
+    "nodes of layers": NODES.repeat(9)[:108].reshape(1, 1, 9, 12),
     "zero": whole(0.0, 9, 12),
     "partly zero": torch.where(torch.arange(12) % 6 < 2, 0.0, EVEN),
     "end of focus": from_blur_axis(1e-12) * EVEN.sign(),

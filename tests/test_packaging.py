@@ -33,13 +33,10 @@ def test_public_names_have_an_example() -> None:
     assert without == []
 
 
-def test_command_is_installed() -> None:
+def test_command_is_installed_and_its_version_shows_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
     (entry,) = importlib.metadata.entry_points(group="console_scripts", name="torchdof")
     assert entry.value == "torchdof.cli.main:main"
     assert callable(entry.load())
-
-
-def test_version_shows_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
     printed = CliRunner().invoke(app, ["--version"]).output
     assert printed.startswith(f"torchdof {importlib.metadata.version('torchdof')}, engine torch (")

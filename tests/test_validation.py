@@ -1,16 +1,16 @@
 """The public functions and classes refuse values of a wrong type."""
 
+import contextlib
 import functools
 import importlib
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-import torchdof
 from tests.refused import refuses
 from torchdof.augmentation import RandomDepthOfField
 from torchdof.distributed import shard_rows
@@ -26,42 +26,27 @@ MODULES = (  # of the API pages
 NOT_CHECKED = ("DepthAugmentationSequential", "make_dataset")  # checked by Kornia; needs Ray
 
 
-def public_callables() -> dict[str, Callable[..., Any]]:
-    """Public functions and classes with an argument, by name."""
-    found: dict[str, Callable[..., Any]] = {}
+def public_callables() -> Iterator[Any]:
+    """Public functions and classes with an argument."""
     for name in MODULES:
         module = importlib.import_module(f"torchdof{name}")
-        for public in set(module.__all__) - set(NOT_CHECKED):
+        for public in sorted(set(module.__all__) - set(NOT_CHECKED)):
             value = getattr(module, public)
             if inspect.isfunction(value) or (inspect.isclass(value) and not issubclass(value, BaseException)):
-                found[f"torchdof{name}.{public}"] = value
-    return found
+                yield pytest.param(value, id=f"torchdof{name}.{public}")
 
 
-def refusals_of(call: Callable[..., Any], count: int) -> list[Exception]:
-    """Errors for first arguments of wrong types; the other required arguments are a depth map."""
-    errors: list[Exception] = []
-    for wrong in (None, "no such file", 3, object()):
-        try:
-            call(wrong, *[DEPTH] * count)
-        except (TypeError, ValueError, OSError):
-            pass
-        except Exception as error:
-            errors.append(error)
-    return errors
-
-
-@pytest.mark.parametrize(("name", "call"), sorted(public_callables().items()))
+@pytest.mark.parametrize("call", list(public_callables()))
 def test_a_first_argument_of_a_wrong_type_is_refused_as_such(
-    name: str, call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An AttributeError or a RuntimeError would come from the first line that uses the value."""
     monkeypatch.chdir(tmp_path)  # some accept a string as the name of a file to write
     parameters = inspect.signature(call).parameters.values()
-    required = [
-        p for p in parameters if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
-    ]
-    assert not refusals_of(call, max(0, len(required) - 1)), name
+    places = [p for p in parameters if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    for wrong in (None, "no such file", 3, object()):
+        with contextlib.suppress(TypeError, ValueError, OSError):
+            call(wrong, *[DEPTH] * (len(places) - 1))
 
 
 aug = RandomDepthOfField(p=1.0)
@@ -72,9 +57,7 @@ test_a_wrong_type_is_named = refuses(
     (lambda: aug({"image": IMAGE, "depth": "depth.png"}), "depth must be a tensor"),
     (partial(aug.label, IMAGE, 3), "depth must be a tensor"),
     (partial(aug.draw, None), "generator must be a torch.Generator, got None"),
-    (partial(RandomDepthOfField, table=3), "table must be a torchdof.BlurTable, got int"),
     (partial(RandomDepthOfField, None), "focus_m must be two numbers"),
-    (partial(torchdof.DepthOfField, None), "camera must be a torchdof.Camera"),
     (partial(write_image, "out.png", IMAGE), r"expected a Picture, such as Picture\(tensor .*, got"),
     (partial(write_sheet, "out.png", None), "panels must be a dict"),
     (partial(write_sheet, "out.png", {"before": Picture(IMAGE)}), "a panel must be a tensor"),

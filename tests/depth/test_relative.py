@@ -20,14 +20,10 @@ def row(*values: float) -> torch.Tensor:
     return torch.tensor([[[list(values)]]])
 
 
-@pytest.mark.parametrize(
-    ("kind", "expected"),
-    [("disparity", [8.0, 1 / (0.25 / 2 + 0.75 / 8), 2.0]), ("inverse", [8.0, 1 / (0.25 / 2 + 0.75 / 8), 2.0]),
-     ("depth", [2.0, 3.5, 8.0])],
-)  # fmt: skip
-def test_extremes_are_at_near_and_far_and_values_between_follow_the_formula(kind: Any, expected: list[float]) -> None:
-    depth = from_relative(row(-3.0, -2.0, 1.0), 2.0, 8.0, kind)
-    torch.testing.assert_close(depth, row(*expected))
+@pytest.mark.parametrize("kind", RELATIVE_KINDS)
+def test_extremes_are_at_near_and_far_and_values_between_follow_the_formula(kind: Any) -> None:
+    expected = [2.0, 3.5, 8.0] if kind == "depth" else [8.0, 1 / (0.25 / 2 + 0.75 / 8), 2.0]
+    torch.testing.assert_close(from_relative(row(-3.0, -2.0, 1.0), 2.0, 8.0, kind), row(*expected))
 
 
 @pytest.mark.parametrize("kind", RELATIVE_KINDS)
@@ -54,12 +50,9 @@ def test_holes_stay_holes_and_do_not_stretch_the_range() -> None:
     torch.testing.assert_close(depth, row(1.0, NAN, 2.0, NAN, NAN, NAN), equal_nan=True)
 
 
-def test_each_item_of_a_batch_has_its_own_extremes() -> None:
+def test_each_item_has_its_own_extremes_unless_value_range_sets_the_scale_and_clamps_values() -> None:
     values = torch.stack([row(0.0, 1.0)[0], row(50.0, 90.0)[0]])
     assert from_relative(values, 1.0, 2.0).flatten().tolist() == [2.0, 1.0, 2.0, 1.0]
-
-
-def test_value_range_sets_the_scale_and_clamps_values() -> None:
     depth = from_relative(row(-5.0, 0.0, 50.0, 100.0, 120.0), 1.0, 3.0, "depth", value_range=(0.0, 100.0))
     assert depth.flatten().tolist() == [1.0, 1.0, 2.0, 3.0, 3.0]
     assert from_relative(row(50.0), 1.0, 3.0, "depth", value_range=(0.0, 100.0)).item() == 2.0
@@ -115,13 +108,10 @@ def test_two_points_give_scale_and_offset_exactly(kind: Any) -> None:
 
 
 def test_near_points_do_not_outweigh_far_ones() -> None:
-    generator = torch.Generator().manual_seed(3)
-    values = torch.rand(1, 1, 40, 60, generator=generator)
+    values = torch.rand(1, 1, 40, 60, generator=torch.Generator().manual_seed(3))
     depth = 1 / (0.98 * values + 0.02)  # 1 to 50 m
-    points = []
-    for k in range(40):
-        y, x = k, (7 * k) % 60
-        points.append((x + 0.5, y + 0.5, float(depth[0, 0, y, x]) * (1 + 0.02 * (-1) ** k)))
+    places = [((7 * y) % 60, y) for y in range(40)]
+    points = [(x + 0.5, y + 0.5, float(depth[0, 0, y, x]) * (1 + 0.02 * (-1) ** y)) for x, y in places]
     scale = solve_scale(values, points, patch=1)
     assert scale.residual == pytest.approx(0.02, rel=0.1)
     assert float((scale.depth(values) / depth - 1).abs().max()) < 0.03

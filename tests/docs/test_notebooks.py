@@ -1,7 +1,4 @@
-"""The notebooks run from top to bottom, with the assertions in their cells, and give the outputs that are stored.
-
-``python -m tests.docs.test_notebooks`` stores the outputs of all.
-"""
+"""Notebooks run and give their stored outputs, which ``python -m tests.docs.test_notebooks`` stores anew."""
 
 import ast
 import base64

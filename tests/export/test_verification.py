@@ -1,5 +1,6 @@
 """``verify`` refuses files that are damaged, not portable, or exported from another module."""
 
+import copy
 import json
 from pathlib import Path
 from typing import Any
@@ -28,19 +29,15 @@ def save(model: onnx.ModelProto, folder: Path) -> Path:
     return folder / "other.onnx"
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"tolerance": 0.01}, "made with options tolerance="),
-        ({"max_coc_px": 5.0}, "made with options max_coc_px="),
-        ({"occlusion": True}, "made with options occlusion="),
-        ({"table": torchdof.BlurTable.gaussian()}, "made with table name="),
-        ({"camera": torchdof.Camera()}, "made with camera "),
-    ],
-)
-def test_another_module_is_refused(plain: Any, change: dict[str, Any], message: str) -> None:
-    options = {"camera": plain.dof.camera, **plain.dof.options.arguments()} | change
-    with pytest.raises(ValueError, match=message):
+OTHERS: dict[str, Any] = {"tolerance": 0.01, "max_coc_px": 5.0, "occlusion": True}
+OTHERS |= {"table": torchdof.BlurTable.gaussian(), "camera": torchdof.Camera()}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_another_module_is_refused(plain: Any, name: str) -> None:
+    options = {"camera": plain.dof.camera, **plain.dof.options.arguments(), name: OTHERS[name]}
+    message = {"table": "table name=", "camera": "camera "}.get(name, f"options {name}=")
+    with pytest.raises(ValueError, match=f"made with {message}"):
         verify(plain.path, torchdof.DepthOfField(**options))
 
 
@@ -59,33 +56,19 @@ def test_a_changed_kernel_is_detected(of_rays: bool, plain: Any, model: onnx.Mod
         verify(save(model, tmp_path), plain.dof)
 
 
-def with_external_weights(model: onnx.ModelProto, path: Path) -> None:
+def test_unportable_is_refused(plain: Any, model: onnx.ModelProto, tmp_path: Path) -> None:
+    domain, interface = copy.deepcopy(model), copy.deepcopy(model)
+    domain.opset_import.append(onnx.helper.make_opsetid("com.microsoft", 1))
+    interface.graph.input[0].type.tensor_type.shape.dim[2].dim_param = "height"
     external: dict[str, Any] = {"save_as_external_data": True, "convert_attribute": True, "size_threshold": 0}
-    onnx.save(model, path, location="weights.bin", **external)
-
-
-def with_another_domain(model: onnx.ModelProto, path: Path) -> None:
-    model.opset_import.append(onnx.helper.make_opsetid("com.microsoft", 1))
-    onnx.save(model, path)
-
-
-def with_another_interface(model: onnx.ModelProto, path: Path) -> None:
-    model.graph.input[0].type.tensor_type.shape.dim[2].dim_param = "height"
-    onnx.save(model, path)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (with_external_weights, "keeps weights in another file"),
-        (with_another_domain, "needs operators of com.microsoft"),
-        (with_another_interface, "the graph must take and give"),
-    ],
-)
-def test_unportable_is_refused(plain: Any, model: onnx.ModelProto, change: Any, message: str, tmp_path: Path) -> None:
-    change(model, tmp_path / "other.onnx")
-    with pytest.raises(ValueError, match=message):
-        verify(tmp_path / "other.onnx", plain.dof)
+    for changed, options, message in (
+        (domain, {}, "needs operators of com.microsoft"),
+        (interface, {}, "the graph must take and give"),
+        (model, external | {"location": "weights.bin"}, "keeps weights in another file"),
+    ):
+        onnx.save(changed, tmp_path / "other.onnx", **options)
+        with pytest.raises(ValueError, match=message):
+            verify(tmp_path / "other.onnx", plain.dof)
 
 
 def test_damaged_and_foreign_files_are_named(plain: Any, tmp_path: Path) -> None:
@@ -146,14 +129,12 @@ def test_foreign_metadata_are_not_executed_and_refused_by_name(
     assert [path.name for path in tmp_path.iterdir()] == ["x.onnx"]
 
 
-def test_describe_opens_no_other_file(tmp_path: Path) -> None:
+def test_describe_reads_no_other_file_and_none_larger_than_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for external in ("missing", "/etc/passwd"):
         store_model(tmp_path / "x.onnx", {}, external)
         assert describe(tmp_path / "x.onnx") == {"options": {}}
-
-
-def test_a_file_larger_than_memory_is_refused_before_reading(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store_model(tmp_path / "x.onnx", {})
     monkeypatch.setattr("torchdof.export.metadata.free_bytes", lambda: 100.0)
     with pytest.raises(ValueError, match=r"x\.onnx takes .* more than there is memory for"):
         describe(tmp_path / "x.onnx")

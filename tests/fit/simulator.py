@@ -1,8 +1,4 @@
-"""A simulated camera that photographs a white dot, sharp and defocused, with the faults of real cameras.
-
-The dot has anti-aliased edges. The blur is a kernel of the renderer, convolved with the sharp picture's pixels. Both
-pictures are in linear light.
-"""
+"""A simulated camera that photographs a white dot, sharp and blurred by a kernel, with the faults of real cameras."""
 
 from __future__ import annotations
 
@@ -31,11 +27,7 @@ def draw_dot(size: int, radius: float, centre: tuple[float, float] = (0.0, 0.0),
 
 
 def shape(kind: str, radius: float) -> np.ndarray:
-    """Kernel `[41, 41]` of a blur that no round family can fit; it sums to 1 and is not centred on its mass.
-
-    "hexagon" has a corner 11 degrees clockwise from the right, "cat's eye" is the intersection of two discs, "coma" a
-    disc whose rays are displaced by the square of their height in the pupil, "mirror" a disc with a central hole.
-    """
+    """Kernel `[41, 41]` of a blur that no round family can fit; it sums to 1 and is not centred on its mass."""
     size, fine = 41, 8
     axis = (np.arange(size * fine) + 0.5) / fine - size / 2
     x, y = np.meshgrid(axis, axis)
@@ -43,7 +35,7 @@ def shape(kind: str, radius: float) -> np.ndarray:
     if kind == "hexagon":
         from_corner = (np.arctan2(y, x) - np.deg2rad(11.0)) % (np.pi / 3)
         light = r * np.cos(from_corner - np.pi / 6) < np.cos(np.pi / 6)
-    elif kind == "coma":
+    elif kind == "coma":  # rays are displaced by the square of their height in the pupil
         a, b, far = x[r < 1], y[r < 1], 0.15 / radius
         edges = np.arange(size * fine + 1) / fine - size / 2
         light = np.histogram2d(b + far * 2 * a * b, a + far * (3 * a**2 + b**2), bins=(edges, edges))[0]
@@ -113,9 +105,8 @@ class Simulator:
             picture = decode_srgb((1 - self.tone) * encoded + self.tone * encoded**2 * (3 - 2 * encoded))
         if self.jpeg is not None:
             stored = io.BytesIO()
-            Image.fromarray(np.round(255 * encode_srgb(picture)).astype(np.uint8)).save(
-                stored, "jpeg", quality=self.jpeg
-            )
+            levels = np.round(255 * encode_srgb(picture)).astype(np.uint8)
+            Image.fromarray(levels).save(stored, "jpeg", quality=self.jpeg)
             return decode_srgb(np.asarray(Image.open(stored), dtype=np.float64) / 255)
         if self.srgb:
             picture = encode_srgb(picture)
@@ -149,10 +140,7 @@ def result_and_warnings(call) -> tuple:
 
 
 def write_captures(folder, camera, focus_m, distances, kernel, width=400, height=240, camera_fields="", grid=()):
-    """Writes a folder of 16-bit sRGB PNGs of a dot, or of a `grid` of positions (x, y), with capture.toml; returns it.
-
-    ``kernel(distance)`` gives (family, params) of the blur; ``kernel(distance, x, y)`` that of a dot at (x, y).
-    """
+    """Writes 16-bit sRGB PNGs of one dot or a grid, with capture.toml; ``kernel(distance[, x, y])`` is the blur."""
     folder.mkdir(parents=True, exist_ok=True)
     shots, arguments = [], len(inspect.signature(kernel).parameters)
     for i, distance in enumerate([focus_m, *distances]):
@@ -174,10 +162,7 @@ def write_captures(folder, camera, focus_m, distances, kernel, width=400, height
 
 
 def write_photographs(folder, focus_m, distances, width=800, tone=0.5, noise=0.01, jpeg=90, exif=True):
-    """Writes JPEGs of the printed target on a grey desk, focused at `focus_m`.
-
-    The phone has a lens of 26 mm equivalent focal length at f/1.8; `tone` is the strength of its S-curve.
-    """
+    """Writes a phone's JPEGs of the printed target on a grey desk; `tone` is the strength of its S-curve."""
     folder.mkdir(parents=True, exist_ok=True)
     focal_mm, f_number = 5.4, 1.8
     image_px = focal_mm / (36 * focal_mm / 26) * width / (1 - focal_mm / 1000 / focus_m)

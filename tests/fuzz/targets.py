@@ -1,16 +1,15 @@
 """Targets of the fuzzer: every reader of files, with valid inputs.
 
-A target reads a file and may refuse it by an error of ``REFUSED``, one sentence that names the file. Everything else
-is a finding: another exception, a crash, a line on the terminal, a picture that is not finite, too much time or memory.
+A reader may refuse a file by an error of ``REFUSED``, one sentence that names the file. Everything else is a finding.
 """
 
 import dataclasses
 import functools
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import OpenImageIO as oiio
@@ -32,14 +31,12 @@ from torchdof.optics.aperture import Aperture
 REFUSED = (ValueError, OSError, FitError)
 
 
-@dataclasses.dataclass(frozen=True)
-class Target:
-    """A target of the fuzzer."""
+class Target(NamedTuple):
+    """Valid files of one suffix, and their readers."""
 
     suffix: str
-    seeds: Callable[[Path], None]  # writes valid files into a folder
-    runs: tuple[Callable[[Path], object], ...]  # read a file; an exception other than ``REFUSED`` is a finding
-    named: bool = True  # whether a refusal must name the file
+    seeds: Callable[[Path], None]  # writes files into a folder
+    runs: tuple[Callable[[Path], object], ...]
 
 
 def _image_seeds(folder: Path, suffix: str) -> None:
@@ -50,29 +47,29 @@ def _image_seeds(folder: Path, suffix: str) -> None:
     if suffix in (".png", ".exr", ".tif"):
         write_image(folder / f"alpha{suffix}", Picture(pixels, ("R", "G", "B", "A")))
     if suffix == ".exr":
-        _exr_seeds(folder)
+        for name, parts in EXR.items():
+            store_parts(folder / f"{name}.exr", parts)
     if suffix == ".jpg":
         tags = {name: ("float", 2.0) for name in ("Exif:FocalLength", "FNumber", "Exif:SubjectDistance")}
         write_image(folder / "exif.jpg", dataclasses.replace(rgb, metadata=tags))
 
 
-def _part(channels: tuple[str, ...] = ("R", "G", "B", "Z"), **attributes: Any) -> tuple[oiio.ImageSpec, np.ndarray]:
+def _part(channels: str = "RGBZ", places: str = "", **attributes: Any) -> tuple[oiio.ImageSpec, np.ndarray]:
     values = np.linspace(0.1, 1, 256 * len(channels), dtype=np.float32).reshape(16, 16, len(channels))
-    return spec_with(values, "half", channels, **attributes), values
+    spec = spec_with(values, "half", tuple(channels), **attributes)
+    for place in places.split():
+        name, _, number = place.partition("=")
+        setattr(spec, name, int(number))
+    return spec, values
 
 
-def _exr_seeds(folder: Path) -> None:
-    """With tiles, levels, parts and a window."""
-    tiled = _part()
-    levels = _part(openexr__levelmode=1, textureformat="Plain Texture")
-    for spec, _ in (tiled, levels):
-        spec.tile_width = spec.tile_height = 16
-    window = _part()
-    spec = window[0]
-    spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height = -3, -5, 0, 0, 8, 8
-    for name, part in {"tiled": tiled, "mipmap": levels, "window": window}.items():
-        store_parts(folder / f"{name}.exr", [part])
-    store_parts(folder / "parts.exr", [_part(("R", "G", "B"), name="beauty"), _part(("Z",), name="depth")])
+TILES = "tile_width=16 tile_height=16"
+EXR = {
+    "tiled": [_part(places=TILES)],
+    "mipmap": [_part(places=TILES, openexr__levelmode=1, textureformat="Plain Texture")],
+    "window": [_part(places="x=-3 y=-5 full_x=0 full_y=0 full_width=8 full_height=8")],
+    "parts": [_part("RGB", name="beauty"), _part("Z", name="depth")],
+}
 
 
 def _read_image(path: Path) -> None:
@@ -174,40 +171,16 @@ def _onnx_seeds(folder: Path) -> None:
     store_model(folder / "dof.onnx", {f"torchdof.{key}": json.dumps(value) for key, value in facts.items()})
 
 
-def _with_suffix(seeds: Callable[[Path, str], None], suffix: str, *runs: Callable[[Path], object]) -> Target:
-    return Target(suffix, lambda folder: seeds(folder, suffix), runs)
-
-
 _FILLS = tuple(functools.partial(_read_array, fill=fill) for fill in ("far", 3.0, None))
 TARGETS: dict[str, Target] = {
-    **{suffix[1:]: _with_suffix(_image_seeds, suffix, _read_image, read_values)
+    **{suffix[1:]: Target(suffix, functools.partial(_image_seeds, suffix=suffix), (_read_image, read_values))
        for suffix in (".png", ".exr", ".tif", ".jpg", ".hdr", ".pfm")},
-    **{suffix[1:]: _with_suffix(_array_seeds, suffix, *_FILLS) for suffix in (".npy", ".npz")},
+    **{suffix[1:]: Target(suffix, functools.partial(_array_seeds, suffix=suffix), _FILLS)
+       for suffix in (".npy", ".npz")},
     "table": Target(".json", _table_seeds, (_read_table,)),
-    "manifest": Target(".toml", _manifest_seeds, (lambda path: read_captures(path, root=path.parent),), named=False),
+    "manifest": Target(".toml", _manifest_seeds, (lambda path: read_captures(path, root=path.parent),)),
     "field": Target(".json", _field_seeds, (_read_field,)),
     "lens": Target(".txt", _lens_seeds, (_read_lens,)),
     "zmx": Target(".zmx", _zmx_seeds, (_read_lens,)),
     "onnx": Target(".onnx", _onnx_seeds, (describe,)),
 }  # fmt: skip
-"""The errors of a manifest name the pictures that are missing instead."""
-
-
-def finding(target: Target, path: Path) -> str | None:
-    """Description of a target's fault on a file, or None."""
-    for run in target.runs:
-        try:
-            run(path)
-        except REFUSED as error:
-            if target.named and path.name not in str(error):
-                return f"refused without its name: {type(error).__name__}: {str(error)[:200]}"
-        except Exception as error:
-            return f"{type(error).__name__}: {str(error)[:200]}"
-    return None
-
-
-def seeds(target: Target, folder: Path) -> Iterator[bytes]:
-    """The valid inputs of a target."""
-    target.seeds(folder)
-    for path in sorted(folder.iterdir()):
-        yield path.read_bytes()

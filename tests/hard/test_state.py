@@ -121,8 +121,7 @@ def state() -> dict[str, Any]:
 def entries(stop: int, error: BaseException | None) -> Iterator[list[str]]:
     """Lists the functions of the package that are entered, and raises ``error`` in the one with number ``stop``.
 
-    Ctrl-C between two instructions of a ``finally`` block can always undo it half; therefore generators, which such
-    blocks resume, do not count.
+    Generators do not count: ``finally`` blocks resume them, and Ctrl-C in such a block can always undo it half.
     """
     names: list[str] = []
 

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from torchdof import BlurTable, blur_by_coc, native
 from torchdof.render import disocclusion
@@ -158,9 +159,8 @@ def test_forward_mode_and_torch_func_agree_with_reverse_mode() -> None:
         return (blur_by_coc(light, coc) * seen).sum()
 
     (slope,) = torch.autograd.grad(total(leaf := image.clone().requires_grad_()), leaf)
-    with torch.autograd.forward_ad.dual_level():
-        out = total(torch.autograd.forward_ad.make_dual(image, step))
-        along = torch.autograd.forward_ad.unpack_dual(out).tangent
+    with forward_ad.dual_level():
+        along = forward_ad.unpack_dual(total(forward_ad.make_dual(image, step))).tangent
     torch.testing.assert_close(along, (slope * step).sum())
     if TRACEABLE:  # older PyTorch is refused by name
         torch.testing.assert_close(torch.func.grad(total)(image), slope, rtol=1e-4, atol=1e-5)

@@ -9,6 +9,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from tests.scenes import slope, whole
 from torchdof import Camera, blur_by_coc, native
 from torchdof.render.edges import mended
 from torchdof.render.plan import Plan
@@ -16,47 +17,34 @@ from torchdof.render.plan import Plan
 pytestmark = pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built")
 
 
-DEPTH = torch.cat(
-    [torch.linspace(-1.0, 9.0, 2003), torch.tensor([0.0, 2.0, math.inf, -math.inf, math.nan, 1e-30, 3e38])]
-)
+STRANGE_M = torch.tensor([0.0, 2.0, math.inf, -math.inf, math.nan, 1e-30, 3e38])
+DEPTH = torch.cat([torch.linspace(-1.0, 9.0, 2003), STRANGE_M]).reshape(1, 1, 30, 67)
 
 
-@pytest.mark.parametrize(
-    "camera",
-    [
-        Camera(focus_m=2.0, f_number=1.4),
-        Camera(focus_m=math.inf),
-        Camera(focus_range_m=(1.5, 2.2)),
-        Camera(focus_range_m=(1.5, math.inf)),
-        Camera.from_fov(fov_x_deg=40.0, aperture_radius_m=0.012, focus_m=2.0),
-        Camera(focus_m=torch.tensor(2.0)),
-    ],
-    ids=str,
-)
+CAMERAS = [
+    *(Camera(focus_m=2.0, f_number=1.4), Camera(focus_m=math.inf), Camera(focus_m=torch.tensor(2.0))),
+    *(Camera(focus_range_m=(1.5, far)) for far in (2.2, math.inf)),
+    Camera.from_fov(fov_x_deg=40.0, aperture_radius_m=0.012, focus_m=2.0),
+]
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=str)
 def test_both_engines_compute_the_same_circle_of_confusion(camera: Camera, monkeypatch: pytest.MonkeyPatch) -> None:
-    depth = DEPTH.reshape(1, 1, 30, 67)
-    compiled = camera.coc_px(depth, 640)
+    compiled = camera.coc_px(DEPTH, 640)
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
-    plain = camera.coc_px(depth, 640)
-    assert torch.equal(compiled.isnan(), plain.isnan())
-    assert torch.equal(compiled.nan_to_num(7.0), plain.nan_to_num(7.0))
+    torch.testing.assert_close(compiled, camera.coc_px(DEPTH, 640), rtol=0.0, atol=0.0, equal_nan=True)
 
 
 def maps() -> dict[str, Tensor]:
-    generator = torch.Generator().manual_seed(2)
-    noise = torch.rand(1, 1, 97, 131, generator=generator)
-    slope = torch.linspace(-20.0, 50.0, 160).expand(2, 1, 90, 160).clone()
-    halves = torch.where(torch.rand(1, 1, 48, 64, generator=generator) < 0.5, -7.3, 12.5)
-    holes = 500.0 * noise**3
-    holes[0, 0, :2] = math.nan
-    beyond = 3.0 * noise
-    beyond[..., 5, 5] = -math.inf
+    noise = torch.rand(1, 1, 97, 131, generator=torch.Generator().manual_seed(2))
+    holes, beyond = 500.0 * noise**3, 3.0 * noise
+    holes[0, 0, :2], beyond[..., 5, 5] = math.nan, -math.inf
     return {
         "noise": 20.0 * noise - 10.0,
-        "slope": slope,
-        "two planes": halves,
-        "one plane": torch.full((1, 1, 16, 20), -3.25),
-        "in focus": torch.zeros(1, 1, 16, 20),
+        "slope": slope(-20.0, 50.0, 90, 160).repeat(2, 1, 1, 1),
+        "two planes": torch.where(noise[..., :48, :64] < 0.5, -7.3, 12.5),
+        "one plane": whole(-3.25, 16, 20),
+        "in focus": whole(0.0, 16, 20),
         "holes": holes,
         "beyond the frame": beyond,
     }
@@ -75,20 +63,16 @@ SIZES = (1, 7, 8, 9, 2**16 - 1, 2**16, 2**16 + 1, 3 * 2**16 + 5)
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_ends_are_minimum_and_maximum(size: int) -> None:
+def test_ends_are_minimum_and_maximum_and_a_single_nan_or_infinity_is_found(size: int) -> None:
     values = torch.randn(size, generator=torch.Generator().manual_seed(size))
     assert native.ends(values) == (float(values.min()), float(values.max()))
     assert native.ends(values.repeat(2, 1).T) == (float(values.min()), float(values.max()))
-
-
-@pytest.mark.parametrize("place", [0, 0.5, 1])
-@pytest.mark.parametrize("size", SIZES)
-def test_a_single_nan_or_infinity_is_found(size: int, place: float) -> None:
-    values = torch.zeros(size)
-    values[int(place * (size - 1))] = -math.inf
-    assert native.ends(values)[0] == -math.inf
-    values[int(place * (size - 1))] = math.nan
-    assert all(map(math.isnan, native.ends(values)))
+    for place in (0, (size - 1) // 2, size - 1):
+        values = torch.zeros(size)
+        values[place] = -math.inf
+        assert native.ends(values)[0] == -math.inf
+        values[place] = math.nan
+        assert all(map(math.isnan, native.ends(values)))
 
 
 class LargeReads(TorchDispatchMode):
@@ -107,7 +91,7 @@ class LargeReads(TorchDispatchMode):
 @pytest.mark.parametrize("occlusion", [True, False])
 def test_no_operator_of_pytorch_reads_a_whole_frame(occlusion: bool) -> None:
     """PyTorch's threads would spin afterwards and compete with those of the engine."""
-    image, coc = torch.rand(1, 3, 256, 256), torch.linspace(-6.0, 9.0, 256).expand(1, 1, 256, -1).contiguous()
+    image, coc = torch.rand(1, 3, 256, 256), slope(-6.0, 9.0, 256, 256)
     reads = LargeReads()
     reads.names = []
     with torch.inference_mode(), reads:
@@ -135,7 +119,8 @@ def test_both_engines_blur_patches_farther_than_a_tile_alike(
     patches = 90.0 * torch.rand(4, 1, 3, 6, generator=generator) - 45.0
     coc = functional.interpolate(patches, (height, width))
     image = torch.rand(4, 1, height, width, generator=generator)
-    compiled = blur_by_coc(image, coc, depth_edges="as given", tolerance=1e-3)
-    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
-    plain = blur_by_coc(image, coc, depth_edges="as given", tolerance=1e-3)
-    torch.testing.assert_close(compiled, plain, rtol=0.0, atol=1e-5)
+    pictures = []
+    for engine in ("native", "torch"):
+        monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+        pictures.append(blur_by_coc(image, coc, depth_edges="as given", tolerance=1e-3))
+    torch.testing.assert_close(*pictures, rtol=0.0, atol=1e-5)

@@ -1,7 +1,4 @@
-"""Checks the installed torchdof, outside the repository: ``python installed.py native`` (or ``torch``).
-
-The argument is the expected engine.
-"""
+"""Checks the installed torchdof, outside the repository: ``python installed.py ENGINE``, native or torch."""
 
 import os
 import subprocess

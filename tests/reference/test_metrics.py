@@ -18,13 +18,10 @@ def test_display_is_kornias_srgb_curve_and_clips() -> None:
     assert metrics.display(torch.tensor([-3.0, 60.0])).tolist() == [0.0, pytest.approx(1.0, abs=1e-6)]
 
 
-def test_psnr_of_a_known_error() -> None:
+def test_psnr_of_a_known_error_counts_only_the_masked_pixels() -> None:
     truth = torch.rand(1, 3, 20, 30, dtype=torch.float64)
     assert metrics.psnr(truth + 0.01, truth) == pytest.approx(40.0, abs=1e-9)
     assert metrics.psnr(truth, truth) == math.inf
-
-
-def test_psnr_counts_only_the_masked_pixels() -> None:
     truth = torch.zeros(2, 3, 8, 8)
     image = truth.clone()
     image[..., :4] = 0.1

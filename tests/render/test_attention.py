@@ -40,12 +40,9 @@ def test_attention_everywhere_or_nowhere_equals_one_tolerance() -> None:
     assert torch.equal(scene.blurred(tolerance=0.05, attention=(80, 40, 10)), scene.blurred(tolerance=0.05))
 
 
-def test_the_circle_fades_out_over_a_quarter_of_its_radius() -> None:
-    weight = weight_map((20.5, 10.5, 8.0), torch.zeros(1, 3, 21, 41))[0, 0, 10]
-    assert weight[20] == 1 and weight[28] == 1 and weight[29] == pytest.approx(0.5) and weight[30] == 0
-
-
-def test_the_box_contains_all_pixels_whose_blur_reaches_the_attended_area() -> None:
+def test_the_circle_fades_over_a_quarter_of_its_radius_and_the_box_has_all_pixels_whose_blur_reaches_it() -> None:
+    row = weight_map((20.5, 10.5, 8.0), torch.zeros(1, 3, 21, 41))[0, 0, 10]
+    assert row[20] == 1 and row[28] == 1 and row[29] == pytest.approx(0.5) and row[30] == 0
     weight = torch.zeros(1, 1, 400, 600)
     weight[..., 200:210, 300:301] = 0.1
     assert box_around(weight, 50.0) == (slice(128, 320), slice(192, 384))  # multiples of 64

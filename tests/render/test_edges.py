@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from tests.scenes import TURNS
 from torchdof import Camera, DepthOfField, blur_by_coc, native
 from torchdof.depth import repair_edges
 from torchdof.options import DepthEdges
@@ -118,7 +119,17 @@ def test_depth_with_an_unrelated_image_is_unchanged(scene: Scene, kind: str) -> 
     assert torch.equal(repair_edges(torch.rand_like(scene.image), depth, "auto"), depth)
 
 
-def test_noise_is_not_an_edge_and_edges_in_noise_are_repaired(scene: Scene) -> None:
+def test_items_of_a_batch_are_repaired_independently(scene: Scene) -> None:
+    images, depth = torch.cat([scene.image, torch.rand_like(scene.image)]), degrade(scene.depth, "half-res")
+    together = repair_edges(images, depth, "auto")
+    assert torch.equal(together[:1], repair_edges(images[:1], depth, "auto"))
+    assert torch.equal(together[1:], depth)
+
+
+def test_noise_is_not_an_edge_and_edges_in_noise_are_repaired(scene: Scene, engine: str) -> None:
+    for shape in ((1, 1, 128, 1), (1, 1, 1, 192)):  # along rows and along columns
+        noise = (2.0 * torch.randn(shape, generator=torch.Generator().manual_seed(0))).expand(scene.depth.shape)
+        assert torch.equal(edges.repair(scene.image, noise.contiguous(), edges.STEP_PX, False), noise)
     exact, thin = (-8.0 * scene.camera.coc_px(degrade(scene.depth, kind), 192) for kind in ("exact", "near -1px"))
     noise = 0.3 * torch.randn(exact.shape)  # its range within five pixels is as large as a step
     assert torch.equal(edges.repair(scene.image, exact + noise, 1.0, True), exact + noise)
@@ -147,20 +158,16 @@ def test_a_thin_structure_of_a_soft_map_comes_no_nearer_than_the_map(scene: Scen
     assert bool((repaired <= functional.max_pool2d(nearness, 11, 1, 5) + 1e-6).all())
 
 
-def discs(square_px: float) -> Tensor:
-    """Mask of discs on a grid; their squared radius is ``square_px``."""
-    rows, columns = torch.meshgrid(torch.arange(96.0), torch.arange(128.0), indexing="ij")
-    return ((rows % 24 - 12) ** 2 + (columns % 26 - 12) ** 2 < square_px) & (columns < 116)
-
-
 def test_the_averaged_depth_of_a_lamp_is_restored_and_does_not_come_nearer_than_it_was() -> None:
-    lamps = discs(5.0)
+    rows, columns = torch.meshgrid(torch.arange(96.0), torch.arange(128.0), indexing="ij")
+    square_px = ((rows % 24 - 12) ** 2 + (columns % 26 - 12) ** 2).where(columns < 116, torch.inf)
+    lamps = square_px < 5.0
     image = torch.where(lamps, 200.0, 0.2 + 0.02 * torch.rand(1, 3, 96, 128))
     given = degrade(torch.where(lamps, 2.0, 8.0)[None, None], "blur 1.5")
     assert float((1 / given)[..., lamps].mean()) < 0.33
     assert 0.39 < float((1 / repair_edges(image, given, "auto"))[..., lamps].mean()) < 0.6
     # larger in the map than in the image, so that no depth was lost
-    given = degraded._blurred(torch.where(discs(14.0), 2.0, 8.0)[None, None], 1.5)
+    given = degraded._blurred(torch.where(square_px < 14.0, 2.0, 8.0)[None, None], 1.5)
     assert float((1 / repair_edges(image, given, "auto")).max()) < 0.6
 
 
@@ -172,14 +179,6 @@ def test_pixels_of_a_lamp_of_uneven_brightness_get_one_depth() -> None:
         image[lamp], depth[lamp] = 50.0 + 150.0 * torch.rand(1, 3, 3, 3, generator=generator), 2.0
     repaired = 1 / repair_edges(image, degrade(depth, "half-res"), "auto")
     assert max(float(repaired[lamp].max() - repaired[lamp].min()) for lamp in lamps) < 0.005
-
-
-TURNS: dict[str, Callable[[Tensor], Tensor]] = {
-    "left-right": lambda t: t.flip(-1),
-    "top-bottom": lambda t: t.flip(-2),
-    "diagonal": lambda t: t.mT,
-    "quarter": lambda t: t.rot90(1, (-2, -1)),
-}
 
 
 @pytest.mark.parametrize("turn", TURNS.values(), ids=TURNS)
@@ -203,19 +202,12 @@ def test_repair_commutes_with_flips_and_turns(
     torch.testing.assert_close(turned, turn(repaired), rtol=0, atol=1e-3)
 
 
-def test_noise_along_rows_and_along_columns_is_not_an_edge(scene: Scene, engine: str) -> None:
-    for shape in ((1, 1, 128, 1), (1, 1, 1, 192)):
-        noise = (2.0 * torch.randn(shape, generator=torch.Generator().manual_seed(0))).expand(scene.depth.shape)
-        assert torch.equal(edges.repair(scene.image, noise.contiguous(), edges.STEP_PX, False), noise)
-
-
-@pytest.mark.parametrize("marked", [0.0, -3.0])
-def test_markers_of_holes_are_kept_and_act_like_nan(scene: Scene, marked: float) -> None:
+def test_markers_of_holes_are_kept_and_act_like_nan(scene: Scene) -> None:
     depth, holes = degrade(scene.depth, "near -1px"), torch.zeros_like(scene.depth, dtype=torch.bool)
     holes[..., 40:60, :30] = True
-    repaired, same = (repair_edges(scene.image, torch.where(holes, value, depth)) for value in (torch.nan, marked))
-    assert bool((same[holes] == marked).all()) and bool(repaired[holes].isnan().all())
-    assert torch.equal(repaired[~holes], same[~holes])
+    repaired, *same = (repair_edges(scene.image, depth.where(~holes, marked)) for marked in (torch.nan, 0.0, -3.0))
+    assert bool(repaired[holes].isnan().all()) and [set(s[holes].tolist()) for s in same] == [{0.0}, {-3.0}]
+    assert all(torch.equal(repaired[~holes], s[~holes]) for s in same)
 
 
 def test_a_hole_within_a_surface_changes_no_other_pixel(scene: Scene) -> None:
@@ -259,14 +251,6 @@ def test_gradients_flow_to_pixels_that_are_not_repaired(scene: Scene) -> None:
     repaired = repair_edges(scene.image, depth)
     (gradient,) = torch.autograd.grad(repaired.sum(), depth)
     assert torch.equal(gradient, (repaired == depth).float())
-
-
-def test_items_of_a_batch_are_repaired_independently(scene: Scene) -> None:
-    images = torch.cat([scene.image, torch.rand_like(scene.image)])
-    depth = degrade(scene.depth, "half-res")
-    together = repair_edges(images, depth, "auto")
-    assert torch.equal(together[:1], repair_edges(images[:1], depth, "auto"))
-    assert torch.equal(together[1:], depth)
 
 
 def test_the_renderer_repairs_by_its_option_depth_edges(scene: Scene) -> None:

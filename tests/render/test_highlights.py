@@ -31,10 +31,9 @@ def street(coc_px: float = 14.0, post_px: float | None = None) -> tuple[Tensor, 
 @pytest.mark.parametrize("tolerance", [0.0, 1 / 255, 4 / 255])
 @pytest.mark.parametrize("coc_px", [-23.0, -9.3, 5.2, 14.0, 31.5])
 def test_a_highlight_is_a_disc_of_its_radius_and_energy(coc_px: float, tolerance: float) -> None:
-    image, coc, (row, column) = street(coc_px)
-    unlit = image.clone()
-    unlit[..., row, column] = 0.05
-    disc = (blur_by_coc(image, coc, tolerance=tolerance) - blur_by_coc(unlit, coc, tolerance=tolerance))[0, 0]
+    image, coc, _ = street(coc_px)
+    lit, unlit = (blur_by_coc(light, coc, tolerance=tolerance)[0, 0] for light in (image, image.clamp(max=0.05)))
+    disc = lit - unlit
     height = LAMP / (math.pi * coc_px**2)
     assert math.sqrt(float((disc > height / 2).sum()) / math.pi) == pytest.approx(abs(coc_px), abs=0.5)
     assert float(disc.sum()) == pytest.approx(LAMP, rel=0.01)
@@ -103,24 +102,19 @@ def test_splatting_in_parts_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> 
     torch.testing.assert_close(blur_by_coc(image, coc), whole, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("changes", "sent"),
-    [
-        ({}, 1.0),
-        ({"nearer_px": 1.5}, 0.7),  # depends on the distance to the nearer surface
-        ({"nearer_px": 1.0}, 0.4),
-        ({"nearer_px": -3.0}, 0.4),
-        ({"beside_light": 1.2}, 0.7),  # on the light of the nearer surface, which must not be a highlight
-        ({"beside_light": 1.6}, 0.4),
-        ({"cover": 0.053}, 0.5265),  # on the coverage, as in layers
-        ({"between": 1}, 1.0),
-        ({"between": 2}, 0.82),  # on the pixels between the surfaces: the light is multiplied by 1.5 - 10 * 2 / 25
-        ({"between": 4}, 0.4),
-        ({"between": 25, "share": 0.05}, 1.0),  # not those near one of the surfaces
-        ({"between": 25, "share": 0.95}, 1.0),
-        ({"between": 3, "share": 0.125}, 0.94),  # counts half
-    ],
-)
+SENT: list[tuple[dict[str, Any], float]] = [  # changes of the scene, share of the light
+    ({}, 1.0),
+    *(({"nearer_px": px}, sent) for px, sent in ((1.5, 0.7), (1.0, 0.4), (-3.0, 0.4))),  # distance to what is nearer
+    *(({"beside_light": light}, sent) for light, sent in ((1.2, 0.7), (1.6, 0.4))),  # which must be no highlight
+    ({"cover": 0.053}, 0.5265),  # the coverage, as in layers
+    # pixels between the surfaces: the light is multiplied by 1.5 - 10 * 2 / 25
+    *(({"between": count}, sent) for count, sent in ((1, 1.0), (2, 0.82), (4, 0.4))),
+    *(({"between": 25, "share": share}, 1.0) for share in (0.05, 0.95)),  # not those near one of the surfaces
+    ({"between": 3, "share": 0.125}, 0.94),  # counts half
+]
+
+
+@pytest.mark.parametrize(("changes", "sent"), SENT)
 def test_a_partly_covered_highlight_at_a_step_sends_its_whole_light(changes: dict[str, float], sent: float) -> None:
     given = {"cover": 0.4, "nearer_px": 4.0, "beside_light": 0.1, "between": 0, "share": 0.5} | changes
     image = torch.full((1, 1, 40, 40), 0.1)
@@ -170,10 +164,9 @@ def test_rays_above_the_limit_fade_into_the_layers(range_of_light: float) -> Non
 
 
 def test_rays_are_differentiable_in_light_and_coc() -> None:
-    image, coc, (row, column) = street(6.13, -2.9)  # no ray hits the centre of a pixel
+    image, coc, _ = street(6.13, -2.9)  # no ray hits the centre of a pixel
     target = torch.rand(1, 3, 96, 96, generator=torch.Generator().manual_seed(3))
-    lamp = torch.zeros_like(coc, dtype=torch.float64)
-    lamp[0, 0, row, column] = 1.0
+    lamp = (image[:, :1] == LAMP).double()
 
     def seen(light: Tensor, radius: Tensor) -> Tensor:
         return (blur_by_coc(image + light * lamp, coc + radius * lamp) * target).sum()

@@ -56,11 +56,9 @@ def test_a_soft_edge_is_split_into_the_colours_beyond_it() -> None:
     distance = torch.arange(60) - 30.5
     covered = 0.5 - 0.5 * torch.erf(distance / (0.8 * math.sqrt(2)))
     own, other, _, share = matte((covered * near + (1 - covered) * far).expand(-1, -1, 48, -1), coc)
-    for x, mine, theirs in ((30, near, far), (31, far, near)):
-        assert torch.allclose(own[..., x], mine[..., 0], atol=0.03) and torch.allclose(
-            other[..., x], theirs[..., 0], atol=0.03
-        )
-        assert torch.allclose(share[..., x], (1 - covered if x == 30 else covered)[x], atol=0.03)
+    for x, mine, theirs, hidden in ((30, near, far, 1 - covered), (31, far, near, covered)):
+        for values, wanted in ((own, mine[..., 0]), (other, theirs[..., 0]), (share, hidden[x])):
+            assert torch.allclose(values[..., x], wanted, atol=0.03)
 
 
 def test_a_lamp_beside_a_strand_before_it_keeps_its_light() -> None:

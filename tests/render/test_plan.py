@@ -23,10 +23,6 @@ def coc_map(*values: float) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float64).reshape(1, 1, 1, -1)
 
 
-def place_of(coc_px: float) -> float:
-    return float(blur_axis(torch.tensor(coc_px, dtype=torch.float64)))
-
-
 @given(st.floats(-3.0, 3.0) | st.floats(-100.0, 100.0))
 def test_the_blur_axis_is_continuous_and_increasing_and_inverted_by_from_blur_axis(coc: float) -> None:
     place, beside = blur_axis(torch.tensor([coc, coc + 1e-4], dtype=torch.float64)).tolist()
@@ -34,17 +30,14 @@ def test_the_blur_axis_is_continuous_and_increasing_and_inverted_by_from_blur_ax
     assert from_blur_axis(place) == pytest.approx(coc if place != 0 else 0.0, abs=1e-11)
 
 
-def test_kernels_that_count_as_in_focus_move_less_than_2e_4_of_the_light() -> None:
+def test_a_scene_in_focus_gets_the_one_sharp_layer_and_its_kernels_move_less_than_2e_4_of_the_light() -> None:
+    assert Plan.for_scene(coc_map(-0.01, 0.0, 0.004, 0.009), 1 / 255, adapt=False).nodes == (0.0,)
+    assert len(Plan.for_scene(coc_map(-0.01, 0.0, 0.02), 1 / 255, adapt=False).nodes) == 2
     edge = from_blur_axis(1e-12)
     assert edge == pytest.approx(0.01, rel=0.02)
     for table in (BlurTable.disc(), BlurTable.gaussian(), BlurTable.load("sato_j15")):
         kernel = table.kernels(torch.tensor([edge], dtype=torch.float64), 500)[0, 0]
         assert 1.0 - float(kernel.max()) < 2e-4
-
-
-def test_a_scene_in_focus_gets_the_one_sharp_layer() -> None:
-    assert Plan.for_scene(coc_map(-0.01, 0.0, 0.004, 0.009), 1 / 255, adapt=False).nodes == (0.0,)
-    assert len(Plan.for_scene(coc_map(-0.01, 0.0, 0.02), 1 / 255, adapt=False).nodes) == 2
 
 
 @given(st.lists(st.floats(-300.0, 300.0), min_size=1, max_size=5), TOLERANCE)
@@ -115,7 +108,7 @@ def test_layers_for_gradients_do_not_depend_on_small_changes_of_the_scene() -> N
 
 
 def test_nan_and_infinite_coc_add_no_layers() -> None:
-    assert Plan.for_scene(coc_map(math.nan, 3.0, 3.0), 1 / 255, adapt=False).nodes[-1] == pytest.approx(place_of(3.0))
+    assert Plan.for_scene(coc_map(math.nan, 3.0, 3.0), 1 / 255, adapt=False).coc_px[-1] == pytest.approx(3.0)
     reaching = Plan.for_scene(coc_map(-math.inf, math.inf), 1 / 20, adapt=False)
     assert all(math.isfinite(x) for x in reaching.nodes)
     coc = torch.zeros(2, 1, 40, 50)

@@ -16,11 +16,6 @@ def scene(height: int = 64, width: int = 96) -> tuple[torch.Tensor, torch.Tensor
     return image, depth
 
 
-def test_a_map_of_the_size_of_the_image_is_returned_itself() -> None:
-    image, depth = scene()
-    assert at_size_of(image, depth) is depth
-
-
 @pytest.mark.parametrize("factor", [2, 4, 6])
 def test_a_smaller_map_gets_the_edges_of_the_image(factor: int) -> None:
     image, depth = (functional.interpolate(values, scale_factor=2) for values in scene(48, 96))
@@ -30,8 +25,9 @@ def test_a_smaller_map_gets_the_edges_of_the_image(factor: int) -> None:
     assert float(wrong) < 0.15 * float(before)
 
 
-def test_a_larger_map_is_averaged() -> None:
+def test_a_map_of_the_size_of_the_image_is_returned_itself_and_a_larger_one_is_averaged() -> None:
     image, depth = scene()
+    assert at_size_of(image, depth) is depth
     large = depth.repeat_interleave(2, -1).repeat_interleave(2, -2)
     torch.testing.assert_close(at_size_of(image, large), depth)
 
@@ -45,11 +41,10 @@ def test_pixels_without_depth_do_not_affect_others() -> None:
     assert float(sized[~sized.isnan()].min()) > 1.9
 
 
-@pytest.mark.parametrize("size", [(64, 64), (32, 45), (33, 47), (32, 50)])
-def test_another_aspect_ratio_is_refused(size: tuple[int, int]) -> None:
-    image, _ = scene()
-    with pytest.raises(ValueError, match=f"depth is {size[1]} x {size[0]} pixels and the image 96 x 64.* crop one"):
-        at_size_of(image, torch.ones(1, 1, *size))
+@pytest.mark.parametrize(("height", "width"), [(64, 64), (32, 45), (33, 47), (32, 50)])
+def test_another_aspect_ratio_is_refused(height: int, width: int) -> None:
+    with pytest.raises(ValueError, match=f"depth is {width} x {height} pixels and the image 96 x 64.* crop one"):
+        at_size_of(scene()[0], torch.ones(1, 1, height, width))
 
 
 def test_the_module_resamples_a_smaller_map_and_stretches_one_of_nearly_the_aspect_ratio() -> None:

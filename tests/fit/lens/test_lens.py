@@ -111,12 +111,9 @@ def test_indices_and_dispersions_of_the_catalogue_are_those_of_glasses():
 @pytest.mark.parametrize(
     "text",
     [
-        SINGLET,
-        ASPHERE,
-        "40 3 1.52/64/0.53 20\n-40 2 1 20\n0 0 0 10\n",
-        "inf 3 1.5 20\n-40 2 1 20\n0 0 0 10\n",
-        "40 3 1.5 20\ninf 3 1.5 12 stop\n-40 2 1 20\n",
-        "40 3 1.5 20\ninf 3 1.6 12 stop\n-40 2 1 20\n",
+        *(SINGLET, ASPHERE),
+        *(f"{front} 20\n-40 2 1 20\n0 0 0 10\n" for front in ("40 3 1.52/64/0.53", "inf 3 1.5")),
+        *(f"40 3 1.5 20\ninf 3 {index} 12 stop\n-40 2 1 20\n" for index in (1.5, 1.6)),
         "glass MINE 1.04 0.23 1.01 0.006 0.02 103.56\n40 3 N-SK15 20\n0 1 0 9\n-90 2 MINE 20\n-40 2 1 20\n",
     ],
 )

@@ -35,10 +35,7 @@ def coc_mm(z_m: float, lens: Lens, f_number: float, focus_m: float) -> float:
 
 @functools.cache
 def traced_kernel(lens: Lens, f_number: float, focus_m: float, coc: float) -> np.ndarray:
-    """Kernel of a traced fan, rotated about the axis on a grid of 1/8 px and integrated over pixels.
-
-    It uses neither the renderer's kernels nor the fit.
-    """
+    """Kernel of a traced fan, rotated about the axis on a grid of 1/8 px and integrated over pixels."""
     per_dioptre = coc_mm(math.inf, lens, f_number, focus_m) * focus_m
     dioptres = 1.0 / focus_m - coc / per_dioptre
     z_m = 1.0 / dioptres if dioptres > 1e-9 else math.inf

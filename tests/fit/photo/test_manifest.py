@@ -1,5 +1,6 @@
 """Folders with a capture.toml: reading, windows around dots, and errors with file and number."""
 
+import functools
 import shutil
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 import torch
 
 from tests.files import store
+from tests.refused import refuses
 from torchdof.fit import Capture, Captures, FitError, FitWarning, fit_pair, read_captures
 from torchdof.fit.photo.captures import read_picture
 from torchdof.io.images import Picture, read_image, write_image
@@ -98,13 +100,10 @@ def test_a_grid_gives_the_dot_in_the_centre_or_every_dot(simulator, tmp_path):
 CROWDED = [(x, y) for x in (-40, 0, 40) for y in (-40, 0, 40)]
 
 
-@pytest.mark.parametrize(
-    ("grid", "dots", "kind", "match"),
-    [
-        (CROWDED, "centre", "several dots", "apart than"),
-        ([(165, 0)], None, "window", "0600mm.png: the frame cuts the blur"),
-    ],
-)
+@pytest.mark.parametrize(("grid", "dots", "kind", "match"), [
+    (CROWDED, "centre", "several dots", "apart than"),
+    ([(165, 0)], None, "window", "0600mm.png: the frame cuts the blur"),
+])  # fmt: skip
 def test_dots_without_room_for_their_blur_are_refused(simulator, tmp_path, grid, dots, kind, match):
     camera = simulator.Simulator(level=0.7, snr_db=50, dot_radius=8.0)
     folder = simulator.write_captures(tmp_path, camera, 0.5, [0.6], lambda d: ("gaussian", {"sigma": 9.0}), grid=grid)
@@ -170,14 +169,11 @@ def test_missing_files_are_named(folder, tmp_path):
 
 
 PAIR = Capture(np.zeros((31, 31)), np.zeros((31, 31)), 1.0)
-
-
-@pytest.mark.parametrize(
-    ("pairs", "f_number", "match"), [((), 2, "one or more"), ((PAIR,) * 2, 2, "increasing"), ((PAIR,), -2, "-2")]
-)
-def test_captures_from_arrays_are_checked(pairs, f_number, match):
-    with pytest.raises(FitError, match=match):
-        Captures(pairs, focus_m=0.5, width_px=100, f_number=f_number)
+test_captures_from_arrays_are_checked = refuses(
+    *((functools.partial(Captures, pairs, 0.5, 100, f_number=f_number), match)
+      for pairs, f_number, match in (((), 2, "one or more"), ((PAIR,) * 2, 2, "increasing"), ((PAIR,), -2, "-2"))),
+    errors=FitError,
+)  # fmt: skip
 
 
 def test_a_mosaic_with_an_orientation_tag_is_refused(tmp_path: Path) -> None:
