@@ -101,8 +101,6 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "Camera.focal_px": (Camera().focal_px, {"width": 5}),
     "Camera.replace": (Camera().replace, {"focus_m": 1.0, "f_number": 2.0}),
     "Camera.focus_at": (Camera().focus_at, {"depth": DEPTH, "x": 1.0, "y": 2.0, "patch": 5}),
-    "Camera.hyperfocal_m": (Camera().hyperfocal_m, {"coc_px": 1.0, "width": 5}),
-    "Camera.sharp_limits_m": (Camera().sharp_limits_m, {"coc_px": 1.0, "width": 5}),
     "BlurTable": (BlurTable, {"family": "disc", "coc": [1.0], "params": {"radius": [1.0]}}),
     "BlurTable, all": (
         lambda **a: BlurTable("disc", [0.1], **a),

@@ -133,11 +133,6 @@ class Camera:
         """Radius of the aperture, ``f / (2 n)``, in metres."""
         return self.focal_length_mm / (2000.0 * self.f_number)
 
-    @property
-    def _ends(self) -> tuple[Number, Number]:
-        """Nearest and farthest distance in focus."""
-        return self.focus_range_m or (self.focus_m, self.focus_m)
-
     def focal_px(self, width: int) -> Number:
         """Image distance over pixel pitch, in pixels of an image ``width`` pixels wide (``F`` of the convention)."""
         pixels_wide(width)
@@ -191,7 +186,8 @@ class Camera:
         """:meth:`coc_px` by the compiled engine; None if it does not support the call (traced, batched, tilted)."""
         if is_traced() or depth.dtype != torch.float32 or not is_in_memory(depth) or not native.chosen():
             return None
-        numbers = [self.aperture_radius_m * self.focal_px(width), *self._ends, self.tilt_deg, self.swing_deg]
+        distances = self.focus_range_m or (self.focus_m, self.focus_m)
+        numbers = [self.aperture_radius_m * self.focal_px(width), *distances, self.tilt_deg, self.swing_deg]
         if any(isinstance(n, Tensor) and (n.numel() > 1 or not is_in_memory(n)) for n in numbers):
             return None
         scale, nearest, farthest, tilt, swing = (float(n) for n in numbers)
@@ -289,32 +285,6 @@ class Camera:
             raise ValueError(f"no focus brings the depth {location} onto the tilted plane; tilt less")
         focus_m = float(medians[0]) if len(medians) == 1 else torch.stack(medians)
         return self.replace(focus_m=focus_m)
-
-    def hyperfocal_m(self, coc_px: float, width: int) -> Number:
-        """Nearest focus distance in metres, a float or ``[B]``, at which infinity is still acceptably sharp.
-
-        ``coc_px`` > 0 is the acceptable radius in pixels of an image ``width`` pixels wide. With the *diameter* ``c``
-        on the sensor, the distance is ``f^2 / (n c) + f``.
-        """
-        _check_number("coc_px", coc_px)
-        at_infinity = dataclasses.replace(self, focus_m=math.inf, focus_range_m=None)
-        hyperfocal = at_infinity.aperture_radius_m * at_infinity.focal_px(width) / coc_px
-        return hyperfocal + self.focal_length_mm / 1000.0 if self.focus_breathing else hyperfocal
-
-    def sharp_limits_m(self, coc_px: float, width: int) -> tuple[Number, Number]:
-        """Nearest and farthest depth in metres on the image's axis, floats or ``[B]``, that is acceptably sharp.
-
-        ``coc_px`` > 0 is the acceptable radius in pixels of an image ``width`` pixels wide. The farthest depth is
-        ``inf`` at and beyond the hyperfocal distance.
-        """
-        _check_number("coc_px", coc_px)
-        scale = self.aperture_radius_m * self.focal_px(width)
-        dioptres = coc_px / scale if isinstance(scale, Tensor) or scale > 0 else math.inf
-        nearest, farthest = self._ends
-        near, far = 1.0 / (1.0 / nearest + dioptres), 1.0 / farthest - dioptres
-        if isinstance(far, Tensor):
-            return near, torch.where(far > 0, 1.0 / far, torch.inf)
-        return near, 1.0 / far if far > 0 else math.inf
 
     def __repr__(self) -> str:
         focus = " to ".join(map(_show, self.focus_range_m or (self.focus_m,)))
