@@ -156,9 +156,6 @@ test_invalid_arguments_are_refused_by_name = refuses(
       for place in ((8.0, 0.0), (0.0, 4.0), (-0.1, 0.0), (0.0, -1.0))),
     (lambda: Camera().focus_at(FRAME, math.nan, 0.0), "x of the focus point must be a number"),
     (lambda: Camera().focus_at(0 * FRAME, 2, 2), "no valid depth"),
-    (lambda: Camera().focus_on(FRAME, FRAME[..., :3] > 0), "must have the depth's shape"),
-    (lambda: Camera().focus_on(FRAME, FRAME < 0), "no valid depth where"),
-    (lambda: Camera().focus_on(FRAME, -FRAME), ">= 0"),
 )  # fmt: skip
 
 
@@ -215,13 +212,3 @@ def test_a_tilted_lens_is_in_focus_on_the_plane_through_its_hinge(tilt: float, s
     fine = camera.coc_px(torch.full((1, 1, 2 * height, 2 * width), 2.0, dtype=torch.float64), width)
     coarse = camera.coc_px(torch.full((1, 1, height, width), 2.0, dtype=torch.float64), width)
     assert_close(torch.nn.functional.avg_pool2d(fine, 2), coarse, rtol=1e-9, atol=1e-12)
-
-
-def test_focus_on_takes_the_median_of_the_subject_and_focus_in_prefers_the_middle_of_its_box() -> None:
-    depth = torch.tensor([[1.0, 2.0, 3.0, math.nan], [9.0, 9.0, 9.0, 9.0]]).reshape(1, 1, 2, 4)
-    mask = torch.tensor([[1, 1, 1, 1], [0, 0, 0, 0]]).reshape(1, 1, 2, 4)
-    assert Camera().focus_on(depth, mask > 0).focus_m == 2.0
-    weighted = torch.tensor([[0.1, 0.2, 0.8, 5.0], [0, 0, 0, 0]]).reshape(1, 1, 2, 4)
-    assert Camera().focus_on(depth, weighted).focus_m == 3.0
-    both = Camera().focus_on(torch.cat([depth, depth + 1]), mask > 0).focus_m
-    assert torch.as_tensor(both).tolist() == [2.0, 3.0]

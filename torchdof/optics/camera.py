@@ -238,53 +238,22 @@ class Camera:
         height, width = depth.shape[-2:]
         if not (0 <= x < width and 0 <= y < height):
             raise ValueError(f"focus point ({x}, {y}) must lie in the frame of {width} x {height} pixels (x, y)")
-        column, row, reach = int(x), int(y), patch // 2
-        weight = torch.zeros_like(depth[:1])
-        weight[..., max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1] = 1.0
-        return self._focused(depth, weight, f"within {reach} pixels of ({x}, {y}); choose another focus point")
-
-    def focus_on(self, depth: Tensor, focus_mask: Tensor) -> "Camera":
-        """This camera focused on a subject: on the median of its depths, each weighted by the mask.
-
-        Args:
-            depth: As in :meth:`focus_at`.
-            focus_mask: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, >= 0: weight of each pixel.
-
-        Raises:
-            ValueError: If the shapes are not as described, or the subject has no valid depth.
-
-        Example:
-            >>> depth = torch.tensor([1.0, 1.2, 1.4, 6.0]).reshape(1, 1, 1, 4)
-            >>> round(Camera().focus_on(depth, depth < 2).focus_m, 3)
-            1.2
-        """
-        one_channel("depth", depth, "in metres")
-        mask = focus_mask.to(depth.dtype) if isinstance(focus_mask, Tensor) else focus_mask
-        one_channel("focus_mask", mask)
-        if mask.shape[0] not in (1, depth.shape[0]) or mask.shape[1:] != depth.shape[1:]:
-            raise ValueError(f"focus_mask must have the depth's shape {list(depth.shape)}, got {list(mask.shape)}")
-        if not bool((mask >= 0).all()):
-            raise ValueError("focus_mask must be >= 0 everywhere")
-        return self._focused(depth, mask, "where focus_mask is above 0")
-
-    def _focused(self, depth: Tensor, weight: Tensor, location: str) -> "Camera":
-        """This camera with the weighted median of the distances that would bring each pixel into focus."""
         distance = depth
         at_infinity = dataclasses.replace(self, focus_m=math.inf, focus_range_m=None)
-        shift = at_infinity._tilted_dioptres(depth, int(depth.shape[-1]))
+        shift = at_infinity._tilted_dioptres(depth, int(width))
         if isinstance(shift, Tensor):  # tilted: solve 1/s + shift (1 - f/s) = 1/z for s; the factor only if it breathes
             breathing = 1.0 - _as_map(self.focal_length_mm / 1000.0, depth) * shift if self.focus_breathing else 1.0
             distance = breathing / (1.0 / depth - shift)
-        medians = []
-        for values, item_weight, valid in zip(distance, weight.expand(depth.shape), depth > 0, strict=True):
-            is_used = valid & (item_weight > 0)
-            if not bool(is_used.any()):
-                raise ValueError(f"depth must be > 0 where the focus lies, got no valid depth {location}")
-            medians.append(_weighted_median(values[is_used], item_weight[is_used]))
+        reach, medians = patch // 2, []
+        rows, columns = (slice(max(0, int(middle) - reach), int(middle) + reach + 1) for middle in (y, x))
+        for distances, is_valid in zip(distance[..., rows, columns], depth[..., rows, columns] > 0, strict=True):
+            if not bool(is_valid.any()):
+                area = f"within {reach} pixels of ({x}, {y}); choose another focus point"
+                raise ValueError(f"depth must be > 0 where the focus lies, got no valid depth {area}")
+            medians.append(distances[is_valid].median())
         if not all(float(median) > 0 for median in medians):
-            raise ValueError(f"no focus brings the depth {location} onto the tilted plane; tilt less")
-        focus_m = float(medians[0]) if len(medians) == 1 else torch.stack(medians)
-        return self.replace(focus_m=focus_m)
+            raise ValueError(f"no focus brings the depth at ({x}, {y}) onto the tilted plane; tilt less")
+        return self.replace(focus_m=float(medians[0]) if len(medians) == 1 else torch.stack(medians))
 
     def __repr__(self) -> str:
         focus = " to ".join(map(_show, self.focus_range_m or (self.focus_m,)))
@@ -304,13 +273,6 @@ def _dioptres_behind(z: Tensor, s: Tensor) -> Tensor:
     z_safe = torch.where(both_finite, z, 1.0)
     s_safe = torch.where(both_finite, s, 1.0)
     return torch.where(both_finite, (z_safe - s_safe) / z_safe / s_safe, 1.0 / s - 1.0 / z)
-
-
-def _weighted_median(values: Tensor, weights: Tensor) -> Tensor:
-    """The smallest of ``values`` ``[n]`` at which the cumulative weight reaches half of the total."""
-    values, order = values.sort()
-    summed = weights[order].double().cumsum(0)
-    return values[int((summed >= 0.5 * summed[-1]).nonzero()[0])]
 
 
 def _show(value: Number) -> str:
