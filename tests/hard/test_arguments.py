@@ -117,7 +117,6 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "BlurTable.params": (RING.params, {"coc_px": torch.ones(2), "width": 5}),
     "BlurTable.kernels": (RING.kernels, {"coc_px": torch.ones(2), "width": 5, "size": 7}),
     "BlurTable.reach_px": (RING.reach_px, {"coc_px": 1.0, "width": 5}),
-    "BlurTable.blur_texture": (RING.blur_texture, {"coc_px": 1.0, "width": 5, "size": None}),
     "psf.pixel_kernels": (psf.pixel_kernels, {"family": "disc", "params": {"radius": 1.0}, "size": 9}),
     "psf.profile": (psf.profile, {"family": "disc", "r": torch.ones(2), "params": {"radius": 1.0}}),
     "psf.support": (psf.support, {"family": "disc", "params": {"radius": 1.0}}),

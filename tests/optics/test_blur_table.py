@@ -142,17 +142,6 @@ def test_the_shipped_table_is_table_one_of_the_paper() -> None:
     assert float((mass * r**2).sum() / mass.sum()) == pytest.approx(float(table.coc) ** 2 / 2, rel=1e-4)
 
 
-def test_blur_texture_is_the_profile_with_the_strength_of_the_nearest_node() -> None:
-    table = BlurTable.from_dict(example(unit="fraction", sensor_width_mm=None))
-    for coc, strength in ((-19.0, 0.5), (-11.0, 0.6), (28.0, 0.7)):
-        sigma, r_c = at(table, coc)["sigma"][0], at(table, coc)["r_c"][0]
-        texture = table.blur_texture(coc, width=100, size=9)
-        assert texture.shape == (1, 9, 9)
-        for dy, dx in ((0, 0), (3, -4)):
-            expected = strength * math.exp(-((math.hypot(dy, dx) - r_c) ** 2) / (2 * sigma**2))
-            assert float(texture[0, 4 + dy, 4 + dx]) == pytest.approx(expected, rel=1e-12)
-
-
 ROUND_TRIPS = [
     BlurTable.disc(),
     BlurTable.gaussian(0.4),

@@ -357,35 +357,6 @@ class BlurTable:
             return abs(coc_px) * _FINEST_SIGMAS * float(spreads.min())
         return abs(coc_px) if self.aperture is None else abs(coc_px) * self.aperture.finest
 
-    def blur_texture(self, coc_px: float, width: int, size: int | None = None) -> Tensor:
-        """The paper's blur texture: the fitted profile f(r), strength N included, at the pixels' centres.
-
-        ``[channels, size, size]``, float64, not normalised. Arguments as in :meth:`kernels`.
-
-        Reference:
-            Sato, Dobashi, Yamamoto, Fig. 3.
-
-        Example:
-            >>> texture = BlurTable.load("sato_j15").blur_texture(10.0, width=512)
-            >>> round(float(texture.max()), 3)
-            0.581
-        """
-        signed = torch.tensor(number("coc_px", coc_px, unit="pixels"), dtype=torch.float64, device="cpu")
-        params = self.params(signed, width)
-        size = psf.width_of(size, psf.support(self.family, params, self.aperture))
-        axis = torch.arange(size, dtype=torch.float64, device="cpu") - size // 2
-        opening = self.aperture or Aperture()
-        r = torch.hypot(axis[:, None], axis[None, :] * opening.squeeze)
-        texture = psf.profile(self.family, r.flatten(), params).unflatten(-1, (size, size))
-        if not opening.is_round:
-            pixel = 1.0 / psf.opening_radius(self.family, params)
-            shares = opening.shares(size // 2, pixel, pixel * opening.squeeze)
-            texture = texture * (shares if signed >= 0 else shares.flip(-2, -1))
-        if self.strength is None:
-            return texture
-        nearest = (self.coc - signed / self.px_per_unit(width)).abs().argmin()
-        return texture * self.strength[nearest]
-
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the table as JSON, whole or not at all; ``OSError`` if the file cannot be written."""
         write_text(path, json.dumps(self.to_dict(), indent=1) + "\n")
