@@ -56,10 +56,10 @@ def _model_line(fit: BlurFit) -> tuple[Array, Array]:
 def sheet_of_photographs(photographs: Photographs, result: TableFit, blur: Callable[..., torch.Tensor]) -> Figure:
     """Draws each distance's target, dot, fit, residual and kernel; and lights, by `blur`: `torchdof.blur_by_coc`."""
     captures = photographs.captures
-    rows = len(captures)
+    rows = len(captures.pairs)
     figure, axes = _new_figure(12.5, 2.1 * rows + 2.6, 5, rows + 1)
     by_distance = {p.distance_m: p for p in photographs.pictures}
-    for panels, pair, fit, coc in zip(axes, captures, result.fits, result.coc_px, strict=False):
+    for panels, pair, fit, coc in zip(axes, captures.pairs, result.fits, result.coc_px, strict=False):
         photograph_axes, window, profile, residual, kernel = panels
         picture = by_distance[pair.distance_m]
         target, half, step = picture.target, picture.target.side_px / 2, max(1, picture.light.shape[1] // 300)

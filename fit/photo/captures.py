@@ -50,7 +50,7 @@ class Capture:
         position_px: position (x, y) of the dot in the sharp frame, relative to the frame's centre.
         colours: red, green and blue of `sharp` and of `blurred`, `[3, H, W]` each; None fits only their mean.
         uncertain: `sharp` and `blurred` for other values of a guess (a tone curve), each one standard error away, in
-            independent directions. The effect on the fit is included in the standard errors.
+            independent directions; enters the standard errors.
     """
 
     sharp: Array
@@ -96,12 +96,6 @@ class Captures:
         check_distances([p.distance_m for p in self.pairs], self.focus_m)
         for name in ("width_px", *(name for name in CAMERA if getattr(self, name) is not None)):
             checked(number, name, getattr(self, name), *RANGES[name])
-
-    def __iter__(self) -> Iterator[Capture]:
-        return iter(self.pairs)
-
-    def __len__(self) -> int:
-        return len(self.pairs)
 
     @property
     def distances_m(self) -> Array:
@@ -197,10 +191,10 @@ def cut_pairs(
     if sharp.light.shape != blurred.light.shape:
         text = f"is {_size(blurred.light)}, {sharp.file.name} is {_size(sharp.light)}; give pictures of one size"
         raise FitError(text, "manifest", blurred_file)
-    for key, word in (("f_number", "f-number"), ("focal_length_mm", "focal length")):
-        before, after = (picture.facts.get(key) for picture in pictures)
+    for name in ("f_number", "focal_length_mm"):
+        before, after = (picture.facts.get(name) for picture in pictures)
         if before and after and abs(math.log(before / after)) > 0.02:
-            text = f"taken at {word} {after:g} by EXIF, {sharp.file.name} at {before:g}; change neither"
+            text = f"taken at {name} {after:g} by EXIF, {sharp.file.name} at {before:g}; change neither"
             raise FitError(text, "manifest", blurred_file)
     if dots == "one":
         matched = [(find_dot(sharp.light, file=str(sharp.file)), find_dot(blurred.light, file=blurred_file))]
