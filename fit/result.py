@@ -40,8 +40,7 @@ class BlurFit:
             None for a round kernel.
         asymmetry: share of the blur's light that depends on the angle but is not in the kernel; NaN if unknown.
         why: one sentence on the choice of the family.
-        samples: radii and strengths [2, n] for plotting.
-        curve: the fitted curve for plotting, [2, m].
+        samples: radii and strengths [2, n], for plotting; curve: the fit at radii [2, m].
     """
 
     family: str
@@ -80,10 +79,8 @@ class BlurFit:
         for name, value in self.params.items():
             array_text = f"  {name}: {np.size(value)} numbers, largest {np.max(value):.4g}"
             lines.append(array_text if np.ndim(value) else f"  {name} = {value:.6g} ± {self.stderr[name]:.2g}")
-        ratio = self.residual_over_noise
-        noise = "" if math.isnan(ratio) else f", {ratio:.2f} x the noise"
-        lines.append(f"  residual {100 * self.residual:.2f} %{noise}")
+        lines.append(f"  residual {100 * self.residual:.2f} %, {self.residual_over_noise:.2f} x the noise")
         if self.model == "forward":
             (x, y), size = self.shift, self.magnification
             lines.append(f"  gain {self.gain:.4g}, shift ({x:+.2f}, {y:+.2f}) px, magnification {size:.4f}")
-        return "\n".join([*lines, *([f"  {self.why}"] if self.why else [])])
+        return "\n".join([*lines, f"  {self.why}"]).rstrip()

@@ -20,7 +20,6 @@ EXPLAINED = 1.15  # largest misfit of an ideal dot, over the noise, with which i
 FAR_ABOVE = 1.6  # residual over noise above which a warning is given
 _HARMONICS, _RINGS = 8, 4
 _RMS_DRAWN_PX = 16.0  # px; size at which a PSF is drawn to measure it; larger: more exact, slower
-
 # A sharp picture
 _FOCUSED_SIGMA_PX = 0.7  # sigma of the edge that demosaicing, a filter before the sensor or a good lens leave in focus
 _MIN_SIZE_ERROR = 0.02  # relative error of the kernel's size, from a soft sharp picture, above which to warn
@@ -28,14 +27,12 @@ _MAX_EXPONENT = 0.7  # exponent of the edge's levels below which the picture cou
 _MIN_STEEPNESS, _MIN_SIGMAS = 0.03, 4.0  # steepness of an S-curve: share of the dot's level, and in standard errors
 _SHARED_DIFFERENCES = 1.9  # second differences for each independent one: neighbours share pixels
 _ENCODED = "as in a picture that is left sRGB encoded; decode it first"
-
 # A tone curve in the residual: its strength, and chi squared (two parameters), above which to warn
 _MIN_CURVE, _MIN_CHI = 0.075, 30.0  # a curve of 20 % has this strength in the residual
 _SUPPORTING_EDGE, _SUPPORTED_CHI = 0.008, 18.0  # steepness of the sharp dot's edge, and chi squared with its support
 _MIN_CONTRAST, _MIN_CONTRAST_CHI = 0.03, 11.0  # at the expected magnification; a curve of 20 % has twice the strength
 _MIN_RESIZING = 0.015  # change of magnification above which no curve is sought; a weak curve causes 0.002 to 0.006
 _CHI_MARGIN = 4.0  # chi squared by which a curve must explain more than a change of magnification does
-
 # The fit
 _MIN_RESIDUAL, _MIN_AT_TWICE = 0.005, 1e-3  # residual, as a share of the light: at FAR_ABOVE, at twice the noise
 _SPOT_SIGMAS, _MIN_SPOT = 8.0, 0.003  # of a spot beyond the blur: standard deviations, share of the dot's level
@@ -101,8 +98,7 @@ def size_of_blur(solution: Solution) -> tuple[float, float]:
         # derivative of a quotient: the total light depends on the values too
         slope = (moment - rms**2 * light) / (light @ values) / (2 * rms)
         return rms, float(np.sqrt(max(slope @ solution.covariance @ slope, 0.0)))
-    pair, shape = solution.pair, list(solution.params)
-    values = np.array([float(solution.params[n]) for n in shape])
+    pair, shape, values = solution.pair, list(solution.params), np.array([*solution.params.values()], np.float64)
     steps = 1e-3 * np.maximum(np.abs(values), 0.1)
     varied = np.vstack([values, values + np.diag(steps)]).T  # a row for each parameter, changed in one column
     is_length = np.array([n in LENGTHS for n in shape])
@@ -127,15 +123,12 @@ def size_of_blur(solution: Solution) -> tuple[float, float]:
 def bic_of(solution: Solution) -> float:
     """Bayesian information criterion of a profile or polygon, up to a constant that depends on the pictures only."""
     pair = solution.pair
-    floor = pair.values.size * (1e-6 * pair.unit) ** 2
-    parameters = len(SHAPES[solution.family])
+    parameters = len(SHAPES[solution.family]) + (solution.family == "polygon")  # and the number of blades
     if solution.family == "radial":
         parameters = int(np.sum(np.asarray(solution.params["values"]) > 0))
-    elif solution.family == "polygon":
-        parameters += 1  # the number of blades
     # correlated neighbours are not independent samples
     count = max(round(pair.values.size * independent_share(pair.noise_correlation)), 1)
-    variance = max((solution.squares + floor) / pair.values.size, np.finfo(float).tiny)
+    variance = max(solution.squares / pair.values.size + (1e-6 * pair.unit) ** 2, np.finfo(float).tiny)
     return count * float(np.log(variance)) + parameters * float(np.log(count))
 
 
@@ -146,10 +139,11 @@ def describe(solution: Solution, why: str) -> BlurFit:
     size = float(np.sqrt(np.mean((pair.data[pair.lit] - solution.background) ** 2)))
     source_variance = (solution.gain * pair.source.noise) ** 2 / pair.fine_share
     noise = np.sqrt(noise_near(solution) ** 2 + source_variance * float(np.sum(solution.kernel**2)))
-    rms, rms_error = size_of_blur(solution)
     errors = np.sqrt(np.diag(solution.covariance))
-    stderr: dict[str, float | Array] = dict(zip(solution.names, errors.tolist(), strict=True))
-    stderr = {n: stderr[n] for n in solution.params if n in stderr}
+    stderr = dict[str, float | Array](zip(solution.names, errors.tolist(), strict=True))
+    if solution.family == "radial":
+        stderr = {"values": errors, "radius": 0.0}
+    radius, radius_stderr = (float(np.sqrt(2) * rms) for rms in size_of_blur(solution))
     distance = np.hypot(columns - x, rows - y)
     is_near = (distance <= 1.2 * pair.dot.reach) & pair.used
     order = np.argsort(distance[is_near])
@@ -158,13 +152,13 @@ def describe(solution: Solution, why: str) -> BlurFit:
         for levels in (pair.data[is_near], solution.fitted[is_near[pair.used]])
     )
     return BlurFit(
-        family=solution.family,
-        params=dict(solution.params),
-        stderr={"values": errors, "radius": 0.0} if solution.family == "radial" else stderr,
-        residual=residual_rms(solution) / size,
-        noise=float(noise) / size,
-        covariance=solution.covariance,
-        names=solution.names,
+        solution.family,
+        dict(solution.params),
+        {n: stderr[n] for n in solution.params},
+        residual_rms(solution) / size,
+        float(noise) / size,
+        solution.covariance,
+        solution.names,
         model="forward",
         gain=solution.gain,
         background=solution.background,
@@ -172,8 +166,8 @@ def describe(solution: Solution, why: str) -> BlurFit:
         centre=(x, y),
         magnification=solution.moves["magnification"],
         asymmetry=asymmetry_of(solution)[0],
-        radius=float(np.sqrt(2) * rms),
-        radius_stderr=float(np.sqrt(2) * rms_error),
+        radius=radius,
+        radius_stderr=radius_stderr,
         why=why,
         aperture=pair.opening_with(solution.params) if solution.family in OPENINGS else None,
         samples=samples,
@@ -243,8 +237,7 @@ def _curves(solution: Solution, level: float) -> Array:
 
 def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | None) -> None:
     """Warns if a soft sharp picture changes the kernel's size; `deconvolved`: the dot was fitted as in focus."""
-    # the variance along an axis of a disc of radius R is R^2 / 4
-    excess = max(edge.softness**2 - _FOCUSED_SIGMA_PX**2, 0.0)
+    excess = max(edge.softness**2 - _FOCUSED_SIGMA_PX**2, 0.0)  # of the variance along an axis; R^2 / 4 for a disc
     size_error = 1 - 1 / np.sqrt(1 + 4 * excess / max(radius_px, 1e-9) ** 2)
     if size_error < _MIN_SIZE_ERROR or edge.radius <= 2 * edge.softness:
         return
