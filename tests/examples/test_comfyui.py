@@ -68,7 +68,7 @@ def test_the_folder_is_a_custom_node_with_inputs_by_comfyuis_rules() -> None:
     assert list(inspect.signature(getattr(NODE, NODE.FUNCTION)).parameters) == ["self", *INPUTS]
 
 
-SQUEEZED = BlurTable.disc().with_aperture(Aperture(squeeze=2.0))
+SQUEEZED = BlurTable.disc().replace(aperture=Aperture(squeeze=2.0))
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ LOPSIDED = [
     BlurTable.polygon(5, 7.0, 0.4, rim=2.0),
     BlurTable.from_aperture(LETTER, squeeze=0.8),
     BlurTable.polygon(5, vignetting=(0.3, 0.1)),
-    BlurTable.load("double_gauss_50mm_f2").with_aperture(Aperture(blades=7, rotation_deg=15.0)),
+    BlurTable.load("double_gauss_50mm_f2").replace(aperture=Aperture(blades=7, rotation_deg=15.0)),
 ]
 
 
@@ -152,6 +152,6 @@ test_an_invalid_opening_is_refused_by_name = refuses(
 def test_an_opening_that_passes_no_light_is_refused() -> None:
     mask = torch.zeros(55, 5)
     mask[0, 0] = 1.0
-    table = BlurTable.gaussian().with_aperture(Aperture(rotation_deg=30.0, mask=mask))
+    table = BlurTable.gaussian().replace(aperture=Aperture(rotation_deg=30.0, mask=mask))
     with pytest.raises(ValueError, match="passes no light"):
         table.kernels(torch.tensor([-5.0]), 16)

@@ -163,7 +163,7 @@ def test_a_table_survives_save_and_load(table: BlurTable, tmp_path: Path) -> Non
     back = BlurTable.load(path)
     assert back.to_dict() == table.to_dict() and repr(back) == repr(table)
     assert back.fingerprint() == table.fingerprint()
-    assert table.aperture is None or table.with_aperture(None).fingerprint() != table.fingerprint()
+    assert table.aperture is None or table.replace(aperture=None).fingerprint() != table.fingerprint()
     coc = torch.tensor([-30.0, -0.7, 0.0, 12.0])
     assert_close(back.kernels(coc, 64, size=15), table.kernels(coc, 64, size=15), rtol=0.0, atol=0.0)
 

@@ -142,7 +142,7 @@ class ApertureOptions(Group):
         aperture = Aperture(self.blades, self.rotation, self.curvature, self.squeeze, mask, self.vignetting)
         table = getattr(BlurTable, name)() if name in ("disc", "gaussian") else BlurTable.load(name)
         is_default = aperture.is_round and self.squeeze == 1.0 and not aperture.depends_on_place
-        return table if is_default else table.with_aperture(aperture)
+        return table if is_default else table.replace(aperture=aperture)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -116,18 +116,16 @@ class BlurTable:
         if sensor_width_mm is not None:
             sensor_width_mm = number("sensor_width_mm", sensor_width_mm, 1e-6, 1e9, "millimetres")
         self.sensor_width_mm = sensor_width_mm
-        self._params = self._check_params(params)
+        self._params, self._fingerprint = self._check_params(params), ""
         self._sides = {sign: self._side(sign) for sign in (-1, 1) if bool((self.coc * sign > 0).any())}
         for distances, nodes in self._sides.values():
             self._check_extent("coc", "params", float(distances[-1]), float(psf.reach(family, nodes).max()))
         lengths = [nodes[name][:, 0] for _, nodes in self._sides.values() for name in psf.LENGTHS & nodes.keys()]
         self.is_sharp_in_focus = not bool(torch.cat(lengths).any())
-        self.strength = self._per_node("strength", strength)
-        self.residual = self._per_node("residual", residual)
-        self.provenance = dict(provenance or {})
-        self.aperture, self.field = aperture, field
-        self._check_field()
-        self._fingerprint: str | None = None
+        self.strength, self.residual = self._per_node("strength", strength), self._per_node("residual", residual)
+        self.provenance, self.aperture, self.field = dict(provenance or {}), aperture, field
+        if field is not None:
+            self._check_field(field)
 
     @classmethod
     def disc(cls) -> "BlurTable":
@@ -178,8 +176,7 @@ class BlurTable:
             >>> BlurTable.polygon(6, rotation_deg=15.0, squeeze=2.0)
             BlurTable('polygon', disc, 1 node, Aperture(6 blades, turned by 15, squeeze 2))
         """
-        opening = Aperture(blades, rotation_deg, curvature, squeeze, vignetting=vignetting)
-        return cls._of_rim(rim, "polygon", opening)
+        return cls._of_rim(rim, "polygon", Aperture(blades, rotation_deg, curvature, squeeze, vignetting=vignetting))
 
     @classmethod
     def from_aperture(
@@ -219,21 +216,16 @@ class BlurTable:
         params = {"radius": [1.0], "sigma": [0.0], "b": [rim], "m": [_RIM_POWER]}
         return cls("softm", [1.0], params, name=name, aperture=aperture)
 
-    def with_aperture(self, aperture: Aperture | None) -> "BlurTable":
-        """The same lens with another opening; None leaves it round.
-
-        Example:
-            >>> BlurTable.gaussian().with_aperture(Aperture(blades=5))
-            BlurTable('gaussian', gaussian, 1 node, Aperture(5 blades))
-        """
-        return self.replace(aperture=aperture)
-
     def replace(self, **changes: Any) -> "BlurTable":
-        """The same table with some arguments of the constructor changed.
+        """The same table with some arguments of the constructor changed, such as the opening.
 
         Raises:
             ValueError: If one is not as described there.
             TypeError: If a name is unknown.
+
+        Example:
+            >>> BlurTable.gaussian().replace(aperture=Aperture(blades=5))
+            BlurTable('gaussian', gaussian, 1 node, Aperture(5 blades))
         """
         given = {name: getattr(self, name) for name in ("family", "unit", "coc", *_OPTIONAL)}
         return BlurTable(**{**given, "params": self._params, **changes})
@@ -255,7 +247,7 @@ class BlurTable:
 
     def fingerprint(self) -> str:
         """Hash of all numbers that kernels depend on; computed once."""
-        if self._fingerprint is None:
+        if not self._fingerprint:
             aperture = None if self.aperture is None else self.aperture.to_dict()
             field = None if self.field is None else self.field.fingerprint()
             params = {name: value.tolist() for name, value in self._params.items()}
@@ -444,10 +436,7 @@ class BlurTable:
         channels = max(v.shape[0] for v in checked.values())
         return {name: value.expand(channels, *value.shape[1:]).contiguous() for name, value in checked.items()}
 
-    def _check_field(self) -> None:
-        field = self.field
-        if field is None:
-            return
+    def _check_field(self, field: Field) -> None:
         if self.aperture is not None:
             raise ValueError(f"a table with a field has its own opening, got {self.aperture!r} too; leave one out")
         if self.unit == "relative":
