@@ -166,17 +166,14 @@ class Aperture:
         return cls(**given)
 
     def __repr__(self) -> str:
-        parts = []
-        if self.mask is not None:
-            parts.append(f"mask {self.mask.shape[0]} x {self.mask.shape[1]}")
-        elif self.blades:
-            parts.append(f"{self.blades} blades" + (f", curvature {self.curvature:g}" if self.curvature else ""))
-        for name, value, default in (("turned by", self.rotation_deg, 0.0), ("squeeze", self.squeeze, 1.0)):
-            if _as_float(value) != default:
-                parts.append(f"{name} {_as_float(value):g}")
-        if self.depends_on_place:
-            parts.append(f"vignetting {sum(self.rims):g}")
-        return f"Aperture({', '.join(parts) or 'round'})"
+        rotation, squeeze, vignetting = _as_float(self.rotation_deg), _as_float(self.squeeze), sum(self.rims)
+        shape = "x" if self.mask is None else " x ".join(map(str, self.mask.shape))
+        parts = {
+            **{f"mask {shape}": self.mask is not None, f"{self.blades} blades": self.blades},
+            **{f"curvature {self.curvature:g}": self.curvature, f"turned by {rotation:g}": rotation},
+            **{f"squeeze {squeeze:g}": squeeze != 1.0, f"vignetting {vignetting:g}": vignetting},
+        }
+        return f"Aperture({', '.join(text for text, is_stated in parts.items() if is_stated) or 'round'})"
 
     def _outline(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """Corners ``[V]`` of the outline, x and y with y down, counter-clockwise as seen with y up."""

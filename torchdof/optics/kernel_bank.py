@@ -1,15 +1,10 @@
 """Kernels of any radius from templates, by two small matrix products.
 
-A cache of finished kernels would not help, because a new camera blurs by new radii. But
 :func:`torchdof.optics.psf.pixel_kernels` works in two steps. The first integrates a PSF over square *cells*, ``n`` from
 the centre to the end of the PSF; the second weights them with the interpolator ``phi`` of each pixel. The first does
 not depend on the radius. So the light in the cells, the *template* ``T``, is computed once for each node of a table. A
-kernel of any radius is then
-
-    ``K = A T B'``  with  ``A[m, i] = phi(m - i h)``,  ``B[m, i] = phi(m - i w)``
-
-for cells ``h`` pixels high and ``w`` pixels wide. As in ``pixel_kernels``, ``K`` is limited, made non-negative and
-scaled to a sum of 1.
+kernel of any radius, with cells ``h`` pixels high and ``w`` wide, is ``K = A T B'`` with ``A[m, i] = phi(m - i h)`` and
+``B[m, i] = phi(m - i w)``, made non-negative and scaled to a sum of 1 as in ``pixel_kernels``.
 
 * Templates have 16, 32, 64, 128 or 256 cells. The one in use has cells of half a pixel to a pixel. The next finer one
   is blended in while cells grow from 0.75 to 1 pixel, so that kernels are continuous functions of the radius. A PSF of
@@ -77,11 +72,10 @@ def bank_of(table: Table) -> "KernelBank":
 
 
 class KernelBank:
-    """Kernels of a table from templates that are computed when they are first needed.
+    """Kernels of the middle of the frame from templates that are computed when they are first needed. Thread-safe.
 
-    All banks together keep up to 128 MB of templates, the most recently used ones. Thread-safe: two threads that miss
-    the same template at once both compute it. Kernels are those of the middle of the frame. For a table with a field
-    they are uniform discs as large as its spots, which :mod:`torchdof.optics.placed_kernels` multiplies by the spots.
+    All banks together keep up to 128 MB of templates, the most recently used ones. For a table with a field the kernels
+    are uniform discs as large as its spots, which :mod:`torchdof.optics.placed_kernels` multiplies by the spots.
 
     With ``gradients`` the templates are not kept, and have gradients to the rotation and squeeze of the aperture.
     """
@@ -250,8 +244,8 @@ class KernelBank:
         place = self._place(coc_px, width)
         low, high = (self._light_and_moment(place.side, place.node + above) for above in (0, 1))
         total = 0.0
-        for (light, moment), (light_above, moment_above), reach in zip(low, high, place.reach, strict=True):
-            moment, light = (a + place.part * (b - a) for a, b in ((moment, moment_above), (light, light_above)))
+        for below, above, reach in zip(low, high, place.reach, strict=True):
+            light, moment = (a + place.part * (b - a) for a, b in zip(below, above, strict=True))
             total += moment / light * (reach / scale) ** 2
         return total / self.colours
 

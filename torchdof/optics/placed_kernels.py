@@ -2,13 +2,9 @@
 
 A lens is rotationally symmetric. So field masks, in [0, 1], are computed only along one line from the middle of the
 frame, at a few distances, in coordinates ``u`` away from the middle and ``v`` across (:mod:`torchdof.optics.field`).
-The kernel ``K_p`` of a place ``p`` is
-
-    ``K_p[m] = K[m] mask_p(m) / sum_m K[m] mask_p(m)``
-
-with ``K`` the kernel of the middle, and ``mask_p`` interpolated between two distances, turned by the azimuth of ``p``
-and sampled bilinearly at the pixels. The division keeps the light: the sharp image shows the darkening of the corners
-already.
+The kernel of a place ``p`` is ``K_p[m] = K[m] mask_p(m) / sum_m K[m] mask_p(m)``, with ``K`` the kernel of the middle,
+and ``mask_p`` interpolated between two distances, turned by the azimuth of ``p`` and sampled bilinearly at the pixels.
+The division keeps the light: the sharp image shows the darkening of the corners already.
 
 * Traced and measured spots: ``K`` is a uniform disc, and the mask is the spot itself, averaged over a pixel.
 * Cat's eyes (``vignetting=``): ``K`` has the whole opening. A ray through the point ``w`` of the aperture to a place
