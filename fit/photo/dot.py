@@ -55,8 +55,7 @@ def find_dot(picture: Array, *, file: str | None = None) -> Dot:
 def find_dots(picture: Array, *, file: str | None = None, smallest: float = _MIN_LIGHT) -> list[Dot]:
     """Finds dots in a picture `[H, W]` in linear light, brightest first, down to a share `smallest` of its light."""
     height, width = a_picture("a picture of a dot", picture, _MIN_SIDE_PX, file).shape
-    noise = noise_of(picture)
-    levels = picture[_near_border(picture.shape, max(1, min(height, width) // 20))]
+    noise, levels = noise_of(picture), picture[_near_border(picture.shape, max(1, min(height, width) // 20))]
     # a mean without outliers: the median is biased if blacks are cut off at 0, which removes half of the noise
     background = float(np.median(levels))
     if noise > 0 and (is_usual := np.abs(levels - background) <= 5 * noise).any():
@@ -143,8 +142,8 @@ def used_pixels(picture: Array, dot: Dot, white: float | None, file: str | None,
     bright = picture > dot.background + 0.15 * dot.peak
     share = float(np.sum(clipped & bright)) / max(int(bright.sum()), 1)
     if refuse and share > _MAX_CLIPPED:
-        text = f"{100 * share:.0f} % of the blurred dot's pixels are clipped at {level:.4g}; at least "
-        raise FitError(f"{text}{100 - 100 * _MAX_CLIPPED:.0f} % must be below: expose less", "saturated", file)
+        text = f"{100 * share:.0f} % of the blurred dot's pixels are clipped at {level:.4g}, at most "
+        raise FitError(f"{text}{100 * _MAX_CLIPPED:.0f} % may be: expose less", "saturated", file)
     if refuse:
         text = f"{count} pixels of the blurred picture are clipped at {level:.4g} and were left out; expose less"
         warn(text, "saturated", file)
@@ -154,12 +153,10 @@ def used_pixels(picture: Array, dot: Dot, white: float | None, file: str | None,
 def _plateau(picture: Array, dot: Dot) -> float | None:
     """The level at which a picture is clipped, if more pixels have it than the next one despite noise; or None."""
     levels, counts = np.unique(picture[picture > dot.background + 0.5 * dot.peak], return_counts=True)
-    tail = levels.size > 1 and counts[-1] <= counts[-2]  # few pixels at the top level are the tail of the noise
-    if tail or counts[-1] < max(5, 0.02 * counts.sum()):
-        return None
-    spacing = float(np.median(np.diff(levels))) if levels.size > 1 else 0.0
-    top = float(levels[-1])
-    return top if dot.noise > 0.6 * spacing and dot.noise > 1e-12 * abs(top) else None
+    top, spacing = float(levels[-1]), float(np.median(np.diff(levels))) if levels.size > 1 else 0.0
+    # few pixels at the top level are the tail of the noise
+    is_peak = counts[-1] >= max(5, 0.02 * counts.sum()) and (levels.size == 1 or counts[-1] > counts[-2])
+    return top if is_peak and dot.noise > max(0.6 * spacing, 1e-12 * abs(top)) else None
 
 
 def check_blacks(picture: Array, dot: Dot, file: str | None) -> None:
@@ -168,9 +165,9 @@ def check_blacks(picture: Array, dot: Dot, file: str | None) -> None:
     levels, counts = np.unique(paper, return_counts=True)
     if levels.size < 2 or counts[0] < _CUT_BLACKS * paper.size:
         return
-    mean = float(paper.mean())
-    within_a_level = not dot.noise > max(0.6 * (levels[1] - levels[0]), 1e-6 * dot.peak)
-    if not within_a_level and np.quantile(paper, 0.995) - mean >= _NOISE_ASYMMETRY * (mean - levels[0]):
+    exceeds_a_level = dot.noise > max(0.6 * (levels[1] - levels[0]), 1e-6 * dot.peak)
+    above, below = np.quantile(paper, 0.995) - paper.mean(), paper.mean() - levels[0]
+    if exceeds_a_level and above >= _NOISE_ASYMMETRY * below:
         share = f"{100 * float(counts[0] / paper.size):.0f} % of the paper lies on its lowest level, {levels[0]:.3g}"
         text = f"{share}: cut blacks make the kernel up to 1 % too small; develop so that black lies above its noise"
         warn(text, "saturated", file)

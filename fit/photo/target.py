@@ -6,6 +6,7 @@ blurred edge of the square darkens as much as it lights up.
 
 import math
 import os
+import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -47,9 +48,8 @@ def write_target(path: str | os.PathLike[str], paper: Paper = "a4") -> None:
     if target.suffix.lower() != ".pdf":
         raise FitError(f"the target is written as PDF: name it {target.with_suffix('.pdf')}", file=str(path))
     checked(choice, "paper", paper, get_args(Paper))
-    page = Path(__file__).with_name(f"target-{paper}.pdf").read_bytes()
     with atomic_file(target) as temporary:
-        Path(temporary).write_bytes(page)
+        shutil.copyfile(Path(__file__).with_name(f"target-{paper}.pdf"), temporary)
 
 
 @dataclass(frozen=True)
@@ -101,9 +101,8 @@ def _squares(thumbnail: Array, dark: Mask) -> Iterator[Target]:
         side = math.sqrt(x.size)
         target = Target(left + float(x.mean()), top + float(y.mean()), side, elongation=1.0, white=0.0, black=0.0)
         distance = _square_distance(thumbnail.shape, target)
-        ring = thumbnail[(distance > 1.12) & (distance < 1.2)]
-        inside = thumbnail[(distance > 0.4) & (distance < 0.85)]
-        middle = thumbnail[distance < 0.03 + 1.5 / side]
+        areas = (1.12, 1.2), (0.4, 0.85), (-1.0, 0.03 + 1.5 / side)
+        ring, inside, middle = (thumbnail[(distance > low) & (distance < high)] for low, high in areas)
         if ring.size < 8 or inside.size < 8 or middle.size < 1:
             continue
         white, black = float(np.median(ring)), float(np.median(inside))
@@ -135,13 +134,10 @@ def _refined(light: Array, rough: Target) -> Target:
         share = np.clip((1 - crop / white) / (1 - black), -0.2, 1.2)
         share[distance < 0.5] = 1.0  # the dot counts as part of the square
         share[distance > 1.15] = 0.0
-        area = float(share.sum())
+        area, level = float(share.sum()), float(np.median(white))
         x, y = float((share * columns).sum() / area), float((share * rows).sum() / area)
-        width, height = (
-            math.sqrt(12 * float((share * (axis - middle) ** 2).sum()) / area)
-            for axis, middle in ((columns, x), (rows, y))
-        )
-        level = float(np.median(white))
+        squares = ((share * (axis - middle) ** 2).sum() for axis, middle in ((columns, x), (rows, y)))
+        width, height = (math.sqrt(12 * float(square) / area) for square in squares)
         target = Target(x + left, y + top, math.sqrt(area), max(width / height, height / width), level, black * level)
     return target
 
@@ -220,20 +216,18 @@ def _edges(light: Array, target: Target) -> list[tuple[Array, Array]]:
             if count.all() and _BIN * float(((share > 0.1) & (share < 0.9)).sum()) > _MIN_EDGE_PX:
                 profiles.append(level)
         if len(profiles) == 2:
-            shorter = min(profile.size for profile in profiles)
+            shorter = min(map(len, profiles))
             pairs.append((profiles[0][:shorter], profiles[1][:shorter]))
     return pairs
 
 
 def _edge_asymmetry(one: Array, other: Array) -> Array:
     """Asymmetry of two opposite edges at equal distances from their centres, over its error."""
-    asymmetry: Array = np.zeros(1)
+    asymmetry, bins, offset = np.zeros(1), np.arange(one.size), np.arange(1.0, one.size // 3)
     for level in (one, other):
         margin = level.size // 6
         paper, ink = float(level[:margin].mean()), float(level[-margin:].mean())
         share = (level - ink) / (paper - ink)
         centre = float(share.sum()) - 0.5  # of a symmetric edge, in bins
-        offset = np.arange(1.0, level.size // 3)
-        bins = np.arange(level.size)
         asymmetry = asymmetry + np.interp(centre + offset, bins, share) + np.interp(centre - offset, bins, share) - 1
     return np.asarray(asymmetry / (2 * _SYMMETRY_ERROR * math.sqrt(asymmetry.size / _POSITIONS)))
