@@ -108,11 +108,10 @@ class BlurTable:
         if not self.coc.any():
             raise ValueError("coc must have a node that is not 0")
         if unit == "relative" and max(int((self.coc > 0).sum()), int((self.coc < 0).sum())) > 1:
-            got = f"{len(self.coc)}; state the unit as 'fraction' (of the image's width) or 'mm'"
-            raise ValueError(f"unit 'relative' takes one node on each side of focus at most, got {got}")
+            remedy = f"got {len(self.coc)}; state the unit as 'fraction' (of the image's width) or 'mm'"
+            raise ValueError(f"unit 'relative' takes one node on each side of focus at most, {remedy}")
         if (unit == "mm") != (sensor_width_mm is not None):
-            got = f"{show(sensor_width_mm)} with {unit!r}"
-            raise ValueError(f"sensor_width_mm goes with unit 'mm' and only with it, got {got}")
+            raise ValueError(f"sensor_width_mm goes with unit 'mm' only, got {show(sensor_width_mm)} with {unit!r}")
         if sensor_width_mm is not None:
             sensor_width_mm = number("sensor_width_mm", sensor_width_mm, 1e-6, 1e9, "millimetres")
         self.sensor_width_mm = sensor_width_mm
@@ -120,8 +119,8 @@ class BlurTable:
         self._sides = {sign: self._side(sign) for sign in (-1, 1) if bool((self.coc * sign > 0).any())}
         for distances, nodes in self._sides.values():
             self._check_extent("coc", "params", float(distances[-1]), float(psf.reach(family, nodes).max()))
-        lengths = [nodes[name][:, 0] for _, nodes in self._sides.values() for name in psf.LENGTHS & nodes.keys()]
-        self.is_sharp_in_focus = not bool(torch.cat(lengths).any())
+        in_focus = [nodes[name][:, 0] for _, nodes in self._sides.values() for name in psf.LENGTHS & nodes.keys()]
+        self.is_sharp_in_focus = not bool(torch.cat(in_focus).any())
         self.strength, self.residual = self._per_node("strength", strength), self._per_node("residual", residual)
         self.provenance, self.aperture, self.field = dict(provenance or {}), aperture, field
         if field is not None:
@@ -283,9 +282,8 @@ class BlurTable:
 
         In front of the focus plane, kernels of an opening that is not round are point-reflected.
 
-        In focus the kernel is a single pixel, because the image is already as sharp there as it should be. A table may
-        have a blur of its own in focus, which moves a share ``M`` of the light to other pixels. It is faded in with the
-        weight ``min(1, 4 coc^2 / M)``: at 0.35 px for ``M`` = 0.5, at 0.05 px for ``M`` = 0.01, it is complete.
+        In focus the kernel is a single pixel, because the image is already as sharp there as it should be. A blur of
+        the table in focus, which moves a share ``M`` of the light, is faded in with the weight ``min(1, 4 coc^2 / M)``.
 
         Args:
             coc_px: Signed coc in pixels ``[n]``.
@@ -466,10 +464,9 @@ class BlurTable:
 
     def _side(self, sign: int) -> tuple[Tensor, dict[str, Tensor]]:
         """Nodes of one side of focus, ordered by ``|coc|``, with a node at 0."""
-        on_side = self.coc * sign >= 0
-        order = torch.argsort(self.coc[on_side].abs())
-        distances = self.coc[on_side].abs()[order]
-        nodes = {k: v[:, on_side][:, order] for k, v in self._params.items()}
+        order = self.coc.abs().argsort()
+        order = order[self.coc[order] * sign >= 0]
+        distances, nodes = self.coc[order].abs(), {k: v[:, order] for k, v in self._params.items()}
         if distances[0] > 0:
             distances = torch.cat([distances.new_zeros(1), distances])
             for name, value in nodes.items():
