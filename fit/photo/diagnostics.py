@@ -61,8 +61,7 @@ def unexplained(solution: Solution, basis: Array) -> tuple[Array, Array, Array]:
     # what the parameters imitate is not in the residual
     imitable, _ = np.linalg.qr(solution.slopes[:, np.abs(solution.slopes).max(axis=0) > 0])
     visible = without_level(basis - imitable @ (imitable.T @ basis), solution.fitted)
-    # a smooth deviation must not count as noise: use the level beside the dot and inside it. Noise cannot exceed the
-    # residual: in a JPEG, dark areas have less noise than the level in the light suggests
+    # a smooth deviation is not noise, which in turn cannot exceed the residual: a JPEG's dark areas have little
     variance = min(noise_near(solution), residual_rms(solution)) ** 2
     pair = solution.pair
     correlated = correlate(pair.picture(visible.T), pair.noise_correlation)[:, pair.used].T
@@ -180,8 +179,7 @@ def check_linearity(picture: Array, dot: Dot, edge: Edge, file: str | None) -> b
     inside, text = inner_pixels(picture, dot), ""
     if inside is not None:
         bright = fine_variance(picture, inside)
-        # rounding to a file's levels hides at most a variance of (level / 2)^2; levels that are means of three colours
-        # are three times as close, and equal means may differ in the last digit
+        # rounding hides at most a variance of (level / 2)^2; means of three colours are three times as close
         levels = np.unique(picture[picture > dot.background + 0.5 * dot.peak])
         steps = [step for step in np.diff(levels).tolist() if step > 1e-6 * np.abs(levels).max()]
         rounding = 3 * min(steps, default=0.0) ** 2 / 4
@@ -229,10 +227,10 @@ def check_levels(solution: Solution, expected: Solution, edge: Edge, file: str |
 
 def _curves(solution: Solution, level: float) -> Array:
     """Effects of weak tone curves on a fit's pixels `[pixels used, 2]`: brightening, and an S-curve's contrast."""
-    light = ((solution.fitted - solution.background) / (solution.gain * level))[None]  # 0 is the paper
-    step = 1e-3
-    curved_light = np.concatenate([untoned(light, (-step, 0, 0)), untoned(light, (0, -1.5 * step, 0))])
-    return np.asarray(solution.gain * level * (curved_light - untoned(light, (0, 0, 0))) / step).T
+    peak, step = solution.gain * level, 1e-3
+    light = ((solution.fitted - solution.background) / peak)[None]  # 0 is the paper
+    straight, *curved = (untoned(light, bend)[0] for bend in ((0, 0, 0), (-step, 0, 0), (0, -1.5 * step, 0)))
+    return peak / step * np.stack([one - straight for one in curved], axis=1)
 
 
 def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | None) -> None:
@@ -242,12 +240,11 @@ def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | Non
     if size_error < _MIN_SIZE_ERROR or edge.radius <= 2 * edge.softness:
         return
     effect = f"the kernel is too small by {100 * size_error:.0f} %"
+    cause = f", as out of focus; {effect}: focus again"
     if edge.softness <= UNFOCUSED_PX:
         cause = f"; if the printed dot's edge is sharp, {effect}"
     elif deconvolved:
         cause = ", as out of focus; the dot was fitted as it would be in focus: focus again, or print a sharper dot"
-    else:
-        cause = f", as out of focus; {effect}: focus again"
     warn(f"the sharp picture is soft: its dot's edge is blurred by {edge.softness:.1f} px{cause}", "not in focus", file)
 
 
@@ -255,11 +252,9 @@ def check_fit(solution: Solution, fit: BlurFit, file: str | None, freest: BlurFi
     """Raises or warns about problems of a fit, which describes the solution; `freest` has the freest kernel."""
     if not fit.gain > 0:
         raise FitError("the blurred picture has nothing in common with the sharp one", file=file)
-    pair = solution.pair
-    # share of the light that the kernel spreads outside the window
-    source = pair.drawn(solution.moves)
+    pair, source = solution.pair, solution.pair.drawn(solution.moves)
     total, inside = float(source.sum()), float(pair.blurred(source, solution.kernel[None]).sum())
-    outside, (height, width) = 1 - inside / total if total > 0 else 1.0, pair.data.shape
+    outside, (height, width) = 1 - inside / total if total > 0 else 1.0, pair.data.shape  # share of the light
     text = f"{100 * outside:.1f} % of the blur lies outside the window of {width}x{height} px: cut a larger one"
     if outside > _REFUSED_OUTSIDE:
         raise FitError(text, "window", file)
@@ -268,7 +263,6 @@ def check_fit(solution: Solution, fit: BlurFit, file: str | None, freest: BlurFi
     # the freest residual is far above the noise, or the chosen family adds much to it
     residual, ratio = freest.residual, freest.residual_over_noise
     far_above = (residual > _MIN_RESIDUAL and ratio > FAR_ABOVE) or (residual > _MIN_AT_TWICE and ratio > 2.0)
-    # a residual far above the noise is reported below; here, only the part that the family adds to it
     warned_ratio = max(2.0, 1.3 * ratio) if far_above else 2.0
     if fit is not freest and fit.residual > _MIN_AT_TWICE and fit.residual_over_noise > warned_ratio:
         text = f"family {fit.family!r} leaves {fit.residual_over_noise:.1f} times the noise, a free profile {ratio:.1f}"
@@ -299,13 +293,11 @@ def check_fit(solution: Solution, fit: BlurFit, file: str | None, freest: BlurFi
     for name, lower, upper in zip(solution.names, *pair.bounds(solution.names), strict=True):
         value = float({**solution.moves, **solution.params}[name])
         at_least, at_most = value <= lower + 1e-6 * abs(lower), value >= upper * (1 - 1e-6)
-        is_length = name in ("sigma", "radius", "r_c")
-        if at_most and is_length:
+        if at_most and name in LENGTHS:
             raise FitError(f"the blur is wider than the window: {name} ran to {value:.3g} px", "flat profile", file)
-        # exempt: the shape of a blur below a pixel, the exponent of a missing tilt, the curvature of straight or
-        # circular blades
-        if (at_least and not is_length and name != "b" or at_most) and name not in ("m", "curvature"):
+        # exempt: the shape of a blur below a pixel, the exponent of a missing tilt, the curvature of any blades
+        if (at_most or (at_least and name not in {"b", *LENGTHS})) and name not in ("m", "curvature"):
             warn(f"{name} ended on its bound {value:.4g}; it is only a limit", "boundary", file)
-    size, error = size_of_blur(solution)
-    if not error < 0.5 * size:
-        warn(f"too little blur or light: its rms radius is {size:.3g} ± {error:.2g} px", "flat profile", file)
+    if not fit.radius_stderr < 0.5 * fit.radius:
+        text = f"too little blur or light: its radius is {fit.radius:.3g} ± {fit.radius_stderr:.2g} px"
+        warn(text, "flat profile", file)
