@@ -160,12 +160,10 @@ def read_picture(
     if left + columns > width or top + rows > height:
         raise invalid(f"crop {[left, top, columns, rows]} extends beyond the picture of {width}x{height}")
     pixels = pixels[:, top : top + rows, left : left + columns]
-    white = 1.0 if picture.sample in ("8", "16") else None
-    is_clipped = pixels >= 1.0 - 1e-6
-    if dark is not None:
-        if dark.shape != pixels.shape:
-            raise invalid(f"the dark frame is {_size(dark[0])}, the picture {_size(pixels[0])}")
-        pixels = pixels - dark
+    white, is_clipped = 1.0 if picture.sample in ("8", "16") else None, pixels >= 1.0 - 1e-6
+    if dark is not None and dark.shape != pixels.shape:
+        raise invalid(f"the dark frame is {_size(dark[0])}, the picture {_size(pixels[0])}")
+    pixels = pixels - (0.0 if dark is None else dark)
     light = pixels.mean(axis=0)
     if white is not None:
         pixels[is_clipped] = white
@@ -235,12 +233,12 @@ def _size(picture: Array) -> str:
 def _matched(sharp: CameraPicture, blurred: CameraPicture, magnification: float) -> list[tuple[Dot, Dot]]:
     """Pairs the dots of a grid in both pictures, from the centre outwards: each moves on its line to the centre."""
     sharp_dots, blurred_dots = (find_dots(f.light, file=str(f.file), smallest=0.3) for f in (sharp, blurred))
-    centre, pairs = sharp.middle, []
-    for dot in sorted(sharp_dots, key=lambda d: math.dist((d.x, d.y), centre)):
-        expected = [m + magnification * (v - m) for m, v in zip(centre, (dot.x, dot.y), strict=True)]
-        nearest = min(blurred_dots, key=lambda d: math.dist((d.x, d.y), expected))
-        spacing = min((math.dist((d.x, d.y), (dot.x, dot.y)) for d in sharp_dots if d is not dot), default=math.inf)
-        if math.dist((nearest.x, nearest.y), expected) < 0.4 * magnification * spacing:
+    (centre_x, centre_y), pairs = sharp.middle, []
+    for dot in sorted(sharp_dots, key=lambda d: math.hypot(d.x - centre_x, d.y - centre_y)):
+        x, y = centre_x + magnification * (dot.x - centre_x), centre_y + magnification * (dot.y - centre_y)
+        away, nearest = min(((math.hypot(d.x - x, d.y - y), d) for d in blurred_dots), key=lambda one: one[0])
+        spacing = min((math.hypot(d.x - dot.x, d.y - dot.y) for d in sharp_dots if d is not dot), default=math.inf)
+        if away < 0.4 * magnification * spacing:
             pairs.append((dot, nearest))
     if not pairs:
         text = f"none of the {len(sharp_dots)} dots of {sharp.file.name} is found again; are the distances right?"
