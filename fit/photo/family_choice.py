@@ -17,10 +17,10 @@ _COMPARED_LEVEL, _DISPLAY_EXPONENT = 0.02, 1 / 2.2  # level of a highlight that 
 
 
 def natural_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
-    """PSNR between a natural image blurred with one kernel and with another, in dB.
+    """PSNR between a natural image blurred with one kernel and with another, in dB, at most 200.
 
     It needs no image: natural ones have an amplitude spectrum of 1/f; a standard deviation of 0.22 of the peak and a
-    width of 256 px are assumed. The kernels are `[k, k]`, k odd, and sum to 1. The result is at most 200 dB.
+    width of 256 px are assumed. The kernels are `[k, k]`, k odd, and sum to 1.
 
     Raises:
         FitError: a kernel is not `[k, k]` with an odd k, or not of finite numbers.
@@ -48,10 +48,7 @@ def highlight_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     """PSNR between the pictures of a highlight through two kernels, in dB.
 
     A highlight shows the kernel itself. It is encoded for display with the peak of `other`, the reference, at white,
-    and compared where either picture is brighter than 2 % of that. Kernels are as for :func:`natural_psnr`.
-
-    Raises:
-        FitError: a kernel is not `[k, k]` with an odd k, or not of finite numbers.
+    and compared where either picture is brighter than 2 % of that. Kernels and errors are as for :func:`natural_psnr`.
 
     Example:
         >>> import torch
@@ -68,7 +65,7 @@ def highlight_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
 
 
 def _decibels(error: float) -> float:
-    return 200.0 if error <= 1e-20 else float(-10 * np.log10(error))
+    return float(-10 * np.log10(max(error, 1e-20)))
 
 
 def _of_one_size(kernel: ArrayLike, other: ArrayLike) -> Array:

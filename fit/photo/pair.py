@@ -51,8 +51,7 @@ def fit_pair(
     """Fits the kernel that turns a picture of a sharp dot into the picture of the same dot out of focus.
 
     The forward model explains every pixel of the window: `blurred = gain * (kernel convolved with the sharp picture,
-    moved and magnified) + background`. All of these are fitted, so they do not bias the kernel. As in rendering, a
-    pixel's own blur, 1/12 px^2 of variance, is in both pictures and not in the parameters.
+    moved and magnified) + background`, all of them fitted. As in rendering, a pixel's own blur is not in the kernel.
 
     `model="ratio"` is the paper's: `blurred / sharp` along spokes inside the dot, then eq. (1). It measures the dot
     convolved with the kernel, so its widths depend on the dot.

@@ -36,13 +36,12 @@ class TableFit:
     """A table and the fits from which it was made.
 
     Attributes:
-        table: the blur table.
-        fits: one for each pair, by increasing distance.
+        table: the blur table, with a kernel for each colour if the captures have colours.
+        fits: one for each pair, by increasing distance; of the mean of the colours.
         coc_px: signed circle of confusion of each pair, px of the frame.
         why: reason for the family.
         scale: source of the circles of confusion: "camera" or "measured".
-        colours: fits of "red", "green" and "blue", if the captures have colours; the table then has a kernel for each,
-            and `fits` are those of their mean.
+        colours: fits of "red", "green" and "blue".
     """
 
     table: BlurTable
@@ -95,11 +94,7 @@ def fit_captures(
         accuracy_db: accuracy for "auto", see `fit_pair`.
         progress: called with (number done, total, text) after each fit.
         command: recorded in the table's provenance.
-        scale_of: the fit of another dot in the same photographs, whose circles of confusion are used if the camera is
-            unknown.
-
-    Returns:
-        The table and its fits.
+        scale_of: the fit of another dot in the same photographs; gives the circles of confusion of an unknown camera.
 
     Raises:
         FitError: a pair cannot be fitted (the message names its file), or, of kind "camera", the fitted blur is far
