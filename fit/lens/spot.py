@@ -224,8 +224,8 @@ def trace_field(
         boxes.append((centre, length, width))
         light.append([_binned((u - centre) / length, np.abs(v) / width, weight) for u, v, weight in spots])
     nodes = (len(coc_mm), len(radius_mm))
-    coc, radius, box, cells = (torch.from_numpy(np.array(values)) for values in (coc_mm, radius_mm, boxes, light))
-    return Field(coc, radius, box.unflatten(0, nodes), cells.transpose(0, 1).unflatten(1, nodes))
+    cocs, radii, box, cells = (torch.from_numpy(np.array(values)) for values in (coc_mm, radius_mm, boxes, light))
+    return Field(cocs, radii, box.unflatten(0, nodes), cells.transpose(0, 1).unflatten(1, nodes))
 
 
 def _binned(u: Array, v: Array, weight: Array) -> Array:

@@ -33,17 +33,17 @@ def _crop(name: str, value: Any) -> None:
         raise ValueError(f"{name} must be [left, top, width, height] in pixels, got {show(value)}")
 
 
-_NUMBERS = {name: partial(number, low=low, high=high) for name, (low, high) in RANGES.items()}
 _FIELDS: Mapping[str, Callable[..., Any]] = {
-    **{name: _NUMBERS[name] for name in ("focus_m", "exposure_s", "full_width_px", *CAMERA)},
-    **dict.fromkeys(("sharp", "dark", "name"), _text),
+    **{name: partial(number, low=low, high=high) for name, (low, high) in RANGES.items()},
+    **dict.fromkeys(("sharp", "dark", "name", "file"), _text),
     "crop": _crop,
     "transfer": partial(choice, choices=("linear", "srgb")),
     "dots": partial(choice, choices=get_args(Dots)),
     "colours": partial(choice, choices=get_args(Colours)),
     "bayer": partial(choice, choices=PATTERNS),
 }
-_SHOT_FIELDS = {"file": _text, **{name: _NUMBERS[name] for name in ("distance_m", "exposure_s")}}
+_OF_MANIFEST = [name for name in _FIELDS if name not in ("file", "distance_m", "width_px")]
+_OF_SHOT = ["file", "distance_m", "exposure_s"]
 _REQUIRED = ("focus_m", "sharp", "file", "distance_m")
 
 
@@ -102,8 +102,8 @@ def read_captures(
     if not isinstance(shots, list) or not shots:
         raise invalid("give at least one [[shot]] with file and distance_m")
     stated |= {name: value for name, value in (("dots", dots), ("colours", colours)) if value}
-    manifest = _valid(MANIFEST, stated, _FIELDS, manifest_name)
-    shots = [_valid("[[shot]]", shot, _SHOT_FIELDS, manifest_name) for shot in shots]
+    manifest = _valid(MANIFEST, stated, _OF_MANIFEST, manifest_name)
+    shots = [_valid("[[shot]]", shot, _OF_SHOT, manifest_name) for shot in shots]
     focus, files = manifest["focus_m"], [shot["file"] for shot in shots]
     check_distances([shot["distance_m"] for shot in shots], focus, manifest_name)
     nearest = min(focus, shots[0]["distance_m"])
@@ -153,11 +153,11 @@ def inside(file: Path, root: str | os.PathLike[str], where: str) -> None:
         raise FitError(f"{str(file)!r} lies outside of {root} (--root)", "manifest", where)
 
 
-def _valid(part: str, stated: Any, checks: Mapping[str, Callable[..., Any]], where: str) -> dict[str, Any]:
+def _valid(part: str, stated: Any, names: list[str], where: str) -> dict[str, Any]:
     """The fields of a part of the manifest, each checked; None for those that are missing and optional."""
-    required = [name for name in checks if name in _REQUIRED]
+    required = [name for name in names if name in _REQUIRED]
     try:
-        given = fields(part, stated, required, [name for name in checks if name not in required])
-        return dict.fromkeys(checks) | {name: checks[name](name, value) or value for name, value in given.items()}
+        given = fields(part, stated, required, [name for name in names if name not in required])
+        return dict.fromkeys(names) | {name: _FIELDS[name](name, value) or value for name, value in given.items()}
     except ValueError as error:
         raise FitError(str(error), "manifest", where) from None

@@ -139,8 +139,9 @@ def read_photographs(
         half = int(WINDOW * min(p.target.side_px for p in both))
         sharp_levels, blurred_levels = (p.target.window(original[p.file], half) for p in both)
         return Capture(
-            *(p.target.window(p.light, half) for p in both),
-            distance_m=blurred.distance_m,
+            sharpest.target.window(sharpest.light, half),
+            blurred.target.window(blurred.light, half),
+            blurred.distance_m,
             files=(str(Path(folder) / sharpest.file), str(Path(folder) / blurred.file)),
             white=1.0 if sharpest.clipped else None,
             colours=(colours_of(sharpest, half), colours_of(blurred, half)) if colours == "each" else None,

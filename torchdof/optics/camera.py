@@ -11,8 +11,7 @@ Sign and axis conventions are stated here once; every other module links to this
 * A lens whose axis points ``swing`` to the right and ``tilt`` down, while the sensor stays, is in focus on a plane
   through the focus distance on the image's axis (Scheimpflug): ``1/s`` above becomes ``1/s + (n_x x + n_y y) / (F f)``,
   with ``(n_x, n_y) = (sin swing cos tilt, sin tilt)`` and ``(x, y)`` the pixel's place from the image's centre, to the
-  right and down. All such planes of one tilt meet ``f / sin tilt`` below the lens (the hinge). The image distance is
-  that of the lens when it is straight.
+  right and down. The image distance is that of the lens when it is straight.
 * ``focus_range_m=(near, far)`` is sharp between both distances. Nearer than ``near`` the blur is that of a lens focused
   on ``near``; farther than ``far``, that of a lens focused on ``far``.
 
@@ -144,8 +143,7 @@ class Camera:
     def coc_px(self, depth: Tensor, width: int) -> Tensor:
         """Signed radius of the circle of confusion.
 
-        Finite distances give ``1/s - 1/z`` as ``(z - s) / (z s)``, which does not cancel near focus. The result is
-        exactly 0 at ``z = s`` and exactly ``(A / 2) F / s`` at infinity.
+        The result is exactly 0 at ``z = s`` and exactly ``(A / 2) F / s`` at infinity.
 
         Args:
             depth: ``[B, 1, H, W]`` (or ``[1, 1, H, W]``, broadcast over the camera's batch), metres, > 0, ``inf``
@@ -270,16 +268,13 @@ class Camera:
 def _dioptres_behind(z: Tensor, s: Tensor) -> Tensor:
     """``1/s - 1/z``, exactly 0 at ``z = s``, for finite and infinite distances."""
     both_finite = torch.isfinite(z) & torch.isfinite(s)
-    z_safe = torch.where(both_finite, z, 1.0)
-    s_safe = torch.where(both_finite, s, 1.0)
+    z_safe, s_safe = torch.where(both_finite, z, 1.0), torch.where(both_finite, s, 1.0)
     return torch.where(both_finite, (z_safe - s_safe) / z_safe / s_safe, 1.0 / s - 1.0 / z)
 
 
 def _show(value: Number) -> str:
-    if isinstance(value, Tensor):
-        values = [f"{x:.6g}" for x in value.detach().flatten().tolist()]
-        return values[0] if len(values) == 1 else "[" + ", ".join(values) + "]"
-    return f"{value:.6g}"
+    values = [f"{x:.6g}" for x in (value.detach().flatten().tolist() if isinstance(value, Tensor) else [value])]
+    return values[0] if len(values) == 1 else f"[{', '.join(values)}]"
 
 
 def _check_number(name: str, value: Any, low: float = 0.0, high: float = math.inf) -> None:
