@@ -146,10 +146,8 @@ def trace_table(
         cocs, channels = place_nodes(d_line, near, far, nodes), coloured or [d_line]
         fitted = [[tracer.fitted(coc) for coc in cocs] for tracer in channels]
         residuals = [[tracer.error(coc, *tracer.fitted(coc)) for coc in cocs] for tracer in channels]
-        spots = None
-        if field is not None:
-            places = coc_nodes(near, far, field_nodes), field
-            spots = trace_field(stopped, sensor, distance, *places, wavelengths_um, field_rays)
+        places = coc_nodes(near, far, field_nodes), field or ()
+        spots = None if field is None else trace_field(stopped, sensor, distance, *places, wavelengths_um, field_rays)
     arguments |= {"nearest_m": nearest_m, "rays": rays}
     call = ", ".join(f"{key}={value!r}" for key, value in arguments.items() if key != "lens")
     provenance = {

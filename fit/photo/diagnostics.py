@@ -127,7 +127,7 @@ def bic_of(solution: Solution) -> float:
         parameters = int(np.sum(np.asarray(solution.params["values"]) > 0))
     # correlated neighbours are not independent samples
     count = max(round(pair.values.size * independent_share(pair.noise_correlation)), 1)
-    variance = max(solution.squares / pair.values.size + (1e-6 * pair.unit) ** 2, np.finfo(float).tiny)
+    variance = max(float(np.mean(solution.residual**2)) + (1e-6 * pair.unit) ** 2, np.finfo(float).tiny)
     return count * float(np.log(variance)) + parameters * float(np.log(count))
 
 

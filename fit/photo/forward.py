@@ -232,8 +232,3 @@ class Solution:
     def residual(self) -> Array:
         """Data minus model `[pixels used]`."""
         return self.pair.values - self.fitted
-
-    @property
-    def squares(self) -> float:
-        """Sum of squared residuals."""
-        return float(self.residual @ self.residual)

@@ -134,12 +134,11 @@ def fit_pair(
             free_pair = replace(pair, fit_moves=ALL_MOVES)
             free = solve_radial(free_pair, solution.moves, end, knots) if free_profile else free_pair.solve(family)
             # scale of chi squared: the residual or, without noise, a spline's rounding; correlated noise counts less
-            scale = max(free.squares / pair.values.size, (1e-4 * pair.unit) ** 2)
-            chi_gain = (solution.squares - free.squares) / scale * independent_share(pair.noise_correlation)
-            if chi_gain > _MIN_CHI_GAIN:
+            squares, free_squares = (float(one.residual @ one.residual) for one in (solution, free))
+            scale = max(free_squares / pair.values.size, (1e-4 * pair.unit) ** 2)
+            if (squares - free_squares) / scale * independent_share(pair.noise_correlation) > _MIN_CHI_GAIN:
                 pair, freest, solution = free_pair, free, free
-        why, opening = "", None
-        pair.held_magnification = freest.moves["magnification"]
+        why, opening, pair.held_magnification = "", None, freest.moves["magnification"]
         if free_profile and family == "auto":
             # every family at the free profile's magnification; the chosen one is then fitted with it
             held_pair = replace(pair, fit_moves=("dx", "dy"))
@@ -187,9 +186,9 @@ def prepared_pair(
         return Forward(point_source(data.shape, data_dot), data, used, data_dot, magnification), None, False
     dot = find_dot(sharp_picture, file=files[0])
     check_blacks(sharp_picture, dot, files[0])
-    is_unclipped = used_pixels(sharp_picture, dot, white, files[0], refuse=False)
-    clipped = int(np.sum(~is_unclipped))
-    edge = soft_edge(sharp_picture, dot, white=float(sharp_picture[~is_unclipped].min()) if clipped else None)
+    clipped_levels = sharp_picture[~used_pixels(sharp_picture, dot, white, files[0], refuse=False)]
+    clipped = clipped_levels.size
+    edge = soft_edge(sharp_picture, dot, white=float(clipped_levels.min()) if clipped else None)
     if softness is not None and softness < edge.softness:
         source, edge = "dot", edge.with_softness(softness)
     linear = clipped > 0 or softness is not None or check_linearity(sharp_picture, dot, edge, files[0])
