@@ -182,7 +182,7 @@ def bare(family: str, coc: list[float], params: dict[str, Any]) -> dict[str, Any
     ("changes", "message"),
     [
         ({"schema": "lut"}, "schema must be 'torchdof/blur-table', got 'lut'"),
-        ({"version": 4}, "version must be 1 or 2 or 3, got 4; update torchdof"),
+        ({"version": 4}, "version must be one of .1, 2, 3., got 4; update torchdof"),
         ({"family": None}, "a blur table must have the fields .*; family is missing"),
         ({"lens": "50 mm"}, "a blur table must have the fields .*; 'lens' is not one"),
         ({"family": "box"}, "family must be one of gaussian, ring"),

@@ -57,8 +57,7 @@ class BlurTable:
         unit: ``"fraction"`` of the image's width, ``"mm"`` on a sensor of ``sensor_width_mm``, or ``"relative"``: only
             the ratio of lengths to coc matters (one node a side).
         sensor_width_mm: Width of the sensor on which the millimetres were measured; with ``unit="mm"`` only.
-        strength: The fitted strength N at the nodes ``[N]``, kept as measured. It does not enter rendering: kernels
-            conserve energy.
+        strength: The fitted strength N at the nodes ``[N]``, as measured; rendering conserves energy instead.
         name: Short name.
         provenance: Origin of the numbers (camera, source, date, command): a JSON-like dict.
         residual: Relative residual of the fit at each node ``[N]``.
@@ -321,10 +320,7 @@ class BlurTable:
         return 1.0 - in_focus[:, in_focus.shape[-2] // 2, in_focus.shape[-1] // 2]
 
     def side_nodes(self, sign: int) -> tuple[Tensor, dict[str, Tensor]]:
-        """Nodes of one side of focus, -1 in front of it, ordered by ``|coc|`` from 0, in the table's unit.
-
-        Unsigned coc ``[N]`` and parameters ``[channels, N]``; a side without nodes has those of the other.
-        """
+        """Unsigned coc ``[N]``, from 0, and parameters ``[channels, N]`` at the nodes of a side, or else the other."""
         return self._sides.get(sign) or self._sides[-sign]
 
     def reach_px(self, coc_px: float, width: float) -> float:
@@ -388,8 +384,7 @@ class BlurTable:
         if not isinstance(schema, str) or schema != _SCHEMA:
             raise ValueError(f"schema must be {_SCHEMA!r}, got {show(schema)}; is this a blur table?")
         if not isinstance(version, int) or version not in _VERSIONS:
-            readable = " or ".join(map(str, _VERSIONS))
-            raise ValueError(f"version must be {readable}, got {show(version)}; update torchdof to read it")
+            raise ValueError(f"version must be one of {_VERSIONS}, got {show(version)}; update torchdof to read it")
         given = fields("a blur table", data, ("schema", "version", "family", "unit", "coc", "params"), _OPTIONAL)
         del given["schema"], given["version"]
         for name, part in (("aperture", Aperture), ("field", Field)):

@@ -91,8 +91,8 @@ class KernelBank:
         self._moved_in_focus = functools.lru_cache(_MAX_WIDTHS)(lambda width: table.moved_in_focus(width).tolist())
         self._found: dict[float, float] = {}
         self._light_and_moment = functools.lru_cache(None)(self._summed)
+        sides = [table.side_nodes(sign) for sign in (-1, 1)]
         with torch.inference_mode(False), torch.no_grad():
-            sides = [table.side_nodes(sign) for sign in (-1, 1)]
             reaches = [psf.reach(table.family, nodes, table.aperture) for _, nodes in sides]  # [C, N]
         self._nodes = [nodes for _, nodes in sides]
         self._distances: list[list[float]] = [distances.tolist() for distances, _ in sides]
@@ -242,9 +242,9 @@ class KernelBank:
     def variance_px(self, coc_px: float, width: float, scale: float) -> float:
         """Second moment of a kernel, mean of both axes and of colours, in squared pixels of a layer (``scale`` px)."""
         place = self._place(coc_px, width)
-        low, high = (self._light_and_moment(place.side, place.node + above) for above in (0, 1))
+        nodes = (self._light_and_moment(place.side, place.node + above) for above in (0, 1))
         total = 0.0
-        for below, above, reach in zip(low, high, place.reach, strict=True):
+        for below, above, reach in zip(*nodes, place.reach, strict=True):
             light, moment = (a + place.part * (b - a) for a, b in zip(below, above, strict=True))
             total += moment / light * (reach / scale) ** 2
         return total / self.colours
@@ -259,10 +259,7 @@ class KernelBank:
         return [(float(cells.sum()), float((cells * square).sum())) for cells in template]
 
     def kept(self, sign: float, find: Callable[["KernelBank", float, float], float]) -> float:
-        """A number that depends only on the blur on one side of focus, computed once: ``find(bank, coc_px, width)``.
-
-        The coc is 1 or -1 pixel, and the width is that of the image in which the last node of the side has this coc.
-        """
+        """``find(bank, coc_px, width)``, computed once, at a coc of ``sign`` px, that of the last node of the side."""
         sign = 1.0 if self._mirrored and self.table.is_round else sign
         if sign not in self._found:
             outermost = float(self._distances[sign > 0][-1]) * self.table.px_per_unit(1.0)
@@ -274,8 +271,8 @@ class KernelBank:
         params = {name: values[:, node] for name, values in self._nodes[side].items()}
         template = psf.template(self.table.family, params, _LEAST_CELLS << level, self.table.aperture)
         if not bool((template.detach().sum((-2, -1)) > 0).all()):
-            problem = f"the aperture passes no light of a {self.table.family}"
-            raise ValueError(f"{problem}: its mask is open where the profile is dark; open it nearer the middle")
+            remedy = "its mask is open where the profile is dark; open it nearer the middle"
+            raise ValueError(f"the aperture passes no light of a {self.table.family}: {remedy}")
         return template
 
     @torch.inference_mode(False)
