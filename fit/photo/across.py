@@ -101,9 +101,9 @@ def _spot(
         angles = np.linspace(0.0, 2.0 * math.pi, azimuths, endpoint=False) if azimuths else [math.atan2(y, x)]
         for angle in angles:
             sine, cosine = math.sin(angle), math.cos(angle)
-            for side in (1.0, -1.0):
-                grid = torch.stack([u * cosine - side * v * sine, u * sine + side * v * cosine], -1)[None]
+            for half in (v, -v):
+                grid = torch.stack([u * cosine - half * sine, u * sine + half * cosine], -1)[None]
                 grid = grid * (2.0 * _KERNEL_HALF / kernel.shape[-1])
-                sampled = functional.grid_sample(kernel, grid, align_corners=False)[0]
-                total += sampled / (len(angles) * sampled.sum((-2, -1), keepdim=True))
+                light = functional.grid_sample(kernel, grid, align_corners=False)[0]
+                total += light / (len(angles) * light.sum((-2, -1), keepdim=True))
     return reach, total / (2 * len(group))

@@ -207,10 +207,8 @@ def cut_pairs(
             text = f"the frame cuts the blur: it reaches {needed:.0f} px from the dot, the frame ends after {half} px"
             raise FitError(text, "window", str(pictures[border_px[0] >= both[0].reach + 2].file))
         cuts = [(..., slice(y - half, y + half + 1), slice(x - half, x + half + 1)) for x, y in centres]
-        windows, colours = (
-            (getattr(sharp, name)[cuts[0]].copy(), getattr(blurred, name)[cuts[1]].copy())
-            for name in ("light", "colours")
-        )
+        windows = sharp.light[cuts[0]].copy(), blurred.light[cuts[1]].copy()
+        colours = sharp.colours[cuts[0]].copy(), blurred.colours[cuts[1]].copy()
         for picture, window in zip(pictures, windows, strict=True):
             if (count := len(find_dots(window, file=str(picture.file)))) > 1:
                 text = f"{count} dots in a window of {2 * half + 1} px: print the dots farther apart than their blur"

@@ -121,10 +121,9 @@ def fine_share_inside(picture: Array, dot: Dot) -> float | None:
     inside = inner_pixels(picture, dot)
     if inside is None:
         return None
-    rows, columns = np.nonzero(inside)
+    (rows, columns), levels = np.nonzero(inside), picture[inside]
     x, y = (columns - dot.x) / dot.radius, (rows - dot.y) / dot.radius
     light = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)  # uneven light
-    levels = picture[inside]
     residual = levels - light @ np.linalg.lstsq(light, levels, rcond=None)[0]
     variance = float(residual @ residual) / (levels.size - light.shape[1])
     return min(fine_variance(picture, inside) / variance, 1.0) if variance > 0 else 1.0
@@ -178,8 +177,7 @@ def noise_of(picture: Array) -> float:
     differences = _mixed_differences(picture)
     # near the border, away from the dot's edges
     magnitudes = np.abs(differences[_near_border(differences.shape, max(3, min(picture.shape) // 5))])
-    # pixels of a mosaic differ in noise, so use the mean square, without outliers. If most pixels are interpolated (one
-    # colour of a mosaic), the others carry the noise
+    # a mosaic's pixels differ in noise, so use the mean square, without outliers; interpolated ones may have none
     typical = 1.4826 * float(np.median(magnitudes))
     typical = typical if typical > 1e-9 * float(np.abs(picture).max()) else float(np.percentile(magnitudes, 90))
     return float(np.sqrt(np.mean(magnitudes[magnitudes <= 5 * typical] ** 2)))
@@ -216,8 +214,7 @@ def correlation_of(values: Array, is_used: Mask) -> Array:
     lags = tuple(slice(n - 1 - LAGS, n + LAGS) for n in values.shape)
     sums, pairs = (correlated(p, p, method="fft")[lags] for p in (clipped, is_used.astype(np.float64)))
     pairs = np.maximum(np.round(pairs), 1.0)
-    correlation = sums / pairs
-    correlation = correlation / max(float(correlation[LAGS, LAGS]), np.finfo(float).tiny)
+    correlation = sums / pairs / max(float(sums[LAGS, LAGS] / pairs[LAGS, LAGS]), np.finfo(float).tiny)
     # correlation makes the estimates at other lags less certain
     significant = np.where(np.abs(correlation) > _MIN_SIGMAS / np.sqrt(pairs), correlation, 0.0)
     threshold = _MIN_SIGMAS * np.sqrt(np.sum(significant**2) / pairs)
@@ -250,7 +247,6 @@ def noise_beside(picture: Array, background: float, dark: Mask) -> tuple[Array, 
     correlation = correlation_of(residual, dark)
     if dark.sum() < _MIN_PIXELS:
         return correlation, 1.0
-    # use the paper's own spread: an insignificant part of the correlation would raise the fine share, and a mosaic's
-    # noise differs between pixels
+    # the paper's own spread, because an insignificant part of the correlation would raise the fine share
     spread = 1.4826 * float(np.median(np.abs(residual[dark] - np.median(residual[dark]))))
     return correlation, min(max((noise_of(picture) / spread) ** 2, _MIN_FINE_SHARE), 1.0) if spread > 0 else 1.0

@@ -189,7 +189,7 @@ def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> N
     is_large = np.maximum(expected, measured) > _MIN_BLUR_PX
     difference = np.maximum(np.abs(measured - expected) - 0.5, 0.0)  # half a pixel is for aberrations
     misfit = np.log1p(difference / np.maximum(np.minimum(measured, expected), 1e-9))
-    misfit_log = float(np.max(np.where(is_large, misfit, 0.0)))
+    misfit_log = float(np.max(misfit * is_large))
     # without a camera the scale is fitted to the distances themselves
     if int(is_large.sum()) < (3 if camera_px is None else 1) or misfit_log < _WARN_LOG:
         return
@@ -225,8 +225,7 @@ def _seen(opening: Aperture, pair: Capture, focus_m: float) -> Aperture:
 def _fit_one(pair: Capture, focus_m: float, family: str, **options: Any) -> BlurFit:
     """Fits one pair by `fit_pair`."""
     expected = {"magnification": focus_m / pair.distance_m, "knots": _KNOTS if family == "radial" else None}
-    options = {"white": pair.white, "files": pair.files, **expected, **options}
-    return fit_pair(pair.sharp, pair.blurred, family, **options)
+    return fit_pair(pair.sharp, pair.blurred, family, white=pair.white, files=pair.files, **expected | options)
 
 
 def _fit_like(fit: BlurFit, pair: Capture, focus_m: float, sharp: Array, blurred: Array, **options: Any) -> BlurFit:
@@ -259,5 +258,4 @@ def _fit_colours(pair: Capture, focus_m: float, mean: BlurFit) -> list[BlurFit]:
     # the sharpest colour's softness is used for all, so that each kernel contains all of its colour's blur
     softness = min(soft_edge(sharp, find_dot(sharp, file=pair.files[0])).softness for sharp in sharp_colours)
     fixed: dict[str, Any] = {"magnification": mean.magnification, "fit_magnification": False, "softness": softness}
-    windows = zip(sharp_colours, blurred_colours, strict=True)
-    return [_fit_like(mean, pair, focus_m, sharp, blurred, **fixed) for sharp, blurred in windows]
+    return [_fit_like(mean, pair, focus_m, *both, **fixed) for both in zip(sharp_colours, blurred_colours, strict=True)]
