@@ -141,8 +141,8 @@ def used_pixels(picture: Array, dot: Dot, white: float | None, file: str | None,
     bright = picture > dot.background + 0.15 * dot.peak
     share = float(np.sum(clipped & bright)) / max(int(bright.sum()), 1)
     if refuse and share > _MAX_CLIPPED:
-        text = f"{100 * share:.0f} % of the blurred dot's pixels are clipped at {level:.4g}, at most "
-        raise FitError(f"{text}{100 * _MAX_CLIPPED:.0f} % may be: expose less", "saturated", file)
+        text = f"{100 * share:.0f} % of the blurred dot's pixels are clipped at {level:.4g}; at least "
+        raise FitError(f"{text}{100 - 100 * _MAX_CLIPPED:.0f} % must be below: expose less", "saturated", file)
     if refuse:
         text = f"{count} pixels of the blurred picture are clipped at {level:.4g} and were left out; expose less"
         warn(text, "saturated", file)
