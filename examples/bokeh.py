@@ -46,9 +46,9 @@ def lenses() -> dict[str, BlurTable]:
     return {
         "perfect": BlurTable.disc(),
         "seven blades": BlurTable.polygon(7, rotation_deg=12.0, curvature=0.2),
-        "double Gauss": traced.with_aperture(Aperture(blades=9, curvature=0.6)),
+        "double Gauss": traced.replace(aperture=Aperture(blades=9, curvature=0.6)),
         "anamorphic": BlurTable.polygon(9, curvature=1.0, squeeze=2.0, rim=0.7),
-        "cat's eyes": BlurTable.disc().with_aperture(Aperture(vignetting=0.45)),
+        "cat's eyes": BlurTable.disc().replace(aperture=Aperture(vignetting=0.45)),
         "heart": BlurTable.from_aperture(heart),
     }
 

@@ -23,7 +23,7 @@ from torchdof.fit.lens.lens import Lens
 from torchdof.fit.lens.spot import Spot, focus_sensor, point_spread
 from torchdof.fit.plots import picture_of_fit
 from torchdof.io.images import Picture, write_image
-from torchdof.optics.psf import pixel_kernels
+from torchdof.optics.psf import pixel_kernels, profile, support
 from torchdof.reference.metrics import psnr
 
 FOCUS_M, PAPER_M = 0.20, 0.50  # distances of the dot in focus and out of focus
@@ -170,9 +170,15 @@ def quad(width: int, height: int, side: float) -> torch.Tensor:
 
 def draw_texture(table: torchdof.BlurTable, coc_px: float, width: int, file: Path) -> None:
     """Fig. 3: the blur texture at a signed circle of confusion, for an image `width` px wide."""
+    params = table.params(torch.tensor(coc_px), width)
+    half = int(np.ceil(support(table.family, params)))
+    offset = torch.arange(-half, half + 1, dtype=torch.float64)
+    r = torch.hypot(offset[:, None], offset)
+    strength = 1.0 if table.strength is None else float(table.strength[0])
+    texture = strength * profile(table.family, r.flatten(), params)[0].reshape(r.shape)
     figure = Figure(figsize=(4.2, 3.6), layout="constrained")
     axes = figure.subplots()
-    image = axes.imshow(table.blur_texture(coc_px, width)[0].numpy(), cmap="gray", vmin=0)
+    image = axes.imshow(texture.numpy(), cmap="gray", vmin=0)
     figure.colorbar(image, ax=axes, label="blur strength")
     axes.set_title(f"blur texture, coc {coc_px:+.1f} px", fontsize=9)
     figure.savefig(file)

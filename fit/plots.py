@@ -55,11 +55,10 @@ def _model_line(fit: BlurFit) -> tuple[Array, Array]:
 
 def sheet_of_photographs(photographs: Photographs, result: TableFit, blur: Callable[..., torch.Tensor]) -> Figure:
     """Draws each distance's target, dot, fit, residual and kernel; and lights, by `blur`: `torchdof.blur_by_coc`."""
-    captures = photographs.captures
-    rows = len(captures)
+    captures, table = photographs.captures, result.table
+    rows, by_distance = len(captures.pairs), {p.distance_m: p for p in photographs.pictures}
     figure, axes = _new_figure(12.5, 2.1 * rows + 2.6, 5, rows + 1)
-    by_distance = {p.distance_m: p for p in photographs.pictures}
-    for panels, pair, fit, coc in zip(axes, captures, result.fits, result.coc_px, strict=False):
+    for panels, pair, fit, coc in zip(axes, captures.pairs, result.fits, result.coc_px, strict=False):
         photograph_axes, window, profile, residual, kernel = panels
         picture = by_distance[pair.distance_m]
         target, half, step = picture.target, picture.target.side_px / 2, max(1, picture.light.shape[1] // 300)
@@ -73,14 +72,13 @@ def sheet_of_photographs(photographs: Photographs, result: TableFit, blur: Calla
         residual.plot(fit.samples[0], fit.samples[1] - fit.curve[1], ".", color=_DATA, markersize=1.5)
         residual.axhline(0, color=_MODEL, linewidth=1)
         residual.set_title(f"residual {fit.residual_over_noise:.2f} x noise", fontsize=8)
-        kernels = result.table.kernels(torch.tensor([coc], dtype=torch.float64), captures.width_px)
+        kernels = table.kernels(torch.tensor([coc], dtype=torch.float64), captures.width_px)
         _show(kernel, kernels[0, 0].detach().numpy(), f"kernel at coc {coc:+.2f} px")
     for unused in axes[rows]:
         unused.remove()
     scene = 0.15 + 0.1 * (np.arange(720) // 12 % 2) * np.ones((90, 1))  # small lights on stripes
     scene[44:46, 18::36] = 25.0
     coc_px = torch.linspace(min(0.0, *result.coc_px), max(0.0, *result.coc_px), 720).expand(1, 1, 90, 720)
-    table = result.table
     if table.sensor_width_mm is not None:  # the scene has its own share of the sensor
         table = table.replace(sensor_width_mm=table.sensor_width_mm * scene.shape[1] / captures.width_px)
     lights = blur(torch.from_numpy(scene).float()[None, None], coc_px, table=table)[0, 0].double().numpy()

@@ -19,10 +19,9 @@ class BlurFit:
 
     Attributes:
         family: "gaussian", "ring", "disc", "softm" or "radial"; or, where the blur is not round, "polygon" or "image":
-            a disc of `params["radius"]` seen through the `aperture`, as in `BlurTable.polygon` and `from_aperture`.
+            a disc of `params["radius"]` seen through the `aperture`.
         params: the family's parameters (see `torchdof.optics.psf.FAMILIES`), lengths in the caller's unit (pixels for
-            `fit_pair`). Floats, except the array "values" [P] of `radial`. A profile fit (`fit_profile`, model "ratio")
-            also has the strength "N".
+            `fit_pair`). Floats, except the array "values" [P] of `radial`. A profile fit also has the strength "N".
         stderr: one standard error for each parameter, calibrated against repeated simulated captures.
         radius: of the uniform disc with the same second moment as the PSF (forward model), px; NaN for a profile.
         radius_stderr: its standard error. The radius is well determined even if single parameters are correlated.
@@ -36,12 +35,10 @@ class BlurFit:
         shift: the fitted displacement (x, y) of the blurred dot against the sharp one, px.
         centre: (x, y) of the blurred dot in its picture, px from the centre of pixel (0, 0).
         magnification: the fitted size of the dot in the blurred picture over its size in the sharp one.
-        aperture: the lens's opening as seen in the defocused picture (rotated by half a turn in front of the focus);
-            None for a round kernel.
+        aperture: the lens's opening as seen in the defocused picture; None for a round kernel.
         asymmetry: share of the blur's light that depends on the angle but is not in the kernel; NaN if unknown.
         why: one sentence on the choice of the family.
-        samples: radii and strengths [2, n] for plotting.
-        curve: the fitted curve for plotting, [2, m].
+        samples: radii and strengths [2, n], for plotting; curve: the fit at radii [2, m].
     """
 
     family: str
@@ -80,10 +77,8 @@ class BlurFit:
         for name, value in self.params.items():
             array_text = f"  {name}: {np.size(value)} numbers, largest {np.max(value):.4g}"
             lines.append(array_text if np.ndim(value) else f"  {name} = {value:.6g} ± {self.stderr[name]:.2g}")
-        ratio = self.residual_over_noise
-        noise = "" if math.isnan(ratio) else f", {ratio:.2f} x the noise"
-        lines.append(f"  residual {100 * self.residual:.2f} %{noise}")
+        lines.append(f"  residual {100 * self.residual:.2f} %, {self.residual_over_noise:.2f} x the noise")
         if self.model == "forward":
             (x, y), size = self.shift, self.magnification
             lines.append(f"  gain {self.gain:.4g}, shift ({x:+.2f}, {y:+.2f}) px, magnification {size:.4f}")
-        return "\n".join([*lines, *([f"  {self.why}"] if self.why else [])])
+        return "\n".join([*lines, f"  {self.why}"]).rstrip()

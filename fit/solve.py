@@ -23,10 +23,9 @@ def best_of(
     jacobian: Callable[[Array], Array] | None = None,
     tolerance: float = _TOLERANCE,
 ) -> Array:
-    """Fits roughly from every start, finishes from the best, and returns the parameters.
+    """Fits roughly from every start, finishes from the best, and returns the parameters, or raises "not converged".
 
-    The model maps parameters `[p]` to a prediction of the data `[n]`, its jacobian to `[n, p]`; all are of order 1. It
-    is an error of kind "not converged" if no start converged.
+    The model maps parameters `[p]` to a prediction of the data `[n]`, its jacobian to `[n, p]`; all are of order 1.
     """
     low, high = (np.asarray(bound, dtype=np.float64) for bound in bounds)
     # starts on a bound would be stuck: the trust region vanishes there
@@ -39,10 +38,8 @@ def best_of(
             jac=jacobian or "3-point",
             bounds=(low, high),
             x_scale="jac",
-            ftol=tolerance,
-            xtol=tolerance,
-            gtol=tolerance,
             max_nfev=_MAX_EVALUATIONS,
+            **dict.fromkeys(("ftol", "xtol", "gtol"), tolerance),
         )
         return (result.cost if result.success and np.isfinite(result.cost) else np.inf), result.x
 

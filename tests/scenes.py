@@ -251,7 +251,7 @@ CASES = [
     Case("even light, a depth of its own for every pixel", [r * noise(2) for r in (1.0, 8.0, 30.0)], itself, even(0.75),
          float32=1.2e-6, float16=0.0),
     Case("even light, cat's eyes", [slope(-12, 14)], itself, even(0.75), float32=1.2e-6, float16=0.0,
-         options={"table": BlurTable.disc().with_aperture(Aperture(vignetting=0.4))}),
+         options={"table": BlurTable.disc().replace(aperture=Aperture(vignetting=0.4))}),
     Case("even light, one near pixel before infinity", [_with(whole(0.0), 12, 16, value=-30.0)], light=even(0.75),
          **_EVEN),
     Case("2001 layers accumulated", [torch.linspace(-1.5, 1.5, HEIGHT * WIDTH).reshape(1, 1, HEIGHT, WIDTH)],

@@ -49,9 +49,9 @@ LENSES = {
     "triangle": BlurTable.polygon(3, 20.0, squeeze=1.6),
     "blades": BlurTable.polygon(5, 7.0, 0.4, rim=2.0),
     "image": BlurTable.from_aperture(torch.eye(9).cumsum(0)[:, :6], squeeze=1.2),
-    "cat's eyes": BlurTable.disc().with_aperture(Aperture(vignetting=0.4)),
+    "cat's eyes": BlurTable.disc().replace(aperture=Aperture(vignetting=0.4)),
     "squeezed cat's eyes": BlurTable.polygon(5, 10.0, squeeze=1.5, vignetting=(0.6, 0.2)),
-    "cat's eyes by colour": BY_COLOUR.with_aperture(Aperture(vignetting=0.5)),
+    "cat's eyes by colour": BY_COLOUR.replace(aperture=Aperture(vignetting=0.5)),
     "spots across the field": lens_with_a_field(),
 }
 

@@ -130,7 +130,7 @@ class DepthOfFieldNode:
         ideal = {"disc": BlurTable.disc, "gaussian": BlurTable.gaussian}
         table = ideal[lens]() if lens in ideal else BlurTable.load(lens)
         if _SHAPES[shape] or squeeze != 1.0:
-            table = table.with_aperture(Aperture(_SHAPES[shape] or 0, rotation_deg, squeeze=squeeze))
+            table = table.replace(aperture=Aperture(_SHAPES[shape] or 0, rotation_deg, squeeze=squeeze))
         coc_px = camera.coc_px(metres, width).expand(len(light), -1, -1, -1)
         advance, rendered = _progress(len(light)), []
         with torch.no_grad():

@@ -47,9 +47,7 @@ class Rays(NamedTuple):
 
     position: Array  # [3, R] in mm: x, y, z with z = 0 at the first vertex
     direction: Array  # unit vectors [3, R]
-    # [R]; False if a ray missed a surface, hit outside a clear diameter, was totally reflected, or met a surface before
-    # the one in front of it (two surfaces that intersect at their rims)
-    alive: Mask
+    alive: Mask  # [R]; False if blocked, totally reflected, or beyond the rim where two surfaces intersect
 
     def at(self, z: float) -> Array:
         """Intersection of the rays, or their backward extensions, with the plane at z: x and y ``[2, R]`` in mm."""
@@ -125,9 +123,9 @@ class Lens:
             raise ValueError(f"lens {self.name!r} must have a positive focal length: it does not converge light")
         if abs(to_stop[0, 0]) < 1.0 / _MAX_MM:
             raise ValueError(f"lens {self.name!r} must have its entrance pupil somewhere: its stop is seen at infinity")
-        focal, pupil = -1.0 / c, self.surfaces[self.stop].diameter / abs(float(to_stop[0, 0]))
-        pupil_z = float(to_stop[0, 1] / to_stop[0, 0])
-        return Paraxial(focal, a * focal, (1.0 - d) * focal, (a - 1.0) * focal, pupil_z, pupil, focal / pupil)
+        focal, (scale, offset) = -1.0 / c, to_stop[0].tolist()
+        pupil = self.surfaces[self.stop].diameter / abs(scale)
+        return Paraxial(focal, a * focal, (1.0 - d) * focal, (a - 1.0) * focal, offset / scale, pupil, focal / pupil)
 
     def with_stop(self, diameter: float) -> Lens:
         """The lens with its stop opened or closed to a diameter in millimetres."""
@@ -141,16 +139,6 @@ class Lens:
         if f_number * _F_NUMBER_ROUNDING < open_at:
             raise ValueError(f"f_number must be at least {open_at:.3g} for lens {self.name!r}, got {f_number:g}")
         return self.with_stop(self.surfaces[self.stop].diameter * min(1.0, open_at / f_number))
-
-    def scaled(self, focal_length_mm: float) -> Lens:
-        """The lens scaled to another focal length; its f-number is unchanged."""
-        factor = number("focal_length_mm", focal_length_mm, 0, 1e9) / self.paraxial().focal_length
-        surfaces = []
-        for surface in self.surfaces:
-            lengths = {name: getattr(surface, name) * factor for name in ("radius", "thickness", "diameter")}
-            polynomial = tuple(a / factor ** (2 * i + 1) for i, a in enumerate(surface.polynomial))
-            surfaces.append(replace(surface, **lengths, polynomial=polynomial))
-        return replace(self, surfaces=tuple(surfaces))
 
     def lines(self) -> list[str]:
         """The surfaces as lines of a prescription file, which :meth:`read` turns back into the same lens."""

@@ -16,11 +16,10 @@ dispersion P_gF, as listed in glass catalogues; an index alone is the same at an
 may be the name of a glass: one of SCHOTT's (``N-BK7``), or one defined on an earlier line by its coefficients of
 Sellmeier's formula, ``glass NAME B1 B2 B3 C1 C2 C3``. ``#`` starts a comment; ``# source:`` is kept.
 
-Of a Zemax file (.zmx) the sequential subset of camera lenses is read: the unit and, for each surface, curvature,
-thickness, clear semi-diameter, glass, conic constant, even asphere, and whether it is the stop. The first surface is
-the object and the last the sensor; flat surfaces in air, except the stop, are skipped. Glasses are SCHOTT's by name,
-otherwise they have the file's index and Abbe number. Mirrors, tilts, other kinds of surfaces and apertures, and several
-configurations raise errors.
+Of a Zemax file (.zmx) the unit is read and, for each surface, curvature, thickness, clear semi-diameter, glass, conic
+constant, even asphere, and whether it is the stop. The first surface is the object and the last the sensor; flat
+surfaces in air, except the stop, are skipped. Glasses are SCHOTT's by name, otherwise they have the file's index and
+Abbe number. Mirrors, tilts, other surfaces and apertures, and several configurations raise errors.
 """
 
 import math

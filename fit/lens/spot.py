@@ -2,8 +2,7 @@
 
 Object distances ``z`` are in metres along the axis from the front principal plane, as in the thin lens formula of
 :class:`torchdof.Camera`. Depth in computer vision starts at the entrance pupil, a tape measure's distance at the first
-surface: add ``paraxial().front_principal`` minus ``paraxial().entrance_pupil`` or 0, in mm. For the 50 mm double Gauss
-at 2 m this is up to 7 cm, and changes the blur of an object at 1 m by 10 %.
+surface: add ``paraxial().front_principal`` minus ``paraxial().entrance_pupil`` or 0, in mm.
 """
 
 import math
@@ -26,9 +25,7 @@ Focus = Literal["best", "paraxial"]
 _PUPIL_INTERVALS = 64  # grid intervals along each side of a box in the pupil
 _FAN_RAYS = 4096
 _MAX_DISTANCE_M = 1e12
-
-# Spots over the field
-_CELLS = (128, 64)  # of half a spot, along and across the radial direction
+_CELLS = (128, 64)  # of half a spot over the field, along and across the radial direction
 _SPACING_POWER = 1.5  # coc grows with this power of the node's index
 _CHIEF_STOP = 0.1  # diameter, relative to the stop's, of the small stop that defines a position in the sharp image
 _CHIEF_RAYS = 900
@@ -44,7 +41,6 @@ class Spot:
     weight: Array  # share of the light of each hit [R]; sums to 1
     centre: float  # the centroid's distance from the axis, along the image's field direction
     pupil_mm2: float  # unvignetted area of the entrance pupil, to about 1 %; off axis over on axis: vignetting
-    meridional: bool = False  # a spot on the axis, traced as one fan along y that represents its rotation
 
     @property
     def r(self) -> Array:
@@ -64,8 +60,6 @@ class Spot:
     @property
     def asymmetry(self) -> float:
         """Rms of the harmonics 1 to 4 of the light around 16 rings of equal light, over its mean: 0 if round."""
-        if self.meridional:
-            return 0.0
         order = np.argsort(self.r)
         light = self.weight[order]
         ring = np.minimum((np.cumsum(light) * 16).astype(int), 15)
@@ -84,12 +78,11 @@ def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best") -> float:
         ValueError: If the object is too near for focusing, or an argument is invalid.
     """
     choice("focus", kind, get_args(Focus))
-    paraxial, object_mm = lens.paraxial(), _vertex_distance_mm(lens, focus_m)
-    distance = object_mm + paraxial.front_principal
-    if distance <= paraxial.focal_length:
-        least = f"the focal length ({paraxial.focal_length:.4g} mm) from the front principal plane"
-        raise ValueError(f"the focus must be farther than {least}, got {distance:.4g} mm")
-    sensor = paraxial.rear_principal + 1.0 / (1.0 / paraxial.focal_length - 1.0 / distance)
+    paraxial, object_mm, distance = lens.paraxial(), _vertex_distance_mm(lens, focus_m), 1000.0 * focus_m
+    if distance <= (focal := paraxial.focal_length):
+        text = f"the focus must be farther than the focal length ({focal:.4g} mm) from the front principal plane"
+        raise ValueError(f"{text}, got {distance:.4g} mm")
+    sensor = paraxial.rear_principal + 1.0 / (1.0 / focal - 1.0 / distance)
     if kind == "best":
         aim, _, high = _rays_of_point(lens, object_mm, sensor)
         traced, weight = aim(_fan(high[1], _FAN_RAYS))
@@ -113,16 +106,13 @@ def point_spread(
     wavelength_um: float | None = None,
     meridional: bool = False,
 ) -> Spot:
-    """Traces the spot of an object point.
-
-    Rays fill the unvignetted part of the entrance pupil on a square grid, weighted by their solid angles.
+    """Traces the spot of an object point: rays on a square grid over the open pupil, weighted by solid angle.
 
     Args:
         lens: The prescription, stopped down as needed.
         z_m: Object distance in metres from the front principal plane; ``inf`` allowed.
         sensor_mm: Distance of the sensor behind the last vertex, from :func:`focus_sensor`.
-        field_mm: Image height in mm in a pinhole camera with its hole in the front principal plane and its sensor at
-            the distance from H'; the real image is there too, up to distortion.
+        field_mm: Height in mm of the image of a pinhole in the front principal plane; distortion moves the real one.
         rays: Number of rays aimed at the lens; vignetting blocks some.
         wavelength_um: None is the d line.
         meridional: On the axis only: trace a fan that represents its rotation; as accurate with 2,000 rays.
@@ -137,8 +127,7 @@ def point_spread(
         0.3705
     """
     whole("rays", rays, 16, 10**8)
-    number("field_mm", field_mm, low=-1e9, high=1e9, unit="millimetres")
-    if meridional and field_mm:
+    if number("field_mm", field_mm, low=-1e9, high=1e9, unit="millimetres") and meridional:
         raise ValueError(f"meridional is for points on the axis, got field_mm = {field_mm}")
     object_mm, side = _vertex_distance_mm(lens, z_m), max(4, round(math.sqrt(rays)))
     aim, low, high = _rays_of_point(lens, object_mm, sensor_mm, field_mm, wavelength_um)
@@ -149,7 +138,7 @@ def point_spread(
         raise ValueError(f"no ray from z = {z_m} m at field {field_mm} mm passes lens {lens.name!r}")
     hits, weight = traced.at(lens.vertices[-1] + sensor_mm)[:, passed], weight[passed] / weight[passed].sum()
     if meridional:
-        return Spot(hits[0], hits[1], weight, 0.0, math.pi * float(points[1, passed].max()) ** 2, True)
+        return Spot(hits[0], hits[1], weight, 0.0, math.pi * float(points[1, passed].max()) ** 2)
     centre = hits @ weight
     x, y = hits - centre[:, None]
     return Spot(x, y, weight, -float(centre[1]), float(np.prod(high - low) * passed.mean()))
@@ -224,12 +213,10 @@ def trace_field(
     """Traces spots at signed coc, whose object distances `distance_m` gives, and at distances from the centre."""
     rows, columns = _CELLS
     heights = [field_height_mm(lens, distance_m(0.0), sensor_mm, radius) for radius in radius_mm]
-    boxes, light = [], []
+    boxes, light = [], []  # of the spots of all nodes; light is [channels, U, V]
     for coc, height in product(coc_mm, heights):
-        spots = [
-            spot_of_place(lens, distance_m(coc), sensor_mm, height, rays=rays, wavelength_um=wavelength)
-            for wavelength in (wavelengths_um or (None,))
-        ]
+        place = lens, distance_m(coc), sensor_mm, height
+        spots = [spot_of_place(*place, rays=rays, wavelength_um=line) for line in wavelengths_um or (None,)]
         low, high = min(u.min() for u, _, _ in spots), max(u.max() for u, _, _ in spots)
         # a ray's light is split among the cells around it, so rays lie half a cell inside the box
         centre, length = (low + high) / 2, max(high - low, 1e-9) / 2 * rows / (rows - 1)
@@ -237,12 +224,8 @@ def trace_field(
         boxes.append((centre, length, width))
         light.append([_binned((u - centre) / length, np.abs(v) / width, weight) for u, v, weight in spots])
     nodes = (len(coc_mm), len(radius_mm))
-    return Field(
-        torch.tensor(list(coc_mm), dtype=torch.float64),
-        torch.tensor(list(radius_mm), dtype=torch.float64),
-        torch.tensor(boxes, dtype=torch.float64).unflatten(0, nodes),
-        torch.from_numpy(np.array(light)).transpose(0, 1).unflatten(1, nodes),  # [channels, K, F, U, V]
-    )
+    cocs, radii, box, cells = (torch.from_numpy(np.array(values)) for values in (coc_mm, radius_mm, boxes, light))
+    return Field(cocs, radii, box.unflatten(0, nodes), cells.transpose(0, 1).unflatten(1, nodes))
 
 
 def _binned(u: Array, v: Array, weight: Array) -> Array:
@@ -259,12 +242,10 @@ def _binned(u: Array, v: Array, weight: Array) -> Array:
     return cells.reshape(rows, columns)
 
 
-def spot_of_place(
-    lens: Lens, z_m: float, sensor_mm: float, field_mm: float, **options: Any
-) -> tuple[Array, Array, Array]:
+def spot_of_place(lens: Lens, z_m: float, sensor_mm: float, field_mm: float, **options: Any) -> list[Array]:
     """Positions ``[R]`` in mm of a point's light, from its sharp image away from the axis, and across; and weight."""
     spot = point_spread(lens, z_m, sensor_mm, field_mm=field_mm, **options)
-    return spot.centre - _chief_ray_mm(lens, z_m, sensor_mm, field_mm) - spot.y, spot.x, spot.weight
+    return [spot.centre - _chief_ray_mm(lens, z_m, sensor_mm, field_mm) - spot.y, spot.x, spot.weight]
 
 
 def _chief_ray_mm(lens: Lens, z_m: float, sensor_mm: float, field_mm: float) -> float:

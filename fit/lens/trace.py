@@ -30,12 +30,9 @@ from .glass import C_UM, F_UM
 from .lens import Lens
 from .spot import Focus, Spot, coc_nodes, focus_sensor, point_spread, trace_field
 
-# Places of the nodes
 _MIN_INTERVAL_PX = 0.01  # pixels of coc; narrower intervals are not divided
 _TARGET_DB = 62.0  # PSNR of a natural image in the middle of an interval; elsewhere it may be a few dB less
 _CONTRAST = 0.22  # standard deviation of natural images over their peak
-
-# Fit of the profiles
 _MAX_FREQUENCY = 3.0  # cycles for each pixel; kernels are sampled on the pixel grid, so higher frequencies are aliased
 _PRIOR_WEIGHT = 1e-4  # weight of the ray histogram, which determines details of the profile far below a pixel
 
@@ -70,22 +67,19 @@ def trace_table(
     Args:
         lens: The prescription.
         f_number: Marked f-number; up to 3 % below that of the open stop means fully open.
-        focus_m: Focus distance in metres from the front principal plane, see :mod:`torchdof.fit.lens.spot`; ``inf``
-            allowed. Depth maps must start there too.
+        focus_m: Focus distance in metres from the front principal plane, where depth maps must start too; or ``inf``.
         nodes: Number of nodes, at least 5, or 3 for a focus at infinity; None uses as many as needed.
-        nearest_m: Nearest object distance in metres; None is a third of the focus distance (the blur is then twice that
-            of infinity), or 25 focal lengths for a focus at infinity. The farthest distance is infinity.
+        nearest_m: Nearest object distance in metres; None is a third of the focus distance, or 25 focal lengths for a
+            focus at infinity. The farthest distance is infinity.
         points: Number of values of a profile, at least 3.
         focus: ``"best"`` or ``"paraxial"``, see :func:`torchdof.fit.lens.spot.focus_sensor`.
-        field_mm: Image height in mm. Off the axis, the table has the rotational average of the spot about its centroid,
-            and ``provenance["asymmetry"]`` the spot's deviation from a round one.
+        field_mm: Image height in mm at which the spot is traced; the table has its rotational average.
         wavelengths_um: One wavelength for each channel, such as :data:`torchdof.fit.lens.lens.RGB_UM`, for a lens whose
             prescription has Abbe numbers; None traces the d line for all channels.
         sensor_width_mm: Width of the sensor.
         width_px: Width of the images for which the fit is made: details far below a pixel do not count.
         rays: Rays for each spot; None is 2,000 on the axis, traced as a fan, and 50,000 off it.
-        field: Distances in mm from the centre of the frame, increasing from 0 (to 21.6 mm for 36 x 24 mm), at which
-            spots are traced for a table whose kernels vary over the frame (:class:`torchdof.optics.field.Field`).
+        field: Distances in mm from the centre, increasing from 0, for a table whose kernels vary over the frame.
         field_nodes: Mean number of blurs on each side of focus at which these are traced.
         field_rays: Rays for each of these spots.
         name: Name of the table; None uses the lens's name and the f-number.
@@ -141,21 +135,19 @@ def trace_table(
 
     options: dict[str, Any] = {"field_mm": field_mm, "rays": rays, "meridional": not field_mm}
 
-    def spot(coc: float, wavelength_um: float | None) -> Spot:
-        return point_spread(stopped, distance(coc), sensor, wavelength_um=wavelength_um, **options)
+    def tracer(line_um: float | None) -> Tracer:
+        def spot(coc: float) -> Spot:
+            return point_spread(stopped, distance(coc), sensor, wavelength_um=line_um, **options)
+
+        return Tracer(spot, points, sensor_width_mm / width_px)
 
     with threadpool_limits(limits=1):
-        d_line, *coloured = (
-            Tracer(functools.partial(spot, wavelength_um=wavelength), points, sensor_width_mm / width_px)
-            for wavelength in (None, *(wavelengths_um or ()))
-        )
+        d_line, *coloured = map(tracer, (None, *(wavelengths_um or ())))
         cocs, channels = place_nodes(d_line, near, far, nodes), coloured or [d_line]
         fitted = [[tracer.fitted(coc) for coc in cocs] for tracer in channels]
         residuals = [[tracer.error(coc, *tracer.fitted(coc)) for coc in cocs] for tracer in channels]
-        spots = None
-        if field is not None:
-            places = coc_nodes(near, far, field_nodes), field
-            spots = trace_field(stopped, sensor, distance, *places, wavelengths_um, field_rays)
+        places = coc_nodes(near, far, field_nodes), field or ()
+        spots = None if field is None else trace_field(stopped, sensor, distance, *places, wavelengths_um, field_rays)
     arguments |= {"nearest_m": nearest_m, "rays": rays}
     call = ", ".join(f"{key}={value!r}" for key, value in arguments.items() if key != "lens")
     provenance = {

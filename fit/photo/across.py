@@ -37,19 +37,16 @@ def table_of_dots(dots: Sequence[tuple[Captures, TableFit]]) -> BlurTable:
     """
     if not isinstance(dots, Sequence) or len(dots) < 2:
         raise FitError(f"dots must be a sequence of two dots of a grid at least, got {show(dots)}")
-    captures, first_fit = dots[0]
-    first = first_fit.table
-    for other, fit in dots:
-        is_like_first = fit.table.coc.shape == first.coc.shape and torch.allclose(fit.table.coc, first.coc, rtol=1e-6)
-        if not is_like_first or fit.table.channels != first.channels:
-            position = other.notes.get("position_px")
-            raise FitError(f"the dot at {position} px must be fitted at the distances and colours of the first one")
-    centres = [other.pairs[0].position_px for other, _ in dots]
+    (captures, first_fit), tables = dots[0], [fit.table for _, fit in dots]
+    first, centres = first_fit.table, [list(other.pairs[0].position_px) for other, _ in dots]
+    for table, centre in zip(tables, centres, strict=True):
+        is_like_first = table.coc.shape == first.coc.shape and torch.allclose(table.coc, first.coc, rtol=1e-6)
+        if not is_like_first or table.channels != first.channels:
+            raise FitError(f"the dot at {centre} px must be fitted at the distances and colours of the first one")
     unit_per_px = float(first.coc[-1]) / first_fit.coc_px[-1]
     positions = [(x * unit_per_px, y * unit_per_px) for x, y in centres]
-    field = field_of_dots([fit.table for _, fit in dots], positions, captures.focus_m / captures.distances_m)
-    dot_positions = {"dots_px": [list(centre) for centre in centres]}
-    return first.replace(aperture=None, field=field, provenance=first.provenance | dot_positions)
+    field = field_of_dots(tables, positions, captures.focus_m / captures.distances_m)
+    return first.replace(aperture=None, field=field, provenance=first.provenance | {"dots_px": centres})
 
 
 def field_of_dots(tables: Sequence[BlurTable], points: Sequence[tuple[float, float]], scales: Array) -> Field:
@@ -97,17 +94,16 @@ def _spot(
     reach = max(tables[i].reach_px(coc, 1.0) for i in group) / unit
     along, across = (torch.arange(n, dtype=torch.float64) + 0.5 for n in _CELLS)
     u, v = (along * (2.0 / _CELLS[0]) - 1.0)[:, None], across / _CELLS[1]
-    total = torch.zeros(tables[0].channels, *_CELLS, dtype=torch.float64)
-    width = _KERNEL_HALF / reach / unit
+    total, width = torch.zeros(tables[0].channels, *_CELLS, dtype=torch.float64), _KERNEL_HALF / reach / unit
     for i in group:
         kernel = tables[i].kernels(torch.tensor([coc * width], dtype=torch.float64), width)
         x, y = points[i]
         angles = np.linspace(0.0, 2.0 * math.pi, azimuths, endpoint=False) if azimuths else [math.atan2(y, x)]
         for angle in angles:
             sine, cosine = math.sin(angle), math.cos(angle)
-            for side in (1.0, -1.0):
-                grid_points = torch.stack([u * cosine - side * v * sine, u * sine + side * v * cosine], -1)
-                grid = grid_points * (2.0 * _KERNEL_HALF / kernel.shape[-1])
-                sampled = functional.grid_sample(kernel, grid[None], align_corners=False)[0]
-                total += sampled / (len(angles) * sampled.sum((-2, -1), keepdim=True))
+            for half in (v, -v):
+                grid = torch.stack([u * cosine - half * sine, u * sine + half * cosine], -1)[None]
+                grid = grid * (2.0 * _KERNEL_HALF / kernel.shape[-1])
+                light = functional.grid_sample(kernel, grid, align_corners=False)[0]
+                total += light / (len(angles) * light.sum((-2, -1), keepdim=True))
     return reach, total / (2 * len(group))

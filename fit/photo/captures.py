@@ -50,7 +50,7 @@ class Capture:
         position_px: position (x, y) of the dot in the sharp frame, relative to the frame's centre.
         colours: red, green and blue of `sharp` and of `blurred`, `[3, H, W]` each; None fits only their mean.
         uncertain: `sharp` and `blurred` for other values of a guess (a tone curve), each one standard error away, in
-            independent directions. The effect on the fit is included in the standard errors.
+            independent directions; enters the standard errors.
     """
 
     sharp: Array
@@ -96,12 +96,6 @@ class Captures:
         check_distances([p.distance_m for p in self.pairs], self.focus_m)
         for name in ("width_px", *(name for name in CAMERA if getattr(self, name) is not None)):
             checked(number, name, getattr(self, name), *RANGES[name])
-
-    def __iter__(self) -> Iterator[Capture]:
-        return iter(self.pairs)
-
-    def __len__(self) -> int:
-        return len(self.pairs)
 
     @property
     def distances_m(self) -> Array:
@@ -166,12 +160,10 @@ def read_picture(
     if left + columns > width or top + rows > height:
         raise invalid(f"crop {[left, top, columns, rows]} extends beyond the picture of {width}x{height}")
     pixels = pixels[:, top : top + rows, left : left + columns]
-    white = 1.0 if picture.sample in ("8", "16") else None
-    is_clipped = pixels >= 1.0 - 1e-6
-    if dark is not None:
-        if dark.shape != pixels.shape:
-            raise invalid(f"the dark frame is {_size(dark[0])}, the picture {_size(pixels[0])}")
-        pixels = pixels - dark
+    white, is_clipped = 1.0 if picture.sample in ("8", "16") else None, pixels >= 1.0 - 1e-6
+    if dark is not None and dark.shape != pixels.shape:
+        raise invalid(f"the dark frame is {_size(dark[0])}, the picture {_size(pixels[0])}")
+    pixels = pixels - (0.0 if dark is None else dark)
     light = pixels.mean(axis=0)
     if white is not None:
         pixels[is_clipped] = white
@@ -197,10 +189,10 @@ def cut_pairs(
     if sharp.light.shape != blurred.light.shape:
         text = f"is {_size(blurred.light)}, {sharp.file.name} is {_size(sharp.light)}; give pictures of one size"
         raise FitError(text, "manifest", blurred_file)
-    for key, word in (("f_number", "f-number"), ("focal_length_mm", "focal length")):
-        before, after = (picture.facts.get(key) for picture in pictures)
+    for name in ("f_number", "focal_length_mm"):
+        before, after = (picture.facts.get(name) for picture in pictures)
         if before and after and abs(math.log(before / after)) > 0.02:
-            text = f"taken at {word} {after:g} by EXIF, {sharp.file.name} at {before:g}; change neither"
+            text = f"taken at {name} {after:g} by EXIF, {sharp.file.name} at {before:g}; change neither"
             raise FitError(text, "manifest", blurred_file)
     if dots == "one":
         matched = [(find_dot(sharp.light, file=str(sharp.file)), find_dot(blurred.light, file=blurred_file))]
@@ -215,10 +207,8 @@ def cut_pairs(
             text = f"the frame cuts the blur: it reaches {needed:.0f} px from the dot, the frame ends after {half} px"
             raise FitError(text, "window", str(pictures[border_px[0] >= both[0].reach + 2].file))
         cuts = [(..., slice(y - half, y + half + 1), slice(x - half, x + half + 1)) for x, y in centres]
-        windows, colours = (
-            (getattr(sharp, name)[cuts[0]].copy(), getattr(blurred, name)[cuts[1]].copy())
-            for name in ("light", "colours")
-        )
+        windows = sharp.light[cuts[0]].copy(), blurred.light[cuts[1]].copy()
+        colours = sharp.colours[cuts[0]].copy(), blurred.colours[cuts[1]].copy()
         for picture, window in zip(pictures, windows, strict=True):
             if (count := len(find_dots(window, file=str(picture.file)))) > 1:
                 text = f"{count} dots in a window of {2 * half + 1} px: print the dots farther apart than their blur"
@@ -241,12 +231,12 @@ def _size(picture: Array) -> str:
 def _matched(sharp: CameraPicture, blurred: CameraPicture, magnification: float) -> list[tuple[Dot, Dot]]:
     """Pairs the dots of a grid in both pictures, from the centre outwards: each moves on its line to the centre."""
     sharp_dots, blurred_dots = (find_dots(f.light, file=str(f.file), smallest=0.3) for f in (sharp, blurred))
-    centre, pairs = sharp.middle, []
-    for dot in sorted(sharp_dots, key=lambda d: math.dist((d.x, d.y), centre)):
-        expected = [m + magnification * (v - m) for m, v in zip(centre, (dot.x, dot.y), strict=True)]
-        nearest = min(blurred_dots, key=lambda d: math.dist((d.x, d.y), expected))
-        spacing = min((math.dist((d.x, d.y), (dot.x, dot.y)) for d in sharp_dots if d is not dot), default=math.inf)
-        if math.dist((nearest.x, nearest.y), expected) < 0.4 * magnification * spacing:
+    (centre_x, centre_y), pairs = sharp.middle, []
+    for dot in sorted(sharp_dots, key=lambda d: math.hypot(d.x - centre_x, d.y - centre_y)):
+        x, y = centre_x + magnification * (dot.x - centre_x), centre_y + magnification * (dot.y - centre_y)
+        away, nearest = min(((math.hypot(d.x - x, d.y - y), d) for d in blurred_dots), key=lambda one: one[0])
+        spacing = min((math.hypot(d.x - dot.x, d.y - dot.y) for d in sharp_dots if d is not dot), default=math.inf)
+        if away < 0.4 * magnification * spacing:
             pairs.append((dot, nearest))
     if not pairs:
         text = f"none of the {len(sharp_dots)} dots of {sharp.file.name} is found again; are the distances right?"

@@ -20,7 +20,6 @@ EXPLAINED = 1.15  # largest misfit of an ideal dot, over the noise, with which i
 FAR_ABOVE = 1.6  # residual over noise above which a warning is given
 _HARMONICS, _RINGS = 8, 4
 _RMS_DRAWN_PX = 16.0  # px; size at which a PSF is drawn to measure it; larger: more exact, slower
-
 # A sharp picture
 _FOCUSED_SIGMA_PX = 0.7  # sigma of the edge that demosaicing, a filter before the sensor or a good lens leave in focus
 _MIN_SIZE_ERROR = 0.02  # relative error of the kernel's size, from a soft sharp picture, above which to warn
@@ -28,14 +27,12 @@ _MAX_EXPONENT = 0.7  # exponent of the edge's levels below which the picture cou
 _MIN_STEEPNESS, _MIN_SIGMAS = 0.03, 4.0  # steepness of an S-curve: share of the dot's level, and in standard errors
 _SHARED_DIFFERENCES = 1.9  # second differences for each independent one: neighbours share pixels
 _ENCODED = "as in a picture that is left sRGB encoded; decode it first"
-
 # A tone curve in the residual: its strength, and chi squared (two parameters), above which to warn
 _MIN_CURVE, _MIN_CHI = 0.075, 30.0  # a curve of 20 % has this strength in the residual
 _SUPPORTING_EDGE, _SUPPORTED_CHI = 0.008, 18.0  # steepness of the sharp dot's edge, and chi squared with its support
 _MIN_CONTRAST, _MIN_CONTRAST_CHI = 0.03, 11.0  # at the expected magnification; a curve of 20 % has twice the strength
 _MIN_RESIZING = 0.015  # change of magnification above which no curve is sought; a weak curve causes 0.002 to 0.006
 _CHI_MARGIN = 4.0  # chi squared by which a curve must explain more than a change of magnification does
-
 # The fit
 _MIN_RESIDUAL, _MIN_AT_TWICE = 0.005, 1e-3  # residual, as a share of the light: at FAR_ABOVE, at twice the noise
 _SPOT_SIGMAS, _MIN_SPOT = 8.0, 0.003  # of a spot beyond the blur: standard deviations, share of the dot's level
@@ -64,8 +61,7 @@ def unexplained(solution: Solution, basis: Array) -> tuple[Array, Array, Array]:
     # what the parameters imitate is not in the residual
     imitable, _ = np.linalg.qr(solution.slopes[:, np.abs(solution.slopes).max(axis=0) > 0])
     visible = without_level(basis - imitable @ (imitable.T @ basis), solution.fitted)
-    # a smooth deviation must not count as noise: use the level beside the dot and inside it. Noise cannot exceed the
-    # residual: in a JPEG, dark areas have less noise than the level in the light suggests
+    # a smooth deviation is not noise, which in turn cannot exceed the residual: a JPEG's dark areas have little
     variance = min(noise_near(solution), residual_rms(solution)) ** 2
     pair = solution.pair
     correlated = correlate(pair.picture(visible.T), pair.noise_correlation)[:, pair.used].T
@@ -101,8 +97,7 @@ def size_of_blur(solution: Solution) -> tuple[float, float]:
         # derivative of a quotient: the total light depends on the values too
         slope = (moment - rms**2 * light) / (light @ values) / (2 * rms)
         return rms, float(np.sqrt(max(slope @ solution.covariance @ slope, 0.0)))
-    pair, shape = solution.pair, list(solution.params)
-    values = np.array([float(solution.params[n]) for n in shape])
+    pair, shape, values = solution.pair, list(solution.params), np.array([*solution.params.values()], np.float64)
     steps = 1e-3 * np.maximum(np.abs(values), 0.1)
     varied = np.vstack([values, values + np.diag(steps)]).T  # a row for each parameter, changed in one column
     is_length = np.array([n in LENGTHS for n in shape])
@@ -127,15 +122,12 @@ def size_of_blur(solution: Solution) -> tuple[float, float]:
 def bic_of(solution: Solution) -> float:
     """Bayesian information criterion of a profile or polygon, up to a constant that depends on the pictures only."""
     pair = solution.pair
-    floor = pair.values.size * (1e-6 * pair.unit) ** 2
-    parameters = len(SHAPES[solution.family])
+    parameters = len(SHAPES[solution.family]) + (solution.family == "polygon")  # and the number of blades
     if solution.family == "radial":
         parameters = int(np.sum(np.asarray(solution.params["values"]) > 0))
-    elif solution.family == "polygon":
-        parameters += 1  # the number of blades
     # correlated neighbours are not independent samples
     count = max(round(pair.values.size * independent_share(pair.noise_correlation)), 1)
-    variance = max((solution.squares + floor) / pair.values.size, np.finfo(float).tiny)
+    variance = max(float(np.mean(solution.residual**2)) + (1e-6 * pair.unit) ** 2, np.finfo(float).tiny)
     return count * float(np.log(variance)) + parameters * float(np.log(count))
 
 
@@ -146,10 +138,11 @@ def describe(solution: Solution, why: str) -> BlurFit:
     size = float(np.sqrt(np.mean((pair.data[pair.lit] - solution.background) ** 2)))
     source_variance = (solution.gain * pair.source.noise) ** 2 / pair.fine_share
     noise = np.sqrt(noise_near(solution) ** 2 + source_variance * float(np.sum(solution.kernel**2)))
-    rms, rms_error = size_of_blur(solution)
     errors = np.sqrt(np.diag(solution.covariance))
-    stderr: dict[str, float | Array] = dict(zip(solution.names, errors.tolist(), strict=True))
-    stderr = {n: stderr[n] for n in solution.params if n in stderr}
+    stderr = dict[str, float | Array](zip(solution.names, errors.tolist(), strict=True))
+    if solution.family == "radial":
+        stderr = {"values": errors, "radius": 0.0}
+    radius, radius_stderr = (float(np.sqrt(2) * rms) for rms in size_of_blur(solution))
     distance = np.hypot(columns - x, rows - y)
     is_near = (distance <= 1.2 * pair.dot.reach) & pair.used
     order = np.argsort(distance[is_near])
@@ -158,13 +151,13 @@ def describe(solution: Solution, why: str) -> BlurFit:
         for levels in (pair.data[is_near], solution.fitted[is_near[pair.used]])
     )
     return BlurFit(
-        family=solution.family,
-        params=dict(solution.params),
-        stderr={"values": errors, "radius": 0.0} if solution.family == "radial" else stderr,
-        residual=residual_rms(solution) / size,
-        noise=float(noise) / size,
-        covariance=solution.covariance,
-        names=solution.names,
+        solution.family,
+        dict(solution.params),
+        {n: stderr[n] for n in solution.params},
+        residual_rms(solution) / size,
+        float(noise) / size,
+        solution.covariance,
+        solution.names,
         model="forward",
         gain=solution.gain,
         background=solution.background,
@@ -172,8 +165,8 @@ def describe(solution: Solution, why: str) -> BlurFit:
         centre=(x, y),
         magnification=solution.moves["magnification"],
         asymmetry=asymmetry_of(solution)[0],
-        radius=float(np.sqrt(2) * rms),
-        radius_stderr=float(np.sqrt(2) * rms_error),
+        radius=radius,
+        radius_stderr=radius_stderr,
         why=why,
         aperture=pair.opening_with(solution.params) if solution.family in OPENINGS else None,
         samples=samples,
@@ -186,8 +179,7 @@ def check_linearity(picture: Array, dot: Dot, edge: Edge, file: str | None) -> b
     inside, text = inner_pixels(picture, dot), ""
     if inside is not None:
         bright = fine_variance(picture, inside)
-        # rounding to a file's levels hides at most a variance of (level / 2)^2; levels that are means of three colours
-        # are three times as close, and equal means may differ in the last digit
+        # rounding hides at most a variance of (level / 2)^2; means of three colours are three times as close
         levels = np.unique(picture[picture > dot.background + 0.5 * dot.peak])
         steps = [step for step in np.diff(levels).tolist() if step > 1e-6 * np.abs(levels).max()]
         rounding = 3 * min(steps, default=0.0) ** 2 / 4
@@ -235,26 +227,24 @@ def check_levels(solution: Solution, expected: Solution, edge: Edge, file: str |
 
 def _curves(solution: Solution, level: float) -> Array:
     """Effects of weak tone curves on a fit's pixels `[pixels used, 2]`: brightening, and an S-curve's contrast."""
-    light = ((solution.fitted - solution.background) / (solution.gain * level))[None]  # 0 is the paper
-    step = 1e-3
-    curved_light = np.concatenate([untoned(light, (-step, 0, 0)), untoned(light, (0, -1.5 * step, 0))])
-    return np.asarray(solution.gain * level * (curved_light - untoned(light, (0, 0, 0))) / step).T
+    peak, step = solution.gain * level, 1e-3
+    light = ((solution.fitted - solution.background) / peak)[None]  # 0 is the paper
+    straight, *curved = (untoned(light, bend)[0] for bend in ((0, 0, 0), (-step, 0, 0), (0, -1.5 * step, 0)))
+    return peak / step * np.stack([one - straight for one in curved], axis=1)
 
 
 def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | None) -> None:
     """Warns if a soft sharp picture changes the kernel's size; `deconvolved`: the dot was fitted as in focus."""
-    # the variance along an axis of a disc of radius R is R^2 / 4
-    excess = max(edge.softness**2 - _FOCUSED_SIGMA_PX**2, 0.0)
+    excess = max(edge.softness**2 - _FOCUSED_SIGMA_PX**2, 0.0)  # of the variance along an axis; R^2 / 4 for a disc
     size_error = 1 - 1 / np.sqrt(1 + 4 * excess / max(radius_px, 1e-9) ** 2)
     if size_error < _MIN_SIZE_ERROR or edge.radius <= 2 * edge.softness:
         return
     effect = f"the kernel is too small by {100 * size_error:.0f} %"
+    cause = f", as out of focus; {effect}: focus again"
     if edge.softness <= UNFOCUSED_PX:
         cause = f"; if the printed dot's edge is sharp, {effect}"
     elif deconvolved:
         cause = ", as out of focus; the dot was fitted as it would be in focus: focus again, or print a sharper dot"
-    else:
-        cause = f", as out of focus; {effect}: focus again"
     warn(f"the sharp picture is soft: its dot's edge is blurred by {edge.softness:.1f} px{cause}", "not in focus", file)
 
 
@@ -262,11 +252,9 @@ def check_fit(solution: Solution, fit: BlurFit, file: str | None, freest: BlurFi
     """Raises or warns about problems of a fit, which describes the solution; `freest` has the freest kernel."""
     if not fit.gain > 0:
         raise FitError("the blurred picture has nothing in common with the sharp one", file=file)
-    pair = solution.pair
-    # share of the light that the kernel spreads outside the window
-    source = pair.drawn(solution.moves)
+    pair, source = solution.pair, solution.pair.drawn(solution.moves)
     total, inside = float(source.sum()), float(pair.blurred(source, solution.kernel[None]).sum())
-    outside, (height, width) = 1 - inside / total if total > 0 else 1.0, pair.data.shape
+    outside, (height, width) = 1 - inside / total if total > 0 else 1.0, pair.data.shape  # share of the light
     text = f"{100 * outside:.1f} % of the blur lies outside the window of {width}x{height} px: cut a larger one"
     if outside > _REFUSED_OUTSIDE:
         raise FitError(text, "window", file)
@@ -275,7 +263,6 @@ def check_fit(solution: Solution, fit: BlurFit, file: str | None, freest: BlurFi
     # the freest residual is far above the noise, or the chosen family adds much to it
     residual, ratio = freest.residual, freest.residual_over_noise
     far_above = (residual > _MIN_RESIDUAL and ratio > FAR_ABOVE) or (residual > _MIN_AT_TWICE and ratio > 2.0)
-    # a residual far above the noise is reported below; here, only the part that the family adds to it
     warned_ratio = max(2.0, 1.3 * ratio) if far_above else 2.0
     if fit is not freest and fit.residual > _MIN_AT_TWICE and fit.residual_over_noise > warned_ratio:
         text = f"family {fit.family!r} leaves {fit.residual_over_noise:.1f} times the noise, a free profile {ratio:.1f}"
@@ -306,13 +293,11 @@ def check_fit(solution: Solution, fit: BlurFit, file: str | None, freest: BlurFi
     for name, lower, upper in zip(solution.names, *pair.bounds(solution.names), strict=True):
         value = float({**solution.moves, **solution.params}[name])
         at_least, at_most = value <= lower + 1e-6 * abs(lower), value >= upper * (1 - 1e-6)
-        is_length = name in ("sigma", "radius", "r_c")
-        if at_most and is_length:
+        if at_most and name in LENGTHS:
             raise FitError(f"the blur is wider than the window: {name} ran to {value:.3g} px", "flat profile", file)
-        # exempt: the shape of a blur below a pixel, the exponent of a missing tilt, the curvature of straight or
-        # circular blades
-        if (at_least and not is_length and name != "b" or at_most) and name not in ("m", "curvature"):
+        # exempt: the shape of a blur below a pixel, the exponent of a missing tilt, the curvature of any blades
+        if (at_most or (at_least and name not in {"b", *LENGTHS})) and name not in ("m", "curvature"):
             warn(f"{name} ended on its bound {value:.4g}; it is only a limit", "boundary", file)
-    size, error = size_of_blur(solution)
-    if not error < 0.5 * size:
-        warn(f"too little blur or light: its rms radius is {size:.3g} ± {error:.2g} px", "flat profile", file)
+    if not fit.radius_stderr < 0.5 * fit.radius:
+        text = f"too little blur or light: its radius is {fit.radius:.3g} ± {fit.radius_stderr:.2g} px"
+        warn(text, "flat profile", file)

@@ -55,8 +55,7 @@ def find_dot(picture: Array, *, file: str | None = None) -> Dot:
 def find_dots(picture: Array, *, file: str | None = None, smallest: float = _MIN_LIGHT) -> list[Dot]:
     """Finds dots in a picture `[H, W]` in linear light, brightest first, down to a share `smallest` of its light."""
     height, width = a_picture("a picture of a dot", picture, _MIN_SIDE_PX, file).shape
-    noise = noise_of(picture)
-    levels = picture[_near_border(picture.shape, max(1, min(height, width) // 20))]
+    noise, levels = noise_of(picture), picture[_near_border(picture.shape, max(1, min(height, width) // 20))]
     # a mean without outliers: the median is biased if blacks are cut off at 0, which removes half of the noise
     background = float(np.median(levels))
     if noise > 0 and (is_usual := np.abs(levels - background) <= 5 * noise).any():
@@ -122,10 +121,9 @@ def fine_share_inside(picture: Array, dot: Dot) -> float | None:
     inside = inner_pixels(picture, dot)
     if inside is None:
         return None
-    rows, columns = np.nonzero(inside)
+    (rows, columns), levels = np.nonzero(inside), picture[inside]
     x, y = (columns - dot.x) / dot.radius, (rows - dot.y) / dot.radius
     light = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)  # uneven light
-    levels = picture[inside]
     residual = levels - light @ np.linalg.lstsq(light, levels, rcond=None)[0]
     variance = float(residual @ residual) / (levels.size - light.shape[1])
     return min(fine_variance(picture, inside) / variance, 1.0) if variance > 0 else 1.0
@@ -154,12 +152,10 @@ def used_pixels(picture: Array, dot: Dot, white: float | None, file: str | None,
 def _plateau(picture: Array, dot: Dot) -> float | None:
     """The level at which a picture is clipped, if more pixels have it than the next one despite noise; or None."""
     levels, counts = np.unique(picture[picture > dot.background + 0.5 * dot.peak], return_counts=True)
-    tail = levels.size > 1 and counts[-1] <= counts[-2]  # few pixels at the top level are the tail of the noise
-    if tail or counts[-1] < max(5, 0.02 * counts.sum()):
-        return None
-    spacing = float(np.median(np.diff(levels))) if levels.size > 1 else 0.0
-    top = float(levels[-1])
-    return top if dot.noise > 0.6 * spacing and dot.noise > 1e-12 * abs(top) else None
+    top, spacing = float(levels[-1]), float(np.median(np.diff(levels))) if levels.size > 1 else 0.0
+    # few pixels at the top level are the tail of the noise
+    is_peak = counts[-1] >= max(5, 0.02 * counts.sum()) and (levels.size == 1 or counts[-1] > counts[-2])
+    return top if is_peak and dot.noise > max(0.6 * spacing, 1e-12 * abs(top)) else None
 
 
 def check_blacks(picture: Array, dot: Dot, file: str | None) -> None:
@@ -168,9 +164,9 @@ def check_blacks(picture: Array, dot: Dot, file: str | None) -> None:
     levels, counts = np.unique(paper, return_counts=True)
     if levels.size < 2 or counts[0] < _CUT_BLACKS * paper.size:
         return
-    mean = float(paper.mean())
-    within_a_level = not dot.noise > max(0.6 * (levels[1] - levels[0]), 1e-6 * dot.peak)
-    if not within_a_level and np.quantile(paper, 0.995) - mean >= _NOISE_ASYMMETRY * (mean - levels[0]):
+    exceeds_a_level = dot.noise > max(0.6 * (levels[1] - levels[0]), 1e-6 * dot.peak)
+    above, below = np.quantile(paper, 0.995) - paper.mean(), paper.mean() - levels[0]
+    if exceeds_a_level and above >= _NOISE_ASYMMETRY * below:
         share = f"{100 * float(counts[0] / paper.size):.0f} % of the paper lies on its lowest level, {levels[0]:.3g}"
         text = f"{share}: cut blacks make the kernel up to 1 % too small; develop so that black lies above its noise"
         warn(text, "saturated", file)
@@ -181,8 +177,7 @@ def noise_of(picture: Array) -> float:
     differences = _mixed_differences(picture)
     # near the border, away from the dot's edges
     magnitudes = np.abs(differences[_near_border(differences.shape, max(3, min(picture.shape) // 5))])
-    # pixels of a mosaic differ in noise, so use the mean square, without outliers. If most pixels are interpolated (one
-    # colour of a mosaic), the others carry the noise
+    # a mosaic's pixels differ in noise, so use the mean square, without outliers; interpolated ones may have none
     typical = 1.4826 * float(np.median(magnitudes))
     typical = typical if typical > 1e-9 * float(np.abs(picture).max()) else float(np.percentile(magnitudes, 90))
     return float(np.sqrt(np.mean(magnitudes[magnitudes <= 5 * typical] ** 2)))
@@ -219,8 +214,7 @@ def correlation_of(values: Array, is_used: Mask) -> Array:
     lags = tuple(slice(n - 1 - LAGS, n + LAGS) for n in values.shape)
     sums, pairs = (correlated(p, p, method="fft")[lags] for p in (clipped, is_used.astype(np.float64)))
     pairs = np.maximum(np.round(pairs), 1.0)
-    correlation = sums / pairs
-    correlation = correlation / max(float(correlation[LAGS, LAGS]), np.finfo(float).tiny)
+    correlation = sums / pairs / max(float(sums[LAGS, LAGS] / pairs[LAGS, LAGS]), np.finfo(float).tiny)
     # correlation makes the estimates at other lags less certain
     significant = np.where(np.abs(correlation) > _MIN_SIGMAS / np.sqrt(pairs), correlation, 0.0)
     threshold = _MIN_SIGMAS * np.sqrt(np.sum(significant**2) / pairs)
@@ -253,7 +247,6 @@ def noise_beside(picture: Array, background: float, dark: Mask) -> tuple[Array, 
     correlation = correlation_of(residual, dark)
     if dark.sum() < _MIN_PIXELS:
         return correlation, 1.0
-    # use the paper's own spread: an insignificant part of the correlation would raise the fine share, and a mosaic's
-    # noise differs between pixels
+    # the paper's own spread, because an insignificant part of the correlation would raise the fine share
     spread = 1.4826 * float(np.median(np.abs(residual[dark] - np.median(residual[dark]))))
     return correlation, min(max((noise_of(picture) / spread) ** 2, _MIN_FINE_SHARE), 1.0) if spread > 0 else 1.0

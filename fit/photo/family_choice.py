@@ -17,11 +17,10 @@ _COMPARED_LEVEL, _DISPLAY_EXPONENT = 0.02, 1 / 2.2  # level of a highlight that 
 
 
 def natural_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
-    """PSNR between a natural image blurred with one kernel and with another, in dB.
+    """PSNR between a natural image blurred with one kernel and with another, in dB, at most 200.
 
-    Natural images have an amplitude spectrum of 1/f. The mean squared difference is then a sum over the kernels'
-    spectra and needs no image; a standard deviation of 0.22 of the peak and a width of 256 px are assumed. The kernels
-    are `[k, k]`, k odd, and sum to 1. The result is at most 200 dB.
+    It needs no image: natural ones have an amplitude spectrum of 1/f; a standard deviation of 0.22 of the peak and a
+    width of 256 px are assumed. The kernels are `[k, k]`, k odd, and sum to 1.
 
     Raises:
         FitError: a kernel is not `[k, k]` with an odd k, or not of finite numbers.
@@ -49,10 +48,7 @@ def highlight_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     """PSNR between the pictures of a highlight through two kernels, in dB.
 
     A highlight shows the kernel itself. It is encoded for display with the peak of `other`, the reference, at white,
-    and compared where either picture is brighter than 2 % of that. Kernels are as for :func:`natural_psnr`.
-
-    Raises:
-        FitError: a kernel is not `[k, k]` with an odd k, or not of finite numbers.
+    and compared where either picture is brighter than 2 % of that. Kernels and errors are as for :func:`natural_psnr`.
 
     Example:
         >>> import torch
@@ -69,29 +65,27 @@ def highlight_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
 
 
 def _decibels(error: float) -> float:
-    return 200.0 if error <= 1e-20 else float(-10 * np.log10(error))
+    return float(-10 * np.log10(max(error, 1e-20)))
 
 
 def _of_one_size(kernel: ArrayLike, other: ArrayLike) -> Array:
     """Two kernels `[2, k, k]`, the smaller one with a border of zeros."""
     arrays = [a_picture("kernel", kernel, 1), a_picture("other", other, 1)]
-    for name, array in zip(("kernel", "other"), arrays, strict=True):
-        if array.shape[0] != array.shape[1] or array.shape[0] % 2 == 0:
-            raise FitError(f"{name} must be [k, k] with an odd k, got {list(array.shape)}")
+    for height, width in (array.shape for array in arrays):
+        if height != width or height % 2 == 0:
+            raise FitError(f"a kernel must be [k, k] with an odd k, got {[height, width]}")
     size = max(map(len, arrays))
     return np.stack([np.pad(array, (size - len(array)) // 2) for array in arrays])
 
 
 def looks_alike(kernel: Array, other: Array, accuracy_db: float) -> bool:
     """Whether two kernels agree within `accuracy_db` on a photograph, and within 20 dB less on a highlight."""
-    highlight = highlight_psnr(kernel, other)
-    return natural_psnr(kernel, other) >= accuracy_db and highlight >= accuracy_db - _HIGHLIGHT_ALLOWANCE_DB
+    return min(natural_psnr(kernel, other), highlight_psnr(kernel, other) + _HIGHLIGHT_ALLOWANCE_DB) >= accuracy_db
 
 
 def choose(kernels: Mapping[str, Array], bic: Mapping[str, float], accuracy_db: float) -> tuple[str, str]:
     """The cheapest family that looks like the simplest one within 2 of the lowest BIC, and why."""
-    lowest = min(bic[f] for f in kernels)
-    likeliest = min((f for f in kernels if bic[f] <= lowest + _BIC_TIE), key=COST.index)
+    likeliest = min((f for f in kernels if bic[f] <= min(bic.values()) + _BIC_TIE), key=COST.index)
     best = kernels[likeliest]
     family = min((f for f in kernels if f == likeliest or looks_alike(kernels[f], best, accuracy_db)), key=COST.index)
     required = f"{accuracy_db:g} dB on a natural image and {accuracy_db - _HIGHLIGHT_ALLOWANCE_DB:g} dB on a highlight"

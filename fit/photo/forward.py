@@ -118,13 +118,11 @@ class Forward:
             jacobian=lambda p: self._jacobian(family, names, p) / self.unit,
             tolerance=1e-7,
         )
-        params = dict(zip(names, numbers.tolist(), strict=True))
-        fitted, gain, background = self.project(shaped(numbers))
-        slopes, moves = self._jacobian(family, names, numbers), self.moves(params)
-        kernel_params: dict[str, float | Array] = {n: params[n] for n in shape}
-        kernel = self.kernels(family, kernel_params)[0]
-        covariance = self.covariance(slopes, self.values - fitted, kernel, gain)
-        return Solution(self, family, kernel_params, moves, gain, background, fitted, names, covariance, slopes)
+        params = dict[str, float | Array](zip(shape, numbers.tolist(), strict=False))
+        moves = self.moves(dict(zip(names, numbers.tolist(), strict=True)))
+        (fitted, gain, background), slopes = self.project(shaped(numbers)), self._jacobian(family, names, numbers)
+        covariance = self.covariance(slopes, self.values - fitted, self.kernels(family, params)[0], gain)
+        return Solution(self, family, params, moves, gain, background, fitted, names, covariance, slopes)
 
     def moves(self, params: Mapping[str, float]) -> dict[str, float]:
         """The fitted moves, completed by the fixed ones."""
@@ -168,12 +166,11 @@ class Forward:
 
     def _jacobian(self, family: str, names: tuple[str, ...], p: Array) -> Array:
         """Derivatives of the projected model `[pixels used, parameters]` (Kaufman's approximation)."""
-        shape = SHAPES[family]
-        n, moves = len(shape), self.moves(dict(zip(names, p, strict=True)))
-        values, (low, high) = p[:n], self.bounds(shape)
-        steps = np.diag(1e-4 * np.maximum(np.abs(values), 0.1))
+        shape, moves = SHAPES[family], self.moves(dict(zip(names, p, strict=True)))
+        n, (low, high) = len(shape), self.bounds(shape)
+        steps = np.diag(1e-4 * np.maximum(np.abs(p[:n]), 0.1))
         # the values, then one parameter increased in each row, then one decreased
-        varied = np.vstack([values, np.minimum(values + steps, high), np.maximum(values - steps, low)])
+        varied = np.vstack([p[:n], np.minimum(p[:n] + steps, high), np.maximum(p[:n] - steps, low)])
         kernels = self.kernels(family, dict(zip(shape, varied.T, strict=True)))
         widths = np.diag(varied[1 : n + 1] - varied[n + 1 :])
         kernel_slopes = (kernels[1 : n + 1] - kernels[n + 1 :]) / widths[:, None, None]
@@ -235,8 +232,3 @@ class Solution:
     def residual(self) -> Array:
         """Data minus model `[pixels used]`."""
         return self.pair.values - self.fitted
-
-    @property
-    def squares(self) -> float:
-        """Sum of squared residuals."""
-        return float(self.residual @ self.residual)

@@ -22,7 +22,6 @@ from .forward import Forward, Solution, without_level
 _CAUTION = 3.0
 _TABLE_SMOOTHNESS = 10.0 ** np.arange(-8.0, 0.0)
 _MAX_STEP = {"dx": 0.5, "dy": 0.5, "magnification": 0.02}  # largest step of an iteration
-
 _BLADES = range(3, 10)
 _MIN_HARMONIC_CHI = 25.0  # chi squared of a polygon's harmonic (two degrees of freedom) above which a polygon is fitted
 _MIN_BIC_GAIN = 10.0  # required decrease of BIC for a polygon; accounts for the choice among seven numbers of blades
@@ -43,10 +42,9 @@ def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: i
     half = min(int(np.ceil(radius)) + 1, pair.half)
     values = torch.eye(count, dtype=torch.float64)
     hats = pixel_kernels("radial", {"values": values, "radius": radius}, 2 * half + 1).numpy()
-    h = radius / (count - 1)
+    moves, h = dict(moves), radius / (count - 1)
     hat_light = 2 * np.pi * h * h * np.arange(count, dtype=np.float64)  # integral of each hat over the plane
     hat_light[0], hat_light[-1] = np.pi * h * h / 3, 2 * np.pi * (radius * h / 2 - h * h / 6)
-    moves = dict(moves)
     for _ in range(10):
         columns = hat_light[:, None] * pair.blurred(pair.drawn(moves), hats)[:, pair.used]  # [knots, pixels]
         weights, smoothing = _non_negative(columns, pair.values)
@@ -62,15 +60,13 @@ def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: i
             moves[name] += float(np.clip(change, -_MAX_STEP[name], _MAX_STEP[name]))
         if np.all(np.abs(step) < 3e-4):
             break
-    free = weights > 0
-    centred = (columns - columns.mean(axis=1, keepdims=True))[free].T
-    free_covariance = pair.covariance(centred, residual, kernel, gain, smoothing[np.ix_(free, free)])
-    covariance = np.zeros((count, count))
-    covariance[np.ix_(free, free)] = np.where(np.isfinite(free_covariance), free_covariance, 0.0)
+    free, covariance = np.ix_(weights > 0, weights > 0), np.zeros((count, count))
+    centred = (columns - columns.mean(axis=1, keepdims=True))[weights > 0].T
+    free_covariance = pair.covariance(centred, residual, kernel, gain, smoothing[free]) / gain**2
+    covariance[free] = np.where(np.isfinite(free_covariance), free_covariance, 0.0)
     params: dict[str, float | Array] = {"values": weights / float(hat_light @ weights), "radius": radius}
-    names = tuple(f"values[{i}]" for i in range(count))
-    slopes = pair.move_columns(moves, ("dx", "dy"), kernel).T
-    return Solution(pair, "radial", params, moves, gain, background, fitted, names, covariance / gain**2, slopes)
+    names, slopes = tuple(f"values[{i}]" for i in range(count)), pair.move_columns(moves, ("dx", "dy"), kernel).T
+    return Solution(pair, "radial", params, moves, gain, background, fitted, names, covariance, slopes)
 
 
 def _non_negative(columns: Array, data: Array) -> tuple[Array, Array]:
@@ -86,8 +82,8 @@ def _non_negative(columns: Array, data: Array) -> tuple[Array, Array]:
         # the Cholesky factor of the normal equations has the same minimum as the tall matrix
         factor = np.linalg.cholesky(normal + smooth + 1e-12 * np.trace(normal) * np.eye(len(normal)))
         weights, _ = nnls(factor.T, np.linalg.solve(factor, right))
-        free = weights > 0
-        effective = np.trace(np.linalg.solve((normal + smooth)[np.ix_(free, free)], normal[np.ix_(free, free)]))
+        free = np.ix_(weights > 0, weights > 0)
+        effective = np.trace(np.linalg.solve((normal + smooth)[free], normal[free]))
         squares = max(total - 2 * float(right @ weights) + float(weights @ normal @ weights), 1e-14 * total)
         score = squares / (data.size - min(_CAUTION * float(effective), 0.9 * data.size)) ** 2
         candidates.append((score, weights, smooth))
@@ -116,8 +112,7 @@ def solve_opening(round_fit: Solution) -> tuple[Solution, str] | None:
 def solve_polygon(round_fit: Solution) -> Solution:
     """Fits the regular polygon whose harmonic is the most significant one in a round profile's residual."""
     blades, _, corner = _harmonic(round_fit)
-    size = np.sqrt(2) * size_of_blur(round_fit)[0]
-    radius = size * math.sqrt(3 / (2 + math.cos(2 * math.pi / blades)))
+    radius = size_of_blur(round_fit)[0] * math.sqrt(6 / (2 + math.cos(2 * math.pi / blades)))
     start = {"radius": radius, "rotation_deg": (-90.0 - corner) % (360.0 / blades), "curvature": 0.1}
     return replace(round_fit.pair, opening=Aperture(blades)).solve("polygon", start)
 
@@ -156,13 +151,11 @@ def _harmonic(round_fit: Solution) -> tuple[int, float, float]:
 
 def _deconvolved(shape: Solution) -> tuple[Array, float]:
     """A kernel `[k, k]` by deconvolution, and twice the increase of withheld pixels' log likelihood over a solution."""
-    pair = shape.pair
+    pair, kernel, candidates = shape.pair, shape.kernel, list[tuple[float, float, Array]]()
     source = pair.drawn(shape.moves)
     # withhold a fifth of the pixels, and take the smoothing that predicts them best
     is_withheld = np.random.default_rng(0).random(pair.values.size) < _WITHHELD
     is_judged = is_withheld & pair.lit[pair.used]
-    candidates: list[tuple[float, float, Array]] = []
-    kernel = shape.kernel
     margin = min(int(np.ceil(float(shape.params["radius"]))) + 2, pair.half - 1) - kernel.shape[0] // 2
     kernel = np.pad(kernel, margin) if margin >= 0 else np.ascontiguousarray(kernel[-margin:margin, -margin:margin])
     for smoothness in _SMOOTHNESS:
@@ -201,12 +194,12 @@ def _descend(
     penalty = smoothness * largest * 1e-2
     step = 1.0 / (largest + 8 * penalty)
     weights = extrapolated = max(pair.project(blurred(start))[1], 1e-12) * start
-    momentum = 1.0
+    momentum, allowed = 1.0, 1.0 if is_lit is None else is_lit
     for _ in range(_MAX_STEPS):
         error = blurred(extrapolated) - pair.values
         error = np.where(is_fitted, error - error[is_fitted].mean(), 0.0)
         gradient = adjoint(error) - penalty * laplace(extrapolated, mode="constant")
-        next_weights = np.maximum(extrapolated - step * gradient, 0.0) * (1.0 if is_lit is None else is_lit)
+        next_weights = np.maximum(extrapolated - step * gradient, 0.0) * allowed
         next_momentum = (1 + np.sqrt(1 + 4 * momentum * momentum)) / 2
         extrapolated = next_weights + (momentum - 1) / next_momentum * (next_weights - weights)
         change, weights, momentum = float(np.abs(next_weights - weights).max()), next_weights, next_momentum

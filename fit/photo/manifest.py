@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from torchdof.validation import choice, number, show
+from torchdof.validation import choice, fields, number, show
 
 from ..problems import FitError, warn
 from .captures import CAMERA, PATTERNS, RANGES, Captures, Dots, check_distances, cut_pairs, read_picture
@@ -22,10 +22,6 @@ _FAR_M = 100.0  # m; a dot on paper is not seen from farther, so larger distance
 Colours = Literal["mean", "each"]
 
 
-def _number(name: str, value: Any) -> float:
-    return number(name, value, *RANGES[name])
-
-
 def _text(name: str, value: Any) -> None:
     if not isinstance(value, str) or not value or "\0" in value:
         raise ValueError(f"{name} must be a text, got {show(value)}")
@@ -38,15 +34,16 @@ def _crop(name: str, value: Any) -> None:
 
 
 _FIELDS: Mapping[str, Callable[..., Any]] = {
-    **dict.fromkeys(("focus_m", "exposure_s", "full_width_px", *CAMERA), _number),
-    **dict.fromkeys(("sharp", "dark", "name"), _text),
+    **{name: partial(number, low=low, high=high) for name, (low, high) in RANGES.items()},
+    **dict.fromkeys(("sharp", "dark", "name", "file"), _text),
     "crop": _crop,
     "transfer": partial(choice, choices=("linear", "srgb")),
     "dots": partial(choice, choices=get_args(Dots)),
     "colours": partial(choice, choices=get_args(Colours)),
     "bayer": partial(choice, choices=PATTERNS),
 }
-_SHOT_FIELDS: Mapping[str, Callable[..., Any]] = {"file": _text, "distance_m": _number, "exposure_s": _number}
+_OF_MANIFEST = [name for name in _FIELDS if name not in ("file", "distance_m", "width_px")]
+_OF_SHOT = ["file", "distance_m", "exposure_s"]
 _REQUIRED = ("focus_m", "sharp", "file", "distance_m")
 
 
@@ -83,11 +80,9 @@ def read_captures(
 
     Raises:
         FitError: of kind "manifest" if it is missing, is not TOML, or has an invalid field; of kind "distance" if
-        distances are not increasing or equal the focus; or the error of a picture, with its file.
+        distances are not increasing or equal the focus; or the error of a picture, with its file. Integers without a
+        stated transfer, and distances above 100 m, give a `FitWarning`.
         OSError: a picture is missing or damaged.
-
-    Warns:
-        FitWarning: of kind "not linear" for integers without a stated transfer, "distance" if all exceed 100 m.
     """
     if not isinstance(folder, str | os.PathLike):
         raise FitError(f"folder must be the path of a folder or of its {MANIFEST}, got {show(folder)}", "manifest")
@@ -100,15 +95,15 @@ def read_captures(
     if not path.is_file():
         raise invalid("there is no such manifest; write a capture.toml beside the pictures")
     try:
-        fields = {"dots": "one"} | tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        stated = {"dots": "one"} | tomllib.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
         raise invalid(f"is not TOML: {error}") from error
-    shots = fields.pop("shot", None)
-    if not isinstance(shots, list) or not shots or not all(isinstance(shot, dict) for shot in shots):
+    shots = stated.pop("shot", None)
+    if not isinstance(shots, list) or not shots:
         raise invalid("give at least one [[shot]] with file and distance_m")
-    fields |= {name: value for name, value in (("dots", dots), ("colours", colours)) if value}
-    manifest = _valid(fields, _FIELDS, manifest_name)
-    shots = [_valid(shot, _SHOT_FIELDS, manifest_name) for shot in shots]
+    stated |= {name: value for name, value in (("dots", dots), ("colours", colours)) if value}
+    manifest = _valid(MANIFEST, stated, _OF_MANIFEST, manifest_name)
+    shots = [_valid("[[shot]]", shot, _OF_SHOT, manifest_name) for shot in shots]
     focus, files = manifest["focus_m"], [shot["file"] for shot in shots]
     check_distances([shot["distance_m"] for shot in shots], focus, manifest_name)
     nearest = min(focus, shots[0]["distance_m"])
@@ -138,13 +133,13 @@ def read_captures(
     width = sharp.width_px if manifest["full_width_px"] is None else round(manifest["full_width_px"])
     if width < sharp.width_px:
         raise invalid(f"full_width_px must be at least {sharp.width_px}, the pictures' own width, got {width}")
-    camera = {name: sharp.facts.get(name) if manifest[name] is None else manifest[name] for name in CAMERA}
-    transfer, name = manifest["transfer"] or "by file type", manifest["name"] or folder_path.resolve().name
+    from_exif = {name: sharp.facts[name] for name in CAMERA if manifest[name] is None and name in sharp.facts}
+    camera = {name: manifest[name] for name in CAMERA} | from_exif
+    transfer, title = manifest["transfer"] or "by file type", manifest["name"] or folder_path.resolve().name
     notes = {"manifest": path.name, "transfer": transfer, "pictures": files, "dots": manifest["dots"]}
-    if from_exif := [name for name in CAMERA if manifest[name] is None and camera[name] is not None]:
-        notes["from_exif"] = from_exif
+    notes |= {"from_exif": list(from_exif)} if from_exif else {}
     return [
-        Captures(pairs, focus, width, **camera, name=name, notes=notes | {"position_px": list(pairs[0].position_px)})
+        Captures(pairs, focus, width, **camera, name=title, notes=notes | {"position_px": list(pairs[0].position_px)})
         for pairs in zip(*columns, strict=False)
     ]
 
@@ -158,16 +153,11 @@ def inside(file: Path, root: str | os.PathLike[str], where: str) -> None:
         raise FitError(f"{str(file)!r} lies outside of {root} (--root)", "manifest", where)
 
 
-def _valid(fields: Mapping[str, Any], checks: Mapping[str, Callable[..., Any]], where: str) -> dict[str, Any]:
+def _valid(part: str, stated: Any, names: list[str], where: str) -> dict[str, Any]:
     """The fields of a part of the manifest, each checked; None for those that are missing and optional."""
-    valid = dict[str, Any]()
+    required = [name for name in names if name in _REQUIRED]
     try:
-        if unknown := [name for name in fields if name not in checks]:
-            raise ValueError(f"{unknown[0]!r} is not a field; known are {', '.join(checks)}")
-        for name, check in checks.items():
-            value = valid[name] = fields.get(name)
-            if value is not None or name in _REQUIRED:
-                valid[name] = check(name, value) or value
+        given = fields(part, stated, required, [name for name in names if name not in required])
+        return dict.fromkeys(names) | {name: _FIELDS[name](name, value) or value for name, value in given.items()}
     except ValueError as error:
         raise FitError(str(error), "manifest", where) from None
-    return valid

@@ -25,11 +25,8 @@ SourceKind = Literal["auto", "image", "dot"]
 
 _MIN_WINDOW_PX = 15
 _MIN_DOT_PX = 0.2
-# An ideal dot represents the sharp dot if the rms misfit of its edge, over the dot's level, is small enough.
-_MAX_EDGE_RMS = 2e-3  # largest misfit of a dot that is magnified
-_MAX_UNEXPLAINED = 0.02  # the same if magnifying its softness adds more than _MIN_VARIANCE
-_MIN_VARIANCE = 0.02  # px^2
-
+_MAX_EDGE_RMS = 2e-3  # largest misfit of the edge, over the level, of a magnified dot that is drawn as an ideal one
+_MAX_UNEXPLAINED, _MIN_VARIANCE = 0.02, 0.02  # the same if magnifying its softness adds more than this, px^2
 _MIN_RADIUS_PX = 4.0  # smallest radius of a dot and its blur; below, pixels have an effect like a tone curve
 _MIN_CHI_GAIN = 12.0  # decrease of chi squared for which the magnification is fitted: 3.5 sigma
 
@@ -54,8 +51,7 @@ def fit_pair(
     """Fits the kernel that turns a picture of a sharp dot into the picture of the same dot out of focus.
 
     The forward model explains every pixel of the window: `blurred = gain * (kernel convolved with the sharp picture,
-    moved and magnified) + background`. All of these are fitted, so they do not bias the kernel. As in rendering, a
-    pixel's own blur, 1/12 px^2 of variance, is in both pictures and not in the parameters.
+    moved and magnified) + background`, all of them fitted. As in rendering, a pixel's own blur is not in the kernel.
 
     `model="ratio"` is the paper's: `blurred / sharp` along spokes inside the dot, then eq. (1). It measures the dot
     convolved with the kernel, so its widths depend on the dot.
@@ -127,27 +123,22 @@ def fit_pair(
         pair.fit_moves = ALL_MOVES if fit_magnification and sharp is not None else ("dx", "dy")
         pair.opening = aperture or Aperture()
         free_profile, end = family in ("auto", "radial", *OPENINGS) and aperture is None, 0.0
-        # a free profile gives an unbiased magnification, unlike a wrong family
+        # a free profile gives an unbiased magnification, unlike a wrong family; it ends slightly outside a soft disc
+        solution = pair.solve("softm" if free_profile else family)
         if free_profile:
-            soft = pair.solve("softm")
-            # a free profile ends slightly outside a fitted soft disc, or at `reach`
-            end = float(soft.params["radius"]) + 3.5 * float(soft.params["sigma"]) + 1.0 if reach is None else reach
-            end = min(end, pair.half - 1.0)
-            solution = solve_radial(pair, soft.moves, end, knots)
-        else:
-            solution = pair.solve(family)
+            radius, sigma = float(solution.params["radius"]), float(solution.params["sigma"])
+            end = min(radius + 3.5 * sigma + 1.0 if reach is None else reach, pair.half - 1.0)
+            solution = solve_radial(pair, solution.moves, end, knots)
         expected = freest = solution
         if sharp is not None and fit_magnification is None:
             free_pair = replace(pair, fit_moves=ALL_MOVES)
             free = solve_radial(free_pair, solution.moves, end, knots) if free_profile else free_pair.solve(family)
-            # scale of chi squared: the residual or, without noise, the rounding of a spline; correlated noise counts
-            # less
-            scale = max(free.squares / pair.values.size, (1e-4 * pair.unit) ** 2)
-            chi_gain = (solution.squares - free.squares) / scale * independent_share(pair.noise_correlation)
-            if chi_gain > _MIN_CHI_GAIN:
+            # scale of chi squared: the residual or, without noise, a spline's rounding; correlated noise counts less
+            squares, free_squares = (float(one.residual @ one.residual) for one in (solution, free))
+            scale = max(free_squares / pair.values.size, (1e-4 * pair.unit) ** 2)
+            if (squares - free_squares) / scale * independent_share(pair.noise_correlation) > _MIN_CHI_GAIN:
                 pair, freest, solution = free_pair, free, free
-        why, opening = "", None
-        pair.held_magnification = freest.moves["magnification"]
+        why, opening, pair.held_magnification = "", None, freest.moves["magnification"]
         if free_profile and family == "auto":
             # every family at the free profile's magnification; the chosen one is then fitted with it
             held_pair = replace(pair, fit_moves=("dx", "dy"))
@@ -169,8 +160,7 @@ def fit_pair(
         freest_fit = fit if freest is solution else describe(freest, "")
         check_fit(solution, fit, files[1], freest_fit)
         if edge is not None:
-            # a residual far above the noise has been reported already. A picture of a kernel is smoothed, which makes
-            # the residual depend on the level
+            # not after a report of a large residual; that of a smooth picture of a kernel depends on the level
             largest_ratio = EXPLAINED if freest.family in OPENINGS else FAR_ABOVE
             is_large = min(fit.radius, edge.radius * fit.magnification) > _MIN_RADIUS_PX
             if linear and is_large and freest_fit.residual_over_noise < largest_ratio:
@@ -196,9 +186,9 @@ def prepared_pair(
         return Forward(point_source(data.shape, data_dot), data, used, data_dot, magnification), None, False
     dot = find_dot(sharp_picture, file=files[0])
     check_blacks(sharp_picture, dot, files[0])
-    is_unclipped = used_pixels(sharp_picture, dot, white, files[0], refuse=False)
-    clipped = int(np.sum(~is_unclipped))
-    edge = soft_edge(sharp_picture, dot, white=float(sharp_picture[~is_unclipped].min()) if clipped else None)
+    clipped_levels = sharp_picture[~used_pixels(sharp_picture, dot, white, files[0], refuse=False)]
+    clipped = clipped_levels.size
+    edge = soft_edge(sharp_picture, dot, white=float(clipped_levels.min()) if clipped else None)
     if softness is not None and softness < edge.softness:
         source, edge = "dot", edge.with_softness(softness)
     linear = clipped > 0 or softness is not None or check_linearity(sharp_picture, dot, edge, files[0])
@@ -208,8 +198,8 @@ def prepared_pair(
     if clipped:
         text = f"{clipped} pixels of the sharp picture are clipped; an ideal dot of {edge.radius:.2f} px stands for it"
         warn(text, "saturated", files[0])
-    # An ideal dot is as exact as the dot's own pixels. Magnification makes two errors of a few thousandths: in a spline
-    # between the pixels of a hard edge, and in the sensor's softness, which does not grow with the dot.
+    # Magnification makes two errors of a few thousandths, which an ideal dot does not have: in a spline between the
+    # pixels of a hard edge, and in the sensor's softness, which does not grow with the dot.
     unexplained = edge.rms * np.sqrt(max(1 - 1 / max(edge.misfit, 1e-9) ** 2, 0.0))
     softness_matters = edge.softness**2 * abs(1 - magnification**2) > _MIN_VARIANCE
     edge_fits = edge.misfit < EXPLAINED or (edge.rms < _MAX_EDGE_RMS and magnification != 1)

@@ -65,12 +65,10 @@ def read_photographs(
 
     Raises:
         FitError: fewer than two photographs show the target, EXIF does not describe the lens, a photograph lies outside
-        of the root, or "each" is used for one without three colours.
+        of the root, or "each" is used for one without three colours. Integers give a `FitWarning` if there are too few
+        photographs to find a tone curve.
         ValueError: the square's side is invalid.
         OSError: a picture is damaged.
-
-    Warns:
-        FitWarning: of kind "not linear" for integers, if there are too few photographs to find a tone curve.
     """
     number("square_mm", square_mm, low=1e-2, high=1e5, unit="millimetres")
     folder_name = str(folder)
@@ -83,9 +81,7 @@ def read_photographs(
     if len(files) < 2:
         text = f"there is neither a {MANIFEST} nor two photographs of the page that torchdof fit --target makes"
         raise FitError(text, "manifest", folder_name)
-    pictures: list[Photograph] = []
-    advice: list[str] = []
-    settings, integers = dict[str, float](), True
+    pictures, advice, settings, integers = list[Photograph](), list[str](), dict[str, float](), True
     for path in files:
         picture = read_image(path)
         if colours == "each" and len(picture.channels) < 3:
@@ -110,7 +106,7 @@ def read_photographs(
     if missing := [name for name in CAMERA if name not in settings]:
         text = f"EXIF has no {', '.join(missing)}: share the originals, or describe them in a {MANIFEST}"
         raise FitError(text, "manifest", folder_name)
-    bend, errors, original_light = np.zeros(3), np.zeros((0, 3)), {p.file: p.light for p in pictures}
+    bend, errors, original = np.zeros(3), np.zeros((0, 3)), {p.file: p.light for p in pictures}
     if integers and len(pictures) >= _MIN_FOR_TONE:
         bend, errors = tone_curve([(p.light, p.target) for p in pictures], square_mm)
     elif integers:
@@ -138,30 +134,24 @@ def read_photographs(
         pixels = read_image(Path(folder) / picture.file).pixels[0, :3].double().numpy()
         return np.stack([untoned(c, bend) if len(errors) else c for c in picture.target.window(pixels, half)])
 
-    pairs = []
-    for blurred in out_of_focus:
+    def pair(blurred: Photograph) -> Capture:
         both = sharpest, blurred
         half = int(WINDOW * min(p.target.side_px for p in both))
-        windows = [p.target.window(original_light[p.file], half) for p in both]
-        capture = Capture(
+        sharp_levels, blurred_levels = (p.target.window(original[p.file], half) for p in both)
+        return Capture(
             sharpest.target.window(sharpest.light, half),
             blurred.target.window(blurred.light, half),
             blurred.distance_m,
             files=(str(Path(folder) / sharpest.file), str(Path(folder) / blurred.file)),
             white=1.0 if sharpest.clipped else None,
             colours=(colours_of(sharpest, half), colours_of(blurred, half)) if colours == "each" else None,
-            uncertain=tuple((untoned(windows[0], bend + step), untoned(windows[1], bend + step)) for step in errors),
+            uncertain=tuple((untoned(sharp_levels, b), untoned(blurred_levels, b)) for b in bend + errors),
         )
-        pairs.append(capture)
-    notes = {
-        "target_square_mm": square_mm,
-        "pictures": [p.file for p in pictures],
-        "sharp": sharpest.file,
-        "tone_curve": bend.tolist(),
-        "from_exif": list(CAMERA),
-    }
+
+    notes = {"target_square_mm": square_mm, "pictures": [p.file for p in pictures], "sharp": sharpest.file}
+    notes |= {"tone_curve": bend.tolist(), "from_exif": list(CAMERA)}
     camera, name = {name: settings[name] for name in CAMERA}, Path(folder).resolve().name
-    captures = Captures(tuple(pairs), focus_m, width, **camera, name=name, notes=notes)
+    captures = Captures(tuple(map(pair, out_of_focus)), focus_m, width, **camera, name=name, notes=notes)
     return Photographs(captures, tuple(pictures), tuple(advice))
 
 
@@ -169,19 +159,18 @@ def _advice(
     pictures: Sequence[Photograph], out_of_focus: Sequence[Photograph], sharp: Photograph, focus_m: float
 ) -> list[str]:
     """Improvements, a sentence each."""
-    advice = []
-    dot_px = sharp.target.side_px * DOT_MM / SQUARE_MM / 2
-    if dot_px < 6:
-        advice.append(f"the sharp dot has a radius of {dot_px:.1f} px, 8 to 20 are best: go nearer")
-    if len(out_of_focus) < 4:
-        advice.append(f"{len(out_of_focus)} distances out of focus: five to nine make a better table")
-    if all(p.distance_m > focus_m for p in out_of_focus):
-        advice.append("no picture is nearer than the focus: there the table will be the mirror image of the far side")
+    dot_px, count = sharp.target.side_px * DOT_MM / SQUARE_MM / 2, len(out_of_focus)
+    is_behind = all(p.distance_m > focus_m for p in out_of_focus)
+    advice = [
+        (dot_px < 6, f"the sharp dot has a radius of {dot_px:.1f} px, 8 to 20 are best: go nearer"),
+        (count < 4, f"{count} distances out of focus: five to nine make a better table"),
+        (is_behind, "no picture is nearer than the focus: there the table will be the mirror image of the far side"),
+    ]
     for p in pictures:
-        if p.clipped:
-            advice.append(f"{p.file}: the paper is clipped; expose a stop less")
-        if p.target.white < 0.15:
-            advice.append(f"{p.file}: the paper is at {100 * p.target.white:.0f} % of white; expose more")
-        if (ratio := p.target.elongation) > 1.03:
-            advice.append(f"{p.file}: the square is {ratio:.2f} times as long as wide; look at it square on")
-    return advice
+        white, ratio = p.target.white, p.target.elongation
+        advice += [
+            (p.clipped, f"{p.file}: the paper is clipped; expose a stop less"),
+            (white < 0.15, f"{p.file}: the paper is at {100 * white:.0f} % of white; expose more"),
+            (ratio > 1.03, f"{p.file}: the square is {ratio:.2f} times as long as wide; look at it square on"),
+        ]
+    return [sentence for is_needed, sentence in advice if is_needed]

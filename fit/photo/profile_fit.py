@@ -46,10 +46,8 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
 
     Raises:
         FitError: wrong shapes, too few samples, negative radii, unknown family, NaN; of kind "flat profile" if the
-        strength does not vary beyond its noise.
-
-    Warns:
-        FitWarning: a parameter is not determined ("flat profile") or ended on its bound ("boundary").
+        strength does not vary beyond its noise. A parameter that is not determined, or on its bound, gives a
+        `FitWarning`.
 
     Reference:
         Sato, Dobashi, Yamamoto, eq. (1): N -> "N", r_c -> "r_c", sigma -> "sigma" (the paper prints sigma^2).
@@ -77,8 +75,7 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
     order = np.argsort(radii, kind="stable")
     unit, peak = float(radii.max()), float(np.abs(values).max())
     x, y = radii[order] / unit, values[order] / peak
-    # noise from second differences of samples sorted by r
-    noise = float(np.sqrt(np.mean((y[2:] - 2 * y[1:-1] + y[:-2]) ** 2) / 6.0))
+    noise = float(np.sqrt(np.mean((y[2:] - 2 * y[1:-1] + y[:-2]) ** 2) / 6.0))  # from second differences
     # F test of a parabola over r against a constant
     parabola = np.stack([np.ones_like(x), x, x * x], axis=1)
     unexplained = float(np.sum((y - parabola @ np.linalg.lstsq(parabola, y, rcond=None)[0]) ** 2))
@@ -106,20 +103,12 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
         covariance = covariance @ (scores.T @ scores) @ covariance * count / max(count - 1, 1)
     scale = np.array([unit if n in LENGTHS else peak if n == "N" else 1.0 for n in names])
     covariance = covariance * np.outer(scale, scale)
-    params: dict[str, float | Array] = dict(zip(names, (fitted * scale).tolist(), strict=True))
-    curve_r = np.linspace(0.0, unit, 257)
-    fit = BlurFit(
-        family=family,
-        params=params,
-        stderr=dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True)),
-        residual=float(np.sqrt(squares / np.sum(y**2))),
-        noise=float(noise * np.sqrt(y.size / np.sum(y**2))),
-        covariance=covariance,
-        names=names,
-        model="profile",
-        samples=np.stack([radii, values]),
-        curve=np.stack([curve_r, evaluate(family, curve_r, params)]),
-    )
+    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    params, stderr = (dict[str, float | Array](zip(names, v.tolist(), strict=True)) for v in (fitted * scale, spread))
+    size, curve_r = float(np.sqrt(np.sum(y**2))), np.linspace(0.0, unit, 257)
+    samples, curve = np.stack([radii, values]), np.stack([curve_r, evaluate(family, curve_r, params)])
+    residuals = float(np.sqrt(squares)) / size, float(noise * np.sqrt(y.size)) / size
+    fit = BlurFit(family, params, stderr, *residuals, covariance, names, "profile", samples=samples, curve=curve)
     for name in LENGTHS.intersection(names):
         value, error, bound = float(fit.params[name]), float(fit.stderr[name]), _BOUNDS[name][1] * unit
         # compare the error of r_c with sigma if r_c is smaller, because a peak at the centre has r_c near 0
@@ -141,8 +130,8 @@ def evaluate(family: str, r: Array, params: dict[str, float | Array]) -> Array:
 def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, Indices]:
     """`I_b(r, theta) / I(r, theta)` from the dot's centre to its edge, at every pixel of r and every 10 degrees.
 
-    As in the paper, both pictures are read from the centre of the sharp dot. The result is the dot convolved with the
-    kernel: use it for comparison with the paper, and the forward model for rendering.
+    As in the paper, both pictures are read from the centre of the sharp dot: the result is the dot convolved with the
+    kernel, for comparison with the paper.
 
     Args:
         sharp: `[H, W]`, linear light, the dot in focus.
@@ -166,8 +155,7 @@ def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, I
     """
     pictures = a_picture("sharp", sharp, _MIN_SIDE_PX), a_picture("blurred", blurred, _MIN_SIDE_PX)
     dot, blurred_dot = map(find_dot, pictures)
-    # the outermost pixel of the dot is half paper
-    r = np.arange(0.0, max(dot.radius - 1.0, 1.0) + 1e-9)
+    r = np.arange(0.0, max(dot.radius - 1.0, 1.0) + 1e-9)  # the outermost pixel of the dot is half paper
     theta = np.deg2rad(np.arange(0, 360, _STEP_DEG))[:, None]
     positions = [dot.y + r * np.sin(theta), dot.x + r * np.cos(theta)]
     levels, blurred_levels = (map_coordinates(picture, positions, order=1, mode="nearest") for picture in pictures)

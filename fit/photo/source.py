@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import affine_transform, convolve1d, spline_filter
+from scipy.ndimage import affine_transform, spline_filter
 from scipy.special import erfc
 
 from ..result import Array
@@ -41,11 +41,8 @@ def picture_of_dot(picture: Array, dot: Dot) -> Source:
 
 def point_source(shape: tuple[int, ...], dot: Dot) -> Source:
     """A point of light at the pixel nearest to a blurred dot's centre, blurred by that pixel."""
-    x, y = int(round(dot.x)), int(round(dot.y))
-    picture = np.zeros(shape)
-    picture[y, x] = 1.0
-    for axis in (0, 1):
-        picture = convolve1d(picture, np.array([1.0, 22.0, 1.0]) / 24.0, axis)
+    (x, y), box, picture = (round(dot.x), round(dot.y)), np.array([1.0, 22.0, 1.0]) / 24.0, np.zeros(shape)
+    picture[y - 1 : y + 2, x - 1 : x + 2] = np.outer(box, box)
     return Source(x, y, 0.0, 4.0, _drawn_by_splines(picture, x, y))
 
 
@@ -84,8 +81,7 @@ class Edge:
     exponent: float  # of the light in the edge's levels, if fitted; 1 in linear light
     rms: float  # residual of the ideal dot, over the dot's peak
     misfit: float  # the same over the expected noise
-    # mean residual of the edge's upper half minus that of its lower half, over the level; positive for an S-curve
-    steepness: float
+    steepness: float  # mean residual of the edge's upper half minus that of its lower, over the level; S-curve: above 0
     steepness_error: float
     shot_noise: float  # growth of a pixel's noise variance from the paper to the dot
 
@@ -128,15 +124,14 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
     shot_noise = 0.0 if inside is None else max(fine_variance(picture, inside) - dot.noise**2, 0.0)
     fine_share = noise_beside(picture, dot.background, ~is_near)[1]
     expected = float(np.sqrt(np.mean(dot.noise**2 + shot_noise * np.clip(levels, 0, 1)) / fine_share)) / dot.peak
-    dx, dy, radius, softness, level = solution[:5].tolist()
+    dx, dy, radius, softness, level, exponent = [*solution.tolist(), 1.0][:6]
     coverage = _coverage(rows, columns, dot.x + dx, dot.y + dy, radius, softness)
-    lower, upper = ((coverage > least) & (coverage < least + 0.38) for least in (0.02, 0.6))
+    halves = [residual[(coverage > least) & (coverage < least + 0.38)] / level for least in (0.02, 0.6)]
     steepness, steepness_error = 0.0, np.inf
-    if min(lower.sum(), upper.sum()) >= 8:
-        steepness = float(residual[upper].mean() - residual[lower].mean()) / level
-        variance = sum(residual[half].var(ddof=1) / half.sum() for half in (lower, upper))
-        steepness_error = float(np.sqrt(variance)) / level
-    exponent, misfit = float(solution[5]) if fit_exponent else 1.0, rms / expected if expected > 0 else np.inf
+    if min(map(len, halves)) >= 8:
+        steepness = float(halves[1].mean() - halves[0].mean())
+        steepness_error = float(np.sqrt(sum(half.var(ddof=1) / len(half) for half in halves)))
+    misfit = rms / expected if expected > 0 else np.inf
     found = radius, softness, level * dot.peak, exponent, rms, misfit, steepness, steepness_error, shot_noise
     return Edge(dot.x + dx, dot.y + dy, *found)
 
@@ -145,8 +140,7 @@ def _coverage(rows: Array, columns: Array, x: float, y: float, radius: float, so
     """Level, 0 to 1, of a soft disc, integrated over each pixel."""
     distance = np.hypot(columns - x, rows - y)
     level = (distance < radius).astype(np.float64)
-    # the fine grid's own step softens the edge
-    sigma = max(softness, 0.3 / _SAMPLES_PER_PX)
+    sigma = max(softness, 0.3 / _SAMPLES_PER_PX)  # the fine grid's own step softens the edge
     band = np.abs(distance - radius) < 0.75 + 5 * sigma
     step = (np.arange(_SAMPLES_PER_PX) + 0.5) / _SAMPLES_PER_PX - 0.5
     fine_x, fine_y = (columns[band] - x)[:, None, None] + step, (rows[band] - y)[:, None, None] + step[:, None]

@@ -29,7 +29,6 @@ _WARN_LOG, _REFUSE_LOG = math.log(1.15), math.log(1.35)
 _MAX_EXPOSURE_RATIO = 1.3  # ratio of fitted to stated exposure above which to warn
 _BY_COST = (*COST, *OPENINGS)
 _KNOTS = 33  # values of a free profile, equal for all distances
-_COLOURS = ("red", "green", "blue")
 
 
 @dataclass(frozen=True)
@@ -37,13 +36,12 @@ class TableFit:
     """A table and the fits from which it was made.
 
     Attributes:
-        table: the blur table.
-        fits: one for each pair, by increasing distance.
+        table: the blur table, with a kernel for each colour if the captures have colours.
+        fits: one for each pair, by increasing distance; of the mean of the colours.
         coc_px: signed circle of confusion of each pair, px of the frame.
         why: reason for the family.
         scale: source of the circles of confusion: "camera" or "measured".
-        colours: fits of "red", "green" and "blue", if the captures have colours; the table then has a kernel for each,
-            and `fits` are those of their mean.
+        colours: fits of "red", "green" and "blue".
     """
 
     table: BlurTable
@@ -96,11 +94,7 @@ def fit_captures(
         accuracy_db: accuracy for "auto", see `fit_pair`.
         progress: called with (number done, total, text) after each fit.
         command: recorded in the table's provenance.
-        scale_of: the fit of another dot in the same photographs, whose circles of confusion are used if the camera is
-            unknown.
-
-    Returns:
-        The table and its fits.
+        scale_of: the fit of another dot in the same photographs; gives the circles of confusion of an unknown camera.
 
     Raises:
         FitError: a pair cannot be fitted (the message names its file), or, of kind "camera", the fitted blur is far
@@ -109,18 +103,17 @@ def fit_captures(
     if not isinstance(captures, Captures):
         raise FitError(f"captures must be a Captures(pairs, focus_m=..., width_px=...), got {show(captures)}")
     checked(choice, "family", family, ("auto", *SHAPES))
-    pairs, has_first_fits, done = captures.pairs, family == "auto" or family in OPENINGS, count(1)
+    focus, pairs, has_first_fits, done = captures.focus_m, captures.pairs, family in ("auto", *OPENINGS), count(1)
 
     def report(pair: Capture) -> None:
         if progress:
             progress(next(done), len(pairs) * (2 if has_first_fits else 1), f"{pair.distance_m:g} m")
 
-    why, opening, first_fits = f"family {family!r} was asked for", None, list[BlurFit]()
-    if has_first_fits:  # each pair alone determines the family or the opening; the final fits warn
-        for pair in pairs:
-            with without_warnings():
-                first_fits.append(_fit_one(pair, captures.focus_m, family, accuracy_db=accuracy_db))
-            report(pair)
+    why, opening, first_fits, fits = f"family {family!r} was asked for", None, list[BlurFit](), list[BlurFit]()
+    for pair in pairs if has_first_fits else ():  # each alone determines the family or the opening; the final fits warn
+        with without_warnings():
+            first_fits.append(_fit_one(pair, focus, family, accuracy_db=accuracy_db))
+        report(pair)
     if family == "auto":
         # the richest family needed at any distance is used for all
         richest = max(range(len(pairs)), key=lambda i: _BY_COST.index(first_fits[i].family))
@@ -129,39 +122,31 @@ def fit_captures(
     if family in OPENINGS:  # that of the largest blur, as seen behind the focus
         openings = [(fit, pair) for fit, pair in zip(first_fits, pairs, strict=True) if fit.family == family]
         largest, pair = max(openings, key=lambda one: one[0].radius)
-        opening = _seen(largest.aperture or Aperture(), pair, captures.focus_m)
-    fits = list[BlurFit]()
+        opening = _seen(largest.aperture or Aperture(), pair, focus)
     for pair in pairs:
-        if opening is None:
-            fit = _fit_one(pair, captures.focus_m, family)
-        else:
-            aperture = _seen(opening, pair, captures.focus_m)
-            fit = replace(_fit_one(pair, captures.focus_m, "image", aperture=aperture), family=family)
+        aperture = None if opening is None else _seen(opening, pair, focus)
+        fit = _fit_one(pair, focus, family if aperture is None else "image", aperture=aperture)
+        fit = replace(fit, family=family)
         ratio = 1.0 if pair.exposure is None or not fit.gain > 0 else fit.gain / pair.exposure
         if max(ratio, 1 / ratio) > _MAX_EXPOSURE_RATIO:
             text = f"the blurred dot is {ratio:.2f} times as bright as the exposures say; did the light stay the same?"
             warn(text, "exposure", pair.files[1])
-        fits.append(_with_uncertainty(pair, captures.focus_m, fit))
+        fits.append(_with_uncertainty(pair, focus, fit))
         report(pair)
     radius_px = np.array([f.radius for f in fits])
     check_agreement(captures, radius_px)
-    camera_px, defocus = captures.promised_px, captures.defocus
-    if camera_px is not None:
-        coc_px, scale = camera_px, "camera"
-    elif scale_of is not None:
+    coc_px, defocus, scale = captures.promised_px, captures.defocus, "camera"
+    if coc_px is None and scale_of is not None:
         coc_px, scale = np.array(scale_of.coc_px), scale_of.scale
-    else:
+    elif coc_px is None:
         coc_px, scale = float(np.abs(defocus) @ radius_px / (defocus @ defocus)) * defocus, "measured"
     if len(pairs) == 1:
         text = f"one distance was measured ({pairs[0].distance_m:g} m); the thin lens scales it to all others"
         warn(text, "single distance", pairs[0].files[1])
     params = _params(fits, family)
     provenance = {
-        "source": "photographs of a dot",
-        "date": datetime.date.today().isoformat(),
-        "focus_m": captures.focus_m,
-        "distances_m": captures.distances_m.tolist(),
-        "width_px": captures.width_px,
+        **{"source": "photographs of a dot", "date": datetime.date.today().isoformat(), "focus_m": focus},
+        **{"distances_m": captures.distances_m.tolist(), "width_px": captures.width_px},
         "residual_over_noise": [round(f.residual_over_noise, 3) for f in fits if math.isfinite(f.residual_over_noise)],
         "asymmetry": [round(f.asymmetry, 4) for f in fits],
         **captures.notes,
@@ -170,8 +155,8 @@ def fit_captures(
     }
     colours: dict[str, tuple[BlurFit, ...]] = {}
     if all(pair.colours is not None for pair in pairs):
-        by_pair = [_fit_colours(pair, captures.focus_m, fit) for pair, fit in zip(pairs, fits, strict=True)]
-        colours = dict(zip(_COLOURS, zip(*by_pair, strict=True), strict=True))
+        by_pair = [_fit_colours(pair, focus, fit) for pair, fit in zip(pairs, fits, strict=True)]
+        colours = dict(zip(("red", "green", "blue"), zip(*by_pair, strict=True), strict=True))
         colour_params = [_params(colour_fits, family) for colour_fits in colours.values()]
         params = {n: np.stack([p[n] for p in colour_params]) for n in params}
         provenance["colours"] = list(colours)
@@ -204,18 +189,16 @@ def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> N
     is_large = np.maximum(expected, measured) > _MIN_BLUR_PX
     difference = np.maximum(np.abs(measured - expected) - 0.5, 0.0)  # half a pixel is for aberrations
     misfit = np.log1p(difference / np.maximum(np.minimum(measured, expected), 1e-9))
-    misfit_log = float(np.max(np.where(is_large, misfit, 0.0)))
+    misfit_log = float(np.max(misfit * is_large))
     # without a camera the scale is fitted to the distances themselves
     if int(is_large.sum()) < (3 if camera_px is None else 1) or misfit_log < _WARN_LOG:
         return
-    worst = int(np.argmax(np.where(is_large, np.abs(np.log(measured / expected)), 0.0)))
-    each = zip(measured / expected, captures.distances_m, strict=True)
-    ratios = ", ".join(f"{ratio:.2f} at {distance:g} m" for ratio, distance in each)
-    text = f"the blur's radius over the expected one is {ratios}: check the distance of a single odd one, the focus if "
+    ratios = measured / expected
+    each = ", ".join(f"{ratio:.2f} at {d:g} m" for ratio, d in zip(ratios, captures.distances_m, strict=True))
+    text = f"the blur's radius over the expected one is {each}: check the distance of a single odd one, the focus if "
     text += "near and far ones differ, and units, a crop (full_width_px) and the camera's numbers if all do"
-    if camera_px is not None:
-        text += f"; without {', '.join(CAMERA)} the scale is measured"
-    file = captures.pairs[worst].files[1]
+    text += "" if camera_px is None else f"; without {', '.join(CAMERA)} the scale is measured"
+    file = captures.pairs[int(np.argmax(np.where(is_large, np.abs(np.log(ratios)), 0.0)))].files[1]
     if misfit_log > _REFUSE_LOG:
         raise FitError(text, "camera", file)
     warn(text, "camera", file)
@@ -242,8 +225,7 @@ def _seen(opening: Aperture, pair: Capture, focus_m: float) -> Aperture:
 def _fit_one(pair: Capture, focus_m: float, family: str, **options: Any) -> BlurFit:
     """Fits one pair by `fit_pair`."""
     expected = {"magnification": focus_m / pair.distance_m, "knots": _KNOTS if family == "radial" else None}
-    options = {"white": pair.white, "files": pair.files, **expected, **options}
-    return fit_pair(pair.sharp, pair.blurred, family, **options)
+    return fit_pair(pair.sharp, pair.blurred, family, white=pair.white, files=pair.files, **expected | options)
 
 
 def _fit_like(fit: BlurFit, pair: Capture, focus_m: float, sharp: Array, blurred: Array, **options: Any) -> BlurFit:
@@ -265,12 +247,9 @@ def _with_uncertainty(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
     covariance = fit.covariance + changes.T @ changes
     spread = np.sqrt(np.diag(covariance))
     errors = {"values": spread} if fit.family == "radial" else dict(zip(names, spread.tolist(), strict=True))
-    return replace(
-        fit,
-        stderr=fit.stderr | {n: error for n, error in errors.items() if n in fit.params},
-        covariance=covariance,
-        radius_stderr=float(np.hypot(fit.radius_stderr, np.linalg.norm([o.radius - fit.radius for o in others]))),
-    )
+    stderr = fit.stderr | {n: error for n, error in errors.items() if n in fit.params}
+    radius_stderr = float(np.hypot(fit.radius_stderr, np.linalg.norm([o.radius - fit.radius for o in others])))
+    return replace(fit, stderr=stderr, covariance=covariance, radius_stderr=radius_stderr)
 
 
 def _fit_colours(pair: Capture, focus_m: float, mean: BlurFit) -> list[BlurFit]:
@@ -279,5 +258,4 @@ def _fit_colours(pair: Capture, focus_m: float, mean: BlurFit) -> list[BlurFit]:
     # the sharpest colour's softness is used for all, so that each kernel contains all of its colour's blur
     softness = min(soft_edge(sharp, find_dot(sharp, file=pair.files[0])).softness for sharp in sharp_colours)
     fixed: dict[str, Any] = {"magnification": mean.magnification, "fit_magnification": False, "softness": softness}
-    windows = zip(sharp_colours, blurred_colours, strict=True)
-    return [_fit_like(mean, pair, focus_m, sharp, blurred, **fixed) for sharp, blurred in windows]
+    return [_fit_like(mean, pair, focus_m, *both, **fixed) for both in zip(sharp_colours, blurred_colours, strict=True)]

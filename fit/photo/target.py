@@ -6,6 +6,7 @@ blurred edge of the square darkens as much as it lights up.
 
 import math
 import os
+import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -47,9 +48,8 @@ def write_target(path: str | os.PathLike[str], paper: Paper = "a4") -> None:
     if target.suffix.lower() != ".pdf":
         raise FitError(f"the target is written as PDF: name it {target.with_suffix('.pdf')}", file=str(path))
     checked(choice, "paper", paper, get_args(Paper))
-    page = Path(__file__).with_name(f"target-{paper}.pdf").read_bytes()
     with atomic_file(target) as temporary:
-        Path(temporary).write_bytes(page)
+        shutil.copyfile(Path(__file__).with_name(f"target-{paper}.pdf"), temporary)
 
 
 @dataclass(frozen=True)
@@ -98,50 +98,42 @@ def _squares(thumbnail: Array, dark: Mask) -> Iterator[Target]:
         # any parallelogram has the area 12 sqrt(det cov)
         if abs(x.size / (12 * math.sqrt(max(float(np.linalg.det(np.cov(np.stack([x, y])))), 1e-9))) - 1) > 0.06:
             continue
-        side = math.sqrt(x.size)
-        target = Target(left + float(x.mean()), top + float(y.mean()), side, elongation=1.0, white=0.0, black=0.0)
-        distance = _square_distance(thumbnail.shape, target)
-        ring = thumbnail[(distance > 1.12) & (distance < 1.2)]
-        inside = thumbnail[(distance > 0.4) & (distance < 0.85)]
-        middle = thumbnail[distance < 0.03 + 1.5 / side]
+        centre_x, centre_y, side = left + float(x.mean()), top + float(y.mean()), math.sqrt(x.size)
+        distance = _square_distance(thumbnail.shape, centre_x, centre_y, side)
+        areas = (1.12, 1.2), (0.4, 0.85), (-1.0, 0.03 + 1.5 / side)
+        ring, inside, middle = (thumbnail[(distance > low) & (distance < high)] for low, high in areas)
         if ring.size < 8 or inside.size < 8 or middle.size < 1:
             continue
         white, black = float(np.median(ring)), float(np.median(inside))
         if white > 2.5 * black and float(middle.max()) - black > max(0.05 * (white - black), 4 * float(inside.std())):
-            yield replace(target, white=white, black=black)
+            yield Target(centre_x, centre_y, side, 1.0, white, black)
 
 
-def _square_distance(shape: tuple[int, ...], target: Target) -> Array:
-    """Distance from the square's centre in half sides, the larger of both axes: 1 on its edge."""
+def _square_distance(shape: tuple[int, ...], x: float, y: float, side: float) -> Array:
+    """Distance from a square's centre in half sides, the larger of both axes: 1 on its edge."""
     rows, columns = np.indices(shape)
-    offset = np.maximum(np.abs(rows - target.y), np.abs(columns - target.x))
-    return np.asarray(offset / (target.side_px / 2))
+    return np.asarray(np.maximum(np.abs(rows - y), np.abs(columns - x)) / (side / 2))
 
 
-def _refined(light: Array, rough: Target) -> Target:
+def _refined(light: Array, target: Target) -> Target:
     """Centre, side and levels from the light of the whole square, which blur moves but keeps."""
-    target = rough
     for _ in range(2):
         half = int(0.62 * target.side_px) + 2
         top, left = max(round(target.y) - half, 0), max(round(target.x) - half, 0)
         crop = light[top : round(target.y) + half + 1, left : round(target.x) + half + 1]
-        local = replace(target, x=target.x - left, y=target.y - top)
-        distance = _square_distance(crop.shape, local)
+        x, y, (rows, columns) = target.x - left, target.y - top, np.indices(crop.shape)
+        distance = _square_distance(crop.shape, x, y, target.side_px)
         paper, ink = (distance > 1.12) & (distance < 1.22), (distance > 0.5) & (distance < 0.85)
-        rows, columns = np.indices(crop.shape)
-        plane = np.stack([np.ones(crop.shape), rows - local.y, columns - local.x], axis=-1)
+        plane = np.stack([np.ones(crop.shape), rows - y, columns - x], axis=-1)
         white = plane @ np.linalg.lstsq(plane[paper], crop[paper], rcond=None)[0]
         black = float(np.median(crop[ink] / white[ink]))
         share = np.clip((1 - crop / white) / (1 - black), -0.2, 1.2)
         share[distance < 0.5] = 1.0  # the dot counts as part of the square
         share[distance > 1.15] = 0.0
-        area = float(share.sum())
+        area, level = float(share.sum()), float(np.median(white))
         x, y = float((share * columns).sum() / area), float((share * rows).sum() / area)
-        width, height = (
-            math.sqrt(12 * float((share * (axis - middle) ** 2).sum()) / area)
-            for axis, middle in ((columns, x), (rows, y))
-        )
-        level = float(np.median(white))
+        squares = ((share * (axis - middle) ** 2).sum() for axis, middle in ((columns, x), (rows, y)))
+        width, height = (math.sqrt(12 * float(square) / area) for square in squares)
         target = Target(x + left, y + top, math.sqrt(area), max(width / height, height / width), level, black * level)
     return target
 
@@ -160,11 +152,11 @@ def tone_curve(pictures: Sequence[tuple[Array, Target]], square_mm: float) -> tu
     """The `bend` of `untoned` [3] that dots and edges show, 0 if insignificant; and its independent errors [3, 3]."""
     dots = []
     for light, target in pictures:
-        half = int(WINDOW * target.side_px)
+        side, half = target.side_px, int(WINDOW * target.side_px)
         window = target.window(light, half)
         distance = np.hypot(*(np.indices(window.shape) - half))
-        inside, surroundings = distance < 0.12 * target.side_px, (distance > 0.2 * target.side_px) & (distance < half)
-        area = math.pi * (DOT_MM / 2 * target.side_px / square_mm) ** 2
+        inside, surroundings = distance < 0.12 * side, (distance > 0.2 * side) & (distance < half)
+        area = math.pi * (DOT_MM / 2 * side / square_mm) ** 2
         # the noise of a demosaiced pixel is correlated with about nine neighbours
         noise = 3 * float(window[surroundings].std()) * math.sqrt(inside.sum()) / (target.white * area)
         dots.append((window, inside, surroundings, target.white, area, math.hypot(noise, _DOT_ERROR)))
@@ -220,20 +212,18 @@ def _edges(light: Array, target: Target) -> list[tuple[Array, Array]]:
             if count.all() and _BIN * float(((share > 0.1) & (share < 0.9)).sum()) > _MIN_EDGE_PX:
                 profiles.append(level)
         if len(profiles) == 2:
-            shorter = min(profile.size for profile in profiles)
+            shorter = min(map(len, profiles))
             pairs.append((profiles[0][:shorter], profiles[1][:shorter]))
     return pairs
 
 
 def _edge_asymmetry(one: Array, other: Array) -> Array:
     """Asymmetry of two opposite edges at equal distances from their centres, over its error."""
-    asymmetry: Array = np.zeros(1)
+    asymmetry, bins, offset = np.zeros(1), np.arange(one.size), np.arange(1.0, one.size // 3)
     for level in (one, other):
         margin = level.size // 6
         paper, ink = float(level[:margin].mean()), float(level[-margin:].mean())
         share = (level - ink) / (paper - ink)
         centre = float(share.sum()) - 0.5  # of a symmetric edge, in bins
-        offset = np.arange(1.0, level.size // 3)
-        bins = np.arange(level.size)
         asymmetry = asymmetry + np.interp(centre + offset, bins, share) + np.interp(centre - offset, bins, share) - 1
     return np.asarray(asymmetry / (2 * _SYMMETRY_ERROR * math.sqrt(asymmetry.size / _POSITIONS)))

@@ -73,7 +73,7 @@ CHANGES: list[tuple[dict[str, Any], BlurTable]] = [
     *(({"lens": name}, BlurTable.load(name)) for name in INPUTS["lens"][0][2:]),
     ({"lens": "gaussian"}, BlurTable.gaussian()),
     ({"shape": "5 blades", "rotation_deg": 10.0}, BlurTable.polygon(5, 10.0)),
-    ({"squeeze": 2.0}, BlurTable.disc().with_aperture(Aperture(squeeze=2.0))),
+    ({"squeeze": 2.0}, BlurTable.disc().replace(aperture=Aperture(squeeze=2.0))),
 ]
 
 

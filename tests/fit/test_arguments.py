@@ -73,7 +73,6 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "Lens": (Lens, {"surfaces": LENS.surfaces, "stop": 0}),
     "Surface": (Surface, vars(LENS.surfaces[0])),
     "Lens.with_f_number": (LENS.with_f_number, {"f_number": 4.0}),
-    "Lens.scaled": (LENS.scaled, {"focal_length_mm": 35.0}),
     "Lens.read": (Lens.read, {"source": "wide_22mm"}),
     "read_captures": (read_captures, {"folder": "nowhere"}),
 }  # fmt: skip

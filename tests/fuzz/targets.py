@@ -98,7 +98,7 @@ def _table_seeds(folder: Path) -> None:
     BlurTable("softm", [-0.01, 0.02], soft, unit="mm", sensor_width_mm=36.0).save(folder / "soft.json")
     BlurTable.polygon(5, 12.0, 0.3, squeeze=1.5, vignetting=(0.3, 0.1)).save(folder / "polygon.json")
     opening = Aperture(rotation_deg=30.0, mask=torch.eye(5), vignetting=0.5)
-    BlurTable.gaussian().with_aperture(opening).save(folder / "mask.json")
+    BlurTable.gaussian().replace(aperture=opening).save(folder / "mask.json")
 
 
 def _read_table(path: Path) -> None:

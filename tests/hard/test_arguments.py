@@ -94,8 +94,6 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "Camera.focal_px": (Camera().focal_px, {"width": 5}),
     "Camera.replace": (Camera().replace, {"focus_m": 1.0, "f_number": 2.0}),
     "Camera.focus_at": (Camera().focus_at, {"depth": DEPTH, "x": 1.0, "y": 2.0, "patch": 5}),
-    "Camera.hyperfocal_m": (Camera().hyperfocal_m, {"coc_px": 1.0, "width": 5}),
-    "Camera.sharp_limits_m": (Camera().sharp_limits_m, {"coc_px": 1.0, "width": 5}),
     "BlurTable": (BlurTable, {"family": "disc", "coc": [1.0], "params": {"radius": [1.0]}}),
     "BlurTable, all": (
         lambda **a: BlurTable("disc", [0.1], **a),
@@ -112,7 +110,6 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "BlurTable.params": (RING.params, {"coc_px": torch.ones(2), "width": 5}),
     "BlurTable.kernels": (RING.kernels, {"coc_px": torch.ones(2), "width": 5, "size": 7}),
     "BlurTable.reach_px": (RING.reach_px, {"coc_px": 1.0, "width": 5}),
-    "BlurTable.blur_texture": (RING.blur_texture, {"coc_px": 1.0, "width": 5, "size": None}),
     "psf.pixel_kernels": (psf.pixel_kernels, {"family": "disc", "params": {"radius": 1.0}, "size": 9}),
     "psf.profile": (psf.profile, {"family": "disc", "r": torch.ones(2), "params": {"radius": 1.0}}),
     "psf.support": (psf.support, {"family": "disc", "params": {"radius": 1.0}}),

@@ -23,7 +23,7 @@ LOPSIDED = [
     BlurTable.polygon(5, 7.0, 0.4, rim=2.0),
     BlurTable.from_aperture(LETTER, squeeze=0.8),
     BlurTable.polygon(5, vignetting=(0.3, 0.1)),
-    BlurTable.load("double_gauss_50mm_f2").with_aperture(Aperture(blades=7, rotation_deg=15.0)),
+    BlurTable.load("double_gauss_50mm_f2").replace(aperture=Aperture(blades=7, rotation_deg=15.0)),
 ]
 
 
@@ -134,7 +134,7 @@ def test_kernels_differentiate_in_rotation_squeeze_and_coc() -> None:
 
 partial: Any = functools.partial
 CORNER = functional.pad(torch.ones(1, 1), (0, 4, 0, 54))  # the only open point
-DARK = BlurTable.gaussian().with_aperture(Aperture(rotation_deg=30.0, mask=CORNER))
+DARK = BlurTable.gaussian().replace(aperture=Aperture(rotation_deg=30.0, mask=CORNER))
 test_an_invalid_opening_is_refused_by_name = refuses(
     (lambda: BlurTable.polygon(2), "blades must be a whole number from 3 to 64, got 2"),
     (lambda: BlurTable.polygon(5, torch.zeros(2)), "rotation_deg must be a number"),

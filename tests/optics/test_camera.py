@@ -62,25 +62,6 @@ def test_rendering_convention_keeps_the_field_of_view_at_any_focus() -> None:
     assert_close(Camera.from_fov(fov, 0.012, 2.0).focal_px(768), torch.tensor(each, dtype=torch.float64))
 
 
-def test_focused_at_the_textbook_hyperfocal_distance_infinity_is_just_acceptable() -> None:
-    camera, radius_px = Camera(focal_length_mm=50.0, f_number=8.0), 0.030 / 2 / 36.0 * 1920
-    hyperfocal_m = camera.hyperfocal_m(radius_px, 1920)
-    assert hyperfocal_m == pytest.approx((50.0**2 / (8.0 * 0.030) + 50.0) / 1000.0, rel=1e-12)
-    focused = camera.replace(focus_m=hyperfocal_m)
-    assert float(focused.coc_px(depth_of(math.inf), 1920)) == pytest.approx(radius_px, rel=1e-12)
-    near, far = focused.sharp_limits_m(radius_px, 1920)
-    assert near == pytest.approx(focused.focus_m / 2, rel=1e-9) and far > 1e9
-    for beyond in (2 * hyperfocal_m, math.inf):
-        assert camera.replace(focus_m=beyond).sharp_limits_m(radius_px, 1920)[1] == math.inf
-
-
-@pytest.mark.parametrize("camera", [Camera(focus_m=3.0), Camera.from_fov(40.0, 0.01, 3.0)], ids=["lens", "fov"])
-def test_the_limits_of_sharpness_have_the_acceptable_coc(camera: Camera) -> None:
-    near, far = (float(limit) for limit in camera.sharp_limits_m(2.0, 1920))
-    assert near < 3.0 < far
-    assert_close(camera.coc_px(depth_of(near, far), 1920).flatten(), torch.tensor([-2.0, 2.0], dtype=torch.float64))
-
-
 def test_a_batch_of_cameras_equals_each_camera_alone() -> None:
     depth = 0.5 + 5 * torch.rand(3, 1, 4, 5, dtype=torch.float64)
     numbers: dict[str, Any] = {
@@ -90,12 +71,10 @@ def test_a_batch_of_cameras_equals_each_camera_alone() -> None:
         "sensor_width_mm": torch.tensor([36.0, 23.5, 17.3], dtype=torch.float64),
     }
     together = Camera(**numbers).coc_px(depth, 640)
-    limits = torch.stack(list(map(torch.as_tensor, Camera(**numbers).sharp_limits_m(1.0, 1920))), 1)
     for i in range(3):
         one: dict[str, Any] = {name: float(value[i]) for name, value in numbers.items()}
         alone = Camera(**one)
         assert_close(together[i : i + 1], alone.coc_px(depth[i : i + 1], 640))
-        assert limits[i].tolist() == pytest.approx(alone.sharp_limits_m(1.0, 1920), rel=1e-7)
     assert Camera(**numbers).coc_px(depth[:1], 640).shape == (3, 1, 4, 5)
 
 
@@ -169,9 +148,6 @@ test_invalid_arguments_are_refused_by_name = refuses(
       for place in ((8.0, 0.0), (0.0, 4.0), (-0.1, 0.0), (0.0, -1.0))),
     (lambda: Camera().focus_at(FRAME, math.nan, 0.0), "x of the focus point must be a number"),
     (lambda: Camera().focus_at(0 * FRAME, 2, 2), "no valid depth"),
-    (lambda: Camera().focus_on(FRAME, FRAME[..., :3] > 0), "must have the depth's shape"),
-    (lambda: Camera().focus_on(FRAME, FRAME < 0), "no valid depth where"),
-    (lambda: Camera().focus_on(FRAME, -FRAME), ">= 0"),
 )  # fmt: skip
 
 
@@ -190,10 +166,6 @@ def test_a_range_is_in_focus_from_end_to_end_and_blur_grows_from_its_ends() -> N
     assert_close(coc, scale * torch.tensor(expected, dtype=coc.dtype), rtol=1e-12, atol=0)
     assert coc[2:5].eq(0.0).all()
     assert camera.focus_m == pytest.approx(2 / (1 / 1.5 + 1 / 2.2), rel=1e-12)
-    assert camera.hyperfocal_m(1.0, 1920) == pytest.approx(Camera(f_number=2.0).hyperfocal_m(1.0, 1920), rel=1e-12)
-    near, far = camera.sharp_limits_m(1.0, 1920)
-    assert float(camera.coc_px(depth_of(float(near)), 1920)) == pytest.approx(-1.0, rel=1e-9)
-    assert float(camera.coc_px(depth_of(float(far)), 1920)) == pytest.approx(1.0, rel=1e-9)
 
 
 def test_a_range_may_be_empty_or_end_at_infinity_and_excludes_a_focus_distance() -> None:
@@ -232,13 +204,3 @@ def test_a_tilted_lens_is_in_focus_on_the_plane_through_its_hinge(tilt: float, s
     fine = camera.coc_px(torch.full((1, 1, 2 * height, 2 * width), 2.0, dtype=torch.float64), width)
     coarse = camera.coc_px(torch.full((1, 1, height, width), 2.0, dtype=torch.float64), width)
     assert_close(torch.nn.functional.avg_pool2d(fine, 2), coarse, rtol=1e-9, atol=1e-12)
-
-
-def test_focus_on_takes_the_median_of_the_subject_and_focus_in_prefers_the_middle_of_its_box() -> None:
-    depth = torch.tensor([[1.0, 2.0, 3.0, math.nan], [9.0, 9.0, 9.0, 9.0]]).reshape(1, 1, 2, 4)
-    mask = torch.tensor([[1, 1, 1, 1], [0, 0, 0, 0]]).reshape(1, 1, 2, 4)
-    assert Camera().focus_on(depth, mask > 0).focus_m == 2.0
-    weighted = torch.tensor([[0.1, 0.2, 0.8, 5.0], [0, 0, 0, 0]]).reshape(1, 1, 2, 4)
-    assert Camera().focus_on(depth, weighted).focus_m == 3.0
-    both = Camera().focus_on(torch.cat([depth, depth + 1]), mask > 0).focus_m
-    assert torch.as_tensor(both).tolist() == [2.0, 3.0]

@@ -108,7 +108,7 @@ test_bad_fields_are_refused_by_name = refuses(
     (read(light=BOMB), "must hold 576 bytes"),
     (read(light=BOMB, shape=[1, 4, 3, 5000, 5000]), "five numbers of cells"),
     (read(box="wide"), "field.box must be numbers"),
-    (lambda: table().with_aperture(Aperture(blades=5)), "has its own opening"),
+    (lambda: table().replace(aperture=Aperture(blades=5)), "has its own opening"),
     (lambda: BlurTable("disc", [1.0], {"radius": [1.0]}, field=field()), "must state its unit"),
     (lambda: table().replace(field=field(3)), "field must have 1 channels"),
 )

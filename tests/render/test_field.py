@@ -19,7 +19,7 @@ from torchdof.reference.metrics import psnr
 from torchdof.render.field import BLOCK
 
 CUT = Aperture(vignetting=0.4)
-TABLE, STRONG = (BlurTable.disc().with_aperture(Aperture(vignetting=share)) for share in (0.4, 0.8))
+TABLE, STRONG = (BlurTable.disc().replace(aperture=Aperture(vignetting=share)) for share in (0.4, 0.8))
 
 
 def number(value: float) -> Tensor:
@@ -59,7 +59,7 @@ def cats_eye(coc_px: float, y: float, x: float, half: int, front: float, rear: f
 def test_the_kernel_of_a_place_is_that_of_disc_and_rims(coc_px: float, y: float, x: float, vignetting: Any) -> None:
     aperture = Aperture(vignetting=vignetting)
     kernel = passed(BlurTable.disc(), coc_px, y, x)
-    cut = passed(BlurTable.disc().with_aperture(aperture), coc_px, y, x)
+    cut = passed(BlurTable.disc().replace(aperture=aperture), coc_px, y, x)
     expected = cats_eye(coc_px, y, x, kernel.shape[-1] // 2, *aperture.rims)
     assert float(cut.sum()) == pytest.approx(1.0, abs=1e-12)
     assert (cut[0] - expected).abs().sum() < 0.04  # share of the light; errors are at the border of a rim
@@ -86,7 +86,7 @@ def lopsided(channels: int = 1) -> BlurTable:
 def test_kernels_are_not_cut_in_the_middle_of_the_frame_or_near_focus() -> None:
     for coc in (-9.0, 0.02, 3.0):
         uncut = passed(BlurTable.gaussian(), coc, 0.6, 0.8)
-        assert_close(passed(BlurTable.gaussian().with_aperture(CUT), coc, 0.0, 0.0), uncut, rtol=1e-12, atol=0)
+        assert_close(passed(BlurTable.gaussian().replace(aperture=CUT), coc, 0.0, 0.0), uncut, rtol=1e-12, atol=0)
     assert_close(passed(TABLE, 0.3, 0.6, 0.8), passed(BlurTable.disc(), 0.3, 0.6, 0.8), rtol=1e-12, atol=0)
     for coc in (0.0, 0.02):  # spots in focus are one pixel
         kernel = passed(lopsided(), coc, 0.4, 0.7, (240, 360))[0]

@@ -114,7 +114,7 @@ def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[w
         elif command.plots is not None:
             from torchdof.fit.plots import picture_of_fit
 
-            for pair, fit in zip(captures, result.fits, strict=True):
+            for pair, fit in zip(captures.pairs, result.fits, strict=True):
                 picture = command.plots / f"{out.stem}_{1000 * pair.distance_m:.0f}mm.png"
                 _save(console, picture_of_fit(fit), picture)
         if command.as_json:
@@ -128,7 +128,7 @@ def _report(console: Console, captures: Captures, result: TableFit) -> dict[str,
     """Prints the fits at all distances, the reason for the family, and the colours; returns them as facts."""
     fits = result.fits
     columns = {
-        "distance m": [f"{pair.distance_m:.4g}" for pair in captures],
+        "distance m": [f"{pair.distance_m:.4g}" for pair in captures.pairs],
         "coc px": [f"{coc:+.2f}" for coc in result.coc_px],
         "measured": [f"{f.radius:.2f}" for f in fits],
         **{n: [f"{f.params[n]:.3f} ± {f.stderr[n]:.2g}" for f in fits] for n in fits[0].params if n != "values"},
@@ -141,7 +141,7 @@ def _report(console: Console, captures: Captures, result: TableFit) -> dict[str,
     console.print(f"family: {result.why}\ncircles of confusion: {how}")
     if result.colours:
         columns = {"": list(result.colours)}
-        for i, pair in enumerate(captures):
+        for i, pair in enumerate(captures.pairs):
             radii = [f"{fits[i].radius:.2f} ± {fits[i].radius_stderr:.2g}" for fits in result.colours.values()]
             columns[f"radius px at {pair.distance_m:g} m"] = radii
         print_columns(console, "colours: the table holds a kernel for each", columns)

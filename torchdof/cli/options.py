@@ -142,7 +142,7 @@ class Blur(Group):
             return table
         mask = None if self.aperture is None else read_image(self.aperture).light[0].mean(0)
         aperture = Aperture(self.blades, self.rotation, self.curvature, self.squeeze, mask, self.vignetting)
-        return table.with_aperture(aperture)
+        return table.replace(aperture=aperture)
 
     def files(self) -> list[Path]:
         """The table and the picture of the opening, if they are files."""

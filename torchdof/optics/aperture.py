@@ -45,9 +45,8 @@ class Aperture:
         mask: Transmission ``[H, W]`` >= 0 of the square around the opening, instead of blades; the longer side of the
             image spans the square. Images of more than 128 pixels are averaged down. Rotation is bilinear.
         vignetting: Cat's eyes, from 0 (round everywhere) to 1 (closed in the corner of the frame). A cat's eye in the
-            corner is shorter than wide by this share of its width. Two rims of the lens barrel cut it, one in front of
-            the opening and one behind it, each by half of that. A pair ``(front, rear)`` gives each rim its own share
-            (:mod:`torchdof.optics.placed_kernels`).
+            corner is shorter than wide by this share of its width, half of it by a rim in front of the opening and half
+            by one behind it. A pair ``(front, rear)`` gives each rim its own share.
 
     Raises:
         ValueError: If a number is out of its range, or the mask is dark or has blades as well.
@@ -115,8 +114,7 @@ class Aperture:
     def finest(self) -> float:
         """Radius, as a share of the circle of confusion, of the disc with detail about as fine as the blur: at most 1.
 
-        For a mask it is twice the radius of the disc with the same ratio of area to outline length, at most 1; for a
-        cat's eye, its height over its width halfway to the corner.
+        For a mask by the ratio of area to outline; for a cat's eye its height over its width halfway to the corner.
         """
         finest = min(1.0, 1.0 / _as_float(self.squeeze)) * (1.0 - min(1.0, sum(self.rims)) / 2)
         if self.mask is None:
@@ -166,17 +164,14 @@ class Aperture:
         return cls(**given)
 
     def __repr__(self) -> str:
-        parts = []
-        if self.mask is not None:
-            parts.append(f"mask {self.mask.shape[0]} x {self.mask.shape[1]}")
-        elif self.blades:
-            parts.append(f"{self.blades} blades" + (f", curvature {self.curvature:g}" if self.curvature else ""))
-        for name, value, default in (("turned by", self.rotation_deg, 0.0), ("squeeze", self.squeeze, 1.0)):
-            if _as_float(value) != default:
-                parts.append(f"{name} {_as_float(value):g}")
-        if self.depends_on_place:
-            parts.append(f"vignetting {sum(self.rims):g}")
-        return f"Aperture({', '.join(parts) or 'round'})"
+        rotation, squeeze, vignetting = _as_float(self.rotation_deg), _as_float(self.squeeze), sum(self.rims)
+        shape = "x" if self.mask is None else " x ".join(map(str, self.mask.shape))
+        parts = {
+            **{f"mask {shape}": self.mask is not None, f"{self.blades} blades": self.blades},
+            **{f"curvature {self.curvature:g}": self.curvature, f"turned by {rotation:g}": rotation},
+            **{f"squeeze {squeeze:g}": squeeze != 1.0, f"vignetting {vignetting:g}": vignetting},
+        }
+        return f"Aperture({', '.join(text for text, is_stated in parts.items() if is_stated) or 'round'})"
 
     def _outline(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """Corners ``[V]`` of the outline, x and y with y down, counter-clockwise as seen with y up."""
@@ -196,12 +191,10 @@ class Aperture:
         if not isinstance(rotation, Tensor) and rotation == 0.0:
             return mask
         angle = torch.deg2rad(torch.as_tensor(rotation, dtype=torch.float64, device=mask.device))
-        cosine, sine = torch.cos(angle), torch.sin(angle)
+        cosine, sine, zero = torch.cos(angle), torch.sin(angle), torch.zeros_like(angle)
         height, width = mask.shape
-        rows = torch.stack([cosine, -sine * height / width, sine * width / height, cosine])
-        grid = functional.affine_grid(
-            torch.cat([rows.reshape(2, 2), rows.new_zeros(2, 1)], 1)[None], [1, 1, height, width], align_corners=False
-        )
+        rows = torch.stack([cosine, -sine * height / width, zero, sine * width / height, cosine, zero])
+        grid = functional.affine_grid(rows.reshape(1, 2, 3), [1, 1, height, width], align_corners=False)
         return functional.grid_sample(mask[None, None], grid, align_corners=False)[0, 0]
 
 

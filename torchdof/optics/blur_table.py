@@ -57,8 +57,7 @@ class BlurTable:
         unit: ``"fraction"`` of the image's width, ``"mm"`` on a sensor of ``sensor_width_mm``, or ``"relative"``: only
             the ratio of lengths to coc matters (one node a side).
         sensor_width_mm: Width of the sensor on which the millimetres were measured; with ``unit="mm"`` only.
-        strength: The fitted strength N at the nodes ``[N]``, kept as measured. It does not enter rendering: kernels
-            conserve energy.
+        strength: The fitted strength N at the nodes ``[N]``, as measured; rendering conserves energy instead.
         name: Short name.
         provenance: Origin of the numbers (camera, source, date, command): a JSON-like dict.
         residual: Relative residual of the fit at each node ``[N]``.
@@ -108,26 +107,23 @@ class BlurTable:
         if not self.coc.any():
             raise ValueError("coc must have a node that is not 0")
         if unit == "relative" and max(int((self.coc > 0).sum()), int((self.coc < 0).sum())) > 1:
-            got = f"{len(self.coc)}; state the unit as 'fraction' (of the image's width) or 'mm'"
-            raise ValueError(f"unit 'relative' takes one node on each side of focus at most, got {got}")
+            remedy = f"got {len(self.coc)}; state the unit as 'fraction' (of the image's width) or 'mm'"
+            raise ValueError(f"unit 'relative' takes one node on each side of focus at most, {remedy}")
         if (unit == "mm") != (sensor_width_mm is not None):
-            got = f"{show(sensor_width_mm)} with {unit!r}"
-            raise ValueError(f"sensor_width_mm goes with unit 'mm' and only with it, got {got}")
+            raise ValueError(f"sensor_width_mm goes with unit 'mm' only, got {show(sensor_width_mm)} with {unit!r}")
         if sensor_width_mm is not None:
             sensor_width_mm = number("sensor_width_mm", sensor_width_mm, 1e-6, 1e9, "millimetres")
         self.sensor_width_mm = sensor_width_mm
-        self._params = self._check_params(params)
+        self._params, self._fingerprint = self._check_params(params), ""
         self._sides = {sign: self._side(sign) for sign in (-1, 1) if bool((self.coc * sign > 0).any())}
         for distances, nodes in self._sides.values():
             self._check_extent("coc", "params", float(distances[-1]), float(psf.reach(family, nodes).max()))
-        lengths = [nodes[name][:, 0] for _, nodes in self._sides.values() for name in psf.LENGTHS & nodes.keys()]
-        self.is_sharp_in_focus = not bool(torch.cat(lengths).any())
-        self.strength = self._per_node("strength", strength)
-        self.residual = self._per_node("residual", residual)
-        self.provenance = dict(provenance or {})
-        self.aperture, self.field = aperture, field
-        self._check_field()
-        self._fingerprint: str | None = None
+        in_focus = [nodes[name][:, 0] for _, nodes in self._sides.values() for name in psf.LENGTHS & nodes.keys()]
+        self.is_sharp_in_focus = not bool(torch.cat(in_focus).any())
+        self.strength, self.residual = self._per_node("strength", strength), self._per_node("residual", residual)
+        self.provenance, self.aperture, self.field = dict(provenance or {}), aperture, field
+        if field is not None:
+            self._check_field(field)
 
     @classmethod
     def disc(cls) -> "BlurTable":
@@ -178,8 +174,7 @@ class BlurTable:
             >>> BlurTable.polygon(6, rotation_deg=15.0, squeeze=2.0)
             BlurTable('polygon', disc, 1 node, Aperture(6 blades, turned by 15, squeeze 2))
         """
-        opening = Aperture(blades, rotation_deg, curvature, squeeze, vignetting=vignetting)
-        return cls._of_rim(rim, "polygon", opening)
+        return cls._of_rim(rim, "polygon", Aperture(blades, rotation_deg, curvature, squeeze, vignetting=vignetting))
 
     @classmethod
     def from_aperture(
@@ -219,21 +214,16 @@ class BlurTable:
         params = {"radius": [1.0], "sigma": [0.0], "b": [rim], "m": [_RIM_POWER]}
         return cls("softm", [1.0], params, name=name, aperture=aperture)
 
-    def with_aperture(self, aperture: Aperture | None) -> "BlurTable":
-        """The same lens with another opening; None leaves it round.
-
-        Example:
-            >>> BlurTable.gaussian().with_aperture(Aperture(blades=5))
-            BlurTable('gaussian', gaussian, 1 node, Aperture(5 blades))
-        """
-        return self.replace(aperture=aperture)
-
     def replace(self, **changes: Any) -> "BlurTable":
-        """The same table with some arguments of the constructor changed.
+        """The same table with some arguments of the constructor changed, such as the opening.
 
         Raises:
             ValueError: If one is not as described there.
             TypeError: If a name is unknown.
+
+        Example:
+            >>> BlurTable.gaussian().replace(aperture=Aperture(blades=5))
+            BlurTable('gaussian', gaussian, 1 node, Aperture(5 blades))
         """
         given = {name: getattr(self, name) for name in ("family", "unit", "coc", *_OPTIONAL)}
         return BlurTable(**{**given, "params": self._params, **changes})
@@ -255,7 +245,7 @@ class BlurTable:
 
     def fingerprint(self) -> str:
         """Hash of all numbers that kernels depend on; computed once."""
-        if self._fingerprint is None:
+        if not self._fingerprint:
             aperture = None if self.aperture is None else self.aperture.to_dict()
             field = None if self.field is None else self.field.fingerprint()
             params = {name: value.tolist() for name, value in self._params.items()}
@@ -291,9 +281,8 @@ class BlurTable:
 
         In front of the focus plane, kernels of an opening that is not round are point-reflected.
 
-        In focus the kernel is a single pixel, because the image is already as sharp there as it should be. A table may
-        have a blur of its own in focus, which moves a share ``M`` of the light to other pixels. It is faded in with the
-        weight ``min(1, 4 coc^2 / M)``: at 0.35 px for ``M`` = 0.5, at 0.05 px for ``M`` = 0.01, it is complete.
+        In focus the kernel is a single pixel, because the image is already as sharp there as it should be. A blur of
+        the table in focus, which moves a share ``M`` of the light, is faded in with the weight ``min(1, 4 coc^2 / M)``.
 
         Args:
             coc_px: Signed coc in pixels ``[n]``.
@@ -331,10 +320,7 @@ class BlurTable:
         return 1.0 - in_focus[:, in_focus.shape[-2] // 2, in_focus.shape[-1] // 2]
 
     def side_nodes(self, sign: int) -> tuple[Tensor, dict[str, Tensor]]:
-        """Nodes of one side of focus, -1 in front of it, ordered by ``|coc|`` from 0, in the table's unit.
-
-        Unsigned coc ``[N]`` and parameters ``[channels, N]``; a side without nodes has those of the other.
-        """
+        """Unsigned coc ``[N]``, from 0, and parameters ``[channels, N]`` at the nodes of a side, or else the other."""
         return self._sides.get(sign) or self._sides[-sign]
 
     def reach_px(self, coc_px: float, width: float) -> float:
@@ -356,35 +342,6 @@ class BlurTable:
             spreads = (self._params["sigma"] / self.coc.abs())[:, self.coc != 0]
             return abs(coc_px) * _FINEST_SIGMAS * float(spreads.min())
         return abs(coc_px) if self.aperture is None else abs(coc_px) * self.aperture.finest
-
-    def blur_texture(self, coc_px: float, width: int, size: int | None = None) -> Tensor:
-        """The paper's blur texture: the fitted profile f(r), strength N included, at the pixels' centres.
-
-        ``[channels, size, size]``, float64, not normalised. Arguments as in :meth:`kernels`.
-
-        Reference:
-            Sato, Dobashi, Yamamoto, Fig. 3.
-
-        Example:
-            >>> texture = BlurTable.load("sato_j15").blur_texture(10.0, width=512)
-            >>> round(float(texture.max()), 3)
-            0.581
-        """
-        signed = torch.tensor(number("coc_px", coc_px, unit="pixels"), dtype=torch.float64, device="cpu")
-        params = self.params(signed, width)
-        size = psf.width_of(size, psf.support(self.family, params, self.aperture))
-        axis = torch.arange(size, dtype=torch.float64, device="cpu") - size // 2
-        opening = self.aperture or Aperture()
-        r = torch.hypot(axis[:, None], axis[None, :] * opening.squeeze)
-        texture = psf.profile(self.family, r.flatten(), params).unflatten(-1, (size, size))
-        if not opening.is_round:
-            pixel = 1.0 / psf.opening_radius(self.family, params)
-            shares = opening.shares(size // 2, pixel, pixel * opening.squeeze)
-            texture = texture * (shares if signed >= 0 else shares.flip(-2, -1))
-        if self.strength is None:
-            return texture
-        nearest = (self.coc - signed / self.px_per_unit(width)).abs().argmin()
-        return texture * self.strength[nearest]
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the table as JSON, whole or not at all; ``OSError`` if the file cannot be written."""
@@ -427,8 +384,7 @@ class BlurTable:
         if not isinstance(schema, str) or schema != _SCHEMA:
             raise ValueError(f"schema must be {_SCHEMA!r}, got {show(schema)}; is this a blur table?")
         if not isinstance(version, int) or version not in _VERSIONS:
-            readable = " or ".join(map(str, _VERSIONS))
-            raise ValueError(f"version must be {readable}, got {show(version)}; update torchdof to read it")
+            raise ValueError(f"version must be one of {_VERSIONS}, got {show(version)}; update torchdof to read it")
         given = fields("a blur table", data, ("schema", "version", "family", "unit", "coc", "params"), _OPTIONAL)
         del given["schema"], given["version"]
         for name, part in (("aperture", Aperture), ("field", Field)):
@@ -473,10 +429,7 @@ class BlurTable:
         channels = max(v.shape[0] for v in checked.values())
         return {name: value.expand(channels, *value.shape[1:]).contiguous() for name, value in checked.items()}
 
-    def _check_field(self) -> None:
-        field = self.field
-        if field is None:
-            return
+    def _check_field(self, field: Field) -> None:
         if self.aperture is not None:
             raise ValueError(f"a table with a field has its own opening, got {self.aperture!r} too; leave one out")
         if self.unit == "relative":
@@ -506,10 +459,9 @@ class BlurTable:
 
     def _side(self, sign: int) -> tuple[Tensor, dict[str, Tensor]]:
         """Nodes of one side of focus, ordered by ``|coc|``, with a node at 0."""
-        on_side = self.coc * sign >= 0
-        order = torch.argsort(self.coc[on_side].abs())
-        distances = self.coc[on_side].abs()[order]
-        nodes = {k: v[:, on_side][:, order] for k, v in self._params.items()}
+        order = self.coc.abs().argsort()
+        order = order[self.coc[order] * sign >= 0]
+        distances, nodes = self.coc[order].abs(), {k: v[:, order] for k, v in self._params.items()}
         if distances[0] > 0:
             distances = torch.cat([distances.new_zeros(1), distances])
             for name, value in nodes.items():

@@ -11,8 +11,7 @@ Sign and axis conventions are stated here once; every other module links to this
 * A lens whose axis points ``swing`` to the right and ``tilt`` down, while the sensor stays, is in focus on a plane
   through the focus distance on the image's axis (Scheimpflug): ``1/s`` above becomes ``1/s + (n_x x + n_y y) / (F f)``,
   with ``(n_x, n_y) = (sin swing cos tilt, sin tilt)`` and ``(x, y)`` the pixel's place from the image's centre, to the
-  right and down. All such planes of one tilt meet ``f / sin tilt`` below the lens (the hinge). The image distance is
-  that of the lens when it is straight.
+  right and down. The image distance is that of the lens when it is straight.
 * ``focus_range_m=(near, far)`` is sharp between both distances. Nearer than ``near`` the blur is that of a lens focused
   on ``near``; farther than ``far``, that of a lens focused on ``far``.
 
@@ -133,11 +132,6 @@ class Camera:
         """Radius of the aperture, ``f / (2 n)``, in metres."""
         return self.focal_length_mm / (2000.0 * self.f_number)
 
-    @property
-    def _ends(self) -> tuple[Number, Number]:
-        """Nearest and farthest distance in focus."""
-        return self.focus_range_m or (self.focus_m, self.focus_m)
-
     def focal_px(self, width: int) -> Number:
         """Image distance over pixel pitch, in pixels of an image ``width`` pixels wide (``F`` of the convention)."""
         pixels_wide(width)
@@ -149,8 +143,7 @@ class Camera:
     def coc_px(self, depth: Tensor, width: int) -> Tensor:
         """Signed radius of the circle of confusion.
 
-        Finite distances give ``1/s - 1/z`` as ``(z - s) / (z s)``, which does not cancel near focus. The result is
-        exactly 0 at ``z = s`` and exactly ``(A / 2) F / s`` at infinity.
+        The result is exactly 0 at ``z = s`` and exactly ``(A / 2) F / s`` at infinity.
 
         Args:
             depth: ``[B, 1, H, W]`` (or ``[1, 1, H, W]``, broadcast over the camera's batch), metres, > 0, ``inf``
@@ -191,7 +184,8 @@ class Camera:
         """:meth:`coc_px` by the compiled engine; None if it does not support the call (traced, batched, tilted)."""
         if is_traced() or depth.dtype != torch.float32 or not is_in_memory(depth) or not native.chosen():
             return None
-        numbers = [self.aperture_radius_m * self.focal_px(width), *self._ends, self.tilt_deg, self.swing_deg]
+        distances = self.focus_range_m or (self.focus_m, self.focus_m)
+        numbers = [self.aperture_radius_m * self.focal_px(width), *distances, self.tilt_deg, self.swing_deg]
         if any(isinstance(n, Tensor) and (n.numel() > 1 or not is_in_memory(n)) for n in numbers):
             return None
         scale, nearest, farthest, tilt, swing = (float(n) for n in numbers)
@@ -242,79 +236,22 @@ class Camera:
         height, width = depth.shape[-2:]
         if not (0 <= x < width and 0 <= y < height):
             raise ValueError(f"focus point ({x}, {y}) must lie in the frame of {width} x {height} pixels (x, y)")
-        column, row, reach = int(x), int(y), patch // 2
-        weight = torch.zeros_like(depth[:1])
-        weight[..., max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1] = 1.0
-        return self._focused(depth, weight, f"within {reach} pixels of ({x}, {y}); choose another focus point")
-
-    def focus_on(self, depth: Tensor, focus_mask: Tensor) -> "Camera":
-        """This camera focused on a subject: on the median of its depths, each weighted by the mask.
-
-        Args:
-            depth: As in :meth:`focus_at`.
-            focus_mask: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, >= 0: weight of each pixel.
-
-        Raises:
-            ValueError: If the shapes are not as described, or the subject has no valid depth.
-
-        Example:
-            >>> depth = torch.tensor([1.0, 1.2, 1.4, 6.0]).reshape(1, 1, 1, 4)
-            >>> round(Camera().focus_on(depth, depth < 2).focus_m, 3)
-            1.2
-        """
-        one_channel("depth", depth, "in metres")
-        mask = focus_mask.to(depth.dtype) if isinstance(focus_mask, Tensor) else focus_mask
-        one_channel("focus_mask", mask)
-        if mask.shape[0] not in (1, depth.shape[0]) or mask.shape[1:] != depth.shape[1:]:
-            raise ValueError(f"focus_mask must have the depth's shape {list(depth.shape)}, got {list(mask.shape)}")
-        if not bool((mask >= 0).all()):
-            raise ValueError("focus_mask must be >= 0 everywhere")
-        return self._focused(depth, mask, "where focus_mask is above 0")
-
-    def _focused(self, depth: Tensor, weight: Tensor, location: str) -> "Camera":
-        """This camera with the weighted median of the distances that would bring each pixel into focus."""
         distance = depth
         at_infinity = dataclasses.replace(self, focus_m=math.inf, focus_range_m=None)
-        shift = at_infinity._tilted_dioptres(depth, int(depth.shape[-1]))
+        shift = at_infinity._tilted_dioptres(depth, int(width))
         if isinstance(shift, Tensor):  # tilted: solve 1/s + shift (1 - f/s) = 1/z for s; the factor only if it breathes
             breathing = 1.0 - _as_map(self.focal_length_mm / 1000.0, depth) * shift if self.focus_breathing else 1.0
             distance = breathing / (1.0 / depth - shift)
-        medians = []
-        for values, item_weight, valid in zip(distance, weight.expand(depth.shape), depth > 0, strict=True):
-            is_used = valid & (item_weight > 0)
-            if not bool(is_used.any()):
-                raise ValueError(f"depth must be > 0 where the focus lies, got no valid depth {location}")
-            medians.append(_weighted_median(values[is_used], item_weight[is_used]))
+        reach, medians = patch // 2, []
+        rows, columns = (slice(max(0, int(middle) - reach), int(middle) + reach + 1) for middle in (y, x))
+        for distances, is_valid in zip(distance[..., rows, columns], depth[..., rows, columns] > 0, strict=True):
+            if not bool(is_valid.any()):
+                area = f"within {reach} pixels of ({x}, {y}); choose another focus point"
+                raise ValueError(f"depth must be > 0 where the focus lies, got no valid depth {area}")
+            medians.append(distances[is_valid].median())
         if not all(float(median) > 0 for median in medians):
-            raise ValueError(f"no focus brings the depth {location} onto the tilted plane; tilt less")
-        focus_m = float(medians[0]) if len(medians) == 1 else torch.stack(medians)
-        return self.replace(focus_m=focus_m)
-
-    def hyperfocal_m(self, coc_px: float, width: int) -> Number:
-        """Nearest focus distance in metres, a float or ``[B]``, at which infinity is still acceptably sharp.
-
-        ``coc_px`` > 0 is the acceptable radius in pixels of an image ``width`` pixels wide. With the *diameter* ``c``
-        on the sensor, the distance is ``f^2 / (n c) + f``.
-        """
-        _check_number("coc_px", coc_px)
-        at_infinity = dataclasses.replace(self, focus_m=math.inf, focus_range_m=None)
-        hyperfocal = at_infinity.aperture_radius_m * at_infinity.focal_px(width) / coc_px
-        return hyperfocal + self.focal_length_mm / 1000.0 if self.focus_breathing else hyperfocal
-
-    def sharp_limits_m(self, coc_px: float, width: int) -> tuple[Number, Number]:
-        """Nearest and farthest depth in metres on the image's axis, floats or ``[B]``, that is acceptably sharp.
-
-        ``coc_px`` > 0 is the acceptable radius in pixels of an image ``width`` pixels wide. The farthest depth is
-        ``inf`` at and beyond the hyperfocal distance.
-        """
-        _check_number("coc_px", coc_px)
-        scale = self.aperture_radius_m * self.focal_px(width)
-        dioptres = coc_px / scale if isinstance(scale, Tensor) or scale > 0 else math.inf
-        nearest, farthest = self._ends
-        near, far = 1.0 / (1.0 / nearest + dioptres), 1.0 / farthest - dioptres
-        if isinstance(far, Tensor):
-            return near, torch.where(far > 0, 1.0 / far, torch.inf)
-        return near, 1.0 / far if far > 0 else math.inf
+            raise ValueError(f"no focus brings the depth at ({x}, {y}) onto the tilted plane; tilt less")
+        return self.replace(focus_m=float(medians[0]) if len(medians) == 1 else torch.stack(medians))
 
     def __repr__(self) -> str:
         focus = " to ".join(map(_show, self.focus_range_m or (self.focus_m,)))
@@ -331,23 +268,13 @@ class Camera:
 def _dioptres_behind(z: Tensor, s: Tensor) -> Tensor:
     """``1/s - 1/z``, exactly 0 at ``z = s``, for finite and infinite distances."""
     both_finite = torch.isfinite(z) & torch.isfinite(s)
-    z_safe = torch.where(both_finite, z, 1.0)
-    s_safe = torch.where(both_finite, s, 1.0)
+    z_safe, s_safe = torch.where(both_finite, z, 1.0), torch.where(both_finite, s, 1.0)
     return torch.where(both_finite, (z_safe - s_safe) / z_safe / s_safe, 1.0 / s - 1.0 / z)
 
 
-def _weighted_median(values: Tensor, weights: Tensor) -> Tensor:
-    """The smallest of ``values`` ``[n]`` at which the cumulative weight reaches half of the total."""
-    values, order = values.sort()
-    summed = weights[order].double().cumsum(0)
-    return values[int((summed >= 0.5 * summed[-1]).nonzero()[0])]
-
-
 def _show(value: Number) -> str:
-    if isinstance(value, Tensor):
-        values = [f"{x:.6g}" for x in value.detach().flatten().tolist()]
-        return values[0] if len(values) == 1 else "[" + ", ".join(values) + "]"
-    return f"{value:.6g}"
+    values = [f"{x:.6g}" for x in (value.detach().flatten().tolist() if isinstance(value, Tensor) else [value])]
+    return values[0] if len(values) == 1 else f"[{', '.join(values)}]"
 
 
 def _check_number(name: str, value: Any, low: float = 0.0, high: float = math.inf) -> None:

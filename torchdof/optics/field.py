@@ -1,13 +1,10 @@
 """Blur across the field: the spots of a lens off its axis, traced or measured.
 
-Away from the middle of the frame the blur of a lens changes: its barrel cuts cat's eyes, its focus shifts (field
-curvature) and differs between the radial and the tangential direction (astigmatism), light trails outwards (coma), and
-colours separate (lateral colour).
-
-The *spot*, the image of a point, has all of these. Because a lens is rotationally symmetric, the spot depends only on
-the signed circle of confusion and on the distance from the middle of the frame; it turns with the azimuth, and is
-symmetric about the line to the middle. So half of each spot is stored, with ``u`` pointing away from the middle and
-``v`` across. The origin is the place of the point in the sharp image.
+The *spot*, the image of a point, has all errors of a lens off its axis: cat's eyes, field curvature, astigmatism, coma
+and lateral colour. Because a lens is rotationally symmetric, the spot depends only on the signed circle of confusion
+and on the distance from the middle of the frame; it turns with the azimuth, and is symmetric about the line to the
+middle. So half of each spot is stored, with ``u`` pointing away from the middle and ``v`` across. The origin is the
+place of the point in the sharp image.
 
 A spot is a histogram in the smallest box that contains it. Boxes and histograms are interpolated linearly in the signed
 coc and in the distance. Beyond the last coc of a side, boxes grow in proportion to the coc; beyond the last distance
@@ -82,8 +79,8 @@ class Field:
         total = light.sum((-2, -1), keepdim=True)
         if not bool((total > 0).all()):
             raise ValueError("field.light must hold some light at every node")
-        object.__setattr__(self, "light", light / total)
         sides = sides.clamp_min(_MIN_SIDE * float(sides.max()))
+        object.__setattr__(self, "light", light / total)
         object.__setattr__(self, "box", torch.cat([self.box[..., :1], sides], -1))
 
     @property
@@ -99,11 +96,9 @@ class Field:
         node, blend = bracket(self.coc, torch.tensor(coc, dtype=torch.float64, device="cpu"))
         box = torch.lerp(self.box[node, nodes], self.box[node + 1, nodes], blend) * growth  # [F, 3]
         light = torch.lerp(self.light[:, node, nodes], self.light[:, node + 1, nodes], blend)  # [channels, F, U, V]
-        low = low - nodes.start
-        return (
-            torch.lerp(box[low], box[low + 1], weight[:, None]),
-            torch.lerp(light[:, low], light[:, low + 1], weight[:, None, None]),
-        )
+        low, weight = low - nodes.start, weight[:, None]
+        light = torch.lerp(light[:, low], light[:, low + 1], weight[..., None])
+        return torch.lerp(box[low], box[low + 1], weight), light
 
     def reach(self, coc: Tensor) -> Tensor:
         """Radius around the origin that contains all spots of each signed coc ``[n]``."""
@@ -143,20 +138,16 @@ class Field:
         """
         light = self.light / self.light.amax((-2, -1), keepdim=True)
         codes = (light * _MAX_CODE).round().to(torch.int32).numpy().astype("<u2")
-        return {
-            "coc": self.coc.tolist(),
-            "radius": self.radius.tolist(),
-            "box": self.box.tolist(),
-            "shape": list(light.shape),
-            "light": base64.b64encode(zlib.compress(codes.tobytes(), 9)).decode("ascii"),
-        }
+        packed = base64.b64encode(zlib.compress(codes.tobytes(), 9)).decode("ascii")
+        lists = {name: getattr(self, name).tolist() for name in ("coc", "radius", "box")}
+        return {**lists, "shape": list(light.shape), "light": packed}
 
     @classmethod
     def from_dict(cls, data: Any) -> "Field":
         """Build a field from :meth:`to_dict`'s data; ``ValueError`` names a field that is missing, unknown or wrong."""
         data = fields("field", data, ("coc", "radius", "box", "shape", "light"))
-        coc, radius, box, sizes = (numbers(f"field.{name}", data[name]) for name in ("coc", "radius", "box", "shape"))
-        shape = [int(n) for n in sizes.flatten().clamp(-1, _MAX_CELLS).tolist()]
+        sizes = numbers("field.shape", data["shape"]).flatten()
+        shape = [int(n) for n in sizes.clamp(-1, _MAX_CELLS).tolist()]
         if len(shape) != 5 or min(shape) < 1 or math.prod(shape) > _MAX_CELLS:
             raise ValueError(f"field.shape must be five numbers of cells, got {show(data['shape'])}")
         count = 2 * math.prod(shape)
@@ -168,7 +159,7 @@ class Field:
         if len(cells) != count:
             raise ValueError(f"field.light must hold {count} bytes for field.shape, got {len(cells)}")
         light = np.frombuffer(cells, "<u2").astype(np.float64).reshape(shape)
-        return cls(coc, radius, box, torch.from_numpy(light))
+        return cls(data["coc"], data["radius"], data["box"], torch.from_numpy(light))
 
     def __repr__(self) -> str:
         return f"Field({len(self.coc)} blurs, {len(self.radius)} distances to {float(self.radius[-1]):g})"

@@ -1,15 +1,10 @@
 """Kernels of any radius from templates, by two small matrix products.
 
-A cache of finished kernels would not help, because a new camera blurs by new radii. But
 :func:`torchdof.optics.psf.pixel_kernels` works in two steps. The first integrates a PSF over square *cells*, ``n`` from
 the centre to the end of the PSF; the second weights them with the interpolator ``phi`` of each pixel. The first does
 not depend on the radius. So the light in the cells, the *template* ``T``, is computed once for each node of a table. A
-kernel of any radius is then
-
-    ``K = A T B'``  with  ``A[m, i] = phi(m - i h)``,  ``B[m, i] = phi(m - i w)``
-
-for cells ``h`` pixels high and ``w`` pixels wide. As in ``pixel_kernels``, ``K`` is limited, made non-negative and
-scaled to a sum of 1.
+kernel of any radius, with cells ``h`` pixels high and ``w`` wide, is ``K = A T B'`` with ``A[m, i] = phi(m - i h)`` and
+``B[m, i] = phi(m - i w)``, made non-negative and scaled to a sum of 1 as in ``pixel_kernels``.
 
 * Templates have 16, 32, 64, 128 or 256 cells. The one in use has cells of half a pixel to a pixel. The next finer one
   is blended in while cells grow from 0.75 to 1 pixel, so that kernels are continuous functions of the radius. A PSF of
@@ -77,11 +72,10 @@ def bank_of(table: Table) -> "KernelBank":
 
 
 class KernelBank:
-    """Kernels of a table from templates that are computed when they are first needed.
+    """Kernels of the middle of the frame from templates that are computed when they are first needed. Thread-safe.
 
-    All banks together keep up to 128 MB of templates, the most recently used ones. Thread-safe: two threads that miss
-    the same template at once both compute it. Kernels are those of the middle of the frame. For a table with a field
-    they are uniform discs as large as its spots, which :mod:`torchdof.optics.placed_kernels` multiplies by the spots.
+    All banks together keep up to 128 MB of templates, the most recently used ones. For a table with a field the kernels
+    are uniform discs as large as its spots, which :mod:`torchdof.optics.placed_kernels` multiplies by the spots.
 
     With ``gradients`` the templates are not kept, and have gradients to the rotation and squeeze of the aperture.
     """
@@ -97,8 +91,8 @@ class KernelBank:
         self._moved_in_focus = functools.lru_cache(_MAX_WIDTHS)(lambda width: table.moved_in_focus(width).tolist())
         self._found: dict[float, float] = {}
         self._light_and_moment = functools.lru_cache(None)(self._summed)
+        sides = [table.side_nodes(sign) for sign in (-1, 1)]
         with torch.inference_mode(False), torch.no_grad():
-            sides = [table.side_nodes(sign) for sign in (-1, 1)]
             reaches = [psf.reach(table.family, nodes, table.aperture) for _, nodes in sides]  # [C, N]
         self._nodes = [nodes for _, nodes in sides]
         self._distances: list[list[float]] = [distances.tolist() for distances, _ in sides]
@@ -248,10 +242,10 @@ class KernelBank:
     def variance_px(self, coc_px: float, width: float, scale: float) -> float:
         """Second moment of a kernel, mean of both axes and of colours, in squared pixels of a layer (``scale`` px)."""
         place = self._place(coc_px, width)
-        low, high = (self._light_and_moment(place.side, place.node + above) for above in (0, 1))
+        nodes = (self._light_and_moment(place.side, place.node + above) for above in (0, 1))
         total = 0.0
-        for (light, moment), (light_above, moment_above), reach in zip(low, high, place.reach, strict=True):
-            moment, light = (a + place.part * (b - a) for a, b in ((moment, moment_above), (light, light_above)))
+        for below, above, reach in zip(*nodes, place.reach, strict=True):
+            light, moment = (a + place.part * (b - a) for a, b in zip(below, above, strict=True))
             total += moment / light * (reach / scale) ** 2
         return total / self.colours
 
@@ -265,10 +259,7 @@ class KernelBank:
         return [(float(cells.sum()), float((cells * square).sum())) for cells in template]
 
     def kept(self, sign: float, find: Callable[["KernelBank", float, float], float]) -> float:
-        """A number that depends only on the blur on one side of focus, computed once: ``find(bank, coc_px, width)``.
-
-        The coc is 1 or -1 pixel, and the width is that of the image in which the last node of the side has this coc.
-        """
+        """``find(bank, coc_px, width)``, computed once, at a coc of ``sign`` px, that of the last node of the side."""
         sign = 1.0 if self._mirrored and self.table.is_round else sign
         if sign not in self._found:
             outermost = float(self._distances[sign > 0][-1]) * self.table.px_per_unit(1.0)
@@ -280,8 +271,8 @@ class KernelBank:
         params = {name: values[:, node] for name, values in self._nodes[side].items()}
         template = psf.template(self.table.family, params, _LEAST_CELLS << level, self.table.aperture)
         if not bool((template.detach().sum((-2, -1)) > 0).all()):
-            problem = f"the aperture passes no light of a {self.table.family}"
-            raise ValueError(f"{problem}: its mask is open where the profile is dark; open it nearer the middle")
+            remedy = "its mask is open where the profile is dark; open it nearer the middle"
+            raise ValueError(f"the aperture passes no light of a {self.table.family}: {remedy}")
         return template
 
     @torch.inference_mode(False)

@@ -34,26 +34,22 @@ class KernelCache:
         self._lock = threading.Lock()
 
     def get(self, key: Hashable, make: Callable[[], Kept]) -> Kept:
-        """The result stored under ``key``; computed by ``make`` if the key is missing.
-
-        Two threads that miss the same key at once both call ``make``; one result is kept.
-        """
+        """The result stored under ``key``; computed by ``make`` if it is missing, twice if two threads miss it."""
         return self.get_all([key], lambda _: [make()])[0]
 
     def get_all(self, keys: Sequence[_Key], make: Callable[[list[_Key]], Sequence[Kept]]) -> list[Kept]:
         """The results of several distinct keys; one call of ``make`` computes those of all missing keys."""
-        results: dict[_Key, Any] = {}
         with self._lock:
-            for key in keys:
-                if key in self._entries:
-                    self._entries.move_to_end(key)
-                    results[key] = self._entries[key][0]
+            results: dict[_Key, Any] = {key: self._entries[key][0] for key in keys if key in self._entries}
+            for key in results:
+                self._entries.move_to_end(key)
         missing = [key for key in keys if key not in results]
-        if missing:
-            results.update(zip(missing, map(_unwrapped, make(missing)), strict=True))
+        results |= zip(missing, map(_unwrapped, make(missing) if missing else ()), strict=True)
         with self._lock:
             for key in missing:
-                size = _ENTRY_BYTES + _bytes(results[key])
+                parts = results[key] if isinstance(results[key], tuple) else (results[key],)
+                sizes = [_TENSOR_BYTES + t.untyped_storage().nbytes() for t in parts if isinstance(t, Tensor)]
+                size = _ENTRY_BYTES + sum(sizes)
                 if key not in self._entries and size <= self.limit_bytes:
                     self._entries[key] = (results[key], size)
                     self.bytes += size
@@ -70,11 +66,6 @@ def _unwrapped(result: Any) -> Any:
     while isinstance(result, Tensor) and torch._C._functorch.is_functorch_wrapped_tensor(result):
         result = torch._C._functorch.get_unwrapped(result)
     return result
-
-
-def _bytes(result: Tensor | tuple[Tensor, ...] | float) -> int:
-    tensors = result if isinstance(result, tuple) else (result,)
-    return sum(_TENSOR_BYTES + t.untyped_storage().nbytes() for t in tensors if isinstance(t, Tensor))
 
 
 _CONSTANTS = KernelCache(16 * 2**20)  # the results of all functions decorated with kept

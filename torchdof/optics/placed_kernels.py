@@ -2,13 +2,9 @@
 
 A lens is rotationally symmetric. So field masks, in [0, 1], are computed only along one line from the middle of the
 frame, at a few distances, in coordinates ``u`` away from the middle and ``v`` across (:mod:`torchdof.optics.field`).
-The kernel ``K_p`` of a place ``p`` is
-
-    ``K_p[m] = K[m] mask_p(m) / sum_m K[m] mask_p(m)``
-
-with ``K`` the kernel of the middle, and ``mask_p`` interpolated between two distances, turned by the azimuth of ``p``
-and sampled bilinearly at the pixels. The division keeps the light: the sharp image shows the darkening of the corners
-already.
+The kernel of a place ``p`` is ``K_p[m] = K[m] mask_p(m) / sum_m K[m] mask_p(m)``, with ``K`` the kernel of the middle,
+and ``mask_p`` interpolated between two distances, turned by the azimuth of ``p`` and sampled bilinearly at the pixels.
+The division keeps the light: the sharp image shows the darkening of the corners already.
 
 * Traced and measured spots: ``K`` is a uniform disc, and the mask is the spot itself, averaged over a pixel.
 * Cat's eyes (``vignetting=``): ``K`` has the whole opening. A ray through the point ``w`` of the aperture to a place
@@ -89,8 +85,7 @@ def _squeeze(table: Table) -> float | Tensor:
 def _computed(table: Table, coc_px: float, scale: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Values and boxes of :class:`FieldMask`, float64.
 
-    Of a spot, the values are means over the pixel around each sample, with a maximum of 1. Its box is shrunk so that
-    the blur that downsampling and sampling add leaves the right variance.
+    Values of a spot are means over a pixel; its box is shrunk by the variance that downsampling and sampling add.
     """
     distance = _line(0.0, DISTANCES)
     if table.field is None:
@@ -150,13 +145,8 @@ def _line(start: float, count: int) -> Tensor:
 def placed(kernel: Tensor, masks: Sequence[tuple[FieldMask, Tensor]], y: Tensor, x: Tensor) -> Tensor:
     """Kernels ``[n, 1 or C, k, k]`` of places in the frame, from that of the middle ``[1 or n, 1 or C, k, k]``.
 
-    Each keeps the sum of ``kernel``.
-
-    Args:
-        kernel: Kernel of the middle of the frame.
-        masks: Masks of one radius, or of two neighbouring ones, each with its weight ``[n]`` or ``[]``.
-        y: Places ``[n]``, in half diagonals down from the middle of the frame.
-        x: The same to the right.
+    ``masks`` are those of one radius, or of two neighbouring ones, each with its weight ``[n]`` or ``[]``; ``y`` and
+    ``x`` are places ``[n]``, in half diagonals down and to the right of the middle. The sum of ``kernel`` is kept.
     """
     offset = torch.arange(kernel.shape[-1], dtype=kernel.dtype, device=kernel.device) - kernel.shape[-1] // 2
     y, x = (t.to(kernel.dtype)[:, None, None] for t in (y, x))
@@ -168,8 +158,8 @@ def placed(kernel: Tensor, masks: Sequence[tuple[FieldMask, Tensor]], y: Tensor,
     fraction = position - low
     across = offset * masks[0][0].squeeze
     u, v = offset[:, None] * down + across * right, (across * down - offset[:, None] * right).abs()
-    boxes = [torch.lerp(entry.boxes[low], entry.boxes[low + 1], fraction[:, None]) for entry, _ in masks]  # [n, 3]
-    box = torch.stack([weight.reshape(-1, 1) * box for (_, weight), box in zip(masks, boxes, strict=True)]).sum(0)
+    boxes = [w.reshape(-1, 1) * torch.lerp(m.boxes[low], m.boxes[low + 1], fraction[:, None]) for m, w in masks]
+    box = torch.stack(boxes).sum(0)  # [n, 3]
     grid = torch.stack([2.0 * v / box[:, 2:, None] - 1.0, (u - box[:, :1, None]) / box[:, 1:2, None]], -1)
     mask = kernel.new_zeros(())
     for entry, weight in masks:

@@ -3,26 +3,19 @@
 A pixel is an integral already: ``J = box * scene`` at the pixel's centre. The pixel of the blurred picture is
 ``(psf * J)(j) = (psf * box * scene)(j)``. So a kernel must not integrate the PSF over the pixel's box once more, which
 adds a variance of 1/12 px^2 along each axis and leaves a PSF smaller than a pixel without effect. Instead it must
-estimate J between the samples. The kernel of least error over pictures of a power spectrum ``S(f)``,
-``P = |box^|^2 S``, is
-
-    ``K^(f) = sum_i P(f + i) psf^(f + i) / sum_i P(f + i)``,
-
-that is ``K[m] = integral psf(x) phi(m - x) dx``, with the interpolator ``phi^(f) = P(f) / sum_i P(f + i)``. Photographs
-have ``S ~ 1 / f^2``; for them the separable cardinal cubic spline is as good a phi. It changes no second moment. Where
-its lobes make a pixel negative, the four neighbours give up light to raise it to 0 (:func:`_non_negative`). Kernels of
-discs are then within 0.3 dB of the non-negative kernel of least error.
+estimate J between the samples. The kernel of least error over pictures of a power spectrum ``P(f)`` has the spectrum
+``sum_i P(f + i) psf^(f + i) / sum_i P(f + i)``, that is ``K[m] = integral psf(x) phi(m - x) dx``, with the interpolator
+``phi^(f) = P(f) / sum_i P(f + i)``. For photographs, ``P ~ |box^|^2 / f^2``, the separable cardinal cubic spline is as
+good a phi. It changes no second moment. Where its lobes make a pixel negative, the four neighbours give up light to
+raise it to 0. Kernels of discs are then within 0.3 dB of the non-negative kernel of least error.
 
 The integral is a sum over square cells: 16 from the centre to the end of a small PSF, cells of a pixel in a large one.
-Every family is a profile ``f(r)`` over the distance ``r`` from the centre. The integral over a cell is exact for
-``gaussian`` and ``disc``. For the others, circles cut the cell into thin slices of exact area, in which ``f`` is
-replaced by its mean over r in closed form.
+Every family is a profile ``f(r)`` over the distance ``r`` from the centre. Its integral over a cell is exact for
+``gaussian`` and ``disc``; for the others, circles cut the cell into slices of exact area, with the mean of f over r.
 
 An aperture (:mod:`torchdof.optics.aperture`) multiplies the profile, and cuts off the part outside of the opening. The
-circumscribed circle of the opening has the radius ``radius``, ``2 sigma`` for ``gaussian`` and ``r_c + 2 sigma`` for
-``ring``. The light of a ``disc`` in a cell is the area of the opening in it. For the other families it is the mean of
-the profile in the cell times the open area; in kernels of up to 64 cells a side, each cell is split in nine for this. A
-squeeze makes the cells narrower than high.
+light of a ``disc`` in a cell is the area of the opening in it; for the other families it is the mean of the profile in
+the cell times the open area, in parts of the cell in small kernels. A squeeze makes the cells narrower than high.
 
 Reference:
     Field, "Relations between the statistics of natural images and the response properties of cortical cells", Journal
@@ -64,6 +57,10 @@ FAMILIES: dict[str, tuple[str, ...]] = {
 
 LENGTHS = frozenset({"sigma", "r_c", "radius"})
 """Parameters that are lengths; the others are pure numbers."""
+
+# Multiples of lengths that add up to the end of a profile, and of the opening around it; the others end at radius.
+_ENDS = {"gaussian": {"sigma": 5.0}, "ring": {"r_c": 1.0, "sigma": 5.0}, "softm": {"radius": 1.0, "sigma": 4.5}}
+_OPENINGS = {"gaussian": {"sigma": 2.0}, "ring": {"r_c": 1.0, "sigma": 2.0}}
 
 # Accuracy; larger: more exact, slower
 _CELLS = 16  # least cells from the centre to the end of a PSF; larger PSFs have cells of a pixel
@@ -195,10 +192,7 @@ def checked(family: str, params: Mapping[str, Any]) -> dict[str, Tensor]:
     valid = {}
     for name in FAMILIES[family]:
         value = params[name]
-        if isinstance(value, Tensor):
-            value = real_tensor(name, value, "[...]", whole=True)
-        else:
-            value = numbers(name, value)
+        value = real_tensor(name, value, "[...]", whole=True) if isinstance(value, Tensor) else numbers(name, value)
         low = -1.0 if name == "b" else 0.0
         if not value.numel() or not bool((torch.isfinite(value.detach()) & (value.detach() >= low)).all()):
             raise ValueError(f"{name} of {family} must be finite and >= {low:g}, got {short(value)}")
@@ -219,26 +213,13 @@ def _rendered(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def reach(family: str, params: Mapping[str, Tensor], aperture: Aperture | None = None) -> Tensor:
-    """Radius at which a profile ends, in the unit of its lengths, without squeeze: ``[...]``.
+    """Radius at which a profile, or the opening that cuts it, ends, in the unit of its lengths, without squeeze.
 
-    Beyond it is less than 4e-6 of the light.
+    ``[...]``; beyond the end of a profile is less than 4e-6 of its light.
     """
-    if aperture is not None and not aperture.is_round:
-        return opening_radius(family, params)
-    if family == "gaussian":
-        return 5.0 * params["sigma"]
-    if family == "ring":
-        return params["r_c"] + 5.0 * params["sigma"]
-    if family == "softm":
-        return params["radius"] + 4.5 * params["sigma"]
-    return params["radius"]
-
-
-def opening_radius(family: str, params: Mapping[str, Tensor]) -> Tensor:
-    """Radius of the circle around the opening that a profile is multiplied by, in the unit of its lengths."""
-    if family == "gaussian":
-        return 2.0 * params["sigma"]  # radius of the disc with the same second moment
-    return params["r_c"] + 2.0 * params["sigma"] if family == "ring" else params["radius"]
+    ends = _ENDS if aperture is None or aperture.is_round else _OPENINGS
+    first, *others = (factor * params[name] for name, factor in ends.get(family, {"radius": 1.0}).items())
+    return sum(others, first)
 
 
 def _tilt_factor(r: Tensor, params: Mapping[str, Tensor]) -> Tensor:
@@ -255,7 +236,7 @@ def _cells(family: str, lengths: Mapping[str, Tensor], half: int, aperture: Aper
     slices = 16 if half - 1 <= _FINE_CELLS else 8
     if aperture is None or aperture.is_round:
         return _round_cells(family, lengths, half, slices)
-    radius = opening_radius(family, lengths)
+    radius = reach(family, lengths, aperture)
     if family == "disc":
         return aperture.shares(half, 1.0 / radius, 1.0 / radius)
     parts = _CELL_PARTS if half <= _FINE_CELLS else 1

@@ -70,7 +70,7 @@ def test_rendered_points_are_the_traced_spots(table: BlurTable, z_m: float, leas
         return [-10.0 * math.log10(error) for error in errors]
 
     assert min(decibels(table)) > least
-    assert max(decibels(table.replace(field=None).with_aperture(Aperture(vignetting=0.8)))) < 27.0
+    assert max(decibels(table.replace(field=None).replace(aperture=Aperture(vignetting=0.8)))) < 27.0
 
 
 def test_lateral_colour_displaces_the_colours_of_a_point() -> None:

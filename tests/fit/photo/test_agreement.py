@@ -104,7 +104,7 @@ def test_exif_supplies_missing_fields_and_a_change_of_the_lens_is_refused(folder
     assert read.notes["from_exif"] == list(CAMERA)
     moved = Picture(read_image(folder / "0400mm.tif").pixels, metadata={**tags, "FNumber": ("float", 2.2)})
     write_image(folder / "0400mm.tif", moved, transfer="srgb", sample="16")
-    with pytest.raises(FitError, match="taken at f-number 2.2"):
+    with pytest.raises(FitError, match="taken at f_number 2.2"):
         read_captures(folder)
 
 

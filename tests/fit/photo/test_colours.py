@@ -62,7 +62,7 @@ def test_demosaicing_is_exact_for_linear_gradients(pattern):
 def test_a_folder_is_read_by_colour(simulator, tmp_path):
     camera = simulator.Simulator(level=0.7, snr_db=46, dot_radius=7.0, black=0.02)
     simulator.write_captures(tmp_path, camera, 0.5, [0.8], lambda d: ("disc", {"radius": 6.0}), width=120, height=90)
-    (pair,) = read_captures(tmp_path, colours="each")[0]
+    (pair,) = read_captures(tmp_path, colours="each")[0].pairs
     still, moved = pair.colours
     assert still.shape == moved.shape == (3, *pair.sharp.shape)
     assert np.allclose(still.mean(0), pair.sharp) and np.allclose(moved.mean(0), pair.blurred)

@@ -44,12 +44,12 @@ def picture(folder, name, value, size=(240, 400)):
 
 def test_pictures_are_decoded_to_linear_light_and_cropped_around_the_dot(folder):
     (captures,) = read_captures(folder)
-    assert [c.distance_m for c in captures] == [0.4, 1.0] and captures.focus_m == 0.5 and captures.width_px == 400
+    assert [c.distance_m for c in captures.pairs] == [0.4, 1.0] and captures.focus_m == 0.5 and captures.width_px == 400
     first = captures.pairs[0]
     assert first.sharp.shape == first.blurred.shape and first.sharp.shape[0] % 2 == 1
     assert first.sharp.max() == pytest.approx(0.72, abs=0.03)
     assert first.white == 1.0 and first.files[1].endswith("0400mm.png")
-    for pair in captures:
+    for pair in captures.pairs:
         fit = fit_pair(pair.sharp, pair.blurred, "gaussian", magnification=0.5 / pair.distance_m, white=pair.white)
         assert fit.params["sigma"] == pytest.approx(softness(pair.distance_m)[1]["sigma"], rel=0.02)
 
@@ -73,14 +73,14 @@ def test_encoded_pictures_without_a_stated_transfer_give_a_warning(folder):
     for name in ("0400mm", "0500mm", "1000mm"):
         write_image(folder / f"{name}.exr", read_image(folder / f"{name}.png"))
         change(folder, f"{name}.png", f"{name}.exr")
-    assert len(read_captures(folder)[0]) == 2  # floats are linear light
+    assert len(read_captures(folder)[0].pairs) == 2  # floats are linear light
 
 
 def test_distances_in_millimetres_give_a_warning(folder):
     for name, metres in (("focus_m", 0.5), ("distance_m", 0.4), ("distance_m", 1.0)):
         change(folder, f"{name} = {metres}", f"{name} = {1000 * metres:g}")
     with pytest.warns(FitWarning, match="all distances are at least 400 m; divide millimetres"):
-        assert [pair.distance_m for pair in read_captures(folder)[0]] == [400, 1000]
+        assert [pair.distance_m for pair in read_captures(folder)[0].pairs] == [400, 1000]
 
 
 def test_a_grid_gives_the_dot_in_the_centre_or_every_dot(simulator, tmp_path):
@@ -119,12 +119,12 @@ WRONG = [
     (SHOT, "distance_m = -1", "manifest", "distance_m must be a number > 1e-05 and < 1e.06, got -1"),
     (FOCUS, "focus_m = ", "manifest", "is not TOML"),
     (FOCUS, f"{FOCUS}\nf_number = 1e-30", "manifest", "f_number must be a number > "),
-    (FOCUS, f"{FOCUS}\nfocal = 50", "manifest", "'focal' is not a field; known are focus_m, exposure_s"),
+    (FOCUS, f"{FOCUS}\nfocal = 50", "manifest", "have the fields focus_m, sharp, .*'focal' is not one of"),
     ('transfer = "srgb"', 'transfer = "gamma"', "manifest", "transfer must be one of linear, srgb, got 'gamma'"),
     (FOCUS, f'{FOCUS}\nbayer = "RGBG"', "manifest", "bayer must be one of RGGB, BGGR"),
     (FOCUS, f'{FOCUS}\nbayer = "RGGB"', "manifest", "is for pictures with one colour a pixel, got 3 colours"),
     (FOCUS, f"{FOCUS}\ncrop = [1, 2, 3]", "manifest", r"crop must be \[left, top, width, height\]"),
-    ('file = "0400mm.png"', "", "manifest", "file must be a text, got None"),
+    ('file = "0400mm.png"', "", "manifest", r"\[\[shot\]\] must have the fields file, .* file is missing"),
     ('file = "0400mm.png"', 'file = "small.png"', "manifest", "small.png: is 100x100, 0500mm.png is 400x240"),
     ('file = "0400mm.png"', 'file = "black.png"', "no dot", "black.png: no dot found"),
 ]  # fmt: skip

@@ -66,7 +66,7 @@ def test_distances_and_focus_are_found_from_the_photographs(folder):
     assert [q.distance_m for q in found.pictures] == pytest.approx([0.2, 0.3, 0.5], rel=3e-3)
     captures = found.captures
     assert captures.focus_m == pytest.approx(0.2, rel=3e-3) and captures.notes["sharp"] == "img_0000.jpg"
-    assert [c.distance_m for c in captures] == pytest.approx([0.3, 0.5], rel=3e-3)
+    assert [c.distance_m for c in captures.pairs] == pytest.approx([0.3, 0.5], rel=3e-3)
     assert captures.width_px == 640
     assert (captures.focal_length_mm, captures.f_number) == pytest.approx((5.4, 1.8))
     assert captures.sensor_width_mm == pytest.approx(36 * 5.4 / 26)
@@ -79,7 +79,7 @@ def test_distances_and_focus_are_found_from_the_photographs(folder):
 def test_each_colour_of_photographs_has_its_own_kernel(folder):
     # the scene is grey, so that all colours have the same blur
     captures = read_photographs(folder, colours="each").captures
-    (pair,) = [c for c in captures if c.distance_m > 0.4]
+    (pair,) = [c for c in captures.pairs if c.distance_m > 0.4]
     assert pair.colours is not None and pair.colours[1].shape == (3, *pair.blurred.shape)
     np.testing.assert_allclose(pair.colours[1].mean(0), pair.blurred, atol=1e-6)
     with pytest.warns(FitWarning, match="one distance"):
