@@ -3,8 +3,12 @@
 Depth edges, hidden surfaces and highlights concern few pixels, which are processed as lists ``[P]``.
 """
 
+import math
+
 import torch
 from torch import Tensor
+
+from .optics.kernel_cache import kept
 
 
 class Selected:
@@ -43,16 +47,19 @@ def indices(mask: Tensor) -> Tensor:
 def places(pixels: Tensor, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
     """Item, row and column of pixels."""
     line = pixels // width
-    item = line // height
-    return item, line - item * height, pixels - line * width
+    return line // height, line % height, pixels % width
+
+
+def rows(values: Tensor) -> Tensor:
+    """Values ``[B, C, H, W]`` by the index of their pixel: ``[C, B * H * W]``."""
+    # one channel needs no transpose, which would be a copy in an exported graph
+    return values.reshape(1, -1) if values.shape[1] == 1 else values.transpose(0, 1).flatten(1)
 
 
 def pick(values: Tensor, pixels: Tensor) -> Tensor:
-    """Values ``[B, C, H, W]`` at pixels of any shape ``[...]``: ``[C, ...]``."""
-    # one channel needs no transpose, which would be a copy in an exported graph
-    flat = values.reshape(1, -1) if values.shape[1] == 1 else values.transpose(0, 1).flatten(1)
-    picked = flat.index_select(1, pixels.flatten())
-    return picked.unflatten(1, pixels.shape)
+    """Values ``[B, C, H, W]``, or their :func:`rows`, at pixels of any shape ``[...]``: ``[C, ...]``."""
+    flat = values if values.dim() == 2 else rows(values)
+    return flat.index_select(1, pixels.flatten()).unflatten(1, pixels.shape)
 
 
 def put(values: Tensor, pixels: Tensor, new: Tensor) -> Tensor:
@@ -65,11 +72,20 @@ def put(values: Tensor, pixels: Tensor, new: Tensor) -> Tensor:
 def around(pixels: Tensor, like: Tensor, reach: int) -> Tensor:
     """Pixels of the square up to ``reach`` around each, row by row, clamped to the frame: ``[(2 reach + 1)^2, P]``."""
     height, width = like.shape[-2:]
-    item, row, column = places(pixels, height, width)
+    line = pixels // width
+    row = line % height
     offsets = torch.arange(-reach, reach + 1, device=pixels.device)[:, None]
-    lines = ((row + offsets).clamp(0, height - 1) + item * height) * width
-    columns = (column + offsets).clamp(0, width - 1)
+    lines = ((row + offsets).clamp(0, height - 1) + (line - row)) * width
+    columns = (pixels % width + offsets).clamp(0, width - 1)
     return (lines[:, None] + columns).flatten(0, 1)
+
+
+@kept
+def gaussian(reach: int, sigma: float, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Gaussian weights of the pixels of a square, in the order of :func:`around`: ``[(2 reach + 1)^2, 1]``."""
+    steps = range(-reach, reach + 1)
+    weights = [math.exp(-(dy * dy + dx * dx) / (2.0 * sigma**2)) for dy in steps for dx in steps]
+    return torch.tensor(weights, dtype=dtype, device=device)[:, None]
 
 
 def corners(item: Tensor, row: Tensor, column: Tensor, height: int, width: int) -> tuple[list[Tensor], Tensor, Tensor]:

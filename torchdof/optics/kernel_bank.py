@@ -17,7 +17,7 @@ The compiled engine makes the same kernels from the same templates (``native/src
 import bisect
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -89,7 +89,6 @@ class KernelBank:
         self.widest = max(1.0, 1.0 / self.squeeze)
         self._lens = table.fingerprint()
         self._moved_in_focus = functools.lru_cache(_MAX_WIDTHS)(lambda width: table.moved_in_focus(width).tolist())
-        self._found: dict[float, float] = {}
         self._light_and_moment = functools.lru_cache(None)(self._summed)
         sides = [table.side_nodes(sign) for sign in (-1, 1)]
         with torch.inference_mode(False), torch.no_grad():
@@ -214,13 +213,13 @@ class KernelBank:
                 sizes, part = reach[items], parts[items][:, None, None, None]
                 cut = halves[items, None] < sizes.detach() * self.widest - 1e-9
                 kernel = self._sampled(torch.lerp(low, high, part), sizes, outside[items], cut)
-                if bool((finer[items] > 0).any()):
+                if key[2:] != key[:2]:
                     fine = self._sampled(torch.lerp(fine_low, fine_high, part), sizes, outside[items], cut)
                     kernel = torch.lerp(kernel, fine, finer[items][:, None, None, None])
                 out = out.index_put((items,), kernel)
         if any(spots.flipped):
             out = torch.where(torch.tensor(spots.flipped, device="cpu")[:, None, None, None], out.flip(-2, -1), out)
-        if bool((fade == 1.0).all()):
+        if all(part == 1.0 for parts in spots.fade for part in parts):
             return out
         centre = torch.zeros_like(out)
         centre[..., half, half] = 1.0
@@ -257,14 +256,6 @@ class KernelBank:
         step = torch.arange(-half, half + 1, dtype=torch.float64, device="cpu") / _LEAST_CELLS
         square = 0.5 * (step[:, None] ** 2 + step**2 / self.squeeze**2)
         return [(float(cells.sum()), float((cells * square).sum())) for cells in template]
-
-    def kept(self, sign: float, find: Callable[["KernelBank", float, float], float]) -> float:
-        """``find(bank, coc_px, width)``, computed once, at a coc of ``sign`` px, that of the last node of the side."""
-        sign = 1.0 if self._mirrored and self.table.is_round else sign
-        if sign not in self._found:
-            outermost = float(self._distances[sign > 0][-1]) * self.table.px_per_unit(1.0)
-            self._found[sign] = find(self, sign, 1.0 if self.table.unit == "relative" else 1.0 / outermost)
-        return self._found[sign]
 
     def _template(self, side: int, node: int, level: int) -> Tensor:
         """Light ``[C, 2 n + 3, 2 n + 3]`` of the cells of a node's PSF, float64."""

@@ -110,7 +110,8 @@ def pixel_kernels(
     in_cells = {k: v / height if k in LENGTHS else v for k, v in lengths.items()}
     farthest = min(float((end / height).detach().max()), (half + _MARGIN_PX) * widest * max(1.0, float(squeeze)))
     cells = _sharpened(_cells(family, in_cells, max(_CELLS, math.ceil(farthest - 1e-9)) + 1, aperture))
-    kernel = sampled(cells, height, height if aperture is None else height / squeeze, half)
+    width = height if aperture is None else height / squeeze
+    kernel = sampled(cells, height, width, half, are_pixels=bool(((height == 1.0) & (width == 1.0)).all()))
     centre = torch.zeros_like(kernel)
     centre[..., half, half] = 1.0
     total = kernel.sum((-2, -1), keepdim=True)
@@ -129,12 +130,18 @@ def template(family: str, params: Mapping[str, Tensor], cells: int, aperture: Ap
     return _sharpened(_cells(family, in_cells, cells + 1, aperture))
 
 
-def sampled(cells: Tensor, height: Tensor, width: Tensor, half: int) -> Tensor:
+def sampled(cells: Tensor, height: Tensor, width: Tensor, half: int, are_pixels: bool = False) -> Tensor:
     """Kernels ``[..., 2 half + 1, 2 half + 1]``, up to a factor, from the light in cells ``[..., n, n]``.
 
-    ``height`` and ``width`` are those of a cell in pixels, ``[...]``.
+    ``height`` and ``width`` are those of a cell in pixels, ``[...]``. With ``are_pixels`` all of them are 1, so that
+    nothing is interpolated.
     """
-    kernels = _non_negative(_interpolated(cells, height, width, half + _MARGIN_PX))
+    wide = half + _MARGIN_PX
+    if are_pixels:
+        light = functional.pad(cells, (wide - cells.shape[-1] // 2,) * 4)
+    else:
+        light = _interpolated(cells, height, width, wide)
+    kernels = _non_negative(light)
     return kernels[..., _MARGIN_PX:-_MARGIN_PX, _MARGIN_PX:-_MARGIN_PX]
 
 
@@ -278,8 +285,6 @@ def _interpolated(cells: Tensor, height: Tensor, width: Tensor, half: int) -> Te
     where the PSF has no light. Cells larger than a pixel are interpolated linearly. Arguments as in :func:`sampled`.
     """
     n = cells.shape[-1] // 2
-    if bool((height == 1.0).all() and (width == 1.0).all()):  # cells are pixels, which need no interpolation
-        return functional.pad(cells, (half - n,) * 4)
     pixel = torch.arange(-half, half + 1, dtype=torch.float64, device=cells.device)[:, None]
     cell_index = torch.arange(-n, n + 1, dtype=torch.float64, device=cells.device)
     splines, lines = [], []

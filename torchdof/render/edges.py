@@ -97,6 +97,8 @@ class _Edges(NamedTuple):
     ring: Tensor  # distance to a step in pixels, from 1; ``_RINGS + 1`` if no step is within ``_RINGS``
     is_edge: Tensor
     direction: Tensor  # towards the near surface: 0 up, 1 left, 2 diagonal, 3 right, 4 down
+    level: Tensor  # place of the pixel between the two surfaces, 0 (far) to 1 (near)
+    climb: Tensor  # steepness in steps per pixel, 0 away from edges; the sum is the length of all edges in pixels
 
 
 def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> Tensor:
@@ -246,48 +248,58 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops 
     is_near = 2.0 * given > edges.near + edges.far
     witness = given.new_tensor(_SURE)[edges.ring] * (valid & ~edges.is_ramp)
 
+    maps = [light.sqrt(), given, witness, edges.near, edges.far, edges.is_ramp.to(given.dtype)]
+    looks = pixels.rows(torch.cat(maps, 1))  # what _judge looks at
+
     # the prior of each kind of edge pixel, from samples
-    height, width = given.shape[-2:]
+    batch, _, height, width = given.shape
     area = torch.scalar_tensor(height * width, dtype=torch.float64, device=given.device)  # not a constant in graphs
     every = (area / _SAMPLED).sqrt().ceil().long()
     rows, columns = (_from_border(n, given.device) // _BLOCK for n in (height, width))
     sampled = pixels.indices(edges.is_edge & ((rows[:, None] + columns) % every == 0))
-    level = ((given - edges.far) / (edges.near - edges.far).clamp_min(1e-12)).clamp(0.0, 1.0)
-    kind = _kind(level, edges)
-    sampled_score = _judge(light, given, witness, edges, sampled, _CLEAR_IN_PRIOR, ops)[0]
-    prior = _calibrate(kind, sampled, sampled_score, given.shape[0])[kind]
+    kind = _kind(edges)
+    score = _judge(looks, given, sampled, _CLEAR_IN_PRIOR, ops)[0]
+    weight = (0.5 * score.abs()).clamp(max=1.0)
+    prior = _calibrate(pixels.pick(kind, sampled)[0], score, weight, batch)[kind]
     wrong = torch.where(is_near, 1.0 - prior, prior)
-    climb = _climb(given, valid, edges)
-    is_mixed = edges.is_edge & ((level - 0.5).abs() < 0.25)
-    parts = (edges.is_ramp.float(), (edges.is_ramp & is_mixed).float(), climb)
-    ramps, mixed, length = (_mean_of(part, edges.is_edge, sampled) for part in parts)
-    is_soft = (ramps > _SOFT) & ((ramps > _WIDE * length) | (mixed > _MIXED * ramps))
-    if auto:
-        is_related = _is_related(level, edges, sampled, sampled_score)
-        is_soft = is_soft & is_related
-        is_inexact = is_related & (is_soft | (_mean_of(wrong, ~edges.is_ramp, sampled) > _EXACT))
+
+    # what kind of map it is: sums over the samples of each item
+    is_mixed = edges.is_edge & ((edges.level - 0.5).abs() < 0.25)
+    maps = [edges.level, wrong, edges.climb, edges.is_ramp, is_mixed, edges.ring]
+    level, doubt, climb, is_ramp, mixed, ring = pixels.pick(torch.cat([t.to(given.dtype) for t in maps], 1), sampled)
+    # colour agrees with the map at clear pixels: in the outermost ring of a step, or near the ends of a ramp; colours
+    # unrelated to the depth agree at half of them
+    weight = weight * torch.where(is_ramp > 0, (level - 0.5).abs() > 0.3, ring == _RINGS)
+    agrees = weight * ((score > 0) == (level > 0.5))
+    parts = [is_ramp, is_ramp * mixed, climb, 1.0 - is_ramp, (1.0 - is_ramp) * doubt, weight, agrees]
+    sums = given.new_zeros(len(parts), batch).index_add(1, sampled // (height * width), torch.stack(parts))
+    ramps, mixed, length, steps, doubts, weight, agrees = sums[..., None, None, None].unbind(0)
+    is_soft = (ramps > _SOFT * (ramps + steps)) & ((ramps > _WIDE * length) | (mixed > _MIXED * ramps))
 
     # which surface the selected pixels show
     doubtful = edges.is_edge
     if auto:
+        is_related = agrees + 0.5 * _PRIOR_COUNT > _RELATED * (weight + _PRIOR_COUNT)
+        is_soft = is_soft & is_related
+        is_inexact = is_related & (is_soft | (doubts > _EXACT * steps))
         doubtful = doubtful & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
     edge_pixels = pixels.indices(doubtful)
     if auto and not is_traced() and len(edge_pixels) == 0:  # nor lamps: a soft map has ramps, which are selected
         return nearness
-    score, evidence, near, far = _judge(light, given, witness, edges, edge_pixels, _CLEAR, ops)
+    score, evidence, near, far = _judge(looks, given, edge_pixels, _CLEAR, ops)
     shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0])
     if auto:  # without auto, correct steps are decided too, and the lead would move them
         shows_near = shows_near + _LEAN * (score.abs() - 1.0).clamp(0.0, 1.0)
     shows_near = shows_near > 0
 
     # the blur of a soft map: its standard deviation in pixels, and the width that it takes from near surfaces
-    climbed = (climb * is_mixed).sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
+    climbed = (edges.climb * is_mixed).sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
     ramp_px = _CLIMBED * is_mixed.sum((1, 2, 3), keepdim=True) / climbed
     sigma = (ramp_px.square() - _PIXEL).clamp_min(0.0).sqrt().clamp(0.2, 3.0)
 
     label = pixels.put(is_near.to(given.dtype), edge_pixels, shows_near.to(given.dtype))
-    length = climb.sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
-    lost_px = torch.where(edges.is_edge, label - level, 0.0).sum((1, 2, 3), keepdim=True) / length
+    length = edges.climb.sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
+    lost_px = torch.where(edges.is_edge, label - edges.level, 0.0).sum((1, 2, 3), keepdim=True) / length
 
     own = pixels.pick(given, edge_pixels)[0]
     is_ramp = pixels.pick(edges.is_ramp, edge_pixels)[0]
@@ -347,15 +359,14 @@ def _noise(nearness: Tensor, valid: Tensor) -> Tensor:
 
 def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
     """Finds ramps and steps, and the nearness of the two surfaces that meet there."""
-    high, low = torch.where(valid, nearness, -_NEVER), torch.where(valid, -nearness, -_NEVER)
-    slope, jump = _slopes(nearness, valid)
-    span = _highest(high, _REACH) + _highest(low, _REACH)
+    ends = _ends(nearness, valid)
+    slope, jump, steepness = _slopes(nearness, valid)
+    span = _highest(ends, _REACH).sum(1, keepdim=True)
     # a ramp is short and has flat places around it; a slope has none
     flattest = -_highest(-_mean(slope, 2), 8)
     is_ramp = (slope > 0.1 * step) & (slope > _SHALLOW * span) & (span > step) & (flattest < 0.3 * slope) & valid
 
     # the surfaces at both ends of a ramp: extremes spread along it pixel by pixel
-    ends = torch.cat([high, low], 1)  # the nearer surface, and the farther one with the opposite sign
     spread = ends
     for _ in range(_RAMP_REACH):
         spread = torch.where(is_ramp, _highest(spread, 1), spread)
@@ -375,22 +386,31 @@ def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
         ring, sides = torch.where(is_step, k, ring), torch.where(is_step, of_ring, sides)
     near, far = torch.where(is_ramp, ends, sides).split(1, 1)
     far = -far
-    is_edge = (is_ramp | (ring <= _RINGS)) & (near - far > step) & valid
+    gap = near - far
+    is_edge = (is_ramp | (ring <= _RINGS)) & (gap > step) & valid
 
     mean = _mean(functional.pad(nearness, (2,) * 4, mode="replicate"), 2)
     right, down = mean[..., 2:-2, 4:] - mean[..., 2:-2, :-4], mean[..., 4:, 2:-2] - mean[..., :-4, 2:-2]
-    tie = _TIE * (near - far)
-    across = torch.where(right.abs() > down.abs() + tie, right.sign(), 0.0)
-    along = torch.where(down.abs() > right.abs() + tie, down.sign(), 0.0)
+    lead, tie = right.abs() - down.abs(), _TIE * gap
+    across = torch.where(lead > tie, right.sign(), 0.0)
+    along = torch.where(-lead > tie, down.sign(), 0.0)
     direction = (2.0 * along + across).long() + _DIRECTIONS // 2
-    return _Edges(near, far, is_ramp, ring, is_edge, direction)
+    gap = gap.clamp_min(1e-12)
+    level, climb = ((nearness - far) / gap).clamp(0.0, 1.0), torch.where(is_edge, steepness / gap, 0.0)
+    return _Edges(near, far, is_ramp, ring, is_edge, direction, level, climb)
 
 
-def _kind(level: Tensor, edges: _Edges) -> Tensor:
+def _ends(nearness: Tensor, valid: Tensor) -> Tensor:
+    """A map and its negative, ``[B, 2, H, W]``, so that maxima of both are the ends of its range."""
+    return torch.where(valid, torch.cat([nearness, -nearness], 1), -_NEVER)
+
+
+def _kind(edges: _Edges) -> Tensor:
     """Index of the kind of each pixel ``[B, 1, H, W]``; pixels of one kind have one prior.
 
     A kind is an item, a place and a direction. A place is a ring on one side of a step, or one level of a ramp.
     """
+    level = edges.level
     side = (level > 0.5).long() * _RINGS + edges.ring.clamp(max=_RINGS) - 1
     place = torch.where(edges.is_ramp, 2 * _RINGS + (level * _LEVELS).long().clamp(0, _LEVELS - 1), side)
     item = torch.arange(level.shape[0], device=level.device).view(-1, 1, 1, 1)
@@ -398,106 +418,79 @@ def _kind(level: Tensor, edges: _Edges) -> Tensor:
 
 
 def _judge(
-    light: Tensor, nearness: Tensor, witness: Tensor, edges: _Edges, edge_pixels: Tensor, clear: float, ops: Ops
+    looks: Tensor, like: Tensor, edge_pixels: Tensor, clear: float, ops: Ops
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Scores by colour which of two surfaces pixels ``[P]`` show.
 
-    1. Take samples of both surfaces from a window around each pixel, weighted by distance and by ``witness``.
+    1. Take samples of both surfaces from a window around each pixel, weighted by distance and by how sure they are.
     2. Compute mean and spread of both colours, and how well these separate the surfaces, in [0, 1].
     3. Compute the likelihood of each surface: the share of its samples that resemble the pixel. A surface of several
        colours has no useful mean. Beside a step, few samples prove little: in a photograph, whose edges are soft, a
        strand of a pixel has mostly the colour of its background.
     4. Average scores over neighbours of similar colour.
 
-    ``clear`` is the sum of weights from which samples of a surface count in full.
+    ``looks`` are :func:`torchdof.pixels.rows` of the colour, the nearness, the weight of samples, the nearness of both
+    surfaces, and whether the pixel is on a ramp; ``like`` is a map of the frame. ``clear`` is the sum of weights from
+    which samples of a surface count in full.
 
     Returns:
         ``[P]`` each: the log-likelihood ratio, positive for the near surface; the evidence, 0 to 1; and the nearness
         of the near and of the far surface, as means of the samples that resemble the pixel.
     """
-    colour = light.sqrt()
-    offsets = torch.arange(-_REACH, _REACH + 1, device=light.device, dtype=light.dtype)
-    apart = offsets[:, None] ** 2 + offsets**2  # a pixel is not its own sample
-    falloff = torch.where(apart > 0, torch.exp(-apart / (2 * _FALLOFF_PX**2)), 0.0).flatten()[:, None]
+    colour = looks[:-5]
+    falloff = pixels.gaussian(_REACH, _FALLOFF_PX, like.dtype, like.device)
+    falloff = torch.where(falloff < 1.0, falloff, 0.0)  # a pixel is not its own sample
 
     def look(part: Tensor) -> Tensor:
-        window = pixels.around(part, nearness, _REACH)
-        near, far = pixels.pick(edges.near, part)[0], pixels.pick(edges.far, part)[0]
-        values, own, others = pixels.pick(nearness, window)[0], pixels.pick(colour, part), pixels.pick(colour, window)
-        weight, most_off = falloff * pixels.pick(witness, window)[0], 0.25 * (near - far).clamp_min(1e-12)
-        sides = [weight * ((values - end).abs() < most_off) for end in (near, far)]
+        samples = pixels.pick(looks[:-3], pixels.around(part, like, _REACH))
+        others, values, trusted = samples[:-2], samples[-2], samples[-1]  # [C, n, P], [n, P]
+        own = pixels.pick(looks, part)
+        ends, is_ramp = own[-3:-1], own[-1]  # near and far, [2, P]
+        most_off = 0.25 * (ends[0] - ends[1]).clamp_min(1e-12)
+        side = falloff * trusted * ((values - ends[:, None]).abs() < most_off)  # [2, n, P]
 
         # mean colours of both surfaces, and the variance around them
-        sums = [side.sum(0) for side in sides]
-        known = (sums[0] > 1e-3) & (sums[1] > 1e-3)
-        totals = [total + 1e-9 for total in sums]
-        means = [(others * side).sum(1) / total for side, total in zip(sides, totals, strict=True)]
-        spreads = [
-            ((others - mean[:, None]).square() * side).sum((0, 1)) / total
-            for mean, side, total in zip(means, sides, totals, strict=True)
-        ]
-        noise = 2.25e-4 * (means[0] + means[1]).square().sum(0)
-        spread = 0.5 * (spreads[0] + spreads[1]) + noise + 1e-12
-        contrast = (means[0] - means[1]).square().sum(0)
+        seen = side.sum(1)
+        least, total = seen.amin(0), seen + 1e-9
+        known = least > 1e-3
+        mean = (others[:, None] * side).sum(2) / total  # [C, 2, P]
+        spread = ((others[:, None] - mean[:, :, None]).square() * side).sum((0, 2)) / total
+        noise = 2.25e-4 * mean.sum(1).square().sum(0)
+        spread = 0.5 * spread.sum(0) + noise + 1e-12
+        contrast = (mean[:, 0] - mean[:, 1]).square().sum(0)
         separation = (contrast / (contrast + 0.5 * spread) - 0.1).clamp_min(0.0) / 0.9
         separation = torch.where(known, separation, 1.0)  # no samples in the middle of a wide ramp: neighbours decide
 
         # likelihoods
-        alike = (1.0 + (others - own[:, None]).square().sum(0) / (0.3 * spread)).square().reciprocal()
-        likelihoods = [(side * alike).sum(0) / total + 1e-9 for side, total in zip(sides, totals, strict=True)]
-        score = torch.where(known, torch.log(likelihoods[0] / likelihoods[1]), 0.0).clamp(-8.0, 8.0)
-        certainty = (torch.minimum(*sums) / clear).clamp(max=1.0)
-        score = torch.where(pixels.pick(edges.is_ramp, part)[0], score, score * certainty)
-        surfaces = []
-        for side, end in zip(sides, (near, far), strict=True):
-            share = side * (alike + 1e-3)
-            surfaces.append(torch.where(known, (share * values).sum(0) / share.sum(0).clamp_min(1e-12), end))
-        return torch.stack([score, separation, *surfaces, known.to(score.dtype)])
+        apart = (others - own[:-5, None]).square().sum(0)
+        alike = (1.0 + apart / (0.3 * spread)).square().reciprocal()
+        likelihood = (side * alike).sum(1) / total + 1e-9
+        score = torch.where(known, torch.log(likelihood[0] / likelihood[1]), 0.0).clamp(-8.0, 8.0)
+        score = torch.where(is_ramp > 0, score, score * (least / clear).clamp(max=1.0))
+        share = side * (alike + 1e-3)
+        surfaces = torch.where(known, (share * values).sum(1) / share.sum(1).clamp_min(1e-12), ends)
+        return torch.cat([torch.stack([score, separation, known.to(score.dtype)]), surfaces])
 
-    score, separation, near, far, known = ops.by_parts(look, edge_pixels).unbind(0)
+    score, separation, known, near, far = ops.by_parts(look, edge_pixels).unbind(0)
 
     # neighbours of similar colour decide together
-    scores = pixels.put(torch.full_like(nearness, torch.nan), edge_pixels, score)
-    window = pixels.around(edge_pixels, nearness, 1)
+    scores = pixels.put(torch.full_like(like, torch.nan), edge_pixels, score)
+    window = pixels.around(edge_pixels, like, 1)
     own, others = pixels.pick(colour, edge_pixels), pixels.pick(colour, window)
     scores = pixels.pick(scores, window)[0]
     alike = 1.0 / (1.0 + (others - own[:, None]).square().sum(0) / (0.0225 * own.square().sum(0) + 1e-12))
-    alike = torch.where(scores.isnan(), 0.0, alike)  # NaN: not an edge pixel
-    scores = torch.where(scores.isnan(), 0.0, scores)
+    is_edge = ~scores.isnan()
+    alike, scores = torch.where(is_edge, alike, 0.0), torch.where(is_edge, scores, 0.0)
     score = (_SHARPNESS * separation * (alike * scores).sum(0) / alike.sum(0).clamp_min(1e-12)).clamp(-6.0, 6.0)
     evidence = (2.0 * separation * scores.abs().amax(0) - 1.0).clamp(0.0, 1.0)
     # at the ends of a wide ramp the window holds only one of the surfaces: use the evidence of its middle
-    around = _highest(pixels.put(torch.zeros_like(nearness), edge_pixels, evidence), 3)
+    around = _highest(pixels.put(torch.zeros_like(like), edge_pixels, evidence), 3)
     evidence = torch.where(known > 0, evidence, pixels.pick(around, edge_pixels)[0])
     return score, evidence, near, far
 
 
-def _mean_of(values: Tensor, mask: Tensor, sampled: Tensor) -> Tensor:
-    """Mean over an item's sampled pixels inside a mask, ``[B, 1, 1, 1]``; 0 without such pixels."""
-    item, weight = sampled // mask[0].numel(), pixels.pick(mask, sampled)[0].to(values.dtype)
-    weighted = weight * pixels.pick(values, sampled)[0]
-    sums = [weight.new_zeros(mask.shape[0]).index_add(0, item, w) for w in (weight, weighted)]
-    return (sums[1] / sums[0].clamp_min(1.0)).view(-1, 1, 1, 1)
-
-
-def _is_related(level: Tensor, edges: _Edges, sampled: Tensor, score: Tensor) -> Tensor:
-    """Whether the colour scores of an item agree with its map at clear pixels, ``[B, 1, 1, 1]``.
-
-    Clear pixels lie in the outermost ring of a step or near the ends of a ramp. An image unrelated to its depth agrees
-    at half of them.
-    """
-    own = pixels.pick(level, sampled)[0]
-    is_ramp, ring = pixels.pick(edges.is_ramp, sampled)[0], pixels.pick(edges.ring, sampled)[0]
-    clear = torch.where(is_ramp, (own - 0.5).abs() > 0.3, ring == _RINGS)
-    weight = (0.5 * score.abs()).clamp(max=1.0) * clear
-    agrees = ((score > 0) == (own > 0.5)).to(score.dtype)
-    item = sampled // level[0].numel()
-    sums = [score.new_zeros(level.shape[0]).index_add(0, item, w) for w in (weight, weight * agrees)]
-    return ((sums[1] + 0.5 * _PRIOR_COUNT) / (sums[0] + _PRIOR_COUNT) > _RELATED).view(-1, 1, 1, 1)
-
-
-def _calibrate(kind: Tensor, sampled: Tensor, score: Tensor, items: int) -> Tensor:
-    """Share of pixels that show the near surface, for each kind: the prior, fitted to colour scores.
+def _calibrate(kinds: Tensor, score: Tensor, weight: Tensor, items: int) -> Tensor:
+    """Share of pixels that show the near surface, for each kind: the prior, fitted to colour scores of samples ``[P]``.
 
     Expectation maximisation with an assumed share, which counts as :data:`_PRIOR_COUNT` pixels. The first fit joins all
     directions; its shares are the assumption of the second fit, one direction at a time.
@@ -506,30 +499,24 @@ def _calibrate(kind: Tensor, sampled: Tensor, score: Tensor, items: int) -> Tens
     steps = torch.tensor([_TRUSTED] * _RINGS + [1.0 - _TRUSTED] * _RINGS, device=device, dtype=dtype)
     ramps = (torch.arange(_LEVELS, device=device, dtype=dtype) + 0.5) / _LEVELS
     assumed = torch.cat([steps, ramps]).repeat(items)
-    kinds = pixels.pick(kind, sampled)[0]
-    places = kinds // _DIRECTIONS
-    weight = (0.5 * score.abs()).clamp(max=1.0)
+    odds = torch.exp(-score)
 
     def fit(groups: Tensor, start: Tensor, assumed: Tensor) -> Tensor:
-        prior = _PRIOR_COUNT * assumed
-        share, total = start, torch.full_like(prior, _PRIOR_COUNT).index_add(0, groups, weight)
+        total = torch.full_like(assumed, _PRIOR_COUNT).index_add(0, groups, weight)
+        prior, share = _PRIOR_COUNT * assumed / total, start
+        # of a pixel that counts w of all, w sigmoid(score + logit(share)) = share / (share / w + (1 - share) odds / w)
+        near = total[groups] / weight.clamp_min(1e-20)
+        far = near * odds
+        change = near - far
         for _ in range(_ROUNDS):
-            near = torch.sigmoid(score + torch.logit(share)[groups])
-            share = (prior.index_add(0, groups, weight * near) / total).clamp(0.005, 0.995)
+            own = share[groups]
+            share = prior.index_add(0, groups, own / torch.addcmul(far, own, change)).clamp(0.005, 0.995)
         return share
 
     is_step = (torch.arange(_PLACES, device=device) < 2 * _RINGS).repeat(items)
+    places = kinds // _DIRECTIONS
     together = fit(places, torch.where(is_step, 0.5, assumed), assumed).repeat_interleave(_DIRECTIONS)
     return fit(kinds, torch.full_like(together, 0.5), together)
-
-
-def _climb(nearness: Tensor, valid: Tensor, edges: _Edges) -> Tensor:
-    """Steepness of edge pixels in steps per pixel, ``[B, 1, H, W]``: its sum is the length of all edges in pixels."""
-    across, along = _changes(nearness, valid, -1), _changes(nearness, valid, -2)
-    beside = [functional.pad(across, ends) for ends in ((1, 0), (0, 1))]
-    below = [functional.pad(along, (0, 0, *ends)) for ends in ((1, 0), (0, 1))]
-    steepness = 0.25 * sum(torch.hypot(a, b) for a in beside for b in below)
-    return torch.where(edges.is_edge, steepness / (edges.near - edges.far).clamp_min(1e-12), 0.0)
 
 
 def _without_ringing(nearness: Tensor, valid: Tensor, step: Tensor) -> Tensor:
@@ -543,12 +530,12 @@ def _without_ringing(nearness: Tensor, valid: Tensor, step: Tensor) -> Tensor:
     Reference:
         Serra, "Image Analysis and Mathematical Morphology, volume 2", 1988, chapter 8 (the centre).
     """
-    high, low = (_spread(torch.where(valid, t, -_NEVER)) for t in (nearness, -nearness))
-    closed_opening, of_negated = (-_spread(-_spread(_spread(-t))) for t in (low, high))
-    opened_closing = -of_negated
-    ends = torch.minimum(closed_opening, opened_closing), torch.maximum(closed_opening, opened_closing)
-    moved = torch.minimum(torch.maximum(nearness, ends[0]), ends[1]) - nearness
-    span = high + low
+    ends = _spread(_ends(nearness, valid))
+    opened_closing, closed_opening = _spread(-_spread(_spread(-ends))).split(1, 1)
+    closed_opening = -closed_opening
+    ends_of_both = torch.minimum(closed_opening, opened_closing), torch.maximum(closed_opening, opened_closing)
+    moved = torch.minimum(torch.maximum(nearness, ends_of_both[0]), ends_of_both[1]) - nearness
+    span = ends.sum(1, keepdim=True)
     return nearness + moved * torch.where(span > step, 2.0 - moved.abs() / (_OVERSHOOT * span), 0.0).clamp(0.0, 1.0)
 
 
@@ -572,7 +559,7 @@ def _lift_lamps(
     """
     brightest = light.amax(1, keepdim=True)
     usual = _mean(brightest.sqrt(), _REACH + 2) ** 2
-    span = _highest(nearness, _REACH) + _highest(-nearness, _REACH)
+    span = _highest(torch.cat([nearness, -nearness], 1), _REACH).sum(1, keepdim=True)
     around = _highest(brightest, 2)
     is_lamp = (brightest > 4.0 * usual) & (brightest > 0.1 * around) & (span > 0.5 * step) & is_soft
     cover = torch.where(brightest > 2.0 * usual, brightest / around.clamp_min(1e-30), 0.0)
@@ -580,9 +567,9 @@ def _lift_lamps(
     behind, difference, fit = _regress(nearness, cover, _blurred(cover, sigma), lamp_pixels, ops)
     # all pixels of a lamp lie on one surface: average their fits
     weight = fit * pixels.pick(cover, lamp_pixels)[0]
-    window, none = pixels.around(lamp_pixels, nearness, 2), torch.zeros_like(nearness)
-    values = (weight, weight * (behind + difference.clamp_min(0.0)), weight * fit)
-    total, level, fit = (pixels.pick(pixels.put(none, lamp_pixels, v), window)[0].sum(0) for v in values)
+    values = torch.stack([weight, weight * (behind + difference.clamp_min(0.0)), weight * fit])
+    of_lamps = pixels.put(torch.zeros_like(nearness).repeat(1, 3, 1, 1), lamp_pixels, values)
+    total, level, fit = pixels.pick(of_lamps, pixels.around(lamp_pixels, nearness, 2)).sum(1).unbind(0)
     level, fit = (values / total.clamp_min(1e-9) for values in (level, fit))
     # a map whose near surfaces are not too thin has lost no lamps: 0 where they are 1 px too wide
     is_lost = (2.4 + 2.5 * lost_px).clamp(0.0, 1.0).flatten()
@@ -598,52 +585,46 @@ def _regress(
 
     The quality is 0 where the sharp ``shape`` explains as much of the variance: there the map is not blurred.
     """
-    offsets = torch.arange(-_REACH, _REACH + 1, device=nearness.device, dtype=nearness.dtype)
-    weight = torch.exp(-(offsets[:, None].square() + offsets.square()) / 18.0).flatten()[:, None]
+    weight = pixels.gaussian(_REACH, 3.0, nearness.dtype, nearness.device)
     weight = weight / weight.sum()
+    maps = pixels.rows(torch.cat([nearness, blurred, shape], 1))
 
     def look(part: Tensor) -> Tensor:
-        window = pixels.around(part, nearness, _REACH)
-        y = pixels.pick(nearness, window)[0]
-        mean_y = (weight * y).sum(0)
-        yy = (weight * (y - mean_y).square()).sum(0)
-        results = []
-        for cover in (blurred, shape):
-            x = pixels.pick(cover, window)[0]
-            mean_x = (weight * x).sum(0)
-            xx = (weight * (x - mean_x).square()).sum(0)
-            xy = (weight * (x - mean_x) * (y - mean_y)).sum(0).clamp_min(0.0)
-            results.append((xx, xy / xx.clamp_min(1e-9), mean_x, xy.square() / (xx * yy).clamp_min(1e-12)))
-        (xx, b, mean_x, explained), (*_, unblurred) = results
+        samples = pixels.pick(maps, pixels.around(part, nearness, _REACH))  # [3, n, P]
+        means = (weight * samples).sum(1)
+        off = samples - means[:, None]
+        yy, *xx = (weight * off.square()).sum(1).unbind(0)
+        xy = (weight * off[0] * off[1:]).sum(1).clamp_min(0.0)
+        explained, unblurred = (c.square() / (v * yy).clamp_min(1e-12) for c, v in zip(xy.unbind(0), xx, strict=True))
         better = ((explained - unblurred) / (_BETTER * (1.0 - unblurred)).clamp_min(1e-6)).clamp(0.0, 1.0)
-        fit = torch.where(xx > 0.004, ((explained - 0.5) / 0.3).clamp(0.0, 1.0) * better, 0.0)
-        return torch.stack([mean_y - b * mean_x, b, fit])
+        fit = torch.where(xx[0] > 0.004, ((explained - 0.5) / 0.3).clamp(0.0, 1.0) * better, 0.0)
+        b = xy[0] / xx[0].clamp_min(1e-9)
+        return torch.stack([means[0] - b * means[1], b, fit])
 
     a, b, fit = ops.by_parts(look, chosen).unbind(0)
     return a, b, fit
 
 
-def _slopes(nearness: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """Slope and jump of each pixel, ``[B, 1, H, W]`` each; the maximum over both axes.
+def _slopes(nearness: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Slope, jump and steepness of each pixel, ``[B, 1, H, W]`` each; slope and jump are the maximum over both axes.
 
     The slope is the smaller of the changes on both sides if these have one sign, else 0. The jump is the larger change
-    minus the slope. Changes from or to an invalid pixel are 0.
+    minus the slope. The steepness is the mean length of the gradient. Changes from or to an invalid pixel are 0.
     """
-    least, jump = [], []
+    least, jump, sides = [], [], []
     for dim in (-1, -2):
-        change = _changes(nearness, valid, dim)
-        none = torch.zeros_like(nearness.narrow(dim, 0, 1))
-        before, after = torch.cat([none, change], dim), torch.cat([change, none], dim)
+        size = nearness.shape[dim]
+        known = valid.narrow(dim, 1, size - 1) & valid.narrow(dim, 0, size - 1)
+        change = torch.where(known, nearness.diff(dim=dim), 0.0)
+        padded = functional.pad(change, (1, 1) if dim == -1 else (0, 0, 1, 1))
+        before, after = padded.narrow(dim, 0, size), padded.narrow(dim, 1, size)
         has_one_sign = before * after > 0
-        least.append(torch.where(has_one_sign, torch.minimum(before.abs(), after.abs()), 0.0))
-        jump.append(torch.maximum(before.abs(), after.abs()) - least[-1])
-    return torch.maximum(*least), torch.maximum(*jump)
-
-
-def _changes(nearness: Tensor, valid: Tensor, dim: int) -> Tensor:
-    """Difference from each pixel to the next along ``dim``; 0 if one of them is invalid."""
-    known = valid.narrow(dim, 1, valid.shape[dim] - 1) & valid.narrow(dim, 0, valid.shape[dim] - 1)
-    return torch.where(known, nearness.diff(dim=dim), 0.0)
+        sides.append([before, after])
+        before, after = before.abs(), after.abs()
+        least.append(torch.where(has_one_sign, torch.minimum(before, after), 0.0))
+        jump.append(torch.maximum(before, after) - least[-1])
+    steepness = torch.stack([torch.hypot(a, b) for a in sides[0] for b in sides[1]]).mean(0)
+    return torch.maximum(*least), torch.maximum(*jump), steepness
 
 
 def _highest(values: Tensor, reach: int) -> Tensor:
@@ -672,5 +653,5 @@ def _blurred(values: Tensor, sigma: Tensor) -> Tensor:
         values = half[..., :1] * values
         for k in range(1, _BLUR_REACH + 1):  # runtimes of graphs cannot convolve with a computed kernel
             both = padded.narrow(dim, _BLUR_REACH - k, size) + padded.narrow(dim, _BLUR_REACH + k, size)
-            values = values + half[..., k : k + 1] * both
+            values = torch.addcmul(values, half[..., k : k + 1], both)
     return values

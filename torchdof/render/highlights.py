@@ -22,6 +22,7 @@ from torch import Tensor
 
 from .. import pixels
 from ..optics.blur_table import BlurTable
+from ..optics.kernel_bank import bank_of
 from ..optics.placed_kernels import FieldMask, placed_between, ray_masks
 from ..tensors import is_traced, recomputed
 from .layer_cocs import mean_change
@@ -241,7 +242,8 @@ def _splatted(
         masks = [mask.to(light) for mask in ray_masks(table, radii, (height, width))]
 
     def half_of(radius: float) -> int:
-        return min(math.ceil(table.reach_px(radius, lens_width) + 0.5), longest - 1)
+        reach = max(bank_of(table).reach_px(coc_px, lens_width) for coc_px in (-radius, radius))
+        return min(math.ceil(reach + 0.5), longest - 1)
 
     margin = max([half_of(radii[-1]), *(half_of(each.coc_px) for each in masks)])  # one of them may be the widest
     across = width + 2 * margin
