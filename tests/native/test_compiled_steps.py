@@ -170,14 +170,15 @@ def test_forward_mode_and_torch_func_agree_with_reverse_mode() -> None:
 def test_surfaces_behind_and_their_gradients_equal_the_plain_engines(
     channels: int, calls: dict[str, list[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Levels of random samples, some empty; some pixels lie exactly where a level begins to be read."""
+    """Levels of random samples, some empty; some pixels lie exactly where a level begins or ceases to count more."""
     generator, levels = torch.Generator().manual_seed(3), []
     coc = 20.0 * torch.rand(2, 1, 70, 101, generator=generator) - 10.0
     coc[..., 5:9] = 2.0
-    for step, slope, most in ((2, 3.5, 0.35), (4, 1.2, 0.12), (4, 1.0, math.inf)):
+    for step, slope, most in ((2, 4.0, 0.5), (4, 2.0, 0.25), (4, 1.0, math.inf)):
         values = torch.rand(2, channels + 2, 80 // step, 112 // step, generator=generator)
         values[:, -2] = 20.0 * values[:, -2] - 8.0
         values[:, -1] *= torch.rand(values[:, -1].shape, generator=generator) > 0.3
+        values[:, -2, :6, :6], values[:, -1, :6, :6] = 30.0, min(most / slope, 1.0)
         levels.append(Level(values, step, step / 4.0, slope, most))
     seen = torch.rand(2, channels + 2, 70, 101, generator=generator) - 0.3
 
