@@ -151,7 +151,7 @@ def _report(console: Console, captures: Captures, result: TableFit) -> dict[str,
         "focus_m": captures.focus_m,
         "fits": [
             {"distance_m": pair.distance_m, "coc_px": coc, **{name: getattr(fit, name) for name in of_fit}}
-            for pair, fit, coc in zip(captures, fits, result.coc_px, strict=True)
+            for pair, fit, coc in zip(captures.pairs, fits, result.coc_px, strict=True)
         ],
         "colours": [{"name": name, "radius_px": [fit.radius for fit in each]} for name, each in result.colours.items()],
     }
