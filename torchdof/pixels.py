@@ -3,12 +3,8 @@
 Depth edges, hidden surfaces and highlights concern few pixels, which are processed as lists ``[P]``.
 """
 
-import math
-
 import torch
 from torch import Tensor
-
-from .optics.kernel_cache import kept
 
 
 class Selected:
@@ -78,14 +74,6 @@ def around(pixels: Tensor, like: Tensor, reach: int) -> Tensor:
     lines = ((row + offsets).clamp(0, height - 1) + (line - row)) * width
     columns = (pixels % width + offsets).clamp(0, width - 1)
     return (lines[:, None] + columns).flatten(0, 1)
-
-
-@kept
-def gaussian(reach: int, sigma: float, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Gaussian weights of the pixels of a square, in the order of :func:`around`: ``[(2 reach + 1)^2, 1]``."""
-    steps = range(-reach, reach + 1)
-    weights = [math.exp(-(dy * dy + dx * dx) / (2.0 * sigma**2)) for dy in steps for dx in steps]
-    return torch.tensor(weights, dtype=dtype, device=device)[:, None]
 
 
 def corners(item: Tensor, row: Tensor, column: Tensor, height: int, width: int) -> tuple[list[Tensor], Tensor, Tensor]:

@@ -11,6 +11,7 @@ All computations use nearness, a measure linear in 1 / depth: planes are linear 
 estimation turn an edge into averages of it.
 """
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -18,6 +19,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from .. import native, pixels, validation
+from ..optics.kernel_cache import kept
 from ..options import DepthEdges
 from ..tensors import is_differentiated, is_in_memory, is_traced
 from ..validation import ends
@@ -438,7 +440,7 @@ def _judge(
         of the near and of the far surface, as means of the samples that resemble the pixel.
     """
     colour = looks[:-5]
-    falloff = pixels.gaussian(_REACH, _FALLOFF_PX, like.dtype, like.device)
+    falloff = _gaussian(_REACH, _FALLOFF_PX, like.dtype, like.device)
     falloff = torch.where(falloff < 1.0, falloff, 0.0)  # a pixel is not its own sample
 
     def look(part: Tensor) -> Tensor:
@@ -585,7 +587,7 @@ def _regress(
 
     The quality is 0 where the sharp ``shape`` explains as much of the variance: there the map is not blurred.
     """
-    weight = pixels.gaussian(_REACH, 3.0, nearness.dtype, nearness.device)
+    weight = _gaussian(_REACH, 3.0, nearness.dtype, nearness.device)
     weight = weight / weight.sum()
     maps = pixels.rows(torch.cat([nearness, blurred, shape], 1))
 
@@ -603,6 +605,14 @@ def _regress(
 
     a, b, fit = ops.by_parts(look, chosen).unbind(0)
     return a, b, fit
+
+
+@kept
+def _gaussian(reach: int, sigma: float, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Gaussian weights of the pixels of a square, in the order of :func:`torchdof.pixels.around`: ``[(2 reach + 1)^2, 1]``."""
+    steps = range(-reach, reach + 1)
+    weights = [math.exp(-(dy * dy + dx * dx) / (2.0 * sigma**2)) for dy in steps for dx in steps]
+    return torch.tensor(weights, dtype=dtype, device=device)[:, None]
 
 
 def _slopes(nearness: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
