@@ -16,10 +16,8 @@ from torchdof.render.plan import Plan
 
 pytestmark = pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built")
 
-
 STRANGE_M = torch.tensor([0.0, 2.0, math.inf, -math.inf, math.nan, 1e-30, 3e38])
 DEPTH = torch.cat([torch.linspace(-1.0, 9.0, 2003), STRANGE_M]).reshape(1, 1, 30, 67)
-
 
 CAMERAS = [
     *(Camera(focus_m=2.0, f_number=1.4), Camera(focus_m=math.inf), Camera(focus_m=torch.tensor(2.0))),

@@ -82,10 +82,9 @@ def test_the_ringing_of_an_enlarged_map_is_removed(scene: Scene, engine: str) ->
 
 
 def test_levels_of_a_file_are_not_edges_however_large_the_blur(engine: str) -> None:
-    level_px = 0.53
     levels = torch.arange(100.0).repeat_interleave(8).expand(1, 1, 32, -1)
     levels = levels + 2.0 * (torch.rand(levels.shape) < 0.1)  # compression: two levels are more than a step
-    coc_px = level_px * levels
+    coc_px = 0.53 * levels
     image = torch.rand(1, 3, *coc_px.shape[-2:])
     assert torch.equal(edges.mended(image, coc_px, "repair"), coc_px)
     assert not edges.judged(image, coc_px, edges.STEP_PX)[0].any()

@@ -609,7 +609,7 @@ def _regress(
 
 @kept
 def _gaussian(reach: int, sigma: float, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Gaussian weights of the pixels of a square, in the order of :func:`torchdof.pixels.around`: ``[(2 reach + 1)^2, 1]``."""
+    """Gaussian weights ``[(2 reach + 1)^2, 1]`` of a square, in the order of :func:`torchdof.pixels.around`."""
     steps = range(-reach, reach + 1)
     weights = [math.exp(-(dy * dy + dx * dx) / (2.0 * sigma**2)) for dy in steps for dx in steps]
     return torch.tensor(weights, dtype=dtype, device=device)[:, None]
