@@ -21,7 +21,7 @@ class Case(NamedTuple):
 
 
 def cases(portable: Portable, channels: int) -> Iterator[Case]:
-    """The calls for which a file of a module must give its result, for images of so many channels.
+    """The calls for which a file of a module must give its result, for images with ``channels`` channels.
 
     Each frame has a size and a shape of its coc; a file with a fixed size gets scenes of this size. The f-number and
     the depth are those that give this coc.

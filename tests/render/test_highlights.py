@@ -104,7 +104,7 @@ def test_splatting_in_parts_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> 
 
 SENT: list[tuple[dict[str, Any], float]] = [  # changes of the scene, share of the light
     ({}, 1.0),
-    *(({"nearer_px": px}, sent) for px, sent in ((1.5, 0.7), (1.0, 0.4), (-3.0, 0.4))),  # distance to what is nearer
+    *(({"nearer_px": px}, sent) for px, sent in ((1.5, 0.7), (1.0, 0.4), (-3.0, 0.4))),  # px of coc to a nearer surface
     *(({"beside_light": light}, sent) for light, sent in ((1.2, 0.7), (1.6, 0.4))),  # which must be no highlight
     ({"cover": 0.053}, 0.5265),  # the coverage, as in layers
     # pixels between the surfaces: the light is multiplied by 1.5 - 10 * 2 / 25

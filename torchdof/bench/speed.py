@@ -41,15 +41,12 @@ def works(
         *((f"{share:g} of the frame 1/255", 1, blur, scene.resized(share)) for share in _SIZES * scan),
     ]
     without = " without occlusion" * (not occlusion)
-    frame = "{1} x {0}"
-    return [
-        (
-            {"setting": f"{name}{without}", "tolerance": n / 255, "frame": frame.format(*view.coc_px.shape[-2:])},
-            blur,
-            view,
-        )
-        for name, n, blur, view in settings
-    ]
+    rows = []
+    for name, n, render, view in settings:
+        height, width = view.image.shape[-2:]
+        columns = {"setting": name + without, "tolerance": n / 255, "frame": f"{width} x {height}"}
+        rows.append((columns, render, view))
+    return rows
 
 
 def _prepared(runtime: str, scene: BenchScene, occlusion: bool) -> Renderer:

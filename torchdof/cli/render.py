@@ -36,7 +36,10 @@ class _Effects(Group):
         type=Parsed("X,Y,RADIUS", numbers(3), "320,200,80"),
     )
     lights: float = option(
-        "Brighten lamps that a photograph clipped at white, by up to so many stops.", 0.0, type=click.FloatRange(min=0)
+        "Brighten lamps that a photograph clipped at white, by up to this many stops, such as 3.",
+        0.0,
+        metavar="STOPS",
+        type=click.FloatRange(min=0),
     )
     show_focus: bool = option("Don't blur: tint the grey image: near orange, in focus green, far blue.", False)
     device: str = option("auto, cpu, cuda, cuda:1, ...", "auto")

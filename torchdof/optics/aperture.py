@@ -164,14 +164,16 @@ class Aperture:
         return cls(**given)
 
     def __repr__(self) -> str:
-        rotation, squeeze, vignetting = _as_float(self.rotation_deg), _as_float(self.squeeze), sum(self.rims)
-        shape = "x" if self.mask is None else " x ".join(map(str, self.mask.shape))
-        parts = {
-            **{f"mask {shape}": self.mask is not None, f"{self.blades} blades": self.blades},
-            **{f"curvature {self.curvature:g}": self.curvature, f"turned by {rotation:g}": rotation},
-            **{f"squeeze {squeeze:g}": squeeze != 1.0, f"vignetting {vignetting:g}": vignetting},
-        }
-        return f"Aperture({', '.join(text for text, is_stated in parts.items() if is_stated) or 'round'})"
+        parts = [] if self.mask is None else ["mask " + " x ".join(map(str, self.mask.shape))]
+        numbers = (
+            ("{:g} blades", self.blades, 0),
+            ("curvature {:g}", self.curvature, 0.0),
+            ("turned by {:g}", _as_float(self.rotation_deg), 0.0),
+            ("squeeze {:g}", _as_float(self.squeeze), 1.0),
+            ("vignetting {:g}", sum(self.rims), 0.0),
+        )
+        parts += [text.format(value) for text, value, default in numbers if value != default]
+        return f"Aperture({', '.join(parts) or 'round'})"
 
     def _outline(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """Corners ``[V]`` of the outline, x and y with y down, counter-clockwise as seen with y up."""
