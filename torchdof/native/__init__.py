@@ -38,7 +38,7 @@ _instructions = "avx2" if torch.backends.cpu.get_cpu_capability().startswith("AV
 
 _SMALL_FRAME = 2**16  # pixels; up to this size the main thread renders itself, which saves 0.1 ms
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
-_REVISION = 11  # of ``src/api.h``
+_REVISION = 12  # of ``src/api.h``
 
 Rules = Sequence[tuple[int, float, float, float]]
 
@@ -76,8 +76,8 @@ _STRUCTURES = {
     "field_mask": "data values boxes, real radius, int colours rows columns",
     "spots": "int count colours, data* templates, int* cells index, double* part finer reach fade, int* flipped half, "
     "double squeeze, int round even",
-    "scene": "int height width channels kind surfaces, data* light coc weight, int occlusion normalize masked, "
-    f"int highlights, real crisp_px reach, {_LAYERS}, field_mask* field_masks, int distances, real squeeze, "
+    "scene": "int height width channels kind surfaces, data* light coc weight, data moved, int occlusion normalize, "
+    f"int masked highlights, real crisp_px reach, {_LAYERS}, field_mask* field_masks, int distances, real squeeze, "
     "int threads, int* cancelled",
     "map": "int height width channels, data light nearness, int of_coc, data steps, real step, int automatic threads, "
     "int* cancelled, data out",
@@ -157,6 +157,7 @@ def describe() -> str:
 def render(
     surfaces: Sequence[Surface],
     kind: Kind,
+    moved: Tensor | None = None,
     *,
     nodes: Sequence[float],
     layers: Sequence[tuple[Tensor, int]],
@@ -186,7 +187,7 @@ def render(
     """
     cancelled, (channels, height, width) = ctypes.c_int32(0), surfaces[0][0].shape
     scene = _TYPES["scene"](
-        *(height, width, channels, get_args(Kind).index(kind), len(surfaces), *_maps(surfaces)),
+        *(height, width, channels, get_args(Kind).index(kind), len(surfaces), *_maps(surfaces), moved),
         *(occlusion, normalize, masked, highlights, crisp_px, reach, *_of_layers(nodes, layers)),
         *(_field_masks(field_masks), field_masks[0][0].shape[1] if field_masks else 0, squeeze),
         *(torch.get_num_threads(), ctypes.pointer(cancelled)),

@@ -40,7 +40,13 @@ _Maps = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 def surfaces_of_image(
-    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: Sequence[int], ops: Ops = EAGER
+    light: Tensor,
+    coc_px: Tensor,
+    valid: Tensor | None,
+    threshold: Tensor,
+    levels: Sequence[int],
+    moved_px: Tensor | None = None,
+    ops: Ops = EAGER,
 ) -> tuple[list[Surface], Tensor]:
     """Splits an image into each pixel's own surface and a second one, mixed or hidden; and the light behind both.
 
@@ -61,6 +67,7 @@ def surfaces_of_image(
         valid: ``[B, 1, H, W]``, 0 where a pixel is left out; None means all count.
         threshold: Light above which a pixel is a highlight, ``[B, 1, H, W]``; highlights are not filled in elsewhere.
         levels: Levels of the pyramid, at least 2, of all items or of each. The widest search is ``2 ** levels`` pixels.
+        moved_px: As for :func:`torchdof.render.matting.matte`.
         ops: Operations.
 
     Returns:
@@ -68,14 +75,21 @@ def surfaces_of_image(
         :data:`BEHIND_STEP`-th pixel, ``[B, C, h, w]``, for an area slightly larger than the image.
     """
     if is_compiled():
-        maps = _operator(light, coc_px, valid, threshold, list(levels))
+        maps = _operator(light, coc_px, valid, threshold, list(levels), moved_px)
     else:
-        maps = _surfaces_of_image(light, coc_px, valid, threshold, levels, ops)
+        maps = _surfaces_of_image(light, coc_px, valid, threshold, levels, moved_px, ops)
     own_light, own_weight, other_light, other_coc, other_weight, behind = maps
     return [Surface(own_light, coc_px, own_weight), Surface(other_light, other_coc, other_weight)], behind
 
 
-def _empty(light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: Sequence[int]) -> _Maps:
+def _empty(
+    light: Tensor,
+    coc_px: Tensor,
+    valid: Tensor | None,
+    threshold: Tensor,
+    levels: Sequence[int],
+    moved_px: Tensor | None = None,
+) -> _Maps:
     colour, single = light.new_empty(light.shape), coc_px.new_empty(coc_px.shape)
     cells = (_continued(n, 2 ** max(levels)) // BEHIND_STEP for n in light.shape[-2:])
     behind = light.new_empty(*light.shape[:2], *cells)
@@ -85,9 +99,14 @@ def _empty(light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tenso
 # The number of pixels to process depends on the data, which compiled graphs do not support.
 @one_operator("torchdof::surfaces", _empty, differentiable=2)
 def _operator(
-    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: Sequence[int]
+    light: Tensor,
+    coc_px: Tensor,
+    valid: Tensor | None,
+    threshold: Tensor,
+    levels: Sequence[int],
+    moved_px: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    maps = (t.contiguous() for t in _surfaces_of_image(light, coc_px, valid, threshold, levels, EAGER))
+    maps = (t.contiguous() for t in _surfaces_of_image(light, coc_px, valid, threshold, levels, moved_px, EAGER))
     own, own_weight, other, other_coc, other_weight, behind = maps
     return own, own_weight, other, other_coc, other_weight, behind
 
@@ -156,10 +175,16 @@ def _largest(values: Tensor, height: int, width: int, step: int) -> Tensor:
 
 
 def _surfaces_of_image(
-    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: Sequence[int], ops: Ops
+    light: Tensor,
+    coc_px: Tensor,
+    valid: Tensor | None,
+    threshold: Tensor,
+    levels: Sequence[int],
+    moved_px: Tensor | None,
+    ops: Ops,
 ) -> _Maps:
     """Light and weight of each pixel's own surface; light, coc and weight of the other one; light behind both."""
-    matted = matte(light, coc_px, valid, ops)
+    matted = matte(light, coc_px, valid, moved_px, ops)
     if ops.has_rays:
         matted = attribute_emitters(light, coc_px, threshold, valid, matted)
     own, other, other_coc, other_weight = matted

@@ -68,6 +68,7 @@ _RELATED = 0.8  # smallest agreement of colours with the clear pixels of a map a
 _EXACT = 0.025  # largest share of wrong pixels at which the steps of a map count as exact
 _DOUBTFUL = 0.05  # share of wrong pixels of a kind above which these pixels are decided again
 _LEAN = 2.0  # log-odds by which a far surface must win: foreground left behind is the more visible error
+_BESIDE, _DIAGONAL = 0.93, 0.57  # log-odds of a neighbour's surface in soft maps; larger: smoother edges, less detail
 
 # Soft maps: blurred by resampling, or written by a network. More than _SOFT of the edge pixels of a soft map lie on
 # ramps. These are wider than _WIDE, or have more than _MIXED of their pixels in the middle half between both surfaces:
@@ -159,9 +160,17 @@ def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER) -
         low, high = ends(coc_px)
         if high - low < _LEAST_STEP_PX:
             return coc_px
-    repaired = repair(image, coc_px.detach(), STEP_PX, auto=edges == "auto", of_coc=True, ops=ops)
+    given = coc_px.detach()
+    repaired = repair(image, given, STEP_PX, auto=edges == "auto", of_coc=True, ops=ops)
+    if repaired is given:
+        return coc_px
     repaired = ops.choose(lambda: _has_steps(coc_px), repaired, coc_px)
     return torch.where(repaired == coc_px, coc_px, repaired) if is_differentiated(coc_px) else repaired
+
+
+def distance(given_px: Tensor, repaired_px: Tensor) -> Tensor:
+    """How far the repair moved the coc of each pixel, constant to autograd; 0 where it is not finite."""
+    return (repaired_px.detach() - given_px.detach()).abs().nan_to_num()
 
 
 def _has_steps(coc_px: Tensor) -> Tensor:
@@ -179,20 +188,21 @@ def repair(
 
     Args:
         image: ``[B, C, H, W]``, linear light.
-        nearness: ``[B or 1, 1, H, W]``, linear in 1 / depth, larger is nearer.
+        nearness: ``[B or 1, 1, H, W]``, linear in 1 / depth, larger is nearer; constant to autograd.
         step: Smallest difference in nearness between two surfaces, ``[B, 1, H, W]`` or a number.
         auto: Whether exact edges stay unchanged.
         of_coc: Whether ``nearness`` is a map of the coc instead, in which a larger value is farther.
         ops: Processes lists of pixels in parts.
 
     Returns:
-        ``[B, 1, H, W]``, constant to autograd; unchanged pixels keep their values to the bit.
+        ``[B, 1, H, W]``, constant to autograd; unchanged pixels keep their values to the bit. ``nearness`` itself if
+        the compiled engine leaves all of it unchanged.
     """
     device = image.device.type
     if torch.is_autocast_enabled(device):  # which would compute in half precision
         with torch.autocast(device, enabled=False):
             return repair(image, nearness, step, auto, of_coc, ops)
-    image, nearness = image.detach(), nearness.detach()
+    image = image.detach()
     compiled = not is_traced() and all(map(is_in_memory, (image, nearness))) and native.chosen()
     if of_coc and not compiled:
         return -repair(image, -nearness, step, auto, ops=ops)
@@ -202,7 +212,10 @@ def repair(
         repaired = _operator(light, given, step, auto)
     elif compiled:
         steps = step.expand(light.shape[0], 1, *given.shape[-2:]) if step.ndim else step.expand(light.shape[0], 1)
-        items = [native.repair_edges(a, b[0], c[0], auto, of_coc) for a, b, c in zip(light, given, steps, strict=True)]
+        maps = [of_item[0] for of_item in given]
+        items = [native.repair_edges(a, b, c[0], auto, of_coc) for a, b, c in zip(light, maps, steps, strict=True)]
+        if all(new is old for new, old in zip(items, maps, strict=True)):
+            return nearness
         repaired = (items[0][None] if len(items) == 1 else torch.stack(items))[:, None]
     else:
         repaired = _repair(light, given, step, auto, ops)
@@ -238,7 +251,8 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops 
     1. Find ramps and steps, and the nearness of both surfaces there.
     2. Score sampled edge pixels by colour, fit the prior of each kind of edge pixel, and detect soft maps.
     3. Select the pixels to decide: all edge pixels; with ``auto``, those of kinds that are often wrong.
-    4. A selected pixel shows the near surface where ``score + logit(prior) > 0``.
+    4. A selected pixel shows the near surface where ``score + logit(prior) > 0``; in soft maps with the chance of its
+       neighbours to show it.
     5. Give selected pixels the nearness of their surface, on ramps in proportion to the evidence.
     6. In soft maps, remove the ringing of interpolation beside steps, and correct lamps of a few pixels.
     """
@@ -292,7 +306,14 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops 
     shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0])
     if auto:  # without auto, correct steps are decided too, and the lead would move them
         shows_near = shows_near + _LEAN * (score.abs() - 1.0).clamp(0.0, 1.0)
-    shows_near = shows_near > 0
+    # single pixels of a soft map that stick out of an edge are mostly background of a similar colour
+    chance = pixels.put(torch.full_like(given, -1.0), edge_pixels, torch.sigmoid(shows_near))
+    chance, values = pixels.pick(torch.cat([chance, given], 1), pixels.around(edge_pixels, given, 1))
+    middle = pixels.pick(looks[-3:-1], edge_pixels).mean(0)  # of both surfaces
+    chance = torch.where(chance < 0, (values > middle).to(given.dtype), chance)
+    neighbours = (_neighbours(given.dtype, given.device) * (2.0 * chance - 1.0)).sum(0)
+    of_soft = is_soft.flatten().index_select(0, edge_pixels // (height * width))
+    shows_near = torch.where(of_soft, shows_near + neighbours, shows_near) > 0
 
     # the blur of a soft map: its standard deviation in pixels, and the width that it takes from near surfaces
     climbed = (edges.climb * is_mixed).sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
@@ -605,6 +626,13 @@ def _regress(
 
     a, b, fit = ops.by_parts(look, chosen).unbind(0)
     return a, b, fit
+
+
+@kept
+def _neighbours(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Log-odds ``[9, 1]`` that a pixel takes from its neighbours, in the order of :func:`torchdof.pixels.around`."""
+    odds = [_DIAGONAL, _BESIDE, _DIAGONAL, _BESIDE, 0.0, _BESIDE, _DIAGONAL, _BESIDE, _DIAGONAL]
+    return torch.tensor(odds, dtype=dtype, device=device)[:, None]
 
 
 @kept

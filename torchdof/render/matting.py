@@ -30,6 +30,7 @@ _TEXTURE = 50.0  # weight of variance against contrast; larger: texture keeps mo
 _MOST_CLEAN = 4.0  # upper limit for a neighbour's clean light, as a multiple of the brightest neighbour
 _SOFTNESS_PX = 0.6  # standard deviation of the Gaussian by which two surfaces mix where their colours are alike
 _ALIKE = 1.0 / 255.0  # contrast at which trust is halved, as a fraction of the brightest light around
+_UNSURE = 3.0  # added weight of variance, in units of _TRUST, where the depth map has no edge; larger: softer edges
 _UNBOUNDED = 1e6  # upper limit for either part, as a multiple of the brightest neighbour; avoids 0 * inf
 
 # Emitters
@@ -52,7 +53,9 @@ class Matted(NamedTuple):
     other_weight: Tensor
 
 
-def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops = EAGER) -> Matted:
+def matte(
+    light: Tensor, coc_px: Tensor, valid: Tensor | None = None, moved_px: Tensor | None = None, ops: Ops = EAGER
+) -> Matted:
     """Splits pixels at depth edges between their own surface and the one across the edge.
 
     1. Take the nearest and the farthest coc of the 3 x 3 pixels around as those of the two surfaces.
@@ -60,13 +63,16 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops =
        count without the light of the other surface: a photograph's edges are wider than a pixel.
     3. Fit ``I = a F + (1 - a) B`` to the pixel's light I by least squares: ``a = (I - B) (F - B) / |F - B|^2``.
     4. Keep a on the side of 1/2 of the pixel's own surface, on which its centre lies. Where contrast is small against
-       texture, a is the near surface's share under a small Gaussian, as far as the pixel's colour agrees.
+       texture, a is the near surface's share under a small Gaussian, as far as the pixel's colour agrees. In a pixel
+       for which the depth map gave a depth between the surfaces, it need not agree: then both parts are those of the
+       colours, and the edge is soft instead of jagged.
     5. Distribute the residual over both parts: they sum to I, and neither leaves the image's range.
 
     Args:
         light: ``[B, C, H, W]``.
         coc_px: ``[B, 1, H, W]``, signed.
         valid: ``[B, 1, H, W]``, 0 where a pixel is left out; None means all count.
+        moved_px: Distance by which the repair of depth edges moved the coc, ``[B, 1, H, W]``, >= 0; None means 0.
         ops: Selects the pixels at edges.
 
     Returns:
@@ -119,7 +125,12 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops =
     strength = (contrast**2).sum(0)
     fitted = (((colour - back) * contrast).sum(0) / strength.clamp_min(1e-12)).clamp(0.0, 1.0)
     misfit = ((colour - back - fitted * contrast) ** 2).sum(0)
-    trust = strength / (strength + _TRUST * (back_variance + front_variance + misfit) + _ALIKE**2)
+    variance = back_variance + front_variance + misfit
+    if moved_px is not None:
+        part = selected.pick(moved_px)[0] / gap.detach()  # 0 or 1: the map as given has an edge here
+        unsure = (4.0 * torch.minimum(part, 1.0 - part)).clamp(0.0, 1.0)
+        variance = variance * (1.0 + _UNSURE * unsure)
+    trust = strength / (strength + _TRUST * variance + _ALIKE**2)
     # a depth between the two belongs to a steep surface, not to an edge
     sided = ((own_coc - near) - (far - own_coc)).abs() / gap
     clear = edge * (4.0 * sided - 2.0).clamp(0.0, 1.0)
@@ -131,7 +142,8 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops =
     # below 1 px of coc the two may be a steep surface, and nothing is to be seen of a soft edge
     geometric = torch.where(is_near, 1.0 - covered, covered).clamp(max=0.5) * clear * (1.0 - trust)
     geometric = geometric * (gap / _EDGE_PX - 2.0).clamp(0.0, 1.0)
-    weight = weight + geometric * noise / (noise + misfit)
+    agreed = geometric * noise / (noise + misfit)
+    weight = weight + (agreed if moved_px is None else torch.lerp(agreed, geometric, unsure))
 
     # Each part gets a share of the residual in proportion to its weight squared: the smallest change of both colours.
     # Then limit the parts to the image's range.
@@ -146,6 +158,9 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops =
     moved = torch.minimum(moved.maximum(weight * least), weight * most)
     own = (colour - moved) / own_weight
     other = torch.where(weight > 0, moved / weight.clamp_min(1e-12), 0.0)
+    if moved_px is not None:
+        disagreed = unsure * (geometric - agreed) / weight.clamp_min(1e-12)
+        own, other = torch.lerp(own, colour, disagreed), torch.lerp(other, other_mean, disagreed)
     return Matted(
         selected.put(light, own * brightest),
         selected.put(torch.zeros_like(light), other * brightest),
@@ -217,10 +232,11 @@ def attribute_emitters(
         sureness = sureness * (10.0 * (emitter_peak / same_peak - share)).clamp(0.0, 1.0)
         return sureness, there, dim, torch.maximum(emitter_peak, same_peak)
 
-    _, other, other_coc, weight = (pixels.pick(t, bright) for t in surfaces)
-    other, other_coc, weight = other / scale, other_coc[0], weight[0]
+    own, other, other_coc, weight = (pixels.pick(t, bright) for t in surfaces)
+    own, other, other_coc, weight = own / scale, other / scale, other_coc[0], weight[0]
     for side, among, least_share in ((-1.0, touches, 1.0), (1.0, counted, 0.5)):
         sureness, there, dim, top = beyond(own_coc, side, among, least_share)
+        is_beyond = sureness > 0
         dimmest = dim * dimness
         surface = (colour * dimmest).sum(1) / dimmest.sum(0).clamp_min(1e-12)  # its light where it is dimmest
         lit = there * near_by * brightness
@@ -238,16 +254,18 @@ def attribute_emitters(
         known = weight.clamp_min(1e-12)
         other = torch.where(weight > 0, moved / known, 0.0)
         other_coc = torch.lerp(other_coc, emitter_coc, given * share / known)
+        own = torch.where(is_beyond, (seen - weight * other) / (1.0 - weight), own)
 
     # The other way round: an emitter on the own surface. The other surface is dark around the pixel, without the light
     # of emitters seen through it, which was taken from it above.
-    own = pixels.put(surfaces.own, bright, (seen - weight * other) / (1.0 - weight) * scale)
-    own_peaks = pixels.pick(own.amax(1, keepdim=True), window)[0] / scale
+    own_peaks = pixels.put(surfaces.own, bright, own * scale).amax(1, keepdim=True)
+    own_peaks = pixels.pick(own_peaks, window)[0] / scale
     bright_other = (other.amax(0) / limit.clamp_min(torch.finfo(light.dtype).tiny) - 1.0).clamp(0.0, 1.0)
     apart = own_coc - other_coc
     sureness = beyond(other_coc, apart.sign(), torch.where(apart > 0, counted, touches), 1.0, own_peaks)[0]
-    weight = weight * (1.0 - (apart.abs() - 1.0).clamp(0.0, 1.0) * bright_other * sureness)
-    own = (seen - weight * other) / (1.0 - weight)
+    taken = (apart.abs() - 1.0).clamp(0.0, 1.0) * bright_other * sureness
+    weight = weight * (1.0 - taken)
+    own = torch.where(taken > 0, (seen - weight * other) / (1.0 - weight), own)
     changed = zip(surfaces, (own * scale, other * scale, other_coc, weight), strict=True)
     return Matted(*(pixels.put(maps, bright, values) for maps, values in changed))
 

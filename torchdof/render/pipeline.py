@@ -6,7 +6,7 @@ Each step takes ``ops`` (:mod:`torchdof.render.ops`): one set of operations for 
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -54,30 +54,38 @@ def blur(
         attention: Area rendered within ``options.tolerance``; the rest is rendered with the tolerance ``"draft"``.
         ops: Operations of all steps.
     """
-    coc_px = edges.mended(image, coc_px, options.depth_edges, ops)
+    given, coc_px = coc_px, edges.mended(image, coc_px, options.depth_edges, ops)
+    moved = None if coc_px is given else edges.distance(given, coc_px)
     if attention is None:
-        return _planned(image, coc_px, plan, options, behind, ops)
+        return _planned(image, coc_px, plan, options, behind, moved, ops)
     weight = weight_map(attention, image)
     if options.table.depends_on_place:  # kernels depend on the distance from the frame's middle, so no part is cut out
-        return _planned(image, coc_px, plan, options, behind, ops)
+        return _planned(image, coc_px, plan, options, behind, moved, ops)
     loose = dataclasses.replace(options, tolerance=max(options.tolerance, NAMED_TOLERANCES["draft"]))
     known = torch.nan_to_num(coc_px.detach(), nan=0.0, posinf=0.0, neginf=0.0)
     box = box_around(weight, _REACH * float(known.abs().amax()))
     if box is None or loose.tolerance == options.tolerance:
-        return _planned(image, coc_px, None, loose, behind, ops)
+        return _planned(image, coc_px, None, loose, behind, moved, ops)
     part = (..., *box)
     if image[part].shape == image.shape and bool((weight == 1).all()):
-        return _planned(image, coc_px, None, options, behind, ops)
-    around = _planned(image, coc_px, None, loose, behind, ops)
+        return _planned(image, coc_px, None, options, behind, moved, ops)
+    around = _planned(image, coc_px, None, loose, behind, moved, ops)
     behind_part = None if behind is None else (behind[0][part], behind[1][part])
-    looked_at = _planned(image[part], coc_px[part], None, options, behind_part, ops)
+    moved_part = None if moved is None else moved[part]
+    looked_at = _planned(image[part], coc_px[part], None, options, behind_part, moved_part, ops)
     rows, columns = box
     ends = (columns.start, image.shape[-1] - columns.stop, rows.start, image.shape[-2] - rows.stop)
     return torch.lerp(around, functional.pad(looked_at, ends), functional.pad(weight[part], ends).to(image.dtype))
 
 
 def _planned(
-    image: Tensor, coc_px: Tensor, plan: Plan | None, options: Options, behind: tuple[Tensor, Tensor] | None, ops: Ops
+    image: Tensor,
+    coc_px: Tensor,
+    plan: Plan | None,
+    options: Options,
+    behind: tuple[Tensor, Tensor] | None,
+    moved_px: Tensor | None,
+    ops: Ops,
 ) -> Tensor:
     """Render an image with repaired depth edges, with the given plan or with one plan for each item."""
     if is_traced() and options.table.depends_on_place:
@@ -85,21 +93,27 @@ def _planned(
             "a compiled or exported graph has one kernel a layer; take a table without vignetting or field"
         )
     wide = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
-    maps = [t.to(wide).contiguous() for t in (image, coc_px, *(behind or ()))]
-    maps = [(t if is_traced() else t.resolve_neg()).expand(image.shape[0], -1, -1, -1) for t in maps]
+    given = {"light": image, "coc": coc_px}
+    if behind is not None:
+        given |= {"behind_light": behind[0], "behind_coc": behind[1]}
+    if moved_px is not None:
+        given["moved_px"] = moved_px
+    maps = {name: t.to(wide).contiguous() for name, t in given.items()}
+    maps = {n: (t if is_traced() else t.resolve_neg()).expand(image.shape[0], -1, -1, -1) for n, t in maps.items()}
+    cocs = [maps["coc"]] if behind is None else [maps["coc"], maps["behind_coc"]]
     if plan is None and is_traced():
         # Floats rebuilt from hex become constants of the graph. The options' own floats would become inputs of the
         # graph if they differ between two modules.
         max_coc_px, tolerance = (float.fromhex(float(n).hex()) for n in (options.max_coc_px, options.tolerance))
         plan = Plan.static(max_coc_px, tolerance)
-    elif plan is None and any(map(is_differentiated, maps[1::2])):
-        plan = Plan.for_scene(torch.cat(maps[1::2]), options.tolerance, on_grid=True)
+    elif plan is None and any(map(is_differentiated, cocs)):
+        plan = Plan.for_scene(torch.cat(cocs), options.tolerance, on_grid=True)
     elif plan is not None and not is_traced():
-        plan = plan.extended_to(torch.cat(maps[1::2]))
+        plan = plan.extended_to(torch.cat(cocs))
     if plan is not None:
-        return _image(options, ops, [plan], *maps).to(image.dtype)
+        return _image(options, ops, [plan], **maps).to(image.dtype)
     # one plan for each item, so that the result does not depend on the rest of the batch
-    scenes = [torch.cat(cocs) for cocs in zip(*(t.split(1) for t in maps[1::2]), strict=True)]
+    scenes = [torch.cat(of_item) for of_item in zip(*(t.split(1) for t in cocs), strict=True)]
     return _each_planned(functools.partial(_image, options, ops), scenes, options, maps).to(image.dtype)
 
 
@@ -113,40 +127,48 @@ def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     valid = torch.isfinite(coc) & torch.isfinite(light).all(2, keepdim=True) & (cover > 0)
     cover, coc = torch.where(valid, cover, 0.0), torch.where(valid, coc, coc.new_zeros(()))
     light = torch.where(valid, light * scale[:, None] / cover.clamp_min(1e-12), 0.0)
-    maps = [t.gather(1, order.expand_as(t)) for t in (light, coc, cover)]
+    given = {"light": light, "coc": coc, "cover": cover}
+    maps = {name: t.gather(1, order.expand_as(t)) for name, t in given.items()}
     if is_differentiated(coc):
-        plan = Plan.for_scene(maps[1].flatten(0, 1), options.tolerance, on_grid=True)
-        rendered = _stack(options, [plan], *maps)
+        plan = Plan.for_scene(maps["coc"].flatten(0, 1), options.tolerance, on_grid=True)
+        rendered = _stack(options, [plan], **maps)
     else:
-        rendered = _each_planned(functools.partial(_stack, options), [*maps[1]], options, maps)
+        rendered = _each_planned(functools.partial(_stack, options), [*maps["coc"]], options, maps)
     return (rendered / scale).to(rgba.dtype)
 
 
 def _each_planned(
-    render: Callable[..., Tensor], scenes: Sequence[Tensor], options: Options, maps: Sequence[Tensor]
+    render: Callable[..., Tensor], scenes: Sequence[Tensor], options: Options, maps: Mapping[str, Tensor]
 ) -> Tensor:
     """Render items, each with its own plan, as many together as have layers that can be joined.
 
-    ``render(plans, *maps)`` renders some items, with one plan or one for each. ``scenes`` are the coc of all maps of
+    ``render(plans, **maps)`` renders some items, with one plan or one for each. ``scenes`` are the coc of all maps of
     each item, ``[N, 1, H, W]``; ``maps`` are those of all items, ``[B, ...]``.
     """
+
+    def rendered(plans: Sequence[Plan], items: Sequence[int]) -> Tensor:
+        if len(items) == len(scenes):
+            return render(plans, **maps)
+        parts = {name: [t[i : i + 1] for i in items] for name, t in maps.items()}
+        return render(plans, **{name: t[0] if len(t) == 1 else torch.cat(t) for name, t in parts.items()})
+
     uniform = options.method == "layered" and not options.table.depends_on_place
-    if len(scenes) == 1 or not uniform or (native.chosen() and all(is_in_memory(t, backward=True) for t in maps)):
+    in_memory = native.chosen() and all(is_in_memory(t, backward=True) for t in maps.values())
+    if len(scenes) == 1 or not uniform or in_memory:
         # the compiled engine renders item by item
         plans = [Plan.for_scene(scene, options.tolerance) for scene in scenes]
-        items = [render([plan], *item) for plan, *item in zip(plans, *(t.split(1) for t in maps), strict=True)]
+        items = [rendered([plan], [i]) for i, plan in enumerate(plans)]
         return items[0] if len(items) == 1 else torch.cat(items)
     plans = Plan.for_scenes(scenes, options.tolerance)
     most = max(1, _TOGETHER // math.prod(scenes[0].shape[-2:]))
     joined = [i for i, plan in enumerate(plans) if len(plan.nodes) > 1]  # a plane has one layer, whose kernel is exact
     groups = [joined[i : i + most] for i in range(0, len(joined), most)]
     groups += [[i] for i in range(len(plans)) if i not in joined]
-    if len(groups) == 1:
-        return render(plans, *maps)
     by_index: dict[int, Tensor] = {}
     for group in groups:
-        rendered = render([plans[i] for i in group], *(torch.cat([t[i : i + 1] for i in group]) for t in maps))
-        by_index |= zip(group, rendered.split(1), strict=True)
+        if len(group) == len(plans):
+            return rendered(plans, group)
+        by_index |= zip(group, rendered([plans[i] for i in group], group).split(1), strict=True)
     return torch.cat([by_index[i] for i in range(len(plans))])
 
 
@@ -171,6 +193,7 @@ def _image(
     coc: Tensor,
     behind_light: Tensor | None = None,
     behind_coc: Tensor | None = None,
+    moved_px: Tensor | None = None,
 ) -> Tensor:
     """Render float maps of images, optionally with a known background, with one plan or with one for each item.
 
@@ -188,7 +211,9 @@ def _image(
         # all in focus: the image is unchanged; with the term 0 * coc, the coc has a gradient of 0 instead of None
         return light + 0.0 * torch.nan_to_num(coc) if is_differentiated(coc) else light.clone()
     if len(plans) == 1:
-        picture = compiled.picture(plan, options, light, coc, behind_light, behind_coc, lens_width=ops.lens_width)
+        picture = compiled.picture(
+            plan, options, light, coc, behind_light, behind_coc, moved_px, lens_width=ops.lens_width
+        )
         if picture is not None:
             return picture
     image, valid, weight = light, None, None
@@ -214,10 +239,10 @@ def _image(
     # surfaces of each pixel, and the light behind all of them
     surfaces, behind = [Surface(light, coc, weight)], None
     if behind_light is not None and behind_coc is not None and limit is not None:
-        surfaces = _before_background(surfaces[0], behind_light, behind_coc, ends, options)
+        surfaces = _before_background(surfaces[0], behind_light, behind_coc, moved_px, ends, options)
     elif options.occlusion and limit is not None and splatted:
         levels = [min(math.ceil(math.log2(max(2.0, most))) + 1, 7) for most in widest]
-        surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels, ops)
+        surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels, moved_px, ops)
 
     # highlights of these surfaces, ray by ray
     splats = None
@@ -256,13 +281,18 @@ def _of_plans(values: Sequence[Sequence[float]], like: Tensor) -> Sequence[Any]:
 
 
 def _before_background(
-    surface: Surface, behind: Tensor, behind_coc: Tensor, ends: Sequence[Any], options: Options
+    surface: Surface,
+    behind: Tensor,
+    behind_coc: Tensor,
+    moved_px: Tensor | None,
+    ends: Sequence[Any],
+    options: Options,
 ) -> list[Surface]:
     """Surfaces of an image in front of a known background, near to far; its coc is clamped to ``ends``."""
     light, coc, weight = surface
     valid = None if options.check else torch.isfinite(behind_coc) & torch.isfinite(behind).all(1, keepdim=True)
     behind_coc = behind_coc.clamp(*ends)
-    own_light, other_light, other_coc, other_weight = matte(light, coc, weight)
+    own_light, other_light, other_coc, other_weight = matte(light, coc, weight, moved_px)
     # of the second surfaces of mixed pixels keep the nearer ones; the known background replaces the farther ones
     own_weight, other_weight = 1.0 - other_weight, torch.where(other_coc < coc, other_weight, 0.0)
     if weight is not None:

@@ -43,6 +43,7 @@ typedef struct {
   const float *const *light;   // for each surface [channels, height, width]
   const float *const *coc;     // for each surface [height, width]: signed radius in pixels, negative in front of the focus
   const float *const *weight;  // for each surface [height, width], or null: it covers its pixels fully
+  const float *moved;          // [height, width]: how far the repair of edges moved the coc, in pixels, or null: nowhere
   int32_t occlusion;           // 0: light of all surfaces is added, without occlusion
   int32_t normalize;           // 0: without occlusion, do not divide by the blurred weight
   int32_t masked;  // 1: inputs may be NaN or infinite (not in a stack); such pixels are copied and do not affect others
@@ -183,5 +184,5 @@ TORCHDOF_API int32_t torchdof_ends(const float *values, int64_t count, int32_t t
 
 // Version of this interface, for the caller to check first: sizes of its structures and, in the upper half,
 // TORCHDOF_REVISION, which increases with every other change of this file.
-#define TORCHDOF_REVISION 11
+#define TORCHDOF_REVISION 12
 TORCHDOF_API int64_t torchdof_interface(void);

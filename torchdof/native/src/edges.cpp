@@ -20,6 +20,7 @@ constexpr int DIRECTIONS = 5, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, KINDS = D
 constexpr int SAMPLED = 12000, SAMPLE_BLOCK = 8, ROUNDS = 10;
 constexpr float TRUSTED = 0.05f, PRIOR_COUNT = 30.0f;
 constexpr float RELATED = 0.8f, EXACT = 0.025f, DOUBTFUL = 0.05f, LEAN = 2.0f;  // decision, in automatic mode
+constexpr float BESIDE = 0.93f, DIAGONAL = 0.57f;                           // decision, in soft maps
 constexpr float SOFT = 0.1f, WIDE = 1.5f, MIXED = 0.5f;  // soft maps
 constexpr float CLIMBED = 0.35f, PIXEL = 0.2f, BETTER = 0.5f, OVERSHOOT = 0.12f;  // lamps, ringing
 constexpr int BLUR_REACH = 9, RINGING_REACH = 3;
@@ -223,7 +224,7 @@ class Repair {
       choose_edges(groups, [&](const Edge &edge) { return doubtful[given_kind_of(edge)]; });
     judge(groups, true);
     decide(groups);
-    const float lost_px = move(groups);
+    const float lost_px = move(groups, is_soft);
     if (is_soft) remove_ringing();
     if (is_soft) lift_lamps(blur(), lost_px);
     return true;
@@ -949,16 +950,24 @@ class Repair {
 
   // Decides which surface pixels show, and moves them to its nearness; on ramps in proportion to the evidence. Returns the
   // width, in pixels, by which the map's near surfaces are too thin.
-  float move(const std::vector<Group> &groups) const {
+  float move(const std::vector<Group> &groups, bool is_soft) const {
     const float lean = map_.automatic ? LEAN : 0.0f;
     float prior[KINDS];
     for (int k = 0; k < KINDS; k++) prior[k] = std::log(shares_[k] / (1.0f - shares_[k]));
+    const auto odds = [&](const Group &group, size_t k) {
+      const float score = group.judged[k].score;
+      return score + prior[group.edges[k].kind] + lean * clamp01(std::fabs(score) - 1.0f);
+    };
+    if (is_soft)
+      parallel((int)groups.size(), [&](int g) {
+        for (size_t k = 0; k < groups[g].edges.size(); k++) score_[groups[g].edges[k].i] = 1.0f / (1.0f + std::exp(-odds(groups[g], k)));
+      });
     std::vector<int64_t> lost(groups.size(), 0);
     parallel((int)groups.size(), [&](int g) {
       for (size_t k = 0; k < groups[g].edges.size(); k++) {
         const Edge &edge = groups[g].edges[k];
         const Judgement &judged = groups[g].judged[k];
-        const bool shows_near = judged.score + prior[edge.kind] > -lean * clamp01(std::fabs(judged.score) - 1.0f);
+        const bool shows_near = odds(groups[g], k) + (is_soft ? neighbours(edge) : 0.0f) > 0;
         const uint8_t marks = marks_[edge.i];
         const bool was_near = marks & NEAR;
         lost[g] += shows_near - was_near;
@@ -971,6 +980,17 @@ class Repair {
     double total = found_.lost;
     for (const int64_t here : lost) total += (double)here;
     return (float)(total / std::max(found_.length, 1e-12));
+  }
+
+  // Log-odds of the near surface from the neighbours; score_ is the chance that a listed one shows it.
+  float neighbours(const Edge &edge) const {
+    float odds = 0;
+    for (const auto &[dy, dx] : NEIGHBOURS) {
+      const int at = std::clamp(edge.i / width_ + dy, 0, height_ - 1) * width_ + std::clamp(edge.i % width_ + dx, 0, width_ - 1);
+      const bool is_near = sign_ * valid(map_.nearness[at]) > 0.5f * (edge.near + edge.far);
+      odds += (dy * dx ? DIAGONAL : BESIDE) * (2.0f * (marks_[at] & LISTED ? score_[at] : (float)is_near) - 1.0f);
+    }
+    return odds;
   }
 
   // The strongest evidence within three pixels, for the ends of wide ramps, where only one surface is in reach.

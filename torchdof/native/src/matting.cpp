@@ -6,7 +6,7 @@ namespace torchdof {
 namespace {
 
 // Constants of render/matting.py, which gives their meanings, units and effects: mixed pixels, emitters.
-constexpr float EDGE_PX = 0.5f, UNCLEAN = 1e-2f, TRUST = 10.0f, TEXTURE = 50.0f, MOST_CLEAN = 4.0f, ALIKE = 1.0f / 255, UNBOUNDED = 1e6f;
+constexpr float EDGE_PX = 0.5f, UNCLEAN = 1e-2f, TRUST = 10.0f, UNSURE = 3.0f, TEXTURE = 50.0f, MOST_CLEAN = 4.0f, ALIKE = 1.0f / 255, UNBOUNDED = 1e6f;
 constexpr int EMITTER_REACH = 3, TOUCHING = 2;
 constexpr float DIM = 0.1f, MOST_WEIGHT = 0.98f;
 constexpr float SAME_PX = 0.5f;  // px of coc: a background at most this far behind the image's surface is the same surface
@@ -28,7 +28,7 @@ constexpr float SMALL_BESIDE = 0.24935221f, SMALL_DIAGONAL = 0.06217652f;
 struct Window {
   explicit Window(int channels) : light((size_t)channels * EDGES * PITCH + LANES), clean(light), around((size_t)channels * (2 * TAPS + 3)) {}
 
-  float coc[SIDE * PITCH + LANES] = {}, valid[SIDE * PITCH + LANES] = {}, edge[EDGES * PITCH + LANES] = {};
+  float coc[SIDE * PITCH + LANES] = {}, valid[SIDE * PITCH + LANES] = {}, moved[BLOCK * PITCH + LANES] = {}, edge[EDGES * PITCH + LANES] = {};
   std::vector<float> light;  // [channels, EDGES, PITCH]
   std::vector<float> clean;  // the same, without the light of other surfaces
   std::vector<vec> around;   // of LANES pixels: light and clean light around them [channels, TAPS], and three colours
@@ -144,7 +144,8 @@ void clean_light(const Job &job, int y0, int x0, Window &w, const float *falloff
 //    neighbours, they count by their difference from the background.
 // 3. The share of the near surface is the projection of the pixel's colour onto the line between both colours.
 // 4. The share of the other surface is at most 1/2. Where texture makes the projection unreliable, it is the share that
-//    the other surface has under a small Gaussian, unless this contradicts the pixel's colour.
+//    the other surface has under a small Gaussian, unless this contradicts the pixel's colour. It may where the map as
+//    given has no edge; then the surfaces have their own colours.
 // 5. The residual colour goes to both surfaces in proportion to their shares, within the range of the image's light.
 template <int CHANNELS>
 void split(const Job &job, Window &w, int y, int x, ivec beside, const float *falloff, const Block &block) {
@@ -230,14 +231,19 @@ void split(const Job &job, Window &w, int y, int x, ivec beside, const float *fa
     const vec left = colour[c] - behind[c] - fitted * (front[c] - behind[c]);
     misfit += left * left;
   }
-  const vec trust = strength / (strength + TRUST * (variance + misfit) + ALIKE * ALIKE), noise = variance + ALIKE * ALIKE;
+  const vec part = load<vec>(w.moved + y * PITCH + x) / gap;  // 0 or 1: the map as given has an edge here
+  const vec unsure = clamp01(4.0f * least(part, 1.0f - part)), noise = variance + ALIKE * ALIKE;
+  const vec trust = strength / (strength + TRUST * (variance + misfit) * (1.0f + UNSURE * unsure) + ALIKE * ALIKE);
   const vec sided = size_of((here - near) - (far - here)) * (all(1.0f) / gap), edge = load<vec>(w.edge + first + tap(TAPS / 2));
   const vec clear = edge * clamp01(4.0f * sided - 2.0f), contradiction = misfit + (covered - fitted) * (covered - fitted) * strength;
-  vec geometric = least(is_near ? 1.0f - covered : covered, all(0.5f)) * clear * (1.0f - trust) * noise / (noise + contradiction);
+  vec geometric = least(is_near ? 1.0f - covered : covered, all(0.5f)) * clear * (1.0f - trust);
   geometric *= clamp01(gap * (1.0f / EDGE_PX) - 2.0f);
-  const vec other = least(is_near ? 1.0f - fitted : fitted, all(0.5f)) * (clear * trust) + geometric, own = 1.0f - other;
+  vec disagreed = geometric * unsure * contradiction / (noise + contradiction);  // with the pixel's colour
+  const vec agreed = geometric * noise / (noise + contradiction);
+  const vec other = least(is_near ? 1.0f - fitted : fitted, all(0.5f)) * (clear * trust) + agreed + disagreed, own = 1.0f - other;
 
   const vec per_own = 1.0f / own, per_other = 1.0f / most(other, all(1e-12f)), of_each = other / (other * other + own * own);
+  disagreed *= per_other;
   auto put = [&](float *plane, vec value) {
     float *const to = plane + y * BLOCK + x;
     store(to, beside ? value : load<vec>(to));
@@ -250,8 +256,9 @@ void split(const Job &job, Window &w, int y, int x, ivec beside, const float *fa
     // the two parts still sum to the pixel, and neither is brighter or darker than the image
     others = least(most(others, colour[c] - own * brightest), colour[c] - own * darkest);
     others = least(most(others, other * darkest), other * brightest);
-    put(block.own + c * BLOCK_PIXELS, (colour[c] - others) * per_own * scale);
-    put(block.other + c * BLOCK_PIXELS, other > vec{} ? others * per_other * scale : vec{});
+    const vec own_light = (colour[c] - others) * per_own, other_light = other > vec{} ? others * per_other : vec{};
+    put(block.own + c * BLOCK_PIXELS, (own_light + disagreed * (colour[c] - own_light)) * scale);
+    put(block.other + c * BLOCK_PIXELS, (other_light + disagreed * (other_mean - other_light)) * scale);
   }
   put(block.coc, is_near ? far : near);
   put(block.weight, other * valid[TAPS / 2]);
@@ -264,6 +271,7 @@ void split_block(Job &job, int by, int bx, Window &w, const float *falloff) {
   for (int c = 0; c < job.channels; c++)
     read_window(job, job.surfaces.light + c * job.surfaces.area(), y0 - RIM, x0 - RIM, EDGES, w.light.data() + (size_t)c * EDGES * PITCH);
   clean_light(job, y0, x0, w, falloff);
+  if (job.scene.moved) read_window(job, job.scene.moved, y0, x0, BLOCK, w.moved);
   for (int y = 0; y < std::min(BLOCK, job.height - y0); y++)
     for (int x = 0; x < std::min(BLOCK, job.width - x0); x += LANES) {
       const ivec beside = (load<vec>(w.edge + (y + RIM) * PITCH + x + RIM) > vec{}) & (counting() < (float)(job.width - x0 - x));
