@@ -290,3 +290,10 @@ def test_a_bad_state_is_refused_by_field_and_changes_nothing(change: Any, messag
     with pytest.raises(ValueError, match=message):
         dof.load_state_dict({"_extra_state": state})
     assert repr(dof) == before
+
+
+def test_operators_of_compiled_graphs_have_no_default_arguments() -> None:
+    """The default compiler refuses them, because the operator of the gradient has an argument after them."""
+    for name in ("surfaces", "surfaces_gradients"):
+        arguments = getattr(torch.ops.torchdof, name).default._schema.arguments
+        assert not any(argument.has_default_value() for argument in arguments)

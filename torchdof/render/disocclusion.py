@@ -88,7 +88,7 @@ def _empty(
     valid: Tensor | None,
     threshold: Tensor,
     levels: Sequence[int],
-    moved_px: Tensor | None = None,
+    moved_px: Tensor | None,
 ) -> _Maps:
     colour, single = light.new_empty(light.shape), coc_px.new_empty(coc_px.shape)
     cells = (_continued(n, 2 ** max(levels)) // BEHIND_STEP for n in light.shape[-2:])
@@ -104,7 +104,7 @@ def _operator(
     valid: Tensor | None,
     threshold: Tensor,
     levels: Sequence[int],
-    moved_px: Tensor | None = None,
+    moved_px: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     maps = (t.contiguous() for t in _surfaces_of_image(light, coc_px, valid, threshold, levels, moved_px, EAGER))
     own, own_weight, other, other_coc, other_weight, behind = maps
