@@ -29,6 +29,7 @@ _TRUST = 10.0  # weight of variance against contrast; larger: texture stops more
 _TEXTURE = 50.0  # weight of variance against contrast; larger: texture keeps more of a neighbour's mixed light
 _MOST_CLEAN = 4.0  # upper limit for a neighbour's clean light, as a multiple of the brightest neighbour
 _SOFTNESS_PX = 0.6  # standard deviation of the Gaussian by which two surfaces mix where their colours are alike
+_UNSURE_PX = 0.8  # the same where the depth map has no edge; larger: softer edges
 _ALIKE = 1.0 / 255.0  # contrast at which trust is halved, as a fraction of the brightest light around
 _UNSURE = 3.0  # added weight of variance, in units of _TRUST, where the depth map has no edge; larger: softer edges
 _UNBOUNDED = 1e6  # upper limit for either part, as a multiple of the brightest neighbour; avoids 0 * inf
@@ -136,6 +137,8 @@ def matte(
     clear = edge * (4.0 * sided - 2.0).clamp(0.0, 1.0)
     weight = torch.where(is_near, 1.0 - fitted, fitted).clamp(max=0.5) * clear * trust  # of the other surface
     small = _falloff(light, 1) ** (2.25 / _SOFTNESS_PX**2)
+    if moved_px is not None:
+        small = torch.lerp(small, _falloff(light, 1) ** (2.25 / _UNSURE_PX**2), unsure)
     small = small if counted is None else small * counted
     covered = (small * nearness).sum(0) / small.sum(0).clamp_min(1e-12)  # by the near surface, under the Gaussian
     noise, misfit = back_variance + front_variance + _ALIKE**2, misfit + (covered - fitted) ** 2 * strength

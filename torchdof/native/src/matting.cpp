@@ -22,8 +22,8 @@ constexpr int SIDE = BLOCK + 2 * MARGIN;   // of the window of coc
 constexpr int EDGES = BLOCK + 2 * RIM;     // of the windows of edges and light
 constexpr int PITCH = 24;                  // of all
 
-// Falloff of a Gaussian of 0.6 px, _SOFTNESS_PX, beside its centre.
-constexpr float SMALL_BESIDE = 0.24935221f, SMALL_DIAGONAL = 0.06217652f;
+// Falloff of Gaussians of 0.6 px, _SOFTNESS_PX, and 0.8 px, _UNSURE_PX, beside their centre.
+constexpr float SMALL_BESIDE = 0.24935221f, SMALL_DIAGONAL = 0.06217652f, WIDE_BESIDE = 0.45783336f, WIDE_DIAGONAL = 0.20961138f;
 
 struct Window {
   explicit Window(int channels) : light((size_t)channels * EDGES * PITCH + LANES), clean(light), around((size_t)channels * (2 * TAPS + 3)) {}
@@ -171,6 +171,9 @@ void split(const Job &job, Window &w, int y, int x, ivec beside, const float *fa
   for (int c = 0; c < C; c++) colour[c] = light[c * TAPS + TAPS / 2];
 
   const vec here = coc[TAPS / 2], gap = most(far - near, all(1e-6f));
+  const vec part = load<vec>(w.moved + y * PITCH + x) / gap;  // 0 or 1: the map as given has an edge here
+  const vec unsure = clamp01(4.0f * least(part, 1.0f - part));
+  const vec beside_it = SMALL_BESIDE + unsure * (WIDE_BESIDE - SMALL_BESIDE), diagonal = SMALL_DIAGONAL + unsure * (WIDE_DIAGONAL - SMALL_DIAGONAL);
   vec nearer[TAPS], farther[TAPS], whole = {};  // weights in the means of both surfaces; sum of those of the front
   vec covered = {}, counted = {};               // by the near surface, under a small Gaussian
   for (int i = 0; i < TAPS; i++) {
@@ -179,7 +182,7 @@ void split(const Job &job, Window &w, int y, int x, ivec beside, const float *fa
     nearer[i] = weight * clamp01(4.0f * nearness - 2.8f);
     farther[i] = weight * clamp01(1.2f - 4.0f * nearness);
     whole += nearer[i];
-    const vec small = (i == TAPS / 2 ? 1.0f : i % 2 ? SMALL_BESIDE : SMALL_DIAGONAL) * valid[i];
+    const vec small = (i == TAPS / 2 ? all(1.0f) : i % 2 ? beside_it : diagonal) * valid[i];
     covered += small * nearness, counted += small;
   }
   covered /= most(counted, all(1e-12f));
@@ -231,8 +234,7 @@ void split(const Job &job, Window &w, int y, int x, ivec beside, const float *fa
     const vec left = colour[c] - behind[c] - fitted * (front[c] - behind[c]);
     misfit += left * left;
   }
-  const vec part = load<vec>(w.moved + y * PITCH + x) / gap;  // 0 or 1: the map as given has an edge here
-  const vec unsure = clamp01(4.0f * least(part, 1.0f - part)), noise = variance + ALIKE * ALIKE;
+  const vec noise = variance + ALIKE * ALIKE;
   const vec trust = strength / (strength + TRUST * (variance + misfit) * (1.0f + UNSURE * unsure) + ALIKE * ALIKE);
   const vec sided = size_of((here - near) - (far - here)) * (all(1.0f) / gap), edge = load<vec>(w.edge + first + tap(TAPS / 2));
   const vec clear = edge * clamp01(4.0f * sided - 2.0f), contradiction = misfit + (covered - fitted) * (covered - fitted) * strength;
