@@ -102,7 +102,8 @@ def matte(
     gap = (far - near).clamp_min(1e-6)
 
     # their colours: means over neighbours that lie on one of them, mostly unmixed ones
-    weight = (1.0 - selected.around(edges)[0] + _UNCLEAN) * _falloff(light, 1)
+    falloff = _falloff(light, 1)
+    weight = (1.0 - selected.around(edges)[0] + _UNCLEAN) * falloff
     if counted is not None:
         weight = weight * counted
     nearness = (far - window_coc) / gap
@@ -136,9 +137,9 @@ def matte(
     sided = ((own_coc - near) - (far - own_coc)).abs() / gap
     clear = edge * (4.0 * sided - 2.0).clamp(0.0, 1.0)
     weight = torch.where(is_near, 1.0 - fitted, fitted).clamp(max=0.5) * clear * trust  # of the other surface
-    small = _falloff(light, 1) ** (2.25 / _SOFTNESS_PX**2)
+    small = falloff ** (2.25 / _SOFTNESS_PX**2)
     if moved_px is not None:
-        small = torch.lerp(small, _falloff(light, 1) ** (2.25 / _UNSURE_PX**2), unsure)
+        small = torch.lerp(small, falloff ** (2.25 / _UNSURE_PX**2), unsure)
     small = small if counted is None else small * counted
     covered = (small * nearness).sum(0) / small.sum(0).clamp_min(1e-12)  # by the near surface, under the Gaussian
     noise, misfit = back_variance + front_variance + _ALIKE**2, misfit + (covered - fitted) ** 2 * strength
