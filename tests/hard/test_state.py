@@ -121,7 +121,7 @@ def state() -> dict[str, Any]:
 def entries(stop: int, error: BaseException | None) -> Iterator[list[str]]:
     """Lists the functions of the package that are entered, and raises ``error`` in the one with number ``stop``.
 
-    Generators are not listed: ``finally`` blocks resume them, and after Ctrl-C in such a block its work is incomplete.
+    Generators are not listed: ``finally`` blocks resume them, and Ctrl-C in this block leaves its work incomplete.
     """
     names: list[str] = []
 

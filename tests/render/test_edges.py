@@ -273,7 +273,7 @@ def test_the_renderer_repairs_by_its_option_depth_edges(scene: Scene) -> None:
     assert torch.equal(DepthOfField(scene.camera).coc_px(scene.image, depth), repaired)
     expected = DepthOfField(scene.camera)(scene.image, depth)
     assert torch.equal(blur_by_coc(scene.image, coc), expected)
-    # the same picture as with the repaired map, but for the softness of edges that the map as given does not have
+    # with the repaired map the picture differs only at edges that the repair made of ramps: there `expected` is soft
     crisp = blur_by_coc(scene.image, repaired, depth_edges="as given")
     assert metrics.psnr(crisp, expected) > metrics.psnr(as_given(scene.image, depth), expected) + 5
 

@@ -75,21 +75,14 @@ def surfaces_of_image(
         :data:`BEHIND_STEP`-th pixel, ``[B, C, h, w]``, for an area slightly larger than the image.
     """
     if is_compiled():
-        maps = _operator(light, coc_px, valid, threshold, list(levels), moved_px)
+        maps = _operator(light, coc_px, list(levels), threshold, valid, moved_px)
     else:
-        maps = _surfaces_of_image(light, coc_px, valid, threshold, levels, moved_px, ops)
+        maps = _surfaces_of_image(light, coc_px, levels, threshold, valid, moved_px, ops)
     own_light, own_weight, other_light, other_coc, other_weight, behind = maps
     return [Surface(own_light, coc_px, own_weight), Surface(other_light, other_coc, other_weight)], behind
 
 
-def _empty(
-    light: Tensor,
-    coc_px: Tensor,
-    valid: Tensor | None,
-    threshold: Tensor,
-    levels: Sequence[int],
-    moved_px: Tensor | None,
-) -> _Maps:
+def _empty(light: Tensor, coc_px: Tensor, levels: Sequence[int], *others: Tensor | None) -> _Maps:
     colour, single = light.new_empty(light.shape), coc_px.new_empty(coc_px.shape)
     cells = (_continued(n, 2 ** max(levels)) // BEHIND_STEP for n in light.shape[-2:])
     behind = light.new_empty(*light.shape[:2], *cells)
@@ -101,13 +94,13 @@ def _empty(
 def _operator(
     light: Tensor,
     coc_px: Tensor,
-    valid: Tensor | None,
-    threshold: Tensor,
     levels: Sequence[int],
+    threshold: Tensor,
+    valid: Tensor | None,
     moved_px: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    maps = (t.contiguous() for t in _surfaces_of_image(light, coc_px, valid, threshold, levels, moved_px, EAGER))
-    own, own_weight, other, other_coc, other_weight, behind = maps
+    maps = _surfaces_of_image(light, coc_px, levels, threshold, valid, moved_px, EAGER)
+    own, own_weight, other, other_coc, other_weight, behind = (t.contiguous() for t in maps)
     return own, own_weight, other, other_coc, other_weight, behind
 
 
@@ -177,9 +170,9 @@ def _largest(values: Tensor, height: int, width: int, step: int) -> Tensor:
 def _surfaces_of_image(
     light: Tensor,
     coc_px: Tensor,
-    valid: Tensor | None,
-    threshold: Tensor,
     levels: Sequence[int],
+    threshold: Tensor,
+    valid: Tensor | None,
     moved_px: Tensor | None,
     ops: Ops,
 ) -> _Maps:

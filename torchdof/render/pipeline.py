@@ -56,20 +56,21 @@ def blur(
     """
     given, coc_px = coc_px, edges.mended(image, coc_px, options.depth_edges, ops)
     moved = None if coc_px is given else edges.distance(given, coc_px)
+    whole = functools.partial(_planned, image, coc_px, behind=behind, moved_px=moved, ops=ops)
     if attention is None:
-        return _planned(image, coc_px, plan, options, behind, moved, ops)
+        return whole(plan, options)
     weight = weight_map(attention, image)
     if options.table.depends_on_place:  # kernels depend on the distance from the frame's middle, so no part is cut out
-        return _planned(image, coc_px, plan, options, behind, moved, ops)
+        return whole(plan, options)
     loose = dataclasses.replace(options, tolerance=max(options.tolerance, NAMED_TOLERANCES["draft"]))
     known = torch.nan_to_num(coc_px.detach(), nan=0.0, posinf=0.0, neginf=0.0)
     box = box_around(weight, _REACH * float(known.abs().amax()))
     if box is None or loose.tolerance == options.tolerance:
-        return _planned(image, coc_px, None, loose, behind, moved, ops)
+        return whole(None, loose)
     part = (..., *box)
     if image[part].shape == image.shape and bool((weight == 1).all()):
-        return _planned(image, coc_px, None, options, behind, moved, ops)
-    around = _planned(image, coc_px, None, loose, behind, moved, ops)
+        return whole(None, options)
+    around = whole(None, loose)
     behind_part = None if behind is None else (behind[0][part], behind[1][part])
     moved_part = None if moved is None else moved[part]
     looked_at = _planned(image[part], coc_px[part], None, options, behind_part, moved_part, ops)
@@ -145,30 +146,24 @@ def _each_planned(
     ``render(plans, **maps)`` renders some items, with one plan or one for each. ``scenes`` are the coc of all maps of
     each item, ``[N, 1, H, W]``; ``maps`` are those of all items, ``[B, ...]``.
     """
-
-    def rendered(plans: Sequence[Plan], items: Sequence[int]) -> Tensor:
-        if len(items) == len(scenes):
-            return render(plans, **maps)
-        parts = {name: [t[i : i + 1] for i in items] for name, t in maps.items()}
-        return render(plans, **{name: t[0] if len(t) == 1 else torch.cat(t) for name, t in parts.items()})
-
     uniform = options.method == "layered" and not options.table.depends_on_place
     in_memory = native.chosen() and all(is_in_memory(t, backward=True) for t in maps.values())
     if len(scenes) == 1 or not uniform or in_memory:
         # the compiled engine renders item by item
         plans = [Plan.for_scene(scene, options.tolerance) for scene in scenes]
-        items = [rendered([plan], [i]) for i, plan in enumerate(plans)]
+        items = [render([plan], **{name: t[i : i + 1] for name, t in maps.items()}) for i, plan in enumerate(plans)]
         return items[0] if len(items) == 1 else torch.cat(items)
     plans = Plan.for_scenes(scenes, options.tolerance)
     most = max(1, _TOGETHER // math.prod(scenes[0].shape[-2:]))
     joined = [i for i, plan in enumerate(plans) if len(plan.nodes) > 1]  # a plane has one layer, whose kernel is exact
     groups = [joined[i : i + most] for i in range(0, len(joined), most)]
     groups += [[i] for i in range(len(plans)) if i not in joined]
+    if len(groups) == 1:
+        return render(plans, **maps)
     by_index: dict[int, Tensor] = {}
     for group in groups:
-        if len(group) == len(plans):
-            return rendered(plans, group)
-        by_index |= zip(group, rendered([plans[i] for i in group], group).split(1), strict=True)
+        of_group = {name: torch.cat([t[i : i + 1] for i in group]) for name, t in maps.items()}
+        by_index |= zip(group, render([plans[i] for i in group], **of_group).split(1), strict=True)
     return torch.cat([by_index[i] for i in range(len(plans))])
 
 

@@ -20,8 +20,7 @@ constexpr int DIRECTIONS = 5, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, KINDS = D
 constexpr int SAMPLED = 12000, SAMPLE_BLOCK = 8, ROUNDS = 10;
 constexpr float TRUSTED = 0.05f, PRIOR_COUNT = 30.0f;
 constexpr float RELATED = 0.8f, EXACT = 0.025f, DOUBTFUL = 0.05f, LEAN = 2.0f;  // decision, in automatic mode
-constexpr float BESIDE = 0.93f, DIAGONAL = 0.57f;                           // decision, in soft maps
-constexpr float SOFT = 0.1f, WIDE = 1.5f, MIXED = 0.5f;  // soft maps
+constexpr float SOFT = 0.1f, WIDE = 1.5f, MIXED = 0.5f, BESIDE = 0.93f, DIAGONAL = 0.57f;  // soft maps
 constexpr float CLIMBED = 0.35f, PIXEL = 0.2f, BETTER = 0.5f, OVERSHOOT = 0.12f;  // lamps, ringing
 constexpr int BLUR_REACH = 9, RINGING_REACH = 3;
 // Half widths in pixels of further windows: the usual light around a lamp, and a lamp.

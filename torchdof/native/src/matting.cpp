@@ -173,7 +173,7 @@ void split(const Job &job, Window &w, int y, int x, ivec beside, const float *fa
   const vec here = coc[TAPS / 2], gap = most(far - near, all(1e-6f));
   const vec part = load<vec>(w.moved + y * PITCH + x) / gap;  // 0 or 1: the map as given has an edge here
   const vec unsure = clamp01(4.0f * least(part, 1.0f - part));
-  const vec beside_it = SMALL_BESIDE + unsure * (WIDE_BESIDE - SMALL_BESIDE), diagonal = SMALL_DIAGONAL + unsure * (WIDE_DIAGONAL - SMALL_DIAGONAL);
+  const vec at_side = SMALL_BESIDE + unsure * (WIDE_BESIDE - SMALL_BESIDE), at_corner = SMALL_DIAGONAL + unsure * (WIDE_DIAGONAL - SMALL_DIAGONAL);
   vec nearer[TAPS], farther[TAPS], whole = {};  // weights in the means of both surfaces; sum of those of the front
   vec covered = {}, counted = {};               // by the near surface, under a small Gaussian
   for (int i = 0; i < TAPS; i++) {
@@ -182,7 +182,7 @@ void split(const Job &job, Window &w, int y, int x, ivec beside, const float *fa
     nearer[i] = weight * clamp01(4.0f * nearness - 2.8f);
     farther[i] = weight * clamp01(1.2f - 4.0f * nearness);
     whole += nearer[i];
-    const vec small = (i == TAPS / 2 ? all(1.0f) : i % 2 ? beside_it : diagonal) * valid[i];
+    const vec small = (i == TAPS / 2 ? all(1.0f) : i % 2 ? at_side : at_corner) * valid[i];
     covered += small * nearness, counted += small;
   }
   covered /= most(counted, all(1e-12f));
