@@ -391,6 +391,30 @@ void check_look_behind(unsigned seed) {
   check_threads(look, "surfaces behind", int(seed));
 }
 
+// Splits the mixed pixels of an image with some steps in its coc, and computes the gradient.
+void check_matte(unsigned seed) {
+  std::mt19937 random(seed);
+  const auto integer = [&](int low, int high) { return std::uniform_int_distribution<int>(low, high)(random); };
+  const int channels = integer(1, 5), height = integer(1, 60), width = integer(1, 80);
+  const size_t pixels = size_t(height) * width, planes = 2 * channels + 2;
+  std::vector<float> light = noise(random, pixels * channels, -0.1, 1.0), coc = noise(random, pixels, -0.1, 0.1);
+  for (int y = 0, column = integer(0, width); y < height; y++)
+    for (int x = column; x < width; x++) coc[size_t(y) * width + x] += 3.0f;
+  const std::vector<float> moved = noise(random, pixels, 0.0, 3.0), valid(pixels, 1.0f), slopes = noise(random, planes * pixels, -1.0, 1.0);
+  const float *maps[] = {light.data(), coc.data(), integer(0, 1) ? valid.data() : nullptr, integer(0, 1) ? moved.data() : nullptr};
+  const auto split = [&](int threads) {
+    std::vector<float> all(slopes.size()), of_light(light.size()), of_coc(pixels);
+    float *const of_maps[] = {of_light.data(), of_coc.data()};
+    if (torchdof_matte(maps, channels, height, width, threads, all.data(), nullptr, nullptr) != TORCHDOF_OK ||
+        torchdof_matte(maps, channels, height, width, threads, nullptr, slopes.data(), of_maps) != TORCHDOF_OK)
+      fail("its mixed pixels cannot be split", int(seed));
+    append(all, of_light);
+    append(all, of_coc);
+    return all;
+  };
+  check_threads(split, "mixed pixels", int(seed));
+}
+
 }  // namespace
 
 int main(int count, char **arguments) {
@@ -400,6 +424,7 @@ int main(int count, char **arguments) {
     check_edges(unsigned(seed));
     check_blend(unsigned(seed));
     check_look_behind(unsigned(seed));
+    check_matte(unsigned(seed));
   }
   std::printf("%s: %d scenes\n", arguments[0], scenes);
 }

@@ -12,6 +12,7 @@ from torch.autograd import forward_ad
 
 from torchdof import BlurTable, blur_by_coc, native
 from torchdof.render import disocclusion
+from torchdof.render.matting import matte
 from torchdof.render.ops import Level
 from torchdof.render.plan import Plan
 from torchdof.tensors import TRACEABLE
@@ -64,7 +65,7 @@ def rendered(way: dict[str, Any], dtype: torch.dtype = torch.float32) -> tuple[T
     return out.detach(), of_light, of_coc
 
 
-STEPS = ("blend", "farthest", "look_behind")
+STEPS = ("blend", "farthest", "look_behind", "matte")
 
 
 @pytest.fixture
@@ -221,3 +222,23 @@ def test_the_finest_level_and_its_gradients_equal_the_plain_engines(
         return [out.detach(), *torch.autograd.grad((out * seen).sum(), leaves)]
 
     assert_both_engines_agree(computed, calls["farthest"], [1e-4] * 6, monkeypatch)
+
+
+@pytest.mark.parametrize("moved", [False, True])
+@pytest.mark.parametrize("hole", [False, True])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_mixed_pixels_and_their_gradients_equal_the_plain_engines(
+    channels: int, hole: bool, moved: bool, calls: dict[str, list[Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Some parts reach the image's darkest or brightest light, which limits them."""
+    light, coc, valid = edges(channels, hole)
+    moved_px = 3.0 * torch.rand(coc.shape, generator=torch.Generator().manual_seed(9)) if moved else None
+
+    def computed() -> list[Tensor]:
+        leaves = [light.clone().requires_grad_(), coc.clone().requires_grad_()]
+        own, other, other_coc, weight = matte(*leaves, valid, moved_px)
+        out = torch.cat([own, other * weight, other_coc, weight], 1)  # light of hardly any weight is undefined
+        seen = torch.rand(out.shape, generator=torch.Generator().manual_seed(1)) - 0.3
+        return [out.detach(), *torch.autograd.grad((out * seen).sum(), leaves)]
+
+    assert_both_engines_agree(computed, calls["matte"], [1e-4] * 3, monkeypatch)

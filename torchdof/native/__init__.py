@@ -38,7 +38,7 @@ _instructions = "avx2" if torch.backends.cpu.get_cpu_capability().startswith("AV
 
 _SMALL_FRAME = 2**16  # pixels; up to this size the main thread renders itself, which saves 0.1 ms
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
-_REVISION = 12  # of ``src/api.h``
+_REVISION = 13  # of ``src/api.h``
 
 Rules = Sequence[tuple[int, float, float, float]]
 
@@ -94,6 +94,7 @@ _FUNCTIONS = {
     "free": "nothing data",
     "repair_edges": "int map* int*",
     "blend": "int layers* data data data* data* data*",
+    "matte": "int data* int int int int data data data*",
     "farthest": "int data* int int int int int int data data data*",
     "look_behind": "int level* int int data int int int data data data* data",
     "coc": "int data long real real real int data",
@@ -265,6 +266,26 @@ def _of_layers(nodes: Sequence[float], layers: Sequence[tuple[Tensor, int]]) -> 
 def _field_masks(masks: Sequence[KernelMask]) -> list[Any] | None:
     mask_of = _TYPES["field_mask"]
     return [mask_of(values, boxes, coc, len(values), *values.shape[2:]) for values, boxes, coc, _ in masks] or None
+
+
+def matte(light: Tensor, coc: Tensor, valid: Tensor | None = None, moved_px: Tensor | None = None) -> Tensor:
+    """Splits the mixed pixels of one image, as :func:`torchdof.render.matting.matte`.
+
+    The result ``[2 C + 2, H, W]`` is own light, and light, coc and weight of the other surface.
+    """
+    channels, *size = light.shape
+    out = _empty(2 * channels + 2, *size)
+    _run("matte", [light, coc, valid, moved_px], channels, *size, torch.get_num_threads(), out, None, None)
+    return out
+
+
+def matte_gradient(
+    gradient: Tensor, light: Tensor, coc: Tensor, valid: Tensor | None = None, moved_px: Tensor | None = None
+) -> list[Tensor]:
+    """The gradients of :func:`matte` by light and coc."""
+    sums = [_empty(*values.shape).zero_() for values in (light, coc)]
+    _run("matte", [light, coc, valid, moved_px], *light.shape, torch.get_num_threads(), None, gradient, sums)
+    return sums
 
 
 def farthest(maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:

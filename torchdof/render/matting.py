@@ -12,8 +12,9 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .. import pixels
+from .. import native, pixels
 from ..tensors import is_traced
+from .compiled_steps import compiled_step
 from .ops import EAGER, Ops
 
 __all__ = ["NEVER_PX", "Matted", "attribute_emitters", "matte"]
@@ -79,6 +80,28 @@ def matte(
     Returns:
         The surfaces; the weight of the other one is in [0, 1/2].
     """
+
+    def constant(*maps: Tensor) -> list[Tensor | None]:
+        rest = iter(maps)
+        return [None if t is None else next(rest) for t in (valid, moved_px)]
+
+    found = compiled_step(
+        lambda light, coc, *maps: native.matte(light, coc, *constant(*maps)),
+        lambda gradient, light, coc, *maps: native.matte_gradient(gradient, light, coc, *constant(*maps)),
+        lambda light, coc, *maps: torch.cat(_split(light, coc, *constant(*maps)), 1),
+        light,
+        coc_px,
+        *(t for t in (valid, moved_px) if t is not None),
+    )
+    if found is None:
+        return _split(light, coc_px, valid, moved_px, ops)
+    return Matted(*found.split([light.shape[1], light.shape[1], 1, 1], 1))
+
+
+def _split(
+    light: Tensor, coc_px: Tensor, valid: Tensor | None = None, moved_px: Tensor | None = None, ops: Ops = EAGER
+) -> Matted:
+    """:func:`matte` by PyTorch."""
     # pixels beside another surface
     known = None if valid is None else valid > 0
     high, low = (c if known is None else torch.where(known, c, -NEVER_PX) for c in (coc_px.detach(), -coc_px.detach()))

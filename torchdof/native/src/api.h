@@ -168,6 +168,12 @@ typedef struct {
 } torchdof_level;
 #define TORCHDOF_MOST_LEVELS 4
 
+// Splits the mixed pixels of an image; see render/matting.py. maps: light [channels, height, width], coc [height, width]; 0 for
+// pixels that are left out, and how far the repair of edges moved the coc, in pixels, both [height, width] or null. out: own
+// and other light, coc and weight of the other surface, [2 channels + 2, height, width]. The first two maps have gradients.
+TORCHDOF_API int32_t torchdof_matte(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t threads,
+                                    float *out, const float *gradient, float *const *of_maps);
+
 // The finest level of that pyramid, [channels + 2, rows, columns], from the surfaces of an image. maps: light [channels, height,
 // width], coc [height, width]; the same of each pixel's other surface, and its weight; light above which a pixel is a
 // highlight; and 0 for pixels that are left out, or null. The first five maps have gradients.
@@ -184,5 +190,5 @@ TORCHDOF_API int32_t torchdof_ends(const float *values, int64_t count, int32_t t
 
 // Version of this interface, for the caller to check first: sizes of its structures and, in the upper half,
 // TORCHDOF_REVISION, which increases with every other change of this file.
-#define TORCHDOF_REVISION 12
+#define TORCHDOF_REVISION 13
 TORCHDOF_API int64_t torchdof_interface(void);

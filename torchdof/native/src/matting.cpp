@@ -25,45 +25,67 @@ constexpr int PITCH = 24;                  // of all
 // Falloff of Gaussians of 0.6 px, _SOFTNESS_PX, and 0.8 px, _UNSURE_PX, beside their centre.
 constexpr float SMALL_BESIDE = 0.24935221f, SMALL_DIAGONAL = 0.06217652f, WIDE_BESIDE = 0.45783336f, WIDE_DIAGONAL = 0.20961138f;
 
+// An image whose mixed pixels are split.
+struct Frame {
+  int height, width, channels;
+  const float *light, *coc, *valid, *moved;  // valid, moved: or null
+  const float *darkest, *brightest;          // range of the light of each channel
+
+  size_t area() const { return (size_t)height * width; }
+};
+
 struct Window {
-  explicit Window(int channels) : light((size_t)channels * EDGES * PITCH + LANES), clean(light), around((size_t)channels * (2 * TAPS + 3)) {}
+  explicit Window(int channels) : light((size_t)channels * EDGES * PITCH + LANES), clean(light), around((size_t)channels * (4 * TAPS + 9)) {}
 
   float coc[SIDE * PITCH + LANES] = {}, valid[SIDE * PITCH + LANES] = {}, moved[BLOCK * PITCH + LANES] = {}, edge[EDGES * PITCH + LANES] = {};
   std::vector<float> light;  // [channels, EDGES, PITCH]
   std::vector<float> clean;  // the same, without the light of other surfaces
-  std::vector<vec> around;   // of LANES pixels: light and clean light around them [channels, TAPS], and three colours
+  std::vector<vec> around;   // memory of Split
+};
+
+// Gradients by the values of a window, by the range of the image's light, and by the surfaces of the window's block.
+struct Slopes {
+  explicit Slopes(int channels) : light((size_t)channels * EDGES * PITCH + LANES), clean(light), darkest(channels), brightest(channels), surfaces((size_t)(2 * channels + 2) * BLOCK * PITCH + LANES) {}
+
+  float coc[SIDE * PITCH + LANES] = {}, edge[EDGES * PITCH + LANES] = {};
+  std::vector<float> light, clean;
+  std::vector<float> darkest, brightest;  // [channels]
+  std::vector<float> surfaces;            // of own and other light, coc and weight, [2 channels + 2, BLOCK, PITCH]
 };
 
 // Copies `size` rows and columns of a plane from y0, x0; a pixel outside the frame is the nearest one inside.
-void read_window(const Job &job, const float *plane, int y0, int x0, int size, float *to) {
-  const bool inside = x0 >= 0 && x0 + size <= job.width;
+void read_window(const Frame &frame, const float *plane, int y0, int x0, int size, float *to) {
+  const bool inside = x0 >= 0 && x0 + size <= frame.width;
   for (int i = 0; i < size; i++, to += PITCH) {
-    const float *from = plane + (size_t)std::clamp(y0 + i, 0, job.height - 1) * job.width;
+    const float *from = plane + (size_t)std::clamp(y0 + i, 0, frame.height - 1) * frame.width;
     if (inside)
       memcpy(to, from + x0, size * sizeof(float));
     else
-      for (int j = 0; j < size; j++) to[j] = from[std::clamp(x0 + j, 0, job.width - 1)];
+      for (int j = 0; j < size; j++) to[j] = from[std::clamp(x0 + j, 0, frame.width - 1)];
   }
 }
 
-// Gives pixels outside the frame the value of the nearest one inside, in a window of EDGES x EDGES pixels around a block.
-void clamp_to_frame(const Job &job, int y0, int x0, float *window) {
-  if (y0 >= RIM && x0 >= RIM && y0 + BLOCK + RIM <= job.height && x0 + BLOCK + RIM <= job.width) return;
+// For each pixel outside the frame in a window of EDGES x EDGES pixels around a block: body(its place, that of the nearest
+// pixel inside).
+template <typename Body>
+void each_outside(const Frame &frame, int y0, int x0, const Body &body) {
+  if (y0 >= RIM && x0 >= RIM && y0 + BLOCK + RIM <= frame.height && x0 + BLOCK + RIM <= frame.width) return;
   for (int i = 0; i < EDGES; i++)
     for (int j = 0; j < EDGES; j++) {
-      const int y = std::clamp(y0 - RIM + i, 0, job.height - 1), x = std::clamp(x0 - RIM + j, 0, job.width - 1);
-      window[i * PITCH + j] = window[(y - y0 + RIM) * PITCH + x - x0 + RIM];
+      const int y = std::clamp(y0 - RIM + i, 0, frame.height - 1), x = std::clamp(x0 - RIM + j, 0, frame.width - 1);
+      const int from = i * PITCH + j, to = (y - y0 + RIM) * PITCH + x - x0 + RIM;
+      if (from != to) body(from, to);
     }
 }
 
 // Computes for each pixel in and around a block the confidence, 0 to 1, that it lies at an edge. False if it is 0 in the
 // whole block.
-bool find_edges(const Job &job, int y0, int x0, Window &w) {
-  const float *valid = job.surfaces.valid;
+bool find_edges(const Frame &frame, int y0, int x0, Window &w) {
+  const float *valid = frame.valid;
   float lows[SIDE * PITCH], highs[SIDE * PITCH];  // of valid pixels
   const float *low = valid ? lows : w.coc, *high = valid ? highs : w.coc;
-  read_window(job, job.surfaces.coc, y0 - MARGIN, x0 - MARGIN, SIDE, w.coc);
-  if (valid) read_window(job, valid, y0 - MARGIN, x0 - MARGIN, SIDE, w.valid);
+  read_window(frame, frame.coc, y0 - MARGIN, x0 - MARGIN, SIDE, w.coc);
+  if (valid) read_window(frame, valid, y0 - MARGIN, x0 - MARGIN, SIDE, w.valid);
   for (int i = 0; valid && i < SIDE * PITCH; i++) {
     lows[i] = w.valid[i] > 0 ? w.coc[i] : NEVER;
     highs[i] = w.valid[i] > 0 ? w.coc[i] : -NEVER;
@@ -83,60 +105,111 @@ bool find_edges(const Job &job, int y0, int x0, Window &w) {
       store(w.edge + i * PITCH + j, valid ? edge * load<vec>(w.valid + (i + 1) * PITCH + j + 1) : edge);
     }
   }
-  clamp_to_frame(job, y0, x0, w.edge);
+  each_outside(frame, y0, x0, [&](int from, int to) { w.edge[from] = w.edge[to]; });
   vec most_edge = {};
   for (int i = RIM; i < RIM + BLOCK; i++)
     for (int j = RIM; j < RIM + BLOCK; j += LANES) most_edge = most(most_edge, load<vec>(w.edge + i * PITCH + j));
   return any_positive(most_edge);
 }
 
-// Weighted mean of the light around pixels [channels, TAPS]. Returns its variance, summed over channels.
-template <int CHANNELS>
-vec mean(const vec *light, int channels, const vec *weight, vec *mean) {
-  const int C = CHANNELS ? CHANNELS : channels;
-  vec total = {}, variance = {};
-  for (int i = 0; i < TAPS; i++) total += weight[i];
-  total = most(total, all(1e-12f));  // divided by, not multiplied with its inverse: equal values are exactly their mean
-  for (int c = 0; c < C; c++, light += TAPS) {
-    vec one = {}, two = {};
-    for (int i = 0; i < TAPS; i++) one += light[i] * weight[i];
-    mean[c] = one / total;
-    for (int i = 0; i < TAPS; i++) two += (light[i] - mean[c]) * (light[i] - mean[c]) * weight[i];
-    variance += two / total;
-  }
-  return variance;
-}
-
 inline int tap(int i) { return i / AROUND * PITCH + i % AROUND; }
+inline vec only(ivec where, vec value) { return where ? value : vec{}; }
+inline void add(float *to, vec value) { store(to, load<vec>(to) + value); }
+// Where a value is not limited by clamp01, so that it has a gradient.
+inline ivec is_within(vec value) { return (value >= vec{}) & (value <= all(1.0f)); }
 
-// Replaces the light of mixed pixels by the mean of the unmixed pixels of the same surface around them.
-void clean_light(const Job &job, int y0, int x0, Window &w, const float *falloff) {
-  w.clean = w.light;
+// The nearest and farthest coc of the 3 x 3 pixels from a place of a window on.
+struct Ends {
+  vec near = all(NEVER), far = all(-NEVER);
+
+  Ends(const Window &w, int at, bool masked) {
+    for (int i = 0; i < TAPS; i++) {
+      const vec coc = load<vec>(w.coc + at + tap(i));
+      const ivec valid = masked ? load<vec>(w.valid + at + tap(i)) > vec{} : vec{} == vec{};
+      near = least(near, valid ? coc : all(NEVER));
+      far = most(far, valid ? coc : all(-NEVER));
+    }
+  }
+
+  // Shares the gradients by both among the pixels that have these coc.
+  void back(const Window &w, int at, bool masked, vec of_near, vec of_far, float *of_coc) const {
+    vec nearest = {}, farthest = {};
+    for (int pass = 0; pass < 2; pass++)
+      for (int i = 0; i < TAPS; i++) {
+        const vec coc = load<vec>(w.coc + at + tap(i));
+        const vec counts = masked ? only(load<vec>(w.valid + at + tap(i)) > vec{}, all(1.0f)) : all(1.0f);
+        const vec is_near = only(coc == near, counts), is_far = only(coc == far, counts);
+        if (pass)
+          add(of_coc + at + tap(i), of_near * is_near / most(nearest, all(1.0f)) + of_far * is_far / most(farthest, all(1.0f)));
+        else
+          nearest += is_near, farthest += is_far;
+      }
+  }
+};
+
+// Replaces the light of mixed pixels by the mean of the unmixed pixels of the same surface around them. With `slopes`:
+// adds the gradients by clean light to those by light, edges and coc instead.
+void clean_light(const Frame &frame, int y0, int x0, Window &w, const float *falloff, Slopes *slopes = nullptr) {
+  const int plane = EDGES * PITCH;
+  if (slopes)
+    for (int c = 0; c < frame.channels; c++)
+      each_outside(frame, y0, x0, [&](int from, int to) {
+        slopes->clean[c * plane + to] += slopes->clean[c * plane + from];
+        slopes->clean[c * plane + from] = 0;
+      });
+  else
+    w.clean = w.light;
   for (int i = 1; i < EDGES - 1; i++)
     for (int j = 1; j < EDGES - 1; j += LANES) {
-      const size_t at = i * PITCH + j, in_coc = at + PITCH + 1;
+      const int at = i * PITCH + j, first = at - PITCH - 1, in_coc = at + PITCH + 1;
       const vec edge = load<vec>(w.edge + at), coc = load<vec>(w.coc + in_coc);
-      if (!any_of(edge > vec{})) continue;
-      vec weight[TAPS], total = {};
+      if (!any_of(edge > vec{})) {
+        for (int c = 0; slopes && c < frame.channels; c++) add(&slopes->light[c * plane + at], load<vec>(&slopes->clean[c * plane + at]));
+        continue;
+      }
+      vec near_by[TAPS], unmixed[TAPS], alike[TAPS], apart[TAPS], weight[TAPS], total = {};
       for (int k = 0; k < TAPS; k++) {
-        const int to = tap(k) - PITCH - 1;
-        const vec apart = (load<vec>(w.coc + in_coc + to) - coc) * (1.0f / EDGE_PX);
-        weight[k] = (all(1.0f + UNCLEAN) - load<vec>(w.edge + at + to)) * falloff[k] * clamp01(2.0f - 2.0f * most(apart, -apart));
-        if (job.surfaces.valid) weight[k] *= load<vec>(w.valid + in_coc + to);
+        apart[k] = (load<vec>(w.coc + first + PITCH + 1 + tap(k)) - coc) * (1.0f / EDGE_PX);
+        near_by[k] = frame.valid ? falloff[k] * load<vec>(w.valid + first + PITCH + 1 + tap(k)) : all(falloff[k]);
+        unmixed[k] = (all(1.0f + UNCLEAN) - load<vec>(w.edge + first + tap(k))) * near_by[k];
+        alike[k] = 2.0f - 2.0f * size_of(apart[k]);
+        weight[k] = unmixed[k] * clamp01(alike[k]);
         total += weight[k];
       }
-      const vec is_clean = edge * clamp01(total - 10.0f * UNCLEAN), per_total = 1.0f / most(total, all(1e-12f));
-      for (int c = 0; c < job.channels; c++) {
-        const float *const light = w.light.data() + (size_t)c * EDGES * PITCH + at;
+      const vec enough = total - 10.0f * UNCLEAN, is_clean = edge * clamp01(enough), per_total = 1.0f / most(total, all(1e-12f));
+      vec of_is_clean = {}, of_weight[TAPS] = {}, of_middle = {};
+      for (int c = 0; c < frame.channels; c++) {
+        const float *const light = &w.light[c * plane];
         vec sum = {};
-        for (int k = 0; k < TAPS; k++) sum += weight[k] * load<vec>(light + tap(k) - PITCH - 1);
-        store(w.clean.data() + (light - w.light.data()), load<vec>(light) + is_clean * (sum * per_total - load<vec>(light)));
+        for (int k = 0; k < TAPS; k++) sum += weight[k] * load<vec>(light + first + tap(k));
+        const vec mean = sum * per_total, here = load<vec>(light + at);
+        if (!slopes) {
+          store(&w.clean[c * plane + at], here + is_clean * (mean - here));
+          continue;
+        }
+        const vec slope = load<vec>(&slopes->clean[c * plane + at]), of_mean = slope * is_clean * per_total;
+        of_is_clean += slope * (mean - here);
+        add(&slopes->light[c * plane + at], slope - slope * is_clean);
+        for (int k = 0; k < TAPS; k++) {
+          of_weight[k] += of_mean * (load<vec>(light + first + tap(k)) - mean);
+          add(&slopes->light[c * plane + first + tap(k)], of_mean * weight[k]);
+        }
       }
+      if (!slopes) continue;
+      add(slopes->edge + at, of_is_clean * clamp01(enough));
+      for (int k = 0; k < TAPS; k++) {
+        const vec slope = of_weight[k] + only(is_within(enough), of_is_clean * edge);
+        add(slopes->edge + first + tap(k), -slope * clamp01(alike[k]) * near_by[k]);
+        const vec of_apart = only(is_within(alike[k]), slope * unmixed[k] * (-2.0f / EDGE_PX)) * (only(apart[k] > vec{}, all(1.0f)) - only(apart[k] < vec{}, all(1.0f)));
+        add(slopes->coc + first + PITCH + 1 + tap(k), of_apart);
+        of_middle -= of_apart;
+      }
+      add(slopes->coc + in_coc, of_middle);
     }
-  for (int c = 0; c < job.channels; c++) clamp_to_frame(job, y0, x0, w.clean.data() + (size_t)c * EDGES * PITCH);
+  for (int c = 0; !slopes && c < frame.channels; c++) each_outside(frame, y0, x0, [&](int from, int to) { w.clean[c * plane + from] = w.clean[c * plane + to]; });
 }
 
-// Splits the pixels of `beside`, out of LANES pixels of a row.
+// Splits LANES pixels of a row.
 //
 // 1. The near and far coc are the extremes of the 3 x 3 neighbours.
 // 2. The colour of each surface is the mean of its neighbours. Their light moves towards their clean light, along the line
@@ -148,138 +221,464 @@ void clean_light(const Job &job, int y0, int x0, Window &w, const float *falloff
 //    given has no edge; then the surfaces have their own colours.
 // 5. The residual colour goes to both surfaces in proportion to their shares, within the range of the image's light.
 template <int CHANNELS>
-void split(const Job &job, Window &w, int y, int x, ivec beside, const float *falloff, const Block &block) {
-  const int C = CHANNELS ? CHANNELS : job.channels;
-  const bool masked = job.surfaces.valid;
-  const size_t first = (size_t)(y + 1) * PITCH + x + 1, in_coc = first + PITCH + 1;
-  vec coc[TAPS], valid[TAPS], near = all(NEVER), far = all(-NEVER);
-  for (int i = 0; i < TAPS; i++) {
-    coc[i] = load<vec>(w.coc + in_coc + tap(i));
-    valid[i] = masked ? load<vec>(w.valid + in_coc + tap(i)) : all(1.0f);
-    near = least(near, valid[i] > vec{} ? coc[i] : all(NEVER));
-    far = most(far, valid[i] > vec{} ? coc[i] : all(-NEVER));
+class Split {
+ public:
+  Split(const Frame &frame, Window &w, int y, int x, const float *falloff)
+      : frame_(frame), w_(w), falloff_(falloff), y_(y), x_(x), first_((y + 1) * PITCH + x + 1), masked_(frame.valid), ends_(w, first_ + PITCH + 1, masked_) {
+    vec *memory = w.around.data();
+    for (vec **colours : {&light_, &clean_, &of_light_, &of_clean_}) *colours = memory, memory += C() * TAPS;
+    for (vec **colours : {&front_, &behind_, &colour_, &clean_front_, &clean_behind_, &of_front_, &of_behind_, &of_colour_, &of_contrast_}) *colours = memory, memory += C();
+    find_colours();
+    weigh();
   }
-  vec *const light = w.around.data(), *const clean = light + C * TAPS;                        // [channels, TAPS]
-  vec *const front = light + 2 * C * TAPS, *const behind = front + C, *const colour = behind + C;  // [channels]
-  vec scale = all(TINY);  // brightest light around; all light is relative to it
-  for (int c = 0; c < C; c++)
-    for (int i = 0; i < TAPS; i++) {
-      light[c * TAPS + i] = load<vec>(w.light.data() + (size_t)c * EDGES * PITCH + first + tap(i));
-      scale = most(scale, most(light[c * TAPS + i], -light[c * TAPS + i]));
+
+  // Writes the surfaces of the pixels `beside` another surface.
+  void put(const Block &block, ivec beside) const {
+    const auto put = [&](float *plane, vec value) {
+      float *const to = plane + y_ * BLOCK + x_;
+      store(to, beside ? value : load<vec>(to));
+    };
+    const vec own = 1.0f - weight_, per_own = 1.0f / own, per_other = 1.0f / most(weight_, all(1e-12f)), disagreed = disagreed_ * per_other;
+    for (int c = 0; c < C(); c++) {
+      const vec other_mean = is_near_ ? behind_[c] : front_[c], others = Other(*this, c).light;
+      const vec own_light = (colour_[c] - others) * per_own, other_light = only(weight_ > vec{}, others * per_other);
+      put(block.own + c * BLOCK_PIXELS, (own_light + disagreed * (colour_[c] - own_light)) * scale_);
+      put(block.other + c * BLOCK_PIXELS, (other_light + disagreed * (other_mean - other_light)) * scale_);
     }
-  for (int i = 0; i < C * TAPS; i++) light[i] /= scale;
-  for (int c = 0; c < C; c++) colour[c] = light[c * TAPS + TAPS / 2];
-
-  const vec here = coc[TAPS / 2], gap = most(far - near, all(1e-6f));
-  const vec part = load<vec>(w.moved + y * PITCH + x) / gap;  // 0 or 1: the map as given has an edge here
-  const vec unsure = clamp01(4.0f * least(part, 1.0f - part));
-  const vec at_side = SMALL_BESIDE + unsure * (WIDE_BESIDE - SMALL_BESIDE), at_corner = SMALL_DIAGONAL + unsure * (WIDE_DIAGONAL - SMALL_DIAGONAL);
-  vec nearer[TAPS], farther[TAPS], whole = {};  // weights in the means of both surfaces; sum of those of the front
-  vec covered = {}, counted = {};               // by the near surface, under a small Gaussian
-  for (int i = 0; i < TAPS; i++) {
-    const vec weight = (all(1.0f + UNCLEAN) - load<vec>(w.edge + first + tap(i))) * falloff[i] * valid[i];
-    const vec nearness = (far - coc[i]) / gap;  // not times 1 / gap, whose rounding the clamps below enlarge
-    nearer[i] = weight * clamp01(4.0f * nearness - 2.8f);
-    farther[i] = weight * clamp01(1.2f - 4.0f * nearness);
-    whole += nearer[i];
-    const vec small = (i == TAPS / 2 ? all(1.0f) : i % 2 ? at_side : at_corner) * valid[i];
-    covered += small * nearness, counted += small;
+    const vec valid = valid_[TAPS / 2];
+    put(block.coc, is_near_ ? ends_.far : ends_.near);
+    put(block.weight, weight_ * valid);
+    put(block.own_weight, own * valid);
   }
-  covered /= most(counted, all(1e-12f));
 
-  const vec per_scale = 1.0f / scale;
-  for (int c = 0; c < C; c++)
-    for (int i = 0; i < TAPS; i++) {
-      const vec relative = load<vec>(w.clean.data() + (size_t)c * EDGES * PITCH + first + tap(i)) * per_scale;
-      clean[c * TAPS + i] = most(least(relative, all(MOST_CLEAN)), all(-MOST_CLEAN));
+  // Adds the gradients by the surfaces of these pixels to those by the window.
+  void back(Slopes &slopes, ivec beside) {
+    std::fill(of_light_, of_light_ + 2 * C() * TAPS, vec{});
+    std::fill(of_front_, of_front_ + 4 * C(), vec{});
+    back_of_parts(slopes, beside);
+    back_of_weight();
+    back_of_colours(slopes);
+  }
+
+ private:
+  // The light of the other surface, times its weight: in proportion to both weights, within the range of the image.
+  struct Other {
+    vec own_mean, mean, unexplained, of_each, darkest, brightest, own_darkest, own_brightest, light;
+    vec steps[4];  // the light after each limit but the last
+
+    Other(const Split &s, int c) {
+      const vec weight = s.weight_, own = 1.0f - weight;
+      own_mean = s.is_near_ ? s.front_[c] : s.behind_[c], mean = s.is_near_ ? s.behind_[c] : s.front_[c];
+      unexplained = s.colour_[c] - own * own_mean - weight * mean;
+      of_each = weight / (weight * weight + own * own);
+      darkest = most(s.frame_.darkest[c] / s.scale_, all(-UNBOUNDED)), brightest = least(s.frame_.brightest[c] / s.scale_, all(UNBOUNDED));
+      own_darkest = s.colour_[c] - own * darkest, own_brightest = s.colour_[c] - own * brightest;
+      // the two parts still sum to the pixel, and neither is brighter or darker than the image
+      steps[0] = weight * (mean + unexplained * of_each);
+      steps[1] = most(steps[0], own_brightest);
+      steps[2] = least(steps[1], own_darkest);
+      steps[3] = most(steps[2], weight * darkest);
+      light = least(steps[3], weight * brightest);
     }
-  const vec texture = mean<CHANNELS>(clean, C, farther, behind) + mean<CHANNELS>(clean, C, nearer, front);
-  vec clean_strength = {}, moved[TAPS] = {};
-  for (int c = 0; c < C; c++) {
-    const vec contrast = front[c] - behind[c];
-    clean_strength += contrast * contrast;
-    for (int i = 0; i < TAPS; i++) moved[i] += (light[c * TAPS + i] - clean[c * TAPS + i]) * contrast;
-  }
-  const vec per_strength = 1.0f / (clean_strength + TEXTURE * texture + ALIKE * ALIKE);
-  for (int i = 0; i < TAPS; i++) {
-    moved[i] *= per_strength;
-    moved[i] = nearer[i] > farther[i] ? -clamp01(-moved[i]) : clamp01(moved[i]);
-  }
-  for (int c = 0; c < C; c++)
-    for (int i = 0; i < TAPS; i++) light[c * TAPS + i] -= moved[i] * (front[c] - behind[c]);
-  vec variance = mean<CHANNELS>(light, C, farther, behind);
-  const vec has_clean = clamp01(whole * (0.1f / UNCLEAN) - 1.0f);
-  if (any_of(has_clean < all(1.0f))) {
-    vec differs[TAPS] = {}, most_of = {};
-    for (int c = 0; c < C; c++)
-      for (int i = 0; i < TAPS; i++) differs[i] += (light[c * TAPS + i] - behind[c]) * (light[c * TAPS + i] - behind[c]);
-    for (int i = 0; i < TAPS; i++) most_of = most(most_of, differs[i]);
-    const vec each = 1.0f / (most_of + ALIKE * ALIKE);
-    for (int i = 0; i < TAPS; i++) {
-      const vec part = (differs[i] + ALIKE * ALIKE) * each;
-      nearer[i] *= part + has_clean * (1.0f - part);
-    }
-  }
-  variance += mean<CHANNELS>(light, C, nearer, front);
-
-  vec along = {}, strength = {}, misfit = {};
-  for (int c = 0; c < C; c++) {
-    const vec contrast = front[c] - behind[c];
-    strength += contrast * contrast;
-    along += (colour[c] - behind[c]) * contrast;
-  }
-  const ivec is_near = here - near < far - here;
-  const vec fitted = clamp01(along / most(strength, all(1e-12f)));
-  for (int c = 0; c < C; c++) {
-    const vec left = colour[c] - behind[c] - fitted * (front[c] - behind[c]);
-    misfit += left * left;
-  }
-  const vec noise = variance + ALIKE * ALIKE;
-  const vec trust = strength / (strength + TRUST * (variance + misfit) * (1.0f + UNSURE * unsure) + ALIKE * ALIKE);
-  const vec sided = size_of((here - near) - (far - here)) * (all(1.0f) / gap), edge = load<vec>(w.edge + first + tap(TAPS / 2));
-  const vec clear = edge * clamp01(4.0f * sided - 2.0f), contradiction = misfit + (covered - fitted) * (covered - fitted) * strength;
-  vec geometric = least(is_near ? 1.0f - covered : covered, all(0.5f)) * clear * (1.0f - trust);
-  geometric *= clamp01(gap * (1.0f / EDGE_PX) - 2.0f);
-  vec disagreed = geometric * unsure * contradiction / (noise + contradiction);  // with the pixel's colour
-  const vec agreed = geometric * noise / (noise + contradiction);
-  const vec other = least(is_near ? 1.0f - fitted : fitted, all(0.5f)) * (clear * trust) + agreed + disagreed, own = 1.0f - other;
-
-  const vec per_own = 1.0f / own, per_other = 1.0f / most(other, all(1e-12f)), of_each = other / (other * other + own * own);
-  disagreed *= per_other;
-  auto put = [&](float *plane, vec value) {
-    float *const to = plane + y * BLOCK + x;
-    store(to, beside ? value : load<vec>(to));
   };
-  for (int c = 0; c < C; c++) {
-    const vec own_mean = is_near ? front[c] : behind[c], other_mean = is_near ? behind[c] : front[c];
-    const vec unexplained = colour[c] - own * own_mean - other * other_mean;
-    const vec darkest = most(job.light_least[c] / scale, all(-UNBOUNDED)), brightest = least(job.light_most[c] / scale, all(UNBOUNDED));
-    vec others = other * (other_mean + unexplained * of_each);  // the other surface's light, times its weight
-    // the two parts still sum to the pixel, and neither is brighter or darker than the image
-    others = least(most(others, colour[c] - own * brightest), colour[c] - own * darkest);
-    others = least(most(others, other * darkest), other * brightest);
-    const vec own_light = (colour[c] - others) * per_own, other_light = other > vec{} ? others * per_other : vec{};
-    put(block.own + c * BLOCK_PIXELS, (own_light + disagreed * (colour[c] - own_light)) * scale);
-    put(block.other + c * BLOCK_PIXELS, (other_light + disagreed * (other_mean - other_light)) * scale);
+
+  // Weighted mean of the light around pixels [channels, TAPS]. Returns its variance, summed over channels.
+  vec mean(const vec *light, const vec *weight, vec *mean) const {
+    vec total = {}, variance = {};
+    for (int i = 0; i < TAPS; i++) total += weight[i];
+    total = most(total, all(1e-12f));  // divided by, not multiplied with its inverse: equal values are exactly their mean
+    for (int c = 0; c < C(); c++, light += TAPS) {
+      vec one = {}, two = {};
+      for (int i = 0; i < TAPS; i++) one += light[i] * weight[i];
+      mean[c] = one / total;
+      for (int i = 0; i < TAPS; i++) two += (light[i] - mean[c]) * (light[i] - mean[c]) * weight[i];
+      variance += two / total;
+    }
+    return variance;
   }
-  put(block.coc, is_near ? far : near);
-  put(block.weight, other * valid[TAPS / 2]);
-  put(block.own_weight, own * valid[TAPS / 2]);
+
+  // Adds the gradients of `mean` by light and weights.
+  void back_of_mean(const vec *light, const vec *weight, const vec *mean, vec variance, const vec *of_mean, vec of_variance, vec *of_light, vec *of_weight) const {
+    vec total = {};
+    for (int i = 0; i < TAPS; i++) total += weight[i];
+    const vec each = 1.0f / most(total, all(1e-12f));
+    for (int i = 0; i < TAPS; i++) {
+      vec sum = -of_variance * variance;
+      for (int c = 0; c < C(); c++) {
+        const vec off = light[c * TAPS + i] - mean[c];
+        of_light[c * TAPS + i] += weight[i] * each * (of_mean[c] + 2.0f * of_variance * off);
+        sum += off * (of_mean[c] + of_variance * off);
+      }
+      of_weight[i] += sum * each;
+    }
+  }
+
+  void find_colours() {
+    const int plane = EDGES * PITCH;
+    for (int i = 0; i < TAPS; i++) valid_[i] = masked_ ? load<vec>(w_.valid + first_ + PITCH + 1 + tap(i)) : all(1.0f);
+    scale_ = all(TINY);  // brightest light around; all light is relative to it
+    for (int c = 0; c < C(); c++)
+      for (int i = 0; i < TAPS; i++) {
+        light_[c * TAPS + i] = load<vec>(&w_.light[c * plane + first_ + tap(i)]);
+        scale_ = most(scale_, size_of(light_[c * TAPS + i]));
+      }
+    for (int i = 0; i < C() * TAPS; i++) light_[i] /= scale_;
+    for (int c = 0; c < C(); c++) colour_[c] = light_[c * TAPS + TAPS / 2];
+
+    here_ = load<vec>(w_.coc + first_ + PITCH + 1 + tap(TAPS / 2));
+    gap_ = most(ends_.far - ends_.near, all(1e-6f));
+    const vec part = load<vec>(w_.moved + y_ * PITCH + x_) / gap_;  // 0 or 1: the map as given has an edge here
+    unsure_ = clamp01(4.0f * least(part, 1.0f - part));
+    const vec at_side = SMALL_BESIDE + unsure_ * (WIDE_BESIDE - SMALL_BESIDE), at_corner = SMALL_DIAGONAL + unsure_ * (WIDE_DIAGONAL - SMALL_DIAGONAL);
+    vec whole = {}, counted = {};  // sums of the weights of the front and of those of the small Gaussian
+    covered_ = vec{};
+    for (int i = 0; i < TAPS; i++) {
+      const vec weight = (all(1.0f + UNCLEAN) - load<vec>(w_.edge + first_ + tap(i))) * falloff_[i] * valid_[i];
+      const vec nearness = (ends_.far - load<vec>(w_.coc + first_ + PITCH + 1 + tap(i))) / gap_;  // not times 1 / gap, whose rounding the clamps below enlarge
+      nearer_[i] = weight * clamp01(4.0f * nearness - 2.8f);
+      farther_[i] = weight * clamp01(1.2f - 4.0f * nearness);
+      whole += nearer_[i];
+      small_[i] = (i == TAPS / 2 ? all(1.0f) : i % 2 ? at_side : at_corner) * valid_[i];
+      covered_ += small_[i] * nearness, counted += small_[i];
+    }
+    per_counted_ = 1.0f / most(counted, all(1e-12f));
+    covered_ *= per_counted_;
+
+    const vec per_scale = 1.0f / scale_;
+    for (int c = 0; c < C(); c++)
+      for (int i = 0; i < TAPS; i++) {
+        const vec relative = load<vec>(&w_.clean[c * plane + first_ + tap(i)]) * per_scale;
+        clean_[c * TAPS + i] = most(least(relative, all(MOST_CLEAN)), all(-MOST_CLEAN));
+      }
+    clean_far_variance_ = mean(clean_, farther_, clean_behind_), clean_near_variance_ = mean(clean_, nearer_, clean_front_);
+    vec strength = {};
+    for (vec &shift : shift_) shift = vec{};
+    for (int c = 0; c < C(); c++) {
+      const vec contrast = clean_front_[c] - clean_behind_[c];
+      strength += contrast * contrast;
+      for (int i = 0; i < TAPS; i++) shift_[i] += (light_[c * TAPS + i] - clean_[c * TAPS + i]) * contrast;
+    }
+    per_strength_ = 1.0f / (strength + TEXTURE * (clean_far_variance_ + clean_near_variance_) + ALIKE * ALIKE);
+    for (int i = 0; i < TAPS; i++) {
+      shift_[i] *= per_strength_;
+      const vec shift = limited_shift(i);
+      for (int c = 0; c < C(); c++) light_[c * TAPS + i] -= shift * (clean_front_[c] - clean_behind_[c]);
+    }
+    far_variance_ = mean(light_, farther_, behind_);
+    has_clean_ = whole * (0.1f / UNCLEAN) - 1.0f;
+    std::copy(nearer_, nearer_ + TAPS, distinct_);
+    if (any_of(has_clean_ < all(1.0f))) {
+      vec differs[TAPS], largest = {};
+      for (int i = 0; i < TAPS; i++) largest = most(largest, differs[i] = difference(i));
+      const vec each = 1.0f / (largest + ALIKE * ALIKE), has_clean = clamp01(has_clean_);
+      for (int i = 0; i < TAPS; i++) {
+        const vec part = (differs[i] + ALIKE * ALIKE) * each;
+        distinct_[i] *= part + has_clean * (1.0f - part);
+      }
+    }
+    near_variance_ = mean(light_, distinct_, front_);
+  }
+
+  // Light of the other surface in a neighbour, as a multiple of the contrast between the clean colours.
+  vec limited_shift(int i) const { return nearer_[i] > farther_[i] ? -clamp01(-shift_[i]) : clamp01(shift_[i]); }
+  // Squared difference of a neighbour from the far surface's colour.
+  vec difference(int i) const {
+    vec sum = {};
+    for (int c = 0; c < C(); c++) sum += (light_[c * TAPS + i] - behind_[c]) * (light_[c * TAPS + i] - behind_[c]);
+    return sum;
+  }
+
+  void weigh() {
+    vec along = {};
+    strength_ = misfit_ = vec{};
+    for (int c = 0; c < C(); c++) {
+      const vec contrast = front_[c] - behind_[c];
+      strength_ += contrast * contrast;
+      along += (colour_[c] - behind_[c]) * contrast;
+    }
+    is_near_ = here_ - ends_.near < ends_.far - here_;
+    along_ = along / most(strength_, all(1e-12f)), fitted_ = clamp01(along_);
+    for (int c = 0; c < C(); c++) {
+      const vec left = colour_[c] - behind_[c] - fitted_ * (front_[c] - behind_[c]);
+      misfit_ += left * left;
+    }
+    noise_ = far_variance_ + near_variance_ + ALIKE * ALIKE;
+    total_ = strength_ + TRUST * (far_variance_ + near_variance_ + misfit_) * (1.0f + UNSURE * unsure_) + ALIKE * ALIKE;
+    trust_ = strength_ / total_;
+    edge_ = load<vec>(w_.edge + first_ + tap(TAPS / 2));
+    sided_ = size_of((here_ - ends_.near) - (ends_.far - here_)) * (all(1.0f) / gap_);
+    clear_ = edge_ * clamp01(4.0f * sided_ - 2.0f), contradiction_ = misfit_ + (covered_ - fitted_) * (covered_ - fitted_) * strength_;
+    by_fit_ = is_near_ ? 1.0f - fitted_ : fitted_, by_cover_ = is_near_ ? 1.0f - covered_ : covered_;
+    wide_ = gap_ * (1.0f / EDGE_PX) - 2.0f;
+    geometric_ = least(by_cover_, all(0.5f)) * clear_ * (1.0f - trust_) * clamp01(wide_);
+    disagreed_ = geometric_ * unsure_ * contradiction_ / (noise_ + contradiction_);  // with the pixel's colour
+    weight_ = least(by_fit_, all(0.5f)) * (clear_ * trust_) + geometric_ * noise_ / (noise_ + contradiction_) + disagreed_;
+  }
+
+  // The gradients by the weight, its part that disagrees with the colour, and the colours, from those by the surfaces.
+  void back_of_parts(Slopes &slopes, ivec beside) {
+    const auto slope = [&](int plane) { return only(beside, load<vec>(&slopes.surfaces[plane * BLOCK * PITCH + y_ * PITCH + x_])); };
+    const vec own = 1.0f - weight_, known = most(weight_, all(1e-12f)), disagreed = disagreed_ / known, squares = weight_ * weight_ + own * own;
+    vec of_own = {}, of_disagreed = {};
+    of_weight_ = slope(2 * C() + 1);
+    const vec of_coc = slope(2 * C());
+    of_near_ = only(~is_near_, of_coc), of_far_ = only(is_near_, of_coc);
+    for (int c = 0; c < C(); c++) {
+      const Other other(*this, c);
+      const vec own_light = (colour_[c] - other.light) / own, other_light = other.light / known;
+      const vec of_own_light = slope(c) * scale_, of_other_light = only(weight_ > vec{}, slope(C() + c) * scale_);
+      of_disagreed += of_own_light * (colour_[c] - own_light) + of_other_light * (other.mean - other_light);
+      const vec of_part = of_own_light * (1.0f - disagreed) / own;
+      vec of_colour = of_own_light * disagreed + of_part, of_mean = of_other_light * disagreed;
+      of_own -= of_part * own_light;
+      // by the other surface's light, and by its weight where the own part depends on their product
+      vec of_light = of_other_light * (1.0f - disagreed) - of_part * weight_;
+      of_weight_ -= of_part * other_light;
+      // the gradient goes to the limit in force, or by halves to two equal ones
+      const auto limited = [&](vec light, vec limit, bool upper) {
+        const vec by_limit = only(upper ? limit < light : limit > light, all(1.0f)) + only(limit == light, all(0.5f)), taken = of_light * by_limit;
+        of_light -= taken;
+        return taken;
+      };
+      vec of_brightest = limited(other.steps[3], weight_ * other.brightest, true), of_darkest = limited(other.steps[2], weight_ * other.darkest, false);
+      const vec by_darkest = limited(other.steps[1], other.own_darkest, true) / known, by_brightest = limited(other.steps[0], other.own_brightest, false) / known;
+      of_colour += by_darkest + by_brightest;
+      of_own -= by_darkest * other.darkest + by_brightest * other.brightest;
+      of_weight_ -= (by_darkest + by_brightest) * other_light;
+      of_darkest -= by_darkest * own, of_brightest -= by_brightest * own;
+      slopes.darkest[c] += sum(only(beside & (other.darkest > all(-UNBOUNDED)), of_darkest / scale_));
+      slopes.brightest[c] += sum(only(beside & (other.brightest < all(UNBOUNDED)), of_brightest / scale_));
+      // light = mean + unexplained of_each, of_each = weight / (weight^2 + own^2)
+      const vec of_each = of_light * other.unexplained, of_unexplained = of_light * other.of_each;
+      of_colour += of_unexplained;
+      of_mean += of_light - of_unexplained * weight_;
+      of_own -= of_unexplained * other.own_mean + of_each * 2.0f * weight_ * own / (squares * squares);
+      of_weight_ += of_each * (own * own - weight_ * weight_) / (squares * squares) - of_unexplained * other.mean;
+      const vec of_own_mean = -of_unexplained * own;
+      of_front_[c] += is_near_ ? of_own_mean : of_mean;
+      of_behind_[c] += is_near_ ? of_mean : of_own_mean;
+      of_colour_[c] += of_colour;
+    }
+    of_disagreed_ = of_disagreed / known;
+    of_weight_ -= of_own + only(weight_ >= all(1e-12f), of_disagreed_ * disagreed);
+  }
+
+  // The gradients by the colours and by coverage, edge and coc, from those by the weight.
+  void back_of_weight() {
+    const vec sum = noise_ + contradiction_, agreeing = noise_ / sum, passed = of_weight_ + of_disagreed_;
+    const vec of_agreed = of_weight_ - unsure_ * passed, of_geometric = unsure_ * passed + of_agreed * agreeing;
+    const vec of_agreeing = of_agreed * geometric_ / sum, of_contradiction = -of_agreeing * agreeing;
+    const vec by_cover = least(by_cover_, all(0.5f)), by_fit = least(by_fit_, all(0.5f)), wide = clamp01(wide_), doubt = 1.0f - trust_;
+    const vec of_clear = of_geometric * by_cover * doubt * wide + of_weight_ * by_fit * trust_;
+    const vec of_trust = (of_weight_ * by_fit - of_geometric * by_cover * wide) * clear_;
+    const vec of_by_cover = only(by_cover_ <= all(0.5f), of_geometric * clear_ * doubt * wide), of_by_fit = only(by_fit_ <= all(0.5f), of_weight_ * clear_ * trust_);
+    const vec off = covered_ - fitted_, of_off = of_contradiction * 2.0f * off * strength_;
+    of_covered_ = of_off + (is_near_ ? -of_by_cover : of_by_cover);
+    vec of_fitted = (is_near_ ? -of_by_fit : of_by_fit) - of_off;
+    of_edge_ = of_clear * clamp01(4.0f * sided_ - 2.0f);
+    const vec signed_side = (here_ - ends_.near) - (ends_.far - here_), side = only(signed_side > vec{}, all(1.0f)) - only(signed_side < vec{}, all(1.0f));
+    const vec of_sided = only(is_within(4.0f * sided_ - 2.0f), of_clear * edge_ * 4.0f) / gap_;
+    of_here_ = 2.0f * side * of_sided;
+    of_near_ -= side * of_sided, of_far_ -= side * of_sided;
+    of_gap_ = only(is_within(wide_), of_geometric * by_cover * clear_ * doubt * (1.0f / EDGE_PX)) - of_sided * sided_;
+    const vec of_total = -of_trust * trust_ / total_, of_noisy = of_total * TRUST * (1.0f + UNSURE * unsure_);
+    vec of_strength = of_trust / total_ + of_total + of_contradiction * off * off;
+    const vec of_misfit = of_contradiction + of_noisy;
+    of_variance_ = of_noisy + of_agreeing * (1.0f - agreeing);
+    for (int c = 0; c < C(); c++) {
+      const vec contrast = front_[c] - behind_[c], of_left = 2.0f * of_misfit * (colour_[c] - behind_[c] - fitted_ * contrast);
+      of_colour_[c] += of_left;
+      of_behind_[c] -= of_left;
+      of_fitted -= of_left * contrast;
+    }
+    const vec of_along = only(is_within(along_), of_fitted) / most(strength_, all(1e-12f));
+    of_strength -= only(strength_ >= all(1e-12f), of_along * along_);
+    const vec of_misfit_contrast = 2.0f * of_misfit * fitted_;
+    for (int c = 0; c < C(); c++) {
+      const vec contrast = front_[c] - behind_[c], left = colour_[c] - behind_[c];
+      const vec of_contrast = of_along * left + 2.0f * of_strength * contrast - of_misfit_contrast * (left - fitted_ * contrast);
+      of_colour_[c] += of_along * contrast;
+      of_front_[c] += of_contrast;
+      of_behind_[c] -= of_along * contrast + of_contrast;
+    }
+  }
+
+  // The gradients by light, clean light, edges and coc of the window, from those by the colours.
+  void back_of_colours(Slopes &slopes) {
+    vec of_nearer[TAPS] = {}, of_farther[TAPS] = {}, of_distinct[TAPS] = {}, of_whole = {};
+    back_of_mean(light_, distinct_, front_, near_variance_, of_front_, of_variance_, of_light_, of_distinct);
+    const vec has_clean = clamp01(has_clean_);
+    if (any_of(has_clean < all(1.0f))) {
+      vec differs[TAPS], largest = {}, ties = {}, of_largest = {};
+      for (int i = 0; i < TAPS; i++) largest = most(largest, differs[i] = difference(i));
+      const vec each = 1.0f / (largest + ALIKE * ALIKE);
+      vec of_part[TAPS];
+      for (int i = 0; i < TAPS; i++) {
+        const vec part = (differs[i] + ALIKE * ALIKE) * each, of_factor = of_distinct[i] * nearer_[i];
+        of_nearer[i] = of_distinct[i] * (part + has_clean * (1.0f - part));
+        of_whole += of_factor * (1.0f - part);
+        of_part[i] = of_factor * (1.0f - has_clean) * each;
+        of_largest -= of_part[i] * part;
+        ties += only(differs[i] == largest, all(1.0f));
+      }
+      of_whole = only(is_within(has_clean_), of_whole * (0.1f / UNCLEAN));
+      for (int i = 0; i < TAPS; i++) {
+        const vec slope = 2.0f * (of_part[i] + only(differs[i] == largest, of_largest / ties));
+        for (int c = 0; c < C(); c++) {
+          const vec of_off = slope * (light_[c * TAPS + i] - behind_[c]);
+          of_light_[c * TAPS + i] += of_off;
+          of_behind_[c] -= of_off;
+        }
+      }
+    } else {
+      std::copy(of_distinct, of_distinct + TAPS, of_nearer);
+    }
+    back_of_mean(light_, farther_, behind_, far_variance_, of_behind_, of_variance_, of_light_, of_farther);
+
+    // light -= shift contrast, shift = per_strength sum((light - clean) contrast), of the clean colours
+    vec of_per_strength = {};
+    std::fill(of_contrast_, of_contrast_ + C(), vec{});
+    for (int i = 0; i < TAPS; i++) {
+      const vec shift = limited_shift(i);
+      vec of_shift = {}, along = {};
+      for (int c = 0; c < C(); c++) {
+        const vec contrast = clean_front_[c] - clean_behind_[c], off = light_[c * TAPS + i] + shift * contrast - clean_[c * TAPS + i];
+        of_shift -= of_light_[c * TAPS + i] * contrast;
+        of_contrast_[c] -= of_light_[c * TAPS + i] * shift;
+        along += off * contrast;
+      }
+      of_shift = only(is_within(nearer_[i] > farther_[i] ? -shift_[i] : shift_[i]), of_shift);
+      of_per_strength += of_shift * along;
+      of_shift *= per_strength_;
+      for (int c = 0; c < C(); c++) {
+        const vec contrast = clean_front_[c] - clean_behind_[c], off = light_[c * TAPS + i] + shift * contrast - clean_[c * TAPS + i];
+        of_light_[c * TAPS + i] += of_shift * contrast;
+        of_clean_[c * TAPS + i] -= of_shift * contrast;
+        of_contrast_[c] += of_shift * off;
+      }
+    }
+    const vec of_strength = -of_per_strength * per_strength_ * per_strength_;
+    for (int c = 0; c < C(); c++) {
+      of_contrast_[c] += 2.0f * of_strength * (clean_front_[c] - clean_behind_[c]);
+      of_front_[c] = of_contrast_[c], of_behind_[c] = -of_contrast_[c];
+    }
+    back_of_mean(clean_, nearer_, clean_front_, clean_near_variance_, of_front_, TEXTURE * of_strength, of_clean_, of_nearer);
+    back_of_mean(clean_, farther_, clean_behind_, clean_far_variance_, of_behind_, TEXTURE * of_strength, of_clean_, of_farther);
+
+    const vec per_scale = 1.0f / scale_;
+    for (int c = 0; c < C(); c++) {
+      of_light_[c * TAPS + TAPS / 2] += of_colour_[c];
+      for (int i = 0; i < TAPS; i++) {
+        const int at = c * EDGES * PITCH + first_ + tap(i);
+        add(&slopes.light[at], of_light_[c * TAPS + i] * per_scale);
+        add(&slopes.clean[at], only(size_of(load<vec>(&w_.clean[at]) * per_scale) <= all(MOST_CLEAN), of_clean_[c * TAPS + i] * per_scale));
+      }
+    }
+    add(slopes.edge + first_ + tap(TAPS / 2), of_edge_);
+    for (int i = 0; i < TAPS; i++) {
+      const int in_coc = first_ + PITCH + 1 + tap(i);
+      const vec near_by = falloff_[i] * valid_[i], weight = (all(1.0f + UNCLEAN) - load<vec>(w_.edge + first_ + tap(i))) * near_by;
+      const vec nearness = (ends_.far - load<vec>(w_.coc + in_coc)) / gap_, to_near = 4.0f * nearness - 2.8f, to_far = 1.2f - 4.0f * nearness;
+      of_nearer[i] += of_whole;
+      add(slopes.edge + first_ + tap(i), -near_by * (of_nearer[i] * clamp01(to_near) + of_farther[i] * clamp01(to_far)));
+      const vec of_ends = 4.0f * weight * (only(is_within(to_near), of_nearer[i]) - only(is_within(to_far), of_farther[i]));
+      const vec of_nearness = (of_ends + of_covered_ * small_[i] * per_counted_) / gap_;
+      add(slopes.coc + in_coc, -of_nearness);
+      of_far_ += of_nearness;
+      of_gap_ -= of_nearness * nearness;
+    }
+    add(slopes.coc + first_ + PITCH + 1 + tap(TAPS / 2), of_here_);
+    ends_.back(w_, first_ + PITCH + 1, masked_, of_near_ - of_gap_, of_far_ + of_gap_, slopes.coc);
+  }
+
+  int C() const { return CHANNELS ? CHANNELS : frame_.channels; }
+
+  const Frame &frame_;
+  const Window &w_;
+  const float *const falloff_;
+  const int y_, x_, first_;  // place in the block; of the first neighbour in windows of edges and light
+  const bool masked_;
+  const Ends ends_;
+  vec *light_, *clean_, *of_light_, *of_clean_;  // of the neighbours [channels, TAPS]; gradients begin with of_
+  vec *front_, *behind_, *colour_, *clean_front_, *clean_behind_, *of_front_, *of_behind_, *of_colour_, *of_contrast_;  // [channels]
+  vec valid_[TAPS], small_[TAPS];
+  vec nearer_[TAPS], farther_[TAPS], distinct_[TAPS];  // weights in the means of both surfaces; the front's, by difference
+  vec shift_[TAPS];  // not limited
+  vec scale_, here_, gap_, unsure_, covered_, per_counted_, per_strength_, has_clean_;  // covered: by the near surface
+  vec clean_near_variance_, clean_far_variance_, near_variance_, far_variance_;
+  ivec is_near_;
+  vec strength_, along_, fitted_, misfit_, noise_, total_, trust_, edge_, sided_, clear_, contradiction_, by_fit_, by_cover_, wide_, geometric_, disagreed_, weight_;
+  vec of_weight_, of_disagreed_, of_variance_, of_covered_, of_edge_, of_here_, of_gap_, of_near_, of_far_;
+};
+
+void read_light(const Frame &frame, int y0, int x0, Window &w) {
+  for (int c = 0; c < frame.channels; c++) read_window(frame, frame.light + c * frame.area(), y0 - RIM, x0 - RIM, EDGES, w.light.data() + (size_t)c * EDGES * PITCH);
+  if (frame.moved) read_window(frame, frame.moved, y0, x0, BLOCK, w.moved);
 }
 
-void split_block(Job &job, int by, int bx, Window &w, const float *falloff) {
-  const int y0 = by * BLOCK, x0 = bx * BLOCK;
-  const Block block = job.surfaces.make_block(by * job.surfaces.block_columns + bx);
-  for (int c = 0; c < job.channels; c++)
-    read_window(job, job.surfaces.light + c * job.surfaces.area(), y0 - RIM, x0 - RIM, EDGES, w.light.data() + (size_t)c * EDGES * PITCH);
-  clean_light(job, y0, x0, w, falloff);
-  if (job.scene.moved) read_window(job, job.scene.moved, y0, x0, BLOCK, w.moved);
-  for (int y = 0; y < std::min(BLOCK, job.height - y0); y++)
-    for (int x = 0; x < std::min(BLOCK, job.width - x0); x += LANES) {
-      const ivec beside = (load<vec>(w.edge + (y + RIM) * PITCH + x + RIM) > vec{}) & (counting() < (float)(job.width - x0 - x));
-      if (!any_of(beside)) continue;
-      job.channels == 3 ? split<3>(job, w, y, x, beside, falloff, block) : split<0>(job, w, y, x, beside, falloff, block);
+// Calls body(row, column, which are mixed) for each LANES pixels of a block that contain mixed ones.
+template <typename Body>
+void each_mixed(const Frame &frame, int y0, int x0, const Window &w, const Body &body) {
+  for (int y = 0; y < std::min(BLOCK, frame.height - y0); y++)
+    for (int x = 0; x < std::min(BLOCK, frame.width - x0); x += LANES) {
+      const ivec beside = (load<vec>(w.edge + (y + RIM) * PITCH + x + RIM) > vec{}) & (counting() < (float)(frame.width - x0 - x));
+      if (any_of(beside)) body(y, x, beside);
     }
+}
+
+void split_block(const Frame &frame, int by, int bx, Window &w, const float *falloff, const Block &block) {
+  const int y0 = by * BLOCK, x0 = bx * BLOCK;
+  read_light(frame, y0, x0, w);
+  clean_light(frame, y0, x0, w, falloff);
+  each_mixed(frame, y0, x0, w, [&](int y, int x, ivec beside) {
+    frame.channels == 3 ? Split<3>(frame, w, y, x, falloff).put(block, beside) : Split<0>(frame, w, y, x, falloff).put(block, beside);
+  });
+}
+
+// Adds the gradients by light and coc of a block's window, from those by the block's surfaces [2 channels + 2, height, width].
+void back_of_block(const Frame &frame, int by, int bx, Window &w, const float *falloff, const float *gradient, Slopes &slopes, float *const *of_maps) {
+  const int y0 = by * BLOCK, x0 = bx * BLOCK, C = frame.channels, plane = EDGES * PITCH;
+  const bool has_edges = find_edges(frame, y0, x0, w);
+  for (int k = 0; k < 2 * C + 2; k++) read_window(frame, gradient + k * frame.area(), y0, x0, BLOCK, &slopes.surfaces[k * BLOCK * PITCH]);
+  for (int y = 0; y < std::min(BLOCK, frame.height - y0); y++)
+    for (int x = 0; x < std::min(BLOCK, frame.width - x0); x++)
+      if (!has_edges || !(w.edge[(y + RIM) * PITCH + x + RIM] > 0)) {  // a pixel of one surface stays as it is
+        const size_t at = (size_t)(y0 + y) * frame.width + x0 + x;
+        for (int c = 0; c < C; c++) of_maps[0][c * frame.area() + at] += slopes.surfaces[(c * BLOCK + y) * PITCH + x];
+        of_maps[1][at] += slopes.surfaces[(2 * C * BLOCK + y) * PITCH + x];
+      }
+  if (!has_edges) return;
+  read_light(frame, y0, x0, w);
+  clean_light(frame, y0, x0, w, falloff);
+  std::fill(slopes.coc, slopes.coc + SIDE * PITCH, 0.0f);
+  std::fill(slopes.edge, slopes.edge + plane, 0.0f);
+  std::fill(slopes.light.begin(), slopes.light.end(), 0.0f);
+  std::fill(slopes.clean.begin(), slopes.clean.end(), 0.0f);
+  each_mixed(frame, y0, x0, w, [&](int y, int x, ivec beside) {
+    C == 3 ? Split<3>(frame, w, y, x, falloff).back(slopes, beside) : Split<0>(frame, w, y, x, falloff).back(slopes, beside);
+  });
+  clean_light(frame, y0, x0, w, falloff, &slopes);
+  each_outside(frame, y0, x0, [&](int from, int to) {
+    slopes.edge[to] += slopes.edge[from];
+    slopes.edge[from] = 0;
+  });
+  for (int i = 0; i < EDGES; i++)
+    for (int j = 0; j < EDGES; j += LANES) {
+      const int at = i * PITCH + j;
+      const Ends ends(w, at, frame.valid);
+      const vec rise = (ends.far - ends.near) * (1.0f / EDGE_PX) - 1.0f;
+      const vec slope = only(is_within(rise) & (load<vec>(w.edge + at) > vec{}), load<vec>(slopes.edge + at) * (1.0f / EDGE_PX));
+      if (any_of(slope != vec{})) ends.back(w, at, frame.valid, -slope, slope, slopes.coc);
+    }
+  const auto add_window = [&](const float *window, int size, int margin, float *to) {
+    for (int i = 0; i < size; i++)
+      for (int j = 0; j < size; j++) {
+        const int y = std::clamp(y0 - margin + i, 0, frame.height - 1), x = std::clamp(x0 - margin + j, 0, frame.width - 1);
+        to[(size_t)y * frame.width + x] += window[i * PITCH + j];
+      }
+  };
+  for (int c = 0; c < C; c++) add_window(&slopes.light[c * plane], EDGES, RIM, of_maps[0] + c * frame.area());
+  add_window(slopes.coc, SIDE, MARGIN, of_maps[1]);
 }
 
 // Estimates from the pixels around a highlight on which surface its emitter lies.
@@ -455,6 +854,7 @@ void Job::split_mixed() {
   const std::vector<float> falloff = falloff_around(REACH), around_emitter = falloff_around(EMITTER_REACH);
   const bool emitters = scene.kind != TORCHDOF_BACKGROUND;  // a given background replaces the light behind
   const int rows = surfaces.block_rows, columns = surfaces.block_columns;
+  const Frame frame{height, width, channels, surfaces.light, surfaces.coc, surfaces.valid, scene.moved, light_least.data(), light_most.data()};
   std::vector<std::unique_ptr<Window>> windows(std::max(1, scene.threads));
   struct Left { int y, x; float weight; };
   std::vector<std::vector<Left>> left(rows);  // other surfaces of highlights' pixels
@@ -478,7 +878,7 @@ void Job::split_mixed() {
         }
       if (!(high - low > EDGE_PX)) continue;
       const int y0 = by * BLOCK, x0 = bx * BLOCK;
-      if (find_edges(*this, y0, x0, w)) split_block(*this, by, bx, w, falloff.data());
+      if (find_edges(frame, y0, x0, w)) split_block(frame, by, bx, w, falloff.data(), surfaces.make_block(by * columns + bx));
       if (!(high - low > 1)) continue;
       each_highlight(by, bx, [&](int y, int x, float least_limit) { attribute_emitter(*this, y, x, least_limit, around_emitter.data()); });
     }
@@ -539,4 +939,58 @@ void Job::add_background() {
   surfaces.independent = true;
 }
 
+// The surfaces of an image [2 channels + 2, height, width]: own and other light, coc and weight of the other; or, given
+// their gradient, the gradients by light and coc.
+static void matte(const float *const *maps, int channels, int height, int width, int threads, float *out, const float *gradient, float *const *of_maps) {
+  const int C = channels, rows = ceil_div(height, BLOCK), columns = ceil_div(width, BLOCK);
+  std::vector<float> darkest(C), brightest(C), of_range((size_t)rows * 2 * C);
+  const size_t area = (size_t)height * width;
+  for (int c = 0; c < C; c++) find_ends(maps[0] + c * area, area, threads, &darkest[c], &brightest[c]);
+  const Frame frame{height, width, C, maps[0], maps[1], maps[2], maps[3], darkest.data(), brightest.data()};
+  const std::vector<float> falloff = falloff_around(REACH);
+  if (!gradient) {
+    memcpy(out, maps[0], C * area * sizeof(float));
+    memcpy(out + 2 * C * area, maps[1], area * sizeof(float));
+    std::fill(out + C * area, out + 2 * C * area, 0.0f);
+    std::fill(out + (2 * C + 1) * area, out + (2 * C + 2) * area, 0.0f);
+    parallel(threads, rows, nullptr, [&](int by, int) {
+      Window w(C);
+      std::vector<float> planes((size_t)(2 * C + 3) * BLOCK_PIXELS);
+      const auto plane = [&](int k) { return &planes[(size_t)k * BLOCK_PIXELS]; };
+      for (int bx = 0; bx < columns; bx++) {
+        const int y0 = by * BLOCK, x0 = bx * BLOCK;
+        if (!find_edges(frame, y0, x0, w)) continue;
+        split_block(frame, by, bx, w, falloff.data(), {plane(0), plane(C), plane(2 * C), plane(2 * C + 1), plane(2 * C + 2)});
+        each_mixed(frame, y0, x0, w, [&](int y, int x, ivec beside) {
+          for (int lane = 0; lane < LANES; lane++)
+            for (int k = 0; beside[lane] && k < 2 * C + 2; k++) out[k * area + (size_t)(y0 + y) * width + x0 + x + lane] = plane(k)[y * BLOCK + x + lane];
+        });
+      }
+    });
+    return;
+  }
+  for (int first = 0; first < 2; first++)  // windows of every second row of blocks do not overlap
+    parallel(threads, (rows + 1 - first) / 2, nullptr, [&](int i, int) {
+      const int by = 2 * i + first;
+      Window w(C);
+      Slopes slopes(C);
+      for (int bx = 0; bx < columns; bx++) back_of_block(frame, by, bx, w, falloff.data(), gradient, slopes, of_maps);
+      std::copy(slopes.darkest.begin(), slopes.darkest.end(), &of_range[(size_t)by * 2 * C]);
+      std::copy(slopes.brightest.begin(), slopes.brightest.end(), &of_range[(size_t)by * 2 * C + C]);
+    });
+  for (int k = 0; k < 2 * C; k++) {  // the pixels with the extremes share their gradients
+    float slope = 0;
+    for (int by = 0; by < rows; by++) slope += of_range[(size_t)by * 2 * C + k];
+    const float *const light = maps[0] + k % C * area, extreme = k < C ? darkest[k] : brightest[k - C];
+    slope /= (float)std::count(light, light + area, extreme);
+    for (size_t at = 0; slope != 0 && at < area; at++)
+      if (light[at] == extreme) of_maps[0][k % C * area + at] += slope;
+  }
+}
+
 }  // namespace torchdof
+
+int32_t torchdof_matte(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t threads, float *out,
+                       const float *gradient, float *const *of_maps) {
+  return torchdof::guarded([&] { torchdof::matte(maps, channels, height, width, threads, out, gradient, of_maps); });
+}
