@@ -415,6 +415,36 @@ void check_matte(unsigned seed) {
   check_threads(split, "mixed pixels", int(seed));
 }
 
+// Continues the light of some surfaces beyond the frame's border, and computes the gradient.
+void check_continued(unsigned seed) {
+  std::mt19937 random(seed);
+  const auto integer = [&](int low, int high) { return std::uniform_int_distribution<int>(low, high)(random); };
+  const int surfaces = integer(1, 3), channels = integer(1, 5), height = integer(1, 40), width = integer(1, 60);
+  const int32_t ends[] = {integer(0, 50), integer(0, 50), integer(0, 50), integer(0, 50)};
+  const size_t pixels = size_t(height) * width, wide = size_t(height + ends[2] + ends[3]) * (width + ends[0] + ends[1]);
+  std::vector<std::vector<float>> maps;  // light of each surface; weight, x, image_x, limit
+  for (int s = 0; s < surfaces; s++) maps.push_back(noise(random, channels * pixels, 0.0, 1.0));
+  for (double most : {1.0, 9.0, 9.0}) maps.push_back(noise(random, surfaces * pixels, 0.0, most));
+  maps.push_back(noise(random, pixels, 0.3, 1.3));
+  const std::vector<float> slopes = noise(random, surfaces * channels * wide, -1.0, 1.0);
+  const auto run = [&](int threads) {
+    std::vector<float> all(slopes.size());
+    std::vector<const float *> maps_at;
+    std::vector<std::vector<float>> of_maps;
+    std::vector<float *> of_maps_at;
+    for (const std::vector<float> &map : maps) of_maps.emplace_back(map.size(), 0.0f), maps_at.push_back(map.data());
+    for (std::vector<float> &of_map : of_maps) of_maps_at.push_back(of_map.data());
+    const auto step = [&](float *out, const float *gradient, float *const *of) {
+      return torchdof_continued(maps_at.data(), surfaces, channels, height, width, ends, threads, out, gradient, of);
+    };
+    if (step(all.data(), nullptr, nullptr) != TORCHDOF_OK) fail("its light cannot be continued", int(seed));
+    if (step(nullptr, slopes.data(), of_maps_at.data()) != TORCHDOF_OK) fail("its continued light has no gradient", int(seed));
+    for (const std::vector<float> &of_map : of_maps) append(all, of_map);
+    return all;
+  };
+  check_threads(run, "continued light", int(seed));
+}
+
 }  // namespace
 
 int main(int count, char **arguments) {
@@ -425,6 +455,7 @@ int main(int count, char **arguments) {
     check_blend(unsigned(seed));
     check_look_behind(unsigned(seed));
     check_matte(unsigned(seed));
+    check_continued(unsigned(seed));
   }
   std::printf("%s: %d scenes\n", arguments[0], scenes);
 }

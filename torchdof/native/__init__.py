@@ -97,6 +97,7 @@ _FUNCTIONS = {
     "matte": "int data* int int int int data data data*",
     "farthest": "int data* int int int int int int data data data*",
     "look_behind": "int level* int int data int int int data data data* data",
+    "continued": "int data* int int int int int* int data data data*",
     "coc": "int data long real real real int data",
     "plan": "int data int int int double* int double* int int*",
     "kernels": "int spots* int data*",
@@ -327,6 +328,26 @@ def look_behind_gradient(levels: Sequence[Tensor], rules: Rules, coc: Tensor, gr
 def _level_arguments(levels: Sequence[Tensor], rules: Rules, coc: Tensor) -> tuple[Any, ...]:
     each = [_TYPES["level"](values, *values.shape[1:], *rule) for values, rule in zip(levels, rules, strict=True)]
     return each, len(each), levels[0].shape[0] - 2, coc, *coc.shape[1:], torch.get_num_threads()
+
+
+def continued(maps: Sequence[Tensor], ends: Sequence[int]) -> Tensor:
+    """Light of S surfaces beyond the frame's border, as :func:`torchdof.render.border.continued`, for one image.
+
+    ``maps`` are light of each surface ``[C, H, W]``; their weight, x and image_x ``[S, 1, H, W]``; limit ``[1, H, W]``.
+    The result is ``[S C, H + ends, W + ends]``.
+    """
+    (channels, height, width), (left, right, top, bottom) = maps[0].shape, ends
+    surfaces = len(maps[-2])
+    out = _empty(surfaces * channels, top + height + bottom, left + width + right)
+    _run("continued", maps, surfaces, channels, height, width, ends, torch.get_num_threads(), out, None, None)
+    return out
+
+
+def continued_gradient(maps: Sequence[Tensor], ends: Sequence[int], gradient: Tensor) -> list[Tensor]:
+    """The gradients of :func:`continued` by all maps but the last."""
+    sums = [_empty(*values.shape).zero_() for values in maps[:-1]]
+    _run("continued", maps, len(maps[-2]), *maps[0].shape, ends, torch.get_num_threads(), None, gradient, sums)
+    return sums
 
 
 def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool = False) -> Tensor:

@@ -16,13 +16,14 @@ Reference:
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from .. import native
 from ..optics.kernel_cache import kept
+from .compiled_steps import compiled_step
 
 _WIDTH = 4  # half width of the mean along the border, over the distance from the border; larger smooths more
 _BINS = 16  # number of bins; more of them separate more surfaces
@@ -55,7 +56,38 @@ def continued(
             surface belong together.
         image_x: The same for the image itself, ``[B, 1, H, W]``; None: it equals ``x``.
     """
-    maps = [lights, [weight], [x], [limit] * len(lights), [image_x] * len(lights)]
+    count, blank = len(lights), torch.zeros_like(lights[0][:, :1])
+    weight = torch.ones_like(blank).repeat(count, 1, 1, 1) if weight is None else weight
+    x = blank.repeat(count, 1, 1, 1) if x is None else x
+    image_x = x if image_x is None else image_x.repeat(count, 1, 1, 1)
+    limit = torch.full_like(blank, torch.finfo(blank.dtype).max) if limit is None else limit
+
+    def plain(*maps: Tensor) -> Tensor:
+        weight, x, image_x = (t.transpose(0, 1).flatten(0, 1) for t in maps[count:-1])
+        return torch.cat(_continued(maps[:count], weight, x, image_x, maps[-1], ends, farthest), 1)
+
+    found = compiled_step(
+        lambda *maps: native.continued(maps, ends),
+        lambda gradient, *maps: native.continued_gradient(maps, ends, gradient),
+        plain,
+        *lights,
+        *(t.unflatten(0, (count, -1)).transpose(0, 1) for t in (weight, x, image_x)),  # [B, S, 1, H, W]
+        limit,
+    )
+    return _continued(lights, weight, x, image_x, limit, ends, farthest) if found is None else [*found.chunk(count, 1)]
+
+
+def _continued(
+    lights: Sequence[Tensor],
+    weight: Tensor,
+    x: Tensor,
+    image_x: Tensor,
+    limit: Tensor,
+    ends: tuple[int, int, int, int],
+    farthest: int,
+) -> list[Tensor]:
+    """:func:`continued` by PyTorch; ``image_x`` is concatenated as ``x``."""
+    maps = [lights, [weight], [x], [limit] * len(lights), [image_x]]
     rows, columns = (
         _beyond(farthest, *(_both(each, dim) for each in maps)).unflatten(1, (len(lights), -1)) for dim in (-2, -1)
     )  # [2, S, B, C, farthest, W]: top and bottom; [2, S, B, C, farthest, H]: left and right
@@ -77,10 +109,9 @@ def continued(
     return wide
 
 
-def _both(maps: Sequence[Tensor | None], dim: int) -> Any:
-    """First and last line of maps ``[B, c, H, W]`` along ``dim``: ``[2, maps B, c, n]``; None if there are no maps."""
-    known = [values for values in maps if values is not None]
-    return torch.stack([torch.cat([values.select(dim, end) for values in known]) for end in (0, -1)]) if known else None
+def _both(maps: Sequence[Tensor], dim: int) -> Tensor:
+    """First and last line of maps ``[B, c, H, W]`` along ``dim``: ``[2, maps B, c, n]``."""
+    return torch.stack([torch.cat([values.select(dim, end) for values in maps]) for end in (0, -1)])
 
 
 def _bins(x: Tensor, image_x: Tensor) -> Tensor:
@@ -98,28 +129,22 @@ def _step(difference: Tensor) -> Tensor:
     return difference * (difference.abs() / _STEP - 1.0).clamp(0.0, 1.0)
 
 
-def _beyond(
-    farthest: int, line: Tensor, weight: Tensor | None, x: Tensor | None, most: Tensor | None, image_x: Tensor | None
-) -> Tensor:
+def _beyond(farthest: int, line: Tensor, weight: Tensor, x: Tensor, most: Tensor, image_x: Tensor) -> Tensor:
     """Continue lines ``[..., C, n]`` at the border by ``farthest`` pixels, nearest first: ``[..., C, farthest, n]``.
 
     The other arguments are lines ``[..., 1, n]`` of the maps of :func:`continued`.
     """
-    if most is not None:
-        brightest = line.amax(-2, keepdim=True)
-        is_bright = brightest > most
-        line = line * torch.where(is_bright, most / torch.where(is_bright, brightest, 1.0), 1.0)
-    weight = torch.ones_like(line[..., :1, :]) if weight is None else weight
+    brightest = line.amax(-2, keepdim=True)
+    is_bright = brightest > most
+    line = line * torch.where(is_bright, most / torch.where(is_bright, brightest, 1.0), 1.0)
     values = torch.cat([line * weight, weight], -2)[..., None, :]  # [..., C + 1, 1, n]
-    bins = None if x is None else _bins(x, x if image_x is None else image_x)
-    values = values if bins is None else values * (1.0 - bins.abs()).clamp_min(0.0)
+    bins = _bins(x, image_x)
+    values = values * (1.0 - bins.abs()).clamp_min(0.0)
     # means for distances that are powers of two, interpolated linearly between them
     levels = farthest.bit_length() + 1
     octave, part = _octaves(farthest, levels, line.dtype, line.device)
-    window = _window_sums(values, levels)
-    if bins is not None:  # sum over the pixel's own surface and farther ones
-        window = window * (1.0 - bins).clamp(0.0, 1.0).unsqueeze(-2)
-    window = window.sum(-3)  # [..., C + 1, levels, n]
+    window = _window_sums(values, levels) * (1.0 - bins).clamp(0.0, 1.0).unsqueeze(-2)
+    window = window.sum(-3)  # of the pixel's own surface and farther ones, [..., C + 1, levels, n]
     total = window[..., -1:, :, :]
     means = window[..., :-1, :, :] / torch.where(total > 0, total, 1.0)
     mean = torch.lerp(means.index_select(-2, octave), means.index_select(-2, octave + 1), part)

@@ -3,93 +3,138 @@
 
 namespace torchdof {
 
-// Constants of render/border.py, which gives their meanings and effects.
-constexpr int WIDTH = 4, BINS = 16;
-constexpr double STEP = 0.5;
+constexpr double STEP = 0.5;  // as in render/border.py
 
-// The part of a difference on the blur axis that is a step between surfaces; 0 for a slope.
+// The part of a difference on the blur axis that is a step between surfaces; 0 for a slope. Below, its derivative.
 static double step_of(double difference) { return difference * std::clamp(std::fabs(difference) / STEP - 1.0, 0.0, 1.0); }
+static double slope_of_step(double difference) {
+  const double steps = std::fabs(difference) / STEP;
+  return steps < 1.0 ? 0.0 : steps > 2.0 ? 1.0 : 2.0 * steps - 1.0;
+}
 
-// Computes, for each side of the frame and each surface, means of the light along the border.
-//
-// 1. Place the border's pixels on an axis on which only steps between surfaces count, in BINS bins.
-// 2. Accumulate light and weight along the border for each bin and all farther ones, so that nearer surfaces are left out.
-// 3. Differences of these sums are the means over windows of doubling width, one for each level.
+WindowSums::WindowSums(int length, int count, const double *values, const double *places)
+    : length_(length), count_(count), bin_(length), part_(length), until_((size_t)(length + 1) * count * BINS) {
+  typedef double bins __attribute__((vector_size(BINS * sizeof(double))));
+  bins before;  // index of the bin before each one
+  for (int k = 0; k < BINS; k++) before[k] = k - 1;
+  double *until = until_.data();
+  std::fill_n(until, count * BINS, 0.0);
+  for (int at = 0; at < length; at++) {
+    bin_[at] = std::min((int)places[at], BINS - 2);
+    part_[at] = places[at] - bin_[at];
+    // shares of the pixel in each bin and all farther ones
+    const bins shares = least(most(places[at] - before, bins{}), bins{} + 1.0);
+    for (int n = 0; n < count; n++, until += BINS) store(until + count * BINS, load<bins>(until) + shares * *values++);
+  }
+}
+
+void WindowSums::sum(int level, double *sums, double *slopes) const {
+  const int half = (int)std::min<int64_t>((int64_t)WIDTH << level, length_);
+  for (int at = 0, i = 0; at < length_; at++) {
+    const double *from = &until_[(size_t)std::max(at - half, 0) * count_ * BINS];
+    const double *to = &until_[(size_t)std::min(at + half + 1, length_) * count_ * BINS];
+    const int bin = bin_[at], before = std::max(bin - (part_[at] == 0), 0);  // a place at a bin has slopes to both sides
+    for (int n = 0; n < count_; n++, i++, from += BINS, to += BINS) {
+      const double lower = to[bin] - from[bin], upper = to[bin + 1] - from[bin + 1];
+      sums[i] = (1.0 - part_[at]) * lower + part_[at] * upper;
+      if (slopes) slopes[i] = (part_[at] < 1 ? upper : 0.0) - (to[before] - from[before]);
+    }
+  }
+}
+
+void BorderLine::set_light(int at, const float *const *light, int channels, float weight, float limit) {
+  float brightest = *light[0];
+  for (int c = 1; c < channels; c++) brightest = std::max(brightest, *light[c]);
+  if (brightest > limit) shares[at] = limit / brightest;
+  double *const value = &values[(size_t)at * (channels + 1)];
+  for (int c = 0; c < channels; c++) value[c] = *light[c] * shares[at] * (double)weight;
+  value[channels] = weight;
+}
+
+void BorderLine::find_places() {
+  for (size_t at = 1; at < x.size(); at++) surface[at] = surface[at - 1] + step_of(image_x[at] - image_x[at - 1]);
+  const auto ends = std::minmax_element(surface.begin(), surface.end());
+  least = *ends.first, most = *ends.second, per_bin = (WindowSums::BINS - 1) / std::max(most - least, 1.0);
+  for (size_t at = 0; at < x.size(); at++)
+    places[at] = std::clamp((surface[at] + step_of(x[at] - image_x[at]) - least) * per_bin, 0.0, WindowSums::BINS - 1.0);
+}
+
+void BorderLine::gradient(const double *of_places, ptrdiff_t step, float *of_x, float *of_image_x) const {
+  std::vector<double> of_surface(x.size());
+  double of_least = 0, of_most = 0, of_next = 0;
+  for (size_t at = 0; at < x.size(); at++) {
+    const double own = x[at] - image_x[at], place = (surface[at] + step_of(own) - least) * per_bin;
+    of_surface[at] = place < 0 || place > WindowSums::BINS - 1 ? 0.0 : of_places[at] * per_bin;
+    of_least -= of_surface[at];
+    if (most - least >= 1) of_most -= of_surface[at] * place / (WindowSums::BINS - 1);
+    of_x[at * step] += of_surface[at] * slope_of_step(own);
+    of_image_x[at * step] -= of_surface[at] * slope_of_step(own);
+  }
+  // pixels of equal extremes share their gradient
+  of_least = (of_least - of_most) / std::count(surface.begin(), surface.end(), least);
+  of_most /= std::count(surface.begin(), surface.end(), most);
+  for (size_t at = x.size() - 1; at > 0; at--) {
+    of_next += of_surface[at] + (surface[at] == least) * of_least + (surface[at] == most) * of_most;
+    const double slope = of_next * slope_of_step(image_x[at] - image_x[at - 1]);
+    of_image_x[at * step] += slope;
+    of_image_x[(at - 1) * step] -= slope;
+  }
+}
+
+Border::Border(int height, int width, int channels, int surfaces, int farthest)
+    : height_(height), width_(width), channels_(channels) {
+  while (farthest >> levels_) levels_++;
+  levels_++;
+  for (int distance = 0, level = 0; distance <= farthest; distance++) {
+    while (2 << level <= distance) level++;
+    level_of_.push_back(level);
+    part_of_.push_back((float)distance / (1 << level) - 1.0f);
+  }
+  for (auto side : {TOP, BOTTOM, LEFT, RIGHT}) {
+    means_[side].resize(start(side, surfaces, 0, 0));
+    shares_[side].resize((size_t)surfaces * length(side));
+  }
+}
+
+void Border::set(Side side, int surface, const BorderLine &line) {
+  const int sums = channels_ + 1;
+  std::copy(line.shares.begin(), line.shares.end(), shares_[side].begin() + (size_t)surface * length(side));
+  const WindowSums windows(length(side), sums, line.values.data(), line.places.data());
+  std::vector<double> sum(line.values.size());
+  for (int level = 0; level < levels_; level++) {
+    windows.sum(level, sum.data());
+    for (int at = 0; at < length(side); at++) {
+      const double *of = &sum[(size_t)at * sums], total = of[channels_];
+      for (int c = 0; c < channels_; c++) means_[side][start(side, surface, c, level) + at] = total > 0 ? (float)(of[c] / total) : 0.0f;
+    }
+  }
+}
+
 Border border_of(const Job &job, int farthest) {
   const Surfaces &s = job.surfaces;
   Border border;
-  border.height_ = job.height, border.width_ = job.width, border.channels_ = job.channels;
   border.dark_ = !job.scene.occlusion && !job.scene.normalize;
   if (border.dark_) return border;
-  while (farthest >> border.levels_) border.levels_++;
-  border.levels_++;
-  for (int distance = 0, level = 0; distance <= farthest; distance++) {
-    while (2 << level <= distance) level++;
-    border.level_of_.push_back(level);
-    border.part_of_.push_back((float)distance / (1 << level) - 1.0f);
-  }
-  for (auto side : {Border::TOP, Border::BOTTOM, Border::LEFT, Border::RIGHT}) {
-    border.means_[side].resize(border.start(side, s.count, 0, 0));
-    border.shares_[side].resize((size_t)s.count * border.length(side));
-  }
+  border = Border(job.height, job.width, job.channels, s.count, farthest);
   const float low = (float)job.scene.nodes[0], high = (float)job.scene.nodes[job.scene.layers - 1];
   job.parallel(4, [&](int which, int) {
     const auto side = (Border::Side)which;
-    const bool upright = side >= Border::LEFT;
-    const int length = border.length(side), C = job.channels, sums = C + 1;
-    const auto row_of = [&](int at) { return upright ? at : side == Border::TOP ? 0 : job.height - 1; };
-    const auto column_of = [&](int at) { return !upright ? at : side == Border::LEFT ? 0 : job.width - 1; };
-    std::vector<double> until((size_t)(length + 1) * BINS * sums);  // prefix sums of each bin: weighted light, weight
-    std::vector<int> bin(length);                                   // lower of each pixel's two bins
-    std::vector<double> part(length);                               // weight of the upper one
-    std::vector<double> image_x(length), surface(length);           // positions on the blur axis; accumulated steps
-    std::vector<const float *> light(C);
+    std::vector<const float *> light(job.channels);
     const float *coc, *weight;
     for (int i = 0; i < s.count; i++) {
       const float *const image = job.scene.kind == TORCHDOF_STACK ? s.cocs[i] : s.coc;
-      for (int at = 0; at < length; at++) {
-        image_x[at] = axis(image[(size_t)row_of(at) * job.width + column_of(at)], low, high);
-        surface[at] = at ? surface[at - 1] + step_of(image_x[at] - image_x[at - 1]) : 0.0;
+      BorderLine line(border.length(side), job.channels);
+      for (int at = 0; at < border.length(side); at++) {
+        const int y = side >= Border::LEFT ? at : side == Border::TOP ? 0 : job.height - 1;
+        const int x = side < Border::LEFT ? at : side == Border::LEFT ? 0 : job.width - 1;
+        line.x[at] = line.image_x[at] = axis(image[(size_t)y * job.width + x], low, high);
+        if (!s.row(i, y, x, light.data(), coc, weight)) continue;
+        line.x[at] = axis(*coc, low, high);
+        const float limit = job.threshold.empty() ? INFINITY : threshold_at(job, y, x);
+        line.set_light(at, light.data(), job.channels, weight ? *weight : 1.0f, limit);
       }
-      const auto ends = std::minmax_element(surface.begin(), surface.end());
-      const double least_surface = *ends.first, per_bin = (BINS - 1) / std::max(*ends.second - least_surface, 1.0);
-      for (int at = 0; at < length; at++) {
-        const int y = row_of(at), x = column_of(at);
-        double *after = &until[(size_t)(at + 1) * BINS * sums];
-        std::copy(after - BINS * sums, after, after);
-        const bool there = s.row(i, y, x, light.data(), coc, weight);
-        const double w = !there ? 0.0 : weight ? *weight : 1.0;
-        float share = 1.0f;  // part of its light below the highlight threshold
-        if (there && !job.threshold.empty()) {
-          float brightest = *light[0];
-          for (int c = 1; c < C; c++) brightest = std::max(brightest, *light[c]);
-          const float limit = threshold_at(job, y, x);
-          if (brightest > limit) share = limit / brightest;
-        }
-        border.shares_[side][(size_t)i * length + at] = share;
-        const double step = there ? step_of(axis(*coc, low, high) - image_x[at]) : 0.0;
-        const double place = std::clamp((surface[at] + step - least_surface) * per_bin, 0.0, BINS - 1.0);
-        bin[at] = std::min((int)place, BINS - 2);
-        part[at] = place - bin[at];
-        for (int next = 0; next < 2 && there; next++) {
-          const double its_weight = w * (next ? part[at] : 1.0 - part[at]);
-          double *const to = after + (bin[at] + next) * sums;
-          for (int c = 0; c < C; c++) to[c] += *light[c] * share * its_weight;
-          to[C] += its_weight;
-        }
-      }
-      for (size_t at = 1; at <= (size_t)length; at++)  // add the sums of all farther bins
-        for (int n = (BINS - 1) * sums - 1; n >= 0; n--) until[at * BINS * sums + n] += until[at * BINS * sums + n + sums];
-      for (int level = 0; level < border.levels_; level++) {
-        const int half = (int)std::min<int64_t>((int64_t)WIDTH << level, length);
-        for (int at = 0; at < length; at++) {
-          const double *from = &until[((size_t)std::max(at - half, 0) * BINS + bin[at]) * sums];
-          const double *to = &until[((size_t)std::min(at + half + 1, length) * BINS + bin[at]) * sums];
-          const auto of = [&](int n) { return (1.0 - part[at]) * (to[n] - from[n]) + part[at] * (to[n + sums] - from[n + sums]); };
-          const double total = of(C);
-          for (int c = 0; c < C; c++) border.means_[side][border.start(side, i, c, level) + at] = total > 0 ? (float)(of(c) / total) : 0.0f;
-        }
-      }
+      line.find_places();
+      border.set(side, i, line);
     }
   });
   return border;

@@ -155,6 +155,14 @@ inline float peak_of(const float *light, size_t step, int channels) {
   return peak;
 }
 
+// Adds the gradient by that peak, which equal channels share.
+inline void add_to_peak(const float *light, size_t step, int channels, float peak, float of_peak, float *of_light) {
+  int peaks = 0;
+  for (int c = 0; c < channels; c++) peaks += light[c * step] == peak;
+  for (int c = 0; c < channels; c++)
+    if (light[c * step] == peak) of_light[c * step] += of_peak / peaks;
+}
+
 inline int place_in_block(int y, int x) { return y % BLOCK * BLOCK + x % BLOCK; }
 
 // The surfaces of a scene: either an image with a second surface in some blocks, or any number of full planes.
@@ -354,9 +362,46 @@ float least_threshold(const Job &job, int y0, int x0);
 // Highlight threshold of a pixel.
 float threshold_at(const Job &job, int y, int x);
 
+// Sums of values [length, count] of pixels over windows along a line; each level has a width, twice that of the level before.
+// Pixels on surfaces nearer than that of the window's middle are left out. places: of the pixels, in bins. border.cpp
+class WindowSums {
+ public:
+  static constexpr int WIDTH = 4, BINS = 16;  // render/border.py gives their meanings and effects
+  WindowSums(int length, int count, const double *values, const double *places);
+  // Computes the sums [length, count] of a level and, unless null, their derivatives by the place of the window's middle.
+  void sum(int level, double *sums, double *slopes = nullptr) const;
+
+ private:
+  int length_, count_;
+  std::vector<int> bin_;      // lower of each pixel's two bins
+  std::vector<double> part_;  // weight of the upper one
+  Buffer<double> until_;      // sums from the line's start on, of each bin and all farther ones [length + 1, count, BINS]
+};
+
+// The pixels of one surface along one side of the frame; border.cpp
+struct BorderLine {
+  BorderLine(int length, int channels)
+      : image_x(length), x(length), surface(length), places(length), values((size_t)length * (channels + 1)), shares(length, 1.0f) {}
+  void set_light(int at, const float *const *light, int channels, float weight, float limit);
+  void find_places();
+  // Adds gradients by x and image_x, whose pixels lie `step` values apart.
+  void gradient(const double *of_places, ptrdiff_t step, float *of_x, float *of_image_x) const;
+
+  std::vector<double> image_x, x;       // positions on the blur axis, of the image and of the surface
+  std::vector<double> surface, places;  // accumulated steps of the image; place of each pixel in bins
+  std::vector<double> values;           // [length, channels + 1]: weighted light, weight
+  std::vector<float> shares;            // of the light below the highlight threshold
+  double least, most, per_bin;          // smallest and largest accumulated steps; bins for each
+};
+
 // Estimate of the light beyond the frame; border.cpp
 class Border {
  public:
+  enum Side { TOP, BOTTOM, LEFT, RIGHT };
+  Border() = default;
+  Border(int height, int width, int channels, int surfaces, int farthest);
+  // Computes the means along a line.
+  void set(Side side, int surface, const BorderLine &line);
   // Light of a surface at a position beyond the frame; nearest: light of the nearest pixel inside.
   float light(int surface, int channel, int y, int x, float nearest) const {
     if (dark_) return 0;
@@ -392,7 +437,6 @@ class Border {
 
  private:
   friend Border border_of(const Job &job, int farthest);
-  enum Side { TOP, BOTTOM, LEFT, RIGHT };
   int length(Side side) const { return side <= BOTTOM ? width_ : height_; }
   size_t start(Side side, int surface, int channel, int level) const {
     return ((size_t)(surface * channels_ + channel) * levels_ + level) * length(side);

@@ -126,12 +126,8 @@ class Farthest {
         of_maps[2 * t.mixed][c * area_ + t.at] += slope[c] * t.count * t.dimmed;
         of_dimmed += slope[c] * t.count * light(t, c);
       }
-      if (t.peak > threshold_[t.at]) {  // the peak's gradient, shared by equal channels
-        int peaks = 0;
-        for (int c = 0; c < C_; c++) peaks += light(t, c) == t.peak;
-        for (int c = 0; c < C_; c++)
-          if (light(t, c) == t.peak) of_maps[2 * t.mixed][c * area_ + t.at] -= of_dimmed * t.dimmed / (t.peak * peaks);
-      }
+      if (t.peak > threshold_[t.at])
+        add_to_peak(light_[t.mixed] + t.at, area_, C_, t.peak, -of_dimmed * t.dimmed / t.peak, of_maps[2 * t.mixed] + t.at);
       of_maps[4][t.at] += (t.mixed ? t.valid : -t.valid) * of_count * (1.0f - clamp01(t.behind)) * t.share;
     }
     for (int k = 0; k < s.number; k++) {

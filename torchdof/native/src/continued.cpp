@@ -1,0 +1,141 @@
+// Light continued beyond the frame's border, forward and backward, for training: the function _continued of
+// render/border.py. Inference computes only the parts that it needs, in border.cpp.
+//
+// For a pixel i of a line along the border with light I and weight w, and the pixels j within 4 d pixels of it:
+//
+//   light at distance d = (I_i + sum K_ij w_j I_j / sum K_ij w_j) / 2
+//
+// K_ij is the share of pixel j that is on the surface of pixel i or on a farther one. With all places reversed, the shares
+// are K_ji, so that the gradients of sums over windows are sums over windows again.
+#include "engine.h"
+
+namespace torchdof {
+namespace {
+
+// The maps of a frame. Sides are those of Border.
+struct Frame {
+  const float *const *light, *weight, *x, *image_x, *limit;  // light: of each surface
+  const int32_t S, C, height, width, *ends;  // numbers of surfaces and channels; pixels added at the left, right, top, bottom
+  const size_t area = (size_t)height * width, pitch = ends[0] + width + ends[1], wide_area = pitch * (ends[2] + height + ends[3]);
+  const size_t first = ends[2] * pitch + ends[0];  // the frame's first pixel in a continued map
+
+  int length(int side) const { return side < Border::LEFT ? width : height; }
+  // Offset of a pixel beyond pixel `at` of a side, or of that pixel itself, from the frame's first pixel.
+  ptrdiff_t place(int side, int at, int distance, ptrdiff_t its_pitch) const {
+    const int across = side % 2 ? length(side ^ 2) - 1 + distance : -distance;
+    return side < Border::LEFT ? across * its_pitch + at : at * its_pitch + across;
+  }
+
+  BorderLine line_of(int side, int s) const {
+    BorderLine line(length(side), C);
+    std::vector<const float *> colours(C);
+    for (int at = 0; at < length(side); at++) {
+      const size_t pixel = place(side, at, 0, width);
+      for (int c = 0; c < C; c++) colours[c] = light[s] + c * area + pixel;
+      line.set_light(at, colours.data(), C, weight[s * area + pixel], limit[pixel]);
+      line.x[at] = x[s * area + pixel], line.image_x[at] = image_x[s * area + pixel];
+    }
+    line.find_places();
+    return line;
+  }
+
+  void write(int threads, float *out) const {
+    Border border(height, width, C, S, *std::max_element(ends, ends + 4));
+    parallel(threads, 4 * S, nullptr, [&](int i, int) { border.set((Border::Side)(i % 4), i / 4, line_of(i % 4, i / 4)); });
+    parallel(threads, S * C, nullptr, [&](int plane, int) {
+      const int s = plane / C, c = plane % C;
+      for (int y = -ends[2]; y < height + ends[3]; y++) {
+        const int nearest = std::clamp(y, 0, height - 1);
+        const float *const from = light[s] + c * area + (size_t)nearest * width;
+        float *const to = out + plane * wide_area + first + y * (ptrdiff_t)pitch;
+        std::copy_n(from, width, to);
+        if (y != nearest) border.continue_row(s, c, y, 0, width, to);
+        for (int column = -ends[0]; column < 0; column++) to[column] = border.light(s, c, y, column, from[0]);
+        for (int column = width; column < width + ends[1]; column++) to[column] = border.light(s, c, y, column, from[width - 1]);
+      }
+    });
+  }
+
+  // Adds the gradients by the maps of surface s.
+  void gradient(int s, const float *slopes, float *const *of_maps) const {
+    slopes += s * C * wide_area + first;
+    for (int c = 0; c < C; c++)
+      for (size_t y = 0; y < (size_t)height; y++)
+        for (int at = 0; at < width; at++) of_maps[s][c * area + y * width + at] += slopes[c * wide_area + y * pitch + at];
+    for (int side = 0; side < 4; side++) add_line(side, s, slopes, of_maps);
+  }
+
+  // Adds the gradients by the pixels of a line.
+  void add_line(int side, int s, const float *slopes, float *const *of_maps) const {
+    const BorderLine line = line_of(side, s);
+    const int n = length(side), sums = C + 1, added = ends[side ^ 2], *const beside = ends + (side & 2);
+    const ptrdiff_t wide_step = place(side, 1, 0, pitch) - place(side, 0, 0, pitch);
+    int levels = 2;
+    while (1 << (levels - 1) <= added) levels++;
+    // gradients by the means of each level; each distance has half of the mean, and half of the nearest pixel
+    std::vector<float> of_means(levels * C * n), row(n);
+    for (int c = 0; c < C; c++)
+      for (int distance = 1, level = 0; distance <= added; distance++) {
+        const float *const beyond = slopes + c * wide_area + place(side, 0, distance, pitch);
+        for (int at = 0; at < n; at++) row[at] = beyond[at * wide_step];
+        for (int k = 1; k <= beside[0]; k++) row[0] += beyond[-k * wide_step] * distance / (distance + k);
+        for (int k = 1; k <= beside[1]; k++) row[n - 1] += beyond[(n - 1 + k) * wide_step] * distance / (distance + k);
+        while (2 << level <= distance) level++;
+        const float part = (float)distance / (1 << level) - 1.0f;
+        float *const near = &of_means[(level * C + c) * n], *const far = near + C * n;
+        for (int at = 0; at < n; at++) near[at] += 0.5f * (1.0f - part) * row[at];
+        for (int at = 0; at < n; at++) far[at] += 0.5f * part * row[at];
+      }
+
+    // gradients by the nearest pixels, by the values in the sums, and by places
+    std::vector<double> sum(n * sums), slope(n * sums), of_sum(n * sums), of_nearest(n * C), of_values(n * sums), of_places(n);
+    std::vector<double> reversed(n);
+    for (int at = 0; at < n; at++) reversed[at] = WindowSums::BINS - 1 - line.places[at];
+    const WindowSums windows(n, sums, line.values.data(), line.places.data());
+    for (int level = 0; level < levels; level++) {
+      windows.sum(level, sum.data(), slope.data());
+      for (int at = 0; at < n; at++) {
+        double *const of = &of_sum[at * sums], *const own = &sum[at * sums], total = own[C] > 0 ? own[C] : 1.0;
+        of[C] = 0;
+        for (int c = 0; c < C; c++) {
+          of_nearest[at * C + c] += of_means[(level * C + c) * n + at];
+          of[c] = of_means[(level * C + c) * n + at] / total;
+          if (own[C] > 0) of[C] -= of[c] * own[c] / total;
+        }
+        for (int k = 0; k < sums; k++) of_places[at] += of[k] * slope[at * sums + k];
+      }
+      WindowSums(n, sums, of_sum.data(), reversed.data()).sum(level, sum.data(), slope.data());
+      for (int at = 0, k = 0; at < n; at++)
+        for (int end = k + sums; k < end; k++) of_values[k] += sum[k], of_places[at] -= line.values[k] * slope[k];
+    }
+
+    const size_t start = place(side, 0, 0, width), step = place(side, 1, 0, width) - start, of_surface = s * area + start;
+    for (int at = 0; at < n; at++) {
+      const float *const pixel = light[s] + start + at * step, share = line.shares[at], peak = peak_of(pixel, area, C);
+      float *const of_light = of_maps[s] + start + at * step;
+      double of_weight = of_values[at * sums + C], of_share = 0;
+      for (int c = 0; c < C; c++) {
+        const double of_dimmed = of_nearest[at * C + c] + of_values[at * sums + c] * line.values[at * sums + C];
+        of_light[c * area] += (float)(of_dimmed * share);
+        of_share += of_dimmed * pixel[c * area];
+        of_weight += of_values[at * sums + c] * pixel[c * area] * share;
+      }
+      if (share < 1) add_to_peak(pixel, area, C, peak, (float)-of_share * share / peak, of_light);
+      of_maps[S][of_surface + at * step] += (float)of_weight;
+    }
+    line.gradient(of_places.data(), step, of_maps[S + 1] + of_surface, of_maps[S + 2] + of_surface);
+  }
+};
+
+}  // namespace
+}  // namespace torchdof
+
+int32_t torchdof_continued(const float *const *maps, int32_t surfaces, int32_t channels, int32_t height, int32_t width,
+                           const int32_t *ends, int32_t threads, float *out, const float *gradient, float *const *of_maps) {
+  return torchdof::guarded([&] {
+    const float *const *const others = maps + surfaces;
+    const torchdof::Frame frame{maps, others[0], others[1], others[2], others[3], surfaces, channels, height, width, ends};
+    if (!gradient) return frame.write(threads, out);
+    torchdof::parallel(threads, surfaces, nullptr, [&](int s, int) { frame.gradient(s, gradient, of_maps); });
+  });
+}
