@@ -353,7 +353,7 @@ void check_blend(unsigned seed) {
   check_threads(blend, "blended layers", int(seed));
 }
 
-// Reads the surfaces behind pixels from one to four levels of a pyramid, and computes the gradient.
+// Reads the surfaces behind pixels or cells from the levels of a pyramid, and computes the gradient.
 void check_look_behind(unsigned seed) {
   std::mt19937 random(seed);
   const auto integer = [&](int low, int high) { return std::uniform_int_distribution<int>(low, high)(random); };
@@ -371,17 +371,20 @@ void check_look_behind(unsigned seed) {
     append(values[l], noise(random, size, 0.0, 1.0));
     levels.push_back({values[l].data(), rows / step, columns / step, step, 0.5f * step, 4.0f, 2.0f});
   }
-  const std::vector<float> coc = noise(random, pixels, -20.0, 20.0), slopes = noise(random, (channels + 2) * pixels, -1.0, 1.0);
+  const std::vector<float> coc = noise(random, pixels, -20.0, 20.0), random_wanted = noise(random, pixels, -1.0, 0.1);
+  const float *const wanted = integer(0, 1) ? random_wanted.data() : nullptr;
+  const size_t places = wanted ? size_t(rows / 4) * (columns / 4) * (count > 2 ? 2 : 1) : pixels;
+  const std::vector<float> slopes = noise(random, (channels + 2) * places, -1.0, 1.0);
   const auto look = [&](int threads) {
     std::vector<float> all(slopes.size()), of_coc(pixels);
     std::vector<std::vector<float>> of_levels;
     std::vector<float *> of_levels_at;
     for (const std::vector<float> &of_level : values) of_levels.emplace_back(of_level.size(), 0.0f);
     for (std::vector<float> &of_level : of_levels) of_levels_at.push_back(of_level.data());
-    if (torchdof_look_behind(levels.data(), count, channels, coc.data(), height, width, threads, all.data(), nullptr, nullptr,
-                             nullptr) != TORCHDOF_OK)
+    if (torchdof_look_behind(levels.data(), count, channels, coc.data(), wanted, height, width, threads, all.data(), nullptr,
+                             nullptr, nullptr) != TORCHDOF_OK)
       fail("surfaces behind cannot be found", int(seed));
-    if (torchdof_look_behind(levels.data(), count, channels, coc.data(), height, width, threads, nullptr, slopes.data(),
+    if (torchdof_look_behind(levels.data(), count, channels, coc.data(), wanted, height, width, threads, nullptr, slopes.data(),
                              of_levels_at.data(), of_coc.data()) != TORCHDOF_OK)
       fail("surfaces behind have no gradient", int(seed));
     append(all, of_coc);

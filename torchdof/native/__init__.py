@@ -29,7 +29,7 @@ Kind = Literal["image", "background", "stack"]
 other, near to far."""
 
 HALF_LARGEST = 256  # largest half width of a kernel, in pixels of its layer; PyTorch blurs with larger ones
-MOST_LEVELS = 4  # most levels of look_behind
+MOST_LEVELS = 7  # most levels of look_behind
 MOST_PLANES = 16  # most channels of light and kernels' colours together in blend
 
 _SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
@@ -96,7 +96,7 @@ _FUNCTIONS = {
     "blend": "int layers* data data data* data* data*",
     "matte": "int data* int int int int data data data*",
     "farthest": "int data* int int int int int int data data data*",
-    "look_behind": "int level* int int data int int int data data data* data",
+    "look_behind": "int level* int int data data int int int data data data* data",
     "continued": "int data* int int int int int* int data data data*",
     "coc": "int data long real real real int data",
     "plan": "int data int int int double* int double* int int*",
@@ -290,44 +290,54 @@ def matte_gradient(
 
 
 def farthest(maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
-    """The finest level of a pyramid of the farthest surfaces, as ``torchdof.render.disocclusion`` defines it.
+    """A level of a pyramid of the farthest surfaces, as ``torchdof.render.disocclusion`` defines it.
 
-    ``maps`` are those of ``_finest_level`` there, for one image; ``size`` is the level's height and width. The result
-    is light, coc and weight, ``[C + 2, h, w]``.
+    ``maps`` are those of ``_finest_level`` there, for one image; or light, coc and weight of the next finer level.
+    ``size`` is the level's height and width. The result is light, coc and weight, ``[C + 2, h, w]``.
     """
     out = _empty(maps[0].shape[0] + 2, *size)
-    _run("farthest", [*maps, None], *maps[0].shape, *size, torch.get_num_threads(), out, None, None)
+    _run("farthest", _of_surfaces(maps), *maps[0].shape, *size, torch.get_num_threads(), out, None, None)
     return out
 
 
 def farthest_gradient(maps: Sequence[Tensor], size: tuple[int, int], gradient: Tensor) -> list[Tensor]:
-    """The gradients of :func:`farthest` by its first five maps."""
-    sums = [_empty(*values.shape).zero_() for values in maps[:5]]
-    _run("farthest", [*maps, None], *maps[0].shape, *size, torch.get_num_threads(), None, gradient, sums)
+    """The gradients of :func:`farthest` by its first five maps, or by all three."""
+    sums, threads = [_empty(*values.shape).zero_() for values in maps[:5]], torch.get_num_threads()
+    _run("farthest", _of_surfaces(maps), *maps[0].shape, *size, threads, None, gradient, _of_surfaces(sums))
     return sums
 
 
-def look_behind(levels: Sequence[Tensor], rules: Rules, coc: Tensor) -> Tensor:
+def _of_surfaces(maps: Sequence[Tensor]) -> list[Tensor | None]:
+    return [*maps[:2], None, None, maps[2], None, None] if len(maps) == 3 else [*maps, None]
+
+
+def look_behind(levels: Sequence[Tensor], rules: Rules, coc: Tensor, wanted: Tensor | None = None) -> Tensor:
     """Surfaces behind those of an image with coc ``[1, H, W]``, as ``torchdof.render.disocclusion`` defines them.
 
     ``levels`` have light, coc and weight of each level of a pyramid, ``[C + 2, h, w]``, and ``rules`` its step,
-    least_px, slope and most, as in ``torchdof_level``. The result is light, coc and votes, ``[C + 2, H, W]``.
+    least_px, slope and most, as in ``torchdof_level``. The result is light, coc and votes, ``[C + 2, H, W]``. With a
+    map ``wanted`` ``[1, H, W]``, it is that of cells, ``[C + 2 or 2 C + 4, h, w]``.
     """
     out = _empty(levels[0].shape[0], *coc.shape[1:])
-    _run("look_behind", *_level_arguments(levels, rules, coc), out, None, None, None)
+    if wanted is not None:
+        planes, *size = levels[0].shape
+        out = _empty(planes * (2 if len(levels) > 2 else 1), *(n * rules[0][0] // 4 for n in size))
+    _run("look_behind", *_level_arguments(levels, rules, coc, wanted), out, None, None, None)
     return out
 
 
-def look_behind_gradient(levels: Sequence[Tensor], rules: Rules, coc: Tensor, gradient: Tensor) -> list[Tensor]:
+def look_behind_gradient(
+    levels: Sequence[Tensor], rules: Rules, coc: Tensor, gradient: Tensor, wanted: Tensor | None = None
+) -> list[Tensor]:
     """The gradients of :func:`look_behind` by coc and by each level."""
-    of_coc, of_levels = _empty(*coc.shape), [_empty(*values.shape).zero_() for values in levels]
-    _run("look_behind", *_level_arguments(levels, rules, coc), None, gradient, of_levels, of_coc)
+    of_coc, *of_levels = (_empty(*values.shape).zero_() for values in (coc, *levels))
+    _run("look_behind", *_level_arguments(levels, rules, coc, wanted), None, gradient, of_levels, of_coc)
     return [of_coc, *of_levels]
 
 
-def _level_arguments(levels: Sequence[Tensor], rules: Rules, coc: Tensor) -> tuple[Any, ...]:
+def _level_arguments(levels: Sequence[Tensor], rules: Rules, coc: Tensor, wanted: Tensor | None) -> tuple[Any, ...]:
     each = [_TYPES["level"](values, *values.shape[1:], *rule) for values, rule in zip(levels, rules, strict=True)]
-    return each, len(each), levels[0].shape[0] - 2, coc, *coc.shape[1:], torch.get_num_threads()
+    return each, len(each), levels[0].shape[0] - 2, coc, wanted, *coc.shape[1:], torch.get_num_threads()
 
 
 def continued(maps: Sequence[Tensor], ends: Sequence[int]) -> Tensor:

@@ -41,7 +41,7 @@ class _Step(torch.autograd.Function):
     def forward(ctx: Any, forward: Any, backward: Any, plain: Any, *tensors: Tensor) -> Tensor:
         ctx.backward_of_item, ctx.plain = backward, plain
         ctx.save_for_backward(*tensors)
-        return torch.stack([forward(*item) for item in zip(*(t.detach() for t in tensors), strict=True)])
+        return _stacked([forward(*item) for item in zip(*(t.detach() for t in tensors), strict=True)])
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
@@ -55,5 +55,9 @@ class _Step(torch.autograd.Function):
         else:
             items = zip(gradient, *(t.detach() for t in tensors), strict=True)
             of_items = [ctx.backward_of_item(*item) for item in items]
-            found = [torch.stack(of_tensor) for of_tensor in zip(*of_items, strict=True)]
+            found = [_stacked(of_tensor) for of_tensor in zip(*of_items, strict=True)]
         return None, None, None, *found, *[None] * (len(tensors) - len(found))
+
+
+def _stacked(items: Sequence[Tensor]) -> Tensor:
+    return torch.stack([*items]) if len(items) > 1 else items[0][None]  # without a copy

@@ -6,7 +6,7 @@ the place of this pixel. Its weight is very small, so that it matters only where
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as functional
@@ -181,8 +181,9 @@ def _surfaces_of_image(
     if ops.has_rays:
         matted = attribute_emitters(light, coc_px, threshold, valid, matted)
     own, other, other_coc, other_weight = matted
-    # weight with which a mixed pixel's other surface counts: 0 up to HIDDEN_WEIGHT / 2, unchanged at HIDDEN_WEIGHT
-    counted = other_weight * (other_weight * (2.0 / HIDDEN_WEIGHT) - 1.0).clamp(0.0, 1.0)
+    # a mixed pixel's other surface does not count up to a weight of HIDDEN_WEIGHT / 2, 0 here; fully from twice that, 1
+    mixed = other_weight * (2.0 / HIDDEN_WEIGHT) - 1.0
+    counted = other_weight * mixed.clamp(0.0, 1.0)
 
     colours = light.shape[1]
     sizes = [[_continued(n, 2**own) for own in levels] for n in coc_px.shape[-2:]]
@@ -190,39 +191,29 @@ def _surfaces_of_image(
     maps = [own, coc_px, other, other_coc, other_weight, threshold, *([] if valid is None else [valid])]
     pyramid = [_repeated(finest_level((rows // 2, columns // 2), *maps), sizes, 1)]
     for level in range(2, max(levels) + 1):
-        pyramid.append(_repeated(_farthest(pyramid[-1]), sizes, level))
-    # cells without valid pixels get the mean light of the others
-    far_light, far_coc, far_weight = pyramid[_FINE_LEVELS - 1].split([colours, 1, 1], 1)
-    total = far_weight.sum((-2, -1), keepdim=True).clamp_min(1e-12)
-    mean = (far_light * far_weight).sum((-2, -1), keepdim=True) / total
-    far_light = torch.where(far_weight > 0, far_light, mean)
-    pyramid[_FINE_LEVELS - 1] = torch.cat([far_light, far_coc, far_weight], 1)
+        pyramid.append(_repeated(coarser_level(pyramid[-1]), sizes, level))
     # a pixel reads a level from a blur of a quarter of its step on
     searched = [Level(t, 2**i, 2.0 ** (i - 2), _FALL**i / _SURE, _FALL**i) for i, t in enumerate(pyramid, 1)]
 
     # the farthest surface around each cell of 4 x 4 pixels, and one level of cells that replaces all coarse levels
     size = (rows // BEHIND_STEP, columns // BEHIND_STEP)
-    wanted = ((coc_px.abs() > 0.5) & (2.0 * other_weight < HIDDEN_WEIGHT)).to(coc_px.dtype)
-    cells = _largest(torch.cat([-coc_px, wanted], 1), *size, BEHIND_STEP)
-    nearest, is_wanted = -cells[:, :1], cells[:, 1:] > 0
-    samples, shares = _samples(searched, size, BEHIND_STEP)
-    shown, known = shown_behind(torch.stack(samples), shares[:, None, None], nearest)
-    found = [*search(searched, shown, known, nearest, farthest=True)]
+    wanted = ((coc_px.abs() > 0.5) & (mixed < 0)).to(coc_px.dtype)
     coarse = searched[_FINE_LEVELS:]
+    looked = behind_cells(searched, size, coc_px, wanted, ops)
+    behind, _, votes, *of_coarse = looked.split([colours, 1, 1, *([colours + 2] if coarse else [])], 1)
+    # where nothing lies behind, the farthest surface of the cell; in a cell without valid pixels, the mean of all cells
+    far_light, _, far_weight = pyramid[_FINE_LEVELS - 1].split([colours, 1, 1], 1)
+    mean = (far_light * far_weight).sum((-2, -1), keepdim=True)
+    mean = mean / far_weight.sum((-2, -1), keepdim=True).clamp_min(1e-12)
+    behind = torch.where(votes > 0, behind, torch.where(far_weight > 0, far_light, mean))
     if coarse:
-        found += search(coarse, shown[_FINE_LEVELS:], known[_FINE_LEVELS:], nearest)
-    looked = torch.cat(found, 1)
-    looked = ops.choose(lambda: is_wanted.any(), looked * is_wanted, torch.zeros_like(looked))
-    behind = torch.where(looked[:, colours + 1 : colours + 2] > 0, looked[:, :colours], far_light)
-    if coarse:
-        of_cells = Level(looked[:, colours + 2 :], BEHIND_STEP, coarse[0].least_px, 1.0, math.inf)
+        of_cells = Level(of_coarse[0], BEHIND_STEP, coarse[0].least_px, 1.0, math.inf)
         searched = [*searched[:_FINE_LEVELS], of_cells]
     seen, total = ops.seen(_seen, searched, coc_px, wanted)
 
     # Up to HIDDEN_WEIGHT / 2 a mixed sample does not count, and the hidden one replaces it. Both weights are 0 at the
     # limit, where light and coc jump from one to the other.
-    free_weight = (HIDDEN_WEIGHT - 2.0 * other_weight).clamp_min(0.0)
-    hidden = (total / _CERTAIN).clamp(max=1.0) * free_weight
+    hidden = (total * (-HIDDEN_WEIGHT / _CERTAIN)).clamp_min(-HIDDEN_WEIGHT) * mixed.clamp(max=0.0)
     is_hidden, (seen_light, seen_coc) = hidden > 0, seen.split([colours, 1], 1)
     other = torch.where(is_hidden, seen_light, other)
     other_coc = torch.where(is_hidden, seen_coc, other_coc)
@@ -313,6 +304,20 @@ def _finest_level(
     return torch.cat([mean[:, :-1], torch.where(total > 0, mean[:, -1:], -NEVER_PX), total], 1)
 
 
+def coarser_level(values: Tensor) -> Tensor:
+    """:func:`_farthest`, by the compiled engine if it can compute it."""
+    found, parts = None, (values.shape[1] - 2, 1, 1)
+    if parts[0] <= native.MOST_PLANES:
+        size = (values.shape[-2] // 2, values.shape[-1] // 2)
+        found = compiled_step(
+            lambda values: native.farthest(values.split(parts), size),
+            lambda gradient, values: [torch.cat(native.farthest_gradient(values.split(parts), size, gradient))],
+            _farthest,
+            values,
+        )
+    return _farthest(values) if found is None else found
+
+
 def _farthest(values: Tensor) -> Tensor:
     """The next coarser level of the pyramid: of each four samples, the mean of those on the farthest surface."""
     light, coc_px, weight = values.split([values.shape[1] - 2, 1, 1], 1)
@@ -326,7 +331,7 @@ def _farthest(values: Tensor) -> Tensor:
 
 def _seen(levels: Sequence[Level], coc_px: Tensor) -> Seen:
     """Light and coc behind the surfaces of an image, ``[B, C + 1, H, W]``, and the sum of votes ``[B, 1, H, W]``."""
-    values, rules = [level.values for level in levels], [level[1:] for level in levels]
+    values = [level.values for level in levels]
 
     def plain(coc_px: Tensor, *values: Tensor) -> Tensor:
         given = [level._replace(values=t) for level, t in zip(levels, values, strict=True)]
@@ -335,18 +340,56 @@ def _seen(levels: Sequence[Level], coc_px: Tensor) -> Seen:
         lights, weights = (torch.stack(parts) for parts in zip(*shown, strict=True))
         return torch.cat(search(given, lights, weights, coc_px), 1)
 
-    found = None
-    if len(levels) <= native.MOST_LEVELS and values[0].shape[1] <= native.MOST_PLANES:
-        found = compiled_step(
-            lambda coc, *levels: native.look_behind(levels, rules, coc),
-            lambda gradient, coc, *levels: native.look_behind_gradient(levels, rules, coc, gradient),
-            plain,
-            coc_px,
-            *values,
-        )
+    found = _looked(plain, levels, coc_px)
     found = recomputed(functools.partial(plain, coc_px, *values)) if found is None else found
     seen, votes = found.split([found.shape[1] - 1, 1], 1)  # not two slices, each of whose gradients is a whole map
     return seen, votes
+
+
+def behind_cells(levels: Sequence[Level], size: tuple[int, int], coc_px: Tensor, wanted: Tensor, ops: Ops) -> Tensor:
+    """Light, coc and votes behind cells of :data:`BEHIND_STEP` pixels, zeros without ``wanted`` pixels.
+
+    Args:
+        levels: All levels of the pyramid.
+        size: Rows and columns of cells, which are centred on the image.
+        coc_px: ``[B, 1, H, W]``; a cell has the smallest one of its pixels.
+        wanted: 1 for pixels that may have a hidden surface, else 0, ``[B, 1, H, W]``.
+        ops: Operations.
+
+    Returns:
+        The farthest surface of all levels, ``[B, C + 2, h, w]``; if there are coarse levels, with the mean of these,
+        ``[B, 2 C + 4, h, w]``.
+    """
+
+    def plain(coc_px: Tensor, *maps: Tensor) -> Tensor:
+        given = [level._replace(values=t) for level, t in zip(levels, maps[:-1], strict=True)]
+        cells = _largest(torch.cat([-coc_px, maps[-1]], 1), *size, BEHIND_STEP)
+        nearest, is_wanted = -cells[:, :1], cells[:, 1:] > 0
+        samples, shares = _samples(given, size, BEHIND_STEP)
+        shown, known = shown_behind(torch.stack(samples), shares[:, None, None], nearest)
+        found = [*search(given, shown, known, nearest, farthest=True)]
+        if len(levels) > _FINE_LEVELS:
+            found += search(given[_FINE_LEVELS:], shown[_FINE_LEVELS:], known[_FINE_LEVELS:], nearest)
+        looked = torch.cat(found, 1)
+        return ops.choose(lambda: is_wanted.any(), looked * is_wanted, torch.zeros_like(looked))
+
+    found = _looked(plain, levels, coc_px, wanted)
+    return plain(coc_px, *(level.values for level in levels), wanted) if found is None else found
+
+
+def _looked(plain: Callable[..., Tensor], levels: Sequence[Level], coc_px: Tensor, *wanted: Tensor) -> Tensor | None:
+    """``plain(coc_px, *values of the levels, *wanted)``, by the compiled engine if it can compute it."""
+    values, rules, count = [level.values for level in levels], [level[1:] for level in levels], len(levels)
+    if count > native.MOST_LEVELS or values[0].shape[1] - 2 > native.MOST_PLANES:
+        return None
+    return compiled_step(
+        lambda coc, *maps: native.look_behind(maps[:count], rules, coc, *maps[count:]),
+        lambda gradient, coc, *maps: native.look_behind_gradient(maps[:count], rules, coc, gradient, *maps[count:]),
+        plain,
+        coc_px,
+        *values,
+        *wanted,
+    )
 
 
 def _samples(levels: Sequence[Level], size: tuple[int, int], step: int) -> tuple[list[Tensor], Tensor]:

@@ -166,7 +166,7 @@ typedef struct {
   float least_px;         // blur above which a pixel reads the level
   float slope, most;      // votes for each weight of the samples, and largest number of votes
 } torchdof_level;
-#define TORCHDOF_MOST_LEVELS 4
+#define TORCHDOF_MOST_LEVELS 7
 
 // Splits the mixed pixels of an image; see render/matting.py. maps: light [channels, height, width], coc [height, width]; 0 for
 // pixels that are left out, and how far the repair of edges moved the coc, in pixels, both [height, width] or null. out: own
@@ -176,13 +176,19 @@ TORCHDOF_API int32_t torchdof_matte(const float *const *maps, int32_t channels, 
 
 // The finest level of that pyramid, [channels + 2, rows, columns], from the surfaces of an image. maps: light [channels, height,
 // width], coc [height, width]; the same of each pixel's other surface, and its weight; light above which a pixel is a
-// highlight; and 0 for pixels that are left out, or null. The first five maps have gradients.
+// highlight; and 0 for pixels that are left out, or null. The first five maps have gradients. Without another surface and
+// a threshold, all null, it is the next level, from the light, coc and weight of a finer one.
 TORCHDOF_API int32_t torchdof_farthest(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t rows,
                                        int32_t columns, int32_t threads, float *out, const float *gradient, float *const *of_maps);
 
-// The surfaces behind pixels with coc [height, width]. out: light, coc and votes, [channels + 2, height, width].
-TORCHDOF_API int32_t torchdof_look_behind(const torchdof_level *levels, int32_t count, int32_t channels, const float *coc, int32_t height,
-                                          int32_t width, int32_t threads, float *out, const float *gradient,
+// The surfaces behind pixels with coc [height, width], from levels fine to coarse. out: light, coc and votes, [channels + 2,
+// height, width].
+//
+// If wanted [height, width] is not null, those behind all cells of 4 x 4 pixels that the levels cover. A cell without a
+// wanted pixel, one that is not 0, has no votes. out: light, coc and votes of the farthest surface, [channels + 2, rows,
+// columns]; with more than two levels, also those of the mean of all but the finest two.
+TORCHDOF_API int32_t torchdof_look_behind(const torchdof_level *levels, int32_t count, int32_t channels, const float *coc,
+                                          const float *wanted, int32_t height, int32_t width, int32_t threads, float *out, const float *gradient,
                                           float *const *of_levels, float *of_coc);
 
 // Light continued beyond the frame's border [surfaces, channels, height + ends, width + ends]; see render/border.py. maps:

@@ -12,7 +12,6 @@ namespace {
 
 constexpr float LEAST = 1e-6f;    // blurred weight up to which the light of a pixel is unknown
 constexpr float COVERED = 1e-6f;  // an uncovered part up to this is a rounding error
-constexpr int BEHIND_STEP = 4;    // pixels between samples of the light behind all surfaces
 constexpr int TILE_PIXELS = TILE * TILE;
 constexpr int PART = 16;  // side in pixels of the parts of a coarse canvas that are skipped if empty
 constexpr float EVEN_SQUARED = 1e-12f;  // square of the difference from 1 up to which a normalizer counts as 1

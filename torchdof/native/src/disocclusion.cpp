@@ -6,8 +6,7 @@ namespace torchdof {
 namespace {
 
 // Constants of render/disocclusion.py, which gives their meanings and effects.
-constexpr float FALL = 0.35f, SURE = 0.1f, CERTAIN = 0.01f;
-constexpr int FINE_LEVELS = 2, STEP = 1 << FINE_LEVELS;
+constexpr float FALL = 0.35f, SURE = 0.1f;
 constexpr float MIXED = 0.05f;  // share above which a second surface is used in the pyramid
 constexpr int BAND = 8;         // rows of a level computed together
 constexpr int CELL_LEVEL = 3;   // cells that may show hidden surfaces have the size of this level's samples
@@ -113,12 +112,12 @@ class Filling {
 
   // 1. Build the pyramid; each level keeps the farthest of the finer level's surfaces.
   // 2. Find the cells near which a farther surface exists.
-  // 3. Combine the levels behind cells of STEP pixels: the light behind all surfaces.
+  // 3. Combine the levels behind cells of BEHIND_STEP pixels: the light behind all surfaces.
   // 4. Give each pixel of the cells found a second surface: the combined samples behind it.
   void run() {
     const int levels = job_.levels, step = 2 << levels;  // padding of half a cell on each side; even sizes on every level
-    area_height_ = ceil_div(job_.height + STEP, step) * step;
-    area_width_ = ceil_div(job_.width + STEP, step) * step;
+    area_height_ = ceil_div(job_.height + BEHIND_STEP, step) * step;
+    area_width_ = ceil_div(job_.width + BEHIND_STEP, step) * step;
     coarsest_ = std::min(levels, CELL_LEVEL);
     cell_ = 1 << coarsest_;
     cell_rows_ = ceil_div(job_.height, cell_);
@@ -333,19 +332,19 @@ class Filling {
     return at;
   }
 
-  // Steps 3 and 4 of `run`. The levels from FINE_LEVELS up are combined once for each cell of STEP pixels, and read like
+  // Steps 3 and 4 of `run`. The levels from FINE_LEVELS up are combined once for each cell of BEHIND_STEP pixels, and read like
   // one level by the pixels.
   void fill() {
     const int levels = job_.levels, H = job_.height, W = job_.width, C = C_;
-    const int rows = area_height_ / STEP, columns = area_width_ / STEP, coarse = std::max(levels - FINE_LEVELS, 0);
-    const int first_y = first_pixel(H, rows, STEP), first_x = first_pixel(W, columns, STEP);
+    const int rows = area_height_ / BEHIND_STEP, columns = area_width_ / BEHIND_STEP, coarse = std::max(levels - FINE_LEVELS, 0);
+    const int first_y = first_pixel(H, rows, BEHIND_STEP), first_x = first_pixel(W, columns, BEHIND_STEP);
     job_.behind_height = rows;
     job_.behind_width = columns;
     job_.behind.resize((size_t)C * rows * columns + 8);  // padding: eight values are read from any position
-    Level combined;  // mean of the coarse levels behind cells of STEP pixels
+    Level combined;  // mean of the coarse levels behind cells of BEHIND_STEP pixels
     combined.height = rows;
     combined.width = columns;
-    combined.step = STEP;
+    combined.step = BEHIND_STEP;
     combined.stride = stride_;
     combined.channels = C;
     centre(combined);
@@ -356,8 +355,8 @@ class Filling {
     }
     std::vector<std::vector<Place>> ys, xs;  // positions of the cells in each level
     for (const Level &l : pyramid_) {
-      ys.push_back(places(0.5f * (H - 1) - 0.5f * (rows - 1) * STEP, STEP, rows, l.height, &Level::place_y, l));
-      xs.push_back(places(0.5f * (W - 1) - 0.5f * (columns - 1) * STEP, STEP, columns, l.width, &Level::place_x, l));
+      ys.push_back(places(0.5f * (H - 1) - 0.5f * (rows - 1) * BEHIND_STEP, BEHIND_STEP, rows, l.height, &Level::place_y, l));
+      xs.push_back(places(0.5f * (W - 1) - 0.5f * (columns - 1) * BEHIND_STEP, BEHIND_STEP, columns, l.width, &Level::place_x, l));
     }
     const Level &base = pyramid_[std::min(levels, FINE_LEVELS) - 1];
     std::vector<float> mean(C, 0.0f);  // mean light, for cells without valid pixels
@@ -381,9 +380,9 @@ class Filling {
         if (!(light[C + 1] > 0)) light = mean.data();
         float *const coarse_mean = coarse ? combined.at(row, column) : nullptr;
         if (coarse) memset(coarse_mean, 0, stride_ * sizeof(float));
-        const int top = first_y + row * STEP, left = first_x + column * STEP;
-        const int y0 = std::clamp(top, 0, H - 1), y1 = std::clamp(top + STEP - 1 + H % 2, 0, H - 1);
-        const int x0 = std::clamp(left, 0, W - 1), x1 = std::clamp(left + STEP - 1 + W % 2, 0, W - 1);
+        const int top = first_y + row * BEHIND_STEP, left = first_x + column * BEHIND_STEP;
+        const int y0 = std::clamp(top, 0, H - 1), y1 = std::clamp(top + BEHIND_STEP - 1 + H % 2, 0, H - 1);
+        const int x0 = std::clamp(left, 0, W - 1), x1 = std::clamp(left + BEHIND_STEP - 1 + W % 2, 0, W - 1);
         bool needed = false;
         for (int r = y0 / cell_; r <= y1 / cell_; r++)
           for (int c = x0 / cell_; c <= x1 / cell_; c++) needed |= found_[(size_t)r * cell_columns_ + c];

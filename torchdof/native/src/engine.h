@@ -131,8 +131,9 @@ constexpr int CELL = 8;   // of the cells for which layers and occluders are lis
 constexpr int TILE = 64;  // of the tiles that are composited at once
 
 // Constants of render/composite.py, disocclusion.py and surfaces.py, which give their meanings and effects.
-constexpr float KNOWN = 2e-3f, BEHIND_PX = 1.0f, OWN_SLOPE = 0.25f, LEAST_SEEN = 1e-4f, HIDDEN_WEIGHT = 0.003f;
+constexpr float KNOWN = 2e-3f, BEHIND_PX = 1.0f, OWN_SLOPE = 0.25f, LEAST_SEEN = 1e-4f, CERTAIN = 0.01f, HIDDEN_WEIGHT = 0.003f;
 constexpr float NEVER = 1e9f;  // larger than any coc
+constexpr int FINE_LEVELS = 2, BEHIND_STEP = 1 << FINE_LEVELS;
 
 // Largest coc of a pixel's own surface nearby.
 template <typename V>

@@ -1,11 +1,13 @@
-// The finest level of the pyramid from which hidden surfaces are filled, forward and backward, for training: the function
-// _finest_level of render/disocclusion.py. Inference computes it in disocclusion.cpp.
+// A level of the pyramid from which hidden surfaces are filled, forward and backward, for training: the functions
+// _finest_level and _farthest of render/disocclusion.py. Inference computes them in disocclusion.cpp.
 //
 // A pixel shows its farther surface: the other one if it is mixed in and lies behind, else its own, with highlights dimmed
 // to their threshold. For a sample and the pixels j around it with light I, coc d, weight w and share s of the sample:
 //
 //   f = max d_j,   n_j = w_j (1 - clamp(f - d_j - BEHIND_PX + 1/2, 0, 1)) s_j / 4
 //   light = sum n_j I_j / sum n_j,   coc = sum n_j d_j / sum n_j,   weight = sum n_j
+//
+// A coarser level has samples of the finer one as its pixels, which have one surface and a weight.
 #include "engine.h"
 
 namespace torchdof {
@@ -31,7 +33,7 @@ template <int CHANNELS>
 class Farthest {
  public:
   Farthest(const float *const *maps, int channels, int height, int width, int rows, int columns, int threads)
-      : light_{maps[0], maps[2]}, coc_{maps[1], maps[3]}, weight_(maps[4]), threshold_(maps[5]), valid_(maps[6]), C_(CHANNELS ? CHANNELS : channels), threads_(threads), area_((size_t)height * width), rows_(height, rows), columns_(width, columns) {}
+      : light_{maps[0], maps[2]}, coc_{maps[1], maps[3]}, weight_(maps[4]), threshold_(maps[5]), valid_(maps[6]), channels_(channels), threads_(threads), area_((size_t)height * width), rows_(height, rows), columns_(width, columns) {}
 
   void write(float *out) const {
     const size_t size = (size_t)rows_.samples * columns_.samples;
@@ -40,9 +42,9 @@ class Farthest {
         Sample s;
         look(y, x, s);
         float *to = out + (size_t)y * columns_.samples + x;
-        for (int c = 0; c < C_; c++) to[c * size] = s.mean[c];
-        to[C_ * size] = s.total > 0 ? s.mean[C_] : -NEVER;
-        to[(C_ + 1) * size] = s.total;
+        for (int c = 0; c < channels(); c++) to[c * size] = s.mean[c];
+        to[channels() * size] = s.total > 0 ? s.mean[channels()] : -NEVER;
+        to[(channels() + 1) * size] = s.total;
       }
     });
   }
@@ -57,7 +59,7 @@ class Farthest {
   }
 
  private:
-  static constexpr int TAPS = 9, MOST = TORCHDOF_MOST_PLANES + 1;
+  static constexpr int TAPS = 9, MOST = (CHANNELS ? CHANNELS : TORCHDOF_MOST_PLANES) + 1;
   struct Tap {
     size_t at;
     bool mixed;
@@ -71,6 +73,7 @@ class Farthest {
     float farthest = -INFINITY, total = 0, mean[MOST];  // mean: light and coc
   };
 
+  int channels() const { return CHANNELS ? CHANNELS : channels_; }
   float light(const Tap &t, int c) const { return light_[t.mixed][c * area_ + t.at]; }
 
   void look(int y, int x, Sample &s) const {
@@ -79,24 +82,24 @@ class Farthest {
         Tap &t = s.taps[s.number++];
         t.at = (size_t)rows_.pixel(y, i) * columns_.size + columns_.pixel(x, j);
         t.share = 0.25f * rows_.share(i) * columns_.share(j);
-        t.mixed = weight_[t.at] > MIXED && coc_[1][t.at] > coc_[0][t.at];
+        t.mixed = coc_[1] && weight_[t.at] > MIXED && coc_[1][t.at] > coc_[0][t.at];
         t.valid = valid_ ? valid_[t.at] : 1.0f;
         t.coc = t.valid > 0 ? coc_[t.mixed][t.at] : -NEVER;
-        t.weight = (t.mixed ? weight_[t.at] : 1.0f - weight_[t.at]) * t.valid;
-        t.peak = peak_of(light_[t.mixed] + t.at, area_, C_);
-        t.dimmed = t.peak > threshold_[t.at] ? threshold_[t.at] / t.peak : 1.0f;
+        t.weight = (t.mixed || !coc_[1] ? weight_[t.at] : 1.0f - weight_[t.at]) * t.valid;
+        t.peak = peak_of(light_[t.mixed] + t.at, area_, channels());
+        t.dimmed = threshold_ && t.peak > threshold_[t.at] ? threshold_[t.at] / t.peak : 1.0f;
         s.farthest = std::max(s.farthest, t.coc);
       }
-    for (int c = 0; c <= C_; c++) s.mean[c] = 0;
+    for (int c = 0; c <= channels(); c++) s.mean[c] = 0;
     for (int k = 0; k < s.number; k++) {
       Tap &t = s.taps[k];
       t.behind = s.farthest - t.coc - (BEHIND_PX - 0.5f);
       t.count = t.weight * (1.0f - clamp01(t.behind)) * t.share;
       s.total += t.count;
-      for (int c = 0; c < C_; c++) s.mean[c] += t.count * (light(t, c) * t.dimmed);
-      s.mean[C_] += t.count * t.coc;
+      for (int c = 0; c < channels(); c++) s.mean[c] += t.count * (light(t, c) * t.dimmed);
+      s.mean[channels()] += t.count * t.coc;
     }
-    for (int c = 0; c <= C_; c++) s.mean[c] *= 1.0f / std::max(s.total, LEAST_TOTAL);
+    for (int c = 0; c <= channels(); c++) s.mean[c] *= 1.0f / std::max(s.total, LEAST_TOTAL);
   }
 
   // Adds a sample's gradients to those of its pixels in [from, to).
@@ -104,41 +107,43 @@ class Farthest {
     const size_t size = (size_t)rows_.samples * columns_.samples, at = (size_t)y * columns_.samples + x;
     Sample s;
     look(y, x, s);
-    float slope[MOST], of_total = slopes[(C_ + 1) * size + at], of_farthest = 0, of_coc[TAPS];
-    for (int c = 0; c <= C_; c++) {
-      slope[c] = c < C_ || s.total > 0 ? slopes[c * size + at] / std::max(s.total, LEAST_TOTAL) : 0.0f;
+    float slope[MOST], of_total = slopes[(channels() + 1) * size + at], of_farthest = 0, of_coc[TAPS];
+    for (int c = 0; c <= channels(); c++) {
+      slope[c] = c < channels() || s.total > 0 ? slopes[c * size + at] / std::max(s.total, LEAST_TOTAL) : 0.0f;
       if (s.total >= LEAST_TOTAL) of_total -= slope[c] * s.mean[c];
     }
     int ties = 0;
     for (int k = 0; k < s.number; k++) {
       const Tap &t = s.taps[k];
-      float of_count = of_total + slope[C_] * t.coc, of_dimmed = 0;
-      for (int c = 0; c < C_; c++) of_count += slope[c] * (light(t, c) * t.dimmed);
-      of_coc[k] = slope[C_] * t.count;
+      float of_count = of_total + slope[channels()] * t.coc, of_dimmed = 0;
+      for (int c = 0; c < channels(); c++) of_count += slope[c] * (light(t, c) * t.dimmed);
+      of_coc[k] = slope[channels()] * t.count;
       if (t.behind >= 0 && t.behind <= 1) {
         const float of_behind = -of_count * t.weight * t.share;
         of_farthest += of_behind;
         of_coc[k] -= of_behind;
       }
-      ties += t.coc == s.farthest;
+      if (coc_[1] || !ties) ties += t.coc == s.farthest;  // in a coarser level the first one has the gradient
       if (t.at < from || t.at >= to) continue;
-      for (int c = 0; c < C_; c++) {
+      for (int c = 0; c < channels(); c++) {
         of_maps[2 * t.mixed][c * area_ + t.at] += slope[c] * t.count * t.dimmed;
         of_dimmed += slope[c] * t.count * light(t, c);
       }
-      if (t.peak > threshold_[t.at])
-        add_to_peak(light_[t.mixed] + t.at, area_, C_, t.peak, -of_dimmed * t.dimmed / t.peak, of_maps[2 * t.mixed] + t.at);
-      of_maps[4][t.at] += (t.mixed ? t.valid : -t.valid) * of_count * (1.0f - clamp01(t.behind)) * t.share;
+      if (threshold_ && t.peak > threshold_[t.at])
+        add_to_peak(light_[t.mixed] + t.at, area_, channels(), t.peak, -of_dimmed * t.dimmed / t.peak, of_maps[2 * t.mixed] + t.at);
+      of_maps[4][t.at] += (t.mixed || !coc_[1] ? t.valid : -t.valid) * of_count * (1.0f - clamp01(t.behind)) * t.share;
     }
     for (int k = 0; k < s.number; k++) {
       const Tap &t = s.taps[k];
       if (t.at < from || t.at >= to || !(t.valid > 0)) continue;
-      of_maps[1 + 2 * t.mixed][t.at] += of_coc[k] + (t.coc == s.farthest ? of_farthest / ties : 0.0f);
+      const bool shares = ties && t.coc == s.farthest;
+      of_maps[1 + 2 * t.mixed][t.at] += of_coc[k] + (shares ? of_farthest / ties : 0.0f);
+      if (!coc_[1] && shares) ties = 0;
     }
   }
 
   const float *const light_[2], *const coc_[2], *const weight_, *const threshold_, *const valid_;  // own and other surface
-  const int C_, threads_;
+  const int channels_, threads_;
   const size_t area_;
   const Axis rows_, columns_;
 };

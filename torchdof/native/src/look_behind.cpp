@@ -9,51 +9,99 @@
 //   v_l = clamp(|c| / least_l - 1, 0, 1) min(slope_l sum p_j, most_l)   its votes
 //
 // The result is sum v_l m_l / sum v_l, and sum v_l.
+//
+// A cell of BEHIND_STEP x BEHIND_STEP pixels has the smallest coc of its pixels. Its first result is the farthest surface of
+// all levels: of two levels with different surfaces, only the farther one counts. Its second result is the one above, of
+// the coarse levels alone.
 #include "engine.h"
 
 namespace torchdof {
 namespace {
 
 constexpr float LEAST_VOTE = 1e-9f;  // smallest divisor
-constexpr int BAND = 32;  // rows of pixels whose gradients one thread adds up; at least twice the step of a level
-constexpr int MOST_LEVELS = TORCHDOF_MOST_LEVELS, MOST_PLANES = TORCHDOF_MOST_PLANES + 2;
+constexpr int BAND = 32;  // least rows of places whose gradients one thread adds up
+constexpr int MOST_LEVELS = TORCHDOF_MOST_LEVELS;
 
-// The samples before and after each pixel of an axis, and the weight of the one after.
+// Places of an axis, pixels or cells, `step` pixels apart and centred on an image; and the pixels of each place, as _window
+// of render/disocclusion.py: on an axis of even size a cell's last pixel repeats the one before.
 struct Axis {
+  const int step, count, taps;
+  std::vector<int> pixels;  // [count, taps]
+  Axis(int size, int step, int count) : step(step), count(count), taps(step > 1 ? step + 1 : 1) {
+    for (int i = 0; i < count * taps; i++) {
+      const int twice = size - 1 + step * (2 * (i / taps) + 1 - count), last = floor_div(twice + step, 2);
+      pixels.push_back(std::clamp(std::min(floor_div(twice - step + 1, 2) + i % taps, last), 0, size - 1));
+    }
+  }
+};
+
+// The samples of a level before and after each place of an axis, and the weight of the one after.
+struct Between {
   std::vector<int> before;
   std::vector<float> part;
-  Axis(int length, int samples, int step, int whole) {
-    const float last = (float)whole / step - 1.0f;
-    for (int i = 0; i < length; i++) {
-      const float place = std::min(std::max((i - 0.5f * (length - 1) + 0.5f * whole) / step - 0.5f, 0.0f), last);
+  Between(const Axis &axis, int samples, int step) {
+    for (int i = 0; i < axis.count; i++) {
+      const float middle = (i - 0.5f * (axis.count - 1)) * axis.step + 0.5f * samples * step;
+      const float place = std::clamp(middle / step - 0.5f, 0.0f, samples - 1.0f);
       before.push_back(std::min((int)place, samples - 2));
       part.push_back(place - before.back());
     }
   }
 };
 
+template <int CHANNELS>
 struct Behind {
-  const torchdof_level *levels;
-  int count, planes, height, width;  // planes: light, coc, weight
-  std::vector<Axis> rows, columns;
+  static constexpr int MOST_PLANES = (CHANNELS ? CHANNELS : TORCHDOF_MOST_PLANES) + 2;
+  const torchdof_level *const levels;
+  const float *const coc, *wanted;  // wanted: null if the places are pixels
+  const int count, channels, width, first;  // first: level of the mean
+  const Axis down, across;
+  std::vector<Between> rows, columns;
+  const size_t area;
 
-  Behind(const torchdof_level *levels, int count, int channels, int height, int width)
-      : levels(levels), count(count), planes(channels + 2), height(height), width(width) {
+  Behind(const torchdof_level *levels, int count, int channels, const float *coc, const float *wanted, int height, int width)
+      : levels(levels), coc(coc), wanted(wanted), count(count), channels(channels), width(width), first(wanted ? FINE_LEVELS : 0),
+        down(height, wanted ? BEHIND_STEP : 1, wanted ? levels->rows * levels->step / BEHIND_STEP : height),
+        across(width, wanted ? BEHIND_STEP : 1, wanted ? levels->columns * levels->step / BEHIND_STEP : width), area((size_t)down.count * across.count) {
     for (int l = 0; l < count; l++) {
-      rows.emplace_back(height, levels[l].rows, levels[l].step, levels[0].rows * levels[0].step);
-      columns.emplace_back(width, levels[l].columns, levels[l].step, levels[0].columns * levels[0].step);
+      rows.emplace_back(down, levels[l].rows, levels[l].step);
+      columns.emplace_back(across, levels[l].columns, levels[l].step);
     }
   }
 
-  // Values of a pixel in a level.
+  int planes() const { return (CHANNELS ? CHANNELS : channels) + 2; }  // light, coc, weight
+  int outputs() const { return (wanted ? planes() : 0) + (first < count ? planes() : 0); }
+  // Calls use(index of a pixel, column of the tap) for the pixels of a place.
+  template <typename Use>
+  void each_pixel(int y, int x, const Use &use) const {
+    for (int j = 0; j < across.taps; j++)
+      for (int i = 0; i < down.taps; i++) use((size_t)down.pixels[y * down.taps + i] * width + across.pixels[x * across.taps + j], j);
+  }
+  // Smallest coc of a place; 0, with which no level is read, if none of its pixels is wanted.
+  float nearest(int y, int x) const {
+    float least = INFINITY;
+    bool any = !wanted;
+    each_pixel(y, x, [&](size_t at, int) {
+      least = std::min(least, coc[at]);
+      any = any || wanted[at] > 0;
+    });
+    return any ? least : 0.0f;
+  }
+
+  // Values of a place in a level.
   struct Found {
+    bool any;                       // false if nothing lies behind the place in this level, which then has no votes
     size_t at[4];                   // of the samples
     float share[4], is_behind[4], part[4];  // is_behind: not clamped
     float weight, looked;           // sum of the parts, or 0 if tiny; clamped blur
     float mean[MOST_PLANES];        // light and coc
     float vote;
+    float of_mean[MOST_PLANES], of_vote, of_sure;  // gradients; of_sure: that of looked * weight / CERTAIN up to 1
   };
-  // Returns false if nothing lies behind the pixel in this level.
+  struct Result {
+    float values[MOST_PLANES], votes;  // values: light and coc
+  };
+  // Returns false if nothing lies behind the place in this level.
   bool find(int l, int y, int x, float coc, Found &f) const {
     const torchdof_level &level = levels[l];
     const float blur = std::fabs(coc) / level.least_px - 1.0f;
@@ -61,9 +109,9 @@ struct Behind {
     f.vote = 0;
     if (!(blur >= 0)) return false;
     const size_t size = (size_t)level.rows * level.columns;
-    const float *const cocs = level.values + (planes - 2) * size, *const weights = cocs + size;
+    const float *const cocs = level.values + (planes() - 2) * size, *const weights = cocs + size;
     const int row = rows[l].before[y], column = columns[l].before[x];
-    const float down = rows[l].part[y], aside = columns[l].part[x];
+    const float below = rows[l].part[y], aside = columns[l].part[x];
     const float end = end_of_surface(coc);
     bool any = false;
     for (int j = 0; j < 4; j++) {
@@ -74,13 +122,13 @@ struct Behind {
     if (!any) return false;
     float total = 0;
     for (int j = 0; j < 4; j++) {
-      f.share[j] = (j / 2 ? down : 1.0f - down) * (j % 2 ? aside : 1.0f - aside);
+      f.share[j] = (j / 2 ? below : 1.0f - below) * (j % 2 ? aside : 1.0f - aside);
       f.part[j] = f.share[j] * weights[f.at[j]] * clamp01(f.is_behind[j]);
       total += f.part[j];
     }
     f.weight = total > LEAST_SEEN ? total : 0.0f;
     const float per = 1.0f / std::max(f.weight, LEAST_SEEN);
-    for (int c = 0; c < planes - 1; c++) {
+    for (int c = 0; c < planes() - 1; c++) {
       float sum = 0;
       for (int j = 0; j < 4; j++) sum += f.part[j] * level.values[c * size + f.at[j]];
       f.mean[c] = sum * per;
@@ -89,97 +137,193 @@ struct Behind {
     return true;
   }
 
-  void look(const float *coc, int threads, float *out) const {
-    const size_t area = (size_t)height * width;
-    torchdof::parallel(threads, height, nullptr, [&](int y, int) {
-      for (int x = 0; x < width; x++) {
-        const size_t at = (size_t)y * width + x;
-        float sums[MOST_PLANES] = {}, votes = 0;
-        for (int l = 0; l < count; l++) {
-          Found f;
-          if (!find(l, y, x, coc[at], f)) continue;
-          votes += f.vote;
-          for (int c = 0; c < planes - 1; c++) sums[c] += f.vote * f.mean[c];
+  bool find_all(int y, int x, float coc, Found *found) const {
+    bool any = false;
+    for (int l = 0; l < count; l++) any |= found[l].any = find(l, y, x, coc, found[l]);
+    return any;
+  }
+
+  // Mean of the levels from the first on, weighted by their votes.
+  Result mean(const Found *found) const {
+    Result r = {};
+    for (int l = first; l < count; l++) {
+      if (!found[l].any) continue;
+      r.votes += found[l].vote;
+      for (int c = 0; c < planes() - 1; c++) r.values[c] += found[l].vote * found[l].mean[c];
+    }
+    for (int c = 0; c < planes() - 1; c++) r.values[c] *= 1.0f / std::max(r.votes, LEAST_VOTE);
+    return r;
+  }
+  void back_of_mean(const float *slopes, Found *found) const {
+    const Result r = mean(found);
+    const float per = 1.0f / std::max(r.votes, LEAST_VOTE);
+    float slope[MOST_PLANES], along = 0;
+    for (int c = 0; c < planes() - 1; c++) {
+      slope[c] = slopes[c * area] * per;
+      along += slope[c] * r.values[c];
+    }
+    if (r.votes < LEAST_VOTE) along = 0;
+    for (int l = first; l < count; l++) {
+      Found &f = found[l];
+      if (!f.any) continue;
+      f.of_vote += slopes[(planes() - 1) * area] - along;
+      for (int c = 0; c < planes() - 1; c++) {
+        f.of_vote += slope[c] * f.mean[c];
+        f.of_mean[c] += slope[c] * f.vote;
+      }
+    }
+  }
+
+  // How a level changes the farthest surface of the levels before it, whose votes are `votes`.
+  struct Change {
+    float apart, nearer, sure, vote, left, votes, part;  // left: share of the votes before that stays
+    Change(const Found &f, const Result &r, int of_coc) : apart(f.mean[of_coc] - r.values[of_coc]) {
+      nearer = r.votes > 0 ? clamp01(-apart - (BEHIND_PX - 0.5f)) : 0.0f;
+      sure = std::min(f.looked * f.weight / CERTAIN, 1.0f);
+      vote = f.vote * (1.0f - nearer);
+      left = 1.0f - sure * clamp01(apart - (BEHIND_PX - 0.5f));
+      votes = r.votes * left + vote;
+      part = vote / std::max(votes, LEAST_VOTE);
+    }
+  };
+  // The farthest surface; before: the one without each level and those after it.
+  Result farthest(const Found *found, Result *before) const {
+    Result r = {};
+    for (int l = 0; l < count; l++) {
+      before[l] = r;
+      if (!found[l].any) continue;
+      const Change change(found[l], r, planes() - 2);
+      for (int c = 0; c < planes() - 1; c++) r.values[c] += (found[l].mean[c] - r.values[c]) * change.part;
+      r.votes = change.votes;
+    }
+    return r;
+  }
+  void back_of_farthest(const float *slopes, Found *found) const {
+    Result before[MOST_LEVELS], of;
+    farthest(found, before);
+    for (int c = 0; c < planes() - 1; c++) of.values[c] = slopes[c * area];
+    of.votes = slopes[(planes() - 1) * area];
+    const auto slopes_up = [](float distance) { return distance >= BEHIND_PX - 0.5f && distance <= BEHIND_PX + 0.5f; };
+    for (int l = count - 1; l >= 0; l--) {
+      Found &f = found[l];
+      if (!f.any) continue;
+      const Change change(f, before[l], planes() - 2);
+      float of_part = 0;
+      for (int c = 0; c < planes() - 1; c++) {
+        of_part += of.values[c] * (f.mean[c] - before[l].values[c]);
+        f.of_mean[c] += of.values[c] * change.part;
+        of.values[c] -= of.values[c] * change.part;
+      }
+      of_part /= std::max(change.votes, LEAST_VOTE);
+      if (change.votes >= LEAST_VOTE) of.votes -= of_part * change.part;
+      const float of_vote = of.votes + of_part, of_left = of.votes * before[l].votes;
+      f.of_vote += of_vote * (1.0f - change.nearer);
+      f.of_sure -= of_left * clamp01(change.apart - (BEHIND_PX - 0.5f));
+      float of_apart = 0;
+      if (slopes_up(change.apart)) of_apart -= of_left * change.sure;
+      if (before[l].votes > 0 && slopes_up(-change.apart)) of_apart += of_vote * f.vote;
+      f.of_mean[planes() - 2] += of_apart;
+      of.values[planes() - 2] -= of_apart;
+      of.votes *= change.left;
+    }
+  }
+
+  void look(int threads, float *out) const {
+    torchdof::parallel(threads, down.count, nullptr, [&](int y, int) {
+      for (int x = 0; x < across.count; x++) {
+        Found found[MOST_LEVELS];
+        Result before[MOST_LEVELS];
+        float *to = out + (size_t)y * across.count + x;
+        if (!find_all(y, x, nearest(y, x), found)) {
+          for (int c = 0; c < outputs(); c++) to[c * area] = 0;
+          continue;
         }
-        const float per = 1.0f / std::max(votes, LEAST_VOTE);
-        for (int c = 0; c < planes - 1; c++) out[c * area + at] = sums[c] * per;
-        out[(planes - 1) * area + at] = votes;
+        const auto put = [&](const Result &r) {
+          for (int c = 0; c < planes(); c++, to += area) *to = c < planes() - 1 ? r.values[c] : r.votes;
+        };
+        if (wanted) put(farthest(found, before));
+        if (first < count) put(mean(found));
       }
     });
   }
 
-  void gradient(const float *coc, const float *slopes, int threads, float *const *of_levels, float *of_coc) const {
-    for (int odd : {0, 1})  // two bands with one between them read different samples
-      torchdof::parallel(threads, ceil_div(height, 2 * BAND), nullptr, [&](int i, int) {
-        for (int y = (2 * i + odd) * BAND; y < std::min((2 * i + odd + 1) * BAND, height); y++)
-          for (int x = 0; x < width; x++) pixel(y, x, coc, slopes, of_levels, of_coc);
+  void gradient(const float *slopes, int threads, float *const *of_levels, float *of_coc) const {
+    // two bands with one between them read different samples: a place reads those up to 2.5 steps away
+    const int band = std::max(BAND, 3 * levels[count - 1].step / down.step);
+    for (int odd : {0, 1})
+      torchdof::parallel(threads, ceil_div(down.count, 2 * band), nullptr, [&](int i, int) {
+        for (int y = (2 * i + odd) * band; y < std::min((2 * i + odd + 1) * band, down.count); y++)
+          for (int x = 0; x < across.count; x++) place(y, x, slopes, of_levels, of_coc);
       });
   }
 
-  // Adds a pixel's gradients to those of the samples that it reads, and sets that of its coc.
-  void pixel(int y, int x, const float *coc, const float *slopes, float *const *of_levels, float *of_coc) const {
-    const size_t area = (size_t)height * width, at = (size_t)y * width + x;
-    of_coc[at] = 0;
-    bool used = false;  // pixels without a hidden surface have no gradient
-    for (int c = 0; c < planes; c++) used |= slopes[c * area + at] != 0;
-    if (!used) return;
+  // Adds a place's gradients to those of the samples and pixels that it reads.
+  void place(int y, int x, const float *slopes, float *const *of_levels, float *of_coc) const {
+    slopes += (size_t)y * across.count + x;
+    bool used = false;  // places without a hidden surface have no gradient
+    for (int c = 0; c < outputs(); c++) used |= slopes[c * area] != 0;
     Found found[MOST_LEVELS];
-    bool any[MOST_LEVELS];
-    float sums[MOST_PLANES] = {}, votes = 0, slope[MOST_PLANES], along = 0, of_own = 0;
+    const float least = used ? nearest(y, x) : 0.0f;
+    if (!find_all(y, x, least, found)) return;
     for (int l = 0; l < count; l++) {
-      any[l] = find(l, y, x, coc[at], found[l]);
-      votes += found[l].vote;
-      for (int c = 0; any[l] && c < planes - 1; c++) sums[c] += found[l].vote * found[l].mean[c];
+      found[l].of_vote = found[l].of_sure = 0;
+      std::fill(found[l].of_mean, found[l].of_mean + planes(), 0.0f);
     }
-    const float per = 1.0f / std::max(votes, LEAST_VOTE);
-    const float slope_of_end = OWN_SLOPE * std::fabs(coc[at]) >= BEHIND_PX ? 1.0f + (coc[at] < 0 ? -OWN_SLOPE : OWN_SLOPE) : 1.0f;
-    for (int c = 0; c < planes - 1; c++) {
-      slope[c] = slopes[c * area + at] * per;
-      along += slope[c] * sums[c] * per;
-    }
-    if (votes < LEAST_VOTE) along = 0;
+    if (wanted) back_of_farthest(slopes, found);
+    if (first < count) back_of_mean(slopes + (wanted ? planes() * area : 0), found);
+    const float slope_of_end = OWN_SLOPE * std::fabs(least) >= BEHIND_PX ? 1.0f + (least < 0 ? -OWN_SLOPE : OWN_SLOPE) : 1.0f;
+    float of_least = 0;
     for (int l = 0; l < count; l++) {
-      if (!any[l]) continue;
       const torchdof_level &level = levels[l];
       const Found &f = found[l];
+      if (!f.any) continue;
       const size_t size = (size_t)level.rows * level.columns;
-      float of_vote = slopes[(planes - 1) * area + at] - along, of_parts = 0;
-      for (int c = 0; c < planes - 1; c++) of_vote += slope[c] * f.mean[c];
       const float counted = f.weight * level.slope, bounded = std::min(counted, level.most);
-      const float blur = std::fabs(coc[at]) / level.least_px - 1.0f;
-      if (blur <= 1) of_own += of_vote * bounded / level.least_px * (coc[at] < 0 ? -1.0f : 1.0f);
+      const float blur = std::fabs(least) / level.least_px - 1.0f, of_sure = f.looked * f.weight <= CERTAIN ? f.of_sure / CERTAIN : 0.0f;
+      if (blur <= 1) of_least += (f.of_vote * bounded + of_sure * f.weight) / level.least_px * (least < 0 ? -1.0f : 1.0f);
+      float of_parts = 0;
       if (f.weight > 0) {
-        if (counted <= level.most) of_parts = of_vote * f.looked * level.slope * (counted == level.most ? 0.5f : 1.0f);
-        for (int c = 0; c < planes - 1; c++) of_parts -= slope[c] * f.vote * f.mean[c] / f.weight;
+        of_parts = of_sure * f.looked;
+        if (counted <= level.most) of_parts += f.of_vote * f.looked * level.slope * (counted == level.most ? 0.5f : 1.0f);
       }
       const float per_weight = 1.0f / std::max(f.weight, LEAST_SEEN);
       for (int j = 0; j < 4; j++) {
         const float *value = level.values + f.at[j];
         float *const of_value = of_levels[l] + f.at[j];
         float of_part = of_parts;
-        for (int c = 0; c < planes - 1; c++) {
-          const float of_mean = slope[c] * f.vote * per_weight;
-          of_part += of_mean * value[c * size];
+        for (int c = 0; c < planes() - 1; c++) {
+          const float of_mean = f.of_mean[c] * per_weight;
+          of_part += of_mean * (value[c * size] - f.mean[c]);
           of_value[c * size] += of_mean * f.part[j];
         }
-        of_value[(planes - 1) * size] += of_part * f.share[j] * clamp01(f.is_behind[j]);
+        of_value[(planes() - 1) * size] += of_part * f.share[j] * clamp01(f.is_behind[j]);
         if (f.is_behind[j] < 0 || f.is_behind[j] > 1) continue;
-        const float of_distance = of_part * f.share[j] * value[(planes - 1) * size];
-        of_value[(planes - 2) * size] += of_distance;
-        of_own -= of_distance * slope_of_end;
+        const float of_distance = of_part * f.share[j] * value[(planes() - 1) * size];
+        of_value[(planes() - 2) * size] += of_distance;
+        of_least -= of_distance * slope_of_end;
       }
     }
-    of_coc[at] = of_own;
+    // the gradient of equal coc is shared by columns, then by rows
+    int ties[BEHIND_STEP + 1] = {}, tied = 0;
+    each_pixel(y, x, [&](size_t at, int j) { ties[j] += coc[at] == least; });
+    for (int n : ties) tied += n > 0;
+    each_pixel(y, x, [&](size_t at, int j) {
+      if (coc[at] == least) of_coc[at] += of_least / (tied * ties[j]);
+    });
   }
 };
 
 }  // namespace
 }  // namespace torchdof
 
-int32_t torchdof_look_behind(const torchdof_level *levels, int32_t count, int32_t channels, const float *coc, int32_t height, int32_t width,
-                             int32_t threads, float *out, const float *gradient, float *const *of_levels, float *of_coc) {
+int32_t torchdof_look_behind(const torchdof_level *levels, int32_t count, int32_t channels, const float *coc, const float *wanted,
+                             int32_t height, int32_t width, int32_t threads, float *out, const float *gradient,
+                             float *const *of_levels, float *of_coc) {
   return torchdof::guarded([&] {
-    const torchdof::Behind behind(levels, count, channels, height, width);
-    gradient ? behind.gradient(coc, gradient, threads, of_levels, of_coc) : behind.look(coc, threads, out);
+    const auto run = [&](const auto &behind) { gradient ? behind.gradient(gradient, threads, of_levels, of_coc) : behind.look(threads, out); };
+    if (channels == 3)
+      run(torchdof::Behind<3>(levels, count, channels, coc, wanted, height, width));
+    else
+      run(torchdof::Behind<0>(levels, count, channels, coc, wanted, height, width));
   });
 }
