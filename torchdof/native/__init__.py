@@ -38,7 +38,7 @@ _instructions = "avx2" if torch.backends.cpu.get_cpu_capability().startswith("AV
 
 _SMALL_FRAME = 2**16  # pixels; up to this size the main thread renders itself, which saves 0.1 ms
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
-_REVISION = 13  # of ``src/api.h``
+_REVISION = 14  # of ``src/api.h``
 
 Rules = Sequence[tuple[int, float, float, float]]
 

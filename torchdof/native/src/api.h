@@ -204,5 +204,5 @@ TORCHDOF_API int32_t torchdof_ends(const float *values, int64_t count, int32_t t
 
 // Version of this interface, for the caller to check first: sizes of its structures and, in the upper half,
 // TORCHDOF_REVISION, which increases with every other change of this file.
-#define TORCHDOF_REVISION 13
+#define TORCHDOF_REVISION 14
 TORCHDOF_API int64_t torchdof_interface(void);
