@@ -223,15 +223,18 @@ class Blend {
       for (int i = 0; i < S_; i++)
         for (int y = row * CELL; y < std::min((row + 1) * CELL, scene_.rows); y++) {
           const float *of_row = scene_.place[i] + (size_t)y * scene_.columns;
-          for (int x = 0, k = 0; x < scene_.columns; x++) {
+          for (int x = 0, next, k = 0; x < scene_.columns; x = next) {
             while (k < last && of_row[x] >= nodes[k + 1]) k++;
             while (k > 0 && of_row[x] < nodes[k]) k--;
             const size_t cell = (size_t)row * cell_columns_ + x / CELL;
             uint64_t *bits = &cells_[cell * words_];
-            lows_[cell] = std::min(lows_[cell], of_row[x]);
-            highs_[cell] = std::max(highs_[cell], of_row[x]);
-            bits[k / 64] |= 1ull << k % 64;
             const bool beyond = of_row[x] > nodes[k], at = of_row[x] == nodes[k] && nodes[k] != 0;
+            for (next = x; next < scene_.columns && next / CELL == x / CELL; next++) {  // pixels between the same nodes
+              if (next > x && !(beyond && of_row[next] > nodes[k] && (k == last || of_row[next] < nodes[k + 1]))) break;
+              lows_[cell] = std::min(lows_[cell], of_row[next]);
+              highs_[cell] = std::max(highs_[cell], of_row[next]);
+            }
+            bits[k / 64] |= 1ull << k % 64;
             // a pixel at a node has a gradient in the layers beside it, except in focus
             if (k < last && (beyond || at)) bits[(k + 1) / 64] |= 1ull << (k + 1) % 64;
             if (k > 0 && at) bits[(k - 1) / 64] |= 1ull << (k - 1) % 64;
