@@ -113,6 +113,18 @@ def test_edges_of_a_soft_map_have_no_teeth(engine: str) -> None:
     torch.testing.assert_close(edges.mended(image, coc_px, "auto")[0, 0], expected, atol=1e-4, rtol=0)
 
 
+def test_ramps_of_a_soft_map_end_where_both_surfaces_look_alike(engine: str) -> None:
+    """A depth between two blurred surfaces may be in focus. A lamp there, which resembles neither, keeps it."""
+    generator, columns = torch.Generator().manual_seed(3), torch.arange(64.0)
+    image = 0.2 + 0.6 * (columns >= 32) + 0.05 * torch.randn(1, 1, 64, 64, generator=generator)
+    image[..., 40:, :] = torch.rand(24, 64, generator=generator)
+    image[..., 18:23, 29:34] = 100.0
+    coc_px = 10 - 20 * ((columns - 28.5) / 6).clamp(0, 1).expand(1, 1, 64, 64)
+    repaired = edges.mended(image.repeat(1, 3, 1, 1), coc_px, "auto")[0, 0]
+    assert float(repaired[44:].abs().min()) > 9.999
+    assert float(repaired[20, 31] - coc_px[0, 0, 20, 31]) == pytest.approx(0.0, abs=1e-4)
+
+
 LEFT = {"half-res": 0.2, "quarter-res": 0.4, "blur 1.5": 0.3, "displaced": 0.6, "shift 1px": 0.6}
 LEFT |= dict.fromkeys(("near -1px", "near -2px", "near +1px"), 0.25)
 

@@ -51,6 +51,7 @@ _FALLOFF_PX = 2.5  # standard deviation of the Gaussian weights of these samples
 _SURE = (0.0, 0.02, 0.06, 0.2, 1.0)  # weight of a sample, by ring: beside a step its depth may be wrong
 _CLEAR = 0.1  # sum of these weights from which samples beside a step count in full; larger: thin strands stay
 _CLEAR_IN_PRIOR = 0.25  # the same where the share of wrong pixels is estimated; larger: soft pictures stay
+_LIKELY = 0.01  # likelihood from which a ramp's pixel shows one of both surfaces; larger: more pixels stay between them
 _SHARPNESS = 1.6  # factor on scores, which samples on the wrong side reduce; larger: colour outweighs the map
 
 # Prior: how often each kind of edge pixel shows the near surface
@@ -108,7 +109,7 @@ def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> 
     """Moves and sharpens the edges of a depth map to where the image has them.
 
     Ramps become steps between their two surfaces. Pixels that show one surface and have the depth of the other are
-    corrected. Slopes stay slopes, and an edge between two surfaces of the same colour stays unchanged.
+    corrected. Slopes stay slopes, and a step between two surfaces of the same colour stays unchanged.
 
     Args:
         image: ``[B, C, H, W]``, linear light, floating point; its scale does not matter.
@@ -457,8 +458,9 @@ def _judge(
     which samples of a surface count in full.
 
     Returns:
-        ``[P]`` each: the log-likelihood ratio, positive for the near surface; the evidence, 0 to 1; and the nearness
-        of the near and of the far surface, as means of the samples that resemble the pixel.
+        ``[P]`` each: the log-likelihood ratio, positive for the near surface; the evidence, 0 to 1, that the pixel
+        shows one of both surfaces and not a third one between them, such as a lamp; and the nearness of the near and
+        of the far surface, as means of the samples that resemble the pixel.
     """
     colour = looks[:-5]
     falloff = _gaussian(_REACH, _FALLOFF_PX, like.dtype, like.device)
@@ -492,9 +494,10 @@ def _judge(
         score = torch.where(is_ramp > 0, score, score * (least / clear).clamp(max=1.0))
         share = side * (alike + 1e-3)
         surfaces = torch.where(known, (share * values).sum(1) / share.sum(1).clamp_min(1e-12), ends)
-        return torch.cat([torch.stack([score, separation, known.to(score.dtype)]), surfaces])
+        likeliest = torch.where(known, likelihood.amax(0), 1.0)
+        return torch.cat([torch.stack([score, separation, likeliest]), surfaces])
 
-    score, separation, known, near, far = ops.by_parts(look, edge_pixels).unbind(0)
+    score, separation, likeliest, near, far = ops.by_parts(look, edge_pixels).unbind(0)
 
     # neighbours of similar colour decide together
     scores = pixels.put(torch.full_like(like, torch.nan), edge_pixels, score)
@@ -505,10 +508,7 @@ def _judge(
     is_edge = ~scores.isnan()
     alike, scores = torch.where(is_edge, alike, 0.0), torch.where(is_edge, scores, 0.0)
     score = (_SHARPNESS * separation * (alike * scores).sum(0) / alike.sum(0).clamp_min(1e-12)).clamp(-6.0, 6.0)
-    evidence = (2.0 * separation * scores.abs().amax(0) - 1.0).clamp(0.0, 1.0)
-    # at the ends of a wide ramp the window holds only one of the surfaces: use the evidence of its middle
-    around = _highest(pixels.put(torch.zeros_like(like), edge_pixels, evidence), 3)
-    evidence = torch.where(known > 0, evidence, pixels.pick(around, edge_pixels)[0])
+    evidence = torch.maximum(2.0 * separation * scores.abs().amax(0) - 1.0, likeliest / _LIKELY).clamp(0.0, 1.0)
     return score, evidence, near, far
 
 

@@ -15,7 +15,7 @@ constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TIE = 0.017f;
 constexpr float NOISES = 12.0f, LEVELS_OF_A_FILE = 64.0f;  // noise
 constexpr int NOISE_SAMPLED = 1 << 13;
 constexpr int REACH = 5;  // colour
-constexpr float CLEAR = 0.1f, CLEAR_IN_PRIOR = 0.25f, SHARPNESS = 1.6f;
+constexpr float CLEAR = 0.1f, CLEAR_IN_PRIOR = 0.25f, LIKELY = 0.01f, SHARPNESS = 1.6f;
 constexpr int DIRECTIONS = 5, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, KINDS = DIRECTIONS * PLACES;  // prior
 constexpr int SAMPLED = 12000, SAMPLE_BLOCK = 8, ROUNDS = 10;
 constexpr float TRUSTED = 0.05f, PRIOR_COUNT = 30.0f;
@@ -153,10 +153,9 @@ void sums(const Grid &in, const Grid &out, const Grid &rows, const Part &part, f
 }
 
 // Which surface a pixel shows. score: log-odds of the near surface. reliability: 0 to 1, how well colours separate the
-// two surfaces. near, far: nearness of the surfaces. known: whether both are in reach.
+// two surfaces. near, far: nearness of the surfaces.
 struct Judgement {
   float score, reliability, near, far;
-  bool known;
 };
 
 struct Around {
@@ -729,7 +728,7 @@ class Repair {
   // 2. For LANES pixels at once, compute the spread of the references' colours, and the contrast of the surfaces.
   // 3. Sum the likelihoods over the windows, which need the spread.
   // 4. The score is the logarithm of the likelihoods' ratio, less beside a step with few samples; the reliability grows
-  //    with the contrast.
+  //    with the contrast. A likelihood of LIKELY is full evidence that the pixel shows one of both surfaces.
   template <int C>
   void judge(Group &group, const float *falloff, bool wants_surfaces) const {
     const int channels = C ? C : channels_, count = 4 + 2 * channels;
@@ -820,16 +819,18 @@ class Repair {
       for (int n = 0; n < 8; n++) store(around + n * LANES, 1.0f / (1.0f + load<vec>(around + n * LANES) * per_light));
       vec likelihood[2];
       for (int side = 0; side < 2; side++) likelihood[side] = load<vec>(likely[side]) * per_total[side] + 1e-9f;
+      const vec likeliest = is_known ? least(most(likelihood[0], likelihood[1]) / LIKELY, one) : one;
       const vec odds = likelihood[0] / likelihood[1], clear = least(least(of(0), of(1)) / (wants_surfaces ? CLEAR : CLEAR_IN_PRIOR), one);
       for (int l = 0; l <= lane; l++) {
         const Edge &edge = group.edges[k - lane + l];
         score_[edge.i] = is_known[l] ? clamp(std::log(odds[l]), -8.0f, 8.0f) * (marks_[edge.i] & RAMP ? 1.0f : clear[l]) : 0.0f;
-        group.judged[k - lane + l] = {0.0f, reliability[l], is_known[l] ? surfaces[0][l] : edge.near, is_known[l] ? surfaces[1][l] : edge.far, (bool)is_known[l]};
+        evidence_[edge.i] = likeliest[l];
+        group.judged[k - lane + l] = {0.0f, reliability[l], is_known[l] ? surfaces[0][l] : edge.near, is_known[l] ? surfaces[1][l] : edge.far};
       }
     });
   }
 
-  // Averages the scores of neighbours of similar colour, and finds the evidence.
+  // Averages the scores of neighbours of similar colour, and adds their evidence.
   void decide(std::vector<Group> &groups) {
     parallel((int)groups.size(), [&](int g) {
       Group &group = groups[g];
@@ -856,7 +857,8 @@ class Repair {
         for (int l = 0; l <= lane; l++) {
           Judgement &judged = group.judged[k - lane + l];
           judged.score = clamp(SHARPNESS * judged.reliability * score[l], -6.0f, 6.0f);
-          evidence_[group.edges[k - lane + l].i] = clamp01(2.0f * judged.reliability * strongest[l] - 1.0f);
+          float &evidence = evidence_[group.edges[k - lane + l].i];
+          evidence = std::max(clamp01(2.0f * judged.reliability * strongest[l] - 1.0f), evidence);
         }
       });
     });
@@ -970,7 +972,7 @@ class Repair {
         const uint8_t marks = marks_[edge.i];
         const bool was_near = marks & NEAR;
         lost[g] += shows_near - was_near;
-        const float moved = !(marks & RAMP) ? (float)(shows_near != was_near) : judged.known ? evidence_[edge.i] : evidence_around(edge.i);
+        const float moved = !(marks & RAMP) ? (float)(shows_near != was_near) : evidence_[edge.i];
         if (!(moved > 0)) continue;
         const float own = nearness(edge.i), surface = shows_near ? judged.near : judged.far;
         map_.out[edge.i] = sign_ * (own + moved * (surface - own));
@@ -990,15 +992,6 @@ class Repair {
       odds += (dy * dx ? DIAGONAL : BESIDE) * (2.0f * (marks_[at] & LISTED ? score_[at] : (float)is_near) - 1.0f);
     }
     return odds;
-  }
-
-  // The strongest evidence within three pixels, for the ends of wide ramps, where only one surface is in reach.
-  float evidence_around(int i) const {
-    float strongest = 0;
-    for (int y = std::max(i / width_ - 3, 0); y <= std::min(i / width_ + 3, height_ - 1); y++)
-      for (int x = std::max(i % width_ - 3, 0); x <= std::min(i % width_ + 3, width_ - 1); x++)
-        if (const int at = y * width_ + x; marks_[at] & LISTED) strongest = std::max(strongest, evidence_[at]);
-    return strongest;
   }
 
   // Removes rims beside steps that are a little nearer, or farther, than the surface to which they belong: the ringing
