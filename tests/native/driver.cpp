@@ -429,7 +429,7 @@ void check_continued(unsigned seed) {
   for (int s = 0; s < surfaces; s++) maps.push_back(noise(random, channels * pixels, 0.0, 1.0));
   for (double most : {1.0, 9.0, 9.0}) maps.push_back(noise(random, surfaces * pixels, 0.0, most));
   maps.push_back(noise(random, pixels, 0.3, 1.3));
-  const std::vector<float> slopes = noise(random, surfaces * channels * wide, -1.0, 1.0);
+  const std::vector<float> slopes = noise(random, surfaces * (channels + 2) * wide, -1.0, 1.0);
   const auto run = [&](int threads) {
     std::vector<float> all(slopes.size());
     std::vector<const float *> maps_at;

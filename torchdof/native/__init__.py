@@ -341,14 +341,14 @@ def _level_arguments(levels: Sequence[Tensor], rules: Rules, coc: Tensor, wanted
 
 
 def continued(maps: Sequence[Tensor], ends: Sequence[int]) -> Tensor:
-    """Light of S surfaces beyond the frame's border, as :func:`torchdof.render.border.continued`, for one image.
+    """S surfaces continued beyond the frame's border, as :func:`torchdof.render.border.continued`, for one image.
 
     ``maps`` are light of each surface ``[C, H, W]``; their weight, x and image_x ``[S, 1, H, W]``; limit ``[1, H, W]``.
-    The result is ``[S C, H + ends, W + ends]``.
+    The result is light, x and weight of each surface, ``[S (C + 2), H + ends, W + ends]``.
     """
     (channels, height, width), (left, right, top, bottom) = maps[0].shape, ends
     surfaces = len(maps[-2])
-    out = _empty(surfaces * channels, top + height + bottom, left + width + right)
+    out = _empty(surfaces * (channels + 2), top + height + bottom, left + width + right)
     _run("continued", maps, surfaces, channels, height, width, ends, torch.get_num_threads(), out, None, None)
     return out
 

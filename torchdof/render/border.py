@@ -24,6 +24,7 @@ from torch import Tensor
 from .. import native
 from ..optics.kernel_cache import kept
 from .compiled_steps import compiled_step
+from .traced import is_compiled
 
 _WIDTH = 4  # half width of the mean along the border, over the distance from the border; larger smooths more
 _BINS = 16  # number of bins; more of them separate more surfaces
@@ -38,14 +39,14 @@ def continued(
     farthest: int,
     x: Tensor | None = None,
     image_x: Tensor | None = None,
-) -> list[Tensor]:
-    """Add continued pixels to the light ``[B, C, H, W]`` of S surfaces at the left, right, top and bottom.
+) -> list[list[Tensor]]:
+    """Add continued pixels to S surfaces at the left, right, top and bottom; their place and weight are the border's.
 
     In a corner, the vertical continuation of the row and the horizontal one of the column are averaged, each weighted
     by its own distance from the frame.
 
     Args:
-        lights: Light of each surface.
+        lights: Light of each surface, ``[B, C, H, W]``.
         weight: Share of each pixel that each surface covers, concatenated to ``[S B, 1, H, W]``: the weight in means.
             None means 1.
         limit: Largest light of a pixel that is not a highlight, ``[B, 1, H, W]``: highlights are not continued. None:
@@ -55,6 +56,9 @@ def continued(
         x: Place of each surface's pixels on the blur axis, concatenated to ``[S B, 1, H, W]``; None: all pixels of a
             surface belong together.
         image_x: The same for the image itself, ``[B, 1, H, W]``; None: it equals ``x``.
+
+    Returns:
+        Light, x and weight of each surface.
     """
     count, blank = len(lights), torch.zeros_like(lights[0][:, :1])
     weight = torch.ones_like(blank).repeat(count, 1, 1, 1) if weight is None else weight
@@ -64,7 +68,8 @@ def continued(
 
     def plain(*maps: Tensor) -> Tensor:
         weight, x, image_x = (t.transpose(0, 1).flatten(0, 1) for t in maps[count:-1])
-        return torch.cat(_continued(maps[:count], weight, x, image_x, maps[-1], ends, farthest), 1)
+        surfaces = _continued(maps[:count], weight, x, image_x, maps[-1], ends, farthest)
+        return torch.cat([t for surface in surfaces for t in surface], 1)
 
     found = compiled_step(
         lambda *maps: native.continued(maps, ends),
@@ -74,7 +79,10 @@ def continued(
         *(t.unflatten(0, (count, -1)).transpose(0, 1) for t in (weight, x, image_x)),  # [B, S, 1, H, W]
         limit,
     )
-    return _continued(lights, weight, x, image_x, limit, ends, farthest) if found is None else [*found.chunk(count, 1)]
+    if found is None:
+        return _continued(lights, weight, x, image_x, limit, ends, farthest)
+    parts = found.split([lights[0].shape[1], 1, 1] * count, 1)
+    return [[*parts[k : k + 3]] for k in range(0, len(parts), 3)]
 
 
 def _continued(
@@ -85,7 +93,7 @@ def _continued(
     limit: Tensor,
     ends: tuple[int, int, int, int],
     farthest: int,
-) -> list[Tensor]:
+) -> list[list[Tensor]]:
     """:func:`continued` by PyTorch; ``image_x`` is concatenated as ``x``."""
     maps = [lights, [weight], [x], [limit] * len(lights), [image_x]]
     rows, columns = (
@@ -106,7 +114,19 @@ def _continued(
             parts = (corners[side, 0, k, ..., :left].flip(-1), rows[side, k], corners[side, 1, k, ..., :right])
             lines.append(torch.cat(parts, -1)[..., :added, :])
         wide.append(torch.cat([lines[1].flip(-2), lines[0], lines[2]], -2))
-    return wide
+    others = (part.unflatten(0, (len(lights), -1)) for part in repeated(torch.cat([x, weight], 1), ends).split(1, 1))
+    return [[*maps] for maps in zip(wide, *others, strict=True)]
+
+
+def repeated(values: Tensor, ends: tuple[int, int, int, int]) -> Tensor:
+    """Repeat the border of maps for some pixels at the left, right, top and bottom."""
+    if not is_compiled():
+        return functional.pad(values, ends, mode="replicate")
+    # the default compiler expects another memory layout of that function's gradient than PyTorch gives it
+    for dim, before, after in ((-1, *ends[:2]), (-2, *ends[2:])):
+        places = torch.arange(-before, values.shape[dim] + after, device=values.device)
+        values = values.index_select(dim, places.clamp(0, values.shape[dim] - 1))
+    return values
 
 
 def _both(maps: Sequence[Tensor], dim: int) -> Tensor:

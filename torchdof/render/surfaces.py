@@ -11,9 +11,8 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ..tensors import is_traced
-from .border import continued
+from .border import continued, repeated
 from .layer_weights import blur_axis, eased, ramps, weights_at_or_behind
-from .traced import is_compiled
 
 HIDDEN_WEIGHT = 0.003
 """Weight of a hidden sample, which is guessed; a visible one has 1. A larger value mixes more guessed light in."""
@@ -246,24 +245,14 @@ def pad_to_frame(
         cover = torch.cat([torch.ones_like(cocs[0]) if weight is None else weight for weight in weights])
     if lit:
         image_x = None if image is None else x.unflatten(0, (len(surfaces), -1))[image]
-        lights = continued(lights, cover, limit, around, margin + multiple - 1, x, image_x)
+        maps = continued(lights, cover, limit, around, margin + multiple - 1, x, image_x)
+        padded = [PaddedSurface(*parts[: 2 if cover is None else 3]) for parts in maps]
     else:
         lights = [functional.pad(light, around) for light in lights]
-    x = _repeated_border(x if cover is None else torch.cat([x, cover], 1), around)
-    maps = [part.unflatten(0, (len(surfaces), -1)) for part in x.split(1, 1)]
-    padded = [PaddedSurface(*parts) for parts in zip(lights, *maps, strict=True)]
+        x = repeated(x if cover is None else torch.cat([x, cover], 1), around)
+        others = (part.unflatten(0, (len(surfaces), -1)) for part in x.split(1, 1))
+        padded = [PaddedSurface(*parts) for parts in zip(lights, *others, strict=True)]
     if behind is not None:
-        behind = _repeated_border(behind, beyond)
+        behind = repeated(behind, beyond)
     starts = ramps(nodes, padded[0].x)
     return PaddedFrame(padded, nodes, starts, behind, margin, (height, width), size, occlusion, image != 0)
-
-
-def _repeated_border(values: Tensor, ends: tuple[int, int, int, int]) -> Tensor:
-    """Repeat the border of maps for some pixels at the left, right, top and bottom."""
-    if not is_compiled():
-        return functional.pad(values, ends, mode="replicate")
-    # the default compiler expects another memory layout of that function's gradient than PyTorch gives it
-    for dim, before, after in ((-1, *ends[:2]), (-2, *ends[2:])):
-        places = torch.arange(-before, values.shape[dim] + after, device=values.device)
-        values = values.index_select(dim, places.clamp(0, values.shape[dim] - 1))
-    return values

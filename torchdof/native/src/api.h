@@ -191,10 +191,10 @@ TORCHDOF_API int32_t torchdof_look_behind(const torchdof_level *levels, int32_t 
                                           const float *wanted, int32_t height, int32_t width, int32_t threads, float *out, const float *gradient,
                                           float *const *of_levels, float *of_coc);
 
-// Light continued beyond the frame's border [surfaces, channels, height + ends, width + ends]; see render/border.py. maps:
-// light of each surface [channels, height, width]; weight, position on the blur axis and that of the image itself [surfaces,
-// height, width]; light above which a pixel is a highlight [height, width]. ends: pixels added at the left, right, top and
-// bottom. All maps but the last have gradients.
+// Surfaces continued beyond the frame's border: light, position on the blur axis and weight of each [surfaces, channels + 2,
+// height + ends, width + ends]; see render/border.py. maps: light of each surface [channels, height, width]; weight, position
+// and that of the image itself [surfaces, height, width]; light above which a pixel is a highlight [height, width]. ends:
+// pixels added at the left, right, top and bottom. All maps but the last have gradients.
 TORCHDOF_API int32_t torchdof_continued(const float *const *maps, int32_t surfaces, int32_t channels, int32_t height, int32_t width,
                                         const int32_t *ends, int32_t threads, float *out, const float *gradient,
                                         float *const *of_maps);

@@ -1,4 +1,4 @@
-// Light continued beyond the frame's border, forward and backward, for training: the function _continued of
+// Surfaces continued beyond the frame's border, forward and backward, for training: the function _continued of
 // render/border.py. Inference computes only the parts that it needs, in border.cpp.
 //
 // For a pixel i of a line along the border with light I and weight w, and the pixels j within 4 d pixels of it:
@@ -42,13 +42,19 @@ struct Frame {
   void write(int threads, float *out) const {
     Border border(height, width, C, S, *std::max_element(ends, ends + 4));
     parallel(threads, 4 * S, nullptr, [&](int i, int) { border.set((Border::Side)(i % 4), i / 4, line_of(i % 4, i / 4)); });
-    parallel(threads, S * C, nullptr, [&](int plane, int) {
-      const int s = plane / C, c = plane % C;
+    parallel(threads, S * (C + 2), nullptr, [&](int plane, int) {
+      const int s = plane / (C + 2), c = plane % (C + 2);
+      const float *const map = c < C ? light[s] + c * area : (c == C ? x : weight) + s * area;
       for (int y = -ends[2]; y < height + ends[3]; y++) {
         const int nearest = std::clamp(y, 0, height - 1);
-        const float *const from = light[s] + c * area + (size_t)nearest * width;
+        const float *const from = map + (size_t)nearest * width;
         float *const to = out + plane * wide_area + first + y * (ptrdiff_t)pitch;
         std::copy_n(from, width, to);
+        if (c >= C) {  // place and weight are those of the border
+          std::fill(to - ends[0], to, from[0]);
+          std::fill(to + width, to + width + ends[1], from[width - 1]);
+          continue;
+        }
         if (y != nearest) border.continue_row(s, c, y, 0, width, to);
         for (int column = -ends[0]; column < 0; column++) to[column] = border.light(s, c, y, column, from[0]);
         for (int column = width; column < width + ends[1]; column++) to[column] = border.light(s, c, y, column, from[width - 1]);
@@ -58,11 +64,19 @@ struct Frame {
 
   // Adds the gradients by the maps of surface s.
   void gradient(int s, const float *slopes, float *const *of_maps) const {
-    slopes += s * C * wide_area + first;
+    slopes += s * (C + 2) * wide_area + first;
     for (int c = 0; c < C; c++)
       for (size_t y = 0; y < (size_t)height; y++)
         for (int at = 0; at < width; at++) of_maps[s][c * area + y * width + at] += slopes[c * wide_area + y * pitch + at];
     for (int side = 0; side < 4; side++) add_line(side, s, slopes, of_maps);
+    for (int k = 0; k < 2; k++)
+      for (int y = -ends[2]; y < height + ends[3]; y++) {
+        const float *const from = slopes + (C + k) * wide_area + y * (ptrdiff_t)pitch;
+        float *const to = of_maps[k ? S : S + 1] + s * area + (size_t)std::clamp(y, 0, height - 1) * width;
+        for (int at = 0; at < width; at++) to[at] += from[at];
+        for (int at = -ends[0]; at < 0; at++) to[0] += from[at];
+        for (int at = width; at < width + ends[1]; at++) to[width - 1] += from[at];
+      }
   }
 
   // Adds the gradients by the pixels of a line.
