@@ -111,11 +111,14 @@ def _planned(
         plan = Plan.for_scene(torch.cat(cocs), options.tolerance, on_grid=True)
     elif plan is not None and not is_traced():
         plan = plan.extended_to(torch.cat(cocs))
-    if plan is not None:
-        return _image(options, ops, [plan], **maps).to(image.dtype)
-    # one plan for each item, so that the result does not depend on the rest of the batch
-    scenes = [torch.cat(of_item) for of_item in zip(*(t.split(1) for t in cocs), strict=True)]
-    return _each_planned(functools.partial(_image, options, ops), scenes, options, maps).to(image.dtype)
+    render = functools.partial(_image, options, ops)
+    if plan is None:
+        # one plan for each item, so that the result does not depend on the rest of the batch
+        scenes = [torch.cat(of_item) for of_item in zip(*(t.split(1) for t in cocs), strict=True)]
+        return _each_planned(render, scenes, options, maps).to(image.dtype)
+    if is_traced() or not _is_in_memory(maps):
+        return render([plan], **maps).to(image.dtype)
+    return _by_item(render, [plan] * len(image), maps).to(image.dtype)
 
 
 def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
@@ -147,12 +150,8 @@ def _each_planned(
     each item, ``[N, 1, H, W]``; ``maps`` are those of all items, ``[B, ...]``.
     """
     uniform = options.method == "layered" and not options.table.depends_on_place
-    in_memory = native.chosen() and all(is_in_memory(t, backward=True) for t in maps.values())
-    if len(scenes) == 1 or not uniform or in_memory:
-        # the compiled engine renders item by item
-        plans = [Plan.for_scene(scene, options.tolerance) for scene in scenes]
-        items = [render([plan], **{name: t[i : i + 1] for name, t in maps.items()}) for i, plan in enumerate(plans)]
-        return items[0] if len(items) == 1 else torch.cat(items)
+    if len(scenes) == 1 or not uniform or _is_in_memory(maps):
+        return _by_item(render, [Plan.for_scene(scene, options.tolerance) for scene in scenes], maps)
     plans = Plan.for_scenes(scenes, options.tolerance)
     most = max(1, _TOGETHER // math.prod(scenes[0].shape[-2:]))
     joined = [i for i, plan in enumerate(plans) if len(plan.nodes) > 1]  # a plane has one layer, whose kernel is exact
@@ -165,6 +164,18 @@ def _each_planned(
         of_group = {name: torch.cat([t[i : i + 1] for i in group]) for name, t in maps.items()}
         by_index |= zip(group, render([plans[i] for i in group], **of_group).split(1), strict=True)
     return torch.cat([by_index[i] for i in range(len(plans))])
+
+
+def _is_in_memory(maps: Mapping[str, Tensor]) -> bool:
+    """Whether the compiled engine, which renders item by item, can read the maps."""
+    return native.chosen() and all(is_in_memory(t, backward=True) for t in maps.values())
+
+
+def _by_item(render: Callable[..., Tensor], plans: Sequence[Plan], maps: Mapping[str, Tensor]) -> Tensor:
+    """Render items one after the other, each with its plan."""
+    items = zip(*(t.split(1) for t in maps.values()), strict=True)
+    rendered = [render([plan], **dict(zip(maps, item, strict=True))) for plan, item in zip(plans, items, strict=True)]
+    return rendered[0] if len(rendered) == 1 else torch.cat(rendered)
 
 
 def _stack(options: Options, plans: Sequence[Plan], light: Tensor, coc: Tensor, cover: Tensor) -> Tensor:
