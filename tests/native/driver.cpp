@@ -425,10 +425,10 @@ void check_continued(unsigned seed) {
   const int surfaces = integer(1, 3), channels = integer(1, 5), height = integer(1, 40), width = integer(1, 60);
   const int32_t ends[] = {integer(0, 50), integer(0, 50), integer(0, 50), integer(0, 50)};
   const size_t pixels = size_t(height) * width, wide = size_t(height + ends[2] + ends[3]) * (width + ends[0] + ends[1]);
-  std::vector<std::vector<float>> maps;  // light of each surface; weight, x, image_x, limit
-  for (int s = 0; s < surfaces; s++) maps.push_back(noise(random, channels * pixels, 0.0, 1.0));
-  for (double most : {1.0, 9.0, 9.0}) maps.push_back(noise(random, surfaces * pixels, 0.0, most));
+  std::vector<std::vector<float>> maps;  // light, coc and weight of each surface; limit
+  for (int s = 0; s < 3 * surfaces; s++) maps.push_back(noise(random, (s < surfaces ? channels : 1) * pixels, 0.0, s / surfaces == 1 ? 9.0 : 1.0));
   maps.push_back(noise(random, pixels, 0.3, 1.3));
+  const int image = integer(-1, surfaces - 1);
   const std::vector<float> slopes = noise(random, surfaces * (channels + 2) * wide, -1.0, 1.0);
   const auto run = [&](int threads) {
     std::vector<float> all(slopes.size());
@@ -438,7 +438,7 @@ void check_continued(unsigned seed) {
     for (const std::vector<float> &map : maps) of_maps.emplace_back(map.size(), 0.0f), maps_at.push_back(map.data());
     for (std::vector<float> &of_map : of_maps) of_maps_at.push_back(of_map.data());
     const auto step = [&](float *out, const float *gradient, float *const *of) {
-      return torchdof_continued(maps_at.data(), surfaces, channels, height, width, ends, threads, out, gradient, of);
+      return torchdof_continued(maps_at.data(), surfaces, channels, height, width, ends, 0.5f, 7.0f, image, threads, out, gradient, of);
     };
     if (step(all.data(), nullptr, nullptr) != TORCHDOF_OK) fail("its light cannot be continued", int(seed));
     if (step(nullptr, slopes.data(), of_maps_at.data()) != TORCHDOF_OK) fail("its continued light has no gradient", int(seed));

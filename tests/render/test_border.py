@@ -10,7 +10,8 @@ from torchdof.render.border import continued
 
 def test_continued_light_is_half_the_nearest_pixel_and_half_a_mean_along_the_border() -> None:
     light = torch.rand(2, 3, 20, 40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    out = continued([light], None, None, (0, 0, 0, 9), 9)[0][0]
+    one = torch.ones_like(light[:, :1])
+    out = continued([light], one, one, (0, 0, 0, 9), 9, one, one)[0]
     assert out.shape == (2, 3, 29, 40)
     assert_close(out[..., :20, :], light)
     for distance in (1, 2, 4, 8):

@@ -97,7 +97,7 @@ _FUNCTIONS = {
     "matte": "int data* int int int int data data data*",
     "farthest": "int data* int int int int int int data data data*",
     "look_behind": "int level* int int data data int int int data data data* data",
-    "continued": "int data* int int int int int* int data data data*",
+    "continued": "int data* int int int int int* real real int int data data data*",
     "coc": "int data long real real real int data",
     "plan": "int data int int int double* int double* int int*",
     "kernels": "int spots* int data*",
@@ -340,23 +340,23 @@ def _level_arguments(levels: Sequence[Tensor], rules: Rules, coc: Tensor, wanted
     return each, len(each), levels[0].shape[0] - 2, coc, wanted, *coc.shape[1:], torch.get_num_threads()
 
 
-def continued(maps: Sequence[Tensor], ends: Sequence[int]) -> Tensor:
-    """S surfaces continued beyond the frame's border, as :func:`torchdof.render.border.continued`, for one image.
+def continued(maps: Sequence[Tensor], ends: Sequence[int], *axis: Any) -> Tensor:
+    """S surfaces continued beyond the frame's border, as in :func:`torchdof.render.surfaces.pad_to_frame`.
 
-    ``maps`` are light of each surface ``[C, H, W]``; their weight, x and image_x ``[S, 1, H, W]``; limit ``[1, H, W]``.
-    The result is light, x and weight of each surface, ``[S (C + 2), H + ends, W + ends]``.
+    ``maps`` are light of each surface ``[C, H, W]``, then coc of each, weight of each, and the limit of highlights, all
+    ``[1, H, W]``; ``axis`` holds the ends of the blur axis, and the index of the image's own surface or -1. The result
+    is light, place on the blur axis and weight of each surface, ``[S (C + 2), H + ends, W + ends]``.
     """
-    (channels, height, width), (left, right, top, bottom) = maps[0].shape, ends
-    surfaces = len(maps[-2])
-    out = _empty(surfaces * (channels + 2), top + height + bottom, left + width + right)
-    _run("continued", maps, surfaces, channels, height, width, ends, torch.get_num_threads(), out, None, None)
+    (channels, height, width), (left, right, top, bottom), count = maps[0].shape, ends, len(maps) // 3
+    out = _empty(count * (channels + 2), top + height + bottom, left + width + right)
+    _run("continued", maps, count, channels, height, width, ends, *axis, torch.get_num_threads(), out, None, None)
     return out
 
 
-def continued_gradient(maps: Sequence[Tensor], ends: Sequence[int], gradient: Tensor) -> list[Tensor]:
+def continued_gradient(gradient: Tensor, maps: Sequence[Tensor], ends: Sequence[int], *axis: Any) -> list[Tensor]:
     """The gradients of :func:`continued` by all maps but the last."""
     sums = [_empty(*values.shape).zero_() for values in maps[:-1]]
-    _run("continued", maps, len(maps[-2]), *maps[0].shape, ends, torch.get_num_threads(), None, gradient, sums)
+    _run("continued", maps, len(maps) // 3, *maps[0].shape, ends, *axis, torch.get_num_threads(), None, gradient, sums)
     return sums
 
 

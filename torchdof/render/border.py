@@ -21,9 +21,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .. import native
 from ..optics.kernel_cache import kept
-from .compiled_steps import compiled_step
 from .traced import is_compiled
 
 _WIDTH = 4  # half width of the mean along the border, over the distance from the border; larger smooths more
@@ -33,68 +31,27 @@ _STEP = 0.5  # px on the blur axis: neighbours that differ by less are one surfa
 
 def continued(
     lights: Sequence[Tensor],
-    weight: Tensor | None,
-    limit: Tensor | None,
+    weight: Tensor,
+    limit: Tensor,
     ends: tuple[int, int, int, int],
     farthest: int,
-    x: Tensor | None = None,
-    image_x: Tensor | None = None,
-) -> list[list[Tensor]]:
-    """Add continued pixels to S surfaces at the left, right, top and bottom; their place and weight are the border's.
+    x: Tensor,
+    image_x: Tensor,
+) -> list[Tensor]:
+    """Add continued pixels to the light ``[B, C, H, W]`` of S surfaces at the left, right, top and bottom.
 
     In a corner, the vertical continuation of the row and the horizontal one of the column are averaged, each weighted
     by its own distance from the frame.
 
     Args:
-        lights: Light of each surface, ``[B, C, H, W]``.
+        lights: Light of each surface.
         weight: Share of each pixel that each surface covers, concatenated to ``[S B, 1, H, W]``: the weight in means.
-            None means 1.
-        limit: Largest light of a pixel that is not a highlight, ``[B, 1, H, W]``: highlights are not continued. None:
-            there are no highlights.
+        limit: Largest light of a pixel that is not a highlight, ``[B, 1, H, W]``: highlights are not continued.
         ends: Pixels to add at each side; in traced code they may be symbols.
         farthest: Upper limit of ``ends``.
-        x: Place of each surface's pixels on the blur axis, concatenated to ``[S B, 1, H, W]``; None: all pixels of a
-            surface belong together.
-        image_x: The same for the image itself, ``[B, 1, H, W]``; None: it equals ``x``.
-
-    Returns:
-        Light, x and weight of each surface.
+        x: Place of each surface's pixels on the blur axis, concatenated to ``[S B, 1, H, W]``.
+        image_x: The same for the image that each surface belongs to.
     """
-    count, blank = len(lights), torch.zeros_like(lights[0][:, :1])
-    weight = torch.ones_like(blank).repeat(count, 1, 1, 1) if weight is None else weight
-    x = blank.repeat(count, 1, 1, 1) if x is None else x
-    image_x = x if image_x is None else image_x.repeat(count, 1, 1, 1)
-    limit = torch.full_like(blank, torch.finfo(blank.dtype).max) if limit is None else limit
-
-    def plain(*maps: Tensor) -> Tensor:
-        weight, x, image_x = (t.transpose(0, 1).flatten(0, 1) for t in maps[count:-1])
-        surfaces = _continued(maps[:count], weight, x, image_x, maps[-1], ends, farthest)
-        return torch.cat([t for surface in surfaces for t in surface], 1)
-
-    found = compiled_step(
-        lambda *maps: native.continued(maps, ends),
-        lambda gradient, *maps: native.continued_gradient(maps, ends, gradient),
-        plain,
-        *lights,
-        *(t.unflatten(0, (count, -1)).transpose(0, 1) for t in (weight, x, image_x)),  # [B, S, 1, H, W]
-        limit,
-    )
-    if found is None:
-        return _continued(lights, weight, x, image_x, limit, ends, farthest)
-    parts = found.split([lights[0].shape[1], 1, 1] * count, 1)
-    return [[*parts[k : k + 3]] for k in range(0, len(parts), 3)]
-
-
-def _continued(
-    lights: Sequence[Tensor],
-    weight: Tensor,
-    x: Tensor,
-    image_x: Tensor,
-    limit: Tensor,
-    ends: tuple[int, int, int, int],
-    farthest: int,
-) -> list[list[Tensor]]:
-    """:func:`continued` by PyTorch; ``image_x`` is concatenated as ``x``."""
     maps = [lights, [weight], [x], [limit] * len(lights), [image_x]]
     rows, columns = (
         _beyond(farthest, *(_both(each, dim) for each in maps)).unflatten(1, (len(lights), -1)) for dim in (-2, -1)
@@ -114,8 +71,7 @@ def _continued(
             parts = (corners[side, 0, k, ..., :left].flip(-1), rows[side, k], corners[side, 1, k, ..., :right])
             lines.append(torch.cat(parts, -1)[..., :added, :])
         wide.append(torch.cat([lines[1].flip(-2), lines[0], lines[2]], -2))
-    others = (part.unflatten(0, (len(lights), -1)) for part in repeated(torch.cat([x, weight], 1), ends).split(1, 1))
-    return [[*maps] for maps in zip(wide, *others, strict=True)]
+    return wide
 
 
 def repeated(values: Tensor, ends: tuple[int, int, int, int]) -> Tensor:

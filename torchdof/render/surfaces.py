@@ -1,6 +1,7 @@
 """Surfaces, as the steps of the pipeline exchange them, and the padded frame from which layers are cut."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from itertools import pairwise
@@ -10,8 +11,10 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from .. import native
 from ..tensors import is_traced
 from .border import continued, repeated
+from .compiled_steps import compiled_step
 from .layer_weights import blur_axis, eased, ramps, weights_at_or_behind
 
 HIDDEN_WEIGHT = 0.003
@@ -231,28 +234,54 @@ def pad_to_frame(
     height, width = ((n + multiple - 1) // multiple * multiple for n in size)
     beyond = (0, width - size[1], 0, height - size[0])  # pixels added right and below, to whole blocks
     around = (margin, margin + beyond[1], margin, margin + beyond[3])
-    lights: Sequence[Tensor]
     lights, cocs, weights = zip(*surfaces, strict=True)
-    x = blur_axis(torch.cat(cocs))
-    if len(nodes) == 1:
-        x = x.clamp(nodes[0][0], nodes[0][-1])
+    if all(weight is None for weight in weights):
+        kept, weights = 2, (torch.ones_like(cocs[0]),) * len(surfaces)
     else:
-        ends = [(row[0], max(place for place in row if place < math.inf)) for row in nodes]
-        low, high = x.new_tensor(ends).repeat(len(surfaces), 1)[..., None, None, None].unbind(1)
-        x = x.clamp(low, high)
-    cover = None
-    if any(weight is not None for weight in weights):
-        cover = torch.cat([torch.ones_like(cocs[0]) if weight is None else weight for weight in weights])
+        kept, weights = 3, tuple(torch.ones_like(cocs[0]) if weight is None else weight for weight in weights)
     if lit:
-        image_x = None if image is None else x.unflatten(0, (len(surfaces), -1))[image]
-        maps = continued(lights, cover, limit, around, margin + multiple - 1, x, image_x)
-        padded = [PaddedSurface(*parts[: 2 if cover is None else 3]) for parts in maps]
+        limit = torch.full_like(cocs[0], torch.finfo(cocs[0].dtype).max) if limit is None else limit
+        maps = (*lights, *cocs, *weights, limit)
+        plain, found = functools.partial(_continued, nodes, around, margin + multiple - 1, image), None
+        if len(nodes) == 1:
+            how = (around, nodes[0][0], nodes[0][-1], -1 if image is None else image)
+            found = compiled_step(
+                lambda *maps: native.continued(maps, *how),
+                lambda gradient, *maps: native.continued_gradient(gradient, maps, *how),
+                lambda *maps: torch.cat(plain(*maps), 1),
+                *maps,
+            )
+        parts = plain(*maps) if found is None else found.split([lights[0].shape[1], 1, 1] * len(surfaces), 1)
     else:
-        lights = [functional.pad(light, around) for light in lights]
-        x = repeated(x if cover is None else torch.cat([x, cover], 1), around)
-        others = (part.unflatten(0, (len(surfaces), -1)) for part in x.split(1, 1))
-        padded = [PaddedSurface(*parts) for parts in zip(lights, *others, strict=True)]
+        others = repeated(torch.cat([_places(cocs, nodes), torch.cat(weights)], 1), around).split(1, 1)
+        others = [part.chunk(len(surfaces)) for part in others]
+        parts = [
+            t for light, *other in zip(lights, *others, strict=True) for t in (functional.pad(light, around), *other)
+        ]
+    padded = [PaddedSurface(*parts[k : k + kept]) for k in range(0, len(parts), 3)]
     if behind is not None:
         behind = repeated(behind, beyond)
     starts = ramps(nodes, padded[0].x)
     return PaddedFrame(padded, nodes, starts, behind, margin, (height, width), size, occlusion, image != 0)
+
+
+def _continued(
+    nodes: Sequence[Sequence[float]], ends: tuple[int, int, int, int], farthest: int, image: int | None, *maps: Tensor
+) -> list[Tensor]:
+    """Light, place and weight of each surface, continued, from ``maps``: lights, cocs, weights and limit."""
+    count = len(maps) // 3
+    x, weight = _places(maps[count : 2 * count], nodes), torch.cat(maps[2 * count : -1])
+    image_x = x if image is None else x.chunk(count)[image].repeat(count, 1, 1, 1)
+    lights = continued(maps[:count], weight, maps[-1], ends, farthest, x, image_x)
+    others = (part.chunk(count) for part in repeated(torch.cat([x, weight], 1), ends).split(1, 1))
+    return [t for parts in zip(lights, *others, strict=True) for t in parts]
+
+
+def _places(cocs: Sequence[Tensor], nodes: Sequence[Sequence[float]]) -> Tensor:
+    """Places of surfaces on the blur axis, clamped to the layers: ``[S B, 1, H, W]``."""
+    x = blur_axis(torch.cat([*cocs]))
+    if len(nodes) == 1:
+        return x.clamp(nodes[0][0], nodes[0][-1])
+    ends = [(row[0], max(place for place in row if place < math.inf)) for row in nodes]
+    low, high = x.new_tensor(ends).repeat(len(cocs), 1)[..., None, None, None].unbind(1)
+    return x.clamp(low, high)

@@ -192,12 +192,13 @@ TORCHDOF_API int32_t torchdof_look_behind(const torchdof_level *levels, int32_t 
                                           float *const *of_levels, float *of_coc);
 
 // Surfaces continued beyond the frame's border: light, position on the blur axis and weight of each [surfaces, channels + 2,
-// height + ends, width + ends]; see render/border.py. maps: light of each surface [channels, height, width]; weight, position
-// and that of the image itself [surfaces, height, width]; light above which a pixel is a highlight [height, width]. ends:
-// pixels added at the left, right, top and bottom. All maps but the last have gradients.
+// height + ends, width + ends]; see render/border.py. maps: light of each surface [channels, height, width], coc of each, weight
+// of each, and light above which a pixel is a highlight, [height, width]. ends: pixels added at the left, right, top and bottom.
+// low, high: ends of the blur axis. image: the image's own surface, or -1: each one is an image. All maps but the last have
+// gradients.
 TORCHDOF_API int32_t torchdof_continued(const float *const *maps, int32_t surfaces, int32_t channels, int32_t height, int32_t width,
-                                        const int32_t *ends, int32_t threads, float *out, const float *gradient,
-                                        float *const *of_maps);
+                                        const int32_t *ends, float low, float high, int32_t image, int32_t threads, float *out,
+                                        const float *gradient, float *const *of_maps);
 
 // Smallest and largest value; both NaN if any value is NaN.
 TORCHDOF_API int32_t torchdof_ends(const float *values, int64_t count, int32_t threads, float *low, float *high);

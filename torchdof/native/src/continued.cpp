@@ -14,10 +14,23 @@ namespace {
 
 // The maps of a frame. Sides are those of Border.
 struct Frame {
-  const float *const *light, *weight, *x, *image_x, *limit;  // light: of each surface
+  const float *const *light, *const *coc, *const *weight, *limit;  // of each surface; limit: light above which a highlight begins
   const int32_t S, C, height, width, *ends;  // numbers of surfaces and channels; pixels added at the left, right, top, bottom
+  const float low, high;                     // ends of the blur axis
+  const int32_t image;                       // the image's own surface, or -1: each one is an image
+  const int threads;
   const size_t area = (size_t)height * width, pitch = ends[0] + width + ends[1], wide_area = pitch * (ends[2] + height + ends[3]);
   const size_t first = ends[2] * pitch + ends[0];  // the frame's first pixel in a continued map
+  const Buffer<float> x{S * area};                 // positions on the blur axis, of each surface
+  const float *x_of(int s) const { return x.data() + s * area; }
+  const float *image_x_of(int s) const { return x_of(image < 0 ? s : image); }
+
+  void find_positions() const {
+    parallel(threads, S * height, nullptr, [&](int row, int) {
+      const float *const from = coc[row / height] + (size_t)(row % height) * width;
+      for (int at = 0; at < width; at++) x[(size_t)row * width + at] = axis(from[at], low, high);
+    });
+  }
 
   int length(int side) const { return side < Border::LEFT ? width : height; }
   // Offset of a pixel beyond pixel `at` of a side, or of that pixel itself, from the frame's first pixel.
@@ -32,19 +45,19 @@ struct Frame {
     for (int at = 0; at < length(side); at++) {
       const size_t pixel = place(side, at, 0, width);
       for (int c = 0; c < C; c++) colours[c] = light[s] + c * area + pixel;
-      line.set_light(at, colours.data(), C, weight[s * area + pixel], limit[pixel]);
-      line.x[at] = x[s * area + pixel], line.image_x[at] = image_x[s * area + pixel];
+      line.set_light(at, colours.data(), C, weight[s][pixel], limit[pixel]);
+      line.x[at] = x_of(s)[pixel], line.image_x[at] = image_x_of(s)[pixel];
     }
     line.find_places();
     return line;
   }
 
-  void write(int threads, float *out) const {
+  void write(float *out) const {
     Border border(height, width, C, S, *std::max_element(ends, ends + 4));
     parallel(threads, 4 * S, nullptr, [&](int i, int) { border.set((Border::Side)(i % 4), i / 4, line_of(i % 4, i / 4)); });
     parallel(threads, S * (C + 2), nullptr, [&](int plane, int) {
       const int s = plane / (C + 2), c = plane % (C + 2);
-      const float *const map = c < C ? light[s] + c * area : (c == C ? x : weight) + s * area;
+      const float *const map = c < C ? light[s] + c * area : c == C ? x_of(s) : weight[s];
       for (int y = -ends[2]; y < height + ends[3]; y++) {
         const int nearest = std::clamp(y, 0, height - 1);
         const float *const from = map + (size_t)nearest * width;
@@ -62,17 +75,37 @@ struct Frame {
     });
   }
 
-  // Adds the gradients by the maps of surface s.
-  void gradient(int s, const float *slopes, float *const *of_maps) const {
+  // Adds the gradients by light, coc and weight of each surface.
+  void gradient(const float *slopes, float *const *of_maps) const {
+    const Buffer<float> of_x(2 * S * area);  // by the position of each surface, and by that of the image next to it
+    std::fill_n(of_x.data(), 2 * S * area, 0.0f);
+    parallel(threads, S, nullptr, [&](int s, int) { add_surface(s, slopes, of_maps[s], of_maps[2 * S + s], &of_x[s * area], &of_x[(S + s) * area]); });
+    parallel(threads, S * height, nullptr, [&](int row, int) {
+      for (size_t s = row / height, at = (size_t)(row % height) * width, end = at + width; at < end; at++) {
+        float slope = of_x[s * area + at] + (image < 0 ? of_x[(S + s) * area + at] : 0.0f);
+        for (int i = 0; (int)s == image && i < S; i++) slope += of_x[(S + i) * area + at];
+        of_maps[S + s][at] += slope * slope_of_axis(coc[s][at]);
+      }
+    });
+  }
+  // Derivative of a position on the blur axis by the coc.
+  float slope_of_axis(float at) const {
+    const float size = std::fabs(at), sum = size + (float)SQUARE_PX, place = at * size / sum;
+    if (std::fabs(place) <= (float)IN_FOCUS) return 0.0f;
+    const float moved = place - std::copysign((float)IN_FOCUS, place);
+    return moved < low || moved > high ? 0.0f : size * (size + 2 * (float)SQUARE_PX) / (sum * sum);
+  }
+
+  void add_surface(int s, const float *slopes, float *of_light, float *of_weight, float *of_x, float *of_image_x) const {
     slopes += s * (C + 2) * wide_area + first;
     for (int c = 0; c < C; c++)
       for (size_t y = 0; y < (size_t)height; y++)
-        for (int at = 0; at < width; at++) of_maps[s][c * area + y * width + at] += slopes[c * wide_area + y * pitch + at];
-    for (int side = 0; side < 4; side++) add_line(side, s, slopes, of_maps);
+        for (int at = 0; at < width; at++) of_light[c * area + y * width + at] += slopes[c * wide_area + y * pitch + at];
+    for (int side = 0; side < 4; side++) add_line(side, s, slopes, of_light, of_weight, of_x, of_image_x);
     for (int k = 0; k < 2; k++)
       for (int y = -ends[2]; y < height + ends[3]; y++) {
         const float *const from = slopes + (C + k) * wide_area + y * (ptrdiff_t)pitch;
-        float *const to = of_maps[k ? S : S + 1] + s * area + (size_t)std::clamp(y, 0, height - 1) * width;
+        float *const to = (k ? of_weight : of_x) + (size_t)std::clamp(y, 0, height - 1) * width;
         for (int at = 0; at < width; at++) to[at] += from[at];
         for (int at = -ends[0]; at < 0; at++) to[0] += from[at];
         for (int at = width; at < width + ends[1]; at++) to[width - 1] += from[at];
@@ -80,7 +113,7 @@ struct Frame {
   }
 
   // Adds the gradients by the pixels of a line.
-  void add_line(int side, int s, const float *slopes, float *const *of_maps) const {
+  void add_line(int side, int s, const float *slopes, float *of_light, float *of_weight, float *of_x, float *of_image_x) const {
     const BorderLine line = line_of(side, s);
     const int n = length(side), sums = C + 1, added = ends[side ^ 2], *const beside = ends + (side & 2);
     const ptrdiff_t wide_step = place(side, 1, 0, pitch) - place(side, 0, 0, pitch);
@@ -123,21 +156,21 @@ struct Frame {
         for (int end = k + sums; k < end; k++) of_values[k] += sum[k], of_places[at] -= line.values[k] * slope[k];
     }
 
-    const size_t start = place(side, 0, 0, width), step = place(side, 1, 0, width) - start, of_surface = s * area + start;
+    const size_t start = place(side, 0, 0, width), step = place(side, 1, 0, width) - start;
     for (int at = 0; at < n; at++) {
       const float *const pixel = light[s] + start + at * step, share = line.shares[at], peak = peak_of(pixel, area, C);
-      float *const of_light = of_maps[s] + start + at * step;
-      double of_weight = of_values[at * sums + C], of_share = 0;
+      float *const of_pixel = of_light + start + at * step;
+      double of_its_weight = of_values[at * sums + C], of_share = 0;
       for (int c = 0; c < C; c++) {
         const double of_dimmed = of_nearest[at * C + c] + of_values[at * sums + c] * line.values[at * sums + C];
-        of_light[c * area] += (float)(of_dimmed * share);
+        of_pixel[c * area] += (float)(of_dimmed * share);
         of_share += of_dimmed * pixel[c * area];
-        of_weight += of_values[at * sums + c] * pixel[c * area] * share;
+        of_its_weight += of_values[at * sums + c] * pixel[c * area] * share;
       }
-      if (share < 1) add_to_peak(pixel, area, C, peak, (float)-of_share * share / peak, of_light);
-      of_maps[S][of_surface + at * step] += (float)of_weight;
+      if (share < 1) add_to_peak(pixel, area, C, peak, (float)-of_share * share / peak, of_pixel);
+      of_weight[start + at * step] += (float)of_its_weight;
     }
-    line.gradient(of_places.data(), step, of_maps[S + 1] + of_surface, of_maps[S + 2] + of_surface);
+    line.gradient(of_places.data(), step, of_x + start, of_image_x + start);
   }
 };
 
@@ -145,11 +178,11 @@ struct Frame {
 }  // namespace torchdof
 
 int32_t torchdof_continued(const float *const *maps, int32_t surfaces, int32_t channels, int32_t height, int32_t width,
-                           const int32_t *ends, int32_t threads, float *out, const float *gradient, float *const *of_maps) {
+                           const int32_t *ends, float low, float high, int32_t image, int32_t threads, float *out,
+                           const float *gradient, float *const *of_maps) {
   return torchdof::guarded([&] {
-    const float *const *const others = maps + surfaces;
-    const torchdof::Frame frame{maps, others[0], others[1], others[2], others[3], surfaces, channels, height, width, ends};
-    if (!gradient) return frame.write(threads, out);
-    torchdof::parallel(threads, surfaces, nullptr, [&](int s, int) { frame.gradient(s, gradient, of_maps); });
+    const torchdof::Frame frame{maps, maps + surfaces, maps + 2 * surfaces, maps[3 * surfaces], surfaces, channels, height, width, ends, low, high, image, threads};
+    frame.find_positions();
+    gradient ? frame.gradient(gradient, of_maps) : frame.write(out);
   });
 }
