@@ -87,6 +87,12 @@ def mixed_edge(share: float, near_px: float = -12.0, far_px: float = 0.0) -> tup
     return image, coc
 
 
+def beyond_the_border(image: Tensor, pixels: int) -> Tensor:
+    """An image of one plane, continued on all sides."""
+    one = torch.ones_like(image[:, :1])
+    return continued([image], one, threshold(image), (pixels,) * 4, pixels, one, one)[0]
+
+
 def disc(image: Tensor, coc_px: Tensor, table: BlurTable | None = None) -> Tensor:
     """Closed form for a plane: the image, continued outside its border, convolved with a kernel, in float64."""
     image, radius = image.double(), coc_px.flatten()[:1].double()
@@ -96,14 +102,14 @@ def disc(image: Tensor, coc_px: Tensor, table: BlurTable | None = None) -> Tenso
     else:
         kernel = table.kernels(radius, image.shape[-1])[0]
     half = kernel.shape[-1] // 2
-    wide = continued([image], None, threshold(image), (half,) * 4, half)[0]
+    wide = beyond_the_border(image, half)
     return functional.conv2d(wide, kernel.expand(image.shape[1], -1, -1)[:, None], groups=image.shape[1])
 
 
 def mean(image: Tensor, _: Tensor) -> Tensor:
     """Closed form for a blur far larger than the frame: means over a square of twice its longer side."""
     half = max(image.shape[-2:]) - 1
-    wide = continued([image], None, threshold(image), (half,) * 4, half)[0]
+    wide = beyond_the_border(image, half)
     return functional.avg_pool2d(wide, 2 * half + 1, stride=1)
 
 

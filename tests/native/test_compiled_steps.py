@@ -280,11 +280,11 @@ def test_mixed_pixels_and_their_gradients_equal_the_plain_engines(
     moved_px = 3.0 * torch.rand(coc.shape, generator=torch.Generator().manual_seed(9)) if moved else None
 
     def computed() -> list[Tensor]:
-        leaves = [light.clone().requires_grad_(), coc.clone().requires_grad_()]
-        own, other, other_coc, weight = matte(*leaves, valid, moved_px)
+        given, its_coc = light.clone().requires_grad_(), coc.clone().requires_grad_()
+        own, other, other_coc, weight = matte(given, its_coc, valid, moved_px)
         out = torch.cat([own, other * weight, other_coc, weight], 1)  # light of hardly any weight is undefined
         seen = torch.rand(out.shape, generator=torch.Generator().manual_seed(1)) - 0.3
-        return [out.detach(), *torch.autograd.grad((out * seen).sum(), leaves)]
+        return [out.detach(), *torch.autograd.grad((out * seen).sum(), (given, its_coc))]
 
     assert_both_engines_agree(computed, calls["matte"], [1e-4] * 3, monkeypatch)
 

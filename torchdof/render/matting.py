@@ -81,9 +81,9 @@ def matte(
         The surfaces; the weight of the other one is in [0, 1/2].
     """
 
-    def constant(*maps: Tensor) -> list[Tensor | None]:
+    def constant(*maps: Tensor) -> tuple[Tensor | None, Tensor | None]:
         rest = iter(maps)
-        return [None if t is None else next(rest) for t in (valid, moved_px)]
+        return None if valid is None else next(rest), None if moved_px is None else next(rest)
 
     found = compiled_step(
         lambda light, coc, *maps: native.matte(light, coc, *constant(*maps)),
