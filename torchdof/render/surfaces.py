@@ -254,7 +254,7 @@ def pad_to_frame(
         parts = plain(*maps) if found is None else found.split([lights[0].shape[1], 1, 1] * len(surfaces), 1)
     else:
         others = repeated(torch.cat([_places(cocs, nodes), torch.cat(weights)], 1), around).split(1, 1)
-        others = [part.chunk(len(surfaces)) for part in others]
+        others = [part.unflatten(0, (len(surfaces), -1)) for part in others]
         parts = [
             t for light, *other in zip(lights, *others, strict=True) for t in (functional.pad(light, around), *other)
         ]
@@ -271,9 +271,9 @@ def _continued(
     """Light, place and weight of each surface, continued, from ``maps``: lights, cocs, weights and limit."""
     count = len(maps) // 3
     x, weight = _places(maps[count : 2 * count], nodes), torch.cat(maps[2 * count : -1])
-    image_x = x if image is None else x.chunk(count)[image].repeat(count, 1, 1, 1)
+    image_x = x if image is None else x.unflatten(0, (count, -1))[image].repeat(count, 1, 1, 1)
     lights = continued(maps[:count], weight, maps[-1], ends, farthest, x, image_x)
-    others = (part.chunk(count) for part in repeated(torch.cat([x, weight], 1), ends).split(1, 1))
+    others = (part.unflatten(0, (count, -1)) for part in repeated(torch.cat([x, weight], 1), ends).split(1, 1))
     return [t for parts in zip(lights, *others, strict=True) for t in parts]
 
 
