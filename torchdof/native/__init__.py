@@ -318,10 +318,10 @@ def look_behind(levels: Sequence[Tensor], rules: Rules, coc: Tensor, wanted: Ten
     least_px, slope and most, as in ``torchdof_level``. The result is light, coc and votes, ``[C + 2, H, W]``. With a
     map ``wanted`` ``[1, H, W]``, it is that of cells, ``[C + 2 or 2 C + 4, h, w]``.
     """
-    out = _empty(levels[0].shape[0], *coc.shape[1:])
-    if wanted is not None:
-        planes, *size = levels[0].shape
-        out = _empty(planes * (2 if len(levels) > 2 else 1), *(n * rules[0][0] // 4 for n in size))
+    planes, *size = levels[0].shape[0], *coc.shape[1:]
+    if wanted is not None:  # cells of 4 x 4 pixels; levels from the third on are coarse
+        planes, size = planes * (2 if len(levels) > 2 else 1), [n * rules[0][0] // 4 for n in levels[0].shape[1:]]
+    out = _empty(planes, *size)
     _run("look_behind", *_level_arguments(levels, rules, coc, wanted), out, None, None, None)
     return out
 

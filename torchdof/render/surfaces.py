@@ -235,29 +235,21 @@ def pad_to_frame(
     beyond = (0, width - size[1], 0, height - size[0])  # pixels added right and below, to whole blocks
     around = (margin, margin + beyond[1], margin, margin + beyond[3])
     lights, cocs, weights = zip(*surfaces, strict=True)
-    if all(weight is None for weight in weights):
-        kept, weights = 2, (torch.ones_like(cocs[0]),) * len(surfaces)
-    else:
-        kept, weights = 3, tuple(torch.ones_like(cocs[0]) if weight is None else weight for weight in weights)
-    if lit:
-        limit = torch.full_like(cocs[0], torch.finfo(cocs[0].dtype).max) if limit is None else limit
-        maps = (*lights, *cocs, *weights, limit)
-        plain, found = functools.partial(_continued, nodes, around, margin + multiple - 1, image), None
-        if len(nodes) == 1:
-            how = (around, nodes[0][0], nodes[0][-1], -1 if image is None else image)
-            found = compiled_step(
-                lambda *maps: native.continued(maps, *how),
-                lambda gradient, *maps: native.continued_gradient(gradient, maps, *how),
-                lambda *maps: torch.cat(plain(*maps), 1),
-                *maps,
-            )
-        parts = plain(*maps) if found is None else found.split([lights[0].shape[1], 1, 1] * len(surfaces), 1)
-    else:
-        others = repeated(torch.cat([_places(cocs, nodes), torch.cat(weights)], 1), around).split(1, 1)
-        others = [part.unflatten(0, (len(surfaces), -1)) for part in others]
-        parts = [
-            t for light, *other in zip(lights, *others, strict=True) for t in (functional.pad(light, around), *other)
-        ]
+    kept = 2 if all(weight is None for weight in weights) else 3
+    whole = (torch.ones_like(cocs[0]) if weight is None else weight for weight in weights)
+    limit = torch.full_like(cocs[0], torch.finfo(cocs[0].dtype).max) if limit is None else limit
+    maps = (*lights, *cocs, *whole, limit)
+    farthest = margin + multiple - 1 if lit else None
+    plain, found = functools.partial(_continued, nodes, around, farthest, image), None
+    if lit and len(nodes) == 1:
+        how = (around, nodes[0][0], nodes[0][-1], -1 if image is None else image)
+        found = compiled_step(
+            lambda *maps: native.continued(maps, *how),
+            lambda gradient, *maps: native.continued_gradient(gradient, maps, *how),
+            lambda *maps: torch.cat(plain(*maps), 1),
+            *maps,
+        )
+    parts = plain(*maps) if found is None else found.split([lights[0].shape[1], 1, 1] * len(surfaces), 1)
     padded = [PaddedSurface(*parts[k : k + kept]) for k in range(0, len(parts), 3)]
     if behind is not None:
         behind = repeated(behind, beyond)
@@ -266,20 +258,30 @@ def pad_to_frame(
 
 
 def _continued(
-    nodes: Sequence[Sequence[float]], ends: tuple[int, int, int, int], farthest: int, image: int | None, *maps: Tensor
+    nodes: Sequence[Sequence[float]],
+    ends: tuple[int, int, int, int],
+    farthest: int | None,
+    image: int | None,
+    *maps: Tensor,
 ) -> list[Tensor]:
-    """Light, place and weight of each surface, continued, from ``maps``: lights, cocs, weights and limit."""
+    """Light, place and weight of each surface, continued, from ``maps``: lights, cocs, weights and limit.
+
+    ``farthest`` is the upper limit of ``ends``; None: beyond the border the light is 0.
+    """
     count = len(maps) // 3
     x, weight = _places(maps[count : 2 * count], nodes), torch.cat(maps[2 * count : -1])
-    image_x = x if image is None else x.unflatten(0, (count, -1))[image].repeat(count, 1, 1, 1)
-    lights = continued(maps[:count], weight, maps[-1], ends, farthest, x, image_x)
+    if farthest is None:
+        lights = [functional.pad(light, ends) for light in maps[:count]]
+    else:
+        image_x = x if image is None else x.unflatten(0, (count, -1))[image].repeat(count, 1, 1, 1)
+        lights = continued(maps[:count], weight, maps[-1], ends, farthest, x, image_x)
     others = (part.unflatten(0, (count, -1)) for part in repeated(torch.cat([x, weight], 1), ends).split(1, 1))
     return [t for parts in zip(lights, *others, strict=True) for t in parts]
 
 
 def _places(cocs: Sequence[Tensor], nodes: Sequence[Sequence[float]]) -> Tensor:
     """Places of surfaces on the blur axis, clamped to the layers: ``[S B, 1, H, W]``."""
-    x = blur_axis(torch.cat([*cocs]))
+    x = blur_axis(torch.cat(tuple(cocs)))
     if len(nodes) == 1:
         return x.clamp(nodes[0][0], nodes[0][-1])
     ends = [(row[0], max(place for place in row if place < math.inf)) for row in nodes]

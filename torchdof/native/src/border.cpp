@@ -82,13 +82,11 @@ void BorderLine::gradient(const double *of_places, ptrdiff_t step, float *of_x, 
 }
 
 Border::Border(int height, int width, int channels, int surfaces, int farthest)
-    : height_(height), width_(width), channels_(channels) {
-  while (farthest >> levels_) levels_++;
-  levels_++;
-  for (int distance = 0, level = 0; distance <= farthest; distance++) {
-    while (2 << level <= distance) level++;
-    level_of_.push_back(level);
-    part_of_.push_back((float)distance / (1 << level) - 1.0f);
+    : height_(height), width_(width), channels_(channels), levels_(Octave(farthest).levels()) {
+  for (int distance = 0; distance <= farthest; distance++) {
+    const Octave octave(distance);
+    level_of_.push_back(octave.level);
+    part_of_.push_back(octave.part);
   }
   for (auto side : {TOP, BOTTOM, LEFT, RIGHT}) {
     means_[side].resize(start(side, surfaces, 0, 0));

@@ -117,21 +117,19 @@ struct Frame {
     const BorderLine line = line_of(side, s);
     const int n = length(side), sums = C + 1, added = ends[side ^ 2], *const beside = ends + (side & 2);
     const ptrdiff_t wide_step = place(side, 1, 0, pitch) - place(side, 0, 0, pitch);
-    int levels = 2;
-    while (1 << (levels - 1) <= added) levels++;
+    const int levels = Octave(added).levels();
     // gradients by the means of each level; each distance has half of the mean, and half of the nearest pixel
     std::vector<float> of_means(levels * C * n), row(n);
     for (int c = 0; c < C; c++)
-      for (int distance = 1, level = 0; distance <= added; distance++) {
+      for (int distance = 1; distance <= added; distance++) {
+        const Octave octave(distance);
         const float *const beyond = slopes + c * wide_area + place(side, 0, distance, pitch);
         for (int at = 0; at < n; at++) row[at] = beyond[at * wide_step];
         for (int k = 1; k <= beside[0]; k++) row[0] += beyond[-k * wide_step] * distance / (distance + k);
         for (int k = 1; k <= beside[1]; k++) row[n - 1] += beyond[(n - 1 + k) * wide_step] * distance / (distance + k);
-        while (2 << level <= distance) level++;
-        const float part = (float)distance / (1 << level) - 1.0f;
-        float *const near = &of_means[(level * C + c) * n], *const far = near + C * n;
-        for (int at = 0; at < n; at++) near[at] += 0.5f * (1.0f - part) * row[at];
-        for (int at = 0; at < n; at++) far[at] += 0.5f * part * row[at];
+        float *const near = &of_means[(octave.level * C + c) * n], *const far = near + C * n;
+        for (int at = 0; at < n; at++) near[at] += 0.5f * (1.0f - octave.part) * row[at];
+        for (int at = 0; at < n; at++) far[at] += 0.5f * octave.part * row[at];
       }
 
     // gradients by the nearest pixels, by the values in the sums, and by places

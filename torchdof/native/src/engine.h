@@ -395,6 +395,18 @@ struct BorderLine {
   double least, most, per_bin;          // smallest and largest accumulated steps; bins for each
 };
 
+// Level l of the means beyond the border is for a distance of 2^l pixels: the level at or below a distance, the fraction of
+// the way to the next one, and the number of levels for distances up to this one.
+struct Octave {
+  int level = 0;
+  float part;
+  explicit Octave(int distance) {
+    while (2 << level <= distance) level++;
+    part = (float)distance / (1 << level) - 1.0f;
+  }
+  int levels() const { return level + 2; }
+};
+
 // Estimate of the light beyond the frame; border.cpp
 class Border {
  public:

@@ -161,16 +161,16 @@ void clean_light(const Frame &frame, int y0, int x0, Window &w, const float *fal
     w.clean = w.light;
   for (int i = 1; i < EDGES - 1; i++)
     for (int j = 1; j < EDGES - 1; j += LANES) {
-      const int at = i * PITCH + j, first = at - PITCH - 1, in_coc = at + PITCH + 1;
-      const vec edge = load<vec>(w.edge + at), coc = load<vec>(w.coc + in_coc);
+      const int at = i * PITCH + j, first = at - PITCH - 1, middle = tap(TAPS / 2);  // the window of coc has one more pixel before
+      const vec edge = load<vec>(w.edge + at), coc = load<vec>(w.coc + at + middle);
       if (!any_of(edge > vec{})) {
         for (int c = 0; slopes && c < frame.channels; c++) add(&slopes->light[c * plane + at], load<vec>(&slopes->clean[c * plane + at]));
         continue;
       }
       vec near_by[TAPS], unmixed[TAPS], alike[TAPS], apart[TAPS], weight[TAPS], total = {};
       for (int k = 0; k < TAPS; k++) {
-        apart[k] = (load<vec>(w.coc + first + PITCH + 1 + tap(k)) - coc) * (1.0f / EDGE_PX);
-        near_by[k] = frame.valid ? falloff[k] * load<vec>(w.valid + first + PITCH + 1 + tap(k)) : all(falloff[k]);
+        apart[k] = (load<vec>(w.coc + at + tap(k)) - coc) * (1.0f / EDGE_PX);
+        near_by[k] = frame.valid ? falloff[k] * load<vec>(w.valid + at + tap(k)) : all(falloff[k]);
         unmixed[k] = (all(1.0f + UNCLEAN) - load<vec>(w.edge + first + tap(k))) * near_by[k];
         alike[k] = 2.0f - 2.0f * size_of(apart[k]);
         weight[k] = unmixed[k] * clamp01(alike[k]);
@@ -201,10 +201,10 @@ void clean_light(const Frame &frame, int y0, int x0, Window &w, const float *fal
         const vec slope = of_weight[k] + only(is_within(enough), of_is_clean * edge);
         add(slopes->edge + first + tap(k), -slope * clamp01(alike[k]) * near_by[k]);
         const vec of_apart = only(is_within(alike[k]), slope * unmixed[k] * (-2.0f / EDGE_PX)) * (only(apart[k] > vec{}, all(1.0f)) - only(apart[k] < vec{}, all(1.0f)));
-        add(slopes->coc + first + PITCH + 1 + tap(k), of_apart);
+        add(slopes->coc + at + tap(k), of_apart);
         of_middle -= of_apart;
       }
-      add(slopes->coc + in_coc, of_middle);
+      add(slopes->coc + at + middle, of_middle);
     }
   for (int c = 0; !slopes && c < frame.channels; c++) each_outside(frame, y0, x0, [&](int from, int to) { w.clean[c * plane + from] = w.clean[c * plane + to]; });
 }
@@ -224,7 +224,7 @@ template <int CHANNELS>
 class Split {
  public:
   Split(const Frame &frame, Window &w, int y, int x, const float *falloff)
-      : frame_(frame), w_(w), falloff_(falloff), y_(y), x_(x), first_((y + 1) * PITCH + x + 1), masked_(frame.valid), ends_(w, first_ + PITCH + 1, masked_) {
+      : frame_(frame), w_(w), falloff_(falloff), y_(y), x_(x), first_((y + 1) * PITCH + x + 1), in_coc_(first_ + PITCH + 1), masked_(frame.valid), ends_(w, in_coc_, masked_) {
     vec *memory = w.around.data();
     for (vec **colours : {&light_, &clean_, &of_light_, &of_clean_}) *colours = memory, memory += C() * TAPS;
     for (vec **colours : {&front_, &behind_, &colour_, &clean_front_, &clean_behind_, &of_front_, &of_behind_, &of_colour_, &of_contrast_}) *colours = memory, memory += C();
@@ -315,7 +315,7 @@ class Split {
 
   void find_colours() {
     const int plane = EDGES * PITCH;
-    for (int i = 0; i < TAPS; i++) valid_[i] = masked_ ? load<vec>(w_.valid + first_ + PITCH + 1 + tap(i)) : all(1.0f);
+    for (int i = 0; i < TAPS; i++) valid_[i] = masked_ ? load<vec>(w_.valid + in_coc_ + tap(i)) : all(1.0f);
     scale_ = all(TINY);  // brightest light around; all light is relative to it
     for (int c = 0; c < C(); c++)
       for (int i = 0; i < TAPS; i++) {
@@ -325,7 +325,7 @@ class Split {
     for (int i = 0; i < C() * TAPS; i++) light_[i] /= scale_;
     for (int c = 0; c < C(); c++) colour_[c] = light_[c * TAPS + TAPS / 2];
 
-    here_ = load<vec>(w_.coc + first_ + PITCH + 1 + tap(TAPS / 2));
+    here_ = load<vec>(w_.coc + in_coc_ + tap(TAPS / 2));
     gap_ = most(ends_.far - ends_.near, all(1e-6f));
     const vec part = load<vec>(w_.moved + y_ * PITCH + x_) / gap_;  // 0 or 1: the map as given has an edge here
     unsure_ = clamp01(4.0f * least(part, 1.0f - part));
@@ -334,7 +334,7 @@ class Split {
     covered_ = vec{};
     for (int i = 0; i < TAPS; i++) {
       const vec weight = (all(1.0f + UNCLEAN) - load<vec>(w_.edge + first_ + tap(i))) * falloff_[i] * valid_[i];
-      const vec nearness = (ends_.far - load<vec>(w_.coc + first_ + PITCH + 1 + tap(i))) / gap_;  // not times 1 / gap, whose rounding the clamps below enlarge
+      const vec nearness = (ends_.far - load<vec>(w_.coc + in_coc_ + tap(i))) / gap_;  // not times 1 / gap, whose rounding the clamps below enlarge
       nearer_[i] = weight * clamp01(4.0f * nearness - 2.8f);
       farther_[i] = weight * clamp01(1.2f - 4.0f * nearness);
       whole += nearer_[i];
@@ -576,7 +576,7 @@ class Split {
     }
     add(slopes.edge + first_ + tap(TAPS / 2), of_edge_);
     for (int i = 0; i < TAPS; i++) {
-      const int in_coc = first_ + PITCH + 1 + tap(i);
+      const int in_coc = in_coc_ + tap(i);
       const vec near_by = falloff_[i] * valid_[i], weight = (all(1.0f + UNCLEAN) - load<vec>(w_.edge + first_ + tap(i))) * near_by;
       const vec nearness = (ends_.far - load<vec>(w_.coc + in_coc)) / gap_, to_near = 4.0f * nearness - 2.8f, to_far = 1.2f - 4.0f * nearness;
       of_nearer[i] += of_whole;
@@ -587,8 +587,8 @@ class Split {
       of_far_ += of_nearness;
       of_gap_ -= of_nearness * nearness;
     }
-    add(slopes.coc + first_ + PITCH + 1 + tap(TAPS / 2), of_here_);
-    ends_.back(w_, first_ + PITCH + 1, masked_, of_near_ - of_gap_, of_far_ + of_gap_, slopes.coc);
+    add(slopes.coc + in_coc_ + tap(TAPS / 2), of_here_);
+    ends_.back(w_, in_coc_, masked_, of_near_ - of_gap_, of_far_ + of_gap_, slopes.coc);
   }
 
   int C() const { return CHANNELS ? CHANNELS : frame_.channels; }
@@ -596,7 +596,7 @@ class Split {
   const Frame &frame_;
   const Window &w_;
   const float *const falloff_;
-  const int y_, x_, first_;  // place in the block; of the first neighbour in windows of edges and light
+  const int y_, x_, first_, in_coc_;  // place in the block; of the first neighbour in windows of edges and light, and of coc
   const bool masked_;
   const Ends ends_;
   vec *light_, *clean_, *of_light_, *of_clean_;  // of the neighbours [channels, TAPS]; gradients begin with of_
