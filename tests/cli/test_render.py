@@ -126,6 +126,17 @@ def test_render_equals_the_function_on_tensors(
     assert "[" not in line and line.count("\n") == 1
 
 
+@pytest.mark.parametrize("points", ["--focus-at 21,5 --focus-at 9,12 --focus-at 20,3", "--focus-range-at 9,12,21,5"])
+def test_several_points_focus_on_all_between_the_nearest_and_the_farthest(depth: Tensor, run: Run, points: str) -> None:
+    depth[..., :6] = 1.0
+    np.save("depth.npy", depth.numpy())
+    line = run(f"render image.exr depth.npy -o out.exr {points} {LENS}")
+    assert line.startswith(f"out.exr: {inside(CAMERA.replace(focus_range_m=(2.0, 6.0)))}; ")
+    out, sharp = pixels("out.exr"), pixels("image.exr")
+    assert torch.equal(out[..., 12:], sharp[..., 12:])
+    assert not torch.equal(out[..., :6], sharp[..., :6])
+
+
 def test_lights_expand_clipped_lamps_of_a_photograph_and_alpha_is_premultiplied(depth: Tensor, run: Run) -> None:
     night = torch.full((1, 4, 16, 24), 0.01)
     night[:, :3, 8, 18], night[:, 3] = 1.0, 1.0
@@ -399,6 +410,21 @@ def test_an_existing_file_named_like_a_pattern_is_one_image(scene: Path, image: 
     assert pixels(str(out)).shape == image.shape
 
 
+def test_the_subject_of_an_inverted_map_is_the_same(run: Run) -> None:
+    """A person, at 0.8 of the range of nearness, stands on the ground before a wall."""
+    nearness = torch.linspace(0.0, 1.0, 16)[:, None].repeat(1, 24)
+    nearness[:8] = 0.1
+    nearness[4:14, 8:16] = 0.8
+    np.save("near.npy", nearness.numpy())
+    np.save("far.npy", (1.0 - nearness).numpy())
+    near_m, far_m = (
+        json.loads(run(f"render image.exr {name}.npy -o out.exr --json"))["camera"]["focus_m"]
+        for name in ("near", "far")
+    )
+    place = (1 / near_m - 1 / 8) / (1 - 1 / 8)
+    assert place == pytest.approx(0.8, abs=0.05) and far_m == pytest.approx(8 - 7 * place, rel=1e-3)
+
+
 def test_depth_of_nearly_the_same_shape_is_stretched_as_the_line_states(run: Run, image: Tensor, depth: Tensor) -> None:
     write_image("large.exr", Picture(torch.nn.functional.interpolate(image, (64, 96)), sample="float"))
     np.save("near.npy", torch.nn.functional.interpolate(depth, (132, 194), mode="nearest").numpy())
@@ -506,7 +532,7 @@ def test_a_part_of_the_frame_has_the_blur_that_it_has_in_the_whole(left: int, to
         write_image("part.exr", Picture(light, sample="float", window=place))
         np.save("part.npy", rays[(0, 0, *area)].numpy())
         lens: dict[str, Any] = {"focal_length_mm": 30.0, "sensor_width_mm": 36.0, "f_number": 1.0}
-        lens |= {"tilt": 0.4, "swing": -0.3, "focus_at": (left + 8, top + 9)}
+        lens |= {"tilt": 0.4, "swing": -0.3, "focus_at": ((left + 8, top + 9),)}
         scene = Scene(**lens, depth_kind="distance")
         frame = read_frame(Path("part.exr"), Path("part.npy"), scene)
         found.append((frame.values, *coc_of(frame, Notices())[:2]))

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchdof.depth import from_relative
 from torchdof.depth.guess import Guess, guess_kind, subject_m
 
 ROWS, COLUMNS = 48, 64
@@ -83,6 +84,19 @@ def test_surfaces_beside_the_middle_noise_stray_pixels_and_holes_are_not_the_sub
     depth = depth * (1 + 0.01 * torch.randn(depth.shape, generator=torch.Generator().manual_seed(0)))
     depth[..., ROWS // 2, COLUMNS // 2], depth[..., ::7, ::7] = 0.1, math.nan
     assert subject_m(depth) == pytest.approx(2.0, rel=0.02)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_map_and_its_negative_have_the_same_subject(seed: int) -> None:
+    """A person before a far wall and the ground, at distances that differ with the seed."""
+    random = torch.Generator().manual_seed(seed)
+    nearness, (wall, person) = ground(0.0, 1.0), torch.rand(2, generator=random).tolist()
+    nearness[..., : ROWS // 2, :] *= wall
+    nearness[..., 10:40, 24:44] = 0.2 + 0.7 * person
+    nearness += 0.02 * torch.rand(nearness.shape, generator=random)
+    depth, of_negative = from_relative(nearness, 1.0, 8.0), from_relative(1.0 - nearness, 1.0, 8.0, "depth")
+    place = (depth - subject_m(depth)).abs().argmin()
+    assert subject_m(of_negative, "depth") == pytest.approx(float(of_negative.flatten()[place]), rel=1e-4)
 
 
 def test_a_large_map_is_judged_as_a_small_one() -> None:

@@ -94,6 +94,7 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "Camera.focal_px": (Camera().focal_px, {"width": 5}),
     "Camera.replace": (Camera().replace, {"focus_m": 1.0, "f_number": 2.0}),
     "Camera.focus_at": (Camera().focus_at, {"depth": DEPTH, "x": 1.0, "y": 2.0, "patch": 5}),
+    "Camera.focus_range_at": (Camera().focus_range_at, {"depth": DEPTH, "points": [(1.0, 2.0)], "patch": 5}),
     "BlurTable": (BlurTable, {"family": "disc", "coc": [1.0], "params": {"radius": [1.0]}}),
     "BlurTable, all": (
         lambda **a: BlurTable("disc", [0.1], **a),

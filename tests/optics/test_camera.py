@@ -123,6 +123,18 @@ def test_focus_at_takes_the_median_of_a_patch_and_ignores_bad_depth() -> None:
     assert torch.as_tensor(Camera().focus_at(items, 1, 1).focus_m).tolist() == [1.0, math.inf]
 
 
+def test_a_range_in_focus_spans_the_surfaces_at_its_points() -> None:
+    depth = torch.tensor([2.0, 3.0, 5.0, math.inf]).reshape(1, 1, 1, 4)
+    points = [(2, 0), (0, 0), (1, 0)]
+    assert Camera().focus_range_at(depth, points, patch=1).focus_range_m == (2.0, 5.0)
+    assert Camera(focus_range_m=(1.0, 9.0)).focus_range_at(depth, [(1, 0)], patch=1).focus_range_m == (3.0, 3.0)
+    assert Camera().focus_range_at(depth, [(1, 0), (3, 0)], patch=1).focus_range_m == (3.0, math.inf)
+    tilted = Camera(80.0, focus_breathing=False, swing_deg=2.0).focus_range_at(depth, points, patch=1)
+    assert tilted.coc_px(depth, 4).flatten()[:3].abs().max() < 1e-5
+    near, far = Camera().focus_range_at(torch.cat([depth, 2 * depth]), points, patch=1).focus_range_m or (0, 0)
+    assert torch.as_tensor(near).tolist() == [2.0, 4.0] and torch.as_tensor(far).tolist() == [5.0, 10.0]
+
+
 @pytest.mark.parametrize("name", ["focal_length_mm", "f_number", "focus_m", "sensor_width_mm"])
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, torch.tensor([2.0, 0.0]), "2.8", True, torch.ones(1, 1)])
 def test_a_bad_number_is_refused_by_name(name: str, value: Any) -> None:
@@ -148,6 +160,8 @@ test_invalid_arguments_are_refused_by_name = refuses(
       for place in ((8.0, 0.0), (0.0, 4.0), (-0.1, 0.0), (0.0, -1.0))),
     (lambda: Camera().focus_at(FRAME, math.nan, 0.0), "x of the focus point must be a number"),
     (lambda: Camera().focus_at(0 * FRAME, 2, 2), "no valid depth"),
+    *((partial(Camera().focus_range_at, FRAME, points), "^points must be") for points in ([], 3.0, (1.0, 2.0), "here")),
+    (lambda: Camera().focus_range_at(FRAME, [(2, 2), (8, 0)]), "must lie in the frame of 8 x 4 pixels"),
 )  # fmt: skip
 
 

@@ -149,7 +149,8 @@ def _parameters(kind: type[Any]) -> Iterator[click.Parameter]:
 def _parameter(field: Any, hint: Any) -> click.Parameter:
     """Argument or option for a field of type ``hint``; a tuple that is not :class:`Parsed` takes several values."""
     given, names, required = field.metadata["details"], field.metadata["names"], field.default is dataclasses.MISSING
-    takes_several = typing.get_origin(hint) is tuple and not isinstance(given.get("type"), Parsed)
+    is_list = typing.get_origin(hint) is tuple and not isinstance(given.get("type"), Parsed)
+    takes_several = given.get("multiple", is_list)
     if typing.get_args(hint) and typing.get_origin(hint) is not Literal:  # X | None, tuple[X, ...]
         hint = typing.get_args(hint)[0]
     kind = click.Choice(typing.get_args(hint)) if typing.get_origin(hint) is Literal else hint

@@ -86,13 +86,19 @@ class Lens(Sensor):
         type=Parsed("METRES", parse_focus, "2.0, or keyframes frame:metres such as 1:2.0,48:5.5, all positive"),
         basic=True,
     )
-    focus_at: tuple[float, float] | None = option(
-        "Focus on the surface at this pixel from the top left; by default as the file states, else on the subject.",
+    focus_at: tuple[tuple[float, float], ...] = option(
+        "Focus on the surface at this pixel from the top left; given several times, on all between the nearest and the "
+        "farthest of them. Default: as the file states, else on the subject.",
+        (),
         type=Parsed("X,Y", numbers(2), "320,200"),
+        multiple=True,
         basic=True,
     )
     focus_range: tuple[float, float] | None = option(
         "Distances in metres between which all is in focus.", type=Parsed("NEAR,FAR", numbers(2), "1.5,2.2")
+    )
+    focus_range_at: tuple[float, float, float, float] | None = option(
+        "Pixels of two surfaces between which all is in focus.", type=Parsed("X,Y,X,Y", numbers(4), "320,200,410,220")
     )
     tilt: float = option("Degrees by which the lens is tilted down: focus comes nearer towards the bottom.", 0.0)
     swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)
@@ -112,12 +118,12 @@ class Lens(Sensor):
     def __post_init__(self) -> None:
         super().__post_init__()
         for names, problem in (
-            (("focus_m", "focus_at", "focus_range"), "both say where to focus"),
+            (("focus_m", "focus_at", "focus_range", "focus_range_at"), "both say where to focus"),
             (("fov_deg", "equivalent", "focal_length_mm"), "say the same"),
             (("fov_deg", "equivalent", "sensor_width_mm"), "say the same"),
             (("f_number", "aperture_radius_m", "equivalent", "blur"), "both say how wide the lens opens"),
         ):
-            given = [f"--{name.replace('_', '-')}" for name in names if getattr(self, name) is not None]
+            given = [f"--{name.replace('_', '-')}" for name in names if getattr(self, name) not in (None, ())]
             refuse((len(given) > 1, f"{' and '.join(given)} {problem}; give one of them"))
         has_radius = self.fov_deg is None and self.aperture_radius_m is not None
         refuse((has_radius, "--aperture-radius-m goes with --fov-deg; a real lens has --f-number instead"))
@@ -125,7 +131,7 @@ class Lens(Sensor):
     @property
     def has_focus(self) -> bool:
         """Whether an option sets the focus."""
-        return bool(self.given(Lens) & {"focus_m", "focus_at", "focus_range"})
+        return bool(self.given(Lens) & {"focus_m", "focus_at", "focus_range", "focus_range_at"})
 
     def refuse_keyframes(self) -> None:
         """Refuse keyframes of the focus, for a command that renders a single image."""
@@ -172,7 +178,7 @@ class Lens(Sensor):
             focus_m = focus_in_file
             remarks.append("focus from the file")
         elif not self.has_focus and is_still:
-            focus_m = subject_m(depth)
+            focus_m = subject_m(depth, frame.scene.relative_kind or "disparity")
             remarks.append("focus on what is nearest the middle")
         elif not self.has_focus:
             raise ValueError("where is the focus? give --focus-m METRES or --focus-at X,Y (the file does not say)")
@@ -188,10 +194,14 @@ class Lens(Sensor):
             camera = camera.replace(f_number=camera.f_number if self.f_number is None else self.f_number)
         camera = camera.replace(focus_range_m=self.focus_range, tilt_deg=self.tilt, swing_deg=self.swing)
         camera = camera.replace(sensor_width_mm=camera.sensor_width_mm * (width / area.width))
-        if self.focus_at is not None:
+        places, both = self.focus_at, self.focus_range_at
+        if both is not None:
+            places = (both[:2], both[2:])
+        if places:
             wide, padded, (_, rows, columns) = area.centred_camera(camera, depth)
-            x, y = self.focus_at[0] - area.x + columns.start, self.focus_at[1] - area.y + rows.start
-            camera = camera.replace(focus_m=wide.focus_at(padded, x, y).focus_m)
+            points = [(x - area.x + columns.start, y - area.y + rows.start) for x, y in places]
+            focused = wide.focus_at(padded, *points[0]) if len(points) == 1 else wide.focus_range_at(padded, points)
+            camera = focused.replace(sensor_width_mm=camera.sensor_width_mm)
         share, is_open = self.blur, is_still and not has_opening and not (is_to_scale and self.given(Lens))
         largest_px = self._largest_coc_px(camera, depth, area) if share is not None or is_open else 0.0
         if is_open and not (is_to_scale and "f_number" in in_file and largest_px >= _VISIBLE_BLUR * width):

@@ -19,8 +19,8 @@ _MAX_8_BIT, _MIN_16_BIT = 255, 60_000
 _NEAR_ZERO = 0.05  # numbers up to 1 are relative if the smallest is below this: in metres it would be too near
 _CLEAR_CORRELATION = 0.35  # absolute correlation of values and rows above which values clearly grow or shrink downwards
 
-# Subject of a picture: a peak in the histogram of 1 / distance
-_BINS = 64  # bins of 1 / distance
+# Subject of a picture: a peak in the histogram of nearness, which is linear in the numbers of the map
+_BINS = 64  # bins of nearness
 _REACH_BINS = 3  # bins on each side of a peak that belong to its surface; more: surfaces merge
 _MIDDLE_SIGMA = 1 / 6  # standard deviation of the weight of the middle, over each side of the picture
 _OUTLIERS = 0.01  # share of the pixels at each end of the distances that is ignored as outliers
@@ -70,22 +70,28 @@ def guess_kind(values: Tensor, integers: bool = False, metric: bool = False) -> 
     return Guess("z", 0.001, 0.0) if is_whole else Guess("z")
 
 
-def subject_m(depth: Tensor) -> float:
+def subject_m(depth: Tensor, kind: RelativeKind = "disparity") -> float:
     """Distance in metres of the subject in the middle of a depth map ``[1, 1, H, W]``; invalid depths are ignored.
 
     The subject is the nearest surface that fills at least a fifth of the middle, which is a Gaussian weight with a
     standard deviation of a sixth of each side. The distance is the median of that surface.
+
+    ``kind`` is that of the numbers from which the depth was made. Surfaces are found in a histogram over those numbers,
+    which is over 1 / depth for ``"disparity"`` and metric depth, and over depth for ``"depth"``. So a map and its
+    negative, in which larger is farther, have the same subject.
     """
     depth = _sampled(depth).double().cpu()
     y, x = (torch.linspace(-0.5, 0.5, size + 2, dtype=torch.float64)[1:-1] for size in depth.shape)
     weight = torch.exp(-0.5 * ((y[:, None] / _MIDDLE_SIGMA).square() + (x / _MIDDLE_SIGMA).square()))
-    is_known = depth > 0
+    is_linear = kind == "depth"
+    is_known = (depth > 0) & (depth.isfinite() | (not is_linear))
     if not bool(is_known.any()):
         raise ValueError("no pixel has a depth; check the kind, scale and offset of the depth map")
-    dioptres, order = (1.0 / depth[is_known]).sort()
+    known = depth[is_known]
+    nearness, order = (-known if is_linear else 1.0 / known).sort()
     weight = weight[is_known][order]
-    low, high = (float(dioptres[int(share * (dioptres.numel() - 1))]) for share in (_OUTLIERS, 1.0 - _OUTLIERS))
-    bins = ((dioptres - low) / max(high - low, 1e-9) * _BINS).clamp(0, _BINS - 1).long()
+    low, high = (float(nearness[int(share * (nearness.numel() - 1))]) for share in (_OUTLIERS, 1.0 - _OUTLIERS))
+    bins = ((nearness - low) / max(high - low, 1e-9) * _BINS).clamp(0, _BINS - 1).long()
     shares = torch.zeros(_BINS, dtype=torch.float64).index_add_(0, bins, weight / weight.sum())
     windows = torch.nn.functional.pad(shares, (_REACH_BINS, _REACH_BINS)).unfold(0, 2 * _REACH_BINS + 1, 1)
     window_shares, is_peak = windows.sum(1), windows.amax(1) == shares
@@ -93,7 +99,9 @@ def subject_m(depth: Tensor) -> float:
     peak_bin = int(is_subject.nonzero().max()) if bool(is_subject.any()) else int(window_shares.argmax())
     of_surface = (bins - peak_bin).abs() <= _REACH_BINS
     cumulative = weight[of_surface].cumsum(0)
-    median = float(dioptres[of_surface][int((cumulative >= 0.5 * cumulative[-1]).nonzero()[0])])
+    median = float(nearness[of_surface][int((cumulative >= 0.5 * cumulative[-1]).nonzero()[0])])
+    if is_linear:
+        return -median
     return 1.0 / median if median > 0 else math.inf
 
 

@@ -22,6 +22,7 @@ Reference:
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -29,7 +30,7 @@ from torch import Tensor
 
 from .. import native
 from ..tensors import floating, is_in_memory, is_traced
-from ..validation import ends, number, one_channel, pixels_wide, real_tensor, show, whole
+from ..validation import ends, number, numbers, one_channel, pixels_wide, real_tensor, show, whole
 
 __all__ = ["Camera"]
 
@@ -252,6 +253,35 @@ class Camera:
         if not all(float(median) > 0 for median in medians):
             raise ValueError(f"no focus brings the depth at ({x}, {y}) onto the tilted plane; tilt less")
         return self.replace(focus_m=float(medians[0]) if len(medians) == 1 else torch.stack(medians))
+
+    def focus_range_at(self, depth: Tensor, points: Sequence[tuple[float, float]], patch: int = 5) -> "Camera":
+        """This camera with all in focus between the nearest and the farthest of the surfaces at some pixels.
+
+        Args:
+            depth: As in :meth:`focus_at`.
+            points: Pixels ``(x, y)``, at least one, each as in :meth:`focus_at`.
+            patch: As in :meth:`focus_at`.
+
+        Returns:
+            A camera whose ``focus_range_m`` spans the focus distances of the points: floats for one item, else ``[B]``.
+
+        Raises:
+            ValueError: If there is no point, a pixel lies outside the frame, or its patch holds no valid depth.
+
+        Example:
+            >>> depth = torch.tensor([2.0, 5.0, 3.0]).expand(1, 1, 2, 3)
+            >>> Camera().focus_range_at(depth, [(2, 1), (0, 1)], patch=1)
+            Camera(50 mm, f/2.8, focus 2 to 3 m, sensor 36 mm)
+        """
+        pairs = numbers("points", points)
+        if pairs.ndim != 2 or pairs.shape[0] < 1 or pairs.shape[1] != 2:
+            raise ValueError(f"points must be pixels (x, y), at least one, got {show(points)}")
+        at_point = self.replace(focus_range_m=None)
+        found = [at_point.focus_at(depth, x, y, patch).focus_m for x, y in pairs.tolist()]
+        if isinstance(found[0], Tensor):
+            distances = torch.stack([torch.as_tensor(distance) for distance in found])
+            return self.replace(focus_range_m=(distances.amin(0), distances.amax(0)))
+        return self.replace(focus_range_m=(min(found), max(found)))
 
     def __repr__(self) -> str:
         focus = " to ".join(map(_show, self.focus_range_m or (self.focus_m,)))
