@@ -1,6 +1,5 @@
 """Depth of field as a module and as functions: they check their arguments and call the pipeline."""
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -84,8 +83,8 @@ class DepthOfField(nn.Module):
         Args:
             image: ``[B, C, H, W]``, linear light, floating point.
             depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres along the optical axis, > 0, ``inf`` allowed. A map of
-                another size with the same aspect ratio is resampled, guided by the image
-                (:func:`torchdof.depth.at_size_of`); a compiled or exported graph takes only the image's size.
+                another size is resampled, guided by the image (:func:`torchdof.depth.at_size_of`); a compiled or
+                exported graph takes only the image's size.
             focus_m: Focus distance in metres for this call: a number, or one for each image as a list, ``[B]`` or
                 ``[B, 1]`` (for clips ``[B]`` or ``[B, T]``); None uses the camera's.
             f_number: F-number for this call, in the same forms; None uses the camera's.
@@ -206,11 +205,8 @@ class DepthOfField(nn.Module):
         The depth ``[B or 1, 1, H, W]`` may have a size that can be resampled to the image's.
         """
         check = self.options.check
-        stretch = None if is_traced() else validation.stretch(image, depth)
-        if stretch is not None and image.shape[-2:] != depth.shape[-2:]:
-            if stretch:
-                warnings.warn(f"{name} is stretched by {stretch:.1%} to the shape of the image", stacklevel=3)
-            depth = at_size_of(image, depth)
+        is_sized = is_traced() or validation.stretch(image, depth) is None or image.shape[-2:] == depth.shape[-2:]
+        depth = depth if is_sized else at_size_of(image, depth)
         validation.image_and_depth(image, depth, values=check, name=name)
         changes = {"focus_m": focus_m, "f_number": f_number}
         camera = self.camera.replace(**{k: v for k, v in changes.items() if v is not None})

@@ -23,7 +23,7 @@ WHOLE_NUMBERS = (
     *(torch.int8, torch.int16, torch.int32, torch.int64),
 )
 
-_MAX_STRETCH = 0.03  # largest change of a depth map's aspect ratio; estimators work at multiples of 14 or 64 px
+_SAME_SHAPE = 0.03  # largest difference between aspect ratios that are meant to be equal
 
 
 def show(value: Any) -> str:
@@ -252,7 +252,7 @@ def background(
 def stretch(image: Any, depth: Any) -> float | None:
     """Relative stretch of a depth map along one axis to the aspect ratio of an image, 0 for less than a pixel.
 
-    None if it is more than 3 %, or if one of the two is not a map ``[B, C, H, W]``.
+    None if one of the two is not a map ``[B, C, H, W]``.
 
     Example:
         >>> round(stretch(torch.rand(1, 3, 1080, 1920), torch.rand(1, 1, 294, 518)), 4)  # multiples of 14
@@ -262,15 +262,19 @@ def stretch(image: Any, depth: Any) -> float | None:
         return None
     (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
     across, down = height * columns, width * rows
-    share = abs(across - down) / min(across, down) if abs(across - down) >= max(width, columns) else 0.0
-    return share if share <= _MAX_STRETCH else None
+    return abs(across - down) / min(across, down) if abs(across - down) >= max(width, columns) else 0.0
 
 
-def same_aspect(image: Tensor, depth: Tensor) -> None:
-    """Refuse a depth map whose aspect ratio differs by more than 3 % from that of an image."""
-    if stretch(image, depth) is None:
+def upright(image: Tensor, depth: Tensor) -> None:
+    """Refuse a depth map that would fit its image only after a turn by 90 degrees; all others can be stretched."""
+    as_it_is, turned = stretch(image, depth), stretch(image, depth.mT)
+    if as_it_is is not None and turned is not None and turned <= _SAME_SHAPE < as_it_is:
         (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
-        is_turned = stretch(image, depth.mT) is not None
-        hint = "turned by 90 degrees it fits: rotate one" if is_turned else "crop one, so that both show the same area"
         sizes = f"depth is {columns} x {rows} pixels and the image {width} x {height}"
-        raise ValueError(f"{sizes}: they must have the same aspect ratio, to within 3 %; {hint}")
+        raise ValueError(f"{sizes}: turned by 90 degrees it fits: rotate one")
+
+
+def stretched(image: Tensor, depth: Tensor) -> str:
+    """A note that a depth map is stretched to the shape of its image; "" for a map of the same shape."""
+    share = stretch(image, depth)
+    return f"depth of {depth.shape[-1]} x {depth.shape[-2]} px stretched by {share:.1%}" if share else ""

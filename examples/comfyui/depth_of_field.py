@@ -56,7 +56,7 @@ class DepthOfFieldNode:
         return {
             "required": {
                 "image": ("IMAGE", {"tooltip": "All in focus."}),
-                "depth": ("IMAGE", {"tooltip": "Its depth, of any size of the same aspect ratio."}),
+                "depth": ("IMAGE", {"tooltip": "Its depth, of any size; another shape is stretched to the image's."}),
                 "depth_kind": (
                     [_NEAR_IS_WHITE, _FAR_IS_WHITE, _METRES],
                     {"tooltip": "Depth Anything and MiDaS paint near white, Marigold far; or the values are metres."},

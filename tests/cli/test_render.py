@@ -425,11 +425,18 @@ def test_the_subject_of_an_inverted_map_is_the_same(run: Run) -> None:
     assert place == pytest.approx(0.8, abs=0.05) and far_m == pytest.approx(8 - 7 * place, rel=1e-3)
 
 
-def test_depth_of_nearly_the_same_shape_is_stretched_as_the_line_states(run: Run, image: Tensor, depth: Tensor) -> None:
+@pytest.mark.parametrize(("height", "width", "share"), [(132, 194, "2.1%"), (96, 96, "50.0%")])
+def test_depth_of_another_shape_is_stretched_as_the_line_states(
+    run: Run, image: Tensor, depth: Tensor, height: int, width: int, share: str
+) -> None:
     write_image("large.exr", Picture(torch.nn.functional.interpolate(image, (64, 96)), sample="float"))
-    np.save("near.npy", torch.nn.functional.interpolate(depth, (132, 194), mode="nearest").numpy())
-    line = run(f"render large.exr near.npy -o out.exr --focus-m 2 {LENS}")
-    assert "depth stretched by 2.1%" in line and "96 x 64" in line
+    stretched = torch.nn.functional.interpolate(depth, (height, width), mode="nearest")
+    np.save("stretched.npy", stretched.numpy())
+    line = run(f"render large.exr stretched.npy -o out.exr --focus-m 2 {LENS}")
+    assert f"depth of {width} x {height} px stretched by {share}" in line and "96 x 64" in line
+    with pytest.warns(UserWarning, match="stretched"):
+        expected = torchdof.depth_of_field(pixels("large.exr"), stretched, CAMERA)
+    torch.testing.assert_close(pixels("out.exr"), expected, rtol=0, atol=1e-5)
 
 
 def test_the_folder_of_the_output_is_made(run: Run) -> None:

@@ -107,6 +107,15 @@ def test_a_smaller_depth_map_a_shared_one_and_alpha_are_accepted() -> None:
     assert out.shape == (2, 18, 24, 4) and focus.shape == (2, 18, 24, 3)
 
 
+def test_a_square_map_is_stretched_with_a_warning() -> None:
+    image, depth = torch.rand(1, 18, 24, 3), torch.full((1, 18, 18, 1), 2.0)
+    depth[:, :, 9:] = 5.0
+    with pytest.warns(UserWarning, match=r"depth of 18 x 18 px stretched by 33\.3% to the shape of the image"):
+        out, _ = render(image, depth, depth_kind="metres", focus_x=0.1)
+    torch.testing.assert_close(out[:, :, :8], image[:, :, :8], rtol=0.0, atol=1e-3)
+    assert float((out - image)[:, :, 16:].abs().max()) > 0.05
+
+
 test_depth_that_does_not_fit_is_refused_in_one_sentence = refuses(
     (lambda: render(scene()[0], torch.rand(3, 18, 24, 3)), "one for each of the 2 images, got 3"),
     (lambda: render(scene()[0], torch.ones(1, 18, 24, 3)), "got 1 everywhere"),

@@ -23,8 +23,8 @@ from ..optics.aperture import Aperture
 from ..optics.blur_table import BlurTable
 from ..optics.camera import Camera
 from ..options import Options
-from ..render.resample import at_size_of
-from ..validation import same_aspect, stretch
+from ..render.resample import resampled
+from ..validation import stretched, upright
 from .command import refuse
 from .lens import Area, Lens
 from .options import Scene
@@ -85,8 +85,8 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
         if kind == "coc" and (rows, columns) != (height, width):
             sizes = f"{columns} x {rows} pixels but the image is {width} x {height}"
             raise ValueError(f"coc is {sizes}; they must be the same")
-        same_aspect(picture.pixels, values)
-        stretched = stretch(picture.pixels, values)
+        upright(picture.pixels, values)
+        remarks = list(filter(None, [stretched(picture.pixels, values)]))
         given: dict[str, Any] = {"unknown": scene.depth_unknown}
         place: Any = (...,)
         if kind == "distance":
@@ -100,11 +100,10 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
             values = depth_from_values(values, kind, scale=scene.depth_scale, offset=scene.depth_offset, **given)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
-    values, filled = values if kind == "coc" else at_size_of(picture.pixels, values[place]), 0
+    values, filled = values if kind == "coc" else resampled(picture.pixels, values[place]), 0
     fill_by: Any = scene.fill_depth
     if fill_by is not None or not holes:
         values, filled = resolve_holes(values, str(source), fill_by, kind in ("relative", "coc"))
-    remarks = [f"depth stretched by {stretched:.1%}"] if stretched else []
     if kind == "relative" and None in (scene.near_m, scene.far_m):
         remarks.append("depth from {:g} to {:g} m assumed".format(*scene.ends_m))
     return Frame(str(source), scene, picture, area, values, filled, remarks, guess)
