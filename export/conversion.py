@@ -187,6 +187,11 @@ def _where(condition: Any, self: Any, other: Any) -> Any:
     return opset20.Or(opset20.And(condition, self), neither)
 
 
+def _nan_to_num(self: Any) -> Any:
+    limits = torch.finfo(torch.float32)
+    return opset20.Where(opset20.IsNaN(self), 0.0, opset20.Clip(self, limits.min, limits.max))
+
+
 def _index_select(self: Any, dim: int, index: Any) -> Any:
     if dim != 1:
         return opset20.Gather(self, index, axis=dim)
@@ -230,6 +235,7 @@ _TRANSLATIONS: dict[Callable[..., Any], Callable[..., Any]] = {
         opset20.ReduceMax(self, keepdims=0),
     ),
     torch.ops.aten.diff.default: _diff,
+    torch.ops.aten.nan_to_num.default: _nan_to_num,
     torch.ops.aten.index_add.default: _index_add,
     torch.ops.aten.addcmul.default: lambda self, first, second: opset20.Add(self, opset20.Mul(first, second)),
     torch.ops.aten.index_copy.default: _index_copy,

@@ -3,18 +3,25 @@
 Usage: python examples/web/write_files.py --out examples/web/dist [--model dof.onnx]
 
 Writes an exported file for each shape of the lens's opening, ``dof.json`` with their names and the camera, and in
-``sample/`` a photograph and its depth in millimetres, 16 bits.
+``sample/`` a photograph and its depth in millimetres, 16 bits. A shape that cannot be written is left out of the page.
 """
 
 import argparse
 import json
 import shutil
+import sys
 from pathlib import Path
 
-import torchdof
-from torchdof.depth import read_depth, repair_edges
-from torchdof.export import describe, to_onnx
-from torchdof.io.images import Picture, read_image, write_image
+try:
+    import torchdof
+    from torchdof.depth import read_depth, repair_edges
+    from torchdof.export import describe, to_onnx
+    from torchdof.io.images import Picture, read_image, write_image
+except ModuleNotFoundError as error:
+    raise SystemExit(
+        f"the page needs {error.name}, which {sys.executable} does not have; run make install in the folder of the "
+        "repository, or pip install '.[export]', or name another Python: PYTHON=/path/to/python npm run build"
+    ) from None
 
 FOV_X_DEG = 40.0  # horizontal field of view of a 50 mm lens on full frame
 MAX_COC_PX = 64.0
@@ -28,6 +35,24 @@ TOLERANCE = 4 / 255  # that of "preview", because a browser is slow
 DATA = Path(__file__).parents[1] / "data" / "motorcycle"
 
 
+def write_shapes(out: Path) -> list[str]:
+    """Writes and verifies an exported file for each shape; returns the names of those that were written."""
+    camera = torchdof.Camera.from_fov(FOV_X_DEG, 0.01, 2.0)  # aperture and focus are inputs of the file
+    print(f"writing and checking {len(SHAPES)} exported files; each takes a minute or two", flush=True)
+    written = []
+    for file, (name, table) in SHAPES.items():
+        dof = torchdof.DepthOfField(camera, table, tolerance=TOLERANCE, max_coc_px=MAX_COC_PX, check=False)
+        try:
+            print(f"{name}: {to_onnx(dof, out / file, depth_edges=dof.options.depth_edges)}", flush=True)
+        except (ValueError, RuntimeError, MemoryError) as error:
+            print(f"warning: the page is without the shape {name!r}: {error}", file=sys.stderr, flush=True)
+        else:
+            written.append(file)
+    if not written:
+        raise SystemExit("error: no exported file could be written, so that there is no page")
+    return written
+
+
 def main() -> None:
     """Write the files."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
@@ -36,23 +61,17 @@ def main() -> None:
     arguments = parser.parse_args()
 
     if arguments.model is None:
-        camera = torchdof.Camera.from_fov(FOV_X_DEG, 0.01, 2.0)  # aperture and focus are inputs of the file
-        print(f"writing and checking {len(SHAPES)} exported files; each takes a minute or two", flush=True)
-        for file, (name, table) in SHAPES.items():
-            dof = torchdof.DepthOfField(
-                camera, table, tolerance=TOLERANCE, max_coc_px=MAX_COC_PX, depth_edges="as given", check=False
-            )
-            print(f"{name}: {to_onnx(dof, arguments.out / file)}", flush=True)
+        written = write_shapes(arguments.out)
     else:
         shutil.copyfile(arguments.model, arguments.out / "dof.onnx")
-    metadata = describe(arguments.out / "dof.onnx")
-    shapes = [{"file": file, "name": name} for file, (name, _) in SHAPES.items() if (arguments.out / file).exists()]
+        written = ["dof.onnx"]
+    metadata = describe(arguments.out / written[0])
     page_settings = {
         "focal_length_mm": metadata["camera"]["focal_length_mm"],
         "sensor_width_mm": metadata["camera"]["sensor_width_mm"],
         "max_coc_px": metadata["options"]["max_coc_px"],
         "tile_px": TILE_PX,
-        "shapes": shapes,
+        "shapes": [{"file": file, "name": SHAPES[file][0]} for file in written],
     }
     (arguments.out / "dof.json").write_text(json.dumps(page_settings))
 

@@ -2,6 +2,9 @@
 
 import { decodePng, isPng } from './png.mjs'
 
+const LEAST_LEVELS = 64 // levels that a map of 8 bits spans at least; with fewer, a step of one level may be an edge
+const REACHES_PX = [4, 2, 1] // distances over which steps of one level are smoothed
+
 /** A depth map: one number a pixel, row by row. */
 export class DepthMap {
   constructor(values, width, height, fullScale = null) {
@@ -20,6 +23,9 @@ export class DepthMap {
  * 'metres'     scale * value; zero and less are holes                    renderers, depth cameras (scale 0.001: mm)
  * 'disparity'  1 / metres is linear, the largest value lies at nearM     MiDaS, DPT, Depth Anything
  * 'depth'      metres are linear, the largest value lies at farM         Marigold
+ *
+ * Relative maps of 8 bits have steps on smooth surfaces, which in a strong blur would appear as fine lines. They become
+ * ramps: a value changes by at most half a level.
  *
  * @param {DepthMap} map
  * @param {{kind: string, scale?: number, nearM?: number, farM?: number}} meaning
@@ -40,11 +46,35 @@ export function metresOf(map, { kind, scale = 1, nearM, farM }) {
   if (!(low < high)) {
     throw new Error('the depth map has one value everywhere: nothing tells near from far. Choose another file.')
   }
-  return map.values.map((value) => {
+  return withoutSteps(map, low, high).map((value) => {
     if (!Number.isFinite(value)) return NaN
-    const share = (value - low) / (high - low)
+    const share = Math.min(1, Math.max(0, (value - low) / (high - low)))
     return kind === 'depth' ? nearM + (farM - nearM) * share : 1 / (share / nearM + (1 - share) / farM)
   })
+}
+
+/** The values of a map whose extremes are low and high; if it is of 8 bits, steps of one level are ramps. */
+function withoutSteps({ values, width, height }, low, high) {
+  const level = high > 1 ? 1 : 1 / 255
+  const isWhole = (value) => !Number.isFinite(value) || Math.abs(value / level - Math.round(value / level)) < 1e-3
+  const isOf8Bits = high - low > LEAST_LEVELS * level && low >= 0 && high <= 255 * level && values.every(isWhole)
+  if (!isOf8Bits) return values
+  const smooth = Float32Array.from(values)
+  for (const reach of REACHES_PX) {
+    for (const [across, down] of [[reach, 0], [0, reach]]) {
+      const now = smooth.slice()
+      for (let i = 0, y = 0; y < height; y++) {
+        const rows = [width * Math.max(0, y - down), width * Math.min(height - 1, y + down)]
+        for (let x = 0; x < width; x++, i++) {
+          const before = rows[0] + Math.max(0, x - across)
+          const after = rows[1] + Math.min(width - 1, x + across)
+          if (Math.abs(values[before] - values[i]) < 1.5 * level) smooth[i] += (now[before] - now[i]) / 4
+          if (Math.abs(values[after] - values[i]) < 1.5 * level) smooth[i] += (now[after] - now[i]) / 4
+        }
+      }
+    }
+  }
+  return smooth.map((value, i) => Math.min(values[i] + level / 2, Math.max(values[i] - level / 2, value)))
 }
 
 /** The smallest and the largest finite value; [Infinity, -Infinity] without finite values. */

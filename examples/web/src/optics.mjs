@@ -1,10 +1,28 @@
 // The thin lens of the exported file, for the numbers and the depth view of the page.
 
-/** Signed radius in pixels of the circle of confusion: coc = (A / 2) F (1/s - 1/z), negative in front of the focus. */
-export function cocPx(camera, width, focusM, fNumber, depthM) {
+/**
+ * Signed radius in pixels of the circle of confusion: coc = (A / 2) F (1/s - 1/z), negative in front of the focus.
+ *
+ * All between `focus.nearM` and `focus.farM` is in focus: in front of this range s is nearM, behind it farM.
+ */
+export function cocPx(camera, width, focus, fNumber, depthM) {
   const apertureRadiusM = camera.focal_length_mm / 1000 / fNumber / 2
   const focalPx = (camera.focal_length_mm / camera.sensor_width_mm) * width
-  return apertureRadiusM * focalPx * (1 / focusM - 1 / depthM)
+  const inFront = Math.min(0, 1 / focus.nearM - 1 / depthM)
+  const behind = Math.max(0, 1 / focus.farM - 1 / depthM)
+  return apertureRadiusM * focalPx * (inFront + behind)
+}
+
+/**
+ * Depth with which a lens focused on `focus.nearM` blurs as one that keeps the whole range of `focus` sharp.
+ *
+ * The exported file focuses on one distance. So the range becomes that distance, and what lies behind it comes nearer by
+ * as many dioptres (1 / depth) as the range spans.
+ */
+export function withoutRange(metres, { nearM, farM }) {
+  if (nearM === farM) return metres
+  const span = 1 / nearM - 1 / farM
+  return metres.map((depthM) => (depthM <= nearM ? depthM : depthM <= farM ? nearM : 1 / (1 / depthM + span)))
 }
 
 /** A picture of depth: near is light; pixels with a blur radius below one pixel of the result are tinted. */

@@ -1,5 +1,6 @@
 // The page: turns files and controls into a scene and a lens, and shows the results.
 
+import { fNumberFor, guessMeaning, inOrder, subjectOf } from './assumed.mjs'
 import { depthAtSize, extremes, fillHoles, metresOf } from './depth.mjs'
 import { kindOf, readDepth, readPhoto } from './files.mjs'
 import { cocPx, depthPicture, distanceAt } from './optics.mjs'
@@ -12,20 +13,22 @@ const HORIZON_M = 1000 // farther is all the same to a lens
 const NEEDS_DEPTH =
   'Now add its depth map: a grey picture of distances, from an estimator such as Depth Anything, a depth camera or a renderer.'
 const SETTLED_MS = 250 // time without a change of the controls after which the size of the scene is rendered
-const MOST_STRETCH = 0.03 // between the shapes of photo and depth map: estimators round sizes to multiples of 14 or 64
+const SAME_SHAPE = 0.03 // largest difference between shapes that are meant to be equal
 
 let camera
 let photo = null // {name, rgba, width, height}
 let depthFile = null // {name, map}
 let isSample = false
-let scene = null // {photo, depth: {metres, width, height}, width, height, nearM, farM}
-let focusM = 2
+let scene = null // {photo, depth: {metres, width, height}, distances, width, height, nearM, farM}
+let focus = { nearM: 2, farM: 2 } // all between these distances is in focus
+let isFocusChosen = false // by a point or the slider; until then the subject is in focus
+let fNumber = 1
 let result = null // the picture of what the controls say, at the size of the scene
 let settling
 
-const fNumberOf = (position) => 2 ** (-position / 6) // six steps: one f-stop of half the diameter
-const fNumber = () => fNumberOf(Number($('aperture').value))
-const stage = new Stage($('frame'), focusAt)
+const fNumberOf = (position) => 2 ** (-position / 6) // six steps: half the diameter
+const positionOf = (number) => -6 * Math.log2(number)
+const stage = new Stage($('frame'), pointAt)
 const renderer = new Renderer({
   onSharp: (picture) => stage.showSharp(picture),
   onBegin: (expectedMs, size, isReady) => {
@@ -48,7 +51,7 @@ const renderer = new Renderer({
     if (picture.size === 'half' || settling !== null) return
     result = picture
     $('save').disabled = false
-    say(`${picture.width} × ${picture.height} in ${seconds(picture.ms)}. Click what should be sharp.`)
+    say(`${picture.width} × ${picture.height} in ${seconds(picture.ms)}. Click what should be sharp; with shift, what else.`)
   },
   onFailed: (message) => {
     stage.endProgress()
@@ -79,7 +82,9 @@ async function take(files, slot = null) {
     isSample = false
     photo = opened.photo ?? photo
     depthFile = opened.depth ?? depthFile
-    if (opened.depth) guessMeaning(depthFile.map)
+    isFocusChosen = false
+    $('automatic').checked = true
+    if (opened.depth) setMeaning(guessMeaning(depthFile.map))
     arrange()
   } catch (error) {
     complain(error.message)
@@ -99,24 +104,22 @@ async function takeSample() {
     photo = await readPhoto(photoFile)
     depthFile = await readDepth(depth)
     isSample = true
-    guessMeaning(depthFile.map)
-    arrange({ u: 0.6, v: 0.5 })
+    isFocusChosen = false
+    $('automatic').checked = true
+    setMeaning(guessMeaning(depthFile.map))
+    arrange()
   } catch (error) {
     complain(error.message)
   }
 }
 
-/** Likely kind of a map: floats are metres, 16 bits millimetres unless they fill their range, 8 bits relative. */
-function guessMeaning({ values, fullScale }) {
-  const [low, high] = extremes(values)
-  const fillsRange = fullScale !== null && low < 0.1 * fullScale && high > 0.9 * fullScale
-  const isRelative = fullScale === 255 || fillsRange
-  $('kind').value = isRelative ? 'disparity' : 'metres'
-  $('scale').value = fullScale === null ? '1' : '0.001'
+function setMeaning({ kind, scale }) {
+  $('kind').value = kind
+  $('scale').value = String(scale)
 }
 
 /** Makes a scene from photo, depth map and its kind; shows a message if one is missing or does not fit. */
-function arrange(point = { u: 0.5, v: 0.5 }) {
+function arrange() {
   showTiles()
   scene = null
   result = null
@@ -136,11 +139,11 @@ function arrange(point = { u: 0.5, v: 0.5 }) {
   }
   const { map } = depthFile
   const [ours, theirs] = [photo.width / photo.height, map.width / map.height]
-  const stretch = Math.abs(Math.log(ours / theirs))
-  if (stretch > MOST_STRETCH) {
+  const stretch = difference(ours, theirs)
+  if (stretch > SAME_SHAPE && difference(ours, 1 / theirs) <= SAME_SHAPE) {
     throw new Error(
-      `The photo is ${photo.width} × ${photo.height}, its depth map ${map.width} × ${map.height}: they must show the same ` +
-        'frame. Choose the depth map of this photo, not cropped and not turned.',
+      `The photo is ${photo.width} × ${photo.height}, its depth map ${map.width} × ${map.height}: turned by 90 degrees it ` +
+        'fits. Turn one of them.',
     )
   }
   const metres = metresOf(map, {
@@ -155,6 +158,7 @@ function arrange(point = { u: 0.5, v: 0.5 }) {
   scene = {
     photo,
     depth: { metres, width: map.width, height: map.height },
+    distances: inOrder(metres),
     width: Math.max(1, Math.round(photo.width * shrink)),
     height: Math.max(1, Math.round(photo.height * shrink)),
     nearM,
@@ -164,14 +168,18 @@ function arrange(point = { u: 0.5, v: 0.5 }) {
   $('lens').disabled = false
   stage.setActive(true)
   renderer.setScene({ photo, depth: scene.depth, width: scene.width, height: scene.height, file: $('shape').value })
-  focusAt(point.u, point.v, true)
+  if (isFocusChosen) focusOnPoints(stage.points, true)
+  else focusOnSubject()
 }
+
+/** Relative difference between two ratios of sides. */
+const difference = (one, other) => Math.max(one / other, other / one) - 1
 
 /** Arrange again after a control has changed. */
 function rearrange() {
   complain(null)
   try {
-    arrange(stage.point)
+    arrange()
   } catch (error) {
     complain(error.message)
   }
@@ -222,16 +230,34 @@ async function drawCovering(canvas, image) {
 
 /* Lens --------------------------------------------------------------------------------------------------------- */
 
-function focusAt(u, v, isDone) {
+/** A point of the picture was pointed at; see Stage. */
+function pointAt(point, how, isDone) {
   if (!scene) return
-  const { metres, width, height } = scene.depth
-  stage.mark(u, v, true)
-  setFocus(distanceAt(metres, width, height, u, v), isDone)
+  isFocusChosen = true
+  const kept = { set: [], add: stage.points, move: stage.points.slice(0, -1) }[how]
+  focusOnPoints([...kept, point], isDone)
 }
 
-function setFocus(distanceM, isDone) {
-  focusM = Math.min(scene.farM, Math.max(scene.nearM, distanceM))
-  $('focus').value = (1000 * Math.log(focusM / scene.nearM)) / Math.log(scene.farM / scene.nearM)
+/** Focus on all between the nearest and the farthest of the surfaces at some points. */
+function focusOnPoints(points, isDone) {
+  const { metres, width, height } = scene.depth
+  stage.mark(points, true)
+  const distances = points.map(({ u, v }) => distanceAt(metres, width, height, u, v))
+  setFocus(Math.min(...distances), Math.max(...distances), isDone)
+}
+
+function focusOnSubject() {
+  const { metres, width, height } = scene.depth
+  const { distanceM, u, v } = subjectOf(metres, width, height, $('kind').value)
+  stage.mark([{ u, v }], true)
+  setFocus(distanceM, distanceM, true)
+}
+
+function setFocus(nearM, farM, isDone) {
+  const inScene = (distanceM) => Math.min(scene.farM, Math.max(scene.nearM, distanceM))
+  focus = { nearM: inScene(nearM), farM: inScene(farM) }
+  const halfwayM = 2 / (1 / focus.nearM + 1 / focus.farM)
+  $('focus').value = (1000 * Math.log(halfwayM / scene.nearM)) / Math.log(scene.farM / scene.nearM)
   update(isDone)
 }
 
@@ -239,7 +265,11 @@ function setFocus(distanceM, isDone) {
 function update(isDone) {
   result = null
   $('save').disabled = true
-  say(`Focus at ${metresText(focusM)}, ${stopText()}`)
+  if ($('automatic').checked) {
+    fNumber = fNumberFor(scene.distances, (depthM) => cocPx(camera, 1, focus, 1, depthM)) ?? fNumber
+    $('aperture').value = positionOf(fNumber)
+  }
+  say(`Focus at ${focusText()}, ${stopText()}`)
   describeLens()
   clearTimeout(settling)
   settling = setTimeout(finish, isDone ? 0 : SETTLED_MS)
@@ -253,22 +283,22 @@ function finish() {
 
 function request(size) {
   const reachPx = Math.min(camera.max_coc_px, largestRadius(photo.width))
-  renderer.request({ size, file: $('shape').value, focusM, fNumber: fNumber(), tilePx: camera.tile_px, reachPx })
+  renderer.request({ size, file: $('shape').value, focus, fNumber, tilePx: camera.tile_px, reachPx })
 }
 
 /** Largest blur radius of the scene in pixels of a picture of that width. */
 function largestRadius(width) {
-  const radius = (depthM) => Math.abs(cocPx(camera, width, focusM, fNumber(), depthM))
+  const radius = (depthM) => Math.abs(cocPx(camera, width, focus, fNumber, depthM))
   return Math.max(radius(scene.nearM), radius(scene.farM))
 }
 
 function describeLens() {
-  $('focus-value').textContent = metresText(focusM)
-  $('focus').setAttribute('aria-valuetext', metresText(focusM))
+  $('focus-value').textContent = focusText()
+  $('focus').setAttribute('aria-valuetext', focusText())
   $('aperture-value').textContent = stopText()
   $('aperture').setAttribute('aria-valuetext', stopText())
   document.querySelector('[data-side=after]').textContent = stopText()
-  const opening = Math.min(1, 0.12 + 0.88 * Math.sqrt(0.5 / fNumber()))
+  const opening = Math.min(1, 0.12 + 0.88 * Math.sqrt(0.5 / fNumber))
   const corners = Array.from({ length: 7 }, (_, i) => {
     const angle = (2 * Math.PI * i) / 7 + 1.2 * (1 - opening)
     return `${(10 * opening * Math.cos(angle)).toFixed(2)},${(10 * opening * Math.sin(angle)).toFixed(2)}`
@@ -290,14 +320,19 @@ function showView() {
   }
   const { width, height, depth, nearM, farM } = scene
   const metres = depthAtSize(depth.metres, depth.width, depth.height, width, height)
-  const coc = (depthM) => cocPx(camera, width, focusM, fNumber(), depthM)
+  const coc = (depthM) => cocPx(camera, width, focus, fNumber, depthM)
   stage.showDepth(depthPicture(metres, width, height, nearM, farM, coc))
 }
 
 /* Words -------------------------------------------------------------------------------------------------------- */
 
-const stopText = () => `f/${fNumber() < 9.5 ? fNumber().toFixed(1) : fNumber().toFixed(0)}`
+const stopText = () => `f/${fNumber.toFixed(fNumber < 9.5 ? 1 : 0)}`
 const seconds = (ms) => `${(ms / 1000).toFixed(ms < 9500 ? 1 : 0)} s`
+
+function focusText() {
+  const [near, far] = [metresText(focus.nearM), metresText(focus.farM)]
+  return near === far ? near : `${near} to ${far}`
+}
 
 function metresText(metres) {
   if (metres >= HORIZON_M) return 'infinity'
@@ -328,8 +363,9 @@ async function download({ rgba, width, height }) {
   const file = await encoded(rgba, width, height, $('format').value)
   const link = document.createElement('a')
   link.href = URL.createObjectURL(file)
+  const distance = [...new Set([focus.nearM, focus.farM].map((metres) => metres.toFixed(2)))].join('-')
   const ending = file.type === 'image/jpeg' ? 'jpg' : file.type.replace('image/', '')
-  link.download = `${photo.name.replace(/\.[^.]*$/, '')}_f${fNumber().toFixed(1)}_${focusM.toFixed(2)}m.${ending}`
+  link.download = `${photo.name.replace(/\.[^.]*$/, '')}_f${fNumber.toFixed(1)}_${distance}m.${ending}`
   link.click()
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000)
   say(`Saved ${link.download}.`)
@@ -348,11 +384,17 @@ async function encoded(rgba, width, height, type) {
 function listen() {
   $('panel').addEventListener('submit', (event) => event.preventDefault())
   $('focus').addEventListener('input', () => {
-    stage.mark(stage.point.u, stage.point.v, false)
-    setFocus(scene.nearM * (scene.farM / scene.nearM) ** ($('focus').value / 1000), false)
+    isFocusChosen = true
+    stage.mark(stage.points.slice(-1), false)
+    const distanceM = scene.nearM * (scene.farM / scene.nearM) ** ($('focus').value / 1000)
+    setFocus(distanceM, distanceM, false)
   })
-  $('aperture').addEventListener('input', () => update(false))
-  for (const name of ['focus', 'aperture']) $(name).addEventListener('change', () => scene && update(true))
+  $('aperture').addEventListener('input', () => {
+    $('automatic').checked = false
+    fNumber = fNumberOf(Number($('aperture').value))
+    update(false)
+  })
+  for (const name of ['focus', 'aperture', 'automatic']) $(name).addEventListener('change', () => scene && update(true))
   for (const name of ['kind', 'scale', 'near', 'far', 'size']) $(name).addEventListener('change', rearrange)
   $('shape').addEventListener('change', () => scene && update(true))
   $('full').addEventListener('change', () => scene && describeLens())

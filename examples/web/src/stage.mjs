@@ -3,7 +3,10 @@
 const clamp = (value, low, high) => Math.min(high, Math.max(low, value))
 
 export class Stage {
-  /** @param onFocus (u, v, isDone): a point of the picture, 0 to 1 from its top left corner, was pointed at. */
+  /**
+   * @param onFocus (point, how, isDone): a point {u, v} of the picture, 0 to 1 from its top left corner, was pointed at.
+   *   how is 'set' for the only point, 'add' for one more (with shift), 'move' for another place of the last one.
+   */
   constructor(frame, onFocus) {
     this.frame = frame
     this.before = frame.querySelector('#before')
@@ -12,7 +15,7 @@ export class Stage {
     this.divider = frame.querySelector('#divider')
     this.reticle = frame.querySelector('#reticle')
     this.progress = frame.querySelector('#progress')
-    this.point = { u: 0.5, v: 0.5 }
+    this.points = [{ u: 0.5, v: 0.5 }]
     this.#listenForFocus(onFocus)
     this.#listenForDivider()
   }
@@ -56,12 +59,21 @@ export class Stage {
     this.depthView.getContext('2d').putImageData(image, 0, 0)
   }
 
-  /** Move the mark to a point; it is paler if the focus was not set there. */
-  mark(u, v, isFocus) {
-    this.point = { u, v }
+  /** Mark the points of focus; the marks are paler if the focus was not set there. */
+  mark(points, isFocus) {
+    this.points = points
+    for (const other of this.frame.querySelectorAll('.reticle.other')) other.remove()
+    for (const { u, v } of points.slice(0, -1)) {
+      const mark = document.createElement('span')
+      mark.className = 'reticle other'
+      mark.style.setProperty('--x', `${100 * u}%`)
+      mark.style.setProperty('--y', `${100 * v}%`)
+      this.reticle.before(mark)
+    }
+    const { u, v } = this.#last()
     this.reticle.style.setProperty('--x', `${100 * u}%`)
     this.reticle.style.setProperty('--y', `${100 * v}%`)
-    this.reticle.classList.toggle('set-by-distance', !isFocus)
+    for (const mark of this.frame.querySelectorAll('.reticle')) mark.classList.toggle('set-by-distance', !isFocus)
   }
 
   /** Show the progress of work that takes about this many ms; null means unknown. */
@@ -90,35 +102,46 @@ export class Stage {
     this.divider.setAttribute('aria-valuenow', share)
   }
 
+  #last() {
+    return this.points.at(-1)
+  }
+
   #pointAt(event) {
     const box = this.frame.getBoundingClientRect()
-    return [clamp((event.clientX - box.left) / box.width, 0, 1), clamp((event.clientY - box.top) / box.height, 0, 1)]
+    return {
+      u: clamp((event.clientX - box.left) / box.width, 0, 1),
+      v: clamp((event.clientY - box.top) / box.height, 0, 1),
+    }
   }
 
   #listenForFocus(onFocus) {
     let isScanning = false
+    let isPlaced = false // the mouse button has set or added the point that the click confirms
+    const howOf = (event) => (event.shiftKey ? 'add' : 'set')
     this.frame.addEventListener('pointerdown', (event) => {
       if (event.pointerType !== 'mouse' || event.button !== 0 || this.divider.contains(event.target)) return
-      isScanning = true
+      isScanning = isPlaced = true
       this.frame.setPointerCapture(event.pointerId)
-      onFocus(...this.#pointAt(event), false)
+      onFocus(this.#pointAt(event), howOf(event), false)
     })
     this.frame.addEventListener('pointermove', (event) => {
-      if (isScanning) onFocus(...this.#pointAt(event), false)
+      if (isScanning) onFocus(this.#pointAt(event), 'move', false)
     })
     this.frame.addEventListener('pointerup', () => (isScanning = false))
-    this.frame.addEventListener('pointercancel', () => (isScanning = false))
+    this.frame.addEventListener('pointercancel', () => (isScanning = isPlaced = false))
     this.frame.addEventListener('click', (event) => {
       const isByKeyboard = event.target === this.reticle && event.detail === 0
-      if (isByKeyboard) onFocus(this.point.u, this.point.v, true)
-      else if (!this.divider.contains(event.target)) onFocus(...this.#pointAt(event), true)
+      if (isByKeyboard) onFocus(this.#last(), howOf(event), true)
+      else if (!this.divider.contains(event.target)) onFocus(this.#pointAt(event), isPlaced ? 'move' : howOf(event), true)
+      isPlaced = false
     })
     this.reticle.addEventListener('keydown', (event) => {
       const step = event.shiftKey ? 0.1 : 0.02
       const [right, down] = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key] ?? []
       if (right === undefined) return
       event.preventDefault()
-      onFocus(clamp(this.point.u + right * step, 0, 1), clamp(this.point.v + down * step, 0, 1), false)
+      const { u, v } = this.#last()
+      onFocus({ u: clamp(u + right * step, 0, 1), v: clamp(v + down * step, 0, 1) }, 'move', false)
     })
   }
 

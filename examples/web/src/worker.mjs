@@ -1,7 +1,7 @@
 // Renders in a worker, so that the page stays responsive.
 //
-// Takes {type: 'scene', photo, depth, width, height, file}, then {type: 'render', size, file, focusM, fNumber, tilePx, reachPx}, where
-// size is 'half' or 'shown', that of the scene, or 'full', that of the photograph.
+// Takes {type: 'scene', photo, depth, width, height, file}, then {type: 'render', size, file, focus, fNumber, tilePx, reachPx}, where
+// size is 'half' or 'shown', that of the scene, or 'full', that of the photograph, and focus is {nearM, farM}.
 // Gives {type: 'ready'}, {type: 'sharp', rgba, width, height}, {type: 'tile', done, count},
 // {type: 'picture', size, rgba, width, height} or {type: 'failed', message}.
 
@@ -9,6 +9,7 @@ import * as ort from './ort.wasm.min.mjs'
 import { depthAtSize } from './depth.mjs'
 import { DepthOfField } from './depth_of_field.mjs'
 import { linearLight, srgbBytes } from './light.mjs'
+import { withoutRange } from './optics.mjs'
 
 ort.env.wasm.wasmPaths = new URL('./', import.meta.url).href
 ort.env.wasm.numThreads = self.crossOriginIsolated ? Math.min(8, navigator.hardwareConcurrency) : 1
@@ -45,10 +46,10 @@ function atSize(size) {
   return sizes.get(size)
 }
 
-async function render({ size, file, focusM, fNumber }) {
+async function render({ size, file, focus, fNumber }) {
   const dof = await lensOf(file)
   const { light, depth, width, height } = atSize(size)
-  const rgba = srgbBytes(await dof.render(light, depth, width, height, focusM, fNumber))
+  const rgba = srgbBytes(await dof.render(light, withoutRange(depth, focus), width, height, focus.nearM, fNumber))
   self.postMessage({ type: 'picture', size, rgba, width, height }, [rgba.buffer])
 }
 
@@ -58,10 +59,11 @@ async function render({ size, file, focusM, fNumber }) {
  * Each tile is rendered with a margin that blur and hidden surfaces do not cross. The file computes the blur from the
  * width of its image, so the f-number is scaled by the tile's share of the whole width.
  */
-async function renderTiles({ file, focusM, fNumber, tilePx, reachPx }) {
+async function renderTiles({ file, focus, fNumber, tilePx, reachPx }) {
   const dof = await lensOf(file)
   const { rgba: photo, width, height } = scene.photo
-  const depth = depthAtSize(scene.depth.metres, scene.depth.width, scene.depth.height, width, height)
+  const { depth: map } = scene
+  const depth = withoutRange(depthAtSize(map.metres, map.width, map.height, width, height), focus)
   const margin = 2 * Math.ceil(reachPx) + 32
   const rgba = new Uint8ClampedArray(4 * width * height)
   const count = Math.ceil(width / tilePx) * Math.ceil(height / tilePx)
@@ -73,7 +75,8 @@ async function renderTiles({ file, focusM, fNumber, tilePx, reachPx }) {
       const [y0, y1] = [Math.max(0, top - margin), Math.min(height, top + tilePx + margin)]
       const [w, h] = [x1 - x0, y1 - y0]
       const light = linearLight(part(photo, 4 * width, 4 * x0, 4 * x1, y0, y1), w, h)
-      const out = await dof.render(light, part(depth, width, x0, x1, y0, y1), w, h, focusM, (fNumber * w) / width)
+      const metres = part(depth, width, x0, x1, y0, y1)
+      const out = await dof.render(light, metres, w, h, focus.nearM, (fNumber * w) / width)
       const tile = srgbBytes(out)
       for (let y = top; y < Math.min(height, top + tilePx); y++) {
         const row = 4 * w * (y - y0)
