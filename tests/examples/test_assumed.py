@@ -1,8 +1,7 @@
-"""The page of ``examples/web`` assumes what ``torchdof render`` assumes: kind of depth, subject, opening of the lens."""
+"""The page of ``examples/web`` assumes what ``torchdof render`` does: kind of depth, subject, opening of the lens."""
 
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np

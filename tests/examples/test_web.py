@@ -14,6 +14,7 @@ import torch
 from filelock import FileLock
 
 from tests.node import ENVIRONMENT, ROOT, linear, needs, pixels, run, srgb_codes
+from torchdof.depth.guess import subject_m
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "google-chrome"))), None)
 CLICKS = {"near": (0.55, 0.6), "far": (0.2, 0.12)}  # shares of width and height, as in web.mjs
@@ -38,24 +39,35 @@ def used(plain: Any, shared_folder: Path) -> tuple[Path, Mapping[str, Any]]:
     return folder, json.loads((folder / "results.json").read_text())
 
 
-def expected(exported: Any, folder: Path, u: float, v: float, f_number: float) -> tuple[np.ndarray, float]:
-    """8-bit sRGB of the file in onnxruntime, focused on a point of the sample, and the distance of that point."""
-    sample = folder / "dist" / "sample"
-    encoded = pixels(sample / "motorcycle.png")[..., :3]
-    depth = np.round(pixels(sample / "motorcycle_depth.png")[..., 0] * 65535) / 1000
-    height, width = depth.shape
+F_NUMBER = 2 ** (-3 / 6)
+
+
+def sample_depth(folder: Path) -> np.ndarray:
+    """Depth of the sample in metres, ``[H, W]``."""
+    return np.round(pixels(folder / "dist" / "sample" / "motorcycle_depth.png")[..., 0] * 65535) / 1000
+
+
+def distance(depth: np.ndarray, name: str) -> float:
+    """Distance at one of the clicks."""
+    (height, width), (u, v) = depth.shape, CLICKS[name]
     row, column = int(v * height), int(u * width)
-    focus_m = float(np.median(depth[row - 2 : row + 3, column - 2 : column + 3]))
-    tensors = [linear(encoded).transpose(2, 0, 1)[None], depth[None, None], [focus_m], [f_number]]
+    return float(np.median(depth[row - 2 : row + 3, column - 2 : column + 3]))
+
+
+def expected(exported: Any, folder: Path, depth: np.ndarray, focus_m: float) -> np.ndarray:
+    """8-bit sRGB of the file in onnxruntime for the sample's photograph."""
+    encoded = pixels(folder / "dist" / "sample" / "motorcycle.png")[..., :3]
+    tensors = [linear(encoded).transpose(2, 0, 1)[None], depth[None, None], [focus_m], [F_NUMBER]]
     out = exported.render(*(torch.tensor(np.asarray(x), dtype=torch.float32) for x in tensors))[0]
-    return srgb_codes(out.numpy().transpose(1, 2, 0)), focus_m
+    return srgb_codes(out.numpy().transpose(1, 2, 0))
 
 
 @pytest.mark.parametrize(("name", "other"), [("near", "far"), ("far", "near")])
 def test_a_click_gives_the_picture_of_the_file_sharp_there(plain: Any, used: Any, name: str, other: str) -> None:
     folder, seen = used
-    u, v = CLICKS[name]
-    picture, focus_m = expected(plain, folder, u, v, 2 ** (-3 / 6))
+    depth, (u, v) = sample_depth(folder), CLICKS[name]
+    focus_m = distance(depth, name)
+    picture = expected(plain, folder, depth, focus_m)
     assert seen[f"{name}Focus"] == f"{focus_m:.2f} m"
     files = (folder / "dist/sample/motorcycle.png", folder / f"{name}.png", folder / f"{other}.png")
     sharp, focused, blurred = (pixels(path)[..., :3] for path in files)
@@ -67,9 +79,31 @@ def test_a_click_gives_the_picture_of_the_file_sharp_there(plain: Any, used: Any
     assert np.abs(blurred - sharp)[window].mean() > 0.008
 
 
+def test_the_page_opens_focused_on_the_subject_with_the_blur_of_the_command(used: Any) -> None:
+    folder, seen = used
+    depth = torch.from_numpy(sample_depth(folder)).float()[None, None]
+    focus, blur = seen["opened"]
+    assert focus == f"{subject_m(depth):.2f} m"
+    assert f"up to {0.02 * depth.shape[-1]:.0f} pixels" in blur or f"up to {0.02 * depth.shape[-1] + 1:.0f} pix" in blur
+    assert not seen["isAutomatic"], "the slider sets the opening"
+
+
+def test_with_shift_all_between_two_points_is_sharp(plain: Any, used: Any) -> None:
+    folder, seen = used
+    depth = sample_depth(folder)
+    near_m, far_m = distance(depth, "near"), distance(depth, "far")
+    assert seen["bothFocus"] == f"{near_m:.2f} m to {far_m:.2f} m" and seen["bothMarks"] == 2
+    assert seen["bothName"] == f"motorcycle_f0.7_{near_m:.2f}-{far_m:.2f}m.png"
+    moved = np.where(depth < near_m, depth, 1 / (1 / np.maximum(depth, far_m) + 1 / near_m - 1 / far_m))
+    saved = np.rint(255 * pixels(folder / "both.png")[..., :3])
+    assert (np.abs(saved - expected(plain, folder, moved, near_m)) > 1).mean() < 1e-3
+
+
 def test_a_saved_file_has_the_size_of_the_photograph_or_that_of_the_screen(plain: Any, used: Any) -> None:
     folder, seen = used
-    picture, focus_m = expected(plain, folder, *CLICKS["near"], 2 ** (-3 / 6))
+    depth = sample_depth(folder)
+    focus_m = distance(depth, "near")
+    picture = expected(plain, folder, depth, focus_m)
     assert seen["shownSize"] == [640, 432] and seen["fullFocus"] == f"{focus_m:.2f} m"
     full = np.rint(255 * pixels(folder / "full.png")[..., :3])
     assert full.shape == picture.shape, "in tiles, whose borders are not visible"
@@ -106,4 +140,5 @@ def test_relative_depth_and_bad_files_are_explained(used: Any) -> None:
     assert "cut_depth.png" in problems["damaged"] and "damaged" in problems["damaged"]
     assert seen["slowPair"][0] == "slow_depth.png", "it belongs to the photo that was still being read"
     assert "1.1 %" in seen["slowPair"][1], "maps of nearly the photo's shape are stretched"
-    assert "90 × 60" in problems["frame"] and "40 × 60" in problems["frame"]
+    assert "90 × 60" in problems["frame"] and "60 × 90: turned by 90 degrees it fits" in problems["frame"]
+    assert "50.0 %; it is stretched to the photo" in seen["squareNote"]

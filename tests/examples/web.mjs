@@ -61,6 +61,10 @@ try {
   await done()
   results.isolated = await page.evaluate(() => window.crossOriginIsolated)
   await page.screenshot({ path: join(out, 'opened.png') })
+  results.opened = [await text('#focus-value'), await text('#blur-note')]
+  await page.fill('#aperture', '3')
+  await done()
+  results.isAutomatic = await page.isChecked('#automatic')
 
   // By mouse: something near, then something far.
   await asked()
@@ -71,6 +75,15 @@ try {
   await clickAt(0.2, 0.12)
   results.farFocus = await text('#focus-value')
   await save('far.png')
+
+  // With shift, one more point: all between the nearest and the farthest of both is sharp.
+  await clickAt(0.55, 0.6)
+  await page.keyboard.down('Shift')
+  await clickAt(0.2, 0.12)
+  await page.keyboard.up('Shift')
+  results.bothFocus = await text('#focus-value')
+  results.bothMarks = await page.locator('.reticle').count()
+  results.bothName = await save('both.png')
 
   // A smaller picture on the screen; the file has the size of the photograph and is rendered in tiles.
   await page.selectOption('#size', '640')
@@ -173,7 +186,10 @@ try {
   await page.waitForFunction(() => document.querySelector('[data-slot=photo] small').textContent === 'slow.png')
   results.slowPair = [await text('[data-slot=depth] small'), await text('#depth-note')]
   await done()
-  results.problems.frame = await problemOf('#depth-file', 'tall_depth.png', 'image/png', await picture(40, 60, ['#000', '#fff']))
+  results.problems.frame = await problemOf('#depth-file', 'tall_depth.png', 'image/png', await picture(60, 90, ['#000', '#fff']))
+  await page.setInputFiles('#depth-file', { name: 'square_depth.png', mimeType: 'image/png', buffer: await picture(60, 60, ['#000', '#fff']) })
+  await done()
+  results.squareNote = await text('#depth-note')
 
   await page.click('#sample')
   await done()
