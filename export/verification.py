@@ -32,7 +32,7 @@ class CaseComparison:
     Args:
         name: Short description.
         shape: Shape of the image, ``[B, C, H, W]``.
-        max_error: Largest difference, relative to the local range of light.
+        max_error: Largest difference, relative to the local range of light, also from each item rendered alone.
         mean_error: Mean difference.
         called_db: PSNR in dB of the file against a normal call of the module, with layers chosen for the scene, its own
             highlights and edge repair; display-encoded, infinite if both are equal.
@@ -101,7 +101,8 @@ def verify(
     contains its weights; that its inputs and output have the names, types and free sizes described at :func:`to_onnx`;
     and that onnxruntime gives the result of eager PyTorch (with the same layers and ``check=False``) within 1e-5 of the
     largest light in the reach of a kernel, for sizes, batches, focus distances and scenes other than the traced ones.
-    The report also has the difference from a normal call of the module.
+    Items of a batch are compared with those that the module renders alone too. The report also has the difference from
+    a normal call of the module.
 
     Args:
         path: The file.
@@ -170,7 +171,12 @@ def _compare(runner: onnxruntime.InferenceSession, portable: Portable, case: Cas
     kernels = portable.plan.layer_kernels(options.table, size, *how)
     reach = max(kernel.halo + kernel.scale - 1 for kernel in kernels)
     light_range = local_range(case.tensors[0], min(reach, max(expected.shape[-2:])))
-    error = (torch.from_numpy(got) - expected).abs() / light_range.clamp_min(torch.finfo(torch.float32).tiny)
+    error = (torch.from_numpy(got) - expected).abs()
+    with torch.no_grad():  # each item of a batch must be rendered as it is alone
+        items = list(zip(*(t.split(1) for t in case.tensors), strict=True))
+        alone = torch.cat([portable(*item) for item in items]) if len(items) > 1 else expected
+    error = torch.maximum(error, (torch.from_numpy(got) - alone).abs())
+    error = error / light_range.clamp_min(torch.finfo(torch.float32).tiny)
     error = torch.where(torch.isfinite(error), error, torch.inf)
     with torch.no_grad():
         called = metrics.display(portable.as_called(*case.tensors).nan_to_num(0.0))

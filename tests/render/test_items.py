@@ -1,5 +1,6 @@
 """Items of a batch are rendered together, each as it is alone."""
 
+import random
 from typing import Any
 
 import pytest
@@ -9,7 +10,8 @@ from torch import Tensor
 
 from examples.benchmarks.steps import Counted
 from tests.scenes import TABLES, assert_same_picture, random_scene
-from torchdof import Camera, DepthOfField, blur_by_coc
+from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
+from torchdof.render.plan import Plan
 
 SIZE = (48, 64)
 RADII = (1.5, 30.0, 4.0, 0.0, 9.0)  # px: different layers, resolutions and pyramids; one item is in focus
@@ -32,7 +34,7 @@ def assert_like_alone(images: Tensor, cocs: Tensor, **options: Any) -> None:
     for i in range(len(images)):
         own: dict[str, Any] = {name: t[i : i + 1] if isinstance(t, Tensor) else t for name, t in options.items()}
         alone = blur_by_coc(images[i : i + 1], cocs[i : i + 1], **own)
-        assert_same_picture(alone, together[i : i + 1], torch.nan_to_num(images[i : i + 1]))
+        assert_same_picture(alone.detach(), together[i : i + 1].detach(), torch.nan_to_num(images[i : i + 1]))
 
 
 OPTIONS: list[dict[str, Any]] = [
@@ -63,6 +65,42 @@ def test_highlights_of_an_item_do_not_depend_on_those_of_another() -> None:
     cocs[1], cocs[1, :, :, 20:28] = 17.3, -3.1  # a post in front of lamps
     cocs[2] = 40.0 * torch.rand(SIZE, generator=torch.Generator().manual_seed(1)) - 20.0
     assert_like_alone(images, cocs, depth_edges="as given")
+
+
+RANDOM = [*range(16), *(pytest.param(seed, marks=pytest.mark.sweep) for seed in range(16, 400))]
+
+
+@pytest.mark.parametrize("seed", RANDOM)
+def test_an_item_of_any_batch_with_lamps_is_rendered_as_alone(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With largest radii of 1 to 64 px, planned for each item, by one plan for all, or with gradients."""
+    monkeypatch.setenv("TORCHDOF_ENGINE", "auto" if seed % 4 == 1 else "torch")
+    draw = random.Random(seed)
+    radii = tuple(64.0 ** draw.random() for _ in range(draw.randint(2, 5)))
+    images, cocs = batch(seed, radii)
+    lamps = torch.rand(len(radii), 1, *SIZE, generator=torch.Generator().manual_seed(seed))
+    images = 0.2 * torch.where(lamps < draw.choice([0.0, 0.002, 0.05]), 500.0 * draw.random(), images)
+    plan = draw.choice([None, None, Plan.static(draw.choice([max(radii), 24.0]), 1 / 255, rays=True)])
+    if plan is None and draw.random() < 0.4:  # grows for items with a larger blur
+        plan = Plan.for_scene(0.5 * cocs[:1], 2 / 255, adapt=False)
+    options = {"plan": plan, "table": draw.choice(TABLES), "occlusion": draw.random() < 0.7}
+    options["depth_edges"] = draw.choice(["auto", "as given"])
+    if draw.random() < 0.2:
+        options |= {"plan": None, "attention": (40.0, 20.0, 6.0)}
+    elif draw.random() < 0.2:
+        options["table"] = BlurTable.polygon(5, vignetting=0.4)
+    assert_like_alone(images, cocs.requires_grad_(draw.random() < 0.3), **options)
+
+
+def test_layers_with_gradients_are_those_of_each_item() -> None:
+    images, cocs = batch(1, (2.0, 30.0))
+    assert_like_alone(images, cocs.requires_grad_())
+    dof = DepthOfField(Camera.from_fov(40.0, 0.09, 3.0))
+    rgba = torch.rand(2, 2, 4, 24, 32, generator=torch.Generator().manual_seed(0))
+    depth = torch.tensor([[2.5, 4.0], [0.6, 30.0]], requires_grad=True)
+    together = dof.layers(rgba, depth).detach()
+    for i in range(2):
+        alone = dof.layers(rgba[i : i + 1], depth[i : i + 1]).detach()
+        assert_same_picture(alone, together[i : i + 1], rgba[i : i + 1, 0])
 
 
 @pytest.mark.parametrize("occlusion", [True, False])

@@ -88,13 +88,12 @@ def extract(
     from_px: float | Tensor = _LEAST_PX,
     beside: tuple[Surface, Tensor] | None = None,
     most_taps: Tensor | None = None,
-    apart: bool = False,
     ops: Ops = EAGER,
 ) -> tuple[Surface, Highlights | None]:
     """Removes the light above a limit from a surface of an image, to be splatted ray by ray.
 
     1. Select visible pixels brighter than ``limit`` and blurred by more than ``from_px``.
-    2. If their rays exceed ``most_taps``, raise the limit: the brightest stay, with their light above that limit.
+    2. If the rays of an item exceed ``most_taps``, raise its limit: the brightest stay, with their light above it.
     3. Split the light of each: ``excess = light (1 - limit / peak) fade``; the surface keeps the rest.
     4. Multiply the excess by the cover of the surface in its pixel.
 
@@ -110,7 +109,6 @@ def extract(
             full at 1 px more.
         beside: The other surface of each pixel, and coc of the image, ``[B, 1, H, W]``; None keeps the cover.
         most_taps: Largest number of rays of each item ``[B]``, as from :func:`affordable_taps`; None: 16 per pixel.
-        apart: Whether each item keeps to its own number of rays. Otherwise all share the sum of them.
         ops: Keeps a frame without highlights as it is.
 
     Returns:
@@ -125,25 +123,19 @@ def extract(
     if not is_traced() and len(bright) == 0:
         return surface, None
     peak, coc, most = (pixels.pick(t, bright)[0] for t in (brightest, coc_px, limit))
-    item = bright // area if apart else None
     start = pixels.pick(from_px.expand_as(coc_px), bright)[0] if isinstance(from_px, Tensor) else from_px
     fades = (coc.abs() - start).clamp(max=1.0)
-    # the limit at which the rays fit into the budget
-    share = ((1.0 - most / peak) * fades).detach()
-    if item is None:
-        budget = _TAPS_PER_PIXEL * math.prod(coc_px.shape) if most_taps is None else most_taps.sum(0)
-        least = _least_peak(peak.detach(), coc.detach(), share, budget)
-    else:
-        own = item == torch.arange(len(coc_px), device=item.device)[:, None]
-        budget = _TAPS_PER_PIXEL * area if most_taps is None else most_taps[:, None]
-        peaks, cocs, shares = (torch.where(own, t.detach(), 0.0) for t in (peak, coc, share))  # 0: of other items
-        least = _least_peak(peaks, cocs, shares, budget)[:, 0].index_select(0, item)
+    # the limit at which the rays of each item fit into its budget
+    share, item = (1.0 - most / peak) * fades, bright // area
+    own = item == torch.arange(coc_px.shape[0], device=item.device)[:, None]  # len() would fix a graph to one size
+    peaks, cocs, shares = (torch.where(own, t.detach(), 0.0) for t in (peak, coc, share))  # 0: of other items
+    budget = _TAPS_PER_PIXEL * area if most_taps is None else most_taps[:, None]
+    least = _least_peak(peaks, cocs, shares, budget)[:, 0].index_select(0, item)
     kept = (peak.detach() > least).nonzero()[:, 0]
     if not is_traced() and len(kept) == 0:
         return surface, None
     bright, peak, fades, coc, most = (t.index_select(0, kept) for t in (bright, peak, fades, coc, most))
-    least = least if item is None else least.index_select(0, kept)
-    taken_from, ordinary = pixels.pick(light, bright), torch.maximum(most, least) / peak
+    taken_from, ordinary = pixels.pick(light, bright), torch.maximum(most, least.index_select(0, kept)) / peak
     excess = taken_from * ((1.0 - ordinary) * fades)
     # not light - excess, whose rounding error is brighter than a dark scene
     left = pixels.put(light, bright, taken_from * ((1.0 - fades) + fades * ordinary))
@@ -177,7 +169,7 @@ def affordable_taps(coc_px: Tensor, reach: Sequence[float]) -> Tensor:
 
 
 def _least_peak(peak: Tensor, coc: Tensor, share: Tensor, most_taps: Tensor | float) -> Tensor:
-    """Raised limit ``[..., 1]`` for the light of highlights ``[..., n]``, at which the number of rays fits the budget.
+    """Raised limit ``[B, 1]`` for the light of highlights ``[B, n]``, at which the number of rays fits the budget.
 
     It is the L that solves ``sum over peaks p > L of taps (1 - L / (2 p)) = most_taps``, or 0 if all rays fit. The
     weights make L grow smoothly with the number of highlights, even equal ones; at most twice ``most_taps`` rays are

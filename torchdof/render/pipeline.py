@@ -54,6 +54,10 @@ def blur(
         attention: Area rendered within ``options.tolerance``; the rest is rendered with the tolerance ``"draft"``.
         ops: Operations of all steps.
     """
+    if attention is not None and len(image) > 1:  # the area depends on the largest blur of each item
+        maps = (image, coc_px, *(behind or ()), weight_map(attention, image))
+        items = zip(*(t.expand(len(image), -1, -1, -1).split(1) for t in maps), strict=True)
+        return torch.cat([blur(i, c, plan, options, tuple(b) or None, w, ops) for i, c, *b, w in items])
     given, coc_px = coc_px, edges.mended(image, coc_px, options.depth_edges, ops)
     moved = None if coc_px is given else edges.distance(given, coc_px)
     whole = functools.partial(_planned, image, coc_px, behind=behind, moved_px=moved, ops=ops)
@@ -88,7 +92,7 @@ def _planned(
     moved_px: Tensor | None,
     ops: Ops,
 ) -> Tensor:
-    """Render an image with repaired depth edges, with the given plan or with one plan for each item."""
+    """Render images with repaired depth edges; the given plan grows to the blur of each item; None plans each."""
     if is_traced() and options.table.depends_on_place:
         raise ValueError(
             "a compiled or exported graph has one kernel a layer; take a table without vignetting or field"
@@ -102,23 +106,22 @@ def _planned(
     maps = {name: t.to(wide).contiguous() for name, t in given.items()}
     maps = {n: (t if is_traced() else t.resolve_neg()).expand(image.shape[0], -1, -1, -1) for n, t in maps.items()}
     cocs = [maps["coc"]] if behind is None else [maps["coc"], maps["behind_coc"]]
-    if plan is None and is_traced():
-        # Floats rebuilt from hex become constants of the graph. The options' own floats would become inputs of the
-        # graph if they differ between two modules.
-        max_coc_px, tolerance = (float.fromhex(float(n).hex()) for n in (options.max_coc_px, options.tolerance))
-        plan = Plan.static(max_coc_px, tolerance)
-    elif plan is None and any(map(is_differentiated, cocs)):
-        plan = Plan.for_scene(torch.cat(cocs), options.tolerance, on_grid=True)
-    elif plan is not None and not is_traced():
-        plan = plan.extended_to(torch.cat(cocs))
     render = functools.partial(_image, options, ops)
-    if plan is None:
-        # one plan for each item, so that the result does not depend on the rest of the batch
-        scenes = [torch.cat(of_item) for of_item in zip(*(t.split(1) for t in cocs), strict=True)]
-        return _each_planned(render, scenes, options, maps).to(image.dtype)
-    if is_traced() or not _is_in_memory(maps):
+    if is_traced():
+        if plan is None:
+            # Floats rebuilt from hex become constants of the graph. The options' own floats would become inputs of the
+            # graph if they differ between two modules.
+            max_coc_px, tolerance = (float.fromhex(float(n).hex()) for n in (options.max_coc_px, options.tolerance))
+            plan = Plan.static(max_coc_px, tolerance)
         return render([plan], **maps).to(image.dtype)
-    return _by_item(render, [plan] * len(image), maps).to(image.dtype)
+    scenes = [torch.cat(of_item) for of_item in zip(*(t.split(1) for t in cocs), strict=True)]
+    if plan is None:
+        plans = Plan.for_scenes(scenes, options.tolerance, on_grid=any(map(is_differentiated, cocs)))
+    elif plan.extended_to(torch.cat(cocs)) is plan:
+        plans = [plan] * len(scenes)
+    else:
+        plans = [plan.extended_to(scene) for scene in scenes]
+    return _each_planned(render, plans, options, maps).to(image.dtype)
 
 
 def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
@@ -133,27 +136,27 @@ def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     light = torch.where(valid, light * scale[:, None] / cover.clamp_min(1e-12), 0.0)
     given = {"light": light, "coc": coc, "cover": cover}
     maps = {name: t.gather(1, order.expand_as(t)) for name, t in given.items()}
-    if is_differentiated(coc):
-        plan = Plan.for_scene(maps["coc"].flatten(0, 1), options.tolerance, on_grid=True)
-        rendered = _stack(options, [plan], **maps)
-    else:
-        rendered = _each_planned(functools.partial(_stack, options), [*maps["coc"]], options, maps)
+    plans = Plan.for_scenes([*maps["coc"]], options.tolerance, on_grid=is_differentiated(coc))
+    rendered = _each_planned(functools.partial(_stack, options), plans, options, maps)
     return (rendered / scale).to(rgba.dtype)
 
 
 def _each_planned(
-    render: Callable[..., Tensor], scenes: Sequence[Tensor], options: Options, maps: Mapping[str, Tensor]
+    render: Callable[..., Tensor], plans: Sequence[Plan], options: Options, maps: Mapping[str, Tensor]
 ) -> Tensor:
-    """Render items, each with its own plan, as many together as have layers that can be joined.
+    """Render items, each with its own plan, so that the result does not depend on the rest of the batch.
 
-    ``render(plans, **maps)`` renders some items, with one plan or one for each. ``scenes`` are the coc of all maps of
-    each item, ``[N, 1, H, W]``; ``maps`` are those of all items, ``[B, ...]``.
+    Together are rendered all items if they have one plan, otherwise as many as have layers that can be joined.
+    ``render(plans, **maps)`` renders some items, with one plan or one for each; ``maps`` are those of all items,
+    ``[B, ...]``.
     """
-    uniform = options.method == "layered" and not options.table.depends_on_place
-    if len(scenes) == 1 or not uniform or _is_in_memory(maps):
-        return _by_item(render, [Plan.for_scene(scene, options.tolerance) for scene in scenes], maps)
-    plans = Plan.for_scenes(scenes, options.tolerance)
-    most = max(1, _TOGETHER // math.prod(scenes[0].shape[-2:]))
+    if len(plans) == 1 or _is_in_memory(maps):
+        return _by_item(render, plans, maps)
+    if len({*plans}) == 1:
+        return render(plans[:1], **maps)
+    if options.method != "layered" or options.table.depends_on_place:
+        return _by_item(render, plans, maps)
+    most = max(1, _TOGETHER // math.prod(maps["coc"].shape[-2:]))
     joined = [i for i, plan in enumerate(plans) if len(plan.nodes) > 1]  # a plane has one layer, whose kernel is exact
     groups = [joined[i : i + most] for i in range(0, len(joined), most)]
     groups += [[i] for i in range(len(plans)) if i not in joined]
@@ -259,8 +262,7 @@ def _image(
         reach = [plan.reach(options.table, ops.lens_width or coc.shape[-1]) for plan in plans]
         most_taps = highlights.affordable_taps(coc, reach) if options.occlusion else None
         extracted = [
-            highlights.extract(s, limit, from_px, b, most_taps, len(plans) > 1, ops)
-            for s, b in zip(surfaces, beside, strict=True)
+            highlights.extract(s, limit, from_px, b, most_taps, ops) for s, b in zip(surfaces, beside, strict=True)
         ]
         surfaces, rays = [s for s, _ in extracted], [r for _, r in extracted if r is not None]
         # surfaces that can block rays, the image's own first; a known background is the farthest and blocks none

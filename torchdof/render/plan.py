@@ -110,8 +110,6 @@ class Plan:
         """
         if not adapt:
             return cls._between(layer_cocs.spreads(coc_px, len(coc_px))[0], tolerance)
-        if not on_grid and coc_px.dtype == torch.float32 and is_in_memory(coc_px) and native.chosen():
-            return cls(*native.plan(coc_px, tolerance))
         return cls.for_scenes([coc_px], tolerance, on_grid)[0]
 
     @classmethod
@@ -120,6 +118,8 @@ class Plan:
 
         Values are copied to the host once for all scenes, and once more if a frame is small beside its blur radii.
         """
+        if not on_grid and native.chosen() and all(s.dtype == torch.float32 and is_in_memory(s) for s in scenes):
+            return [cls(*native.plan(scene, tolerance)) for scene in scenes]
         coc_px = torch.cat([scene.detach() for scene in scenes])
         count, shorter = len(scenes[0]), min(coc_px.shape[-2:])
         spreads = layer_cocs.spreads(coc_px, count)
