@@ -38,7 +38,7 @@ DATA = Path(__file__).parents[1] / "data" / "motorcycle"
 def write_shapes(out: Path) -> list[str]:
     """Writes and verifies an exported file for each shape; returns the names of those that were written."""
     camera = torchdof.Camera.from_fov(FOV_X_DEG, 0.01, 2.0)  # aperture and focus are inputs of the file
-    print(f"writing and checking {len(SHAPES)} exported files; each takes about three minutes", flush=True)
+    print(f"writing and checking {len(SHAPES)} exported files; each takes about four minutes", flush=True)
     written = []
     for file, (name, table) in SHAPES.items():
         dof = torchdof.DepthOfField(camera, table, tolerance=TOLERANCE, max_coc_px=MAX_COC_PX, check=False)

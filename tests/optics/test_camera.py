@@ -160,7 +160,8 @@ test_invalid_arguments_are_refused_by_name = refuses(
       for place in ((8.0, 0.0), (0.0, 4.0), (-0.1, 0.0), (0.0, -1.0))),
     (lambda: Camera().focus_at(FRAME, math.nan, 0.0), "x of the focus point must be a number"),
     (lambda: Camera().focus_at(0 * FRAME, 2, 2), "no valid depth"),
-    *((partial(Camera().focus_range_at, FRAME, points), "^points must be") for points in ([], 3.0, (1.0, 2.0), "here")),
+    *((partial(Camera().focus_range_at, FRAME, bad), "^points must be") for bad in ([(1.0,)], 3.0, (1.0, 2.0), "here")),
+    (lambda: Camera().focus_range_at(FRAME, []), "^points must be pixels"),
     (lambda: Camera().focus_range_at(FRAME, [(2, 2), (8, 0)]), "must lie in the frame of 8 x 4 pixels"),
 )  # fmt: skip
 
