@@ -118,6 +118,9 @@ class BlurTable:
         self._sides = {sign: self._side(sign) for sign in (-1, 1) if bool((self.coc * sign > 0).any())}
         for distances, nodes in self._sides.values():
             self._check_extent("coc", "params", float(distances[-1]), float(psf.reach(family, nodes).max()))
+        self._finest = 1.0  # radius of the disc in finest_px over the coc; a number, as traced code reads no tensors
+        if family == "gaussian":
+            self._finest = _FINEST_SIGMAS * float((self._params["sigma"] / self.coc.abs())[:, self.coc != 0].min())
         in_focus = [nodes[name][:, 0] for _, nodes in self._sides.values() for name in psf.LENGTHS & nodes.keys()]
         self.is_sharp_in_focus = not bool(torch.cat(in_focus).any())
         self.strength, self.residual = self._per_node("strength", strength), self._per_node("residual", residual)
@@ -338,10 +341,9 @@ class BlurTable:
         if self.field is not None:
             per_unit = self.px_per_unit(width)
             return min(abs(coc_px), self.field.finest(coc_px / per_unit) * per_unit)
-        if self.family == "gaussian":
-            spreads = (self._params["sigma"] / self.coc.abs())[:, self.coc != 0]
-            return abs(coc_px) * _FINEST_SIGMAS * float(spreads.min())
-        return abs(coc_px) if self.aperture is None else abs(coc_px) * self.aperture.finest
+        if self.aperture is None or self.family == "gaussian":
+            return abs(coc_px) * self._finest
+        return abs(coc_px) * self.aperture.finest
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the table as JSON, whole or not at all; ``OSError`` if the file cannot be written."""

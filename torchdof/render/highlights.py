@@ -129,8 +129,9 @@ def extract(
     share, item = (1.0 - most / peak) * fades, bright // area
     own = item == torch.arange(coc_px.shape[0], device=item.device)[:, None]  # len() would fix a graph to one size
     peaks, cocs, shares = (torch.where(own, t.detach(), 0.0) for t in (peak, coc, share))  # 0: of other items
-    budget = _TAPS_PER_PIXEL * area if most_taps is None else most_taps[:, None]
-    least = _least_peak(peaks, cocs, shares, budget)[:, 0].index_select(0, item)
+    if most_taps is None:  # not as_tensor(), which would fix a graph to the size of its example
+        most_taps = torch.scalar_tensor(_TAPS_PER_PIXEL * area, dtype=torch.float64, device=item.device).reshape(1)
+    least = _least_peak(peaks, cocs, shares, most_taps[:, None])[:, 0].index_select(0, item)
     kept = (peak.detach() > least).nonzero()[:, 0]
     if not is_traced() and len(kept) == 0:
         return surface, None
@@ -168,7 +169,7 @@ def affordable_taps(coc_px: Tensor, reach: Sequence[float]) -> Tensor:
     return _TAPS_PER_PIXEL * math.prod(coc_px.shape[1:]) / (crowd * area)
 
 
-def _least_peak(peak: Tensor, coc: Tensor, share: Tensor, most_taps: Tensor | float) -> Tensor:
+def _least_peak(peak: Tensor, coc: Tensor, share: Tensor, most_taps: Tensor) -> Tensor:
     """Raised limit ``[B, 1]`` for the light of highlights ``[B, n]``, at which the number of rays fits the budget.
 
     It is the L that solves ``sum over peaks p > L of taps (1 - L / (2 p)) = most_taps``, or 0 if all rays fit. The
@@ -179,8 +180,7 @@ def _least_peak(peak: Tensor, coc: Tensor, share: Tensor, most_taps: Tensor | fl
     values, order = functional.pad(peak.double(), (0, 1)).sort(-1, descending=True)  # with a last peak of 0
     count = functional.pad(taps.double(), (0, 1)).gather(-1, order)
     slope = torch.where(values > 0, 0.5 * count / values, 0.0).cumsum(-1)
-    budget = torch.as_tensor(most_taps, dtype=count.dtype, device=count.device)
-    count = count.cumsum(-1) - budget  # rays beyond the budget at L = 0
+    count = count.cumsum(-1) - most_taps.double()  # rays beyond the budget at L = 0
     at_next = count - functional.pad(values[..., 1:], (0, 1)) * slope  # rays beyond the budget at L = the next peak
     last = ((at_next < 0) & (values > 0)).sum(-1, keepdim=True)
     count, slope, value = (t.gather(-1, last) for t in (count, slope, values))
