@@ -1,6 +1,6 @@
 import dataclasses
 import inspect
-import io
+import json
 import math
 from collections.abc import Callable
 from typing import Any
@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Tensor
+from torch import Tensor, nn
 from torch.testing import assert_close
 
 from tests.refused import refuses
@@ -103,18 +103,57 @@ def test_any_shape_type_and_stride_gives_the_picture_of_a_plain_tensor(
 # The module as a module
 
 
-def test_the_configuration_travels_with_the_state_dict() -> None:
-    camera = Camera(85.0, torch.tensor([1.4, 2.0]), 1.2, 24.0, focus_breathing=False)
-    options: dict[str, Any] = {"tolerance": 1 / 100, "occlusion": False, "normalize": False, "method": "fold"}
-    dof = DepthOfField(camera, BlurTable.load("sato_j15"), **options, max_coc_px=20.0, check=False)
-    stored = io.BytesIO()
-    torch.save(dof.state_dict(), stored)
-    stored.seek(0)
-    other = DepthOfField(Camera())
-    other.load_state_dict(torch.load(stored, weights_only=True))
-    assert repr(other) == repr(dof)
+CONFIGURED: dict[str, tuple[Camera, BlurTable | None, dict[str, Any]]] = {
+    "defaults": (Camera(), None, {}),
+    "numbers for each item": (
+        Camera(85.0, torch.tensor([1.4, 2.1]), 1.2, 24.0, focus_breathing=False),
+        BlurTable.load("sato_j15"),
+        {"tolerance": 1 / 100, "occlusion": False, "normalize": False, "max_coc_px": 20.0, "check": False},
+    ),
+    "range": (
+        Camera(focus_range_m=(torch.tensor([1.0, 1.5]), math.inf), swing_deg=3.0),
+        BlurTable.polygon(7, 15.0),
+        {"method": "fold"},
+    ),
+    "infinity": (Camera(focus_m=math.inf, tilt_deg=1.0), BlurTable.load("double_gauss_50mm_f2"), {}),
+    "opening": (Camera(focus_m=torch.tensor([1.0, math.inf])), BlurTable.from_aperture(torch.rand(9, 9)), {}),
+}
+
+
+@pytest.mark.parametrize("name", CONFIGURED)
+def test_the_configuration_survives_strict_json(name: str) -> None:
+    camera, table, options = CONFIGURED[name]
+    dof = DepthOfField(camera, table, **options)
+    other = DepthOfField.from_dict(json.loads(json.dumps(dof.to_dict(), allow_nan=False)))
+    assert repr(other) == repr(dof) and other.to_dict() == dof.to_dict()
     image, depth = torch.rand(2, 3, 9, 12), 0.6 + 4 * torch.rand(2, 1, 9, 12)
     assert torch.equal(other(image, depth), dof(image, depth))
+
+
+def test_a_short_configuration_written_by_hand_takes_the_defaults() -> None:
+    dof = DepthOfField.from_dict({"camera": {"focus_m": 1.5}, "tolerance": "draft"})
+    assert repr(dof) == repr(DepthOfField(Camera(focus_m=1.5), tolerance="draft"))
+
+
+def test_a_model_with_the_module_has_the_checkpoints_of_one_without() -> None:
+    dof = DepthOfField(Camera(focus_m=3.0), BlurTable.load("sato_j15"), tolerance=0.1)
+    model = nn.ModuleDict({"net": nn.Conv2d(1, 1, 1), "dof": dof})
+    before, state = repr(dof), model.state_dict()
+    assert [*state] == ["net.weight", "net.bias"]
+    model.load_state_dict(nn.ModuleDict({"net": nn.Conv2d(1, 1, 1)}).state_dict())
+    model.load_state_dict(state)
+    assert repr(dof) == before
+
+
+def test_checkpoints_with_the_configuration_of_earlier_versions_load_and_leave_the_module_as_it_is() -> None:
+    dof = DepthOfField(Camera(focus_m=3.0, f_number=torch.tensor([1.0, 2.0])), BlurTable.load("sato_j15"), tolerance=0.1)
+    numbers = {name: getattr(dof.camera, name) for name in Camera.__dataclass_fields__}  # tensors, as it was stored
+    old = {"camera": numbers, **dof.options.arguments(), "table": dof.table.to_dict()}
+    model = nn.ModuleDict({"net": nn.Conv2d(1, 1, 1), "dof": DepthOfField(Camera(focus_m=1.0))})
+    state = {**model.state_dict(), "dof._extra_state": old}
+    assert not any(model.load_state_dict(state))
+    assert model["dof"].camera.focus_m == 1.0
+    assert repr(DepthOfField.from_dict(state["dof._extra_state"])) == repr(dof)
 
 
 def test_repr_shows_camera_table_and_options() -> None:
@@ -269,27 +308,27 @@ def test_bad_numbers_are_refused_and_counted(name: str, bad: float) -> None:
         calls[name]()
 
 
-BAD_STATES: list[tuple[Any, str]] = [
-    (None, "the state of a DepthOfField must"),
-    (5, "the state of a DepthOfField must"),
-    ({}, "the state of a DepthOfField must"),
-    ({"camera": None}, "camera of the state must be a dict, got None"),
-    ({"camera": {"focal_length_mm": 50.0}}, "camera of the state must have the fields .*f_number is missing"),
-    ({"camera": {**Camera().__dict__, "f_number": -1.0}}, "camera of the state: f_number must be"),
-    ({"table": {"schema": "other"}}, "table of the state: schema must be"),
-    ({"tolerance": "fine"}, "the state of a DepthOfField: tolerance must be a number"),
+BAD_CONFIGURATIONS: list[tuple[Any, str]] = [
+    (None, "the configuration of a DepthOfField must be a dict, got None"),
+    (5, "the configuration of a DepthOfField must"),
+    ({}, "the configuration of a DepthOfField must have the fields .*; camera is missing"),
+    ({"camera": None}, "camera of the configuration must be a dict, got None"),
+    ({"camera": {"f_numer": 2.0}}, "camera of the configuration must have the fields .*'f_numer' is not one"),
+    ({"camera": {"f_number": -1.0}}, "camera of the configuration: f_number must be"),
+    ({"camera": {"f_number": "2"}}, "camera of the configuration: f_number must be"),
+    ({"camera": {"f_number": ["2"]}}, "camera of the configuration: f_number must be"),
+    ({"camera": {"focus_range_m": [1.0]}}, "camera of the configuration: focus_range_m must be"),
+    ({"table": {"schema": "other"}}, "table of the configuration: schema must be"),
+    ({"tolerance": "fine"}, "the configuration of a DepthOfField: tolerance must be a number"),
     ({"forward": print}, "must have the fields .*'forward' is not one of them"),
 ]
 
 
-@pytest.mark.parametrize(("change", "message"), BAD_STATES)
-def test_a_bad_state_is_refused_by_field_and_changes_nothing(change: Any, message: str) -> None:
-    dof = DepthOfField(Camera(focus_m=1.0), tolerance=0.1)
-    before = repr(dof)
-    state = {**dof.get_extra_state(), "method": "fold", **change} if isinstance(change, dict) and change else change
+@pytest.mark.parametrize(("change", "message"), BAD_CONFIGURATIONS)
+def test_a_bad_configuration_is_refused_by_field(change: Any, message: str) -> None:
+    config = {**DepthOfField(Camera()).to_dict(), **change} if isinstance(change, dict) and change else change
     with pytest.raises(ValueError, match=message):
-        dof.load_state_dict({"_extra_state": state})
-    assert repr(dof) == before
+        DepthOfField.from_dict(config)
 
 
 def test_operators_of_compiled_graphs_have_no_default_arguments() -> None:

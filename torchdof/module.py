@@ -12,7 +12,7 @@ from . import validation
 from .batch import flattened, leading_axes, numbers, restored
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera
-from .options import OPTION_NAMES, OptionArguments, Options, read_state, spells_options
+from .options import OPTION_NAMES, OptionArguments, Options, from_config, spells_options, to_config
 from .render import edges, pipeline
 from .render.attention import Attention
 from .render.ops import EAGER, Ops
@@ -240,14 +240,33 @@ class DepthOfField(nn.Module):
         (coc,) = flattened(leading_axes(image), coc_px=self.coc_px(image, depth, focus_m, f_number))
         return Plan.for_scene(coc, self.options.tolerance).with_pixels(coc)
 
-    def get_extra_state(self) -> dict[str, Any]:
-        """Camera, table and options: the whole configuration travels with ``state_dict``."""
-        camera = {k: getattr(self.camera, k) for k in Camera.__dataclass_fields__}
-        return {"camera": camera, **self.options.arguments(), "table": self.options.table.to_dict()}
+    def to_dict(self) -> dict[str, Any]:
+        """The configuration, camera, table and options, as plain JSON types: the inverse of :meth:`from_dict`.
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore the result of :meth:`get_extra_state`; ``ValueError`` names a bad field, and changes nothing."""
-        self.camera, self.options = read_state(state)
+        A module without parameters has an empty ``state_dict``; the configuration belongs beside a checkpoint.
+
+        Example:
+            >>> import json
+            >>> config = json.dumps(DepthOfField(Camera(focus_m=1.5), BlurTable.gaussian()).to_dict())
+            >>> DepthOfField.from_dict(json.loads(config)).camera
+            Camera(50 mm, f/2.8, focus 1.5 m, sensor 36 mm)
+        """
+        return to_config(self.camera, self.options)
+
+    @classmethod
+    def from_dict(cls, config: Any) -> "DepthOfField":
+        """Build a module from :meth:`to_dict`'s data; options and numbers of the camera that are missing are defaults.
+
+        Raises:
+            ValueError: If a field is unknown or wrong; the message names it.
+        """
+        camera, options = from_config(config)
+        return cls(camera, **options.arguments())
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *arguments: Any) -> None:
+        """As PyTorch's; the configuration that checkpoints of earlier versions have is left out, not an error."""
+        state_dict.pop(f"{prefix}_extra_state", None)
+        super()._load_from_state_dict(state_dict, prefix, *arguments)
 
     def extra_repr(self) -> str:
         """Camera, table and options, as ``repr`` shows them."""
