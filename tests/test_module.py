@@ -16,6 +16,7 @@ from tests.refused import refuses
 from tests.scenes import CAMERA, EVERY_WAY, HEIGHT, WAYS, WIDTH, disc, slope, texture
 from tests.traced import TRACED
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field, tensors
+from torchdof.augmentation import RandomDepthOfField
 from torchdof.options import OptionArguments, Options
 from torchdof.reference import metrics
 from torchdof.render.plan import Plan
@@ -146,7 +147,8 @@ def test_a_model_with_the_module_has_the_checkpoints_of_one_without() -> None:
 
 
 def test_checkpoints_with_the_configuration_of_earlier_versions_load_and_leave_the_module_as_it_is() -> None:
-    dof = DepthOfField(Camera(focus_m=3.0, f_number=torch.tensor([1.0, 2.0])), BlurTable.load("sato_j15"), tolerance=0.1)
+    camera = Camera(focus_m=3.0, f_number=torch.tensor([1.0, 2.0]))
+    dof = DepthOfField(camera, BlurTable.load("sato_j15"), tolerance=0.1)
     numbers = {name: getattr(dof.camera, name) for name in Camera.__dataclass_fields__}  # tensors, as it was stored
     old = {"camera": numbers, **dof.options.arguments(), "table": dof.table.to_dict()}
     model = nn.ModuleDict({"net": nn.Conv2d(1, 1, 1), "dof": DepthOfField(Camera(focus_m=1.0))})
@@ -168,11 +170,13 @@ def test_repr_shows_camera_table_and_options() -> None:
 DEFAULTS = {field.name: field.default for field in dataclasses.fields(Options)}
 
 
-@pytest.mark.parametrize("function", [DepthOfField, depth_of_field, blur_by_coc])
+@pytest.mark.parametrize("function", [DepthOfField, depth_of_field, blur_by_coc, RandomDepthOfField])
 def test_the_signature_has_every_option_with_its_default_and_help_names_their_class(function: object) -> None:
     assert ["table", *OptionArguments.__annotations__] == list(DEFAULTS)  # type hints
     parameters = inspect.signature(function).parameters  # type: ignore[arg-type]
-    assert {name: parameters[name].default for name in DEFAULTS} == {**DEFAULTS, "table": None}
+    different = {"check": False} if function is RandomDepthOfField else {}
+    assert {name: parameters[name].default for name in DEFAULTS} == {**DEFAULTS, "table": None, **different}
+    assert RandomDepthOfField().renderings[0].check is False
     assert "**options: As in :class:`torchdof.options.Options`" in (function.__doc__ or "")
 
 

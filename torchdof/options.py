@@ -112,12 +112,15 @@ class OptionArguments(TypedDict, total=False):
     depth_edges: DepthEdges
 
 
-def spells_options(function: _Decorated) -> _Decorated:
-    """Decorator that shows, in the signature of a function with ``**options``, each option with its default."""
+def spells_options(function: _Decorated, **defaults: Any) -> _Decorated:
+    """Decorator that shows, in the signature of a function with ``**options``, each option with its default.
+
+    ``defaults`` are those that differ from :class:`Options`.
+    """
     target: Any = function.__init__ if inspect.isclass(function) else function
     signature = inspect.signature(target)
     parameters = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-    options = {field.name: field.default for field in dataclasses.fields(Options)}
+    options = {field.name: field.default for field in dataclasses.fields(Options)} | defaults
     options_shown = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=options[name], annotation=kind)
         for name, kind in OptionArguments.__annotations__.items()
