@@ -263,6 +263,10 @@ def called(**arguments: Any) -> Callable[[], Any]:
     return lambda: DepthOfField(Camera())(**{"image": IMAGE, "depth": DEPTH, **arguments})
 
 
+def several(camera: Camera | None = None, **numbers: Any) -> Tensor:
+    return depth_of_field(IMAGE.expand(2, -1, -1, -1), DEPTH, camera or Camera(), **numbers)
+
+
 test_a_wrong_argument_is_refused_in_one_sentence = refuses(
     (called(image=IMAGE.byte()), "image must be a tensor .* floating point .*got a torch.uint8"),
     (called(image=[[1.0]]), r"image must be a tensor .*got \[\[1.0\]\]"),
@@ -277,7 +281,12 @@ test_a_wrong_argument_is_refused_in_one_sentence = refuses(
     (called(depth=0.0 * DEPTH), "depth must be > 0 .* 20 of 20 pixels .*; check its unit"),
     (called(focus_m=0.01), "focus_m must be longer than the focal length"),
     (called(f_number=-1.0), "f_number must be positive"),
-    (called(focus_m=torch.tensor([1.0, 2.0])), r"must be \[1, 1, 4, 5\].* got \[2, 1, 4, 5\]"),
+    (called(focus_m=torch.tensor([1.0, 2.0])), r"focus_m must be a number or \[1\], for one image, got \[2\]"),
+    (lambda: several(focus_m=[1.0, 2.0, 3.0]), r"focus_m must be a number or \[2\], for 2 images, got \[3\]"),
+    (lambda: several(Camera(focus_range_m=(1.0, torch.ones(3)))), r"focus_range_m must be .*\[2\].* got \[3\]"),
+    (called(image=[IMAGE[0], IMAGE[0]]), r"got a list of 2 tensors of shape \[3, 4, 5\]; torch.stack"),
+    (called(image=[IMAGE[0], IMAGE[0, :, 1:]]), r"of shape \[3, 4, 5\], \[3, 3, 5\]; render them one by one"),
+    (called(depth=torch.ones(3)), r"depth must be \[1, 1, 4, 5\] in metres"),
     (module(camera=50.0), "^camera must be a torchdof.Camera, got float"),
     (module(table="disc"), "^table must be a torchdof.BlurTable, got str; read a file with BlurTable.load"),
     *((module(tolerance=value), r"^tolerance must be a number in \[0, 1\)") for value in (-0.1, 1.0, math.nan, True)),

@@ -214,6 +214,8 @@ class DepthOfField(nn.Module):
         validation.image_and_depth(image, depth, values=check, name=name)
         changes = {"focus_m": focus_m, "f_number": f_number}
         camera = self.camera.replace(**{k: v for k, v in changes.items() if v is not None})
+        if not is_traced():
+            camera.refuse_other_batch(len(image))
         # a tensor, because an exported graph would do Python's arithmetic with the width in float32
         width: Any = torch.scalar_tensor(image.shape[-1], dtype=torch.float64, device="cpu")
         coc = camera.coc_px(depth, width)

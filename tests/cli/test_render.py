@@ -580,3 +580,9 @@ def test_a_stray_pixel_does_not_reduce_the_blur_of_the_others(image: Tensor, dep
         line = run("render large.exr large.npy -o out.exr --focus-m 2 --blur 4% --depth-edges as-given")
         openings += numbers_in(line, r"f/([\d.]+)")
     assert openings[0] == openings[1]
+
+
+def test_a_depth_map_with_one_value_is_named_as_such(depth: Tensor) -> None:
+    np.save("flat.npy", np.full(depth.shape[-2:], 128.0))
+    note = "note: flat.npy: has one value everywhere, 128, so nothing is nearer"
+    assert note in told("render image.exr flat.npy -o out.png")[1]

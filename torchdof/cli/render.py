@@ -24,6 +24,7 @@ _OWN_EXTREMES = (
     "each frame's relative depth is scaled by its own extremes, so that distances pulse; give the values that near and "
     "far have in all frames: --value-range LOW,HIGH"
 )
+_MOST_FRAMES = 1_000_000  # of one run; a larger number is a slip of the finger, and would not fit into memory
 Encoding = Literal["linear", "srgb"]
 _NOT_OF_FRAMES = ("out", "sheet", "frames", "resume", "strict", "device", "as_json")  # options that change no frame
 
@@ -121,6 +122,9 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         elif not is_single:
             first, last = self.frames or (keys[0][0], keys[-1][0])
             numbers = range(first, last + 1)
+            for pattern in filter(None, (images, depths)):
+                pattern.refuse_missing(numbers)
+            refuse((len(numbers) > _MOST_FRAMES, f"{first}-{last} are {len(numbers)} frames, more than {_MOST_FRAMES}"))
         if not numbers:
             raise FileNotFoundError(f"{self.image}: there are no such files")
         outputs: dict[int, Path] = {}
