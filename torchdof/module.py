@@ -15,6 +15,7 @@ from .optics.camera import Camera
 from .options import OPTION_NAMES, OptionArguments, Options, from_config, spells_options, to_config
 from .render import edges, pipeline
 from .render.attention import Attention
+from .render.one_thread import on_one_thread
 from .render.ops import EAGER, Ops
 from .render.plan import Plan
 from .render.resample import at_size_of
@@ -389,5 +390,12 @@ def blur(
         raise ValueError("attention plans for two tolerances; leave plan out, or attention")
     if attention is not None and is_traced():
         raise ValueError("attention chooses its work by where the viewer looks; a compiled or exported graph cannot")
-    with without_autocast(image.device.type):  # it would convolve in half precision
-        return pipeline.blur(image, coc_px, plan, options, hidden, attention, ops)
+
+    def render(image: Tensor, coc_px: Tensor, *hidden: Tensor) -> Tensor:
+        behind = (hidden[0], hidden[1]) if hidden else None
+        with without_autocast(image.device.type):  # it would convolve in half precision
+            return pipeline.blur(image, coc_px, plan, options, behind, attention, ops)
+
+    tensors = (image, coc_px, *(hidden or ()))
+    has_others = options.table.is_differentiated or isinstance(attention, Tensor)
+    return render(*tensors) if has_others else on_one_thread(render, *tensors)
