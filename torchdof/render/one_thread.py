@@ -17,9 +17,7 @@ from torch import Tensor
 from .. import native
 from ..tensors import is_in_memory, is_traced
 
-_MOST_PIXELS = (
-    2**18
-)  # of an image; larger ones gain from several threads, smaller ones lose little even on idle machines
+_MOST_PIXELS = 2**18  # of an image; larger ones gain more from several threads than they lose by waiting ones
 
 
 def on_one_thread(render: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
