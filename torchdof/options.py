@@ -43,7 +43,10 @@ class Options:
         table: Blur measured from a lens; None takes the ideal disc.
         tolerance: Accepted RMS difference, display-encoded, from the same rendering with exact kernels, dense layers
             and full resolution. 0 gives that rendering itself. Its kernels are interpolated between layers half a pixel
-            apart; if depth is noise, this differs by 1 to 2.5/255 RMS from a scatter of each pixel's own kernel.
+            apart; if depth is noise, this differs by 1 to 2.5/255 RMS from a scatter of each pixel's own kernel. While
+            gradients with respect to the circle of confusion are recorded, layers are fixed instead of lying at the
+            scene's ends: if the image is noise, the picture then differs by up to 2.5/255 for blurs of about 1 px and
+            1.5/255 up to 4 px, whatever the tolerance, and by less than 1/255 beyond the tolerance for larger ones.
             ``"draft"`` is 8/255, ``"preview"`` 4/255 and ``"final"`` 1/255.
         occlusion: True composites layers far to near: blurred foregrounds cover the surfaces behind them, and blurred
             backgrounds do not bleed onto sharp foregrounds. False is the algorithm of the paper: the light of all
