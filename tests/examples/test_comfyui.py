@@ -129,7 +129,7 @@ def test_a_mask_and_the_geometries_of_comfyuis_own_nodes_are_depth_too() -> None
         assert torch.equal(render(image, given, depth_kind="metres")[0], infinite[0])
 
 
-def test_a_geometry_is_scaled_to_near_and_far_whatever_is_said_of_white() -> None:
+def test_a_geometry_is_scaled_to_near_and_far_for_both_kinds_of_white() -> None:
     image, depth = near_and_far()
     expected = render(image, 0.1 * depth, depth_kind="white is far")
     for kind in ("white is near", "white is far"):
