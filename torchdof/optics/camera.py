@@ -43,6 +43,9 @@ Number = float | Tensor
 class Camera:
     """A thin lens in front of a sensor. Every number may be a float or a tensor ``[B]``, one value a batch item.
 
+    A tensor may be an ``nn.Parameter`` and then gets gradients. But a camera is not a module, so ``parameters()`` of a
+    :class:`torchdof.DepthOfField` does not list it: register it in your own module.
+
     Args:
         focal_length_mm: Focal length in millimetres, > 0.
         f_number: Focal length over aperture diameter, > 0.
