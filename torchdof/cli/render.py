@@ -222,9 +222,9 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
             record.write(is_first=False)
         foreign = [out for out, version in written.items() if _version(out) != version]
         if foreign:
-            frames = f"{len(foreign)} of {count} frames, {foreign[0].name} first,"
+            names = f"{len(foreign)} of {count} frames, {foreign[0].name} first,"
             remedy = "end the other run, and render these frames again"
-            raise ValueError(f"{self.out}: another run replaced {frames} while this one went on; {remedy}")
+            raise ValueError(f"{self.out}: another run replaced {names} while this one went on; {remedy}")
 
 
 def _version(path: Path) -> tuple[int, int]:
