@@ -3,7 +3,7 @@
     python examples/defocus_dataset.py --images photos --depths depth --out data --workers 2 --copies 4
 
 A depth map has the name of its image, with any suffix. After an interruption, the same command continues where it
-stopped. Needs Ray: pip install 'torchdof[ray]'.
+stopped. Needs Ray: pip install '.[ray]'.
 """
 
 import argparse

@@ -15,7 +15,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
+
+try:
+    from matplotlib.figure import Figure
+except ModuleNotFoundError:
+    raise SystemExit("paper.py draws with matplotlib; run: pip install '.[fit,plot]'") from None
 
 import torchdof
 from torchdof.fit import BlurFit, blur_strength, fit_captures, fit_pair, fit_profile, natural_psnr, read_captures

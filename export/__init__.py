@@ -4,6 +4,15 @@
 in one file, and ``describe`` reads a file's metadata.
 """
 
+from torchdof.extras import missing
+
+try:
+    import onnx  # noqa: F401
+    import onnxruntime  # noqa: F401
+    import onnxscript  # noqa: F401
+except ModuleNotFoundError as error:
+    raise missing("torchdof.export", error.name) or error from None
+
 from .conversion import to_onnx
 from .joining import chain
 from .metadata import describe

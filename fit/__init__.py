@@ -1,5 +1,13 @@
 """Fits kernels to photographs of a dot or traced lenses, and makes blur tables; lengths in the caller's unit."""
 
+from torchdof.extras import missing
+
+try:
+    import scipy  # noqa: F401
+    import threadpoolctl  # noqa: F401
+except ModuleNotFoundError as error:
+    raise missing("torchdof.fit", error.name) or error from None
+
 from .lens.trace import trace_table
 from .photo.across import table_of_dots
 from .photo.captures import Capture, Captures

@@ -215,3 +215,37 @@ test_errors_name_the_argument = refuses(
     (lambda: random_dof()(IMAGE, DEPTH[:3, 0]), r"depth must be \[4, 1, 18, 24\].* got \[1, 3, 18, 24\]"),
     (lambda: random_dof()((IMAGE - 0.5) / 0.2, DEPTH), r"must lie in \[0, 1\].*.*normalize after"),
 )  # fmt: skip
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("as_dict", [False, True])
+def test_depth_beside_images_of_half_precision_is_not_rounded(dtype: torch.dtype, as_dict: bool) -> None:
+    image, depth = sample()
+    depth[..., :4] = 1e5  # more than the largest float16
+    seq = DepthAugmentationSequential(
+        K.RandomHorizontalFlip(p=1.0), random_dof(), data_keys=None if as_dict else ["input", "mask"]
+    )
+    if as_dict:
+        out = seq({"input": image.to(dtype), "mask": depth, "name": "a"})
+        assert out["name"] == "a"
+        blurred, moved = out["input"], out["mask"]
+    else:
+        blurred, moved = seq(image.to(dtype), depth)
+        inverse = seq.inverse(blurred, moved)
+        assert torch.equal(inverse[1], depth) and inverse[0].dtype == dtype
+    assert blurred.dtype == dtype and torch.equal(moved, depth.flip(-1))
+
+
+@pytest.mark.parametrize("p", [0.5, 1.0])
+def test_an_empty_batch_passes_as_through_kornias_own_steps(p: float) -> None:
+    image, depth = sample(0)
+    aug = random_dof(p=p)
+    for given in ((image, depth), (image, torch.ones(1, 1, 18, 24)), (torch.cat([image, depth], 1),)):
+        assert aug(*given).shape == given[0].shape
+    assert aug({"image": image, "depth": depth})["image"].shape == image.shape
+    out = DepthAugmentationSequential(K.RandomHorizontalFlip(), aug, data_keys=["input", "mask"])(image, depth)
+    assert [t.shape for t in out] == [image.shape, depth.shape]
+    label = aug.label(image, depth)
+    assert label["coc_px"].shape == depth.shape and label["focus_m"].shape == (0,)
+    with pytest.raises(ValueError, match="depth must be"):
+        aug(image, torch.rand(0, 1, 18, 23))

@@ -14,6 +14,7 @@ FOLDERS = {"torchdof": "torchdof", "torchdof.fit": "fit", "torchdof.export": "ex
 
 # Folder or module of torchdof -> those that it may import; the lowest first.
 ALLOWED = {
+    "extras": set(),
     "native": set(),
     "pixels": set(),
     "tensors": set(),
@@ -27,14 +28,14 @@ ALLOWED = {
     "reference": {"validation", "io", "optics", "render"},
     "module": {"tensors", "validation", "batch", "optics", "options", "render"},
     "functional": {"tensors", "validation", "batch", "optics"},
-    "fit": {"validation", "io", "optics"},
-    "export": {"pixels", "tensors", "validation", "io", "optics", "options", "render", "reference", "module"},
+    "fit": {"extras", "validation", "io", "optics"},
+    "export": {"extras", "pixels", "tensors", "validation", "io", "optics", "options", "render", "reference", "module"},
     "augmentation": {"tensors", "validation", "io", "optics", "options", "module"},
-    "distributed": {"validation", "io", "depth", "render", "module", "augmentation"},
+    "distributed": {"extras", "validation", "io", "depth", "render", "module", "augmentation"},
     "bench": {"validation", "io", "optics", "reference", "module", "export"},
     "cli": {
         *("tensors", "validation", "native", "io", "optics", "depth", "options", "render", "module"),
-        *("fit", "export", "bench"),
+        *("extras", "fit", "export", "bench"),
     },
 }
 
@@ -146,3 +147,30 @@ for arguments in {WITHOUT_PYTORCH!r}:
     assert "torch" not in sys.modules, arguments
 """
     assert loaded(code, "torch", "numpy", "kornia", "scipy", "onnx", "rich") == []
+
+
+def test_a_checkout_has_the_packages_that_lie_beside_it(tmp_path: Path) -> None:
+    """Without the finder of an editable install, as where the folder of the repository hides an installed package."""
+    script = f"""
+import sys
+sys.meta_path[:] = [finder for finder in sys.meta_path if "editable" not in type(finder).__module__]
+sys.path.insert(0, {str(ROOT)!r})
+import torchdof.fit, torchdof.export
+print(torchdof.fit.__file__)
+"""
+    assert output_of(script).splitlines()[-1] == str(ROOT / "fit" / "__init__.py")
+
+
+def test_a_missing_package_of_an_extra_is_named_with_what_installs_it() -> None:
+    script = """
+import sys
+sys.modules |= {"scipy": None, "onnx": None}
+for name in ("torchdof.fit", "torchdof.export"):
+    try:
+        __import__(name)
+    except ModuleNotFoundError as error:
+        print(error)
+"""
+    lines = output_of(script).splitlines()[-2:]
+    assert [line.partition(";")[0] for line in lines] == ["torchdof.fit needs scipy", "torchdof.export needs onnx"]
+    assert [line.rpartition("install ")[2] for line in lines] == ["'.[fit]'", "'.[export]'"]

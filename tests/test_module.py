@@ -1,6 +1,6 @@
 import dataclasses
 import inspect
-import io
+import json
 import math
 from collections.abc import Callable
 from typing import Any
@@ -9,13 +9,14 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Tensor
+from torch import Tensor, nn
 from torch.testing import assert_close
 
 from tests.refused import refuses
 from tests.scenes import CAMERA, EVERY_WAY, HEIGHT, WAYS, WIDTH, disc, slope, texture
 from tests.traced import TRACED
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field, tensors
+from torchdof.augmentation import RandomDepthOfField
 from torchdof.options import OptionArguments, Options
 from torchdof.reference import metrics
 from torchdof.render.plan import Plan
@@ -103,18 +104,58 @@ def test_any_shape_type_and_stride_gives_the_picture_of_a_plain_tensor(
 # The module as a module
 
 
-def test_the_configuration_travels_with_the_state_dict() -> None:
-    camera = Camera(85.0, torch.tensor([1.4, 2.0]), 1.2, 24.0, focus_breathing=False)
-    options: dict[str, Any] = {"tolerance": 1 / 100, "occlusion": False, "normalize": False, "method": "fold"}
-    dof = DepthOfField(camera, BlurTable.load("sato_j15"), **options, max_coc_px=20.0, check=False)
-    stored = io.BytesIO()
-    torch.save(dof.state_dict(), stored)
-    stored.seek(0)
-    other = DepthOfField(Camera())
-    other.load_state_dict(torch.load(stored, weights_only=True))
-    assert repr(other) == repr(dof)
+CONFIGURED: dict[str, tuple[Camera, BlurTable | None, dict[str, Any]]] = {
+    "defaults": (Camera(), None, {}),
+    "numbers for each item": (
+        Camera(85.0, torch.tensor([1.4, 2.1]), 1.2, 24.0, focus_breathing=False),
+        BlurTable.load("sato_j15"),
+        {"tolerance": 1 / 100, "occlusion": False, "normalize": False, "max_coc_px": 20.0, "check": False},
+    ),
+    "range": (
+        Camera(focus_range_m=(torch.tensor([1.0, 1.5]), math.inf), swing_deg=3.0),
+        BlurTable.polygon(7, 15.0),
+        {"method": "fold"},
+    ),
+    "infinity": (Camera(focus_m=math.inf, tilt_deg=1.0), BlurTable.load("double_gauss_50mm_f2"), {}),
+    "opening": (Camera(focus_m=torch.tensor([1.0, math.inf])), BlurTable.from_aperture(torch.rand(9, 9)), {}),
+}
+
+
+@pytest.mark.parametrize("name", CONFIGURED)
+def test_the_configuration_survives_strict_json(name: str) -> None:
+    camera, table, options = CONFIGURED[name]
+    dof = DepthOfField(camera, table, **options)
+    other = DepthOfField.from_dict(json.loads(json.dumps(dof.to_dict(), allow_nan=False)))
+    assert repr(other) == repr(dof) and other.to_dict() == dof.to_dict()
     image, depth = torch.rand(2, 3, 9, 12), 0.6 + 4 * torch.rand(2, 1, 9, 12)
     assert torch.equal(other(image, depth), dof(image, depth))
+
+
+def test_a_short_configuration_written_by_hand_takes_the_defaults() -> None:
+    dof = DepthOfField.from_dict({"camera": {"focus_m": 1.5}, "tolerance": "draft"})
+    assert repr(dof) == repr(DepthOfField(Camera(focus_m=1.5), tolerance="draft"))
+
+
+def test_a_model_with_the_module_has_the_checkpoints_of_one_without() -> None:
+    dof = DepthOfField(Camera(focus_m=3.0), BlurTable.load("sato_j15"), tolerance=0.1)
+    model = nn.ModuleDict({"net": nn.Conv2d(1, 1, 1), "dof": dof})
+    before, state = repr(dof), model.state_dict()
+    assert [*state] == ["net.weight", "net.bias"]
+    model.load_state_dict(nn.ModuleDict({"net": nn.Conv2d(1, 1, 1)}).state_dict())
+    model.load_state_dict(state)
+    assert repr(dof) == before
+
+
+def test_checkpoints_with_the_configuration_of_earlier_versions_load_and_leave_the_module_as_it_is() -> None:
+    camera = Camera(focus_m=3.0, f_number=torch.tensor([1.0, 2.0]))
+    dof = DepthOfField(camera, BlurTable.load("sato_j15"), tolerance=0.1)
+    numbers = {name: getattr(dof.camera, name) for name in Camera.__dataclass_fields__}  # tensors, as it was stored
+    old = {"camera": numbers, **dof.options.arguments(), "table": dof.table.to_dict()}
+    model = nn.ModuleDict({"net": nn.Conv2d(1, 1, 1), "dof": DepthOfField(Camera(focus_m=1.0))})
+    state = {**model.state_dict(), "dof._extra_state": old}
+    assert not any(model.load_state_dict(state))
+    assert model["dof"].camera.focus_m == 1.0
+    assert repr(DepthOfField.from_dict(state["dof._extra_state"])) == repr(dof)
 
 
 def test_repr_shows_camera_table_and_options() -> None:
@@ -129,11 +170,13 @@ def test_repr_shows_camera_table_and_options() -> None:
 DEFAULTS = {field.name: field.default for field in dataclasses.fields(Options)}
 
 
-@pytest.mark.parametrize("function", [DepthOfField, depth_of_field, blur_by_coc])
+@pytest.mark.parametrize("function", [DepthOfField, depth_of_field, blur_by_coc, RandomDepthOfField])
 def test_the_signature_has_every_option_with_its_default_and_help_names_their_class(function: object) -> None:
     assert ["table", *OptionArguments.__annotations__] == list(DEFAULTS)  # type hints
     parameters = inspect.signature(function).parameters  # type: ignore[arg-type]
-    assert {name: parameters[name].default for name in DEFAULTS} == {**DEFAULTS, "table": None}
+    different = {"check": False} if function is RandomDepthOfField else {}
+    assert {name: parameters[name].default for name in DEFAULTS} == {**DEFAULTS, "table": None, **different}
+    assert RandomDepthOfField().renderings[0].check is False
     assert "**options: As in :class:`torchdof.options.Options`" in (function.__doc__ or "")
 
 
@@ -220,6 +263,10 @@ def called(**arguments: Any) -> Callable[[], Any]:
     return lambda: DepthOfField(Camera())(**{"image": IMAGE, "depth": DEPTH, **arguments})
 
 
+def several(camera: Camera | None = None, **numbers: Any) -> Tensor:
+    return depth_of_field(IMAGE.expand(2, -1, -1, -1), DEPTH, camera or Camera(), **numbers)
+
+
 test_a_wrong_argument_is_refused_in_one_sentence = refuses(
     (called(image=IMAGE.byte()), "image must be a tensor .* floating point .*got a torch.uint8"),
     (called(image=[[1.0]]), r"image must be a tensor .*got \[\[1.0\]\]"),
@@ -234,7 +281,12 @@ test_a_wrong_argument_is_refused_in_one_sentence = refuses(
     (called(depth=0.0 * DEPTH), "depth must be > 0 .* 20 of 20 pixels .*; check its unit"),
     (called(focus_m=0.01), "focus_m must be longer than the focal length"),
     (called(f_number=-1.0), "f_number must be positive"),
-    (called(focus_m=torch.tensor([1.0, 2.0])), r"must be \[1, 1, 4, 5\].* got \[2, 1, 4, 5\]"),
+    (called(focus_m=torch.tensor([1.0, 2.0])), r"focus_m must be a number or \[1\], for one image, got \[2\]"),
+    (lambda: several(focus_m=[1.0, 2.0, 3.0]), r"focus_m must be a number or \[2\], for 2 images, got \[3\]"),
+    (lambda: several(Camera(focus_range_m=(1.0, torch.ones(3)))), r"focus_range_m must be .*\[2\].* got \[3\]"),
+    (called(image=[IMAGE[0], IMAGE[0]]), r"got a list of 2 tensors of shape \[3, 4, 5\]; torch.stack"),
+    (called(image=[IMAGE[0], IMAGE[0, :, 1:]]), r"of shape \[3, 4, 5\], \[3, 3, 5\]; render them one by one"),
+    (called(depth=torch.ones(3)), r"depth must be \[1, 1, 4, 5\] in metres"),
     (module(camera=50.0), "^camera must be a torchdof.Camera, got float"),
     (module(table="disc"), "^table must be a torchdof.BlurTable, got str; read a file with BlurTable.load"),
     *((module(tolerance=value), r"^tolerance must be a number in \[0, 1\)") for value in (-0.1, 1.0, math.nan, True)),
@@ -269,27 +321,27 @@ def test_bad_numbers_are_refused_and_counted(name: str, bad: float) -> None:
         calls[name]()
 
 
-BAD_STATES: list[tuple[Any, str]] = [
-    (None, "the state of a DepthOfField must"),
-    (5, "the state of a DepthOfField must"),
-    ({}, "the state of a DepthOfField must"),
-    ({"camera": None}, "camera of the state must be a dict, got None"),
-    ({"camera": {"focal_length_mm": 50.0}}, "camera of the state must have the fields .*f_number is missing"),
-    ({"camera": {**Camera().__dict__, "f_number": -1.0}}, "camera of the state: f_number must be"),
-    ({"table": {"schema": "other"}}, "table of the state: schema must be"),
-    ({"tolerance": "fine"}, "the state of a DepthOfField: tolerance must be a number"),
+BAD_CONFIGURATIONS: list[tuple[Any, str]] = [
+    (None, "the configuration of a DepthOfField must be a dict, got None"),
+    (5, "the configuration of a DepthOfField must"),
+    ({}, "the configuration of a DepthOfField must have the fields .*; camera is missing"),
+    ({"camera": None}, "camera of the configuration must be a dict, got None"),
+    ({"camera": {"f_numer": 2.0}}, "camera of the configuration must have the fields .*'f_numer' is not one"),
+    ({"camera": {"f_number": -1.0}}, "camera of the configuration: f_number must be"),
+    ({"camera": {"f_number": "2"}}, "camera of the configuration: f_number must be"),
+    ({"camera": {"f_number": ["2"]}}, "camera of the configuration: f_number must be"),
+    ({"camera": {"focus_range_m": [1.0]}}, "camera of the configuration: focus_range_m must be"),
+    ({"table": {"schema": "other"}}, "table of the configuration: schema must be"),
+    ({"tolerance": "fine"}, "the configuration of a DepthOfField: tolerance must be a number"),
     ({"forward": print}, "must have the fields .*'forward' is not one of them"),
 ]
 
 
-@pytest.mark.parametrize(("change", "message"), BAD_STATES)
-def test_a_bad_state_is_refused_by_field_and_changes_nothing(change: Any, message: str) -> None:
-    dof = DepthOfField(Camera(focus_m=1.0), tolerance=0.1)
-    before = repr(dof)
-    state = {**dof.get_extra_state(), "method": "fold", **change} if isinstance(change, dict) and change else change
+@pytest.mark.parametrize(("change", "message"), BAD_CONFIGURATIONS)
+def test_a_bad_configuration_is_refused_by_field(change: Any, message: str) -> None:
+    config = {**DepthOfField(Camera()).to_dict(), **change} if isinstance(change, dict) and change else change
     with pytest.raises(ValueError, match=message):
-        dof.load_state_dict({"_extra_state": state})
-    assert repr(dof) == before
+        DepthOfField.from_dict(config)
 
 
 def test_operators_of_compiled_graphs_have_no_default_arguments() -> None:

@@ -1,6 +1,7 @@
 """A calibrated depth-of-field post-process: an all-in-focus image and its depth in, a real lens's photograph out."""
 
 import importlib
+import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -19,6 +20,12 @@ _HOMES = {
     "depth_of_field": "module",
 }
 _SUBPACKAGES = ("augmentation", "depth", "distributed", "export", "fit", "functional")
+
+
+# A checkout has the packages fit and export beside this one, where an installation has them inside.
+_CHECKOUT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+if all(os.path.isfile(os.path.join(_CHECKOUT, name)) for name in ("Makefile", os.path.join("fit", "__init__.py"))):
+    __path__.append(_CHECKOUT)
 
 
 def __getattr__(name: str) -> Any:

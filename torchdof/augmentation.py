@@ -7,7 +7,7 @@ channel of the image, in ``DepthAugmentationSequential`` with the depth as a mas
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -33,7 +33,7 @@ _ENCODED_RANGE = (-0.5, 1.5)  # accepted values of encoded images: [0, 1], and t
 _IMAGE_NAMES = ("image", "input", "img")
 
 
-@spells_options
+@functools.partial(spells_options, check=False)
 class RandomDepthOfField(IntensityAugmentationBase2D):
     """Blurs images by their depth with a random focus, f-number and lens.
 
@@ -106,7 +106,7 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         if not isinstance(return_label, bool):
             raise ValueError(f"return_label must be True or False, got {show(return_label)}")
         self.return_label = return_label
-        options.setdefault("check", False)
+        options.setdefault("check", False)  # as the signature shows
         self.focus_m, self.f_number = (near_m, far_m), (smallest_f, largest_f)
         self.renderings = [Options(table, **options) for table in tables]  # type: ignore[arg-type]
         self.flags = {"transfer": transfer}
@@ -170,8 +170,9 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         """Blur images.
 
         Args:
-            input: ``[B, C, H, W]`` or ``[C, H, W]``; without ``depth``, its last channel is the depth. Or a dict with
-                ``"image"`` (or ``"input"``, ``"img"``) and ``"depth"``, which is returned with the image replaced.
+            input: ``[B, C, H, W]``, B may be 0, or ``[C, H, W]``; without ``depth``, its last channel is the depth. Or
+                a dict with ``"image"`` (or ``"input"``, ``"img"``) and ``"depth"``, which is returned with the image
+                replaced.
             depth: Metres, ``[B, 1, H, W]``, ``[B, H, W]`` or ``[1, 1, H, W]``; of one image ``[1, H, W]`` or
                 ``[H, W]``.
             params: Parameters of an earlier call, to repeat it; None draws new ones.
@@ -310,6 +311,10 @@ class DepthAugmentationSequential(AugmentationSequential):
     Geometric steps transform image, depth and masks alike, depth and masks by nearest neighbour, so that no depth
     between two surfaces appears. :class:`RandomDepthOfField` receives the depth as the steps before left it.
 
+    Kornia converts masks to the dtype of the images, which rounds a depth to 11 bits for float16 and to 8 for bfloat16.
+    Beside a wider depth, images of half precision are therefore transformed in float32; the results have the dtypes of
+    the arguments.
+
     Args:
         *args: Augmentations; :class:`RandomDepthOfField` must be a direct member, not inside another container.
         **kwargs: As Kornia's; ``data_keys`` are ``"input"``, ``"mask"`` for the depth, and any others. With
@@ -332,6 +337,28 @@ class DepthAugmentationSequential(AugmentationSequential):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.transform_op = _DepthOps(self.data_keys)
+
+    def forward(self, *args: Any, **kwargs: Any) -> Any:
+        """As Kornia's, without rounding of the depth."""
+        return _in_single_precision(super().forward, args, kwargs)
+
+    def inverse(self, *args: Any, **kwargs: Any) -> Any:
+        """As Kornia's, without rounding of the depth."""
+        return _in_single_precision(super().inverse, args, kwargs)
+
+
+def _in_single_precision(call: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    """The result of ``call`` on tensors, one of which may be a dict of them; half precision beside wider is widened."""
+    is_dict = len(args) == 1 and isinstance(args[0], dict)
+    given: dict[Any, Any] = args[0] if is_dict else dict(enumerate(args))
+    half = {k: v.dtype for k, v in given.items() if isinstance(v, Tensor) and v.dtype in (torch.half, torch.bfloat16)}
+    if not half or all(k in half or v is None for k, v in given.items()):
+        return call(*args, **kwargs)
+    widened = {k: v.float() if k in half else v for k, v in given.items()}
+    results = call(widened, **kwargs) if is_dict else call(*widened.values(), **kwargs)
+    named = results if is_dict else dict(enumerate(results))
+    restored = {k: v.to(half[k]) if k in half else v for k, v in named.items()}
+    return restored if is_dict else [*restored.values()]
 
 
 class _DepthOps(AugmentationSequentialOps):
@@ -366,7 +393,9 @@ def _image_and_depth(input: Tensor, depth: Tensor | None) -> tuple[Tensor, Tenso
     if depth.ndim in (2, 3):
         depth = depth.unsqueeze(-3) if depth.ndim == 2 or len(depth) == len(input) else depth
         depth = depth if depth.ndim == 4 else depth[None]
-    image_and_map(image, "depth", depth, "in metres")
+    # an empty batch passes, as through Kornia's own steps; its other axes are checked
+    checked_image, checked_depth = (t if len(t) else t.new_empty(1, *t.shape[1:]) for t in (image, depth))
+    image_and_map(checked_image, "depth", checked_depth, "in metres")
     return image, depth.expand(len(input), -1, -1, -1), passed_on
 
 

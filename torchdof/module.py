@@ -11,9 +11,10 @@ from . import validation
 from .batch import flattened, leading_axes, numbers, restored
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera
-from .options import OPTION_NAMES, OptionArguments, Options, read_state, spells_options
+from .options import OPTION_NAMES, OptionArguments, Options, from_config, spells_options, to_config
 from .render import edges, pipeline
 from .render.attention import Attention
+from .render.one_thread import on_one_thread
 from .render.ops import EAGER, Ops
 from .render.plan import Plan
 from .render.resample import at_size_of
@@ -210,6 +211,8 @@ class DepthOfField(nn.Module):
         validation.image_and_depth(image, depth, values=check, name=name)
         changes = {"focus_m": focus_m, "f_number": f_number}
         camera = self.camera.replace(**{k: v for k, v in changes.items() if v is not None})
+        if not is_traced():
+            camera.refuse_other_batch(len(image))
         # a tensor, because an exported graph would do Python's arithmetic with the width in float32
         width: Any = torch.scalar_tensor(image.shape[-1], dtype=torch.float64, device="cpu")
         coc = camera.coc_px(depth, width)
@@ -236,14 +239,33 @@ class DepthOfField(nn.Module):
         (coc,) = flattened(leading_axes(image), coc_px=self.coc_px(image, depth, focus_m, f_number))
         return Plan.for_scene(coc, self.options.tolerance).with_pixels(coc)
 
-    def get_extra_state(self) -> dict[str, Any]:
-        """Camera, table and options: the whole configuration travels with ``state_dict``."""
-        camera = {k: getattr(self.camera, k) for k in Camera.__dataclass_fields__}
-        return {"camera": camera, **self.options.arguments(), "table": self.options.table.to_dict()}
+    def to_dict(self) -> dict[str, Any]:
+        """The configuration, camera, table and options, as plain JSON types: the inverse of :meth:`from_dict`.
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore the result of :meth:`get_extra_state`; ``ValueError`` names a bad field, and changes nothing."""
-        self.camera, self.options = read_state(state)
+        A module without parameters has an empty ``state_dict``; the configuration belongs beside a checkpoint.
+
+        Example:
+            >>> import json
+            >>> config = json.dumps(DepthOfField(Camera(focus_m=1.5), BlurTable.gaussian()).to_dict())
+            >>> DepthOfField.from_dict(json.loads(config)).camera
+            Camera(50 mm, f/2.8, focus 1.5 m, sensor 36 mm)
+        """
+        return to_config(self.camera, self.options)
+
+    @classmethod
+    def from_dict(cls, config: Any) -> "DepthOfField":
+        """Build a module from :meth:`to_dict`'s data; options and numbers of the camera that are missing are defaults.
+
+        Raises:
+            ValueError: If a field is unknown or wrong; the message names it.
+        """
+        camera, options = from_config(config)
+        return cls(camera, **options.arguments())
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *arguments: Any) -> None:
+        """As PyTorch's; the configuration that checkpoints of earlier versions have is left out, not an error."""
+        state_dict.pop(f"{prefix}_extra_state", None)
+        super()._load_from_state_dict(state_dict, prefix, *arguments)
 
     def extra_repr(self) -> str:
         """Camera, table and options, as ``repr`` shows them."""
@@ -364,5 +386,12 @@ def blur(
         raise ValueError("attention plans for two tolerances; leave plan out, or attention")
     if attention is not None and is_traced():
         raise ValueError("attention chooses its work by where the viewer looks; a compiled or exported graph cannot")
-    with without_autocast(image.device.type):  # it would convolve in half precision
-        return pipeline.blur(image, coc_px, plan, options, hidden, attention, ops)
+
+    def render(image: Tensor, coc_px: Tensor, *hidden: Tensor) -> Tensor:
+        behind = (hidden[0], hidden[1]) if hidden else None
+        with without_autocast(image.device.type):  # it would convolve in half precision
+            return pipeline.blur(image, coc_px, plan, options, behind, attention, ops)
+
+    tensors = (image, coc_px, *(hidden or ()))
+    has_others = options.table.is_differentiated or isinstance(attention, Tensor)
+    return render(*tensors) if has_others else on_one_thread(render, *tensors)

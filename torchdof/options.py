@@ -2,7 +2,11 @@
 
 import dataclasses
 import inspect
+import math
 from typing import Any, Literal, TypedDict, TypeVar, get_args
+
+import torch
+from torch import Tensor
 
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera
@@ -15,8 +19,9 @@ __all__ = [
     "OptionArguments",
     "Options",
     "Tolerance",
-    "read_state",
+    "from_config",
     "spells_options",
+    "to_config",
 ]
 
 Method = Literal["layered", "fold"]
@@ -38,7 +43,10 @@ class Options:
         table: Blur measured from a lens; None takes the ideal disc.
         tolerance: Accepted RMS difference, display-encoded, from the same rendering with exact kernels, dense layers
             and full resolution. 0 gives that rendering itself. Its kernels are interpolated between layers half a pixel
-            apart; if depth is noise, this differs by 1 to 2.5/255 RMS from a scatter of each pixel's own kernel.
+            apart; if depth is noise, this differs by 1 to 2.5/255 RMS from a scatter of each pixel's own kernel. While
+            gradients with respect to the circle of confusion are recorded, layers are fixed instead of lying at the
+            scene's ends: if the image is noise, the picture then differs by up to 2.5/255 for blurs of about 1 px and
+            1.5/255 up to 4 px, whatever the tolerance, and by less than 1/255 beyond the tolerance for larger ones.
             ``"draft"`` is 8/255, ``"preview"`` 4/255 and ``"final"`` 1/255.
         occlusion: True composites layers far to near: blurred foregrounds cover the surfaces behind them, and blurred
             backgrounds do not bleed onto sharp foregrounds. False is the algorithm of the paper: the light of all
@@ -107,12 +115,15 @@ class OptionArguments(TypedDict, total=False):
     depth_edges: DepthEdges
 
 
-def spells_options(function: _Decorated) -> _Decorated:
-    """Decorator that shows, in the signature of a function with ``**options``, each option with its default."""
+def spells_options(function: _Decorated, **defaults: Any) -> _Decorated:
+    """Decorator that shows, in the signature of a function with ``**options``, each option with its default.
+
+    ``defaults`` are those that differ from :class:`Options`.
+    """
     target: Any = function.__init__ if inspect.isclass(function) else function
     signature = inspect.signature(target)
     parameters = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-    options = {field.name: field.default for field in dataclasses.fields(Options)}
+    options = {field.name: field.default for field in dataclasses.fields(Options)} | defaults
     options_shown = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=options[name], annotation=kind)
         for name, kind in OptionArguments.__annotations__.items()
@@ -121,17 +132,46 @@ def spells_options(function: _Decorated) -> _Decorated:
     return function
 
 
-def read_state(state: Any) -> tuple[Camera, Options]:
-    """Camera and options (with the table) from the state of a module; ``ValueError`` names a wrong field."""
-    part = "the state of a DepthOfField"
-    given = fields(part, state, ("camera", *OPTION_NAMES))
-    numbers = fields("camera of the state", given.pop("camera"), Camera.__dataclass_fields__)
+def to_config(camera: Camera, options: Options) -> dict[str, Any]:
+    """Camera and options (with the table) as plain JSON types; a tensor ``[B]`` becomes a list, infinity ``"inf"``."""
+    numbers = {name: _as_json(getattr(camera, name)) for name in Camera.__dataclass_fields__}
+    return {"camera": numbers, **options.arguments(), "table": options.table.to_dict()}
+
+
+def from_config(config: Any) -> tuple[Camera, Options]:
+    """Camera and options from :func:`to_config`; missing fields are defaults, ``ValueError`` names a wrong field."""
+    part = "the configuration of a DepthOfField"
+    given = fields(part, config, ("camera",), OPTION_NAMES)
+    numbers = fields("camera of the configuration", given.pop("camera"), (), Camera.__dataclass_fields__)
     try:
-        part = "camera of the state"
-        camera = Camera(**numbers)
-        part = "table of the state"
-        given["table"] = BlurTable.from_dict(given["table"])
-        part = "the state of a DepthOfField"
+        part = "camera of the configuration"
+        camera = Camera(**{name: _from_json(value, name == "focus_range_m") for name, value in numbers.items()})
+        part = "table of the configuration"
+        if given.get("table") is not None:
+            given["table"] = BlurTable.from_dict(given["table"])
+        part = "the configuration of a DepthOfField"
         return camera, Options(**given)
     except ValueError as error:
         raise ValueError(f"{part}: {error}") from error
+
+
+def _as_json(value: Any) -> Any:
+    """A number, a tensor ``[B]`` or a range of these as plain JSON types."""
+    value = value.tolist() if isinstance(value, Tensor) else value
+    if isinstance(value, list | tuple):
+        return [_as_json(item) for item in value]
+    return "inf" if isinstance(value, float) and value == math.inf else value  # JSON has no infinity
+
+
+def _from_json(value: Any, is_range: bool) -> Any:
+    """The inverse of :func:`_as_json`; a list becomes a tensor, or with ``is_range`` a tuple of two numbers."""
+    if not isinstance(value, list | tuple):
+        return math.inf if isinstance(value, str) and value == "inf" else value
+    values = [_from_json(item, False) for item in value]
+    if is_range:
+        return tuple(values)
+    try:
+        wide = torch.tensor(values, dtype=torch.float64, device="cpu")
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        return value  # the camera refuses it by its name
+    return wide.float() if torch.equal(wide.float().double(), wide) else wide  # most often a tensor of float32

@@ -35,6 +35,11 @@ def show(value: Any) -> str:
     if isinstance(value, np.ndarray):
         advice = "use torch.from_numpy(array), and .movedim(-1, -3) for an image with channels last"
         return f"a {value.dtype} array of shape {list(value.shape)}; {advice}"
+    if isinstance(value, list | tuple) and value and all(isinstance(item, Tensor) and item.ndim for item in value):
+        shapes = list(dict.fromkeys(str(list(item.shape)) for item in value))
+        shown = f"{', '.join(shapes[:3])}{', ...' * (len(shapes) > 3)}"
+        one_size = "torch.stack makes a batch of it" if len(shapes) == 1 else "render them one by one, or at one size"
+        return f"a {type(value).__name__} of {len(value)} tensors of shape {shown}; {one_size}"
     try:
         text = repr(value)
     except Exception:  # an integer with more digits than Python prints, or an error in the object's own repr
@@ -194,7 +199,8 @@ def image_and_map(image: Tensor, name: str, value: Tensor, unit: str) -> None:
         hint = "; did you forget the batch dimension? use image[None]" if image.ndim == 3 else ""
         raise ValueError(f"image must be [B, C, H, W] with at least one pixel, got {list(image.shape)}{hint}")
     batch, _, height, width = image.shape
-    expected = f"[{batch}, 1, {height}, {width}] or [1, 1, {height}, {width}] {unit} beside this image"
+    shared = "" if is_traced() or batch == 1 else f"or [1, 1, {height}, {width}] "  # no comparison in a traced graph
+    expected = f"[{batch}, 1, {height}, {width}] {shared}{unit} beside this image"
     real_tensor(name, value, expected)
     if value.ndim != 4 or value.shape[1:] != (1, height, width) or value.shape[0] not in (1, batch):
         hint = "; did you forget the channel dimension?" if value.ndim == 3 else ""
@@ -211,8 +217,9 @@ def image_and_depth(image: Tensor, depth: Tensor, values: bool, name: str = "dep
     if values and not is_traced() and not ends(depth)[0] > 0:
         bad = int((~(depth > 0)).sum())
         remedy = "check its unit and kind" if bad == depth.numel() else "fill the holes"
+        remedy += ", or leave these pixels sharp with check=False"
         got = f"{bad} of {depth.numel()} pixels that are NaN, zero or negative"
-        raise ValueError(f"{name} must be > 0 (inf allowed), got {got}; {remedy}, or let them sharp with check=False")
+        raise ValueError(f"{name} must be > 0 (inf allowed), got {got}; {remedy}")
 
 
 def image_and_coc(image: Tensor, coc_px: Tensor, channels: int, values: bool) -> None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchdof import BlurTable, Camera, blur_by_coc
-from torchdof.depth import at_size_of, from_relative
+from torchdof.depth import at_size_of, fill_holes, from_relative
 from torchdof.depth.inspect import tint_focus
 from torchdof.io.transfer import decode, encode
 from torchdof.optics.aperture import Aperture
@@ -17,6 +17,8 @@ __all__ = ["NODE_CLASS_MAPPINGS", "NODE_DISPLAY_NAME_MAPPINGS", "DepthOfFieldNod
 
 _NEAR_IS_WHITE, _FAR_IS_WHITE, _METRES = "white is near", "white is far", "metres"
 _POINT, _DISTANCE = "point", "metres"
+_DEPTH_TYPES = "IMAGE,MASK,MOGE_GEOMETRY,DA3_GEOMETRY"  # the last two are dicts of ComfyUI's own MoGe and DA3 nodes
+_SKY = 0.5  # probability of sky above which a pixel of Depth Anything 3 is infinitely far
 _SHAPES = {"as the lens": None, **{f"{count} blades": count for count in range(5, 10)}}
 
 
@@ -56,10 +58,16 @@ class DepthOfFieldNode:
         return {
             "required": {
                 "image": ("IMAGE", {"tooltip": "All in focus."}),
-                "depth": ("IMAGE", {"tooltip": "Its depth, of any size; another shape is stretched to the image's."}),
+                "depth": (
+                    _DEPTH_TYPES,
+                    {"tooltip": "Its depth, of any size; another shape is stretched to the image's."},
+                ),
                 "depth_kind": (
                     [_NEAR_IS_WHITE, _FAR_IS_WHITE, _METRES],
-                    {"tooltip": "Depth Anything and MiDaS paint near white, Marigold far; or the values are metres."},
+                    {
+                        "tooltip": "Depth Anything and MiDaS paint near white, Marigold far; or the values are metres. "
+                        "A geometry has metres, or is scaled to near_m and far_m."
+                    },
                 ),
                 "near_m": _number(
                     1.0, 0.05, 1000.0, 0.05, "Distance of the nearest value in metres, if not in metres."
@@ -83,7 +91,7 @@ class DepthOfFieldNode:
     def render(
         self,
         image: Tensor,
-        depth: Tensor,
+        depth: Tensor | dict[str, Any],
         depth_kind: str,
         near_m: float,
         far_m: float,
@@ -102,8 +110,9 @@ class DepthOfFieldNode:
     ) -> tuple[Tensor, Tensor]:
         """Renders; the inputs are explained in :meth:`INPUT_TYPES`.
 
-        All images of a batch share the range of values of ``depth`` ``[B or 1, h, w, C]``, so that the focus of a clip
-        does not pulse.
+        ``depth`` is an image ``[B or 1, h, w, C]``, a mask ``[B or 1, h, w]`` or a geometry. All images of a batch
+        share the range of its values, so that the focus of a clip does not pulse. Pixels without depth (NaN, and in
+        metres 0) take that of the surface behind them.
 
         Returns:
             Two images ``[B, H, W, 3 or 4]`` and ``[B, H, W, 3]``, encoded for display as ComfyUI passes images.
@@ -111,17 +120,15 @@ class DepthOfFieldNode:
         Raises:
             ValueError: If an input is not as described, or the focus point has no depth.
         """
-        if len(depth) not in (1, len(image)):
-            raise ValueError(f"depth must be one image, or one for each of the {len(image)} images, got {len(depth)}")
-        encoded, values = image.float().movedim(-1, 1), depth.float().movedim(-1, 1)[:, :3].mean(1, keepdim=True)
+        if not bool(image.isfinite().all()):
+            raise ValueError("image has pixels that are NaN or infinite; look for the node that makes them")
+        encoded = image.float().movedim(-1, 1)
         has_alpha = encoded.shape[1] == 4
         light = decode(encoded, "srgb", has_alpha, straight=True)
-        if depth_kind != _METRES:
-            extremes = (float(values.min()), float(values.max()))
-            if not extremes[0] < extremes[1]:
-                raise ValueError(f"depth must have different values, near and far, got {extremes[0]:g} everywhere")
-            kind: Any = "disparity" if depth_kind == _NEAR_IS_WHITE else "depth"
-            values = from_relative(values, near_m, far_m, kind, value_range=extremes)
+        values, is_distance = _values(depth)
+        if len(values) not in (1, len(image)):
+            raise ValueError(f"depth must be one image, or one for each of the {len(image)} images, got {len(values)}")
+        values = _metres(values, depth_kind, is_distance, near_m, far_m)
         metres = at_size_of(light, values)
         camera = Camera(focal_length_mm, f_number, focus_m, sensor_width_mm)
         height, width = light.shape[-2:]
@@ -141,6 +148,42 @@ class DepthOfFieldNode:
         tinted = tint_focus(light, coc_px, has_alpha)[:, :3]
         pictures = encode(out.clamp_min(0.0), "srgb", has_alpha, straight=True), encode(tinted, "srgb", False, False)
         return pictures[0].clamp(0.0, 1.0).movedim(1, -1), pictures[1].clamp(0.0, 1.0).movedim(1, -1)
+
+
+def _values(depth: Tensor | dict[str, Any]) -> tuple[Tensor, bool]:
+    """Values ``[B or 1, 1, h, w]`` of the depth input, and whether larger ones are known to be farther."""
+    if isinstance(depth, dict):
+        if "depth" not in depth:
+            raise ValueError("the geometry has no depth; connect the node that runs MoGe or Depth Anything 3")
+        values = depth["depth"].float()
+        is_far = ~depth["mask"].bool() if "mask" in depth else torch.zeros_like(values, dtype=torch.bool)
+        if "sky" in depth:
+            is_far = is_far | (depth["sky"] > _SKY)
+        return torch.where(is_far, torch.inf, values)[:, None], True
+    values = depth.float()
+    if values.ndim == 4:  # an image
+        return values[..., :3].mean(-1)[:, None], False
+    return values.reshape(-1, 1, *values.shape[-2:]), False  # a mask
+
+
+def _metres(values: Tensor, depth_kind: str, is_distance: bool, near_m: float, far_m: float) -> Tensor:
+    """Metres without holes from the values of the depth input; infinitely far pixels have ``far_m`` or infinity."""
+    known = values[values.isfinite() & ((values > 0) | (depth_kind != _METRES))]
+    if not len(known):
+        raise ValueError("depth has no pixel with a depth, only NaN, infinite or (in metres) zero ones")
+    if depth_kind == _METRES:
+        metres = torch.where(values > 0, values, torch.nan)
+    else:
+        extremes = (float(known.min()), float(known.max()))
+        if not extremes[0] < extremes[1]:
+            raise ValueError(f"depth must have different values, near and far, got {extremes[0]:g} everywhere")
+        kind: Any = "disparity" if depth_kind == _NEAR_IS_WHITE and not is_distance else "depth"
+        if kind == "depth":
+            values = torch.where(values == torch.inf, extremes[1], values)
+        metres = from_relative(values, near_m, far_m, kind, value_range=extremes)
+    # a frame of a clip without any depth is as far as its farthest frame
+    farthest = metres[~metres.isnan()].max()
+    return torch.cat([fill_holes(m, "far" if not bool(m.isnan().all()) else float(farthest)) for m in metres.split(1)])
 
 
 NODE_CLASS_MAPPINGS = {"TorchdofDepthOfField": DepthOfFieldNode}

@@ -56,7 +56,8 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setitem(sys.modules, "scipy", None)
     monkeypatch.setattr(Export, "run", missing)
-    assert "this command needs scipy; install it with: pip install 'torchdof[fit]'" in run("export", code=2)
+    expected = "this command needs scipy; in the folder of torchdof's source, run: pip install '.[fit]'"
+    assert expected in run("export", code=2)
 
 
 @pytest.mark.parametrize("place", ["importlib.import_module", "torchdof.bench.speed.compare"])

@@ -2,7 +2,9 @@
 
 import json
 import math
+import os
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -397,6 +399,55 @@ def test_a_run_ends_if_another_one_renders_its_frames_with_other_options(
     assert told(f"{SEQUENCE} {PULL} --f-number 4 --resume")[0] == "3 of 3 frames are there already\n"
 
 
+def test_frames_that_another_run_replaced_are_named_at_the_end(
+    scene: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A frame that an earlier run with other options was still writing when this one began."""
+    torchdof.BlurTable.disc().save("lens.json")
+    render, rendered = Renderer.render, list[int]()
+
+    def render_after_a_late_write(self: Renderer, *arguments: Any) -> Any:
+        rendered.append(arguments[2])
+        if rendered == [1, 2, 3]:
+            shutil.copy("image.exr", "late.exr")
+            Path("late.exr").replace("out.0001.exr")
+        return render(self, *arguments)
+
+    monkeypatch.setattr(Renderer, "render", render_after_a_late_write)
+    message = run(f"{SEQUENCE} {PULL}", code=2)
+    assert "another run replaced 1 of 3 frames, out.0001.exr first, while this one went on" in message
+
+
+def test_the_first_run_ends_even_if_the_other_begins_with_its_last_frame(
+    scene: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torchdof.BlurTable.disc().save("lens.json")
+    write, written = Renderer.write, list[Path]()
+
+    def write_before_another_run(self: Renderer, out: Path, *arguments: Any) -> None:
+        write(self, out, *arguments)
+        written.append(out)
+        if len(written) == 3:
+            record = json.loads(Path(RECORD).read_text()) | {"--f-number": 4.0}
+            Path(RECORD).write_text(json.dumps(record))
+
+    monkeypatch.setattr(Renderer, "write", write_before_another_run)
+    assert "another run renders the same frames with other options (--f-number" in run(f"{SEQUENCE} {PULL}", code=2)
+
+
+def test_resume_removes_what_killed_runs_left(scene: Path, run: Run) -> None:
+    torchdof.BlurTable.disc().save("lens.json")
+    run(f"{SEQUENCE} {PULL}")
+    old, young, other = (Path(f".{c * 32}.part.exr") for c in "0a"), Path(f".{'b' * 32}.part.exr"), Path(".my.part.exr")
+    for path in (old := [*old]) + [young, other]:
+        path.write_bytes(b"half")
+    for path in old:
+        os.utime(path, (1.0, 1.0))
+    notes = told(f"{SEQUENCE} {PULL} --resume")[1]
+    assert "removed 2 unfinished files (.part) of killed runs" in notes and "1 unfinished files (.part) stay" in notes
+    assert young.is_file() and other.is_file() and not any(path.exists() for path in old)
+
+
 # Names
 
 
@@ -613,3 +664,9 @@ def test_a_stray_pixel_does_not_reduce_the_blur_of_the_others(image: Tensor, dep
         line = run("render large.exr large.npy -o out.exr --focus-m 2 --blur 4% --depth-edges as-given")
         openings += numbers_in(line, r"f/([\d.]+)")
     assert openings[0] == openings[1]
+
+
+def test_a_depth_map_with_one_value_is_named_as_such(depth: Tensor) -> None:
+    np.save("flat.npy", np.full(depth.shape[-2:], 128.0))
+    note = "note: flat.npy: has one value everywhere, 128, so nothing is nearer"
+    assert note in told("render image.exr flat.npy -o out.png")[1]

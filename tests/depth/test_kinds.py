@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.refused import refuses
+from torchdof.depth import from_relative, read_depth
 from torchdof.depth.holes import fill_holes
-from torchdof.depth.kinds import depth_from_values, read_depth
+from torchdof.depth.kinds import depth_from_values
 
 NAN, INF = math.nan, math.inf
 
@@ -106,6 +107,22 @@ test_invalid_arguments_are_refused = refuses(
     *((functools.partial(fill_holes, row(1.0, NAN), fill), "fill")
       for fill in cast(Any, ("middle", 0.0, -1.0, NAN, True))),
 )  # fmt: skip
+
+
+def test_relative_depth_is_read_with_its_nearest_and_farthest_distance(tmp_path: Path) -> None:
+    path, values = tmp_path / "d.npy", torch.tensor([[[[0.0, 0.25], [0.5, 1.0]]]])
+    np.save(path, values[0, 0].numpy())
+    for kind in ("disparity", "depth"):
+        read = read_depth(path, "relative", near_m=1.0, far_m=8.0, relative_kind=kind, value_range=(0.0, 2.0))
+        assert torch.equal(read, from_relative(values, 1.0, 8.0, kind, value_range=(0.0, 2.0)))
+    for wrong, message in (
+        ({"near_m": 1}, "relative depth needs near_m and far_m"),
+        ({"near_m": 1, "far_m": 2, "scale": 2.0}, "relative depth has no scale and offset"),
+        ({"kind": "z", "near_m": 1}, "are for the kind 'relative', got the kind 'z'"),
+        ({"kind": "metres"}, "the kind of depth must be one of z, .*, relative, got 'metres'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read_depth(path, **cast(Any, {"kind": "relative", **wrong}))
 
 
 def test_holes_are_refused_without_a_fill(tmp_path: Path) -> None:

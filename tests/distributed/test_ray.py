@@ -19,7 +19,7 @@ from torchdof.io.images import Picture, write_image
 ROOT = Path(__file__).parents[2]
 _RAY = importlib.util.find_spec("ray")
 HAS_RAY = _RAY is not None and _RAY.origin is not None  # a plain folder named "ray" has no origin
-NEEDS_RAY = pytest.mark.skipif(not HAS_RAY, reason="Ray is not installed: pip install 'torchdof[ray]'")
+NEEDS_RAY = pytest.mark.skipif(not HAS_RAY, reason="Ray is not installed: pip install '.[ray]'")
 
 
 @pytest.fixture
@@ -74,5 +74,5 @@ def test_a_killed_and_resumed_job_makes_the_same_shards(photos: Path) -> None:
 
 @pytest.mark.skipif(HAS_RAY, reason="Ray is installed")
 def test_without_ray_the_error_states_how_to_install_it(photos: Path) -> None:
-    with pytest.raises(ModuleNotFoundError, match=r"pip install 'torchdof\[ray\]'"):
+    with pytest.raises(ModuleNotFoundError, match=r"run: pip install '\.\[ray\]'"):
         make_dataset(pairs_in(photos / "images", photos / "depths"), photos / "out")

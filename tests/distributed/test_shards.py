@@ -240,7 +240,7 @@ def test_webdataset_reads_the_shards(pairs: list[Pair], tmp_path: Path) -> None:
         (lambda f: RenderShards(f, picture=".jpg"), ValueError, "picture must be"),  # type: ignore[arg-type]
         (lambda f: RenderShards(f, "disc"), ValueError, "blur must be a RandomDepthOfField"),  # type: ignore[arg-type]
         (lambda f: RenderShards(f, depth={"scal": 2.0}), ValueError, "depth must be some of kind, scale, .*'scal'"),
-        (lambda f: RenderShards(f, depth={"kind": "relative"}), ValueError, "some of kind, near_m, .*: .*'near_m'"),
+        (lambda f: RenderShards(f, depth={"kind": "relative"}), ValueError, "'relative' must have near_m and far_m"),
         (lambda f: RenderShards(f, seed=-1), ValueError, "seed must be a whole number"),
         (lambda f: RenderShards(f, threads=0), ValueError, "threads must be a whole number"),
         (lambda f: RenderShards(f / "none"), FileNotFoundError, "there is no such folder; make it first"),
@@ -261,7 +261,7 @@ def test_a_missing_package_of_a_format_is_reported_before_rendering(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ModuleNotFoundError, match=r"parquet needs pyarrow: pip install 'torchdof\[ray\]'"):
+    with pytest.raises(ModuleNotFoundError, match=r"parquet needs pyarrow; .*pip install '\.\[ray\]'"):
         RenderShards(tmp_path, format="parquet")
 
 

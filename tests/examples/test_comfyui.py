@@ -19,7 +19,7 @@ from torchdof.io.transfer import decode, encode
 from torchdof.optics.aperture import Aperture
 
 FOLDER = Path(__file__).parents[2] / "examples" / "comfyui"
-TYPES = {"IMAGE", "MASK", "INT", "FLOAT", "STRING", "BOOLEAN"}
+TYPES = {"IMAGE", "MASK", "INT", "FLOAT", "STRING", "BOOLEAN", "MOGE_GEOMETRY", "DA3_GEOMETRY"}
 
 
 def loaded() -> ModuleType:
@@ -38,7 +38,7 @@ INPUTS: dict[str, Any] = NODE.INPUT_TYPES()["required"]
 DEFAULTS = {  # that ComfyUI's page starts with: the first of a list, or the input's default
     name: kind[0] if isinstance(kind, list) else extra[0]["default"]
     for name, (kind, *extra) in INPUTS.items()
-    if kind != "IMAGE"
+    if isinstance(kind, list) or extra[0].get("default") is not None
 }
 
 
@@ -46,7 +46,7 @@ def scene() -> tuple[Tensor, Tensor]:
     return torch.rand(2, 18, 24, 3), torch.rand(2, 18, 24, 1).expand(-1, -1, -1, 3)
 
 
-def render(image: Tensor, depth: Tensor, **changes: Any) -> tuple[Tensor, Tensor]:
+def render(image: Tensor, depth: Any, **changes: Any) -> tuple[Tensor, Tensor]:
     """As ComfyUI's ``execution``: a new node, its FUNCTION by name, inputs by keyword."""
     given = {"sensor_width_mm": 4.0, **changes}
     out = getattr(NODE(), NODE.FUNCTION)(image=image, depth=depth, **{**DEFAULTS, **given})
@@ -62,7 +62,7 @@ def test_the_folder_is_a_custom_node_with_inputs_by_comfyuis_rules() -> None:
     assert isinstance(NODE.CATEGORY, str) and set(NODE.INPUT_TYPES()) <= {"required", "optional", "hidden"}
     assert (FOLDER / "requirements.txt").read_text().split() == ["torchdof"]
     for kind, *extra in INPUTS.values():
-        assert all(isinstance(value, str) for value in kind) if isinstance(kind, list) else kind in TYPES
+        assert all(isinstance(value, str) for value in kind) if isinstance(kind, list) else {*kind.split(",")} <= TYPES
         if kind == "FLOAT":
             assert extra[0]["min"] <= extra[0]["default"] <= extra[0]["max"] and extra[0]["step"] > 0
     assert list(inspect.signature(getattr(NODE, NODE.FUNCTION)).parameters) == ["self", *INPUTS]
@@ -116,9 +116,54 @@ def test_a_square_map_is_stretched_with_a_warning() -> None:
     assert float((out - image)[:, :, 16:].abs().max()) > 0.05
 
 
+def near_and_far() -> tuple[Tensor, Tensor]:
+    """An image, and depth in metres ``[1, 18, 24]`` of a post at 2 m before a wall at 5 m."""
+    depth = torch.full((1, 18, 24), 5.0)
+    depth[:, :, 8:16] = 2.0
+    return torch.rand(1, 18, 24, 3), depth
+
+
+def test_a_mask_and_the_geometries_of_comfyuis_own_nodes_are_depth_too() -> None:
+    image, depth = near_and_far()
+    expected = render(image, depth[..., None].expand(-1, -1, -1, 3), depth_kind="metres")
+    kinds: dict[str, Any] = {"mask": depth, "one mask": depth[0], "MoGe": {"depth": depth, "image": image}}
+    kinds["Depth Anything 3"] = {"depth": depth, "mode": "mono", "sky": torch.zeros_like(depth)}
+    for given in kinds.values():
+        for out, same in zip(render(image, given, depth_kind="metres"), expected, strict=True):
+            torch.testing.assert_close(out, same, rtol=0.0, atol=0.0)
+    sky = torch.zeros_like(depth, dtype=torch.bool)
+    sky[:, :6] = True
+    infinite = render(image, torch.where(sky, torch.inf, depth), depth_kind="metres")
+    for given in ({"depth": depth, "mask": ~sky}, {"depth": depth, "sky": sky.float(), "mode": "mono"}):
+        assert torch.equal(render(image, given, depth_kind="metres")[0], infinite[0])
+
+
+def test_a_geometry_is_scaled_to_near_and_far_for_both_kinds_of_white() -> None:
+    image, depth = near_and_far()
+    expected = render(image, 0.1 * depth, depth_kind="white is far")
+    for kind in ("white is near", "white is far"):
+        assert torch.equal(render(image, {"depth": 0.1 * depth}, depth_kind=kind)[0], expected[0])
+
+
+@pytest.mark.parametrize("kind", ["metres", "white is near", "white is far"])
+@pytest.mark.parametrize("hole", [0.0, torch.nan, torch.inf, -torch.inf])
+def test_pixels_without_depth_take_that_of_the_surface_behind_them(kind: str, hole: float) -> None:
+    image, depth = near_and_far()
+    values = 1.0 / depth if kind == "white is near" else depth
+    full = render(image, values, depth_kind=kind, focus="metres")[0]
+    holes = torch.zeros_like(depth, dtype=torch.bool)
+    holes[:, 3:5, 2:5] = True
+    out = render(image, torch.where(holes, hole, values), depth_kind=kind, focus="metres")[0]
+    if not (hole == 0.0 and kind != "metres") and (kind, hole) != ("metres", torch.inf):  # those are depths
+        assert torch.equal(out, full)
+
+
 test_depth_that_does_not_fit_is_refused_in_one_sentence = refuses(
     (lambda: render(scene()[0], torch.rand(3, 18, 24, 3)), "one for each of the 2 images, got 3"),
     (lambda: render(scene()[0], torch.ones(1, 18, 24, 3)), "got 1 everywhere"),
+    (lambda: render(scene()[0], torch.zeros(1, 18, 24), depth_kind="metres"), "depth has no pixel with a depth"),
+    (lambda: render(scene()[0], {"image": scene()[0]}), "the geometry has no depth"),
+    (lambda: render(scene()[0] / 0.0, scene()[1]), "image has pixels that are NaN or infinite"),
 )
 
 

@@ -72,6 +72,24 @@ def test_python_needs_no_torch(plain: Any, tmp_path: Path) -> None:
     assert 0.002 < np.abs(sharp - blurred).mean() < 0.2
 
 
+def test_python_reads_depth_in_a_png_as_the_javascript_sample_does(plain: Any, tmp_path: Path) -> None:
+    photo, depth_mm = crop()
+    write(tmp_path / "photo.png", photo)
+    half = write(tmp_path / "half.png", depth_mm[::2, ::2])
+    small = np.repeat(np.repeat(depth_mm[::2, ::2], 2, 0), 2, 1).astype(np.float64)
+    share = (small - small.min()) / (small.max() - small.min())
+    metres = {
+        "--scale 0.001": np.where(small > 0, small / 1000, np.nan),
+        "--near-m 1 --far-m 5": 1 / (share / 1 + (1 - share) / 5),
+    }
+    for options, expected in metres.items():
+        call = [sys.executable, EMBED / "run_onnx.py", plain.path, tmp_path / "photo.png", half, tmp_path / "out.png"]
+        run([*call, "--focus-m", FOCUS_M, "--f-number", F_NUMBER, *options.split()])
+        value = rendered(plain, linear(photo / 255), expected)
+        difference = np.abs(np.rint(255 * pixels(tmp_path / "out.png")[..., :3]) - srgb_codes(value))
+        assert difference.max() <= 1 and (difference > 0).mean() < 1e-3
+
+
 @needs("onnxruntime-web")
 def test_javascript_gives_the_pixels_of_the_file(plain: Any, tmp_path: Path) -> None:
     shutil.copytree(EMBED / "javascript", tmp_path / "sample")
@@ -116,7 +134,7 @@ def test_javascript_decodes_resizes_and_scales_as_python_does(tmp_path: Path) ->
 
 @pytest.mark.skipif(
     header_folder() is None,
-    reason="onnxruntime's C++ headers are not installed: Debian's libonnxruntime-dev, or an unpacked release in "
+    reason="onnxruntime's C++ headers are not installed: libonnxruntime-dev of Debian 13, or an unpacked release in "
     "TORCHDOF_ONNXRUNTIME",
 )
 @pytest.mark.skipif(shutil.which("cmake") is None or shutil.which("c++") is None, reason="no CMake or C++ compiler")

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 import torch.nn.functional as functional
 from rich.console import Console
-from rich.progress import track
+from rich.progress import Progress
 from torch import Tensor
 
 from ..io.sheet import write_sheet
@@ -61,20 +61,24 @@ def compare(truth: Path, out: Path, views: Sequence[int], degraded: bool, peers:
     tile_px = min(_TILE_PX, *(size for scene in scenes for size in scene.image.shape[-2:]))
     panels: dict[str, list[Tensor]] = {}
     cases = [(scene, kind) for scene in scenes for kind in (KINDS if degraded else ["exact"])]
-    for scene, kind in track(cases, "scenes", console=console, transient=True, disable=not console.is_terminal):
-        coc_px, pictures = scene.camera.coc_px(degrade(scene.depth, kind), scene.image.shape[-1]), {}
-        for name, blur in by_name.items():
-            with torch.inference_mode():
-                picture, row = measure(blur, BenchScene(scene.name, scene.image, coc_px), again=False)
-            row |= error(picture, scene.truth)
-            if bool(scene.inner.any()):
-                displayed = metrics.display(picture), metrics.display(scene.truth)
-                row["psnr_inner"] = metrics.psnr(*displayed, scene.inner)
-            rows.append({"scene": scene.name, "depth": kind, "renderer": name, **row})
-            pictures[name] = picture
-        window = _worst(pictures["torchdof"], scene, tile_px)
-        for name, picture in {"sharp": scene.image, "truth": scene.truth, **pictures}.items():
-            panels.setdefault(name, []).append(picture[window][:, :3].expand(-1, 3, -1, -1))
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=len(cases) * len(by_name))
+        for scene, kind in cases:
+            coc_px, pictures = scene.camera.coc_px(degrade(scene.depth, kind), scene.image.shape[-1]), {}
+            for name, blur in by_name.items():
+                bar.update(task, description=f"{scene.name}: {name}")
+                with torch.inference_mode():
+                    picture, row = measure(blur, BenchScene(scene.name, scene.image, coc_px), again=False)
+                row |= error(picture, scene.truth)
+                if bool(scene.inner.any()):
+                    displayed = metrics.display(picture), metrics.display(scene.truth)
+                    row["psnr_inner"] = metrics.psnr(*displayed, scene.inner)
+                rows.append({"scene": scene.name, "depth": kind, "renderer": name, **row})
+                pictures[name] = picture
+                bar.advance(task)
+            window = _worst(pictures["torchdof"], scene, tile_px)
+            for name, picture in {"sharp": scene.image, "truth": scene.truth, **pictures}.items():
+                panels.setdefault(name, []).append(picture[window][:, :3].expand(-1, 3, -1, -1))
     means = summary(rows, ["depth", "renderer"], statistics.fmean)
     remark = "psnr_inner: without the border reached by light from outside the frame."
     if degraded:

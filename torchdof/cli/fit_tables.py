@@ -11,6 +11,7 @@ from rich.console import Console
 
 from torchdof import BlurTable, blur_by_coc
 from torchdof.cli.output import json_line, progress_bar
+from torchdof.extras import missing
 from torchdof.fit.lens import trace
 from torchdof.fit.lens.lens import RGB_UM, Lens
 from torchdof.fit.photo.across import table_of_dots
@@ -110,7 +111,7 @@ def fit_photographs(command: Fit, folder: Path, console: Console, caught: list[w
 
                 _save(console, sheet_of_photographs(photographs, result, blur_by_coc), out.with_suffix(".png"))
             except ModuleNotFoundError as error:
-                console.print(f"no sheet of pictures: {error.name} is not installed (pip install torchdof[plot])")
+                console.print(f"no sheet of pictures: {missing('it', error.name) or error}", markup=False)
         elif command.plots is not None:
             from torchdof.fit.plots import picture_of_fit
 

@@ -8,6 +8,7 @@ import sys
 
 import click
 
+from ..extras import missing
 from ..io.atomic import exit_on_signals
 from .command import by_option, command_of
 from .output import to_stderr
@@ -15,8 +16,6 @@ from .output import to_stderr
 COMMANDS = ("render", "fit", "export", "bench", "inspect", "tables")
 """Names of the commands; each is a module with a class of the same name, capitalised."""
 
-_EXTRAS = {"scipy": "fit", "threadpoolctl": "fit", "matplotlib": "plot"}
-_EXTRAS |= dict.fromkeys(("onnx", "onnxscript", "onnxruntime"), "export")
 # Parts of the messages of PyTorch's RuntimeError when memory runs out; they come from several libraries.
 _NO_MEMORY = "allocate memory|not enough memory|out of memory|bad_alloc|calculation overflowed|new thread"
 
@@ -43,10 +42,10 @@ class _Commands(click.Group):
             to_stderr("interrupted")
             raise SystemExit(130) from None
         except ModuleNotFoundError as error:
-            package = (error.name or "").partition(".")[0]
-            if package not in _EXTRAS:
+            reason = missing("this command", error.name)
+            if reason is None:
                 raise
-            message = f"this command needs {package}; install it with: pip install 'torchdof[{_EXTRAS[package]}]'"
+            message = str(reason)
         except (OSError, ValueError) as error:
             if isinstance(error, BrokenPipeError):
                 raise

@@ -94,6 +94,10 @@ class DepthMap(Group):
             depth_unknown=guess.unknown if self.depth_unknown is None else self.depth_unknown,
             fill_depth="far" if self.fill_depth is None else self.fill_depth,
         )
+        finite = known[known.isfinite()]
+        if finite.numel() and bool((finite == finite[0]).all()):
+            same = f"has one value everywhere, {float(finite[0]):g}, so nothing is nearer or farther"
+            return options, f"{same}; is this the depth map? it was taken for metres (else --depth-kind)"
         if guess.kind == "z":
             unit = "metres" if guess.scale is None else "millimetres"
             return options, f"taken for {unit} (else --depth-kind, --depth-scale)"

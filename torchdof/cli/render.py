@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from ..io.atomic import check_writable
+from ..io.atomic import check_writable, remove_unfinished
 from ..io.sequence import FramePattern, parse_frames
 from .command import Command, Group, Parsed, argument, numbers, option, refuse
 from .options import Accuracy, Blur, Scene, check_files
-from .output import json_line, progress_bar
+from .output import json_line, progress_bar, to_stderr
 from .resume import Record
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ _OWN_EXTREMES = (
     "each frame's relative depth is scaled by its own extremes, so that distances pulse; give the values that near and "
     "far have in all frames: --value-range LOW,HIGH"
 )
+_MOST_FRAMES = 1_000_000  # of one run; a larger number is a slip of the finger, and would not fit into memory
 Encoding = Literal["linear", "srgb"]
 _NOT_OF_FRAMES = ("out", "sheet", "frames", "resume", "strict", "device", "as_json")  # options that change no frame
 
@@ -121,6 +122,9 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         elif not is_single:
             first, last = self.frames or (keys[0][0], keys[-1][0])
             numbers = range(first, last + 1)
+            for pattern in filter(None, (images, depths)):
+                pattern.refuse_missing(numbers)
+            refuse((len(numbers) > _MOST_FRAMES, f"{first}-{last} are {len(numbers)} frames, more than {_MOST_FRAMES}"))
         if not numbers:
             raise FileNotFoundError(f"{self.image}: there are no such files")
         outputs: dict[int, Path] = {}
@@ -135,6 +139,13 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         options |= {"files": self.files(), "torchdof": importlib.metadata.version("torchdof")}
         record, existing = Record(self.out, options), [out for out in outputs.values() if out.is_file()]
         reason, done = record.difference(), set[Path]()
+        if self.resume:
+            removed, young = remove_unfinished(self.out.parent)
+            if removed:
+                to_stderr(f"note: {self.out.parent}: removed {removed} unfinished files (.part) of killed runs")
+            if young:
+                writer = "another run is writing, or was killed a moment ago"
+                to_stderr(f"note: {self.out.parent}: {young} unfinished files (.part) stay, which {writer}")
         if self.resume and not reason:
             done = record.kept(outputs, {n: [*sources(n), *self.files()] for n in whole}, self.steady)
             reason = "they are older than their files or options, or they are cut short"
@@ -179,9 +190,15 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         """Renders frames in order; while one is rendered, the next is read and the previous one is written.
 
         The record is written before the first frame, but after it is rendered: an error in it leaves no file. Before
-        each later frame it is read: the run ends if another one has begun to write other frames of these names.
+        each later frame it is read: the run ends if another one has begun to write other frames of these names. A
+        frame that another run wrote in the meantime is named at the end.
         """
-        count = len(files)
+        count, written = len(files), dict[Path, tuple[int, int]]()
+
+        def write_and_note(write: Callable[[], None], out: Path) -> None:
+            write()
+            written[out] = _version(out)
+
         with (
             progress_bar(f"rendering {self.out.name}", count if count > 1 else None) as update,
             ThreadPoolExecutor(2) as pool,
@@ -198,6 +215,22 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
                     writing.result()
                     if record is not None:
                         record.write(is_first=k == 0)
-                    writing = pool.submit(write)  # Ctrl-C does not stop this thread
+                    writing = pool.submit(write_and_note, write, out)  # Ctrl-C does not stop this thread
             finally:  # a rendered frame is written even if the next one fails
                 writing.result()
+        if record is not None:
+            record.write(is_first=False)
+        foreign = [out for out, version in written.items() if _version(out) != version]
+        if foreign:
+            names = f"{len(foreign)} of {count} frames, {foreign[0].name} first,"
+            remedy = "end the other run, and render these frames again"
+            raise ValueError(f"{self.out}: another run replaced {names} while this one went on; {remedy}")
+
+
+def _version(path: Path) -> tuple[int, int]:
+    """Numbers that change when a file is written again; zeros if it is missing."""
+    try:
+        status = path.stat()
+    except OSError:
+        return 0, 0
+    return status.st_ino, status.st_mtime_ns

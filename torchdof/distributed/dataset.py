@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from .. import extras
 from ..io.atomic import write_text
 from ..io.paths import IMAGE_SUFFIXES, MAP_SUFFIXES
 from ..validation import whole
@@ -88,7 +89,7 @@ def make_dataset(
     try:
         import ray.data
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("data sets need Ray; install it with: pip install 'torchdof[ray]'") from error
+        raise extras.missing("a data set", "ray") or error from error
     whole("workers", workers, 1, 100_000)
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)

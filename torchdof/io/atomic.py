@@ -1,16 +1,21 @@
 """Writes a file whole or not at all: under a temporary name in the same folder, renamed when it is complete.
 
-The temporary file is removed on any error, including Ctrl-C, SIGTERM and SIGHUP. Only SIGKILL leaves it behind.
+The temporary file is removed on any error, including Ctrl-C, SIGTERM and SIGHUP. Only SIGKILL leaves it behind;
+:func:`remove_unfinished` removes such files later.
 """
 
 import contextlib
 import os
+import re
 import signal
 import sys
 import threading
+import time
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
+
+_ABANDONED_S = 60.0  # seconds without a change after which no process writes a temporary file any more
 
 
 @contextlib.contextmanager
@@ -30,6 +35,22 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
             os.replace(temporary, target)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+def remove_unfinished(folder: str | os.PathLike[str]) -> tuple[int, int]:
+    """Removes the temporary files of killed processes from a folder.
+
+    Returns:
+        The number of removed files, and of those that changed in the last minute and may still be written.
+    """
+    parts = [path for path in Path(folder).glob(".*.part*") if re.fullmatch(r"\.[0-9a-f]{32}\.part.*", path.name)]
+    removed = 0
+    for path in parts:
+        with contextlib.suppress(OSError):  # finished or removed by another process
+            if time.time() - path.stat().st_mtime > _ABANDONED_S:
+                path.unlink()
+                removed += 1
+    return removed, sum(path.exists() for path in parts)
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:

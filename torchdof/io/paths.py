@@ -89,9 +89,12 @@ def _existing_file(path: str | os.PathLike[str], suffixes: tuple[str, ...], what
 
         raise ValueError(f"expected the path of {what}, got {show(path)}")
     path = Path(path)
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: is a folder; name a file in it, or a sequence as {path.name}/frame.####.exr")
     if path.suffix.lower() not in suffixes:
-        kind = path.suffix or "no suffix"
-        raise ValueError(f"{path}: {kind} is not {what} that can be read; use {' '.join(suffixes)}")
+        kind = f"a file of type {path.suffix}" if path.suffix else "a file without a suffix"
+        known = " ".join(suffix for suffix in suffixes if refusal(f"a{suffix}") is None)
+        raise ValueError(f"{path}: {kind} is not {what} that can be read; use {known}")
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
     if not path.is_file():

@@ -42,6 +42,16 @@ class FramePattern:
         numbers = {int(match[1]) for path in self.path.parent.iterdir() if (match := pattern.fullmatch(path.name))}
         return sorted(n for n in numbers if self.name(n).is_file())
 
+    def refuse_missing(self, numbers: range) -> None:
+        """Refuse a part of the sequence with frames that do not exist; the message counts them."""
+        existing = self.frames()
+        missing = len(numbers) - sum(n in numbers for n in existing)
+        if missing:
+            have = f"there are {existing[0]} to {existing[-1]}" if existing else "there are no such files"
+            first = self.name(next(n for n in numbers if n not in existing)).name
+            count = f"{missing} of {len(numbers)} frames are missing"
+            raise FileNotFoundError(f"{self.path}: {count}, {first} first; {have}")
+
 
 def parse_frames(text: str) -> tuple[int, int]:
     """Reads ``first-last`` or a single number; ``ValueError`` if it is neither."""

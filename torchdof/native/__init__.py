@@ -10,6 +10,7 @@ and raises ``MemoryError`` if there is not enough memory.
 """
 
 import concurrent.futures
+import contextlib
 import ctypes
 import functools
 import importlib.resources
@@ -18,7 +19,7 @@ import os
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
@@ -38,6 +39,7 @@ _instructions = "avx2" if torch.backends.cpu.get_cpu_capability().startswith("AV
 
 _SMALL_FRAME = 2**16  # pixels; up to this size the main thread renders itself, which saves 0.1 ms
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
+_of_thread = threading.local()  # its count, if set, is the number of threads for calls of this thread
 _REVISION = 14  # of ``src/api.h``
 
 Rules = Sequence[tuple[int, float, float, float]]
@@ -142,6 +144,21 @@ def chosen() -> bool:
     return library is not None
 
 
+@contextlib.contextmanager
+def threads_are(count: int) -> Iterator[None]:
+    """In this block the engine uses ``count`` threads for calls of this thread, whatever PyTorch uses."""
+    before = getattr(_of_thread, "count", None)
+    _of_thread.count = count
+    try:
+        yield
+    finally:
+        _of_thread.count = before
+
+
+def _threads() -> int:
+    return getattr(_of_thread, "count", None) or torch.get_num_threads()
+
+
 def describe() -> str:
     """Name of the engine in use, and the reason if it is not the compiled one.
 
@@ -192,7 +209,7 @@ def render(
         *(height, width, channels, get_args(Kind).index(kind), len(surfaces), *_maps(surfaces), moved),
         *(occlusion, normalize, masked, highlights, crisp_px, reach, *_of_layers(nodes, layers)),
         *(_field_masks(field_masks), field_masks[0][0].shape[1] if field_masks else 0, squeeze),
-        *(torch.get_num_threads(), ctypes.pointer(cancelled)),
+        *(_threads(), ctypes.pointer(cancelled)),
     )
     out = _empty(channels, height, width)
 
@@ -246,7 +263,7 @@ def _layers_of(
     """``torchdof_layers`` for :func:`blend`; ``area`` is the picture's height and width."""
     channels, rows, columns = surfaces[0][0].shape
     size = (rows, columns, margin, *area, channels, len(surfaces))
-    how = (occlusion, backed, *_of_layers(nodes, layers), torch.get_num_threads(), ctypes.pointer(ctypes.c_int32(0)))
+    how = (occlusion, backed, *_of_layers(nodes, layers), _threads(), ctypes.pointer(ctypes.c_int32(0)))
     return _TYPES["layers"](*size, *_maps(surfaces), *how)
 
 
@@ -276,7 +293,7 @@ def matte(light: Tensor, coc: Tensor, valid: Tensor | None = None, moved_px: Ten
     """
     channels, *size = light.shape
     out = _empty(2 * channels + 2, *size)
-    _run("matte", [light, coc, valid, moved_px], channels, *size, torch.get_num_threads(), out, None, None)
+    _run("matte", [light, coc, valid, moved_px], channels, *size, _threads(), out, None, None)
     return out
 
 
@@ -285,7 +302,7 @@ def matte_gradient(
 ) -> list[Tensor]:
     """The gradients of :func:`matte` by light and coc."""
     sums = [_empty(*values.shape).zero_() for values in (light, coc)]
-    _run("matte", [light, coc, valid, moved_px], *light.shape, torch.get_num_threads(), None, gradient, sums)
+    _run("matte", [light, coc, valid, moved_px], *light.shape, _threads(), None, gradient, sums)
     return sums
 
 
@@ -296,13 +313,13 @@ def farthest(maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
     ``size`` is the level's height and width. The result is light, coc and weight, ``[C + 2, h, w]``.
     """
     out = _empty(maps[0].shape[0] + 2, *size)
-    _run("farthest", _of_surfaces(maps), *maps[0].shape, *size, torch.get_num_threads(), out, None, None)
+    _run("farthest", _of_surfaces(maps), *maps[0].shape, *size, _threads(), out, None, None)
     return out
 
 
 def farthest_gradient(maps: Sequence[Tensor], size: tuple[int, int], gradient: Tensor) -> list[Tensor]:
     """The gradients of :func:`farthest` by its first five maps, or by all three."""
-    sums, threads = [_empty(*values.shape).zero_() for values in maps[:5]], torch.get_num_threads()
+    sums, threads = [_empty(*values.shape).zero_() for values in maps[:5]], _threads()
     _run("farthest", _of_surfaces(maps), *maps[0].shape, *size, threads, None, gradient, _of_surfaces(sums))
     return sums
 
@@ -337,7 +354,7 @@ def look_behind_gradient(
 
 def _level_arguments(levels: Sequence[Tensor], rules: Rules, coc: Tensor, wanted: Tensor | None) -> tuple[Any, ...]:
     each = [_TYPES["level"](values, *values.shape[1:], *rule) for values, rule in zip(levels, rules, strict=True)]
-    return each, len(each), levels[0].shape[0] - 2, coc, wanted, *coc.shape[1:], torch.get_num_threads()
+    return each, len(each), levels[0].shape[0] - 2, coc, wanted, *coc.shape[1:], _threads()
 
 
 def continued(maps: Sequence[Tensor], ends: Sequence[int], *axis: Any) -> Tensor:
@@ -349,14 +366,14 @@ def continued(maps: Sequence[Tensor], ends: Sequence[int], *axis: Any) -> Tensor
     """
     (channels, height, width), (left, right, top, bottom), count = maps[0].shape, ends, len(maps) // 3
     out = _empty(count * (channels + 2), top + height + bottom, left + width + right)
-    _run("continued", maps, count, channels, height, width, ends, *axis, torch.get_num_threads(), out, None, None)
+    _run("continued", maps, count, channels, height, width, ends, *axis, _threads(), out, None, None)
     return out
 
 
 def continued_gradient(gradient: Tensor, maps: Sequence[Tensor], ends: Sequence[int], *axis: Any) -> list[Tensor]:
     """The gradients of :func:`continued` by all maps but the last."""
     sums = [_empty(*values.shape).zero_() for values in maps[:-1]]
-    _run("continued", maps, len(maps) // 3, *maps[0].shape, ends, *axis, torch.get_num_threads(), None, gradient, sums)
+    _run("continued", maps, len(maps) // 3, *maps[0].shape, ends, *axis, _threads(), None, gradient, sums)
     return sums
 
 
@@ -369,7 +386,7 @@ def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_c
     out, cancelled, changed = _empty(*nearness.shape), ctypes.c_int32(0), ctypes.c_int32(0)
     steps = (None, float(step)) if step.ndim == 0 else (step, 0.0)
     maps = (*nearness.shape, light.shape[0], light, nearness, of_coc, *steps)
-    scene = _TYPES["map"](*maps, auto, torch.get_num_threads(), ctypes.pointer(cancelled), out)
+    scene = _TYPES["map"](*maps, auto, _threads(), ctypes.pointer(cancelled), out)
     _interruptible(lambda: _run("repair_edges", scene, changed), cancelled, nearness.numel())
     return out if changed.value else nearness
 
@@ -381,7 +398,7 @@ def coc_px(depth: Tensor, scale: float, nearest_m: float, farthest_m: float) -> 
     and depths from ``nearest_m`` to ``farthest_m`` are in focus. NaN where depth is not > 0.
     """
     out = _empty(*depth.shape)
-    _run("coc", depth, depth.numel(), scale, nearest_m, farthest_m, torch.get_num_threads(), out)
+    _run("coc", depth, depth.numel(), scale, nearest_m, farthest_m, _threads(), out)
     return out
 
 
@@ -391,7 +408,7 @@ def plan(coc_px: Tensor, tolerance: float) -> tuple[tuple[float, ...], float]:
     while True:
         nodes, kept = _array(ctypes.c_double, capacity)(), ctypes.c_double(tolerance)
         size = (coc_px.shape[0], *coc_px.shape[-2:])
-        _run("plan", coc_px, *size, kept, torch.get_num_threads(), nodes, capacity, count)
+        _run("plan", coc_px, *size, kept, _threads(), nodes, capacity, count)
         if count.value <= capacity:
             return tuple(nodes[: count.value]), kept.value
         capacity = count.value
@@ -409,7 +426,7 @@ def kernels(spots: Spots, *, squeeze: float, is_round: bool, is_even: bool) -> l
     index, reach, fade = ([*itertools.chain(*each)] for each in (spots.which, spots.reach, spots.fade))
     numbers = (spots.part, spots.finer, reach, fade, spots.flipped, spots.half)
     scene = _TYPES["spots"](len(made), colours, spots.templates, cells, index, *numbers, squeeze, is_round, is_even)
-    _run("kernels", scene, torch.get_num_threads(), made)
+    _run("kernels", scene, _threads(), made)
     return made
 
 
@@ -419,7 +436,7 @@ def ends(values: Tensor) -> tuple[float, float]:
     PyTorch's own reduction would leave its threads spinning, which slows down the engine's threads.
     """
     low, high = ctypes.c_float(), ctypes.c_float()
-    _run("ends", values, values.numel(), torch.get_num_threads(), low, high)
+    _run("ends", values, values.numel(), _threads(), low, high)
     return low.value, high.value
 
 

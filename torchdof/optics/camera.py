@@ -44,6 +44,9 @@ Number = float | Tensor
 class Camera:
     """A thin lens in front of a sensor. Every number may be a float or a tensor ``[B]``, one value a batch item.
 
+    A tensor may be an ``nn.Parameter`` and then gets gradients. But a camera is not a module, so ``parameters()`` of a
+    :class:`torchdof.DepthOfField` does not list it: register it in your own module.
+
     Args:
         focal_length_mm: Focal length in millimetres, > 0.
         f_number: Focal length over aperture diameter, > 0.
@@ -180,6 +183,16 @@ class Camera:
             stated = ", ".join(f"{name} {_show(getattr(self, name))}" for name in _NUMBERS)
             checked = f"this lens ({stated}) and the depth, which starts at {float(depth.detach().min()):.3g} m"
             raise ValueError(f"depth and lens must give a finite blur radius, got an infinite one: check {checked}")
+
+    def refuse_other_batch(self, count: int) -> None:
+        """Refuse numbers ``[B]`` for another number of images than ``count``; the message names them."""
+        for name, value in vars(self).items():
+            if name == "focus_m" and self.focus_range_m is not None:
+                continue  # is computed from the range
+            for given in value if isinstance(value, tuple) else (value,):
+                if isinstance(given, Tensor) and given.numel() not in (1, count):
+                    images = f"[{count}], for {count} images" if count > 1 else "[1], for one image"
+                    raise ValueError(f"{name} must be a number or {images}, got {list(given.shape)}")
 
     def _compiled_coc_px(self, depth: Tensor, width: int) -> Tensor | None:
         """:meth:`coc_px` by the compiled engine; None if it does not support the call (traced, batched, tilted)."""
@@ -334,6 +347,7 @@ def _as_map(value: Number, like: Tensor) -> Tensor:
     if value.ndim == 0 or value.numel() == 1:
         return value.reshape(())
     if like.ndim != 4 or (like.shape[0] != value.shape[0] and like.shape[0] != 1):
-        expected = f"[{value.shape[0]}, 1, H, W] (or [1, 1, H, W]) for a camera whose numbers are [{value.shape[0]}]"
-        raise ValueError(f"depth must be {expected}, got {list(like.shape)}")
+        images = f"one for each of the {like.shape[0]} maps" if like.ndim == 4 else "and depth [B, 1, H, W]"
+        got = f"{value.shape[0]} numbers and depth {list(like.shape)}"
+        raise ValueError(f"a number of the camera must be a float or a tensor [B], {images} of depth, got {got}")
     return value.reshape(-1, 1, 1, 1)
