@@ -200,8 +200,10 @@ def test_the_first_part_with_colour_is_read_and_depth_of_the_same_size(tmp_path:
     assert picture.sample == "half"
     assert picture.depth is not None and torch.equal(picture.depth[0, 0], torch.from_numpy(depth[1][..., 0]))
     assert torch.equal(read_image(tmp_path / "x.exr", layer="beauty").pixels, picture.pixels)
-    store_parts(tmp_path / "y.exr", [colour, small])
-    assert read_image(tmp_path / "y.exr").depth is None
+    store_parts(tmp_path / "y.exr", [colour, small])  # depth of a quarter of the frame
+    depth_m = read_image(tmp_path / "y.exr").depth
+    assert depth_m is not None and depth_m.isfinite().sum() == 16 * 16
+    assert torch.equal(depth_m[0, 0, :16, :16], torch.from_numpy(small[1][..., 0]))
     assert read_values(tmp_path / "y.exr").shape == (1, 1, 16, 16)
     store_parts(tmp_path / "many.exr", [part(RGB, f"part {i}", 16) for i in range(200)])
     assert read_image(tmp_path / "many.exr", layer="part 199").pixels.shape == (1, 3, 16, 16)
@@ -231,6 +233,118 @@ def test_tiled_mipmapped_and_windowed_exr_files_survive_read_and_write(tmp_path:
     write_image(tmp_path / "copy.exr", picture, sample="float")
     copy = read_image(tmp_path / "copy.exr")
     assert torch.equal(copy.pixels, picture.pixels) and copy.window == picture.window
+
+
+# Depth of a layer, view or part
+
+
+def of_values(**channels: float) -> Any:
+    """One part whose channels are constant; `__` in a name stands for a dot."""
+    values = np.ones((4, 6, len(channels)), np.float32) * np.array([*channels.values()], np.float32)
+    return spec_with(values, "float", tuple(name.replace("__", ".") for name in channels)), values
+
+
+def named(name: str, part: Any) -> Any:
+    part[0].attribute("oiio:subimagename", name)
+    return part
+
+
+COLOUR = dict.fromkeys("RGB", 0.5)
+
+
+@pytest.mark.parametrize(
+    ("parts", "layer", "expected"),  # the depth of the layer, or a part of the refusal
+    [
+        ([of_values(**COLOUR, Z=2, left__R=1, left__G=1, left__B=1, left__Z=8)], None, 2.0),
+        ([of_values(**COLOUR, Z=2, left__R=1, left__G=1, left__B=1, left__Z=8)], "left", 8.0),
+        ([of_values(A__C__R=1, A__C__G=1, A__C__B=1, A__Depth__Z=2, B__Depth__Z=8)], "A.C", 2.0),
+        ([of_values(b__Combined__R=1, b__Combined__G=1, b__Combined__B=1, a__Depth__Z=2, b__Depth__Z=8)], None, 8.0),
+        ([of_values(**COLOUR, a__Depth__Z=2, b__Depth__Z=8)], None, "belongs to the image: a.Depth.Z, b.Depth.Z"),
+        ([of_values(**COLOUR, a__Depth__Z=2, b__Depth__Z=2)], None, 2.0),  # the same numbers
+        ([of_values(**COLOUR, Z=2, fog__Z=8)], None, 2.0),
+        ([of_values(**COLOUR, N__X=1, N__Y=1, N__Z=8, P__Z=2)], None, 2.0),
+        ([named("l", of_values(Z=2)), named("rgba_right", of_values(**COLOUR)), named("depth_right", of_values(Z=8))],
+         "rgba_right", 8.0),
+        ([named("rgba.left", of_values(**COLOUR)), named("z.right", of_values(Z=2)), named("z.left", of_values(Z=8))],
+         None, 8.0),
+        ([named("image left", of_values(**COLOUR)), named("depth right", of_values(Z=2))], None, "of the other eye"),
+        ([named("rgb", of_values(**COLOUR)), named("one", of_values(Z=2)), named("two", of_values(Z=8))], None,
+         "belongs to the image: one.Z, two.Z"),
+    ],
+)  # fmt: skip
+def test_depth_is_that_of_the_layer_view_or_part_of_the_image(
+    tmp_path: Path, parts: Any, layer: str | None, expected: Any
+) -> None:
+    picture = read_image(store_parts(tmp_path / "x.exr", parts), layer=layer)
+    if isinstance(expected, float):
+        assert picture.depth is not None and picture.depth.unique().tolist() == [expected]
+        assert read_values(tmp_path / "x.exr", image=picture).unique().tolist() == [expected]
+        return
+    assert picture.depth is None and expected in picture.depth_problem
+    with pytest.raises(ValueError, match=expected):
+        read_values(tmp_path / "x.exr", image=picture)
+
+
+@pytest.mark.parametrize("channel", ["depth_right", "depth_right.Z"])
+def test_a_depth_channel_is_chosen_by_the_name_of_its_part(tmp_path: Path, channel: str) -> None:
+    parts = [named(name, of_values(Z=z)) for name, z in (("depth_left", 2.0), ("depth_right", 8.0))]
+    assert read_values(store_parts(tmp_path / "x.exr", parts), channel).unique().tolist() == [8.0]
+    with pytest.raises(ValueError, match="which of its depth channels .*: depth_left.Z, depth_right.Z"):
+        read_values(tmp_path / "x.exr", "Z")
+    with pytest.raises(ValueError, match="no channel 'depth'; it has Z, Z in the parts depth_left, depth_right"):
+        read_values(tmp_path / "x.exr", "depth")
+
+
+# Data windows
+
+
+def with_window(values: np.ndarray, box: tuple[int, int, int, int], frame: tuple[int, int] = (0, 0)) -> Any:
+    """A part with the values in a box (x, y, end x, end y) of a frame that starts at another place."""
+    x, y, end_x, end_y = box
+    cut = np.atleast_3d(values[y:end_y, x:end_x])
+    spec = spec_with(cut, "float", ("Z",) if cut.shape[2] == 1 else RGB)
+    spec.x, spec.y, spec.full_x, spec.full_y = x + frame[0], y + frame[1], *frame
+    spec.full_height, spec.full_width = values.shape[:2]
+    return spec, cut
+
+
+FRAME = np.arange(1.0, 24 * 32 + 1, dtype=np.float32).reshape(24, 32)
+
+
+@pytest.mark.parametrize("of_image", [(0, 0, 32, 24), (8, 6, 28, 20)])
+@pytest.mark.parametrize("of_depth", [(0, 0, 32, 24), (8, 6, 32, 24), (2, 0, 32, 24), (0, 4, 10, 8), (28, 20, 32, 24)])
+@pytest.mark.parametrize("start", [(0, 0), (-5, 7)])
+def test_depth_of_another_data_window_lies_where_its_window_states(
+    tmp_path: Path, of_image: Any, of_depth: Any, start: Any
+) -> None:
+    colours = np.repeat(FRAME[..., None], 3, 2)
+    image = with_window(colours, of_image)
+    expected = np.full_like(FRAME, np.nan)
+    x, y, end_x, end_y = of_depth
+    expected[y:end_y, x:end_x] = FRAME[y:end_y, x:end_x]
+    x, y, end_x, end_y = of_image
+    picture = read_image(store_parts(tmp_path / "image.exr", [image]))
+    depth = read_values(store_parts(tmp_path / "depth.exr", [with_window(FRAME, of_depth, start)]), image=picture)
+    np.testing.assert_array_equal(depth[0, 0].numpy(), expected[y:end_y, x:end_x])
+    both = read_image(store_parts(tmp_path / "both.exr", [image, named("z", with_window(FRAME, of_depth))]))
+    assert both.depth is not None
+    np.testing.assert_array_equal(both.depth[0, 0].numpy(), expected[y:end_y, x:end_x])
+
+
+def test_depth_of_half_the_size_or_without_a_window_is_placed_too(tmp_path: Path) -> None:
+    part = store_parts(tmp_path / "part.exr", [with_window(np.repeat(FRAME[..., None], 3, 2), (8, 6, 28, 20))])
+    picture, cut = read_image(part), FRAME[6:20, 8:28]
+    for name, values in (("frame.npy", FRAME), ("part.npy", cut)):  # of the frame, and of the pixels
+        np.save(tmp_path / name, values)
+        np.testing.assert_array_equal(read_values(tmp_path / name, image=picture)[0, 0].numpy(), cut)
+    half = store_parts(tmp_path / "half.exr", [with_window(FRAME[::2, ::2], (2, 0, 16, 12))])
+    np.testing.assert_array_equal(read_values(half, image=picture)[0, 0].numpy(), FRAME[6:20:2, 8:28:2])
+    odd = store_parts(tmp_path / "odd.exr", [with_window(np.repeat(FRAME[..., None], 3, 2), (7, 6, 28, 20))])
+    with pytest.raises(ValueError, match="half.exr: its frame has 16 x 12 pixels, the image's 32 x 24, so that"):
+        read_values(half, image=read_image(odd))
+    store(tmp_path / "x.png", np.zeros((24, 32, 3), np.uint8), "uint8")
+    shifted = store_parts(tmp_path / "z.exr", [with_window(FRAME, (4, 0, 32, 24))])
+    assert read_values(shifted, image=read_image(tmp_path / "x.png"))[0, 0, 5, 4] == FRAME[5, 4]
 
 
 # Metadata

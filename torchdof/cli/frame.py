@@ -68,9 +68,11 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
     x, y, full_x, full_y, *size = (picture.window if is_exr else None) or (0, 0, 0, 0, width, height)
     area = Area(x - full_x, y - full_y, *size)
     if depth is not None or scene.depth_channel is not None:
-        values = read_values(source, scene.depth_channel)
+        values = read_values(source, scene.depth_channel, picture)
     elif picture.depth is not None:
         values = picture.depth
+    elif picture.depth_problem:
+        raise ValueError(f"{image}: {picture.depth_problem}")
     else:
         hint = "" if is_exr else ", which a network such as Depth Anything makes of it"
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH{hint}")

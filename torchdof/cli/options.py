@@ -46,7 +46,7 @@ class DepthMap(Group):
         "Fill pixels without depth from the nearest one, from the farthest around, or with a distance (inf for a sky).",
         type=Parsed("nearest|far|METRES", number_or("nearest", "far")),
     )
-    depth_channel: str | None = option("Channel (or array of an .npz) that is depth.")
+    depth_channel: str | None = option("Channel, layer or part (or array of an .npz) that is depth.")
     strict: bool = option("Refuse what looks like a wrong unit or scale, instead of warning.", False)
 
     def __post_init__(self) -> None:

@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from ..io.images import read_values
+from ..io.images import Picture, read_values
 from ..validation import choice, number, one_channel
 from .holes import Fill, resolve_holes
 
@@ -101,8 +101,11 @@ def read_depth(
     fov_x_deg: float | None = None,
     fill: Fill | None = None,
     channel: str | None = None,
+    image: Picture | None = None,
 ) -> Tensor:
     """Reads a depth map: :func:`torchdof.io.images.read_values`, :func:`depth_from_values`, :func:`fill_holes`.
+
+    ``image``, if given, is the picture that the map belongs to, in whose frame an EXR's data window is placed.
 
     Returns:
         ``[1, 1, H, W]`` float32 in metres (signed pixels for coc), without holes.
@@ -112,6 +115,6 @@ def read_depth(
         ValueError: If the map has holes and ``fill`` is None, or an argument is missing or wrong.
     """
     depth = depth_from_values(
-        read_values(path, channel), kind, scale=scale, offset=offset, unknown=unknown, fov_x_deg=fov_x_deg
+        read_values(path, channel, image), kind, scale=scale, offset=offset, unknown=unknown, fov_x_deg=fov_x_deg
     )
     return resolve_holes(depth, str(path), fill)[0]

@@ -227,7 +227,7 @@ class RenderShards:
     ) -> dict[str, Any]:
         """One sample as WebDataset takes it: its key, the contents of its files by name, its parameters as ``json``."""
         source = read_image(image, self.transfer)
-        metres = at_size_of(source.pixels, self._read_depth(depth or image, **self.depth))
+        metres = at_size_of(source.pixels, self._read_depth(depth or image, image=source, **self.depth))
         digest = hashlib.sha256(f"{self.seed} {key}".encode()).digest()
         drawn = self.blur.draw(torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1))
         camera = self.blur.camera.replace(
@@ -263,9 +263,10 @@ class RenderShards:
 def _read_relative(
     path: str, kind: str, near_m: float, far_m: float, relative_kind: Any = "disparity", *,
     fill: Any = None, channel: str | None = None, value_range: Any = None, unknown: float | None = None,
+    image: Picture | None = None,
 ) -> Tensor:  # fmt: skip
     """Reads depth without a scale and converts it to metres, ``[1, 1, H, W]``, without holes."""
-    values = read_values(path, channel)
+    values = read_values(path, channel, image)
     metres = from_relative(values, near_m, far_m, relative_kind, value_range=value_range, unknown=unknown)
     return resolve_holes(metres, path, fill)[0]
 

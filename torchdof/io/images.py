@@ -6,7 +6,7 @@ of floats (EXR, HDR, PFM, TIFF of floats) linear light, unless the argument ``tr
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,12 @@ from torch import Tensor
 
 from ..validation import choice, real_tensor, show
 from .atomic import atomic_file
-from .channels import colour_channels, depth_channel
+from .channels import colour_channels, depth_channels, named_channels, nearest_channel
 from .decode import Part, errors_named, first_line, is_complete, read_array, read_parts, utf8_name
 from .paths import PixelType, existing_image, existing_map, samples_of
 from .transfer import Transfer, decode, default_transfer, encode, encode_8_bits
 from .webp import add_exif
+from .windows import Window, placed
 
 __all__ = ["Picture", "read_image", "read_values", "write_image"]
 
@@ -44,13 +45,16 @@ class Picture:
     Args:
         pixels: ``[1, C, H, W]`` float32 in linear light. Colour is premultiplied by alpha, if there is alpha.
         channels: Names of the channels: ``("R", "G", "B")`` or grey ``("Y",)``, either with ``"A"`` at the end.
-        depth: ``[1, 1, H, W]``, the numbers of the file's own depth channel, or None.
+        depth: ``[1, 1, H, W]``, the numbers of the file's own depth channel, or None. Where another data window leaves
+            pixels without depth, it is NaN.
         metadata: Name -> (OpenImageIO type, value).
         sample: Stored type of a sample: "8", "16", "half" or "float".
         transfer: Encoding of the file, "linear" or "srgb".
         window: Place of the pixels in the full frame (EXR data window): x, y, full x, full y, full width, full height.
         orientation: EXIF orientation of the file; the pixels are upright already.
         other_layers: Names of the layers of the file that are neither the pixels nor the depth.
+        layer: Names of the part and layer of the pixels, joined by a dot.
+        depth_problem: The reason why none of several depth channels was taken, or empty.
     """
 
     pixels: Tensor
@@ -59,9 +63,11 @@ class Picture:
     metadata: Mapping[str, tuple[Any, Any]] = dataclasses.field(default_factory=dict)
     sample: PixelType = "float"
     transfer: Transfer = "linear"
-    window: tuple[int, int, int, int, int, int] | None = None
+    window: Window | None = None
     orientation: int = 1
     other_layers: tuple[str, ...] = ()
+    layer: str = ""
+    depth_problem: str = ""
 
     @property
     def has_alpha(self) -> bool:
@@ -105,15 +111,20 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
         part, indices, names = colour_channels(parts, layer)
         source = parts[part]
         pixels, sample, transfer = _light(source, indices, transfer, has_alpha=names[-1] == "A")
-        depth, places = None, {(part, k) for k in indices}
-        same_size = [n for n, p in enumerate(parts) if p.values.shape[:2] == source.values.shape[:2]]
-        depth_place = depth_channel([parts[n] for n in same_size])
-        if depth_place is not None:
-            places.add((same_size[depth_place[0]], depth_place[1]))
-            depth = _map(parts[same_size[depth_place[0]]].values[..., depth_place[1]])
+        depth, problem, places = None, "", {(part, k) for k in indices}
+        in_layer = source.names[indices[0]].rpartition(".")[0]
+        label = f"{source.label}.{in_layer}".strip(".")
+        if found := depth_channels(parts):
+            try:
+                n, k = nearest_channel(parts, found, label)
+                depth = _placed(parts[n], k, pixels.shape[-2:], source.window)
+                places.add((n, k))
+            except ValueError as error:
+                problem = str(error)
     left = [(p.label, name) for n, p in enumerate(parts) for k, name in enumerate(p.names) if (n, k) not in places]
     layers = tuple(dict.fromkeys(name.rpartition(".")[0] or label or name for label, name in left))
-    return Picture(pixels, names, depth, source.metadata, sample, transfer, source.window, source.orientation, layers)
+    window, orientation = source.window, source.orientation
+    return Picture(pixels, names, depth, source.metadata, sample, transfer, window, orientation, layers, label, problem)
 
 
 def _light(
@@ -244,13 +255,15 @@ def write_image(
                 add_exif(temporary, spec)
 
 
-def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Tensor:
+def read_values(path: str | os.PathLike[str], channel: str | None = None, image: Picture | None = None) -> Tensor:
     """Reads the numbers of a one-channel map, such as a depth map, without transfer curve or scaling of integers.
 
     Args:
         path: An image of one channel (or of equal ones), an EXR file with a depth channel, or ``.npy`` / ``.npz``.
-        channel: Name of a channel of an image, or of an array in an ``.npz`` file; None takes the only one, or the
-            depth channel.
+        channel: Name of a channel, layer or part of an image, or of an array in an ``.npz`` file; None takes the only
+            one, or the depth channel.
+        image: The image that the map belongs to. Of several depth channels, that of its layer is taken; the map is
+            placed by the data windows of both, NaN where the map has no numbers. None takes the map as it is stored.
 
     Returns:
         ``[1, 1, H, W]`` float32; a 16-bit file gives 0 to 65535, an 8-bit file 0 to 255. The scale in the header of
@@ -263,21 +276,38 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
     path = existing_map(path)
     with errors_named(path):
         if path.suffix.lower() in (".npy", ".npz"):
-            return _map(read_array(path, channel))
-        parts = read_parts(path)
-        planes = [(p.label, name, p.values[..., k]) for p in parts for k, name in enumerate(p.names)]
-        channel_names = ", ".join(name for _, name, _ in planes)
-        if channel is not None:
-            for label, name, values in planes:
-                if channel in (name, f"{label}.{name}"):
-                    return _map(values)
-            raise ValueError(f"no channel {channel!r}; it has {channel_names}")
-        if (depth_place := depth_channel(parts)) is not None:
-            return _map(parts[depth_place[0]].values[..., depth_place[1]])
-        if all(np.array_equal(values, planes[0][2]) for _, name, values in planes if name != "A"):
-            return _map(planes[0][2])
-        advice = "name it (--depth-channel); the colours of a heat map are no depth: save the map in grey, or as .npy"
-        raise ValueError(f"which of the channels {channel_names} is depth? {advice}")
+            part, k = Part("", ("Y",), read_array(path, channel)[..., None], ("float",)), 0
+        else:
+            parts = read_parts(path)
+            n, k = _map_channel(parts, channel, "" if image is None else image.layer)
+            part = parts[n]
+        if image is None:
+            return _map(part.values[..., k])
+        return _placed(part, k, image.pixels.shape[-2:], image.window)
+
+
+def _map_channel(parts: list[Part], channel: str | None, layer: str) -> tuple[int, int]:
+    """Index of the part and of the channel in it that is the map of an image of a layer."""
+    every = [(n, k) for n, part in enumerate(parts) for k in range(len(part.names))]
+    names = ", ".join(parts[n].names[k] for n, k in every)
+    if channel is not None:
+        if found := named_channels(parts, channel):
+            return found[0] if len(found) == 1 else nearest_channel(parts, found, layer)
+        labels = ", ".join(filter(None, (part.label for part in parts)))
+        raise ValueError(f"no channel {channel!r}; it has {names}" + (f" in the parts {labels}" if labels else ""))
+    if found := depth_channels(parts):
+        return nearest_channel(parts, found, layer)
+    first = parts[0].values[..., 0]
+    if all(np.array_equal(parts[n].values[..., k], first) for n, k in every if parts[n].names[k] != "A"):
+        return every[0]
+    advice = "name it (--depth-channel); the colours of a heat map are no depth: save the map in grey, or as .npy"
+    raise ValueError(f"which of the channels {names} is depth? {advice}")
+
+
+def _placed(part: Part, channel: int, size: Sequence[int], target: Window | None) -> Tensor:
+    """A channel as ``[1, 1, h, w]`` with the area of an image of a size and window; see :func:`placed`."""
+    window = part.window if part.is_exr else None
+    return _map(placed(part.values[..., channel], window, (size[0], size[1]), target))
 
 
 def _map(values: np.ndarray) -> Tensor:
