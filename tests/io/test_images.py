@@ -1,6 +1,8 @@
 """Reading and writing images of every format: values, channels, parts and tags."""
 
 import dataclasses
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ import pytest
 import torch
 
 from tests.files import spec_with, store, store_parts
+from torchdof.io.colour import stated_transfer
 from torchdof.io.images import Picture, read_image, read_values, write_image
 
 GREY = 0.21404114  # linear light of an sRGB value of 0.5
@@ -105,6 +108,119 @@ def test_integers_are_srgb_and_floats_linear_by_default(tmp_path: Path, suffix: 
         assert read_image(path, transfer=transfer).pixels.mean().item() == pytest.approx(  # type: ignore[arg-type]
             expected, abs=5e-3
         )
+
+
+def profile(curve: bytes) -> bytes:
+    """The parts of an ICC profile that are read: its table of tags, and the red curve."""
+    tags = (1).to_bytes(4, "big") + b"rTRC" + (144).to_bytes(4, "big") + len(curve).to_bytes(4, "big")
+    return bytes(128) + tags + curve
+
+
+def png(path: Path, value: int, *chunks: tuple[bytes, bytes]) -> Path:
+    """A PNG of 16 bits with one value, and some chunks."""
+
+    def block(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    rows = zlib.compress(b"".join(b"\0" + np.full((6, 3), value, ">u2").tobytes() for _ in range(4)))
+    header = (b"IHDR", struct.pack(">IIBBBBB", 6, 4, 16, 2, 0, 0, 0))
+    content = [block(*each) for each in (header, *chunks, (b"IDAT", rows), (b"IEND", b""))]
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(content))
+    return path
+
+
+def chunks_of(path: Path) -> dict[bytes, bytes]:
+    content, start, found = path.read_bytes(), 8, {}
+    while start < len(content):
+        length = int.from_bytes(content[start : start + 4], "big")
+        found[content[start + 4 : start + 8]] = content[start + 8 : start + 8 + length]
+        start += 12 + length
+    return found
+
+
+def gamma_chunk(exponent: float) -> tuple[bytes, bytes]:
+    return b"gAMA", round(100_000 / exponent).to_bytes(4, "big")
+
+
+PQ_HALF = 92.2457 / 203.0  # an encoded 0.5 is 92.2457 cd/m2
+ICC = b"iCCP", b"x\0\0" + zlib.compress(profile(b"curv" + bytes(8)))
+
+
+@pytest.mark.parametrize(
+    ("stated", "transfer", "light"),
+    [
+        ([], "srgb", GREY),
+        ([gamma_chunk(1.0)], "linear", 0.5),
+        ([gamma_chunk(1.8)], "gamma 1.8", 0.5**1.8),
+        ([gamma_chunk(2.4)], "gamma 2.4", 0.5**2.4),
+        ([gamma_chunk(2.2)], "srgb", GREY),
+        ([(b"sRGB", b"\0"), gamma_chunk(1.0)], "srgb", GREY),  # sRGB comes before gAMA
+        ([(b"cICP", bytes([1, 8, 0, 1]))], "linear", 0.5),
+        ([(b"cICP", bytes([1, 13, 0, 1])), gamma_chunk(1.0)], "srgb", GREY),
+        ([(b"cICP", bytes([1, 1, 0, 1]))], "bt709", ((0.5 + 0.0992968) / 1.0992968) ** (1 / 0.45)),
+        ([(b"cICP", bytes([9, 16, 0, 1]))], "pq", PQ_HALF),
+        ([(b"cICP", bytes([9, 18, 0, 1]))], "hlg", 1 / 12),
+    ],
+)  # fmt: skip
+def test_a_png_is_decoded_as_it_states_and_a_copy_states_the_same(
+    tmp_path: Path, stated: Any, transfer: str, light: float
+) -> None:
+    source = png(tmp_path / "a.png", 32768, *stated)
+    picture = read_image(source)
+    assert picture.transfer == transfer
+    assert float(picture.pixels.mean()) == pytest.approx(light, rel=1e-4)
+    assert read_values(source).unique().tolist() == [32768.0]
+    assert read_image(source, "linear").pixels.mean() == pytest.approx(0.5, rel=1e-4)  # type: ignore[arg-type]
+    write_image(tmp_path / "b.png", picture)
+    assert stored(tmp_path / "b.png").min() == stored(tmp_path / "b.png").max() == 32768
+    copy = chunks_of(tmp_path / "b.png")
+    for name, content in stated:
+        assert transfer == "srgb" or copy.get(name, content) == content
+    again = read_image(tmp_path / "b.png")
+    assert again.transfer == transfer and torch.equal(again.pixels, picture.pixels)
+    write_image(tmp_path / "c.jpg", picture)  # a JPEG cannot state it
+    assert transfer in ("pq", "hlg") or read_image(tmp_path / "c.jpg").pixels.mean() == pytest.approx(light, rel=0.02)  # type: ignore[arg-type]
+
+
+def test_a_linear_profile_is_decoded_and_an_unknown_encoding_refused(tmp_path: Path) -> None:
+    assert stated_transfer({"ICCProfile": profile(b"curv" + bytes(8))}) == "linear"
+    gamma = profile(b"para" + bytes(8) + round(1.8 * 65536).to_bytes(4, "big"))
+    assert stated_transfer({"ICCProfile": gamma, "oiio:ColorSpace": "lin_rec709_scene"}) == "gamma 1.8"
+    assert stated_transfer({"ICCProfile": profile(b"para" + bytes(4) + b"\0\3" + bytes(20))}) is None  # that of sRGB
+    for codes in ((1, 9, 0, 1), (3, 13, 0, 1), (9, 16, 0, 0)):
+        path = png(tmp_path / "x.png", 9, (b"cICP", bytes(codes)))
+        with pytest.raises(ValueError, match=r"x\.png: its colours are encoded as cICP .* expected transfer 1, "):
+            read_image(path)
+        assert read_image(path, "srgb").transfer == "srgb" and read_values(path).max() == 9.0
+
+
+@pytest.mark.parametrize(
+    ("primaries", "colour", "expected"),  # one colour in both
+    [
+        ((0.708, 0.292, 0.17, 0.797, 0.131, 0.046, 0.3127, 0.329), (0.6274, 0.0691, 0.0164), (1.0, 0.0, 0.0)),
+        ((1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3), (1.0, 1.0, 1.0), (1.0, 1.0, 1.0)),  # XYZ, white
+        ((0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767), (0.4397, 0.0898, 0.0175), (1.0, 0.0, 0.0)),
+        ((0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329), (0.2, 0.3, 0.4), (0.2, 0.3, 0.4)),
+    ],
+    ids=["Rec.2020", "XYZ", "ACES 2065-1", "Rec.709"],
+)
+def test_primaries_of_an_exr_are_kept_in_an_exr_and_else_converted(
+    tmp_path: Path, primaries: Any, colour: Any, expected: Any
+) -> None:
+    spec = oiio.ImageSpec(6, 4, 3, "float")
+    spec.attribute("chromaticities", "float[8]", primaries)
+    values = np.ones((4, 6, 3), np.float32) * np.array(colour, np.float32)
+    picture = read_image(store_parts(tmp_path / "a.exr", [(spec, values)]))
+    assert picture.pixels[0, :, 0, 0].tolist() == pytest.approx(colour)
+    write_image(tmp_path / "b.exr", picture)
+    assert spec_of(tmp_path / "b.exr").getattribute("chromaticities") == pytest.approx(primaries)
+    write_image(tmp_path / "b.pfm", picture)
+    assert read_image(tmp_path / "b.pfm").pixels[0, :, 0, 0].tolist() == pytest.approx(expected, abs=2e-3)
+
+
+def test_primaries_of_a_png_are_stated_in_an_exr(tmp_path: Path) -> None:
+    write_image(tmp_path / "x.exr", read_image(png(tmp_path / "x.png", 9, (b"cICP", bytes([9, 16, 0, 1])))))
+    assert spec_of(tmp_path / "x.exr").getattribute("chromaticities")[:2] == pytest.approx((0.708, 0.292))
 
 
 def test_transfer_is_kept_from_integers_to_integers_and_else_is_the_default(tmp_path: Path) -> None:

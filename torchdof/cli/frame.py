@@ -15,6 +15,7 @@ from ..depth.inspect import coc_colours, depth_colours, tint_focus
 from ..depth.kinds import depth_from_values
 from ..depth.relative import from_relative
 from ..depth.sanity import Mistake, coc_mistakes, depth_mistakes
+from ..io.colour import stated_primaries
 from ..io.highlights import expand_highlights
 from ..io.images import Picture, read_image, read_values, write_image
 from ..io.sheet import shrunk, write_sheet
@@ -189,6 +190,14 @@ class Renderer:
         if frame.picture.other_layers and suffix == ".exr":
             layers = ", ".join(frame.picture.other_layers)
             note("layers", f"{out}: is without the other layers of the image: {layers}")
+        if picture.is_stated:
+            kept = picture.transfer if suffix == ".png" and command.out_transfer is None else "another encoding"
+            stated = f"{command.image}: states that it is encoded as {picture.transfer}, and is decoded so"
+            note("transfer", f"{stated} (else --transfer); {out} has {kept}")
+        if stated_primaries(picture.metadata) is not None:
+            is_kept = suffix == ".exr" or (suffix == ".png" and "CICP" in picture.metadata)
+            kept = "keeps the primaries of the image" if is_kept else "has the primaries of sRGB, converted"
+            note("primaries", f"{out}: {kept}; the image states others than those of sRGB")
         options, table = Options(**command.arguments()), self.table
         facts = {
             "out": str(out),

@@ -40,6 +40,7 @@ class Part:
     metadata: Metadata = dataclasses.field(default_factory=dict)
     window: tuple[int, int, int, int, int, int] | None = None  # x, y, full x, full y, full width, full height
     orientation: int = 1  # EXIF orientation as stored; the values are upright already
+    stated: dict[str, Any] = dataclasses.field(default_factory=dict)  # what a PNG states of its encoding
 
 
 @contextlib.contextmanager
@@ -116,6 +117,7 @@ def _parts(name: str) -> Iterator[Part]:
                 metadata=metadata,
                 window=window if values.shape[:2] == (spec.height, spec.width) else None,
                 orientation=orientation,
+                stated={a.name: a.value for a in spec.extra_attribs} if source.format_name() == "png" else {},
             )
     finally:
         source.close()

@@ -1,7 +1,8 @@
 """Reads and writes images in linear light: EXR, PNG, TIFF, JPEG, WebP, HDR and PFM, with OpenImageIO.
 
-The transfer curve is never guessed from a tag. Files of integers (PNG, JPEG, TIFF of 8 or 16 bits) are sRGB, and files
-of floats (EXR, HDR, PFM, TIFF of floats) linear light, unless the argument ``transfer`` changes that.
+Files of integers (PNG, JPEG, TIFF of 8 or 16 bits) are sRGB, and files of floats (EXR, HDR, PFM, TIFF of floats) linear
+light, unless the argument ``transfer`` changes that, or a PNG states another encoding (gAMA, cICP). Other tags are
+ignored. Primaries are kept where the written file can state them, and are otherwise converted to those of sRGB.
 """
 
 import dataclasses
@@ -17,6 +18,7 @@ from torch import Tensor
 from ..validation import choice, real_tensor, show
 from .atomic import atomic_file
 from .channels import colour_channels, depth_channels, named_channels, nearest_channel
+from .colour import in_rec709, stated_primaries, stated_transfer
 from .decode import Part, errors_named, first_line, is_complete, read_array, read_parts, utf8_name
 from .paths import PixelType, existing_image, existing_map, samples_of
 from .transfer import Transfer, decode, default_transfer, encode, encode_8_bits
@@ -49,7 +51,8 @@ class Picture:
             pixels without depth, it is NaN.
         metadata: Name -> (OpenImageIO type, value).
         sample: Stored type of a sample: "8", "16", "half" or "float".
-        transfer: Encoding of the file, "linear" or "srgb".
+        transfer: Encoding of the file: "linear" or "srgb", or another one that a PNG states.
+        is_stated: Whether the file states its encoding, and that is not sRGB.
         window: Place of the pixels in the full frame (EXR data window): x, y, full x, full y, full width, full height.
         orientation: EXIF orientation of the file; the pixels are upright already.
         other_layers: Names of the layers of the file that are neither the pixels nor the depth.
@@ -66,6 +69,7 @@ class Picture:
     window: Window | None = None
     orientation: int = 1
     other_layers: tuple[str, ...] = ()
+    is_stated: bool = False
     layer: str = ""
     depth_problem: str = ""
 
@@ -85,7 +89,7 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
 
     Args:
         path: An EXR, PNG, TIFF, JPEG, WebP, HDR or PFM file; HEIC and raw files if OpenImageIO was built to read them.
-        transfer: "linear" or "srgb"; None uses "srgb" for integers and "linear" for floats, and ignores tags.
+        transfer: "linear" or "srgb"; None uses what a PNG states, else "srgb" for integers and "linear" for floats.
         layer: Name of the part or layer of an EXR file to read; None takes the first that has colour.
 
     Returns:
@@ -110,6 +114,8 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
         parts = read_parts(path)
         part, indices, names = colour_channels(parts, layer)
         source = parts[part]
+        stated = stated_transfer(source.stated) if transfer is None else None
+        transfer = stated or transfer
         pixels, sample, transfer = _light(source, indices, transfer, has_alpha=names[-1] == "A")
         depth, problem, places = None, "", {(part, k) for k in indices}
         in_layer = source.names[indices[0]].rpartition(".")[0]
@@ -123,8 +129,10 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
                 problem = str(error)
     left = [(p.label, name) for n, p in enumerate(parts) for k, name in enumerate(p.names) if (n, k) not in places]
     layers = tuple(dict.fromkeys(name.rpartition(".")[0] or label or name for label, name in left))
-    window, orientation = source.window, source.orientation
-    return Picture(pixels, names, depth, source.metadata, sample, transfer, window, orientation, layers, label, problem)
+    return Picture(
+        *(pixels, names, depth, source.metadata, sample, transfer, source.window, source.orientation, layers),
+        **{"is_stated": stated is not None, "layer": label, "depth_problem": problem},
+    )
 
 
 def _light(
@@ -176,7 +184,8 @@ def write_image(
             folder is made.
         picture: Pixels in linear light; metadata that the format supports is written too.
         transfer: "linear" or "srgb". None keeps the picture's own if both its ``sample`` and the new one are integers,
-            or both floats; otherwise it is "srgb" for integers and "linear" for floats.
+            or both floats, and the file can state it where the picture's file does; otherwise it is "srgb" for integers
+            and "linear" for floats.
         sample: "8", "16", "half" or "float"; None keeps the picture's own if the format supports it, and otherwise
             takes the default of the format (8 bits, or half for EXR).
 
@@ -198,7 +207,8 @@ def write_image(
         raise ValueError(f"{path}: a {suffix} file holds samples of {' or '.join(sample_types)}, not {sample}")
     if transfer is None:
         both_floats_or_integers = default_transfer(sample) == default_transfer(picture.sample)
-        transfer = picture.transfer if both_floats_or_integers else default_transfer(sample)
+        is_kept = both_floats_or_integers and (suffix == ".png" or not picture.is_stated)
+        transfer = picture.transfer if is_kept else default_transfer(sample)
     pixels = real_tensor("pixels", picture.pixels, "[1, C, H, W] in linear light").detach().cpu().float()
     names = picture.channels
     if pixels.ndim != 4 or pixels.shape[:2] != (1, len(names)):
@@ -207,6 +217,14 @@ def write_image(
         if bool((pixels[:, -1] < 1.0).any()):
             raise ValueError(f"{path}: a {suffix} file cannot hold the alpha channel; write .exr, .png or .tif instead")
         pixels, names = pixels[:, :-1], names[:-1]
+    primaries = stated_primaries(picture.metadata)
+    codes = {name: value for name, (_, value) in picture.metadata.items() if name == "CICP"}
+    is_cicp = bool(codes) and suffix == ".png" and transfer == (stated_transfer(codes) or "srgb")
+    if primaries is not None and names[0] == "R" and suffix != ".exr" and not is_cicp:
+        try:
+            pixels = in_rec709(pixels, primaries)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
     if names[0] == "Y" and suffix not in _GREY_SUFFIXES:
         pixels, names = pixels.expand(-1, 3, -1, -1), ("R", "G", "B")
     straight = names[-1] == "A" and suffix != ".exr"
@@ -226,11 +244,18 @@ def write_image(
         spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height = picture.window
     for name, (kind, value) in picture.metadata.items():
         is_lossless = suffix == ".exr" and value in _LOSSLESS_EXR
-        if {"compression": is_lossless, "ICCProfile": transfer == picture.transfer}.get(name, True):
+        is_same = {"ICCProfile": transfer == picture.transfer, "CICP": is_cicp, "chromaticities": suffix == ".exr"}
+        if {"compression": is_lossless, **is_same}.get(name, True):
             typed = (value,) if isinstance(value, int) else (kind, value)  # with a 16-bit type it would be dropped
             spec.attribute(name, *typed)
-    if transfer == "srgb" or suffix != ".exr":  # not of linear EXR files, whose primaries are those of the input
+    if is_cicp or transfer not in ("linear", "srgb"):  # "unknown": OpenImageIO states what the other attributes say
+        spec.attribute("oiio:ColorSpace", "unknown")
+        if transfer.startswith("gamma") and not is_cicp:
+            spec.attribute("oiio:Gamma", float(transfer.split()[1]))
+    elif transfer == "srgb" or suffix != ".exr":  # not of linear EXR files, whose primaries are those of the input
         spec.attribute("oiio:ColorSpace", "srgb_rec709_scene" if transfer == "srgb" else "lin_rec709_scene")
+    if suffix == ".exr" and primaries is not None:
+        spec.attribute("chromaticities", "float[8]", primaries)
     if transfer == "linear" and suffix != ".exr":
         spec.attribute("Exif:ColorSpace", 65535)  # "uncalibrated"; OpenImageIO cannot write a TIFF without any EXIF
     if straight:
