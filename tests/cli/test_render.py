@@ -459,6 +459,54 @@ def test_a_guess_of_metres_is_noted_unless_the_focus_is_in_metres(depth: Tensor,
 # How much blur
 
 
+@pytest.mark.parametrize("value", [65535, 65504, 32767])
+def test_stray_sentinels_change_neither_the_guess_nor_the_other_pixels(run: Run, depth: Tensor, value: int) -> None:
+    metres = torch.linspace(2.0, 6.0, 24).expand(1, 1, 16, 24)
+    mm = (1000 * metres[0, 0]).round().numpy().astype(np.uint16)
+    given = mm.copy()
+    given[3, 5:8], mm[3, 5:8] = value, 0  # 0 is not measured too
+    store(Path("a.png"), given, "uint16")
+    store(Path("b.png"), mm, "uint16")
+    for options in ("", "--depth-scale 0.001 --fill-depth far "):
+        (line, notes), _ = (told(f"render image.exr {name} {options}-o {name}.exr") for name in ("a.png", "b.png"))
+        assert f"3 px of {value} without depth" in line and "3 px of depth filled (far)" in line
+        assert options or "taken for millimetres" in notes
+        assert torch.equal(pixels("a.png.exr"), pixels("b.png.exr"))
+
+
+def test_what_is_too_near_to_measure_is_the_nearest_and_not_the_farthest(run: Run, image: Tensor) -> None:
+    metres = np.linspace(2.0, 6.0, 24, dtype=np.float32)[None].repeat(16, 0)
+    metres[:, 10] = -np.inf
+    np.save("near.npy", metres)
+    of_kinds: list[dict[str, Any]] = [{"depth_kind": "z", "fill_depth": "far"}]
+    of_kinds += [{"depth_kind": "relative", "relative_kind": "depth", "near_m": 2.0, "far_m": 6.0}]
+    for options in of_kinds:
+        scene = Scene(focus_m=[(0, 2.0)], **options)
+        frame = read_frame(Path("image.exr"), Path("near.npy"), scene)
+        assert bool((frame.values[..., 10] == 2.0).all()), options
+
+
+def test_a_guess_that_is_not_safe_names_both_directions(run: Run) -> None:
+    values = np.full((16, 24), 0.9, np.float32) + np.linspace(0, 0.1, 24, dtype=np.float32)
+    values[5:, 8:16] = np.linspace(0.0, 0.05, 8, dtype=np.float32)
+    np.save("marigold.npy", values)
+    notes = told("render image.exr marigold.npy -o out.exr")[1]
+    assert "larger is farther by a guess that is not safe: --relative-kind depth if larger is farther" in notes
+    assert "--relative-kind disparity if larger is nearer" in notes
+
+
+def test_a_sequence_of_relative_depth_is_not_taken_for_metres_in_silence(run: Run) -> None:
+    disparity = torch.linspace(0.3, 12.0, 16)[None, None, :, None].repeat(1, 1, 1, 24)
+    for n in range(1, 4):
+        write_image(f"video.{n:04d}.exr", Picture(disparity, ("Y",), sample="float"))
+    command = "render shot.####.exr video.####.exr -o out.####.exr --focus-m 2"
+    warning = told(command)[1]
+    assert warning.count("taken for metres, as in every sequence without --depth-kind") == 1
+    assert "--relative-kind disparity if larger is nearer" in warning and "--depth-kind z if they are" in warning
+    assert "taken for metres" not in told(f"{command} --depth-kind z")[1]
+    assert "but its numbers grow downwards" in told("render image.exr video.0001.exr -o out.exr")[1]
+
+
 def test_blur_sets_the_largest_radius_as_a_share_of_the_width(depth: Tensor, run: Run) -> None:
     for focus in ("--focus-m 2", "--focus-m 5", "--focus-at 21,5"):
         for lens in ("", " --focal-length-mm 85", " --fov-deg 40"):

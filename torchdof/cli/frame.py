@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -10,11 +11,13 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from ..depth.guess import looks_relative
 from ..depth.holes import resolve_holes
 from ..depth.inspect import coc_colours, depth_colours, tint_focus
 from ..depth.kinds import depth_from_values
 from ..depth.relative import from_relative
-from ..depth.sanity import Mistake, coc_mistakes, depth_mistakes
+from ..depth.sanity import Mistake, coc_mistakes, depth_mistakes, whole_numbers
+from ..depth.sentinels import without_sentinels
 from ..io.colour import stated_primaries
 from ..io.highlights import expand_highlights
 from ..io.images import Picture, read_image, read_values, write_image
@@ -28,7 +31,7 @@ from ..render.resample import at_size_of
 from ..validation import same_aspect, stretch
 from .command import refuse
 from .lens import Area, Lens
-from .options import Scene
+from .options import INTEGER_TYPES, LIKE_RELATIVE, Scene
 from .output import Notices, print_result
 
 if TYPE_CHECKING:
@@ -77,12 +80,23 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
     else:
         hint = "" if is_exr else ", which a network such as Depth Anything makes of it"
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH{hint}")
+    known = values if scene.depth_unknown is None else values.masked_fill(values == scene.depth_unknown, math.nan)
+    known, sentinels = without_sentinels(known)
     if scene.depth_kind == "auto":
         is_metric = bool(scene.given(Lens) & {"focus_m", "focus_range", "aperture_radius_m"})
         stated_fill = scene.fill_depth
-        scene, guess = scene.guessed(values, source, is_metric)
+        scene, guess = scene.guessed(known, source, is_metric)
         scene = dataclasses.replace(scene, fill_depth=stated_fill) if holes else scene
     kind: Any = scene.depth_kind
+    is_whole = source.suffix.lower() in INTEGER_TYPES or whole_numbers(known[known.isfinite()])
+    is_sky = kind in ("z", "distance") and not is_whole  # a renderer writes a large distance where nothing is
+    if not sentinels or is_sky or kind == "coc" or scene.value_range is not None:
+        sentinels = ""
+    else:
+        values = known
+        scene = scene if holes or scene.strict else dataclasses.replace(scene, fill_depth=scene.fill_depth or "far")
+    if kind == "relative" and scene.relative_kind == "depth":  # -inf is too near to be measured
+        values = torch.where(values == -math.inf, torch.where(known.isfinite(), known, math.inf).min(), values)
     rows, columns = values.shape[-2:]
     try:
         if kind == "coc" and (rows, columns) != (height, width):
@@ -107,7 +121,8 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
     fill_by: Any = scene.fill_depth
     if fill_by is not None or not holes:
         values, filled = resolve_holes(values, str(source), fill_by, kind in ("relative", "coc"))
-    remarks = [f"depth stretched by {stretched:.1%}"] if stretched else []
+    remarks = [sentinels] if sentinels else []
+    remarks += [f"depth stretched by {stretched:.1%}"] if stretched else []
     if kind == "relative" and None in (scene.near_m, scene.far_m):
         remarks.append("depth from {:g} to {:g} m assumed".format(*scene.ends_m))
     return Frame(str(source), scene, picture, area, values, filled, remarks, guess)
@@ -133,10 +148,11 @@ def coc_of(
 class Renderer:
     """Reads, renders and writes the frames of ``torchdof render``."""
 
-    def __init__(self, command: "Render", is_still: bool) -> None:
+    def __init__(self, command: "Render", is_still: bool, is_assumed: bool = False) -> None:
+        """``is_assumed``: no option states that depth is in metres."""
         self.command, self.is_still = command, is_still
         self.table, self.device = command.blur_table(), _device(command.device)
-        self.notices = Notices(command.strict)
+        self.notices, self.is_assumed = Notices(command.strict), is_assumed
 
     def read(self, image: Path, depth: Path | None) -> Frame:
         """Reads a frame as :func:`read_frame`, with the transfer curve and layer of the options."""
@@ -146,6 +162,9 @@ class Renderer:
         """Renders a frame of a number; returns the function that writes it to ``out``."""
         start, picture, command = time.perf_counter(), frame.picture, self.command
         frame = dataclasses.replace(frame, values=frame.values.to(self.device))
+        if self.is_assumed and looks_relative(frame.values):
+            message = f"taken for metres, as in every sequence without --depth-kind, but {LIKE_RELATIVE}"
+            self.notices.warn(frame.name, [Mistake("relative", message)])
         coc_px, camera, remarks = coc_of(frame, self.notices, number, self.is_still)
         pixels, colours = picture.pixels.to(self.device), picture.light.shape[1]
         if command.show_focus:

@@ -48,7 +48,7 @@ class _Effects(Group):
 class _Files(Group):
     """Files and frames."""
 
-    transfer: Encoding | None = option("How IMAGE is encoded. Default: as a PNG states, else integers srgb, floats linear.")
+    transfer: Encoding | None = option("How IMAGE is encoded. Default: as a PNG states; integers srgb, floats linear.")
     out_transfer: Encoding | None = option("How OUT is encoded. Default: as IMAGE, else by type.")
     bits: Literal["8", "16", "half", "float"] | None = option("What OUT stores. Default: as IMAGE, where the type can.")
     layer: str | None = option("Layer or part of an EXR that is the image.")
@@ -151,8 +151,9 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         from ..depth.steady import SteadyFrames
         from .frame import Renderer
 
-        is_guessed = images and self.depth_kind == "auto"  # a guess could differ from frame to frame
-        renderer = Renderer(dataclasses.replace(self, depth_kind="z") if is_guessed else self, images is None)
+        is_assumed = images is not None and self.depth_kind == "auto"  # a guess could differ from frame to frame
+        of_frames = dataclasses.replace(self, depth_kind="z") if is_assumed else self
+        renderer = Renderer(of_frames, images is None, is_assumed)
         if self.resume and len(existing) > len(done):
             again = f"{len(existing) - len(done)} of {len(outputs)} frames are rendered again"
             renderer.notices.note("again", f"{self.out}: {again}: {reason}")
