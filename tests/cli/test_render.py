@@ -20,7 +20,7 @@ from torchdof.cli.main import app
 from torchdof.cli.options import Scene
 from torchdof.cli.output import Notices
 from torchdof.io.highlights import expand_highlights
-from torchdof.io.images import Picture, read_image, write_image
+from torchdof.io.images import Picture, read_image, read_values, write_image
 from torchdof.optics.field import Field
 
 pytestmark = pytest.mark.usefixtures("scene")  # its files lie in the working folder
@@ -301,7 +301,10 @@ def test_a_note_names_the_layers_of_an_exr_that_are_not_copied(image: Tensor, de
     channels = torch.cat([image, depth, image, image[:, :1]], 1)[0].permute(1, 2, 0).numpy()
     store(Path("shot.exr"), channels, "float", ("R", "G", "B", "Z", "dif.R", "dif.G", "dif.B", "N.Z"))
     note = told("render shot.exr -o out.exr --focus-m 2")[1]
-    assert "note: out.exr: is without the other layers of the image: N, dif\n" in note
+    assert "note: out.exr: is without the other layers of the image: N, dif (--keep-layers)\n" in note
+    assert "layers" not in told("render shot.exr -o kept.exr --focus-m 2 --keep-layers")[1]
+    assert torch.equal(pixels("kept.exr"), pixels("out.exr"))
+    assert torch.equal(read_values("kept.exr", "Z"), depth) and read_values("kept.exr", "dif.R").shape == depth.shape
     for options in ("shot.exr -o out.png", "image.exr depth.npy -o out.exr"):
         assert "layers" not in told(f"render {options} --focus-m 2")[1]
 

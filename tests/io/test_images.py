@@ -13,6 +13,7 @@ import torch
 
 from tests.files import spec_with, store, store_parts
 from torchdof.io.colour import stated_transfer
+from torchdof.io.decode import read_parts
 from torchdof.io.images import Picture, read_image, read_values, write_image
 
 GREY = 0.21404114  # linear light of an sRGB value of 0.5
@@ -461,6 +462,53 @@ def test_depth_of_half_the_size_or_without_a_window_is_placed_too(tmp_path: Path
     store(tmp_path / "x.png", np.zeros((24, 32, 3), np.uint8), "uint8")
     shifted = store_parts(tmp_path / "z.exr", [with_window(FRAME, (4, 0, 32, 24))])
     assert read_values(shifted, image=read_image(tmp_path / "x.png"))[0, 0, 5, 4] == FRAME[5, 4]
+
+
+# Other layers of a copy
+
+
+def test_a_copy_with_all_layers_differs_only_in_the_image(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    names = ("R", "G", "B", "A", "Z", "dif.R", "dif.G", "dif.B", "Crypto00.R", "Crypto00.G")
+    beauty = rng.random((6, 8, len(names)), np.float32)
+    beauty[..., 3] = 1.0
+    spec = spec_with(beauty, "half", names, Owner="me", oiio__subimagename="rgba")
+    spec.attribute("cryptomatte/ab12/manifest", "{}")
+    kinds = ["half"] * 4 + ["float"] + ["half"] * 3 + ["float"] * 2
+    spec.channelformats = tuple(oiio.TypeDesc(kind) for kind in kinds)
+    ids = rng.integers(0, 2**32 - 1, (4, 5, 1), np.uint32)
+    ids_spec = spec_with(ids, "uint32", ("id",), oiio__subimagename="ids", view="left")
+    ids_spec.x, ids_spec.y, ids_spec.full_width, ids_spec.full_height = 2, 1, 8, 6
+    source = store_parts(tmp_path / "a.exr", [(ids_spec, ids), (spec, beauty)])
+    picture = read_image(source, keep_layers=True)
+    changed = dataclasses.replace(picture, pixels=picture.pixels / 2)
+    write_image(tmp_path / "b.exr", changed)
+    before, after = (read_parts(tmp_path / name) for name in ("a.exr", "b.exr"))
+    for old, new in zip(before, after, strict=True):
+        assert (new.label, new.window, {*new.names}) == (old.label, old.window, {*old.names})
+        for k, name in enumerate(old.names):
+            j = new.names.index(name)
+            assert new.kinds[j] == old.kinds[k]
+            is_image = old.label == "rgba" and name in "RGBA"
+            assert np.array_equal(new.values[..., j], old.values[..., k] / (2 if is_image else 1)), name
+    assert after[1].metadata["cryptomatte/ab12/manifest"][1] == "{}" and after[0].metadata["view"][1] == "left"
+    write_image(tmp_path / "c.exr", read_image(source))
+    (alone,) = read_parts(tmp_path / "c.exr")
+    assert alone.names == ("R", "G", "B", "A") and alone.metadata["Owner"][1] == "me"
+    assert not any(name.startswith("cryptomatte") for name in alone.metadata)
+
+
+def test_layers_that_cannot_be_kept_are_refused(tmp_path: Path) -> None:
+    spec, values = of_values(**COLOUR, id=7)
+    spec.channelformats = tuple(map(oiio.TypeDesc, ("half", "half", "half", "uint")))
+    path = store_parts(tmp_path / "a.exr", [(spec, values)])
+    with pytest.raises(ValueError, match="a.exr: cannot keep the layers: id hold whole numbers beside others"):
+        read_image(path, keep_layers=True)
+    picture = read_image(store_parts(tmp_path / "b.exr", [of_values(**COLOUR, Z=1)]), keep_layers=True)
+    grey = dataclasses.replace(picture, pixels=picture.pixels[:, :1], channels=("Y",))
+    with pytest.raises(ValueError, match="cannot keep the layers of a picture whose channels are now Y"):
+        write_image(tmp_path / "c.exr", grey)
+    write_image(tmp_path / "c.png", picture)  # has no layers
 
 
 # Metadata

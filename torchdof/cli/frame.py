@@ -155,8 +155,10 @@ class Renderer:
         self.notices, self.is_assumed = Notices(command.strict), is_assumed
 
     def read(self, image: Path, depth: Path | None) -> Frame:
-        """Reads a frame as :func:`read_frame`, with the transfer curve and layer of the options."""
-        return read_frame(image, depth, self.command, transfer=self.command.transfer, layer=self.command.layer)
+        """Reads a frame as :func:`read_frame`, with the transfer curve and layers of the options."""
+        command = self.command
+        encoding = {"transfer": command.transfer, "layer": command.layer, "keep_layers": command.keep_layers}
+        return read_frame(image, depth, command, **encoding)
 
     def render(self, frame: Frame, out: Path, number: int) -> Callable[[], None]:
         """Renders a frame of a number; returns the function that writes it to ``out``."""
@@ -206,9 +208,9 @@ class Renderer:
         has_exif, suffix = any(name.startswith("Exif:") for name in frame.picture.metadata), out.suffix.lower()
         if has_exif and suffix in _WITHOUT_EXIF:
             note("exif", f"{out}: EXIF data are lost in a {suffix} file; write .jpg, .png or .tif to keep them")
-        if frame.picture.other_layers and suffix == ".exr":
+        if frame.picture.other_layers and suffix == ".exr" and not command.keep_layers:
             layers = ", ".join(frame.picture.other_layers)
-            note("layers", f"{out}: is without the other layers of the image: {layers}")
+            note("layers", f"{out}: is without the other layers of the image: {layers} (--keep-layers)")
         if picture.is_stated:
             kept = picture.transfer if suffix == ".png" and command.out_transfer is None else "another encoding"
             stated = f"{command.image}: states that it is encoded as {picture.transfer}, and is decoded so"

@@ -7,6 +7,7 @@ ignored. Primaries are kept where the written file can state them, and are other
 
 import dataclasses
 import os
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from .atomic import atomic_file
 from .channels import colour_channels, depth_channels, named_channels, nearest_channel
 from .colour import in_rec709, stated_primaries, stated_transfer
 from .decode import Part, errors_named, first_line, is_complete, read_array, read_parts, utf8_name
+from .layers import LOSSLESS, OF_LAYERS, Layers
 from .paths import PixelType, existing_image, existing_map, samples_of
 from .transfer import Transfer, decode, default_transfer, encode, encode_8_bits
 from .webp import add_exif
@@ -32,7 +34,6 @@ _SAMPLE_TYPES: dict[str, PixelType] = {name: sample for sample, name in _OIIO_SA
 _WHITE = {"8": 255.0, "16": 65535.0, "half": 1.0, "float": 1.0}
 _ALPHA_SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".webp")
 _GREY_SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pfm")
-_LOSSLESS_EXR = ("none", "rle", "zip", "zips", "piz")
 _JPEG = {"compression": "jpeg:95", "jpeg:subsampling": "4:4:4"}
 _SETTINGS: dict[str, Mapping[str, object]] = {
     **{".jpg": _JPEG, ".jpeg": _JPEG, ".webp": {"compression": "webp:95"}},
@@ -58,6 +59,7 @@ class Picture:
         other_layers: Names of the layers of the file that are neither the pixels nor the depth.
         layer: Names of the part and layer of the pixels, joined by a dot.
         depth_problem: The reason why none of several depth channels was taken, or empty.
+        layers: All parts and layers of an EXR file, which :func:`write_image` then writes too; None writes the pixels.
     """
 
     pixels: Tensor
@@ -72,6 +74,7 @@ class Picture:
     is_stated: bool = False
     layer: str = ""
     depth_problem: str = ""
+    layers: Layers | None = None
 
     @property
     def has_alpha(self) -> bool:
@@ -84,13 +87,16 @@ class Picture:
         return self.pixels[:, :-1] if self.has_alpha else self.pixels
 
 
-def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, layer: str | None = None) -> Picture:
+def read_image(
+    path: str | os.PathLike[str], transfer: Transfer | None = None, layer: str | None = None, keep_layers: bool = False
+) -> Picture:
     """Reads an image into linear light.
 
     Args:
         path: An EXR, PNG, TIFF, JPEG, WebP, HDR or PFM file; HEIC and raw files if OpenImageIO was built to read them.
         transfer: "linear" or "srgb"; None uses what a PNG states, else "srgb" for integers and "linear" for floats.
         layer: Name of the part or layer of an EXR file to read; None takes the first that has colour.
+        keep_layers: Keep the other layers and parts of an EXR file, so that a copy has them too.
 
     Returns:
         The picture, upright; its depth channel is one like ``Z``, ``depth`` or ``ViewLayer.Depth.Z`` of an EXR file.
@@ -117,6 +123,7 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
         stated = stated_transfer(source.stated) if transfer is None else None
         transfer = stated or transfer
         pixels, sample, transfer = _light(source, indices, transfer, has_alpha=names[-1] == "A")
+        kept = Layers(tuple(parts), part, tuple(indices)) if keep_layers and source.is_exr else None
         depth, problem, places = None, "", {(part, k) for k in indices}
         in_layer = source.names[indices[0]].rpartition(".")[0]
         label = f"{source.label}.{in_layer}".strip(".")
@@ -131,6 +138,7 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
     layers = tuple(dict.fromkeys(name.rpartition(".")[0] or label or name for label, name in left))
     return Picture(
         *(pixels, names, depth, source.metadata, sample, transfer, source.window, source.orientation, layers),
+        layers=kept,
         **{"is_stated": stated is not None, "layer": label, "depth_problem": problem},
     )
 
@@ -243,9 +251,10 @@ def write_image(
     if picture.window is not None:
         spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height = picture.window
     for name, (kind, value) in picture.metadata.items():
-        is_lossless = suffix == ".exr" and value in _LOSSLESS_EXR
+        is_lossless = suffix == ".exr" and value in LOSSLESS
         is_same = {"ICCProfile": transfer == picture.transfer, "CICP": is_cicp, "chromaticities": suffix == ".exr"}
-        if {"compression": is_lossless, **is_same}.get(name, True):
+        is_lost = picture.layers is None and re.match(OF_LAYERS, name) is not None
+        if {"compression": is_lossless, **is_same}.get(name, not is_lost):
             typed = (value,) if isinstance(value, int) else (kind, value)  # with a 16-bit type it would be dropped
             spec.attribute(name, *typed)
     if is_cicp or transfer not in ("linear", "srgb"):  # "unknown": OpenImageIO states what the other attributes say
@@ -263,16 +272,27 @@ def write_image(
     for name, setting in _SETTINGS.get(suffix, {}).items():
         spec.attribute(name, setting)
 
+    parts = [(spec, array)]
+    if picture.layers is not None and suffix == ".exr":
+        if len(picture.layers.channels) != len(names):
+            raise ValueError(f"{path}: cannot keep the layers of a picture whose channels are now {', '.join(names)}")
+        parts = picture.layers.replaced(spec, array)
+    specs = tuple(each for each, _ in parts)
+
     with atomic_file(path) as temporary:
         with temporary.open("wb") as file:
             if suffix in (".jpg", ".jpeg") and hasattr(os, "posix_fallocate"):
                 os.posix_fallocate(file.fileno(), 0, array.size + 2**20)  # fails here: libjpeg exits on a full disk
         with utf8_name(temporary) as name:
             output = oiio.ImageOutput.create(name)
-            if output is None or not output.open(name, spec):
+            if output is None or not output.open(name, specs if len(specs) > 1 else specs[0]):
                 problem = (oiio if output is None else output).geterror()
                 raise OSError(f"{path}: could not be opened for writing ({first_line(problem)})")
-            is_written, is_closed = output.write_image(array), output.close()
+            is_written = True
+            for number, (each, values) in enumerate(parts):
+                is_open = number == 0 or output.open(name, each, "AppendSubimage")
+                is_written = is_written and is_open and output.write_image(np.ascontiguousarray(values))
+            is_closed = output.close()
             problem = output.geterror()  # of a full disk, unless it fills up in the last flush of the buffer
             if not (is_written and is_closed) or problem or not is_complete(temporary):
                 raise OSError(f"{path}: could not be written ({first_line(problem)}); is the disk full?")
