@@ -157,7 +157,11 @@ class Renderer:
     def read(self, image: Path, depth: Path | None) -> Frame:
         """Reads a frame as :func:`read_frame`, with the transfer curve and layers of the options."""
         command = self.command
-        encoding = {"transfer": command.transfer, "layer": command.layer, "keep_layers": command.keep_layers}
+        encoding: dict[str, Any] = {
+            "transfer": command.transfer,
+            "layer": command.layer,
+            "keep_layers": command.keep_layers,
+        }
         return read_frame(image, depth, command, **encoding)
 
     def render(self, frame: Frame, out: Path, number: int) -> Callable[[], None]:

@@ -20,6 +20,7 @@ _NEAR_ZERO = 0.05  # numbers up to 1 are relative if the smallest is below this:
 _EMPTY_GAP = 0.1  # smallest number over the largest from which a 0 is no number of the map
 _KITTI_ASPECTS = (3.1, 3.7)  # width over height of KITTI's pictures, whose maps hold metres * 256
 _KITTI_EMPTY = 0.6  # share of zeros from which whole numbers are a lidar's, as in KITTI's maps
+_NEAR_SHARE = 0.1  # the same as a share of the largest: a close-up in metres rarely spans as much
 _CLEAR_DIFFERENCE = 0.3  # of mean ranks, in [0, 1], between the bottom's middle and the upper corners
 _CLEAR_CORRELATION = 0.35  # absolute correlation of values and rows above which values clearly grow or shrink downwards
 
@@ -73,7 +74,7 @@ def guess_kind(values: Tensor, integers: bool = False, metric: bool = False) -> 
     if is_whole:
         is_relative = high <= _MAX_8_BIT or high >= _MIN_16_BIT
     else:
-        is_relative = low < 0 or (high <= 1 and low < _NEAR_ZERO)
+        is_relative = low < 0 or (high <= 1 and low < max(_NEAR_ZERO, _NEAR_SHARE * high))
     if is_relative:
         to_person = _growth_to_person(values)
         is_clear = abs(downwards) > _CLEAR_CORRELATION

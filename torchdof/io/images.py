@@ -135,11 +135,21 @@ def read_image(
             except ValueError as error:
                 problem = str(error)
     left = [(p.label, name) for n, p in enumerate(parts) for k, name in enumerate(p.names) if (n, k) not in places]
-    layers = tuple(dict.fromkeys(name.rpartition(".")[0] or label or name for label, name in left))
+    others = tuple(dict.fromkeys(name.rpartition(".")[0] or label or name for label, name in left))
     return Picture(
-        *(pixels, names, depth, source.metadata, sample, transfer, source.window, source.orientation, layers),
+        pixels,
+        names,
+        depth,
+        source.metadata,
+        sample,
+        transfer,
+        source.window,
+        source.orientation,
+        others,
+        is_stated=stated is not None,
+        layer=label,
+        depth_problem=problem,
         layers=kept,
-        **{"is_stated": stated is not None, "layer": label, "depth_problem": problem},
     )
 
 
