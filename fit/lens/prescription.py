@@ -174,7 +174,7 @@ def _decoded(content: bytes) -> str:
 
 
 def _zemax_glass(fields: list[str], catalogues: list[str]) -> tuple[Glass, str]:
-    """The glass of the fields of GLAS, and a remark on where its data are from if its name does not say that.
+    """The glass of the fields of GLAS, and a remark with its maker and index, "" for SCHOTT's.
 
     The second field is 0 for a glass by name, whose numbers in the fourth and fifth field are placeholders, and 1 for a
     model glass, which has its index and Abbe number there.

@@ -1,4 +1,4 @@
-"""Sentinels are told from depth by their distance from all other numbers."""
+"""Sentinels are distinguished from depth by their distance from all other numbers."""
 
 import math
 

@@ -12,7 +12,7 @@ Place = tuple[int, int]
 
 _DEPTH_WORDS = ("depth", "z", "zdepth")
 _KINDS_OF_LAYERS = {*_DEPTH_WORDS, "rgb", "rgba", "combined", "colour", "color", "beauty", "image"}
-"""Words in the names of layers and parts that say what they hold, and not which layer, part or view they belong to."""
+"""Words for the content of a layer or part; the other words of its name are those of a layer, part or view."""
 
 
 def colour_channels(parts: list[Part], layer: str | None) -> tuple[int, list[int], tuple[str, ...]]:
