@@ -40,14 +40,6 @@ class Glass:
             self.index(wavelength_um)
 
     @classmethod
-    def named(cls, name: str) -> Glass:
-        """A glass of the catalogue; an unknown name gives a `ValueError` with the alternatives."""
-        if not isinstance(name, str) or name.upper() not in catalogue():
-            remedy = f"define it by a line `glass {name} B1 B2 B3 C1 C2 C3`, or write index/V or index/V/P_gF"
-            raise ValueError(f"no glass {show(name)} in the catalogue of SCHOTT; {remedy}")
-        return catalogue()[name.upper()]
-
-    @classmethod
     def of_numbers(cls, index: float, *dispersion: float) -> Glass:
         """A glass from its index n_d at the d line, Abbe number and partial dispersion, as listed in catalogues.
 
@@ -83,7 +75,7 @@ class Glass:
 
 @functools.cache
 def catalogue() -> dict[str, Glass]:
-    """The glasses of the catalogue, by upper-case name."""
+    """The included glasses, those of SCHOTT, by upper-case name."""
     text = (Path(__file__).parent / "glasses" / "schott.txt").read_text(encoding="utf-8")
     lines = filter(None, (line.partition("#")[0].split() for line in text.splitlines()))
     return {name: Glass(name, tuple(map(float, numbers))) for name, *numbers in lines}

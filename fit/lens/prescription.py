@@ -13,19 +13,23 @@ surface and ``diameter`` the clear diameter. Radius 0 is a flat aperture stop in
 constant and polynomial, ``k=-0.6 A4=1.2e-6 A6=-3e-9`` (:mod:`torchdof.fit.lens.surface`).
 ``1.67/47.1`` is an index at 587.56 nm (the d line) with its Abbe number V, and ``1.67/47.1/0.557`` also has its partial
 dispersion P_gF, as listed in glass catalogues; an index alone is the same at any wavelength. Instead of an index there
-may be the name of a glass: one of SCHOTT's (``N-BK7``), or one defined on an earlier line by its coefficients of
-Sellmeier's formula, ``glass NAME B1 B2 B3 C1 C2 C3``. ``#`` starts a comment; ``# source:`` is kept.
+may be the name of a glass: of a maker's catalogue (``N-BK7``, ``S-LAH64``), or defined on an earlier line by its
+coefficients of Sellmeier's formula, ``glass NAME B1 B2 B3 C1 C2 C3``. ``#`` starts a comment; ``# source:`` is kept.
 
 Of a Zemax file (.zmx) the unit is read and, for each surface, curvature, thickness, clear semi-diameter, glass, conic
 constant, even asphere, and whether it is the stop. The first surface is the object and the last the sensor; flat
-surfaces in air, except the stop, are skipped. Glasses are SCHOTT's by name, otherwise they have the file's index and
-Abbe number. Mirrors, tilts, other surfaces and apertures, and several configurations raise errors.
+surfaces in air, except the stop, are skipped. A glass by name is that of the catalogues that the file states
+(:mod:`torchdof.fit.lens.catalogues`); the numbers behind the name are placeholders. A model glass has its index and
+Abbe number in the file. Mirrors, tilts, other surfaces and apertures, and several configurations raise errors.
 """
 
+import contextlib
 import math
+import re
 from dataclasses import replace
 
-from .glass import AIR, Glass, catalogue
+from .catalogues import named_glass
+from .glass import AIR, Glass
 from .surface import Surface
 
 _COLUMNS = ("radius", "thickness", "index", "diameter")
@@ -82,7 +86,11 @@ def _surface(words: list[str], medium: Glass, defined: dict[str, Glass]) -> tupl
     elif index in defined:
         glass = defined[index]
     elif index[0].isalpha() and index.lower() not in ("inf", "nan"):
-        glass = Glass.named(index)
+        try:
+            glass, _ = named_glass(index)
+        except ValueError as error:
+            remedy = f"define it by a line `glass {index} B1 B2 B3 C1 C2 C3`, or write index/V or index/V/P_gF"
+            raise ValueError(f"{error}; {remedy}") from None
     elif len(numbers := [_number("index", part) for part in index.split("/")]) <= 3:
         glass = Glass.of_numbers(*numbers)
     else:
@@ -104,11 +112,10 @@ def _number(name: str, text: str) -> float:
 
 
 def parse_zemax(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
-    """The surfaces of a .zmx file, UTF-16 or plain, the index of the stop, and the source; an error has the surface."""
-    text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+    """The surfaces of a .zmx file in any encoding, the index of the stop, and the source; an error has the surface."""
     records: list[dict[str, list[str]]] = []
-    unit, name = "MM", ""
-    for line in text.splitlines():
+    unit, name, catalogues = "MM", "", list[str]()
+    for line in re.split(r"\r\n|\r|\n", _decoded(content)):  # splitlines also splits at bytes of other encodings
         word, *fields = line.split() or [""]
         if word == "SURF":
             records.append({})
@@ -118,6 +125,8 @@ def parse_zemax(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
             raise ValueError(f"one configuration was expected, got {fields[0]}; save the one that is wanted alone")
         elif word == "UNIT":
             unit = " ".join(fields[:1])
+        elif word == "GCAT":
+            catalogues = fields
         elif word == "NAME":
             name = " ".join(fields)
         elif records:
@@ -127,13 +136,15 @@ def parse_zemax(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
     if len(records) < 3:
         raise ValueError(f"expected an object, surfaces of a lens and an image (SURF), got {len(records)} surfaces")
     surfaces: list[Surface] = []
-    stops = []
+    stops, remarks = [], dict[str, None]()
     for surface_number, record in enumerate(records[1:-1], start=1):
         try:
-            surface = _zemax_surface(record, _UNITS[unit], surfaces[-1].glass if surfaces else AIR)
+            glass, remark = _zemax_glass(record.get("GLAS", []), catalogues)
+            surface = _zemax_surface(record, _UNITS[unit], surfaces[-1].glass if surfaces else AIR, glass)
             if isinstance(surface, Surface):
                 stops += [len(surfaces)] * ("STOP" in record)
                 surfaces.append(surface)
+                remarks |= {remark: None} if remark else {}
             elif surfaces:
                 surfaces[-1] = replace(surfaces[-1], thickness=surfaces[-1].thickness + surface)
         except ValueError as error:
@@ -141,11 +152,55 @@ def parse_zemax(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
     if len(stops) != 1:
         raise ValueError(f"expected one stop (STOP) among the surfaces of the lens, got {len(stops)}")
     surfaces[-1] = replace(surfaces[-1], thickness=0.0)
-    return tuple(surfaces), stops[0], f"Zemax file{f': {name}' if name else ''}"
+    return tuple(surfaces), stops[0], "; ".join([f"Zemax file{f': {name}' if name else ''}", *remarks])
 
 
-def _zemax_surface(record: dict[str, list[str]], unit: float, medium: Glass) -> Surface | float:
-    """A surface behind a medium; for a flat one in air, which is not part of the lens, only its thickness in mm."""
+def _decoded(content: bytes) -> str:
+    """The text of a .zmx file: UTF-8, UTF-16 with or without its mark, or a code page of Windows.
+
+    Only names and comments have other characters than ASCII, so that a wrong code page does not change the lens.
+    """
+    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return content.decode("utf-16")
+    if b"\0" in content[:2]:  # half of each ASCII character
+        return content.decode("utf-16-be" if content[0] == 0 else "utf-16-le")
+    has_double_bytes = re.search(rb"[\x80-\xff]{3}", content) is not None
+    for encoding in ("utf-8-sig", *(("cp932", "gbk") if has_double_bytes else ())):
+        with contextlib.suppress(UnicodeDecodeError):
+            text = content.decode(encoding)
+            if encoding != "cp932" or not re.search("[\uff61-\uff9f\ue000-\uf8ff]", text):  # rare in Japanese
+                return text
+    return content.decode("latin-1")
+
+
+def _zemax_glass(fields: list[str], catalogues: list[str]) -> tuple[Glass, str]:
+    """The glass of the fields of GLAS, and a remark with its maker and index, "" for SCHOTT's.
+
+    The second field is 0 for a glass by name, whose numbers in the fourth and fifth field are placeholders, and 1 for a
+    model glass, which has its index and Abbe number there.
+    """
+    name, kind = (*fields, "", "")[:2]
+    if name in ("", "AIR"):
+        return AIR, ""
+    if name == "MIRROR":
+        raise ValueError("mirrors are not traced")
+    if kind in ("2", "4") or (name.startswith("___") and kind != "1"):
+        expected = "a glass by name, or a model glass with its numbers (second field 1)"
+        raise ValueError(f"expected {expected}, got GLAS {' '.join(fields[:5])}")
+    if kind == "1":
+        index, abbe = (_number("GLAS", text) for text in (*fields, "0", "0", "0", "0")[3:5])
+        return Glass.of_numbers(index, *[abbe] * (abbe > 0)), ""
+    try:
+        glass, maker = named_glass(name, catalogues)
+    except ValueError as error:
+        remedy = "make it a model glass with its index and Abbe number (GLAS NAME 1 0 INDEX ABBE)"
+        raise ValueError(f"{error}; the numbers behind the name of a glass are placeholders; {remedy}") from None
+    is_clear = glass.name == name.upper() and maker == "SCHOTT"
+    return glass, "" if is_clear else f"{name} is {maker}'s of {glass.index():.5f}"
+
+
+def _zemax_surface(record: dict[str, list[str]], unit: float, medium: Glass, glass: Glass) -> Surface | float:
+    """A surface between two media; for a flat one in air, not part of the lens, only its thickness in mm."""
 
     def number(word: str, index: int = 0) -> float:
         fields = record.get(word, [])
@@ -156,16 +211,6 @@ def _zemax_surface(record: dict[str, list[str]], unit: float, medium: Glass) -> 
         raise ValueError(f"TYPE must be STANDARD or EVENASPH, got {kind}")
     if unsupported := _APERTURES.intersection(record):
         raise ValueError(f"only round apertures without obstruction are read, got {min(unsupported)}")
-    glass_name, index, abbe = (record.get("GLAS") or [""])[0], number("GLAS", 3), number("GLAS", 4)
-    if glass_name == "MIRROR":
-        raise ValueError("mirrors are not traced")
-    if not glass_name or glass_name.upper() in catalogue():
-        glass = Glass.named(glass_name) if glass_name else AIR
-    elif index > 1.0:
-        glass = Glass.of_numbers(index, *[abbe] * (abbe > 0))
-    else:
-        missing = "the file gives no index and Abbe number for it (GLAS, fourth and fifth)"
-        raise ValueError(f"glass {glass_name} is not in the catalogue of SCHOTT, and {missing}")
     curvature, thickness = number("CURV") / unit, number("DISZ") * unit
     powers = range(1, 9) if kind == "EVENASPH" else ()
     polynomial = tuple(number(f"PARM {i}", 1) * unit ** (1 - 2 * i) for i in powers)

@@ -22,7 +22,7 @@ from torchdof.cli.main import app
 from torchdof.cli.options import Scene
 from torchdof.cli.output import Notices
 from torchdof.io.highlights import expand_highlights
-from torchdof.io.images import Picture, read_image, write_image
+from torchdof.io.images import Picture, read_image, read_values, write_image
 from torchdof.optics.field import Field
 
 pytestmark = pytest.mark.usefixtures("scene")  # its files lie in the working folder
@@ -314,7 +314,10 @@ def test_a_note_names_the_layers_of_an_exr_that_are_not_copied(image: Tensor, de
     channels = torch.cat([image, depth, image, image[:, :1]], 1)[0].permute(1, 2, 0).numpy()
     store(Path("shot.exr"), channels, "float", ("R", "G", "B", "Z", "dif.R", "dif.G", "dif.B", "N.Z"))
     note = told("render shot.exr -o out.exr --focus-m 2")[1]
-    assert "note: out.exr: is without the other layers of the image: N, dif\n" in note
+    assert "note: out.exr: is without the other layers of the image: N, dif (--keep-layers)\n" in note
+    assert "layers" not in told("render shot.exr -o kept.exr --focus-m 2 --keep-layers")[1]
+    assert torch.equal(pixels("kept.exr"), pixels("out.exr"))
+    assert torch.equal(read_values("kept.exr", "Z"), depth) and read_values("kept.exr", "dif.R").shape == depth.shape
     for options in ("shot.exr -o out.png", "image.exr depth.npy -o out.exr"):
         assert "layers" not in told(f"render {options} --focus-m 2")[1]
 
@@ -541,6 +544,54 @@ def test_a_guess_of_metres_is_noted_unless_the_focus_is_in_metres(depth: Tensor,
 
 
 # How much blur
+
+
+@pytest.mark.parametrize("value", [65535, 65504, 32767])
+def test_stray_sentinels_change_neither_the_guess_nor_the_other_pixels(run: Run, depth: Tensor, value: int) -> None:
+    metres = torch.linspace(2.0, 6.0, 24).expand(1, 1, 16, 24)
+    mm = (1000 * metres[0, 0]).round().numpy().astype(np.uint16)
+    given = mm.copy()
+    given[3, 5:8], mm[3, 5:8] = value, 0  # 0 is not measured too
+    store(Path("a.png"), given, "uint16")
+    store(Path("b.png"), mm, "uint16")
+    for options in ("", "--depth-scale 0.001 --fill-depth far "):
+        (line, notes), _ = (told(f"render image.exr {name} {options}-o {name}.exr") for name in ("a.png", "b.png"))
+        assert f"3 px of {value} without depth" in line and "3 px of depth filled (far)" in line
+        assert options or "taken for millimetres" in notes
+        assert torch.equal(pixels("a.png.exr"), pixels("b.png.exr"))
+
+
+def test_what_is_too_near_to_measure_is_the_nearest_and_not_the_farthest(run: Run, image: Tensor) -> None:
+    metres = np.linspace(2.0, 6.0, 24, dtype=np.float32)[None].repeat(16, 0)
+    metres[:, 10] = -np.inf
+    np.save("near.npy", metres)
+    of_kinds: list[dict[str, Any]] = [{"depth_kind": "z", "fill_depth": "far"}]
+    of_kinds += [{"depth_kind": "relative", "relative_kind": "depth", "near_m": 2.0, "far_m": 6.0}]
+    for options in of_kinds:
+        scene = Scene(focus_m=[(0, 2.0)], **options)
+        frame = read_frame(Path("image.exr"), Path("near.npy"), scene)
+        assert bool((frame.values[..., 10] == 2.0).all()), options
+
+
+def test_a_guess_that_is_not_safe_names_both_directions(run: Run) -> None:
+    values = np.full((16, 24), 0.9, np.float32) + np.linspace(0, 0.1, 24, dtype=np.float32)
+    values[5:, 8:16] = np.linspace(0.0, 0.05, 8, dtype=np.float32)
+    np.save("marigold.npy", values)
+    notes = told("render image.exr marigold.npy -o out.exr")[1]
+    assert "larger is farther by a guess that is not safe: --relative-kind depth if larger is farther" in notes
+    assert "--relative-kind disparity if larger is nearer" in notes
+
+
+def test_a_sequence_of_relative_depth_is_not_taken_for_metres_in_silence(run: Run) -> None:
+    disparity = torch.linspace(0.3, 12.0, 16)[None, None, :, None].repeat(1, 1, 1, 24)
+    for n in range(1, 4):
+        write_image(f"video.{n:04d}.exr", Picture(disparity, ("Y",), sample="float"))
+    command = "render shot.####.exr video.####.exr -o out.####.exr --focus-m 2"
+    warning = told(command)[1]
+    assert warning.count("taken for metres, as in every sequence without --depth-kind") == 1
+    assert "--relative-kind disparity if larger is nearer" in warning and "--depth-kind z if they are" in warning
+    assert "taken for metres" not in told(f"{command} --depth-kind z")[1]
+    assert "but its numbers grow downwards" in told("render image.exr video.0001.exr -o out.exr")[1]
 
 
 def test_blur_sets_the_largest_radius_as_a_share_of_the_width(depth: Tensor, run: Run) -> None:

@@ -45,6 +45,37 @@ def test_the_kind_of_a_map_follows_from_its_numbers(values: Tensor, whole: bool,
     assert guess_kind(values, whole) == expected
 
 
+def portrait(person: float, wall: float) -> Tensor:
+    """A person, who fills the middle of the bottom, in front of a wall that is a little slanted."""
+    values = torch.linspace(wall, wall + 0.05, COLUMNS).expand(1, 1, ROWS, COLUMNS).clone()
+    values[..., ROWS // 4 :, COLUMNS // 3 : 2 * COLUMNS // 3] = torch.linspace(person, person + 0.02, COLUMNS // 3)
+    return (values - values.min()) / (values.max() - values.min())
+
+
+def test_the_direction_of_a_portrait_is_that_of_the_person_and_is_not_sure() -> None:
+    for values, kind in ((portrait(0.2, 0.8), "depth"), (portrait(0.8, 0.2), "disparity")):
+        guess = guess_kind(values)
+        assert (guess.relative_kind, guess.is_sure) == (kind, False)
+    assert guess_kind(ground(0.0, 1.0)).is_sure and guess_kind(ground(1.0, 0.0)).is_sure
+    corridor = torch.maximum(*((torch.linspace(-1, 1, n).abs().unsqueeze(d)) for n, d in ((ROWS, 1), (COLUMNS, 0))))
+    assert guess_kind(corridor[None, None]) == Guess("relative")
+
+
+def test_kitti_is_known_by_its_shape_or_by_its_empty_pixels() -> None:
+    values = (256 * torch.linspace(70.0, 5.0, 94)).round()[None, None, :, None].repeat(1, 1, 1, 311)
+    assert guess_kind(values, integers=True) == Guess("z", 1 / 256, 0.0)
+    lidar = (256 * ground(70.0, 5.0)).round()
+    assert guess_kind(lidar, integers=True) == MILLIMETRES
+    lidar[..., 1::2, :], lidar[..., ::3] = 0.0, 0.0
+    assert guess_kind(lidar, integers=True) == Guess("z", 1 / 256, 0.0)
+
+
+def test_a_zero_that_marks_a_hole_does_not_make_a_close_up_relative() -> None:
+    values = ground(0.9, 0.2)
+    values[..., 0, 0] = 0.0
+    assert guess_kind(values) == Guess("z")
+
+
 def test_metric_input_is_not_taken_for_disparity() -> None:
     assert guess_kind(ground(1.0, 9.0)).kind == "relative"
     assert guess_kind(ground(1.0, 9.0), metric=True) == Guess("z")

@@ -35,7 +35,9 @@ def row(*values: float) -> torch.Tensor:
         ("coc", {}, -3.5, -3.5),
         ("coc", {"scale": 0.5}, 4.0, 2.0),
         ("coc", {}, 0.0, 0.0),
-        *(("z", {}, value, NAN) for value in (0.0, -1.0, NAN, -INF)),
+        *(("z", {}, value, NAN) for value in (0.0, -1.0, NAN)),
+        *((kind, {"fov_x_deg": 1.0}, -INF, 1.0) for kind in ("z", "distance")),  # too near, so as near as the nearest
+        ("z", {"unknown": -INF}, -INF, NAN),
         ("z", {"unknown": INF}, INF, NAN),
         ("z", {"unknown": 65535.0, "scale": 0.001}, 65535.0, NAN),
         *(("disparity", {"scale": 100.0}, value, NAN) for value in (INF, -2.0)),

@@ -1,6 +1,8 @@
 """Reading and writing images of every format: values, channels, parts and tags."""
 
 import dataclasses
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,8 @@ import pytest
 import torch
 
 from tests.files import spec_with, store, store_parts
+from torchdof.io.colour import stated_transfer
+from torchdof.io.decode import read_parts
 from torchdof.io.images import Picture, read_image, read_values, write_image
 
 GREY = 0.21404114  # linear light of an sRGB value of 0.5
@@ -107,6 +111,119 @@ def test_integers_are_srgb_and_floats_linear_by_default(tmp_path: Path, suffix: 
         )
 
 
+def profile(curve: bytes) -> bytes:
+    """The parts of an ICC profile that are read: its table of tags, and the red curve."""
+    tags = (1).to_bytes(4, "big") + b"rTRC" + (144).to_bytes(4, "big") + len(curve).to_bytes(4, "big")
+    return bytes(128) + tags + curve
+
+
+def png(path: Path, value: int, *chunks: tuple[bytes, bytes]) -> Path:
+    """A PNG of 16 bits with one value, and some chunks."""
+
+    def block(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    rows = zlib.compress(b"".join(b"\0" + np.full((6, 3), value, ">u2").tobytes() for _ in range(4)))
+    header = (b"IHDR", struct.pack(">IIBBBBB", 6, 4, 16, 2, 0, 0, 0))
+    content = [block(*each) for each in (header, *chunks, (b"IDAT", rows), (b"IEND", b""))]
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(content))
+    return path
+
+
+def chunks_of(path: Path) -> dict[bytes, bytes]:
+    content, start, found = path.read_bytes(), 8, {}
+    while start < len(content):
+        length = int.from_bytes(content[start : start + 4], "big")
+        found[content[start + 4 : start + 8]] = content[start + 8 : start + 8 + length]
+        start += 12 + length
+    return found
+
+
+def gamma_chunk(exponent: float) -> tuple[bytes, bytes]:
+    return b"gAMA", round(100_000 / exponent).to_bytes(4, "big")
+
+
+PQ_HALF = 92.2457 / 203.0  # an encoded 0.5 is 92.2457 cd/m2
+ICC = b"iCCP", b"x\0\0" + zlib.compress(profile(b"curv" + bytes(8)))
+
+
+@pytest.mark.parametrize(
+    ("stated", "transfer", "light"),
+    [
+        ([], "srgb", GREY),
+        ([gamma_chunk(1.0)], "linear", 0.5),
+        ([gamma_chunk(1.8)], "gamma 1.8", 0.5**1.8),
+        ([gamma_chunk(2.4)], "gamma 2.4", 0.5**2.4),
+        ([gamma_chunk(2.2)], "srgb", GREY),
+        ([(b"sRGB", b"\0"), gamma_chunk(1.0)], "srgb", GREY),  # sRGB comes before gAMA
+        ([(b"cICP", bytes([1, 8, 0, 1]))], "linear", 0.5),
+        ([(b"cICP", bytes([1, 13, 0, 1])), gamma_chunk(1.0)], "srgb", GREY),
+        ([(b"cICP", bytes([1, 1, 0, 1]))], "bt709", ((0.5 + 0.0992968) / 1.0992968) ** (1 / 0.45)),
+        ([(b"cICP", bytes([9, 16, 0, 1]))], "pq", PQ_HALF),
+        ([(b"cICP", bytes([9, 18, 0, 1]))], "hlg", 1 / 12),
+    ],
+)  # fmt: skip
+def test_a_png_is_decoded_as_it_states_and_a_copy_states_the_same(
+    tmp_path: Path, stated: Any, transfer: str, light: float
+) -> None:
+    source = png(tmp_path / "a.png", 32768, *stated)
+    picture = read_image(source)
+    assert picture.transfer == transfer
+    assert float(picture.pixels.mean()) == pytest.approx(light, rel=1e-4)
+    assert read_values(source).unique().tolist() == [32768.0]
+    assert read_image(source, "linear").pixels.mean() == pytest.approx(0.5, rel=1e-4)  # type: ignore[arg-type]
+    write_image(tmp_path / "b.png", picture)
+    assert stored(tmp_path / "b.png").min() == stored(tmp_path / "b.png").max() == 32768
+    copy = chunks_of(tmp_path / "b.png")
+    for name, content in stated:
+        assert transfer == "srgb" or copy.get(name, content) == content
+    again = read_image(tmp_path / "b.png")
+    assert again.transfer == transfer and torch.equal(again.pixels, picture.pixels)
+    write_image(tmp_path / "c.jpg", picture)  # a JPEG cannot state it
+    assert transfer in ("pq", "hlg") or read_image(tmp_path / "c.jpg").pixels.mean() == pytest.approx(light, rel=0.02)  # type: ignore[arg-type]
+
+
+def test_a_linear_profile_is_decoded_and_an_unknown_encoding_refused(tmp_path: Path) -> None:
+    assert stated_transfer({"ICCProfile": profile(b"curv" + bytes(8))}) == "linear"
+    gamma = profile(b"para" + bytes(8) + round(1.8 * 65536).to_bytes(4, "big"))
+    assert stated_transfer({"ICCProfile": gamma, "oiio:ColorSpace": "lin_rec709_scene"}) == "gamma 1.8"
+    assert stated_transfer({"ICCProfile": profile(b"para" + bytes(4) + b"\0\3" + bytes(20))}) is None  # that of sRGB
+    for codes in ((1, 9, 0, 1), (3, 13, 0, 1), (9, 16, 0, 0)):
+        path = png(tmp_path / "x.png", 9, (b"cICP", bytes(codes)))
+        with pytest.raises(ValueError, match=r"x\.png: its colours are encoded as cICP .* expected transfer 1, "):
+            read_image(path)
+        assert read_image(path, "srgb").transfer == "srgb" and read_values(path).max() == 9.0
+
+
+@pytest.mark.parametrize(
+    ("primaries", "colour", "expected"),  # one colour in both
+    [
+        ((0.708, 0.292, 0.17, 0.797, 0.131, 0.046, 0.3127, 0.329), (0.6274, 0.0691, 0.0164), (1.0, 0.0, 0.0)),
+        ((1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3), (1.0, 1.0, 1.0), (1.0, 1.0, 1.0)),  # XYZ, white
+        ((0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767), (0.4397, 0.0898, 0.0175), (1.0, 0.0, 0.0)),
+        ((0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329), (0.2, 0.3, 0.4), (0.2, 0.3, 0.4)),
+    ],
+    ids=["Rec.2020", "XYZ", "ACES 2065-1", "Rec.709"],
+)
+def test_primaries_of_an_exr_are_kept_in_an_exr_and_else_converted(
+    tmp_path: Path, primaries: Any, colour: Any, expected: Any
+) -> None:
+    spec = oiio.ImageSpec(6, 4, 3, "float")
+    spec.attribute("chromaticities", "float[8]", primaries)
+    values = np.ones((4, 6, 3), np.float32) * np.array(colour, np.float32)
+    picture = read_image(store_parts(tmp_path / "a.exr", [(spec, values)]))
+    assert picture.pixels[0, :, 0, 0].tolist() == pytest.approx(colour)
+    write_image(tmp_path / "b.exr", picture)
+    assert spec_of(tmp_path / "b.exr").getattribute("chromaticities") == pytest.approx(primaries)
+    write_image(tmp_path / "b.pfm", picture)
+    assert read_image(tmp_path / "b.pfm").pixels[0, :, 0, 0].tolist() == pytest.approx(expected, abs=2e-3)
+
+
+def test_primaries_of_a_png_are_stated_in_an_exr(tmp_path: Path) -> None:
+    write_image(tmp_path / "x.exr", read_image(png(tmp_path / "x.png", 9, (b"cICP", bytes([9, 16, 0, 1])))))
+    assert spec_of(tmp_path / "x.exr").getattribute("chromaticities")[:2] == pytest.approx((0.708, 0.292))
+
+
 def test_transfer_is_kept_from_integers_to_integers_and_else_is_the_default(tmp_path: Path) -> None:
     picture = Picture(torch.full((1, 3, 2, 2), 0.5), sample="16", transfer="linear")
     for name, changes, first in (
@@ -200,8 +317,10 @@ def test_the_first_part_with_colour_is_read_and_depth_of_the_same_size(tmp_path:
     assert picture.sample == "half"
     assert picture.depth is not None and torch.equal(picture.depth[0, 0], torch.from_numpy(depth[1][..., 0]))
     assert torch.equal(read_image(tmp_path / "x.exr", layer="beauty").pixels, picture.pixels)
-    store_parts(tmp_path / "y.exr", [colour, small])
-    assert read_image(tmp_path / "y.exr").depth is None
+    store_parts(tmp_path / "y.exr", [colour, small])  # depth of a quarter of the frame
+    depth_m = read_image(tmp_path / "y.exr").depth
+    assert depth_m is not None and depth_m.isfinite().sum() == 16 * 16
+    assert torch.equal(depth_m[0, 0, :16, :16], torch.from_numpy(small[1][..., 0]))
     assert read_values(tmp_path / "y.exr").shape == (1, 1, 16, 16)
     store_parts(tmp_path / "many.exr", [part(RGB, f"part {i}", 16) for i in range(200)])
     assert read_image(tmp_path / "many.exr", layer="part 199").pixels.shape == (1, 3, 16, 16)
@@ -233,6 +352,165 @@ def test_tiled_mipmapped_and_windowed_exr_files_survive_read_and_write(tmp_path:
     assert torch.equal(copy.pixels, picture.pixels) and copy.window == picture.window
 
 
+# Depth of a layer, view or part
+
+
+def of_values(**channels: float) -> Any:
+    """One part whose channels are constant; `__` in a name stands for a dot."""
+    values = np.ones((4, 6, len(channels)), np.float32) * np.array([*channels.values()], np.float32)
+    return spec_with(values, "float", tuple(name.replace("__", ".") for name in channels)), values
+
+
+def named(name: str, part: Any) -> Any:
+    part[0].attribute("oiio:subimagename", name)
+    return part
+
+
+COLOUR = dict.fromkeys("RGB", 0.5)
+
+
+@pytest.mark.parametrize(
+    ("parts", "layer", "expected"),  # the depth of the layer, or a part of the refusal
+    [
+        ([of_values(**COLOUR, Z=2, left__R=1, left__G=1, left__B=1, left__Z=8)], None, 2.0),
+        ([of_values(**COLOUR, Z=2, left__R=1, left__G=1, left__B=1, left__Z=8)], "left", 8.0),
+        ([of_values(A__C__R=1, A__C__G=1, A__C__B=1, A__Depth__Z=2, B__Depth__Z=8)], "A.C", 2.0),
+        ([of_values(b__Combined__R=1, b__Combined__G=1, b__Combined__B=1, a__Depth__Z=2, b__Depth__Z=8)], None, 8.0),
+        ([of_values(**COLOUR, a__Depth__Z=2, b__Depth__Z=8)], None, "belongs to the image: a.Depth.Z, b.Depth.Z"),
+        ([of_values(**COLOUR, a__Depth__Z=2, b__Depth__Z=2)], None, 2.0),  # the same numbers
+        ([of_values(**COLOUR, Z=2, fog__Z=8)], None, 2.0),
+        ([of_values(**COLOUR, N__X=1, N__Y=1, N__Z=8, P__Z=2)], None, 2.0),
+        ([named("l", of_values(Z=2)), named("rgba_right", of_values(**COLOUR)), named("depth_right", of_values(Z=8))],
+         "rgba_right", 8.0),
+        ([named("rgba.left", of_values(**COLOUR)), named("z.right", of_values(Z=2)), named("z.left", of_values(Z=8))],
+         None, 8.0),
+        ([named("image left", of_values(**COLOUR)), named("depth right", of_values(Z=2))], None, "of the other eye"),
+        ([named("rgb", of_values(**COLOUR)), named("one", of_values(Z=2)), named("two", of_values(Z=8))], None,
+         "belongs to the image: one.Z, two.Z"),
+    ],
+)  # fmt: skip
+def test_depth_is_that_of_the_layer_view_or_part_of_the_image(
+    tmp_path: Path, parts: Any, layer: str | None, expected: Any
+) -> None:
+    picture = read_image(store_parts(tmp_path / "x.exr", parts), layer=layer)
+    if isinstance(expected, float):
+        assert picture.depth is not None and picture.depth.unique().tolist() == [expected]
+        assert read_values(tmp_path / "x.exr", image=picture).unique().tolist() == [expected]
+        return
+    assert picture.depth is None and expected in picture.depth_problem
+    with pytest.raises(ValueError, match=expected):
+        read_values(tmp_path / "x.exr", image=picture)
+
+
+@pytest.mark.parametrize("channel", ["depth_right", "depth_right.Z"])
+def test_a_depth_channel_is_chosen_by_the_name_of_its_part(tmp_path: Path, channel: str) -> None:
+    parts = [named(name, of_values(Z=z)) for name, z in (("depth_left", 2.0), ("depth_right", 8.0))]
+    assert read_values(store_parts(tmp_path / "x.exr", parts), channel).unique().tolist() == [8.0]
+    with pytest.raises(ValueError, match="which of its depth channels .*: depth_left.Z, depth_right.Z"):
+        read_values(tmp_path / "x.exr", "Z")
+    with pytest.raises(ValueError, match="no channel 'depth'; it has Z, Z in the parts depth_left, depth_right"):
+        read_values(tmp_path / "x.exr", "depth")
+
+
+# Data windows
+
+
+def with_window(values: np.ndarray, box: tuple[int, int, int, int], frame: tuple[int, int] = (0, 0)) -> Any:
+    """A part with the values in a box (x, y, end x, end y) of a frame that starts at another place."""
+    x, y, end_x, end_y = box
+    cut = np.atleast_3d(values[y:end_y, x:end_x])
+    spec = spec_with(cut, "float", ("Z",) if cut.shape[2] == 1 else RGB)
+    spec.x, spec.y, spec.full_x, spec.full_y = x + frame[0], y + frame[1], *frame
+    spec.full_height, spec.full_width = values.shape[:2]
+    return spec, cut
+
+
+FRAME = np.arange(1.0, 24 * 32 + 1, dtype=np.float32).reshape(24, 32)
+
+
+@pytest.mark.parametrize("of_image", [(0, 0, 32, 24), (8, 6, 28, 20)])
+@pytest.mark.parametrize("of_depth", [(0, 0, 32, 24), (8, 6, 32, 24), (2, 0, 32, 24), (0, 4, 10, 8), (28, 20, 32, 24)])
+@pytest.mark.parametrize("start", [(0, 0), (-5, 7)])
+def test_depth_of_another_data_window_lies_where_its_window_states(
+    tmp_path: Path, of_image: Any, of_depth: Any, start: Any
+) -> None:
+    colours = np.repeat(FRAME[..., None], 3, 2)
+    image = with_window(colours, of_image)
+    expected = np.full_like(FRAME, np.nan)
+    x, y, end_x, end_y = of_depth
+    expected[y:end_y, x:end_x] = FRAME[y:end_y, x:end_x]
+    x, y, end_x, end_y = of_image
+    picture = read_image(store_parts(tmp_path / "image.exr", [image]))
+    depth = read_values(store_parts(tmp_path / "depth.exr", [with_window(FRAME, of_depth, start)]), image=picture)
+    np.testing.assert_array_equal(depth[0, 0].numpy(), expected[y:end_y, x:end_x])
+    both = read_image(store_parts(tmp_path / "both.exr", [image, named("z", with_window(FRAME, of_depth))]))
+    assert both.depth is not None
+    np.testing.assert_array_equal(both.depth[0, 0].numpy(), expected[y:end_y, x:end_x])
+
+
+def test_depth_of_half_the_size_or_without_a_window_is_placed_too(tmp_path: Path) -> None:
+    part = store_parts(tmp_path / "part.exr", [with_window(np.repeat(FRAME[..., None], 3, 2), (8, 6, 28, 20))])
+    picture, cut = read_image(part), FRAME[6:20, 8:28]
+    for name, values in (("frame.npy", FRAME), ("part.npy", cut)):  # of the frame, and of the pixels
+        np.save(tmp_path / name, values)
+        np.testing.assert_array_equal(read_values(tmp_path / name, image=picture)[0, 0].numpy(), cut)
+    half = store_parts(tmp_path / "half.exr", [with_window(FRAME[::2, ::2], (2, 0, 16, 12))])
+    np.testing.assert_array_equal(read_values(half, image=picture)[0, 0].numpy(), FRAME[6:20:2, 8:28:2])
+    odd = store_parts(tmp_path / "odd.exr", [with_window(np.repeat(FRAME[..., None], 3, 2), (7, 6, 28, 20))])
+    with pytest.raises(ValueError, match="half.exr: its frame has 16 x 12 pixels, the image's 32 x 24, so that"):
+        read_values(half, image=read_image(odd))
+    store(tmp_path / "x.png", np.zeros((24, 32, 3), np.uint8), "uint8")
+    shifted = store_parts(tmp_path / "z.exr", [with_window(FRAME, (4, 0, 32, 24))])
+    assert read_values(shifted, image=read_image(tmp_path / "x.png"))[0, 0, 5, 4] == FRAME[5, 4]
+
+
+# Other layers of a copy
+
+
+def test_a_copy_with_all_layers_differs_only_in_the_image(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    names = ("R", "G", "B", "A", "Z", "dif.R", "dif.G", "dif.B", "Crypto00.R", "Crypto00.G")
+    beauty = rng.random((6, 8, len(names)), np.float32)
+    beauty[..., 3] = 1.0
+    spec = spec_with(beauty, "half", names, Owner="me", oiio__subimagename="rgba")
+    spec.attribute("cryptomatte/ab12/manifest", "{}")
+    kinds = ["half"] * 4 + ["float"] + ["half"] * 3 + ["float"] * 2
+    spec.channelformats = tuple(oiio.TypeDesc(kind) for kind in kinds)
+    ids = rng.integers(0, 2**32 - 1, (4, 5, 1), np.uint32)
+    ids_spec = spec_with(ids, "uint32", ("id",), oiio__subimagename="ids", view="left")
+    ids_spec.x, ids_spec.y, ids_spec.full_width, ids_spec.full_height = 2, 1, 8, 6
+    source = store_parts(tmp_path / "a.exr", [(ids_spec, ids), (spec, beauty)])
+    picture = read_image(source, keep_layers=True)
+    changed = dataclasses.replace(picture, pixels=picture.pixels / 2)
+    write_image(tmp_path / "b.exr", changed)
+    before, after = (read_parts(tmp_path / name) for name in ("a.exr", "b.exr"))
+    for old, new in zip(before, after, strict=True):
+        assert (new.label, new.window, {*new.names}) == (old.label, old.window, {*old.names})
+        for k, name in enumerate(old.names):
+            j = new.names.index(name)
+            assert new.kinds[j] == old.kinds[k]
+            is_image = old.label == "rgba" and name in "RGBA"
+            assert np.array_equal(new.values[..., j], old.values[..., k] / (2 if is_image else 1)), name
+    assert after[1].metadata["cryptomatte/ab12/manifest"][1] == "{}" and after[0].metadata["view"][1] == "left"
+    write_image(tmp_path / "c.exr", read_image(source))
+    (alone,) = read_parts(tmp_path / "c.exr")
+    assert alone.names == ("R", "G", "B", "A") and alone.metadata["Owner"][1] == "me"
+    assert not any(name.startswith("cryptomatte") for name in alone.metadata)
+
+
+def test_layers_that_cannot_be_kept_are_refused(tmp_path: Path) -> None:
+    spec, values = of_values(**COLOUR, id=7)
+    spec.channelformats = tuple(map(oiio.TypeDesc, ("half", "half", "half", "uint")))
+    path = store_parts(tmp_path / "a.exr", [(spec, values)])
+    with pytest.raises(ValueError, match="a.exr: cannot keep the layers: id hold whole numbers beside others"):
+        read_image(path, keep_layers=True)
+    picture = read_image(store_parts(tmp_path / "b.exr", [of_values(**COLOUR, Z=1)]), keep_layers=True)
+    grey = dataclasses.replace(picture, pixels=picture.pixels[:, :1], channels=("Y",))
+    with pytest.raises(ValueError, match="cannot keep the layers of a picture whose channels are now Y"):
+        write_image(tmp_path / "c.exr", grey)
+    write_image(tmp_path / "c.png", picture)  # has no layers
+
+
 # Metadata
 
 
@@ -262,6 +540,35 @@ def test_pfm_rows_start_at_the_bottom_and_the_scale_is_not_applied(tmp_path: Pat
     header, size, scale, data = (tmp_path / "x.pfm").read_bytes().split(b"\n", 3)
     assert (header, size) == (b"Pf", b"3 2")
     assert np.frombuffer(data, "<f4" if float(scale) < 0 else ">f4").tolist() == [3, 4, 5, 0, 1, 2]
+
+
+@pytest.mark.parametrize("end", [b"\n", b"\r\n", b" ", b"\r"])
+@pytest.mark.parametrize("comment", [b"", b"# written by a program\n", b"# 3 4\r\n"])
+@pytest.mark.parametrize("is_text", [False, True])
+def test_pfm_headers_of_any_line_end_and_with_comments_are_read(
+    tmp_path: Path, end: bytes, comment: bytes, is_text: bool
+) -> None:
+    values = np.array([[2.0, 2.3e-41, 2.5], [3.0, 4.0, 5.0]], "<f4")  # the second contains the byte of a line feed
+    values[0, 1] = np.frombuffer(b"\n\r\n@", "<f4")[0]
+    data = values[::-1].tobytes()
+    if is_text:  # Windows
+        data, end = data.replace(b"\n", b"\r\n"), end.replace(b"\n", b"\r\n") if end == b"\n" else end
+    (tmp_path / "x.pfm").write_bytes(b"Pf" + end + comment + b"3 2" + end + b"-1.0" + end + data)
+    assert np.array_equal(read_values(tmp_path / "x.pfm")[0, 0].numpy(), values)
+
+
+def test_numbers_like_random_bytes_are_refused_and_sentinels_are_not(tmp_path: Path) -> None:
+    depth = np.linspace(2.0, 5.0, 4800, dtype="<f4").reshape(60, 80)
+    noise = np.random.default_rng(0).bytes(4 * depth.size)
+    for data in (depth.tobytes()[1:] + b"\0", depth.astype(">f4").tobytes(), noise):
+        (tmp_path / "x.pfm").write_bytes(b"Pf\n80 60\n-1\n" + data)
+        np.save(tmp_path / "x.npy", np.frombuffer(data, "<f4").reshape(60, 80))
+        for name in ("x.pfm", "x.npy"):
+            with pytest.raises(ValueError, match="as random bytes have: its bytes are in another order"):
+                read_values(tmp_path / name)
+    depth[20:], depth[:20:2], depth[1] = 1e30, 0.0, np.inf
+    np.save(tmp_path / "x.npy", depth)
+    assert np.array_equal(read_values(tmp_path / "x.npy")[0, 0].numpy(), depth)
 
 
 @pytest.mark.parametrize(

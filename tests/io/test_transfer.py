@@ -19,3 +19,13 @@ def test_curves_are_odd_functions_with_finite_gradients_at_black() -> None:
         dark = torch.tensor([0.0, -0.0, 1e-3, 0.5], dtype=torch.float64).reshape(1, 1, 1, 4).requires_grad_()
         curve(dark, "srgb", False, False).sum().backward()
         assert dark.grad is not None and bool(torch.isfinite(dark.grad).all())
+
+
+@pytest.mark.parametrize("transfer", ["bt709", "pq", "hlg", "gamma 1.8"])
+def test_other_curves_are_inverse_to_each_other_increase_and_are_odd(transfer: str) -> None:
+    values = torch.linspace(0, 1, 1001, dtype=torch.float64).reshape(1, 1, 1, -1)
+    light = decode(values, transfer, False, False)
+    torch.testing.assert_close(encode(light, transfer, False, False), values, rtol=0, atol=2e-4)
+    assert bool((light.diff() > 0).all()) and torch.equal(decode(-values, transfer, False, False), -light)
+    with pytest.raises(ValueError, match="transfer must be linear, srgb, bt709, pq, hlg, or gamma"):
+        decode(values, "cineon", False, False)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -10,11 +11,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from ..depth.guess import looks_relative
 from ..depth.holes import resolve_holes
 from ..depth.inspect import coc_colours, depth_colours, tint_focus
 from ..depth.kinds import depth_from_values
 from ..depth.relative import from_relative
-from ..depth.sanity import Mistake, coc_mistakes, depth_mistakes
+from ..depth.sanity import Mistake, coc_mistakes, depth_mistakes, whole_numbers
+from ..depth.sentinels import without_sentinels
+from ..io.colour import stated_primaries
 from ..io.highlights import expand_highlights
 from ..io.images import Picture, read_image, read_values, write_image
 from ..io.sheet import shrunk, write_sheet
@@ -27,7 +31,7 @@ from ..render.resample import resampled
 from ..validation import stretched, upright
 from .command import refuse
 from .lens import Area, Lens
-from .options import Scene
+from .options import INTEGER_TYPES, LIKE_RELATIVE, Scene
 from .output import Notices, print_result
 
 if TYPE_CHECKING:
@@ -68,25 +72,38 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
     x, y, full_x, full_y, *size = (picture.window if is_exr else None) or (0, 0, 0, 0, width, height)
     area = Area(x - full_x, y - full_y, *size)
     if depth is not None or scene.depth_channel is not None:
-        values = read_values(source, scene.depth_channel)
+        values = read_values(source, scene.depth_channel, picture)
     elif picture.depth is not None:
         values = picture.depth
+    elif picture.depth_problem:
+        raise ValueError(f"{image}: {picture.depth_problem}")
     else:
         hint = "" if is_exr else ", which a network such as Depth Anything makes of it"
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH{hint}")
+    known = values if scene.depth_unknown is None else values.masked_fill(values == scene.depth_unknown, math.nan)
+    known, sentinels = without_sentinels(known)
     if scene.depth_kind == "auto":
         is_metric = bool(scene.given(Lens) & {"focus_m", "focus_range", "aperture_radius_m"})
         stated_fill = scene.fill_depth
-        scene, guess = scene.guessed(values, source, is_metric)
+        scene, guess = scene.guessed(known, source, is_metric)
         scene = dataclasses.replace(scene, fill_depth=stated_fill) if holes else scene
     kind: Any = scene.depth_kind
+    is_whole = source.suffix.lower() in INTEGER_TYPES or whole_numbers(known[known.isfinite()])
+    is_sky = kind in ("z", "distance") and not is_whole  # a renderer writes a large distance where nothing is
+    if not sentinels or is_sky or kind == "coc" or scene.value_range is not None:
+        sentinels = ""
+    else:
+        values = known
+        scene = scene if holes or scene.strict else dataclasses.replace(scene, fill_depth=scene.fill_depth or "far")
+    if kind == "relative" and scene.relative_kind == "depth":  # -inf is too near to be measured
+        values = torch.where(values == -math.inf, torch.where(known.isfinite(), known, math.inf).min(), values)
     rows, columns = values.shape[-2:]
     try:
         if kind == "coc" and (rows, columns) != (height, width):
             sizes = f"{columns} x {rows} pixels but the image is {width} x {height}"
             raise ValueError(f"coc is {sizes}; they must be the same")
         upright(picture.pixels, values)
-        remarks = list(filter(None, [stretched(picture.pixels, values)]))
+        remarks = list(filter(None, [sentinels, stretched(picture.pixels, values)]))
         given: dict[str, Any] = {"unknown": scene.depth_unknown}
         place: Any = (...,)
         if kind == "distance":
@@ -129,19 +146,29 @@ def coc_of(
 class Renderer:
     """Reads, renders and writes the frames of ``torchdof render``."""
 
-    def __init__(self, command: "Render", is_still: bool) -> None:
+    def __init__(self, command: "Render", is_still: bool, is_assumed: bool = False) -> None:
+        """``is_assumed``: no option states that depth is in metres."""
         self.command, self.is_still = command, is_still
         self.table, self.device = command.blur_table(), _device(command.device)
-        self.notices = Notices(command.strict)
+        self.notices, self.is_assumed = Notices(command.strict), is_assumed
 
     def read(self, image: Path, depth: Path | None) -> Frame:
-        """Reads a frame as :func:`read_frame`, with the transfer curve and layer of the options."""
-        return read_frame(image, depth, self.command, transfer=self.command.transfer, layer=self.command.layer)
+        """Reads a frame as :func:`read_frame`, with the transfer curve and layers of the options."""
+        command = self.command
+        encoding: dict[str, Any] = {
+            "transfer": command.transfer,
+            "layer": command.layer,
+            "keep_layers": command.keep_layers,
+        }
+        return read_frame(image, depth, command, **encoding)
 
     def render(self, frame: Frame, out: Path, number: int) -> Callable[[], None]:
         """Renders a frame of a number; returns the function that writes it to ``out``."""
         start, picture, command = time.perf_counter(), frame.picture, self.command
         frame = dataclasses.replace(frame, values=frame.values.to(self.device))
+        if self.is_assumed and looks_relative(frame.values):
+            message = f"taken for metres, as in every sequence without --depth-kind, but {LIKE_RELATIVE}"
+            self.notices.warn(frame.name, [Mistake("relative", message)])
         coc_px, camera, remarks = coc_of(frame, self.notices, number, self.is_still)
         pixels, colours = picture.pixels.to(self.device), picture.light.shape[1]
         if command.show_focus:
@@ -183,9 +210,17 @@ class Renderer:
         has_exif, suffix = any(name.startswith("Exif:") for name in frame.picture.metadata), out.suffix.lower()
         if has_exif and suffix in _WITHOUT_EXIF:
             note("exif", f"{out}: EXIF data are lost in a {suffix} file; write .jpg, .png or .tif to keep them")
-        if frame.picture.other_layers and suffix == ".exr":
+        if frame.picture.other_layers and suffix == ".exr" and not command.keep_layers:
             layers = ", ".join(frame.picture.other_layers)
-            note("layers", f"{out}: is without the other layers of the image: {layers}")
+            note("layers", f"{out}: is without the other layers of the image: {layers} (--keep-layers)")
+        if picture.is_stated:
+            kept = picture.transfer if suffix == ".png" and command.out_transfer is None else "another encoding"
+            stated = f"{command.image}: states that it is encoded as {picture.transfer}, and is decoded so"
+            note("transfer", f"{stated} (else --transfer); {out} has {kept}")
+        if stated_primaries(picture.metadata) is not None:
+            is_kept = suffix == ".exr" or (suffix == ".png" and "CICP" in picture.metadata)
+            kept = "keeps the primaries of the image" if is_kept else "has the primaries of sRGB, converted"
+            note("primaries", f"{out}: {kept}; the image states others than those of sRGB")
         options, table = Options(**command.arguments()), self.table
         facts = {
             "out": str(out),

@@ -17,8 +17,12 @@ if TYPE_CHECKING:
     from ..optics.blur_table import BlurTable
 
 _NEAR_M, _FAR_PER_NEAR = 1.0, 8.0  # nearest relative depth in m, and farthest over nearest, by default
-_INTEGER_TYPES = (".png", ".jpg", ".jpeg", ".webp")  # types that hold whole numbers only
+INTEGER_TYPES = (".png", ".jpg", ".jpeg", ".webp")  # types that hold whole numbers only
 _RENDER_TYPES = (".exr", ".tif", ".tiff")  # types whose floats are taken for distances
+LIKE_RELATIVE = (
+    "its numbers grow downwards, as those of relative depth do: --relative-kind disparity if larger is nearer (Depth "
+    "Anything), --relative-kind depth if larger is farther (Marigold), --depth-kind z if they are distances"
+)
 
 
 class DepthMap(Group):
@@ -46,7 +50,7 @@ class DepthMap(Group):
         "Fill pixels without depth from the nearest one, from the farthest around, or with a distance (inf for a sky).",
         type=Parsed("nearest|far|METRES", number_or("nearest", "far")),
     )
-    depth_channel: str | None = option("Channel (or array of an .npz) that is depth.")
+    depth_channel: str | None = option("Channel, layer or part (or array of an .npz) that is depth.")
     strict: bool = option("Refuse what looks like a wrong unit or scale, instead of warning.", False)
 
     def __post_init__(self) -> None:
@@ -77,15 +81,14 @@ class DepthMap(Group):
 
     def guessed(self, values: "Tensor", path: Path, is_metric: bool) -> "tuple[Self, str]":
         """These options with a guessed kind, and a message unless it is clear; ``is_metric``: others are in metres."""
-        from ..depth.guess import guess_kind
+        from ..depth.guess import guess_kind, looks_relative
 
         known = values if self.depth_unknown is None else values.masked_fill(values == self.depth_unknown, math.nan)
         suffix = path.suffix.lower()
-        guess = guess_kind(known, suffix in _INTEGER_TYPES, is_metric or suffix in _RENDER_TYPES)
+        guess = guess_kind(known, suffix in INTEGER_TYPES, is_metric or suffix in _RENDER_TYPES)
         if guess.kind == "z" and guess.scale is None and is_metric:
-            is_clear = suffix in _RENDER_TYPES or guess_kind(known).kind == "z"
-            doubt = "its numbers grow downwards, as in relative depth (--depth-kind relative)"
-            message = "" if is_clear else f"taken for metres, as the options are in metres, but {doubt}"
+            is_clear = guess_kind(known).kind == "z"
+            message = "" if is_clear else f"taken for metres, as the options are in metres, but {LIKE_RELATIVE}"
             return replace(self, depth_kind="z"), message
         options = replace(
             self,
@@ -99,11 +102,21 @@ class DepthMap(Group):
             same = f"has one value everywhere, {float(finite[0]):g}, so nothing is nearer or farther"
             return options, f"{same}; is this the depth map? it was taken for metres (else --depth-kind)"
         if guess.kind == "z":
-            unit = "metres" if guess.scale is None else "millimetres"
-            return options, f"taken for {unit} (else --depth-kind, --depth-scale)"
-        larger, other = ("nearer", "depth") if guess.relative_kind == "disparity" else ("farther", "disparity")
-        message = f"taken for relative depth (else --depth-kind), larger is {larger} (else --relative-kind {other}), "
-        message += "from {:g} to {:g} m (else --near-m, --far-m)".format(*self.ends_m)
+            unit, other = {
+                0.001: ("millimetres", ", with 0.0039 for KITTI's metres * 256, 0.0002 for metres * 5000"),
+                1 / 256: ("metres * 256, as KITTI's", ", with 0.001 for millimetres"),
+            }.get(guess.scale or 1.0, ("metres", ""))
+            doubt = f", but {LIKE_RELATIVE}" if guess.scale is None and looks_relative(known) else ""
+            return options, f"taken for {unit} (else --depth-kind, --depth-scale{other}){doubt}"
+        larger, smaller = ("nearer", "farther") if guess.relative_kind == "disparity" else ("farther", "nearer")
+        message = f"taken for relative depth (else --depth-kind), larger is {larger} "
+        other_kind = "depth" if guess.relative_kind == "disparity" else "disparity"
+        if guess.is_sure:
+            message += f"(else --relative-kind {other_kind})"
+        else:
+            message += f"by a guess that is not safe: --relative-kind {guess.relative_kind} if larger is {larger}, "
+            message += f"--relative-kind {other_kind} if larger is {smaller}"
+        message += ", from {:g} to {:g} m (else --near-m, --far-m)".format(*self.ends_m)
         return replace(options, relative_kind=guess.relative_kind), message
 
 

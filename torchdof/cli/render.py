@@ -49,10 +49,11 @@ class _Effects(Group):
 class _Files(Group):
     """Files and frames."""
 
-    transfer: Encoding | None = option("How IMAGE is encoded. Default: integers srgb, floats linear.")
+    transfer: Encoding | None = option("How IMAGE is encoded. Default: as a PNG states; integers srgb, floats linear.")
     out_transfer: Encoding | None = option("How OUT is encoded. Default: as IMAGE, else by type.")
     bits: Literal["8", "16", "half", "float"] | None = option("What OUT stores. Default: as IMAGE, where the type can.")
     layer: str | None = option("Layer or part of an EXR that is the image.")
+    keep_layers: bool = option("Keep other layers, depth and parts of an EXR, unblurred.", False)
     sheet: Path | None = option("Also write the image, its depth and the result side by side to this file.")
     frames: tuple[int, int] | None = option("Part of a sequence.", type=Parsed("FIRST-LAST", parse_frames, "1-48"))
     steady: bool = option("Filter depth of a sequence along time, where neither image nor depth moved.", False)
@@ -105,7 +106,10 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         has_number = numbered and FramePattern.is_padded(self.out) and not FramePattern.is_padded(self.image)
         of_sequences = (images is None and (self.steady or depths)) or (is_single and (self.frames or has_number))
         no_number = f"{self.out}: expected one place for the frame number, such as pull.##.png; ffmpeg joins frames"
+        are_exr = {self.image.suffix.lower(), self.out.suffix.lower()} == {".exr"}
         refuse(
+            (self.keep_layers and not are_exr, "--keep-layers is for an EXR that is written to an EXR; leave it out"),
+            (self.keep_layers and self.show_focus, "--keep-layers keeps what is not blurred; leave --show-focus out"),
             (not is_single and not numbered, no_number),
             (self.sheet and not is_single, "--sheet is of one picture; leave it out where there are more"),
             (of_sequences, f"{self.image}: is a single image; for a sequence write it as shot.####.exr"),
@@ -162,8 +166,9 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         from ..depth.steady import SteadyFrames
         from .frame import Renderer
 
-        is_guessed = images and self.depth_kind == "auto"  # a guess could differ from frame to frame
-        renderer = Renderer(dataclasses.replace(self, depth_kind="z") if is_guessed else self, images is None)
+        is_assumed = images is not None and self.depth_kind == "auto"  # a guess could differ from frame to frame
+        of_frames = dataclasses.replace(self, depth_kind="z") if is_assumed else self
+        renderer = Renderer(of_frames, images is None, is_assumed)
         if self.resume and len(existing) > len(done):
             again = f"{len(existing) - len(done)} of {len(outputs)} frames are rendered again"
             renderer.notices.note("again", f"{self.out}: {again}: {reason}")

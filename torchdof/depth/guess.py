@@ -10,13 +10,18 @@ from torch import Tensor
 from .relative import RelativeKind
 from .sanity import whole_numbers
 
-__all__ = ["Guess", "guess_kind", "subject_m"]
+__all__ = ["Guess", "guess_kind", "looks_relative", "subject_m"]
 
 _MAX_SAMPLES = 65_536  # most pixels examined
 
 # Kind of the numbers. Whole numbers are grey levels if the largest is <= _MAX_8_BIT or >= _MIN_16_BIT.
 _MAX_8_BIT, _MIN_16_BIT = 255, 60_000
 _NEAR_ZERO = 0.05  # numbers up to 1 are relative if the smallest is below this: in metres it would be too near
+_EMPTY_GAP = 0.1  # smallest number over the largest from which a 0 is no number of the map
+_KITTI_ASPECTS = (3.1, 3.7)  # width over height of KITTI's pictures, whose maps hold metres * 256
+_KITTI_EMPTY = 0.6  # share of zeros from which whole numbers are a lidar's, as in KITTI's maps
+_NEAR_SHARE = 0.1  # the same as a share of the largest: a close-up in metres rarely spans as much
+_CLEAR_DIFFERENCE = 0.3  # of mean ranks, in [0, 1], between the bottom's middle and the upper corners
 _CLEAR_CORRELATION = 0.35  # absolute correlation of values and rows above which values clearly grow or shrink downwards
 
 # Subject of a picture: a peak in the histogram of nearness, which is linear in the numbers of the map
@@ -35,17 +40,21 @@ class Guess:
     scale: float | None = None  # metres per unit, for "z"; None for metres
     unknown: float | None = None  # the value that means "not measured"
     relative_kind: RelativeKind = "disparity"  # larger for nearer surfaces; "depth" is larger for farther ones
+    is_sure: bool = dataclasses.field(default=True, compare=False)  # whether the map shows which end is near
 
 
 def guess_kind(values: Tensor, integers: bool = False, metric: bool = False) -> Guess:
     """Guesses the meaning of the numbers of a depth map ``[1, 1, H, W]``; NaN and infinite values are ignored.
 
     * Whole numbers are relative depth (grey levels) if the largest is at most 255, or at least 60,000. Otherwise they
-      are millimetres, with 0 for pixels that were not measured.
+      are millimetres, with 0 for pixels that were not measured; in maps of KITTI's shape, or if most are 0, metres
+      times 256.
     * Other numbers are relative depth if they lie in [0, 1] and come near 0, or if some are negative; else metres.
       A single negative number, such as -1, marks pixels without depth.
     * Relative depth is "disparity" (larger is nearer), unless the values clearly shrink downwards: the ground is nearer
-      than the sky. For the same reason distances that clearly grow downwards are taken for relative disparity.
+      than the sky; or, where this is unclear, are smaller in the middle of the bottom than in the upper corners: a
+      person is nearer than the background. For the same reason distances that clearly grow downwards are taken for
+      relative disparity.
 
     ``integers``: the file type holds whole numbers only; otherwise the values are examined. ``metric``: other input is
     in metres; distances are then never taken for disparity.
@@ -57,17 +66,33 @@ def guess_kind(values: Tensor, integers: bool = False, metric: bool = False) -> 
     low, high = (float(end) for end in finite.aminmax()) if finite.numel() else (0.0, 0.0)
     if low == high:
         return Guess("z")
+    if low == 0.0:  # "not measured" rather than a number of the map, if it is far from all others
+        positive = float(finite[finite > 0].min())
+        low = positive if positive > _EMPTY_GAP * high else low
     downwards = _growth_downwards(values)
     is_whole = integers or whole_numbers(finite)
     if is_whole:
         is_relative = high <= _MAX_8_BIT or high >= _MIN_16_BIT
     else:
-        is_relative = low < 0 or (high <= 1 and low < _NEAR_ZERO)
+        is_relative = low < 0 or (high <= 1 and low < max(_NEAR_ZERO, _NEAR_SHARE * high))
     if is_relative:
-        return Guess("relative", relative_kind="depth" if downwards < -_CLEAR_CORRELATION else "disparity")
+        to_person = _growth_to_person(values)
+        is_clear = abs(downwards) > _CLEAR_CORRELATION
+        is_farther = downwards < -_CLEAR_CORRELATION if is_clear else to_person < -_CLEAR_DIFFERENCE
+        is_sure = is_clear and downwards * to_person >= 0  # a picture of the ground
+        return Guess("relative", relative_kind="depth" if is_farther else "disparity", is_sure=is_sure)
     if downwards > _CLEAR_CORRELATION and not metric:
         return Guess("relative")
-    return Guess("z", 0.001, 0.0) if is_whole else Guess("z")
+    if not is_whole:
+        return Guess("z")
+    aspect = values.shape[-1] / values.shape[-2]
+    is_of_kitti = _KITTI_ASPECTS[0] < aspect < _KITTI_ASPECTS[1] or float((values == 0).double().mean()) > _KITTI_EMPTY
+    return Guess("z", 1 / 256 if is_of_kitti else 0.001, 0.0)
+
+
+def looks_relative(metres: Tensor) -> bool:
+    """Whether depth ``[1, 1, H, W]`` that is taken for metres clearly grows downwards, as disparity does."""
+    return _growth_downwards(metres) > _CLEAR_CORRELATION
 
 
 def subject_m(depth: Tensor, kind: RelativeKind = "disparity") -> float:
@@ -109,6 +134,21 @@ def _sampled(values: Tensor) -> Tensor:
     """Every n-th row and column of a map ``[1, 1, H, W]``, so that about ``_MAX_SAMPLES`` values remain: ``[h, w]``."""
     step = math.ceil(math.sqrt(values.numel() / _MAX_SAMPLES))
     return values[0, 0, step // 2 :: step, step // 2 :: step]
+
+
+def _growth_to_person(values: Tensor) -> float:
+    """Mean rank, in [0, 1], in the middle of the bottom less that in the upper corners; positive if it is larger."""
+    values = _sampled(values)
+    known = values.isfinite() & (values != 0)
+    rows, columns = (torch.linspace(0.0, 1.0, n, dtype=torch.float64) for n in values.shape)
+    is_side, is_middle = (columns - 0.5).abs() > 0.25, (columns - 0.5).abs() < 0.2
+    corners = known & (rows < 0.4)[:, None] & is_side
+    bottom = known & (rows > 0.6)[:, None] & is_middle
+    if not bool(corners.any()) or not bool(bottom.any()):
+        return 0.0
+    ordered = values[known].sort().values
+    ranks = [torch.searchsorted(ordered, values[area]).double().mean() / ordered.numel() for area in (bottom, corners)]
+    return float(ranks[0] - ranks[1])
 
 
 def _growth_downwards(values: Tensor) -> float:

@@ -41,7 +41,8 @@ def depth_from_values(
         scale: Factor; None means 1, but is refused for disparity.
         offset: Added to the value before scaling.
         unknown: A value that marks pixels without depth, for example 0, -1 or inf. NaN always does, and so does every
-            value whose result is zero, negative or NaN (a disparity of inf, for example); for coc, NaN and inf.
+            value whose result is zero, negative or NaN (a disparity of inf, for example); for coc, NaN and inf. -inf
+            of "z" and "distance" means too near to be measured, and becomes the smallest depth of the item.
         fov_x_deg: Horizontal field of view in degrees; required for "distance".
 
     Returns:
@@ -85,4 +86,9 @@ def depth_from_values(
         y, x = ((torch.arange(n, dtype=depth.dtype, device=depth.device) + 0.5 - n / 2) for n in depth.shape[-2:])
         depth /= torch.sqrt(1.0 + (x * slope) ** 2 + (y[:, None] * slope) ** 2)
     metres = depth.float()
-    return torch.where(metres.isfinite() if kind == "coc" else metres > 0, metres, torch.nan)
+    is_known = metres.isfinite() if kind == "coc" else metres > 0
+    if kind in ("z", "distance") and unknown != -math.inf:
+        nearest = torch.where(is_known & metres.isfinite(), metres, torch.inf).amin((1, 2, 3), keepdim=True)
+        is_too_near = (values == -math.inf) & nearest.isfinite()
+        metres, is_known = torch.where(is_too_near, nearest, metres), is_known | is_too_near
+    return torch.where(is_known, metres, torch.nan)

@@ -5,7 +5,7 @@ from typing import Literal
 
 from torch import Tensor
 
-from ..io.images import read_values
+from ..io.images import Picture, read_values
 from ..validation import choice
 from .holes import Fill, resolve_holes
 from .kinds import KINDS, DepthKind, depth_from_values
@@ -28,12 +28,13 @@ def read_depth(
     value_range: tuple[float, float] | None = None,
     fill: Fill | None = None,
     channel: str | None = None,
+    image: Picture | None = None,
 ) -> Tensor:
     """Reads a depth map: :func:`torchdof.io.images.read_values`, conversion to metres, :func:`fill_holes`.
 
     The conversion is :func:`depth_from_values` with ``scale``, ``offset``, ``unknown`` and ``fov_x_deg``. For the kind
     ``"relative"`` it is :func:`from_relative` with ``near_m``, ``far_m``, ``relative_kind``, ``value_range`` and
-    ``unknown``.
+    ``unknown``. ``image``, if given, is the picture that the map belongs to, in whose frame an EXR's data window is placed.
 
     Returns:
         ``[1, 1, H, W]`` float32 in metres (signed pixels for coc), without holes.
@@ -49,7 +50,7 @@ def read_depth(
     if not is_relative and (near_m, far_m, value_range, relative_kind) != (None, None, None, "disparity"):
         names = "near_m, far_m, relative_kind and value_range"
         raise ValueError(f"{names} are for the kind 'relative', got the kind {kind!r}; leave them out")
-    values = read_values(path, channel)
+    values = read_values(path, channel, image)
     if kind == "relative":
         if near_m is None or far_m is None:
             raise ValueError("relative depth needs near_m and far_m, the distances of the nearest and farthest value")

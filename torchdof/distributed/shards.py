@@ -226,7 +226,7 @@ class RenderShards:
     ) -> dict[str, Any]:
         """One sample as WebDataset takes it: its key, the contents of its files by name, its parameters as ``json``."""
         source = read_image(image, self.transfer)
-        metres = at_size_of(source.pixels, read_depth(depth or image, **self.depth))
+        metres = at_size_of(source.pixels, read_depth(depth or image, image=source, **self.depth))
         digest = hashlib.sha256(f"{self.seed} {key}".encode()).digest()
         drawn = self.blur.draw(torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1))
         camera = self.blur.camera.replace(

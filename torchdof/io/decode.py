@@ -19,6 +19,11 @@ from .metadata import Metadata, kept_metadata, upright
 
 MAX_PIXELS = 2**28  # of an image or array; a larger limit allows damaged headers to claim more memory
 MAX_ATTRIBUTES = 4096  # in all parts of an EXR file together; renderers write a few hundred
+_MAX_STRANGE = 0.1  # largest share of numbers smaller than 1e-18 or larger than 1e18; more: damaged files are read
+_SPACE = rb"(?:\s|#[^\n]*\n)+"  # white space and comments
+_PFM_HEADER = re.compile(
+    rb"P([Ff])" + _SPACE + rb"(-?\d{1,9})" + _SPACE + rb"(-?\d{1,9})" + _SPACE + rb"([-+.\deE]+)(?=\s)"
+)
 MAX_CHANNELS = 1024  # in a part of an EXR file; OpenImageIO has the same limit
 
 
@@ -35,6 +40,7 @@ class Part:
     metadata: Metadata = dataclasses.field(default_factory=dict)
     window: tuple[int, int, int, int, int, int] | None = None  # x, y, full x, full y, full width, full height
     orientation: int = 1  # EXIF orientation as stored; the values are upright already
+    stated: dict[str, Any] = dataclasses.field(default_factory=dict)  # what a PNG states of its encoding
 
 
 @contextlib.contextmanager
@@ -86,7 +92,7 @@ def _parts(name: str) -> Iterator[Part]:
             if not source.seek_subimage(number, 0):
                 return
             spec = source.spec()
-            _check_size(spec.width, spec.height, spec.nchannels * (spec.format.size() + 4))
+            check_size(spec.width, spec.height, spec.nchannels * (spec.format.size() + 4))
             if spec.deep:
                 raise ValueError("holds deep samples; flatten it to one sample a pixel first")
             _check_colours(spec)
@@ -111,6 +117,7 @@ def _parts(name: str) -> Iterator[Part]:
                 metadata=metadata,
                 window=window if values.shape[:2] == (spec.height, spec.width) else None,
                 orientation=orientation,
+                stated={a.name: a.value for a in spec.extra_attribs} if source.format_name() == "png" else {},
             )
     finally:
         source.close()
@@ -170,20 +177,50 @@ def _check_colours(spec: Any) -> None:
 def _read_pfm(path: Path) -> Part:
     """Reads a PFM file. OpenImageIO would multiply disparities by the scale in the header."""
     with path.open("rb") as file:
-        header = re.match(rb"P([Ff])\s+(-?\d+)\s+(-?\d+)\s+([-+.\deE]+)\s", file.read(400))
+        header = _PFM_HEADER.match(file.read(4096))
         if header is None:
             raise OSError("is not a PFM file (its header should read 'PF' or 'Pf', size and scale)")
         names = "RGB" if header[1] == b"F" else "Y"
-        width, height = int(header[2]), int(header[3])
-        _check_size(width, height, 2 * 4 * len(names))
-        count = width * height * len(names)
+        width, height, scale = int(header[2]), int(header[3]), header[4]
+        check_size(width, height, 2 * 4 * len(names))
+        try:
+            has_order = float(scale) != 0.0
+        except ValueError:
+            raise OSError(f"is not a PFM file (its scale should be a number, got {scale.decode()!r})") from None
+        if not has_order:
+            raise ValueError("has scale 0, which states no byte order; write -1 for little-endian or 1 for big-endian")
+        byte_count = 4 * width * height * len(names)
         file.seek(header.end())
-        data = file.read(4 * count)
-    if len(data) != 4 * count:
-        raise OSError(f"is cut short ({len(data)} of {4 * count} bytes of pixels)")
-    values = np.frombuffer(data, dtype="<f4" if header[4].startswith(b"-") else ">f4").astype(np.float32)
+        data = file.read(2 * byte_count + 2)
+    if len(data) == byte_count + 2 and data[:2] == b"\r\n":
+        data = data[1:]
+    elif len(data) > byte_count + 1 and len(data) - data.count(b"\r\n") == byte_count + 1:
+        data = data.replace(b"\r\n", b"\n")  # all of it was written in the text mode of Windows
+    data = data[1:]  # without the white space that ends the header
+    if len(data) != byte_count:
+        problem = "is cut short" if len(data) < byte_count else "is longer than its header says"
+        raise OSError(f"{problem} ({len(data)} of {byte_count} bytes of pixels)")
+    values = np.frombuffer(data, dtype="<f4" if scale.startswith(b"-") else ">f4").astype(np.float32)
+    _refuse_noise(values)
     values = values.reshape(height, width, len(names))[::-1]  # the bottom row is stored first
     return Part("", tuple(names), values, ("float",) * len(names))
+
+
+def _refuse_noise(values: np.ndarray) -> None:
+    """Refuses floating-point numbers whose magnitudes are those of bytes in a wrong order or from a wrong place.
+
+    A quarter of random single-precision numbers is smaller than 1e-18, and a quarter is larger than 1e18. One or two
+    such numbers may mark pixels without depth.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        magnitudes = np.abs(values.reshape(-1)[:: 1 + values.size // 2**20].astype(np.float64))
+    magnitudes = magnitudes[np.isfinite(magnitudes) & (magnitudes > 0)]
+    is_strange = (magnitudes < 1e-18) | (magnitudes > 1e18)
+    share = is_strange.mean() if magnitudes.size else 0.0
+    if share == 1.0 or (share > _MAX_STRANGE and np.unique(magnitudes[is_strange]).size > 2):
+        ends = f"{magnitudes.min():.1g} to {magnitudes.max():.1g}"
+        advice = "its bytes are in another order, type or place than its header says; write the file anew"
+        raise ValueError(f"its numbers have magnitudes from {ends}, as random bytes have: {advice}")
 
 
 def read_array(path: Path, key: str | None) -> np.ndarray:
@@ -212,11 +249,13 @@ def read_array(path: Path, key: str | None) -> np.ndarray:
         array = array[0] if array.shape[0] == 1 else array[..., 0]
     if array.ndim != 2 or array.dtype.kind not in "fiu" or array.size == 0:
         raise ValueError(f"expected an array [H, W] of numbers, got {list(shape)} of {array.dtype}")
-    _check_size(array.shape[1], array.shape[0], array.dtype.itemsize + 4)
+    check_size(array.shape[1], array.shape[0], array.dtype.itemsize + 4)
+    if array.dtype.kind == "f":
+        _refuse_noise(array)
     return np.asarray(array)
 
 
-def _check_size(width: int, height: int, pixel_bytes: int) -> None:
+def check_size(width: int, height: int, pixel_bytes: int) -> None:
     """Refuses a picture with too many pixels, or for which there is too little memory."""
     claim = f"its header claims {width} x {height} pixels"
     if width < 1 or height < 1 or width * height > MAX_PIXELS:

@@ -1,12 +1,14 @@
 """Reads and writes images in linear light: EXR, PNG, TIFF, JPEG, WebP, HDR and PFM, with OpenImageIO.
 
-The transfer curve is never guessed from a tag. Files of integers (PNG, JPEG, TIFF of 8 or 16 bits) are sRGB, and files
-of floats (EXR, HDR, PFM, TIFF of floats) linear light, unless the argument ``transfer`` changes that.
+Files of integers (PNG, JPEG, TIFF of 8 or 16 bits) are sRGB, and files of floats (EXR, HDR, PFM, TIFF of floats) linear
+light, unless the argument ``transfer`` changes that, or a PNG states another encoding (gAMA, cICP). Other tags are
+ignored. Primaries are kept where the written file can state them, and are otherwise converted to those of sRGB.
 """
 
 import dataclasses
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +18,14 @@ from torch import Tensor
 
 from ..validation import choice, real_tensor, show
 from .atomic import atomic_file
-from .channels import colour_channels, depth_channel
+from .channels import colour_channels, depth_channels, named_channels, nearest_channel
+from .colour import in_rec709, stated_primaries, stated_transfer
 from .decode import Part, errors_named, first_line, is_complete, read_array, read_parts, utf8_name
+from .layers import LOSSLESS, OF_LAYERS, Layers
 from .paths import PixelType, existing_image, existing_map, samples_of
 from .transfer import Transfer, decode, default_transfer, encode, encode_8_bits
 from .webp import add_exif
+from .windows import Window, placed
 
 __all__ = ["Picture", "read_image", "read_values", "write_image"]
 
@@ -29,7 +34,6 @@ _SAMPLE_TYPES: dict[str, PixelType] = {name: sample for sample, name in _OIIO_SA
 _WHITE = {"8": 255.0, "16": 65535.0, "half": 1.0, "float": 1.0}
 _ALPHA_SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".webp")
 _GREY_SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pfm")
-_LOSSLESS_EXR = ("none", "rle", "zip", "zips", "piz")
 _JPEG = {"compression": "jpeg:95", "jpeg:subsampling": "4:4:4"}
 _SETTINGS: dict[str, Mapping[str, object]] = {
     **{".jpg": _JPEG, ".jpeg": _JPEG, ".webp": {"compression": "webp:95"}},
@@ -44,13 +48,18 @@ class Picture:
     Args:
         pixels: ``[1, C, H, W]`` float32 in linear light. Colour is premultiplied by alpha, if there is alpha.
         channels: Names of the channels: ``("R", "G", "B")`` or grey ``("Y",)``, either with ``"A"`` at the end.
-        depth: ``[1, 1, H, W]``, the numbers of the file's own depth channel, or None.
+        depth: ``[1, 1, H, W]``, the numbers of the file's own depth channel, or None. Where another data window leaves
+            pixels without depth, it is NaN.
         metadata: Name -> (OpenImageIO type, value).
         sample: Stored type of a sample: "8", "16", "half" or "float".
-        transfer: Encoding of the file, "linear" or "srgb".
+        transfer: Encoding of the file: "linear" or "srgb", or another one that a PNG states.
+        is_stated: Whether the file states its encoding, and that is not sRGB.
         window: Place of the pixels in the full frame (EXR data window): x, y, full x, full y, full width, full height.
         orientation: EXIF orientation of the file; the pixels are upright already.
         other_layers: Names of the layers of the file that are neither the pixels nor the depth.
+        layer: Names of the part and layer of the pixels, joined by a dot.
+        depth_problem: The reason why none of several depth channels was taken, or empty.
+        layers: All parts and layers of an EXR file, which :func:`write_image` then writes too; None writes the pixels.
     """
 
     pixels: Tensor
@@ -59,9 +68,13 @@ class Picture:
     metadata: Mapping[str, tuple[Any, Any]] = dataclasses.field(default_factory=dict)
     sample: PixelType = "float"
     transfer: Transfer = "linear"
-    window: tuple[int, int, int, int, int, int] | None = None
+    window: Window | None = None
     orientation: int = 1
     other_layers: tuple[str, ...] = ()
+    is_stated: bool = False
+    layer: str = ""
+    depth_problem: str = ""
+    layers: Layers | None = None
 
     @property
     def has_alpha(self) -> bool:
@@ -74,13 +87,16 @@ class Picture:
         return self.pixels[:, :-1] if self.has_alpha else self.pixels
 
 
-def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, layer: str | None = None) -> Picture:
+def read_image(
+    path: str | os.PathLike[str], transfer: Transfer | None = None, layer: str | None = None, keep_layers: bool = False
+) -> Picture:
     """Reads an image into linear light.
 
     Args:
         path: An EXR, PNG, TIFF, JPEG, WebP, HDR or PFM file; HEIC and raw files if OpenImageIO was built to read them.
-        transfer: "linear" or "srgb"; None uses "srgb" for integers and "linear" for floats, and ignores tags.
+        transfer: "linear" or "srgb"; None uses what a PNG states, else "srgb" for integers and "linear" for floats.
         layer: Name of the part or layer of an EXR file to read; None takes the first that has colour.
+        keep_layers: Keep the other layers and parts of an EXR file, so that a copy has them too.
 
     Returns:
         The picture, upright; its depth channel is one like ``Z``, ``depth`` or ``ViewLayer.Depth.Z`` of an EXR file.
@@ -104,16 +120,37 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
         parts = read_parts(path)
         part, indices, names = colour_channels(parts, layer)
         source = parts[part]
+        stated = stated_transfer(source.stated) if transfer is None else None
+        transfer = stated or transfer
         pixels, sample, transfer = _light(source, indices, transfer, has_alpha=names[-1] == "A")
-        depth, places = None, {(part, k) for k in indices}
-        same_size = [n for n, p in enumerate(parts) if p.values.shape[:2] == source.values.shape[:2]]
-        depth_place = depth_channel([parts[n] for n in same_size])
-        if depth_place is not None:
-            places.add((same_size[depth_place[0]], depth_place[1]))
-            depth = _map(parts[same_size[depth_place[0]]].values[..., depth_place[1]])
+        kept = Layers(tuple(parts), part, tuple(indices)) if keep_layers and source.is_exr else None
+        depth, problem, places = None, "", {(part, k) for k in indices}
+        in_layer = source.names[indices[0]].rpartition(".")[0]
+        label = f"{source.label}.{in_layer}".strip(".")
+        if found := depth_channels(parts):
+            try:
+                n, k = nearest_channel(parts, found, label)
+                depth = _placed(parts[n], k, pixels.shape[-2:], source.window)
+                places.add((n, k))
+            except ValueError as error:
+                problem = str(error)
     left = [(p.label, name) for n, p in enumerate(parts) for k, name in enumerate(p.names) if (n, k) not in places]
-    layers = tuple(dict.fromkeys(name.rpartition(".")[0] or label or name for label, name in left))
-    return Picture(pixels, names, depth, source.metadata, sample, transfer, source.window, source.orientation, layers)
+    others = tuple(dict.fromkeys(name.rpartition(".")[0] or label or name for label, name in left))
+    return Picture(
+        pixels,
+        names,
+        depth,
+        source.metadata,
+        sample,
+        transfer,
+        source.window,
+        source.orientation,
+        others,
+        is_stated=stated is not None,
+        layer=label,
+        depth_problem=problem,
+        layers=kept,
+    )
 
 
 def _light(
@@ -165,7 +202,8 @@ def write_image(
             folder is made.
         picture: Pixels in linear light; metadata that the format supports is written too.
         transfer: "linear" or "srgb". None keeps the picture's own if both its ``sample`` and the new one are integers,
-            or both floats; otherwise it is "srgb" for integers and "linear" for floats.
+            or both floats, and the file can state it where the picture's file does; otherwise it is "srgb" for integers
+            and "linear" for floats.
         sample: "8", "16", "half" or "float"; None keeps the picture's own if the format supports it, and otherwise
             takes the default of the format (8 bits, or half for EXR).
 
@@ -187,7 +225,8 @@ def write_image(
         raise ValueError(f"{path}: a {suffix} file holds samples of {' or '.join(sample_types)}, not {sample}")
     if transfer is None:
         both_floats_or_integers = default_transfer(sample) == default_transfer(picture.sample)
-        transfer = picture.transfer if both_floats_or_integers else default_transfer(sample)
+        is_kept = both_floats_or_integers and (suffix == ".png" or not picture.is_stated)
+        transfer = picture.transfer if is_kept else default_transfer(sample)
     pixels = real_tensor("pixels", picture.pixels, "[1, C, H, W] in linear light").detach().cpu().float()
     names = picture.channels
     if pixels.ndim != 4 or pixels.shape[:2] != (1, len(names)):
@@ -196,6 +235,14 @@ def write_image(
         if bool((pixels[:, -1] < 1.0).any()):
             raise ValueError(f"{path}: a {suffix} file cannot hold the alpha channel; write .exr, .png or .tif instead")
         pixels, names = pixels[:, :-1], names[:-1]
+    primaries = stated_primaries(picture.metadata)
+    codes = {name: value for name, (_, value) in picture.metadata.items() if name == "CICP"}
+    is_cicp = bool(codes) and suffix == ".png" and transfer == (stated_transfer(codes) or "srgb")
+    if primaries is not None and names[0] == "R" and suffix != ".exr" and not is_cicp:
+        try:
+            pixels = in_rec709(pixels, primaries)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
     if names[0] == "Y" and suffix not in _GREY_SUFFIXES:
         pixels, names = pixels.expand(-1, 3, -1, -1), ("R", "G", "B")
     straight = names[-1] == "A" and suffix != ".exr"
@@ -214,12 +261,20 @@ def write_image(
     if picture.window is not None:
         spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height = picture.window
     for name, (kind, value) in picture.metadata.items():
-        is_lossless = suffix == ".exr" and value in _LOSSLESS_EXR
-        if {"compression": is_lossless, "ICCProfile": transfer == picture.transfer}.get(name, True):
+        is_lossless = suffix == ".exr" and value in LOSSLESS
+        is_same = {"ICCProfile": transfer == picture.transfer, "CICP": is_cicp, "chromaticities": suffix == ".exr"}
+        is_lost = picture.layers is None and re.match(OF_LAYERS, name) is not None
+        if {"compression": is_lossless, **is_same}.get(name, not is_lost):
             typed = (value,) if isinstance(value, int) else (kind, value)  # with a 16-bit type it would be dropped
             spec.attribute(name, *typed)
-    if transfer == "srgb" or suffix != ".exr":  # not of linear EXR files, whose primaries are those of the input
+    if is_cicp or transfer not in ("linear", "srgb"):  # "unknown": OpenImageIO states what the other attributes say
+        spec.attribute("oiio:ColorSpace", "unknown")
+        if transfer.startswith("gamma") and not is_cicp:
+            spec.attribute("oiio:Gamma", float(transfer.split()[1]))
+    elif transfer == "srgb" or suffix != ".exr":  # not of linear EXR files, whose primaries are those of the input
         spec.attribute("oiio:ColorSpace", "srgb_rec709_scene" if transfer == "srgb" else "lin_rec709_scene")
+    if suffix == ".exr" and primaries is not None:
+        spec.attribute("chromaticities", "float[8]", primaries)
     if transfer == "linear" and suffix != ".exr":
         spec.attribute("Exif:ColorSpace", 65535)  # "uncalibrated"; OpenImageIO cannot write a TIFF without any EXIF
     if straight:
@@ -227,16 +282,27 @@ def write_image(
     for name, setting in _SETTINGS.get(suffix, {}).items():
         spec.attribute(name, setting)
 
+    parts = [(spec, array)]
+    if picture.layers is not None and suffix == ".exr":
+        if len(picture.layers.channels) != len(names):
+            raise ValueError(f"{path}: cannot keep the layers of a picture whose channels are now {', '.join(names)}")
+        parts = picture.layers.replaced(spec, array)
+    specs = tuple(each for each, _ in parts)
+
     with atomic_file(path) as temporary:
         with temporary.open("wb") as file:
             if suffix in (".jpg", ".jpeg") and hasattr(os, "posix_fallocate"):
                 os.posix_fallocate(file.fileno(), 0, array.size + 2**20)  # fails here: libjpeg exits on a full disk
         with utf8_name(temporary) as name:
             output = oiio.ImageOutput.create(name)
-            if output is None or not output.open(name, spec):
+            if output is None or not output.open(name, specs if len(specs) > 1 else specs[0]):
                 problem = (oiio if output is None else output).geterror()
                 raise OSError(f"{path}: could not be opened for writing ({first_line(problem)})")
-            is_written, is_closed = output.write_image(array), output.close()
+            is_written = True
+            for number, (each, values) in enumerate(parts):
+                is_open = number == 0 or output.open(name, each, "AppendSubimage")
+                is_written = is_written and is_open and output.write_image(np.ascontiguousarray(values))
+            is_closed = output.close()
             problem = output.geterror()  # of a full disk, unless it fills up in the last flush of the buffer
             if not (is_written and is_closed) or problem or not is_complete(temporary):
                 raise OSError(f"{path}: could not be written ({first_line(problem)}); is the disk full?")
@@ -244,13 +310,15 @@ def write_image(
                 add_exif(temporary, spec)
 
 
-def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Tensor:
+def read_values(path: str | os.PathLike[str], channel: str | None = None, image: Picture | None = None) -> Tensor:
     """Reads the numbers of a one-channel map, such as a depth map, without transfer curve or scaling of integers.
 
     Args:
         path: An image of one channel (or of equal ones), an EXR file with a depth channel, or ``.npy`` / ``.npz``.
-        channel: Name of a channel of an image, or of an array in an ``.npz`` file; None takes the only one, or the
-            depth channel.
+        channel: Name of a channel, layer or part of an image, or of an array in an ``.npz`` file; None takes the only
+            one, or the depth channel.
+        image: The image that the map belongs to. Of several depth channels, that of its layer is taken; the map is
+            placed by the data windows of both, NaN where the map has no numbers. None takes the map as it is stored.
 
     Returns:
         ``[1, 1, H, W]`` float32; a 16-bit file gives 0 to 65535, an 8-bit file 0 to 255. The scale in the header of
@@ -263,21 +331,38 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
     path = existing_map(path)
     with errors_named(path):
         if path.suffix.lower() in (".npy", ".npz"):
-            return _map(read_array(path, channel))
-        parts = read_parts(path)
-        planes = [(p.label, name, p.values[..., k]) for p in parts for k, name in enumerate(p.names)]
-        channel_names = ", ".join(name for _, name, _ in planes)
-        if channel is not None:
-            for label, name, values in planes:
-                if channel in (name, f"{label}.{name}"):
-                    return _map(values)
-            raise ValueError(f"no channel {channel!r}; it has {channel_names}")
-        if (depth_place := depth_channel(parts)) is not None:
-            return _map(parts[depth_place[0]].values[..., depth_place[1]])
-        if all(np.array_equal(values, planes[0][2]) for _, name, values in planes if name != "A"):
-            return _map(planes[0][2])
-        advice = "name it (--depth-channel); the colours of a heat map are no depth: save the map in grey, or as .npy"
-        raise ValueError(f"which of the channels {channel_names} is depth? {advice}")
+            part, k = Part("", ("Y",), read_array(path, channel)[..., None], ("float",)), 0
+        else:
+            parts = read_parts(path)
+            n, k = _map_channel(parts, channel, "" if image is None else image.layer)
+            part = parts[n]
+        if image is None:
+            return _map(part.values[..., k])
+        return _placed(part, k, image.pixels.shape[-2:], image.window)
+
+
+def _map_channel(parts: list[Part], channel: str | None, layer: str) -> tuple[int, int]:
+    """Index of the part and of the channel in it that is the map of an image of a layer."""
+    every = [(n, k) for n, part in enumerate(parts) for k in range(len(part.names))]
+    names = ", ".join(parts[n].names[k] for n, k in every)
+    if channel is not None:
+        if found := named_channels(parts, channel):
+            return found[0] if len(found) == 1 else nearest_channel(parts, found, layer)
+        labels = ", ".join(filter(None, (part.label for part in parts)))
+        raise ValueError(f"no channel {channel!r}; it has {names}" + (f" in the parts {labels}" if labels else ""))
+    if found := depth_channels(parts):
+        return nearest_channel(parts, found, layer)
+    first = parts[0].values[..., 0]
+    if all(np.array_equal(parts[n].values[..., k], first) for n, k in every if parts[n].names[k] != "A"):
+        return every[0]
+    advice = "name it (--depth-channel); the colours of a heat map are no depth: save the map in grey, or as .npy"
+    raise ValueError(f"which of the channels {names} is depth? {advice}")
+
+
+def _placed(part: Part, channel: int, size: Sequence[int], target: Window | None) -> Tensor:
+    """A channel as ``[1, 1, h, w]`` with the area of an image of a size and window; see :func:`placed`."""
+    window = part.window if part.is_exr else None
+    return _map(placed(part.values[..., channel], window, (size[0], size[1]), target))
 
 
 def _map(values: np.ndarray) -> Tensor:

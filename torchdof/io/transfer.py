@@ -3,13 +3,18 @@
 Kornia's curves give the same bits, for three channels and light in [0, 1] only, and take a second to import.
 """
 
-from typing import Literal
-
 import numpy as np
 import torch
 from torch import Tensor
 
-Transfer = Literal["linear", "srgb"]
+Transfer = str
+"""Encoding of a file: "linear", "srgb", "bt709", "pq", "hlg", or "gamma G" with the exponent G, such as "gamma 1.8"."""
+
+# SMPTE ST 2084 (PQ); 1 of light is the reference white of 203 cd/m2 of ITU-R BT.2408
+_PQ_M1, _PQ_M2, _PQ_C1, _PQ_C2, _PQ_C3 = 0.1593017578125, 78.84375, 0.8359375, 18.8515625, 18.6875
+_PQ_PEAK = 10_000.0 / 203.0
+_BT709_A, _BT709_B = 1.09929682680944, 0.018053968510807  # the digits of ITU-R BT.2020, whose curve is the same
+_HLG_A, _HLG_B, _HLG_C = 0.17883277, 0.28466892, 0.55991073  # ITU-R BT.2100 (HLG), light of the scene from 0 to 1
 
 
 def default_transfer(sample: str) -> Transfer:
@@ -20,22 +25,21 @@ def default_transfer(sample: str) -> Transfer:
 def decode(pixels: Tensor, transfer: Transfer, has_alpha: bool, straight: bool) -> Tensor:
     """File values to linear light, premultiplied."""
     if not has_alpha:
-        return _srgb_to_linear(pixels) if transfer == "srgb" else pixels
+        return _to_linear(pixels, transfer)
     colour, alpha = pixels[:, :-1], pixels[:, -1:]
-    if transfer == "srgb":
+    if transfer != "linear":
         colour = colour if straight else _divide(colour, alpha)
-        colour, straight = _srgb_to_linear(colour), True
+        colour, straight = _to_linear(colour, transfer), True
     return torch.cat([colour * alpha if straight else colour, alpha], dim=1)
 
 
 def encode(pixels: Tensor, transfer: Transfer, has_alpha: bool, straight: bool) -> Tensor:
     """Linear light, premultiplied, to file values."""
     if not has_alpha:
-        return _linear_to_srgb(pixels) if transfer == "srgb" else pixels
+        return _from_linear(pixels, transfer)
     colour, alpha = pixels[:, :-1], pixels[:, -1:]
-    if straight or transfer == "srgb":
-        colour = _divide(colour, alpha)
-        colour = _linear_to_srgb(colour) if transfer == "srgb" else colour
+    if straight or transfer != "linear":
+        colour = _from_linear(_divide(colour, alpha), transfer)
         colour = colour if straight else colour * alpha
     return torch.cat([colour, alpha], dim=1)
 
@@ -63,6 +67,52 @@ def encode_8_bits(pixels: Tensor, transfer: Transfer, has_alpha: bool) -> np.nda
 
 def _divide(colour: Tensor, alpha: Tensor) -> Tensor:
     return torch.where(alpha > 0, colour / torch.where(alpha > 0, alpha, 1.0), 0.0)
+
+
+def _to_linear(encoded: Tensor, transfer: Transfer) -> Tensor:
+    """Light of encoded numbers; odd for negative ones."""
+    if transfer in ("linear", "srgb"):
+        return _srgb_to_linear(encoded) if transfer == "srgb" else encoded
+    magnitude = encoded.abs()
+    if transfer == "bt709":
+        light = torch.where(
+            magnitude < 4.5 * _BT709_B, magnitude / 4.5, ((magnitude + _BT709_A - 1) / _BT709_A) ** (1 / 0.45)
+        )
+    elif transfer == "pq":
+        root = magnitude.clamp(max=1.0) ** (1 / _PQ_M2)
+        light = _PQ_PEAK * ((root - _PQ_C1).clamp(min=0.0) / (_PQ_C2 - _PQ_C3 * root)) ** (1 / _PQ_M1)
+    elif transfer == "hlg":
+        light = torch.where(magnitude <= 0.5, magnitude**2 / 3.0, (((magnitude - _HLG_C) / _HLG_A).exp() + _HLG_B) / 12)
+    else:
+        light = magnitude ** _exponent(transfer)
+    return light.copysign(encoded)
+
+
+def _from_linear(light: Tensor, transfer: Transfer) -> Tensor:
+    """The inverse of :func:`_to_linear`."""
+    if transfer in ("linear", "srgb"):
+        return _linear_to_srgb(light) if transfer == "srgb" else light
+    magnitude = light.abs()
+    if transfer == "bt709":
+        encoded = torch.where(magnitude < _BT709_B, 4.5 * magnitude, _BT709_A * magnitude**0.45 - (_BT709_A - 1))
+    elif transfer == "pq":
+        power = (magnitude / _PQ_PEAK).clamp(max=1.0) ** _PQ_M1
+        encoded = ((_PQ_C1 + _PQ_C2 * power) / (1.0 + _PQ_C3 * power)) ** _PQ_M2
+        encoded = torch.where(magnitude > 0, encoded, 0.0)
+    elif transfer == "hlg":
+        logarithm = _HLG_A * (12.0 * magnitude - _HLG_B).clamp(min=1e-12).log() + _HLG_C
+        encoded = torch.where(magnitude <= 1 / 12, (3.0 * magnitude).sqrt(), logarithm)
+    else:
+        encoded = magnitude ** (1.0 / _exponent(transfer))
+    return encoded.copysign(light)
+
+
+def _exponent(transfer: Transfer) -> float:
+    """The exponent of "gamma G"."""
+    word, _, exponent = transfer.partition(" ")
+    if word != "gamma" or not 0.0 < float(exponent) < 100.0:
+        raise ValueError(f"transfer must be linear, srgb, bt709, pq, hlg, or gamma and its exponent, got {transfer!r}")
+    return float(exponent)
 
 
 def _srgb_to_linear(encoded: Tensor) -> Tensor:
