@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from tests.refused import refuses
 from torchdof.depth.holes import fill_holes
-from torchdof.depth.kinds import depth_from_values, read_depth
+from torchdof.depth.kinds import depth_from_values
+from torchdof.depth.read import read_depth
 
 NAN, INF = math.nan, math.inf
 
@@ -113,3 +114,20 @@ def test_holes_are_refused_without_a_fill(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"d\.npy: 2 pixels \(50\.0 %\) have no depth"):
         read_depth(tmp_path / "d.npy")
     assert read_depth(tmp_path / "d.npy", fill="far").flatten().tolist() == [1.0, 2.0, 2.0, 2.0]
+
+
+def test_relative_depth_is_read_between_two_distances(tmp_path: Path) -> None:
+    np.save(tmp_path / "d.npy", np.array([[0.0, 0.5, 1.0]]))
+    path, ends = tmp_path / "d.npy", {"near_m": 1.0, "far_m": 4.0}
+    assert read_depth(path, "relative", **ends).flatten().tolist() == pytest.approx([4.0, 1.6, 1.0])
+    assert read_depth(path, "relative", **ends, relative_kind="depth").flatten().tolist() == [1.0, 2.5, 4.0]
+    half = read_depth(path, "relative", **ends, value_range=(0.0, 2.0))
+    assert half.flatten().tolist() == pytest.approx([4.0, 1 / 0.4375, 1.6])
+    with pytest.raises(ValueError, match="relative depth takes near_m and far_m"):
+        read_depth(path, "relative", near_m=1.0)
+    with pytest.raises(ValueError, match="and no scale or offset"):
+        read_depth(path, "relative", **ends, scale=2.0)
+    with pytest.raises(ValueError, match="near_m, far_m describe relative depth; give kind 'relative' .* got 'z'"):
+        read_depth(path, "z", **ends)
+    with pytest.raises(ValueError, match="must be one of z, .*, relative, got 'metres'"):
+        read_depth(path, cast(Any, "metres"))

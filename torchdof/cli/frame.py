@@ -16,7 +16,7 @@ from ..depth.kinds import depth_from_values
 from ..depth.relative import from_relative
 from ..depth.sanity import Mistake, coc_mistakes, depth_mistakes
 from ..io.highlights import expand_highlights
-from ..io.images import Picture, read_image, read_values, write_image
+from ..io.images import Picture, read_image, read_map, write_image
 from ..io.sheet import shrunk, write_sheet
 from ..module import blur_by_coc
 from ..optics.aperture import Aperture
@@ -62,18 +62,21 @@ class Frame:
 
 def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = False, **encoding: Any) -> Frame:
     """Reads an image, with arguments of ``read_image``, and its depth; ``holes`` that no option fills stay NaN."""
-    source, guess, picture = depth or image, "", read_image(image, **encoding)
+    source, meaning, picture = depth or image, dict[str, Any](), read_image(image, **encoding)
     height, width = picture.pixels.shape[-2:]
     is_exr = image.suffix.lower() == ".exr"
     x, y, full_x, full_y, *size = (picture.window if is_exr else None) or (0, 0, 0, 0, width, height)
     area = Area(x - full_x, y - full_y, *size)
     if depth is not None or scene.depth_channel is not None:
-        values = read_values(source, scene.depth_channel)
+        values, meaning = read_map(source, scene.depth_channel)
     elif picture.depth is not None:
-        values = picture.depth
+        values, meaning = picture.depth, picture.depth_meaning
+    elif picture.depth_problem:
+        raise ValueError(f"{image}: {picture.depth_problem}")
     else:
         hint = "" if is_exr else ", which a network such as Depth Anything makes of it"
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH{hint}")
+    scene, guess = scene.with_meaning(meaning) if meaning else (scene, "")
     if scene.depth_kind == "auto":
         is_metric = bool(scene.given(Lens) & {"focus_m", "focus_range", "aperture_radius_m"})
         stated_fill = scene.fill_depth
@@ -89,13 +92,17 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
         stretched = stretch(picture.pixels, values)
         given: dict[str, Any] = {"unknown": scene.depth_unknown}
         place: Any = (...,)
-        if kind == "distance":
+        is_along_ray = kind == "distance" or (kind == "relative" and "along_ray" in meaning)
+        if is_along_ray:
             centred_width = width + abs(area.width - 2 * area.x - width)
             given["fov_x_deg"] = scene.view_deg(picture.metadata, centred_width, area)
             values, place = area.centred(values, (height, width))
         if kind == "relative":
             given["value_range"] = scene.value_range
+            fov_x_deg = given.pop("fov_x_deg", None)
             values = from_relative(values, *scene.ends_m, scene.relative_kind or "disparity", **given)
+            if is_along_ray:
+                values = depth_from_values(values, "distance", fov_x_deg=fov_x_deg)
         else:
             values = depth_from_values(values, kind, scale=scene.depth_scale, offset=scene.depth_offset, **given)
     except ValueError as error:

@@ -4,7 +4,8 @@ from ..render.edges import repair_edges
 from ..render.resample import at_size_of
 from .holes import fill_holes
 from .inspect import DepthReport, inspect_depth
-from .kinds import depth_from_values, read_depth
+from .kinds import depth_from_values
+from .read import read_depth
 from .relative import Scale, from_relative, solve_scale
 from .sanity import DepthWarning, check
 from .steady import Steady, SteadyFrames

@@ -1,17 +1,14 @@
-"""Depth values of any stated kind, given or read from a file, to metres along the optical axis."""
+"""Depth values of any stated kind to metres along the optical axis."""
 
 import math
-import os
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from ..io.images import read_values
 from ..validation import choice, number, one_channel
-from .holes import Fill, resolve_holes
 
-__all__ = ["DepthKind", "depth_from_values", "read_depth"]
+__all__ = ["DepthKind", "depth_from_values"]
 
 DepthKind = Literal["z", "distance", "disparity", "inverse", "coc"]
 KINDS: tuple[DepthKind, ...] = ("z", "distance", "disparity", "inverse", "coc")
@@ -89,29 +86,3 @@ def depth_from_values(
         depth /= torch.sqrt(1.0 + (x * slope) ** 2 + (y[:, None] * slope) ** 2)
     metres = depth.float()
     return torch.where(metres.isfinite() if kind == "coc" else metres > 0, metres, torch.nan)
-
-
-def read_depth(
-    path: str | os.PathLike[str],
-    kind: DepthKind = "z",
-    *,
-    scale: float | None = None,
-    offset: float = 0.0,
-    unknown: float | None = None,
-    fov_x_deg: float | None = None,
-    fill: Fill | None = None,
-    channel: str | None = None,
-) -> Tensor:
-    """Reads a depth map: :func:`torchdof.io.images.read_values`, :func:`depth_from_values`, :func:`fill_holes`.
-
-    Returns:
-        ``[1, 1, H, W]`` float32 in metres (signed pixels for coc), without holes.
-
-    Raises:
-        OSError: If the file cannot be read.
-        ValueError: If the map has holes and ``fill`` is None, or an argument is missing or wrong.
-    """
-    depth = depth_from_values(
-        read_values(path, channel), kind, scale=scale, offset=offset, unknown=unknown, fov_x_deg=fov_x_deg
-    )
-    return resolve_holes(depth, str(path), fill)[0]

@@ -19,11 +19,9 @@ import torch
 from torch import Tensor
 
 from ..augmentation import RandomDepthOfField
-from ..depth.holes import resolve_holes
-from ..depth.kinds import read_depth
-from ..depth.relative import from_relative
+from ..depth.read import read_depth
 from ..io.atomic import atomic_file, write_text
-from ..io.images import Picture, read_image, read_values, write_image
+from ..io.images import Picture, read_image, write_image
 from ..io.transfer import Transfer
 from ..module import depth_of_field
 from ..render.resample import at_size_of
@@ -103,9 +101,8 @@ class RenderShards:
     Args:
         out: Folder of the shards; it must exist.
         blur: Draws focus, f-number and lens, and renders. Its ``p`` is ignored: every sample is blurred.
-        depth: How to read depth maps: keyword arguments of :func:`torchdof.depth.read_depth`; or, for depth
-            without a scale, ``{"kind": "relative", "near_m": 1.0, "far_m": 8.0}``, with ``relative_kind``,
-            ``value_range`` and ``unknown`` as in :func:`torchdof.depth.from_relative`, and ``fill`` and ``channel``.
+        depth: How to read depth maps: keyword arguments of :func:`torchdof.depth.read_depth`, for example
+            ``{"kind": "relative", "near_m": 1.0, "far_m": 8.0}`` for depth without a scale.
         format: "webdataset" or "parquet"; requires the package webdataset or pyarrow.
         keep: Files written for each sample: any of "blurred", "sharp" and "depth".
         seed: Seed of the draws; a sample's draw depends only on the seed and its key.
@@ -156,12 +153,13 @@ class RenderShards:
             raise ValueError(f"keep must be some of {', '.join(_FILES)}, got {show(keep)}")
         if not isinstance(self.blur, RandomDepthOfField):
             raise ValueError(f"blur must be a RandomDepthOfField, got {show(blur)}")
-        self._read_depth = _read_relative if self.depth.get("kind") == "relative" else read_depth
-        signature = inspect.signature(self._read_depth)
+        signature = inspect.signature(read_depth)
         try:
             signature.bind("", **self.depth)
         except TypeError as error:
             raise ValueError(f"depth must be some of {', '.join([*signature.parameters][1:])}: {error}") from None
+        if self.depth.get("kind") == "relative" and not {"near_m", "far_m"} <= self.depth.keys():
+            raise ValueError(f"depth of kind 'relative' needs near_m and far_m in metres, got {show(self.depth)}")
         if threads is not None:
             torch.set_num_threads(whole("threads", threads, 1, 4096))
 
@@ -227,7 +225,7 @@ class RenderShards:
     ) -> dict[str, Any]:
         """One sample as WebDataset takes it: its key, the contents of its files by name, its parameters as ``json``."""
         source = read_image(image, self.transfer)
-        metres = at_size_of(source.pixels, self._read_depth(depth or image, **self.depth))
+        metres = at_size_of(source.pixels, read_depth(depth or image, **self.depth))
         digest = hashlib.sha256(f"{self.seed} {key}".encode()).digest()
         drawn = self.blur.draw(torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1))
         camera = self.blur.camera.replace(
@@ -258,16 +256,6 @@ class RenderShards:
             **{"seed": self.seed, "torchdof": importlib.metadata.version("torchdof")},
         }
         return record
-
-
-def _read_relative(
-    path: str, kind: str, near_m: float, far_m: float, relative_kind: Any = "disparity", *,
-    fill: Any = None, channel: str | None = None, value_range: Any = None, unknown: float | None = None,
-) -> Tensor:  # fmt: skip
-    """Reads depth without a scale and converts it to metres, ``[1, 1, H, W]``, without holes."""
-    values = read_values(path, channel)
-    metres = from_relative(values, near_m, far_m, relative_kind, value_range=value_range, unknown=unknown)
-    return resolve_holes(metres, path, fill)[0]
 
 
 def _text(name: str) -> str:

@@ -86,7 +86,7 @@ def _parts(name: str) -> Iterator[Part]:
             if not source.seek_subimage(number, 0):
                 return
             spec = source.spec()
-            _check_size(spec.width, spec.height, spec.nchannels * (spec.format.size() + 4))
+            check_size(spec.width, spec.height, spec.nchannels * (spec.format.size() + 4))
             if spec.deep:
                 raise ValueError("holds deep samples; flatten it to one sample a pixel first")
             _check_colours(spec)
@@ -175,7 +175,7 @@ def _read_pfm(path: Path) -> Part:
             raise OSError("is not a PFM file (its header should read 'PF' or 'Pf', size and scale)")
         names = "RGB" if header[1] == b"F" else "Y"
         width, height = int(header[2]), int(header[3])
-        _check_size(width, height, 2 * 4 * len(names))
+        check_size(width, height, 2 * 4 * len(names))
         count = width * height * len(names)
         file.seek(header.end())
         data = file.read(4 * count)
@@ -212,11 +212,11 @@ def read_array(path: Path, key: str | None) -> np.ndarray:
         array = array[0] if array.shape[0] == 1 else array[..., 0]
     if array.ndim != 2 or array.dtype.kind not in "fiu" or array.size == 0:
         raise ValueError(f"expected an array [H, W] of numbers, got {list(shape)} of {array.dtype}")
-    _check_size(array.shape[1], array.shape[0], array.dtype.itemsize + 4)
+    check_size(array.shape[1], array.shape[0], array.dtype.itemsize + 4)
     return np.asarray(array)
 
 
-def _check_size(width: int, height: int, pixel_bytes: int) -> None:
+def check_size(width: int, height: int, pixel_bytes: int) -> None:
     """Refuses a picture with too many pixels, or for which there is too little memory."""
     claim = f"its header claims {width} x {height} pixels"
     if width < 1 or height < 1 or width * height > MAX_PIXELS:

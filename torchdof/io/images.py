@@ -13,12 +13,17 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from ..validation import choice, real_tensor, show
 from .atomic import atomic_file
 from .channels import colour_channels, depth_channel
 from .decode import Part, errors_named, first_line, is_complete, read_array, read_parts, utf8_name
-from .paths import PixelType, existing_image, existing_map, samples_of
+from .heif import heif_maps, read_heif
+from .jpeg import jpeg_maps
+from .metadata import turned
+from .paths import PixelType, existing_image, existing_map, has_pi_heif, samples_of
+from .portraits import Embedded
 from .transfer import Transfer, decode, default_transfer, encode, encode_8_bits
 from .webp import add_exif
 
@@ -51,6 +56,10 @@ class Picture:
         window: Place of the pixels in the full frame (EXR data window): x, y, full x, full y, full width, full height.
         orientation: EXIF orientation of the file; the pixels are upright already.
         other_layers: Names of the layers of the file that are neither the pixels nor the depth.
+        depth_meaning: Arguments of :func:`torchdof.depth.from_relative` with which a phone's own depth becomes metres,
+            and ``along_ray`` if these are distances along the ray; empty if the file does not state it.
+        depth_problem: Reason for which a phone's own depth cannot be used; "" if there is none.
+        matte: Coverage by the subject that a phone stored, ``[1, 1, H, W]`` in [0, 1], or None.
     """
 
     pixels: Tensor
@@ -62,6 +71,9 @@ class Picture:
     window: tuple[int, int, int, int, int, int] | None = None
     orientation: int = 1
     other_layers: tuple[str, ...] = ()
+    depth_meaning: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    depth_problem: str = ""
+    matte: Tensor | None = None
 
     @property
     def has_alpha(self) -> bool:
@@ -78,12 +90,15 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
     """Reads an image into linear light.
 
     Args:
-        path: An EXR, PNG, TIFF, JPEG, WebP, HDR or PFM file; HEIC and raw files if OpenImageIO was built to read them.
+        path: An EXR, PNG, TIFF, JPEG, WebP, HDR or PFM file; HEIC and AVIF with ``pip install 'torchdof[heif]'``; raw
+            files if OpenImageIO was built to read them.
         transfer: "linear" or "srgb"; None uses "srgb" for integers and "linear" for floats, and ignores tags.
         layer: Name of the part or layer of an EXR file to read; None takes the first that has colour.
 
     Returns:
-        The picture, upright; its depth channel is one like ``Z``, ``depth`` or ``ViewLayer.Depth.Z`` of an EXR file.
+        The picture, upright; its depth channel is one like ``Z``, ``depth`` or ``ViewLayer.Depth.Z`` of an EXR file, or
+        the depth that a phone stored in a portrait, which may have another size. If a portrait holds the photograph
+        without blur as well, that is read.
 
     Raises:
         OSError: If the file is missing, empty, truncated, not an image, or does not fit into memory.
@@ -101,7 +116,7 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
     if transfer is not None:
         choice("transfer", transfer, ("linear", "srgb"))
     with errors_named(path):
-        parts = read_parts(path)
+        parts, maps = _read(path)
         part, indices, names = colour_channels(parts, layer)
         source = parts[part]
         pixels, sample, transfer = _light(source, indices, transfer, has_alpha=names[-1] == "A")
@@ -111,9 +126,34 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
         if depth_place is not None:
             places.add((same_size[depth_place[0]], depth_place[1]))
             depth = _map(parts[same_size[depth_place[0]]].values[..., depth_place[1]])
+        elif maps.depth is not None:
+            depth = _map(turned(maps.depth, source.orientation, source.values.shape))
     left = [(p.label, name) for n, p in enumerate(parts) for k, name in enumerate(p.names) if (n, k) not in places]
     layers = tuple(dict.fromkeys(name.rpartition(".")[0] or label or name for label, name in left))
-    return Picture(pixels, names, depth, source.metadata, sample, transfer, source.window, source.orientation, layers)
+    meaning, matte = maps.meaning if depth_place is None else {}, None
+    if maps.matte is not None:
+        coverage = _map(turned(maps.matte, source.orientation, source.values.shape))
+        matte = interpolate(coverage, pixels.shape[-2:], mode="bilinear", antialias=True)
+    about_file = source.metadata, sample, transfer, source.window, source.orientation, layers
+    return Picture(pixels, names, depth, *about_file, meaning, maps.problem, matte)
+
+
+def _read(path: Path) -> tuple[list[Part], Embedded]:
+    """The parts of a file, and the maps that a phone stored in it."""
+    with path.open("rb") as file:
+        start = file.read(12)
+    is_heif = start[4:8] == b"ftyp" and has_pi_heif()
+    parts, maps = [read_heif(path)] if is_heif else read_parts(path), Embedded()
+    try:
+        if is_heif:
+            maps = heif_maps(path)
+        elif start[:2] == b"\xff\xd8":
+            maps = jpeg_maps(path)
+    except (OSError, ValueError) as error:  # the photograph itself can be used
+        maps = Embedded(problem=f"its depth cannot be used: {error}")
+    if maps.original is not None:
+        parts = [dataclasses.replace(maps.original, metadata=parts[0].metadata)]
+    return parts, maps
 
 
 def _light(
@@ -260,22 +300,31 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
         OSError: If the file is missing, empty, truncated or unreadable, or does not fit into memory.
         ValueError: If the channel is ambiguous or missing, or the array is not two-dimensional numbers.
     """
+    return read_map(path, channel)[0]
+
+
+def read_map(path: str | os.PathLike[str], channel: str | None = None) -> tuple[Tensor, Mapping[str, Any]]:
+    """As :func:`read_values`, and the meaning of the numbers of a phone's portrait, as in :class:`Picture`."""
     path = existing_map(path)
     with errors_named(path):
         if path.suffix.lower() in (".npy", ".npz"):
-            return _map(read_array(path, channel))
-        parts = read_parts(path)
+            return _map(read_array(path, channel)), {}
+        parts, maps = _read(path)
+        if maps.problem:
+            raise ValueError(maps.problem)
+        if maps.depth is not None:
+            return _map(turned(maps.depth, parts[0].orientation, parts[0].values.shape)), maps.meaning
         planes = [(p.label, name, p.values[..., k]) for p in parts for k, name in enumerate(p.names)]
         channel_names = ", ".join(name for _, name, _ in planes)
         if channel is not None:
             for label, name, values in planes:
                 if channel in (name, f"{label}.{name}"):
-                    return _map(values)
+                    return _map(values), {}
             raise ValueError(f"no channel {channel!r}; it has {channel_names}")
         if (depth_place := depth_channel(parts)) is not None:
-            return _map(parts[depth_place[0]].values[..., depth_place[1]])
+            return _map(parts[depth_place[0]].values[..., depth_place[1]]), {}
         if all(np.array_equal(values, planes[0][2]) for _, name, values in planes if name != "A"):
-            return _map(planes[0][2])
+            return _map(planes[0][2]), {}
         advice = "name it (--depth-channel); the colours of a heat map are no depth: save the map in grey, or as .npy"
         raise ValueError(f"which of the channels {channel_names} is depth? {advice}")
 
