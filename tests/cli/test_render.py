@@ -580,3 +580,11 @@ def test_a_stray_pixel_does_not_reduce_the_blur_of_the_others(image: Tensor, dep
         line = run("render large.exr large.npy -o out.exr --focus-m 2 --blur 4% --depth-edges as-given")
         openings += numbers_in(line, r"f/([\d.]+)")
     assert openings[0] == openings[1]
+
+
+def test_an_exr_without_depth_lists_its_channels(run: Run) -> None:
+    store(
+        Path("x.exr"), np.ones((4, 6, 4), np.float32) * np.arange(4, dtype=np.float32), "float", ("R", "G", "B", "N.X")
+    )
+    error = run("render x.exr -o y.exr --focus-m 2 --fov-deg 40 --blur 2%", code=2)
+    assert "which of the channels R, G, B, N.X is depth? name it (--depth-channel)" in error

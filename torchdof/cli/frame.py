@@ -73,6 +73,8 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
         values, meaning = picture.depth, picture.depth_meaning
     elif picture.depth_problem:
         raise ValueError(f"{image}: {picture.depth_problem}")
+    elif is_exr and picture.other_layers:
+        values, meaning = read_map(image)  # whose error lists the channels
     else:
         hint = "" if is_exr else ", which a network such as Depth Anything makes of it"
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH{hint}")

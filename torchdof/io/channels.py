@@ -2,6 +2,15 @@
 
 from .decode import Part
 
+_LETTERS = {"red": "R", "green": "G", "blue": "B", "alpha": "A", **{letter.lower(): letter for letter in "RGBAYZ"}}
+
+
+def plain(name: str) -> tuple[str, str]:
+    """Layer and channel of a name as programs write them: ``.R``, ``r``, ``Beauty.red`` and ``Beauty.[red]`` are R."""
+    layer, _, channel = name.rpartition(".")
+    channel = channel.removeprefix("[").removesuffix("]")
+    return layer, _LETTERS.get(channel.lower(), channel)
+
 
 def colour_channels(parts: list[Part], layer: str | None) -> tuple[int, list[int], tuple[str, ...]]:
     """Index of a part, indices in it of R, G, B (or grey, Y) and, if present, A, and their names without layer.
@@ -10,16 +19,15 @@ def colour_channels(parts: list[Part], layer: str | None) -> tuple[int, list[int
     """
     layers_with_colour = []
     for part, source in enumerate(parts):
-        names = source.names
-        for layer_name in dict.fromkeys(name.rpartition(".")[0] if source.is_exr else "" for name in names):
-            start = layer_name + "." if layer_name else ""
-            colours = next((each for each in ("RGB", "Y") if all(start + name in names for name in each)), "")
+        names = [plain(name) if source.is_exr else ("", name) for name in source.names]
+        for layer_name in dict.fromkeys(layer_name for layer_name, _ in names):
+            colours = next((each for each in ("RGB", "Y") if all((layer_name, name) in names for name in each)), "")
             if colours:
-                channels = tuple(colours + "A" if start + "A" in names else colours)
-                indices = [names.index(start + name) for name in channels]
+                channels = tuple(colours + "A" if (layer_name, "A") in names else colours)
+                indices = [names.index((layer_name, name)) for name in channels]
                 layers_with_colour.append((layer_name, source.label, part, indices, channels))
     if layer is None:
-        layers_with_colour.sort(key=lambda entry: entry[0] != "")
+        layers_with_colour.sort(key=lambda entry: (entry[0] != "", _of_depth(entry[0])))
         chosen = layers_with_colour[:1]
     else:
         chosen = [found for found in layers_with_colour if layer in found[:2] or found[0].startswith(layer + ".")]
@@ -33,12 +41,22 @@ def colour_channels(parts: list[Part], layer: str | None) -> tuple[int, list[int
 
 
 def depth_channel(parts: list[Part]) -> tuple[int, int] | None:
-    """Indices of the part and of the depth channel in it: ``Z``, ``depth``, ``ViewLayer.Depth.Z``; not ``Normal.Z``."""
-    for part, source in enumerate(parts):
-        for index, name in enumerate(source.names):
-            words = name.lower().split(".")
-            in_layer = len(words) > 1 and words[-2] in ("depth", "z", "zdepth") and words[-1] in ("z", "v", "y", "r")
-            in_own_part = source.label.lower() in ("depth", "z", "zdepth") and len(source.names) == 1
-            if name.lower() == "z" or words[-1] == "depth" or in_layer or in_own_part:
-                return part, index
-    return None
+    """Indices of the part and of the depth channel in it: ``Z``, ``ViewLayer.Depth.Z``, ``VRayZDepth``; not ``N.Z``."""
+    places = [(part, index) for part, source in enumerate(parts) for index in range(len(source.names))]
+    return next((place for place in places if _is_depth(parts[place[0]], place[1])), None)
+
+
+def _is_depth(part: Part, index: int) -> bool:
+    """Whether a channel is depth by its name, the last word of its layer, or the name of its part."""
+    layer, channel = plain(part.names[index])
+    word = channel.lower()
+    if word.endswith("depth") or (not layer and word in ("z", "pz")):
+        return True
+    in_own_part = part.label.lower() in ("depth", "z", "zdepth") and len(part.names) == 1
+    return in_own_part or (_of_depth(layer) and channel in ("Z", "V", "Y", "R"))
+
+
+def _of_depth(layer: str) -> bool:
+    """Whether a layer is depth by the last word of its name, as in ``FinalImageWorldDepth.R``."""
+    word = layer.lower().rpartition(".")[2]
+    return word == "z" or word.endswith("depth")
