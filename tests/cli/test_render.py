@@ -588,3 +588,36 @@ def test_an_exr_without_depth_lists_its_channels(run: Run) -> None:
     )
     error = run("render x.exr -o y.exr --focus-m 2 --fov-deg 40 --blur 2%", code=2)
     assert "which of the channels R, G, B, N.X is depth? name it (--depth-channel)" in error
+
+
+def test_a_file_with_a_map_for_each_image_is_read_map_by_map(run: Run, depth: Tensor) -> None:
+    stack = torch.cat([depth, depth * 2, depth * 3])[:, 0].numpy()
+    np.savez("all.npz", depth=stack, conf=stack)
+    options = "--focus-m 2 --fov-deg 40 --aperture-radius-m 0.1"
+    run(f"render shot.####.exr all.npz -o out.####.exr --frames 2-3 {options}")
+    for number in (2, 3):
+        np.save("one.npy", stack[number - 1])
+        run(f"render shot.{number:04d}.exr one.npy -o one.exr --depth-kind z {options}")
+        assert torch.equal(pixels(f"out.{number:04d}.exr"), pixels("one.exr"))
+    np.save("two.npy", stack[:2])
+    error = run(f"render shot.####.exr two.npy -o out.####.exr {options}", code=2)
+    assert "holds 2 maps (an array [2, 16, 24]); the sequence has 3 images" in error
+
+
+def test_the_camera_of_an_estimator_is_used_unless_options_or_exif_state_it(image: Tensor, depth: Tensor) -> None:
+    np.savez("pro.npz", depth=depth[0, 0].numpy(), focallength_px=12.0)  # 90 degrees
+    out, _ = told("render image.exr pro.npz -o out.png --focus-m 2")
+    assert "18 mm," in out and "sensor 36 mm" in out and "focal length from the depth file" in out
+    out, _ = told("render image.exr pro.npz -o out.png --focus-m 2 --focal-length-mm 36")
+    assert "36 mm," in out and "sensor 72 mm" in out
+    write_image("image.exr", with_tags(image, FocalLength=50.0, FocalLengthIn35mmFilm=50.0))
+    out, _ = told("render image.exr pro.npz -o out.png --focus-m 2")
+    assert "50 mm," in out and "sensor 36 mm" in out and "from the depth file" not in out
+
+
+def test_the_scale_of_depth_anything_3_is_offered(image: Tensor, depth: Tensor) -> None:
+    matrix = np.diag([60.0, 60.0, 1.0])
+    np.savez("three.npz", depth=depth[0].numpy(), conf=depth[0].numpy(), intrinsics=matrix[None])
+    assert (
+        "of the metric model of Depth Anything 3: --depth-scale 0.2" in told("render image.exr three.npz -o o.png")[1]
+    )

@@ -15,6 +15,7 @@ from ..depth.inspect import coc_colours, depth_colours, tint_focus
 from ..depth.kinds import depth_from_values
 from ..depth.relative import from_relative
 from ..depth.sanity import Mistake, coc_mistakes, depth_mistakes
+from ..io.estimates import Estimate, estimate_of
 from ..io.highlights import expand_highlights
 from ..io.images import Picture, read_image, read_map, write_image
 from ..io.sheet import shrunk, write_sheet
@@ -50,6 +51,7 @@ class Frame:
     filled: int  # number of filled holes, in pixels
     remarks: list[str]  # changes of the depth, and assumptions about it, that no option states
     guess: str  # message about the guessed kind of depth, or empty
+    fov_x_deg: float | None = None  # horizontal field of view that the depth file states
 
     def mistakes(self, camera: Camera) -> list[Mistake]:
         """Likely mistakes in the depth, given the camera."""
@@ -60,15 +62,25 @@ class Frame:
         return [mistake for mistake in mistakes if mistake.name not in meant]
 
 
-def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = False, **encoding: Any) -> Frame:
-    """Reads an image, with arguments of ``read_image``, and its depth; ``holes`` that no option fills stay NaN."""
+def read_frame(
+    image: Path,
+    depth: Path | None,
+    scene: Scene,
+    holes: bool = False,
+    place: tuple[int, int] | None = None,
+    **encoding: Any,
+) -> Frame:
+    """Reads an image, with arguments of ``read_image``, and its depth; ``holes`` that no option fills stay NaN.
+
+    ``place`` is the index of the image in its sequence, and their number, for a file with a map for each of them.
+    """
     source, meaning, picture = depth or image, dict[str, Any](), read_image(image, **encoding)
     height, width = picture.pixels.shape[-2:]
     is_exr = image.suffix.lower() == ".exr"
     x, y, full_x, full_y, *size = (picture.window if is_exr else None) or (0, 0, 0, 0, width, height)
     area = Area(x - full_x, y - full_y, *size)
     if depth is not None or scene.depth_channel is not None:
-        values, meaning = read_map(source, scene.depth_channel)
+        values, meaning = read_map(source, scene.depth_channel, place)
     elif picture.depth is not None:
         values, meaning = picture.depth, picture.depth_meaning
     elif picture.depth_problem:
@@ -78,12 +90,15 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
     else:
         hint = "" if is_exr else ", which a network such as Depth Anything makes of it"
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH{hint}")
+    estimate = Estimate() if depth is None else estimate_of(depth, values.shape[-1], place)
     scene, guess = scene.with_meaning(meaning) if meaning else (scene, "")
     if scene.depth_kind == "auto":
         is_metric = bool(scene.given(Lens) & {"focus_m", "focus_range", "aperture_radius_m"})
         stated_fill = scene.fill_depth
         scene, guess = scene.guessed(values, source, is_metric)
         scene = dataclasses.replace(scene, fill_depth=stated_fill) if holes else scene
+        if estimate.metric_scale is not None and scene.depth_kind == "z" and scene.depth_scale is None:
+            guess += f"; of the metric model of Depth Anything 3: --depth-scale {estimate.metric_scale:.4g}"
     kind: Any = scene.depth_kind
     rows, columns = values.shape[-2:]
     try:
@@ -97,7 +112,7 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
         is_along_ray = kind == "distance" or (kind == "relative" and "along_ray" in meaning)
         if is_along_ray:
             centred_width = width + abs(area.width - 2 * area.x - width)
-            given["fov_x_deg"] = scene.view_deg(picture.metadata, centred_width, area)
+            given["fov_x_deg"] = scene.view_deg(picture.metadata, centred_width, area, estimate.fov_x_deg)
             values, place = area.centred(values, (height, width))
         if kind == "relative":
             given["value_range"] = scene.value_range
@@ -116,7 +131,7 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
     remarks = [f"depth stretched by {stretched:.1%}"] if stretched else []
     if kind == "relative" and None in (scene.near_m, scene.far_m):
         remarks.append("depth from {:g} to {:g} m assumed".format(*scene.ends_m))
-    return Frame(str(source), scene, picture, area, values, filled, remarks, guess)
+    return Frame(str(source), scene, picture, area, values, filled, remarks, guess, estimate.fov_x_deg)
 
 
 def coc_of(
@@ -144,9 +159,10 @@ class Renderer:
         self.table, self.device = command.blur_table(), _device(command.device)
         self.notices = Notices(command.strict)
 
-    def read(self, image: Path, depth: Path | None) -> Frame:
+    def read(self, image: Path, depth: Path | None, place: tuple[int, int] | None = None) -> Frame:
         """Reads a frame as :func:`read_frame`, with the transfer curve and layer of the options."""
-        return read_frame(image, depth, self.command, transfer=self.command.transfer, layer=self.command.layer)
+        encoding: Any = {"transfer": self.command.transfer, "layer": self.command.layer}
+        return read_frame(image, depth, self.command, place=place, **encoding)
 
     def render(self, frame: Frame, out: Path, number: int) -> Callable[[], None]:
         """Renders a frame of a number; returns the function that writes it to ``out``."""

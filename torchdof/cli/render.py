@@ -159,9 +159,12 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         if images and self.depth_kind == "relative" and self.value_range is None and len(numbers) > 1:
             renderer.notices.warn(self.depth or self.image, [Mistake("range", _OWN_EXTREMES)])
         read_files = functools.lru_cache(maxsize=1)(renderer.read)  # a focus pull reads one image many times
+        in_one_file = images and not depths and self.depth and self.depth.suffix.lower() in (".npy", ".npz")
+        all_frames = images.frames() if images and in_one_file else []
+        places = {n: (k, len(all_frames)) for k, n in enumerate(all_frames)}
 
         def as_stored(n: int) -> "Frame":
-            return read_files(*sources(n))
+            return read_files(*sources(n), places.get(n))
 
         steady = SteadyFrames(lambda k: (as_stored(whole[k]).picture.pixels, as_stored(whole[k]).values))
 

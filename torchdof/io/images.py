@@ -288,9 +288,10 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
     """Reads the numbers of a one-channel map, such as a depth map, without transfer curve or scaling of integers.
 
     Args:
-        path: An image of one channel (or of equal ones), an EXR file with a depth channel, or ``.npy`` / ``.npz``.
-        channel: Name of a channel of an image, or of an array in an ``.npz`` file; None takes the only one, or the
-            depth channel.
+        path: An image of one channel (or of equal ones), an EXR file with a depth channel, ``.pgm``, ``.npy`` or
+            ``.npz``, or a phone's portrait.
+        channel: Name of a channel of an image, or of an array in an ``.npz`` file; None takes the only one, or the one
+            called depth.
 
     Returns:
         ``[1, 1, H, W]`` float32; a 16-bit file gives 0 to 65535, an 8-bit file 0 to 255. The scale in the header of
@@ -303,12 +304,17 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
     return read_map(path, channel)[0]
 
 
-def read_map(path: str | os.PathLike[str], channel: str | None = None) -> tuple[Tensor, Mapping[str, Any]]:
-    """As :func:`read_values`, and the meaning of the numbers of a phone's portrait, as in :class:`Picture`."""
+def read_map(
+    path: str | os.PathLike[str], channel: str | None = None, place: tuple[int, int] | None = None
+) -> tuple[Tensor, Mapping[str, Any]]:
+    """As :func:`read_values`, and the meaning of the numbers of a phone's portrait, as in :class:`Picture`.
+
+    ``place`` is the index of an image in a sequence, and the number of images, for an array ``[N, H, W]``.
+    """
     path = existing_map(path)
     with errors_named(path):
         if path.suffix.lower() in (".npy", ".npz"):
-            return _map(read_array(path, channel)), {}
+            return _map(read_array(path, channel, place)), {}
         parts, maps = _read(path)
         if maps.problem:
             raise ValueError(maps.problem)

@@ -20,7 +20,7 @@ _SAMPLES: dict[str, tuple[PixelType, ...]] = {  # suffix -> sample types, the de
 IMAGE_SUFFIXES = tuple(_SAMPLES)
 """Suffixes of images that every installation reads and writes."""
 
-MAP_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".npz")
+MAP_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".npz", ".pgm")
 """Suffixes of depth maps."""
 
 _CONVERT = "install its reader, pip install 'torchdof[heif]', or convert it to JPEG or 16-bit TIFF (heif-convert)"
