@@ -33,13 +33,17 @@ def to_stderr(line: str) -> None:
 
 
 class Notices:
-    """Notes, and warnings of likely mistakes, or errors if ``strict``; each kind is printed once for all frames."""
+    """Notes, and warnings of likely mistakes, or errors if ``strict``.
 
-    def __init__(self, strict: bool = False) -> None:
-        self._strict, self._kinds = strict, set[str]()
+    Each kind is printed once for all frames; with ``each_message``, for pictures that differ, each text once.
+    """
+
+    def __init__(self, strict: bool = False, each_message: bool = False) -> None:
+        self._strict, self._each_message, self._kinds = strict, each_message, set[str]()
 
     def note(self, kind: str, line: str, word: str = "note") -> None:
         """Prints a note: an assumption, or advice, with the options that change it."""
+        kind = line.partition(": ")[2] if self._each_message else kind  # a line starts with the name of its file
         if kind not in self._kinds:
             to_stderr(f"{word}: {line}")
         self._kinds.add(kind)

@@ -77,6 +77,10 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
 
         torchdof render shot.####.exr -o out.####.exr --focus-m 1:2,48:5.5 --f-number 2 --resume
 
+    A folder of photographs and one of their depth maps, matched by name; portraits of phones need no map:
+
+        torchdof render photos/ depths/ -o out/
+
     A photograph with a focus pull:
 
         torchdof render photo.jpg depth.png -o pull.##.png --focus-m 1:1,24:5
@@ -90,14 +94,19 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
     the largest blur radius is 2 % of the width, unless the file's lens blurs enough.
     """
 
-    image: Path = argument("All-in-focus image (EXR, PNG, TIFF, JPEG, WebP, HDR, PFM) or shot.####.exr.", "IMAGE")
-    depth: Path | None = argument(
-        "Its depth (the same types, .npy, .npz); not needed if IMAGE has a Z channel.", "[DEPTH]", None
-    )
-    out: Path = option("File to write, or out.####.exr.", ..., names=("--out", "-o"), metavar="OUT")
+    image: Path = argument("All-in-focus image, shot.####.exr, or a folder.", "IMAGE")
+    depth: Path | None = argument("Its depth; not needed if IMAGE has a Z channel or is a portrait.", "[DEPTH]", None)
+    out: Path = option("File to write, out.####.exr, or a folder.", ..., names=("--out", "-o"), metavar="OUT")
 
     def run(self) -> None:
-        """Renders one image, the frames of a sequence, or a focus pull in a still image."""
+        """Renders one image, the frames of a sequence, a focus pull in a still image, or a folder."""
+        parameters = click.get_current_context().command.params
+        options = {p.opts[0]: getattr(self, p.name) for p in parameters if p.name and p.name not in _NOT_OF_FRAMES}
+        options |= {"files": self.files(), "torchdof": importlib.metadata.version("torchdof")}
+        if self.image.is_dir():
+            from .folder import render_folder
+
+            return render_folder(self, options)
         images, depths, numbered = map(FramePattern.of, (self.image, self.depth, self.out))
         keys = (self.focus_m or []) if images is None else []
         is_single = images is None and len(keys) < 2
@@ -130,9 +139,6 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         whole = list(numbers)  # frames of the sequence, each of which may depend on those before it
         if images and self.steady:
             whole = [n for n in images.frames() if depths is None or depths.name(n).is_file()]
-        parameters = click.get_current_context().command.params
-        options = {p.opts[0]: getattr(self, p.name) for p in parameters if p.name and p.name not in _NOT_OF_FRAMES}
-        options |= {"files": self.files(), "torchdof": importlib.metadata.version("torchdof")}
         record, existing = Record(self.out, options), [out for out in outputs.values() if out.is_file()]
         reason, done = record.difference(), set[Path]()
         if self.resume and not reason:
