@@ -36,6 +36,7 @@ ALLOWED = {
         *("tensors", "validation", "native", "io", "optics", "depth", "options", "render", "module"),
         *("fit", "export", "bench"),
     },
+    "photograph": {"validation", "io", "optics", "cli"},
 }
 
 

@@ -25,7 +25,7 @@ from ..optics.blur_table import BlurTable
 from ..optics.camera import Camera
 from ..options import Options
 from ..render.resample import at_size_of
-from ..validation import same_aspect, stretch
+from ..validation import one_channel, same_aspect, stretch
 from .command import refuse
 from .lens import Area, Lens
 from .options import Scene
@@ -63,8 +63,8 @@ class Frame:
 
 
 def read_frame(
-    image: Path,
-    depth: Path | None,
+    image: Path | Picture,
+    depth: Path | Tensor | None,
     scene: Scene,
     holes: bool = False,
     place: tuple[int, int] | None = None,
@@ -72,14 +72,20 @@ def read_frame(
 ) -> Frame:
     """Reads an image, with arguments of ``read_image``, and its depth; ``holes`` that no option fills stay NaN.
 
+    Both may be in memory already; depth is then the numbers of a map.
     ``place`` is the index of the image in its sequence, and their number, for a file with a map for each of them.
     """
-    source, meaning, picture = depth or image, dict[str, Any](), read_image(image, **encoding)
+    picture = image if isinstance(image, Picture) else read_image(image, **encoding)
+    image = Path("image") if isinstance(image, Picture) else image
+    values, depth = (depth.detach().cpu(), Path("depth")) if isinstance(depth, Tensor) else (None, depth)
+    source, meaning = depth or image, dict[str, Any]()
     height, width = picture.pixels.shape[-2:]
     is_exr = image.suffix.lower() == ".exr"
     x, y, full_x, full_y, *size = (picture.window if is_exr else None) or (0, 0, 0, 0, width, height)
     area = Area(x - full_x, y - full_y, *size)
-    if depth is not None or scene.depth_channel is not None:
+    if values is not None:
+        one_channel("depth", values, whole=True)
+    elif depth is not None or scene.depth_channel is not None:
         values, meaning = read_map(source, scene.depth_channel, place)
     elif picture.depth is not None:
         values, meaning = picture.depth, picture.depth_meaning
@@ -90,7 +96,8 @@ def read_frame(
     else:
         hint = "" if is_exr else ", which a network such as Depth Anything makes of it"
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH{hint}")
-    estimate = Estimate() if depth is None else estimate_of(depth, values.shape[-1], place)
+    is_file = depth is not None and depth.is_file()
+    estimate = estimate_of(source, values.shape[-1], place) if is_file else Estimate()
     scene, guess = scene.with_meaning(meaning) if meaning else (scene, "")
     if scene.depth_kind == "auto":
         is_metric = bool(scene.given(Lens) & {"focus_m", "focus_range", "aperture_radius_m"})
@@ -166,7 +173,13 @@ class Renderer:
 
     def render(self, frame: Frame, out: Path, number: int) -> Callable[[], None]:
         """Renders a frame of a number; returns the function that writes it to ``out``."""
-        start, picture, command = time.perf_counter(), frame.picture, self.command
+        start = time.perf_counter()
+        *rendered, camera = self.rendered(frame, number)
+        return functools.partial(self.write, out, *rendered, camera, time.perf_counter() - start)
+
+    def rendered(self, frame: Frame, number: int = 0) -> tuple[Frame, Picture, Tensor, Camera | None]:
+        """The frame with all remarks, its picture after rendering, the signed blur radius in pixels, and the camera."""
+        picture, command = frame.picture, self.command
         frame = dataclasses.replace(frame, values=frame.values.to(self.device))
         coc_px, camera, remarks = coc_of(frame, self.notices, number, self.is_still)
         pixels, colours = picture.pixels.to(self.device), picture.light.shape[1]
@@ -184,8 +197,8 @@ class Renderer:
             table = _with_alpha(self.table) if picture.has_alpha else self.table
             with torch.no_grad():
                 pixels = blur_by_coc(pixels, coc_px, table=table, attention=attention, **command.arguments())
-        frame, picture = dataclasses.replace(frame, remarks=remarks), dataclasses.replace(picture, pixels=pixels)
-        return functools.partial(self.write, out, frame, picture, coc_px, camera, time.perf_counter() - start)
+        picture = dataclasses.replace(picture, pixels=pixels)
+        return dataclasses.replace(frame, remarks=remarks), picture, coc_px, camera
 
     def write(
         self, out: Path, frame: Frame, picture: Picture, coc_px: Tensor, camera: Camera | None, seconds: float

@@ -38,14 +38,17 @@ class Notices:
     Each kind is printed once for all frames; with ``each_message``, for pictures that differ, each text once.
     """
 
-    def __init__(self, strict: bool = False, each_message: bool = False) -> None:
-        self._strict, self._each_message, self._kinds = strict, each_message, set[str]()
+    def __init__(self, strict: bool = False, each_message: bool = False, is_printed: bool = True) -> None:
+        self._strict, self._each_message, self._is_printed = strict, each_message, is_printed
+        self._kinds, self.lines = set[str](), list[str]()  # what is noted, and the lines
 
     def note(self, kind: str, line: str, word: str = "note") -> None:
         """Prints a note: an assumption, or advice, with the options that change it."""
         kind = line.partition(": ")[2] if self._each_message else kind  # a line starts with the name of its file
         if kind not in self._kinds:
-            to_stderr(f"{word}: {line}")
+            self.lines.append(f"{word}: {line}")
+            if self._is_printed:
+                to_stderr(self.lines[-1])
         self._kinds.add(kind)
 
     def warn(self, source: str | os.PathLike[str], mistakes: "Iterable[Mistake]") -> None:
