@@ -16,9 +16,9 @@ from torchdof.io.images import read_image
 Run = Callable[..., str]
 
 
-def test_an_iphone_portrait_is_rendered_by_one_command(tmp_path: Path, run: Run, capsys: pytest.CaptureFixture) -> None:
+def test_an_iphone_portrait_is_rendered_by_one_command(tmp_path: Path, run: Run) -> None:
     line = run(f"render {HEIC} -o", tmp_path / "out.jpg")
-    assert "5.7 mm" in line and "focus on what is nearest the middle" in line
+    assert "5.7 mm, from the file" in line and "0.5 m, on what is nearest the middle" in line
     written = read_image(tmp_path / "out.jpg")
     assert written.pixels.shape == (1, 3, 192, 128) and written.orientation == 1
     assert written.metadata["Exif:FocalLengthIn35mmFilm"][1] == 26

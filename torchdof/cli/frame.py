@@ -29,13 +29,20 @@ from ..validation import one_channel, same_aspect, stretch
 from .command import refuse
 from .lens import Area, Lens
 from .options import Scene
-from .output import Notices, print_result
+from .output import Notices, print_result, rounded
 
 if TYPE_CHECKING:
     from .render import Render
 
 _VISIBLE_PX = 2.0  # px; a note advises more blur if the largest radius is below
 _WITHOUT_EXIF = (".hdr", ".pfm")  # types in which OpenImageIO writes no EXIF data
+_OPTIONS = {  # first words of an assumption: options that change it
+    "focus": "--focus-at, --focus-m",
+    "focal length": "--focal-length-mm, --equivalent",
+    "f-number": "--blur, --f-number",
+    "sensor width": "--sensor-width-mm, --equivalent",
+    "depth": "--near-m, --far-m",
+}
 _PANEL_PX = 800  # px; longer side of a panel on a sheet
 
 
@@ -163,6 +170,7 @@ class Renderer:
 
     def __init__(self, command: "Render", is_still: bool) -> None:
         self.command, self.is_still = command, is_still
+        self.has_table = False  # whether assumptions are a table below the line of a picture
         self.table, self.device = command.blur_table(), _device(command.device)
         self.notices = Notices(command.strict)
 
@@ -241,7 +249,7 @@ class Renderer:
         }
         shown = "focus shown: near orange, sharp green, far blue"
         words = [
-            _inside(camera),
+            rounded(_inside(camera)),
             f"blur radius up to {largest_px:.1f} px",
             shown if command.show_focus else f"{facts['table']}, {options.method}",
             _inside(table.aperture),
@@ -253,12 +261,36 @@ class Renderer:
             f"{seconds:.2f} s on {self.device}",
         ]
         remarks = f" [{', '.join(frame.remarks)}]" if frame.remarks else ""
+        if self.has_table and frame.remarks:
+            remarks = "\n" + _table(frame.remarks, camera)
         print_result(command.as_json, facts, f"{out}: {'; '.join(filter(None, words))}{remarks}")
 
 
 def _inside(value: Camera | Aperture | None) -> str:
     """The text of a camera or an opening without its brackets; "" for None."""
     return repr(value).partition("(")[2].removesuffix(")")
+
+
+def _table(remarks: list[str], camera: Camera | None) -> str:
+    """Assumptions as lines of three columns: a number, its source, and the options that change it."""
+    numbers = (
+        {}
+        if camera is None
+        else {
+            "focus": f"{float(camera.focus_m)} m",
+            "focal length": f"{float(camera.focal_length_mm)} mm",
+            "f-number": f"f/{float(camera.f_number)}",
+            "sensor width": f"{float(camera.sensor_width_mm)} mm",
+        }
+    )
+    rows = []
+    for remark in remarks:
+        name = next((name for name in _OPTIONS if remark.startswith(name)), "")
+        source = remark.removeprefix(name).strip()
+        options = "" if "stretched" in source else _OPTIONS.get(name, "")
+        rows.append((name, rounded(", ".join(filter(None, (numbers.get(name, ""), source)))), options))
+    widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
+    return "\n".join(f"  {a:{widths[0]}}  {b:{widths[1]}}  {c}".rstrip() for a, b, c in rows)
 
 
 def _device(name: str) -> torch.device:

@@ -56,11 +56,16 @@ class Area(NamedTuple):
 
 
 def _width_fraction(text: str) -> float:
-    """Reads a percentage of the width, as a fraction."""
+    """Reads a percentage of the width, as a fraction; without the sign, numbers below 1 could be fractions already."""
     share = float(text.removesuffix("%")) / 100
-    if not (text.endswith("%") and 0 < share <= 0.5):
+    if not (0 < share <= 0.5 and (text.endswith("%") or share >= 0.01)):
         raise ValueError
     return share
+
+
+def _f_number(text: str) -> float:
+    """Reads an f-number, as ``1.8`` or ``f/1.8``."""
+    return float(re.sub(r"^\s*[fF]/?", "", text))
 
 
 def _equivalent(text: str) -> tuple[float, ...]:
@@ -96,7 +101,7 @@ class Lens(Sensor):
     )
     tilt: float = option("Degrees by which the lens is tilted down: focus comes nearer towards the bottom.", 0.0)
     swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)
-    f_number: float | None = option("Smaller is blurrier.", basic=True)
+    f_number: float | None = option("Smaller is blurrier.", type=Parsed("N", _f_number, "1.8 or f/1.8"), basic=True)
     blur: float | None = option(
         "Open the lens until the largest blur radius is this share of the width, such as 2%; instead of --f-number.",
         type=Parsed("SHARE%", _width_fraction, "2%, above 0 and at most 50%"),

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
@@ -24,6 +25,18 @@ def json_line(facts: Mapping[str, Any]) -> str:
     """Facts as one line of JSON; numbers that are not finite become the strings inf, -inf and nan."""
     text = json.dumps(facts, default=lambda value: value.tolist())  # numpy's numbers and arrays
     return json.dumps(json.loads(text, parse_constant=_NOT_FINITE.__getitem__))
+
+
+def rounded(text: str) -> str:
+    """A text with its numbers as a person writes them: three significant digits, two of an f-number."""
+
+    def short(match: re.Match[str]) -> str:
+        value = float(match[2])
+        if not match[1]:
+            return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+        return f"f/{value:.0f}" if value >= 10 or value == round(value) else f"f/{value:.{1 if value >= 1 else 2}f}"
+
+    return re.sub(r"(f/)?(?<![\w.])(\d+\.\d+(?:e[-+]?\d+)?)", short, text)
 
 
 def to_stderr(line: str) -> None:

@@ -159,6 +159,7 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
 
         is_guessed = images and self.depth_kind == "auto"  # a guess could differ from frame to frame
         renderer = Renderer(dataclasses.replace(self, depth_kind="z") if is_guessed else self, images is None)
+        renderer.has_table = is_single
         if self.resume and len(existing) > len(done):
             again = f"{len(existing) - len(done)} of {len(outputs)} frames are rendered again"
             renderer.notices.note("again", f"{self.out}: {again}: {reason}")
