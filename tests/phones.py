@@ -4,6 +4,7 @@ import base64
 import struct
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,10 +13,10 @@ from tests.files import store
 XMP, EXTENSION = b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0"
 
 
-def jpeg(values: np.ndarray, **attributes: object) -> bytes:
+def jpeg(values: np.ndarray, **attributes: Any) -> bytes:
     """A picture as JPEG."""
     with tempfile.TemporaryDirectory() as folder:
-        settings = {"compression": "jpeg:100", "jpeg__subsampling": "4:4:4", **attributes}
+        settings: dict[str, Any] = {"compression": "jpeg:100", "jpeg__subsampling": "4:4:4", **attributes}
         return store(Path(folder, "a.jpg"), values, "uint8", **settings).read_bytes()
 
 

@@ -40,7 +40,10 @@ def names(*found: str) -> list[tuple[str, str | None, str]]:
     for name in found:
         Path(name).parent.mkdir(parents=True, exist_ok=True)
         Path(name).touch()
-    return [(p.image.name, p.depth and str(p.depth), p.out.name) for p in pictures_in(Path("p"), Path("d"), Path("o"))]
+    return [
+        (p.image.name, str(p.depth) if p.depth else None, p.out.name)
+        for p in pictures_in(Path("p"), Path("d"), Path("o"))
+    ]
 
 
 def test_maps_are_matched_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ STEPS = np.repeat(np.array([0, 64, 128, 255], np.uint8), 8)[None].repeat(24, 0) 
 LINEAR_M = [2.0, 2.0 + 4.0 * 64 / 255, 2.0 + 4.0 * 128 / 255, 6.0]
 INVERSE_M = [1 / (1 / 2 - n / 255 * (1 / 2 - 1 / 6)) for n in (0, 64, 128, 255)]  # 0 is the nearest
 FARTHEST_FIRST_M = [1 / (1 / 6 + n / 255 * (1 / 2 - 1 / 6)) for n in (0, 64, 128, 255)]
-NEAR_FAR: dict[str, object] = {"Format": "RangeInverse", "Near": 2.0, "Far": 6.0, "Units": "m"}
+NEAR_FAR: dict[str, Any] = {"Format": "RangeInverse", "Near": 2.0, "Far": 6.0, "Units": "m"}
 
 
 def stored(folder: Path, content: bytes) -> Path:

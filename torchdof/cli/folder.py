@@ -17,6 +17,7 @@ from .output import Notices, json_line, progress_bar, to_stderr
 from .resume import Record
 
 if TYPE_CHECKING:
+    from .frame import Frame
     from .render import Render
 
 _MAP_WORDS = (
@@ -108,7 +109,7 @@ def _render_each(command: "Render", todo: Sequence[Picture], record: Record) -> 
     renderer = Renderer(command, is_still=True)
     renderer.notices = Notices(command.strict, each_message=True)
 
-    def read(picture: Picture) -> object:
+    def read(picture: Picture) -> "Frame":
         check_files(*picture)
         check_writable(picture.out)
         return renderer.read(picture.image, picture.depth)

@@ -3,9 +3,9 @@
 import dataclasses
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor
@@ -85,7 +85,7 @@ def read_frame(
     picture = image if isinstance(image, Picture) else read_image(image, **encoding)
     image = Path("image") if isinstance(image, Picture) else image
     values, depth = (depth.detach().cpu(), Path("depth")) if isinstance(depth, Tensor) else (None, depth)
-    source, meaning = depth or image, dict[str, Any]()
+    source, meaning = depth or image, cast(Mapping[str, Any], {})
     height, width = picture.pixels.shape[-2:]
     is_exr = image.suffix.lower() == ".exr"
     x, y, full_x, full_y, *size = (picture.window if is_exr else None) or (0, 0, 0, 0, width, height)
@@ -122,12 +122,12 @@ def read_frame(
         same_aspect(picture.pixels, values)
         stretched = stretch(picture.pixels, values)
         given: dict[str, Any] = {"unknown": scene.depth_unknown}
-        place: Any = (...,)
+        part: Any = (...,)
         is_along_ray = kind == "distance" or (kind == "relative" and "along_ray" in meaning)
         if is_along_ray:
             centred_width = width + abs(area.width - 2 * area.x - width)
             given["fov_x_deg"] = scene.view_deg(picture.metadata, centred_width, area, estimate.fov_x_deg)
-            values, place = area.centred(values, (height, width))
+            values, part = area.centred(values, (height, width))
         if kind == "relative":
             given["value_range"] = scene.value_range
             fov_x_deg = given.pop("fov_x_deg", None)
@@ -138,7 +138,7 @@ def read_frame(
             values = depth_from_values(values, kind, scale=scene.depth_scale, offset=scene.depth_offset, **given)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
-    values, filled = values if kind == "coc" else at_size_of(picture.pixels, values[place]), 0
+    values, filled = values if kind == "coc" else at_size_of(picture.pixels, values[part]), 0
     fill_by: Any = scene.fill_depth
     if fill_by is not None or not holes:
         values, filled = resolve_holes(values, str(source), fill_by, kind in ("relative", "coc"))
@@ -182,8 +182,8 @@ class Renderer:
     def render(self, frame: Frame, out: Path, number: int) -> Callable[[], None]:
         """Renders a frame of a number; returns the function that writes it to ``out``."""
         start = time.perf_counter()
-        *rendered, camera = self.rendered(frame, number)
-        return functools.partial(self.write, out, *rendered, camera, time.perf_counter() - start)
+        rendered = self.rendered(frame, number)
+        return functools.partial(self.write, out, *rendered, seconds=time.perf_counter() - start)
 
     def rendered(self, frame: Frame, number: int = 0) -> tuple[Frame, Picture, Tensor, Camera | None]:
         """The frame with all remarks, its picture after rendering, the signed blur radius in pixels, and the camera."""

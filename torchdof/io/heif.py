@@ -50,14 +50,15 @@ def heif_maps(path: Path) -> Embedded:
             depth, meaning = _depth(picture)
         for kind, numbers in file.info.get("aux", {}).items():
             if _MATTE in kind:
-                check_size(*file.get_aux_image(numbers[0]).size, 2 * 4)
-                matte = _pixels(file.get_aux_image(numbers[0]), 8)[..., 0].astype(np.float32) / 255
+                auxiliary = file.get_aux_image(numbers[0])
+                check_size(auxiliary.size[0], auxiliary.size[1], 2 * 4)
+                matte = _pixels(auxiliary, 8)[..., 0].astype(np.float32) / 255
     return Embedded(depth, meaning, matte)
 
 
 def _depth(picture: Any) -> tuple[np.ndarray, dict[str, Any]]:
     """Stored numbers ``[h, w]`` of a depth image, and their meaning."""
-    check_size(*picture.size, 2 * 4)
+    check_size(picture.size[0], picture.size[1], 2 * 4)
     stated = picture.info["metadata"] or {}
     values = _pixels(picture, 8 if picture.mode == "L" else 10)[..., 0]
     top, kind = float(np.iinfo(values.dtype).max), stated.get("representation_type")
@@ -97,7 +98,7 @@ def _read_avif(path: Path) -> Part:
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit here is that of check_size
             picture = Image.open(path, formats=["AVIF"])
         with picture:
-            check_size(*picture.size, 4 * 4)
+            check_size(picture.width, picture.height, 4 * 4)
             values, mode = np.atleast_3d(np.asarray(picture)), picture.mode
             metadata, orientation = _metadata(picture.info)
             values, _ = upright(values, {"Orientation": (None, orientation)})
@@ -106,7 +107,7 @@ def _read_avif(path: Path) -> Part:
     return Part("", tuple(mode), values, ("uint8",) * len(mode), straight_alpha=mode[-1] == "A", metadata=metadata)
 
 
-def _metadata(info: Mapping[str, Any]) -> tuple[Metadata, int]:
+def _metadata(info: Mapping[Any, Any]) -> tuple[Metadata, int]:
     """EXIF data and the colour profile as those of an upright picture in OpenImageIO's names, and the orientation.
 
     OpenImageIO reads the data from a PNG of one pixel.
