@@ -82,7 +82,7 @@ def multi_picture(picture: bytes, *others: bytes) -> bytes:
 
 
 def apple(picture: bytes, kind: str, ends: tuple[float, float] | None = None) -> bytes:
-    """A further picture that states what it is, as Apple does."""
+    """A further picture with Apple's statement of its kind."""
     stated = f"<apdi:AuxiliaryImageType>{kind}</apdi:AuxiliaryImageType>"
     for name, value in zip(("Min", "Max"), ends or (), strict=False):
         stated += f"<apdi:Float{name}Value>{value}</apdi:Float{name}Value>"

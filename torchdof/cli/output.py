@@ -53,7 +53,7 @@ class Notices:
 
     def __init__(self, strict: bool = False, each_message: bool = False, is_printed: bool = True) -> None:
         self._strict, self._each_message, self._is_printed = strict, each_message, is_printed
-        self._kinds, self.lines = set[str](), list[str]()  # what is noted, and the lines
+        self._kinds, self.lines = set[str](), list[str]()  # kinds that were noted, and the lines
 
     def note(self, kind: str, line: str, word: str = "note") -> None:
         """Prints a note: an assumption, or advice, with the options that change it."""

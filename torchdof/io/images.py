@@ -58,7 +58,7 @@ class Picture:
         other_layers: Names of the layers of the file that are neither the pixels nor the depth.
         depth_meaning: Arguments of :func:`torchdof.depth.from_relative` with which a phone's own depth becomes metres,
             and ``along_ray`` if these are distances along the ray; empty if the file does not state it.
-        depth_problem: Reason for which a phone's own depth cannot be used; "" if there is none.
+        depth_problem: Reason for which a phone's own depth cannot be used, or "".
         matte: Coverage by the subject that a phone stored, ``[1, 1, H, W]`` in [0, 1], or None.
     """
 

@@ -28,7 +28,7 @@ class _Jpeg(NamedTuple):
 
     content: bytes
     xmp: str  # standard and extended
-    mpf: int  # offset of the index of pictures, from which it counts; 0 if there is none
+    mpf: int  # offset of the index of pictures, from which it counts, or 0
     end: int  # offset behind the first picture
 
     def field(self, prefix: str, name: str) -> str | None:
@@ -61,7 +61,7 @@ def jpeg_maps(path: Path) -> Embedded:
 def _with_picture(maps: Embedded, picture: bytes) -> Embedded:
     """The maps, and those that a further picture of a multi-picture file adds.
 
-    Apple's pictures state what they are. Another grey picture is taken for depth whose numbers are not stated.
+    Apple's pictures state their kind. Another grey picture is taken for depth whose numbers are not stated.
     """
     stated = _parsed(picture)
     kind, header = stated.field("apdi", "AuxiliaryImageType") or "", picture[:_HEADER_BYTES]

@@ -24,7 +24,7 @@ class Embedded:
             ``along_ray`` if these are distances along the ray. Empty if the file does not state it.
         matte: Coverage by the subject, ``[h, w]``, float32 in [0, 1], or None.
         original: The photograph without blur, if the file's own is blurred already.
-        problem: Reason for which maps that are there cannot be used; "" if there is none.
+        problem: Reason for which the maps of the file cannot be used, or "".
     """
 
     depth: np.ndarray | None = None
