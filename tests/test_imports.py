@@ -37,6 +37,7 @@ ALLOWED = {
         *("tensors", "validation", "native", "io", "optics", "depth", "options", "render", "module"),
         *("extras", "fit", "export", "bench"),
     },
+    "photograph": {"validation", "io", "optics", "cli"},
 }
 
 

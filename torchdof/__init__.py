@@ -8,8 +8,9 @@ if TYPE_CHECKING:
     from .module import DepthOfField, blur_by_coc, depth_of_field
     from .optics.blur_table import BlurTable
     from .optics.camera import Camera
+    from .photograph import photo
 
-__all__ = ["BlurTable", "Camera", "DepthOfField", "blur_by_coc", "depth_of_field"]
+__all__ = ["BlurTable", "Camera", "DepthOfField", "blur_by_coc", "depth_of_field", "photo"]
 
 # Imported on first use, so that ``torchdof --help`` does not import PyTorch.
 _HOMES = {
@@ -18,6 +19,7 @@ _HOMES = {
     "DepthOfField": "module",
     "blur_by_coc": "module",
     "depth_of_field": "module",
+    "photo": "photograph",
 }
 _SUBPACKAGES = ("augmentation", "depth", "distributed", "export", "fit", "functional")
 

@@ -54,6 +54,7 @@ image.exr depth.npy --focus-m 2 --f-number 2 --blur 2% | --f-number and --blur b
 image.exr depth.npy --focus-m 2 --equivalent 85,1.4 --focal-length-mm 50 | --equivalent and --focal-length-mm say
 image.exr depth.npy --focus-m 2 --equivalent 85       | --equivalent expects MM,F such as 85mm,1.4, got '85'
 image.exr depth.npy --focus-m 2 --blur 99%            | --blur expects SHARE% such as 2%, above 0 and at most 50%
+image.exr depth.npy --focus-m 2 --blur 0.5            | --blur expects SHARE% such as 2%
 image.exr depth.npy --depth-kind coc --blur 2%        | --depth-kind coc is the blur itself and takes no camera
 shot.####.exr depth.npy -o o.#.exr --focus-m 2 --blur 2% | --blur would open the lens anew in each frame
 image.exr depth.npy --focus-m 2 --aperture-radius-m 1 | --aperture-radius-m goes with --fov-deg
@@ -149,7 +150,10 @@ def test_an_error_is_one_sentence_with_names_of_options(
     ("line", "expected"),
     [
         ("render image.exr", "Missing option '--out' / '-o'"),
-        ("render image.exr depth.npy -o out.exr --f-number wide", "'wide' is not a valid float"),
+        (
+            "render image.exr depth.npy -o out.exr --f-number wide",
+            "--f-number expects N such as 1.8 or f/1.8, got 'wide'",
+        ),
         ("render image.exr depth.npy -o out.exr --depth-kind odd", "'odd' is not one of 'auto', 'z', 'distance'"),
         ("bench --repeat 0", "0 is not in the range x>=1"),
         ("render image.exr depth.npy -o out.exr --fov-deg 200", "'--fov-deg': 200.0 is not in the range 0<x<180"),

@@ -20,7 +20,7 @@ from tests.files import store
 from torchdof.cli.frame import Renderer, coc_of, read_frame
 from torchdof.cli.main import app
 from torchdof.cli.options import Scene
-from torchdof.cli.output import Notices
+from torchdof.cli.output import Notices, rounded
 from torchdof.io.highlights import expand_highlights
 from torchdof.io.images import Picture, read_image, read_values, write_image
 from torchdof.optics.field import Field
@@ -124,7 +124,7 @@ def test_render_equals_the_function_on_tensors(
     plain = {name: value for name, value in arguments.items() if name in ("method", "depth_edges", "attention")}
     assert plain.items() <= passed.items()
     radius = float(camera.coc_px(depth, depth.shape[-1]).abs().max())
-    assert line.startswith(f"out.exr: {inside(camera)}; ") and f"; blur radius up to {radius:.1f} px; " in line
+    assert line.startswith(f"out.exr: {rounded(inside(camera))}; ") and f"; blur radius up to {radius:.1f} px; " in line
     assert "[" not in line and line.count("\n") == 1
 
 
@@ -156,7 +156,7 @@ def test_lights_expand_clipped_lamps_of_a_photograph_and_alpha_is_premultiplied(
 def test_the_line_states_camera_blur_and_table(run: Run) -> None:
     line = run(f"{ONE} {LENS} --resume --no-occlusion {BLADES}")
     assert run(f"{ONE} {LENS} --resume --no-occlusion {BLADES}") == "out.exr: is there already\n"
-    assert line.startswith(f"out.exr: {inside(CAMERA)}; blur radius up to 2.1 px; disc, layered; ")
+    assert line.startswith(f"out.exr: {rounded(inside(CAMERA))}; blur radius up to 2.1 px; disc, layered; ")
     assert f"layered; {inside(PENTAGON.aperture)}; no occlusion; 24 x 16; " in line
 
 
@@ -165,12 +165,21 @@ def test_the_camera_is_read_from_the_file_and_the_line_names_the_source(image: T
     write_image("photo.exr", with_tags(image, **tags))
     line = run("render photo.exr depth.npy -o out.exr")
     assert ": 85 mm, f/1.8, focus 3 m, sensor 36 mm; " in line
-    assert "[focus from the file, focal length from the file, f-number from the file, sensor width from the f" in line
+    assert line.splitlines()[1:] == [
+        "  focus         3 m, from the file    --focus-at, --focus-m",
+        "  focal length  85 mm, from the file  --focal-length-mm, --equivalent",
+        "  f-number      f/1.8, from the file  --blur, --f-number",
+        "  sensor width  36 mm, from the file  --sensor-width-mm, --equivalent",
+    ]
     line = run("render photo.exr depth.npy -o out.exr --f-number 4 --focus-m 2")
     assert "85 mm, f/4, focus 2 m" in line and "f-number from" not in line
-    assert "[focal length assumed, f-number assumed, sensor width assumed]" in run(ONE)
+    assert re.findall(r"\n  (.*?)  +(.*?)  +--", run(ONE)) == [
+        ("focal length", "50 mm, assumed"),
+        ("f-number", "f/2.8, assumed"),
+        ("sensor width", "36 mm, assumed"),
+    ]
     write_image("photo.exr", with_tags(image, **tags | {"FNumber": 64.0}))  # hardly any blur
-    assert "f-number for a blur of 2% of the width" in run("render photo.exr depth.npy -o out.exr")
+    assert ", for a blur of 2% of the width" in run("render photo.exr depth.npy -o out.exr")
 
 
 def test_every_kind_of_depth_converts_to_the_same_metres(image: Tensor, depth: Tensor, run: Run) -> None:
@@ -297,8 +306,8 @@ def test_metadata_are_copied_and_bits_and_transfer_follow_the_options(image: Ten
 def test_a_phones_lens_without_a_sensor_is_wide_and_an_impossible_distance_is_no_focus(image: Tensor, run: Run) -> None:
     write_image("phone.png", with_tags(image, "8", FocalLength=4.0, SubjectDistance=0.001))
     line = run("render phone.png depth.npy -o out.png")
-    assert ": 4 mm, f/" in line and "sensor 5.53846 mm" in line and "sensor width assumed" in line  # 36 / 26 * 4 mm
-    assert "focus on what is nearest the middle" in line
+    assert ": 4 mm, f/" in line and "sensor 5.54 mm" in line and "5.54 mm, assumed" in line  # 36 / 26 * 4 mm
+    assert "on what is nearest the middle" in line
     assert "sensor 8 mm" in run("render phone.png depth.npy -o out.png --sensor-width-mm 8 --focus-m 2")
 
 
@@ -427,8 +436,8 @@ def test_the_first_run_ends_even_if_the_other_begins_with_its_last_frame(
     torchdof.BlurTable.disc().save("lens.json")
     write, written = Renderer.write, list[Path]()
 
-    def write_before_another_run(self: Renderer, out: Path, *arguments: Any) -> None:
-        write(self, out, *arguments)
+    def write_before_another_run(self: Renderer, out: Path, *arguments: Any, seconds: float) -> None:
+        write(self, out, *arguments, seconds=seconds)
         written.append(out)
         if len(written) == 3:
             record = json.loads(Path(RECORD).read_text()) | {"--f-number": 4.0}
@@ -479,7 +488,7 @@ def test_the_subject_of_an_inverted_map_is_the_same(run: Run) -> None:
     assert place == pytest.approx(0.8, abs=0.05) and far_m == pytest.approx(8 - 7 * place, rel=1e-3)
 
 
-@pytest.mark.parametrize(("height", "width", "share"), [(132, 194, "2.1%"), (96, 96, "50.0%")])
+@pytest.mark.parametrize(("height", "width", "share"), [(132, 194, "2.1%"), (96, 96, "50%")])
 def test_depth_of_another_shape_is_stretched_as_the_line_states(
     run: Run, image: Tensor, depth: Tensor, height: int, width: int, share: str
 ) -> None:
@@ -487,7 +496,7 @@ def test_depth_of_another_shape_is_stretched_as_the_line_states(
     stretched = torch.nn.functional.interpolate(depth, (height, width), mode="nearest")
     np.save("stretched.npy", stretched.numpy())
     line = run(f"render large.exr stretched.npy -o out.exr --focus-m 2 {LENS}")
-    assert f"depth of {width} x {height} px stretched by {share}" in line and "96 x 64" in line
+    assert f"depth  of {width} x {height} px stretched by {share}" in line and "96 x 64" in line
     with pytest.warns(UserWarning, match="stretched"):
         expected = torchdof.depth_of_field(pixels("large.exr"), stretched, CAMERA)
     torch.testing.assert_close(pixels("out.exr"), expected, rtol=0, atol=1e-5)
@@ -521,8 +530,8 @@ def test_the_first_command_needs_no_option(run: Run, low: int, high: int, sample
     store(Path("depth.png"), values.astype(sample), sample, ("Y",))
     line, note = told("render photo.png depth.png -o out.png")
     assert note.count("\n") == 1 and note.startswith(f"note: depth.png: {noted}")
-    assert "blur radius up to 2.4 px" in line and "f-number for a blur of 2% of the width" in line
-    assert "focus on what is nearest the middle" in line
+    assert "blur radius up to 2.4 px" in line and ", for a blur of 2% of the width" in line
+    assert "on what is nearest the middle" in line
     before, after = pixels("photo.png"), pixels("out.png")
     torch.testing.assert_close(after[..., 45:, 50:70], before[..., 45:, 50:70], rtol=0, atol=0.01)
     assert float((after - before)[..., :12, :].abs().mean()) > 0.05
@@ -599,7 +608,7 @@ def test_blur_sets_the_largest_radius_as_a_share_of_the_width(depth: Tensor, run
         for lens in ("", " --focal-length-mm 85", " --fov-deg 40"):
             line = run(f"render image.exr depth.npy -o out.exr {focus}{lens} --blur 10%")
             assert "blur radius up to 2.4 px" in line and "f-number" not in line
-    (f_number,) = numbers_in(run(f"{ONE} --blur 10%"), r"f/([\d.]+)")
+    f_number = json.loads(run(f"{ONE} --blur 10% --json"))["camera"]["f_number"]
     assert float(torchdof.Camera(50.0, f_number, 2.0).coc_px(depth, 24).max()) == pytest.approx(2.4, rel=0.01)
     run(f"{ONE} --blur 40% --strict")  # a large blur that is stated is no mistake
 
@@ -613,11 +622,11 @@ def test_an_equivalent_lens_is_for_full_frame_either_way_up(run: Run, size: tupl
     camera = torchdof.Camera(85.0, 1.4, 1.5, sensor_mm)
     for said in ("85mm,1.4", "85,f1.4", "'85mm f/1.4'"):
         line = run(f"render phone.exr metres.npy -o out.exr --bits float --focus-m 1.5 --equivalent {said}")
-        assert f": {inside(camera)}; " in line and "[" not in line
+        assert f": {rounded(inside(camera))}; " in line and "[" not in line
     expected = torchdof.depth_of_field(image, depth, camera)
     torch.testing.assert_close(pixels("out.exr"), expected, rtol=0, atol=1e-6)
     line = run("render phone.exr metres.npy -o out.exr --depth-kind relative --relative-kind depth --equivalent 85,1.4")
-    assert "f/1.4, focus 1 m" in line and "depth from 1 to 8 m assumed" in line
+    assert "f/1.4, focus 1 m" in line and "from 1 to 8 m assumed" in line
 
 
 def test_lens_and_points_are_those_of_the_display_window(image: Tensor, depth: Tensor, run: Run) -> None:
@@ -659,7 +668,7 @@ def test_a_note_advises_to_increase_a_hardly_visible_blur(run: Run) -> None:
         assert note.count("\n") == 1
     np.save("flat.npy", np.full((16, 24), 3.0))
     line, note = told("render image.exr flat.npy -o out.exr")
-    assert "nothing is blurred, for all depth is in focus" in note and "f-number assumed" in line
+    assert "nothing is blurred, for all depth is in focus" in note and "f/2.8, assumed" in line
     assert told(f"{ONE} {LENS}")[1] == ""
 
 
@@ -721,3 +730,67 @@ def test_a_depth_map_with_one_value_is_named_as_such(depth: Tensor) -> None:
     np.save("flat.npy", np.full(depth.shape[-2:], 128.0))
     note = "note: flat.npy: has one value everywhere, 128, so nothing is nearer"
     assert note in told("render image.exr flat.npy -o out.png")[1]
+
+
+def test_an_exr_without_depth_lists_its_channels(run: Run) -> None:
+    store(
+        Path("x.exr"), np.ones((4, 6, 4), np.float32) * np.arange(4, dtype=np.float32), "float", ("R", "G", "B", "N.X")
+    )
+    error = run("render x.exr -o y.exr --focus-m 2 --fov-deg 40 --blur 2%", code=2)
+    assert "which of the channels R, G, B, N.X is depth? name it (--depth-channel)" in error
+
+
+def test_a_file_with_a_map_for_each_image_is_read_map_by_map(run: Run, depth: Tensor) -> None:
+    stack = torch.cat([depth, depth * 2, depth * 3])[:, 0].numpy()
+    np.savez("all.npz", depth=stack, conf=stack)
+    options = "--focus-m 2 --fov-deg 40 --aperture-radius-m 0.1"
+    run(f"render shot.####.exr all.npz -o out.####.exr --frames 2-3 {options}")
+    for number in (2, 3):
+        np.save("one.npy", stack[number - 1])
+        run(f"render shot.{number:04d}.exr one.npy -o one.exr --depth-kind z {options}")
+        assert torch.equal(pixels(f"out.{number:04d}.exr"), pixels("one.exr"))
+    np.save("two.npy", stack[:2])
+    error = run(f"render shot.####.exr two.npy -o out.####.exr {options}", code=2)
+    assert "holds 2 maps (an array [2, 16, 24]); the sequence has 3 images" in error
+
+
+def test_the_camera_of_an_estimator_is_used_unless_options_or_exif_state_it(image: Tensor, depth: Tensor) -> None:
+    np.savez("pro.npz", depth=depth[0, 0].numpy(), focallength_px=12.0)  # 90 degrees
+    out, _ = told("render image.exr pro.npz -o out.png --focus-m 2")
+    assert "18 mm," in out and "sensor 36 mm" in out and "18 mm, from the depth file" in out
+    out, _ = told("render image.exr pro.npz -o out.png --focus-m 2 --focal-length-mm 36")
+    assert "36 mm," in out and "sensor 72 mm" in out
+    write_image("image.exr", with_tags(image, FocalLength=50.0, FocalLengthIn35mmFilm=50.0))
+    out, _ = told("render image.exr pro.npz -o out.png --focus-m 2")
+    assert "50 mm," in out and "sensor 36 mm" in out and "from the depth file" not in out
+
+
+def test_the_scale_of_depth_anything_3_is_offered(image: Tensor, depth: Tensor) -> None:
+    matrix = np.diag([60.0, 60.0, 1.0])
+    np.savez("three.npz", depth=depth[0].numpy(), conf=depth[0].numpy(), intrinsics=matrix[None])
+    assert (
+        "of the metric model of Depth Anything 3: --depth-scale 0.2" in told("render image.exr three.npz -o o.png")[1]
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("50 mm, f/1.26491, focus 1.20681 m", "50 mm, f/1.3, focus 1.21 m"),
+        ("f/1.02344, focus 2.2987 m", "f/1.0, focus 2.3 m"),
+        ("f/2.0, f/0.172291, f/16.4", "f/2, f/0.17, f/16"),
+        ("focus 12345.6 m, 0.00123456 m, inf m, 3 layers", "focus 12346 m, 0.00123 m, inf m, 3 layers"),
+    ],
+)
+def test_numbers_are_printed_as_a_person_writes_them(text: str, expected: str) -> None:
+    assert rounded(text) == expected
+
+
+def test_numbers_are_read_as_a_person_writes_them(run: Run) -> None:
+    options = "--focal-length-mm 50 --sensor-width-mm 4"
+    run(f"render image.exr depth.npy -o a.exr {options} --focus-m 2.3 --f-number 1.2")
+    run(f"render image.exr depth.npy -o b.exr {options} --focus-m '2.3 m' --f-number f/1.2")
+    assert torch.equal(pixels("a.exr"), pixels("b.exr"))
+    run("render image.exr depth.npy -o a.exr --blur 5%")
+    run("render image.exr depth.npy -o b.exr --blur 5")
+    assert torch.equal(pixels("a.exr"), pixels("b.exr"))

@@ -117,10 +117,11 @@ def test_relative_depth_is_read_with_its_nearest_and_farthest_distance(tmp_path:
     for kind in ("disparity", "depth"):
         read = read_depth(path, "relative", near_m=1.0, far_m=8.0, relative_kind=kind, value_range=(0.0, 2.0))
         assert torch.equal(read, from_relative(values, 1.0, 8.0, kind, value_range=(0.0, 2.0)))
+    assert torch.equal(read_depth(path, "relative", near_m=1.0, far_m=8.0), from_relative(values, 1.0, 8.0))
     for wrong, message in (
         ({"near_m": 1}, "relative depth needs near_m and far_m"),
         ({"near_m": 1, "far_m": 2, "scale": 2.0}, "relative depth has no scale and offset"),
-        ({"kind": "z", "near_m": 1}, "are for the kind 'relative', got the kind 'z'"),
+        ({"kind": "z", "near_m": 1, "far_m": 2}, "near_m, far_m describe relative depth; .* 'relative' .* got 'z'"),
         ({"kind": "metres"}, "the kind of depth must be one of z, .*, relative, got 'metres'"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -240,7 +240,11 @@ def test_webdataset_reads_the_shards(pairs: list[Pair], tmp_path: Path) -> None:
         (lambda f: RenderShards(f, picture=".jpg"), ValueError, "picture must be"),  # type: ignore[arg-type]
         (lambda f: RenderShards(f, "disc"), ValueError, "blur must be a RandomDepthOfField"),  # type: ignore[arg-type]
         (lambda f: RenderShards(f, depth={"scal": 2.0}), ValueError, "depth must be some of kind, scale, .*'scal'"),
-        (lambda f: RenderShards(f, depth={"kind": "relative"}), ValueError, "'relative' must have near_m and far_m"),
+        (
+            lambda f: RenderShards(f, depth={"kind": "relative"}),
+            ValueError,
+            "needs near_m and far_m in metres, got",
+        ),
         (lambda f: RenderShards(f, seed=-1), ValueError, "seed must be a whole number"),
         (lambda f: RenderShards(f, threads=0), ValueError, "threads must be a whole number"),
         (lambda f: RenderShards(f / "none"), FileNotFoundError, "there is no such folder; make it first"),

@@ -274,7 +274,11 @@ def test_half_values_beyond_the_range_of_half_stay_finite(tmp_path: Path) -> Non
 # Channels, layers and parts
 
 
-@pytest.mark.parametrize("depth_name", ["Z", "z", "depth", "Depth.Z", "ViewLayer.Depth.Z", None])
+DEPTH_NAMES = ["Z", "z", ".Z", "depth", "Depth.Z", "ViewLayer.Depth.Z", "VRayZDepth", "Pz", "WorldDepth", "SceneDepth"]
+DEPTH_NAMES += ["Depth.red", "FinalImageWorldDepth.R", "depth.[Z]", "zDepth.V"]
+
+
+@pytest.mark.parametrize("depth_name", [*DEPTH_NAMES, None])
 def test_a_depth_channel_is_found_beside_colour_and_normals(tmp_path: Path, depth_name: str | None) -> None:
     values = np.zeros((2, 3, 8), np.float32)
     names = ("R", "G", "B", "A", depth_name or "u", "Normal.X", "Normal.Y", "Normal.Z")
@@ -300,6 +304,18 @@ def test_layers_are_chosen_by_name_and_plain_channels_come_first(tmp_path: Path)
         read_values(path, "depth")
     store(path, values, "float", ("Albedo.R", "Albedo.G", "Albedo.B", "R", "G", "B"))
     assert read_image(path).pixels.unique().tolist() == [2.0]
+
+
+@pytest.mark.parametrize(
+    "names", ["r g b a", ".R .G .B .A", "L.red L.green L.blue L.alpha", "L.[red] L.[green] L.[blue] L.[alpha]"]
+)
+def test_colours_are_found_under_the_names_of_other_programs(tmp_path: Path, names: str) -> None:
+    values = np.arange(1, 9, dtype=np.float32).reshape(1, 1, 8).repeat(2, 0)
+    others = ("Depth.R", "Depth.G", "Depth.B", "z")
+    picture = read_image(store(tmp_path / "x.exr", values, "float", (*names.split(), *others)))
+    assert picture.channels == ("R", "G", "B", "A") and picture.pixels[0, :, 0, 0].tolist() == [1, 2, 3, 4]
+    if "L." in names:
+        assert read_image(tmp_path / "x.exr", layer="L").pixels[0, 0, 0, 0] == 1.0
 
 
 def part(channels: tuple[str, ...], name: str = "", side: int = 32, sample: str = "float") -> Any:

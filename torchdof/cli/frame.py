@@ -4,9 +4,9 @@ import dataclasses
 import functools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor
@@ -19,8 +19,9 @@ from ..depth.relative import from_relative
 from ..depth.sanity import Mistake, coc_mistakes, depth_mistakes, whole_numbers
 from ..depth.sentinels import without_sentinels
 from ..io.colour import stated_primaries
+from ..io.estimates import Estimate, estimate_of
 from ..io.highlights import expand_highlights
-from ..io.images import Picture, read_image, read_values, write_image
+from ..io.images import Picture, read_image, read_map, write_image
 from ..io.sheet import shrunk, write_sheet
 from ..module import blur_by_coc
 from ..optics.aperture import Aperture
@@ -28,17 +29,24 @@ from ..optics.blur_table import BlurTable
 from ..optics.camera import Camera
 from ..options import Options
 from ..render.resample import resampled
-from ..validation import stretched, upright
+from ..validation import one_channel, stretched, upright
 from .command import refuse
 from .lens import Area, Lens
 from .options import INTEGER_TYPES, LIKE_RELATIVE, Scene
-from .output import Notices, print_result
+from .output import Notices, print_result, rounded
 
 if TYPE_CHECKING:
     from .render import Render
 
 _VISIBLE_PX = 2.0  # px; a note advises more blur if the largest radius is below
 _WITHOUT_EXIF = (".hdr", ".pfm")  # types in which OpenImageIO writes no EXIF data
+_OPTIONS = {  # first words of an assumption: options that change it
+    "focus": "--focus-at, --focus-m",
+    "focal length": "--focal-length-mm, --equivalent",
+    "f-number": "--blur, --f-number",
+    "sensor width": "--sensor-width-mm, --equivalent",
+    "depth": "--near-m, --far-m",
+}
 _PANEL_PX = 800  # px; longer side of a panel on a sheet
 
 
@@ -54,6 +62,7 @@ class Frame:
     filled: int  # number of filled holes, in pixels
     remarks: list[str]  # changes of the depth, and assumptions about it, that no option states
     guess: str  # message about the guessed kind of depth, or empty
+    fov_x_deg: float | None = None  # horizontal field of view that the depth file states
 
     def mistakes(self, camera: Camera) -> list[Mistake]:
         """Likely mistakes in the depth, given the camera."""
@@ -64,22 +73,44 @@ class Frame:
         return [mistake for mistake in mistakes if mistake.name not in meant]
 
 
-def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = False, **encoding: Any) -> Frame:
-    """Reads an image, with arguments of ``read_image``, and its depth; ``holes`` that no option fills stay NaN."""
-    source, guess, picture = depth or image, "", read_image(image, **encoding)
+def read_frame(
+    image: Path | Picture,
+    depth: Path | Tensor | None,
+    scene: Scene,
+    holes: bool = False,
+    place: tuple[int, int] | None = None,
+    **encoding: Any,
+) -> Frame:
+    """Reads an image, with arguments of ``read_image``, and its depth; ``holes`` that no option fills stay NaN.
+
+    Both may be in memory already; depth is then the numbers of a map.
+    ``place`` is the index of the image in its sequence, and their number, for a file with a map for each of them.
+    """
+    picture = image if isinstance(image, Picture) else read_image(image, **encoding)
+    image = Path("image") if isinstance(image, Picture) else image
+    values, depth = (depth.detach().cpu(), Path("depth")) if isinstance(depth, Tensor) else (None, depth)
+    source, meaning = depth or image, cast(Mapping[str, Any], {})
     height, width = picture.pixels.shape[-2:]
     is_exr = image.suffix.lower() == ".exr"
     x, y, full_x, full_y, *size = (picture.window if is_exr else None) or (0, 0, 0, 0, width, height)
     area = Area(x - full_x, y - full_y, *size)
-    if depth is not None or scene.depth_channel is not None:
-        values = read_values(source, scene.depth_channel, picture)
+    if values is not None:
+        one_channel("depth", values, whole=True)
+        values = values.float()
+    elif depth is not None or scene.depth_channel is not None:
+        values, meaning = read_map(source, scene.depth_channel, place, picture)
     elif picture.depth is not None:
-        values = picture.depth
+        values, meaning = picture.depth, picture.depth_meaning
     elif picture.depth_problem:
         raise ValueError(f"{image}: {picture.depth_problem}")
+    elif is_exr and picture.other_layers:
+        values, meaning = read_map(image)  # whose error lists the channels
     else:
         hint = "" if is_exr else ", which a network such as Depth Anything makes of it"
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH{hint}")
+    is_file = depth is not None and depth.is_file()
+    estimate = estimate_of(source, values.shape[-1], place) if is_file else Estimate()
+    scene, guess = scene.with_meaning(meaning) if meaning else (scene, "")
     known = values if scene.depth_unknown is None else values.masked_fill(values == scene.depth_unknown, math.nan)
     known, sentinels = without_sentinels(known)
     if scene.depth_kind == "auto":
@@ -87,6 +118,8 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
         stated_fill = scene.fill_depth
         scene, guess = scene.guessed(known, source, is_metric)
         scene = dataclasses.replace(scene, fill_depth=stated_fill) if holes else scene
+        if estimate.metric_scale is not None and scene.depth_kind == "z" and scene.depth_scale is None:
+            guess += f"; of the metric model of Depth Anything 3: --depth-scale {estimate.metric_scale:.4g}"
     kind: Any = scene.depth_kind
     is_whole = source.suffix.lower() in INTEGER_TYPES or whole_numbers(known[known.isfinite()])
     is_sky = kind in ("z", "distance") and not is_whole  # a renderer writes a large distance where nothing is
@@ -105,25 +138,29 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
         upright(picture.pixels, values)
         remarks = list(filter(None, [sentinels, stretched(picture.pixels, values)]))
         given: dict[str, Any] = {"unknown": scene.depth_unknown}
-        place: Any = (...,)
-        if kind == "distance":
+        part: Any = (...,)
+        is_along_ray = kind == "distance" or (kind == "relative" and "along_ray" in meaning)
+        if is_along_ray:
             centred_width = width + abs(area.width - 2 * area.x - width)
-            given["fov_x_deg"] = scene.view_deg(picture.metadata, centred_width, area)
-            values, place = area.centred(values, (height, width))
+            given["fov_x_deg"] = scene.view_deg(picture.metadata, centred_width, area, estimate.fov_x_deg)
+            values, part = area.centred(values, (height, width))
         if kind == "relative":
             given["value_range"] = scene.value_range
+            fov_x_deg = given.pop("fov_x_deg", None)
             values = from_relative(values, *scene.ends_m, scene.relative_kind or "disparity", **given)
+            if is_along_ray:
+                values = depth_from_values(values, "distance", fov_x_deg=fov_x_deg)
         else:
             values = depth_from_values(values, kind, scale=scene.depth_scale, offset=scene.depth_offset, **given)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
-    values, filled = values if kind == "coc" else resampled(picture.pixels, values[place]), 0
+    values, filled = values if kind == "coc" else resampled(picture.pixels, values[part]), 0
     fill_by: Any = scene.fill_depth
     if fill_by is not None or not holes:
         values, filled = resolve_holes(values, str(source), fill_by, kind in ("relative", "coc"))
     if kind == "relative" and None in (scene.near_m, scene.far_m):
         remarks.append("depth from {:g} to {:g} m assumed".format(*scene.ends_m))
-    return Frame(str(source), scene, picture, area, values, filled, remarks, guess)
+    return Frame(str(source), scene, picture, area, values, filled, remarks, guess, estimate.fov_x_deg)
 
 
 def coc_of(
@@ -149,22 +186,25 @@ class Renderer:
     def __init__(self, command: "Render", is_still: bool, is_assumed: bool = False) -> None:
         """``is_assumed``: no option states that depth is in metres."""
         self.command, self.is_still = command, is_still
+        self.has_table = False  # whether assumptions are a table below the line of a picture
         self.table, self.device = command.blur_table(), _device(command.device)
         self.notices, self.is_assumed = Notices(command.strict), is_assumed
 
-    def read(self, image: Path, depth: Path | None) -> Frame:
+    def read(self, image: Path | Picture, depth: Path | Tensor | None, place: tuple[int, int] | None = None) -> Frame:
         """Reads a frame as :func:`read_frame`, with the transfer curve and layers of the options."""
-        command = self.command
-        encoding: dict[str, Any] = {
-            "transfer": command.transfer,
-            "layer": command.layer,
-            "keep_layers": command.keep_layers,
-        }
-        return read_frame(image, depth, command, **encoding)
+        names = ("transfer", "layer", "keep_layers")
+        encoding: Any = {name: getattr(self.command, name) for name in names}
+        return read_frame(image, depth, self.command, place=place, **encoding)
 
     def render(self, frame: Frame, out: Path, number: int) -> Callable[[], None]:
         """Renders a frame of a number; returns the function that writes it to ``out``."""
-        start, picture, command = time.perf_counter(), frame.picture, self.command
+        start = time.perf_counter()
+        rendered = self.rendered(frame, number)
+        return functools.partial(self.write, out, *rendered, seconds=time.perf_counter() - start)
+
+    def rendered(self, frame: Frame, number: int = 0) -> tuple[Frame, Picture, Tensor, Camera | None]:
+        """The frame with all remarks, its picture after rendering, the signed blur radius in pixels, and the camera."""
+        picture, command = frame.picture, self.command
         frame = dataclasses.replace(frame, values=frame.values.to(self.device))
         if self.is_assumed and looks_relative(frame.values):
             message = f"taken for metres, as in every sequence without --depth-kind, but {LIKE_RELATIVE}"
@@ -185,8 +225,8 @@ class Renderer:
             table = _with_alpha(self.table) if picture.has_alpha else self.table
             with torch.no_grad():
                 pixels = blur_by_coc(pixels, coc_px, table=table, attention=attention, **command.arguments())
-        frame, picture = dataclasses.replace(frame, remarks=remarks), dataclasses.replace(picture, pixels=pixels)
-        return functools.partial(self.write, out, frame, picture, coc_px, camera, time.perf_counter() - start)
+        picture = dataclasses.replace(picture, pixels=pixels)
+        return dataclasses.replace(frame, remarks=remarks), picture, coc_px, camera
 
     def write(
         self, out: Path, frame: Frame, picture: Picture, coc_px: Tensor, camera: Camera | None, seconds: float
@@ -237,7 +277,7 @@ class Renderer:
         }
         shown = "focus shown: near orange, sharp green, far blue"
         words = [
-            _inside(camera),
+            rounded(_inside(camera)),
             f"blur radius up to {largest_px:.1f} px",
             shown if command.show_focus else f"{facts['table']}, {options.method}",
             _inside(table.aperture),
@@ -249,12 +289,36 @@ class Renderer:
             f"{seconds:.2f} s on {self.device}",
         ]
         remarks = f" [{', '.join(frame.remarks)}]" if frame.remarks else ""
+        if self.has_table and frame.remarks:
+            remarks = "\n" + _table(frame.remarks, camera)
         print_result(command.as_json, facts, f"{out}: {'; '.join(filter(None, words))}{remarks}")
 
 
 def _inside(value: Camera | Aperture | None) -> str:
     """The text of a camera or an opening without its brackets; "" for None."""
     return repr(value).partition("(")[2].removesuffix(")")
+
+
+def _table(remarks: list[str], camera: Camera | None) -> str:
+    """Assumptions as lines of three columns: a number, its source, and the options that change it."""
+    numbers = (
+        {}
+        if camera is None
+        else {
+            "focus": f"{float(camera.focus_m)} m",
+            "focal length": f"{float(camera.focal_length_mm)} mm",
+            "f-number": f"f/{float(camera.f_number)}",
+            "sensor width": f"{float(camera.sensor_width_mm)} mm",
+        }
+    )
+    rows = []
+    for remark in remarks:
+        name = next((name for name in _OPTIONS if remark.startswith(name)), "")
+        source = remark.removeprefix(name).strip()
+        options = "" if "stretched" in source else _OPTIONS.get(name, "")
+        rows.append((name, rounded(", ".join(filter(None, (numbers.get(name, ""), source)))), options))
+    widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
+    return "\n".join(f"  {a:{widths[0]}}  {b:{widths[1]}}  {c}".rstrip() for a, b, c in rows)
 
 
 def _device(name: str) -> torch.device:

@@ -56,11 +56,16 @@ class Area(NamedTuple):
 
 
 def _width_fraction(text: str) -> float:
-    """Reads a percentage of the width, as a fraction."""
+    """Reads a percentage of the width, as a fraction; without the sign, numbers below 1 could be fractions already."""
     share = float(text.removesuffix("%")) / 100
-    if not (text.endswith("%") and 0 < share <= 0.5):
+    if not (0 < share <= 0.5 and (text.endswith("%") or share >= 0.01)):
         raise ValueError
     return share
+
+
+def _f_number(text: str) -> float:
+    """Reads an f-number, as ``1.8`` or ``f/1.8``."""
+    return float(re.sub(r"^\s*[fF]/?", "", text))
 
 
 def _equivalent(text: str) -> tuple[float, ...]:
@@ -102,7 +107,7 @@ class Lens(Sensor):
     )
     tilt: float = option("Degrees by which the lens is tilted down: focus comes nearer towards the bottom.", 0.0)
     swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)
-    f_number: float | None = option("Smaller is blurrier.", basic=True)
+    f_number: float | None = option("Smaller is blurrier.", type=Parsed("N", _f_number, "1.8 or f/1.8"), basic=True)
     blur: float | None = option(
         "Open the lens until the largest blur radius is this share of the width, such as 2%; instead of --f-number.",
         type=Parsed("SHARE%", _width_fraction, "2%, above 0 and at most 50%"),
@@ -138,9 +143,10 @@ class Lens(Sensor):
         has_keys = len(self.focus_m or []) > 1
         refuse((has_keys, "--focus-m has keyframes but IMAGE is a single image; give one distance in metres"))
 
-    def view_deg(self, metadata: Mapping[str, Any], width: int, area: Area) -> float:
-        """Horizontal field of view in degrees of an image, as stated, or from focal length and sensor."""
-        lens = camera_settings(metadata, area.width, area.height) | self._stated(area)
+    def view_deg(self, metadata: Mapping[str, Any], width: int, area: Area, estimated_deg: float | None) -> float:
+        """Horizontal field of view in degrees of an image, as stated, or from focal length and sensor, or estimated."""
+        stated = self._stated(area)
+        lens = _estimated(estimated_deg, stated, area) | camera_settings(metadata, area.width, area.height) | stated
         if self.fov_deg is not None:
             half = math.tan(math.radians(self.fov_deg) / 2)
         elif {"focal_length_mm", "sensor_width_mm"} <= set(lens):
@@ -168,8 +174,13 @@ class Lens(Sensor):
         width, stated = depth.shape[-1], self._stated(area)
         in_file = camera_settings(frame.picture.metadata, area.width, area.height)
         focus_in_file = in_file.pop("focus_m", 0.0)
-        lens: dict[str, Any] = _DEFAULTS | in_file | stated
-        if in_file.get("focal_length_mm", math.inf) < _PHONE_MM and "sensor_width_mm" not in in_file | stated:
+        has_view = {"focal_length_mm", "sensor_width_mm"} <= in_file.keys()
+        estimated = {} if has_view else _estimated(frame.fov_x_deg, stated, area)
+        lens: dict[str, Any] = _DEFAULTS | in_file | estimated | stated
+        if (
+            in_file.get("focal_length_mm", math.inf) < _PHONE_MM
+            and "sensor_width_mm" not in in_file | estimated | stated
+        ):
             lens["sensor_width_mm"] = _full_frame_mm(area) * in_file["focal_length_mm"] / _PHONE_EQUIVALENT_MM
         remarks, focus_m = list[str](), math.inf
         if self.focus_m is not None:
@@ -186,6 +197,7 @@ class Lens(Sensor):
         if self.fov_deg is not None and not has_opening:
             raise ValueError("--fov-deg needs the opening of the lens: --aperture-radius-m, --f-number or --blur")
         sources = {name: "from the file" if name in in_file else "assumed" for name in _DEFAULTS if name not in stated}
+        sources |= {name: "from the depth file" for name in estimated}
         if self.fov_deg is None:
             camera = Camera(**lens, focus_m=focus_m)
         else:
@@ -219,6 +231,18 @@ class Lens(Sensor):
         radii = [area.coc_px(at_key, depth).abs().nan_to_num(0.0).flatten() for at_key in cameras]
         sampled = [radius[:: 1 + radius.numel() // _MAX_SAMPLES] for radius in radii]
         return max(float(radius.kthvalue(radius.numel() - radius.numel() // _PER_OUTLIER).values) for radius in sampled)
+
+
+def _estimated(fov_x_deg: float | None, stated: Mapping[str, float], area: Area) -> dict[str, float]:
+    """Focal length and sensor width of a field of view, unless they are stated: by default of a full-frame camera."""
+    if fov_x_deg is None:
+        return {}
+    widths = 1 / (2 * math.tan(math.radians(fov_x_deg) / 2))  # focal length over sensor width
+    focal_mm, sensor_mm = stated.get("focal_length_mm"), stated.get("sensor_width_mm")
+    if focal_mm is None:
+        focal_mm = widths * (sensor_mm or _full_frame_mm(area))
+    lens = {"focal_length_mm": focal_mm, "sensor_width_mm": sensor_mm or focal_mm / widths}
+    return {name: value for name, value in lens.items() if name not in stated}
 
 
 def _full_frame_mm(area: Area) -> float:

@@ -2,6 +2,7 @@
 
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -78,6 +79,18 @@ class DepthMap(Group):
     def is_to_scale(self) -> bool:
         """Whether distances are in metres, and not only assumed for relative depth."""
         return self.depth_kind != "relative" or self.near_m is not None or self.far_m is not None
+
+    def with_meaning(self, meaning: Mapping[str, Any]) -> "tuple[Self, str]":
+        """These options with what a phone states about its depth, unless an option states it, and a message."""
+        if self.depth_kind not in ("auto", "relative"):
+            return self, ""
+        stated = {"relative_kind": meaning["kind"], "fill_depth": "far"}
+        if self.depth_kind == "auto":  # no option states distances
+            stated |= {name: meaning[name] for name in ("near_m", "far_m", "value_range")}
+        unset = {name: value for name, value in stated.items() if getattr(self, name) is None}
+        options = replace(self, depth_kind="relative", **unset)
+        ends = "from {:.3g} to {:.3g} m".format(*options.ends_m)
+        return options, f"its own depth is used, {ends} (else name a depth file after it: IMAGE DEPTH)"
 
     def guessed(self, values: "Tensor", path: Path, is_metric: bool) -> "tuple[Self, str]":
         """These options with a guessed kind, and a message unless it is clear; ``is_metric``: others are in metres."""

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
@@ -26,6 +27,18 @@ def json_line(facts: Mapping[str, Any]) -> str:
     return json.dumps(json.loads(text, parse_constant=_NOT_FINITE.__getitem__))
 
 
+def rounded(text: str) -> str:
+    """A text with its numbers as a person writes them: three significant digits, two of an f-number."""
+
+    def short(match: re.Match[str]) -> str:
+        value = float(match[2])
+        if not match[1]:
+            return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+        return f"f/{value:.0f}" if value >= 10 or value == round(value) else f"f/{value:.{1 if value >= 1 else 2}f}"
+
+    return re.sub(r"(f/)?(?<![\w.])(\d+\.\d+(?:e[-+]?\d+)?)", short, text)
+
+
 def to_stderr(line: str) -> None:
     """Prints a line on standard error; one that cannot be written must not stop the command."""
     with contextlib.suppress(OSError):
@@ -33,15 +46,22 @@ def to_stderr(line: str) -> None:
 
 
 class Notices:
-    """Notes, and warnings of likely mistakes, or errors if ``strict``; each kind is printed once for all frames."""
+    """Notes, and warnings of likely mistakes, or errors if ``strict``.
 
-    def __init__(self, strict: bool = False) -> None:
-        self._strict, self._kinds = strict, set[str]()
+    Each kind is printed once for all frames; with ``each_message``, for pictures that differ, each text once.
+    """
+
+    def __init__(self, strict: bool = False, each_message: bool = False, is_printed: bool = True) -> None:
+        self._strict, self._each_message, self._is_printed = strict, each_message, is_printed
+        self._kinds, self.lines = set[str](), list[str]()  # kinds that were noted, and the lines
 
     def note(self, kind: str, line: str, word: str = "note") -> None:
         """Prints a note: an assumption, or advice, with the options that change it."""
+        kind = line.partition(": ")[2] if self._each_message else kind  # a line starts with the name of its file
         if kind not in self._kinds:
-            to_stderr(f"{word}: {line}")
+            self.lines.append(f"{word}: {line}")
+            if self._is_printed:
+                to_stderr(self.lines[-1])
         self._kinds.add(kind)
 
     def warn(self, source: str | os.PathLike[str], mistakes: "Iterable[Mistake]") -> None:

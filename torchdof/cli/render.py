@@ -79,6 +79,10 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
 
         torchdof render shot.####.exr -o out.####.exr --focus-m 1:2,48:5.5 --f-number 2 --resume
 
+    A folder of photographs and one of their depth maps, matched by name; portraits of phones need no map:
+
+        torchdof render photos/ depths/ -o out/
+
     A photograph with a focus pull:
 
         torchdof render photo.jpg depth.png -o pull.##.png --focus-m 1:1,24:5
@@ -92,14 +96,19 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
     the largest blur radius is 2 % of the width, unless the file's lens blurs enough.
     """
 
-    image: Path = argument("All-in-focus image (EXR, PNG, TIFF, JPEG, WebP, HDR, PFM) or shot.####.exr.", "IMAGE")
-    depth: Path | None = argument(
-        "Its depth (the same types, .npy, .npz); not needed if IMAGE has a Z channel.", "[DEPTH]", None
-    )
-    out: Path = option("File to write, or out.####.exr.", ..., names=("--out", "-o"), metavar="OUT")
+    image: Path = argument("All-in-focus image, shot.####.exr, or a folder.", "IMAGE")
+    depth: Path | None = argument("Its depth; not needed if IMAGE has a Z channel or is a portrait.", "[DEPTH]", None)
+    out: Path = option("File to write, out.####.exr, or a folder.", ..., names=("--out", "-o"), metavar="OUT")
 
     def run(self) -> None:
-        """Renders one image, the frames of a sequence, or a focus pull in a still image."""
+        """Renders one image, the frames of a sequence, a focus pull in a still image, or a folder."""
+        parameters = click.get_current_context().command.params
+        options = {p.opts[0]: getattr(self, p.name) for p in parameters if p.name and p.name not in _NOT_OF_FRAMES}
+        options |= {"files": self.files(), "torchdof": importlib.metadata.version("torchdof")}
+        if self.image.is_dir():
+            from .folder import render_folder
+
+            return render_folder(self, options)
         images, depths, numbered = map(FramePattern.of, (self.image, self.depth, self.out))
         keys = (self.focus_m or []) if images is None else []
         is_single = images is None and len(keys) < 2
@@ -138,9 +147,6 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         whole = list(numbers)  # frames of the sequence, each of which may depend on those before it
         if images and self.steady:
             whole = [n for n in images.frames() if depths is None or depths.name(n).is_file()]
-        parameters = click.get_current_context().command.params
-        options = {p.opts[0]: getattr(self, p.name) for p in parameters if p.name and p.name not in _NOT_OF_FRAMES}
-        options |= {"files": self.files(), "torchdof": importlib.metadata.version("torchdof")}
         record, existing = Record(self.out, options), [out for out in outputs.values() if out.is_file()]
         reason, done = record.difference(), set[Path]()
         if self.resume:
@@ -169,15 +175,19 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         is_assumed = images is not None and self.depth_kind == "auto"  # a guess could differ from frame to frame
         of_frames = dataclasses.replace(self, depth_kind="z") if is_assumed else self
         renderer = Renderer(of_frames, images is None, is_assumed)
+        renderer.has_table = is_single
         if self.resume and len(existing) > len(done):
             again = f"{len(existing) - len(done)} of {len(outputs)} frames are rendered again"
             renderer.notices.note("again", f"{self.out}: {again}: {reason}")
         if images and self.depth_kind == "relative" and self.value_range is None and len(numbers) > 1:
             renderer.notices.warn(self.depth or self.image, [Mistake("range", _OWN_EXTREMES)])
         read_files = functools.lru_cache(maxsize=1)(renderer.read)  # a focus pull reads one image many times
+        in_one_file = images and not depths and self.depth and self.depth.suffix.lower() in (".npy", ".npz")
+        all_frames = images.frames() if images and in_one_file else []
+        places = {n: (k, len(all_frames)) for k, n in enumerate(all_frames)}
 
         def as_stored(n: int) -> "Frame":
-            return read_files(*sources(n))
+            return read_files(*sources(n), places.get(n))
 
         steady = SteadyFrames(lambda k: (as_stored(whole[k]).picture.pixels, as_stored(whole[k]).values))
 

@@ -5,7 +5,7 @@ from ..render.resample import at_size_of
 from .holes import fill_holes
 from .inspect import DepthReport, inspect_depth
 from .kinds import depth_from_values
-from .reading import read_depth
+from .read import read_depth
 from .relative import Scale, from_relative, solve_scale
 from .sanity import DepthWarning, check
 from .steady import Steady, SteadyFrames

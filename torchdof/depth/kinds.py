@@ -1,4 +1,4 @@
-"""Depth values of any stated kind, given or read from a file, to metres along the optical axis."""
+"""Depth values of any stated kind to metres along the optical axis."""
 
 import math
 from typing import Literal

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from ..augmentation import RandomDepthOfField
-from ..depth.reading import read_depth
+from ..depth.read import read_depth
 from ..extras import missing
 from ..io.atomic import atomic_file, write_text
 from ..io.images import Picture, read_image, write_image
@@ -159,8 +159,8 @@ class RenderShards:
             signature.bind("", **self.depth)
         except TypeError as error:
             raise ValueError(f"depth must be some of {', '.join([*signature.parameters][1:])}: {error}") from None
-        if self.depth.get("kind") == "relative" and not {"near_m", "far_m"} <= {*self.depth}:
-            raise ValueError("depth of the kind 'relative' must have near_m and far_m, in metres")
+        if self.depth.get("kind") == "relative" and not {"near_m", "far_m"} <= self.depth.keys():
+            raise ValueError(f"depth of kind 'relative' needs near_m and far_m in metres, got {show(self.depth)}")
         if threads is not None:
             torch.set_num_threads(whole("threads", threads, 1, 4096))
 

@@ -10,9 +10,16 @@ from .decode import Part
 Place = tuple[int, int]
 """Index of a part, and of a channel in it."""
 
-_DEPTH_WORDS = ("depth", "z", "zdepth")
-_KINDS_OF_LAYERS = {*_DEPTH_WORDS, "rgb", "rgba", "combined", "colour", "color", "beauty", "image"}
-"""Words for the content of a layer or part; the other words of its name are those of a layer, part or view."""
+_KINDS_OF_LAYERS = {"rgb", "rgba", "combined", "colour", "color", "beauty", "image"}
+"""Words for the content of a layer or part, beside those for depth; other words of its name are of layer or view."""
+_LETTERS = {"red": "R", "green": "G", "blue": "B", "alpha": "A", **{letter.lower(): letter for letter in "RGBAYZ"}}
+
+
+def plain(name: str) -> tuple[str, str]:
+    """Layer and channel of a name as programs write them: ``.R``, ``r``, ``Beauty.red`` and ``Beauty.[red]`` are R."""
+    layer, _, channel = name.rpartition(".")
+    channel = channel.removeprefix("[").removesuffix("]")
+    return layer, _LETTERS.get(channel.lower(), channel)
 
 
 def colour_channels(parts: list[Part], layer: str | None) -> tuple[int, list[int], tuple[str, ...]]:
@@ -22,16 +29,15 @@ def colour_channels(parts: list[Part], layer: str | None) -> tuple[int, list[int
     """
     layers_with_colour = []
     for part, source in enumerate(parts):
-        names = source.names
-        for layer_name in dict.fromkeys(name.rpartition(".")[0] if source.is_exr else "" for name in names):
-            start = layer_name + "." if layer_name else ""
-            colours = next((each for each in ("RGB", "Y") if all(start + name in names for name in each)), "")
+        names = [plain(name) if source.is_exr else ("", name) for name in source.names]
+        for layer_name in dict.fromkeys(layer_name for layer_name, _ in names):
+            colours = next((each for each in ("RGB", "Y") if all((layer_name, name) in names for name in each)), "")
             if colours:
-                channels = tuple(colours + "A" if start + "A" in names else colours)
-                indices = [names.index(start + name) for name in channels]
+                channels = tuple(colours + "A" if (layer_name, "A") in names else colours)
+                indices = [names.index((layer_name, name)) for name in channels]
                 layers_with_colour.append((layer_name, source.label, part, indices, channels))
     if layer is None:
-        layers_with_colour.sort(key=lambda entry: entry[0] != "")
+        layers_with_colour.sort(key=lambda entry: (entry[0] != "", _of_depth(entry[0])))
         chosen = layers_with_colour[:1]
     else:
         chosen = [found for found in layers_with_colour if layer in found[:2] or found[0].startswith(layer + ".")]
@@ -51,18 +57,30 @@ def full_name(parts: list[Part], place: Place) -> str:
 
 
 def depth_channels(parts: list[Part]) -> list[Place]:
-    """The channels that hold depth by their names: ``Z``, ``depth``, ``left.Z``, ``ViewLayer.Depth.Z``; not ``N.Z``."""
-    places = []
-    for part, source in enumerate(parts):
-        names = [name.lower() for name in source.names]
-        for index, name in enumerate(names):
-            layer, _, last = name.rpartition(".")
-            of_view = last == "z" and f"{layer}.x" not in names
-            in_layer = last in ("z", "v", "y", "r") and not {*layer.split(".")}.isdisjoint(_DEPTH_WORDS)
-            in_own_part = source.label.lower() in _DEPTH_WORDS and len(names) == 1
-            if name == "z" or last == "depth" or of_view or in_layer or in_own_part:
-                places.append((part, index))
-    return places
+    """The channels that hold depth by their names: ``Z``, ``depth``, ``left.Z``, ``VRayZDepth``; not ``N.Z``."""
+    every = [(part, index) for part, source in enumerate(parts) for index in range(len(source.names))]
+    return [place for place in every if _is_depth(parts[place[0]], place[1])]
+
+
+def _is_depth(part: Part, index: int) -> bool:
+    """Whether a channel is depth by its name, by its layer's without other coordinates, or by its part's."""
+    layer, channel = plain(part.names[index])
+    word = channel.lower()
+    if word.endswith("depth") or (not layer and word in ("z", "pz")):
+        return True
+    if word == "z" and not any(plain(name) in ((layer, "x"), (layer, "X")) for name in part.names):
+        return True
+    in_own_part = _of_depth(part.label) and len(part.names) == 1
+    return in_own_part or (_of_depth(layer) and channel.upper() in ("Z", "V", "Y", "R"))
+
+
+def _of_depth(name: str) -> bool:
+    """Whether a layer or part is depth by a word of its name, as ``FinalImageWorldDepth`` or ``ViewLayer.Depth``."""
+    return any(_means_depth(word) for word in name.lower().split("."))
+
+
+def _means_depth(word: str) -> bool:
+    return word == "z" or word.endswith("depth")
 
 
 def named_channels(parts: list[Part], name: str) -> list[Place]:
@@ -105,4 +123,5 @@ def nearest_channel(parts: list[Part], places: Sequence[Place], layer: str = "")
 
 
 def _words(name: str) -> set[str]:
-    return {*re.split(r"[^a-z0-9]+", name.lower())} - _KINDS_OF_LAYERS - {""}
+    words = {*re.split(r"[^a-z0-9]+", name.lower())} - _KINDS_OF_LAYERS - {""}
+    return {word for word in words if not _means_depth(word)}

@@ -24,6 +24,7 @@ _SPACE = rb"(?:\s|#[^\n]*\n)+"  # white space and comments
 _PFM_HEADER = re.compile(
     rb"P([Ff])" + _SPACE + rb"(-?\d{1,9})" + _SPACE + rb"(-?\d{1,9})" + _SPACE + rb"([-+.\deE]+)(?=\s)"
 )
+DEPTH_ARRAYS = ("depth", "depths", "predicted_depth")  # names of depth among the arrays of an estimator's file
 MAX_CHANNELS = 1024  # in a part of an EXR file; OpenImageIO has the same limit
 
 
@@ -74,7 +75,8 @@ def read_parts(path: Path) -> list[Part]:
         return [_read_pfm(path)]
     _check_header(path)
     with utf8_name(path) as name:
-        return list(_parts(name))
+        parts = list(_parts(name))
+    return [_unscaled(path, parts[0])] if path.suffix.lower() == ".pgm" else parts
 
 
 def _parts(name: str) -> Iterator[Part]:
@@ -223,8 +225,21 @@ def _refuse_noise(values: np.ndarray) -> None:
         raise ValueError(f"its numbers have magnitudes from {ends}, as random bytes have: {advice}")
 
 
-def read_array(path: Path, key: str | None) -> np.ndarray:
-    """The array ``[H, W]`` of an ``.npy`` file, or of an ``.npz`` file: its only array, or ``key``. Refuses pickles."""
+def _unscaled(path: Path, part: Part) -> Part:
+    """The numbers as a PGM file stores them; OpenImageIO would multiply them to fill 8 or 16 bits."""
+    with path.open("rb") as file:
+        header = re.sub(rb"#[^\n]*", b"", file.read(400)).split()
+    largest = int(header[3])
+    levels = np.rint(part.values * (largest / np.iinfo(part.values.dtype).max)).astype(part.values.dtype)
+    return dataclasses.replace(part, values=levels)
+
+
+def read_array(path: Path, key: str | None, place: tuple[int, int] | None = None) -> np.ndarray:
+    """The array ``[H, W]`` of an ``.npy`` file, or of an ``.npz`` file: its only array, depth, or ``key``.
+
+    ``place`` is the index of an image in a sequence, and the number of images, for an array ``[N, H, W]``. Refuses
+    pickles.
+    """
     try:
         if path.suffix.lower() == ".npz":
             with zipfile.ZipFile(path) as archive:
@@ -233,11 +248,15 @@ def read_array(path: Path, key: str | None) -> np.ndarray:
                 raise ValueError(f"holds {largest} bytes, more than {MAX_PIXELS} pixels or than there is memory for")
             with np.load(path, allow_pickle=False) as arrays:
                 names = ", ".join(arrays.files)
+                named = [name for name in arrays.files if name.lower() in DEPTH_ARRAYS]
+                key = named[0] if key is None and len(named) == 1 else key
                 if key is None and len(arrays.files) != 1:
                     raise ValueError(f"which of the arrays {names} is depth? name it (--depth-channel)")
                 if key is not None and key not in arrays.files:
                     raise ValueError(f"no array {key!r}; it has {names}")
-                array = arrays[key or arrays.files[0]]
+                array, mask = arrays[key or arrays.files[0]], arrays["mask"] if "mask" in arrays.files else None
+                if mask is not None and mask.dtype == bool and mask.shape == array.shape and array.dtype.kind == "f":
+                    array = np.where(mask, array, np.inf)  # as MoGe writes skies in its other files
         else:
             array = np.load(path, allow_pickle=False, mmap_mode="r")
         if not isinstance(array, np.ndarray):
@@ -247,6 +266,12 @@ def read_array(path: Path, key: str | None) -> np.ndarray:
     shape = array.shape
     while array.ndim > 2 and 1 in (array.shape[0], array.shape[-1]):
         array = array[0] if array.shape[0] == 1 else array[..., 0]
+    if array.ndim == 3 and array.shape[-1] > 4:  # not [H, W, C]
+        if place is None or place[1] != len(array):
+            images = "" if place is None else f"; the sequence has {place[1]} images"
+            remedy = "give a sequence of as many images, such as shot.####.png"
+            raise ValueError(f"holds {len(array)} maps (an array {list(shape)}){images}; {remedy}")
+        array = array[place[0]]
     if array.ndim != 2 or array.dtype.kind not in "fiu" or array.size == 0:
         raise ValueError(f"expected an array [H, W] of numbers, got {list(shape)} of {array.dtype}")
     check_size(array.shape[1], array.shape[0], array.dtype.itemsize + 4)

@@ -15,14 +15,19 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from ..validation import choice, real_tensor, show
 from .atomic import atomic_file
 from .channels import colour_channels, depth_channels, named_channels, nearest_channel
 from .colour import in_rec709, stated_primaries, stated_transfer
 from .decode import Part, errors_named, first_line, is_complete, read_array, read_parts, utf8_name
+from .heif import heif_maps, read_heif
+from .jpeg import jpeg_maps
 from .layers import LOSSLESS, OF_LAYERS, Layers
-from .paths import PixelType, existing_image, existing_map, samples_of
+from .metadata import turned
+from .paths import PixelType, existing_image, existing_map, has_pi_heif, samples_of
+from .portraits import Embedded
 from .transfer import Transfer, decode, default_transfer, encode, encode_8_bits
 from .webp import add_exif
 from .windows import Window, placed
@@ -58,8 +63,11 @@ class Picture:
         orientation: EXIF orientation of the file; the pixels are upright already.
         other_layers: Names of the layers of the file that are neither the pixels nor the depth.
         layer: Names of the part and layer of the pixels, joined by a dot.
-        depth_problem: The reason why none of several depth channels was taken, or empty.
+        depth_problem: The reason why none of several depth channels, or a phone's own depth, was taken, or empty.
         layers: All parts and layers of an EXR file, which :func:`write_image` then writes too; None writes the pixels.
+        depth_meaning: Arguments of :func:`torchdof.depth.from_relative` with which a phone's own depth becomes metres,
+            and ``along_ray`` if these are distances along the ray; empty if the file does not state it.
+        matte: Coverage by the subject that a phone stored, ``[1, 1, H, W]`` in [0, 1], or None.
     """
 
     pixels: Tensor
@@ -75,6 +83,8 @@ class Picture:
     layer: str = ""
     depth_problem: str = ""
     layers: Layers | None = None
+    depth_meaning: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    matte: Tensor | None = None
 
     @property
     def has_alpha(self) -> bool:
@@ -93,13 +103,16 @@ def read_image(
     """Reads an image into linear light.
 
     Args:
-        path: An EXR, PNG, TIFF, JPEG, WebP, HDR or PFM file; HEIC and raw files if OpenImageIO was built to read them.
+        path: An EXR, PNG, TIFF, JPEG, WebP, HDR or PFM file; HEIC and AVIF with ``pip install 'torchdof[heif]'``; raw
+            files if OpenImageIO was built to read them.
         transfer: "linear" or "srgb"; None uses what a PNG states, else "srgb" for integers and "linear" for floats.
         layer: Name of the part or layer of an EXR file to read; None takes the first that has colour.
         keep_layers: Keep the other layers and parts of an EXR file, so that a copy has them too.
 
     Returns:
-        The picture, upright; its depth channel is one like ``Z``, ``depth`` or ``ViewLayer.Depth.Z`` of an EXR file.
+        The picture, upright; its depth channel is one like ``Z``, ``depth`` or ``ViewLayer.Depth.Z`` of an EXR file, or
+        the depth that a phone stored in a portrait, which may have another size. If a portrait holds the photograph
+        without blur as well, that is read.
 
     Raises:
         OSError: If the file is missing, empty, truncated, not an image, or does not fit into memory.
@@ -117,14 +130,14 @@ def read_image(
     if transfer is not None:
         choice("transfer", transfer, ("linear", "srgb"))
     with errors_named(path):
-        parts = read_parts(path)
+        parts, maps = _read(path)
         part, indices, names = colour_channels(parts, layer)
         source = parts[part]
         stated = stated_transfer(source.stated) if transfer is None else None
         transfer = stated or transfer
         pixels, sample, transfer = _light(source, indices, transfer, has_alpha=names[-1] == "A")
         kept = Layers(tuple(parts), part, tuple(indices)) if keep_layers and source.is_exr else None
-        depth, problem, places = None, "", {(part, k) for k in indices}
+        depth, problem, places = None, maps.problem, {(part, k) for k in indices}
         in_layer = source.names[indices[0]].rpartition(".")[0]
         label = f"{source.label}.{in_layer}".strip(".")
         if found := depth_channels(parts):
@@ -134,6 +147,12 @@ def read_image(
                 places.add((n, k))
             except ValueError as error:
                 problem = str(error)
+        elif maps.depth is not None:
+            depth = _map(turned(maps.depth, source.orientation, source.values.shape))
+        matte = None
+        if maps.matte is not None:
+            coverage = _map(turned(maps.matte, source.orientation, source.values.shape))
+            matte = interpolate(coverage, pixels.shape[-2:], mode="bilinear", antialias=True)
     left = [(p.label, name) for n, p in enumerate(parts) for k, name in enumerate(p.names) if (n, k) not in places]
     others = tuple(dict.fromkeys(name.rpartition(".")[0] or label or name for label, name in left))
     return Picture(
@@ -149,8 +168,28 @@ def read_image(
         is_stated=stated is not None,
         layer=label,
         depth_problem=problem,
+        depth_meaning=maps.meaning,
+        matte=matte,
         layers=kept,
     )
+
+
+def _read(path: Path) -> tuple[list[Part], Embedded]:
+    """The parts of a file, and the maps that a phone stored in it."""
+    with path.open("rb") as file:
+        start = file.read(12)
+    is_heif = start[4:8] == b"ftyp" and has_pi_heif()
+    parts, maps = [read_heif(path)] if is_heif else read_parts(path), Embedded()
+    try:
+        if is_heif:
+            maps = heif_maps(path)
+        elif start[:2] == b"\xff\xd8":
+            maps = jpeg_maps(path)
+    except (OSError, ValueError) as error:  # the photograph itself can be used
+        maps = Embedded(problem=f"its depth cannot be used: {error}")
+    if maps.original is not None:
+        parts = [dataclasses.replace(maps.original, metadata=parts[0].metadata)]
+    return parts, maps
 
 
 def _light(
@@ -314,9 +353,10 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None, image:
     """Reads the numbers of a one-channel map, such as a depth map, without transfer curve or scaling of integers.
 
     Args:
-        path: An image of one channel (or of equal ones), an EXR file with a depth channel, or ``.npy`` / ``.npz``.
+        path: An image of one channel (or of equal ones), an EXR file with a depth channel, ``.pgm``, ``.npy`` or
+            ``.npz``, or a phone's portrait.
         channel: Name of a channel, layer or part of an image, or of an array in an ``.npz`` file; None takes the only
-            one, or the depth channel.
+            one, or the depth channel, or the array called depth.
         image: The image that the map belongs to. Of several depth channels, that of its layer is taken; the map is
             placed by the data windows of both, NaN where the map has no numbers. None takes the map as it is stored.
 
@@ -328,17 +368,34 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None, image:
         OSError: If the file is missing, empty, truncated or unreadable, or does not fit into memory.
         ValueError: If the channel is ambiguous or missing, or the array is not two-dimensional numbers.
     """
+    return read_map(path, channel, image=image)[0]
+
+
+def read_map(
+    path: str | os.PathLike[str],
+    channel: str | None = None,
+    place: tuple[int, int] | None = None,
+    image: Picture | None = None,
+) -> tuple[Tensor, Mapping[str, Any]]:
+    """As :func:`read_values`, and the meaning of the numbers of a phone's portrait, as in :class:`Picture`.
+
+    ``place`` is the index of an image in a sequence, and the number of images, for an array ``[N, H, W]``.
+    """
     path = existing_map(path)
     with errors_named(path):
         if path.suffix.lower() in (".npy", ".npz"):
-            part, k = Part("", ("Y",), read_array(path, channel)[..., None], ("float",)), 0
+            part, k = Part("", ("Y",), read_array(path, channel, place)[..., None], ("float",)), 0
         else:
-            parts = read_parts(path)
+            parts, maps = _read(path)
+            if maps.problem:
+                raise ValueError(maps.problem)
+            if maps.depth is not None:
+                return _map(turned(maps.depth, parts[0].orientation, parts[0].values.shape)), maps.meaning
             n, k = _map_channel(parts, channel, "" if image is None else image.layer)
             part = parts[n]
         if image is None:
-            return _map(part.values[..., k])
-        return _placed(part, k, image.pixels.shape[-2:], image.window)
+            return _map(part.values[..., k]), {}
+        return _placed(part, k, image.pixels.shape[-2:], image.window), {}
 
 
 def _map_channel(parts: list[Part], channel: str | None, layer: str) -> tuple[int, int]:

@@ -36,6 +36,14 @@ def upright(values: "np.ndarray", metadata: Metadata) -> "tuple[np.ndarray, Meta
     return values[rows, columns], upright_metadata
 
 
+def turned(values: "np.ndarray", orientation: int, shape: tuple[int, ...]) -> "np.ndarray":
+    """Turns a map ``[h, w]`` like a photograph that is upright and ``shape`` large, unless its sides are so already."""
+    is_upright = orientation >= 5 and (values.shape[0] > values.shape[1]) == (shape[0] > shape[1])
+    if is_upright:
+        return values
+    return upright(values[..., None], {"Orientation": (None, orientation)})[0][..., 0]
+
+
 def kept_metadata(attributes: Iterable[Any]) -> Metadata:
     """Metadata for a copy of an image: OpenImageIO's ``extra_attribs``, without those of the storage."""
     return {a.name: (a.type, a.value) for a in attributes if not re.match(_STORAGE, a.name)}

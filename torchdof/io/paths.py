@@ -4,6 +4,7 @@ Nothing here imports PyTorch, so that an error about a path appears at once.
 """
 
 import os
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
@@ -19,16 +20,21 @@ _SAMPLES: dict[str, tuple[PixelType, ...]] = {  # suffix -> sample types, the de
 IMAGE_SUFFIXES = tuple(_SAMPLES)
 """Suffixes of images that every installation reads and writes."""
 
-MAP_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".npz")
+MAP_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".npz", ".pgm")
 """Suffixes of depth maps."""
 
-_CONVERT = "convert it to JPEG or 16-bit TIFF (heif-convert, sips -s format tiff, or let the phone share it as JPEG)"
+_CONVERT = "install its reader, pip install 'torchdof[heif]', or convert it to JPEG or 16-bit TIFF (heif-convert)"
 _DEVELOP = "develop it to linear 16-bit TIFF (dcraw -4 -T, or a converter's linear profile) and copy its EXIF"
 OPTIONAL_SUFFIXES = {
     **dict.fromkeys((".heic", ".heif", ".avif"), ("heif", _CONVERT)),
     **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"), ("raw", _DEVELOP)),
 }
-"""Suffixes of images that OpenImageIO reads only if it was built with a further library, and what to do if not."""
+"""Suffixes of images that are read with a further library, as OpenImageIO calls it, and what to do without it."""
+
+
+def has_pi_heif() -> bool:
+    """Whether pi-heif is installed, which reads HEIC and AVIF files."""
+    return find_spec("pi_heif") is not None
 
 
 def readers() -> list[str]:
@@ -42,7 +48,9 @@ def refusal(path: str | os.PathLike[str]) -> str | None:
     """Message with the reason and the conversion for a file that cannot be read here; None for other files."""
     suffix = Path(path).suffix.lower()
     reader, remedy = OPTIONAL_SUFFIXES.get(suffix, ("", ""))
-    return f"{suffix} is not read here: {remedy}" if reader and reader not in readers() else None
+    if not reader or (reader == "heif" and has_pi_heif()) or reader in readers():
+        return None
+    return f"{suffix} is not read here: {remedy}"
 
 
 def samples_of(path: Path) -> tuple[PixelType, ...]:
@@ -56,15 +64,12 @@ def samples_of(path: Path) -> tuple[PixelType, ...]:
 
 def existing_image(path: str | os.PathLike[str]) -> Path:
     """Checks the path of an image; errors name it."""
-    path = _existing_file(path, (*IMAGE_SUFFIXES, *OPTIONAL_SUFFIXES), "an image")
-    if reason := refusal(path):
-        raise ValueError(f"{path}: {reason}")
-    return path
+    return _readable_file(path, (*IMAGE_SUFFIXES, *OPTIONAL_SUFFIXES), "an image")
 
 
 def existing_map(path: str | os.PathLike[str]) -> Path:
     """Checks the path of a depth map; errors name it."""
-    return _existing_file(path, MAP_SUFFIXES, "a depth map")
+    return _readable_file(path, (*MAP_SUFFIXES, *OPTIONAL_SUFFIXES), "a depth map")
 
 
 def named_file(source: str | os.PathLike[str], folder: Path, suffix: str, what: str) -> Path:
@@ -82,8 +87,8 @@ def named_file(source: str | os.PathLike[str], folder: Path, suffix: str, what: 
     return path
 
 
-def _existing_file(path: str | os.PathLike[str], suffixes: tuple[str, ...], what: str) -> Path:
-    """Returns ``path`` if it is a file with one of ``suffixes`` and is not empty; messages call it ``what``."""
+def _readable_file(path: str | os.PathLike[str], suffixes: tuple[str, ...], what: str) -> Path:
+    """Returns ``path`` if it is a file that can be read, with one of ``suffixes``; messages call it ``what``."""
     if not isinstance(path, str | os.PathLike) or "\0" in os.fspath(path):
         from ..validation import show  # imports PyTorch
 
@@ -101,4 +106,6 @@ def _existing_file(path: str | os.PathLike[str], suffixes: tuple[str, ...], what
         raise IsADirectoryError(f"{path}: is not a file")
     if path.stat().st_size == 0:
         raise OSError(f"{path}: the file is empty")
+    if reason := refusal(path):
+        raise ValueError(f"{path}: {reason}")
     return path

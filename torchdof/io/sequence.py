@@ -65,8 +65,8 @@ def parse_focus(text: str) -> list[tuple[int, float]]:
     """Reads a focus distance in metres, ``2.0``, as one keyframe, or keyframes ``frame:metres``, sorted by frame."""
     keys: dict[int, float] = {}
     for part in text.split(","):
-        frame, colon, metres = part.partition(":")
-        key, distance = (int(frame), float(metres)) if colon else (0, float(part))
+        frame, colon, metres = part.strip().removesuffix("m").partition(":")  # as in 2.3 m
+        key, distance = (int(frame), float(metres)) if colon else (0, float(frame))
         if not distance > 0 or key in keys or (not colon and "," in text):
             raise ValueError(text)
         keys[key] = distance
