@@ -4,7 +4,7 @@ import functools
 import itertools
 import string
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import onnx
@@ -128,7 +128,7 @@ def _convolve_averages(model: onnx_ir.Model) -> None:
             continue
         (pad,) = following
         padded = pad.outputs[0]
-        scale, shape = node.attributes["kernel_shape"].as_ints()[0], onnx_ir.Shape(padded.shape)
+        scale, shape = node.attributes["kernel_shape"].as_ints()[0], cast(Any, padded.shape)
         weight = np.full((int(shape[1]), 1, scale, scale), scale**-2.0, np.float32)
         kernel = _initializer(model.graph, weight, f"mean_{padded.name}")
         tape = Tape()
@@ -136,7 +136,7 @@ def _convolve_averages(model: onnx_ir.Model) -> None:
         mean = tape.op(
             "Conv", [filled, kernel], {"group": len(weight), "strides": [scale, scale]}, name=f"{kernel.name}_conv"
         )
-        mean.type, mean.shape = padded.type, shape
+        mean.type, mean.shape = padded.type, onnx_ir.Shape(shape)
         model.graph.insert_before(pad, list(tape.nodes))
         padded.replace_all_uses_with(mean)
         model.graph.remove([pad, node], safe=True)

@@ -148,13 +148,15 @@ def test_a_model_with_the_module_has_the_checkpoints_of_one_without() -> None:
 
 def test_checkpoints_with_the_configuration_of_earlier_versions_load_and_leave_the_module_as_it_is() -> None:
     camera = Camera(focus_m=3.0, f_number=torch.tensor([1.0, 2.0]))
-    dof = DepthOfField(camera, BlurTable.load("sato_j15"), tolerance=0.1)
+    table = BlurTable.load("sato_j15")
+    dof = DepthOfField(camera, table, tolerance=0.1)
     numbers = {name: getattr(dof.camera, name) for name in Camera.__dataclass_fields__}  # tensors, as it was stored
-    old = {"camera": numbers, **dof.options.arguments(), "table": dof.table.to_dict()}
-    model = nn.ModuleDict({"net": nn.Conv2d(1, 1, 1), "dof": DepthOfField(Camera(focus_m=1.0))})
+    old = {"camera": numbers, **dof.options.arguments(), "table": table.to_dict()}
+    other = DepthOfField(Camera(focus_m=1.0))
+    model = nn.ModuleDict({"net": nn.Conv2d(1, 1, 1), "dof": other})
     state = {**model.state_dict(), "dof._extra_state": old}
     assert not any(model.load_state_dict(state))
-    assert model["dof"].camera.focus_m == 1.0
+    assert other.camera.focus_m == 1.0
     assert repr(DepthOfField.from_dict(state["dof._extra_state"])) == repr(dof)
 
 

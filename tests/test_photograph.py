@@ -22,6 +22,7 @@ DEPTH = torch.linspace(0, 1, 32).reshape(1, 1, 32, 1).expand(1, 1, 32, 48)  # re
     [
         ({}, ""),
         ({"focus_at": (4, 4), "blur": 0.05}, "--focus-at 4,4 --blur 5%"),
+        ({"focus_at": ((4, 4), (9, 4))}, "--focus-at 4,4 --focus-at 9,4"),
         ({"focus_m": 2.0, "equivalent": (85, 1.4), "near_m": 1.5}, "--focus-m 2 --equivalent 85mm,1.4 --near-m 1.5"),
     ],
 )

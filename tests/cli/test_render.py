@@ -436,8 +436,8 @@ def test_the_first_run_ends_even_if_the_other_begins_with_its_last_frame(
     torchdof.BlurTable.disc().save("lens.json")
     write, written = Renderer.write, list[Path]()
 
-    def write_before_another_run(self: Renderer, out: Path, *arguments: Any, seconds: float) -> None:
-        write(self, out, *arguments, seconds=seconds)
+    def write_before_another_run(self: Renderer, out: Path, *arguments: Any, **named: Any) -> None:
+        write(self, out, *arguments, **named)
         written.append(out)
         if len(written) == 3:
             record = json.loads(Path(RECORD).read_text()) | {"--f-number": 4.0}
@@ -450,8 +450,8 @@ def test_the_first_run_ends_even_if_the_other_begins_with_its_last_frame(
 def test_resume_removes_what_killed_runs_left(scene: Path, run: Run) -> None:
     torchdof.BlurTable.disc().save("lens.json")
     run(f"{SEQUENCE} {PULL}")
-    old, young, other = (Path(f".{c * 32}.part.exr") for c in "0a"), Path(f".{'b' * 32}.part.exr"), Path(".my.part.exr")
-    for path in (old := [*old]) + [young, other]:
+    old, young, other = [Path(f".{c * 32}.part.exr") for c in "0a"], Path(f".{'b' * 32}.part.exr"), Path(".my.part.exr")
+    for path in [*old, young, other]:
         path.write_bytes(b"half")
     for path in old:
         os.utime(path, (1.0, 1.0))

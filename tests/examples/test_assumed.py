@@ -15,7 +15,13 @@ from torchdof.cli.main import app
 from torchdof.io.images import Picture, write_image
 
 SIZE = (240, 330)
-KINDS = {("relative", "disparity"): "disparity", ("relative", "depth"): "depth"}
+NOTES: dict[tuple[object, float], str] = {  # of the command, for a kind and a scale of the page
+    ("disparity", 1): "taken for relative depth (else --depth-kind), larger is nearer",
+    ("depth", 1): "taken for relative depth (else --depth-kind), larger is farther",
+    ("metres", 1): "taken for metres (",
+    ("metres", 0.001): "taken for millimetres (",
+    ("metres", 1 / 256): "taken for metres * 256,",
+}
 
 
 def person(seed: int) -> np.ndarray:
@@ -41,6 +47,16 @@ def maps() -> dict[str, np.ndarray]:
         maps[f"millimetres {seed}"] = (1000 * maps[f"metres {seed}"]).astype(np.uint16)
     depth = pixels(ROOT / "examples" / "data" / "portrait" / "depth.png")[..., 0]
     maps["portrait"], maps["negative portrait"] = ((255 * x).round().astype(np.uint8) for x in (depth, 1 - depth))
+    for name, (person_at, wall_at) in {"person nearer": (0.8, 0.2), "person smaller": (0.2, 0.8)}.items():
+        values = np.linspace(wall_at, wall_at + 0.05, SIZE[1])[None].repeat(SIZE[0], 0)
+        values[60:, 110:220] = np.linspace(person_at, person_at + 0.02, 110)
+        maps[name] = (values - values.min()) / np.ptp(values)
+    ground = np.linspace(70.0, 5.0, SIZE[0])[:, None].repeat(SIZE[1], 1)
+    maps["shape of KITTI"] = (256 * ground[::3]).astype(np.uint16)[:, :280]
+    maps["lidar"] = np.where(np.arange(SIZE[1]) % 3 == 0, 256 * ground, 0).astype(np.uint16)
+    maps["whole floats"] = (1000 * ground).round()
+    maps["close-up"] = np.linspace(0.9, 0.2, SIZE[0])[:, None].repeat(SIZE[1], 1)
+    maps["close-up"][0, 0] = 0.0
     maps["sky"] = np.where(person(1) > 0.5, 2.0, np.inf)
     maps["sky"][0, 0] = 9.0
     return maps
@@ -66,9 +82,7 @@ def test_the_page_assumes_what_the_command_assumes(page: tuple[Path, dict[str, d
     call = ["render", str(image), str(path), "-o", str(folder / "out.png"), "--json", "--depth-edges", "as-given"]
     result = CliRunner().invoke(app, call, catch_exceptions=False)
     told = json.loads(result.stdout)
-    noted = "larger is farther" if found["kind"] == "depth" else "larger is nearer"
-    expected = {"metres": "millimetres" if found["scale"] == 0.001 else ""}.get(str(found["kind"]), noted)
-    assert expected in result.stderr
+    assert NOTES[found["kind"], found["scale"]] in result.stderr
     assert found["distanceM"] == pytest.approx(told["camera"]["focus_m"], rel=1e-4)
     assert found["shownM"] == pytest.approx(found["distanceM"], rel=0.1)
     # the f-number at which the largest radius is 2 % of the width; the command's lens breathes

@@ -58,5 +58,6 @@ def test_a_file_of_wide_kernels_with_occlusion_is_verified(tmp_path: Path) -> No
 @pytest.mark.parametrize("seed", range(40))
 def test_the_file_of_a_random_module_is_verified(tmp_path: Path, seed: int) -> None:
     draw = random.Random(seed)
-    radius, family, layout = 64.0 ** draw.random(), draw.choice([*FAMILIES]), draw.choice(["tiles", "tiles", "whole"])
+    layouts: list[Layout] = ["tiles", "tiles", "whole"]
+    radius, family, layout = 64.0 ** draw.random(), draw.choice([*FAMILIES]), draw.choice(layouts)
     written(tmp_path, radius, family, draw.choice([1, 4, 8]), layout, occlusion=draw.random() < 0.6)

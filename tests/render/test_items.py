@@ -82,7 +82,7 @@ def test_an_item_of_any_batch_with_lamps_is_rendered_as_alone(seed: int, monkeyp
     plan = draw.choice([None, None, Plan.static(draw.choice([max(radii), 24.0]), 1 / 255, rays=True)])
     if plan is None and draw.random() < 0.4:  # grows for items with a larger blur
         plan = Plan.for_scene(0.5 * cocs[:1], 2 / 255, adapt=False)
-    options = {"plan": plan, "table": draw.choice(TABLES), "occlusion": draw.random() < 0.7}
+    options: dict[str, Any] = {"plan": plan, "table": draw.choice(TABLES), "occlusion": draw.random() < 0.7}
     options["depth_edges"] = draw.choice(["auto", "as given"])
     if draw.random() < 0.2:
         options |= {"plan": None, "attention": (40.0, 20.0, 6.0)}

@@ -4,8 +4,14 @@
 const MOST_SAMPLES = 65_536
 const LARGEST_8_BIT = 255
 const SMALLEST_16_BIT = 60_000
+const LEAST_LEVELS = 16 // fewer different whole numbers may be floating-point numbers by chance
 const NEAR_ZERO = 0.05
+const NEAR_SHARE = 0.1 // the same as a share of the largest number
+const EMPTY_GAP = 0.1 // smallest number over the largest from which a 0 is no number of the map
+const KITTI_ASPECTS = [3.1, 3.7] // width over height of KITTI's pictures, whose maps hold metres * 256
+const KITTI_EMPTY = 0.6 // share of zeros from which whole numbers are a lidar's, as in KITTI's maps
 const CLEAR_CORRELATION = 0.35
+const CLEAR_DIFFERENCE = 0.3 // of mean ranks between the bottom's middle and the upper corners
 
 const BINS = 64
 const REACH_BINS = 3
@@ -19,29 +25,43 @@ const PER_OUTLIER = 1000 // one pixel in 1000 is ignored as an outlier
 /**
  * The likely meaning of the numbers of a depth map.
  *
- * Whole numbers are relative depth if the largest is at most 255 or at least 60,000, else millimetres. Other numbers are
- * relative depth if they lie in [0, 1] and come near 0, or if some are negative, else metres. Relative depth is larger for
- * nearer surfaces, unless it clearly shrinks downwards, because the ground is nearer than the sky.
+ * Whole numbers are relative depth if the largest is at most 255 or at least 60,000, else millimetres; in maps of KITTI's
+ * shape, or if most are 0, metres times 256. Other numbers are relative depth if they lie in [0, 1] and come near 0, or if
+ * some are negative, else metres. Relative depth is larger for nearer surfaces, unless it clearly shrinks downwards, because
+ * the ground is nearer than the sky; or, where this is unclear, is smaller in the middle of the bottom than in the upper
+ * corners, because a person is nearer than the background.
  *
  * @param {DepthMap} map
  * @returns {{kind: 'disparity' | 'depth' | 'metres', scale: number}} as `metresOf` takes them.
  */
 export function guessMeaning({ values, width, height, fullScale }) {
   const isHole = holeTest(values)
-  let [low, high] = [Infinity, -Infinity]
+  let [low, high, positive, isWhole] = [Infinity, -Infinity, Infinity, true]
+  const levels = new Set() // the first different values
   for (const value of values) {
     if (!Number.isFinite(value) || isHole(value)) continue
     low = Math.min(low, value)
     high = Math.max(high, value)
+    if (value > 0) positive = Math.min(positive, value)
+    isWhole &&= Number.isInteger(value)
+    if (levels.size < LEAST_LEVELS) levels.add(value)
   }
+  if (low === 0 && positive > EMPTY_GAP * high) low = positive // 0 means "not measured"
+  isWhole = fullScale !== null || (isWhole && levels.size === LEAST_LEVELS)
   const downwards = growthDownwards(values, width, height, isHole)
-  const isWhole = fullScale !== null
   const isRelative = isWhole
     ? high <= LARGEST_8_BIT || high >= SMALLEST_16_BIT
-    : low < 0 || (high <= 1 && low < NEAR_ZERO)
-  if (isRelative) return { kind: downwards < -CLEAR_CORRELATION ? 'depth' : 'disparity', scale: 1 }
+    : low < 0 || (high <= 1 && low < Math.max(NEAR_ZERO, NEAR_SHARE * high))
+  if (isRelative) {
+    const isClear = Math.abs(downwards) > CLEAR_CORRELATION
+    const isFarther = isClear ? downwards < 0 : growthToPerson(values, width, height, isHole) < -CLEAR_DIFFERENCE
+    return { kind: isFarther ? 'depth' : 'disparity', scale: 1 }
+  }
   if (downwards > CLEAR_CORRELATION) return { kind: 'disparity', scale: 1 }
-  return { kind: 'metres', scale: isWhole ? 0.001 : 1 }
+  if (!isWhole) return { kind: 'metres', scale: 1 }
+  const [aspect, empty] = [width / height, values.filter((value) => value === 0).length / values.length]
+  const isOfKitti = (KITTI_ASPECTS[0] < aspect && aspect < KITTI_ASPECTS[1]) || empty > KITTI_EMPTY
+  return { kind: 'metres', scale: isOfKitti ? 1 / 256 : 0.001 }
 }
 
 /** Whether a value marks pixels without depth: the negative number, if all negative numbers are the same. */
@@ -51,10 +71,33 @@ function holeTest(values) {
   return (value) => isMark && value < 0
 }
 
+/** The samples with a value, in the order of their values. */
+function knownInOrder(samples, values, isHole) {
+  const known = samples.filter(({ i }) => Number.isFinite(values[i]) && values[i] !== 0 && !isHole(values[i]))
+  return known.sort((a, b) => values[a.i] - values[b.i])
+}
+
+/** Mean rank, in [0, 1], in the middle of the bottom less that in the upper corners; positive if it is larger. */
+function growthToPerson(values, width, height, isHole) {
+  const samples = sampled(width, height)
+  const [columns, rows] = [samples.at(-1).x, samples.at(-1).y]
+  const sums = { bottom: [0, 0], corners: [0, 0] } // of ranks, and their number
+  let rank = 0 // the number of smaller values
+  knownInOrder(samples, values, isHole).forEach(({ i, x, y }, place, known) => {
+    if (place === 0 || values[i] !== values[known[place - 1].i]) rank = place
+    const fromMiddle = Math.abs(x / columns - 0.5)
+    const area = y / rows > 0.6 && fromMiddle < 0.2 ? 'bottom' : y / rows < 0.4 && fromMiddle > 0.25 ? 'corners' : null
+    if (area === null) return
+    sums[area][0] += rank / known.length
+    sums[area][1]++
+  })
+  const { bottom, corners } = sums
+  return bottom[1] && corners[1] ? bottom[0] / bottom[1] - corners[0] / corners[1] : 0
+}
+
 /** Correlation of the ranks of the values with their rows, in [-1, 1]; positive if values grow downwards. */
 function growthDownwards(values, width, height, isHole) {
-  const known = sampled(width, height).filter(({ i }) => Number.isFinite(values[i]) && values[i] !== 0 && !isHole(values[i]))
-  known.sort((a, b) => values[a.i] - values[b.i])
+  const known = knownInOrder(sampled(width, height), values, isHole)
   const ranks = new Float64Array(known.length)
   for (let begin = 0; begin < known.length; ) {
     let end = begin
