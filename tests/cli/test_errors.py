@@ -28,7 +28,8 @@ shot.####.exr depth.npy --focus-m 2 -o o.#.exr --frames 1-300000000 | 299999997 
 shot.####.exr none.####.npy -o o.#.exr --frames 1-2   | none.####.npy: 2 of 2 frames are missing, none.0001.npy first;
 image.exr depth.npy --focus-m 1:2,3:4 -o o.#.exr --frames 1-300000000 | 1-300000000 are 300000000 frames, more than
 nowhere depth.npy                                     | nowhere: a file without a suffix is not an image that can be
-. depth.npy                                           | .: is a folder; name a file in it, or a sequence as
+. depth.npy                                           | depth.npy: with a folder of images, DEPTH is the folder of
+image.exr .                                           | .: is a folder; name a file in it, or a sequence as
 image.exr shot.0003.exr --focus-m 1:2,3:4 -o shot.####.exr | shot.0003.exr: is one of the inputs
 shot.####.exr depth.####.npy -o o.#.exr --depth-kind coc --steady | --steady filters depth in metres
 shot.%099999999d.exr depth.npy --focus-m 2            | must have at most 18 digits

@@ -123,10 +123,10 @@ def test_the_next_frame_is_read_and_the_last_written_while_one_is_rendered(
 ) -> None:
     barrier = threading.Barrier(3)  # passes only if all three steps run at the same time
 
-    def waiting(self: frame.Renderer, step: Callable[..., Any], out: str, *arguments: Any) -> Any:
+    def waiting(self: frame.Renderer, step: Callable[..., Any], out: str, *arguments: Any, **named: Any) -> Any:
         if out in repr(arguments):
             barrier.wait(20)
-        return step(self, *arguments)
+        return step(self, *arguments, **named)
 
     for name, out in (("read", "shot.0003"), ("render", "out.0002"), ("write", "out.0001")):
         original = getattr(frame.Renderer, name)
@@ -138,7 +138,7 @@ def test_the_next_frame_is_read_and_the_last_written_while_one_is_rendered(
 def test_a_huge_range_of_frames_is_refused_at_once(scene: Path, run: Callable[..., str], frames: str) -> None:
     start = time.monotonic()
     message = run(f"{SEQUENCE} --frames", frames, code=2)
-    assert "there is no such file" in message or "--frames expects FIRST-LAST" in message
+    assert "frames are missing" in message or "--frames expects FIRST-LAST" in message
     assert time.monotonic() - start < 5.0 and len(message) < 200
 
 

@@ -24,7 +24,8 @@ def photographs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, image: torch.Te
     """Two photographs, one of which has relative depth, and their maps; the working folder."""
     monkeypatch.chdir(tmp_path)
     Path("depths").mkdir()
-    for name, values in (("a", depth), ("b", (6 - depth) / 4)):
+    nearness = torch.linspace(0.0, 1.0, depth.shape[-2])[:, None].expand(depth.shape)
+    for name, values in (("a", depth), ("b", nearness)):
         write_image(f"photos/{name}.png", Picture(image))
         np.save(f"depths/{name}.npy", values.numpy())
     return tmp_path

@@ -105,6 +105,8 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         parameters = click.get_current_context().command.params
         options = {p.opts[0]: getattr(self, p.name) for p in parameters if p.name and p.name not in _NOT_OF_FRAMES}
         options |= {"files": self.files(), "torchdof": importlib.metadata.version("torchdof")}
+        both = self.keep_layers and self.show_focus
+        refuse((both, "--keep-layers keeps what is not blurred; leave --show-focus out"))
         if self.image.is_dir():
             from .folder import render_folder
 
@@ -118,7 +120,6 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         are_exr = {self.image.suffix.lower(), self.out.suffix.lower()} == {".exr"}
         refuse(
             (self.keep_layers and not are_exr, "--keep-layers is for an EXR that is written to an EXR; leave it out"),
-            (self.keep_layers and self.show_focus, "--keep-layers keeps what is not blurred; leave --show-focus out"),
             (not is_single and not numbered, no_number),
             (self.sheet and not is_single, "--sheet is of one picture; leave it out where there are more"),
             (of_sequences, f"{self.image}: is a single image; for a sequence write it as shot.####.exr"),

@@ -19,6 +19,7 @@ def without_sentinels(values: Tensor) -> tuple[Tensor, str]:
     if it is 50 times the next one, such as 1e10. The only negative number is one if it is whole, such as -1 or -9999.
 
     Example:
+        >>> import torch
         >>> values, remark = without_sentinels(torch.tensor([[[[1500.0, 4000.0, 65535.0]]]]))
         >>> values, remark
         (tensor([[[[1500., 4000.,   nan]]]]), '1 px of 65535 without depth')
