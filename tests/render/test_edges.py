@@ -103,14 +103,32 @@ def test_narrow_ramps_of_averaged_depth_are_repaired(scene: Scene, engine: str) 
 
 def test_edges_of_a_soft_map_have_no_teeth(engine: str) -> None:
     """Single pixels whose colour is undecided have their neighbours' surface; one with the near colour stays near."""
-    columns = torch.arange(64.0)
-    image = 0.2 + 0.6 * (columns >= 32) + 0.05 * torch.randn(1, 1, 64, 64, generator=torch.Generator().manual_seed(3))
-    image = image.repeat(1, 3, 1, 1)
+    image = two_colours()
     image[..., 8:50:8, 31], image[..., 56, 31] = 0.52, 0.8
-    coc_px = -10 * ((columns - 28.5) / 6).clamp(0, 1).expand(1, 1, 64, 64)
-    expected = -10.0 * (columns >= 32).repeat(64, 1)
-    expected[56, 31] = -10.0
-    torch.testing.assert_close(edges.mended(image, coc_px, "auto")[0, 0], expected, atol=1e-4, rtol=0)
+    is_near = (torch.arange(64) >= 32).repeat(64, 1)
+    is_near[56, 31] = True
+    repaired = edges.mended(image, 5 - 10 * RAMP, "auto")[0, 0]  # both surfaces are equally blurred
+    torch.testing.assert_close(repaired, torch.where(is_near, -5.0, 5.0), atol=1e-4, rtol=0)
+
+
+def test_undecided_pixels_of_a_soft_map_show_the_more_blurred_surface(engine: str) -> None:
+    """Light that is blurred by mistake is hardly seen; light that stays sharp by mistake is a speck."""
+    image = two_colours()
+    image[..., 8:50:8, 31] = 0.55
+    near_is_blurred, far_is_blurred = (
+        edges.mended(image, far_px - 10 * RAMP, "auto")[0, 0, 8:50:8, 31] for far_px in (0.0, 10.0)
+    )
+    torch.testing.assert_close(near_is_blurred, torch.full((6,), -10.0), atol=1e-4, rtol=0)
+    torch.testing.assert_close(far_is_blurred, torch.full((6,), 10.0), atol=1e-4, rtol=0)
+
+
+RAMP = ((torch.arange(64.0) - 28.5) / 6).clamp(0, 1).expand(1, 1, 64, 64)
+
+
+def two_colours() -> Tensor:
+    """Dark left and bright right of column 32, with noise."""
+    noise = torch.randn(1, 1, 64, 64, generator=torch.Generator().manual_seed(3))
+    return (0.2 + 0.6 * (torch.arange(64.0) >= 32) + 0.05 * noise).repeat(1, 3, 1, 1)
 
 
 def test_ramps_of_a_soft_map_end_where_both_surfaces_look_alike(engine: str) -> None:
@@ -279,7 +297,7 @@ def test_gradients_flow_to_pixels_that_are_not_repaired(scene: Scene) -> None:
 def test_the_renderer_repairs_by_its_option_depth_edges(scene: Scene) -> None:
     depth = degrade(scene.depth, "half-res")
     coc = scene.camera.coc_px(depth, 192)
-    repaired = -edges.repair(scene.image, -coc, torch.tensor(1.0), True)
+    repaired = edges.repair(scene.image, coc, torch.tensor(1.0), True, of_coc=True)
     as_given = DepthOfField(scene.camera, depth_edges="as given")
     assert torch.equal(as_given.coc_px(scene.image, depth), coc)
     assert torch.equal(DepthOfField(scene.camera).coc_px(scene.image, depth), repaired)
@@ -291,14 +309,13 @@ def test_the_renderer_repairs_by_its_option_depth_edges(scene: Scene) -> None:
 
 
 def assert_engines_agree(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> None:
-    plain = edges._repair(image, nearness, step, auto)
-    fast, coc = (native.repair_edges(image[0], n[0, 0], step.squeeze(), auto, of_coc=of_coc)
-                 for n, of_coc in ((nearness, False), (-nearness, True)))  # fmt: skip
-    same = torch.isclose(fast, plain[0, 0], rtol=1e-3, atol=1e-3, equal_nan=True)
-    assert float(same.float().mean()) > 0.999  # rounding may decide if both surfaces are equally likely
-    torch.testing.assert_close(coc, -fast, rtol=0, atol=0, equal_nan=True)
-    unchanged = [torch.allclose(n, nearness[0, 0], rtol=0, atol=0, equal_nan=True) for n in (plain[0, 0], fast)]
-    assert unchanged[0] == unchanged[1]
+    for given, of_coc in ((nearness, False), (-nearness, True)):
+        plain = edges._repair(image, given, step, auto, of_coc)[0, 0]
+        fast = native.repair_edges(image[0], given[0, 0], step.squeeze(), auto, of_coc=of_coc)
+        same = torch.isclose(fast, plain, rtol=1e-3, atol=1e-3, equal_nan=True)
+        assert float(same.float().mean()) > 0.999  # rounding may decide if both surfaces are equally likely
+        unchanged = [torch.allclose(n, given[0, 0], rtol=0, atol=0, equal_nan=True) for n in (plain, fast)]
+        assert unchanged[0] == unchanged[1]
 
 
 @COMPILED

@@ -159,3 +159,19 @@ def test_a_split_conserves_light_and_stays_within_the_range_of_the_image() -> No
         for light in (own, other):
             light = light[(light != 0).all(1, keepdim=True).expand_as(light)]  # pixels with a second surface
             assert float(light.min()) >= 0.2 - 1e-5 and float(light.max()) <= 0.8 + 1e-5
+
+
+@pytest.mark.parametrize(("near_px", "far_px"), [(-12.0, 0.0), (0.0, 12.0)])
+def test_noise_of_a_blurred_surface_does_not_reach_a_sharper_one(engine: str, near_px: float, far_px: float) -> None:
+    """Coloured noise in the light of the sharper surface would stay visible as dots along the blurred edge."""
+    coc_px = torch.full((1, 1, 32, 32), far_px)
+    coc_px[..., 16:] = near_px
+    clean = torch.where(torch.arange(32) < 16, 0.2, 0.8).repeat(1, 3, 32, 1)
+    clean[..., 15], clean[..., 16] = 0.4, 0.6  # a third of the other surface in each
+    noise = 0.05 * torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    is_blurred = coc_px.abs() > 1.0
+    surfaces = matte(torch.where(is_blurred, clean + noise, clean), coc_px)
+    mixed = is_blurred & (surfaces.other_weight > 0.2)
+    assert int(mixed.sum()) == 32
+    light = surfaces.other.movedim(1, -1)[mixed[:, 0]]  # [32, 3]
+    assert float(light.std(0).mean()) < 0.3 * float(noise.std())

@@ -69,6 +69,10 @@ _RELATED = 0.8  # smallest agreement of colours with the clear pixels of a map a
 _EXACT = 0.025  # largest share of wrong pixels at which the steps of a map count as exact
 _DOUBTFUL = 0.05  # share of wrong pixels of a kind above which these pixels are decided again
 _LEAN = 2.0  # log-odds by which a far surface must win: foreground left behind is the more visible error
+_TO_BLURRED = (
+    2.5  # log-odds for a soft map's more blurred surface: what stays sharp by mistake is the more visible error
+)
+_MORE_BLURRED_PX = 2.0  # difference in blur of two surfaces from which these log-odds count in full
 _BESIDE, _DIAGONAL = 0.93, 0.57  # log-odds of a neighbour's surface in soft maps; larger: smoother edges, less detail
 
 # Soft maps: blurred by resampling, or written by a network. More than _SOFT of the edge pixels of a soft map lie on
@@ -192,7 +196,8 @@ def repair(
         nearness: ``[B or 1, 1, H, W]``, linear in 1 / depth, larger is nearer; constant to autograd.
         step: Smallest difference in nearness between two surfaces, ``[B, 1, H, W]`` or a number.
         auto: Whether exact edges stay unchanged.
-        of_coc: Whether ``nearness`` is a map of the coc instead, in which a larger value is farther.
+        of_coc: Whether ``nearness`` is a map of the coc instead, in which a larger value is farther. It tells which
+            surface is more blurred; with ``auto``, undecided pixels of a soft map go to that one.
         ops: Processes lists of pixels in parts.
 
     Returns:
@@ -205,12 +210,10 @@ def repair(
             return repair(image, nearness, step, auto, of_coc, ops)
     image = image.detach()
     compiled = not is_traced() and all(map(is_in_memory, (image, nearness))) and native.chosen()
-    if of_coc and not compiled:
-        return -repair(image, -nearness, step, auto, ops=ops)
     light, given = image.float(), nearness.float().expand(image.shape[0], -1, -1, -1)
     step = torch.as_tensor(step, dtype=given.dtype, device=given.device)
     if is_compiled():
-        repaired = _operator(light, given, step, auto)
+        repaired = _operator(light, given, step, auto, of_coc)
     elif compiled:
         steps = step.expand(light.shape[0], 1, *given.shape[-2:]) if step.ndim else step.expand(light.shape[0], 1)
         maps = [of_item[0] for of_item in given]
@@ -219,7 +222,7 @@ def repair(
             return nearness
         repaired = (items[0][None] if len(items) == 1 else torch.stack(items))[:, None]
     else:
-        repaired = _repair(light, given, step, auto, ops)
+        repaired = _repair(light, given, step, auto, of_coc, ops)
     if nearness.dtype == torch.float32:
         return repaired
     return torch.where(repaired == given, nearness, repaired.to(nearness.dtype))
@@ -246,7 +249,9 @@ def judged(image: Tensor, nearness: Tensor, step: Tensor | float) -> tuple[Tenso
 
 
 @torch.no_grad()
-def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops = EAGER) -> Tensor:
+def _repair(
+    image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool = False, ops: Ops = EAGER
+) -> Tensor:
     """Plain PyTorch version of :func:`repair`.
 
     1. Find ramps and steps, and the nearness of both surfaces there.
@@ -257,6 +262,8 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops 
     5. Give selected pixels the nearness of their surface, on ramps in proportion to the evidence.
     6. In soft maps, remove the ringing of interpolation beside steps, and correct lamps of a few pixels.
     """
+    if of_coc:
+        nearness = -nearness
     valid = nearness.abs() <= _LARGEST
     given = torch.where(valid, nearness, 0.0)
     step = torch.maximum(step, _NOISES * _noise(given, valid))
@@ -302,7 +309,7 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops 
         doubtful = doubtful & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
     edge_pixels = pixels.indices(doubtful)
     if auto and not is_traced() and len(edge_pixels) == 0:  # nor lamps: a soft map has ramps, which are selected
-        return nearness
+        return -nearness if of_coc else nearness
     score, evidence, near, far = _judge(looks, given, edge_pixels, _CLEAR, ops)
     shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0])
     if auto:  # without auto, correct steps are decided too, and the lead would move them
@@ -313,6 +320,9 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops 
     middle = pixels.pick(looks[-3:-1], edge_pixels).mean(0)  # of both surfaces
     chance = torch.where(chance < 0, (values > middle).to(given.dtype), chance)
     neighbours = (_neighbours(given.dtype, given.device) * (2.0 * chance - 1.0)).sum(0)
+    if auto and of_coc:
+        blur = pixels.pick(looks[-3:-1], edge_pixels).abs()  # of the near and of the far surface
+        neighbours = neighbours + _TO_BLURRED * ((blur[0] - blur[1]) / _MORE_BLURRED_PX).clamp(-1.0, 1.0)
     of_soft = is_soft.flatten().index_select(0, edge_pixels // (height * width))
     shows_near = torch.where(of_soft, shows_near + neighbours, shows_near) > 0
 
@@ -330,17 +340,18 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops 
     moved = torch.where(is_ramp, evidence, (shows_near != pixels.pick(is_near, edge_pixels)[0]).to(given.dtype))
     out = pixels.put(given, edge_pixels, torch.lerp(own, torch.where(shows_near, near, far), moved))
     out = torch.where(is_soft, _without_ringing(out, valid, step), out)
-    return torch.where(valid, _lift_lamps(light, given, out, step, is_soft, sigma, lost_px, ops), nearness)
+    out = torch.where(valid, _lift_lamps(light, given, out, step, is_soft, sigma, lost_px, ops), nearness)
+    return -out if of_coc else out
 
 
-def _empty(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
+def _empty(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool) -> Tensor:
     return torch.empty_like(nearness, memory_format=torch.contiguous_format)
 
 
 # The number of pixels to process depends on the data, which compiled graphs do not support.
 @one_operator("torchdof::repair_edges", _empty)
-def _operator(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
-    return _repair(image, nearness, step, auto).clone()
+def _operator(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool) -> Tensor:
+    return _repair(image, nearness, step, auto, of_coc).clone()
 
 
 def _from_border(size: int, device: torch.device) -> Tensor:

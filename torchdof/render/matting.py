@@ -68,7 +68,8 @@ def matte(
        texture, a is the near surface's share under a small Gaussian, as far as the pixel's colour agrees. In a pixel
        for which the depth map gave a depth between the surfaces, it need not agree: then both parts are those of the
        colours, and the edge is soft instead of jagged.
-    5. Distribute the residual over both parts: they sum to I, and neither leaves the image's range.
+    5. Distribute the residual over both parts, but none of it to an other surface that is less blurred: they sum to I,
+       and neither leaves the image's range.
 
     Args:
         light: ``[B, C, H, W]``.
@@ -173,11 +174,14 @@ def _split(
     weight = weight + (agreed if moved_px is None else torch.lerp(agreed, geometric, unsure))
 
     # Each part gets a share of the residual in proportion to its weight squared: the smallest change of both colours.
+    # A sharper other surface gets none: texture and noise of this pixel would stay there as dots beside a blurred edge.
     # Then limit the parts to the image's range.
     own_mean, other_mean = torch.where(is_near, front, back), torch.where(is_near, back, front)
     own_weight = 1.0 - weight
     unexplained = colour - own_weight * own_mean - weight * other_mean
-    moved = weight * (other_mean + unexplained * weight / (weight**2 + own_weight**2))
+    sharper = own_coc.abs() - torch.where(is_near, far, near).abs()  # px by which the other surface is less blurred
+    lent = (1.0 - sharper).clamp(0.0, 1.0)
+    moved = weight * (other_mean + unexplained * lent * weight / (weight**2 + own_weight**2))
     range_of_image = light.amin((2, 3)), light.amax((2, 3))
     extremes = (selected.of_item(extreme) / brightest for extreme in range_of_image)
     least, most = (extreme.clamp(-_UNBOUNDED, _UNBOUNDED) for extreme in extremes)  # 0 * inf would be NaN

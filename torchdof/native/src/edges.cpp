@@ -19,7 +19,7 @@ constexpr float CLEAR = 0.1f, CLEAR_IN_PRIOR = 0.25f, LIKELY = 0.01f, SHARPNESS 
 constexpr int DIRECTIONS = 5, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, KINDS = DIRECTIONS * PLACES;  // prior
 constexpr int SAMPLED = 12000, SAMPLE_BLOCK = 8, ROUNDS = 10;
 constexpr float TRUSTED = 0.05f, PRIOR_COUNT = 30.0f;
-constexpr float RELATED = 0.8f, EXACT = 0.025f, DOUBTFUL = 0.05f, LEAN = 2.0f;  // decision, in automatic mode
+constexpr float RELATED = 0.8f, EXACT = 0.025f, DOUBTFUL = 0.05f, LEAN = 2.0f, TO_BLURRED = 2.5f, MORE_BLURRED_PX = 2.0f;  // decision, in automatic mode
 constexpr float SOFT = 0.1f, WIDE = 1.5f, MIXED = 0.5f, BESIDE = 0.93f, DIAGONAL = 0.57f;  // soft maps
 constexpr float CLIMBED = 0.35f, PIXEL = 0.2f, BETTER = 0.5f, OVERSHOOT = 0.12f;  // lamps, ringing
 constexpr int BLUR_REACH = 9, RINGING_REACH = 3;
@@ -952,7 +952,7 @@ class Repair {
   // Decides which surface pixels show, and moves them to its nearness; on ramps in proportion to the evidence. Returns the
   // width, in pixels, by which the map's near surfaces are too thin.
   float move(const std::vector<Group> &groups, bool is_soft) const {
-    const float lean = map_.automatic ? LEAN : 0.0f;
+    const float lean = map_.automatic ? LEAN : 0.0f, to_blurred = map_.automatic && map_.of_coc ? TO_BLURRED : 0.0f;
     float prior[KINDS];
     for (int k = 0; k < KINDS; k++) prior[k] = std::log(shares_[k] / (1.0f - shares_[k]));
     const auto odds = [&](const Group &group, size_t k) {
@@ -968,7 +968,8 @@ class Repair {
       for (size_t k = 0; k < groups[g].edges.size(); k++) {
         const Edge &edge = groups[g].edges[k];
         const Judgement &judged = groups[g].judged[k];
-        const bool shows_near = odds(groups[g], k) + (is_soft ? neighbours(edge) : 0.0f) > 0;
+        const float more_blurred = clamp((std::fabs(edge.near) - std::fabs(edge.far)) / MORE_BLURRED_PX, -1.0f, 1.0f);
+        const bool shows_near = odds(groups[g], k) + (is_soft ? neighbours(edge) + to_blurred * more_blurred : 0.0f) > 0;
         const uint8_t marks = marks_[edge.i];
         const bool was_near = marks & NEAR;
         lost[g] += shows_near - was_near;

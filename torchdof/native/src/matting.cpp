@@ -219,7 +219,8 @@ void clean_light(const Frame &frame, int y0, int x0, Window &w, const float *fal
 // 4. The share of the other surface is at most 1/2. Where texture makes the projection unreliable, it is the share that
 //    the other surface has under a small Gaussian, unless this contradicts the pixel's colour. It may where the map as
 //    given has no edge; then the surfaces have their own colours.
-// 5. The residual colour goes to both surfaces in proportion to their shares, within the range of the image's light.
+// 5. The residual colour goes to both surfaces in proportion to their shares, none of it to an other surface that is less
+//    blurred, within the range of the image's light.
 template <int CHANNELS>
 class Split {
  public:
@@ -270,7 +271,7 @@ class Split {
       const vec weight = s.weight_, own = 1.0f - weight;
       own_mean = s.is_near_ ? s.front_[c] : s.behind_[c], mean = s.is_near_ ? s.behind_[c] : s.front_[c];
       unexplained = s.colour_[c] - own * own_mean - weight * mean;
-      of_each = weight / (weight * weight + own * own);
+      of_each = s.lent_ * weight / (weight * weight + own * own);
       darkest = most(s.frame_.darkest[c] / s.scale_, all(-UNBOUNDED)), brightest = least(s.frame_.brightest[c] / s.scale_, all(UNBOUNDED));
       own_darkest = s.colour_[c] - own * darkest, own_brightest = s.colour_[c] - own * brightest;
       // the two parts still sum to the pixel, and neither is brighter or darker than the image
@@ -402,6 +403,7 @@ class Split {
       const vec left = colour_[c] - behind_[c] - fitted_ * (front_[c] - behind_[c]);
       misfit_ += left * left;
     }
+    sharper_ = size_of(here_) - size_of(is_near_ ? ends_.far : ends_.near), lent_ = 1.0f - clamp01(sharper_);
     noise_ = far_variance_ + near_variance_ + ALIKE * ALIKE;
     total_ = strength_ + TRUST * (far_variance_ + near_variance_ + misfit_) * (1.0f + UNSURE * unsure_) + ALIKE * ALIKE;
     trust_ = strength_ / total_;
@@ -419,7 +421,7 @@ class Split {
   void back_of_parts(Slopes &slopes, ivec beside) {
     const auto slope = [&](int plane) { return only(beside, load<vec>(&slopes.surfaces[plane * BLOCK * PITCH + y_ * PITCH + x_])); };
     const vec own = 1.0f - weight_, known = most(weight_, all(1e-12f)), disagreed = disagreed_ / known, squares = weight_ * weight_ + own * own;
-    vec of_own = {}, of_disagreed = {};
+    vec of_own = {}, of_disagreed = {}, of_lent = {};
     of_weight_ = slope(2 * C() + 1);
     const vec of_coc = slope(2 * C());
     of_near_ = only(~is_near_, of_coc), of_far_ = only(is_near_, of_coc);
@@ -448,8 +450,9 @@ class Split {
       of_darkest -= by_darkest * own, of_brightest -= by_brightest * own;
       slopes.darkest[c] += sum(only(beside & (other.darkest > all(-UNBOUNDED)), of_darkest / scale_));
       slopes.brightest[c] += sum(only(beside & (other.brightest < all(UNBOUNDED)), of_brightest / scale_));
-      // light = mean + unexplained of_each, of_each = weight / (weight^2 + own^2)
-      const vec of_each = of_light * other.unexplained, of_unexplained = of_light * other.of_each;
+      // light = mean + unexplained of_each, of_each = lent weight / (weight^2 + own^2)
+      const vec of_each = of_light * other.unexplained * lent_, of_unexplained = of_light * other.of_each;
+      of_lent += of_light * other.unexplained * weight_ / squares;
       of_colour += of_unexplained;
       of_mean += of_light - of_unexplained * weight_;
       of_own -= of_unexplained * other.own_mean + of_each * 2.0f * weight_ * own / (squares * squares);
@@ -459,6 +462,11 @@ class Split {
       of_behind_[c] += is_near_ ? of_mean : of_own_mean;
       of_colour_[c] += of_colour;
     }
+    // lent = 1 - sharper, sharper = |here| - |other coc|
+    const auto sign = [](vec value) { return only(value > vec{}, all(1.0f)) - only(value < vec{}, all(1.0f)); };
+    const vec of_sharper = only(is_within(sharper_), -of_lent), of_other = -of_sharper * sign(is_near_ ? ends_.far : ends_.near);
+    of_here_ = of_sharper * sign(here_);
+    of_near_ += only(~is_near_, of_other), of_far_ += only(is_near_, of_other);
     of_disagreed_ = of_disagreed / known;
     of_weight_ -= of_own + only(weight_ >= all(1e-12f), of_disagreed_ * disagreed);
   }
@@ -478,7 +486,7 @@ class Split {
     of_edge_ = of_clear * clamp01(4.0f * sided_ - 2.0f);
     const vec signed_side = (here_ - ends_.near) - (ends_.far - here_), side = only(signed_side > vec{}, all(1.0f)) - only(signed_side < vec{}, all(1.0f));
     const vec of_sided = only(is_within(4.0f * sided_ - 2.0f), of_clear * edge_ * 4.0f) / gap_;
-    of_here_ = 2.0f * side * of_sided;
+    of_here_ += 2.0f * side * of_sided;
     of_near_ -= side * of_sided, of_far_ -= side * of_sided;
     of_gap_ = only(is_within(wide_), of_geometric * by_cover * clear_ * doubt * (1.0f / EDGE_PX)) - of_sided * sided_;
     const vec of_total = -of_trust * trust_ / total_, of_noisy = of_total * TRUST * (1.0f + UNSURE * unsure_);
@@ -607,6 +615,7 @@ class Split {
   vec scale_, here_, gap_, unsure_, covered_, per_counted_, per_strength_, has_clean_;  // covered: by the near surface
   vec clean_near_variance_, clean_far_variance_, near_variance_, far_variance_;
   ivec is_near_;
+  vec sharper_, lent_;  // px by which the other surface is less blurred; share of the residual that it may get, 0 to 1
   vec strength_, along_, fitted_, misfit_, noise_, total_, trust_, edge_, sided_, clear_, contradiction_, by_fit_, by_cover_, wide_, geometric_, disagreed_, weight_;
   vec of_weight_, of_disagreed_, of_variance_, of_covered_, of_edge_, of_here_, of_gap_, of_near_, of_far_;
 };
