@@ -276,7 +276,8 @@ test_a_wrong_argument_is_refused_in_one_sentence = refuses(
     (called(image=IMAGE.movedim(1, -1)), r"got \[1, 1, 4, 5\]; channels come before .*image.movedim\(-1, -3\)"),
     (called(depth=DEPTH[0]), r"depth must be \[1, 1, 4, 5\].*did you forget the channel dimension"),
     *((called(depth=torch.ones(size)), r"depth must be \[1, 1, 4, 5\].* got \[{}, {}, {}, {}\]".format(*size))
-      for size in ((1, 1, 5, 4), (2, 1, 4, 5), (1, 3, 4, 5))),
+      for size in ((2, 1, 4, 5), (1, 3, 4, 5))),
+    (called(depth=torch.ones(1, 1, 5, 4)), "depth is 4 x 5 pixels and the image 5 x 4: turned by 90 degrees it fits"),
     (called(depth=DEPTH.long()), "depth must be .*floating point .*got a torch.int64"),
     (called(depth=2.0), "depth must be .*got 2.0"),
     (called(depth=DEPTH.to("meta")), "depth must be a tensor .* got one on the meta device"),

@@ -1,7 +1,6 @@
 """The files that ``examples/web`` uses, written with its settings, and what its build says if a part is missing."""
 
 import importlib.util
-import json
 import os
 import subprocess
 import sys
@@ -30,20 +29,21 @@ def script() -> ModuleType:
 
 
 @pytest.mark.skipif(not TRACEABLE, reason="this PyTorch cannot write ONNX files")
-def test_all_files_of_the_page_are_written_and_verified(tmp_path: Path) -> None:
+@pytest.mark.parametrize("count", [1, pytest.param(3, marks=pytest.mark.sweep)])
+def test_the_files_of_the_page_are_written_and_verified(
+    script: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], count: int
+) -> None:
     """With the page's own radius, tolerance and shapes: a smaller file may be right where these are not."""
     from torchdof.export import describe
 
-    call = [sys.executable, str(WEB / "write_files.py"), "--out", str(tmp_path)]
-    done = subprocess.run(call, capture_output=True, text=True, timeout=3600)
-    assert done.returncode == 0 and done.stderr == "", done.stderr[-3000:]
-    settings = json.loads((tmp_path / "dof.json").read_text())
-    assert [shape["name"] for shape in settings["shapes"]] == ["Round", "Six blades", "Soft, a Gaussian"]
-    assert settings["max_coc_px"] == 64.0
-    for shape in settings["shapes"]:
-        assert describe(tmp_path / shape["file"])["depth_edges"] == torchdof.DepthOfField(torchdof.Camera()).depth_edges
-    assert done.stdout.count("verified (largest error") == 3
-    assert {path.name for path in (tmp_path / "sample").iterdir()} == {"motorcycle.png", "motorcycle_depth.png"}
+    assert [name for name, _ in script.SHAPES.values()] == ["Round", "Six blades", "Soft, a Gaussian"]
+    assert script.MAX_COC_PX == 64.0
+    monkeypatch.setattr(script, "SHAPES", dict([*script.SHAPES.items()][:count]))
+    written = script.write_shapes(tmp_path)
+    assert len(written) == count
+    for name in written:
+        assert describe(tmp_path / name)["depth_edges"] == torchdof.DepthOfField(torchdof.Camera()).depth_edges
+    assert capsys.readouterr().out.count("verified (largest error") == count
 
 
 def test_a_shape_that_cannot_be_written_is_left_out(

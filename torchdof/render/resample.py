@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..validation import real_tensor, show, stretch, stretched, upright
+from ..validation import image_and_map, real_tensor, show, stretch, stretched, upright
 from .edges import repair_edges
 
 _LARGEST_FACTOR = 4  # largest enlargement in one step: its ramps are the widest that the repair takes for edges
@@ -41,6 +41,8 @@ def at_size_of(image: Tensor, depth: Tensor) -> Tensor:
         return depth
     if stretch(image, depth) is None:
         raise ValueError(f"image must be [B, C, H, W] and depth [B, 1, h, w], got {show(image)} and {show(depth)}")
+    if image.ndim == 4 and image.shape[1:3] == depth.shape[-2:]:  # height, width, channels: refused with the remedy
+        image_and_map(image, "depth", depth, "in metres")
     upright(image, depth)
     if note := stretched(image, depth):
         warnings.warn(f"{note} to the shape of the image; both must show the same area", stacklevel=2)
