@@ -69,9 +69,7 @@ _RELATED = 0.8  # smallest agreement of colours with the clear pixels of a map a
 _EXACT = 0.025  # largest share of wrong pixels at which the steps of a map count as exact
 _DOUBTFUL = 0.05  # share of wrong pixels of a kind above which these pixels are decided again
 _LEAN = 2.0  # log-odds by which a far surface must win: foreground left behind is the more visible error
-_TO_BLURRED = (
-    2.5  # log-odds for a soft map's more blurred surface: what stays sharp by mistake is the more visible error
-)
+_TO_BLURRED = 2.5  # log-odds for a soft map's more blurred surface; larger: fewer sharp specks, less detail
 _MORE_BLURRED_PX = 2.0  # difference in blur of two surfaces from which these log-odds count in full
 _BESIDE, _DIAGONAL = 0.93, 0.57  # log-odds of a neighbour's surface in soft maps; larger: smoother edges, less detail
 
@@ -196,8 +194,8 @@ def repair(
         nearness: ``[B or 1, 1, H, W]``, linear in 1 / depth, larger is nearer; constant to autograd.
         step: Smallest difference in nearness between two surfaces, ``[B, 1, H, W]`` or a number.
         auto: Whether exact edges stay unchanged.
-        of_coc: Whether ``nearness`` is a map of the coc instead, in which a larger value is farther. It tells which
-            surface is more blurred; with ``auto``, undecided pixels of a soft map go to that one.
+        of_coc: Whether ``nearness`` is a map of the coc instead, in which a larger value is farther. With
+            ``auto``, undecided pixels of a soft map then go to the more blurred surface.
         ops: Processes lists of pixels in parts.
 
     Returns:
@@ -257,8 +255,8 @@ def _repair(
     1. Find ramps and steps, and the nearness of both surfaces there.
     2. Score sampled edge pixels by colour, fit the prior of each kind of edge pixel, and detect soft maps.
     3. Select the pixels to decide: all edge pixels; with ``auto``, those of kinds that are often wrong.
-    4. A selected pixel shows the near surface where ``score + logit(prior) > 0``; in soft maps with the chance of its
-       neighbours to show it.
+    4. A selected pixel shows the near surface where ``score + logit(prior) > 0``. In soft maps the sum also has the
+       chance of its neighbours to show it and, for a map of the coc, a term for the more blurred surface.
     5. Give selected pixels the nearness of their surface, on ramps in proportion to the evidence.
     6. In soft maps, remove the ringing of interpolation beside steps, and correct lamps of a few pixels.
     """
