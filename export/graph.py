@@ -10,13 +10,13 @@ import torch._dynamo.config
 import torch.fx.config
 from torch import Tensor, nn
 
-from torchdof import DepthOfField
-from torchdof.module import blur
+from torchdof import DepthOfField, validation
+from torchdof.module import render
 from torchdof.optics.camera import Camera
 from torchdof.options import DepthEdges, Options
+from torchdof.render import routes
 from torchdof.render.ops import Ops
 from torchdof.render.plan import Plan
-from torchdof.validation import choice
 
 from .operations import GraphOps, WholeOps
 
@@ -55,8 +55,8 @@ class Portable(nn.Module):
         size: Size = None,
     ) -> None:
         super().__init__()
-        choice("inputs", inputs, INPUTS)
-        choice("layout", layout, get_args(Layout))
+        validation.choice("inputs", inputs, INPUTS)
+        validation.choice("layout", layout, get_args(Layout))
         for name in Camera.__dataclass_fields__:
             if isinstance(getattr(dof.camera, name), Tensor):
                 raise ValueError(
@@ -67,11 +67,7 @@ class Portable(nn.Module):
             raise ValueError(f'size is for layout="whole"; tiles are for frames of any size, got size={size!r}')
         if size is not None and (len(size) != 2 or any(not isinstance(n, int) or n < 1 for n in size)):
             raise ValueError(f"size must be height and width of a frame in pixels, such as (1080, 1920), got {size!r}")
-        if layout == "whole" and depth_edges != "as given":
-            raise ValueError(
-                'layout="whole" cannot repair depth edges, whose number depends on the map; repair the map before, or '
-                f'use layout="tiles"; got depth_edges={depth_edges!r}'
-            )
+        routes.refuse(dof.options, "whole file" if layout == "whole" else "file", repairs=depth_edges != "as given")
         table = dof.options.table
         if table.unit == "relative" and width is not None:
             raise ValueError(f"{table!r} has the same kernels at any image width; leave out width={width}")
@@ -101,15 +97,17 @@ class Portable(nn.Module):
         nearest_m = float(camera.focal_length_mm) / 1000.0 if camera.focus_breathing else 0.0
         is_possible = (focus_m > nearest_m) & (f_number > 0) & (f_number < torch.inf)
         undefined = torch.where(is_possible[:, None, None, None], out, torch.nan)
-        return self.ops.choose(lambda: ~is_possible.all(), undefined, out)
+        return self.ops.equal_unless(lambda: ~is_possible.all(), undefined, out)
 
     def as_called(self, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
         """Renders like a call of the module: layers chosen for the scene, its own highlights and edge repair."""
         return self._rendered(self.called, None, image, map_, *lens)
 
     def _rendered(self, options: Options, plan: Plan | None, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
-        coc_px = self.dof.coc_as_given(image, map_, lens[0], lens[1]) if lens else map_
-        return blur(image, coc_px, options, plan, ops=self.ops)
+        if lens:
+            return render(image, self.dof.coc_as_given(image, map_, lens[0], lens[1]), options, plan, ops=self.ops)
+        validation.scene(image, "coc_px", map_, channels=options.table.channels, values=False)
+        return render(image, map_, options, plan, ops=self.ops)
 
 
 def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:

@@ -40,7 +40,7 @@ class GraphOps(Ops):
         self.kernels = plan.constants(table, layered, lens_width or 1)
         self.rays = kernels_of(table, plan, lens_width or 1)
 
-    def choose(self, needed: Callable[[], Tensor], result: Tensor, given: Tensor) -> Tensor:
+    def equal_unless(self, needed: Callable[[], Tensor], result: Tensor, given: Tensor) -> Tensor:
         """A branch."""
         return choose(needed(), result, given)
 

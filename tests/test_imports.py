@@ -27,7 +27,7 @@ ALLOWED = {
     "depth": {"tensors", "validation", "io", "optics", "render"},
     "reference": {"validation", "io", "optics", "render"},
     "module": {"tensors", "validation", "batch", "optics", "options", "render"},
-    "functional": {"tensors", "validation", "batch", "optics"},
+    "functional": {"validation", "batch", "optics", "options", "render"},
     "fit": {"extras", "validation", "io", "optics"},
     "export": {"extras", "pixels", "tensors", "validation", "io", "optics", "options", "render", "reference", "module"},
     "augmentation": {"tensors", "validation", "io", "optics", "options", "module"},

@@ -15,7 +15,7 @@ from torch.testing import assert_close
 from tests.refused import refuses
 from tests.scenes import CAMERA, EVERY_WAY, HEIGHT, WAYS, WIDTH, disc, slope, texture
 from tests.traced import TRACED
-from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field, tensors
+from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field, tensors, validation
 from torchdof.augmentation import RandomDepthOfField
 from torchdof.options import OptionArguments, Options
 from torchdof.reference import metrics
@@ -253,6 +253,27 @@ def test_the_compiler_of_an_old_pytorch_is_refused_by_name(fullgraph: bool, monk
 
 
 # Errors
+
+
+def test_an_image_and_its_maps_are_checked_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each look at the values is a pass over memory, and each check of the shapes takes the time of a small frame."""
+    looked_at: list[str] = []
+
+    def noted(name: str) -> None:
+        check = getattr(validation, name)
+        monkeypatch.setattr(
+            validation, name, lambda *arguments, **more: (looked_at.append(name), check(*arguments, **more))[1]
+        )
+
+    for name in ("image_and_map", "ends"):
+        noted(name)
+    image = texture()
+    DepthOfField(CAMERA)(image, slope(1.0, 9.0))
+    assert sorted(looked_at) == ["ends"] * 3 + ["image_and_map"]  # depth, image, circle of confusion
+    looked_at.clear()
+    blur_by_coc(image, slope(-2.0, 3.0), background=image, background_coc_px=slope(1.0, 4.0))
+    assert sorted(looked_at) == ["ends"] * 4 + ["image_and_map"] * 2
+
 
 IMAGE, DEPTH, COC = torch.rand(1, 3, 4, 5), torch.ones(1, 1, 4, 5), torch.zeros(1, 1, 4, 5)
 

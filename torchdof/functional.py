@@ -14,8 +14,9 @@ from .batch import flattened, leading_axes, restored
 from .optics.blur_table import BlurTable
 from .optics.kernel_bank import bank_of
 from .optics.kernel_cache import KernelCache
-from .tensors import is_traced
-from .validation import ends, image_and_coc, image_and_map, show
+from .options import Options
+from .render import routes
+from .validation import ends, image_and_map, scene
 
 __all__ = ["splat"]
 
@@ -23,7 +24,6 @@ _STEPS_PER_PX = 128  # kernels per px of radius, up to _LINEAR_UP_TO_PX; more ta
 _LINEAR_UP_TO_PX = 2.0  # px; above this radius kernels are 1/256 of the radius apart; a larger limit: more kernels
 _KERNELS_AT_ONCE = 64  # kernels of similar radius made together, each as wide as the widest; more take more memory
 _MIN_WEIGHT = 1e-6  # scattered weight, of 1: pixels with less are unknown and become 0
-_DISC = BlurTable.disc()
 _GAUSSIAN = BlurTable.gaussian(1.0)
 _kernels = KernelCache(128 * 2**20)
 
@@ -78,8 +78,8 @@ def splat(
         >>> torch.equal(splat(image, sigma_px=torch.zeros(1, 1, 8, 12)), image)
         True
     """
-    if is_traced():
-        raise ValueError("splat cannot be compiled or exported; use torch.compiler.disable(splat), or blur_by_coc")
+    blur = Options(table, occlusion=False)  # type: ignore[arg-type]
+    routes.refuse(blur, "splat")
     axes = leading_axes(image)
     image, coc_px, sigma_px = flattened(axes, image=image, coc_px=coc_px, sigma_px=sigma_px)
     if (coc_px is None) == (sigma_px is None):
@@ -91,15 +91,9 @@ def splat(
         image_and_map(image, "sigma_px", sigma_px, "in pixels")
         if not 0.0 <= ends(sigma_px)[0]:
             raise ValueError("sigma_px must be >= 0 and finite, got a number that is negative or NaN")
-        coc_px, table = sigma_px, _GAUSSIAN
-    table = _DISC if table is None else table
-    if not isinstance(table, BlurTable):
-        raise ValueError(f"table must be a torchdof.BlurTable, got {show(table)}; read a file with BlurTable.load()")
-    image_and_coc(image, coc_px, table.channels, values=True)
-    if table.depends_on_place:
-        raise ValueError("splat takes one kernel a radius, no table with a field or vignetting; use blur_by_coc")
-    if table.is_differentiated:
-        raise ValueError("splat gives no gradient to the aperture; detach its rotation and squeeze, or use blur_by_coc")
+        coc_px = sigma_px
+    table = blur.table if sigma_px is None else _GAUSSIAN
+    scene(image, "coc_px", coc_px, channels=table.channels)
     return restored(axes, _splatted(image, coc_px, table, normalize))
 
 

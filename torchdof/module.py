@@ -12,7 +12,7 @@ from .batch import flattened, leading_axes, numbers, restored
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera
 from .options import OPTION_NAMES, OptionArguments, Options, from_config, spells_options, to_config
-from .render import edges, pipeline
+from .render import edges, pipeline, routes
 from .render.attention import Attention
 from .render.one_thread import on_one_thread
 from .render.ops import EAGER, Ops
@@ -117,12 +117,12 @@ class DepthOfField(nn.Module):
             background_depth=background_depth,
             attention=attention,
         )
-        coc = self.coc_as_given(image, depth, *lens)
-        validation.background(image, background, "background_depth", background_depth, "in metres")
-        behind = None
+        depth, channels = self._sized(image, depth), options.table.channels
+        validation.scene(image, "depth", depth, background, background_depth, channels=channels, values=options.check)
+        coc, behind = self._coc(depth, image, *lens), None
         if background is not None and background_depth is not None:
-            behind = self.coc_as_given(background, background_depth, *lens, name="background_depth")
-        return restored(axes, blur(image, coc, options, plan, background, behind, attention))
+            behind = (background, self._coc(background_depth, image, *lens))
+        return restored(axes, render(image, coc, options, plan, behind, attention))
 
     def layers(
         self,
@@ -153,8 +153,7 @@ class DepthOfField(nn.Module):
             torch.Size([1, 4, 8, 12])
         """
         options = self.options
-        if not options.occlusion:
-            raise ValueError("layers hide each other: they need occlusion=True")
+        routes.refuse(options, "stack")
         validation.real_tensor("rgba", rgba, "[B, N, C + 1, H, W]")
         validation.real_tensor("depth_m", depth_m, "in metres")
         if rgba.ndim != 5 or rgba.shape[2] < 2 or 0 in rgba.shape:
@@ -168,8 +167,9 @@ class DepthOfField(nn.Module):
             raise ValueError(f"depth_m must be {expected} in metres, got {list(depth_m.shape)}") from None
         if options.check:
             validation.finite("rgba", rgba)
-            low, high = (0.0, 1.0) if is_traced() else validation.ends(rgba[:, :, -1])
-            if not 0.0 <= low <= high <= 1.0:
+            cover = rgba[:, :, -1]
+            if not validation.holds(cover, lambda low, high: 0.0 <= low <= high <= 1.0):
+                low, high = validation.ends(cover)
                 raise ValueError(f"coverage, the last channel of rgba, must lie in [0, 1], got {low:g} to {high:g}")
         frame = rgba.new_empty(batch, 1, height, width)
         cocs = [self.coc_as_given(frame, layer, focus_m, f_number, name="depth_m") for layer in maps.unbind(1)]
@@ -205,18 +205,26 @@ class DepthOfField(nn.Module):
 
         The depth ``[B or 1, 1, H, W]`` may have a size that can be resampled to the image's.
         """
-        check = self.options.check
+        depth = self._sized(image, depth)
+        validation.image_and_depth(image, depth, values=self.options.check, name=name)
+        return self._coc(depth, image, focus_m, f_number)
+
+    def _sized(self, image: Tensor, depth: Tensor) -> Tensor:
+        """A depth map resampled to the size of its image, if it has another one that fits; unchecked."""
         is_sized = is_traced() or validation.stretch(image, depth) is None or image.shape[-2:] == depth.shape[-2:]
-        depth = depth if is_sized else at_size_of(image, depth)
-        validation.image_and_depth(image, depth, values=check, name=name)
+        return depth if is_sized else at_size_of(image, depth)
+
+    def _coc(
+        self, depth: Tensor, image: Tensor, focus_m: float | Tensor | None, f_number: float | Tensor | None
+    ) -> Tensor:
+        """The circle of confusion of a checked depth map of an image; finite, or with ``check=False`` NaN at holes."""
         changes = {"focus_m": focus_m, "f_number": f_number}
         camera = self.camera.replace(**{k: v for k, v in changes.items() if v is not None})
-        if not is_traced():
-            camera.refuse_other_batch(len(image))
+        camera.refuse_other_batch(image.shape[0])
         # a tensor, because an exported graph would do Python's arithmetic with the width in float32
         width: Any = torch.scalar_tensor(image.shape[-1], dtype=torch.float64, device="cpu")
         coc = camera.coc_px(depth, width)
-        if not check:
+        if not self.options.check:
             return torch.where(depth > 0, coc, torch.nan)
         camera.refuse_overflow(coc, depth)
         return coc
@@ -357,41 +365,35 @@ def blur_by_coc(
         axes, image=image, coc_px=coc_px, background=background, background_coc_px=hidden_coc, attention=attention
     )
     given = Options(table, **options)  # type: ignore[arg-type]
-    return restored(axes, blur(image, coc_px, given, plan, background, hidden_coc, attention))
+    validation.scene(image, "coc_px", coc_px, background, hidden_coc, channels=given.table.channels, values=given.check)
+    behind = None if background is None or hidden_coc is None else (background, hidden_coc)
+    return restored(axes, render(image, coc_px, given, plan, behind, attention))
 
 
-def blur(
+def render(
     image: Tensor,
     coc_px: Tensor,
     options: Options,
     plan: Plan | None,
-    background: Tensor | None = None,
-    background_coc_px: Tensor | None = None,
+    behind: tuple[Tensor, Tensor] | None = None,
     attention: Attention | None = None,
     ops: Ops = EAGER,
 ) -> Tensor:
-    """Check the arguments of a rendering and call the pipeline; all functions above end here.
+    """Call the pipeline with a checked scene, if an engine renders these arguments; all functions above end here.
 
-    Arguments as in :func:`blur_by_coc`, with four axes, and the operations ``ops`` (an exported graph has its own).
+    Arguments as in :func:`blur_by_coc`, with four axes; ``behind`` is the background and its circle of confusion, and
+    ``ops`` are the operations (an exported graph has its own).
     """
-    validation.image_and_coc(image, coc_px, options.table.channels, values=options.check)
     if plan is not None and not isinstance(plan, Plan):
         got = validation.show(plan)
         raise ValueError(f"plan must be a Plan from DepthOfField.plan(image, depth), or left out, got {got}")
-    validation.background(image, background, "background_coc_px", background_coc_px, "in pixels", options.check)
-    hidden = None if background is None or background_coc_px is None else (background, background_coc_px)
-    if hidden is not None and not options.occlusion:
-        raise ValueError("without occlusion nothing is hidden: a background needs occlusion=True")
-    if attention is not None and plan is not None:
-        raise ValueError("attention plans for two tolerances; leave plan out, or attention")
-    if attention is not None and is_traced():
-        raise ValueError("attention chooses its work by where the viewer looks; a compiled or exported graph cannot")
+    routes.refuse(options, background=behind is not None, attention=attention is not None, plan=plan is not None)
 
-    def render(image: Tensor, coc_px: Tensor, *hidden: Tensor) -> Tensor:
+    def rendered(image: Tensor, coc_px: Tensor, *hidden: Tensor) -> Tensor:
         behind = (hidden[0], hidden[1]) if hidden else None
         with without_autocast(image.device.type):  # it would convolve in half precision
             return pipeline.blur(image, coc_px, plan, options, behind, attention, ops)
 
-    tensors = (image, coc_px, *(hidden or ()))
+    tensors = (image, coc_px, *(behind or ()))
     has_others = options.table.is_differentiated or isinstance(attention, Tensor)
-    return render(*tensors) if has_others else on_one_thread(render, *tensors)
+    return rendered(*tensors) if has_others else on_one_thread(rendered, *tensors)

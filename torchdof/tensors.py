@@ -47,6 +47,11 @@ def _refuse_compiler() -> None:
 _refuse_compiler._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
+def is_empty(values: Tensor) -> bool:
+    """Whether a list of pixels is empty; False in traced code, where its length cannot be read."""
+    return not is_traced() and len(values) == 0
+
+
 def is_fake() -> bool:
     """Whether new tensors have no memory, as under ``FakeTensorMode``."""
     return torch._C._get_dispatch_mode(torch._C._TorchDispatchModeKey.FAKE) is not None

@@ -5,8 +5,8 @@ tensors are never read in a traced program.
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -145,12 +145,27 @@ def ends(values: Tensor) -> tuple[float, float]:
     if not TRACEABLE and torch._C._functorch.is_functorch_wrapped_tensor(values):
         needed = f"PyTorch 2.13 or newer, this is {torch.__version__}"
         raise ValueError(f"an argument comes from torch.func, for which torchdof needs {needed}; use torch.autograd")
-    if values.dtype == torch.float32 and is_in_memory(values) and native.chosen():
+    if engine_reads(values):
         return native.ends(values)
     # in float32 at least: autocast supports only one half-precision dtype at a time
     dtype = torch.float64 if values.dtype == torch.float64 else torch.float32
     low, high = torch.stack([end.to(dtype) for end in torch.aminmax(values.detach())]).tolist()
     return low, high
+
+
+def engine_reads(*values: Tensor, backward: bool = False) -> bool:
+    """Whether the compiled engine is in use and can read tensors: float32 in CPU memory, in eager code.
+
+    ``backward`` as in :func:`torchdof.tensors.is_in_memory`.
+    """
+    if is_traced() or not native.chosen():
+        return False
+    return all(t.dtype == torch.float32 and is_in_memory(t, backward) for t in values)
+
+
+def holds(values: Tensor, test: Callable[[float, float], bool]) -> bool:
+    """Whether the smallest and the largest value pass a test; True in a traced program, where they cannot be read."""
+    return is_traced() or test(*ends(values))
 
 
 def real_tensor(name: str, value: Any, what: str, whole: bool = False) -> Tensor:
@@ -185,9 +200,14 @@ def one_channel(name: str, value: Any, unit: str = "", whole: bool = False) -> N
         raise ValueError(f"{name} must be {expected} with at least one pixel, got {list(value.shape)}")
 
 
+def are_finite(*values: float) -> bool:
+    """Whether no number is NaN or infinite."""
+    return all(map(math.isfinite, values))
+
+
 def finite(name: str, values: Tensor) -> None:
-    """Refuse values that are NaN or infinite; those of a traced program pass."""
-    if not is_traced() and not all(map(math.isfinite, ends(values))):
+    """Refuse values that are NaN or infinite."""
+    if not holds(values, are_finite):
         bad = values.numel() - int(torch.isfinite(values).sum())
         raise ValueError(f"{name} must be finite, got {bad} of {values.numel()} NaN or infinite (or pass check=False)")
 
@@ -214,7 +234,13 @@ def image_and_map(image: Tensor, name: str, value: Tensor, unit: str) -> None:
 def image_and_depth(image: Tensor, depth: Tensor, values: bool, name: str = "depth") -> None:
     """Refuse an image and a depth map in metres that do not fit, or, with ``values``, depth that is not positive."""
     image_and_map(image, name, depth, "in metres")
-    if values and not is_traced() and not ends(depth)[0] > 0:
+    if values:
+        positive(name, depth)
+
+
+def positive(name: str, depth: Tensor) -> None:
+    """Refuse depth in metres that is NaN or not positive."""
+    if not holds(depth, lambda nearest, _: nearest > 0):
         bad = int((~(depth > 0)).sum())
         remedy = "check its unit and kind" if bad == depth.numel() else "fill the holes"
         remedy += ", or leave these pixels sharp with check=False"
@@ -222,38 +248,42 @@ def image_and_depth(image: Tensor, depth: Tensor, values: bool, name: str = "dep
         raise ValueError(f"{name} must be > 0 (inf allowed), got {got}; {remedy}")
 
 
-def image_and_coc(image: Tensor, coc_px: Tensor, channels: int, values: bool) -> None:
-    """Refuse an image and a signed circle of confusion in pixels that do not fit.
+def scene(
+    image: Tensor,
+    kind: Literal["depth", "coc_px"],
+    where: Tensor,
+    background: Tensor | None = None,
+    background_where: Tensor | None = None,
+    *,
+    channels: int = 1,
+    values: bool = True,
+) -> None:
+    """Check an image, its map and a known background with its map: all shapes, then with ``values`` all values.
 
-    ``channels`` is the number of kernels of the table at a node: 1, or one for each channel of the image. With
-    ``values`` both must be finite.
+    ``kind`` is that of both maps: ``where`` is a depth in metres, which must be positive, or a signed circle of
+    confusion in pixels, which must be finite. ``channels`` is the number of kernels of the table at a node: 1, or one
+    for each channel of the image.
     """
-    image_and_map(image, "coc_px", coc_px, "in pixels")
+    unit, background_name = "in metres" if kind == "depth" else "in pixels", f"background_{kind}"
+    image_and_map(image, kind, where, unit)
     if channels not in (1, image.shape[1]):
         raise ValueError(f"the table blurs {channels} channels, the image has {image.shape[1]}")
+    images, maps = {"image": image}, {str(kind): where}
+    if background is not None and background_where is not None:
+        real_tensor("background", background, "like the image")
+        if (background.shape, background.dtype, background.device) != (image.shape, image.dtype, image.device):
+            got = f"{show(background)} on {background.device}"
+            raise ValueError(f"background must be like the image, {show(image)}, got {got}")
+        image_and_map(image, background_name, background_where, unit)
+        images, maps = images | {"background": background}, maps | {background_name: background_where}
+    elif background is not None or background_where is not None:
+        got = background_name if background is None else "background"
+        raise ValueError(f"background and {background_name} need each other, got only {got}")
     if values:
-        finite("coc_px", coc_px)
-        finite("image", image)
-
-
-def background(
-    image: Tensor, hidden: Tensor | None, name: str, where: Tensor | None, unit: str, values: bool = False
-) -> None:
-    """Refuse a background that is not like the image, or whose depth or circle of confusion ``where`` does not fit.
-
-    ``name`` and ``unit`` are those of ``where``. With ``values`` both must be finite.
-    """
-    if hidden is None and where is None:
-        return
-    if hidden is None or where is None:
-        raise ValueError(f"background and {name} need each other, got only {name if hidden is None else 'background'}")
-    real_tensor("background", hidden, "like the image")
-    if (hidden.shape, hidden.dtype, hidden.device) != (image.shape, image.dtype, image.device):
-        raise ValueError(f"background must be like the image, {show(image)}, got {show(hidden)} on {hidden.device}")
-    image_and_map(image, name, where, unit)
-    if values:
-        finite(name, where)
-        finite("background", hidden)
+        for name, values_of_map in maps.items():
+            (positive if kind == "depth" else finite)(name, values_of_map)
+        for name, light in images.items():
+            finite(name, light)
 
 
 def stretch(image: Any, depth: Any) -> float | None:

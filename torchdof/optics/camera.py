@@ -30,7 +30,18 @@ from torch import Tensor
 
 from .. import native
 from ..tensors import floating, is_in_memory, is_traced
-from ..validation import ends, number, numbers, one_channel, pixels_wide, real_tensor, show, whole
+from ..validation import (
+    are_finite,
+    engine_reads,
+    holds,
+    number,
+    numbers,
+    one_channel,
+    pixels_wide,
+    real_tensor,
+    show,
+    whole,
+)
 
 __all__ = ["Camera"]
 
@@ -179,7 +190,7 @@ class Camera:
 
     def refuse_overflow(self, coc_px: Tensor, depth: Tensor) -> None:
         """Refuse a circle of confusion of a depth if it overflowed; the message has the numbers of the lens."""
-        if not is_traced() and not all(map(math.isfinite, ends(coc_px))):
+        if not holds(coc_px, are_finite):
             stated = ", ".join(f"{name} {_show(getattr(self, name))}" for name in _NUMBERS)
             checked = f"this lens ({stated}) and the depth, which starts at {float(depth.detach().min()):.3g} m"
             raise ValueError(f"depth and lens must give a finite blur radius, got an infinite one: check {checked}")
@@ -196,7 +207,7 @@ class Camera:
 
     def _compiled_coc_px(self, depth: Tensor, width: int) -> Tensor | None:
         """:meth:`coc_px` by the compiled engine; None if it does not support the call (traced, batched, tilted)."""
-        if is_traced() or depth.dtype != torch.float32 or not is_in_memory(depth) or not native.chosen():
+        if not engine_reads(depth):
             return None
         distances = self.focus_range_m or (self.focus_m, self.focus_m)
         numbers = [self.aperture_radius_m * self.focal_px(width), *distances, self.tilt_deg, self.swing_deg]

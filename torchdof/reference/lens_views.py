@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ..render.matting import matte
-from ..validation import image_and_coc, whole
+from ..validation import scene, whole
 from .scenes import spread_points
 
 __all__ = ["LensViews", "lens_views"]
@@ -68,7 +68,7 @@ def lens_views(image: Tensor, coc_px: Tensor, *, views: int = 256) -> LensViews:
         >>> lens_views(image, torch.zeros(1, 1, 8, 12), views=4).image.equal(image)
         True
     """
-    image_and_coc(image, coc_px, channels=1, values=True)
+    scene(image, "coc_px", coc_px)
     whole("views", views, 1, 2**31)
     cocs = coc_px.float().expand(image.shape[0], -1, -1, -1)
     averages = [_average(*maps, views) for maps in zip(image.float().split(1), cocs.split(1), strict=True)]

@@ -8,17 +8,24 @@ from torch import Tensor
 
 from .. import native
 from ..optics.aperture import Aperture
-from ..optics.kernel_bank import bank_of
+from ..optics.blur_table import BlurTable
+from ..optics.kernel_bank import Spots, bank_of
 from ..optics.placed_kernels import ray_masks
 from ..options import Options
-from ..tensors import is_in_memory, is_traced
 from . import exposure
 from .plan import KERNELS_PER_PX, Plan, kernels_of, layer_spots, longest_px
+
+
+def layer_spots_of(plan: Plan, table: BlurTable, size: tuple[int, int], lens_width: int | None) -> Spots:
+    """Recipe for the kernels of the layers of a picture of ``size``; ``lens_width`` as for :func:`picture`."""
+    width, scales = plan.layer_sizes(table, lens_width or size[1], coarse=True)
+    return layer_spots(table, plan.coc_px, width, scales, longest_px(size, scales))
 
 
 def picture(
     plan: Plan,
     options: Options,
+    spots: Spots,
     light: Tensor,
     coc: Tensor,
     behind_light: Tensor | None = None,
@@ -26,26 +33,15 @@ def picture(
     moved_px: Tensor | None = None,
     cover: Tensor | None = None,
     lens_width: int | None = None,
-) -> Tensor | None:
-    """Render ``[B, C, H, W]`` item by item; None if the compiled engine does not support the arguments.
+) -> Tensor:
+    """Render ``[B, C, H, W]`` item by item, if the compiled engine can (:func:`torchdof.render.routes.route`).
 
-    It supports ``method="layered"`` in float32 on the CPU, in eager code without gradients. Arguments are those of
-    :mod:`torchdof.render.pipeline`; ``lens_width`` is the width in pixels of the image whose kernels are
-    used, if it differs from the picture's.
+    ``spots`` are those of :func:`layer_spots_of`. The other arguments are those of :mod:`torchdof.render.pipeline`;
+    ``lens_width`` is the width in pixels of the image whose kernels are used, if it differs from the picture's.
     """
-    table, given = options.table, [t for t in (light, coc, behind_light, behind_coc, moved_px, cover) if t is not None]
-    if table.is_differentiated or options.method != "layered" or is_traced() or not native.chosen():
-        return None
-    if plan.rays and cover is None and plan.kernels_per_px != KERNELS_PER_PX:
-        return None
-    if not all(t.dtype == torch.float32 and is_in_memory(t) for t in given):
-        return None
-    size = (int(light.shape[-2]), int(light.shape[-1]))
+    table, size = options.table, (int(light.shape[-2]), int(light.shape[-1]))
     lens_width = lens_width or size[1]
-    kernels_width, scales = plan.layer_sizes(table, lens_width, coarse=True)
-    spots = layer_spots(table, plan.coc_px, kernels_width, scales, longest_px(size, scales))
-    if max(spots.half) > native.HALF_LARGEST:
-        return None
+    _, scales = plan.layer_sizes(table, lens_width, coarse=True)
     cpu = torch.empty(0, dtype=torch.float32, device="cpu")
 
     def psfs(steps: Sequence[int]) -> list[Tensor]:

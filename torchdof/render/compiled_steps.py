@@ -6,8 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .. import native
-from ..tensors import is_in_memory, is_traced
+from ..validation import engine_reads
 
 
 def compiled_step(
@@ -28,9 +27,7 @@ def compiled_step(
         None if the compiled engine is not in use or cannot read the tensors: it needs float32 on the CPU, and eager
         code without function transforms.
     """
-    if is_traced() or not native.chosen():
-        return None
-    if not all(t.dtype == torch.float32 and is_in_memory(t, backward=True) for t in tensors):
+    if not engine_reads(*tensors, backward=True):
         return None
     result: Tensor = _Step.apply(forward, backward, plain, *tensors)
     return result

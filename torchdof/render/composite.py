@@ -164,13 +164,13 @@ def _composite_layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter:
             part = blank(*(n // scale + 2 for n in frame.area))
         for group in groups:
             front = recomputed(functools.partial(with_group, part, group))
-            part = ops.choose(_needed(frame, blurs, group), front, part)
+            part = ops.equal_unless(_needed(frame, blurs, group), front, part)
         if scale > 1:
             fine = upsampled(part, scale)
             fine = fine[..., scale:-scale, scale:-scale]
             needed = _needed(frame, blurs, [k for group in groups for k in group])
             together = torch.cat(in_front(_parts(fine, colours), _parts(picture, colours)), 1)
-            part = ops.choose(needed, together, picture)
+            part = ops.equal_unless(needed, together, picture)
         picture = part
     return picture
 

@@ -371,7 +371,7 @@ def behind_cells(levels: Sequence[Level], size: tuple[int, int], coc_px: Tensor,
         if len(levels) > _FINE_LEVELS:
             found += search(given[_FINE_LEVELS:], shown[_FINE_LEVELS:], known[_FINE_LEVELS:], nearest)
         looked = torch.cat(found, 1)
-        return ops.choose(lambda: is_wanted.any(), looked * is_wanted, torch.zeros_like(looked))
+        return ops.equal_unless(lambda: is_wanted.any(), looked * is_wanted, torch.zeros_like(looked))
 
     found = _looked(plain, levels, coc_px, wanted)
     return plain(coc_px, *(level.values for level in levels), wanted) if found is None else found

@@ -167,7 +167,7 @@ def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER) -
     repaired = repair(image, given, STEP_PX, auto=edges == "auto", of_coc=True, ops=ops)
     if repaired is given:
         return coc_px
-    repaired = ops.choose(lambda: _has_steps(coc_px), repaired, coc_px)
+    repaired = ops.equal_unless(lambda: _has_steps(coc_px), repaired, coc_px)
     return torch.where(repaired == coc_px, coc_px, repaired) if is_differentiated(coc_px) else repaired
 
 

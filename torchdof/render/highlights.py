@@ -24,7 +24,7 @@ from .. import pixels
 from ..optics.blur_table import BlurTable
 from ..optics.kernel_bank import bank_of
 from ..optics.placed_kernels import FieldMask, placed_between, ray_masks
-from ..tensors import is_traced, recomputed
+from ..tensors import is_empty, is_traced, recomputed
 from .layer_cocs import mean_change
 from .ops import EAGER, Ops
 from .plan import KERNELS_PER_PX, kernels_for
@@ -120,7 +120,7 @@ def extract(
     brightest = light.amax(1, keepdim=True)
     is_bright = (brightest > limit) & (coc_px.detach().abs() > from_px)
     bright = pixels.indices(is_bright if weight is None else is_bright & (weight > HIDDEN_WEIGHT))
-    if not is_traced() and len(bright) == 0:
+    if is_empty(bright):
         return surface, None
     peak, coc, most = (pixels.pick(t, bright)[0] for t in (brightest, coc_px, limit))
     start = pixels.pick(from_px.expand_as(coc_px), bright)[0] if isinstance(from_px, Tensor) else from_px
@@ -133,14 +133,14 @@ def extract(
         most_taps = torch.scalar_tensor(_TAPS_PER_PIXEL * area, dtype=torch.float64, device=item.device).reshape(1)
     least = _least_peak(peaks, cocs, shares, most_taps[:, None])[:, 0].index_select(0, item)
     kept = (peak.detach() > least).nonzero()[:, 0]
-    if not is_traced() and len(kept) == 0:
+    if is_empty(kept):
         return surface, None
     bright, peak, fades, coc, most = (t.index_select(0, kept) for t in (bright, peak, fades, coc, most))
     taken_from, ordinary = pixels.pick(light, bright), torch.maximum(most, least.index_select(0, kept)) / peak
     excess = taken_from * ((1.0 - ordinary) * fades)
     # not light - excess, whose rounding error is brighter than a dark scene
     left = pixels.put(light, bright, taken_from * ((1.0 - fades) + fades * ordinary))
-    left = ops.choose(lambda: is_bright.any(), left, light)
+    left = ops.equal_unless(lambda: is_bright.any(), left, light)
     if weight is not None:
         cover = pixels.pick(weight, bright)
         if beside is not None:

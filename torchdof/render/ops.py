@@ -56,10 +56,10 @@ class Ops:
         """Selects the pixels of a mask, to compute only these."""
         return pixels.Selected(mask)
 
-    def choose(self, needed: Callable[[], Tensor], result: Tensor, given: Tensor) -> Tensor:
-        """Returns ``result`` if ``needed()``, a bool ``[]``, is true, else ``given``, which equals it in that case.
+    def equal_unless(self, needed: Callable[[], Tensor], result: Tensor, given: Tensor) -> Tensor:
+        """Returns ``result``, of which the caller promises that it equals ``given`` unless ``needed()``, a bool ``[]``.
 
-        A graph computes ``result`` only if it is needed.
+        Eager code relies on the promise and asks nothing. A graph returns ``given`` where it can, and skips ``result``.
         """
         return result
 

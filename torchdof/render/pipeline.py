@@ -17,7 +17,7 @@ from .. import native
 from ..options import Options
 from ..tensors import is_differentiated, is_in_memory, is_traced
 from ..validation import NAMED_TOLERANCES
-from . import compiled, composite, edges, exposure, highlights
+from . import compiled, composite, edges, exposure, highlights, routes
 from .attention import Attention, box_around, weight_map
 from .convolution import convolve
 from .disocclusion import behind_pixels, surfaces_of_image
@@ -93,10 +93,6 @@ def _planned(
     ops: Ops,
 ) -> Tensor:
     """Render images with repaired depth edges; the given plan grows to the blur of each item; None plans each."""
-    if is_traced() and options.table.depends_on_place:
-        raise ValueError(
-            "a compiled or exported graph has one kernel a layer; take a table without vignetting or field"
-        )
     wide = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
     given = {"light": image, "coc": coc_px}
     if behind is not None:
@@ -181,12 +177,32 @@ def _by_item(render: Callable[..., Tensor], plans: Sequence[Plan], maps: Mapping
     return rendered[0] if len(rendered) == 1 else torch.cat(rendered)
 
 
+def _compiled(
+    plans: Sequence[Plan],
+    options: Options,
+    lens_width: int | None,
+    light: Tensor,
+    coc: Tensor,
+    **others: Tensor | None,
+) -> Tensor | None:
+    """A picture by the compiled engine; None if another engine renders. ``others`` are further maps of its function."""
+    plan, size, made = plans[0], (light.shape[-2], light.shape[-1]), []
+
+    def half_widths() -> list[int]:
+        made.append(compiled.layer_spots_of(plan, options.table, size, lens_width))
+        return made[0].half
+
+    maps = [light, coc, *(t for t in others.values() if t is not None)]
+    if routes.route(plan, options, maps, "cover" in others, half_widths).engine != "compiled":
+        return None
+    return compiled.picture(plan, options, made[0], light, coc, lens_width=lens_width, **others)
+
+
 def _stack(options: Options, plans: Sequence[Plan], light: Tensor, coc: Tensor, cover: Tensor) -> Tensor:
     """Render float maps of layers ``[B, N, ...]``, near to far, with one plan or with one for each item."""
-    if len(plans) == 1 and plans[0].nodes != (0.0,):
-        picture = compiled.picture(plans[0], options, light, coc, cover=cover)
-        if picture is not None:
-            return picture
+    picture = _compiled(plans, options, None, light, coc, cover=cover)
+    if picture is not None:
+        return picture
     reach = _reach(plans, coc)
     stack = [Surface(light[:, i], coc[:, i].clamp(*reach), cover[:, i]) for i in range(light.shape[1])]
     # a black surface behind the layers, for pixels that no layer covers
@@ -219,12 +235,10 @@ def _image(
     if len(plans) == 1 and plan.nodes == (0.0,):
         # all in focus: the image is unchanged; with the term 0 * coc, the coc has a gradient of 0 instead of None
         return light + 0.0 * torch.nan_to_num(coc) if is_differentiated(coc) else light.clone()
-    if len(plans) == 1:
-        picture = compiled.picture(
-            plan, options, light, coc, behind_light, behind_coc, moved_px, lens_width=ops.lens_width
-        )
-        if picture is not None:
-            return picture
+    others = {"behind_light": behind_light, "behind_coc": behind_coc, "moved_px": moved_px}
+    picture = _compiled(plans, options, ops.lens_width, light, coc, **others)
+    if picture is not None:
+        return picture
     image, valid, weight = light, None, None
     if not options.check:
         valid = torch.isfinite(coc) & torch.isfinite(light).all(1, keepdim=True)
@@ -275,7 +289,7 @@ def _image(
     out = _composite(surfaces, behind, plans, options, ops, own, limit, splats)
     out = out / scale
     out = out if valid is None else torch.where(valid, out, image)
-    return ops.choose(lambda: blur_axis(coc).abs().max() > 0, out, image)
+    return ops.equal_unless(lambda: blur_axis(coc).abs().max() > 0, out, image)
 
 
 def _reach(plans: Sequence[Plan], like: Tensor) -> Sequence[Any]:

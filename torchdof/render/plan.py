@@ -12,8 +12,8 @@ from .. import native
 from ..optics.blur_table import BlurTable
 from ..optics.kernel_bank import Spots, bank_of
 from ..optics.placed_kernels import FieldMask, layer_mask
-from ..tensors import is_in_memory, is_traced
-from ..validation import show, tolerance_of
+from ..tensors import is_traced
+from ..validation import engine_reads, show, tolerance_of
 from . import layer_cocs, traced
 from .downsampling import shrink
 from .layer_weights import blur_axis_of_radius, from_blur_axis, ramps, weights_at_or_behind
@@ -118,7 +118,7 @@ class Plan:
 
         Values are copied to the host once for all scenes, and once more if a frame is small beside its blur radii.
         """
-        if not on_grid and native.chosen() and all(s.dtype == torch.float32 and is_in_memory(s) for s in scenes):
+        if not on_grid and engine_reads(*scenes):
             return [cls(*native.plan(scene, tolerance)) for scene in scenes]
         coc_px = torch.cat([scene.detach() for scene in scenes])
         count, shorter = len(scenes[0]), min(coc_px.shape[-2:])
@@ -357,9 +357,9 @@ def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int, per_
 def kernels_of(table: BlurTable, spots: Spots, dtype: torch.dtype = torch.float64) -> list[Tensor]:
     """Kernels ``[1 or C, k, k]`` on the CPU from their spots; by the compiled engine if float32 suffices."""
     bank = bank_of(table)
-    if dtype == torch.float32 and spots.moves is None and native.chosen():
-        if is_in_memory(torch.empty(0, device="cpu")):  # new tensors have no memory in torch.func and fake modes
-            return native.kernels(spots, squeeze=bank.squeeze, is_round=table.is_round, is_even=bank.is_even)
+    is_plain = dtype == torch.float32 and spots.moves is None
+    if is_plain and engine_reads(torch.empty(0, dtype=dtype, device="cpu")):  # not so in torch.func and fake modes
+        return native.kernels(spots, squeeze=bank.squeeze, is_round=table.is_round, is_even=bank.is_even)
     made = bank.of_spots(spots)
     spare = [made.shape[-1] // 2 - half for half in spots.half]
     return [k[:, n : k.shape[-1] - n, n : k.shape[-1] - n] for k, n in zip(made, spare, strict=True)]

@@ -1,0 +1,174 @@
+"""Which engine renders a call, and which calls no engine renders.
+
+| call | eager, float32 on the CPU | with gradients | float64 or a GPU | `torch.compile` | ONNX file |
+| --- | --- | --- | --- | --- | --- |
+| image, with or without occlusion | compiled | steps | PyTorch | graph | graph |
+| a known background | compiled | steps | PyTorch | graph | no such input |
+| `attention` | compiled | steps | PyTorch | refused | no such input |
+| stack of layers (`DepthOfField.layers`) | compiled | steps | PyTorch | left out | no such input |
+| a table whose blur depends on the place in the frame | compiled | steps | PyTorch | refused | refused |
+| `method="fold"` | steps | steps | PyTorch | graph | graph |
+| an aperture whose rotation or squeeze has a gradient | steps | steps | PyTorch | left out | refused |
+| kernels wider than 513 pixels of their layer | steps | steps | PyTorch | graph | graph |
+| `torchdof.functional.splat` | PyTorch | PyTorch | PyTorch | refused | no such input |
+
+- compiled: the compiled engine renders the whole picture.
+- steps: PyTorch renders, and the compiled engine computes those of its steps that it supports.
+- PyTorch: PyTorch renders alone. So it does everywhere without a compiled engine or with `TORCHDOF_ENGINE=torch`, and
+  in forward mode or under `torch.func`.
+- graph: one static graph. That of `torch.compile` has no rays of highlights.
+- left out: `torch.compile` calls it as eager code between two graphs; with `fullgraph=True` it fails.
+- float16 and bfloat16 are rendered as float32. A frame wholly in focus is returned unchanged, without an engine.
+
+`logging.getLogger("torchdof").setLevel(logging.DEBUG)` shows a line for each rendered item: the engine and the reason.
+"""
+
+import logging
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .. import native
+from ..options import Options
+from ..tensors import is_differentiated, is_traced
+from ..validation import engine_reads
+from .plan import KERNELS_PER_PX, Plan
+
+Call = Literal["image", "stack", "splat", "file", "whole file"]
+"""What is called: the rendering of an image or of a stack of layers, ``splat``, or the export in tiles or whole."""
+
+Engine = Literal["compiled", "steps", "PyTorch", "graph"]
+
+_ENGINES: dict[Engine, str] = {
+    "compiled": "the compiled engine",
+    "steps": "PyTorch with compiled steps",
+    "PyTorch": "PyTorch",
+    "graph": "a graph",
+}
+_log = logging.getLogger("torchdof")
+
+
+class Route(NamedTuple):
+    """The engine of a rendering, and the reason."""
+
+    engine: Engine
+    why: str
+
+
+def refuse(
+    options: Options,
+    call: Call = "image",
+    *,
+    background: bool = False,
+    attention: bool = False,
+    plan: bool = False,
+    repairs: bool = False,
+) -> None:
+    """Refuse a combination of arguments that no engine renders: all these combinations are here.
+
+    Args:
+        options: Options of the rendering.
+        call: What is called.
+        background: Whether a background is given.
+        attention: Whether the viewer's attention is given.
+        plan: Whether a plan is given.
+        repairs: Whether a file is to repair depth edges.
+
+    Raises:
+        ValueError: With the combination and the remedy.
+    """
+    table, traced = options.table, is_traced()
+    for is_refused, message in (
+        (
+            call == "splat" and traced,
+            "splat cannot be compiled or exported; use torch.compiler.disable(splat), or blur_by_coc",
+        ),
+        (
+            call == "splat" and table.depends_on_place,
+            "splat takes one kernel a radius, no table with a field or vignetting; use blur_by_coc",
+        ),
+        (
+            call == "splat" and table.is_differentiated,
+            "splat gives no gradient to the aperture; detach its rotation and squeeze, or use blur_by_coc",
+        ),
+        (
+            call == "stack" and not options.occlusion,
+            "layers hide each other: they need occlusion=True",
+        ),
+        (
+            background and not options.occlusion,
+            "without occlusion nothing is hidden: a background needs occlusion=True",
+        ),
+        (
+            attention and plan,
+            "attention plans for two tolerances; leave plan out, or attention",
+        ),
+        (
+            attention and traced,
+            "attention chooses its work by where the viewer looks; a compiled or exported graph cannot",
+        ),
+        (
+            (traced or call in ("file", "whole file")) and table.depends_on_place,
+            "a compiled or exported graph has one kernel a layer; take a table without vignetting or field",
+        ),
+        (
+            call in ("file", "whole file") and table.is_differentiated,
+            "a file has constant kernels, without a gradient to the aperture; detach its rotation and squeeze",
+        ),
+        (
+            call == "whole file" and repairs,
+            'layout="whole" cannot repair depth edges, whose number depends on the map; repair the map before, or use '
+            'layout="tiles"',
+        ),
+    ):
+        if is_refused:
+            raise ValueError(message)
+
+
+def route(
+    plan: Plan, options: Options, maps: Sequence[Tensor], is_stack: bool, half_widths: Callable[[], Sequence[int]]
+) -> Route:
+    """The engine that renders an item, whose name and reason are logged.
+
+    Args:
+        plan: Its layers.
+        options: Options of the rendering.
+        maps: All its light, circles of confusion and weights.
+        is_stack: Whether it is a stack of layers instead of an image.
+        half_widths: Half widths of the layers' kernels, in pixels of the layer; called only if all else fits.
+    """
+    if is_traced():
+        return Route("graph", "the call is compiled or exported")
+    chosen = _of_eager(plan, options, maps, is_stack, half_widths)
+    _log.debug("rendered by %s: %s", _ENGINES[chosen.engine], chosen.why)
+    return chosen
+
+
+def _of_eager(
+    plan: Plan, options: Options, maps: Sequence[Tensor], is_stack: bool, half_widths: Callable[[], Sequence[int]]
+) -> Route:
+    """As :func:`route`, in eager code and without a line in the log."""
+    if not native.chosen():
+        return Route("PyTorch", native.describe())
+    if any(t.dtype != torch.float32 for t in maps):
+        return Route("PyTorch", "the compiled engine computes in float32, and a map is float64")
+    if not engine_reads(*maps, backward=True):
+        device = maps[0].device.type
+        where = "a map has no plain memory, as in torch.func and forward mode" if device == "cpu" else f"on {device}"
+        return Route("PyTorch", where)
+    if any(map(is_differentiated, maps)):
+        return Route("steps", "gradients are recorded")
+    if options.table.is_differentiated:
+        return Route("steps", "the aperture's rotation or squeeze has a gradient")
+    if options.method != "layered":
+        return Route("steps", f"method={options.method!r} is in PyTorch alone")
+    if is_stack and plan.nodes == (0.0,):
+        return Route("steps", "all layers of the stack are in focus")
+    if plan.rays and not is_stack and plan.kernels_per_px != KERNELS_PER_PX:
+        return Route("steps", "the plan has the kernels of a graph's highlights")
+    half = max(half_widths())
+    if half > native.HALF_LARGEST:
+        return Route("steps", f"a kernel is {2 * half + 1} pixels wide, the largest is {2 * native.HALF_LARGEST + 1}")
+    return Route("compiled", "float32 in CPU memory, no gradients")
