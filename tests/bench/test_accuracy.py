@@ -68,3 +68,33 @@ def test_a_peer_that_cannot_run_is_refused(tmp_path: Path, text: str, message: s
         accuracy.read_peer(peer)
     result = run("--truth", DATA, "--out", tmp_path, "--peer", tmp_path / "none.py")
     assert result.exit_code == 2 and "No such file or directory" in result.output
+
+
+def test_bench_shows_the_change_without_a_rule_on_every_scene(tmp_path: Path) -> None:
+    scenes, out = tmp_path / "scenes", tmp_path / "out"
+    for name in ("room", "planes"):
+        shutil.copytree(DATA / name, scenes / name)
+    result = run("--truth", scenes, "--without", "filling", "--out", out)
+    assert result.exit_code == 0, result.output
+    with (out / "ablation.csv").open() as file:
+        rows = {(row["scene"], row["without"]): row for row in csv.DictReader(file)}
+    assert {scene for scene, _ in rows} == {scene.name for scene in read_scenes(scenes)} and len(rows) == 4
+    for (name, rule), row in rows.items():
+        whole = float(rows[name, ""]["psnr_db"])
+        assert float(row["change_db"]) == pytest.approx(float(row["psnr_db"]) - whole, abs=1e-4)
+        assert (float(row["change_db"]) == 0) == (rule == "")
+    assert "fills hidden surfaces behind blurred foregrounds" in result.output
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--without", "fill"], "--without: there is no rule 'fill'; the rules are matting"),
+        (["--without", "filling", "--ablation"], "--ablation measures every rule; leave --without out"),
+        (["--ablation", "--views", "4"], "leave --views and --peer out"),
+    ],
+)
+def test_options_for_rules_that_do_not_fit_are_refused(tmp_path: Path, options: list[str], message: str) -> None:
+    result = run("--truth", DATA, "--out", tmp_path / "out", *options)
+    assert result.exit_code != 0 and message in " ".join(result.output.split())
+    assert not (tmp_path / "out").exists()

@@ -30,6 +30,10 @@ class _Accuracy(Group):
         type=click.IntRange(min=1),
     )
     degrade: bool = option("Instead, measure the cost of soft, displaced, coarse or noisy depth.", False)
+    without: tuple[str, ...] = option(
+        "Instead, render without this rule of the picture, and show the change in dB; may be repeated.", ()
+    )
+    ablation: bool = option("The same for every rule, one after the other; takes long.", False)
     peer: tuple[Path, ...] = option("A Python file with another renderer, blur(image, coc_px); may be repeated.", ())
 
 
@@ -65,15 +69,34 @@ class Bench(Scene, Blur, _Speed, _Accuracy, Command):
             raise ValueError("--truth writes tables and pictures; give a folder with --out, and leave --json out")
         if self.degrade and self.views:
             raise ValueError("--degrade compares without the reference; leave --views out")
+        if self.without or self.ablation:
+            return self._measure_rules(self.truth, self.out)
         from ..bench import accuracy
 
         check_writable(self.out / "accuracy.csv")
         accuracy.compare(self.truth, self.out, [] if self.degrade else self.views or [256], self.degrade, self.peer)
 
+    def _measure_rules(self, truth: Path, out: Path) -> None:
+        """Measures the change in dB without each of the named rules, or of all rules."""
+        if self.views or self.peer:
+            raise ValueError("--without and --ablation compare torchdof with itself; leave --views and --peer out")
+        if self.without and self.ablation:
+            raise ValueError("--ablation measures every rule; leave --without out")
+        from ..bench import ablation
+        from ..render.rules import RULES
+
+        for name in self.without:
+            if name not in RULES:
+                raise ValueError(f"--without: there is no rule {name!r}; the rules are {', '.join(RULES)}")
+        check_writable(out / "ablation.csv")
+        ablation.compare(truth, out, self.degrade, self.without or list(RULES))
+
     def _measure_speed(self) -> None:
         """Checks the options, and measures speed against error on the user's scene or on the built-in one."""
         if self.given(_Accuracy):
-            raise ValueError("--views, --degrade and --peer compare with a truth; name its folder with --truth")
+            raise ValueError(
+                "--views, --degrade, --without, --ablation and --peer need a truth; name its folder with --truth"
+            )
         if self.image is None and self.given(Scene):
             raise ValueError("the built-in scene has its own camera and depth; name an IMAGE for these options")
         self.refuse_keyframes()

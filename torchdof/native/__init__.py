@@ -136,12 +136,23 @@ def chosen() -> bool:
     wanted = os.environ.get("TORCHDOF_ENGINE", "auto")
     if wanted not in ("auto", "native", "torch"):
         raise ValueError(f"TORCHDOF_ENGINE must be auto, native or torch, got {wanted!r}")
-    if wanted == "torch":
+    if wanted == "torch" or getattr(_of_thread, "is_off", False):
         return False
     library, missing = _library()
     if library is None and wanted == "native":
         raise ValueError(f"TORCHDOF_ENGINE is native, but {missing}; install torchdof where there is a C++ compiler")
     return library is not None
+
+
+@contextlib.contextmanager
+def engine_off() -> Iterator[None]:
+    """In this block calls of this thread use the plain engine."""
+    before = getattr(_of_thread, "is_off", False)
+    _of_thread.is_off = True
+    try:
+        yield
+    finally:
+        _of_thread.is_off = before
 
 
 @contextlib.contextmanager

@@ -22,6 +22,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ..optics.kernel_cache import kept
+from .rules import active
 from .traced import is_compiled
 
 _WIDTH = 4  # half width of the mean along the border, over the distance from the border; larger smooths more
@@ -102,6 +103,8 @@ def _bins(x: Tensor, image_x: Tensor) -> Tensor:
 
 def _step(difference: Tensor) -> Tensor:
     """Keep differences on the blur axis that are steps between surfaces; set those of a slope to 0."""
+    if not active().border_surfaces:
+        return torch.zeros_like(difference)
     return difference * (difference.abs() / _STEP - 1.0).clamp(0.0, 1.0)
 
 
@@ -124,7 +127,7 @@ def _beyond(farthest: int, line: Tensor, weight: Tensor, x: Tensor, most: Tensor
     total = window[..., -1:, :, :]
     means = window[..., :-1, :, :] / torch.where(total > 0, total, 1.0)
     mean = torch.lerp(means.index_select(-2, octave), means.index_select(-2, octave + 1), part)
-    return torch.lerp(line[..., None, :], mean, 0.5)
+    return torch.lerp(line[..., None, :], mean, 0.5 if active().border else 0.0)
 
 
 def _window_sums(values: Tensor, levels: int) -> Tensor:

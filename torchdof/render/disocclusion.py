@@ -19,6 +19,7 @@ from .compiled_steps import compiled_step
 from .downsampling import downsampled
 from .matting import NEVER_PX, attribute_emitters, matte
 from .ops import EAGER, Level, Ops, Seen
+from .rules import active
 from .surfaces import HIDDEN_WEIGHT, Surface
 from .traced import is_compiled, one_operator
 
@@ -178,7 +179,7 @@ def _surfaces_of_image(
 ) -> _Maps:
     """Light and weight of each pixel's own surface; light, coc and weight of the other one; light behind both."""
     matted = matte(light, coc_px, valid, moved_px, ops)
-    if ops.has_rays:
+    if ops.has_rays and active().emitters:
         matted = attribute_emitters(light, coc_px, threshold, valid, matted)
     own, other, other_coc, other_weight = matted
     # a mixed pixel's other surface does not count up to a weight of HIDDEN_WEIGHT / 2, 0 here; fully from twice that, 1
@@ -214,6 +215,8 @@ def _surfaces_of_image(
     # Up to HIDDEN_WEIGHT / 2 a mixed sample does not count, and the hidden one replaces it. Both weights are 0 at the
     # limit, where light and coc jump from one to the other.
     hidden = (total * (-HIDDEN_WEIGHT / _CERTAIN)).clamp_min(-HIDDEN_WEIGHT) * mixed.clamp(max=0.0)
+    if not active().filling:
+        hidden = torch.zeros_like(hidden)
     is_hidden, (seen_light, seen_coc) = hidden > 0, seen.split([colours, 1], 1)
     other = torch.where(is_hidden, seen_light, other)
     other_coc = torch.where(is_hidden, seen_coc, other_coc)
@@ -425,7 +428,8 @@ def shown_behind(samples: Tensor, shares: Tensor, coc_px: Tensor) -> Seen:
     count = samples.shape[-4] - 2
     coc, weight = samples.narrow(-4, count, 1), samples.narrow(-4, count + 1, 1)
     # the pixel's own surface may slope nearby by a part of its blur
-    end_of_surface = coc_px + (_OWN_SLOPE * coc_px.abs() - BEHIND_PX).clamp_min(0.0)
+    slope = _OWN_SLOPE if active().own_slope else 0.0
+    end_of_surface = coc_px + (slope * coc_px.abs() - BEHIND_PX).clamp_min(0.0)
     part = shares * weight * _is_behind(coc - end_of_surface.unsqueeze(2))
     total = part.sum(-3)
     total = torch.where(total > _LEAST_SEEN, total, 0.0)

@@ -24,6 +24,7 @@ from ..options import DepthEdges
 from ..tensors import is_differentiated, is_in_memory, is_traced
 from ..validation import ends
 from .ops import EAGER, Ops
+from .rules import active
 from .traced import is_compiled, one_operator
 
 __all__ = ["STEP_PX", "judged", "mended", "repair", "repair_edges"]
@@ -157,7 +158,7 @@ def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER) -
     Returns:
         The map, ``[B, 1, H, W]`` if it is repaired. Gradients flow to unchanged pixels.
     """
-    if edges == "as given":
+    if edges == "as given" or not active().edges:
         return coc_px
     if not is_traced():
         low, high = ends(coc_px)
@@ -260,6 +261,7 @@ def _repair(
     5. Give selected pixels the nearness of their surface, on ramps in proportion to the evidence.
     6. In soft maps, remove the ringing of interpolation beside steps, and correct lamps of a few pixels.
     """
+    rules = active()
     if of_coc:
         nearness = -nearness
     valid = nearness.abs() <= _LARGEST
@@ -311,14 +313,16 @@ def _repair(
     score, evidence, near, far = _judge(looks, given, edge_pixels, _CLEAR, ops)
     shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0])
     if auto:  # without auto, correct steps are decided too, and the lead would move them
-        shows_near = shows_near + _LEAN * (score.abs() - 1.0).clamp(0.0, 1.0)
+        shows_near = shows_near + (_LEAN if rules.far_lead else 0.0) * (score.abs() - 1.0).clamp(0.0, 1.0)
     # single pixels of a soft map that stick out of an edge are mostly background of a similar colour
     chance = pixels.put(torch.full_like(given, -1.0), edge_pixels, torch.sigmoid(shows_near))
     chance, values = pixels.pick(torch.cat([chance, given], 1), pixels.around(edge_pixels, given, 1))
     middle = pixels.pick(looks[-3:-1], edge_pixels).mean(0)  # of both surfaces
     chance = torch.where(chance < 0, (values > middle).to(given.dtype), chance)
     neighbours = (_neighbours(given.dtype, given.device) * (2.0 * chance - 1.0)).sum(0)
-    if auto and of_coc:
+    if not rules.neighbours:
+        neighbours = torch.zeros_like(neighbours)
+    if auto and of_coc and rules.more_blurred:
         blur = pixels.pick(looks[-3:-1], edge_pixels).abs()  # of the near and of the far surface
         neighbours = neighbours + _TO_BLURRED * ((blur[0] - blur[1]) / _MORE_BLURRED_PX).clamp(-1.0, 1.0)
     of_soft = is_soft.flatten().index_select(0, edge_pixels // (height * width))
@@ -335,10 +339,15 @@ def _repair(
 
     own = pixels.pick(given, edge_pixels)[0]
     is_ramp = pixels.pick(edges.is_ramp, edge_pixels)[0]
+    if not rules.third_surfaces:
+        evidence = torch.ones_like(evidence)
     moved = torch.where(is_ramp, evidence, (shows_near != pixels.pick(is_near, edge_pixels)[0]).to(given.dtype))
     out = pixels.put(given, edge_pixels, torch.lerp(own, torch.where(shows_near, near, far), moved))
-    out = torch.where(is_soft, _without_ringing(out, valid, step), out)
-    out = torch.where(valid, _lift_lamps(light, given, out, step, is_soft, sigma, lost_px, ops), nearness)
+    if rules.ringing:
+        out = torch.where(is_soft, _without_ringing(out, valid, step), out)
+    if rules.soft_lamps:
+        out = _lift_lamps(light, given, out, step, is_soft, sigma, lost_px, ops)
+    out = torch.where(valid, out, nearness)
     return -out if of_coc else out
 
 
@@ -386,7 +395,8 @@ def _noise(nearness: Tensor, valid: Tensor) -> Tensor:
         )
     bend = torch.maximum(*(torch.where(middle < torch.inf, middle, 0.0) for middle in middles))
     quantum, span = torch.minimum(*least), torch.maximum(*ends)
-    noise = torch.where(span > _LEVELS_OF_A_FILE * quantum, 0.2887 * quantum, 0.0)  # 1 / sqrt(12)
+    rounding = 0.2887 * quantum if active().rounding else 0.0 * quantum  # 1 / sqrt(12)
+    noise = torch.where(span > _LEVELS_OF_A_FILE * quantum, rounding, 0.0)
     return torch.maximum(0.6053 * bend, noise)[..., None, None]  # 1.4826 / sqrt(6), for Gaussian noise
 
 
@@ -427,7 +437,7 @@ def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
     lead, tie = right.abs() - down.abs(), _TIE * gap
     across = torch.where(lead > tie, right.sign(), 0.0)
     along = torch.where(-lead > tie, down.sign(), 0.0)
-    direction = (2.0 * along + across).long() + _DIRECTIONS // 2
+    direction = (2.0 * along + across).long() * active().directions + _DIRECTIONS // 2
     gap = gap.clamp_min(1e-12)
     level, climb = ((nearness - far) / gap).clamp(0.0, 1.0), torch.where(is_edge, steepness / gap, 0.0)
     return _Edges(near, far, is_ramp, ring, is_edge, direction, level, climb)
@@ -500,7 +510,8 @@ def _judge(
         alike = (1.0 + apart / (0.3 * spread)).square().reciprocal()
         likelihood = (side * alike).sum(1) / total + 1e-9
         score = torch.where(known, torch.log(likelihood[0] / likelihood[1]), 0.0).clamp(-8.0, 8.0)
-        score = torch.where(is_ramp > 0, score, score * (least / clear).clamp(max=1.0))
+        if active().few_samples:
+            score = torch.where(is_ramp > 0, score, score * (least / clear).clamp(max=1.0))
         share = side * (alike + 1e-3)
         surfaces = torch.where(known, (share * values).sum(1) / share.sum(1).clamp_min(1e-12), ends)
         likeliest = torch.where(known, likelihood.amax(0), 1.0)
@@ -514,6 +525,8 @@ def _judge(
     own, others = pixels.pick(colour, edge_pixels), pixels.pick(colour, window)
     scores = pixels.pick(scores, window)[0]
     alike = 1.0 / (1.0 + (others - own[:, None]).square().sum(0) / (0.0225 * own.square().sum(0) + 1e-12))
+    if not active().like_scores:
+        alike = (torch.arange(len(alike), device=alike.device) == len(alike) // 2).to(alike.dtype)[:, None]
     is_edge = ~scores.isnan()
     alike, scores = torch.where(is_edge, alike, 0.0), torch.where(is_edge, scores, 0.0)
     score = (_SHARPNESS * separation * (alike * scores).sum(0) / alike.sum(0).clamp_min(1e-12)).clamp(-6.0, 6.0)

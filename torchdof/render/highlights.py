@@ -28,6 +28,7 @@ from ..tensors import is_empty, is_traced, recomputed
 from .layer_cocs import mean_change
 from .ops import EAGER, Ops
 from .plan import KERNELS_PER_PX, kernels_for
+from .rules import active
 from .surfaces import HIDDEN_WEIGHT, Highlights, Surface, continuation_weight
 
 FACTOR = 8.0
@@ -143,7 +144,7 @@ def extract(
     left = ops.equal_unless(lambda: is_bright.any(), left, light)
     if weight is not None:
         cover = pixels.pick(weight, bright)
-        if beside is not None:
+        if beside is not None and active().whole_highlights:
             other, image_coc_px = beside
             gap = coc - pixels.pick(other.coc_px, bright)[0]
             stopped = (gap - NEARER_PX).clamp(0.0, 1.0)
@@ -165,6 +166,8 @@ def affordable_taps(coc_px: Tensor, reach: Sequence[float]) -> Tensor:
     ``reach`` times as far as discs (:meth:`torchdof.render.plan.Plan.reach`), one number for all frames or for each.
     """
     crowd = (mean_change(coc_px.detach()) / _FREE_CHANGE_PX).clamp_min(1.0)
+    if not active().fewer_rays:
+        crowd = torch.ones_like(crowd)
     area = reach[0] ** 2 if len(reach) == 1 else coc_px.new_tensor(reach) ** 2
     return _TAPS_PER_PIXEL * math.prod(coc_px.shape[1:]) / (crowd * area)
 

@@ -16,6 +16,7 @@ from .. import native, pixels
 from ..tensors import is_traced
 from .compiled_steps import compiled_step
 from .ops import EAGER, Ops
+from .rules import active
 
 __all__ = ["NEVER_PX", "Matted", "attribute_emitters", "matte"]
 
@@ -103,6 +104,11 @@ def _split(
     light: Tensor, coc_px: Tensor, valid: Tensor | None = None, moved_px: Tensor | None = None, ops: Ops = EAGER
 ) -> Matted:
     """:func:`matte` by PyTorch."""
+    rules = active()
+    if not rules.matting:
+        return Matted(light, torch.zeros_like(light), coc_px, torch.zeros_like(coc_px))
+    if not rules.uncertain_edges:
+        moved_px = None
     # pixels beside another surface
     known = None if valid is None else valid > 0
     high, low = (c if known is None else torch.where(known, c, -NEVER_PX) for c in (coc_px.detach(), -coc_px.detach()))
@@ -138,13 +144,10 @@ def _split(
     clean = torch.lerp(colour, clean, edge * (same.sum(0) - 10.0 * _UNCLEAN).clamp(0.0, 1.0))
     clean = selected.around(selected.put(light, clean * brightest)) / brightest
     clean = clean.clamp(-_MOST_CLEAN, _MOST_CLEAN)
-    window_light = window_light - _mixed_light(window_light, clean, near_weight, far_weight)
+    if rules.mixed_neighbours:
+        window_light = window_light - _mixed_light(window_light, clean, near_weight, far_weight)
     back, back_variance = _mean_of(window_light, far_weight)
-    # a thin foreground has no unmixed pixel: prefer those that differ most from the background
-    differs = ((window_light - back[:, None]) ** 2).sum(0)
-    differs = (differs + _ALIKE**2) / (differs.amax(0) + _ALIKE**2)
-    clean = (0.1 * near_weight.sum(0) / _UNCLEAN - 1.0).clamp(0.0, 1.0)
-    front, front_variance = _mean_of(window_light, near_weight * torch.lerp(differs, torch.ones_like(clean), clean))
+    front, front_variance = _mean_of(window_light, near_weight)
 
     # a = (I - B) (F - B) / |F - B|^2, and the trust in it
     contrast = front - back
@@ -169,7 +172,7 @@ def _split(
     noise, misfit = back_variance + front_variance + _ALIKE**2, misfit + (covered - fitted) ** 2 * strength
     # below 1 px of coc the two may be a steep surface, and nothing is to be seen of a soft edge
     geometric = torch.where(is_near, 1.0 - covered, covered).clamp(max=0.5) * clear * (1.0 - trust)
-    geometric = geometric * (gap / _EDGE_PX - 2.0).clamp(0.0, 1.0)
+    geometric = geometric * ((gap / _EDGE_PX - 2.0).clamp(0.0, 1.0) if rules.alike_colours else 0.0)
     agreed = geometric * noise / (noise + misfit)
     weight = weight + (agreed if moved_px is None else torch.lerp(agreed, geometric, unsure))
 
@@ -180,7 +183,7 @@ def _split(
     own_weight = 1.0 - weight
     unexplained = colour - own_weight * own_mean - weight * other_mean
     sharper = own_coc.abs() - torch.where(is_near, far, near).abs()  # px by which the other surface is less blurred
-    lent = (1.0 - sharper).clamp(0.0, 1.0)
+    lent = (1.0 - sharper).clamp(0.0, 1.0) if rules.sharper_surface else 1.0
     moved = weight * (other_mean + unexplained * lent * weight / (weight**2 + own_weight**2))
     range_of_image = light.amin((2, 3)), light.amax((2, 3))
     extremes = (selected.of_item(extreme) / brightest for extreme in range_of_image)
@@ -294,7 +297,7 @@ def attribute_emitters(
     bright_other = (other.amax(0) / limit.clamp_min(torch.finfo(light.dtype).tiny) - 1.0).clamp(0.0, 1.0)
     apart = own_coc - other_coc
     sureness = beyond(other_coc, apart.sign(), torch.where(apart > 0, counted, touches), 1.0, own_peaks)[0]
-    taken = (apart.abs() - 1.0).clamp(0.0, 1.0) * bright_other * sureness
+    taken = (apart.abs() - 1.0).clamp(0.0, 1.0) * bright_other * (sureness if active().own_emitters else 0.0)
     weight = weight * (1.0 - taken)
     own = torch.where(taken > 0, (seen - weight * other) / (1.0 - weight), own)
     changed = zip(surfaces, (own * scale, other * scale, other_coc, weight), strict=True)

@@ -17,7 +17,7 @@ from .. import native
 from ..options import Options
 from ..tensors import is_differentiated, is_in_memory, is_traced
 from ..validation import NAMED_TOLERANCES
-from . import compiled, composite, edges, exposure, highlights, routes
+from . import compiled, composite, edges, exposure, highlights, routes, rules
 from .attention import Attention, box_around, weight_map
 from .convolution import convolve
 from .disocclusion import behind_pixels, surfaces_of_image
@@ -250,7 +250,7 @@ def _image(
 
     # Limit of highlights. Without occlusion, only highlights that a coarse layer would soften are splatted. A compiled
     # graph has no rays, as their number depends on the light.
-    has_rays = plan.rays and ops.has_rays and not is_compiled()
+    has_rays = plan.rays and ops.has_rays and rules.active().rays and not is_compiled()
     crisp_px = [plan.crisp_px if options.method == "layered" else math.inf for plan in plans]
     widest = [max(map(abs, plan.coc_px)) for plan in plans]
     coarse = has_rays and any(crisp < most for crisp, most in zip(crisp_px, widest, strict=True))
@@ -266,6 +266,7 @@ def _image(
     elif options.occlusion and limit is not None and splatted:
         levels = [min(math.ceil(math.log2(max(2.0, most))) + 1, 7) for most in widest]
         surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels, moved_px, ops)
+        behind = behind if rules.active().light_behind else None
 
     # highlights of these surfaces, ray by ray
     splats = None
@@ -281,8 +282,9 @@ def _image(
         surfaces, rays = [s for s, _ in extracted], [r for _, r in extracted if r is not None]
         # surfaces that can block rays, the image's own first; a known background is the farthest and blocks none
         shown = surfaces if behind_light is None else surfaces[1::-1]
+        stops = options.occlusion and rules.active().occluders
         if rays:
-            splats = highlights.splat(rays, shown, options.table, options.occlusion, plan.kernels_per_px, ops)
+            splats = highlights.splat(rays, shown, options.table, stops, plan.kernels_per_px, ops)
 
     # blur and composite the layers, far to near
     own = 0 if behind_light is None else 1

@@ -16,6 +16,7 @@ from ..tensors import is_traced
 from .border import continued, repeated
 from .compiled_steps import compiled_step
 from .layer_weights import blur_axis, eased, ramps, weights_at_or_behind
+from .rules import active
 
 HIDDEN_WEIGHT = 0.003
 """Weight of a hidden sample, which is guessed; a visible one has 1. A larger value mixes more guessed light in."""
@@ -150,6 +151,8 @@ def continuation_weight(cover: Tensor) -> Tensor:
 
     ``cover`` is the share of the pixel in which it is visible.
     """
+    if not active().continuation:
+        return torch.zeros_like(cover)
     return (1.0 - cover) * ((cover - HIDDEN_WEIGHT) / _CONTINUES_FROM).clamp(0.0, 1.0)
 
 

@@ -213,8 +213,7 @@ void clean_light(const Frame &frame, int y0, int x0, Window &w, const float *fal
 //
 // 1. The near and far coc are the extremes of the 3 x 3 neighbours.
 // 2. The colour of each surface is the mean of its neighbours. Their light moves towards their clean light, along the line
-//    between the clean colours of both surfaces, and less where texture is strong. If a thin foreground has no unmixed
-//    neighbours, they count by their difference from the background.
+//    between the clean colours of both surfaces, and less where texture is strong.
 // 3. The share of the near surface is the projection of the pixel's colour onto the line between both colours.
 // 4. The share of the other surface is at most 1/2. Where texture makes the projection unreliable, it is the share that
 //    the other surface has under a small Gaussian, unless this contradicts the pixel's colour. It may where the map as
@@ -331,14 +330,13 @@ class Split {
     const vec part = load<vec>(w_.moved + y_ * PITCH + x_) / gap_;  // 0 or 1: the map as given has an edge here
     unsure_ = clamp01(4.0f * least(part, 1.0f - part));
     const vec at_side = SMALL_BESIDE + unsure_ * (WIDE_BESIDE - SMALL_BESIDE), at_corner = SMALL_DIAGONAL + unsure_ * (WIDE_DIAGONAL - SMALL_DIAGONAL);
-    vec whole = {}, counted = {};  // sums of the weights of the front and of those of the small Gaussian
+    vec counted = {};  // sum of the weights of the small Gaussian
     covered_ = vec{};
     for (int i = 0; i < TAPS; i++) {
       const vec weight = (all(1.0f + UNCLEAN) - load<vec>(w_.edge + first_ + tap(i))) * falloff_[i] * valid_[i];
       const vec nearness = (ends_.far - load<vec>(w_.coc + in_coc_ + tap(i))) / gap_;  // not times 1 / gap, whose rounding the clamps below enlarge
       nearer_[i] = weight * clamp01(4.0f * nearness - 2.8f);
       farther_[i] = weight * clamp01(1.2f - 4.0f * nearness);
-      whole += nearer_[i];
       small_[i] = (i == TAPS / 2 ? all(1.0f) : i % 2 ? at_side : at_corner) * valid_[i];
       covered_ += small_[i] * nearness, counted += small_[i];
     }
@@ -366,28 +364,11 @@ class Split {
       for (int c = 0; c < C(); c++) light_[c * TAPS + i] -= shift * (clean_front_[c] - clean_behind_[c]);
     }
     far_variance_ = mean(light_, farther_, behind_);
-    has_clean_ = whole * (0.1f / UNCLEAN) - 1.0f;
-    std::copy(nearer_, nearer_ + TAPS, distinct_);
-    if (any_of(has_clean_ < all(1.0f))) {
-      vec differs[TAPS], largest = {};
-      for (int i = 0; i < TAPS; i++) largest = most(largest, differs[i] = difference(i));
-      const vec each = 1.0f / (largest + ALIKE * ALIKE), has_clean = clamp01(has_clean_);
-      for (int i = 0; i < TAPS; i++) {
-        const vec part = (differs[i] + ALIKE * ALIKE) * each;
-        distinct_[i] *= part + has_clean * (1.0f - part);
-      }
-    }
-    near_variance_ = mean(light_, distinct_, front_);
+    near_variance_ = mean(light_, nearer_, front_);
   }
 
   // Light of the other surface in a neighbour, as a multiple of the contrast between the clean colours.
   vec limited_shift(int i) const { return nearer_[i] > farther_[i] ? -clamp01(-shift_[i]) : clamp01(shift_[i]); }
-  // Squared difference of a neighbour from the far surface's colour.
-  vec difference(int i) const {
-    vec sum = {};
-    for (int c = 0; c < C(); c++) sum += (light_[c * TAPS + i] - behind_[c]) * (light_[c * TAPS + i] - behind_[c]);
-    return sum;
-  }
 
   void weigh() {
     vec along = {};
@@ -513,34 +494,8 @@ class Split {
 
   // The gradients by light, clean light, edges and coc of the window, from those by the colours.
   void back_of_colours(Slopes &slopes) {
-    vec of_nearer[TAPS] = {}, of_farther[TAPS] = {}, of_distinct[TAPS] = {}, of_whole = {};
-    back_of_mean(light_, distinct_, front_, near_variance_, of_front_, of_variance_, of_light_, of_distinct);
-    const vec has_clean = clamp01(has_clean_);
-    if (any_of(has_clean < all(1.0f))) {
-      vec differs[TAPS], largest = {}, ties = {}, of_largest = {};
-      for (int i = 0; i < TAPS; i++) largest = most(largest, differs[i] = difference(i));
-      const vec each = 1.0f / (largest + ALIKE * ALIKE);
-      vec of_part[TAPS];
-      for (int i = 0; i < TAPS; i++) {
-        const vec part = (differs[i] + ALIKE * ALIKE) * each, of_factor = of_distinct[i] * nearer_[i];
-        of_nearer[i] = of_distinct[i] * (part + has_clean * (1.0f - part));
-        of_whole += of_factor * (1.0f - part);
-        of_part[i] = of_factor * (1.0f - has_clean) * each;
-        of_largest -= of_part[i] * part;
-        ties += only(differs[i] == largest, all(1.0f));
-      }
-      of_whole = only(is_within(has_clean_), of_whole * (0.1f / UNCLEAN));
-      for (int i = 0; i < TAPS; i++) {
-        const vec slope = 2.0f * (of_part[i] + only(differs[i] == largest, of_largest / ties));
-        for (int c = 0; c < C(); c++) {
-          const vec of_off = slope * (light_[c * TAPS + i] - behind_[c]);
-          of_light_[c * TAPS + i] += of_off;
-          of_behind_[c] -= of_off;
-        }
-      }
-    } else {
-      std::copy(of_distinct, of_distinct + TAPS, of_nearer);
-    }
+    vec of_nearer[TAPS] = {}, of_farther[TAPS] = {};
+    back_of_mean(light_, nearer_, front_, near_variance_, of_front_, of_variance_, of_light_, of_nearer);
     back_of_mean(light_, farther_, behind_, far_variance_, of_behind_, of_variance_, of_light_, of_farther);
 
     // light -= shift contrast, shift = per_strength sum((light - clean) contrast), of the clean colours
@@ -587,7 +542,6 @@ class Split {
       const int in_coc = in_coc_ + tap(i);
       const vec near_by = falloff_[i] * valid_[i], weight = (all(1.0f + UNCLEAN) - load<vec>(w_.edge + first_ + tap(i))) * near_by;
       const vec nearness = (ends_.far - load<vec>(w_.coc + in_coc)) / gap_, to_near = 4.0f * nearness - 2.8f, to_far = 1.2f - 4.0f * nearness;
-      of_nearer[i] += of_whole;
       add(slopes.edge + first_ + tap(i), -near_by * (of_nearer[i] * clamp01(to_near) + of_farther[i] * clamp01(to_far)));
       const vec of_ends = 4.0f * weight * (only(is_within(to_near), of_nearer[i]) - only(is_within(to_far), of_farther[i]));
       const vec of_nearness = (of_ends + of_covered_ * small_[i] * per_counted_) / gap_;
@@ -610,9 +564,9 @@ class Split {
   vec *light_, *clean_, *of_light_, *of_clean_;  // of the neighbours [channels, TAPS]; gradients begin with of_
   vec *front_, *behind_, *colour_, *clean_front_, *clean_behind_, *of_front_, *of_behind_, *of_colour_, *of_contrast_;  // [channels]
   vec valid_[TAPS], small_[TAPS];
-  vec nearer_[TAPS], farther_[TAPS], distinct_[TAPS];  // weights in the means of both surfaces; the front's, by difference
+  vec nearer_[TAPS], farther_[TAPS];  // weights in the means of both surfaces
   vec shift_[TAPS];  // not limited
-  vec scale_, here_, gap_, unsure_, covered_, per_counted_, per_strength_, has_clean_;  // covered: by the near surface
+  vec scale_, here_, gap_, unsure_, covered_, per_counted_, per_strength_;  // covered: by the near surface
   vec clean_near_variance_, clean_far_variance_, near_variance_, far_variance_;
   ivec is_near_;
   vec sharper_, lent_;  // px by which the other surface is less blurred; share of the residual that it may get, 0 to 1
