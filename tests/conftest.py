@@ -23,6 +23,15 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # one core for each worker and its subp
     torch.set_num_threads(1)
 
 
+# Folders and files with long tests. They start first: a worker without tests then takes short ones from the other.
+LONG = ("tests/examples/test_web_files.py", "tests/export/", "tests/fit/")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Sorts long tests to the front, so that no worker waits for one at the end of a run."""
+    items.sort(key=lambda item: [not item.nodeid.startswith(name) for name in LONG])
+
+
 @pytest.fixture(autouse=True)
 def _same_random_numbers() -> None:
     torch.manual_seed(0)

@@ -17,9 +17,10 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 from torchdof.optics.aperture import Aperture
 from torchdof.optics.psf import FAMILIES, LENGTHS, pixel_kernels, support
 
-from ..result import Array, Mask
+from ..result import Array, BlurFit, Mask
 from ..solve import best_of, inverse
-from .dot import Dot, correlate, correlation_of, distance_from, noise_beside
+from .dot import Dot, correlate, correlation_of, distance_from, independent_share, noise_beside
+from .expected_shape import deviations
 from .source import Source
 
 ALL_MOVES = ("dx", "dy", "magnification")
@@ -50,6 +51,7 @@ class Forward:
     shot_noise: float = 0.0  # growth of a pixel's noise variance (by second differences) with its level
     fine_share_of_light: float | None = None  # share of that growth seen in second differences; None: the dark paper's
     opening: Aperture = Aperture()  # of the lens, for the kernels in OPENINGS: blades or an image
+    like: BlurFit | None = None  # of a similar blur, whose shape is expected
 
     def __post_init__(self) -> None:
         self.half = min(self.data.shape) // 2  # half the window, px: limits the kernel
@@ -62,6 +64,9 @@ class Forward:
         self.noise_correlation, self.fine_share = noise_beside(self.data, self.dot.background, dark)
         # the largest level, so that one tolerance suits all pictures
         self.unit = max(float(np.abs(self.values - self.dot.background).max()), np.finfo(float).tiny)
+        # standard deviation of an independent pixel; without noise, of a spline's rounding
+        variance = self.dot.noise**2 / self.fine_share / independent_share(self.noise_correlation)
+        self.noise = float(np.sqrt(variance + (1e-4 * self.unit) ** 2))
 
     def drawn(self, moves: Mapping[str, float]) -> Array:
         """The displaced and magnified source `[H, W]`."""
@@ -110,18 +115,22 @@ class Forward:
             source = self.drawn(self.moves(dict(zip(names, p, strict=True))))
             return self.blurred(source, self.kernels(family, dict(zip(shape, p, strict=False))))[0][self.used]
 
-        numbers = best_of(
-            lambda p: self.project(shaped(p))[0] / self.unit,
-            self.values / self.unit,
-            [[one[n] for n in names] for one in starts],
-            self.bounds(names),
-            jacobian=lambda p: self._jacobian(family, names, p) / self.unit,
-            tolerance=1e-7,
-        )
+        def model(p: Array) -> Array:  # the used pixels, then how unusual the shape is
+            return np.append(self.project(shaped(p))[0], self.noise * deviations(family, p, self.like)[0]) / self.unit
+
+        def jacobian(p: Array) -> Array:
+            shape_slopes = self.noise * deviations(family, p, self.like)[1]
+            return np.vstack([self._jacobian(family, names, p), shape_slopes]) / self.unit
+
+        points = [np.array([one[n] for n in names]) for one in starts]
+        data = np.append(self.values, 0.0 * deviations(family, points[0], self.like)[0]) / self.unit
+        numbers = best_of(model, data, points, self.bounds(names), jacobian=jacobian, tolerance=1e-7)
         params = dict[str, float | Array](zip(shape, numbers.tolist(), strict=False))
         moves = self.moves(dict(zip(names, numbers.tolist(), strict=True)))
         (fitted, gain, background), slopes = self.project(shaped(numbers)), self._jacobian(family, names, numbers)
-        covariance = self.covariance(slopes, self.values - fitted, self.kernels(family, params)[0], gain)
+        shape_slopes = self.noise * deviations(family, numbers, self.like)[1]
+        penalty, kernel = shape_slopes.T @ shape_slopes, self.kernels(family, params)[0]
+        covariance = self.covariance(slopes, self.values - fitted, kernel, gain, penalty, self.noise**2 * penalty)
         return Solution(self, family, params, moves, gain, background, fitted, names, covariance, slopes)
 
     def moves(self, params: Mapping[str, float]) -> dict[str, float]:
@@ -131,9 +140,19 @@ class Forward:
         return {n: params.get(n, value) for n, value in fixed.items()}
 
     def covariance(
-        self, slopes: Array, residual: Array, kernel: Array, gain: float, penalty: Array | float = 0.0
+        self,
+        slopes: Array,
+        residual: Array,
+        kernel: Array,
+        gain: float,
+        penalty: Array | float = 0.0,
+        penalty_covariance: Array | float = 0.0,
     ) -> Array:
-        """Covariance of the parameters under the noise of both pictures (a sandwich estimator)."""
+        """Covariance of the parameters under the noise of both pictures (a sandwich estimator).
+
+        The `penalty` `[parameters, parameters]` is added to the information of the pictures; the covariance of its
+        gradient is 0 if it only smooths.
+        """
         information_inverse = inverse(slopes.T @ slopes + penalty)
         is_determined = np.isfinite(np.diag(information_inverse))
         information_inverse = np.where(np.outer(is_determined, is_determined), information_inverse, 0.0)
@@ -152,7 +171,7 @@ class Forward:
             spread = np.where(has_source_noise, self.blurred(self.picture(slopes.T), kernel[None]), 0.0)
             correlated_spread = correlate(spread, self.noise_correlation)
             score_cov = score_cov + source_variance * np.tensordot(spread, correlated_spread, ((1, 2), (1, 2)))
-        covariance = information_inverse @ score_cov @ information_inverse
+        covariance = information_inverse @ (score_cov + penalty_covariance) @ information_inverse
         covariance[~is_determined, ~is_determined] = np.inf
         return np.asarray(covariance)
 

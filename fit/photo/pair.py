@@ -46,12 +46,17 @@ def fit_pair(
     reach: float | None = None,
     aperture: Aperture | None = None,
     softness: float | None = None,
+    like: BlurFit | None = None,
     files: tuple[str | None, str | None] = (None, None),
 ) -> BlurFit:
     """Fits the kernel that turns a picture of a sharp dot into the picture of the same dot out of focus.
 
     The forward model explains every pixel of the window: `blurred = gain * (kernel convolved with the sharp picture,
     moved and magnified) + background`, all of them fitted. As in rendering, a pixel's own blur is not in the kernel.
+
+    A blur of one or two pixels determines its size only. Its shape, if the family is "ring" or "softm", is then the
+    expected one: that of a nearly uniform disc, or of `like`. The expectation counts as one measurement, and enters the
+    standard errors.
 
     `model="ratio"` is the paper's: `blurred / sharp` along spokes inside the dot, then eq. (1). It measures the dot
     convolved with the kernel, so its widths depend on the dot.
@@ -73,6 +78,7 @@ def fit_pair(
         reach: end of a "radial" profile, px; None uses a fitted soft disc.
         aperture: the lens's opening as seen in `blurred`, if known, for the family "image"; only its size is fitted.
         softness: sigma of the sharp dot's edge in focus, px, if it is known to be less than in `sharp`.
+        like: a fit of the same lens at a slightly different blur; its shape is expected if it has the same family.
         files: names of the two pictures, for messages.
 
     Returns:
@@ -108,6 +114,8 @@ def fit_pair(
         raise FitError(f"fit_magnification must be True, False or None, got {show(fit_magnification)}")
     if aperture is not None and (not isinstance(aperture, Aperture) or family != "image"):
         raise FitError(f"aperture must be an Aperture, and goes with family='image', got {show(aperture)}")
+    if like is not None and not isinstance(like, BlurFit):
+        raise FitError(f"like must be a BlurFit, the result of a fit, got {show(like)}")
     data = a_picture("blurred", blurred, _MIN_WINDOW_PX, files[1])
     sharp_picture = None if sharp is None else a_picture("sharp", sharp, _MIN_WINDOW_PX, files[0])
     if sharp_picture is not None and sharp_picture.shape != data.shape:
@@ -121,7 +129,7 @@ def fit_pair(
     with threadpool_limits(limits=1):  # the steps of a fit are too small for more threads
         pair, edge, linear = prepared_pair(sharp_picture, data, source, magnification, white, files, softness)
         pair.fit_moves = ALL_MOVES if fit_magnification and sharp is not None else ("dx", "dy")
-        pair.opening = aperture or Aperture()
+        pair.opening, pair.like = aperture or Aperture(), like
         free_profile, end = family in ("auto", "radial", *OPENINGS) and aperture is None, 0.0
         # a free profile gives an unbiased magnification, unlike a wrong family; it ends slightly outside a soft disc
         solution = pair.solve("softm" if free_profile else family)

@@ -109,7 +109,7 @@ def fit_captures(
         if progress:
             progress(next(done), len(pairs) * (2 if has_first_fits else 1), f"{pair.distance_m:g} m")
 
-    why, opening, first_fits, fits = f"family {family!r} was asked for", None, list[BlurFit](), list[BlurFit]()
+    why, opening, first_fits = f"family {family!r} was asked for", None, list[BlurFit]()
     for pair in pairs if has_first_fits else ():  # each alone determines the family or the opening; the final fits warn
         with without_warnings():
             first_fits.append(_fit_one(pair, focus, family, accuracy_db=accuracy_db))
@@ -123,16 +123,20 @@ def fit_captures(
         openings = [(fit, pair) for fit, pair in zip(first_fits, pairs, strict=True) if fit.family == family]
         largest, pair = max(openings, key=lambda one: one[0].radius)
         opening = _seen(largest.aperture or Aperture(), pair, focus)
-    for pair in pairs:
+    fit_of, larger = dict[int, BlurFit](), dict[bool, BlurFit]()  # larger: the next larger blur on each side of focus
+    for i in np.argsort(-np.abs(captures.defocus)).tolist():
+        pair, side = pairs[i], bool(captures.defocus[i] > 0)
         aperture = None if opening is None else _seen(opening, pair, focus)
-        fit = _fit_one(pair, focus, family if aperture is None else "image", aperture=aperture)
+        name = family if aperture is None else "image"
+        fit = _fit_one(pair, focus, name, aperture=aperture, like=larger.get(side))
         fit = replace(fit, family=family)
         ratio = 1.0 if pair.exposure is None or not fit.gain > 0 else fit.gain / pair.exposure
         if max(ratio, 1 / ratio) > _MAX_EXPOSURE_RATIO:
             text = f"the blurred dot is {ratio:.2f} times as bright as the exposures say; did the light stay the same?"
             warn(text, "exposure", pair.files[1])
-        fits.append(_with_uncertainty(pair, focus, fit))
+        fit_of[i] = larger[side] = _with_uncertainty(pair, focus, fit)
         report(pair)
+    fits = [fit_of[i] for i in range(len(pairs))]
     radius_px = np.array([f.radius for f in fits])
     check_agreement(captures, radius_px)
     coc_px, defocus, scale = captures.promised_px, captures.defocus, "camera"
@@ -231,7 +235,7 @@ def _fit_one(pair: Capture, focus_m: float, family: str, **options: Any) -> Blur
 def _fit_like(fit: BlurFit, pair: Capture, focus_m: float, sharp: Array, blurred: Array, **options: Any) -> BlurFit:
     """Fits other pictures of a pair like its own: with the same family and opening, or free profile's end."""
     family = fit.family if fit.aperture is None else "image"
-    options |= {"aperture": fit.aperture, "reach": fit.params["radius"] if family == "radial" else None}
+    options |= {"aperture": fit.aperture, "like": fit, "reach": fit.params["radius"] if family == "radial" else None}
     with without_warnings():  # the pair's own fit has already warned
         return _fit_one(replace(pair, sharp=sharp, blurred=blurred), focus_m, family, **options)
 

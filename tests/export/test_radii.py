@@ -39,8 +39,8 @@ def written(folder: Path, radius: float, family: str, tolerance: float, layout: 
 
 
 @pytest.mark.parametrize(("radius", "family", "tolerance", "layout"), [
-    (57.1, "disc", 48, "tiles"), (11.7, "gaussian", 8, "tiles"),
-    (33.0, "lens", 16, "whole"),
+    (11.7, "gaussian", 8, "tiles"), (33.0, "lens", 16, "whole"),
+    pytest.param(57.1, "disc", 48, "tiles", marks=pytest.mark.sweep),  # examples/test_web_files.py: 64 px
 ])  # fmt: skip
 def test_a_file_of_wide_kernels_is_verified(
     tmp_path: Path, radius: float, family: str, tolerance: float, layout: Layout
@@ -48,7 +48,7 @@ def test_a_file_of_wide_kernels_is_verified(
     written(tmp_path, radius, family, tolerance, layout, occlusion=False)
 
 
-@pytest.mark.hard
+@pytest.mark.sweep  # the files of the web page are wider still: examples/test_web_files.py
 def test_a_file_of_wide_kernels_with_occlusion_is_verified(tmp_path: Path) -> None:
     """At this radius the lamps of a case need more rays than are affordable."""
     written(tmp_path, 40.0, "disc", 128, "tiles", occlusion=True)
