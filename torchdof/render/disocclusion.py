@@ -31,6 +31,9 @@ _FALL = 0.35  # weight of a level relative to the next finer one; larger: hidden
 _FINE_LEVELS = 2  # levels that each pixel reads; coarser ones are read once per cell of 2**_FINE_LEVELS pixels
 _SURE = 0.1  # weight of the samples of a level at which its vote is full
 _LEAST_SEEN = 1e-4  # weight of samples up to which they count as empty
+_LEAST_TOTAL = 1e-9  # smallest divisor of sums of light
+_MIXED = 0.05  # share above which the second surface of a pixel counts; larger: fewer mixed pixels
+_HIDING_FROM_PX = 0.5  # px: pixels blurred less hide nothing that is seen
 _CERTAIN = 0.01  # votes at which a hidden sample has full weight, or a farther surface replaces a nearer one
 
 BEHIND_STEP = 2**_FINE_LEVELS
@@ -197,7 +200,7 @@ def _surfaces_of_image(
 
     # the farthest surface around each cell of 4 x 4 pixels, and one level of cells that replaces all coarse levels
     size = (rows // BEHIND_STEP, columns // BEHIND_STEP)
-    wanted = ((coc_px.abs() > 0.5) & (mixed < 0)).to(coc_px.dtype)
+    wanted = ((coc_px.abs() > _HIDING_FROM_PX) & (mixed < 0)).to(coc_px.dtype)
     coarse = searched[_FINE_LEVELS:]
     looked = behind_cells(searched, size, coc_px, wanted, ops)
     behind, _, votes, *of_coarse = looked.split([colours, 1, 1, *([colours + 2] if coarse else [])], 1)
@@ -270,7 +273,7 @@ def _finest_level(
     It is, at every second pixel from the centre, the farthest of the pixels around it. Each pixel shows its farther
     surface, dimmed to the threshold. Maps are those of its own and its other surface.
     """
-    is_mixed = (other_weight > 0.05) & (other_coc_px > coc_px)
+    is_mixed = (other_weight > _MIXED) & (other_coc_px > coc_px)
     coc_px, light = torch.where(is_mixed, other_coc_px, coc_px), torch.where(is_mixed, other_light, light)
     brightest = light.amax(1, keepdim=True)
     is_bright = brightest > threshold
@@ -300,7 +303,7 @@ def _finest_level(
     summed = around[0][:, :-1] * counts[:, :1]
     for k in range(1, 9):
         summed = torch.addcmul(summed, around[k][:, :-1], counts[:, k, None])
-    mean = summed / total.clamp_min(1e-9)
+    mean = summed / total.clamp_min(_LEAST_TOTAL)
     return torch.cat([mean[:, :-1], torch.where(total > 0, mean[:, -1:], -NEVER_PX), total], 1)
 
 
@@ -325,7 +328,7 @@ def _farthest(values: Tensor) -> Tensor:
     counts = weight * (1.0 - _is_behind(farthest - coc_px))
     means = downsampled(torch.cat([light * counts, coc_px * counts, counts], 1), 2)
     total = means[:, -1:]
-    means = means[:, :-1] / total.clamp_min(1e-9)
+    means = means[:, :-1] / total.clamp_min(_LEAST_TOTAL)
     return torch.cat([means[:, :-1], torch.where(total > 0, means[:, -1:], -NEVER_PX), total], 1)
 
 
@@ -451,7 +454,7 @@ def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tenso
     votes = looked * torch.minimum(weight * slope, most)
     if not farthest:
         total = votes.sum(0)
-        return (shown * votes).sum(0) / total.clamp_min(1e-9), total
+        return (shown * votes).sum(0) / total.clamp_min(_LEAST_TOTAL), total
     sure = (looked * weight / _CERTAIN).clamp(max=1.0)
     total, seen = votes[0], shown[0]
     for k in range(1, len(levels)):
@@ -459,7 +462,7 @@ def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tenso
         apart, vote = beyond[:, -1:], votes[k]
         vote = torch.where(total > 0, vote * (1.0 - _is_behind(-apart)), vote)
         total = total * (1.0 - sure[k] * _is_behind(apart)) + vote
-        seen = seen + beyond * (vote / total.clamp_min(1e-9))
+        seen = seen + beyond * (vote / total.clamp_min(_LEAST_TOTAL))
     return seen, total
 
 

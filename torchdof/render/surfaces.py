@@ -22,6 +22,7 @@ HIDDEN_WEIGHT = 0.003
 
 _HIDING_SHARE = 0.06
 """Share of a surface at or behind a layer at which it counts there in full; larger: it fades in over more depth."""
+_LEAST_PASSING = 1e-6  # smallest divisor: share of the light that passes the part of a surface in front of a layer
 _CONTINUES_FROM = 0.1
 """Visible share of a far surface, above HIDDEN_WEIGHT, at which it continues in full behind the near one."""
 
@@ -196,7 +197,9 @@ def _stacked(
         cover = torch.ones_like(x) if weight is None else weight
         here = cover * eased((behind / _HIDING_SHARE).clamp(max=1.0))
         passes = 1.0 - here * (1.0 - behind)  # share not hidden by the surface's part in front of layer k
-        stops = cover * (behind - beyond) / passes.clamp_min(1e-6)  # share of the arriving light stopped in layer k
+        stops = (
+            cover * (behind - beyond) / passes.clamp_min(_LEAST_PASSING)
+        )  # share of the arriving light stopped in layer k
         stopped.append(arriving * stops)
         arriving, visible = arriving * (1.0 - stops), visible * passes
         unknown = unknown * (1.0 - here)

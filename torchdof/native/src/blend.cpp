@@ -126,7 +126,7 @@ class Blend {
   }
 
  private:
-  static constexpr int MOST = TORCHDOF_MOST_PLANES;
+  static constexpr int MOST = MOST_PLANES;
   using Events = std::vector<float>;
   // A step of a composite, far to near: a layer, or the canvas of a coarse run (then `run` is not null).
   struct Step {
@@ -349,7 +349,7 @@ class Blend {
       p.t[j] = ramp(p.here[j], over_);
     }
     if (S < 2) return;
-    p.known = (p.weight[1] - HIDDEN_WEIGHT) * (1.0f / CONTINUATION_SHARE);
+    p.known = (p.weight[1] - HIDDEN_WEIGHT) * (1.0f / CONTINUES_FROM);
     p.share = p.h[0] * (1.0f / HIDING_SHARE);
     p.extra = (1.0f - p.weight[1]) * clamp01(p.known);
     p.counted[1] += p.extra * (1.0f - clamp01(p.share));
@@ -814,7 +814,7 @@ class Blend {
       if (S > 1) {
         const vec hidden = 1.0f - clamp01(p.share);
         const auto known_inside = (p.known >= vec{}) & (p.known <= all(1.0f)), share_inside = (p.share >= vec{}) & (p.share <= all(1.0f));
-        const vec of_extra = (known_inside ? (1.0f - p.weight[1]) * (1.0f / CONTINUATION_SHARE) : vec{}) - clamp01(p.known);
+        const vec of_extra = (known_inside ? (1.0f - p.weight[1]) * (1.0f / CONTINUES_FROM) : vec{}) - clamp01(p.known);
         of_h[0] -= share_inside ? of_counted[1] * p.extra * (1.0f / HIDING_SHARE) : vec{};
         of_counted[1] *= 1.0f + of_extra * hidden;
       }

@@ -10,7 +10,8 @@
 namespace torchdof {
 namespace {
 
-constexpr float LEAST = 1e-6f;    // blurred weight up to which the light of a pixel is unknown
+constexpr float LEAST = constants::composite::LEAST;
+constexpr float LEAST_PASSING = constants::surfaces::LEAST_PASSING;
 constexpr float COVERED = 1e-6f;  // an uncovered part up to this is a rounding error
 constexpr int TILE_PIXELS = TILE * TILE;
 constexpr int PART = 16;  // side in pixels of the parts of a coarse canvas that are skipped if empty
@@ -545,7 +546,7 @@ class Composite {
       for (int j = 0; j < s_.count; j++) {
         const vec p = load<vec>(place[j] + i), cover = load<vec>(weight[j] + i), h = at_or_behind(l, p, over_);
         const vec here = cover * eased(least(h / HIDING_SHARE, all(1.0f))), there = 1.0f - here * (1.0f - h);
-        const vec stops = cover * (h - behind(l, p, over_)) / most(there, all(LEAST));
+        const vec stops = cover * (h - behind(l, p, over_)) / most(there, all(LEAST_PASSING));
         m[j] = left * stops;
         left *= 1.0f - stops;
         normalizer *= there;

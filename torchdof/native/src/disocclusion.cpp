@@ -5,9 +5,11 @@
 namespace torchdof {
 namespace {
 
-// Constants of render/disocclusion.py, which gives their meanings and effects.
-constexpr float FALL = 0.35f, SURE = 0.1f;
-constexpr float MIXED = 0.05f;  // share above which a second surface is used in the pyramid
+constexpr float FALL = constants::disocclusion::FALL;
+constexpr float SURE = constants::disocclusion::SURE;
+constexpr float LEAST_TOTAL = constants::disocclusion::LEAST_TOTAL;
+constexpr float MIXED = constants::disocclusion::MIXED;
+constexpr float HIDING_FROM_PX = constants::disocclusion::HIDING_FROM_PX;
 constexpr int BAND = 8;         // rows of a level computed together
 constexpr int CELL_LEVEL = 3;   // cells that may show hidden surfaces have the size of this level's samples
 
@@ -96,7 +98,7 @@ float mix(const Level *levels, const Sample *samples, int n, bool farthest, floa
     }
     total += vote;
     if (!(vote > 0)) continue;
-    const float part = vote / std::max(total, 1e-9f);
+    const float part = vote / std::max(total, LEAST_TOTAL);
     for (const f8 &value : samples[l].values) {
       store(out, load<f8>(out) + (value - load<f8>(out)) * part);
       out += F8;
@@ -262,7 +264,7 @@ class Filling {
         counts[j] *= 0.25f * (half_row ? 0.5f : 1.0f) * (half_column ? 0.5f : 1.0f) * child[j];
         total += counts[j];
       }
-      const vec each = all(1.0f) / most(total, all(1e-9f));
+      const vec each = all(1.0f) / most(total, all(LEAST_TOTAL));
       for (int i = 0; i < n; i++) store(out + (i + 1) * stride_ - F8, f8{});  // padding
       for (int k = 0; k <= C; k++) {
         read(k);
@@ -288,7 +290,7 @@ class Filling {
         }
         for (int k = 0; k < 4; k++) total += counts[k] = child[k][C_ + 1] * (1.0f - is_behind(farthest - child[k][C_]));
         total *= 0.25f;
-        for (float &count : counts) count *= 0.25f / std::max(total, 1e-9f);
+        for (float &count : counts) count *= 0.25f / std::max(total, LEAST_TOTAL);
         for (int c = 0; c <= C_; c++) out[c] = child[0][c] * counts[0] + child[1][c] * counts[1] + child[2][c] * counts[2] + child[3][c] * counts[3];
         if (!(total > 0)) out[C_] = -NEVER;
         out[C_ + 1] = total;
@@ -321,7 +323,7 @@ class Filling {
 
   bool wanted(int y, int x) const {
     const int which = s_.block_of(y, x);
-    if (!(std::fabs(s_.coc[(size_t)y * job_.width + x]) > 0.5f)) return false;
+    if (!(std::fabs(s_.coc[(size_t)y * job_.width + x]) > HIDING_FROM_PX)) return false;
     return !s_.has_block(which) || s_.block(which).weight[y % BLOCK * BLOCK + x % BLOCK] < 0.5f * HIDDEN_WEIGHT;
   }
 
@@ -481,7 +483,7 @@ class Filling {
       if (columns < CELL) here_of = (const float *)memcpy(cut, here_of, columns * sizeof(float));
       for (int v = 0; v < VECTORS; v++) {
         const vec here = load<vec>(here_of + v * LANES), size = most(here, -here);
-        ivec wanted = size > all(0.5f);
+        ivec wanted = size > all(HIDING_FROM_PX);
         if (s_.has_block(which)) wanted &= load<vec>(s_.block(which).weight + within + v * LANES) < all(0.5f * HIDDEN_WEIGHT);
         if (!any_of(wanted)) continue;
         const vec end = end_of_surface(here);
@@ -508,7 +510,7 @@ class Filling {
           const vec voted = level.vote > 0 ? level.vote * least(weight * (1.0f / SURE), all(1.0f)) : weight;
           const vec vote = is_seen ? level_weight * voted : vec{};
           total += vote;
-          const vec part = vote / most(total, all(1e-9f)), each = all(1.0f) / most(weight, all(LEAST_SEEN));
+          const vec part = vote / most(total, all(LEAST_TOTAL)), each = all(1.0f) / most(weight, all(LEAST_SEEN));
           for (vec &count : counts) count *= each;
           for (int k = 0; k <= C; k++) {
             const size_t plane = (size_t)k * VECTORS;

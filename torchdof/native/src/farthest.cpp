@@ -13,8 +13,8 @@
 namespace torchdof {
 namespace {
 
-constexpr float MIXED = 0.05f;          // weight above which the other surface counts
-constexpr float LEAST_TOTAL = 1e-9f;    // smallest divisor
+constexpr float MIXED = constants::disocclusion::MIXED;
+constexpr float LEAST_TOTAL = constants::disocclusion::LEAST_TOTAL;
 constexpr int BAND = 32;                // rows of pixels whose gradients one thread adds up
 
 // The pixels of an axis around each sample: `taps` of them from 2 sample - before on, which the frame's ends repeat.
@@ -59,7 +59,7 @@ class Farthest {
   }
 
  private:
-  static constexpr int TAPS = 9, MOST = (CHANNELS ? CHANNELS : TORCHDOF_MOST_PLANES) + 1;
+  static constexpr int TAPS = 9, MOST = (CHANNELS ? CHANNELS : MOST_PLANES) + 1;
   struct Tap {
     size_t at;
     bool mixed;

@@ -18,9 +18,8 @@
 namespace torchdof {
 namespace {
 
-constexpr float LEAST_VOTE = 1e-9f;  // smallest divisor
+constexpr float LEAST_TOTAL = constants::disocclusion::LEAST_TOTAL;
 constexpr int BAND = 32;  // least rows of places whose gradients one thread adds up
-constexpr int MOST_LEVELS = TORCHDOF_MOST_LEVELS;
 
 // Places of an axis, pixels or cells, `step` pixels apart and centred on an image; and the pixels of each place, as _window
 // of render/disocclusion.py: on an axis of even size a cell's last pixel repeats the one before.
@@ -51,7 +50,7 @@ struct Between {
 
 template <int CHANNELS>
 struct Behind {
-  static constexpr int MOST_PLANES = (CHANNELS ? CHANNELS : TORCHDOF_MOST_PLANES) + 2;
+  static constexpr int MOST_VALUES = (CHANNELS ? CHANNELS : MOST_PLANES) + 2;
   const torchdof_level *const levels;
   const float *const coc, *wanted;  // wanted: null if the places are pixels
   const int count, channels, width, first;  // first: level of the mean
@@ -94,12 +93,12 @@ struct Behind {
     size_t at[4];                   // of the samples
     float share[4], is_behind[4], part[4];  // is_behind: not clamped
     float weight, looked;           // sum of the parts, or 0 if tiny; clamped blur
-    float mean[MOST_PLANES];        // light and coc
+    float mean[MOST_VALUES];        // light and coc
     float vote;
-    float of_mean[MOST_PLANES], of_vote, of_sure;  // gradients; of_sure: that of looked * weight / CERTAIN up to 1
+    float of_mean[MOST_VALUES], of_vote, of_sure;  // gradients; of_sure: that of looked * weight / CERTAIN up to 1
   };
   struct Result {
-    float values[MOST_PLANES], votes;  // values: light and coc
+    float values[MOST_VALUES], votes;  // values: light and coc
   };
   // Returns false if nothing lies behind the place in this level.
   bool find(int l, int y, int x, float coc, Found &f) const {
@@ -151,18 +150,18 @@ struct Behind {
       r.votes += found[l].vote;
       for (int c = 0; c < planes() - 1; c++) r.values[c] += found[l].vote * found[l].mean[c];
     }
-    for (int c = 0; c < planes() - 1; c++) r.values[c] *= 1.0f / std::max(r.votes, LEAST_VOTE);
+    for (int c = 0; c < planes() - 1; c++) r.values[c] *= 1.0f / std::max(r.votes, LEAST_TOTAL);
     return r;
   }
   void back_of_mean(const float *slopes, Found *found) const {
     const Result r = mean(found);
-    const float per = 1.0f / std::max(r.votes, LEAST_VOTE);
-    float slope[MOST_PLANES], along = 0;
+    const float per = 1.0f / std::max(r.votes, LEAST_TOTAL);
+    float slope[MOST_VALUES], along = 0;
     for (int c = 0; c < planes() - 1; c++) {
       slope[c] = slopes[c * area] * per;
       along += slope[c] * r.values[c];
     }
-    if (r.votes < LEAST_VOTE) along = 0;
+    if (r.votes < LEAST_TOTAL) along = 0;
     for (int l = first; l < count; l++) {
       Found &f = found[l];
       if (!f.any) continue;
@@ -183,7 +182,7 @@ struct Behind {
       vote = f.vote * (1.0f - nearer);
       left = 1.0f - sure * clamp01(apart - (BEHIND_PX - 0.5f));
       votes = r.votes * left + vote;
-      part = vote / std::max(votes, LEAST_VOTE);
+      part = vote / std::max(votes, LEAST_TOTAL);
     }
   };
   // The farthest surface; before: the one without each level and those after it.
@@ -214,8 +213,8 @@ struct Behind {
         f.of_mean[c] += of.values[c] * change.part;
         of.values[c] -= of.values[c] * change.part;
       }
-      of_part /= std::max(change.votes, LEAST_VOTE);
-      if (change.votes >= LEAST_VOTE) of.votes -= of_part * change.part;
+      of_part /= std::max(change.votes, LEAST_TOTAL);
+      if (change.votes >= LEAST_TOTAL) of.votes -= of_part * change.part;
       const float of_vote = of.votes + of_part, of_left = of.votes * before[l].votes;
       f.of_vote += of_vote * (1.0f - change.nearer);
       f.of_sure -= of_left * clamp01(change.apart - (BEHIND_PX - 0.5f));
