@@ -6,6 +6,7 @@ build runs this file, which reads the sources without importing them.
 """
 
 import ast
+import contextlib
 import math
 import operator
 import re
@@ -40,20 +41,16 @@ def constants_of(module: str) -> dict[str, Value]:
     source = (PACKAGE / f"{module}.py").read_text(encoding="utf-8")
     constants: dict[str, Value] = {}
     for node in ast.parse(source).body:
-        targets = (
-            [node.target] if isinstance(node, ast.AnnAssign) else node.targets if isinstance(node, ast.Assign) else []
-        )
-        for target in targets:
-            names = target.elts if isinstance(target, ast.Tuple) else [target]
-            values = (
-                node.value.elts if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple) else [node.value]
-            )
-            for name, value in zip(names, values, strict=False):
-                if isinstance(name, ast.Name) and re.fullmatch("_?[A-Z][A-Z0-9_]*", name.id):
-                    try:
-                        constants[name.id] = _value(value, constants)
-                    except (KeyError, TypeError, ArithmeticError):
-                        pass  # not a number
+        if not isinstance(node, ast.Assign | ast.AnnAssign):
+            continue
+        target, value = node.targets[0] if isinstance(node, ast.Assign) else node.target, node.value
+        pairs: list[tuple[ast.AST, ast.AST | None]] = [(target, value)]
+        if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
+            pairs = [*zip(target.elts, value.elts, strict=True)]
+        for name, number in pairs:
+            if isinstance(name, ast.Name) and re.fullmatch("_?[A-Z][A-Z0-9_]*", name.id):
+                with contextlib.suppress(KeyError, TypeError, ArithmeticError):  # not a number
+                    constants[name.id] = _value(number, constants)
     return constants
 
 

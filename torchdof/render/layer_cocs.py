@@ -25,7 +25,7 @@ _FEW = 100  # the radius of a frame is the mean of 1 / _FEW of its pixels, the m
 # A place gets a layer of its own if many of the border's pixels lie there; larger: fewer layers
 _CROWD = 0.03  # share of the border's pixels
 _LEAST_CROWD = 16  # and pixels, at least
-APART = 0.6  # finest distances between such a place and other layers
+APART = 0.6  # finest distances; a crowd nearer to another layer gets none
 
 # Spacing of layers: measured so that errors stay below the tolerance; larger: fewer layers
 _SPACING = 0.25  # px near focus at a tolerance of 1/255
