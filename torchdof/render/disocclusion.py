@@ -23,7 +23,9 @@ from .surfaces import HIDDEN_WEIGHT, Surface
 from .traced import is_compiled, one_operator
 
 # Another surface, or a slope of the pixel's own one; larger values of both: fewer hidden samples
-BEHIND_PX = 1.0  # px; difference in coc at which a sample lies on another surface with confidence 1/2; 1 at 1/2 px more
+_BEHIND_PX = (
+    1.0  # px; difference in coc at which a sample lies on another surface with confidence 1/2; 1 at 1/2 px more
+)
 _OWN_SLOPE = 0.25  # part of a pixel's blur by which its own surface may be farther nearby
 
 # Levels of the pyramid
@@ -107,9 +109,19 @@ def _operator(
     return own, own_weight, other, other_coc, other_weight, behind
 
 
-def _is_behind(distance_px: Tensor) -> Tensor:
+def is_another_surface(distance_px: Tensor) -> Tensor:
     """Confidence, 0 to 1, that a surface farther by ``distance_px`` of coc is another surface."""
-    return (distance_px - BEHIND_PX + 0.5).clamp(0.0, 1.0)
+    return (distance_px - _BEHIND_PX + 0.5).clamp(0.0, 1.0)
+
+
+def end_of_surface(coc_px: Tensor) -> Tensor:
+    """Largest coc of a pixel's own surface nearby, which may slope, of the coc of the pixel."""
+    return coc_px + (_OWN_SLOPE * coc_px.abs() - _BEHIND_PX).clamp_min(0.0)
+
+
+def is_read(coc_px: Tensor, least_px: float | Tensor) -> Tensor:
+    """How much a pixel reads a level of the pyramid, 0 to 1: in full from a blur of twice its ``least_px`` on."""
+    return (coc_px.abs() / least_px - 1.0).clamp(0.0, 1.0)
 
 
 def behind_pixels(behind: Tensor, size: tuple[int, int]) -> Tensor:
@@ -298,7 +310,7 @@ def _finest_level(
     share = (shares[1][:, None, :, None] * shares[0][:, None, :]).flatten(0, 1)
     # on an axis of even size the last of three pixels has no share
     farthest = torch.where(share > 0, coc, -NEVER_PX).amax(1, keepdim=True)
-    counts = weight * (1.0 - _is_behind(farthest - coc)) * (share / 4.0)
+    counts = weight * (1.0 - is_another_surface(farthest - coc)) * (share / 4.0)
     total = counts.sum(1, keepdim=True)
     summed = around[0][:, :-1] * counts[:, :1]
     for k in range(1, 9):
@@ -325,7 +337,7 @@ def _farthest(values: Tensor) -> Tensor:
     """The next coarser level of the pyramid: of each four samples, the mean of those on the farthest surface."""
     light, coc_px, weight = values.split([values.shape[1] - 2, 1, 1], 1)
     farthest = functional.interpolate(functional.max_pool2d(coc_px, 2), scale_factor=2.0, mode="nearest")
-    counts = weight * (1.0 - _is_behind(farthest - coc_px))
+    counts = weight * (1.0 - is_another_surface(farthest - coc_px))
     means = downsampled(torch.cat([light * counts, coc_px * counts, counts], 1), 2)
     total = means[:, -1:]
     means = means[:, :-1] / total.clamp_min(_LEAST_TOTAL)
@@ -428,8 +440,7 @@ def shown_behind(samples: Tensor, shares: Tensor, coc_px: Tensor) -> Seen:
     count = samples.shape[-4] - 2
     coc, weight = samples.narrow(-4, count, 1), samples.narrow(-4, count + 1, 1)
     # the pixel's own surface may slope nearby by a part of its blur
-    end_of_surface = coc_px + (_OWN_SLOPE * coc_px.abs() - BEHIND_PX).clamp_min(0.0)
-    part = shares * weight * _is_behind(coc - end_of_surface.unsqueeze(2))
+    part = shares * weight * is_another_surface(coc - end_of_surface(coc_px).unsqueeze(2))
     total = part.sum(-3)
     total = torch.where(total > _LEAST_SEEN, total, 0.0)
     return (samples.narrow(-4, 0, count + 1) * part).sum(-3) / total.clamp_min(_LEAST_SEEN), total
@@ -450,7 +461,7 @@ def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tenso
     """
     numbers = _numbers_of(tuple(level[2:] for level in levels), coc_px.dtype, coc_px.device)
     least, slope, most = (numbers[i, :, None, None, None, None] for i in range(3))
-    looked = (coc_px.abs() / least - 1.0).clamp(0.0, 1.0)
+    looked = is_read(coc_px, least)
     votes = looked * torch.minimum(weight * slope, most)
     if not farthest:
         total = votes.sum(0)
@@ -460,8 +471,8 @@ def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tenso
     for k in range(1, len(levels)):
         beyond = shown[k] - seen
         apart, vote = beyond[:, -1:], votes[k]
-        vote = torch.where(total > 0, vote * (1.0 - _is_behind(-apart)), vote)
-        total = total * (1.0 - sure[k] * _is_behind(apart)) + vote
+        vote = torch.where(total > 0, vote * (1.0 - is_another_surface(-apart)), vote)
+        total = total * (1.0 - sure[k] * is_another_surface(apart)) + vote
         seen = seen + beyond * (vote / total.clamp_min(_LEAST_TOTAL))
     return seen, total
 

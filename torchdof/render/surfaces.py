@@ -154,6 +154,11 @@ def continuation_weight(cover: Tensor) -> Tensor:
     return (1.0 - cover) * ((cover - HIDDEN_WEIGHT) / _CONTINUES_FROM).clamp(0.0, 1.0)
 
 
+def visible_part(nearer: Tensor) -> Tensor:
+    """Part of that coverage that counts in a layer, where ``nearer`` is the near surface's share at or behind it."""
+    return 1.0 - (nearer / _HIDING_SHARE).clamp(0.0, 1.0)
+
+
 def _mixed(surfaces: Sequence[PaddedSurface], pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
     """``m_k I``, ``m_k`` and ``M_k - m_k`` of one surface, or of two that share their pixels, near to far.
 
@@ -169,7 +174,7 @@ def _mixed(surfaces: Sequence[PaddedSurface], pairs: Sequence[tuple[Tensor, Tens
         own = behind - beyond
         if cover is not None:
             if nearer is not None:
-                cover = cover + continuation_weight(cover) * (1.0 - (nearer / _HIDING_SHARE).clamp(0.0, 1.0))
+                cover = cover + continuation_weight(cover) * visible_part(nearer)
             beyond, own = beyond * cover, own * cover
         terms = [light * own, own, beyond]
         sums = [a + b for a, b in zip(sums, terms, strict=True)] if sums else terms

@@ -154,10 +154,6 @@ constexpr float NEVER = constants::matting::NEVER_PX;
 constexpr int MOST_LEVELS = constants::native::MOST_LEVELS;
 constexpr int MOST_PLANES = constants::native::MOST_PLANES;
 
-// Largest coc of a pixel's own surface nearby.
-template <typename V>
-inline V end_of_surface(V coc) { return coc + most(most(coc, -coc) * OWN_SLOPE - BEHIND_PX, V{}); }
-
 // The surfaces of BLOCK x BLOCK pixels where a second one exists or the first differs from the image.
 struct Block {
   float *own;     // light of the first surface [channels, BLOCK_PIXELS]
@@ -274,44 +270,6 @@ inline V axis(V coc, float low, float high) {
 inline float coc_at(double node) {
   const double beyond = (std::fabs(node) + IN_FOCUS) / 2;
   return (float)(node == 0 ? 0 : std::copysign(beyond + std::sqrt(beyond * (beyond + 2 * SQUARE_PX)), node));
-}
-
-constexpr float FOOT = constants::layer_weights::FOOT;
-constexpr float SLOPE = 1 / (1 - FOOT / 2);  // slope of the straight part above it
-// A ramp from 0 to 1 with a parabola as its foot; exact at both ends.
-template <typename V>
-inline V eased(V v) {
-  const V foot = least(v, V{} + FOOT);
-  return most(1.0f - SLOPE * (1.0f - v), SLOPE / (2 * FOOT) * foot * foot);
-}
-template <typename V>
-inline V ramp(V v, bool ease) {
-  const V zero = {};
-  v = least(most(v, zero), zero + 1.0f);
-  return ease ? eased(v) : v;
-}
-// Share of a surface at `place` that belongs to the layer or to layers behind it; below, the share that belongs to layers
-// behind it. Both are eased under occlusion.
-template <typename V>
-inline V at_or_behind(const Layer &l, V place, bool ease) {
-  return ramp((place - l.before) * l.per_before + (l.first ? 1.0f : 0.0f), ease);
-}
-template <typename V>
-inline V behind(const Layer &l, V place, bool ease) {
-  return ramp((place - l.at) * l.per_after, ease);
-}
-
-// The farther surface of a mixed pixel continues behind the nearer one. `continuation` gives its extra weight, from its
-// share of the pixel. `visible_continuation` gives the part of this weight that counts in a layer, from the nearer
-// surface's share at or behind the layer.
-template <typename V>
-inline V continuation(V share) {
-  const V zero = {}, known = (share - HIDDEN_WEIGHT) * (1.0f / CONTINUES_FROM);
-  return (1.0f - share) * least(most(known, zero), zero + 1.0f);
-}
-template <typename V>
-inline V visible_continuation(V continuation, V nearer) {
-  return continuation * (1.0f - least(nearer * (1.0f / HIDING_SHARE), V{} + 1.0f));
 }
 
 // Layer k of `count`, without its resolution and kernels.

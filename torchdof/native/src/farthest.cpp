@@ -8,7 +8,7 @@
 //   light = sum n_j I_j / sum n_j,   coc = sum n_j d_j / sum n_j,   weight = sum n_j
 //
 // A coarser level has samples of the finer one as its pixels, which have one surface and a weight.
-#include "engine.h"
+#include "rules.h"
 
 namespace torchdof {
 namespace {
@@ -93,7 +93,7 @@ class Farthest {
     for (int c = 0; c <= channels(); c++) s.mean[c] = 0;
     for (int k = 0; k < s.number; k++) {
       Tap &t = s.taps[k];
-      t.behind = s.farthest - t.coc - (BEHIND_PX - 0.5f);
+      t.behind = unlimited_another_surface(s.farthest - t.coc);
       t.count = t.weight * (1.0f - clamp01(t.behind)) * t.share;
       s.total += t.count;
       for (int c = 0; c < channels(); c++) s.mean[c] += t.count * (light(t, c) * t.dimmed);
@@ -118,7 +118,7 @@ class Farthest {
       float of_count = of_total + slope[channels()] * t.coc, of_dimmed = 0;
       for (int c = 0; c < channels(); c++) of_count += slope[c] * (light(t, c) * t.dimmed);
       of_coc[k] = slope[channels()] * t.count;
-      if (t.behind >= 0 && t.behind <= 1) {
+      if (within(t.behind)) {
         const float of_behind = -of_count * t.weight * t.share;
         of_farthest += of_behind;
         of_coc[k] -= of_behind;

@@ -13,7 +13,7 @@
 // A cell of BEHIND_STEP x BEHIND_STEP pixels has the smallest coc of its pixels. Its first result is the farthest surface of
 // all levels: of two levels with different surfaces, only the farther one counts. Its second result is the one above, of
 // the coarse levels alone.
-#include "engine.h"
+#include "rules.h"
 
 namespace torchdof {
 namespace {
@@ -103,7 +103,7 @@ struct Behind {
   // Returns false if nothing lies behind the place in this level.
   bool find(int l, int y, int x, float coc, Found &f) const {
     const torchdof_level &level = levels[l];
-    const float blur = std::fabs(coc) / level.least_px - 1.0f;
+    const float blur = unlimited_read(std::fabs(coc), level.least_px);
     f.looked = clamp01(blur);
     f.vote = 0;
     if (!(blur >= 0)) return false;
@@ -115,7 +115,7 @@ struct Behind {
     bool any = false;
     for (int j = 0; j < 4; j++) {
       f.at[j] = (size_t)(row + j / 2) * level.columns + column + j % 2;
-      f.is_behind[j] = cocs[f.at[j]] - end - (BEHIND_PX - 0.5f);
+      f.is_behind[j] = unlimited_another_surface(cocs[f.at[j]] - end);
       any |= f.is_behind[j] >= 0;
     }
     if (!any) return false;
@@ -177,10 +177,10 @@ struct Behind {
   struct Change {
     float apart, nearer, sure, vote, left, votes, part;  // left: share of the votes before that stays
     Change(const Found &f, const Result &r, int of_coc) : apart(f.mean[of_coc] - r.values[of_coc]) {
-      nearer = r.votes > 0 ? clamp01(-apart - (BEHIND_PX - 0.5f)) : 0.0f;
+      nearer = r.votes > 0 ? is_another_surface(-apart) : 0.0f;
       sure = std::min(f.looked * f.weight / CERTAIN, 1.0f);
       vote = f.vote * (1.0f - nearer);
-      left = 1.0f - sure * clamp01(apart - (BEHIND_PX - 0.5f));
+      left = 1.0f - sure * is_another_surface(apart);
       votes = r.votes * left + vote;
       part = vote / std::max(votes, LEAST_TOTAL);
     }
@@ -202,7 +202,7 @@ struct Behind {
     farthest(found, before);
     for (int c = 0; c < planes() - 1; c++) of.values[c] = slopes[c * area];
     of.votes = slopes[(planes() - 1) * area];
-    const auto slopes_up = [](float distance) { return distance >= BEHIND_PX - 0.5f && distance <= BEHIND_PX + 0.5f; };
+    const auto slopes_up = [](float distance) { return within(unlimited_another_surface(distance)); };
     for (int l = count - 1; l >= 0; l--) {
       Found &f = found[l];
       if (!f.any) continue;
@@ -217,7 +217,7 @@ struct Behind {
       if (change.votes >= LEAST_TOTAL) of.votes -= of_part * change.part;
       const float of_vote = of.votes + of_part, of_left = of.votes * before[l].votes;
       f.of_vote += of_vote * (1.0f - change.nearer);
-      f.of_sure -= of_left * clamp01(change.apart - (BEHIND_PX - 0.5f));
+      f.of_sure -= of_left * is_another_surface(change.apart);
       float of_apart = 0;
       if (slopes_up(change.apart)) of_apart -= of_left * change.sure;
       if (before[l].votes > 0 && slopes_up(-change.apart)) of_apart += of_vote * f.vote;
@@ -270,7 +270,6 @@ struct Behind {
     }
     if (wanted) back_of_farthest(slopes, found);
     if (first < count) back_of_mean(slopes + (wanted ? planes() * area : 0), found);
-    const float slope_of_end = OWN_SLOPE * std::fabs(least) >= BEHIND_PX ? 1.0f + (least < 0 ? -OWN_SLOPE : OWN_SLOPE) : 1.0f;
     float of_least = 0;
     for (int l = 0; l < count; l++) {
       const torchdof_level &level = levels[l];
@@ -278,7 +277,7 @@ struct Behind {
       if (!f.any) continue;
       const size_t size = (size_t)level.rows * level.columns;
       const float counted = f.weight * level.slope, bounded = std::min(counted, level.most);
-      const float blur = std::fabs(least) / level.least_px - 1.0f, of_sure = f.looked * f.weight <= CERTAIN ? f.of_sure / CERTAIN : 0.0f;
+      const float blur = unlimited_read(std::fabs(least), level.least_px), of_sure = f.looked * f.weight <= CERTAIN ? f.of_sure / CERTAIN : 0.0f;
       if (blur <= 1) of_least += (f.of_vote * bounded + of_sure * f.weight) / level.least_px * (least < 0 ? -1.0f : 1.0f);
       float of_parts = 0;
       if (f.weight > 0) {
@@ -296,10 +295,10 @@ struct Behind {
           of_value[c * size] += of_mean * f.part[j];
         }
         of_value[(planes() - 1) * size] += of_part * f.share[j] * clamp01(f.is_behind[j]);
-        if (f.is_behind[j] < 0 || f.is_behind[j] > 1) continue;
+        if (!within(f.is_behind[j])) continue;
         const float of_distance = of_part * f.share[j] * value[(planes() - 1) * size];
         of_value[(planes() - 2) * size] += of_distance;
-        of_least -= of_distance * slope_of_end;
+        of_least -= of_distance * slope_of_end(least);
       }
     }
     // the gradient of equal coc is shared by columns, then by rows
