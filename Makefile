@@ -71,7 +71,8 @@ SECONDS := 3600
 fuzz: $(INSTALLED)
 	FUZZ_SECONDS=$(SECONDS) $(BIN)/python -m pytest -n 1 -m hard tests/fuzz
 
-INSTALLS_FROM := pyproject.toml constraints.txt CMakeLists.txt $(wildcard torchdof/native/src/*) build/modules
+INSTALLS_FROM := pyproject.toml constraints.txt CMakeLists.txt $(wildcard torchdof/native/src/*) build/modules \
+	build/constants/checksum.h
 
 # --no-compile: Python compiles a module when it first imports it; most of the 11,000 are never imported.
 $(INSTALLED): $(INSTALLS_FROM)
@@ -89,6 +90,10 @@ $(FOR_DEMO): $(INSTALLS_FROM)
 # An editable installation knows where each module lies: after one has moved it must be made again.
 build/modules: always
 	@mkdir -p $(@D); find torchdof fit export -name '*.py' | sort >$@.new; cmp -s $@.new $@ || cp $@.new $@
+
+# The engine is compiled with the constants of Python modules; the headers are written only where they change.
+build/constants/checksum.h: always
+	@$(PYTHON) cmake/constants.py $(@D)
 
 .PHONY: always
 

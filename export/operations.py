@@ -13,7 +13,7 @@ from torch import Tensor
 from torchdof import pixels
 from torchdof.optics.blur_table import BlurTable
 from torchdof.pixels import Selected
-from torchdof.render.disocclusion import BEHIND_PX, search, shown_behind
+from torchdof.render.disocclusion import is_another_surface, search, shown_behind
 from torchdof.render.ops import Level, Ops, Seen
 from torchdof.render.plan import Plan
 from torchdof.render.surfaces import Highlights, PaddedFrame, PaddedSurface
@@ -79,7 +79,7 @@ class GraphOps(Ops):
         lights, weights = (torch.stack(parts) for parts in zip(*behind, strict=True))
         surfaces = torch.cat(search(levels, lights, weights, coc_px), 1)
         nearest = torch.stack([values[:, -2].max() for values in windows]).max()
-        hides = (mask.max() > 0) & (nearest > coc_px.min() + (BEHIND_PX - 0.5))
+        hides = (mask.max() > 0) & (is_another_surface(nearest - coc_px.min()) > 0)
         tile = choose(hides, surfaces, torch.zeros_like(surfaces))
         # narrow() instead of slices: tracing then knows the sizes of the result
         maps = tiles.joined(tile).narrow(-2, top, size[0]).narrow(-1, left, size[1])

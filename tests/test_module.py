@@ -261,9 +261,12 @@ def test_an_image_and_its_maps_are_checked_once(monkeypatch: pytest.MonkeyPatch)
 
     def noted(name: str) -> None:
         check = getattr(validation, name)
-        monkeypatch.setattr(
-            validation, name, lambda *arguments, **more: (looked_at.append(name), check(*arguments, **more))[1]
-        )
+
+        def checked(*arguments: Any, **more: Any) -> Any:
+            looked_at.append(name)
+            return check(*arguments, **more)
+
+        monkeypatch.setattr(validation, name, checked)
 
     for name in ("image_and_map", "ends"):
         noted(name)

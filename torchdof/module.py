@@ -119,9 +119,9 @@ class DepthOfField(nn.Module):
         )
         depth, channels = self._sized(image, depth), options.table.channels
         validation.scene(image, "depth", depth, background, background_depth, channels=channels, values=options.check)
-        coc, behind = self._coc(depth, image, *lens), None
+        coc, behind = self._coc(depth, image, *lens, options.check), None
         if background is not None and background_depth is not None:
-            behind = (background, self._coc(background_depth, image, *lens))
+            behind = (background, self._coc(background_depth, image, *lens, options.check))
         return restored(axes, render(image, coc, options, plan, behind, attention))
 
     def layers(
@@ -205,9 +205,9 @@ class DepthOfField(nn.Module):
 
         The depth ``[B or 1, 1, H, W]`` may have a size that can be resampled to the image's.
         """
-        depth = self._sized(image, depth)
-        validation.image_and_depth(image, depth, values=self.options.check, name=name)
-        return self._coc(depth, image, focus_m, f_number)
+        depth, check = self._sized(image, depth), self.options.check
+        validation.image_and_depth(image, depth, values=check, name=name)
+        return self._coc(depth, image, focus_m, f_number, check)
 
     def _sized(self, image: Tensor, depth: Tensor) -> Tensor:
         """A depth map resampled to the size of its image, if it has another one that fits; unchecked."""
@@ -215,7 +215,12 @@ class DepthOfField(nn.Module):
         return depth if is_sized else at_size_of(image, depth)
 
     def _coc(
-        self, depth: Tensor, image: Tensor, focus_m: float | Tensor | None, f_number: float | Tensor | None
+        self,
+        depth: Tensor,
+        image: Tensor,
+        focus_m: float | Tensor | None,
+        f_number: float | Tensor | None,
+        check: bool,
     ) -> Tensor:
         """The circle of confusion of a checked depth map of an image; finite, or with ``check=False`` NaN at holes."""
         changes = {"focus_m": focus_m, "f_number": f_number}
@@ -224,7 +229,7 @@ class DepthOfField(nn.Module):
         # a tensor, because an exported graph would do Python's arithmetic with the width in float32
         width: Any = torch.scalar_tensor(image.shape[-1], dtype=torch.float64, device="cpu")
         coc = camera.coc_px(depth, width)
-        if not self.options.check:
+        if not check:
             return torch.where(depth > 0, coc, torch.nan)
         camera.refuse_overflow(coc, depth)
         return coc

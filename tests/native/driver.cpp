@@ -16,6 +16,7 @@
 #include <vector>
 
 #include "api.h"
+#include "constants/native.h"
 
 namespace {
 
@@ -357,7 +358,7 @@ void check_blend(unsigned seed) {
 void check_look_behind(unsigned seed) {
   std::mt19937 random(seed);
   const auto integer = [&](int low, int high) { return std::uniform_int_distribution<int>(low, high)(random); };
-  const int channels = integer(1, TORCHDOF_MOST_PLANES), count = integer(1, TORCHDOF_MOST_LEVELS);
+  const int channels = integer(1, torchdof::constants::native::MOST_PLANES), count = integer(1, torchdof::constants::native::MOST_LEVELS);
   const int rows = (2 << count) * integer(1, 5), columns = (2 << count) * integer(1, 7);  // pixels of all levels
   const int height = integer(1, rows), width = integer(1, columns);
   const size_t pixels = size_t(height) * width;

@@ -30,7 +30,7 @@ Kind = Literal["image", "background", "stack"]
 other, near to far."""
 
 HALF_LARGEST = 256  # largest half width of a kernel, in pixels of its layer; PyTorch blurs with larger ones
-MOST_LEVELS = 7  # most levels of look_behind
+MOST_LEVELS = 7  # most levels of the pyramid of hidden surfaces; more: surfaces are filled in from farther away
 MOST_PLANES = 16  # most channels of light and kernels' colours together in blend
 
 _SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
@@ -40,7 +40,7 @@ _instructions = "avx2" if torch.backends.cpu.get_cpu_capability().startswith("AV
 _SMALL_FRAME = 2**16  # pixels; up to this size the main thread renders itself, which saves 0.1 ms
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
 _of_thread = threading.local()  # its count, if set, is the number of threads for calls of this thread
-_REVISION = 14  # of ``src/api.h``
+_REVISION = 15  # of ``src/api.h``
 
 Rules = Sequence[tuple[int, float, float, float]]
 
@@ -105,6 +105,7 @@ _FUNCTIONS = {
     "kernels": "int spots* int data*",
     "ends": "int data long int real* real*",
     "interface": "long",
+    "constants": "long",
 }
 """Functions of ``src/api.h``: types of the result and of the arguments."""
 

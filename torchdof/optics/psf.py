@@ -70,6 +70,7 @@ _FINE_CELLS = 64  # cells from the centre to the end of a PSF; larger ones are s
 _MIN_LENGTH_PX = 1e-7  # px; a length below it is rendered as this, which is a kernel of one pixel to 1e-14
 _TILT_EXPONENT = 460.0  # largest logarithm of (r / R)^m, e^460 = 1e200; a larger power would overflow
 _MAX_WIDTH_PX = 2**16 + 1  # px; a kernel of this width takes 34 GB
+_RIPPLING = 1.0 / 16.0  # px: the interpolator of smaller cells has no ripple
 _MARGIN_PX = 2  # px around a kernel that its values depend on (the four neighbours in _non_negative, and theirs)
 _SLICES_AT_ONCE = 2**20  # slices computed together; limits memory
 
@@ -303,7 +304,7 @@ def _ripple(pixel: Tensor, cell: Tensor) -> Tensor:
 
     Cells sample the interpolator, so by Poisson summation the sum is 1 plus its spectrum at one cycle per cell.
     """
-    cycles = 1.0 / cell.clamp(1.0 / 16.0, 1.0)  # cycles per pixel; smaller cells have no ripple
+    cycles = 1.0 / cell.clamp(_RIPPLING, 1.0)  # cycles per pixel
     power = torch.sinc(cycles) ** 4
     spectrum = 3.0 * power / (2.0 + torch.cos(2.0 * math.pi * cycles))
     return 1.0 + 2.0 * spectrum * torch.cos(2.0 * math.pi * cycles * pixel)

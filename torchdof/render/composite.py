@@ -132,8 +132,7 @@ def _composite_layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter:
         shares = weights[0].split(each, 1)
         if frame.occlusion:
             weight, beyond = weights
-            lacking = (_KNOWN - weight - beyond).clamp_min(0.0)
-            beyond = beyond + lacking * lacking * (0.5 / _KNOWN)
+            beyond = raised(weight, beyond)
             known = weight + beyond
             # the transmittance as a sum of positive terms: a difference would round badly behind bright light
             shares = ((beyond if backed else weight) / known).split(each, 1)
@@ -173,6 +172,15 @@ def _composite_layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter:
             part = ops.equal_unless(needed, together, picture)
         picture = part
     return picture
+
+
+def raised(weight: Tensor, beyond: Tensor) -> Tensor:
+    """The weight beyond a layer, raised where it and the layer's lack ``l`` to :data:`_KNOWN`: by ``l^2 / (2 _KNOWN)``.
+
+    So the coverage ``weight / (weight + beyond)`` fades to 0 with the weight.
+    """
+    lacking = (_KNOWN - weight - beyond).clamp_min(0.0)
+    return beyond + lacking * lacking * (0.5 / _KNOWN)
 
 
 def _scattered(

@@ -24,7 +24,9 @@ from .surfaces import HIDDEN_WEIGHT, Surface
 from .traced import is_compiled, one_operator
 
 # Another surface, or a slope of the pixel's own one; larger values of both: fewer hidden samples
-BEHIND_PX = 1.0  # px; difference in coc at which a sample lies on another surface with confidence 1/2; 1 at 1/2 px more
+_BEHIND_PX = (
+    1.0  # px; difference in coc at which a sample lies on another surface with confidence 1/2; 1 at 1/2 px more
+)
 _OWN_SLOPE = 0.25  # part of a pixel's blur by which its own surface may be farther nearby
 
 # Levels of the pyramid
@@ -32,6 +34,9 @@ _FALL = 0.35  # weight of a level relative to the next finer one; larger: hidden
 _FINE_LEVELS = 2  # levels that each pixel reads; coarser ones are read once per cell of 2**_FINE_LEVELS pixels
 _SURE = 0.1  # weight of the samples of a level at which its vote is full
 _LEAST_SEEN = 1e-4  # weight of samples up to which they count as empty
+_LEAST_TOTAL = 1e-9  # smallest divisor of sums of light
+_MIXED = 0.05  # share above which the second surface of a pixel counts; larger: fewer mixed pixels
+_HIDING_FROM_PX = 0.5  # px: pixels blurred less hide nothing that is seen
 _CERTAIN = 0.01  # votes at which a hidden sample has full weight, or a farther surface replaces a nearer one
 
 BEHIND_STEP = 2**_FINE_LEVELS
@@ -105,9 +110,20 @@ def _operator(
     return own, own_weight, other, other_coc, other_weight, behind
 
 
-def _is_behind(distance_px: Tensor) -> Tensor:
+def is_another_surface(distance_px: Tensor) -> Tensor:
     """Confidence, 0 to 1, that a surface farther by ``distance_px`` of coc is another surface."""
-    return (distance_px - BEHIND_PX + 0.5).clamp(0.0, 1.0)
+    return (distance_px - _BEHIND_PX + 0.5).clamp(0.0, 1.0)
+
+
+def end_of_surface(coc_px: Tensor) -> Tensor:
+    """Largest coc of a pixel's own surface nearby, which may slope, of the coc of the pixel."""
+    slope = _OWN_SLOPE if active().own_slope else 0.0
+    return coc_px + (slope * coc_px.abs() - _BEHIND_PX).clamp_min(0.0)
+
+
+def is_read(coc_px: Tensor, least_px: float | Tensor) -> Tensor:
+    """How much a pixel reads a level of the pyramid, 0 to 1: in full from a blur of twice its ``least_px`` on."""
+    return (coc_px.abs() / least_px - 1.0).clamp(0.0, 1.0)
 
 
 def behind_pixels(behind: Tensor, size: tuple[int, int]) -> Tensor:
@@ -198,7 +214,7 @@ def _surfaces_of_image(
 
     # the farthest surface around each cell of 4 x 4 pixels, and one level of cells that replaces all coarse levels
     size = (rows // BEHIND_STEP, columns // BEHIND_STEP)
-    wanted = ((coc_px.abs() > 0.5) & (mixed < 0)).to(coc_px.dtype)
+    wanted = ((coc_px.abs() > _HIDING_FROM_PX) & (mixed < 0)).to(coc_px.dtype)
     coarse = searched[_FINE_LEVELS:]
     looked = behind_cells(searched, size, coc_px, wanted, ops)
     behind, _, votes, *of_coarse = looked.split([colours, 1, 1, *([colours + 2] if coarse else [])], 1)
@@ -273,7 +289,7 @@ def _finest_level(
     It is, at every second pixel from the centre, the farthest of the pixels around it. Each pixel shows its farther
     surface, dimmed to the threshold. Maps are those of its own and its other surface.
     """
-    is_mixed = (other_weight > 0.05) & (other_coc_px > coc_px)
+    is_mixed = (other_weight > _MIXED) & (other_coc_px > coc_px)
     coc_px, light = torch.where(is_mixed, other_coc_px, coc_px), torch.where(is_mixed, other_light, light)
     brightest = light.amax(1, keepdim=True)
     is_bright = brightest > threshold
@@ -298,12 +314,12 @@ def _finest_level(
     share = (shares[1][:, None, :, None] * shares[0][:, None, :]).flatten(0, 1)
     # on an axis of even size the last of three pixels has no share
     farthest = torch.where(share > 0, coc, -NEVER_PX).amax(1, keepdim=True)
-    counts = weight * (1.0 - _is_behind(farthest - coc)) * (share / 4.0)
+    counts = weight * (1.0 - is_another_surface(farthest - coc)) * (share / 4.0)
     total = counts.sum(1, keepdim=True)
     summed = around[0][:, :-1] * counts[:, :1]
     for k in range(1, 9):
         summed = torch.addcmul(summed, around[k][:, :-1], counts[:, k, None])
-    mean = summed / total.clamp_min(1e-9)
+    mean = summed / total.clamp_min(_LEAST_TOTAL)
     return torch.cat([mean[:, :-1], torch.where(total > 0, mean[:, -1:], -NEVER_PX), total], 1)
 
 
@@ -325,10 +341,10 @@ def _farthest(values: Tensor) -> Tensor:
     """The next coarser level of the pyramid: of each four samples, the mean of those on the farthest surface."""
     light, coc_px, weight = values.split([values.shape[1] - 2, 1, 1], 1)
     farthest = functional.interpolate(functional.max_pool2d(coc_px, 2), scale_factor=2.0, mode="nearest")
-    counts = weight * (1.0 - _is_behind(farthest - coc_px))
+    counts = weight * (1.0 - is_another_surface(farthest - coc_px))
     means = downsampled(torch.cat([light * counts, coc_px * counts, counts], 1), 2)
     total = means[:, -1:]
-    means = means[:, :-1] / total.clamp_min(1e-9)
+    means = means[:, :-1] / total.clamp_min(_LEAST_TOTAL)
     return torch.cat([means[:, :-1], torch.where(total > 0, means[:, -1:], -NEVER_PX), total], 1)
 
 
@@ -428,9 +444,7 @@ def shown_behind(samples: Tensor, shares: Tensor, coc_px: Tensor) -> Seen:
     count = samples.shape[-4] - 2
     coc, weight = samples.narrow(-4, count, 1), samples.narrow(-4, count + 1, 1)
     # the pixel's own surface may slope nearby by a part of its blur
-    slope = _OWN_SLOPE if active().own_slope else 0.0
-    end_of_surface = coc_px + (slope * coc_px.abs() - BEHIND_PX).clamp_min(0.0)
-    part = shares * weight * _is_behind(coc - end_of_surface.unsqueeze(2))
+    part = shares * weight * is_another_surface(coc - end_of_surface(coc_px).unsqueeze(2))
     total = part.sum(-3)
     total = torch.where(total > _LEAST_SEEN, total, 0.0)
     return (samples.narrow(-4, 0, count + 1) * part).sum(-3) / total.clamp_min(_LEAST_SEEN), total
@@ -451,19 +465,19 @@ def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tenso
     """
     numbers = _numbers_of(tuple(level[2:] for level in levels), coc_px.dtype, coc_px.device)
     least, slope, most = (numbers[i, :, None, None, None, None] for i in range(3))
-    looked = (coc_px.abs() / least - 1.0).clamp(0.0, 1.0)
+    looked = is_read(coc_px, least)
     votes = looked * torch.minimum(weight * slope, most)
     if not farthest:
         total = votes.sum(0)
-        return (shown * votes).sum(0) / total.clamp_min(1e-9), total
+        return (shown * votes).sum(0) / total.clamp_min(_LEAST_TOTAL), total
     sure = (looked * weight / _CERTAIN).clamp(max=1.0)
     total, seen = votes[0], shown[0]
     for k in range(1, len(levels)):
         beyond = shown[k] - seen
         apart, vote = beyond[:, -1:], votes[k]
-        vote = torch.where(total > 0, vote * (1.0 - _is_behind(-apart)), vote)
-        total = total * (1.0 - sure[k] * _is_behind(apart)) + vote
-        seen = seen + beyond * (vote / total.clamp_min(1e-9))
+        vote = torch.where(total > 0, vote * (1.0 - is_another_surface(-apart)), vote)
+        total = total * (1.0 - sure[k] * is_another_surface(apart)) + vote
+        seen = seen + beyond * (vote / total.clamp_min(_LEAST_TOTAL))
     return seen, total
 
 

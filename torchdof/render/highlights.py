@@ -42,10 +42,15 @@ NEARER_PX = 1.0
 
 _STEP = 3  # the threshold samples every third pixel; odd, as _CELL, so that a mirrored image has mirrored samples
 _CELL = 11  # samples along a side of a cell; larger: a smoother threshold
+_BRIGHT_PART = 5  # the usual light of a cell is that which 1 / _BRIGHT_PART of its samples exceed
 _LEAST_PX = 1.0  # smallest blur of a highlight, in pixels
 _WHOLE = 4.0  # a highlight counts with min(1, _WHOLE * share splatted) of its rays against the budget
 _TAPS_PER_PIXEL = 16  # budget of rays per pixel of the frame; the layers keep the light beyond it
 _FREE_CHANGE_PX = 0.4  # mean change of coc between neighbours, in pixels, above which the budget shrinks
+# Whole light of a highlight behind a nearer surface; larger starts: in more cases, steeper slopes: more abruptly
+_DARK = 2.0  # limits of a highlight: the nearer surface is dark by 2 - its light
+_BETWEEN_START, _BETWEEN_SLOPE = 3.5, 8.0  # a coc lies between two by 3.5 - 8 times its distance from their middle
+_STEP_START, _STEP_SLOPE = 1.5, 10.0  # the edge is a step by 1.5 - 10 times the share of pixels that lie between
 _TAPS = 2**21  # rays that are splatted at once; larger, as in the next two: faster, with more memory
 _PAIRS = 2**22  # pairs of a highlight and a bin of occluders that are tested at once
 _PAIR_TAPS = 2**19  # rays of these pairs that are tested at once
@@ -65,7 +70,7 @@ def threshold(light: Tensor, valid: Tensor | None = None) -> Tensor:
     side = _STEP * _CELL
     (top, rows), (left, columns) = (_cells(n, side, light.device) for n in (height, width))
     cells = functional.pixel_unshuffle(brightest.index_select(-2, rows).index_select(-1, columns), _CELL)
-    level = torch.topk(cells, cells.shape[1] // 5, dim=1)[0][:, -1:]
+    level = torch.topk(cells, cells.shape[1] // _BRIGHT_PART, dim=1)[0][:, -1:]
     level = FACTOR * level.clamp(0.0, torch.finfo(light.dtype).max / FACTOR)
     level = functional.interpolate(level, scale_factor=float(side), mode="bilinear", align_corners=False)
     return level.narrow(-2, top, height).narrow(-1, left, width)
@@ -149,10 +154,11 @@ def extract(
             gap = coc - pixels.pick(other.coc_px, bright)[0]
             stopped = (gap - NEARER_PX).clamp(0.0, 1.0)
             beside_peak = pixels.pick(other.light, bright).amax(0)
-            is_dark = (2.0 - beside_peak / most.clamp_min(torch.finfo(most.dtype).tiny)).clamp(0.0, 1.0)
+            is_dark = (_DARK - beside_peak / most.clamp_min(torch.finfo(most.dtype).tiny)).clamp(0.0, 1.0)
             around = pixels.pick(image_coc_px, pixels.around(bright, image_coc_px, 2))[0]
             off_middle = (around - (coc - 0.5 * gap)).abs() / gap.clamp_min(NEARER_PX)  # 1/2 at the coc of a surface
-            is_step = (1.5 - 10.0 * (3.5 - 8.0 * off_middle).clamp(0.0, 1.0).mean(0)).clamp(0.0, 1.0)
+            between = (_BETWEEN_START - _BETWEEN_SLOPE * off_middle).clamp(0.0, 1.0)
+            is_step = (_STEP_START - _STEP_SLOPE * between.mean(0)).clamp(0.0, 1.0)
             cover = cover + continuation_weight(cover) * (stopped * is_dark * is_step)
         excess = excess * cover
     return surface._replace(light=left), Highlights(bright, excess, coc)

@@ -25,15 +25,19 @@ _FEW = 100  # the radius of a frame is the mean of 1 / _FEW of its pixels, the m
 # A place gets a layer of its own if many of the border's pixels lie there; larger: fewer layers
 _CROWD = 0.03  # share of the border's pixels
 _LEAST_CROWD = 16  # and pixels, at least
+APART = 0.6  # finest distances; a crowd nearer to another layer gets none
 
 # Spacing of layers: measured so that errors stay below the tolerance; larger: fewer layers
 _SPACING = 0.25  # px near focus at a tolerance of 1/255
 _SPACING_POWER = 0.8  # exponent of the tolerance
 _LOOSE = 4.0  # tolerance times 255 above which the spacing grows with its square root, to keep more than two layers
+_GROWS_FROM_PX = 0.5  # px: blur above which the spacing grows
+_GROWTH = 0.75  # exponent of the blur in the spacing
 _FINEST = 0.5  # px: smallest distance between layers near the focus
 _FINEST_PARTS = 40.0  # elsewhere the smallest distance is the blur divided by this
 _WIDE = _FINEST * _FINEST_PARTS  # px: blur above which the smallest distance grows
 _NEAR = 0.3  # spacings: nearer to a fixed node, a node merges with it; at twice this distance it does not move
+_WIDEST = 4.0  # longer sides of a frame, and of a pixel more: radius above which kernels are constant in it
 
 
 def on_axis(coc_px: Tensor, longest: int) -> Tensor:
@@ -44,7 +48,7 @@ def on_axis(coc_px: Tensor, longest: int) -> Tensor:
 
 def _reach(longest: int) -> float:
     """Radius in pixels above which a kernel is constant within a frame whose longer side has ``longest`` pixels."""
-    return 4.0 * longest + 4.0
+    return _WIDEST * longest + _WIDEST
 
 
 def finest(x: float) -> float:
@@ -56,7 +60,7 @@ def spacing(x: float, tolerance: float) -> float:
     """Distance on the blur axis from a node at ``x`` to the next one outwards."""
     times = tolerance * 255.0
     loose = times**_SPACING_POWER if times <= _LOOSE else max(_LOOSE**_SPACING_POWER, math.sqrt(times))
-    return max(finest(x), _SPACING * loose * max(abs(x) + 0.5, 1.0) ** 0.75)
+    return max(finest(x), _SPACING * loose * max(abs(x) + (1.0 - _GROWS_FROM_PX), 1.0) ** _GROWTH)
 
 
 def spaced_nodes(low: float, high: float, tolerance: float, dense_from: float = math.inf) -> tuple[float, ...]:
@@ -155,7 +159,7 @@ def border_nodes(border: np.ndarray) -> list[float]:
         if count < least:
             break
         place = _from_finest((first + i) / 3.0)
-        if all(abs(place - other) > 0.6 * finest(place) for other in places):
+        if all(abs(place - other) > APART * finest(place) for other in places):
             # the lower median is a value that occurs, so pixels of that value lie in this layer alone
             crowd = np.sort(border[np.abs(bins - first - i) <= 1])
             places.append(float(crowd[(len(crowd) - 1) // 2]))

@@ -264,7 +264,7 @@ def _image(
     if behind_light is not None and behind_coc is not None and limit is not None:
         surfaces = _before_background(surfaces[0], behind_light, behind_coc, moved_px, ends, options)
     elif options.occlusion and limit is not None and splatted:
-        levels = [min(math.ceil(math.log2(max(2.0, most))) + 1, 7) for most in widest]
+        levels = [min(math.ceil(math.log2(max(2.0, most))) + 1, native.MOST_LEVELS) for most in widest]
         surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels, moved_px, ops)
         behind = behind if rules.active().light_behind else None
 

@@ -25,6 +25,7 @@ _LEAST_CUT = 24  # layer pixels: smaller kernels are never cut, so that those of
 _SMALL_RADII = 3.0  # blur radii: frames with a shorter side below this are planned for a smaller tolerance
 _ROUGH_PX = 8.0  # mean change of coc between neighbours, in pixels, above which a frame needs fewer layers
 _ROUGH_TOLERANCE = 4.0 / 255.0  # tolerance of the roughest frames; larger: their errors exceed 1/255
+_CROWDS_FROM = 2.5  # finest distances: wider spacings get layers at crowds of the border
 _FARTHEST_PX = 1e9  # px: upper limit of nodes; frames are smaller
 
 _Layer = tuple[float, Tensor] | None  # place on the blur axis and kernel of a layer of one item; None: it has none
@@ -147,9 +148,9 @@ class Plan:
         fixed = [low, high]
         for crowded in layer_cocs.border_nodes(spread.border):
             finest = layer_cocs.finest(crowded)
-            if layer_cocs.spacing(crowded, tolerance) > 2.5 * finest:
+            if layer_cocs.spacing(crowded, tolerance) > _CROWDS_FROM * finest:
                 for node in (crowded, crowded - finest, crowded + finest):
-                    if low < node < high and min(abs(node - other) for other in fixed) > 0.6 * finest:
+                    if low < node < high and min(abs(node - other) for other in fixed) > layer_cocs.APART * finest:
                         fixed.append(node)
         # nodes between the fixed ones slide smoothly onto them, so that the picture does not jump when a scene moves
         nodes = {*fixed}

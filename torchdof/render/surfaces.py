@@ -23,6 +23,7 @@ HIDDEN_WEIGHT = 0.003
 
 _HIDING_SHARE = 0.06
 """Share of a surface at or behind a layer at which it counts there in full; larger: it fades in over more depth."""
+_LEAST_PASSING = 1e-6  # smallest divisor: share of the light that passes the part of a surface in front of a layer
 _CONTINUES_FROM = 0.1
 """Visible share of a far surface, above HIDDEN_WEIGHT, at which it continues in full behind the near one."""
 
@@ -156,6 +157,11 @@ def continuation_weight(cover: Tensor) -> Tensor:
     return (1.0 - cover) * ((cover - HIDDEN_WEIGHT) / _CONTINUES_FROM).clamp(0.0, 1.0)
 
 
+def visible_part(nearer: Tensor) -> Tensor:
+    """Part of that coverage that counts in a layer, where ``nearer`` is the near surface's share at or behind it."""
+    return 1.0 - (nearer / _HIDING_SHARE).clamp(0.0, 1.0)
+
+
 def _mixed(surfaces: Sequence[PaddedSurface], pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
     """``m_k I``, ``m_k`` and ``M_k - m_k`` of one surface, or of two that share their pixels, near to far.
 
@@ -171,7 +177,7 @@ def _mixed(surfaces: Sequence[PaddedSurface], pairs: Sequence[tuple[Tensor, Tens
         own = behind - beyond
         if cover is not None:
             if nearer is not None:
-                cover = cover + continuation_weight(cover) * (1.0 - (nearer / _HIDING_SHARE).clamp(0.0, 1.0))
+                cover = cover + continuation_weight(cover) * visible_part(nearer)
             beyond, own = beyond * cover, own * cover
         terms = [light * own, own, beyond]
         sums = [a + b for a, b in zip(sums, terms, strict=True)] if sums else terms
@@ -199,7 +205,9 @@ def _stacked(
         cover = torch.ones_like(x) if weight is None else weight
         here = cover * eased((behind / _HIDING_SHARE).clamp(max=1.0))
         passes = 1.0 - here * (1.0 - behind)  # share not hidden by the surface's part in front of layer k
-        stops = cover * (behind - beyond) / passes.clamp_min(1e-6)  # share of the arriving light stopped in layer k
+        stops = (
+            cover * (behind - beyond) / passes.clamp_min(_LEAST_PASSING)
+        )  # share of the arriving light stopped in layer k
         stopped.append(arriving * stops)
         arriving, visible = arriving * (1.0 - stops), visible * passes
         unknown = unknown * (1.0 - here)

@@ -131,7 +131,7 @@ typedef struct {
   int32_t rows, columns;         // of the maps; multiples of the largest scale, as is the margin
   int32_t margin;                // pixels of the maps before the picture
   int32_t height, width;         // of the picture, multiples of the largest scale
-  int32_t channels;              // with kernel_colours at most TORCHDOF_MOST_PLANES
+  int32_t channels;              // with kernel_colours at most MOST_PLANES of native/__init__.py
   int32_t surfaces;              // 1, or 2 that share each pixel
   const float *const *light;     // for each surface [channels, rows, columns]
   const float *const *place;     // for each surface [rows, columns]: position on the blur axis
@@ -148,7 +148,6 @@ typedef struct {
   int32_t threads;
   const volatile int32_t *cancelled;
 } torchdof_layers;
-#define TORCHDOF_MOST_PLANES 16
 
 // Steps with a gradient. Without `gradient` they write `out`; else, given the gradient of `out`, they add to the gradients
 // of the inputs, which have the inputs' shapes, and write nothing else.
@@ -166,7 +165,6 @@ typedef struct {
   float least_px;         // blur above which a pixel reads the level
   float slope, most;      // votes for each weight of the samples, and largest number of votes
 } torchdof_level;
-#define TORCHDOF_MOST_LEVELS 7
 
 // Splits the mixed pixels of an image; see render/matting.py. maps: light [channels, height, width], coc [height, width]; 0 for
 // pixels that are left out, and how far the repair of edges moved the coc, in pixels, both [height, width] or null. out: own
@@ -204,6 +202,8 @@ TORCHDOF_API int32_t torchdof_continued(const float *const *maps, int32_t surfac
 TORCHDOF_API int32_t torchdof_ends(const float *values, int64_t count, int32_t threads, float *low, float *high);
 
 // Version of this interface, for the caller to check first: sizes of its structures and, in the upper half,
-// TORCHDOF_REVISION, which increases with every other change of this file.
-#define TORCHDOF_REVISION 14
+// _REVISION of native/__init__.py, which increases with every other change of this file.
 TORCHDOF_API int64_t torchdof_interface(void);
+
+// Checksum of the constants of Python modules that it was compiled with; cmake/constants.py computes that of the sources.
+TORCHDOF_API int64_t torchdof_constants(void);

@@ -9,7 +9,7 @@
 // Backward, the blurred l, w and v are computed again and kept, block by block; their gradients replace them. Each block
 // then composites its layers again, walks back through them from near to far, and the gradients of l, w and v are
 // scattered by the turned kernels to the gradients of m I, m and r, and from these to the surfaces.
-#include "engine.h"
+#include "rules.h"
 
 namespace torchdof {
 namespace {
@@ -26,13 +26,6 @@ inline void add_some(float *p, vec v, int n) {
   if (n >= LANES) return store(p, load<vec>(p) + v);
   for (int i = 0; i < n; i++) p[i] += v[i];
 }
-// Derivative of a ramp clamped to [0, 1], eased or not, by its argument before the clamp.
-inline vec slope_of_ramp(vec v, bool ease) {
-  const auto inside = (v >= vec{}) & (v <= all(1.0f));
-  const vec slope = ease ? (v > all(FOOT) ? all(SLOPE) : v * (SLOPE / FOOT)) : all(1.0f);
-  return inside ? slope : vec{};
-}
-
 // Consecutive layers of one resolution on one side of the focus, on a grid of their pixels, the padded frame's.
 struct Run {
   int scale, margin;                     // margin: pixels of the grid before the picture
@@ -126,7 +119,7 @@ class Blend {
   }
 
  private:
-  static constexpr int MOST = TORCHDOF_MOST_PLANES;
+  static constexpr int MOST = MOST_PLANES;
   using Events = std::vector<float>;
   // A step of a composite, far to near: a layer, or the canvas of a coarse run (then `run` is not null).
   struct Step {
@@ -324,8 +317,8 @@ class Blend {
     vec weight[2], counted[2];  // given; with the continuation of the farther surface
     vec ahead[2], here[2];      // arguments of the ramps
     vec h[2], t[2];             // share at or behind the layer; share behind it
-    vec extra = {}, known = {}, share = {};  // terms of the continuation
-    decltype(vec{} < vec{}) swapped;         // the frame's second surface is the nearer one
+    vec extra = {};             // weight of the continuation
+    decltype(vec{} < vec{}) swapped;  // the frame's second surface is the nearer one
   };
   // Surface j of the frame from the nearer and the farther one, or the other way round.
   template <int S>
@@ -343,16 +336,14 @@ class Blend {
     for (int j = 0; j < S; j++) {
       const vec its_place = swap<S>(p, place, j);
       p.weight[j] = p.counted[j] = swap<S>(p, weight, j);
-      p.ahead[j] = (its_place - l.before) * l.per_before + (l.first ? 1.0f : 0.0f);
-      p.here[j] = (its_place - l.at) * l.per_after;
+      p.ahead[j] = unlimited_at_or_behind(l, its_place);
+      p.here[j] = unlimited_behind(l, its_place);
       p.h[j] = ramp(p.ahead[j], over_);
       p.t[j] = ramp(p.here[j], over_);
     }
     if (S < 2) return;
-    p.known = (p.weight[1] - HIDDEN_WEIGHT) * (1.0f / CONTINUATION_SHARE);
-    p.share = p.h[0] * (1.0f / HIDING_SHARE);
-    p.extra = (1.0f - p.weight[1]) * clamp01(p.known);
-    p.counted[1] += p.extra * (1.0f - clamp01(p.share));
+    p.extra = continuation(p.weight[1]);
+    p.counted[1] += p.extra * visible_part(p.h[0]);
   }
 
   // Calls body(y, x, n, side, occupied) for up to LANES pixels of the padded frame at a time, for those cells of a range of
@@ -469,8 +460,8 @@ class Blend {
     vec lacking, behind, sum;  // what the sum lacks to KNOWN; the share behind the layer, raised; their sum
   };
   static Normalizer normalizer_of(vec own, vec behind) {
-    const vec lacking = most(all(KNOWN) - own - behind, vec{}), raised = behind + lacking * lacking * (0.5f / KNOWN);
-    return {lacking, raised, own + raised};
+    const vec lacks = lacking(own, behind), raised = behind + raise(lacks);
+    return {lacks, raised, own + raised};
   }
   int first_channel(int e) const { return E_ == 1 ? 0 : e; }
   int last_channel(int e) const { return E_ == 1 ? C_ - 1 : e; }
@@ -675,9 +666,9 @@ class Blend {
         store(its, of_light);
       });
       of_sum -= of_share * share * per;
-      const vec of_part = of_share * per, of_raised = of_sum + (scene_.backed ? of_part : vec{}), lacking = n.lacking * (1.0f / KNOWN);
-      store(own, of_sum + (scene_.backed ? vec{} : of_part) - of_raised * lacking);
-      store(behind_it, of_raised * (1.0f - lacking));
+      const vec of_part = of_share * per, of_raised = of_sum + (scene_.backed ? of_part : vec{}), slope = slope_of_raise(n.lacking);
+      store(own, of_sum + (scene_.backed ? vec{} : of_part) + of_raised * slope);
+      store(behind_it, of_raised * (1.0f + slope));
     });
   }
 
@@ -812,11 +803,8 @@ class Blend {
         }
       }
       if (S > 1) {
-        const vec hidden = 1.0f - clamp01(p.share);
-        const auto known_inside = (p.known >= vec{}) & (p.known <= all(1.0f)), share_inside = (p.share >= vec{}) & (p.share <= all(1.0f));
-        const vec of_extra = (known_inside ? (1.0f - p.weight[1]) * (1.0f / CONTINUATION_SHARE) : vec{}) - clamp01(p.known);
-        of_h[0] -= share_inside ? of_counted[1] * p.extra * (1.0f / HIDING_SHARE) : vec{};
-        of_counted[1] *= 1.0f + of_extra * hidden;
+        of_h[0] += of_counted[1] * p.extra * slope_of_visible_part(p.h[0]);
+        of_counted[1] *= 1.0f + slope_of_continuation(p.weight[1]) * visible_part(p.h[0]);
       }
       vec of_place[2];
       for (int j = 0; j < S; j++)

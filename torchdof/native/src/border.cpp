@@ -3,7 +3,7 @@
 
 namespace torchdof {
 
-constexpr double STEP = 0.5;  // as in render/border.py
+constexpr double STEP = constants::border::STEP;
 
 // The part of a difference on the blur axis that is a step between surfaces; 0 for a slope. Below, its derivative.
 static double step_of(double difference) { return difference * std::clamp(std::fabs(difference) / STEP - 1.0, 0.0, 1.0); }

@@ -5,12 +5,13 @@
 //
 // Runs of layers of a coarser resolution are composited first, each on a canvas of its own resolution. Then each tile
 // composites its full-resolution layers and these canvases while it is in the cache.
-#include "engine.h"
+#include "rules.h"
 
 namespace torchdof {
 namespace {
 
-constexpr float LEAST = 1e-6f;    // blurred weight up to which the light of a pixel is unknown
+constexpr float LEAST = constants::composite::LEAST;
+constexpr float LEAST_PASSING = constants::surfaces::LEAST_PASSING;
 constexpr float COVERED = 1e-6f;  // an uncovered part up to this is a rounding error
 constexpr int TILE_PIXELS = TILE * TILE;
 constexpr int PART = 16;  // side in pixels of the parts of a coarse canvas that are skipped if empty
@@ -545,7 +546,7 @@ class Composite {
       for (int j = 0; j < s_.count; j++) {
         const vec p = load<vec>(place[j] + i), cover = load<vec>(weight[j] + i), h = at_or_behind(l, p, over_);
         const vec here = cover * eased(least(h / HIDING_SHARE, all(1.0f))), there = 1.0f - here * (1.0f - h);
-        const vec stops = cover * (h - behind(l, p, over_)) / most(there, all(LEAST));
+        const vec stops = cover * (h - behind(l, p, over_)) / most(there, all(LEAST_PASSING));
         m[j] = left * stops;
         left *= 1.0f - stops;
         normalizer *= there;
@@ -744,7 +745,7 @@ class Composite {
     const auto other_is_nearer = place[1] < place[0];
     const vec extra = continuation(other_is_nearer ? weight[0] : weight[1]);
     if (!any_positive(extra)) return;
-    const vec more = visible_continuation(extra, other_is_nearer ? h[1] : h[0]);
+    const vec more = extra * visible_part(other_is_nearer ? h[1] : h[0]);
     weight[0] += other_is_nearer ? more : vec{};
     weight[1] += other_is_nearer ? vec{} : more;
   }
@@ -828,8 +829,8 @@ class Composite {
       // colour = light / normalizer, coverage = share / normalizer
       float *const canvas = b.canvas[C_ + e] + at;
       for (int i = 0; i < STRIP; i += LANES) {
-        const vec all_normalizer = load<vec>(normalizer + i), its_share = load<vec>(share + i), missing = most(all(KNOWN) - all_normalizer, vec{});
-        const vec known = all_normalizer + missing * missing * (0.5f / KNOWN), per_normalizer = all(1.0f) / known, cover = its_share * per_normalizer;
+        const vec all_normalizer = load<vec>(normalizer + i), its_share = load<vec>(share + i), missing = lacking(all_normalizer);
+        const vec known = all_normalizer + raise(missing), per_normalizer = all(1.0f) / known, cover = its_share * per_normalizer;
         // a layer that covers a pixel fully removes all light behind it, however bright
         const vec its_left = its_share < known ? most(all(1.0f) - cover, vec{}) : vec{};
         store(gain + i, per_normalizer);

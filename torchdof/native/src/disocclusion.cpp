@@ -1,13 +1,15 @@
 // Disocclusion: fills the surfaces hidden behind a blurred foreground with light and depth of the farthest surfaces
 // around, as described in render/disocclusion.py.
-#include "engine.h"
+#include "rules.h"
 
 namespace torchdof {
 namespace {
 
-// Constants of render/disocclusion.py, which gives their meanings and effects.
-constexpr float FALL = 0.35f, SURE = 0.1f;
-constexpr float MIXED = 0.05f;  // share above which a second surface is used in the pyramid
+constexpr float FALL = constants::disocclusion::FALL;
+constexpr float SURE = constants::disocclusion::SURE;
+constexpr float LEAST_TOTAL = constants::disocclusion::LEAST_TOTAL;
+constexpr float MIXED = constants::disocclusion::MIXED;
+constexpr float HIDING_FROM_PX = constants::disocclusion::HIDING_FROM_PX;
 constexpr int BAND = 8;         // rows of a level computed together
 constexpr int CELL_LEVEL = 3;   // cells that may show hidden surfaces have the size of this level's samples
 
@@ -24,9 +26,6 @@ struct Level {
   float *at(int y, int x) const { return values.data() + ((size_t)y * width + x) * stride; }
   float coc(int y, int x) const { return at(y, x)[channels]; }
 };
-
-// Confidence, 0 to 1, that a surface farther by this difference in coc is another surface.
-inline float is_behind(float distance_px) { return clamp01(distance_px - (BEHIND_PX - 0.5f)); }
 
 typedef float f8 __attribute__((vector_size(32)));
 constexpr int F8 = 8;
@@ -59,7 +58,7 @@ struct Sample {
   // Reads the bilinear mean of the four samples around a position, without those in front of or at coc `here`.
   void read(const Level &level, Place row, Place column, float here) {
     const int C = level.channels;
-    level_weight = clamp01(std::fabs(here) / level.least_px - 1.0f);
+    level_weight = is_read(std::fabs(here), level.least_px);
     weight = 0;
     if (!(level_weight > 0)) return;
     const float end = end_of_surface(here), down = row.part, right = column.part;
@@ -68,7 +67,7 @@ struct Sample {
     float total = 0, counts[4];
     for (int k = 0; k < 4; k++) {
       corners[k] = level.at(std::min(row.before + k / 2, level.height - 1), std::min(column.before + k % 2, level.width - 1));
-      total += counts[k] = share[k] * corners[k][C + 1] * is_behind(corners[k][C] - end);
+      total += counts[k] = share[k] * corners[k][C + 1] * is_another_surface(corners[k][C] - end);
     }
     if (!(total > LEAST_SEEN)) return;
     weight = total;
@@ -91,12 +90,12 @@ float mix(const Level *levels, const Sample *samples, int n, bool farthest, floa
     float vote = level_weight * (level.vote > 0 ? level.vote * std::min(weight / SURE, 1.0f) : weight);
     if (farthest) {
       const float apart = ((const float *)samples[l].values.data())[C] - out[C];
-      if (total > 0) vote *= 1.0f - is_behind(-apart);
-      total *= 1.0f - std::min(level_weight * weight / CERTAIN, 1.0f) * is_behind(apart);
+      if (total > 0) vote *= 1.0f - is_another_surface(-apart);
+      total *= 1.0f - std::min(level_weight * weight / CERTAIN, 1.0f) * is_another_surface(apart);
     }
     total += vote;
     if (!(vote > 0)) continue;
-    const float part = vote / std::max(total, 1e-9f);
+    const float part = vote / std::max(total, LEAST_TOTAL);
     for (const f8 &value : samples[l].values) {
       store(out, load<f8>(out) + (value - load<f8>(out)) * part);
       out += F8;
@@ -255,14 +254,14 @@ class Filling {
       read(C);
       vec farthest_coc = child[0];
       for (int j = 1; j < count; j++) farthest_coc = most(farthest_coc, child[j]);
-      for (int j = 0; j < count; j++) counts[j] = all(1.0f) - clamp01(farthest_coc - child[j] - all(BEHIND_PX - 0.5f));
+      for (int j = 0; j < count; j++) counts[j] = all(1.0f) - is_another_surface(farthest_coc - child[j]);
       read(C + 1);
       for (int j = 0; j < count; j++) {
         const bool half_row = rows_count == 3 && j / COLUMNS != 1, half_column = COLUMNS == 3 && j % COLUMNS != 1;
         counts[j] *= 0.25f * (half_row ? 0.5f : 1.0f) * (half_column ? 0.5f : 1.0f) * child[j];
         total += counts[j];
       }
-      const vec each = all(1.0f) / most(total, all(1e-9f));
+      const vec each = all(1.0f) / most(total, all(LEAST_TOTAL));
       for (int i = 0; i < n; i++) store(out + (i + 1) * stride_ - F8, f8{});  // padding
       for (int k = 0; k <= C; k++) {
         read(k);
@@ -286,9 +285,9 @@ class Filling {
           child[k] = fine.at(2 * y + k / 2, 2 * x + k % 2);
           farthest = std::max(farthest, child[k][C_]);
         }
-        for (int k = 0; k < 4; k++) total += counts[k] = child[k][C_ + 1] * (1.0f - is_behind(farthest - child[k][C_]));
+        for (int k = 0; k < 4; k++) total += counts[k] = child[k][C_ + 1] * (1.0f - is_another_surface(farthest - child[k][C_]));
         total *= 0.25f;
-        for (float &count : counts) count *= 0.25f / std::max(total, 1e-9f);
+        for (float &count : counts) count *= 0.25f / std::max(total, LEAST_TOTAL);
         for (int c = 0; c <= C_; c++) out[c] = child[0][c] * counts[0] + child[1][c] * counts[1] + child[2][c] * counts[2] + child[3][c] * counts[3];
         if (!(total > 0)) out[C_] = -NEVER;
         out[C_ + 1] = total;
@@ -311,7 +310,7 @@ class Filling {
         float most = -NEVER;
         for (int y = std::max(0, y0); y <= std::min(l.height - 1, y1); y++)
           for (int x = std::max(0, x0); x <= std::min(l.width - 1, x1); x++) most = std::max(most, l.coc(y, x));
-        if (most > near + BEHIND_PX - 0.5f) {
+        if (is_another_surface(most - near) > 0) {
           found_[cell] = 1;
           if (i < FINE_LEVELS) fine_[cell] = 1;
         }
@@ -321,7 +320,7 @@ class Filling {
 
   bool wanted(int y, int x) const {
     const int which = s_.block_of(y, x);
-    if (!(std::fabs(s_.coc[(size_t)y * job_.width + x]) > 0.5f)) return false;
+    if (!(std::fabs(s_.coc[(size_t)y * job_.width + x]) > HIDING_FROM_PX)) return false;
     return !s_.has_block(which) || s_.block(which).weight[y % BLOCK * BLOCK + x % BLOCK] < 0.5f * HIDDEN_WEIGHT;
   }
 
@@ -481,7 +480,7 @@ class Filling {
       if (columns < CELL) here_of = (const float *)memcpy(cut, here_of, columns * sizeof(float));
       for (int v = 0; v < VECTORS; v++) {
         const vec here = load<vec>(here_of + v * LANES), size = most(here, -here);
-        ivec wanted = size > all(0.5f);
+        ivec wanted = size > all(HIDING_FROM_PX);
         if (s_.has_block(which)) wanted &= load<vec>(s_.block(which).weight + within + v * LANES) < all(0.5f * HIDDEN_WEIGHT);
         if (!any_of(wanted)) continue;
         const vec end = end_of_surface(here);
@@ -499,16 +498,16 @@ class Filling {
           for (int x = 0; x < LANES; x++) right[x] = xs[std::min(v * LANES + x, columns - 1)].part;
           const vec left = all(1.0f) - right, shares[4] = {left * (1.0f - row.part), right * (1.0f - row.part), left * row.part, right * row.part};
           for (int k = 0; k < 4; k++) {
-            const vec farther = clamp01(corners[k][C * VECTORS] - end - all(BEHIND_PX - 0.5f));
+            const vec farther = is_another_surface(corners[k][C * VECTORS] - end);
             weight += counts[k] = shares[k] * corners[k][(C + 1) * VECTORS] * farther;
           }
-          const vec level_weight = clamp01(size * (1.0f / level.least_px) - all(1.0f));
+          const vec level_weight = is_read(size, level.least_px);
           const ivec is_seen = (weight > all(LEAST_SEEN)) & (level_weight > vec{});
           if (!any_of(is_seen)) continue;
           const vec voted = level.vote > 0 ? level.vote * least(weight * (1.0f / SURE), all(1.0f)) : weight;
           const vec vote = is_seen ? level_weight * voted : vec{};
           total += vote;
-          const vec part = vote / most(total, all(1e-9f)), each = all(1.0f) / most(weight, all(LEAST_SEEN));
+          const vec part = vote / most(total, all(LEAST_TOTAL)), each = all(1.0f) / most(weight, all(LEAST_SEEN));
           for (vec &count : counts) count *= each;
           for (int k = 0; k <= C; k++) {
             const size_t plane = (size_t)k * VECTORS;

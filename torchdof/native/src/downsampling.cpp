@@ -4,7 +4,7 @@
 // second). The means of weight w and light, and of w t and light t, over the pixels between each two nodes are
 // therefore enough: the layer at the first node takes mean(w) - mean(w t), the one at the second takes mean(w t).
 // In the code, `sums` are without t, and `sums_behind` with t: of the parts that lie behind the first node.
-#include "engine.h"
+#include "rules.h"
 
 namespace torchdof {
 
@@ -305,7 +305,7 @@ class Downsampling {
       const vec of_near = other_is_nearer ? fars[1] : fars[0], of_far = other_is_nearer ? fars[0] : fars[1];
       const ivec interval[2] = {load<ivec>(interval_[0] + i), load<ivec>(interval_[1] + i)};
       const ivec k = other_is_nearer ? interval[1] : interval[0], n = other_is_nearer ? interval[0] : interval[1];
-      const vec next = share + visible_continuation(extra, of_near);  // in layer k + 1
+      const vec next = share + extra * visible_part(of_near);  // in layer k + 1
       const vec first = n == k ? share : n == k + 1 ? next : whole, second = n == k ? next : whole;
       store(before_[0] + i, other_is_nearer ? first : weight[0]);
       store(after_[0] + i, other_is_nearer ? second : weight[0]);

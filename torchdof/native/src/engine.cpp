@@ -1,6 +1,11 @@
 // Prepares a scene: cleaned copies, second surfaces, highlights.
 #include "engine.h"
 
+#include <limits>
+
+#include "constants/checksum.h"
+#include "constants/exposure.h"
+
 namespace torchdof {
 
 Job::Job(const torchdof_scene &scene)
@@ -116,7 +121,7 @@ void Job::take_scene() {
     light_least[i % channels] = std::min(light_least[i % channels], leasts[i]);
     light_most[i % channels] = std::max(light_most[i % channels], mosts[i]);
   }
-  constexpr float BRIGHTEST = 268435456.0f;  // 2^28: powers of light are summed
+  constexpr float BRIGHTEST = 1 << (std::numeric_limits<float>::max_exponent - constants::exposure::SUMMED) / 4;  // fourth powers are summed
   for (int c = 0; c < channels; c++)
     if (std::max(light_most[c], -light_least[c]) > BRIGHTEST) throw TooBright();
   if (surfaces.valid)
@@ -174,7 +179,7 @@ void Job::begin() {
   } else if (limited && scene.occlusion) {
     surfaces.count = 2;
     split_mixed();
-    levels = std::min((int)std::ceil(std::log2(std::max(2.0, (double)reach))) + 1, 7);
+    levels = std::min((int)std::ceil(std::log2(std::max(2.0, (double)reach))) + 1, MOST_LEVELS);
     fill_hidden();
   }
   if (limited && scene.highlights) extract_highlights();
@@ -212,5 +217,7 @@ int32_t torchdof_ends(const float *values, int64_t count, int32_t threads, float
 }
 
 int64_t torchdof_interface(void) {
-  return (int64_t)TORCHDOF_REVISION << 32 | (int64_t)sizeof(torchdof_scene) << 16 | (int64_t)(sizeof(torchdof_map) + sizeof(torchdof_layers) + sizeof(torchdof_level));
+  return (int64_t)torchdof::constants::native::REVISION << 32 | (int64_t)sizeof(torchdof_scene) << 16 | (int64_t)(sizeof(torchdof_map) + sizeof(torchdof_layers) + sizeof(torchdof_level));
 }
+
+int64_t torchdof_constants(void) { return torchdof::constants::checksum::ALL; }

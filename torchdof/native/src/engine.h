@@ -12,6 +12,15 @@
 #include <vector>
 
 #include "api.h"
+#include "constants/border.h"
+#include "constants/composite.h"
+#include "constants/disocclusion.h"
+#include "constants/field.h"
+#include "constants/layer_weights.h"
+#include "constants/matting.h"
+#include "constants/native.h"
+#include "constants/placed_kernels.h"
+#include "constants/surfaces.h"
 #include "memory.h"
 #include "threads.h"
 
@@ -130,14 +139,20 @@ constexpr int BLOCK_PIXELS = BLOCK * BLOCK;
 constexpr int CELL = 8;   // of the cells for which layers and occluders are listed
 constexpr int TILE = 64;  // of the tiles that are composited at once
 
-// Constants of render/composite.py, disocclusion.py and surfaces.py, which give their meanings and effects.
-constexpr float KNOWN = 2e-3f, BEHIND_PX = 1.0f, OWN_SLOPE = 0.25f, LEAST_SEEN = 1e-4f, CERTAIN = 0.01f, HIDDEN_WEIGHT = 0.003f;
-constexpr float NEVER = 1e9f;  // larger than any coc
-constexpr int FINE_LEVELS = 2, BEHIND_STEP = 1 << FINE_LEVELS;
-
-// Largest coc of a pixel's own surface nearby.
-template <typename V>
-inline V end_of_surface(V coc) { return coc + most(most(coc, -coc) * OWN_SLOPE - BEHIND_PX, V{}); }
+// Constants of Python modules, which give their meanings, units and effects; here with the type of the computations.
+constexpr float KNOWN = constants::composite::KNOWN;
+constexpr float BEHIND_PX = constants::disocclusion::BEHIND_PX;
+constexpr float OWN_SLOPE = constants::disocclusion::OWN_SLOPE;
+constexpr float LEAST_SEEN = constants::disocclusion::LEAST_SEEN;
+constexpr float CERTAIN = constants::disocclusion::CERTAIN;
+constexpr int FINE_LEVELS = constants::disocclusion::FINE_LEVELS;
+constexpr int BEHIND_STEP = constants::disocclusion::BEHIND_STEP;
+constexpr float HIDDEN_WEIGHT = constants::surfaces::HIDDEN_WEIGHT;
+constexpr float HIDING_SHARE = constants::surfaces::HIDING_SHARE;
+constexpr float CONTINUES_FROM = constants::surfaces::CONTINUES_FROM;
+constexpr float NEVER = constants::matting::NEVER_PX;
+constexpr int MOST_LEVELS = constants::native::MOST_LEVELS;
+constexpr int MOST_PLANES = constants::native::MOST_PLANES;
 
 // The surfaces of BLOCK x BLOCK pixels where a second one exists or the first differs from the image.
 struct Block {
@@ -245,7 +260,8 @@ struct Layer {
 };
 
 // The blur axis of render/layer_weights.py: the position of a signed coc, clamped to [low, high], and its inverse.
-constexpr double SQUARE_PX = 0.5, IN_FOCUS = 2e-4;
+constexpr double SQUARE_PX = constants::layer_weights::SQUARE_PX;
+constexpr double IN_FOCUS = constants::layer_weights::IN_FOCUS;
 template <typename V>
 inline V axis(V coc, float low, float high) {
   const V zero = {}, focus = zero + (float)IN_FOCUS, size = most(coc, -coc), x = coc * size / (size + (float)SQUARE_PX);
@@ -254,48 +270,6 @@ inline V axis(V coc, float low, float high) {
 inline float coc_at(double node) {
   const double beyond = (std::fabs(node) + IN_FOCUS) / 2;
   return (float)(node == 0 ? 0 : std::copysign(beyond + std::sqrt(beyond * (beyond + 2 * SQUARE_PX)), node));
-}
-
-constexpr float FOOT = 0.15f;                 // share up to which the ramp between two layers is a parabola
-constexpr float SLOPE = 1 / (1 - FOOT / 2);  // slope of the straight part above it
-// A ramp from 0 to 1 with a parabola as its foot; exact at both ends.
-template <typename V>
-inline V eased(V v) {
-  const V foot = least(v, V{} + FOOT);
-  return most(1.0f - SLOPE * (1.0f - v), SLOPE / (2 * FOOT) * foot * foot);
-}
-template <typename V>
-inline V ramp(V v, bool ease) {
-  const V zero = {};
-  v = least(most(v, zero), zero + 1.0f);
-  return ease ? eased(v) : v;
-}
-// Share of a surface at `place` that belongs to the layer or to layers behind it; below, the share that belongs to layers
-// behind it. Both are eased under occlusion.
-template <typename V>
-inline V at_or_behind(const Layer &l, V place, bool ease) {
-  return ramp((place - l.before) * l.per_before + (l.first ? 1.0f : 0.0f), ease);
-}
-template <typename V>
-inline V behind(const Layer &l, V place, bool ease) {
-  return ramp((place - l.at) * l.per_after, ease);
-}
-
-// share in a layer at which a surface fully hides those behind it; a smaller share hides in proportion
-constexpr float HIDING_SHARE = 0.06f;
-// share of a mixed pixel's farther surface, above HIDDEN_WEIGHT, at which its continuation is full
-constexpr float CONTINUATION_SHARE = 0.1f;
-// The farther surface of a mixed pixel continues behind the nearer one. `continuation` gives its extra weight, from its
-// share of the pixel. `visible_continuation` gives the part of this weight that counts in a layer, from the nearer
-// surface's share at or behind the layer.
-template <typename V>
-inline V continuation(V share) {
-  const V zero = {}, known = (share - HIDDEN_WEIGHT) * (1.0f / CONTINUATION_SHARE);
-  return (1.0f - share) * least(most(known, zero), zero + 1.0f);
-}
-template <typename V>
-inline V visible_continuation(V continuation, V nearer) {
-  return continuation * (1.0f - least(nearer * (1.0f / HIDING_SHARE), V{} + 1.0f));
 }
 
 // Layer k of `count`, without its resolution and kernels.
@@ -367,7 +341,7 @@ float threshold_at(const Job &job, int y, int x);
 // Pixels on surfaces nearer than that of the window's middle are left out. places: of the pixels, in bins. border.cpp
 class WindowSums {
  public:
-  static constexpr int WIDTH = 4, BINS = 16;  // render/border.py gives their meanings and effects
+  static constexpr int WIDTH = constants::border::WIDTH, BINS = constants::border::BINS;
   WindowSums(int length, int count, const double *values, const double *places);
   // Computes the sums [length, count] of a level and, unless null, their derivatives by the place of the window's middle.
   void sum(int level, double *sums, double *slopes = nullptr) const;
@@ -562,8 +536,8 @@ Kernel make_kernel(const float *values, int half, bool one_sided);
 // Transmittance of the lens's field over a blur kernel at one position in the frame; see optics/placed_kernels.py.
 class FieldMask {
  public:
-  static constexpr int ROWS = 8, COLUMNS = 16;  // pixels that share one masked kernel
-  static constexpr float LEAST = 1e-6f;         // share of a kernel's light below which the kernel is left unmasked
+  static constexpr int ROWS = constants::field::BLOCK[0], COLUMNS = constants::field::BLOCK[1];
+  static constexpr float LEAST = constants::placed_kernels::MIN_LIGHT;
 
   // For the samples a, or the mix of a and b with weight `part` of b. y, x: position in half diagonals from the centre.
   FieldMask(const torchdof_scene &scene, const torchdof_field_mask &a, const torchdof_field_mask *b, float part, int colour, float y, float x)

@@ -8,13 +8,13 @@
 //   light = sum n_j I_j / sum n_j,   coc = sum n_j d_j / sum n_j,   weight = sum n_j
 //
 // A coarser level has samples of the finer one as its pixels, which have one surface and a weight.
-#include "engine.h"
+#include "rules.h"
 
 namespace torchdof {
 namespace {
 
-constexpr float MIXED = 0.05f;          // weight above which the other surface counts
-constexpr float LEAST_TOTAL = 1e-9f;    // smallest divisor
+constexpr float MIXED = constants::disocclusion::MIXED;
+constexpr float LEAST_TOTAL = constants::disocclusion::LEAST_TOTAL;
 constexpr int BAND = 32;                // rows of pixels whose gradients one thread adds up
 
 // The pixels of an axis around each sample: `taps` of them from 2 sample - before on, which the frame's ends repeat.
@@ -59,7 +59,7 @@ class Farthest {
   }
 
  private:
-  static constexpr int TAPS = 9, MOST = (CHANNELS ? CHANNELS : TORCHDOF_MOST_PLANES) + 1;
+  static constexpr int TAPS = 9, MOST = (CHANNELS ? CHANNELS : MOST_PLANES) + 1;
   struct Tap {
     size_t at;
     bool mixed;
@@ -93,7 +93,7 @@ class Farthest {
     for (int c = 0; c <= channels(); c++) s.mean[c] = 0;
     for (int k = 0; k < s.number; k++) {
       Tap &t = s.taps[k];
-      t.behind = s.farthest - t.coc - (BEHIND_PX - 0.5f);
+      t.behind = unlimited_another_surface(s.farthest - t.coc);
       t.count = t.weight * (1.0f - clamp01(t.behind)) * t.share;
       s.total += t.count;
       for (int c = 0; c < channels(); c++) s.mean[c] += t.count * (light(t, c) * t.dimmed);
@@ -118,7 +118,7 @@ class Farthest {
       float of_count = of_total + slope[channels()] * t.coc, of_dimmed = 0;
       for (int c = 0; c < channels(); c++) of_count += slope[c] * (light(t, c) * t.dimmed);
       of_coc[k] = slope[channels()] * t.count;
-      if (t.behind >= 0 && t.behind <= 1) {
+      if (within(t.behind)) {
         const float of_behind = -of_count * t.weight * t.share;
         of_farthest += of_behind;
         of_coc[k] -= of_behind;

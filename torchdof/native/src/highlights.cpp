@@ -1,22 +1,28 @@
 // Highlights: light far brighter than its surroundings is removed from the layers and rendered ray by ray, as described
 // in render/highlights.py.
-#include "engine.h"
+#include "rules.h"
+#include "constants/highlights.h"
+#include "constants/plan.h"
 
 namespace torchdof {
 namespace {
 
-constexpr float FACTOR = 8.0f;          // a highlight exceeds the usual light around by this factor; larger extracts fewer
-constexpr int STEP = 3;                 // every STEP-th pixel is sampled for the threshold
-constexpr int CELL_STEPS = 11;          // samples along the side of a threshold cell
+constexpr float FACTOR = constants::highlights::FACTOR;
+constexpr float LEAST_PX = constants::highlights::LEAST_PX;
+constexpr float NEARER_PX = constants::highlights::NEARER_PX;
+constexpr float WHOLE = constants::highlights::WHOLE;
+constexpr float DARK = constants::highlights::DARK;
+constexpr float BETWEEN_START = constants::highlights::BETWEEN_START;
+constexpr float BETWEEN_SLOPE = constants::highlights::BETWEEN_SLOPE;
+constexpr float STEP_START = constants::highlights::STEP_START;
+constexpr float STEP_SLOPE = constants::highlights::STEP_SLOPE;
+constexpr int STEP = constants::highlights::STEP;
+constexpr int CELL_STEPS = constants::highlights::CELL;
+constexpr int BRIGHT_PART = constants::highlights::BRIGHT_PART;
+constexpr int TAPS_PER_PIXEL = constants::highlights::TAPS_PER_PIXEL;
 constexpr int THRESHOLD_CELL = STEP * CELL_STEPS;
-constexpr float LEAST_PX = 1.0f;        // blur radius in pixels up to which highlights stay in the layers
-constexpr float NEARER_PX = 1.0f;       // difference in coc at which a nearer surface starts to block rays
-// a highlight's cost counts in full where 1 / WHOLE of its light or more is extracted
-constexpr float WHOLE = 4.0f;
-// budget of kernel taps for each pixel of the frame; highlights beyond it stay in layers
-constexpr int TAPS_PER_PIXEL = 16;
-constexpr double FREE_CHANGE_PX = 0.4;  // mean change of coc between neighbours above which the limit shrinks in proportion
-constexpr int STEPS_PER_PX = 32;        // resolution of the radii of ray kernels
+constexpr double FREE_CHANGE_PX = constants::highlights::FREE_CHANGE_PX;
+constexpr int KERNELS_PER_PX = constants::plan::KERNELS_PER_PX;
 constexpr int PATCH = 16;               // side in pixels of the squares in which rays are processed
 
 struct Candidate {
@@ -101,7 +107,7 @@ void Job::find_threshold() {
     const float largest = 3.4028234663852886e38f;
     for (int column = 0; column < threshold_columns; column++)
       threshold[(size_t)row * threshold_columns + column] =
-          FACTOR * std::min(ranked(COUNT / 5, &brightest[(size_t)column * VECTORS * LANES], VECTORS), largest / FACTOR);
+          FACTOR * std::min(ranked(COUNT / BRIGHT_PART, &brightest[(size_t)column * VECTORS * LANES], VECTORS), largest / FACTOR);
   });
 }
 
@@ -122,12 +128,12 @@ static float part_sent(const Surfaces &surfaces, int channels, int second, int y
     for (int dx = -2; dx <= 2; dx++) {
       // 1/2 on either surface
       const float off_middle = std::fabs(row[std::clamp(x + dx, 0, surfaces.width - 1)] - middle) / gap;
-      between += clamp01(3.5f - 8.0f * off_middle);
+      between += clamp01(BETWEEN_START - BETWEEN_SLOPE * off_middle);
     }
   }
-  const float is_step = clamp01(1.5f - 10.0f * (between / 25.0f));
+  const float is_step = clamp01(STEP_START - STEP_SLOPE * (between / 25.0f));
   const float beside = peak_of((second ? block.own : block.other) + within, BLOCK_PIXELS, channels);
-  const float is_dark = clamp01(2.0f - beside / std::max(limit, TINY));
+  const float is_dark = clamp01(DARK - beside / std::max(limit, TINY));
   return cover + continuation(cover) * (stopped * is_dark * is_step);
 }
 
@@ -212,7 +218,7 @@ void Job::extract_highlights() {
       const float left = (1.0f - fades(p)) + fades(p) * (p.limit / p.peak);  // 1 - share without cancellation
       if (!surfaces.full_planes()) surfaces.make_block(surfaces.block_of(p.row, p.column));
       surfaces.row(i, p.row, p.column, light_of.data(), coc, weight);
-      const double steps = (double)p.coc * STEPS_PER_PX, below = std::floor(steps);
+      const double steps = (double)p.coc * KERNELS_PER_PX, below = std::floor(steps);
       rays.push_back({p.row, p.column, (int)below, (float)(steps - below), p.coc});
       for (int c = 0; c < channels; c++) {
         float &light = const_cast<float &>(*light_of[c]);  // of this job: a block, or a copy

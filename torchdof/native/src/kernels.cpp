@@ -1,10 +1,12 @@
 // Makes kernels of any radius from a lens's templates; formulas in optics/kernel_bank.py and optics/psf.py.
 #include "engine.h"
+#include "constants/psf.h"
 
 namespace torchdof {
 namespace {
 
-constexpr int AROUND = 2;  // pixels computed around a kernel: its negative values borrow from them
+constexpr int MARGIN_PX = constants::psf::MARGIN_PX;
+constexpr double RIPPLING = constants::psf::RIPPLING;
 constexpr int FAR = 11;    // distance in pixels beyond which the spline is below 5e-7
 constexpr double ROOT = 1.7320508075688772, PI = 3.141592653589793;
 
@@ -36,7 +38,7 @@ class Spline {
 // What a constant template would give at a pixel instead of 1: the sum of the spline over samples `cell` pixels apart,
 // times `cell`. Weights are divided by it.
 double ripple(int pixel, double cell) {
-  const double cycles = 1 / std::min(std::max(cell, 1.0 / 16), 1.0), turn = PI * cycles, sinc = std::sin(turn) / turn;
+  const double cycles = 1 / std::min(std::max(cell, RIPPLING), 1.0), turn = PI * cycles, sinc = std::sin(turn) / turn;
   const double spectrum = 3 * sinc * sinc * sinc * sinc / (2 + std::cos(2 * turn));
   return 1 + 2 * spectrum * std::cos(2 * turn * pixel);
 }
@@ -155,15 +157,15 @@ class Maker {
         const size_t at = (size_t)(from + y) * across_all + from + x;
         light_[(size_t)y * cells + x] = a[at] + part * (b[at] - a[at]);
       }
-    const Axis down(half + AROUND, count, high, folded_);
-    const Axis across = wide == high ? down : Axis(half + AROUND, count, wide, folded_);
+    const Axis down(half + MARGIN_PX, count, high, folded_);
+    const Axis across = wide == high ? down : Axis(half + MARGIN_PX, count, wide, folded_);
     const int n = down.pixels;
     kernel_.resize((size_t)n * n);
     at_most_.resize(kernel_.size());
     product(down, across, light_.data(), &Axis::spline, row_, kernel_.data());
     product(down, across, light_.data(), &Axis::line, row_, at_most_.data());
     settle(n);
-    const int start = folded_ ? 0 : AROUND, side = 2 * half + 1;
+    const int start = folded_ ? 0 : MARGIN_PX, side = 2 * half + 1;
     double sum = 0;
     for (int y = 0; y < side; y++)
       for (int x = 0; x < side; x++) {

@@ -13,14 +13,13 @@
 // A cell of BEHIND_STEP x BEHIND_STEP pixels has the smallest coc of its pixels. Its first result is the farthest surface of
 // all levels: of two levels with different surfaces, only the farther one counts. Its second result is the one above, of
 // the coarse levels alone.
-#include "engine.h"
+#include "rules.h"
 
 namespace torchdof {
 namespace {
 
-constexpr float LEAST_VOTE = 1e-9f;  // smallest divisor
+constexpr float LEAST_TOTAL = constants::disocclusion::LEAST_TOTAL;
 constexpr int BAND = 32;  // least rows of places whose gradients one thread adds up
-constexpr int MOST_LEVELS = TORCHDOF_MOST_LEVELS;
 
 // Places of an axis, pixels or cells, `step` pixels apart and centred on an image; and the pixels of each place, as _window
 // of render/disocclusion.py: on an axis of even size a cell's last pixel repeats the one before.
@@ -51,7 +50,7 @@ struct Between {
 
 template <int CHANNELS>
 struct Behind {
-  static constexpr int MOST_PLANES = (CHANNELS ? CHANNELS : TORCHDOF_MOST_PLANES) + 2;
+  static constexpr int MOST_VALUES = (CHANNELS ? CHANNELS : MOST_PLANES) + 2;
   const torchdof_level *const levels;
   const float *const coc, *wanted;  // wanted: null if the places are pixels
   const int count, channels, width, first;  // first: level of the mean
@@ -94,17 +93,17 @@ struct Behind {
     size_t at[4];                   // of the samples
     float share[4], is_behind[4], part[4];  // is_behind: not clamped
     float weight, looked;           // sum of the parts, or 0 if tiny; clamped blur
-    float mean[MOST_PLANES];        // light and coc
+    float mean[MOST_VALUES];        // light and coc
     float vote;
-    float of_mean[MOST_PLANES], of_vote, of_sure;  // gradients; of_sure: that of looked * weight / CERTAIN up to 1
+    float of_mean[MOST_VALUES], of_vote, of_sure;  // gradients; of_sure: that of looked * weight / CERTAIN up to 1
   };
   struct Result {
-    float values[MOST_PLANES], votes;  // values: light and coc
+    float values[MOST_VALUES], votes;  // values: light and coc
   };
   // Returns false if nothing lies behind the place in this level.
   bool find(int l, int y, int x, float coc, Found &f) const {
     const torchdof_level &level = levels[l];
-    const float blur = std::fabs(coc) / level.least_px - 1.0f;
+    const float blur = unlimited_read(std::fabs(coc), level.least_px);
     f.looked = clamp01(blur);
     f.vote = 0;
     if (!(blur >= 0)) return false;
@@ -116,7 +115,7 @@ struct Behind {
     bool any = false;
     for (int j = 0; j < 4; j++) {
       f.at[j] = (size_t)(row + j / 2) * level.columns + column + j % 2;
-      f.is_behind[j] = cocs[f.at[j]] - end - (BEHIND_PX - 0.5f);
+      f.is_behind[j] = unlimited_another_surface(cocs[f.at[j]] - end);
       any |= f.is_behind[j] >= 0;
     }
     if (!any) return false;
@@ -151,18 +150,18 @@ struct Behind {
       r.votes += found[l].vote;
       for (int c = 0; c < planes() - 1; c++) r.values[c] += found[l].vote * found[l].mean[c];
     }
-    for (int c = 0; c < planes() - 1; c++) r.values[c] *= 1.0f / std::max(r.votes, LEAST_VOTE);
+    for (int c = 0; c < planes() - 1; c++) r.values[c] *= 1.0f / std::max(r.votes, LEAST_TOTAL);
     return r;
   }
   void back_of_mean(const float *slopes, Found *found) const {
     const Result r = mean(found);
-    const float per = 1.0f / std::max(r.votes, LEAST_VOTE);
-    float slope[MOST_PLANES], along = 0;
+    const float per = 1.0f / std::max(r.votes, LEAST_TOTAL);
+    float slope[MOST_VALUES], along = 0;
     for (int c = 0; c < planes() - 1; c++) {
       slope[c] = slopes[c * area] * per;
       along += slope[c] * r.values[c];
     }
-    if (r.votes < LEAST_VOTE) along = 0;
+    if (r.votes < LEAST_TOTAL) along = 0;
     for (int l = first; l < count; l++) {
       Found &f = found[l];
       if (!f.any) continue;
@@ -178,12 +177,12 @@ struct Behind {
   struct Change {
     float apart, nearer, sure, vote, left, votes, part;  // left: share of the votes before that stays
     Change(const Found &f, const Result &r, int of_coc) : apart(f.mean[of_coc] - r.values[of_coc]) {
-      nearer = r.votes > 0 ? clamp01(-apart - (BEHIND_PX - 0.5f)) : 0.0f;
+      nearer = r.votes > 0 ? is_another_surface(-apart) : 0.0f;
       sure = std::min(f.looked * f.weight / CERTAIN, 1.0f);
       vote = f.vote * (1.0f - nearer);
-      left = 1.0f - sure * clamp01(apart - (BEHIND_PX - 0.5f));
+      left = 1.0f - sure * is_another_surface(apart);
       votes = r.votes * left + vote;
-      part = vote / std::max(votes, LEAST_VOTE);
+      part = vote / std::max(votes, LEAST_TOTAL);
     }
   };
   // The farthest surface; before: the one without each level and those after it.
@@ -203,7 +202,7 @@ struct Behind {
     farthest(found, before);
     for (int c = 0; c < planes() - 1; c++) of.values[c] = slopes[c * area];
     of.votes = slopes[(planes() - 1) * area];
-    const auto slopes_up = [](float distance) { return distance >= BEHIND_PX - 0.5f && distance <= BEHIND_PX + 0.5f; };
+    const auto slopes_up = [](float distance) { return within(unlimited_another_surface(distance)); };
     for (int l = count - 1; l >= 0; l--) {
       Found &f = found[l];
       if (!f.any) continue;
@@ -214,11 +213,11 @@ struct Behind {
         f.of_mean[c] += of.values[c] * change.part;
         of.values[c] -= of.values[c] * change.part;
       }
-      of_part /= std::max(change.votes, LEAST_VOTE);
-      if (change.votes >= LEAST_VOTE) of.votes -= of_part * change.part;
+      of_part /= std::max(change.votes, LEAST_TOTAL);
+      if (change.votes >= LEAST_TOTAL) of.votes -= of_part * change.part;
       const float of_vote = of.votes + of_part, of_left = of.votes * before[l].votes;
       f.of_vote += of_vote * (1.0f - change.nearer);
-      f.of_sure -= of_left * clamp01(change.apart - (BEHIND_PX - 0.5f));
+      f.of_sure -= of_left * is_another_surface(change.apart);
       float of_apart = 0;
       if (slopes_up(change.apart)) of_apart -= of_left * change.sure;
       if (before[l].votes > 0 && slopes_up(-change.apart)) of_apart += of_vote * f.vote;
@@ -271,7 +270,6 @@ struct Behind {
     }
     if (wanted) back_of_farthest(slopes, found);
     if (first < count) back_of_mean(slopes + (wanted ? planes() * area : 0), found);
-    const float slope_of_end = OWN_SLOPE * std::fabs(least) >= BEHIND_PX ? 1.0f + (least < 0 ? -OWN_SLOPE : OWN_SLOPE) : 1.0f;
     float of_least = 0;
     for (int l = 0; l < count; l++) {
       const torchdof_level &level = levels[l];
@@ -279,7 +277,7 @@ struct Behind {
       if (!f.any) continue;
       const size_t size = (size_t)level.rows * level.columns;
       const float counted = f.weight * level.slope, bounded = std::min(counted, level.most);
-      const float blur = std::fabs(least) / level.least_px - 1.0f, of_sure = f.looked * f.weight <= CERTAIN ? f.of_sure / CERTAIN : 0.0f;
+      const float blur = unlimited_read(std::fabs(least), level.least_px), of_sure = f.looked * f.weight <= CERTAIN ? f.of_sure / CERTAIN : 0.0f;
       if (blur <= 1) of_least += (f.of_vote * bounded + of_sure * f.weight) / level.least_px * (least < 0 ? -1.0f : 1.0f);
       float of_parts = 0;
       if (f.weight > 0) {
@@ -297,10 +295,10 @@ struct Behind {
           of_value[c * size] += of_mean * f.part[j];
         }
         of_value[(planes() - 1) * size] += of_part * f.share[j] * clamp01(f.is_behind[j]);
-        if (f.is_behind[j] < 0 || f.is_behind[j] > 1) continue;
+        if (!within(f.is_behind[j])) continue;
         const float of_distance = of_part * f.share[j] * value[(planes() - 1) * size];
         of_value[(planes() - 2) * size] += of_distance;
-        of_least -= of_distance * slope_of_end;
+        of_least -= of_distance * slope_of_end(least);
       }
     }
     // the gradient of equal coc is shared by columns, then by rows

@@ -4,23 +4,37 @@
 
 #include <numeric>
 
+#include "constants/layer_cocs.h"
+#include "constants/plan.h"
+
 namespace torchdof {
 namespace {
 
-// Constants of render/layer_cocs.py and render/plan.py, which give their meanings, units and effects.
-constexpr double FINEST = 0.5, FINEST_PARTS = 40, WIDE = FINEST * FINEST_PARTS;
-constexpr double SPACING = 0.25, SPACING_POWER = 0.8, LOOSE = 4, NEAR = 0.3;
-constexpr int FEW = 100;
-constexpr double SMALL_RADII = 3, ROUGH_PX = 8, ROUGH_TOLERANCE = 4 / 255.0;
-constexpr double CROWD = 0.03;
-constexpr int LEAST_CROWD = 16;
+constexpr double FINEST = constants::layer_cocs::FINEST;
+constexpr double FINEST_PARTS = constants::layer_cocs::FINEST_PARTS;
+constexpr double WIDE = constants::layer_cocs::WIDE;
+constexpr double SPACING = constants::layer_cocs::SPACING;
+constexpr double SPACING_POWER = constants::layer_cocs::SPACING_POWER;
+constexpr double LOOSE = constants::layer_cocs::LOOSE;
+constexpr double NEAR = constants::layer_cocs::NEAR;
+constexpr double GROWS_FROM_PX = constants::layer_cocs::GROWS_FROM_PX;
+constexpr double GROWTH = constants::layer_cocs::GROWTH;
+constexpr double CROWD = constants::layer_cocs::CROWD;
+constexpr double APART = constants::layer_cocs::APART;
+constexpr int FEW = constants::layer_cocs::FEW;
+constexpr int LEAST_CROWD = constants::layer_cocs::LEAST_CROWD;
+constexpr float WIDEST = constants::layer_cocs::WIDEST;
+constexpr double SMALL_RADII = constants::plan::SMALL_RADII;
+constexpr double ROUGH_PX = constants::plan::ROUGH_PX;
+constexpr double ROUGH_TOLERANCE = constants::plan::ROUGH_TOLERANCE;
+constexpr double CROWDS_FROM = constants::plan::CROWDS_FROM;
 
 double finest(double x) { return std::max(FINEST, std::fabs(x) / FINEST_PARTS); }
 
 double spacing(double x, double tolerance) {
   const double times = tolerance * 255;
   const double loose = times <= LOOSE ? std::pow(times, SPACING_POWER) : std::max(std::pow(LOOSE, SPACING_POWER), std::sqrt(times));
-  return std::max(finest(x), SPACING * loose * std::pow(std::max(std::fabs(x) + 0.5, 1.0), 0.75));
+  return std::max(finest(x), SPACING * loose * std::pow(std::max(std::fabs(x) + (1 - GROWS_FROM_PX), 1.0), GROWTH));
 }
 
 // Positions in units of the finest spacing from focus, and the inverse.
@@ -49,7 +63,7 @@ std::vector<double> border_nodes(std::vector<float> places) {
     if (crowds[i] < least) break;
     const double place = from_finest((first + i) / 3.0);
     bool is_new = true;
-    for (double other : nodes) is_new &= std::fabs(place - other) > 0.6 * finest(place);
+    for (double other : nodes) is_new &= std::fabs(place - other) > APART * finest(place);
     if (!is_new) continue;
     std::vector<float> there;  // the median: a pixel's actual position, so that the pixel lies in this layer alone
     for (size_t k = 0; k < bins.size(); k++)
@@ -67,7 +81,7 @@ vec dioptres_behind(vec z, float s) {
 }
 
 // Radius above which a kernel is constant within the frame.
-float reach_of(int height, int width) { return 4.0f * std::max(height, width) + 4.0f; }
+float reach_of(int height, int width) { return WIDEST * std::max(height, width) + WIDEST; }
 
 void coc_of_depth(const float *depth, int64_t count, float scale, float nearest, float farthest, int threads, float *out) {
   constexpr int64_t PART = 1 << 15;
@@ -153,9 +167,9 @@ std::vector<double> plan(const float *coc, int maps, int height, int width, doub
   };
   for (double node : border_nodes(std::move(border))) {
     const double step = finest(node);
-    if (!(spacing(node, tolerance) > 2.5 * step)) continue;
+    if (!(spacing(node, tolerance) > CROWDS_FROM * step)) continue;
     for (double beside : {node, node - step, node + step})
-      if (nearest < beside && beside < farthest && to_fixed(beside) > 0.6 * step) fixed.push_back(beside);
+      if (nearest < beside && beside < farthest && to_fixed(beside) > APART * step) fixed.push_back(beside);
   }
   std::vector<double> nodes(fixed);
   if (nearest < 0 && 0 < farthest) nodes.push_back(0);

@@ -1,0 +1,115 @@
+// Rules of the picture, each in one place: its formula, the Python function that defines it, and for the gradients its
+// derivative. A rule without its limits to [0, 1] is named `unlimited`: the derivative is that of the limited one where
+// `within` holds, and 0 elsewhere. Templates are for a float and for a vector of pixels.
+#pragma once
+#include "engine.h"
+
+namespace torchdof {
+
+// Whether 0 <= v <= 1.
+template <typename V>
+inline auto within(V v) {
+  return (v >= V{}) & (v <= V{} + 1.0f);
+}
+
+// Largest coc of a pixel's own surface nearby, which may slope: c + max(OWN_SLOPE |c| - BEHIND_PX, 0); and its derivative.
+// render/disocclusion.py, end_of_surface.
+template <typename V>
+inline V end_of_surface(V coc) {
+  return coc + most(most(coc, -coc) * OWN_SLOPE - BEHIND_PX, V{});
+}
+inline float slope_of_end(float coc) {
+  return OWN_SLOPE * std::fabs(coc) >= BEHIND_PX ? 1.0f + (coc < 0 ? -OWN_SLOPE : OWN_SLOPE) : 1.0f;
+}
+
+// Confidence that a surface whose coc is larger by d is another surface: clamp(d - BEHIND_PX + 1/2, 0, 1).
+// render/disocclusion.py, is_another_surface.
+template <typename V>
+inline V unlimited_another_surface(V distance_px) {
+  return distance_px - (BEHIND_PX - 0.5f);
+}
+template <typename V>
+inline V is_another_surface(V distance_px) {
+  return clamp01(unlimited_another_surface(distance_px));
+}
+
+// How much a pixel reads a level of the pyramid: clamp(|c| / least_px - 1, 0, 1). render/disocclusion.py, is_read.
+template <typename V>
+inline V unlimited_read(V size_px, float least_px) {
+  return size_px * (1.0f / least_px) - 1.0f;  // least_px is a power of two: no rounding
+}
+template <typename V>
+inline V is_read(V size_px, float least_px) {
+  return clamp01(unlimited_read(size_px, least_px));
+}
+
+// A ramp from 0 to 1 with a parabola as its foot, up to FOOT; exact at both ends. render/layer_weights.py, eased.
+constexpr float FOOT = constants::layer_weights::FOOT;
+constexpr float SLOPE = 1 / (1 - FOOT / 2);  // of the straight part
+template <typename V>
+inline V eased(V v) {
+  const V foot = least(v, V{} + FOOT);
+  return most(1.0f - SLOPE * (1.0f - v), SLOPE / (2 * FOOT) * foot * foot);
+}
+// The ramp clamp(v, 0, 1), eased or not, and its derivative.
+template <typename V>
+inline V ramp(V v, bool ease) {
+  v = clamp01(v);
+  return ease ? eased(v) : v;
+}
+inline vec slope_of_ramp(vec v, bool ease) {
+  const vec slope = ease ? (v > all(FOOT) ? all(SLOPE) : v * (SLOPE / FOOT)) : all(1.0f);
+  return within(v) ? slope : vec{};
+}
+
+// Share of a surface at `place` that belongs to a layer or to layers behind it; below, the share that belongs to layers
+// behind it. Both are ramps, eased under occlusion. render/layer_weights.py, weights_at_or_behind.
+template <typename V>
+inline V unlimited_at_or_behind(const Layer &l, V place) {
+  return (place - l.before) * l.per_before + (l.first ? 1.0f : 0.0f);
+}
+template <typename V>
+inline V at_or_behind(const Layer &l, V place, bool ease) {
+  return ramp(unlimited_at_or_behind(l, place), ease);
+}
+template <typename V>
+inline V unlimited_behind(const Layer &l, V place) {
+  return (place - l.at) * l.per_after;
+}
+template <typename V>
+inline V behind(const Layer &l, V place, bool ease) {
+  return ramp(unlimited_behind(l, place), ease);
+}
+
+// The farther surface of a mixed pixel, whose share of the pixel is w, continues behind the nearer one with the extra weight
+// (1 - w) clamp((w - HIDDEN_WEIGHT) / CONTINUES_FROM, 0, 1); and the derivative. render/surfaces.py, continuation_weight.
+template <typename V>
+inline V unlimited_known(V share) {
+  return (share - HIDDEN_WEIGHT) * (1.0f / CONTINUES_FROM);
+}
+template <typename V>
+inline V continuation(V share) {
+  return (1.0f - share) * clamp01(unlimited_known(share));
+}
+inline vec slope_of_continuation(vec share) {
+  const vec known = unlimited_known(share);
+  return (within(known) ? (1.0f - share) * (1.0f / CONTINUES_FROM) : vec{}) - clamp01(known);
+}
+
+// Part of that weight that counts in a layer, where the nearer surface has a share at or behind the layer: 1 -
+// clamp(nearer / HIDING_SHARE, 0, 1); and the derivative. render/surfaces.py, visible_part.
+template <typename V>
+inline V visible_part(V nearer) {
+  return 1.0f - clamp01(nearer * (1.0f / HIDING_SHARE));
+}
+inline vec slope_of_visible_part(vec nearer) {
+  return within(nearer * (1.0f / HIDING_SHARE)) ? all(-1.0f / HIDING_SHARE) : vec{};
+}
+
+// The normalizer of a layer, its weight w plus the weight v behind it, is raised where it is small: with l = max(KNOWN - w -
+// v, 0), by l^2 / (2 KNOWN), whose derivative by w or v is -l / KNOWN. render/composite.py, raised.
+inline vec lacking(vec weight, vec behind = vec{}) { return most(all(KNOWN) - weight - behind, vec{}); }
+inline vec raise(vec lacking) { return lacking * lacking * (0.5f / KNOWN); }
+inline vec slope_of_raise(vec lacking) { return lacking * (-1.0f / KNOWN); }
+
+}  // namespace torchdof
