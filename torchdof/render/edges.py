@@ -37,11 +37,16 @@ _LEAST_STEP_PX = 0.5 * STEP_PX  # smallest range of coc in a map that is repaire
 _STEP = 0.1  # step of :func:`repair_edges`, as a fraction of the largest nearness around; larger: fewer edges
 _RINGS = 3  # px on each side of a step that are checked; larger: corrects wider displacements
 _ABRUPT = 0.3  # smallest jump between neighbours at a step, as a fraction of the step; larger: fewer steps
+_FLAT_REACH = 8  # px within which a ramp becomes flat; larger: more slopes count as ramps
 _RAMP_REACH = 6  # px; half the width of the widest ramp, anything wider is a slope
 _SHALLOW = 0.03  # smallest slope of a ramp per pixel, as a fraction of the range of nearness around
+_FLAT = 0.3  # slope of the flattest place around a ramp, over the ramp's; larger: more slopes count as ramps
+_NEAREST = 0.6  # a step nearer to the pixel counts from this part of the largest one around; larger: fewer rings
 _TIE = 0.017  # steps by which one axis must lead to give an edge its direction; breaks ties of means over 25 pixels
 
 # Noise of a map, below which a step is not an edge
+_NOISE_OF_BEND = 0.6053  # 1.4826 / sqrt(6): deviation of Gaussian noise over the median of |second difference|
+_NOISE_OF_ROUNDING = 0.2887  # 1 / sqrt(12): deviation of rounding over the distance of two levels
 _NOISES = 12.0  # smallest step, in standard deviations of the noise; larger: fewer edges in noisy maps
 _LEVELS_OF_A_FILE = 64  # fewest levels of a map with the noise of rounding; larger: more edges in coarse maps
 _NOISE_SAMPLED = 2**13  # pixels per frame that are sampled, half along rows and half along columns
@@ -53,6 +58,9 @@ _SURE = (0.0, 0.02, 0.06, 0.2, 1.0)  # weight of a sample, by ring: beside a ste
 _CLEAR = 0.1  # sum of these weights from which samples beside a step count in full; larger: thin strands stay
 _CLEAR_IN_PRIOR = 0.25  # the same where the share of wrong pixels is estimated; larger: soft pictures stay
 _LIKELY = 0.01  # likelihood from which a ramp's pixel shows one of both surfaces; larger: more pixels stay between them
+_COLOUR_NOISE = 2.25e-4  # (1.5 %)^2: variance of a colour, over its square, that a surface has at least
+_SPREAD = 0.3  # variance, over that of both surfaces, by which a sample resembles a pixel; larger: more do
+_SIMILAR = 0.0225  # (15 %)^2: squared difference, over the square, at which a neighbour counts by half
 _SHARPNESS = 1.6  # factor on scores, which samples on the wrong side reduce; larger: colour outweighs the map
 
 # Prior: how often each kind of edge pixel shows the near surface
@@ -66,6 +74,7 @@ _PRIOR_COUNT = 30.0  # weight of assumptions, in pixels; larger: the frame chang
 _ROUNDS = 10  # iterations of the fit
 
 # Decision, with "auto"
+_CLEAR_LEVEL = 0.3  # distance from the middle of a ramp, in steps, from which its pixels are clear
 _RELATED = 0.8  # smallest agreement of colours with the clear pixels of a map at which colours are used
 _EXACT = 0.025  # largest share of wrong pixels at which the steps of a map count as exact
 _DOUBTFUL = 0.05  # share of wrong pixels of a kind above which these pixels are decided again
@@ -84,7 +93,11 @@ _MIXED = 0.5  # share of a ramp's pixels
 # Lamps and ringing of soft maps
 _BLUR_REACH = 9  # px; half the width of the Gaussian kernel
 _CLIMBED = 0.35  # standard deviation of a ramp, as a fraction of (pixels of its middle half) / (steps they climb)
+_USUAL_REACH = _REACH + 2  # px; half the width of the window of the usual light around a lamp
+_LAMP_REACH = 2  # px; half the width of the largest lamp
 _PIXEL = 0.2  # px^2; variance that the area of a pixel adds to a ramp
+_LEAST_BLUR_PX, _MOST_BLUR_PX = 0.2, 3.0  # range of the standard deviation
+_EXPLAINED, _EXPLAINED_MORE = 0.5, 0.3  # fraction of the variance from which a fit counts; the part above, for full
 _BETTER = 0.5  # fraction of the variance unexplained by a sharp shape that its blur must explain for full confidence
 _RINGING_REACH = 3  # px; half the largest width of a rim of ringing; larger: wider details are flattened
 _OVERSHOOT = 0.12  # largest height of a rim that is removed in full, in steps; at twice this height it stays
@@ -293,7 +306,7 @@ def _repair(
     level, doubt, climb, is_ramp, mixed, ring = pixels.pick(torch.cat([t.to(given.dtype) for t in maps], 1), sampled)
     # colour agrees with the map at clear pixels: in the outermost ring of a step, or near the ends of a ramp; colours
     # unrelated to the depth agree at half of them
-    weight = weight * torch.where(is_ramp > 0, (level - 0.5).abs() > 0.3, ring == _RINGS)
+    weight = weight * torch.where(is_ramp > 0, (level - 0.5).abs() > _CLEAR_LEVEL, ring == _RINGS)
     agrees = weight * ((score > 0) == (level > 0.5))
     parts = [is_ramp, is_ramp * mixed, climb, 1.0 - is_ramp, (1.0 - is_ramp) * doubt, weight, agrees]
     sums = given.new_zeros(len(parts), batch).index_add(1, sampled // (height * width), torch.stack(parts))
@@ -331,7 +344,7 @@ def _repair(
     # the blur of a soft map: its standard deviation in pixels, and the width that it takes from near surfaces
     climbed = (edges.climb * is_mixed).sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
     ramp_px = _CLIMBED * is_mixed.sum((1, 2, 3), keepdim=True) / climbed
-    sigma = (ramp_px.square() - _PIXEL).clamp_min(0.0).sqrt().clamp(0.2, 3.0)
+    sigma = (ramp_px.square() - _PIXEL).clamp_min(0.0).sqrt().clamp(_LEAST_BLUR_PX, _MOST_BLUR_PX)
 
     label = pixels.put(is_near.to(given.dtype), edge_pixels, shows_near.to(given.dtype))
     length = edges.climb.sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
@@ -395,9 +408,9 @@ def _noise(nearness: Tensor, valid: Tensor) -> Tensor:
         )
     bend = torch.maximum(*(torch.where(middle < torch.inf, middle, 0.0) for middle in middles))
     quantum, span = torch.minimum(*least), torch.maximum(*ends)
-    rounding = 0.2887 * quantum if active().rounding else 0.0 * quantum  # 1 / sqrt(12)
+    rounding = (_NOISE_OF_ROUNDING if active().rounding else 0.0) * quantum
     noise = torch.where(span > _LEVELS_OF_A_FILE * quantum, rounding, 0.0)
-    return torch.maximum(0.6053 * bend, noise)[..., None, None]  # 1.4826 / sqrt(6), for Gaussian noise
+    return torch.maximum(_NOISE_OF_BEND * bend, noise)[..., None, None]
 
 
 def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
@@ -406,8 +419,8 @@ def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
     slope, jump, steepness = _slopes(nearness, valid)
     span = _highest(ends, _REACH).sum(1, keepdim=True)
     # a ramp is short and has flat places around it; a slope has none
-    flattest = -_highest(-_mean(slope, 2), 8)
-    is_ramp = (slope > 0.1 * step) & (slope > _SHALLOW * span) & (span > step) & (flattest < 0.3 * slope) & valid
+    flattest = -_highest(-_mean(slope, 2), _FLAT_REACH)
+    is_ramp = (slope > 0.1 * step) & (slope > _SHALLOW * span) & (span > step) & (flattest < _FLAT * slope) & valid
 
     # the surfaces at both ends of a ramp: extremes spread along it pixel by pixel
     spread = ends
@@ -420,7 +433,7 @@ def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
     rings = [torch.cat([ends, jump], 1)]
     for _ in range(_RINGS):
         rings.append(_highest(rings[-1], 1))
-    least = torch.maximum(0.6 * rings[-1][:, :2].sum(1, keepdim=True), step)
+    least = torch.maximum(_NEAREST * rings[-1][:, :2].sum(1, keepdim=True), step)
     ring, sides = torch.full_like(nearness, _RINGS + 1, dtype=torch.long), rings[-1][:, :2]
     for k in range(_RINGS, 0, -1):
         of_ring, largest_jump = rings[k].split([2, 1], 1)
@@ -499,7 +512,7 @@ def _judge(
         known = least > 1e-3
         mean = (others[:, None] * side).sum(2) / total  # [C, 2, P]
         spread = ((others[:, None] - mean[:, :, None]).square() * side).sum((0, 2)) / total
-        noise = 2.25e-4 * mean.sum(1).square().sum(0)
+        noise = _COLOUR_NOISE * mean.sum(1).square().sum(0)
         spread = 0.5 * spread.sum(0) + noise + 1e-12
         contrast = (mean[:, 0] - mean[:, 1]).square().sum(0)
         separation = (contrast / (contrast + 0.5 * spread) - 0.1).clamp_min(0.0) / 0.9
@@ -507,7 +520,7 @@ def _judge(
 
         # likelihoods
         apart = (others - own[:-5, None]).square().sum(0)
-        alike = (1.0 + apart / (0.3 * spread)).square().reciprocal()
+        alike = (1.0 + apart / (_SPREAD * spread)).square().reciprocal()
         likelihood = (side * alike).sum(1) / total + 1e-9
         score = torch.where(known, torch.log(likelihood[0] / likelihood[1]), 0.0).clamp(-8.0, 8.0)
         if active().few_samples:
@@ -524,7 +537,7 @@ def _judge(
     window = pixels.around(edge_pixels, like, 1)
     own, others = pixels.pick(colour, edge_pixels), pixels.pick(colour, window)
     scores = pixels.pick(scores, window)[0]
-    alike = 1.0 / (1.0 + (others - own[:, None]).square().sum(0) / (0.0225 * own.square().sum(0) + 1e-12))
+    alike = 1.0 / (1.0 + (others - own[:, None]).square().sum(0) / (_SIMILAR * own.square().sum(0) + 1e-12))
     if not active().like_scores:
         alike = (torch.arange(len(alike), device=alike.device) == len(alike) // 2).to(alike.dtype)[:, None]
     is_edge = ~scores.isnan()
@@ -603,9 +616,9 @@ def _lift_lamps(
     The fit ``nearness = a + b blurred(cover)`` gives the lamp ``a + b``; its cover is its light over its brightest.
     """
     brightest = light.amax(1, keepdim=True)
-    usual = _mean(brightest.sqrt(), _REACH + 2) ** 2
+    usual = _mean(brightest.sqrt(), _USUAL_REACH) ** 2
     span = _highest(torch.cat([nearness, -nearness], 1), _REACH).sum(1, keepdim=True)
-    around = _highest(brightest, 2)
+    around = _highest(brightest, _LAMP_REACH)
     is_lamp = (brightest > 4.0 * usual) & (brightest > 0.1 * around) & (span > 0.5 * step) & is_soft
     cover = torch.where(brightest > 2.0 * usual, brightest / around.clamp_min(1e-30), 0.0)
     lamp_pixels = pixels.indices(is_lamp)
@@ -614,7 +627,7 @@ def _lift_lamps(
     weight = fit * pixels.pick(cover, lamp_pixels)[0]
     values = torch.stack([weight, weight * (behind + difference.clamp_min(0.0)), weight * fit])
     of_lamps = pixels.put(torch.zeros_like(nearness).repeat(1, 3, 1, 1), lamp_pixels, values)
-    total, level, fit = pixels.pick(of_lamps, pixels.around(lamp_pixels, nearness, 2)).sum(1).unbind(0)
+    total, level, fit = pixels.pick(of_lamps, pixels.around(lamp_pixels, nearness, _LAMP_REACH)).sum(1).unbind(0)
     level, fit = (values / total.clamp_min(1e-9) for values in (level, fit))
     # a map whose near surfaces are not too thin has lost no lamps: 0 where they are 1 px too wide
     is_lost = (2.4 + 2.5 * lost_px).clamp(0.0, 1.0).flatten()
@@ -642,7 +655,7 @@ def _regress(
         xy = (weight * off[0] * off[1:]).sum(1).clamp_min(0.0)
         explained, unblurred = (c.square() / (v * yy).clamp_min(1e-12) for c, v in zip(xy.unbind(0), xx, strict=True))
         better = ((explained - unblurred) / (_BETTER * (1.0 - unblurred)).clamp_min(1e-6)).clamp(0.0, 1.0)
-        fit = torch.where(xx[0] > 0.004, ((explained - 0.5) / 0.3).clamp(0.0, 1.0) * better, 0.0)
+        fit = torch.where(xx[0] > 0.004, ((explained - _EXPLAINED) / _EXPLAINED_MORE).clamp(0.0, 1.0) * better, 0.0)
         b = xy[0] / xx[0].clamp_min(1e-9)
         return torch.stack([means[0] - b * means[1], b, fit])
 

@@ -31,7 +31,9 @@ _TRUST = 10.0  # weight of variance against contrast; larger: texture stops more
 _TEXTURE = 50.0  # weight of variance against contrast; larger: texture keeps more of a neighbour's mixed light
 _MOST_CLEAN = 4.0  # upper limit for a neighbour's clean light, as a multiple of the brightest neighbour
 _SOFTNESS_PX = 0.6  # standard deviation of the Gaussian by which two surfaces mix where their colours are alike
+_SOFTNESS_FALLOFF = math.exp(-0.5 / _SOFTNESS_PX**2)  # its weight at a distance of 1 px
 _UNSURE_PX = 0.8  # the same where the depth map has no edge; larger: softer edges
+_UNSURE_FALLOFF = math.exp(-0.5 / _UNSURE_PX**2)
 _ALIKE = 1.0 / 255.0  # contrast at which trust is halved, as a fraction of the brightest light around
 _UNSURE = 3.0  # added weight of variance, in units of _TRUST, where the depth map has no edge; larger: softer edges
 _UNBOUNDED = 1e6  # upper limit for either part, as a multiple of the brightest neighbour; avoids 0 * inf
@@ -164,9 +166,9 @@ def _split(
     sided = ((own_coc - near) - (far - own_coc)).abs() / gap
     clear = edge * (4.0 * sided - 2.0).clamp(0.0, 1.0)
     weight = torch.where(is_near, 1.0 - fitted, fitted).clamp(max=0.5) * clear * trust  # of the other surface
-    small = falloff ** (2.25 / _SOFTNESS_PX**2)
+    small = _falloff(light, 1, _SOFTNESS_FALLOFF)
     if moved_px is not None:
-        small = torch.lerp(small, falloff ** (2.25 / _UNSURE_PX**2), unsure)
+        small = torch.lerp(small, _falloff(light, 1, _UNSURE_FALLOFF), unsure)
     small = small if counted is None else small * counted
     covered = (small * nearness).sum(0) / small.sum(0).clamp_min(1e-12)  # by the near surface, under the Gaussian
     noise, misfit = back_variance + front_variance + _ALIKE**2, misfit + (covered - fitted) ** 2 * strength
@@ -317,10 +319,10 @@ def _mixed_light(window: Tensor, clean: Tensor, near_weight: Tensor, far_weight:
     return torch.where(near_weight > far_weight, share.clamp(-1.0, 0.0), share.clamp(0.0, 1.0)) * contrast
 
 
-def _falloff(light: Tensor, reach: int) -> Tensor:
-    """Gaussian weights of the pixels of a window, ``[(2 reach + 1)^2, 1]``."""
+def _falloff(light: Tensor, reach: int, beside: float = _FALLOFF) -> Tensor:
+    """Gaussian weights of the pixels of a window, ``[(2 reach + 1)^2, 1]``; ``beside`` is that at 1 px."""
     steps = range(-reach, reach + 1)
-    return light.new_tensor([_FALLOFF ** (dy * dy + dx * dx) for dy in steps for dx in steps])[:, None]
+    return light.new_tensor([beside ** (dy * dy + dx * dx) for dy in steps for dx in steps])[:, None]
 
 
 def _mean_of(colour: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:

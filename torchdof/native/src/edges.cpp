@@ -4,35 +4,78 @@
 // copied with a margin, padded beyond the frame with the nearest border pixel, so that loops run in whole vectors.
 #include <array>
 
+#include "constants/edges.h"
 #include "engine.h"
 
 namespace torchdof {
 namespace {
 
-// Constants in the groups of render/edges.py, which gives their meanings, units and effects.
-constexpr int RINGS = 3, RAMP_REACH = 6, FLAT_REACH = 8;  // edges; FLAT_REACH: pixels within which a ramp becomes flat
-constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TIE = 0.017f;
-constexpr float NOISES = 12.0f, LEVELS_OF_A_FILE = 64.0f;  // noise
-constexpr int NOISE_SAMPLED = 1 << 13;
-constexpr int REACH = 5;  // colour
-constexpr float CLEAR = 0.1f, CLEAR_IN_PRIOR = 0.25f, LIKELY = 0.01f, SHARPNESS = 1.6f;
-constexpr int DIRECTIONS = 5, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, KINDS = DIRECTIONS * PLACES;  // prior
-constexpr int SAMPLED = 12000, SAMPLE_BLOCK = 8, ROUNDS = 10;
-constexpr float TRUSTED = 0.05f, PRIOR_COUNT = 30.0f;
-constexpr float RELATED = 0.8f, EXACT = 0.025f, DOUBTFUL = 0.05f, LEAN = 2.0f, TO_BLURRED = 2.5f, MORE_BLURRED_PX = 2.0f;  // decision, in automatic mode
-constexpr float SOFT = 0.1f, WIDE = 1.5f, MIXED = 0.5f, BESIDE = 0.93f, DIAGONAL = 0.57f;  // soft maps
-constexpr float CLIMBED = 0.35f, PIXEL = 0.2f, BETTER = 0.5f, OVERSHOOT = 0.12f;  // lamps, ringing
-constexpr int BLUR_REACH = 9, RINGING_REACH = 3;
-// Half widths in pixels of further windows: the usual light around a lamp, and a lamp.
-constexpr int USUAL_REACH = REACH + 2, LAMP_REACH = 2;
+// Constants of render/edges.py, which gives their meanings, units and effects.
+constexpr int RINGS = constants::edges::RINGS;
+constexpr int RAMP_REACH = constants::edges::RAMP_REACH;
+constexpr int FLAT_REACH = constants::edges::FLAT_REACH;
+constexpr int REACH = constants::edges::REACH;
+constexpr int NOISE_SAMPLED = constants::edges::NOISE_SAMPLED;
+constexpr int DIRECTIONS = constants::edges::DIRECTIONS;
+constexpr int LEVELS = constants::edges::LEVELS;
+constexpr int PLACES = constants::edges::PLACES;
+constexpr int SAMPLED = constants::edges::SAMPLED;
+constexpr int SAMPLE_BLOCK = constants::edges::BLOCK;
+constexpr int ROUNDS = constants::edges::ROUNDS;
+constexpr int BLUR_REACH = constants::edges::BLUR_REACH;
+constexpr int RINGING_REACH = constants::edges::RINGING_REACH;
+constexpr int USUAL_REACH = constants::edges::USUAL_REACH;
+constexpr int LAMP_REACH = constants::edges::LAMP_REACH;
+constexpr float ABRUPT = (float)constants::edges::ABRUPT;
+constexpr float SHALLOW = (float)constants::edges::SHALLOW;
+constexpr float TIE = (float)constants::edges::TIE;
+constexpr float FLAT = (float)constants::edges::FLAT;
+constexpr float NEAREST = (float)constants::edges::NEAREST;
+constexpr float SPREAD = (float)constants::edges::SPREAD;
+constexpr float CLEAR_LEVEL = (float)constants::edges::CLEAR_LEVEL;
+constexpr float LEAST_BLUR_PX = (float)constants::edges::LEAST_BLUR_PX;
+constexpr float MOST_BLUR_PX = (float)constants::edges::MOST_BLUR_PX;
+constexpr float EXPLAINED = (float)constants::edges::EXPLAINED;
+constexpr float EXPLAINED_MORE = (float)constants::edges::EXPLAINED_MORE;
+constexpr float NOISES = (float)constants::edges::NOISES;
+constexpr float NOISE_OF_BEND = (float)constants::edges::NOISE_OF_BEND;
+constexpr float NOISE_OF_ROUNDING = (float)constants::edges::NOISE_OF_ROUNDING;
+constexpr float LEVELS_OF_A_FILE = (float)constants::edges::LEVELS_OF_A_FILE;
+constexpr float FALLOFF_PX = (float)constants::edges::FALLOFF_PX;
+constexpr float CLEAR = (float)constants::edges::CLEAR;
+constexpr float CLEAR_IN_PRIOR = (float)constants::edges::CLEAR_IN_PRIOR;
+constexpr float LIKELY = (float)constants::edges::LIKELY;
+constexpr float SHARPNESS = (float)constants::edges::SHARPNESS;
+constexpr float COLOUR_NOISE = (float)constants::edges::COLOUR_NOISE;
+constexpr float SIMILAR = (float)constants::edges::SIMILAR;
+constexpr float TRUSTED = (float)constants::edges::TRUSTED;
+constexpr float PRIOR_COUNT = (float)constants::edges::PRIOR_COUNT;
+constexpr float RELATED = (float)constants::edges::RELATED;
+constexpr float EXACT = (float)constants::edges::EXACT;
+constexpr float DOUBTFUL = (float)constants::edges::DOUBTFUL;
+constexpr float LEAN = (float)constants::edges::LEAN;
+constexpr float TO_BLURRED = (float)constants::edges::TO_BLURRED;
+constexpr float MORE_BLURRED_PX = (float)constants::edges::MORE_BLURRED_PX;
+constexpr float SOFT = (float)constants::edges::SOFT;
+constexpr float WIDE = (float)constants::edges::WIDE;
+constexpr float MIXED = (float)constants::edges::MIXED;
+constexpr float BESIDE = (float)constants::edges::BESIDE;
+constexpr float DIAGONAL = (float)constants::edges::DIAGONAL;
+constexpr float CLIMBED = (float)constants::edges::CLIMBED;
+constexpr float PIXEL = (float)constants::edges::PIXEL;
+constexpr float BETTER = (float)constants::edges::BETTER;
+constexpr float OVERSHOOT = (float)constants::edges::OVERSHOOT;
+constexpr float NONE = (float)constants::edges::NEVER;
+constexpr float LARGEST = (float)constants::edges::LARGEST;
+constexpr float BRIGHTEST = (float)constants::edges::BRIGHTEST;
+constexpr int KINDS = DIRECTIONS * PLACES;
 
 constexpr int AREA = 96;       // side of a tile in pixels
 // A pixel's result depends on the pixels within this many of it: without ramps, and with ramps.
 constexpr int STEP_HALO = RINGS + REACH, HALO = RINGS + RAMP_REACH + FLAT_REACH + 3;
-constexpr float NONE = 1e30f;       // negated, replaces invalid values in maxima
 constexpr float NO_SCORE = 100.0f;  // marks pixels without a score; above all scores
 constexpr int NEIGHBOURS[8][2] = {{-1, -1}, {-1, 0}, {-1, 1}, {0, -1}, {0, 1}, {1, -1}, {1, 0}, {1, 1}};
-constexpr float LARGEST = 1e15f, BRIGHTEST = 1e30f, FINITE = 3.402823466e38f;
+constexpr float FINITE = 3.402823466e38f;
 // Vectors of a window of SIDE x SIDE pixels: first WHOLE columns of each row, then the remaining 4 columns.
 constexpr int SIDE = 2 * REACH + 1, WHOLE = SIDE / LANES * LANES, ROWS_AT_ONCE = LANES / 4, WINDOW = SIDE * WHOLE / LANES + (SIDE + ROWS_AT_ONCE - 1) / ROWS_AT_ONCE;
 static_assert(SIDE - WHOLE <= 4 && WHOLE > REACH + 1);
@@ -40,7 +83,8 @@ static_assert(SIDE - WHOLE <= 4 && WHOLE > REACH + 1);
 // Bits of a pixel's mark. NEAR: the map gives it the near surface's depth. Bits from UNSURE up: index into SURE.
 constexpr uint8_t EDGE = 1, RAMP = 2, NEAR = 4, LISTED = 8, UNSURE = 32;
 // weight as a colour reference: far from steps, RINGS pixels from one, ..., beside one; 0 for invalid pixels and ramps
-constexpr float SURE[256 / UNSURE] = {1.0f, 0.2f, 0.06f, 0.02f, 0.0f};
+using constants::edges::SURE;
+constexpr float SURE_OF[256 / UNSURE] = {(float)SURE[4], (float)SURE[3], (float)SURE[2], (float)SURE[1], (float)SURE[0]};
 
 // A rectangle in the coordinates of the frame; may reach beyond the frame.
 struct Part {
@@ -271,7 +315,7 @@ class Repair {
       return *middle;
     };
     const float bend = std::max(middle_bend(height_, width_, width_, 1), middle_bend(width_, height_, 1, width_));
-    return std::max(0.6053f * bend, span > LEVELS_OF_A_FILE * quantum ? 0.2887f * quantum : 0.0f);
+    return std::max(NOISE_OF_BEND * bend, span > LEVELS_OF_A_FILE * quantum ? NOISE_OF_ROUNDING * quantum : 0.0f);
   }
 
   // Whether the sampled steps are ramps that are wide, or whose values are often far from both surfaces.
@@ -588,7 +632,7 @@ class Repair {
           store(marks_of_row + k, is_valid ? none : all((float)UNSURE * (RINGS + 1)));
           continue;
         }
-        const vec least_gap = most(0.6f * (near + far), s);
+        const vec least_gap = most(NEAREST * (near + far), s);
         for (int r = RINGS - 1; r >= 0; r--) {
           const vec n = load<vec>(nears[r].at(y, x)), f = load<vec>(fars[r].at(y, x)), gap = n + f;
           const auto is_step = (gap > least_gap) & (load<vec>(jumps[r].at(y, x)) > ABRUPT * gap);
@@ -672,7 +716,7 @@ class Repair {
     std::vector<Piece> pieces;
     for (int y = inside.y0; y < inside.bottom(); y++)
       for (int x = ramps.x0; x < ramps.right(); x += LANES) {
-        vec is_ramp = (load<vec>(ramp.at(y, x)) > vec{}) & (-load<vec>(low.at(y, x)) < 0.3f * load<vec>(slope.at(y, x))) ? all(1.0f) : vec{};
+        vec is_ramp = (load<vec>(ramp.at(y, x)) > vec{}) & (-load<vec>(low.at(y, x)) < FLAT * load<vec>(slope.at(y, x))) ? all(1.0f) : vec{};
         if (x < inside.x0 || x + LANES > inside.right())
           for (int i = 0; i < LANES; i++)
             if (x + i < inside.x0 || x + i >= inside.right()) is_ramp[i] = 0;
@@ -710,7 +754,7 @@ class Repair {
   // For each edge: the score of its surfaces by colour and, if wanted, their nearness.
   void judge(std::vector<Group> &groups, bool wants_surfaces) const {
     // a pixel is not its own reference
-    const std::vector<float> falloff = window([](float square) { return square > 0 ? std::exp(-square / 12.5f) : 0.0f; });
+    const std::vector<float> falloff = window([](float square) { return square > 0 ? std::exp(-square / (2 * FALLOFF_PX * FALLOFF_PX)) : 0.0f; });
     parallel((int)groups.size(), [&](int g) {
       if (groups[g].edges.empty()) return;
       groups[g].judged.resize(groups[g].edges.size());
@@ -738,7 +782,7 @@ class Repair {
     fetch(map_.nearness, given, [this](float v) { return sign_ * valid(v); });
     fetch(marks_.data(), witness, [](uint8_t marks) { return (float)(marks / UNSURE); });
     float *sure = witness.at(around.y0, around.x0);
-    for (size_t i = 0; i < witness.size; i += LANES) store(sure + i, pick(SURE, convert(load<vec>(sure + i))));
+    for (size_t i = 0; i < witness.size; i += LANES) store(sure + i, pick(SURE_OF, convert(load<vec>(sure + i))));
     std::vector<vec> many(C ? 0 : count);
     std::vector<float> of_lanes((count + channels) * LANES);  // of LANES pixels: totals, own colours
     struct Window {
@@ -789,9 +833,9 @@ class Repair {
         contrast += (near_off - far_off) * (near_off - far_off);
         noise += both * both;
       }
-      vec spread = 2.25e-4f * noise + 1e-12f;
+      vec spread = COLOUR_NOISE * noise + 1e-12f;
       for (int side = 0; side < 2; side++) spread += 0.5f * most(of(2 + side) * per_total[side] - from_mean[side], none);
-      const vec per_light = 1.0f / (0.0225f * square + 1e-12f), per_spread = 1.0f / (0.3f * spread);
+      const vec per_light = 1.0f / (SIMILAR * square + 1e-12f), per_spread = 1.0f / (SPREAD * spread);
       const auto is_known = (of(0) > 1e-3f) & (of(1) > 1e-3f);  // else the neighbours decide
       const vec reliability = is_known ? most(contrast / (contrast + 0.5f * spread) - 0.1f, none) / 0.9f : one;
       float likely[2][LANES], surfaces[2][LANES], *around = group.around[k / LANES].alike[0];
@@ -883,7 +927,7 @@ class Repair {
       for (size_t k = 0; k < group.edges.size(); k++) {
         const Edge &edge = group.edges[k];
         const float score = group.judged[k].score, level = (nearness(edge.i) - edge.far) / std::max(edge.near - edge.far, 1e-12f);
-        if (marks_[edge.i] & RAMP ? std::fabs(level - 0.5f) <= 0.3f : edge.kind / DIRECTIONS % RINGS != RINGS - 1) continue;
+        if (marks_[edge.i] & RAMP ? std::fabs(level - 0.5f) <= CLEAR_LEVEL : edge.kind / DIRECTIONS % RINGS != RINGS - 1) continue;
         const float weight = std::min(0.5f * std::fabs(score), 1.0f);
         total += weight;
         if ((score > 0) == (level > 0.5f)) agreed += weight;
@@ -946,7 +990,7 @@ class Repair {
   // Standard deviation, in pixels, of the blur that turned steps into ramps.
   float blur() const {
     const double width = CLIMBED * found_.middles / std::max(found_.climbed, 1e-12);
-    return clamp((float)std::sqrt(std::max(width * width - PIXEL, 0.0)), 0.2f, 3.0f);
+    return clamp((float)std::sqrt(std::max(width * width - PIXEL, 0.0)), LEAST_BLUR_PX, MOST_BLUR_PX);
   }
 
   // Decides which surface pixels show, and moves them to its nearness; on ramps in proportion to the evidence. Returns the
@@ -1075,7 +1119,7 @@ class Repair {
       explained[i] = both[i] * both[i] / std::max(of_x[i] * yy, 1e-12f);
     }
     const float b = both[0] / std::max(of_x[0], 1e-9f), better = clamp01((explained[0] - explained[1]) / std::max(BETTER * (1.0f - explained[1]), 1e-6f));
-    return {mean_y - b * mean_x[0] + own, b, of_x[0] > 0.004f ? clamp01((explained[0] - 0.5f) / 0.3f) * better : 0.0f};
+    return {mean_y - b * mean_x[0] + own, b, of_x[0] > 0.004f ? clamp01((explained[0] - EXPLAINED) / EXPLAINED_MORE) * better : 0.0f};
   }
 
   // Raises the nearness of lamps of a few pixels, which a soft map averages with their surroundings.

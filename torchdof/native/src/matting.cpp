@@ -1,15 +1,26 @@
 // Matting: a pixel at a depth edge mixes the light of two surfaces but has the depth of one. Splits it into both, as
 // described in render/matting.py.
+#include "constants/matting.h"
+#include "constants/pipeline.h"
 #include "engine.h"
 
 namespace torchdof {
 namespace {
 
-// Constants of render/matting.py, which gives their meanings, units and effects: mixed pixels, emitters.
-constexpr float EDGE_PX = 0.5f, UNCLEAN = 1e-2f, TRUST = 10.0f, UNSURE = 3.0f, TEXTURE = 50.0f, MOST_CLEAN = 4.0f, ALIKE = 1.0f / 255, UNBOUNDED = 1e6f;
-constexpr int EMITTER_REACH = 3, TOUCHING = 2;
-constexpr float DIM = 0.1f, MOST_WEIGHT = 0.98f;
-constexpr float SAME_PX = 0.5f;  // px of coc: a background at most this far behind the image's surface is the same surface
+// Constants of render/matting.py and render/pipeline.py, which give their meanings, units and effects.
+constexpr float EDGE_PX = (float)constants::matting::EDGE_PX;
+constexpr float UNCLEAN = (float)constants::matting::UNCLEAN;
+constexpr float TRUST = (float)constants::matting::TRUST;
+constexpr float UNSURE = (float)constants::matting::UNSURE;
+constexpr float TEXTURE = (float)constants::matting::TEXTURE;
+constexpr float MOST_CLEAN = (float)constants::matting::MOST_CLEAN;
+constexpr float ALIKE = (float)constants::matting::ALIKE;
+constexpr float UNBOUNDED = (float)constants::matting::UNBOUNDED;
+constexpr float DIM = (float)constants::matting::DIM;
+constexpr float MOST_WEIGHT = (float)constants::matting::MOST_WEIGHT;
+constexpr int EMITTER_REACH = constants::matting::EMITTER_REACH;
+constexpr int TOUCHING = constants::matting::TOUCHING;
+constexpr float SAME_PX = (float)constants::pipeline::SAME_PX;
 enum Side { IN_FRONT = -1, BEHIND = 1 };  // of an emitter, relative to a surface
 
 // Windows around the pixels of a block
@@ -22,8 +33,10 @@ constexpr int SIDE = BLOCK + 2 * MARGIN;   // of the window of coc
 constexpr int EDGES = BLOCK + 2 * RIM;     // of the windows of edges and light
 constexpr int PITCH = 24;                  // of all
 
-// Falloff of Gaussians of 0.6 px, _SOFTNESS_PX, and 0.8 px, _UNSURE_PX, beside their centre.
-constexpr float SMALL_BESIDE = 0.24935221f, SMALL_DIAGONAL = 0.06217652f, WIDE_BESIDE = 0.45783336f, WIDE_DIAGONAL = 0.20961138f;
+// Falloff of the Gaussians of both softnesses, beside their centre.
+constexpr float SMALL_BESIDE = (float)constants::matting::SOFTNESS_FALLOFF;
+constexpr float WIDE_BESIDE = (float)constants::matting::UNSURE_FALLOFF;
+constexpr float SMALL_DIAGONAL = SMALL_BESIDE * SMALL_BESIDE, WIDE_DIAGONAL = WIDE_BESIDE * WIDE_BESIDE;
 
 // An image whose mixed pixels are split.
 struct Frame {
