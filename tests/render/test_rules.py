@@ -46,7 +46,7 @@ def scene_for(rule: str) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize("rule", RULES)
 def test_the_picture_changes_without_a_rule(rule: str) -> None:
     image, coc_px = scene_for(rule)
-    mode: DepthEdges = "repair" if rule == "rounding" else "auto"  # "auto" leaves such a map as it is
+    mode: DepthEdges = "repair" if rule == "rounding" else "auto"  # "auto" does not change this map
     with torch.inference_mode():
         with without([]):
             whole = blur_by_coc(image, coc_px, depth_edges=mode)

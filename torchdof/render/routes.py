@@ -37,7 +37,7 @@ from ..validation import engine_reads
 from .plan import KERNELS_PER_PX, Plan
 
 Call = Literal["image", "stack", "splat", "file", "whole file"]
-"""What is called: the rendering of an image or of a stack of layers, ``splat``, or the export in tiles or whole."""
+"""The kind of call: the rendering of an image or of a stack of layers, ``splat``, or the export in tiles or whole."""
 
 Engine = Literal["compiled", "steps", "PyTorch", "graph"]
 
@@ -70,7 +70,7 @@ def refuse(
 
     Args:
         options: Options of the rendering.
-        call: What is called.
+        call: The kind of call.
         background: Whether a background is given.
         attention: Whether the viewer's attention is given.
         plan: Whether a plan is given.

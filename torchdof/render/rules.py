@@ -53,7 +53,7 @@ class Rules:
 
 
 RULES = {field.name: str(field.metadata["does"]) for field in dataclasses.fields(Rules)}
-"""Name of each rule, and what it does."""
+"""Description of each rule, by its name."""
 
 _ALL = Rules()
 _active: ContextVar[Rules] = ContextVar("rules", default=_ALL)
