@@ -32,7 +32,7 @@ ALLOWED = {
     "export": {"extras", "pixels", "tensors", "validation", "io", "optics", "options", "render", "reference", "module"},
     "augmentation": {"tensors", "validation", "io", "optics", "options", "module"},
     "distributed": {"extras", "validation", "io", "depth", "render", "module", "augmentation"},
-    "bench": {"validation", "io", "optics", "reference", "module", "export"},
+    "bench": {"validation", "io", "optics", "render", "reference", "module", "export"},
     "cli": {
         *("tensors", "validation", "native", "io", "optics", "depth", "options", "render", "module"),
         *("extras", "fit", "export", "bench"),

@@ -9,6 +9,8 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
 
+import torch
+
 from .. import native
 
 __all__ = ["RULES", "Rules", "active", "without"]
@@ -60,8 +62,8 @@ _active: ContextVar[Rules] = ContextVar("rules", default=_ALL)
 
 
 def active() -> Rules:
-    """The rules that apply in this block."""
-    return _active.get()
+    """The rules that apply in this block; all in compiled code, which cannot read a context variable."""
+    return _ALL if torch.compiler.is_compiling() else _active.get()
 
 
 @contextlib.contextmanager
