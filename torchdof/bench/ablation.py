@@ -43,8 +43,8 @@ def compare(truth: Path, out: Path, degraded: bool, rules: Sequence[str]) -> Non
                 with without([rule] if rule else []):
                     psnr = error(blur_by_coc(scene.image, coc_px), scene.truth)["psnr_db"]
                 whole = whole if rule else psnr
-                details.append({"without": rule, "depth": kind, "scene": scene.name, "change_db": psnr - whole})
-                details[-1] |= {"psnr_db": psnr}
+                case = {"without": rule, "depth": kind, "scene": scene.name}
+                details.append({**case, "psnr_db": psnr, "change_db": psnr - whole})
                 bar.advance(task)
     rows: list[Row] = []
     for kind in dict.fromkeys(kind for _, kind in cases):
