@@ -13,7 +13,7 @@ from ..reference.degraded import KINDS, degrade
 from ..reference.scenes import read_scenes
 from ..render.rules import RULES, without
 from .measurement import error
-from .report import Row, publish
+from .report import Row, publish, summary
 
 __all__ = ["compare"]
 
@@ -46,13 +46,10 @@ def compare(truth: Path, out: Path, degraded: bool, rules: Sequence[str]) -> Non
                 case = {"without": rule, "depth": kind, "scene": scene.name}
                 details.append({**case, "psnr_db": psnr, "change_db": psnr - whole})
                 bar.advance(task)
-    rows: list[Row] = []
-    for kind in dict.fromkeys(kind for _, kind in cases):
-        for rule in ("", *rules):
-            of_rule = [row for row in details if (row["without"], row["depth"]) == (rule, kind)]
-            changes = [row["change_db"] for row in of_rule]
-            means = {name: statistics.fmean(row[name] for row in of_rule) for name in ("psnr_db", "change_db")}
-            ends = {"least_db": min(changes), "most_db": max(changes)}
-            rows.append({"without": rule, "depth": kind, **means, **ends, "rule": RULES.get(rule, "")})
+    means, least, most = (summary(details, ["without", "depth"], of) for of in (statistics.fmean, min, max))
+    rows = [
+        {**mean, "least_db": low["change_db"], "most_db": high["change_db"], "rule": RULES.get(mean["without"], "")}
+        for mean, low, high in zip(means, least, most, strict=True)
+    ]
     remarks = ["Means over the scenes, by the plain engine; least_db and most_db are the smallest and largest change."]
     publish("What each rule is worth", rows, remarks, out / "ablation", details=details)

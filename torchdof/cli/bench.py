@@ -83,11 +83,9 @@ class Bench(Scene, Blur, _Speed, _Accuracy, Command):
         if self.without and self.ablation:
             raise ValueError("--ablation measures every rule; leave --without out")
         from ..bench import ablation
-        from ..render.rules import RULES
+        from ..render.rules import RULES, refuse_unknown
 
-        for name in self.without:
-            if name not in RULES:
-                raise ValueError(f"--without: there is no rule {name!r}; the rules are {', '.join(RULES)}")
+        refuse_unknown(self.without, "--without: ")
         check_writable(out / "ablation.csv")
         ablation.compare(truth, out, self.degrade, self.without or list(RULES))
 

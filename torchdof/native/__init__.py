@@ -39,7 +39,7 @@ _instructions = "avx2" if torch.backends.cpu.get_cpu_capability().startswith("AV
 
 _SMALL_FRAME = 2**16  # pixels; up to this size the main thread renders itself, which saves 0.1 ms
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
-_of_thread = threading.local()  # its count, if set, is the number of threads for calls of this thread
+_of_thread = threading.local()  # count: threads for calls of this thread; is_off: they use the plain engine
 _REVISION = 15  # of ``src/api.h``
 
 Rules = Sequence[tuple[int, float, float, float]]
@@ -145,26 +145,24 @@ def chosen() -> bool:
     return library is not None
 
 
-@contextlib.contextmanager
-def engine_off() -> Iterator[None]:
-    """In this block calls of this thread use the plain engine."""
-    before = getattr(_of_thread, "is_off", False)
-    _of_thread.is_off = True
-    try:
-        yield
-    finally:
-        _of_thread.is_off = before
+def engine_off() -> contextlib.AbstractContextManager[None]:
+    """A block in which calls of this thread use the plain engine."""
+    return _in_this_thread("is_off", True)
+
+
+def threads_are(count: int) -> contextlib.AbstractContextManager[None]:
+    """A block in which the engine uses ``count`` threads for calls of this thread, whatever PyTorch uses."""
+    return _in_this_thread("count", count)
 
 
 @contextlib.contextmanager
-def threads_are(count: int) -> Iterator[None]:
-    """In this block the engine uses ``count`` threads for calls of this thread, whatever PyTorch uses."""
-    before = getattr(_of_thread, "count", None)
-    _of_thread.count = count
+def _in_this_thread(name: str, value: int) -> Iterator[None]:
+    before = getattr(_of_thread, name, None)
+    setattr(_of_thread, name, value)
     try:
         yield
     finally:
-        _of_thread.count = before
+        setattr(_of_thread, name, before)
 
 
 def _threads() -> int:

@@ -21,7 +21,7 @@ from torch import Tensor
 from .. import native, pixels, validation
 from ..optics.kernel_cache import kept
 from ..options import DepthEdges
-from ..tensors import is_differentiated, is_in_memory, is_traced
+from ..tensors import is_differentiated, is_empty, is_in_memory, is_traced
 from ..validation import ends
 from .ops import EAGER, Ops
 from .rules import active
@@ -321,7 +321,7 @@ def _repair(
         is_inexact = is_related & (is_soft | (doubts > _EXACT * steps))
         doubtful = doubtful & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
     edge_pixels = pixels.indices(doubtful)
-    if auto and not is_traced() and len(edge_pixels) == 0:  # nor lamps: a soft map has ramps, which are selected
+    if auto and is_empty(edge_pixels):  # nor lamps: a soft map has ramps, which are selected
         return -nearness if of_coc else nearness
     score, evidence, near, far = _judge(looks, given, edge_pixels, _CLEAR, ops)
     shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0])

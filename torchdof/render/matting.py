@@ -13,7 +13,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from .. import native, pixels
-from ..tensors import is_traced
+from ..tensors import is_empty
 from .compiled_steps import compiled_step
 from .ops import EAGER, Ops
 from .rules import active
@@ -233,7 +233,7 @@ def attribute_emitters(
     brightest = light.amax(1, keepdim=True)
     is_bright = brightest > threshold
     bright = pixels.indices(is_bright if valid is None else is_bright & (valid > 0))
-    if not is_traced() and len(bright) == 0:
+    if is_empty(bright):
         return surfaces
     window = pixels.around(bright, coc_px, _EMITTER_REACH)
     seen, own_coc, limit = pixels.pick(light, bright), pixels.pick(coc_px, bright)[0], pixels.pick(threshold, bright)[0]

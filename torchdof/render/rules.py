@@ -13,7 +13,7 @@ import torch
 
 from .. import native
 
-__all__ = ["RULES", "Rules", "active", "without"]
+__all__ = ["RULES", "Rules", "active", "refuse_unknown", "without"]
 
 
 def _rule(does: str) -> bool:
@@ -66,6 +66,13 @@ def active() -> Rules:
     return _ALL if torch.compiler.is_compiling() else _active.get()
 
 
+def refuse_unknown(rules: Sequence[str], option: str = "") -> None:
+    """Refuse names that are none of :data:`RULES`; the message begins with the option that has them."""
+    for name in rules:
+        if name not in RULES:
+            raise ValueError(f"{option}there is no rule {name!r}; the rules are {', '.join(RULES)}")
+
+
 @contextlib.contextmanager
 def without(rules: Sequence[str]) -> Iterator[None]:
     """Render without these rules in this block, by the plain engine.
@@ -73,9 +80,7 @@ def without(rules: Sequence[str]) -> Iterator[None]:
     Raises:
         ValueError: If there is no rule of a name.
     """
-    for name in rules:
-        if name not in RULES:
-            raise ValueError(f"there is no rule {name!r}; the rules are {', '.join(RULES)}")
+    refuse_unknown(rules)
     token = _active.set(dataclasses.replace(_active.get(), **dict.fromkeys(rules, False)))
     try:
         with native.engine_off():

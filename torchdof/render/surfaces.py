@@ -205,9 +205,8 @@ def _stacked(
         cover = torch.ones_like(x) if weight is None else weight
         here = cover * eased((behind / _HIDING_SHARE).clamp(max=1.0))
         passes = 1.0 - here * (1.0 - behind)  # share not hidden by the surface's part in front of layer k
-        stops = (
-            cover * (behind - beyond) / passes.clamp_min(_LEAST_PASSING)
-        )  # share of the arriving light stopped in layer k
+        # share of the arriving light stopped in layer k
+        stops = cover * (behind - beyond) / passes.clamp_min(_LEAST_PASSING)
         stopped.append(arriving * stops)
         arriving, visible = arriving * (1.0 - stops), visible * passes
         unknown = unknown * (1.0 - here)

@@ -8,19 +8,19 @@ namespace torchdof {
 namespace {
 
 // Constants of render/matting.py and render/pipeline.py, which give their meanings, units and effects.
-constexpr float EDGE_PX = (float)constants::matting::EDGE_PX;
-constexpr float UNCLEAN = (float)constants::matting::UNCLEAN;
-constexpr float TRUST = (float)constants::matting::TRUST;
-constexpr float UNSURE = (float)constants::matting::UNSURE;
-constexpr float TEXTURE = (float)constants::matting::TEXTURE;
-constexpr float MOST_CLEAN = (float)constants::matting::MOST_CLEAN;
-constexpr float ALIKE = (float)constants::matting::ALIKE;
-constexpr float UNBOUNDED = (float)constants::matting::UNBOUNDED;
-constexpr float DIM = (float)constants::matting::DIM;
-constexpr float MOST_WEIGHT = (float)constants::matting::MOST_WEIGHT;
+constexpr float EDGE_PX = constants::matting::EDGE_PX;
+constexpr float UNCLEAN = constants::matting::UNCLEAN;
+constexpr float TRUST = constants::matting::TRUST;
+constexpr float UNSURE = constants::matting::UNSURE;
+constexpr float TEXTURE = constants::matting::TEXTURE;
+constexpr float MOST_CLEAN = constants::matting::MOST_CLEAN;
+constexpr float ALIKE = constants::matting::ALIKE;
+constexpr float UNBOUNDED = constants::matting::UNBOUNDED;
+constexpr float DIM = constants::matting::DIM;
+constexpr float MOST_WEIGHT = constants::matting::MOST_WEIGHT;
 constexpr int EMITTER_REACH = constants::matting::EMITTER_REACH;
 constexpr int TOUCHING = constants::matting::TOUCHING;
-constexpr float SAME_PX = (float)constants::pipeline::SAME_PX;
+constexpr float SAME_PX = constants::pipeline::SAME_PX;
 enum Side { IN_FRONT = -1, BEHIND = 1 };  // of an emitter, relative to a surface
 
 // Windows around the pixels of a block
@@ -34,8 +34,8 @@ constexpr int EDGES = BLOCK + 2 * RIM;     // of the windows of edges and light
 constexpr int PITCH = 24;                  // of all
 
 // Falloff of the Gaussians of both softnesses, beside their centre.
-constexpr float SMALL_BESIDE = (float)constants::matting::SOFTNESS_FALLOFF;
-constexpr float WIDE_BESIDE = (float)constants::matting::UNSURE_FALLOFF;
+constexpr float SMALL_BESIDE = constants::matting::SOFTNESS_FALLOFF;
+constexpr float WIDE_BESIDE = constants::matting::UNSURE_FALLOFF;
 constexpr float SMALL_DIAGONAL = SMALL_BESIDE * SMALL_BESIDE, WIDE_DIAGONAL = WIDE_BESIDE * WIDE_BESIDE;
 
 // An image whose mixed pixels are split.
