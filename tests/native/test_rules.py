@@ -29,6 +29,9 @@ RULES: dict[str, Callable[[Tensor], Tensor]] = {
     "ramp(x, false)": lambda x: x.clamp(0.0, 1.0),
     "continuation(v)[0]": surfaces.continuation_weight,
     "visible_part(v)[0]": surfaces.visible_part,
+    "at_focus(v)[0]": surfaces.at_focus,
+    "stands_in(v)[0]": surfaces.stands_in,
+    "alone(v)[0]": surfaces.alone,
     "(v + raise(lacking(all(5e-4f), v)))[0]": lambda x: composite.raised(torch.full_like(x, 5e-4), x),
 }
 # C++ expression of a derivative -> the rule
@@ -38,6 +41,9 @@ SLOPES: dict[str, str] = {
     "slope_of_ramp(v, false)[0]": "ramp(x, false)",
     "slope_of_continuation(v)[0]": "continuation(v)[0]",
     "slope_of_visible_part(v)[0]": "visible_part(v)[0]",
+    "slope_of_at_focus(v)[0]": "at_focus(v)[0]",
+    "slope_of_stands_in(v)[0]": "stands_in(v)[0]",
+    "slope_of_alone(v)[0]": "alone(v)[0]",
     "1.0f + slope_of_raise(lacking(all(5e-4f), v))[0]": "(v + raise(lacking(all(5e-4f), v)))[0]",
     "float(within(unlimited_another_surface(x)))": "is_another_surface(x)",
 }
@@ -106,5 +112,10 @@ def test_rules_at_points_computed_by_hand() -> None:
     assert surfaces.visible_part(torch.tensor([0.0, 0.03, 0.5])).tolist() == pytest.approx([1.0, 0.5, 0.0])
     cover = torch.tensor([0.003, 0.053, 0.6])
     assert surfaces.continuation_weight(cover).tolist() == pytest.approx([0.0, 0.4735, 0.4])
+    assert surfaces.at_focus(torch.tensor([-1.0, -0.1, 0.0, 5.0])).tolist() == pytest.approx([0.0, 0.75, 1.0, 1.0])
+    assert surfaces.stands_in(torch.tensor([-3.5, -2.25, -1.0, -0.0125, 1.0])).tolist() == pytest.approx(
+        [0, 0.5, 1, 0.25, 0]
+    )
+    assert surfaces.alone(torch.tensor([0.0, 0.00075, 0.003])).tolist() == pytest.approx([1.0, 0.5, 0.0])
     weights = torch.tensor([0.0, 0.001, 0.1])
     assert composite.raised(weights, weights).tolist() == pytest.approx([0.001, 0.001, 0.1])

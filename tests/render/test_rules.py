@@ -24,6 +24,10 @@ def scene_for(rule: str) -> tuple[Tensor, Tensor]:
         levels = torch.arange(100.0).repeat_interleave(8).expand(1, 1, 32, -1)
         levels = levels + 2.0 * (torch.rand(levels.shape, generator=generator) < 0.1)
         return torch.rand(1, 3, *levels.shape[-2:], generator=generator), 0.53 * levels
+    if rule == "stand_ins":  # a dark surface with steps, before a bright one far behind
+        coc = torch.full((1, 1, 64, 96), 60.0)
+        coc[..., 24:], coc[..., 40:] = -1.0, -0.5
+        return torch.where(coc > 0, 1.0, 0.01).expand(-1, 3, -1, -1).contiguous(), coc
     if rule in ("own_slope", "fewer_rays"):
         light = torch.rand(1, 3, 64, 96, generator=torch.Generator().manual_seed(0))
         y, x = torch.meshgrid(torch.linspace(0, 1, 64), torch.linspace(0, 1, 96), indexing="ij")

@@ -15,6 +15,7 @@ from .compiled_steps import compiled_step
 from .downsampling import downsampled, upsampled
 from .ops import EAGER, Ops
 from .plan import LayerKernel
+from .rules import active
 from .scatter import fold
 from .surfaces import PaddedFrame, PaddedSurface
 
@@ -109,6 +110,7 @@ def _composite_layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter:
     3. Scatter each group by one convolution.
     4. Put its layers in front of the picture at their resolution.
     5. Upsample coarse results and put them in front of the full picture in the same way.
+    6. Between the focus and the layers in front of it, put :meth:`PaddedFrame.stand_ins` in front of the picture.
     """
     order = [k for k, occupied in enumerate(frame.occupied()) if occupied][::-1]
     light, colours, backed = frame.surfaces[0].light, frame.colours, frame.behind is not None
@@ -144,20 +146,26 @@ def _composite_layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter:
 
     picture = blank(*frame.area)
 
-    # A run has one resolution. A coarse one stays on one side of the focus, because finer layers lie between the sides.
+    # A run has one resolution and stays on one side of the focus.
     # A group of a run has at most as many layers as fill the channels of one convolution.
     uniform = each == 1 and blurs[0].mask is None
     most = ops.channels // (colours + 1 + frame.occlusion) if uniform else 1
     runs: dict[tuple[int, bool], list[list[int]]] = {}
+    before_focus = [min(places) < 0 for places in zip(*frame.nodes, strict=True)]
     for k in order:
-        groups = runs.setdefault((blurs[k].scale, blurs[k].scale > 1 and min(row[k] for row in frame.nodes) < 0), [])
+        groups = runs.setdefault((blurs[k].scale, before_focus[k]), [])
         group = groups[-1] if groups else []
         widths = [blurs[j].kernel.shape[-1] for j in [*group, k]]
         if group and group[-1] == k + 1 and len(group) < most and max(widths) ** 2 <= 2 * min(widths) ** 2:
             group.append(k)
         else:
             groups.append([k])
-    for (scale, _), groups in runs.items():
+    has_stand_ins = frame.occlusion and active().stand_ins
+    for (scale, is_before_focus), groups in runs.items():
+        if is_before_focus and has_stand_ins:
+            has_stand_ins = False
+            light, share = frame.stand_ins()
+            picture = torch.cat(in_front((light, 1.0 - share if backed else share), _parts(picture, colours)), 1)
         part = picture
         if scale > 1:  # one more pixel on each side, for the interpolation
             part = blank(*(n // scale + 2 for n in frame.area))

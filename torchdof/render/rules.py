@@ -35,6 +35,7 @@ class Rules:
     light_behind: bool = _rule("puts light behind the hidden surface")
     own_slope: bool = _rule("takes a slightly farther sample for the same, sloping surface")
     continuation: bool = _rule("continues a mixed pixel's far surface behind the near one")
+    stand_ins: bool = _rule("lets barely blurred surfaces be their own background")
     rays: bool = _rule("splats highlights ray by ray")
     occluders: bool = _rule("lets surfaces stop these rays")
     whole_highlights: bool = _rule("sends a mixed pixel's whole highlight from its far surface")

@@ -27,6 +27,11 @@ _LEAST_PASSING = 1e-6  # smallest divisor: share of the light that passes the pa
 _CONTINUES_FROM = 0.1
 """Visible share of a far surface, above HIDDEN_WEIGHT, at which it continues in full behind the near one."""
 
+# Surfaces that stand in for what lies behind them; distances on the blur axis from the focus to the near side
+_AT_FOCUS = 0.4  # where another surface begins to count as one at the focus; larger: fewer pixels need a stand-in
+_OFF_FOCUS = 0.05  # from which surfaces stand in in full; larger: it fades in over more depth
+_BARELY_BLURRED = 1.5  # up to which surfaces stand in in full, and not at all at twice this; larger: fewer bright lines
+
 
 class Surface(NamedTuple):
     """A surface in each pixel: light ``[B, C, H, W]``, signed coc and weight ``[B, 1, H, W]``.
@@ -145,6 +150,44 @@ class PaddedFrame:
         pairs = [(weight[:, :-1], weight[:, 1:]) for weight in weights.unbind(0)]
         surfaces = [PaddedSurface(*(t.unsqueeze(1) for t in s if t is not None)) for s in surfaces]
         return (_stacked if self.stacked else _mixed)(surfaces, pairs)
+
+    def stand_ins(self) -> tuple[Tensor, Tensor]:
+        """What stands in for the picture at and behind the focus: light ``[B, C, h, w]`` and cover ``[B, 1, h, w]``.
+
+        In front of the focus, kernels become smaller with each layer. A kernel may just reach a farther part of its own
+        surface whose smaller kernel does not reach back. The light that passes there would come from far behind, and
+        draw a bright line on a dark surface. So a barely blurred surface is its own background, in pixels without
+        another surface at the focus or behind it. With ``w`` the weights of a pixel's surfaces and ``x`` their places,
+        the cover of surface j is ``w_j stands_in(x_j) alone(sum(w_i at_focus(x_i)))``, where i are the other surfaces.
+        """
+        surfaces = [PaddedSurface(*(self.cut(t, 0) for t in s if t is not None)) for s in self.surfaces]
+        left = torch.ones_like(surfaces[0].x)
+        weights = []
+        for surface in surfaces:
+            weight = left if surface.weight is None else surface.weight * left
+            weights.append(weight)
+            left = left - weight if self.stacked else left
+        x, weight = torch.stack([s.x for s in surfaces]), torch.stack(weights)
+        shown = weight * at_focus(x)
+        # not a difference from the sum of all, which would round badly
+        others = torch.stack([shown[:j].sum(0) + shown[j + 1 :].sum(0) for j in range(len(surfaces))])
+        cover = weight * stands_in(x) * alone(others)
+        return torch.stack([s.light * part for s, part in zip(surfaces, cover, strict=True)]).sum(0), cover.sum(0)
+
+
+def at_focus(x: Tensor) -> Tensor:
+    """How far a surface at places ``x`` counts as one at the focus or behind it, 0 to 1."""
+    return (1.0 + x / _AT_FOCUS).clamp(0.0, 1.0)
+
+
+def stands_in(x: Tensor) -> Tensor:
+    """How far a surface at places ``x`` in front of the focus stands in for what lies behind it, 0 to 1."""
+    return (2.0 + x / _BARELY_BLURRED).clamp(0.0, 1.0) * (x / -_OFF_FOCUS).clamp(0.0, 1.0)
+
+
+def alone(others: Tensor) -> Tensor:
+    """The same for the weight of other surfaces at the focus or behind it: a hidden sample is enough for 0."""
+    return (1.0 - others * (2.0 / HIDDEN_WEIGHT)).clamp(0.0, 1.0)
 
 
 def continuation_weight(cover: Tensor) -> Tensor:

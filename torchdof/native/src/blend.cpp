@@ -6,6 +6,8 @@
 //   l = K * (m I),  w = K * m,  v = K * r,   n = w + v' (v' is v, raised where w + v < KNOWN)
 //   picture = l / n + (1 - w / n) picture
 //
+// Between the focus and the layers before it, surfaces stand in for what lies behind them (stand_ins in render/surfaces.py).
+//
 // Backward, the blurred l, w and v are computed again and kept, block by block; their gradients replace them. Each block
 // then composites its layers again, walks back through them from near to far, and the gradients of l, w and v are
 // scattered by the turned kernels to the gradients of m I, m and r, and from these to the surfaces.
@@ -92,6 +94,7 @@ class Blend {
   }
 
   void gradient(const float *out_gradient, float *const *light, float *const *place, float *const *weight) {
+    light_ = light, place_ = place, weight_ = weight;
     blur_all();
     const size_t area = (size_t)scene_.height * scene_.width;
     for (Run &run : runs_)
@@ -114,18 +117,18 @@ class Blend {
         walk(steps, block, events, slopes);
       });
     }
-    light_ = light, place_ = place, weight_ = weight;
     for (const Run &run : runs_) each_tile(run, values_, [&](int k, const Tile &tile) { scatter_back(run, k, tile); });
   }
 
  private:
   static constexpr int MOST = MOST_PLANES;
   using Events = std::vector<float>;
-  // A step of a composite, far to near: a layer, or the canvas of a coarse run (then `run` is not null).
+  // A step of a composite, far to near: a layer, the canvas of a coarse run (then `run` is not null), or the stand-ins.
   struct Step {
     const Run *run;
     int layer;
   };
+  static constexpr Step STAND_INS = {nullptr, -1};
 
   const Run &fine() const { return *std::find_if(runs_.begin(), runs_.end(), [](const Run &run) { return run.scale == 1; }); }
 
@@ -492,15 +495,22 @@ class Blend {
   }
   std::vector<Step> steps_of_picture() const {
     std::vector<Step> steps;
+    bool has_stand_ins = over_;
+    auto add = [&](Step step, int layer) {
+      if (has_stand_ins && layers_[layer].node < 0) has_stand_ins = false, steps.push_back(STAND_INS);
+      steps.push_back(step);
+    };
     for (const Run &run : runs_) {
-      const std::vector<Step> more = run.scale > 1 ? std::vector<Step>{{&run, -1}} : steps_of(run);
-      steps.insert(steps.end(), more.begin(), more.end());
+      if (run.scale > 1)
+        add({&run, -1}, run.layers[0]);
+      else
+        for (int k : run.layers) add({nullptr, k}, k);
     }
     return steps;
   }
   // Puts a step in front of a canvas; returns false if it is empty there. `kept`: takes a coarse canvas, interpolated.
   bool put(const Step &step, int block, float *canvas, float *kept) const {
-    return step.run ? join(*step.run, block, canvas, kept) : put_layer(step.layer, block, canvas);
+    return step.run ? join(*step.run, block, canvas, kept) : step.layer < 0 ? put_stand_ins(block, canvas) : put_layer(step.layer, block, canvas);
   }
   void composite(const std::vector<Step> &steps, int block, float *canvas) const {
     float kept[MOST * BLOCK_PIXELS];
@@ -522,6 +532,79 @@ class Blend {
       over(e, i, front((scene_.backed ? n.behind : own) * per), values, per, canvas);
     });
     return true;
+  }
+
+  // The surfaces of some pixels as stand-ins.
+  struct StandIns {
+    vec place[2], weight[2], others[2], cover[2];  // others: weight of the other surface at the focus
+    vec sum = {};                                  // of covers
+  };
+  StandIns stand_ins(size_t at, int n) const {
+    StandIns s;
+    for (int j = 0; j < S_; j++) {
+      s.place[j] = load_some(scene_.place[j] + at, n);
+      s.weight[j] = weight_at(j, at, n);
+    }
+    for (int j = 0; j < S_; j++) {
+      s.others[j] = S_ > 1 ? s.weight[1 - j] * at_focus(s.place[1 - j]) : vec{};
+      s.cover[j] = s.weight[j] * stands_in(s.place[j]) * alone(s.others[j]);
+      s.sum += s.cover[j];
+    }
+    return s;
+  }
+  // Calls body(i, at, n, stand_ins) for up to LANES pixels at a time, i in a block of the picture and `at` in the padded
+  // frame, where any surface stands in.
+  template <typename Body>
+  void each_stand_in(int block, const Body &body) const {
+    const int y0 = block / fine().block_columns * BLOCK, x0 = block % fine().block_columns * BLOCK;
+    for (int y = 0; y < std::min(BLOCK, scene_.rows - y0); y++)
+      for (int x = 0; x < std::min(BLOCK, scene_.columns - x0); x += LANES) {
+        const size_t at = (size_t)(y0 + y) * scene_.columns + x0 + x;
+        const int n = std::min(LANES, scene_.columns - x0 - x);
+        const StandIns s = stand_ins(at, n);
+        if (any_positive(s.sum)) body(y * BLOCK + x, at, n, s);
+      }
+  }
+  Front front_of(const StandIns &s) const { return front(scene_.backed ? all(1.0f) - s.sum : s.sum); }
+  bool put_stand_ins(int block, float *canvas) const {
+    bool any = false;
+    float light[MOST * BLOCK_PIXELS];
+    each_stand_in(block, [&](int i, size_t at, int n, const StandIns &s) {
+      any = true;
+      for (int c = 0; c < C_; c++) {
+        vec sum = {};
+        for (int j = 0; j < S_; j++) sum += s.cover[j] * load_some(scene_.light[j] + c * map_ + at, n);
+        store(light + c * BLOCK_PIXELS + i, sum);
+      }
+      for (int e = 0; e < E_; e++) over(e, i, front_of(s), light, all(1.0f), canvas);
+    });
+    return any;
+  }
+  // Walks back through the stand-ins, to the gradients of the surfaces.
+  void walk_stand_ins(int block, const float *behind, float *slopes) const {
+    each_stand_in(block, [&](int i, size_t at, int n, const StandIns &s) {
+      vec of_sum = {}, of_cover[2] = {}, of_weight[2] = {}, of_place[2] = {};
+      for (int e = 0; e < E_; e++)
+        of_sum += through(e, i, front_of(s), behind, slopes, [&](int c, vec slope) {
+          for (int j = 0; j < S_; j++) {
+            of_cover[j] += slope * load_some(scene_.light[j] + c * map_ + at, n);
+            add_some(light_[j] + c * map_ + at, slope * s.cover[j], n);
+          }
+        });
+      for (int j = 0; j < S_; j++) {
+        of_cover[j] += scene_.backed ? -of_sum : of_sum;
+        of_weight[j] += of_cover[j] * stands_in(s.place[j]) * alone(s.others[j]);
+        of_place[j] += of_cover[j] * s.weight[j] * slope_of_stands_in(s.place[j]) * alone(s.others[j]);
+        if (S_ == 1) continue;
+        const vec of_other = of_cover[j] * s.weight[j] * stands_in(s.place[j]) * slope_of_alone(s.others[j]);
+        of_weight[1 - j] += of_other * at_focus(s.place[1 - j]);
+        of_place[1 - j] += of_other * s.weight[1 - j] * slope_of_at_focus(s.place[1 - j]);
+      }
+      for (int j = 0; j < S_; j++) {
+        add_some(place_[j] + at, of_place[j], n);
+        if (scene_.weight[j]) add_some(weight_[j] + at, of_weight[j], n);
+      }
+    });
   }
 
   // Row and column of a coarse canvas before a pixel of the picture, and the fraction of the way to the next.
@@ -689,6 +772,8 @@ class Blend {
       if (!behind[i]) continue;
       if (steps[i].run)
         walk_join(*steps[i].run, block, behind[i], behind[i] + size, slopes);
+      else if (steps[i].layer < 0)
+        walk_stand_ins(block, behind[i], slopes);
       else
         walk_layer(steps[i].layer, block, behind[i], slopes);
     }

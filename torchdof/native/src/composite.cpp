@@ -77,6 +77,7 @@ struct Scratch {
   std::vector<uint32_t> occupied, partial, varying, every;
   std::vector<MaskedKernels> masked_kernels = std::vector<MaskedKernels>(TILE / FieldMask::COLUMNS);
   std::vector<const float *> pointers;
+  std::vector<vec> shown, cover;  // of each surface, as stand-ins
   std::vector<uint64_t> layers, block_layers;
   std::vector<WindowBlock> blocks;
   WindowPieces pieces;
@@ -168,6 +169,8 @@ class Composite {
       for (auto *rows : {&b.occupied, &b.partial, &b.varying}) rows->resize(window_);
       b.every.assign(window_, ~0u);
       b.pointers.resize(C_);
+      b.shown.resize(s_.count);
+      b.cover.resize(s_.count);
       b.layers.resize(index_.words);
     }
     return *scratches_[worker];
@@ -923,10 +926,49 @@ class Composite {
     }
   }
 
+  // Puts the surfaces that stand in for what lies behind them in front of the tile's canvas.
+  void add_stand_ins(int y0, int x0, int rows, int columns, Scratch &b) {
+    around(y0 / CELL, (y0 + rows - 1) / CELL, x0 / CELL, (x0 + columns - 1) / CELL, b.layers.data());
+    bool any = false;  // a pixel between a layer and the next one belongs to both
+    for (int k = 0; k < N_ && layers_[k].node < 0; k++) any |= layers_[std::min(k + 1, N_ - 1)].node > -2 * BARELY_BLURRED && has(b.layers.data(), k);
+    if (!any) return;
+    std::vector<float> memory((size_t)s_.count * (C_ + 2) * (TILE + LANES));
+    float *m = memory.data();
+    std::vector<float *> light(s_.count * C_), place(s_.count), weight(s_.count);
+    for (auto *v : {&light, &place, &weight})
+      for (float *&row : *v) row = m, m += TILE + LANES;
+    for (int y = 0; y < rows; y++) {
+      read_row(y0 + y, x0, columns, false, light.data(), place.data(), weight.data(), b);
+      for (int x = 0; x < columns; x += LANES) {
+        vec left = all(1.0f), share = {};
+        for (int j = 0; j < s_.count; j++) {
+          const vec at = load<vec>(place[j] + x), its = load<vec>(weight[j] + x) * left;
+          if (s_.independent) left -= its;
+          b.shown[j] = its * at_focus(at);
+          b.cover[j] = its * stands_in(at);
+        }
+        for (int j = 0; j < s_.count; j++) {
+          vec others = {};
+          for (int i = 0; i < s_.count; i++) others += i == j ? vec{} : b.shown[i];
+          share += b.cover[j] *= alone(others);
+        }
+        if (!any_positive(share)) continue;
+        const vec through = most(all(1.0f) - share, vec{});
+        for (int c = 0; c < C_ + E_; c++) {
+          vec sum = c < C_ ? vec{} : share;
+          for (int j = 0; c < C_ && j < s_.count; j++) sum += load<vec>(light[j * C_ + c] + x) * b.cover[j];
+          float *to = b.canvas[c] + y * TILE + x;
+          store(to, sum + through * load<vec>(to));
+        }
+      }
+    }
+  }
+
   // Renders one tile of the picture.
   //
   // 1. List the full-resolution layers whose blur reaches the tile, and read the window that they need.
-  // 2. From far to near, composite these layers and the coarser canvases onto the tile's canvas.
+  // 2. From far to near, composite these layers and the coarser canvases onto the tile's canvas; between the focus and the
+  //    layers before it, the surfaces that stand in for what lies behind them.
   // 3. Finish: light behind all layers, highlights.
   void tile(int tile_row, int tile_column, Scratch &b) {
     const int y0 = tile_row * TILE, x0 = tile_column * TILE, rows = std::min(TILE, H_ - y0), columns = std::min(TILE, W_ - x0);
@@ -948,14 +990,20 @@ class Composite {
     const int height = rows + 2 * halo, across = ceil_div(x0 + columns + halo - left, BLOCK) * BLOCK;
     if (!reaching.empty() && !s_.independent) find_blocks(top, height, left, across, b);
     size_t next = 0;
+    bool has_stand_ins = over_;
+    auto pass = [&](const Layer &l) {
+      if (has_stand_ins && l.node < 0) has_stand_ins = false, add_stand_ins(y0, x0, rows, columns, b);
+    };
     for (int r = (int)runs_.size() - 1; r >= 0; r--) {
       const Run &run = runs_[r];
       if (run.scale > 1) {
+        pass(layers_[run.first]);
         join_finer(run, y0, x0, b);
         continue;
       }
       for (; next < reaching.size() && reaching[next] >= run.first; next++) {
         const Layer &l = layers_[reaching[next]];
+        pass(l);
         const int first = halo - l.half, from = x0 - l.half - left, reach_rows = rows + 2 * l.half, reach_columns = columns + 2 * l.half;
         if (s_.independent)
           block_means(reaching[next], 1, top + first, left + from, reach_rows, reach_columns, first, from, b);

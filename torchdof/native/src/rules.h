@@ -106,6 +106,24 @@ inline vec slope_of_visible_part(vec nearer) {
   return within(nearer * (1.0f / HIDING_SHARE)) ? all(-1.0f / HIDING_SHARE) : vec{};
 }
 
+// How far a surface counts as one at the focus: clamp(1 + x / AT_FOCUS, 0, 1); how far one stands in for what lies behind it:
+// clamp(2 + x / BARELY_BLURRED, 0, 1) clamp(-x / OFF_FOCUS, 0, 1), times clamp(1 - 2 v / HIDDEN_WEIGHT, 0, 1) where other
+// surfaces at the focus have the weight v; and the derivatives. render/surfaces.py, at_focus, stands_in and alone.
+inline vec unlimited_at_focus(vec place) { return place * (1.0f / AT_FOCUS) + 1.0f; }
+inline vec at_focus(vec place) { return clamp01(unlimited_at_focus(place)); }
+inline vec slope_of_at_focus(vec place) { return within(unlimited_at_focus(place)) ? all(1.0f / AT_FOCUS) : vec{}; }
+inline vec unlimited_stand_in(vec place) { return place * (1.0f / BARELY_BLURRED) + 2.0f; }
+inline vec unlimited_off_focus(vec place) { return place * (-1.0f / OFF_FOCUS); }
+inline vec stands_in(vec place) { return clamp01(unlimited_stand_in(place)) * clamp01(unlimited_off_focus(place)); }
+inline vec slope_of_stands_in(vec place) {  // 0 where it is 0
+  const vec in = unlimited_stand_in(place), off = unlimited_off_focus(place);
+  const vec slope = (in <= all(1.0f) ? clamp01(off) * (1.0f / BARELY_BLURRED) : vec{}) - (off <= all(1.0f) ? clamp01(in) * (1.0f / OFF_FOCUS) : vec{});
+  return stands_in(place) > vec{} ? slope : vec{};
+}
+inline vec unlimited_alone(vec others) { return 1.0f - others * (2.0f / HIDDEN_WEIGHT); }
+inline vec alone(vec others) { return clamp01(unlimited_alone(others)); }
+inline vec slope_of_alone(vec others) { return within(unlimited_alone(others)) ? all(-2.0f / HIDDEN_WEIGHT) : vec{}; }
+
 // The normalizer of a layer, its weight w plus the weight v behind it, is raised where it is small: with l = max(KNOWN - w -
 // v, 0), by l^2 / (2 KNOWN), whose derivative by w or v is -l / KNOWN. render/composite.py, raised.
 inline vec lacking(vec weight, vec behind = vec{}) { return most(all(KNOWN) - weight - behind, vec{}); }
