@@ -404,8 +404,8 @@ void check_matte(unsigned seed) {
   std::vector<float> light = noise(random, pixels * channels, -0.1, 1.0), coc = noise(random, pixels, -0.1, 0.1);
   for (int y = 0, column = integer(0, width); y < height; y++)
     for (int x = column; x < width; x++) coc[size_t(y) * width + x] += 3.0f;
-  const std::vector<float> moved = noise(random, pixels, 0.0, 3.0), valid(pixels, 1.0f), slopes = noise(random, planes * pixels, -1.0, 1.0);
-  const float *maps[] = {light.data(), coc.data(), integer(0, 1) ? valid.data() : nullptr, integer(0, 1) ? moved.data() : nullptr};
+  const std::vector<float> valid(pixels, 1.0f), slopes = noise(random, planes * pixels, -1.0, 1.0);
+  const float *maps[] = {light.data(), coc.data(), integer(0, 1) ? valid.data() : nullptr};
   const auto split = [&](int threads) {
     std::vector<float> all(slopes.size()), of_light(light.size()), of_coc(pixels);
     float *const of_maps[] = {of_light.data(), of_coc.data()};

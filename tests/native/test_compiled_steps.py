@@ -269,19 +269,17 @@ def test_the_finest_level_and_its_gradients_equal_the_plain_engines(
     assert_both_engines_agree(computed, calls["farthest"], [1e-4] * 6, monkeypatch)
 
 
-@pytest.mark.parametrize("moved", [False, True])
 @pytest.mark.parametrize("hole", [False, True])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_mixed_pixels_and_their_gradients_equal_the_plain_engines(
-    channels: int, hole: bool, moved: bool, calls: dict[str, list[Any]], monkeypatch: pytest.MonkeyPatch
+    channels: int, hole: bool, calls: dict[str, list[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Some parts reach the image's darkest or brightest light, which limits them."""
     light, coc, valid = edges(channels, hole)
-    moved_px = 3.0 * torch.rand(coc.shape, generator=torch.Generator().manual_seed(9)) if moved else None
 
     def computed() -> list[Tensor]:
         given, its_coc = light.clone().requires_grad_(), coc.clone().requires_grad_()
-        own, other, other_coc, weight = matte(given, its_coc, valid, moved_px)
+        own, other, other_coc, weight = matte(given, its_coc, valid)
         out = torch.cat([own, other * weight, other_coc, weight], 1)  # light of hardly any weight is undefined
         seen = torch.rand(out.shape, generator=torch.Generator().manual_seed(1)) - 0.3
         return [out.detach(), *torch.autograd.grad((out * seen).sum(), (given, its_coc))]

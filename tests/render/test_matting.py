@@ -133,22 +133,6 @@ def test_lamps_in_focus_leave_no_halo_on_the_blurred_wall_behind_them() -> None:
     assert float((made - scene.truth[0])[:, around].abs().max()) < 0.02  # 0.18 with mean colours alone
 
 
-def test_an_edge_that_the_map_does_not_have_is_soft_where_texture_hides_it() -> None:
-    near, noise = COLUMNS < 40, 0.5 * torch.rand(1, 3, 64, 80, generator=torch.Generator().manual_seed(0))
-    light, coc = torch.where(near, 0.8, noise), torch.where(near, 0.0, 12.0)[None, None]
-    for moved in (0.0, 12.0):  # the map had the edge here, or a pixel beside it
-        for found, alone in zip(matte(light, coc, None, torch.full_like(coc, moved)), matte(light, coc), strict=True):
-            torch.testing.assert_close(found, alone, rtol=1e-5, atol=1e-6)
-    crisp, soft = matte(light, coc), matte(light, coc, None, torch.full_like(coc, 6.0))
-    for x in (39, 40):
-        assert 0.04 < float((soft.other_weight - crisp.other_weight)[..., x].mean()) < 0.2
-    torch.testing.assert_close(soft.own[..., 39], light[..., 39], atol=0.01, rtol=0)
-    assert float((soft.other[..., 40].mean() - 0.8).abs()) < 0.05
-    coc.requires_grad_()
-    total = torch.stack([t.sum() for t in matte(light, coc, None, torch.full_like(light[:, :1], 6.0))]).sum()
-    assert bool(torch.autograd.grad(total, coc)[0].isfinite().all())
-
-
 def test_a_split_conserves_light_and_stays_within_the_range_of_the_image() -> None:
     made = torch.Generator().manual_seed(3)
     for _ in range(20):

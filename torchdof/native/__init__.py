@@ -78,7 +78,7 @@ _STRUCTURES = {
     "field_mask": "data values boxes, real radius, int colours rows columns",
     "spots": "int count colours, data* templates, int* cells index, double* part finer reach fade, int* flipped half, "
     "double squeeze, int round even",
-    "scene": "int height width channels kind surfaces, data* light coc weight, data moved, int occlusion normalize, "
+    "scene": "int height width channels kind surfaces, data* light coc weight, int occlusion normalize, "
     f"int masked highlights, real crisp_px reach, {_LAYERS}, field_mask* field_masks, int distances, real squeeze, "
     "int threads, int* cancelled",
     "map": "int height width channels, data light nearness, int of_coc, data steps, real step, int automatic threads, "
@@ -186,7 +186,6 @@ def describe() -> str:
 def render(
     surfaces: Sequence[Surface],
     kind: Kind,
-    moved: Tensor | None = None,
     *,
     nodes: Sequence[float],
     layers: Sequence[tuple[Tensor, int]],
@@ -216,7 +215,7 @@ def render(
     """
     cancelled, (channels, height, width) = ctypes.c_int32(0), surfaces[0][0].shape
     scene = _TYPES["scene"](
-        *(height, width, channels, get_args(Kind).index(kind), len(surfaces), *_maps(surfaces), moved),
+        *(height, width, channels, get_args(Kind).index(kind), len(surfaces), *_maps(surfaces)),
         *(occlusion, normalize, masked, highlights, crisp_px, reach, *_of_layers(nodes, layers)),
         *(_field_masks(field_masks), field_masks[0][0].shape[1] if field_masks else 0, squeeze),
         *(_threads(), ctypes.pointer(cancelled)),
@@ -296,23 +295,21 @@ def _field_masks(masks: Sequence[KernelMask]) -> list[Any] | None:
     return [mask_of(values, boxes, coc, len(values), *values.shape[2:]) for values, boxes, coc, _ in masks] or None
 
 
-def matte(light: Tensor, coc: Tensor, valid: Tensor | None = None, moved_px: Tensor | None = None) -> Tensor:
+def matte(light: Tensor, coc: Tensor, valid: Tensor | None = None) -> Tensor:
     """Splits the mixed pixels of one image, as :func:`torchdof.render.matting.matte`.
 
     The result ``[2 C + 2, H, W]`` is own light, and light, coc and weight of the other surface.
     """
     channels, *size = light.shape
     out = _empty(2 * channels + 2, *size)
-    _run("matte", [light, coc, valid, moved_px], channels, *size, _threads(), out, None, None)
+    _run("matte", [light, coc, valid], channels, *size, _threads(), out, None, None)
     return out
 
 
-def matte_gradient(
-    gradient: Tensor, light: Tensor, coc: Tensor, valid: Tensor | None = None, moved_px: Tensor | None = None
-) -> list[Tensor]:
+def matte_gradient(gradient: Tensor, light: Tensor, coc: Tensor, valid: Tensor | None = None) -> list[Tensor]:
     """The gradients of :func:`matte` by light and coc."""
     sums = [_empty(*values.shape).zero_() for values in (light, coc)]
-    _run("matte", [light, coc, valid, moved_px], *light.shape, _threads(), None, gradient, sums)
+    _run("matte", [light, coc, valid], *light.shape, _threads(), None, gradient, sums)
     return sums
 
 

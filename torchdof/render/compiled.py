@@ -30,7 +30,6 @@ def picture(
     coc: Tensor,
     behind_light: Tensor | None = None,
     behind_coc: Tensor | None = None,
-    moved_px: Tensor | None = None,
     cover: Tensor | None = None,
     lens_width: int | None = None,
 ) -> Tensor:
@@ -63,7 +62,6 @@ def picture(
         ray_masks=lambda steps: [m.to(cpu) for m in ray_masks(table, [step / KERNELS_PER_PX for step in steps], size)],
         squeeze=float((table.aperture or Aperture()).squeeze),
     )
-    moved = [None] * len(light) if moved_px is None else moved_px[:, 0]
     if cover is not None:
         low, high = plan.coc_px[0], plan.coc_px[-1]
         # a black surface behind the layers, for pixels that no layer covers
@@ -73,20 +71,20 @@ def picture(
             items.append(render([*zip(*surfaces, strict=True), (nothing, farthest, None)], "stack"))
     elif behind_light is not None and behind_coc is not None:
         items = []
-        each = zip(light, coc[:, 0], behind_light, behind_coc[:, 0], moved, strict=True)
-        for own, own_coc, other, other_coc, moved_by in each:
+        each = zip(light, coc[:, 0], behind_light, behind_coc[:, 0], strict=True)
+        for own, own_coc, other, other_coc in each:
             scale = exposure.scale_of(own[None], other[None])[0]
             scaled = [(own * scale, own_coc, None), (other * scale, other_coc, None)]
-            items.append(render(scaled, "background", moved=moved_by) / scale)
+            items.append(render(scaled, "background") / scale)
     else:
-        items = [_image(render, *item) for item in zip(light, coc[:, 0], moved, strict=True)]
+        items = [_image(render, *item) for item in zip(light, coc[:, 0], strict=True)]
     return items[0][None] if len(items) == 1 else torch.stack(items)
 
 
-def _image(render: Callable[..., Tensor], light: Tensor, coc: Tensor, moved: Tensor | None) -> Tensor:
+def _image(render: Callable[..., Tensor], light: Tensor, coc: Tensor) -> Tensor:
     """Render one image, with very bright light scaled down."""
     try:
-        return render([(light, coc, None)], "image", moved=moved)
+        return render([(light, coc, None)], "image")
     except OverflowError:
         scale = exposure.scale_of(light[None])[0]
-        return render([(light * scale, coc, None)], "image", moved=moved) / scale
+        return render([(light * scale, coc, None)], "image") / scale

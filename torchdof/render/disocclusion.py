@@ -51,7 +51,6 @@ def surfaces_of_image(
     valid: Tensor | None,
     threshold: Tensor,
     levels: Sequence[int],
-    moved_px: Tensor | None = None,
     ops: Ops = EAGER,
 ) -> tuple[list[Surface], Tensor]:
     """Splits an image into each pixel's own surface and a second one, mixed or hidden; and the light behind both.
@@ -73,7 +72,6 @@ def surfaces_of_image(
         valid: ``[B, 1, H, W]``, 0 where a pixel is left out; None means all count.
         threshold: Light above which a pixel is a highlight, ``[B, 1, H, W]``; highlights are not filled in elsewhere.
         levels: Levels of the pyramid, at least 2, of all items or of each. The widest search is ``2 ** levels`` pixels.
-        moved_px: As for :func:`torchdof.render.matting.matte`.
         ops: Operations.
 
     Returns:
@@ -81,9 +79,9 @@ def surfaces_of_image(
         :data:`BEHIND_STEP`-th pixel, ``[B, C, h, w]``, for an area slightly larger than the image.
     """
     if is_compiled():
-        maps = _operator(light, coc_px, list(levels), threshold, valid, moved_px)
+        maps = _operator(light, coc_px, list(levels), threshold, valid)
     else:
-        maps = _surfaces_of_image(light, coc_px, levels, threshold, valid, moved_px, ops)
+        maps = _surfaces_of_image(light, coc_px, levels, threshold, valid, ops)
     own_light, own_weight, other_light, other_coc, other_weight, behind = maps
     return [Surface(own_light, coc_px, own_weight), Surface(other_light, other_coc, other_weight)], behind
 
@@ -103,9 +101,8 @@ def _operator(
     levels: Sequence[int],
     threshold: Tensor,
     valid: Tensor | None,
-    moved_px: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    maps = _surfaces_of_image(light, coc_px, levels, threshold, valid, moved_px, EAGER)
+    maps = _surfaces_of_image(light, coc_px, levels, threshold, valid, EAGER)
     own, own_weight, other, other_coc, other_weight, behind = (t.contiguous() for t in maps)
     return own, own_weight, other, other_coc, other_weight, behind
 
@@ -190,11 +187,10 @@ def _surfaces_of_image(
     levels: Sequence[int],
     threshold: Tensor,
     valid: Tensor | None,
-    moved_px: Tensor | None,
     ops: Ops,
 ) -> _Maps:
     """Light and weight of each pixel's own surface; light, coc and weight of the other one; light behind both."""
-    matted = matte(light, coc_px, valid, moved_px, ops)
+    matted = matte(light, coc_px, valid, ops)
     if ops.has_rays and active().emitters:
         matted = attribute_emitters(light, coc_px, threshold, valid, matted)
     own, other, other_coc, other_weight = matted

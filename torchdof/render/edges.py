@@ -185,11 +185,6 @@ def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER) -
     return torch.where(repaired == coc_px, coc_px, repaired) if is_differentiated(coc_px) else repaired
 
 
-def distance(given_px: Tensor, repaired_px: Tensor) -> Tensor:
-    """How far the repair moved the coc of each pixel, constant to autograd; 0 where it is not finite."""
-    return (repaired_px.detach() - given_px.detach()).abs().nan_to_num()
-
-
 def _has_steps(coc_px: Tensor) -> Tensor:
     """Whether the range of a map reaches :data:`_LEAST_STEP_PX` or contains NaN: a bool ``[]``."""
     low, high = torch.aminmax(coc_px)

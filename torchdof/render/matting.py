@@ -32,10 +32,7 @@ _TEXTURE = 50.0  # weight of variance against contrast; larger: texture keeps mo
 _MOST_CLEAN = 4.0  # upper limit for a neighbour's clean light, as a multiple of the brightest neighbour
 _SOFTNESS_PX = 0.6  # standard deviation of the Gaussian by which two surfaces mix where their colours are alike
 _SOFTNESS_FALLOFF = math.exp(-0.5 / _SOFTNESS_PX**2)  # its weight at a distance of 1 px
-_UNSURE_PX = 0.8  # the same where the depth map has no edge; larger: softer edges
-_UNSURE_FALLOFF = math.exp(-0.5 / _UNSURE_PX**2)
 _ALIKE = 1.0 / 255.0  # contrast at which trust is halved, as a fraction of the brightest light around
-_UNSURE = 3.0  # added weight of variance, in units of _TRUST, where the depth map has no edge; larger: softer edges
 _UNBOUNDED = 1e6  # upper limit for either part, as a multiple of the brightest neighbour; avoids 0 * inf
 
 # Emitters
@@ -58,9 +55,7 @@ class Matted(NamedTuple):
     other_weight: Tensor
 
 
-def matte(
-    light: Tensor, coc_px: Tensor, valid: Tensor | None = None, moved_px: Tensor | None = None, ops: Ops = EAGER
-) -> Matted:
+def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops = EAGER) -> Matted:
     """Splits pixels at depth edges between their own surface and the one across the edge.
 
     1. Take the nearest and the farthest coc of the 3 x 3 pixels around as those of the two surfaces.
@@ -68,9 +63,7 @@ def matte(
        count without the light of the other surface: a photograph's edges are wider than a pixel.
     3. Fit ``I = a F + (1 - a) B`` to the pixel's light I by least squares: ``a = (I - B) (F - B) / |F - B|^2``.
     4. Keep a on the side of 1/2 of the pixel's own surface, on which its centre lies. Where contrast is small against
-       texture, a is the near surface's share under a small Gaussian, as far as the pixel's colour agrees. In a pixel
-       for which the depth map gave a depth between the surfaces, it need not agree: then both parts are those of the
-       colours, and the edge is soft instead of jagged.
+       texture, a is the near surface's share under a small Gaussian, as far as the pixel's colour agrees.
     5. Distribute the residual over both parts, but none of it to an other surface that is less blurred: they sum to I,
        and neither leaves the image's range.
 
@@ -78,39 +71,29 @@ def matte(
         light: ``[B, C, H, W]``.
         coc_px: ``[B, 1, H, W]``, signed.
         valid: ``[B, 1, H, W]``, 0 where a pixel is left out; None means all count.
-        moved_px: Distance by which the repair of depth edges moved the coc, ``[B, 1, H, W]``, >= 0; None means 0.
         ops: Selects the pixels at edges.
 
     Returns:
         The surfaces; the weight of the other one is in [0, 1/2].
     """
-
-    def constant(*maps: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        rest = iter(maps)
-        return None if valid is None else next(rest), None if moved_px is None else next(rest)
-
     found = compiled_step(
-        lambda light, coc, *maps: native.matte(light, coc, *constant(*maps)),
-        lambda gradient, light, coc, *maps: native.matte_gradient(gradient, light, coc, *constant(*maps)),
-        lambda light, coc, *maps: torch.cat(_split(light, coc, *constant(*maps)), 1),
+        native.matte,
+        native.matte_gradient,
+        lambda *maps: torch.cat(_split(*maps), 1),
         light,
         coc_px,
-        *(t for t in (valid, moved_px) if t is not None),
+        *([] if valid is None else [valid]),
     )
     if found is None:
-        return _split(light, coc_px, valid, moved_px, ops)
+        return _split(light, coc_px, valid, ops)
     return Matted(*found.split([light.shape[1], light.shape[1], 1, 1], 1))
 
 
-def _split(
-    light: Tensor, coc_px: Tensor, valid: Tensor | None = None, moved_px: Tensor | None = None, ops: Ops = EAGER
-) -> Matted:
+def _split(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops = EAGER) -> Matted:
     """:func:`matte` by PyTorch."""
     rules = active()
     if not rules.matting:
         return Matted(light, torch.zeros_like(light), coc_px, torch.zeros_like(coc_px))
-    if not rules.uncertain_edges:
-        moved_px = None
     # pixels beside another surface
     known = None if valid is None else valid > 0
     high, low = (c if known is None else torch.where(known, c, -NEVER_PX) for c in (coc_px.detach(), -coc_px.detach()))
@@ -156,27 +139,19 @@ def _split(
     strength = (contrast**2).sum(0)
     fitted = (((colour - back) * contrast).sum(0) / strength.clamp_min(1e-12)).clamp(0.0, 1.0)
     misfit = ((colour - back - fitted * contrast) ** 2).sum(0)
-    variance = back_variance + front_variance + misfit
-    if moved_px is not None:
-        part = selected.pick(moved_px)[0] / gap.detach()  # 0 or 1: the map as given has an edge here
-        unsure = (4.0 * torch.minimum(part, 1.0 - part)).clamp(0.0, 1.0)
-        variance = variance * (1.0 + _UNSURE * unsure)
-    trust = strength / (strength + _TRUST * variance + _ALIKE**2)
+    trust = strength / (strength + _TRUST * (back_variance + front_variance + misfit) + _ALIKE**2)
     # a depth between the two belongs to a steep surface, not to an edge
     sided = ((own_coc - near) - (far - own_coc)).abs() / gap
     clear = edge * (4.0 * sided - 2.0).clamp(0.0, 1.0)
     weight = torch.where(is_near, 1.0 - fitted, fitted).clamp(max=0.5) * clear * trust  # of the other surface
     small = _falloff(light, 1, _SOFTNESS_FALLOFF)
-    if moved_px is not None:
-        small = torch.lerp(small, _falloff(light, 1, _UNSURE_FALLOFF), unsure)
     small = small if counted is None else small * counted
     covered = (small * nearness).sum(0) / small.sum(0).clamp_min(1e-12)  # by the near surface, under the Gaussian
     noise, misfit = back_variance + front_variance + _ALIKE**2, misfit + (covered - fitted) ** 2 * strength
     # below 1 px of coc the two may be a steep surface, and nothing is to be seen of a soft edge
     geometric = torch.where(is_near, 1.0 - covered, covered).clamp(max=0.5) * clear * (1.0 - trust)
     geometric = geometric * ((gap / _EDGE_PX - 2.0).clamp(0.0, 1.0) if rules.alike_colours else 0.0)
-    agreed = geometric * noise / (noise + misfit)
-    weight = weight + (agreed if moved_px is None else torch.lerp(agreed, geometric, unsure))
+    weight = weight + geometric * noise / (noise + misfit)
 
     # Each part gets a share of the residual in proportion to its weight squared: the smallest change of both colours.
     # A sharper other surface gets none: texture and noise of this pixel would stay there as dots beside a blurred edge.
@@ -194,9 +169,6 @@ def _split(
     moved = torch.minimum(moved.maximum(weight * least), weight * most)
     own = (colour - moved) / own_weight
     other = torch.where(weight > 0, moved / weight.clamp_min(1e-12), 0.0)
-    if moved_px is not None:
-        disagreed = unsure * (geometric - agreed) / weight.clamp_min(1e-12)
-        own, other = torch.lerp(own, colour, disagreed), torch.lerp(other, other_mean, disagreed)
     return Matted(
         selected.put(light, own * brightest),
         selected.put(torch.zeros_like(light), other * brightest),

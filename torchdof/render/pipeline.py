@@ -58,9 +58,8 @@ def blur(
         maps = (image, coc_px, *(behind or ()), weight_map(attention, image))
         items = zip(*(t.expand(len(image), -1, -1, -1).split(1) for t in maps), strict=True)
         return torch.cat([blur(i, c, plan, options, tuple(b) or None, w, ops) for i, c, *b, w in items])
-    given, coc_px = coc_px, edges.mended(image, coc_px, options.depth_edges, ops)
-    moved = None if coc_px is given else edges.distance(given, coc_px)
-    whole = functools.partial(_planned, image, coc_px, behind=behind, moved_px=moved, ops=ops)
+    coc_px = edges.mended(image, coc_px, options.depth_edges, ops)
+    whole = functools.partial(_planned, image, coc_px, behind=behind, ops=ops)
     if attention is None:
         return whole(plan, options)
     weight = weight_map(attention, image)
@@ -76,8 +75,7 @@ def blur(
         return whole(None, options)
     around = whole(None, loose)
     behind_part = None if behind is None else (behind[0][part], behind[1][part])
-    moved_part = None if moved is None else moved[part]
-    looked_at = _planned(image[part], coc_px[part], None, options, behind_part, moved_part, ops)
+    looked_at = _planned(image[part], coc_px[part], None, options, behind_part, ops)
     rows, columns = box
     ends = (columns.start, image.shape[-1] - columns.stop, rows.start, image.shape[-2] - rows.stop)
     return torch.lerp(around, functional.pad(looked_at, ends), functional.pad(weight[part], ends).to(image.dtype))
@@ -89,7 +87,6 @@ def _planned(
     plan: Plan | None,
     options: Options,
     behind: tuple[Tensor, Tensor] | None,
-    moved_px: Tensor | None,
     ops: Ops,
 ) -> Tensor:
     """Render images with repaired depth edges; the given plan grows to the blur of each item; None plans each."""
@@ -97,8 +94,6 @@ def _planned(
     given = {"light": image, "coc": coc_px}
     if behind is not None:
         given |= {"behind_light": behind[0], "behind_coc": behind[1]}
-    if moved_px is not None:
-        given["moved_px"] = moved_px
     maps = {name: t.to(wide).contiguous() for name, t in given.items()}
     maps = {n: (t if is_traced() else t.resolve_neg()).expand(image.shape[0], -1, -1, -1) for n, t in maps.items()}
     cocs = [maps["coc"]] if behind is None else [maps["coc"], maps["behind_coc"]]
@@ -218,7 +213,6 @@ def _image(
     coc: Tensor,
     behind_light: Tensor | None = None,
     behind_coc: Tensor | None = None,
-    moved_px: Tensor | None = None,
 ) -> Tensor:
     """Render float maps of images, optionally with a known background, with one plan or with one for each item.
 
@@ -235,7 +229,7 @@ def _image(
     if len(plans) == 1 and plan.nodes == (0.0,):
         # all in focus: the image is unchanged; with the term 0 * coc, the coc has a gradient of 0 instead of None
         return light + 0.0 * torch.nan_to_num(coc) if is_differentiated(coc) else light.clone()
-    others = {"behind_light": behind_light, "behind_coc": behind_coc, "moved_px": moved_px}
+    others = {"behind_light": behind_light, "behind_coc": behind_coc}
     picture = _compiled(plans, options, ops.lens_width, light, coc, **others)
     if picture is not None:
         return picture
@@ -262,10 +256,10 @@ def _image(
     # surfaces of each pixel, and the light behind all of them
     surfaces, behind = [Surface(light, coc, weight)], None
     if behind_light is not None and behind_coc is not None and limit is not None:
-        surfaces = _before_background(surfaces[0], behind_light, behind_coc, moved_px, ends, options)
+        surfaces = _before_background(surfaces[0], behind_light, behind_coc, ends, options)
     elif options.occlusion and limit is not None and splatted:
         levels = [min(math.ceil(math.log2(max(2.0, most))) + 1, native.MOST_LEVELS) for most in widest]
-        surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels, moved_px, ops)
+        surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels, ops)
         behind = behind if rules.active().light_behind else None
 
     # highlights of these surfaces, ray by ray
@@ -308,7 +302,6 @@ def _before_background(
     surface: Surface,
     behind: Tensor,
     behind_coc: Tensor,
-    moved_px: Tensor | None,
     ends: Sequence[Any],
     options: Options,
 ) -> list[Surface]:
@@ -316,7 +309,7 @@ def _before_background(
     light, coc, weight = surface
     valid = None if options.check else torch.isfinite(behind_coc) & torch.isfinite(behind).all(1, keepdim=True)
     behind_coc = behind_coc.clamp(*ends)
-    own_light, other_light, other_coc, other_weight = matte(light, coc, weight, moved_px)
+    own_light, other_light, other_coc, other_weight = matte(light, coc, weight)
     # of the second surfaces of mixed pixels keep the nearer ones; the known background replaces the farther ones
     own_weight, other_weight = 1.0 - other_weight, torch.where(other_coc < coc, other_weight, 0.0)
     if weight is not None:

@@ -27,7 +27,6 @@ class Rules:
     matting: bool = _rule("splits mixed pixels between two surfaces")
     mixed_neighbours: bool = _rule("takes the other surface's light out of mixed neighbours")
     alike_colours: bool = _rule("splits pixels of two surfaces of like colours by their place")
-    uncertain_edges: bool = _rule("makes edges softer where the map as given has none")
     sharper_surface: bool = _rule("keeps what two colours do not explain out of a less blurred surface")
     emitters: bool = _rule("gives a highlight's light to the surface of its emitter")
     own_emitters: bool = _rule("the same where the emitter lies on the pixel's own surface")

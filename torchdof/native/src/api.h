@@ -43,7 +43,6 @@ typedef struct {
   const float *const *light;   // for each surface [channels, height, width]
   const float *const *coc;     // for each surface [height, width]: signed radius in pixels, negative in front of the focus
   const float *const *weight;  // for each surface [height, width], or null: it covers its pixels fully
-  const float *moved;          // [height, width]: how far the repair of edges moved the coc, in pixels, or null: nowhere
   int32_t occlusion;           // 0: light of all surfaces is added, without occlusion
   int32_t normalize;           // 0: without occlusion, do not divide by the blurred weight
   int32_t masked;  // 1: inputs may be NaN or infinite (not in a stack); such pixels are copied and do not affect others
@@ -166,9 +165,9 @@ typedef struct {
   float slope, most;      // votes for each weight of the samples, and largest number of votes
 } torchdof_level;
 
-// Splits the mixed pixels of an image; see render/matting.py. maps: light [channels, height, width], coc [height, width]; 0 for
-// pixels that are left out, and how far the repair of edges moved the coc, in pixels, both [height, width] or null. out: own
-// and other light, coc and weight of the other surface, [2 channels + 2, height, width]. The first two maps have gradients.
+// Splits the mixed pixels of an image; see render/matting.py. maps: light [channels, height, width], coc [height, width], and 0 for
+// pixels that are left out [height, width] or null. out: own and other light, coc and weight of the other surface, [2 channels
+// + 2, height, width]. The first two maps have gradients.
 TORCHDOF_API int32_t torchdof_matte(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t threads,
                                     float *out, const float *gradient, float *const *of_maps);
 

@@ -11,7 +11,6 @@ namespace {
 constexpr float EDGE_PX = constants::matting::EDGE_PX;
 constexpr float UNCLEAN = constants::matting::UNCLEAN;
 constexpr float TRUST = constants::matting::TRUST;
-constexpr float UNSURE = constants::matting::UNSURE;
 constexpr float TEXTURE = constants::matting::TEXTURE;
 constexpr float MOST_CLEAN = constants::matting::MOST_CLEAN;
 constexpr float ALIKE = constants::matting::ALIKE;
@@ -33,16 +32,15 @@ constexpr int SIDE = BLOCK + 2 * MARGIN;   // of the window of coc
 constexpr int EDGES = BLOCK + 2 * RIM;     // of the windows of edges and light
 constexpr int PITCH = 24;                  // of all
 
-// Falloff of the Gaussians of both softnesses, beside their centre.
+// Falloff of the Gaussian by which two surfaces mix, beside its centre.
 constexpr float SMALL_BESIDE = constants::matting::SOFTNESS_FALLOFF;
-constexpr float WIDE_BESIDE = constants::matting::UNSURE_FALLOFF;
-constexpr float SMALL_DIAGONAL = SMALL_BESIDE * SMALL_BESIDE, WIDE_DIAGONAL = WIDE_BESIDE * WIDE_BESIDE;
+constexpr float SMALL_DIAGONAL = SMALL_BESIDE * SMALL_BESIDE;
 
 // An image whose mixed pixels are split.
 struct Frame {
   int height, width, channels;
-  const float *light, *coc, *valid, *moved;  // valid, moved: or null
-  const float *darkest, *brightest;          // range of the light of each channel
+  const float *light, *coc, *valid;  // valid: or null
+  const float *darkest, *brightest;  // range of the light of each channel
 
   size_t area() const { return (size_t)height * width; }
 };
@@ -50,7 +48,7 @@ struct Frame {
 struct Window {
   explicit Window(int channels) : light((size_t)channels * EDGES * PITCH + LANES), clean(light), around((size_t)channels * (4 * TAPS + 9)) {}
 
-  float coc[SIDE * PITCH + LANES] = {}, valid[SIDE * PITCH + LANES] = {}, moved[BLOCK * PITCH + LANES] = {}, edge[EDGES * PITCH + LANES] = {};
+  float coc[SIDE * PITCH + LANES] = {}, valid[SIDE * PITCH + LANES] = {}, edge[EDGES * PITCH + LANES] = {};
   std::vector<float> light;  // [channels, EDGES, PITCH]
   std::vector<float> clean;  // the same, without the light of other surfaces
   std::vector<vec> around;   // memory of Split
@@ -251,12 +249,11 @@ class Split {
       float *const to = plane + y_ * BLOCK + x_;
       store(to, beside ? value : load<vec>(to));
     };
-    const vec own = 1.0f - weight_, per_own = 1.0f / own, per_other = 1.0f / most(weight_, all(1e-12f)), disagreed = disagreed_ * per_other;
+    const vec own = 1.0f - weight_, per_own = 1.0f / own, per_other = 1.0f / most(weight_, all(1e-12f));
     for (int c = 0; c < C(); c++) {
-      const vec other_mean = is_near_ ? behind_[c] : front_[c], others = Other(*this, c).light;
-      const vec own_light = (colour_[c] - others) * per_own, other_light = only(weight_ > vec{}, others * per_other);
-      put(block.own + c * BLOCK_PIXELS, (own_light + disagreed * (colour_[c] - own_light)) * scale_);
-      put(block.other + c * BLOCK_PIXELS, (other_light + disagreed * (other_mean - other_light)) * scale_);
+      const vec others = Other(*this, c).light;
+      put(block.own + c * BLOCK_PIXELS, (colour_[c] - others) * per_own * scale_);
+      put(block.other + c * BLOCK_PIXELS, only(weight_ > vec{}, others * per_other) * scale_);
     }
     const vec valid = valid_[TAPS / 2];
     put(block.coc, is_near_ ? ends_.far : ends_.near);
@@ -340,9 +337,6 @@ class Split {
 
     here_ = load<vec>(w_.coc + in_coc_ + tap(TAPS / 2));
     gap_ = most(ends_.far - ends_.near, all(1e-6f));
-    const vec part = load<vec>(w_.moved + y_ * PITCH + x_) / gap_;  // 0 or 1: the map as given has an edge here
-    unsure_ = clamp01(4.0f * least(part, 1.0f - part));
-    const vec at_side = SMALL_BESIDE + unsure_ * (WIDE_BESIDE - SMALL_BESIDE), at_corner = SMALL_DIAGONAL + unsure_ * (WIDE_DIAGONAL - SMALL_DIAGONAL);
     vec counted = {};  // sum of the weights of the small Gaussian
     covered_ = vec{};
     for (int i = 0; i < TAPS; i++) {
@@ -350,7 +344,7 @@ class Split {
       const vec nearness = (ends_.far - load<vec>(w_.coc + in_coc_ + tap(i))) / gap_;  // not times 1 / gap, whose rounding the clamps below enlarge
       nearer_[i] = weight * clamp01(4.0f * nearness - 2.8f);
       farther_[i] = weight * clamp01(1.2f - 4.0f * nearness);
-      small_[i] = (i == TAPS / 2 ? all(1.0f) : i % 2 ? at_side : at_corner) * valid_[i];
+      small_[i] = (i == TAPS / 2 ? 1.0f : i % 2 ? SMALL_BESIDE : SMALL_DIAGONAL) * valid_[i];
       covered_ += small_[i] * nearness, counted += small_[i];
     }
     per_counted_ = 1.0f / most(counted, all(1e-12f));
@@ -399,7 +393,7 @@ class Split {
     }
     sharper_ = size_of(here_) - size_of(is_near_ ? ends_.far : ends_.near), lent_ = 1.0f - clamp01(sharper_);
     noise_ = far_variance_ + near_variance_ + ALIKE * ALIKE;
-    total_ = strength_ + TRUST * (far_variance_ + near_variance_ + misfit_) * (1.0f + UNSURE * unsure_) + ALIKE * ALIKE;
+    total_ = strength_ + TRUST * (far_variance_ + near_variance_ + misfit_) + ALIKE * ALIKE;
     trust_ = strength_ / total_;
     edge_ = load<vec>(w_.edge + first_ + tap(TAPS / 2));
     sided_ = size_of((here_ - ends_.near) - (ends_.far - here_)) * (all(1.0f) / gap_);
@@ -407,15 +401,14 @@ class Split {
     by_fit_ = is_near_ ? 1.0f - fitted_ : fitted_, by_cover_ = is_near_ ? 1.0f - covered_ : covered_;
     wide_ = gap_ * (1.0f / EDGE_PX) - 2.0f;
     geometric_ = least(by_cover_, all(0.5f)) * clear_ * (1.0f - trust_) * clamp01(wide_);
-    disagreed_ = geometric_ * unsure_ * contradiction_ / (noise_ + contradiction_);  // with the pixel's colour
-    weight_ = least(by_fit_, all(0.5f)) * (clear_ * trust_) + geometric_ * noise_ / (noise_ + contradiction_) + disagreed_;
+    weight_ = least(by_fit_, all(0.5f)) * (clear_ * trust_) + geometric_ * noise_ / (noise_ + contradiction_);
   }
 
-  // The gradients by the weight, its part that disagrees with the colour, and the colours, from those by the surfaces.
+  // The gradients by the weight and the colours, from those by the surfaces.
   void back_of_parts(Slopes &slopes, ivec beside) {
     const auto slope = [&](int plane) { return only(beside, load<vec>(&slopes.surfaces[plane * BLOCK * PITCH + y_ * PITCH + x_])); };
-    const vec own = 1.0f - weight_, known = most(weight_, all(1e-12f)), disagreed = disagreed_ / known, squares = weight_ * weight_ + own * own;
-    vec of_own = {}, of_disagreed = {}, of_lent = {};
+    const vec own = 1.0f - weight_, known = most(weight_, all(1e-12f)), squares = weight_ * weight_ + own * own;
+    vec of_own = {}, of_lent = {};
     of_weight_ = slope(2 * C() + 1);
     const vec of_coc = slope(2 * C());
     of_near_ = only(~is_near_, of_coc), of_far_ = only(is_near_, of_coc);
@@ -423,12 +416,11 @@ class Split {
       const Other other(*this, c);
       const vec own_light = (colour_[c] - other.light) / own, other_light = other.light / known;
       const vec of_own_light = slope(c) * scale_, of_other_light = only(weight_ > vec{}, slope(C() + c) * scale_);
-      of_disagreed += of_own_light * (colour_[c] - own_light) + of_other_light * (other.mean - other_light);
-      const vec of_part = of_own_light * (1.0f - disagreed) / own;
-      vec of_colour = of_own_light * disagreed + of_part, of_mean = of_other_light * disagreed;
+      const vec of_part = of_own_light / own;
+      vec of_colour = of_part, of_mean = {};
       of_own -= of_part * own_light;
       // by the other surface's light, and by its weight where the own part depends on their product
-      vec of_light = of_other_light * (1.0f - disagreed) - of_part * weight_;
+      vec of_light = of_other_light - of_part * weight_;
       of_weight_ -= of_part * other_light;
       // the gradient goes to the limit in force, or by halves to two equal ones
       const auto limited = [&](vec light, vec limit, bool upper) {
@@ -461,15 +453,13 @@ class Split {
     const vec of_sharper = only(is_within(sharper_), -of_lent), of_other = -of_sharper * sign(is_near_ ? ends_.far : ends_.near);
     of_here_ = of_sharper * sign(here_);
     of_near_ += only(~is_near_, of_other), of_far_ += only(is_near_, of_other);
-    of_disagreed_ = of_disagreed / known;
-    of_weight_ -= of_own + only(weight_ >= all(1e-12f), of_disagreed_ * disagreed);
+    of_weight_ -= of_own;
   }
 
   // The gradients by the colours and by coverage, edge and coc, from those by the weight.
   void back_of_weight() {
-    const vec sum = noise_ + contradiction_, agreeing = noise_ / sum, passed = of_weight_ + of_disagreed_;
-    const vec of_agreed = of_weight_ - unsure_ * passed, of_geometric = unsure_ * passed + of_agreed * agreeing;
-    const vec of_agreeing = of_agreed * geometric_ / sum, of_contradiction = -of_agreeing * agreeing;
+    const vec sum = noise_ + contradiction_, agreeing = noise_ / sum, of_geometric = of_weight_ * agreeing;
+    const vec of_agreeing = of_weight_ * geometric_ / sum, of_contradiction = -of_agreeing * agreeing;
     const vec by_cover = least(by_cover_, all(0.5f)), by_fit = least(by_fit_, all(0.5f)), wide = clamp01(wide_), doubt = 1.0f - trust_;
     const vec of_clear = of_geometric * by_cover * doubt * wide + of_weight_ * by_fit * trust_;
     const vec of_trust = (of_weight_ * by_fit - of_geometric * by_cover * wide) * clear_;
@@ -483,7 +473,7 @@ class Split {
     of_here_ += 2.0f * side * of_sided;
     of_near_ -= side * of_sided, of_far_ -= side * of_sided;
     of_gap_ = only(is_within(wide_), of_geometric * by_cover * clear_ * doubt * (1.0f / EDGE_PX)) - of_sided * sided_;
-    const vec of_total = -of_trust * trust_ / total_, of_noisy = of_total * TRUST * (1.0f + UNSURE * unsure_);
+    const vec of_total = -of_trust * trust_ / total_, of_noisy = of_total * TRUST;
     vec of_strength = of_trust / total_ + of_total + of_contradiction * off * off;
     const vec of_misfit = of_contradiction + of_noisy;
     of_variance_ = of_noisy + of_agreeing * (1.0f - agreeing);
@@ -579,17 +569,16 @@ class Split {
   vec valid_[TAPS], small_[TAPS];
   vec nearer_[TAPS], farther_[TAPS];  // weights in the means of both surfaces
   vec shift_[TAPS];  // not limited
-  vec scale_, here_, gap_, unsure_, covered_, per_counted_, per_strength_;  // covered: by the near surface
+  vec scale_, here_, gap_, covered_, per_counted_, per_strength_;  // covered: by the near surface
   vec clean_near_variance_, clean_far_variance_, near_variance_, far_variance_;
   ivec is_near_;
   vec sharper_, lent_;  // px by which the other surface is less blurred; share of the residual that it may get, 0 to 1
-  vec strength_, along_, fitted_, misfit_, noise_, total_, trust_, edge_, sided_, clear_, contradiction_, by_fit_, by_cover_, wide_, geometric_, disagreed_, weight_;
-  vec of_weight_, of_disagreed_, of_variance_, of_covered_, of_edge_, of_here_, of_gap_, of_near_, of_far_;
+  vec strength_, along_, fitted_, misfit_, noise_, total_, trust_, edge_, sided_, clear_, contradiction_, by_fit_, by_cover_, wide_, geometric_, weight_;
+  vec of_weight_, of_variance_, of_covered_, of_edge_, of_here_, of_gap_, of_near_, of_far_;
 };
 
 void read_light(const Frame &frame, int y0, int x0, Window &w) {
   for (int c = 0; c < frame.channels; c++) read_window(frame, frame.light + c * frame.area(), y0 - RIM, x0 - RIM, EDGES, w.light.data() + (size_t)c * EDGES * PITCH);
-  if (frame.moved) read_window(frame, frame.moved, y0, x0, BLOCK, w.moved);
 }
 
 // Calls body(row, column, which are mixed) for each LANES pixels of a block that contain mixed ones.
@@ -830,7 +819,7 @@ void Job::split_mixed() {
   const std::vector<float> falloff = falloff_around(REACH), around_emitter = falloff_around(EMITTER_REACH);
   const bool emitters = scene.kind != TORCHDOF_BACKGROUND;  // a given background replaces the light behind
   const int rows = surfaces.block_rows, columns = surfaces.block_columns;
-  const Frame frame{height, width, channels, surfaces.light, surfaces.coc, surfaces.valid, scene.moved, light_least.data(), light_most.data()};
+  const Frame frame{height, width, channels, surfaces.light, surfaces.coc, surfaces.valid, light_least.data(), light_most.data()};
   std::vector<std::unique_ptr<Window>> windows(std::max(1, scene.threads));
   struct Left { int y, x; float weight; };
   std::vector<std::vector<Left>> left(rows);  // other surfaces of highlights' pixels
@@ -922,7 +911,7 @@ static void matte(const float *const *maps, int channels, int height, int width,
   std::vector<float> darkest(C), brightest(C), of_range((size_t)rows * 2 * C);
   const size_t area = (size_t)height * width;
   for (int c = 0; c < C; c++) find_ends(maps[0] + c * area, area, threads, &darkest[c], &brightest[c]);
-  const Frame frame{height, width, C, maps[0], maps[1], maps[2], maps[3], darkest.data(), brightest.data()};
+  const Frame frame{height, width, C, maps[0], maps[1], maps[2], darkest.data(), brightest.data()};
   const std::vector<float> falloff = falloff_around(REACH);
   if (!gradient) {
     memcpy(out, maps[0], C * area * sizeof(float));
