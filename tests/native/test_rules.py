@@ -31,7 +31,8 @@ RULES: dict[str, Callable[[Tensor], Tensor]] = {
     "visible_part(v)[0]": surfaces.visible_part,
     "at_focus(v)[0]": surfaces.at_focus,
     "stands_in(v)[0]": surfaces.stands_in,
-    "alone(v)[0]": surfaces.alone,
+    "counts(v)[0]": surfaces.counts,
+    "seen(v)[0]": surfaces.seen,
     "(v + raise(lacking(all(5e-4f), v)))[0]": lambda x: composite.raised(torch.full_like(x, 5e-4), x),
 }
 # C++ expression of a derivative -> the rule
@@ -43,7 +44,8 @@ SLOPES: dict[str, str] = {
     "slope_of_visible_part(v)[0]": "visible_part(v)[0]",
     "slope_of_at_focus(v)[0]": "at_focus(v)[0]",
     "slope_of_stands_in(v)[0]": "stands_in(v)[0]",
-    "slope_of_alone(v)[0]": "alone(v)[0]",
+    "slope_of_counts(v)[0]": "counts(v)[0]",
+    "slope_of_seen(v)[0]": "seen(v)[0]",
     "1.0f + slope_of_raise(lacking(all(5e-4f), v))[0]": "(v + raise(lacking(all(5e-4f), v)))[0]",
     "float(within(unlimited_another_surface(x)))": "is_another_surface(x)",
 }
@@ -116,6 +118,6 @@ def test_rules_at_points_computed_by_hand() -> None:
     assert surfaces.stands_in(torch.tensor([-3.5, -2.25, -1.0, -0.0125, 1.0])).tolist() == pytest.approx(
         [0, 0.5, 1, 0.25, 0]
     )
-    assert surfaces.alone(torch.tensor([0.0, 0.00075, 0.003])).tolist() == pytest.approx([1.0, 0.5, 0.0])
+    assert surfaces.counts(torch.tensor([0.0, 0.0012, 0.003])).tolist() == pytest.approx([0.0, 0.5, 1.0])
     weights = torch.tensor([0.0, 0.001, 0.1])
     assert composite.raised(weights, weights).tolist() == pytest.approx([0.001, 0.001, 0.1])

@@ -42,8 +42,9 @@ def scene_for(rule: str) -> tuple[Tensor, Tensor]:
     elif rule == "soft_lamps":
         name, kind = "highlights/0", "blur 1.5"
     scene = SCENES[name]
-    coc_px = scene.camera.coc_px(degrade(scene.depth, kind), scene.image.shape[-1])
-    side = None if rule == "soft_lamps" else 96
+    depth = scene.depth if rule == "whole_highlights" else degrade(scene.depth, kind)
+    coc_px = scene.camera.coc_px(depth, scene.image.shape[-1])
+    side = None if rule in ("soft_lamps", "few_samples") else 96
     return scene.image[..., :side, :side], coc_px[..., :side, :side]
 
 

@@ -36,7 +36,7 @@ def test_nothing_shines_through_a_step_of_a_surface(
 def test_a_map_of_few_levels_has_no_contour_lines(level: float) -> None:
     slope = ((torch.arange(160.0) - 60.0) / 20.0 - 2.0).expand(48, -1)
     lines = before_a_bright_wall((slope / level).round() * level) - before_a_bright_wall(slope)
-    assert float(lines[8:-8, 46:].abs().max()) < 2.5 * LEAK
+    assert float(lines[8:-8, 46:].abs().max()) < 3.0 * LEAK  # 35 times without stand-ins, at half a pixel
 
 
 def test_a_surface_behind_it_is_still_seen() -> None:

@@ -82,6 +82,7 @@ _LEAN = 2.0  # log-odds by which a far surface must win: foreground left behind 
 _TO_BLURRED = 2.5  # log-odds for a soft map's more blurred surface; larger: fewer sharp specks, less detail
 _MORE_BLURRED_PX = 2.0  # difference in blur of two surfaces from which these log-odds count in full
 _BESIDE, _DIAGONAL = 0.93, 0.57  # log-odds of a neighbour's surface in soft maps; larger: smoother edges, less detail
+_DECIDED_ROUNDS = 4  # times that neighbours decide again; more: smoother edges
 
 # Soft maps: blurred by resampling, or written by a network. More than _SOFT of the edge pixels of a soft map lie on
 # ramps. These are wider than _WIDE, or have more than _MIXED of their pixels in the middle half between both surfaces:
@@ -264,8 +265,9 @@ def _repair(
     1. Find ramps and steps, and the nearness of both surfaces there.
     2. Score sampled edge pixels by colour, fit the prior of each kind of edge pixel, and detect soft maps.
     3. Select the pixels to decide: all edge pixels; with ``auto``, those of kinds that are often wrong.
-    4. A selected pixel shows the near surface where ``score + logit(prior) > 0``. In soft maps the sum also has the
-       chance of its neighbours to show it and, for a map of the coc, a term for the more blurred surface.
+    4. A selected pixel shows the near surface where ``score + logit(prior) > 0``. In soft maps the sum also has a term
+       for the more blurred surface, for a map of the coc, and the chances of its neighbours to show it, which depend on
+       theirs in turn: a mean field of a few rounds, so that edges are smooth lines without single pixels beside them.
     5. Give selected pixels the nearness of their surface, on ramps in proportion to the evidence.
     6. In soft maps, remove the ringing of interpolation beside steps, and correct lamps of a few pixels.
     """
@@ -322,19 +324,22 @@ def _repair(
     shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0])
     if auto:  # without auto, correct steps are decided too, and the lead would move them
         shows_near = shows_near + (_LEAN if rules.far_lead else 0.0) * (score.abs() - 1.0).clamp(0.0, 1.0)
-    # single pixels of a soft map that stick out of an edge are mostly background of a similar colour
-    chance = pixels.put(torch.full_like(given, -1.0), edge_pixels, torch.sigmoid(shows_near))
-    chance, values = pixels.pick(torch.cat([chance, given], 1), pixels.around(edge_pixels, given, 1))
-    middle = pixels.pick(looks[-3:-1], edge_pixels).mean(0)  # of both surfaces
-    chance = torch.where(chance < 0, (values > middle).to(given.dtype), chance)
-    neighbours = (_neighbours(given.dtype, given.device) * (2.0 * chance - 1.0)).sum(0)
-    if not rules.neighbours:
-        neighbours = torch.zeros_like(neighbours)
+    of_soft = is_soft.flatten().index_select(0, edge_pixels // (height * width))
     if auto and of_coc and rules.more_blurred:
         blur = pixels.pick(looks[-3:-1], edge_pixels).abs()  # of the near and of the far surface
-        neighbours = neighbours + _TO_BLURRED * ((blur[0] - blur[1]) / _MORE_BLURRED_PX).clamp(-1.0, 1.0)
-    of_soft = is_soft.flatten().index_select(0, edge_pixels // (height * width))
-    shows_near = torch.where(of_soft, shows_near + neighbours, shows_near) > 0
+        more_blurred = _TO_BLURRED * ((blur[0] - blur[1]) / _MORE_BLURRED_PX).clamp(-1.0, 1.0)
+        shows_near = torch.where(of_soft, shows_near + more_blurred, shows_near)
+    # pixels of a soft map that stick out of an edge are mostly background of a similar colour
+    window = pixels.around(edge_pixels, given, 1)
+    middle = pixels.pick(looks[-3:-1], edge_pixels).mean(0)  # of both surfaces
+    by_map = (pixels.pick(given, window)[0] > middle).to(given.dtype)
+    odds = shows_near
+    for _ in range(_DECIDED_ROUNDS if rules.neighbours else 0):
+        chance = pixels.put(torch.full_like(given, -1.0), edge_pixels, torch.sigmoid(odds))
+        chance = pixels.pick(chance, window)[0]
+        chance = torch.where(chance < 0, by_map, chance)
+        odds = shows_near + (_neighbours(given.dtype, given.device) * (2.0 * chance - 1.0)).sum(0)
+    shows_near = torch.where(of_soft, odds, shows_near) > 0
 
     # the blur of a soft map: its standard deviation in pixels, and the width that it takes from near surfaces
     climbed = (edges.climb * is_mixed).sum((1, 2, 3), keepdim=True).clamp_min(1e-12)

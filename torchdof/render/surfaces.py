@@ -158,20 +158,19 @@ class PaddedFrame:
         surface whose smaller kernel does not reach back. The light that passes there would come from far behind, and
         draw a bright line on a dark surface. So a barely blurred surface is its own background, in pixels without
         another surface at the focus or behind it. With ``w`` the weights of a pixel's surfaces and ``x`` their places,
-        the cover of surface j is ``w_j stands_in(x_j) alone(sum(w_i at_focus(x_i)))``, where i are the other surfaces.
+        the cover of surface j is ``seen(w_j) stands_in(x_j) prod(1 - counts(w_i) at_focus(x_i))``, i being the others.
         """
         surfaces = [PaddedSurface(*(self.cut(t, 0) for t in s if t is not None)) for s in self.surfaces]
-        left = torch.ones_like(surfaces[0].x)
-        weights = []
-        for surface in surfaces:
-            weight = left if surface.weight is None else surface.weight * left
-            weights.append(weight)
-            left = left - weight if self.stacked else left
-        x, weight = torch.stack([s.x for s in surfaces]), torch.stack(weights)
-        shown = weight * at_focus(x)
-        # not a difference from the sum of all, which would round badly
-        others = torch.stack([shown[:j].sum(0) + shown[j + 1 :].sum(0) for j in range(len(surfaces))])
-        cover = weight * stands_in(x) * alone(others)
+        x = torch.stack([s.x for s in surfaces])
+        weight = torch.stack([torch.ones_like(s.x) if s.weight is None else s.weight for s in surfaces])
+        missing = 1.0 - counts(weight) * at_focus(x)
+        alone = torch.stack([missing[:j].prod(0) * missing[j + 1 :].prod(0) for j in range(len(surfaces))])
+        cover = seen(weight) * stands_in(x) * alone
+        if self.stacked:  # a surface covers a part of what nearer ones leave
+            left = [torch.ones_like(x[0])]
+            for share in weight[:-1]:
+                left.append(left[-1] * (1.0 - share))
+            cover = cover * torch.stack(left)
         return torch.stack([s.light * part for s, part in zip(surfaces, cover, strict=True)]).sum(0), cover.sum(0)
 
 
@@ -185,9 +184,14 @@ def stands_in(x: Tensor) -> Tensor:
     return (2.0 + x / _BARELY_BLURRED).clamp(0.0, 1.0) * (x / -_OFF_FOCUS).clamp(0.0, 1.0)
 
 
-def alone(others: Tensor) -> Tensor:
-    """The same for the weight of other surfaces at the focus or behind it: a hidden sample is enough for 0."""
-    return (1.0 - others * (2.0 / HIDDEN_WEIGHT)).clamp(0.0, 1.0)
+def seen(weight: Tensor) -> Tensor:
+    """The weight of a stand-in of this weight: hidden samples are none, as all weights of a pixel could exceed 1."""
+    return (weight - 2.0 * HIDDEN_WEIGHT).clamp_min(0.0)
+
+
+def counts(weight: Tensor) -> Tensor:
+    """How far a surface of this weight takes the place of a stand-in, 0 to 1: a hidden sample does."""
+    return (weight * (1.25 / HIDDEN_WEIGHT)).clamp(0.0, 1.0)
 
 
 def continuation_weight(cover: Tensor) -> Tensor:

@@ -536,22 +536,23 @@ class Blend {
 
   // The surfaces of some pixels as stand-ins.
   struct StandIns {
-    vec place[2], weight[2], others[2], cover[2];  // others: weight of the other surface at the focus
-    vec sum = {};                                  // of covers
+    vec place[2], weight[2], missing[2], cover[2];  // missing: 1 where the surface takes no stand-in's place
+    vec sum = {};                                   // of covers
   };
   StandIns stand_ins(size_t at, int n) const {
     StandIns s;
     for (int j = 0; j < S_; j++) {
       s.place[j] = load_some(scene_.place[j] + at, n);
       s.weight[j] = weight_at(j, at, n);
+      s.missing[j] = 1.0f - counts(s.weight[j]) * at_focus(s.place[j]);
     }
     for (int j = 0; j < S_; j++) {
-      s.others[j] = S_ > 1 ? s.weight[1 - j] * at_focus(s.place[1 - j]) : vec{};
-      s.cover[j] = s.weight[j] * stands_in(s.place[j]) * alone(s.others[j]);
+      s.cover[j] = seen(s.weight[j]) * stands_in(s.place[j]) * alone(s, j);
       s.sum += s.cover[j];
     }
     return s;
   }
+  vec alone(const StandIns &s, int j) const { return S_ > 1 ? s.missing[1 - j] : all(1.0f); }
   // Calls body(i, at, n, stand_ins) for up to LANES pixels at a time, i in a block of the picture and `at` in the padded
   // frame, where any surface stands in.
   template <typename Body>
@@ -593,12 +594,12 @@ class Blend {
         });
       for (int j = 0; j < S_; j++) {
         of_cover[j] += scene_.backed ? -of_sum : of_sum;
-        of_weight[j] += of_cover[j] * stands_in(s.place[j]) * alone(s.others[j]);
-        of_place[j] += of_cover[j] * s.weight[j] * slope_of_stands_in(s.place[j]) * alone(s.others[j]);
+        of_weight[j] += of_cover[j] * slope_of_seen(s.weight[j]) * stands_in(s.place[j]) * alone(s, j);
+        of_place[j] += of_cover[j] * seen(s.weight[j]) * slope_of_stands_in(s.place[j]) * alone(s, j);
         if (S_ == 1) continue;
-        const vec of_other = of_cover[j] * s.weight[j] * stands_in(s.place[j]) * slope_of_alone(s.others[j]);
-        of_weight[1 - j] += of_other * at_focus(s.place[1 - j]);
-        of_place[1 - j] += of_other * s.weight[1 - j] * slope_of_at_focus(s.place[1 - j]);
+        const vec of_missing = of_cover[j] * seen(s.weight[j]) * stands_in(s.place[j]);
+        of_weight[1 - j] -= of_missing * slope_of_counts(s.weight[1 - j]) * at_focus(s.place[1 - j]);
+        of_place[1 - j] -= of_missing * counts(s.weight[1 - j]) * slope_of_at_focus(s.place[1 - j]);
       }
       for (int j = 0; j < S_; j++) {
         add_some(place_[j] + at, of_place[j], n);

@@ -77,7 +77,7 @@ struct Scratch {
   std::vector<uint32_t> occupied, partial, varying, every;
   std::vector<MaskedKernels> masked_kernels = std::vector<MaskedKernels>(TILE / FieldMask::COLUMNS);
   std::vector<const float *> pointers;
-  std::vector<vec> shown, cover;  // of each surface, as stand-ins
+  std::vector<vec> missing, cover;  // of each surface, for the stand-ins
   std::vector<uint64_t> layers, block_layers;
   std::vector<WindowBlock> blocks;
   WindowPieces pieces;
@@ -169,7 +169,7 @@ class Composite {
       for (auto *rows : {&b.occupied, &b.partial, &b.varying}) rows->resize(window_);
       b.every.assign(window_, ~0u);
       b.pointers.resize(C_);
-      b.shown.resize(s_.count);
+      b.missing.resize(s_.count);
       b.cover.resize(s_.count);
       b.layers.resize(index_.words);
     }
@@ -942,15 +942,14 @@ class Composite {
       for (int x = 0; x < columns; x += LANES) {
         vec left = all(1.0f), share = {};
         for (int j = 0; j < s_.count; j++) {
-          const vec at = load<vec>(place[j] + x), its = load<vec>(weight[j] + x) * left;
-          if (s_.independent) left -= its;
-          b.shown[j] = its * at_focus(at);
-          b.cover[j] = its * stands_in(at);
+          const vec at = load<vec>(place[j] + x), given = load<vec>(weight[j] + x);
+          b.missing[j] = 1.0f - counts(given) * at_focus(at);
+          b.cover[j] = seen(given) * stands_in(at) * left;
+          if (s_.independent) left *= 1.0f - given;
         }
         for (int j = 0; j < s_.count; j++) {
-          vec others = {};
-          for (int i = 0; i < s_.count; i++) others += i == j ? vec{} : b.shown[i];
-          share += b.cover[j] *= alone(others);
+          for (int i = 0; i < s_.count; i++) b.cover[j] *= i == j ? all(1.0f) : b.missing[i];
+          share += b.cover[j];
         }
         if (!any_positive(share)) continue;
         const vec through = most(all(1.0f) - share, vec{});

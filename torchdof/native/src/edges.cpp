@@ -61,6 +61,7 @@ constexpr float WIDE = constants::edges::WIDE;
 constexpr float MIXED = constants::edges::MIXED;
 constexpr float BESIDE = constants::edges::BESIDE;
 constexpr float DIAGONAL = constants::edges::DIAGONAL;
+constexpr int DECIDED_ROUNDS = constants::edges::DECIDED_ROUNDS;
 constexpr float CLIMBED = constants::edges::CLIMBED;
 constexpr float PIXEL = constants::edges::PIXEL;
 constexpr float BETTER = constants::edges::BETTER;
@@ -1001,19 +1002,27 @@ class Repair {
     for (int k = 0; k < KINDS; k++) prior[k] = std::log(shares_[k] / (1.0f - shares_[k]));
     const auto odds = [&](const Group &group, size_t k) {
       const float score = group.judged[k].score;
-      return score + prior[group.edges[k].kind] + lean * clamp01(std::fabs(score) - 1.0f);
+      const Edge &edge = group.edges[k];
+      const float more_blurred = clamp((std::fabs(edge.near) - std::fabs(edge.far)) / MORE_BLURRED_PX, -1.0f, 1.0f);
+      return score + prior[edge.kind] + lean * clamp01(std::fabs(score) - 1.0f) + (is_soft ? to_blurred * more_blurred : 0.0f);
     };
-    if (is_soft)
+    std::vector<std::vector<float>> chances(groups.size());
+    for (int round = 0; is_soft && round < DECIDED_ROUNDS; round++) {
       parallel((int)groups.size(), [&](int g) {
-        for (size_t k = 0; k < groups[g].edges.size(); k++) score_[groups[g].edges[k].i] = 1.0f / (1.0f + std::exp(-odds(groups[g], k)));
+        chances[g].resize(groups[g].edges.size());
+        for (size_t k = 0; k < chances[g].size(); k++)
+          chances[g][k] = 1.0f / (1.0f + std::exp(-odds(groups[g], k) - (round ? neighbours(groups[g].edges[k]) : 0.0f)));
       });
+      parallel((int)groups.size(), [&](int g) {
+        for (size_t k = 0; k < chances[g].size(); k++) score_[groups[g].edges[k].i] = chances[g][k];
+      });
+    }
     std::vector<int64_t> lost(groups.size(), 0);
     parallel((int)groups.size(), [&](int g) {
       for (size_t k = 0; k < groups[g].edges.size(); k++) {
         const Edge &edge = groups[g].edges[k];
         const Judgement &judged = groups[g].judged[k];
-        const float more_blurred = clamp((std::fabs(edge.near) - std::fabs(edge.far)) / MORE_BLURRED_PX, -1.0f, 1.0f);
-        const bool shows_near = odds(groups[g], k) + (is_soft ? neighbours(edge) + to_blurred * more_blurred : 0.0f) > 0;
+        const bool shows_near = odds(groups[g], k) + (is_soft ? neighbours(edge) : 0.0f) > 0;
         const uint8_t marks = marks_[edge.i];
         const bool was_near = marks & NEAR;
         lost[g] += shows_near - was_near;
