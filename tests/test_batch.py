@@ -65,6 +65,7 @@ test_mismatched_shapes_are_refused = refuses(
     (shown((2, 3, 3, 9, 12), (3, 3, 1, 9, 12)), r"depth must be \[2, 3, 1, H, W\]"),
     (shown((2, 3, 3, 9, 12), (2, 3, 1, 9, 12), [1.0, 2.0, 3.0]), r"focus_m must be a number, \[2\] or \[2, 3\]"),
     (shown((2, 3, 9, 12), (2, 1, 9, 12), ["near", 2.0]), "focus_m must be a number, a list of numbers"),
+    (shown((2, 3, 3, 9, 12), (2, 3, 1, 9, 12), torch.ones(2).to_sparse()), r"focus_m must be a tensor \[B\].*dense"),
     (shown((3, 12), (1, 12)), r"image must be \[B, C, H, W\]"),
     (shown((0, 0, 0), (1, 0, 0)), "image must be .* with at least one pixel"),
     (shown((2, 0, 3, 0, 0), (2, 0, 1, 0, 0)), "image must be .* with at least one pixel"),

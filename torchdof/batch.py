@@ -73,7 +73,7 @@ def numbers(axes: tuple[int, ...], name: str, value: Any) -> Any:
     if not isinstance(value, Tensor):
         return value
     _refuse_vmap(name, value)
-    if value.ndim == 0:
+    if value.ndim == 0 or value.layout != torch.strided:  # the checks of the camera refuse other layouts
         return value
     if len(axes) < 2:
         return value[:, 0] if value.ndim == 2 and value.shape[1] == 1 else value
