@@ -185,7 +185,7 @@ def stands_in(x: Tensor) -> Tensor:
 
 
 def seen(weight: Tensor) -> Tensor:
-    """The weight of a stand-in of this weight: hidden samples are none, as all weights of a pixel could exceed 1."""
+    """Part of a weight that may stand in: 0 for hidden samples, with which a pixel's weights could exceed 1."""
     return (weight - 2.0 * HIDDEN_WEIGHT).clamp_min(0.0)
 
 
