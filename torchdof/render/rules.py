@@ -67,7 +67,7 @@ def active() -> Rules:
 
 
 def refuse_unknown(rules: Sequence[str], option: str = "") -> None:
-    """Refuse names that are none of :data:`RULES`; the message begins with the option that has them."""
+    """Refuse names that :data:`RULES` does not have; the message begins with the option that has them."""
     for name in rules:
         if name not in RULES:
             raise ValueError(f"{option}there is no rule {name!r}; the rules are {', '.join(RULES)}")

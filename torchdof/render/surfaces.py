@@ -27,10 +27,12 @@ _LEAST_PASSING = 1e-6  # smallest divisor: share of the light that passes the pa
 _CONTINUES_FROM = 0.1
 """Visible share of a far surface, above HIDDEN_WEIGHT, at which it continues in full behind the near one."""
 
-# Surfaces that stand in for what lies behind them; distances on the blur axis from the focus to the near side
+# Surfaces that stand in for the background; distances on the blur axis from the focus to the near side
 _AT_FOCUS = 0.4  # where another surface begins to count as one at the focus; larger: fewer pixels need a stand-in
 _OFF_FOCUS = 0.05  # from which surfaces stand in in full; larger: it fades in over more depth
 _BARELY_BLURRED = 1.5  # up to which surfaces stand in in full, and not at all at twice this; larger: fewer bright lines
+_COUNTED = 1.25 / HIDDEN_WEIGHT  # per weight: a little less than a hidden sample's weight takes the place of a stand-in
+_SEEN_FROM = 2.0 * HIDDEN_WEIGHT  # weight from which a surface stands in; hidden samples have less
 
 
 class Surface(NamedTuple):
@@ -152,7 +154,7 @@ class PaddedFrame:
         return (_stacked if self.stacked else _mixed)(surfaces, pairs)
 
     def stand_ins(self) -> tuple[Tensor, Tensor]:
-        """What stands in for the picture at and behind the focus: light ``[B, C, h, w]`` and cover ``[B, 1, h, w]``.
+        """Stand-ins for the picture at and behind the focus: light ``[B, C, h, w]`` and cover ``[B, 1, h, w]``.
 
         In front of the focus, kernels become smaller with each layer. A kernel may just reach a farther part of its own
         surface whose smaller kernel does not reach back. The light that passes there would come from far behind, and
@@ -180,18 +182,18 @@ def at_focus(x: Tensor) -> Tensor:
 
 
 def stands_in(x: Tensor) -> Tensor:
-    """How far a surface at places ``x`` in front of the focus stands in for what lies behind it, 0 to 1."""
+    """How far a surface at places ``x`` in front of the focus stands in for its background, 0 to 1."""
     return (2.0 + x / _BARELY_BLURRED).clamp(0.0, 1.0) * (x / -_OFF_FOCUS).clamp(0.0, 1.0)
 
 
 def seen(weight: Tensor) -> Tensor:
     """Part of a weight that may stand in: 0 for hidden samples, with which a pixel's weights could exceed 1."""
-    return (weight - 2.0 * HIDDEN_WEIGHT).clamp_min(0.0)
+    return (weight - _SEEN_FROM).clamp_min(0.0)
 
 
 def counts(weight: Tensor) -> Tensor:
     """How far a surface of this weight takes the place of a stand-in, 0 to 1: a hidden sample does."""
-    return (weight * (1.25 / HIDDEN_WEIGHT)).clamp(0.0, 1.0)
+    return (weight * _COUNTED).clamp(0.0, 1.0)
 
 
 def continuation_weight(cover: Tensor) -> Tensor:

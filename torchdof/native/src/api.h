@@ -165,9 +165,9 @@ typedef struct {
   float slope, most;      // votes for each weight of the samples, and largest number of votes
 } torchdof_level;
 
-// Splits the mixed pixels of an image; see render/matting.py. maps: light [channels, height, width], coc [height, width], and 0 for
-// pixels that are left out [height, width] or null. out: own and other light, coc and weight of the other surface, [2 channels
-// + 2, height, width]. The first two maps have gradients.
+// Splits the mixed pixels of an image; see render/matting.py. maps: light [channels, height, width], coc [height, width], and 0
+// for pixels that are left out [height, width] or null. out: own and other light, coc and weight of the other surface,
+// [2 channels + 2, height, width]. The first two maps have gradients.
 TORCHDOF_API int32_t torchdof_matte(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t threads,
                                     float *out, const float *gradient, float *const *of_maps);
 

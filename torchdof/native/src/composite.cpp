@@ -926,7 +926,7 @@ class Composite {
     }
   }
 
-  // Puts the surfaces that stand in for what lies behind them in front of the tile's canvas.
+  // Puts the surfaces that stand in for the background in front of the tile's canvas.
   void add_stand_ins(int y0, int x0, int rows, int columns, Scratch &b) {
     around(y0 / CELL, (y0 + rows - 1) / CELL, x0 / CELL, (x0 + columns - 1) / CELL, b.layers.data());
     bool any = false;  // a pixel between a layer and the next one belongs to both
@@ -967,7 +967,7 @@ class Composite {
   //
   // 1. List the full-resolution layers whose blur reaches the tile, and read the window that they need.
   // 2. From far to near, composite these layers and the coarser canvases onto the tile's canvas; between the focus and the
-  //    layers before it, the surfaces that stand in for what lies behind them.
+  //    layers before it, the surfaces that stand in for the background.
   // 3. Finish: light behind all layers, highlights.
   void tile(int tile_row, int tile_column, Scratch &b) {
     const int y0 = tile_row * TILE, x0 = tile_column * TILE, rows = std::min(TILE, H_ - y0), columns = std::min(TILE, W_ - x0);

@@ -106,10 +106,10 @@ inline vec slope_of_visible_part(vec nearer) {
   return within(nearer * (1.0f / HIDING_SHARE)) ? all(-1.0f / HIDING_SHARE) : vec{};
 }
 
-// How far a surface counts as one at the focus: clamp(1 + x / AT_FOCUS, 0, 1); how far one stands in for what lies behind it:
-// clamp(2 + x / BARELY_BLURRED, 0, 1) clamp(-x / OFF_FOCUS, 0, 1); how far one of weight w takes the place of a stand-in:
-// clamp(1.25 w / HIDDEN_WEIGHT, 0, 1), and its own weight as one: max(w - 2 HIDDEN_WEIGHT, 0); and the derivatives.
-// render/surfaces.py, at_focus, stands_in, counts and seen.
+// Stand-ins for the background, each rule with its derivative. A surface at x counts as one at the focus by clamp(1 + x /
+// AT_FOCUS, 0, 1), and stands in by clamp(2 + x / BARELY_BLURRED, 0, 1) clamp(-x / OFF_FOCUS, 0, 1). With the weight w it takes
+// the place of a stand-in by clamp(COUNTED w, 0, 1), and has the weight max(w - SEEN_FROM, 0) as one. render/surfaces.py,
+// at_focus, stands_in, counts and seen.
 inline vec unlimited_at_focus(vec place) { return place * (1.0f / AT_FOCUS) + 1.0f; }
 inline vec at_focus(vec place) { return clamp01(unlimited_at_focus(place)); }
 inline vec slope_of_at_focus(vec place) { return within(unlimited_at_focus(place)) ? all(1.0f / AT_FOCUS) : vec{}; }
@@ -121,11 +121,11 @@ inline vec slope_of_stands_in(vec place) {  // 0 where it is 0
   const vec slope = (in <= all(1.0f) ? clamp01(off) * (1.0f / BARELY_BLURRED) : vec{}) - (off <= all(1.0f) ? clamp01(in) * (1.0f / OFF_FOCUS) : vec{});
   return stands_in(place) > vec{} ? slope : vec{};
 }
-inline vec seen(vec weight) { return most(weight - 2 * HIDDEN_WEIGHT, vec{}); }
-inline vec slope_of_seen(vec weight) { return weight > 2 * HIDDEN_WEIGHT ? all(1.0f) : vec{}; }
-inline vec unlimited_counts(vec weight) { return weight * (1.25f / HIDDEN_WEIGHT); }
+inline vec seen(vec weight) { return most(weight - SEEN_FROM, vec{}); }
+inline vec slope_of_seen(vec weight) { return weight > SEEN_FROM ? all(1.0f) : vec{}; }
+inline vec unlimited_counts(vec weight) { return weight * COUNTED; }
 inline vec counts(vec weight) { return clamp01(unlimited_counts(weight)); }
-inline vec slope_of_counts(vec weight) { return within(unlimited_counts(weight)) ? all(1.25f / HIDDEN_WEIGHT) : vec{}; }
+inline vec slope_of_counts(vec weight) { return within(unlimited_counts(weight)) ? all(COUNTED) : vec{}; }
 
 // The normalizer of a layer, its weight w plus the weight v behind it, is raised where it is small: with l = max(KNOWN - w -
 // v, 0), by l^2 / (2 KNOWN), whose derivative by w or v is -l / KNOWN. render/composite.py, raised.
