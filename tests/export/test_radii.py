@@ -39,7 +39,8 @@ def written(folder: Path, radius: float, family: str, tolerance: float, layout: 
 
 
 @pytest.mark.parametrize(("radius", "family", "tolerance", "layout"), [
-    (11.7, "gaussian", 8, "tiles"), (33.0, "lens", 16, "whole"),
+    (11.7, "gaussian", 8, "tiles"),
+    pytest.param(33.0, "lens", 16, "whole", marks=pytest.mark.sweep),
     pytest.param(29.3, "softm", 24, "tiles", marks=pytest.mark.sweep),
     pytest.param(57.1, "disc", 48, "tiles", marks=pytest.mark.sweep),  # examples/test_web_files.py: 64 px
 ])  # fmt: skip

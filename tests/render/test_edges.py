@@ -122,6 +122,16 @@ def test_undecided_pixels_of_a_soft_map_show_the_more_blurred_surface(engine: st
     torch.testing.assert_close(far_is_blurred, torch.full((6,), 10.0), atol=1e-4, rtol=0)
 
 
+@pytest.mark.parametrize("mixed", [0.42, 0.48])
+def test_a_mixed_colour_belongs_to_a_more_blurred_near_surface(engine: str, mixed: float) -> None:
+    """It is light of the near surface too; in focus with the far one it would be a sharp outline."""
+    image = two_colours()
+    image[..., 8:50:8, 31] = mixed
+    coc_px = edges.mended(image, -10 * RAMP, "auto")[0, 0]
+    torch.testing.assert_close(coc_px[8:50:8, 31], torch.full((6,), -10.0), atol=1e-4, rtol=0)
+    torch.testing.assert_close(coc_px[:, 28], torch.zeros(64), atol=1e-4, rtol=0)
+
+
 RAMP = ((torch.arange(64.0) - 28.5) / 6).clamp(0, 1).expand(1, 1, 64, 64)
 
 

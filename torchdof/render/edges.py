@@ -59,6 +59,7 @@ _CLEAR = 0.1  # sum of these weights from which samples beside a step count in f
 _CLEAR_IN_PRIOR = 0.25  # the same where the share of wrong pixels is estimated; larger: soft pictures stay
 _LIKELY = 0.01  # likelihood from which a ramp's pixel shows one of both surfaces; larger: more pixels stay between them
 _COLOUR_NOISE = 2.25e-4  # (1.5 %)^2: variance of a colour, over its square, that a surface has at least
+_MIXTURE = 0.05  # likelihood of a mixed colour on a more blurred near surface; larger: fewer outlines, less detail
 _SPREAD = 0.3  # variance, over that of both surfaces, by which a sample resembles a pixel; larger: more do
 _SIMILAR = 0.0225  # (15 %)^2: squared difference, over the square, at which a neighbour counts by half
 _SHARPNESS = 1.6  # factor on scores, which samples on the wrong side reduce; larger: colour outweighs the map
@@ -292,7 +293,7 @@ def _repair(
     rows, columns = (_from_border(n, given.device) // _BLOCK for n in (height, width))
     sampled = pixels.indices(edges.is_edge & ((rows[:, None] + columns) % every == 0))
     kind = _kind(edges)
-    score = _judge(looks, given, sampled, _CLEAR_IN_PRIOR, ops)[0]
+    score = _judge(looks, given, sampled, _CLEAR_IN_PRIOR, False, ops)[0]
     weight = (0.5 * score.abs()).clamp(max=1.0)
     prior = _calibrate(pixels.pick(kind, sampled)[0], score, weight, batch)[kind]
     wrong = torch.where(is_near, 1.0 - prior, prior)
@@ -320,14 +321,13 @@ def _repair(
     edge_pixels = pixels.indices(doubtful)
     if auto and is_empty(edge_pixels):  # nor lamps: a soft map has ramps, which are selected
         return -nearness if of_coc else nearness
-    score, evidence, near, far = _judge(looks, given, edge_pixels, _CLEAR, ops)
+    score, evidence, near, far = _judge(looks, given, edge_pixels, _CLEAR, of_coc, ops)
     shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0])
     if auto:  # without auto, correct steps are decided too, and the lead would move them
         shows_near = shows_near + (_LEAN if rules.far_lead else 0.0) * (score.abs() - 1.0).clamp(0.0, 1.0)
     of_soft = is_soft.flatten().index_select(0, edge_pixels // (height * width))
     if auto and of_coc and rules.more_blurred:
-        blur = pixels.pick(looks[-3:-1], edge_pixels).abs()  # of the near and of the far surface
-        more_blurred = _TO_BLURRED * ((blur[0] - blur[1]) / _MORE_BLURRED_PX).clamp(-1.0, 1.0)
+        more_blurred = _TO_BLURRED * _more_blurred(pixels.pick(looks[-3:-1], edge_pixels))
         shows_near = torch.where(of_soft, shows_near + more_blurred, shows_near)
     # pixels of a soft map that stick out of an edge are mostly background of a similar colour
     window = pixels.around(edge_pixels, given, 1)
@@ -474,7 +474,7 @@ def _kind(edges: _Edges) -> Tensor:
 
 
 def _judge(
-    looks: Tensor, like: Tensor, edge_pixels: Tensor, clear: float, ops: Ops
+    looks: Tensor, like: Tensor, edge_pixels: Tensor, clear: float, mixtures: bool, ops: Ops
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Scores by colour which of two surfaces pixels ``[P]`` show.
 
@@ -483,7 +483,9 @@ def _judge(
     3. Compute the likelihood of each surface: the share of its samples that resemble the pixel. A surface of several
        colours has no useful mean. Beside a step, few samples prove little: in a photograph, whose edges are soft, a
        strand of a pixel has mostly the colour of its background.
-    4. Average scores over neighbours of similar colour.
+    4. With ``mixtures``, which needs maps of the coc, add the likelihood of a mixture of both colours to a more blurred
+       near surface. Such a pixel resembles neither surface; left in the sharper far one it would be a sharp outline.
+    5. Average scores over neighbours of similar colour.
 
     ``looks`` are :func:`torchdof.pixels.rows` of the colour, the nearness, the weight of samples, the nearness of both
     surfaces, and whether the pixel is on a ramp; ``like`` is a map of the frame. ``clear`` is the sum of weights from
@@ -522,6 +524,12 @@ def _judge(
         apart = (others - own[:-5, None]).square().sum(0)
         alike = (1.0 + apart / (_SPREAD * spread)).square().reciprocal()
         likelihood = (side * alike).sum(1) / total + 1e-9
+        if mixtures and active().mixtures:
+            off, along = own[:-5] - mean[:, 1], mean[:, 0] - mean[:, 1]
+            share = ((off * along).sum(0) / contrast.clamp_min(1e-12)).clamp(0.0, 1.0)
+            mixed = (1.0 + (off - share * along).square().sum(0) / spread).square().reciprocal()
+            mixed = _MIXTURE * mixed * _more_blurred(ends).clamp_min(0.0)
+            likelihood = torch.stack([likelihood[0] + mixed, likelihood[1]])
         score = torch.where(known, torch.log(likelihood[0] / likelihood[1]), 0.0).clamp(-8.0, 8.0)
         if active().few_samples:
             score = torch.where(is_ramp > 0, score, score * (least / clear).clamp(max=1.0))
@@ -545,6 +553,12 @@ def _judge(
     score = (_SHARPNESS * separation * (alike * scores).sum(0) / alike.sum(0).clamp_min(1e-12)).clamp(-6.0, 6.0)
     evidence = torch.maximum(2.0 * separation * scores.abs().amax(0) - 1.0, likeliest / _LIKELY).clamp(0.0, 1.0)
     return score, evidence, near, far
+
+
+def _more_blurred(surfaces: Tensor) -> Tensor:
+    """How clearly the near one of two surfaces, of cocs ``[2, P]``, is the more blurred one: -1, not at all, to 1."""
+    blur = surfaces.abs()
+    return ((blur[0] - blur[1]) / _MORE_BLURRED_PX).clamp(-1.0, 1.0)
 
 
 def _calibrate(kinds: Tensor, score: Tensor, weight: Tensor, items: int) -> Tensor:

@@ -48,6 +48,7 @@ class Rules:
     neighbours: bool = _rule("lets neighbours decide together in soft maps")
     like_scores: bool = _rule("averages scores over neighbours of similar colour")
     few_samples: bool = _rule("trusts colours less where a surface has few samples")
+    mixtures: bool = _rule("gives mixed colours to a more blurred near surface")
     third_surfaces: bool = _rule("keeps a ramp's pixel that shows neither surface between them")
     ringing: bool = _rule("removes rims of interpolation from soft maps")
     soft_lamps: bool = _rule("restores lamps that a soft map has averaged away")

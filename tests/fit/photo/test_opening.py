@@ -38,7 +38,9 @@ def captured(simulator, kind, radius):
 NEEDED = [("hexagon", "polygon", 60, 22), ("cat's eye", "image", 48, 15), ("coma", "image", 47, 16)]
 
 
-@pytest.mark.parametrize(("kind", "family", "natural", "look"), [*NEEDED, ("mirror", "ring", 48, 13)])
+@pytest.mark.parametrize(
+    ("kind", "family", "natural", "look"), [*NEEDED, pytest.param("mirror", "ring", 48, 13, marks=pytest.mark.sweep)]
+)
 def test_auto_chooses_the_family_that_a_shape_needs(simulator, kind, family, natural, look):
     pair, kernel = captured(simulator, kind, 7.5)
     fit = fit_pair(*pair)

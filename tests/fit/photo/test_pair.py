@@ -75,13 +75,23 @@ def test_the_blur_is_that_of_the_light_without_the_width_of_a_pixel(sigma, most)
 @pytest.mark.parametrize(
     ("camera", "family", "true", "options", "draws", "spread"),
     [
-        ({"size": 45}, "gaussian", {"sigma": 3.0}, {"fit_magnification": True}, 12, (0.75, 1.3)),
+        pytest.param(
+            {"size": 45},
+            "gaussian",
+            {"sigma": 3.0},
+            {"fit_magnification": True},
+            12,
+            (0.75, 1.3),
+            marks=pytest.mark.sweep,
+        ),
         # the noise of the dot's picture passes through the kernel: 1.3 to 2 times too small without it
         ({"size": 41}, "gaussian", {"sigma": 0.8}, {"source": "image", **HELD}, 24, (0.75, 1.3)),
-        ({"size": 55}, "ring", RING, HELD, 8, (0.5, 1.5)),
+        pytest.param({"size": 55}, "ring", RING, HELD, 8, (0.5, 1.5), marks=pytest.mark.sweep),
         # demosaiced: 2.0 to 2.3 times too small where pixels count as independent
         ({"size": 61, "bayer": True}, "disc", {"radius": 5.0}, HELD, 10, (0.7, 1.4)),
-        ({"size": 61, "snr_db": 10.0}, "gaussian", {"sigma": 2.0}, {}, 6, (0.5, 1.5)),
+        pytest.param(
+            {"size": 61, "snr_db": 10.0}, "gaussian", {"sigma": 2.0}, {}, 6, (0.5, 1.5), marks=pytest.mark.sweep
+        ),
         ({"size": 21, "dot_radius": 3.0}, "gaussian", {"sigma": 1.0}, {}, 6, (0.5, 1.5)),
         ({"size": 61, "clip": 0.9, "snr_db": 30.0}, "gaussian", {"sigma": 2.0}, {}, 6, (0.5, 1.5)),
     ],

@@ -154,6 +154,7 @@ def scene(width):
     return (image * tint)[None], torch.linspace(0.2, 0.8, width).expand(1, 1, height, width).clone()
 
 
+@pytest.mark.sweep  # the curve alone, and tables of pictures without one, have tests of their own
 def test_a_table_of_photographs_with_an_unknown_tone_curve_renders_the_true_lens_s_picture(simulator, tmp_path):
     simulator.write_photographs(tmp_path, 0.2, [0.28, 0.4, 0.6])
     found = read_photographs(tmp_path)

@@ -54,6 +54,7 @@ constexpr float RELATED = constants::edges::RELATED;
 constexpr float EXACT = constants::edges::EXACT;
 constexpr float DOUBTFUL = constants::edges::DOUBTFUL;
 constexpr float LEAN = constants::edges::LEAN;
+constexpr float MIXTURE = constants::edges::MIXTURE;
 constexpr float TO_BLURRED = constants::edges::TO_BLURRED;
 constexpr float MORE_BLURRED_PX = constants::edges::MORE_BLURRED_PX;
 constexpr float SOFT = constants::edges::SOFT;
@@ -764,6 +765,11 @@ class Repair {
     });
   }
 
+  // How clearly the near surface is the more blurred one: from -1, the far one is, to 1.
+  static float more_blurred(const Edge &edge) {
+    return clamp((std::fabs(edge.near) - std::fabs(edge.far)) / MORE_BLURRED_PX, -1.0f, 1.0f);
+  }
+
   // C: channels, or 0 for any number.
   //
   // The reference colours of a surface are those of the window's pixels whose nearness is within a quarter of the gap.
@@ -772,7 +778,8 @@ class Repair {
   // 1. Sum over each pixel's window the weights and colour differences of the references of both surfaces.
   // 2. For LANES pixels at once, compute the spread of the references' colours, and the contrast of the surfaces.
   // 3. Sum the likelihoods over the windows, which need the spread.
-  // 4. The score is the logarithm of the likelihoods' ratio, less beside a step with few samples; the reliability grows
+  // 4. In maps of the coc, where surfaces are wanted: add the likelihood of a mixture to a more blurred near surface.
+  // 5. The score is the logarithm of the likelihoods' ratio, less beside a step with few samples; the reliability grows
   //    with the contrast. A likelihood of LIKELY is full evidence that the pixel shows one of both surfaces.
   template <int C>
   void judge(Group &group, const float *falloff, bool wants_surfaces) const {
@@ -825,13 +832,14 @@ class Repair {
 
       // LANES pixels at once
       const vec per_total[2] = {1.0f / of(0), 1.0f / of(1)};
-      vec square = none, contrast = none, noise = none, from_mean[2] = {none, none};
+      vec square = none, contrast = none, noise = none, from_mean[2] = {none, none}, along = none;
       for (int c = 0; c < channels; c++) {
         const vec mine = of(count + c), near_off = of(4 + 2 * c) * per_total[0], far_off = of(5 + 2 * c) * per_total[1], both = 2.0f * mine + near_off + far_off;
         square += mine * mine;
         from_mean[0] += near_off * near_off;
         from_mean[1] += far_off * far_off;
         contrast += (near_off - far_off) * (near_off - far_off);
+        along += far_off * (far_off - near_off);  // from the far surface's colour towards the near one's
         noise += both * both;
       }
       vec spread = COLOUR_NOISE * noise + 1e-12f;
@@ -839,7 +847,10 @@ class Repair {
       const vec per_light = 1.0f / (SIMILAR * square + 1e-12f), per_spread = 1.0f / (SPREAD * spread);
       const auto is_known = (of(0) > 1e-3f) & (of(1) > 1e-3f);  // else the neighbours decide
       const vec reliability = is_known ? most(contrast / (contrast + 0.5f * spread) - 0.1f, none) / 0.9f : one;
-      float likely[2][LANES], surfaces[2][LANES], *around = group.around[k / LANES].alike[0];
+      const vec share = most(least(along / most(contrast, all(1e-12f)), one), none);
+      const vec unmixed = 1.0f + most(from_mean[1] - share * (2.0f * along - share * contrast), none) / spread;
+      const vec mixed = wants_surfaces && map_.of_coc ? MIXTURE / (unmixed * unmixed) : none;
+      float likely[2][LANES], surfaces[2][LANES], blurs[LANES], *around = group.around[k / LANES].alike[0];
       for (int l = 0; l <= lane; l++) {
         const Window &window = windows[l];
         const Edge &edge = group.edges[k - lane + l];
@@ -856,6 +867,7 @@ class Repair {
             parts[4 + side] += part * window.values[n];
           }
         }
+        blurs[l] = std::max(more_blurred(edge), 0.0f);
         for (int side = 0; side < 2; side++) {
           likely[side][l] = sum(parts[side]);
           surfaces[side][l] = edge.near + sum(parts[4 + side]) / std::max(sum(parts[2 + side]), 1e-12f);
@@ -864,6 +876,7 @@ class Repair {
       for (int n = 0; n < 8; n++) store(around + n * LANES, 1.0f / (1.0f + load<vec>(around + n * LANES) * per_light));
       vec likelihood[2];
       for (int side = 0; side < 2; side++) likelihood[side] = load<vec>(likely[side]) * per_total[side] + 1e-9f;
+      likelihood[0] += mixed * load<vec>(blurs);
       const vec likeliest = is_known ? least(most(likelihood[0], likelihood[1]) / LIKELY, one) : one;
       const vec odds = likelihood[0] / likelihood[1], clear = least(least(of(0), of(1)) / (wants_surfaces ? CLEAR : CLEAR_IN_PRIOR), one);
       for (int l = 0; l <= lane; l++) {
@@ -1003,8 +1016,7 @@ class Repair {
     const auto odds = [&](const Group &group, size_t k) {
       const float score = group.judged[k].score;
       const Edge &edge = group.edges[k];
-      const float more_blurred = clamp((std::fabs(edge.near) - std::fabs(edge.far)) / MORE_BLURRED_PX, -1.0f, 1.0f);
-      return score + prior[edge.kind] + lean * clamp01(std::fabs(score) - 1.0f) + (is_soft ? to_blurred * more_blurred : 0.0f);
+      return score + prior[edge.kind] + lean * clamp01(std::fabs(score) - 1.0f) + (is_soft ? to_blurred * more_blurred(edge) : 0.0f);
     };
     std::vector<std::vector<float>> chances(groups.size());
     for (int round = 0; is_soft && round < DECIDED_ROUNDS; round++) {
