@@ -35,6 +35,7 @@ print(torch.get_num_threads(), [torch.allclose(torch.load(file), render()) for f
 
 @pytest.mark.hard
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no fork")
+@pytest.mark.parametrize("engine", ["native", pytest.param("torch", marks=pytest.mark.sweep)], indirect=True)
 def test_a_forked_worker_renders_whatever_its_parent_has_done(engine: str, tmp_path: Path) -> None:
     """Each of the steps, after which the parent forks, starts OpenMP's threads, which do not survive the fork."""
     write_image(tmp_path / "shared.exr", Picture(torch.rand(1, 3, 200, 300)))

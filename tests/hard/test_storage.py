@@ -38,6 +38,7 @@ print(image.grad.dtype)
 """
 
 
+@pytest.mark.parametrize("engine", ["native", pytest.param("torch", marks=pytest.mark.sweep)], indirect=True)
 def test_a_default_device_or_type_and_a_fake_mode_change_nothing_of_other_pictures(engine: str) -> None:
     assert output_of(ELSEWHERE) == "True\ntorch.float32\n"
 
