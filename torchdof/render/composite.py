@@ -10,14 +10,15 @@ from torch import Tensor
 
 from .. import native
 from ..tensors import recomputed
-from . import field
+from . import field, on_gpu
 from .compiled_steps import compiled_step
+from .convolution import convolve
 from .downsampling import downsampled, upsampled
 from .ops import EAGER, Ops
 from .plan import LayerKernel
 from .rules import active
 from .scatter import fold
-from .surfaces import PaddedFrame, PaddedSurface
+from .surfaces import PaddedFrame, maps_of, surfaces_of
 
 Scatter = Callable[[Tensor, Tensor, int], Tensor]
 """``(light [B, C, H, W], kernels [1 or C, k, k], halo) -> [B, C, H - 2 halo, W - 2 halo]``."""
@@ -73,15 +74,15 @@ def accumulate_once(frame: PaddedFrame, blurs: Sequence[LayerKernel]) -> Tensor:
 
 
 def _layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter: Scatter, ops: Ops) -> Tensor:
-    """:func:`_composite_layers`, by the compiled engine if it can compute it."""
-    kernels, maps = [blur.kernel for blur in blurs], [t for s in frame.surfaces for t in s if t is not None]
-    each = len(maps) // len(frame.surfaces)
-
-    def surfaces(maps: tuple[Tensor, ...]) -> list[PaddedSurface]:
-        return [PaddedSurface(*maps[i : i + each]) for i in range(0, len(maps), each)]
+    """:func:`_composite_layers`, by the kernels of a GPU or by the compiled engine if they can compute it."""
+    if scatter is not fold:
+        picture = on_gpu.composited(frame, blurs, _by_convolution)
+        if picture is not None:
+            return picture
+    kernels, maps, count = [blur.kernel for blur in blurs], maps_of(frame.surfaces), len(frame.surfaces)
 
     def plain(*maps: Tensor) -> Tensor:
-        given = dataclasses.replace(frame, surfaces=surfaces(maps))
+        given = dataclasses.replace(frame, surfaces=surfaces_of(maps, count))
         return _composite_layers(given.near_to_far(), blurs, scatter, ops)
 
     planes, half = frame.colours + max(k.shape[-3] for k in kernels), max(blur.half for blur in blurs)
@@ -91,12 +92,17 @@ def _layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter: Scatter, 
             scaled = [(blur.kernel, blur.scale) for blur in blurs]
             how = (frame.margin, frame.area, frame.nodes[0], scaled, frame.occlusion, frame.behind is not None)
             found = compiled_step(
-                lambda *maps: native.blend(surfaces(maps), *how),
-                lambda gradient, *maps: native.blend_gradient(gradient, surfaces(maps), *how),
+                lambda *maps: native.blend(surfaces_of(maps, count), *how),
+                lambda gradient, *maps: native.blend_gradient(gradient, surfaces_of(maps, count), *how),
                 plain,
                 *maps,
             )
     return plain(*maps) if found is None else found
+
+
+def _by_convolution(frame: PaddedFrame, blurs: Sequence[LayerKernel]) -> Tensor:
+    """:func:`_composite_layers` with kernels of any lens."""
+    return _composite_layers(frame.near_to_far(), blurs, functools.partial(convolve, turned=True), EAGER)
 
 
 def _composite_layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter: Scatter, ops: Ops) -> Tensor:
