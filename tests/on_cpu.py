@@ -1,4 +1,4 @@
-"""The kernels of `torchdof/kernels` on the CPU: the same source, compiled by the C++ compiler, one thread after the other.
+"""The kernels of `torchdof/kernels` on the CPU: compiled by the C++ compiler, one thread runs after the other.
 
 So the tests run the kernels and their host code without a GPU.
 """
@@ -37,7 +37,9 @@ static void launch(Kernel kernel, const Index &grid, const Index &block, const R
           for (threadIdx.x = 0; threadIdx.x < block.x; threadIdx.x++) kernel(run);
 }
 """
-_OF_KERNEL = 'extern "C" void run_{0}(const Index *grid, const Index *block, const Run *run) {{ launch({0}, *grid, *block, *run); }}\n'
+_OF_KERNEL = """
+extern "C" void run_{0}(const Index *grid, const Index *block, const Run *run) {{ launch({0}, *grid, *block, *run); }}
+"""
 _OPTIONS = ("-std=c++17", "-O3", "-march=native", "-shared", "-fPIC", "-Wno-unknown-pragmas")
 
 

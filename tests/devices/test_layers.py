@@ -13,10 +13,10 @@ from tests.scenes import CAMERA, CASES, Case, assert_same_picture, post_before_l
 from torchdof import BlurTable, DepthOfField, blur_by_coc
 from torchdof.kernels import layers
 from torchdof.render import composite, on_gpu, pipeline
-from torchdof.render.plan import LayerKernel, Plan
+from torchdof.render.plan import Plan
 from torchdof.render.surfaces import PaddedFrame, maps_of, surfaces_of
 
-Padded = tuple[PaddedFrame, Sequence[LayerKernel]]
+Padded = tuple[PaddedFrame, on_gpu.Kernels]
 
 
 @pytest.fixture
@@ -24,19 +24,19 @@ def frames(launched: list[str], monkeypatch: pytest.MonkeyPatch) -> list[Padded]
     """The padded frames that kernels composite, and the kernels of their layers."""
     found: list[Padded] = []
 
-    def composited(frame: PaddedFrame, blurs: Sequence[LayerKernel], plain: Any) -> Tensor | None:
-        found.append((frame, blurs))
-        return render(frame, blurs, plain)
+    def composited(frame: PaddedFrame, kernels: on_gpu.Kernels, plain: Any) -> Tensor | None:
+        found.append((frame, kernels))
+        return render(frame, kernels, plain)
 
     render = on_gpu.composited
     monkeypatch.setattr(on_gpu, "composited", composited)
     return found
 
 
-def computed(frame: PaddedFrame, blurs: Sequence[LayerKernel], render: Callable[..., Tensor]) -> list[Tensor]:
+def computed(frame: PaddedFrame, kernels: on_gpu.Kernels, render: Callable[..., Tensor]) -> list[Tensor]:
     """A picture, and the gradients of a random sum over it by the surfaces."""
     leaves = [t.detach().requires_grad_() for t in maps_of(frame.surfaces)]
-    picture = render(dataclasses.replace(frame, surfaces=surfaces_of(leaves, len(frame.surfaces))), blurs)
+    picture = render(dataclasses.replace(frame, surfaces=surfaces_of(leaves, len(frame.surfaces))), kernels)
     weight = torch.rand(picture.shape, generator=torch.Generator().manual_seed(1)) - 0.3
     return [picture.detach(), *torch.autograd.grad((picture * weight).sum(), leaves)]
 
@@ -45,9 +45,9 @@ def assert_same_layers(frames: Sequence[Padded]) -> None:
     """Pictures differ by 1e-5 of the light nearby, gradients by 1e-4 of their norm."""
     assert frames
     plain = composite._by_convolution
-    for frame, blurs in frames:
-        picture, *gradients = computed(frame, blurs, functools.partial(on_gpu._by_kernels, plain=plain))
-        expected, *others = computed(frame, blurs, plain)
+    for frame, kernels in frames:
+        picture, *gradients = computed(frame, kernels, functools.partial(on_gpu._by_kernels, plain=plain))
+        expected, *others = computed(frame, kernels, plain)
         light, weights = picture[:, : frame.colours], picture[:, frame.colours :]
         assert_same_picture(expected[:, : frame.colours], light, light)
         assert float((weights - expected[:, frame.colours :]).abs().max()) <= 1e-5
@@ -70,8 +70,8 @@ TABLES = {
 def test_layers_of_any_radius_are_the_plain_engines(radius_px: float, frames: list[Padded]) -> None:
     light, coc = (t[..., :50, :75] for t in post_before_lamps())
     coc = coc * radius_px / 11.0
-    plan = Plan.for_scene(coc, 1 / 255, adapt=False)
-    blur_by_coc(light, coc, depth_edges="as given", plan=plan)
+    spanned = 1.01 * coc  # ends between nodes: at a node the plain engine may leave out the layer beside it
+    blur_by_coc(light, coc, depth_edges="as given", plan=Plan.for_scene(spanned, 1 / 255, adapt=False))
     assert_same_layers(frames)
 
 
@@ -81,7 +81,7 @@ def test_layers_of_any_table_and_tolerance_are_the_plain_engines(
     table: str, tolerance: float, frames: list[Padded]
 ) -> None:
     light, coc = (t[..., :30, 30:80] for t in post_before_lamps())
-    blur_by_coc(light, 0.5 * coc, table=TABLES[table], tolerance=tolerance)
+    blur_by_coc(light, (0.5 * coc).requires_grad_(), table=TABLES[table], tolerance=tolerance)
     assert_same_layers(frames)
 
 
@@ -96,8 +96,8 @@ def test_layers_of_random_scenes_are_the_plain_engines(seed: int, frames: list[P
         if "background" in options:
             options["background"] = options["background"][:, :1].repeat(1, channels, 1, 1)
         options.pop("table", None)
-    blur_by_coc(scene.image.float(), scene.coc_px.float(), **options)
-    assert_same_layers(frames) if scene.coc_px.abs().max() > 0.01 else None
+    blur_by_coc(scene.image.float(), scene.coc_px.float().requires_grad_(), **options)
+    assert_same_layers(frames)
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -112,6 +112,7 @@ def test_stacks_are_the_plain_engines(count: int, frames: list[Padded]) -> None:
 @pytest.mark.parametrize("case", [case for case in CASES if not case.options], ids=lambda case: case.name)
 def test_the_error_of_a_hostile_scene_is_within_its_limit(case: Case, launched: list[str]) -> None:
     assert case.error(torch.float32) <= case.float32
+    assert launched or case.float32 == 0.0  # in focus
 
 
 def test_a_batch_is_rendered_as_its_items_are_alone(launched: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -119,12 +120,12 @@ def test_a_batch_is_rendered_as_its_items_are_alone(launched: list[str], monkeyp
     light, coc = (t[..., :40, 30:90] for t in post_before_lamps(3))
     coc[2] = coc[2].clamp(-2.0, 3.0)
     for table in (BlurTable.disc(), TABLES["by colour"]):
-        alone = torch.cat([blur_by_coc(i, c, table=table) for i, c in zip(light.split(1), coc.split(1), strict=True)])
-        monkeypatch.setattr(pipeline, "_is_in_memory", lambda maps: False)
-        launched.clear()
-        together = blur_by_coc(light, coc, table=table)
+        items = zip(light.split(1), coc.split(1), strict=True)
+        alone = torch.cat([blur_by_coc(*item, table=table) for item in items])
+        with monkeypatch.context() as patched:
+            patched.setattr(pipeline, "_is_in_memory", lambda maps: False)
+            together = blur_by_coc(light, coc, table=table)
         assert launched
-        monkeypatch.undo() if False else None
         assert_same_picture(alone, together, light)
 
 

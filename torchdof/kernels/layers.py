@@ -1,7 +1,7 @@
 """The layers of a frame on a GPU: the host code of ``layers.cu``, whose comments have the formulas.
 
-Tensors are float32, contiguous and on one device. ``B`` items have ``C`` channels. With kernels of ``E = C`` colours, each
-colour is an item of one channel, which shares its places and weights with the item's other colours.
+Tensors are float32, contiguous and on one device. ``B`` items have ``C`` channels. With kernels of ``E = C`` colours,
+each colour is an item of one channel, which shares its places and weights with the item's other colours.
 """
 
 import ctypes

@@ -16,7 +16,8 @@ from typing import Any
 
 import torch
 
-HEADERS = ("rules.h", "numbers.h", *(f"constants/{n}.h" for n in ("composite", "disocclusion", "layer_weights", "surfaces")))
+_CONSTANTS = ("composite", "disocclusion", "layer_weights", "surfaces")
+HEADERS = ("rules.h", "numbers.h", *(f"constants/{name}.h" for name in _CONSTANTS))
 """Files beside this one that kernels include; the build installs them."""
 
 _NO_STANDARD_LIBRARY = {"cstdint": "typedef long long int64_t;\ntypedef unsigned int uint32_t;\n"}
@@ -29,7 +30,7 @@ def text(name: str) -> str:
 
 
 def _candidates(version: str) -> Iterator[str]:
-    """Paths at which NVRTC of a version of CUDA such as "12.8" may be: in packages of pip and conda, or the system's."""
+    """Paths at which NVRTC of CUDA, such as "12.8", may be: in packages of pip and conda, or the system's."""
     major = version.partition(".")[0]
     if sys.platform == "win32":
         folders, pattern, name = ("bin", "bin/x86_64", "lib"), f"nvrtc64_{major}0_0.dll", f"nvrtc64_{major}0_0.dll"
@@ -97,7 +98,8 @@ def compile_program(source: str, options: Sequence[str], capability: int, versio
     library.nvrtcGetSupportedArchs(known)
     usable = [each for each in known if each <= capability]
     if not usable:
-        raise RuntimeError(f"the device has compute capability {capability / 10}, NVRTC {version} needs {min(known) / 10}")
+        needed = f"NVRTC {version} needs {min(known) / 10:.1f} or more"
+        raise RuntimeError(f"the device has compute capability {capability / 10:.1f}, {needed}")
     is_known = capability in usable
     target = f"--gpu-architecture={'sm' if is_known else 'compute'}_{capability if is_known else max(usable)}"
     texts, includes = (_strings(part) for part in (names.values(), names))

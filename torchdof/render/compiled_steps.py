@@ -33,9 +33,7 @@ def compiled_step(
     return result
 
 
-def plain_gradients(
-    plain: Callable[..., Tensor], tensors: Sequence[Tensor], gradient: Tensor
-) -> list[Tensor | None]:
+def plain_gradients(plain: Callable[..., Tensor], tensors: Sequence[Tensor], gradient: Tensor) -> list[Tensor | None]:
     """The gradients of ``plain(*tensors)`` by its tensors, which can be differentiated again."""
     tensors = [t.view_as(t) for t in tensors]  # one may be computed from another: gradients stop at the views
     wanted = [t for t in tensors if t.requires_grad]

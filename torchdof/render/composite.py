@@ -75,11 +75,13 @@ def accumulate_once(frame: PaddedFrame, blurs: Sequence[LayerKernel]) -> Tensor:
 
 def _layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter: Scatter, ops: Ops) -> Tensor:
     """:func:`_composite_layers`, by the kernels of a GPU or by the compiled engine if they can compute it."""
-    if scatter is not fold:
-        picture = on_gpu.composited(frame, blurs, _by_convolution)
+    kernels, maps, count = [blur.kernel for blur in blurs], maps_of(frame.surfaces), len(frame.surfaces)
+    scaled = [(blur.kernel, blur.scale) for blur in blurs]
+    one_kernel_a_layer = scatter is not fold and blurs[0].mask is None
+    if one_kernel_a_layer:
+        picture = on_gpu.composited(frame, scaled, _by_convolution)
         if picture is not None:
             return picture
-    kernels, maps, count = [blur.kernel for blur in blurs], maps_of(frame.surfaces), len(frame.surfaces)
 
     def plain(*maps: Tensor) -> Tensor:
         given = dataclasses.replace(frame, surfaces=surfaces_of(maps, count))
@@ -88,8 +90,7 @@ def _layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter: Scatter, 
     planes, half = frame.colours + max(k.shape[-3] for k in kernels), max(blur.half for blur in blurs)
     found, is_one_plan = None, len(frame.nodes) == 1 and not frame.stacked
     if is_one_plan and planes <= native.MOST_PLANES and half <= native.HALF_LARGEST:
-        if scatter is not fold and blurs[0].mask is None and not any(k.requires_grad for k in kernels):
-            scaled = [(blur.kernel, blur.scale) for blur in blurs]
+        if one_kernel_a_layer and not any(k.requires_grad for k in kernels):
             how = (frame.margin, frame.area, frame.nodes[0], scaled, frame.occlusion, frame.behind is not None)
             found = compiled_step(
                 lambda *maps: native.blend(surfaces_of(maps, count), *how),
@@ -100,8 +101,9 @@ def _layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter: Scatter, 
     return plain(*maps) if found is None else found
 
 
-def _by_convolution(frame: PaddedFrame, blurs: Sequence[LayerKernel]) -> Tensor:
-    """:func:`_composite_layers` with kernels of any lens."""
+def _by_convolution(frame: PaddedFrame, kernels: Sequence[tuple[Tensor, int]]) -> Tensor:
+    """:func:`_composite_layers` with a kernel and a resolution for each layer."""
+    blurs = [LayerKernel(*of_layer) for of_layer in kernels]
     return _composite_layers(frame.near_to_far(), blurs, functools.partial(convolve, turned=True), EAGER)
 
 

@@ -19,7 +19,6 @@ from ..kernels import layers
 from ..tensors import is_in_memory, is_traced, without_autocast
 from .compiled_steps import plain_gradients
 from .layer_weights import ramps
-from .plan import LayerKernel
 from .surfaces import PaddedFrame, PaddedSurface, maps_of, surfaces_of
 
 DEVICE = "cuda"
@@ -28,24 +27,27 @@ DEVICE = "cuda"
 _NEAR = 1e-5  # largest difference between the pictures of both engines, of the light
 _NEAR_GRADIENT = 1e-4  # the same of their gradients, of the norm
 
-Plain = Callable[[PaddedFrame, Sequence[LayerKernel]], Tensor]
+Kernels = Sequence[tuple[Tensor, int]]
+"""Kernel ``[1 or C, k, k]`` or ``[B, 1 or C, k, k]`` of each layer, near to far, and the size of its pixels."""
+
+Plain = Callable[[PaddedFrame, Kernels], Tensor]
 """The plain engine: light ``[B, C, h, w]``, then its weight of each of the kernels' colours."""
 
 
-def composited(frame: PaddedFrame, blurs: Sequence[LayerKernel], plain: Plain) -> Tensor | None:
-    """The result of ``plain(frame, blurs)`` by kernels; None if it is not for them, or if they cannot be used.
+def composited(frame: PaddedFrame, kernels: Kernels, plain: Plain) -> Tensor | None:
+    """The result of ``plain(frame, kernels)`` by kernels of a GPU; None if they do not render it or cannot be used.
 
     Raises:
         ValueError: If they cannot be used and ``TORCHDOF_ENGINE`` is ``gpu``.
     """
-    maps, colours = maps_of(frame.surfaces), blurs[0].kernel.shape[-3]
-    if not frame.occlusion or blurs[0].mask is not None or any(blur.kernel.requires_grad for blur in blurs):
+    maps, colours = maps_of(frame.surfaces), kernels[0][0].shape[-3]
+    if not frame.occlusion or any(kernel.requires_grad for kernel, _ in kernels):
         return None
     channels, items = frame.colours // colours, len(maps[0]) * colours
     if not takes(maps, channels, len(frame.surfaces)) or items > layers.MOST_ITEMS:
         return None
     variant = (channels, len(frame.surfaces), frame.stacked, maps[0].device.index or 0)
-    return None if _missing(plain, *variant) else _by_kernels(frame, blurs, plain)
+    return None if _missing(plain, *variant) else _by_kernels(frame, kernels, plain)
 
 
 def takes(maps: Sequence[Tensor], channels: int, surfaces: int) -> bool:
@@ -79,23 +81,22 @@ def why_missing(plain: Plain, channels: int, surfaces: int, stacked: bool, devic
     where = torch.device(DEVICE, device)
     try:
         with torch.inference_mode(False), torch.enable_grad(), without_autocast(DEVICE):
-            frame, blurs = _trial(channels, surfaces, stacked, where)
+            frame, kernels = _trial(channels, surfaces, stacked, where)
             results = []
             for render in (plain, functools.partial(_by_kernels, plain=plain)):
-                picture = render(frame, blurs)
-                results.append((picture.detach(), *torch.autograd.grad(picture.square().sum(), maps_of(frame.surfaces))))
+                picture = render(frame, kernels)
+                gradients = torch.autograd.grad(picture.square().sum(), maps_of(frame.surfaces))
+                results.append((picture.detach(), *gradients))
     except Exception as error:  # of any kind: the plain engine needs none of this
         return str(error) or type(error).__name__
-    (picture, *gradients), (other, *others) = results
+    (picture, *of_plain), (other, *of_kernels) = results
     is_near = bool((other - picture).abs().max() <= _NEAR) and all(
-        bool((b - a).norm() <= _NEAR_GRADIENT * a.norm()) for a, b in zip(gradients, others, strict=True)
+        bool((b - a).norm() <= _NEAR_GRADIENT * a.norm()) for a, b in zip(of_plain, of_kernels, strict=True)
     )
     return "" if is_near else "on this device they render another picture than PyTorch"
 
 
-def _trial(
-    channels: int, surfaces: int, stacked: bool, device: torch.device
-) -> tuple[PaddedFrame, Sequence[LayerKernel]]:
+def _trial(channels: int, surfaces: int, stacked: bool, device: torch.device) -> tuple[PaddedFrame, Kernels]:
     """A small frame of random light from 0 to 1, places and weights, and layers of two resolutions."""
     dice, nodes, (height, width), margin = torch.Generator().manual_seed(0), (-3.0, -1.0, 0.0, 1.0, 3.0), (20, 36), 8
 
@@ -107,23 +108,24 @@ def _trial(
         (random(1, channels, *size), 7.0 * random(1, 1, *size) - 3.5, random(1, 1, *size) / surfaces)
         for _ in range(surfaces)
     ]
-    blurs = []
+    kernels = []
     for half, scale in ((2, 2), (3, 1), (0, 1), (3, 1), (3, 2)):
         kernel = random(1, 2 * half + 1, 2 * half + 1)
-        blurs.append(LayerKernel((kernel / kernel.sum()).to(device), scale))
+        kernels.append(((kernel / kernel.sum()).to(device), scale))
     padded = [PaddedSurface(*(t.to(device).requires_grad_() for t in of_surface)) for of_surface in maps]
     behind, starts = random(1, channels, height, width).to(device), ramps([nodes], padded[0].x.detach())
-    return PaddedFrame(padded, [nodes], starts, behind, margin, (height, width), (height, width), True, stacked), blurs
+    area = (height, width)
+    return PaddedFrame(padded, [nodes], starts, behind, margin, area, area, True, stacked), kernels
 
 
-def _by_kernels(frame: PaddedFrame, blurs: Sequence[LayerKernel], plain: Plain) -> Tensor:
-    result: Tensor = _Layers.apply(frame, blurs, plain, *maps_of(frame.surfaces))
+def _by_kernels(frame: PaddedFrame, kernels: Kernels, plain: Plain) -> Tensor:
+    result: Tensor = _Layers.apply(frame, kernels, plain, *maps_of(frame.surfaces))
     return result
 
 
 class _Layers(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, frame: PaddedFrame, blurs: Sequence[LayerKernel], plain: Plain, *maps: Tensor) -> Tensor:
+    def forward(ctx: Any, frame: PaddedFrame, kernels: Kernels, plain: Plain, *maps: Tensor) -> Tensor:
         ctx.save_for_backward(*maps)
         count, frame = len(frame.surfaces), dataclasses.replace(frame, surfaces=[])  # autograd keeps the maps
         ctx.kept = [] if any(ctx.needs_input_grad) else None
@@ -131,8 +133,8 @@ class _Layers(torch.autograd.Function):
         def with_maps(maps: Sequence[Tensor]) -> PaddedFrame:
             return dataclasses.replace(frame, surfaces=surfaces_of(maps, count))
 
-        ctx.plain = lambda *maps: plain(with_maps(maps), blurs)
-        ctx.composite = lambda maps: _composite(with_maps(maps), blurs)
+        ctx.plain = lambda *maps: plain(with_maps(maps), kernels)
+        ctx.composite = lambda maps: _composite(with_maps(maps), kernels)
         picture: Tensor = ctx.composite(maps).picture(ctx.kept)
         return picture
 
@@ -147,12 +149,12 @@ class _Layers(torch.autograd.Function):
         return None, None, None, *found
 
 
-def _composite(frame: PaddedFrame, blurs: Sequence[LayerKernel]) -> layers.Composite:
+def _composite(frame: PaddedFrame, kernels: Kernels) -> layers.Composite:
     """The layers of a frame for the kernels."""
     given = layers.Frame(
         frame.ramps.contiguous(),
-        [blur.kernel.detach() for blur in blurs],
-        [blur.scale for blur in blurs],
+        [kernel.detach() for kernel, _ in kernels],
+        [scale for _, scale in kernels],
         [min(places) < 0 for places in zip(*frame.nodes, strict=True)],
         frame.margin,
         frame.area,

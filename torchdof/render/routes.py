@@ -1,6 +1,6 @@
 """Which engine renders a call, and which calls no engine renders.
 
-| call | eager, float32 on the CPU | with gradients | float32 on a CUDA device | float64, other devices | `torch.compile` | ONNX file |
+| call | eager, float32 on the CPU | with gradients | on a CUDA device | otherwise | `torch.compile` | ONNX file |
 | --- | --- | --- | --- | --- | --- | --- |
 | image | compiled | steps | kernels | PyTorch | graph | graph |
 | image without occlusion | compiled | steps | PyTorch | PyTorch | graph | graph |
@@ -16,9 +16,9 @@
 
 - compiled: the compiled engine renders the whole picture.
 - steps: PyTorch renders, and the compiled engine computes those of its steps that it supports.
-- kernels: PyTorch renders, and CUDA kernels blur and composite the layers, with and without gradients, of up to 8 channels
-  or of colours with their own kernels
-  (:mod:`torchdof.render.on_gpu`).
+- kernels: PyTorch renders, and CUDA kernels blur and composite the layers of float32, with and without gradients, of up
+  to 8 channels, or of any number of colours with kernels of their own (:mod:`torchdof.render.on_gpu`).
+- otherwise: float64, or another device.
 - PyTorch: PyTorch renders alone. So it does where there is no compiled engine, or no NVRTC beside PyTorch for the
   kernels; with `TORCHDOF_ENGINE=torch`; and in forward mode or under `torch.func`.
 - graph: one static graph. That of `torch.compile` has no rays of highlights.
@@ -185,7 +185,7 @@ def _of_eager(
 
 
 def _of_gpu(options: Options, maps: Sequence[Tensor], is_stack: bool) -> Route:
-    """As :func:`route`, for a device with kernels; by the same conditions as :func:`torchdof.render.on_gpu.composited`."""
+    """As :func:`route`, for a device with kernels, by the conditions of :func:`torchdof.render.on_gpu.composited`."""
     channels = 1 if options.table.channels > 1 else maps[0].shape[-3]
     # a stack has a black surface behind it; a known background is behind the two surfaces of a pixel
     surfaces = maps[0].shape[1] + 1 if is_stack else 3 if len(maps) > 2 else 2
