@@ -3,6 +3,7 @@
 So the tests run the kernels and their host code without a GPU.
 """
 
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -12,10 +13,9 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 
-from torchdof.kernels import layers
+from torchdof.kernels import layers, loader
 
 ROOT = Path(__file__).parents[1]
 COMPILER = os.environ.get("CXX") or shutil.which("c++")
@@ -37,22 +37,45 @@ static void launch(Kernel kernel, const Index &grid, const Index &block, const R
           for (threadIdx.x = 0; threadIdx.x < block.x; threadIdx.x++) kernel(run);
 }
 """
-_OF_KERNEL = """
-extern "C" void run_{0}(const Index *grid, const Index *block, const Run *run) {{ launch({0}, *grid, *block, *run); }}
+
+# Functions of the CUDA driver: a "function" is a kernel, the only parameter of which is a Run.
+_DRIVER = """
+#include <cstring>
+typedef void (*Kernel)(Run);
+static const struct { const char *name; Kernel kernel; } KERNELS[] = {%s};
+extern "C" int cuModuleLoadData(const void **module, const void *image) {
+  *module = KERNELS;
+  return image ? 0 : 1;
+}
+extern "C" int cuModuleGetFunction(Kernel *function, const void *module, const char *name) {
+  for (const auto &each : KERNELS)
+    if (module == KERNELS && !strcmp(each.name, name)) {
+      *function = each.kernel;
+      return 0;
+    }
+  return 500;
+}
+extern "C" int cuLaunchKernel(Kernel function, unsigned gx, unsigned gy, unsigned gz, unsigned bx, unsigned by,
+                              unsigned bz, unsigned shared, void *stream, void **parameters, void **extra) {
+  if (shared || extra || bz != 1 || stream != (void *)7) return 1;
+  launch(function, {(int)gx, (int)gy, (int)gz}, {(int)bx, (int)by, 1}, *(const Run *)parameters[0]);
+  return 0;
+}
+extern "C" int cuGetErrorString(int status, const char **text) {
+  *text = status == 500 ? "named symbol not found" : "invalid argument";
+  return 0;
+}
 """
+STREAM = 7  # the only one of this driver
 _OPTIONS = ("-std=c++17", "-O3", "-march=native", "-shared", "-fPIC", "-Wno-unknown-pragmas")
 
 
-class _Index(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_int) for name in "xyz"]
-
-
 @functools.cache
-def module(channels: int, surfaces: int, stacked: bool, device: int = 0) -> layers.Launch:
-    """As :func:`torchdof.kernels.layers.module`, for the CPU. The library is kept for other processes of a test run."""
+def driver(channels: int, surfaces: int, stacked: bool) -> ctypes.CDLL:
+    """A driver with the kernels for frames of so many channels and surfaces; kept for the other processes of a run."""
     source = (_SOURCES[0] / "layers.cu").read_text()
     kernels = re.findall(r'^extern "C" __global__ void (\w+)\(', source, re.MULTILINE)
-    program = _BEFORE + "".join(map(_OF_KERNEL.format, kernels))
+    program = _BEFORE + _DRIVER % ", ".join(f'{{"{name}", {name}}}' for name in kernels)
     given = [*_OPTIONS, *layers.options(channels, surfaces, stacked)]
     headers = [file.read_text() for file in sorted(_SOURCES[1].glob("*.h"))]
     constants = (ROOT / "cmake" / "constants.py").read_text()
@@ -70,9 +93,9 @@ def module(channels: int, surfaces: int, stacked: bool, device: int = 0) -> laye
             folder.mkdir(exist_ok=True)
             shutil.copy(path / "kernels.so", unfinished := folder / f"{os.getpid()}.so")
             unfinished.replace(library)
-    loaded = ctypes.CDLL(str(library))
+    return ctypes.CDLL(str(library))
 
-    def launch(kernel: str, grid: Sequence[int], block: Sequence[int], argument: ctypes.Structure) -> None:
-        getattr(loaded, f"run_{kernel}")(*map(ctypes.byref, (_Index(*grid), _Index(*block), argument)))
 
-    return launch
+def module(channels: int, surfaces: int, stacked: bool, device: int = 0) -> layers.Launch:
+    """As :func:`torchdof.kernels.layers.module`, with that driver."""
+    return loader.Module(driver(channels, surfaces, stacked), b"program", lambda: contextlib.nullcontext(STREAM))

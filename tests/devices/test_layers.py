@@ -87,17 +87,19 @@ def test_layers_of_any_table_and_tolerance_are_the_plain_engines(
 
 @pytest.mark.parametrize("seed", range(10))
 def test_layers_of_random_scenes_are_the_plain_engines(seed: int, frames: list[Padded]) -> None:
-    """Images alone and in front of a known background, of 1 to 4 channels."""
+    """Images alone and in front of a known background, of 1 or 3 channels."""
     scene = random_scene(seed, ["filled", "background"], side=40)
-    channels = 1 + seed % 4
     options = {k: v.float() if isinstance(v, Tensor) else v for k, v in scene.options.items()}
-    if channels != scene.image.shape[1]:
-        scene.image = scene.image[:, :1].repeat(1, channels, 1, 1)
-        if "background" in options:
-            options["background"] = options["background"][:, :1].repeat(1, channels, 1, 1)
-        options.pop("table", None)
     blur_by_coc(scene.image.float(), scene.coc_px.float().requires_grad_(), **options)
     assert_same_layers(frames)
+
+
+def test_layers_of_eight_channels_are_the_plain_engines_and_of_more_are_not_taken(frames: list[Padded]) -> None:
+    light, coc = (t[..., :24, 40:70] for t in post_before_lamps())
+    light = torch.cat([light, light.flip(-1), light.flip(-2)], 1)
+    blur_by_coc(light[:, :8], coc.requires_grad_())
+    assert_same_layers(frames)
+    assert not on_gpu.takes([light], 9, 2)
 
 
 @pytest.mark.parametrize("count", [1, 3])

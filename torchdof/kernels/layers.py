@@ -83,7 +83,7 @@ class Kept(NamedTuple):
 @functools.cache
 def module(channels: int, surfaces: int, stacked: bool, device: int) -> Launch:
     """The kernels for frames of so many channels and surfaces, compiled for a CUDA device."""
-    return loader.Module(loader.text("layers.cu"), options(channels, surfaces, stacked), device)
+    return loader.on_device(loader.text("layers.cu"), options(channels, surfaces, stacked), device)
 
 
 def options(channels: int, surfaces: int, stacked: bool) -> list[str]:

@@ -10,7 +10,8 @@ import os
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -126,45 +127,55 @@ def _strings(texts: Iterable[str]) -> Any:
     return (ctypes.c_char_p * len(encoded))(*encoded)
 
 
-class Module:
-    """Kernels of a source on a device; ``module(name, grid, block, argument)`` launches one.
+Queue = Callable[[], AbstractContextManager[int]]
+"""A block in which a device's context is current; its value is the handle of the stream in use."""
 
-    Args:
-        source: CUDA C, whose kernels have one argument, a structure.
-        options: Options of NVRTC.
-        device: Index of the CUDA device.
+
+def on_device(source: str, options: Sequence[str], device: int) -> "Module":
+    """Kernels of a source on a CUDA device, on PyTorch's current stream there.
 
     Raises:
         OSError: If NVRTC or the driver is not found.
         RuntimeError: If the source cannot be compiled or loaded.
     """
+    if torch.version.cuda is None:
+        raise RuntimeError("this PyTorch is not built for CUDA")
+    driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    major, minor = torch.cuda.get_device_capability(device)
+    image = compiled(source, options, 10 * major + minor, torch.version.cuda)
 
-    def __init__(self, source: str, options: Sequence[str], device: int) -> None:
-        if torch.version.cuda is None:
-            raise RuntimeError("this PyTorch is not built for CUDA")
-        self._driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
-        self._device, self._functions = device, dict[str, ctypes.c_void_p]()
-        major, minor = torch.cuda.get_device_capability(device)
-        image, module = compiled(source, options, 10 * major + minor, torch.version.cuda), ctypes.c_void_p()
+    @contextlib.contextmanager
+    def queue() -> Iterator[int]:
         with torch.cuda.device(device):
-            torch.cuda.current_stream().synchronize()  # makes PyTorch's context current
-            self._check(self._driver.cuModuleLoadData(ctypes.byref(module), image))
-        self._module = module
+            yield torch.cuda.current_stream().cuda_stream
+
+    with torch.cuda.device(device):
+        torch.cuda.synchronize()  # PyTorch makes its context current
+    return Module(driver, image, queue)
+
+
+class Module:
+    """Kernels on a device; ``module(name, grid, block, argument)`` launches one, whose only argument is a structure."""
+
+    def __init__(self, driver: ctypes.CDLL, image: bytes, queue: Queue) -> None:
+        self._driver, self._queue, self._functions = driver, queue, dict[str, ctypes.c_void_p]()
+        self._module = ctypes.c_void_p()
+        with queue():
+            self._check(driver.cuModuleLoadData(ctypes.byref(self._module), image))
 
     def __call__(self, name: str, grid: Sequence[int], block: Sequence[int], argument: ctypes.Structure) -> None:
-        """Launch a kernel on PyTorch's current stream of the device; grid and block are x, y, z."""
-        function = self._functions.get(name)
-        if function is None:
-            function = ctypes.c_void_p()
-            self._check(self._driver.cuModuleGetFunction(ctypes.byref(function), self._module, name.encode()))
-            self._functions[name] = function
+        """Launch a kernel; grid and block are x, y, z."""
         pointers = (ctypes.c_void_p * 1)(ctypes.addressof(argument))
-        with torch.cuda.device(self._device):
-            stream = ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
-            self._check(self._driver.cuLaunchKernel(function, *grid, *block, 0, stream, pointers, None))
+        with self._queue() as stream:
+            if name not in self._functions:
+                function = ctypes.c_void_p()
+                self._check(self._driver.cuModuleGetFunction(ctypes.byref(function), self._module, name.encode()))
+                self._functions[name] = function
+            given = (*grid, *block, 0, ctypes.c_void_p(stream), pointers, None)
+            self._check(self._driver.cuLaunchKernel(self._functions[name], *given))
 
     def _check(self, status: int) -> None:
         if status:
             reason = ctypes.c_char_p()
             self._driver.cuGetErrorString(status, ctypes.byref(reason))
-            raise RuntimeError(f"the CUDA driver reports: {(reason.value or b'').decode()} ({status})")
+            raise RuntimeError(f"the CUDA driver reports {(reason.value or b'nothing').decode()!r}, error {status}")
