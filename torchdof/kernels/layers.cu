@@ -283,25 +283,27 @@ extern "C" __global__ void find_read(const __grid_constant__ Run r) {
   r.read[tile_at(r, blockIdx.z / r.layers * r.colours, blockIdx.z % r.layers, row, column)] = any_near(r, r.lit, row, column);
 }
 
-// The terms of a pixel of the grid in a layer; blockIdx.z counts items, and layers in them.
+// The terms of a pixel of the grid in all layers: one thread has them all, so that the surfaces stay in the cache.
 extern "C" __global__ void terms(const __grid_constant__ Run r) {
-  const int y = pixel_row(), x = pixel_column(), item = blockIdx.z / r.layers, layer = blockIdx.z % r.layers;
-  if (!r.read[tile_at(r, item, layer, blockIdx.y, blockIdx.x)] || y >= r.rows || x >= r.columns) return;
-  const Ramps l = ramps_of(r, item, layer);
-  const int first = first_in_frame(r, y, x);
-  float sum[VALUES] = {};  // outside of the frame 0, because convolve multiplies it by 0
-  for (int i = 0; first >= 0 && i < r.scale * r.scale; i++) {
-    const int at = first + i / r.scale * r.frame_columns + i % r.scale;
-    const Pixel p = pixel_of(r, item, at);
-    const Weights w = weigh(l, p);
-    for (int j = 0; j < SURFACES; j++) {
-      for (int c = 0; c < CHANNELS; c++) sum[c] += light_of(r, p, j, light_at(r, item, c, at)) * w.own[j];
-      sum[OWN] += w.own[j];
+  const int y = pixel_row(), x = pixel_column(), item = blockIdx.z, first = first_in_frame(r, y, x);
+  if (y >= r.rows || x >= r.columns) return;
+  for (int layer = 0; layer < r.layers; layer++) {
+    if (!r.read[tile_at(r, item, layer, blockIdx.y, blockIdx.x)]) continue;
+    const Ramps l = ramps_of(r, item, layer);
+    float sum[VALUES] = {};  // outside of the frame 0, because convolve multiplies it by 0
+    for (int i = 0; first >= 0 && i < r.scale * r.scale; i++) {
+      const int at = first + i / r.scale * r.frame_columns + i % r.scale;
+      const Pixel p = pixel_of(r, item, at);
+      const Weights w = weigh(l, p);
+      for (int j = 0; j < SURFACES; j++) {
+        for (int c = 0; c < CHANNELS; c++) sum[c] += light_of(r, p, j, light_at(r, item, c, at)) * w.own[j];
+        sum[OWN] += w.own[j];
+      }
+      sum[BEYOND] += w.beyond;
     }
-    sum[BEYOND] += w.beyond;
+    float *const to = r.terms + ((long long)item * r.layers + layer) * VALUES * area_of_grid(r) + y * r.columns + x;
+    for (int n = 0; n < VALUES; n++) to[n * area_of_grid(r)] = sum[n] / (r.scale * r.scale);
   }
-  float *const to = r.terms + blockIdx.z * VALUES * area_of_grid(r) + y * r.columns + x;
-  for (int n = 0; n < VALUES; n++) to[n * area_of_grid(r)] = sum[n] / (r.scale * r.scale);
 }
 
 // Convolves the first VALUES planes of a grid at the ROWS pixels from (y, x) on. turned: with the kernel turned, which scatters.

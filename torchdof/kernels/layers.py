@@ -19,7 +19,7 @@ MOST_CHANNELS, MOST_SURFACES, MOST_ITEMS = 8, 4, 4000
 
 _LAYERS = 16  # most layers of a launch
 _TILE_ROWS, _TILE_COLUMNS, _ROWS = 16, 32, 4  # as in layers.cu
-_MOST_VALUES = 2**26  # most values of a launch's terms, 256 MB; larger: fewer launches, more memory
+_MOST_VALUES = 2**27  # most values of a launch's terms, 512 MB; larger: fewer launches, more memory
 
 Surface = tuple[Tensor, Tensor, Tensor | None]
 """Light ``[B, C, H, W]``, place on the blur axis and weight (None: 1), ``[B, 1, H, W]``."""
@@ -233,7 +233,7 @@ class Composite:
         """Lays a group of layers over a canvas; returns the memory of its terms."""
         terms = self._empty(*group.grid, planes=len(group.layers) * (self._channels + 2))
         argument = self._of_group(group, of_group.tables, before=of_group.before, terms=terms, **pointers)
-        self._run("terms", group.grid, argument, self._items * len(group.layers))
+        self._run("terms", group.grid, argument)
         self._run("composite", (group.height, group.width), argument, rows=_ROWS)
         return terms
 
