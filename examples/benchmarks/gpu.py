@@ -28,17 +28,18 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from examples.benchmarks.steps import crops
-from torchdof import blur_by_coc
+from examples.benchmarks.steps import Counted, crops
+from torchdof import blur_by_coc, native
 from torchdof.functional import splat
 from torchdof.kernels import layers, loader
-from torchdof.render import on_gpu, pipeline
+from torchdof.render import on_gpu
 
 HAS_DEVICE = torch.cuda.is_available()
 DEVICE = "cuda" if HAS_DEVICE else "cpu"
 CASES = [
-    *(((1080, 1920, 1), radius_px) for radius_px in (8.0, 16.0, 64.0)),
+    ((1080, 1920, 1), 8.0),
     ((256, 256, 8), 8.0),
+    *(((1080, 1920, 1), radius_px) for radius_px in (16.0, 64.0)),
     ((2160, 3840, 1), 16.0),
 ]
 """Height, width and number of pictures, and the largest radius of the blur."""
@@ -80,31 +81,39 @@ class Launches:
 
     def __init__(self) -> None:
         self.count: collections.Counter[str] = collections.Counter()
-        self.bytes: collections.Counter[str] = collections.Counter()
-        self.ms: collections.Counter[str] = collections.Counter()
+        self.bytes: dict[str, float] = collections.defaultdict(float)
+        self.ms: dict[str, float] = collections.defaultdict(float)
 
-    def of(self, launch: layers.Launch, variant: Sequence[Any]) -> layers.Launch:
+    def __enter__(self) -> "Launches":
+        self._module = layers.module
+        layers.module = lambda *variant: self._counted(self._module(*variant), variant)  # type: ignore[assignment]
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        layers.module = self._module
+
+    def _counted(self, launch: layers.Launch, variant: Sequence[Any]) -> layers.Launch:
         """A launch that is counted. Without a device only the tables of tiles are computed, which the model needs."""
 
         def counted(kernel: str, grid: Any, block: Any, argument: Any) -> None:
             self.count[kernel] += 1
             if HAS_DEVICE:
-                self.ms[kernel] += milliseconds(lambda: launch(kernel, grid, block, argument), 1)
+                self.ms[kernel] += milliseconds(1, launch, kernel, grid, block, argument)
                 return
             if kernel in ("mark", "find_lit", "find_read"):
                 launch(kernel, grid, block, argument)
             moved, operations = cost(kernel, argument, grid[2], *variant[:2])
-            self.bytes[kernel] += int(moved)
+            self.bytes[kernel] += moved
             self.ms[kernel] += 1e3 * max(LAUNCH_S, moved / BYTES_PER_S, operations / FLOPS)
 
         return counted
 
     def show(self, name: str) -> None:
         """Prints a line for all kernels, and one for each."""
-        what = "" if HAS_DEVICE else f", {sum(self.bytes.values()) / 1e6:.0f} MB, by the model"
-        print(f"  {name}: {sum(self.count.values())} launches{what} {sum(self.ms.values()):.2f} ms")
+        what = "," if HAS_DEVICE else f", {sum(self.bytes.values()) / 1e6:.0f} MB, by the model"
+        print(f"{name}: {sum(self.count.values())} launches{what} {sum(self.ms.values()):.2f} ms")
         for kernel, count in sorted(self.count.items(), key=lambda item: -self.ms[item[0]]):
-            print(f"    {kernel:15} {count:3} launches {self.ms[kernel]:8.3f} ms")
+            print(f"  {kernel:15} {count:3} launches {self.ms[kernel]:8.3f} ms")
 
 
 def cost(kernel: str, r: Any, depth: int, channels: int, surfaces: int) -> tuple[float, float]:
@@ -127,7 +136,7 @@ def cost(kernel: str, r: Any, depth: int, channels: int, surfaces: int) -> tuple
     pixels = r.rows * r.columns * frame * depth
     numbers, operations = {
         "mark": (surfaces * pixels, 0.0),
-        "terms": (any_read * frame * maps + read * values, 40.0 * read * frame * surfaces),
+        "terms": (any_read * frame * maps + read * values, 100.0 * read * frame * surfaces),
         "composite": (lit * values + 2.0 * picture, 2.0 * taps * values),
         "walk_back": (lit * (2 * values + 1) + 2.0 * picture, 0.0),
         "convolve_back": ((lit + read) * values, 2.0 * taps * values),
@@ -141,13 +150,13 @@ def cost(kernel: str, r: Any, depth: int, channels: int, surfaces: int) -> tuple
     return 4.0 * numbers, operations
 
 
-def milliseconds(call: Callable[[], Any], repeat: int) -> float:
+def milliseconds(repeat: int, call: Callable[..., Any], *arguments: Any) -> float:
     """Median milliseconds of some calls on the device."""
     taken = []
     for _ in range(repeat):
         start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
         start.record()
-        call()
+        call(*arguments)
         end.record()
         torch.cuda.synchronize()
         taken.append(start.elapsed_time(end))
@@ -170,7 +179,7 @@ def on_cpu() -> None:
     from tests import on_cpu
 
     on_gpu.DEVICE, layers.module = "cpu", on_cpu.module  # type: ignore[assignment]
-    pipeline._is_in_memory = lambda maps: False  # items of a batch together, as on a device
+    native._library = lambda: (None, "switched off")  # as on a device: all but the layers by PyTorch, items together
 
 
 def scene(size: tuple[int, int, int], radius_px: float, focus: float = 0.4) -> tuple[str, Tensor, Tensor]:
@@ -203,14 +212,15 @@ def versions() -> None:
 def first_use() -> None:
     """Seconds until the first picture: compiled and tried, then with the kept program."""
     _, light, coc_px = scene((256, 256, 1), 8.0)
-    for name in ("compiled", "kept"):
+    for name in ("without kernels", "kernels compiled", "the kept program"):
         for cached in (layers.module, on_gpu.why_missing):
             getattr(cached, "cache_clear", lambda: None)()
         start = time.perf_counter()
-        blur_by_coc(light, coc_px)
+        with engine("torch" if name == "without kernels" else "gpu"):
+            blur_by_coc(light, coc_px)
         if HAS_DEVICE:
             torch.cuda.synchronize()
-        print(f"first picture, program {name}: {time.perf_counter() - start:.2f} s")
+        print(f"first picture, {name}: {time.perf_counter() - start:.2f} s")
 
 
 def same_pictures() -> None:
@@ -233,23 +243,26 @@ def costs(ends: float) -> None:
             print("no time left for further cases")
             return
         name, light, coc_px = scene(size, radius_px)
-        print(name)
         for kind, call in (("picture", picture), ("step", step)):
             if HAS_DEVICE:
-                times = []
-                for selected in ("gpu", "torch"):
-                    with engine(selected):
-                        call(light, coc_px)
-                        torch.cuda.reset_peak_memory_stats()
-                        before, taken = torch.cuda.memory_allocated(), milliseconds(lambda: call(light, coc_px), 5)
-                        most = (torch.cuda.max_memory_allocated() - before) / 2**30
-                    times.append(f"{taken:.1f} ms, {most:.2f} GiB")
-                print(f"  {kind}: {times[0]}; plain engine {times[1]}", flush=True)
-            launches, made = Launches(), layers.module
-            layers.module = lambda *variant: launches.of(made(*variant), variant)  # type: ignore[assignment]
-            call(light, coc_px)
-            layers.module = made
-            launches.show(f"layers of a {kind}")
+                found = [measured(selected, call, light, coc_px) for selected in ("gpu", "torch")]
+                print(f"{name}, a {kind}: {found[0]}; without kernels {found[1]}", flush=True)
+            with Launches() as launches, Counted() as counted:
+                call(light, coc_px)
+            launches.show(f"{name}, layers of a {kind}")
+            with engine("torch"), Counted() as plain:
+                call(light, coc_px)
+            print(f"  {counted.operations} operations of PyTorch, without kernels {plain.operations}", flush=True)
+
+
+def measured(selected: str, call: Callable[..., Any], light: Tensor, coc_px: Tensor) -> str:
+    """Time and memory of a call by an engine, on the device."""
+    with engine(selected):
+        call(light, coc_px)
+        torch.cuda.reset_peak_memory_stats()
+        before, taken = torch.cuda.memory_allocated(), milliseconds(5, call, light, coc_px)
+        most = (torch.cuda.max_memory_allocated() - before) / 2**30
+    return f"{taken:.1f} ms, {most:.2f} GiB"
 
 
 def picture(light: Tensor, coc_px: Tensor) -> Tensor:
@@ -265,14 +278,13 @@ def other_formulas() -> None:
         print("BokehMe's formula: NVRTC compiles it")
         return
     launch = loader.on_device(SCATTER, [], torch.cuda.current_device())
-    for size, radius_px in CASES[:2]:
+    for size, radius_px in (CASES[0], CASES[2]):
         name, light, coc_px = scene(size, radius_px)
         out, reach = torch.empty_like(light), int(coc_px.abs().max()) + 2
         argument = Scatter(*(t.data_ptr() for t in (light, coc_px, out)), *size[:2], reach)
         grid = (-(-size[1] // 32), -(-size[0] // 16), 1)
-        scatter = milliseconds(lambda: launch("scatter", grid, (32, 16, 1), argument), 5)
-        print(f"{name}: BokehMe's formula {scatter:.1f} ms", flush=True)
-        print(f"{name}: DeepLens's formula (splat) {milliseconds(lambda: splat(light, coc_px), 3):.1f} ms", flush=True)
+        print(f"{name}: BokehMe's formula {milliseconds(5, launch, 'scatter', grid, (32, 16, 1), argument):.1f} ms")
+        print(f"{name}: DeepLens's formula (splat) {milliseconds(3, splat, light, coc_px):.1f} ms", flush=True)
 
 
 def main() -> None:
@@ -284,7 +296,8 @@ def main() -> None:
     if not HAS_DEVICE:
         on_cpu()
     with engine("gpu"), tempfile.TemporaryDirectory() as cache:
-        os.environ["LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME"] = cache  # empty: kernels are compiled
+        # an empty folder, so that kernels are compiled
+        os.environ["LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME"] = cache
         for part in (versions, first_use, same_pictures, lambda: costs(ends), other_formulas):
             if time.perf_counter() > ends:
                 print("no time left")

@@ -201,7 +201,9 @@ class Composite:
         of_coarse: Tensor | None = None
         for step, of_step in zip(self.steps[::-1], kept[::-1], strict=True):
             if isinstance(step, Group):
-                self._lay_over_back(step, of_step, of_coarse if step.more else slopes, pointers)
+                of_canvas = of_coarse if step.more else slopes
+                assert of_canvas is not None  # coarse layers come before their canvas, which has a gradient by now
+                self._lay_over_back(step, of_step, of_canvas, pointers)
                 continue
             argument = self._over_picture(step, of_step, of_after=slopes, **pointers)
             if isinstance(step, StandIns):
@@ -221,8 +223,7 @@ class Composite:
         """Tiles with pixels in a layer, tiles of the canvas that its light reaches, tiles whose terms these need."""
         tiles = [-(-n // side) for n, side in zip(group.grid, (_TILE_ROWS, _TILE_COLUMNS), strict=True)]
         batch, count = self._items // self._colours, len(group.layers)
-        size, like = (batch, count, *tiles), {"dtype": torch.int8, "device": self._surfaces[0][0].device}
-        tables = [torch.zeros(size, **like), *(torch.empty(size, **like) for _ in range(2))]
+        tables = [*self._surfaces[0][0].new_zeros(3, batch, count, *tiles, dtype=torch.int8)]
         argument = self._of_group(group, tables)
         self._run("mark", group.grid, argument, batch)
         self._run("find_lit", tiles, argument, batch * count)

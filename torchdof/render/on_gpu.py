@@ -161,5 +161,8 @@ def _composite(frame: PaddedFrame, kernels: Kernels) -> layers.Composite:
         frame.stacked,
         frame.behind is not None,
     )
-    surfaces = [tuple(None if t is None else t.detach().contiguous() for t in surface) for surface in frame.surfaces]
+    surfaces = [
+        (light.detach().contiguous(), x.detach().contiguous(), None if weight is None else weight.detach().contiguous())
+        for light, x, weight in frame.surfaces
+    ]
     return layers.Composite(given, surfaces)
