@@ -25,6 +25,7 @@ _BEFORE = """
 #define __global__
 #define __device__
 #define __grid_constant__
+#define __launch_bounds__(threads)
 struct Index { int x, y, z; };
 static thread_local Index blockIdx, threadIdx;
 #include "layers.cu"
@@ -74,7 +75,7 @@ _OPTIONS = ("-std=c++17", "-O3", "-march=native", "-shared", "-fPIC", "-Wno-unkn
 def driver(channels: int, surfaces: int, stacked: bool) -> ctypes.CDLL:
     """A driver with the kernels for frames of so many channels and surfaces; kept for the other processes of a run."""
     source = (_SOURCES[0] / "layers.cu").read_text()
-    kernels = re.findall(r'^extern "C" __global__ void (\w+)\(', source, re.MULTILINE)
+    kernels = re.findall(r'^extern "C" __global__ void (?:__launch_bounds__\(.*?\) )?(\w+)\(', source, re.MULTILINE)
     program = _BEFORE + _DRIVER % ", ".join(f'{{"{name}", {name}}}' for name in kernels)
     given = [*_OPTIONS, *layers.options(channels, surfaces, stacked)]
     headers = [file.read_text() for file in sorted(_SOURCES[1].glob("*.h"))]

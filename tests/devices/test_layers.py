@@ -15,6 +15,7 @@ from torchdof.kernels import layers
 from torchdof.render import composite, on_gpu, pipeline
 from torchdof.render.plan import Plan
 from torchdof.render.surfaces import PaddedFrame, maps_of, surfaces_of
+from torchdof.tensors import TRACEABLE
 
 Padded = tuple[PaddedFrame, on_gpu.Kernels]
 
@@ -66,7 +67,7 @@ TABLES = {
 }
 
 
-@pytest.mark.parametrize("radius_px", [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0])
+@pytest.mark.parametrize("radius_px", [1.0, 4.0, 8.0, 16.0, 64.0])
 def test_layers_of_any_radius_are_the_plain_engines(radius_px: float, frames: list[Padded]) -> None:
     light, coc = (t[..., :50, :75] for t in post_before_lamps())
     coc = coc * radius_px / 11.0
@@ -182,11 +183,13 @@ def test_inference_mode_and_offloaded_gradients_work(launched: list[str]) -> Non
     assert all(map(torch.equal, plain, offloaded))
 
 
-def test_float64_autocast_and_torch_func_are_no_error(launched: list[str]) -> None:
+def test_float64_and_torch_func_take_the_plain_engine_and_autocast_the_kernels(launched: list[str]) -> None:
     expected = rendered()
     launched.clear()
     light, coc = (t[..., :24, 40:70] for t in post_before_lamps())
     assert_same_picture(blur_by_coc(light.double(), coc.double()).float(), expected, light)
+    if TRACEABLE:  # older PyTorch is refused by name
+        torch.func.grad(lambda light: blur_by_coc(light, coc).sum())(light)
     assert not launched
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert torch.equal(rendered(), expected)

@@ -416,7 +416,7 @@ extern "C" __global__ void convolve_back(const __grid_constant__ Run r) {
 }
 
 // Adds the gradients by the surfaces of a pixel of the frame.
-extern "C" __global__ void terms_back(const __grid_constant__ Run r) {
+extern "C" __global__ void __launch_bounds__(TILE_ROWS * TILE_COLUMNS) terms_back(const __grid_constant__ Run r) {
   const int y = pixel_row() / r.scale, x = pixel_column() / r.scale, item = blockIdx.z, first = first_in_frame(r, y, x);
   if (first < 0) return;
   const int at = first + pixel_row() % r.scale * r.frame_columns + pixel_column() % r.scale;
