@@ -73,7 +73,7 @@ _OPTIONS = ("-std=c++17", "-O3", "-march=native", "-shared", "-fPIC", "-Wno-unkn
 
 @functools.cache
 def driver(channels: int, surfaces: int, stacked: bool) -> ctypes.CDLL:
-    """A driver with the kernels for frames of so many channels and surfaces; kept for the other processes of a run."""
+    """A driver with the kernels of :func:`torchdof.kernels.layers.module`, kept for the other processes of a run."""
     source = (_SOURCES[0] / "layers.cu").read_text()
     kernels = re.findall(r'^extern "C" __global__ void (?:__launch_bounds__\(.*?\) )?(\w+)\(', source, re.MULTILINE)
     program = _BEFORE + _DRIVER % ", ".join(f'{{"{name}", {name}}}' for name in kernels)

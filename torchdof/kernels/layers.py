@@ -82,12 +82,12 @@ class Kept(NamedTuple):
 
 @functools.cache
 def module(channels: int, surfaces: int, stacked: bool, device: int) -> Launch:
-    """The kernels for frames of so many channels and surfaces, compiled for a CUDA device."""
+    """The kernels for light of a number of channels and pixels of a number of surfaces, compiled for a CUDA device."""
     return loader.on_device(loader.text("layers.cu"), options(channels, surfaces, stacked), device)
 
 
 def options(channels: int, surfaces: int, stacked: bool) -> list[str]:
-    """The compiler's options for frames of so many channels and surfaces."""
+    """The compiler's options for the kernels of :func:`module`."""
     numbers = {"CHANNELS": channels, "SURFACES": surfaces, "STACKED": int(stacked), "LAYERS": _LAYERS}
     return [f"-D{name}={number}" for name, number in numbers.items()]
 

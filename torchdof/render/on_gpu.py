@@ -51,7 +51,7 @@ def composited(frame: PaddedFrame, kernels: Kernels, plain: Plain) -> Tensor | N
 
 
 def takes(maps: Sequence[Tensor], channels: int, surfaces: int) -> bool:
-    """Whether the kernels are wanted, and render maps of so many channels of light and surfaces in each pixel."""
+    """Whether the kernels are wanted, and render maps with these numbers of channels and of surfaces in a pixel."""
     if is_traced() or native.wanted() == "torch":
         return False
     if channels > layers.MOST_CHANNELS or surfaces > layers.MOST_SURFACES:
@@ -77,7 +77,7 @@ def _warn(reason: str) -> None:
 
 @functools.cache
 def why_missing(plain: Plain, channels: int, surfaces: int, stacked: bool, device: int) -> str:
-    """Why the kernels for frames of so many channels and surfaces cannot be used on a device; empty if they can."""
+    """Why the kernels for these numbers of channels and surfaces cannot be used on a device; empty if they can."""
     where = torch.device(DEVICE, device)
     try:
         with torch.inference_mode(False), torch.enable_grad(), without_autocast(DEVICE):
