@@ -44,6 +44,8 @@ CASES = [
 ]
 """Height, width and number of pictures, and the largest radius of the blur."""
 
+SMALL_CASES = [((96, 128, 1), 8.0), ((64, 96, 2), 4.0)]  # rendered on the CPU
+
 LAUNCH_S, BYTES_PER_S, FLOPS = 3e-6, 2.5e12, 12e12  # of the model: an H100's, kernels without tensor cores
 
 # The formula of the scatter that BokehMe compares with (Peng et al., CVPR 2022), as a gather: a pixel at distance d
@@ -211,7 +213,7 @@ def versions() -> None:
 
 def first_use() -> None:
     """Seconds until the first picture: compiled and tried, then with the kept program."""
-    _, light, coc_px = scene((256, 256, 1), 8.0)
+    _, light, coc_px = scene(*SMALL_CASES[0])
     for name in ("without kernels", "kernels compiled", "the kept program"):
         for cached in (layers.module, on_gpu.why_missing):
             getattr(cached, "cache_clear", lambda: None)()
@@ -225,7 +227,7 @@ def first_use() -> None:
 
 def same_pictures() -> None:
     """The picture and gradients of the kernels beside those of the plain engine."""
-    for size, radius_px in CASES if HAS_DEVICE else (((96, 128, 1), 8.0), ((64, 96, 2), 4.0)):
+    for size, radius_px in CASES if HAS_DEVICE else SMALL_CASES:
         name, light, coc_px = scene(size, radius_px)
         found = step(light, coc_px)
         with engine("torch"):
