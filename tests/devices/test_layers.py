@@ -118,6 +118,15 @@ def test_the_error_of_a_hostile_scene_is_within_its_limit(case: Case, launched: 
     assert launched or case.float32 == 0.0  # in focus
 
 
+def test_invalid_pixels_are_those_of_the_plain_engine(launched: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    light, coc = (t[..., :40, 30:90].clone() for t in post_before_lamps())
+    light[..., 5:8, 9:12], light[0, 1, 30, 40], coc[..., 20:24, 30:33] = torch.nan, torch.inf, torch.nan
+    found = blur_by_coc(light, coc, check=False)
+    assert launched
+    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
+    assert_same_picture(blur_by_coc(light, coc, check=False), found, torch.nan_to_num(light, 0.0, 0.0))
+
+
 def test_a_batch_is_rendered_as_its_items_are_alone(launched: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Items with layers and kernels of their own, in one launch; the last one has fewer layers."""
     light, coc = (t[..., :40, 30:90] for t in post_before_lamps(3))

@@ -113,8 +113,8 @@ def _trial(channels: int, surfaces: int, stacked: bool, device: torch.device) ->
         kernel = random(1, 2 * half + 1, 2 * half + 1)
         kernels.append(((kernel / kernel.sum()).to(device), scale))
     padded = [PaddedSurface(*(t.to(device).requires_grad_() for t in of_surface)) for of_surface in maps]
-    behind, starts = random(1, channels, height, width).to(device), ramps([nodes], padded[0].x.detach())
-    area = (height, width)
+    behind = None if stacked else random(1, channels, height, width).to(device)
+    starts, area = ramps([nodes], padded[0].x.detach()), (height, width)
     return PaddedFrame(padded, [nodes], starts, behind, margin, area, area, True, stacked), kernels
 
 
