@@ -78,7 +78,7 @@ def driver(channels: int, surfaces: int, stacked: bool) -> ctypes.CDLL:
     kernels = re.findall(r'^extern "C" __global__ void (?:__launch_bounds__\(.*?\) )?(\w+)\(', source, re.MULTILINE)
     program = _BEFORE + _DRIVER % ", ".join(f'{{"{name}", {name}}}' for name in kernels)
     given = [*_OPTIONS, *layers.options(channels, surfaces, stacked)]
-    headers = [file.read_text() for file in sorted(_SOURCES[1].glob("*.h"))]
+    headers = [file.read_text() for folder in _SOURCES for file in sorted(folder.glob("*.h"))]
     constants = (ROOT / "cmake" / "constants.py").read_text()
     key = hashlib.sha256("\0".join([source, program, *given, *headers, constants]).encode()).hexdigest()
     folder = Path(tempfile.gettempdir()) / f"torchdof_kernels_{key[:16]}"

@@ -18,7 +18,7 @@ from . import loader
 MOST_CHANNELS, MOST_SURFACES, MOST_ITEMS = 8, 4, 4000
 
 _LAYERS = 16  # most layers of a launch
-_TILE_ROWS, _TILE_COLUMNS, _ROWS = 16, 32, 4  # as in layers.cu
+_TILE_ROWS, _TILE_COLUMNS, _ROWS = 16, 32, 4  # as in frame.h
 _MOST_VALUES = 2**27  # most values of a launch's terms, 512 MB; larger: fewer launches, more memory
 
 Surface = tuple[Tensor, Tensor, Tensor | None]
@@ -94,8 +94,8 @@ def options(channels: int, surfaces: int, stacked: bool) -> list[str]:
 
 @functools.cache
 def argument_type(surfaces: int) -> type[ctypes.Structure]:
-    """The structure that all kernels take, as ``layers.cu`` defines it."""
-    body = re.search(r"struct Run {\n(.*?)\n};", loader.text("layers.cu"), re.DOTALL)
+    """The structure that all kernels take, as ``frame.h`` defines it."""
+    body = re.search(r"struct Run {\n(.*?)\n};", loader.text("frame.h"), re.DOTALL)
     assert body is not None
     fields: list[tuple[str, Any]] = []
     for kind, name, size in re.findall(r"^  (?:const )?([\w ]+ ?\*?)\b(\w+)(?:\[(\w+)\])?;", body[1], re.MULTILINE):

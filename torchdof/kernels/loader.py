@@ -18,8 +18,8 @@ from typing import Any
 import torch
 
 _CONSTANTS = ("composite", "disocclusion", "layer_weights", "surfaces")
-HEADERS = ("rules.h", "numbers.h", *(f"constants/{name}.h" for name in _CONSTANTS))
-"""Files beside this one that kernels include; the build installs them."""
+HEADERS = ("frame.h", "weights.h", "rules.h", "numbers.h", *(f"constants/{name}.h" for name in _CONSTANTS))
+"""Files beside this one that kernels include; the build installs those that the compiled engine includes too."""
 
 _NO_STANDARD_LIBRARY = {"cstdint": "typedef long long int64_t;\ntypedef unsigned int uint32_t;\n"}
 _OPTIONS = ("--std=c++17", "--device-as-default-execution-space")
