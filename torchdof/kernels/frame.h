@@ -5,7 +5,7 @@ constexpr int TILE_ROWS = 16, TILE_COLUMNS = 32;  // of the tiles of a grid, in 
 constexpr int ROWS = 4;                            // pixels of a column that one thread convolves
 constexpr int OWN = CHANNELS, BEYOND = CHANNELS + 1, VALUES = CHANNELS + 2;  // terms: light, m and v
 constexpr int PLANES = CHANNELS + 1;  // of a picture: light, and the transmittance of all layers or, without light behind, their coverage
-constexpr int KEPT = VALUES + 1;      // for the gradients: blurred terms, and the gradient's product with what lies behind the layer
+constexpr int KEPT = VALUES + 1;      // for the gradients: blurred terms, and the gradient's product with the canvas behind the layer
 
 // What a kernel works on, filled in by layers.py: one member a line. Gradients of x are named of_x.
 struct Run {

@@ -105,8 +105,8 @@ __device__ inline void weigh_back(const Ramps &l, const Pixel &p, const Weights 
 }
 #endif
 
-// Stand-ins for the background (PaddedFrame.stand_ins in render/surfaces.py): the cover of each surface of a pixel, and what it is
-// the product of. missing: how far no surface at the focus is in its place.
+// Stand-ins for the background (PaddedFrame.stand_ins in render/surfaces.py): the cover of each surface of a pixel, its
+// factors, and their sum. taken: how far a surface at the focus takes the place of a stand-in.
 struct StandIns {
   float seen_part[SURFACES], at_place[SURFACES], taken[SURFACES], alone[SURFACES], left[SURFACES], cover[SURFACES], sum;
 };
