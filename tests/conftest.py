@@ -1,5 +1,6 @@
 import importlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -8,8 +9,10 @@ import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
-from tests import exported
+from tests import exported, on_cpu
 from torchdof import native
+from torchdof.kernels import layers
+from torchdof.render import on_gpu
 from torchdof.tensors import TRACEABLE
 
 settings.register_profile("local", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -45,6 +48,32 @@ def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
         pytest.skip("the compiled engine is not built")
     monkeypatch.setenv("TORCHDOF_ENGINE", request.param)
     return str(request.param)
+
+
+@pytest.fixture
+def launched(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """Names of the kernels that were launched; tensors on the CPU are rendered as those on a GPU are."""
+    if on_cpu.COMPILER is None:
+        pytest.skip("there is no C++ compiler")
+    names: list[str] = []
+
+    def module(*variant: Any) -> layers.Launch:
+        launch = on_cpu.module(*variant)
+
+        def recorded(kernel: str, *arguments: Any) -> None:
+            names.append(kernel)
+            launch(kernel, *arguments)
+
+        return recorded
+
+    monkeypatch.setattr(on_gpu, "DEVICE", "cpu")
+    monkeypatch.setattr(layers, "module", module)
+    monkeypatch.setenv("TORCHDOF_ENGINE", "gpu")
+    for cached in (on_gpu.why_missing, on_gpu._warn):
+        cached.cache_clear()
+    yield names
+    for cached in (on_gpu.why_missing, on_gpu._warn):
+        cached.cache_clear()
 
 
 @pytest.fixture(scope="session")

@@ -15,6 +15,7 @@ FOLDERS = {"torchdof": "torchdof", "torchdof.fit": "fit", "torchdof.export": "ex
 # Folder or module of torchdof -> those that it may import; the lowest first.
 ALLOWED = {
     "extras": set(),
+    "kernels": set(),
     "native": set(),
     "pixels": set(),
     "tensors": set(),
@@ -23,7 +24,7 @@ ALLOWED = {
     "io": {"validation"},
     "optics": {"tensors", "validation", "native", "io"},
     "options": {"validation", "optics"},
-    "render": {"tensors", "validation", "pixels", "native", "optics", "options"},
+    "render": {"tensors", "validation", "pixels", "kernels", "native", "optics", "options"},
     "depth": {"tensors", "validation", "io", "optics", "render"},
     "reference": {"validation", "io", "optics", "render"},
     "module": {"tensors", "validation", "batch", "optics", "options", "render"},

@@ -106,14 +106,14 @@ def recomputed(compute: Callable[[], Tensor]) -> Tensor:
         return compute()
 
 
-def is_in_memory(values: Tensor, backward: bool = False) -> bool:
-    """Whether the compiled engine can use a tensor: dense CPU memory that holds its values, no gradients, not fake.
+def is_in_memory(values: Tensor, backward: bool = False, device: str = "cpu") -> bool:
+    """Whether compiled code can use a tensor: dense memory of a device with its values, no gradients, not fake.
 
     The memory of a negated view, such as ``z.conj().imag`` of a complex ``z``, holds its values with the other sign.
 
     ``backward`` allows gradients in reverse mode, which some of its steps have.
     """
-    if values.device.type != "cpu" or torch._C._functorch.is_functorch_wrapped_tensor(values):
+    if values.device.type != device or torch._C._functorch.is_functorch_wrapped_tensor(values):
         return False
     if is_fake() or values.is_neg() or not has_storage(values):
         return False

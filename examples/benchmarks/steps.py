@@ -16,7 +16,7 @@ import itertools
 import json
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -62,10 +62,15 @@ def pictures(folder: Path | None, device: str) -> Iterator[tuple[str, Tensor, Te
                 name = " to ".join(dict.fromkeys((group[0].name, group[-1].name)))
                 yield name, torch.cat([s.image for s in group]), torch.cat([-s.coc_px for s in group])
         return
+    yield from crops(SIZES[device.split(":")[0]])
+
+
+def crops(sizes: Sequence[tuple[int, int, int]]) -> Iterator[tuple[str, Tensor, Tensor]]:
+    """As :func:`pictures`, parts of a photograph: height, width and number of each batch; enlarged if it is smaller."""
     calibration = json.loads((DATA / "camera.json").read_text())
     photograph = read_image(DATA / "motorcycle_left.png").pixels
     dioptres = 1.0 / read_depth(DATA / "motorcycle_disp.npz", **calibration["depth"])
-    for height, width, batch in SIZES[device.split(":")[0]]:  # parts of the photograph, enlarged if it is smaller
+    for height, width, batch in sizes:
         factor = max(1.0, height / photograph.shape[-2], width / photograph.shape[-1])
         size = [round(factor * n) for n in photograph.shape[-2:]]
         image = functional.interpolate(photograph, size, mode="bilinear", align_corners=False)

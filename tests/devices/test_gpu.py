@@ -61,6 +61,20 @@ def test_gradients_are_the_same(occlusion: bool, monkeypatch: pytest.MonkeyPatch
         assert float((gradient - expected).norm()) <= 1e-3 * float(expected.norm())
 
 
+@pytest.mark.parametrize("batch", [1, 3])
+def test_kernels_render_the_plain_engines_picture_and_gradients(batch: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a stream of the caller's too."""
+    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
+    expected, *of_plain = with_gradients("cuda", batch, True)
+    monkeypatch.setenv("TORCHDOF_ENGINE", "gpu")
+    for stream in (torch.cuda.current_stream(), torch.cuda.Stream()):
+        with torch.cuda.stream(stream):
+            picture, *of_kernels = with_gradients("cuda", batch, True)
+        assert_same_picture(expected, picture, expected)
+        for plain, gradient in zip(of_plain, of_kernels, strict=True):
+            assert float((gradient - plain).norm()) <= 1e-3 * float(plain.norm())
+
+
 @OCCLUSION
 def test_deterministic_algorithms_give_the_same_bits(occlusion: bool) -> None:
     torch.use_deterministic_algorithms(True)

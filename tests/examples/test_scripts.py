@@ -3,6 +3,7 @@
 import math
 import re
 import runpy
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 import torch
 import torch.nn.functional as functional
 
+from tests import on_cpu
 from torchdof.cli.command import command_of
 from torchdof.cli.render import Render
 from torchdof.io.images import read_image
@@ -58,6 +60,24 @@ def test_steps_prints_the_cost_of_a_step(run: Run) -> None:
         assert (memory <= of_step < 1000 or math.isnan(memory)) and operations > reads > 0
     made = [(light.shape, near.shape) for _, light, near in names["pictures"](None, "cpu")]
     assert made == [((n, 3, *size), (n, 1, *size)) for *size, n in names["SIZES"]["cpu"]]
+
+
+@pytest.mark.skipif(on_cpu.COMPILER is None, reason="there is no C++ compiler")
+def test_the_run_for_a_gpu_compares_and_counts_without_one() -> None:
+    """In a process of its own, because it takes the CPU for a device."""
+    script = """
+import examples.benchmarks.gpu as gpu
+gpu.SMALL_CASES = gpu.CASES = [((24, 32, 1), 3.0)]
+gpu.main()
+"""
+    printed = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+    assert "no CUDA device: the kernels run on the CPU" in printed and "failed" not in printed
+    apart = re.findall(r"picture (\S+) of the light nearby, gradients by light (\S+), coc (\S+)", printed)
+    assert apart and all(float(value) < limit for value, limit in zip(apart[0], (1e-5, 1e-4, 1e-4), strict=True))
+    launches, mib = map(float, re.findall(r"layers of a picture: (\d+) launches, (\d+) MB, by the model", printed)[0])
+    assert launches > 5 and mib > 0 and "composite" in printed
 
 
 MAX_OUTLIERS = {"near": 680, "middle": 1070, "far": 390}

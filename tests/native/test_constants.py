@@ -12,10 +12,13 @@ from typing import Any
 import pytest
 
 from torchdof import native
+from torchdof.kernels import loader
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "cmake" / "constants.py"
-SOURCES = sorted((ROOT / "torchdof" / "native" / "src").glob("*.[ch]*"))
+SOURCES = sorted(
+    [*(ROOT / "torchdof" / "native" / "src").glob("*.[ch]*"), *(ROOT / "torchdof" / "kernels").glob("*.[ch]*")]
+)
 DEFINITION = re.compile(r"constexpr \w+ (\w+)(?:\[\])? = (.*);")
 
 
@@ -88,6 +91,16 @@ def test_the_engine_was_compiled_with_the_numbers_of_these_sources() -> None:
     """`make install` compiles it again after a number has changed."""
     (checksum,) = written(CONSTANTS.headers()["checksum"]).values()
     assert native._engine().torchdof_constants() == checksum
+
+
+@pytest.mark.parametrize("name", loader.HEADERS)
+def test_the_kernels_include_the_headers_of_these_sources(name: str) -> None:
+    """`make install` installs them again after a number or a rule has changed."""
+    if name.startswith("constants/"):
+        assert loader.text(name) == CONSTANTS.headers()[Path(name).stem]
+    else:
+        folder = "kernels" if name in ("frame.h", "weights.h") else "native/src"
+        assert loader.text(name) == (ROOT / "torchdof" / folder / name).read_text()
 
 
 def test_no_source_of_the_engine_defines_a_number_that_python_defines() -> None:

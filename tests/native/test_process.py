@@ -141,5 +141,5 @@ def test_an_engine_of_another_version_is_not_used_and_gives_a_warning(monkeypatc
 def test_an_unknown_engine_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", "numpy")
     for call in (native.describe, lambda: blur_by_coc(torch.rand(1, 3, 3, 4), torch.full((1, 1, 3, 4), 3.0))):
-        with pytest.raises(ValueError, match="must be auto, native or torch, got 'numpy'"):
+        with pytest.raises(ValueError, match="must be auto, native, gpu or torch, got 'numpy'"):
             call()

@@ -61,7 +61,9 @@ def computed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Tensor]:
     folder = tmp_path_factory.mktemp("rules")
     lines = [f'    std::printf("%.9g ", (double)({expression}));' for expression in [*RULES, *SLOPES]]
     source = f"""
+#include "engine.h"
 #include "rules.h"
+#include <cmath>
 #include <cstdio>
 using namespace torchdof;
 int main() {{

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import torch
 
+from torchdof.kernels import loader
+
 PICTURE = """
 import sys, torch, torchdof
 image = torch.rand(1, 3, 60, 90, generator=torch.Generator().manual_seed(0))
@@ -31,12 +33,13 @@ def rendered(engine: str) -> torch.Tensor:
 def main(engine: str) -> None:
     """Checks the files, the command and a picture, and prints the version."""
     files = resources.files("torchdof")
-    for name in ("py.typed", "fit/__init__.py", "export/__init__.py", "native/__init__.py"):
+    modules = ("py.typed", "fit/__init__.py", "export/__init__.py", "native/__init__.py")
+    for name in (*modules, *(f"kernels/{source}" for source in ("layers.cu", *loader.HEADERS))):
         assert files.joinpath(name).is_file(), f"{name} is not installed"
     names = [str(path.relative_to(str(files))) for path in Path(str(files)).rglob("*")]
     for suffix in ("/sato_j15.json", "/double_gauss_50mm.txt"):
         assert any(name.endswith(suffix) for name in names), f"{suffix[1:]} is not installed"
-    sources = [name for name in names if name.endswith((".cpp", ".h", ".o"))]
+    sources = [name for name in names if name.endswith((".cpp", ".h", ".o")) and not name.startswith("kernels")]
     assert not sources, f"sources are installed: {sources}"
     assert any(Path(name).stem == "_engine" for name in names) == (engine == "native")
 

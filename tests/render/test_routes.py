@@ -1,5 +1,6 @@
 """The table of routes in :mod:`torchdof.render.routes` says what renders a call; each cell is tried."""
 
+import functools
 import logging
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -35,22 +36,21 @@ def known_background(image: Tensor, coc: Tensor) -> Tensor:
     return blur_by_coc(image, coc, background=image.flip(-1), background_coc_px=coc.detach() + 3.0)
 
 
-def layers(image: Tensor, coc: Tensor) -> Tensor:
+def layers(image: Tensor, coc: Tensor, count: int) -> Tensor:
     dof = DepthOfField(CAMERA)
     return dof.layers(
-        torch.cat([image * 0.5, torch.full_like(coc, 0.5)], 1)[:, None].expand(-1, 2, -1, -1, -1),
-        coc[0, 0, 0, :2].abs() + 3,
+        torch.cat([image * 0.5, torch.full_like(coc, 0.5)], 1)[:, None].expand(-1, count, -1, -1, -1),
+        coc[0, 0, 0, :count].abs() + 3,
     )
 
 
 CALLS: dict[str, Call] = {
-    "image, with or without occlusion": lambda image, coc: (
-        blur_by_coc(image, coc),
-        blur_by_coc(image, coc, occlusion=False),
-    ),
+    "image": blur_by_coc,
+    "image without occlusion": lambda image, coc: blur_by_coc(image, coc, occlusion=False),
     "a known background": known_background,
     "`attention`": lambda image, coc: blur_by_coc(image, coc, attention=(4.0, 5.0, 3.0)),
-    "stack of layers (`DepthOfField.layers`)": layers,
+    "stack of up to 3 layers (`DepthOfField.layers`)": functools.partial(layers, count=3),
+    "stack of more layers": functools.partial(layers, count=4),
     "a table whose blur depends on the place in the frame": lambda image, coc: blur_by_coc(
         image, coc, table=lens_with_a_field()
     ),
@@ -59,7 +59,7 @@ CALLS: dict[str, Call] = {
     "kernels wider than 513 pixels of their layer": blur_by_coc,
     "`torchdof.functional.splat`": splat,
 }
-LOGGED = {cell: f"rendered by {routes._ENGINES[cell]}: " for cell in ("compiled", "steps", "PyTorch")}
+LOGGED = {cell: f"rendered by {routes._ENGINES[cell]}: " for cell in ("compiled", "steps", "kernels", "PyTorch")}
 
 
 def scene(dtype: torch.dtype, gradients: bool) -> tuple[Tensor, Tensor]:
@@ -70,25 +70,40 @@ def scene(dtype: torch.dtype, gradients: bool) -> tuple[Tensor, Tensor]:
 
 def test_every_row_of_the_table_is_tried() -> None:
     assert [*ROWS] == [*CALLS]
-    assert all(len(cells) == 5 for cells in ROWS.values())
+    assert all(len(cells) == 6 for cells in ROWS.values())
 
 
-@pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built")
-@pytest.mark.parametrize("column", range(3), ids=["float32", "gradients", "float64"])
-@pytest.mark.parametrize("call", CALLS)
-def test_eager_calls_are_rendered_by_the_engine_of_the_table(
+def assert_rendered_as_the_table_says(
     call: str, column: int, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("TORCHDOF_ENGINE", "auto")
     if call == "kernels wider than 513 pixels of their layer":
         monkeypatch.setattr(native, "HALF_LARGEST", 3)
     caplog.set_level(logging.DEBUG, "torchdof")
-    CALLS[call](*scene(torch.float64 if column == 2 else torch.float32, column == 1))
+    CALLS[call](*scene(torch.float64 if column == 3 else torch.float32, column == 1))
     if call == "`torchdof.functional.splat`":  # has no choice
         assert ROWS[call][column] == "PyTorch" and not caplog.messages
     else:
         assert caplog.messages
         assert all(message.startswith(LOGGED[ROWS[call][column]]) for message in caplog.messages), caplog.messages
+
+
+@pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built")
+@pytest.mark.parametrize("column", [0, 1, 3], ids=["float32", "gradients", "float64"])
+@pytest.mark.parametrize("call", CALLS)
+def test_eager_calls_are_rendered_by_the_engine_of_the_table(
+    call: str, column: int, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCHDOF_ENGINE", "auto")
+    assert_rendered_as_the_table_says(call, column, caplog, monkeypatch)
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_calls_with_tensors_of_a_gpu_are_rendered_by_the_engine_of_the_table(
+    call: str, launched: list[str], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tensors on the CPU are taken for those of a GPU."""
+    assert_rendered_as_the_table_says(call, 2, caplog, monkeypatch)
+    assert bool(launched) == (ROWS[call][2] == "kernels")
 
 
 @pytest.mark.parametrize("call", CALLS)
@@ -97,7 +112,7 @@ def test_calls_that_the_table_says_are_refused_in_a_graph_are_refused(
 ) -> None:
     monkeypatch.setattr(routes, "is_traced", lambda: True)
     tried = CALLS[call]
-    if ROWS[call][3] == "refused":
+    if ROWS[call][4] == "refused":
         with pytest.raises(ValueError, match=r"cannot|take a table without"):
             tried(*scene(torch.float32, False))
 

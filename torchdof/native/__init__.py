@@ -1,8 +1,9 @@
 """The compiled engine: the computations of :mod:`torchdof.render` in C++, for eager inference on the CPU.
 
 It has a plain C interface (``src/api.h``) and is built when the package is installed. Without it the PyTorch engine is
-used. The environment variable ``TORCHDOF_ENGINE`` selects: ``auto`` (the default) uses the compiled engine where it
-can, ``native`` requires it, ``torch`` disables it. The instruction set is the one that PyTorch uses, AVX2 or the
+used. The environment variable ``TORCHDOF_ENGINE`` selects: ``auto`` (the default) uses compiled code where it can,
+``native`` requires this engine on the CPU, ``gpu`` requires the kernels of :mod:`torchdof.kernels` on CUDA devices, and
+``torch`` uses PyTorch alone. The instruction set is the one that PyTorch uses, AVX2 or the
 processor's baseline (``ATEN_CPU_CAPABILITY=default`` selects the baseline for both).
 
 Tensors are float32. Every computation uses as many threads as PyTorch does, gives the same bits for any number of them,
@@ -37,6 +38,7 @@ _SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 _instructions = "avx2" if torch.backends.cpu.get_cpu_capability().startswith("AVX") else "baseline"
 """Instruction set for which the engine in use is compiled."""
 
+_ENGINES = ("auto", "native", "gpu", "torch")  # values of TORCHDOF_ENGINE
 _SMALL_FRAME = 2**16  # pixels; up to this size the main thread renders itself, which saves 0.1 ms
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
 _of_thread = threading.local()  # count: threads for calls of this thread; is_off: they use the plain engine
@@ -128,19 +130,28 @@ for _name, _groups in _STRUCTURES.items():
     _TYPES[_name] = type(_name, (_Structure,), {"_fields_": _fields})
 
 
+def wanted() -> str:
+    """The value of ``TORCHDOF_ENGINE``; ``torch`` in a block of :func:`engine_off`.
+
+    Raises:
+        ValueError: If it is not one of its values.
+    """
+    value = os.environ.get("TORCHDOF_ENGINE", "auto")
+    if value not in _ENGINES:
+        raise ValueError(f"TORCHDOF_ENGINE must be {', '.join(_ENGINES[:-1])} or {_ENGINES[-1]}, got {value!r}")
+    return "torch" if getattr(_of_thread, "is_off", False) else value
+
+
 def chosen() -> bool:
     """Whether the compiled engine is used.
 
     Raises:
-        ValueError: If ``TORCHDOF_ENGINE`` is not one of the three values, or is ``native`` and the engine is missing.
+        ValueError: If ``TORCHDOF_ENGINE`` is not one of its values, or is ``native`` and the engine is missing.
     """
-    wanted = os.environ.get("TORCHDOF_ENGINE", "auto")
-    if wanted not in ("auto", "native", "torch"):
-        raise ValueError(f"TORCHDOF_ENGINE must be auto, native or torch, got {wanted!r}")
-    if wanted == "torch" or getattr(_of_thread, "is_off", False):
+    if wanted() == "torch":
         return False
     library, missing = _library()
-    if library is None and wanted == "native":
+    if library is None and wanted() == "native":
         raise ValueError(f"TORCHDOF_ENGINE is native, but {missing}; install torchdof where there is a C++ compiler")
     return library is not None
 

@@ -33,6 +33,14 @@ def compiled_step(
     return result
 
 
+def plain_gradients(plain: Callable[..., Tensor], tensors: Sequence[Tensor], gradient: Tensor) -> list[Tensor | None]:
+    """The gradients of ``plain(*tensors)`` by its tensors, which can be differentiated again."""
+    tensors = [t.view_as(t) for t in tensors]  # one may be computed from another: gradients stop at the views
+    wanted = [t for t in tensors if t.requires_grad]
+    of_wanted = iter(torch.autograd.grad(plain(*tensors), wanted, gradient, create_graph=True))
+    return [next(of_wanted) if t.requires_grad else None for t in tensors]
+
+
 class _Step(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, forward: Any, backward: Any, plain: Any, *tensors: Tensor) -> Tensor:
@@ -45,10 +53,7 @@ class _Step(torch.autograd.Function):
         (gradient,), tensors = gradients, ctx.saved_tensors
         found: list[Tensor | None]
         if torch.is_grad_enabled():  # the gradients will be differentiated again
-            tensors = [t.view_as(t) for t in tensors]  # one may be computed from another: gradients stop at the views
-            wanted = [t for t in tensors if t.requires_grad]
-            of_wanted = iter(torch.autograd.grad(ctx.plain(*tensors), wanted, gradient, create_graph=True))
-            found = [next(of_wanted) if t.requires_grad else None for t in tensors]
+            found = plain_gradients(ctx.plain, tensors, gradient)
         else:
             items = zip(gradient, *(t.detach() for t in tensors), strict=True)
             of_items = [ctx.backward_of_item(*item) for item in items]

@@ -10,14 +10,15 @@ from torch import Tensor
 
 from .. import native
 from ..tensors import recomputed
-from . import field
+from . import field, on_gpu
 from .compiled_steps import compiled_step
+from .convolution import convolve
 from .downsampling import downsampled, upsampled
 from .ops import EAGER, Ops
 from .plan import LayerKernel
 from .rules import active
 from .scatter import fold
-from .surfaces import PaddedFrame, PaddedSurface
+from .surfaces import PaddedFrame, maps_of, surfaces_of
 
 Scatter = Callable[[Tensor, Tensor, int], Tensor]
 """``(light [B, C, H, W], kernels [1 or C, k, k], halo) -> [B, C, H - 2 halo, W - 2 halo]``."""
@@ -73,30 +74,37 @@ def accumulate_once(frame: PaddedFrame, blurs: Sequence[LayerKernel]) -> Tensor:
 
 
 def _layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter: Scatter, ops: Ops) -> Tensor:
-    """:func:`_composite_layers`, by the compiled engine if it can compute it."""
-    kernels, maps = [blur.kernel for blur in blurs], [t for s in frame.surfaces for t in s if t is not None]
-    each = len(maps) // len(frame.surfaces)
-
-    def surfaces(maps: tuple[Tensor, ...]) -> list[PaddedSurface]:
-        return [PaddedSurface(*maps[i : i + each]) for i in range(0, len(maps), each)]
+    """:func:`_composite_layers`, by the kernels of a GPU or by the compiled engine if they can compute it."""
+    kernels, maps, count = [blur.kernel for blur in blurs], maps_of(frame.surfaces), len(frame.surfaces)
+    scaled = [(blur.kernel, blur.scale) for blur in blurs]
+    one_kernel_a_layer = scatter is not fold and blurs[0].mask is None
+    if one_kernel_a_layer:
+        picture = on_gpu.composited(frame, scaled, _by_convolution)
+        if picture is not None:
+            return picture
 
     def plain(*maps: Tensor) -> Tensor:
-        given = dataclasses.replace(frame, surfaces=surfaces(maps))
+        given = dataclasses.replace(frame, surfaces=surfaces_of(maps, count))
         return _composite_layers(given.near_to_far(), blurs, scatter, ops)
 
     planes, half = frame.colours + max(k.shape[-3] for k in kernels), max(blur.half for blur in blurs)
     found, is_one_plan = None, len(frame.nodes) == 1 and not frame.stacked
     if is_one_plan and planes <= native.MOST_PLANES and half <= native.HALF_LARGEST:
-        if scatter is not fold and blurs[0].mask is None and not any(k.requires_grad for k in kernels):
-            scaled = [(blur.kernel, blur.scale) for blur in blurs]
+        if one_kernel_a_layer and not any(k.requires_grad for k in kernels):
             how = (frame.margin, frame.area, frame.nodes[0], scaled, frame.occlusion, frame.behind is not None)
             found = compiled_step(
-                lambda *maps: native.blend(surfaces(maps), *how),
-                lambda gradient, *maps: native.blend_gradient(gradient, surfaces(maps), *how),
+                lambda *maps: native.blend(surfaces_of(maps, count), *how),
+                lambda gradient, *maps: native.blend_gradient(gradient, surfaces_of(maps, count), *how),
                 plain,
                 *maps,
             )
     return plain(*maps) if found is None else found
+
+
+def _by_convolution(frame: PaddedFrame, kernels: Sequence[tuple[Tensor, int]]) -> Tensor:
+    """:func:`_composite_layers` with a kernel and a resolution for each layer."""
+    blurs = [LayerKernel(*of_layer) for of_layer in kernels]
+    return _composite_layers(frame.near_to_far(), blurs, functools.partial(convolve, turned=True), EAGER)
 
 
 def _composite_layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter: Scatter, ops: Ops) -> Tensor:

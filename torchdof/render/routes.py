@@ -1,21 +1,26 @@
 """Which engine renders a call, and which calls no engine renders.
 
-| call | eager, float32 on the CPU | with gradients | float64 or a GPU | `torch.compile` | ONNX file |
-| --- | --- | --- | --- | --- | --- |
-| image, with or without occlusion | compiled | steps | PyTorch | graph | graph |
-| a known background | compiled | steps | PyTorch | graph | no such input |
-| `attention` | compiled | steps | PyTorch | refused | no such input |
-| stack of layers (`DepthOfField.layers`) | compiled | steps | PyTorch | left out | no such input |
-| a table whose blur depends on the place in the frame | compiled | steps | PyTorch | refused | refused |
-| `method="fold"` | steps | steps | PyTorch | graph | graph |
-| an aperture whose rotation or squeeze has a gradient | steps | steps | PyTorch | left out | refused |
-| kernels wider than 513 pixels of their layer | steps | steps | PyTorch | graph | graph |
-| `torchdof.functional.splat` | PyTorch | PyTorch | PyTorch | refused | no such input |
+| call | eager, float32 on the CPU | with gradients | on a CUDA device | otherwise | `torch.compile` | ONNX file |
+| --- | --- | --- | --- | --- | --- | --- |
+| image | compiled | steps | kernels | PyTorch | graph | graph |
+| image without occlusion | compiled | steps | PyTorch | PyTorch | graph | graph |
+| a known background | compiled | steps | kernels | PyTorch | graph | no such input |
+| `attention` | compiled | steps | kernels | PyTorch | refused | no such input |
+| stack of up to 3 layers (`DepthOfField.layers`) | compiled | steps | kernels | PyTorch | left out | no such input |
+| stack of more layers | compiled | steps | PyTorch | PyTorch | left out | no such input |
+| a table whose blur depends on the place in the frame | compiled | steps | PyTorch | PyTorch | refused | refused |
+| `method="fold"` | steps | steps | PyTorch | PyTorch | graph | graph |
+| an aperture whose rotation or squeeze has a gradient | steps | steps | PyTorch | PyTorch | left out | refused |
+| kernels wider than 513 pixels of their layer | steps | steps | kernels | PyTorch | graph | graph |
+| `torchdof.functional.splat` | PyTorch | PyTorch | PyTorch | PyTorch | refused | no such input |
 
 - compiled: the compiled engine renders the whole picture.
 - steps: PyTorch renders, and the compiled engine computes those of its steps that it supports.
-- PyTorch: PyTorch renders alone. So it does everywhere without a compiled engine or with `TORCHDOF_ENGINE=torch`, and
-  in forward mode or under `torch.func`.
+- kernels: PyTorch renders, and CUDA kernels blur and composite the layers of float32, with and without gradients, of up
+  to 8 channels, or of any number of colours with kernels of their own (:mod:`torchdof.render.on_gpu`).
+- otherwise: float64, or another device.
+- PyTorch: PyTorch renders alone. So it does where there is no compiled engine, or no NVRTC beside PyTorch for the
+  kernels; with `TORCHDOF_ENGINE=torch`; and in forward mode or under `torch.func`.
 - graph: one static graph. That of `torch.compile` has no rays of highlights.
 - left out: `torch.compile` calls it as eager code between two graphs; with `fullgraph=True` it fails.
 - float16 and bfloat16 are rendered as float32. A frame wholly in focus is returned unchanged, without an engine.
@@ -31,22 +36,26 @@ import torch
 from torch import Tensor
 
 from .. import native
+from ..kernels import layers
 from ..options import Options
 from ..tensors import is_differentiated, is_traced
 from ..validation import engine_reads
+from . import on_gpu
 from .plan import KERNELS_PER_PX, Plan
 
 Call = Literal["image", "stack", "splat", "file", "whole file"]
 """The kind of call: the rendering of an image or of a stack of layers, ``splat``, or the export in tiles or whole."""
 
-Engine = Literal["compiled", "steps", "PyTorch", "graph"]
+Engine = Literal["compiled", "steps", "kernels", "PyTorch", "graph"]
 
 _ENGINES: dict[Engine, str] = {
     "compiled": "the compiled engine",
     "steps": "PyTorch with compiled steps",
+    "kernels": "PyTorch with CUDA kernels",
     "PyTorch": "PyTorch",
     "graph": "a graph",
 }
+_NO_MEMORY = "a map has no plain memory, as in torch.func and forward mode"
 _log = logging.getLogger("torchdof")
 
 
@@ -150,14 +159,15 @@ def _of_eager(
     plan: Plan, options: Options, maps: Sequence[Tensor], is_stack: bool, half_widths: Callable[[], Sequence[int]]
 ) -> Route:
     """As :func:`route`, in eager code and without a line in the log."""
+    if maps[0].device.type == on_gpu.DEVICE:
+        return _of_gpu(options, maps, is_stack)
     if not native.chosen():
         return Route("PyTorch", native.describe())
     if any(t.dtype != torch.float32 for t in maps):
         return Route("PyTorch", "the compiled engine computes in float32, and a map is float64")
     if not engine_reads(*maps, backward=True):
         device = maps[0].device.type
-        where = "a map has no plain memory, as in torch.func and forward mode" if device == "cpu" else f"on {device}"
-        return Route("PyTorch", where)
+        return Route("PyTorch", _NO_MEMORY if device == "cpu" else f"on {device}")
     if any(map(is_differentiated, maps)):
         return Route("steps", "gradients are recorded")
     if options.table.is_differentiated:
@@ -172,3 +182,24 @@ def _of_eager(
     if half > native.HALF_LARGEST:
         return Route("steps", f"a kernel is {2 * half + 1} pixels wide, the largest is {2 * native.HALF_LARGEST + 1}")
     return Route("compiled", "float32 in CPU memory, no gradients")
+
+
+def _of_gpu(options: Options, maps: Sequence[Tensor], is_stack: bool) -> Route:
+    """As :func:`route`, for a device with kernels, by the conditions of :func:`torchdof.render.on_gpu.composited`."""
+    channels = 1 if options.table.channels > 1 else maps[0].shape[-3]
+    # a stack has a black surface behind it; a known background is behind the two surfaces of a pixel
+    surfaces = maps[0].shape[1] + 1 if is_stack else 3 if len(maps) > 2 else 2
+    for is_refused, why in (
+        (native.wanted() == "torch", "as TORCHDOF_ENGINE says"),
+        (any(t.dtype != torch.float32 for t in maps), "the kernels compute in float32, and a map is float64"),
+        (not options.occlusion, "without occlusion"),
+        (options.method != "layered", f"method={options.method!r}"),
+        (options.table.depends_on_place, "the blur depends on the place in the frame"),
+        (options.table.is_differentiated, "the aperture's rotation or squeeze has a gradient"),
+        (channels > layers.MOST_CHANNELS, f"more than {layers.MOST_CHANNELS} channels"),
+        (surfaces > layers.MOST_SURFACES, f"a stack of more than {layers.MOST_SURFACES - 1} layers"),
+        (not on_gpu.takes(maps, channels, surfaces), _NO_MEMORY),
+    ):
+        if is_refused:
+            return Route("PyTorch", f"on {maps[0].device.type}, {why}")
+    return Route("kernels", f"float32 on {maps[0].device.type}")

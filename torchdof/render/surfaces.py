@@ -62,6 +62,17 @@ class PaddedSurface(NamedTuple):
     weight: Tensor | None = None
 
 
+def maps_of(surfaces: Sequence[PaddedSurface]) -> list[Tensor]:
+    """Light, place and, where given, weight, surface by surface."""
+    return [t for surface in surfaces for t in surface if t is not None]
+
+
+def surfaces_of(maps: Sequence[Tensor], count: int) -> list[PaddedSurface]:
+    """The ``count`` surfaces of :func:`maps_of`."""
+    each = len(maps) // count
+    return [PaddedSurface(*maps[i : i + each]) for i in range(0, len(maps), each)]
+
+
 @dataclasses.dataclass(frozen=True)
 class PaddedFrame:
     """Surfaces of a frame, continued beyond its border; the layers are cut out of it.

@@ -11,6 +11,7 @@
 // Backward, the blurred l, w and v are computed again and kept, block by block; their gradients replace them. Each block
 // then composites its layers again, walks back through them from near to far, and the gradients of l, w and v are
 // scattered by the turned kernels to the gradients of m I, m and r, and from these to the surfaces.
+#include "engine.h"
 #include "rules.h"
 
 namespace torchdof {

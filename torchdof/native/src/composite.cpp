@@ -5,13 +5,13 @@
 //
 // Runs of layers of a coarser resolution are composited first, each on a canvas of its own resolution. Then each tile
 // composites its full-resolution layers and these canvases while it is in the cache.
+#include "engine.h"
 #include "rules.h"
 
 namespace torchdof {
 namespace {
 
 constexpr float LEAST = constants::composite::LEAST;
-constexpr float LEAST_PASSING = constants::surfaces::LEAST_PASSING;
 constexpr float COVERED = 1e-6f;  // an uncovered part up to this is a rounding error
 constexpr int TILE_PIXELS = TILE * TILE;
 constexpr int PART = 16;  // side in pixels of the parts of a coarse canvas that are skipped if empty

@@ -1,5 +1,6 @@
 // Disocclusion: fills the surfaces hidden behind a blurred foreground with light and depth of the farthest surfaces
 // around, as described in render/disocclusion.py.
+#include "engine.h"
 #include "rules.h"
 
 namespace torchdof {

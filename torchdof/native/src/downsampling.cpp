@@ -4,6 +4,7 @@
 // second). The means of weight w and light, and of w t and light t, over the pixels between each two nodes are
 // therefore enough: the layer at the first node takes mean(w) - mean(w t), the one at the second takes mean(w t).
 // In the code, `sums` are without t, and `sums_behind` with t: of the parts that lie behind the first node.
+#include "engine.h"
 #include "rules.h"
 
 namespace torchdof {

@@ -13,15 +13,13 @@
 
 #include "api.h"
 #include "constants/border.h"
-#include "constants/composite.h"
 #include "constants/disocclusion.h"
 #include "constants/field.h"
-#include "constants/layer_weights.h"
 #include "constants/matting.h"
 #include "constants/native.h"
 #include "constants/placed_kernels.h"
-#include "constants/surfaces.h"
 #include "memory.h"
+#include "numbers.h"
 #include "threads.h"
 
 namespace torchdof {
@@ -45,15 +43,6 @@ inline void store(T *p, V v) {
   *(unaligned *)p = v;
 }
 inline vec all(float v) { return v - vec{}; }
-// The larger and the smaller of two values; b if a is NaN.
-template <typename V>
-inline V most(V a, V b) {
-  return a > b ? a : b;
-}
-template <typename V>
-inline V least(V a, V b) {
-  return a < b ? a : b;
-}
 #if defined(__AVX2__)  // compilers do not always find the single instruction
 template <>
 inline vec most(vec a, vec b) {
@@ -71,7 +60,6 @@ inline vec counting() {  // 0, 1, 2, ...
 }
 inline ivec convert(vec v) { return __builtin_convertvector(v, ivec); }
 inline vec convert(ivec v) { return __builtin_convertvector(v, vec); }
-inline vec clamp01(vec v) { return least(most(v, vec{}), all(1.0f)); }
 inline float largest(vec v) {
   float m = v[0];
   for (int i = 1; i < LANES; i++) m = v[i] > m ? v[i] : m;
@@ -113,7 +101,6 @@ inline bool any_of(ivec mask) {
 #endif
 inline bool any_positive(vec v) { return any_of(v > vec{}); }
 inline float clamp(float v, float low, float high) { return std::min(std::max(v, low), high); }
-inline float clamp01(float v) { return clamp(v, 0.0f, 1.0f); }
 inline int ceil_div(int a, int b) { return (a + b - 1) / b; }
 inline int floor_div(int a, int b) { return a >= 0 ? a / b : -((-a + b - 1) / b); }
 
@@ -140,21 +127,10 @@ constexpr int CELL = 8;   // of the cells for which layers and occluders are lis
 constexpr int TILE = 64;  // of the tiles that are composited at once
 
 // Constants of Python modules, which give their meanings, units and effects; here with the type of the computations.
-constexpr float KNOWN = constants::composite::KNOWN;
-constexpr float BEHIND_PX = constants::disocclusion::BEHIND_PX;
-constexpr float OWN_SLOPE = constants::disocclusion::OWN_SLOPE;
 constexpr float LEAST_SEEN = constants::disocclusion::LEAST_SEEN;
 constexpr float CERTAIN = constants::disocclusion::CERTAIN;
 constexpr int FINE_LEVELS = constants::disocclusion::FINE_LEVELS;
 constexpr int BEHIND_STEP = constants::disocclusion::BEHIND_STEP;
-constexpr float HIDDEN_WEIGHT = constants::surfaces::HIDDEN_WEIGHT;
-constexpr float HIDING_SHARE = constants::surfaces::HIDING_SHARE;
-constexpr float CONTINUES_FROM = constants::surfaces::CONTINUES_FROM;
-constexpr float AT_FOCUS = constants::surfaces::AT_FOCUS;
-constexpr float OFF_FOCUS = constants::surfaces::OFF_FOCUS;
-constexpr float BARELY_BLURRED = constants::surfaces::BARELY_BLURRED;
-constexpr float COUNTED = constants::surfaces::COUNTED;
-constexpr float SEEN_FROM = constants::surfaces::SEEN_FROM;
 constexpr float NEVER = constants::matting::NEVER_PX;
 constexpr int MOST_LEVELS = constants::native::MOST_LEVELS;
 constexpr int MOST_PLANES = constants::native::MOST_PLANES;

@@ -8,6 +8,7 @@
 //   light = sum n_j I_j / sum n_j,   coc = sum n_j d_j / sum n_j,   weight = sum n_j
 //
 // A coarser level has samples of the finer one as its pixels, which have one surface and a weight.
+#include "engine.h"
 #include "rules.h"
 
 namespace torchdof {

@@ -1,5 +1,6 @@
 // Highlights: light far brighter than its surroundings is removed from the layers and rendered ray by ray, as described
 // in render/highlights.py.
+#include "engine.h"
 #include "rules.h"
 #include "constants/highlights.h"
 #include "constants/plan.h"

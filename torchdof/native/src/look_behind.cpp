@@ -13,6 +13,7 @@
 // A cell of BEHIND_STEP x BEHIND_STEP pixels has the smallest coc of its pixels. Its first result is the farthest surface of
 // all levels: of two levels with different surfaces, only the farther one counts. Its second result is the one above, of
 // the coarse levels alone.
+#include "engine.h"
 #include "rules.h"
 
 namespace torchdof {

@@ -1,8 +1,9 @@
 // Rules of the picture, each in one place: its formula, the Python function that defines it, and for the gradients its
 // derivative. A rule without its limits to [0, 1] is named `unlimited`: the derivative is that of the limited one where
-// `within` holds, and 0 elsewhere. Templates are for a float and for a vector of pixels.
+// `within` holds, and 0 elsewhere. Templates are for a float and for a vector of pixels; a layer is any type with the ends and
+// slopes of its ramps.
 #pragma once
-#include "engine.h"
+#include "numbers.h"
 
 namespace torchdof {
 
@@ -19,7 +20,7 @@ inline V end_of_surface(V coc) {
   return coc + most(most(coc, -coc) * OWN_SLOPE - BEHIND_PX, V{});
 }
 inline float slope_of_end(float coc) {
-  return OWN_SLOPE * std::fabs(coc) >= BEHIND_PX ? 1.0f + (coc < 0 ? -OWN_SLOPE : OWN_SLOPE) : 1.0f;
+  return OWN_SLOPE * most(coc, -coc) >= BEHIND_PX ? 1.0f + (coc < 0 ? -OWN_SLOPE : OWN_SLOPE) : 1.0f;
 }
 
 // Confidence that a surface whose coc is larger by d is another surface: clamp(d - BEHIND_PX + 1/2, 0, 1).
@@ -44,7 +45,6 @@ inline V is_read(V size_px, float least_px) {
 }
 
 // A ramp from 0 to 1 with a parabola as its foot, up to FOOT; exact at both ends. render/layer_weights.py, eased.
-constexpr float FOOT = constants::layer_weights::FOOT;
 constexpr float SLOPE = 1 / (1 - FOOT / 2);  // of the straight part
 template <typename V>
 inline V eased(V v) {
@@ -57,27 +57,28 @@ inline V ramp(V v, bool ease) {
   v = clamp01(v);
   return ease ? eased(v) : v;
 }
-inline vec slope_of_ramp(vec v, bool ease) {
-  const vec slope = ease ? (v > all(FOOT) ? all(SLOPE) : v * (SLOPE / FOOT)) : all(1.0f);
-  return within(v) ? slope : vec{};
+template <typename V>
+inline V slope_of_ramp(V v, bool ease) {
+  const V slope = ease ? (v > V{} + FOOT ? V{} + SLOPE : v * (SLOPE / FOOT)) : V{} + 1.0f;
+  return within(v) ? slope : V{};
 }
 
 // Share of a surface at `place` that belongs to a layer or to layers behind it; below, the share that belongs to layers
 // behind it. Both are ramps, eased under occlusion. render/layer_weights.py, weights_at_or_behind.
-template <typename V>
-inline V unlimited_at_or_behind(const Layer &l, V place) {
+template <typename L, typename V>
+inline V unlimited_at_or_behind(const L &l, V place) {
   return (place - l.before) * l.per_before + (l.first ? 1.0f : 0.0f);
 }
-template <typename V>
-inline V at_or_behind(const Layer &l, V place, bool ease) {
+template <typename L, typename V>
+inline V at_or_behind(const L &l, V place, bool ease) {
   return ramp(unlimited_at_or_behind(l, place), ease);
 }
-template <typename V>
-inline V unlimited_behind(const Layer &l, V place) {
+template <typename L, typename V>
+inline V unlimited_behind(const L &l, V place) {
   return (place - l.at) * l.per_after;
 }
-template <typename V>
-inline V behind(const Layer &l, V place, bool ease) {
+template <typename L, typename V>
+inline V behind(const L &l, V place, bool ease) {
   return ramp(unlimited_behind(l, place), ease);
 }
 
@@ -91,9 +92,10 @@ template <typename V>
 inline V continuation(V share) {
   return (1.0f - share) * clamp01(unlimited_known(share));
 }
-inline vec slope_of_continuation(vec share) {
-  const vec known = unlimited_known(share);
-  return (within(known) ? (1.0f - share) * (1.0f / CONTINUES_FROM) : vec{}) - clamp01(known);
+template <typename V>
+inline V slope_of_continuation(V share) {
+  const V known = unlimited_known(share);
+  return (within(known) ? (1.0f - share) * (1.0f / CONTINUES_FROM) : V{}) - clamp01(known);
 }
 
 // Part of that weight that counts in a layer, where the nearer surface has a share at or behind the layer: 1 -
@@ -102,35 +104,51 @@ template <typename V>
 inline V visible_part(V nearer) {
   return 1.0f - clamp01(nearer * (1.0f / HIDING_SHARE));
 }
-inline vec slope_of_visible_part(vec nearer) {
-  return within(nearer * (1.0f / HIDING_SHARE)) ? all(-1.0f / HIDING_SHARE) : vec{};
+template <typename V>
+inline V slope_of_visible_part(V nearer) {
+  return within(nearer * (1.0f / HIDING_SHARE)) ? V{} - 1.0f / HIDING_SHARE : V{};
 }
 
 // Stand-ins for the background, each rule with its derivative. A surface at x counts as one at the focus by clamp(1 + x /
 // AT_FOCUS, 0, 1), and stands in by clamp(2 + x / BARELY_BLURRED, 0, 1) clamp(-x / OFF_FOCUS, 0, 1). With the weight w it takes
 // the place of a stand-in by clamp(COUNTED w, 0, 1), and has the weight max(w - SEEN_FROM, 0) as one. render/surfaces.py,
 // at_focus, stands_in, counts and seen.
-inline vec unlimited_at_focus(vec place) { return place * (1.0f / AT_FOCUS) + 1.0f; }
-inline vec at_focus(vec place) { return clamp01(unlimited_at_focus(place)); }
-inline vec slope_of_at_focus(vec place) { return within(unlimited_at_focus(place)) ? all(1.0f / AT_FOCUS) : vec{}; }
-inline vec unlimited_stand_in(vec place) { return place * (1.0f / BARELY_BLURRED) + 2.0f; }
-inline vec unlimited_off_focus(vec place) { return place * (-1.0f / OFF_FOCUS); }
-inline vec stands_in(vec place) { return clamp01(unlimited_stand_in(place)) * clamp01(unlimited_off_focus(place)); }
-inline vec slope_of_stands_in(vec place) {  // 0 where it is 0
-  const vec in = unlimited_stand_in(place), off = unlimited_off_focus(place);
-  const vec slope = (in <= all(1.0f) ? clamp01(off) * (1.0f / BARELY_BLURRED) : vec{}) - (off <= all(1.0f) ? clamp01(in) * (1.0f / OFF_FOCUS) : vec{});
-  return stands_in(place) > vec{} ? slope : vec{};
+template <typename V>
+inline V unlimited_at_focus(V place) { return place * (1.0f / AT_FOCUS) + 1.0f; }
+template <typename V>
+inline V at_focus(V place) { return clamp01(unlimited_at_focus(place)); }
+template <typename V>
+inline V slope_of_at_focus(V place) { return within(unlimited_at_focus(place)) ? V{} + 1.0f / AT_FOCUS : V{}; }
+template <typename V>
+inline V unlimited_stand_in(V place) { return place * (1.0f / BARELY_BLURRED) + 2.0f; }
+template <typename V>
+inline V unlimited_off_focus(V place) { return place * (-1.0f / OFF_FOCUS); }
+template <typename V>
+inline V stands_in(V place) { return clamp01(unlimited_stand_in(place)) * clamp01(unlimited_off_focus(place)); }
+template <typename V>
+inline V slope_of_stands_in(V place) {  // 0 where it is 0
+  const V in = unlimited_stand_in(place), off = unlimited_off_focus(place);
+  const V slope = (in <= V{} + 1.0f ? clamp01(off) * (1.0f / BARELY_BLURRED) : V{}) - (off <= V{} + 1.0f ? clamp01(in) * (1.0f / OFF_FOCUS) : V{});
+  return stands_in(place) > V{} ? slope : V{};
 }
-inline vec seen(vec weight) { return most(weight - SEEN_FROM, vec{}); }
-inline vec slope_of_seen(vec weight) { return weight > SEEN_FROM ? all(1.0f) : vec{}; }
-inline vec unlimited_counts(vec weight) { return weight * COUNTED; }
-inline vec counts(vec weight) { return clamp01(unlimited_counts(weight)); }
-inline vec slope_of_counts(vec weight) { return within(unlimited_counts(weight)) ? all(COUNTED) : vec{}; }
+template <typename V>
+inline V seen(V weight) { return most(weight - SEEN_FROM, V{}); }
+template <typename V>
+inline V slope_of_seen(V weight) { return weight > SEEN_FROM ? V{} + 1.0f : V{}; }
+template <typename V>
+inline V unlimited_counts(V weight) { return weight * COUNTED; }
+template <typename V>
+inline V counts(V weight) { return clamp01(unlimited_counts(weight)); }
+template <typename V>
+inline V slope_of_counts(V weight) { return within(unlimited_counts(weight)) ? V{} + COUNTED : V{}; }
 
 // The normalizer of a layer, its weight w plus the weight v behind it, is raised where it is small: with l = max(KNOWN - w -
 // v, 0), by l^2 / (2 KNOWN), whose derivative by w or v is -l / KNOWN. render/composite.py, raised.
-inline vec lacking(vec weight, vec behind = vec{}) { return most(all(KNOWN) - weight - behind, vec{}); }
-inline vec raise(vec lacking) { return lacking * lacking * (0.5f / KNOWN); }
-inline vec slope_of_raise(vec lacking) { return lacking * (-1.0f / KNOWN); }
+template <typename V>
+inline V lacking(V weight, V behind = V{}) { return most(V{} + KNOWN - weight - behind, V{}); }
+template <typename V>
+inline V raise(V lacking) { return lacking * lacking * (0.5f / KNOWN); }
+template <typename V>
+inline V slope_of_raise(V lacking) { return lacking * (-1.0f / KNOWN); }
 
 }  // namespace torchdof

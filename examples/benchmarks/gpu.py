@@ -1,0 +1,315 @@
+"""What a CUDA device makes of the kernels: the same picture and gradients, time of each kernel, memory, first use.
+
+python examples/benchmarks/gpu.py [--seconds 330]
+
+It takes less than six minutes, prints the most important parts first, and leaves out parts for which no time is left.
+Without a CUDA device it says so, runs the same code on the CPU with the kernels' C++ build, and prints how often each
+kernel is launched, the bytes that it moves, and the milliseconds of a model: no measurement, but a lower bound for a
+device with :data:`LAUNCH_S`, :data:`BYTES_PER_S` and :data:`FLOPS`.
+"""
+
+import argparse
+import collections
+import contextlib
+import ctypes
+import os
+import statistics
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from examples.benchmarks.steps import Counted, crops
+from torchdof import blur_by_coc, native
+from torchdof.functional import splat
+from torchdof.kernels import layers, loader
+from torchdof.render import on_gpu
+
+HAS_DEVICE = torch.cuda.is_available()
+DEVICE = "cuda" if HAS_DEVICE else "cpu"
+CASES = [
+    ((1080, 1920, 1), 8.0),
+    ((256, 256, 8), 8.0),
+    *(((1080, 1920, 1), radius_px) for radius_px in (16.0, 64.0)),
+    ((2160, 3840, 1), 16.0),
+]
+"""Height, width and number of pictures, and the largest radius of the blur."""
+
+SMALL_CASES = [((96, 128, 1), 8.0), ((64, 96, 2), 4.0)]  # rendered on the CPU
+
+LAUNCH_S, BYTES_PER_S, FLOPS = 3e-6, 2.5e12, 12e12  # of the model: an H100's, kernels without tensor cores
+
+# The formula of the scatter that BokehMe compares with (Peng et al., CVPR 2022), as a gather: a pixel at distance d
+# with radius r gives its light with the weight (1 + tanh(4 (r - d))) / 2 / (r^2 + 0.2).
+SCATTER = """
+struct Scatter { const float *light, *radius; float *out; int height, width, reach; };
+extern "C" __global__ void scatter(const __grid_constant__ Scatter s) {
+  const int y = blockIdx.y * 16 + threadIdx.y, x = blockIdx.x * 32 + threadIdx.x, area = s.height * s.width;
+  if (y >= s.height || x >= s.width) return;
+  float sum[3] = {}, total = 0;
+  for (int v = max(y - s.reach, 0); v <= min(y + s.reach, s.height - 1); v++)
+    for (int u = max(x - s.reach, 0); u <= min(x + s.reach, s.width - 1); u++) {
+      const int at = v * s.width + u;
+      const float r = fabsf(s.radius[at]), distance = sqrtf(float((v - y) * (v - y) + (u - x) * (u - x)));
+      const float weight = (0.5f + 0.5f * tanhf(4 * (r - distance))) / (r * r + 0.2f);
+      for (int c = 0; c < 3; c++) sum[c] += weight * s.light[c * area + at];
+      total += weight;
+    }
+  for (int c = 0; c < 3; c++) s.out[c * area + y * s.width + x] = sum[c] / total;
+}
+"""
+
+
+class Scatter(ctypes.Structure):
+    """The argument of :data:`SCATTER`."""
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in ("light", "radius", "out")),
+        *((name, ctypes.c_int) for name in ("height", "width", "reach")),
+    ]
+
+
+class Launches:
+    """Counts the launches of the kernels, and what each costs: measured on a device, otherwise by the model."""
+
+    def __init__(self) -> None:
+        self.count: collections.Counter[str] = collections.Counter()
+        self.bytes: dict[str, float] = collections.defaultdict(float)
+        self.ms: dict[str, float] = collections.defaultdict(float)
+
+    def __enter__(self) -> "Launches":
+        self._module = layers.module
+        layers.module = lambda *variant: self._counted(self._module(*variant), variant)  # type: ignore[assignment]
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        layers.module = self._module
+
+    def _counted(self, launch: layers.Launch, variant: Sequence[Any]) -> layers.Launch:
+        """A launch that is counted. Without a device only the tables of tiles are computed, which the model needs."""
+
+        def counted(kernel: str, grid: Any, block: Any, argument: Any) -> None:
+            self.count[kernel] += 1
+            if HAS_DEVICE:
+                self.ms[kernel] += milliseconds(1, launch, kernel, grid, block, argument)
+                return
+            if kernel in ("mark", "find_lit", "find_read"):
+                launch(kernel, grid, block, argument)
+            moved, operations = cost(kernel, argument, grid[2], *variant[:2])
+            self.bytes[kernel] += moved
+            self.ms[kernel] += 1e3 * max(LAUNCH_S, moved / BYTES_PER_S, operations / FLOPS)
+
+        return counted
+
+    def show(self, name: str) -> None:
+        """Prints a line for all kernels, and one for each."""
+        what = "," if HAS_DEVICE else f", {sum(self.bytes.values()) / 1e6:.0f} MB, by the model"
+        print(f"{name}: {sum(self.count.values())} launches{what} {sum(self.ms.values()):.2f} ms")
+        for kernel, count in sorted(self.count.items(), key=lambda item: -self.ms[item[0]]):
+            print(f"  {kernel:15} {count:3} launches {self.ms[kernel]:8.3f} ms")
+
+
+def cost(kernel: str, r: Any, depth: int, channels: int, surfaces: int) -> tuple[float, float]:
+    """Bytes that a launch of a kernel moves if each value is read once, and its floating-point operations."""
+    values, tile, maps = channels + 2, 16 * 32, surfaces * (channels + 2)
+    items, frame = depth // max(r.layers, 1) if kernel == "convolve_back" else depth, r.scale * r.scale
+    picture, canvas = r.height * r.width * (channels + 1) * depth, r.coarse_height * r.coarse_width * (channels + 1)
+    lit = read = any_read = taps = 0.0
+    if r.layers and r.lit:
+        each = r.tile_rows * r.tile_columns
+        count = r.layers * each * max(items // r.colours, 1) if kernel not in ("mark", "find_lit", "find_read") else 0
+        tables = ((ctypes.c_int8 * count).from_address(table) for table in (r.lit, r.read))
+        found = [torch.tensor(list(table)).view(-1, r.layers, each) for table in tables]
+        by_layer = [table.sum((0, 2)) * r.colours for table in found]
+        lit, read = (float(part.sum()) * tile for part in by_layer)
+        any_read = float(found[1].amax(1).sum()) * r.colours * tile if count else 0.0
+        sides = torch.tensor([(2 * r.half[i] + 1) ** 2 for i in range(r.layers)])
+        chosen = by_layer[1] if kernel == "convolve_back" else by_layer[0]
+        taps = float((chosen * sides).sum()) * tile
+    pixels = r.rows * r.columns * frame * depth
+    numbers, operations = {
+        "mark": (surfaces * pixels, 0.0),
+        "terms": (any_read * frame * maps + read * values, 100.0 * read * frame * surfaces),
+        "composite": (lit * values + 2.0 * picture, 2.0 * taps * values),
+        "walk_back": (lit * (2 * values + 1) + 2.0 * picture, 0.0),
+        "convolve_back": ((lit + read) * values, 2.0 * taps * values),
+        "terms_back": (read * values + 3.0 * maps * pixels, 0.0),
+        "stand_ins": (2.0 * picture + maps * r.height * r.width * depth, 0.0),
+        "stand_ins_back": (3.0 * picture + 3.0 * maps * r.height * r.width * depth, 0.0),
+        "upsample": (2.0 * picture + canvas * depth, 0.0),
+        "upsample_back": (2.0 * picture + canvas * depth, 0.0),
+        "pass_back": (2.0 * picture + canvas * depth, 0.0),
+    }.get(kernel, (0.0, 0.0))
+    return 4.0 * numbers, operations
+
+
+def milliseconds(repeat: int, call: Callable[..., Any], *arguments: Any) -> float:
+    """Median milliseconds of some calls on the device."""
+    taken = []
+    for _ in range(repeat):
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        start.record()
+        call(*arguments)
+        end.record()
+        torch.cuda.synchronize()
+        taken.append(start.elapsed_time(end))
+    return statistics.median(taken)
+
+
+@contextlib.contextmanager
+def engine(name: str) -> Iterator[None]:
+    """A block with ``TORCHDOF_ENGINE`` of a name."""
+    before = os.environ.get("TORCHDOF_ENGINE", "auto")
+    os.environ["TORCHDOF_ENGINE"] = name
+    try:
+        yield
+    finally:
+        os.environ["TORCHDOF_ENGINE"] = before
+
+
+def on_cpu() -> None:
+    """Takes tensors on the CPU for those of a device, whose kernels are their C++ build."""
+    from tests import on_cpu
+
+    on_gpu.DEVICE, layers.module = "cpu", on_cpu.module  # type: ignore[assignment]
+    native._library = lambda: (None, "switched off")  # as on a device: all but the layers by PyTorch, items together
+
+
+def scene(size: tuple[int, int, int], radius_px: float, focus: float = 0.4) -> tuple[str, Tensor, Tensor]:
+    """Name, light and coc of a part of a photograph."""
+    ((name, light, near),) = crops([size])
+    near = (near - near.min()) / (near.max() - near.min())
+    coc_px = 2.0 * radius_px * (focus - near).contiguous()
+    return f"{name}, {radius_px:g} px", light.contiguous().to(DEVICE), coc_px.to(DEVICE)
+
+
+def step(light: Tensor, coc_px: Tensor) -> list[Tensor]:
+    """A picture, and the gradients of its mean square by light and radius."""
+    leaves = [light.clone().requires_grad_(), coc_px.clone().requires_grad_()]
+    picture = blur_by_coc(*leaves)
+    return [picture.detach(), *torch.autograd.grad(picture.square().mean(), leaves)]
+
+
+def versions() -> None:
+    """PyTorch, the device, and NVRTC."""
+    print(f"PyTorch {torch.__version__}, Python {sys.version.split()[0]}, {sys.platform}, {os.cpu_count()} CPU cores")
+    if HAS_DEVICE:
+        major, minor = torch.cuda.get_device_capability()
+        print(f"{torch.cuda.get_device_name()}, compute capability {major}.{minor}, CUDA {torch.version.cuda}")
+    else:
+        print("no CUDA device: the kernels run on the CPU, milliseconds are those of the model")
+    with contextlib.suppress(OSError):
+        print(f"NVRTC {loader.nvrtc(torch.version.cuda or '12')._name}")
+
+
+def first_use() -> None:
+    """Seconds until the first picture: compiled and tried, then with the kept program."""
+    _, light, coc_px = scene(*SMALL_CASES[0])
+    for name in ("without kernels", "kernels compiled", "the kept program"):
+        for cached in (layers.module, on_gpu.why_missing):
+            getattr(cached, "cache_clear", lambda: None)()
+        start = time.perf_counter()
+        with engine("torch" if name == "without kernels" else "gpu"):
+            blur_by_coc(light, coc_px)
+        if HAS_DEVICE:
+            torch.cuda.synchronize()
+        print(f"first picture, {name}: {time.perf_counter() - start:.2f} s")
+
+
+def same_pictures() -> None:
+    """The picture and gradients of the kernels beside those of the plain engine."""
+    for size, radius_px in CASES if HAS_DEVICE else SMALL_CASES:
+        name, light, coc_px = scene(size, radius_px)
+        found = step(light, coc_px)
+        with engine("torch"):
+            expected = step(light, coc_px)
+        local = functional.max_pool2d(expected[0].amax(1, keepdim=True), 17, 1, 8).clamp_min(1e-6)
+        apart = float(((found[0] - expected[0]).abs() / local).max())
+        of_light, of_coc = (float((a - b).norm() / b.norm()) for a, b in zip(found[1:], expected[1:], strict=True))
+        print(f"{name}: picture {apart:.1e} of the light nearby, gradients by light {of_light:.1e}, coc {of_coc:.1e}")
+
+
+def costs(ends: float) -> None:
+    """Milliseconds and memory of a picture and a step, and what each kernel takes."""
+    for size, radius_px in CASES:
+        if time.perf_counter() > ends:
+            print("no time left for further cases")
+            return
+        name, light, coc_px = scene(size, radius_px)
+        for kind, call in (("picture", picture), ("step", step)):
+            if HAS_DEVICE:
+                found = [measured(selected, call, light, coc_px) for selected in ("gpu", "torch")]
+                print(f"{name}, a {kind}: {found[0]}; without kernels {found[1]}", flush=True)
+            with Launches() as launches, Counted() as counted:
+                call(light, coc_px)
+            launches.show(f"{name}, layers of a {kind}")
+            with engine("torch"), Counted() as plain:
+                call(light, coc_px)
+            print(f"  {counted.operations} operations of PyTorch, without kernels {plain.operations}", flush=True)
+
+
+def measured(selected: str, call: Callable[..., Any], light: Tensor, coc_px: Tensor) -> str:
+    """Time and memory of a call by an engine, on the device."""
+    with engine(selected):
+        call(light, coc_px)
+        torch.cuda.reset_peak_memory_stats()
+        before, taken = torch.cuda.memory_allocated(), milliseconds(5, call, light, coc_px)
+        most = (torch.cuda.max_memory_allocated() - before) / 2**30
+    return f"{taken:.1f} ms, {most:.2f} GiB"
+
+
+def picture(light: Tensor, coc_px: Tensor) -> Tensor:
+    """A picture without gradients."""
+    with torch.no_grad():
+        return blur_by_coc(light, coc_px)
+
+
+def other_formulas() -> None:
+    """DeepLens's formula, which is that of splat, and BokehMe's scatter: no layers, no occlusion."""
+    if not HAS_DEVICE:
+        loader.compile_program(SCATTER, [], 90, "12")
+        print("BokehMe's formula: NVRTC compiles it")
+        return
+    launch = loader.on_device(SCATTER, [], torch.cuda.current_device())
+    for size, radius_px in (CASES[0], CASES[2]):
+        name, light, coc_px = scene(size, radius_px)
+        out, reach = torch.empty_like(light), int(coc_px.abs().max()) + 2
+        argument = Scatter(*(t.data_ptr() for t in (light, coc_px, out)), *size[:2], reach)
+        grid = (-(-size[1] // 32), -(-size[0] // 16), 1)
+        print(f"{name}: BokehMe's formula {milliseconds(5, launch, 'scatter', grid, (32, 16, 1), argument):.1f} ms")
+        print(f"{name}: DeepLens's formula (splat) {milliseconds(3, splat, light, coc_px):.1f} ms", flush=True)
+
+
+def main() -> None:
+    """Prints all parts."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=330.0, help="no part begins later")
+    ends = time.perf_counter() + parser.parse_args().seconds
+    warnings.simplefilter("error", RuntimeWarning)
+    if not HAS_DEVICE:
+        on_cpu()
+    with engine("gpu"), tempfile.TemporaryDirectory() as cache:
+        # an empty folder, so that kernels are compiled
+        os.environ["LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME"] = cache
+        for part in (versions, first_use, same_pictures, lambda: costs(ends), other_formulas):
+            if time.perf_counter() > ends:
+                print("no time left")
+                break
+            try:
+                part()
+            except Exception as error:  # the other parts are still worth their time
+                print(f"failed: {type(error).__name__}: {error}")
+            sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,126 @@
+// The weights of a pixel's surfaces in a layer, and the stand-ins for its background; with their gradients.
+#pragma once
+#include "frame.h"
+#include "rules.h"
+
+using namespace torchdof;
+
+// Weights of a pixel in a layer: of each surface, and behind the layer.
+struct Weights {
+  float own[SURFACES], beyond;
+};
+
+// The product of 1 - values[i] for i < count, without one or two of them.
+__device__ inline float left_by(const float *values, int count, int without, int and_without = -1) {
+  float left = 1;
+  for (int i = 0; i < count; i++)
+    if (i != without && i != and_without) left *= 1 - values[i];
+  return left;
+}
+
+#if STACKED
+// Surfaces that cover a pixel independently, near to far; the formula of _stacked in render/surfaces.py. Of surface j: its
+// share a at or behind the layer, and b behind it; h, the part of the light from behind that the surface hides in this layer and
+// those behind it; hidden, the part that its part in front of the layer hides; s, the part of the arriving light that stops in the layer.
+struct Stack {
+  float a[SURFACES], b[SURFACES], h[SURFACES], hidden[SURFACES], s[SURFACES];
+};
+__device__ inline Stack stack_of(const Ramps &l, const Pixel &p) {
+  Stack t;
+  for (int j = 0; j < SURFACES; j++) {
+    t.a[j] = ramp(l.at_or_behind(p.place[j]), true);
+    t.b[j] = ramp(l.behind(p.place[j]), true);
+    t.h[j] = p.weight[j] * ramp(t.a[j] / HIDING_SHARE, true);
+    t.hidden[j] = t.h[j] * (1 - t.a[j]);
+    t.s[j] = p.weight[j] * (t.a[j] - t.b[j]) / most(1 - t.hidden[j], LEAST_PASSING);
+  }
+  return t;
+}
+__device__ inline Weights weigh(const Ramps &l, const Pixel &p) {
+  const Stack t = stack_of(l, p);
+  const float visible = left_by(t.hidden, SURFACES, -1);
+  Weights w = {{}, visible * (1 - left_by(t.h, SURFACES, -1))};
+  float arriving = 1;
+  for (int j = 0; j < SURFACES; j++) {
+    w.own[j] = visible * arriving * t.s[j];
+    arriving *= 1 - t.s[j];
+    w.beyond -= w.own[j];
+  }
+  return w;
+}
+// Adds the gradients by places and weights.
+__device__ inline void weigh_back(const Ramps &l, const Pixel &p, const Weights &of, float *of_place, float *of_weight) {
+  const Stack t = stack_of(l, p);
+  const float visible = left_by(t.hidden, SURFACES, -1), known = 1 - left_by(t.h, SURFACES, -1);
+  float of_visible = of.beyond * known, of_arriving = 0;  // of_arriving: by the light that arrives at the next surface
+  for (int j = 0; j < SURFACES; j++) of_visible += (of.own[j] - of.beyond) * left_by(t.s, j, -1) * t.s[j];
+  for (int j = SURFACES - 1; j >= 0; j--) {
+    const float of_stopped = (of.own[j] - of.beyond) * visible, passing = most(1 - t.hidden[j], LEAST_PASSING);
+    const float of_s = left_by(t.s, j, -1) * (of_stopped - of_arriving), of_difference = of_s * p.weight[j] / passing;
+    of_arriving = of_stopped * t.s[j] + (1 - t.s[j]) * of_arriving;
+    const float of_hidden = (1 - t.hidden[j] >= LEAST_PASSING ? of_s * t.s[j] / passing : 0.0f) - of_visible * left_by(t.hidden, SURFACES, j);
+    const float of_h = of_hidden * (1 - t.a[j]) + of.beyond * visible * left_by(t.h, SURFACES, j), nearer = t.a[j] / HIDING_SHARE;
+    const float of_a = of_difference - of_hidden * t.h[j] + of_h * p.weight[j] * slope_of_ramp(nearer, true) / HIDING_SHARE;
+    of_place[j] += of_a * slope_of_ramp(l.at_or_behind(p.place[j]), true) / l.width;
+    of_place[j] -= of_difference * slope_of_ramp(l.behind(p.place[j]), true) / l.next_width;
+    of_weight[j] += of_s * (t.a[j] - t.b[j]) / passing + of_h * ramp(nearer, true);
+  }
+}
+#else
+// One surface, or two that share a pixel; the formula of _mixed in render/surfaces.py. Of surface j: its share a at or behind the
+// layer, and b behind it; c, the weight that counts, w + continuation(w) visible_part(a of the nearer surface).
+struct Mixture {
+  float a[SURFACES], b[SURFACES], c[SURFACES];
+};
+__device__ inline Mixture mixture_of(const Ramps &l, const Pixel &p) {
+  Mixture t;
+  for (int j = 0; j < SURFACES; j++) {
+    t.a[j] = ramp(l.at_or_behind(p.place[j]), true);
+    t.b[j] = ramp(l.behind(p.place[j]), true);
+    t.c[j] = p.weight[j] + (j ? continuation(p.weight[j]) * visible_part(t.a[0]) : 0.0f);
+  }
+  return t;
+}
+__device__ inline Weights weigh(const Ramps &l, const Pixel &p) {
+  const Mixture t = mixture_of(l, p);
+  Weights w = {};
+  for (int j = 0; j < SURFACES; j++) {
+    w.own[j] = (t.a[j] - t.b[j]) * t.c[j];
+    w.beyond += t.b[j] * t.c[j];
+  }
+  return w;
+}
+// Adds the gradients by places and weights.
+__device__ inline void weigh_back(const Ramps &l, const Pixel &p, const Weights &of, float *of_place, float *of_weight) {
+  const Mixture t = mixture_of(l, p);
+  float of_nearer = 0;
+  for (int j = SURFACES - 1; j >= 0; j--) {
+    const float of_c = of.own[j] * (t.a[j] - t.b[j]) + of.beyond * t.b[j];
+    const float of_a = of.own[j] * t.c[j] + (j ? 0.0f : of_nearer), of_b = (of.beyond - of.own[j]) * t.c[j];
+    if (j) of_nearer += of_c * continuation(p.weight[j]) * slope_of_visible_part(t.a[0]);
+    of_weight[j] += of_c * (j ? 1 + slope_of_continuation(p.weight[j]) * visible_part(t.a[0]) : 1.0f);
+    of_place[j] += of_a * slope_of_ramp(l.at_or_behind(p.place[j]), true) / l.width;
+    of_place[j] += of_b * slope_of_ramp(l.behind(p.place[j]), true) / l.next_width;
+  }
+}
+#endif
+
+// Stand-ins for the background (PaddedFrame.stand_ins in render/surfaces.py): the cover of each surface of a pixel, its
+// factors, and their sum. taken: how far a surface at the focus takes the place of a stand-in.
+struct StandIns {
+  float seen_part[SURFACES], at_place[SURFACES], taken[SURFACES], alone[SURFACES], left[SURFACES], cover[SURFACES], sum;
+};
+__device__ inline StandIns stand_ins_of(const Pixel &p) {
+  StandIns t;
+  t.sum = 0;
+  for (int j = 0; j < SURFACES; j++) t.taken[j] = counts(p.weight[j]) * at_focus(p.place[j]);
+  for (int j = 0; j < SURFACES; j++) {
+    t.seen_part[j] = seen(p.weight[j]);
+    t.at_place[j] = stands_in(p.place[j]);
+    t.alone[j] = left_by(t.taken, SURFACES, j);
+    t.left[j] = STACKED ? left_by(p.weight, j, -1) : 1.0f;  // what nearer surfaces leave
+    t.cover[j] = t.seen_part[j] * t.at_place[j] * t.alone[j] * t.left[j];
+    t.sum += t.cover[j];
+  }
+  return t;
+}
