@@ -49,6 +49,7 @@ CALLS: dict[str, Call] = {
         blur_by_coc(image, coc, occlusion=False),
     ),
     "a known background": known_background,
+    "a matte": lambda image, coc: blur_by_coc(image, coc, matte=(coc.detach() < 1.0).to(coc.dtype)),
     "`attention`": lambda image, coc: blur_by_coc(image, coc, attention=(4.0, 5.0, 3.0)),
     "stack of layers (`DepthOfField.layers`)": layers,
     "a table whose blur depends on the place in the frame": lambda image, coc: blur_by_coc(

@@ -4,6 +4,7 @@
 | --- | --- | --- | --- | --- | --- |
 | image, with or without occlusion | compiled | steps | PyTorch | graph | graph |
 | a known background | compiled | steps | PyTorch | graph | no such input |
+| a matte | compiled | steps | PyTorch | graph | graph |
 | `attention` | compiled | steps | PyTorch | refused | no such input |
 | stack of layers (`DepthOfField.layers`) | compiled | steps | PyTorch | left out | no such input |
 | a table whose blur depends on the place in the frame | compiled | steps | PyTorch | refused | refused |
@@ -12,7 +13,7 @@
 | kernels wider than 513 pixels of their layer | steps | steps | PyTorch | graph | graph |
 | `torchdof.functional.splat` | PyTorch | PyTorch | PyTorch | refused | no such input |
 
-- compiled: the compiled engine renders the whole picture.
+- compiled: the compiled engine renders the whole picture. What a matte says is computed in PyTorch before.
 - steps: PyTorch renders, and the compiled engine computes those of its steps that it supports.
 - PyTorch: PyTorch renders alone. So it does everywhere without a compiled engine or with `TORCHDOF_ENGINE=torch`, and
   in forward mode or under `torch.func`.
@@ -64,6 +65,7 @@ def refuse(
     background: bool = False,
     attention: bool = False,
     plan: bool = False,
+    matte: bool = False,
     repairs: bool = False,
 ) -> None:
     """Refuse a combination of arguments that no engine renders: all these combinations are here.
@@ -74,6 +76,7 @@ def refuse(
         background: Whether a background is given.
         attention: Whether the viewer's attention is given.
         plan: Whether a plan is given.
+        matte: Whether a matte is given.
         repairs: Whether a file is to repair depth edges.
 
     Raises:
@@ -100,6 +103,10 @@ def refuse(
         (
             background and not options.occlusion,
             "without occlusion nothing is hidden: a background needs occlusion=True",
+        ),
+        (
+            matte and not options.occlusion,
+            "without occlusion all light is added, whatever covers a pixel: a matte needs occlusion=True",
         ),
         (
             attention and plan,
