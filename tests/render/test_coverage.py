@@ -12,6 +12,7 @@ from tests.refused import refuses
 from torchdof import Camera, DepthOfField, blur_by_coc
 from torchdof.reference import metrics
 from torchdof.render.coverage import covered_by
+from torchdof.render.highlights import threshold
 
 SIZE = (96, 128)
 NEAR_PX, FAR_PX = -9.0, 0.0
@@ -71,7 +72,7 @@ def test_light_of_both_surfaces_is_exact_where_each_has_one_colour() -> None:
     cover, figure, wall = (4 * strands()).round() / 4, torch.tensor([0.6, 0.2, 0.1]), torch.tensor([0.2, 0.5, 0.9])
     image = cover * figure[:, None, None] + (1 - cover) * wall[:, None, None]
     coc = torch.where(cover > 0.5, 8.0, 2.0)  # the subject is behind: the sides are symmetric
-    moved, covered = covered_by(image, displaced(coc, 1), cover)
+    moved, covered = covered_by(image, displaced(coc, 1), cover, threshold)
     assert covered is not None
     share, other, weight, certainty = covered.split([3, 1, 1, 1], 1)
     mixed = ((cover > 0.02) & (cover < 0.98)).squeeze(1)
@@ -100,7 +101,7 @@ def test_a_nearer_surface_outside_the_matte_keeps_its_depth() -> None:
     cover[..., 20:60, 40:80] = 1.0
     coc = torch.where(cover > 0, 0.0, 6.0)
     coc[..., 60:, :] = -8.0
-    moved, _ = covered_by(torch.rand(1, 3, *SIZE), coc, cover)
+    moved, _ = covered_by(torch.rand(1, 3, *SIZE), coc, cover, threshold)
     away_from_corners = torch.ones_like(coc, dtype=torch.bool)
     away_from_corners[..., 50:64, 32:44] = away_from_corners[..., 50:64, 76:88] = False  # all three surfaces meet there
     assert torch.equal(moved[away_from_corners], coc[away_from_corners])

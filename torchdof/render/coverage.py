@@ -15,13 +15,14 @@ times, because errors of a blurred surface are seen less. :mod:`torchdof.render.
 colours, which say little where hair and wall are alike.
 """
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
 from ..tensors import is_traced
 from .downsampling import downsampled, upsampled
-from .highlights import threshold
 
 __all__ = ["covered_by"]
 
@@ -33,7 +34,9 @@ _STEEP = 10.0  # inverse of the coverage that counts as a mixed pixel's; larger:
 _LEAST = 1e-4  # (1 %)^2: smallest variance of a surface's light, as a fraction of its mean square
 
 
-def covered_by(image: Tensor, coc_px: Tensor, matte: Tensor) -> tuple[Tensor, Tensor | None]:
+def covered_by(
+    image: Tensor, coc_px: Tensor, matte: Tensor, threshold: Callable[[Tensor, Tensor], Tensor]
+) -> tuple[Tensor, Tensor | None]:
     """Both surfaces of the pixels at the edges of a matte, where the depth has an edge too.
 
     1. Guess the coc of the subject and of its surroundings, each as a mean over many pixels that the matte gives to it.
@@ -45,6 +48,8 @@ def covered_by(image: Tensor, coc_px: Tensor, matte: Tensor) -> tuple[Tensor, Te
         image: ``[B, C, H, W]``, linear light.
         coc_px: ``[B or 1, 1, H, W]``, signed; a pixel that is not finite stays.
         matte: Coverage by the subject, ``[B or 1, 1, H, W]``, in [0, 1].
+        threshold: Gives the light above which a pixel is a highlight, of an image and of the validity of its pixels:
+            :func:`torchdof.render.highlights.threshold`.
 
     Returns:
         The map of the coc, ``[B, 1, H, W]``; and the other surfaces, ``[B, C + 3, H, W]``: their part of the pixel's
