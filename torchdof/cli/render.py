@@ -42,6 +42,11 @@ class _Effects(Group):
         metavar="STOPS",
         type=click.FloatRange(min=0),
     )
+    matte: Path | None = option(
+        "A subject's mask, in which white is the subject: decides where hair and other soft edges end. Default: that "
+        "of a phone's portrait; none leaves it out.",
+        metavar="FILE|none",
+    )
     show_focus: bool = option("Don't blur: tint the grey image: near orange, in focus green, far blue.", False)
     device: str = option("auto, cpu, cuda, cuda:1, ...", "auto")
 
@@ -100,6 +105,15 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
     depth: Path | None = argument("Its depth; not needed if IMAGE has a Z channel or is a portrait.", "[DEPTH]", None)
     out: Path = option("File to write, out.####.exr, or a folder.", ..., names=("--out", "-o"), metavar="OUT")
 
+    @property
+    def has_matte_file(self) -> bool:
+        """Whether a file with a matte is named."""
+        return self.matte is not None and str(self.matte) != "none"
+
+    def files(self) -> list[Path]:
+        """The files besides image and depth."""
+        return super().files() + [path for path in [self.matte] if path and self.has_matte_file]
+
     def run(self) -> None:
         """Renders one image, the frames of a sequence, a focus pull in a still image, or a folder."""
         parameters = click.get_current_context().command.params
@@ -122,6 +136,7 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
             (self.keep_layers and not are_exr, "--keep-layers is for an EXR that is written to an EXR; leave it out"),
             (not is_single and not numbered, no_number),
             (self.sheet and not is_single, "--sheet is of one picture; leave it out where there are more"),
+            (self.has_matte_file and images, "--matte is of one picture; leave it out with a sequence"),
             (of_sequences, f"{self.image}: is a single image; for a sequence write it as shot.####.exr"),
             (images and self.blur, "--blur would open the lens anew in each frame of a sequence; give --f-number"),
             (self.steady and self.depth_kind == "coc", "--steady filters depth in metres; --depth-kind coc has none"),

@@ -234,11 +234,11 @@ def _unscaled(path: Path, part: Part) -> Part:
     return dataclasses.replace(part, values=levels)
 
 
-def read_array(path: Path, key: str | None, place: tuple[int, int] | None = None) -> np.ndarray:
+def read_array(path: Path, key: str | None, place: tuple[int, int] | None = None, kinds: str = "fiu") -> np.ndarray:
     """The array ``[H, W]`` of an ``.npy`` file, or of an ``.npz`` file: its only array, depth, or ``key``.
 
-    ``place`` is the index of an image in a sequence, and the number of images, for an array ``[N, H, W]``. Refuses
-    pickles.
+    ``place`` is the index of an image in a sequence, and the number of images, for an array ``[N, H, W]``. ``kinds``
+    are letters of NumPy for the types that are accepted. Refuses pickles.
     """
     try:
         if path.suffix.lower() == ".npz":
@@ -272,7 +272,7 @@ def read_array(path: Path, key: str | None, place: tuple[int, int] | None = None
             remedy = "give a sequence of as many images, such as shot.####.png"
             raise ValueError(f"holds {len(array)} maps (an array {list(shape)}){images}; {remedy}")
         array = array[place[0]]
-    if array.ndim != 2 or array.dtype.kind not in "fiu" or array.size == 0:
+    if array.ndim != 2 or array.dtype.kind not in kinds or array.size == 0:
         raise ValueError(f"expected an array [H, W] of numbers, got {list(shape)} of {array.dtype}")
     check_size(array.shape[1], array.shape[0], array.dtype.itemsize + 4)
     if array.dtype.kind == "f":

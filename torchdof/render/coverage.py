@@ -61,7 +61,7 @@ def covered_by(
     if not is_traced() and not bool((_change(matte.detach(), 3) > 0).any()):
         return coc_px, None
     wide = torch.promote_types(torch.promote_types(image.dtype, coc_px.dtype), torch.float32)
-    light, (coc, cover) = image.to(wide), (t.to(wide).expand(len(image), -1, -1, -1) for t in (coc_px, matte))
+    light, (coc, cover) = image.to(wide), (t.to(wide).expand(image.shape[0], -1, -1, -1) for t in (coc_px, matte))
     known = torch.isfinite(coc) & torch.isfinite(light).all(1, keepdim=True)
     light, coc = torch.where(known, light, 0.0), torch.where(known, coc, 0.0)
     parts = (cover, 1.0 - cover)
