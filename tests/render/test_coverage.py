@@ -59,7 +59,7 @@ def scene(shift: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 @pytest.mark.parametrize(("shift", "gain_db"), [(0, 6.0), (2, 14.0), (-2, 14.0)])
 def test_true_coverage_renders_strands_before_a_wall_in_focus(shift: int, gain_db: float, engine: str) -> None:
-    """Colours do not tell the wall from a strand of its shade, and a displaced map has no strands where they are."""
+    """A strand may have the colour of the wall, and a displaced map has strands in other places."""
     image, coc, cover, truth = scene(shift)
     inner = torch.zeros(1, 1, *SIZE, dtype=torch.bool)
     inner[..., 12:-12, 12:-12] = True

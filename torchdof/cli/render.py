@@ -116,7 +116,8 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
 
     def run(self) -> None:
         """Renders one image, the frames of a sequence, a focus pull in a still image, or a folder."""
-        parameters = click.get_current_context().command.params
+        context = click.get_current_context()
+        parameters = context.command.params
         options = {p.opts[0]: getattr(self, p.name) for p in parameters if p.name and p.name not in _NOT_OF_FRAMES}
         options |= {"files": self.files(), "torchdof": importlib.metadata.version("torchdof")}
         both = self.keep_layers and self.show_focus
@@ -188,8 +189,11 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         from ..depth.steady import SteadyFrames
         from .frame import Renderer
 
-        is_assumed = images is not None and self.depth_kind == "auto"  # a guess could differ from frame to frame
-        of_frames = dataclasses.replace(self, depth_kind="z") if is_assumed else self
+        is_auto = images is not None and self.depth_kind == "auto"  # a guess could differ from frame to frame
+        of_frames = dataclasses.replace(self, depth_kind="z") if is_auto else self
+        is_stated = context.get_parameter_source("depth_kind") is not click.core.ParameterSource.DEFAULT
+        is_implied = self.strict and self.depth_kind == "z" and self.depth_scale is None and not is_stated
+        is_assumed = is_auto or (images is not None and is_implied)
         renderer = Renderer(of_frames, images is None, is_assumed)
         renderer.has_table = is_single
         if self.resume and len(existing) > len(done):

@@ -72,7 +72,7 @@ def matte(
        texture, a is the near surface's share under a small Gaussian, as far as the pixel's colour agrees.
     5. Distribute the residual over both parts, but none of it to an other surface that is less blurred: they sum to I,
        and neither leaves the image's range.
-    6. Replace what was guessed by what is known from a matte.
+    6. Replace these guesses by the surfaces of a matte, where there is one.
 
     Args:
         light: ``[B, C, H, W]``.
