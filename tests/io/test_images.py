@@ -10,6 +10,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import torch
+from PIL import Image
 
 from tests.files import spec_with, store, store_parts
 from torchdof.io.colour import stated_primaries, stated_transfer
@@ -620,7 +621,7 @@ def test_equal_channels_are_one_map(tmp_path: Path) -> None:
 def test_primaries_of_a_png_are_converted_unless_it_is_srgb(tmp_path: Path) -> None:
     """Chunk cHRM: white, red, green, blue; Display P3's red is outside of sRGB."""
     path = tmp_path / "p3.png"
-    write_image(path, Picture(torch.tensor([1.0, 0.0, 0.0]).reshape(1, 3, 1, 1).expand(1, 3, 4, 4)))
+    Image.new("RGB", (4, 4), (255, 0, 0)).save(path)  # without sRGB or gAMA
     plain = path.read_bytes()
     body = b"cHRM" + struct.pack(">8I", 31270, 32900, 68000, 32000, 26500, 69000, 15000, 6000)
     chunk = struct.pack(">I", 32) + body + struct.pack(">I", zlib.crc32(body))
