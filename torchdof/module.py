@@ -412,8 +412,8 @@ def render(
         got = validation.show(plan)
         raise ValueError(f"plan must be a Plan from DepthOfField.plan(image, depth), or left out, got {got}")
     has_matte = matte is not None
-    given = {"background": behind is not None, "attention": attention is not None, "plan": plan is not None}
-    routes.refuse(options, **given, matte=has_matte)
+    has_plan, has_background = plan is not None, behind is not None
+    routes.refuse(options, background=has_background, attention=attention is not None, plan=has_plan, matte=has_matte)
     if matte is not None:
         validation.coverage(image, matte, values=options.check)
 

@@ -85,7 +85,8 @@ def covered_by(
     is_wrong = (4.0 * away - 1.0).clamp(0.0, 1.0)
 
     # near an edge of the matte; a wrong coc also a few pixels from it, if that of the own surface is as near
-    beside_own = torch.where(is_subject, *(_largest(weight, _RISE) for weight in samples))
+    subjects, others = (_largest(weight, _RISE) for weight in samples)
+    beside_own = torch.where(is_subject, subjects, others)
     band = torch.maximum(_change(cover, 3), beside_own * is_wrong * _change(cover, _RISE)) * _STEEP
     # a third surface has its coc elsewhere; on a slope, the samples of both lie apart without an edge
     is_edge = 10.0 * _largest_around(_change(coc.detach(), _RISE)) / step_px.clamp_min(1e-6) - 3.0
