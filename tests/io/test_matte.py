@@ -116,8 +116,8 @@ def test_a_portrait_is_rendered_with_its_own_matte_unless_none_is_wanted(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     told = render(f"{HEIC} -o own.png --blur 5%")
-    assert "its own matte decides where the subject ends (else --matte)" in told
-    assert "own matte" not in render(f"{HEIC} -o none.png --blur 5% --matte none")
+    assert "own.png: the own matte of the portrait decides where the subject ends (else --matte)" in told
+    assert "own matte of" not in render(f"{HEIC} -o none.png --blur 5% --matte none")
     own, none = (read_image(name).pixels for name in ("own.png", "none.png"))
     assert not torch.equal(own, none)
 

@@ -266,7 +266,7 @@ class Renderer:
         if has_exif and suffix in _WITHOUT_EXIF:
             note("exif", f"{out}: EXIF data are lost in a {suffix} file; write .jpg, .png or .tif to keep them")
         if frame.picture.matte is not None and frame.matte is not None and command.matte is None:
-            note("matte", f"{command.image}: its own matte decides where the subject ends (else --matte)")
+            note("matte", f"{out}: the own matte of the portrait decides where the subject ends (else --matte)")
         if frame.picture.other_layers and suffix == ".exr" and not command.keep_layers:
             layers = ", ".join(frame.picture.other_layers)
             note("layers", f"{out}: is without the other layers of the image: {layers} (--keep-layers)")
