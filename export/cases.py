@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .graph import Portable
+from .graph import INPUTS, Portable
 
 __all__ = ["Case", "cases"]
 
@@ -26,7 +26,7 @@ def cases(portable: Portable, channels: int) -> Iterator[Case]:
     Each frame has a size and a shape of its coc; a file with a fixed size gets scenes of this size. The f-number and
     the depth are those that give this coc.
     """
-    reach = portable.dof.options.max_coc_px
+    reach, names = portable.dof.options.max_coc_px, INPUTS[portable.inputs]
     generator = torch.Generator().manual_seed(4)
     frames = [
         ("one pixel", (1, 1, 1), _ramp(0.3, 0.9)),
@@ -69,10 +69,12 @@ def cases(portable: Portable, channels: int) -> Iterator[Case]:
             # The noise is smaller than the step between surfaces; light would depend steeply on larger noise.
             noise = torch.rand(coc.shape, generator=generator, dtype=coc.dtype)
             coc = coc + coc.clamp(-10.0, 10.0) * 0.03 * noise
-        if portable.inputs == "coc_px":
+        is_near = (coc < 0.2 * reach).float()
+        matte = (functional.avg_pool2d(is_near, 3, 1, 1, count_include_pad=False),) * ("matte" in names)
+        if "coc_px" in names:
             if name == "bad depths":
                 coc[:, :, ::7, 3::11] = math.nan
-            yield Case(name, (image, coc))
+            yield Case(name, (image, coc, *matte))
             continue
         focus, farthest = torch.linspace(1.2, 3.1, batch, dtype=torch.float32), 1.05 * coc.abs().amax().clamp_min(1.0)
         widest = portable.dof.camera.replace(focus_m=focus, f_number=1.0)
@@ -85,7 +87,7 @@ def cases(portable: Portable, channels: int) -> Iterator[Case]:
             depth[:, :, ::7, 3::11] = math.nan
             depth[:, :, 1::7, 5::11] = 0.0
             depth[:, :, 2::7, 1::11] = -1.0
-        yield Case(name, (image, depth, focus, f_number))
+        yield Case(name, (image, depth, *matte, focus, f_number))
 
 
 def _ramp(low: float, high: float) -> Callable[[int, int, int], Tensor]:

@@ -60,7 +60,9 @@ def to_onnx(
     Args:
         dof: The module. The file contains its camera, table and options, except focus and f-number, which are inputs.
         path: The file. It is written to a temporary file beside it, verified, and moved into place.
-        inputs: ``"depth"``, or ``"coc_px"`` for pipelines that already have the circle of confusion.
+        inputs: ``"depth"``, or ``"coc_px"`` for pipelines that already have the circle of confusion. With
+            ``"depth+matte"`` or ``"coc_px+matte"`` the third input is ``matte [B, 1, H, W]``, coverage in [0, 1]; a
+            matte of zeros changes nothing.
         channels: Channels of the image, C.
         width: Required for a table with lengths in millimetres or fractions of the width: the image width for which the
             file's kernels are made. The file uses the same kernel for a radius in pixels at any width.

@@ -20,7 +20,7 @@ from torchdof.render.plan import Plan
 
 from .operations import GraphOps, WholeOps
 
-__all__ = ["INPUTS", "ITEMS", "OUTPUT", "Layout", "Portable", "Size", "axes", "trace"]
+__all__ = ["INPUTS", "ITEMS", "LENS", "OUTPUT", "Layout", "Portable", "Size", "axes", "trace"]
 
 Layout = Literal["tiles", "whole"]
 """Structure of a graph: a loop over tiles, or straight operations on whole frames."""
@@ -28,8 +28,16 @@ Layout = Literal["tiles", "whole"]
 Size = tuple[int, int] | None
 """Height and width of the only frame that a graph takes, as a batch of one; None: any batch, height and width."""
 
-INPUTS = {"depth": ("image", "depth", "focus_m", "f_number"), "coc_px": ("image", "coc_px")}
-"""Names of the graph's inputs, in order, for each kind of map."""
+INPUTS = {
+    "depth": ("image", "depth", "focus_m", "f_number"),
+    "depth+matte": ("image", "depth", "matte", "focus_m", "f_number"),
+    "coc_px": ("image", "coc_px"),
+    "coc_px+matte": ("image", "coc_px", "matte"),
+}
+"""Names of the graph's inputs, in order, for each choice of them."""
+
+LENS = ("focus_m", "f_number")
+"""Names of the inputs with a number for each item; the others are maps."""
 
 ITEMS = "B_or_1"
 """Name of the batch axis of every input except the image."""
@@ -87,27 +95,30 @@ class Portable(nn.Module):
         self.ops.lens_width = width
         self.eval()
 
-    def forward(self, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
-        """Renders ``[B, C, H, W]`` from depth and ``(focus_m, f_number)``, or from a map of the coc."""
-        out = self._rendered(self.dof.options, self.plan, image, map_, *lens)
-        if not lens:
+    def forward(self, image: Tensor, *others: Tensor) -> Tensor:
+        """Renders ``[B, C, H, W]`` from the :data:`INPUTS` of the file."""
+        out = self._rendered(self.dof.options, self.plan, image, *others)
+        if "focus_m" not in INPUTS[self.inputs]:
             return out
-        focus_m, f_number = lens
+        focus_m, f_number = others[-2:]
         camera = self.dof.camera
         nearest_m = float(camera.focal_length_mm) / 1000.0 if camera.focus_breathing else 0.0
         is_possible = (focus_m > nearest_m) & (f_number > 0) & (f_number < torch.inf)
         undefined = torch.where(is_possible[:, None, None, None], out, torch.nan)
         return self.ops.equal_unless(lambda: ~is_possible.all(), undefined, out)
 
-    def as_called(self, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
+    def as_called(self, image: Tensor, *others: Tensor) -> Tensor:
         """Renders like a call of the module: layers chosen for the scene, its own highlights and edge repair."""
-        return self._rendered(self.called, None, image, map_, *lens)
+        return self._rendered(self.called, None, image, *others)
 
-    def _rendered(self, options: Options, plan: Plan | None, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
-        if lens:
-            return render(image, self.dof.coc_as_given(image, map_, lens[0], lens[1]), options, plan, ops=self.ops)
-        validation.scene(image, "coc_px", map_, channels=options.table.channels, values=False)
-        return render(image, map_, options, plan, ops=self.ops)
+    def _rendered(self, options: Options, plan: Plan | None, image: Tensor, *others: Tensor) -> Tensor:
+        given = dict(zip(INPUTS[self.inputs][1:], others, strict=True))
+        if "depth" in given:
+            coc_px = self.dof.coc_as_given(image, given["depth"], given["focus_m"], given["f_number"])
+        else:
+            coc_px = given["coc_px"]
+            validation.scene(image, "coc_px", coc_px, channels=options.table.channels, values=False)
+        return render(image, coc_px, options, plan, ops=self.ops, matte=given.get("matte"))
 
 
 def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
@@ -118,7 +129,8 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
     # With a single row or column of tiles, PyTorch would record the number of tiles as the number of items, because
     # both are the same in the example: take several, of the largest tiles too. They are not computed while tracing.
     batch, size = (5, (600, 850)) if portable.size is None else (1, portable.size)
-    sizes = [(batch, channels, *size), (batch, 1, *size), (batch,), (batch,)][: len(INPUTS[portable.inputs])]
+    shapes = {"image": (batch, channels, *size), **dict.fromkeys(LENS, (batch,))}
+    sizes = [shapes.get(name, (batch, 1, *size)) for name in INPUTS[portable.inputs]]
     example = tuple(torch.ones(1, dtype=torch.float32).expand(shape) for shape in sizes)  # values do not matter
     traced = copy.copy(portable)
     layered = portable.dof.options.method == "layered"
@@ -142,5 +154,5 @@ def axes(portable: Portable, batch: Any, height: Any, width: Any) -> tuple[Any, 
     if portable.size is not None:
         return None
     frame = {0: batch, 2: height, 3: width}
-    lens = ({0: batch},) * (len(INPUTS[portable.inputs]) - 2)
-    return (frame, frame, lens) if lens else (frame, frame)  # of forward(image, map_, *lens)
+    others = tuple({0: batch} if name in LENS else frame for name in INPUTS[portable.inputs][1:])
+    return frame, others  # of forward(image, *others)

@@ -24,6 +24,7 @@ UNITS = {
     "image": "[B, {channels}, H, W] float32, linear light, >= 0, any range",
     "depth": "[B, 1, H, W] float32, metres along the optical axis, inf allowed; NaN, zero and negative pass sharp",
     "coc_px": "[B, 1, H, W] float32, radius in pixels, negative in front of the focus plane; NaN passes sharp",
+    "matte": "[B, 1, H, W] float32, coverage by a subject in [0, 1]; 0 everywhere changes nothing",
     "focus_m": "[B] float32, metres, inf allowed; NaN, and where the lens cannot focus, give NaN in their item",
     "f_number": "[B] float32, focal length over aperture diameter; NaN, inf, zero and negative give NaN in their item",
     "near_m": "[B] float32, metres at which the nearest pixel is put",

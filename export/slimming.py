@@ -3,7 +3,7 @@
 import functools
 import itertools
 import string
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, cast
 
 import numpy as np
@@ -200,23 +200,29 @@ def _drop_defaults(model: onnx_ir.Model) -> None:
                 del node.attributes[name]
 
 
-def _shorten(model: onnx_ir.Model) -> None:
-    """Removes names of nodes, and shortens names of values; the most frequent names become the shortest.
+def _names() -> Iterator[str]:
+    """Names of one to four letters, the shortest first."""
+    return ("".join(letters) for n in range(1, 5) for letters in itertools.product(string.ascii_letters, repeat=n))
 
-    Types and shapes of intermediate values are also removed, because they would be most of the file; inference finds
-    them.
+
+def _shorten(model: onnx_ir.Model) -> None:
+    """Shortens names of values, the most frequent ones most; removes names of nodes except in subgraphs.
+
+    There they are needed by onnxruntime: it names new values after nodes, and without them its optimised copy of a file
+    has the same names in several subgraphs. Types and shapes of intermediate values are also removed, because they
+    would be most of the file; inference finds them.
     """
     interface_names = {value.name for value in (*model.graph.inputs, *model.graph.outputs)}
     values: list[onnx_ir.Value] = []
+    names_of_nodes = _names()
     for graph in (model.graph, *model.graph.subgraphs()):
         values += [*graph.inputs]
         for node in graph:
-            node.name = None
+            node.name = None if graph is model.graph else f"_{next(names_of_nodes)}"  # not a name of a value
             values += node.outputs
             for value in node.outputs:
                 if not value.is_graph_output():
                     value.shape = value.type = None
     values = sorted((v for v in values if v.name not in interface_names), key=lambda v: -len(v.uses()))
-    names = ("".join(letters) for n in range(1, 5) for letters in itertools.product(string.ascii_letters, repeat=n))
-    for value, name in zip(values, (name for name in names if name not in interface_names), strict=False):
+    for value, name in zip(values, (name for name in _names() if name not in interface_names), strict=False):
         value.name = name

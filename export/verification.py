@@ -16,7 +16,7 @@ from torchdof import DepthOfField
 from torchdof.reference import metrics
 
 from .cases import Case, cases
-from .graph import INPUTS, ITEMS, OUTPUT, Portable
+from .graph import INPUTS, ITEMS, LENS, OUTPUT, Portable
 from .metadata import facts_of, load, settings
 
 __all__ = ["TOLERANCE", "CaseComparison", "Verification", "check_format", "session", "verify"]
@@ -119,7 +119,7 @@ def verify(
     """
     model = load(path, external=False)
     facts = facts_of(model, str(path))
-    inputs = "depth" if "depth" in facts["inputs"] else "coc_px"
+    inputs = next((kind for kind, names in INPUTS.items() if set(names) == set(facts["inputs"])), "depth")
     size = None if facts["size"] is None else tuple(facts["size"])
     portable = Portable(dof, inputs, facts["width"], facts["depth_edges"], facts["layout"], size)
     check_format(model, os.fspath(path))
@@ -226,8 +226,8 @@ def _check_interface(model: onnx.ModelProto, portable: Portable) -> int:
     batch, items, frame = ("B", ITEMS, ("H", "W")) if portable.size is None else (1, 1, portable.size)
     single, colours = (items, 1, *frame), (batch, channels, *frame)
     inputs = INPUTS[portable.inputs]
-    lens_inputs = ((items,),) * (len(inputs) - 2)
-    expected = [*zip(inputs, (colours, single, *lens_inputs), strict=True), (OUTPUT, colours)]
+    shapes = {"image": colours, **dict.fromkeys(LENS, (items,))}
+    expected = [*((name, shapes.get(name, single)) for name in inputs), (OUTPUT, colours)]
     actual = []
     for value in (*model.graph.input, *model.graph.output):
         kind = value.type.tensor_type

@@ -259,6 +259,14 @@ def _background(lamps: float, check: bool) -> Scene:
     return scene
 
 
+def _matted(lamps: float, behind: bool, check: bool = True) -> Scene:
+    scene = _background(lamps, check) if behind else made("planes", 70, 90, 9.0, items=2, lamps=lamps, check=check)
+    edges = functional.avg_pool2d(scene.coc_px, 3, 1, 1)
+    ends = edges.amin((2, 3), keepdim=True), edges.amax((2, 3), keepdim=True)
+    scene.options["matte"] = ((ends[1] - edges) / (ends[1] - ends[0])).roll(1, -1) ** 2
+    return scene
+
+
 def _planned(reach_px: float) -> Scene:
     plan = Plan.for_scene(made("smooth", 50, 50, reach_px).coc_px, 1 / 255, adapt=False)
     return made("planes", 60, 75, 9.0, items=3, lamps=300.0, plan=plan)
@@ -270,6 +278,9 @@ SCENES: dict[str, Callable[[], Scene]] = {
        for size in ((1, 1), (1, 7), (9, 1), (2, 3), (16, 16), (17, 33), (64, 5))},
     **{f"background, lamps {lamps:g}, check {check}": functools.partial(_background, lamps, check)
        for lamps in (1.0, 50.0) for check in (True, False)},
+    **{f"matte, lamps {lamps:g}, background {behind}": functools.partial(_matted, lamps, behind)
+       for lamps in (1.0, 50.0) for behind in (True, False)},
+    "matte with holes": functools.partial(_matted, 1.0, True, False),
     **{f"the plan of {reach:g} px": functools.partial(_planned, reach) for reach in (2.3, 31.0)},
     **{f"few coarse layers, {ends}, {occlusion}": functools.partial(_few_coarse, *ends, occlusion=occlusion)
        for ends in ((-9.0, 11.0), (-24.0, 30.0)) for occlusion in (True, False)},

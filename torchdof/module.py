@@ -75,6 +75,7 @@ class DepthOfField(nn.Module):
         background: Tensor | None = None,
         background_depth: Tensor | None = None,
         attention: Attention | None = None,
+        matte: Tensor | None = None,
     ) -> Tensor:
         """Render a batch of images.
 
@@ -97,9 +98,13 @@ class DepthOfField(nn.Module):
                 are replaced by it.
             attention: Where the viewer looks: ``(x, y, radius)`` in pixels, or a map ``[B, 1, H, W]`` in [0, 1]. There
                 the tolerance applies; elsewhere that of ``"draft"``.
+            matte: Coverage of each pixel by a subject, ``[B, 1, H, W]`` or ``[1, 1, H, W]`` in [0, 1], such as the
+                mask of a person. Where its edges are within a few pixels of an edge of the depth, it decides which
+                surface a pixel shows and how much of it; elsewhere it changes nothing. The subject need not be the
+                nearest surface.
 
         Returns:
-            The image's shape and dtype. Differentiable with respect to image, depth, focus and f-number.
+            The image's shape and dtype. Differentiable with respect to image, depth, focus, f-number and matte.
             While gradients with respect to the circle of confusion are recorded, the layers are fixed instead of
             following the scene, so that the picture is a continuous, piecewise linear function of it.
 
@@ -109,20 +114,21 @@ class DepthOfField(nn.Module):
         refuse_old_compiler()
         options, axes = self.options, leading_axes(image)
         lens = (numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number))
-        image, depth, background, background_depth, attention = flattened(
+        image, depth, background, background_depth, attention, matte = flattened(
             axes,
             image=image,
             depth=depth,
             background=background,
             background_depth=background_depth,
             attention=attention,
+            matte=matte,
         )
         depth, channels = self._sized(image, depth), options.table.channels
         validation.scene(image, "depth", depth, background, background_depth, channels=channels, values=options.check)
         coc, behind = self._coc(depth, image, *lens, options.check), None
         if background is not None and background_depth is not None:
             behind = (background, self._coc(background_depth, image, *lens, options.check))
-        return restored(axes, render(image, coc, options, plan, behind, attention))
+        return restored(axes, render(image, coc, options, plan, behind, attention, matte=matte))
 
     def layers(
         self,
@@ -179,7 +185,7 @@ class DepthOfField(nn.Module):
     def coc_px(
         self, image: Tensor, depth: Tensor, focus_m: Number | None = None, f_number: Number | None = None
     ) -> Tensor:
-        """Signed circle of confusion that :meth:`forward` uses for the same arguments: ``[B, 1, H, W]``, pixels.
+        """Signed circle of confusion that :meth:`forward` uses without a matte: ``[B, 1, H, W]``, pixels.
 
         For one image it is ``[1, H, W]``, for clips ``[B, T, 1, H, W]``.
 
@@ -298,6 +304,7 @@ def depth_of_field(
     f_number: Number | None = None,
     plan: Plan | None = None,
     attention: Attention | None = None,
+    matte: Tensor | None = None,
     **options: Unpack[OptionArguments],
 ) -> Tensor:
     """Functional form of :class:`DepthOfField`, whose arguments and those of :meth:`DepthOfField.forward` it takes.
@@ -311,6 +318,7 @@ def depth_of_field(
         f_number: Overrides the camera's f-number.
         plan: Layers to render with; None plans for this image.
         attention: Where the viewer looks.
+        matte: Coverage by a subject, as in :meth:`DepthOfField.forward`.
         **options: As in :class:`torchdof.options.Options`.
 
     Returns:
@@ -325,7 +333,9 @@ def depth_of_field(
         torch.Size([1, 3, 8, 12])
     """
     refuse_old_compiler()
-    return DepthOfField(camera, table, **options)(image, depth, focus_m, f_number, plan, attention=attention)
+    return DepthOfField(camera, table, **options)(
+        image, depth, focus_m, f_number, plan, attention=attention, matte=matte
+    )
 
 
 @spells_options
@@ -338,6 +348,7 @@ def blur_by_coc(
     background: Tensor | None = None,
     background_coc_px: Tensor | None = None,
     attention: Attention | None = None,
+    matte: Tensor | None = None,
     **options: Unpack[OptionArguments],
 ) -> Tensor:
     """Depth of field from a map of the circle of confusion.
@@ -351,6 +362,7 @@ def blur_by_coc(
         background: As in :meth:`DepthOfField.forward`.
         background_coc_px: Its signed radius in pixels.
         attention: As in :meth:`DepthOfField.forward`.
+        matte: As in :meth:`DepthOfField.forward`.
         **options: As in :class:`torchdof.options.Options`.
 
     Returns:
@@ -366,13 +378,19 @@ def blur_by_coc(
     """
     refuse_old_compiler()
     axes, hidden_coc = leading_axes(image), background_coc_px
-    image, coc_px, background, hidden_coc, attention = flattened(
-        axes, image=image, coc_px=coc_px, background=background, background_coc_px=hidden_coc, attention=attention
+    image, coc_px, background, hidden_coc, attention, matte = flattened(
+        axes,
+        image=image,
+        coc_px=coc_px,
+        background=background,
+        background_coc_px=hidden_coc,
+        attention=attention,
+        matte=matte,
     )
     given = Options(table, **options)  # type: ignore[arg-type]
     validation.scene(image, "coc_px", coc_px, background, hidden_coc, channels=given.table.channels, values=given.check)
     behind = None if background is None or hidden_coc is None else (background, hidden_coc)
-    return restored(axes, render(image, coc_px, given, plan, behind, attention))
+    return restored(axes, render(image, coc_px, given, plan, behind, attention, matte=matte))
 
 
 def render(
@@ -383,8 +401,9 @@ def render(
     behind: tuple[Tensor, Tensor] | None = None,
     attention: Attention | None = None,
     ops: Ops = EAGER,
+    matte: Tensor | None = None,
 ) -> Tensor:
-    """Call the pipeline with a checked scene, if an engine renders these arguments; all functions above end here.
+    """Call the pipeline with a checked scene and a matte, if an engine renders them; all functions above end here.
 
     Arguments as in :func:`blur_by_coc`, with four axes; ``behind`` is the background and its circle of confusion, and
     ``ops`` are the operations (an exported graph has its own).
@@ -392,13 +411,18 @@ def render(
     if plan is not None and not isinstance(plan, Plan):
         got = validation.show(plan)
         raise ValueError(f"plan must be a Plan from DepthOfField.plan(image, depth), or left out, got {got}")
-    routes.refuse(options, background=behind is not None, attention=attention is not None, plan=plan is not None)
+    has_matte = matte is not None
+    has_plan, has_background = plan is not None, behind is not None
+    routes.refuse(options, background=has_background, attention=attention is not None, plan=has_plan, matte=has_matte)
+    if matte is not None:
+        validation.coverage(image, matte, values=options.check)
 
-    def rendered(image: Tensor, coc_px: Tensor, *hidden: Tensor) -> Tensor:
-        behind = (hidden[0], hidden[1]) if hidden else None
+    def rendered(image: Tensor, coc_px: Tensor, *others: Tensor) -> Tensor:
+        hidden = others[has_matte:]
+        behind, matte = (hidden[0], hidden[1]) if hidden else None, others[0] if has_matte else None
         with without_autocast(image.device.type):  # it would convolve in half precision
-            return pipeline.blur(image, coc_px, plan, options, behind, attention, ops)
+            return pipeline.blur(image, coc_px, plan, options, behind, attention, ops, matte)
 
-    tensors = (image, coc_px, *(behind or ()))
+    tensors = (image, coc_px, *(() if matte is None else (matte,)), *(behind or ()))
     has_others = options.table.is_differentiated or isinstance(attention, Tensor)
     return rendered(*tensors) if has_others else on_one_thread(rendered, *tensors)

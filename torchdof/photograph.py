@@ -54,8 +54,9 @@ def photo(
         image: A file, or ``[1, C, H, W]`` in linear light with 1 or 3 channels, or with alpha at the end.
         depth: A file, or the numbers of a map, ``[1, 1, h, w]`` of any kind; None for an EXR with Z or a portrait.
         **options: Those of the command, with underscores: ``focus_m=2.0``, ``focus_at=(320, 200)``, ``f_number=1.8``,
-            ``blur=0.03`` (the largest blur radius over the width), ``equivalent=(85, 1.4)``, ``depth_kind="z"``,
-            ``depth_scale=0.001``, ``near_m=1.0``, ``table="sato_j15"``, ``tolerance="draft"``, ``device="cuda"``, ...
+            ``blur=0.03`` (the largest blur radius over the width), ``equivalent=(85, 1.4)``, ``matte="mask.png"`` (or
+            coverage ``[1, 1, H, W]``), ``depth_kind="z"``, ``depth_scale=0.001``, ``near_m=1.0``, ``table="sato_j15"``,
+            ``tolerance="draft"``, ``device="cuda"``, ...
 
     Returns:
         The picture, and the depth, blur, camera and assumptions with which it was rendered.

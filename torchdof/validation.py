@@ -286,6 +286,15 @@ def scene(
             finite(name, light)
 
 
+def coverage(image: Tensor, matte: Tensor, values: bool) -> None:
+    """Refuse a matte that does not fit an image, or, with ``values``, whose numbers are not in [0, 1]."""
+    image_and_map(image, "matte", matte, "of coverage in [0, 1]")
+    if values and not holds(matte, lambda low, high: 0.0 <= low <= high <= 1.0):
+        low, high = ends(matte)
+        remedy = "divide by 255 or 65535 if it comes from a file" if high > 1 else "clamp it, and fill in NaN"
+        raise ValueError(f"matte must be coverage in [0, 1], got {low:g} to {high:g}; {remedy}")
+
+
 def stretch(image: Any, depth: Any) -> float | None:
     """Relative stretch of a depth map along one axis to the aspect ratio of an image, 0 for less than a pixel.
 

@@ -794,3 +794,15 @@ def test_numbers_are_read_as_a_person_writes_them(run: Run) -> None:
     run("render image.exr depth.npy -o a.exr --blur 5%")
     run("render image.exr depth.npy -o b.exr --blur 5")
     assert torch.equal(pixels("a.exr"), pixels("b.exr"))
+
+
+def test_a_strict_sequence_refuses_numbers_that_look_relative_unless_they_are_stated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Run
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for n in (1, 2):
+        write_image(f"s.{n}.exr", Picture(torch.rand(1, 3, 32, 48)))
+        write_image(f"d.{n}.exr", Picture((torch.rand(1, 1, 32, 48) * 20 + 0.5).sort(2).values, ("Y",)))
+    line = "render s.#.exr d.#.exr -o o.#.exr --focus-m 5 --strict"
+    assert "its numbers grow downwards" in run(line, code=2)
+    assert "o.2.exr" in run(f"{line} --depth-kind z")

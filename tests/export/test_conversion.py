@@ -3,7 +3,9 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import onnx_ir
+import onnxruntime
 import pytest
 import torch
 
@@ -11,6 +13,7 @@ import torchdof
 from torchdof.export import conversion, to_onnx
 from torchdof.export.graph import Portable, trace
 from torchdof.export.rays import kernels_of
+from torchdof.export.verification import session
 
 CAMERA = torchdof.Camera.from_fov(50.0, 0.05, 2.0)
 SIMPLE: dict[str, Any] = {"occlusion": False, "tolerance": "draft", "max_coc_px": 1.0, "check": False}
@@ -113,3 +116,29 @@ def test_an_exporter_that_is_too_old_is_refused_at_once(monkeypatch: pytest.Monk
     with pytest.raises(ValueError, match=r"needs PyTorch 2\.13 or newer to write ONNX files, this is "):
         to_onnx(torchdof.DepthOfField(torchdof.Camera()), tmp_path / "dof.onnx")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_onnxruntimes_optimised_copy_of_a_file_with_tiles_can_be_loaded(layered: Any, tmp_path: Path) -> None:
+    """It names new values after nodes, so that those of subgraphs need names."""
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4
+    options.optimized_model_filepath = str(tmp_path / "optimised.onnx")
+    onnxruntime.InferenceSession(layered.path, options, providers=["CPUExecutionProvider"])
+    copy = onnxruntime.InferenceSession(tmp_path / "optimised.onnx", providers=["CPUExecutionProvider"])
+    feed = {"image": torch.rand(1, 3, 20, 30).numpy(), "depth": torch.linspace(1, 9, 600).reshape(1, 1, 20, 30).numpy()}
+    feed |= {"focus_m": np.float32([2.0]), "f_number": np.float32([1.0])}
+    np.testing.assert_allclose(copy.run(None, feed)[0], layered.runner.run(None, feed)[0], rtol=0, atol=1e-6)
+
+
+def test_a_file_takes_a_matte_and_zeros_change_nothing(tmp_path: Path) -> None:
+    """``to_onnx`` compares the file with the module on every case."""
+    dof = torchdof.DepthOfField(CAMERA, max_coc_px=1.5, tolerance=64 / 255, depth_edges="as given")
+    report = to_onnx(dof, tmp_path / "matte.onnx", inputs="coc_px+matte", layout="whole")
+    assert report.passed
+    image, coc = torch.rand(1, 3, 24, 32), torch.where(torch.arange(32) < 16, -1.2, 1.2).expand(1, 1, 24, 32)
+    feed = {"image": image.numpy(), "coc_px": coc.numpy().astype(np.float32)}
+    run = session(tmp_path / "matte.onnx").run
+    plain = run(None, {**feed, "matte": np.zeros((1, 1, 24, 32), np.float32)})[0]
+    shifted = run(None, {**feed, "matte": (coc < 0).roll(2, -1).float().numpy()})[0]
+    np.testing.assert_allclose(Portable(dof, "coc_px", layout="whole")(image, coc).numpy(), plain, rtol=0, atol=1e-5)
+    assert float(np.abs(shifted - plain).max()) > 0.01

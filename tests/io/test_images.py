@@ -10,9 +10,10 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import torch
+from PIL import Image
 
 from tests.files import spec_with, store, store_parts
-from torchdof.io.colour import stated_transfer
+from torchdof.io.colour import stated_primaries, stated_transfer
 from torchdof.io.decode import read_parts
 from torchdof.io.images import Picture, read_image, read_values, write_image
 
@@ -615,3 +616,31 @@ def test_array_of_an_npz_is_chosen_by_name(tmp_path: Path) -> None:
 def test_equal_channels_are_one_map(tmp_path: Path) -> None:
     path = store(tmp_path / "x.png", np.repeat(np.full((2, 2, 1), 9, np.uint8), 3, axis=2), "uint8")
     assert read_values(path).unique().tolist() == [9.0]
+
+
+def test_primaries_of_a_png_are_converted_unless_it_is_srgb(tmp_path: Path) -> None:
+    """Chunk cHRM: white, red, green, blue; Display P3's red is outside of sRGB."""
+    path = tmp_path / "p3.png"
+    Image.new("RGB", (4, 4), (255, 0, 0)).save(path)  # without sRGB or gAMA
+    plain = path.read_bytes()
+    body = b"cHRM" + struct.pack(">8I", 31270, 32900, 68000, 32000, 26500, 69000, 15000, 6000)
+    chunk = struct.pack(">I", 32) + body + struct.pack(">I", zlib.crc32(body))
+    path.write_bytes(plain[:33] + chunk + plain[33:])
+    stated = read_image(path)
+    assert stated_primaries(stated.metadata) == (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329)
+    write_image(tmp_path / "copy.exr", stated)
+    assert stated_primaries(read_image(tmp_path / "copy.exr").metadata) is not None
+    write_image(tmp_path / "float.pfm", dataclasses.replace(stated, sample="float", transfer="linear"))
+    converted = read_image(tmp_path / "float.pfm").pixels[0, :, 0, 0]
+    torch.testing.assert_close(converted, torch.tensor([1.2249, -0.0421, -0.0196]), rtol=0, atol=1e-3)
+    body = b"sRGB\0"
+    srgb = struct.pack(">I", 1) + body + struct.pack(">I", zlib.crc32(body))
+    path.write_bytes(plain[:33] + chunk + srgb + plain[33:])
+    assert stated_primaries(read_image(path).metadata) is None
+
+
+def test_a_pfm_of_half_floats_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "half.pfm"
+    path.write_bytes(b"Pf\n4 3\n-1.0\n" + np.ones(12, "<f2").tobytes())
+    with pytest.raises(OSError, match="half.pfm: holds 2 bytes a number, as of half floats; .* write float32"):
+        read_image(path)

@@ -40,6 +40,7 @@ def assert_like_alone(images: Tensor, cocs: Tensor, **options: Any) -> None:
 OPTIONS: list[dict[str, Any]] = [
     *({"table": table, "occlusion": occlusion} for table in TABLES for occlusion in (True, False)),
     {"background": torch.full((5, 3, *SIZE), 0.3), "background_coc_px": torch.full((5, 1, *SIZE), 31.0)},
+    {"matte": (torch.rand(5, 1, *SIZE, generator=torch.Generator().manual_seed(7)) * 1.5).clamp(max=1.0)},
     {"check": False},
     {"tolerance": "draft", "normalize": False, "occlusion": False},
     {"depth_edges": "repair"},

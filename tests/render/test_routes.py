@@ -48,6 +48,7 @@ CALLS: dict[str, Call] = {
     "image": blur_by_coc,
     "image without occlusion": lambda image, coc: blur_by_coc(image, coc, occlusion=False),
     "a known background": known_background,
+    "a matte": lambda image, coc: blur_by_coc(image, coc, matte=(coc.detach() < 1.0).to(coc.dtype)),
     "`attention`": lambda image, coc: blur_by_coc(image, coc, attention=(4.0, 5.0, 3.0)),
     "stack of up to 3 layers (`DepthOfField.layers`)": functools.partial(layers, count=3),
     "stack of more layers": functools.partial(layers, count=4),

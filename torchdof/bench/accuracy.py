@@ -62,10 +62,14 @@ def compare(truth: Path, out: Path, views: Sequence[int], degraded: bool, peers:
     panels: dict[str, list[Tensor]] = {}
     cases = [(scene, kind) for scene in scenes for kind in (KINDS if degraded else ["exact"])]
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=len(cases) * len(by_name))
+        matted = sum(scene.matte is not None for scene, _ in cases)
+        task = bar.add_task("", total=len(cases) * len(by_name) + matted)
         for scene, kind in cases:
             coc_px, pictures = scene.camera.coc_px(degrade(scene.depth, kind), scene.image.shape[-1]), {}
-            for name, blur in by_name.items():
+            of_scene = dict(by_name)
+            if scene.matte is not None:
+                of_scene["torchdof, matte"] = functools.partial(blur_by_coc, matte=scene.matte)
+            for name, blur in of_scene.items():
                 bar.update(task, description=f"{scene.name}: {name}")
                 with torch.inference_mode():
                     picture, row = measure(blur, BenchScene(scene.name, scene.image, coc_px), again=False)
@@ -77,7 +81,8 @@ def compare(truth: Path, out: Path, views: Sequence[int], degraded: bool, peers:
                 pictures[name] = picture
                 bar.advance(task)
             window = _worst(pictures["torchdof"], scene, tile_px)
-            for name, picture in {"sharp": scene.image, "truth": scene.truth, **pictures}.items():
+            shown = {name: picture for name, picture in pictures.items() if name in by_name}
+            for name, picture in {"sharp": scene.image, "truth": scene.truth, **shown}.items():
                 panels.setdefault(name, []).append(picture[window][:, :3].expand(-1, 3, -1, -1))
     means = summary(rows, ["depth", "renderer"], statistics.fmean)
     remark = "psnr_inner: without the border reached by light from outside the frame."

@@ -21,8 +21,10 @@ def _size(text: str) -> tuple[int, int]:
 class _Graph(Group):
     """Graph."""
 
-    inputs: Literal["depth", "coc_px"] = option(
-        "Depth in metres, with focus and f-number as further inputs; or the signed blur radius in pixels.", "depth"
+    inputs: Literal["depth", "coc_px", "depth+matte", "coc_px+matte"] = option(
+        "Depth in metres, with focus and f-number as further inputs; or the signed blur radius in pixels. With +matte "
+        "there is an input for the coverage by a subject.",
+        "depth",
     )
     channels: int = option("Channels of the image.", 3)
     width: int | None = option("Image width whose kernels the file holds, for a table in millimetres or fractions.")

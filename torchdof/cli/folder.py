@@ -79,6 +79,7 @@ def render_folder(command: "Render", options: dict[str, object]) -> None:
         (out.is_file() or out.suffix.lower() in IMAGE_SUFFIXES, f"{out}: with a folder of images, OUT is a folder"),
         (out.resolve() in (images.resolve(), depths and depths.resolve()), f"{out}: write to another folder"),
         (command.sheet, "--sheet is of one picture; leave it out with a folder"),
+        (command.has_matte_file, "--matte is of one picture; leave it out with a folder, where portraits have theirs"),
         (command.frames or command.steady, "--frames and --steady are for sequences, such as shot.####.exr"),
         (len(command.focus_m or []) > 1, "--focus-m has keyframes; a folder takes one distance in metres"),
     )

@@ -22,6 +22,7 @@ from ..io.colour import stated_primaries
 from ..io.estimates import Estimate, estimate_of
 from ..io.highlights import expand_highlights
 from ..io.images import Picture, read_image, read_map, write_image
+from ..io.matte import matte_of_size, read_matte
 from ..io.sheet import shrunk, write_sheet
 from ..module import blur_by_coc
 from ..optics.aperture import Aperture
@@ -63,6 +64,7 @@ class Frame:
     remarks: list[str]  # changes of the depth, and assumptions about it, that no option states
     guess: str  # message about the guessed kind of depth, or empty
     fov_x_deg: float | None = None  # horizontal field of view that the depth file states
+    matte: Tensor | None = None  # [1, 1, H, W], coverage by a subject
 
     def mistakes(self, camera: Camera) -> list[Mistake]:
         """Likely mistakes in the depth, given the camera."""
@@ -194,7 +196,18 @@ class Renderer:
         """Reads a frame as :func:`read_frame`, with the transfer curve and layers of the options."""
         names = ("transfer", "layer", "keep_layers")
         encoding: Any = {name: getattr(self.command, name) for name in names}
-        return read_frame(image, depth, self.command, place=place, **encoding)
+        frame = read_frame(image, depth, self.command, place=place, **encoding)
+        return dataclasses.replace(frame, matte=self._matte(frame.picture))
+
+    def _matte(self, picture: Picture) -> Tensor | None:
+        """The coverage by a subject that the options name, or that the picture brings along."""
+        given: Any = self.command.matte
+        if given is None:
+            return None if self.command.no_occlusion else picture.matte
+        if isinstance(given, Tensor):
+            one_channel("matte", given)
+            return matte_of_size(given.detach().cpu().float(), picture.pixels.shape[-2:])
+        return read_matte(given, picture.pixels.shape[-2:]) if self.command.has_matte_file else None
 
     def render(self, frame: Frame, out: Path, number: int) -> Callable[[], None]:
         """Renders a frame of a number; returns the function that writes it to ``out``."""
@@ -224,7 +237,9 @@ class Renderer:
                 attention = (attention[0] - frame.area.x, attention[1] - frame.area.y, attention[2])
             table = _with_alpha(self.table) if picture.has_alpha else self.table
             with torch.no_grad():
-                pixels = blur_by_coc(pixels, coc_px, table=table, attention=attention, **command.arguments())
+                given: Any = {"table": table, "attention": attention, **command.arguments()}
+                matte = None if frame.matte is None else frame.matte.to(self.device)
+                pixels = blur_by_coc(pixels, coc_px, matte=matte, **given)
         picture = dataclasses.replace(picture, pixels=pixels)
         return dataclasses.replace(frame, remarks=remarks), picture, coc_px, camera
 
@@ -250,6 +265,8 @@ class Renderer:
         has_exif, suffix = any(name.startswith("Exif:") for name in frame.picture.metadata), out.suffix.lower()
         if has_exif and suffix in _WITHOUT_EXIF:
             note("exif", f"{out}: EXIF data are lost in a {suffix} file; write .jpg, .png or .tif to keep them")
+        if frame.picture.matte is not None and frame.matte is not None and command.matte is None:
+            note("matte", f"{out}: the own matte of the portrait decides where the subject ends (else --matte)")
         if frame.picture.other_layers and suffix == ".exr" and not command.keep_layers:
             layers = ", ".join(frame.picture.other_layers)
             note("layers", f"{out}: is without the other layers of the image: {layers} (--keep-layers)")

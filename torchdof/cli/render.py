@@ -42,6 +42,11 @@ class _Effects(Group):
         metavar="STOPS",
         type=click.FloatRange(min=0),
     )
+    matte: Path | None = option(
+        "A subject's mask, in which white is the subject: decides where hair and other soft edges end. Default: that "
+        "of a phone's portrait; none leaves it out.",
+        metavar="FILE|none",
+    )
     show_focus: bool = option("Don't blur: tint the grey image: near orange, in focus green, far blue.", False)
     device: str = option("auto, cpu, cuda, cuda:1, ...", "auto")
 
@@ -100,9 +105,19 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
     depth: Path | None = argument("Its depth; not needed if IMAGE has a Z channel or is a portrait.", "[DEPTH]", None)
     out: Path = option("File to write, out.####.exr, or a folder.", ..., names=("--out", "-o"), metavar="OUT")
 
+    @property
+    def has_matte_file(self) -> bool:
+        """Whether a file with a matte is named."""
+        return self.matte is not None and str(self.matte) != "none"
+
+    def files(self) -> list[Path]:
+        """The files besides image and depth."""
+        return super().files() + [path for path in [self.matte] if path and self.has_matte_file]
+
     def run(self) -> None:
         """Renders one image, the frames of a sequence, a focus pull in a still image, or a folder."""
-        parameters = click.get_current_context().command.params
+        context = click.get_current_context()
+        parameters = context.command.params
         options = {p.opts[0]: getattr(self, p.name) for p in parameters if p.name and p.name not in _NOT_OF_FRAMES}
         options |= {"files": self.files(), "torchdof": importlib.metadata.version("torchdof")}
         both = self.keep_layers and self.show_focus
@@ -122,6 +137,7 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
             (self.keep_layers and not are_exr, "--keep-layers is for an EXR that is written to an EXR; leave it out"),
             (not is_single and not numbered, no_number),
             (self.sheet and not is_single, "--sheet is of one picture; leave it out where there are more"),
+            (self.has_matte_file and images, "--matte is of one picture; leave it out with a sequence"),
             (of_sequences, f"{self.image}: is a single image; for a sequence write it as shot.####.exr"),
             (images and self.blur, "--blur would open the lens anew in each frame of a sequence; give --f-number"),
             (self.steady and self.depth_kind == "coc", "--steady filters depth in metres; --depth-kind coc has none"),
@@ -173,8 +189,11 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         from ..depth.steady import SteadyFrames
         from .frame import Renderer
 
-        is_assumed = images is not None and self.depth_kind == "auto"  # a guess could differ from frame to frame
-        of_frames = dataclasses.replace(self, depth_kind="z") if is_assumed else self
+        is_auto = images is not None and self.depth_kind == "auto"  # a guess could differ from frame to frame
+        of_frames = dataclasses.replace(self, depth_kind="z") if is_auto else self
+        is_stated = context.get_parameter_source("depth_kind") is not click.core.ParameterSource.DEFAULT
+        is_implied = self.strict and self.depth_kind == "z" and self.depth_scale is None and not is_stated
+        is_assumed = is_auto or (images is not None and is_implied)
         renderer = Renderer(of_frames, images is None, is_assumed)
         renderer.has_table = is_single
         if self.resume and len(existing) > len(done):

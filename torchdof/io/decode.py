@@ -6,6 +6,7 @@ import itertools
 import mmap
 import os
 import re
+import struct
 import tempfile
 import zipfile
 from collections.abc import Iterator
@@ -109,6 +110,12 @@ def _parts(name: str) -> Iterator[Part]:
                 names = tuple(("Y", "YA", "RGB", "RGBA")[len(names) - 1]) if len(names) <= 4 else names
                 orientation = spec.get_int_attribute("Orientation", 1)
                 values, metadata = upright(values, metadata)
+            if (
+                source.format_name() == "png"
+                and (primaries := _png_primaries(Path(name)))
+                and "ICCProfile" not in metadata
+            ):
+                metadata |= {"chromaticities": ("float[8]", primaries)} if "CICP" not in metadata else {}
             yield Part(
                 label=spec.get_string_attribute("name"),
                 names=names,
@@ -123,6 +130,21 @@ def _parts(name: str) -> Iterator[Part]:
             )
     finally:
         source.close()
+
+
+def _png_primaries(path: Path) -> tuple[float, ...] | None:
+    """Chromaticities in the cHRM chunk of a PNG, in the order of EXR files; None without one or beside sRGB."""
+    found = None
+    with path.open("rb") as file:
+        file.seek(8)
+        while len(head := file.read(8)) == 8 and head[4:] not in (b"IDAT", b"sRGB"):
+            size = int.from_bytes(head[:4], "big")
+            if head[4:] == b"cHRM" and size == 32:
+                numbers = [number / 100_000 for number in struct.unpack(">8I", file.read(32))]
+                found = (*numbers[2:], *numbers[:2])
+                size = 0
+            file.seek(size + 4, os.SEEK_CUR)
+    return None if head[4:] == b"sRGB" else found
 
 
 def is_complete(path: Path) -> bool:
@@ -199,6 +221,8 @@ def _read_pfm(path: Path) -> Part:
     elif len(data) > byte_count + 1 and len(data) - data.count(b"\r\n") == byte_count + 1:
         data = data.replace(b"\r\n", b"\n")  # all of it was written in the text mode of Windows
     data = data[1:]  # without the white space that ends the header
+    if len(data) == byte_count // 2:
+        raise OSError("holds 2 bytes a number, as of half floats; a PFM file holds 4: write float32, or an EXR file")
     if len(data) != byte_count:
         problem = "is cut short" if len(data) < byte_count else "is longer than its header says"
         raise OSError(f"{problem} ({len(data)} of {byte_count} bytes of pixels)")
@@ -234,11 +258,11 @@ def _unscaled(path: Path, part: Part) -> Part:
     return dataclasses.replace(part, values=levels)
 
 
-def read_array(path: Path, key: str | None, place: tuple[int, int] | None = None) -> np.ndarray:
+def read_array(path: Path, key: str | None, place: tuple[int, int] | None = None, kinds: str = "fiu") -> np.ndarray:
     """The array ``[H, W]`` of an ``.npy`` file, or of an ``.npz`` file: its only array, depth, or ``key``.
 
-    ``place`` is the index of an image in a sequence, and the number of images, for an array ``[N, H, W]``. Refuses
-    pickles.
+    ``place`` is the index of an image in a sequence, and the number of images, for an array ``[N, H, W]``. ``kinds``
+    are letters of NumPy for the types that are accepted. Refuses pickles.
     """
     try:
         if path.suffix.lower() == ".npz":
@@ -272,7 +296,7 @@ def read_array(path: Path, key: str | None, place: tuple[int, int] | None = None
             remedy = "give a sequence of as many images, such as shot.####.png"
             raise ValueError(f"holds {len(array)} maps (an array {list(shape)}){images}; {remedy}")
         array = array[place[0]]
-    if array.ndim != 2 or array.dtype.kind not in "fiu" or array.size == 0:
+    if array.ndim != 2 or array.dtype.kind not in kinds or array.size == 0:
         raise ValueError(f"expected an array [H, W] of numbers, got {list(shape)} of {array.dtype}")
     check_size(array.shape[1], array.shape[0], array.dtype.itemsize + 4)
     if array.dtype.kind == "f":

@@ -42,7 +42,7 @@ _ENGINES = ("auto", "native", "gpu", "torch")  # values of TORCHDOF_ENGINE
 _SMALL_FRAME = 2**16  # pixels; up to this size the main thread renders itself, which saves 0.1 ms
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
 _of_thread = threading.local()  # count: threads for calls of this thread; is_off: they use the plain engine
-_REVISION = 15  # of ``src/api.h``
+_REVISION = 16  # of ``src/api.h``
 
 Rules = Sequence[tuple[int, float, float, float]]
 
@@ -80,7 +80,7 @@ _STRUCTURES = {
     "field_mask": "data values boxes, real radius, int colours rows columns",
     "spots": "int count colours, data* templates, int* cells index, double* part finer reach fade, int* flipped half, "
     "double squeeze, int round even",
-    "scene": "int height width channels kind surfaces, data* light coc weight, int occlusion normalize, "
+    "scene": "int height width channels kind surfaces, data* light coc weight, data covered, int occlusion normalize, "
     f"int masked highlights, real crisp_px reach, {_LAYERS}, field_mask* field_masks, int distances, real squeeze, "
     "int threads, int* cancelled",
     "map": "int height width channels, data light nearness, int of_coc, data steps, real step, int automatic threads, "
@@ -210,6 +210,7 @@ def render(
     field_masks: Sequence[KernelMask],
     ray_masks: Callable[[list[int]], Sequence[KernelMask]],
     squeeze: float,
+    covered: Tensor | None = None,
 ) -> Tensor:
     """Renders depth of field for one image: ``[C, H, W]``.
 
@@ -226,7 +227,7 @@ def render(
     """
     cancelled, (channels, height, width) = ctypes.c_int32(0), surfaces[0][0].shape
     scene = _TYPES["scene"](
-        *(height, width, channels, get_args(Kind).index(kind), len(surfaces), *_maps(surfaces)),
+        *(height, width, channels, get_args(Kind).index(kind), len(surfaces), *_maps(surfaces), covered),
         *(occlusion, normalize, masked, highlights, crisp_px, reach, *_of_layers(nodes, layers)),
         *(_field_masks(field_masks), field_masks[0][0].shape[1] if field_masks else 0, squeeze),
         *(_threads(), ctypes.pointer(cancelled)),

@@ -6,7 +6,8 @@ A folder holds ``sharp.exr`` (all in focus, linear light), ``depth.exr`` (metres
     {"name": "planes", "F_px": 1055.03,
      "truths": [{"file": "truth_0.exr", "aperture_radius_m": 0.02, "focus_distance_m": 8.0, "margin_px": 20}]}
 
-``F_px`` is the image distance in pixels, also if the files show only a part of the frame. ``margin_px`` is needed only
+``matte.png`` or ``matte.exr``, if there is one, holds the coverage by a subject. ``F_px`` is the image distance in
+pixels, also if the files show only a part of the frame. ``margin_px`` is needed only
 where the largest circle of confusion lies outside the files.
 """
 
@@ -43,6 +44,7 @@ class Scene:
         camera: The setting of the lens.
         truth: ``[1, C, H, W]``, linear light.
         margin_px: Width of the border reached by light from outside the frame: the largest circle of confusion.
+        matte: Coverage by a subject, ``[1, 1, H, W]``, or None.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Scene:
     camera: Camera
     truth: Tensor
     margin_px: int = 0
+    matte: Tensor | None = None
 
     @property
     def coc_px(self) -> Tensor:
@@ -73,6 +76,7 @@ def read_scenes(folder: str | os.PathLike[str]) -> Iterator[Scene]:
         ValueError: If a file is invalid; the message names it.
     """
     from ..io.images import read_image, read_values
+    from ..io.matte import read_matte
 
     metas = sorted(Path(folder).rglob("meta.json"))
     if not metas:
@@ -87,6 +91,8 @@ def read_scenes(folder: str | os.PathLike[str]) -> Iterator[Scene]:
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{meta}: must describe a scene as torchdof.reference.scenes says; {error!r}") from None
         image, depth = read_image(meta.with_name("sharp.exr")).pixels, read_values(meta.with_name("depth.exr"))
+        mattes = [path for path in map(meta.with_name, ("matte.png", "matte.exr")) if path.is_file()]
+        matte = read_matte(mattes[0], image.shape[-2:]) if mattes else None
         for index, (entry, lens) in enumerate(zip(truths, lenses, strict=True)):
             truth = read_image(meta.with_name(str(entry.get("file", f"truth_{index}.exr")))).pixels
             if truth.shape != image.shape:
@@ -94,7 +100,8 @@ def read_scenes(folder: str | os.PathLike[str]) -> Iterator[Scene]:
             name = f"{data.get('name', meta.parent.name)}/{entry.get('index', index)}"
             camera = camera_of(focal_px, image.shape[-1], *lens.values())
             largest_coc = math.ceil(float(camera.coc_px(depth, image.shape[-1]).abs().max()))
-            yield Scene(name, image, depth, camera, truth, max(largest_coc, int(entry.get("margin_px", 0))))
+            margin_px = max(largest_coc, int(entry.get("margin_px", 0)))
+            yield Scene(name, image, depth, camera, truth, margin_px, matte)
 
 
 def camera_of(focal_px: float, width: int, aperture_radius_m: float, focus_m: float) -> Camera:

@@ -31,6 +31,7 @@ def picture(
     behind_light: Tensor | None = None,
     behind_coc: Tensor | None = None,
     cover: Tensor | None = None,
+    covered: Tensor | None = None,
     lens_width: int | None = None,
 ) -> Tensor:
     """Render ``[B, C, H, W]`` item by item, if the compiled engine can (:func:`torchdof.render.routes.route`).
@@ -69,22 +70,24 @@ def picture(
         items = []
         for surfaces in zip(light, coc[:, :, 0].clamp(low, high), cover[:, :, 0], strict=True):
             items.append(render([*zip(*surfaces, strict=True), (nothing, farthest, None)], "stack"))
-    elif behind_light is not None and behind_coc is not None:
+        return torch.stack(items)
+    of_items = [None] * len(light) if covered is None else [*covered]
+    if behind_light is not None and behind_coc is not None:
         items = []
-        each = zip(light, coc[:, 0], behind_light, behind_coc[:, 0], strict=True)
-        for own, own_coc, other, other_coc in each:
+        each = zip(light, coc[:, 0], behind_light, behind_coc[:, 0], of_items, strict=True)
+        for own, own_coc, other, other_coc, known in each:
             scale = exposure.scale_of(own[None], other[None])[0]
             scaled = [(own * scale, own_coc, None), (other * scale, other_coc, None)]
-            items.append(render(scaled, "background") / scale)
+            items.append(render(scaled, "background", covered=known) / scale)
     else:
-        items = [_image(render, *item) for item in zip(light, coc[:, 0], strict=True)]
+        items = [_image(render, *item) for item in zip(light, coc[:, 0], of_items, strict=True)]
     return items[0][None] if len(items) == 1 else torch.stack(items)
 
 
-def _image(render: Callable[..., Tensor], light: Tensor, coc: Tensor) -> Tensor:
+def _image(render: Callable[..., Tensor], light: Tensor, coc: Tensor, covered: Tensor | None) -> Tensor:
     """Render one image, with very bright light scaled down."""
     try:
-        return render([(light, coc, None)], "image")
+        return render([(light, coc, None)], "image", covered=covered)
     except OverflowError:
         scale = exposure.scale_of(light[None])[0]
-        return render([(light * scale, coc, None)], "image") / scale
+        return render([(light * scale, coc, None)], "image", covered=covered) / scale

@@ -52,6 +52,7 @@ def surfaces_of_image(
     threshold: Tensor,
     levels: Sequence[int],
     ops: Ops = EAGER,
+    covered: Tensor | None = None,
 ) -> tuple[list[Surface], Tensor]:
     """Splits an image into each pixel's own surface and a second one, mixed or hidden; and the light behind both.
 
@@ -73,20 +74,22 @@ def surfaces_of_image(
         threshold: Light above which a pixel is a highlight, ``[B, 1, H, W]``; highlights are not filled in elsewhere.
         levels: Levels of the pyramid, at least 2, of all items or of each. The widest search is ``2 ** levels`` pixels.
         ops: Operations.
+        covered: Surfaces that a matte gives, as from :func:`torchdof.render.coverage.covered_by`.
 
     Returns:
         The surfaces, the second one with weight 0 where the pixel has one surface; and the light behind both at every
         :data:`BEHIND_STEP`-th pixel, ``[B, C, h, w]``, for an area slightly larger than the image.
     """
     if is_compiled():
-        maps = _operator(light, coc_px, list(levels), threshold, valid)
+        given = light.new_empty(0) if covered is None else covered
+        maps = _operator(light, coc_px, given, list(levels), threshold, valid)
     else:
-        maps = _surfaces_of_image(light, coc_px, levels, threshold, valid, ops)
+        maps = _surfaces_of_image(light, coc_px, covered, levels, threshold, valid, ops)
     own_light, own_weight, other_light, other_coc, other_weight, behind = maps
     return [Surface(own_light, coc_px, own_weight), Surface(other_light, other_coc, other_weight)], behind
 
 
-def _empty(light: Tensor, coc_px: Tensor, levels: Sequence[int], *others: Tensor | None) -> _Maps:
+def _empty(light: Tensor, coc_px: Tensor, _: Tensor, levels: Sequence[int], *others: Tensor | None) -> _Maps:
     colour, single = light.new_empty(light.shape), coc_px.new_empty(coc_px.shape)
     cells = (_continued(n, 2 ** max(levels)) // BEHIND_STEP for n in light.shape[-2:])
     behind = light.new_empty(*light.shape[:2], *cells)
@@ -94,15 +97,17 @@ def _empty(light: Tensor, coc_px: Tensor, levels: Sequence[int], *others: Tensor
 
 
 # The number of pixels to process depends on the data, which compiled graphs do not support.
-@one_operator("torchdof::surfaces", _empty, differentiable=2)
+@one_operator("torchdof::surfaces", _empty, differentiable=3)
 def _operator(
     light: Tensor,
     coc_px: Tensor,
+    covered: Tensor,
     levels: Sequence[int],
     threshold: Tensor,
     valid: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    maps = _surfaces_of_image(light, coc_px, levels, threshold, valid, EAGER)
+    given = covered if covered.numel() else None  # each argument with a gradient is a tensor
+    maps = _surfaces_of_image(light, coc_px, given, levels, threshold, valid, EAGER)
     own, own_weight, other, other_coc, other_weight, behind = (t.contiguous() for t in maps)
     return own, own_weight, other, other_coc, other_weight, behind
 
@@ -184,13 +189,14 @@ def _largest(values: Tensor, height: int, width: int, step: int) -> Tensor:
 def _surfaces_of_image(
     light: Tensor,
     coc_px: Tensor,
+    covered: Tensor | None,
     levels: Sequence[int],
     threshold: Tensor,
     valid: Tensor | None,
     ops: Ops,
 ) -> _Maps:
     """Light and weight of each pixel's own surface; light, coc and weight of the other one; light behind both."""
-    matted = matte(light, coc_px, valid, ops)
+    matted = matte(light, coc_px, valid, ops, covered)
     if ops.has_rays and active().emitters:
         matted = attribute_emitters(light, coc_px, threshold, valid, matted)
     own, other, other_coc, other_weight = matted

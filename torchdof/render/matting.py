@@ -55,7 +55,13 @@ class Matted(NamedTuple):
     other_weight: Tensor
 
 
-def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops = EAGER) -> Matted:
+def matte(
+    light: Tensor,
+    coc_px: Tensor,
+    valid: Tensor | None = None,
+    ops: Ops = EAGER,
+    covered: Tensor | None = None,
+) -> Matted:
     """Splits pixels at depth edges between their own surface and the one across the edge.
 
     1. Take the nearest and the farthest coc of the 3 x 3 pixels around as those of the two surfaces.
@@ -66,12 +72,14 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops =
        texture, a is the near surface's share under a small Gaussian, as far as the pixel's colour agrees.
     5. Distribute the residual over both parts, but none of it to an other surface that is less blurred: they sum to I,
        and neither leaves the image's range.
+    6. Replace these guesses by the surfaces of a matte, where there is one.
 
     Args:
         light: ``[B, C, H, W]``.
         coc_px: ``[B, 1, H, W]``, signed.
         valid: ``[B, 1, H, W]``, 0 where a pixel is left out; None means all count.
         ops: Selects the pixels at edges.
+        covered: Other surfaces by a matte, as :func:`torchdof.render.coverage.covered_by` returns them, or None.
 
     Returns:
         The surfaces; the weight of the other one is in [0, 1/2].
@@ -85,8 +93,22 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops =
         *([] if valid is None else [valid]),
     )
     if found is None:
-        return _split(light, coc_px, valid, ops)
-    return Matted(*found.split([light.shape[1], light.shape[1], 1, 1], 1))
+        surfaces = _split(light, coc_px, valid, ops)
+    else:
+        surfaces = Matted(*found.split([light.shape[1], light.shape[1], 1, 1], 1))
+    return surfaces if covered is None else _with_covered(light, surfaces, covered)
+
+
+def _with_covered(light: Tensor, surfaces: Matted, covered: Tensor) -> Matted:
+    """The surfaces of each pixel: those of a matte by their certainty, those given for the rest."""
+    share, coc, weight, certainty = covered.split([light.shape[1], 1, 1, 1], 1)
+    kept, given = (1.0 - certainty) * surfaces.other_weight, certainty * weight
+    both = kept + given
+    known = both.clamp_min(1e-12)
+    other = torch.where(both > 0, (kept * surfaces.other + certainty * share * light) / known, 0.0)
+    other_coc = torch.where(both > 0, (kept * surfaces.other_coc_px + given * coc) / known, surfaces.other_coc_px)
+    split = Matted((light - both * other) / (1.0 - both), other, other_coc, both)
+    return Matted(*(torch.where(certainty > 0, new, old) for new, old in zip(split, surfaces, strict=True)))
 
 
 def _split(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops = EAGER) -> Matted:

@@ -20,6 +20,7 @@ from ..validation import NAMED_TOLERANCES
 from . import compiled, composite, edges, exposure, highlights, routes, rules
 from .attention import Attention, box_around, weight_map
 from .convolution import convolve
+from .coverage import covered_by
 from .disocclusion import behind_pixels, surfaces_of_image
 from .layer_weights import blur_axis
 from .matting import matte
@@ -42,6 +43,7 @@ def blur(
     behind: tuple[Tensor, Tensor] | None = None,
     attention: Attention | None = None,
     ops: Ops = EAGER,
+    matte: Tensor | None = None,
 ) -> Tensor:
     """Render depth of field from the checked arguments of :func:`torchdof.blur_by_coc`.
 
@@ -53,13 +55,17 @@ def blur(
         behind: Known background ``[B, C, H, W]`` and its coc ``[B, 1, H, W]``.
         attention: Area rendered within ``options.tolerance``; the rest is rendered with the tolerance ``"draft"``.
         ops: Operations of all steps.
+        matte: Coverage by the subject ``[B or 1, 1, H, W]``, in [0, 1].
     """
     if attention is not None and len(image) > 1:  # the area depends on the largest blur of each item
-        maps = (image, coc_px, *(behind or ()), weight_map(attention, image))
-        items = zip(*(t.expand(len(image), -1, -1, -1).split(1) for t in maps), strict=True)
-        return torch.cat([blur(i, c, plan, options, tuple(b) or None, w, ops) for i, c, *b, w in items])
-    coc_px = edges.mended(image, coc_px, options.depth_edges, ops)
-    whole = functools.partial(_planned, image, coc_px, behind=behind, ops=ops)
+        given = (image, coc_px, weight_map(attention, image), matte, *(behind or ()))
+        maps = [[None] * len(image) if t is None else t.expand(len(image), -1, -1, -1).split(1) for t in given]
+        items = zip(*maps, strict=True)
+        return torch.cat([blur(i, c, plan, options, tuple(b) or None, w, ops, a) for i, c, w, a, *b in items])
+    coc_px, covered = edges.mended(image, coc_px, options.depth_edges, ops), None
+    if matte is not None:
+        coc_px, covered = covered_by(image, coc_px, matte, highlights.threshold)
+    whole = functools.partial(_planned, image, coc_px, behind=behind, ops=ops, covered=covered)
     if attention is None:
         return whole(plan, options)
     weight = weight_map(attention, image)
@@ -75,7 +81,8 @@ def blur(
         return whole(None, options)
     around = whole(None, loose)
     behind_part = None if behind is None else (behind[0][part], behind[1][part])
-    looked_at = _planned(image[part], coc_px[part], None, options, behind_part, ops)
+    covered_part = None if covered is None else covered[part]
+    looked_at = _planned(image[part], coc_px[part], None, options, behind_part, ops, covered_part)
     rows, columns = box
     ends = (columns.start, image.shape[-1] - columns.stop, rows.start, image.shape[-2] - rows.stop)
     return torch.lerp(around, functional.pad(looked_at, ends), functional.pad(weight[part], ends).to(image.dtype))
@@ -88,12 +95,15 @@ def _planned(
     options: Options,
     behind: tuple[Tensor, Tensor] | None,
     ops: Ops,
+    covered: Tensor | None,
 ) -> Tensor:
     """Render images with repaired depth edges; the given plan grows to the blur of each item; None plans each."""
     wide = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
     given = {"light": image, "coc": coc_px}
     if behind is not None:
         given |= {"behind_light": behind[0], "behind_coc": behind[1]}
+    if covered is not None:
+        given["covered"] = covered
     maps = {name: t.to(wide).contiguous() for name, t in given.items()}
     maps = {n: (t if is_traced() else t.resolve_neg()).expand(image.shape[0], -1, -1, -1) for n, t in maps.items()}
     cocs = [maps["coc"]] if behind is None else [maps["coc"], maps["behind_coc"]]
@@ -213,6 +223,7 @@ def _image(
     coc: Tensor,
     behind_light: Tensor | None = None,
     behind_coc: Tensor | None = None,
+    covered: Tensor | None = None,
 ) -> Tensor:
     """Render float maps of images, optionally with a known background, with one plan or with one for each item.
 
@@ -229,7 +240,7 @@ def _image(
     if len(plans) == 1 and plan.nodes == (0.0,):
         # all in focus: the image is unchanged; with the term 0 * coc, the coc has a gradient of 0 instead of None
         return light + 0.0 * torch.nan_to_num(coc) if is_differentiated(coc) else light.clone()
-    others = {"behind_light": behind_light, "behind_coc": behind_coc}
+    others = {"behind_light": behind_light, "behind_coc": behind_coc, "covered": covered}
     picture = _compiled(plans, options, ops.lens_width, light, coc, **others)
     if picture is not None:
         return picture
@@ -256,10 +267,10 @@ def _image(
     # surfaces of each pixel, and the light behind all of them
     surfaces, behind = [Surface(light, coc, weight)], None
     if behind_light is not None and behind_coc is not None and limit is not None:
-        surfaces = _before_background(surfaces[0], behind_light, behind_coc, ends, options)
+        surfaces = _before_background(surfaces[0], behind_light, behind_coc, ends, options, covered)
     elif options.occlusion and limit is not None and splatted:
         levels = [min(math.ceil(math.log2(max(2.0, most))) + 1, native.MOST_LEVELS) for most in widest]
-        surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels, ops)
+        surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels, ops, covered)
         behind = behind if rules.active().light_behind else None
 
     # highlights of these surfaces, ray by ray
@@ -304,12 +315,13 @@ def _before_background(
     behind_coc: Tensor,
     ends: Sequence[Any],
     options: Options,
+    covered: Tensor | None,
 ) -> list[Surface]:
     """Surfaces of an image in front of a known background, near to far; its coc is clamped to ``ends``."""
     light, coc, weight = surface
     valid = None if options.check else torch.isfinite(behind_coc) & torch.isfinite(behind).all(1, keepdim=True)
     behind_coc = behind_coc.clamp(*ends)
-    own_light, other_light, other_coc, other_weight = matte(light, coc, weight)
+    own_light, other_light, other_coc, other_weight = matte(light, coc, weight, covered=covered)
     # of the second surfaces of mixed pixels keep the nearer ones; the known background replaces the farther ones
     own_weight, other_weight = 1.0 - other_weight, torch.where(other_coc < coc, other_weight, 0.0)
     if weight is not None:

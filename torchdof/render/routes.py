@@ -5,6 +5,7 @@
 | image | compiled | steps | kernels | PyTorch | graph | graph |
 | image without occlusion | compiled | steps | PyTorch | PyTorch | graph | graph |
 | a known background | compiled | steps | kernels | PyTorch | graph | no such input |
+| a matte | compiled | steps | kernels | PyTorch | graph | graph |
 | `attention` | compiled | steps | kernels | PyTorch | refused | no such input |
 | stack of up to 3 layers (`DepthOfField.layers`) | compiled | steps | kernels | PyTorch | left out | no such input |
 | stack of more layers | compiled | steps | PyTorch | PyTorch | left out | no such input |
@@ -14,7 +15,7 @@
 | kernels wider than 513 pixels of their layer | steps | steps | kernels | PyTorch | graph | graph |
 | `torchdof.functional.splat` | PyTorch | PyTorch | PyTorch | PyTorch | refused | no such input |
 
-- compiled: the compiled engine renders the whole picture.
+- compiled: the compiled engine renders the whole picture. What a matte says is computed in PyTorch before.
 - steps: PyTorch renders, and the compiled engine computes those of its steps that it supports.
 - kernels: PyTorch renders, and CUDA kernels blur and composite the layers of float32, with and without gradients, of up
   to 8 channels, or of any number of colours with kernels of their own (:mod:`torchdof.render.on_gpu`).
@@ -73,6 +74,7 @@ def refuse(
     background: bool = False,
     attention: bool = False,
     plan: bool = False,
+    matte: bool = False,
     repairs: bool = False,
 ) -> None:
     """Refuse a combination of arguments that no engine renders: all these combinations are here.
@@ -83,6 +85,7 @@ def refuse(
         background: Whether a background is given.
         attention: Whether the viewer's attention is given.
         plan: Whether a plan is given.
+        matte: Whether a matte is given.
         repairs: Whether a file is to repair depth edges.
 
     Raises:
@@ -109,6 +112,10 @@ def refuse(
         (
             background and not options.occlusion,
             "without occlusion nothing is hidden: a background needs occlusion=True",
+        ),
+        (
+            matte and not options.occlusion,
+            "without occlusion all light is added, whatever covers a pixel: a matte needs occlusion=True",
         ),
         (
             attention and plan,

@@ -43,6 +43,7 @@ typedef struct {
   const float *const *light;   // for each surface [channels, height, width]
   const float *const *coc;     // for each surface [height, width]: signed radius in pixels, negative in front of the focus
   const float *const *weight;  // for each surface [height, width], or null: it covers its pixels fully
+  const float *covered;        // second surfaces that a matte gives [channels + 3, height, width], or null; see render/coverage.py
   int32_t occlusion;           // 0: light of all surfaces is added, without occlusion
   int32_t normalize;           // 0: without occlusion, do not divide by the blurred weight
   int32_t masked;  // 1: inputs may be NaN or infinite (not in a stack); such pixels are copied and do not affect others

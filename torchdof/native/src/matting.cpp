@@ -733,6 +733,28 @@ void set_weight(const Surfaces &s, const Block &block, size_t at, int within, fl
   block.own_weight[within] = 1.0f - weight;
 }
 
+// Gives pixels of a block the second surfaces of a matte, by their certainty; see render/coverage.py.
+void cover_block(Job &job, int by, int bx) {
+  Surfaces &s = job.surfaces;
+  const size_t area = s.area();
+  const float *const part = job.scene.covered, *const coc = part + s.channels * area, *const weight = coc + area, *const certainty = weight + area;
+  for (int y = by * BLOCK; y < std::min(s.height, (by + 1) * BLOCK); y++)
+    for (int x = bx * BLOCK; x < std::min(s.width, (bx + 1) * BLOCK); x++) {
+      const size_t at = (size_t)y * s.width + x;
+      if (!(certainty[at] > 0)) continue;
+      const Block block = s.make_block(by * s.block_columns + bx);
+      const int within = place_in_block(y, x);
+      const float kept = (1.0f - certainty[at]) * block.weight[within], given = certainty[at] * weight[at], both = kept + given;
+      const float per = both > 0 ? 1.0f / std::max(both, 1e-12f) : 0.0f;
+      for (int c = 0; c < s.channels; c++) {
+        float &other = block.other[c * BLOCK_PIXELS + within];
+        other = (kept * other + certainty[at] * part[c * area + at] * s.light[c * area + at]) * per;
+      }
+      if (both > 0) block.coc[within] = (kept * block.coc[within] + given * coc[at]) * per;
+      set_weight(s, block, at, within, both);
+    }
+}
+
 // Assigns the light of a highlight's pixel to the surface of its emitter, in front of the pixel's own surface or behind.
 void attribute_emitter(Job &job, int y, int x, float least_limit, const float *falloff) {
   Surfaces &s = job.surfaces;
@@ -841,9 +863,10 @@ void Job::split_mixed() {
           low = std::min(low, block_low[v * columns + u]);
           high = std::max(high, block_high[v * columns + u]);
         }
-      if (!(high - low > EDGE_PX)) continue;
       const int y0 = by * BLOCK, x0 = bx * BLOCK;
-      if (find_edges(frame, y0, x0, w)) split_block(frame, by, bx, w, falloff.data(), surfaces.make_block(by * columns + bx));
+      if (high - low > EDGE_PX && find_edges(frame, y0, x0, w))
+        split_block(frame, by, bx, w, falloff.data(), surfaces.make_block(by * columns + bx));
+      if (scene.covered) cover_block(*this, by, bx);
       if (!(high - low > 1)) continue;
       each_highlight(by, bx, [&](int y, int x, float least_limit) { attribute_emitter(*this, y, x, least_limit, around_emitter.data()); });
     }
