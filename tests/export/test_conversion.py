@@ -126,7 +126,7 @@ def test_onnxruntimes_optimised_copy_of_a_file_with_tiles_can_be_loaded(layered:
     onnxruntime.InferenceSession(layered.path, options, providers=["CPUExecutionProvider"])
     copy = onnxruntime.InferenceSession(tmp_path / "optimised.onnx", providers=["CPUExecutionProvider"])
     feed = {"image": torch.rand(1, 3, 20, 30).numpy(), "depth": torch.linspace(1, 9, 600).reshape(1, 1, 20, 30).numpy()}
-    feed |= {"focus_m": np.float32([2.0]), "f_number": np.float32([1.0])}
+    feed |= {"focus_m": torch.tensor([2.0]).numpy(), "f_number": torch.tensor([1.0]).numpy()}
     np.testing.assert_allclose(copy.run(None, feed)[0], layered.runner.run(None, feed)[0], rtol=0, atol=1e-6)
 
 
