@@ -74,7 +74,7 @@ SIMPLY = torchdof.DepthOfField(CAMERA, **SIMPLE)
 @pytest.mark.parametrize(
     ("dof", "change", "message"),
     [
-        (SIMPLY, {"inputs": "disparity"}, "inputs must be one of depth, coc_px"),
+        (SIMPLY, {"inputs": "disparity"}, "inputs must be one of depth, depth.matte, coc_px, coc_px.matte"),
         (SIMPLY, {"opset": 17}, "opset must be a whole number from 20"),
         (SIMPLY, {"width": 640}, "same kernels at any image width"),
         (SIMPLY, {"channels": 0}, "channels must be a whole number"),

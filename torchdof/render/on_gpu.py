@@ -41,6 +41,8 @@ def composited(frame: PaddedFrame, kernels: Kernels, plain: Plain) -> Tensor | N
         ValueError: If they cannot be used and ``TORCHDOF_ENGINE`` is ``gpu``.
     """
     maps, colours = maps_of(frame.surfaces), kernels[0][0].shape[-3]
+    if is_traced():  # before the number of items, which a graph leaves open, is taken for a constant
+        return None
     if not frame.occlusion or any(kernel.requires_grad for kernel, _ in kernels):
         return None
     channels, items = frame.colours // colours, len(maps[0]) * colours
