@@ -40,13 +40,12 @@ def composited(frame: PaddedFrame, kernels: Kernels, plain: Plain) -> Tensor | N
     Raises:
         ValueError: If they cannot be used and ``TORCHDOF_ENGINE`` is ``gpu``.
     """
-    maps, colours = maps_of(frame.surfaces), kernels[0][0].shape[-3]
-    if is_traced():  # before the number of items, which a graph leaves open, is taken for a constant
-        return None
     if not frame.occlusion or any(kernel.requires_grad for kernel, _ in kernels):
         return None
-    channels, items = frame.colours // colours, len(maps[0]) * colours
-    if not takes(maps, channels, len(frame.surfaces)) or items > layers.MOST_ITEMS:
+    maps, colours = maps_of(frame.surfaces), kernels[0][0].shape[-3]
+    channels = frame.colours // colours
+    # the number of items last: a traced graph, which `takes` refuses, leaves it open
+    if not takes(maps, channels, len(frame.surfaces)) or len(maps[0]) * colours > layers.MOST_ITEMS:
         return None
     variant = (channels, len(frame.surfaces), frame.stacked, maps[0].device.index or 0)
     return None if _missing(plain, *variant) else _by_kernels(frame, kernels, plain)
