@@ -80,7 +80,7 @@ _RELATED = 0.8  # smallest agreement of colours with the clear pixels of a map a
 _EXACT = 0.025  # largest share of wrong pixels at which the steps of a map count as exact
 _DOUBTFUL = 0.05  # share of wrong pixels of a kind above which these pixels are decided again
 _LEAN = 2.0  # log-odds by which a far surface must win: foreground left behind is the more visible error
-_TO_BLURRED = 2.5  # log-odds for a soft map's more blurred surface; larger: fewer sharp specks, less detail
+_TO_BLURRED = 2.5  # log-odds for a soft map's near surface that is more blurred; larger: fewer specks, less detail
 _MORE_BLURRED_PX = 2.0  # difference in blur of two surfaces from which these log-odds count in full
 _BESIDE, _DIAGONAL = 0.93, 0.57  # log-odds of a neighbour's surface in soft maps; larger: smoother edges, less detail
 _DECIDED_ROUNDS = 4  # times that neighbours decide again; more: smoother edges
@@ -206,7 +206,7 @@ def repair(
         step: Smallest difference in nearness between two surfaces, ``[B, 1, H, W]`` or a number.
         auto: Whether exact edges stay unchanged.
         of_coc: Whether ``nearness`` is a map of the coc instead, in which a larger value is farther. With
-            ``auto``, undecided pixels of a soft map then go to the more blurred surface.
+            ``auto``, undecided pixels of a soft map then go to a near surface that is more blurred.
         ops: Processes lists of pixels in parts.
 
     Returns:
@@ -267,7 +267,7 @@ def _repair(
     2. Score sampled edge pixels by colour, fit the prior of each kind of edge pixel, and detect soft maps.
     3. Select the pixels to decide: all edge pixels; with ``auto``, those of kinds that are often wrong.
     4. A selected pixel shows the near surface where ``score + logit(prior) > 0``. In soft maps the sum also has a term
-       for the more blurred surface, for a map of the coc, and the chances of its neighbours to show it, which depend on
+       for a more blurred near surface, for a map of the coc, and the chances of its neighbours to show it, which depend on
        theirs in turn: a mean field of a few rounds, so that edges are smooth lines without single pixels beside them.
     5. Give selected pixels the nearness of their surface, on ramps in proportion to the evidence.
     6. In soft maps, remove the ringing of interpolation beside steps, and correct lamps of a few pixels.
@@ -528,7 +528,7 @@ def _judge(
             off, along = own[:-5] - mean[:, 1], mean[:, 0] - mean[:, 1]
             share = ((off * along).sum(0) / contrast.clamp_min(1e-12)).clamp(0.0, 1.0)
             mixed = (1.0 + (off - share * along).square().sum(0) / spread).square().reciprocal()
-            mixed = _MIXTURE * mixed * _more_blurred(ends).clamp_min(0.0)
+            mixed = _MIXTURE * mixed * _more_blurred(ends)
             likelihood = torch.stack([likelihood[0] + mixed, likelihood[1]])
         score = torch.where(known, torch.log(likelihood[0] / likelihood[1]), 0.0).clamp(-8.0, 8.0)
         if active().few_samples:
@@ -556,9 +556,9 @@ def _judge(
 
 
 def _more_blurred(surfaces: Tensor) -> Tensor:
-    """How clearly the near one of two surfaces, of cocs ``[2, P]``, is the more blurred one: -1, not at all, to 1."""
+    """How clearly the near one of two surfaces, of cocs ``[2, P]``, is the more blurred one, 0 to 1."""
     blur = surfaces.abs()
-    return ((blur[0] - blur[1]) / _MORE_BLURRED_PX).clamp(-1.0, 1.0)
+    return ((blur[0] - blur[1]) / _MORE_BLURRED_PX).clamp(0.0, 1.0)
 
 
 def _calibrate(kinds: Tensor, score: Tensor, weight: Tensor, items: int) -> Tensor:

@@ -765,9 +765,9 @@ class Repair {
     });
   }
 
-  // How clearly the near surface is the more blurred one: from -1, the far one is, to 1.
+  // How clearly the near surface is the more blurred one, 0 to 1.
   static float more_blurred(const Edge &edge) {
-    return clamp((std::fabs(edge.near) - std::fabs(edge.far)) / MORE_BLURRED_PX, -1.0f, 1.0f);
+    return clamp01((std::fabs(edge.near) - std::fabs(edge.far)) / MORE_BLURRED_PX);
   }
 
   // C: channels, or 0 for any number.
@@ -867,7 +867,7 @@ class Repair {
             parts[4 + side] += part * window.values[n];
           }
         }
-        blurs[l] = std::max(more_blurred(edge), 0.0f);
+        blurs[l] = more_blurred(edge);
         for (int side = 0; side < 2; side++) {
           likely[side][l] = sum(parts[side]);
           surfaces[side][l] = edge.near + sum(parts[4 + side]) / std::max(sum(parts[2 + side]), 1e-12f);
