@@ -63,6 +63,7 @@ _MIXTURE = 0.05  # likelihood of a mixed colour on a more blurred near surface; 
 _SPREAD = 0.3  # variance, over that of both surfaces, by which a sample resembles a pixel; larger: more do
 _SIMILAR = 0.0225  # (15 %)^2: squared difference, over the square, at which a neighbour counts by half
 _SHARPNESS = 1.6  # factor on scores, which samples on the wrong side reduce; larger: colour outweighs the map
+_SOFT_SHARPNESS = 0.7  # the same in soft maps, where samples near the edge are rarely wrong
 
 # Prior: how often each kind of edge pixel shows the near surface
 _DIRECTIONS = 5  # directions of an edge: up, left, diagonal, right, down
@@ -80,9 +81,9 @@ _RELATED = 0.8  # smallest agreement of colours with the clear pixels of a map a
 _EXACT = 0.025  # largest share of wrong pixels at which the steps of a map count as exact
 _DOUBTFUL = 0.05  # share of wrong pixels of a kind above which these pixels are decided again
 _LEAN = 2.0  # log-odds by which a far surface must win: foreground left behind is the more visible error
-_TO_BLURRED = 2.5  # log-odds for a soft map's near surface that is more blurred; larger: fewer specks, less detail
+_TO_BLURRED = 4.5  # log-odds for a soft map's near surface that is more blurred; larger: fewer specks, less detail
 _MORE_BLURRED_PX = 2.0  # difference in blur of two surfaces from which these log-odds count in full
-_BESIDE, _DIAGONAL = 0.93, 0.57  # log-odds of a neighbour's surface in soft maps; larger: smoother edges, less detail
+_BESIDE, _DIAGONAL = 1.3, 0.8  # log-odds of a neighbour's surface in soft maps; larger: smoother edges, less detail
 _DECIDED_ROUNDS = 4  # times that neighbours decide again; more: smoother edges
 
 # Soft maps: blurred by resampling, or written by a network. More than _SOFT of the edge pixels of a soft map lie on
@@ -264,11 +265,12 @@ def _repair(
     """Plain PyTorch version of :func:`repair`.
 
     1. Find ramps and steps, and the nearness of both surfaces there.
-    2. Score sampled edge pixels by colour, fit the prior of each kind of edge pixel, and detect soft maps.
+    2. Detect soft maps from sampled edge pixels, score these by colour, and fit the prior of each kind of edge pixel.
     3. Select the pixels to decide: all edge pixels; with ``auto``, those of kinds that are often wrong.
     4. A selected pixel shows the near surface where ``score + logit(prior) > 0``. In soft maps the sum also has a term
-       for a more blurred near surface, for a map of the coc, and the chances of its neighbours to show it, which depend on
-       theirs in turn: a mean field of a few rounds, so that edges are smooth lines without single pixels beside them.
+       for a more blurred near surface, for a map of the coc, and the chances of its neighbours to show it, which
+       depend on theirs in turn: a mean field of a few rounds, so that edges are smooth lines without single pixels
+       beside them.
     5. Give selected pixels the nearness of their surface, on ramps in proportion to the evidence.
     6. In soft maps, remove the ringing of interpolation beside steps, and correct lamps of a few pixels.
     """
@@ -286,34 +288,39 @@ def _repair(
     maps = [light.sqrt(), given, witness, edges.near, edges.far, edges.is_ramp.to(given.dtype)]
     looks = pixels.rows(torch.cat(maps, 1))  # what _judge looks at
 
-    # the prior of each kind of edge pixel, from samples
+    # a sample of the edge pixels
     batch, _, height, width = given.shape
     area = torch.scalar_tensor(height * width, dtype=torch.float64, device=given.device)  # not a constant in graphs
     every = (area / _SAMPLED).sqrt().ceil().long()
     rows, columns = (_from_border(n, given.device) // _BLOCK for n in (height, width))
     sampled = pixels.indices(edges.is_edge & ((rows[:, None] + columns) % every == 0))
+
+    def sums(*parts: Tensor) -> tuple[Tensor, ...]:  # over the samples of each item
+        items = given.new_zeros(len(parts), batch)
+        return items.index_add(1, sampled // (height * width), torch.stack(parts))[..., None, None, None].unbind(0)
+
+    # whether the map is soft
+    is_mixed = edges.is_edge & ((edges.level - 0.5).abs() < 0.25)
+    maps = [edges.level, edges.climb, edges.is_ramp, is_mixed, edges.ring]
+    level, climb, is_ramp, mixed, ring = pixels.pick(torch.cat([t.to(given.dtype) for t in maps], 1), sampled)
+    ramps, mixed, length, steps = sums(is_ramp, is_ramp * mixed, climb, 1.0 - is_ramp)
+    is_soft = (ramps > _SOFT * (ramps + steps)) & ((ramps > _WIDE * length) | (mixed > _MIXED * ramps))
+    sharpness = torch.where(is_soft, _SOFT_SHARPNESS, _SHARPNESS).flatten().to(given.dtype)
+
     kind = _kind(edges)
-    score = _judge(looks, given, sampled, _CLEAR_IN_PRIOR, False, ops)[0]
+    score = _judge(looks, given, sampled, sharpness, _CLEAR_IN_PRIOR, False, ops)[0]
     weight = (0.5 * score.abs()).clamp(max=1.0)
     prior = _calibrate(pixels.pick(kind, sampled)[0], score, weight, batch)[kind]
     wrong = torch.where(is_near, 1.0 - prior, prior)
 
-    # what kind of map it is: sums over the samples of each item
-    is_mixed = edges.is_edge & ((edges.level - 0.5).abs() < 0.25)
-    maps = [edges.level, wrong, edges.climb, edges.is_ramp, is_mixed, edges.ring]
-    level, doubt, climb, is_ramp, mixed, ring = pixels.pick(torch.cat([t.to(given.dtype) for t in maps], 1), sampled)
-    # colour agrees with the map at clear pixels: in the outermost ring of a step, or near the ends of a ramp; colours
-    # unrelated to the depth agree at half of them
-    weight = weight * torch.where(is_ramp > 0, (level - 0.5).abs() > _CLEAR_LEVEL, ring == _RINGS)
-    agrees = weight * ((score > 0) == (level > 0.5))
-    parts = [is_ramp, is_ramp * mixed, climb, 1.0 - is_ramp, (1.0 - is_ramp) * doubt, weight, agrees]
-    sums = given.new_zeros(len(parts), batch).index_add(1, sampled // (height * width), torch.stack(parts))
-    ramps, mixed, length, steps, doubts, weight, agrees = sums[..., None, None, None].unbind(0)
-    is_soft = (ramps > _SOFT * (ramps + steps)) & ((ramps > _WIDE * length) | (mixed > _MIXED * ramps))
-
     # which surface the selected pixels show
     doubtful = edges.is_edge
     if auto:
+        # colour agrees with the map at clear pixels: in the outermost ring of a step, or near the ends of a ramp;
+        # colours unrelated to the depth agree at half of them
+        weight = weight * torch.where(is_ramp > 0, (level - 0.5).abs() > _CLEAR_LEVEL, ring == _RINGS)
+        agrees = weight * ((score > 0) == (level > 0.5))
+        doubts, weight, agrees = sums((1.0 - is_ramp) * pixels.pick(wrong, sampled)[0], weight, agrees)
         is_related = agrees + 0.5 * _PRIOR_COUNT > _RELATED * (weight + _PRIOR_COUNT)
         is_soft = is_soft & is_related
         is_inexact = is_related & (is_soft | (doubts > _EXACT * steps))
@@ -321,7 +328,7 @@ def _repair(
     edge_pixels = pixels.indices(doubtful)
     if auto and is_empty(edge_pixels):  # nor lamps: a soft map has ramps, which are selected
         return -nearness if of_coc else nearness
-    score, evidence, near, far = _judge(looks, given, edge_pixels, _CLEAR, of_coc, ops)
+    score, evidence, near, far = _judge(looks, given, edge_pixels, sharpness, _CLEAR, of_coc, ops)
     shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0])
     if auto:  # without auto, correct steps are decided too, and the lead would move them
         shows_near = shows_near + (_LEAN if rules.far_lead else 0.0) * (score.abs() - 1.0).clamp(0.0, 1.0)
@@ -474,7 +481,7 @@ def _kind(edges: _Edges) -> Tensor:
 
 
 def _judge(
-    looks: Tensor, like: Tensor, edge_pixels: Tensor, clear: float, mixtures: bool, ops: Ops
+    looks: Tensor, like: Tensor, edge_pixels: Tensor, sharpness: Tensor, clear: float, mixtures: bool, ops: Ops
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Scores by colour which of two surfaces pixels ``[P]`` show.
 
@@ -488,8 +495,8 @@ def _judge(
     5. Average scores over neighbours of similar colour.
 
     ``looks`` are :func:`torchdof.pixels.rows` of the colour, the nearness, the weight of samples, the nearness of both
-    surfaces, and whether the pixel is on a ramp; ``like`` is a map of the frame. ``clear`` is the sum of weights from
-    which samples of a surface count in full.
+    surfaces, and whether the pixel is on a ramp; ``like`` is a map of the frame. ``sharpness`` is the factor on the
+    scores of each item. ``clear`` is the sum of weights from which samples of a surface count in full.
 
     Returns:
         ``[P]`` each: the log-likelihood ratio, positive for the near surface; the evidence, 0 to 1, that the pixel
@@ -550,7 +557,8 @@ def _judge(
         alike = (torch.arange(len(alike), device=alike.device) == len(alike) // 2).to(alike.dtype)[:, None]
     is_edge = ~scores.isnan()
     alike, scores = torch.where(is_edge, alike, 0.0), torch.where(is_edge, scores, 0.0)
-    score = (_SHARPNESS * separation * (alike * scores).sum(0) / alike.sum(0).clamp_min(1e-12)).clamp(-6.0, 6.0)
+    score = separation * (alike * scores).sum(0) / alike.sum(0).clamp_min(1e-12)
+    score = (sharpness.index_select(0, edge_pixels // like[0].numel()) * score).clamp(-6.0, 6.0)
     evidence = torch.maximum(2.0 * separation * scores.abs().amax(0) - 1.0, likeliest / _LIKELY).clamp(0.0, 1.0)
     return score, evidence, near, far
 

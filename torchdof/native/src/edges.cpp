@@ -45,7 +45,7 @@ constexpr float FALLOFF_PX = constants::edges::FALLOFF_PX;
 constexpr float CLEAR = constants::edges::CLEAR;
 constexpr float CLEAR_IN_PRIOR = constants::edges::CLEAR_IN_PRIOR;
 constexpr float LIKELY = constants::edges::LIKELY;
-constexpr float SHARPNESS = constants::edges::SHARPNESS;
+constexpr float SHARPNESS = constants::edges::SHARPNESS, SOFT_SHARPNESS = constants::edges::SOFT_SHARPNESS;
 constexpr float COLOUR_NOISE = constants::edges::COLOUR_NOISE;
 constexpr float SIMILAR = constants::edges::SIMILAR;
 constexpr float TRUSTED = constants::edges::TRUSTED;
@@ -233,7 +233,7 @@ class Repair {
   explicit Repair(const torchdof_map &map)
       : map_(map), sign_(map.of_coc ? -1.0f : 1.0f), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)map.height * map.width), score_(area_), evidence_(area_), marks_(area_) {}
 
-  // 1. Find the edges of a sample of the frame and decide by colour which surface each pixel shows.
+  // 1. Find the edges of a sample of the frame, see whether the map is soft, and decide by colour which surface each pixel shows.
   // 2. Calibrate: for each kind of edge pixel, the share that shows the near surface.
   // 3. In automatic mode stop here if the map is exact or its edges are unrelated to the image's.
   // 4. Find and decide the edges of the whole frame; move pixels that have the depth of the wrong surface.
@@ -253,10 +253,11 @@ class Repair {
     }
     // blocks and tiles contain edge pixels that are not sampled
     choose_edges(sampled, [&](const Edge &edge) { return is_sampled(edge.i / width_, edge.i % width_); });
+    const bool is_soft = is_on_ramps(sampled);
+    sharpness_ = is_soft ? SOFT_SHARPNESS : SHARPNESS;
     judge(sampled, false);
     decide(sampled);
     calibrate(sampled);
-    const bool is_soft = is_on_ramps(sampled);
     if (map_.automatic && (!is_related(sampled) || !(is_soft || is_inexact(sampled)))) return false;
     parallel(height_, [&](int y) {
       memcpy(map_.out + (size_t)y * width_, map_.nearness + (size_t)y * width_, width_ * sizeof(float));
@@ -914,7 +915,7 @@ class Repair {
         score /= total;
         for (int l = 0; l <= lane; l++) {
           Judgement &judged = group.judged[k - lane + l];
-          judged.score = clamp(SHARPNESS * judged.reliability * score[l], -6.0f, 6.0f);
+          judged.score = clamp(sharpness_ * judged.reliability * score[l], -6.0f, 6.0f);
           float &evidence = evidence_[group.edges[k - lane + l].i];
           evidence = std::max(clamp01(2.0f * judged.reliability * strongest[l] - 1.0f), evidence);
         }
@@ -1270,6 +1271,7 @@ class Repair {
   const int height_, width_, channels_;
   const size_t area_;
   float noise_step_ = 0.0f;  // smallest step that is larger than the map's noise
+  float sharpness_ = SHARPNESS;
   const Buffer<float> score_, evidence_;
   const Buffer<uint8_t> marks_;
   std::vector<float> shares_;
