@@ -49,6 +49,18 @@ def test_the_report_marks_the_edges_that_rendering_repairs(damage: Callable[[Ten
     assert torch.equal((report.edges == 2) | (report.edges == 3), DepthOfField(CAMERA).coc_px(image, depth) != coc_px)
 
 
+def test_the_report_knows_the_blur_of_the_near_surface() -> None:
+    """Undecided pixels go to a near surface that is more blurred, in the report as in the picture."""
+    ramp = ((torch.arange(64.0) - 28.5) / 6).clamp(0, 1).expand(1, 1, 64, 64)
+    image = (0.2 + 0.6 * (torch.arange(64.0) >= 32) + 0.05 * torch.rand(1, 1, 64, 64)).repeat(1, 3, 1, 1)
+    image[..., 8:50:8, 31] = 0.55
+    depth = 1.0 / (0.5 + ramp)
+    report = inspect_depth(image, depth, CAMERA)
+    assert torch.equal(report.repaired_px, DepthOfField(CAMERA).coc_px(image, depth))
+    assert (report.edges[0, 0, 8:50:8, 31] == 1 + EDGES.index("ramp")).all()
+    assert (report.repaired_px[0, 0, 8:50:8, 31] < -10).all()
+
+
 def test_ranges_holes_and_shares_are_those_of_the_map() -> None:
     depth = torch.full((1, 1, 10, 10), 3.0)
     depth[..., :2, :] = torch.nan

@@ -12,7 +12,8 @@ class Inspect(Scene, Command):
     """Report on a depth map and its blur by a camera, before anything is rendered.
 
     Prints ranges, blur radii, the share in focus, holes, and how many edges of the depth match edges of the image.
-    Draws depth, blur and doubtful edges. The defaults of focus and lens are those of torchdof render.
+    Draws depth, blur, doubtful edges, and the blur with these repaired. The defaults of focus and lens are those of
+    torchdof render.
 
         torchdof inspect photo.jpg depth.png --depth-scale 0.001 --focus-at 320,200 --f-number 1.8
     """

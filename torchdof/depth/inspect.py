@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..optics.camera import Camera
-from ..render.edges import STEP_PX, judged
+from ..render.edges import judged
 from ..validation import image_and_map
 
 __all__ = ["EDGES", "DepthReport", "coc_colours", "depth_colours", "inspect_depth", "panels", "tint_focus"]
@@ -37,12 +37,14 @@ class DepthReport:
     Args:
         depth: The map, ``[1, 1, H, W]`` in metres, NaN in holes.
         coc_px: Signed circle of confusion, ``[1, 1, H, W]``, NaN in holes.
+        repaired_px: The same after the repair of edges, as it is rendered.
         edges: ``[1, 1, H, W]``, uint8: 0 away from depth edges, else 1 + the index in :data:`EDGES`.
         counts: Number of pixels of each kind in :data:`EDGES`.
     """
 
     depth: Tensor
     coc_px: Tensor
+    repaired_px: Tensor
     edges: Tensor
     counts: tuple[int, int, int, int]
 
@@ -139,11 +141,12 @@ def inspect_depth(image: Tensor, depth: Tensor, camera: Camera) -> DepthReport:
         raise ValueError(f"inspect one image at a time, got a batch of {image.shape[0]}")
     depth = torch.where(depth > 0, depth, torch.nan)
     coc_px = camera.coc_px(depth, depth.shape[-1])
-    is_edge, is_ramp, is_changed = judged(image, -coc_px, STEP_PX)
+    is_edge, is_ramp, repaired_px = judged(image, coc_px)
+    is_changed = (repaired_px != coc_px) & ~coc_px.isnan()
     kept, changed = torch.where(is_ramp, _UNCLEAR, _EXACT * is_edge), torch.where(is_ramp, _RAMP, _BESIDE)
     kinds = torch.where(is_changed, changed, kept).byte()
     counts = torch.bincount(kinds.flatten(), minlength=len(EDGES) + 1)[1:].tolist()
-    return DepthReport(depth, coc_px, kinds, (counts[0], counts[1], counts[2], counts[3]))
+    return DepthReport(depth, coc_px, repaired_px, kinds, (counts[0], counts[1], counts[2], counts[3]))
 
 
 def depth_colours(depth: Tensor) -> Tensor:
@@ -156,7 +159,7 @@ def depth_colours(depth: Tensor) -> Tensor:
 
 
 def coc_colours(coc_px: Tensor) -> Tensor:
-    """Signed radii ``[1, 1, H, W]`` in pixels as ``[1, 3, H, W]`` in linear light.
+    """Signed radii ``[B, 1, H, W]`` in pixels as ``[B, 3, H, W]`` in linear light.
 
     Orange is in front of the focus, blue behind; the largest radius (at least 1 px) has full colour.
     """
@@ -168,18 +171,20 @@ def coc_colours(coc_px: Tensor) -> Tensor:
 def panels(image: Tensor, report: DepthReport) -> dict[str, Tensor]:
     """Pictures of the report of an image ``[1, C, H, W]``: caption -> ``[1, 3, H, W]`` in linear light."""
     is_hole = report.depth.isnan()
-    coc_px = torch.where(is_hole, 0.0, report.coc_px)
-    blur = torch.where(is_hole, image.new_tensor(_HOLE)[:, None, None], coc_colours(coc_px))
+    coc_px = torch.where(is_hole, 0.0, torch.cat([report.coc_px, report.repaired_px]))
+    blur, repaired = torch.where(is_hole, image.new_tensor(_HOLE)[:, None, None], coc_colours(coc_px)).split(1)
+    ends = f"{float(coc_px[0].min()):+.1f} to {float(coc_px[0].max()):+.1f} px"
     colours = image.new_tensor([[0, 0, 0], [0.0, 0.7, 0.1], [1.0, 0.05, 0.0], [1.0, 0.0, 0.8], [0.05, 0.1, 0.5]])
     marks = colours[report.edges[:, 0].long()].permute(0, 3, 1, 2)  # [1, H, W, 3] -> [1, 3, H, W]
     brightness = image.mean(1, keepdim=True) / image.mean().clamp(min=1e-12)
     background = (0.08 * brightness).clamp(0, 0.3).expand(-1, 3, -1, -1)
     return {
         "depth: near is bright, holes magenta": depth_colours(report.depth),
-        f"blur radius {float(coc_px.min()):+.1f} to {float(coc_px.max()):+.1f} px: near orange, far blue": blur,
+        f"blur radius {ends}: near orange, far blue": blur,
         "depth edges: exact green, ramps red, beside the image's pink, unclear blue": torch.where(
             report.edges > 0, marks, background
         ),
+        "the same blur radius as rendered: edges repaired": repaired,
     }
 
 

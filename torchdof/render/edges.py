@@ -239,23 +239,21 @@ def repair(
 
 
 @torch.no_grad()
-def judged(image: Tensor, nearness: Tensor, step: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:
-    """Finds the pixels at a map's edges, and those that :func:`repair` changes with ``auto``.
+def judged(image: Tensor, coc_px: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Finds the pixels at the edges of a map of the coc, and what :func:`mended` makes of them with "auto".
 
     Args:
-        image: As for :func:`repair`.
-        nearness: As for :func:`repair`.
-        step: As for :func:`repair`.
+        image: As for :func:`mended`.
+        coc_px: As for :func:`mended`.
 
     Returns:
-        Whether a pixel is at an edge, whether it is on a ramp there, and whether it changes, ``[B, 1, H, W]`` each.
+        Whether a pixel is at an edge, whether it is on a ramp there, and the repaired map, ``[B, 1, H, W]`` each.
     """
-    given = nearness.float().expand(image.shape[0], -1, -1, -1)
-    valid = given.abs() <= _LARGEST
-    step = torch.as_tensor(step, dtype=given.dtype, device=given.device)
-    edges = _find(torch.where(valid, given, 0.0), valid, torch.maximum(step, _NOISES * _noise(given, valid)))
-    repaired = repair(image, nearness, step, auto=True)
-    return edges.is_edge, edges.is_edge & edges.is_ramp, (repaired != nearness) & valid
+    nearness = -coc_px.float().expand(image.shape[0], -1, -1, -1)
+    valid = nearness.abs() <= _LARGEST
+    step = (_NOISES * _noise(nearness, valid)).clamp_min(STEP_PX)
+    edges = _find(torch.where(valid, nearness, 0.0), valid, step)
+    return edges.is_edge, edges.is_edge & edges.is_ramp, mended(image, coc_px, "auto")
 
 
 @torch.no_grad()
