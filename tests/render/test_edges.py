@@ -87,7 +87,7 @@ def test_levels_of_a_file_are_not_edges_however_large_the_blur(engine: str) -> N
     coc_px = 0.53 * levels
     image = torch.rand(1, 3, *coc_px.shape[-2:])
     assert torch.equal(edges.mended(image, coc_px, "repair"), coc_px)
-    assert not edges.judged(image, coc_px, edges.STEP_PX)[0].any()
+    assert not edges.judged(image, coc_px)[0].any()
 
 
 def test_narrow_ramps_of_averaged_depth_are_repaired(scene: Scene, engine: str) -> None:
@@ -131,6 +131,13 @@ def test_a_mixed_colour_belongs_to_a_more_blurred_near_surface(engine: str, mixe
     coc_px = edges.mended(image, -10 * RAMP, "auto")[0, 0]
     torch.testing.assert_close(coc_px[8:50:8, 31], torch.full((6,), -10.0), atol=1e-4, rtol=0)
     torch.testing.assert_close(coc_px[:, 28], torch.zeros(64), atol=1e-4, rtol=0)
+
+
+def test_colours_need_to_agree_with_one_side_only(engine: str) -> None:
+    """Beside a foreground that is too thin, what the map calls background has the colour of the foreground."""
+    ramp = ((torch.arange(64.0) - 32.5) / 3).clamp(0, 1).expand(1, 1, 256, 64)  # 2 px to the right of the image's edge
+    coc_px = edges.mended(two_colours().repeat(1, 1, 4, 1), -10 * ramp, "auto")[0, 0]
+    torch.testing.assert_close(coc_px[:, 33:], torch.full((256, 31), -10.0), atol=1e-4, rtol=0)
 
 
 RAMP = ((torch.arange(64.0) - 28.5) / 6).clamp(0, 1).expand(1, 1, 64, 64)

@@ -77,7 +77,7 @@ _ROUNDS = 10  # iterations of the fit
 
 # Decision, with "auto"
 _CLEAR_LEVEL = 0.3  # distance from the middle of a ramp, in steps, from which its pixels are clear
-_RELATED = 0.8  # smallest agreement of colours with the clear pixels of a map at which colours are used
+_RELATED = 0.8  # smallest agreement of colours with the clear pixels of one side of edges at which colours are used
 _EXACT = 0.025  # largest share of wrong pixels at which the steps of a map count as exact
 _DOUBTFUL = 0.05  # share of wrong pixels of a kind above which these pixels are decided again
 _LEAN = 2.0  # log-odds by which a far surface must win: foreground left behind is the more visible error
@@ -314,12 +314,14 @@ def _repair(
     # which surface the selected pixels show
     doubtful = edges.is_edge
     if auto:
-        # colour agrees with the map at clear pixels: in the outermost ring of a step, or near the ends of a ramp;
-        # colours unrelated to the depth agree at half of them
+        # colour agrees with the map at clear pixels: in the outermost ring of a step, or near a ramp's ends; on one
+        # side of the edges only where the map's foreground is too thin, and at half of them where it has no relation
         weight = weight * torch.where(is_ramp > 0, (level - 0.5).abs() > _CLEAR_LEVEL, ring == _RINGS)
-        agrees = weight * ((score > 0) == (level > 0.5))
-        doubts, weight, agrees = sums((1.0 - is_ramp) * pixels.pick(wrong, sampled)[0], weight, agrees)
-        is_related = agrees + 0.5 * _PRIOR_COUNT > _RELATED * (weight + _PRIOR_COUNT)
+        is_clear = weight * torch.stack([level > 0.5, level <= 0.5])  # of the near and of the far surface
+        agrees = is_clear * ((score > 0) == (level > 0.5))
+        doubts, *clear = sums((1.0 - is_ramp) * pixels.pick(wrong, sampled)[0], *is_clear, *agrees)
+        clear, agrees = torch.stack(clear).chunk(2)
+        is_related = (agrees + 0.25 * _PRIOR_COUNT > _RELATED * (clear + 0.5 * _PRIOR_COUNT)).any(0)
         is_soft = is_soft & is_related
         is_inexact = is_related & (is_soft | (doubts > _EXACT * steps))
         doubtful = doubtful & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)

@@ -935,19 +935,22 @@ class Repair {
     clamp_to_frame(grid, grid);
   }
 
-  // Whether colours agree with the map at pixels where the map is most likely right.
+  // Whether colours agree with the map at pixels where the map is most likely right: on one side of its edges at least,
+  // because beside a foreground that is too thin they show the foreground.
   bool is_related(const std::vector<Group> &groups) const {
-    double total = 0, agreed = 0;
+    double total[2] = {}, agreed[2] = {};
     for (const Group &group : groups)
       for (size_t k = 0; k < group.edges.size(); k++) {
         const Edge &edge = group.edges[k];
         const float score = group.judged[k].score, level = (nearness(edge.i) - edge.far) / std::max(edge.near - edge.far, 1e-12f);
         if (marks_[edge.i] & RAMP ? std::fabs(level - 0.5f) <= CLEAR_LEVEL : edge.kind / DIRECTIONS % RINGS != RINGS - 1) continue;
         const float weight = std::min(0.5f * std::fabs(score), 1.0f);
-        total += weight;
-        if ((score > 0) == (level > 0.5f)) agreed += weight;
+        const bool is_near = level > 0.5f;
+        total[is_near] += weight;
+        if ((score > 0) == is_near) agreed[is_near] += weight;
       }
-    return (agreed + 0.5f * PRIOR_COUNT) / (total + PRIOR_COUNT) > RELATED;
+    const auto agrees = [&](bool side) { return (agreed[side] + 0.25f * PRIOR_COUNT) / (total[side] + 0.5f * PRIOR_COUNT) > RELATED; };
+    return agrees(false) || agrees(true);
   }
 
   // Share of pixels that show the near surface, by kind: a maximum-likelihood fit (EM) to the scores, with PRIOR_COUNT
