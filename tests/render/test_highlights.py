@@ -149,6 +149,12 @@ def test_fewer_highlights_are_rays_if_kernels_reach_farther() -> None:
     assert float(disc) == 16 * 32 * 32 and float(wide) == pytest.approx(float(disc) / 6.25)
 
 
+def test_fewer_highlights_are_rays_in_noisy_depth_where_each_meets_more_surfaces() -> None:
+    stripes = torch.arange(32) % 2 * torch.ones(1, 1, 32, 1)  # neighbours along one of both axes differ by 1 px
+    even, rough, rougher = (float(highlights.affordable_taps(change * stripes, [1.0])) for change in (0.0, 4.0, 8.0))
+    assert even == 16 * 32 * 32 and rough < even / 4 and rougher == pytest.approx(rough / 2)
+
+
 @pytest.mark.parametrize("range_of_light", [0.0, 1.0])
 def test_rays_above_the_limit_fade_into_the_layers(range_of_light: float) -> None:
     generator = torch.Generator().manual_seed(2)
