@@ -11,8 +11,8 @@ from torch import Tensor
 from torchdof import BlurTable, blur_by_coc
 from torchdof.reference import metrics
 from torchdof.render import highlights
-from torchdof.render.plan import Plan
-from torchdof.render.surfaces import HIDDEN_WEIGHT, Surface
+from torchdof.render.layers.plan import Plan
+from torchdof.render.surfaces.frame import HIDDEN_WEIGHT, Surface
 
 LAMP = 3000.0
 

@@ -1,6 +1,6 @@
 """Render one image: plan layers, split mixed pixels, fill hidden areas, extract highlights, blur layers, composite.
 
-Each step takes ``ops`` (:mod:`torchdof.render.ops`): one set of operations for eager code, another for exported graphs.
+Each step takes ``ops`` (:mod:`torchdof.render.engines.ops`): operations for eager code, or those for exported graphs.
 """
 
 import dataclasses
@@ -17,18 +17,21 @@ from .. import native
 from ..options import Options
 from ..tensors import is_differentiated, is_in_memory, is_traced
 from ..validation import NAMED_TOLERANCES
-from . import compiled, composite, edges, exposure, highlights, routes, rules
+from . import exposure, highlights, routes, rules
 from .attention import Attention, box_around, weight_map
-from .convolution import convolve
-from .coverage import covered_by
-from .disocclusion import behind_pixels, surfaces_of_image
-from .layer_weights import blur_axis
-from .matting import matte
-from .ops import EAGER, Ops
-from .plan import Plan, joined_layers
-from .scatter import fold
-from .surfaces import PaddedFrame, Surface, pad_to_frame
-from .traced import is_compiled
+from .engines import compiled
+from .engines.ops import EAGER, Ops
+from .engines.traced import is_compiled
+from .layers import composite
+from .layers.convolution import convolve
+from .layers.layer_weights import blur_axis
+from .layers.plan import Plan, joined_layers
+from .layers.scatter import fold
+from .surfaces import edges
+from .surfaces.coverage import covered_by
+from .surfaces.disocclusion import behind_pixels, surfaces_of_image
+from .surfaces.frame import PaddedFrame, Surface, pad_to_frame
+from .surfaces.matting import matte
 
 _REACH = 4.0  # margin around an attention area, in largest blur radii; less changes its light and hidden surfaces
 _TOGETHER = 2**21  # pixels of items rendered together; larger: fewer, larger operations, and more memory

@@ -1,5 +1,5 @@
 // Matting: a pixel at a depth edge mixes the light of two surfaces but has the depth of one. Splits it into both, as
-// described in render/matting.py.
+// described in render/surfaces/matting.py.
 #include "constants/matting.h"
 #include "constants/pipeline.h"
 #include "engine.h"
@@ -7,7 +7,7 @@
 namespace torchdof {
 namespace {
 
-// Constants of render/matting.py and render/pipeline.py, which give their meanings, units and effects.
+// Constants of render/surfaces/matting.py and render/pipeline.py, which give their meanings, units and effects.
 constexpr float EDGE_PX = constants::matting::EDGE_PX;
 constexpr float UNCLEAN = constants::matting::UNCLEAN;
 constexpr float TRUST = constants::matting::TRUST;
@@ -733,7 +733,7 @@ void set_weight(const Surfaces &s, const Block &block, size_t at, int within, fl
   block.own_weight[within] = 1.0f - weight;
 }
 
-// Gives pixels of a block the second surfaces of a matte, by their certainty; see render/coverage.py.
+// Gives pixels of a block the second surfaces of a matte, by their certainty; see render/surfaces/coverage.py.
 void cover_block(Job &job, int by, int bx) {
   Surfaces &s = job.surfaces;
   const size_t area = s.area();
