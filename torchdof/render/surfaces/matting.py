@@ -13,6 +13,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ... import native, pixels
+from ...pixels import Selected
 from ...tensors import is_empty
 from ..engines.compiled_steps import compiled_step
 from ..engines.ops import EAGER, Ops
@@ -111,92 +112,148 @@ def _with_covered(light: Tensor, surfaces: Matted, covered: Tensor) -> Matted:
     return Matted(*(torch.where(certainty > 0, new, old) for new, old in zip(split, surfaces, strict=True)))
 
 
+class _EdgePixels(NamedTuple):
+    """P pixels at depth edges, with the 3 x 3 pixels around each. Light is relative to the brightest of these."""
+
+    chosen: Selected
+    brightest: Tensor  # [P]
+    light: Tensor  # of the pixel, [C, P]
+    around: Tensor  # light around it, [C, 9, P]
+    coc_px: Tensor  # [P]
+    coc_around: Tensor  # [9, P]
+    counts: Tensor | None  # 0 where a pixel around is left out, [9, P]
+    near_px: Tensor  # coc of the near surface, [P]
+    far_px: Tensor  # coc of the far surface, [P]
+    certainty: Tensor  # confidence that there are two surfaces, [P]
+
+    @property
+    def gap_px(self) -> Tensor:
+        """Difference in coc of both surfaces, at least 1e-6."""
+        return (self.far_px - self.near_px).clamp_min(1e-6)
+
+    @property
+    def nearness(self) -> Tensor:
+        """Place of the pixels around between the far surface, 0, and the near one, 1: ``[9, P]``."""
+        return (self.far_px - self.coc_around) / self.gap_px
+
+    def by_owner(self, if_near: Tensor, if_far: Tensor) -> Tensor:
+        """Values of pixels whose own surface is the near one, and of those whose own surface is the far one."""
+        return torch.where(self.coc_px - self.near_px < self.far_px - self.coc_px, if_near, if_far)
+
+
+class _Colour(NamedTuple):
+    """Mean colour of a surface, ``[C, P]``, and its variance, ``[P]``, summed over channels."""
+
+    mean: Tensor
+    variance: Tensor
+
+
 def _split(light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops = EAGER) -> Matted:
-    """:func:`matte` by PyTorch."""
-    rules = active()
-    if not rules.matting:
+    """:func:`matte` by PyTorch, without a matte."""
+    if not active().matting:
         return Matted(light, torch.zeros_like(light), coc_px, torch.zeros_like(coc_px))
-    # pixels beside another surface
+    edge = _edge_pixels(light, coc_px, valid, ops)
+    near, far = _colours(edge, light, coc_px)
+    weight = _weight_of_other(edge, near, far)
+    own, other = _parts(edge, near, far, weight, light)
+    put = edge.chosen.put
+    return Matted(
+        put(light, own * edge.brightest),
+        put(torch.zeros_like(light), other * edge.brightest),
+        put(coc_px, edge.by_owner(edge.far_px, edge.near_px)),
+        put(torch.zeros_like(coc_px), weight),
+    )
+
+
+def _edge_pixels(light: Tensor, coc_px: Tensor, valid: Tensor | None, ops: Ops) -> _EdgePixels:
+    """Step 1 of :func:`matte`: the pixels beside another surface, and the coc of the two surfaces around each."""
     known = None if valid is None else valid > 0
     high, low = (c if known is None else torch.where(known, c, -NEVER_PX) for c in (coc_px.detach(), -coc_px.detach()))
     high, low = (functional.max_pool2d(c, 3, stride=1, padding=1) for c in (high, low))
     is_edge = high + low > _EDGE_PX
-    selected = ops.select(is_edge if known is None else is_edge & known)
+    chosen = ops.select(is_edge if known is None else is_edge & known)
 
-    # coc of the two surfaces; light relative to the brightest neighbour, so that its scale does not matter
-    own_coc, colour = selected.pick(coc_px)[0], selected.pick(light)
-    window_light, window_coc = selected.around(light), selected.around(coc_px)[0]  # [C, 9, P], [9, P]
-    brightest = window_light.detach().abs().amax((0, 1)).clamp_min(torch.finfo(light.dtype).tiny)
-    colour, window_light = colour / brightest, window_light / brightest
-    near = far = window_coc
-    counted = None if valid is None else selected.around(valid)[0]
-    if counted is not None:
-        near, far = torch.where(counted > 0, near, NEVER_PX), torch.where(counted > 0, far, -NEVER_PX)
-    near, far = near.amin(0), far.amax(0)
-    is_near = own_coc - near < far - own_coc
-    edge = ((far - near) / _EDGE_PX - 1.0).clamp(0.0, 1.0)  # confidence that there are two surfaces
-    edges = selected.put(torch.zeros_like(coc_px), edge)
-    gap = (far - near).clamp_min(1e-6)
+    own_light, around, coc_around = chosen.pick(light), chosen.around(light), chosen.around(coc_px)[0]
+    brightest = around.detach().abs().amax((0, 1)).clamp_min(torch.finfo(light.dtype).tiny)
+    near_px = far_px = coc_around
+    counts = None if valid is None else chosen.around(valid)[0]
+    if counts is not None:
+        near_px, far_px = torch.where(counts > 0, near_px, NEVER_PX), torch.where(counts > 0, far_px, -NEVER_PX)
+    near_px, far_px = near_px.amin(0), far_px.amax(0)
+    certainty = ((far_px - near_px) / _EDGE_PX - 1.0).clamp(0.0, 1.0)
+    lights, cocs = (own_light / brightest, around / brightest), (chosen.pick(coc_px)[0], coc_around)
+    return _EdgePixels(chosen, brightest, *lights, *cocs, counts, near_px, far_px, certainty)
 
-    # their colours: means over neighbours that lie on one of them, mostly unmixed ones
-    falloff = _falloff(light, 1)
-    weight = (1.0 - selected.around(edges)[0] + _UNCLEAN) * falloff
-    if counted is not None:
-        weight = weight * counted
-    nearness = (far - window_coc) / gap
-    near_weight, far_weight = weight * (4 * nearness - 2.8).clamp(0, 1), weight * (1.2 - 4 * nearness).clamp(0, 1)
-    # a photograph's edges are wider than a pixel: mixed neighbours count without the light of the other surface
-    same = weight * (2.0 - 2.0 * (window_coc - own_coc).abs() / _EDGE_PX).clamp(0.0, 1.0)
-    clean = (window_light * same).sum(1) / same.sum(0).clamp_min(1e-12)
-    clean = torch.lerp(colour, clean, edge * (same.sum(0) - 10.0 * _UNCLEAN).clamp(0.0, 1.0))
-    clean = selected.around(selected.put(light, clean * brightest)) / brightest
-    clean = clean.clamp(-_MOST_CLEAN, _MOST_CLEAN)
-    if rules.mixed_neighbours:
-        window_light = window_light - _mixed_light(window_light, clean, near_weight, far_weight)
-    back, back_variance = _mean_of(window_light, far_weight)
-    front, front_variance = _mean_of(window_light, near_weight)
 
+def _colours(edge: _EdgePixels, light: Tensor, coc_px: Tensor) -> tuple[_Colour, _Colour]:
+    """Step 2 of :func:`matte`: the colours of the near and the far surface, mostly of unmixed pixels."""
+    certainty = edge.chosen.put(torch.zeros_like(coc_px), edge.certainty)
+    weight = (1.0 - edge.chosen.around(certainty)[0] + _UNCLEAN) * _falloff(light, 1)
+    weight = weight if edge.counts is None else weight * edge.counts
+    nearness = edge.nearness
+    weights = weight * (4 * nearness - 2.8).clamp(0, 1), weight * (1.2 - 4 * nearness).clamp(0, 1)
+    around = edge.around
+    if active().mixed_neighbours:
+        around = around - _mixed_light(around, _clean_light(edge, weight, light), *weights)
+    near, far = (_mean_of(around, each) for each in weights)
+    return near, far
+
+
+def _clean_light(edge: _EdgePixels, weight: Tensor, light: Tensor) -> Tensor:
+    """Light around each pixel without that of another surface, ``[C, 9, P]``.
+
+    A mixed pixel gets the mean of the pixels around it that lie on its own surface, by their ``weight``, ``[9, P]``; it
+    keeps its light if all of them may be mixed.
+    """
+    same = weight * (2.0 - 2.0 * (edge.coc_around - edge.coc_px).abs() / _EDGE_PX).clamp(0.0, 1.0)
+    mean = (edge.around * same).sum(1) / same.sum(0).clamp_min(1e-12)
+    clean = torch.lerp(edge.light, mean, edge.certainty * (same.sum(0) - 10.0 * _UNCLEAN).clamp(0.0, 1.0))
+    around = edge.chosen.around(edge.chosen.put(light, clean * edge.brightest)) / edge.brightest
+    return around.clamp(-_MOST_CLEAN, _MOST_CLEAN)
+
+
+def _weight_of_other(edge: _EdgePixels, near: _Colour, far: _Colour) -> Tensor:
+    """Steps 3 and 4 of :func:`matte`: the part of each pixel that its other surface covers, ``[P]``."""
     # a = (I - B) (F - B) / |F - B|^2, and the trust in it
-    contrast = front - back
+    contrast = near.mean - far.mean
     strength = (contrast**2).sum(0)
-    fitted = (((colour - back) * contrast).sum(0) / strength.clamp_min(1e-12)).clamp(0.0, 1.0)
-    misfit = ((colour - back - fitted * contrast) ** 2).sum(0)
-    trust = strength / (strength + _TRUST * (back_variance + front_variance + misfit) + _ALIKE**2)
+    fitted = (((edge.light - far.mean) * contrast).sum(0) / strength.clamp_min(1e-12)).clamp(0.0, 1.0)
+    misfit = ((edge.light - far.mean - fitted * contrast) ** 2).sum(0)
+    trust = strength / (strength + _TRUST * (far.variance + near.variance + misfit) + _ALIKE**2)
     # a depth between the two belongs to a steep surface, not to an edge
-    sided = ((own_coc - near) - (far - own_coc)).abs() / gap
-    clear = edge * (4.0 * sided - 2.0).clamp(0.0, 1.0)
-    weight = torch.where(is_near, 1.0 - fitted, fitted).clamp(max=0.5) * clear * trust  # of the other surface
-    small = _falloff(light, 1, _SOFTNESS_FALLOFF)
-    small = small if counted is None else small * counted
-    covered = (small * nearness).sum(0) / small.sum(0).clamp_min(1e-12)  # by the near surface, under the Gaussian
-    noise, misfit = back_variance + front_variance + _ALIKE**2, misfit + (covered - fitted) ** 2 * strength
-    # below 1 px of coc the two may be a steep surface, and nothing is to be seen of a soft edge
-    geometric = torch.where(is_near, 1.0 - covered, covered).clamp(max=0.5) * clear * (1.0 - trust)
-    geometric = geometric * ((gap / _EDGE_PX - 2.0).clamp(0.0, 1.0) if rules.alike_colours else 0.0)
-    weight = weight + geometric * noise / (noise + misfit)
+    sided = ((edge.coc_px - edge.near_px) - (edge.far_px - edge.coc_px)).abs() / edge.gap_px
+    clear = edge.certainty * (4.0 * sided - 2.0).clamp(0.0, 1.0)
+    by_colour = edge.by_owner(1.0 - fitted, fitted).clamp(max=0.5) * clear * trust
 
-    # Each part gets a share of the residual in proportion to its weight squared: the smallest change of both colours.
-    # A sharper other surface gets none: texture and noise of this pixel would stay there as dots beside a blurred edge.
-    # Then limit the parts to the image's range.
-    own_mean, other_mean = torch.where(is_near, front, back), torch.where(is_near, back, front)
+    # the near surface's share under a small Gaussian
+    small = _falloff(edge.light, 1, _SOFTNESS_FALLOFF)
+    small = small if edge.counts is None else small * edge.counts
+    covered = (small * edge.nearness).sum(0) / small.sum(0).clamp_min(1e-12)
+    by_place = edge.by_owner(1.0 - covered, covered).clamp(max=0.5) * clear * (1.0 - trust)
+    # below 1 px of coc the two may be a steep surface, and nothing is to be seen of a soft edge
+    by_place = by_place * ((edge.gap_px / _EDGE_PX - 2.0).clamp(0.0, 1.0) if active().alike_colours else 0.0)
+    noise, misfit = far.variance + near.variance + _ALIKE**2, misfit + (covered - fitted) ** 2 * strength
+    return by_colour + by_place * noise / (noise + misfit)
+
+
+def _parts(edge: _EdgePixels, near: _Colour, far: _Colour, weight: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
+    """Step 5 of :func:`matte`: light of the own and of the other surface, ``[C, P]``, with ``weight`` of the other.
+
+    Each part gets a share of the residual in proportion to its weight squared: the smallest change of both colours. A
+    sharper other surface gets none: texture and noise of this pixel would stay there as dots beside a blurred edge.
+    """
+    own_mean, other_mean = edge.by_owner(near.mean, far.mean), edge.by_owner(far.mean, near.mean)
     own_weight = 1.0 - weight
-    unexplained = colour - own_weight * own_mean - weight * other_mean
-    sharper = own_coc.abs() - torch.where(is_near, far, near).abs()  # px by which the other surface is less blurred
-    lent = (1.0 - sharper).clamp(0.0, 1.0) if rules.sharper_surface else 1.0
-    moved = weight * (other_mean + unexplained * lent * weight / (weight**2 + own_weight**2))
-    range_of_image = light.amin((2, 3)), light.amax((2, 3))
-    extremes = (selected.of_item(extreme) / brightest for extreme in range_of_image)
+    residual = edge.light - own_weight * own_mean - weight * other_mean
+    sharper_px = edge.coc_px.abs() - edge.by_owner(edge.far_px, edge.near_px).abs()
+    lent = (1.0 - sharper_px).clamp(0.0, 1.0) if active().sharper_surface else 1.0
+    moved = weight * (other_mean + residual * lent * weight / (weight**2 + own_weight**2))
+    # neither part leaves the image's range
+    extremes = (edge.chosen.of_item(ends) / edge.brightest for ends in (light.amin((2, 3)), light.amax((2, 3))))
     least, most = (extreme.clamp(-_UNBOUNDED, _UNBOUNDED) for extreme in extremes)  # 0 * inf would be NaN
-    moved = torch.minimum(moved.maximum(colour - own_weight * most), colour - own_weight * least)
+    moved = torch.minimum(moved.maximum(edge.light - own_weight * most), edge.light - own_weight * least)
     moved = torch.minimum(moved.maximum(weight * least), weight * most)
-    own = (colour - moved) / own_weight
-    other = torch.where(weight > 0, moved / weight.clamp_min(1e-12), 0.0)
-    return Matted(
-        selected.put(light, own * brightest),
-        selected.put(torch.zeros_like(light), other * brightest),
-        selected.put(coc_px, torch.where(is_near, far, near)),
-        selected.put(torch.zeros_like(coc_px), weight),
-    )
+    return (edge.light - moved) / own_weight, torch.where(weight > 0, moved / weight.clamp_min(1e-12), 0.0)
 
 
 def attribute_emitters(
@@ -300,16 +357,15 @@ def attribute_emitters(
     return Matted(*(pixels.put(maps, bright, values) for maps, values in changed))
 
 
-def _mixed_light(window: Tensor, clean: Tensor, near_weight: Tensor, far_weight: Tensor) -> Tensor:
+def _mixed_light(around: Tensor, clean: Tensor, near_weight: Tensor, far_weight: Tensor) -> Tensor:
     """Light of the other surface in neighbours ``[C, 9, P]``, which have clean light ``[C, 9, P]``.
 
     It is the part of their difference on the line between the colours of both surfaces, less where texture is strong.
     """
-    back, back_variance = _mean_of(clean, far_weight)
-    front, front_variance = _mean_of(clean, near_weight)
-    contrast = (front - back)[:, None]
-    strength = (contrast**2).sum(0) + _TEXTURE * (back_variance + front_variance) + _ALIKE**2
-    share = ((window - clean) * contrast).sum(0) / strength
+    near, far = _mean_of(clean, near_weight), _mean_of(clean, far_weight)
+    contrast = (near.mean - far.mean)[:, None]
+    strength = (contrast**2).sum(0) + _TEXTURE * (far.variance + near.variance) + _ALIKE**2
+    share = ((around - clean) * contrast).sum(0) / strength
     return torch.where(near_weight > far_weight, share.clamp(-1.0, 0.0), share.clamp(0.0, 1.0)) * contrast
 
 
@@ -319,9 +375,9 @@ def _falloff(light: Tensor, reach: int, beside: float = _FALLOFF) -> Tensor:
     return light.new_tensor([beside ** (dy * dy + dx * dx) for dy in steps for dx in steps])[:, None]
 
 
-def _mean_of(colour: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted mean ``[C, P]`` of colours ``[C, n, P]`` over n, and their variance ``[P]``, summed over channels."""
+def _mean_of(colour: Tensor, weight: Tensor) -> _Colour:
+    """Weighted mean of colours ``[C, n, P]`` over n, and their variance."""
     total = weight.sum(0).clamp_min(1e-12)
     mean = (colour * weight).sum(1) / total
     # not E[x^2] - E[x]^2, whose rounding error dominates where all colours are alike
-    return mean, (((colour - mean[:, None]) ** 2 * weight).sum(1) / total).sum(0)
+    return _Colour(mean, (((colour - mean[:, None]) ** 2 * weight).sum(1) / total).sum(0))
