@@ -20,7 +20,7 @@ MODULES = (
     "native/__init__",
     *(f"optics/{name}" for name in ("kernel_bank", "placed_kernels", "psf")),
     *(f"render/{name}" for name in ("exposure", "highlights", "pipeline")),
-    *(f"render/surfaces/{name}" for name in ("border", "disocclusion", "edges", "frame", "matting")),
+    *(f"render/surfaces/{name}" for name in ("border", "disocclusion", "edges", "emitters", "frame", "matting")),
     *(f"render/layers/{name}" for name in ("composite", "convolution", "downsampling", "field")),
     *(f"render/layers/{name}" for name in ("layer_cocs", "layer_weights", "plan")),
 )

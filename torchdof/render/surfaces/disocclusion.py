@@ -20,8 +20,9 @@ from ..engines.ops import EAGER, Level, Ops, Seen
 from ..engines.traced import is_compiled, one_operator
 from ..layers.downsampling import downsampled
 from ..rules import active
+from .emitters import attribute_emitters
 from .frame import HIDDEN_WEIGHT, Surface
-from .matting import NEVER_PX, attribute_emitters, matte
+from .matting import NEVER_PX, matte
 
 # Another surface, or a slope of the pixel's own one; larger values of both: fewer hidden samples
 _BEHIND_PX = (

@@ -12,21 +12,19 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ... import native, pixels
+from ... import native
 from ...pixels import Selected
-from ...tensors import is_empty
 from ..engines.compiled_steps import compiled_step
 from ..engines.ops import EAGER, Ops
 from ..rules import active
 
-__all__ = ["NEVER_PX", "Matted", "attribute_emitters", "matte"]
+__all__ = ["FALLOFF", "NEVER_PX", "Matted", "falloff", "matte"]
 
 NEVER_PX = 1e9
 """A coc in pixels that no pixel has: marks the absence of a surface."""
 
-# Mixed pixels
 _EDGE_PX = 0.5  # px; smallest difference in coc of neighbours on two surfaces; larger: fewer edges
-_FALLOFF = math.exp(-1 / 4.5)  # weight of a neighbour at a distance of 1 px: a Gaussian of sigma 1.5
+FALLOFF = math.exp(-1 / 4.5)  # weight of a neighbour at a distance of 1 px: a Gaussian of sigma 1.5
 _UNCLEAN = 1e-2  # weight in a surface's mean colour of pixels that may be mixed; others have 1
 _TRUST = 10.0  # weight of variance against contrast; larger: texture stops more splits by colour
 _TEXTURE = 50.0  # weight of variance against contrast; larger: texture keeps more of a neighbour's mixed light
@@ -35,12 +33,6 @@ _SOFTNESS_PX = 0.6  # standard deviation of the Gaussian by which two surfaces m
 _SOFTNESS_FALLOFF = math.exp(-0.5 / _SOFTNESS_PX**2)  # its weight at a distance of 1 px
 _ALIKE = 1.0 / 255.0  # contrast at which trust is halved, as a fraction of the brightest light around
 _UNBOUNDED = 1e6  # upper limit for either part, as a multiple of the brightest neighbour; avoids 0 * inf
-
-# Emitters
-_EMITTER_REACH = 3  # px; half the width of the window in which an emitter's surface is searched
-_TOUCHING = 2  # px; distance over which a soft image spreads the light of an emitter in front
-_DIM = 0.1  # fraction of the highlight below which all pixels are equally good samples of a surface's own light
-_MOST_WEIGHT = 0.98  # largest weight of an emitter on another surface in a highlight's pixel
 
 
 class Matted(NamedTuple):
@@ -188,7 +180,7 @@ def _edge_pixels(light: Tensor, coc_px: Tensor, valid: Tensor | None, ops: Ops) 
 def _colours(edge: _EdgePixels, light: Tensor, coc_px: Tensor) -> tuple[_Colour, _Colour]:
     """Step 2 of :func:`matte`: the colours of the near and the far surface, mostly of unmixed pixels."""
     certainty = edge.chosen.put(torch.zeros_like(coc_px), edge.certainty)
-    weight = (1.0 - edge.chosen.around(certainty)[0] + _UNCLEAN) * _falloff(light, 1)
+    weight = (1.0 - edge.chosen.around(certainty)[0] + _UNCLEAN) * falloff(light, 1)
     weight = weight if edge.counts is None else weight * edge.counts
     nearness = edge.nearness
     weights = weight * (4 * nearness - 2.8).clamp(0, 1), weight * (1.2 - 4 * nearness).clamp(0, 1)
@@ -226,7 +218,7 @@ def _weight_of_other(edge: _EdgePixels, near: _Colour, far: _Colour) -> Tensor:
     by_colour = edge.by_owner(1.0 - fitted, fitted).clamp(max=0.5) * clear * trust
 
     # the near surface's share under a small Gaussian
-    small = _falloff(edge.light, 1, _SOFTNESS_FALLOFF)
+    small = falloff(edge.light, 1, _SOFTNESS_FALLOFF)
     small = small if edge.counts is None else small * edge.counts
     covered = (small * edge.nearness).sum(0) / small.sum(0).clamp_min(1e-12)
     by_place = edge.by_owner(1.0 - covered, covered).clamp(max=0.5) * clear * (1.0 - trust)
@@ -256,107 +248,6 @@ def _parts(edge: _EdgePixels, near: _Colour, far: _Colour, weight: Tensor, light
     return (edge.light - moved) / own_weight, torch.where(weight > 0, moved / weight.clamp_min(1e-12), 0.0)
 
 
-def attribute_emitters(
-    light: Tensor, coc_px: Tensor, threshold: Tensor, valid: Tensor | None, surfaces: Matted
-) -> Matted:
-    """Gives the light of highlights to the surface on which their emitter lies.
-
-    An emitter seen through hair shines into pixels that have the depth of a strand. An emitter in front of a wall
-    shines into pixels around it that have the depth of the wall. In a highlight's pixel, for emitters in front and then
-    for emitters behind:
-
-    1. Test for an emitter on another surface: its own surface is dim around it, and farther pixels, or nearer ones that
-       touch it, are about as bright as the highlight.
-    2. If so, the other surface gets the light above that of the own one, and may cover more than half of the pixel.
-    3. Conversely, if the emitter lies on the pixel's own surface, reduce the weight of the other surface. It does if
-       the other surface is dim around the pixel and nowhere as bright as the highlight.
-
-    Args:
-        light: ``[B, C, H, W]``.
-        coc_px: ``[B, 1, H, W]``, signed.
-        threshold: Light above which a pixel is a highlight, ``[B, 1, H, W]``.
-        valid: As for :func:`matte`.
-        surfaces: The result of :func:`matte`.
-
-    Returns:
-        The surfaces, changed at those pixels.
-    """
-    brightest = light.amax(1, keepdim=True)
-    is_bright = brightest > threshold
-    bright = pixels.indices(is_bright if valid is None else is_bright & (valid > 0))
-    if is_empty(bright):
-        return surfaces
-    window = pixels.around(bright, coc_px, _EMITTER_REACH)
-    seen, own_coc, limit = pixels.pick(light, bright), pixels.pick(coc_px, bright)[0], pixels.pick(threshold, bright)[0]
-    peaks, own_peak = pixels.pick(brightest, window)[0], pixels.pick(brightest, bright)[0]
-    scale = peaks.detach().amax(0)
-    colour = pixels.pick(light, window) / scale
-    seen, peaks, own_peak, limit = seen / scale, peaks / scale, own_peak / scale, limit / scale
-    excess = (own_peak / limit - 1.0).clamp(0.0, 1.0)
-    window_coc, near_by = pixels.pick(coc_px, window)[0], _falloff(light, _EMITTER_REACH)
-    counted = torch.ones_like(peaks) if valid is None else pixels.pick(valid, window)[0]
-    touches = counted * (near_by > _FALLOFF ** (2 * _TOUCHING**2 + 1))
-    nearest = window_coc.amin(0)
-
-    brightness = (peaks**2).clamp(max=1e30)  # 0 * inf would be NaN, beside negative light
-    dimness = 1.0 / (brightness + (_DIM * own_peak) ** 2).clamp_min(1e-24)
-
-    def beyond(
-        coc: Tensor, side: float | Tensor, among: Tensor, share: float, peaks: Tensor = peaks
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Confidence that the emitter lies behind (side 1) or in front of (-1) surfaces with coc ``coc``, 0 to 1.
-
-        It is above 0 only if pixels there, ``among`` some of the window, have a peak above ``share`` times that of the
-        surfaces. Also returns the weights of the window's pixels beyond the surfaces, those of dim pixels on them, and
-        the larger of both peaks.
-        """
-        away = side * (window_coc - coc)
-        there = among * (away - 1.0).clamp(0.0, 1.0)
-        same = counted * (2.0 - away.abs()).clamp(0.0, 1.0)
-        dim = same * near_by * (2.5 - 5.0 * peaks / own_peak.clamp_min(1e-12)).clamp(0.0, 1.0)
-        emitter_peak, same_peak = (there * peaks).amax(0), (same * peaks).amax(0).clamp_min(1e-12)
-        sureness = excess * (10.0 * dim.sum(0)).clamp(max=1.0)
-        sureness = sureness * (10.0 * (emitter_peak / same_peak - share)).clamp(0.0, 1.0)
-        return sureness, there, dim, torch.maximum(emitter_peak, same_peak)
-
-    own, other, other_coc, weight = (pixels.pick(t, bright) for t in surfaces)
-    own, other, other_coc, weight = own / scale, other / scale, other_coc[0], weight[0]
-    for side, among, least_share in ((-1.0, touches, 1.0), (1.0, counted, 0.5)):
-        sureness, there, dim, top = beyond(own_coc, side, among, least_share)
-        is_beyond = sureness > 0
-        dimmest = dim * dimness
-        surface = (colour * dimmest).sum(1) / dimmest.sum(0).clamp_min(1e-12)  # its light where it is dimmest
-        lit = there * near_by * brightness
-        emitter_coc = nearest + ((window_coc - nearest) * lit).sum(0) / lit.sum(0).clamp_min(1e-12)
-        if side < 0:  # an emitter seen through a surface is not in front of it
-            sureness = sureness * (1.0 - beyond(emitter_coc, 1.0, counted, 0.5)[0])
-        floor = surface.amax(0)
-        share = ((own_peak - floor) / (top - floor).clamp_min(1e-12)).clamp(1.0 - _MOST_WEIGHT, _MOST_WEIGHT)
-        emitter = (seen - (1.0 - share) * surface).clamp_min(0.0)
-        # The earlier result fades into the new one in front, which is mostly the same surface. Behind is another
-        # surface: the earlier result fades out before the new one fades in, so that their coc do not mix.
-        kept, given = (1.0 - sureness, sureness) if side < 0 else (1.0 - 2.0 * sureness, 2.0 * sureness - 1.0)
-        kept, given = kept.clamp_min(0.0) * weight, given.clamp_min(0.0)
-        moved, weight = kept * other + given * emitter, kept + given * share
-        known = weight.clamp_min(1e-12)
-        other = torch.where(weight > 0, moved / known, 0.0)
-        other_coc = torch.lerp(other_coc, emitter_coc, given * share / known)
-        own = torch.where(is_beyond, (seen - weight * other) / (1.0 - weight), own)
-
-    # The other way round: an emitter on the own surface. The other surface is dark around the pixel, without the light
-    # of emitters seen through it, which was taken from it above.
-    own_peaks = pixels.put(surfaces.own, bright, own * scale).amax(1, keepdim=True)
-    own_peaks = pixels.pick(own_peaks, window)[0] / scale
-    bright_other = (other.amax(0) / limit.clamp_min(torch.finfo(light.dtype).tiny) - 1.0).clamp(0.0, 1.0)
-    apart = own_coc - other_coc
-    sureness = beyond(other_coc, apart.sign(), torch.where(apart > 0, counted, touches), 1.0, own_peaks)[0]
-    taken = (apart.abs() - 1.0).clamp(0.0, 1.0) * bright_other * (sureness if active().own_emitters else 0.0)
-    weight = weight * (1.0 - taken)
-    own = torch.where(taken > 0, (seen - weight * other) / (1.0 - weight), own)
-    changed = zip(surfaces, (own * scale, other * scale, other_coc, weight), strict=True)
-    return Matted(*(pixels.put(maps, bright, values) for maps, values in changed))
-
-
 def _mixed_light(around: Tensor, clean: Tensor, near_weight: Tensor, far_weight: Tensor) -> Tensor:
     """Light of the other surface in neighbours ``[C, 9, P]``, which have clean light ``[C, 9, P]``.
 
@@ -369,7 +260,7 @@ def _mixed_light(around: Tensor, clean: Tensor, near_weight: Tensor, far_weight:
     return torch.where(near_weight > far_weight, share.clamp(-1.0, 0.0), share.clamp(0.0, 1.0)) * contrast
 
 
-def _falloff(light: Tensor, reach: int, beside: float = _FALLOFF) -> Tensor:
+def falloff(light: Tensor, reach: int, beside: float = FALLOFF) -> Tensor:
     """Gaussian weights of the pixels of a window, ``[(2 reach + 1)^2, 1]``; ``beside`` is that at 1 px."""
     steps = range(-reach, reach + 1)
     return light.new_tensor([beside ** (dy * dy + dx * dx) for dy in steps for dx in steps])[:, None]
